@@ -1,0 +1,49 @@
+"""Test-time anti-aliasing for pretrained 3D Gaussian Splatting scenes.
+
+Read `aaplug.pipeline` first: it holds the whole flow on one page.
+"""
+
+from aaplug.cameras import Camera, CameraSet, look_at
+from aaplug.conversion import convert
+from aaplug.errors import AaplugError
+from aaplug.evaluation import Task, evaluate
+from aaplug.gaussians import ANTIALIASED, CLASSIC, MIP, Convention, Gaussians
+from aaplug.interfaces import Training
+from aaplug.io.cameras import read_cameras
+from aaplug.io.images import read_image, write_png
+from aaplug.io.scenes import read_scene, write_scene
+from aaplug.pipeline import learn, render, smooth
+from aaplug.recipes import RECIPES, Recipe, find_recipe
+from aaplug.sampling import SamplingBounds, check_frame, sampling_bounds
+from aaplug.splats import Render
+
+__all__ = [
+    "ANTIALIASED",
+    "CLASSIC",
+    "MIP",
+    "RECIPES",
+    "AaplugError",
+    "Camera",
+    "CameraSet",
+    "Convention",
+    "Gaussians",
+    "Recipe",
+    "Render",
+    "SamplingBounds",
+    "Task",
+    "Training",
+    "check_frame",
+    "convert",
+    "evaluate",
+    "find_recipe",
+    "learn",
+    "look_at",
+    "read_cameras",
+    "read_image",
+    "read_scene",
+    "render",
+    "sampling_bounds",
+    "smooth",
+    "write_png",
+    "write_scene",
+]

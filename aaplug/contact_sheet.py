@@ -1,0 +1,55 @@
+"""A grid of images of different sizes, each shown at the same size with its pixels visible.
+
+Images are [h, w, 3] in [0, 1].  Text is drawn with OpenCV's built-in font, which knows ASCII alone.
+"""
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+CELL = 320  # px: height of a shown image
+GAP = 12  # px
+HEADING = 36  # px: height of a line of text
+INK = (40, 40, 40)
+
+
+def contact_sheet(
+    columns: Sequence[str], rows: Sequence[tuple[str, Sequence[Float[Tensor, "h w 3"]]]]
+) -> Float[Tensor, "H W 3"]:
+    """The images with a heading over every column and a label left of every row; widths follow the first row."""
+    cells = [[_enlarged(image) for image in images] for _, images in rows]
+    widths = [cell.shape[1] for cell in cells[0]]
+    margin = max(_text_width(label) for label, _ in rows) + 2 * GAP
+    width = margin + sum(widths) + GAP * len(widths)
+    height = HEADING + len(rows) * (CELL + GAP)
+    sheet = np.full((height, width, 3), 255, dtype=np.uint8)
+    lefts = [margin + sum(widths[:i]) + GAP * i for i in range(len(widths))]
+    for left, heading in zip(lefts, columns, strict=True):
+        _write(sheet, heading, left, HEADING - GAP)
+    for r, ((label, _), images) in enumerate(zip(rows, cells, strict=True)):
+        top = HEADING + r * (CELL + GAP)
+        _write(sheet, label, GAP, top + CELL // 2)
+        for left, room, image in zip(lefts, widths, images, strict=True):
+            shown = image[:, :room]
+            sheet[top : top + CELL, left : left + shown.shape[1]] = shown
+    return torch.from_numpy(sheet).float() / 255
+
+
+def _enlarged(image: Float[Tensor, "h w 3"]) -> np.ndarray:
+    """8-bit, CELL px high; small images keep hard pixels, large ones are averaged."""
+    pixels = (image.clamp(0, 1) * 255).round().byte().cpu().numpy()
+    width = max(1, round(pixels.shape[1] * CELL / pixels.shape[0]))
+    kernel = cv2.INTER_NEAREST if pixels.shape[0] < CELL else cv2.INTER_AREA
+    return cv2.resize(pixels, (width, CELL), interpolation=kernel)
+
+
+def _text_width(text: str) -> int:
+    return cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.6, 1)[0][0]
+
+
+def _write(sheet: np.ndarray, text: str, left: int, bottom: int) -> None:
+    cv2.putText(sheet, text, (left, bottom), cv2.FONT_HERSHEY_SIMPLEX, 0.6, INK, 1, cv2.LINE_AA)

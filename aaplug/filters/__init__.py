@@ -1,0 +1,37 @@
+"""Filters by name; a new one is a file here and a line below."""
+
+from aaplug.filters.dilation import Dilation
+from aaplug.filters.energy import MATCHED_VARIANCE, MatchedEnergy
+from aaplug.filters.matched import PIXEL_VARIANCE, Matched, RateChoice
+from aaplug.filters.smoothing import NYQUIST_VARIANCE, Smoothing3D, StoredSmoothing, fuse_stored
+from aaplug.interfaces import ScreenFilter, WorldFilter
+
+WORLD_FILTERS: dict[str, WorldFilter] = {
+    "smoothing3d": Smoothing3D(),
+    "stored": StoredSmoothing(),
+    "matched-energy": MatchedEnergy(),
+}
+
+SCREEN_FILTERS: dict[str, ScreenFilter] = {
+    "classic": Dilation(0.3, compensated=False),
+    "ewa": Dilation(0.3, compensated=True),
+    "mip": Dilation(0.1, compensated=True),
+    "matched": Matched("global"),
+    "matched-sharpest": Matched("sharpest"),
+    "matched-interval": Matched("interval"),
+}
+
+__all__ = [
+    "MATCHED_VARIANCE",
+    "NYQUIST_VARIANCE",
+    "PIXEL_VARIANCE",
+    "SCREEN_FILTERS",
+    "WORLD_FILTERS",
+    "Dilation",
+    "Matched",
+    "MatchedEnergy",
+    "RateChoice",
+    "Smoothing3D",
+    "StoredSmoothing",
+    "fuse_stored",
+]

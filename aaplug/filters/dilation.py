@@ -1,0 +1,27 @@
+"""Dilation by a constant: what 3DGS, its --antialiasing, gsplat and Mip-Splatting do to every projected covariance."""
+
+from dataclasses import dataclass
+
+from aaplug.cameras import Camera
+from aaplug.interfaces import Training
+from aaplug.splats import Splats2D
+
+
+@dataclass(frozen=True)
+class Dilation:
+    """Add `variance` px² to the covariance, whatever the rate; with `compensated`, keep the splat's energy.
+
+    0.3 uncompensated is 3DGS (Kerbl et al. 2023); 0.3 compensated is EWA splatting as in 3DGS --antialiasing and
+    gsplat "antialiased"; 0.1 compensated is the 2D Mip filter (Mip-Splatting, eq. 10).
+    """
+
+    variance: float
+    compensated: bool
+
+    def __call__(self, splats: Splats2D, camera: Camera, training: Training) -> Splats2D:
+        """Filter the splats of one view."""
+        return splats.blurred(self.variance, self.compensated)
+
+    def for_samples(self) -> "Dilation":
+        """The same: the constant is per sample, as if the larger image had been asked for."""
+        return self

@@ -1,0 +1,71 @@
+"""The matched screen filter: what training saw, carried to the rate being rendered, then the rest of the pixel.
+
+A classic checkpoint was fitted with +0.3 px² of dilation, so its look lives in C + 0.3 I at the training rate, and in
+C + 0.3 r² I at r times that rate.  Step one restores that look, with the training's own compensation if it had any.
+Where the rate is below training's (r < 1) a pixel is larger than training's pixel, and step two adds the part of the
+pixel's own filter, 0.1 (1 − r²) px², that training's pixel did not hold, compensating this step alone.  At r = 1 the
+result is the training's renderer itself.  The design and its measurements are aaplug's own; the first step with one
+global rate is SA-GS's filter (Song et al., arXiv 2403.19615).
+"""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from aaplug.cameras import Camera
+from aaplug.interfaces import Training
+from aaplug.splats import Splats2D
+
+PIXEL_VARIANCE = 0.1  # px²: one pixel seen as a Gaussian; Mip-Splatting (a box has 1/12)
+
+RateChoice = Literal["global", "sharpest", "interval"]
+
+
+@dataclass(frozen=True)
+class Matched:
+    """Match training's dilation at the new rate, then integrate over what is left of the pixel.
+
+    rate: what a Gaussian's rate is compared with.
+        "global" (A): the view's own training size; equals training's renderer at every training view.
+        "sharpest" (B): the highest rate any training view had; one world-space blur for all views, the one that can
+            be fused, thinner than what most views were trained with.
+        "interval" (C): the range of rates the training views had, widened by this pose's own at the training size
+            if it is a pose of the data set; equals training's renderer inside the range and adapts outside, for
+            cameras that move nearer or farther.
+    pixel_variance: of the whole pixel's filter, in px²; 0 leaves the integration to several samples a pixel.
+    """
+
+    rate: RateChoice = "global"
+    pixel_variance: float = PIXEL_VARIANCE
+
+    def __call__(self, splats: Splats2D, camera: Camera, training: Training) -> Splats2D:
+        """Filter the splats of one view."""
+        rate = self.rates(splats, camera, training)
+        trained = training.convention
+        matched = splats.blurred(trained.kernel * rate * rate, trained.compensated)
+        rest = self.pixel_variance * (1 - rate * rate).clamp(min=0.0)
+        return matched.blurred(rest, compensate=True)
+
+    def for_samples(self) -> "Matched":
+        """Only the match: averaging the samples integrates over the pixel."""
+        return replace(self, pixel_variance=0.0)
+
+    def rates(self, splats: Splats2D, camera: Camera, training: Training) -> Float[Tensor, " m"]:
+        """Rate of each splat against the one that training saw; the view's own for Gaussians no camera saw."""
+        view = torch.full_like(splats.depths, training.rate(camera))
+        if self.rate == "global":
+            return view
+        seen = training.bounds.seen[splats.sources]
+        highest = training.bounds.highest[splats.sources].to(splats.depths)
+        now = camera.focal / splats.depths
+        if self.rate == "sharpest":
+            return torch.where(seen, now / highest, view)
+        lowest = training.bounds.lowest[splats.sources].to(splats.depths)
+        if camera.trained_focal is not None:
+            own = camera.trained_focal / splats.depths
+            lowest, highest = torch.minimum(lowest, own), torch.maximum(highest, own)
+        nearest = torch.minimum(torch.maximum(now, lowest), highest)
+        return torch.where(seen, now / nearest, view)

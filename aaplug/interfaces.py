@@ -1,0 +1,67 @@
+"""Every seam on one page: what a plug-in gets, what it gives back, and what it must hold to.
+
+A world filter acts once per scene; a screen filter acts per view on the projected splats; a rasterizer turns splats
+into an image.  Each is a frozen dataclass or a function, deterministic, without side effects, and never changes its
+input.  A plug-in is one file and one line in its folder's `__init__`; the laws in `tests/laws` then run over it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from statistics import median
+from typing import Protocol
+
+from aaplug.cameras import Camera
+from aaplug.gaussians import Convention, Gaussians
+from aaplug.sampling import SamplingBounds
+from aaplug.splats import Render, Splats2D
+
+
+@dataclass(frozen=True)
+class Training:
+    """What is known at test time about training: how it rendered, and how finely its cameras sampled the scene."""
+
+    convention: Convention
+    cameras: Sequence[Camera]
+    bounds: SamplingBounds
+
+    def rate(self, camera: Camera) -> float:
+        """How finely a view samples the scene against training: 1 at the training size, 1/2 at half of it.
+
+        A free camera is compared with the training cameras' median focal length.
+        """
+        trained = camera.trained_focal or median(c.focal for c in self.cameras)
+        return camera.focal / trained
+
+
+class WorldFilter(Protocol):
+    """Changes scales and opacities in the world, before a view is chosen, and records itself in `Gaussians.fused`."""
+
+    def __call__(self, scene: Gaussians, training: Training) -> Gaussians:
+        """Filter the scene; Gaussians keep their number and order."""
+        ...
+
+
+class ScreenFilter(Protocol):
+    """Changes the covariances and opacities of one view's splats."""
+
+    def __call__(self, splats: Splats2D, camera: Camera, training: Training) -> Splats2D:
+        """Filter the splats of `camera`; `training.rate(camera)` says how finely it samples against training."""
+        ...
+
+    def for_samples(self) -> "ScreenFilter":
+        """The same filter for samples that are averaged over the pixel, which then does a part of its work."""
+        ...
+
+
+class Rasterizer(Protocol):
+    """Composites splats front to back over a background.
+
+    The rules are 3DGS's: alpha = min(0.99, opacity·Gaussian at the pixel's centre), skipped below 1/255; a pixel stops
+    before the splat that would bring its transmittance under 1e-4; splats of equal depth are drawn in scene order.
+    """
+
+    def __call__(
+        self, splats: Splats2D, hw: tuple[int, int], background: tuple[float, float, float]
+    ) -> Render:
+        """Draw coloured splats into an image of height and width `hw`."""
+        ...

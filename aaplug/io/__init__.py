@@ -1,0 +1,1 @@
+"""Everything that touches the disk: scenes, cameras, images, and the writing of whole files."""

@@ -1,0 +1,117 @@
+"""The settings of an INRIA training run: `cfg_args`, the text of a Python `Namespace(...)`.
+
+The text ships with scenes that come from anywhere, so it is parsed and never evaluated: one call of
+`Namespace` whose keywords are literals, or nothing.  `source_path` is of no use on another machine
+and is not read.
+"""
+
+import ast
+import math
+import re
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from aaplug.errors import FormatError
+from aaplug.io.cameras.values import MAX_SIDE, Place, number, read_bounded, text
+
+NAME = "cfg_args"
+LIMIT = 64 * 2**10  # bytes: real ones have about 300
+CAPPED = -1  # 3DGS's default resolution: the width capped at WIDTH_CAP
+WIDTH_CAP = 1600  # px: 3DGS, utils/camera_utils.py
+DIVISORS = (1, 2, 4, 8)  # resolutions that divide the size; others are a width in px
+
+
+@dataclass(frozen=True)
+class CfgArgs:
+    """What a run says about its images.
+
+    resolution: a divisor of DIVISORS, CAPPED, or a width in px.  images: the folder of the photos.
+    white_background: None if the file does not say.  held_out: whether every 8th view was kept from
+    training (eval).
+    """
+
+    resolution: float = CAPPED
+    images: str = "images"
+    white_background: bool | None = None
+    held_out: bool = False
+
+    @property
+    def divisor(self) -> int:
+        """What the photos' folder says they were divided by: 4 for images_4."""
+        match = re.search(r"_([1-9][0-9]?)$", self.images)
+        return int(match[1]) if match else 1
+
+    def size(self, width: int, height: int) -> tuple[int, int]:
+        """The size at which 3DGS trains on an image of `width` × `height` px."""
+        if self.resolution in DIVISORS:
+            return max(1, round(width / self.resolution)), max(1, round(height / self.resolution))
+        target = min(width, WIDTH_CAP) if self.resolution == CAPPED else int(self.resolution)
+        return target, max(1, height * target // width)  # 3DGS cuts here and rounds above
+
+
+def read_cfg_args(path: Path) -> CfgArgs:
+    """The settings that matter for cameras, at their defaults where the file does not mention them.
+
+    Raises:
+        FormatError: the file is anything but a Namespace of literals, or a setting is wrong.
+    """
+    found = _literals(path, _parsed(path))
+    place = Place(path, "Namespace")
+    settings = CfgArgs()
+    return CfgArgs(
+        _resolution(found.get("resolution", settings.resolution), place),
+        text(found.get("images", settings.images), place, "images"),
+        _flag(found, "white_background", place),
+        bool(_flag(found, "eval", place)),
+    )
+
+
+def _parsed(path: Path) -> ast.Call:
+    source = read_bounded(path, LIMIT)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # a path's backslashes are no concern of the user's
+            call = ast.parse(source.decode().strip(), mode="eval").body
+    except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
+        raise FormatError(path, f"should be a Python Namespace(...): {error}") from error
+    if not (isinstance(call, ast.Call) and isinstance(call.func, ast.Name)):
+        raise FormatError(path, "should be a Python Namespace(...), and is something else")
+    plain = not call.args and all(keyword.arg for keyword in call.keywords)
+    if call.func.id != "Namespace" or not plain:
+        raise FormatError(path, f"should be Namespace(name=value, ...), not {call.func.id}(...)")
+    return call
+
+
+def _literals(path: Path, call: ast.Call) -> dict[str, Any]:
+    found = {}
+    for keyword in call.keywords:
+        name = str(keyword.arg)
+        try:
+            found[name] = ast.literal_eval(keyword.value)
+        except (ValueError, TypeError, SyntaxError, RecursionError, MemoryError) as error:
+            raise FormatError(
+                path,
+                f"{name} should be a literal (number, text, True, list); code is never run",
+            ) from error
+    return found
+
+
+def _resolution(value: object, place: Place) -> float:
+    real = number(value, place, "resolution")
+    if real != CAPPED and not 1 <= real <= MAX_SIDE:
+        raise place.wrong("resolution", f"-1, 1, 2, 4, 8 or a width up to {MAX_SIDE} px", value)
+    return real
+
+
+def _flag(found: dict[str, Any], name: str, place: Place) -> bool | None:
+    value = found.get(name)
+    if value is not None and not isinstance(value, bool):
+        raise place.wrong(name, "True or False", value)
+    return value
+
+
+def half_up(value: float) -> int:
+    """Rounding as image tools do it to make an images_N folder; Python goes to the even number."""
+    return max(1, math.floor(value + 0.5))

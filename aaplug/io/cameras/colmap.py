@@ -1,0 +1,164 @@
+"""COLMAP datasets.
+
+The root holds `images` and a model in `sparse/0` or `sparse`: cameras (intrinsics) and images
+(poses), both .bin or both .txt.  Poses are world-to-camera, OpenCV axes, in world units; the centre
+of the first pixel is (0.5, 0.5); focal lengths and principal points are in px.  Points are not
+read.
+"""
+
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from aaplug.cameras import Camera, CameraSet
+from aaplug.errors import FormatError, listing
+from aaplug.io.cameras.cfg_args import WIDTH_CAP
+from aaplug.io.cameras.colmap_files import KINDS, Image, Intrinsics, read_cameras, read_images
+from aaplug.io.cameras.options import LLFF_HOLD, Options, every_nth
+from aaplug.io.cameras.photos import (
+    Size,
+    described_sizes,
+    distinct,
+    photo_folder,
+    photo_sizes,
+    scaled_sizes,
+    trained_at,
+    whole,
+    with_photos,
+    without_suffix,
+)
+from aaplug.io.cameras.values import (
+    Place,
+    distortion_refusal,
+    focal,
+    inverse,
+    number,
+    pixels,
+    pose,
+)
+
+LEAST_QUATERNION = 1e-6  # a length below this has no direction
+
+
+def sniff(path: Path) -> bool:
+    """Whether it is a dataset's root, the folder of a model, or one of a model's files."""
+    return _model_folder(path) is not None
+
+
+def read(path: Path, options: Options) -> CameraSet:
+    """The cameras at the size of their photos.
+
+    Raises:
+        FormatError: a file is not what it should be, or a camera is no pinhole.
+        UsageError: the options do not fit.
+    """
+    folder = _model_folder(path) or path
+    cameras_file, images_file = _files(folder)
+    intrinsics = read_cameras(cameras_file)
+    images = sorted(read_images(images_file), key=lambda image: image.name)
+    photos = photo_folder(
+        _root(folder),
+        options.images,
+        "images",
+        Place(folder, "images"),
+    )
+    source = [_camera(image, intrinsics) for image in images]
+    source = with_photos(source, [image.place for image in images], photos)
+    names = distinct(images_file, [image.name for image in images], (without_suffix, whole))
+    source = [replace(camera, name=name) for camera, name in zip(source, names, strict=True)]
+    sizes, why = _training_sizes(source, options)
+    trained = trained_at(source, sizes)
+    split = every_nth(
+        trained, options, LLFF_HOLD, "3DGS --eval's rule; --test-every 0 for no split"
+    )
+    notes = (
+        f"COLMAP ({images_file.suffix[1:]}): {len(source)} cameras, "
+        f"{described_sizes(source)} in the file",
+        split.note,
+        f"training size: {described_sizes(trained)} ({why})",
+    )
+    return CameraSet(split.train, split.test, notes=notes)
+
+
+def _model_folder(path: Path) -> Path | None:
+    if not os.path.isdir(path):
+        known = path.stem in ("cameras", "images", "points3D") and path.suffix in KINDS
+        return path.parent if known else None
+    tries = (path / "sparse" / "0", path / "sparse", path / "0", path)
+    return next((t for t in tries if any(os.path.isfile(t / f"cameras{k}") for k in KINDS)), None)
+
+
+def _files(folder: Path) -> tuple[Path, Path]:
+    pairs = [(folder / f"cameras{kind}", folder / f"images{kind}") for kind in KINDS]
+    for pair in pairs:
+        if all(os.path.isfile(file) for file in pair):
+            return pair
+    there = [file.name for pair in pairs for file in pair if os.path.isfile(file)]
+    raise FormatError(
+        folder,
+        "a COLMAP model needs cameras.bin and images.bin, or cameras.txt and images.txt; "
+        f"found {listing(there) or 'neither'}",
+    )
+
+
+def _root(folder: Path) -> Path:
+    """The dataset's root, above sparse/0 or sparse."""
+    folder = folder.absolute()
+    if folder.name.isdigit() and "sparse" in folder.parent.name:
+        folder = folder.parent
+    return folder.parent if "sparse" in folder.name else folder
+
+
+def _training_sizes(cameras: Sequence[Camera], options: Options) -> tuple[list[Size], str]:
+    if options.train_scale is not None:
+        why = f"size in the file × {options.train_scale:g}: --train-scale"
+        return scaled_sizes(cameras, options.train_scale), why
+    there = sum(camera.photo is not None for camera in cameras)
+    sizes = photo_sizes(cameras)
+    why = f"size of the {there} photos found" if there else "size in the file, no photos found"
+    if max(width for width, _ in sizes) > WIDTH_CAP:
+        why += f"; 3DGS itself would have capped the width at {WIDTH_CAP}: --train-scale sets it"
+    return sizes, why
+
+
+def _camera(image: Image, intrinsics: dict[int, Intrinsics]) -> Camera:
+    if image.camera_id not in intrinsics:
+        raise image.place.error(f"uses camera {image.camera_id}, which cameras does not hold")
+    lens = intrinsics[image.camera_id]
+    fx, fy, cx, cy = _pinhole(lens)
+    width = pixels(lens.width, lens.place, "width")
+    height = pixels(lens.height, lens.place, "height")
+    translation = [number(value, image.place, "translation") for value in image.translation]
+    cam_from_world = pose(
+        _rotation(image), torch.tensor(translation, dtype=torch.float64), image.place, "quaternion"
+    )
+    inverse(cam_from_world, image.place, "translation")  # the centre must be within reach
+    return Camera(image.name, width, height, fx, fy, cx, cy, cam_from_world)
+
+
+def _pinhole(lens: Intrinsics) -> tuple[float, float, float, float]:
+    """Fx, fy, cx, cy, if that is all there is."""
+    if not lens.model.straight:
+        raise distortion_refusal(lens.place, f"its model is {lens.model.name}")
+    values = [number(value, lens.place, "parameter") for value in lens.parameters]
+    n = lens.model.focals
+    if any(values[n + 2 :]):
+        raise distortion_refusal(lens.place, f"its model is {lens.model.name} with distortion")
+    fx, fy = (focal(f, lens.place, "focal length") for f in (values[0], values[n - 1]))
+    return fx, fy, values[n], values[n + 1]
+
+
+def _rotation(image: Image) -> Float[Tensor, "3 3"]:
+    """The rotation of a quaternion wxyz of any length: I + 2w[v]ₓ + 2[v]ₓ² once it has length 1."""
+    length = math.hypot(*image.quaternion)
+    if not LEAST_QUATERNION <= length < math.inf:
+        raise image.place.wrong("quaternion", "finite and not zero", image.quaternion)
+    w, x, y, z = (value / length for value in image.quaternion)
+    cross = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
+    return torch.eye(3, dtype=torch.float64) + 2 * w * cross + 2 * cross @ cross

@@ -1,0 +1,279 @@
+"""The records of COLMAP's model files, binary and text, as they stand there.
+
+cameras: id, projection, size in px, the projection's parameters (focal lengths, principal point,
+distortion; px). images: id, world-to-camera pose as quaternion wxyz and translation, camera id,
+name; then their points, passed over.
+"""
+
+import os
+import struct
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO, TypeVar
+
+from aaplug.errors import FormatError
+from aaplug.io.cameras.values import Place, text
+
+Record = TypeVar("Record")
+
+KINDS = (".bin", ".txt")
+NAME_LIMIT = 4096  # bytes: the longest path that systems take
+LINE_LIMIT = 64 * 2**20  # bytes: one image's points
+POINT_SIZE = 24  # bytes: x, y (float64) and the 3D point's id
+COUNT = struct.Struct("<Q")
+CAMERA = struct.Struct("<IiQQ")  # id, model, width, height; the parameters follow
+IMAGE = struct.Struct("<I7dI")  # id, quaternion, translation, camera id; name and points follow
+LEAST_CAMERA = CAMERA.size + 2 * 8  # bytes: the model with the fewest parameters has 2
+LEAST_IMAGE = IMAGE.size + 1 + COUNT.size  # bytes: an empty name still ends
+CAMERA_FIELDS = 4  # id, model, width, height
+IMAGE_FIELDS = 10  # id, 4 of the quaternion, 3 of the translation, camera id, name
+
+
+@dataclass(frozen=True)
+class Model:
+    """One of COLMAP's projections.
+
+    parameters: how many.  focals: how many of them lead as focal lengths; cx and cy follow, then
+    distortion. straight: whether it is a pinhole once its distortion is zero.
+    """
+
+    name: str
+    parameters: int
+    focals: int
+    straight: bool
+
+
+MODELS = (  # by COLMAP's model id
+    Model("SIMPLE_PINHOLE", 3, 1, True),
+    Model("PINHOLE", 4, 2, True),
+    Model("SIMPLE_RADIAL", 4, 1, True),
+    Model("RADIAL", 5, 1, True),
+    Model("OPENCV", 8, 2, True),
+    Model("OPENCV_FISHEYE", 8, 2, False),
+    Model("FULL_OPENCV", 12, 2, True),
+    Model("FOV", 5, 2, True),
+    Model("SIMPLE_RADIAL_FISHEYE", 4, 1, False),
+    Model("RADIAL_FISHEYE", 5, 1, False),
+    Model("THIN_PRISM_FISHEYE", 12, 2, False),
+    Model("RAD_TAN_THIN_PRISM_FISHEYE", 16, 2, False),
+    Model("SIMPLE_DIVISION", 4, 1, True),
+    Model("DIVISION", 5, 2, True),
+    Model("SIMPLE_FISHEYE", 3, 1, False),
+    Model("FISHEYE", 4, 2, False),
+    Model("EUCM", 6, 2, False),
+    Model("EQUIRECTANGULAR", 2, 0, False),
+)
+MODEL_NAMES = {model.name: model for model in MODELS}
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """One of the model's cameras as its file has it; checked when an image uses it."""
+
+    place: Place
+    key: int
+    model: Model
+    width: int
+    height: int
+    parameters: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Image:
+    """One of the model's images as its file has it."""
+
+    place: Place
+    name: str
+    camera_id: int
+    quaternion: tuple[float, ...]
+    translation: tuple[float, ...]
+
+
+def read_cameras(file: Path) -> dict[int, Intrinsics]:
+    """The intrinsics by camera id.
+
+    Raises:
+        FormatError: the file is not what it should be.
+    """
+    found: dict[int, Intrinsics] = {}
+    for intrinsics in _records(file, _binary_cameras, _text_cameras):
+        if intrinsics.key in found:
+            raise intrinsics.place.error("ids should be unique, and this one is there twice")
+        found[intrinsics.key] = intrinsics
+    return found
+
+
+def read_images(file: Path) -> list[Image]:
+    """The images, in the file's order.
+
+    Raises:
+        FormatError: the file is not what it should be, or holds no image.
+    """
+    found = list(_records(file, _binary_images, _text_images))
+    if not found:
+        raise FormatError(file, "holds no image; the model has no camera that was placed")
+    return found
+
+
+class _Reader:
+    """A binary file that is never asked for more than it holds."""
+
+    def __init__(self, path: Path, file: BinaryIO) -> None:
+        self.path = path
+        self.file = file
+        self.left = os.fstat(file.fileno()).st_size
+
+    def unpack(self, record: struct.Struct, what: str) -> tuple:
+        """One record of fixed size."""
+        self._need(record.size, what)
+        return record.unpack(self.file.read(record.size))
+
+    def count(self, least: int, what: str) -> int:
+        """A number of records of at least `least` bytes each, which the file can hold."""
+        (n,) = self.unpack(COUNT, f"number of {what}")
+        if n * least > self.left:
+            raise FormatError(
+                self.path,
+                f"{n} {what} need {n * least} bytes at least, and {self.left} are left; "
+                "the file is cut short or no COLMAP file",
+            )
+        return n
+
+    def skip(self, size: int, what: str) -> None:
+        """Pass over bytes that are of no use."""
+        self._need(size, what)
+        self.file.seek(size, os.SEEK_CUR)
+
+    def name(self, what: str) -> bytes:
+        """Bytes up to a NUL."""
+        start = self.file.tell()
+        chunk = self.file.read(min(NAME_LIMIT + 1, self.left))
+        name, end, _ = chunk.partition(b"\0")
+        if not end:
+            raise FormatError(
+                self.path,
+                f"{what}: its name should end within {NAME_LIMIT} bytes, not after {len(chunk)}",
+            )
+        self.file.seek(start + len(name) + 1)
+        self.left -= len(name) + 1
+        return name
+
+    def _need(self, size: int, what: str) -> None:
+        if size > self.left:
+            raise FormatError(
+                self.path, f"{what}: {size} bytes expected, {self.left} left; the file is cut short"
+            )
+        self.left -= size
+
+
+def _records(
+    file: Path,
+    binary: Callable[[Path, BinaryIO], Iterator[Record]],
+    lines: Callable[[Path, BinaryIO], Iterator[Record]],
+) -> Iterator[Record]:
+    try:
+        with file.open("rb") as stream:
+            yield from (binary if file.suffix == KINDS[0] else lines)(file, stream)
+    except OSError as error:
+        raise FormatError(file, f"cannot be read: {error.strerror}") from error
+
+
+def _binary_cameras(file: Path, stream: BinaryIO) -> Iterator[Intrinsics]:
+    reader = _Reader(file, stream)
+    for index in range(reader.count(LEAST_CAMERA, "cameras")):
+        key, model_id, width, height = reader.unpack(CAMERA, f"camera record {index}")
+        place = Place(reader.path, f"camera {key}")
+        if not 0 <= model_id < len(MODELS):
+            raise place.wrong("model", f"COLMAP's, 0 to {len(MODELS) - 1}", model_id)
+        model = MODELS[model_id]
+        parameters = reader.unpack(struct.Struct(f"<{model.parameters}d"), f"camera record {index}")
+        yield Intrinsics(place, key, model, width, height, parameters)
+
+
+def _binary_images(file: Path, stream: BinaryIO) -> Iterator[Image]:
+    reader = _Reader(file, stream)
+    for index in range(reader.count(LEAST_IMAGE, "images")):
+        what = f"image record {index}"
+        key, *motion, camera_id = reader.unpack(IMAGE, what)
+        place = Place(reader.path, f"image {key}")
+        name = _decoded(reader.name(what), place)
+        points = reader.count(POINT_SIZE, f"points of {what}")
+        reader.skip(points * POINT_SIZE, what)
+        yield Image(place, name, camera_id, tuple(motion[:4]), tuple(motion[4:]))
+
+
+def _text_cameras(file: Path, stream: BinaryIO) -> Iterator[Intrinsics]:
+    for row, line in _lines(file, stream):
+        fields = _decoded_line(line, Place(file, f"line {row}")).split()
+        if not fields or fields[0].startswith("#"):
+            continue
+        place = Place(file, f"camera {fields[0][:20]!s} in line {row}")
+        yield _text_camera(fields, place)
+
+
+def _text_camera(fields: Sequence[str], place: Place) -> Intrinsics:
+    if len(fields) < CAMERA_FIELDS:
+        raise place.wrong("it", "id, model, width, height and parameters", " ".join(fields))
+    if (model := MODEL_NAMES.get(fields[1])) is None:
+        raise place.wrong("model", "one of COLMAP's", fields[1])
+    key, width, height = (_integer(fields[i], place) for i in (0, 2, 3))
+    parameters = tuple(_real(field, place) for field in fields[CAMERA_FIELDS:])
+    if len(parameters) != model.parameters:
+        raise place.wrong(
+            "it", f"{model.name} with {model.parameters} parameters", f"{len(parameters)} of them"
+        )
+    return Intrinsics(place, key, model, width, height, parameters)
+
+
+def _text_images(file: Path, stream: BinaryIO) -> Iterator[Image]:
+    lines = _lines(file, stream)
+    for row, line in lines:
+        if not line.strip() or line.lstrip().startswith(b"#"):
+            continue
+        yield _text_image(line, Place(file, f"image in line {row}"))
+        next(lines, None)  # the image's points, an empty line if there are none
+
+
+def _text_image(line: bytes, place: Place) -> Image:
+    fields = _decoded_line(line, place).split(maxsplit=IMAGE_FIELDS - 1)
+    if len(fields) != IMAGE_FIELDS:
+        raise place.wrong("it", "id, quaternion, translation, camera id and name", line)
+    motion = tuple(_real(field, place) for field in fields[1:8])
+    name = text(fields[-1].strip(), place, "name")
+    return Image(place, name, _integer(fields[8], place), motion[:4], motion[4:])
+
+
+def _lines(file: Path, stream: BinaryIO) -> Iterator[tuple[int, bytes]]:
+    """Numbered lines, none of them longer than memory bears."""
+    row = 0
+    while line := stream.readline(LINE_LIMIT + 1):
+        row += 1
+        if len(line) > LINE_LIMIT:
+            raise FormatError(file, f"line {row} is longer than {LINE_LIMIT} bytes")
+        yield row, line
+
+
+def _decoded(name: bytes, place: Place) -> str:
+    return text(_decoded_line(name, place), place, "name")
+
+
+def _decoded_line(line: bytes, place: Place) -> str:
+    try:
+        return line.decode()
+    except UnicodeDecodeError as error:
+        raise place.wrong("it", "UTF-8", line) from error
+
+
+def _real(field: str, place: Place) -> float:
+    try:
+        return float(field)
+    except ValueError as error:
+        raise place.wrong("it", "numbers", field) from error
+
+
+def _integer(field: str, place: Place) -> int:
+    try:
+        return int(field)
+    except ValueError as error:
+        raise place.wrong("it", "whole numbers for id and size", field) from error

@@ -1,0 +1,171 @@
+"""INRIA's `cameras.json`, with the run's `cfg_args` where it lies beside: a 3DGS model folder.
+
+A list of {id, img_name, width, height, position, rotation, fx, fy}.  position: the camera's centre,
+in world units; rotation: camera-to-world, OpenCV axes; fx, fy: in px.  The principal point is the
+image's centre.  Sizes are those of the source, written before training shrank the photos, so the
+training size is worked out as 3DGS does it.
+"""
+
+import os
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from aaplug.cameras import BLACK, WHITE, Camera, CameraSet
+from aaplug.io.cameras import cfg_args
+from aaplug.io.cameras.cfg_args import WIDTH_CAP, CfgArgs, half_up, read_cfg_args
+from aaplug.io.cameras.options import LLFF_HOLD, Options, Split, every_nth, explicit
+from aaplug.io.cameras.photos import (
+    Size,
+    described_sizes,
+    photo_folder,
+    photo_sizes,
+    scaled_sizes,
+    trained_at,
+    with_photos,
+)
+from aaplug.io.cameras.values import Entry, Place, entries, inverse, mentions, pose, read_json
+
+FILE = "cameras.json"
+
+
+def sniff(path: Path) -> bool:
+    """Whether a folder holds cameras.json, or a file is one by name or by its keys."""
+    if os.path.isdir(path):
+        return os.path.isfile(path / FILE)
+    return path.name == FILE or mentions(path, ["img_name"])
+
+
+def sniff_model(path: Path) -> bool:
+    """Whether it is a model folder, cameras.json and cfg_args side by side, or its cfg_args."""
+    folder = path.parent if path.name == cfg_args.NAME else path
+    return all(os.path.isfile(folder / name) for name in (FILE, cfg_args.NAME))
+
+
+def read(path: Path, options: Options) -> CameraSet:
+    """The cameras at the size at which 3DGS trained on them.
+
+    Raises:
+        FormatError: a file is not what it should be.
+        UsageError: the options do not fit.
+    """
+    file = _file(path)
+    found = entries(file, "camera", read_json(file))
+    settings = _settings(file.parent)
+    folder = photo_folder(
+        file.parent,
+        options.images,
+        (settings or CfgArgs()).images,
+        Place(file.parent / cfg_args.NAME, "images"),
+    )
+    source = with_photos([_camera(e) for e in found], [e.place for e in found], folder)
+    source = _without_copies(source)
+    sizes, why = _training_sizes(source, settings, options)
+    trained = trained_at(source, sizes)
+    split = _split(trained, settings, options)
+    notes = (
+        f"INRIA cameras.json: {len(source)} cameras, {described_sizes(source)} in the file",
+        split.note,
+        f"training size: {described_sizes(trained)} ({why})",
+    )
+    return CameraSet(split.train, split.test, _background(settings), notes)
+
+
+def _file(path: Path) -> Path:
+    if os.path.isdir(path):
+        return path / FILE
+    return path.with_name(FILE) if path.name == cfg_args.NAME else path
+
+
+def _settings(folder: Path) -> CfgArgs | None:
+    file = folder / cfg_args.NAME
+    return read_cfg_args(file) if os.path.isfile(file) else None
+
+
+def _background(settings: CfgArgs | None) -> tuple[float, float, float] | None:
+    if settings is None or settings.white_background is None:
+        return None
+    return WHITE if settings.white_background else BLACK
+
+
+def _camera(entry: Entry) -> Camera:
+    rotation, position = entry.matrix("rotation", 3, 3), entry.vector("position", 3)
+    width, height = entry.pixels("width"), entry.pixels("height")
+    world_from_cam = pose(rotation, position, entry.place, "rotation")
+    return Camera(
+        entry.text("img_name"),
+        width,
+        height,
+        entry.focal("fx"),
+        entry.focal("fy"),
+        width / 2,
+        height / 2,
+        inverse(world_from_cam, entry.place, "position"),
+    )
+
+
+def _without_copies(cameras: Sequence[Camera]) -> list[Camera]:
+    """Runs that write a view into more than one split list it more than once."""
+    first: dict[tuple[object, ...], Camera] = {}
+    for camera in cameras:
+        first.setdefault((camera.name, *camera.cam_from_world.flatten().tolist()), camera)
+    return list(first.values())
+
+
+def _training_sizes(
+    cameras: Sequence[Camera], settings: CfgArgs | None, options: Options
+) -> tuple[list[Size], str]:
+    if options.train_scale is not None:
+        why = f"size in the file × {options.train_scale:g}: --train-scale"
+        return scaled_sizes(cameras, options.train_scale), why
+    run = settings or CfgArgs()
+    base, base_why = _base_sizes(cameras, run)
+    rule = f"resolution {run.resolution:g} in cfg_args"
+    if settings is None:
+        rule = f"3DGS's cap at {WIDTH_CAP} px, assumed without cfg_args: --train-scale sets it"
+    return [run.size(*size) for size in base], f"{base_why}, {rule}"
+
+
+def _base_sizes(cameras: Sequence[Camera], run: CfgArgs) -> tuple[list[Size], str]:
+    """The size of the photos that training loaded, before its own resolution rule."""
+    if any(camera.photo for camera in cameras):
+        return photo_sizes(cameras), "size of the photos"
+    n = run.divisor
+    sizes = [(half_up(camera.width / n), half_up(camera.height / n)) for camera in cameras]
+    return sizes, "size in the file" + (f" / {n} for {run.images}" if n > 1 else "")
+
+
+def _split(cameras: Sequence[Camera], settings: CfgArgs | None, options: Options) -> Split:
+    held_out = settings is not None and settings.held_out
+    names = [camera.name for camera in cameras]
+    second = _second_run(names)
+    if held_out and options.test_every is None and second:
+        return explicit(cameras[second:], cameras[:second], "names repeat: test views come first")
+    ordered = sorted(_renamed(cameras), key=lambda camera: camera.name)
+    if settings is None:
+        return every_nth(ordered, options, 0, "no cfg_args says which; --test-every 8 is 3DGS's")
+    hold = LLFF_HOLD if held_out else 0
+    return every_nth(ordered, options, hold, f"eval={held_out} in cfg_args")
+
+
+def _second_run(names: Sequence[str]) -> int | None:
+    """Where names start anew, if just once: Blender's test views r_0 ..., then training r_0 ..."""
+    if not (start := next((i for i, n in enumerate(_times_met(names)) if n > 1), None)):
+        return None
+    return start if len(set(names[start:])) == len(names[start:]) else None
+
+
+def _renamed(cameras: Sequence[Camera]) -> list[Camera]:
+    """Views that share a name are told apart by a number."""
+    times = _times_met([camera.name for camera in cameras])
+    return [
+        camera if n == 1 else replace(camera, name=f"{camera.name}~{n}")
+        for camera, n in zip(cameras, times, strict=True)
+    ]
+
+
+def _times_met(names: Sequence[str]) -> list[int]:
+    """How often each name has been met by its place in the list, itself included."""
+    met = Counter()
+    return [met.update([name]) or met[name] for name in names]

@@ -1,0 +1,211 @@
+"""Images as float tensors, and back to PNG.
+
+Tensors are RGB, float32, [height, width, 3], row 0 at the top, values in [0, 1] exactly as stored
+in the file (no gamma is undone).  Bit depths are 8 or 16.  Orientation tags are ignored: pixels
+stay where the file has them, since that is what the cameras were calibrated on.
+"""
+
+import logging
+import math
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+from PIL import Image
+from torch import Tensor
+
+from aaplug.errors import FormatError, UsageError
+from aaplug.io.atomic import check_output, replacing
+
+MAX_PIXELS = 2**28  # 16384 x 16384; more is taken for a decompression bomb
+SAMPLE_TYPES = {8: np.uint8, 16: np.uint16}  # by bit depth
+ALPHA_CHANNELS = 4  # RGB and alpha
+DAMAGE = ("Corrupt JPEG data", "Premature end of JPEG file")  # libjpeg's words for lost pixels
+WHOLE = 1e-6  # slack when a factor or a side is taken for a whole number
+STDERR = 2  # its file descriptor, to which the codecs write directly
+
+log = logging.getLogger("aaplug")
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height in px as stored, from the header alone.
+
+    Raises:
+        FormatError: the file is missing, is no image, or has more than 2^28 pixels.
+    """
+    return _look(path)[0]
+
+
+def read_image(path: Path, background: tuple[float, float, float] | None) -> Float[Tensor, "h w 3"]:
+    """Read an 8- or 16-bit image; transparency is composited on `background` in float.
+
+    Raises:
+        FormatError: the file is missing, damaged or too large, or it is transparent and no
+            background is given.
+    """
+    _, transparent = _look(path)
+    pixels = _decode(path)
+    if pixels.dtype not in SAMPLE_TYPES.values():
+        raise FormatError(path, f"holds {pixels.dtype} samples; save it with 8 or 16 bits")
+    if transparent != (pixels.shape[2] == ALPHA_CHANNELS):
+        raise FormatError(
+            path, "has colours or transparency that OpenCV does not read; save it as RGB(A) PNG"
+        )
+    if transparent and background is None:
+        raise FormatError(path, "is transparent; say what lies behind it with --background")
+    image = _to_rgb(pixels)
+    return torch.from_numpy(image if background is None else _composite(image, background))
+
+
+def write_png(
+    path: Path, rgb: Float[Tensor, "h w 3"], bit_depth: int = 8, overwrite: bool = False
+) -> None:
+    """Write a PNG of [0, 1]-clamped colours, whole or not at all.
+
+    Raises:
+        OutputError: the file exists and `overwrite` is false, or it cannot be written.
+    """
+    check_output(path, overwrite)
+    png = encode_png(rgb, bit_depth)
+    with replacing(path, overwrite) as stream:
+        stream.write(png)
+
+
+def encode_png(rgb: Float[Tensor, "h w 3"], bit_depth: int) -> bytes:
+    """The bytes of a PNG file of [0, 1]-clamped colours."""
+    samples = _samples(rgb, bit_depth).cpu().numpy().astype(SAMPLE_TYPES[bit_depth])
+    done, png = cv2.imencode(".png", samples[..., ::-1])
+    assert done
+    return png.tobytes()
+
+
+def quantise(rgb: Float[Tensor, "h w 3"], bit_depth: int = 8) -> Float[Tensor, "h w 3"]:
+    """What reading back the PNG of these colours gives."""
+    return _samples(rgb, bit_depth) / (2**bit_depth - 1)
+
+
+def downsample(rgb: Float[Tensor, "h w 3"], factor: int) -> Float[Tensor, "h2 w2 3"]:
+    """Average boxes of factor x factor px; what is left over at bottom and right is cropped.
+
+    Raises:
+        UsageError: the factor is not positive or no box fits into the image.
+    """
+    height, width, _ = rgb.shape
+    if not 1 <= factor <= min(height, width):
+        raise UsageError(
+            f"downsampling by {factor}", f"impossible for an image of {width}x{height} px"
+        )
+    rows, columns = height // factor, width // factor
+    whole = rgb[: rows * factor, : columns * factor]
+    return whole.reshape(rows, factor, columns, factor, 3).mean(dim=(1, 3))
+
+
+def resampled(
+    rgb: Float[Tensor, "h w 3"], factor: float, hw: tuple[int, int] | None = None
+) -> Float[Tensor, "h2 w2 3"]:
+    """The image with pixels `factor` times as dense: box averages below 1, bicubic above.
+
+    Exact boxes where 1/factor is whole, area-weighted ones otherwise.  What a smaller pixel grid
+    cannot hold whole is cropped at the bottom and the right; `hw` asks for that height and width.
+    """
+    hw = hw or (_whole(rgb.shape[0] * factor), _whole(rgb.shape[1] * factor))
+    if factor == 1:
+        return rgb[: hw[0], : hw[1]]
+    if factor < 1 and abs(1 / factor - round(1 / factor)) < WHOLE:
+        return downsample(rgb, round(1 / factor))[: hw[0], : hw[1]]
+    kernel = cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC
+    used = rgb[: math.ceil(hw[0] / factor - WHOLE), : math.ceil(hw[1] / factor - WHOLE)]
+    image = cv2.resize(used.cpu().numpy(), (hw[1], hw[0]), interpolation=kernel)
+    return torch.from_numpy(image)
+
+
+def _whole(side: float) -> int:
+    return max(1, math.floor(side + WHOLE))
+
+
+def _samples(rgb: Float[Tensor, "h w 3"], bit_depth: int) -> Float[Tensor, "h w 3"]:
+    assert bit_depth in SAMPLE_TYPES, bit_depth
+    assert bool(torch.isfinite(rgb).all()), "a rendered colour is NaN or infinite"
+    return (rgb.clamp(0, 1) * (2**bit_depth - 1)).round()
+
+
+def _look(path: Path) -> tuple[tuple[int, int], bool]:
+    """Width and height, and whether the file promises transparency, from the header alone."""
+    try:
+        with _no_pillow_limit(), Image.open(path) as header:
+            size, transparent = header.size, header.has_transparency_data
+    except FileNotFoundError as error:
+        raise FormatError(path, "does not exist") from error
+    except Exception as error:  # Pillow's parsers raise whatever they stumble over
+        raise FormatError(path, "is not an image that can be read") from error
+    if size[0] * size[1] > MAX_PIXELS:
+        raise FormatError(path, f"has {size[0]}x{size[1]} px, more than the {MAX_PIXELS:,} allowed")
+    return size, transparent
+
+
+@contextmanager
+def _no_pillow_limit() -> Iterator[None]:
+    """Pillow's own limit lies below ours and comes as a warning that nobody sees."""
+    limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+    try:
+        yield
+    finally:
+        Image.MAX_IMAGE_PIXELS = limit
+
+
+def _decode(path: Path) -> np.ndarray:
+    """Samples as stored, [h, w, channels], BGR(A) or gray."""
+    try:
+        with _codecs_heard() as words:
+            # UNCHANGED keeps 16 bits and alpha, and leaves the orientation tag alone
+            pixels = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+            damage = _damage(words)
+    except (OSError, MemoryError, cv2.error) as error:
+        raise FormatError(path, "cannot be read or is damaged") from error
+    if pixels is None:
+        raise FormatError(path, "is damaged or cut short")
+    if damage:
+        log.warning("%s: is damaged (%s)", path, damage)
+    return pixels[..., None] if pixels.ndim == 2 else pixels
+
+
+@contextmanager
+def _codecs_heard() -> Iterator[IO[bytes]]:
+    """Catch what libpng and libjpeg print: they name no file and would tear a progress bar."""
+    with tempfile.TemporaryFile() as words:
+        saved = os.dup(STDERR)
+        os.dup2(words.fileno(), STDERR)
+        try:
+            yield words
+        finally:
+            os.dup2(saved, STDERR)
+            os.close(saved)
+
+
+def _damage(words: IO[bytes]) -> str:
+    words.seek(0)
+    lines = words.read().decode("ascii", "replace").splitlines()
+    return next((line for line in lines if line.startswith(DAMAGE)), "")
+
+
+def _to_rgb(pixels: np.ndarray) -> np.ndarray:
+    """Float32 in [0, 1], RGB or RGBA."""
+    image = pixels.astype(np.float32) / np.iinfo(pixels.dtype).max
+    if image.shape[2] == 1:
+        return np.repeat(image, 3, axis=2)
+    order = [2, 1, 0, 3][: image.shape[2]]
+    return np.ascontiguousarray(image[..., order])
+
+
+def _composite(image: np.ndarray, background: tuple[float, float, float]) -> np.ndarray:
+    if image.shape[2] < ALPHA_CHANNELS:
+        return image
+    rgb, alpha = image[..., :3], image[..., 3:]
+    return rgb * alpha + np.asarray(background, np.float32) * (1 - alpha)

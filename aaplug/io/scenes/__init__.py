@@ -1,0 +1,139 @@
+"""Scene files of any known format, read into `Gaussians` and written back.
+
+A format is a module with a `name` (also its files' suffix), `sniff`, `read` and, where it can be
+written, `write`; it is added by one line in `FORMATS`.  Formats are told apart by content when
+reading and by suffix when writing.
+"""
+
+import re
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+from aaplug.errors import FormatError, OutputError
+from aaplug.gaussians import Convention, Gaussians
+from aaplug.io.atomic import check_output
+from aaplug.io.scenes import ply
+
+MAX_GAUSSIANS = (
+    100_000_000  # far above any scene seen (about 25 GB as .ply); more is taken for a mistake
+)
+HEAD_BYTES = 64  # of a file, shown to each format's `sniff`
+
+
+class SceneFormat(Protocol):
+    """A format that can be read."""
+
+    name: str
+
+    def sniff(self, path: Path, head: bytes) -> bool:
+        """Whether a file that begins with `head` looks like this format."""
+        ...
+
+    def read(
+        self, path: Path, *, convention: Convention | None, drop_bad: bool, max_gaussians: int
+    ) -> Gaussians:
+        """The scene in the file."""
+        ...
+
+
+@runtime_checkable
+class WritableFormat(Protocol):
+    """A format that can be written too."""
+
+    def write(self, path: Path, scene: Gaussians, overwrite: bool) -> None:
+        """Write the scene, whole or not at all."""
+        ...
+
+
+FORMATS: tuple[SceneFormat, ...] = (ply,)
+
+
+def read_scene(
+    path: Path,
+    *,
+    convention: Convention | None = None,
+    drop_bad: bool = False,
+    max_gaussians: int = MAX_GAUSSIANS,
+) -> Gaussians:
+    """Read the scene in the file `path`.
+
+    Args:
+        path: a file; for an INRIA model folder see `find_scene`.
+        convention: how the scene was trained, where the file does not know or is wrong.
+        drop_bad: leave out Gaussians with NaN, infinite or unusable values, and log a warning with
+            their number, instead of refusing.
+        max_gaussians: refuse more than this.
+
+    Raises:
+        FormatError: the file is missing, of no known format, or breaks its format.
+    """
+    head = _head(path)
+    for format in FORMATS:
+        if format.sniff(path, head):
+            return format.read(
+                path, convention=convention, drop_bad=drop_bad, max_gaussians=max_gaussians
+            )
+    known = ", ".join("." + format.name for format in FORMATS)
+    raise FormatError(path, f"is of no known scene format; aaplug reads {known}")
+
+
+def write_scene(path: Path, scene: Gaussians, *, overwrite: bool = False) -> None:
+    """Write a scene in the format of the path's suffix, with all else that its origin held.
+
+    Raises:
+        OutputError: the suffix is of no format that can be written, the path is the file that the
+            scene was read from, exists and `overwrite` is false, or cannot be written.
+    """
+    writers = {"." + f.name: f for f in FORMATS if isinstance(f, WritableFormat)}
+    writer = writers.get(path.suffix.lower())
+    if writer is None:
+        raise OutputError(
+            path, f"has no suffix of a format that can be written: {', '.join(writers)}"
+        )
+    check_output(path, overwrite, [Path(scene.origin.path)] if scene.origin else [])
+    writer.write(path, scene, overwrite)
+
+
+def find_scene(path: Path, iteration: int | None = None) -> Path:
+    """The scene file itself, or the one of the last (or given) iteration in an INRIA model folder.
+
+    Raises:
+        FormatError: nothing there, or not that iteration.
+    """
+    if not path.is_dir():
+        return path
+    scenes = _iterations(path)
+    if not scenes:
+        raise FormatError(
+            path, "holds no point_cloud/iteration_<N>/point_cloud.ply; name the scene's file"
+        )
+    chosen = max(scenes) if iteration is None else iteration
+    if chosen not in scenes:
+        available = ", ".join(map(str, sorted(scenes)))
+        raise FormatError(path, f"has no iteration {chosen}; it has {available}")
+    return scenes[chosen]
+
+
+def _iterations(model: Path) -> dict[int, Path]:
+    found = {}
+    for scene in model.glob("point_cloud/iteration_*/point_cloud.ply"):
+        number = re.fullmatch(r"iteration_(\d+)", scene.parent.name, re.ASCII)
+        if number:
+            found[int(number[1])] = scene
+    return found
+
+
+def _head(path: Path) -> bytes:
+    try:
+        if path.is_dir():
+            raise FormatError(path, "is a folder; name the scene's file")
+        if path.exists() and not path.is_file():
+            raise FormatError(path, "is not an ordinary file")  # opening a pipe would wait for ever
+        with path.open("rb") as stream:
+            head = stream.read(HEAD_BYTES)
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else None
+        raise FormatError(path, f"cannot be read: {(reason or str(error)).lower()}") from error
+    if not head:
+        raise FormatError(path, "is empty")
+    return head

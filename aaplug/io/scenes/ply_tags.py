@@ -1,0 +1,150 @@
+"""What a .ply header says about how a scene was trained and what has been fused into it.
+
+Understood, strongest first:
+    comment aaplug [fused=<method>] key=value ... [convention=<name>]   our own record
+    a vertex column filter_3D                                           Mip-Splatting, not yet fused
+    comment SplatRenderMode: mip | antialiased | default                Brush, splat-transform
+    comment antialiased 1 | 0                                           Postshot
+In each kind the last one counts.  Viewers know only the tag; our record tells 0.1 from 0.3 px².
+"""
+
+import re
+from dataclasses import dataclass
+
+from aaplug.errors import FormatError
+from aaplug.gaussians import ANTIALIASED, CLASSIC, CONVENTIONS, MIP, Convention, Fusion
+from aaplug.io.scenes.ply_header import Header
+
+FILTER_COLUMN = (
+    "filter_3D"  # Mip-Splatting's name for its smoothing, a standard deviation in world units
+)
+RECORD = re.compile(r"aaplug\s+(?=fused=|convention=)(.*)")
+RENDER_MODE = re.compile(r"SplatRenderMode\s*:\s*(\S*)", re.IGNORECASE)
+POSTSHOT = re.compile(r"antialiased\s+([01])\s*", re.IGNORECASE)
+MIP_TAG = "SplatRenderMode: mip"
+WORD = re.compile(r"[!-~]+")  # printable ASCII without spaces
+KEY = re.compile(r"[!-<>-~]+")  # the same without "="
+
+# Brush, whose tag it is, blurs by 0.1 px² in "mip"; "antialiased" is gsplat's word for 0.3 px²
+MODES = {"mip": MIP, "antialiased": ANTIALIASED, "default": CLASSIC}
+
+
+@dataclass(frozen=True)
+class Meaning:
+    """What the header says, with the sentence that tells a user why."""
+
+    convention: Convention
+    evidence: str
+    fused: tuple[Fusion, ...]
+
+
+def meaning(header: Header) -> Meaning:
+    """Read the header's tags.
+
+    Raises:
+        FormatError: a record is damaged or names an unknown convention, or the scene is made of
+            2D Gaussians.
+    """
+    records = [_record(header.path, m[1]) for m in _matches(header, RECORD)]
+    fused = tuple(
+        Fusion(
+            record["fused"], {k: v for k, v in record.items() if k not in ("fused", "convention")}
+        )
+        for record in records
+        if "fused" in record
+    )
+    mode = _last(header, RENDER_MODE)
+    if mode and mode.lower() == "2dgs":
+        raise FormatError(
+            header.path, "holds 2D Gaussians (SplatRenderMode: 2dgs), not supported yet"
+        )
+    recorded = [record["convention"] for record in records if "convention" in record]
+    if recorded:
+        convention = _convention(header.path, recorded[-1])
+        return Meaning(convention, f"aaplug's record in the file: {convention.name}", fused)
+    return Meaning(*_from_others(header, mode), fused)
+
+
+def stating(
+    header: Header, read: Header | None, convention: Convention, fused: tuple[Fusion, ...]
+) -> Header:
+    """The header made to say this; untouched if it does and so did the one that was `read`."""
+    assert convention in CONVENTIONS.values(), convention
+    if read and _said(read) == _said(header) == (convention, fused):
+        return header
+    header = header.without_comments(RECORD.fullmatch)
+    if convention.compensated:
+        header = header.without_comments(_is_tag).with_comments([MIP_TAG])
+    elif _tagged(header).compensated:
+        header = header.without_comments(_is_tag)
+    header = header.with_comments(_fused_line(fusion, convention) for fusion in fused)
+    if meaning(header).convention != convention:  # nobody's tag tells, so ours must
+        header = header.with_comments([f"aaplug convention={convention.name}"])
+    return header
+
+
+def _said(header: Header) -> tuple[Convention, tuple[Fusion, ...]]:
+    said = meaning(header)
+    return said.convention, said.fused
+
+
+def _from_others(header: Header, mode: str | None) -> tuple[Convention, str]:
+    postshot = _last(header, POSTSHOT)
+    if FILTER_COLUMN in header.vertex.names:
+        return MIP, f"column {FILTER_COLUMN} in the file: Mip-Splatting, not yet fused"
+    if mode is not None and mode.lower() in MODES:
+        return MODES[mode.lower()], f"tag in the file: SplatRenderMode: {mode}"
+    if mode is not None:
+        return CLASSIC, f"tag in the file, SplatRenderMode: {mode}, is unknown: assumed classic"
+    if postshot is not None:
+        return (
+            ANTIALIASED if postshot == "1" else CLASSIC
+        ), f"tag in the file: antialiased {postshot}"
+    return CLASSIC, "no tag in the file: assumed classic (3DGS default)"
+
+
+def _tagged(header: Header) -> Convention:
+    """What the tags alone say."""
+    mode, postshot = _last(header, RENDER_MODE), _last(header, POSTSHOT)
+    if mode is not None:
+        return MODES.get(mode.lower(), CLASSIC)
+    return ANTIALIASED if postshot == "1" else CLASSIC
+
+
+def _is_tag(comment: str) -> bool:
+    return bool(RENDER_MODE.fullmatch(comment) or POSTSHOT.fullmatch(comment))
+
+
+def _matches(header: Header, pattern: re.Pattern[str]) -> list[re.Match[str]]:
+    return [m for comment in header.comments if (m := pattern.fullmatch(comment))]
+
+
+def _last(header: Header, pattern: re.Pattern[str]) -> str | None:
+    found = _matches(header, pattern)
+    return found[-1][1] if found else None
+
+
+def _record(path: str, words: str) -> dict[str, str]:
+    pairs = [word.partition("=") for word in words.split()]
+    for key, equals, value in pairs:
+        if not (key and equals and value):
+            raise FormatError(
+                path, f"comment 'aaplug {words}' is damaged: expected key=value pairs"
+            )
+    return {key: value for key, _, value in pairs}
+
+
+def _convention(path: str, name: str) -> Convention:
+    if name not in CONVENTIONS:
+        known = ", ".join(CONVENTIONS)
+        raise FormatError(path, f"its aaplug comment has convention={name}; known are {known}")
+    return CONVENTIONS[name]
+
+
+def _fused_line(fusion: Fusion, convention: Convention) -> str:
+    pairs = {"fused": fusion.method, **fusion.settings, "convention": convention.name}
+    assert pairs["fused"] == fusion.method, "a setting is called fused"
+    for key, value in pairs.items():
+        assert KEY.fullmatch(key), key
+        assert WORD.fullmatch(value), value
+    return "aaplug " + " ".join(f"{key}={value}" for key, value in pairs.items())

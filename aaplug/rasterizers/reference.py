@@ -1,0 +1,63 @@
+"""The judge: every splat at every pixel, in float64, in the order and with the stopping rule of 3DGS.
+
+h, w: the image; p: pixels of a strip; c: splats of a chunk.  No tiles, no extents, no cleverness: memory is bounded
+by strips and chunks alone.  Differentiable through autograd.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from aaplug.rasterizers.rules import MAX_ALPHA, MIN_TRANSMITTANCE, over
+from aaplug.splats import MIN_ALPHA, Render, Splats2D
+
+STRIP_PIXELS = 4096
+CHUNK_SPLATS = 512
+
+
+def rasterize(
+    splats: Splats2D, hw: tuple[int, int], background: tuple[float, float, float]
+) -> Render:
+    """Draw the splats in float64; the image comes back in float64."""
+    splats = splats.to(torch.float64)
+    splats = splats[torch.sort(splats.depths, stable=True).indices]
+    centres = _pixel_centres(hw).to(splats.means.device)
+    strips = [_strip(splats, strip) for strip in centres.split(STRIP_PIXELS)]
+    rgb = torch.cat([rgb for rgb, _ in strips]).reshape(*hw, 3)
+    transmittance = torch.cat([t for _, t in strips]).reshape(hw)
+    return over(rgb, 1 - transmittance, background)
+
+
+def _pixel_centres(hw: tuple[int, int]) -> Float[Tensor, "p 2"]:
+    y, x = (torch.arange(side, dtype=torch.float64) + 0.5 for side in hw)
+    return torch.cartesian_prod(y, x).flip(1)
+
+
+def _strip(
+    splats: Splats2D, centres: Float[Tensor, "p 2"]
+) -> tuple[Float[Tensor, "p 3"], Float[Tensor, " p"]]:
+    rgb = centres.new_zeros(len(centres), 3)
+    transmittance = centres.new_ones(len(centres))
+    going = torch.ones_like(transmittance, dtype=torch.bool)
+    for start in range(0, len(splats), CHUNK_SPLATS):
+        chunk = splats[start : start + CHUNK_SPLATS]
+        alpha = alphas(chunk, centres)
+        after = transmittance[:, None] * (1 - alpha).cumprod(dim=1)
+        before = torch.cat([transmittance[:, None], after[:, :-1]], dim=1)
+        kept = (after >= MIN_TRANSMITTANCE) & going[
+            :, None
+        ]  # `after` only falls: the first miss ends the pixel
+        assert chunk.rgb is not None
+        rgb = rgb + (torch.where(kept, alpha * before, 0.0)) @ chunk.rgb
+        transmittance = torch.minimum(transmittance, torch.where(kept, after, 1.0).amin(dim=1))
+        going = going & kept[:, -1]
+    return rgb, transmittance
+
+
+def alphas(splats: Splats2D, centres: Float[Tensor, "p 2"]) -> Float[Tensor, "p c"]:
+    """Alpha of each splat at each point: min(0.99, o·exp(−dᵀ C⁻¹ d / 2)), 0 below 1/255 (3DGS, eq. 4)."""
+    dx, dy = (centres[:, None, :] - splats.means[None]).unbind(dim=2)
+    xx, xy, yy = splats.covs.unbind(dim=1)
+    distance = (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / splats.dets
+    alpha = (splats.opacities * torch.exp(-0.5 * distance.clamp(min=0.0))).clamp(max=MAX_ALPHA)
+    return torch.where(alpha >= MIN_ALPHA, alpha, 0.0)

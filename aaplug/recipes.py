@@ -1,0 +1,112 @@
+"""Recipes: a world filter, a screen filter and a number of samples a pixel, each preset with its source.
+
+`samples` says how finely a pixel is sampled: the smallest n is taken for which rate·n reaches it, so 0 is one sample
+a pixel at every rate, 1 is training's own pixel size.  At and above the training rate that is always one sample.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+from aaplug.errors import UsageError, listing
+from aaplug.filters import SCREEN_FILTERS, Matched, RateChoice, Smoothing3D
+from aaplug.interfaces import ScreenFilter, WorldFilter
+
+SAMPLING = {"fast": 0.0, "balanced": 0.5, "best": 1.0}  # rate·n that a quality asks for
+WHOLE = 1e-6  # slack before one more sample is taken
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How to render a scene.
+
+    source: the paper or design that it follows.  when: what it is for, in a line.
+    """
+
+    name: str
+    screen: ScreenFilter
+    source: str
+    when: str
+    world: WorldFilter | None = None
+    samples: float = 0.0
+
+    def samples_at(self, rate: float) -> int:
+        """Samples along a pixel's side for a view at `rate` against training."""
+        return max(1, math.ceil(min(self.samples, 1.0) / rate - WHOLE)) if self.samples else 1
+
+    def screen_at(self, rate: float) -> ScreenFilter:
+        """The screen filter for one sample of a view at `rate`."""
+        return self.screen if self.samples_at(rate) == 1 else self.screen.for_samples()
+
+
+RECIPES: dict[str, Recipe] = {
+    recipe.name: recipe
+    for recipe in (
+        Recipe(
+            "classic",
+            SCREEN_FILTERS["classic"],
+            "3DGS (Kerbl et al. 2023): +0.3 px²",
+            "the look to compare with; right only at the training size",
+        ),
+        Recipe(
+            "ewa",
+            SCREEN_FILTERS["ewa"],
+            "EWA splatting (Zwicker et al. 2002); 3DGS --antialiasing, gsplat antialiased: 0.3 px², compensated",
+            "scenes trained with it",
+        ),
+        Recipe(
+            "mip",
+            SCREEN_FILTERS["mip"],
+            "Mip-Splatting's 2D Mip filter (Yu et al. 2024, eq. 10): 0.1 px², compensated",
+            "scenes trained with it, and scenes converted by aaplug",
+        ),
+        Recipe(
+            "mip-splatting",
+            SCREEN_FILTERS["mip"],
+            "Mip-Splatting (Yu et al. 2024): 3D smoothing (eq. 9) with its volume factor, then the 2D Mip filter",
+            "comparison: it dims scenes that were not trained with it",
+            world=Smoothing3D(),
+        ),
+        Recipe(
+            "matched",
+            Matched(),
+            "aaplug: training's dilation carried to the new rate, then the rest of the pixel's filter",
+            "one sample a pixel: the fastest that is right",
+        ),
+        Recipe(
+            "auto",
+            Matched(),
+            "aaplug: matched, with the samples a pixel that --quality asks for",
+            "the default",
+            samples=SAMPLING["balanced"],
+        ),
+    )
+}
+
+
+def find_recipe(
+    name: str,
+    *,
+    quality: str = "balanced",
+    rate: RateChoice | None = None,
+    samples: float | None = None,
+) -> Recipe:
+    """A preset by name, with the choices that the user made.
+
+    quality: rate·n of `auto`.  rate: what `matched` and `auto` compare a Gaussian's rate with.
+    samples: rate·n of any recipe, over its own.
+
+    Raises:
+        UsageError: the name or quality is not known, or the recipe has no rate to choose.
+    """
+    if name not in RECIPES:
+        raise UsageError("--recipe", f"'{name}' is not one of {listing(list(RECIPES), most=99)}")
+    if quality not in SAMPLING:
+        raise UsageError("--quality", f"'{quality}' is not one of {listing(list(SAMPLING))}")
+    recipe = RECIPES[name]
+    if rate is not None:
+        if not isinstance(recipe.screen, Matched):
+            raise UsageError("--rate", f"recipe '{name}' matches no rate; only matched and auto do")
+        recipe = replace(recipe, screen=replace(recipe.screen, rate=rate))
+    if name == "auto":
+        recipe = replace(recipe, samples=SAMPLING[quality])
+    return recipe if samples is None else replace(recipe, samples=samples)

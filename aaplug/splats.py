@@ -1,0 +1,104 @@
+"""Screen-space Gaussians and images.
+
+m: visible Gaussians.  Pixel (0, 0) covers [0, 1) × [0, 1); its centre is (0.5, 0.5).  Covariances are packed
+(xx, xy, yy), in px².  The determinant travels beside the covariance, because xx·yy − xy² of a needle has no correct
+digit in float32 while the determinant from factors has all of them.
+"""
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+MIN_ALPHA = 1 / 255  # a contribution below it is skipped (3DGS)
+MIN_COMPENSATION = (
+    0.005  # floor of an opacity factor, so that rounding makes no splat vanish (3DGS, gsplat)
+)
+
+
+@dataclass(frozen=True)
+class Splats2D:
+    """What the rasterizer draws, in no particular order."""
+
+    means: Float[Tensor, "m 2"]
+    covs: Float[Tensor, "m 3"]  # xx, xy, yy in px²
+    dets: Float[Tensor, " m"]  # px⁴
+    depths: Float[Tensor, " m"]
+    opacities: Float[Tensor, " m"]
+    sources: Int[Tensor, " m"]  # index in the scene
+    rgb: Float[Tensor, "m 3"] | None = None
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    def __getitem__(self, index: Tensor | slice) -> "Splats2D":
+        """The splats at `index` (a mask, indices or a slice), in that order."""
+        return Splats2D(
+            means=self.means[index],
+            covs=self.covs[index],
+            dets=self.dets[index],
+            depths=self.depths[index],
+            opacities=self.opacities[index],
+            sources=self.sources[index],
+            rgb=None if self.rgb is None else self.rgb[index],
+        )
+
+    def to(self, dtype: torch.dtype) -> "Splats2D":
+        """The same splats in another precision."""
+        return replace(
+            self,
+            means=self.means.to(dtype),
+            covs=self.covs.to(dtype),
+            dets=self.dets.to(dtype),
+            depths=self.depths.to(dtype),
+            opacities=self.opacities.to(dtype),
+            rgb=None if self.rgb is None else self.rgb.to(dtype),
+        )
+
+    def blurred(
+        self,
+        variance: float | Float[Tensor, " m"],
+        compensate: bool,
+        floor: float = MIN_COMPENSATION,
+    ) -> "Splats2D":
+        """Convolve with an isotropic Gaussian of `variance` px², the one home of that formula.
+
+        det(C + vI) = det C + v·tr C + v², a sum of non-negative terms.  With `compensate`, opacity is multiplied by
+        √(det C / det(C + vI)), at least `floor`, which keeps the splat's energy (EWA splatting, Zwicker et al. 2001;
+        Mip-Splatting, eq. 10).
+        """
+        trace = self.covs[:, 0] + self.covs[:, 2]
+        dets = self.dets + variance * trace + variance * variance
+        diagonal = self.covs.new_tensor([1.0, 0.0, 1.0])
+        added = variance[:, None] if isinstance(variance, Tensor) else variance
+        opacities = self.opacities
+        if compensate:
+            opacities = opacities * (self.dets / dets).sqrt().clamp(min=floor)
+        return replace(self, covs=self.covs + added * diagonal, dets=dets, opacities=opacities)
+
+
+class Render(NamedTuple):
+    """An image: rgb not clamped above, over its background; alpha is the share of the background that is hidden."""
+
+    rgb: Float[Tensor, "h w 3"]
+    alpha: Float[Tensor, "h w"]
+
+
+def reach(splats: Splats2D) -> Float[Tensor, " m"]:
+    """Squared Mahalanobis distance at which alpha falls to 1/255; below zero for a splat that never reaches it."""
+    return 2 * torch.log(splats.opacities / MIN_ALPHA)
+
+
+def half_sizes(splats: Splats2D) -> Float[Tensor, "m 2"]:
+    """Half width and height of the box outside of which a splat's alpha is below 1/255, in px."""
+    return (reach(splats).clamp(min=0.0)[:, None] * splats.covs[:, [0, 2]]).sqrt()
+
+
+def drawn(splats: Splats2D, hw: tuple[int, int]) -> Splats2D:
+    """The splats that can change an image of height and width `hw`; a splat of no area cannot."""
+    half = half_sizes(splats)
+    size = splats.means.new_tensor([hw[1], hw[0]])
+    inside = ((splats.means + half > 0) & (splats.means - half < size)).all(dim=1)
+    return splats[inside & (splats.opacities >= MIN_ALPHA) & (splats.dets > 0)]

@@ -1,0 +1,67 @@
+"""What the user sees: log and progress on stderr, data on stdout."""
+
+import json
+import logging
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+LINE_SECONDS = 10.0  # between progress lines where there is no terminal
+
+log = Console(stderr=True, highlight=False, soft_wrap=True)
+out = Console(highlight=False)
+
+
+class _Warnings(logging.Handler):
+    def emit(self, record: logging.LogRecord) -> None:
+        log.print(f"[yellow]warning:[/] {escape(record.getMessage())}")
+
+
+def set_up() -> None:
+    """Send the library's warnings to the log."""
+    logger = logging.getLogger("aaplug")
+    logger.handlers, logger.propagate = [_Warnings()], False
+
+
+def say(text: str) -> None:
+    """One line of log."""
+    log.print(escape(text))
+
+
+def print_json(data: Any) -> None:
+    """One object on stdout, strict JSON."""
+    sys.stdout.write(json.dumps(data, indent=1, allow_nan=False) + "\n")
+
+
+@contextmanager
+def progress(what: str, unit: str) -> Iterator[Callable[[int, int], None]]:
+    """A function to tell (done, total): a bar with an estimate on a terminal, a line now and then elsewhere."""
+    if not log.is_terminal:
+        yield _Lines(what, unit)
+        return
+    columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TextColumn(unit))
+    with Progress(*columns, TimeRemainingColumn(), console=log, transient=True) as bar:
+        task = bar.add_task(what, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+class _Lines:
+    """Progress for logs: a line every LINE_SECONDS and one at the end."""
+
+    def __init__(self, what: str, unit: str) -> None:
+        self.what, self.unit = what, unit
+        self.started = self.told = time.monotonic()
+
+    def __call__(self, done: int, total: int) -> None:
+        now = time.monotonic()
+        if done == total or now - self.told >= LINE_SECONDS:
+            left = (now - self.started) / max(done, 1) * (total - done)
+            eta = f", about {left:.0f} s left" if 0 < done < total else ""
+            say(f"{self.what}: {done} of {total} {self.unit}{eta}")
+            self.told = now

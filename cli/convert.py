@@ -1,0 +1,55 @@
+"""aaplug convert: a plain .ply with anti-aliasing fused in."""
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+from aaplug_cli.console import print_json, say
+from aaplug_cli.options import CameraOptions, SceneOptions, flag
+
+from aaplug.conversion import FORMS, default_form, describe
+from aaplug.conversion import convert as fuse
+from aaplug.io.atomic import check_output
+from aaplug.io.scenes import find_scene, write_scene
+
+
+@dataclass(frozen=True)
+class Convert:
+    """Fuse anti-aliasing into a plain .ply, for viewers with the 2D Mip filter (0.1 px², compensated)."""
+
+    output: Annotated[Path, flag("FILE.ply", "-o")]
+    """Where to write."""
+    scene: SceneOptions = field(default_factory=SceneOptions)
+    cameras: CameraOptions = field(default_factory=CameraOptions)
+    form: Annotated[
+        Literal["matched-energy", "mip-splatting"] | None, flag("matched-energy|mip-splatting")
+    ] = None
+    """What to fuse: the energy that training showed, or Mip-Splatting's 3D smoothing (default for filter_3D files)."""
+    variance: Annotated[float | None, flag("PX2")] = None
+    """Variance fused, in px² at the training rate (default: 0.2 for both forms)."""
+    overwrite: bool = False
+    """Replace an existing output."""
+    json: bool = False
+    """Print what was done as one JSON object on stdout."""
+
+
+def convert(options: Convert) -> int:
+    """Fuse anti-aliasing into a plain .ply."""
+    source = find_scene(options.scene.path, options.scene.iteration)
+    check_output(options.output, options.overwrite, [source])
+    scene = options.scene.read()
+    form = FORMS[options.form or default_form(scene)]
+    if options.variance is not None:
+        form = replace(form, variance=options.variance)  # type: ignore[type-var]
+    stored = scene.filter_3d is not None or bool(scene.fused)  # either needs no cameras
+    training = None
+    if not stored:
+        training = options.cameras.learn(scene, options.cameras.read(options.scene))
+    converted = fuse(scene, training, form)
+    write_scene(options.output, converted, overwrite=options.overwrite)
+    done = "; ".join(describe(fusion) for fusion in converted.fused)
+    say(f"wrote {options.output}: fused {done}; show it with the Mip rule (0.1 px², compensated)")
+    if options.json:
+        fused = [{"method": f.method, **f.settings} for f in converted.fused]
+        print_json({"output": str(options.output), "gaussians": len(converted), "fused": fused})
+    return 0

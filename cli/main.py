@@ -1,0 +1,64 @@
+"""The program: words to verbs, errors to exit codes.
+
+Exit codes: 0 all done, 1 some of the work failed, 2 the request cannot be carried out, 130 interrupted.
+"""
+
+import re
+import sys
+from collections.abc import Sequence
+from importlib.metadata import version
+
+import tyro
+from aaplug_cli import console
+from aaplug_cli.convert import Convert, convert
+from aaplug_cli.demo import Demo, demo
+from aaplug_cli.evaluate import Evaluate, evaluate
+from aaplug_cli.info import Info, info
+from aaplug_cli.render import Render, render
+
+from aaplug.errors import AaplugError
+
+FAILED, REFUSED, INTERRUPTED = 1, 2, 130
+VERBS = {Info: info, Convert: convert, Render: render, Evaluate: evaluate, Demo: demo}
+CONFIG = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    """Run the program and exit."""
+    words = list(sys.argv[1:] if words is None else words)
+    if words == ["--version"]:
+        print(f"aaplug {version('aaplug')}")
+        sys.exit(0)
+    console.set_up()
+    try:
+        sys.exit(run(words))
+    except AaplugError as error:
+        console.log.print(f"[red]error:[/] {console.escape(str(error))}")
+        sys.exit(REFUSED)
+    except KeyboardInterrupt:
+        console.say("interrupted")
+        sys.exit(INTERRUPTED)
+
+
+def run(words: Sequence[str]) -> int:
+    """Run one verb with its options; its result is the exit code."""
+    description = "Test-time anti-aliasing for pretrained 3D Gaussian Splatting scenes."
+    options = tyro.extras.subcommand_cli_from_dict(
+        {noun.__name__.lower(): noun for noun in VERBS},
+        prog="aaplug",
+        description=description,
+        args=_joined(words),
+        config=CONFIG,
+    )
+    return VERBS[type(options)](options)
+
+
+def _joined(words: Sequence[str]) -> list[str]:
+    """`--resolution -1x720` as one word, for the parser would take the value for a flag."""
+    joined: list[str] = []
+    for word in words:
+        if joined and joined[-1] == "--resolution" and re.fullmatch(r"-?\d+x-?\d+", word):
+            joined[-1] += "=" + word
+        else:
+            joined.append(word)
+    return joined

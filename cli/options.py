@@ -1,0 +1,149 @@
+"""Options that several verbs share, and the reading that follows from them.
+
+Each class is a group of flags; its methods read what the flags name and say on stderr what they found.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+from aaplug_cli.console import say
+
+from aaplug.cameras import BLACK, WHITE, Camera, CameraSet
+from aaplug.conversion import describe
+from aaplug.errors import UsageError
+from aaplug.gaussians import CONVENTIONS, Gaussians
+from aaplug.interfaces import Rasterizer, Training
+from aaplug.io.cameras import read_cameras, select_views
+from aaplug.io.scenes import find_scene, read_scene
+from aaplug.pipeline import learn
+from aaplug.rasterizers import RASTERIZERS
+from aaplug.recipes import SAMPLING
+from aaplug.sampling import MIN_SEEN_SHARE, check_frame
+
+Quality = Literal["fast", "balanced", "best"]
+Rate = Literal["global", "sharpest", "interval"]
+
+
+def flag(metavar: str, *aliases: str) -> Any:
+    """A flag whose help shows `metavar` and no default, for what is absent unless given."""
+    return tyro.conf.arg(metavar=metavar, aliases=aliases, help_behavior_hint="")
+
+
+assert set(SAMPLING) == {"fast", "balanced", "best"}
+
+
+@dataclass(frozen=True)
+class SceneOptions:
+    """The scene."""
+
+    scene: Annotated[Path | None, tyro.conf.Positional, flag("SCENE")] = None
+    """A 3DGS .ply, or an INRIA model folder (output/scene)."""
+    model_path: Annotated[Path | None, flag("FOLDER", "-m")] = None
+    """An INRIA model folder, instead of SCENE."""
+    iteration: Annotated[int | None, flag("N")] = None
+    """Which iteration of a model folder (default: the last)."""
+    convention: Annotated[
+        Literal["classic", "antialiased", "mip"] | None, flag("classic|antialiased|mip")
+    ] = None
+    """How the scene was trained, where its file does not say."""
+    drop_bad: bool = False
+    """Leave out Gaussians with NaN, infinite or unusable values instead of stopping."""
+
+    @property
+    def path(self) -> Path:
+        """What the user named."""
+        if (self.scene is None) == (self.model_path is None):
+            raise UsageError("SCENE", "name one scene: a .ply, a model folder, or -m FOLDER")
+        path = self.scene or self.model_path
+        assert path is not None
+        return path
+
+    def read(self) -> Gaussians:
+        """Read the scene and say what it is."""
+        convention = None if self.convention is None else CONVENTIONS[self.convention]
+        path = find_scene(self.path, self.iteration)
+        scene = read_scene(path, convention=convention, drop_bad=self.drop_bad)
+        assert scene.origin is not None
+        say(
+            f"scene: {path}: {len(scene):,} Gaussians, SH degree {scene.sh_degree}, "
+            f"{scene.convention.name} ({scene.origin.evidence})"
+        )
+        for fusion in scene.fused:
+            say(f"fused: {describe(fusion)}")
+        return scene
+
+
+@dataclass(frozen=True)
+class CameraOptions:
+    """The cameras."""
+
+    cameras: Annotated[Path | None, flag("PATH")] = None
+    """cameras.json, COLMAP model, Blender transforms_*.json, or their folder (default: SCENE's model folder)."""
+    train_scale: Annotated[float | None, flag("FACTOR")] = None
+    """Training size over the cameras' source size, where the files do not say."""
+    images: Annotated[str | None, flag("FOLDER")] = None
+    """Folder of photographs inside the data set (default: the format's own)."""
+    test_every: Annotated[int | None, flag("N")] = None
+    """Hold out every N-th view by name; 0 for no split (default: as the format's users do)."""
+    min_seen: float = MIN_SEEN_SHARE
+    """Stop if fewer of the Gaussians than this share are seen by any camera."""
+
+    def read(self, options: SceneOptions) -> CameraSet:
+        """Read the cameras and say where sizes and split come from."""
+        path = self.cameras
+        if path is None and options.path.is_dir():
+            path = options.path
+        if path is None:
+            raise UsageError(
+                "--cameras", "is needed: cameras.json, a COLMAP model or transforms_*.json"
+            )
+        cameras = read_cameras(
+            path, train_scale=self.train_scale, images=self.images, test_every=self.test_every
+        )
+        for note in cameras.notes:
+            say(f"cameras: {note}")
+        return cameras
+
+    def learn(self, scene: Gaussians, cameras: CameraSet) -> Training:
+        """Check that scene and cameras share a frame, and compute the sampling bounds."""
+        assert scene.origin is not None
+        check_frame(scene.means, cameras.train, scene.origin.path, self.min_seen)
+        return learn(scene, cameras.train)
+
+
+@dataclass(frozen=True)
+class RenderOptions:
+    """How views are rendered."""
+
+    views: Annotated[str, tyro.conf.arg(metavar="NAME,...|test|train|all")] = "test"
+    """Which views."""
+    quality: Quality = "balanced"
+    """Samples a pixel of recipe auto: fast is one, balanced reaches half the training rate, best all of it."""
+    rate: Annotated[Rate | None, flag("global|sharpest|interval")] = None
+    """What matched and auto compare a Gaussian's rate with: training's size, sharpest view or range of views."""
+    background: Literal["auto", "white", "black"] = "auto"
+    """Behind the scene; auto is what training had."""
+    rasterizer: Literal["tiled", "reference"] = "tiled"
+    """tiled is fast; reference is slow, exact and float64."""
+
+    def select(self, cameras: CameraSet) -> Sequence[Camera]:
+        """The views that --views names."""
+        return select_views(cameras, self.views)
+
+    def background_of(self, cameras: CameraSet) -> tuple[float, float, float]:
+        """The colour behind the scene; says which."""
+        if self.background != "auto":
+            return WHITE if self.background == "white" else BLACK
+        colour = cameras.background or BLACK
+        name = {WHITE: "white", BLACK: "black"}.get(colour, str(colour))
+        why = "from the camera files" if cameras.background else "assumed; --background sets it"
+        say(f"background: {name} ({why})")
+        return colour
+
+    @property
+    def rasterize(self) -> Rasterizer:
+        """The rasterizer by name."""
+        return RASTERIZERS[self.rasterizer]

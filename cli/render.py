@@ -1,0 +1,144 @@
+"""aaplug render: images at new resolutions."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from aaplug_cli.console import print_json, progress, say
+from aaplug_cli.files import make_folder, refuse_existing
+from aaplug_cli.options import CameraOptions, RenderOptions, SceneOptions, flag
+
+from aaplug.cameras import Camera
+from aaplug.errors import OutputError, UsageError, listing
+from aaplug.interfaces import Training
+from aaplug.io.atomic import check_output
+from aaplug.io.images import write_png
+from aaplug.pipeline import render as render_view
+from aaplug.pipeline import smooth
+from aaplug.recipes import RECIPES, Recipe, find_recipe
+
+MAX_SIDE = 16384  # px
+
+
+@dataclass(frozen=True)
+class Render:
+    """Render views at any resolution to PNG."""
+
+    output: Annotated[Path, flag("PATH", "-o")]
+    """A folder for the images, or one .png for one view."""
+    scene: SceneOptions = field(default_factory=SceneOptions)
+    cameras: CameraOptions = field(default_factory=CameraOptions)
+    rendering: RenderOptions = field(default_factory=RenderOptions)
+    recipe: Annotated[str, tyro.conf.arg(metavar="|".join(RECIPES))] = "auto"
+    """How to render."""
+    scale: Annotated[float | None, flag("FACTOR")] = None
+    """Size against the training size (default 1)."""
+    resolution: Annotated[str | None, flag("WxH")] = None
+    """Size in px, such as 400x400; -1 on one side keeps the aspect (-1x720)."""
+    bit_depth: Literal[8, 16] = 8
+    """Bits a colour channel."""
+    overwrite: bool = False
+    """Replace existing images."""
+    json: bool = False
+    """Print what was written as one JSON object on stdout."""
+
+
+def render(options: Render) -> int:
+    """Render views at any resolution to PNG."""
+    size = _size_of(options)
+    recipe = find_recipe(
+        options.recipe, quality=options.rendering.quality, rate=options.rendering.rate
+    )
+    scene = options.scene.read()
+    cameras = options.cameras.read(options.scene)
+    views = [size(view) for view in options.rendering.select(cameras)]
+    paths = _paths(options.output, views, options.overwrite)
+    background = options.rendering.background_of(cameras)
+    training = options.cameras.learn(scene, cameras)
+    scene = smooth(scene, training, recipe)
+    say(_choice(recipe, views, training))
+    if not options.output.suffix:
+        make_folder(options.output)
+    with progress("rendering", "views") as tell:
+        for done, (view, path) in enumerate(zip(views, paths, strict=True)):
+            tell(done, len(views))
+            image = render_view(
+                scene, view, recipe, training, options.rendering.rasterize, background
+            )
+            write_png(path, image.rgb.float(), options.bit_depth, options.overwrite)
+        tell(len(views), len(views))
+    if options.json:
+        images = [
+            {"view": v.name, "file": str(p), "width": v.width, "height": v.height}
+            for v, p in zip(views, paths, strict=True)
+        ]
+        print_json({"recipe": recipe.name, "images": images})
+    else:
+        say(f"wrote {len(paths)} image{'s' * (len(paths) != 1)} to {options.output}")
+    return 0
+
+
+def _size_of(options: Render):
+    """The function that gives a view its new size."""
+    if options.scale is not None and options.resolution is not None:
+        raise UsageError("--scale and --resolution", "both say how large; give one")
+    if options.resolution is not None:
+        return lambda view: _checked(view.resized(*_resolution(options.resolution or "", view)))
+    scale = 1.0 if options.scale is None else options.scale
+    if not scale > 0:
+        raise UsageError("--scale", f"must be above 0, got {scale:g}")
+    return lambda view: _checked(view.scaled(scale))
+
+
+def _resolution(text: str, view: Camera) -> tuple[int, int]:
+    match = re.fullmatch(r"(-?\d+)x(-?\d+)", text)
+    width, height = (int(match[1]), int(match[2])) if match else (0, 0)
+    if max(width, height) < 1 or min(width, height) == 0:
+        raise UsageError(
+            "--resolution", f"expected WIDTHxHEIGHT such as 400x400 or -1x720, got '{text}'"
+        )
+    if width < 0:
+        width = max(1, round(view.width * height / view.height))
+    if height < 0:
+        height = max(1, round(view.height * width / view.width))
+    return width, height
+
+
+def _checked(view: Camera) -> Camera:
+    if max(view.hw) > MAX_SIDE:
+        raise UsageError(
+            view.name, f"would be {view.width}x{view.height} px; the limit is {MAX_SIDE} a side"
+        )
+    return view
+
+
+def _paths(output: Path, views: Sequence[Camera], overwrite: bool) -> list[Path]:
+    """One file a view, none of which may exist already or twice; asked before anything is rendered."""
+    if output.suffix:
+        if output.suffix.lower() != ".png" or len(views) != 1:
+            raise OutputError(
+                output, f"name a folder, or one .png for one view ({len(views)} views asked for)"
+            )
+        check_output(output, overwrite)
+        return [output]
+    names = [re.sub(r"[^\w.\-]+", "_", view.name).lstrip(".") or "view" for view in views]
+    if len({name.casefold() for name in names}) < len(names):
+        names = [f"{index:05d}_{name}" for index, name in enumerate(names)]
+    paths = [output / f"{name}.png" for name in names]
+    refuse_existing(paths, overwrite)
+    return paths
+
+
+def _choice(recipe: Recipe, views: Sequence[Camera], training: Training) -> str:
+    """What is about to be rendered, in words."""
+    samples = sorted({recipe.samples_at(training.rate(view)) for view in views})
+    grid = " or ".join(f"{n}×{n}" for n in samples)
+    sizes = listing(sorted({f"{view.width}x{view.height}" for view in views}), most=3)
+    trained = training.convention
+    return (
+        f"recipe: {recipe.name} for a {trained.name} scene, {grid} sample{'s' * (samples != [1])} a pixel, "
+        f"{len(views)} view{'s' * (len(views) != 1)} at {sizes}"
+    )

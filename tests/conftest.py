@@ -1,0 +1,97 @@
+"""Scenes and cameras that tests share.
+
+`shared_data` is a folder of real scenes that may lie beside the repository; tests that use it skip where it is absent.
+"""
+
+import math
+from importlib.resources import files
+from pathlib import Path
+
+import pytest
+import torch
+
+from aaplug.cameras import Camera, CameraSet, look_at
+from aaplug.gaussians import Gaussians
+from aaplug.interfaces import Training
+from aaplug.io.cameras import read_cameras
+from aaplug.io.scenes import read_scene
+from aaplug.pipeline import learn
+from aaplug.splats import Splats2D
+
+SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+SAMPLE = Path(str(files("aaplug.sample")))
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    if not SHARED_DATA.is_dir():
+        pytest.skip("the real scenes are not here")
+    return SHARED_DATA
+
+
+@pytest.fixture(scope="session")
+def sample_folder() -> Path:
+    return SAMPLE
+
+
+@pytest.fixture(scope="session")
+def sample_scene() -> Gaussians:
+    return read_scene(SAMPLE / "chair.ply")
+
+
+@pytest.fixture(scope="session")
+def sample_cameras() -> CameraSet:
+    return read_cameras(SAMPLE)
+
+
+@pytest.fixture(scope="session")
+def sample_training(sample_scene: Gaussians, sample_cameras: CameraSet) -> Training:
+    return learn(sample_scene, sample_cameras.train)
+
+
+def make_camera(
+    eye: tuple[float, float, float] = (0.0, -4.0, 0.0),
+    size: tuple[int, int] = (64, 48),
+    fov: float = 0.7,
+    name: str = "view",
+) -> Camera:
+    """A camera of the data set that looks at the origin; size is width, height."""
+    focal = 0.5 * size[0] / math.tan(fov / 2)
+    pose = look_at(torch.tensor(eye), torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
+    centre = size[0] / 2, size[1] / 2
+    return Camera(name, *size, focal, focal, *centre, pose).as_trained()
+
+
+def make_scene(n: int, seed: int = 0, dtype: torch.dtype = torch.float32, degree: int = 1) -> Gaussians:
+    """Random Gaussians around the origin, a few tenths of a unit large."""
+    g = torch.Generator().manual_seed(seed)
+    rand = {"generator": g, "dtype": torch.float64}
+    return Gaussians(
+        means=torch.randn(n, 3, **rand) * 0.7,
+        quats=torch.randn(n, 4, **rand),
+        log_scales=torch.randn(n, 3, **rand) * 0.7 - 2.5,
+        logit_opacities=torch.randn(n, **rand) * 2,
+        sh=torch.randn(n, (degree + 1) ** 2, 3, **rand) * 0.5,
+    ).to(dtype)
+
+
+def make_splats(
+    m: int, hw: tuple[int, int], seed: int = 0, log_sigmas: tuple[float, float] = (-1.0, 2.0)
+) -> Splats2D:
+    """Random coloured ellipses in and around an image; log_sigmas is the range of ln standard deviations in px."""
+    g = torch.Generator().manual_seed(seed)
+    low, high = log_sigmas
+    sigmas = torch.exp(low + (high - low) * torch.rand(m, 2, generator=g))
+    angle = torch.rand(m, generator=g) * math.pi
+    cos, sin = angle.cos(), angle.sin()
+    a = torch.stack([cos * sigmas[:, 0], -sin * sigmas[:, 1]], dim=1)
+    b = torch.stack([sin * sigmas[:, 0], cos * sigmas[:, 1]], dim=1)
+    return Splats2D(
+        means=torch.rand(m, 2, generator=g) * 1.2 * torch.tensor([hw[1], hw[0]]) - 0.1 * max(hw),
+        covs=torch.stack([(a * a).sum(1), (a * b).sum(1), (b * b).sum(1)], dim=1),
+        dets=sigmas.prod(dim=1).square(),
+        depths=torch.rand(m, generator=g) * 5 + 1,
+        opacities=torch.rand(m, generator=g),
+        sources=torch.arange(m),
+        rgb=torch.rand(m, 3, generator=g),
+    )

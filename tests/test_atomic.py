@@ -1,0 +1,155 @@
+"""Outputs appear whole or not at all, and never in place of an input."""
+
+import errno
+import os
+import resource
+from pathlib import Path
+
+import pytest
+
+from aaplug.errors import OutputError
+from aaplug.io.atomic import check_output, replacing
+
+OLD, NEW = b"old", b"new and longer"
+
+
+@pytest.fixture
+def output(tmp_path: Path) -> Path:
+    path = tmp_path / "scene.ply"
+    path.write_bytes(OLD)
+    return path
+
+
+def write(path: Path, content: bytes, overwrite: bool = False) -> None:
+    with replacing(path, overwrite) as stream:
+        stream.write(content)
+
+
+def only_the_old_file_is_there(path: Path) -> bool:
+    return path.read_bytes() == OLD and list(path.parent.iterdir()) == [path]
+
+
+def test_a_new_file_holds_what_was_written(tmp_path: Path):
+    write(tmp_path / "new", NEW)
+    assert (tmp_path / "new").read_bytes() == NEW
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_an_existing_file_needs_overwrite(output: Path):
+    with pytest.raises(OutputError, match="--overwrite"):
+        write(output, NEW)
+    assert only_the_old_file_is_there(output)
+    write(output, NEW, overwrite=True)
+    assert output.read_bytes() == NEW
+
+
+def test_an_existing_file_is_noticed_before_any_work(output: Path):
+    with pytest.raises(OutputError), replacing(output, overwrite=False):
+        pytest.fail("work was begun")
+
+
+@pytest.mark.parametrize("failure", [KeyboardInterrupt, SystemExit, ValueError, MemoryError])
+def test_whatever_interrupts_leaves_the_old_file(output: Path, failure: type[BaseException]):
+    def interrupted() -> None:
+        with replacing(output, overwrite=True) as stream:
+            stream.write(NEW)
+            assert output.read_bytes() == OLD
+            raise failure
+
+    with pytest.raises(failure):
+        interrupted()
+    assert only_the_old_file_is_there(output)
+
+
+@pytest.mark.parametrize("call", ["fsync", "replace"])
+def test_a_full_disk_is_one_line(output: Path, call: str, monkeypatch: pytest.MonkeyPatch):
+    def fail(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, call, fail)
+    with pytest.raises(OutputError, match=r"scene\.ply: cannot be written: no space left"):
+        write(output, NEW, overwrite=True)
+    assert only_the_old_file_is_there(output)
+
+
+def test_a_file_too_large_for_the_system_is_one_line(output: Path):
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
+    try:
+        with pytest.raises(OutputError, match="cannot be written: file too large"):
+            write(output, bytes(100_000), overwrite=True)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert only_the_old_file_is_there(output)
+
+
+def test_permissions_follow_the_umask(tmp_path: Path):
+    old = os.umask(0o027)
+    try:
+        write(tmp_path / "new", NEW)
+    finally:
+        os.umask(old)
+    assert (tmp_path / "new").stat().st_mode & 0o777 == 0o640
+
+
+def test_a_link_stays_a_link(output: Path, tmp_path: Path):
+    link = tmp_path / "link"
+    link.symlink_to(output)
+    write(link, NEW, overwrite=True)
+    assert link.is_symlink()
+    assert output.read_bytes() == NEW
+
+
+@pytest.mark.parametrize(
+    ("name", "problem"),
+    [
+        ("missing/out.ply", "folder does not exist"),
+        ("scene.ply/out.ply", "cannot be written"),
+        (".", "is a folder"),
+        ("x" * 300, "cannot be written"),
+        ("nul\0", "cannot be written"),
+    ],
+)
+def test_impossible_outputs_are_refused(output: Path, name: str, problem: str):
+    with pytest.raises(OutputError, match=problem):
+        write(output.parent / name, NEW, overwrite=True)
+    with pytest.raises(OutputError, match=problem):
+        check_output(output.parent / name, True)
+    assert only_the_old_file_is_there(output)
+
+
+def test_a_pipe_is_refused(tmp_path: Path):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(OutputError, match="not an ordinary file"):
+        write(tmp_path / "pipe", NEW, overwrite=True)
+
+
+def test_no_permission_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def refuse(*_: object) -> None:
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+
+    monkeypatch.setattr("builtins.open", refuse)  # root may write everywhere
+    with pytest.raises(OutputError, match="cannot be written: permission denied"):
+        write(tmp_path / "new", NEW)
+
+
+@pytest.mark.parametrize("disguise", ["same", "dotted", "symlink", "hard link"])
+def test_an_input_is_never_an_output(output: Path, disguise: str):
+    other = output.parent / "other"
+    (output.parent / "folder").mkdir()
+    if disguise == "symlink":
+        other.symlink_to(output)
+    elif disguise == "hard link":
+        os.link(output, other)
+    else:
+        other = output if disguise == "same" else output.parent / "folder" / ".." / output.name
+    with pytest.raises(OutputError, match="is also the input"):
+        check_output(other, True, [output.parent / "missing", output])
+
+
+def test_checking_creates_nothing(output: Path):
+    check_output(output.parent / "new", False, [output])
+    check_output(output, True, [output.parent / "missing"])
+    with pytest.raises(OutputError, match="exists"):
+        check_output(output, False)
+    assert only_the_old_file_is_there(output)

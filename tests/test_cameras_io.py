@@ -1,0 +1,748 @@
+"""Cameras from every format: values checked by hand, one scene in all its formats, and hostile files."""
+
+import json
+import math
+import shutil
+import struct
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from aaplug.cameras import BLACK, WHITE, CameraSet
+from aaplug.errors import AaplugError, FormatError, UsageError
+from aaplug.io.cameras import read_cameras, select_views
+from aaplug.io.cameras.cfg_args import read_cfg_args
+
+QUARTER_TURN = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]  # 90° about z
+HALF = math.sqrt(0.5)
+
+
+@pytest.fixture(scope="module")
+def shared_data():
+    folder = Path(__file__).resolve().parents[2] / "shared" / "data"
+    if not folder.is_dir():
+        pytest.skip("the real scenes are not here")
+    return folder
+
+
+def write_json(path, document):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(document))
+    return path
+
+
+def photo(path, width, height, mode="RGB"):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.new(mode, (width, height)).save(path)
+
+
+def names(cameras):
+    return [camera.name for camera in cameras]
+
+
+# INRIA ------------------------------------------------------------------------------------------
+
+
+def inria_entry(name="a", **changes):
+    entry = {
+        "id": 0,
+        "img_name": name,
+        "width": 400,
+        "height": 200,
+        "position": [1.0, 2.0, 3.0],
+        "rotation": QUARTER_TURN,
+        "fx": 300.0,
+        "fy": 310.0,
+    }
+    return entry | changes
+
+
+def inria(folder, *entries, cfg=None):
+    write_json(folder / "cameras.json", list(entries or [inria_entry()]))
+    if cfg is not None:
+        (folder / "cfg_args").write_text(cfg)
+    return folder
+
+
+def many(count):
+    """Views v00, v01 ... one step apart, the test views first, as 3DGS writes them."""
+    order = [i for i in range(count) if i % 8 == 0] + [i for i in range(count) if i % 8]
+    return [inria_entry(f"v{i:02}", position=[float(i), 0, 0]) for i in order]
+
+
+def test_inria_pose_is_the_inverse_of_camera_to_world(tmp_path):
+    (camera,) = read_cameras(inria(tmp_path)).train
+    expected = torch.tensor(
+        [[0, 1, 0, -2], [-1, 0, 0, 1], [0, 0, 1, -3], [0, 0, 0, 1]], dtype=torch.float64
+    )
+    assert torch.equal(camera.cam_from_world, expected)
+    assert camera.centre.tolist() == [1, 2, 3]
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (300, 310, 200, 100)
+    assert (camera.name, camera.hw, camera.trained_focal) == ("a", (200, 400), camera.focal)
+
+
+@pytest.mark.parametrize(
+    ("cfg", "size"),
+    [
+        (None, (1600, 666)),  # the assumed cap: 1000 · 1600 / 2402 = 666.1
+        ("Namespace(resolution=-1)", (1600, 666)),
+        ("Namespace(resolution=1)", (2402, 1000)),
+        ("Namespace(resolution=2)", (1201, 500)),
+        ("Namespace(resolution=4)", (600, 250)),  # 600.5 goes to the even 600, as in 3DGS
+        ("Namespace(resolution=1200)", (1200, 499)),
+        ("Namespace(resolution=-1, images='images_4')", (601, 250)),  # image tools round 600.5 up
+        ("Namespace(resolution=2, images='images_2')", (600, 250)),
+    ],
+)
+def test_inria_training_size_follows_3dgs(tmp_path, cfg, size):
+    cameras = read_cameras(inria(tmp_path, inria_entry(width=2402, height=1000), cfg=cfg))
+    (camera,) = cameras.train
+    assert (camera.width, camera.height) == size
+    assert camera.fx == pytest.approx(300 * size[0] / 2402)
+    assert camera.trained_focal == camera.focal
+    assert any("training size" in n and str(size[0]) in n for n in cameras.notes)
+    assert any("assumed" in n for n in cameras.notes) == (cfg is None)
+
+
+def test_inria_photos_count_more_than_the_sizes_in_the_file(tmp_path):
+    photo(tmp_path / "images_4" / "a.JPG", 100, 50)
+    inria(tmp_path, inria_entry(), inria_entry("b"), cfg="Namespace(images='images_4')")
+    with_photo, without = read_cameras(tmp_path).train
+    assert (with_photo.width, with_photo.photo) == (100, tmp_path / "images_4" / "a.JPG")
+    assert (without.width, without.photo) == (100, None)
+
+
+def test_train_scale_overrides_everything(tmp_path):
+    photo(tmp_path / "images" / "a.png", 200, 100)
+    inria(tmp_path, cfg="Namespace(resolution=8)")
+    (camera,) = read_cameras(tmp_path, train_scale=0.25).train
+    assert (camera.width, camera.height, camera.fx, camera.trained_focal) == (
+        100,
+        50,
+        75.0,
+        camera.focal,
+    )
+
+
+def test_photo_of_another_shape_is_refused(tmp_path):
+    photo(tmp_path / "images" / "a.png", 100, 200)
+    with pytest.raises(FormatError, match="100×200 px, which is not the shape"):
+        read_cameras(inria(tmp_path))
+
+
+def test_inria_split_goes_by_name(tmp_path):
+    inria(tmp_path, *many(17), cfg="Namespace(eval=True, white_background=True)")
+    cameras = read_cameras(tmp_path)
+    assert names(cameras.test) == ["v00", "v08", "v16"]
+    assert len(cameras.train) == 14
+    assert cameras.background == WHITE
+    assert names(read_cameras(tmp_path, test_every=16).test) == ["v00", "v16"]
+    undivided = read_cameras(tmp_path, test_every=0)
+    assert undivided.train is undivided.test
+    assert len(undivided.train) == 17
+
+
+def test_inria_without_eval_has_no_split(tmp_path):
+    cameras = read_cameras(inria(tmp_path, *many(9), cfg="Namespace(white_background=False)"))
+    assert len(cameras.train) == len(cameras.test) == 9
+    assert cameras.background == BLACK
+    assert read_cameras(inria(tmp_path / "bare", *many(9))).background is None
+
+
+def test_inria_copies_of_a_view_count_once(tmp_path):
+    cameras = read_cameras(inria(tmp_path, inria_entry(), inria_entry(id=1), inria_entry("b")))
+    assert names(cameras.train) == ["a", "b"]
+
+
+def test_inria_model_of_a_blender_set_lists_test_views_first(tmp_path):
+    test = [inria_entry(f"r_{i}", position=[float(i), 0, 0]) for i in range(3)]
+    train = [inria_entry(f"r_{i}", position=[0, float(i) + 1, 0]) for i in range(2)]
+    cameras = read_cameras(inria(tmp_path, *test, *train, cfg="Namespace(eval=True)"))
+    assert (names(cameras.test), names(cameras.train)) == (["r_0", "r_1", "r_2"], ["r_0", "r_1"])
+    merged = read_cameras(inria(tmp_path, *test, *train, cfg="Namespace(eval=False)"))
+    assert sorted(names(merged.train)) == ["r_0", "r_0~2", "r_1", "r_1~2", "r_2"]
+
+
+def test_cfg_args_is_never_run(tmp_path):
+    trap = tmp_path / "trap"
+    cfg = f"Namespace(resolution=1, eval=open({str(trap)!r}, 'w'))"
+    with pytest.raises(FormatError, match="eval should be a literal"):
+        read_cameras(inria(tmp_path, cfg=cfg))
+    assert not trap.exists()
+
+
+@pytest.mark.parametrize(
+    "cfg",
+    [
+        "",
+        "1",
+        "print(1)",
+        "Namespace(1)",
+        "Namespace(**{'resolution': 1})",
+        "Namespace(resolution=True)",
+        "Namespace(resolution=0)",
+        "Namespace(resolution=1e999)",
+        "Namespace(resolution='4')",
+        "Namespace(images=3)",
+        "Namespace(eval=1)",
+        "Namespace(images='../secret')",
+        "Namespace(x=f'{1}')",
+        "a.Namespace(x=1)",
+        "Namespace(x=" + "(" * 5000 + ")" * 5000 + ")",
+        "Namespace(x=" + "-" * 5000 + "1)",
+        "Namespace(x=1); import os",
+        "Namespace(x='" + "y" * 70000 + "')",
+        "Namespace(x='\0')",
+    ],
+    ids=range(19),
+)
+def test_odd_cfg_args_are_refused(tmp_path, cfg):
+    with pytest.raises(FormatError):
+        read_cameras(inria(tmp_path, cfg=cfg))
+
+
+def test_cfg_args_of_windows_is_read_without_warnings(tmp_path):
+    (tmp_path / "cfg_args").write_text(r"Namespace(source_path='D:\data\scene', resolution=2)")
+    assert read_cfg_args(tmp_path / "cfg_args").resolution == 2
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"fx": 0}, "camera 1: fx should be above 0 and at most 1e+09 px, not 0"),
+        ({"fx": 1e300}, "camera 1: fx should be above 0 and at most"),
+        ({"fx": True}, "camera 1: fx should be a number, not True"),
+        ({"fx": 10**400}, "camera 1: fx should be a finite number"),
+        ({"width": 0}, "camera 1: width should be a whole number of px from 1 to 65536, not 0"),
+        ({"width": 70000}, "width should be a whole number"),
+        ({"width": 1.5}, "width should be a whole number"),
+        ({"position": [1, 2]}, "camera 1: position should be 3 numbers"),
+        ({"position": [1e308, 1e308, 1e308]}, None),
+        ({"rotation": [[1, 0, 0], [0, 1, 0]]}, "rotation should be 3 rows of 3 numbers"),
+        ({"rotation": [[2, 0, 0], [0, 1, 0], [0, 0, 1]]}, "R·Rᵀ is 3 off the identity"),
+        ({"rotation": [[-1, 0, 0], [0, 1, 0], [0, 0, 1]]}, "it mirrors"),
+        ({"rotation": [[1e200, 0, 0], [0, 1, 0], [0, 0, 1]]}, "should be a rotation"),
+        ({"img_name": "../a"}, "path '../a' should stay within the dataset"),
+        ({"img_name": "/etc/passwd"}, "should stay within the dataset"),
+        ({"img_name": "C:\\a"}, "should stay within the dataset"),
+        ({"img_name": "a\0b"}, "img_name should be printable text"),
+        ({"img_name": "\ud800"}, "img_name should be printable text"),
+        ({"img_name": ""}, "img_name should be printable text"),
+        ({"img_name": "y" * 5000}, None),
+    ],
+    ids=str,
+)
+def test_inria_names_what_is_wrong(tmp_path, change, message):
+    folder = inria(tmp_path, inria_entry(), inria_entry("b", **change) | change)
+    if message is None:  # odd, but allowed
+        read_cameras(folder)
+        return
+    with pytest.raises(FormatError) as caught:
+        read_cameras(folder)
+    assert message in str(caught.value)
+    assert "cameras.json" in str(caught.value)
+
+
+def test_missing_field_is_named(tmp_path):
+    entry = inria_entry()
+    del entry["fy"]
+    with pytest.raises(FormatError, match="camera 0: fy is missing"):
+        read_cameras(inria(tmp_path, entry))
+
+
+def test_rotation_is_made_orthonormal(tmp_path):
+    rough = [[0.0, -1.0002, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.9999]]
+    (camera,) = read_cameras(inria(tmp_path, inria_entry(rotation=rough))).train
+    r = camera.cam_from_world[:3, :3]
+    assert torch.allclose(r @ r.T, torch.eye(3, dtype=torch.float64), atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "{}",
+        "[]",
+        "[1]",
+        "null",
+        "[" * 100_000,
+        '[{"img_name": NaN}]',
+        '[{"img_name": "a", "width": ' + "9" * 5000 + "}]",
+        "\xff",
+    ],
+    ids=range(9),
+)
+def test_odd_json_is_refused(tmp_path, text):
+    (tmp_path / "cameras.json").write_text(text, encoding="latin-1")
+    with pytest.raises(FormatError):
+        read_cameras(tmp_path)
+
+
+def test_json_is_capped(tmp_path, monkeypatch):
+    monkeypatch.setattr("aaplug.io.cameras.values.JSON_LIMIT", 100)
+    with pytest.raises(FormatError, match="longer than 100 bytes"):
+        read_cameras(inria(tmp_path))
+
+
+# COLMAP -----------------------------------------------------------------------------------------
+
+CAMERAS = ((1, 1, 400, 200, (300.0, 310.0, 199.0, 101.0)), (7, 0, 400, 200, (250.0, 200.0, 100.0)))
+MODEL_NAMES = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE")
+IMAGES = (  # a quarter turn about z, not of unit length; no turn
+    (5, (2.0, 0.0, 0.0, 2.0), (1.0, 2.0, 3.0), 1, "cam b/with space.jpg"),
+    (3, (1.0, 0.0, 0.0, 0.0), (0.0, 0.5, 0.25), 7, "a.b.png"),
+)
+POINTS = ((1.5, 2.5, 9), (3.5, 4.5, 2**64 - 1))
+
+
+def colmap_bin(folder, cameras=CAMERAS, images=IMAGES):
+    folder.mkdir(parents=True, exist_ok=True)
+    data = struct.pack("<Q", len(cameras))
+    for key, model, width, height, values in cameras:
+        data += struct.pack(f"<IiQQ{len(values)}d", key, model, width, height, *values)
+    (folder / "cameras.bin").write_bytes(data)
+    data = struct.pack("<Q", len(images))
+    for key, quaternion, translation, camera, name in images:
+        data += struct.pack("<I7dI", key, *quaternion, *translation, camera) + name.encode() + b"\0"
+        data += struct.pack("<Q", len(POINTS)) + b"".join(struct.pack("<2dQ", *p) for p in POINTS)
+    (folder / "images.bin").write_bytes(data)
+    return folder
+
+
+def colmap_txt(folder, cameras=CAMERAS, images=IMAGES, points="1.5 2.5 9 3.5 4.5 -1"):
+    folder.mkdir(parents=True, exist_ok=True)
+    lines = ["# Camera list", ""]
+    for key, model, width, height, values in cameras:
+        lines.append(" ".join(map(str, (key, MODEL_NAMES[model], width, height, *values))))
+    (folder / "cameras.txt").write_text("\n".join(lines) + "\n")
+    lines = ["# Image list"]
+    for key, quaternion, translation, camera, name in images:
+        lines += [" ".join(map(str, (key, *quaternion, *translation, camera, name))), points]
+    (folder / "images.txt").write_text("\n".join(lines) + "\n")
+    return folder
+
+
+def one_camera(model, values):
+    return ((1, model, 400, 200, values),), ((1, (1.0, 0, 0, 0), (0.0, 0, 0), 1, "a.png"),)
+
+
+@pytest.mark.parametrize("write", [colmap_bin, colmap_txt])
+def test_colmap_values(tmp_path, write):
+    write(tmp_path / "sparse" / "0")
+    first, second = read_cameras(tmp_path, test_every=0).train
+    assert (first.name, second.name) == ("a.b", "cam b/with space")
+    assert (first.fx, first.fy, first.cx, first.cy) == (250, 250, 200, 100)
+    assert (second.fx, second.fy, second.cx, second.cy) == (300, 310, 199, 101)
+    turned = torch.tensor(
+        [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]], dtype=torch.float64
+    )
+    assert torch.allclose(second.cam_from_world, turned, atol=1e-15)
+    assert first.cam_from_world[:3, 3].tolist() == [0, 0.5, 0.25]
+    assert (first.hw, first.trained_focal) == ((200, 400), 250)
+
+
+@pytest.mark.parametrize("points", ["", "1 2 3"])
+def test_colmap_text_is_the_same_as_binary(tmp_path, points):
+    binary = read_cameras(colmap_bin(tmp_path / "bin"))
+    text = read_cameras(colmap_txt(tmp_path / "txt", points=points))
+    for a, b in zip(binary.all, text.all, strict=True):
+        assert torch.equal(a.cam_from_world, b.cam_from_world)
+        assert (a.name, a.hw, a.fx, a.fy, a.cx, a.cy) == (b.name, b.hw, b.fx, b.fy, b.cx, b.cy)
+
+
+@pytest.mark.parametrize(
+    "path", [".", "sparse", "sparse/0", "sparse/0/images.bin", "sparse/0/cameras.bin"]
+)
+def test_colmap_is_found_from_anywhere_in_it(tmp_path, path):
+    colmap_bin(tmp_path / "sparse" / "0")
+    photo(tmp_path / "images" / "a.b.png", 400, 200)
+    cameras = read_cameras(tmp_path / path, test_every=0)
+    assert names(cameras.train) == ["a.b", "cam b/with space"]
+    assert cameras.train[0].photo == tmp_path / "images" / "a.b.png"
+
+
+def test_colmap_trains_at_the_size_of_its_photos(tmp_path):
+    colmap_bin(tmp_path / "sparse")
+    photo(tmp_path / "images_4" / "a.b.png", 100, 50)
+    photo(tmp_path / "images_4" / "cam b" / "with space.jpg", 100, 50)
+    first, second = read_cameras(tmp_path, images="images_4", test_every=0).train
+    assert (first.width, first.fx, first.cx) == (100, 62.5, 50)
+    assert (second.fx, second.fy, second.cx, second.cy) == (75, 77.5, 49.75, 25.25)
+    assert second.trained_focal == second.focal
+    (scaled, _) = read_cameras(tmp_path, images="images_4", test_every=0, train_scale=0.5).train
+    assert (scaled.width, scaled.fx) == (200, 125)
+
+
+def test_colmap_split_is_every_eighth_by_name(tmp_path):
+    views = tuple((i, (1.0, 0, 0, 0), (0.0, 0, i), 1, f"v{i:02}.png") for i in range(16, -1, -1))
+    colmap_bin(tmp_path, images=views)
+    cameras = read_cameras(tmp_path)
+    assert names(cameras.test) == ["v00", "v08", "v16"]
+    assert names(cameras.train)[:2] == ["v01", "v02"]
+    assert names(read_cameras(tmp_path, test_every=10).test) == ["v00", "v10"]
+
+
+def test_colmap_names_that_collide_keep_their_suffix(tmp_path):
+    views = tuple(
+        (i, (1.0, 0, 0, 0), (0.0, 0, 0), 1, f"a.{s}") for i, s in enumerate(["jpg", "png"])
+    )
+    assert names(read_cameras(colmap_bin(tmp_path, images=views)).all) == ["a.png", "a.jpg"]
+    with pytest.raises(FormatError, match=r"'a\.jpg' is there twice"):
+        read_cameras(colmap_bin(tmp_path, images=views[:1] * 2))
+
+
+@pytest.mark.parametrize("write", [colmap_bin, colmap_txt])
+def test_colmap_distortion_is_refused_unless_it_is_zero(tmp_path, write):
+    straight = one_camera(4, (300.0, 310.0, 200.0, 100.0, 0.0, 0.0, 0.0, 0.0))
+    assert read_cameras(write(tmp_path / "a", *straight)).train[0].fy == 310
+    bent = one_camera(4, (300.0, 310.0, 200.0, 100.0, 0.0, 0.0, 0.0, 1e-9))
+    with pytest.raises(FormatError, match=r"camera 1.*OPENCV with distortion.*image_undistorter"):
+        read_cameras(write(tmp_path / "b", *bent))
+    fisheye = one_camera(5, (300.0, 310.0, 200.0, 100.0, 0.0, 0.0, 0.0, 0.0))
+    with pytest.raises(FormatError, match=r"camera 1.*OPENCV_FISHEYE.*image_undistorter"):
+        read_cameras(write(tmp_path / "c", *fisheye))
+
+
+@pytest.mark.parametrize(
+    ("model", "count"),
+    list(enumerate([3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6, 2])),
+)
+def test_colmap_models_have_their_number_of_parameters(tmp_path, model, count):
+    """A second camera is met only if the first one's parameters were all read and no more."""
+    cameras = ((2, model, 400, 200, (1.0,) * count), *CAMERAS)
+    assert len(read_cameras(colmap_bin(tmp_path, cameras)).all) == 2
+
+
+@pytest.mark.parametrize(
+    ("image", "message"),
+    [
+        ((1, (0.0, 0, 0, 0), (0.0, 0, 0), 1, "a"), "image 1: quaternion should be finite"),
+        ((1, (math.nan, 0, 0, 0), (0.0, 0, 0), 1, "a"), "image 1: quaternion should be finite"),
+        ((1, (1.0, 0, 0, 0), (math.inf, 0, 0), 1, "a"), "translation should be a finite number"),
+        ((1, (1.0, 0, 0, 0), (0.0, 0, 0), 9, "a"), "uses camera 9"),
+        ((1, (1.0, 0, 0, 0), (0.0, 0, 0), 1, "../a"), "should stay within the dataset"),
+        ((1, (1.0, 0, 0, 0), (0.0, 0, 0), 1, "/a"), "should stay within the dataset"),
+        ((1, (1.0, 0, 0, 0), (0.0, 0, 0), 1, "a\nb"), "name should be printable"),
+        ((1, (1.0, 0, 0, 0), (0.0, 0, 0), 1, ""), "name should be printable"),
+        ((1, (1.0, 0, 0, 0), (0.0, 0, 0), 1, "n" * 5000), "should end within 4096 bytes"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_colmap_names_what_is_wrong(tmp_path, image, message):
+    with pytest.raises(FormatError) as caught:
+        read_cameras(colmap_bin(tmp_path, images=(image,)))
+    assert message in str(caught.value)
+
+
+def test_colmap_cut_anywhere_is_refused(tmp_path):
+    colmap_bin(tmp_path)
+    for name in ("cameras.bin", "images.bin"):
+        data = (tmp_path / name).read_bytes()
+        for length in range(len(data)):
+            (tmp_path / name).write_bytes(data[:length])
+            with pytest.raises(FormatError, match=name):
+                read_cameras(tmp_path)
+        (tmp_path / name).write_bytes(data)
+
+
+def test_colmap_truncation_names_record_and_bytes(tmp_path):
+    colmap_bin(tmp_path)
+    data = (tmp_path / "images.bin").read_bytes()
+    (tmp_path / "images.bin").write_bytes(data[:-1])
+    with pytest.raises(FormatError, match=r"points of image record 1 need 48 bytes .* 47 are left"):
+        read_cameras(tmp_path)
+
+
+def test_photo_behind_a_link_out_of_the_dataset_is_refused(tmp_path):
+    photo(tmp_path / "elsewhere" / "a.b.png", 400, 200)
+    root = tmp_path / "root"
+    colmap_bin(root / "sparse")
+    (root / "images").mkdir()
+    (root / "images" / "a.b.png").symlink_to(tmp_path / "elsewhere" / "a.b.png")
+    with pytest.raises(FormatError, match="lies outside"):
+        read_cameras(root)
+    (root / "images" / "a.b.png").unlink()
+    (root / "images").rmdir()
+    (root / "images").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(FormatError, match="lies outside"):
+        read_cameras(root)
+    assert read_cameras(root, images=str(tmp_path / "elsewhere")).test[0].photo is not None
+
+
+def test_folder_of_photos_must_exist_and_hold_some(tmp_path):
+    colmap_bin(tmp_path)
+    with pytest.raises(UsageError, match="there is no folder"):
+        read_cameras(tmp_path, images="images_4")
+    (tmp_path / "images_4").mkdir()
+    with pytest.raises(UsageError, match="holds no photo of these cameras"):
+        read_cameras(tmp_path, images="images_4")
+
+
+# Blender and nerfstudio -------------------------------------------------------------------------
+
+OPENGL = [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
+
+
+def transforms(frames, **shared):
+    frames = [{"transform_matrix": OPENGL} | frame for frame in frames]
+    return {"camera_angle_x": math.pi / 2} | shared | {"frames": frames}
+
+
+def blender(folder):
+    for split, count in (("train", 3), ("test", 2), ("val", 1)):
+        frames = [{"file_path": f"./{split}/r_{i}"} for i in range(count)]
+        write_json(folder / f"transforms_{split}.json", transforms(frames))
+        photo(folder / split / "r_0.png", 40, 20, "RGBA")
+    return folder
+
+
+def test_blender_values(tmp_path):
+    cameras = read_cameras(blender(tmp_path))
+    assert (names(cameras.train), names(cameras.test)) == (["r_0", "r_1", "r_2"], ["r_0", "r_1"])
+    camera = cameras.train[0]
+    assert (camera.width, camera.height, camera.cx, camera.cy) == (40, 20, 20, 10)
+    assert camera.fx == camera.fy == pytest.approx(20)  # 90° over 40 px
+    assert camera.photo == tmp_path / "train" / "r_0.png"
+    assert cameras.train[1].photo is None
+    assert cameras.background == WHITE
+    assert camera.centre.tolist() == [1, 2, 3]
+    # the camera looks along its own -z, so along the world's -z; its up is -x of the world
+    ahead = torch.tensor([1.0, 2.0, 0.0, 1.0], dtype=torch.float64)
+    above = torch.tensor([0.0, 2.0, 3.0, 1.0], dtype=torch.float64)
+    assert (camera.cam_from_world @ ahead).tolist() == [0, 0, 3, 1]
+    assert (camera.cam_from_world @ above).tolist() == [0, -1, 0, 1]
+    assert any("transforms_val.json" in note for note in cameras.notes)
+
+
+def test_blender_train_scale(tmp_path):
+    camera = read_cameras(blender(tmp_path), train_scale=0.25).test[0]
+    assert (camera.hw, camera.trained_focal) == ((5, 10), camera.focal)
+    assert camera.fx == pytest.approx(5)
+
+
+def test_blender_split_is_not_overruled(tmp_path):
+    with pytest.raises(UsageError, match="gives the split"):
+        read_cameras(blender(tmp_path), test_every=8)
+    one = read_cameras(tmp_path / "transforms_test.json")
+    assert one.train is one.test
+    (tmp_path / "transforms_test.json").unlink()
+    assert names(read_cameras(tmp_path).test) == ["r_0", "r_1", "r_2"]
+
+
+def test_transforms_intrinsics_of_a_frame_come_first(tmp_path):
+    shared = {"w": 40, "h": 20.0, "fl_x": 30, "fl_y": 31, "cx": 19, "cy": 9, "k1": 0}
+    frames = [{"file_path": "a/1.png"}, {"file_path": "b/1.png", "fl_x": 50, "w": 60}]
+    path = write_json(tmp_path / "transforms.json", transforms(frames, **shared))
+    first, second = read_cameras(tmp_path).train
+    assert (first.name, second.name) == ("a/1", "b/1")
+    assert (first.fx, first.fy, first.cx, first.cy, first.hw) == (30, 31, 19, 9, (20, 40))
+    assert (second.fx, second.fy, second.hw) == (50, 31, (20, 60))
+    assert read_cameras(path, test_every=2).test[0].name == "a/1"
+
+
+@pytest.mark.parametrize(
+    ("frame", "message"),
+    [
+        ({"k1": 0.1}, "frame 0: k1 is 0.1"),
+        ({"distortion_params": [0, 0.1]}, "distortion_params are not zero"),
+        ({"camera_model": "OPENCV_FISHEYE"}, "camera_model is OPENCV_FISHEYE"),
+        ({"is_fisheye": True}, "is_fisheye"),
+        ({"camera_angle_x": 3.2}, "camera_angle_x should be above 0 and below π"),
+        ({"camera_angle_x": 5e-324}, "camera_angle_x should be above 0 and below π"),
+        ({"file_path": "../x"}, "should stay within the dataset"),
+        ({"file_path": "/x"}, "should stay within the dataset"),
+        ({"file_path": 3}, "file_path should be printable text"),
+        ({"transform_matrix": OPENGL[:3]}, "transform_matrix should be 4 rows of 4 numbers"),
+        ({"transform_matrix": [*OPENGL[:3], [0, 0, 0, 2]]}, "last row should be 0 0 0 1"),
+        ({"w": "40"}, "w should be a number"),
+    ],
+    ids=str,
+)
+def test_transforms_name_what_is_wrong(tmp_path, frame, message):
+    document = transforms([{"file_path": "a"} | frame], w=40, h=20)
+    if "w" in frame:
+        del document["w"]
+    with pytest.raises(FormatError) as caught:
+        read_cameras(write_json(tmp_path / "transforms.json", document))
+    assert message in str(caught.value)
+
+
+def test_transforms_without_a_size_say_what_to_do(tmp_path):
+    write_json(tmp_path / "transforms.json", transforms([{"file_path": "a"}]))
+    with pytest.raises(FormatError, match="add w and h"):
+        read_cameras(tmp_path)
+
+
+# Plain pinholes ---------------------------------------------------------------------------------
+
+
+def pinhole(**changes):
+    motion = [[0, 1, 0, 4], [-1, 0, 0, 5], [0, 0, 1, 6], [0, 0, 0, 1]]
+    sizes = {"width": 40, "height": 20, "fx": 30, "fy": 31, "cx": 19, "cy": 9}
+    return sizes | {"world_to_camera": motion} | changes
+
+
+def test_pinhole_values(tmp_path):
+    (camera,) = read_cameras(write_json(tmp_path / "cam_40.json", pinhole())).train
+    assert camera.cam_from_world.tolist() == pinhole()["world_to_camera"]
+    assert (camera.fx, camera.fy, camera.cx, camera.cy, camera.hw) == (30, 31, 19, 9, (20, 40))
+    assert camera.name == "cam_40"
+    views = read_cameras(write_json(tmp_path / "list.json", [pinhole()] * 11), test_every=5)
+    assert names(views.test) == ["camera_00", "camera_05", "camera_10"]
+
+
+# Choosing ---------------------------------------------------------------------------------------
+
+
+def test_a_folder_is_read_as_the_most_telling_of_its_formats(tmp_path):
+    def kind():
+        return read_cameras(tmp_path).notes[0].split()[0]
+
+    write_json(tmp_path / "transforms.json", transforms([{"file_path": "a"}], w=4, h=2))
+    assert kind() == "transforms"
+    inria(tmp_path)
+    assert kind() == "INRIA"
+    blender(tmp_path)
+    assert kind() == "transforms"
+    colmap_bin(tmp_path / "sparse" / "0")
+    assert kind() == "COLMAP"
+    (tmp_path / "cfg_args").write_text("Namespace()")
+    assert kind() == "INRIA"
+
+
+def test_a_folder_without_cameras_says_what_was_looked_for(tmp_path):
+    with pytest.raises(FormatError, match=r"cameras\.json.*COLMAP.*transforms_train\.json"):
+        read_cameras(tmp_path)
+    with pytest.raises(FormatError, match="no such file"):
+        read_cameras(tmp_path / "none")
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"train_scale": 0.0},
+        {"train_scale": math.nan},
+        {"train_scale": 1e9},
+        {"test_every": 1},
+        {"test_every": -8},
+    ],
+    ids=str,
+)
+def test_odd_options_are_refused(tmp_path, options):
+    with pytest.raises(UsageError):
+        read_cameras(inria(tmp_path), **options)
+
+
+def test_views_are_chosen_by_split_or_name(tmp_path):
+    cameras = read_cameras(inria(tmp_path, *many(17), cfg="Namespace(eval=True)"))
+    assert select_views(cameras, "train") == cameras.train
+    assert select_views(cameras, "test") == cameras.test
+    assert len(select_views(cameras, "all")) == 17
+    assert names(select_views(cameras, "v08, v01,v08")) == ["v08", "v01"]
+    with pytest.raises(UsageError, match=r"no view 'v1'.*v1"):
+        select_views(cameras, "v01,v1")
+    with pytest.raises(UsageError):
+        select_views(cameras, "")
+
+
+def test_a_name_in_both_splits_is_the_test_view(tmp_path):
+    cameras = read_cameras(blender(tmp_path))
+    assert select_views(cameras, "r_0") == (cameras.test[0],)
+    assert select_views(cameras, "r_2") == (cameras.train[2],)
+
+
+# Hostile bytes ----------------------------------------------------------------------------------
+
+
+def fixtures(folder):
+    """Each format once, and the file of it to spoil."""
+    yield inria(folder / "inria", cfg="Namespace(eval=True, resolution=4)"), "cameras.json"
+    yield folder / "inria", "cfg_args"
+    yield colmap_bin(folder / "bin"), "cameras.bin"
+    yield folder / "bin", "images.bin"
+    yield colmap_txt(folder / "txt"), "cameras.txt"
+    yield folder / "txt", "images.txt"
+    yield blender(folder / "blender"), "transforms_train.json"
+    yield write_json(folder / "pinhole" / "p.json", pinhole()), ""
+
+
+@settings(
+    max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(data=st.data())
+def test_spoiled_files_read_or_raise_our_errors(tmp_path, data):
+    shutil.rmtree(tmp_path / "spoil", ignore_errors=True)
+    path, name = data.draw(st.sampled_from(list(fixtures(tmp_path / "spoil"))))
+    file = path / name if name else path
+    spoiled = bytearray(file.read_bytes())
+    for _ in range(data.draw(st.integers(1, 4))):
+        at = data.draw(st.integers(0, len(spoiled) - 1))
+        length = data.draw(st.integers(0, 4))
+        spoiled[at : at + length] = data.draw(st.binary(max_size=8))
+        if not spoiled:
+            break
+    file.write_bytes(spoiled)
+    try:
+        assert isinstance(read_cameras(path), CameraSet)
+    except AaplugError as error:
+        str(error).encode()
+
+
+# Real scenes ------------------------------------------------------------------------------------
+
+
+@pytest.mark.data
+def test_one_scene_has_the_same_poses_in_all_its_formats(shared_data):
+    folder = shared_data / "snowmiku"
+    colmap = read_cameras(folder)
+    assert (len(colmap.train), len(colmap.test)) == (84, 13)
+    expected = {camera.name: camera for camera in colmap.all}
+    for name in ("cameras.json", "transforms.json"):
+        cameras = read_cameras(folder / name).all
+        assert {camera.name for camera in cameras} == set(expected)
+        for camera in cameras:
+            twin = expected[camera.name]
+            assert torch.allclose(camera.cam_from_world, twin.cam_from_world, rtol=0, atol=1e-6)
+            assert (camera.hw, camera.photo) == (twin.hw, twin.photo)
+            assert (camera.fx, camera.cx) == pytest.approx((twin.fx, twin.cx), abs=1e-6)
+
+
+@pytest.mark.data
+def test_chair(shared_data):
+    cameras = read_cameras(shared_data / "chair")
+    assert (len(cameras.train), len(cameras.test)) == (100, 25)
+    assert cameras.background == WHITE
+    assert all(c.hw == (800, 800) and c.photo for c in cameras.all)
+    eighth = read_cameras(shared_data / "chair", train_scale=1 / 8)
+    assert all(c.hw == (100, 100) and c.trained_focal == c.focal for c in eighth.all)
+
+
+@pytest.mark.data
+def test_test_views_by_name_are_those_that_3dgs_lists_first(shared_data):
+    for folder in (shared_data / "formats" / "inria").rglob("original_3dgs_train/*"):
+        listed = [entry["img_name"] for entry in json.loads((folder / "cameras.json").read_text())]
+        cameras = read_cameras(folder)
+        assert names(cameras.test) == listed[: len(cameras.test)]
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("kind", ["colmap", "inria", "transforms"])
+def test_real_files_read_or_raise_our_errors(shared_data, kind):
+    files = [path for path in (shared_data / "formats" / kind).rglob("*") if path.is_file()]
+    outcomes = set()
+    for path in {*files, *(file.parent for file in files)}:
+        try:
+            outcomes.add(bool(read_cameras(path).all))
+        except FormatError:
+            outcomes.add(False)
+    assert outcomes == {True, False} or kind == "inria"
+
+
+@pytest.mark.data
+def test_truncated_model_is_refused(shared_data):
+    with pytest.raises(FormatError, match=r"images\.bin: 10040 points of image record \d+ need"):
+        read_cameras(shared_data / "formats" / "colmap" / "jianzhengjie" / "data")

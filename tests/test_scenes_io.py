@@ -1,0 +1,723 @@
+"""Scene files lose nothing on the way through, and damaged ones end in one line."""
+
+import logging
+import random
+import re
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from aaplug.errors import FormatError, OutputError
+from aaplug.gaussians import (
+    ANTIALIASED,
+    CLASSIC,
+    CONVENTIONS,
+    MIP,
+    Convention,
+    Fusion,
+    Gaussians,
+)
+from aaplug.io.scenes import find_scene, read_scene, write_scene
+
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the real scenes are not here")
+QUICK = 0.5  # s, for a refusal
+NUMPY = {
+    "float": "<f4",
+    "float32": "<f4",
+    "double": "<f8",
+    "uchar": "u1",
+    "short": "<i2",
+    "int32": "<i4",
+}
+
+
+def parameters(degree: int) -> list[str]:
+    rest = [f"f_rest_{i}" for i in range(3 * ((degree + 1) ** 2 - 1))]
+    dc = [f"f_dc_{i}" for i in range(3)]
+    scales = [f"scale_{i}" for i in range(3)]
+    return ["x", "y", "z", *dc, *rest, "opacity", *scales, *(f"rot_{i}" for i in range(4))]
+
+
+@dataclass(frozen=True)
+class File:
+    """A .ply file to be made, whole or damaged."""
+
+    columns: Sequence[tuple[str, str]] = tuple(("float", name) for name in parameters(1))
+    n: int = 5
+    count: str = "5"
+    top: Sequence[str] = ("format binary_little_endian 1.0",)
+    before: tuple[Sequence[str], bytes] = ((), b"")
+    after: tuple[Sequence[str], bytes] = ((), b"")
+    newline: bytes = b"\n"
+
+    @property
+    def rows(self) -> np.ndarray:
+        rng = np.random.default_rng(0)
+        dtype = [(f"{i}", NUMPY[kind]) for i, (kind, _) in enumerate(self.columns)]
+        rows = np.zeros(self.n, dtype)
+        for column in rows.dtype.names or ():
+            rows[column] = rng.uniform(1, 99, self.n)
+        return rows
+
+    @property
+    def header(self) -> bytes:
+        vertex = [f"element vertex {self.count}", *(f"property {t} {n}" for t, n in self.columns)]
+        lines = ["ply", *self.top, *self.before[0], *vertex, *self.after[0], "end_header"]
+        return b"".join(line.encode() + self.newline for line in lines)
+
+    @property
+    def content(self) -> bytes:
+        return self.header + self.before[1] + self.rows.tobytes() + self.after[1]
+
+    def save(self, folder: Path) -> Path:
+        path = folder / "in.ply"
+        path.write_bytes(self.content)
+        return path
+
+
+def plain(*extra: str, degree: int = 1, **changes) -> File:
+    """A file with these comments."""
+    columns = [("float", name) for name in parameters(degree)]
+    top = ["format binary_little_endian 1.0", *(f"comment {text}" for text in extra)]
+    return replace(File(), **{"columns": columns, "top": top, **changes})
+
+
+def filtered(*comments: str) -> File:
+    return plain(
+        *comments, columns=[("float", name) for name in [*parameters(1), "filter_3D", "nx"]]
+    )
+
+
+shuffled = random.Random(0).sample(
+    [*File().columns, ("uchar", "red"), ("double", "weight"), ("short", "id"), ("int32", "class")],
+    len(File().columns) + 4,
+)
+box = ["element chunk 2", "comment of a chunk", "property float lo", "property uchar hi"]
+faces = ["element face 2", "property list uchar int vertex_indices", "property int flags"]
+face_rows = b"\x03" + bytes(range(12)) + bytes(4) + b"\x00" + bytes(4)
+tagged = ["comment made  by hand ", "format binary_little_endian 1.0", "obj_info  a b", "comment c"]
+ROUND_TRIPS = {
+    "plain": File(),
+    "no rows": File(n=0, count="0"),
+    "odd order and types": File(columns=shuffled),
+    "comments": File(top=[*tagged, " ", "comment last"]),
+    "element before": File(before=(box, bytes(range(10)))),
+    "element after": File(after=(box, bytes(range(10)))),
+    "lists before": File(before=(faces, face_rows)),
+    "lists after": File(after=(faces, face_rows)),
+    "CRLF": File(newline=b"\r\n", top=tagged),
+    "long type names": plain(columns=[("float32", n) for _, n in File().columns]),
+    "filter_3D": filtered("hello"),
+    "record": plain("aaplug fused=mip convention=antialiased k=1", "aaplug was here"),
+    **{f"degree {d}": plain(degree=d) for d in range(4)},
+}
+
+
+def through(scene: Gaussians, folder: Path) -> bytes:
+    write_scene(folder / "out.ply", scene, overwrite=True)
+    return (folder / "out.ply").read_bytes()
+
+
+def comments(content: bytes) -> list[str]:
+    lines = content.split(b"end_header")[0].decode().splitlines()
+    return [line.removeprefix("comment ") for line in lines if line.startswith("comment")]
+
+
+def values(content: bytes, file: File) -> np.ndarray:
+    dtype = [(name, NUMPY[kind]) for kind, name in file.columns]
+    return np.frombuffer(content.split(b"end_header\n")[1], dtype)
+
+
+def random_scene(n: int, degree: int, seed: int = 0) -> Gaussians:
+    rng = torch.Generator().manual_seed(seed)
+    shapes = [(n, 3), (n, 4), (n, 3), (n,), (n, (degree + 1) ** 2, 3)]
+    means, quats, log_scales, logits, sh = (torch.randn(s, generator=rng) for s in shapes)
+    return Gaussians(means, quats, log_scales, logits, sh)
+
+
+def same_values(a: Gaussians, b: Gaussians) -> bool:
+    names = ("means", "quats", "log_scales", "logit_opacities", "sh")
+    return all(torch.equal(getattr(a, name), getattr(b, name)) for name in names)
+
+
+# Round trips
+
+
+@pytest.mark.parametrize("file", ROUND_TRIPS.values(), ids=ROUND_TRIPS.keys())
+def test_an_unchanged_scene_is_written_back_to_the_byte(tmp_path: Path, file: File):
+    assert through(read_scene(file.save(tmp_path)), tmp_path) == file.content
+
+
+@given(st.integers(0, 3), st.integers(0, 20), st.sampled_from([*CONVENTIONS.values()]), st.data())
+@settings(max_examples=60, deadline=None)
+def test_what_was_written_is_read(tmp_path_factory, degree, n, convention, data):
+    folder = tmp_path_factory.getbasetemp()
+    word = st.text("abcXYZ019._-+", min_size=1, max_size=8)
+    pairs = st.dictionaries(word.map(lambda key: "k" + key), word, max_size=3)
+    fusion = st.builds(Fusion, word, pairs)
+    scene = random_scene(n, degree, seed=n)
+    fused = tuple(data.draw(st.lists(fusion, max_size=2)))
+    filter_3d = torch.rand(n) if data.draw(st.booleans()) else None
+    scene = replace(scene, convention=convention, fused=fused, filter_3d=filter_3d)
+    content = through(scene, folder)
+    again = read_scene(folder / "out.ply")
+    assert same_values(again, scene)
+    assert (again.convention, again.fused) == (convention, fused)
+    assert (again.filter_3d is None) == (filter_3d is None)
+    assert comments(content).count("SplatRenderMode: mip") == convention.compensated
+    write_scene(folder / "again.ply", again, overwrite=True)
+    assert (folder / "again.ply").read_bytes() == content
+
+
+def test_columns_go_where_inria_puts_them(tmp_path: Path):
+    file = plain(degree=2)
+    scene, rows = read_scene(file.save(tmp_path)), values(file.content, file)
+    assert scene.means[:, 2].tolist() == rows["z"].tolist()
+    assert scene.quats[:, 0].tolist() == rows["rot_0"].tolist()
+    assert scene.log_scales[:, 1].tolist() == rows["scale_1"].tolist()
+    assert scene.logit_opacities.tolist() == rows["opacity"].tolist()
+    assert scene.sh.shape == (5, 9, 3)
+    assert scene.sh[:, 0, 2].tolist() == rows["f_dc_2"].tolist()
+    assert scene.sh[:, 1, 0].tolist() == rows["f_rest_0"].tolist()
+    assert scene.sh[:, 8, 0].tolist() == rows["f_rest_7"].tolist()
+    assert scene.sh[:, 1, 1].tolist() == rows["f_rest_8"].tolist()
+    assert scene.sh[:, 3, 2].tolist() == rows["f_rest_18"].tolist()
+
+
+def test_a_scene_without_origin_has_inrias_columns(tmp_path: Path):
+    header = through(random_scene(2, 1), tmp_path).split(b"end_header")[0].decode()
+    names = re.findall(r"property float (\S+)\n", header)
+    order = parameters(1)
+    assert names == [*order[:3], "nx", "ny", "nz", *order[3:]]
+    assert header.startswith("ply\nformat binary_little_endian 1.0\nelement vertex 2\n")
+
+
+def test_only_changed_columns_differ(tmp_path: Path):
+    file = File(columns=shuffled)
+    scene = read_scene(file.save(tmp_path))
+    scene = replace(scene, log_scales=scene.log_scales + torch.tensor([0.0, 1.0, 0.0]))
+    content = through(scene, tmp_path)
+    assert content.startswith(file.header)
+    old, new = values(file.content, file), values(content, file)
+    assert [n for n in old.dtype.names or () if (old[n] != new[n]).any()] == ["scale_1"]
+
+
+@pytest.mark.parametrize("index", [[3, 1], [], [4, 4, 0]])
+def test_chosen_rows_keep_their_unknown_columns(tmp_path: Path, index: list[int]):
+    file = File(columns=shuffled, after=(box, bytes(range(10))))
+    scene = read_scene(file.save(tmp_path))[torch.tensor(index, dtype=torch.int64)]
+    expected = replace(file, count=str(len(index))).header + file.rows[index].tobytes()
+    assert through(scene, tmp_path) == expected + file.after[1]
+
+
+def test_double_precision_is_written_as_float(tmp_path: Path):
+    scene = read_scene(File().save(tmp_path))
+    assert through(scene.to(torch.float64), tmp_path) == File().content
+
+
+def test_fewer_harmonics_drop_their_columns(tmp_path: Path):
+    scene = read_scene(plain(degree=2).save(tmp_path))
+    content = through(replace(scene, sh=scene.sh[:, :4]), tmp_path)
+    assert content.count(b"property float f_rest_") == 9
+    assert torch.equal(read_scene(tmp_path / "out.ply").sh, scene.sh[:, :4])
+
+
+def test_large_scenes_are_copied_in_whole(tmp_path: Path):
+    scene = random_scene(70_000, 0)
+    write_scene(tmp_path / "large.ply", scene)
+    assert same_values(read_scene(tmp_path / "large.ply"), scene)
+
+
+@needs_data
+@pytest.mark.data
+@pytest.mark.parametrize(
+    ("name", "n", "degree"),
+    [
+        ("chair/chair.ply", 49_295, 3),
+        ("splats/train-1000.ply", 1000, 3),
+        ("splats/flowers_lod3_sh2.ply", 26_895, 2),
+        ("small_splats/supersplat_pr291/fruit_drops_minimal.ply", 4721, 3),
+        ("small_splats/metalsplatter/SplatIO/TestData/test-splat.3-points-from-train.ply", 3, 3),
+    ],
+)
+def test_real_scenes_are_written_back_to_the_byte(tmp_path: Path, name, n, degree):
+    path = next(p for p in (DATA / name, DATA / "formats" / name) if p.exists())
+    scene = read_scene(path)
+    assert (len(scene), scene.sh_degree, scene.convention) == (n, degree, CLASSIC)
+    assert through(scene, tmp_path) == path.read_bytes()
+
+
+@needs_data
+@pytest.mark.data
+@pytest.mark.parametrize(
+    ("name", "problem"),
+    [
+        ("formats/splats/guitar.compressed.ply", "compressed"),
+        ("formats/splats/biker.spz", "no known scene format"),
+        ("formats/inria/dngs/model/input.ply", "point cloud or a mesh"),
+        ("formats/small_splats/metalsplatter/PLYIO/TestData/beetle.ascii.ply", "ascii 1.0"),
+        ("formats/small_splats/metalsplatter/PLYIO/TestData/beetle.binary.ply", "lacks f_dc_0"),
+        ("formats/small_splats/cvlab_pc_short/public/pc_short.ply", "14,029 bytes more"),
+    ],
+)
+def test_real_files_that_are_no_scenes_are_refused(name: str, problem: str):
+    with pytest.raises(FormatError, match=problem):
+        read_scene(DATA / name)
+
+
+# Conventions and records
+
+
+@pytest.mark.parametrize(
+    ("file", "convention", "evidence"),
+    [
+        (plain(), CLASSIC, "no tag in the file: assumed classic"),
+        (plain("SplatRenderMode: mip"), MIP, "SplatRenderMode: mip"),
+        (plain("splatrendermode:MIP"), MIP, "MIP"),
+        (plain("SplatRenderMode: default"), CLASSIC, "default"),
+        (plain("SplatRenderMode: antialiased"), ANTIALIASED, "antialiased"),
+        (plain("SplatRenderMode: mip", "SplatRenderMode: default"), CLASSIC, "default"),
+        (plain("SplatRenderMode: fancy"), CLASSIC, "fancy, is unknown"),
+        (plain("antialiased 1"), ANTIALIASED, "antialiased 1"),
+        (plain("antialiased 1", "antialiased 0"), CLASSIC, "antialiased 0"),
+        (plain("SplatRenderMode: mip", "antialiased 0"), MIP, "SplatRenderMode"),
+        (plain("not antialiased 1"), CLASSIC, "no tag"),
+        (filtered("SplatRenderMode: default"), MIP, "filter_3D"),
+        (filtered("aaplug fused=x convention=antialiased"), ANTIALIASED, "aaplug's record"),
+        (plain("aaplug fused=x a=b", "antialiased 1"), ANTIALIASED, "antialiased 1"),
+    ],
+)
+def test_the_strongest_evidence_decides(tmp_path, file, convention, evidence):
+    scene = read_scene(file.save(tmp_path))
+    assert scene.convention == convention
+    assert scene.origin
+    assert evidence in scene.origin.evidence
+
+
+def test_the_user_knows_best(tmp_path: Path):
+    path = filtered("aaplug fused=x convention=mip").save(tmp_path)
+    scene = read_scene(path, convention=ANTIALIASED)
+    assert scene.convention == ANTIALIASED
+    assert scene.origin
+    assert scene.origin.evidence == "given by --convention"
+
+
+def test_the_filter_column_is_read_dropped_and_written(tmp_path: Path):
+    file = filtered()
+    scene = read_scene(file.save(tmp_path))
+    assert scene.filter_3d is not None
+    assert scene.filter_3d.tolist() == values(file.content, file)["filter_3D"].tolist()
+    content = through(replace(scene, filter_3d=scene.filter_3d + 1), tmp_path)
+    assert values(content, file)["filter_3D"].tolist() == (scene.filter_3d + 1).tolist()
+    fused = through(replace(scene, filter_3d=None), tmp_path)
+    assert b"filter_3D" not in fused
+    assert comments(fused) == ["SplatRenderMode: mip"]
+    assert len(fused) == len(file.content) - 5 * 4 - len("property float filter_3D\n") + len(
+        "comment SplatRenderMode: mip\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("before", "convention", "after"),
+    [
+        (["hi", "SplatRenderMode: default"], MIP, ["hi", "SplatRenderMode: mip"]),
+        (["antialiased 0", "splatrendermode: x"], MIP, ["SplatRenderMode: mip"]),
+        (["SplatRenderMode: mip", "hi"], CLASSIC, ["hi"]),
+        (["antialiased 1", "hi"], CLASSIC, ["hi"]),
+        (["antialiased 1", "SplatRenderMode: default"], CLASSIC, None),
+        (["antialiased 1"], ANTIALIASED, None),
+        (["SplatRenderMode: mip", "SplatRenderMode: mip"], MIP, None),
+        (
+            ["SplatRenderMode: mip", "SplatRenderMode: MIP"],
+            ANTIALIASED,
+            ["SplatRenderMode: mip", "aaplug convention=antialiased"],
+        ),
+        (["aaplug convention=antialiased", "SplatRenderMode: mip"], CLASSIC, []),
+    ],
+)
+def test_tags_follow_the_convention(tmp_path, before, convention: Convention, after):
+    scene = read_scene(plain(*before).save(tmp_path))
+    content = through(replace(scene, convention=convention), tmp_path)
+    assert comments(content) == (before if after is None else after)
+    assert read_scene(tmp_path / "out.ply").convention == convention
+
+
+def test_a_new_filter_column_and_convention_come_with_a_tag(tmp_path: Path):
+    scene = replace(read_scene(plain().save(tmp_path)), filter_3d=torch.ones(5), convention=MIP)
+    assert comments(through(scene, tmp_path)) == ["SplatRenderMode: mip"]
+    classic = replace(scene, convention=CLASSIC)
+    assert comments(through(classic, tmp_path)) == ["aaplug convention=classic"]
+
+
+def test_a_fusion_is_recorded_and_read_back(tmp_path: Path):
+    scene = read_scene(plain("hello", "SplatRenderMode: default").save(tmp_path))
+    fusion = Fusion("mip", {"kernel": "0.1", "compensated": "1"})
+    content = through(replace(scene, fused=(fusion,)), tmp_path)
+    record = "aaplug fused=mip kernel=0.1 compensated=1 convention=classic"
+    assert comments(content) == ["hello", "SplatRenderMode: default", record]
+    again = read_scene(tmp_path / "out.ply")
+    assert again.fused == (fusion,)
+    (tmp_path / "twice").mkdir()
+    again = replace(again, fused=(fusion, Fusion("b")), convention=MIP)
+    twice = through(again, tmp_path / "twice")
+    assert comments(twice) == [
+        "hello",
+        "SplatRenderMode: mip",
+        "aaplug fused=mip kernel=0.1 compensated=1 convention=mip",
+        "aaplug fused=b convention=mip",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("comment", "problem"),
+    [
+        ("SplatRenderMode: 2DGS", "2D Gaussians.*not supported yet"),
+        ("aaplug fused=mip convention=fancy", "convention=fancy; known are classic"),
+        ("aaplug fused=mip kernel", "expected key=value"),
+        ("aaplug fused=", "expected key=value"),
+    ],
+)
+def test_comments_that_cannot_be_obeyed_are_refused(tmp_path: Path, comment: str, problem: str):
+    with pytest.raises(FormatError, match=problem):
+        read_scene(plain(comment).save(tmp_path))
+
+
+# Damaged files
+
+
+def without(*missing: str) -> File:
+    return plain(columns=[(t, n) for t, n in File().columns if n not in missing])
+
+
+def with_type(kind: str, column: str) -> File:
+    return plain(columns=[(kind if n == column else t, n) for t, n in File().columns])
+
+
+def with_rest(names: Sequence[str]) -> File:
+    return plain(columns=[("float", n) for n in [*parameters(0), *names]])
+
+
+def extended(*names: str) -> File:
+    return plain(columns=[*File().columns, *(("float", name) for name in names)])
+
+
+BAD_HEADERS = {
+    "count 10^12": (File(count=str(10**12)), "promises .* bytes and it has"),
+    "count 2^63": (File(count=str(2**63)), "impossible count"),
+    "count of 5000 digits": (File(count="9" * 5000), "impossible count '9{60}'"),
+    "count -5": (File(count="-5"), "impossible count '-5'"),
+    "count 5.0": (File(count="5.0"), "impossible count"),
+    "one row too many promised": (File(count="6"), "5 of 6 Gaussians are whole"),
+    "one row too few promised": (File(count="4"), "92 bytes more"),
+    "missing columns": (without("x", "rot_3", "opacity"), "lacks x, opacity, rot_3, which"),
+    "2DGS": (without("scale_2"), "looks like 2DGS, not supported yet"),
+    "double position": (with_type("double", "x"), "x must be float"),
+    "double harmonics": (with_type("double", "f_rest_3"), "f_rest_3 must be float"),
+    "double filter": (
+        plain(columns=[*File().columns, ("double", "filter_3D")]),
+        "filter_3D must be float",
+    ),
+    "duplicate property": (extended("x"), "property of vertex 'x' is declared twice"),
+    "duplicate element": (File(after=(box + box, bytes(20))), "element 'chunk' is declared twice"),
+    "duplicate list": (File(after=([*faces, faces[1]], face_rows)), "declared twice"),
+    "72 f_rest": (with_rest([f"f_rest_{i}" for i in range(72)]), "72 f_rest"),
+    "8 f_rest": (with_rest([f"f_rest_{i}" for i in range(8)]), "8 f_rest"),
+    "f_rest with a gap": (with_rest([f"f_rest_{i}" for i in range(1, 10)]), "not f_rest_0"),
+    "ascii": (File(top=["format ascii 1.0"]), "format is ascii 1.0; only binary_little"),
+    "big endian": (File(top=["format binary_big_endian 1.0"]), "binary_big_endian 1.0; only"),
+    "version": (File(top=["format binary_little_endian 2.0"]), "2.0; only"),
+    "no format": (File(top=[]), "its format is none"),
+    "empty line": (File(top=[*File().top, ""]), "line 3 of the header is not PLY: ''"),
+    "two formats": (File(top=[*File().top, *File().top]), "1.0 and binary"),
+    "unknown type": (File(after=(["element a 1", "property half b"], b"")), "not PLY"),
+    "unknown keyword": (File(top=[*File().top, "surprise"]), "line 3 .* 'surprise'"),
+    "property first": (File(top=[*File().top, "property float q"]), "not PLY"),
+    "late obj_info": (File(after=(["obj_info late"], b"")), "cannot be read as .ply"),
+    "non-ASCII": (plain("é"), "line 3 of the header is not ASCII"),
+    "1001 lines": (plain(*["c"] * 1000), "lines, more than the 1000"),
+    "long header": (plain(*["c" * 1000] * 200), "no line 'end_header' in its first 131,072"),
+    "old Mac line ends": (File(newline=b"\r"), "first line"),
+    "trailing bytes": (File(after=([], b"x")), "1 bytes more"),
+    "trailing after lists": (File(after=(faces, face_rows + b"x")), "1 bytes after"),
+    "short lists": (File(after=(faces, face_rows[:-1])), "cannot be read as .ply"),
+    "faces 10^12": (
+        File(after=(["element face 1000000000000", *faces[1:]], face_rows)),
+        "is cut short",
+    ),
+    "list of 2^31": (
+        File(after=(["element face 1", "property list int int v"], b"\xff\xff\xff\x7f")),
+        "cannot be read as .ply",
+    ),
+    "empty vertex": (File(columns=[]), "lacks x"),
+}
+
+
+@pytest.mark.parametrize(("file", "problem"), BAD_HEADERS.values(), ids=BAD_HEADERS.keys())
+def test_bad_headers_are_one_quick_line(tmp_path: Path, file: File, problem: str):
+    path = file.save(tmp_path)
+    start = time.perf_counter()
+    with pytest.raises(FormatError, match=problem) as caught:
+        read_scene(path)
+    assert time.perf_counter() - start < QUICK
+    assert "\n" not in str(caught.value)
+    assert str(caught.value).startswith(str(path))
+
+
+def test_a_list_among_the_gaussians_is_named(tmp_path: Path):
+    path = tmp_path / "in.ply"
+    header = File().header.replace(b"property float x\n", b"property list uchar float x\n")
+    path.write_bytes(header + File().rows.tobytes())
+    with pytest.raises(FormatError, match="vertex property x is a list"):
+        read_scene(path)
+
+
+def test_a_file_without_vertices_is_refused(tmp_path: Path):
+    path = tmp_path / "in.ply"
+    path.write_bytes(b"ply\nformat binary_little_endian 1.0\nend_header\n")
+    with pytest.raises(FormatError, match="no element 'vertex'"):
+        read_scene(path)
+
+
+@pytest.mark.parametrize("kind", ["header line", "body"])
+def test_64_mib_of_nothing_is_refused_at_once(tmp_path: Path, kind: str):
+    path = tmp_path / "in.ply"
+    start = b"ply\nformat binary_little_endian 1.0\ncomment " if kind == "header line" else b"p"
+    with path.open("wb") as stream:
+        stream.write(start)
+        stream.write(b"a" * (64 << 20))
+    begin = time.perf_counter()
+    with pytest.raises(FormatError):
+        read_scene(path)
+    assert time.perf_counter() - begin < QUICK
+
+
+@pytest.mark.parametrize("file", [File(), File(newline=b"\r\n"), File(n=0, count="0")])
+def test_a_header_cut_anywhere_is_refused(tmp_path: Path, file: File):
+    path = tmp_path / "in.ply"
+    for size in range(len(file.header)):
+        path.write_bytes(file.content[:size])
+        with pytest.raises(FormatError, match=r"in\.ply: "):
+            read_scene(path)
+
+
+@pytest.mark.parametrize(("kept", "whole"), [(0, 0), (91, 0), (92, 1), (300, 3), (459, 4)])
+def test_a_cut_body_says_how_much_is_whole(tmp_path: Path, kept: int, whole: int):
+    path = tmp_path / "in.ply"
+    path.write_bytes(File().header + File().rows.tobytes()[:kept])
+    sizes = f"{len(File().content)} bytes and it has {len(File().header) + kept}"
+    with pytest.raises(FormatError) as caught:
+        read_scene(path)
+    assert sizes in str(caught.value).replace(",", "")
+    assert f"{whole} of 5 Gaussians are whole" in str(caught.value)
+
+
+def test_whole_rows_are_counted_after_the_elements_before(tmp_path: Path):
+    path = tmp_path / "in.ply"
+    file = File(before=(box, bytes(10)))
+    path.write_bytes(file.content[:-1])
+    with pytest.raises(FormatError, match="4 of 5 Gaussians are whole"):
+        read_scene(path)
+
+
+@given(st.data())
+@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+def test_flipped_bytes_in_a_header_end_in_a_scene_or_one_error(tmp_path_factory, data):
+    file = plain("SplatRenderMode: mip", "aaplug fused=x convention=mip", after=(faces, face_rows))
+    content = bytearray(file.content)
+    for _ in range(data.draw(st.integers(1, 3))):
+        at = data.draw(st.integers(0, len(file.header) - 1))
+        content[at] = data.draw(st.integers(0, 255) | st.sampled_from(b"0123456789 \n\r=xyz"))
+    path = tmp_path_factory.getbasetemp() / "flipped.ply"
+    path.write_bytes(content)
+    try:
+        scene = read_scene(path)
+    except FormatError:
+        return
+    assert len(scene) == 5
+    assert through(scene, tmp_path_factory.getbasetemp()) == content
+
+
+@given(st.binary(max_size=300))
+@settings(deadline=None)
+def test_noise_after_ply_is_refused(tmp_path_factory, noise: bytes):
+    path = tmp_path_factory.getbasetemp() / "noise.ply"
+    path.write_bytes(b"ply\n" + noise)
+    with pytest.raises(FormatError):
+        read_scene(path)
+
+
+def test_more_gaussians_than_allowed_are_refused(tmp_path: Path):
+    path = File().save(tmp_path)
+    assert len(read_scene(path, max_gaussians=5)) == 5
+    with pytest.raises(FormatError, match="holds 5 Gaussians and the limit is 4; raise --max"):
+        read_scene(path, max_gaussians=4)
+
+
+# Unusable values
+
+
+def damaged(folder: Path, file: File, **cells: tuple[int, float]) -> Path:
+    path = folder / "in.ply"
+    rows = values(file.content, file).copy()
+    for column, (row, value) in cells.items():
+        rows[column][row] = value
+    path.write_bytes(file.header + rows.tobytes())
+    return path
+
+
+@pytest.mark.parametrize("column", [*parameters(1), "filter_3D"])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_bad_number_is_found_in_every_column(tmp_path: Path, column: str, value: float):
+    path = damaged(tmp_path, filtered(), **{column: (3, value)})
+    what = "NaN" if np.isnan(value) else "Inf"
+    with pytest.raises(FormatError, match=f"row 3 has {what} in {column}[;,]?.* pass --drop-bad"):
+        read_scene(path)
+    assert read_scene(path, drop_bad=True).origin.rows.tolist() == [0, 1, 2, 4]  # type: ignore[union-attr]
+
+
+def test_a_bad_number_in_an_unknown_column_is_kept(tmp_path: Path):
+    path = damaged(tmp_path, filtered(), nx=(3, np.nan))
+    assert through(read_scene(path), tmp_path) == path.read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("length", "problem"), [(0.0, "length zero"), (1e-20, "length zero"), (3e38, "too long")]
+)
+def test_a_quaternion_without_direction_is_refused(tmp_path: Path, length: float, problem: str):
+    cells = {f"rot_{i}": (1, length) for i in range(4)}
+    path = damaged(tmp_path, File(), **cells)
+    with pytest.raises(FormatError, match=f"row 1 has a quaternion.*{problem}"):
+        read_scene(path)
+    assert len(read_scene(path, drop_bad=True)) == 4
+
+
+def test_a_negative_filter_is_refused(tmp_path: Path):
+    with pytest.raises(FormatError, match="row 0 has a negative filter_3D"):
+        read_scene(damaged(tmp_path, filtered(), filter_3D=(0, -1.0)))
+
+
+def test_dropped_rows_are_counted_aloud_and_stay_dropped(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+):
+    file = File(columns=shuffled)
+    rows = file.rows.copy()
+    names = [name for _, name in file.columns]
+    for column, row in [("x", 1), ("x", 2), ("opacity", 2)]:
+        rows[str(names.index(column))][row] = np.nan
+    path = tmp_path / "in.ply"
+    path.write_bytes(file.header + rows.tobytes())
+    with pytest.raises(
+        FormatError, match=r"row 1 \(and 1 more\) has NaN in x, row 2 has NaN in op"
+    ):
+        read_scene(path)
+    with caplog.at_level(logging.WARNING, logger="aaplug"):
+        scene = read_scene(path, drop_bad=True)
+    assert "left out 2 of 5 Gaussians (NaN in x: 2, NaN in opacity: 1)" in caplog.text
+    expected = replace(file, count="3").header + rows[[0, 3, 4]].tobytes()
+    assert through(scene, tmp_path) == expected
+
+
+# Files and folders
+
+
+@pytest.mark.parametrize(
+    ("name", "problem"),
+    [
+        ("missing.ply", "cannot be read: no such file"),
+        (".", "is a folder"),
+        ("empty.ply", "is empty"),
+        ("junk.ply", r"no known scene format; aaplug reads \.ply"),
+        ("nul\0.ply", "cannot be read"),
+    ],
+)
+def test_what_is_no_scene_file_is_refused(tmp_path: Path, name: str, problem: str):
+    (tmp_path / "empty.ply").touch()
+    (tmp_path / "junk.ply").write_bytes(b"junk")
+    with pytest.raises(FormatError, match=problem):
+        read_scene(tmp_path / name)
+
+
+def test_formats_are_told_by_content(tmp_path: Path):
+    path = tmp_path / "scene.dat"
+    path.write_bytes(File().content)
+    assert len(read_scene(path)) == 5
+
+
+def test_a_suffix_nobody_writes_is_refused(tmp_path: Path):
+    with pytest.raises(OutputError, match=r"can be written: \.ply"):
+        write_scene(tmp_path / "out.spz", random_scene(1, 0))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_scene_is_never_written_over_its_own_file(tmp_path: Path):
+    path = File().save(tmp_path)
+    (tmp_path / "link.ply").symlink_to(path)
+    scene = read_scene(path)
+    for output in (path, tmp_path / "link.ply"):
+        with pytest.raises(OutputError, match="is also the input"):
+            write_scene(output, scene, overwrite=True)
+    assert path.read_bytes() == File().content
+
+
+def test_an_existing_scene_needs_overwrite(tmp_path: Path):
+    write_scene(tmp_path / "out.ply", random_scene(1, 0))
+    with pytest.raises(OutputError, match="--overwrite"):
+        write_scene(tmp_path / "out.ply", random_scene(2, 0))
+    assert len(read_scene(tmp_path / "out.ply")) == 1
+    write_scene(tmp_path / "out.ply", random_scene(2, 0), overwrite=True)
+    assert len(read_scene(tmp_path / "out.ply")) == 2
+
+
+def test_a_failure_while_writing_leaves_the_old_scene(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    from aaplug.io.scenes import ply
+
+    def half(self: object, stream) -> None:
+        stream.write(b"ply\nhalf")
+
+    path = tmp_path / "out.ply"
+    write_scene(path, random_scene(1, 0))
+    before = path.read_bytes()
+    monkeypatch.setattr(ply._Verbatim, "write", half)
+    with pytest.raises(OutputError, match="8 bytes were written instead of"):
+        write_scene(path, random_scene(2, 0), overwrite=True)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def inria_model(folder: Path, *iterations: str) -> Path:
+    for iteration in iterations:
+        scene = folder / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply"
+        scene.parent.mkdir(parents=True)
+        scene.write_bytes(File().content)
+    (folder / "point_cloud" / "iteration_99999").mkdir(parents=True)
+    return folder
+
+
+def test_a_model_folder_means_its_last_iteration(tmp_path: Path):
+    model = inria_model(tmp_path, "7000", "30000", "best")
+    assert find_scene(model).parent.name == "iteration_30000"
+    assert find_scene(model, 7000).parent.name == "iteration_7000"
+    assert len(read_scene(find_scene(model))) == 5
+    with pytest.raises(FormatError, match="no iteration 5; it has 7000, 30000"):
+        find_scene(model, 5)
+
+
+def test_a_folder_without_scenes_is_refused(tmp_path: Path):
+    with pytest.raises(FormatError, match="holds no point_cloud/iteration_<N>"):
+        find_scene(inria_model(tmp_path))
+
+
+def test_a_file_is_its_own_scene(tmp_path: Path):
+    path = File().save(tmp_path)
+    assert find_scene(path) == path
+    assert find_scene(tmp_path / "missing.ply") == tmp_path / "missing.ply"
