@@ -6,6 +6,7 @@ a pair (images too small) or infinite (equal images) is None, never a number tha
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -37,7 +38,7 @@ def ssim(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> float 
     """Structural similarity as Wang et al. 2004 define it; None for images smaller than the window."""
     if min(image.shape[:2]) < SSIM_WINDOW:
         return None
-    value = structural_similarity(
+    value: Any = structural_similarity(
         image.double().numpy(),
         truth.double().numpy(),
         gaussian_weights=True,

@@ -97,11 +97,11 @@ def _held_inside(
 
 def _sh_basis(directions: Float[Tensor, "m 3"], coefficients: int) -> list[Float[Tensor, " m"]]:
     x, y, z = directions.unbind(dim=1)
+    xx, yy, zz = x * x, y * y, z * z
     basis = [torch.full_like(x, SH_C0)]
     if coefficients > 1:
         basis += [-SH_C1 * y, SH_C1 * z, -SH_C1 * x]
     if coefficients > 4:
-        xx, yy, zz = x * x, y * y, z * z
         basis += [SH_C2[0] * x * y, -SH_C2[0] * y * z, SH_C2[1] * (2 * zz - xx - yy)]
         basis += [-SH_C2[0] * x * z, SH_C2[2] * (xx - yy)]
     if coefficients > 9:

@@ -5,9 +5,10 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
+from rich.markup import escape
 from rich.table import Table
 
-from aaplug.metrics import METRICS
+from aaplug.metrics import METRICS, Metric
 
 CEILING = "training size, resampled"  # the row that every table holds
 
@@ -62,22 +63,25 @@ def scale_name(scale: float) -> str:
     return str(fraction) if exact else f"{scale:g}"
 
 
-def table(report: Report) -> Table:
-    """Metrics by recipe and scale, the best recipe of a column in bold, and the time a view took."""
-    grid = Table(title=f"{report.protocol['truth']}, {report.protocol['views']} views")
-    grid.add_column("recipe")
+def tables(report: Report) -> list[Table]:
+    """A table a metric and one of seconds a view, recipes down and scales across; the best of a column is bold."""
+    what = f"{report.protocol['truth']}, {report.protocol['views']} views"
+    grids = []
     for metric in METRICS.values():
-        for scale in report.scales:
-            unit = f" [dim]{metric.unit}[/]" if metric.unit else ""
-            grid.add_column(f"{metric.name} {scale_name(scale)}{unit}", justify="right")
-    for scale in report.scales:
-        grid.add_column(f"s {scale_name(scale)}", justify="right", style="dim")
-    best = {(m, s): _best(report, m, s) for m in METRICS for s in report.scales}
+        unit = f" [{metric.unit}]" if metric.unit else ""
+        best = [_best(report, metric.name, scale) for scale in report.scales]
+        grid = _grid(f"{metric.name}{unit}, {what}", report)
+        for recipe in report.recipes:
+            cells = [
+                _cell(mean(report.select(recipe, scale), metric.name), metric, top)
+                for scale, top in zip(report.scales, best, strict=True)
+            ]
+            grid.add_row(recipe, *cells, style="italic" if recipe == CEILING else None)
+        grids.append(grid)
+    times = _grid("seconds a view", report)
     for recipe in report.recipes:
-        cells = [_cell(report, recipe, m, s, best[m, s]) for m in METRICS for s in report.scales]
-        times = [f"{_seconds(report, recipe, s):.2f}" for s in report.scales]
-        grid.add_row(recipe, *cells, *times, style="italic" if recipe == CEILING else None)
-    return grid
+        times.add_row(recipe, *[f"{_seconds(report, recipe, s):.2f}" for s in report.scales])
+    return [*grids, times]
 
 
 def results(report: Report) -> dict[str, Any]:
@@ -124,9 +128,16 @@ def _best(report: Report, metric: str, scale: float) -> float | None:
     return max(known) if METRICS[metric].higher_is_better else min(known)
 
 
-def _cell(report: Report, recipe: str, metric: str, scale: float, best: float | None) -> str:
-    value = mean(report.select(recipe, scale), metric)
+def _grid(title: str, report: Report) -> Table:
+    grid = Table(title=escape(title), title_justify="left")
+    grid.add_column("recipe", no_wrap=True)
+    for scale in report.scales:
+        grid.add_column(scale_name(scale), justify="right", no_wrap=True)
+    return grid
+
+
+def _cell(value: float | None, metric: Metric, best: float | None) -> str:
     if value is None:
         return "–"
-    text = f"{value:.2f}" if METRICS[metric].unit == "dB" else f"{value:.4f}"
+    text = f"{value:.2f}" if metric.unit == "dB" else f"{value:.4f}"
     return f"[bold]{text}[/]" if value == best else text

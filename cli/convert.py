@@ -4,13 +4,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
-from aaplug_cli.console import print_json, say
-from aaplug_cli.options import CameraOptions, SceneOptions, flag
-
 from aaplug.conversion import FORMS, default_form, describe
 from aaplug.conversion import convert as fuse
 from aaplug.io.atomic import check_output
 from aaplug.io.scenes import find_scene, write_scene
+
+from .console import print_json, say
+from .options import CameraOptions, SceneOptions, flag
 
 
 @dataclass(frozen=True)

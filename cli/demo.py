@@ -6,9 +6,6 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from aaplug_cli.console import out, progress, say
-from aaplug_cli.evaluate import write_results
-from aaplug_cli.files import make_folder, refuse_existing
 from jaxtyping import Float
 from torch import Tensor
 
@@ -25,7 +22,11 @@ from aaplug.io.images import quantise, read_image, resampled, write_png
 from aaplug.io.scenes import read_scene, write_scene
 from aaplug.pipeline import learn, render
 from aaplug.recipes import find_recipe
-from aaplug.report import scale_name, table
+from aaplug.report import scale_name, tables
+
+from .console import out, progress, say
+from .evaluate import write_results
+from .files import make_folder, refuse_existing
 
 SCALES = (1.0, 0.5, 0.25, 0.125)
 RECIPES = ("classic", "mip", "matched", "auto")
@@ -66,7 +67,7 @@ def demo(options: Demo) -> int:
         with progress("measuring", "views") as tell:
             report = measure(scene, training, task, progress=tell)
     write_results(report, options.output, options.overwrite)
-    out.print(table(report))
+    out.print(*tables(report))
     say(f"look at {options.output / names[1]}")
     return 0
 
@@ -76,13 +77,25 @@ def _sheet(
 ) -> Float[Tensor, "H W 3"]:
     assert view.photo is not None
     photo = quantise(read_image(view.photo, WHITE))
-    rows = []
+    classic = find_recipe("classic")
+    rows, left, top, right, bottom = [], *_box(render(scene, view, classic, training).alpha)
     for scale in SCALES:
         camera = view.scaled(scale)
-        shown = [
+        images = [resampled(photo, scale)] + [
             render(drawn, camera, find_recipe(name), training, background=WHITE).rgb
             for drawn, name in ((scene, "classic"), (scene, "auto"), (converted, "mip"))
         ]
+        y = slice(round(top * scale), round(bottom * scale))
+        x = slice(round(left * scale), round(right * scale))
         label = f"{scale_name(scale)}: {camera.width}x{camera.height}"
-        rows.append((label, [resampled(photo, scale), *shown]))
+        rows.append((label, [image[y, x] for image in images]))
     return contact_sheet(COLUMNS, rows)
+
+
+def _box(alpha: Float[Tensor, "h w"]) -> tuple[int, int, int, int]:
+    """Left, top, right and bottom of what is drawn, on whole pixels of the smallest scale."""
+    rows, columns = (alpha > 0.5).any(dim=1).nonzero(), (alpha > 0.5).any(dim=0).nonzero()
+    step = round(1 / min(SCALES))
+    low = [int(side.min()) // step * step for side in (columns, rows)]
+    high = [-(-(int(side.max()) + 1) // step) * step for side in (columns, rows)]
+    return low[0], low[1], high[0], high[1]

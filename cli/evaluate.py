@@ -9,9 +9,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
-from aaplug_cli.console import out, print_json, progress, say
-from aaplug_cli.files import make_folder, refuse_existing
-from aaplug_cli.options import CameraOptions, RenderOptions, SceneOptions, flag
 
 from aaplug.cameras import Camera
 from aaplug.evaluation import Task
@@ -19,7 +16,11 @@ from aaplug.evaluation import evaluate as measure
 from aaplug.gaussians import Gaussians
 from aaplug.io.atomic import replacing
 from aaplug.recipes import RECIPES, find_recipe
-from aaplug.report import Report, per_view, results, table
+from aaplug.report import Report, per_view, results, tables
+
+from .console import out, print_json, progress, say
+from .files import make_folder, refuse_existing
+from .options import CameraOptions, RenderOptions, SceneOptions, flag
 
 HASH_BLOCK = 1 << 20  # bytes read at once
 
@@ -73,7 +74,7 @@ def evaluate(options: Evaluate) -> int:
     if options.json:
         print_json(results(report))
     else:
-        out.print(table(report))
+        out.print(*tables(report))
     return 0
 
 

@@ -4,8 +4,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-from aaplug_cli.console import out, print_json
-from aaplug_cli.options import CameraOptions, SceneOptions
 from rich.markup import escape
 from rich.table import Table
 
@@ -13,6 +11,9 @@ from aaplug.conversion import describe
 from aaplug.filters import NYQUIST_VARIANCE
 from aaplug.gaussians import Gaussians
 from aaplug.interfaces import Training
+
+from .console import out, print_json
+from .options import CameraOptions, SceneOptions
 
 
 @dataclass(frozen=True)

@@ -9,14 +9,15 @@ from collections.abc import Sequence
 from importlib.metadata import version
 
 import tyro
-from aaplug_cli import console
-from aaplug_cli.convert import Convert, convert
-from aaplug_cli.demo import Demo, demo
-from aaplug_cli.evaluate import Evaluate, evaluate
-from aaplug_cli.info import Info, info
-from aaplug_cli.render import Render, render
 
 from aaplug.errors import AaplugError
+
+from . import console
+from .convert import Convert, convert
+from .demo import Demo, demo
+from .evaluate import Evaluate, evaluate
+from .info import Info, info
+from .render import Render, render
 
 FAILED, REFUSED, INTERRUPTED = 1, 2, 130
 VERBS = {Info: info, Convert: convert, Render: render, Evaluate: evaluate, Demo: demo}

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
-from aaplug_cli.console import say
 
 from aaplug.cameras import BLACK, WHITE, Camera, CameraSet
 from aaplug.conversion import describe
@@ -22,6 +21,8 @@ from aaplug.pipeline import learn
 from aaplug.rasterizers import RASTERIZERS
 from aaplug.recipes import SAMPLING
 from aaplug.sampling import MIN_SEEN_SHARE, check_frame
+
+from .console import say
 
 Quality = Literal["fast", "balanced", "best"]
 Rate = Literal["global", "sharpest", "interval"]

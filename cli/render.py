@@ -7,9 +7,6 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
-from aaplug_cli.console import print_json, progress, say
-from aaplug_cli.files import make_folder, refuse_existing
-from aaplug_cli.options import CameraOptions, RenderOptions, SceneOptions, flag
 
 from aaplug.cameras import Camera
 from aaplug.errors import OutputError, UsageError, listing
@@ -19,6 +16,10 @@ from aaplug.io.images import write_png
 from aaplug.pipeline import render as render_view
 from aaplug.pipeline import smooth
 from aaplug.recipes import RECIPES, Recipe, find_recipe
+
+from .console import print_json, progress, say
+from .files import make_folder, refuse_existing
+from .options import CameraOptions, RenderOptions, SceneOptions, flag
 
 MAX_SIDE = 16384  # px
 

@@ -220,7 +220,7 @@ def _pass(
     kept = 1 - alpha
     for k in range(len(splats)):
         torch.mul(steps[k], kept[k], out=steps[k + 1])
-    after = torch.nn.functional.threshold_(steps[1:], BELOW_MIN_TRANSMITTANCE, 0.0)
+    after = torch.threshold_(steps[1:], BELOW_MIN_TRANSMITTANCE, 0.0)
     weight = alpha.mul_(steps[:-1]).mul_(after > 0)
     colour = torch.nn.functional.pad(splats[..., RGB], (0, 1), value=1.0)
     total.baddbmm_(weight.permute(1, 2, 0), colour.transpose(0, 1))
@@ -236,5 +236,5 @@ def _alphas(
     v = torch.stack([vx * dx + vy * dy, vx, vy], dim=-1).flatten(0, 1) @ local
     exponent = u.square_().addcmul_(v, v).neg_().add_(splats[..., LOG2_OPACITY].reshape(-1, 1))
     alpha = exponent.clamp_(min=LOG2_SILENT).exp2_()
-    alpha = torch.nn.functional.threshold_(alpha, BELOW_MIN_ALPHA, 0.0).clamp_(max=MAX_ALPHA)
+    alpha = torch.threshold_(alpha, BELOW_MIN_ALPHA, 0.0).clamp_(max=MAX_ALPHA)
     return alpha.view(*splats.shape[:2], -1)

@@ -22,9 +22,8 @@ from aaplug.errors import FormatError
 JSON_LIMIT = 64 * 2**20  # bytes: 100 times the largest camera file met so far
 HEAD_LIMIT = 64 * 2**10  # bytes: enough to meet an entry's keys when a file's format is guessed
 MAX_SIDE = 65536  # px: a longer side is a mistake, not a photograph
-ORTHONORMAL = (
-    1e-3  # how far R·Rᵀ may be from the identity, by entry, and still be meant as a rotation
-)
+MAX_FOCAL = 1e9  # px: no lens sees so little, and what follows from it stays finite
+ORTHONORMAL = 1e-3  # the most that an entry of R·Rᵀ may be off the identity's
 
 
 @dataclass(frozen=True)
