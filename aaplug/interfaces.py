@@ -8,7 +8,7 @@ input.  A plug-in is one file and one line in its folder's `__init__`; the laws 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import median
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from aaplug.cameras import Camera
 from aaplug.gaussians import Convention, Gaussians
@@ -33,6 +33,7 @@ class Training:
         return camera.focal / trained
 
 
+@runtime_checkable
 class WorldFilter(Protocol):
     """Changes scales and opacities in the world, before a view is chosen, and records itself in `Gaussians.fused`."""
 
@@ -41,6 +42,7 @@ class WorldFilter(Protocol):
         ...
 
 
+@runtime_checkable
 class ScreenFilter(Protocol):
     """Changes the covariances and opacities of one view's splats."""
 
@@ -53,6 +55,7 @@ class ScreenFilter(Protocol):
         ...
 
 
+@runtime_checkable
 class Rasterizer(Protocol):
     """Composites splats front to back over a background.
 

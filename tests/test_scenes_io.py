@@ -157,7 +157,7 @@ def test_an_unchanged_scene_is_written_back_to_the_byte(tmp_path: Path, file: Fi
 
 
 @given(st.integers(0, 3), st.integers(0, 20), st.sampled_from([*CONVENTIONS.values()]), st.data())
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 def test_what_was_written_is_read(tmp_path_factory, degree, n, convention, data):
     folder = tmp_path_factory.getbasetemp()
     word = st.text("abcXYZ019._-+", min_size=1, max_size=8)

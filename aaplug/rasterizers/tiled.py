@@ -162,7 +162,7 @@ def _reaches(
 
 def _composite(
     drawing: Float[Tensor, "m 10"], bins: Bins, grid: tuple[int, int]
-) -> Float[Tensor, "t P 4"]:
+) -> Float[Tensor, "all P 4"]:
     """Premultiplied colour and alpha of every pixel of every tile."""
     image = drawing.new_zeros(grid[0] * grid[1], TILE * TILE, 4)
     order = torch.sort(bins.counts, descending=True).indices[: int((bins.counts > 0).sum())]
@@ -176,7 +176,7 @@ def _composite_block(
     bins: Bins,
     tiles: Int[Tensor, " t"],
     columns: int,
-    image: Float[Tensor, "t P 4"],
+    image: Float[Tensor, "all P 4"],
 ) -> None:
     """Composite some tiles, longest first, into the image; tiles leave when they are saturated or drawn out."""
     first, counts = bins.first[tiles], bins.counts[tiles]

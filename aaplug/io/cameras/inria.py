@@ -167,5 +167,9 @@ def _renamed(cameras: Sequence[Camera]) -> list[Camera]:
 
 def _times_met(names: Sequence[str]) -> list[int]:
     """How often each name has been met by its place in the list, itself included."""
-    met = Counter()
-    return [met.update([name]) or met[name] for name in names]
+    met: Counter[str] = Counter()
+    times = []
+    for name in names:
+        met[name] += 1
+        times.append(met[name])
+    return times

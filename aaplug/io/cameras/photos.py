@@ -14,22 +14,9 @@ from aaplug.errors import FormatError, UsageError, listing
 from aaplug.io.cameras.values import MAX_SIDE, Place
 from aaplug.io.images import image_size
 
-SUFFIXES = (
-    ".png",
-    ".jpg",
-    ".jpeg",
-    ".PNG",
-    ".JPG",
-    ".JPEG",
-    ".webp",
-    ".tif",
-    ".tiff",
-    ".bmp",
-    ".exr",
-)
-SAME_SHAPE = (
-    0.01  # how far a photo's aspect may be from its camera's: rounding of small sizes, no more
-)
+COMMON = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")  # tried for names without a suffix
+SUFFIXES = (*COMMON, ".webp", ".tif", ".tiff", ".bmp", ".exr")  # what counts as one
+SAME_SHAPE = 0.01  # how far rounding may take a small photo's aspect from its camera's
 
 Size = tuple[int, int]
 
@@ -53,7 +40,7 @@ class PhotoFolder:
         """
         _refuse_escape(name, place)
         bare = without_suffix(name)
-        tries = (name, *(bare + suffix for suffix in SUFFIXES))
+        tries = (name, *(bare + suffix for suffix in COMMON))
         found = next((p for p in (self.folder / t for t in tries) if os.path.isfile(p)), None)
         if found is not None and not _within(found, self.home):
             raise place.error(

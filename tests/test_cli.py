@@ -1,0 +1,350 @@
+"""The command line as its users meet it: words, files, exit codes, one-line errors that leave nothing behind."""
+
+import json
+import math
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from aaplug.cameras import BLACK
+from aaplug.io.cameras import read_cameras
+from aaplug.io.images import image_size, write_png
+from aaplug.io.scenes import read_scene, write_scene
+from aaplug.pipeline import learn, render
+from aaplug.recipes import RECIPES
+from aaplug_cli.main import main
+from tests.conftest import make_camera, make_scene
+
+EYES = {"train": [(0.0, -4.0, 0.0), (2.0, -3.5, 1.0), (-3.0, -3.0, 0.5)], "test": [(1.0, -4.0, 0.0)]}
+SIZE = (64, 48)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory) -> Path:
+    """A folder with scene.ply, three training cameras and a test camera with its photograph."""
+    folder = tmp_path_factory.mktemp("dataset")
+    write_scene(folder / "scene.ply", make_scene(150))
+    for split, eyes in EYES.items():
+        write_transforms(folder, split, eyes)
+    (folder / "test").mkdir()
+    write_png(folder / "test" / "r_0.png", torch.zeros(SIZE[1], SIZE[0], 3))
+    cameras = read_cameras(folder)
+    scene = read_scene(folder / "scene.ply")
+    image = render(scene, cameras.test[0], RECIPES["classic"], learn(scene, cameras.train)).rgb
+    write_png(folder / "test" / "r_0.png", image, overwrite=True)
+    return folder
+
+
+@pytest.fixture
+def cli(dataset, tmp_path, monkeypatch, capsys):
+    """Run the program in a fresh folder holding a copy of the data set; gives (exit code, stdout, stderr)."""
+    shutil.copytree(dataset, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+
+    def run(words: str) -> tuple[int, str, str]:
+        with pytest.raises(SystemExit) as stop:
+            main(words.split())
+        printed = capsys.readouterr()
+        return int(stop.value.code or 0), printed.out, printed.err
+
+    return run
+
+
+def write_transforms(folder: Path, split: str, eyes: list[tuple[float, float, float]]) -> None:
+    cameras = [make_camera(eye, SIZE) for eye in eyes]
+    flip = np.diag([1.0, -1.0, -1.0, 1.0])  # Blender looks along −z with y up
+    frames = [
+        {"file_path": f"./{split}/r_{i}", "transform_matrix": (np.linalg.inv(c.cam_from_world) @ flip).tolist()}
+        for i, c in enumerate(cameras)
+    ]  # fmt: skip
+    angle = 2 * math.atan(0.5 * SIZE[0] / cameras[0].fx)
+    data = {"camera_angle_x": angle, "w": SIZE[0], "h": SIZE[1], "frames": frames}
+    (folder / f"transforms_{split}.json").write_text(json.dumps(data))
+
+
+# what works
+
+
+def test_render_writes_a_view_at_a_scale(cli):
+    code, out, err = cli("render scene.ply --cameras . -o out --scale 0.5")
+    assert (code, out) == (0, "")
+    assert image_size(Path("out/r_0.png")) == (32, 24)
+    assert "recipe: auto for a classic scene, 1×1 sample a pixel, 1 view at 32x24" in err
+    assert "background: black" in err
+
+
+@pytest.mark.parametrize(
+    ("resolution", "size"), [("40x40", (40, 40)), ("-1x24", (32, 24)), ("128x-1", (128, 96))]
+)
+def test_render_writes_a_resolution(cli, resolution, size):
+    assert cli(f"render scene.ply --cameras . -o one.png --resolution {resolution}")[0] == 0
+    assert image_size(Path("one.png")) == size
+
+
+def test_render_writes_16_bits(cli):
+    assert cli("render scene.ply --cameras . -o one.png --bit-depth 16")[0] == 0
+    pixels = cv2.imread("one.png", cv2.IMREAD_UNCHANGED)
+    assert pixels.dtype == np.uint16
+    assert len(np.unique(pixels)) > 256
+
+
+def test_render_selects_views(cli):
+    code, out, _ = cli("render scene.ply --cameras . -o out --views train --scale 0.25 --json")
+    images = json.loads(out)["images"]
+    assert code == 0
+    assert [image["view"] for image in images] == ["r_0", "r_1", "r_2"]
+    assert all(Path(image["file"]).is_file() for image in images)
+
+
+def test_render_at_the_training_size_is_the_classic_render(cli):
+    cli("render scene.ply --cameras . -o auto.png --bit-depth 16")
+    cli("render scene.ply --cameras . -o classic.png --bit-depth 16 --recipe classic")
+    assert Path("auto.png").read_bytes() == Path("classic.png").read_bytes()
+
+
+def test_render_one_file_of_cameras_serves_as_both(cli):
+    assert cli("render scene.ply --cameras transforms_test.json -o one.png")[0] == 0
+
+
+def test_render_takes_an_inria_model_folder_as_it_is(cli):
+    model = inria_model(Path("model"), config="Namespace(white_background=True, resolution=2, images='images', eval=False)")
+    assert cli(f"render -m {model} -o out --views all")[0] == 0
+    assert image_size(Path("out/a.png")) == (32, 24)  # cameras.json holds the source's size; training was at -r 2
+    assert cli(f"render {model} -o again --iteration 7 --views a")[0] == 0
+    code, _, err = cli(f"render {model} -o again --iteration 8 --views a --overwrite")
+    assert (code, "has no iteration 8; it has 7, 30" in err) == (2, True)
+
+
+def test_convert_then_info_shows_what_was_fused(cli):
+    code, out, err = cli("convert scene.ply --cameras . -o converted.ply --json")
+    assert code == 0
+    assert json.loads(out)["fused"][0]["method"] == "matched-energy"
+    assert "Mip rule" in err
+    facts = json.loads(cli("info converted.ply --json")[1])
+    assert facts["convention"] == "mip"
+    assert facts["fused"] == [
+        {"method": "matched-energy", "variance": "0.2", "views": "3", "from": "classic"}
+    ]
+    assert "matched-energy (variance=0.2" in cli("info converted.ply")[1]
+
+
+def test_convert_fuses_plain_mip_splatting_by_flag(cli):
+    assert cli("convert scene.ply --cameras . -o converted.ply --form mip-splatting")[0] == 0
+    fused = json.loads(cli("info converted.ply --json")[1])["fused"]
+    assert fused == [{"method": "smoothing3d", "variance": "0.2", "opacity": "volume"}]
+
+
+def test_convert_fuses_a_stored_filter_without_cameras(cli):
+    from dataclasses import replace
+
+    from aaplug.gaussians import MIP
+
+    scene = replace(make_scene(20), filter_3d=torch.full((20,), 0.01), convention=MIP)
+    write_scene(Path("unfused.ply"), scene)
+    assert cli("convert unfused.ply -o fused.ply")[0] == 0
+    facts = json.loads(cli("info fused.ply --json")[1])
+    assert facts["fused"] == [{"method": "filter_3D"}]
+    assert not facts["stored_filter_3d"]
+
+
+def test_info_with_cameras_tells_the_sampling(cli):
+    facts = json.loads(cli("info scene.ply --cameras . --json")[1])
+    assert facts["gaussians"] == 150
+    assert facts["training_cameras"] == 3
+    assert 0.5 < facts["seen_share"] <= 1
+
+
+def test_evaluate_writes_results_and_prints_a_table(cli):
+    code, out, _ = cli("evaluate scene.ply --cameras . -o out --recipe classic auto --scale 1 0.5")
+    assert code == 0
+    assert "training size, resampled" in out
+    results = json.loads(Path("out/results.json").read_text())
+    assert results["auto@1"]["PSNR"] is None or results["auto@1"]["PSNR"] > 45
+    about = results["_aaplug"]
+    assert about["truth"] == "photographs"
+    assert len(about["scene"]["sha256"]) == 64
+    assert {"aaplug", "torch"} <= set(about["versions"])
+    assert list(json.loads(Path("out/per_view.json").read_text())["classic@0.5"]["SSIM"]) == ["r_0"]
+
+
+def test_evaluate_without_photographs_takes_the_scenes_own_look(cli):
+    code, out, err = cli("evaluate scene.ply --cameras . --views train --scale 0.5 --json")
+    assert code == 0
+    assert "truth: self" in err
+    assert json.loads(out)["_aaplug"]["truth"] == "self"
+
+
+def test_data_goes_to_stdout_and_the_log_to_stderr(cli):
+    _, out, err = cli("info scene.ply --json")
+    json.loads(out)
+    assert err.startswith("scene: scene.ply: 150 Gaussians, SH degree 1, classic (no tag")
+
+
+def test_drop_bad_leaves_bad_gaussians_out_and_counts_them(cli):
+    scene = make_scene(20)
+    scene.means[3, 0] = torch.nan
+    scene.means[7, 1] = torch.inf
+    write_scene(Path("bad.ply"), scene)
+    code, out, err = cli("info bad.ply --json --drop-bad")
+    assert (code, json.loads(out)["gaussians"]) == (0, 18)
+    assert "warning:" in err
+
+
+def test_version_and_help(cli):
+    assert cli("--version")[1].startswith("aaplug ")
+    assert "--resolution" in cli("render --help")[1]
+
+
+# what is refused: one line, exit code 2, nothing written
+
+
+def break_truncated(folder: Path) -> None:
+    data = (folder / "scene.ply").read_bytes()
+    (folder / "scene.ply").write_bytes(data[:-100])
+
+
+def break_count(folder: Path) -> None:
+    data = (folder / "scene.ply").read_bytes()
+    (folder / "scene.ply").write_bytes(data.replace(b"vertex 150", b"vertex 1000000000000"))
+
+
+def break_column(folder: Path) -> None:
+    data = (folder / "scene.ply").read_bytes()
+    (folder / "scene.ply").write_bytes(data.replace(b"property float rot_3", b"property float spin_"))
+
+
+def break_nan(folder: Path) -> None:
+    scene = make_scene(20)
+    scene.means[3:5, 0] = torch.nan
+    write_scene(folder / "scene.ply", scene, overwrite=True)
+
+
+def break_quaternion(folder: Path) -> None:
+    scene = make_scene(20)
+    scene.quats[5] = 0
+    write_scene(folder / "scene.ply", scene, overwrite=True)
+
+
+def break_frame(folder: Path) -> None:
+    scene = make_scene(150)
+    scene.means[:] += 1000
+    write_scene(folder / "scene.ply", scene, overwrite=True)
+
+
+def break_photo(folder: Path) -> None:
+    data = (folder / "test" / "r_0.png").read_bytes()
+    (folder / "test" / "r_0.png").write_bytes(data[: len(data) // 2])
+
+
+def break_nothing(folder: Path) -> None:
+    (folder / "present.ply").write_bytes(b"mine")
+
+
+CONVERT = "convert scene.ply --cameras . -o new.ply"
+REFUSED = {
+    "truncated": (break_truncated, CONVERT, ["scene.ply", "bytes"]),
+    "a count of 10^12": (break_count, CONVERT, ["scene.ply", "1,000,000,000,000"]),
+    "missing column": (break_column, CONVERT, ["scene.ply", "rot_3"]),
+    "NaN means": (break_nan, CONVERT, ["scene.ply", "row 3", "1 more", "--drop-bad"]),
+    "zero quaternion": (break_quaternion, CONVERT, ["scene.ply", "row 5", "quaternion"]),
+    "cameras of another scene": (break_frame, CONVERT, ["scene.ply", "different frames"]),
+    "frame, on render": (
+        break_frame, "render scene.ply --cameras . -o new", ["scene.ply", "different frames"]),
+    "frame, on evaluate": (
+        break_frame, "evaluate scene.ply --cameras . -o new", ["scene.ply", "different frames"]),
+    "output is input": (
+        break_nothing, "convert scene.ply --cameras . -o ./scene.ply --overwrite", ["scene.ply", "input"]),
+    "existing output": (
+        break_nothing, "convert scene.ply --cameras . -o present.ply", ["present.ply", "--overwrite"]),
+    "existing image": (
+        break_nothing, "render scene.ply --cameras . -o test", ["test", "r_0.png", "--overwrite"]),
+    "unreadable photograph": (break_photo, "evaluate scene.ply --cameras . -o new", ["r_0.png"]),
+    "unknown view": (
+        break_nothing, "render scene.ply --cameras . -o new --views r_9", ["r_9", "r_0"]),
+    "unknown recipe": (
+        break_nothing, "render scene.ply --cameras . -o new --recipe mipp", ["mipp", "matched"]),
+    "scale and resolution": (
+        break_nothing, "render scene.ply --cameras . -o new --scale 2 --resolution 8x8", ["give one"]),
+    "negative scale": (break_nothing, "render scene.ply --cameras . -o new --scale -1", ["--scale"]),
+    "bad resolution": (
+        break_nothing, "render scene.ply --cameras . -o new --resolution 8by8", ["--resolution", "8by8"]),
+    "too large": (
+        break_nothing, "render scene.ply --cameras . -o new --scale 9999", ["16384"]),
+    "no scene": (break_nothing, "render --cameras . -o new", ["SCENE"]),
+    "no cameras": (break_nothing, "render scene.ply -o new", ["--cameras"]),
+    "missing scene": (break_nothing, "render gone.ply --cameras . -o new", ["gone.ply"]),
+    "missing cameras": (break_nothing, "render scene.ply --cameras gone -o new", ["gone"]),
+    "one file for several views": (
+        break_nothing, "render scene.ply --cameras . -o new.png --views train", ["new.png", "3 views"]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_refusals_name_file_and_cause_and_write_nothing(cli, case):
+    spoil, words, named = REFUSED[case]
+    spoil(Path())
+    before = {path: path.stat().st_mtime_ns for path in Path().rglob("*")}
+    code, out, err = cli(words)
+    assert (code, out) == (2, "")
+    last = err.rstrip("\n").split("\n")[-1]
+    assert last.startswith("error: ")
+    for word in named:
+        assert word in last
+    assert {path: path.stat().st_mtime_ns for path in Path().rglob("*")} == before
+
+
+def test_an_unknown_flag_is_refused(cli):
+    assert cli("render scene.ply --cameras . -o new --colour red")[0] == 2
+
+
+def test_interrupting_ends_with_130_and_leaves_no_file(cli, monkeypatch):
+    def interrupted(*args, **kwargs):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("aaplug_cli.convert.write_scene", interrupted)
+    assert cli(CONVERT)[0] == 130
+    assert not Path("new.ply").exists()
+
+
+def test_demo_does_the_whole_job(cli, monkeypatch):
+    monkeypatch.setattr("aaplug_cli.demo.SCALES", (0.25, 0.125))
+    code, out, _ = cli("demo -o shown")
+    assert code == 0
+    assert "auto" in out
+    results = json.loads(Path("shown/results.json").read_text())
+    assert results["auto@0.125"]["PSNR"] > results["classic@0.125"]["PSNR"] + 15
+    assert read_scene(Path("shown/chair-converted.ply")).fused
+    width, height = image_size(Path("shown/contact-sheet.png"))
+    assert min(width, height) > 300
+    assert cli("demo -o shown")[0] == 2
+
+
+def inria_model(folder: Path, config: str) -> Path:
+    """A model folder as 3DGS writes it, with iterations 7 and 30."""
+    for iteration in (7, 30):
+        (folder / f"point_cloud/iteration_{iteration}").mkdir(parents=True)
+        write_scene(folder / f"point_cloud/iteration_{iteration}/point_cloud.ply", make_scene(100))
+    cameras = []
+    for i, (name, eye) in enumerate(zip("ab", EYES["train"], strict=False)):
+        camera = make_camera(eye, SIZE)
+        pose = torch.linalg.inv(camera.cam_from_world)
+        cameras.append(
+            {"id": i, "img_name": name, "width": SIZE[0], "height": SIZE[1], "position": pose[:3, 3].tolist(),
+             "rotation": pose[:3, :3].tolist(), "fx": camera.fx, "fy": camera.fy}
+        )  # fmt: skip
+    (folder / "cameras.json").write_text(json.dumps(cameras))
+    (folder / "cfg_args").write_text(config)
+    return folder
+
+
+def test_background_comes_from_cfg_args(cli):
+    model = inria_model(Path("model"), "Namespace(white_background=True, resolution=1, images='images', eval=False)")
+    _, _, err = cli(f"render -m {model} -o out --views a")
+    assert "background: white (from the camera files)" in err
+    corner = cv2.imread("out/a.png")[0, 0]
+    assert corner.min() > 200
+    assert BLACK == (0.0, 0.0, 0.0)

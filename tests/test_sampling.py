@@ -1,0 +1,263 @@
+"""Sampling bounds by hand, at the edges of what a camera sees, and against a loop in float64."""
+
+import json
+import math
+import statistics
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from aaplug.cameras import Camera
+from aaplug.errors import FrameError, UsageError
+from aaplug.filters import Smoothing3D
+from aaplug.pipeline import learn
+from aaplug.sampling import check_frame, median_rates, sampling_bounds
+from tests.conftest import make_camera, make_scene
+
+FAR = torch.tensor([5e6, -5e6, 5e6], dtype=torch.float64)
+MEMORY_LIMIT = 350e6  # bytes; measured: 190e6 in chunks, 1000e6 without
+PROC_STATUS = Path("/proc/self/status")
+
+
+def straight_camera(
+    focal: float = 64.0,
+    size: tuple[int, int] = (80, 40),
+    centre: tuple[float, float] | None = None,
+    back: float = 0.0,
+) -> Camera:
+    """At (0, 0, -back), looking along +z, with x and y as in the image."""
+    cx, cy = centre or (size[0] / 2, size[1] / 2)
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[2, 3] = back
+    return Camera("straight", *size, focal, focal, cx, cy, pose)
+
+
+def ring(n: int = 7, focal_step: float = 0.2) -> list[Camera]:
+    """Cameras around the origin, each of another focal length; one with pixels that are not square."""
+    eyes = [(4 * math.cos(a), 3 * math.sin(a), 1.5 * math.sin(3 * a)) for a in range(n)]
+    cameras = [make_camera(eye, fov=0.4 + focal_step * (i % 4)) for i, eye in enumerate(eyes)]
+    return [replace(cameras[0], fy=cameras[0].fy * 1.3), *cameras[1:]]
+
+
+def moved(camera: Camera, offset: torch.Tensor) -> Camera:
+    """The camera carried along by `offset` in the world."""
+    pose = camera.cam_from_world.clone()
+    pose[:3, 3] -= pose[:3, :3] @ offset
+    return replace(camera, cam_from_world=pose)
+
+
+def rates_by_loop(mean: list[float], cameras: list[Camera]) -> list[float]:
+    """Sampling rates of the cameras that see a point, in plain Python floats."""
+    rates = []
+    for camera in cameras:
+        pose = camera.cam_from_world.tolist()
+        x, y, z = (sum(row[j] * mean[j] for j in range(3)) + row[3] for row in pose[:3])
+        if z <= 0.2:
+            continue
+        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+        in_width = -0.15 * camera.width <= u <= 1.15 * camera.width
+        in_height = -0.15 * camera.height <= v <= 1.15 * camera.height
+        if in_width and in_height:
+            rates.append(math.sqrt(camera.fx * camera.fy) / z)
+    return rates
+
+
+def seen_at(camera: Camera, u: float, v: float) -> bool:
+    """Whether the camera sees the point one unit in front of it at pixel (u, v)."""
+    x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
+    point = torch.tensor([[x, y, 1.0]], dtype=torch.float64)
+    return bool(sampling_bounds(point, [camera]).seen)
+
+
+def test_one_camera_samples_a_gaussian_with_its_focal_length_over_depth():
+    bounds = sampling_bounds(torch.tensor([[0.5, -0.25, 4.0]]), [straight_camera(64.0)])
+    assert bounds.highest.tolist() == [16.0]
+    assert bounds.lowest.tolist() == [16.0]
+    assert bounds.views.tolist() == [1]
+
+
+def test_depth_is_along_the_optical_axis_not_the_distance():
+    corner = torch.tensor([[1.125, 0.5625, 2.0]])  # 2.36 units away
+    assert sampling_bounds(corner, [straight_camera(64.0)]).highest.tolist() == [32.0]
+
+
+def test_pixels_that_are_not_square_sample_with_the_mean_of_both_focal_lengths():
+    camera = replace(straight_camera(100.0), fy=25.0)
+    assert sampling_bounds(torch.tensor([[0.0, 0.0, 2.0]]), [camera]).highest.tolist() == [25.0]
+
+
+# W is 80 px and H 40 px: 15 % are 12 px and 6 px, which binary numbers hold exactly
+@pytest.mark.parametrize(
+    ("edge", "outside"),
+    [
+        ((92.0, 20.0), (1.1501 * 80, 20.0)),
+        ((-12.0, 20.0), (-0.1501 * 80, 20.0)),
+        ((40.0, 46.0), (40.0, 1.1501 * 40)),
+        ((40.0, -6.0), (40.0, -0.1501 * 40)),
+    ],
+    ids=["right", "left", "bottom", "top"],
+)
+@pytest.mark.parametrize("centre", [(40.0, 20.0), (16.0, 32.0)], ids=["centred", "off centre"])
+def test_the_image_counts_with_a_margin_of_15_percent(edge, outside, centre):
+    camera = straight_camera(centre=centre)
+    assert seen_at(camera, *edge)
+    assert not seen_at(camera, *outside)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_near_plane_itself_is_not_seen(dtype):
+    depths = torch.tensor([-1.0, 0.0, 0.1999, 0.2, 0.2001], dtype=dtype)
+    points = torch.nn.functional.pad(depths[:, None], (2, 0))
+    seen = sampling_bounds(points, [straight_camera()]).seen
+    assert seen.tolist() == [False, False, False, False, True]
+
+
+def test_each_camera_pairs_its_own_focal_length_with_its_own_depth():
+    # the paper's equation 7; the published code's max f / min z would be 128 / 2 = 64
+    near, far = straight_camera(64.0, back=2.0), straight_camera(128.0, back=8.0)
+    point = torch.zeros(1, 3)
+    bounds = sampling_bounds(point, [near, far])
+    assert bounds.highest.tolist() == [32.0]
+    assert bounds.lowest.tolist() == [16.0]
+    assert bounds.views.tolist() == [2]
+
+
+def test_of_equal_focal_lengths_the_nearest_camera_samples_highest_and_the_farthest_lowest():
+    cameras = [straight_camera(64.0, back=back) for back in (4.0, 2.0, 8.0)]
+    bounds = sampling_bounds(torch.zeros(1, 3), cameras)
+    assert (bounds.highest.item(), bounds.lowest.item()) == (32.0, 8.0)
+    assert median_rates(torch.zeros(1, 3), cameras).item() == 16.0
+
+
+def test_a_camera_that_does_not_see_a_gaussian_has_no_say():
+    blind = straight_camera(1e6, back=-50.0)
+    bounds = sampling_bounds(torch.tensor([[0.0, 0.0, 4.0]]), [blind, straight_camera(64.0)])
+    assert (bounds.highest.item(), bounds.lowest.item(), bounds.views.item()) == (16.0, 16.0, 1)
+
+
+def test_unseen_gaussians_are_zero_and_may_stand_in_with_the_coarsest_rate():
+    points = torch.tensor([[0.0, 0.0, 2.0], [0.0, 0.0, 8.0], [0.0, 0.0, -1.0], [99.0, 0.0, 1.0]])
+    bounds = sampling_bounds(points, [straight_camera(64.0)])
+    assert bounds.seen.tolist() == [True, True, False, False]
+    assert bounds.highest.tolist() == [32.0, 8.0, 0.0, 0.0]
+    assert bounds.lowest.tolist() == [32.0, 8.0, 0.0, 0.0]
+    assert bounds.views.tolist() == [1, 1, 0, 0]
+    assert bounds.highest_or_coarsest.tolist() == [32.0, 8.0, 8.0, 8.0]
+    assert median_rates(points, [straight_camera(64.0)]).tolist() == [32.0, 8.0, 0.0, 0.0]
+
+
+def test_a_scene_that_no_camera_sees_is_no_crash_of_a_library():
+    scene = make_scene(3)
+    training = learn(scene, [straight_camera(back=-1e3)])
+    assert not training.bounds.seen.any()
+    try:
+        smoothed = Smoothing3D()(scene, training)
+    except (FrameError, UsageError):
+        return
+    assert smoothed.log_scales.isfinite().all()
+
+
+@pytest.mark.parametrize(
+    ("dtype", "rtol"), [(torch.float64, 1e-12), (torch.float32, 2e-6)], ids=str
+)
+def test_bounds_agree_with_a_loop_in_float64(dtype, rtol):
+    means = (make_scene(200, seed=3).means * 3).to(dtype)
+    cameras = ring()
+    bounds, median = sampling_bounds(means, cameras), median_rates(means, cameras)
+    expected = [rates_by_loop(mean, cameras) for mean in means.tolist()]
+    counts = [len(rates) for rates in expected]
+    assert len(set(counts)) == len(cameras) + 1, "the scene should try every number of views"
+    assert bounds.views.tolist() == counts
+    for got, pick in (
+        (bounds.highest, max),
+        (bounds.lowest, min),
+        (median, statistics.median_low),
+    ):
+        want = torch.tensor([pick(rates) if rates else 0.0 for rates in expected], dtype=dtype)
+        torch.testing.assert_close(got, want, rtol=rtol, atol=0)
+
+
+@pytest.mark.parametrize("chunk_pairs", [1, 7, 64, 350, 10**9])
+def test_the_size_of_chunks_changes_nothing(chunk_pairs):
+    means, cameras = make_scene(50).means * 2, ring()
+    whole, parts = sampling_bounds(means, cameras), sampling_bounds(means, cameras, chunk_pairs)
+    torch.testing.assert_close(parts.highest, whole.highest, rtol=1e-6, atol=0)
+    torch.testing.assert_close(parts.lowest, whole.lowest, rtol=1e-6, atol=0)
+    assert parts.views.equal(whole.views)
+
+
+def test_a_scene_far_from_the_origin_keeps_its_digits():
+    means = (make_scene(100).means.double() * 3 + FAR).float()  # rounded to half units out there
+    cameras = [moved(camera, FAR) for camera in ring()]
+    exact = sampling_bounds(means.double(), cameras)
+    bounds = sampling_bounds(means, cameras)
+    assert 0 < exact.seen.sum() < 100
+    assert bounds.views.equal(exact.views)
+    torch.testing.assert_close(bounds.highest.double(), exact.highest, rtol=2e-6, atol=0)
+    torch.testing.assert_close(bounds.lowest.double(), exact.lowest, rtol=2e-6, atol=0)
+
+
+def test_a_number_of_cameras_is_needed():
+    with pytest.raises(UsageError, match="at least one"):
+        sampling_bounds(torch.zeros(1, 3), [])
+
+
+def test_an_empty_scene_has_empty_bounds():
+    bounds = sampling_bounds(torch.zeros(0, 3), [straight_camera()])
+    assert len(bounds.highest) == len(bounds.lowest) == len(bounds.views) == 0
+    assert check_frame(torch.zeros(0, 3), [straight_camera()], "empty") == 1.0
+
+
+def test_the_frame_check_gives_the_share_of_gaussians_seen():
+    points = torch.tensor([[0.0, 0.0, 1.0]] * 3 + [[0.0, 0.0, -1.0]])
+    assert check_frame(points, [straight_camera()], "scene.ply") == 0.75
+
+
+def test_cameras_of_another_scene_are_refused_by_name_and_cause():
+    means = make_scene(500).means
+    strangers = [moved(camera, torch.tensor([40.0, 0.0, 0.0]).double()) for camera in ring()]
+    assert check_frame(means, ring(), "garden.ply") > 0.9
+    with pytest.raises(FrameError, match=r"garden\.ply: only .*% .*different frames") as caught:
+        check_frame(means, strangers, "garden.ply")
+    assert caught.value.where == "garden.ply"
+    assert "7 cameras" in caught.value.problem
+    assert "dataparser_transforms.json" in caught.value.problem
+    assert check_frame(means, strangers, "garden.ply", min_share=0.0) < 0.5
+
+
+def test_the_frame_check_samples_a_large_scene_evenly():
+    seen = torch.arange(200_000) % 10 < 6
+    points = torch.zeros(200_000, 3)
+    points[:, 2] = torch.where(seen, 1.0, -1.0)
+    assert check_frame(points, [straight_camera()], "large") == pytest.approx(0.6, abs=0.01)
+
+
+MEASURE = """
+import json, torch
+from aaplug.sampling import sampling_bounds
+from tests.test_sampling import ring
+
+def peak():
+    lines = open("/proc/self/status").read().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM")) * 1024
+
+means, cameras = torch.randn(300_000, 3), ring(100)
+sampling_bounds(means[:1000], cameras)
+before = peak()
+bounds = sampling_bounds(means, cameras)
+print(json.dumps([peak() - before, bounds.views.sum().item()]))
+"""
+
+
+@pytest.mark.skipif(not PROC_STATUS.exists(), reason="peak memory of a process is read from /proc")
+def test_memory_does_not_grow_with_gaussians_times_cameras():
+    root = Path(__file__).resolve().parents[1]
+    command = [sys.executable, "-c", MEASURE]
+    run = subprocess.run(command, cwd=root, capture_output=True, text=True, check=True, timeout=120)
+    growth, pairs_seen = json.loads(run.stdout)
+    assert pairs_seen > 10_000_000
+    assert growth < MEMORY_LIMIT
