@@ -58,7 +58,7 @@ def write_transforms(folder: Path, split: str, eyes: list[tuple[float, float, fl
     cameras = [make_camera(eye, SIZE) for eye in eyes]
     flip = np.diag([1.0, -1.0, -1.0, 1.0])  # Blender looks along −z with y up
     frames = [
-        {"file_path": f"./{split}/r_{i}", "transform_matrix": (np.linalg.inv(c.cam_from_world) @ flip).tolist()}
+        {"file_path": f"./{split}/r_{i}", "transform_matrix": (np.linalg.inv(c.cam_from_world.numpy()) @ flip).tolist()}
         for i, c in enumerate(cameras)
     ]  # fmt: skip
     angle = 2 * math.atan(0.5 * SIZE[0] / cameras[0].fx)

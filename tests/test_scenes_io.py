@@ -260,7 +260,7 @@ def test_real_scenes_are_written_back_to_the_byte(tmp_path: Path, name, n, degre
 @pytest.mark.parametrize(
     ("name", "problem"),
     [
-        ("formats/splats/guitar.compressed.ply", "compressed"),
+        ("formats/splats/guitar.compressed.ply", "is a compressed"),
         ("formats/splats/biker.spz", "no known scene format"),
         ("formats/inria/dngs/model/input.ply", "point cloud or a mesh"),
         ("formats/small_splats/metalsplatter/PLYIO/TestData/beetle.ascii.ply", "ascii 1.0"),
@@ -428,7 +428,10 @@ BAD_HEADERS = {
     "duplicate property": (extended("x"), "property of vertex 'x' is declared twice"),
     "duplicate element": (File(after=(box + box, bytes(20))), "element 'chunk' is declared twice"),
     "duplicate list": (File(after=([*faces, faces[1]], face_rows)), "declared twice"),
-    "72 f_rest": (with_rest([f"f_rest_{i}" for i in range(72)]), "72 f_rest"),
+    "72 f_rest": (
+        with_rest([f"f_rest_{i}" for i in range(72)]),
+        "72 .* .degree 4., not supported yet",
+    ),
     "8 f_rest": (with_rest([f"f_rest_{i}" for i in range(8)]), "8 f_rest"),
     "f_rest with a gap": (with_rest([f"f_rest_{i}" for i in range(1, 10)]), "not f_rest_0"),
     "ascii": (File(top=["format ascii 1.0"]), "format is ascii 1.0; only binary_little"),
@@ -578,7 +581,9 @@ def damaged(folder: Path, file: File, **cells: tuple[int, float]) -> Path:
 def test_a_bad_number_is_found_in_every_column(tmp_path: Path, column: str, value: float):
     path = damaged(tmp_path, filtered(), **{column: (3, value)})
     what = "NaN" if np.isnan(value) else "Inf"
-    with pytest.raises(FormatError, match=f"row 3 has {what} in {column}[;,]?.* pass --drop-bad"):
+    with pytest.raises(
+        FormatError, match=f"in.ply: row 3 has {what} in {column}[;,].*pass --drop-bad"
+    ):
         read_scene(path)
     assert read_scene(path, drop_bad=True).origin.rows.tolist() == [0, 1, 2, 4]  # type: ignore[union-attr]
 

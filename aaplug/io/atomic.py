@@ -67,9 +67,7 @@ def _check_target(path: Path, overwrite: bool) -> None:
 
 
 def _same_file(a: Path, b: Path) -> bool:
-    if os.path.realpath(a) == os.path.realpath(b):
-        return True
-    with suppress(OSError):  # at most one of them exists, or neither can be looked at
+    with suppress(OSError, ValueError):  # one of them does not exist: they are not the same
         return os.path.samefile(a, b)
     return False
 
