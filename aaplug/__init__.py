@@ -4,7 +4,7 @@ Read `aaplug.pipeline` first: it holds the whole flow on one page.
 """
 
 from aaplug.cameras import Camera, CameraSet, look_at
-from aaplug.conversion import convert
+from aaplug.conversion import FORMS, convert
 from aaplug.errors import AaplugError
 from aaplug.evaluation import Task, evaluate
 from aaplug.gaussians import ANTIALIASED, CLASSIC, MIP, Convention, Gaussians
@@ -20,6 +20,7 @@ from aaplug.splats import Render
 __all__ = [
     "ANTIALIASED",
     "CLASSIC",
+    "FORMS",
     "MIP",
     "RECIPES",
     "AaplugError",

@@ -15,6 +15,7 @@ from torch import Tensor
 
 WHITE = (1.0, 1.0, 1.0)
 BLACK = (0.0, 0.0, 0.0)
+NEAR = 0.2  # world units of depth: only what is farther is drawn or counted as seen (3DGS)
 WHOLE_PIXEL = 1e-6  # px: slack when a scaled size is cut to whole pixels
 
 

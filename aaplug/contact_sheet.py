@@ -18,7 +18,7 @@ INK = (40, 40, 40)
 
 
 def contact_sheet(
-    columns: Sequence[str], rows: Sequence[tuple[str, Sequence[Float[Tensor, "h w 3"]]]]
+    columns: Sequence[str], rows: Sequence[tuple[str, Sequence[Float[Tensor, "_ _ 3"]]]]
 ) -> Float[Tensor, "H W 3"]:
     """The images with a heading over every column and a label left of every row; widths follow the first row."""
     cells = [[_enlarged(image) for image in images] for _, images in rows]

@@ -11,9 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.cameras import Camera
+from aaplug.cameras import NEAR, Camera
 from aaplug.gaussians import Gaussians
-from aaplug.sampling import NEAR
 from aaplug.splats import Splats2D
 
 JACOBIAN_MARGIN = 0.3  # of half the image at depth 1: 3DGS linearises no farther out (1.3 tan(fov/2) when centred)

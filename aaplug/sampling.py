@@ -13,10 +13,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from aaplug.cameras import Camera
+from aaplug.cameras import NEAR, Camera
 from aaplug.errors import FrameError, UsageError
 
-NEAR = 0.2  # world units: what is nearer is not drawn (3DGS), strictly
 MARGIN = 0.15  # of the image's side; equals 3DGS's clamp of the Jacobian at 1.3 tan(fov/2)
 CHUNK_PAIRS = 4_000_000  # Gaussian-camera pairs held at once: about 150 MB
 MIN_SEEN_SHARE = 0.5  # fewer Gaussians seen than this: scene and cameras are taken for strangers

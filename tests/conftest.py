@@ -62,7 +62,9 @@ def make_camera(
     return Camera(name, *size, focal, focal, *centre, pose).as_trained()
 
 
-def make_scene(n: int, seed: int = 0, dtype: torch.dtype = torch.float32, degree: int = 1) -> Gaussians:
+def make_scene(
+    n: int, seed: int = 0, dtype: torch.dtype = torch.float32, degree: int = 1
+) -> Gaussians:
     """Random Gaussians around the origin, a few tenths of a unit large."""
     g = torch.Generator().manual_seed(seed)
     rand = {"generator": g, "dtype": torch.float64}

@@ -53,7 +53,9 @@ def test_the_ceiling_is_always_among_the_rows(world):
     report = evaluate(scene, training, task(views))
     assert report.recipes == (CEILING, "classic", "matched")
     full = render(scene, views[0], RECIPES["classic"], training).rgb.clamp(0, 1)
-    expected = psnr(quantise(downsample(full, 2)), downsample(quantise(read_image(views[0].photo, None)), 2))
+    expected = psnr(
+        quantise(downsample(full, 2)), downsample(quantise(read_image(views[0].photo, None)), 2)
+    )
     assert report.select(CEILING, 0.5)[0].values["PSNR"] == pytest.approx(expected, abs=1e-9)
 
 
@@ -71,7 +73,9 @@ def test_self_truth_needs_no_photographs_and_makes_the_ceiling_perfect(world):
     report = evaluate(scene, training, task(bare, truth="self"))
     assert mean(report.select(CEILING, 0.5), "PSNR") is None  # equal images
     assert mean(report.select(CEILING, 0.5), "SSIM") == pytest.approx(1.0)
-    assert mean(report.select("matched", 2.0), "PSNR") is None  # its own truth above the training size
+    assert (
+        mean(report.select("matched", 2.0), "PSNR") is None
+    )  # its own truth above the training size
     assert mean(report.select("classic", 2.0), "PSNR") < 40
     assert mean(report.select("matched", 0.5), "PSNR") > mean(report.select("classic", 0.5), "PSNR")
 

@@ -48,4 +48,8 @@ def brute_force_ssim(a: torch.Tensor, b: torch.Tensor) -> float:
     ma, mb = windowed(a), windowed(b)
     va, vb, cov = windowed(a * a) - ma**2, windowed(b * b) - mb**2, windowed(a * b) - ma * mb
     c1, c2 = 0.01**2, 0.03**2
-    return (((2 * ma * mb + c1) * (2 * cov + c2)) / ((ma**2 + mb**2 + c1) * (va + vb + c2))).mean().item()
+    return (
+        (((2 * ma * mb + c1) * (2 * cov + c2)) / ((ma**2 + mb**2 + c1) * (va + vb + c2)))
+        .mean()
+        .item()
+    )

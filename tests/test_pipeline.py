@@ -18,7 +18,11 @@ from aaplug.recipes import RECIPES, find_recipe
 from tests.conftest import make_camera, make_scene
 
 REFERENCE = RASTERIZERS["reference"]
-TRAINED_WITH = {"classic": "classic", "antialiased": "ewa", "mip": "mip"}  # convention: its own recipe
+TRAINED_WITH = {
+    "classic": "classic",
+    "antialiased": "ewa",
+    "mip": "mip",
+}  # convention: its own recipe
 EYES = [(0.0, -4.0, 0.0), (3.0, -3.5, 1.0), (-1.0, -2.5, 1.5), (0.5, 5.0, -1.0)]
 
 
@@ -73,7 +77,9 @@ def test_matched_keeps_the_light_of_an_isolated_splat_at_every_rate(rate):
     for dx in shifts:
         for dy in shifts:
             moved = replace(view, cx=view.cx + dx, cy=view.cy + dy)
-            total += render(scene, moved, recipe, training, REFERENCE).alpha.sum() / len(shifts) ** 2
+            total += (
+                render(scene, moved, recipe, training, REFERENCE).alpha.sum() / len(shifts) ** 2
+            )
     assert total / rate**2 == pytest.approx(trained.item(), rel=0.03)
 
 
@@ -91,7 +97,14 @@ def test_classic_bloats_an_isolated_splat_when_zoomed_out():
 
 @pytest.mark.parametrize(
     ("rate", "fast", "balanced", "best"),
-    [(1.0, 1, 1, 1), (2.0, 1, 1, 1), (0.5, 1, 1, 2), (0.25, 1, 2, 4), (0.125, 1, 4, 8), (0.3, 1, 2, 4)],
+    [
+        (1.0, 1, 1, 1),
+        (2.0, 1, 1, 1),
+        (0.5, 1, 1, 2),
+        (0.25, 1, 2, 4),
+        (0.125, 1, 4, 8),
+        (0.3, 1, 2, 4),
+    ],
 )
 def test_quality_takes_the_fewest_samples_that_reach_its_rate(rate, fast, balanced, best):
     counts = [
@@ -168,7 +181,9 @@ def test_a_mip_scene_without_stored_filter_has_nothing_to_fuse(cameras):
 def test_converted_splats_show_the_energy_that_training_showed(convention):
     """One camera, so that nothing is averaged: the Mip viewer's o√det equals training's to rounding."""
     scene = replace(make_scene(100, dtype=torch.float64), convention=convention)
-    scene = replace(scene, logit_opacities=scene.logit_opacities - 4)  # far from the bound on opacity
+    scene = replace(
+        scene, logit_opacities=scene.logit_opacities - 4
+    )  # far from the bound on opacity
     camera = make_camera()
     training = learn(scene, [camera])
     converted = convert(scene, training, FORMS["matched-energy"])
@@ -176,7 +191,9 @@ def test_converted_splats_show_the_energy_that_training_showed(convention):
     shown = project(converted, camera)
     seen = training.bounds.seen[shown.sources]
     energy = (shown.opacities * shown.dets.sqrt())[seen]
-    torch.testing.assert_close(energy, (trained.opacities * trained.dets.sqrt())[seen], rtol=1e-6, atol=0)
+    torch.testing.assert_close(
+        energy, (trained.opacities * trained.dets.sqrt())[seen], rtol=1e-6, atol=0
+    )
 
 
 def test_a_free_camera_is_compared_with_the_training_cameras_focal():

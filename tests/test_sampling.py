@@ -46,7 +46,7 @@ def ring(n: int = 7, focal_step: float = 0.2) -> list[Camera]:
 def moved(camera: Camera, offset: torch.Tensor) -> Camera:
     """The camera carried along by `offset` in the world."""
     pose = camera.cam_from_world.clone()
-    pose[:3, 3] -= pose[:3, :3] @ offset
+    pose[:3, 3] -= pose[:3, :3] @ offset.double()
     return replace(camera, cam_from_world=pose)
 
 
@@ -129,8 +129,9 @@ def test_each_camera_pairs_its_own_focal_length_with_its_own_depth():
 def test_of_equal_focal_lengths_the_nearest_camera_samples_highest_and_the_farthest_lowest():
     cameras = [straight_camera(64.0, back=back) for back in (4.0, 2.0, 8.0)]
     bounds = sampling_bounds(torch.zeros(1, 3), cameras)
-    assert (bounds.highest.item(), bounds.lowest.item()) == (32.0, 8.0)
-    assert median_rates(torch.zeros(1, 3), cameras).item() == 16.0
+    assert bounds.highest.item() == pytest.approx(32.0)
+    assert bounds.lowest.item() == pytest.approx(8.0)
+    assert median_rates(torch.zeros(1, 3), cameras).item() == pytest.approx(16.0)
 
 
 def test_a_camera_that_does_not_see_a_gaussian_has_no_say():
@@ -219,7 +220,7 @@ def test_the_frame_check_gives_the_share_of_gaussians_seen():
 
 def test_cameras_of_another_scene_are_refused_by_name_and_cause():
     means = make_scene(500).means
-    strangers = [moved(camera, torch.tensor([40.0, 0.0, 0.0]).double()) for camera in ring()]
+    strangers = [moved(camera, torch.tensor([0.0, 0.0, 200.0])) for camera in ring()]
     assert check_frame(means, ring(), "garden.ply") > 0.9
     with pytest.raises(FrameError, match=r"garden\.ply: only .*% .*different frames") as caught:
         check_frame(means, strangers, "garden.ply")

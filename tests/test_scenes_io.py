@@ -113,6 +113,7 @@ ROUND_TRIPS = {
     "element after": File(after=(box, bytes(range(10)))),
     "lists before": File(before=(faces, face_rows)),
     "lists after": File(after=(faces, face_rows)),
+    "empty lists": File(after=(faces, bytes(10))),
     "CRLF": File(newline=b"\r\n", top=tagged),
     "long type names": plain(columns=[("float32", n) for _, n in File().columns]),
     "filter_3D": filtered("hello"),
@@ -293,6 +294,7 @@ def test_real_files_that_are_no_scenes_are_refused(name: str, problem: str):
         (filtered("SplatRenderMode: default"), MIP, "filter_3D"),
         (filtered("aaplug fused=x convention=antialiased"), ANTIALIASED, "aaplug's record"),
         (plain("aaplug fused=x a=b", "antialiased 1"), ANTIALIASED, "antialiased 1"),
+        (plain("aaplug fused=x convention=mip", "aaplug convention=classic"), CLASSIC, "record"),
     ],
 )
 def test_the_strongest_evidence_decides(tmp_path, file, convention, evidence):
@@ -323,6 +325,18 @@ def test_the_filter_column_is_read_dropped_and_written(tmp_path: Path):
     assert len(fused) == len(file.content) - 5 * 4 - len("property float filter_3D\n") + len(
         "comment SplatRenderMode: mip\n"
     )
+
+
+def test_other_elements_keep_their_columns(tmp_path: Path):
+    other = (["element cell 1", "property float filter_3D"], bytes(4))
+    scene = read_scene(replace(filtered(), before=other).save(tmp_path))
+    content = through(replace(scene, filter_3d=None), tmp_path)
+    assert content.count(b"property float filter_3D") == 1
+    assert b"element cell 1\nproperty float filter_3D\nelement vertex 5\n" in content
+    scene = read_scene(replace(plain(), after=other).save(tmp_path))
+    content = through(replace(scene, filter_3d=torch.ones(5)), tmp_path)
+    assert b"rot_3\nproperty float filter_3D\nelement cell 1\nproperty float filter_3D" in content
+    assert read_scene(tmp_path / "out.ply").filter_3d is not None
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,9 @@ from torch import Tensor
 from aaplug.gaussians import Fusion, Gaussians, scale_opacities
 from aaplug.interfaces import Training
 
-NYQUIST_VARIANCE = 0.2  # px² at the highest rate: Mip-Splatting's published constant (its eq. 9 omits a square)
+NYQUIST_VARIANCE = (
+    0.2  # px² at the highest rate: Mip-Splatting's published constant (its eq. 9 omits a square)
+)
 
 
 @dataclass(frozen=True)
