@@ -30,7 +30,7 @@ from .files import make_folder, refuse_existing
 
 SCALES = (1.0, 0.5, 0.25, 0.125)
 RECIPES = ("classic", "mip", "matched", "auto")
-SHOWN = "r_8"  # the view on the contact sheet
+SHOWN = "r_136"  # the view on the contact sheet
 COLUMNS = ("photograph", "classic 3DGS", "aaplug", "converted .ply, Mip viewer")
 
 

@@ -119,7 +119,7 @@ class Header:
         inside = False
         for line in self.lines:
             words = line.split()
-            if words[:1] in (["end_header"],):
+            if inside and words[:1] in (["element"], ["end_header"]):
                 lines += [f"property float {name}" for name in added]
             if words[:1] == ["element"]:
                 inside = words[1] == "vertex"

@@ -1,0 +1,420 @@
+"""Projection by hand, against finite differences, and colour against a table of spherical harmonics."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from aaplug.cameras import Camera
+from aaplug.gaussians import Gaussians
+from aaplug.projection import project, rotation_matrices, sh_colour, shade
+from tests.conftest import make_camera, make_scene
+
+F64 = torch.float64
+IDENTITY = (1.0, 0.0, 0.0, 0.0)
+
+
+def straight_camera(
+    fx: float = 100.0,
+    fy: float = 100.0,
+    size: tuple[int, int] = (80, 60),
+    centre: tuple[float, float] | None = None,
+) -> Camera:
+    """At the origin, looking along +z, with x and y as in the image."""
+    cx, cy = centre or (size[0] / 2, size[1] / 2)
+    return Camera("straight", *size, fx, fy, cx, cy, torch.eye(4, dtype=F64))
+
+
+def one_gaussian(
+    mean: tuple[float, float, float],
+    scales: tuple[float, float, float] = (0.1, 0.1, 0.1),
+    quat: tuple[float, float, float, float] = IDENTITY,
+    sh: torch.Tensor | None = None,
+) -> Gaussians:
+    return Gaussians(
+        means=torch.tensor([mean], dtype=F64),
+        quats=torch.tensor([quat], dtype=F64),
+        log_scales=torch.tensor([scales], dtype=F64).log(),
+        logit_opacities=torch.zeros(1, dtype=F64),
+        sh=torch.zeros(1, 1, 3, dtype=F64) if sh is None else sh,
+    )
+
+
+def packed(covariance: torch.Tensor) -> torch.Tensor:
+    return torch.stack([covariance[0, 0], covariance[0, 1], covariance[1, 1]])
+
+
+def sandwich(jacobian: list[list[float]], covariance: torch.Tensor) -> torch.Tensor:
+    """J Σ Jᵀ, packed."""
+    j = torch.tensor(jacobian, dtype=F64)
+    return packed(j @ covariance @ j.T)
+
+
+def world_covariance(scene: Gaussians) -> torch.Tensor:
+    """R S Sᵀ Rᵀ of the first Gaussian, R built by turning the axes with the quaternion's own product."""
+    w, x, y, z = (scene.quats[0] / scene.quats[0].norm()).tolist()
+    v, eye = torch.tensor([x, y, z], dtype=F64), torch.eye(3, dtype=F64)
+    turned = [
+        axis + 2 * torch.linalg.cross(v, torch.linalg.cross(v, axis) + w * axis) for axis in eye
+    ]
+    rotation = torch.stack(turned, dim=1)
+    return rotation @ scene.log_scales[0].exp().square().diag() @ rotation.T
+
+
+# where a splat lands ----------------------------------------------------------------------------
+
+
+def test_a_sphere_on_the_axis_becomes_a_disc_of_focal_times_size_over_depth():
+    splats = project(one_gaussian((0.0, 0.0, 4.0)), straight_camera())
+    expected = (100 * 0.1 / 4) ** 2
+    torch.testing.assert_close(splats.means, torch.tensor([[40.0, 30.0]], dtype=F64))
+    torch.testing.assert_close(splats.covs, torch.tensor([[expected, 0.0, expected]], dtype=F64))
+    torch.testing.assert_close(splats.dets, torch.tensor([expected**2], dtype=F64))
+    assert splats.depths.tolist() == [4.0]
+    assert splats.opacities.tolist() == [0.5]
+    assert splats.sources.tolist() == [0]
+
+
+def test_x_is_right_y_is_down_and_depth_is_along_the_optical_axis():
+    splats = project(one_gaussian((1.0, 0.5, 5.0)), straight_camera(centre=(13.0, 41.0)))
+    torch.testing.assert_close(splats.means, torch.tensor([[33.0, 51.0]], dtype=F64))
+    assert splats.depths.tolist() == [5.0]
+
+
+def test_pixels_that_are_not_square_stretch_means_and_covariances():
+    scene = one_gaussian((0.4, 0.4, 4.0), scales=(0.1, 0.1, 1e-12))
+    splats = project(scene, straight_camera(fx=100.0, fy=50.0))
+    torch.testing.assert_close(splats.means, torch.tensor([[50.0, 35.0]], dtype=F64))
+    torch.testing.assert_close(splats.covs, torch.tensor([[6.25, 0.0, 1.5625]], dtype=F64))
+
+
+def test_a_gaussian_turned_about_the_optical_axis_turns_in_the_image():
+    half = math.radians(30) / 2  # from x towards y: clockwise on the screen
+    scene = one_gaussian((0, 0, 1.0), (0.2, 0.1, 0.1), (math.cos(half), 0, 0, math.sin(half)))
+    xx, xy, yy = project(scene, straight_camera()).covs[0].tolist()
+    assert xx == pytest.approx(400 * 0.75 + 100 * 0.25)
+    assert xy == pytest.approx((400 - 100) * math.sqrt(3) / 4)
+    assert yy == pytest.approx(400 * 0.25 + 100 * 0.75)
+
+
+def test_the_length_of_a_quaternion_does_not_matter():
+    scene = make_scene(5, dtype=F64)
+    longer = replace(scene, quats=scene.quats * torch.tensor([0.01, 0.5, 2.0, 30.0, -1.0])[:, None])
+    torch.testing.assert_close(
+        project(longer, make_camera()).covs, project(scene, make_camera()).covs
+    )
+
+
+def test_rotations_are_orthonormal_and_right_handed():
+    quats = torch.nn.functional.normalize(make_scene(20, dtype=F64).quats, dim=1)
+    rotations = rotation_matrices(quats)
+    eye = torch.eye(3, dtype=F64).expand(20, 3, 3)
+    torch.testing.assert_close(rotations @ rotations.mT, eye, atol=1e-12, rtol=0)
+    torch.testing.assert_close(torch.linalg.det(rotations), torch.ones(20, dtype=F64))
+
+
+def test_integer_pixels_of_3dgs_are_half_a_pixel_less_than_ours():
+    camera = straight_camera(fx=90.0, fy=70.0)
+    x, y, z = 0.7, -0.4, 3.0
+    ndc = x / z * camera.fx / (camera.width / 2), y / z * camera.fy / (camera.height / 2)
+    sides = camera.width, camera.height
+    theirs = [((c + 1) * side - 1) / 2 for c, side in zip(ndc, sides, strict=True)]
+    ours = project(one_gaussian((x, y, z)), camera).means[0]
+    torch.testing.assert_close(ours - 0.5, torch.tensor(theirs, dtype=F64))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_the_near_plane_itself_is_not_drawn(dtype):
+    scene = make_scene(5, dtype=dtype)
+    depths = torch.tensor([0.2, 0.2001, -1.0, 0.0, 3.0], dtype=dtype)
+    scene = replace(scene, means=torch.nn.functional.pad(depths[:, None], (2, 0)))
+    splats = project(scene, straight_camera())
+    assert splats.sources.tolist() == [1, 4]
+    torch.testing.assert_close(splats.depths, depths[[1, 4]])
+    torch.testing.assert_close(splats.opacities, scene.opacities[[1, 4]])
+
+
+def test_nothing_in_front_of_the_camera_is_no_splats():
+    splats = project(one_gaussian((0.0, 0.0, -1.0)), straight_camera())
+    assert len(splats) == 0
+    assert shade(splats, one_gaussian((0.0, 0.0, -1.0)), straight_camera()).rgb.shape == (0, 3)
+
+
+# the linearised projection ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_off_the_axis_a_covariance_follows_the_derivative_of_the_pinhole(seed):
+    camera = replace(make_camera((2.0, -3.0, 1.0)), fy=50.0, cx=20.0, cy=31.0)
+    scene = make_scene(1, seed=seed, dtype=F64)
+    scene = replace(scene, means=scene.means * 0.5)
+    pose = camera.cam_from_world
+
+    def pixel(point: torch.Tensor) -> torch.Tensor:
+        x, y, z = pose[:3, :3] @ point + pose[:3, 3]
+        return torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy])
+
+    step = 1e-5 * torch.eye(3, dtype=F64)
+    mean = scene.means[0]
+    columns = [(pixel(mean + d) - pixel(mean - d)) / 2e-5 for d in step]
+    jacobian = torch.stack(columns, dim=1)
+    expected = jacobian @ world_covariance(scene) @ jacobian.T
+    splats = project(scene, camera)
+    assert 0 < splats.means[0, 0] < camera.width
+    assert 0 < splats.means[0, 1] < camera.height
+    torch.testing.assert_close(splats.means[0], pixel(mean))
+    torch.testing.assert_close(splats.covs[0], packed(expected), rtol=1e-8, atol=1e-8)
+    torch.testing.assert_close(splats.dets[0], torch.linalg.det(expected), rtol=1e-7, atol=0)
+
+
+# With f = 100 a side of 80 px reaches from −0.4 to 0.4 at depth 1 when the centre is at 40, and from −0.2 to 0.6 when
+# it is at 20; 0.3 · 40 / 100 = 0.12 more is kept on either side.  Height 60: 0.3 · 30 / 100 = 0.09.
+@pytest.mark.parametrize(
+    ("centre", "slope", "held"),
+    [
+        ((40.0, 30.0), (0.51, 0.0), (0.51, 0.0)),
+        ((40.0, 30.0), (0.9, 0.0), (0.52, 0.0)),
+        ((40.0, 30.0), (-0.9, 0.0), (-0.52, 0.0)),
+        ((40.0, 30.0), (0.0, 0.9), (0.0, 0.39)),
+        ((40.0, 30.0), (0.0, -0.9), (0.0, -0.39)),
+        ((40.0, 30.0), (3.0, -3.0), (0.52, -0.39)),
+        ((20.0, 30.0), (0.71, 0.0), (0.71, 0.0)),
+        ((20.0, 30.0), (0.9, 0.0), (0.72, 0.0)),
+        ((20.0, 30.0), (-0.9, 0.0), (-0.32, 0.0)),
+        ((40.0, 45.0), (0.0, 0.9), (0.0, 0.24)),
+        ((40.0, 45.0), (0.0, -0.9), (0.0, -0.54)),
+    ],
+)
+def test_the_derivative_is_taken_no_farther_out_than_the_widened_image(centre, slope, held):
+    camera, depth = straight_camera(centre=centre), 2.0
+    half = math.radians(50) / 2
+    scene = one_gaussian(
+        (slope[0] * depth, slope[1] * depth, depth),
+        scales=(0.3, 0.1, 0.2),
+        quat=(math.cos(half), 0.6 * math.sin(half), 0.8 * math.sin(half), 0.0),
+    )
+    jacobian = [[50.0, 0.0, -50.0 * held[0]], [0.0, 50.0, -50.0 * held[1]]]
+    splats = project(scene, camera)
+    torch.testing.assert_close(splats.covs[0], sandwich(jacobian, world_covariance(scene)))
+    landed = [100 * slope[0] + centre[0], 100 * slope[1] + centre[1]]
+    torch.testing.assert_close(splats.means[0], torch.tensor(landed, dtype=F64))
+
+
+def test_for_a_centred_camera_the_derivative_stops_at_1_3_times_the_field_of_view():
+    camera = straight_camera(fx=64.0, fy=64.0)
+    tangent = camera.width / 2 / camera.fx
+    scene = one_gaussian((20.0, 0.0, 2.0), scales=(1e-9, 1e-9, 0.1))
+    xx = project(scene, camera).covs[0, 0].item()
+    assert xx == pytest.approx((64 / 2 * 1.3 * tangent * 0.1) ** 2)
+
+
+# precision --------------------------------------------------------------------------------------
+
+
+def needles(n: int, long: float, thin: float) -> tuple[Gaussians, Camera]:
+    """Needles of `long` × `thin` px, in random orientations but never end-on, near the axis of a camera."""
+    g = torch.Generator().manual_seed(0)
+    turn = torch.rand(n, generator=g, dtype=F64) * math.pi
+    tilt = (torch.rand(n, generator=g, dtype=F64) - 0.5) * 2.0
+    zero = torch.zeros(n, dtype=F64)
+    about_z = torch.stack([(turn / 2).cos(), zero, zero, (turn / 2).sin()], dim=1)
+    # a tilt about the needle's own y, then a turn about the optical axis: q = q_z · q_y
+    cz, sz, cy, sy = about_z[:, 0], about_z[:, 3], (tilt / 2).cos(), (tilt / 2).sin()
+    quats = torch.stack([cz * cy, -sz * sy, cz * sy, sz * cy], dim=1)
+    depth = 5.0
+    sizes = torch.tensor([long, thin, thin], dtype=F64) * depth / 100
+    return (
+        Gaussians(
+            means=torch.nn.functional.pad(
+                torch.randn(n, 2, generator=g, dtype=F64), (0, 1), value=5.0
+            ),
+            quats=quats,
+            log_scales=sizes.log().expand(n, 3),
+            logit_opacities=zero,
+            sh=torch.zeros(n, 1, 3, dtype=F64),
+        ),
+        straight_camera(),
+    )
+
+
+@pytest.mark.parametrize(("long", "thin"), [(200.0, 0.1), (200.0, 0.01), (2000.0, 0.01)])
+def test_the_determinant_of_a_needle_has_its_digits_in_float32(long, thin):
+    scene, camera = needles(500, long, thin)
+    scene = scene.to(torch.float32)
+    single, exact = project(scene, camera), project(scene.to(F64), camera)
+    from_covariance = single.covs[:, 0] * single.covs[:, 2] - single.covs[:, 1].square()
+    lost = (from_covariance.double() / exact.dets - 1).abs()
+    assert lost.median() > 1e-3, "a needle this thin is meant to defeat the plain formula"
+    error = (single.dets.double() / exact.dets - 1).abs()
+    assert error.max() < 1e-5
+
+
+def test_the_determinant_is_that_of_the_covariance():
+    splats = project(make_scene(100, dtype=F64), make_camera())
+    xx, xy, yy = splats.covs.unbind(dim=1)
+    torch.testing.assert_close(splats.dets, xx * yy - xy * xy, rtol=1e-8, atol=0)
+
+
+def test_a_flat_gaussian_seen_from_its_side_has_a_determinant_of_no_less_than_zero():
+    scene = one_gaussian((0.0, 0.0, 2.0), scales=(1.0, 1e-20, 1.0))
+    splats = project(scene.to(torch.float32), straight_camera())
+    assert splats.dets.item() >= 0
+    assert splats.covs.isfinite().all()
+
+
+def test_float32_agrees_with_float64():
+    scene, camera = make_scene(300, degree=3), make_camera()
+    single = shade(project(scene, camera), scene, camera)
+    double = scene.to(F64)
+    exact = shade(project(double, camera), double, camera)
+    assert single.sources.equal(exact.sources)
+    assert single.means.dtype == single.covs.dtype == single.dets.dtype == torch.float32
+    for name, rtol, atol in (
+        ("means", 1e-5, 1e-4),
+        ("covs", 1e-4, 1e-4),
+        ("dets", 1e-4, 0.0),
+        ("depths", 1e-5, 0.0),
+        ("opacities", 1e-5, 0.0),
+        ("rgb", 1e-5, 1e-5),
+    ):
+        got, want = getattr(single, name).double(), getattr(exact, name)
+        torch.testing.assert_close(
+            got, want, rtol=rtol, atol=atol, msg=lambda m, n=name: f"{n}: {m}"
+        )
+
+
+def test_a_scene_far_from_the_origin_projects_as_if_it_were_near():
+    offset = torch.tensor([2.0**22, -(2.0**22), 2.0**22], dtype=F64)
+    scene, camera = make_scene(50, dtype=F64), make_camera()
+    scene = replace(scene, means=scene.means.mul(2).round().div(2)).to(torch.float32)
+    pose = camera.cam_from_world.clone()
+    pose[:3, 3] -= pose[:3, :3] @ offset
+    far = replace(scene, means=(scene.means.double() + offset).float())
+    assert (far.means.double() - offset).equal(scene.means.double()), "halves are exact out there"
+    there, here = project(far, replace(camera, cam_from_world=pose)), project(scene, camera)
+    torch.testing.assert_close(there.means, here.means, rtol=1e-5, atol=1e-4)
+    torch.testing.assert_close(there.covs, here.covs, rtol=1e-4, atol=1e-4)
+    shaded = shade(there, far, replace(camera, cam_from_world=pose)), shade(here, scene, camera)
+    torch.testing.assert_close(shaded[0].rgb, shaded[1].rgb, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("factor", [0.25, 0.5, 2.0, 3.0])
+def test_scaling_a_camera_scales_means_and_covariances(factor):
+    camera = replace(make_camera(size=(64, 48)), cx=24.0, cy=20.0)
+    scene = make_scene(50, dtype=F64)
+    scene = replace(scene, means=scene.means * 2)  # some beyond where the derivative stops
+    before, after = project(scene, camera), project(scene, camera.scaled(factor))
+    torch.testing.assert_close(after.means, before.means * factor)
+    torch.testing.assert_close(after.covs, before.covs * factor**2)
+    torch.testing.assert_close(after.dets, before.dets * factor**4)
+    assert after.depths.equal(before.depths)
+
+
+def test_a_scale_too_large_for_float32_stays_finite():
+    scene = one_gaussian((0.0, 0.0, 2.0)).to(torch.float32)
+    scene = replace(scene, log_scales=torch.full((1, 3), 1000.0))
+    assert project(scene, straight_camera()).covs.isfinite().all()
+
+
+# colour -----------------------------------------------------------------------------------------
+
+PI = math.pi
+C0, C1 = 0.5 * math.sqrt(1 / PI), math.sqrt(3 / (4 * PI))
+C2, C20 = 0.5 * math.sqrt(15 / PI), 0.25 * math.sqrt(5 / PI)
+C33, C32 = 0.25 * math.sqrt(35 / (2 * PI)), 0.5 * math.sqrt(105 / PI)
+C31, C30 = 0.25 * math.sqrt(21 / (2 * PI)), 0.25 * math.sqrt(7 / PI)
+D = 1 / math.sqrt(3)
+DIRECTIONS = {
+    "+x": (1.0, 0.0, 0.0),
+    "+y": (0.0, 1.0, 0.0),
+    "+z": (0.0, 0.0, 1.0),
+    "diagonal": (D, D, D),
+    "thirds": (2 / 3, -1 / 3, 2 / 3),
+}
+# every function of the basis, worked out on paper in these directions
+TABLE = [
+    ("0", C0, {"+x": 1, "+y": 1, "+z": 1, "diagonal": 1, "thirds": 1}),
+    ("-y", -C1, {"+y": 1, "diagonal": D, "thirds": -1 / 3}),
+    ("z", C1, {"+z": 1, "diagonal": D, "thirds": 2 / 3}),
+    ("-x", -C1, {"+x": 1, "diagonal": D, "thirds": 2 / 3}),
+    ("xy", C2, {"diagonal": 1 / 3, "thirds": -2 / 9}),
+    ("-yz", -C2, {"diagonal": 1 / 3, "thirds": -2 / 9}),
+    ("2zz-xx-yy", C20, {"+x": -1, "+y": -1, "+z": 2, "thirds": 1 / 3}),
+    ("-xz", -C2, {"diagonal": 1 / 3, "thirds": 4 / 9}),
+    ("xx-yy", C2 / 2, {"+x": 1, "+y": -1, "thirds": 1 / 3}),
+    ("-y(3xx-yy)", -C33, {"+y": -1, "diagonal": 2 * D / 3, "thirds": -11 / 27}),
+    ("xyz", C32, {"diagonal": D / 3, "thirds": -4 / 27}),
+    ("-y(4zz-xx-yy)", -C31, {"+y": -1, "diagonal": 2 * D / 3, "thirds": -11 / 27}),
+    ("z(2zz-3xx-3yy)", C30, {"+z": 2, "diagonal": -4 * D / 3, "thirds": -14 / 27}),
+    ("-x(4zz-xx-yy)", -C31, {"+x": -1, "diagonal": 2 * D / 3, "thirds": 22 / 27}),
+    ("z(xx-yy)", C32 / 2, {"thirds": 2 / 9}),
+    ("-x(xx-3yy)", -C33, {"+x": 1, "diagonal": -2 * D / 3, "thirds": 2 / 27}),
+]
+
+
+def basis(directions: torch.Tensor, functions: int = 16) -> torch.Tensor:
+    """Value of each function in each direction, read off the colour of scenes that hold one function alone."""
+    m = len(directions)
+    columns = []
+    for k in range(functions):
+        sh = torch.zeros(m, functions, 3, dtype=F64)
+        sh[:, k, 1] = 1.0
+        columns.append(sh_colour(sh, directions)[:, 1] - 0.5)
+    return torch.stack(columns, dim=1)
+
+
+@pytest.mark.parametrize("direction", DIRECTIONS)
+def test_spherical_harmonics_have_their_values_on_paper(direction):
+    values = basis(torch.tensor([DIRECTIONS[direction]], dtype=F64))[0]
+    expected = [factor * where.get(direction, 0.0) for _, factor, where in TABLE]
+    torch.testing.assert_close(values, torch.tensor(expected, dtype=F64), atol=1e-9, rtol=1e-9)
+
+
+def test_spherical_harmonics_are_orthonormal():
+    # Gauss-Legendre in z and equal steps around: exact for the products, which have degree 6
+    z, weights = (torch.from_numpy(a) for a in np.polynomial.legendre.leggauss(4))
+    around = torch.arange(8, dtype=F64) * PI / 4 + 0.1
+    z, angle = torch.cartesian_prod(z, around).T
+    weights = weights.repeat_interleave(8) * PI / 4
+    radius = (1 - z * z).sqrt()
+    values = basis(torch.stack([radius * angle.cos(), radius * angle.sin(), z], dim=1))
+    gram = values.T @ (weights[:, None] * values)
+    torch.testing.assert_close(gram, torch.eye(16, dtype=F64), atol=1e-9, rtol=0)
+
+
+@pytest.mark.parametrize("functions", [1, 4, 9, 16])
+def test_a_lower_degree_is_the_beginning_of_a_higher_one(functions):
+    directions = torch.nn.functional.normalize(make_scene(10, dtype=F64).means, dim=1)
+    torch.testing.assert_close(basis(directions, functions), basis(directions)[:, :functions])
+
+
+def test_channels_keep_apart():
+    sh = torch.zeros(1, 4, 3, dtype=F64)
+    sh[0, 2] = torch.tensor([1.0, 2.0, -3.0])
+    rgb = sh_colour(sh, torch.tensor([[0.0, 0.0, 1.0]], dtype=F64))
+    torch.testing.assert_close(rgb[0], torch.tensor([1.0, 2.0, -3.0], dtype=F64) * C1 + 0.5)
+
+
+def test_colour_is_seen_along_the_ray_from_the_camera_to_the_gaussian():
+    sh = torch.zeros(1, 4, 3, dtype=F64)
+    sh[0, 1, 0], sh[0, 2, 1], sh[0, 3, 2] = -0.1, 0.1, -0.1  # the direction's y, z, x
+    scene = one_gaussian((0.3, -0.4, 1.2), sh=sh)  # 1.3 away from a camera at the origin
+    rgb = shade(project(scene, straight_camera()), scene, straight_camera()).rgb
+    expected = 0.5 + 0.1 * C1 * torch.tensor([[-0.4, 1.2, 0.3]], dtype=F64) / 1.3
+    torch.testing.assert_close(rgb, expected)
+
+
+def test_colour_is_held_above_black_but_not_below_white():
+    scene = one_gaussian((0.0, 0.0, 2.0), sh=torch.tensor([[[-9.0, 0.0, 9.0]]], dtype=F64))
+    rgb = shade(project(scene, straight_camera()), scene, straight_camera()).rgb
+    torch.testing.assert_close(rgb, torch.tensor([[0.0, 0.5, 0.5 + 9 * C0]], dtype=F64))
+
+
+def test_colours_go_with_their_gaussians_when_some_are_behind_the_camera():
+    scene = make_scene(3, dtype=F64, degree=0)
+    means = torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, 3.0], [0.1, 0.0, 2.0]], dtype=F64)
+    scene = replace(scene, means=means)
+    splats = shade(project(scene, straight_camera()), scene, straight_camera())
+    torch.testing.assert_close(splats.rgb, (scene.sh[1:, 0] * C0 + 0.5).clamp(min=0))

@@ -1,0 +1,387 @@
+"""The rules of compositing by hand, the judge against a plain loop, and the fast rasterizer against the judge.
+
+At a cut-off (alpha at 1/255, transmittance at 1e-4) float32 and float64 may decide differently.  Pixels where that
+can happen are told apart by `near_a_cut_off`: all others must agree tightly, and those that differ are counted.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+
+import pytest
+import torch
+
+from aaplug.interfaces import Rasterizer
+from aaplug.rasterizers import RASTERIZERS, reference, tiled
+from aaplug.splats import Splats2D
+from tests.conftest import make_splats
+
+F64 = torch.float64
+BLACK, WHITE, SKY = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (0.25, 0.5, 1.0)
+RED, GREEN, BLUE = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+TOLERANCE = 1e-5
+FLIPS = 1e-4  # share of pixels that may fall on the other side of a cut-off
+UNIT = (4.0, 0.0, 4.0)
+
+
+@pytest.fixture(params=RASTERIZERS.values(), ids=RASTERIZERS)
+def rasterize(request: pytest.FixtureRequest) -> Rasterizer:
+    return request.param
+
+
+def splats_of(*rows: tuple) -> Splats2D:
+    """Splats of (mean, covariance, depth, opacity, colour)."""
+    means, covs, depths, opacities, colours = zip(*rows, strict=True)
+    covs = torch.tensor(covs, dtype=F64)
+    return Splats2D(
+        means=torch.tensor(means, dtype=F64),
+        covs=covs,
+        dets=covs[:, 0] * covs[:, 2] - covs[:, 1].square(),
+        depths=torch.tensor(depths, dtype=F64),
+        opacities=torch.tensor(opacities, dtype=F64),
+        sources=torch.arange(len(rows)),
+        rgb=torch.tensor(colours, dtype=F64),
+    )
+
+
+def stack(*layers: tuple[float, tuple[float, float, float]]) -> Splats2D:
+    """Layers of (opacity, colour), nearest first, all centred on pixel (4, 4)."""
+    rows = [((4.5, 4.5), UNIT, 1.0 + i, opacity, rgb) for i, (opacity, rgb) in enumerate(layers)]
+    return splats_of(*rows)
+
+
+def close(image: torch.Tensor, expected, atol: float = 1e-6) -> None:
+    torch.testing.assert_close(
+        image.double(), torch.as_tensor(expected, dtype=F64), rtol=0, atol=atol
+    )
+
+
+# by hand ----------------------------------------------------------------------------------------
+
+
+def test_alpha_at_the_centre_is_the_opacity(rasterize):
+    image = rasterize(stack((0.8, (0.5, 0.25, 2.0))), (9, 9), BLACK)
+    close(image.alpha[4, 4], 0.8)
+    close(image.rgb[4, 4], [0.4, 0.2, 1.6])
+
+
+def test_alpha_falls_with_the_mahalanobis_distance(rasterize):
+    # C = (5 2; 2 3), det 11, 11·C⁻¹ = (3 −2; −2 5): for d = (1, 2) dᵀC⁻¹d = 15/11, for (1, −2) it is 31/11
+    image = rasterize(splats_of(((4.5, 4.5), (5.0, 2.0, 3.0), 1.0, 0.9, RED)), (9, 9), BLACK)
+    close(image.alpha[6, 5], 0.9 * math.exp(-15 / 22))
+    close(image.alpha[2, 5], 0.9 * math.exp(-31 / 22))
+    close(image.alpha[2, 3], 0.9 * math.exp(-15 / 22))
+
+
+def test_a_pixel_is_sampled_at_its_centre_x_along_columns_and_y_along_rows(rasterize):
+    splats = splats_of(((10.5, 3.5), (0.2, 0.0, 0.2), 1.0, 0.9, RED))
+    image = rasterize(splats, (6, 13), BLACK)
+    assert image.rgb.shape == (6, 13, 3)
+    assert image.alpha.shape == (6, 13)
+    close(image.alpha[3, 10], 0.9)
+    between = rasterize(replace(splats, means=splats.means + 0.5), (6, 13), BLACK).alpha
+    close(between[3:5, 10:12], torch.full((2, 2), 0.9 * math.exp(-0.5 * (0.25 + 0.25) / 0.2)))
+
+
+def test_what_shines_through_is_the_background(rasterize):
+    image = rasterize(stack((0.75, RED)), (9, 9), SKY)
+    close(image.rgb[4, 4], [0.75 + 0.25 * 0.25, 0.25 * 0.5, 0.25 * 1.0])
+    close(image.alpha[4, 4], 0.75)
+    corner = 0.75 * math.exp(-0.5 * (16 + 16) / 4)
+    close(image.rgb[0, 0], [corner + (1 - corner) * 0.25, (1 - corner) * 0.5, 1 - corner])
+
+
+@pytest.mark.parametrize("near_first", [True, False])
+def test_the_nearer_splat_hides_the_farther_whatever_their_order(rasterize, near_first):
+    both = stack((0.6, RED), (0.5, GREEN))
+    both = both if near_first else both[torch.tensor([1, 0])]
+    image = rasterize(both, (9, 9), SKY)
+    rest = 0.4 * 0.5
+    close(image.rgb[4, 4], [0.6 + rest * 0.25, 0.4 * 0.5 + rest * 0.5, rest])
+    close(image.alpha[4, 4], 1 - rest)
+    swapped = replace(both, depths=3 - both.depths)
+    close(rasterize(swapped, (9, 9), BLACK).rgb[4, 4], [0.5 * 0.6, 0.5, 0.0])
+
+
+@pytest.mark.parametrize("order", [[0, 1, 2], [2, 1, 0], [1, 2, 0]])
+def test_splats_of_equal_depth_are_drawn_in_scene_order(rasterize, order):
+    splats = stack((0.5, RED), (0.5, GREEN), (0.5, BLUE))[torch.tensor(order)]
+    image = rasterize(replace(splats, depths=torch.ones(3, dtype=F64)), (9, 9), BLACK)
+    expected = torch.zeros(3)
+    expected[torch.tensor(order)] = torch.tensor([0.5, 0.25, 0.125])
+    close(image.rgb[4, 4], expected)
+
+
+@pytest.mark.parametrize("opacity", [0.991, 0.999, 1.0])
+def test_no_splat_hides_more_than_99_percent(rasterize, opacity):
+    image = rasterize(stack((opacity, RED)), (9, 9), SKY)
+    close(image.alpha[4, 4], 0.99)
+    close(image.rgb[4, 4], [0.99 + 0.01 * 0.25, 0.01 * 0.5, 0.01])
+    close(image.alpha[4, 5], opacity * math.exp(-1 / 8))  # below the cap nothing is changed
+
+
+@pytest.mark.parametrize(("alpha", "drawn"), [(1.001 / 255, True), (0.999 / 255, False)])
+def test_contributions_under_1_255_are_skipped(rasterize, alpha, drawn):
+    variance = 2.0**2 / (2 * math.log(0.5 / alpha))  # alpha two pixels from the centre
+    splats = splats_of(((4.5, 4.5), (variance, 0.0, variance), 1.0, 0.5, RED))
+    image = rasterize(splats, (9, 9), BLACK)
+    for row, column in ((4, 6), (4, 2), (6, 4), (2, 4)):
+        close(image.alpha[row, column], alpha if drawn else 0.0, atol=1e-8)
+    close(rasterize(stack((alpha, RED)), (9, 9), BLACK).alpha[4, 4], alpha if drawn else 0.0)
+
+
+def test_a_pixel_stops_before_the_splat_that_would_bring_it_under_1e_4(rasterize):
+    # transmittances 0.1, 0.01, 0.001, then 5e-5: not drawn, nor is the faint green one that would leave 9.9e-4
+    layers = [(0.9, RED)] * 3 + [(0.95, BLUE), (0.01, GREEN)]
+    image = rasterize(stack(*layers), (9, 9), WHITE)
+    close(image.rgb[4, 4], [0.999 + 0.001, 0.001, 0.001], atol=5e-7)
+    close(image.alpha[4, 4], 0.999, atol=5e-7)
+
+
+def test_a_splat_that_leaves_more_than_1e_4_is_drawn(rasterize):
+    layers = [(0.9, RED)] * 3 + [
+        (0.89, BLUE),
+        (0.2, GREEN),
+    ]  # 1.1e-4 is left by blue, 8.8e-5 by green
+    image = rasterize(stack(*layers), (9, 9), BLACK)
+    close(image.rgb[4, 4], [0.999, 0.0, 0.00089], atol=5e-7)
+    close(image.alpha[4, 4], 1 - 1.1e-4, atol=5e-7)
+
+
+def test_two_capped_splats_stop_a_pixel_as_they_do_in_3dgs(rasterize):
+    # 0.01 · 0.01 is a hair under 1e-4 in 3DGS's float32; gsplat stops at 1e-4 as well
+    image = rasterize(stack((1.0, RED), (1.0, GREEN), (0.5, BLUE)), (9, 9), BLACK)
+    close(image.rgb[4, 4], [0.99, 0.0, 0.0])
+
+
+def test_pixels_stop_one_by_one(rasterize):
+    wall = [((2.5, 4.5), (1.0, 0.0, 1e4), 1.0 + i / 10, 0.98, RED) for i in range(3)]
+    far = ((4.5, 4.5), (1e6, 0.0, 1e6), 9.0, 0.5, GREEN)
+    green = rasterize(splats_of(*wall, far), (9, 9), BLACK).rgb[4, :, 1]
+    assert green[2] == 0
+    close(green[8], 0.5, atol=1e-4)
+
+
+# the judge and a plain loop ---------------------------------------------------------------------
+
+
+def draw_by_loop(
+    splats: Splats2D, hw: tuple[int, int], background: tuple[float, float, float]
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Every rule of the interface, one pixel and one splat at a time, in Python's floats."""
+    rgb, alphas = torch.zeros(*hw, 3, dtype=F64), torch.zeros(hw, dtype=F64)
+    assert splats.rgb is not None
+    order = sorted(range(len(splats)), key=lambda i: splats.depths[i].item())
+    for row in range(hw[0]):
+        for column in range(hw[1]):
+            left, colour = 1.0, [0.0, 0.0, 0.0]
+            for i in order:
+                dx = column + 0.5 - splats.means[i, 0].item()
+                dy = row + 0.5 - splats.means[i, 1].item()
+                xx, xy, yy = splats.covs[i].tolist()
+                power = -0.5 * (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy)
+                alpha = splats.opacities[i].item() * math.exp(power / (xx * yy - xy * xy))
+                alpha = min(0.99, alpha)
+                if alpha < 1 / 255:
+                    continue
+                if left * (1 - alpha) < 1e-4:
+                    break
+                weight = alpha * left
+                colour = [
+                    c + weight * s for c, s in zip(colour, splats.rgb[i].tolist(), strict=True)
+                ]
+                left *= 1 - alpha
+            over = [c + left * b for c, b in zip(colour, background, strict=True)]
+            rgb[row, column], alphas[row, column] = torch.tensor(over, dtype=F64), 1 - left
+    return rgb, alphas
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("opaque", [False, True])
+def test_the_judge_equals_a_plain_loop(seed, opaque):
+    hw = (7, 9)
+    splats = make_splats(25, hw, seed, (-1.0, 1.5)).to(F64)
+    if opaque:
+        splats = replace(splats, opacities=0.8 + 0.18 * splats.opacities, covs=splats.covs * 9)
+    xx, xy, yy = splats.covs.unbind(dim=1)
+    splats = replace(splats, dets=xx * yy - xy * xy)
+    rgb, alpha = draw_by_loop(splats, hw, SKY)
+    assert (alpha.max() > 0.999) == opaque, "only the opaque ones should stop pixels"
+    image = reference.rasterize(splats, hw, SKY)
+    close(image.rgb, rgb, atol=1e-12)
+    close(image.alpha, alpha, atol=1e-12)
+
+
+def test_strips_and_chunks_of_the_judge_change_nothing(monkeypatch):
+    hw = (12, 17)
+    splats = make_splats(120, hw, 5, (0.0, 2.5)).to(F64)
+    splats = replace(splats, opacities=splats.opacities * 0.98)
+    whole = reference.rasterize(splats, hw, SKY)
+    assert (whole.alpha > 0.999).any(), "some pixels should stop inside a chunk"
+    monkeypatch.setattr(reference, "STRIP_PIXELS", 50)
+    monkeypatch.setattr(reference, "CHUNK_SPLATS", 7)
+    parts = reference.rasterize(splats, hw, SKY)
+    close(parts.rgb, whole.rgb, atol=1e-12)
+    close(parts.alpha, whole.alpha, atol=1e-12)
+
+
+# the fast rasterizer and the judge --------------------------------------------------------------
+
+
+def needles(m: int, hw: tuple[int, int], seed: int, long: float, thin: float) -> Splats2D:
+    """Splats of `long` × `thin` px in random directions, exact to float64."""
+    splats = make_splats(m, hw, seed).to(F64)
+    angle = torch.rand(m, generator=torch.Generator().manual_seed(seed), dtype=F64) * math.pi
+    cos, sin = angle.cos(), angle.sin()
+    xx = (cos * long).square() + (sin * thin).square()
+    yy = (sin * long).square() + (cos * thin).square()
+    covs = torch.stack([xx, cos * sin * (long**2 - thin**2), yy], dim=1)
+    return replace(splats, covs=covs, dets=torch.full((m,), (long * thin) ** 2, dtype=F64))
+
+
+def dense(m: int, hw: tuple[int, int], seed: int) -> Splats2D:
+    """Nearly opaque splats, many deep.
+
+    The cap on alpha is left out: two capped splats stand at the stopping rule's very edge.
+    """
+    splats = make_splats(m, hw, seed, (1.0, 2.0))
+    return replace(splats, opacities=0.8 + 0.18 * splats.opacities)
+
+
+REGIMES: dict[str, tuple[tuple[int, int], Callable[[tuple[int, int]], Splats2D]]] = {
+    "sub-pixel": ((64, 96), lambda hw: make_splats(1200, hw, 1, (-2.0, -0.7))),
+    "medium": ((61, 83), lambda hw: make_splats(300, hw, 2, (-1.0, 2.0))),
+    "huge": ((50, 101), lambda hw: make_splats(150, hw, 3, (3.0, 5.0))),
+    "larger than the image": ((31, 33), lambda hw: make_splats(60, hw, 4, (6.0, 9.0))),
+    "needles": ((65, 63), lambda hw: needles(150, hw, 5, 40.0, 0.6)),
+    "long needles": ((63, 100), lambda hw: needles(100, hw, 6, 300.0, 0.6)),
+    "dense": ((47, 56), lambda hw: dense(500, hw, 7)),
+    "faint": (
+        (40, 41),
+        lambda hw: replace(m := make_splats(300, hw, 8), opacities=m.opacities / 9),
+    ),
+    "one row": ((1, 130), lambda hw: make_splats(80, hw, 9, (0.0, 2.0))),
+    "one column": ((130, 1), lambda hw: make_splats(80, hw, 10, (0.0, 2.0))),
+    "one pixel": ((1, 1), lambda hw: make_splats(20, hw, 11, (-1.0, 1.0))),
+    "one tile": ((8, 8), lambda hw: make_splats(60, hw, 12, (-1.0, 1.0))),
+    "one more than a tile": ((9, 9), lambda hw: make_splats(60, hw, 13, (-1.0, 1.0))),
+    "one less than a tile": ((7, 7), lambda hw: make_splats(60, hw, 14, (-1.0, 1.0))),
+}
+
+
+@cache
+def drawn_twice(regime: str) -> tuple[torch.Tensor, torch.Tensor]:
+    """Largest difference of the two rasterizers at each pixel, and where a cut-off may explain one."""
+    hw, make = REGIMES[regime]
+    splats = make(hw).to(F64)
+    fast, judge = tiled.rasterize(splats, hw, SKY), reference.rasterize(splats, hw, SKY)
+    difference = (fast.rgb - judge.rgb).abs().amax(dim=2)
+    difference = torch.maximum(difference, (fast.alpha - judge.alpha).abs())
+    return difference, near_a_cut_off(splats, hw)
+
+
+def near_a_cut_off(splats: Splats2D, hw: tuple[int, int], band: float = 1e-3) -> torch.Tensor:
+    """Pixels where some alpha is within a share of `band` of 1/255, or some transmittance of 1e-4."""
+    splats = splats[splats.depths.argsort(stable=True)]
+    row, column = torch.meshgrid(*(torch.arange(side) + 0.5 for side in hw), indexing="ij")
+    dx, dy = column[..., None] - splats.means[:, 0], row[..., None] - splats.means[:, 1]
+    xx, xy, yy = splats.covs.T
+    power = (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / splats.dets
+    alpha = splats.opacities * torch.exp(-0.5 * power)
+    at_alpha = (alpha * 255 - 1).abs() < band
+    left = (1 - torch.where(alpha >= 1 / 255, alpha.clamp(max=0.99), 0)).cumprod(dim=2)
+    at_end = (left * 1e4 - 1).abs() < band
+    return (at_alpha | at_end).any(dim=2)
+
+
+@pytest.mark.parametrize("regime", REGIMES)
+def test_the_fast_rasterizer_equals_the_judge_away_from_cut_offs(regime):
+    difference, excused = drawn_twice(regime)
+    assert difference[~excused].max() < TOLERANCE
+
+
+def test_hardly_a_pixel_flips_at_a_cut_off():
+    differences = torch.cat([drawn_twice(regime)[0].flatten() for regime in REGIMES])
+    assert (differences > TOLERANCE).double().mean() < FLIPS
+
+
+def test_a_needle_rounded_to_float32_looks_as_it_did_before():
+    hw = (64, 64)
+    exact = needles(60, hw, 0, 200.0, 0.6)
+    for name, rasterize in RASTERIZERS.items():
+        image = rasterize(exact.to(torch.float32), hw, WHITE)
+        difference = (image.rgb - reference.rasterize(exact, hw, WHITE).rgb).abs().amax(dim=2)
+        worst = difference[~near_a_cut_off(exact, hw)].max().item()
+        assert worst < TOLERANCE, f"{name} is {worst:.1e} off"
+
+
+@pytest.mark.parametrize("x", [0.0, 7.5, 8.0, 8.5, 16.0, 24.0, -0.5, 24.5])
+@pytest.mark.parametrize("y", [0.0, 8.0, 15.5, 16.5])
+@pytest.mark.parametrize("sigma", [0.3, 1.0, 5.0])
+def test_splats_on_the_edges_of_tiles_are_drawn_whole(x, y, sigma):
+    splats = splats_of(((x, y), (sigma**2, 0.0, sigma**2), 1.0, 0.77, RED))
+    fast, judge = tiled.rasterize(splats, (16, 24), SKY), reference.rasterize(splats, (16, 24), SKY)
+    close(fast.rgb, judge.rgb)
+    close(fast.alpha, judge.alpha)
+
+
+@pytest.mark.parametrize(
+    "way", [(1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1)]
+)
+@pytest.mark.parametrize("alpha", [1.0001 / 255, 2 / 255])
+def test_a_splat_reaches_the_first_pixel_of_the_next_tile(way, alpha):
+    # the middle tile reaches from 8 to 16; its neighbours' nearest pixel centres are at 7.5 and 16.5
+    mean = [12.0 + 2.0 * step if step else 12.5 for step in way]
+    first = [12.0 + 4.5 * step if step else 12.5 for step in way]
+    variance = math.dist(mean, first) ** 2 / (2 * math.log(0.9 / alpha))
+    splats = splats_of((tuple(mean), (variance, 0.0, variance), 1.0, 0.9, RED))
+    image = tiled.rasterize(splats, (24, 24), BLACK)
+    close(image.alpha[int(first[1]), int(first[0])], alpha)
+    close(image.alpha, reference.rasterize(splats, (24, 24), BLACK).alpha)
+
+
+def test_thin_splats_that_only_cross_the_corner_of_a_tile_are_drawn_there():
+    # along x + y = 17 the line cuts the tile at (8, 8) in its first pixel alone
+    splats = splats_of(((2.5, 14.5), (72.0, -71.9, 72.0), 1.0, 0.9, RED))
+    fast, judge = (
+        tiled.rasterize(splats, (24, 24), BLACK),
+        reference.rasterize(splats, (24, 24), BLACK),
+    )
+    assert judge.alpha[8, 8] > 0.1
+    close(fast.alpha, judge.alpha, atol=1e-5)
+
+
+@pytest.mark.parametrize("opacity", [0.005, 0.02, 0.3])
+def test_thousands_of_splats_on_one_tile(opacity):
+    splats = make_splats(4000, (8, 8), 3, (2.0, 3.0)).to(F64)
+    splats = replace(splats, opacities=torch.full((4000,), opacity, dtype=F64))
+    fast, judge = tiled.rasterize(splats, (8, 8), SKY), reference.rasterize(splats, (8, 8), SKY)
+    difference = (fast.rgb - judge.rgb).abs().amax(dim=2)
+    assert difference.max() < 1e-3, "a flip is worth no more than what it leaves out"
+    assert difference.median() < TOLERANCE
+    assert difference[~near_a_cut_off(splats, (8, 8), band=1e-5)].max() < TOLERANCE
+
+
+def test_pairs_expanded_in_parts_change_nothing(monkeypatch):
+    hw = (40, 50)
+    splats = make_splats(200, hw, 6, (0.0, 3.0))
+    whole = tiled.rasterize(splats, hw, SKY)
+    for budget in (1, 30, 500):
+        monkeypatch.setattr(tiled, "PAIR_BUDGET", budget)
+        parts = tiled.rasterize(splats, hw, SKY)
+        assert parts.rgb.equal(whole.rgb)
+        assert parts.alpha.equal(whole.alpha)
+
+
+@pytest.mark.parametrize("which", ["none at all", "none in the image", "none opaque enough"])
+def test_without_splats_there_is_the_background(rasterize, which):
+    splats = stack((0.5, RED))
+    splats = {
+        "none at all": splats[:0],
+        "none in the image": replace(splats, means=splats.means + 1000),
+        "none opaque enough": replace(splats, opacities=splats.opacities * 0.001),
+    }[which]
+    image = rasterize(splats, (9, 11), SKY)
+    close(image.rgb, torch.tensor(SKY, dtype=F64).expand(9, 11, 3), atol=0)
+    close(image.alpha, torch.zeros(9, 11), atol=0)

@@ -1,0 +1,338 @@
+"""Convolution on the screen and in the world: published numbers, needles and extremes."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from aaplug.filters.smoothing import smooth, volume_log_factor
+from aaplug.gaussians import MIN_OPACITY, Gaussians, scale_opacities
+from aaplug.splats import Splats2D, drawn, half_sizes, reach
+from tests.conftest import make_scene, make_splats
+
+F64 = torch.float64
+
+
+def splat(xx: float, xy: float, yy: float, opacity: float = 1.0, dtype=F64) -> Splats2D:
+    return Splats2D(
+        means=torch.tensor([[10.0, 20.0]], dtype=dtype),
+        covs=torch.tensor([[xx, xy, yy]], dtype=dtype),
+        dets=torch.tensor([xx * yy - xy * xy], dtype=dtype),
+        depths=torch.ones(1, dtype=dtype),
+        opacities=torch.tensor([opacity], dtype=dtype),
+        sources=torch.zeros(1, dtype=torch.long),
+    )
+
+
+# compensation -----------------------------------------------------------------------------------
+
+VECTORS = [
+    ((4.0, 0.0, 4.0), 0.975610, 0.930233, 0.930233),
+    ((1.0, 0.3, 0.5), 0.848114, 0.656947, 0.656947),
+    ((0.05, 0.0, 0.05), 0.333327, 0.142860, 0.142857),
+    ((0.5, 0.0, 1e-4), 0.028870, 0.014466, 0.014431),
+    ((0.01, 0.0, 0.01), 0.090911, 0.032273, 0.032258),
+]
+
+
+@pytest.mark.parametrize(("covariance", "mip", "mip_wide", "floored"), VECTORS)
+def test_compensation_equals_the_published_forms(covariance, mip, mip_wide, floored):
+    # Mip-Splatting takes √(det₀ / (det₁ + 1e-6) + 1e-6); without both 1e-6 the square is off by no more than this
+    for variance, published in ((0.1, mip), (0.3, mip_wide)):
+        blurred = splat(*covariance).blurred(variance, compensate=True)
+        square = blurred.opacities.item() ** 2
+        regularised = 1e-6 * (1 + square / blurred.dets.item())
+        rounding = 2 * published * 5e-7
+        assert abs(square - published**2) <= regularised + rounding
+    factor = splat(*covariance).blurred(0.3, compensate=True).opacities.item()
+    assert factor == pytest.approx(floored, abs=5e-7)
+
+
+def test_compensation_has_a_floor_so_that_no_splat_vanishes_by_rounding():
+    # Mip-Splatting drops this one: its determinant of 1e-6 hits a floor there
+    speck = splat(1e-3, 0.0, 1e-3)
+    assert speck.blurred(0.3, compensate=True).opacities.item() == 0.005
+    assert speck.blurred(0.1, compensate=True).opacities.item() == pytest.approx(1e-3 / 0.101)
+    assert speck.blurred(0.3, True, floor=0.0).opacities.item() == pytest.approx(1e-3 / 0.301)
+
+
+def test_blurring_adds_its_variance_to_the_diagonal_alone():
+    blurred = splat(1.0, 0.3, 0.5, opacity=0.7).blurred(0.25, compensate=False)
+    torch.testing.assert_close(blurred.covs, torch.tensor([[1.25, 0.3, 0.75]], dtype=F64))
+    torch.testing.assert_close(blurred.dets, torch.tensor([1.25 * 0.75 - 0.09], dtype=F64))
+    assert blurred.opacities.item() == 0.7
+
+
+def test_blurring_takes_a_variance_for_each_splat():
+    splats = make_splats(4, (32, 32)).to(F64)
+    variances = torch.tensor([0.0, 0.1, 2.0, 30.0], dtype=F64)
+    together = splats.blurred(variances, compensate=True)
+    for i, variance in enumerate(variances.tolist()):
+        alone = splats[i : i + 1].blurred(variance, compensate=True)
+        torch.testing.assert_close(together.covs[i : i + 1], alone.covs)
+        torch.testing.assert_close(together.dets[i : i + 1], alone.dets)
+        torch.testing.assert_close(together.opacities[i : i + 1], alone.opacities)
+
+
+@pytest.mark.parametrize("compensate", [False, True])
+def test_two_blurs_are_one_of_the_summed_variance(compensate):
+    splats = make_splats(50, (32, 32)).to(F64)
+    twice = splats.blurred(0.2, compensate).blurred(0.5, compensate)
+    once = splats.blurred(0.7, compensate)
+    torch.testing.assert_close(twice.covs, once.covs)
+    torch.testing.assert_close(twice.dets, once.dets)
+    torch.testing.assert_close(twice.opacities, once.opacities)
+
+
+def test_compensation_keeps_the_energy():
+    splats = make_splats(50, (32, 32), log_sigmas=(-1.0, 3.0)).to(F64)
+    blurred = splats.blurred(0.3, compensate=True)
+    energy = blurred.opacities * blurred.dets.sqrt()
+    torch.testing.assert_close(energy, splats.opacities * splats.dets.sqrt())
+
+
+@pytest.mark.parametrize(("long", "thin"), [(200.0, 0.1), (200.0, 0.01), (2000.0, 0.01)])
+def test_a_needle_is_compensated_right_in_any_direction_in_float32(long, thin):
+    angle = torch.linspace(0, math.pi, 181, dtype=F64)
+    cos, sin = angle.cos(), angle.sin()
+    a = torch.stack([cos * long, -sin * thin], dim=1)
+    b = torch.stack([sin * long, cos * thin], dim=1)
+    covs = torch.stack([(a * a).sum(1), (a * b).sum(1), (b * b).sum(1)], dim=1)
+    n = len(angle)
+    needles = Splats2D(
+        means=torch.zeros(n, 2, dtype=F64),
+        covs=covs,
+        dets=torch.full((n,), (long * thin) ** 2, dtype=F64),
+        depths=torch.ones(n, dtype=F64),
+        opacities=torch.ones(n, dtype=F64),
+        sources=torch.arange(n),
+    ).to(torch.float32)
+    blurred = needles.blurred(0.3, compensate=True)
+    dets = (long**2 + 0.3) * (thin**2 + 0.3)
+    torch.testing.assert_close(
+        blurred.dets.double(), torch.full((n,), dets).double(), rtol=1e-6, atol=0
+    )
+    factor = torch.full((n,), long * thin / math.sqrt(dets)).double()
+    torch.testing.assert_close(blurred.opacities.double(), factor, rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("factor", ["dets", "opacities"])
+def test_a_splat_of_no_area_has_finite_gradients_when_blurred(factor):
+    point = splat(0.0, 0.0, 0.0)
+    inputs = point.covs.requires_grad_(), point.dets.requires_grad_()
+    blurred = replace(point, covs=inputs[0], dets=inputs[1]).blurred(0.3, compensate=True)
+    gradients = torch.autograd.grad(getattr(blurred, factor).sum(), inputs, allow_unused=True)
+    assert all(g.isfinite().all() for g in gradients if g is not None)
+
+
+# extents ----------------------------------------------------------------------------------------
+
+
+def test_alpha_is_1_255_at_the_reach():
+    splats = splat(4.0, 0.0, 9.0, opacity=0.8)
+    distance = reach(splats).item()
+    assert 0.8 * math.exp(-distance / 2) == pytest.approx(1 / 255)
+    assert half_sizes(splats)[0].tolist() == pytest.approx([2 * distance**0.5, 3 * distance**0.5])
+
+
+def test_a_box_touches_its_ellipse_on_every_side():
+    splats = splat(4.0, 2.5, 9.0, opacity=0.8)
+    angle = torch.linspace(0, 2 * math.pi, 100_001, dtype=F64)
+    factor = torch.linalg.cholesky(torch.tensor([[4.0, 2.5], [2.5, 9.0]], dtype=F64))
+    rim = reach(splats).sqrt() * factor @ torch.stack([angle.cos(), angle.sin()])
+    torch.testing.assert_close(half_sizes(splats)[0], rim.amax(dim=1), rtol=1e-8, atol=0)
+
+
+def test_a_splat_too_faint_to_draw_has_a_reach_below_zero_and_no_size():
+    faint = splat(4.0, 0.0, 9.0, opacity=0.003)
+    assert reach(faint).item() < 0
+    assert half_sizes(faint).tolist() == [[0.0, 0.0]]
+    assert half_sizes(splat(4.0, 0.0, 9.0, opacity=0.0)).tolist() == [[0.0, 0.0]]
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "kept"),
+    [
+        (1.0, 1.0, True),
+        (-0.9, 5.0, True),
+        (-1.1, 5.0, False),
+        (40.9, 5.0, True),
+        (41.1, 5.0, False),
+        (5.0, -0.9, True),
+        (5.0, -1.1, False),
+        (5.0, 20.9, True),
+        (5.0, 21.1, False),
+    ],
+)
+def test_drawn_keeps_what_reaches_into_the_image(x, y, kept):
+    side = 1 / (2 * math.log(255))  # variance of a splat that reaches 1 px
+    splats = replace(splat(side, 0.0, side), means=torch.tensor([[x, y]], dtype=F64))
+    assert len(drawn(splats, (20, 40))) == kept
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"opacities": torch.tensor([0.0039])},
+        {"opacities": torch.tensor([0.0])},
+        {"dets": torch.tensor([0.0])},
+        {"opacities": torch.tensor([math.nan])},
+        {"means": torch.tensor([[math.nan, 1.0]])},
+        {"covs": torch.tensor([[math.nan, 0.0, 1.0]])},
+    ],
+    ids=["faint", "transparent", "flat", "nan opacity", "nan mean", "nan covariance"],
+)
+def test_drawn_drops_what_cannot_be_drawn(change):
+    good = splat(4.0, 0.0, 4.0, dtype=torch.float32)
+    assert len(drawn(good, (40, 40))) == 1
+    assert len(drawn(replace(good, **change), (40, 40))) == 0
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_an_opacity_of_exactly_1_255_is_drawn(dtype):
+    assert len(drawn(splat(4.0, 0.0, 4.0, opacity=1 / 255, dtype=dtype), (40, 40))) == 1
+
+
+def test_splats_are_taken_whole_and_in_order():
+    splats = make_splats(6, (20, 20))
+    for index in (torch.tensor([4, 1, 1]), torch.arange(6) % 2 == 0, slice(2, 5)):
+        part = splats[index]
+        for name in ("means", "covs", "dets", "depths", "opacities", "sources", "rgb"):
+            assert getattr(part, name).equal(getattr(splats, name)[index]), name
+
+
+# smoothing in the world -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("scales", "expected"),
+    [
+        ((1.0, 1.0, 1.0), 0.353553),
+        ((1.0, 1.0, 0.01), 0.0050),
+        ((2.0, 2.0, 2.0), 0.715542),
+        ((5.0, 5.0, 0.1), 0.095677),
+    ],
+)
+@pytest.mark.parametrize("sigma", [1e-8, 1e-3, 1.0, 1e3])
+def test_the_volume_factor_equals_the_published_values(scales, expected, sigma):
+    log_scales = (torch.tensor([scales]) * sigma).log()
+    factor = volume_log_factor(log_scales, torch.tensor([sigma]).log()).exp().item()
+    assert factor == pytest.approx(expected, abs=5e-7 if expected > 0.01 else 5e-6)
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1e-7, 3e-8, 1e-8, 1e-12, 1e-20, 1e-30])
+@pytest.mark.parametrize("ratio", [1e-3, 0.1, 1.0, 2.0, 1e4])
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_the_volume_factor_is_exact_for_scales_of_any_size(scale, ratio, dtype):
+    log_scales = torch.full((1, 3), math.log(scale), dtype=dtype)
+    factor = volume_log_factor(log_scales, torch.tensor([math.log(scale * ratio)], dtype=dtype))
+    rounding = 1e-12 if dtype == F64 else 1e-4  # ln 1e-30 is −69, known to 8e-6 in float32
+    assert factor.item() == pytest.approx(-1.5 * math.log1p(ratio**2), rel=rounding)
+
+
+@pytest.mark.parametrize("scale", [1e-12, 1e-18, 1e-24, 1e-30])
+def test_the_volume_factor_and_its_gradient_stay_finite_for_points(scale):
+    log_scales = torch.full((1, 3), math.log(scale), requires_grad=True)
+    factor = volume_log_factor(log_scales, torch.zeros(1))
+    assert factor.item() == pytest.approx(3 * math.log(scale), rel=1e-5)
+    (gradient,) = torch.autograd.grad(factor.sum(), log_scales)
+    torch.testing.assert_close(gradient, torch.ones(1, 3))
+
+
+@pytest.mark.parametrize("volume", [False, True])
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_smoothing_by_nothing_is_the_identity_to_the_bit(volume, dtype):
+    scene = replace(
+        make_scene(200, dtype=dtype),
+        log_scales=torch.linspace(-60, 40, 600, dtype=dtype).view(200, 3),
+    )
+    scene.logit_opacities[:4] = torch.tensor([-100.0, -20.0, 20.0, 100.0])
+    same = smooth(scene, torch.full((200,), -math.inf, dtype=dtype), volume)
+    assert same.log_scales.equal(scene.log_scales)
+    assert same.logit_opacities.equal(scene.logit_opacities)
+
+
+def test_smoothing_adds_variances():
+    scene = make_scene(50, dtype=F64)
+    sigma = torch.linspace(0.01, 1, 50, dtype=F64)
+    smoothed = smooth(scene, sigma.log(), volume=True)
+    variances = scene.scales.square() + sigma.square()[:, None]
+    torch.testing.assert_close(smoothed.scales.square(), variances)
+    ratio = scene.scales.prod(dim=1) / smoothed.scales.prod(dim=1)
+    torch.testing.assert_close(smoothed.opacities, (scene.opacities * ratio).clamp(min=MIN_OPACITY))
+    assert smooth(scene, sigma.log(), volume=False).logit_opacities is scene.logit_opacities
+
+
+@pytest.mark.parametrize("log_scale", [-70.0, -28.0, -5.0, 0.0, 30.0])
+@pytest.mark.parametrize("log_sigma", [-70.0, -28.0, -5.0, 0.0, 30.0])
+def test_the_smoothed_scale_is_finite_and_the_larger_of_both_where_they_differ(
+    log_scale, log_sigma
+):
+    scene = replace(make_scene(1), log_scales=torch.full((1, 3), log_scale))
+    smoothed = smooth(scene, torch.tensor([log_sigma]), volume=True)
+    expected = max(log_scale, log_sigma) + (0.5 * math.log(2) if log_scale == log_sigma else 0)
+    assert smoothed.log_scales[0].tolist() == pytest.approx([expected] * 3, rel=1e-4, abs=1e-4)
+    assert smoothed.logit_opacities.isfinite().all()
+
+
+# opacities --------------------------------------------------------------------------------------
+
+
+def scaled_logit(logit: float, factor: float, most: float = 1 - MIN_OPACITY) -> float:
+    """logit(o·c), o·c held in [MIN_OPACITY, most], in Python's floats and without cancellation near 1."""
+    if logit > 0:
+        rest = math.exp(-logit) / (1 + math.exp(-logit))  # 1 − o
+        opacity, missing = (1 - rest) * factor, (1 - factor) + factor * rest
+    else:
+        opacity = math.exp(logit) / (1 + math.exp(logit)) * factor
+        missing = 1 - opacity
+    if opacity < MIN_OPACITY:
+        opacity, missing = MIN_OPACITY, 1 - MIN_OPACITY
+    if missing < 1 - most:
+        opacity, missing = most, 1 - most
+    return math.log(opacity) - math.log(missing)
+
+
+@pytest.mark.parametrize("logit", [-100.0, -20.0, -5.5, -1.0, 0.0, 1.0, 5.0, 12.0, 20.0, 100.0])
+@pytest.mark.parametrize("factor", [1e-30, 1e-6, 0.005, 0.5, 0.999, 1 - 2**-20])
+def test_opacities_are_scaled_right_near_0_and_near_1(logit, factor):
+    for dtype, tolerance in ((F64, 1e-8), (torch.float32, 1e-4)):
+        log_factor = torch.tensor([math.log(factor)], dtype=dtype)
+        got = scale_opacities(torch.tensor([logit], dtype=dtype), log_factor).item()
+        assert got == pytest.approx(scaled_logit(logit, factor), abs=tolerance, rel=tolerance)
+
+
+@pytest.mark.parametrize("logit", [-3.0, 0.0, 2.0, 9.0])
+def test_an_opacity_may_grow_up_to_its_limit(logit):
+    logits, doubled = torch.tensor([logit], dtype=F64), torch.tensor([math.log(2)], dtype=F64)
+    opacity = min(2 / (1 + math.exp(-logit)), 0.9999)
+    expected = math.log(opacity / (1 - opacity))
+    assert scale_opacities(logits, doubled, 0.9999).item() == pytest.approx(expected, rel=1e-9)
+
+
+def test_a_factor_of_one_leaves_every_opacity_to_the_bit():
+    logits = torch.tensor([-math.inf, -100.0, -20.0, -0.3, 0.0, 17.0, 20.0, 100.0, math.inf])
+    assert scale_opacities(logits, torch.zeros(9)).equal(logits)
+
+
+def test_scaled_opacities_are_finite_whatever_they_were():
+    logits = torch.tensor([-math.inf, -100.0, 0.0, 100.0, math.inf])
+    for log_factor in (-math.inf, -100.0, -1e-7, 1e-7, 100.0):
+        scaled = scale_opacities(logits, torch.full((5,), log_factor))
+        assert scaled.isfinite().all()
+        assert scaled.sigmoid().min() >= MIN_OPACITY * (1 - 1e-5)
+        assert scaled.sigmoid().max() < 1
+
+
+def test_scaled_opacities_have_the_gradient_of_their_formula():
+    logits = torch.linspace(-6, 6, 13, dtype=F64, requires_grad=True)
+    log_factor = torch.linspace(-3, -0.01, 13, dtype=F64, requires_grad=True)
+    assert torch.autograd.gradcheck(scale_opacities, (logits, log_factor))
+
+
+def test_opacity_and_scale_of_a_gaussian_are_the_activations_of_what_is_stored():
+    scene: Gaussians = make_scene(5, dtype=F64)
+    torch.testing.assert_close(scene.opacities, 1 / (1 + torch.exp(-scene.logit_opacities)))
+    torch.testing.assert_close(scene.scales, torch.exp(scene.log_scales))
+    torch.testing.assert_close(scene.unit_quats.norm(dim=1), torch.ones(5, dtype=F64))
