@@ -102,7 +102,9 @@ class Gaussians:
 
     def __getitem__(self, index: Tensor | slice) -> "Gaussians":
         """The Gaussians at `index` (a mask, indices or a slice), in that order."""
-        kept = index.cpu() if isinstance(index, Tensor) else index  # the file's rows stay on the CPU
+        kept = (
+            index.cpu() if isinstance(index, Tensor) else index
+        )  # the file's rows stay on the CPU
         origin = self.origin and replace(self.origin, rows=self.origin.rows[kept])
         return replace(
             self,

@@ -8,14 +8,12 @@ t: tiles of TILE × TILE px; p: pairs of a splat and a tile that it reaches; K: 
    stably by tile.
 3. Tiles of like length go through compositing together, K splats a pass; finished tiles leave.
 
-Blocks of tiles run in threads of their own, each operation small enough that torch does not split it: operations split
-over threads wait for the slowest at every step, and on cores shared with other work that wait was measured to cost
-forty times the work itself.  Not differentiable; the reference is.
+Each operation on a pass is small enough that torch runs it in one thread: operations split over threads wait for the
+slowest at every step, and on cores shared with other work that wait was measured to cost forty times the work itself.
+Not differentiable; the reference is.
 """
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
 from itertools import pairwise
 from math import log2
 
@@ -27,8 +25,8 @@ from aaplug.rasterizers.rules import MAX_ALPHA, MIN_TRANSMITTANCE, over
 from aaplug.splats import MIN_ALPHA, Render, Splats2D, half_sizes, reach
 
 TILE = 8  # px
-PASS = 16  # splats composited in one pass
-BLOCK = 32  # tiles in one pass: PASS·BLOCK·TILE² = 32768 elements stay in the L2 cache, and torch runs them serially
+PASS = 16  # splats composited in one pass, at least
+BLOCK = 32  # tiles in one pass, at most: PASS·BLOCK·TILE² = 32768 elements stay in the L2 cache and in one thread
 PAIR_BUDGET = 8_000_000  # candidate pairs expanded at once
 HALF_LOG2_E = 0.5 * log2(torch.e)
 LOG2_SILENT = (
@@ -55,6 +53,7 @@ class Bins:
     counts: Int[Tensor, " t"]
 
 
+@torch.no_grad()
 def rasterize(
     splats: Splats2D, hw: tuple[int, int], background: tuple[float, float, float]
 ) -> Render:
@@ -172,14 +171,11 @@ def _composite(
     """Premultiplied colour and alpha of every pixel of every tile."""
     image = drawing.new_zeros(grid[0] * grid[1], TILE * TILE, 4)
     order = torch.sort(bins.counts, descending=True).indices[: int((bins.counts > 0).sum())]
-    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
-        work = partial(_composite_block, drawing, bins, columns=grid[1], image=image)
-        for _ in pool.map(work, order.split(BLOCK)):
-            pass  # every block writes tiles of its own; waiting here passes exceptions on
+    for tiles in order.split(BLOCK):
+        _composite_block(drawing, bins, tiles, grid[1], image)
     return image
 
 
-@torch.no_grad()
 def _composite_block(
     drawing: Float[Tensor, "m 10"],
     bins: Bins,
@@ -193,19 +189,19 @@ def _composite_block(
     local = _local_positions(drawing)
     transmittance = drawing.new_ones(len(tiles), TILE * TILE)
     total = drawing.new_zeros(len(tiles), TILE * TILE, 4)
-    steps = torch.arange(PASS, device=tiles.device)[:, None]
-    for start in range(0, int(counts.max()), PASS):
-        place = steps + start
+    start, longest = 0, int(counts.max())
+    while len(tiles) and start < longest:
+        step = PASS * max(1, BLOCK // len(tiles))  # few tiles take more splats at once
+        place = start + torch.arange(step, device=tiles.device)[:, None]
         pair = torch.where(place < counts, first + place, 0)
         splat = torch.where(place < counts, bins.splats[pair], len(drawing) - 1)
         transmittance = _pass(drawing[splat], centre, local, transmittance, total)
-        live = (transmittance.amax(dim=1) > 0) & (counts > start + PASS)
+        start += step
+        live = (transmittance.amax(dim=1) > 0) & (counts > start)
         if not live.all():
             image[tiles[~live]] = total[~live]
             tiles, first, counts, centre = tiles[live], first[live], counts[live], centre[live]
             transmittance, total = transmittance[live], total[live]
-        if len(tiles) == 0:
-            return
 
 
 def _local_positions(like: Tensor) -> Float[Tensor, "3 P"]:
@@ -226,9 +222,9 @@ def _pass(
     alpha = _alphas(splats, centre, local)
     steps = alpha.new_empty(len(splats) + 1, *transmittance.shape)
     steps[0] = transmittance
-    kept = 1 - alpha
-    for k in range(len(splats)):
-        torch.mul(steps[k], kept[k], out=steps[k + 1])
+    views = steps.unbind()
+    for before, after, kept in zip(views, views[1:], (1 - alpha).unbind(), strict=False):
+        torch.mul(before, kept, out=after)
     after = torch.threshold_(steps[1:], BELOW_MIN_TRANSMITTANCE, 0.0)
     weight = alpha.mul_(steps[:-1]).mul_(after > 0)
     colour = torch.nn.functional.pad(splats[..., RGB], (0, 1), value=1.0)

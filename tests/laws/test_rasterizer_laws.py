@@ -1,0 +1,236 @@
+"""What every rasterizer must hold to, whatever its method."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from aaplug.interfaces import Rasterizer
+from aaplug.rasterizers import RASTERIZERS
+from aaplug.splats import Render, Splats2D
+from tests.conftest import make_splats
+
+HW = (29, 43)
+SKY = (0.25, 0.5, 1.0)
+NAMES = ("means", "covs", "dets", "depths", "opacities", "sources", "rgb")
+SAME = 1e-6  # adding nothing may change the order of a sum, no more
+
+
+@pytest.fixture(params=RASTERIZERS.values(), ids=RASTERIZERS)
+def rasterize(request: pytest.FixtureRequest) -> Rasterizer:
+    return request.param
+
+
+@pytest.fixture
+def splats() -> Splats2D:
+    """Splats of distinct depths from 2 to 3."""
+    splats = make_splats(150, HW, seed=1)
+    order = torch.randperm(150, generator=torch.Generator().manual_seed(2))
+    return replace(splats, depths=2 + order / 150)
+
+
+def joined(*parts: Splats2D) -> Splats2D:
+    return Splats2D(*(torch.cat([getattr(part, name) for part in parts]) for name in NAMES))
+
+
+def shuffled(splats: Splats2D, seed: int = 0) -> Splats2D:
+    return splats[torch.randperm(len(splats), generator=torch.Generator().manual_seed(seed))]
+
+
+def one(
+    mean: tuple[float, float] = (20.5, 12.5),
+    covariance: tuple[float, float, float] = (9.0, 0.0, 9.0),
+    opacity: float = 0.5,
+    det: float | None = None,
+) -> Splats2D:
+    xx, xy, yy = covariance
+    return Splats2D(
+        means=torch.tensor([mean]),
+        covs=torch.tensor([covariance]),
+        dets=torch.tensor([xx * yy - xy * xy if det is None else det]),
+        depths=torch.tensor([1.0]),
+        opacities=torch.tensor([opacity]),
+        sources=torch.tensor([0]),
+        rgb=torch.tensor([[1.0, 0.5, 0.25]]),
+    )
+
+
+def assert_same(image: Render, other: Render, atol: float = SAME) -> None:
+    torch.testing.assert_close(image.rgb, other.rgb, rtol=0, atol=atol)
+    torch.testing.assert_close(image.alpha, other.alpha, rtol=0, atol=atol)
+
+
+def background_share(image: Render) -> torch.Tensor:
+    """How far the image is from its background, at most."""
+    away = (image.rgb - torch.tensor(SKY, dtype=image.rgb.dtype)).abs().max()
+    return torch.maximum(away, image.alpha.abs().max())
+
+
+def test_the_image_has_the_shape_that_was_asked_for(rasterize, splats):
+    for hw in (HW, (1, 1), (8, 16), (17, 3)):
+        image = rasterize(splats, hw, SKY)
+        assert image.rgb.shape == (*hw, 3)
+        assert image.alpha.shape == hw
+
+
+def test_splats_behind_an_opaque_wall_change_nothing(rasterize, splats):
+    wall = joined(*[one(covariance=(1e8, 0.0, 1e8), opacity=1.0)] * 3)
+    before = rasterize(joined(wall, splats), HW, SKY)
+    hidden = make_splats(100, HW, seed=7)
+    hidden = replace(hidden, depths=hidden.depths + 1.5, rgb=hidden.rgb * 100)
+    assert_same(rasterize(shuffled(joined(wall, splats, hidden)), HW, SKY), before)
+    assert_same(rasterize(wall, HW, SKY), before)
+
+
+def test_splats_behind_a_wall_show_where_it_is_not(rasterize, splats):
+    wall = joined(*[one(covariance=(4.0, 0.0, 4.0), opacity=1.0)] * 3)
+    alone, together = rasterize(wall, HW, SKY), rasterize(joined(wall, splats), HW, SKY)
+    assert (alone.rgb - together.rgb).abs().amax() > 0.1
+
+
+@pytest.mark.parametrize("way", [(-1, 0), (1, 0), (0, -1), (0, 1), (1, 1), (-1, -1)])
+@pytest.mark.parametrize("distance", [3.0, 100.0, 1e5, 1e9])
+def test_splats_off_the_screen_change_nothing(rasterize, splats, way, distance):
+    # a splat of opacity 1 and 0.6 px reaches 2 px
+    rows, columns = HW
+    middle = (columns / 2, rows / 2)
+    mean = [m + step * (m + distance) for m, step in zip(middle, way, strict=True)]
+    outside = replace(one(tuple(mean), (0.36, 0.1, 0.36), 1.0), rgb=torch.full((1, 3), 100.0))
+    before = rasterize(splats, HW, SKY)
+    assert_same(rasterize(joined(outside, splats), HW, SKY), before)
+
+
+@pytest.mark.parametrize("opacity", [0.0, 1e-40, 1e-9, 0.9999 / 255])
+def test_transparent_splats_change_nothing(rasterize, splats, opacity):
+    ghosts = make_splats(40, HW, seed=8)
+    ghosts = replace(ghosts, opacities=torch.full((40,), opacity), rgb=ghosts.rgb * 100)
+    before = rasterize(splats, HW, SKY)
+    assert_same(rasterize(shuffled(joined(ghosts, splats)), HW, SKY), before)
+
+
+def test_the_order_of_splats_of_distinct_depths_changes_nothing(rasterize, splats):
+    assert splats.depths.unique().numel() == len(splats)
+    before = rasterize(splats, HW, SKY)
+    for seed in range(3):
+        assert_same(rasterize(shuffled(splats, seed), HW, SKY), before)
+
+
+def test_depths_count_by_their_order_alone(rasterize, splats):
+    before = rasterize(splats, HW, SKY)
+    assert_same(rasterize(replace(splats, depths=splats.depths.exp() * 1e3), HW, SKY), before)
+
+
+def test_no_splats_give_the_background(rasterize, splats):
+    assert background_share(rasterize(splats[:0], HW, SKY)) == 0
+
+
+@pytest.mark.parametrize("opacity", [0.0, 0.003])
+def test_splats_of_no_effect_give_the_background(rasterize, opacity):
+    assert background_share(rasterize(one(opacity=opacity), HW, SKY)) == 0
+    assert background_share(rasterize(one(mean=(-500.0, 12.5)), HW, SKY)) == 0
+
+
+def test_two_runs_give_the_same_bits(rasterize):
+    splats = make_splats(600, (120, 130), seed=3)
+    first, second = (rasterize(splats, (120, 130), SKY) for _ in range(2))
+    assert first.rgb.equal(second.rgb)
+    assert first.alpha.equal(second.alpha)
+
+
+def test_splats_are_not_modified(rasterize, splats):
+    before = {name: getattr(splats, name).clone() for name in NAMES}
+    rasterize(splats, HW, SKY)
+    assert all(getattr(splats, name).equal(kept) for name, kept in before.items())
+
+
+@pytest.mark.parametrize("log_sigmas", [(-2.0, 0.0), (0.0, 2.0), (3.0, 6.0)])
+def test_alpha_is_between_0_and_1(rasterize, log_sigmas):
+    splats = make_splats(400, HW, seed=4, log_sigmas=log_sigmas)
+    alpha = rasterize(replace(splats, opacities=splats.opacities.sqrt()), HW, SKY).alpha
+    assert alpha.min() >= 0
+    assert 0.5 < alpha.max() <= 1
+
+
+def test_the_image_is_what_the_splats_show_plus_what_alpha_leaves_of_the_background(
+    rasterize, splats
+):
+    on_black, on_sky = rasterize(splats, HW, (0.0, 0.0, 0.0)), rasterize(splats, HW, SKY)
+    assert on_black.alpha.equal(on_sky.alpha)
+    sky = (1 - on_black.alpha)[..., None] * torch.tensor(SKY)
+    torch.testing.assert_close(on_sky.rgb, on_black.rgb + sky.to(on_sky.rgb), rtol=0, atol=SAME)
+
+
+def test_splats_of_one_colour_show_it_in_the_measure_of_alpha(rasterize, splats):
+    white = replace(splats, rgb=torch.ones(len(splats), 3))
+    image = rasterize(white, HW, (0.0, 0.0, 0.0))
+    torch.testing.assert_close(
+        image.rgb, image.alpha[..., None].expand(*HW, 3), rtol=0, atol=2 * SAME
+    )
+
+
+def test_moving_everything_by_a_pixel_moves_the_image(rasterize, splats):
+    before = rasterize(splats, HW, SKY)
+    moved = rasterize(replace(splats, means=splats.means + torch.tensor([1.0, 2.0])), HW, SKY)
+    torch.testing.assert_close(moved.rgb[2:, 1:], before.rgb[:-2, :-1], rtol=0, atol=2e-5)
+
+
+def test_mirroring_everything_mirrors_the_image(rasterize, splats):
+    mirrored = replace(
+        splats,
+        means=torch.tensor([float(HW[1]), 0.0]) + splats.means * torch.tensor([-1.0, 1.0]),
+        covs=splats.covs * torch.tensor([1.0, -1.0, 1.0]),
+    )
+    before, after = rasterize(splats, HW, SKY), rasterize(mirrored, HW, SKY)
+    torch.testing.assert_close(after.rgb.flip(1), before.rgb, rtol=0, atol=2e-5)
+
+
+POISON = {
+    "a denormal opacity": one(opacity=1e-40),
+    "opacity 0": one(opacity=0.0),
+    "opacity 1/255": one(opacity=1 / 255),
+    "opacity 1": one(opacity=1.0),
+    "a million px": one(covariance=(1e12, 0.0, 1e12)),
+    "a million px, seen from afar": one((1e6, -1e6), (1e12, 0.0, 1e12)),
+    "a needle of a million px": one(covariance=(1e12, 0.0, 0.3)),
+    "a denormal covariance": one(covariance=(1e-22, 0.0, 1e-22), det=1e-44),
+    "a denormal width": one(covariance=(1.0, 0.0, 1e-40), det=1e-40),
+    "a denormal width, between pixels": one((20.7, 12.2), (1.0, 0.0, 1e-40), det=1e-40),
+    "no area": one(covariance=(1.0, 0.0, 0.0), det=0.0),
+    "a point": one(covariance=(0.0, 0.0, 0.0), det=0.0),
+    "an infinite determinant": one(covariance=(1e20, 0.0, 1e20), det=math.inf),
+    "far away": one(mean=(1e30, -1e30)),
+}
+
+
+@pytest.mark.parametrize("poison", POISON)
+def test_extreme_splats_render_finite_and_spoil_no_other(rasterize, splats, poison):
+    alone = rasterize(POISON[poison], HW, SKY)
+    together = rasterize(joined(splats, POISON[poison]), HW, SKY)
+    for image in (alone, together):
+        assert image.rgb.isfinite().all()
+        assert image.alpha.isfinite().all()
+        assert image.alpha.min() >= 0
+        assert image.alpha.max() <= 1
+
+
+@pytest.mark.parametrize(
+    ("poison", "alpha"),
+    [
+        ("opacity 1/255", 1 / 255),
+        ("opacity 1", 0.99),
+        ("a million px", 0.5),
+        ("a million px, seen from afar", 0.5 * math.exp(-1)),
+        ("a needle of a million px", 0.5),
+        ("a denormal covariance", 0.5),
+    ],
+)
+def test_extreme_splats_show_what_they_should_at_their_centre(rasterize, poison, alpha):
+    centre = rasterize(POISON[poison], HW, SKY).alpha[12, 20].item()
+    assert centre == pytest.approx(alpha, rel=1e-4)
+
+
+def test_a_splat_of_endless_extent_covers_the_image_in_every_rasterizer(rasterize):
+    # a squared area beyond float32's range: a scale of 4e9 px
+    alpha = rasterize(POISON["an infinite determinant"], HW, SKY).alpha
+    torch.testing.assert_close(alpha.float(), torch.full(HW, 0.5), rtol=0, atol=1e-5)
