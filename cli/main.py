@@ -36,6 +36,11 @@ def main(words: Sequence[str] | None = None) -> None:
     except AaplugError as error:
         console.log.print(f"[red]error:[/] {console.escape(str(error))}")
         sys.exit(REFUSED)
+    except MemoryError:
+        console.log.print(
+            "[red]error:[/] out of memory; a smaller --scale or fewer Gaussians need less"
+        )
+        sys.exit(REFUSED)
     except KeyboardInterrupt:
         console.say("interrupted")
         sys.exit(INTERRUPTED)

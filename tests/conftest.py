@@ -18,6 +18,10 @@ from aaplug.io.scenes import read_scene
 from aaplug.pipeline import learn
 from aaplug.splats import Splats2D
 
+torch.set_num_threads(
+    1
+)  # test processes run side by side, and threads that wait for each other would stall them all
+
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 SAMPLE = Path(str(files("aaplug.sample")))
 
