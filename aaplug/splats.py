@@ -13,6 +13,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 MIN_ALPHA = 1 / 255  # a contribution below it is skipped (3DGS)
+    1 / 255
+).item()  # a contribution below it is skipped (3DGS, in its float32)
 MIN_COMPENSATION = (
     0.005  # floor of an opacity factor, so that rounding makes no splat vanish (3DGS, gsplat)
 )
@@ -75,7 +77,7 @@ class Splats2D:
         added = variance[:, None] if isinstance(variance, Tensor) else variance
         opacities = self.opacities
         if compensate:
-            opacities = opacities * (self.dets / dets).sqrt().clamp(min=floor)
+            opacities = opacities * (self.dets / dets).clamp(min=floor * floor).sqrt()
         return replace(self, covs=self.covs + added * diagonal, dets=dets, opacities=opacities)
 
 
@@ -84,6 +86,24 @@ class Render(NamedTuple):
 
     rgb: Float[Tensor, "h w 3"]
     alpha: Float[Tensor, "h w"]
+
+
+def whitening(splats: Splats2D) -> Float[Tensor, "m 2 2"]:
+    """W of each splat with |W d|² = dᵀ C⁻¹ d, for d = (dx, dy) in px.
+
+    The row without slope runs along the axis of larger variance, so that the other's slope is at most one; with the
+    determinant given, no digits are lost for needles, as they are in yy·dx² − 2xy·dx·dy + xx·dy².
+    """
+    xx, xy, yy = splats.covs.unbind(dim=1)
+    wide = xx >= yy
+    pivot = torch.where(wide, xx, yy)
+    along, across = pivot.rsqrt(), (pivot / splats.dets).sqrt()
+    slope, zero = -xy / pivot * across, torch.zeros_like(along)
+    sloped = torch.stack(
+        [torch.where(wide, slope, across), torch.where(wide, across, slope)], dim=1
+    )
+    straight = torch.stack([torch.where(wide, along, zero), torch.where(wide, zero, along)], dim=1)
+    return torch.stack([sloped, straight], dim=1)
 
 
 def reach(splats: Splats2D) -> Float[Tensor, " m"]:

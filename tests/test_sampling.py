@@ -239,14 +239,19 @@ def test_the_frame_check_samples_a_large_scene_evenly():
 
 MEASURE = """
 import json, torch
+from aaplug.cameras import Camera
 from aaplug.sampling import sampling_bounds
-from tests.test_sampling import ring
 
 def peak():
     lines = open("/proc/self/status").read().splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM")) * 1024
 
-means, cameras = torch.randn(300_000, 3), ring(100)
+def camera(back):
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[2, 3] = back
+    return Camera("view", 80, 40, 64.0, 64.0, 40.0, 20.0, pose)
+
+means, cameras = torch.randn(300_000, 3), [camera(4.0 + i / 50) for i in range(100)]
 sampling_bounds(means[:1000], cameras)
 before = peak()
 bounds = sampling_bounds(means, cameras)

@@ -70,5 +70,5 @@ def volume_log_factor(
     log_scales: Float[Tensor, "n 3"], log_sigma: Float[Tensor, " n"]
 ) -> Float[Tensor, " n"]:
     """ln ∏ s/√(s² + f²) = −½ Σ ln(1 + f²/s²)."""
-    ratio = (2 * (log_sigma[:, None] - log_scales)).exp()
-    return -0.5 * ratio.log1p().sum(dim=1)
+    log_ratio = 2 * (log_sigma[:, None] - log_scales)
+    return -0.5 * torch.logaddexp(log_ratio, torch.zeros_like(log_ratio)).sum(dim=1)

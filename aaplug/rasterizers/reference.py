@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.rasterizers.rules import MAX_ALPHA, MIN_TRANSMITTANCE, over
-from aaplug.splats import MIN_ALPHA, Render, Splats2D
+from aaplug.splats import MIN_ALPHA, Render, Splats2D, whitening
 
 STRIP_PIXELS = 4096
 CHUNK_SPLATS = 512
@@ -56,8 +56,7 @@ def _strip(
 
 def alphas(splats: Splats2D, centres: Float[Tensor, "p 2"]) -> Float[Tensor, "p c"]:
     """Alpha of each splat at each point: min(0.99, o·exp(−dᵀ C⁻¹ d / 2)), 0 below 1/255 (3DGS, eq. 4)."""
-    dx, dy = (centres[:, None, :] - splats.means[None]).unbind(dim=2)
-    xx, xy, yy = splats.covs.unbind(dim=1)
-    distance = (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / splats.dets
-    alpha = (splats.opacities * torch.exp(-0.5 * distance.clamp(min=0.0))).clamp(max=MAX_ALPHA)
+    white = torch.einsum("cij,pcj->pci", whitening(splats), centres[:, None] - splats.means)
+    distance = white.square().sum(dim=2)
+    alpha = (splats.opacities * torch.exp(-0.5 * distance)).clamp(max=MAX_ALPHA)
     return torch.where(alpha >= MIN_ALPHA, alpha, 0.0)

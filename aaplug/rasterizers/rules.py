@@ -1,12 +1,17 @@
 """The rules of 3DGS's compositing that every rasterizer keeps (Kerbl et al. 2023, and its published constants)."""
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.splats import Render
 
-MAX_ALPHA = 0.99  # no splat hides more than this
-MIN_TRANSMITTANCE = 1e-4  # a pixel stops before the splat that would bring it under this
+# Rounded to float32 as 3DGS has them, in every precision: (1 − 0.99)² is a hair under 1e-4 there, and two splats at the
+# cap, which are common, end a pixel.
+MAX_ALPHA = torch.tensor(0.99).item()  # no splat hides more than this
+MIN_TRANSMITTANCE = torch.tensor(
+    1e-4
+).item()  # a pixel stops before the splat that would bring it under this
 
 
 def over(

@@ -22,7 +22,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from aaplug.rasterizers.rules import MAX_ALPHA, MIN_TRANSMITTANCE, over
-from aaplug.splats import MIN_ALPHA, Render, Splats2D, half_sizes, reach
+from aaplug.splats import MIN_ALPHA, Render, Splats2D, half_sizes, reach, whitening
 
 TILE = 8  # px
 PASS = 16  # splats composited in one pass, at least
@@ -68,21 +68,10 @@ def rasterize(
 
 
 def _drawing(splats: Splats2D) -> Float[Tensor, "m 10"]:
-    """Linear forms, centre, log2 opacity and colour of each splat, and a last row that draws nothing.
-
-    The form without slope runs along the axis of larger variance, so that the other's slope is at most one.
-    """
-    xx, xy, yy = splats.covs.unbind(dim=1)
-    wide = xx >= yy
-    pivot = torch.where(wide, xx, yy)
-    across = (HALF_LOG2_E * pivot / splats.dets).sqrt()
-    along = (HALF_LOG2_E / pivot).sqrt()
-    slope = -xy / pivot * across
-    zero = torch.zeros_like(along)
-    rows = [torch.where(wide, slope, across), torch.where(wide, across, slope)]
-    rows += [torch.where(wide, along, zero), torch.where(wide, zero, along)]
+    """Linear forms, centre, log2 opacity and colour of each splat, and a last row that draws nothing."""
     assert splats.rgb is not None
-    columns = [torch.stack(rows, dim=1), splats.means, splats.opacities.log2()[:, None], splats.rgb]
+    forms = HALF_LOG2_E**0.5 * whitening(splats).flatten(1)
+    columns = [forms, splats.means, splats.opacities.log2()[:, None], splats.rgb]
     nothing = splats.means.new_zeros(1, 10)
     nothing[:, LOG2_OPACITY] = LOG2_SILENT
     return torch.cat([torch.cat(columns, dim=1), nothing])
@@ -189,8 +178,8 @@ def _composite_block(
     local = _local_positions(drawing)
     transmittance = drawing.new_ones(len(tiles), TILE * TILE)
     total = drawing.new_zeros(len(tiles), TILE * TILE, 4)
-    start, longest = 0, int(counts.max())
-    while len(tiles) and start < longest:
+    start = 0
+    while len(tiles):
         step = PASS * max(1, BLOCK // len(tiles))  # few tiles take more splats at once
         place = start + torch.arange(step, device=tiles.device)[:, None]
         pair = torch.where(place < counts, first + place, 0)
