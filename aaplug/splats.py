@@ -13,10 +13,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 MIN_ALPHA = 1 / 255  # a contribution below it is skipped (3DGS)
-    1 / 255
-).item()  # a contribution below it is skipped (3DGS, in its float32)
 MIN_COMPENSATION = (
-    0.005  # floor of an opacity factor, so that rounding makes no splat vanish (3DGS, gsplat)
+    0.005  # floor of an opacity factor: rounding makes no splat vanish (3DGS, gsplat)
 )
 
 
