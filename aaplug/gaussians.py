@@ -97,7 +97,7 @@ class Gaussians:
 
     @property
     def sh_degree(self) -> int:
-        """Degree of the spherical harmonics, 0 to 4."""
+        """Degree of the spherical harmonics, 0 to 3."""
         return round(self.sh.shape[1] ** 0.5) - 1
 
     def __getitem__(self, index: Tensor | slice) -> "Gaussians":

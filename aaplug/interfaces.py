@@ -5,6 +5,7 @@ into an image.  Each is a frozen dataclass or a function, deterministic, without
 input.  A plug-in is one file and one line in its folder's `__init__`; the laws in `tests/laws` then run over it.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import median
@@ -18,11 +19,16 @@ from aaplug.splats import Render, Splats2D
 
 @dataclass(frozen=True)
 class Training:
-    """What is known at test time about training: how it rendered, and how finely its cameras sampled the scene."""
+    """What is known at test time about training: how it rendered, and how finely its cameras sampled the scene.
+
+    guard: share of an image's longer side; training drew no Gaussian whose centre lay farther outside the image.
+    3DGS and gsplat draw them all, but a scene trained with such a guard band is hazy without it.
+    """
 
     convention: Convention
     cameras: Sequence[Camera]
     bounds: SamplingBounds
+    guard: float = math.inf
 
     def rate(self, camera: Camera) -> float:
         """How finely a view samples the scene against training: 1 at the training size, 1/2 at half of it.

@@ -5,6 +5,7 @@ scene = smooth(scene, training, recipe)
 image = render(scene, camera, recipe, training).rgb
 """
 
+import math
 from collections.abc import Sequence
 
 from aaplug.cameras import BLACK, Camera
@@ -18,13 +19,15 @@ from aaplug.sampling import sampling_bounds
 from aaplug.splats import Render, drawn
 
 
-def learn(scene: Gaussians, cameras: Sequence[Camera]) -> Training:
+def learn(scene: Gaussians, cameras: Sequence[Camera], guard: float = math.inf) -> Training:
     """What filters need to know of training: the convention, the cameras and the bounds that they set.
+
+    guard: see `Training`.
 
     Raises:
         UsageError: there are no cameras.
     """
-    return Training(scene.convention, tuple(cameras), sampling_bounds(scene.means, cameras))
+    return Training(scene.convention, tuple(cameras), sampling_bounds(scene.means, cameras), guard)
 
 
 def smooth(scene: Gaussians, training: Training, recipe: Recipe) -> Gaussians:
@@ -46,5 +49,5 @@ def render(
     samples = recipe.samples_at(rate)
     fine = camera.resized(camera.width * samples, camera.height * samples)
     splats = recipe.screen_at(rate)(project(scene, fine), fine, training)
-    splats = shade(drawn(splats, fine.hw), scene, fine)
+    splats = shade(drawn(splats, fine.hw, training.guard), scene, fine)
     return averaged(rasterizer(splats, fine.hw, background), samples)

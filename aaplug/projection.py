@@ -16,6 +16,7 @@ from aaplug.gaussians import Gaussians
 from aaplug.splats import Splats2D
 
 JACOBIAN_MARGIN = 0.3  # of half the image at depth 1: 3DGS linearises no farther out (1.3 tan(fov/2) when centred)
+MAX_SIGMA = 1e9  # px: larger splats look the same, and their determinant would overflow float32
 COLOUR_OFFSET = 0.5  # 3DGS stores colours around mid-grey
 
 SH_C0 = 0.28209479177387814
@@ -38,7 +39,7 @@ def project(scene: Gaussians, camera: Camera) -> Splats2D:
     sources = (in_camera[:, 2] > NEAR).nonzero().squeeze(1)
     in_camera = in_camera[sources]
     factors = _jacobian(in_camera, camera) @ rotation @ _axes(scene, sources)
-    a, b = factors.unbind(dim=1)
+    a, b = factors.clamp(-MAX_SIGMA, MAX_SIGMA).unbind(dim=1)
     covs = torch.stack([(a * a).sum(1), (a * b).sum(1), (b * b).sum(1)], dim=1)
     dets = torch.linalg.cross(a, b).square().sum(1)
     x, y, z = in_camera.unbind(dim=1)

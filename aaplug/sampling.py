@@ -41,7 +41,15 @@ class SamplingBounds:
 
     @property
     def highest_or_coarsest(self) -> Float[Tensor, " n"]:
-        """Highest rates, with the coarsest one found standing in for Gaussians never seen (Mip-Splatting's rule)."""
+        """Highest rates, with the coarsest one found standing in for Gaussians never seen (Mip-Splatting's rule).
+
+        Raises:
+            FrameError: no camera sees any Gaussian.
+        """
+        if len(self.views) and not self.seen.any():
+            raise FrameError(
+                "sampling bounds", "no camera sees any Gaussian: there is no rate to filter by"
+            )
         coarsest = self.highest[self.seen].min()
         return torch.where(self.seen, self.highest, coarsest)
 

@@ -5,6 +5,7 @@ m: visible Gaussians.  Pixel (0, 0) covers [0, 1) × [0, 1); its centre is (0.5,
 digit in float32 while the determinant from factors has all of them.
 """
 
+import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -114,9 +115,15 @@ def half_sizes(splats: Splats2D) -> Float[Tensor, "m 2"]:
     return (reach(splats).clamp(min=0.0)[:, None] * splats.covs[:, [0, 2]]).sqrt()
 
 
-def drawn(splats: Splats2D, hw: tuple[int, int]) -> Splats2D:
-    """The splats that can change an image of height and width `hw`; a splat of no area cannot."""
+def drawn(splats: Splats2D, hw: tuple[int, int], guard: float = math.inf) -> Splats2D:
+    """The splats that can change an image of height and width `hw`; a splat of no area cannot.
+
+    guard: leave out splats whose centre lies farther outside the image than this share of its longer side.
+    """
     half = half_sizes(splats)
     size = splats.means.new_tensor([hw[1], hw[0]])
     inside = ((splats.means + half > 0) & (splats.means - half < size)).all(dim=1)
+    if guard < math.inf:
+        band = guard * max(hw)
+        inside &= ((splats.means >= -band) & (splats.means <= size + band)).all(dim=1)
     return splats[inside & (splats.opacities >= MIN_ALPHA) & (splats.dets > 0)]

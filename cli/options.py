@@ -3,6 +3,7 @@
 Each class is a group of flags; its methods read what the flags name and say on stderr what they found.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -91,6 +92,8 @@ class CameraOptions:
     """Hold out every N-th view by name; 0 for no split (default: as the format's users do)."""
     min_seen: float = MIN_SEEN_SHARE
     """Stop if fewer of the Gaussians than this share are seen by any camera."""
+    guard: Annotated[float, flag("SHARE")] = math.inf
+    """Draw no Gaussian centred farther outside the image than this share of its longer side, if training did not."""
 
     def read(self, options: SceneOptions) -> CameraSet:
         """Read the cameras and say where sizes and split come from."""
@@ -112,7 +115,7 @@ class CameraOptions:
         """Check that scene and cameras share a frame, and compute the sampling bounds."""
         assert scene.origin is not None
         check_frame(scene.means, cameras.train, scene.origin.path, self.min_seen)
-        return learn(scene, cameras.train)
+        return learn(scene, cameras.train, self.guard)
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,10 @@
 """The command line as its users meet it: words, files, exit codes, one-line errors that leave nothing behind."""
 
 import json
+import logging
 import math
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -13,6 +15,7 @@ from aaplug_cli.main import main
 from plyfile import PlyData
 
 from aaplug.cameras import BLACK
+from aaplug.gaussians import MIP
 from aaplug.io.cameras import read_cameras
 from aaplug.io.images import image_size, write_png
 from aaplug.io.scenes import read_scene, write_scene
@@ -48,6 +51,9 @@ def cli(dataset, tmp_path, monkeypatch, capsys):
     """Run the program in a fresh folder holding a copy of the data set; gives (exit code, stdout, stderr)."""
     shutil.copytree(dataset, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
+    logger = logging.getLogger("aaplug")  # whose handlers the program replaces
+    monkeypatch.setattr(logger, "handlers", list(logger.handlers))
+    monkeypatch.setattr(logger, "propagate", True)
 
     def run(words: str) -> tuple[int, str, str]:
         with pytest.raises(SystemExit) as stop:
@@ -148,10 +154,6 @@ def test_convert_fuses_plain_mip_splatting_by_flag(cli):
 
 
 def test_convert_fuses_a_stored_filter_without_cameras(cli):
-    from dataclasses import replace
-
-    from aaplug.gaussians import MIP
-
     scene = replace(make_scene(20), filter_3d=torch.full((20,), 0.01), convention=MIP)
     write_scene(Path("unfused.ply"), scene)
     assert cli("convert unfused.ply -o fused.ply")[0] == 0
@@ -198,6 +200,14 @@ def test_drop_bad_leaves_bad_gaussians_out_and_counts_them(cli):
     code, out, err = cli("info scene.ply --json --drop-bad")
     assert (code, json.loads(out)["gaussians"]) == (0, 148)
     assert "warning:" in err
+
+
+def test_guard_leaves_out_what_is_centred_far_outside(cli):
+    cli("render scene.ply --cameras . -o all.png")
+    cli("render scene.ply --cameras . -o guarded.png --guard -0.2")
+    assert Path("all.png").read_bytes() != Path("guarded.png").read_bytes()
+    cli("render scene.ply --cameras . -o wide.png --guard 100")
+    assert Path("all.png").read_bytes() == Path("wide.png").read_bytes()
 
 
 def test_version_and_help(cli):

@@ -7,11 +7,12 @@ import pytest
 import torch
 
 from aaplug.filters.smoothing import smooth, volume_log_factor
-from aaplug.gaussians import MIN_OPACITY, Gaussians, scale_opacities
-from aaplug.splats import Splats2D, drawn, half_sizes, reach
+from aaplug.gaussians import Gaussians, scale_opacities
+from aaplug.splats import Splats2D, drawn, half_sizes, reach, whitening
 from tests.conftest import make_scene, make_splats
 
 F64 = torch.float64
+MIN_OPACITY = 1e-7  # keeps a logit finite in float32
 
 
 def splat(xx: float, xy: float, yy: float, opacity: float = 1.0, dtype=F64) -> Splats2D:
@@ -142,6 +143,15 @@ def test_a_box_touches_its_ellipse_on_every_side():
     factor = torch.linalg.cholesky(torch.tensor([[4.0, 2.5], [2.5, 9.0]], dtype=F64))
     rim = reach(splats).sqrt() * factor @ torch.stack([angle.cos(), angle.sin()])
     torch.testing.assert_close(half_sizes(splats)[0], rim.amax(dim=1), rtol=1e-8, atol=0)
+
+
+def test_whitening_is_a_square_root_of_the_inverse_covariance():
+    splats = make_splats(50, (32, 32), log_sigmas=(-2.0, 4.0)).to(F64)
+    xx, xy, yy = splats.covs.unbind(dim=1)
+    splats = replace(splats, dets=xx * yy - xy * xy)
+    inverse = torch.stack([yy, -xy, -xy, xx], dim=1) / splats.dets[:, None]
+    white = whitening(splats)
+    torch.testing.assert_close((white.mT @ white).flatten(1), inverse, rtol=1e-9, atol=1e-12)
 
 
 def test_a_splat_too_faint_to_draw_has_a_reach_below_zero_and_no_size():

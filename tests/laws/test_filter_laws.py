@@ -141,6 +141,21 @@ def test_a_huge_splat_keeps_its_opacity_and_shape(screen, view, convention):
     torch.testing.assert_close(filtered.covs, splats.covs, rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("name", "variance", "compensated"),
+    [("classic", 0.3, False), ("ewa", 0.3, True), ("mip", 0.1, True)],
+)
+def test_a_dilation_has_the_constant_of_its_name_at_every_rate(
+    name, variance, compensated, view, convention
+):
+    splats = project(SCENE, view)
+    expected = splats.blurred(variance, compensated)
+    for dilation in (SCREEN_FILTERS[name], SCREEN_FILTERS[name].for_samples()):
+        filtered = dilation(splats, view, trained_with(convention))
+        torch.testing.assert_close(filtered.covs, expected.covs)
+        torch.testing.assert_close(filtered.opacities, expected.opacities)
+
+
 @pytest.mark.parametrize("sigma", [0.03, 0.1, 0.5, 2.0])
 @pytest.mark.parametrize("name", [n for n in SCREEN if getattr(SCREEN[n], "compensated", False)])
 def test_a_compensated_dilation_keeps_energy_down_to_its_floor(name, sigma, convention):
@@ -459,6 +474,24 @@ def test_matched_energy_shows_in_a_compensating_viewer_what_training_showed(conv
     energy = shown.opacities * shown.dets.sqrt()
     torch.testing.assert_close(energy[seen], (trained.opacities * trained.dets.sqrt())[seen])
     assert fused.convention == MIP
+
+
+def test_matched_energy_asks_only_the_cameras_that_see_a_gaussian():
+    scene = make_scene(10, dtype=F64)
+    blind = replace(CAMERAS[1], cx=1e5)
+    alone = MatchedEnergy()(scene, learn(scene, CAMERAS[:1]))
+    beside = MatchedEnergy()(scene, learn(scene, [CAMERAS[0], blind, blind]))
+    torch.testing.assert_close(beside.log_scales, alone.log_scales)
+    torch.testing.assert_close(beside.logit_opacities, alone.logit_opacities)
+
+
+def test_matched_energy_leaves_an_opacity_of_0_alone():
+    scene = make_scene(3)
+    scene.logit_opacities[1] = -200.0
+    fused = MatchedEnergy()(scene, learn(scene, CAMERAS))
+    assert scene.opacities[1] == 0
+    assert fused.logit_opacities[1] == -200
+    assert fused.logit_opacities.isfinite().all()
 
 
 def test_matched_energy_gives_a_mip_viewer_the_classic_look_of_a_sphere():
