@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 import platform
 from dataclasses import dataclass, field
 from importlib.metadata import version
@@ -67,8 +68,10 @@ def evaluate(options: Evaluate) -> int:
     background = options.rendering.background_of(cameras)
     training = options.cameras.learn(scene, cameras)
     task = Task(recipes, options.scale, views, background, truth, options.rendering.rasterize)
+    facts = _facts(scene, cameras.notes, views, truth)
+    facts["guard"] = training.guard if math.isfinite(training.guard) else None
     with progress("evaluating", "views") as tell:
-        report = measure(scene, training, task, _facts(scene, cameras.notes, views, truth), tell)
+        report = measure(scene, training, task, facts, tell)
     if options.output is not None:
         write_results(report, options.output, options.overwrite)
     if options.json:

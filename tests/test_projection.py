@@ -418,3 +418,21 @@ def test_colours_go_with_their_gaussians_when_some_are_behind_the_camera():
     scene = replace(scene, means=means)
     splats = shade(project(scene, straight_camera()), scene, straight_camera())
     torch.testing.assert_close(splats.rgb, (scene.sh[1:, 0] * C0 + 0.5).clamp(min=0))
+
+
+def test_the_determinants_ratio_is_the_change_of_area_across_the_ray():
+    # AAA-Gaussians' opacity factor, arXiv 2504.12811: with r = (Rᵀ·ray)², r·(s_y²s_z², s_z²s_x², s_x²s_y²) is the
+    # squared area orthogonal to the ray up to a factor of the view alone, as long as the Jacobian is not held.
+    scene, camera = make_scene(200, seed=3, dtype=F64), make_camera((0.3, -6.0, 0.4), fov=1.2)
+    wide = replace(scene, log_scales=0.5 * (scene.scales.square() + 0.05**2).log())
+    before, after = project(scene, camera), project(wide, camera)
+    ray = torch.nn.functional.normalize(scene.means - camera.centre, dim=1)[before.sources]
+    rotation = rotation_matrices(scene.unit_quats)[before.sources]
+    r = torch.einsum("mji,mj->mi", rotation, ray).square()
+
+    def area(scales: torch.Tensor) -> torch.Tensor:
+        x, y, z = scales[before.sources].square().unbind(dim=1)
+        return (r * torch.stack([y * z, z * x, x * y], dim=1)).sum(dim=1)
+
+    factor = area(scene.scales) / area(wide.scales)
+    torch.testing.assert_close(before.dets / after.dets, factor, rtol=1e-9, atol=0)
