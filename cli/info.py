@@ -97,5 +97,6 @@ def _text(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.4g}"
     if isinstance(value, list):
-        return "  ".join(_text(item) for item in value)
+        lines = any(isinstance(item, str) for item in value)
+        return ("\n" if lines else "  ").join(_text(item) for item in value)
     return f"{value:,}" if isinstance(value, int) else str(value)
