@@ -39,7 +39,7 @@ class Task:
     views: Sequence[Camera]
     background: tuple[float, float, float]
     truth: Literal["photographs", "self"]
-    rasterizer: Rasterizer = RASTERIZERS["tiled"]
+    rasterizer: Rasterizer = RASTERIZERS["eager"]
 
 
 def evaluate(

@@ -41,7 +41,7 @@ def render(
     camera: Camera,
     recipe: Recipe,
     training: Training,
-    rasterizer: Rasterizer = RASTERIZERS["tiled"],
+    rasterizer: Rasterizer = RASTERIZERS["eager"],
     background: tuple[float, float, float] = BLACK,
 ) -> Render:
     """One image of a smoothed scene, rgb and alpha of `camera.hw`, by the recipe's screen filter and samples."""

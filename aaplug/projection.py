@@ -5,14 +5,17 @@ M = J W R S (Zwicker et al., "EWA splatting", 2002; 3DGS, eq. 5), and its determ
 and b, where nothing cancels.  The camera's centre is subtracted in float64; the rest runs in the scene's precision.
 """
 
+from collections.abc import Iterable
 from dataclasses import replace
+from functools import partial, reduce
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from aaplug.cameras import NEAR, Camera
-from aaplug.gaussians import Gaussians
+from aaplug.gaussians import MAX_LOG_SCALE, Gaussians
+from aaplug.kernels import EAGER, Kernel, Kernels
 from aaplug.splats import Splats2D
 
 JACOBIAN_MARGIN = 0.3  # of half the image at depth 1: 3DGS linearises no farther out (1.3 tan(fov/2) when centred)
@@ -31,68 +34,118 @@ SH_C3 = (
 )
 
 
-def project(scene: Gaussians, camera: Camera) -> Splats2D:
+def project(scene: Gaussians, camera: Camera, kernels: Kernels = EAGER) -> Splats2D:
     """Splats of every Gaussian in front of the near plane, without colour and before any screen filter."""
-    rotation = camera.cam_from_world[:3, :3].to(scene.means)
-    local = (scene.means.double() - camera.centre.to(scene.means.device)).to(scene.means)
-    in_camera = local @ rotation.T
-    sources = (in_camera[:, 2] > NEAR).nonzero().squeeze(1)
-    in_camera = in_camera[sources]
-    factors = _jacobian(in_camera, camera) @ rotation @ _axes(scene, sources)
-    a, b = factors.clamp(-MAX_SIGMA, MAX_SIGMA).unbind(dim=1)
-    covs = torch.stack([(a * a).sum(1), (a * b).sum(1), (b * b).sum(1)], dim=1)
-    dets = torch.linalg.cross(a, b).square().sum(1)
-    x, y, z = in_camera.unbind(dim=1)
-    means = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], dim=1)
-    return Splats2D(means, covs, dets, z, scene.opacities[sources], sources)
+    columns = kernels.run(
+        PROJECT, scene.means, scene.quats, scene.log_scales, *_camera_rows(scene.means, camera)
+    )
+    means, covs, dets, depths = columns
+    splats = Splats2D(
+        means, covs, dets, depths, scene.opacities, torch.arange(len(scene), device=means.device)
+    )
+    in_front = depths > NEAR
+    return splats if in_front.all() else splats[in_front.nonzero().squeeze(1)]
 
 
-def shade(splats: Splats2D, scene: Gaussians, camera: Camera) -> Splats2D:
+def shade(
+    splats: Splats2D, scene: Gaussians, camera: Camera, kernels: Kernels = EAGER
+) -> Splats2D:
     """Give splats their colour as seen from the camera: SH plus mid-grey, not below black (3DGS)."""
-    means = scene.means[splats.sources].double() - camera.centre.to(scene.means.device)
-    directions = torch.nn.functional.normalize(means, dim=1).to(scene.means)
-    rgb = sh_colour(scene.sh[splats.sources], directions)
-    return replace(splats, rgb=rgb.clamp(min=0.0))
+    centre = camera.centre.to(scene.means.device)
+    kernel = SHADE.get(scene.sh.shape[1])
+    args = (scene.sh, scene.means, splats.sources, centre)
+    (rgb,) = _shade(*args) if kernel is None else kernels.run(kernel, *args)
+    return replace(splats, rgb=rgb)
 
 
 def sh_colour(sh: Float[Tensor, "m k 3"], directions: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:
     """Colour of real spherical harmonics of degree 0 to 3 in unit directions from the camera, not clamped."""
-    basis = torch.stack(_sh_basis(directions, sh.shape[1]), dim=1)
-    return torch.einsum("mk,mkc->mc", basis, sh) + COLOUR_OFFSET
+    colour = torch.full_like(directions, COLOUR_OFFSET)
+    for k, basis in enumerate(_sh_basis(directions, sh.shape[1])):
+        colour = colour + basis[:, None] * sh[:, k]
+    return colour
+
+
+def _shade(
+    sh: Float[Tensor, "n k 3"],
+    means: Float[Tensor, "n 3"],
+    sources: Int[Tensor, " m"],
+    centre: Float[Tensor, " 3"],
+) -> tuple[Tensor]:
+    offset = (means[sources].double() - centre).to(means)
+    directions = offset / offset.square().sum(dim=1, keepdim=True).sqrt()
+    return (sh_colour(sh[sources], directions).clamp(min=0.0),)
+
+
+def _camera_rows(
+    like: Tensor, camera: Camera
+) -> tuple[Float[Tensor, " 3"], Float[Tensor, "3 3"], Float[Tensor, " 8"]]:
+    """Centre (float64), rotation, and fx, fy, cx, cy with the slopes between which the projection is linearised."""
+    x = _slope_limits(camera.cx, camera.fx, camera.width)
+    y = _slope_limits(camera.cy, camera.fy, camera.height)
+    lens = like.new_tensor([camera.fx, camera.fy, camera.cx, camera.cy, *x, *y])
+    rotation = camera.cam_from_world[:3, :3].to(like)
+    return camera.centre.to(like.device), rotation, lens
+
+
+def _slope_limits(centre: float, focal: float, side: int) -> tuple[float, float]:
+    margin = JACOBIAN_MARGIN * 0.5 * side / focal
+    return -centre / focal - margin, (side - centre) / focal + margin
+
+
+def _project(
+    means: Float[Tensor, "n 3"],
+    quats: Float[Tensor, "n 4"],
+    log_scales: Float[Tensor, "n 3"],
+    centre: Float[Tensor, " 3"],
+    rotation: Float[Tensor, "3 3"],
+    lens: Float[Tensor, " 8"],
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Mean, packed covariance, determinant and depth of each Gaussian, written out in columns so that it fuses."""
+    local = (means.double() - centre).to(means).unbind(dim=1)
+    fx, fy, cx, cy, left, right, top, bottom = lens.unbind()
+    world = [row.unbind() for row in rotation.unbind()]
+    x, y, z = (sum_of(r * p for r, p in zip(row, local, strict=True)) for row in world)
+    ahead = z.clamp(min=NEAR)  # the rest is left out; nothing there may overflow into gradients
+    slope_x, slope_y = x / ahead, y / ahead
+    # J W: the rows of the projection's derivative in the world's axes, its direction held inside the widened image
+    held_x = torch.minimum(torch.maximum(slope_x, left), right)
+    held_y = torch.minimum(torch.maximum(slope_y, top), bottom)
+    across = [fx / ahead * (i - held_x * k) for i, k in zip(world[0], world[2], strict=True)]
+    down = [fy / ahead * (j - held_y * k) for j, k in zip(world[1], world[2], strict=True)]
+    lengths = log_scales.clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE).exp().unbind(dim=1)
+    quats = quats / quats.square().sum(dim=1, keepdim=True).sqrt()
+    axes = zip(*rotation_rows(quats), strict=True)
+    a, b = [], []
+    for axis, length in zip(axes, lengths, strict=True):
+        for factor, row in ((a, across), (b, down)):
+            along = sum_of(p * q for p, q in zip(row, axis, strict=True)) * length
+            factor.append(along.clamp(-MAX_SIGMA, MAX_SIGMA))
+    covs = [sum_of(p * q for p, q in zip(*pair, strict=True)) for pair in ((a, a), (a, b), (b, b))]
+    normal = [a[i - 2] * b[i - 1] - a[i - 1] * b[i - 2] for i in range(3)]
+    dets = sum_of(side * side for side in normal)
+    centres = [fx * slope_x + cx, fy * slope_y + cy]
+    return torch.stack(centres, dim=1), torch.stack(covs, dim=1), dets, z
+
+
+def sum_of(terms: Iterable[Tensor]) -> Tensor:
+    """Sum from left to right."""
+    return reduce(torch.add, terms)
+
+
+def rotation_rows(quats: Float[Tensor, "n 4"]) -> list[list[Tensor]]:
+    """Rows of the rotation matrices of unit quaternions wxyz."""
+    w, x, y, z = quats.unbind(dim=-1)
+    return [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
 
 
 def rotation_matrices(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
     """Rotation matrices of unit quaternions wxyz."""
-    w, x, y, z = quats.unbind(dim=-1)
-    rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
-
-
-def _axes(scene: Gaussians, sources: Tensor) -> Float[Tensor, "m 3 3"]:
-    """R S: the Gaussians' axes as columns, each as long as its standard deviation."""
-    return rotation_matrices(scene.unit_quats[sources]) * scene.scales[sources][:, None, :]
-
-
-def _jacobian(in_camera: Float[Tensor, "m 3"], camera: Camera) -> Float[Tensor, "m 2 3"]:
-    """Derivative of the pinhole projection in px, its direction held inside the widened image (3DGS, gsplat)."""
-    x, y, z = in_camera.unbind(dim=1)
-    x_over_z = _held_inside(x / z, camera.cx, camera.fx, camera.width)
-    y_over_z = _held_inside(y / z, camera.cy, camera.fy, camera.height)
-    zero = torch.zeros_like(z)
-    across = torch.stack([camera.fx / z, zero, -camera.fx / z * x_over_z], dim=1)
-    down = torch.stack([zero, camera.fy / z, -camera.fy / z * y_over_z], dim=1)
-    return torch.stack([across, down], dim=1)
-
-
-def _held_inside(
-    slope: Float[Tensor, " m"], centre: float, focal: float, side: int
-) -> Float[Tensor, " m"]:
-    margin = JACOBIAN_MARGIN * 0.5 * side / focal
-    return slope.clamp(-centre / focal - margin, (side - centre) / focal + margin)
+    return torch.stack([torch.stack(row, dim=-1) for row in rotation_rows(quats)], dim=-2)
 
 
 def _sh_basis(directions: Float[Tensor, "m 3"], coefficients: int) -> list[Float[Tensor, " m"]]:
@@ -113,3 +166,30 @@ def _sh_basis(directions: Float[Tensor, "m 3"], coefficients: int) -> list[Float
         basis += [SH_C3[3] * z * (2 * zz - 3 * xx - 3 * yy), -SH_C3[2] * x * (4 * zz - xx - yy)]
         basis += [SH_C3[4] * z * (xx - yy), -SH_C3[0] * x * (xx - 3 * yy)]
     return basis
+
+
+def _example(coefficients: int) -> tuple[Tensor, ...]:
+    return (
+        torch.zeros(8, coefficients, 3),
+        torch.ones(8, 3),
+        torch.arange(5),
+        torch.zeros(3, dtype=torch.float64),
+    )
+
+
+PROJECT = Kernel(
+    "project",
+    _project,
+    lambda: (
+        torch.ones(8, 3),
+        torch.ones(8, 4),
+        torch.zeros(8, 3),
+        torch.zeros(3, dtype=torch.float64),
+        torch.eye(3),
+        torch.ones(8),
+    ),
+    ("n", "n", "n", None, None, None),
+)
+SHADE = {
+    k: Kernel(f"shade-{k}", _shade, partial(_example, k), ("n", "n", "m", None)) for k in (4, 9, 16)
+}

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from aaplug.interfaces import Rasterizer
-from aaplug.rasterizers import RASTERIZERS, reference, tiled
+from aaplug.rasterizers import RASTERIZERS, Tiled, reference, tiled
 from aaplug.splats import Splats2D
 from tests.conftest import make_splats
 
@@ -23,6 +23,7 @@ RED, GREEN, BLUE = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 TOLERANCE = 1e-5
 FLIPS = 1e-4  # share of pixels that may fall on the other side of a cut-off
 UNIT = (4.0, 0.0, 4.0)
+TILED = Tiled()
 
 
 @pytest.fixture(params=RASTERIZERS.values(), ids=RASTERIZERS)
@@ -275,7 +276,7 @@ def drawn_twice(regime: str) -> tuple[torch.Tensor, torch.Tensor]:
     """Largest difference of the two rasterizers at each pixel, and where a cut-off may explain one."""
     hw, make = REGIMES[regime]
     splats = make(hw).to(F64)
-    fast, judge = tiled.rasterize(splats, hw, SKY), reference.rasterize(splats, hw, SKY)
+    fast, judge = TILED(splats.to(torch.float32), hw, SKY), reference.rasterize(splats, hw, SKY)
     difference = (fast.rgb - judge.rgb).abs().amax(dim=2)
     difference = torch.maximum(difference, (fast.alpha - judge.alpha).abs())
     return difference, near_a_cut_off(splats, hw)
@@ -321,7 +322,7 @@ def test_a_needle_rounded_to_float32_looks_as_it_did_before():
 @pytest.mark.parametrize("sigma", [0.3, 1.0, 5.0])
 def test_splats_on_the_edges_of_tiles_are_drawn_whole(x, y, sigma):
     splats = splats_of(((x, y), (sigma**2, 0.0, sigma**2), 1.0, 0.77, RED))
-    fast, judge = tiled.rasterize(splats, (16, 24), SKY), reference.rasterize(splats, (16, 24), SKY)
+    fast, judge = TILED(splats, (16, 24), SKY), reference.rasterize(splats, (16, 24), SKY)
     close(fast.rgb, judge.rgb)
     close(fast.alpha, judge.alpha)
 
@@ -336,7 +337,7 @@ def test_a_splat_reaches_the_first_pixel_of_the_next_tile(way, alpha):
     first = [12.0 + 4.5 * step if step else 12.5 for step in way]
     variance = math.dist(mean, first) ** 2 / (2 * math.log(0.9 / alpha))
     splats = splats_of((tuple(mean), (variance, 0.0, variance), 1.0, 0.9, RED))
-    image = tiled.rasterize(splats, (24, 24), BLACK)
+    image = TILED(splats, (24, 24), BLACK)
     close(image.alpha[int(first[1]), int(first[0])], alpha)
     close(image.alpha, reference.rasterize(splats, (24, 24), BLACK).alpha)
 
@@ -345,7 +346,7 @@ def test_thin_splats_that_only_cross_the_corner_of_a_tile_are_drawn_there():
     # along x + y = 17 the line cuts the tile at (8, 8) in its first pixel alone
     splats = splats_of(((2.5, 14.5), (72.0, -71.9, 72.0), 1.0, 0.9, RED))
     fast, judge = (
-        tiled.rasterize(splats, (24, 24), BLACK),
+        TILED(splats, (24, 24), BLACK),
         reference.rasterize(splats, (24, 24), BLACK),
     )
     assert judge.alpha[8, 8] > 0.1
@@ -356,7 +357,7 @@ def test_thin_splats_that_only_cross_the_corner_of_a_tile_are_drawn_there():
 def test_thousands_of_splats_on_one_tile(opacity):
     splats = make_splats(4000, (8, 8), 3, (2.0, 3.0)).to(F64)
     splats = replace(splats, opacities=torch.full((4000,), opacity, dtype=F64))
-    fast, judge = tiled.rasterize(splats, (8, 8), SKY), reference.rasterize(splats, (8, 8), SKY)
+    fast, judge = TILED(splats, (8, 8), SKY), reference.rasterize(splats, (8, 8), SKY)
     difference = (fast.rgb - judge.rgb).abs().amax(dim=2)
     assert difference.max() < 1e-3, "a flip is worth no more than what it leaves out"
     assert difference.median() < TOLERANCE
@@ -366,10 +367,10 @@ def test_thousands_of_splats_on_one_tile(opacity):
 def test_pairs_expanded_in_parts_change_nothing(monkeypatch):
     hw = (40, 50)
     splats = make_splats(200, hw, 6, (0.0, 3.0))
-    whole = tiled.rasterize(splats, hw, SKY)
+    whole = TILED(splats, hw, SKY)
     for budget in (1, 30, 500):
         monkeypatch.setattr(tiled, "PAIR_BUDGET", budget)
-        parts = tiled.rasterize(splats, hw, SKY)
+        parts = TILED(splats, hw, SKY)
         assert parts.rgb.equal(whole.rgb)
         assert parts.alpha.equal(whole.alpha)
 

@@ -1,12 +1,13 @@
 """Rasterizers by name; a new one is a file here and a line below."""
 
 from aaplug.interfaces import Rasterizer
-from aaplug.rasterizers import reference, tiled
+from aaplug.rasterizers import reference
 from aaplug.rasterizers.supersampled import averaged
+from aaplug.rasterizers.tiled import Tiled
 
 RASTERIZERS: dict[str, Rasterizer] = {
-    "tiled": tiled.rasterize,
+    "eager": Tiled(),
     "reference": reference.rasterize,
 }
 
-__all__ = ["RASTERIZERS", "averaged"]
+__all__ = ["RASTERIZERS", "Tiled", "averaged"]

@@ -1,34 +1,39 @@
-"""The fast rasterizer: tiles, one depth sort, and compositing as vectorized array code.
+"""The fast rasterizer: tiles, one depth sort, and compositing as elementwise array code that compiles to one loop.
 
-t: tiles of TILE × TILE px; p: pairs of a splat and a tile that it reaches; K: splats a pass; P: pixels a tile.
+t: tiles of TILE × TILE px; p: pairs of a splat and a tile; K: splats a pass; P: pixels a tile.
 
 1. A splat becomes two linear forms u, v of the pixel's position with u² + v² = log2(e)/2 · dᵀ C⁻¹ d, so that alpha is
    2^(log2 o − u² − v²).  Forms lose no digits where the expanded quadratic of a needle would.
-2. Splats are sorted by depth, paired with the tiles that their alpha ≥ 1/255 ellipse reaches, and the pairs sorted
-   stably by tile.
-3. Tiles of like length go through compositing together, K splats a pass; finished tiles leave.
+2. Splats are paired, nearest first, with the tiles in the box around their alpha ≥ 1/255 ellipse; pairs whose ellipse
+   misses the tile go to a bin that nobody draws, and one stable sort by tile does the rest.
+3. Tiles are composited K splats a pass, those with most splats first; finished tiles leave.
 
-Each operation on a pass is small enough that torch runs it in one thread: operations split over threads wait for the
-slowest at every step, and on cores shared with other work that wait was measured to cost forty times the work itself.
-Not differentiable; the reference is.
+The backward pass is a forward sweep too: with S = Σ g·w·c of a pixel, known from the image, the rest R = S − Σ_{j≤k}
+g·w·c gives ∂L/∂alpha_k = T_k g·c_k − R/(1 − alpha_k), so that T at each pass's start is all that is kept.
+
+Bands of tile rows bound the memory: a band's candidate pairs are at most about PAIR_BUDGET.
 """
 
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from math import log2
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from aaplug.kernels import EAGER, Kernel, Kernels
 from aaplug.rasterizers.rules import MAX_ALPHA, MIN_TRANSMITTANCE, over
 from aaplug.splats import MIN_ALPHA, Render, Splats2D, half_sizes, reach, whitening
 
 TILE = 8  # px
-PASS = 16  # splats composited in one pass, at least
-BLOCK = 32  # tiles in one pass, at most: PASS·BLOCK·TILE² = 32768 elements stay in the L2 cache and in one thread
-PAIR_BUDGET = 8_000_000  # candidate pairs expanded at once
+PASS = 8  # splats composited in one pass: more compile slowly, fewer load and store more
+PAIR_BUDGET = 8_000_000  # candidate pairs expanded at once; each takes about 40 bytes
 HALF_LOG2_E = 0.5 * log2(torch.e)
+LN_2 = math.log(2)
 LOG2_SILENT = (
     -24.0
 )  # log2 of an alpha far below 1/255; stops exp2 before it underflows, which is slow
@@ -36,35 +41,48 @@ REACH_SLACK = (
     1e-4  # relative, on the squared reach: float32 rounding never drops a pixel that counts
 )
 
-# `threshold` keeps what is above its bound; these keep what is at the bound as well.
-BELOW_MIN_ALPHA = torch.nextafter(torch.tensor(MIN_ALPHA), torch.tensor(0.0)).item()
-BELOW_MIN_TRANSMITTANCE = torch.nextafter(torch.tensor(MIN_TRANSMITTANCE), torch.tensor(0.0)).item()
-
 # columns of a splat's drawing parameters
-UX, UY, VX, VY, X, Y, LOG2_OPACITY, RGB = 0, 1, 2, 3, 4, 5, 6, slice(7, 10)
+UX, UY, VX, VY, X, Y, LOG2_OPACITY, RED, GREEN, BLUE = range(10)
+COLUMNS = 10
+
+
+@dataclass(frozen=True)
+class Tiled:
+    """Draws in tiles, in the splats' precision; differentiable.
+
+    kernels: how the elementwise stages run.
+    """
+
+    kernels: Kernels = EAGER
+
+    def __call__(
+        self, splats: Splats2D, hw: tuple[int, int], background: tuple[float, float, float]
+    ) -> Render:
+        """Draw the splats."""
+        grid = (-(-hw[0] // TILE), -(-hw[1] // TILE))
+        drawing = _drawing(splats)
+        image = torch.cat(
+            [
+                _composite(drawing, bins, self.kernels).unflatten(0, (-1, grid[1]))
+                for bins in _bands(splats, grid, self.kernels)
+            ]
+        )
+        image = image.unflatten(2, (TILE, TILE)).transpose(1, 2)
+        image = image.reshape(grid[0] * TILE, grid[1] * TILE, 4)[: hw[0], : hw[1]]
+        return over(image[..., :3], image[..., 3], background)
 
 
 @dataclass(frozen=True)
 class Bins:
-    """Which splats each tile draws: `splats[first[t] : first[t] + counts[t]]`, nearest first."""
+    """Which splats each tile of a band draws: `splats[first[t] : first[t] + counts[t]]`, nearest first.
+
+    origins: the tiles' top left corners, in px.
+    """
 
     splats: Int[Tensor, " p"]
     first: Int[Tensor, " t"]
     counts: Int[Tensor, " t"]
-
-
-@torch.no_grad()
-def rasterize(
-    splats: Splats2D, hw: tuple[int, int], background: tuple[float, float, float]
-) -> Render:
-    """Draw the splats in float32."""
-    splats = splats.to(torch.float32)
-    splats = splats[torch.sort(splats.depths, stable=True).indices]
-    grid = (-(-hw[0] // TILE), -(-hw[1] // TILE))
-    image = _composite(_drawing(splats), _bin(splats, grid), grid)
-    image = image.unflatten(1, (TILE, TILE)).unflatten(0, grid).transpose(1, 2)
-    image = image.reshape(grid[0] * TILE, grid[1] * TILE, 4)[: hw[0], : hw[1]]
-    return over(image[..., :3], image[..., 3], background)
+    origins: Float[Tensor, "t 2"]
 
 
 def _drawing(splats: Splats2D) -> Float[Tensor, "m 10"]:
@@ -72,163 +90,374 @@ def _drawing(splats: Splats2D) -> Float[Tensor, "m 10"]:
     assert splats.rgb is not None
     forms = HALF_LOG2_E**0.5 * whitening(splats).flatten(1)
     columns = [forms, splats.means, splats.opacities.log2()[:, None], splats.rgb]
-    nothing = splats.means.new_zeros(1, 10)
+    nothing = splats.means.new_zeros(1, COLUMNS)
     nothing[:, LOG2_OPACITY] = LOG2_SILENT
     return torch.cat([torch.cat(columns, dim=1), nothing])
 
 
-def _bin(splats: Splats2D, grid: tuple[int, int]) -> Bins:
-    """Pair splats, already in depth order, with the tiles they reach."""
-    low, size = _tile_boxes(splats, grid)
-    ends = size.prod(dim=1).cumsum(0)
-    pairs = [_pairs(splats, low, size, part, grid[1]) for part in _parts(ends)]
-    owners = torch.cat([owner for owner, _ in pairs]) if pairs else ends.new_zeros(0)
-    tiles = torch.cat([tile for _, tile in pairs]) if pairs else ends.new_zeros(0).int()
-    tiles, order = torch.sort(tiles, stable=True)
-    counts = torch.bincount(tiles, minlength=grid[0] * grid[1])
-    return Bins(owners[order], counts.cumsum(0) - counts, counts)
+# --------------------------------------------------------------------------------------------------------- binning
+
+
+@torch.no_grad()
+def _bands(splats: Splats2D, grid: tuple[int, int], kernels: Kernels) -> Iterator[Bins]:
+    """Bins of bands of tile rows, from the top."""
+    order = _depth_order(splats.depths)
+    low, high = _tile_boxes(splats, grid)
+    table = _reach_table(splats)
+    for rows in _rows(low, high, grid[0]):
+        yield _bin(table, low, high, order, rows, grid[1], kernels)
+
+
+def _depth_order(depths: Float[Tensor, " m"]) -> Int[Tensor, " m"]:
+    """Nearest first, in scene order where equal.  Positive floats sort as their bits, and integers sort faster."""
+    keys = depths.contiguous().view(torch.int32) if depths.dtype == torch.float32 else depths
+    return torch.sort(keys, stable=True).indices
 
 
 def _tile_boxes(
     splats: Splats2D, grid: tuple[int, int]
 ) -> tuple[Int[Tensor, "m 2"], Int[Tensor, "m 2"]]:
-    """First tile and number of tiles, in x and y, of the box around each splat's ellipse."""
+    """First tile and the one after the last, in x and y, of the box around each splat's ellipse."""
     half = half_sizes(splats) * (1 + REACH_SLACK)
     limit = splats.means.new_tensor([grid[1], grid[0]])
     low = ((splats.means - half) / TILE).floor().clamp(min=0.0).minimum(limit)
     high = ((splats.means + half) / TILE).floor().add(1).clamp(min=0.0).minimum(limit)
-    return low.long(), (high - low).clamp(min=0.0).long()
+    return low.int(), high.maximum(low).int()
 
 
-def _parts(ends: Int[Tensor, " m"]) -> list[slice]:
-    """Cut the splats into runs of at most about PAIR_BUDGET candidate pairs."""
-    total = int(ends[-1]) if len(ends) else 0
-    marks = torch.arange(PAIR_BUDGET, total + PAIR_BUDGET, PAIR_BUDGET, device=ends.device)
-    cuts = [0, *dict.fromkeys(torch.searchsorted(ends, marks).clamp(max=len(ends)).tolist())]
-    cuts = [*cuts, len(ends)] if cuts[-1] != len(ends) else cuts
-    return [slice(a, b) for a, b in pairwise(cuts) if b > a]
+def _rows(low: Int[Tensor, "m 2"], high: Int[Tensor, "m 2"], rows: int) -> list[tuple[int, int]]:
+    """Cut the grid into runs of tile rows of at most about PAIR_BUDGET candidate pairs, at least a row each."""
+    width = (high - low)[:, 0].long()
+    change = width.new_zeros(rows + 1)
+    change.index_add_(0, low[:, 1], width).index_add_(0, high[:, 1], -width)
+    ends = change.cumsum(0).cumsum(0)[:rows]  # candidates down to each row
+    total = int(ends[-1])
+    marks = ends.new_tensor(range(PAIR_BUDGET, total, PAIR_BUDGET))
+    cuts = [0, *(torch.searchsorted(ends, marks) + 1).tolist(), rows]
+    return [(a, b) for a, b in pairwise(dict.fromkeys(cuts)) if b > a]
 
 
-def _pairs(
-    splats: Splats2D,
+def _reach_table(splats: Splats2D) -> Float[Tensor, "m 6"]:
+    """Centre, conic xx, xy, yy and squared reach of each splat."""
+    xx, xy, yy = (splats.covs / splats.dets[:, None]).unbind(dim=1)
+    x, y = splats.means.unbind(dim=1)
+    return torch.stack([x, y, yy, -xy, xx, reach(splats)], dim=1)
+
+
+def _bin(
+    table: Float[Tensor, "m 6"],
     low: Int[Tensor, "m 2"],
-    size: Int[Tensor, "m 2"],
-    part: slice,
+    high: Int[Tensor, "m 2"],
+    order: Int[Tensor, " m"],
+    rows: tuple[int, int],
     columns: int,
+    kernels: Kernels,
+) -> Bins:
+    """Pair splats with the tiles that they reach in a band of rows."""
+    top, bottom = low[:, 1].clamp(*rows), high[:, 1].clamp(*rows)
+    width = high[:, 0] - low[:, 0]
+    counts = (width * (bottom - top))[order].long()
+    ends = counts.cumsum(0)
+    rank = torch.repeat_interleave(counts)
+    boxes = torch.stack([low[:, 0], top, width], dim=1)
+    band = order.new_tensor([rows[0], rows[1], columns])
+    owners, tiles = kernels.run(REACH, rank, ends - counts, order, boxes, table, band)
+    size = (rows[1] - rows[0]) * columns
+    if size < torch.iinfo(torch.int16).max:
+        tiles = tiles.short()  # half the bits sort in half the time
+    pairs = torch.sort(tiles, stable=True).indices
+    drawn = torch.bincount(tiles, minlength=size + 1)[:size]
+    ends = drawn.cumsum(0)
+    tile = torch.arange(size, device=table.device)
+    origins = torch.stack([tile % columns, tile // columns + rows[0]], dim=1) * TILE
+    kept = owners[pairs[: int(ends[-1])]]
+    return Bins(kept, ends - drawn, drawn, origins.to(table.dtype))
+
+
+def _reach(
+    rank: Int[Tensor, " p"],
+    starts: Int[Tensor, " m"],
+    order: Int[Tensor, " m"],
+    boxes: Int[Tensor, "m 3"],
+    table: Float[Tensor, "m 6"],
+    band: Int[Tensor, " 3"],
 ) -> tuple[Int[Tensor, " p"], Int[Tensor, " p"]]:
-    """Owners and tiles of the pairs whose ellipse reaches a pixel centre's box of the tile."""
-    low, size = low[part], size[part]
-    counts = size.prod(dim=1)
-    owner = torch.repeat_interleave(counts)
-    place = torch.arange(len(owner), device=owner.device) - (counts.cumsum(0) - counts)[owner]
-    width = size[:, 0][owner]
-    row = place // width
-    tile_x = place - row * width + low[:, 0][owner]
-    tile_y = row + low[:, 1][owner]
-    reached = _reaches(splats[part], owner, tile_x, tile_y)
-    tiles = (tile_y * columns + tile_x)[reached].int()
-    return owner[reached] + part.start, tiles
+    """Owner and tile of each candidate pair; the tile after the last where alpha < 1/255 all over the tile.
 
-
-def _reaches(
-    splats: Splats2D, owner: Int[Tensor, " p"], tile_x: Int[Tensor, " p"], tile_y: Int[Tensor, " p"]
-) -> Tensor:
-    """Whether alpha ≥ 1/255 anywhere in the box of the tile's pixel centres.
-
-    The quadratic is convex, so over a box that does not hold the centre its minimum lies on a side that faces the
-    centre; both facing sides are tried.
+    The quadratic is convex, so over a box of pixel centres that does not hold the splat's centre its minimum lies on
+    a side that faces the centre; both facing sides are tried.
     """
-    x, y = splats.means[owner].unbind(dim=1)
+    owner = order[rank]
+    place = (torch.arange(rank.shape[0], device=rank.device) - starts[rank]).int()
+    box, splat = boxes[owner], table[owner]
+    row = place // box[:, 2]
+    tile_x = place - row * box[:, 2] + box[:, 0]
+    tile_y = row + box[:, 1]
+    x, y, xx, xy, yy, reached = splat.unbind(dim=1)
     left, top = tile_x * TILE + 0.5 - x, tile_y * TILE + 0.5 - y
     right, bottom = left + (TILE - 1), top + (TILE - 1)
-    side_x = torch.zeros_like(x).clamp(left, right)
-    side_y = torch.zeros_like(y).clamp(top, bottom)
-    xx, xy, yy = (splats.covs / splats.dets[:, None])[owner].unbind(dim=1)  # conic is (yy, −xy, xx)
-    on_x = (xy / xx * side_x).clamp(top, bottom)
-    on_y = (xy / yy * side_y).clamp(left, right)
+    zero = torch.zeros_like(x)
+    side_x = torch.minimum(torch.maximum(zero, left), right)
+    side_y = torch.minimum(torch.maximum(zero, top), bottom)
+    on_x = torch.minimum(torch.maximum(-xy / yy * side_x, top), bottom)
+    on_y = torch.minimum(torch.maximum(-xy / xx * side_y, left), right)
     distance = torch.minimum(
-        yy * side_x * side_x - 2 * xy * side_x * on_x + xx * on_x * on_x,
-        yy * on_y * on_y - 2 * xy * on_y * side_y + xx * side_y * side_y,
+        xx * side_x * side_x + 2 * xy * side_x * on_x + yy * on_x * on_x,
+        xx * on_y * on_y + 2 * xy * on_y * side_y + yy * side_y * side_y,
     )
-    slack = REACH_SLACK * (1 + yy * side_x * side_x + xx * side_y * side_y)
-    return distance <= reach(splats)[owner] + slack
+    slack = REACH_SLACK * (1 + xx * side_x * side_x + yy * side_y * side_y)
+    first, last, columns = band.int().unbind()
+    tile = (tile_y - first) * columns + tile_x
+    nowhere = (last - first) * columns
+    return owner, torch.where(distance <= reached + slack, tile, nowhere)
+
+
+# ----------------------------------------------------------------------------------------------------- compositing
 
 
 def _composite(
-    drawing: Float[Tensor, "m 10"], bins: Bins, grid: tuple[int, int]
-) -> Float[Tensor, "all P 4"]:
+    drawing: Float[Tensor, "m 10"], bins: Bins, kernels: Kernels
+) -> Float[Tensor, "t P 4"]:
     """Premultiplied colour and alpha of every pixel of every tile."""
-    image = drawing.new_zeros(grid[0] * grid[1], TILE * TILE, 4)
-    order = torch.sort(bins.counts, descending=True).indices[: int((bins.counts > 0).sum())]
-    for tiles in order.split(BLOCK):
-        _composite_block(drawing, bins, tiles, grid[1], image)
+    if drawing.requires_grad and torch.is_grad_enabled():
+        return _Composite.apply(drawing, bins, kernels)  # pyright: ignore[reportReturnType]
+    image, _ = _forward(drawing, bins, kernels, keep=False)
     return image
+
+
+@dataclass(frozen=True)
+class _Pass:
+    """What a pass composited: K splats for each of some tiles, from transmittance `before`."""
+
+    tiles: Int[Tensor, " t"]
+    splats: Int[Tensor, "t K"]
+    before: Float[Tensor, "t P"]
+
+
+def _forward(
+    drawing: Float[Tensor, "m 10"], bins: Bins, kernels: Kernels, keep: bool
+) -> tuple[Float[Tensor, "all P 4"], list[_Pass]]:
+    """The image, and with `keep` the passes that made it, in order."""
+    image = drawing.new_zeros(len(bins.counts), TILE * TILE, 4)
+    passes: list[_Pass] = []
+    order = torch.sort(bins.counts, descending=True, stable=True).indices
+    order = order[: int((bins.counts > 0).sum())]
+    for tiles in order.split(kernels.tiles):
+        _composite_block(drawing, bins, tiles, image, kernels, passes if keep else None)
+    return image, passes
 
 
 def _composite_block(
     drawing: Float[Tensor, "m 10"],
     bins: Bins,
     tiles: Int[Tensor, " t"],
-    columns: int,
     image: Float[Tensor, "all P 4"],
+    kernels: Kernels,
+    passes: list[_Pass] | None,
 ) -> None:
     """Composite some tiles, longest first, into the image; tiles leave when they are saturated or drawn out."""
-    first, counts = bins.first[tiles], bins.counts[tiles]
-    centre = torch.stack([tiles % columns, tiles // columns], dim=1) * TILE + TILE / 2
-    local = _local_positions(drawing)
-    transmittance = drawing.new_ones(len(tiles), TILE * TILE)
-    total = drawing.new_zeros(len(tiles), TILE * TILE, 4)
+    local = _pixel_centres(drawing)
+    step = torch.arange(PASS, device=tiles.device)
+    first, counts, origins = bins.first[tiles], bins.counts[tiles], bins.origins[tiles]
+    state = (
+        drawing.new_ones(len(tiles), TILE * TILE),
+        *drawing.new_zeros(4, len(tiles), TILE * TILE),
+    )
     start = 0
     while len(tiles):
-        step = PASS * max(1, BLOCK // len(tiles))  # few tiles take more splats at once
-        place = start + torch.arange(step, device=tiles.device)[:, None]
-        pair = torch.where(place < counts, first + place, 0)
-        splat = torch.where(place < counts, bins.splats[pair], len(drawing) - 1)
-        transmittance = _pass(drawing[splat], centre, local, transmittance, total)
-        start += step
-        live = (transmittance.amax(dim=1) > 0) & (counts > start)
+        place = start + step
+        inside = place < counts[:, None]
+        pair = (first[:, None] + place).clamp(max=len(bins.splats) - 1)
+        splats = torch.where(inside, bins.splats[pair], len(drawing) - 1)
+        if passes is not None:
+            passes.append(_Pass(tiles, splats, state[0]))
+        state = kernels.run(COMPOSITE, drawing, splats, origins, *state, *local, _stop(tiles, drawing))
+        start += PASS
+        live = (state[0].amax(dim=1) > 0) & (counts > start)
         if not live.all():
-            image[tiles[~live]] = total[~live]
-            tiles, first, counts, centre = tiles[live], first[live], counts[live], centre[live]
-            transmittance, total = transmittance[live], total[live]
+            done = ~live
+            image[tiles[done]] = torch.stack([column[done] for column in state[1:]], dim=-1)
+            tiles, first, counts, origins = (x[live] for x in (tiles, first, counts, origins))
+            state = tuple(column[live] for column in state)
 
 
-def _local_positions(like: Tensor) -> Float[Tensor, "3 P"]:
-    """Rows 1, x, y of a tile's pixel centres, from the tile's centre."""
-    offset = torch.arange(TILE, dtype=like.dtype, device=like.device) + 0.5 - TILE / 2
+def _pixel_centres(like: Tensor) -> tuple[Float[Tensor, " P"], Float[Tensor, " P"]]:
+    """x and y of a tile's pixel centres, from its corner."""
+    offset = torch.arange(TILE, dtype=like.dtype, device=like.device) + 0.5
     y, x = torch.meshgrid(offset, offset, indexing="ij")
-    return torch.stack([torch.ones_like(x), x, y]).flatten(1)
+    return x.flatten(), y.flatten()
 
 
-def _pass(
-    splats: Float[Tensor, "K t 10"],
-    centre: Float[Tensor, "t 2"],
-    local: Float[Tensor, "3 P"],
-    transmittance: Float[Tensor, "t P"],
-    total: Float[Tensor, "t P 4"],
-) -> Float[Tensor, "t P"]:
-    """Composite K splats a tile onto `total` in place; returns the transmittance, 0 where the pixel has stopped."""
-    alpha = _alphas(splats, centre, local)
-    steps = alpha.new_empty(len(splats) + 1, *transmittance.shape)
-    steps[0] = transmittance
-    views = steps.unbind()
-    for before, after, kept in zip(views, views[1:], (1 - alpha).unbind(), strict=False):
-        torch.mul(before, kept, out=after)
-    after = torch.threshold_(steps[1:], BELOW_MIN_TRANSMITTANCE, 0.0)
-    weight = alpha.mul_(steps[:-1]).mul_(after > 0)
-    colour = torch.nn.functional.pad(splats[..., RGB], (0, 1), value=1.0)
-    total.baddbmm_(weight.permute(1, 2, 0), colour.transpose(0, 1))
-    return after[-1]
+def _stop(tiles: Tensor, like: Tensor) -> Float[Tensor, " t"]:
+    """The transmittance at which a pixel stops, for each tile: a column keeps the compiler to loops over tiles."""
+    return like.new_full((len(tiles),), MIN_TRANSMITTANCE)
 
 
-def _alphas(
-    splats: Float[Tensor, "K t 10"], centre: Float[Tensor, "t 2"], local: Float[Tensor, "3 P"]
-) -> Float[Tensor, "K t P"]:
-    dx, dy = (centre - splats[..., X : Y + 1]).unbind(dim=-1)
-    ux, uy, vx, vy = splats[..., UX : VY + 1].unbind(dim=-1)
-    u = torch.stack([ux * dx + uy * dy, ux, uy], dim=-1).flatten(0, 1) @ local
-    v = torch.stack([vx * dx + vy * dy, vx, vy], dim=-1).flatten(0, 1) @ local
-    exponent = u.square_().addcmul_(v, v).neg_().add_(splats[..., LOG2_OPACITY].reshape(-1, 1))
-    alpha = exponent.clamp_(min=LOG2_SILENT).exp2_()
-    alpha = torch.threshold_(alpha, BELOW_MIN_ALPHA, 0.0).clamp_(max=MAX_ALPHA)
-    return alpha.view(*splats.shape[:2], -1)
+def _chunk(
+    drawing: Float[Tensor, "m 10"],
+    splats: Int[Tensor, "t K"],
+    origins: Float[Tensor, "t 2"],
+    T: Float[Tensor, "t P"],
+    red: Float[Tensor, "t P"],
+    green: Float[Tensor, "t P"],
+    blue: Float[Tensor, "t P"],
+    hidden: Float[Tensor, "t P"],
+    local_x: Float[Tensor, " P"],
+    local_y: Float[Tensor, " P"],
+    stop: Float[Tensor, " t"],
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Composite K splats: transmittance (0 where the pixel has stopped), colour and alpha."""
+    x, y = origins[:, 0, None] + local_x, origins[:, 1, None] + local_y
+    for k in range(PASS):
+        row = drawing[splats[:, k]]
+        _, _, _, _, alpha = _alpha(row, x, y)
+        wanted = alpha * T
+        after = T - wanted
+        going = after >= stop[:, None]
+        weight = torch.where(going, wanted, 0.0)
+        T = torch.where(going, after, 0.0)
+        red = red + weight * row[:, RED, None]
+        green = green + weight * row[:, GREEN, None]
+        blue = blue + weight * row[:, BLUE, None]
+        hidden = hidden + weight
+    return T, red, green, blue, hidden
+
+
+def _alpha(
+    row: Float[Tensor, "t 10"], x: Float[Tensor, "t P"], y: Float[Tensor, "t P"]
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Offset from the centre in px, the two forms, and alpha, of one splat a tile."""
+    dx, dy = x - row[:, X, None], y - row[:, Y, None]
+    u = row[:, UX, None] * dx + row[:, UY, None] * dy
+    v = row[:, VX, None] * dx + row[:, VY, None] * dy
+    exponent = row[:, LOG2_OPACITY, None] - u * u - v * v
+    alpha = torch.exp2(exponent.clamp(min=LOG2_SILENT)).clamp(max=MAX_ALPHA)
+    return dx, dy, u, v, torch.where(alpha >= MIN_ALPHA, alpha, 0.0)
+
+
+class _Composite(torch.autograd.Function):
+    """Compositing with its own backward pass."""
+
+    @staticmethod
+    def forward(ctx: Any, drawing: Tensor, bins: Bins, kernels: Kernels) -> Tensor:
+        image, ctx.passes = _forward(drawing, bins, kernels, keep=True)
+        ctx.save_for_backward(drawing, image)
+        ctx.bins, ctx.kernels = bins, kernels
+        return image
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None, None]:
+        drawing, image = ctx.saved_tensors
+        return _backward(drawing, image, grads[0], ctx.bins, ctx.passes, ctx.kernels), None, None
+
+
+def _backward(
+    drawing: Float[Tensor, "m 10"],
+    image: Float[Tensor, "all P 4"],
+    grad: Float[Tensor, "all P 4"],
+    bins: Bins,
+    passes: list[_Pass],
+    kernels: Kernels,
+) -> Float[Tensor, "m 10"]:
+    """Gradient of the drawing parameters."""
+    rest = (image * grad).sum(dim=2)
+    columns = [column.contiguous() for column in grad.unbind(dim=2)]
+    local = _pixel_centres(drawing)
+    total = torch.zeros_like(drawing)
+    for part in passes:
+        tiles = part.tiles
+        *sums, left = kernels.run(
+            COMPOSITE_BACKWARD,
+            drawing,
+            part.splats,
+            bins.origins[tiles],
+            part.before,
+            rest[tiles],
+            *(column[tiles] for column in columns),
+            *local,
+            _stop(tiles, drawing),
+        )
+        rest[tiles] = left
+        moments = torch.stack(sums, dim=-1).view(-1, COLUMNS)
+        owners = part.splats.flatten()
+        total.scatter_add_(0, owners[:, None].expand(-1, COLUMNS), moments)
+    return _from_moments(drawing, total)
+
+
+def _from_moments(
+    drawing: Float[Tensor, "m 10"], moments: Float[Tensor, "m 10"]
+) -> Float[Tensor, "m 10"]:
+    """Gradients of the parameters from sums over pixels of s·(u dx, u dy, v dx, v dy, u, v, 1) and of the colours'."""
+    udx, udy, vdx, vdy, u, v, s, red, green, blue = moments.unbind(dim=1)
+    ux, uy, vx, vy = drawing[:, UX : VY + 1].unbind(dim=1)
+    x, y = 2 * (u * ux + v * vx), 2 * (u * uy + v * vy)
+    return torch.stack([-2 * udx, -2 * udy, -2 * vdx, -2 * vdy, x, y, s, red, green, blue], dim=1)
+
+
+def _chunk_backward(
+    drawing: Float[Tensor, "m 10"],
+    splats: Int[Tensor, "t K"],
+    origins: Float[Tensor, "t 2"],
+    T: Float[Tensor, "t P"],
+    rest: Float[Tensor, "t P"],
+    g_red: Float[Tensor, "t P"],
+    g_green: Float[Tensor, "t P"],
+    g_blue: Float[Tensor, "t P"],
+    g_hidden: Float[Tensor, "t P"],
+    local_x: Float[Tensor, " P"],
+    local_y: Float[Tensor, " P"],
+    stop: Float[Tensor, " t"],
+) -> tuple[Tensor, ...]:
+    """Sums over a tile's pixels for each of K splats, ten columns [t, K], and what is left of `rest`."""
+    x, y = origins[:, 0, None] + local_x, origins[:, 1, None] + local_y
+    sums: list[list[Tensor]] = []
+    for k in range(PASS):
+        row = drawing[splats[:, k]]
+        dx, dy, u, v, alpha = _alpha(row, x, y)
+        wanted = alpha * T
+        after = T - wanted
+        going = after >= stop[:, None]
+        weight = torch.where(going, wanted, 0.0)
+        colour = row[:, RED, None] * g_red + row[:, GREEN, None] * g_green
+        colour = colour + row[:, BLUE, None] * g_blue + g_hidden
+        rest = rest - weight * colour
+        # d alpha / d exponent = alpha ln 2, where alpha is neither skipped (then it is 0) nor capped
+        smooth = going & (alpha < MAX_ALPHA)
+        s = torch.where(smooth, LN_2 * alpha * (T * colour - rest / (1 - alpha)), 0.0)
+        T = torch.where(going, after, 0.0)
+        su, sv = s * u, s * v
+        terms = (su * dx, su * dy, sv * dx, sv * dy, su, sv, s)
+        colours = (weight * g_red, weight * g_green, weight * g_blue)
+        sums.append([term.sum(dim=1) for term in (*terms, *colours)])
+    return *(torch.stack(column, dim=1) for column in zip(*sums, strict=True)), rest
+
+
+# --------------------------------------------------------------------------------------------------------- kernels
+
+
+def _tile_example(states: int) -> tuple[Tensor, ...]:
+    splats = torch.zeros(6, PASS, dtype=torch.int64)
+    local = _pixel_centres(torch.zeros(1))
+    state = torch.ones(states, 6, TILE * TILE).unbind()
+    return torch.ones(9, COLUMNS), splats, torch.zeros(6, 2), *state, *local, torch.ones(6)
+
+
+def _reach_example() -> tuple[Tensor, ...]:
+    order = torch.arange(5)
+    boxes = torch.ones(5, 3, dtype=torch.int32)
+    return torch.zeros(7, dtype=torch.int64), order, order, boxes, torch.ones(5, 6), order[:3] + 1
+
+
+REACH = Kernel("reach", _reach, _reach_example, ("p", "m", "m", "m", "m", None))
+COMPOSITE = Kernel(
+    "composite",
+    _chunk,
+    lambda: _tile_example(5),
+    ("m", *7 * ("t",), None, None, "t"),
+)
+COMPOSITE_BACKWARD = Kernel(
+    "composite-backward",
+    _chunk_backward,
+    lambda: _tile_example(6),
+    ("m", *8 * ("t",), None, None, "t"),
+)

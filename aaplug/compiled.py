@@ -1,0 +1,156 @@
+"""Kernels compiled ahead of time: built once, kept in the user's cache folder, loaded in milliseconds.
+
+Each kernel becomes one package of `torch._inductor`.  The folder's name is made of the versions of torch and of the
+kernels' source and of the processor's instruction set, so that a stale package is never found; a package that does
+not load, or whose answer differs from the eager one, is built anew.
+"""
+
+import hashlib
+import inspect
+import os
+import shutil
+import tempfile
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import platformdirs
+import torch
+
+from aaplug import kernels as kernels_module
+from aaplug import projection
+from aaplug.errors import UsageError
+from aaplug.kernels import CompiledKernels, Kernel
+from aaplug.rasterizers import tiled
+
+KERNELS: tuple[Kernel, ...] = (
+    projection.PROJECT,
+    *projection.SHADE.values(),
+    tiled.REACH,
+    tiled.COMPOSITE,
+    tiled.COMPOSITE_BACKWARD,
+)
+OPTIONS = {
+    "max_fusion_size": 1_000_000,  # a pass is one loop, however many operations it has
+    "assert_indirect_indexing": False,  # indices are our own, and a check a load is slow
+    "cpp.enable_floating_point_contract_flag": "fast",  # multiply and add in one instruction
+}
+LARGEST_SIZE = 1 << 31
+TOLERANCE = 1e-4  # between a package's answer and the eager one, on the example
+
+
+def cache_folder() -> Path:
+    """Where the packages of this version on this processor are."""
+    source = "".join(inspect.getsource(module) for module in (kernels_module, projection, tiled))
+    facts = [torch.__version__, torch.backends.cpu.get_cpu_capability(), source, str(OPTIONS)]
+    key = hashlib.sha256("\0".join(facts).encode()).hexdigest()[:16]
+    return Path(platformdirs.user_cache_dir("aaplug", appauthor=False)) / f"kernels-{key}"
+
+
+def has_compiler() -> bool:
+    """Whether this machine can build packages."""
+    from torch._inductor.cpp_builder import get_cpp_compiler
+
+    try:
+        return shutil.which(get_cpp_compiler()) is not None
+    except Exception:  # torch names no public exception for "no compiler"
+        return False
+
+
+def load() -> CompiledKernels | None:
+    """The compiled kernels, if all of them are built and sound."""
+    packages = {}
+    for kernel in KERNELS:
+        package = _load(kernel)
+        if package is None:
+            return None
+        packages[kernel.name] = package
+    return CompiledKernels(packages)
+
+
+def build(
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> CompiledKernels:
+    """Build what is missing, stale or broken, and load all.
+
+    progress: told (kernels done, kernels in all).
+
+    Raises:
+        UsageError: there is no compiler, or the cache folder cannot be written.
+    """
+    for done, kernel in enumerate(KERNELS):
+        progress(done, len(KERNELS))
+        if _load(kernel) is None:
+            _build(kernel)
+    progress(len(KERNELS), len(KERNELS))
+    loaded = load()
+    if loaded is None:
+        raise UsageError("warmup", f"the packages in {cache_folder()} do not load")
+    return loaded
+
+
+def _path(kernel: Kernel) -> Path:
+    return cache_folder() / f"{kernel.name}.pt2"
+
+
+def _load(kernel: Kernel) -> Any | None:
+    """A package that gives the eager answer, or nothing."""
+    path = _path(kernel)
+    if not path.is_file():
+        return None
+    try:
+        with _quiet():
+            package = torch._inductor.aoti_load_package(str(path))
+        args = kernel.example()
+        with torch.no_grad():
+            answers = zip(package(*args), kernel.function(*args), strict=True)
+        close = all(
+            torch.allclose(a.double(), b.double(), TOLERANCE, TOLERANCE) for a, b in answers
+        )
+        return package if close else None
+    except Exception:  # a broken package can fail in any way; it is built anew
+        return None
+
+
+def _build(kernel: Kernel) -> None:
+    if not has_compiler():
+        raise UsageError("warmup", "needs a C++ compiler (g++ or clang++) for torch to compile with")
+    path = _path(kernel)
+    sizes = {
+        name: torch.export.Dim(f"size_{name}", min=2, max=LARGEST_SIZE)
+        for name in kernel.sizes
+        if name is not None
+    }
+    shapes = tuple({0: sizes[name]} if name is not None else None for name in kernel.sizes)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=path.parent) as folder, _quiet(), torch.no_grad():
+            module = _Module(kernel)
+            program = torch.export.export(module, kernel.example(), dynamic_shapes=(shapes,))
+            made = torch._inductor.aoti_compile_and_package(
+                program, package_path=str(Path(folder) / "k.pt2"), inductor_configs=dict(OPTIONS)
+            )
+            os.replace(made, path)
+    except OSError as error:
+        raise UsageError("warmup", f"cannot write {path.parent}: {error}") from error
+
+
+class _Module(torch.nn.Module):
+    """A kernel as torch.export takes it."""
+
+    def __init__(self, kernel: Kernel):
+        super().__init__()
+        self._function = kernel.function
+
+    def forward(self, *args: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        return self._function(*args)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep torch's own deprecation notices from the user."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
