@@ -20,7 +20,7 @@ import platformdirs
 import torch
 
 from aaplug import kernels as kernels_module
-from aaplug import projection
+from aaplug import projection, splats
 from aaplug.errors import UsageError
 from aaplug.kernels import CompiledKernels, Kernel
 from aaplug.rasterizers import tiled
@@ -28,6 +28,9 @@ from aaplug.rasterizers import tiled
 KERNELS: tuple[Kernel, ...] = (
     projection.PROJECT,
     *projection.SHADE.values(),
+    splats.INSIDE,
+    tiled.DRAWING,
+    tiled.TABLE,
     tiled.REACH,
     tiled.COMPOSITE,
     tiled.COMPOSITE_BACKWARD,
@@ -43,7 +46,7 @@ TOLERANCE = 1e-4  # between a package's answer and the eager one, on the example
 
 def cache_folder() -> Path:
     """Where the packages of this version on this processor are."""
-    source = "".join(inspect.getsource(module) for module in (kernels_module, projection, tiled))
+    source = "".join(inspect.getsource(module) for module in (kernels_module, projection, splats, tiled))
     facts = [torch.__version__, torch.backends.cpu.get_cpu_capability(), source, str(OPTIONS)]
     key = hashlib.sha256("\0".join(facts).encode()).hexdigest()[:16]
     return Path(platformdirs.user_cache_dir("aaplug", appauthor=False)) / f"kernels-{key}"

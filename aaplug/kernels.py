@@ -44,7 +44,7 @@ class CompiledKernels(Kernels):
     """Runs what was compiled for float32 on a CPU, and everything else eagerly: gradients, precisions, devices."""
 
     name = "compiled"
-    tiles = 1024
+    tiles = 2048
 
     def __init__(self, packages: dict[str, Any]):
         self._packages = packages

@@ -44,7 +44,7 @@ def project(scene: Gaussians, camera: Camera, kernels: Kernels = EAGER) -> Splat
         means, covs, dets, depths, scene.opacities, torch.arange(len(scene), device=means.device)
     )
     in_front = depths > NEAR
-    return splats if in_front.all() else splats[in_front.nonzero().squeeze(1)]
+    return splats if in_front.all() else splats[in_front]
 
 
 def shade(
@@ -168,28 +168,26 @@ def _sh_basis(directions: Float[Tensor, "m 3"], coefficients: int) -> list[Float
     return basis
 
 
-def _example(coefficients: int) -> tuple[Tensor, ...]:
-    return (
-        torch.zeros(8, coefficients, 3),
-        torch.ones(8, 3),
-        torch.arange(5),
-        torch.zeros(3, dtype=torch.float64),
-    )
+EXAMPLE_SIZE = 100_000  # as large as real work: the compiler decides by it which loops run in threads
 
 
-PROJECT = Kernel(
-    "project",
-    _project,
-    lambda: (
-        torch.ones(8, 3),
-        torch.ones(8, 4),
-        torch.zeros(8, 3),
-        torch.zeros(3, dtype=torch.float64),
-        torch.eye(3),
-        torch.ones(8),
-    ),
-    ("n", "n", "n", None, None, None),
-)
+def _shade_example(coefficients: int) -> tuple[Tensor, ...]:
+    sh = torch.linspace(-1.0, 1.0, EXAMPLE_SIZE * coefficients * 3)
+    means = torch.linspace(1.0, 2.0, EXAMPLE_SIZE * 3).view(-1, 3)
+    sources = torch.arange(0, EXAMPLE_SIZE, 2)
+    return sh.view(-1, coefficients, 3), means, sources, torch.zeros(3, dtype=torch.float64)
+
+
+def _project_example() -> tuple[Tensor, ...]:
+    means = torch.linspace(1.0, 2.0, EXAMPLE_SIZE * 3).view(-1, 3)
+    quats = torch.linspace(0.1, 1.0, EXAMPLE_SIZE * 4).view(-1, 4)
+    centre = torch.zeros(3, dtype=torch.float64)
+    lens = torch.tensor([9.0, 9.0, 4.0, 4.0, -2.0, 2.0, -2.0, 2.0])
+    return means, quats, -means, centre, torch.eye(3), lens
+
+
+PROJECT = Kernel("project", _project, _project_example, ("n", "n", "n", None, None, None))
 SHADE = {
-    k: Kernel(f"shade-{k}", _shade, partial(_example, k), ("n", "n", "m", None)) for k in (4, 9, 16)
+    k: Kernel(f"shade-{k}", _shade, partial(_shade_example, k), ("n", "n", "m", None))
+    for k in (4, 9, 16)
 }

@@ -13,6 +13,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from aaplug.kernels import EAGER, Kernel, Kernels
+
 MIN_ALPHA = 1 / 255  # a contribution below it is skipped (3DGS)
 MIN_COMPENSATION = (
     0.005  # floor of an opacity factor: rounding makes no splat vanish (3DGS, gsplat)
@@ -36,14 +38,20 @@ class Splats2D:
 
     def __getitem__(self, index: Tensor | slice) -> "Splats2D":
         """The splats at `index` (a mask, indices or a slice), in that order."""
+        if isinstance(index, Tensor) and index.dtype == torch.bool:
+            index = index.nonzero().squeeze(1)
+
+        def at(column: Tensor) -> Tensor:  # index_select is several times faster than [index]
+            return column[index] if isinstance(index, slice) else column.index_select(0, index)
+
         return Splats2D(
-            means=self.means[index],
-            covs=self.covs[index],
-            dets=self.dets[index],
-            depths=self.depths[index],
-            opacities=self.opacities[index],
-            sources=self.sources[index],
-            rgb=None if self.rgb is None else self.rgb[index],
+            means=at(self.means),
+            covs=at(self.covs),
+            dets=at(self.dets),
+            depths=at(self.depths),
+            opacities=at(self.opacities),
+            sources=at(self.sources),
+            rgb=None if self.rgb is None else at(self.rgb),
         )
 
     def to(self, dtype: torch.dtype) -> "Splats2D":
@@ -88,42 +96,78 @@ class Render(NamedTuple):
 
 
 def whitening(splats: Splats2D) -> Float[Tensor, "m 2 2"]:
-    """W of each splat with |W d|² = dᵀ C⁻¹ d, for d = (dx, dy) in px.
+    """W of each splat with |W d|² = dᵀ C⁻¹ d, for d = (dx, dy) in px."""
+    return torch.stack(whitening_columns(splats.covs, splats.dets), dim=1).unflatten(1, (2, 2))
+
+
+def whitening_columns(
+    covs: Float[Tensor, "m 3"], dets: Float[Tensor, " m"]
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The four entries of each splat's whitening.
 
     The row without slope runs along the axis of larger variance, so that the other's slope is at most one; with the
     determinant given, no digits are lost for needles, as they are in yy·dx² − 2xy·dx·dy + xx·dy².
     """
-    xx, xy, yy = splats.covs.unbind(dim=1)
+    xx, xy, yy = covs.unbind(dim=1)
     wide = xx >= yy
     pivot = torch.where(wide, xx, yy)
-    along, across = pivot.rsqrt(), (pivot / splats.dets).sqrt()
+    along, across = pivot.rsqrt(), (pivot / dets).sqrt()
     slope, zero = -xy / pivot * across, torch.zeros_like(along)
-    sloped = torch.stack(
-        [torch.where(wide, slope, across), torch.where(wide, across, slope)], dim=1
+    return (
+        torch.where(wide, slope, across),
+        torch.where(wide, across, slope),
+        torch.where(wide, along, zero),
+        torch.where(wide, zero, along),
     )
-    straight = torch.stack([torch.where(wide, along, zero), torch.where(wide, zero, along)], dim=1)
-    return torch.stack([sloped, straight], dim=1)
 
 
-def reach(splats: Splats2D) -> Float[Tensor, " m"]:
+def reach(opacities: Float[Tensor, " m"]) -> Float[Tensor, " m"]:
     """Squared Mahalanobis distance at which alpha falls to 1/255; below zero for a splat that never reaches it."""
-    return 2 * torch.log(splats.opacities / MIN_ALPHA)
+    return 2 * torch.log(opacities / MIN_ALPHA)
 
 
 def half_sizes(splats: Splats2D) -> Float[Tensor, "m 2"]:
     """Half width and height of the box outside of which a splat's alpha is below 1/255, in px."""
-    return (reach(splats).clamp(min=0.0)[:, None] * splats.covs[:, [0, 2]]).sqrt()
+    return (reach(splats.opacities).clamp(min=0.0)[:, None] * splats.covs[:, [0, 2]]).sqrt()
 
 
-def drawn(splats: Splats2D, hw: tuple[int, int], guard: float = math.inf) -> Splats2D:
+def drawn(
+    splats: Splats2D, hw: tuple[int, int], guard: float = math.inf, kernels: Kernels = EAGER
+) -> Splats2D:
     """The splats that can change an image of height and width `hw`; a splat of no area cannot.
 
     guard: leave out splats whose centre lies farther outside the image than this share of its longer side.
     """
-    half = half_sizes(splats)
-    size = splats.means.new_tensor([hw[1], hw[0]])
-    inside = ((splats.means + half > 0) & (splats.means - half < size)).all(dim=1)
-    if guard < math.inf:
-        band = guard * max(hw)
-        inside &= ((splats.means >= -band) & (splats.means <= size + band)).all(dim=1)
-    return splats[inside & (splats.opacities >= MIN_ALPHA) & (splats.dets > 0)]
+    size = splats.means.new_tensor([hw[1], hw[0], guard * max(hw)])
+    (inside,) = kernels.run(
+        INSIDE, splats.means, splats.covs, splats.dets, splats.opacities, size
+    )
+    return splats[inside]
+
+
+def _inside(
+    means: Float[Tensor, "m 2"],
+    covs: Float[Tensor, "m 3"],
+    dets: Float[Tensor, " m"],
+    opacities: Float[Tensor, " m"],
+    size: Float[Tensor, " 3"],
+) -> tuple[Tensor]:
+    *sides, band = size.unbind()
+    inside = (opacities >= MIN_ALPHA) & (dets > 0)
+    reached = reach(opacities).clamp(min=0.0)
+    for mean, variance, side in zip(
+        means.unbind(dim=1), (covs[:, 0], covs[:, 2]), sides, strict=True
+    ):
+        half = (reached * variance).sqrt()
+        inside = inside & (mean + half > 0) & (mean - half < side)
+        inside = inside & (mean >= -band) & (mean <= side + band)
+    return (inside,)
+
+
+def _inside_example() -> tuple[Tensor, ...]:
+    m = 100_000
+    means = torch.linspace(-9.0, 9.0, 2 * m).view(m, 2)
+    return means, torch.ones(m, 3), torch.ones(m), torch.ones(m), torch.tensor([4.0, 4.0, 2.0])
+
+
+INSIDE = Kernel("inside", _inside, _inside_example, ("m", "m", "m", "m", None))

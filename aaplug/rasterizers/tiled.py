@@ -27,10 +27,12 @@ from torch import Tensor
 
 from aaplug.kernels import EAGER, Kernel, Kernels
 from aaplug.rasterizers.rules import MAX_ALPHA, MIN_TRANSMITTANCE, over
-from aaplug.splats import MIN_ALPHA, Render, Splats2D, half_sizes, reach, whitening
+from aaplug.splats import MIN_ALPHA, Render, Splats2D, reach, whitening_columns
 
 TILE = 8  # px
 PASS = 8  # splats composited in one pass: more compile slowly, fewer load and store more
+CHECK_EVERY = 2  # passes between looks at which tiles are saturated
+COMPACT_BELOW = 7 / 8  # share of tiles still going at which the others leave
 PAIR_BUDGET = 8_000_000  # candidate pairs expanded at once; each takes about 40 bytes
 HALF_LOG2_E = 0.5 * log2(torch.e)
 LN_2 = math.log(2)
@@ -44,6 +46,7 @@ REACH_SLACK = (
 # columns of a splat's drawing parameters
 UX, UY, VX, VY, X, Y, LOG2_OPACITY, RED, GREEN, BLUE = range(10)
 COLUMNS = 10
+LOW_X = 6  # where a box of tiles begins in a row of the table
 
 
 @dataclass(frozen=True)
@@ -60,7 +63,7 @@ class Tiled:
     ) -> Render:
         """Draw the splats."""
         grid = (-(-hw[0] // TILE), -(-hw[1] // TILE))
-        drawing = _drawing(splats)
+        drawing = _drawing(splats, self.kernels)
         image = torch.cat(
             [
                 _composite(drawing, bins, self.kernels).unflatten(0, (-1, grid[1]))
@@ -85,14 +88,27 @@ class Bins:
     origins: Float[Tensor, "t 2"]
 
 
-def _drawing(splats: Splats2D) -> Float[Tensor, "m 10"]:
+def _drawing(splats: Splats2D, kernels: Kernels) -> Float[Tensor, "m 10"]:
     """Linear forms, centre, log2 opacity and colour of each splat, and a last row that draws nothing."""
     assert splats.rgb is not None
-    forms = HALF_LOG2_E**0.5 * whitening(splats).flatten(1)
-    columns = [forms, splats.means, splats.opacities.log2()[:, None], splats.rgb]
+    (rows,) = kernels.run(
+        DRAWING, splats.means, splats.covs, splats.dets, splats.opacities, splats.rgb
+    )
     nothing = splats.means.new_zeros(1, COLUMNS)
     nothing[:, LOG2_OPACITY] = LOG2_SILENT
-    return torch.cat([torch.cat(columns, dim=1), nothing])
+    return torch.cat([rows, nothing])
+
+
+def _drawing_rows(
+    means: Float[Tensor, "m 2"],
+    covs: Float[Tensor, "m 3"],
+    dets: Float[Tensor, " m"],
+    opacities: Float[Tensor, " m"],
+    rgb: Float[Tensor, "m 3"],
+) -> tuple[Float[Tensor, "m 10"]]:
+    forms = [HALF_LOG2_E**0.5 * form for form in whitening_columns(covs, dets)]
+    columns = [*forms, *means.unbind(dim=1), opacities.log2(), *rgb.unbind(dim=1)]
+    return (torch.stack(columns, dim=1),)
 
 
 # --------------------------------------------------------------------------------------------------------- binning
@@ -102,10 +118,9 @@ def _drawing(splats: Splats2D) -> Float[Tensor, "m 10"]:
 def _bands(splats: Splats2D, grid: tuple[int, int], kernels: Kernels) -> Iterator[Bins]:
     """Bins of bands of tile rows, from the top."""
     order = _depth_order(splats.depths)
-    low, high = _tile_boxes(splats, grid)
-    table = _reach_table(splats)
-    for rows in _rows(low, high, grid[0]):
-        yield _bin(table, low, high, order, rows, grid[1], kernels)
+    table = _table(splats, grid, kernels).index_select(0, order)
+    for rows in _rows(table, grid[0]):
+        yield _bin(table, order, rows, grid[1], kernels)
 
 
 def _depth_order(depths: Float[Tensor, " m"]) -> Int[Tensor, " m"]:
@@ -114,54 +129,63 @@ def _depth_order(depths: Float[Tensor, " m"]) -> Int[Tensor, " m"]:
     return torch.sort(keys, stable=True).indices
 
 
-def _tile_boxes(
-    splats: Splats2D, grid: tuple[int, int]
-) -> tuple[Int[Tensor, "m 2"], Int[Tensor, "m 2"]]:
-    """First tile and the one after the last, in x and y, of the box around each splat's ellipse."""
-    half = half_sizes(splats) * (1 + REACH_SLACK)
+def _table(splats: Splats2D, grid: tuple[int, int], kernels: Kernels) -> Float[Tensor, "m 10"]:
+    """Centre, conic xx, xy, yy, squared reach of each splat, and the box of tiles around its ellipse.
+
+    A box is its first tile in x and y and the ones after its last.
+    """
     limit = splats.means.new_tensor([grid[1], grid[0]])
-    low = ((splats.means - half) / TILE).floor().clamp(min=0.0).minimum(limit)
-    high = ((splats.means + half) / TILE).floor().add(1).clamp(min=0.0).minimum(limit)
-    return low.int(), high.maximum(low).int()
+    (table,) = kernels.run(
+        TABLE, splats.means, splats.covs, splats.dets, splats.opacities, limit
+    )
+    return table
 
 
-def _rows(low: Int[Tensor, "m 2"], high: Int[Tensor, "m 2"], rows: int) -> list[tuple[int, int]]:
+def _table_rows(
+    means: Float[Tensor, "m 2"],
+    covs: Float[Tensor, "m 3"],
+    dets: Float[Tensor, " m"],
+    opacities: Float[Tensor, " m"],
+    limit: Float[Tensor, " 2"],
+) -> tuple[Float[Tensor, "m 10"]]:
+    xx, xy, yy = covs.unbind(dim=1)
+    reached = reach(opacities)
+    lows, highs = [], []
+    for mean, variance, end in zip(means.unbind(dim=1), (xx, yy), limit.unbind(), strict=True):
+        half = (reached.clamp(min=0.0) * variance).sqrt() * (1 + REACH_SLACK)
+        low = torch.minimum(((mean - half) / TILE).floor().clamp(min=0.0), end)
+        high = torch.minimum(((mean + half) / TILE).floor().add(1).clamp(min=0.0), end)
+        lows.append(low)
+        highs.append(torch.maximum(low, high))
+    conic = [yy / dets, -xy / dets, xx / dets]
+    return (torch.stack([*means.unbind(dim=1), *conic, reached, *lows, *highs], dim=1),)
+
+
+def _rows(table: Float[Tensor, "m 10"], rows: int) -> list[tuple[int, int]]:
     """Cut the grid into runs of tile rows of at most about PAIR_BUDGET candidate pairs, at least a row each."""
-    width = (high - low)[:, 0].long()
-    change = width.new_zeros(rows + 1)
-    change.index_add_(0, low[:, 1], width).index_add_(0, high[:, 1], -width)
+    left, top, right, bottom = table[:, LOW_X:].long().unbind(dim=1)
+    change = top.new_zeros(rows + 1)
+    change.index_add_(0, top, right - left).index_add_(0, bottom, left - right)
     ends = change.cumsum(0).cumsum(0)[:rows]  # candidates down to each row
-    total = int(ends[-1])
-    marks = ends.new_tensor(range(PAIR_BUDGET, total, PAIR_BUDGET))
+    marks = ends.new_tensor(range(PAIR_BUDGET, int(ends[-1]), PAIR_BUDGET))
     cuts = [0, *(torch.searchsorted(ends, marks) + 1).tolist(), rows]
     return [(a, b) for a, b in pairwise(dict.fromkeys(cuts)) if b > a]
 
 
-def _reach_table(splats: Splats2D) -> Float[Tensor, "m 6"]:
-    """Centre, conic xx, xy, yy and squared reach of each splat."""
-    xx, xy, yy = (splats.covs / splats.dets[:, None]).unbind(dim=1)
-    x, y = splats.means.unbind(dim=1)
-    return torch.stack([x, y, yy, -xy, xx, reach(splats)], dim=1)
-
-
 def _bin(
-    table: Float[Tensor, "m 6"],
-    low: Int[Tensor, "m 2"],
-    high: Int[Tensor, "m 2"],
+    table: Float[Tensor, "m 10"],
     order: Int[Tensor, " m"],
     rows: tuple[int, int],
     columns: int,
     kernels: Kernels,
 ) -> Bins:
-    """Pair splats with the tiles that they reach in a band of rows."""
-    top, bottom = low[:, 1].clamp(*rows), high[:, 1].clamp(*rows)
-    width = high[:, 0] - low[:, 0]
-    counts = (width * (bottom - top))[order].long()
+    """Pair splats, nearest first, with the tiles that they reach in a band of rows."""
+    low, top, high, bottom = table[:, LOW_X:].unbind(dim=1)
+    counts = ((high - low) * (bottom.clamp(*rows) - top.clamp(*rows))).long()
     ends = counts.cumsum(0)
     rank = torch.repeat_interleave(counts)
-    boxes = torch.stack([low[:, 0], top, width], dim=1)
     band = order.new_tensor([rows[0], rows[1], columns])
-    owners, tiles = kernels.run(REACH, rank, ends - counts, order, boxes, table, band)
+    (tiles,) = kernels.run(REACH, rank, ends - counts, table, band)
     size = (rows[1] - rows[0]) * columns
     if size < torch.iinfo(torch.int16).max:
         tiles = tiles.short()  # half the bits sort in half the time
@@ -170,30 +194,30 @@ def _bin(
     ends = drawn.cumsum(0)
     tile = torch.arange(size, device=table.device)
     origins = torch.stack([tile % columns, tile // columns + rows[0]], dim=1) * TILE
-    kept = owners[pairs[: int(ends[-1])]]
+    kept = order[rank[pairs[: int(ends[-1])]]]
     return Bins(kept, ends - drawn, drawn, origins.to(table.dtype))
 
 
 def _reach(
     rank: Int[Tensor, " p"],
     starts: Int[Tensor, " m"],
-    order: Int[Tensor, " m"],
-    boxes: Int[Tensor, "m 3"],
-    table: Float[Tensor, "m 6"],
+    table: Float[Tensor, "m 10"],
     band: Int[Tensor, " 3"],
-) -> tuple[Int[Tensor, " p"], Int[Tensor, " p"]]:
-    """Owner and tile of each candidate pair; the tile after the last where alpha < 1/255 all over the tile.
+) -> tuple[Int[Tensor, " p"]]:
+    """Tile of each candidate pair; the tile after the last where alpha < 1/255 all over the tile.
 
     The quadratic is convex, so over a box of pixel centres that does not hold the splat's centre its minimum lies on
     a side that faces the centre; both facing sides are tried.
     """
-    owner = order[rank]
-    place = (torch.arange(rank.shape[0], device=rank.device) - starts[rank]).int()
-    box, splat = boxes[owner], table[owner]
-    row = place // box[:, 2]
-    tile_x = place - row * box[:, 2] + box[:, 0]
-    tile_y = row + box[:, 1]
-    x, y, xx, xy, yy, reached = splat.unbind(dim=1)
+    first, last, columns = band.unbind()
+    row = table[rank]
+    x, y, xx, xy, yy, reached, low_x, low_y, high_x, _ = row.unbind(dim=1)
+    low_y = torch.maximum(low_y, first)
+    place = (torch.arange(rank.shape[0], device=rank.device) - starts[rank]).double()
+    width = (high_x - low_x).double()
+    down = ((place + 0.5) / width).floor()  # exact, and faster than to divide integers
+    tile_x = (place - down * width).to(x) + low_x
+    tile_y = down.to(x) + low_y
     left, top = tile_x * TILE + 0.5 - x, tile_y * TILE + 0.5 - y
     right, bottom = left + (TILE - 1), top + (TILE - 1)
     zero = torch.zeros_like(x)
@@ -206,10 +230,9 @@ def _reach(
         xx * on_y * on_y + 2 * xy * on_y * side_y + yy * side_y * side_y,
     )
     slack = REACH_SLACK * (1 + xx * side_x * side_x + yy * side_y * side_y)
-    first, last, columns = band.int().unbind()
-    tile = (tile_y - first) * columns + tile_x
+    tile = (tile_y.int() - first) * columns + tile_x.int()
     nowhere = (last - first) * columns
-    return owner, torch.where(distance <= reached + slack, tile, nowhere)
+    return (torch.where(distance <= reached + slack, tile, nowhere).int(),)
 
 
 # ----------------------------------------------------------------------------------------------------- compositing
@@ -258,27 +281,36 @@ def _composite_block(
     """Composite some tiles, longest first, into the image; tiles leave when they are saturated or drawn out."""
     local = _pixel_centres(drawing)
     step = torch.arange(PASS, device=tiles.device)
-    first, counts, origins = bins.first[tiles], bins.counts[tiles], bins.origins[tiles]
+    columns = (tiles, *(x.index_select(0, tiles) for x in (bins.first, bins.counts, bins.origins)))
+    stop = drawing.new_full((len(tiles),), MIN_TRANSMITTANCE)
     state = (
         drawing.new_ones(len(tiles), TILE * TILE),
         *drawing.new_zeros(4, len(tiles), TILE * TILE),
     )
     start = 0
-    while len(tiles):
+    while len(columns[0]):
+        tiles, first, counts, origins = columns
         place = start + step
-        inside = place < counts[:, None]
-        pair = (first[:, None] + place).clamp(max=len(bins.splats) - 1)
-        splats = torch.where(inside, bins.splats[pair], len(drawing) - 1)
+        pair = (first[:, None] + place).clamp_(max=len(bins.splats) - 1)
+        splats = bins.splats.index_select(0, pair.flatten()).view(-1, PASS)
+        splats.masked_fill_(place >= counts[:, None], len(drawing) - 1)
         if passes is not None:
             passes.append(_Pass(tiles, splats, state[0]))
-        state = kernels.run(COMPOSITE, drawing, splats, origins, *state, *local, _stop(tiles, drawing))
+        state = kernels.run(
+            COMPOSITE, drawing, splats, origins, *state, *local, stop[: len(tiles)]
+        )
         start += PASS
-        live = (state[0].amax(dim=1) > 0) & (counts > start)
-        if not live.all():
-            done = ~live
-            image[tiles[done]] = torch.stack([column[done] for column in state[1:]], dim=-1)
-            tiles, first, counts, origins = (x[live] for x in (tiles, first, counts, origins))
-            state = tuple(column[live] for column in state)
+        live = counts > start
+        if start // PASS % CHECK_EVERY == 0:
+            live &= state[0].amax(dim=1) > 0
+        remaining = int(live.sum())
+        if remaining == 0 or remaining < COMPACT_BELOW * len(tiles):
+            done = (~live).nonzero().squeeze(1)
+            finished = [column.index_select(0, done) for column in state[1:]]
+            image.index_copy_(0, tiles.index_select(0, done), torch.stack(finished, dim=-1))
+            kept = live.nonzero().squeeze(1)
+            columns = tuple(column.index_select(0, kept) for column in columns)
+            state = tuple(column.index_select(0, kept) for column in state)
 
 
 def _pixel_centres(like: Tensor) -> tuple[Float[Tensor, " P"], Float[Tensor, " P"]]:
@@ -286,11 +318,6 @@ def _pixel_centres(like: Tensor) -> tuple[Float[Tensor, " P"], Float[Tensor, " P
     offset = torch.arange(TILE, dtype=like.dtype, device=like.device) + 0.5
     y, x = torch.meshgrid(offset, offset, indexing="ij")
     return x.flatten(), y.flatten()
-
-
-def _stop(tiles: Tensor, like: Tensor) -> Float[Tensor, " t"]:
-    """The transmittance at which a pixel stops, for each tile: a column keeps the compiler to loops over tiles."""
-    return like.new_full((len(tiles),), MIN_TRANSMITTANCE)
 
 
 def _chunk(
@@ -306,7 +333,10 @@ def _chunk(
     local_y: Float[Tensor, " P"],
     stop: Float[Tensor, " t"],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Composite K splats: transmittance (0 where the pixel has stopped), colour and alpha."""
+    """Composite K splats: transmittance (0 where the pixel has stopped), colour and alpha.
+
+    stop: the transmittance at which pixels stop, as a column, which keeps the compiler to one loop over tiles.
+    """
     x, y = origins[:, 0, None] + local_x, origins[:, 1, None] + local_y
     for k in range(PASS):
         row = drawing[splats[:, k]]
@@ -375,7 +405,7 @@ def _backward(
             rest[tiles],
             *(column[tiles] for column in columns),
             *local,
-            _stop(tiles, drawing),
+            drawing.new_full((len(tiles),), MIN_TRANSMITTANCE),
         )
         rest[tiles] = left
         moments = torch.stack(sums, dim=-1).view(-1, COLUMNS)
@@ -433,22 +463,38 @@ def _chunk_backward(
 
 
 # --------------------------------------------------------------------------------------------------------- kernels
+# Examples are as large as real work: the compiler decides by them which loops run in threads.
 
 
 def _tile_example(states: int) -> tuple[Tensor, ...]:
-    splats = torch.zeros(6, PASS, dtype=torch.int64)
+    tiles, rows = 1024, 4096
+    drawing = torch.linspace(0.01, 0.1, rows * COLUMNS).view(rows, COLUMNS)
+    splats = torch.arange(tiles * PASS).view(tiles, PASS) % rows
+    state = torch.full((states, tiles, TILE * TILE), 0.5).unbind()
     local = _pixel_centres(torch.zeros(1))
-    state = torch.ones(states, 6, TILE * TILE).unbind()
-    return torch.ones(9, COLUMNS), splats, torch.zeros(6, 2), *state, *local, torch.ones(6)
+    return drawing, splats, torch.ones(tiles, 2), *state, *local, torch.full((tiles,), 1e-4)
+
+
+def _splat_example() -> tuple[Tensor, ...]:
+    m = 100_000
+    means = torch.linspace(0.0, 99.0, 2 * m).view(m, 2)
+    return means, torch.tensor([3.0, 1.0, 2.0]).repeat(m, 1), torch.full((m,), 5.0), torch.ones(m)
 
 
 def _reach_example() -> tuple[Tensor, ...]:
-    order = torch.arange(5)
-    boxes = torch.ones(5, 3, dtype=torch.int32)
-    return torch.zeros(7, dtype=torch.int64), order, order, boxes, torch.ones(5, 6), order[:3] + 1
+    boxes = 20_000
+    row = [12.0, 12.0, 1.0, 0.5, 1.0, 9.0, 0.0, 0.0, 2.0, 4.0]
+    table = torch.tensor(row).repeat(boxes, 1)
+    return torch.arange(8 * boxes) // 8, 8 * torch.arange(boxes), table, torch.tensor([0, 4, 4])
 
 
-REACH = Kernel("reach", _reach, _reach_example, ("p", "m", "m", "m", "m", None))
+DRAWING = Kernel(
+    "drawing", _drawing_rows, lambda: (*_splat_example(), torch.ones(100_000, 3)), ("m",) * 5
+)
+TABLE = Kernel(
+    "table", _table_rows, lambda: (*_splat_example(), torch.full((2,), 9.0)), ("m",) * 4 + (None,)
+)
+REACH = Kernel("reach", _reach, _reach_example, ("p", "m", "m", None))
 COMPOSITE = Kernel(
     "composite",
     _chunk,
