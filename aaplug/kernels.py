@@ -33,7 +33,7 @@ class Kernels:
     """
 
     name = "eager"
-    tiles = 256
+    tiles = 1024
 
     def run(self, kernel: Kernel, *args: Tensor) -> tuple[Tensor, ...]:
         """Run one stage."""

@@ -43,6 +43,11 @@ REACH_SLACK = (
     1e-4  # relative, on the squared reach: float32 rounding never drops a pixel that counts
 )
 
+# `threshold` keeps what is above its bound; these keep what is at the bound as well.
+BELOW_MIN_ALPHA = torch.nextafter(torch.tensor(MIN_ALPHA), torch.tensor(0.0)).item()
+BELOW_MIN_TRANSMITTANCE = torch.nextafter(torch.tensor(MIN_TRANSMITTANCE), torch.tensor(0.0)).item()
+SURELY = 1e9  # times anything that is not 0 here is over 1
+
 # columns of a splat's drawing parameters
 UX, UY, VX, VY, X, Y, LOG2_OPACITY, RED, GREEN, BLUE = range(10)
 COLUMNS = 10
@@ -194,7 +199,7 @@ def _bin(
     ends = drawn.cumsum(0)
     tile = torch.arange(size, device=table.device)
     origins = torch.stack([tile % columns, tile // columns + rows[0]], dim=1) * TILE
-    kept = order[rank[pairs[: int(ends[-1])]]]
+    kept = order.index_select(0, rank.index_select(0, pairs[: int(ends[-1])]))
     return Bins(kept, ends - drawn, drawn, origins.to(table.dtype))
 
 
@@ -282,7 +287,7 @@ def _composite_block(
     local = _pixel_centres(drawing)
     step = torch.arange(PASS, device=tiles.device)
     columns = (tiles, *(x.index_select(0, tiles) for x in (bins.first, bins.counts, bins.origins)))
-    stop = drawing.new_full((len(tiles),), MIN_TRANSMITTANCE)
+    ones = drawing.new_ones(len(tiles))
     state = (
         drawing.new_ones(len(tiles), TILE * TILE),
         *drawing.new_zeros(4, len(tiles), TILE * TILE),
@@ -297,7 +302,7 @@ def _composite_block(
         if passes is not None:
             passes.append(_Pass(tiles, splats, state[0]))
         state = kernels.run(
-            COMPOSITE, drawing, splats, origins, *state, *local, stop[: len(tiles)]
+            COMPOSITE, drawing, splats, origins, *state, *local, ones[: len(tiles)]
         )
         start += PASS
         live = counts > start
@@ -331,21 +336,17 @@ def _chunk(
     hidden: Float[Tensor, "t P"],
     local_x: Float[Tensor, " P"],
     local_y: Float[Tensor, " P"],
-    stop: Float[Tensor, " t"],
+    one: Float[Tensor, " t"],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Composite K splats: transmittance (0 where the pixel has stopped), colour and alpha.
 
-    stop: the transmittance at which pixels stop, as a column, which keeps the compiler to one loop over tiles.
+    one: ones; a column of them in each step keeps the compiler to one loop over tiles.
     """
     x, y = origins[:, 0, None] + local_x, origins[:, 1, None] + local_y
     for k in range(PASS):
         row = drawing[splats[:, k]]
         _, _, _, _, alpha = _alpha(row, x, y)
-        wanted = alpha * T
-        after = T - wanted
-        going = after >= stop[:, None]
-        weight = torch.where(going, wanted, 0.0)
-        T = torch.where(going, after, 0.0)
+        weight, T = _step(alpha, T, one)
         red = red + weight * row[:, RED, None]
         green = green + weight * row[:, GREEN, None]
         blue = blue + weight * row[:, BLUE, None]
@@ -362,7 +363,18 @@ def _alpha(
     v = row[:, VX, None] * dx + row[:, VY, None] * dy
     exponent = row[:, LOG2_OPACITY, None] - u * u - v * v
     alpha = torch.exp2(exponent.clamp(min=LOG2_SILENT)).clamp(max=MAX_ALPHA)
-    return dx, dy, u, v, torch.where(alpha >= MIN_ALPHA, alpha, 0.0)
+    return dx, dy, u, v, torch.threshold(alpha, BELOW_MIN_ALPHA, 0.0)
+
+
+def _step(
+    alpha: Float[Tensor, "t P"], T: Float[Tensor, "t P"], one: Float[Tensor, " t"]
+) -> tuple[Tensor, Tensor]:
+    """The weight of a splat, and the transmittance after it: both 0 where it would end the pixel.
+
+    Comparing and choosing is slow in eager array code; thresholds and minima are not.
+    """
+    after = torch.threshold(T * (one[:, None] - alpha), BELOW_MIN_TRANSMITTANCE, 0.0)
+    return torch.minimum(alpha * T, after * SURELY), after
 
 
 class _Composite(torch.autograd.Function):
@@ -405,7 +417,7 @@ def _backward(
             rest[tiles],
             *(column[tiles] for column in columns),
             *local,
-            drawing.new_full((len(tiles),), MIN_TRANSMITTANCE),
+            drawing.new_ones(len(tiles)),
         )
         rest[tiles] = left
         moments = torch.stack(sums, dim=-1).view(-1, COLUMNS)
@@ -436,7 +448,7 @@ def _chunk_backward(
     g_hidden: Float[Tensor, "t P"],
     local_x: Float[Tensor, " P"],
     local_y: Float[Tensor, " P"],
-    stop: Float[Tensor, " t"],
+    one: Float[Tensor, " t"],
 ) -> tuple[Tensor, ...]:
     """Sums over a tile's pixels for each of K splats, ten columns [t, K], and what is left of `rest`."""
     x, y = origins[:, 0, None] + local_x, origins[:, 1, None] + local_y
@@ -444,17 +456,14 @@ def _chunk_backward(
     for k in range(PASS):
         row = drawing[splats[:, k]]
         dx, dy, u, v, alpha = _alpha(row, x, y)
-        wanted = alpha * T
-        after = T - wanted
-        going = after >= stop[:, None]
-        weight = torch.where(going, wanted, 0.0)
+        weight, after = _step(alpha, T, one)
         colour = row[:, RED, None] * g_red + row[:, GREEN, None] * g_green
         colour = colour + row[:, BLUE, None] * g_blue + g_hidden
         rest = rest - weight * colour
-        # d alpha / d exponent = alpha ln 2, where alpha is neither skipped (then it is 0) nor capped
-        smooth = going & (alpha < MAX_ALPHA)
-        s = torch.where(smooth, LN_2 * alpha * (T * colour - rest / (1 - alpha)), 0.0)
-        T = torch.where(going, after, 0.0)
+        # d alpha / d exponent = alpha ln 2, where alpha is neither skipped (then it is 0) nor capped nor too late
+        smooth = torch.minimum(after, MAX_ALPHA - alpha).mul(SURELY).clamp(max=1.0)
+        s = LN_2 * alpha * smooth * (T * colour - rest / (1 - alpha))
+        T = after
         su, sv = s * u, s * v
         terms = (su * dx, su * dy, sv * dx, sv * dy, su, sv, s)
         colours = (weight * g_red, weight * g_green, weight * g_blue)
@@ -472,7 +481,7 @@ def _tile_example(states: int) -> tuple[Tensor, ...]:
     splats = torch.arange(tiles * PASS).view(tiles, PASS) % rows
     state = torch.full((states, tiles, TILE * TILE), 0.5).unbind()
     local = _pixel_centres(torch.zeros(1))
-    return drawing, splats, torch.ones(tiles, 2), *state, *local, torch.full((tiles,), 1e-4)
+    return drawing, splats, torch.ones(tiles, 2), *state, *local, torch.ones(tiles)
 
 
 def _splat_example() -> tuple[Tensor, ...]:
