@@ -21,9 +21,10 @@ import torch
 
 from aaplug import kernels as kernels_module
 from aaplug import projection, splats
-from aaplug.errors import UsageError
+from aaplug.errors import UsageError, listing
+from aaplug.interfaces import Rasterizer
 from aaplug.kernels import CompiledKernels, Kernel
-from aaplug.rasterizers import tiled
+from aaplug.rasterizers import RASTERIZERS, Tiled, tiled
 
 KERNELS: tuple[Kernel, ...] = (
     projection.PROJECT,
@@ -41,12 +42,15 @@ OPTIONS = {
     "cpp.enable_floating_point_contract_flag": "fast",  # multiply and add in one instruction
 }
 LARGEST_SIZE = 1 << 31
+FRAMES_THAT_PAY = 300  # a frame of 800² saves about 0.4 s, and compiling takes about 90 s
 TOLERANCE = 1e-4  # between a package's answer and the eager one, on the example
 
 
 def cache_folder() -> Path:
     """Where the packages of this version on this processor are."""
-    source = "".join(inspect.getsource(module) for module in (kernels_module, projection, splats, tiled))
+    source = "".join(
+        inspect.getsource(module) for module in (kernels_module, projection, splats, tiled)
+    )
     facts = [torch.__version__, torch.backends.cpu.get_cpu_capability(), source, str(OPTIONS)]
     key = hashlib.sha256("\0".join(facts).encode()).hexdigest()[:16]
     return Path(platformdirs.user_cache_dir("aaplug", appauthor=False)) / f"kernels-{key}"
@@ -94,6 +98,31 @@ def build(
     return loaded
 
 
+def choose(name: str, frames: int, say: Callable[[str], None]) -> Rasterizer:
+    """The rasterizer that a user asked for by name, or for "auto" the one that pays.
+
+    Compiled kernels are used where they are built, and built where `frames` are enough to repay it.
+
+    Raises:
+        UsageError: the name is not known, or "compiled" was asked for and cannot be built.
+    """
+    if name in RASTERIZERS:
+        return RASTERIZERS[name]
+    if name not in ("auto", "compiled"):
+        names = listing(["auto", "compiled", *RASTERIZERS])
+        raise UsageError("--rasterizer", f"'{name}' is not one of {names}")
+    kernels = load()
+    if kernels is None and (name == "compiled" or (frames >= FRAMES_THAT_PAY and has_compiler())):
+        say("rasterizer: compiling the kernels, once for this machine (about two minutes)")
+        kernels = build()
+    if kernels is not None:
+        say("rasterizer: compiled")
+        return Tiled(kernels)
+    why = "`aaplug warmup` compiles it, for several times the speed"
+    say(f"rasterizer: eager ({why if has_compiler() else 'no C++ compiler found to compile it'})")
+    return RASTERIZERS["eager"]
+
+
 def _path(kernel: Kernel) -> Path:
     return cache_folder() / f"{kernel.name}.pt2"
 
@@ -119,7 +148,9 @@ def _load(kernel: Kernel) -> Any | None:
 
 def _build(kernel: Kernel) -> None:
     if not has_compiler():
-        raise UsageError("warmup", "needs a C++ compiler (g++ or clang++) for torch to compile with")
+        raise UsageError(
+            "warmup", "needs a C++ compiler (g++ or clang++) for torch to compile with"
+        )
     path = _path(kernel)
     sizes = {
         name: torch.export.Dim(f"size_{name}", min=2, max=LARGEST_SIZE)

@@ -13,6 +13,7 @@ from typing import Protocol, runtime_checkable
 
 from aaplug.cameras import Camera
 from aaplug.gaussians import Convention, Gaussians
+from aaplug.kernels import Kernels
 from aaplug.sampling import SamplingBounds
 from aaplug.splats import Render, Splats2D
 
@@ -68,6 +69,11 @@ class Rasterizer(Protocol):
     The rules are 3DGS's: alpha = min(0.99, opacity·Gaussian at the pixel's centre), skipped below 1/255; a pixel stops
     before the splat that would bring its transmittance under 1e-4; splats of equal depth are drawn in scene order.
     """
+
+    @property
+    def kernels(self) -> Kernels:
+        """How the elementwise stages run, those before the rasterizer as well."""
+        ...
 
     def __call__(
         self, splats: Splats2D, hw: tuple[int, int], background: tuple[float, float, float]

@@ -7,16 +7,19 @@ image = render(scene, camera, recipe, training).rgb
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 from aaplug.cameras import BLACK, Camera
 from aaplug.filters import fuse_stored
 from aaplug.gaussians import Gaussians
-from aaplug.interfaces import Rasterizer, Training
+from aaplug.interfaces import Rasterizer, ScreenFilter, Training
 from aaplug.projection import project, shade
 from aaplug.rasterizers import RASTERIZERS, averaged
 from aaplug.recipes import Recipe
 from aaplug.sampling import sampling_bounds
-from aaplug.splats import Render, drawn
+from aaplug.splats import Render, Splats2D, drawn, joined
+
+PART = 1 << 20  # Gaussians projected at once
 
 
 def learn(scene: Gaussians, cameras: Sequence[Camera], guard: float = math.inf) -> Training:
@@ -44,10 +47,32 @@ def render(
     rasterizer: Rasterizer = RASTERIZERS["eager"],
     background: tuple[float, float, float] = BLACK,
 ) -> Render:
-    """One image of a smoothed scene, rgb and alpha of `camera.hw`, by the recipe's screen filter and samples."""
-    rate = training.rate(camera)
-    samples = recipe.samples_at(rate)
+    """One image of a smoothed scene, rgb and alpha of `camera.hw`, by the recipe's screen filter and samples.
+
+    Differentiable in everything that the scene holds and in `camera.cam_from_world`.
+    """
+    samples = recipe.samples_at(training.rate(camera))
     fine = camera.resized(camera.width * samples, camera.height * samples)
-    splats = recipe.screen_at(rate)(project(scene, fine), fine, training)
-    splats = shade(drawn(splats, fine.hw, training.guard), scene, fine)
+    splats = splats_of(scene, fine, recipe.screen_at(training.rate(camera)), training, rasterizer)
     return averaged(rasterizer(splats, fine.hw, background), samples)
+
+
+def splats_of(
+    scene: Gaussians,
+    camera: Camera,
+    screen: ScreenFilter,
+    training: Training,
+    rasterizer: Rasterizer = RASTERIZERS["eager"],
+) -> Splats2D:
+    """What a view draws: projected, filtered, inside the image, coloured.
+
+    Gaussians go through in parts, so that what most of them leave behind never needs memory at once.
+    """
+    kernels, parts = rasterizer.kernels, []
+    for start in range(0, max(1, len(scene)), PART):
+        part = scene if len(scene) <= PART else scene[start : start + PART]
+        splats = project(part, camera, kernels)
+        splats = replace(splats, sources=splats.sources + start)
+        splats = drawn(screen(splats, camera, training), camera.hw, training.guard, kernels)
+        parts.append(shade(splats, scene, camera, kernels))
+    return parts[0] if len(parts) == 1 else joined(parts)

@@ -47,9 +47,7 @@ def project(scene: Gaussians, camera: Camera, kernels: Kernels = EAGER) -> Splat
     return splats if in_front.all() else splats[in_front]
 
 
-def shade(
-    splats: Splats2D, scene: Gaussians, camera: Camera, kernels: Kernels = EAGER
-) -> Splats2D:
+def shade(splats: Splats2D, scene: Gaussians, camera: Camera, kernels: Kernels = EAGER) -> Splats2D:
     """Give splats their colour as seen from the camera: SH plus mid-grey, not below black (3DGS)."""
     centre = camera.centre.to(scene.means.device)
     kernel = SHADE.get(scene.sh.shape[1])
@@ -168,7 +166,9 @@ def _sh_basis(directions: Float[Tensor, "m 3"], coefficients: int) -> list[Float
     return basis
 
 
-EXAMPLE_SIZE = 100_000  # as large as real work: the compiler decides by it which loops run in threads
+EXAMPLE_SIZE = (
+    100_000  # as large as real work: the compiler decides by it which loops run in threads
+)
 
 
 def _shade_example(coefficients: int) -> tuple[Tensor, ...]:

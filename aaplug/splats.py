@@ -6,6 +6,7 @@ digit in float32 while the determinant from factors has all of them.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -88,6 +89,16 @@ class Splats2D:
         return replace(self, covs=self.covs + added * diagonal, dets=dets, opacities=opacities)
 
 
+def joined(parts: Sequence[Splats2D]) -> Splats2D:
+    """Splats of several parts as one; all have colours or none."""
+    columns = {
+        name: torch.cat([getattr(part, name) for part in parts])
+        for name in ("means", "covs", "dets", "depths", "opacities", "sources")
+    }
+    colours = [part.rgb for part in parts if part.rgb is not None]
+    return Splats2D(**columns, rgb=torch.cat(colours) if colours else None)
+
+
 class Render(NamedTuple):
     """An image: rgb not clamped above, over its background; alpha is the share of the background that is hidden."""
 
@@ -139,9 +150,7 @@ def drawn(
     guard: leave out splats whose centre lies farther outside the image than this share of its longer side.
     """
     size = splats.means.new_tensor([hw[1], hw[0], guard * max(hw)])
-    (inside,) = kernels.run(
-        INSIDE, splats.means, splats.covs, splats.dets, splats.opacities, size
-    )
+    (inside,) = kernels.run(INSIDE, splats.means, splats.covs, splats.dets, splats.opacities, size)
     return splats[inside]
 
 

@@ -67,7 +67,8 @@ def evaluate(options: Evaluate) -> int:
     truth = _truth(options.truth, views)
     background = options.rendering.background_of(cameras)
     training = options.cameras.learn(scene, cameras)
-    task = Task(recipes, options.scale, views, background, truth, options.rendering.rasterize)
+    rasterizer = options.rendering.rasterize(len(views) * len(recipes) * len(options.scale))
+    task = Task(recipes, options.scale, views, background, truth, rasterizer)
     facts = _facts(scene, cameras.notes, views, truth)
     facts["guard"] = training.guard if math.isfinite(training.guard) else None
     with progress("evaluating", "views") as tell:

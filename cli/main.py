@@ -13,14 +13,24 @@ import tyro
 from aaplug.errors import AaplugError
 
 from . import console
+from .bench import Bench, bench
 from .convert import Convert, convert
 from .demo import Demo, demo
 from .evaluate import Evaluate, evaluate
 from .info import Info, info
 from .render import Render, render
+from .warmup import Warmup, warmup
 
 FAILED, REFUSED, INTERRUPTED = 1, 2, 130
-VERBS = {Info: info, Convert: convert, Render: render, Evaluate: evaluate, Demo: demo}
+VERBS = {
+    Info: info,
+    Convert: convert,
+    Render: render,
+    Evaluate: evaluate,
+    Demo: demo,
+    Warmup: warmup,
+    Bench: bench,
+}
 CONFIG = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
 
 

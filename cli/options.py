@@ -9,9 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import torch
 import tyro
 
 from aaplug.cameras import BLACK, WHITE, Camera, CameraSet
+from aaplug.compiled import choose
 from aaplug.conversion import describe
 from aaplug.errors import UsageError
 from aaplug.gaussians import CONVENTIONS, Gaussians
@@ -19,7 +21,6 @@ from aaplug.interfaces import Rasterizer, Training
 from aaplug.io.cameras import read_cameras, select_views
 from aaplug.io.scenes import find_scene, read_scene
 from aaplug.pipeline import learn
-from aaplug.rasterizers import RASTERIZERS
 from aaplug.recipes import SAMPLING
 from aaplug.sampling import MIN_SEEN_SHARE, check_frame
 
@@ -130,8 +131,10 @@ class RenderOptions:
     """What matched and auto compare a Gaussian's rate with: training's size, sharpest view or range of views."""
     background: Literal["auto", "white", "black"] = "auto"
     """Behind the scene; auto is what training had."""
-    rasterizer: Literal["tiled", "reference"] = "tiled"
-    """tiled is fast; reference is slow, exact and float64."""
+    rasterizer: Literal["auto", "compiled", "eager", "reference"] = "auto"
+    """auto is compiled where `aaplug warmup` has run, else eager; reference is slow, exact and float64."""
+    threads: Annotated[int | None, flag("N")] = None
+    """Processor threads (default: all)."""
 
     def select(self, cameras: CameraSet) -> Sequence[Camera]:
         """The views that --views names."""
@@ -147,7 +150,10 @@ class RenderOptions:
         say(f"background: {name} ({why})")
         return colour
 
-    @property
-    def rasterize(self) -> Rasterizer:
-        """The rasterizer by name."""
-        return RASTERIZERS[self.rasterizer]
+    def rasterize(self, frames: int) -> Rasterizer:
+        """The rasterizer by name, on as many threads as asked for; says which."""
+        if self.threads is not None:
+            if self.threads < 1:
+                raise UsageError("--threads", f"must be 1 or more, got {self.threads}")
+            torch.set_num_threads(self.threads)
+        return choose(self.rasterizer, frames, say)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
+import torch
 import tyro
 
 from aaplug.cameras import Camera
@@ -61,14 +62,14 @@ def render(options: Render) -> int:
     training = options.cameras.learn(scene, cameras)
     scene = smooth(scene, training, recipe)
     say(_choice(recipe, views, training))
+    rasterizer = options.rendering.rasterize(len(views))
     if not options.output.suffix:
         make_folder(options.output)
     with progress("rendering", "views") as tell:
         for done, (view, path) in enumerate(zip(views, paths, strict=True)):
             tell(done, len(views))
-            image = render_view(
-                scene, view, recipe, training, options.rendering.rasterize, background
-            )
+            with torch.no_grad():
+                image = render_view(scene, view, recipe, training, rasterizer, background)
             write_png(path, image.rgb.float(), options.bit_depth, options.overwrite)
         tell(len(views), len(views))
     if options.json:

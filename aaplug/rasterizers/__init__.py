@@ -1,13 +1,13 @@
 """Rasterizers by name; a new one is a file here and a line below."""
 
 from aaplug.interfaces import Rasterizer
-from aaplug.rasterizers import reference
+from aaplug.rasterizers.reference import Reference
 from aaplug.rasterizers.supersampled import averaged
 from aaplug.rasterizers.tiled import Tiled
 
 RASTERIZERS: dict[str, Rasterizer] = {
     "eager": Tiled(),
-    "reference": reference.rasterize,
+    "reference": Reference(),
 }
 
-__all__ = ["RASTERIZERS", "Tiled", "averaged"]
+__all__ = ["RASTERIZERS", "Reference", "Tiled", "averaged"]

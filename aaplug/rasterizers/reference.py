@@ -4,15 +4,31 @@ h, w: the image; p: pixels of a strip; c: splats of a chunk.  No tiles, no exten
 by strips and chunks alone.  Differentiable through autograd.
 """
 
+from dataclasses import dataclass
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from aaplug.kernels import EAGER, Kernels
 from aaplug.rasterizers.rules import MAX_ALPHA, MIN_TRANSMITTANCE, over
 from aaplug.splats import MIN_ALPHA, Render, Splats2D, whitening
 
 STRIP_PIXELS = 4096
 CHUNK_SPLATS = 512
+
+
+@dataclass(frozen=True)
+class Reference:
+    """`rasterize`, as a rasterizer."""
+
+    kernels: Kernels = EAGER
+
+    def __call__(
+        self, splats: Splats2D, hw: tuple[int, int], background: tuple[float, float, float]
+    ) -> Render:
+        """Draw the splats in float64."""
+        return rasterize(splats, hw, background)
 
 
 def rasterize(

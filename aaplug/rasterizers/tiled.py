@@ -68,11 +68,11 @@ class Tiled:
     ) -> Render:
         """Draw the splats."""
         grid = (-(-hw[0] // TILE), -(-hw[1] // TILE))
-        drawing = _drawing(splats, self.kernels)
+        drawing = drawing_of(splats, self.kernels)
         image = torch.cat(
             [
-                _composite(drawing, bins, self.kernels).unflatten(0, (-1, grid[1]))
-                for bins in _bands(splats, grid, self.kernels)
+                composite(drawing, bins, self.kernels).unflatten(0, (-1, grid[1]))
+                for bins in bands(splats, grid, self.kernels)
             ]
         )
         image = image.unflatten(2, (TILE, TILE)).transpose(1, 2)
@@ -93,7 +93,7 @@ class Bins:
     origins: Float[Tensor, "t 2"]
 
 
-def _drawing(splats: Splats2D, kernels: Kernels) -> Float[Tensor, "m 10"]:
+def drawing_of(splats: Splats2D, kernels: Kernels) -> Float[Tensor, "m 10"]:
     """Linear forms, centre, log2 opacity and colour of each splat, and a last row that draws nothing."""
     assert splats.rgb is not None
     (rows,) = kernels.run(
@@ -120,7 +120,7 @@ def _drawing_rows(
 
 
 @torch.no_grad()
-def _bands(splats: Splats2D, grid: tuple[int, int], kernels: Kernels) -> Iterator[Bins]:
+def bands(splats: Splats2D, grid: tuple[int, int], kernels: Kernels) -> Iterator[Bins]:
     """Bins of bands of tile rows, from the top."""
     order = _depth_order(splats.depths)
     table = _table(splats, grid, kernels).index_select(0, order)
@@ -140,9 +140,7 @@ def _table(splats: Splats2D, grid: tuple[int, int], kernels: Kernels) -> Float[T
     A box is its first tile in x and y and the ones after its last.
     """
     limit = splats.means.new_tensor([grid[1], grid[0]])
-    (table,) = kernels.run(
-        TABLE, splats.means, splats.covs, splats.dets, splats.opacities, limit
-    )
+    (table,) = kernels.run(TABLE, splats.means, splats.covs, splats.dets, splats.opacities, limit)
     return table
 
 
@@ -243,7 +241,7 @@ def _reach(
 # ----------------------------------------------------------------------------------------------------- compositing
 
 
-def _composite(
+def composite(
     drawing: Float[Tensor, "m 10"], bins: Bins, kernels: Kernels
 ) -> Float[Tensor, "t P 4"]:
     """Premultiplied colour and alpha of every pixel of every tile."""
@@ -301,9 +299,7 @@ def _composite_block(
         splats.masked_fill_(place >= counts[:, None], len(drawing) - 1)
         if passes is not None:
             passes.append(_Pass(tiles, splats, state[0]))
-        state = kernels.run(
-            COMPOSITE, drawing, splats, origins, *state, *local, ones[: len(tiles)]
-        )
+        state = kernels.run(COMPOSITE, drawing, splats, origins, *state, *local, ones[: len(tiles)])
         start += PASS
         live = counts > start
         if start // PASS % CHECK_EVERY == 0:

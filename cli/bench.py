@@ -1,0 +1,159 @@
+"""aaplug bench: how fast this machine renders, stage by stage."""
+
+import re
+from dataclasses import dataclass, field
+from typing import Annotated, Literal
+
+import torch
+import tyro
+from rich.table import Table
+
+from aaplug.benchmark import Figures, exponent, measure, synthetic_camera, synthetic_scene
+from aaplug.cameras import Camera
+from aaplug.compiled import choose, load
+from aaplug.errors import UsageError
+from aaplug.gaussians import Gaussians
+from aaplug.rasterizers import Tiled
+
+from .console import out, print_json, say
+from .options import CameraOptions, SceneOptions, flag
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Time the rasterizer on synthetic scenes, or on SCENE with --cameras (its first training view)."""
+
+    scene: SceneOptions = field(default_factory=SceneOptions)
+    cameras: CameraOptions = field(default_factory=CameraOptions)
+    gaussians: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N ...")] = (
+        10_000,
+        100_000,
+        1_000_000,
+    )
+    """Sizes of the synthetic scenes."""
+    resolution: Annotated[tuple[str, ...], tyro.conf.arg(metavar="WxH ...")] = ("800x800",)
+    """Sizes of the synthetic scenes' image."""
+    rasterizer: Literal["all", "compiled", "eager"] = "all"
+    """Which to time; all is compiled, if `aaplug warmup` has run, and eager."""
+    repeats: int = 5
+    """Runs that each median is of."""
+    threads: Annotated[int | None, flag("N")] = None
+    """Processor threads (default: all)."""
+    forward_only: bool = False
+    """Leave out the backward pass."""
+    json: bool = False
+    """Print one JSON object on stdout: the figures, or {"runs": [...]} of several."""
+
+
+def bench(options: Bench) -> int:
+    """Time every rasterizer on every scene."""
+    if options.threads is not None:
+        torch.set_num_threads(max(1, options.threads))
+    rasterizers = _rasterizers(options.rasterizer)
+    runs: list[Figures] = []
+    for scene, camera in _work(options):
+        for rasterizer in rasterizers:
+            run = measure(scene, camera, rasterizer, options.repeats, not options.forward_only)
+            say(
+                f"{run.gaussians:,} Gaussians, {run.width}x{run.height}, {run.rasterizer}: {run.forward_ms:.0f} ms"
+            )
+            runs.append(run)
+    exponents = _exponents(runs)
+    if options.json:
+        several = {"runs": [run.as_json() for run in runs], "exponents": exponents}
+        print_json(runs[0].as_json() if len(runs) == 1 else several)
+        return 0
+    out.print(_table(runs))
+    out.print(_stages(runs))
+    for name, value in exponents.items():
+        out.print(f"time grows as {name}^{value:.2f}")
+    return 0
+
+
+def _rasterizers(name: str) -> list[Tiled]:
+    if name == "eager":
+        return [Tiled()]
+    if name == "compiled":
+        chosen = choose(name, 1, say)
+        assert isinstance(chosen, Tiled)
+        return [chosen]
+    compiled = load()
+    if compiled is None:
+        say("rasterizer: eager alone; `aaplug warmup` compiles the fast one")
+    return [*([Tiled(compiled)] if compiled else []), Tiled()]
+
+
+def _work(options: Bench) -> list[tuple[Gaussians, Camera]]:
+    if options.repeats < 1:
+        raise UsageError("--repeats", f"must be 1 or more, got {options.repeats}")
+    if options.scene.scene is not None or options.scene.model_path is not None:
+        scene = options.scene.read()
+        return [(scene, options.cameras.read(options.scene).train[0])]
+    sizes = [re.fullmatch(r"(\d+)x(\d+)", text) for text in options.resolution]
+    if not all(sizes) or min(options.gaussians, default=0) < 1:
+        raise UsageError("bench", "--gaussians takes numbers, --resolution sizes such as 800x800")
+    cameras = [synthetic_camera(int(size[1]), int(size[2])) for size in sizes if size]
+    scenes = [synthetic_scene(n) for n in options.gaussians]
+    return [(scene, camera) for scene in scenes for camera in cameras]
+
+
+def _exponents(runs: list[Figures]) -> dict[str, float]:
+    """How forward time grows with Gaussians at one size, and with pixels for one scene."""
+    found: dict[str, float] = {}
+    for name in dict.fromkeys(run.rasterizer for run in runs):
+        own = [run for run in runs if run.rasterizer == name]
+        first = own[0]
+        same_size = [r for r in own if (r.width, r.height) == (first.width, first.height)]
+        same_scene = [r for r in own if r.gaussians == first.gaussians]
+        if len(same_size) > 1:
+            counts = [float(r.gaussians) for r in same_size]
+            found[f"{name}: Gaussians"] = exponent(counts, [r.forward_ms for r in same_size])
+        if len(same_scene) > 1:
+            pixels = [float(r.width * r.height) for r in same_scene]
+            found[f"{name}: pixels"] = exponent(pixels, [r.forward_ms for r in same_scene])
+    return found
+
+
+def _table(runs: list[Figures]) -> Table:
+    table = Table(
+        title=f"medians; matmul is a 2048³ float32 product, {torch.get_num_threads()} threads"
+    )
+    names = (
+        "Gaussians",
+        "size",
+        "rasterizer",
+        "forward",
+        "+ backward",
+        "/ matmul",
+        "Mpairs",
+        "ns/pair",
+        "peak",
+    )
+    for name in names:
+        table.add_column(name, justify="left" if name == "rasterizer" else "right")
+    for run in runs:
+        both = "" if run.forward_backward_ms is None else f"{run.forward_backward_ms:.0f} ms"
+        table.add_row(
+            f"{run.gaussians:,}",
+            f"{run.width}x{run.height}",
+            run.rasterizer,
+            f"{run.forward_ms:.0f} ms",
+            both,
+            f"{run.share:.2f}",
+            f"{run.pairs / 1e6:.0f}",
+            f"{run.ns_per_pair:.2f}",
+            f"{run.peak_bytes / 1e9:.1f} GB",
+        )
+    return table
+
+
+def _stages(runs: list[Figures]) -> Table:
+    table = Table(title="stages, ms")
+    names = list(runs[0].stages_ms)
+    for name in ("Gaussians", "size", "rasterizer", *names):
+        table.add_column(name, justify="left" if name == "rasterizer" else "right")
+    for run in runs:
+        size = f"{run.width}x{run.height}"
+        stages = [f"{run.stages_ms[name]:.1f}" for name in names]
+        table.add_row(f"{run.gaussians:,}", size, run.rasterizer, *stages)
+    return table
