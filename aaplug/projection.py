@@ -59,8 +59,10 @@ def shade(splats: Splats2D, scene: Gaussians, camera: Camera, kernels: Kernels =
 def sh_colour(sh: Float[Tensor, "m k 3"], directions: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:
     """Colour of real spherical harmonics of degree 0 to 3 in unit directions from the camera, not clamped."""
     colour = torch.full_like(directions, COLOUR_OFFSET)
-    for k, basis in enumerate(_sh_basis(directions, sh.shape[1])):
-        colour = colour + basis[:, None] * sh[:, k]
+    for basis, coefficients in zip(
+        _sh_basis(directions, sh.shape[1]), sh.unbind(dim=1), strict=True
+    ):
+        colour = colour + basis[:, None] * coefficients
     return colour
 
 
@@ -70,9 +72,9 @@ def _shade(
     sources: Int[Tensor, " m"],
     centre: Float[Tensor, " 3"],
 ) -> tuple[Tensor]:
-    offset = (means[sources].double() - centre).to(means)
+    offset = (means.index_select(0, sources).double() - centre).to(means)
     directions = offset / offset.square().sum(dim=1, keepdim=True).sqrt()
-    return (sh_colour(sh[sources], directions).clamp(min=0.0),)
+    return (sh_colour(sh.index_select(0, sources), directions).clamp(min=0.0),)
 
 
 def _camera_rows(

@@ -408,14 +408,14 @@ def _backward(
             COMPOSITE_BACKWARD,
             drawing,
             part.splats,
-            bins.origins[tiles],
+            bins.origins.index_select(0, tiles),
             part.before,
-            rest[tiles],
-            *(column[tiles] for column in columns),
+            rest.index_select(0, tiles),
+            *(column.index_select(0, tiles) for column in columns),
             *local,
             drawing.new_ones(len(tiles)),
         )
-        rest[tiles] = left
+        rest.index_copy_(0, tiles, left)
         moments = torch.stack(sums, dim=-1).view(-1, COLUMNS)
         owners = part.splats.flatten()
         total.scatter_add_(0, owners[:, None].expand(-1, COLUMNS), moments)
