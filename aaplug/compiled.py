@@ -14,7 +14,6 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import platformdirs
 import torch
@@ -23,7 +22,7 @@ from aaplug import kernels as kernels_module
 from aaplug import projection, splats
 from aaplug.errors import UsageError, listing
 from aaplug.interfaces import Rasterizer
-from aaplug.kernels import CompiledKernels, Kernel
+from aaplug.kernels import CompiledKernels, Kernel, Package
 from aaplug.rasterizers import RASTERIZERS, Tiled, tiled
 
 KERNELS: tuple[Kernel, ...] = (
@@ -127,7 +126,7 @@ def _path(kernel: Kernel) -> Path:
     return cache_folder() / f"{kernel.name}.pt2"
 
 
-def _load(kernel: Kernel) -> Any | None:
+def _load(kernel: Kernel) -> Package | None:
     """A package that gives the eager answer, or nothing."""
     path = _path(kernel)
     if not path.is_file():
@@ -141,7 +140,7 @@ def _load(kernel: Kernel) -> Any | None:
         close = all(
             torch.allclose(a.double(), b.double(), TOLERANCE, TOLERANCE) for a, b in answers
         )
-        return package if close else None
+        return Package(package, tuple(arg.dtype for arg in args)) if close else None
     except Exception:  # a broken package can fail in any way; it is built anew
         return None
 

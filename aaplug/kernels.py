@@ -6,7 +6,6 @@ use; `aaplug.compiled` turns the same source into one fused loop ahead of time. 
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -40,28 +39,37 @@ class Kernels:
         return kernel.function(*args)
 
 
+@dataclass(frozen=True)
+class Package:
+    """A kernel compiled for arguments of these types on a CPU."""
+
+    run: Callable[..., list[Tensor]]
+    dtypes: tuple[torch.dtype, ...]
+
+    def takes(self, args: tuple[Tensor, ...]) -> bool:
+        """Whether it can run these: no gradients, and no sizes of one, which are a case of their own to compilers."""
+        tracked = torch.is_grad_enabled() and any(arg.requires_grad for arg in args)
+        return not tracked and all(
+            arg.dtype == dtype and arg.device.type == "cpu" and len(arg) > 1
+            for arg, dtype in zip(args, self.dtypes, strict=True)
+        )
+
+
 class CompiledKernels(Kernels):
-    """Runs what was compiled for float32 on a CPU, and everything else eagerly: gradients, precisions, devices."""
+    """Runs what was compiled where it can, and everything else eagerly: gradients, precisions, devices."""
 
     name = "compiled"
     tiles = 2048
 
-    def __init__(self, packages: dict[str, Any]):
+    def __init__(self, packages: dict[str, Package]):
         self._packages = packages
 
     def run(self, kernel: Kernel, *args: Tensor) -> tuple[Tensor, ...]:
         """Run one stage."""
         package = self._packages.get(kernel.name)
-        if package is None or not all(_fits(arg) for arg in args):
+        if package is None or not package.takes(args):
             return super().run(kernel, *args)
-        return tuple(package(*(arg.detach().contiguous() for arg in args)))
-
-
-def _fits(arg: Tensor) -> bool:
-    """Whether compiled code takes it: one element is a size of its own to the compiler."""
-    tracked = arg.requires_grad and torch.is_grad_enabled()
-    plain = arg.device.type == "cpu" and arg.dtype not in (torch.float16, torch.bfloat16)
-    return plain and not tracked and len(arg) > 1
+        return tuple(package.run(*(arg.detach().contiguous() for arg in args)))
 
 
 EAGER = Kernels()

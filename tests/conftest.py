@@ -10,17 +10,25 @@ from pathlib import Path
 import pytest
 import torch
 
+from aaplug import compiled
 from aaplug.cameras import Camera, CameraSet, look_at
 from aaplug.gaussians import Gaussians
-from aaplug.interfaces import Training
+from aaplug.interfaces import Rasterizer, Training
 from aaplug.io.cameras import read_cameras
 from aaplug.io.scenes import read_scene
 from aaplug.pipeline import learn
+from aaplug.rasterizers import RASTERIZERS, Tiled
 from aaplug.splats import Splats2D
 
 torch.set_num_threads(
     1
 )  # test processes run side by side, and threads that wait for each other would stall them all
+
+COMPILED = compiled.load()
+ALL_RASTERIZERS: dict[str, Rasterizer] = {
+    **RASTERIZERS,
+    **({} if COMPILED is None else {"compiled": Tiled(COMPILED)}),
+}
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 SAMPLE = Path(str(files("aaplug.sample")))

@@ -13,9 +13,9 @@ import pytest
 import torch
 
 from aaplug.interfaces import Rasterizer
-from aaplug.rasterizers import RASTERIZERS, Tiled, reference, tiled
+from aaplug.rasterizers import Tiled, reference, tiled
 from aaplug.splats import Splats2D
-from tests.conftest import make_splats
+from tests.conftest import ALL_RASTERIZERS, make_splats
 
 F64 = torch.float64
 BLACK, WHITE, SKY = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (0.25, 0.5, 1.0)
@@ -26,7 +26,7 @@ UNIT = (4.0, 0.0, 4.0)
 TILED = Tiled()
 
 
-@pytest.fixture(params=RASTERIZERS.values(), ids=RASTERIZERS)
+@pytest.fixture(params=ALL_RASTERIZERS.values(), ids=ALL_RASTERIZERS)
 def rasterize(request: pytest.FixtureRequest) -> Rasterizer:
     return request.param
 
@@ -310,7 +310,7 @@ def test_hardly_a_pixel_flips_at_a_cut_off():
 def test_a_needle_rounded_to_float32_looks_as_it_did_before():
     hw = (64, 64)
     exact = needles(60, hw, 0, 200.0, 0.6)
-    for name, rasterize in RASTERIZERS.items():
+    for name, rasterize in ALL_RASTERIZERS.items():
         image = rasterize(exact.to(torch.float32), hw, WHITE)
         difference = (image.rgb - reference.rasterize(exact, hw, WHITE).rgb).abs().amax(dim=2)
         worst = difference[~near_a_cut_off(exact, hw)].max().item()

@@ -59,11 +59,12 @@ class Matched:
         if self.rate == "global":
             return view
         seen = training.bounds.seen[splats.sources]
-        highest = training.bounds.highest[splats.sources].to(splats.depths)
+        # where no camera saw a Gaussian any number but 0 will do: it is not chosen, and divides no gradient by 0
+        highest = training.bounds.highest[splats.sources].to(splats.depths).where(seen, 1.0)
         now = camera.focal / splats.depths
         if self.rate == "sharpest":
             return torch.where(seen, now / highest, view)
-        lowest = training.bounds.lowest[splats.sources].to(splats.depths)
+        lowest = training.bounds.lowest[splats.sources].to(splats.depths).where(seen, 1.0)
         if camera.trained_focal is not None:
             own = camera.trained_focal / splats.depths
             lowest, highest = torch.minimum(lowest, own), torch.maximum(highest, own)

@@ -7,9 +7,8 @@ import pytest
 import torch
 
 from aaplug.interfaces import Rasterizer
-from aaplug.rasterizers import RASTERIZERS
 from aaplug.splats import Render, Splats2D
-from tests.conftest import make_splats
+from tests.conftest import ALL_RASTERIZERS, make_splats
 
 HW = (29, 43)
 SKY = (0.25, 0.5, 1.0)
@@ -17,7 +16,7 @@ NAMES = ("means", "covs", "dets", "depths", "opacities", "sources", "rgb")
 SAME = 1e-6  # adding nothing may change the order of a sum, no more
 
 
-@pytest.fixture(params=RASTERIZERS.values(), ids=RASTERIZERS)
+@pytest.fixture(params=ALL_RASTERIZERS.values(), ids=ALL_RASTERIZERS)
 def rasterize(request: pytest.FixtureRequest) -> Rasterizer:
     return request.param
 

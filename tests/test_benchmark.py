@@ -1,0 +1,91 @@
+"""The benchmark: figures that are measured, scenes that are what they say."""
+
+import json
+
+import pytest
+import torch
+from aaplug_cli.main import main
+
+from aaplug.benchmark import exponent, measure, synthetic_camera, synthetic_scene
+from aaplug.pipeline import learn, render
+from aaplug.projection import rotation_matrices
+from aaplug.rasterizers import Tiled
+from aaplug.recipes import RECIPES
+from aaplug.splats import MIN_ALPHA
+
+STAGES = ["project", "filter", "cull", "shade", "bin", "forms", "composite"]
+
+
+def test_figures_of_a_small_scene():
+    run = measure(synthetic_scene(500), synthetic_camera(40, 24), Tiled(), repeats=1)
+    assert run.rasterizer == "eager"
+    assert (run.gaussians, run.width, run.height) == (500, 40, 24)
+    assert list(run.stages_ms) == STAGES
+    assert min(run.stages_ms.values()) > 0
+    assert run.forward_ms > 0
+    assert run.forward_backward_ms > run.forward_ms
+    assert run.pairs % 64 == 0
+    assert run.tile_pairs > 0
+    assert run.ns_per_pair == pytest.approx(run.stages_ms["composite"] * 1e6 / run.pairs)
+    assert run.peak_bytes > 1e7
+    assert run.share == run.forward_ms / run.matmul_ms
+
+
+def test_synthetic_scenes_cover_the_image_alike_at_every_size():
+    camera = synthetic_camera(96, 96)
+    alphas = []
+    for n in (3000, 30000):
+        scene = synthetic_scene(n)
+        assert len(scene) == n
+        assert scene.means.isfinite().all()
+        alphas.append(
+            render(scene, camera, RECIPES["classic"], learn(scene, [camera])).alpha.mean().item()
+        )
+    assert min(alphas) > 0.8
+    assert alphas[0] == pytest.approx(alphas[1], abs=0.1)
+
+
+def test_synthetic_gaussians_lie_flat_on_the_ground():
+    scene = synthetic_scene(1000)
+    ground = scene.means[:, 2] == -1.25
+    assert ground.sum() == 270
+    normals = rotation_matrices(scene.unit_quats)[ground][:, :, 2]
+    torch.testing.assert_close(normals, torch.tensor([0.0, 0.0, 1.0]).expand(270, 3))
+    assert (scene.opacities > MIN_ALPHA).all()
+
+
+@pytest.mark.parametrize("power", [0.5, 1.0, 2.0])
+def test_the_exponent_of_a_power_is_found(power):
+    sizes = [10.0, 100.0, 1000.0]
+    assert exponent(sizes, [3 * size**power for size in sizes]) == pytest.approx(power)
+
+
+def run_bench(capsys, *words: str):
+    with pytest.raises(SystemExit) as end:
+        main(["bench", "--rasterizer", "eager", "--repeats", "1", "--resolution", "40x24", *words])
+    return end.value.code, capsys.readouterr()
+
+
+def test_one_run_is_one_object(capsys):
+    code, said = run_bench(capsys, "--gaussians", "300", "--json")
+    figures = json.loads(said.out)
+    assert code == 0
+    names = "rasterizer forward_ms forward_backward_ms pairs ns_per_pair stages_ms peak_bytes"
+    assert set(names.split()) <= set(figures)
+    assert figures["gaussians"] == 300
+
+
+def test_several_runs_are_a_table_with_exponents(capsys):
+    code, said = run_bench(capsys, "--gaussians", "300", "600", "--forward-only")
+    assert code == 0
+    assert "300" in said.out
+    assert "time grows as eager: Gaussians^" in said.out
+
+
+@pytest.mark.parametrize(
+    "words", [("--gaussians", "0"), ("--resolution", "big"), ("--repeats", "0")]
+)
+def test_bad_sizes_are_refused(capsys, words):
+    code, said = run_bench(capsys, *words)
+    assert code == 2
+    assert "error" in said.err

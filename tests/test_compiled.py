@@ -1,0 +1,129 @@
+"""Kernels compiled ahead of time: the same answers, and a cache that nothing can break."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from aaplug import compiled, kernels
+from aaplug.errors import UsageError
+from aaplug.kernels import EAGER, CompiledKernels, Kernel, Package
+from aaplug.pipeline import learn, render
+from aaplug.rasterizers import RASTERIZERS, Tiled, reference
+from aaplug.recipes import RECIPES
+from tests.conftest import make_camera, make_scene
+
+ANSWER = 1e-5
+
+
+@pytest.fixture
+def built() -> CompiledKernels:
+    found = compiled.load()
+    if found is None:
+        pytest.skip("the kernels are not compiled here (aaplug warmup)")
+    return found
+
+
+@pytest.fixture
+def empty_cache(tmp_path, monkeypatch):
+    monkeypatch.setattr(compiled.platformdirs, "user_cache_dir", lambda *_, **__: str(tmp_path))
+    return tmp_path
+
+
+@pytest.mark.parametrize("kernel", compiled.KERNELS, ids=lambda kernel: kernel.name)
+def test_compiled_kernels_give_the_eager_answer(built, kernel: Kernel):
+    args = kernel.example()
+    for fast, slow in zip(built.run(kernel, *args), EAGER.run(kernel, *args), strict=True):
+        assert fast.dtype == slow.dtype
+        torch.testing.assert_close(fast.double(), slow.double(), rtol=ANSWER, atol=ANSWER)
+
+
+@pytest.mark.parametrize("recipe", RECIPES)
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_compiled_images_are_the_eager_ones(built, recipe, degree):
+    scene, camera = make_scene(400, degree=degree), make_camera(size=(150, 110))
+    training, view = learn(scene, [camera]), camera.scaled(0.6)
+    fast, eager = (
+        render(scene, view, RECIPES[recipe], training, rasterizer)
+        for rasterizer in (Tiled(built), RASTERIZERS["eager"])
+    )
+    difference = (fast.rgb - eager.rgb).abs().amax(dim=2)
+    assert (difference > ANSWER).double().mean() < 1e-3, "more than flips at a cut-off"
+    assert difference.max() < 0.02
+
+
+def test_compiled_kernels_leave_gradients_and_other_precisions_to_the_eager_ones(built):
+    scene = make_scene(100, dtype=torch.float64)
+    camera = make_camera()
+    training = learn(scene, [camera])
+    exact = render(scene, camera, RECIPES["classic"], training, Tiled(built)).rgb
+    assert exact.dtype == torch.float64
+    eager = render(scene, camera, RECIPES["classic"], training).rgb
+    assert exact.equal(eager)
+    means = scene.means.clone().requires_grad_()
+    image = render(replace(scene, means=means), camera, RECIPES["classic"], training, Tiled(built))
+    image.rgb.sum().backward()
+    assert means.grad is not None
+    assert means.grad.abs().sum() > 0
+
+
+def test_an_empty_cache_gives_nothing(empty_cache):
+    assert compiled.load() is None
+
+
+def test_a_broken_package_gives_nothing_and_does_not_raise(built, empty_cache):
+    folder = compiled.cache_folder()
+    folder.mkdir(parents=True)
+    for kernel in compiled.KERNELS:
+        (folder / f"{kernel.name}.pt2").write_bytes(b"not a package")
+    assert compiled.load() is None
+
+
+def test_another_source_is_another_folder(monkeypatch):
+    before = compiled.cache_folder()
+    assert compiled.cache_folder() == before
+    monkeypatch.setattr(compiled, "OPTIONS", {"max_fusion_size": 1})
+    assert compiled.cache_folder() != before
+
+
+@pytest.mark.parametrize("compiler", [True, False])
+def test_without_packages_auto_runs_eagerly_and_says_why(empty_cache, monkeypatch, compiler):
+    monkeypatch.setattr(compiled, "has_compiler", lambda: compiler)
+    said: list[str] = []
+    assert compiled.choose("auto", 1, said.append) is RASTERIZERS["eager"]
+    assert len(said) == 1
+    assert ("warmup" if compiler else "no C++ compiler") in said[0]
+
+
+def test_many_frames_build_what_is_missing(empty_cache, monkeypatch):
+    made = CompiledKernels({})
+    monkeypatch.setattr(compiled, "has_compiler", lambda: True)
+    monkeypatch.setattr(compiled, "build", lambda: made)
+    chosen = compiled.choose("auto", compiled.FRAMES_THAT_PAY, lambda text: None)
+    assert isinstance(chosen, Tiled)
+    assert chosen.kernels is made
+
+
+def test_without_a_compiler_a_build_is_refused_in_words(empty_cache, monkeypatch):
+    monkeypatch.setattr(compiled, "has_compiler", lambda: False)
+    with pytest.raises(UsageError, match=r"warmup: needs a C\+\+ compiler"):
+        compiled.build()
+
+
+def test_an_unknown_name_lists_the_known_ones():
+    with pytest.raises(UsageError, match="'fast' is not one of auto, compiled, eager, reference"):
+        compiled.choose("fast", 1, lambda text: None)
+
+
+def test_one_row_is_left_to_the_eager_function():
+    ran = CompiledKernels({"double": Package(lambda x: [3 * x], (torch.float32,))})
+    double = Kernel("double", lambda x: (2 * x,), lambda: (torch.ones(4),), ("n",))
+    assert ran.run(double, torch.ones(1))[0].item() == 2
+    assert ran.run(double, torch.ones(2))[0].tolist() == [3, 3]
+    assert ran.run(double, torch.ones(2).double())[0].tolist() == [2, 2]
+    assert kernels.EAGER.run(double, torch.ones(2))[0].tolist() == [2, 2]
+
+
+def test_the_judge_runs_no_compiled_stage():
+    assert RASTERIZERS["reference"].kernels is EAGER
+    assert reference.Reference().kernels is EAGER

@@ -1,0 +1,119 @@
+"""Gradients of the whole way from a scene and a pose to an image, against finite differences and the judge."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from aaplug import compiled
+from aaplug.cameras import Camera
+from aaplug.filters import SCREEN_FILTERS, WORLD_FILTERS
+from aaplug.gaussians import Gaussians
+from aaplug.pipeline import learn, render, smooth
+from aaplug.rasterizers import RASTERIZERS, Reference, Tiled
+from aaplug.recipes import RECIPES, Recipe
+from tests.conftest import make_camera, make_scene, make_splats
+
+F64 = torch.float64
+STEP = 1e-6
+RELATIVE = 1e-5
+SCENE = make_scene(25, seed=4, dtype=F64)
+CAMERA = make_camera((0.5, -3.5, 0.4), size=(28, 20))
+# a free pose: at a training pose the interval of rates has its end right at the view, and a kink there
+VIEW = replace(make_camera((0.7, -3.4, 0.2), size=(28, 20)), trained_focal=None).scaled(0.75)
+TRAINING = learn(SCENE, [CAMERA, make_camera((2.0, -3.0, 1.0), size=(28, 20))])
+NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh", "pose")
+MATCHED = {f"recipe {name}": recipe for name, recipe in RECIPES.items()}
+SCREENS = {
+    f"screen {name}": Recipe(name, screen, "", "") for name, screen in SCREEN_FILTERS.items()
+}
+WORLDS = {
+    f"world {name}": Recipe(name, SCREEN_FILTERS["mip"], "", "", world=world)
+    for name, world in WORLD_FILTERS.items()
+}
+SAMPLED = {"samples": replace(RECIPES["matched"], samples=1.0)}
+RECIPES_HERE = MATCHED | SCREENS | WORLDS | SAMPLED
+
+
+def leaves() -> dict[str, Tensor]:
+    values = {name: getattr(SCENE, name) for name in NAMES[:-1]} | {"pose": VIEW.cam_from_world}
+    return {name: value.clone().requires_grad_() for name, value in values.items()}
+
+
+def loss(recipe: Recipe, values: dict[str, Tensor], rasterizer=RASTERIZERS["eager"]) -> Tensor:
+    """A weighted sum of the image and of its alpha."""
+    scene: Gaussians = replace(SCENE, **{n: v for n, v in values.items() if n != "pose"})
+    view: Camera = replace(VIEW, cam_from_world=values["pose"])
+    image = render(
+        smooth(scene, TRAINING, recipe), view, recipe, TRAINING, rasterizer, (0.1, 0.5, 0.9)
+    )
+    weights = torch.rand(*view.hw, 4, generator=torch.Generator().manual_seed(1), dtype=F64)
+    return (torch.cat([image.rgb, image.alpha[..., None]], dim=2) * weights.to(image.rgb)).sum()
+
+
+def direction(name: str, like: Tensor) -> Tensor:
+    """A random direction; of a pose, one that turns and moves it."""
+    g = torch.Generator().manual_seed(NAMES.index(name))
+    if name != "pose":
+        return torch.randn(like.shape, generator=g, dtype=F64)
+    turn = torch.randn(3, 3, generator=g, dtype=F64)
+    twist = torch.zeros(4, 4, dtype=F64)
+    twist[:3, :3], twist[:3, 3] = turn - turn.T, torch.randn(3, generator=g, dtype=F64)
+    return twist @ like
+
+
+@pytest.mark.parametrize("recipe", RECIPES_HERE)
+def test_gradients_are_finite_differences(recipe):
+    chosen, values = RECIPES_HERE[recipe], leaves()
+    grads = torch.autograd.grad(loss(chosen, values), list(values.values()))
+    for (name, value), grad in zip(values.items(), grads, strict=True):
+        way = direction(name, value.detach())
+        ends = [
+            loss(chosen, values | {name: value.detach() + sign * STEP * way}).item()
+            for sign in (1, -1)
+        ]
+        slope = (ends[0] - ends[1]) / (2 * STEP)
+        assert (grad * way).sum().item() == pytest.approx(slope, rel=RELATIVE, abs=1e-6), name
+        assert abs(slope) > 1e-3, f"{name} does not matter here"
+
+
+@pytest.mark.parametrize("recipe", RECIPES_HERE)
+def test_gradients_are_those_of_the_judge(recipe):
+    chosen, values = RECIPES_HERE[recipe], leaves()
+    fast = torch.autograd.grad(loss(chosen, values), list(values.values()))
+    judge = torch.autograd.grad(loss(chosen, values, Reference()), list(values.values()))
+    for a, b in zip(fast, judge, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-9)
+
+
+def test_stacked_capped_and_faint_splats_have_the_judges_gradients():
+    hw = (17, 26)
+    splats = make_splats(400, hw, seed=2).to(F64)
+    splats = replace(splats, opacities=splats.opacities.sqrt())
+    names = ("means", "covs", "dets", "opacities", "rgb")
+    found = []
+    for rasterizer in (Tiled(), Reference()):
+        values = {name: getattr(splats, name).clone().requires_grad_() for name in names}
+        image = rasterizer(replace(splats, **values), hw, (0.0, 0.0, 0.0))
+        found.append(
+            torch.autograd.grad(image.rgb.square().sum() + image.alpha.sum(), list(values.values()))
+        )
+    for a, b in zip(*found, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-9)
+
+
+def test_compiled_gradients_are_the_eager_ones():
+    kernels = compiled.load()
+    if kernels is None:
+        pytest.skip("the kernels are not compiled here (aaplug warmup)")
+    hw = (90, 120)
+    splats = make_splats(3000, hw, seed=5)
+    names = ("means", "covs", "dets", "opacities", "rgb")
+    found = []
+    for rasterizer in (Tiled(kernels), Tiled()):
+        values = {name: getattr(splats, name).clone().requires_grad_() for name in names}
+        image = rasterizer(replace(splats, **values), hw, (0.0, 0.0, 0.0))
+        found.append(torch.autograd.grad(image.rgb.square().sum(), list(values.values())))
+    for fast, eager in zip(*found, strict=True):
+        assert (fast - eager).norm() < 1e-4 * eager.norm()
