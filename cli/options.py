@@ -5,7 +5,7 @@ Each class is a group of flags; its methods read what the flags name and say on 
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -21,6 +21,8 @@ from aaplug.interfaces import Rasterizer, Training
 from aaplug.io.cameras import read_cameras, select_views
 from aaplug.io.scenes import find_scene, read_scene
 from aaplug.pipeline import learn
+from aaplug.rasterizers import Tiled
+from aaplug.rasterizers.tiled import MEMORY
 from aaplug.recipes import SAMPLING
 from aaplug.sampling import MIN_SEEN_SHARE, check_frame
 
@@ -136,6 +138,9 @@ class RenderOptions:
     threads: Annotated[int | None, flag("N")] = None
     """Processor threads (default: all)."""
 
+    memory: Annotated[float, flag("GB")] = MEMORY / 1e9
+    """Memory of a frame beside the scene and the image."""
+
     def select(self, cameras: CameraSet) -> Sequence[Camera]:
         """The views that --views names."""
         return select_views(cameras, self.views)
@@ -156,4 +161,8 @@ class RenderOptions:
             if self.threads < 1:
                 raise UsageError("--threads", f"must be 1 or more, got {self.threads}")
             torch.set_num_threads(self.threads)
-        return choose(self.rasterizer, frames, say)
+        if not self.memory > 0:
+            raise UsageError("--memory", f"must be above 0, got {self.memory:g}")
+        chosen = choose(self.rasterizer, frames, say)
+        tiled = isinstance(chosen, Tiled)
+        return replace(chosen, memory=self.memory * 1e9) if tiled else chosen

@@ -11,7 +11,7 @@ t: tiles of TILE × TILE px; p: pairs of a splat and a tile; K: splats a pass; P
 The backward pass is a forward sweep too: with S = Σ g·w·c of a pixel, known from the image, the rest R = S − Σ_{j≤k}
 g·w·c gives ∂L/∂alpha_k = T_k g·c_k − R/(1 − alpha_k), so that T at each pass's start is all that is kept.
 
-Bands of tile rows bound the memory: a band's candidate pairs are at most about PAIR_BUDGET.
+Bands of tile rows bound the memory: as many as the budget has room for candidate pairs.
 """
 
 import math
@@ -33,7 +33,8 @@ TILE = 8  # px
 PASS = 8  # splats composited in one pass: more compile slowly, fewer load and store more
 CHECK_EVERY = 2  # passes between looks at which tiles are saturated
 COMPACT_BELOW = 7 / 8  # share of tiles still going at which the others leave
-PAIR_BUDGET = 8_000_000  # candidate pairs expanded at once; each takes about 40 bytes
+MEMORY = 1e9  # bytes
+PAIR_BYTES = 64  # of a candidate pair while a band is binned, measured
 HALF_LOG2_E = 0.5 * log2(torch.e)
 LN_2 = math.log(2)
 LOG2_SILENT = (
@@ -58,10 +59,11 @@ LOW_X = 6  # where a box of tiles begins in a row of the table
 class Tiled:
     """Draws in tiles, in the splats' precision; differentiable.
 
-    kernels: how the elementwise stages run.
+    kernels: how the elementwise stages run.  memory: bytes that binning may take beside the scene and the image.
     """
 
     kernels: Kernels = EAGER
+    memory: float = MEMORY
 
     def __call__(
         self, splats: Splats2D, hw: tuple[int, int], background: tuple[float, float, float]
@@ -69,15 +71,19 @@ class Tiled:
         """Draw the splats."""
         grid = (-(-hw[0] // TILE), -(-hw[1] // TILE))
         drawing = drawing_of(splats, self.kernels)
-        image = torch.cat(
-            [
-                composite(drawing, bins, self.kernels).unflatten(0, (-1, grid[1]))
-                for bins in bands(splats, grid, self.kernels)
-            ]
-        )
-        image = image.unflatten(2, (TILE, TILE)).transpose(1, 2)
-        image = image.reshape(grid[0] * TILE, grid[1] * TILE, 4)[: hw[0], : hw[1]]
-        return over(image[..., :3], image[..., 3], background)
+        rgb, alpha = [], []
+        for bins in bands(splats, grid, self.kernels, self.memory):
+            image = _untiled(composite(drawing, bins, self.kernels), grid[1])[:, : hw[1]]
+            part = over(image[..., :3], image[..., 3], background)
+            rgb.append(part.rgb)
+            alpha.append(part.alpha)
+        return Render(torch.cat(rgb)[: hw[0]], torch.cat(alpha)[: hw[0]])
+
+
+def _untiled(tiles: Float[Tensor, "t P 4"], columns: int) -> Float[Tensor, "h w 4"]:
+    """Tiles of whole rows put in their places."""
+    image = tiles.unflatten(0, (-1, columns)).unflatten(2, (TILE, TILE)).transpose(1, 2)
+    return image.reshape(-1, columns * TILE, 4)
 
 
 @dataclass(frozen=True)
@@ -120,11 +126,13 @@ def _drawing_rows(
 
 
 @torch.no_grad()
-def bands(splats: Splats2D, grid: tuple[int, int], kernels: Kernels) -> Iterator[Bins]:
+def bands(
+    splats: Splats2D, grid: tuple[int, int], kernels: Kernels, memory: float = MEMORY
+) -> Iterator[Bins]:
     """Bins of bands of tile rows, from the top."""
     order = _depth_order(splats.depths)
     table = _table(splats, grid, kernels).index_select(0, order)
-    for rows in _rows(table, grid[0]):
+    for rows in _rows(table, grid[0], max(1, int(memory / PAIR_BYTES))):
         yield _bin(table, order, rows, grid[1], kernels)
 
 
@@ -164,13 +172,13 @@ def _table_rows(
     return (torch.stack([*means.unbind(dim=1), *conic, reached, *lows, *highs], dim=1),)
 
 
-def _rows(table: Float[Tensor, "m 10"], rows: int) -> list[tuple[int, int]]:
-    """Cut the grid into runs of tile rows of at most about PAIR_BUDGET candidate pairs, at least a row each."""
+def _rows(table: Float[Tensor, "m 10"], rows: int, budget: int) -> list[tuple[int, int]]:
+    """Cut the grid into runs of tile rows of about `budget` candidate pairs, at least a row each."""
     left, top, right, bottom = table[:, LOW_X:].long().unbind(dim=1)
     change = top.new_zeros(rows + 1)
     change.index_add_(0, top, right - left).index_add_(0, bottom, left - right)
     ends = change.cumsum(0).cumsum(0)[:rows]  # candidates down to each row
-    marks = ends.new_tensor(range(PAIR_BUDGET, int(ends[-1]), PAIR_BUDGET))
+    marks = ends.new_tensor(range(budget, int(ends[-1]), budget))
     cuts = [0, *(torch.searchsorted(ends, marks) + 1).tolist(), rows]
     return [(a, b) for a, b in pairwise(dict.fromkeys(cuts)) if b > a]
 
