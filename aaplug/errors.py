@@ -16,6 +16,10 @@ class AaplugError(Exception):
         self.problem = problem
         super().__init__(f"{self.where}: {problem}")
 
+    def __reduce__(self) -> tuple[type["AaplugError"], tuple[str, str]]:
+        """As the parts it was made of, so that it can come back from another process."""
+        return type(self), (self.where, self.problem)
+
 
 class FormatError(AaplugError):
     """A file is not what its format promises."""

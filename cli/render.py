@@ -11,10 +11,9 @@ import tyro
 
 from aaplug.cameras import Camera
 from aaplug.errors import OutputError, UsageError, listing
+from aaplug.frames import Frames, write_frames
 from aaplug.interfaces import Training
 from aaplug.io.atomic import check_output
-from aaplug.io.images import write_png
-from aaplug.pipeline import render as render_view
 from aaplug.pipeline import smooth
 from aaplug.recipes import RECIPES, Recipe, find_recipe
 
@@ -65,13 +64,10 @@ def render(options: Render) -> int:
     rasterizer = options.rendering.rasterize(len(views))
     if not options.output.suffix:
         make_folder(options.output)
+    depth, overwrite = options.bit_depth, options.overwrite
+    frames = Frames(scene, training, recipe, background, views, paths, depth, overwrite)
     with progress("rendering", "views") as tell:
-        for done, (view, path) in enumerate(zip(views, paths, strict=True)):
-            tell(done, len(views))
-            with torch.no_grad():
-                image = render_view(scene, view, recipe, training, rasterizer, background)
-            write_png(path, image.rgb.float(), options.bit_depth, options.overwrite)
-        tell(len(views), len(views))
+        write_frames(frames, rasterizer, torch.get_num_threads(), tell)
     if options.json:
         images = [
             {"view": v.name, "file": str(p), "width": v.width, "height": v.height}
