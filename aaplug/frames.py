@@ -6,6 +6,7 @@ wait for each other; Python threads gained nothing.  An image does not depend on
 
 import multiprocessing
 import tempfile
+import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -24,7 +25,7 @@ from aaplug.pipeline import render
 from aaplug.rasterizers import Tiled
 from aaplug.recipes import Recipe
 
-FRAMES_A_PROCESS = 40  # a process starts in about two seconds, and saves 25 to 200 ms a frame
+PAYS_AFTER = 20.0  # seconds of work left: two processes take five to start, and save two fifths
 
 
 @dataclass(frozen=True)
@@ -46,21 +47,26 @@ def write_frames(
     rasterizer: Rasterizer,
     threads: int,
     progress: Callable[[int, int], None] = lambda done, total: None,
-    frames_a_process: int = FRAMES_A_PROCESS,
+    pays_after: float = PAYS_AFTER,
 ) -> None:
     """Render every view to its file, in order, on `threads` threads in all.
 
-    progress: told (views done, views in all).  frames_a_process: the fewest that a process is started for.
+    progress: told (views done, views in all).  pays_after: seconds of work left, by the
+    first frame's time, for which processes are started.
 
     Raises:
         OutputError: an image cannot be written.
         UsageError: a process died, which is what too little memory does.
     """
     total = len(frames.views)
-    processes = min(threads, total // frames_a_process)
     progress(0, total)
+    started = time.perf_counter()
+    _write(frames, rasterizer, 0)
+    progress(1, total)
+    left = (time.perf_counter() - started) * (total - 1)
+    processes = min(threads, total - 1) if left > pays_after else 1
     if processes < 2:
-        for index in range(total):
+        for index in range(1, total):
             _write(frames, rasterizer, index)
             progress(index + 1, total)
         return
@@ -73,7 +79,7 @@ def write_frames(
             processes, multiprocessing.get_context("spawn"), _start, (str(file),)
         )
         try:
-            for done, _ in enumerate(pool.map(_write_own, range(total)), start=1):
+            for done, _ in enumerate(pool.map(_write_own, range(1, total)), start=2):
                 progress(done, total)
         except BrokenProcessPool as error:
             raise UsageError("--threads", "a process died; fewer need less memory") from error

@@ -33,7 +33,7 @@ def test_files_are_the_same_whatever_the_number_of_processes(frames, tmp_path, n
         paths = [tmp_path / str(threads) / path.name for path in frames.paths]
         own = replace(frames, paths=paths)
         write_frames(
-            own, ALL_RASTERIZERS[name], threads, lambda *now, tell=tell: tell.append(now), 1
+            own, ALL_RASTERIZERS[name], threads, lambda *now, tell=tell: tell.append(now), 0.0
         )
         files[threads] = [path.read_bytes() for path in paths]
     assert files[1] == files[2]
@@ -45,11 +45,11 @@ def test_files_are_the_same_whatever_the_number_of_processes(frames, tmp_path, n
 def test_an_existing_file_is_refused_by_name(frames, threads):
     frames.paths[3].write_bytes(b"mine")
     with pytest.raises(OutputError, match=r"v3\.png: exists"):
-        write_frames(frames, ALL_RASTERIZERS["eager"], threads, frames_a_process=1)
+        write_frames(frames, ALL_RASTERIZERS["eager"], threads, pays_after=0.0)
     assert frames.paths[3].read_bytes() == b"mine"
 
 
-def test_few_frames_start_no_process(frames, monkeypatch):
+def test_little_work_starts_no_process(frames, monkeypatch):
     monkeypatch.setattr("aaplug.frames.ProcessPoolExecutor", None)
     write_frames(frames, ALL_RASTERIZERS["eager"], 8)
     assert all(path.is_file() for path in frames.paths)
