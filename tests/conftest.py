@@ -3,6 +3,7 @@
 `shared_data` is a folder of real scenes that may lie beside the repository; tests that use it skip where it is absent.
 """
 
+import logging
 import math
 from importlib.resources import files
 from pathlib import Path
@@ -32,6 +33,14 @@ ALL_RASTERIZERS: dict[str, Rasterizer] = {
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 SAMPLE = Path(str(files("aaplug.sample")))
+
+
+@pytest.fixture(autouse=True)
+def own_log(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Give the library's log back as it was: the program replaces its handlers."""
+    logger = logging.getLogger("aaplug")
+    monkeypatch.setattr(logger, "handlers", list(logger.handlers))
+    monkeypatch.setattr(logger, "propagate", True)
 
 
 @pytest.fixture(scope="session")

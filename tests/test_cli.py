@@ -1,7 +1,6 @@
 """The command line as its users meet it: words, files, exit codes, one-line errors that leave nothing behind."""
 
 import json
-import logging
 import math
 import shutil
 from dataclasses import replace
@@ -51,9 +50,6 @@ def cli(dataset, tmp_path, monkeypatch, capsys):
     """Run the program in a fresh folder holding a copy of the data set; gives (exit code, stdout, stderr)."""
     shutil.copytree(dataset, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
-    logger = logging.getLogger("aaplug")  # whose handlers the program replaces
-    monkeypatch.setattr(logger, "handlers", list(logger.handlers))
-    monkeypatch.setattr(logger, "propagate", True)
 
     def run(words: str) -> tuple[int, str, str]:
         with pytest.raises(SystemExit) as stop:
