@@ -79,7 +79,7 @@ def measure(
         frame = _timed(lambda: render(scene, camera, recipe, training, rasterizer), repeats)
     both = None
     if backward:
-        both = _timed(lambda: _step(scene, camera, recipe, training, rasterizer), repeats)
+        both = _timed(lambda: gradient_step(scene, camera, recipe, training, rasterizer), repeats)
     return Figures(
         rasterizer=rasterizer.kernels.name,
         gaussians=len(scene),
@@ -94,6 +94,17 @@ def measure(
         peak_bytes=_peak_bytes(),
         matmul_ms=_matmul(repeats),
     )
+
+
+def gradient_step(
+    scene: Gaussians, camera: Camera, recipe: Recipe, training: Training, rasterizer: Rasterizer
+) -> dict[str, Tensor]:
+    """One render, and the gradient of its mean square to everything that the scene holds."""
+    names = ("means", "quats", "log_scales", "logit_opacities", "sh")
+    leaves = {name: getattr(scene, name).detach().requires_grad_() for name in names}
+    image = render(replace(scene, **leaves), camera, recipe, training, rasterizer, BLACK)
+    grads = torch.autograd.grad(image.rgb.square().mean(), list(leaves.values()))
+    return dict(zip(names, grads, strict=True))
 
 
 def exponent(sizes: list[float], times: list[float]) -> float:
@@ -201,16 +212,6 @@ def _stages(
     drawing = stage("forms", lambda: tiled.drawing_of(splats, kernels))
     stage("composite", lambda: [tiled.composite(drawing, band, kernels) for band in bins])
     return times, sum(int(band.counts.sum()) for band in bins) * tiled.TILE**2
-
-
-def _step(
-    scene: Gaussians, camera: Camera, recipe: Recipe, training: Training, rasterizer: Rasterizer
-) -> None:
-    """One render and its gradient to everything that the scene holds."""
-    names = ("means", "quats", "log_scales", "logit_opacities", "sh")
-    leaves = {name: getattr(scene, name).detach().requires_grad_() for name in names}
-    image = render(replace(scene, **leaves), camera, recipe, training, rasterizer, BLACK)
-    image.rgb.square().mean().backward()
 
 
 def _matmul(repeats: int) -> float:

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from aaplug.cameras import BLACK, Camera
+from aaplug.errors import UsageError
 from aaplug.filters import fuse_stored
 from aaplug.gaussians import Gaussians
 from aaplug.interfaces import Rasterizer, ScreenFilter, Training
@@ -50,6 +51,9 @@ def render(
     """One image of a smoothed scene, rgb and alpha of `camera.hw`, by the recipe's screen filter and samples.
 
     Differentiable in everything that the scene holds and in `camera.cam_from_world`.
+
+    Raises:
+        UsageError: a Gaussian in view has a colour that is NaN or infinite.
     """
     samples = recipe.samples_at(training.rate(camera))
     fine = camera.resized(camera.width * samples, camera.height * samples)
@@ -75,4 +79,16 @@ def splats_of(
         splats = replace(splats, sources=splats.sources + start)
         splats = drawn(screen(splats, camera, training), camera.hw, training.guard, kernels)
         parts.append(shade(splats, scene, camera, kernels))
-    return parts[0] if len(parts) == 1 else joined(parts)
+    splats = parts[0] if len(parts) == 1 else joined(parts)
+    _check_colours(splats)
+    return splats
+
+
+def _check_colours(splats: Splats2D) -> None:
+    """One colour that is not a number would spoil every pixel that it touches; bad shapes are not drawn at all."""
+    assert splats.rgb is not None
+    if not splats.rgb.sum().isfinite():
+        bad = ~splats.rgb.isfinite().all(dim=1)
+        if bad.any():
+            first, count = int(splats.sources[bad].min()), int(bad.sum())
+            raise UsageError(f"Gaussian {first}", f"has no finite colour (the first of {count})")

@@ -1,0 +1,40 @@
+"""Frames and steps for pytest-benchmark: `pytest tests/bench/rasterizer.py -n0`."""
+
+import pytest
+import torch
+
+from aaplug.benchmark import gradient_step, synthetic_camera, synthetic_scene
+from aaplug.pipeline import learn, render
+from aaplug.recipes import find_recipe
+from tests.conftest import ALL_RASTERIZERS
+
+CAMERA = synthetic_camera(800, 800).as_trained()
+ROUNDS = {"rounds": 5, "warmup_rounds": 1}
+RECIPE = find_recipe("classic")
+
+
+@pytest.fixture(params=["compiled", "eager"])
+def rasterizer(request: pytest.FixtureRequest):
+    if request.param not in ALL_RASTERIZERS:
+        pytest.skip("the kernels are not compiled here (aaplug warmup)")
+    return ALL_RASTERIZERS[request.param]
+
+
+@pytest.fixture(params=[10_000, 100_000, 1_000_000], ids=str)
+def scene(request: pytest.FixtureRequest):
+    return synthetic_scene(request.param)
+
+
+def test_forward(benchmark, scene, rasterizer):
+    training = learn(scene, [CAMERA])
+    with torch.no_grad():
+        image = benchmark.pedantic(render, (scene, CAMERA, RECIPE, training, rasterizer), **ROUNDS)
+    assert image.alpha.mean() > 0.5
+
+
+def test_forward_and_backward(benchmark, scene, rasterizer):
+    training = learn(scene, [CAMERA])
+    grads = benchmark.pedantic(
+        gradient_step, (scene, CAMERA, RECIPE, training, rasterizer), **ROUNDS
+    )
+    assert all(grad.abs().sum() > 0 for grad in grads.values())

@@ -1,0 +1,83 @@
+"""Scenes with values that no training makes: every rasterizer draws the rest, or refuses and says which."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from aaplug.errors import UsageError
+from aaplug.gaussians import Gaussians
+from aaplug.pipeline import learn, render
+from aaplug.recipes import RECIPES
+from tests.conftest import ALL_RASTERIZERS, make_camera, make_scene
+
+CAMERA = make_camera(size=(40, 30))
+SCENE = make_scene(50, seed=3)
+VICTIM = 20
+TRAINING = learn(SCENE, [CAMERA])
+CENTRE = CAMERA.centre.float()
+BACK = CAMERA.cam_from_world[2, :3].float()  # the camera's z in the world
+
+DRAWN_WITHOUT = {
+    "NaN mean": ("means", torch.tensor([math.nan, 0.0, 0.0])),
+    "infinite mean": ("means", torch.tensor([math.inf, 0.0, 0.0])),
+    "NaN scale": ("log_scales", torch.tensor([math.nan, -2.0, -2.0])),
+    "NaN rotation": ("quats", torch.full((4,), math.nan)),
+    "NaN opacity": ("logit_opacities", torch.tensor(math.nan)),
+    "at the camera's centre": ("means", CENTRE),
+    "behind the camera": ("means", CENTRE - BACK),
+    "just before the near plane": ("means", CENTRE + 0.1999 * BACK),
+    "transparent": ("logit_opacities", torch.tensor(-math.inf)),
+}
+DRAWN_SOMEHOW = {
+    "opaque": ("logit_opacities", torch.tensor(math.inf)),
+    "a million px": ("log_scales", torch.full((3,), 12.0)),
+    "infinitely large": ("log_scales", torch.full((3,), math.inf)),
+    "a point": ("log_scales", torch.full((3,), -math.inf)),
+    "denormal rotation": ("quats", torch.tensor([1e-30, 0.0, 0.0, 0.0])),
+}
+
+
+def poisoned(field: str, value: torch.Tensor) -> Gaussians:
+    column = getattr(SCENE, field).clone()
+    column[VICTIM] = value
+    return replace(SCENE, **{field: column})
+
+
+def draw(scene: Gaussians, name: str) -> torch.Tensor:
+    with torch.no_grad():
+        rgb, alpha = render(scene, CAMERA, RECIPES["matched"], TRAINING, ALL_RASTERIZERS[name])
+    return torch.cat([rgb, alpha[..., None]], dim=2)
+
+
+@pytest.mark.parametrize("name", ALL_RASTERIZERS)
+@pytest.mark.parametrize("poison", DRAWN_WITHOUT)
+def test_what_cannot_be_seen_is_left_out(name, poison):
+    kept = torch.arange(len(SCENE)) != VICTIM
+    training = replace(TRAINING, bounds=learn(SCENE[kept], [CAMERA]).bounds)
+    with torch.no_grad():
+        without = render(
+            SCENE[kept], CAMERA, RECIPES["matched"], training, ALL_RASTERIZERS[name]
+        ).rgb
+    image = draw(poisoned(*DRAWN_WITHOUT[poison]), name)[..., :3]
+    torch.testing.assert_close(image, without, rtol=0, atol=1e-6)
+    assert (draw(SCENE, name)[..., :3] - without).abs().max() > 1e-3, "the victim is not in view"
+
+
+@pytest.mark.parametrize("name", ALL_RASTERIZERS)
+@pytest.mark.parametrize("poison", DRAWN_SOMEHOW)
+def test_extremes_draw_finite_images(name, poison):
+    image = draw(poisoned(*DRAWN_SOMEHOW[poison]), name)
+    assert image.isfinite().all()
+    assert image[..., 3].min() >= 0
+    assert image[..., 3].max() <= 1
+
+
+@pytest.mark.parametrize("name", ALL_RASTERIZERS)
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_colour_that_is_no_number_is_refused_by_its_index(name, value):
+    with pytest.raises(
+        UsageError, match=rf"Gaussian {VICTIM}: has no finite colour \(the first of 1\)"
+    ):
+        draw(poisoned("sh", torch.full((4, 3), value)), name)
