@@ -184,7 +184,7 @@ class _Counting(Kernels):
 
     def run(self, kernel: Kernel, *args: Tensor) -> tuple[Tensor, ...]:
         if kernel is tiled.COMPOSITE:
-            self.pairs += args[1].numel() * tiled.TILE**2
+            self.pairs += len(args[2]) * tiled.PASS * tiled.TILE**2
         return self._kernels.run(kernel, *args)
 
 

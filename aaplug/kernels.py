@@ -1,6 +1,6 @@
 """Kernels: the elementwise stages of a frame, one source with two ways to run.
 
-A kernel is a pure function of tensors.  Run eagerly it is plain array code that any device, precision and gradient can
+A kernel is a function of tensors.  Run eagerly it is plain array code that any device, precision and gradient can
 use; `aaplug.compiled` turns the same source into one fused loop ahead of time.  A stage asks its `Kernels` to run it.
 """
 
@@ -15,8 +15,8 @@ from torch import Tensor
 class Kernel:
     """One stage.
 
-    function: tensors in, a tuple of tensors out, without side effects.  example: arguments to compile for.
-    sizes: of each argument the name of its leading size, None where that is fixed; sizes of one name are equal.
+    function: tensors in, a tuple of tensors out; what it updates in place must be contiguous.
+    example: arguments to compile for.  sizes: of each argument the name of its leading size, None where that is fixed; sizes of one name are equal.
     """
 
     name: str
@@ -43,7 +43,7 @@ class Kernels:
 class Package:
     """A kernel compiled for arguments of these types on a CPU."""
 
-    run: Callable[..., list[Tensor]]
+    run: Callable[[list[Tensor]], list[Tensor]]
     dtypes: tuple[torch.dtype, ...]
 
     def takes(self, args: tuple[Tensor, ...]) -> bool:
@@ -59,7 +59,7 @@ class CompiledKernels(Kernels):
     """Runs what was compiled where it can, and everything else eagerly: gradients, precisions, devices."""
 
     name = "compiled"
-    tiles = 2048
+    tiles = 4096
 
     def __init__(self, packages: dict[str, Package]):
         self._packages = packages
@@ -69,7 +69,7 @@ class CompiledKernels(Kernels):
         package = self._packages.get(kernel.name)
         if package is None or not package.takes(args):
             return super().run(kernel, *args)
-        return tuple(package.run(*(arg.detach().contiguous() for arg in args)))
+        return tuple(package.run([arg.contiguous() for arg in args]))
 
 
 EAGER = Kernels()

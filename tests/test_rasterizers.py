@@ -13,8 +13,9 @@ import pytest
 import torch
 
 from aaplug.interfaces import Rasterizer
+from aaplug.kernels import EAGER
 from aaplug.rasterizers import Tiled, reference, tiled
-from aaplug.splats import Splats2D
+from aaplug.splats import Splats2D, reach
 from tests.conftest import ALL_RASTERIZERS, make_splats
 
 F64 = torch.float64
@@ -372,6 +373,50 @@ def test_a_smaller_memory_changes_nothing():
         parts = Tiled(memory=float(pairs * tiled.PAIR_BYTES))(splats, hw, SKY)
         assert parts.rgb.equal(whole.rgb)
         assert parts.alpha.equal(whole.alpha)
+
+
+def test_exactly_the_tiles_that_the_ellipses_reach_are_paired():
+    grid = (9, 11)
+    splats = make_splats(300, (9 * tiled.TILE, 11 * tiled.TILE), 5, (-2.0, 3.5)).to(F64)
+    bins = next(tiled.bands(splats, grid, EAGER))
+    listed = torch.zeros(300, grid[0] * grid[1], dtype=torch.bool)
+    for tile, (first, count) in enumerate(zip(bins.first, bins.counts, strict=True)):
+        mine = bins.splats[first : first + count].long()
+        assert splats.depths[mine].diff().min() >= 0 if count > 1 else True
+        listed[mine, tile] = True
+    # the least of dᵀ C⁻¹ d over the box of each tile's pixel centres, by projected steps along each side in turn
+    steps = torch.linspace(0, 1, 2001, dtype=F64)
+    xx, xy, yy = (column[:, None] for column in splats.covs.unbind(dim=1))
+    conic = yy / splats.dets[:, None], -xy / splats.dets[:, None], xx / splats.dets[:, None]
+    for tile in range(grid[0] * grid[1]):
+        corner = torch.tensor([tile % grid[1], tile // grid[1]]) * tiled.TILE + 0.5
+        least = torch.full((300,), math.inf, dtype=F64)
+        low = corner - splats.means
+        high = low + tiled.TILE - 1
+        inside = ((low <= 0) & (high >= 0)).all(dim=1)
+        for fixed in (0, 1):
+            for side in (low, high):
+                along = low[:, 1 - fixed, None] + (tiled.TILE - 1) * steps
+                across = side[:, fixed, None].expand_as(along)
+                dx, dy = (across, along) if fixed == 0 else (along, across)
+                distance = conic[0] * dx * dx + 2 * conic[1] * dx * dy + conic[2] * dy * dy
+                least = torch.minimum(least, distance.amin(dim=1))
+        least[inside] = 0
+        reached = reach(splats.opacities)
+        assert listed[least <= reached, tile].all()
+        surely_missed = least > reached * 1.001 + 0.01
+        assert not listed[surely_missed, tile].any()
+
+
+def test_the_polynomial_that_compiled_loops_use_is_exp2(monkeypatch):
+    exponents = torch.linspace(-12, 0.5, 100_001)[:, None]
+    monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)
+    compiled = tiled._audible_exp2(exponents)
+    exact = torch.exp2(exponents.double())
+    heard = exponents >= tiled.LOG2_MIN_ALPHA
+    assert compiled[~heard].eq(0).all()
+    relative = compiled[heard].double() / exact[heard] - 1
+    assert relative.abs().max() < 2e-6
 
 
 @pytest.mark.parametrize("which", ["none at all", "none in the image", "none opaque enough"])

@@ -1,12 +1,14 @@
 """The fast rasterizer: tiles, one depth sort, and compositing as elementwise array code that compiles to one loop.
 
-t: tiles of TILE × TILE px; p: pairs of a splat and a tile; K: splats a pass; P: pixels a tile.
+t: tiles of TILE × TILE px; s: spans, p: pairs of a splat and a tile; K: splats a pass; P: pixels a tile.
 
 1. A splat becomes two linear forms u, v of the pixel's position with u² + v² = log2(e)/2 · dᵀ C⁻¹ d, so that alpha is
    2^(log2 o − u² − v²).  Forms lose no digits where the expanded quadratic of a needle would.
-2. Splats are paired, nearest first, with the tiles in the box around their alpha ≥ 1/255 ellipse; pairs whose ellipse
-   misses the tile go to a bin that nobody draws, and one stable sort by tile does the rest.
-3. Tiles are composited K splats a pass, those with most splats first; finished tiles leave.
+2. Splats are paired, nearest first, with the tiles that their alpha ≥ 1/255 ellipse reaches.  What an ellipse has in a
+   row of tiles is convex, so the tiles are a run of columns between its two ends there: a splat becomes spans, a span
+   becomes pairs, and one stable sort of the pairs by tile does the rest.
+3. Tiles are composited K splats a pass, those with most splats first, so that the ones that are done are the last;
+   tiles whose pixels are all saturated leave now and then.
 
 The backward pass is a forward sweep too: with S = Σ g·w·c of a pixel, known from the image, the rest R = S − Σ_{j≤k}
 g·w·c gives ∂L/∂alpha_k = T_k g·c_k − R/(1 − alpha_k), so that T at each pass's start is all that is kept.
@@ -31,15 +33,14 @@ from aaplug.splats import MIN_ALPHA, Render, Splats2D, reach, whitening_columns
 
 TILE = 8  # px
 PASS = 8  # splats composited in one pass: more compile slowly, fewer load and store more
-CHECK_EVERY = 2  # passes between looks at which tiles are saturated
-COMPACT_BELOW = 7 / 8  # share of tiles still going at which the others leave
+CHECK_EVERY = 4  # passes between looks at which tiles are saturated
+COMPACT_BELOW = 3 / 4  # share of tiles still going at which the others leave
 MEMORY = 1e9  # bytes
 PAIR_BYTES = 64  # of a candidate pair while a band is binned, measured
 HALF_LOG2_E = 0.5 * log2(torch.e)
 LN_2 = math.log(2)
-LOG2_SILENT = (
-    -24.0
-)  # log2 of an alpha far below 1/255; stops exp2 before it underflows, which is slow
+LOG2_SILENT = -9.0  # log2 of an alpha below 1/255; stops exp2 before it underflows, which is slow
+LOG2_MIN_ALPHA = torch.tensor(MIN_ALPHA).log2().item()
 REACH_SLACK = (
     1e-4  # relative, on the squared reach: float32 rounding never drops a pixel that counts
 )
@@ -49,10 +50,25 @@ BELOW_MIN_ALPHA = torch.nextafter(torch.tensor(MIN_ALPHA), torch.tensor(0.0)).it
 BELOW_MIN_TRANSMITTANCE = torch.nextafter(torch.tensor(MIN_TRANSMITTANCE), torch.tensor(0.0)).item()
 SURELY = 1e9  # times anything that is not 0 here is over 1
 
+
+def _root_of_exp2(squarings: int, degree: int) -> tuple[float, ...]:
+    """Coefficients of a polynomial in h ≥ 0 that, squared some times, is 2^(LOG2_SILENT + h), for exponents up to 0.
+
+    It goes through the Chebyshev nodes, as good polynomials do, and has no floor, bits or calls in it.
+    """
+    angles = math.pi * (torch.arange(degree + 1, dtype=torch.float64) + 0.5) / (degree + 1)
+    h = -LOG2_SILENT / 2 * (1 + angles.cos())
+    values = torch.exp2((LOG2_SILENT + h) / 2**squarings)
+    return tuple(torch.linalg.solve(torch.linalg.vander(h), values).tolist())
+
+
+SQUARINGS = 3
+ROOT_OF_EXP2 = _root_of_exp2(SQUARINGS, degree=6)  # relative error of the power: 1e-6 in float32
+
 # columns of a splat's drawing parameters
 UX, UY, VX, VY, X, Y, LOG2_OPACITY, RED, GREEN, BLUE = range(10)
 COLUMNS = 10
-LOW_X = 6  # where a box of tiles begins in a row of the table
+BOX = 7  # where the box of tiles begins in a row of the table
 
 
 @dataclass(frozen=True)
@@ -80,9 +96,9 @@ class Tiled:
         return Render(torch.cat(rgb)[: hw[0]], torch.cat(alpha)[: hw[0]])
 
 
-def _untiled(tiles: Float[Tensor, "t P 4"], columns: int) -> Float[Tensor, "h w 4"]:
+def _untiled(tiles: Float[Tensor, "4 t P"], columns: int) -> Float[Tensor, "h w 4"]:
     """Tiles of whole rows put in their places."""
-    image = tiles.unflatten(0, (-1, columns)).unflatten(2, (TILE, TILE)).transpose(1, 2)
+    image = tiles.view(4, -1, columns, TILE, TILE).permute(1, 3, 2, 4, 0)
     return image.reshape(-1, columns * TILE, 4)
 
 
@@ -90,10 +106,11 @@ def _untiled(tiles: Float[Tensor, "t P 4"], columns: int) -> Float[Tensor, "h w 
 class Bins:
     """Which splats each tile of a band draws: `splats[first[t] : first[t] + counts[t]]`, nearest first.
 
+    splats: with K more at the end, so that a pass may read on.
     origins: the tiles' top left corners, in px.
     """
 
-    splats: Int[Tensor, " p"]
+    splats: Int[Tensor, " p_and_K"]
     first: Int[Tensor, " t"]
     counts: Int[Tensor, " t"]
     origins: Float[Tensor, "t 2"]
@@ -131,7 +148,7 @@ def bands(
 ) -> Iterator[Bins]:
     """Bins of bands of tile rows, from the top."""
     order = _depth_order(splats.depths)
-    table = _table(splats, grid, kernels).index_select(0, order)
+    table = _table(splats, grid, kernels)
     for rows in _rows(table, grid[0], max(1, int(memory / PAIR_BYTES))):
         yield _bin(table, order, rows, grid[1], kernels)
 
@@ -142,8 +159,8 @@ def _depth_order(depths: Float[Tensor, " m"]) -> Int[Tensor, " m"]:
     return torch.sort(keys, stable=True).indices
 
 
-def _table(splats: Splats2D, grid: tuple[int, int], kernels: Kernels) -> Float[Tensor, "m 10"]:
-    """Centre, conic xx, xy, yy, squared reach of each splat, and the box of tiles around its ellipse.
+def _table(splats: Splats2D, grid: tuple[int, int], kernels: Kernels) -> Float[Tensor, "m 11"]:
+    """What the spans of each splat are made of, with the box of tiles around its ellipse in the last four columns.
 
     A box is its first tile in x and y and the ones after its last.
     """
@@ -158,23 +175,26 @@ def _table_rows(
     dets: Float[Tensor, " m"],
     opacities: Float[Tensor, " m"],
     limit: Float[Tensor, " 2"],
-) -> tuple[Float[Tensor, "m 10"]]:
+) -> tuple[Float[Tensor, "m 11"]]:
+    """Centre; of x given y the slope and the variance; yy; squared reach; height of the rightmost point; box."""
     xx, xy, yy = covs.unbind(dim=1)
-    reached = reach(opacities)
+    reached = reach(opacities) * (1 + REACH_SLACK)
+    reached = torch.where(((xx + yy) / dets).isfinite(), reached, -1.0)  # no width: not drawn
     lows, highs = [], []
     for mean, variance, end in zip(means.unbind(dim=1), (xx, yy), limit.unbind(), strict=True):
-        half = (reached.clamp(min=0.0) * variance).sqrt() * (1 + REACH_SLACK)
+        half = (reached.clamp(min=0.0) * variance).sqrt()
         low = torch.minimum(((mean - half) / TILE).floor().clamp(min=0.0), end)
         high = torch.minimum(((mean + half) / TILE).floor().add(1).clamp(min=0.0), end)
         lows.append(low)
         highs.append(torch.maximum(low, high))
-    conic = [yy / dets, -xy / dets, xx / dets]
-    return (torch.stack([*means.unbind(dim=1), *conic, reached, *lows, *highs], dim=1),)
+    rightmost = xy * (reached.clamp(min=0.0) / xx).sqrt()
+    ellipse = [xy / yy, dets / yy, yy, reached, rightmost]
+    return (torch.stack([*means.unbind(dim=1), *ellipse, *lows, *highs], dim=1),)
 
 
-def _rows(table: Float[Tensor, "m 10"], rows: int, budget: int) -> list[tuple[int, int]]:
+def _rows(table: Float[Tensor, "m 11"], rows: int, budget: int) -> list[tuple[int, int]]:
     """Cut the grid into runs of tile rows of about `budget` candidate pairs, at least a row each."""
-    left, top, right, bottom = table[:, LOW_X:].long().unbind(dim=1)
+    left, top, right, bottom = table[:, BOX:].long().unbind(dim=1)
     change = top.new_zeros(rows + 1)
     change.index_add_(0, top, right - left).index_add_(0, bottom, left - right)
     ends = change.cumsum(0).cumsum(0)[:rows]  # candidates down to each row
@@ -184,66 +204,81 @@ def _rows(table: Float[Tensor, "m 10"], rows: int, budget: int) -> list[tuple[in
 
 
 def _bin(
-    table: Float[Tensor, "m 10"],
+    table: Float[Tensor, "m 11"],
     order: Int[Tensor, " m"],
     rows: tuple[int, int],
     columns: int,
     kernels: Kernels,
 ) -> Bins:
     """Pair splats, nearest first, with the tiles that they reach in a band of rows."""
-    low, top, high, bottom = table[:, LOW_X:].unbind(dim=1)
-    counts = ((high - low) * (bottom.clamp(*rows) - top.clamp(*rows))).long()
-    ends = counts.cumsum(0)
-    rank = torch.repeat_interleave(counts)
-    band = order.new_tensor([rows[0], rows[1], columns])
-    (tiles,) = kernels.run(REACH, rank, ends - counts, table, band)
+    _, top, _, bottom = table[:, BOX:].unbind(dim=1)
+    heights = (bottom.clamp(*rows) - top.clamp(*rows)).long().index_select(0, order)
+    ranks = torch.repeat_interleave(heights)
+    band = order.new_tensor([rows[0], columns])
+    args = (ranks, order, _starts(heights), table, band)
+    first, widths, owners = kernels.run(SPANS, *args)
+    spans = torch.repeat_interleave(widths)
+    tiles, splats = kernels.run(PAIRS, spans, _starts(widths), first, owners)
     size = (rows[1] - rows[0]) * columns
     if size < torch.iinfo(torch.int16).max:
         tiles = tiles.short()  # half the bits sort in half the time
-    pairs = torch.sort(tiles, stable=True).indices
-    drawn = torch.bincount(tiles, minlength=size + 1)[:size]
-    ends = drawn.cumsum(0)
+    sorted_tiles, pairs = torch.sort(tiles, stable=True)
     tile = torch.arange(size, device=table.device)
+    ends = torch.searchsorted(sorted_tiles, tile.to(tiles), right=True)
+    first = torch.cat([ends.new_zeros(1), ends[:-1]])
     origins = torch.stack([tile % columns, tile // columns + rows[0]], dim=1) * TILE
-    kept = order.index_select(0, rank.index_select(0, pairs[: int(ends[-1])]))
-    return Bins(kept, ends - drawn, drawn, origins.to(table.dtype))
+    drawn = torch.cat([splats.index_select(0, pairs), splats.new_zeros(PASS)])
+    return Bins(drawn, first, ends - first, origins.to(table.dtype))
 
 
-def _reach(
-    rank: Int[Tensor, " p"],
+def _starts(counts: Int[Tensor, " m"]) -> Int[Tensor, " m"]:
+    return counts.cumsum(0) - counts
+
+
+def _spans(
+    ranks: Int[Tensor, " s"],
+    order: Int[Tensor, " m"],
     starts: Int[Tensor, " m"],
-    table: Float[Tensor, "m 10"],
-    band: Int[Tensor, " 3"],
-) -> tuple[Int[Tensor, " p"]]:
-    """Tile of each candidate pair; the tile after the last where alpha < 1/255 all over the tile.
+    table: Float[Tensor, "m 11"],
+    band: Int[Tensor, " 2"],
+) -> tuple[Int[Tensor, " s"], Int[Tensor, " s"], Int[Tensor, " s"]]:
+    """First tile of the band, number of tiles, and splat, of what a splat reaches in one row of tiles.
 
-    The quadratic is convex, so over a box of pixel centres that does not hold the splat's centre its minimum lies on
-    a side that faces the centre; both facing sides are tried.
+    At height h over its centre the ellipse goes from slope·h − w to slope·h + w, w² = variance (reach − h²/yy).  Its
+    right end grows up to the rightmost point and shrinks after it, so that over the pixel centres of a row it is
+    farthest at the height nearest to that point's.
     """
-    first, last, columns = band.unbind()
-    row = table[rank]
-    x, y, xx, xy, yy, reached, low_x, low_y, high_x, _ = row.unbind(dim=1)
-    low_y = torch.maximum(low_y, first)
-    place = (torch.arange(rank.shape[0], device=rank.device) - starts[rank]).double()
-    width = (high_x - low_x).double()
-    down = ((place + 0.5) / width).floor()  # exact, and faster than to divide integers
-    tile_x = (place - down * width).to(x) + low_x
-    tile_y = down.to(x) + low_y
-    left, top = tile_x * TILE + 0.5 - x, tile_y * TILE + 0.5 - y
-    right, bottom = left + (TILE - 1), top + (TILE - 1)
-    zero = torch.zeros_like(x)
-    side_x = torch.minimum(torch.maximum(zero, left), right)
-    side_y = torch.minimum(torch.maximum(zero, top), bottom)
-    on_x = torch.minimum(torch.maximum(-xy / yy * side_x, top), bottom)
-    on_y = torch.minimum(torch.maximum(-xy / xx * side_y, left), right)
-    distance = torch.minimum(
-        xx * side_x * side_x + 2 * xy * side_x * on_x + yy * on_x * on_x,
-        xx * on_y * on_y + 2 * xy * on_y * side_y + yy * side_y * side_y,
-    )
-    slack = REACH_SLACK * (1 + xx * side_x * side_x + yy * side_y * side_y)
-    tile = (tile_y.int() - first) * columns + tile_x.int()
-    nowhere = (last - first) * columns
-    return (torch.where(distance <= reached + slack, tile, nowhere).int(),)
+    top_row, columns = band.unbind()
+    owners = order[ranks]
+    row = table[owners]
+    x, y, slope, variance, yy, reached, rightmost, _, low_y, _, _ = row.unbind(dim=1)
+    down = (torch.arange(ranks.shape[0], device=ranks.device) - starts[ranks]).to(x)
+    tile_y = torch.maximum(low_y, top_row) + down
+    top = tile_y * TILE + 0.5 - y
+    ends = []
+    for sign in (-1, 1):
+        h = torch.minimum(torch.maximum(sign * rightmost, top), top + (TILE - 1))
+        width = (variance * (reached - h * h / yy).clamp(min=0.0)).sqrt()
+        slack = REACH_SLACK * (width + (slope * h).abs())
+        ends.append(x + slope * h + sign * (width + slack))
+    nearest = torch.minimum(torch.maximum(torch.zeros_like(top), top), top + (TILE - 1))
+    reaches = nearest * nearest / yy <= reached
+    limit = columns.to(x)
+    left = torch.minimum(((ends[0] + 0.5 - TILE) / TILE).ceil().clamp(min=0.0), limit)
+    right = torch.minimum(((ends[1] - 0.5) / TILE).floor() + 1, limit)
+    width = torch.where(reaches, (right - left).clamp(min=0.0), 0.0)
+    return (tile_y.long() - top_row) * columns + left.long(), width.long(), owners.int()
+
+
+def _pairs(
+    spans: Int[Tensor, " p"],
+    starts: Int[Tensor, " s"],
+    first: Int[Tensor, " s"],
+    owners: Int[Tensor, " s"],
+) -> tuple[Int[Tensor, " p"], Int[Tensor, " p"]]:
+    """Tile and splat of each pair."""
+    place = torch.arange(spans.shape[0], device=spans.device)
+    return (place + (first - starts)[spans]).int(), owners[spans]
 
 
 # ----------------------------------------------------------------------------------------------------- compositing
@@ -251,75 +286,84 @@ def _reach(
 
 def composite(
     drawing: Float[Tensor, "m 10"], bins: Bins, kernels: Kernels
-) -> Float[Tensor, "t P 4"]:
-    """Premultiplied colour and alpha of every pixel of every tile."""
+) -> Float[Tensor, "4 t P"]:
+    """Premultiplied red, green, blue, and alpha, of every pixel of every tile."""
     if drawing.requires_grad and torch.is_grad_enabled():
         return _Composite.apply(drawing, bins, kernels)  # pyright: ignore[reportReturnType]
-    image, _ = _forward(drawing, bins, kernels, keep=False)
-    return image
+    return _forward(drawing, bins, kernels)
 
 
 @dataclass(frozen=True)
-class _Pass:
-    """What a pass composited: K splats for each of some tiles, from transmittance `before`."""
+class _Turn:
+    """What was composited between two looks at which tiles are done.
+
+    splats: first and after last of each tile, from where the turn began.  before: of each pass the transmittance of
+    the tiles, the first of `tiles`, that took part.
+    """
 
     tiles: Int[Tensor, " t"]
-    splats: Int[Tensor, "t K"]
-    before: Float[Tensor, "t P"]
+    splats: tuple[Int[Tensor, " t"], Int[Tensor, " t"]]
+    origins: Float[Tensor, "t 2"]
+    before: list[Float[Tensor, "n P"]]
 
 
 def _forward(
-    drawing: Float[Tensor, "m 10"], bins: Bins, kernels: Kernels, keep: bool
-) -> tuple[Float[Tensor, "all P 4"], list[_Pass]]:
-    """The image, and with `keep` the passes that made it, in order."""
-    image = drawing.new_zeros(len(bins.counts), TILE * TILE, 4)
-    passes: list[_Pass] = []
+    drawing: Float[Tensor, "m 10"],
+    bins: Bins,
+    kernels: Kernels,
+    turns: list[_Turn] | None = None,
+) -> Float[Tensor, "4 all P"]:
+    """The image; the turns that made it are put into `turns`, in order."""
+    image = drawing.new_zeros(4, len(bins.counts), TILE * TILE)
     order = torch.sort(bins.counts, descending=True, stable=True).indices
     order = order[: int((bins.counts > 0).sum())]
     for tiles in order.split(kernels.tiles):
-        _composite_block(drawing, bins, tiles, image, kernels, passes if keep else None)
-    return image, passes
+        _composite_block(drawing, bins, tiles, image, kernels, turns)
+    return image
 
 
 def _composite_block(
     drawing: Float[Tensor, "m 10"],
     bins: Bins,
     tiles: Int[Tensor, " t"],
-    image: Float[Tensor, "all P 4"],
+    image: Float[Tensor, "4 all P"],
     kernels: Kernels,
-    passes: list[_Pass] | None,
+    turns: list[_Turn] | None,
 ) -> None:
-    """Composite some tiles, longest first, into the image; tiles leave when they are saturated or drawn out."""
+    """Composite some tiles, longest first, into the image, until they are drawn out or saturated."""
     local = _pixel_centres(drawing)
-    step = torch.arange(PASS, device=tiles.device)
-    columns = (tiles, *(x.index_select(0, tiles) for x in (bins.first, bins.counts, bins.origins)))
-    ones = drawing.new_ones(len(tiles))
-    state = (
-        drawing.new_ones(len(tiles), TILE * TILE),
-        *drawing.new_zeros(4, len(tiles), TILE * TILE),
-    )
+    state = drawing.new_zeros(5, len(tiles), TILE * TILE)
+    state[0] = 1
     start = 0
-    while len(columns[0]):
-        tiles, first, counts, origins = columns
-        place = start + step
-        pair = (first[:, None] + place).clamp_(max=len(bins.splats) - 1)
-        splats = bins.splats.index_select(0, pair.flatten()).view(-1, PASS)
-        splats.masked_fill_(place >= counts[:, None], len(drawing) - 1)
-        if passes is not None:
-            passes.append(_Pass(tiles, splats, state[0]))
-        state = kernels.run(COMPOSITE, drawing, splats, origins, *state, *local, ones[: len(tiles)])
-        start += PASS
-        live = counts > start
-        if start // PASS % CHECK_EVERY == 0:
-            live &= state[0].amax(dim=1) > 0
-        remaining = int(live.sum())
-        if remaining == 0 or remaining < COMPACT_BELOW * len(tiles):
-            done = (~live).nonzero().squeeze(1)
-            finished = [column.index_select(0, done) for column in state[1:]]
-            image.index_copy_(0, tiles.index_select(0, done), torch.stack(finished, dim=-1))
-            kept = live.nonzero().squeeze(1)
-            columns = tuple(column.index_select(0, kept) for column in columns)
-            state = tuple(column.index_select(0, kept) for column in state)
+    while len(tiles):
+        columns = [x.index_select(0, tiles) for x in (bins.first, bins.counts, bins.origins)]
+        first, counts, origins = columns
+        at, ends, ones = first + start, first + counts, torch.ones_like(origins[:, 0])
+        going = _going(counts - start)
+        kept, before = tiles[:0], []
+        if turns is not None:
+            turns.append(_Turn(tiles, (at, ends), origins, before))
+        for turn, n in enumerate(going):
+            if turns is not None:
+                before.append(state[0, :n].clone())
+            columns = (bins.splats, at[:n] + turn * PASS, ends[:n], origins[:n])
+            kernels.run(COMPOSITE, drawing, *columns, *state[:, :n].unbind(), *local, ones[:n])
+            start += PASS
+            if turn % CHECK_EVERY == CHECK_EVERY - 1 and turn + 1 < len(going):
+                left = going[turn + 1]
+                alive = state[0, :left].amax(dim=1) > 0
+                if int(alive.sum()) < COMPACT_BELOW * left:
+                    kept = alive.nonzero().squeeze(1)
+                    break
+        image.index_copy_(1, tiles, state[1:])
+        tiles, state = tiles.index_select(0, kept), state.index_select(1, kept)
+
+
+def _going(counts: Int[Tensor, " t"]) -> list[int]:
+    """How many tiles take part in each pass, from their splats, most first."""
+    passes = (counts + (PASS - 1)) // PASS
+    turns = torch.arange(int(passes[0]), device=counts.device)
+    return (len(passes) - torch.searchsorted(passes.flip(0), turns, right=True)).tolist()
 
 
 def _pixel_centres(like: Tensor) -> tuple[Float[Tensor, " P"], Float[Tensor, " P"]]:
@@ -331,7 +375,9 @@ def _pixel_centres(like: Tensor) -> tuple[Float[Tensor, " P"], Float[Tensor, " P
 
 def _chunk(
     drawing: Float[Tensor, "m 10"],
-    splats: Int[Tensor, "t K"],
+    ids: Int[Tensor, " p"],
+    at: Int[Tensor, " t"],
+    ends: Int[Tensor, " t"],
     origins: Float[Tensor, "t 2"],
     T: Float[Tensor, "t P"],
     red: Float[Tensor, "t P"],
@@ -341,44 +387,87 @@ def _chunk(
     local_x: Float[Tensor, " P"],
     local_y: Float[Tensor, " P"],
     one: Float[Tensor, " t"],
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Composite K splats: transmittance (0 where the pixel has stopped), colour and alpha.
+) -> tuple[()]:
+    """Composite splats at to at + K of each tile into its transmittance (0 once a pixel has stopped), colour and alpha.
 
     one: ones; a column of them in each step keeps the compiler to one loop over tiles.
     """
     x, y = origins[:, 0, None] + local_x, origins[:, 1, None] + local_y
+    before = T
     for k in range(PASS):
-        row = drawing[splats[:, k]]
+        row = _row(drawing, ids, at + k, ends)
         _, _, _, _, alpha = _alpha(row, x, y)
-        weight, T = _step(alpha, T, one)
-        red = red + weight * row[:, RED, None]
-        green = green + weight * row[:, GREEN, None]
-        blue = blue + weight * row[:, BLUE, None]
-        hidden = hidden + weight
-    return T, red, green, blue, hidden
+        after = before * _left(alpha, one[:, None])
+        weight = _where_above(BELOW_MIN_TRANSMITTANCE, after, before - after)
+        before = after
+        red.addcmul_(weight, row[:, RED, None])
+        green.addcmul_(weight, row[:, GREEN, None])
+        blue.addcmul_(weight, row[:, BLUE, None])
+        hidden.add_(weight)
+    T.copy_(torch.threshold(before, BELOW_MIN_TRANSMITTANCE, 0.0))
+    return ()
+
+
+def _row(
+    drawing: Float[Tensor, "m 10"],
+    ids: Int[Tensor, " p"],
+    at: Int[Tensor, " t"],
+    ends: Int[Tensor, " t"],
+) -> Float[Tensor, "t 10"]:
+    """The splat that each tile draws, or the one that draws nothing after the tile's last."""
+    return drawing[torch.where(at < ends, ids[at], -1)]
 
 
 def _alpha(
     row: Float[Tensor, "t 10"], x: Float[Tensor, "t P"], y: Float[Tensor, "t P"]
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Offset from the centre in px, the two forms, and alpha, of one splat a tile."""
+    """Offset from the centre in px, the two forms, and alpha before its cap, of one splat a tile."""
     dx, dy = x - row[:, X, None], y - row[:, Y, None]
     u = row[:, UX, None] * dx + row[:, UY, None] * dy
     v = row[:, VX, None] * dx + row[:, VY, None] * dy
     exponent = row[:, LOG2_OPACITY, None] - u * u - v * v
-    alpha = torch.exp2(exponent.clamp(min=LOG2_SILENT)).clamp(max=MAX_ALPHA)
-    return dx, dy, u, v, torch.threshold(alpha, BELOW_MIN_ALPHA, 0.0)
+    return dx, dy, u, v, _audible_exp2(exponent)
 
 
-def _step(
-    alpha: Float[Tensor, "t P"], T: Float[Tensor, "t P"], one: Float[Tensor, " t"]
-) -> tuple[Tensor, Tensor]:
-    """The weight of a splat, and the transmittance after it: both 0 where it would end the pixel.
+def _left(alpha: Float[Tensor, "t P"], one: Float[Tensor, "t 1"]) -> Float[Tensor, "t P"]:
+    """The share of the light that a splat lets through."""
+    least = 1 - MAX_ALPHA
+    if torch.compiler.is_compiling():
+        return torch.relu(MAX_ALPHA * one - alpha) + least
+    return (one - alpha).clamp_(min=least)
 
-    Comparing and choosing is slow in eager array code; thresholds and minima are not.
-    """
-    after = torch.threshold(T * (one[:, None] - alpha), BELOW_MIN_TRANSMITTANCE, 0.0)
-    return torch.minimum(alpha * T, after * SURELY), after
+
+# Array code pays for every operation and most for choosing; a compiled loop pays for calls, of which exp2 is one, and
+# for minima and maxima, which look for NaN.  So these three are written for each.
+
+
+def _audible_exp2(exponent: Float[Tensor, "t P"]) -> Float[Tensor, "t P"]:
+    """2^exponent where that is at least 1/255, else 0."""
+    if torch.compiler.is_compiling():
+        root = _polynomial(torch.relu(exponent - LOG2_SILENT), ROOT_OF_EXP2)
+        return torch.where(exponent >= LOG2_MIN_ALPHA, _power(root, SQUARINGS), 0.0)
+    return torch.threshold(exponent.clamp(min=LOG2_SILENT).exp2_(), BELOW_MIN_ALPHA, 0.0)
+
+
+def _where_above(bound: float, test: Tensor, value: Tensor) -> Tensor:
+    """A value, not negative, where a test is above a bound, itself not negative; else 0."""
+    if torch.compiler.is_compiling():
+        return torch.where(test > bound, value, 0.0)
+    return torch.minimum(torch.threshold(test, bound, 0.0).mul_(SURELY), value)
+
+
+def _polynomial(x: Tensor, coefficients: tuple[float, ...]) -> Tensor:
+    *rest, last = coefficients
+    value = x * last + rest[-1]
+    for coefficient in rest[-2::-1]:
+        value = value * x + coefficient
+    return value
+
+
+def _power(x: Tensor, squarings: int) -> Tensor:
+    for _ in range(squarings):
+        x = x * x
+    return x
 
 
 class _Composite(torch.autograd.Function):
@@ -386,7 +475,8 @@ class _Composite(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, drawing: Tensor, bins: Bins, kernels: Kernels) -> Tensor:
-        image, ctx.passes = _forward(drawing, bins, kernels, keep=True)
+        ctx.turns = []
+        image = _forward(drawing, bins, kernels, ctx.turns)
         ctx.save_for_backward(drawing, image)
         ctx.bins, ctx.kernels = bins, kernels
         return image
@@ -394,55 +484,50 @@ class _Composite(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None, None]:
         drawing, image = ctx.saved_tensors
-        return _backward(drawing, image, grads[0], ctx.bins, ctx.passes, ctx.kernels), None, None
+        return _backward(drawing, image, grads[0], ctx.bins, ctx.turns, ctx.kernels), None, None
 
 
 def _backward(
     drawing: Float[Tensor, "m 10"],
-    image: Float[Tensor, "all P 4"],
-    grad: Float[Tensor, "all P 4"],
+    image: Float[Tensor, "4 all P"],
+    grad: Float[Tensor, "4 all P"],
     bins: Bins,
-    passes: list[_Pass],
+    turns: list[_Turn],
     kernels: Kernels,
 ) -> Float[Tensor, "m 10"]:
     """Gradient of the drawing parameters."""
-    rest = (image * grad).sum(dim=2)
-    columns = [column.contiguous() for column in grad.unbind(dim=2)]
+    rest = (image * grad).sum(dim=0)
     local = _pixel_centres(drawing)
-    total = torch.zeros_like(drawing)
-    for part in passes:
-        tiles = part.tiles
-        *sums, left = kernels.run(
-            COMPOSITE_BACKWARD,
-            drawing,
-            part.splats,
-            bins.origins.index_select(0, tiles),
-            part.before,
-            rest.index_select(0, tiles),
-            *(column.index_select(0, tiles) for column in columns),
-            *local,
-            drawing.new_ones(len(tiles)),
-        )
-        rest.index_copy_(0, tiles, left)
-        moments = torch.stack(sums, dim=-1).view(-1, COLUMNS)
-        owners = part.splats.flatten()
-        total.scatter_add_(0, owners[:, None].expand(-1, COLUMNS), moments)
-    return _from_moments(drawing, total)
+    total, monomials = torch.zeros_like(drawing), _monomials(drawing)
+    for turn in turns:
+        left, grads = rest.index_select(0, turn.tiles), grad.index_select(1, turn.tiles)
+        colours = grads[:3].permute(1, 2, 0).contiguous()
+        ones = drawing.new_ones(len(turn.tiles))
+        for i, before in enumerate(turn.before):
+            n = len(before)
+            at, ends = turn.splats
+            where = (bins.splats, at[:n] + i * PASS, ends[:n])
+            pixels = (before, left[:n], *grads[:, :n].unbind(), *local, ones[:n])
+            weights, moves = kernels.run(CHUNK_BACKWARD, drawing, *where, turn.origins[:n], *pixels)
+            sums = (moves @ monomials, torch.bmm(weights, colours[:n]))
+            owners, added = kernels.run(CHUNK_SUMS, drawing, *where, turn.origins[:n], *sums)
+            owners = owners.view(-1, 1).expand(-1, COLUMNS)
+            total.scatter_add_(0, owners, added.view(-1, COLUMNS))
+        rest.index_copy_(0, turn.tiles, left)
+    return total
 
 
-def _from_moments(
-    drawing: Float[Tensor, "m 10"], moments: Float[Tensor, "m 10"]
-) -> Float[Tensor, "m 10"]:
-    """Gradients of the parameters from sums over pixels of s·(u dx, u dy, v dx, v dy, u, v, 1) and of the colours'."""
-    udx, udy, vdx, vdy, u, v, s, red, green, blue = moments.unbind(dim=1)
-    ux, uy, vx, vy = drawing[:, UX : VY + 1].unbind(dim=1)
-    x, y = 2 * (u * ux + v * vx), 2 * (u * uy + v * vy)
-    return torch.stack([-2 * udx, -2 * udy, -2 * vdx, -2 * vdy, x, y, s, red, green, blue], dim=1)
+def _monomials(like: Tensor) -> Float[Tensor, "P 6"]:
+    """1, x, y, x², xy, y² of a tile's pixel centres from its middle, where no digits are lost."""
+    x, y = (centre - TILE / 2 for centre in _pixel_centres(like))
+    return torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y], dim=1)
 
 
 def _chunk_backward(
     drawing: Float[Tensor, "m 10"],
-    splats: Int[Tensor, "t K"],
+    ids: Int[Tensor, " p"],
+    at: Int[Tensor, " t"],
+    ends: Int[Tensor, " t"],
     origins: Float[Tensor, "t 2"],
     T: Float[Tensor, "t P"],
     rest: Float[Tensor, "t P"],
@@ -453,26 +538,58 @@ def _chunk_backward(
     local_x: Float[Tensor, " P"],
     local_y: Float[Tensor, " P"],
     one: Float[Tensor, " t"],
-) -> tuple[Tensor, ...]:
-    """Sums over a tile's pixels for each of K splats, ten columns [t, K], and what is left of `rest`."""
+) -> tuple[Float[Tensor, "t K P"], Float[Tensor, "t K P"]]:
+    """The weight of each of K splats, and the gradient of its exponent, at each pixel; takes its share from `rest`."""
     x, y = origins[:, 0, None] + local_x, origins[:, 1, None] + local_y
-    sums: list[list[Tensor]] = []
+    weights, gradients = [], []
+    behind = rest
     for k in range(PASS):
-        row = drawing[splats[:, k]]
-        dx, dy, u, v, alpha = _alpha(row, x, y)
-        weight, after = _step(alpha, T, one)
+        row = _row(drawing, ids, at + k, ends)
+        _, _, _, _, alpha = _alpha(row, x, y)
+        left = _left(alpha, one[:, None])
+        after = T * left
+        weight = _where_above(BELOW_MIN_TRANSMITTANCE, after, T - after)
         colour = row[:, RED, None] * g_red + row[:, GREEN, None] * g_green
         colour = colour + row[:, BLUE, None] * g_blue + g_hidden
-        rest = rest - weight * colour
+        behind = behind - weight * colour
         # d alpha / d exponent = alpha ln 2, where alpha is neither skipped (then it is 0) nor capped nor too late
-        smooth = torch.minimum(after, MAX_ALPHA - alpha).mul(SURELY).clamp(max=1.0)
-        s = LN_2 * alpha * smooth * (T * colour - rest / (1 - alpha))
+        moves = _where_above(BELOW_MIN_TRANSMITTANCE, after, LN_2 * alpha)
+        moves = _where_above(0.0, MAX_ALPHA - alpha, moves)
+        weights.append(weight)
+        gradients.append(moves * (T * colour - behind / left))
         T = after
-        su, sv = s * u, s * v
-        terms = (su * dx, su * dy, sv * dx, sv * dy, su, sv, s)
-        colours = (weight * g_red, weight * g_green, weight * g_blue)
-        sums.append([term.sum(dim=1) for term in (*terms, *colours)])
-    return *(torch.stack(column, dim=1) for column in zip(*sums, strict=True)), rest
+    rest.copy_(behind)
+    return torch.stack(weights, dim=1), torch.stack(gradients, dim=1)
+
+
+def _chunk_sums(
+    drawing: Float[Tensor, "m 10"],
+    ids: Int[Tensor, " p"],
+    at: Int[Tensor, " t"],
+    ends: Int[Tensor, " t"],
+    origins: Float[Tensor, "t 2"],
+    moments: Float[Tensor, "t K 6"],
+    colours: Float[Tensor, "t K 3"],
+) -> tuple[Int[Tensor, "t K"], Float[Tensor, "t K 10"]]:
+    """The splat of each of K places of a tile, and what the tile adds to the gradient of its parameters.
+
+    moments: sums over pixels of the gradient of the exponent, log2 o − u² − v², times the monomials.
+    """
+    place = at[:, None] + torch.arange(PASS, device=at.device)
+    owners = torch.where(place < ends[:, None], ids[place], drawing.shape[0] - 1).long()
+    ux, uy, vx, vy, x, y, *_ = drawing[owners].unbind(dim=2)
+    dx, dy = origins[:, 0, None] + TILE / 2 - x, origins[:, 1, None] + TILE / 2 - y
+    s, sx, sy, sxx, sxy, syy = moments.unbind(dim=2)
+    forms = []
+    to_x, to_y = torch.zeros_like(s), torch.zeros_like(s)
+    for i, j in ((ux, uy), (vx, vy)):
+        middle = i * dx + j * dy
+        along = middle * s + i * sx + j * sy  # Σ s u
+        forms += [dx * along + middle * sx + i * sxx + j * sxy]  # Σ s u dx
+        forms += [dy * along + middle * sy + i * sxy + j * syy]
+        to_x, to_y = to_x + i * along, to_y + j * along
+    shape = [-2 * form for form in forms]
+    return owners, torch.stack([*shape, 2 * to_x, 2 * to_y, s, *colours.unbind(dim=2)], dim=2)
 
 
 # --------------------------------------------------------------------------------------------------------- kernels
@@ -482,10 +599,17 @@ def _chunk_backward(
 def _tile_example(states: int) -> tuple[Tensor, ...]:
     tiles, rows = 1024, 4096
     drawing = torch.linspace(0.01, 0.1, rows * COLUMNS).view(rows, COLUMNS)
-    splats = torch.arange(tiles * PASS).view(tiles, PASS) % rows
-    state = torch.full((states, tiles, TILE * TILE), 0.5).unbind()
+    ids = torch.arange((tiles + 1) * PASS, dtype=torch.int32) % rows
+    at = torch.arange(tiles) * PASS
+    state = [torch.full((tiles, TILE * TILE), 0.5) for _ in range(states)]
     local = _pixel_centres(torch.zeros(1))
-    return drawing, splats, torch.ones(tiles, 2), *state, *local, torch.ones(tiles)
+    return drawing, ids, at, at + PASS, torch.ones(tiles, 2), *state, *local, torch.ones(tiles)
+
+
+def _sums_example() -> tuple[Tensor, ...]:
+    *where, _ = _tile_example(0)
+    moments, colours = (torch.linspace(0.1, 1.0, 1024 * PASS * n) for n in (6, 3))
+    return *where[:5], moments.view(1024, PASS, 6), colours.view(1024, PASS, 3)
 
 
 def _splat_example() -> tuple[Tensor, ...]:
@@ -494,11 +618,17 @@ def _splat_example() -> tuple[Tensor, ...]:
     return means, torch.tensor([3.0, 1.0, 2.0]).repeat(m, 1), torch.full((m,), 5.0), torch.ones(m)
 
 
-def _reach_example() -> tuple[Tensor, ...]:
-    boxes = 20_000
-    row = [12.0, 12.0, 1.0, 0.5, 1.0, 9.0, 0.0, 0.0, 2.0, 4.0]
+def _spans_example() -> tuple[Tensor, ...]:
+    boxes = 50_000
+    row = [12.0, 12.0, 0.5, 1.0, 1.0, 9.0, 0.5, 0.0, 0.0, 2.0, 4.0]
     table = torch.tensor(row).repeat(boxes, 1)
-    return torch.arange(8 * boxes) // 8, 8 * torch.arange(boxes), table, torch.tensor([0, 4, 4])
+    order = torch.arange(boxes)
+    return torch.arange(4 * boxes) // 4, order, 4 * order, table, torch.tensor([0, 4])
+
+
+def _pairs_example() -> tuple[Tensor, ...]:
+    spans = torch.arange(50_000)
+    return torch.arange(200_000) // 4, 4 * spans, spans % 999, spans.int()
 
 
 DRAWING = Kernel(
@@ -507,16 +637,18 @@ DRAWING = Kernel(
 TABLE = Kernel(
     "table", _table_rows, lambda: (*_splat_example(), torch.full((2,), 9.0)), ("m",) * 4 + (None,)
 )
-REACH = Kernel("reach", _reach, _reach_example, ("p", "m", "m", None))
+SPANS = Kernel("spans", _spans, _spans_example, ("s", "m", "m", "m", None))
+PAIRS = Kernel("pairs", _pairs, _pairs_example, ("p", "s", "s", "s"))
 COMPOSITE = Kernel(
     "composite",
     _chunk,
     lambda: _tile_example(5),
-    ("m", *7 * ("t",), None, None, "t"),
+    ("m", "p", *8 * ("t",), None, None, "t"),
 )
-COMPOSITE_BACKWARD = Kernel(
+CHUNK_BACKWARD = Kernel(
     "composite-backward",
     _chunk_backward,
     lambda: _tile_example(6),
-    ("m", *8 * ("t",), None, None, "t"),
+    ("m", "p", *9 * ("t",), None, None, "t"),
 )
+CHUNK_SUMS = Kernel("composite-sums", _chunk_sums, _sums_example, ("m", "p", *5 * ("t",)))
