@@ -16,7 +16,8 @@ class Kernel:
     """One stage.
 
     function: tensors in, a tuple of tensors out; what it updates in place must be contiguous.
-    example: arguments to compile for.  sizes: of each argument the name of its leading size, None where that is fixed; sizes of one name are equal.
+    example: arguments to compile for.
+    sizes: of each argument the name of its leading size, None where that is fixed; sizes of one name are equal.
     """
 
     name: str
