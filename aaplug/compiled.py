@@ -24,7 +24,7 @@ from aaplug import projection, splats
 from aaplug.errors import UsageError, listing
 from aaplug.interfaces import Rasterizer
 from aaplug.kernels import CompiledKernels, Kernel, Package
-from aaplug.rasterizers import RASTERIZERS, Tiled, tiled
+from aaplug.rasterizers import RASTERIZERS, Tiled, pixels, tiled
 
 KERNELS: tuple[Kernel, ...] = (
     projection.PROJECT,
@@ -34,8 +34,9 @@ KERNELS: tuple[Kernel, ...] = (
     tiled.TABLE,
     tiled.SPANS,
     tiled.PAIRS,
-    tiled.COMPOSITE,
-    tiled.CHUNK_BACKWARD,
+    tiled.COMPOSITE["point"],
+    tiled.COMPOSITE["integral"],
+    tiled.CHUNK_BACKWARD["point"],
     tiled.CHUNK_SUMS,
 )
 OPTIONS = {
@@ -51,7 +52,7 @@ TOLERANCE = 1e-4  # between a package's answer and the eager one, on the example
 def cache_folder() -> Path:
     """Where the packages of this version on this processor are."""
     source = "".join(
-        inspect.getsource(module) for module in (kernels_module, projection, splats, tiled)
+        inspect.getsource(module) for module in (kernels_module, projection, splats, pixels, tiled)
     )
     facts = [torch.__version__, torch.backends.cpu.get_cpu_capability(), source, str(OPTIONS)]
     key = hashlib.sha256("\0".join(facts).encode()).hexdigest()[:16]

@@ -9,13 +9,17 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import median
-from typing import Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
 from aaplug.cameras import Camera
 from aaplug.gaussians import Convention, Gaussians
 from aaplug.kernels import Kernels
 from aaplug.sampling import SamplingBounds
 from aaplug.splats import Render, Splats2D
+
+# What alpha is at a pixel: the Gaussian's value at its centre, or its mean over the pixel by the normal distribution or
+# by Analytic-Splatting's logistic approximation of it (`rasterizers.pixels`).
+PixelKernel = Literal["point", "integral", "logistic"]
 
 
 @dataclass(frozen=True)
@@ -66,8 +70,8 @@ class ScreenFilter(Protocol):
 class Rasterizer(Protocol):
     """Composites splats front to back over a background.
 
-    The rules are 3DGS's: alpha = min(0.99, opacity·Gaussian at the pixel's centre), skipped below 1/255; a pixel stops
-    before the splat that would bring its transmittance under 1e-4; splats of equal depth are drawn in scene order.
+    The rules are 3DGS's: alpha = min(0.99, opacity·Gaussian at the pixel), skipped below 1/255; a pixel stops before
+    the splat that would bring its transmittance under 1e-4; splats of equal depth are drawn in scene order.
     """
 
     @property
@@ -76,7 +80,11 @@ class Rasterizer(Protocol):
         ...
 
     def __call__(
-        self, splats: Splats2D, hw: tuple[int, int], background: tuple[float, float, float]
+        self,
+        splats: Splats2D,
+        hw: tuple[int, int],
+        background: tuple[float, float, float],
+        pixel: PixelKernel = "point",
     ) -> Render:
         """Draw coloured splats into an image of height and width `hw`."""
         ...

@@ -13,9 +13,9 @@ from aaplug.cameras import BLACK, Camera
 from aaplug.errors import UsageError
 from aaplug.filters import fuse_stored
 from aaplug.gaussians import Gaussians
-from aaplug.interfaces import Rasterizer, ScreenFilter, Training
+from aaplug.interfaces import PixelKernel, Rasterizer, ScreenFilter, Training
 from aaplug.projection import project, shade
-from aaplug.rasterizers import RASTERIZERS, averaged
+from aaplug.rasterizers import RASTERIZERS, averaged, grown
 from aaplug.recipes import Recipe
 from aaplug.sampling import sampling_bounds
 from aaplug.splats import Render, Splats2D, drawn, joined
@@ -57,8 +57,9 @@ def render(
     """
     samples = recipe.samples_at(training.rate(camera))
     fine = camera.resized(camera.width * samples, camera.height * samples)
-    splats = splats_of(scene, fine, recipe.screen_at(training.rate(camera)), training, rasterizer)
-    return averaged(rasterizer(splats, fine.hw, background), samples)
+    screen = recipe.screen_at(training.rate(camera))
+    splats = splats_of(scene, fine, screen, training, rasterizer, recipe.pixel)
+    return averaged(rasterizer(splats, fine.hw, background, recipe.pixel), samples)
 
 
 def splats_of(
@@ -67,6 +68,7 @@ def splats_of(
     screen: ScreenFilter,
     training: Training,
     rasterizer: Rasterizer = RASTERIZERS["eager"],
+    pixel: PixelKernel = "point",
 ) -> Splats2D:
     """What a view draws: projected, filtered, inside the image, coloured.
 
@@ -77,7 +79,9 @@ def splats_of(
         part = scene if len(scene) <= PART else scene[start : start + PART]
         splats = project(part, camera, kernels)
         splats = replace(splats, sources=splats.sources + start)
-        splats = drawn(screen(splats, camera, training), camera.hw, training.guard, kernels)
+        splats = screen(splats, camera, training)
+        extents = None if pixel == "point" else grown(splats)
+        splats = drawn(splats, camera.hw, training.guard, kernels, extents)
         parts.append(shade(splats, scene, camera, kernels))
     splats = parts[0] if len(parts) == 1 else joined(parts)
     _check_colours(splats)

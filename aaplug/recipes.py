@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 from aaplug.errors import UsageError, listing
 from aaplug.filters import SCREEN_FILTERS, Matched, RateChoice, Smoothing3D
-from aaplug.interfaces import ScreenFilter, WorldFilter
+from aaplug.interfaces import PixelKernel, ScreenFilter, WorldFilter
 
 SAMPLING = {"fast": 0.0, "balanced": 0.5, "best": 1.0}  # rate·n that a quality asks for
 WHOLE = 1e-6  # slack before one more sample is taken
@@ -20,6 +20,7 @@ class Recipe:
     """How to render a scene.
 
     source: the paper or design that it follows.  when: what it is for, in a line.
+    grid: samples along a pixel's side that it takes at every rate.
     """
 
     name: str
@@ -28,10 +29,12 @@ class Recipe:
     when: str
     world: WorldFilter | None = None
     samples: float = 0.0
+    grid: int = 1
+    pixel: PixelKernel = "point"
 
     def samples_at(self, rate: float) -> int:
         """Samples along a pixel's side for a view at `rate` against training."""
-        return max(1, math.ceil(min(self.samples, 1.0) / rate - WHOLE)) if self.samples else 1
+        return max(self.grid, math.ceil(min(self.samples, 1.0) / rate - WHOLE))
 
     def screen_at(self, rate: float) -> ScreenFilter:
         """The screen filter for one sample of a view at `rate`."""
@@ -67,10 +70,52 @@ RECIPES: dict[str, Recipe] = {
             world=Smoothing3D(),
         ),
         Recipe(
+            "analytic",
+            SCREEN_FILTERS["none"],
+            "Analytic-Splatting (Liang et al. 2024): no dilation, alpha integrated over the pixel by the exact normal "
+            "distribution",
+            "scenes trained with it",
+            pixel="integral",
+        ),
+        Recipe(
+            "analytic-logistic",
+            SCREEN_FILTERS["none"],
+            "Analytic-Splatting (Liang et al. 2024) with its logistic approximation",
+            "parity with its published figures",
+            pixel="logistic",
+        ),
+        Recipe(
+            "sa-gs",
+            SCREEN_FILTERS["sa-gs"],
+            "SA-GS's 2D scale-adaptive filter (Song et al., arXiv 2403.19615): 0.3 r² px², one rate a view",
+            "comparison: matched without its second step",
+        ),
+        Recipe(
+            "sa-gs-integral",
+            SCREEN_FILTERS["sa-gs"],
+            "SA-GS's filter and integration, by standard deviation (its code divides by the variance)",
+            "comparison: it blurs what training had already blurred",
+            pixel="integral",
+        ),
+        Recipe(
+            "sa-gs-samples",
+            SCREEN_FILTERS["sa-gs"],
+            "SA-GS's filter and super-sampling, the background with the true transmittance",
+            "comparison: nine samples a pixel at every rate",
+            grid=3,
+        ),
+        Recipe(
             "matched",
             Matched(),
             "aaplug: training's dilation carried to the new rate, then the rest of the pixel's filter",
             "one sample a pixel: the fastest that is right",
+        ),
+        Recipe(
+            "matched-integral",
+            Matched(windowed=True),
+            "aaplug: matched, with Analytic-Splatting's integral over the rest of the pixel",
+            "one sample a pixel, a little sharper and slower",
+            pixel="integral",
         ),
         Recipe(
             "auto",

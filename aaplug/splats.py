@@ -24,7 +24,10 @@ MIN_COMPENSATION = (
 
 @dataclass(frozen=True)
 class Splats2D:
-    """What the rasterizer draws, in no particular order."""
+    """What the rasterizer draws, in no particular order.
+
+    window: side, in px, of the square that alpha is averaged over, where the pixel kernel averages at all.
+    """
 
     means: Float[Tensor, "m 2"]
     covs: Float[Tensor, "m 3"]  # xx, xy, yy in px²
@@ -33,6 +36,7 @@ class Splats2D:
     opacities: Float[Tensor, " m"]
     sources: Int[Tensor, " m"]  # index in the scene
     rgb: Float[Tensor, "m 3"] | None = None
+    window: float = 1.0
 
     def __len__(self) -> int:
         return self.means.shape[0]
@@ -53,6 +57,7 @@ class Splats2D:
             opacities=at(self.opacities),
             sources=at(self.sources),
             rgb=None if self.rgb is None else at(self.rgb),
+            window=self.window,
         )
 
     def to(self, dtype: torch.dtype) -> "Splats2D":
@@ -96,7 +101,8 @@ def joined(parts: Sequence[Splats2D]) -> Splats2D:
         for name in ("means", "covs", "dets", "depths", "opacities", "sources")
     }
     colours = [part.rgb for part in parts if part.rgb is not None]
-    return Splats2D(**columns, rgb=torch.cat(colours) if colours else None)
+    rgb = torch.cat(colours) if colours else None
+    return Splats2D(**columns, rgb=rgb, window=parts[0].window)
 
 
 class Render(NamedTuple):
@@ -132,6 +138,22 @@ def whitening_columns(
     )
 
 
+def principal_columns(
+    covs: Float[Tensor, "m 3"], dets: Float[Tensor, " m"]
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The four entries of the whitening whose rows run along each splat's own axes, the longer first."""
+    xx, xy, yy = covs.unbind(dim=1)
+    across, along = 2 * xy, xx - yy
+    round_ = (across == 0) & (along == 0)  # any axes will do, but there the angle has no gradient
+    angle = 0.5 * torch.atan2(across.where(~round_, 0.0), along.where(~round_, 1.0))
+    half = 0.5 * (xx + yy)
+    root = torch.hypot(0.5 * along.where(~round_, 1.0), xy)
+    longer = half + torch.where(round_, 0.0, root)
+    wide, thin = longer.rsqrt(), (longer / dets).sqrt()
+    cos, sin = angle.cos(), angle.sin()
+    return cos * wide, sin * wide, -sin * thin, cos * thin
+
+
 def reach(opacities: Float[Tensor, " m"]) -> Float[Tensor, " m"]:
     """Squared Mahalanobis distance at which alpha falls to 1/255; below zero for a splat that never reaches it."""
     return 2 * torch.log(opacities / MIN_ALPHA)
@@ -143,14 +165,20 @@ def half_sizes(splats: Splats2D) -> Float[Tensor, "m 2"]:
 
 
 def drawn(
-    splats: Splats2D, hw: tuple[int, int], guard: float = math.inf, kernels: Kernels = EAGER
+    splats: Splats2D,
+    hw: tuple[int, int],
+    guard: float = math.inf,
+    kernels: Kernels = EAGER,
+    extents: Splats2D | None = None,
 ) -> Splats2D:
     """The splats that can change an image of height and width `hw`; a splat of no area cannot.
 
     guard: leave out splats whose centre lies farther outside the image than this share of its longer side.
+    extents: the same splats, as wide as a pixel's centre may be from what it shows.
     """
     size = splats.means.new_tensor([hw[1], hw[0], guard * max(hw)])
-    (inside,) = kernels.run(INSIDE, splats.means, splats.covs, splats.dets, splats.opacities, size)
+    of = splats if extents is None else extents
+    (inside,) = kernels.run(INSIDE, of.means, of.covs, of.dets, of.opacities, size)
     return splats[inside]
 
 

@@ -419,6 +419,46 @@ def test_the_polynomial_that_compiled_loops_use_is_exp2(monkeypatch):
     assert relative.abs().max() < 2e-6
 
 
+# algorithms of Analytic-Splatting, o = 0.8: covariance, offset, and alpha by its logistic, exactly, and at the centre
+ANALYTIC = [
+    ((0.36, 0.0, 0.36), (0.0, 0.0), 0.642785, 0.641368, 0.800000),
+    ((0.36, 0.0, 0.36), (0.7, 0.2), 0.357458, 0.357462, 0.383178),
+    ((1.0, 0.3, 0.5), (0.0, 0.0), 0.693060, 0.690872, 0.800000),
+    ((1.0, 0.3, 0.5), (0.7, 0.2), 0.552017, 0.551579, 0.626087),
+    ((0.05, 0.0, 0.05), (0.0, 0.0), 0.238807, 0.238748, 0.800000),
+    ((0.05, 0.0, 0.05), (0.7, 0.2), 0.042340, 0.042402, 0.003993),
+]
+
+
+@pytest.mark.parametrize(("cov", "offset", "logistic", "exact", "point"), ANALYTIC)
+def test_pixel_kernels_have_the_published_values(rasterize, cov, offset, logistic, exact, point):
+    centre = (4.5 - offset[0], 4.5 - offset[1])
+    splats = splats_of((centre, cov, 1.0, 0.8, WHITE))
+    for pixel, expected in (("logistic", logistic), ("integral", exact), ("point", point)):
+        alpha = rasterize(splats, (8, 8), BLACK, pixel).alpha[4, 4].item()
+        assert alpha == pytest.approx(expected, abs=2e-6), pixel
+
+
+@pytest.mark.parametrize("pixel", ["integral", "logistic"])
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+@pytest.mark.parametrize("window", [0.0, 0.6, 1.0])
+def test_means_over_pixels_are_the_judges(pixel, dtype, window):
+    hw = (61, 83)
+    splats = replace(make_splats(500, hw, 8, (-3.0, 3.0)), window=window).to(dtype)
+    fast, judge = TILED(splats, hw, SKY, pixel), reference.rasterize(splats, hw, SKY, pixel)
+    difference = (fast.rgb - judge.rgb).abs().amax(dim=2)
+    assert (difference > 2 * TOLERANCE).double().mean() < 1e-3, "more than flips at a cut-off"
+    assert difference.max() < 0.01
+
+
+def test_the_integral_of_a_small_splat_is_its_energy():
+    splats = splats_of(((4.3, 4.6), (1e-6, 3e-7, 1e-6), 1.0, 0.9, WHITE))
+    energy = 0.9 * 2 * math.pi * math.sqrt(1e-12 - 9e-14)
+    many = replace(splats, opacities=splats.opacities * 1e5)
+    alpha = TILED(many, (8, 8), BLACK, "integral").alpha
+    assert alpha.sum().item() == pytest.approx(energy * 1e5, rel=1e-5)
+
+
 @pytest.mark.parametrize("which", ["none at all", "none in the image", "none opaque enough"])
 def test_without_splats_there_is_the_background(rasterize, which):
     splats = stack((0.5, RED))

@@ -16,6 +16,8 @@ SCREEN_FILTERS: dict[str, ScreenFilter] = {
     "classic": Dilation(0.3, compensated=False),
     "ewa": Dilation(0.3, compensated=True),
     "mip": Dilation(0.1, compensated=True),
+    "none": Dilation(0.0, compensated=False),
+    "sa-gs": Matched("global", pixel_variance=0.0),
     "matched": Matched("global"),
     "matched-sharpest": Matched("sharpest"),
     "matched-interval": Matched("interval"),

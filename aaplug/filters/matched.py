@@ -36,22 +36,27 @@ class Matched:
             if it is a pose of the data set; equals training's renderer inside the range and adapts outside, for
             cameras that move nearer or farther.
     pixel_variance: of the whole pixel's filter, in px²; 0 leaves the integration to several samples a pixel.
+    windowed: integrate over a window instead, for pixel kernels that do: as wide as makes its variance and that of
+        training's pixel one pixel's, √(1 − r²) px, and no wider than a point where r is not below 1.
     """
 
     rate: RateChoice = "global"
     pixel_variance: float = PIXEL_VARIANCE
+    windowed: bool = False
 
     def __call__(self, splats: Splats2D, camera: Camera, training: Training) -> Splats2D:
         """Filter the splats of one view."""
         rate = self.rates(splats, camera, training)
         trained = training.convention
         matched = splats.blurred(trained.kernel * rate * rate, trained.compensated)
+        if self.windowed:
+            return replace(matched, window=max(0.0, 1 - training.rate(camera) ** 2) ** 0.5)
         rest = self.pixel_variance * (1 - rate * rate).clamp(min=0.0)
         return matched.blurred(rest, compensate=True)
 
     def for_samples(self) -> "Matched":
         """Only the match: averaging the samples integrates over the pixel."""
-        return replace(self, pixel_variance=0.0)
+        return replace(self, pixel_variance=0.0, windowed=False)
 
     def rates(self, splats: Splats2D, camera: Camera, training: Training) -> Float[Tensor, " m"]:
         """Rate of each splat against the one that training saw; the view's own for Gaussians no camera saw."""

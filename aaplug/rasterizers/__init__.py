@@ -1,6 +1,7 @@
 """Rasterizers by name; a new one is a file here and a line below."""
 
 from aaplug.interfaces import Rasterizer
+from aaplug.rasterizers.pixels import grown
 from aaplug.rasterizers.reference import Reference
 from aaplug.rasterizers.supersampled import averaged
 from aaplug.rasterizers.tiled import Tiled
@@ -10,4 +11,4 @@ RASTERIZERS: dict[str, Rasterizer] = {
     "reference": Reference(),
 }
 
-__all__ = ["RASTERIZERS", "Reference", "Tiled", "averaged"]
+__all__ = ["RASTERIZERS", "Reference", "Tiled", "averaged", "grown"]

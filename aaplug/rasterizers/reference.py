@@ -4,18 +4,24 @@ h, w: the image; p: pixels of a strip; c: splats of a chunk.  No tiles, no exten
 by strips and chunks alone.  Differentiable through autograd.
 """
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.special import ndtr
 
+from aaplug.interfaces import PixelKernel
 from aaplug.kernels import EAGER, Kernels
+from aaplug.rasterizers.pixels import logistic
 from aaplug.rasterizers.rules import MAX_ALPHA, MIN_TRANSMITTANCE, over
-from aaplug.splats import MIN_ALPHA, Render, Splats2D, whitening
+from aaplug.splats import MIN_ALPHA, Render, Splats2D, principal_columns, whitening
 
 STRIP_PIXELS = 4096
 CHUNK_SPLATS = 512
+NARROWEST = 1e-5  # px: a window as narrow as this shows the value at a point, to ten digits
 
 
 @dataclass(frozen=True)
@@ -25,20 +31,27 @@ class Reference:
     kernels: Kernels = EAGER
 
     def __call__(
-        self, splats: Splats2D, hw: tuple[int, int], background: tuple[float, float, float]
+        self,
+        splats: Splats2D,
+        hw: tuple[int, int],
+        background: tuple[float, float, float],
+        pixel: PixelKernel = "point",
     ) -> Render:
         """Draw the splats in float64."""
-        return rasterize(splats, hw, background)
+        return rasterize(splats, hw, background, pixel)
 
 
 def rasterize(
-    splats: Splats2D, hw: tuple[int, int], background: tuple[float, float, float]
+    splats: Splats2D,
+    hw: tuple[int, int],
+    background: tuple[float, float, float],
+    pixel: PixelKernel = "point",
 ) -> Render:
     """Draw the splats in float64; the image comes back in float64."""
     splats = splats.to(torch.float64)
     splats = splats[torch.sort(splats.depths, stable=True).indices]
     centres = _pixel_centres(hw).to(splats.means.device)
-    strips = [_strip(splats, strip) for strip in centres.split(STRIP_PIXELS)]
+    strips = [_strip(splats, strip, pixel) for strip in centres.split(STRIP_PIXELS)]
     rgb = torch.cat([rgb for rgb, _ in strips]).reshape(*hw, 3)
     transmittance = torch.cat([t for _, t in strips]).reshape(hw)
     return over(rgb, 1 - transmittance, background)
@@ -50,14 +63,14 @@ def _pixel_centres(hw: tuple[int, int]) -> Float[Tensor, "p 2"]:
 
 
 def _strip(
-    splats: Splats2D, centres: Float[Tensor, "p 2"]
+    splats: Splats2D, centres: Float[Tensor, "p 2"], pixel: PixelKernel
 ) -> tuple[Float[Tensor, "p 3"], Float[Tensor, " p"]]:
     rgb = centres.new_zeros(len(centres), 3)
     transmittance = centres.new_ones(len(centres))
     going = torch.ones_like(transmittance, dtype=torch.bool)
     for start in range(0, len(splats), CHUNK_SPLATS):
         chunk = splats[start : start + CHUNK_SPLATS]
-        alpha = alphas(chunk, centres)
+        alpha = alphas(chunk, centres, pixel)
         after = transmittance[:, None] * (1 - alpha).cumprod(dim=1)
         before = torch.cat([transmittance[:, None], after[:, :-1]], dim=1)
         kept = (after >= MIN_TRANSMITTANCE) & going[
@@ -70,9 +83,34 @@ def _strip(
     return rgb, transmittance
 
 
-def alphas(splats: Splats2D, centres: Float[Tensor, "p 2"]) -> Float[Tensor, "p c"]:
-    """Alpha of each splat at each point: min(0.99, o·exp(−dᵀ C⁻¹ d / 2)), 0 below 1/255 (3DGS, eq. 4)."""
-    white = torch.einsum("cij,pcj->pci", whitening(splats), centres[:, None] - splats.means)
-    distance = white.square().sum(dim=2)
-    alpha = (splats.opacities * torch.exp(-0.5 * distance)).clamp(max=MAX_ALPHA)
+def alphas(
+    splats: Splats2D, centres: Float[Tensor, "p 2"], pixel: PixelKernel = "point"
+) -> Float[Tensor, "p c"]:
+    """Alpha of each splat at each pixel: min(0.99, o·g), 0 below 1/255 (3DGS, eq. 4).
+
+    g: exp(−dᵀ C⁻¹ d / 2) at the centre, or its mean over the pixel (Analytic-Splatting, eq. 11).
+    """
+    offsets = centres[:, None] - splats.means
+    if pixel == "point":
+        white = torch.einsum("cij,pcj->pci", whitening(splats), offsets)
+        values = torch.exp(-0.5 * white.square().sum(dim=2))
+    else:
+        values = _over_pixels(splats, offsets, logistic if pixel == "logistic" else ndtr)
+    alpha = (splats.opacities * values).clamp(max=MAX_ALPHA)
     return torch.where(alpha >= MIN_ALPHA, alpha, 0.0)
+
+
+def _over_pixels(
+    splats: Splats2D, offsets: Float[Tensor, "p c 2"], distribution: Callable[[Tensor], Tensor]
+) -> Float[Tensor, "p c"]:
+    """2π σ₁ σ₂ times the probabilities of a pixel's width along each axis."""
+    values = torch.ones_like(offsets[..., 0])
+    rows = principal_columns(splats.covs, splats.dets)
+    for x, y in (rows[:2], rows[2:]):
+        per_px = max(splats.window, NARROWEST) * torch.hypot(
+            x, y
+        )  # standard deviations in the window
+        u = x * offsets[..., 0] + y * offsets[..., 1]
+        probability = distribution(u + per_px / 2) - distribution(u - per_px / 2)
+        values = values * probability * math.sqrt(2 * math.pi) / per_px
+    return values

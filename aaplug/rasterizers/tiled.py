@@ -17,8 +17,9 @@ Bands of tile rows bound the memory: as many as the budget has room for candidat
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from math import log2
 from typing import Any
@@ -27,9 +28,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from aaplug.interfaces import PixelKernel
 from aaplug.kernels import EAGER, Kernel, Kernels
+from aaplug.rasterizers.pixels import grown, mean_gaussian, mean_logistic
 from aaplug.rasterizers.rules import MAX_ALPHA, MIN_TRANSMITTANCE, over
-from aaplug.splats import MIN_ALPHA, Render, Splats2D, reach, whitening_columns
+from aaplug.splats import MIN_ALPHA, Render, Splats2D, principal_columns, reach, whitening_columns
 
 TILE = 8  # px
 PASS = 8  # splats composited in one pass: more compile slowly, fewer load and store more
@@ -65,9 +68,9 @@ def _root_of_exp2(squarings: int, degree: int) -> tuple[float, ...]:
 SQUARINGS = 3
 ROOT_OF_EXP2 = _root_of_exp2(SQUARINGS, degree=6)  # relative error of the power: 1e-6 in float32
 
-# columns of a splat's drawing parameters
-UX, UY, VX, VY, X, Y, LOG2_OPACITY, RED, GREEN, BLUE = range(10)
-COLUMNS = 10
+# columns of a splat's drawing parameters; the last two only where alpha is a mean over the pixel
+UX, UY, VX, VY, X, Y, OPACITY, RED, GREEN, BLUE, HALF_U, HALF_V = range(12)
+COLUMNS, MEAN_COLUMNS = 10, 12
 BOX = 7  # where the box of tiles begins in a row of the table
 
 
@@ -82,14 +85,20 @@ class Tiled:
     memory: float = MEMORY
 
     def __call__(
-        self, splats: Splats2D, hw: tuple[int, int], background: tuple[float, float, float]
+        self,
+        splats: Splats2D,
+        hw: tuple[int, int],
+        background: tuple[float, float, float],
+        pixel: PixelKernel = "point",
     ) -> Render:
         """Draw the splats."""
         grid = (-(-hw[0] // TILE), -(-hw[1] // TILE))
-        drawing = drawing_of(splats, self.kernels)
+        drawing = drawing_of(splats, self.kernels, pixel)
+        extents = splats if pixel == "point" else grown(splats)
         rgb, alpha = [], []
-        for bins in bands(splats, grid, self.kernels, self.memory):
-            image = _untiled(composite(drawing, bins, self.kernels), grid[1])[:, : hw[1]]
+        for bins in bands(extents, grid, self.kernels, self.memory):
+            tiles = composite(drawing, bins, self.kernels, pixel)
+            image = _untiled(tiles, grid[1])[:, : hw[1]]
             part = over(image[..., :3], image[..., 3], background)
             rgb.append(part.rgb)
             alpha.append(part.alpha)
@@ -116,14 +125,18 @@ class Bins:
     origins: Float[Tensor, "t 2"]
 
 
-def drawing_of(splats: Splats2D, kernels: Kernels) -> Float[Tensor, "m 10"]:
-    """Linear forms, centre, log2 opacity and colour of each splat, and a last row that draws nothing."""
+def drawing_of(
+    splats: Splats2D, kernels: Kernels, pixel: PixelKernel = "point"
+) -> Float[Tensor, "m c"]:
+    """Linear forms, centre, opacity and colour of each splat, and a last row that draws nothing."""
     assert splats.rgb is not None
-    (rows,) = kernels.run(
-        DRAWING, splats.means, splats.covs, splats.dets, splats.opacities, splats.rgb
-    )
-    nothing = splats.means.new_zeros(1, COLUMNS)
-    nothing[:, LOG2_OPACITY] = LOG2_SILENT
+    columns = (splats.means, splats.covs, splats.dets, splats.opacities, splats.rgb)
+    if pixel == "point":
+        (rows,) = kernels.run(DRAWING, *columns)
+    else:
+        rows = _mean_rows(*columns, splats.window)
+    nothing = rows.new_zeros(1, rows.shape[1])
+    nothing[:, OPACITY] = LOG2_SILENT if pixel == "point" else 0.0
     return torch.cat([rows, nothing])
 
 
@@ -134,9 +147,25 @@ def _drawing_rows(
     opacities: Float[Tensor, " m"],
     rgb: Float[Tensor, "m 3"],
 ) -> tuple[Float[Tensor, "m 10"]]:
+    """Rows for values at points, the opacity as its log2."""
     forms = [HALF_LOG2_E**0.5 * form for form in whitening_columns(covs, dets)]
     columns = [*forms, *means.unbind(dim=1), opacities.log2(), *rgb.unbind(dim=1)]
     return (torch.stack(columns, dim=1),)
+
+
+def _mean_rows(
+    means: Float[Tensor, "m 2"],
+    covs: Float[Tensor, "m 3"],
+    dets: Float[Tensor, " m"],
+    opacities: Float[Tensor, " m"],
+    rgb: Float[Tensor, "m 3"],
+    window: float,
+) -> Float[Tensor, "m 12"]:
+    """Rows for means over pixels: forms along the splat's own axes, and the half windows, in standard deviations."""
+    ux, uy, vx, vy = principal_columns(covs, dets)
+    halves = [0.5 * window * torch.hypot(x, y) for x, y in ((ux, uy), (vx, vy))]
+    columns = [ux, uy, vx, vy, *means.unbind(dim=1), opacities, *rgb.unbind(dim=1), *halves]
+    return torch.stack(columns, dim=1)
 
 
 # --------------------------------------------------------------------------------------------------------- binning
@@ -285,12 +314,12 @@ def _pairs(
 
 
 def composite(
-    drawing: Float[Tensor, "m 10"], bins: Bins, kernels: Kernels
+    drawing: Float[Tensor, "m c"], bins: Bins, kernels: Kernels, pixel: PixelKernel = "point"
 ) -> Float[Tensor, "4 t P"]:
     """Premultiplied red, green, blue, and alpha, of every pixel of every tile."""
     if drawing.requires_grad and torch.is_grad_enabled():
-        return _Composite.apply(drawing, bins, kernels)  # pyright: ignore[reportReturnType]
-    return _forward(drawing, bins, kernels)
+        return _Composite.apply(drawing, bins, kernels, pixel)  # pyright: ignore[reportReturnType]
+    return _forward(drawing, bins, kernels, pixel)
 
 
 @dataclass(frozen=True)
@@ -308,9 +337,10 @@ class _Turn:
 
 
 def _forward(
-    drawing: Float[Tensor, "m 10"],
+    drawing: Float[Tensor, "m c"],
     bins: Bins,
     kernels: Kernels,
+    pixel: PixelKernel,
     turns: list[_Turn] | None = None,
 ) -> Float[Tensor, "4 all P"]:
     """The image; the turns that made it are put into `turns`, in order."""
@@ -318,16 +348,17 @@ def _forward(
     order = torch.sort(bins.counts, descending=True, stable=True).indices
     order = order[: int((bins.counts > 0).sum())]
     for tiles in order.split(kernels.tiles):
-        _composite_block(drawing, bins, tiles, image, kernels, turns)
+        _composite_block(drawing, bins, tiles, image, kernels, COMPOSITE[pixel], turns)
     return image
 
 
 def _composite_block(
-    drawing: Float[Tensor, "m 10"],
+    drawing: Float[Tensor, "m c"],
     bins: Bins,
     tiles: Int[Tensor, " t"],
     image: Float[Tensor, "4 all P"],
     kernels: Kernels,
+    chunk: Kernel,
     turns: list[_Turn] | None,
 ) -> None:
     """Composite some tiles, longest first, into the image, until they are drawn out or saturated."""
@@ -347,7 +378,7 @@ def _composite_block(
             if turns is not None:
                 before.append(state[0, :n].clone())
             columns = (bins.splats, at[:n] + turn * PASS, ends[:n], origins[:n])
-            kernels.run(COMPOSITE, drawing, *columns, *state[:, :n].unbind(), *local, ones[:n])
+            kernels.run(chunk, drawing, *columns, *state[:, :n].unbind(), *local, ones[:n])
             start += PASS
             if turn % CHECK_EVERY == CHECK_EVERY - 1 and turn + 1 < len(going):
                 left = going[turn + 1]
@@ -373,8 +404,12 @@ def _pixel_centres(like: Tensor) -> tuple[Float[Tensor, " P"], Float[Tensor, " P
     return x.flatten(), y.flatten()
 
 
+AlphaOf = Callable[[Tensor, Tensor, Tensor], Tensor]  # of a row a tile, at pixel centres x and y
+
+
 def _chunk(
-    drawing: Float[Tensor, "m 10"],
+    alpha_of: AlphaOf,
+    drawing: Float[Tensor, "m c"],
     ids: Int[Tensor, " p"],
     at: Int[Tensor, " t"],
     ends: Int[Tensor, " t"],
@@ -396,7 +431,7 @@ def _chunk(
     before = T
     for k in range(PASS):
         row = _row(drawing, ids, at + k, ends)
-        _, _, _, _, alpha = _alpha(row, x, y)
+        alpha = alpha_of(row, x, y)
         after = before * _left(alpha, one[:, None])
         weight = _where_above(BELOW_MIN_TRANSMITTANCE, after, before - after)
         before = after
@@ -409,24 +444,42 @@ def _chunk(
 
 
 def _row(
-    drawing: Float[Tensor, "m 10"],
+    drawing: Float[Tensor, "m c"],
     ids: Int[Tensor, " p"],
     at: Int[Tensor, " t"],
     ends: Int[Tensor, " t"],
-) -> Float[Tensor, "t 10"]:
+) -> Float[Tensor, "t c"]:
     """The splat that each tile draws, or the one that draws nothing after the tile's last."""
     return drawing[torch.where(at < ends, ids[at], -1)]
 
 
-def _alpha(
-    row: Float[Tensor, "t 10"], x: Float[Tensor, "t P"], y: Float[Tensor, "t P"]
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Offset from the centre in px, the two forms, and alpha before its cap, of one splat a tile."""
+def _at_centre(
+    row: Float[Tensor, "t c"], x: Float[Tensor, "t P"], y: Float[Tensor, "t P"]
+) -> Float[Tensor, "t P"]:
+    """Alpha, before its cap, of one splat a tile at the pixels' centres."""
+    u, v = _forms(row, x, y)
+    return _audible_exp2(row[:, OPACITY, None] - u * u - v * v)
+
+
+def _forms(
+    row: Float[Tensor, "t c"], x: Float[Tensor, "t P"], y: Float[Tensor, "t P"]
+) -> tuple[Float[Tensor, "t P"], Float[Tensor, "t P"]]:
     dx, dy = x - row[:, X, None], y - row[:, Y, None]
     u = row[:, UX, None] * dx + row[:, UY, None] * dy
-    v = row[:, VX, None] * dx + row[:, VY, None] * dy
-    exponent = row[:, LOG2_OPACITY, None] - u * u - v * v
-    return dx, dy, u, v, _audible_exp2(exponent)
+    return u, row[:, VX, None] * dx + row[:, VY, None] * dy
+
+
+def _over_pixel(
+    mean: Callable[[Tensor, Tensor], Tensor],
+    row: Float[Tensor, "t c"],
+    x: Float[Tensor, "t P"],
+    y: Float[Tensor, "t P"],
+) -> Float[Tensor, "t P"]:
+    """Alpha, before its cap, of one splat a tile: opacity times its means over a pixel's width along both axes."""
+    alpha = row[:, OPACITY, None]
+    for form, half in zip(_forms(row, x, y), (HALF_U, HALF_V), strict=True):
+        alpha = alpha * mean(form, row[:, half, None])
+    return torch.threshold(alpha, BELOW_MIN_ALPHA, 0.0)
 
 
 def _left(alpha: Float[Tensor, "t P"], one: Float[Tensor, "t 1"]) -> Float[Tensor, "t P"]:
@@ -474,27 +527,30 @@ class _Composite(torch.autograd.Function):
     """Compositing with its own backward pass."""
 
     @staticmethod
-    def forward(ctx: Any, drawing: Tensor, bins: Bins, kernels: Kernels) -> Tensor:
-        ctx.turns = []
-        image = _forward(drawing, bins, kernels, ctx.turns)
+    def forward(
+        ctx: Any, drawing: Tensor, bins: Bins, kernels: Kernels, pixel: PixelKernel
+    ) -> Tensor:
+        turns: list[_Turn] = []
+        image = _forward(drawing, bins, kernels, pixel, turns)
         ctx.save_for_backward(drawing, image)
-        ctx.bins, ctx.kernels = bins, kernels
+        ctx.rest = (bins, turns, kernels, pixel)
         return image
 
     @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None, None]:
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None, None, None]:
         drawing, image = ctx.saved_tensors
-        return _backward(drawing, image, grads[0], ctx.bins, ctx.turns, ctx.kernels), None, None
+        return _backward(drawing, image, grads[0], *ctx.rest), None, None, None
 
 
 def _backward(
-    drawing: Float[Tensor, "m 10"],
+    drawing: Float[Tensor, "m c"],
     image: Float[Tensor, "4 all P"],
     grad: Float[Tensor, "4 all P"],
     bins: Bins,
     turns: list[_Turn],
     kernels: Kernels,
-) -> Float[Tensor, "m 10"]:
+    pixel: PixelKernel,
+) -> Float[Tensor, "m c"]:
     """Gradient of the drawing parameters."""
     rest = (image * grad).sum(dim=0)
     local = _pixel_centres(drawing)
@@ -508,13 +564,53 @@ def _backward(
             at, ends = turn.splats
             where = (bins.splats, at[:n] + i * PASS, ends[:n])
             pixels = (before, left[:n], *grads[:, :n].unbind(), *local, ones[:n])
-            weights, moves = kernels.run(CHUNK_BACKWARD, drawing, *where, turn.origins[:n], *pixels)
-            sums = (moves @ monomials, torch.bmm(weights, colours[:n]))
-            owners, added = kernels.run(CHUNK_SUMS, drawing, *where, turn.origins[:n], *sums)
-            owners = owners.view(-1, 1).expand(-1, COLUMNS)
-            total.scatter_add_(0, owners, added.view(-1, COLUMNS))
+            weights, moves = kernels.run(
+                CHUNK_BACKWARD[pixel], drawing, *where, turn.origins[:n], *pixels
+            )
+            splats = (drawing, *where, turn.origins[:n])
+            by_colour = torch.bmm(weights, colours[:n])
+            if pixel == "point":
+                owners, added = kernels.run(CHUNK_SUMS, *splats, moves @ monomials, by_colour)
+            else:
+                owners, added = _sums_by_autograd(ALPHA[pixel], *splats, moves, by_colour)
+            owners = owners.view(-1, 1).expand(-1, drawing.shape[1])
+            total.scatter_add_(0, owners, added.view(-1, drawing.shape[1]))
         rest.index_copy_(0, turn.tiles, left)
     return total
+
+
+def _sums_by_autograd(
+    alpha_of: AlphaOf,
+    drawing: Float[Tensor, "m c"],
+    ids: Int[Tensor, " p"],
+    at: Int[Tensor, " t"],
+    ends: Int[Tensor, " t"],
+    origins: Float[Tensor, "t 2"],
+    moves: Float[Tensor, "t K P"],
+    colours: Float[Tensor, "t K 3"],
+) -> tuple[Int[Tensor, "t K"], Float[Tensor, "t K c"]]:
+    """What `_chunk_sums` gives, for any kernel: from the gradient of log2 alpha by autograd of alpha."""
+    owners = _owners(drawing, ids, at, ends)
+    local_x, local_y = _pixel_centres(drawing)
+    x, y = origins[:, 0, None] + local_x, origins[:, 1, None] + local_y
+    with torch.enable_grad():
+        rows = drawing[owners].detach().requires_grad_()
+        alpha = torch.stack([alpha_of(row, x, y) for row in rows.unbind(dim=1)], dim=1)
+        grads = torch.where(alpha > 0, moves / (LN_2 * alpha), 0.0).detach()
+        (added,) = torch.autograd.grad(alpha, rows, grads)
+    added[..., RED : BLUE + 1] = colours
+    return owners, added
+
+
+def _owners(
+    drawing: Float[Tensor, "m c"],
+    ids: Int[Tensor, " p"],
+    at: Int[Tensor, " t"],
+    ends: Int[Tensor, " t"],
+) -> Int[Tensor, "t K"]:
+    """The splat of each of K places of a tile, or the one that draws nothing."""
+    place = at[:, None] + torch.arange(PASS, device=at.device)
+    return torch.where(place < ends[:, None], ids[place], drawing.shape[0] - 1).long()
 
 
 def _monomials(like: Tensor) -> Float[Tensor, "P 6"]:
@@ -524,7 +620,8 @@ def _monomials(like: Tensor) -> Float[Tensor, "P 6"]:
 
 
 def _chunk_backward(
-    drawing: Float[Tensor, "m 10"],
+    alpha_of: AlphaOf,
+    drawing: Float[Tensor, "m c"],
     ids: Int[Tensor, " p"],
     at: Int[Tensor, " t"],
     ends: Int[Tensor, " t"],
@@ -539,20 +636,20 @@ def _chunk_backward(
     local_y: Float[Tensor, " P"],
     one: Float[Tensor, " t"],
 ) -> tuple[Float[Tensor, "t K P"], Float[Tensor, "t K P"]]:
-    """The weight of each of K splats, and the gradient of its exponent, at each pixel; takes its share from `rest`."""
+    """The weight of each of K splats, and the gradient of log2 alpha, at each pixel; takes its share from `rest`."""
     x, y = origins[:, 0, None] + local_x, origins[:, 1, None] + local_y
     weights, gradients = [], []
     behind = rest
     for k in range(PASS):
         row = _row(drawing, ids, at + k, ends)
-        _, _, _, _, alpha = _alpha(row, x, y)
+        alpha = alpha_of(row, x, y)
         left = _left(alpha, one[:, None])
         after = T * left
         weight = _where_above(BELOW_MIN_TRANSMITTANCE, after, T - after)
         colour = row[:, RED, None] * g_red + row[:, GREEN, None] * g_green
         colour = colour + row[:, BLUE, None] * g_blue + g_hidden
         behind = behind - weight * colour
-        # d alpha / d exponent = alpha ln 2, where alpha is neither skipped (then it is 0) nor capped nor too late
+        # d alpha / d log2 alpha = alpha ln 2, where alpha is neither skipped (then it is 0) nor capped nor too late
         moves = _where_above(BELOW_MIN_TRANSMITTANCE, after, LN_2 * alpha)
         moves = _where_above(0.0, MAX_ALPHA - alpha, moves)
         weights.append(weight)
@@ -575,8 +672,7 @@ def _chunk_sums(
 
     moments: sums over pixels of the gradient of the exponent, log2 o − u² − v², times the monomials.
     """
-    place = at[:, None] + torch.arange(PASS, device=at.device)
-    owners = torch.where(place < ends[:, None], ids[place], drawing.shape[0] - 1).long()
+    owners = _owners(drawing, ids, at, ends)
     ux, uy, vx, vy, x, y, *_ = drawing[owners].unbind(dim=2)
     dx, dy = origins[:, 0, None] + TILE / 2 - x, origins[:, 1, None] + TILE / 2 - y
     s, sx, sy, sxx, sxy, syy = moments.unbind(dim=2)
@@ -596,9 +692,9 @@ def _chunk_sums(
 # Examples are as large as real work: the compiler decides by them which loops run in threads.
 
 
-def _tile_example(states: int) -> tuple[Tensor, ...]:
+def _tile_example(states: int, columns: int = COLUMNS) -> tuple[Tensor, ...]:
     tiles, rows = 1024, 4096
-    drawing = torch.linspace(0.01, 0.1, rows * COLUMNS).view(rows, COLUMNS)
+    drawing = torch.linspace(0.01, 0.1, rows * columns).view(rows, columns)
     ids = torch.arange((tiles + 1) * PASS, dtype=torch.int32) % rows
     at = torch.arange(tiles) * PASS
     state = [torch.full((tiles, TILE * TILE), 0.5) for _ in range(states)]
@@ -639,16 +735,30 @@ TABLE = Kernel(
 )
 SPANS = Kernel("spans", _spans, _spans_example, ("s", "m", "m", "m", None))
 PAIRS = Kernel("pairs", _pairs, _pairs_example, ("p", "s", "s", "s"))
-COMPOSITE = Kernel(
-    "composite",
-    _chunk,
-    lambda: _tile_example(5),
-    ("m", "p", *8 * ("t",), None, None, "t"),
-)
-CHUNK_BACKWARD = Kernel(
-    "composite-backward",
-    _chunk_backward,
-    lambda: _tile_example(6),
-    ("m", "p", *9 * ("t",), None, None, "t"),
-)
+ALPHA: dict[PixelKernel, AlphaOf] = {
+    "point": _at_centre,
+    "integral": partial(_over_pixel, mean_gaussian),
+    "logistic": partial(_over_pixel, mean_logistic),
+}
+WIDTH: dict[PixelKernel, int] = {
+    name: COLUMNS if name == "point" else MEAN_COLUMNS for name in ALPHA
+}
+COMPOSITE: dict[PixelKernel, Kernel] = {
+    name: Kernel(
+        f"composite-{name}",
+        partial(_chunk, alpha_of),
+        partial(_tile_example, 5, WIDTH[name]),
+        ("m", "p", *8 * ("t",), None, None, "t"),
+    )
+    for name, alpha_of in ALPHA.items()
+}
+CHUNK_BACKWARD: dict[PixelKernel, Kernel] = {
+    name: Kernel(
+        f"composite-{name}-backward",
+        partial(_chunk_backward, alpha_of),
+        partial(_tile_example, 6, WIDTH[name]),
+        ("m", "p", *9 * ("t",), None, None, "t"),
+    )
+    for name, alpha_of in ALPHA.items()
+}
 CHUNK_SUMS = Kernel("composite-sums", _chunk_sums, _sums_example, ("m", "p", *5 * ("t",)))
