@@ -18,4 +18,6 @@ def over(
     rgb: Float[Tensor, "h w 3"], alpha: Float[Tensor, "h w"], background: tuple[float, float, float]
 ) -> Render:
     """Put an image of premultiplied colours over a background."""
-    return Render(rgb + (1 - alpha)[..., None] * rgb.new_tensor(background), alpha)
+    if not any(background):  # black adds nothing
+        return Render(rgb, alpha)
+    return Render(torch.addcmul(rgb, (1 - alpha)[..., None], rgb.new_tensor(background)), alpha)

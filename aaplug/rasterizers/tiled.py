@@ -95,14 +95,12 @@ class Tiled:
         grid = (-(-hw[0] // TILE), -(-hw[1] // TILE))
         drawing = drawing_of(splats, self.kernels, pixel)
         extents = splats if pixel == "point" else grown(splats)
-        rgb, alpha = [], []
-        for bins in bands(extents, grid, self.kernels, self.memory):
-            tiles = composite(drawing, bins, self.kernels, pixel)
-            image = _untiled(tiles, grid[1])[:, : hw[1]]
-            part = over(image[..., :3], image[..., 3], background)
-            rgb.append(part.rgb)
-            alpha.append(part.alpha)
-        return Render(torch.cat(rgb)[: hw[0]], torch.cat(alpha)[: hw[0]])
+        planes = [
+            _untiled(composite(drawing, bins, self.kernels, pixel), grid[1])[:, : hw[1]]
+            for bins in bands(extents, grid, self.kernels, self.memory)
+        ]
+        image = (planes[0] if len(planes) == 1 else torch.cat(planes))[: hw[0]]
+        return over(image[..., :3], image[..., 3], background)
 
 
 def _untiled(tiles: Float[Tensor, "4 t P"], columns: int) -> Float[Tensor, "h w 4"]:
@@ -465,8 +463,8 @@ def _forms(
     row: Float[Tensor, "t c"], x: Float[Tensor, "t P"], y: Float[Tensor, "t P"]
 ) -> tuple[Float[Tensor, "t P"], Float[Tensor, "t P"]]:
     dx, dy = x - row[:, X, None], y - row[:, Y, None]
-    u = row[:, UX, None] * dx + row[:, UY, None] * dy
-    return u, row[:, VX, None] * dx + row[:, VY, None] * dy
+    u = torch.addcmul(row[:, UX, None] * dx, row[:, UY, None], dy)
+    return u, torch.addcmul(row[:, VX, None] * dx, row[:, VY, None], dy)
 
 
 def _over_pixel(
