@@ -28,7 +28,9 @@ from aaplug.rasterizers import RASTERIZERS, Tiled, pixels, tiled
 
 KERNELS: tuple[Kernel, ...] = (
     projection.PROJECT,
+    projection.PROJECT_BACKWARD,
     *projection.SHADE.values(),
+    *projection.SHADE_BACKWARD.values(),
     splats.INSIDE,
     tiled.DRAWING,
     tiled.TABLE,
@@ -46,7 +48,9 @@ OPTIONS = {
 }
 LARGEST_SIZE = 1 << 31
 FRAMES_THAT_PAY = 300  # a frame of 800² saves about 0.4 s, and compiling takes about 90 s
-TOLERANCE = 1e-4  # between a package's answer and the eager one, on the example
+TOLERANCE = (
+    1e-4  # of the largest value: between a package's answer and the eager one, on the example
+)
 
 
 def cache_folder() -> Path:
@@ -66,14 +70,21 @@ def has_compiler() -> bool:
 
 
 def load() -> CompiledKernels | None:
-    """The compiled kernels, if all of them are built and sound."""
+    """The compiled kernels, if all of them are built and those for images are sound.
+
+    Those for gradients are loaded when they are first needed, and left to the eager functions if they are broken.
+    """
+    if not all(_path(kernel).is_file() for kernel in KERNELS):
+        return None
     packages = {}
     for kernel in KERNELS:
-        package = _load(kernel)
-        if package is None:
-            return None
-        packages[kernel.name] = package
-    return CompiledKernels(packages)
+        if not kernel.pulls_back:
+            package = _load(kernel)
+            if package is None:
+                return None
+            packages[kernel.name] = package
+    pulling = {kernel.name: kernel for kernel in KERNELS if kernel.pulls_back}
+    return CompiledKernels(packages, lambda name: _load(pulling[name]) if name in pulling else None)
 
 
 def build(
@@ -137,15 +148,17 @@ def _load(kernel: Kernel) -> Package | None:
         package = loader(str(path), "model", True, 1, -1).run
         args, twins = kernel.example(), kernel.example()
         with torch.no_grad():  # what comes back, and what was updated in place
-            answers = zip(
-                [*package(list(args)), *args], [*kernel.function(*twins), *twins], strict=True
-            )
-            close = all(
-                torch.allclose(a.double(), b.double(), TOLERANCE, TOLERANCE) for a, b in answers
-            )
+            found = [*package(list(args)), *args]
+            expected = [*kernel.function(*twins), *twins]
+        close = all(_close(a, b) for a, b in zip(found, expected, strict=True))
         return Package(package, tuple(arg.dtype for arg in args)) if close else None
     except Exception:  # a broken package can fail in any way; it is built anew
         return None
+
+
+def _close(found: torch.Tensor, expected: torch.Tensor) -> bool:
+    found, expected = found.double(), expected.double()
+    return bool((found - expected).abs().max() <= TOLERANCE * (1 + expected.abs().max()))
 
 
 def _build(kernel: Kernel) -> None:
@@ -162,9 +175,18 @@ def _build(kernel: Kernel) -> None:
     shapes = tuple({0: sizes[name]} if name is not None else None for name in kernel.sizes)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        from torch.fx.experimental.proxy_tensor import make_fx  # takes a second
+
         with tempfile.TemporaryDirectory(dir=path.parent) as folder, _quiet(), torch.no_grad():
-            module = _Module(kernel)
-            program = torch.export.export(module, kernel.example(), dynamic_shapes=(shapes,))
+            args = kernel.example()
+            module = (
+                make_fx(kernel.function, tracing_mode="symbolic")(*args)
+                if kernel.pulls_back
+                else _Module(kernel)
+            )
+            program = torch.export.export(
+                module, args, dynamic_shapes=shapes if kernel.pulls_back else (shapes,)
+            )
             made = torch._inductor.aoti_compile_and_package(
                 program, package_path=str(Path(folder) / "k.pt2"), inductor_configs=dict(OPTIONS)
             )

@@ -4,11 +4,14 @@ A kernel is a function of tensors.  Run eagerly it is plain array code that any 
 use; `aaplug.compiled` turns the same source into one fused loop ahead of time.  A stage asks its `Kernels` to run it.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
+
+BACKWARD = "-backward"  # after the name of a kernel, the name of the one for its gradients
 
 
 @dataclass(frozen=True)
@@ -24,6 +27,38 @@ class Kernel:
     function: Callable[..., tuple[Tensor, ...]]
     example: Callable[[], tuple[Tensor, ...]]
     sizes: tuple[str | None, ...]
+    pulls_back: bool = (
+        False  # the function takes gradients itself, so that it is traced before it is compiled
+    )
+
+
+def backward_of(kernel: Kernel, answers: tuple[str, ...]) -> Kernel:
+    """The kernel that gives the gradient of each floating point argument of a kernel without side effects.
+
+    It takes the arguments and the gradients of the answers, whose leading sizes have the names `answers`.
+    """
+    count = len(kernel.sizes)
+
+    def function(*args: Tensor) -> tuple[Tensor, ...]:
+        inputs, grads = args[:count], args[count:]
+        moving = [i for i, arg in enumerate(inputs) if arg.is_floating_point()]
+
+        def of(*values: Tensor) -> tuple[Tensor, ...]:
+            filled = list(inputs)
+            for i, value in zip(moving, values, strict=True):
+                filled[i] = value
+            return kernel.function(*filled)
+
+        pull = torch.func.vjp(of, *(inputs[i] for i in moving))[1]
+        return tuple(pull(grads))
+
+    def example() -> tuple[Tensor, ...]:
+        args = kernel.example()
+        found = kernel.function(*args)
+        return *args, *(torch.linspace(-1.0, 1.0, x.numel()).to(x).view_as(x) for x in found)
+
+    sizes = (*kernel.sizes, *answers)
+    return Kernel(kernel.name + BACKWARD, function, example, sizes, pulls_back=True)
 
 
 class Kernels:
@@ -48,9 +83,8 @@ class Package:
     dtypes: tuple[torch.dtype, ...]
 
     def takes(self, args: tuple[Tensor, ...]) -> bool:
-        """Whether it can run these: no gradients, and no sizes of one, which are a case of their own to compilers."""
-        tracked = torch.is_grad_enabled() and any(arg.requires_grad for arg in args)
-        return not tracked and all(
+        """Whether it can run these; sizes of one are a case of their own to compilers."""
+        return all(
             arg.dtype == dtype and arg.device.type == "cpu" and len(arg) > 1
             for arg, dtype in zip(args, self.dtypes, strict=True)
         )
@@ -62,15 +96,46 @@ class CompiledKernels(Kernels):
     name = "compiled"
     tiles = 4096
 
-    def __init__(self, packages: dict[str, Package]):
-        self._packages = packages
+    def __init__(
+        self,
+        packages: Mapping[str, Package],
+        later: Callable[[str], Package | None] = lambda name: None,
+    ):
+        """packages: by the names of their kernels.  later: gives those that are loaded when they are first needed."""
+        self._packages: dict[str, Package | None] = dict(packages)
+        self._later = later
 
     def run(self, kernel: Kernel, *args: Tensor) -> tuple[Tensor, ...]:
         """Run one stage."""
         package = self._packages.get(kernel.name)
         if package is None or not package.takes(args):
             return super().run(kernel, *args)
-        return tuple(package.run([arg.contiguous() for arg in args]))
+        if not (torch.is_grad_enabled() and any(arg.requires_grad for arg in args)):
+            return tuple(package.run([arg.contiguous() for arg in args]))
+        name = kernel.name + BACKWARD
+        if name not in self._packages:
+            self._packages[name] = self._later(name)
+        backward = self._packages[name]
+        if backward is None:
+            return super().run(kernel, *args)
+        return _Tracked.apply(package, backward, *args)  # pyright: ignore[reportReturnType]
+
+
+class _Tracked(torch.autograd.Function):
+    """A compiled kernel with a compiled backward pass, which computes what it needs anew."""
+
+    @staticmethod
+    def forward(ctx: Any, package: Package, backward: Package, *args: Tensor) -> tuple[Tensor, ...]:
+        args = tuple(arg.contiguous() for arg in args)
+        ctx.save_for_backward(*args)
+        ctx.package = backward
+        return tuple(package.run(list(args)))
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        args = ctx.saved_tensors
+        found = iter(ctx.package.run([*args, *(grad.contiguous() for grad in grads)]))
+        return None, None, *(next(found) if arg.is_floating_point() else None for arg in args)
 
 
 EAGER = Kernels()

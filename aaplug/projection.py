@@ -15,7 +15,7 @@ from torch import Tensor
 
 from aaplug.cameras import NEAR, Camera
 from aaplug.gaussians import MAX_LOG_SCALE, Gaussians
-from aaplug.kernels import EAGER, Kernel, Kernels
+from aaplug.kernels import EAGER, Kernel, Kernels, backward_of
 from aaplug.splats import Splats2D
 
 JACOBIAN_MARGIN = 0.3  # of half the image at depth 1: 3DGS linearises no farther out (1.3 tan(fov/2) when centred)
@@ -181,15 +181,18 @@ def _shade_example(coefficients: int) -> tuple[Tensor, ...]:
 
 
 def _project_example() -> tuple[Tensor, ...]:
-    means = torch.linspace(1.0, 2.0, EXAMPLE_SIZE * 3).view(-1, 3)
-    quats = torch.linspace(0.1, 1.0, EXAMPLE_SIZE * 4).view(-1, 4)
-    centre = torch.zeros(3, dtype=torch.float64)
-    lens = torch.tensor([9.0, 9.0, 4.0, 4.0, -2.0, 2.0, -2.0, 2.0])
-    return means, quats, -means, centre, torch.eye(3), lens
+    draw = torch.Generator().manual_seed(0)
+    means, log_scales = torch.rand(2, EXAMPLE_SIZE, 3, generator=draw).unbind()
+    quats = torch.randn(EXAMPLE_SIZE, 4, generator=draw)
+    centre = torch.tensor([0.5, 0.5, -2.0], dtype=torch.float64)
+    lens = torch.tensor([90.0, 90.0, 40.0, 40.0, -0.5, 0.5, -0.5, 0.5])
+    return means, quats, log_scales - 4, centre, torch.eye(3), lens
 
 
 PROJECT = Kernel("project", _project, _project_example, ("n", "n", "n", None, None, None))
+PROJECT_BACKWARD = backward_of(PROJECT, ("n", "n", "n", "n"))
 SHADE = {
     k: Kernel(f"shade-{k}", _shade, partial(_shade_example, k), ("n", "n", "m", None))
     for k in (4, 9, 16)
 }
+SHADE_BACKWARD = {k: backward_of(kernel, ("m",)) for k, kernel in SHADE.items()}

@@ -39,7 +39,8 @@ def test_compiled_kernels_give_the_eager_answer(built, kernel: Kernel):
     for fast, slow in answers:  # what comes back, and what was updated in place
         assert fast.dtype == slow.dtype
         # behind a splat of alpha 0.99 a gradient has a hundred times the rounding of its alpha
-        torch.testing.assert_close(fast.double(), slow.double(), rtol=10 * ANSWER, atol=ANSWER)
+        scale = 1 + slow.double().abs().max()
+        assert (fast.double() - slow.double()).abs().max() < 10 * ANSWER * scale
 
 
 @pytest.mark.parametrize("recipe", RECIPES)
