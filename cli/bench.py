@@ -114,35 +114,31 @@ def _exponents(runs: list[Figures]) -> dict[str, float]:
     return found
 
 
+def _scene(run: Figures) -> str:
+    """Size of the scene and of the image, in little room."""
+    for unit, mark in ((1e6, "M"), (1e3, "k")):
+        if run.gaussians >= 10 * unit or run.gaussians % unit == 0:
+            return f"{run.gaussians / unit:.0f}{mark} {run.width}x{run.height}"
+    return f"{run.gaussians} {run.width}x{run.height}"
+
+
 def _table(runs: list[Figures]) -> Table:
-    table = Table(
-        title=f"medians; matmul is a 2048³ float32 product, {torch.get_num_threads()} threads"
-    )
-    names = (
-        "Gaussians",
-        "size",
-        "rasterizer",
-        "forward",
-        "+ backward",
-        "/ matmul",
-        "Mpairs",
-        "ns/pair",
-        "peak",
-    )
+    threads = torch.get_num_threads()
+    table = Table(title=f"medians, ms; matmul is a 2048³ float32 product, {threads} threads")
+    names = ("scene", "", "forward", "+ back", "matmul", "share", "Mpairs", "ns/pair", "GB")
     for name in names:
-        table.add_column(name, justify="left" if name == "rasterizer" else "right")
+        table.add_column(name, justify="left" if name == "" else "right")
     for run in runs:
-        both = "" if run.forward_backward_ms is None else f"{run.forward_backward_ms:.0f} ms"
         table.add_row(
-            f"{run.gaussians:,}",
-            f"{run.width}x{run.height}",
+            _scene(run),
             run.rasterizer,
-            f"{run.forward_ms:.0f} ms",
-            both,
+            f"{run.forward_ms:.0f}",
+            "" if run.forward_backward_ms is None else f"{run.forward_backward_ms:.0f}",
+            f"{run.matmul_ms:.0f}",
             f"{run.share:.2f}",
             f"{run.pairs / 1e6:.0f}",
             f"{run.ns_per_pair:.2f}",
-            f"{run.peak_bytes / 1e9:.1f} GB",
+            f"{run.peak_bytes / 1e9:.1f}",
         )
     return table
 
@@ -150,10 +146,9 @@ def _table(runs: list[Figures]) -> Table:
 def _stages(runs: list[Figures]) -> Table:
     table = Table(title="stages, ms")
     names = list(runs[0].stages_ms)
-    for name in ("Gaussians", "size", "rasterizer", *names):
-        table.add_column(name, justify="left" if name == "rasterizer" else "right")
+    for name in ("scene", "", *names):
+        table.add_column(name.replace("composite", "compose"), justify="right" if name else "left")
     for run in runs:
-        size = f"{run.width}x{run.height}"
-        stages = [f"{run.stages_ms[name]:.1f}" for name in names]
-        table.add_row(f"{run.gaussians:,}", size, run.rasterizer, *stages)
+        stages = [f"{run.stages_ms[name]:.0f}" for name in names]
+        table.add_row(_scene(run), run.rasterizer, *stages)
     return table
