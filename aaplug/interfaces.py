@@ -18,8 +18,9 @@ from aaplug.sampling import SamplingBounds
 from aaplug.splats import Render, Splats2D
 
 # What alpha is at a pixel: the Gaussian's value at its centre, or its mean over the pixel by the normal distribution or
-# by Analytic-Splatting's logistic approximation of it (`rasterizers.pixels`).
-PixelKernel = Literal["point", "integral", "logistic"]
+# by Analytic-Splatting's logistic approximation of it (`rasterizers.pixels`), or over the window of it that light still
+# passes (`rasterizers.blending`).
+PixelKernel = Literal["point", "integral", "logistic", "blending"]
 
 
 @dataclass(frozen=True)
@@ -58,11 +59,10 @@ class ScreenFilter(Protocol):
     """Changes the covariances and opacities of one view's splats."""
 
     def __call__(self, splats: Splats2D, camera: Camera, training: Training) -> Splats2D:
-        """Filter the splats of `camera`; `training.rate(camera)` says how finely it samples against training."""
-        ...
+        """Filter the splats of `camera`; `training.rate(camera)` says how finely it samples against training.
 
-    def for_samples(self) -> "ScreenFilter":
-        """The same filter for samples that are averaged over the pixel, which then does a part of its work."""
+        Where a pixel takes several samples, `camera` is the larger image that the samples are pixels of.
+        """
         ...
 
 

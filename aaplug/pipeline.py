@@ -57,8 +57,7 @@ def render(
     """
     samples = recipe.samples_at(training.rate(camera))
     fine = camera.resized(camera.width * samples, camera.height * samples)
-    screen = recipe.screen_at(training.rate(camera))
-    splats = splats_of(scene, fine, screen, training, rasterizer, recipe.pixel)
+    splats = splats_of(scene, fine, recipe.screen, training, rasterizer, recipe.pixel)
     return averaged(rasterizer(splats, fine.hw, background, recipe.pixel), samples)
 
 

@@ -81,16 +81,22 @@ def _camera_rows(
     like: Tensor, camera: Camera
 ) -> tuple[Float[Tensor, " 3"], Float[Tensor, "3 3"], Float[Tensor, " 8"]]:
     """Centre (float64), rotation, and fx, fy, cx, cy with the slopes between which the projection is linearised."""
-    x = _slope_limits(camera.cx, camera.fx, camera.width)
-    y = _slope_limits(camera.cy, camera.fy, camera.height)
+    x, y = slope_limits(camera)
     lens = like.new_tensor([camera.fx, camera.fy, camera.cx, camera.cy, *x, *y])
     rotation = camera.cam_from_world[:3, :3].to(like)
     return camera.centre.to(like.device), rotation, lens
 
 
-def _slope_limits(centre: float, focal: float, side: int) -> tuple[float, float]:
-    margin = JACOBIAN_MARGIN * 0.5 * side / focal
-    return -centre / focal - margin, (side - centre) / focal + margin
+def slope_limits(camera: Camera) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Least and greatest x/z, and y/z, at which the projection is linearised; beyond, it is as at these."""
+    limits = []
+    for centre, focal, side in (
+        (camera.cx, camera.fx, camera.width),
+        (camera.cy, camera.fy, camera.height),
+    ):
+        margin = JACOBIAN_MARGIN * 0.5 * side / focal
+        limits.append((-centre / focal - margin, (side - centre) / focal + margin))
+    return limits[0], limits[1]
 
 
 def _project(

@@ -11,7 +11,9 @@ from aaplug.errors import UsageError, listing
 from aaplug.filters import SCREEN_FILTERS, Matched, RateChoice, Smoothing3D
 from aaplug.interfaces import PixelKernel, ScreenFilter, WorldFilter
 
-SAMPLING = {"fast": 0.0, "balanced": 0.5, "best": 1.0}  # rate·n that a quality asks for
+# rate·n that a quality asks for.  A small image's cost is a Gaussian's, not a pixel's: at 1/8 of the training size 2×2
+# samples take no more pairs than classic's one.
+SAMPLING = {"fast": 0.25, "balanced": 0.5, "best": 1.0}
 WHOLE = 1e-6  # slack before one more sample is taken
 
 
@@ -35,10 +37,6 @@ class Recipe:
     def samples_at(self, rate: float) -> int:
         """Samples along a pixel's side for a view at `rate` against training."""
         return max(self.grid, math.ceil(min(self.samples, 1.0) / rate - WHOLE))
-
-    def screen_at(self, rate: float) -> ScreenFilter:
-        """The screen filter for one sample of a view at `rate`."""
-        return self.screen if self.samples_at(rate) == 1 else self.screen.for_samples()
 
 
 RECIPES: dict[str, Recipe] = {
@@ -68,6 +66,26 @@ RECIPES: dict[str, Recipe] = {
             "Mip-Splatting (Yu et al. 2024): 3D smoothing (eq. 9) with its volume factor, then the 2D Mip filter",
             "comparison: it dims scenes that were not trained with it",
             world=Smoothing3D(),
+        ),
+        Recipe(
+            "mip-splatting-code",
+            SCREEN_FILTERS["mip"],
+            "Mip-Splatting as its published code has it: the largest focal length for every camera",
+            "parity; differs where cameras' focal lengths do",
+            world=Smoothing3D(focal="largest"),
+        ),
+        Recipe(
+            "mip-splatting-balanced",
+            SCREEN_FILTERS["mip"],
+            "aaplug: Mip-Splatting with opacities balanced by the broadest face's area, not by volume, and bounded",
+            "comparison: most of the dimming of mip-splatting avoided",
+            world=Smoothing3D(opacity="balanced"),
+        ),
+        Recipe(
+            "aaa",
+            SCREEN_FILTERS["aaa"],
+            "AAA-Gaussians' adaptive 3D filter (ICCV 2025, arXiv 2504.12811), with its projected-area factor",
+            "scenes trained with it",
         ),
         Recipe(
             "analytic",
@@ -116,6 +134,13 @@ RECIPES: dict[str, Recipe] = {
             "aaplug: matched, with Analytic-Splatting's integral over the rest of the pixel",
             "one sample a pixel, a little sharper and slower",
             pixel="integral",
+        ),
+        Recipe(
+            "gaussian-blending",
+            Matched(windowed=True),
+            "after Gaussian Blending (arXiv 2511.15102), whose update is not published: this one is aaplug's own",
+            "comparison: the best of one sample a pixel, slower than several",
+            pixel="blending",
         ),
         Recipe(
             "auto",

@@ -27,11 +27,13 @@ class SamplingBounds:
     """What filters learn about a camera set; all zero for a Gaussian that no camera sees.
 
     highest, lowest: sampling rates over the cameras that see the Gaussian, in px per world unit.
+    nearest: least depth in them, in world units.
     views: how many cameras see it.
     """
 
     highest: Float[Tensor, " n"]
     lowest: Float[Tensor, " n"]
+    nearest: Float[Tensor, " n"]
     views: Int[Tensor, " n"]
 
     @property
@@ -65,15 +67,19 @@ def sampling_bounds(
         UsageError: there are no cameras.
     """
     n = len(means)
-    highest, lowest = means.new_zeros(n), means.new_zeros(n)
+    highest, lowest, nearest = (means.new_zeros(n) for _ in range(3))
+    focals = means.new_tensor([camera.focal for camera in cameras])
     views = torch.zeros(n, dtype=torch.int32, device=means.device)
     for part, rates in _rates_in_chunks(means, cameras, chunk_pairs):
         seen = rates > 0
         views[part] = seen.sum(dim=1, dtype=torch.int32)
         highest[part] = rates.amax(dim=1)
+        nearest[part] = focals[0] / highest[part]
+        if (focals != focals[0]).any():
+            nearest[part] = (focals / rates).amin(dim=1)
         lowest[part] = rates.masked_fill_(~seen, torch.inf).amin(dim=1)
-    lowest[views == 0] = 0
-    return SamplingBounds(highest, lowest, views)
+    lowest[views == 0] = nearest[views == 0] = 0
+    return SamplingBounds(highest, lowest, nearest, views)
 
 
 def median_rates(

@@ -88,10 +88,24 @@ class Splats2D:
         dets = self.dets + variance * trace + variance * variance
         diagonal = self.covs.new_tensor([1.0, 0.0, 1.0])
         added = variance[:, None] if isinstance(variance, Tensor) else variance
+        return self._widened(self.covs + added * diagonal, dets, compensate, floor)
+
+    def convolved(
+        self, added: Float[Tensor, "m 3"], compensate: bool, floor: float = MIN_COMPENSATION
+    ) -> "Splats2D":
+        """The same for any covariance, packed and in px²: det(A + B) = det A + det B + A's part across B."""
+        a, b, c = added.unbind(dim=1)
+        xx, xy, yy = self.covs.unbind(dim=1)
+        dets = self.dets + (a * c - b * b) + (xx * c + yy * a - 2 * xy * b).clamp(min=0.0)
+        return self._widened(self.covs + added, dets, compensate, floor)
+
+    def _widened(
+        self, covs: Float[Tensor, "m 3"], dets: Float[Tensor, " m"], compensate: bool, floor: float
+    ) -> "Splats2D":
         opacities = self.opacities
         if compensate:
             opacities = opacities * (self.dets / dets).clamp(min=floor * floor).sqrt()
-        return replace(self, covs=self.covs + added * diagonal, dets=dets, opacities=opacities)
+        return replace(self, covs=covs, dets=dets, opacities=opacities)
 
 
 def joined(parts: Sequence[Splats2D]) -> Splats2D:

@@ -102,7 +102,7 @@ def test_classic_bloats_an_isolated_splat_when_zoomed_out():
         (2.0, 1, 1, 1),
         (0.5, 1, 1, 2),
         (0.25, 1, 2, 4),
-        (0.125, 1, 4, 8),
+        (0.125, 2, 4, 8),
         (0.3, 1, 2, 4),
     ],
 )

@@ -439,7 +439,7 @@ def test_pixel_kernels_have_the_published_values(rasterize, cov, offset, logisti
         assert alpha == pytest.approx(expected, abs=2e-6), pixel
 
 
-@pytest.mark.parametrize("pixel", ["integral", "logistic"])
+@pytest.mark.parametrize("pixel", ["integral", "logistic", "blending"])
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
 @pytest.mark.parametrize("window", [0.0, 0.6, 1.0])
 def test_means_over_pixels_are_the_judges(pixel, dtype, window):

@@ -1,5 +1,6 @@
 """Filters by name; a new one is a file here and a line below."""
 
+from aaplug.filters.adaptive import ADAPTIVE_VARIANCE, Adaptive
 from aaplug.filters.dilation import Dilation
 from aaplug.filters.energy import MATCHED_VARIANCE, MatchedEnergy
 from aaplug.filters.matched import PIXEL_VARIANCE, Matched, RateChoice
@@ -8,6 +9,8 @@ from aaplug.interfaces import ScreenFilter, WorldFilter
 
 WORLD_FILTERS: dict[str, WorldFilter] = {
     "smoothing3d": Smoothing3D(),
+    "smoothing3d-largest-focal": Smoothing3D(focal="largest"),
+    "smoothing3d-balanced": Smoothing3D(opacity="balanced"),
     "stored": StoredSmoothing(),
     "matched-energy": MatchedEnergy(),
 }
@@ -17,6 +20,7 @@ SCREEN_FILTERS: dict[str, ScreenFilter] = {
     "ewa": Dilation(0.3, compensated=True),
     "mip": Dilation(0.1, compensated=True),
     "none": Dilation(0.0, compensated=False),
+    "aaa": Adaptive(),
     "sa-gs": Matched("global", pixel_variance=0.0),
     "matched": Matched("global"),
     "matched-sharpest": Matched("sharpest"),
@@ -24,11 +28,13 @@ SCREEN_FILTERS: dict[str, ScreenFilter] = {
 }
 
 __all__ = [
+    "ADAPTIVE_VARIANCE",
     "MATCHED_VARIANCE",
     "NYQUIST_VARIANCE",
     "PIXEL_VARIANCE",
     "SCREEN_FILTERS",
     "WORLD_FILTERS",
+    "Adaptive",
     "Dilation",
     "Matched",
     "MatchedEnergy",

@@ -21,7 +21,3 @@ class Dilation:
     def __call__(self, splats: Splats2D, camera: Camera, training: Training) -> Splats2D:
         """Filter the splats of one view."""
         return splats.blurred(self.variance, self.compensated)
-
-    def for_samples(self) -> "Dilation":
-        """The same: the constant is per sample, as if the larger image had been asked for."""
-        return self

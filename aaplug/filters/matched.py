@@ -3,9 +3,10 @@
 A classic checkpoint was fitted with +0.3 px² of dilation, so its look lives in C + 0.3 I at the training rate, and in
 C + 0.3 r² I at r times that rate.  Step one restores that look, with the training's own compensation if it had any.
 Where the rate is below training's (r < 1) a pixel is larger than training's pixel, and step two adds the part of the
-pixel's own filter, 0.1 (1 − r²) px², that training's pixel did not hold, compensating this step alone.  At r = 1 the
-result is the training's renderer itself.  The design and its measurements are aaplug's own; the first step with one
-global rate is SA-GS's filter (Song et al., arXiv 2403.19615).
+pixel's own filter, 0.07 (1 − r²) px², that training's pixel did not hold, compensating this step alone.  At r = 1 the
+result is the training's renderer itself.  Each of several samples a pixel is filtered by the same rule, as a pixel of
+the larger image that it belongs to.  The design and its measurements are aaplug's own; the first step with one global
+rate is SA-GS's filter (Song et al., arXiv 2403.19615).
 """
 
 from dataclasses import dataclass, replace
@@ -19,7 +20,9 @@ from aaplug.cameras import Camera
 from aaplug.interfaces import Training
 from aaplug.splats import Splats2D
 
-PIXEL_VARIANCE = 0.1  # px²: one pixel seen as a Gaussian; Mip-Splatting (a box has 1/12)
+# px²: one pixel seen as a Gaussian.  A box has 1/12 and Mip-Splatting takes 0.1; opaque splats side by side hide less
+# than their energies together should, and a narrower filter makes up for some of it (docs/quality.md).
+PIXEL_VARIANCE = 0.07
 
 RateChoice = Literal["global", "sharpest", "interval"]
 
@@ -35,7 +38,7 @@ class Matched:
         "interval" (C): the range of rates the training views had, widened by this pose's own at the training size
             if it is a pose of the data set; equals training's renderer inside the range and adapts outside, for
             cameras that move nearer or farther.
-    pixel_variance: of the whole pixel's filter, in px²; 0 leaves the integration to several samples a pixel.
+    pixel_variance: of the whole pixel's filter, in px²; 0 is the match alone.
     windowed: integrate over a window instead, for pixel kernels that do: as wide as makes its variance and that of
         training's pixel one pixel's, √(1 − r²) px, and no wider than a point where r is not below 1.
     """
@@ -53,10 +56,6 @@ class Matched:
             return replace(matched, window=max(0.0, 1 - training.rate(camera) ** 2) ** 0.5)
         rest = self.pixel_variance * (1 - rate * rate).clamp(min=0.0)
         return matched.blurred(rest, compensate=True)
-
-    def for_samples(self) -> "Matched":
-        """Only the match: averaging the samples integrates over the pixel."""
-        return replace(self, pixel_variance=0.0, windowed=False)
 
     def rates(self, splats: Splats2D, camera: Camera, training: Training) -> Float[Tensor, " m"]:
         """Rate of each splat against the one that training saw; the view's own for Gaussians no camera saw."""

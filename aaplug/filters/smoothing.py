@@ -5,6 +5,7 @@ s' = √(s² + f²).  With the volume factor the Gaussian keeps its integral: o'
 in log space, where scales of 1e-12 and below are exact and have gradients.
 """
 
+import math
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -18,24 +19,43 @@ from aaplug.interfaces import Training
 NYQUIST_VARIANCE = (
     0.2  # px² at the highest rate: Mip-Splatting's published constant (its eq. 9 omits a square)
 )
+BALANCE_FLOOR = 0.5  # of an opacity: balancing dims no Gaussian below it
 
 
 @dataclass(frozen=True)
 class Smoothing3D:
     """Smooth by `variance` / ν², ν the highest rate at which any training camera sampled the Gaussian.
 
-    variance: px² at that rate.  opacity: "volume" keeps the integral, "kept" leaves opacity alone.
+    variance: px² at that rate.
+    opacity: "volume" keeps the integral, "kept" leaves opacity alone.  "balanced" keeps the area of the broadest face,
+        down to half of the opacity: the volume of a surfel says little of what it hides.  It is aaplug's own;
+        AA-Splat's opacity balancing (arXiv 2603.29394) has no published formula.
+    focal: "own" pairs each camera's depth with its own focal length, as Mip-Splatting's equation 7 does; "largest"
+        pairs every depth with the largest of all, as its published code does.
     Gaussians that no camera saw get the coarsest rate found.
     """
 
     variance: float = NYQUIST_VARIANCE
-    opacity: Literal["volume", "kept"] = "volume"
+    opacity: Literal["volume", "balanced", "kept"] = "volume"
+    focal: Literal["own", "largest"] = "own"
 
     def __call__(self, scene: Gaussians, training: Training) -> Gaussians:
         """Fuse the smoothing into scales and opacities."""
-        sigma = self.variance**0.5 / training.bounds.highest_or_coarsest
-        smoothed = smooth(scene, sigma.log(), self.opacity == "volume")
+        bounds = training.bounds
+        if self.focal == "largest":
+            largest = max(camera.focal for camera in training.cameras)
+            bounds = replace(
+                bounds, highest=torch.where(bounds.seen, largest / bounds.nearest, 0.0)
+            )
+        log_sigma = (self.variance**0.5 / bounds.highest_or_coarsest).log()
+        smoothed = smooth(scene, log_sigma, self.opacity == "volume")
+        if self.opacity == "balanced":
+            factor = face_log_factor(scene.log_scales, log_sigma).clamp(min=math.log(BALANCE_FLOOR))
+            logits = scale_opacities(scene.logit_opacities, factor)
+            smoothed = replace(smoothed, logit_opacities=logits)
         settings = {"variance": f"{self.variance:g}", "opacity": self.opacity}
+        if self.focal != "own":
+            settings["focal"] = self.focal
         return replace(smoothed, fused=(*scene.fused, Fusion("smoothing3d", settings)))
 
 
@@ -70,5 +90,18 @@ def volume_log_factor(
     log_scales: Float[Tensor, "n 3"], log_sigma: Float[Tensor, " n"]
 ) -> Float[Tensor, " n"]:
     """ln ∏ s/√(s² + f²) = −½ Σ ln(1 + f²/s²)."""
+    return _axis_log_factors(log_scales, log_sigma).sum(dim=1)
+
+
+def face_log_factor(
+    log_scales: Float[Tensor, "n 3"], log_sigma: Float[Tensor, " n"]
+) -> Float[Tensor, " n"]:
+    """The same product over the two widest axes, which span the broadest face."""
+    return _axis_log_factors(log_scales, log_sigma).topk(2, dim=1).values.sum(dim=1)
+
+
+def _axis_log_factors(
+    log_scales: Float[Tensor, "n 3"], log_sigma: Float[Tensor, " n"]
+) -> Float[Tensor, "n 3"]:
     log_ratio = 2 * (log_sigma[:, None] - log_scales)
-    return -0.5 * torch.logaddexp(log_ratio, torch.zeros_like(log_ratio)).sum(dim=1)
+    return -0.5 * torch.logaddexp(log_ratio, torch.zeros_like(log_ratio))

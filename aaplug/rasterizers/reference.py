@@ -7,6 +7,7 @@ by strips and chunks alone.  Differentiable through autograd.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from jaxtyping import Float
@@ -21,6 +22,7 @@ from aaplug.splats import MIN_ALPHA, Render, Splats2D, principal_columns, whiten
 
 STRIP_PIXELS = 4096
 CHUNK_SPLATS = 512
+FARTHEST = 6.0  # standard deviations from a window's edge: a Gaussian has 1e-9 of itself beyond
 NARROWEST = 1e-5  # px: a window as narrow as this shows the value at a point, to ten digits
 
 
@@ -51,7 +53,8 @@ def rasterize(
     splats = splats.to(torch.float64)
     splats = splats[torch.sort(splats.depths, stable=True).indices]
     centres = _pixel_centres(hw).to(splats.means.device)
-    strips = [_strip(splats, strip, pixel) for strip in centres.split(STRIP_PIXELS)]
+    draw = _blended_strip if pixel == "blending" else partial(_strip, pixel=pixel)
+    strips = [draw(splats, strip) for strip in centres.split(STRIP_PIXELS)]
     rgb = torch.cat([rgb for rgb, _ in strips]).reshape(*hw, 3)
     transmittance = torch.cat([t for _, t in strips]).reshape(hw)
     return over(rgb, 1 - transmittance, background)
@@ -114,3 +117,63 @@ def _over_pixels(
         probability = distribution(u + per_px / 2) - distribution(u - per_px / 2)
         values = values * probability * math.sqrt(2 * math.pi) / per_px
     return values
+
+
+def _blended_strip(
+    splats: Splats2D, centres: Float[Tensor, "p 2"]
+) -> tuple[Float[Tensor, "p 3"], Float[Tensor, " p"]]:
+    """The rule of `blending`, a splat at a time, with windows in px as vectors and matrices."""
+    assert splats.rgb is not None
+    first = max(splats.window, NARROWEST)
+    rgb, hidden_so_far = centres.new_zeros(len(centres), 3), centres.new_zeros(len(centres))
+    mass = torch.ones_like(hidden_so_far)
+    middle, sides = torch.zeros_like(centres), torch.full_like(centres, first)
+    for i, forms in enumerate(_turned(splats)):
+        lengths = forms.norm(dim=1)
+        axes = forms / lengths[:, None]
+        u = (centres + middle - splats.means[i]) @ forms.T
+        half = 0.5 * sides * lengths
+        value, mean, square = _moments(u, half)
+        alpha = (splats.opacities[i] * value.prod(dim=1)).clamp(max=MAX_ALPHA)
+        alpha = torch.where(alpha >= MIN_ALPHA, alpha, 0.0)
+        left = mass * (1 - alpha)
+        going = left >= MIN_TRANSMITTANCE
+        weight = torch.where(going, mass * alpha, 0.0)
+        rgb, hidden_so_far = rgb + weight[:, None] * splats.rgb[i], hidden_so_far + weight
+        mass = torch.where(going, left, 0.0)
+        hidden = (mean / lengths) @ axes
+        hidden_square = (square / lengths**2) @ axes**2 + hidden**2
+        share = (alpha / (1 - alpha))[:, None]
+        moved = -share * hidden
+        variance = sides**2 / 12 + share * (sides**2 / 12 - hidden_square) - moved**2
+        new = (12 * variance.clamp(min=1e-8 * first**2)).sqrt()
+        grow = (left * first**2 / new.prod(dim=1)).clamp(min=1.0).sqrt()
+        new = (new * grow[:, None]).clamp(max=first)
+        room = (first - new) / 2
+        hides = (alpha > 0)[:, None]
+        middle = torch.where(
+            hides, torch.maximum(torch.minimum(middle + moved, room), -room), middle
+        )
+        sides = torch.where(hides, new, sides)
+    return rgb, 1 - hidden_so_far
+
+
+def _turned(splats: Splats2D) -> Float[Tensor, "m 2 2"]:
+    """The whitening along each splat's own axes, the one nearer to x first."""
+    rows = torch.stack(principal_columns(splats.covs, splats.dets), dim=1).unflatten(1, (2, 2))
+    nearness = rows[..., 0].abs() / rows.norm(dim=2)
+    return torch.where((nearness[:, 0] < nearness[:, 1])[:, None, None], rows.flip(1), rows)
+
+
+def _moments(
+    u: Float[Tensor, "p 2"], half: Float[Tensor, "p 2"]
+) -> tuple[Float[Tensor, "p 2"], Float[Tensor, "p 2"], Float[Tensor, "p 2"]]:
+    """Mean value of exp(−x²/2) on u ± half; mean from u, and variance, of x weighted by it."""
+    near = u.abs() - half < FARTHEST
+    u = torch.where(near, u, 0.0)  # gradients of 0 / 0 would be felt even where nothing is taken
+    ends = (u - half, u + half)
+    low, high = ((-0.5 * end * end).exp() for end in ends)
+    total = math.sqrt(2 * math.pi) * (ndtr(ends[1]) - ndtr(ends[0]))
+    mean = (low - high) / total
+    variance = 1 + (ends[0] * low - ends[1] * high) / total - mean**2
+    return near * total / (2 * half), mean - u, variance.clamp(min=0.0)

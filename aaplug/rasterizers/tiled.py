@@ -30,6 +30,7 @@ from torch import Tensor
 
 from aaplug.interfaces import PixelKernel
 from aaplug.kernels import EAGER, Kernel, Kernels
+from aaplug.rasterizers.blending import blended, table_of
 from aaplug.rasterizers.pixels import grown, mean_gaussian, mean_logistic
 from aaplug.rasterizers.rules import MAX_ALPHA, MIN_TRANSMITTANCE, over
 from aaplug.splats import MIN_ALPHA, Render, Splats2D, principal_columns, reach, whitening_columns
@@ -38,6 +39,7 @@ TILE = 8  # px
 PASS = 8  # splats composited in one pass: more compile slowly, fewer load and store more
 CHECK_EVERY = 4  # passes between looks at which tiles are saturated
 COMPACT_BELOW = 3 / 4  # share of tiles still going at which the others leave
+BLENDED_TILES = 64  # of about equally many splats, blended together
 MEMORY = 1e9  # bytes
 PAIR_BYTES = 64  # of a candidate pair while a band is binned, measured
 HALF_LOG2_E = 0.5 * log2(torch.e)
@@ -93,14 +95,22 @@ class Tiled:
     ) -> Render:
         """Draw the splats."""
         grid = (-(-hw[0] // TILE), -(-hw[1] // TILE))
-        drawing = drawing_of(splats, self.kernels, pixel)
         extents = splats if pixel == "point" else grown(splats)
+        paint = self._painter(splats, pixel)
         planes = [
-            _untiled(composite(drawing, bins, self.kernels, pixel), grid[1])[:, : hw[1]]
+            _untiled(paint(bins), grid[1])[:, : hw[1]]
             for bins in bands(extents, grid, self.kernels, self.memory)
         ]
         image = (planes[0] if len(planes) == 1 else torch.cat(planes))[: hw[0]]
         return over(image[..., :3], image[..., 3], background)
+
+    def _painter(self, splats: Splats2D, pixel: PixelKernel) -> Callable[["Bins"], Tensor]:
+        """What paints the tiles of a band."""
+        if pixel == "blending":
+            return partial(_blend, table_of(splats), splats)
+        return partial(
+            composite, drawing_of(splats, self.kernels, pixel), kernels=self.kernels, pixel=pixel
+        )
 
 
 def _untiled(tiles: Float[Tensor, "4 t P"], columns: int) -> Float[Tensor, "h w 4"]:
@@ -684,6 +694,18 @@ def _chunk_sums(
         to_x, to_y = to_x + i * along, to_y + j * along
     shape = [-2 * form for form in forms]
     return owners, torch.stack([*shape, 2 * to_x, 2 * to_y, s, *colours.unbind(dim=2)], dim=2)
+
+
+def _blend(table: Float[Tensor, "m 12"], splats: Splats2D, bins: Bins) -> Float[Tensor, "4 t P"]:
+    """The same by the rule of `blending`, in array code alone."""
+    local = _pixel_centres(table)
+    order = torch.sort(bins.counts, descending=True, stable=True).indices
+    parts = []
+    for tiles in order.split(BLENDED_TILES):
+        x, y = (bins.origins[tiles, i, None] + local[i] for i in (0, 1))
+        lists = (bins.splats, bins.first[tiles], bins.counts[tiles])
+        parts.append(blended(table, splats.window, *lists, x, y))
+    return torch.cat(parts, dim=1)[:, order.argsort()].to(splats.means)
 
 
 # --------------------------------------------------------------------------------------------------------- kernels

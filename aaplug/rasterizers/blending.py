@@ -1,0 +1,197 @@
+"""Blending inside the pixel: transmittance kept as a window, so that splats side by side do not leak.
+
+Gaussian Blending (arXiv 2511.15102) keeps, instead of one transmittance a pixel, a level on a rectangle inside it, and
+takes from it what each splat hides there.  Its exact update is not published.  This one is aaplug's own:
+
+1. Light passes a pixel where T(x) = level on a window of sides l and centre c, and nowhere else; at first the window
+   is the square that alpha is averaged over, `Splats2D.window` wide, and the level is 1.
+2. A splat hides p = mean of min(0.99, o g(x)) over the window, taken as min(0.99, o · mean of g).  On the window turned
+   to the splat's axes (by at most 45°, as Analytic-Splatting turns its pixel) g factors, and so do the moments of what
+   it hides: mass p, mean d and variance s about the window's centre.
+3. What is left, T (1 − o g), has the mass M' = M (1 − p), and about the window's centre the mean −p d / (1 − p) and the
+   second moments (l²/12 − p (s + d²)) / (1 − p).
+4. The next window is the rectangle along the pixel's axes with that mean and variance, no smaller than M' (a level is
+   at most 1) and inside the first one.  Of it only the position in the first window is kept: its level follows from M'.
+
+A first window of no size is a point, and this is 3DGS's rule again.  Steps are computed in float64, because the
+variance of what is left is a small difference.
+
+u, v: position along a splat's axes; h: half a window; both in the splat's standard deviations there.
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from aaplug.rasterizers.pixels import SMALL
+from aaplug.rasterizers.rules import MAX_ALPHA, MIN_TRANSMITTANCE
+from aaplug.splats import MIN_ALPHA, Splats2D, principal_columns
+
+THINNEST = 1e-6  # standard deviations: of half the first window, which is divided by
+LEAST_VARIANCE = 1e-8  # of a window against the first one's: rounding never makes it vanish
+CHECK_EVERY = 16  # turns between looks at whether every pixel is done
+FARTHEST = 6.0  # standard deviations from a window's edge, beyond which 2e-8 of a Gaussian is in it
+
+
+class Window(NamedTuple):
+    """Where light passes: its mass, and the window's centre and sides in units of the first window."""
+
+    mass: Tensor
+    x: Tensor
+    y: Tensor
+    width: Tensor
+    height: Tensor
+
+    @staticmethod
+    def whole(like: Tensor) -> "Window":
+        """Nothing is hidden yet."""
+        none, one = torch.zeros_like(like), torch.ones_like(like)
+        return Window(one, none, none, one, one)
+
+
+class Axes(NamedTuple):
+    """A splat's whitening forms, the one that runs nearer to x first, and half the first window along them."""
+
+    ux: Tensor
+    uy: Tensor
+    vx: Tensor
+    vy: Tensor
+    half_u: Tensor
+    half_v: Tensor
+
+
+def axes_of(splats: Splats2D) -> Axes:
+    """The axes of each splat, in its standard deviations a px."""
+    ux, uy, vx, vy = principal_columns(splats.covs, splats.dets)
+    swap = ux.abs() * torch.hypot(vx, vy) < vx.abs() * torch.hypot(ux, uy)
+    ux, vx = torch.where(swap, vx, ux), torch.where(swap, ux, vx)
+    uy, vy = torch.where(swap, vy, uy), torch.where(swap, uy, vy)
+    halves = [0.5 * splats.window * torch.hypot(x, y) for x, y in ((ux, uy), (vx, vy))]
+    return Axes(ux, uy, vx, vy, *(half.clamp(min=THINNEST) for half in halves))
+
+
+def through(
+    window: Window, axes: Axes, opacity: Tensor, dx: Tensor, dy: Tensor, side: float
+) -> tuple[Tensor, Window]:
+    """What a splat hides of the light that passes a pixel, and the window after it.
+
+    All broadcast together.  dx, dy: the pixel's centre from the splat's, in px.  side: of the first window, in px.
+    """
+    dx, dy = dx + side * window.x, dy + side * window.y
+    u, v = axes.ux * dx + axes.uy * dy, axes.vx * dx + axes.vy * dy
+    along_u = moments(u, axes.half_u * window.width)
+    along_v = moments(v, axes.half_v * window.height)
+    alpha = (opacity * along_u[0] * along_v[0]).clamp(max=MAX_ALPHA)
+    alpha = torch.where(alpha >= MIN_ALPHA, alpha, 0.0)
+    left = window.mass * (1 - alpha)
+    going = left >= MIN_TRANSMITTANCE
+    hidden = torch.where(going, window.mass - left, 0.0)
+    after = _rest(window, axes, along_u, along_v, alpha)
+    after = [torch.where(alpha > 0, new, old) for new, old in zip(after, window[1:], strict=True)]
+    return hidden, Window(torch.where(going, left, 0.0), *after)
+
+
+def moments(u: Tensor, h: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Of exp(−x²/2) on u ± h: its mean value; and of x weighted by it, the mean from u and the variance.
+
+    Where h is small, their series in h.  A window that the Gaussian does not reach holds nothing of it.
+    """
+    reached = u.abs() - h < FARTHEST
+    u = torch.where(reached, u, 0.0)  # so that nothing is divided by nothing, not even in gradients
+    small = SMALL[u.dtype]
+    wide = h.clamp(min=small)
+    low, high = u - wide, u + wide
+    at_low, at_high = (-0.5 * low * low).exp(), (-0.5 * high * high).exp()
+    root = math.sqrt(0.5)
+    mass = math.sqrt(math.pi / 2) * ((high * root).erf() - (low * root).erf())
+    centre = (at_low - at_high) / mass
+    variance = 1 + (low * at_low - high * at_high) / mass - centre * centre
+    uu, hh = u * u, h * h
+    values = (1 + hh * (uu - 1) / 6) * (-0.5 * uu).exp()
+    near = h < small
+    return (
+        torch.where(near, values, mass / (2 * wide)) * reached,
+        torch.where(near, -u * hh / 3, centre - u),
+        torch.where(near, hh / 3 * (1 - hh * 2 / 15 * (1 + uu * 1.5)), variance.clamp(min=0.0)),
+    )
+
+
+def _rest(
+    window: Window,
+    axes: Axes,
+    along_u: tuple[Tensor, Tensor, Tensor],
+    along_v: tuple[Tensor, Tensor, Tensor],
+    alpha: Tensor,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Centre and sides of the window that is left, in units of the first one."""
+    cos, sin = _unit(axes.ux, axes.uy)
+    across, up = _unit(axes.vx, axes.vy)
+    mean_u, mean_v = along_u[1] / (2 * axes.half_u), along_v[1] / (2 * axes.half_v)
+    square_u = along_u[2] / (2 * axes.half_u) ** 2
+    square_v = along_v[2] / (2 * axes.half_v) ** 2
+    sides = []
+    for i, j, centre, side in (
+        (cos, across, window.x, window.width),
+        (sin, up, window.y, window.height),
+    ):
+        hidden_mean = i * mean_u + j * mean_v
+        hidden_square = i * i * square_u + j * j * square_v + hidden_mean * hidden_mean
+        mean = -alpha * hidden_mean / (1 - alpha)
+        square = (side * side / 12 - alpha * hidden_square) / (1 - alpha)
+        variance = (square - mean * mean).clamp(min=LEAST_VARIANCE)
+        sides.append((centre + mean, (12 * variance).sqrt()))
+    (x, width), (y, height) = sides
+    grown = (window.mass * (1 - alpha) / (width * height)).clamp(min=1.0).sqrt()
+    width, height = (width * grown).clamp(max=1.0), (height * grown).clamp(max=1.0)
+    return _held(x, width), _held(y, height), width, height
+
+
+def _held(centre: Tensor, side: Tensor) -> Tensor:
+    """The centre that keeps a window inside the first one."""
+    room = (1 - side) / 2
+    return torch.minimum(torch.maximum(centre, -room), room)
+
+
+def _unit(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+    length = torch.hypot(x, y)
+    return x / length, y / length
+
+
+def table_of(splats: Splats2D) -> Float[Tensor, "m 12"]:
+    """What `blended` needs of each splat, in float64: axes, opacity, centre and colour."""
+    exact = splats.to(torch.float64)
+    assert exact.rgb is not None
+    columns = [*axes_of(exact), exact.opacities, *exact.means.unbind(1), *exact.rgb.unbind(1)]
+    return torch.stack(columns, dim=1)
+
+
+def blended(
+    table: Float[Tensor, "m 12"],
+    side: float,
+    order: Int[Tensor, " p"],
+    first: Int[Tensor, " t"],
+    counts: Int[Tensor, " t"],
+    x: Float[Tensor, "t P"],
+    y: Float[Tensor, "t P"],
+) -> Float[Tensor, "4 t P"]:
+    """Premultiplied colour, and alpha, of pixels whose centres are x, y.
+
+    Each row of pixels draws the splats order[first : first + counts] of its own, one a turn.  side: of the first
+    window, in px.
+    """
+    window = Window.whole(x)
+    image = x.new_zeros(4, *x.shape)
+    for turn in range(int(counts.max())):
+        if turn % CHECK_EVERY == 0 and not window.mass.any():
+            break
+        drawn = (turn < counts).to(table)
+        rows = table[order[(first + turn).clamp(max=len(order) - 1)].long()]
+        *axes, opacity, mean_x, mean_y, red, green, blue = (c[:, None] for c in rows.unbind(1))
+        offset = x - mean_x, y - mean_y
+        alpha = opacity * drawn[:, None]
+        hidden, window = through(window, Axes(*axes), alpha, *offset, side)
+        image = image + hidden * torch.stack([red, green, blue, torch.ones_like(red)])
+    return image

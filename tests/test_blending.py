@@ -1,0 +1,80 @@
+"""Blending inside the pixel: its moments are integrals, and splats side by side do not leak."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from aaplug.rasterizers import RASTERIZERS
+from aaplug.rasterizers.blending import Window, axes_of, moments, through
+from tests.test_rasterizers import BLACK, WHITE, splats_of
+
+F64 = torch.float64
+NODES = 20_001
+
+
+@pytest.mark.parametrize("half", [1e-5, 5e-4, 2e-3, 0.3, 4.0])
+@pytest.mark.parametrize("u", [0.0, 0.7, -2.5])
+def test_moments_are_integrals(u, half):
+    x = u + half * torch.linspace(-1, 1, NODES, dtype=F64)
+    density = (-0.5 * x * x).exp()
+    mass = torch.trapezoid(density, x)
+    centre = torch.trapezoid(density * (x - u), x) / mass
+    variance = torch.trapezoid(density * (x - u - centre) ** 2, x) / mass
+    found = moments(torch.tensor([u], dtype=F64), torch.tensor([half], dtype=F64))
+    expected = (mass / (2 * half), centre, variance)
+    for a, b in zip(found, expected, strict=True):
+        assert a.item() == pytest.approx(b.item(), rel=1e-6, abs=1e-9 * half)
+
+
+@pytest.mark.parametrize("cov", [(0.3, 0.0, 0.05), (0.2, 0.05, 0.4)])
+def test_what_is_left_has_the_moments_of_the_light_that_is_left(cov):
+    """Against sums over a fine grid, turned to the splat's axes as the pixel is."""
+    splats = splats_of(((0.3, -0.2), cov, 1.0, 0.8, WHITE)).to(F64)
+    axes = axes_of(splats)
+    whole = Window.whole(torch.zeros(1, dtype=F64))
+    dx, dy = -splats.means.T
+    hidden, after = through(whole, axes, splats.opacities, dx, dy, 1.0)
+    ticks = torch.linspace(-0.5, 0.5, 401, dtype=F64)
+    p, q = (t.flatten() for t in torch.meshgrid(ticks, ticks, indexing="ij"))
+    cos, sin = axes.ux / torch.hypot(axes.ux, axes.uy), axes.uy / torch.hypot(axes.ux, axes.uy)
+    across, up = axes.vx / torch.hypot(axes.vx, axes.vy), axes.vy / torch.hypot(axes.vx, axes.vy)
+    x, y = cos * p + across * q, sin * p + up * q
+    u, v = axes.ux * (x + dx) + axes.uy * (y + dy), axes.vx * (x + dx) + axes.vy * (y + dy)
+    left = 1 - 0.8 * (-0.5 * (u * u + v * v)).exp()
+    assert 1 - hidden.item() == pytest.approx(left.mean().item(), abs=2e-3)
+    for position, centre, side, turned in (
+        (x, after.x, after.width, cos * cos + across * across),
+        (y, after.y, after.height, sin * sin + up * up),
+    ):
+        mean = (left * position).mean() / left.mean()
+        variance = (left * (position - mean) ** 2).mean() / left.mean()
+        variance = variance + (1 - turned.item()) / 12
+        assert centre.item() == pytest.approx(mean.item(), abs=2e-3)
+        assert side.item() == pytest.approx(min(1.0, (12 * variance.item()) ** 0.5), abs=5e-3)
+
+
+def leak(pixel: str) -> float:
+    """What passes a pixel whose halves are each covered by a wide opaque splat of its own."""
+    covs = (0.02, 0.0, 25.0)
+    splats = splats_of(((4.25, 4.5), covs, 1.0, 0.99, WHITE), ((4.75, 4.5), covs, 2.0, 0.99, WHITE))
+    render = RASTERIZERS["eager"](replace(splats, window=1.0), (9, 9), BLACK, pixel)
+    return 1 - render.alpha[4, 4].item()
+
+
+def test_splats_side_by_side_leak_less_than_splats_at_random():
+    alpha = 0.99 * math.sqrt(2 * math.pi * 0.02) * 0.92  # about what each hides of the pixel
+    assert leak("integral") == pytest.approx((1 - alpha) ** 2, rel=0.1)
+    assert leak("blending") < 0.75 * leak("integral")
+
+
+def test_a_window_of_no_size_is_a_point():
+    splats = splats_of(
+        ((4.2, 4.6), (0.5, 0.2, 0.4), 1.0, 0.7, WHITE),
+        ((4.4, 3.9), (2.0, 0.0, 1.0), 2.0, 0.9, WHITE),
+    )
+    draw = RASTERIZERS["eager"]
+    point = draw(splats, (9, 9), BLACK)
+    blended = draw(replace(splats, window=0.0), (9, 9), BLACK, "blending")
+    torch.testing.assert_close(blended.alpha, point.alpha, rtol=1e-5, atol=1e-6)
