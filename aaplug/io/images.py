@@ -50,18 +50,21 @@ def read_image(path: Path, background: tuple[float, float, float] | None) -> Flo
         FormatError: the file is missing, damaged or too large, or it is transparent and no
             background is given.
     """
-    _, transparent = _look(path)
-    pixels = _decode(path)
-    if pixels.dtype not in SAMPLE_TYPES.values():
-        raise FormatError(path, f"holds {pixels.dtype} samples; save it with 8 or 16 bits")
-    if transparent != (pixels.shape[2] == ALPHA_CHANNELS):
-        raise FormatError(
-            path, "has colours or transparency that OpenCV does not read; save it as RGB(A) PNG"
-        )
-    if transparent and background is None:
+    pixels = _read(path)
+    if pixels.shape[2] == ALPHA_CHANNELS and background is None:
         raise FormatError(path, "is transparent; say what lies behind it with --background")
-    image = _to_rgb(pixels)
-    return torch.from_numpy(image if background is None else _composite(image, background))
+    return torch.from_numpy(pixels if background is None else _composite(pixels, background))
+
+
+def read_rgba(path: Path) -> Float[Tensor, "h w 4"]:
+    """Read an 8- or 16-bit image with its transparency, not multiplied into the colours; opaque where it has none.
+
+    Raises:
+        FormatError: the file is missing, damaged or too large.
+    """
+    pixels = torch.from_numpy(_read(path))
+    opaque = torch.ones_like(pixels[..., :1])
+    return pixels if pixels.shape[2] == ALPHA_CHANNELS else torch.cat([pixels, opaque], dim=2)
 
 
 def write_png(
@@ -126,6 +129,12 @@ def resampled(
     return torch.from_numpy(image)
 
 
+def stretched(rgb: Float[Tensor, "h w 3"], hw: tuple[int, int]) -> Float[Tensor, "h2 w2 3"]:
+    """The whole image in `hw` pixels: area-weighted averages where that is fewer, bicubic where it is more."""
+    kernel = cv2.INTER_AREA if hw[0] < rgb.shape[0] else cv2.INTER_CUBIC
+    return torch.from_numpy(cv2.resize(rgb.cpu().numpy(), (hw[1], hw[0]), interpolation=kernel))
+
+
 def _whole(side: float) -> int:
     return max(1, math.floor(side + WHOLE))
 
@@ -158,6 +167,19 @@ def _no_pillow_limit() -> Iterator[None]:
         yield
     finally:
         Image.MAX_IMAGE_PIXELS = limit
+
+
+def _read(path: Path) -> np.ndarray:
+    """Float32 in [0, 1], RGB or RGBA."""
+    _, transparent = _look(path)
+    pixels = _decode(path)
+    if pixels.dtype not in SAMPLE_TYPES.values():
+        raise FormatError(path, f"holds {pixels.dtype} samples; save it with 8 or 16 bits")
+    if transparent != (pixels.shape[2] == ALPHA_CHANNELS):
+        raise FormatError(
+            path, "has colours or transparency that OpenCV does not read; save it as RGB(A) PNG"
+        )
+    return _to_rgb(pixels)
 
 
 def _decode(path: Path) -> np.ndarray:
