@@ -12,6 +12,7 @@ import importlib.util
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Literal
 
 import cv2
@@ -23,6 +24,7 @@ from torch import Tensor
 from aaplug.errors import UsageError
 
 SsimFlavour = Literal["wang", "3dgs"]
+LpipsFlavour = Literal["3dgs", "vgg", "alex"]
 
 SSIM_WINDOW = 11  # px: a Gaussian window of sigma 1.5 cut there (Wang et al. 2004)
 SSIM_SIGMA = 1.5  # px
@@ -44,9 +46,7 @@ class Metric:
     ideal: float
     digits: int
     protocol: str
-    measure: (
-        Callable[[Float[Tensor, "h w 3"], Float[Tensor, "h w 3"]], float | None] | None
-    ) = None
+    measure: Callable[[Float[Tensor, "h w 3"], Float[Tensor, "h w 3"]], float | None] | None = None
 
     def loss(self, value: float) -> float:
         """What is smallest for the best value."""
@@ -104,9 +104,7 @@ def energy(rgb: Float[Tensor, "h w 3"]) -> float:
     return float((rgb.double() @ rgb.new_tensor(LUMINANCE).double()).mean())
 
 
-def energy_drift(
-    drawn: Float[Tensor, "h w 3"], expected: Float[Tensor, "h w 3"]
-) -> float | None:
+def energy_drift(drawn: Float[Tensor, "h w 3"], expected: Float[Tensor, "h w 3"]) -> float | None:
     """How much more light an image has than it should, as a share; None where it should have none."""
     before = energy(expected)
     return None if before == 0 else energy(drawn) / before - 1
@@ -120,7 +118,7 @@ def flicker(
     Above 1 an image shimmers, below 1 it is blurred.
     """
     own, expected = (
-        sum(float((b - a).double().square().mean()) for a, b in zip(x, x[1:], strict=False))
+        sum(float((b - a).double().square().mean()) for a, b in pairwise(x))
         for x in (frames, motion)
     )
     return None if expected == 0 else math.sqrt(own / expected)

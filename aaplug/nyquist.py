@@ -19,7 +19,10 @@ from aaplug.gaussians import Gaussians
 from aaplug.interfaces import Training
 
 BINS = 48
-LOWEST, HIGHEST = -7.0, 5.0  # log2 of the multiple of the bound that the histogram shows; the rest is in its ends
+LOWEST, HIGHEST = (
+    -7.0,
+    5.0,
+)  # log2 of the multiple of the bound that the histogram shows; the rest is in its ends
 
 
 @dataclass(frozen=True)

@@ -17,11 +17,10 @@ from torch import Tensor
 from aaplug.cameras import NEAR, WHITE, Camera
 from aaplug.errors import UsageError, listing
 from aaplug.filters import RateChoice
-from aaplug.metrics import SsimFlavour
+from aaplug.metrics import LpipsFlavour, SsimFlavour
 
 Change = Literal["size", "distance", "fov"]
 Truth = Literal["photographs", "self"]
-LpipsFlavour = Literal["3dgs", "vgg", "alex"]
 
 ZOOM_OUT = (1.0, 0.5, 0.25, 0.125)
 ZOOM_IN = (1.0, 2.0, 4.0, 8.0)

@@ -7,8 +7,8 @@ evaluation gives what an uninterrupted one does.
 
 import json
 import os
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -21,56 +21,72 @@ class Record:
     """An open record.  known: the measurements of the finished views, by their place in the request."""
 
     def __init__(self, path: Path, request: Mapping[str, Any], resume: bool):
-        """Start a record, or continue the one that `path` holds if that is asked for and it is of the same request.
+        """A new record, made with the first view's line, or the one that `path` holds if `resume` asks for it.
 
         Raises:
             UsageError: it is the record of another request, or another process is writing it.
             OutputError: it cannot be written.
         """
         self.path, self.known = path, dict[int, tuple[Measurement, ...]]()
-        request = json.loads(json.dumps(request, allow_nan=False))
-        try:
-            self._stream = open(path, "r+b" if path.exists() else "x+b")
-            _lock(self._stream, path)
-            first, *rest = _whole_lines(self._stream) if resume else (None,)
-            if first is None:
-                self._stream.seek(0)
-                self._stream.truncate()
-                self._write({"request": request})
-                return
-            _check_same(path, first.get("request"), request)
-            for line in rest:
-                self.known[line["view"]] = tuple(Measurement(**m) for m in line["measurements"])
-        except OSError as error:
-            raise OutputError(path, f"cannot be written: {(error.strerror or '').lower()}") from error
+        self._request = json.loads(json.dumps(request, allow_nan=False))
+        self._stream: BinaryIO | None = None
+        if resume and path.exists():
+            self._continue()
 
     def add(self, view: int, measurements: Sequence[Measurement]) -> None:
         """Note a finished view.
 
         Raises:
+            UsageError: another process is writing the record.
             OutputError: it cannot be written.
         """
-        try:
+        with _worded(self.path):
+            if self._stream is None:
+                self.path.parent.mkdir(parents=True, exist_ok=True)
+                self._stream = open(self.path, "ab")  # not emptied before it is ours
+                _lock(self._stream, self.path)
+                self._stream.truncate(0)
+                self._write({"request": self._request})
             self._write({"view": view, "measurements": [asdict(m) for m in measurements]})
-        except OSError as error:
-            raise OutputError(
-                self.path, f"cannot be written: {(error.strerror or '').lower()}"
-            ) from error
 
     def close(self) -> None:
         """Let others write."""
-        self._stream.close()
+        if self._stream is not None:
+            self._stream.close()
+
+    def _continue(self) -> None:
+        with _worded(self.path):
+            stream = open(self.path, "r+b")
+            _lock(stream, self.path)
+            lines = _whole_lines(stream)
+        if not lines:
+            stream.close()
+            return
+        self._stream = stream
+        _check_same(self.path, lines[0].get("request"), self._request)
+        for line in lines[1:]:
+            self.known[line["view"]] = tuple(Measurement(**m) for m in line["measurements"])
 
     def _write(self, line: Mapping[str, Any]) -> None:
+        assert self._stream is not None
         self._stream.write(json.dumps(line, allow_nan=False).encode() + b"\n")
         self._stream.flush()
         os.fsync(self._stream.fileno())
 
 
-def _whole_lines(stream: BinaryIO) -> tuple[dict[str, Any] | None, ...]:
-    """The lines that were written whole; the stream stands after them and ends there.  None where there are none."""
+@contextmanager
+def _worded(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise OutputError(path, f"cannot be written: {reason}") from error
+
+
+def _whole_lines(stream: BinaryIO) -> list[dict[str, Any]]:
+    """The lines that were written whole; the stream stands after them and ends there."""
     stream.seek(0)
-    found, end = [], 0
+    found, end = list[dict[str, Any]](), 0
     for line in stream:
         if not line.endswith(b"\n"):
             break
@@ -81,7 +97,7 @@ def _whole_lines(stream: BinaryIO) -> tuple[dict[str, Any] | None, ...]:
         end += len(line)
     stream.seek(end)
     stream.truncate()
-    return tuple(found) or (None,)
+    return found
 
 
 def _check_same(path: Path, before: Any, now: Mapping[str, Any]) -> None:

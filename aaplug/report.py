@@ -88,10 +88,10 @@ def tables(report: Report) -> list[Table]:
             cells = [f"[bold]{text}[/]" if best else text for text, best in row]
             grid.add_row(recipe, *cells, style="italic" if recipe == CEILING else None)
         grids.append(grid)
-    for title, column in (("seconds a view", seconds), ("million pairs a view", million_pairs)):
+    for title, lines in work(report):
         grid = _grid(title, report)
-        for recipe in report.recipes:
-            grid.add_row(recipe, *[_figure(column(report, recipe, s), 2) for s in report.scales])
+        for recipe, cells in zip(report.recipes, lines, strict=True):
+            grid.add_row(recipe, *cells)
         grids.append(grid)
     return grids
 
@@ -101,11 +101,29 @@ def rows(report: Report, metric: Metric) -> list[list[tuple[str, bool]]]:
     best = [_best(report, metric, scale) for scale in report.scales]
     return [
         [
-            (_figure(value, metric.digits), value is not None and value == top)
+            (
+                _figure(value, metric.digits),
+                value is not None and value == top and recipe != CEILING,
+            )
             for scale, top in zip(report.scales, best, strict=True)
             for value in [mean(report.select(recipe, scale), metric.name)]
         ]
         for recipe in report.recipes
+    ]
+
+
+def work(report: Report) -> list[tuple[str, list[list[str]]]]:
+    """Tables of what a view costs, recipes down and scales across, as (title, lines)."""
+    columns = (("seconds a view", seconds, 3), ("million pairs a view", million_pairs, 2))
+    return [
+        (
+            title,
+            [
+                [_figure(column(report, recipe, scale), digits) for scale in report.scales]
+                for recipe in report.recipes
+            ],
+        )
+        for title, column, digits in columns
     ]
 
 

@@ -25,6 +25,7 @@ from aaplug.errors import FormatError, UsageError
 from aaplug.io.atomic import check_output, replacing
 
 MAX_PIXELS = 2**28  # 16384 x 16384; more is taken for a decompression bomb
+LOSSLESS_WEBP = 101  # OpenCV's quality for it
 SAMPLE_TYPES = {8: np.uint8, 16: np.uint16}  # by bit depth
 ALPHA_CHANNELS = 4  # RGB and alpha
 DAMAGE = ("Corrupt JPEG data", "Premature end of JPEG file")  # libjpeg's words for lost pixels
@@ -87,6 +88,15 @@ def encode_png(rgb: Float[Tensor, "h w 3"], bit_depth: int) -> bytes:
     done, png = cv2.imencode(".png", samples[..., ::-1])
     assert done
     return png.tobytes()
+
+
+def encode_webp(rgb: Float[Tensor, "h w 3"], quality: int | None) -> bytes:
+    """The bytes of a WebP file of [0, 1]-clamped colours in 8 bits; lossless without a quality, of 1 to 100."""
+    samples = _samples(rgb, 8).cpu().numpy().astype(np.uint8)
+    setting = LOSSLESS_WEBP if quality is None else quality
+    done, webp = cv2.imencode(".webp", samples[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, setting])
+    assert done
+    return webp.tobytes()
 
 
 def quantise(rgb: Float[Tensor, "h w 3"], bit_depth: int = 8) -> Float[Tensor, "h w 3"]:

@@ -44,7 +44,9 @@ class Downscale:
 
 def _box(path: Path, background: Background) -> Photograph:
     photo = quantise(read_image(path, background))
-    return Photograph((photo.shape[0], photo.shape[1]), lambda hw, factor: resampled(photo, factor, hw))
+    return Photograph(
+        (photo.shape[0], photo.shape[1]), lambda hw, factor: resampled(photo, factor, hw)
+    )
 
 
 def _rgba_box(path: Path, background: Background) -> Photograph:
@@ -97,7 +99,7 @@ DOWNSCALES = {
         ),
         Downscale(
             "rgba-box",
-            "RGBA halved by 2×2 box means in float, cut to 8 bits, composited, cut to 8 bits (multi-scale Blender data)",
+            "RGBA halved by 2×2 box means in float, cut to 8 bits, composited, cut again (multi-scale Blender data)",
             _rgba_box,
         ),
         Downscale(
