@@ -166,8 +166,8 @@ FLICKER = Metric(
     "",
     1.0,
     3,
-    "frame-to-frame change over three steps of 1/4 px, over that of the training-size image, averaged down: 1 is motion "
-    "alone; null at and above the training size",
+    "frame-to-frame change over three steps of 1/4 px, over that of the training-size image, averaged down: 1 is "
+    "motion alone; null at and above the training size",
 )
 METRICS = {
     metric.name: metric

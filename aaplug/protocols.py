@@ -1,4 +1,4 @@
-"""Evaluation protocols by name: what a scale changes, what is the truth and how it is made smaller, which SSIM and LPIPS.
+"""Evaluation protocols by name: what a scale changes, the truth and how it is made smaller, which SSIM and LPIPS.
 
 A scale is a factor on how finely the scene is sampled against training.  What carries it:
 "size": the image has that many times the pixels a side, at the same pose and field of view.
@@ -58,7 +58,7 @@ class Protocol:
             return replace(view, fx=view.fx * scale, fy=view.fy * scale)
         pose = view.cam_from_world.clone()
         pose[2, 3] += depth * (1 / scale - 1)
-        return replace(view, cam_from_world=pose)
+        return replace(view, cam_from_world=pose, trained_focal=None)  # training never was there
 
 
 def median_depth(means: Float[Tensor, "n 3"], view: Camera) -> float:

@@ -19,6 +19,7 @@ from .demo import Demo, demo
 from .evaluate import Evaluate, evaluate
 from .info import Info, info
 from .render import Render, render
+from .video import Video, video
 from .warmup import Warmup, warmup
 
 FAILED, REFUSED, INTERRUPTED = 1, 2, 130
@@ -27,6 +28,7 @@ VERBS = {
     Convert: convert,
     Render: render,
     Evaluate: evaluate,
+    Video: video,
     Demo: demo,
     Warmup: warmup,
     Bench: bench,

@@ -195,7 +195,7 @@ def _read(path: Path) -> np.ndarray:
 def _decode(path: Path) -> np.ndarray:
     """Samples as stored, [h, w, channels], BGR(A) or gray."""
     try:
-        with _codecs_heard() as words:
+        with codecs_heard() as words:
             # UNCHANGED keeps 16 bits and alpha, and leaves the orientation tag alone
             pixels = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
             damage = _damage(words)
@@ -209,8 +209,8 @@ def _decode(path: Path) -> np.ndarray:
 
 
 @contextmanager
-def _codecs_heard() -> Iterator[IO[bytes]]:
-    """Catch what libpng and libjpeg print: they name no file and would tear a progress bar."""
+def codecs_heard() -> Iterator[IO[bytes]]:
+    """Catch what libpng, libjpeg and FFmpeg print: they name no file and would tear a progress bar."""
     with tempfile.TemporaryFile() as words:
         saved = os.dup(STDERR)
         os.dup2(words.fileno(), STDERR)
