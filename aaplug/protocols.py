@@ -83,8 +83,8 @@ PROTOCOLS = {
         Protocol("default", "aaplug: photographs where every view has one, else self", ZOOM_OUT),
         Protocol(
             "blender",
-            "NeRF-synthetic, single-train multi-test (Mip-Splatting, section 6.2): trained at full size, tested down to "
-            "1/8, on white",
+            "NeRF-synthetic, single-train multi-test (Mip-Splatting, section 6.2): trained at full size, tested "
+            "down to 1/8, on white",
             ZOOM_OUT,
             "photographs",
             downscale="rgba-box",

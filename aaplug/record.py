@@ -43,7 +43,7 @@ class Record:
         with _worded(self.path):
             if self._stream is None:
                 self.path.parent.mkdir(parents=True, exist_ok=True)
-                self._stream = open(self.path, "ab")  # not emptied before it is ours
+                self._stream = self.path.open("ab")  # not emptied before it is ours
                 _lock(self._stream, self.path)
                 self._stream.truncate(0)
                 self._write({"request": self._request})
@@ -56,7 +56,7 @@ class Record:
 
     def _continue(self) -> None:
         with _worded(self.path):
-            stream = open(self.path, "r+b")
+            stream = self.path.open("r+b")
             _lock(stream, self.path)
             lines = _whole_lines(stream)
         if not lines:

@@ -2,7 +2,6 @@
 
 import csv
 import io
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
@@ -182,7 +181,7 @@ def seconds(report: Report, recipe: str, scale: float) -> float | None:
 
 
 def million_pairs(report: Report, recipe: str, scale: float) -> float | None:
-    """Mean number of splat and pixel pairs that compositing evaluated in a view, in millions; None where not counted."""
+    """Mean number of splat and pixel pairs that compositing evaluated in a view, in millions; None if not counted."""
     pairs = [m.pairs / 1e6 for m in report.select(recipe, scale) if m.pairs is not None]
     return _mean(pairs)
 

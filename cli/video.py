@@ -105,7 +105,8 @@ def _recipes(options: Video) -> tuple[list[Recipe], list[str]]:
 
 
 def _along(options: Video, scene: Gaussians, cameras: CameraSet, fps: float) -> Sequence[Camera]:
-    for name, value in (("--start", options.start), ("--end", options.end), ("--seconds", options.seconds)):  # fmt: skip
+    given = {"--start": options.start, "--end": options.end, "--seconds": options.seconds}
+    for name, value in given.items():
         if not value > 0:
             raise UsageError(name, f"must be above 0, got {value:g}")
     count = max(1, round(options.seconds * fps))
