@@ -8,7 +8,7 @@ evaluation gives what an uninterrupted one does.
 import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -55,17 +55,17 @@ class Record:
             self._stream.close()
 
     def _continue(self) -> None:
-        with _worded(self.path):
-            stream = self.path.open("r+b")
+        with _worded(self.path), ExitStack() as stack:
+            stream = stack.enter_context(self.path.open("r+b"))
             _lock(stream, self.path)
             lines = _whole_lines(stream)
-        if not lines:
-            stream.close()
-            return
-        self._stream = stream
-        _check_same(self.path, lines[0].get("request"), self._request)
-        for line in lines[1:]:
-            self.known[line["view"]] = tuple(Measurement(**m) for m in line["measurements"])
+            if not lines:
+                return
+            _check_same(self.path, lines[0].get("request"), self._request)
+            for line in lines[1:]:
+                self.known[line["view"]] = tuple(Measurement(**m) for m in line["measurements"])
+            stack.pop_all()  # it stays open
+            self._stream = stream
 
     def _write(self, line: Mapping[str, Any]) -> None:
         assert self._stream is not None

@@ -8,7 +8,9 @@ import json
 import re
 import traceback
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import redirect_stderr
 from dataclasses import dataclass, replace
+from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +24,7 @@ from aaplug.report import Report, as_csv, method, results, scale_name
 
 from .console import escape, log, out, print_json, say
 from .files import make_folder, refuse_existing
+from .options import CONFIG
 
 if TYPE_CHECKING:
     from .evaluate import Evaluate
@@ -115,13 +118,8 @@ def _set(
             raise FormatError(path, f"{where}: {key} is no setting here{hint}")
         words = _words(key, value)
         try:
-            base = tyro.cli(
-                Evaluate,
-                args=words,
-                default=base,
-                config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
-                console_outputs=False,
-            )
+            with redirect_stderr(StringIO()):  # tyro words its complaints for a command line
+                base = tyro.cli(Evaluate, args=words, default=base, config=CONFIG)
         except SystemExit as error:
             raise FormatError(
                 path,

@@ -18,6 +18,7 @@ from .convert import Convert, convert
 from .demo import Demo, demo
 from .evaluate import Evaluate, evaluate
 from .info import Info, info
+from .options import CONFIG
 from .render import Render, render
 from .video import Video, video
 from .warmup import Warmup, warmup
@@ -33,7 +34,6 @@ VERBS = {
     Warmup: warmup,
     Bench: bench,
 }
-CONFIG = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
 
 
 def main(words: Sequence[str] | None = None) -> None:
