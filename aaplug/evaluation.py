@@ -9,7 +9,7 @@ photograph is read once for all scales.
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -206,14 +206,31 @@ class _Bench:
             truth = self._truth(photo, view, camera, scale, ceiling)
             if full is not None and ceiling is not None:
                 row = full._replace(rgb=ceiling, samples=1)
-                yield self._judged(index, CEILING, scale, view, row, truth, {})
+                values = self._judged(row, truth, {})
+                yield self._noted(index, CEILING, scale, view, row, truth, values)
             motion = self._motion(view, camera, scale)
+            drawings: dict[Hashable, _Drawn] = {}
+            judgements: dict[Hashable, dict[str, float | None]] = {}
+            if full is not None and scale == 1:
+                drawings[self._work(find_recipe("matched"), view)] = full
             for recipe in task.recipes:
-                drawn = self._draw(self.smoothed[recipe.name], camera, recipe)
+                work = self._work(recipe, camera)
+                if work not in drawings:
+                    drawings[work] = self._draw(self.smoothed[recipe.name], camera, recipe)
+                drawn = drawings[work]
                 if scale == 1:
                     fulls[recipe.name] = drawn
-                figures = self._figures(recipe, camera, scale, drawn, fulls, motion)
-                yield self._judged(index, recipe.name, scale, view, drawn, truth, figures)
+                if work not in judgements:
+                    figures = self._figures(recipe, camera, scale, drawn, fulls, motion)
+                    judgements[work] = self._judged(drawn, truth, figures)
+                values = judgements[work]
+                yield self._noted(index, recipe.name, scale, view, drawn, truth, values)
+
+    def _work(self, recipe: Recipe, camera: Camera) -> Hashable:
+        """What a recipe does at a view's rate: `auto` is `matched` where it takes one sample, and not drawn again."""
+        rate = self.training.rate(camera)
+        samples = recipe.samples_at(rate)
+        return recipe.world, recipe.screen_at(rate), samples, recipe.pixel
 
     def _draw(self, scene: Gaussians, camera: Camera, recipe: Recipe) -> _Drawn:
         rasterizer, counting = self.task.rasterizer, None
@@ -289,8 +306,8 @@ class _Bench:
             expected = self._shrunk(full.rgb.clamp(0, 1), camera, scale)
             figures[CONSISTENCY.name] = psnr(drawn.rgb.clamp(0, 1), expected)
         if full is not None and ENERGY.name in figures:
-            expected = self._shrunk(full.own, camera, scale)
-            figures[ENERGY.name] = energy_drift(drawn.own, expected)
+            rows, columns = (math.ceil(side / scale) for side in camera.hw)
+            figures[ENERGY.name] = energy_drift(drawn.own, full.own[:rows, :columns])
         if motion is not None:
             scene = self.smoothed[recipe.name]
             moved = [_moved(camera, float(step)) for step in range(FLICKER_STEPS)]
@@ -299,6 +316,18 @@ class _Bench:
         return figures
 
     def _judged(
+        self, drawn: _Drawn, truth: Tensor | None, figures: Mapping[str, float | None]
+    ) -> dict[str, float | None]:
+        """Every metric's value, and the figures that need no truth."""
+        values: dict[str, float | None] = {metric.name: None for metric in self.task.judges}
+        if truth is not None:
+            image = quantise(drawn.rgb)
+            for metric in self.task.judges:
+                assert metric.measure is not None
+                values[metric.name] = metric.measure(image, truth)
+        return values | {metric.name: figures.get(metric.name) for metric in self.task.figures}
+
+    def _noted(
         self,
         index: int,
         recipe: str,
@@ -306,19 +335,13 @@ class _Bench:
         view: Camera,
         drawn: _Drawn,
         truth: Tensor | None,
-        figures: Mapping[str, float | None],
+        values: dict[str, float | None],
     ) -> Measurement:
-        image = quantise(drawn.rgb)
+        """The measurement, once its images are in place."""
         if self.images is not None:
-            self.images.keep(index, recipe, scale, image, truth)
-        judges = self.task.judges
-        values: dict[str, float | None] = {metric.name: None for metric in judges}
-        if truth is not None:
-            for metric in judges:
-                assert metric.measure is not None
-                values[metric.name] = metric.measure(image, truth)
-        note = _note(values, truth is None)
-        values |= {metric.name: figures.get(metric.name) for metric in self.task.figures}
+            self.images.keep(index, recipe, scale, drawn.rgb, truth)
+        compared = {metric.name: values[metric.name] for metric in self.task.judges}
+        note = _note(compared, truth is None)
         return Measurement(
             recipe, scale, view.name, values, drawn.samples, drawn.seconds, note, drawn.pairs
         )

@@ -67,11 +67,12 @@ def ssim(
         return None
     a, b = image.double().cpu().numpy(), truth.double().cpu().numpy()
     mean_a, mean_b = _windowed(a, flavour), _windowed(b, flavour)
-    variance_a = _windowed(a * a, flavour) - mean_a * mean_a
-    variance_b = _windowed(b * b, flavour) - mean_b * mean_b
-    covariance = _windowed(a * b, flavour) - mean_a * mean_b
-    alike = (2 * mean_a * mean_b + SSIM_C1) * (2 * covariance + SSIM_C2)
-    size = (mean_a * mean_a + mean_b * mean_b + SSIM_C1) * (variance_a + variance_b + SSIM_C2)
+    covariance = _windowed(a * b, flavour)
+    # only the variances' sum counts, so that their windows are one
+    variances = _windowed(a * a + b * b, flavour)
+    product, squares = mean_a * mean_b, mean_a * mean_a + mean_b * mean_b
+    alike = (2 * product + SSIM_C1) * (2 * (covariance - product) + SSIM_C2)
+    size = (squares + SSIM_C1) * (variances - squares + SSIM_C2)
     return float((alike / size).mean())
 
 
@@ -80,7 +81,9 @@ def _windowed(image: np.ndarray, flavour: SsimFlavour) -> np.ndarray:
     line = cv2.getGaussianKernel(SSIM_WINDOW, SSIM_SIGMA, cv2.CV_64F)
     means = cv2.sepFilter2D(image, cv2.CV_64F, line, line, borderType=cv2.BORDER_CONSTANT)
     border = SSIM_WINDOW // 2
-    return means if flavour == "3dgs" else means[border:-border, border:-border]
+    if flavour == "3dgs":
+        return means
+    return np.ascontiguousarray(means[border:-border, border:-border])
 
 
 def flip(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> float | None:

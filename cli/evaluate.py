@@ -41,7 +41,7 @@ FILES = ("results.json", "per_view.json", "results.csv")
 class OtherScenes:
     """More scenes."""
 
-    more: Annotated[tuple[Path, ...], tyro.conf.Positional, flag("SCENE")] = ()
+    more: Annotated[tuple[Path, ...], tyro.conf.Positional, flag("[SCENE ...]")] = ()
     """More scenes, with the same --cameras or each a model folder; their results go to folders of their own."""
 
 
@@ -69,8 +69,7 @@ class Evaluate:
     scale: Annotated[tuple[float, ...] | None, flag("FACTOR [FACTOR ...]")] = None
     """One or more sizes against the training size, on either side of 1 (default: the protocol's)."""
     truth: Literal["auto", "photographs", "self"] = "auto"
-    """Compare with photographs, or with the scene's own supersampled look; auto is the protocol's, or photographs where
-    all exist."""
+    """Compare with photographs, or with the scene's own supersampled look; auto leaves it to the protocol."""
     ssim: Annotated[Literal["wang", "3dgs"] | None, flag("wang|3dgs")] = None
     """SSIM with the border cropped (scikit-image) or zero-padded (3DGS) (default: the protocol's)."""
     lpips: Annotated[tuple[Path, Path] | None, flag("TRUNK HEADS")] = None
