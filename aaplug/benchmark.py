@@ -19,10 +19,11 @@ from torch import Tensor
 from aaplug.cameras import BLACK, Camera, look_at
 from aaplug.gaussians import Gaussians
 from aaplug.interfaces import Rasterizer, Training
-from aaplug.kernels import Kernel, Kernels
+from aaplug.kernels import Kernels
 from aaplug.pipeline import learn, render
 from aaplug.projection import SH_C0, project, shade
 from aaplug.rasterizers import Tiled, tiled
+from aaplug.rasterizers.counting import Counting
 from aaplug.recipes import Recipe, find_recipe
 from aaplug.splats import drawn
 
@@ -74,7 +75,7 @@ def measure(
     camera = camera.as_trained()
     with torch.no_grad():
         stages, tile_pairs = _stages(scene, camera, rasterizer.kernels, training, recipe, repeats)
-        counting = _Counting(rasterizer.kernels)
+        counting = Counting(rasterizer.kernels)
         render(scene, camera, recipe, training, replace(rasterizer, kernels=counting))
         a = torch.ones(MATRIX_SIDE, MATRIX_SIDE)
         frame, product = _timed_in_turn(
@@ -177,18 +178,6 @@ def _turned_to(normals: Float[Tensor, "n 3"], roll: Float[Tensor, " n"]) -> Floa
     w, i, j = (1 + z).clamp(min=1e-3), -y, x
     cos, sin = roll.cos(), roll.sin()
     return torch.stack([w * cos, i * cos + j * sin, j * cos - i * sin, w * sin], dim=1)
-
-
-class _Counting(Kernels):
-    """Counts the pairs that compositing evaluates."""
-
-    def __init__(self, kernels: Kernels):
-        self._kernels, self.name, self.tiles, self.pairs = kernels, kernels.name, kernels.tiles, 0
-
-    def run(self, kernel: Kernel, *args: Tensor) -> tuple[Tensor, ...]:
-        if kernel in tiled.COMPOSITE.values():
-            self.pairs += len(args[2]) * tiled.PASS * tiled.TILE**2
-        return self._kernels.run(kernel, *args)
 
 
 def _stages(

@@ -15,6 +15,7 @@ CELL = 320  # px: height of a shown image
 GAP = 12  # px
 HEADING = 36  # px: height of a line of text
 INK = (40, 40, 40)
+LIGHT_INK = (245, 245, 245)
 
 
 def contact_sheet(
@@ -39,6 +40,15 @@ def contact_sheet(
     return torch.from_numpy(sheet).float() / 255
 
 
+def labelled(image: Float[Tensor, "h w 3"], label: str) -> Float[Tensor, "h w 3"]:
+    """The image with a label on a dark strip in its top left corner."""
+    pixels = (image.clamp(0, 1) * 255).round().byte().cpu().numpy().copy()
+    strip = pixels[:HEADING, : _text_width(label) + 2 * GAP]
+    strip[:] = strip // 4
+    _write(pixels, label, GAP, HEADING - GAP, LIGHT_INK)
+    return torch.from_numpy(pixels).float() / 255
+
+
 def _enlarged(image: Float[Tensor, "h w 3"]) -> np.ndarray:
     """8-bit, CELL px high; small images keep hard pixels, large ones are averaged."""
     pixels = (image.clamp(0, 1) * 255).round().byte().cpu().numpy()
@@ -51,5 +61,7 @@ def _text_width(text: str) -> int:
     return cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.6, 1)[0][0]
 
 
-def _write(sheet: np.ndarray, text: str, left: int, bottom: int) -> None:
-    cv2.putText(sheet, text, (left, bottom), cv2.FONT_HERSHEY_SIMPLEX, 0.6, INK, 1, cv2.LINE_AA)
+def _write(
+    sheet: np.ndarray, text: str, left: int, bottom: int, ink: tuple[int, int, int] = INK
+) -> None:
+    cv2.putText(sheet, text, (left, bottom), cv2.FONT_HERSHEY_SIMPLEX, 0.6, ink, 1, cv2.LINE_AA)

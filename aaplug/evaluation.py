@@ -1,45 +1,78 @@
-"""Multi-scale evaluation: every recipe at every scale against one truth.
+"""Multi-scale evaluation: every recipe at every scale against one truth, as a protocol says.
 
-A scale is a size against training's.  Truth "photographs": the photograph, alpha composited on the background in
-float, rounded to 8 bits and box-averaged to the size being judged.  Truth "self": the scene's own look, its
-training-size render box-averaged below that size and `matched` above it.  Renders are clamped and rounded to 8 bits
-before they are compared.  Views stream: nothing grows with their number but the numbers.
+What a scale changes, where the truth comes from and how it is made smaller is the protocol's (`aaplug.protocols`).
+Truth "self" is the scene's own look: for sizes its training-size render averaged down, and `matched` above that size;
+for distances and fields of view `matched` with as many samples as reach training's rate.  Renders are clamped and
+rounded to 8 bits before they are compared.  Views stream: nothing grows with their number but the numbers, and a
+photograph is read once for all scales.
 """
 
+import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.cameras import Camera
 from aaplug.errors import UsageError
 from aaplug.gaussians import Gaussians
+from aaplug.images import Images
 from aaplug.interfaces import Rasterizer, Training
-from aaplug.io.images import quantise, read_image, resampled
-from aaplug.metrics import METRICS
+from aaplug.io.images import quantise, resampled, stretched
+from aaplug.io.photographs import DOWNSCALES, Photograph
+from aaplug.metrics import (
+    CONSISTENCY,
+    ENERGY,
+    FLICKER,
+    PSNR,
+    SSIM,
+    Metric,
+    energy_drift,
+    flicker,
+    psnr,
+)
 from aaplug.pipeline import render, smooth
-from aaplug.rasterizers import RASTERIZERS
+from aaplug.protocols import PROTOCOLS, Protocol, Truth, median_depth
+from aaplug.rasterizers import RASTERIZERS, Tiled
+from aaplug.rasterizers.counting import Counting
 from aaplug.recipes import Recipe, find_recipe
+from aaplug.record import Record
 from aaplug.report import CEILING, Measurement, Report
 
 NO_PHOTOGRAPH = "no photograph is this large: metrics above the photographs' own size are undefined"
 EQUAL_IMAGES = "equal images: PSNR is infinite and left out of the mean"
 TOO_SMALL = "image smaller than the SSIM window"
+FLICKER_STEPS = 4  # frames, a step of 1/4 px right and down between them
 
 
 @dataclass(frozen=True)
 class Task:
-    """What to evaluate and against which truth."""
+    """What to evaluate and against which truth.
+
+    metrics: None takes PSNR and the protocol's SSIM.  figures: what is measured without a photograph, out of
+    CONSISTENCY, ENERGY and FLICKER.
+    """
 
     recipes: Sequence[Recipe]
     scales: Sequence[float]
     views: Sequence[Camera]
     background: tuple[float, float, float]
-    truth: Literal["photographs", "self"]
+    truth: Truth
     rasterizer: Rasterizer = RASTERIZERS["eager"]
+    protocol: Protocol = PROTOCOLS["default"]
+    metrics: Sequence[Metric] | None = None
+    figures: Sequence[Metric] = ()
+
+    @property
+    def judges(self) -> tuple[Metric, ...]:
+        """The metrics that compare with the truth."""
+        own = (PSNR, SSIM[self.protocol.ssim])
+        return own if self.metrics is None else tuple(self.metrics)
 
 
 def evaluate(
@@ -48,36 +81,64 @@ def evaluate(
     task: Task,
     facts: Mapping[str, Any] | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
+    record: Path | None = None,
+    resume: bool = False,
+    images: Images | None = None,
 ) -> Report:
     """Measure every recipe at every scale on every view.
 
     facts: JSON-ready entries for the protocol (versions, hashes).  progress: told (views done, views in all).
+    record: a file that holds what is finished; with `resume` the views that it holds are not measured again.
+    images: where images are stored.
 
     Raises:
-        UsageError: nothing to measure, or the truth is photographs and a view has none.
+        UsageError: nothing to measure, the truth is photographs and a view has none, or the record is of another
+            request.
         FormatError: a photograph cannot be read.
+        OutputError: the record or an image cannot be written.
     """
+    task = replace(task, views=_distinct(task.views))
     _check(task)
-    smoothed = [smooth(scene, training, recipe) for recipe in task.recipes]
-    own = smooth(scene, training, find_recipe("matched"))
-    measurements: list[Measurement] = []
-    for done, view in enumerate(task.views):
-        progress(done, len(task.views))
-        measurements += _one_view(view, smoothed, own, training, task)
+    protocol = _protocol(task) | dict(facts or {})
+    finished = None if record is None else Record(record, protocol, resume)
+    known = {} if finished is None else finished.known
+    try:
+        bench = _Bench(scene, training, task, images)
+        measurements: list[Measurement] = []
+        for index, view in enumerate(task.views):
+            progress(index, len(task.views))
+            measured = known.get(index) or tuple(bench.measure(index, view))
+            if finished is not None and index not in known:
+                finished.add(index, measured)
+            measurements += measured
+    finally:
+        if finished is not None:
+            finished.close()
     progress(len(task.views), len(task.views))
     order = [CEILING, *(recipe.name for recipe in task.recipes)]
     measurements.sort(key=lambda m: (order.index(m.recipe), task.scales.index(m.scale)))
-    return Report(tuple(measurements), _protocol(task) | dict(facts or {}))
+    return Report(tuple(measurements), protocol)
+
+
+def _distinct(views: Sequence[Camera]) -> Sequence[Camera]:
+    """Views of the same name, as two splits may hold, get their place before it."""
+    if len({view.name for view in views}) == len(views):
+        return views
+    return [replace(view, name=f"{i:05d}_{view.name}") for i, view in enumerate(views)]
 
 
 def _check(task: Task) -> None:
     if not (task.recipes and task.scales and task.views):
         raise UsageError("evaluate", "needs at least one recipe, one scale and one view")
-    if any(not scale > 0 for scale in task.scales):
+    if any(not (scale > 0 and math.isfinite(scale)) for scale in task.scales):
         raise UsageError("--scale", f"sizes must be above 0, got {min(task.scales):g}")
     names = [recipe.name for recipe in task.recipes]
     if len(set(names)) != len(names) or len(set(task.scales)) != len(task.scales):
         raise UsageError("evaluate", "a recipe or a scale is named twice")
+    if task.truth == "photographs" and task.protocol.change != "size":
+        raise UsageError(
+            "--truth", f"protocol {task.protocol.name} moves the camera: no photograph shows that"
+        )
     missing = [view.name for view in task.views if view.photo is None]
     if task.truth == "photographs" and missing:
         raise UsageError(
@@ -87,83 +148,213 @@ def _check(task: Task) -> None:
 
 
 def _protocol(task: Task) -> dict[str, Any]:
+    protocol = task.protocol
+    downscale = DOWNSCALES[protocol.downscale] if task.truth == "photographs" else DOWNSCALES["box"]
     return {
+        "protocol": {
+            "name": protocol.name,
+            "source": protocol.source,
+            "scale changes": protocol.change,
+            "sizes": "rounded, pixels stretched by less than one"
+            if protocol.whole_sizes
+            else "what does not fill a pixel is cropped",
+        },
         "truth": task.truth,
-        "downscale": "box average (area-weighted where the factor is not whole), after compositing and 8-bit rounding",
+        "downscale": downscale.protocol,
         "rounding": "renders clamped to [0, 1] and rounded to 8 bits",
         "background": list(task.background),
-        "metrics": {metric.name: metric.protocol for metric in METRICS.values()},
+        "metrics": {m.name: m.protocol for m in (*task.judges, *task.figures)},
         "views": len(task.views),
         "view_names": [view.name for view in task.views],
         "scales": list(task.scales),
         "recipes": {recipe.name: recipe.source for recipe in task.recipes},
+        "rasterizer": task.rasterizer.kernels.name
+        if isinstance(task.rasterizer, Tiled)
+        else type(task.rasterizer).__name__.lower(),
     }
 
 
-def _one_view(
-    view: Camera, smoothed: Sequence[Gaussians], own: Gaussians, training: Training, task: Task
-) -> Iterator[Measurement]:
-    """Measure one view; its photograph is read and its training-size render made once for all scales."""
-    started = time.perf_counter()
-    full = render(own, view, find_recipe("matched"), training, task.rasterizer, task.background).rgb
-    full = full.clamp(0.0, 1.0)
-    seconds = time.perf_counter() - started
-    photo = _photograph(view, task)
-    for scale in task.scales:
-        camera = view.scaled(scale)
-        ceiling = resampled(full, scale)
-        truth = _self_truth(own, camera, ceiling, training, task) if photo is None else None
-        truth = truth if photo is None else _scaled_photograph(photo, camera, view, scale)
-        yield _measure(CEILING, scale, view, ceiling, truth, 1, seconds)
-        for recipe, scene in zip(task.recipes, smoothed, strict=True):
-            started = time.perf_counter()
-            image = render(scene, camera, recipe, training, task.rasterizer, task.background).rgb
-            seconds_taken = time.perf_counter() - started
-            samples = recipe.samples_at(training.rate(camera))
-            yield _measure(recipe.name, scale, view, image, truth, samples, seconds_taken)
+class _Drawn(NamedTuple):
+    """A timed render.  own: its light without the background, for energy."""
+
+    rgb: Float[Tensor, "h w 3"]
+    own: Float[Tensor, "h w 3"]
+    samples: int
+    seconds: float
+    pairs: int | None
 
 
-def _photograph(view: Camera, task: Task) -> Float[Tensor, "h w 3"] | None:
-    if task.truth == "self":
-        return None
-    assert view.photo is not None
-    return quantise(read_image(view.photo, task.background))
+class _Bench:
+    """What all views share, and the measuring of one."""
+
+    def __init__(self, scene: Gaussians, training: Training, task: Task, images: Images | None):
+        self.training, self.task, self.images = training, task, images
+        self.smoothed = {r.name: smooth(scene, training, r) for r in task.recipes}
+        self.own = smooth(scene, training, find_recipe("matched"))
+
+    def measure(self, index: int, view: Camera) -> Iterator[Measurement]:
+        """Measure one view; its photograph is read and its training-size render made once for all scales."""
+        task, protocol = self.task, self.task.protocol
+        photo = self._photograph(view)
+        depth = median_depth(self.own.means, view) if protocol.change == "distance" else 1.0
+        sized = protocol.change == "size"
+        full = self._draw(self.own, view, find_recipe("matched")) if sized else None
+        fulls: dict[str, _Drawn] = {}
+        for scale in sorted(task.scales, key=lambda scale: scale != 1):  # figures look back at 1
+            camera = protocol.camera(view, scale, depth)
+            ceiling = None if full is None else self._shrunk(full.rgb.clamp(0, 1), camera, scale)
+            truth = self._truth(photo, view, camera, scale, ceiling)
+            if full is not None and ceiling is not None:
+                row = full._replace(rgb=ceiling, samples=1)
+                values = self._judged(row, truth, {})
+                yield self._noted(index, CEILING, scale, view, row, truth, values)
+            motion = self._motion(view, camera, scale)
+            drawings: dict[Hashable, _Drawn] = {}
+            judgements: dict[Hashable, dict[str, float | None]] = {}
+            if full is not None and scale == 1:
+                drawings[self._work(find_recipe("matched"), view)] = full
+            for recipe in task.recipes:
+                work = self._work(recipe, camera)
+                if work not in drawings:
+                    drawings[work] = self._draw(self.smoothed[recipe.name], camera, recipe)
+                drawn = drawings[work]
+                if scale == 1:
+                    fulls[recipe.name] = drawn
+                if work not in judgements:
+                    figures = self._figures(recipe, camera, scale, drawn, fulls, motion)
+                    judgements[work] = self._judged(drawn, truth, figures)
+                values = judgements[work]
+                yield self._noted(index, recipe.name, scale, view, drawn, truth, values)
+
+    def _work(self, recipe: Recipe, camera: Camera) -> Hashable:
+        """What a recipe does at a view's rate: `auto` is `matched` where it takes one sample, and not drawn again."""
+        rate = self.training.rate(camera)
+        samples = recipe.samples_at(rate)
+        return recipe.world, recipe.screen_at(rate), samples, recipe.pixel
+
+    def _draw(self, scene: Gaussians, camera: Camera, recipe: Recipe) -> _Drawn:
+        rasterizer, counting = self.task.rasterizer, None
+        if isinstance(rasterizer, Tiled):
+            counting = Counting(rasterizer.kernels)
+            rasterizer = replace(rasterizer, kernels=counting)
+        behind = self.task.background
+        started = time.perf_counter()
+        with torch.no_grad():
+            rgb, alpha = render(scene, camera, recipe, self.training, rasterizer, behind)
+        seconds = time.perf_counter() - started
+        rgb, alpha = rgb.float(), alpha.float()
+        own = rgb - (1 - alpha[..., None]) * rgb.new_tensor(behind)
+        samples = recipe.samples_at(self.training.rate(camera))
+        return _Drawn(rgb, own, samples, seconds, counting and counting.pairs)
+
+    def _shrunk(self, full: Tensor, camera: Camera, scale: float) -> Float[Tensor, "h w 3"]:
+        """A training-size image at the camera's size."""
+        if self.task.protocol.whole_sizes:
+            return stretched(full, camera.hw)
+        return resampled(full, scale)
+
+    def _photograph(self, view: Camera) -> Photograph | None:
+        if self.task.truth == "self":
+            return None
+        assert view.photo is not None
+        return DOWNSCALES[self.task.protocol.downscale].read(view.photo, self.task.background)
+
+    def _truth(
+        self,
+        photo: Photograph | None,
+        view: Camera,
+        camera: Camera,
+        scale: float,
+        ceiling: Float[Tensor, "h w 3"] | None,
+    ) -> Float[Tensor, "h w 3"] | None:
+        """What the images are compared with; None where the render is larger than the photograph."""
+        if photo is not None:
+            factor = scale * view.width / photo.hw[1]
+            return None if factor > 1 else photo.at(camera.hw, factor)
+        if ceiling is not None and self.training.rate(camera) <= 1:
+            return quantise(ceiling)
+        if ceiling is not None:
+            recipe = find_recipe("auto", quality="best")
+        else:
+            moved = self.task.protocol.change == "distance"
+            recipe = find_recipe("matched", rate="interval" if moved else None)
+            recipe = replace(recipe, grid=max(1, math.ceil(1 / scale)))
+        return quantise(self._draw(self.own, camera, recipe).rgb)
+
+    def _motion(self, view: Camera, camera: Camera, scale: float) -> list[Tensor] | None:
+        """The training-size look, averaged down, as it moves by steps of a part of a pixel."""
+        if FLICKER not in self.task.figures or scale >= 1 or self.task.protocol.change != "size":
+            return None
+        recipe = find_recipe("matched")
+        moved = [_moved(view, step / scale) for step in range(FLICKER_STEPS)]
+        fulls = [self._draw(self.own, shifted, recipe).rgb.clamp(0, 1) for shifted in moved]
+        return [self._shrunk(full, camera, scale) for full in fulls]
+
+    def _figures(
+        self,
+        recipe: Recipe,
+        camera: Camera,
+        scale: float,
+        drawn: _Drawn,
+        fulls: Mapping[str, _Drawn],
+        motion: list[Tensor] | None,
+    ) -> dict[str, float | None]:
+        """What needs no photograph."""
+        figures: dict[str, float | None] = {metric.name: None for metric in self.task.figures}
+        full = fulls.get(recipe.name) if self.task.protocol.change == "size" else None
+        if full is not None and CONSISTENCY.name in figures and scale < 1:
+            expected = self._shrunk(full.rgb.clamp(0, 1), camera, scale)
+            figures[CONSISTENCY.name] = psnr(drawn.rgb.clamp(0, 1), expected)
+        if full is not None and ENERGY.name in figures:
+            rows, columns = (math.ceil(side / scale) for side in camera.hw)
+            figures[ENERGY.name] = energy_drift(drawn.own, full.own[:rows, :columns])
+        if motion is not None:
+            scene = self.smoothed[recipe.name]
+            moved = [_moved(camera, float(step)) for step in range(FLICKER_STEPS)]
+            frames = [self._draw(scene, shifted, recipe).rgb.clamp(0, 1) for shifted in moved]
+            figures[FLICKER.name] = flicker(frames, motion)
+        return figures
+
+    def _judged(
+        self, drawn: _Drawn, truth: Tensor | None, figures: Mapping[str, float | None]
+    ) -> dict[str, float | None]:
+        """Every metric's value, and the figures that need no truth."""
+        values: dict[str, float | None] = {metric.name: None for metric in self.task.judges}
+        if truth is not None:
+            image = quantise(drawn.rgb)
+            for metric in self.task.judges:
+                assert metric.measure is not None
+                values[metric.name] = metric.measure(image, truth)
+        return values | {metric.name: figures.get(metric.name) for metric in self.task.figures}
+
+    def _noted(
+        self,
+        index: int,
+        recipe: str,
+        scale: float,
+        view: Camera,
+        drawn: _Drawn,
+        truth: Tensor | None,
+        values: dict[str, float | None],
+    ) -> Measurement:
+        """The measurement, once its images are in place."""
+        if self.images is not None:
+            self.images.keep(index, recipe, scale, drawn.rgb, truth)
+        compared = {metric.name: values[metric.name] for metric in self.task.judges}
+        note = _note(compared, truth is None)
+        return Measurement(
+            recipe, scale, view.name, values, drawn.samples, drawn.seconds, note, drawn.pairs
+        )
 
 
-def _scaled_photograph(
-    photo: Float[Tensor, "H W 3"], camera: Camera, view: Camera, scale: float
-) -> Float[Tensor, "h w 3"] | None:
-    """The photograph box-averaged to the camera's size; None where the render is larger than the photograph."""
-    factor = scale * view.width / photo.shape[1]
-    return None if factor > 1 else resampled(photo, factor, camera.hw)
+def _moved(camera: Camera, steps: float) -> Camera:
+    """The image content moved right and down by `steps` quarters of a pixel."""
+    step = steps / FLICKER_STEPS
+    return replace(camera, cx=camera.cx + step, cy=camera.cy + step)
 
 
-def _self_truth(
-    own: Gaussians, camera: Camera, ceiling: Tensor, training: Training, task: Task
-) -> Float[Tensor, "h w 3"]:
-    if training.rate(camera) <= 1:
-        return quantise(ceiling)
-    recipe = find_recipe("auto", quality="best")
-    return quantise(render(own, camera, recipe, training, task.rasterizer, task.background).rgb)
-
-
-def _measure(
-    recipe: str,
-    scale: float,
-    view: Camera,
-    image: Tensor,
-    truth: Tensor | None,
-    samples: int,
-    seconds: float,
-) -> Measurement:
-    if truth is None:
-        values: dict[str, float | None] = dict.fromkeys(METRICS)
-        return Measurement(recipe, scale, view.name, values, samples, seconds, NO_PHOTOGRAPH)
-    image = quantise(image)
-    values = {metric.name: metric.measure(image, truth) for metric in METRICS.values()}
-    return Measurement(recipe, scale, view.name, values, samples, seconds, _note(values))
-
-
-def _note(values: Mapping[str, float | None]) -> str:
-    notes = {"PSNR": EQUAL_IMAGES, "SSIM": TOO_SMALL}
-    return "; ".join(notes[name] for name, value in values.items() if value is None)
+def _note(values: Mapping[str, float | None], no_photograph: bool) -> str:
+    if no_photograph:
+        return NO_PHOTOGRAPH
+    notes = {"PSNR": EQUAL_IMAGES, "SSIM": TOO_SMALL, "LPIPS": TOO_SMALL, "FLIP": TOO_SMALL}
+    return "; ".join(dict.fromkeys(notes[name] for name, value in values.items() if value is None))

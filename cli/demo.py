@@ -66,7 +66,7 @@ def demo(options: Demo) -> int:
         task = Task(recipes, SCALES, cameras.test, WHITE, "photographs")
         with progress("measuring", "views") as tell:
             report = measure(scene, training, task, progress=tell)
-    write_results(report, options.output, options.overwrite)
+    write_results(report, options.output, options.overwrite, "chair")
     out.print(*tables(report))
     say(f"look at {options.output / names[1]}")
     return 0

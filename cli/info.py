@@ -8,9 +8,9 @@ from rich.markup import escape
 from rich.table import Table
 
 from aaplug.conversion import describe
-from aaplug.filters import NYQUIST_VARIANCE
 from aaplug.gaussians import Gaussians
 from aaplug.interfaces import Training
+from aaplug.nyquist import coverage
 
 from .console import out, print_json
 from .options import CameraOptions, SceneOptions
@@ -64,15 +64,13 @@ def _scene_facts(scene: Gaussians) -> dict[str, Any]:
 
 
 def _sampling_facts(scene: Gaussians, training: Training) -> dict[str, Any]:
-    bounds = training.bounds
-    # the middle axis: surfaces are flat, and one thin axis alone shows only edge-on
-    middle = scene.scales.median(dim=1).values[bounds.seen]
-    limit = NYQUIST_VARIANCE**0.5 / bounds.highest[bounds.seen]
+    bounds, found = training.bounds, coverage(scene, training, ())
     return {
         "training_cameras": len(training.cameras),
         "seen_share": bounds.seen.double().mean().item(),
         "median_rate_px_per_unit": _median(bounds.highest[bounds.seen]),
-        "under_sampling_bound_share": (middle < limit).double().mean().item(),
+        "under_sampling_bound_share": found.under,
+        "aliasing_begins_at_scale": found.begins,
     }
 
 

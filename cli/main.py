@@ -18,7 +18,9 @@ from .convert import Convert, convert
 from .demo import Demo, demo
 from .evaluate import Evaluate, evaluate
 from .info import Info, info
+from .options import CONFIG
 from .render import Render, render
+from .video import Video, video
 from .warmup import Warmup, warmup
 
 FAILED, REFUSED, INTERRUPTED = 1, 2, 130
@@ -27,11 +29,11 @@ VERBS = {
     Convert: convert,
     Render: render,
     Evaluate: evaluate,
+    Video: video,
     Demo: demo,
     Warmup: warmup,
     Bench: bench,
 }
-CONFIG = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
 
 
 def main(words: Sequence[str] | None = None) -> None:

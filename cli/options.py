@@ -28,6 +28,7 @@ from aaplug.sampling import MIN_SEEN_SHARE, check_frame
 
 from .console import say
 
+CONFIG = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)  # how classes become flags
 Quality = Literal["fast", "balanced", "best"]
 Rate = Literal["global", "sharpest", "interval"]
 

@@ -1,7 +1,7 @@
 """aaplug render: images at new resolutions."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
@@ -49,7 +49,7 @@ class Render:
 
 def render(options: Render) -> int:
     """Render views at any resolution to PNG."""
-    size = _size_of(options)
+    size = size_of(options.scale, options.resolution)
     recipe = find_recipe(
         options.recipe, quality=options.rendering.quality, rate=options.rendering.rate
     )
@@ -79,16 +79,16 @@ def render(options: Render) -> int:
     return 0
 
 
-def _size_of(options: Render):
+def size_of(scale: float | None, resolution: str | None) -> Callable[[Camera], Camera]:
     """The function that gives a view its new size."""
-    if options.scale is not None and options.resolution is not None:
+    if scale is not None and resolution is not None:
         raise UsageError("--scale and --resolution", "both say how large; give one")
-    if options.resolution is not None:
-        return lambda view: _checked(view.resized(*_resolution(options.resolution or "", view)))
-    scale = 1.0 if options.scale is None else options.scale
-    if not scale > 0:
-        raise UsageError("--scale", f"must be above 0, got {scale:g}")
-    return lambda view: _checked(view.scaled(scale))
+    if resolution is not None:
+        return lambda view: _checked(view.resized(*_resolution(resolution, view)))
+    factor = 1.0 if scale is None else scale
+    if not factor > 0:
+        raise UsageError("--scale", f"must be above 0, got {factor:g}")
+    return lambda view: _checked(view.scaled(factor))
 
 
 def _resolution(text: str, view: Camera) -> tuple[int, int]:

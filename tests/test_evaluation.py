@@ -9,11 +9,14 @@ import torch
 from aaplug.cameras import BLACK
 from aaplug.errors import UsageError
 from aaplug.evaluation import NO_PHOTOGRAPH, Task, evaluate
+from aaplug.images import Images
 from aaplug.io.images import downsample, quantise, read_image, write_png
-from aaplug.metrics import psnr
+from aaplug.metrics import CONSISTENCY, ENERGY, FLICKER, SSIM, psnr
 from aaplug.pipeline import learn, render
-from aaplug.recipes import RECIPES
-from aaplug.report import CEILING, mean, per_view, results, scale_name, tables
+from aaplug.protocols import PROTOCOLS
+from aaplug.rasterizers import RASTERIZERS
+from aaplug.recipes import RECIPES, find_recipe
+from aaplug.report import CEILING, as_csv, mean, per_view, results, scale_name, tables
 from tests.conftest import make_camera, make_scene
 
 
@@ -131,3 +134,146 @@ def test_evaluation_is_deterministic(world):
     values = [[m.values for m in report.measurements] for report in reports]
     assert values[0] == values[1]
     assert all(torch.tensor(m.seconds) > 0 for m in reports[0].measurements)
+
+
+def test_pairs_are_counted_and_fewer_where_images_are_smaller(world):
+    scene, training, views = world
+    report = evaluate(scene, training, task(views))
+    for recipe in ("classic", "matched"):
+        small, full = (report.select(recipe, scale)[0].pairs for scale in (0.5, 1.0))
+        assert 0 < small < full
+    reference = task(views[:1], scales=(0.5,), rasterizer=RASTERIZERS["reference"])
+    assert evaluate(scene, training, reference).measurements[0].pairs is None
+
+
+FIGURES = (CONSISTENCY, ENERGY, FLICKER)
+
+
+def test_figures_without_a_photograph_are_those_taken_by_hand(world):
+    scene, training, views = world
+    report = evaluate(scene, training, task(views, figures=FIGURES))
+    full = render(scene, views[0], RECIPES["classic"], training)
+    small = render(scene, views[0].scaled(0.5), RECIPES["classic"], training)
+    values = report.select("classic", 0.5)[0].values
+    expected = psnr(small.rgb.clamp(0, 1), downsample(full.rgb.clamp(0, 1), 2))
+    assert values["consistency"] == pytest.approx(expected, abs=1e-6)
+    light = torch.tensor([0.2126, 0.7152, 0.0722]).double()
+    gained = (small.rgb.double() @ light).mean() / (full.rgb.double() @ light).mean() - 1
+    assert values["energy drift"] == pytest.approx(float(gained), abs=1e-6)
+    assert report.select("classic", 1.0)[0].values["energy drift"] == 0
+    assert report.select("classic", 1.0)[0].values["consistency"] is None
+
+
+def test_flicker_of_supersampling_is_nearer_to_motion_alone(world):
+    scene, training, views = world
+    recipes = [RECIPES["ewa"], find_recipe("auto", quality="best")]
+    work = replace(task(views[:1], scales=(0.25,), figures=(FLICKER,)), recipes=recipes)
+    report = evaluate(scene, training, work)
+    far, near = (abs(report.select(r.name, 0.25)[0].values["flicker"] - 1) for r in recipes)
+    assert near < far
+    assert near < 0.05
+
+
+def test_figures_need_scale_1_and_are_null_without(world):
+    scene, training, views = world
+    report = evaluate(scene, training, task(views[:1], scales=(0.5,), figures=FIGURES[:2]))
+    assert mean(report.select("classic", 0.5), "consistency") is None
+    assert mean(report.select("classic", 0.5), "energy drift") is None
+
+
+@pytest.mark.parametrize("name", ["distance", "fov"])
+def test_moved_cameras_are_judged_by_the_supersampled_look(world, name):
+    scene, training, views = world
+    recipes = [RECIPES["classic"], find_recipe("matched", rate="interval")]
+    work = replace(
+        task(views, scales=(1.0, 0.25), truth="self", protocol=PROTOCOLS[name]), recipes=recipes
+    )
+    report = evaluate(scene, training, work)
+    assert report.recipes == ("classic", "matched")  # the truth is its own ceiling
+    classic, matched = (mean(report.select(r.name, 0.25), "PSNR") for r in recipes)
+    assert matched > classic + 3
+    assert report.protocol["protocol"]["scale changes"] == name
+
+
+def test_a_protocol_names_its_flavours_in_every_result(world):
+    scene, training, views = world
+    work = task(views[:1], scales=(1.0, 0.5), protocol=PROTOCOLS["360-zoom-out"])
+    report = evaluate(scene, training, work)
+    assert results(report)["_aaplug"]["metrics"]["SSIM"] == SSIM["3dgs"].protocol
+    assert "Pillow" in per_view(report)["_aaplug"]["downscale"]
+    plain = evaluate(scene, training, task(views[:1], scales=(1.0, 0.5)))
+    for r in (1.0, 0.5):
+        assert (
+            report.select("classic", r)[0].values["SSIM"]
+            != plain.select("classic", r)[0].values["SSIM"]
+        )
+
+
+def test_photographs_do_not_show_moved_cameras(world):
+    scene, training, views = world
+    with pytest.raises(UsageError, match="moves the camera"):
+        evaluate(scene, training, task(views, protocol=PROTOCOLS["fov"]))
+
+
+def test_views_of_one_name_are_told_apart(world):
+    scene, training, views = world
+    twins = [replace(view, name="same") for view in views]
+    report = evaluate(scene, training, task(twins, scales=(0.5,)))
+    assert list(per_view(report)["classic@0.5"]["PSNR"]) == ["00000_same", "00001_same"]
+
+
+class StoppedError(Exception):
+    pass
+
+
+def test_an_interrupted_evaluation_continues_and_redoes_nothing(world, tmp_path, monkeypatch):
+    scene, training, views = world
+    whole = evaluate(scene, training, task(views), record=tmp_path / "whole.jsonl")
+    path = tmp_path / "progress.jsonl"
+
+    def stop(done: int, total: int) -> None:
+        if done == 1:
+            raise StoppedError
+
+    with pytest.raises(StoppedError):
+        evaluate(scene, training, task(views), progress=stop, record=path)
+    before = path.read_bytes()
+    drawn = []
+    monkeypatch.setattr(
+        "aaplug.evaluation.render", lambda *args: (drawn.append(args[1].name), render(*args))[1]
+    )
+    report = evaluate(scene, training, task(views), record=path, resume=True)
+    assert set(drawn) == {"b"}
+    assert path.read_bytes().startswith(before)
+
+    def timeless(report):
+        return [replace(m, seconds=0.0) for m in report.measurements]
+
+    assert timeless(report) == timeless(whole)
+    drawn.clear()
+    assert evaluate(scene, training, task(views), record=path, resume=True) == report
+    assert not drawn
+
+
+def test_images_lie_where_3dgs_scripts_look(world, tmp_path):
+    scene, training, views = world
+    store = Images(tmp_path, shown=(1,), everything=True)
+    evaluate(scene, training, task(views), images=store)
+    every = sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.png"))
+    assert "test/classic@0.5/renders/00000.png" in every
+    assert "test/classic@0.5/gt/00001.png" in every
+    assert not any("@2/" in path for path in every if path.startswith("test"))  # no truth there
+    assert "images/ceiling@0.5/renders/00001.png" in every
+    assert not any(path.endswith("00000.png") for path in every if path.startswith("images"))
+    stored = read_image(store.path(1, "matched", 0.5), None)
+    image = render(scene, views[1].scaled(0.5), RECIPES["matched"], training).rgb
+    assert stored.equal(quantise(image))
+
+
+def test_csv_holds_a_line_a_measurement(world):
+    scene, training, views = world
+    report = evaluate(scene, training, task(views))
+    lines = as_csv({'a "scene"': report}).splitlines()
+    assert lines[0] == "scene,protocol,recipe,scale,view,PSNR,SSIM,samples,pairs,seconds,note"
+    assert len(lines) == 1 + len(report.measurements)
+    assert lines[1].startswith('"a ""scene""",default,"training size, resampled",1,a,')

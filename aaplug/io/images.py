@@ -25,6 +25,7 @@ from aaplug.errors import FormatError, UsageError
 from aaplug.io.atomic import check_output, replacing
 
 MAX_PIXELS = 2**28  # 16384 x 16384; more is taken for a decompression bomb
+LOSSLESS_WEBP = 101  # OpenCV's quality for it
 SAMPLE_TYPES = {8: np.uint8, 16: np.uint16}  # by bit depth
 ALPHA_CHANNELS = 4  # RGB and alpha
 DAMAGE = ("Corrupt JPEG data", "Premature end of JPEG file")  # libjpeg's words for lost pixels
@@ -50,18 +51,21 @@ def read_image(path: Path, background: tuple[float, float, float] | None) -> Flo
         FormatError: the file is missing, damaged or too large, or it is transparent and no
             background is given.
     """
-    _, transparent = _look(path)
-    pixels = _decode(path)
-    if pixels.dtype not in SAMPLE_TYPES.values():
-        raise FormatError(path, f"holds {pixels.dtype} samples; save it with 8 or 16 bits")
-    if transparent != (pixels.shape[2] == ALPHA_CHANNELS):
-        raise FormatError(
-            path, "has colours or transparency that OpenCV does not read; save it as RGB(A) PNG"
-        )
-    if transparent and background is None:
+    pixels = _read(path)
+    if pixels.shape[2] == ALPHA_CHANNELS and background is None:
         raise FormatError(path, "is transparent; say what lies behind it with --background")
-    image = _to_rgb(pixels)
-    return torch.from_numpy(image if background is None else _composite(image, background))
+    return torch.from_numpy(pixels if background is None else _composite(pixels, background))
+
+
+def read_rgba(path: Path) -> Float[Tensor, "h w 4"]:
+    """Read an 8- or 16-bit image with its transparency, not multiplied into the colours; opaque where it has none.
+
+    Raises:
+        FormatError: the file is missing, damaged or too large.
+    """
+    pixels = torch.from_numpy(_read(path))
+    opaque = torch.ones_like(pixels[..., :1])
+    return pixels if pixels.shape[2] == ALPHA_CHANNELS else torch.cat([pixels, opaque], dim=2)
 
 
 def write_png(
@@ -84,6 +88,15 @@ def encode_png(rgb: Float[Tensor, "h w 3"], bit_depth: int) -> bytes:
     done, png = cv2.imencode(".png", samples[..., ::-1])
     assert done
     return png.tobytes()
+
+
+def encode_webp(rgb: Float[Tensor, "h w 3"], quality: int | None) -> bytes:
+    """The bytes of a WebP file of [0, 1]-clamped colours in 8 bits; lossless without a quality, of 1 to 100."""
+    samples = _samples(rgb, 8).cpu().numpy().astype(np.uint8)
+    setting = LOSSLESS_WEBP if quality is None else quality
+    done, webp = cv2.imencode(".webp", samples[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, setting])
+    assert done
+    return webp.tobytes()
 
 
 def quantise(rgb: Float[Tensor, "h w 3"], bit_depth: int = 8) -> Float[Tensor, "h w 3"]:
@@ -126,6 +139,12 @@ def resampled(
     return torch.from_numpy(image)
 
 
+def stretched(rgb: Float[Tensor, "h w 3"], hw: tuple[int, int]) -> Float[Tensor, "h2 w2 3"]:
+    """The whole image in `hw` pixels: area-weighted averages where that is fewer, bicubic where it is more."""
+    kernel = cv2.INTER_AREA if hw[0] < rgb.shape[0] else cv2.INTER_CUBIC
+    return torch.from_numpy(cv2.resize(rgb.cpu().numpy(), (hw[1], hw[0]), interpolation=kernel))
+
+
 def _whole(side: float) -> int:
     return max(1, math.floor(side + WHOLE))
 
@@ -160,10 +179,23 @@ def _no_pillow_limit() -> Iterator[None]:
         Image.MAX_IMAGE_PIXELS = limit
 
 
+def _read(path: Path) -> np.ndarray:
+    """Float32 in [0, 1], RGB or RGBA."""
+    _, transparent = _look(path)
+    pixels = _decode(path)
+    if pixels.dtype not in SAMPLE_TYPES.values():
+        raise FormatError(path, f"holds {pixels.dtype} samples; save it with 8 or 16 bits")
+    if transparent != (pixels.shape[2] == ALPHA_CHANNELS):
+        raise FormatError(
+            path, "has colours or transparency that OpenCV does not read; save it as RGB(A) PNG"
+        )
+    return _to_rgb(pixels)
+
+
 def _decode(path: Path) -> np.ndarray:
     """Samples as stored, [h, w, channels], BGR(A) or gray."""
     try:
-        with _codecs_heard() as words:
+        with codecs_heard() as words:
             # UNCHANGED keeps 16 bits and alpha, and leaves the orientation tag alone
             pixels = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
             damage = _damage(words)
@@ -177,8 +209,8 @@ def _decode(path: Path) -> np.ndarray:
 
 
 @contextmanager
-def _codecs_heard() -> Iterator[IO[bytes]]:
-    """Catch what libpng and libjpeg print: they name no file and would tear a progress bar."""
+def codecs_heard() -> Iterator[IO[bytes]]:
+    """Catch what libpng, libjpeg and FFmpeg print: they name no file and would tear a progress bar."""
     with tempfile.TemporaryFile() as words:
         saved = os.dup(STDERR)
         os.dup2(words.fileno(), STDERR)

@@ -1,0 +1,173 @@
+"""Many scenes in one evaluation: files, isolation of failures, continuing after a kill."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from aaplug.errors import FormatError
+from aaplug.io.batch_file import read_batch
+from tests.test_cli import cli, dataset  # noqa: F401  (fixtures)
+
+SETTINGS = """
+output = "out"
+recipe = ["classic", "matched"]
+scale = [0.5]
+views = "train"
+rasterizer = "eager"
+
+[[scene]]
+name = "whole"
+scene = "scene.ply"
+cameras = "."
+
+[[scene]]
+scene = "broken.ply"
+cameras = "."
+recipe = ["classic"]
+"""
+
+
+@pytest.fixture
+def batch(cli):  # noqa: F811
+    """The program, in a folder that holds batch.toml, a whole scene and a broken one."""
+    data = Path("scene.ply").read_bytes()
+    Path("broken.ply").write_bytes(data[:-100])
+    Path("batch.toml").write_text(SETTINGS)
+    return cli
+
+
+def timeless(folder: Path) -> dict[str, str]:
+    """Every file of results without its times."""
+    found = {}
+    for path in sorted(folder.rglob("*.json")):
+        data = json.loads(path.read_text())
+        for method in data.values():
+            if isinstance(method, dict):
+                method.pop("seconds", None)
+        found[str(path.relative_to(folder))] = json.dumps(data)
+    for path in sorted(folder.rglob("*.csv")):
+        rows = [line.split(",") for line in path.read_text().splitlines()]
+        seconds = rows[0].index("seconds") - len(rows[0])  # from the end: names may hold commas
+        found[str(path.relative_to(folder))] = "\n".join(
+            ",".join(cell for i, cell in enumerate(row) if i != len(row) + seconds) for row in rows
+        )
+    for path in sorted(folder.rglob("*.png")):
+        if "plots" not in path.parts:
+            found[str(path.relative_to(folder))] = path.read_bytes().hex()
+    return found
+
+
+def test_a_broken_scene_stops_no_other_and_is_named(batch):
+    code, out, err = batch("evaluate --batch batch.toml")
+    assert code == 1
+    assert "failed" in out
+    assert "broken" in out
+    assert "failed: broken" in err
+    results = json.loads(Path("out/whole/results.json").read_text())
+    assert {"classic@0.5", "matched@0.5", "_aaplug"} <= set(results)
+    summary = json.loads(Path("out/batch.json").read_text())
+    assert summary["scenes"]["whole"]["status"] == "done"
+    assert summary["scenes"]["broken"]["status"] == "failed"
+    assert "bytes" in summary["scenes"]["broken"]["error"]
+    assert summary["mean_over"] == ["whole"]
+    assert summary["mean"]["matched@0.5"] == results["matched@0.5"]
+    assert not Path("out/broken").exists()
+    lines = Path("out/results.csv").read_text().splitlines()
+    assert len(lines) == 1 + 3 * 3  # ceiling and two recipes, three views
+    assert "r_0" in lines[1]
+
+
+def test_a_mended_scene_is_added_by_resuming_and_the_other_not_redone(batch):
+    batch("evaluate --batch batch.toml")
+    before = Path("out/whole/progress.jsonl").read_bytes()
+    assert batch("evaluate --batch batch.toml")[0] == 2  # there are results already
+    shutil.copy("scene.ply", "broken.ply")
+    assert batch("evaluate --batch batch.toml --resume")[0] == 0
+    assert Path("out/whole/progress.jsonl").read_bytes() == before
+    assert Path("out/broken/results.json").is_file()
+    assert "broken" in Path("out/results.csv").read_text()
+
+
+def test_scenes_of_the_command_line_share_their_cameras(batch):
+    shutil.copy("scene.ply", "other.ply")
+    words = "scene.ply other.ply --cameras . -o out --rasterizer eager --recipe matched --scale 0.5 --json"
+    code, out, _ = batch(f"evaluate {words}")
+    assert code == 0
+    assert set(json.loads(out)["scenes"]) == {"scene", "other"}
+    assert json.loads(out)["mean"]["matched@0.5"]["SSIM"] > 0.5
+
+
+@pytest.mark.parametrize("stop", [0, 4])
+def test_a_killed_batch_continues_to_the_same_bytes(batch, monkeypatch, stop):
+    words = "evaluate --batch batch.toml --layout inria"
+    shutil.copy("scene.ply", "broken.ply")
+    assert batch(words)[0] == 0
+    whole = timeless(Path("out"))
+    shutil.rmtree("out")
+    from aaplug.record import Record
+
+    added, add = [], Record.add
+
+    def killed(record, view, measurements):
+        if len(added) == stop:
+            raise KeyboardInterrupt
+        added.append(view)
+        add(record, view, measurements)
+
+    monkeypatch.setattr(Record, "add", killed)
+    assert batch(words)[0] == 130
+    monkeypatch.setattr(Record, "add", add)
+    if (record := Path("out/whole/progress.jsonl")).exists():
+        with record.open("ab") as stream:
+            stream.write(b'{"view": 2, "meas')  # what a kill leaves
+        assert batch(words)[0] == 2  # without --resume nothing is lost
+    assert batch(words + " --resume")[0] == 0
+    assert timeless(Path("out")) == whole
+
+
+def test_resuming_another_request_is_refused(batch):
+    words = "evaluate scene.ply --cameras . -o one --rasterizer eager --recipe classic --scale"
+    assert batch(f"{words} 1")[0] == 0
+    code, _, err = batch(f"{words} 0.5 --resume")
+    assert code == 2
+    assert "is of another request (scales changed since)" in err
+
+
+REFUSED = {
+    "no toml": ("scene = [", "should be TOML"),
+    "no scene": ("output = 'out'", "names no scene"),
+    "nameless": ("[[scene]]\ncameras = '.'", "names no scene; add scene"),
+    "one name": ("[[scene]]\nscene = 'a.ply'\n[[scene]]\nscene = 'b/A.ply'", "name of its own"),
+    "unknown": (SETTINGS.replace("scale", "scales"), "scales is no setting here; did you mean scale?"),
+    "misfit": (SETTINGS.replace("[0.5]", "['big']"), "scale = ['big'] does not fit"),
+    "not here": (SETTINGS + "output = 'elsewhere'", "scene 'broken': output is no setting here"),
+    "a choice": (SETTINGS + "truth = 'other'", "truth = 'other' does not fit"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_a_batch_file_that_does_not_fit_is_refused_by_key(batch, case):
+    text, named = REFUSED[case]
+    Path("bad.toml").write_text(text)
+    code, out, err = batch("evaluate --batch bad.toml")
+    assert (code, out) == (2, "")
+    assert err.startswith("error: ")
+    assert "bad.toml" in err
+    assert named in err
+    assert not Path("out").exists()
+
+
+def test_paths_start_at_the_file_and_names_at_the_scenes(tmp_path):
+    path = tmp_path / "b.toml"
+    path.write_text("guard = 0.3\n[[scene]]\nscene = 'x/a.ply'\ncameras = '/abs'\ntest-every = 8")
+    file = read_batch(path)
+    assert file.shared == {"guard": 0.3}
+    expected = {"scene": str(tmp_path / "x/a.ply"), "cameras": "/abs", "test_every": 8}
+    assert file.scenes == {"a": expected}
+
+
+def test_a_missing_batch_file_is_named(tmp_path):
+    with pytest.raises(FormatError, match="no such file"):
+        read_batch(tmp_path / "gone.toml")

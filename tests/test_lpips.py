@@ -1,0 +1,112 @@
+"""LPIPS from weights that the user gives: the published formula, and files that are not what they should be."""
+
+import pytest
+import torch
+from torch.nn.functional import conv2d, max_pool2d, relu
+
+from aaplug.errors import FormatError
+from aaplug.lpips import NETS, lpips_metric
+
+CHANNELS = (4, 5, 6, 7, 8)
+
+
+@pytest.fixture
+def weights(tmp_path):
+    """Random weights of few channels, in the layout of torchvision and of the lpips package, by net."""
+    files = {}
+    for name, net in NETS.items():
+        g = torch.Generator().manual_seed(3)
+        trunk, before, size = {}, 3, {"vgg": 3, "alex": 3}[name]
+        for stage, channels in zip(net, CHANNELS, strict=True):
+            for number, *_ in stage.convolutions:
+                trunk[f"features.{number}.weight"] = torch.randn(
+                    channels, before, size, size, generator=g
+                )
+                trunk[f"features.{number}.bias"] = torch.randn(channels, generator=g)
+                before = channels
+        heads = {
+            f"lin{i}.model.1.weight": torch.rand(1, c, 1, 1, generator=g)
+            for i, c in enumerate(CHANNELS)
+        }
+        files[name] = tmp_path / f"{name}.pth", tmp_path / f"{name}-heads.pth"
+        torch.save(trunk, files[name][0])
+        torch.save(heads, files[name][1])
+    return files
+
+
+def by_hand(image, truth, trunk, heads, low):
+    """VGG16's five stages written out; low is what black is mapped to."""
+    mean, std = torch.tensor([-0.030, -0.088, -0.188]), torch.tensor([0.458, 0.448, 0.450])
+    maps = []
+    for x in (image, truth):
+        x = (((x if low == 0 else 2 * x - 1) - mean) / std).permute(2, 0, 1)[None]
+        found = []
+        for number in (
+            0,
+            2,
+            "pool",
+            5,
+            7,
+            "pool",
+            10,
+            12,
+            14,
+            "pool",
+            17,
+            19,
+            21,
+            "pool",
+            24,
+            26,
+            28,
+        ):
+            if number == "pool":
+                found.append(x)
+                x = max_pool2d(x, 2)
+            else:
+                x = relu(
+                    conv2d(
+                        x,
+                        trunk[f"features.{number}.weight"],
+                        trunk[f"features.{number}.bias"],
+                        padding=1,
+                    )
+                )
+        maps.append([*found, x])  # fmt: skip
+    total = 0.0
+    for i, (a, b) in enumerate(zip(*maps, strict=True)):
+        a, b = (m / (m.norm(dim=1, keepdim=True) + 1e-10) for m in (a, b))
+        total += ((a - b) ** 2 * heads[f"lin{i}.model.1.weight"]).sum(dim=1).mean().item()
+    return total
+
+
+@pytest.mark.parametrize(("flavour", "low"), [("vgg", -1), ("3dgs", 0)])
+def test_lpips_is_the_published_formula(weights, flavour, low):
+    g = torch.Generator().manual_seed(0)
+    image, truth = torch.rand(40, 48, 3, generator=g), torch.rand(40, 48, 3, generator=g)
+    metric = lpips_metric(flavour, *weights["vgg"])
+    trunk, heads = (torch.load(path, weights_only=True) for path in weights["vgg"])
+    expected = by_hand(image, truth, trunk, heads, low)
+    assert metric.measure(image, truth) == pytest.approx(expected, rel=1e-5)
+    assert metric.protocol.startswith(f"{flavour}:")
+
+
+def test_lpips_of_equal_images_is_zero_and_of_tiny_ones_undefined(weights):
+    metric = lpips_metric("alex", *weights["alex"])
+    image = torch.rand(64, 64, 3)
+    assert metric.measure(image, image) == 0
+    assert metric.measure(image, 1 - image) > 0
+    assert metric.measure(image[:20], image[:20]) is None
+
+
+def test_other_files_are_refused(weights, tmp_path):
+    (trunk, heads), other = weights["vgg"], weights["alex"]
+    with pytest.raises(FormatError, match=r"alex\.pth: holds no features\.2"):
+        lpips_metric("vgg", other[0], heads)
+    with pytest.raises(FormatError, match="lin0"):
+        lpips_metric("vgg", trunk, trunk)
+    (tmp_path / "text").write_text("not weights")
+    with pytest.raises(FormatError, match="torch weights"):
+        lpips_metric("vgg", tmp_path / "text", heads)
+    with pytest.raises(FormatError, match="no such file"):
+        lpips_metric("vgg", tmp_path / "gone", heads)

@@ -1,0 +1,51 @@
+"""How Gaussians sit against their sampling bounds."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from aaplug.gaussians import CLASSIC
+from aaplug.nyquist import coverage, multiples
+from aaplug.pipeline import learn
+from tests.conftest import make_camera, make_scene
+
+
+def at_bound(multiple: float, n: int = 10):
+    """Round Gaussians at the origin whose extent is that multiple of their bound."""
+    view = make_camera((0.0, -4.0, 0.0))
+    scene = replace(make_scene(n), means=torch.zeros(n, 3))
+    sigma = multiple * 0.2**0.5 / (view.focal / 4.0)
+    scene = replace(scene, log_scales=torch.full((n, 3), sigma).log())
+    return scene, learn(scene, [view])
+
+
+@pytest.mark.parametrize("multiple", [0.5, 1.01, 3.0])
+def test_the_multiple_is_the_extent_over_the_bound(multiple):
+    scene, training = at_bound(multiple)
+    assert multiples(scene, training) == pytest.approx([multiple] * 10, rel=1e-4)
+    assert coverage(scene, training, ()).under == (multiple < 1)
+
+
+def test_aliasing_begins_where_what_training_drew_meets_the_bound():
+    scene, training = at_bound(2.0)
+    assert scene.convention == CLASSIC
+    found = coverage(scene, training, (1.0, 0.5, 0.4, 0.25))
+    # σ²ν² = 4·0.2 px², and 0.3 px² of dilation: r²·1.1 = 0.2
+    assert found.begins == pytest.approx((0.2 / 1.1) ** 0.5, rel=1e-4)
+    assert dict(found.aliased) == {1.0: 0.0, 0.5: 0.0, 0.4: 1.0, 0.25: 1.0}
+
+
+def test_every_seen_gaussian_is_in_the_histogram():
+    scene = make_scene(400)
+    scene = replace(scene, log_scales=scene.log_scales * 6)  # far into both ends
+    training = learn(scene, [make_camera()])
+    found = coverage(scene, training, (1.0,))
+    assert sum(found.counts) == found.seen == int(training.bounds.seen.sum())
+    assert found.as_json()["gaussians"] == 400
+
+
+def test_a_scene_that_nothing_sees_has_no_share():
+    scene = replace(make_scene(5), means=torch.full((5, 3), 1e6))
+    found = coverage(scene, learn(scene, [make_camera()]), (1.0,))
+    assert (found.seen, found.under, found.begins, found.aliased) == (0, None, None, ())

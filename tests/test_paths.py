@@ -1,0 +1,90 @@
+"""Camera paths, and reading nerfstudio's."""
+
+import json
+import math
+
+import pytest
+import torch
+
+from aaplug import paths
+from aaplug.cameras import CameraSet
+from aaplug.errors import FormatError
+from aaplug.io.cameras.camera_path import read_camera_path, sniff
+from tests.conftest import make_camera
+
+VIEW = make_camera((0.0, -4.0, 0.0))
+UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+
+
+def test_a_zoom_goes_from_start_to_end_and_back_in_octaves():
+    ways = [paths.zoom(VIEW, t, 1.0, 0.25).fx / VIEW.fx for t in (0.0, 0.25, 0.5, 0.75)]
+    assert ways == pytest.approx([1.0, 0.5, 0.25, 0.5])
+    assert paths.zoom(VIEW, 0.3, 1.0, 0.25).hw == VIEW.hw
+
+
+def test_a_dolly_moves_along_the_axis_and_keeps_the_focal_length():
+    far = paths.dolly(VIEW, 0.5, 1.0, 0.25, depth=4.0)
+    assert far.centre.tolist() == pytest.approx([0.0, -16.0, 0.0], abs=1e-9)
+    assert (far.fx, far.trained_focal) == (VIEW.fx, None)
+
+
+@pytest.mark.parametrize("t", [0.0, 0.25, 0.6])
+def test_an_orbit_keeps_distance_and_looks_at_the_pivot(t):
+    camera = paths.orbit(VIEW, t, 4.0, UP)
+    assert camera.centre.norm().item() == pytest.approx(4.0)
+    pivot = camera.cam_from_world[:3, 3]  # the origin, seen from the camera
+    assert pivot.tolist() == pytest.approx([0.0, 0.0, 4.0], abs=1e-6)
+    angle = math.atan2(camera.centre[1], camera.centre[0])
+    assert math.cos(angle + math.pi / 2) == pytest.approx(math.cos(2 * math.pi * t))
+
+
+def test_up_is_what_is_up_in_the_images():
+    views = (VIEW, make_camera((3.0, -1.0, 0.0)))
+    assert paths.up_of(CameraSet(views, views)).tolist() == pytest.approx([0, 0, 1], abs=1e-9)
+
+
+def test_frames_are_named_by_number():
+    frames = paths.frames(lambda t: paths.zoom(VIEW, t, 1.0, 0.5), 11)
+    assert [frame.name for frame in frames][:2] == ["00", "01"]
+    assert frames[1].fx == pytest.approx(frames[-1].fx)  # there and back
+
+
+def document(**changes):
+    pose = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 5, 0, 0, 0, 1]
+    frame = {"camera_to_world": pose, "fov": 60.0, "aspect": 1.5}
+    about = {"render_width": 60, "render_height": 40, "fps": 24, "camera_type": "perspective"}
+    return about | {"camera_path": [frame]} | changes
+
+
+def test_a_camera_path_is_opengl_with_a_vertical_angle(tmp_path):
+    file = tmp_path / "camera_path.json"
+    file.write_text(json.dumps(document()))
+    assert sniff(file)
+    path = read_camera_path(file)
+    (camera,) = path.cameras
+    assert (path.fps, camera.width, camera.height) == (24, 60, 40)
+    assert camera.fy == pytest.approx(20 / math.tan(math.pi / 6))
+    assert camera.centre.tolist() == pytest.approx([0, 0, 5])
+    ahead = camera.cam_from_world @ torch.tensor([0.0, 1.0, 0.0, 1.0]).double()
+    assert ahead.tolist() == pytest.approx([0, -1, 5, 1])  # before it, and up in the image
+    assert camera.trained_focal is None
+
+
+BROKEN = {
+    "no path": ([], "should be an object with 'camera_path'"),
+    "a fisheye": (document(camera_type="fisheye"), "camera_type should be perspective"),
+    "no frames": (document(camera_path=[]), "list of frames"),
+    "no size": (document(render_width=0), "render_width"),
+    "no time": (document(fps=0), "fps should be above 0"),
+    "an angle": (document(camera_path=[document()["camera_path"][0] | {"fov": 180}]), "frame 0: fov"),
+    "a short pose": (document(camera_path=[{"camera_to_world": [1], "fov": 50}]), "camera_to_world"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_a_broken_camera_path_is_refused_by_its_field(tmp_path, case):
+    content, named = BROKEN[case]
+    file = tmp_path / "camera_path.json"
+    file.write_text(json.dumps(content))
+    with pytest.raises(FormatError, match=named):
+        read_camera_path(file)

@@ -1,0 +1,61 @@
+"""Photographs made smaller, in each of the field's ways."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from aaplug.errors import UsageError
+from aaplug.io.images import downsample, quantise, read_image
+from aaplug.io.photographs import DOWNSCALES
+
+WHITE = (1.0, 1.0, 1.0)
+
+
+@pytest.fixture
+def rgba(tmp_path):
+    """A file of random colours and transparencies, 24×16 px."""
+    pixels = np.random.default_rng(0).integers(0, 256, (16, 24, 4), dtype=np.uint8)
+    path = tmp_path / "photo.png"
+    cv2.imwrite(str(path), pixels)
+    return path
+
+
+@pytest.mark.parametrize("name", DOWNSCALES)
+def test_every_way_keeps_size_and_range(rgba, name):
+    photo = DOWNSCALES[name].read(rgba, WHITE)
+    assert photo.hw == (16, 24)
+    for factor, hw in ((1.0, (16, 24)), (0.5, (8, 12)), (0.25, (4, 6))):
+        image = photo.at(hw, factor)
+        assert image.shape == (*hw, 3)
+        assert image.min() >= 0
+        assert image.max() <= 1
+
+
+def test_box_composites_rounds_and_averages(rgba):
+    expected = downsample(quantise(read_image(rgba, WHITE)), 4)
+    assert DOWNSCALES["box"].read(rgba, WHITE).at((4, 6), 0.25).equal(expected)
+
+
+def test_rgba_box_averages_straight_alpha_and_cuts_twice(rgba):
+    bgra = cv2.imread(str(rgba), cv2.IMREAD_UNCHANGED)[..., [2, 1, 0, 3]].astype(np.float64) / 255
+    small = bgra.reshape(4, 4, 6, 4, 4).mean(axis=(1, 3))
+    saved = np.floor(small * 255 + 1e-6) / 255
+    composited = saved[..., :3] * saved[..., 3:] + 1 - saved[..., 3:]
+    found = DOWNSCALES["rgba-box"].read(rgba, WHITE).at((4, 6), 0.25)
+    levels = np.floor(composited * 255 + 1e-3)
+    assert np.abs((found * 255).round().numpy() - levels).max() == 0
+
+
+def test_rgba_box_refuses_what_is_not_halved(rgba):
+    with pytest.raises(UsageError, match="power of 1/2"):
+        DOWNSCALES["rgba-box"].read(rgba, WHITE).at((5, 8), 1 / 3)
+
+
+def test_pil_bicubic_is_pillows(rgba):
+    pixels = (quantise(read_image(rgba, WHITE)) * 255).round().byte().numpy()
+    small = np.array(Image.fromarray(pixels).resize((6, 4), Image.Resampling.BICUBIC))
+    found = DOWNSCALES["pil-bicubic"].read(rgba, WHITE).at((4, 6), 0.25)
+    assert torch.allclose(found, torch.from_numpy(small).float() / 255)
+    assert not torch.allclose(found, DOWNSCALES["box"].read(rgba, WHITE).at((4, 6), 0.25))

@@ -1,0 +1,65 @@
+"""Protocols: what a scale does to a camera."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from aaplug.errors import UsageError
+from aaplug.io.photographs import DOWNSCALES
+from aaplug.metrics import SSIM
+from aaplug.protocols import PROTOCOLS, find_protocol, median_depth
+from tests.conftest import make_camera, make_scene
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS.values(), ids=lambda p: p.name)
+def test_scale_one_is_the_view_itself(protocol):
+    view = make_camera()
+    camera = protocol.camera(view, 1.0, 4.0)
+    assert (camera.hw, camera.fx, camera.cx) == (view.hw, view.fx, view.cx)
+    assert camera.cam_from_world.equal(view.cam_from_world)
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS.values(), ids=lambda p: p.name)
+@pytest.mark.parametrize("scale", [0.25, 2.0])
+def test_every_protocol_samples_what_is_in_the_middle_by_the_scale(protocol, scale):
+    view = make_camera((0.0, -4.0, 0.0))
+    camera = protocol.camera(view, scale, 4.0)
+    depth = camera.cam_from_world[2, 3].item()  # of the world's origin, which the view looks at
+    assert camera.fx / depth == pytest.approx(scale * view.fx / 4.0)
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS.values(), ids=lambda p: p.name)
+def test_a_protocol_names_what_exists(protocol):
+    assert protocol.downscale in DOWNSCALES
+    assert protocol.ssim in SSIM
+    assert protocol.source
+    assert find_protocol(protocol.name) is protocol
+
+
+def test_a_moved_camera_is_free():
+    view = make_camera()
+    assert PROTOCOLS["distance"].camera(view, 0.5, 4.0).trained_focal is None
+    assert PROTOCOLS["fov"].camera(view, 0.5, 4.0).trained_focal == view.trained_focal
+
+
+def test_whole_sizes_are_rounded_as_3dgs_does():
+    view = make_camera(size=(987, 743))
+    assert PROTOCOLS["360-zoom-out"].camera(view, 0.25, 1.0).hw == (186, 247)
+    assert PROTOCOLS["default"].camera(view, 0.25, 1.0).hw == (185, 246)
+
+
+def test_median_depth_is_of_what_the_view_shows():
+    scene = make_scene(500)
+    view = make_camera((0.0, -4.0, 0.0))
+    depths = scene.means @ view.cam_from_world[2, :3].float() + view.cam_from_world[2, 3].float()
+    assert depths.min() < median_depth(scene.means, view) < depths.max()
+    backwards = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0])).double()
+    away = replace(view, cam_from_world=backwards @ view.cam_from_world)
+    with pytest.raises(UsageError, match="sees no Gaussian"):
+        median_depth(scene.means, away)
+
+
+def test_an_unknown_protocol_is_refused():
+    with pytest.raises(UsageError, match="'blendr' is not one of default, blender"):
+        find_protocol("blendr")

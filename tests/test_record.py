@@ -1,0 +1,91 @@
+"""The record of an evaluation: what survives a kill, and what it refuses."""
+
+import json
+
+import pytest
+
+from aaplug.errors import OutputError, UsageError
+from aaplug.record import Record
+from aaplug.report import Measurement
+
+REQUEST = {"views": 3, "scales": [1.0, 0.1]}
+
+
+def measured(view: str) -> Measurement:
+    return Measurement("auto", 0.1, view, {"PSNR": 1 / 3, "SSIM": None}, 2, 0.125, "note", 7)
+
+
+@pytest.fixture
+def path(tmp_path):
+    """A record of two finished views."""
+    record = Record(tmp_path / "r" / "progress.jsonl", REQUEST, resume=False)
+    for i, name in enumerate("ab"):
+        record.add(i, [measured(name)])
+    record.close()
+    return record.path
+
+
+def test_what_is_finished_comes_back_to_the_bit(path):
+    record = Record(path, REQUEST, resume=True)
+    assert record.known == {0: (measured("a"),), 1: (measured("b"),)}
+    record.close()
+
+
+@pytest.mark.parametrize("lost", [1, 20, 60])
+def test_a_torn_line_is_forgotten_and_written_again(path, lost):
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-lost])
+    record = Record(path, REQUEST, resume=True)
+    assert list(record.known) == [0]
+    record.add(1, [measured("b")])
+    record.close()
+    assert path.read_bytes() == whole
+
+
+def test_zeros_that_a_lost_disk_leaves_are_forgotten(path):
+    whole = path.read_bytes()
+    path.write_bytes(whole + b"\0" * 50 + b"\n")
+    record = Record(path, REQUEST, resume=True)
+    record.close()
+    assert sorted(record.known) == [0, 1]
+    assert path.read_bytes() == whole
+
+
+def test_a_torn_first_line_starts_anew(path):
+    path.write_bytes(path.read_bytes()[:10])
+    record = Record(path, REQUEST, resume=True)
+    assert not record.known
+    record.add(0, [measured("a")])
+    record.close()
+    assert json.loads(path.read_text().splitlines()[0])["request"] == REQUEST
+
+
+def test_another_request_is_refused_by_what_changed(path):
+    with pytest.raises(UsageError, match=r"another request \(scales changed"):
+        Record(path, REQUEST | {"scales": [1.0]}, resume=True)
+
+
+def test_without_resume_it_starts_anew(path):
+    record = Record(path, REQUEST | {"views": 9}, resume=False)
+    record.add(0, [measured("c")])
+    record.close()
+    assert len(path.read_text().splitlines()) == 2
+
+
+def test_two_processes_do_not_share_a_record(path):
+    first = Record(path, REQUEST, resume=True)
+    with pytest.raises(UsageError, match="another process"):
+        Record(path, REQUEST, resume=True)
+    first.close()
+
+
+def test_nothing_is_made_before_the_first_view_is_done(tmp_path):
+    Record(tmp_path / "deep" / "progress.jsonl", REQUEST, resume=True).close()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_place_that_cannot_be_written_is_named(tmp_path):
+    (tmp_path / "file").write_text("")
+    record = Record(tmp_path / "file" / "progress.jsonl", REQUEST, resume=False)
+    with pytest.raises(OutputError, match=r"progress\.jsonl: cannot be written"):
+        record.add(0, [measured("a")])
