@@ -60,9 +60,8 @@ FLOATS = ("f4", "f8")
 CHUNK = (
     1 << 12
 )  # rows taken apart at a time: 1 MB, so that a column's stride stays within the cache
-SPARSE = (
-    16  # rows chosen from a block of more than this many times their number are fetched one by one
-)
+SPARSE = 16  # rows that span more than this many times their number are fetched one by one
+BLOCK = 1 << 20  # bytes copied at a time
 
 name = "ply"
 
