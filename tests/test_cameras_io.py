@@ -285,12 +285,12 @@ def test_odd_json_is_refused(tmp_path, text):
 @pytest.mark.parametrize("constant", ["NaN", "Infinity", "-Infinity"])
 def test_json_holds_no_constants_even_where_they_are_not_used(tmp_path, constant):
     inria(tmp_path, inria_entry(id=float(constant)))
-    with pytest.raises(FormatError, match=f"{constant} is no number"):
+    with pytest.raises(FormatError, match=f"{constant} is no finite number"):
         read_cameras(tmp_path)
 
 
 def test_json_is_capped(tmp_path, monkeypatch):
-    monkeypatch.setattr("aaplug.io.cameras.values.JSON_LIMIT", 100)
+    monkeypatch.setenv("AAPLUG_JSON", "100")
     with pytest.raises(FormatError, match="longer than 100 bytes"):
         read_cameras(inria(tmp_path))
 

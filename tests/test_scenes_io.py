@@ -824,7 +824,7 @@ def test_dropped_rows_are_counted_aloud_and_stay_dropped(
         ("missing.ply", "cannot be read: no such file"),
         (".", "is a folder"),
         ("empty.ply", "is empty"),
-        ("junk.ply", r"no known scene format; aaplug reads \.ply"),
+        ("junk.ply", r"no known scene format; aaplug reads \.compressed\.ply, \.ply, \.spz"),
         ("nul\0.ply", "cannot be read"),
     ],
 )

@@ -30,7 +30,8 @@ from aaplug.io.cameras.photos import (
     whole,
     without_suffix,
 )
-from aaplug.io.cameras.values import (
+from aaplug.io.images import image_size
+from aaplug.io.values import (
     Entry,
     distortion_refusal,
     entries,
@@ -42,7 +43,6 @@ from aaplug.io.cameras.values import (
     read_json,
     rigid,
 )
-from aaplug.io.images import image_size
 
 ALONE, TRAIN, TEST, VAL = (f"transforms{part}.json" for part in ("", "_train", "_test", "_val"))
 PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV")  # OPENCV is one as long as it does not distort

@@ -33,7 +33,7 @@ from aaplug.io.cameras.photos import (
     with_photos,
     without_suffix,
 )
-from aaplug.io.cameras.values import (
+from aaplug.io.values import (
     Place,
     distortion_refusal,
     focal,

@@ -11,8 +11,9 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from aaplug.cameras import Camera
 from aaplug.errors import FormatError, UsageError, listing
-from aaplug.io.cameras.values import MAX_SIDE, Place
 from aaplug.io.images import image_size
+from aaplug.io.limits import whole_limit
+from aaplug.io.values import Place
 
 COMMON = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")  # tried for names without a suffix
 SUFFIXES = (*COMMON, ".webp", ".tif", ".tiff", ".bmp", ".exr")  # what counts as one
@@ -114,8 +115,9 @@ def scaled_sizes(cameras: Sequence[Camera], scale: float) -> list[Size]:
         UsageError: that is more than an image can have.
     """
     sizes = [scaled(camera, scale) for camera in cameras]
-    if max(map(max, sizes)) > MAX_SIDE:
-        raise UsageError("--train-scale", f"makes an image of more than {MAX_SIDE} px a side")
+    most = whole_limit("CAMERA_SIDE")
+    if max(map(max, sizes)) > most:
+        raise UsageError("--train-scale", f"makes an image of more than {most} px a side")
     return sizes
 
 

@@ -8,15 +8,16 @@ writing.
 import re
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
 from aaplug.errors import FormatError, OutputError
 from aaplug.gaussians import Convention, Gaussians
 from aaplug.io.atomic import check_output
-from aaplug.io.scenes import ply
+from aaplug.io.scenes import compressed_ply, ksplat, ply, pt, sog, splat, spz
 from aaplug.io.scenes.scene_file import SceneFile
 
 HEAD_BYTES = 64  # of a file, shown to each format's `sniff`
+SpzAxes = Literal["opengl", "opencv"]
 SOG_FOLDER = "meta.json"  # what a folder of SOG images is known by
 
 
@@ -43,11 +44,15 @@ class WritableFormat(Protocol):
         ...
 
 
-FORMATS: tuple[SceneFormat, ...] = (ply,)
+FORMATS: tuple[SceneFormat, ...] = (compressed_ply, ply, spz, sog, pt, splat, ksplat)
 
 
 def open_scene(
-    path: Path, *, convention: Convention | None = None, allow_checkpoint: bool = False
+    path: Path,
+    *,
+    convention: Convention | None = None,
+    allow_checkpoint: bool = False,
+    spz_axes: SpzAxes = "opengl",
 ) -> SceneFile:
     """Look at the scene in the file `path` without reading its Gaussians.
 
@@ -55,6 +60,7 @@ def open_scene(
         path: a file; for a folder see `find_scene`.
         convention: how the scene was trained, where the file does not know or is wrong.
         allow_checkpoint: open a .pt file too, a pickle, of which nothing but tensors is taken.
+        spz_axes: those of a .spz: "opengl" by its specification, "opencv" as splat-transform and gsply write them.
 
     Raises:
         FormatError: the file is missing, of no known format, or breaks its format.
@@ -67,7 +73,8 @@ def open_scene(
                     path,
                     "is a training checkpoint (a pickle); --allow-checkpoint reads it, or export it as .ply",
                 )
-            return format.open_scene(path).stated(convention)
+            opened = format.open_scene(path).stated(convention)
+            return spz.as_stored(opened) if format is spz and spz_axes == "opencv" else opened
     known = ", ".join("." + format.name for format in FORMATS)
     raise FormatError(path, f"is of no known scene format; aaplug reads {known}")
 
@@ -78,6 +85,7 @@ def read_scene(
     convention: Convention | None = None,
     drop_bad: bool = False,
     allow_checkpoint: bool = False,
+    spz_axes: SpzAxes = "opengl",
 ) -> Gaussians:
     """Read the scene in the file `path`.
 
@@ -86,12 +94,14 @@ def read_scene(
         convention: how the scene was trained, where the file does not know or is wrong.
         drop_bad: leave out Gaussians with NaN, infinite or unusable values, and log a warning with
             their number, instead of refusing.
-        allow_checkpoint: read a .pt file too; see `open_scene`.
+        allow_checkpoint, spz_axes: see `open_scene`.
 
     Raises:
         FormatError: the file is missing, of no known format, breaks its format, or is too large for this machine.
     """
-    opened = open_scene(path, convention=convention, allow_checkpoint=allow_checkpoint)
+    opened = open_scene(
+        path, convention=convention, allow_checkpoint=allow_checkpoint, spz_axes=spz_axes
+    )
     return opened.whole(drop_bad)
 
 

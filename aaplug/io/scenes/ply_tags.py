@@ -39,8 +39,8 @@ class Meaning:
     flat: bool = False
 
 
-def meaning(header: Header) -> Meaning:
-    """Read the header's tags.
+def meaning(header: Header, compressed: bool = False) -> Meaning:
+    """Read the header's tags; `compressed` columns say nothing themselves.
 
     Raises:
         FormatError: a record is damaged or names an unknown convention.
@@ -54,12 +54,13 @@ def meaning(header: Header) -> Meaning:
         if "fused" in record
     )
     mode = _last(header, RENDER_MODE)
-    flat = "scale_2" not in header.vertex.names or bool(mode and mode.lower() == FLAT)
+    two = not compressed and "scale_2" not in header.vertex.names
+    flat = two or bool(mode and mode.lower() == FLAT)
     recorded = [record["convention"] for record in records if "convention" in record]
     if recorded:
         convention = _convention(header.path, recorded[-1])
         return Meaning(convention, f"aaplug's record in the file: {convention.name}", fused, flat)
-    return Meaning(*_from_others(header, mode), fused, flat)
+    return Meaning(*_from_others(header, mode, two), fused, flat)
 
 
 def stating(
@@ -85,13 +86,13 @@ def _said(header: Header) -> tuple[Convention, tuple[Fusion, ...]]:
     return said.convention, said.fused
 
 
-def _from_others(header: Header, mode: str | None) -> tuple[Convention, str]:
+def _from_others(header: Header, mode: str | None, two: bool) -> tuple[Convention, str]:
     postshot = _last(header, POSTSHOT)
     if FILTER_COLUMN in header.vertex.names:
         return MIP, f"column {FILTER_COLUMN} in the file: Mip-Splatting, not yet fused"
     if mode is not None and mode.lower() == FLAT:
         return CLASSIC, f"tag in the file, SplatRenderMode: {mode}: 2D Gaussians, taken for classic"
-    if mode is None and "scale_2" not in header.vertex.names:
+    if mode is None and two:
         return CLASSIC, "two scales in the file: 2D Gaussians (2DGS), taken for classic"
     if mode is not None and mode.lower() in MODES:
         return MODES[mode.lower()], f"tag in the file: SplatRenderMode: {mode}"
