@@ -274,7 +274,9 @@ def test_ksplat_counts_that_lie_do_no_harm(tmp_path: Path, level: int, offset: i
         scene = read_scene(tmp_path / "a.ksplat")
     except FormatError:
         return
-    assert offset in (4104, 4128) or level == 0  # room in buckets, and for blocks: what is there is read
+    assert (
+        offset in (4104, 4128) or level == 0
+    )  # room in buckets, and for blocks: what is there is read
     assert len(scene) == 40
 
 

@@ -83,20 +83,24 @@ class SceneFile:
             origin=origin,
         )
 
-    def parts(self, drop_bad: bool = False, size: int = PART) -> Iterator[Gaussians]:
+    def parts(
+        self, drop_bad: bool = False, size: int = PART, found: dict[str, int] | None = None
+    ) -> Iterator[Gaussians]:
         """The scene part by part, at least one, checked.
+
+        found: to be given what was wrong with rows left out, and how many they are, instead of the log.
 
         Raises:
             FormatError: a row cannot be used and not `drop_bad`, or the file cannot be read.
         """
-        dropped: dict[str, int] = {}
+        dropped: dict[str, int] = {} if found is None else found
         left_out = 0
         for start in range(0, max(self.count, 1), size):
             part = self.raw(start, min(start + size, self.count))
             bad = _check(part, self.path, drop_bad, dropped)
             left_out += 0 if bad is None else int(bad.sum())
             yield part if bad is None else part[~bad]
-        if left_out:
+        if left_out and found is None:
             counts = listing([f"{text}: {number:,}" for text, number in dropped.items()])
             log.warning("%s: left out %d of %d Gaussians (%s)", self.path, left_out, self.count, counts)  # fmt: skip
 
