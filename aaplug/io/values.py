@@ -150,13 +150,6 @@ def text(value: object, place: Place, field: str) -> str:
     return value
 
 
-def distortion_refusal(place: Place, what: str) -> FormatError:
-    """The refusal of every camera that is no plain pinhole."""
-    return place.error(
-        f"{what}, and splatting needs plain pinholes; undistort first (colmap image_undistorter)"
-    )
-
-
 def pose(
     rotation: Float[Tensor, "3 3"], translation: Float[Tensor, " 3"], place: Place, field: str
 ) -> Float[Tensor, "4 4"]:

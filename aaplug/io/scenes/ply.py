@@ -11,7 +11,7 @@ big-endian tables; numpy reads the Gaussians' rows.
 import io
 import re
 import warnings
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import chain
@@ -43,6 +43,8 @@ from aaplug.io.scenes.scene_file import (
     check_count,
     columns,
     empty,
+    matrix_of,
+    scene_of,
     sh_of_colour,
 )
 
@@ -61,6 +63,7 @@ CHUNK = (
     1 << 12
 )  # rows taken apart at a time: 1 MB, so that a column's stride stays within the cache
 SPARSE = 16  # rows that span more than this many times their number are fetched one by one
+BATCH = 1 << 16  # rows written at a time: 16 MB
 BLOCK = 1 << 20  # bytes copied at a time
 
 name = "ply"
@@ -326,6 +329,8 @@ def _rows(document: Document, degree: int, flat: bool, start: int, stop: int) ->
     if len(rows) != stop - start:
         raise FormatError(table.path, "was cut short while it was being read")
     fields = rows.dtype.names or ()
+    if _one_type(rows.dtype) and COLOURS[0] in fields:
+        return scene_of(fields, torch.from_numpy(_matrix(rows)), degree, flat)
     scene = empty(len(rows), degree, FILTER_COLUMN in fields, flat)
     targets = {c: v for c, v in columns(scene).items() if c in fields}
     for begin in range(0, len(rows), CHUNK):
@@ -335,6 +340,15 @@ def _rows(document: Document, degree: int, flat: bool, start: int, stop: int) ->
         if COLOURS[0] not in fields:
             scene.sh[part, 0] = sh_of_colour(_byte_colours(rows[part]))
     return scene
+
+
+def _one_type(dtype: np.dtype) -> bool:
+    """Whether all columns are little-endian float32, so that rows make a matrix."""
+    return all(dtype[i] == np.dtype("<f4") for i in range(len(dtype.names or ())))
+
+
+def _matrix(rows: np.ndarray) -> np.ndarray:
+    return rows.view("<f4").reshape(len(rows), -1)
 
 
 def _byte_colours(rows: np.ndarray) -> Tensor:
@@ -367,8 +381,8 @@ def _document_of(scene: Gaussians) -> Document | None:
 
 
 def _write_rows(stream: BinaryIO, header: Header, scene: Gaussians) -> None:
-    for start in range(0, len(scene), CHUNK):
-        part = scene[start : start + CHUNK] if len(scene) > CHUNK else scene
+    for start in range(0, len(scene), BATCH):
+        part = scene[start : start + BATCH] if len(scene) > BATCH else scene
         stream.write(_records(header, part).tobytes())
 
 
@@ -377,10 +391,12 @@ def _records(header: Header, scene: Gaussians) -> np.ndarray:
 
     A column of another type than float32 keeps what it had where the scene's value is what was read from it.
     """
-    values = columns(scene)
     properties = header.vertex.properties
     records = np.zeros(len(scene), np.dtype([(p.name, "<" + p.code) for p in properties]))
-    old = None if _all_known(header, values) else _old_rows(scene)
+    if _one_type(records.dtype) and scene.means.dtype == torch.float32:
+        return _filled(records, scene)
+    values = columns(scene)
+    old = _old_rows(scene)
     for p in properties:
         was = old[p.name] if old is not None and p.name in (old.dtype.names or ()) else None
         if p.name not in values:
@@ -394,8 +410,18 @@ def _records(header: Header, scene: Gaussians) -> np.ndarray:
     return records
 
 
-def _all_known(header: Header, values: Collection[str]) -> bool:
-    return all(p.name in values and p.code == "f4" for p in header.vertex.properties)
+def _filled(records: np.ndarray, scene: Gaussians) -> np.ndarray:
+    """The same for float32 alone, all columns at once."""
+    names, fields = list(records.dtype.names or ()), _matrix(records)
+    known, values = matrix_of(scene)
+    values = values.detach().cpu().numpy()
+    assert not np.isnan(values).any(), "a parameter is NaN"
+    if set(names) != set(known) and (old := _old_rows(scene)) is not None:
+        for i, column in enumerate(names):
+            if column not in known and column in (old.dtype.names or ()):
+                fields[:, i] = old[column]
+    fields[:, [names.index(column) for column in known]] = values
+    return records
 
 
 def _old_rows(scene: Gaussians) -> np.ndarray | None:

@@ -1,0 +1,68 @@
+"""nerfstudio's `camera_path.json`: free cameras along a path.
+
+{render_width, render_height, camera_type, camera_path: [{camera_to_world, fov}]}.  camera_to_world: 16 numbers, row by
+row, OpenGL axes, in the frame of the trained scene; fov: the vertical angle in degrees; sizes in px.
+"""
+
+import math
+import os
+from pathlib import Path
+
+import torch
+
+from aaplug.cameras import Camera, CameraSet
+from aaplug.errors import FormatError
+from aaplug.io.cameras.options import Options, undivided
+from aaplug.io.cameras.photos import described_sizes, refuse_folder, scaled_sizes
+from aaplug.io.values import Entry, Place, entries, focal, inverse, mentions, pose, read_json
+
+OPENCV_FROM_OPENGL = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
+KEY = "camera_path"
+HALF_TURN = 180.0  # degrees: a pinhole sees less
+
+
+def sniff(path: Path) -> bool:
+    """Whether a file's keys are those of a camera path."""
+    return not os.path.isdir(path) and mentions(path, [KEY, "camera_to_world"])
+
+
+def read(path: Path, options: Options) -> CameraSet:
+    """The cameras, free ones: they are no poses of a data set, so they tell nothing of training's sampling.
+
+    Raises:
+        FormatError: the file is not what it should be.
+        UsageError: the options do not fit.
+    """
+    refuse_folder(options.images)
+    document = read_json(path)
+    if not isinstance(document, dict):
+        raise FormatError(path, f"should be an object with {KEY}")
+    kind = document.get("camera_type", "perspective")
+    if kind != "perspective":
+        raise Place(path, "it").wrong("camera_type", "perspective", kind)
+    whole = Entry(Place(path, "it"), document)
+    size = whole.pixels("render_width"), whole.pixels("render_height")
+    found = entries(path, "camera", document.get(KEY))
+    digits = len(str(len(found) - 1))
+    cameras = [_camera(entry, f"{i:0{digits}}", *size) for i, entry in enumerate(found)]
+    scale = 1.0 if options.train_scale is None else options.train_scale
+    cameras = [c.resized(*s) for c, s in zip(cameras, scaled_sizes(cameras, scale), strict=True)]
+    split = undivided(cameras, "a path has no split")
+    notes = (
+        f"camera path: {len(cameras)} free cameras, {described_sizes(cameras)}; "
+        "they stand in for training cameras, which give better bounds",
+        split.note,
+    )
+    return CameraSet(split.train, split.test, notes=notes)
+
+
+def _camera(entry: Entry, name: str, width: int, height: int) -> Camera:
+    angle = entry.number("fov")
+    if not 0 < angle < HALF_TURN:
+        raise entry.place.wrong("fov", f"above 0 and below {HALF_TURN:g} degrees", angle)
+    f = focal(height / 2 / math.tan(math.radians(angle) / 2), entry.place, "fov's focal length")
+    motion = entry.vector("camera_to_world", 16).reshape(4, 4)
+    rotation = motion[:3, :3] * OPENCV_FROM_OPENGL
+    world_from_cam = pose(rotation, motion[:3, 3], entry.place, "camera_to_world")
+    cam_from_world = inverse(world_from_cam, entry.place, "camera_to_world")
+    return Camera(name, width, height, f, f, width / 2, height / 2, cam_from_world)
