@@ -48,6 +48,11 @@ def describe(fusion: Fusion) -> str:
 
 
 def _check(scene: Gaussians, form: WorldFilter) -> None:
+    if scene.flat:
+        raise UsageError(
+            _name(scene),
+            "holds 2D Gaussians, which no filter here can thicken and stay 2D Gaussians",
+        )
     if scene.fused:
         done = "; ".join(describe(fusion) for fusion in scene.fused)
         raise UsageError(

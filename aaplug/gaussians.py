@@ -63,7 +63,11 @@ class Origin:
 
 @dataclass(frozen=True)
 class Gaussians:
-    """n Gaussians and how they were trained."""
+    """n Gaussians and how they were trained.
+
+    flat: these are 2D Gaussians (2DGS, Huang et al. 2024), discs across the third axis.  Their file has two
+    scales; the third log-scale here is −MAX_LOG_SCALE, no thickness, so that a renderer needs no special case.
+    """
 
     means: Float[Tensor, "n 3"]
     quats: Float[Tensor, "n 4"]  # wxyz, of any length but zero
@@ -76,6 +80,7 @@ class Gaussians:
     )
     fused: tuple[Fusion, ...] = ()
     origin: Origin | None = None
+    flat: bool = False
 
     def __len__(self) -> int:
         return self.means.shape[0]
@@ -97,7 +102,7 @@ class Gaussians:
 
     @property
     def sh_degree(self) -> int:
-        """Degree of the spherical harmonics, 0 to 3."""
+        """Degree of the spherical harmonics, 0 to 4."""
         return round(self.sh.shape[1] ** 0.5) - 1
 
     def __getitem__(self, index: Tensor | slice) -> "Gaussians":

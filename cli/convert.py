@@ -7,9 +7,11 @@ from typing import Annotated, Literal
 from aaplug.conversion import FORMS, default_form, describe
 from aaplug.conversion import convert as fuse
 from aaplug.io.atomic import check_output
-from aaplug.io.scenes import find_scene, write_scene
+from aaplug.io.scenes import find_scene, write_parts, write_scene
+from aaplug.io.scenes.scene_file import SceneFile
+from aaplug.streaming import LARGE, check_frame_of, convert_parts
 
-from .console import print_json, say
+from .console import print_json, progress, say
 from .options import CameraOptions, SceneOptions, flag
 
 
@@ -37,7 +39,10 @@ def convert(options: Convert) -> int:
     """Fuse anti-aliasing into a plain .ply."""
     source = find_scene(options.scene.path, options.scene.iteration)
     check_output(options.output, options.overwrite, [source])
-    scene = options.scene.read()
+    opened = options.scene.open()
+    if opened.count > LARGE:
+        return _convert_in_parts(options, opened)
+    scene = opened.whole(options.scene.drop_bad)
     form = FORMS[options.form or default_form(scene)]
     if options.variance is not None:
         form = replace(form, variance=options.variance)  # type: ignore[type-var]
@@ -52,4 +57,25 @@ def convert(options: Convert) -> int:
     if options.json:
         fused = [{"method": f.method, **f.settings} for f in converted.fused]
         print_json({"output": str(options.output), "gaussians": len(converted), "fused": fused})
+    return 0
+
+
+def _convert_in_parts(options: Convert, opened: SceneFile) -> int:
+    """The same for a scene that would need much memory whole."""
+    first = opened.raw(0, min(1, opened.count))
+    form = FORMS[options.form or default_form(first)]
+    if options.variance is not None:
+        form = replace(form, variance=options.variance)  # type: ignore[type-var]
+    cameras = ()
+    if first.filter_3d is None and not opened.fused:
+        cameras = options.cameras.read(options.scene).train
+        check_frame_of(opened, cameras, options.cameras.min_seen)
+    with progress("converting", "Gaussians") as tell:
+        parts = convert_parts(
+            opened, cameras, form, options.cameras.guard, options.scene.drop_bad, tell
+        )
+        write_parts(options.output, parts, opened.count, [opened.path], overwrite=options.overwrite)
+    say(f"wrote {options.output}, in parts; show it with the Mip rule (0.1 px², compensated)")
+    if options.json:
+        print_json({"output": str(options.output), "gaussians": opened.count})
     return 0

@@ -19,7 +19,8 @@ from aaplug.errors import UsageError
 from aaplug.gaussians import CONVENTIONS, Gaussians
 from aaplug.interfaces import Rasterizer, Training
 from aaplug.io.cameras import read_cameras, select_views
-from aaplug.io.scenes import find_scene, read_scene
+from aaplug.io.scenes import SpzAxes, find_scene, open_scene
+from aaplug.io.scenes.scene_file import SceneFile
 from aaplug.pipeline import learn
 from aaplug.rasterizers import Tiled
 from aaplug.rasterizers.tiled import MEMORY
@@ -46,7 +47,7 @@ class SceneOptions:
     """The scene."""
 
     scene: Annotated[Path | None, tyro.conf.Positional, flag("SCENE")] = None
-    """A 3DGS .ply, or an INRIA model folder (output/scene)."""
+    """A scene (.ply, .compressed.ply, .spz, .sog, .splat, .ksplat) or its folder (INRIA model, SOG)."""
     model_path: Annotated[Path | None, flag("FOLDER", "-m")] = None
     """An INRIA model folder, instead of SCENE."""
     iteration: Annotated[int | None, flag("N")] = None
@@ -57,6 +58,10 @@ class SceneOptions:
     """How the scene was trained, where its file does not say."""
     drop_bad: bool = False
     """Leave out Gaussians with NaN, infinite or unusable values instead of stopping."""
+    allow_checkpoint: bool = False
+    """Read gsplat's .pt too: a pickle, of which nothing but tensors is taken."""
+    spz_axes: SpzAxes = "opengl"
+    """Axes of a .spz: opengl by its specification; opencv as splat-transform and gsply write them."""
 
     @property
     def path(self) -> Path:
@@ -67,19 +72,27 @@ class SceneOptions:
         assert path is not None
         return path
 
+    def open(self) -> SceneFile:
+        """Look at the scene and say what it is."""
+        opened = open_scene(
+            find_scene(self.path, self.iteration),
+            convention=None if self.convention is None else CONVENTIONS[self.convention],
+            allow_checkpoint=self.allow_checkpoint,
+            spz_axes=self.spz_axes,
+        )
+        say(
+            f"scene: {opened.path}: {opened.count:,} Gaussians, SH degree {opened.sh_degree}, "
+            f"{opened.convention.name} ({opened.evidence})"
+        )
+        for note in opened.notes:
+            say(f"scene: {note}")
+        for fusion in opened.fused:
+            say(f"fused: {describe(fusion)}")
+        return opened
+
     def read(self) -> Gaussians:
         """Read the scene and say what it is."""
-        convention = None if self.convention is None else CONVENTIONS[self.convention]
-        path = find_scene(self.path, self.iteration)
-        scene = read_scene(path, convention=convention, drop_bad=self.drop_bad)
-        assert scene.origin is not None
-        say(
-            f"scene: {path}: {len(scene):,} Gaussians, SH degree {scene.sh_degree}, "
-            f"{scene.convention.name} ({scene.origin.evidence})"
-        )
-        for fusion in scene.fused:
-            say(f"fused: {describe(fusion)}")
-        return scene
+        return self.open().whole(self.drop_bad)
 
 
 @dataclass(frozen=True)

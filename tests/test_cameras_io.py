@@ -6,6 +6,7 @@ import shutil
 import struct
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
@@ -285,12 +286,12 @@ def test_odd_json_is_refused(tmp_path, text):
 @pytest.mark.parametrize("constant", ["NaN", "Infinity", "-Infinity"])
 def test_json_holds_no_constants_even_where_they_are_not_used(tmp_path, constant):
     inria(tmp_path, inria_entry(id=float(constant)))
-    with pytest.raises(FormatError, match=f"{constant} is no number"):
+    with pytest.raises(FormatError, match=f"{constant} is no finite number"):
         read_cameras(tmp_path)
 
 
 def test_json_is_capped(tmp_path, monkeypatch):
-    monkeypatch.setattr("aaplug.io.cameras.values.JSON_LIMIT", 100)
+    monkeypatch.setenv("AAPLUG_JSON", "100")
     with pytest.raises(FormatError, match="longer than 100 bytes"):
         read_cameras(inria(tmp_path))
 
@@ -403,15 +404,32 @@ def test_colmap_names_that_collide_keep_their_suffix(tmp_path):
 
 
 @pytest.mark.parametrize("write", [colmap_bin, colmap_txt])
-def test_colmap_distortion_is_refused_unless_it_is_zero(tmp_path, write):
+def test_a_colmap_lens_that_distorts_is_the_pinhole_at_its_centre(tmp_path, write):
     straight = one_camera(4, (300.0, 310.0, 200.0, 100.0, 0.0, 0.0, 0.0, 0.0))
-    assert read_cameras(write(tmp_path / "a", *straight)).train[0].fy == 310
-    bent = one_camera(4, (300.0, 310.0, 200.0, 100.0, 0.0, 0.0, 0.0, 1e-9))
-    with pytest.raises(FormatError, match=r"camera 1.*OPENCV with distortion.*image_undistorter"):
-        read_cameras(write(tmp_path / "b", *bent))
-    fisheye = one_camera(5, (300.0, 310.0, 200.0, 100.0, 0.0, 0.0, 0.0, 0.0))
-    with pytest.raises(FormatError, match=r"camera 1.*OPENCV_FISHEYE.*image_undistorter"):
-        read_cameras(write(tmp_path / "c", *fisheye))
+    cameras = read_cameras(write(tmp_path / "a", *straight))
+    assert cameras.train[0].fy == 310
+    assert not any("distorts" in note for note in cameras.notes)
+    for model, values in ((4, (0.0, 0.0, 0.0, 1e-9)), (5, (0.0,) * 4)):
+        folder = tmp_path / f"m{model}"
+        photo(folder / "images" / "a.png", 200, 100)
+        bent = one_camera(model, (300.0, 310.0, 200.0, 100.0, *values))
+        cameras = read_cameras(write(folder / "sparse", *bent).parent)
+        (camera,) = cameras.train
+        assert (camera.fx, camera.fy, camera.cx, camera.cy) == (
+            150,
+            155,
+            100,
+            50,
+        )  # its photo's size
+        assert camera.photo is None
+        assert f"1 cameras have a lens that distorts ({MODEL_NAMES[model]})" in cameras.notes[-1]
+
+
+def test_a_colmap_camera_that_sees_all_around_is_refused(tmp_path):
+    colmap_txt(tmp_path, *one_camera(1, (300.0, 310.0, 200.0, 100.0)))
+    (tmp_path / "cameras.txt").write_text("1 EQUIRECTANGULAR 400 200 400 200\n")
+    with pytest.raises(FormatError, match="EQUIRECTANGULAR, which has no focal length"):
+        read_cameras(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -554,10 +572,9 @@ def test_transforms_intrinsics_of_a_frame_come_first(tmp_path):
 @pytest.mark.parametrize(
     ("frame", "message"),
     [
-        ({"k1": 0.1}, "frame 0: k1 is 0.1"),
-        ({"distortion_params": [0, 0.1]}, "distortion_params are not zero"),
-        ({"camera_model": "OPENCV_FISHEYE"}, "camera_model is OPENCV_FISHEYE"),
-        ({"is_fisheye": True}, "is_fisheye"),
+        ({"k1": "a"}, "frame 0: k1 should be a number"),
+        ({"distortion_params": 3}, "distortion_params should be a list"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "camera_model is EQUIRECTANGULAR"),
         ({"camera_angle_x": 3.2}, "camera_angle_x should be above 0 and below π"),
         ({"camera_angle_x": 5e-324}, "camera_angle_x should be above 0 and below π"),
         ({"file_path": "../x"}, "should stay within the dataset"),
@@ -576,6 +593,58 @@ def test_transforms_name_what_is_wrong(tmp_path, frame, message):
     with pytest.raises(FormatError) as caught:
         read_cameras(write_json(tmp_path / "transforms.json", document))
     assert message in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("lens", "name"),
+    [
+        ({"k1": 0.1, "camera_model": "OPENCV"}, "OPENCV"),
+        ({"distortion_params": [0, 0.1]}, "PINHOLE"),
+        ({"camera_model": "OPENCV_FISHEYE"}, "OPENCV_FISHEYE"),
+        ({"is_fisheye": True}, "fisheye"),
+    ],
+    ids=str,
+)
+def test_a_lens_that_distorts_is_the_pinhole_at_its_centre(tmp_path, lens, name):
+    photo(tmp_path / "a.png", 40, 20)
+    frames = [{"file_path": "a.png"} | lens, {"file_path": "b.png"}]
+    document = transforms(frames, w=40, h=20, fl_x=30, cx=19, cy=9)
+    cameras = read_cameras(write_json(tmp_path / "transforms.json", document))
+    assert (cameras.train[0].fx, cameras.train[0].cx, cameras.train[0].photo) == (30, 19, None)
+    assert f"1 cameras have a lens that distorts ({name})" in cameras.notes[-1]
+
+
+def test_nerfstudios_lists_are_the_split(tmp_path):
+    frames = [{"file_path": f"{c}.png"} for c in "abc"]
+    lists = {"train_filenames": ["a.png", "c.png"], "test_filenames": ["b.png"]}
+    path = write_json(tmp_path / "transforms.json", transforms(frames, w=40, h=20, **lists))
+    cameras = read_cameras(path)
+    assert (names(cameras.train), names(cameras.test)) == (["a", "c"], ["b"])
+    assert len(read_cameras(path, test_every=0).train) == 3
+    lists["train_filenames"] = "a.png"
+    write_json(path, transforms(frames, w=40, h=20, **lists))
+    with pytest.raises(FormatError, match="train_filenames should be a list"):
+        read_cameras(path)
+
+
+def test_the_dataparsers_transform_takes_poses_to_the_trained_frame(tmp_path):
+    frames = [{"file_path": "a.png"}]
+    document = transforms(frames, w=40, h=20, applied_transform=[[1, 0, 0, 0]])
+    path = write_json(tmp_path / "transforms.json", document)
+    before = read_cameras(path)
+    assert "dataparser_transforms.json" in before.notes[-1]
+    turn = [[0.0, -1.0, 0.0, 1.0], [1.0, 0.0, 0.0, 2.0], [0.0, 0.0, 1.0, 3.0]]
+    write_json(tmp_path / "dataparser_transforms.json", {"transform": turn, "scale": 0.5})
+    after = read_cameras(path)
+    matrix = torch.tensor(turn, dtype=torch.float64)
+    point = torch.tensor([0.3, -0.7, 0.2, 1.0], dtype=torch.float64)
+    moved = torch.cat([0.5 * (matrix @ point), point[3:]])
+    seen, still = (c.train[0].cam_from_world @ p for c, p in ((before, point), (after, moved)))
+    torch.testing.assert_close(still[:3], 0.5 * seen[:3])  # the same picture, at half the size
+    for wrong in ({"transform": turn, "scale": 0}, {"transform": [[1]], "scale": 1}, [], {}):
+        write_json(tmp_path / "dataparser_transforms.json", wrong)
+        with pytest.raises(FormatError, match="dataparser_transforms"):
+            read_cameras(path)
 
 
 def test_transforms_without_a_size_say_what_to_do(tmp_path):
@@ -600,6 +669,126 @@ def test_pinhole_values(tmp_path):
     assert camera.name == "cam_40"
     views = read_cameras(write_json(tmp_path / "list.json", [pinhole()] * 11), test_every=5)
     assert names(views.test) == ["camera_00", "camera_05", "camera_10"]
+
+
+# Camera paths, LLFF, multi-scale Blender ---------------------------------------------------------
+
+
+def camera_path(**changes):
+    motion = [cell for row in OPENGL for cell in row]
+    view = {"camera_to_world": motion, "fov": 90.0, "aspect": 2.0}
+    return {
+        "render_width": 40,
+        "render_height": 20,
+        "camera_type": "perspective",
+        "camera_path": [view],
+    } | changes
+
+
+def test_a_camera_path_is_free_cameras(tmp_path):
+    path = write_json(tmp_path / "camera_path.json", camera_path())
+    (camera,) = read_cameras(path).train
+    same = read_cameras(
+        write_json(tmp_path / "transforms.json", transforms([{"file_path": "a"}], w=40, h=20))
+    ).train[0]
+    assert torch.equal(camera.cam_from_world, same.cam_from_world)
+    assert (camera.fx, camera.fy, camera.hw) == (pytest.approx(10), pytest.approx(10), (20, 40))
+    assert camera.trained_focal is None
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"camera_type": "equirectangular"},
+        {"render_width": 0},
+        {"camera_path": []},
+        {"camera_path": [{"fov": 180, "camera_to_world": [0] * 16}]},
+        {"camera_path": [{"fov": 50, "camera_to_world": [0] * 16}]},
+        {"camera_path": [{"fov": 50, "camera_to_world": [1] * 15}]},
+    ],
+    ids=str,
+)
+def test_odd_camera_paths_are_refused(tmp_path, change):
+    with pytest.raises(FormatError, match=r"camera_path\.json"):
+        read_cameras(write_json(tmp_path / "camera_path.json", camera_path(**change)))
+
+
+def llff(folder, count=9):
+    """The camera of the transforms above, in LLFF's axes: down, right, back."""
+    opengl = np.array(OPENGL)[:3]
+    right, up, back, centre = opengl.T
+    matrix = np.stack([-up, right, back, centre, [20.0, 40.0, 30.0]], axis=1)
+    folder.mkdir(exist_ok=True)
+    np.save(folder / "poses_bounds.npy", np.tile(np.append(matrix.ravel(), [1, 9]), (count, 1)))
+    return folder
+
+
+def test_llff_axes_are_down_right_and_back(tmp_path):
+    cameras = read_cameras(llff(tmp_path))
+    same = read_cameras(
+        write_json(tmp_path / "transforms.json", transforms([{"file_path": "a"}], w=40, h=20))
+    ).train[0]
+    camera = cameras.train[0]
+    assert torch.allclose(camera.cam_from_world, same.cam_from_world, atol=1e-15)
+    assert (camera.fx, camera.hw, camera.name) == (30, (20, 40), "001")
+    assert names(cameras.test) == ["000", "008"]
+    for i in range(9):
+        photo(tmp_path / "images" / f"IMG_{i}.JPG", 20, 10)
+    camera = read_cameras(tmp_path / "poses_bounds.npy").train[0]
+    assert (camera.name, camera.fx, camera.hw) == ("IMG_1", 15, (10, 20))
+
+
+def test_odd_llff_files_are_refused(tmp_path):
+    file = tmp_path / "poses_bounds.npy"
+    for rows in (
+        np.zeros((2, 16)),
+        np.zeros(17),
+        np.zeros((0, 17)),
+        np.zeros((2, 17)),
+        np.ones((2, 17), int),
+        np.array([{}] * 17)[None],
+    ):
+        np.save(file, rows)
+        with pytest.raises(FormatError, match=r"poses_bounds\.npy"):
+            read_cameras(tmp_path)
+    header = llff(tmp_path / "good") / "poses_bounds.npy"
+    file.write_bytes(header.read_bytes().replace(b"(9, 17)", b"(999999999, 17)"))
+    with pytest.raises(FormatError, match=r"no \.npy file"):
+        read_cameras(tmp_path)
+
+
+def multiscale(folder):
+    row = {
+        "file_path": ["train/r_0.png", "train/r_0_d1.png"],
+        "cam2world": [OPENGL] * 2,
+        "width": [40, 20],
+        "height": [20, 10],
+        "focal": [30.0, 15.0],
+        "label": [0, 1],
+    }
+    test = {key: values[:1] for key, values in row.items()}
+    return write_json(folder / "metadata.json", {"train": row, "test": test})
+
+
+def test_multiscale_blender_has_a_view_a_scale(tmp_path):
+    cameras = read_cameras(multiscale(tmp_path).parent)
+    assert names(cameras.train) == ["r_0", "r_0_d1"]
+    assert [(c.fx, c.hw, c.trained_focal) for c in cameras.train] == [
+        (30, (20, 40), 30),
+        (15, (10, 20), 15),
+    ]
+    assert (len(cameras.test), cameras.background) == (1, WHITE)
+    with pytest.raises(UsageError, match="gives the split"):
+        read_cameras(tmp_path, test_every=8)
+
+
+@pytest.mark.parametrize("key", ["file_path", "cam2world", "width", "height", "focal"])
+@pytest.mark.parametrize("value", [None, 3, [], [1], ["../x", "y"], [1e999, 1]], ids=str)
+def test_odd_multiscale_sets_are_refused(tmp_path, key, value):
+    document = json.loads(multiscale(tmp_path).read_text())
+    document["train"][key] = value
+    with pytest.raises(FormatError, match=r"metadata\.json"):
+        read_cameras(write_json(tmp_path / "metadata.json", document))
 
 
 # Choosing ---------------------------------------------------------------------------------------
@@ -675,6 +864,9 @@ def fixtures(folder):
     yield folder / "txt", "images.txt"
     yield blender(folder / "blender"), "transforms_train.json"
     yield write_json(folder / "pinhole" / "p.json", pinhole()), ""
+    yield write_json(folder / "path" / "camera_path.json", camera_path()), ""
+    yield llff(folder / "llff"), "poses_bounds.npy"
+    yield multiscale(folder / "multiscale").parent, "metadata.json"
 
 
 @settings(

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from aaplug.errors import FormatError
-from aaplug.io.cameras.values import read_bounded
+from aaplug.io.values import read_bounded
 
 LIMIT = 2**20  # bytes: thousands of scenes
 SCENES = "scene"

@@ -23,8 +23,8 @@ from torch import Tensor
 
 from aaplug.errors import FormatError, UsageError
 from aaplug.io.atomic import check_output, replacing
+from aaplug.io.limits import whole_limit
 
-MAX_PIXELS = 2**28  # 16384 x 16384; more is taken for a decompression bomb
 LOSSLESS_WEBP = 101  # OpenCV's quality for it
 SAMPLE_TYPES = {8: np.uint8, 16: np.uint16}  # by bit depth
 ALPHA_CHANNELS = 4  # RGB and alpha
@@ -164,8 +164,9 @@ def _look(path: Path) -> tuple[tuple[int, int], bool]:
         raise FormatError(path, "does not exist") from error
     except Exception as error:  # Pillow's parsers raise whatever they stumble over
         raise FormatError(path, "is not an image that can be read") from error
-    if size[0] * size[1] > MAX_PIXELS:
-        raise FormatError(path, f"has {size[0]}x{size[1]} px, more than the {MAX_PIXELS:,} allowed")
+    most = whole_limit("IMAGE")  # more is taken for a decompression bomb
+    if size[0] * size[1] > most:
+        raise FormatError(path, f"has {size[0]}x{size[1]} px, more than the {most:,} allowed")
     return size, transparent
 
 

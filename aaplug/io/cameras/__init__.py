@@ -14,7 +14,7 @@ from pathlib import Path
 
 from aaplug.cameras import Camera, CameraSet
 from aaplug.errors import FormatError, UsageError, listing
-from aaplug.io.cameras import blender, colmap, inria, pinhole
+from aaplug.io.cameras import blender, camera_path, colmap, inria, llff, multiscale, pinhole
 from aaplug.io.cameras.options import Options
 
 CLOSE_NAMES = 3  # names to offer for one that is unknown
@@ -31,11 +31,14 @@ class CameraFormat:
 
 FORMATS = (  # the first that fits is taken
     CameraFormat("a JSON file with world_to_camera", pinhole.sniff, pinhole.read),
+    CameraFormat("a JSON file with camera_path (nerfstudio)", camera_path.sniff, camera_path.read),
     CameraFormat("cameras.json with cfg_args (INRIA)", inria.sniff_model, inria.read),
     CameraFormat("sparse/0 or sparse (COLMAP)", colmap.sniff, colmap.read),
     CameraFormat("transforms_train.json (Blender)", blender.sniff_split, blender.read_split),
     CameraFormat("cameras.json (INRIA)", inria.sniff, inria.read),
-    CameraFormat("transforms.json (nerfstudio)", blender.sniff, blender.read),
+    CameraFormat("metadata.json (multi-scale Blender)", multiscale.sniff, multiscale.read),
+    CameraFormat("transforms.json (nerfstudio, instant-ngp)", blender.sniff, blender.read),
+    CameraFormat("poses_bounds.npy (LLFF)", llff.sniff, llff.read),
 )
 
 

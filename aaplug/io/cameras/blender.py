@@ -1,7 +1,8 @@
 """`transforms*.json`: Blender's (NeRF-synthetic), and nerfstudio's where it describes pinholes.
 
 frames: [{file_path, transform_matrix}].  transform_matrix: camera-to-world, OpenGL axes (x right, y
-up, z backward), world units.  The focal length is fl_x and fl_y, in px, or comes from
+up, z backward), world units.  A file dataparser_transforms.json beside it takes poses to the frame in
+which nerfstudio trained.  The focal length is fl_x and fl_y, in px, or comes from
 camera_angle_x, the full angle in radians; w, h, cx, cy are in px.  Keys beside `frames` hold for
 every frame that has none of its own.  Without w and h the photos give the size.  Paths are relative
 to the file.
@@ -12,11 +13,13 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from aaplug.cameras import WHITE, Camera, CameraSet
 from aaplug.errors import FormatError, UsageError
+from aaplug.io.cameras.dataparser import DATAPARSER, Dataparser, read_dataparser
 from aaplug.io.cameras.options import Options, Split, every_nth, explicit
 from aaplug.io.cameras.photos import (
     PhotoFolder,
@@ -24,15 +27,17 @@ from aaplug.io.cameras.photos import (
     described_sizes,
     distinct,
     last_part,
+    lens_notes,
     refuse_folder,
     scaled_sizes,
     trained_at,
     whole,
     without_suffix,
 )
-from aaplug.io.cameras.values import (
+from aaplug.io.images import image_size
+from aaplug.io.values import (
     Entry,
-    distortion_refusal,
+    Place,
     entries,
     focal,
     inverse,
@@ -42,16 +47,32 @@ from aaplug.io.cameras.values import (
     read_json,
     rigid,
 )
-from aaplug.io.images import image_size
 
 ALONE, TRAIN, TEST, VAL = (f"transforms{part}.json" for part in ("", "_train", "_test", "_val"))
+AROUND = (
+    "EQUIRECTANGULAR",
+    "OMNIDIRECTIONALSTEREO_L",
+    "OMNIDIRECTIONALSTEREO_R",
+    "VR180_L",
+    "VR180_R",
+)
 PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV")  # OPENCV is one as long as it does not distort
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 OPENCV_FROM_OPENGL = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)  # y and z change sign
 LEAST_ANGLE = 1e-9  # rad: less is no view
+SPLITS = ("train_filenames", "val_filenames", "test_filenames")  # nerfstudio's lists
 PNG = b"\x89PNG\r\n\x1a\n"
 PNG_COLOUR_TYPE = 25  # byte of the header
 PNG_ALPHA = (4, 6)  # colour types with alpha: grey and colour
+
+
+@dataclass(frozen=True)
+class Source:
+    """A file's cameras as it describes them.  held_out: which of them are test views, None if it does not say."""
+
+    cameras: tuple[Camera, ...]
+    held_out: tuple[bool, ...] | None = None
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -86,10 +107,14 @@ def read_split(path: Path, options: Options) -> CameraSet:
         return _with_note(read(path / TRAIN, options), _ignored(path))
     if options.test_every is not None:
         raise UsageError("--test-every", f"{path / TEST} gives the split; leave the option out")
-    sources = [_cameras(path / name, options) for name in (TRAIN, TEST)]
-    train, test = (_trained(source, options) for source in sources)
-    split = explicit(train, test, f"{TRAIN} and {TEST}")
-    return _with_note(_cameras_set([*sources[0], *sources[1]], split, options), _ignored(path))
+    train, test = (_source(path / name, options) for name in (TRAIN, TEST))
+    split = explicit(
+        _trained(train.cameras, options), _trained(test.cameras, options), f"{TRAIN} and {TEST}"
+    )
+    both = Source(
+        (*train.cameras, *test.cameras), notes=tuple({**dict.fromkeys(train.notes + test.notes)})
+    )
+    return _with_note(_cameras_set(both, split, options), _ignored(path))
 
 
 def read(path: Path, options: Options) -> CameraSet:
@@ -100,14 +125,23 @@ def read(path: Path, options: Options) -> CameraSet:
         UsageError: the options do not fit.
     """
     file = path / ALONE if os.path.isdir(path) else path
-    source = _cameras(file, options)
-    trained = _trained(source, options)
+    source = _source(file, options)
+    trained = _trained(source.cameras, options)
+    if source.held_out is not None and options.test_every is None:
+        pairs = list(zip(trained, source.held_out, strict=True))
+        split = explicit(
+            [c for c, out in pairs if not out],
+            [c for c, out in pairs if out],
+            "lists of file names",
+        )
+        return _cameras_set(source, split, options)
     if options.test_every:
         trained = sorted(trained, key=lambda camera: camera.name)
     return _cameras_set(source, every_nth(trained, options, 0, f"only {file.name} read"), options)
 
 
-def _cameras_set(source: Sequence[Camera], split: Split, options: Options) -> CameraSet:
+def _cameras_set(read: Source, split: Split, options: Options) -> CameraSet:
+    source = read.cameras
     scale = options.train_scale
     why = "size in the files" if scale is None else f"size in the files × {scale:g}: --train-scale"
     alpha = any(camera.photo and _has_alpha(camera.photo) for camera in source)
@@ -116,6 +150,7 @@ def _cameras_set(source: Sequence[Camera], split: Split, options: Options) -> Ca
         split.note,
         f"training size: {described_sizes([*split.train, *split.test])} ({why})",
         *(["background: white, Blender's custom, as photos have alpha"] if alpha else []),
+        *read.notes,
     )
     return CameraSet(split.train, split.test, WHITE if alpha else None, notes)
 
@@ -135,22 +170,55 @@ def _trained(source: Sequence[Camera], options: Options) -> list[Camera]:
     return trained_at(source, scaled_sizes(source, scale))
 
 
-def _cameras(file: Path, options: Options) -> list[Camera]:
-    """The file's cameras at the size that the file or the photos give."""
+def _source(file: Path, options: Options) -> Source:
+    """The file's cameras at the size that the file or the photos give, in the frame of the trained scene."""
     refuse_folder(options.images)
-    frames = _frames(file)
+    document = _document(file)
+    frames = _frames(file, document)
     paths = [frame.entry.text("file_path") for frame in frames]
     names = distinct(file, paths, (last_part, without_suffix, whole))
     spare = _spare_size(frames)
-    return [_camera(frame, name, spare) for frame, name in zip(frames, names, strict=True)]
+    parser = read_dataparser(file.parent / DATAPARSER)
+    cameras = [
+        _camera(frame, name, spare, parser) for frame, name in zip(frames, names, strict=True)
+    ]
+    notes = lens_notes([_bent(frame.entry) for frame in frames])
+    if parser:
+        notes.append(
+            f"frame: that of {DATAPARSER} (scale {parser.scale:g}), in which nerfstudio trains"
+        )
+    elif "applied_transform" in document:
+        notes.append(
+            f"frame: as in the file; a scene that nerfstudio trained needs its {DATAPARSER} beside it"
+        )
+    return Source(tuple(cameras), _held_out(file, document, paths), tuple(notes))
 
 
-def _frames(file: Path) -> list[Frame]:
+def _held_out(
+    file: Path, document: dict[str, Any], paths: Sequence[str]
+) -> tuple[bool, ...] | None:
+    """Which frames nerfstudio's lists of file names keep from training, if there are lists."""
+    place = Place(file, "lists of file names")
+    lists = {key: document[key] for key in SPLITS if key in document}
+    if SPLITS[0] not in lists:
+        return None
+    for key, listed in lists.items():
+        if not isinstance(listed, list) or not all(isinstance(p, str) for p in listed):
+            raise place.wrong(key, "a list of paths", listed)
+    train = set(lists[SPLITS[0]])
+    return tuple(path not in train for path in paths)
+
+
+def _document(file: Path) -> dict[str, Any]:
     document = read_json(file)
     if not isinstance(document, dict) or "frames" not in document:
         raise FormatError(
             file, "should be an object with 'frames', as Blender and nerfstudio write"
         )
+    return document
+
+
+def _frames(file: Path, document: dict[str, Any]) -> list[Frame]:
     shared = {key: value for key, value in document.items() if key != "frames"}
     folder = PhotoFolder(file.parent, file.parent)
     return [
@@ -165,15 +233,15 @@ def _spare_size(frames: Sequence[Frame]) -> Size | None:
     return image_size(photo) if photo else None
 
 
-def _camera(frame: Frame, name: str, spare: Size | None) -> Camera:
+def _camera(frame: Frame, name: str, spare: Size | None, parser: Dataparser | None) -> Camera:
     entry = frame.entry
-    _refuse_distortion(entry)
     width, height = _size(frame, spare)
     fx = _focal(entry, width)
     motion = rigid(entry, "transform_matrix")
     world_from_cam = pose(
         motion[:3, :3] * OPENCV_FROM_OPENGL, motion[:3, 3], entry.place, "transform_matrix"
     )
+    world_from_cam = world_from_cam if parser is None else parser.moved(world_from_cam)
     return Camera(
         name,
         width,
@@ -183,7 +251,7 @@ def _camera(frame: Frame, name: str, spare: Size | None) -> Camera:
         entry.number("cx") if "cx" in entry else width / 2,
         entry.number("cy") if "cy" in entry else height / 2,
         inverse(world_from_cam, entry.place, "transform_matrix"),
-        photo=frame.photo,
+        photo=None if _bent(entry) else frame.photo,
     )
 
 
@@ -210,20 +278,19 @@ def _focal(entry: Entry, width: int) -> float:
     return focal(width / 2 / math.tan(angle / 2), entry.place, "camera_angle_x's focal length")
 
 
-def _refuse_distortion(entry: Entry) -> None:
+def _bent(entry: Entry) -> str | None:
+    """The lens, if it is more than a pinhole."""
     model = entry.text("camera_model") if "camera_model" in entry else PINHOLES[0]
-    if model not in PINHOLES:
-        raise distortion_refusal(entry.place, f"its camera_model is {model}")
+    if model in AROUND:
+        raise entry.place.error(f"its camera_model is {model}, which has no focal length")
     if entry.fields.get("is_fisheye"):
-        raise distortion_refusal(entry.place, "is_fisheye is set")
-    bent = [key for key in DISTORTION if key in entry and entry.number(key)]
-    if bent:
-        raise distortion_refusal(entry.place, f"{bent[0]} is {entry.number(bent[0]):g}")
-    parameters = entry.fields.get("distortion_params") or []
-    if not isinstance(parameters, list) or any(
-        number(value, entry.place, "distortion_params") for value in parameters
-    ):
-        raise distortion_refusal(entry.place, "distortion_params are not zero")
+        return "fisheye"
+    values = entry.fields.get("distortion_params") or []
+    if not isinstance(values, list):
+        raise entry.place.wrong("distortion_params", "a list of numbers", values)
+    found = [number(value, entry.place, "distortion_params") for value in values]
+    found += [entry.number(key) for key in DISTORTION if key in entry]
+    return model if model not in PINHOLES or any(found) else None
 
 
 def _has_alpha(photo: Path) -> bool:

@@ -1,23 +1,27 @@
-"""nerfstudio's `camera_path.json`: the frames of a video.
+"""nerfstudio's `camera_path.json`: free cameras along a path, the frames of a video.
 
-{render_width, render_height, fps, camera_type, camera_path: [{camera_to_world, fov}]}.  Sizes are in px;
-camera_to_world: 16 numbers, row by row, OpenGL axes (x right, y up, z backward), world units; fov: the vertical angle
-in degrees.
+{render_width, render_height, fps, camera_type, camera_path: [{camera_to_world, fov}]}.  camera_to_world: 16 numbers, row
+by row, OpenGL axes, in the frame of the trained scene; fov: the vertical angle in degrees; sizes in px.
 """
 
 import math
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 
-from aaplug.cameras import Camera
+from aaplug.cameras import Camera, CameraSet
 from aaplug.errors import FormatError
-from aaplug.io.cameras.values import Entry, Place, entries, inverse, mentions, pose, read_json
+from aaplug.io.cameras.options import Options, undivided
+from aaplug.io.cameras.photos import described_sizes, refuse_folder, scaled_sizes
+from aaplug.io.values import Entry, Place, entries, focal, inverse, mentions, pose, read_json
 
+OPENCV_FROM_OPENGL = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
+KEY = "camera_path"
 PERSPECTIVE = "perspective"
-LEAST_ANGLE, MOST_ANGLE = 1e-6, 180 - 1e-6  # degrees
-OPENCV_FROM_OPENGL = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)  # y and z change sign
+USUAL_FPS = 24.0  # where the file does not say
+HALF_TURN = 180.0  # degrees: a pinhole sees less
 
 
 @dataclass(frozen=True)
@@ -30,40 +34,59 @@ class CameraPath:
 
 def sniff(path: Path) -> bool:
     """Whether a file's keys are those of a camera path."""
-    return mentions(path, ["camera_path"])
+    return not os.path.isdir(path) and mentions(path, [KEY, "camera_to_world"])
+
+
+def read(path: Path, options: Options) -> CameraSet:
+    """The cameras, free ones: they are no poses of a data set, so they tell nothing of training's sampling.
+
+    Raises:
+        FormatError: the file is not what it should be.
+        UsageError: the options do not fit.
+    """
+    refuse_folder(options.images)
+    cameras = read_camera_path(path).cameras
+    scale = 1.0 if options.train_scale is None else options.train_scale
+    cameras = [c.resized(*s) for c, s in zip(cameras, scaled_sizes(cameras, scale), strict=True)]
+    split = undivided(cameras, "a path has no split")
+    notes = (
+        f"camera path: {len(cameras)} free cameras, {described_sizes(cameras)}; "
+        "they stand in for training cameras, which give better bounds",
+        split.note,
+    )
+    return CameraSet(split.train, split.test, notes=notes)
 
 
 def read_camera_path(path: Path) -> CameraPath:
-    """The frames of a camera path.
+    """The frames of a video.
 
     Raises:
         FormatError: the file is not what it should be.
     """
     document = read_json(path)
-    if not isinstance(document, dict) or "camera_path" not in document:
-        raise FormatError(path, "should be an object with 'camera_path', as nerfstudio writes")
-    about = Entry(Place(path, "the path"), document)
+    if not isinstance(document, dict) or KEY not in document:
+        raise FormatError(path, f"should be an object with '{KEY}', as nerfstudio writes")
     kind = document.get("camera_type", PERSPECTIVE)
+    about = Entry(Place(path, "the path"), document)
     if kind != PERSPECTIVE:
         raise about.place.wrong("camera_type", PERSPECTIVE, kind)
-    width, height = about.pixels("render_width"), about.pixels("render_height")
-    fps = about.number("fps")
+    size = about.pixels("render_width"), about.pixels("render_height")
+    fps = about.number("fps") if "fps" in document else USUAL_FPS
     if not fps > 0:
         raise about.place.wrong("fps", "above 0", fps)
-    frames = entries(path, "frame", document["camera_path"])
+    frames = entries(path, "frame", document[KEY])
     digits = len(str(len(frames) - 1))
-    cameras = (_camera(e, f"{i:0{digits}}", width, height) for i, e in enumerate(frames))
+    cameras = (_camera(entry, f"{i:0{digits}}", *size) for i, entry in enumerate(frames))
     return CameraPath(tuple(cameras), fps)
 
 
 def _camera(entry: Entry, name: str, width: int, height: int) -> Camera:
     angle = entry.number("fov")
-    if not LEAST_ANGLE < angle < MOST_ANGLE:
-        raise entry.place.wrong("fov", "an angle between 0 and 180 degrees", angle)
-    focal = 0.5 * height / math.tan(math.radians(angle) / 2)
+    if not 0 < angle < HALF_TURN:
+        raise entry.place.wrong("fov", f"above 0 and below {HALF_TURN:g} degrees", angle)
+    f = focal(height / 2 / math.tan(math.radians(angle) / 2), entry.place, "fov's focal length")
     motion = entry.vector("camera_to_world", 16).reshape(4, 4)
-    world_from_cam = pose(
-        motion[:3, :3] * OPENCV_FROM_OPENGL, motion[:3, 3], entry.place, "camera_to_world"
-    )
+    rotation = motion[:3, :3] * OPENCV_FROM_OPENGL
+    world_from_cam = pose(rotation, motion[:3, 3], entry.place, "camera_to_world")
     cam_from_world = inverse(world_from_cam, entry.place, "camera_to_world")
-    return Camera(name, width, height, focal, focal, width / 2, height / 2, cam_from_world)
+    return Camera(name, width, height, f, f, width / 2, height / 2, cam_from_world)

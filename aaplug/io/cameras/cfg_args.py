@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any
 
 from aaplug.errors import FormatError
-from aaplug.io.cameras.values import MAX_SIDE, Place, number, read_bounded, text
+from aaplug.io.limits import whole_limit
+from aaplug.io.values import Place, number, read_bounded, text
 
 NAME = "cfg_args"
-LIMIT = 64 * 2**10  # bytes: real ones have about 300
 CAPPED = -1  # 3DGS's default resolution: the width capped at WIDTH_CAP
 WIDTH_CAP = 1600  # px: 3DGS, utils/camera_utils.py
 DIVISORS = (1, 2, 4, 8)  # resolutions that divide the size; others are a width in px
@@ -69,7 +69,7 @@ def read_cfg_args(path: Path) -> CfgArgs:
 
 
 def _parsed(path: Path) -> ast.Call:
-    source = read_bounded(path, LIMIT)
+    source = read_bounded(path, whole_limit("CFG_ARGS"))
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a path's backslashes are no concern of the user's
@@ -99,9 +99,9 @@ def _literals(path: Path, call: ast.Call) -> dict[str, Any]:
 
 
 def _resolution(value: object, place: Place) -> float:
-    real = number(value, place, "resolution")
-    if real != CAPPED and not 1 <= real <= MAX_SIDE:
-        raise place.wrong("resolution", f"-1, 1, 2, 4, 8 or a width up to {MAX_SIDE} px", value)
+    real, most = number(value, place, "resolution"), whole_limit("CAMERA_SIDE")
+    if real != CAPPED and not 1 <= real <= most:
+        raise place.wrong("resolution", f"-1, 1, 2, 4, 8 or a width up to {most} px", value)
     return real
 
 

@@ -2,8 +2,8 @@
 
 The root holds `images` and a model in `sparse/0` or `sparse`: cameras (intrinsics) and images
 (poses), both .bin or both .txt.  Poses are world-to-camera, OpenCV axes, in world units; the centre
-of the first pixel is (0.5, 0.5); focal lengths and principal points are in px.  Points are not
-read.
+of the first pixel is (0.5, 0.5); focal lengths and principal points are in px.  A lens that distorts
+counts as the pinhole at its centre, and its photos are of no use.  Points are not read.
 """
 
 import math
@@ -25,17 +25,18 @@ from aaplug.io.cameras.photos import (
     Size,
     described_sizes,
     distinct,
+    lens_notes,
     photo_folder,
     photo_sizes,
     scaled_sizes,
+    straightened,
     trained_at,
     whole,
     with_photos,
     without_suffix,
 )
-from aaplug.io.cameras.values import (
+from aaplug.io.values import (
     Place,
-    distortion_refusal,
     focal,
     inverse,
     number,
@@ -55,7 +56,7 @@ def read(path: Path, options: Options) -> CameraSet:
     """The cameras at the size of their photos.
 
     Raises:
-        FormatError: a file is not what it should be, or a camera is no pinhole.
+        FormatError: a file is not what it should be, or a camera sees all around.
         UsageError: the options do not fit.
     """
     folder = _model_folder(path) or path
@@ -73,7 +74,8 @@ def read(path: Path, options: Options) -> CameraSet:
     names = distinct(images_file, [image.name for image in images], (without_suffix, whole))
     source = [replace(camera, name=name) for camera, name in zip(source, names, strict=True)]
     sizes, why = _training_sizes(source, options)
-    trained = trained_at(source, sizes)
+    bent = [_bent(intrinsics[image.camera_id]) for image in images]
+    trained = straightened(trained_at(source, sizes), bent)
     split = every_nth(
         trained, options, LLFF_HOLD, "3DGS --eval's rule; --test-every 0 for no split"
     )
@@ -82,6 +84,7 @@ def read(path: Path, options: Options) -> CameraSet:
         f"{described_sizes(source)} in the file",
         split.note,
         f"training size: {described_sizes(trained)} ({why})",
+        *lens_notes(bent),
     )
     return CameraSet(split.train, split.test, notes=notes)
 
@@ -143,15 +146,19 @@ def _camera(image: Image, intrinsics: dict[int, Intrinsics]) -> Camera:
 
 
 def _pinhole(lens: Intrinsics) -> tuple[float, float, float, float]:
-    """Fx, fy, cx, cy, if that is all there is."""
-    if not lens.model.straight:
-        raise distortion_refusal(lens.place, f"its model is {lens.model.name}")
+    """Fx, fy, cx, cy: the lens without its distortion."""
     values = [number(value, lens.place, "parameter") for value in lens.parameters]
     n = lens.model.focals
-    if any(values[n + 2 :]):
-        raise distortion_refusal(lens.place, f"its model is {lens.model.name} with distortion")
+    if not n:
+        raise lens.place.error(f"its model is {lens.model.name}, which has no focal length")
     fx, fy = (focal(f, lens.place, "focal length") for f in (values[0], values[n - 1]))
     return fx, fy, values[n], values[n + 1]
+
+
+def _bent(lens: Intrinsics) -> str | None:
+    """The model's name, if it is more than a pinhole."""
+    rest = lens.parameters[lens.model.focals + 2 :]
+    return lens.model.name if not lens.model.straight or any(rest) else None
 
 
 def _rotation(image: Image) -> Float[Tensor, "3 3"]:

@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import BinaryIO, TypeVar
 
 from aaplug.errors import FormatError
-from aaplug.io.cameras.values import Place, text
+from aaplug.io.limits import whole_limit
+from aaplug.io.values import Place, text
 
 Record = TypeVar("Record")
 
 KINDS = (".bin", ".txt")
-NAME_LIMIT = 4096  # bytes: the longest path that systems take
 LINE_LIMIT = 64 * 2**20  # bytes: one image's points
 POINT_SIZE = 24  # bytes: x, y (float64) and the 3D point's id
 COUNT = struct.Struct("<Q")
@@ -147,13 +147,13 @@ class _Reader:
 
     def name(self, what: str) -> bytes:
         """Bytes up to a NUL."""
-        start = self.file.tell()
-        chunk = self.file.read(min(NAME_LIMIT + 1, self.left))
+        start, most = self.file.tell(), whole_limit("NAME")
+        chunk = self.file.read(min(most + 1, self.left))
         name, end, _ = chunk.partition(b"\0")
         if not end:
             raise FormatError(
                 self.path,
-                f"{what}: its name should end within {NAME_LIMIT} bytes, not after {len(chunk)}",
+                f"{what}: its name should end within {most} bytes, not after {len(chunk)}",
             )
         self.file.seek(start + len(name) + 1)
         self.left -= len(name) + 1

@@ -25,7 +25,7 @@ from aaplug.io.cameras.photos import (
     trained_at,
     with_photos,
 )
-from aaplug.io.cameras.values import Entry, Place, entries, inverse, mentions, pose, read_json
+from aaplug.io.values import Entry, Place, entries, inverse, mentions, pose, read_json
 
 FILE = "cameras.json"
 

@@ -11,8 +11,9 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from aaplug.cameras import Camera
 from aaplug.errors import FormatError, UsageError, listing
-from aaplug.io.cameras.values import MAX_SIDE, Place
 from aaplug.io.images import image_size
+from aaplug.io.limits import whole_limit
+from aaplug.io.values import Place
 
 COMMON = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")  # tried for names without a suffix
 SUFFIXES = (*COMMON, ".webp", ".tif", ".tiff", ".bmp", ".exr")  # what counts as one
@@ -114,8 +115,9 @@ def scaled_sizes(cameras: Sequence[Camera], scale: float) -> list[Size]:
         UsageError: that is more than an image can have.
     """
     sizes = [scaled(camera, scale) for camera in cameras]
-    if max(map(max, sizes)) > MAX_SIDE:
-        raise UsageError("--train-scale", f"makes an image of more than {MAX_SIDE} px a side")
+    most = whole_limit("CAMERA_SIDE")
+    if max(map(max, sizes)) > most:
+        raise UsageError("--train-scale", f"makes an image of more than {most} px a side")
     return sizes
 
 
@@ -127,6 +129,24 @@ def scaled(camera: Camera, scale: float) -> Size:
 def trained_at(cameras: Sequence[Camera], sizes: Sequence[Size]) -> list[Camera]:
     """The cameras with an unchanged field of view at the sizes that they were trained at."""
     return [c.resized(*size).as_trained() for c, size in zip(cameras, sizes, strict=True)]
+
+
+def straightened(cameras: Sequence[Camera], bent: Sequence[str | None]) -> list[Camera]:
+    """The cameras, without the photos of those whose lens distorts: a pinhole does not see what they show."""
+    pairs = zip(cameras, bent, strict=True)
+    return [replace(camera, photo=None) if lens else camera for camera, lens in pairs]
+
+
+def lens_notes(bent: Sequence[str | None]) -> list[str]:
+    """A line on lenses that distort, by the names of their models, if there are any."""
+    models = sorted({lens for lens in bent if lens})
+    if not models:
+        return []
+    count = sum(lens is not None for lens in bent)
+    return [
+        f"{count} cameras have a lens that distorts ({', '.join(models)}): they count as the pinholes at its centre, "
+        "and their photos are not used; undistorted ones (colmap image_undistorter) would be"
+    ]
 
 
 def described_sizes(cameras: Sequence[Camera]) -> str:

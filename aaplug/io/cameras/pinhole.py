@@ -9,7 +9,7 @@ from pathlib import Path
 from aaplug.cameras import Camera, CameraSet
 from aaplug.io.cameras.options import Options, every_nth
 from aaplug.io.cameras.photos import described_sizes, refuse_folder, scaled_sizes, trained_at
-from aaplug.io.cameras.values import Entry, entries, inverse, mentions, pose, read_json, rigid
+from aaplug.io.values import Entry, entries, inverse, mentions, pose, read_json, rigid
 
 
 def sniff(path: Path) -> bool:

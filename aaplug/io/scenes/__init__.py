@@ -1,23 +1,24 @@
-"""Scene files of any known format, read into `Gaussians` and written back.
+"""Scene files of any known format, read into `Gaussians` whole or part by part, and written back.
 
-A format is a module with a `name` (also its files' suffix), `sniff`, `read` and, where it can be
-written, `write`; it is added by one line in `FORMATS`.  Formats are told apart by content when
-reading and by suffix when writing.
+A format is a module with a `name` (also its files' suffix), `sniff`, `open_scene` and, where it can be written,
+`write`; it is added by one line in `FORMATS`.  Formats are told apart by content when reading and by suffix when
+writing.
 """
 
 import re
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
 from aaplug.errors import FormatError, OutputError
 from aaplug.gaussians import Convention, Gaussians
 from aaplug.io.atomic import check_output
-from aaplug.io.scenes import ply
+from aaplug.io.scenes import compressed_ply, ksplat, ply, pt, sog, splat, spz
+from aaplug.io.scenes.scene_file import SceneFile
 
-MAX_GAUSSIANS = (
-    100_000_000  # far above any scene seen (about 25 GB as .ply); more is taken for a mistake
-)
 HEAD_BYTES = 64  # of a file, shown to each format's `sniff`
+SpzAxes = Literal["opengl", "opencv"]
+SOG_FOLDER = "meta.json"  # what a folder of SOG images is known by
 
 
 class SceneFormat(Protocol):
@@ -29,10 +30,8 @@ class SceneFormat(Protocol):
         """Whether a file that begins with `head` looks like this format."""
         ...
 
-    def read(
-        self, path: Path, *, convention: Convention | None, drop_bad: bool, max_gaussians: int
-    ) -> Gaussians:
-        """The scene in the file."""
+    def open_scene(self, path: Path) -> SceneFile:
+        """Look at the scene in the file."""
         ...
 
 
@@ -40,29 +39,28 @@ class SceneFormat(Protocol):
 class WritableFormat(Protocol):
     """A format that can be written too."""
 
-    def write(self, path: Path, scene: Gaussians, overwrite: bool) -> None:
-        """Write the scene, whole or not at all."""
+    def write(self, path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool) -> None:
+        """Write the parts of a scene, `count` Gaussians at most, whole or not at all."""
         ...
 
 
-FORMATS: tuple[SceneFormat, ...] = (ply,)
+FORMATS: tuple[SceneFormat, ...] = (compressed_ply, ply, spz, sog, pt, splat, ksplat)
 
 
-def read_scene(
+def open_scene(
     path: Path,
     *,
     convention: Convention | None = None,
-    drop_bad: bool = False,
-    max_gaussians: int = MAX_GAUSSIANS,
-) -> Gaussians:
-    """Read the scene in the file `path`.
+    allow_checkpoint: bool = False,
+    spz_axes: SpzAxes = "opengl",
+) -> SceneFile:
+    """Look at the scene in the file `path` without reading its Gaussians.
 
     Args:
-        path: a file; for an INRIA model folder see `find_scene`.
+        path: a file; for a folder see `find_scene`.
         convention: how the scene was trained, where the file does not know or is wrong.
-        drop_bad: leave out Gaussians with NaN, infinite or unusable values, and log a warning with
-            their number, instead of refusing.
-        max_gaussians: refuse more than this.
+        allow_checkpoint: open a .pt file too, a pickle, of which nothing but tensors is taken.
+        spz_axes: those of a .spz: "opengl" by its specification, "opencv" as splat-transform and gsply write them.
 
     Raises:
         FormatError: the file is missing, of no known format, or breaks its format.
@@ -70,11 +68,41 @@ def read_scene(
     head = _head(path)
     for format in FORMATS:
         if format.sniff(path, head):
-            return format.read(
-                path, convention=convention, drop_bad=drop_bad, max_gaussians=max_gaussians
-            )
+            if format.name == "pt" and not allow_checkpoint:
+                raise FormatError(
+                    path,
+                    "is a training checkpoint (a pickle); --allow-checkpoint reads it, or export it as .ply",
+                )
+            opened = format.open_scene(path).stated(convention)
+            return spz.as_stored(opened) if format is spz and spz_axes == "opencv" else opened
     known = ", ".join("." + format.name for format in FORMATS)
     raise FormatError(path, f"is of no known scene format; aaplug reads {known}")
+
+
+def read_scene(
+    path: Path,
+    *,
+    convention: Convention | None = None,
+    drop_bad: bool = False,
+    allow_checkpoint: bool = False,
+    spz_axes: SpzAxes = "opengl",
+) -> Gaussians:
+    """Read the scene in the file `path`.
+
+    Args:
+        path: a file; for a folder see `find_scene`.
+        convention: how the scene was trained, where the file does not know or is wrong.
+        drop_bad: leave out Gaussians with NaN, infinite or unusable values, and log a warning with
+            their number, instead of refusing.
+        allow_checkpoint, spz_axes: see `open_scene`.
+
+    Raises:
+        FormatError: the file is missing, of no known format, breaks its format, or is too large for this machine.
+    """
+    opened = open_scene(
+        path, convention=convention, allow_checkpoint=allow_checkpoint, spz_axes=spz_axes
+    )
+    return opened.whole(drop_bad)
 
 
 def write_scene(path: Path, scene: Gaussians, *, overwrite: bool = False) -> None:
@@ -84,18 +112,35 @@ def write_scene(path: Path, scene: Gaussians, *, overwrite: bool = False) -> Non
         OutputError: the suffix is of no format that can be written, the path is the file that the
             scene was read from, exists and `overwrite` is false, or cannot be written.
     """
+    source = [Path(scene.origin.path)] if scene.origin else []
+    write_parts(path, [scene], len(scene), source, overwrite=overwrite)
+
+
+def write_parts(
+    path: Path,
+    parts: Iterable[Gaussians],
+    count: int,
+    inputs: Iterable[Path] = (),
+    *,
+    overwrite: bool = False,
+) -> None:
+    """Write a scene that comes in parts, `count` Gaussians or fewer, of one convention and all with the same columns.
+
+    Raises:
+        OutputError: as in `write_scene`; `inputs` are the files that may not be replaced.
+    """
     writers = {"." + f.name: f for f in FORMATS if isinstance(f, WritableFormat)}
     writer = writers.get(path.suffix.lower())
-    if writer is None:
+    if writer is None or path.name.lower().endswith(".compressed.ply"):
         raise OutputError(
             path, f"has no suffix of a format that can be written: {', '.join(writers)}"
         )
-    check_output(path, overwrite, [Path(scene.origin.path)] if scene.origin else [])
-    writer.write(path, scene, overwrite)
+    check_output(path, overwrite, inputs)
+    writer.write(path, parts, count, overwrite)
 
 
 def find_scene(path: Path, iteration: int | None = None) -> Path:
-    """The scene file itself, or the one of the last (or given) iteration in an INRIA model folder.
+    """The scene file itself, a folder's SOG, or the last (or given) iteration of an INRIA model folder.
 
     Raises:
         FormatError: nothing there, or not that iteration.
@@ -103,6 +148,8 @@ def find_scene(path: Path, iteration: int | None = None) -> Path:
     if not path.is_dir():
         return path
     scenes = _iterations(path)
+    if not scenes and (path / SOG_FOLDER).is_file():
+        return path / SOG_FOLDER
     if not scenes:
         raise FormatError(
             path, "holds no point_cloud/iteration_<N>/point_cloud.ply; name the scene's file"

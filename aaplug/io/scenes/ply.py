@@ -1,82 +1,123 @@
-"""INRIA's .ply scenes, read and written through plyfile so that nothing in them is lost.
+"""The .ply scenes of INRIA's 3DGS and its many relatives, read and written so that nothing in them is lost.
 
 A Gaussian is a row of the element "vertex": x y z, f_dc_0..2, f_rest_*, opacity (a logit),
-scale_0..2 (natural logarithms), rot_0..3 (wxyz, any length), all float32, in any order and between
-any other columns.  k: coefficients a channel; f_rest is channel-major: f_rest_(c·(k − 1) + j) is
-coefficient 1 + j of channel c.  Mip-Splatting adds filter_3D.  Rows are counted from 0.  What is
-not a Gaussian's parameter stays in the document and is written back to the byte.
+scale_0..2 (natural logarithms), rot_0..3 (wxyz, any length), in any order and between any other columns, in any of
+PLY's three codings.  Dialects: float64 columns (converted), red green blue in place of f_dc_* (nerfstudio's rgb mode),
+scale_0..1 alone (2DGS), filter_3D (Mip-Splatting).  What is not a Gaussian's parameter stays in the document and is
+written back to the byte; what is written is little-endian binary.  plyfile reads text, checks lists and converts
+big-endian tables; numpy reads the Gaussians' rows.
 """
 
-import logging
+import io
 import re
-from collections.abc import Iterator
+import warnings
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
 from plyfile import PlyData, PlyElement
 from torch import Tensor
 
-from aaplug.errors import FormatError, OutputError, listing
-from aaplug.gaussians import Convention, Gaussians, Origin
+from aaplug.errors import AaplugError, FormatError, OutputError, listing
+from aaplug.gaussians import Gaussians
 from aaplug.io.atomic import replacing
-from aaplug.io.scenes.ply_header import Header, Property, check_size, parse, read_header
-from aaplug.io.scenes.ply_tags import FILTER_COLUMN, meaning, stating
+from aaplug.io.scenes.ply_header import (
+    BIG,
+    LITTLE,
+    TEXT,
+    Header,
+    Property,
+    check_size,
+    parse,
+    read_header,
+)
+from aaplug.io.scenes.ply_tags import meaning, stating
+from aaplug.io.scenes.scene_file import (
+    FILTER_COLUMN,
+    SceneFile,
+    check_count,
+    columns,
+    empty,
+    matrix_of,
+    scene_of,
+    sh_of_colour,
+)
 
-REST_COUNTS = (0, 9, 24, 45)  # f_rest columns of degrees 0 to 3: 3((d + 1)² − 1)
-REST_COUNT_4 = 72  # of degree 4
+DEGREES = {3 * ((d + 1) ** 2 - 1): d for d in range(5)}  # by the number of f_rest columns
 REST = re.compile(r"f_rest_\d+")
+COLOURS = ("f_dc_0", "f_dc_1", "f_dc_2")
+BYTE_COLOURS = ("red", "green", "blue")  # uchar
+SCALES = ("scale_0", "scale_1", "scale_2")
 REQUIRED = (
-    *("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
-    *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+    *("x", "y", "z", *COLOURS, "opacity", *SCALES),
+    *("rot_0", "rot_1", "rot_2", "rot_3"),
 )
 NORMALS = ("nx", "ny", "nz")  # unused; 3DGS writes them and some readers expect them
-SHORTEST_QUATERNION = 1e-12  # below this torch's `normalize` gives no unit quaternion
-CHUNK = 1 << 16  # rows copied at a time: 16 MB
+FLOATS = ("f4", "f8")
+CHUNK = (
+    1 << 12
+)  # rows taken apart at a time: 1 MB, so that a column's stride stays within the cache
+SPARSE = 16  # rows that span more than this many times their number are fetched one by one
+BATCH = 1 << 16  # rows written at a time: 16 MB
+BLOCK = 1 << 20  # bytes copied at a time
 
 name = "ply"
-log = logging.getLogger("aaplug")
+
+
+@dataclass(frozen=True)
+class Table:
+    """The Gaussians' rows in a file, read when asked for, or held where they had to be parsed.
+
+    stamp: the file's size and time of change, for what is read later must be what was there before.
+    """
+
+    path: Path
+    offset: int
+    count: int
+    dtype: np.dtype
+    stamp: tuple[int, int]
+    held: np.ndarray | None = None
+
+    def read(self, start: int, stop: int) -> np.ndarray:
+        """The rows from start up to stop."""
+        if self.held is not None:
+            return self.held[start:stop]
+        self._check_unchanged()
+        offset = self.offset + start * self.dtype.itemsize
+        return np.fromfile(self.path, self.dtype, stop - start, offset=offset)
+
+    def take(self, rows: Tensor) -> np.ndarray:
+        """The rows of these indices."""
+        if len(rows) == 0:
+            return np.empty(0, self.dtype)
+        first, last = int(rows.min()), int(rows.max())
+        if self.held is None and last - first > SPARSE * len(rows):
+            self._check_unchanged()
+            table = np.memmap(self.path, self.dtype, "r", self.offset, (self.count,))
+            return np.array(table[rows.numpy()])
+        return self.read(first, last + 1)[(rows - first).numpy()]
+
+    def _check_unchanged(self) -> None:
+        if _stamp(self.path) != self.stamp:
+            raise FormatError(self.path, "changed while it was being read")
 
 
 @dataclass(frozen=True)
 class Document:
-    """The whole file.
+    """A whole file: its header, the Gaussians' table, and all other tables as little-endian bytes.
 
-    elements: all tables, memory-mapped where they hold no lists.
-    other_size: bytes of all tables but the Gaussians'.
+    before, after: the bytes themselves, or where in the file they stand (start, stop).
     """
 
     header: Header
-    elements: tuple[PlyElement, ...] = ()
-    other_size: int = 0
-
-
-@dataclass(frozen=True)
-class Fault:
-    """Rows of a column that no renderer can use."""
-
-    text: str
-    rows: Bool[Tensor, " n"]
-
-    def __str__(self) -> str:
-        rows = self.rows.nonzero().flatten()
-        more = f" (and {len(rows) - 1} more)" if len(rows) > 1 else ""
-        return f"row {int(rows[0])}{more} has {self.text}"
-
-
-class _Verbatim(PlyData):
-    """Tables under a header that is written as it stands instead of in plyfile's words."""
-
-    def __init__(self, elements: list[PlyElement], text: str) -> None:
-        super().__init__(elements, byte_order="<")
-        self._text = text
-
-    @property
-    def header(self) -> str:
-        return self._text.removesuffix("\n")  # which plyfile adds
+    table: Table | None = None
+    before: bytes | tuple[int, int] = b""
+    after: bytes | tuple[int, int] = b""
 
 
 def sniff(path: Path, head: bytes) -> bool:
@@ -84,66 +125,69 @@ def sniff(path: Path, head: bytes) -> bool:
     return head.startswith((b"ply\n", b"ply\r"))
 
 
-def read(
-    path: Path, *, convention: Convention | None, drop_bad: bool, max_gaussians: int
-) -> Gaussians:
-    """Read a scene; see `aaplug.io.scenes.read_scene`.
+def open_scene(path: Path) -> SceneFile:
+    """Look at a scene; see `aaplug.io.scenes.open_scene`.
 
     Raises:
-        FormatError: the file is no scene, is damaged, or has unusable rows and not `drop_bad`.
+        FormatError: the file is no scene, or is damaged.
     """
-    with _library_errors(path):
+    with library_errors(path):
         header = read_header(path)
-        check_size(header, path.stat().st_size)
-        _check_columns(header)
-        _check_number(header, max_gaussians)
+        stamp = _stamp(path)
+        check_size(header, stamp[0])
+        notes = _check_columns(header)
+        check_count(path, header.vertex.count)
         said = meaning(header)
-        document = _load(path, header)
-        scene = _fill(document)
-    if convention:
-        said = replace(said, convention=convention, evidence="given by --convention")
-    origin = Origin(str(path), name, said.evidence, document, torch.arange(len(scene)))
-    scene = replace(scene, convention=said.convention, fused=said.fused, origin=origin)
-    return _without_faults(scene, path, drop_bad)
+        document = _document(path, header, stamp)
+    degree = DEGREES[len(_rest(header))]
+    return SceneFile(
+        path,
+        name,
+        header.vertex.count,
+        degree,
+        lambda start, stop: _rows(document, degree, said.flat, start, stop),
+        said.evidence,
+        said.convention,
+        said.fused,
+        said.flat,
+        document,
+        tuple(notes),
+    )
 
 
-def write(path: Path, scene: Gaussians, overwrite: bool) -> None:
-    """Write a scene; see `aaplug.io.scenes.write_scene`.
+def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool) -> None:
+    """Write a scene part by part; see `aaplug.io.scenes.write_parts`.
 
     Raises:
         OutputError: the file exists and `overwrite` is false, or it cannot be written.
     """
-    origin = scene.origin if scene.origin and scene.origin.format == name else None
-    document = origin.document if origin else Document(_plain_header(scene))
-    header = _updated(document.header, scene, new=origin is None)
-    vertex = PlyElement.describe(_records(header, scene, document, origin), "vertex")
-    tables = [vertex if e.name == "vertex" else e for e in document.elements] or [vertex]
-    size = len(header.text) + header.vertex.least_size + document.other_size
+    parts = iter(parts)
+    first = next(parts)
+    document = _document_of(first) or Document(_plain_header(first))
+    header = _updated(document.header, first, count, new=document.table is None)
     with replacing(path, overwrite) as stream:
-        _Verbatim(tables, header.text).write(stream)
+        stream.write(header.content)
+        _copy(stream, document, document.before)
+        start, written = stream.tell(), 0
+        for part in chain([first], parts):
+            _write_rows(stream, header, part)
+            written += len(part)
+        size = start + written * header.vertex.stride
         if stream.tell() != size:
             raise OutputError(path, f"{stream.tell():,} bytes were written instead of {size:,}")
-
-
-def columns(scene: Gaussians) -> dict[str, Float[Tensor, " n"]]:
-    """A view of each parameter under its column's name: the one place that knows the layout."""
-    k = scene.sh.shape[1]
-    named = {axis: scene.means[:, i] for i, axis in enumerate("xyz")}
-    named |= {f"f_dc_{c}": scene.sh[:, 0, c] for c in range(3)}
-    named |= {
-        f"f_rest_{c * (k - 1) + j}": scene.sh[:, 1 + j, c] for c in range(3) for j in range(k - 1)
-    }
-    named |= {"opacity": scene.logit_opacities}
-    named |= {f"scale_{i}": scene.log_scales[:, i] for i in range(3)}
-    named |= {f"rot_{i}": scene.quats[:, i] for i in range(4)}
-    return named if scene.filter_3d is None else named | {FILTER_COLUMN: scene.filter_3d}
+        _copy(stream, document, document.after)
+        if written != count:  # fewer than thought, so the number takes no more room
+            assert written < count
+            stream.seek(0)
+            stream.write(header.with_padded_count(written).content)
 
 
 @contextmanager
-def _library_errors(path: Path) -> Iterator[None]:
+def library_errors(path: Path) -> Iterator[None]:
+    """Whatever a library raises over a damaged file, in the user's words."""
     try:
         yield
-    except FormatError:
+    except AaplugError:
         raise
     except MemoryError as error:
         raise FormatError(path, "does not fit into memory") from error
@@ -155,7 +199,17 @@ def _library_errors(path: Path) -> Iterator[None]:
         raise FormatError(path, f"cannot be read as .ply: {error}") from error
 
 
-def _check_columns(header: Header) -> None:
+def _stamp(path: Path) -> tuple[int, int]:
+    status = path.stat()
+    return status.st_size, status.st_mtime_ns
+
+
+def _rest(header: Header) -> list[str]:
+    return [column for column in header.vertex.names if REST.fullmatch(column)]
+
+
+def _check_columns(header: Header) -> list[str]:
+    """What is unusual about the columns and still understood."""
     vertex = header.vertex
     known = {p.name: p for p in vertex.properties}
     if vertex.lists:
@@ -163,149 +217,232 @@ def _check_columns(header: Header) -> None:
             header.path,
             f"vertex property {listing(vertex.lists)} is a list; a scene has numbers only",
         )
-    missing = [column for column in REQUIRED if column not in known]
+    coloured = _has_byte_colours(known)
+    optional = {*(COLOURS if coloured else ()), SCALES[2]}
+    missing = [c for c in REQUIRED if c not in known and c not in optional]
     if missing:
-        raise FormatError(header.path, _about_missing(missing, known))
+        raise FormatError(header.path, _about_missing(missing))
     used = [p for p in known.values() if _is_parameter(p.name)]
-    wrong = [p.name for p in used if p.code != "f4"]
+    wrong = [p.name for p in used if p.code not in FLOATS]
     if wrong:
         raise FormatError(
-            header.path, f"{listing(wrong)} must be float (float32); convert the file to float32"
+            header.path, f"{listing(wrong)} must be float; convert the file to float32"
         )
-    _check_rest(header.path, [n for n in known if REST.fullmatch(n)])
+    _check_rest(header.path, _rest(header))
+    double = [p.name for p in used if p.code == "f8"]
+    return [
+        *([f"coding: {header.coding}"] if header.coding != LITTLE else []),
+        *([f"{len(double)} columns of float64, used as float32"] if double else []),
+        *(["colours from the columns red, green, blue; no harmonics"] if coloured else []),
+    ]
 
 
-def _about_missing(missing: list[str], known: dict[str, Property]) -> str:
-    if "packed_position" in known:
-        return "is a compressed .ply, not supported yet; make it a plain one with splat-transform"
-    if {"scale_0", "scale_1"} <= known.keys() and "scale_2" in missing:
-        return "has two scales only: it looks like 2DGS, not supported yet"
+def _has_byte_colours(known: dict[str, Property]) -> bool:
+    there = all(c in known and known[c].code == "u1" for c in BYTE_COLOURS)
+    return there and not any(c in known for c in COLOURS)
+
+
+def _about_missing(missing: list[str]) -> str:
     return (
         f"vertex lacks {', '.join(missing)}, which a 3DGS .ply has; is it a point cloud or a mesh?"
     )
 
 
 def _check_rest(path: str, rest: list[str]) -> None:
-    if len(rest) == REST_COUNT_4:
-        raise FormatError(path, "has 72 f_rest columns (degree 4), not supported yet")
-    if len(rest) not in REST_COUNTS:
+    if len(rest) not in DEGREES:
         raise FormatError(
-            path, f"has {len(rest)} f_rest columns; degrees 0 to 3 have 0, 9, 24 or 45"
+            path, f"has {len(rest)} f_rest columns; degrees 0 to 4 have 0, 9, 24, 45 or 72"
         )
     gaps = [f"f_rest_{i}" for i in range(len(rest)) if f"f_rest_{i}" not in rest]
     if gaps:
         raise FormatError(path, f"has {len(rest)} f_rest columns, but not {listing(gaps)}")
 
 
-def _check_number(header: Header, max_gaussians: int) -> None:
-    count = header.vertex.count
-    if count > max_gaussians:
-        raise FormatError(
-            header.path,
-            f"holds {count:,} Gaussians and the limit is {max_gaussians:,}; raise --max-gaussians",
-        )
-
-
 def _is_parameter(column: str) -> bool:
     return column in REQUIRED or column == FILTER_COLUMN or bool(REST.fullmatch(column))
 
 
-def _load(path: Path, header: Header) -> Document:
-    with path.open("rb") as stream:
-        data = PlyData.read(stream, mmap="r")
-        end = stream.tell()
-    size = path.stat().st_size
-    if end != size:  # only where other elements hold lists; without them the size is known before
-        raise FormatError(path, f"has {size - end:,} bytes after its last element; it is damaged")
-    other_size = size - len(header.text) - header.vertex.least_size
-    return Document(header, data.elements, other_size)
-
-
-def _fill(document: Document) -> Gaussians:
-    """The parameters as tensors, copied by chunks as a row's values lie together in the file."""
-    vertex = document.header.vertex
-    rest = sum(bool(REST.fullmatch(column)) for column in vertex.names)
-    scene = _empty(vertex.count, 1 + rest // 3, FILTER_COLUMN in vertex.names)
-    data = _table(document)
-    for start in range(0, len(scene), CHUNK):
-        rows = slice(start, start + CHUNK)
-        chunk = np.array(data[rows])
-        for column, values in columns(scene).items():
-            values[rows] = torch.from_numpy(np.ascontiguousarray(chunk[column]))
-    return scene
-
-
-def _empty(n: int, k: int, filtered: bool) -> Gaussians:
-    return Gaussians(
-        means=torch.empty(n, 3),
-        quats=torch.empty(n, 4),
-        log_scales=torch.empty(n, 3),
-        logit_opacities=torch.empty(n),
-        sh=torch.empty(n, k, 3),
-        filter_3d=torch.empty(n) if filtered else None,
+def _document(path: Path, header: Header, stamp: tuple[int, int]) -> Document:
+    """Where everything stands; plyfile parses what numpy cannot."""
+    order = ">" if header.coding == BIG else "<"
+    dtype = np.dtype([(p.name, order + p.code) for p in header.vertex.properties])
+    at = header.elements.index(header.vertex)
+    offset = header.size + sum(e.least_size for e in header.elements[:at])
+    lists = any(e.lists for e in header.elements)
+    if header.coding == LITTLE and not lists:
+        return _by_offsets(path, header, stamp, offset, dtype)
+    if header.coding == BIG and len(header.elements) == 1:
+        table = Table(path, offset, header.vertex.count, dtype, stamp)
+        return Document(header, table)
+    if not header.plain:
+        raise FormatError(
+            path, "its header has empty lines or letters beyond ASCII; take them out to read it"
+        )
+    elements = _parsed(path, stamp[0], header.coding)
+    data = elements[at].data
+    if header.coding == LITTLE:
+        offset = int(getattr(data, "offset", offset))
+        return _by_offsets(path, header, stamp, offset, dtype)
+    before, after = (_little(part) for part in (elements[:at], elements[at + 1 :]))
+    return Document(
+        header, Table(path, 0, len(data), data.dtype, stamp, np.asarray(data)), before, after
     )
 
 
-def _table(document: Document) -> np.ndarray:
-    return next(e.data for e in document.elements if e.name == "vertex")
+def _by_offsets(
+    path: Path, header: Header, stamp: tuple[int, int], offset: int, dtype: np.dtype
+) -> Document:
+    table = Table(path, offset, header.vertex.count, dtype, stamp)
+    end = offset + header.vertex.least_size
+    return Document(header, table, (header.size, offset), (end, stamp[0]))
 
 
-def _without_faults(scene: Gaussians, path: Path, drop_bad: bool) -> Gaussians:
-    faults = _faults(scene)
-    if not faults:
-        return scene
-    if not drop_bad:
-        what = listing([str(fault) for fault in faults])
-        raise FormatError(path, f"{what}; pass --drop-bad to leave such rows out")
-    bad = torch.stack([fault.rows for fault in faults]).any(dim=0)
-    counts = listing([f"{fault.text}: {int(fault.rows.sum()):,}" for fault in faults])
-    log.warning("%s: left out %d of %d Gaussians (%s)", path, int(bad.sum()), len(scene), counts)
-    return scene[~bad]
+def _parsed(path: Path, size: int, coding: str) -> tuple[PlyElement, ...]:
+    if coding == TEXT:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # numpy's, of empty lists
+            return PlyData.read(str(path)).elements
+    with path.open("rb") as stream:
+        elements = PlyData.read(stream, mmap="r").elements
+        end = stream.tell()
+    if end != size:  # without lists a binary file's size is known before
+        raise FormatError(path, f"has {size - end:,} bytes after its last element; it is damaged")
+    return elements
 
 
-def _faults(scene: Gaussians) -> list[Fault]:
-    named = columns(scene)
-    faults = [Fault(f"NaN in {column}", values.isnan()) for column, values in named.items()]
-    faults += [Fault(f"Inf in {column}", values.isinf()) for column, values in named.items()]
-    length = torch.linalg.vector_norm(scene.quats, dim=-1)
-    finite = scene.quats.isfinite().all(dim=-1)
-    faults.append(Fault("a quaternion of length zero", length <= SHORTEST_QUATERNION))
-    faults.append(Fault("a quaternion too long for float32", length.isinf() & finite))
-    if scene.filter_3d is not None:
-        faults.append(Fault(f"a negative {FILTER_COLUMN}", scene.filter_3d < 0))
-    return [fault for fault in faults if fault.rows.any()]
+def _little(elements: Iterable[PlyElement]) -> bytes:
+    elements = list(elements)
+    if not elements:
+        return b""
+    stream = io.BytesIO()
+    data = PlyData(elements, byte_order="<")
+    data.write(stream)
+    return stream.getvalue()[len(data.header) + 1 :]
+
+
+def _rows(document: Document, degree: int, flat: bool, start: int, stop: int) -> Gaussians:
+    """Parameters as tensors, a chunk at a time as a row's values lie together in the file."""
+    table = document.table
+    assert table is not None
+    with library_errors(table.path):
+        rows = table.read(start, stop)
+    if len(rows) != stop - start:
+        raise FormatError(table.path, "was cut short while it was being read")
+    fields = rows.dtype.names or ()
+    if _one_type(rows.dtype) and COLOURS[0] in fields:
+        return scene_of(fields, torch.from_numpy(_matrix(rows)), degree, flat)
+    scene = empty(len(rows), degree, FILTER_COLUMN in fields, flat)
+    targets = {c: v for c, v in columns(scene).items() if c in fields}
+    for begin in range(0, len(rows), CHUNK):
+        part = slice(begin, begin + CHUNK)
+        for column, values in targets.items():
+            values[part] = torch.from_numpy(rows[column][part].astype(np.float32))
+        if COLOURS[0] not in fields:
+            scene.sh[part, 0] = sh_of_colour(_byte_colours(rows[part]))
+    return scene
+
+
+def _one_type(dtype: np.dtype) -> bool:
+    """Whether all columns are little-endian float32, so that rows make a matrix."""
+    return all(dtype[i] == np.dtype("<f4") for i in range(len(dtype.names or ())))
+
+
+def _matrix(rows: np.ndarray) -> np.ndarray:
+    return rows.view("<f4").reshape(len(rows), -1)
+
+
+def _byte_colours(rows: np.ndarray) -> Tensor:
+    colours = np.stack([rows[c].astype(np.float32) for c in BYTE_COLOURS], axis=1)
+    return torch.from_numpy(colours) / np.iinfo(np.uint8).max
 
 
 def _plain_header(scene: Gaussians) -> Header:
     """3DGS's own header, in its order of columns."""
     rest = [f"f_rest_{i}" for i in range(3 * (scene.sh.shape[1] - 1))]
-    order = [*REQUIRED[:3], *NORMALS, *REQUIRED[3:6], *rest, *REQUIRED[6:]]
-    properties = [f"property float {column}" for column in order]
-    start = ["ply", "format binary_little_endian 1.0", f"element vertex {len(scene)}"]
+    order = [*REQUIRED[:3], *NORMALS, *COLOURS, *rest, *REQUIRED[6:]]
+    properties = [f"property float {c}" for c in order if c in NORMALS or c in columns(scene)]
+    start = ["ply", f"format {LITTLE} 1.0", f"element vertex {len(scene)}"]
     return parse("scene", [*start, *properties, "end_header"], "\n")
 
 
-def _updated(old: Header, scene: Gaussians, new: bool) -> Header:
+def _updated(old: Header, scene: Gaussians, count: int, new: bool) -> Header:
     """The header for this scene: number, columns, and what it says of convention and fusions."""
     wanted = columns(scene)
     known = old.vertex.names
-    dropped = [column for column in known if _is_parameter(column) and column not in wanted]
+    kept = SCALES[2] if scene.flat else None
+    dropped = [c for c in known if _is_parameter(c) and c not in wanted and c != kept]
     added = [column for column in wanted if column not in known]
-    header = old.with_vertex(len(scene), dropped, added)
+    header = old.little().with_vertex(count, dropped, added)
     return stating(header, None if new else old, scene.convention, scene.fused)
 
 
-def _records(
-    header: Header, scene: Gaussians, document: Document, origin: Origin | None
-) -> np.ndarray:
-    """The Gaussians' table: parameters from the scene, other columns from the document."""
+def _document_of(scene: Gaussians) -> Document | None:
+    return scene.origin.document if scene.origin and scene.origin.format == name else None
+
+
+def _write_rows(stream: BinaryIO, header: Header, scene: Gaussians) -> None:
+    for start in range(0, len(scene), BATCH):
+        part = scene[start : start + BATCH] if len(scene) > BATCH else scene
+        stream.write(_records(header, part).tobytes())
+
+
+def _records(header: Header, scene: Gaussians) -> np.ndarray:
+    """Rows of the Gaussians' table: parameters from the scene, other columns from the document.
+
+    A column of another type than float32 keeps what it had where the scene's value is what was read from it.
+    """
+    properties = header.vertex.properties
+    records = np.zeros(len(scene), np.dtype([(p.name, "<" + p.code) for p in properties]))
+    if _one_type(records.dtype) and scene.means.dtype == torch.float32:
+        return _filled(records, scene)
     values = columns(scene)
-    dtype = np.dtype([(p.name, "<" + p.code) for p in header.vertex.properties])
-    records = np.zeros(len(scene), dtype)
-    for column in header.vertex.names:
-        if column in values:
-            assert values[column].isfinite().all(), f"{column} is NaN or infinite"
-            records[column] = values[column].detach().cpu().numpy()
-        elif origin:
-            records[column] = _table(document)[column][origin.rows.cpu().numpy()]
+    old = _old_rows(scene)
+    for p in properties:
+        was = old[p.name] if old is not None and p.name in (old.dtype.names or ()) else None
+        if p.name not in values:
+            records[p.name] = 0 if was is None else was
+            continue
+        assert not values[p.name].isnan().any(), f"{p.name} is NaN"
+        new = values[p.name].detach().cpu().numpy()
+        if was is not None and p.code != "f4":
+            new = np.where(was.astype(np.float32) == new, was, new)
+        records[p.name] = new
     return records
+
+
+def _filled(records: np.ndarray, scene: Gaussians) -> np.ndarray:
+    """The same for float32 alone, all columns at once."""
+    names, fields = list(records.dtype.names or ()), _matrix(records)
+    known, values = matrix_of(scene)
+    values = values.detach().cpu().numpy()
+    assert not np.isnan(values).any(), "a parameter is NaN"
+    if set(names) != set(known) and (old := _old_rows(scene)) is not None:
+        for i, column in enumerate(names):
+            if column not in known and column in (old.dtype.names or ()):
+                fields[:, i] = old[column]
+    fields[:, [names.index(column) for column in known]] = values
+    return records
+
+
+def _old_rows(scene: Gaussians) -> np.ndarray | None:
+    document = _document_of(scene)
+    if document is None or document.table is None:
+        return None
+    assert scene.origin is not None
+    return document.table.take(scene.origin.rows.cpu())
+
+
+def _copy(stream: BinaryIO, document: Document, content: bytes | tuple[int, int]) -> None:
+    """Other tables, from memory or from where they stand in the file."""
+    if isinstance(content, bytes):
+        stream.write(content)
+        return
+    start, stop = content
+    if start == stop:
+        return
+    assert document.table is not None
+    with document.table.path.open("rb") as source:
+        source.seek(start)
+        while start < stop and (data := source.read(min(BLOCK, stop - start))):
+            stream.write(data)
+            start += len(data)

@@ -1,6 +1,7 @@
 """A .ply file's header: a bounded look before anything is allocated, and edits that keep the rest.
 
-A header is lines of ASCII from "ply" to "end_header", here without their line ends.  It declares
+A header is lines of text from "ply" to "end_header", here without their line ends and without empty lines.  Only
+comments may hold other letters than ASCII, in whatever encoding: each byte is kept as one letter.  It declares
 elements (tables) of `count` rows, each row made of properties (columns): scalars, or lists of a
 stored length.  Sizes are in bytes.
 """
@@ -12,12 +13,13 @@ from functools import cached_property
 from pathlib import Path
 
 from aaplug.errors import FormatError
+from aaplug.io.limits import whole_limit
 
-MAX_HEADER = 128 * 1024  # bytes; a scene's header has about 2 KB
-MAX_LINES = 1000  # a scene's header has about 70
 MAX_COUNT_DIGITS = 18  # still an int64
+BYTES = "latin-1"  # a letter a byte
 MAX_SHOWN = 60  # characters of an offending line in a message
-FORMAT = ["binary_little_endian", "1.0"]
+LITTLE, BIG, TEXT = "binary_little_endian", "binary_big_endian", "ascii"
+LEAST_TEXT = 2  # bytes of a value in text: a digit and a space or line end
 CODES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
     "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
@@ -59,6 +61,11 @@ class Element:
         return self.count * self.stride
 
     @property
+    def least_text(self) -> int:
+        """The same for a table in text."""
+        return self.count * len(self.properties) * LEAST_TEXT
+
+    @property
     def lists(self) -> list[str]:
         """Names of the columns that hold lists."""
         return [p.name for p in self.properties if p.length_code]
@@ -71,17 +78,32 @@ class Element:
 
 @dataclass(frozen=True)
 class Header:
-    """The header's lines as they stand in the file `path`, and what they declare."""
+    """The header's lines as they stand in the file `path`, and what they declare.
+
+    coding: LITTLE, BIG or TEXT.  size: of the header in its file.
+    """
 
     path: str
     lines: tuple[str, ...]
     newline: str
     elements: tuple[Element, ...]
+    coding: str
+    size: int
 
     @cached_property
     def text(self) -> str:
         """All of it, up to the last line's end."""
-        return "".join(line + self.newline for line in self.lines)
+        return _text(self.lines, self.newline)
+
+    @property
+    def content(self) -> bytes:
+        """The text as it stands in a file."""
+        return self.text.encode(BYTES)
+
+    @property
+    def plain(self) -> bool:
+        """Whether a strict reader takes it: ASCII, and nothing left out."""
+        return self.text.isascii() and len(self.text) == self.size
 
     @property
     def comments(self) -> list[str]:
@@ -113,6 +135,21 @@ class Header:
         added = [f"comment {comment}" for comment in comments]
         return parse(self.path, [*self.lines[:first], *added, *self.lines[first:]], self.newline)
 
+    def little(self) -> "Header":
+        """The header of the same tables in binary, little-endian."""
+        words = f"format {LITTLE} 1.0"
+        lines = (words if _keyword(line) == "format" else line for line in self.lines)
+        return parse(self.path, lines, self.newline)
+
+    def with_padded_count(self, count: int) -> "Header":
+        """The header with fewer vertices and not a byte less: spaces make up for lost digits."""
+        old = str(self.vertex.count)
+        lines = (
+            re.sub(rf"^(\s*element\s+vertex\s+){old}", rf"\g<1>{count:>{len(old)}}", x)
+            for x in self.lines
+        )
+        return parse(self.path, lines, self.newline)
+
     def with_vertex(self, count: int, dropped: Collection[str], added: Iterable[str]) -> "Header":
         """The header with `count` vertices, columns `dropped`, and float columns `added` last."""
         lines: list[str] = []
@@ -130,30 +167,32 @@ class Header:
 
 
 def read_header(path: Path) -> Header:
-    """Read and check the header, looking at no more than 128 KiB of the file.
+    """Read and check the header, looking at no more of the file than the limit.
 
     Raises:
         FormatError: it is not a header, ends nowhere, or declares something twice or impossible.
     """
+    most, most_lines = whole_limit("HEADER"), whole_limit("HEADER_LINES")
     with path.open("rb") as stream:
-        head = stream.read(MAX_HEADER)
+        head = stream.read(most)
     newline = b"\r\n" if head.startswith(b"ply\r\n") else b"\n"
     if not head.startswith(b"ply" + newline):
         raise FormatError(path, "is not a .ply file: its first line is not 'ply'")
     end = head.find(newline + b"end_header" + newline)
     if end < 0:
-        where = f"in its first {MAX_HEADER:,} bytes" if len(head) == MAX_HEADER else "in the file"
+        where = f"in its first {most:,} bytes" if len(head) == most else "in the file"
         raise FormatError(path, f"no line 'end_header' {where}; it is cut short or no .ply")
     lines = (head[:end] + newline + b"end_header").split(newline)
-    if len(lines) > MAX_LINES:
+    if len(lines) > most_lines:
         raise FormatError(
-            path, f"the header has {len(lines)} lines, more than the {MAX_LINES} allowed"
+            path, f"the header has {len(lines)} lines, more than the {most_lines} allowed"
         )
-    return parse(str(path), _plain(path, lines), newline.decode())
+    size = end + len(newline + b"end_header" + newline)
+    return parse(str(path), [line.decode(BYTES) for line in lines if line], newline.decode(), size)
 
 
-def parse(path: str, lines: Iterable[str], newline: str) -> Header:
-    """Understand a header's lines.
+def parse(path: str, lines: Iterable[str], newline: str, size: int | None = None) -> Header:
+    """Understand a header's lines; `size` is that of the header in its file.
 
     Raises:
         FormatError: a line is not PLY, or a count, type or name is impossible or appears twice.
@@ -163,10 +202,12 @@ def parse(path: str, lines: Iterable[str], newline: str) -> Header:
     formats: list[list[str]] = []
     for number, line in enumerate(lines[1:-1], start=2):
         match line.split():
-            case ["comment" | "obj_info", *_]:
+            case ["comment" | "obj_info", *_] | []:
                 pass
-            case [] if line:  # spaces only; plyfile takes an empty line for the file's end
-                pass
+            case _ if not line.isascii():
+                raise FormatError(
+                    path, f"line {number} of the header is not ASCII: {line[:MAX_SHOWN]!r}"
+                )
             case ["format", *words]:
                 formats.append(words)
             case ["element", name, count]:
@@ -178,9 +219,10 @@ def parse(path: str, lines: Iterable[str], newline: str) -> Header:
                 raise FormatError(
                     path, f"line {number} of the header is not PLY: {line[:MAX_SHOWN]!r}"
                 )
-    _check_format(path, formats)
+    coding = _coding(path, formats)
     _check_unique(path, elements)
-    return Header(path, lines, newline, tuple(elements))
+    size = len(_text(lines, newline)) if size is None else size
+    return Header(path, lines, newline, tuple(elements), coding, size)
 
 
 def check_size(header: Header, actual: int) -> None:
@@ -189,7 +231,15 @@ def check_size(header: Header, actual: int) -> None:
     Raises:
         FormatError: the file is shorter or longer.
     """
-    least = len(header.text) + sum(e.least_size for e in header.elements)
+    text = header.coding == TEXT
+    least = header.size + sum(e.least_text if text else e.least_size for e in header.elements)
+    if text and actual < least - 1:  # the last line may end without a line end
+        raise FormatError(
+            header.path,
+            f"is cut short: the values that its header promises need {least:,} bytes at least, and it has {actual:,}",
+        )
+    if text:
+        return
     if actual < least:
         whole, promised = _whole_rows(header, actual), header.vertex.count
         raise FormatError(
@@ -207,7 +257,7 @@ def check_size(header: Header, actual: int) -> None:
 
 def _whole_rows(header: Header, actual: int) -> int:
     before = header.elements[: header.elements.index(header.vertex)]
-    room = actual - len(header.text) - sum(e.least_size for e in before)
+    room = actual - header.size - sum(e.least_size for e in before)
     return max(0, min(header.vertex.count, room // max(1, header.vertex.stride)))
 
 
@@ -219,14 +269,8 @@ def _comment(line: str) -> str:
     return line.strip()[len("comment") :].strip()
 
 
-def _plain(path: Path, lines: list[bytes]) -> list[str]:
-    for number, line in enumerate(lines, start=1):
-        if not line.isascii():
-            raise FormatError(
-                path,
-                f"line {number} of the header is not ASCII; replace those letters by plain ones",
-            )
-    return [line.decode("ascii") for line in lines]
+def _text(lines: Iterable[str], newline: str) -> str:
+    return "".join(line + newline for line in lines)
 
 
 def _count(path: str, name: str, count: str) -> int:
@@ -244,14 +288,14 @@ def _property(words: list[str]) -> Property | None:
     return None
 
 
-def _check_format(path: str, formats: list[list[str]]) -> None:
-    if formats != [FORMAT]:
-        found = " and ".join(" ".join(words)[:MAX_SHOWN] for words in formats) or "none"
-        raise FormatError(
-            path,
-            f"its format is {found}; only {' '.join(FORMAT)} is supported yet: "
-            "convert it, for example with splat-transform",
-        )
+def _coding(path: str, formats: list[list[str]]) -> str:
+    match formats:
+        case [[("binary_little_endian" | "binary_big_endian" | "ascii") as coding, "1.0"]]:
+            return coding
+    found = " and ".join(" ".join(words)[:MAX_SHOWN] for words in formats) or "none"
+    raise FormatError(
+        path, f"its format is {found}; known are {LITTLE}, {BIG} and {TEXT}, each 1.0"
+    )
 
 
 def _check_unique(path: str, elements: list[Element]) -> None:

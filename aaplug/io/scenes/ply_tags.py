@@ -3,6 +3,7 @@
 Understood, strongest first:
     comment aaplug [fused=<method>] key=value ... [convention=<name>]   our own record
     a vertex column filter_3D                                           Mip-Splatting, not yet fused
+    two scales, or comment SplatRenderMode: 2dgs                        2D Gaussians, drawn as classic ones
     comment SplatRenderMode: mip | antialiased | default                Brush, splat-transform
     comment antialiased 1 | 0                                           Postshot
 In each kind the last one counts.  Viewers know only the tag; our record tells 0.1 from 0.3 px².
@@ -14,14 +15,13 @@ from dataclasses import dataclass
 from aaplug.errors import FormatError
 from aaplug.gaussians import ANTIALIASED, CLASSIC, CONVENTIONS, MIP, Convention, Fusion
 from aaplug.io.scenes.ply_header import Header
+from aaplug.io.scenes.scene_file import FILTER_COLUMN
 
-FILTER_COLUMN = (
-    "filter_3D"  # Mip-Splatting's name for its smoothing, a standard deviation in world units
-)
 RECORD = re.compile(r"aaplug\s+(?=fused=|convention=)(.*)")
 RENDER_MODE = re.compile(r"SplatRenderMode\s*:\s*(\S*)", re.IGNORECASE)
 POSTSHOT = re.compile(r"antialiased\s+([01])\s*", re.IGNORECASE)
 MIP_TAG = "SplatRenderMode: mip"
+FLAT = "2dgs"  # the mode of 2D Gaussians
 WORD = re.compile(r"[!-~]+")  # printable ASCII without spaces
 KEY = re.compile(r"[!-<>-~]+")  # the same without "="
 
@@ -36,14 +36,14 @@ class Meaning:
     convention: Convention
     evidence: str
     fused: tuple[Fusion, ...]
+    flat: bool = False
 
 
-def meaning(header: Header) -> Meaning:
-    """Read the header's tags.
+def meaning(header: Header, compressed: bool = False) -> Meaning:
+    """Read the header's tags; `compressed` columns say nothing themselves.
 
     Raises:
-        FormatError: a record is damaged or names an unknown convention, or the scene is made of
-            2D Gaussians.
+        FormatError: a record is damaged or names an unknown convention.
     """
     records = [_record(header.path, m[1]) for m in _matches(header, RECORD)]
     fused = tuple(
@@ -54,15 +54,13 @@ def meaning(header: Header) -> Meaning:
         if "fused" in record
     )
     mode = _last(header, RENDER_MODE)
-    if mode and mode.lower() == "2dgs":
-        raise FormatError(
-            header.path, "holds 2D Gaussians (SplatRenderMode: 2dgs), not supported yet"
-        )
+    two = not compressed and "scale_2" not in header.vertex.names
+    flat = two or bool(mode and mode.lower() == FLAT)
     recorded = [record["convention"] for record in records if "convention" in record]
     if recorded:
         convention = _convention(header.path, recorded[-1])
-        return Meaning(convention, f"aaplug's record in the file: {convention.name}", fused)
-    return Meaning(*_from_others(header, mode), fused)
+        return Meaning(convention, f"aaplug's record in the file: {convention.name}", fused, flat)
+    return Meaning(*_from_others(header, mode, two), fused, flat)
 
 
 def stating(
@@ -88,10 +86,14 @@ def _said(header: Header) -> tuple[Convention, tuple[Fusion, ...]]:
     return said.convention, said.fused
 
 
-def _from_others(header: Header, mode: str | None) -> tuple[Convention, str]:
+def _from_others(header: Header, mode: str | None, two: bool) -> tuple[Convention, str]:
     postshot = _last(header, POSTSHOT)
     if FILTER_COLUMN in header.vertex.names:
         return MIP, f"column {FILTER_COLUMN} in the file: Mip-Splatting, not yet fused"
+    if mode is not None and mode.lower() == FLAT:
+        return CLASSIC, f"tag in the file, SplatRenderMode: {mode}: 2D Gaussians, taken for classic"
+    if mode is None and two:
+        return CLASSIC, "two scales in the file: 2D Gaussians (2DGS), taken for classic"
     if mode is not None and mode.lower() in MODES:
         return MODES[mode.lower()], f"tag in the file: SplatRenderMode: {mode}"
     if mode is not None:

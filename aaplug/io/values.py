@@ -18,10 +18,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.errors import FormatError
+from aaplug.io.limits import whole_limit
 
-JSON_LIMIT = 64 * 2**20  # bytes: 100 times the largest camera file met so far
 HEAD_LIMIT = 64 * 2**10  # bytes: enough to meet an entry's keys when a file's format is guessed
-MAX_SIDE = 65536  # px: a longer side is a mistake, not a photograph
 MAX_FOCAL = 1e9  # px: no lens sees so little, and what follows from it stays finite
 ORTHONORMAL = 1e-3  # the most that an entry of R·Rᵀ may be off the identity's
 
@@ -134,9 +133,9 @@ def pixels(value: object, place: Place, field: str) -> int:
     Raises:
         FormatError: it is none.
     """
-    real = number(value, place, field)
-    if not (1 <= real <= MAX_SIDE and real.is_integer()):
-        raise place.wrong(field, f"a whole number of px from 1 to {MAX_SIDE}", value)
+    real, most = number(value, place, field), whole_limit("CAMERA_SIDE")
+    if not (1 <= real <= most and real.is_integer()):
+        raise place.wrong(field, f"a whole number of px from 1 to {most}", value)
     return int(real)
 
 
@@ -149,13 +148,6 @@ def text(value: object, place: Place, field: str) -> str:
     if not isinstance(value, str) or not value or not value.isprintable():
         raise place.wrong(field, "printable text", value)
     return value
-
-
-def distortion_refusal(place: Place, what: str) -> FormatError:
-    """The refusal of every camera that is no plain pinhole."""
-    return place.error(
-        f"{what}, and splatting needs plain pinholes; undistort first (colmap image_undistorter)"
-    )
 
 
 def pose(
@@ -231,13 +223,21 @@ def read_json(path: Path) -> Any:
     """A JSON document.
 
     Raises:
-        FormatError: the file is none, is longer than `JSON_LIMIT`, or holds NaN or Infinity.
+        FormatError: the file is none, is longer than the limit, or holds NaN or Infinity.
     """
-    data = read_bounded(path, JSON_LIMIT)
+    return parse_json(read_bounded(path, whole_limit("JSON")), path)
+
+
+def parse_json(data: bytes, path: Path) -> Any:
+    """The JSON document in these bytes of the file `path`.
+
+    Raises:
+        FormatError: they are none, or hold NaN or Infinity.
+    """
     try:
         return json.loads(data.decode("utf-8-sig"), parse_constant=_refuse)
     except (RecursionError, MemoryError) as error:
-        raise FormatError(path, "is not a camera file: its JSON is nested too deeply") from error
+        raise FormatError(path, "its JSON is nested too deeply") from error
     except ValueError as error:
         raise FormatError(path, f"should be JSON: {error}") from error
 
@@ -281,4 +281,4 @@ def _entry(place: Place, item: object, shared: dict[str, Any]) -> Entry:
 
 
 def _refuse(constant: str) -> NoReturn:
-    raise ValueError(f"{constant} is no number that a camera can have")
+    raise ValueError(f"{constant} is no finite number")

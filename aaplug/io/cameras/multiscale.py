@@ -1,0 +1,105 @@
+"""Mip-NeRF's multi-scale Blender sets: `metadata.json`, a column a fact and a split.
+
+{train: {file_path, cam2world, width, height, focal, label, ...}, test: ...}, each a list, an entry a photo.  cam2world:
+4×4, OpenGL axes; sizes and focal in px.  Every scale is a view of its own, trained at its own size.
+"""
+
+import os
+from pathlib import Path
+
+import torch
+
+from aaplug.cameras import WHITE, Camera, CameraSet
+from aaplug.errors import FormatError, UsageError
+from aaplug.io.cameras.options import Options, explicit, undivided
+from aaplug.io.cameras.photos import (
+    PhotoFolder,
+    described_sizes,
+    distinct,
+    last_part,
+    refuse_folder,
+    scaled_sizes,
+    trained_at,
+    whole,
+    without_suffix,
+)
+from aaplug.io.values import Entry, Place, inverse, mentions, pose, read_json, rigid
+
+FILE = "metadata.json"
+OPENCV_FROM_OPENGL = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
+COLUMNS = ("file_path", "cam2world", "width", "height", "focal")
+
+
+def sniff(path: Path) -> bool:
+    """Whether a folder holds such a metadata.json, or a file is one by its keys."""
+    file = path / FILE if os.path.isdir(path) else path
+    return mentions(file, ["cam2world"]) and mentions(file, ["file_path"])
+
+
+def read(path: Path, options: Options) -> CameraSet:
+    """The cameras of all scales, split as the file says.
+
+    Raises:
+        FormatError: the file is not what it should be.
+        UsageError: the options do not fit.
+    """
+    refuse_folder(options.images)
+    if options.test_every is not None:
+        raise UsageError("--test-every", f"{FILE} gives the split; leave the option out")
+    file = path / FILE if os.path.isdir(path) else path
+    document = read_json(file)
+    if not isinstance(document, dict) or not isinstance(document.get("train"), dict):
+        raise FormatError(
+            file, "should be an object with 'train', as multi-scale Blender sets have"
+        )
+    train = _cameras(file, "train", document["train"])
+    test = _cameras(file, "test", document["test"]) if "test" in document else []
+    scale = 1.0 if options.train_scale is None else options.train_scale
+    trained, held = (
+        trained_at(views, scaled_sizes(views, scale)) if views else [] for views in (train, test)
+    )
+    split = explicit(trained, held, FILE) if held else undivided(trained, f"no test in {FILE}")
+    notes = (
+        f"multi-scale Blender: {len(train) + len(test)} cameras, {described_sizes(train)}",
+        split.note,
+        "training size: each photo's own, all scales were trained on",
+        "background: white, Blender's custom",
+    )
+    return CameraSet(split.train, split.test, WHITE, notes)
+
+
+def _cameras(file: Path, split: str, columns: object) -> list[Camera]:
+    place = Place(file, split)
+    if not isinstance(columns, dict):
+        raise place.wrong("it", "an object", columns)
+    lists = [columns.get(key) for key in COLUMNS]
+    lengths = {len(values) for values in lists if isinstance(values, list)}
+    if any(not isinstance(values, list) for values in lists) or len(lengths) != 1 or 0 in lengths:
+        raise place.error(f"{', '.join(COLUMNS)} should be lists of one length")
+    rows = zip(*(values for values in lists if isinstance(values, list)), strict=True)
+    found = [
+        Entry(Place(file, f"{split} {i}"), dict(zip(COLUMNS, row, strict=True)))
+        for i, row in enumerate(rows)
+    ]
+    paths = [entry.text("file_path") for entry in found]
+    names = distinct(file, paths, (last_part, without_suffix, whole))
+    folder = PhotoFolder(file.parent, file.parent)
+    return [_camera(entry, name, folder) for entry, name in zip(found, names, strict=True)]
+
+
+def _camera(entry: Entry, name: str, folder: PhotoFolder) -> Camera:
+    motion = rigid(entry, "cam2world")
+    rotation = motion[:3, :3] * OPENCV_FROM_OPENGL
+    world_from_cam = pose(rotation, motion[:3, 3], entry.place, "cam2world")
+    width, height, f = entry.pixels("width"), entry.pixels("height"), entry.focal("focal")
+    return Camera(
+        name,
+        width,
+        height,
+        f,
+        f,
+        width / 2,
+        height / 2,
+        inverse(world_from_cam, entry.place, "cam2world"),
+        photo=folder.find(entry.text("file_path"), entry.place),
+    )

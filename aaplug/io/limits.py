@@ -1,0 +1,71 @@
+"""Every bound on what a file may ask for, in one table; `aaplug info --limits` prints it.
+
+A limit is raised or lowered by an environment variable, AAPLUG_ and its name: AAPLUG_GAUSSIANS=2e8.  Sizes are in
+bytes.  Most were set after failures of other readers: counts that allocate terabytes, inflation bombs, endless headers.
+"""
+
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from aaplug.errors import UsageError
+
+
+@dataclass(frozen=True)
+class Limit:
+    """The most that is accepted of something."""
+
+    value: int | float
+    unit: str
+    what: str
+
+
+LIMITS: Mapping[str, Limit] = {
+    "HEADER": Limit(128 * 2**10, "bytes", "a .ply's header; scenes have about 2 KB"),
+    "HEADER_LINES": Limit(1000, "lines", "a .ply's header; scenes have about 70"),
+    "GAUSSIANS": Limit(1e8, "Gaussians", "of a scene; about 25 GB as .ply"),
+    "MEMORY_SHARE": Limit(0.5, "of RAM", "that a scene read whole may take"),
+    "JSON": Limit(64 * 2**20, "bytes", "a JSON file"),
+    "CFG_ARGS": Limit(64 * 2**10, "bytes", "INRIA's cfg_args"),
+    "NAME": Limit(4096, "bytes", "a photograph's name"),
+    "IMAGE": Limit(2**28, "px", "an image; 16384 x 16384"),
+    "CAMERA_SIDE": Limit(65536, "px", "a side of a camera's image"),
+    "INFLATE": Limit(200, "times", "growth of a compressed member; gzip and zstd streams are held to the "
+                     "size that their header announces"),
+    "SLACK": Limit(64 * 2**10, "bytes", "what an inflated stream may hold beyond that"),
+    "CHECKPOINT": Limit(32 * 2**30, "bytes", "a .pt checkpoint"),
+}  # fmt: skip
+
+
+def limit(name: str) -> int | float:
+    """The limit in force.
+
+    Raises:
+        UsageError: the environment holds something else than a positive number.
+    """
+    variable = f"AAPLUG_{name}"
+    text = os.environ.get(variable)
+    if text is None:
+        return LIMITS[name].value
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not value > 0:
+        raise UsageError(variable, f"should be a number above 0, not {text!r}")
+    return value
+
+
+def whole_limit(name: str) -> int:
+    """The limit in force, of things that are counted."""
+    value = limit(name)
+    return int(min(value, 2**62))
+
+
+def memory_of_machine() -> float | None:
+    """Bytes of RAM, None where the system does not say."""
+    try:
+        return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    except (AttributeError, ValueError, OSError):
+        return None

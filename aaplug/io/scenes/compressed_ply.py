@@ -1,0 +1,193 @@
+"""PlayCanvas' .compressed.ply (SuperSplat, splat-transform, gsplat): four words a Gaussian.
+
+Element "chunk": for every 256 Gaussians the least and most of position, log-scale and, in newer files, colour.
+Element "vertex": packed_position and packed_scale (11, 10, 11 bits between those), packed_rotation (2 bits for the
+largest component, 3 × 10 for the others), packed_color (4 bytes).  Element "sh", if any: a byte for each f_rest.
+The header's comments say how the scene was trained, as in a plain .ply.
+"""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from aaplug.errors import FormatError
+from aaplug.gaussians import Gaussians
+from aaplug.io.limits import whole_limit
+from aaplug.io.scenes.packed import byte_opacities, floats, largest_last
+from aaplug.io.scenes.ply import DEGREES, library_errors
+from aaplug.io.scenes.ply_header import LITTLE, Element, Header, check_size, read_header
+from aaplug.io.scenes.ply_tags import meaning
+from aaplug.io.scenes.scene_file import SceneFile, check_count, sh_of_colour
+
+SIGN = re.compile(rb"property\s+uint\w*\s+packed_position")
+WORDS = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+BOUNDS = [f"{end}_{axis}" for end in ("min", "max") for axis in ("x", "y", "z")]
+SCALE_BOUNDS = [f"{end}_scale_{axis}" for end in ("min", "max") for axis in ("x", "y", "z")]
+COLOUR_BOUNDS = [f"{end}_{c}" for end in ("min", "max") for c in ("r", "g", "b")]
+PER_CHUNK = 256  # Gaussians
+SH_SPAN = 8.0  # harmonics lie in ±4
+
+name = "compressed.ply"
+
+
+@dataclass(frozen=True)
+class Table:
+    """An element's rows in the file."""
+
+    path: Path
+    dtype: np.dtype
+    offset: int
+    count: int
+
+    def read(self, start: int, stop: int) -> np.ndarray:
+        """The rows from start up to stop."""
+        at = self.offset + start * self.dtype.itemsize
+        rows = np.fromfile(self.path, self.dtype, stop - start, offset=at)
+        if len(rows) != stop - start:
+            raise FormatError(self.path, "was cut short while it was being read")
+        return rows
+
+
+def sniff(path: Path, head: bytes) -> bool:
+    """Whether this is a .ply with packed words."""
+    if not head.startswith((b"ply\n", b"ply\r")):
+        return False
+    try:
+        with path.open("rb") as stream:
+            start = stream.read(whole_limit("HEADER"))
+    except OSError:
+        return False
+    return bool(SIGN.search(start.partition(b"end_header")[0]))
+
+
+def open_scene(path: Path) -> SceneFile:
+    """Look at a scene; see `aaplug.io.scenes.open_scene`.
+
+    Raises:
+        FormatError: the file is damaged.
+    """
+    with library_errors(path):
+        header = read_header(path)
+        check_size(header, path.stat().st_size)
+        tables = _tables(path, header)
+        _check(header, tables)
+        said = meaning(header, compressed=True)
+        bounds = tables["chunk"].read(0, tables["chunk"].count)
+    sh = tables.get("sh")
+    degree = DEGREES[len(sh.dtype.names or ())] if sh else 0
+    return SceneFile(
+        path,
+        name,
+        header.vertex.count,
+        degree,
+        lambda start, stop: _rows(tables, bounds, degree, start, stop),
+        said.evidence,
+        said.convention,
+        said.fused,
+    )
+
+
+def _tables(path: Path, header: Header) -> dict[str, Table]:
+    if header.coding != LITTLE or any(e.lists for e in header.elements):
+        raise FormatError(path, f"is packed, and should be {LITTLE} without lists")
+    tables, at = {}, header.size
+    for element in header.elements:
+        dtype = np.dtype([(p.name, "<" + p.code) for p in element.properties])
+        tables[element.name] = Table(path, dtype, at, element.count)
+        at += element.least_size
+    return tables
+
+
+def _check(header: Header, tables: dict[str, Table]) -> None:
+    elements = {e.name: e for e in header.elements}
+    count = header.vertex.count
+    check_count(Path(header.path), count)
+    _need(header, header.vertex, WORDS, "u4")
+    chunk = elements.get("chunk")
+    if chunk is None or chunk.count * PER_CHUNK < count:
+        there = 0 if chunk is None else chunk.count
+        raise FormatError(header.path, f"has {there:,} chunks, too few for {count:,} Gaussians")
+    coloured = COLOUR_BOUNDS if COLOUR_BOUNDS[0] in chunk.names else []
+    _need(header, chunk, [*BOUNDS, *SCALE_BOUNDS, *coloured], "f4")
+    if sh := elements.get("sh"):
+        rest = len(sh.properties)
+        if sh.count != count or rest not in DEGREES:
+            raise FormatError(
+                header.path, f"has {sh.count:,} rows of {rest} harmonics for {count:,} Gaussians"
+            )
+        _need(header, sh, [f"f_rest_{i}" for i in range(rest)], "u1")
+
+
+def _need(
+    header: Header, element: Element, columns: list[str] | tuple[str, ...], code: str
+) -> None:
+    known = {p.name: p.code for p in element.properties}
+    missing = [c for c in columns if known.get(c) != code]
+    if missing:
+        raise FormatError(header.path, f"element {element.name!r} needs {missing[0]} as {code}")
+
+
+def _rows(
+    tables: dict[str, Table], bounds: np.ndarray, degree: int, start: int, stop: int
+) -> Gaussians:
+    with library_errors(tables["vertex"].path):
+        words = tables["vertex"].read(start, stop)
+        rest = tables["sh"].read(start, stop) if degree else None
+    of_row = np.arange(start, stop) // PER_CHUNK
+    colour = words["packed_color"]
+    rgb = _bytes(colour, (24, 16, 8))
+    if COLOUR_BOUNDS[0] in (bounds.dtype.names or ()):
+        rgb = _between(bounds, COLOUR_BOUNDS, of_row, rgb)
+    sh = torch.zeros(len(words), (degree + 1) ** 2, 3)
+    sh[:, 0] = sh_of_colour(rgb)
+    if rest is not None:
+        k = sh.shape[1] - 1
+        for i in range(3 * k):
+            sh[:, 1 + i % k, i // k] = _harmonic(rest[f"f_rest_{i}"])
+    return Gaussians(
+        _between(bounds, BOUNDS, of_row, _eleven_ten_eleven(words["packed_position"])),
+        _quaternions(words["packed_rotation"]),
+        _between(bounds, SCALE_BOUNDS, of_row, _eleven_ten_eleven(words["packed_scale"])),
+        byte_opacities(colour & 255),
+        sh,
+    )
+
+
+def _between(
+    bounds: np.ndarray, names: list[str], of_row: np.ndarray, share: Float[Tensor, "n 3"]
+) -> Float[Tensor, "n 3"]:
+    low, high = (
+        torch.from_numpy(np.stack([bounds[c][of_row] for c in part], axis=1))
+        for part in (names[:3], names[3:])
+    )
+    return torch.lerp(low, high, share)
+
+
+def _eleven_ten_eleven(words: np.ndarray) -> Float[Tensor, "n 3"]:
+    fields = [
+        (words >> shift & (1 << bits) - 1, bits) for shift, bits in ((21, 11), (11, 10), (0, 11))
+    ]
+    return torch.stack([floats(field) / ((1 << bits) - 1) for field, bits in fields], dim=1)
+
+
+def _bytes(words: np.ndarray, shifts: tuple[int, ...]) -> Float[Tensor, "n c"]:
+    return torch.stack([floats(words >> shift & 255) / 255 for shift in shifts], dim=1)
+
+
+def _quaternions(words: np.ndarray) -> Float[Tensor, "n 4"]:
+    fields = [floats(words >> shift & 1023) / 1023 for shift in (20, 10, 0)]
+    rest = (torch.stack(fields, dim=1) - 0.5) * 2**0.5
+    return largest_last(rest, floats(words >> 30))
+
+
+def _harmonic(values: np.ndarray) -> Float[Tensor, " n"]:
+    """Bytes stand for the middles of 256 steps, the first and the last for the ends."""
+    middle = (floats(values) + 0.5) / 256
+    ends = torch.from_numpy(values == 255).float()
+    share = torch.where(torch.from_numpy((values == 0) | (values == 255)), ends, middle)
+    return (share - 0.5) * SH_SPAN

@@ -1,0 +1,184 @@
+"""mkkellogg's .ksplat, compression levels 0 to 2 (github.com/mkkellogg/GaussianSplats3D).
+
+A header of 4096 bytes, then one of 1024 for each section, then the sections.  A section holds the sizes of its last,
+partly filled buckets, the buckets' centres, and a record for each Gaussian: position (float32, or 16 bits around its
+bucket's centre), scales (linear; float32 or float16), quaternion wxyz, colour with opacity (bytes), harmonics (float32,
+float16 or bytes), degree by degree and in each channel by channel.
+"""
+
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from aaplug.errors import FormatError
+from aaplug.gaussians import Gaussians
+from aaplug.io.scenes.packed import byte_opacities, floats
+from aaplug.io.scenes.ply import library_errors
+from aaplug.io.scenes.scene_file import SceneFile, check_count, empty, sh_of_colour
+from aaplug.io.scenes.splat import EVIDENCE
+
+MAIN = struct.Struct(
+    "<BBxxI8xIH14xff"
+)  # version, sections, Gaussians, level, harmonics' least and most
+MAIN_SIZE, SECTION_SIZE = 4096, 1024
+SECTION = struct.Struct("<IIIIfH2xI4xIIH")  # see Section
+FLOATS = ("<f4", "<f2", "<f2")  # of scales and quaternions, by level
+POSITIONS = ("<f4", "<u2", "<u2")
+HARMONICS = ("<f4", "<f2", "u1")
+RANGES = (1, 32767, 32767)  # of positions, where the section does not say
+SH_RANGE = (-1.5, 1.5)  # of harmonics in bytes, where the file does not say
+MAX_DEGREE = 3
+
+name = "ksplat"
+
+
+@dataclass(frozen=True)
+class Section:
+    """A section's header: Gaussians there and room for them, buckets, and the length of a block around a centre."""
+
+    count: int
+    room: int
+    capacity: int
+    buckets: int
+    block: float
+    bucket_size: int
+    range: int
+    full: int
+    partial: int
+    degree: int
+
+
+@dataclass(frozen=True)
+class Records:
+    """A section's Gaussians: their records, and the centre of each one's bucket."""
+
+    section: Section
+    rows: np.ndarray
+    centres: np.ndarray
+
+
+def sniff(path: Path, head: bytes) -> bool:
+    """Whether the file is called .ksplat; its content has no sign."""
+    return path.suffix.lower() == ".ksplat"
+
+
+def open_scene(path: Path) -> SceneFile:
+    """Read a scene's records; see `aaplug.io.scenes.open_scene`.
+
+    Raises:
+        FormatError: the file is damaged, or promises more than it holds.
+    """
+    with library_errors(path):
+        data = path.read_bytes()
+        level, sh_range, sections = _sections(path, data)
+        count = sum(len(s.rows) for s in sections)
+        degree = max((s.section.degree for s in sections), default=0)
+        scene = _joined([_decoded(s, level, sh_range, degree) for s in sections], degree)
+    return SceneFile(
+        path,
+        name,
+        count,
+        degree,
+        lambda start, stop: scene[start:stop],
+        EVIDENCE,
+        notes=(f"compression level {level}",),
+    )
+
+
+def _sections(path: Path, data: bytes) -> tuple[int, tuple[float, float], list[Records]]:
+    if len(data) < MAIN_SIZE:
+        raise FormatError(path, f"is cut short: a header has {MAIN_SIZE:,} bytes, {len(data):,} are there")  # fmt: skip
+    major, minor, number, count, level, least, most = MAIN.unpack_from(data)
+    if (major, level) not in ((0, 0), (0, 1), (0, 2)) or minor < 1:
+        raise FormatError(
+            path, f"has version {major}.{minor}, level {level}; known are 0.1 and levels 0 to 2"
+        )
+    check_count(path, count)
+    at = MAIN_SIZE + number * SECTION_SIZE
+    if at > len(data):
+        raise FormatError(path, f"promises {number:,} sections, more than it can hold")
+    found = []
+    for index in range(number):
+        section = Section(*SECTION.unpack_from(data, MAIN_SIZE + index * SECTION_SIZE))
+        records, at = _records(path, data, at, section, level)
+        if section.count:
+            found.append(records)
+    if sum(len(s.rows) for s in found) != count:
+        raise FormatError(path, f"promises {count:,} Gaussians, and its sections hold others")
+    return level, (least or SH_RANGE[0], most or SH_RANGE[1]), found
+
+
+def _records(path: Path, data: bytes, at: int, section: Section, level: int) -> tuple[Records, int]:
+    record = _record(section.degree, level) if section.degree <= MAX_DEGREE else None
+    sizes = 4 * section.partial
+    start = at + sizes + section.bucket_size * section.buckets
+    end = start + (record.itemsize * section.room if record else 0)
+    held = section.full + section.partial
+    wrong = record is None or section.count > section.room or end > len(data)
+    if level:
+        wrong = wrong or held > section.buckets or (section.buckets and section.bucket_size != 12)
+    if wrong:
+        raise FormatError(path, f"has a damaged section at byte {at:,}: {section}")
+    rows = np.frombuffer(data, record, section.count, start)
+    if not level:
+        return Records(section, rows, np.zeros((len(rows), 3), np.float32)), end
+    full = np.full(section.full, section.capacity, np.int64)
+    partial = np.frombuffer(data, "<u4", section.partial, at).astype(np.int64)
+    fill = np.minimum(np.concatenate([full, partial]), section.count)
+    if fill.sum() < section.count:
+        raise FormatError(path, f"has buckets for {fill.sum():,} of {section.count:,} Gaussians")
+    ends = np.cumsum(fill)
+    bucket = np.searchsorted(ends, np.arange(section.count), side="right")
+    centres = np.frombuffer(data, "<f4", 3 * section.buckets, at + sizes).reshape(-1, 3)
+    return Records(section, rows, centres[bucket]), end
+
+
+def _record(degree: int, level: int) -> np.dtype:
+    rest = 3 * ((degree + 1) ** 2 - 1)
+    return np.dtype(
+        [
+            ("means", POSITIONS[level], 3),
+            ("scales", FLOATS[level], 3),
+            ("quats", FLOATS[level], 4),
+            ("rgba", "u1", 4),
+            ("sh", HARMONICS[level], rest),
+        ]
+    )
+
+
+def _decoded(records: Records, level: int, sh_range: tuple[float, float], degree: int) -> Gaussians:
+    section, rows = records.section, records.rows
+    means = rows["means"].astype(np.float64)
+    if level:
+        steps = section.range or RANGES[level]
+        means = (means - steps) * (section.block / 2 / steps) + records.centres
+    sh = torch.zeros(len(rows), (degree + 1) ** 2, 3)
+    sh[:, 0] = sh_of_colour(floats(rows["rgba"][:, :3]) / 255)
+    rest = floats(rows["sh"])
+    if level == len(HARMONICS) - 1:
+        rest = sh_range[0] + rest / 255 * (sh_range[1] - sh_range[0])
+    for d in range(1, section.degree + 1):
+        band = rest[:, 3 * (d * d - 1) : 3 * ((d + 1) ** 2 - 1)]
+        sh[:, d * d : (d + 1) ** 2] = band.reshape(len(rows), 3, 2 * d + 1).transpose(1, 2)
+    return Gaussians(
+        floats(means),
+        floats(rows["quats"]),
+        floats(rows["scales"]).log(),
+        byte_opacities(rows["rgba"][:, 3]),
+        sh,
+    )
+
+
+def _joined(scenes: list[Gaussians], degree: int) -> Gaussians:
+    if not scenes:
+        return empty(0, degree)
+    return Gaussians(
+        torch.cat([s.means for s in scenes]),
+        torch.cat([s.quats for s in scenes]),
+        torch.cat([s.log_scales for s in scenes]),
+        torch.cat([s.logit_opacities for s in scenes]),
+        torch.cat([s.sh for s in scenes]),
+    )

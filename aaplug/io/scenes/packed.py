@@ -1,0 +1,107 @@
+"""What the compressed formats share: bounded inflation, quaternions of three components, and other axes.
+
+Arrays are numpy's as they come from files; n: rows.
+"""
+
+import io
+import zlib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+import zstandard
+from jaxtyping import Float
+from torch import Tensor
+
+from aaplug.errors import FormatError
+from aaplug.gaussians import Gaussians
+from aaplug.io.limits import limit, whole_limit
+from aaplug.io.scenes.scene_file import logit_of
+
+GZIP_WINDOW = 31  # zlib's word for a gzip stream with the largest window
+MAX_WINDOW = 1 << 27  # bytes: zstd's own most
+BYTE = 255
+
+
+def check_growth(path: Path, inflated: int, compressed: int) -> None:
+    """Refuse to inflate `compressed` bytes to more than a real scene would.
+
+    Raises:
+        FormatError: it would grow by more than the limit.
+    """
+    if inflated > limit("INFLATE") * compressed + limit("SLACK"):
+        raise FormatError(
+            path,
+            f"its {compressed:,} compressed bytes announce {inflated:,}, more than {limit('INFLATE'):g} times as many; "
+            "it is damaged or a bomb (AAPLUG_INFLATE raises the limit)",
+        )
+
+
+def gunzip_start(data: bytes, size: int) -> bytes:
+    """The first bytes of a gzip stream, fewer if it has fewer."""
+    return zlib.decompressobj(GZIP_WINDOW).decompress(data, size)
+
+
+def gunzip(data: bytes, size: int, path: Path) -> bytes:
+    """A gzip stream that should hold `size` bytes; some more are let pass.
+
+    Raises:
+        FormatError: it holds fewer, or many more.
+    """
+    most = size + whole_limit("SLACK")
+    inflated = zlib.decompressobj(GZIP_WINDOW).decompress(data, most + 1)
+    if not size <= len(inflated) <= most:
+        many = "more than " * (len(inflated) > most)
+        raise FormatError(
+            path, f"inflates to {many}{len(inflated):,} bytes where its header promises {size:,}"
+        )
+    return inflated
+
+
+def unzstd(data: bytes, size: int, path: Path) -> bytes:
+    """A zstd stream that should hold `size` bytes.
+
+    Raises:
+        FormatError: it holds another number.
+    """
+    inflater = zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW)
+    with inflater.stream_reader(io.BytesIO(data)) as stream:
+        inflated = stream.read(size + 1)
+    if len(inflated) != size:
+        raise FormatError(
+            path, f"a stream inflates to {len(inflated):,} bytes where {size:,} are promised"
+        )
+    return inflated
+
+
+def largest_last(rest: Float[Tensor, "n 3"], largest: Tensor) -> Float[Tensor, "n 4"]:
+    """Unit quaternions from three components, in order, and the index of the largest, which is left out."""
+    missing = (1 - rest.square().sum(dim=1)).clamp(min=0).sqrt()
+    order = torch.tensor([[3, 0, 1, 2], [0, 3, 1, 2], [0, 1, 3, 2], [0, 1, 2, 3]])
+    return torch.cat([rest, missing[:, None]], dim=1).gather(1, order[largest.long()])
+
+
+def byte_opacities(alpha: np.ndarray) -> Float[Tensor, " n"]:
+    """Logits of opacities stored as bytes."""
+    return logit_of(floats(alpha) / BYTE)
+
+
+def floats(values: np.ndarray) -> Tensor:
+    """A tensor of float32 of its own."""
+    return torch.from_numpy(values.astype(np.float32))
+
+
+def half_turn_about_x(scene: Gaussians) -> Gaussians:
+    """The scene with y and z negated, from OpenGL's axes to OpenCV's or back.
+
+    A harmonic of degree l and order m changes by (−1)^(m < 0) for y and (−1)^(l − |m|) for z.
+    """
+    orders = [(d, m) for d in range(scene.sh_degree + 1) for m in range(-d, d + 1)]
+    signs = torch.tensor([(-1.0) ** ((m < 0) + d - abs(m)) for d, m in orders])
+    return replace(
+        scene,
+        means=scene.means * torch.tensor([1.0, -1.0, -1.0]),
+        quats=scene.quats * torch.tensor([1.0, 1.0, -1.0, -1.0]),
+        sh=scene.sh * signs[:, None],
+    )

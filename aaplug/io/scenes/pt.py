@@ -1,0 +1,106 @@
+"""gsplat's checkpoints (.pt), a pickle in a zip, of which torch's restricted loader takes tensors and nothing else.
+
+Under the key "splats": means, scales (natural logarithms), quats (wxyz), opacities (logits), sh0 and shN.  The loader
+has had holes (CVE-2025-32434, CVE-2026-24747), so an older torch than 2.10 is refused, there is no way around the
+restriction, and the user must ask for this format by --allow-checkpoint.
+"""
+
+import re
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from aaplug.errors import FormatError
+from aaplug.gaussians import Gaussians
+from aaplug.io.limits import whole_limit
+from aaplug.io.scenes.ply import DEGREES, library_errors
+from aaplug.io.scenes.scene_file import SceneFile, check_count
+
+SAFE_TORCH = (2, 10)  # the first release without CVE-2026-24747
+SUFFIXES = (".pt", ".pth", ".ckpt")
+ZIP = b"PK\x03\x04"
+SHAPES = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (), "sh0": (1, 3)}
+EVIDENCE = "the format does not say (the run's cfg.yml has antialiased): assumed classic"
+
+name = "pt"
+
+
+def sniff(path: Path, head: bytes) -> bool:
+    """Whether the file is called like a checkpoint."""
+    return path.suffix.lower() in SUFFIXES
+
+
+def open_scene(path: Path) -> SceneFile:
+    """Look at a checkpoint; see `aaplug.io.scenes.open_scene`.
+
+    Raises:
+        FormatError: torch is too old, or the file is no gsplat checkpoint.
+    """
+    found = re.match(r"(\d+)\.(\d+)", torch.__version__)
+    if found is None or (int(found[1]), int(found[2])) < SAFE_TORCH:
+        raise FormatError(
+            path, f"needs torch 2.10 or newer to be read safely; this is {torch.__version__}"
+        )
+    with library_errors(path):
+        size = path.stat().st_size
+        _check_archive(path, size)
+        splats = _splats(path, torch.load(path, "cpu", weights_only=True, mmap=True))
+    count = len(splats["means"])
+    check_count(path, count)
+    tensors = {key: _checked(path, splats, key, count, size) for key in splats}
+    degree = DEGREES[3 * tensors["shN"].shape[1]]
+    return SceneFile(
+        path, name, count, degree, lambda start, stop: _rows(tensors, start, stop), EVIDENCE
+    )
+
+
+def _check_archive(path: Path, size: int) -> None:
+    """Torch stores members as they are; a compressed one would be inflated without a bound."""
+    if size > whole_limit("CHECKPOINT"):
+        raise FormatError(path, f"has {size:,} bytes; AAPLUG_CHECKPOINT raises the limit")
+    with zipfile.ZipFile(path) as archive:
+        members = archive.infolist()
+    if any(m.compress_type != zipfile.ZIP_STORED or m.file_size > size for m in members):
+        raise FormatError(path, "has compressed members, which torch does not write")
+
+
+def _splats(path: Path, document: Any) -> dict[str, Tensor]:
+    splats = document.get("splats", document) if isinstance(document, dict) else None
+    if not isinstance(splats, dict) or not all(isinstance(splats.get(k), Tensor) for k in SHAPES):
+        raise FormatError(path, f"holds no splats with {', '.join(SHAPES)}, as gsplat writes them")
+    means = splats["means"]
+    if means.ndim != 2:
+        raise FormatError(path, f"means has the shape {list(means.shape)}")
+    rest = splats.get("shN", torch.zeros(len(means), 0, 3))
+    if not isinstance(rest, Tensor):
+        raise FormatError(path, "shN is no tensor")
+    return {**{key: splats[key] for key in SHAPES}, "shN": rest}
+
+
+def _checked(path: Path, splats: dict[str, Tensor], key: str, count: int, size: int) -> Tensor:
+    tensor = splats[key]
+    if key in SHAPES:
+        fits = tensor.shape[1:] == SHAPES[key]
+    else:
+        fits = tensor.ndim == 3 and tensor.shape[2] == 3 and 3 * tensor.shape[1] in DEGREES
+    plain = tensor.is_floating_point() and tensor.layout == torch.strided
+    if not (fits and plain and len(tensor) == count):
+        kind = f"{tensor.dtype} of shape {list(tensor.shape)}"
+        raise FormatError(path, f"{key} is {kind}, for {count:,} Gaussians")
+    if tensor.numel() * tensor.element_size() > size:
+        raise FormatError(path, f"{key} has {tensor.numel():,} values, more than the file holds")
+    return tensor
+
+
+def _rows(tensors: dict[str, Tensor], start: int, stop: int) -> Gaussians:
+    parts = {key: tensor[start:stop].detach().float().clone() for key, tensor in tensors.items()}
+    return Gaussians(
+        parts["means"],
+        parts["quats"],
+        parts["scales"],
+        parts["opacities"],
+        torch.cat([parts["sh0"], parts["shN"]], dim=1),
+    )

@@ -1,0 +1,264 @@
+"""PlayCanvas' SOG, versions 1 and 2: meta.json and lossless WebP images, in a folder or in a .sog zip.
+
+A Gaussian is a pixel of each image, row by row.  means: 16 bits a coordinate in two images, between mins and maxs of
+sign(x)·ln(1 + |x|); quats: three bytes and the index of the largest; scales and sh0 (colour, opacity): entries of a
+codebook, in version 1 bytes between mins and maxs; shN: 16 bits that choose one of a palette, 64 entries a row.
+Images are read only where meta.json names plain files beside it.
+"""
+
+import io
+import json
+import re
+import warnings
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from PIL import Image
+from torch import Tensor
+
+from aaplug.errors import FormatError
+from aaplug.gaussians import ANTIALIASED, CLASSIC, MAX_LOG_SCALE, Convention, Gaussians
+from aaplug.io.limits import whole_limit
+from aaplug.io.scenes.packed import byte_opacities, check_growth, floats, largest_last
+from aaplug.io.scenes.ply import library_errors
+from aaplug.io.scenes.scene_file import SceneFile, check_count
+from aaplug.io.values import Entry, Place, parse_json, read_bounded
+
+META = "meta.json"
+FILE = re.compile(r"[\w\-][\w\-.]{0,99}", re.ASCII)
+ZIP = b"PK\x03\x04"
+PALETTE_ROW = 64  # entries
+LARGEST = 252  # the alpha of a quaternion whose w is largest; 253 to 255 are x, y, z
+IMAGE_MEMORY = 4  # bytes a pixel
+SPARE_PIXELS = 1 << 16  # that an image may have beyond twice those in use
+
+name = "sog"
+
+Fetch = Callable[[str, int], bytes]
+
+
+@dataclass(frozen=True)
+class Part:
+    """One of meta.json's entries, with its images as RGBA rows, a row a pixel."""
+
+    entry: Entry
+    pixels: list[np.ndarray]
+    widths: list[int]
+
+    def between(self, image: int, channels: int, rows: slice) -> Float[Tensor, "n c"]:
+        """Version 1: bytes between mins and maxs."""
+        low, high = (self.entry.vector(key, channels).float() for key in ("mins", "maxs"))
+        return torch.lerp(low, high, floats(self.pixels[image][rows, :channels]) / 255)
+
+    def coded(self, image: int, rows: slice) -> Float[Tensor, "n 3"]:
+        """Version 2: bytes that choose from a codebook."""
+        return self.codebook[torch.from_numpy(self.pixels[image][rows, :3].astype(np.int64))]
+
+    @property
+    def codebook(self) -> Float[Tensor, " 256"]:
+        """The values that bytes stand for."""
+        return self.entry.vector("codebook", 256).float()
+
+
+def sniff(path: Path, head: bytes) -> bool:
+    """Whether this looks like a SOG's meta.json, or a zip by that name."""
+    zipped = head.startswith(ZIP) and path.suffix.lower() in (".sog", ".zip")
+    return zipped or (path.name == META and head.lstrip().startswith(b"{"))
+
+
+def open_scene(path: Path) -> SceneFile:
+    """Decode a scene's images; see `aaplug.io.scenes.open_scene`.
+
+    Raises:
+        FormatError: the file is damaged, names files elsewhere, or promises more than it can hold.
+    """
+    with library_errors(path):
+        if path.name == META:
+            meta = parse_json(read_bounded(path, whole_limit("JSON")), path)
+            return _scene(path, meta, lambda file, most: _from_folder(path, file, most))
+        with zipfile.ZipFile(path) as archive:
+            meta = parse_json(_from_zip(path, archive, META, whole_limit("JSON")), path)
+            return _scene(path, meta, lambda file, most: _from_zip(path, archive, file, most))
+
+
+def _from_folder(path: Path, file: str, most: int) -> bytes:
+    image = path.parent / file
+    if not image.resolve().is_relative_to(path.parent.resolve()):
+        raise FormatError(path, f"names {file!r}, a link that leads out of its folder")
+    return read_bounded(image, most)
+
+
+def _from_zip(path: Path, archive: zipfile.ZipFile, file: str, most: int) -> bytes:
+    inside = [i for i in archive.infolist() if i.filename.rpartition("/")[2] == file]
+    if len(inside) != 1:
+        raise FormatError(path, f"should hold {file} once, and holds it {len(inside)} times")
+    check_growth(path, inside[0].file_size, inside[0].compress_size)
+    if inside[0].file_size > most:
+        raise FormatError(path, f"{file} has {inside[0].file_size:,} bytes, more than {most:,}")
+    with archive.open(inside[0]) as stream:
+        return stream.read(most + 1)
+
+
+def _scene(path: Path, meta: Any, fetch: Fetch) -> SceneFile:
+    if not isinstance(meta, dict):
+        raise FormatError(path, "should be an object with means, scales, quats and sh0")
+    place = Place(path, META)
+    root = Entry(place, meta)
+    version = root.fields.get("version", 1)
+    if version not in (1, 2) or (version == 2) != ("version" in meta):
+        raise place.wrong("version", "2, or left out", version)
+    count = _count(root, version)
+    check_count(path, count)
+    used = [key for key in ("means", "quats", "scales", "sh0", "shN") if meta.get(key)]
+    parts = {key: _part(path, root, key, count, fetch) for key in used}
+    lacking = [key for key in ("means", "quats", "scales", "sh0") if key not in parts]
+    if lacking:
+        raise place.error(f"{lacking[0]} is missing")
+    palette = _palette(parts["shN"], version) if "shN" in parts else torch.zeros(1, 0, 3)
+    degree = round((palette.shape[1] + 1) ** 0.5) - 1
+    convention, evidence, flat = _meaning(meta)
+    return SceneFile(
+        path,
+        name,
+        count,
+        degree,
+        lambda start, stop: _rows(parts, palette, version, flat, slice(start, stop)),
+        evidence,
+        convention,
+        flat=flat,
+        notes=(f"version {version}",),
+    )
+
+
+def _count(root: Entry, version: int) -> int:
+    value = (
+        root.number("count") if version > 1 else _section(root, "means").fields.get("shape", [0])
+    )
+    number = value[0] if isinstance(value, list) and value else value
+    if not isinstance(number, int | float) or number < 0 or number != int(number):
+        raise root.place.wrong("count", "a whole number", number)
+    return int(number)
+
+
+def _section(root: Entry, key: str) -> Entry:
+    value = root.value(key)
+    if not isinstance(value, dict):
+        raise root.place.wrong(key, "an object", value)
+    return Entry(Place(root.place.file, key), value)
+
+
+def _part(path: Path, root: Entry, key: str, count: int, fetch: Fetch) -> Part:
+    entry = _section(root, key)
+    files = entry.value("files")
+    wanted = 2 if key in ("means", "shN") else 1
+    if not isinstance(files, list) or len(files) != wanted:
+        raise entry.place.wrong("files", f"{wanted} names", files)
+    pixels, widths = [], []
+    for index, file in enumerate(files):
+        if not isinstance(file, str) or not FILE.fullmatch(file):
+            raise entry.place.wrong("files", "names of plain files beside meta.json", file)
+        palette = key == "shN" and index == 0
+        noisy = key == "means" and index == 0  # low bytes do not compress, so they tell the size
+        rgba, width = _image(path, file, fetch, None if palette else count, noisy)
+        pixels.append(rgba)
+        widths.append(width)
+    return Part(entry, pixels, widths)
+
+
+def _image(
+    path: Path, file: str, fetch: Fetch, count: int | None, noisy: bool
+) -> tuple[np.ndarray, int]:
+    """RGBA of a lossless WebP, a row a pixel; no larger than `count` pixels ask for."""
+    most = 2 * count + SPARE_PIXELS if count is not None else PALETTE_ROW * 15 * (1 << 10)
+    data = fetch(file, IMAGE_MEMORY * most + whole_limit("SLACK"))
+    if noisy:
+        check_growth(path, IMAGE_MEMORY * (count or 0), len(data))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # Pillow's, of large images; ours is the bound below
+        with Image.open(io.BytesIO(data), formats=["WEBP"]) as image:
+            width, height = image.size
+            if width * height > most or width * height < (count or 1):
+                raise FormatError(
+                    path, f"{file} has {width}x{height} px, and {count or most:,} are wanted"
+                )
+            return np.asarray(image.convert("RGBA")).reshape(-1, 4), width
+
+
+def _meaning(meta: dict[str, Any]) -> tuple[Convention, str, bool]:
+    model = meta.get("model")
+    if model is None:
+        return CLASSIC, "no model in meta.json: assumed classic (3DGS default)", False
+    said = f"model in meta.json: {json.dumps(model)[:40]}"
+    if model == "antialiased":
+        return ANTIALIASED, f"{said}; its kernel is not recorded, 0.3 px² assumed", False
+    if model == "2dgs":
+        return CLASSIC, f"{said}: 2D Gaussians, taken for classic", True
+    return CLASSIC, said + ("" if model == "default" else " is unknown: assumed classic"), False
+
+
+def _palette(part: Part, version: int) -> Float[Tensor, "p c 3"]:
+    """The harmonics that labels choose from."""
+    width = part.widths[0]
+    coefficients = {3: 3, 8: 8, 15: 15}.get(width // PALETTE_ROW)
+    if coefficients is None or width % PALETTE_ROW:
+        raise part.entry.place.error(
+            f"the palette's image is {width} px wide; 192, 512 or 960 expected"
+        )
+    pixels = part.pixels[0][:, :3].reshape(-1, coefficients, 3)
+    if version > 1:
+        return part.codebook[torch.from_numpy(pixels.astype(np.int64))]
+    low, high = part.entry.number("mins"), part.entry.number("maxs")
+    return floats(pixels) / 255 * (high - low) + low
+
+
+def _rows(
+    parts: dict[str, Part],
+    palette: Float[Tensor, "p c 3"],
+    version: int,
+    flat: bool,
+    rows: slice,
+) -> Gaussians:
+    means, quats, scales, sh0 = (parts[key] for key in ("means", "quats", "scales", "sh0"))
+    alpha = sh0.pixels[0][rows, 3]
+    if version > 1:
+        log_scales, colours = scales.coded(0, rows), sh0.coded(0, rows)
+        logits = byte_opacities(alpha)
+    else:
+        log_scales, both = scales.between(0, 3, rows), sh0.between(0, 4, rows)
+        colours, logits = both[:, :3], both[:, 3]
+    sh = torch.zeros(len(alpha), 1 + palette.shape[1], 3)
+    sh[:, 0] = colours
+    if "shN" in parts:
+        sh[:, 1:] = _chosen(parts["shN"], palette, rows)
+    if flat:
+        log_scales[:, 2] = -MAX_LOG_SCALE
+    return Gaussians(_means(means, rows), _quats(quats.pixels[0][rows]), log_scales, logits, sh)
+
+
+def _means(part: Part, rows: slice) -> Float[Tensor, "n 3"]:
+    low, high = (part.pixels[i][rows, :3].astype(np.float64) for i in range(2))
+    least, most = part.entry.vector("mins", 3), part.entry.vector("maxs", 3)
+    span = torch.where(most == least, 1.0, most - least)
+    logs = least + span * torch.from_numpy((low + 256 * high) / 65535)
+    return (logs.sign() * logs.abs().expm1()).float()
+
+
+def _quats(pixels: np.ndarray) -> Float[Tensor, "n 4"]:
+    rest = (floats(pixels[:, :3]) / 255 - 0.5) * 2**0.5
+    known = torch.from_numpy(pixels[:, 3] >= LARGEST)
+    largest = torch.from_numpy(pixels[:, 3].astype(np.int64)) - LARGEST
+    quats = largest_last(rest, largest.clamp(min=0))
+    return torch.where(known[:, None], quats, torch.tensor([1.0, 0.0, 0.0, 0.0]))
+
+
+def _chosen(part: Part, palette: Float[Tensor, "p c 3"], rows: slice) -> Float[Tensor, "n c 3"]:
+    labels = part.pixels[1][rows].astype(np.int64)
+    index = torch.from_numpy(labels[:, 0] + 256 * labels[:, 1])
+    chosen = palette[index.clamp(max=len(palette) - 1)]
+    return chosen * (index < len(palette))[:, None, None]

@@ -1,0 +1,164 @@
+"""One small scene in every format: by splat-transform where it writes it (tests/data), else packed by hand."""
+
+import gzip
+import struct
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from aaplug.gaussians import Gaussians
+from aaplug.io.scenes import read_scene
+
+DATA = Path(__file__).resolve().parent / "data"
+ORACLE = (
+    DATA / "oracle.ply"
+)  # random, 40 Gaussians of degree 3, tagged mip; the others are made of it
+
+
+def oracle() -> Gaussians:
+    return read_scene(ORACLE)
+
+
+def bytes_of(values: torch.Tensor, gain: float, offset: float) -> np.ndarray:
+    return (values * gain + offset).round().clamp(0, 255).to(torch.uint8).numpy()
+
+
+def spz(version: int, zipped: bool = True, flags: int = 1, degree: int = 3) -> bytes:
+    """Versions 1 and 2, and what is common to all before 4, in OpenGL's axes."""
+    s = oracle()
+    flip = torch.tensor([1.0, -1.0, -1.0])
+    means, k = s.means * flip, (degree + 1) ** 2
+    signs = [(-1.0) ** ((m < 0) + d - abs(m)) for d in range(degree + 1) for m in range(-d, d + 1)]
+    sh = torch.zeros(len(s), k, 3)
+    sh[:, : min(k, 16)] = s.sh[:, :k]
+    sh = sh * torch.tensor(signs)[:, None]
+    fixed = (means.double() * 4096).round().to(torch.int32).numpy().astype("<i4")
+    positions = fixed.view(np.uint8).reshape(len(s), 3, 4)[..., :3].tobytes()
+    if version == 1:
+        positions = means.half().numpy().astype("<f2").tobytes()
+    w, *xyz = s.unit_quats.T
+    turned = torch.stack(xyz, 1) * flip * torch.where(w < 0, -1.0, 1.0)[:, None]
+    body = [
+        positions,
+        bytes_of(s.opacities, 255, 0).tobytes(),
+        bytes_of(s.sh[:, 0], 0.15 * 255, 127.5).tobytes(),
+        bytes_of(s.log_scales, 16, 160).tobytes(),
+        bytes_of(turned, 127.5, 127.5).tobytes(),
+        bytes_of(sh[:, 1:], 128, 128).tobytes(),
+    ]
+    data = struct.pack("<4sIIBBBB", b"NGSP", version, len(s), degree, 12, flags, 0) + b"".join(body)
+    return gzip.compress(data, mtime=0) if zipped else data
+
+
+def splat() -> bytes:
+    s = oracle()
+    rows = []
+    for i in range(len(s)):
+        rgb = 0.5 + 0.28209479177387814 * s.sh[i, 0]
+        rows.append(struct.pack("<6f", *s.means[i].tolist(), *s.scales[i].tolist()))
+        rows.append(bytes_of(torch.cat([rgb, s.opacities[i : i + 1]]), 255, 0).tobytes())
+        rows.append(bytes_of(s.unit_quats[i], 128, 128).tobytes())
+    return b"".join(rows)
+
+
+def ksplat(level: int, degree: int = 2, per_bucket: int = 16) -> bytes:
+    """One section in buckets of 16, the last one filled in part."""
+    s, block, steps = oracle(), 8.0, 32767
+    n, k = len(s), (degree + 1) ** 2
+    full, left = divmod(n, per_bucket)
+    centres = np.array([[0.1, -0.2, 0.3]] * (full + 1), "<f4")
+    bands = [
+        s.sh[:, d * d : (d + 1) ** 2].transpose(1, 2).reshape(n, -1) for d in range(1, degree + 1)
+    ]
+    rest = torch.cat([torch.zeros(n, 0), *bands], dim=1).numpy()
+    assert rest.shape[1] == 3 * (k - 1)
+    wide, sh_type = ("<f4", "<f4") if level == 0 else ("<f2", "<f2" if level == 1 else "u1")
+    record = np.dtype(
+        [
+            ("p", "<f4" if level == 0 else "<u2", 3),
+            ("s", wide, 3),
+            ("q", wide, 4),
+            ("c", "u1", 4),
+            ("h", sh_type, rest.shape[1]),
+        ]
+    )
+    rows = np.zeros(n, record)
+    means = s.means.numpy()
+    rows["p"] = (
+        means if level == 0 else np.round((means - centres[0]) * steps / (block / 2) + steps)
+    )
+    rows["s"], rows["q"] = s.scales.numpy(), s.unit_quats.numpy()
+    rgb = 0.5 + 0.28209479177387814 * s.sh[:, 0]
+    rows["c"] = bytes_of(torch.cat([rgb, s.opacities[:, None]], 1), 255, 0)
+    rows["h"] = rest if level < 2 else np.round((rest + 1.5) / 3 * 255).clip(0, 255)
+    main = bytearray(4096)
+    struct.pack_into("<BBxxIIIIHxx", main, 0, 0, 1, 1, 1, n, n, level)
+    struct.pack_into("<ff", main, 36, -1.5, 1.5)
+    section = bytearray(1024)
+    buckets = (0, 0, 0, 0) if level == 0 else (per_bucket, full + 1, full, 1)
+    struct.pack_into(
+        "<IIIIfHxxIxxxxIIH",
+        section,
+        0,
+        n,
+        n,
+        *buckets[:2],
+        block,
+        12 * (level > 0),
+        steps,
+        *buckets[2:],
+        degree,
+    )
+    body = b"" if level == 0 else struct.pack("<I", left) + centres.tobytes()
+    return bytes(main + section) + body + rows.tobytes()
+
+
+def splats() -> dict[str, torch.Tensor]:
+    """The scene as gsplat's trainer holds it."""
+    s = oracle()
+    return {
+        "means": s.means.clone(),
+        "scales": s.log_scales.clone(),
+        "quats": s.quats.clone(),
+        "opacities": s.logit_opacities.clone(),
+        "sh0": s.sh[:, :1].clone(),
+        "shN": s.sh[:, 1:].clone(),
+    }
+
+
+def checkpoint(path: Path) -> None:
+    torch.save({"step": 1, "splats": splats()}, path)
+
+
+MADE: Mapping[str, Callable[[], bytes]] = {
+    "v1.spz": lambda: spz(1),
+    "v2.spz": lambda: spz(2),
+    "raw.spz": lambda: spz(2, zipped=False),
+    "degree4.spz": lambda: spz(2, degree=4),
+    "plain.splat": splat,
+    "level0.ksplat": lambda: ksplat(0),
+    "level1.ksplat": lambda: ksplat(1),
+    "level2.ksplat": lambda: ksplat(2),
+}
+STORED = (
+    "oracle.ply",
+    "oracle.compressed.ply",
+    "oracle_v3.spz",
+    "oracle_v4.spz",
+    "oracle.sog",
+    "oracle_sog/meta.json",
+)
+
+
+def write_file(folder: Path, name: str) -> Path:
+    """The file of that name of MADE or STORED, or a checkpoint, in a folder."""
+    path = folder / name
+    if name.endswith(".pt"):
+        checkpoint(path)
+    elif name in MADE:
+        path.write_bytes(MADE[name]())
+    else:
+        return DATA / name
+    return path

@@ -1,0 +1,407 @@
+"""The compressed formats against the scene that they were made of, within a step of what each one stores."""
+
+import io
+import json
+import struct
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial import cKDTree
+
+from aaplug.errors import FormatError
+from aaplug.gaussians import ANTIALIASED, CLASSIC, MAX_LOG_SCALE, MIP, Gaussians
+from aaplug.io.scenes import find_scene, open_scene, read_scene, write_scene
+from tests.scene_files import DATA, MADE, ksplat, oracle, splat, splats, spz, write_file
+
+CARRY_A_TAG = {
+    "oracle.compressed.ply": MIP,
+    "oracle_v3.spz": ANTIALIASED,
+    "oracle_v4.spz": ANTIALIASED,
+    "oracle.sog": ANTIALIASED,
+    "oracle_sog/meta.json": ANTIALIASED,
+    "v1.spz": ANTIALIASED,
+    "v2.spz": ANTIALIASED,
+    "raw.spz": ANTIALIASED,
+    "degree4.spz": ANTIALIASED,
+}
+TAGLESS = ("plain.splat", "level0.ksplat", "level1.ksplat", "level2.ksplat", "run.pt")
+# largest errors of position, log-scale, opacity, colour and harmonics: a step of each format
+STEPS = {
+    "oracle.compressed.ply": (3e-3, 3e-3, 3e-3, 0.02, 0.02),
+    "v1.spz": (2e-3, 0.04, 3e-3, 0.02, 6e-3),
+    "spz": (3e-4, 0.04, 3e-3, 0.02, 0.07),  # its writers keep 4 or 5 bits of harmonics
+    "v2.spz": (3e-4, 0.04, 3e-3, 0.02, 6e-3),
+    "raw.spz": (3e-4, 0.04, 3e-3, 0.02, 6e-3),
+    "degree4.spz": (3e-4, 0.04, 3e-3, 0.02, 6e-3),
+    "sog": (2e-4, 0.03, 4e-3, 0.03, 0.7),  # 256 values a codebook; harmonics share a palette
+    "splat": (0.0, 1e-5, 3e-3, 8e-3, 0.0),
+    "level0.ksplat": (0.0, 1e-5, 3e-3, 8e-3, 0.0),
+    "level1.ksplat": (2e-4, 1e-3, 3e-3, 8e-3, 1e-3),
+    "level2.ksplat": (2e-4, 1e-3, 3e-3, 8e-3, 8e-3),
+    "pt": (0.0, 0.0, 1e-6, 0.0, 0.0),
+}
+BY_KIND = {
+    "oracle_v3.spz": "spz",
+    "oracle_v4.spz": "spz",
+    "oracle.sog": "sog",
+    "oracle_sog/meta.json": "sog",
+    "plain.splat": "splat",
+    "run.pt": "pt",
+}
+
+
+@pytest.fixture
+def expected() -> Gaussians:
+    return oracle()
+
+
+def in_the_same_order(scene: Gaussians, expected: Gaussians) -> Gaussians:
+    """The expected scene's rows as the file has them: writers sort, so nearest positions pair up."""
+    nearest = torch.cdist(scene.means, expected.means).argmin(dim=1)
+    assert len(nearest.unique()) == len(expected)
+    return expected[nearest]
+
+
+@pytest.mark.parametrize("name", [*CARRY_A_TAG, *TAGLESS])
+def test_each_format_gives_the_scene_within_its_steps(tmp_path: Path, expected, name: str):
+    axes = "opencv" if name.startswith("oracle_v") else "opengl"  # splat-transform turns none
+    scene = read_scene(write_file(tmp_path, name), allow_checkpoint=True, spz_axes=axes)
+    position, scale, opacity, colour, rest = STEPS[BY_KIND.get(name, name)]
+    assert len(scene) == len(expected)
+    twin = in_the_same_order(scene, expected)
+    k = min(scene.sh.shape[1], twin.sh.shape[1])
+    # what most formats store lies in a range; what the scene has beyond it is cut off
+    shown = [(0.5 + 0.2821 * s.sh[:, 0]).clamp(0, 1) for s in (scene, twin)]
+    for got, wanted, step in (
+        (scene.means, twin.means, position),
+        (scene.log_scales, twin.log_scales, scale),
+        (scene.opacities, twin.opacities, opacity),
+        (*shown, colour),
+        (scene.sh[:, 1:k].clamp(-0.99, 0.99), twin.sh[:, 1:k].clamp(-0.99, 0.99), rest),
+    ):
+        torch.testing.assert_close(got, wanted, rtol=1e-6, atol=step + 1e-6)
+    both = torch.stack([scene.sh[:, 1:k].flatten(), twin.sh[:, 1:k].flatten()])
+    assert k == 1 or torch.corrcoef(both)[0, 1] > 0.9
+    alignment = (scene.unit_quats * twin.unit_quats).sum(dim=1).abs()
+    assert alignment.min() > (0.997 if name in MADE and name.endswith("spz") else 0.9998)
+    assert (scene.convention, scene.flat) == (CARRY_A_TAG.get(name, CLASSIC), False)
+
+
+@pytest.mark.parametrize("name", [*CARRY_A_TAG, *TAGLESS])
+def test_each_format_is_read_in_parts_too(tmp_path: Path, name: str):
+    opened = open_scene(write_file(tmp_path, name), allow_checkpoint=True)
+    whole, parts = opened.whole(), list(opened.parts(size=16))
+    assert [len(part) for part in parts] == [16, 16, 8]
+    for field in ("means", "quats", "log_scales", "logit_opacities", "sh"):
+        assert torch.equal(torch.cat([getattr(p, field) for p in parts]), getattr(whole, field))
+
+
+@pytest.mark.parametrize("name", [*CARRY_A_TAG, *TAGLESS])
+def test_each_format_can_be_written_as_ply(tmp_path: Path, name: str):
+    scene = read_scene(write_file(tmp_path, name), allow_checkpoint=True)
+    write_scene(tmp_path / "out.ply", scene)
+    again = read_scene(tmp_path / "out.ply")
+    assert torch.equal(again.means, scene.means)
+    assert torch.equal(again.sh, scene.sh)
+    assert again.convention == scene.convention
+
+
+@pytest.mark.parametrize("flags", [0, 1, 2, 3])
+def test_spz_flag_1_is_antialiasing(tmp_path: Path, flags: int):
+    (tmp_path / "a.spz").write_bytes(spz(2, flags=flags))
+    scene = open_scene(tmp_path / "a.spz")
+    assert scene.convention == (ANTIALIASED if flags & 1 else CLASSIC)
+    assert "flag" in scene.evidence
+
+
+def test_spz_axes_can_be_left_as_they_are(tmp_path: Path):
+    (tmp_path / "a.spz").write_bytes(spz(2))
+    turned = read_scene(tmp_path / "a.spz")
+    stored = read_scene(tmp_path / "a.spz", spz_axes="opencv")
+    assert torch.equal(stored.means, turned.means * torch.tensor([1.0, -1.0, -1.0]))
+    assert "--spz-axes" in open_scene(tmp_path / "a.spz", spz_axes="opencv").notes[0]
+
+
+def test_a_half_turn_of_the_scene_is_a_half_turn_of_the_view():
+    """Colours seen from turned directions are those seen before."""
+    from aaplug.io.scenes.packed import half_turn_about_x
+    from aaplug.projection import sh_colour
+
+    scene = oracle()
+    directions = torch.nn.functional.normalize(torch.randn(len(scene), 3), dim=1)
+    turned = directions * torch.tensor([1.0, -1.0, -1.0])
+    seen = sh_colour(scene.sh, directions)
+    torch.testing.assert_close(sh_colour(half_turn_about_x(scene).sh, turned), seen)
+
+
+def test_splat_is_written_as_it_is_read(tmp_path: Path):
+    (tmp_path / "in.splat").write_bytes(splat())
+    write_scene(tmp_path / "out.splat", read_scene(tmp_path / "in.splat"))
+    old, new = (
+        np.frombuffer((tmp_path / n).read_bytes(), np.uint8).reshape(-1, 32)
+        for n in ("in.splat", "out.splat")
+    )
+    assert (old[:, :12] == new[:, :12]).all()
+    assert np.abs(old[:, 24:].astype(int) - new[:, 24:]).max() <= 1
+
+
+def test_a_sog_folder_is_a_scene(expected):
+    assert find_scene(DATA / "oracle_sog").name == "meta.json"
+    assert open_scene(find_scene(DATA / "oracle_sog")).count == len(expected)
+
+
+def sog_folder(folder: Path, **changes: object) -> Path:
+    for file in (DATA / "oracle_sog").iterdir():
+        (folder / file.name).write_bytes(file.read_bytes())
+    meta = json.loads((folder / "meta.json").read_text()) | changes
+    (folder / "meta.json").write_text(json.dumps({k: v for k, v in meta.items() if v is not None}))
+    return folder / "meta.json"
+
+
+def test_version_1_of_sog(tmp_path: Path, expected):
+    """Bytes between least and most, the logit of opacity among them."""
+    meta = json.loads((DATA / "oracle_sog" / "meta.json").read_text())
+    first = {
+        "means": {**meta["means"], "shape": [40, 3]},
+        "scales": {"mins": [-5.0] * 3, "maxs": [0.0] * 3, "files": ["scales.webp"]},
+        "sh0": {"mins": [-1.0] * 3 + [-4.0], "maxs": [1.0] * 3 + [4.0], "files": ["sh0.webp"]},
+        "quats": meta["quats"],
+        "shN": {"mins": -2.0, "maxs": 2.0, "files": meta["shN"]["files"]},
+    }
+    path = sog_folder(tmp_path)
+    path.write_text(json.dumps(first))
+    scene, second = read_scene(path), read_scene(DATA / "oracle_sog" / "meta.json")
+    assert torch.equal(scene.means, second.means)
+    assert scene.sh_degree == 3
+    steps = (scene.log_scales + 5) / 5 * 255
+    torch.testing.assert_close(steps, steps.round(), atol=1e-3, rtol=0)
+    assert scene.logit_opacities.abs().max() <= 4
+    assert scene.convention == CLASSIC
+
+
+def test_sog_of_discs(tmp_path: Path):
+    scene = read_scene(sog_folder(tmp_path, model="2dgs"))
+    assert scene.flat
+    assert (scene.log_scales[:, 2] == -MAX_LOG_SCALE).all()
+    assert open_scene(sog_folder(tmp_path, model=None)).convention == CLASSIC
+
+
+# Hostile files
+
+
+@pytest.mark.parametrize(
+    "file", ["../secret.webp", "/etc/passwd", "a/b.webp", "C:\\x.webp", "..", "", 3, "x\0"]
+)
+def test_sog_reads_nothing_elsewhere(tmp_path: Path, file: object):
+    quats = {"files": [file]}
+    with pytest.raises(FormatError, match=r"files should be names of plain files"):
+        read_scene(sog_folder(tmp_path, quats=quats))
+
+
+def test_sog_follows_no_link_out_of_its_folder(tmp_path: Path):
+    (tmp_path / "scene").mkdir()
+    path = sog_folder(tmp_path / "scene")
+    (tmp_path / "outside.webp").write_bytes((tmp_path / "scene" / "quats.webp").read_bytes())
+    (tmp_path / "scene" / "quats.webp").unlink()
+    (tmp_path / "scene" / "quats.webp").symlink_to(tmp_path / "outside.webp")
+    with pytest.raises(FormatError, match="leads out of its folder"):
+        read_scene(path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "problem"),
+    [
+        ({"count": 10**12}, "limit is 100,000,000"),
+        ({"count": 90_000_000}, "bomb"),
+        ({"count": -1}, "whole number"),
+        ({"count": 2.5}, "whole number"),
+        ({"count": True}, "number"),
+        ({"version": 3}, "version should be 2"),
+        ({"means": None}, "means is missing"),
+        ({"scales": {"codebook": [1.0], "files": ["scales.webp"]}}, "codebook should be 256"),
+        ({"quats": {"files": ["quats.webp", "quats.webp"]}}, "files should be 1 names"),
+        ({"quats": {"files": ["meta.json"]}}, "cannot be read"),
+        ({"quats": {"files": ["none.webp"]}}, "no such file"),
+        ({"quats": 5}, "quats should be an object"),
+    ],
+    ids=str,
+)
+def test_odd_sogs_are_refused(tmp_path: Path, changes: dict[str, object], problem: str):
+    with pytest.raises(FormatError, match=problem):
+        read_scene(sog_folder(tmp_path, **changes))
+
+
+def test_a_zip_bomb_is_refused(tmp_path: Path):
+    with zipfile.ZipFile(tmp_path / "bomb.sog", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("meta.json", b" " * (50 << 20))
+    with pytest.raises(FormatError, match="bomb"):
+        read_scene(tmp_path / "bomb.sog")
+
+
+@pytest.mark.parametrize("points", [1, 10**6, 2**32 - 1])
+def test_a_gzip_bomb_is_refused(tmp_path: Path, points: int):
+    """The case of 306 kB and 300 MB of zeros that other readers inflate."""
+    import zlib
+
+    squeeze = zlib.compressobj(9, wbits=31)
+    header = struct.pack("<4sIIBBBB", b"NGSP", 3, points, 0, 12, 0, 0)
+    zeros = b"".join(squeeze.compress(bytes(1 << 20)) for _ in range(300))
+    (tmp_path / "bomb.spz").write_bytes(squeeze.compress(header) + zeros + squeeze.flush())
+    with pytest.raises(FormatError, match=r"inflates to|bomb|limit"):
+        read_scene(tmp_path / "bomb.spz")
+
+
+def test_spz_streams_are_held_to_their_size(tmp_path: Path):
+    data = bytearray((DATA / "oracle_v4.spz").read_bytes())
+    for wrong in (0, 2**63, 361):
+        struct.pack_into("<Q", data, 32 + 8, wrong)
+        (tmp_path / "a.spz").write_bytes(data)
+        with pytest.raises(FormatError, match=r"lists a stream|announce"):
+            read_scene(tmp_path / "a.spz")
+
+
+@pytest.mark.parametrize("level", [0, 1, 2])
+@pytest.mark.parametrize("offset", [4, 16, 20, 4096, 4104, 4108, 4128, 4132, 4136])
+def test_ksplat_counts_that_lie_do_no_harm(tmp_path: Path, level: int, offset: int):
+    data = bytearray(ksplat(level))
+    struct.pack_into("<H" if offset in (20, 4136) else "<I", data, offset, 65000)
+    (tmp_path / "a.ksplat").write_bytes(data)
+    try:
+        scene = read_scene(tmp_path / "a.ksplat")
+    except FormatError:
+        return
+    assert (
+        offset in (4104, 4128) or level == 0
+    )  # room in buckets, and for blocks: what is there is read
+    assert len(scene) == 40
+
+
+def test_a_checkpoint_needs_the_users_word(tmp_path: Path):
+    path = write_file(tmp_path, "run.pt")
+    with pytest.raises(FormatError, match="--allow-checkpoint"):
+        read_scene(path)
+
+
+class Trap:
+    def __reduce__(self):
+        return Path.touch, (Path("trap"),)
+
+
+@pytest.mark.parametrize(
+    "content", [Trap(), {"splats": Trap()}, [1], {"splats": {"means": 3}}], ids=range(4)
+)
+def test_a_checkpoint_runs_nothing(tmp_path: Path, monkeypatch, content: object):
+    monkeypatch.chdir(tmp_path)
+    torch.save(content, tmp_path / "a.pt")
+    with pytest.raises(FormatError):
+        read_scene(tmp_path / "a.pt", allow_checkpoint=True)
+    assert not (tmp_path / "trap").exists()
+
+
+def test_a_checkpoint_is_not_inflated(tmp_path: Path):
+    stream = io.BytesIO()
+    torch.save({"splats": {}}, stream)
+    with zipfile.ZipFile(tmp_path / "a.pt", "w", zipfile.ZIP_DEFLATED) as new:
+        for member in zipfile.ZipFile(stream).infolist():
+            new.writestr(member.filename, zipfile.ZipFile(stream).read(member))
+    with pytest.raises(FormatError, match="compressed members"):
+        read_scene(tmp_path / "a.pt", allow_checkpoint=True)
+
+
+def test_a_checkpoint_of_wrong_shapes_is_refused(tmp_path: Path):
+    good = splats()
+    for key, value in {
+        "means": torch.zeros(()),
+        "quats": torch.zeros(40, 3),
+        "scales": torch.zeros(40, 3, dtype=torch.int32),
+        "shN": torch.zeros(40, 5, 3),
+        "opacities": torch.zeros(39),
+        "sh0": torch.zeros(1).expand(40, 1, 3)[:, :, :2],
+    }.items():
+        torch.save({"splats": good | {key: value}}, tmp_path / "a.pt")
+        with pytest.raises(FormatError):
+            read_scene(tmp_path / "a.pt", allow_checkpoint=True)
+    large = torch.zeros(1).expand(10**9)
+    torch.save({"splats": good | {"opacities": large}}, tmp_path / "a.pt")
+    with pytest.raises(FormatError):
+        read_scene(tmp_path / "a.pt", allow_checkpoint=True)
+
+
+def test_an_older_torch_is_refused(tmp_path: Path, monkeypatch):
+    path = write_file(tmp_path, "run.pt")
+    monkeypatch.setattr(torch, "__version__", "2.9.1")
+    with pytest.raises(FormatError, match=r"needs torch 2\.10"):
+        read_scene(path, allow_checkpoint=True)
+
+
+def test_bytes_of_an_opaque_gaussian_stay_finite(tmp_path: Path):
+    data = bytearray(splat())
+    data[24:28] = b"\xff" * 4
+    data[32 + 24 : 32 + 28] = b"\0" * 4
+    (tmp_path / "a.splat").write_bytes(data)
+    scene = read_scene(tmp_path / "a.splat")
+    assert scene.logit_opacities.isfinite().all()
+    assert scene.opacities[0] > 0.999999
+    assert scene.opacities[1] < 1e-6
+
+
+@pytest.mark.data
+def test_the_same_points_in_three_formats(shared_data):
+    folder = shared_data / "formats/small_splats/metalsplatter/SplatIO/TestData"
+    ply, packed, spzs = (
+        read_scene(folder / f"test-splat.3-points-from-train.{e}") for e in ("ply", "splat", "spz")
+    )
+    for scene in (packed, spzs):
+        torch.testing.assert_close(scene.means, ply.means, atol=1e-3, rtol=0)
+        torch.testing.assert_close(scene.log_scales, ply.log_scales, atol=0.04, rtol=0)
+        assert (scene.unit_quats * ply.unit_quats).sum(dim=1).abs().min() > 0.999
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(
+    ("name", "n", "degree"),
+    [
+        ("splats/guitar.compressed.ply", 90_854, 0),
+        ("splats/biker.spz", 152_746, 0),
+        ("splats/flowers_lod3_sog/meta.json", 26_895, 2),
+        ("small_splats/splat-transform_fixtures/minimal-raw.spz", 4, 0),
+        ("small_splats/splat-transform_fixtures/minimal-v2.spz", 4, 0),
+        ("small_splats/splat-transform_fixtures/minimal-v3.spz", 4, 0),
+        ("small_splats/splat-transform_fixtures/minimal-v4.spz", 4, 0),
+        ("small_splats/splat-transform_fixtures/minimal.splat", 4, 0),
+        ("small_splats/splat-transform_fixtures/minimal.ksplat", 4, 0),
+        (
+            "small_splats/schwa/Examples/MetalGaussianSplatsDemo/Sample Splats/centered_lastchance.splat",
+            14_007,
+            0,
+        ),
+    ],
+)
+def test_real_compressed_scenes_are_read(shared_data, name: str, n: int, degree: int):
+    scene = read_scene(shared_data / "formats" / name)
+    assert (len(scene), scene.sh_degree) == (n, degree)
+    assert scene.means.isfinite().all()
+
+
+@pytest.mark.data
+def test_sog_is_the_ply_that_it_was_made_of(shared_data):
+    folder = shared_data / "formats/splats"
+    sog, ply = (
+        read_scene(folder / "flowers_lod3_sog/meta.json"),
+        read_scene(folder / "flowers_lod3_sh2.ply"),
+    )
+    twin = in_the_same_order_of(sog, ply)
+    assert (sog.means - twin.means).abs().max() < 1e-3
+
+
+def in_the_same_order_of(scene: Gaussians, expected: Gaussians) -> Gaussians:
+    return expected[torch.from_numpy(cKDTree(expected.means.numpy()).query(scene.means.numpy())[1])]
+
+
+def test_every_fixture_is_covered():
+    assert set(MADE) | {"run.pt"} <= {*CARRY_A_TAG, *TAGLESS}
+    assert replace(oracle(), origin=None).convention == MIP

@@ -1,0 +1,196 @@
+"""What is done part by part is what would be done with the whole."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from aaplug_cli.main import main
+
+from aaplug.cameras import Camera
+from aaplug.conversion import FORMS, convert
+from aaplug.errors import FormatError, FrameError, UsageError
+from aaplug.filters import NYQUIST_VARIANCE
+from aaplug.gaussians import Gaussians
+from aaplug.io.scenes import open_scene, read_scene, write_parts, write_scene
+from aaplug.pipeline import learn
+from aaplug.streaming import Histogram, check_frame_of, convert_parts, survey
+from tests.conftest import make_camera, make_scene
+
+SIZE = 37  # Gaussians a part, so that the last one is not full
+
+
+@pytest.fixture
+def cameras() -> list[Camera]:
+    return [make_camera(eye) for eye in ((0.0, -4.0, 0.0), (2.0, -3.5, 1.0), (-3.0, -3.0, 0.5))]
+
+
+def saved(folder: Path, scene: Gaussians) -> Path:
+    write_scene(folder / "in.ply", scene)
+    return folder / "in.ply"
+
+
+@pytest.fixture
+def wide_scene() -> Gaussians:
+    """A scene of which cameras see only a part."""
+    scene = make_scene(150)
+    return replace(scene, means=scene.means * 4)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_parts_are_converted_as_the_whole_is(tmp_path: Path, wide_scene, cameras, form: str):
+    path = saved(tmp_path, wide_scene)
+    scene = read_scene(path)
+    training = learn(scene, cameras)
+    assert 0 < training.bounds.seen.sum() < len(scene)
+    write_scene(tmp_path / "whole.ply", convert(scene, training, FORMS[form]))
+    opened, told = open_scene(path), []
+    parts = convert_parts(opened, cameras, FORMS[form], tell=lambda *x: told.append(x), size=SIZE)
+    write_parts(tmp_path / "parts.ply", parts, opened.count)
+    heads = [
+        (tmp_path / n).read_bytes().split(b"end_header")[0] for n in ("parts.ply", "whole.ply")
+    ]
+    assert heads[0] == heads[1]
+    together, whole = (read_scene(tmp_path / name) for name in ("parts.ply", "whole.ply"))
+    for field in (
+        "means",
+        "log_scales",
+        "logit_opacities",
+        "sh",
+    ):  # products of matrices round by their size
+        torch.testing.assert_close(
+            getattr(together, field), getattr(whole, field), rtol=1e-5, atol=1e-6
+        )
+    assert told[-1] == (150, 150)
+
+
+def test_a_stored_filter_is_fused_in_parts_without_cameras(tmp_path: Path):
+    path = saved(tmp_path, replace(make_scene(100), filter_3d=torch.rand(100) * 0.1))
+    whole = convert(read_scene(path), None, FORMS["mip-splatting"])
+    parts = list(convert_parts(open_scene(path), (), FORMS["mip-splatting"], size=SIZE))
+    assert torch.equal(torch.cat([p.log_scales for p in parts]), whole.log_scales)
+    assert torch.equal(torch.cat([p.logit_opacities for p in parts]), whole.logit_opacities)
+    assert parts[0].fused == whole.fused
+
+
+def test_a_failure_in_a_late_part_leaves_no_file(tmp_path: Path, cameras):
+    scene = make_scene(100)
+    scene.means[90, 1] = math.nan
+    path = tmp_path / "in.ply"
+    with pytest.raises(AssertionError, match="NaN"):
+        write_scene(path, scene)
+    write_scene(path, make_scene(100))
+    data = bytearray(path.read_bytes())
+    stride = (len(data) - data.index(b"end_header\n") - 11) // 100
+    at = len(data) - 10 * stride
+    data[at : at + 4] = b"\xff\xff\xff\x7f"
+    path.write_bytes(data)
+    opened = open_scene(path)
+    with pytest.raises(FormatError, match="row 90 has NaN in x"):
+        write_parts(
+            tmp_path / "out.ply",
+            convert_parts(opened, cameras, FORMS["matched-energy"], size=SIZE),
+            100,
+        )
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["in.ply"]
+
+
+def test_discs_are_not_converted(tmp_path: Path, cameras):
+    path = saved(tmp_path, replace(make_scene(5), flat=True))
+    with pytest.raises(UsageError, match="2D Gaussians"):
+        list(convert_parts(open_scene(path), cameras, FORMS["matched-energy"]))
+
+
+def test_strangers_are_noticed_on_a_sample(tmp_path: Path, cameras):
+    path = saved(tmp_path, replace(make_scene(500), means=make_scene(500).means + 100))
+    with pytest.raises(FrameError, match="different frames"):
+        check_frame_of(open_scene(path), cameras, 0.5)
+    near = tmp_path / "near.ply"
+    write_scene(near, make_scene(500))
+    assert check_frame_of(open_scene(near), cameras, 0.5) > 0.9
+
+
+def test_a_survey_finds_what_the_whole_shows(tmp_path: Path, wide_scene, cameras):
+    opened = open_scene(saved(tmp_path, wide_scene))
+    found, scene = survey(opened, cameras), read_scene(opened.path)
+    bounds = learn(scene, cameras).bounds
+    middle = scene.scales.median(dim=1).values
+    under = middle[bounds.seen] < NYQUIST_VARIANCE**0.5 / bounds.highest[bounds.seen]
+    assert (found.count, found.seen, found.under) == (150, bounds.seen.sum(), under.sum())
+    assert torch.equal(found.low, scene.means.amin(0))
+    assert found.opacities.quantile(0.5) == pytest.approx(scene.opacities.median().item(), abs=1e-3)
+    assert found.scales.quantile(0.5) == pytest.approx(middle.log().median().item(), abs=0.02)
+    assert found.rates.quantile(0.5) == pytest.approx(
+        bounds.highest[bounds.seen].log().median().item(), abs=0.02
+    )
+
+
+def test_a_survey_counts_what_cannot_be_used(tmp_path: Path):
+    scene = make_scene(20)
+    path = saved(tmp_path, scene)
+    data = bytearray(path.read_bytes())
+    data[-4:] = b"\xff\xff\xff\x7f"  # the last row's last number
+    path.write_bytes(data)
+    found = survey(open_scene(path))
+    assert (found.count, found.faults) == (19, {"NaN in rot_3": 1})
+
+
+def test_a_histogram_has_the_quantiles_of_its_values():
+    values = torch.rand(10_000, generator=torch.Generator().manual_seed(0))
+    histogram = Histogram(0.0, 1.0)
+    assert histogram.quantile(0.5) is None
+    for part in values.split(999):
+        histogram.add(part)
+    for share in (0.1, 0.5, 0.9):
+        assert histogram.quantile(share) == pytest.approx(values.quantile(share).item(), abs=1e-3)
+
+
+@pytest.mark.parametrize("kind", ["scales", "opacities", "tags", "filter", "empty"])
+def test_info_names_problems(tmp_path: Path, capsys, kind: str):
+    scene = make_scene(0 if kind == "empty" else 10)
+    if kind == "scales":
+        scene = replace(scene, log_scales=scene.log_scales.exp())
+    if kind == "opacities":
+        scene = replace(scene, logit_opacities=scene.opacities)
+    if kind == "filter":
+        scene = replace(scene, filter_3d=torch.rand(10))
+    path = saved(tmp_path, scene)
+    if kind == "tags":
+        both = b"comment SplatRenderMode: mip\ncomment SplatRenderMode: default\nelement vertex"
+        path.write_bytes(path.read_bytes().replace(b"element vertex", both, 1))
+    with pytest.raises(SystemExit) as stop:
+        main(["info", str(path), "--json"])
+    assert stop.value.code == 0
+    (problem,) = json.loads(capsys.readouterr().out)["problems"]
+    words = {
+        "scales": "exponentiated",
+        "opacities": "activated",
+        "tags": "contradict",
+        "filter": "aaplug convert",
+        "empty": "empty",
+    }
+    assert words[kind] in problem
+
+
+def test_large_scenes_go_through_the_program_in_parts(tmp_path: Path, monkeypatch, capsys):
+    path = saved(tmp_path, replace(make_scene(50), filter_3d=torch.rand(50) * 0.1))
+    monkeypatch.setattr("aaplug_cli.convert.LARGE", 49)
+    for output in ("parts.ply", "whole.ply"):
+        with pytest.raises(SystemExit) as stop:
+            main(["convert", str(path), "-o", str(tmp_path / output)])
+        assert stop.value.code == 0
+        monkeypatch.setattr("aaplug_cli.convert.LARGE", 50)
+    assert "in parts" in capsys.readouterr().err
+    assert (tmp_path / "parts.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()
+
+
+def test_limits_are_printed(monkeypatch, capsys):
+    monkeypatch.setenv("AAPLUG_GAUSSIANS", "123")
+    with pytest.raises(SystemExit):
+        main(["info", "--limits", "--json"])
+    assert json.loads(capsys.readouterr().out)["GAUSSIANS"] == 123
+    with pytest.raises(SystemExit):
+        main(["info", "--limits"])
+    assert "AAPLUG_INFLATE" in capsys.readouterr().out
