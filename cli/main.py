@@ -17,6 +17,7 @@ from .bench import Bench, bench
 from .convert import Convert, convert
 from .demo import Demo, demo
 from .evaluate import Evaluate, evaluate
+from .finetune import Finetune, finetune
 from .info import Info, info
 from .render import Render, render
 from .warmup import Warmup, warmup
@@ -27,6 +28,7 @@ VERBS = {
     Convert: convert,
     Render: render,
     Evaluate: evaluate,
+    Finetune: finetune,
     Demo: demo,
     Warmup: warmup,
     Bench: bench,
