@@ -13,6 +13,7 @@ from aaplug.cameras import Camera, CameraSet
 from aaplug.contact_sheet import contact_sheet
 from aaplug.conversion import VIEWERS, convert_for
 from aaplug.errors import UsageError
+from aaplug.filters import fuse_stored
 from aaplug.finetuning import OURS, Candidate, Job, Settings, Truth, find_upsampler, mipmap_gs
 from aaplug.finetuning.settings import RATES
 from aaplug.gaussians import Gaussians
@@ -48,7 +49,7 @@ class Finetune:
     scale: tuple[float, ...] = tuple(OURS.weights)
     """Sizes against training's that must look right, beside the training size itself."""
     steps: Annotated[int | None, flag("N")] = None
-    """Steps (default: 1500; mipmap-gs 1000)."""
+    """Steps (default: 1000)."""
     loss: Literal["l2", "l1-dssim"] = "l2"
     """l2, or 3DGS's 0.8 L1 + 0.2 D-SSIM."""
     anchor: float = OURS.anchor
@@ -61,8 +62,9 @@ class Finetune:
     """Clone, split and prune every N steps; 0 for never (default: the method's own)."""
     truth: Literal["auto", "self", "photographs"] = "auto"
     """What the training size shows: the scene's own render, or photographs; auto takes those where all exist."""
-    upsampler: Annotated[str, tyro.conf.arg(metavar="bicubic|lanczos|FILE")] = "bicubic"
-    """For scales above 1 without photographs: built in, or a network's weights (ESPCN_x4.pb, a torch.export .pt2)."""
+    upsampler: Annotated[str | None, flag("bicubic|lanczos|FILE")] = None
+    """For scales above 1 without photographs that large: an interpolation, or a network's weights (ESPCN_x4.pb, a
+    torch.export .pt2); default: the scene's own render there, corrected to the training size's averages."""
     seed: int = 0
     """Of what the steps draw."""
     checkpoint_every: Annotated[int, flag("N")] = 100
@@ -175,14 +177,14 @@ def _truth(
     if options.truth == "photographs" and missing:
         raise UsageError(missing[0], "has no photograph; --truth self needs none")
     photographs = options.truth == "photographs" or (options.truth == "auto" and not missing)
-    upsample = find_upsampler(options.upsampler)
+    upsample = None if options.upsampler is None else find_upsampler(options.upsampler)
     return Truth(scene, training, rasterizer, background, photographs, upsample)
 
 
 def _target(target: str, scene: Gaussians, training: Training):
     """The scene to start from, the rule that will show it, and the convention that the file names."""
     if target == "fast":
-        return scene, RECIPES["matched"], scene.convention
+        return fuse_stored(scene), RECIPES["matched"], scene.convention
     viewer = VIEWERS[target]
     start = convert_for(scene, training, viewer)
     return start, RECIPES[viewer.recipe], viewer.convention

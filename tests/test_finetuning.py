@@ -336,6 +336,18 @@ def test_truth_is_the_box_average_of_the_training_size():
     assert not forgetful._kept
 
 
+def test_larger_truth_has_the_averages_of_the_training_size():
+    job = make_job()
+    full, larger = job.truth(VIEWS[0], 1.0), job.truth(VIEWS[0], 2.0)
+    own = render(job.start, VIEWS[0].scaled(2.0), RECIPES["matched"], job.training, background=GREY)
+
+    def off(image):
+        boxes = image.unflatten(1, (-1, 2)).unflatten(0, (-1, 2)).mean(dim=(1, 3))
+        return (boxes - full).square().mean()
+
+    assert off(larger) < 0.2 * off(own.rgb)
+
+
 @pytest.mark.parametrize("name", UPSAMPLERS)
 def test_upsamplers_keep_what_is_smooth(name):
     x = torch.linspace(0.2, 0.8, 16)

@@ -1,7 +1,9 @@
 """What a view should look like at a scale: averages of a larger image below it, a guess from it above.
 
 The larger image is the scene's own render at the training size by the rule that it was trained with, so that no
-photograph is needed, or the photograph.  A scale is a size against training's.
+photograph is needed, or the photograph.  A scale is a size against training's.  Where nothing is large enough, the
+guess is the scene's render there, corrected so that its averages are the image at hand (back-projection, Irani and
+Peleg 1991), unless an upsampler is given.
 """
 
 from dataclasses import dataclass, field
@@ -11,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.cameras import Camera
-from aaplug.finetuning.upsamplers import UPSAMPLERS, Upsampler
+from aaplug.finetuning.upsamplers import Upsampler, bicubic
 from aaplug.gaussians import Gaussians
 from aaplug.interfaces import Rasterizer, Training
 from aaplug.io.images import quantise, read_image, resampled
@@ -31,7 +33,7 @@ class Truth:
     rasterizer: Rasterizer
     background: tuple[float, float, float]
     photographs: bool = False
-    upsample: Upsampler = UPSAMPLERS["bicubic"]
+    upsample: Upsampler | None = None
     memory: float = MEMORY
     _kept: dict[tuple[str, float], Tensor] = field(default_factory=dict)
 
@@ -49,16 +51,27 @@ class Truth:
     def _made(self, view: Camera, scale: float) -> Float[Tensor, "h w 3"]:
         full, camera = self._full(view), view.scaled(scale)
         factor = scale * view.width / full.shape[1]
-        if factor > 1:
-            return self.upsample(full, camera.hw).clamp(0.0, 1.0)
-        return resampled(full, factor, camera.hw)
+        if factor <= 1:
+            return resampled(full, factor, camera.hw)
+        return (
+            self._guess(full, camera) if self.upsample is None else self.upsample(full, camera.hw)
+        ).clamp(0.0, 1.0)
 
-    @torch.no_grad()
+    def _guess(self, full: Float[Tensor, "h w 3"], camera: Camera) -> Float[Tensor, "H W 3"]:
+        """The scene's render, corrected by what its averages lack."""
+        image = self._render(camera)
+        averages = resampled(image, full.shape[1] / camera.width, (full.shape[0], full.shape[1]))
+        return image + bicubic(full - averages, camera.hw)
+
     def _full(self, view: Camera) -> Float[Tensor, "h w 3"]:
         if self.photographs:
             assert view.photo is not None
             return quantise(read_image(view.photo, self.background))
+        return self._render(view)
+
+    @torch.no_grad()
+    def _render(self, camera: Camera) -> Float[Tensor, "h w 3"]:
         recipe = RECIPES["matched"]
         own = smooth(self.scene, self.training, recipe)
-        image = render(own, view, recipe, self.training, self.rasterizer, self.background)
+        image = render(own, camera, recipe, self.training, self.rasterizer, self.background)
         return image.rgb.clamp(0.0, 1.0)

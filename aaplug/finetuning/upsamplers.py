@@ -29,10 +29,8 @@ def _resized(kernel: int) -> Upsampler:
     return upsample
 
 
-UPSAMPLERS: dict[str, Upsampler] = {
-    "bicubic": _resized(cv2.INTER_CUBIC),
-    "lanczos": _resized(cv2.INTER_LANCZOS4),
-}
+bicubic, lanczos = _resized(cv2.INTER_CUBIC), _resized(cv2.INTER_LANCZOS4)
+UPSAMPLERS: dict[str, Upsampler] = {"bicubic": bicubic, "lanczos": lanczos}
 
 
 def find_upsampler(name: str) -> Upsampler:
