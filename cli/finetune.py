@@ -42,8 +42,12 @@ class Finetune:
     scene: SceneOptions = field(default_factory=SceneOptions)
     cameras: CameraOptions = field(default_factory=CameraOptions)
     viewing: ViewOptions = field(default_factory=ViewOptions)
-    target: Annotated[Target, tyro.conf.arg(name="for")] = "fast"
-    """What will show it: aaplug with one sample a pixel (recipe matched), or a viewer with a rule of its own."""
+    target: Annotated[
+        Target | None,
+        tyro.conf.arg(name="for", metavar="|".join(get_args(Target)), help_behavior_hint=""),
+    ] = None
+    """What will show it: aaplug with one sample a pixel (fast, the default), or a viewer with a rule of its own
+    (mipmap-gs's default is classic-viewer)."""
     method: Literal["consistency", "mipmap-gs"] = "consistency"
     """consistency is one model for all scales; mipmap-gs is Mipmap-GS as published, for the one --scale given."""
     scale: tuple[float, ...] = tuple(OURS.weights)
@@ -93,7 +97,8 @@ def finetune(options: Finetune) -> int:
     training = options.cameras.learn(scene, cameras)
     rasterizer = options.viewing.rasterize(settings.steps)
     truth = _truth(options, scene, cameras, training, rasterizer, background)
-    start, recipe, convention = _target(options.target, scene, training)
+    target = options.target or ("fast" if options.method == "consistency" else "classic-viewer")
+    start, recipe, convention = _target(target, scene, training)
     job = Job(start, training, recipe, cameras.train, truth, settings, rasterizer, background)
     say(
         f"tuning for {recipe.name} ({recipe.source}): {settings.name}, {settings.steps} steps, "
@@ -103,7 +108,7 @@ def finetune(options: Finetune) -> int:
     if not done:
         say(f"stopped at step {state.step}; go on with the same command and --resume")
         return INTERRUPTED
-    tuned = recorded(state, job, convention, {"for": options.target, "method": settings.name})
+    tuned = recorded(state, job, convention, {"for": target, "method": settings.name})
     write_scene(options.output, tuned, overwrite=options.overwrite)
     candidates = [Candidate("before", scene, recipe), Candidate("after", tuned, recipe)]
     if start is not scene:

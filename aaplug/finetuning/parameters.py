@@ -58,7 +58,7 @@ def extent(cameras: tuple[Camera, ...]) -> float:
     return EXTENT_MARGIN * spread if spread > 0 else 1.0
 
 
-def thinnest(log_scales: Float[Tensor, "n 3"], bounds: SamplingBounds) -> Float[Tensor, "n 3"]:
-    """ln of the least standard deviation that each axis may take, from where it starts."""
+def thinnest(born: Float[Tensor, "n 3"], bounds: SamplingBounds) -> Float[Tensor, "n 3"]:
+    """ln of the least standard deviation that each axis may take, from the one that it started with."""
     floor = 0.5 * torch.log(torch.tensor(NYQUIST_VARIANCE)) - bounds.highest_or_coarsest.log()
-    return torch.minimum(log_scales, floor.to(log_scales)[:, None])
+    return torch.minimum(born, floor.to(born)[:, None])

@@ -43,13 +43,15 @@ class Job:
 class State:
     """Where a run is; changed in place, step by step.
 
-    thinnest: ln of the least standard deviations.  bad: steps in a row that gave no finite gradient.
+    born: ln of the standard deviations that the Gaussians started with.  thinnest: ln of the least that they may have.
+    bad: steps in a row that gave no finite gradient.
     back_offs: times that the run went back.  curve: of each step its number, scale, view and loss.
     """
 
     step: int
     leaves: Leaves
     adam: torch.optim.Adam
+    born: Float[Tensor, "n 3"]
     thinnest: Float[Tensor, "n 3"]
     pulls: Pulls
     bad: int = 0
@@ -64,9 +66,9 @@ class State:
 def begin(job: Job) -> State:
     """The state before the first step."""
     leaves = leaves_of(job.start)
-    bounds = sampling_bounds(leaves["means"], job.training.cameras)
-    thin = thinnest(leaves["log_scales"], bounds)
-    return State(0, leaves, optimizer(leaves, job.settings), thin, Pulls.none(len(thin)))
+    born = job.start.log_scales
+    thin = thinnest(born, sampling_bounds(job.start.means, job.training.cameras))
+    return State(0, leaves, optimizer(leaves, job.settings), born, thin, Pulls.none(len(born)))
 
 
 def optimizer(leaves: Leaves, settings: Settings) -> torch.optim.Adam:

@@ -22,7 +22,7 @@ from aaplug.finetuning.settings import Settings
 from aaplug.finetuning.state import Job, State, optimizer
 from aaplug.pipeline import splats_of
 from aaplug.rasterizers import averaged
-from aaplug.sampling import SamplingBounds, sampling_bounds
+from aaplug.sampling import sampling_bounds
 from aaplug.splats import Splats2D
 
 BOUNDS_EVERY = 100  # steps between computations of the sampling bounds (Mip-Splatting)
@@ -88,8 +88,7 @@ def advance(job: Job, state: State) -> None:
     if dense and state.step % dense == 0 and state.step < settings.steps:
         _densify(job, state)
     elif state.step % BOUNDS_EVERY == 0 and "means" in settings.rates:
-        now = thinnest(state.leaves["log_scales"].detach(), _bounds(job, state))
-        state.thinnest = torch.minimum(state.thinnest, now)
+        _bound(job, state)
 
 
 def _go_back(job: Job, state: State, good: Mapping[str, Any], say: Callable[[str], None]) -> None:
@@ -178,11 +177,15 @@ def _densify(job: Job, state: State) -> None:
     state.adam = optimizer(state.leaves, job.settings)
     for group in state.adam.param_groups:
         state.adam.state[group["params"][0]] = moments[group["name"]]
-    before = state.thinnest[change.sources]
-    now = thinnest(state.leaves["log_scales"].detach(), _bounds(job, state))
-    state.thinnest = torch.where(change.new[:, None], now, before)
-    state.pulls = Pulls.none(len(state.thinnest))
+    own = state.leaves["log_scales"].detach().clone()
+    state.born = torch.where(change.new[:, None], own, state.born[change.sources])
+    _bound(job, state)
+    state.pulls = Pulls.none(len(own))
 
 
-def _bounds(job: Job, state: State) -> SamplingBounds:
-    return sampling_bounds(state.leaves["means"].detach(), job.training.cameras)
+@torch.no_grad()
+def _bound(job: Job, state: State) -> None:
+    """Find the bounds anew where the Gaussians are now, and keep them."""
+    bounds = sampling_bounds(state.leaves["means"].detach(), job.training.cameras)
+    state.thinnest = thinnest(state.born, bounds)
+    _hold(state)
