@@ -44,7 +44,7 @@ OURS = Settings(
     decay=0.03,
 )
 QUICK = replace(  # a conversion's: a few minutes, and little is lost at the training size
-    OURS, name="quick", steps=300, weights={0.5: 1.0, 0.25: 1.0, 0.125: 1.0}, anchor=10.0
+    OURS, name="quick", steps=300, weights={0.5: 1.0, 0.25: 1.0, 0.125: 1.0}, anchor=6.0
 )
 
 
