@@ -96,7 +96,7 @@ def _fitted(options: Convert, scene: Gaussians, target: str) -> int:
     rasterizer = options.viewing.rasterize(settings.steps)
     truth = Truth(scene, training, rasterizer, background)
     job = Job(start, training, recipe, cameras.train, truth, settings, rasterizer, background)
-    state, done, _ = tune(job)
+    state, done = tune(job)
     if not done:
         say("stopped; nothing is written")
         return INTERRUPTED

@@ -104,7 +104,7 @@ def finetune(options: Finetune) -> int:
         f"tuning for {recipe.name} ({recipe.source}): {settings.name}, {settings.steps} steps, "
         f"truth: {'photographs' if truth.photographs else 'the own training-size render'}"
     )
-    state, done, probes = tune(job, checkpoint, options.checkpoint_every, options.resume)
+    state, done = tune(job, checkpoint, options.checkpoint_every, options.resume)
     if not done:
         say(f"stopped at step {state.step}; go on with the same command and --resume")
         return INTERRUPTED
@@ -117,7 +117,7 @@ def finetune(options: Finetune) -> int:
     judged = replace(truth, photographs=all(view.photo for view in views))
     scales = sorted({1.0, *settings.weights}, reverse=True)
     report = measured(candidates, views, scales, judged)
-    shown = results(report) | {"settings": _facts(settings)} | {"probes": probes}
+    shown = results(report) | {"settings": _facts(settings)} | {"probes": state.probes}
     with replacing(report_file, options.overwrite) as stream:
         stream.write(json.dumps(shown | {"curve": state.curve}, indent=1).encode())
     write_png(sheet_file, _sheet(candidates, views[0], scales, judged), overwrite=options.overwrite)

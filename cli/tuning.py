@@ -21,19 +21,15 @@ PROBES = 3  # training views, evenly spread, by which progress is told
 
 @dataclass
 class Watch:
-    """Tells how a run goes, and keeps what it told."""
+    """Tells how a run goes."""
 
     job: Job
     checkpoint: Path | None
-    tell: Callable[[int, int], None]
-    probes: list[dict[str, Any]]
     started: float
     first: int
 
     def keep(self, state: State, good: Mapping[str, Any]) -> None:
-        """Write the checkpoint, and measure a few training views."""
-        if self.checkpoint is not None:
-            save(self.checkpoint, self.job, state, good)
+        """Measure a few training views, and write the checkpoint."""
         scales = _ends(self.job)
         report = compare(
             [Candidate("now", state.scene(self.job), self.job.recipe)],
@@ -42,7 +38,11 @@ class Watch:
             self.job.truth,
         )
         decibels = {s: mean(report.select("now", s), "PSNR") for s in scales}
-        self.probes.append({"step": state.step, "psnr": {f"{s:g}": d for s, d in decibels.items()}})
+        state.probes.append(
+            {"step": state.step, "psnr": {f"{s:g}": d for s, d in decibels.items()}}
+        )
+        if self.checkpoint is not None:
+            save(self.checkpoint, self.job, state, good)
         told = ", ".join(f"{_number(d)} dB at {scale_name(s)}" for s, d in decibels.items())
         pace = (time.monotonic() - self.started) / max(1, state.step - self.first)
         lost = f", loss {_recent(state):.2e}" if state.curve else ""
@@ -51,8 +51,8 @@ class Watch:
 
 def tune(
     job: Job, checkpoint: Path | None = None, every: int = 100, resume: bool = False
-) -> tuple[State, bool, list[dict[str, Any]]]:
-    """Run a job; its state, whether it is done (Ctrl-C stops it after a step), and the probes told on the way.
+) -> tuple[State, bool]:
+    """Run a job; its state, and whether it is done (Ctrl-C stops it after a step).
 
     Raises:
         FormatError, UsageError: there is nothing to resume, or it is of another run.
@@ -62,7 +62,7 @@ def tune(
     if resume:
         say(f"resumed at step {state.step}")
     with progress("tuning", "steps") as tell, _interruptible() as stopped:
-        watch = Watch(job, checkpoint, tell, [], time.monotonic(), state.step)
+        watch = Watch(job, checkpoint, time.monotonic(), state.step)
 
         def stop() -> bool:
             tell(state.step, job.settings.steps)
@@ -71,7 +71,7 @@ def tune(
         done = run(job, state, good, every=every, keep=watch.keep, stop=stop, say=say)
         if done:
             tell(job.settings.steps, job.settings.steps)
-    return state, done, watch.probes
+    return state, done
 
 
 def recorded(state: State, job: Job, convention: Convention, settings: dict[str, str]) -> Gaussians:

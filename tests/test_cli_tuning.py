@@ -61,6 +61,7 @@ def test_finetune_stopped_by_ctrl_c_and_resumed_writes_what_an_uninterrupted_one
         real(job, state)
 
     whole = Path("tuned.ply").rename("whole.ply").read_bytes()
+    curve = json.loads(Path("tuned.finetune.json").read_text())["curve"]
     for path in Path().glob("tuned.*"):
         path.unlink()
     monkeypatch.setattr(tuning, "advance", pressed)
@@ -72,6 +73,9 @@ def test_finetune_stopped_by_ctrl_c_and_resumed_writes_what_an_uninterrupted_one
     code, _, err = cli(f"{TUNE} --steps 5 --checkpoint-every 2 --resume")
     assert (code, "resumed at step 3" in err) == (0, True)
     assert Path("tuned.ply").read_bytes() == whole
+    report = json.loads(Path("tuned.finetune.json").read_text())
+    assert report["curve"] == curve
+    assert [probe["step"] for probe in report["probes"]] == [2, 3, 4, 5]
 
 
 def test_finetune_killed_outright_resumes_from_its_checkpoint(cli, tmp_path):

@@ -38,6 +38,7 @@ def packed(state: State) -> dict[str, Any]:
         "bad": state.bad,
         "back_offs": state.back_offs,
         "curve": list(state.curve),
+        "probes": list(state.probes),
     }
 
 
@@ -59,6 +60,7 @@ def unpacked(data: Mapping[str, Any], job: Job) -> State:
         bad=data["bad"],
         back_offs=data["back_offs"],
         curve=list(data["curve"]),
+        probes=list(data["probes"]),
     )
 
 
@@ -107,6 +109,8 @@ def facts(job: Job) -> dict[str, str]:
         "views": _hash(repr([(v.name, v.hw, v.focal) for v in job.views]).encode()),
         "background": str(job.background),
         "guard": str(job.training.guard),
+        "rasterizer": job.rasterizer.kernels.name,
+        "number of threads": str(torch.get_num_threads()),  # sums are taken in another order
     }
 
 

@@ -57,6 +57,7 @@ class State:
     bad: int = 0
     back_offs: int = 0
     curve: list[dict[str, Any]] = field(default_factory=list)
+    probes: list[dict[str, Any]] = field(default_factory=list)
 
     def scene(self, job: Job) -> Gaussians:
         """The scene as it is now."""
