@@ -91,7 +91,7 @@ def test_losses_are_the_papers():
 @pytest.mark.parametrize("recipe", ["matched", "ewa", "mip", "classic"])
 def test_gradients_of_the_whole_loss_are_finite_differences(loss, recipe):
     job = make_job(25, replace(SETTINGS, loss=loss), F64, recipe)
-    white = replace(job.truth, background=WHITE, _kept={})  # far from the kinks of L1
+    white = replace(job.truth, background=WHITE)  # far from the kinks of L1
     job = replace(job, truth=white)
     generator = torch.Generator().manual_seed(2)
     leaves = {
@@ -331,9 +331,12 @@ def test_truth_is_the_box_average_of_the_training_size():
     truth = job.truth(VIEWS[0], 0.25)
     torch.testing.assert_close(truth, boxes, atol=1e-3, rtol=0)
     assert torch.equal(job.truth(VIEWS[0], 0.25), truth)
-    forgetful = replace(job.truth, memory=0.0, _kept={})
+    forgetful = replace(job.truth, memory=0.0)
     assert torch.equal(forgetful(VIEWS[0], 0.25), truth)
     assert not forgetful._kept
+    namesake = replace(VIEWS[1], name=VIEWS[0].name)  # as in Blender's splits
+    assert torch.equal(job.truth(namesake, 0.25), forgetful(VIEWS[1], 0.25))
+    assert not replace(job.truth, photographs=True)._kept
 
 
 def test_larger_truth_has_the_averages_of_the_training_size():

@@ -35,11 +35,11 @@ class Truth:
     photographs: bool = False
     upsample: Upsampler | None = None
     memory: float = MEMORY
-    _kept: dict[tuple[str, float], Tensor] = field(default_factory=dict)
+    _kept: dict[tuple[bytes, float], Tensor] = field(default_factory=dict, init=False)
 
     def __call__(self, view: Camera, scale: float) -> Float[Tensor, "h w 3"]:
         """The image of a view, given at the training size, at a scale."""
-        key = view.name, scale
+        key = view.cam_from_world.numpy().tobytes(), scale  # names recur in other splits
         if key not in self._kept:
             image = self._made(view, scale).to(KEPT)
             used = sum(x.numel() * x.element_size() for x in self._kept.values())
