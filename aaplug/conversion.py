@@ -18,6 +18,7 @@ FORMS: Mapping[str, WorldFilter] = {
     "mip-splatting": Smoothing3D(),
 }
 FITTED_VARIANCE = 0.1  # px²: of a scene trained without compensation for a viewer with it, measured
+TUNED = "finetune"  # the record of fine-tuning, which blurs nothing
 
 
 @dataclass(frozen=True)
@@ -100,8 +101,9 @@ def _check(scene: Gaussians, form: WorldFilter) -> None:
 
 
 def _check_fused(scene: Gaussians) -> None:
-    if scene.fused:
-        done = "; ".join(describe(fusion) for fusion in scene.fused)
+    blurs = [fusion for fusion in scene.fused if fusion.method != TUNED]
+    if blurs:
+        done = "; ".join(describe(fusion) for fusion in blurs)
         raise UsageError(
             _name(scene), f"already has {done} fused; converting it again would blur it twice"
         )

@@ -14,15 +14,24 @@ from aaplug.contact_sheet import contact_sheet
 from aaplug.conversion import VIEWERS, convert_for
 from aaplug.errors import UsageError
 from aaplug.filters import fuse_stored
-from aaplug.finetuning import OURS, Candidate, Job, Settings, Truth, find_upsampler, mipmap_gs
+from aaplug.finetuning import (
+    OURS,
+    Candidate,
+    Job,
+    Settings,
+    State,
+    Truth,
+    find_upsampler,
+    mipmap_gs,
+)
 from aaplug.finetuning.settings import RATES
-from aaplug.gaussians import Gaussians
+from aaplug.gaussians import Convention, Gaussians
 from aaplug.interfaces import Rasterizer, Training
 from aaplug.io.atomic import check_output, replacing
 from aaplug.io.images import write_png
 from aaplug.io.scenes import find_scene, write_scene
-from aaplug.pipeline import render
-from aaplug.recipes import RECIPES
+from aaplug.pipeline import render, smooth
+from aaplug.recipes import RECIPES, Recipe
 from aaplug.report import results, scale_name, tables
 
 from .console import out, print_json, say
@@ -83,13 +92,7 @@ class Finetune:
 
 def finetune(options: Finetune) -> int:
     """Move the Gaussians until every scale shows what the training size shows."""
-    source = find_scene(options.scene.path, options.scene.iteration)
-    report_file, sheet_file, checkpoint = (
-        options.output.with_suffix(f".finetune.{kind}") for kind in ("json", "png", "pt")
-    )
-    for path in (options.output, report_file, sheet_file):
-        check_output(path, options.overwrite, [source])
-    check_output(checkpoint, options.resume or options.overwrite, [source])
+    files = _files(options)
     settings = settings_of(options)
     scene = options.scene.read()
     cameras = options.cameras.read(options.scene)
@@ -104,30 +107,66 @@ def finetune(options: Finetune) -> int:
         f"tuning for {recipe.name} ({recipe.source}): {settings.name}, {settings.steps} steps, "
         f"truth: {'photographs' if truth.photographs else 'the own training-size render'}"
     )
-    state, done = tune(job, checkpoint, options.checkpoint_every, options.resume)
+    state, done = tune(job, files.checkpoint, options.checkpoint_every, options.resume)
     if not done:
         say(f"stopped at step {state.step}; go on with the same command and --resume")
         return INTERRUPTED
     tuned = recorded(state, job, convention, {"for": target, "method": settings.name})
-    write_scene(options.output, tuned, overwrite=options.overwrite)
-    candidates = [Candidate("before", scene, recipe), Candidate("after", tuned, recipe)]
-    if start is not scene:
-        candidates.insert(1, Candidate("closed form", start, recipe))
-    views = options.viewing.select(cameras)
-    judged = replace(truth, photographs=all(view.photo for view in views))
-    scales = sorted({1.0, *settings.weights}, reverse=True)
-    report = measured(candidates, views, scales, judged)
-    shown = results(report) | {"settings": _facts(settings)} | {"probes": state.probes}
-    with replacing(report_file, options.overwrite) as stream:
-        stream.write(json.dumps(shown | {"curve": state.curve}, indent=1).encode())
-    write_png(sheet_file, _sheet(candidates, views[0], scales, judged), overwrite=options.overwrite)
-    checkpoint.unlink(missing_ok=True)
+    write_scene(files.scene, tuned, overwrite=options.overwrite)
+    _report(options, files, job, state, scene, tuned, options.viewing.select(cameras))
+    files.checkpoint.unlink(missing_ok=True)
+    say(f"wrote {files.scene}, {files.report.name} and {files.pictures.name}")
+    return 0
+
+
+@dataclass(frozen=True)
+class _Files:
+    """What a run writes."""
+
+    scene: Path
+    report: Path
+    pictures: Path
+    checkpoint: Path
+
+
+def _files(options: Finetune) -> _Files:
+    """The outputs, none of which may stand there already."""
+    source = find_scene(options.scene.path, options.scene.iteration)
+    files = _Files(
+        options.output,
+        *(options.output.with_suffix(f".finetune.{kind}") for kind in ("json", "png", "pt")),
+    )
+    for path in (files.scene, files.report, files.pictures):
+        check_output(path, options.overwrite, [source])
+    check_output(files.checkpoint, options.resume or options.overwrite, [source])
+    return files
+
+
+def _report(
+    options: Finetune,
+    files: _Files,
+    job: Job,
+    state: State,
+    scene: Gaussians,
+    tuned: Gaussians,
+    views: Sequence[Camera],
+) -> None:
+    """Measure before and after, and write and print what was found."""
+    candidates = [Candidate("before", scene, job.recipe), Candidate("after", tuned, job.recipe)]
+    if len(job.start.fused) > len(scene.fused):
+        candidates.insert(1, Candidate("closed form", job.start, job.recipe))
+    truth = replace(job.truth, photographs=all(view.photo for view in views))
+    scales = sorted({1.0, *job.settings.weights}, reverse=True)
+    report = measured(candidates, views, scales, truth)
+    found = results(report) | {"settings": _facts(job.settings), "probes": state.probes}
+    with replacing(files.report, options.overwrite) as stream:
+        stream.write(json.dumps(found | {"curve": state.curve}, indent=1).encode())
+    sheet = _sheet(candidates, views[0], scales, truth)
+    write_png(files.pictures, sheet, overwrite=options.overwrite)
     if options.json:
-        print_json(shown)
+        print_json(found)
     else:
         out.print(*tables(report))
-    say(f"wrote {options.output}, {report_file.name} and {sheet_file.name}")
-    return 0
 
 
 def settings_of(options: Finetune) -> Settings:
@@ -186,7 +225,9 @@ def _truth(
     return Truth(scene, training, rasterizer, background, photographs, upsample)
 
 
-def _target(target: str, scene: Gaussians, training: Training):
+def _target(
+    target: str, scene: Gaussians, training: Training
+) -> tuple[Gaussians, Recipe, Convention]:
     """The scene to start from, the rule that will show it, and the convention that the file names."""
     if target == "fast":
         return fuse_stored(scene), RECIPES["matched"], scene.convention
@@ -210,7 +251,12 @@ def _sheet(
         camera = view.scaled(scale)
         images = [truth(view, scale)] + [
             render(
-                c.scene, camera, c.recipe, truth.training, truth.rasterizer, truth.background
+                smooth(c.scene, truth.training, c.recipe),
+                camera,
+                c.recipe,
+                truth.training,
+                truth.rasterizer,
+                truth.background,
             ).rgb
             for c in candidates
         ]

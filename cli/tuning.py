@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from aaplug.cameras import Camera
+from aaplug.conversion import TUNED
 from aaplug.finetuning import Candidate, Job, State, Truth, begin, compare, load, run, save
 from aaplug.gaussians import Convention, Fusion, Gaussians
 from aaplug.report import Report, mean, scale_name
@@ -80,7 +81,7 @@ def recorded(state: State, job: Job, convention: Convention, settings: dict[str,
         return replace(job.start, convention=convention)
     scene = state.scene(job)
     steps = {"steps": str(state.step), **settings}
-    fusion = Fusion("finetune", steps)
+    fusion = Fusion(TUNED, steps)
     return replace(scene, convention=convention, fused=(*scene.fused, fusion))
 
 

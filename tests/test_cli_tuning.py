@@ -152,3 +152,13 @@ def test_convert_refuses_options_that_contradict_each_other(cli):
         code, _, err = cli(f"convert scene.ply --cameras . -o c.ply {options}")
         assert (code, "error:" in err) == (2, True)
         assert not Path("c.ply").exists()
+
+
+def test_what_was_tuned_for_fast_rendering_converts_and_what_was_converted_does_not_again(cli):
+    cli(f"{TUNE} --steps 1")
+    assert cli("convert tuned.ply --cameras . -o c.ply --for mip-viewer --steps 1")[0] == 0
+    assert [f.method for f in read_scene(Path("c.ply")).fused] == [
+        "finetune", "matched-energy", "finetune"
+    ]  # fmt: skip
+    code, _, err = cli("convert c.ply --cameras . -o d.ply --for mip-viewer")
+    assert (code, "already has matched-energy" in err) == (2, True)
