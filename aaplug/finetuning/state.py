@@ -45,7 +45,8 @@ class State:
 
     born: ln of the standard deviations that the Gaussians started with.  thinnest: ln of the least that they may have.
     bad: steps in a row that gave no finite gradient.
-    back_offs: times that the run went back.  curve: of each step its number, scale, view and loss.
+    back_offs: times that the run went back.  curve: of each step its number, view, and loss by scale.
+    probes: what was measured on the way, by whoever watches.
     """
 
     step: int
