@@ -1,5 +1,6 @@
 """What `finetune` and `convert --for` share: a run on the terminal, with its progress, its checkpoints and Ctrl-C."""
 
+import math
 import signal
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -118,7 +119,7 @@ def _interruptible() -> Iterator[Callable[[], bool]]:
 
 def _ends(job: Job) -> list[float]:
     """The training size and the scale farthest from it."""
-    return list(dict.fromkeys([1.0, min(job.settings.weights), max(job.settings.weights)]))[:2]
+    return list(dict.fromkeys([1.0, max(job.settings.weights, key=lambda s: abs(math.log(s)))]))
 
 
 def _recent(state: State) -> float:
