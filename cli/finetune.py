@@ -58,7 +58,7 @@ class Finetune:
     """What will show it: aaplug with one sample a pixel (fast, the default), or a viewer with a rule of its own
     (mipmap-gs's default is classic-viewer)."""
     method: Literal["consistency", "mipmap-gs"] = "consistency"
-    """consistency is one model for all scales; mipmap-gs is Mipmap-GS as published, for the one --scale given."""
+    """consistency is one model for all scales; mipmap-gs is one for the one --scale given, as Mipmap-GS makes it."""
     scale: tuple[float, ...] = tuple(OURS.weights)
     """Sizes against training's that must look right, beside the training size itself."""
     steps: Annotated[int | None, flag("N")] = None
