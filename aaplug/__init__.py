@@ -4,7 +4,7 @@ Read `aaplug.pipeline` first: it holds the whole flow on one page.
 """
 
 from aaplug.cameras import Camera, CameraSet, look_at
-from aaplug.conversion import FORMS, convert
+from aaplug.conversion import FORMS, VIEWERS, convert, convert_for
 from aaplug.errors import AaplugError
 from aaplug.evaluation import Task, evaluate
 from aaplug.gaussians import ANTIALIASED, CLASSIC, MIP, Convention, Gaussians
@@ -23,6 +23,7 @@ __all__ = [
     "FORMS",
     "MIP",
     "RECIPES",
+    "VIEWERS",
     "AaplugError",
     "Camera",
     "CameraSet",
@@ -35,6 +36,7 @@ __all__ = [
     "Training",
     "check_frame",
     "convert",
+    "convert_for",
     "evaluate",
     "find_recipe",
     "learn",

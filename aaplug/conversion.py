@@ -1,21 +1,65 @@
-"""A plain scene file in which the anti-aliasing of training is fused, for a viewer with the 2D Mip filter.
+"""A plain scene file in which the anti-aliasing of training is fused, for a viewer that follows another rule.
 
-What viewers then need is the Mip rule, 0.1 px² with compensation (or, for a stored 3D filter, what Mip-Splatting's
-own fused export needs, which is the same).
+Without a viewer named it is the Mip rule's, 0.1 px² with compensation (or, for a stored 3D filter, what Mip-Splatting's
+own fused export needs, which is the same).  A closed form looks at one Gaussian at a time; `aaplug.finetuning` can take
+its result as a start.
 """
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from aaplug.errors import UsageError
 from aaplug.filters import MatchedEnergy, Smoothing3D, fuse_stored
-from aaplug.gaussians import MIP, Fusion, Gaussians
+from aaplug.gaussians import ANTIALIASED, CLASSIC, MIP, Convention, Fusion, Gaussians
 from aaplug.interfaces import Training, WorldFilter
 
 FORMS: Mapping[str, WorldFilter] = {
     "matched-energy": MatchedEnergy(),
     "mip-splatting": Smoothing3D(),
 }
+FITTED_VARIANCE = 0.1  # px²: of a scene trained without compensation for a viewer with it, measured
+TUNED = "finetune"  # the record of fine-tuning, which blurs nothing
+
+
+@dataclass(frozen=True)
+class Viewer:
+    """A program that shows scenes by one rule: the recipe of that rule, and what a file says to ask for it."""
+
+    name: str
+    recipe: str
+    convention: Convention
+    rule: str
+
+
+VIEWERS: Mapping[str, Viewer] = {
+    viewer.name: viewer
+    for viewer in (
+        Viewer("classic-viewer", "classic", CLASSIC, "0.3 px², not compensated"),
+        Viewer("antialiased-viewer", "ewa", ANTIALIASED, "0.3 px², compensated"),
+        Viewer("mip-viewer", "mip", MIP, "0.1 px², compensated"),
+        Viewer("gsplat", "ewa", ANTIALIASED, 'rasterize_mode="antialiased": 0.3 px², compensated'),
+    )
+}
+
+
+def form_for(scene: Gaussians, viewer: Viewer) -> MatchedEnergy:
+    """The closed form that brings a scene to a viewer's rule: its missing blur, the energy that training showed."""
+    trained, shown = scene.convention, viewer.convention
+    fitted = shown.compensated and not trained.compensated
+    return MatchedEnergy(FITTED_VARIANCE if fitted else trained.kernel - shown.kernel, shown)
+
+
+def convert_for(scene: Gaussians, training: Training, viewer: Viewer) -> Gaussians:
+    """A scene for a viewer, in closed form; unchanged where the viewer follows training's own rule.
+
+    Raises:
+        UsageError: something is fused already that a second conversion would blur again.
+    """
+    _check_fused(scene)
+    scene = fuse_stored(scene)
+    if scene.convention == viewer.convention:
+        return scene
+    return form_for(scene, viewer)(scene, training)
 
 
 def default_form(scene: Gaussians) -> str:
@@ -53,15 +97,20 @@ def _check(scene: Gaussians, form: WorldFilter) -> None:
             _name(scene),
             "holds 2D Gaussians, which no filter here can thicken and stay 2D Gaussians",
         )
-    if scene.fused:
-        done = "; ".join(describe(fusion) for fusion in scene.fused)
-        raise UsageError(
-            _name(scene), f"already has {done} fused; converting it again would blur it twice"
-        )
+    _check_fused(scene)
     if scene.convention == MIP and scene.filter_3d is None and isinstance(form, MatchedEnergy):
         raise UsageError(
             _name(scene),
             "was trained by the Mip rule and stores no 3D filter: there is nothing to fuse",
+        )
+
+
+def _check_fused(scene: Gaussians) -> None:
+    blurs = [fusion for fusion in scene.fused if fusion.method != TUNED]
+    if blurs:
+        done = "; ".join(describe(fusion) for fusion in blurs)
+        raise UsageError(
+            _name(scene), f"already has {done} fused; converting it again would blur it twice"
         )
 
 

@@ -228,9 +228,8 @@ class _Bench:
 
     def _work(self, recipe: Recipe, camera: Camera) -> Hashable:
         """What a recipe does at a view's rate: `auto` is `matched` where it takes one sample, and not drawn again."""
-        rate = self.training.rate(camera)
-        samples = recipe.samples_at(rate)
-        return recipe.world, recipe.screen_at(rate), samples, recipe.pixel
+        samples = recipe.samples_at(self.training.rate(camera))
+        return recipe.world, recipe.screen, samples, recipe.pixel
 
     def _draw(self, scene: Gaussians, camera: Camera, recipe: Recipe) -> _Drawn:
         rasterizer, counting = self.task.rasterizer, None

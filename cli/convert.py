@@ -2,33 +2,52 @@
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from aaplug.conversion import FORMS, default_form, describe
+import tyro
+
+from aaplug.conversion import FORMS, VIEWERS, convert_for, default_form, describe
 from aaplug.conversion import convert as fuse
+from aaplug.errors import UsageError
+from aaplug.finetuning import QUICK, Candidate, Job, Truth
+from aaplug.gaussians import Gaussians
 from aaplug.io.atomic import check_output
 from aaplug.io.scenes import find_scene, write_parts, write_scene
 from aaplug.io.scenes.scene_file import SceneFile
+from aaplug.recipes import RECIPES
+from aaplug.report import Report, results, tables
 from aaplug.streaming import LARGE, check_frame_of, convert_parts
 
-from .console import print_json, progress, say
-from .options import CameraOptions, SceneOptions, flag
+from .console import out, print_json, progress, say
+from .options import CameraOptions, SceneOptions, ViewOptions, flag
+from .tuning import INTERRUPTED, measured, recorded, spread, tune
+
+JUDGED = 8  # training views, evenly spread, that the residual is measured on
 
 
 @dataclass(frozen=True)
 class Convert:
-    """Fuse anti-aliasing into a plain .ply, for viewers with the 2D Mip filter (0.1 px², compensated)."""
+    """Fuse anti-aliasing into a plain .ply, for viewers with the 2D Mip filter (0.1 px², compensated) or another."""
 
     output: Annotated[Path, flag("FILE.ply", "-o")]
     """Where to write."""
     scene: SceneOptions = field(default_factory=SceneOptions)
     cameras: CameraOptions = field(default_factory=CameraOptions)
+    viewing: ViewOptions = field(default_factory=lambda: ViewOptions(views="train"))
+    target: Annotated[
+        Literal["classic-viewer", "antialiased-viewer", "mip-viewer", "gsplat"] | None,
+        tyro.conf.arg(name="for", metavar="|".join(VIEWERS), help_behavior_hint=""),
+    ] = None
+    """Fit the scene to what a viewer does, from the closed form by a short optimization, and print what is left."""
+    steps: Annotated[int | None, flag("N")] = None
+    """Steps of that optimization (default: 300); 0 keeps the closed form."""
     form: Annotated[
         Literal["matched-energy", "mip-splatting"] | None, flag("matched-energy|mip-splatting")
     ] = None
-    """What to fuse: the energy that training showed, or Mip-Splatting's 3D smoothing (default for filter_3D files)."""
+    """Without --for, what to fuse: the energy that training showed, or Mip-Splatting's 3D smoothing (default for
+    filter_3D files)."""
     variance: Annotated[float | None, flag("PX2")] = None
-    """Variance fused, in px² at the training rate (default: 0.2 for both forms)."""
+    """Without --for, variance fused, in px² at the training rate (default: 0.2 for both forms)."""
     overwrite: bool = False
     """Replace an existing output."""
     json: bool = False
@@ -39,10 +58,13 @@ def convert(options: Convert) -> int:
     """Fuse anti-aliasing into a plain .ply."""
     source = find_scene(options.scene.path, options.scene.iteration)
     check_output(options.output, options.overwrite, [source])
+    _check(options)
     opened = options.scene.open()
-    if opened.count > LARGE:
+    if opened.count > LARGE and options.target is None:
         return _convert_in_parts(options, opened)
     scene = opened.whole(options.scene.drop_bad)
+    if options.target is not None:
+        return _fitted(options, scene, options.target)
     form = FORMS[options.form or default_form(scene)]
     if options.variance is not None:
         form = replace(form, variance=options.variance)  # type: ignore[type-var]
@@ -55,8 +77,7 @@ def convert(options: Convert) -> int:
     done = "; ".join(describe(fusion) for fusion in converted.fused)
     say(f"wrote {options.output}: fused {done}; show it with the Mip rule (0.1 px², compensated)")
     if options.json:
-        fused = [{"method": f.method, **f.settings} for f in converted.fused]
-        print_json({"output": str(options.output), "gaussians": len(converted), "fused": fused})
+        print_json(_facts(options, converted))
     return 0
 
 
@@ -79,3 +100,55 @@ def _convert_in_parts(options: Convert, opened: SceneFile) -> int:
     if options.json:
         print_json({"output": str(options.output), "gaussians": opened.count})
     return 0
+
+
+def _check(options: Convert) -> None:
+    if options.target is None and options.steps is not None:
+        raise UsageError("--steps", "is of the optimization of --for; name a viewer")
+    if options.target is not None and (options.form or options.variance is not None):
+        raise UsageError("--for", "chooses form and variance itself; leave out --form, --variance")
+    if options.steps is not None and options.steps < 0:
+        raise UsageError("--steps", f"must be 0 or more, got {options.steps}")
+
+
+def _fitted(options: Convert, scene: Gaussians, target: str) -> int:
+    """Convert for a viewer: the closed form, some steps from there, and what is left."""
+    viewer = VIEWERS[target]
+    cameras = options.cameras.read(options.scene)
+    background = options.viewing.background_of(cameras)
+    training = options.cameras.learn(scene, cameras)
+    start, recipe = convert_for(scene, training, viewer), RECIPES[viewer.recipe]
+    settings = QUICK if options.steps is None else replace(QUICK, steps=options.steps)
+    rasterizer = options.viewing.rasterize(settings.steps)
+    truth = Truth(scene, training, rasterizer, background)
+    job = Job(start, training, recipe, cameras.train, truth, settings, rasterizer, background)
+    state, done = tune(job)
+    if not done:
+        say("stopped; nothing is written")
+        return INTERRUPTED
+    converted = recorded(state, job, viewer.convention, {"for": target})
+    write_scene(options.output, converted, overwrite=options.overwrite)
+    candidates = [
+        Candidate("original", scene, recipe),
+        Candidate("closed form", start, recipe),
+        Candidate("converted", converted, recipe),
+    ]
+    views = spread(options.viewing.select(cameras), JUDGED)
+    report = measured(candidates, views, (1.0, *settings.weights), truth)
+    fused = "; ".join(describe(fusion) for fusion in converted.fused) or "nothing"
+    if options.json:
+        print_json(_facts(options, converted) | {"for": target, "residual": results(report)})
+    else:
+        _print(report)
+    say(f"wrote {options.output}: fused {fused}; show it with {viewer.rule}")
+    return 0
+
+
+def _print(report: Report) -> None:
+    out.print("By the viewer's rule, against the scene's own training-size render:")
+    out.print(tables(report)[0])
+
+
+def _facts(options: Convert, converted: Gaussians) -> dict[str, Any]:
+    fused = [{"method": f.method, **f.settings} for f in converted.fused]
+    return {"output": str(options.output), "gaussians": len(converted), "fused": fused}

@@ -17,6 +17,7 @@ from .bench import Bench, bench
 from .convert import Convert, convert
 from .demo import Demo, demo
 from .evaluate import Evaluate, evaluate
+from .finetune import Finetune, finetune
 from .info import Info, info
 from .options import CONFIG
 from .render import Render, render
@@ -30,6 +31,7 @@ VERBS = {
     Render: render,
     Evaluate: evaluate,
     Video: video,
+    Finetune: finetune,
     Demo: demo,
     Warmup: warmup,
     Bench: bench,

@@ -136,22 +136,17 @@ class CameraOptions:
 
 
 @dataclass(frozen=True)
-class RenderOptions:
-    """How views are rendered."""
+class ViewOptions:
+    """Which views, over what, and what draws them."""
 
     views: Annotated[str, tyro.conf.arg(metavar="NAME,...|test|train|all")] = "test"
     """Which views."""
-    quality: Quality = "balanced"
-    """Samples a pixel of recipe auto: fast is one, balanced reaches half the training rate, best all of it."""
-    rate: Annotated[Rate | None, flag("global|sharpest|interval")] = None
-    """What matched and auto compare a Gaussian's rate with: training's size, sharpest view or range of views."""
     background: Literal["auto", "white", "black"] = "auto"
     """Behind the scene; auto is what training had."""
     rasterizer: Literal["auto", "compiled", "eager", "reference"] = "auto"
     """auto is compiled where `aaplug warmup` has run, else eager; reference is slow, exact and float64."""
     threads: Annotated[int | None, flag("N")] = None
     """Processor threads (default: all)."""
-
     memory: Annotated[float, flag("GB")] = MEMORY / 1e9
     """Memory of a frame beside the scene and the image."""
 
@@ -180,3 +175,13 @@ class RenderOptions:
         chosen = choose(self.rasterizer, frames, say)
         tiled = isinstance(chosen, Tiled)
         return replace(chosen, memory=self.memory * 1e9) if tiled else chosen
+
+
+@dataclass(frozen=True)
+class RenderOptions(ViewOptions):
+    """How views are rendered."""
+
+    quality: Quality = "balanced"
+    """Samples a pixel of recipe auto: fast is one, balanced reaches half the training rate, best all of it."""
+    rate: Annotated[Rate | None, flag("global|sharpest|interval")] = None
+    """What matched and auto compare a Gaussian's rate with: training's size, sharpest view or range of views."""

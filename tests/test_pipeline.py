@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from aaplug.cameras import WHITE, Camera
-from aaplug.conversion import FORMS, convert
+from aaplug.conversion import FITTED_VARIANCE, FORMS, VIEWERS, convert, convert_for
 from aaplug.errors import UsageError
 from aaplug.filters import StoredSmoothing
 from aaplug.gaussians import ANTIALIASED, CLASSIC, CONVENTIONS, MIP, Gaussians
@@ -15,6 +15,7 @@ from aaplug.pipeline import learn, render, smooth
 from aaplug.projection import project
 from aaplug.rasterizers import RASTERIZERS
 from aaplug.recipes import RECIPES, find_recipe
+from aaplug.sampling import median_rates
 from tests.conftest import make_camera, make_scene
 
 REFERENCE = RASTERIZERS["reference"]
@@ -194,6 +195,44 @@ def test_converted_splats_show_the_energy_that_training_showed(convention):
     torch.testing.assert_close(
         energy, (trained.opacities * trained.dets.sqrt())[seen], rtol=1e-6, atol=0
     )
+
+
+@pytest.mark.parametrize("viewer", VIEWERS.values(), ids=VIEWERS)
+@pytest.mark.parametrize("trained", CONVENTIONS.values(), ids=CONVENTIONS)
+def test_converted_for_a_viewer_shows_the_energy_that_training_showed(viewer, trained):
+    """One camera, and splats as wide as they need be: the viewer's o√det equals training's, and so does the width."""
+    scene = replace(make_scene(100, dtype=torch.float64), convention=trained)
+    scene = replace(
+        scene,
+        logit_opacities=scene.logit_opacities - 4,
+        log_scales=scene.log_scales[:, :1].repeat(1, 3).clamp(min=-2.5),
+        means=scene.means * 0.1,
+    )
+    camera = make_camera()
+    training = learn(scene, [camera])
+    converted = convert_for(scene, training, viewer)
+    assert converted.convention == viewer.convention
+    assert (converted is scene) == (trained == viewer.convention)
+    rules = (scene, trained), (converted, viewer.convention)
+    then, now = (project(s, camera).blurred(c.kernel, c.compensated) for s, c in rules)
+    energies = [splats.opacities * splats.dets.sqrt() for splats in (then, now)]
+    torch.testing.assert_close(*energies, rtol=1e-6, atol=0)
+    fitted = viewer.convention.compensated and not trained.compensated
+    missing = FITTED_VARIANCE + viewer.convention.kernel - trained.kernel if fitted else 0.0
+    trace = [splats.covs[:, 0] + splats.covs[:, 2] for splats in (then, now)]
+    torch.testing.assert_close(trace[0] + 2 * missing, trace[1], rtol=0.01, atol=0)
+
+
+def test_a_scene_too_thin_for_a_viewers_blur_keeps_some_area(cameras):
+    scene = replace(make_scene(40), convention=MIP)
+    scene = replace(scene, log_scales=scene.log_scales - 4)
+    converted = convert_for(scene, learn(scene, cameras), VIEWERS["antialiased-viewer"])
+    assert (converted.log_scales <= scene.log_scales).all()
+    assert converted.log_scales.isfinite().all()
+    px = converted.scales * median_rates(scene.means, cameras)[:, None]
+    least = (scene.scales * median_rates(scene.means, cameras)[:, None]).clamp(max=0.1)
+    assert (px >= 0.999 * least).all()
+    assert (px < 0.999 * scene.scales * median_rates(scene.means, cameras)[:, None]).any()
 
 
 def test_a_free_camera_is_compared_with_the_training_cameras_focal():

@@ -1,7 +1,7 @@
 """nerfstudio's `camera_path.json`: free cameras along a path, the frames of a video.
 
-{render_width, render_height, fps, camera_type, camera_path: [{camera_to_world, fov}]}.  camera_to_world: 16 numbers, row
-by row, OpenGL axes, in the frame of the trained scene; fov: the vertical angle in degrees; sizes in px.
+{render_width, render_height, fps, camera_type, camera_path: [{camera_to_world, fov}]}.  camera_to_world:
+16 numbers, row by row, OpenGL axes, in the frame of the trained scene; fov: the vertical angle in degrees; sizes in px.
 """
 
 import math

@@ -1,0 +1,56 @@
+"""What a fine-tuning step minimises: how far a render is from the image that it should be.
+
+Images are [h, w, 3].  A loss is a scalar, 0 where both are equal, and differentiable in the first argument.
+"""
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from aaplug.metrics import SSIM_SIGMA, SSIM_WINDOW
+
+SSIM_SHARE = 0.2  # of D-SSIM beside L1 (3DGS, eq. 7)
+SSIM_K = (0.01, 0.03)  # of the value range, squared: Wang et al. 2004
+
+Loss = Callable[[Float[Tensor, "h w 3"], Float[Tensor, "h w 3"]], Float[Tensor, ""]]
+
+
+def l2(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
+    """Mean squared error (Mipmap-GS)."""
+    return (image - truth).square().mean()
+
+
+def l1_dssim(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
+    """0.8 mean absolute error + 0.2 (1 − SSIM): what 3DGS is trained with (its eq. 7)."""
+    absolute = (image - truth).abs().mean()
+    return (1 - SSIM_SHARE) * absolute + SSIM_SHARE * (1 - structural_similarity(image, truth))
+
+
+def structural_similarity(
+    image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]
+) -> Float[Tensor, ""]:
+    """Mean SSIM over the windows that lie in the image whole, or over one as large as a smaller image."""
+    a, b = (x.permute(2, 0, 1)[:, None] for x in (image, truth))
+    rows, columns = (_window(min(SSIM_WINDOW, side)).to(image) for side in a.shape[2:])
+
+    def blurred(x: Tensor) -> Tensor:
+        down = torch.nn.functional.conv2d(x, rows[None, None, :, None])
+        return torch.nn.functional.conv2d(down, columns[None, None, None, :])
+
+    mean_a, mean_b = blurred(a), blurred(b)
+    var_a, var_b = blurred(a * a) - mean_a**2, blurred(b * b) - mean_b**2
+    cov = blurred(a * b) - mean_a * mean_b
+    c1, c2 = (k * k for k in SSIM_K)
+    alike = (2 * mean_a * mean_b + c1) * (2 * cov + c2)
+    return (alike / ((mean_a**2 + mean_b**2 + c1) * (var_a + var_b + c2))).mean()
+
+
+def _window(size: int) -> Float[Tensor, " w"]:
+    x = torch.arange(size, dtype=torch.float64) - (size - 1) / 2
+    weights = torch.exp(-0.5 * (x / SSIM_SIGMA) ** 2)
+    return weights / weights.sum()
+
+
+LOSSES: dict[str, Loss] = {"l2": l2, "l1-dssim": l1_dssim}

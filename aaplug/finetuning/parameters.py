@@ -1,0 +1,64 @@
+"""The scene as leaves that an optimizer moves, with 3DGS's learning rates, and the bounds that they keep.
+
+n: Gaussians.  Colours are two leaves, the constant (dc) and the rest of the harmonics, for 3DGS moves them at rates of
+their own.  A Gaussian may become no thinner than its sampling bound lets it be, or than it was if it was thinner:
+below √0.2 px at the highest rate of any training camera nothing could be told from noise (Mip-Splatting, section 5.1).
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from aaplug.cameras import Camera
+from aaplug.filters import NYQUIST_VARIANCE
+from aaplug.gaussians import Gaussians
+from aaplug.sampling import SamplingBounds
+
+Leaves = dict[str, Tensor]
+
+RATES: Mapping[str, float] = {  # 3DGS's, a step; means' in shares of the scene's extent
+    "means": 1.6e-4,
+    "quats": 1e-3,
+    "log_scales": 5e-3,
+    "logit_opacities": 5e-2,
+    "dc": 2.5e-3,
+    "rest": 2.5e-3 / 20,
+}
+EXTENT_MARGIN = 1.1  # of the training cameras' farthest distance from their mean (3DGS)
+
+
+def leaves_of(scene: Gaussians) -> Leaves:
+    """Copies of everything that can move."""
+    leaves = {
+        "means": scene.means,
+        "quats": scene.quats,
+        "log_scales": scene.log_scales,
+        "logit_opacities": scene.logit_opacities,
+        "dc": scene.sh[:, :1],
+        "rest": scene.sh[:, 1:],
+    }
+    return {name: value.detach().clone() for name, value in leaves.items()}
+
+
+def scene_of(leaves: Mapping[str, Tensor], like: Gaussians) -> Gaussians:
+    """The scene that the leaves stand for; what has another number of Gaussians than its file is not from there."""
+    values = {n: leaves[n] for n in ("means", "quats", "log_scales", "logit_opacities")}
+    sh = torch.cat([leaves["dc"], leaves["rest"]], dim=1)
+    origin = like.origin if len(sh) == len(like) else None
+    return replace(like, **values, sh=sh, origin=origin)
+
+
+def extent(cameras: tuple[Camera, ...]) -> float:
+    """The scene's size as 3DGS has it, in world units: from the spread of its training cameras."""
+    centres = torch.stack([camera.centre for camera in cameras])
+    spread = (centres - centres.mean(dim=0)).norm(dim=1).max().item()
+    return EXTENT_MARGIN * spread if spread > 0 else 1.0
+
+
+def thinnest(born: Float[Tensor, "n 3"], bounds: SamplingBounds) -> Float[Tensor, "n 3"]:
+    """ln of the least standard deviation that each axis may take, from the one that it started with."""
+    floor = 0.5 * torch.log(torch.tensor(NYQUIST_VARIANCE)) - bounds.highest_or_coarsest.log()
+    return torch.minimum(born, floor.to(born)[:, None])

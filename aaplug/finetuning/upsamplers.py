@@ -1,0 +1,101 @@
+"""Larger images from smaller ones, for views larger than training's: a guess that fine-tuning takes for the truth.
+
+Built in are bicubic and Lanczos; learned ones come as the user's file of weights: a network of OpenCV's
+`dnn_superres` named as theirs are (ESPCN_x4.pb), or a torch program (.pt2, `torch.export`) that takes [1, 3, h, w] in
+[0, 1] and gives [1, 3, H, W].  What a network gives is brought to the size asked for: averaged where it is larger,
+bicubic where it is smaller.
+"""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from aaplug.errors import FormatError, UsageError
+
+Upsampler = Callable[[Float[Tensor, "h w 3"], tuple[int, int]], Float[Tensor, "H W 3"]]
+OPENCV_NAME = re.compile(r"(edsr|espcn|fsrcnn|lapsrn).*_x(\d)\.pb", re.IGNORECASE)
+BYTE = 255.0
+
+
+def _resized(kernel: int) -> Upsampler:
+    def upsample(image: Tensor, hw: tuple[int, int]) -> Tensor:
+        return torch.from_numpy(cv2.resize(image.numpy(), hw[::-1], interpolation=kernel))
+
+    return upsample
+
+
+bicubic, lanczos = _resized(cv2.INTER_CUBIC), _resized(cv2.INTER_LANCZOS4)
+UPSAMPLERS: dict[str, Upsampler] = {"bicubic": bicubic, "lanczos": lanczos}
+
+
+def find_upsampler(name: str) -> Upsampler:
+    """One that is built in, or the network in a file.
+
+    Raises:
+        UsageError: neither is meant.
+        FormatError: the file cannot be read as what its name says.
+    """
+    if name in UPSAMPLERS:
+        return UPSAMPLERS[name]
+    path = Path(name)
+    if path.suffix not in (".pb", ".pt2"):
+        raise UsageError(
+            "--upsampler", f"expected {', '.join(UPSAMPLERS)} or a .pb or .pt2 file, got '{name}'"
+        )
+    if not path.is_file():
+        raise FormatError(path, "does not exist")
+    network = _opencv(path) if path.suffix == ".pb" else _torch(path)
+    return lambda image, hw: _brought_to(network(image), hw)
+
+
+def _opencv(path: Path) -> Callable[[Tensor], Tensor]:
+    match = OPENCV_NAME.fullmatch(path.name)
+    if match is None:
+        raise FormatError(path, "has no name such as ESPCN_x4.pb, which tells network and factor")
+    network = cv2.dnn_superres.DnnSuperResImpl.create()
+    try:
+        network.readModel(str(path))
+    except cv2.error as error:
+        raise FormatError(path, "is not a network that OpenCV can read") from error
+    network.setModel(match[1].lower(), int(match[2]))
+
+    def enlarge(image: Tensor) -> Tensor:
+        pixels = (image.flip(2) * BYTE).round().byte().numpy()  # BGR
+        try:
+            larger = network.upsample(pixels)
+        except cv2.error as error:
+            raise FormatError(path, f"is no {match[1]} network for x{match[2]}") from error
+        return torch.from_numpy(larger).flip(2).float() / BYTE
+
+    return enlarge
+
+
+def _torch(path: Path) -> Callable[[Tensor], Tensor]:
+    try:
+        module = torch.export.load(path).module()
+    except Exception as error:  # a file of anything fails in any way
+        raise FormatError(path, "is not a program of torch.export") from error
+
+    def enlarge(image: Tensor) -> Tensor:
+        with torch.no_grad():
+            try:
+                larger = module(image.permute(2, 0, 1)[None])
+                return larger[0].permute(1, 2, 0).contiguous()
+            except Exception as error:
+                raise FormatError(
+                    path, f"does not take an image of {image.shape[1]}x{image.shape[0]} px"
+                ) from error
+
+    return enlarge
+
+
+def _brought_to(image: Tensor, hw: tuple[int, int]) -> Tensor:
+    if tuple(image.shape[:2]) == hw:
+        return image
+    kernel = cv2.INTER_AREA if image.shape[0] > hw[0] else cv2.INTER_CUBIC
+    return _resized(kernel)(image, hw)

@@ -1,0 +1,403 @@
+"""Fine-tuning: gradients of the whole loss, bounds, densification, and runs that nothing can spoil."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from skimage.metrics import structural_similarity as ssim_of_skimage
+
+from aaplug.cameras import WHITE
+from aaplug.errors import FormatError, UsageError
+from aaplug.finetuning import Job, Settings, State, Truth, advance, begin, load, loss_at, run, save
+from aaplug.finetuning import tuning as tuning_module
+from aaplug.finetuning.densification import MIN_SHOWN, PULL, SHRINK, carried, densify
+from aaplug.finetuning.losses import LOSSES, l1_dssim, l2, structural_similarity
+from aaplug.finetuning.parameters import RATES, extent, leaves_of, scene_of, thinnest
+from aaplug.finetuning.upsamplers import UPSAMPLERS, find_upsampler
+from aaplug.gaussians import Gaussians
+from aaplug.pipeline import learn, render
+from aaplug.rasterizers import RASTERIZERS
+from aaplug.recipes import RECIPES
+from tests.conftest import make_camera, make_scene
+
+F64 = torch.float64
+EYES = [(0.5, -3.5, 0.4), (2.0, -3.0, 1.0), (-2.5, -3.0, 0.2)]
+VIEWS = tuple(
+    make_camera(eye, size=(32, 24), name=f"view{i}", fov=0.9) for i, eye in enumerate(EYES)
+)
+WEIGHTS = {0.5: 1.0, 0.25: 2.0}
+SETTINGS = Settings("test", 12, WEIGHTS, RATES, anchor=3.0, decay=0.1)
+GREY = (0.5, 0.5, 0.5)
+
+
+def make_job(
+    n: int = 60,
+    settings: Settings = SETTINGS,
+    dtype: torch.dtype = torch.float32,
+    recipe: str = "matched",
+) -> Job:
+    scene = make_scene(n, seed=4, dtype=dtype)
+    training = learn(scene, VIEWS)
+    eager = RASTERIZERS["eager"]
+    truth = Truth(scene, training, eager, GREY)
+    return Job(scene, training, RECIPES[recipe], VIEWS, truth, settings, eager, GREY)
+
+
+def after(job: Job, steps: int | None = None) -> State:
+    state = begin(job)
+    for _ in range(job.settings.steps if steps is None else steps):
+        advance(job, state)
+    return state
+
+
+def assert_same(a: State, b: State) -> None:
+    assert (a.step, a.curve) == (b.step, b.curve)
+    assert a.leaves.keys() == b.leaves.keys()
+    for name, leaf in a.leaves.items():
+        assert torch.equal(leaf, b.leaves[name]), name
+
+
+# losses
+
+
+def test_ssim_is_skimages():
+    a, b = torch.rand(2, 30, 41, 3, dtype=F64)
+    options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
+    _, full = ssim_of_skimage(
+        a.numpy(), b.numpy(), data_range=1.0, channel_axis=2, full=True, **options
+    )
+    assert structural_similarity(a, b).item() == pytest.approx(full[5:-5, 5:-5].mean(), abs=1e-9)
+
+
+@pytest.mark.parametrize("loss", LOSSES.values(), ids=LOSSES)
+@pytest.mark.parametrize("hw", [(20, 30), (4, 7), (1, 1)])
+def test_losses_are_0_where_images_are_equal_and_only_there(loss, hw):
+    image = torch.rand(*hw, 3, dtype=F64)
+    assert loss(image, image).item() == pytest.approx(0.0, abs=1e-12)
+    assert loss(image, image + 0.1).item() > 1e-4
+
+
+def test_losses_are_the_papers():
+    image, truth = torch.full((12, 12, 3), 0.5).double(), torch.full((12, 12, 3), 0.3).double()
+    assert l2(image, truth).item() == pytest.approx(0.04)
+    luminance = (2 * 0.15 + 1e-4) / (0.25 + 0.09 + 1e-4)
+    expected = 0.8 * 0.2 + 0.2 * (1 - luminance)
+    assert l1_dssim(image, truth).item() == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+@pytest.mark.parametrize("recipe", ["matched", "ewa", "mip", "classic"])
+def test_gradients_of_the_whole_loss_are_finite_differences(loss, recipe):
+    job = make_job(25, replace(SETTINGS, loss=loss), F64, recipe)
+    white = replace(job.truth, background=WHITE)  # far from the kinks of L1
+    job = replace(job, truth=white)
+    generator = torch.Generator().manual_seed(2)
+    leaves = {
+        name: value + 0.05 * torch.randn(value.shape, generator=generator, dtype=F64)
+        for name, value in leaves_of(job.start).items()
+    }  # away from where the training size has no error at all
+
+    def total(values):
+        return sum(
+            w * loss_at(job, values, VIEWS[0], s)[0] for s, w in {**WEIGHTS, 1.0: 3.0}.items()
+        )
+
+    moving = {name: value.clone().requires_grad_() for name, value in leaves.items()}
+    grads = torch.autograd.grad(total(moving), list(moving.values()))
+    for (name, value), grad in zip(leaves.items(), grads, strict=True):
+        way = torch.randn(value.shape, generator=generator, dtype=F64)
+        ends = [total(leaves | {name: value + sign * 1e-6 * way}).item() for sign in (1, -1)]
+        slope = (ends[0] - ends[1]) / 2e-6
+        assert (grad * way).sum().item() == pytest.approx(slope, rel=1e-4, abs=1e-9), name
+        assert abs(slope) > 1e-6, f"{name} does not matter here"
+
+
+# what moves, and how far
+
+
+def test_leaves_and_scene_are_each_other():
+    scene = make_scene(9)
+    again = scene_of(leaves_of(scene), scene)
+    for name in ("means", "quats", "log_scales", "logit_opacities", "sh"):
+        assert torch.equal(getattr(again, name), getattr(scene, name))
+
+
+def test_steps_lower_the_loss_at_every_scale():
+    job = make_job(60, replace(SETTINGS, steps=24))
+
+    def losses(scene: Gaussians) -> list[float]:
+        leaves = leaves_of(scene)
+        return [
+            sum(loss_at(job, leaves, view, scale)[0].item() for view in VIEWS) for scale in WEIGHTS
+        ]
+
+    before, now = losses(job.start), losses(after(job).scene(job))
+    assert all(b < 0.9 * a for a, b in zip(before, now, strict=True)), (before, now)
+
+
+def test_only_what_has_a_rate_moves():
+    job = make_job(settings=replace(SETTINGS, rates={"dc": 0.1}))
+    state = after(job, 3)
+    for name, leaf in leaves_of(job.start).items():
+        assert torch.equal(leaf, state.leaves[name]) == (name != "dc"), name
+
+
+def test_no_step_leaves_a_gaussian_thinner_than_its_bound():
+    job = make_job(settings=replace(SETTINGS, rates={"log_scales": 0.5}, anchor=0.0))
+    bound = thinnest(job.start.log_scales, job.training.bounds)
+    state = begin(job)
+    held = 0
+    for _ in range(6):
+        advance(job, state)
+        held += int((state.leaves["log_scales"] == bound).sum())
+        assert (state.leaves["log_scales"] >= bound).all()
+    assert held > 10
+
+
+def test_the_bound_is_the_sampling_bound_or_where_a_gaussian_started():
+    job = make_job()
+    nyquist = 0.2**0.5 / job.training.bounds.highest_or_coarsest[:, None]
+    start = job.start.scales
+    bound = thinnest(job.start.log_scales, job.training.bounds).exp()
+    torch.testing.assert_close(bound, torch.minimum(start, nyquist))
+    assert (start < nyquist).any()
+    assert (start > nyquist).any()
+
+
+# densification
+
+
+def test_densify_clones_the_small_splits_the_large_and_prunes_the_faint():
+    scene = make_scene(4)
+    scene = replace(
+        scene,
+        log_scales=torch.tensor([-6.0, -6.0, 0.0, 0.0])[:, None].repeat(1, 3),
+        logit_opacities=torch.tensor([1.0, -9.0, 1.0, 1.0]),
+    )
+    pull = torch.tensor([2 * PULL, 0.0, 2 * PULL, 0.0])
+    change = densify(scene, pull, 1.0, torch.Generator().manual_seed(0))
+    assert change.sources.tolist() == [0, 3, 0, 2, 2]
+    assert change.new.tolist() == [False, False, True, True, True]
+    clone, halves = change.scene[2:3], change.scene[3:]
+    assert torch.equal(clone.means[0], scene.means[0])
+    torch.testing.assert_close(halves.log_scales, scene.log_scales[2:] - math.log(SHRINK))
+    assert not torch.equal(halves.means[0], halves.means[1])
+    assert (change.scene.opacities >= MIN_SHOWN).all()
+
+
+def test_halves_lie_where_the_gaussian_lies():
+    scene = make_scene(1)
+    scene = replace(scene, log_scales=torch.tensor([[1.0, -3.0, -5.0]]))
+    many = scene[torch.zeros(4000, dtype=torch.long)]
+    change = densify(
+        many, torch.full((4000,), 1.0), 0.1, torch.Generator().manual_seed(1)
+    )  # all are split
+    offsets = (change.scene.means - scene.means).double()
+    w, x, y, z = scene.unit_quats[0].double().tolist()
+    R = torch.tensor(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ],
+        dtype=F64,
+    )
+    along = offsets @ R
+    torch.testing.assert_close(along.std(dim=0), scene.scales[0].double(), rtol=0.05, atol=0)
+
+
+def test_the_optimizer_forgets_what_is_new_alone():
+    change = densify(
+        make_scene(3), torch.tensor([1.0, 0.0, 0.0]), 1e9, torch.Generator().manual_seed(0)
+    )
+    moments = {"step": torch.tensor(5.0), "exp_avg": torch.arange(1.0, 4.0)[:, None]}
+    found = carried(moments, change)
+    assert found["exp_avg"][:, 0].tolist() == [1.0, 2.0, 3.0, 0.0]
+    assert found["step"] == 5
+
+
+def test_a_densified_run_grows_and_goes_on():
+    job = make_job(settings=replace(SETTINGS, steps=6, densify_every=2))
+    state = after(job)
+    assert len(state.leaves["means"]) > 60
+    assert state.thinnest.shape == state.leaves["log_scales"].shape
+    assert all(leaf.isfinite().all() for leaf in state.leaves.values())
+
+
+# runs
+
+
+@pytest.mark.parametrize(("densify_every", "stopped_at"), [(0, 4), (3, 5)])
+def test_a_run_that_was_stopped_and_resumed_is_one_that_never_was(
+    densify_every, stopped_at, tmp_path
+):
+    job = make_job(settings=replace(SETTINGS, densify_every=densify_every))
+    whole = begin(job)
+    assert run(job, whole, every=4)
+    first = begin(job)
+
+    def keep(state, good):
+        save(tmp_path / "run.pt", job, state, good)
+
+    assert not run(job, first, every=4, keep=keep, stop=lambda: first.step == stopped_at)
+    again, good = load(tmp_path / "run.pt", job)
+    assert again.step == stopped_at
+    assert good["step"] == 4
+    assert run(job, again, good, every=4)
+    assert_same(again, whole)
+
+
+def test_nothing_after_a_checkpoint_changes_it(tmp_path):
+    job, kept = make_job(), []
+    run(job, begin(job), every=4, keep=lambda state, good: kept.append(good))
+    assert [good["step"] for good in kept] == [4, 8, 12]
+    assert not torch.equal(kept[0]["leaves"]["dc"], kept[2]["leaves"]["dc"])
+
+
+def spoil(monkeypatch, bad_steps: set[int]) -> None:
+    """Make the gradient of these steps, counted from 0, not a number."""
+    calls = iter(range(10**6))
+    real = tuning_module.loss_at
+
+    def spoiled(job, leaves, view, scale):
+        loss, splats, hw = real(job, leaves, view, scale)
+        return (loss * math.nan if next(calls) // 2 in bad_steps else loss), splats, hw
+
+    monkeypatch.setattr(tuning_module, "loss_at", spoiled)
+
+
+WITHOUT_SAME = replace(SETTINGS, weights={0.5: 1.0})  # two losses a step
+
+
+def test_a_step_without_a_finite_gradient_changes_nothing(monkeypatch):
+    job = make_job(settings=WITHOUT_SAME)
+    state = after(job, 3)
+    before = state.scene(job)
+    spoil(monkeypatch, {0})
+    advance(job, state)
+    assert (state.step, state.bad, len(state.curve)) == (4, 1, 3)
+    assert torch.equal(state.scene(job).means, before.means)
+    advance(job, state)
+    assert (state.step, state.bad, len(state.curve)) == (5, 0, 4)
+
+
+def test_three_bad_steps_go_back_and_say_so(monkeypatch):
+    job, said, kept = make_job(settings=WITHOUT_SAME), [], []
+    spoil(monkeypatch, {5, 6, 7})
+    state = begin(job)
+    assert run(
+        job, state, every=4, keep=lambda s, good: kept.append((s.step, good)), say=said.append
+    )
+    assert said == ["step 8: 3 steps without a finite gradient; back to step 4, at half the rates"]
+    assert (state.step, state.back_offs) == (12, 1)
+    assert [entry["step"] for entry in state.curve] == [1, 2, 3, 4, 9, 10, 11, 12]
+
+
+def test_a_run_that_never_has_a_gradient_ends(monkeypatch):
+    job = make_job(settings=replace(WITHOUT_SAME, steps=100))
+    spoil(monkeypatch, set(range(100)))
+    with pytest.raises(UsageError, match="no finite gradient"):
+        run(job, begin(job))
+
+
+def test_checkpoints_of_others_are_refused(tmp_path):
+    job, path = make_job(), tmp_path / "run.pt"
+    with pytest.raises(FormatError, match="no run to resume"):
+        load(path, job)
+    path.write_bytes(b"not a checkpoint")
+    with pytest.raises(FormatError, match="damaged"):
+        load(path, job)
+    state = begin(job)
+    run(job, state, stop=lambda: state.step == 2, keep=lambda s, good: save(path, job, s, good))
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(FormatError, match="damaged"):
+        load(path, job)
+    save(path, job, state, {})
+    with pytest.raises(UsageError, match="its steps was 12, now it is 13"):
+        load(path, replace(job, settings=replace(SETTINGS, steps=13)))
+    with pytest.raises(UsageError, match="its scene was"):
+        load(path, replace(job, start=make_scene(60, seed=5)))
+
+
+# what renders are compared with
+
+
+def test_truth_is_the_box_average_of_the_training_size():
+    job = make_job()
+    full = render(job.start, VIEWS[0], RECIPES["classic"], job.training, background=GREY).rgb
+    boxes = full.clamp(0, 1).unflatten(1, (-1, 4)).unflatten(0, (-1, 4)).mean(dim=(1, 3))
+    truth = job.truth(VIEWS[0], 0.25)
+    torch.testing.assert_close(truth, boxes, atol=1e-3, rtol=0)
+    assert torch.equal(job.truth(VIEWS[0], 0.25), truth)
+    forgetful = replace(job.truth, memory=0.0)
+    assert torch.equal(forgetful(VIEWS[0], 0.25), truth)
+    assert not forgetful._kept
+    namesake = replace(VIEWS[1], name=VIEWS[0].name)  # as in Blender's splits
+    assert torch.equal(job.truth(namesake, 0.25), forgetful(VIEWS[1], 0.25))
+    assert not replace(job.truth, photographs=True)._kept
+
+
+def test_larger_truth_has_the_averages_of_the_training_size():
+    job = make_job()
+    full, larger = job.truth(VIEWS[0], 1.0), job.truth(VIEWS[0], 2.0)
+    own = render(job.start, VIEWS[0].scaled(2.0), RECIPES["matched"], job.training, background=GREY)
+
+    def off(image):
+        boxes = image.unflatten(1, (-1, 2)).unflatten(0, (-1, 2)).mean(dim=(1, 3))
+        return (boxes - full).square().mean()
+
+    assert off(larger) < 0.2 * off(own.rgb)
+
+
+@pytest.mark.parametrize("name", UPSAMPLERS)
+def test_upsamplers_keep_what_is_smooth(name):
+    x = torch.linspace(0.2, 0.8, 16)
+    image = x[None, :, None].repeat(12, 1, 3)
+    larger = find_upsampler(name)(image, (24, 32))
+    assert larger.shape == (24, 32, 3)
+    boxes = larger.unflatten(1, (-1, 2)).unflatten(0, (-1, 2)).mean(dim=(1, 3))
+    torch.testing.assert_close(boxes[2:-2, 2:-2], image[2:-2, 2:-2], atol=2e-3, rtol=0)
+
+
+class Doubling(torch.nn.Module):
+    def forward(self, x):
+        return torch.nn.functional.interpolate(x, scale_factor=2.0, mode="nearest")
+
+
+def test_a_torch_program_upsamples(tmp_path):
+    path = tmp_path / "network.pt2"
+    sides = {2: torch.export.Dim("h", min=2), 3: torch.export.Dim("w", min=2)}
+    program = torch.export.export(Doubling(), (torch.rand(1, 3, 6, 5),), dynamic_shapes=(sides,))
+    torch.export.save(program, path)
+    image = torch.rand(8, 9, 3)
+    doubled = image.repeat_interleave(2, dim=0).repeat_interleave(2, dim=1)
+    upsample = find_upsampler(str(path))
+    torch.testing.assert_close(upsample(image, (16, 18)), doubled)
+    torch.testing.assert_close(upsample(image, (8, 9)), image, atol=1e-6, rtol=0)  # brought back
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("nearest", "expected bicubic, lanczos"),
+        ("missing.pb", "does not exist"),
+        ("ESPCN_x4.pb", "not a network"),
+        ("other.pb", "has no name such as"),
+        ("network.pt2", "not a program"),
+    ],
+)
+def test_what_is_no_upsampler_is_refused(name, words, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    if not name.startswith("missing"):
+        Path(name).write_bytes(b"nonsense")
+    with pytest.raises((FormatError, UsageError), match=words):
+        find_upsampler(name)
+
+
+def test_the_extent_is_that_of_the_training_cameras():
+    centres = torch.stack([view.centre for view in VIEWS])
+    far = (centres - centres.mean(0)).norm(dim=1).max().item()
+    assert extent(VIEWS) == pytest.approx(1.1 * far)
+    assert extent(VIEWS[:1]) == 1.0
