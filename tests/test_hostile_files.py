@@ -35,7 +35,11 @@ def test_damage_does_no_harm(tmp_path: Path, name: str):
 
 
 @given(data=st.data())
-@settings(max_examples=max(25, MUTATIONS), deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])  # fmt: skip
+@settings(
+    max_examples=max(25, MUTATIONS),
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
 def test_whatever_hypothesis_thinks_of_does_no_harm(tmp_path: Path, data: st.DataObject):
     name = data.draw(st.sampled_from(NAMES))
     content = bytearray(content_of(name, tmp_path))
@@ -65,6 +69,7 @@ def zip_of(name: str, size: int) -> bytes:
 
 
 PLY = b"ply\nformat binary_little_endian 1.0\n"
+TEXT = b"ply\nformat ascii 1.0\n"
 SPZ = b"NGSP\x03\0\0\0%b\0\x0c\0\0"
 BOMBS: dict[str, tuple[str, Callable[[], bytes]]] = {
     "306 kB for 300 MB": ("a.spz", lambda: gzip_of(SPZ % b"\x01\0\0\0", 300 << 20)),
@@ -73,7 +78,7 @@ BOMBS: dict[str, tuple[str, Callable[[], bytes]]] = {
     "zip": ("a.sog", lambda: zip_of("meta.json", 60 << 20)),
     "checkpoint": ("a.pt", lambda: zip_of("archive/data.pkl", 60 << 20)),
     "count 1e12": ("a.ply", lambda: PLY + b"element vertex 1000000000000\nproperty float x\nend_header\n"),
-    "text of 1e12": ("a.ply", lambda: b"ply\nformat ascii 1.0\nelement vertex 1000000000000\nproperty float x\nend_header\n0\n"),
+    "text of 1e12": ("a.ply", lambda: TEXT + b"element vertex 1000000000000\nproperty float x\nend_header\n0\n"),
     "list of 4e9": ("a.ply", lambda: PLY + b"element face 1\nproperty list uint float v\nend_header\n\xff\xff\xff\xff"),
     "64 MiB header": ("a.ply", lambda: PLY + b"comment " + b"a" * (64 << 20)),
     "deep JSON": ("meta.json", lambda: b'{"a":' * 100_000),
