@@ -391,7 +391,7 @@ def test_a_lower_degree_is_the_beginning_of_a_higher_one(functions):
 
 
 def test_the_functions_of_degree_4_turn_with_the_order_they_have():
-    """Order ±m goes around |m| times: two orders are one function turned, as in the lower degrees, and each its parity."""
+    """Orders m and −m are one function, turned by a quarter of its period, as in the lower degrees."""
     z = torch.tensor([0.3], dtype=F64)
     r = (1 - z * z).sqrt()
 

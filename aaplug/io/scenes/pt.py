@@ -7,6 +7,7 @@ restriction, and the user must ask for this format by --allow-checkpoint.
 
 import pickle
 import re
+import warnings
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -71,7 +72,9 @@ def _check_archive(path: Path, size: int) -> None:
 def _load(path: Path) -> Any:
     """Tensors and plain containers of them; torch's own words would advise to load all the rest."""
     try:
-        return torch.load(path, "cpu", weights_only=True, mmap=True)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # torch's, of what a damaged pickle asks for
+            return torch.load(path, "cpu", weights_only=True, mmap=True)
     except pickle.UnpicklingError as error:
         raise FormatError(
             path, "is damaged, or holds more than tensors, of which nothing was run"
