@@ -32,6 +32,13 @@ SH_C3 = (
     0.3731763325901154,
     1.445305721320277,
 )
+SH_C4 = (  # 3/4·√(35/π), 3/4·√(35/2π), 3/4·√(5/π), 3/4·√(5/2π), 3/16·√(1/π)
+    2.5033429417967046,
+    1.7701307697799304,
+    0.9461746957575601,
+    0.6690465435572892,
+    0.10578554691520431,
+)
 
 
 def project(scene: Gaussians, camera: Camera, kernels: Kernels = EAGER) -> Splats2D:
@@ -57,7 +64,7 @@ def shade(splats: Splats2D, scene: Gaussians, camera: Camera, kernels: Kernels =
 
 
 def sh_colour(sh: Float[Tensor, "m k 3"], directions: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:
-    """Colour of real spherical harmonics of degree 0 to 3 in unit directions from the camera, not clamped."""
+    """Colour of real spherical harmonics of degree 0 to 4 in unit directions from the camera, not clamped."""
     colour = torch.full_like(directions, COLOUR_OFFSET)
     for basis, coefficients in zip(
         _sh_basis(directions, sh.shape[1]), sh.unbind(dim=1), strict=True
@@ -171,6 +178,12 @@ def _sh_basis(directions: Float[Tensor, "m 3"], coefficients: int) -> list[Float
         ]
         basis += [SH_C3[3] * z * (2 * zz - 3 * xx - 3 * yy), -SH_C3[2] * x * (4 * zz - xx - yy)]
         basis += [SH_C3[4] * z * (xx - yy), -SH_C3[0] * x * (xx - 3 * yy)]
+    if coefficients > 16:
+        basis += [SH_C4[0] * x * y * (xx - yy), -SH_C4[1] * y * z * (3 * xx - yy)]
+        basis += [SH_C4[2] * x * y * (7 * zz - 1), -SH_C4[3] * y * z * (7 * zz - 3)]
+        basis += [SH_C4[4] * (zz * (35 * zz - 30) + 3), -SH_C4[3] * x * z * (7 * zz - 3)]
+        basis += [SH_C4[2] / 2 * (xx - yy) * (7 * zz - 1), -SH_C4[1] * x * z * (xx - 3 * yy)]
+        basis += [SH_C4[0] / 4 * (xx * (xx - 3 * yy) - yy * (3 * xx - yy))]
     return basis
 
 

@@ -5,7 +5,9 @@ after the other.  The one thing that it needs of all others, the coarsest rate f
 """
 
 import math
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import torch
@@ -38,10 +40,11 @@ def convert_parts(
     drop_bad: bool = False,
     tell: Tell = lambda done, total: None,
     size: int = PART,
+    threads: int = 1,
 ) -> Iterator[Gaussians]:
     """The parts of the scene, each converted; together what `conversion.convert` makes of the whole.
 
-    cameras: none where the scene stores its filter.
+    cameras: none where the scene stores its filter.  threads: how many parts are worked on side by side.
 
     Raises:
         UsageError, FormatError: see `conversion.convert` and `SceneFile.parts`.
@@ -49,14 +52,38 @@ def convert_parts(
     coarsest = None
     if cameras and not isinstance(form, MatchedEnergy):
         coarsest = _coarsest(opened, cameras, drop_bad, size)
-    done = 0
-    for part in opened.parts(drop_bad, size):
+
+    def converted(part: Gaussians) -> Gaussians:
         training = None
         if cameras:
             training = Training(part.convention, cameras, _bounds(part, cameras, coarsest), guard)
-        yield convert(part, training, form)
+        return convert(part, training, form)
+
+    done = 0
+    for part in _side_by_side(converted, opened.parts(drop_bad, size), threads):
+        yield part
         done += len(part)
         tell(min(done, opened.count), opened.count)
+
+
+def _side_by_side(
+    work: Callable[[Gaussians], Gaussians], parts: Iterator[Gaussians], threads: int
+) -> Iterator[Gaussians]:
+    """Results in order, from threads of one processor each; never more than one part a thread is waiting."""
+    before = torch.get_num_threads()
+    waiting: deque[Future[Gaussians]] = deque()
+    with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+        try:
+            torch.set_num_threads(1)
+            for part in parts:
+                waiting.append(pool.submit(work, part))
+                if len(waiting) > threads:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            torch.set_num_threads(before)
+            pool.shutdown(wait=True, cancel_futures=True)
 
 
 def check_frame_of(opened: SceneFile, cameras: Sequence[Camera], min_share: float) -> float:

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import torch
 import tyro
 
 from aaplug.conversion import FORMS, VIEWERS, convert_for, default_form, describe
@@ -93,7 +94,13 @@ def _convert_in_parts(options: Convert, opened: SceneFile) -> int:
         check_frame_of(opened, cameras, options.cameras.min_seen)
     with progress("converting", "Gaussians") as tell:
         parts = convert_parts(
-            opened, cameras, form, options.cameras.guard, options.scene.drop_bad, tell
+            opened,
+            cameras,
+            form,
+            options.cameras.guard,
+            options.scene.drop_bad,
+            tell,
+            threads=torch.get_num_threads(),
         )
         write_parts(options.output, parts, opened.count, [opened.path], overwrite=options.overwrite)
     say(f"wrote {options.output}, in parts; show it with the Mip rule (0.1 px², compensated)")

@@ -1,8 +1,10 @@
 """Outputs appear whole or not at all, and never in place of an input."""
 
 import errno
+import multiprocessing
 import os
 import resource
+import signal
 from pathlib import Path
 
 import pytest
@@ -152,4 +154,49 @@ def test_checking_creates_nothing(output: Path):
     check_output(output, True, [output.parent / "missing"])
     with pytest.raises(OutputError, match="exists"):
         check_output(output, False)
+    assert only_the_old_file_is_there(output)
+
+
+def killed(path: Path, at: str) -> None:
+    """A child that dies by kill -9 just before it calls the function `at` of os."""
+
+    def die(*_: object) -> None:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    def work() -> None:
+        setattr(os, at, die)
+        write(path, NEW * 1000, overwrite=True)
+
+    child = multiprocessing.get_context("fork").Process(target=work)
+    child.start()
+    child.join(30)
+    assert child.exitcode == -signal.SIGKILL
+
+
+@pytest.mark.parametrize("at", ["fsync", "replace"])
+def test_kill_9_before_the_rename_leaves_the_old_file(output: Path, at: str):
+    killed(output, at)
+    assert output.read_bytes() == OLD
+    (torn,) = (p for p in output.parent.iterdir() if p != output)
+    assert torn.name.startswith(".aaplug-")  # hidden, and never taken for a scene
+    write(output, NEW, overwrite=True)
+    assert output.read_bytes() == NEW
+
+
+def test_a_disk_that_fills_up_leaves_the_old_file(output: Path):
+    """A limit of the process stands in for a small disk: writing fails half way, with all that was there in place."""
+
+    def work() -> None:
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 16, 1 << 16))
+        try:
+            write(output, bytes(1 << 20), overwrite=True)
+        except OutputError as error:
+            os._exit(0 if "cannot be written: file too large" in str(error) else 3)
+        os._exit(4)
+
+    child = multiprocessing.get_context("fork").Process(target=work)
+    child.start()
+    child.join(30)
+    assert child.exitcode == 0
     assert only_the_old_file_is_there(output)

@@ -193,7 +193,11 @@ def test_data_goes_to_stdout_and_the_log_to_stderr(cli):
 
 def test_drop_bad_leaves_bad_gaussians_out_and_counts_them(cli):
     break_nan(Path())
-    code, out, err = cli("info scene.ply --json --drop-bad")
+    code, out, _ = cli("info scene.ply --json")
+    facts = json.loads(out)
+    assert (code, facts["gaussians"], facts["unusable_gaussians"]) == (0, 150, 2)
+    assert "--drop-bad" in facts["problems"][0]
+    code, out, err = cli("convert scene.ply --cameras . -o out.ply --json --drop-bad")
     assert (code, json.loads(out)["gaussians"]) == (0, 148)
     assert "warning:" in err
 

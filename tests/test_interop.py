@@ -1,4 +1,4 @@
-"""Converted files in somebody else's reader: splat-transform, where it is installed."""
+"""Files of ours in somebody else's reader, and of theirs in ours: splat-transform and pycolmap, where installed."""
 
 import shutil
 import subprocess
@@ -7,7 +7,9 @@ import pytest
 import torch
 
 from aaplug.conversion import FORMS, convert
+from aaplug.io.cameras import read_cameras
 from aaplug.io.scenes import read_scene, write_scene
+from tests.scene_files import ORACLE
 
 SPLAT_TRANSFORM = shutil.which("splat-transform")  # of the npm package @playcanvas/splat-transform
 
@@ -24,3 +26,44 @@ def test_splat_transform_reads_a_converted_scene(form, sample_scene, sample_trai
     for field in ("log_scales", "logit_opacities"):
         a, b = (getattr(s, field)[o] for s, o in zip((ours, theirs), order, strict=True))
         torch.testing.assert_close(a, b)
+
+
+@pytest.mark.skipif(SPLAT_TRANSFORM is None, reason="splat-transform is not installed")
+@pytest.mark.parametrize("suffix", [".compressed.ply", ".sog", ".spz", ".ply"])
+def test_what_splat_transform_packs_is_read_as_it_unpacks_it(suffix, tmp_path):
+    packed, unpacked = tmp_path / f"packed{suffix}", tmp_path / "unpacked.ply"
+    for source, target in ((ORACLE, packed), (packed, unpacked)):
+        words = [SPLAT_TRANSFORM, "-q", "-w", "-g", "cpu", str(source), str(target)]
+        subprocess.run(words, check=True, capture_output=True, timeout=120)
+    ours, theirs = read_scene(packed, spz_axes="opencv"), read_scene(unpacked)
+    for field in ("means", "log_scales", "logit_opacities", "sh"):
+        torch.testing.assert_close(getattr(ours, field), getattr(theirs, field), rtol=0, atol=1e-5)
+    assert (ours.unit_quats * theirs.unit_quats).sum(dim=1).abs().min() > 0.9999
+    assert ours.convention.compensated
+    assert theirs.convention.compensated
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(
+    "model",
+    ["myhan/sparse/0", "upup/sparse/0", "bartoszek/sparse/0", "colmap_multicam/colmap_sparse/0"],
+)
+def test_colmap_models_are_read_as_pycolmap_reads_them(model, shared_data):
+    pycolmap = pytest.importorskip("pycolmap")
+    folder = shared_data / "formats" / "colmap" / model
+    theirs = pycolmap.Reconstruction(str(folder))
+    ours = read_cameras(folder, test_every=0).all
+    images = sorted(theirs.images.values(), key=lambda image: image.name)
+    assert len(ours) == len(images)
+    for camera, image in zip(ours, images, strict=True):
+        lens, motion = image.camera, image.cam_from_world()
+        assert (camera.width, camera.height) == (lens.width, lens.height)
+        expected = (
+            lens.focal_length_x,
+            lens.focal_length_y,
+            lens.principal_point_x,
+            lens.principal_point_y,
+        )
+        assert (camera.fx, camera.fy, camera.cx, camera.cy) == pytest.approx(expected)
+        pose = torch.from_numpy(motion.matrix())
+        torch.testing.assert_close(camera.cam_from_world[:3], pose, rtol=0, atol=1e-9)

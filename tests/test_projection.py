@@ -373,21 +373,39 @@ def test_spherical_harmonics_have_their_values_on_paper(direction):
 
 
 def test_spherical_harmonics_are_orthonormal():
-    # Gauss-Legendre in z and equal steps around: exact for the products, which have degree 6
-    z, weights = (torch.from_numpy(a) for a in np.polynomial.legendre.leggauss(4))
-    around = torch.arange(8, dtype=F64) * PI / 4 + 0.1
+    # Gauss-Legendre in z and equal steps around: exact for the products, which have degree 8
+    z, weights = (torch.from_numpy(a) for a in np.polynomial.legendre.leggauss(5))
+    around = torch.arange(10, dtype=F64) * PI / 5 + 0.1
     z, angle = torch.cartesian_prod(z, around).T
-    weights = weights.repeat_interleave(8) * PI / 4
+    weights = weights.repeat_interleave(10) * PI / 5
     radius = (1 - z * z).sqrt()
-    values = basis(torch.stack([radius * angle.cos(), radius * angle.sin(), z], dim=1))
+    values = basis(torch.stack([radius * angle.cos(), radius * angle.sin(), z], dim=1), 25)
     gram = values.T @ (weights[:, None] * values)
-    torch.testing.assert_close(gram, torch.eye(16, dtype=F64), atol=1e-9, rtol=0)
+    torch.testing.assert_close(gram, torch.eye(25, dtype=F64), atol=1e-9, rtol=0)
 
 
 @pytest.mark.parametrize("functions", [1, 4, 9, 16])
 def test_a_lower_degree_is_the_beginning_of_a_higher_one(functions):
     directions = torch.nn.functional.normalize(make_scene(10, dtype=F64).means, dim=1)
-    torch.testing.assert_close(basis(directions, functions), basis(directions)[:, :functions])
+    torch.testing.assert_close(basis(directions, functions), basis(directions, 25)[:, :functions])
+
+
+def test_the_functions_of_degree_4_turn_with_the_order_they_have():
+    """Orders m and −m are one function, turned by a quarter of its period, as in the lower degrees."""
+    z = torch.tensor([0.3], dtype=F64)
+    r = (1 - z * z).sqrt()
+
+    def at(angle: float) -> torch.Tensor:
+        a = torch.tensor([angle], dtype=F64)
+        return basis(torch.stack([r * a.cos(), r * a.sin(), z], dim=1), 25)[0]
+
+    for degree in (2, 3, 4):
+        for m in range(1, degree + 1):
+            middle = degree * degree + degree
+            quarter = at(0.4 + PI / (2 * m))  # sin becomes cos there
+            torch.testing.assert_close(quarter[middle - m], at(0.4)[middle + m])
+        pole = basis(torch.tensor([[0.0, 0.0, 1.0]], dtype=F64), 25)[0]
+        assert pole[middle] == pytest.approx(((2 * degree + 1) / (4 * PI)) ** 0.5)
 
 
 def test_channels_keep_apart():

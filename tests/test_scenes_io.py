@@ -593,7 +593,7 @@ BAD_HEADERS = {
     "duplicate list": (File(after=([*faces, faces[1]], face_rows)), "declared twice"),
     "8 f_rest": (with_rest([f"f_rest_{i}" for i in range(8)]), "8 f_rest"),
     "f_rest with a gap": (with_rest([f"f_rest_{i}" for i in range(1, 10)]), "not f_rest_0"),
-    "ascii that is binary": (File(top=["format ascii 1.0"]), "cannot be read as .ply"),
+    "ascii that is binary": (File(top=["format ascii 1.0"]), "is damaged and cannot be read"),
     "ascii 10^12": (File(top=["format ascii 1.0"], count=str(10**12)), "is cut short"),
     "big endian": (File(top=["format binary_big_endian 1.0"]), "quaternion"),
     "version": (File(top=["format binary_little_endian 2.0"]), "2.0; known are"),
@@ -608,14 +608,14 @@ BAD_HEADERS = {
     "old Mac line ends": (File(newline=b"\r"), "first line"),
     "trailing bytes": (File(after=([], b"x")), "1 bytes more"),
     "trailing after lists": (File(after=(faces, face_rows + b"x")), "1 bytes after"),
-    "short lists": (File(after=(faces, face_rows[:-1])), "cannot be read as .ply"),
+    "short lists": (File(after=(faces, face_rows[:-1])), "is damaged and cannot be read"),
     "faces 10^12": (
         File(after=(["element face 1000000000000", *faces[1:]], face_rows)),
         "is cut short",
     ),
     "list of 2^31": (
         File(after=(["element face 1", "property list int int v"], b"\xff\xff\xff\x7f")),
-        "cannot be read as .ply",
+        "is damaged and cannot be read",
     ),
     "empty vertex": (File(columns=[]), "lacks x"),
 }

@@ -19,10 +19,10 @@ from aaplug.errors import FormatError
 from aaplug.gaussians import Gaussians
 from aaplug.io.limits import whole_limit
 from aaplug.io.scenes.packed import byte_opacities, floats, largest_last
-from aaplug.io.scenes.ply import DEGREES, library_errors
+from aaplug.io.scenes.ply import DEGREES
 from aaplug.io.scenes.ply_header import LITTLE, Element, Header, check_size, read_header
 from aaplug.io.scenes.ply_tags import meaning
-from aaplug.io.scenes.scene_file import SceneFile, check_count, sh_of_colour
+from aaplug.io.scenes.scene_file import SceneFile, check_count, library_errors, sh_of_colour
 
 SIGN = re.compile(rb"property\s+uint\w*\s+packed_position")
 WORDS = ("packed_position", "packed_rotation", "packed_scale", "packed_color")

@@ -16,8 +16,7 @@ import torch
 from aaplug.errors import FormatError
 from aaplug.gaussians import Gaussians
 from aaplug.io.scenes.packed import byte_opacities, floats
-from aaplug.io.scenes.ply import library_errors
-from aaplug.io.scenes.scene_file import SceneFile, check_count, empty, sh_of_colour
+from aaplug.io.scenes.scene_file import SceneFile, check_count, empty, library_errors, sh_of_colour
 from aaplug.io.scenes.splat import EVIDENCE
 
 MAIN = struct.Struct(

@@ -11,8 +11,7 @@ big-endian tables; numpy reads the Gaussians' rows.
 import io
 import re
 import warnings
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -23,7 +22,7 @@ import torch
 from plyfile import PlyData, PlyElement
 from torch import Tensor
 
-from aaplug.errors import AaplugError, FormatError, OutputError, listing
+from aaplug.errors import FormatError, OutputError, listing
 from aaplug.gaussians import Gaussians
 from aaplug.io.atomic import replacing
 from aaplug.io.scenes.ply_header import (
@@ -43,6 +42,7 @@ from aaplug.io.scenes.scene_file import (
     check_count,
     columns,
     empty,
+    library_errors,
     matrix_of,
     scene_of,
     sh_of_colour,
@@ -180,23 +180,6 @@ def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool) -
             assert written < count
             stream.seek(0)
             stream.write(header.with_padded_count(written).content)
-
-
-@contextmanager
-def library_errors(path: Path) -> Iterator[None]:
-    """Whatever a library raises over a damaged file, in the user's words."""
-    try:
-        yield
-    except AaplugError:
-        raise
-    except MemoryError as error:
-        raise FormatError(path, "does not fit into memory") from error
-    except OSError as error:
-        raise FormatError(
-            path, f"cannot be read: {(error.strerror or str(error)).lower()}"
-        ) from error
-    except Exception as error:  # plyfile raises its own, ValueError, OverflowError and others
-        raise FormatError(path, f"cannot be read as .ply: {error}") from error
 
 
 def _stamp(path: Path) -> tuple[int, int]:
@@ -348,7 +331,7 @@ def _one_type(dtype: np.dtype) -> bool:
 
 
 def _matrix(rows: np.ndarray) -> np.ndarray:
-    return rows.view("<f4").reshape(len(rows), -1)
+    return rows.view("<f4").reshape(len(rows), len(rows.dtype.names or ()))
 
 
 def _byte_colours(rows: np.ndarray) -> Tensor:

@@ -5,7 +5,9 @@ has had holes (CVE-2025-32434, CVE-2026-24747), so an older torch than 2.10 is r
 restriction, and the user must ask for this format by --allow-checkpoint.
 """
 
+import pickle
 import re
+import warnings
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -16,8 +18,8 @@ from torch import Tensor
 from aaplug.errors import FormatError
 from aaplug.gaussians import Gaussians
 from aaplug.io.limits import whole_limit
-from aaplug.io.scenes.ply import DEGREES, library_errors
-from aaplug.io.scenes.scene_file import SceneFile, check_count
+from aaplug.io.scenes.ply import DEGREES
+from aaplug.io.scenes.scene_file import SceneFile, check_count, library_errors
 
 SAFE_TORCH = (2, 10)  # the first release without CVE-2026-24747
 SUFFIXES = (".pt", ".pth", ".ckpt")
@@ -47,7 +49,7 @@ def open_scene(path: Path) -> SceneFile:
     with library_errors(path):
         size = path.stat().st_size
         _check_archive(path, size)
-        splats = _splats(path, torch.load(path, "cpu", weights_only=True, mmap=True))
+        splats = _splats(path, _load(path))
     count = len(splats["means"])
     check_count(path, count)
     tensors = {key: _checked(path, splats, key, count, size) for key in splats}
@@ -65,6 +67,18 @@ def _check_archive(path: Path, size: int) -> None:
         members = archive.infolist()
     if any(m.compress_type != zipfile.ZIP_STORED or m.file_size > size for m in members):
         raise FormatError(path, "has compressed members, which torch does not write")
+
+
+def _load(path: Path) -> Any:
+    """Tensors and plain containers of them; torch's own words would advise to load all the rest."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # torch's, of what a damaged pickle asks for
+            return torch.load(path, "cpu", weights_only=True, mmap=True)
+    except pickle.UnpicklingError as error:
+        raise FormatError(
+            path, "is damaged, or holds more than tensors, of which nothing was run"
+        ) from error
 
 
 def _splats(path: Path, document: Any) -> dict[str, Tensor]:

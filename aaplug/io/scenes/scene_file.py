@@ -6,15 +6,17 @@ are counted from 0.  Nothing of the size of the scene is held unless the whole i
 
 import logging
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from aaplug.errors import FormatError, listing
+from aaplug.errors import AaplugError, FormatError, listing
 from aaplug.gaussians import (
     CLASSIC,
     MAX_LOG_SCALE,
@@ -27,9 +29,10 @@ from aaplug.gaussians import (
 from aaplug.io.limits import limit, memory_of_machine, whole_limit
 
 SHORTEST_QUATERNION = 1e-12  # below this torch's `normalize` gives no unit quaternion
-PART = 1 << 18  # Gaussians read at once: 62 MB of degree 3
+PART = 1 << 16  # Gaussians read at once: 15 MB of degree 3
 C0 = 0.28209479177387814  # 1/(2√π): the harmonic of degree 0
 FLOAT = 4  # bytes
+MAX_REASON = 200  # letters of a library's message
 FILTER_COLUMN = "filter_3D"  # Mip-Splatting's smoothing, a standard deviation in world units
 
 log = logging.getLogger("aaplug")
@@ -75,8 +78,10 @@ class SceneFile:
         origin = Origin(
             str(self.path), self.format, self.evidence, self.document, torch.arange(start, stop)
         )
+        with library_errors(self.path):
+            rows = self.load(start, stop)
         return replace(
-            self.load(start, stop),
+            rows,
             convention=self.convention,
             fused=self.fused,
             flat=self.flat,
@@ -123,6 +128,25 @@ class SceneFile:
                 f"its {self.count:,} Gaussians take {needed / 1e9:.1f} GB, more than {share:.0%} of this machine's "
                 f"{memory / 1e9:.0f} GB; info and convert read it in parts, AAPLUG_MEMORY_SHARE=1 allows all",
             )
+
+
+@contextmanager
+def library_errors(path: Path) -> Iterator[None]:
+    """Whatever a library raises over a damaged file, in one line for the user."""
+    try:
+        with np.errstate(all="ignore"):  # numbers that are none are found and counted later
+            yield
+    except AaplugError:
+        raise
+    except MemoryError as error:
+        raise FormatError(path, "does not fit into memory") from error
+    except OSError as error:
+        raise FormatError(
+            path, f"cannot be read: {(error.strerror or str(error)).lower()}"
+        ) from error
+    except Exception as error:  # plyfile, numpy, zlib, zipfile, Pillow and torch raise all kinds
+        reason = " ".join(str(error).split())[:MAX_REASON]
+        raise FormatError(path, f"is damaged and cannot be read: {reason}") from error
 
 
 def check_count(path: Path, count: int) -> None:

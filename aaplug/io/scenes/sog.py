@@ -26,8 +26,7 @@ from aaplug.errors import FormatError
 from aaplug.gaussians import ANTIALIASED, CLASSIC, MAX_LOG_SCALE, Convention, Gaussians
 from aaplug.io.limits import whole_limit
 from aaplug.io.scenes.packed import byte_opacities, check_growth, floats, largest_last
-from aaplug.io.scenes.ply import library_errors
-from aaplug.io.scenes.scene_file import SceneFile, check_count
+from aaplug.io.scenes.scene_file import SceneFile, check_count, library_errors
 from aaplug.io.values import Entry, Place, parse_json, read_bounded
 
 META = "meta.json"

@@ -14,8 +14,7 @@ from aaplug.errors import FormatError
 from aaplug.gaussians import Gaussians
 from aaplug.io.atomic import replacing
 from aaplug.io.scenes.packed import byte_opacities, floats
-from aaplug.io.scenes.ply import library_errors
-from aaplug.io.scenes.scene_file import C0, SceneFile, check_count, sh_of_colour
+from aaplug.io.scenes.scene_file import C0, SceneFile, check_count, library_errors, sh_of_colour
 
 RECORD = np.dtype(
     [("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)]

@@ -29,8 +29,7 @@ from aaplug.io.scenes.packed import (
     largest_last,
     unzstd,
 )
-from aaplug.io.scenes.ply import library_errors
-from aaplug.io.scenes.scene_file import SceneFile, check_count
+from aaplug.io.scenes.scene_file import SceneFile, check_count, library_errors
 
 MAGIC = b"NGSP"
 GZIP = b"\x1f\x8b"
@@ -187,10 +186,10 @@ def _streams(path: Path, data: bytes, sizes: list[int]) -> Iterable[bytes]:
 
 def _rows(header: Header, sections: list[np.ndarray]) -> Gaussians:
     positions, alphas, colours, scales, quats, harmonics = sections
-    n = len(positions)
-    sh = torch.zeros(n, (header.degree + 1) ** 2, 3)
+    n, k = len(positions), (header.degree + 1) ** 2
+    sh = torch.zeros(n, k, 3)
     sh[:, 0] = (floats(colours) / 255 - 0.5) / COLOUR_GAIN
-    sh[:, 1:] = (floats(harmonics.reshape(n, -1, 3)) - 128) / 128
+    sh[:, 1:] = (floats(harmonics.reshape(n, k - 1, 3)) - 128) / 128
     scene = Gaussians(
         _positions(header, positions),
         _threes(quats) if header.version >= THREES else _first_three(quats),

@@ -1,0 +1,182 @@
+"""A worker for files that mean harm: reads each in a child of its own limits, and says what came of it.
+
+    python -m tests.hostile all|NAME,... N [SEED]      N random mutations of each small scene, figures on stdout
+
+A child process is forked once a batch, after everything is imported, and may take `MEMORY` more address space than it
+has.  Each file must end as a scene or as an error of ours, within `SECONDS` and `GROWTH` of resident memory.
+"""
+
+import multiprocessing
+import random
+import resource
+import shutil
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import torch
+
+from aaplug.errors import AaplugError
+from aaplug.io.scenes import open_scene
+from aaplug.streaming import survey
+from tests.scene_files import DATA, MADE, STORED, write_file
+
+SECONDS = 1.0  # of processor time a file; other processes may make the clock's run longer
+GROWTH = (
+    100 * 2**20
+)  # bytes of resident memory beyond what the program itself has, which is about 200 MB
+MEMORY = 2**30  # bytes of address space beyond what the worker has when it starts
+BATCH = 500  # files a child
+NAMES = (*STORED, "run.pt", *MADE)
+
+
+def outcome(path: Path) -> str:
+    """Read the scene as `aaplug info` does: "scene", "refused", or what went wrong."""
+    try:
+        survey(open_scene(path, allow_checkpoint=True))
+    except AaplugError as error:
+        str(error).encode()
+        return "refused" if "\n" not in str(error) else f"two lines: {error!r}"
+    except BaseException as error:
+        return f"{type(error).__name__}: {error!r:.200}"
+    return "scene"
+
+
+def mutations(data: bytes, seed: int, count: int) -> Iterator[bytes]:
+    """Copies with bytes flipped, replaced, cut out, doubled, and digits and lengths changed."""
+    rng = random.Random(seed)
+    for _ in range(count):
+        spoiled = bytearray(data)
+        for _ in range(rng.choice((1, 1, 2, 4, 8))):
+            spoiled = _spoil(spoiled, rng)
+        yield bytes(spoiled)
+
+
+def cuts(data: bytes, header: int, body: int = 200) -> Iterator[bytes]:
+    """Cut at every byte of the header and at places spread over the body."""
+    step = max(1, (len(data) - header) // body)
+    for size in [*range(header), *range(header, len(data), step)]:
+        yield data[:size]
+
+
+def flipped_digits(data: bytes, header: int) -> Iterator[bytes]:
+    """Every digit of the header replaced by some others."""
+    for at in range(header):
+        if 48 <= data[at] < 58:
+            for digit in b"0189-":
+                yield data[:at] + bytes([digit]) + data[at + 1 :]
+
+
+def header_size(name: str, data: bytes) -> int:
+    """How many bytes tell about the rest."""
+    if name.endswith(".ply"):
+        return data.index(b"end_header\n") + 11
+    return len(data) if len(data) < 512 else 256
+
+
+def check(name: str, files: Iterable[bytes]) -> Counter[str]:
+    """Read each of these as the named format, in children; counts of outcomes.
+
+    Raises:
+        AssertionError: a file did harm.
+    """
+    outcomes: Counter[str] = Counter()
+    batch: list[bytes] = []
+    for data in files:
+        batch.append(data)
+        if len(batch) == BATCH:
+            outcomes += _in_a_child(name, batch)
+            batch = []
+    return outcomes + _in_a_child(name, batch) if batch else outcomes
+
+
+def _spoil(data: bytearray, rng: random.Random) -> bytearray:
+    at = (
+        rng.randrange(len(data) + 1)
+        if rng.random() < 0.5
+        else rng.randrange(min(len(data), 300) + 1)
+    )
+    kind = rng.randrange(6)
+    if kind == 0 and at < len(data):
+        data[at] ^= 1 << rng.randrange(8)
+    elif kind == 1:
+        data[at : at + rng.randrange(9)] = rng.randbytes(rng.randrange(9))
+    elif kind == 2:
+        del data[at : at + rng.choice((1, 4, 16, len(data) // 2))]
+    elif kind == 3:
+        data[at:at] = data[at : at + rng.choice((1, 4, 16, 256))]
+    elif kind == 4:
+        data[at : at + 4] = rng.choice((b"\xff" * 4, b"\0" * 4, b"\xff\xff\xff\x7f", b"\0\0\0\x80"))
+    else:
+        data[at : at + 1] = rng.choice((b"0", b"9", b"99999999", b"-1", b" ", b"\n", b"1e9", b"\0"))
+    return data
+
+
+def _in_a_child(name: str, files: list[bytes]) -> Counter[str]:
+    receive, send = multiprocessing.Pipe(duplex=False)
+    child = multiprocessing.get_context("fork").Process(target=_work, args=(name, files, send))
+    child.start()
+    send.close()
+    try:
+        found, slowest, growth, left = receive.recv()
+    except EOFError:
+        child.join()
+        raise AssertionError(f"{name}: the reader died with {child.exitcode}") from None
+    child.join()
+    strange = {key: n for key, n in found.items() if key not in ("scene", "refused")}
+    assert not strange, (name, strange)
+    assert slowest < SECONDS, (name, slowest)
+    assert growth < GROWTH, (name, growth)
+    assert not left, (name, left)
+    return found
+
+
+def _work(name: str, files: list[bytes], send) -> None:
+    torch.set_num_threads(1)
+    space = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (space + MEMORY, space + MEMORY))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    before = _resident()
+    found: Counter[str] = Counter()
+    slowest = 0.0
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / name
+        if "/" in name:
+            shutil.copytree((DATA / name).parent, path.parent)
+        there = sorted(p.name for p in path.parent.iterdir())
+        for data in files:
+            path.write_bytes(data)
+            start = time.process_time()
+            result = outcome(path)
+            found[result] += 1
+            slowest = max(slowest, time.process_time() - start)
+        left = [p.name for p in path.parent.iterdir() if p.name not in (*there, path.name)]
+    send.send((found, slowest, _resident() - before, left))
+
+
+def _resident() -> int:
+    """Most resident memory so far of this process, a fork's own."""
+    words = Path("/proc/self/status").read_text().split()
+    return int(words[words.index("VmHWM:") + 1]) * 1024
+
+
+def content_of(name: str, folder: Path) -> bytes:
+    """The format's small scene."""
+    return write_file(folder, name).read_bytes()
+
+
+def main() -> None:
+    name, count, seed = sys.argv[1], int(sys.argv[2]), int([*sys.argv, "0"][3])
+    for each in NAMES if name == "all" else name.split(","):
+        with tempfile.TemporaryDirectory() as folder:
+            data = content_of(each, Path(folder))
+        start = time.perf_counter()
+        found = check(each, mutations(data, seed, count))
+        print(each, dict(found), f"{time.perf_counter() - start:.0f} s", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,104 @@
+"""Damaged and hostile scene files: a scene or one line of ours, quickly, in little memory, and nothing left behind.
+
+A few hundred files a format run here; AAPLUG_FUZZ=10000 runs that many mutations of each (or python -m tests.hostile).
+"""
+
+import io
+import os
+import subprocess
+import sys
+import zipfile
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from aaplug.errors import AaplugError
+from aaplug.io.scenes import open_scene
+from tests.hostile import NAMES, check, content_of, cuts, flipped_digits, header_size, mutations
+
+pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="limits are Linux's")
+MUTATIONS = int(os.environ.get("AAPLUG_FUZZ", "25"))
+EVERY = 1 if MUTATIONS >= 1000 else 31  # of cuts and flips, where the campaign is not asked for
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_damage_does_no_harm(tmp_path: Path, name: str):
+    data = content_of(name, tmp_path)
+    header = header_size(name, data)
+    files = [*cuts(data, header)][::EVERY] + [*flipped_digits(data, header)][::EVERY]
+    found = check(name, [*files, *mutations(data, 0, MUTATIONS)])
+    assert found["refused"] > 0
+
+
+@given(data=st.data())
+@settings(
+    max_examples=max(25, MUTATIONS),
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+def test_whatever_hypothesis_thinks_of_does_no_harm(tmp_path: Path, data: st.DataObject):
+    name = data.draw(st.sampled_from(NAMES))
+    content = bytearray(content_of(name, tmp_path))
+    for _ in range(data.draw(st.integers(1, 3))):
+        at = data.draw(st.integers(0, len(content)))
+        content[at : at + data.draw(st.integers(0, 8))] = data.draw(st.binary(max_size=8))
+    path = tmp_path / Path(name).name
+    path.write_bytes(content)
+    try:
+        for part in open_scene(path, allow_checkpoint=True).parts():
+            assert len(part) < 10_000
+    except AaplugError as error:
+        str(error).encode()
+
+
+def gzip_of(start: bytes, zeros: int) -> bytes:
+    squeeze = zlib.compressobj(9, wbits=31)
+    body = b"".join(squeeze.compress(bytes(1 << 20)) for _ in range(zeros >> 20))
+    return squeeze.compress(start) + body + squeeze.flush()
+
+
+def zip_of(name: str, size: int) -> bytes:
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr(name, bytes(size))
+    return stream.getvalue()
+
+
+PLY = b"ply\nformat binary_little_endian 1.0\n"
+TEXT = b"ply\nformat ascii 1.0\n"
+SPZ = b"NGSP\x03\0\0\0%b\0\x0c\0\0"
+BOMBS: dict[str, tuple[str, Callable[[], bytes]]] = {
+    "306 kB for 300 MB": ("a.spz", lambda: gzip_of(SPZ % b"\x01\0\0\0", 300 << 20)),
+    "300 MB as promised": ("a.spz", lambda: gzip_of(SPZ % b"\0\0\0\x01", 300 << 20)),
+    "4e9 points": ("a.spz", lambda: gzip_of(SPZ % b"\xff\xff\xff\xff", 0)),
+    "zip": ("a.sog", lambda: zip_of("meta.json", 60 << 20)),
+    "checkpoint": ("a.pt", lambda: zip_of("archive/data.pkl", 60 << 20)),
+    "count 1e12": ("a.ply", lambda: PLY + b"element vertex 1000000000000\nproperty float x\nend_header\n"),
+    "text of 1e12": ("a.ply", lambda: TEXT + b"element vertex 1000000000000\nproperty float x\nend_header\n0\n"),
+    "list of 4e9": ("a.ply", lambda: PLY + b"element face 1\nproperty list uint float v\nend_header\n\xff\xff\xff\xff"),
+    "64 MiB header": ("a.ply", lambda: PLY + b"comment " + b"a" * (64 << 20)),
+    "deep JSON": ("meta.json", lambda: b'{"a":' * 100_000),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("bomb", BOMBS)
+def test_bombs_are_duds(bomb: str):
+    name, content = BOMBS[bomb]
+    assert check(name, [content()]) == {"refused": 1}
+
+
+@pytest.mark.parametrize("name", ["oracle.ply", "oracle_v4.spz"])
+def test_the_program_ends_with_2_and_one_line(tmp_path: Path, name: str):
+    path = tmp_path / name
+    path.write_bytes(content_of(name, tmp_path)[:-7])
+    words = ["convert", str(path), "-o", str(tmp_path / "out.ply")]
+    program = "import sys; from aaplug_cli.main import main; main(sys.argv[1:])"
+    done = subprocess.run([sys.executable, "-c", program, *words], capture_output=True, text=True)
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+    assert "error:" in done.stderr
+    assert [p.name for p in tmp_path.iterdir()] == [name]
