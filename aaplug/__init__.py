@@ -13,6 +13,7 @@ from aaplug.io.cameras import read_cameras
 from aaplug.io.images import read_image, write_png
 from aaplug.io.scenes import read_scene, write_scene
 from aaplug.pipeline import learn, render, smooth
+from aaplug.protocols import PROTOCOLS, Protocol, find_protocol
 from aaplug.recipes import RECIPES, Recipe, find_recipe
 from aaplug.sampling import SamplingBounds, check_frame, sampling_bounds
 from aaplug.splats import Render
@@ -22,6 +23,7 @@ __all__ = [
     "CLASSIC",
     "FORMS",
     "MIP",
+    "PROTOCOLS",
     "RECIPES",
     "VIEWERS",
     "AaplugError",
@@ -29,6 +31,7 @@ __all__ = [
     "CameraSet",
     "Convention",
     "Gaussians",
+    "Protocol",
     "Recipe",
     "Render",
     "SamplingBounds",
@@ -38,6 +41,7 @@ __all__ = [
     "convert",
     "convert_for",
     "evaluate",
+    "find_protocol",
     "find_recipe",
     "learn",
     "look_at",

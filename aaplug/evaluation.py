@@ -204,13 +204,13 @@ class _Bench:
             camera = protocol.camera(view, scale, depth)
             ceiling = None if full is None else self._shrunk(full.rgb.clamp(0, 1), camera, scale)
             truth = self._truth(photo, view, camera, scale, ceiling)
+            judge = _Judge(self.task.judges, truth)
             if full is not None and ceiling is not None:
                 row = full._replace(rgb=ceiling, samples=1)
-                values = self._judged(row, truth, {})
-                yield self._noted(index, CEILING, scale, view, row, truth, values)
+                values = judge(ceiling)
+                yield self._noted(index, CEILING, scale, view, row, truth, values, {})
             motion = self._motion(view, camera, scale)
             drawings: dict[Hashable, _Drawn] = {}
-            judgements: dict[Hashable, dict[str, float | None]] = {}
             if full is not None and scale == 1:
                 drawings[self._work(find_recipe("matched"), view)] = full
             for recipe in task.recipes:
@@ -220,11 +220,9 @@ class _Bench:
                 drawn = drawings[work]
                 if scale == 1:
                     fulls[recipe.name] = drawn
-                if work not in judgements:
-                    figures = self._figures(recipe, camera, scale, drawn, fulls, motion)
-                    judgements[work] = self._judged(drawn, truth, figures)
-                values = judgements[work]
-                yield self._noted(index, recipe.name, scale, view, drawn, truth, values)
+                figures = self._figures(recipe, camera, scale, drawn, fulls, motion)
+                values = judge(drawn.rgb)
+                yield self._noted(index, recipe.name, scale, view, drawn, truth, values, figures)
 
     def _work(self, recipe: Recipe, camera: Camera) -> Hashable:
         """What a recipe does at a view's rate: `auto` is `matched` where it takes one sample, and not drawn again."""
@@ -314,18 +312,6 @@ class _Bench:
             figures[FLICKER.name] = flicker(frames, motion)
         return figures
 
-    def _judged(
-        self, drawn: _Drawn, truth: Tensor | None, figures: Mapping[str, float | None]
-    ) -> dict[str, float | None]:
-        """Every metric's value, and the figures that need no truth."""
-        values: dict[str, float | None] = {metric.name: None for metric in self.task.judges}
-        if truth is not None:
-            image = quantise(drawn.rgb)
-            for metric in self.task.judges:
-                assert metric.measure is not None
-                values[metric.name] = metric.measure(image, truth)
-        return values | {metric.name: figures.get(metric.name) for metric in self.task.figures}
-
     def _noted(
         self,
         index: int,
@@ -334,16 +320,40 @@ class _Bench:
         view: Camera,
         drawn: _Drawn,
         truth: Tensor | None,
-        values: dict[str, float | None],
+        values: Mapping[str, float | None],
+        figures: Mapping[str, float | None],
     ) -> Measurement:
         """The measurement, once its images are in place."""
         if self.images is not None:
             self.images.keep(index, recipe, scale, drawn.rgb, truth)
-        compared = {metric.name: values[metric.name] for metric in self.task.judges}
-        note = _note(compared, truth is None)
+        found = {**values, **{m.name: figures.get(m.name) for m in self.task.figures}}
+        note = _note(values, truth is None)
         return Measurement(
-            recipe, scale, view.name, values, drawn.samples, drawn.seconds, note, drawn.pairs
+            recipe, scale, view.name, found, drawn.samples, drawn.seconds, note, drawn.pairs
         )
+
+
+class _Judge:
+    """Compares images with one truth; what recipes draw alike, as they do at the training rate, is compared once."""
+
+    def __init__(self, metrics: Sequence[Metric], truth: Tensor | None):
+        self.metrics, self.truth = metrics, truth
+        self.seen: list[tuple[Tensor, dict[str, float | None]]] = []
+
+    def __call__(self, rgb: Float[Tensor, "h w 3"]) -> dict[str, float | None]:
+        """Every metric's value, None for all where there is no truth."""
+        if self.truth is None:
+            return {metric.name: None for metric in self.metrics}
+        image = quantise(rgb)
+        for known, values in self.seen:
+            if image.equal(known):
+                return values
+        values: dict[str, float | None] = {}
+        for metric in self.metrics:
+            assert metric.measure is not None
+            values[metric.name] = metric.measure(image, self.truth)
+        self.seen.append((image, values))
+        return values
 
 
 def _moved(camera: Camera, steps: float) -> Camera:

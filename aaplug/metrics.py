@@ -17,7 +17,6 @@ from typing import Literal
 
 import cv2
 import numpy as np
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -55,8 +54,9 @@ class Metric:
 
 def psnr(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> float | None:
     """Peak signal-to-noise ratio over all channels, in dB, for a peak of 1; None for equal images."""
-    error = (image.double() - truth.double()).square().mean()
-    return None if error == 0 else -10 * torch.log10(error).item()
+    a, b = image.cpu().numpy(), truth.to(image.dtype).cpu().numpy()
+    error = cv2.norm(a, b, cv2.NORM_L2SQR) / a.size  # summed in float64
+    return None if error == 0 else -10 * math.log10(error)
 
 
 def ssim(
@@ -104,10 +104,11 @@ def flip(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> float 
 
 def energy(rgb: Float[Tensor, "h w 3"]) -> float:
     """Mean luminance (Rec. 709)."""
-    return float((rgb.double() @ rgb.new_tensor(LUMINANCE).double()).mean())
+    means = cv2.mean(rgb.cpu().numpy())  # summed in float64
+    return sum(weight * mean for weight, mean in zip(LUMINANCE, means, strict=False))
 
 
-def energy_drift(drawn: Float[Tensor, "h w 3"], expected: Float[Tensor, "h w 3"]) -> float | None:
+def energy_drift(drawn: Float[Tensor, "h w 3"], expected: Float[Tensor, "H W 3"]) -> float | None:
     """How much more light an image has than it should, as a share; None where it should have none."""
     before = energy(expected)
     return None if before == 0 else energy(drawn) / before - 1

@@ -116,6 +116,9 @@ def _set(
             close = difflib.get_close_matches(key, [k for k in known if k not in refused], 1)
             hint = f"; did you mean {close[0]}?" if close else ""
             raise FormatError(path, f"{where}: {key} is no setting here{hint}")
+        if value is False:
+            base = _off(base, key)
+            continue
         words = _words(key, value)
         try:
             with redirect_stderr(StringIO()):  # tyro words its complaints for a command line
@@ -139,13 +142,23 @@ def _flags() -> set[str]:
     return names
 
 
+def _off(options: Any, key: str) -> Any:
+    """The options with a flag taken back, which no word of the command line does."""
+    if isinstance(getattr(options, key, None), bool):
+        return replace(options, **{key: False})
+    groups = {
+        n: _off(g, key) for n, g in vars(options).items() if hasattr(g, "__dataclass_fields__")
+    }
+    return replace(options, **groups)
+
+
 def _words(key: str, value: Any) -> list[str]:
     """A setting as words of the command line."""
     if key == "scene":
         return [str(value)]
     name = "--" + key.replace("_", "-")
-    if isinstance(value, bool):
-        return [name] if value else []
+    if value is True:
+        return [name]
     values = value if isinstance(value, list) else [value]
     return [name, *map(str, values)]
 

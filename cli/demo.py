@@ -46,7 +46,13 @@ class Demo:
 
 def demo(options: Demo) -> int:
     """Convert, render and measure the bundled sample scene."""
-    names = ("chair-converted.ply", "contact-sheet.png", "results.json", "per_view.json")
+    names = (
+        "chair-converted.ply",
+        "contact-sheet.png",
+        "results.json",
+        "per_view.json",
+        "results.csv",
+    )
     refuse_existing([options.output / name for name in names], options.overwrite)
     make_folder(options.output)
     with as_file(files("aaplug.sample")) as sample:

@@ -168,6 +168,21 @@ def test_paths_start_at_the_file_and_names_at_the_scenes(tmp_path):
     assert file.scenes == {"a": expected}
 
 
+def test_a_file_can_take_back_what_the_command_line_sets(batch):
+    Path("batch.toml").write_text(
+        SETTINGS.split("[[scene]]")[0]
+        + """
+[[scene]]
+scene = "scene.ply"
+cameras = "."
+flicker = false
+drop-bad = false
+"""
+    )
+    assert batch("evaluate --batch batch.toml --flicker --drop-bad")[0] == 0
+    assert "flicker" not in Path("out/scene/results.json").read_text()
+
+
 def test_a_missing_batch_file_is_named(tmp_path):
     with pytest.raises(FormatError, match="no such file"):
         read_batch(tmp_path / "gone.toml")

@@ -185,6 +185,34 @@ def test_evaluate_without_photographs_takes_the_scenes_own_look(cli):
     assert json.loads(out)["_aaplug"]["truth"] == "self"
 
 
+def test_evaluate_by_a_protocol_names_it_and_its_flavours(cli):
+    words = (
+        "evaluate scene.ply --cameras . --protocol blender --scale 1 0.5 --recipe matched --json"
+    )
+    about = json.loads(cli(words)[1])["_aaplug"]
+    assert about["protocol"]["name"] == "blender"
+    assert about["background"] == [1, 1, 1]
+    assert about["metrics"]["SSIM"].startswith("3dgs")
+    assert "RGBA halved" in about["downscale"]
+    overridden = json.loads(cli(words + " --ssim wang")[1])["_aaplug"]
+    assert overridden["metrics"]["SSIM"].startswith("wang")
+
+
+def test_evaluate_writes_a_report_and_inrias_folders(cli):
+    words = (
+        "evaluate scene.ply --cameras . -o out --recipe classic auto --scale 1 0.5 --flip --flicker"
+    )
+    pytest.importorskip("flip_evaluator")
+    code, out, err = cli(f"{words} --report --layout inria --show r_0")
+    assert code == 0, err
+    page = Path("out/report.html").read_text()
+    assert "FLIP" in out
+    assert "flicker" in page
+    assert Path("out/plots/psnr.png").is_file()
+    assert image_size(Path("out/test/classic@0.5/gt/00000.png")) == (32, 24)
+    assert Path("out/results.csv").read_text().count("\n") == 7
+
+
 def test_data_goes_to_stdout_and_the_log_to_stderr(cli):
     _, out, err = cli("info scene.ply --json")
     json.loads(out)
@@ -287,6 +315,34 @@ REFUSED = {
         break_nothing, "render scene.ply --cameras . -o new --recipe mipp", ["mipp", "matched"]),
     "scale and resolution": (
         break_nothing, "render scene.ply --cameras . -o new --scale 2 --resolution 8x8", ["give one"]),
+    "a report without a folder": (
+        break_nothing, "evaluate scene.ply --cameras . --report", ["--report", "-o FOLDER"]),
+    "resume and overwrite": (
+        break_nothing, "evaluate scene.ply --cameras . -o new --resume --overwrite", ["contradict"]),
+    "unknown protocol": (
+        break_nothing, "evaluate scene.ply --cameras . -o new --protocol blendr", ["blendr", "blender"]),
+    "unknown shown view": (
+        break_nothing, "evaluate scene.ply --cameras . -o new --report --show r_9", ["--show", "r_9"]),
+    "scene and batch": (
+        break_nothing, "evaluate scene.ply --batch b.toml -o new", ["--batch", "scene.ply"]),
+    "several scenes without a folder": (
+        break_nothing, "evaluate scene.ply scene.ply --cameras .", ["-o FOLDER", "several"]),
+    "scenes without cameras": (
+        break_nothing, "evaluate scene.ply scene.ply -o new", ["--cameras", "model folders"]),
+    "photographs of a moved camera": (
+        break_nothing, "evaluate scene.ply --cameras . --protocol fov --truth photographs -o new", ["fov"]),
+    "a scale that does not halve": (
+        break_nothing, "evaluate scene.ply --cameras . --protocol blender --scale 0.3 -o new", ["1/2"]),
+    "no weights": (
+        break_nothing, "evaluate scene.ply --cameras . --lpips a.pth b.pth -o new", ["a.pth"]),
+    "a flavour without weights": (
+        break_nothing, "evaluate scene.ply --cameras . --lpips-flavour vgg -o new", ["--lpips TRUNK HEADS"]),
+    "a video of no kind": (
+        break_nothing, "video scene.ply --cameras . -o new.gif", ["new.gif", ".webm"]),
+    "a video of no length": (
+        break_nothing, "video scene.ply --cameras . -o new.webm --seconds 0", ["--seconds"]),
+    "a path that is none": (
+        break_nothing, "video scene.ply --cameras . -o new.webm --path scene.ply", ["scene.ply"]),
     "negative scale": (break_nothing, "render scene.ply --cameras . -o new --scale -1", ["--scale"]),
     "bad resolution": (
         break_nothing, "render scene.ply --cameras . -o new --resolution 8by8", ["--resolution", "8by8"]),
