@@ -146,14 +146,14 @@ def _blended_strip(
         share = (alpha / (1 - alpha))[:, None]
         moved = -share * hidden
         variance = sides**2 / 12 + share * (sides**2 / 12 - hidden_square) - moved**2
+        moved = (middle + moved).clamp(-0.499 * first, 0.499 * first)
         new = (12 * variance.clamp(min=1e-8 * first**2)).sqrt()
+        new = torch.minimum(new, first - 2 * moved.abs())
         grow = (left * first**2 / new.prod(dim=1)).clamp(min=1.0).sqrt()
         new = (new * grow[:, None]).clamp(max=first)
         room = (first - new) / 2
         hides = (alpha > 0)[:, None]
-        middle = torch.where(
-            hides, torch.maximum(torch.minimum(middle + moved, room), -room), middle
-        )
+        middle = torch.where(hides, torch.maximum(torch.minimum(moved, room), -room), middle)
         sides = torch.where(hides, new, sides)
     return rgb, 1 - hidden_so_far
 
