@@ -36,7 +36,7 @@ from aaplug.metrics import (
     flicker,
     psnr,
 )
-from aaplug.pipeline import render, smooth
+from aaplug.pipeline import rate_of, render, smooth
 from aaplug.protocols import PROTOCOLS, Protocol, Truth, median_depth
 from aaplug.rasterizers import RASTERIZERS, Tiled
 from aaplug.rasterizers.counting import Counting
@@ -226,7 +226,7 @@ class _Bench:
 
     def _work(self, recipe: Recipe, camera: Camera) -> Hashable:
         """What a recipe does at a view's rate: `auto` is `matched` where it takes one sample, and not drawn again."""
-        samples = recipe.samples_at(self.training.rate(camera))
+        samples = recipe.samples_at(rate_of(self.own, camera, self.training))
         return recipe.world, recipe.screen, samples, recipe.pixel
 
     def _draw(self, scene: Gaussians, camera: Camera, recipe: Recipe) -> _Drawn:
@@ -241,7 +241,7 @@ class _Bench:
         seconds = time.perf_counter() - started
         rgb, alpha = rgb.float(), alpha.float()
         own = rgb - (1 - alpha[..., None]) * rgb.new_tensor(behind)
-        samples = recipe.samples_at(self.training.rate(camera))
+        samples = recipe.samples_at(rate_of(scene, camera, self.training))
         return _Drawn(rgb, own, samples, seconds, counting and counting.pairs)
 
     def _shrunk(self, full: Tensor, camera: Camera, scale: float) -> Float[Tensor, "h w 3"]:

@@ -9,6 +9,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
+import torch
+
 from aaplug.cameras import BLACK, Camera
 from aaplug.errors import UsageError
 from aaplug.filters import fuse_stored
@@ -55,10 +57,27 @@ def render(
     Raises:
         UsageError: a Gaussian in view has a colour that is NaN or infinite.
     """
-    samples = recipe.samples_at(training.rate(camera))
+    samples = recipe.samples_at(rate_of(scene, camera, training))
     fine = camera.resized(camera.width * samples, camera.height * samples)
     splats = splats_of(scene, fine, recipe.screen, training, rasterizer, recipe.pixel)
     return averaged(rasterizer(splats, fine.hw, background, recipe.pixel), samples)
+
+
+def rate_of(scene: Gaussians, camera: Camera, training: Training) -> float:
+    """How finely a view samples the scene against training, by which samples a pixel are chosen.
+
+    A pose of the data set has its size against training's.  A free camera may be nearer or farther than any training
+    camera: it has the median, over the Gaussians in view, of their rate against the nearest one that training had.
+    """
+    bounds = training.bounds
+    if camera.trained_focal is not None or not bounds.seen.any():
+        return training.rate(camera)
+    now = sampling_bounds(scene.means.detach(), [camera]).highest
+    both = (now > 0) & bounds.seen
+    if not both.any():
+        return training.rate(camera)
+    now, lowest, highest = (x[both] for x in (now, bounds.lowest, bounds.highest))
+    return float((now / torch.minimum(torch.maximum(now, lowest), highest)).median())
 
 
 def splats_of(

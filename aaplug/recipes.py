@@ -129,6 +129,25 @@ RECIPES: dict[str, Recipe] = {
             "one sample a pixel: the fastest that is right",
         ),
         Recipe(
+            "matched-interval",
+            Matched("interval"),
+            "aaplug: matched, each Gaussian's rate against the range that the training cameras had (choice C)",
+            "cameras nearer or farther than training's; `matched` takes it for those by itself",
+        ),
+        Recipe(
+            "matched-sharpest",
+            Matched("sharpest"),
+            "aaplug: matched, each Gaussian's rate against the highest that a training camera had (choice B)",
+            "comparison: the one blur that can be fused, thinner than training's at most views",
+        ),
+        Recipe(
+            "matched-samples",
+            Matched(),
+            "aaplug: matched, with 3×3 samples a pixel at every rate",
+            "comparison",
+            grid=3,
+        ),
+        Recipe(
             "matched-integral",
             Matched(windowed=True),
             "aaplug: matched, with Analytic-Splatting's integral over the rest of the pixel",

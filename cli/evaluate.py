@@ -59,13 +59,13 @@ class Evaluate:
     """Folder for results.json, per_view.json and results.csv."""
     protocol: Annotated[str, tyro.conf.arg(metavar="|".join(PROTOCOLS))] = "default"
     """Scales, truth, downscaling and flavours of metrics, by name."""
-    recipe: Annotated[tuple[str, ...], tyro.conf.arg(metavar="|".join(RECIPES))] = (
+    recipe: Annotated[tuple[str, ...], tyro.conf.arg(metavar="|".join([*RECIPES, "all"]))] = (
         "classic",
         "mip",
         "matched",
         "auto",
     )
-    """One or more recipes."""
+    """One or more recipes, or all."""
     scale: Annotated[tuple[float, ...] | None, flag("FACTOR [FACTOR ...]")] = None
     """One or more sizes against the training size, on either side of 1 (default: the protocol's)."""
     truth: Literal["auto", "photographs", "self"] = "auto"
@@ -183,7 +183,7 @@ def _recipes(options: Evaluate) -> list[Recipe]:
             quality=options.rendering.quality,
             rate=rate if name in ("matched", "auto") else None,
         )
-        for name in options.recipe
+        for name in (RECIPES if "all" in options.recipe else options.recipe)
     ]
 
 
@@ -299,7 +299,7 @@ def _facts(
         "photographs": {"count": len(photos), "sha256": _sha256(photos) if photos else None},
         "options": {
             "quality": options.rendering.quality,
-            "rate": options.rendering.rate or find_protocol(options.protocol).rate or "global",
+            "rate": options.rendering.rate or find_protocol(options.protocol).rate or "pose",
             "shown": options.show if options.report else None,
             "layout": options.layout,
         },

@@ -31,7 +31,7 @@ from .console import say
 
 CONFIG = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)  # how classes become flags
 Quality = Literal["fast", "balanced", "best"]
-Rate = Literal["global", "sharpest", "interval"]
+Rate = Literal["pose", "global", "sharpest", "interval"]
 
 
 def flag(metavar: str, *aliases: str) -> Any:

@@ -12,9 +12,10 @@ import tyro
 from aaplug.cameras import Camera
 from aaplug.errors import OutputError, UsageError, listing
 from aaplug.frames import Frames, write_frames
+from aaplug.gaussians import Gaussians
 from aaplug.interfaces import Training
 from aaplug.io.atomic import check_output
-from aaplug.pipeline import smooth
+from aaplug.pipeline import rate_of, smooth
 from aaplug.recipes import RECIPES, Recipe, find_recipe
 
 from .console import print_json, progress, say
@@ -60,7 +61,7 @@ def render(options: Render) -> int:
     background = options.rendering.background_of(cameras)
     training = options.cameras.learn(scene, cameras)
     scene = smooth(scene, training, recipe)
-    say(_choice(recipe, views, training))
+    say(_choice(recipe, views, scene, training))
     rasterizer = options.rendering.rasterize(len(views))
     if not options.output.suffix:
         make_folder(options.output)
@@ -130,13 +131,15 @@ def _paths(output: Path, views: Sequence[Camera], overwrite: bool) -> list[Path]
     return paths
 
 
-def _choice(recipe: Recipe, views: Sequence[Camera], training: Training) -> str:
-    """What is about to be rendered, in words."""
-    samples = sorted({recipe.samples_at(training.rate(view)) for view in views})
+def _choice(recipe: Recipe, views: Sequence[Camera], scene: Gaussians, training: Training) -> str:
+    """What is about to be rendered and why, in words."""
+    rates = [rate_of(scene, view, training) for view in views]
+    samples = sorted({recipe.samples_at(rate) for rate in rates})
     grid = " or ".join(f"{n}×{n}" for n in samples)
     sizes = listing(sorted({f"{view.width}x{view.height}" for view in views}), most=3)
     trained = training.convention
+    span = " to ".join(dict.fromkeys(f"{rate:.3g}" for rate in (min(rates), max(rates))))
     return (
-        f"recipe: {recipe.name} for a {trained.name} scene, {grid} sample{'s' * (samples != [1])} a pixel, "
-        f"{len(views)} view{'s' * (len(views) != 1)} at {sizes}"
+        f"recipe: {recipe.name} for a {trained.name} scene, {len(views)} view{'s' * (len(views) != 1)} at {sizes}, "
+        f"{span} × the rate of training: {grid} sample{'s' * (samples != [1])} a pixel"
     )

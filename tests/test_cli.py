@@ -79,7 +79,10 @@ def test_render_writes_a_view_at_a_scale(cli):
     code, out, err = cli("render scene.ply --cameras . -o out --scale 0.5")
     assert (code, out) == (0, "")
     assert image_size(Path("out/r_0.png")) == (32, 24)
-    assert "recipe: auto for a classic scene, 1×1 sample a pixel, 1 view at 32x24" in err
+    assert (
+        "recipe: auto for a classic scene, 1 view at 32x24, 0.5 × the rate of training: 1×1 sample a pixel"
+        in err
+    )
     assert "background: black" in err
 
 

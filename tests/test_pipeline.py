@@ -11,7 +11,7 @@ from aaplug.errors import UsageError
 from aaplug.filters import StoredSmoothing
 from aaplug.gaussians import ANTIALIASED, CLASSIC, CONVENTIONS, MIP, Gaussians
 from aaplug.io.scenes import read_scene, write_scene
-from aaplug.pipeline import learn, render, smooth
+from aaplug.pipeline import learn, rate_of, render, smooth
 from aaplug.projection import project
 from aaplug.rasterizers import RASTERIZERS
 from aaplug.recipes import RECIPES, find_recipe
@@ -264,3 +264,30 @@ def one_gaussian(sigma: float, opacity: float) -> Gaussians:
         logit_opacities=torch.logit(torch.tensor([opacity])),
         sh=torch.zeros(1, 1, 3),
     )
+
+
+@pytest.mark.parametrize(("distance", "rate"), [(4.0, 1.0), (2.0, 2.0), (16.0, 0.25)])
+def test_a_free_camera_has_the_rate_of_its_distance(distance, rate):
+    scene = make_scene(50, dtype=torch.float64)
+    scene = replace(scene, means=0.01 * scene.means)
+    trained = make_camera((0.0, -4.0, 0.0))
+    training = learn(scene, [trained])
+    free = replace(make_camera((0.0, -distance, 0.0)), trained_focal=None)
+    assert rate_of(scene, free, training) == pytest.approx(rate, rel=0.05)
+    assert rate_of(scene, trained.scaled(0.25), training) == 0.25
+    unseeing = replace(make_camera((0.0, -9.0, 0.0)), trained_focal=None, cx=1e6)
+    assert rate_of(scene, unseeing, training) == training.rate(unseeing)
+
+
+@pytest.mark.parametrize(("free", "like"), [(True, "interval"), (False, "global")])
+def test_matched_takes_the_interval_for_free_cameras_alone(free, like):
+    scene, cameras = make_scene(50), [make_camera((0.0, -4.0, 0.0)), make_camera((2.0, -3.0, 1.0))]
+    training = learn(scene, cameras)
+    view = make_camera((0.0, -8.0, 0.0)).scaled(0.5)
+    if free:
+        view = replace(view, trained_focal=None)
+    found = RECIPES["matched"].screen(project(scene, view), view, training)
+    expected = find_recipe("matched", rate=like).screen(project(scene, view), view, training)
+    other = find_recipe("matched", rate="sharpest").screen(project(scene, view), view, training)
+    assert torch.equal(found.covs, expected.covs)
+    assert not torch.equal(found.covs, other.covs)

@@ -22,7 +22,8 @@ SCREEN_FILTERS: dict[str, ScreenFilter] = {
     "none": Dilation(0.0, compensated=False),
     "aaa": Adaptive(),
     "sa-gs": Matched("global", pixel_variance=0.0),
-    "matched": Matched("global"),
+    "matched": Matched(),
+    "matched-global": Matched("global"),
     "matched-sharpest": Matched("sharpest"),
     "matched-interval": Matched("interval"),
 }

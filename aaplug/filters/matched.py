@@ -24,7 +24,7 @@ from aaplug.splats import Splats2D
 # than their energies together should, and a narrower filter makes up for some of it (docs/quality.md).
 PIXEL_VARIANCE = 0.07
 
-RateChoice = Literal["global", "sharpest", "interval"]
+RateChoice = Literal["pose", "global", "sharpest", "interval"]
 
 
 @dataclass(frozen=True)
@@ -32,6 +32,8 @@ class Matched:
     """Match training's dilation at the new rate, then integrate over what is left of the pixel.
 
     rate: what a Gaussian's rate is compared with.
+        "pose": as "global" at a pose of the data set, as "interval" for a free camera, whose distance no training
+            view had.
         "global" (A): the view's own training size; equals training's renderer at every training view.
         "sharpest" (B): the highest rate any training view had; one world-space blur for all views, the one that can
             be fused, thinner than what most views were trained with.
@@ -43,7 +45,7 @@ class Matched:
         training's pixel one pixel's, √(1 − r²) px, and no wider than a point where r is not below 1.
     """
 
-    rate: RateChoice = "global"
+    rate: RateChoice = "pose"
     pixel_variance: float = PIXEL_VARIANCE
     windowed: bool = False
 
@@ -60,7 +62,8 @@ class Matched:
     def rates(self, splats: Splats2D, camera: Camera, training: Training) -> Float[Tensor, " m"]:
         """Rate of each splat against the one that training saw; the view's own for Gaussians no camera saw."""
         view = torch.full_like(splats.depths, training.rate(camera))
-        if self.rate == "global":
+        known = camera.trained_focal is not None
+        if self.rate == "global" or (self.rate == "pose" and known):
             return view
         seen = training.bounds.seen[splats.sources]
         # where no camera saw a Gaussian any number but 0 will do: it is not chosen, and divides no gradient by 0
