@@ -65,13 +65,19 @@ def multiples(scene: Gaussians, training: Training) -> Float[Tensor, " seen"]:
     return (middle * bounds.highest[bounds.seen] / NYQUIST_VARIANCE**0.5).double()
 
 
+def aliasing_begins(sigma: float, kernel: float) -> float:
+    """The scale below which a Gaussian of standard deviation `sigma` px, as training drew it, aliases."""
+    return (NYQUIST_VARIANCE / (sigma**2 + kernel)) ** 0.5
+
+
 def coverage(scene: Gaussians, training: Training, scales: Sequence[float]) -> Coverage:
     """How the scene sits against its bounds, at the training size and at `scales`."""
     extents = multiples(scene, training)
     logs = extents.clamp(min=2.0**LOWEST).log2().clamp(LOWEST, HIGHEST)
     edges = torch.linspace(LOWEST, HIGHEST, BINS + 1, dtype=torch.float64)
     counts = torch.histogram(logs.cpu(), edges).hist
-    drawn = (extents.square() + training.convention.kernel / NYQUIST_VARIANCE).sqrt()
+    kernel = training.convention.kernel
+    drawn = (extents.square() + kernel / NYQUIST_VARIANCE).sqrt()
     some = len(extents) > 0
     return Coverage(
         len(scene),
@@ -79,6 +85,6 @@ def coverage(scene: Gaussians, training: Training, scales: Sequence[float]) -> C
         tuple(edges.tolist()),
         tuple(int(count) for count in counts),
         float((extents < 1).double().mean()) if some else None,
-        float(1 / drawn.median()) if some else None,
+        aliasing_begins(float(extents.median()) * NYQUIST_VARIANCE**0.5, kernel) if some else None,
         tuple((s, float((drawn * s < 1).double().mean())) for s in scales) if some else (),
     )

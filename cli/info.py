@@ -10,11 +10,11 @@ from rich.table import Table
 
 from aaplug.cameras import CameraSet
 from aaplug.conversion import describe
-from aaplug.filters import NYQUIST_VARIANCE
 from aaplug.gaussians import MAX_LOG_SCALE
 from aaplug.io.limits import LIMITS, limit, memory_of_machine
 from aaplug.io.scenes.ply import Document
 from aaplug.io.scenes.scene_file import SceneFile
+from aaplug.nyquist import aliasing_begins
 from aaplug.streaming import Survey, check_frame_of, survey
 
 from .console import out, print_json, progress
@@ -52,7 +52,7 @@ def info(options: Info) -> int:
         found = survey(opened, cameras.train if cameras else (), tell)
     facts = _scene_facts(opened, found)
     if cameras:
-        facts |= _sampling_facts(found, cameras)
+        facts |= _sampling_facts(found, cameras, opened.convention.kernel)
     facts["problems"] = list(_problems(opened, found))
     if options.json:
         print_json(facts)
@@ -92,15 +92,16 @@ def _comments(opened: SceneFile) -> list[str]:
     return document.header.comments if isinstance(document, Document) else []
 
 
-def _sampling_facts(found: Survey, cameras: CameraSet) -> dict[str, Any]:
+def _sampling_facts(found: Survey, cameras: CameraSet, kernel: float) -> dict[str, Any]:
     rate, sigma = found.rates.quantile(0.5), found.sigmas.quantile(0.5)
     return {
         "training_cameras": len(cameras.train),
         "seen_share": found.seen / max(1, found.count),
         "median_rate_px_per_unit": None if rate is None else math.exp(rate),
         "under_sampling_bound_share": found.under / max(1, found.seen),
-        # the scale at which half of the Gaussians seen are thinner than one pixel's share of them
-        "aliases_below_scale": None if sigma is None else NYQUIST_VARIANCE**0.5 / math.exp(sigma),
+        "aliasing_begins_at_scale": None
+        if sigma is None
+        else aliasing_begins(math.exp(sigma), kernel),
         "cameras": list(cameras.notes),
     }
 

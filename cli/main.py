@@ -3,6 +3,7 @@
 Exit codes: 0 all done, 1 some of the work failed, 2 the request cannot be carried out, 130 interrupted.
 """
 
+import os
 import re
 import sys
 from collections.abc import Sequence
@@ -58,6 +59,11 @@ def main(words: Sequence[str] | None = None) -> None:
     except KeyboardInterrupt:
         console.say("interrupted")
         sys.exit(INTERRUPTED)
+    except (
+        BrokenPipeError
+    ):  # whoever read our output has seen enough; nothing may be flushed to them at exit
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(FAILED)
 
 
 def run(words: Sequence[str]) -> int:

@@ -3,6 +3,8 @@
 import json
 import math
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -427,3 +429,14 @@ def test_background_comes_from_cfg_args(cli):
     corner = cv2.imread("out/a.png")[0, 0]
     assert corner.min() > 200
     assert BLACK == (0.0, 0.0, 0.0)
+
+
+def test_a_reader_that_leaves_early_sees_no_traceback():
+    program = "from aaplug_cli.main import main; main()"
+    words = [sys.executable, "-c", program, "render", "--help"]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as run:
+        assert run.stdout is not None
+        assert run.stderr is not None
+        run.stdout.close()
+        err = run.stderr.read()
+    assert (run.returncode, err) == (1, "")
