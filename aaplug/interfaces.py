@@ -17,10 +17,11 @@ from aaplug.kernels import Kernels
 from aaplug.sampling import SamplingBounds
 from aaplug.splats import Render, Splats2D
 
-# What alpha is at a pixel: the Gaussian's value at its centre, or its mean over the pixel by the normal distribution or
-# by Analytic-Splatting's logistic approximation of it (`rasterizers.pixels`), or over the window of it that light still
-# passes (`rasterizers.blending`).
-PixelKernel = Literal["point", "integral", "logistic", "blending"]
+# What alpha is at a pixel: the Gaussian's value at its centre; its mean over the pixel by the normal distribution, by
+# Analytic-Splatting's logistic approximation of it, or over the pixel's own square (`rasterizers.pixels`); a disc's
+# value where the ray meets it, as 2DGS and AA-2DGS have it (`rasterizers.surfels`); or its mean over the window that
+# light still passes (`rasterizers.blending`).
+PixelKernel = Literal["point", "integral", "logistic", "square", "surfel", "surfel-mip", "blending"]
 
 
 @dataclass(frozen=True)

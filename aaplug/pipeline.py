@@ -16,8 +16,8 @@ from aaplug.errors import UsageError
 from aaplug.filters import fuse_stored
 from aaplug.gaussians import Gaussians
 from aaplug.interfaces import PixelKernel, Rasterizer, ScreenFilter, Training
-from aaplug.projection import project, shade
-from aaplug.rasterizers import RASTERIZERS, averaged, grown
+from aaplug.projection import project, shade, tilt
+from aaplug.rasterizers import RASTERIZERS, SURFELS, averaged, extents_of
 from aaplug.recipes import Recipe
 from aaplug.sampling import sampling_bounds
 from aaplug.splats import Render, Splats2D, drawn, joined
@@ -63,6 +63,7 @@ def render(
     return averaged(rasterizer(splats, fine.hw, background, recipe.pixel), samples)
 
 
+@torch.no_grad()
 def rate_of(scene: Gaussians, camera: Camera, training: Training) -> float:
     """How finely a view samples the scene against training, by which samples a pixel are chosen.
 
@@ -72,7 +73,7 @@ def rate_of(scene: Gaussians, camera: Camera, training: Training) -> float:
     bounds = training.bounds
     if camera.trained_focal is not None or not bounds.seen.any():
         return training.rate(camera)
-    now = sampling_bounds(scene.means.detach(), [camera]).highest
+    now = sampling_bounds(scene.means, [camera]).highest
     both = (now > 0) & bounds.seen
     if not both.any():
         return training.rate(camera)
@@ -96,9 +97,10 @@ def splats_of(
     for start in range(0, max(1, len(scene)), PART):
         part = scene if len(scene) <= PART else scene[start : start + PART]
         splats = project(part, camera, kernels)
+        splats = tilt(splats, part, camera) if pixel in SURFELS else splats
         splats = replace(splats, sources=splats.sources + start)
         splats = screen(splats, camera, training)
-        extents = None if pixel == "point" else grown(splats)
+        extents = extents_of(splats, pixel)
         splats = drawn(splats, camera.hw, training.guard, kernels, extents)
         parts.append(shade(splats, scene, camera, kernels))
     splats = parts[0] if len(parts) == 1 else joined(parts)

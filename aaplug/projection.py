@@ -20,6 +20,7 @@ from aaplug.splats import Splats2D
 
 JACOBIAN_MARGIN = 0.3  # of half the image at depth 1: 3DGS linearises no farther out (1.3 tan(fov/2) when centred)
 MAX_SIGMA = 1e9  # px: larger splats look the same, and their determinant would overflow float32
+MIN_FACING = 1e-6  # of depth: a disc seen at a flatter angle is a line, and its tilt would overflow
 COLOUR_OFFSET = 0.5  # 3DGS stores colours around mid-grey
 
 SH_C0 = 0.28209479177387814
@@ -52,6 +53,35 @@ def project(scene: Gaussians, camera: Camera, kernels: Kernels = EAGER) -> Splat
     )
     in_front = depths > NEAR
     return splats if in_front.all() else splats[in_front]
+
+
+def tilt(splats: Splats2D, scene: Gaussians, camera: Camera) -> Splats2D:
+    """Give splats the tilt of the disc that each Gaussian is across its thinnest axis.
+
+    A ray meets the plane through c with the normal N at the inverse depth N·ray / N·c, which is linear in the pixel.
+    """
+    rotation = camera.cam_from_world[:3, :3].to(scene.means)
+    thinnest = scene.log_scales.argmin(dim=1).index_select(0, splats.sources)
+    axes = _rotations(scene.unit_quats.index_select(0, splats.sources))
+    normals = axes.gather(2, thinnest[:, None, None].expand(-1, 3, 1)).squeeze(2) @ rotation.T
+    offset = scene.means.index_select(0, splats.sources).double() - camera.centre.to(
+        scene.means.device
+    )
+    facing = (normals * (offset.to(scene.means) @ rotation.T)).sum(dim=1)
+    edge_on = facing.abs() < MIN_FACING * splats.depths
+    facing = torch.where(edge_on, MIN_FACING * splats.depths, facing)
+    focal = normals.new_tensor([camera.fx, camera.fy])
+    return replace(splats, tilts=-(splats.depths / facing)[:, None] * normals[:, :2] / focal)
+
+
+def _rotations(quats: Float[Tensor, "m 4"]) -> Float[Tensor, "m 3 3"]:
+    w, x, y, z = quats.unbind(dim=1)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
 
 
 def shade(splats: Splats2D, scene: Gaussians, camera: Camera, kernels: Kernels = EAGER) -> Splats2D:

@@ -8,7 +8,7 @@ import math
 from dataclasses import dataclass, replace
 
 from aaplug.errors import UsageError, listing
-from aaplug.filters import SCREEN_FILTERS, Matched, RateChoice, Smoothing3D
+from aaplug.filters import SCREEN_FILTERS, FlatSmoothing, LowPass, Matched, RateChoice, Smoothing3D
 from aaplug.interfaces import PixelKernel, ScreenFilter, WorldFilter
 
 # rate·n that a quality asks for.  A small image's cost is a Gaussian's, not a pixel's: at 1/8 of the training size 2×2
@@ -153,6 +153,37 @@ RECIPES: dict[str, Recipe] = {
             "aaplug: matched, with Analytic-Splatting's integral over the rest of the pixel",
             "one sample a pixel, a little sharper and slower",
             pixel="integral",
+        ),
+        Recipe(
+            "matched-square",
+            Matched(windowed=True),
+            "aaplug, after MipSLAM's elliptical integration (arXiv 2603.06989), whose constants are not published: "
+            "matched, with the mean over the rest of the pixel's own square",
+            "comparison: as matched-integral, for splats askew",
+            pixel="square",
+        ),
+        Recipe(
+            "2dgs",
+            LowPass(),
+            "2DGS (Huang et al. 2024): discs where rays meet them, and a low-pass filter of √½ px",
+            "scenes of 2D Gaussians, as they were trained; Gaussians are taken for discs across their thinnest axis",
+            pixel="surfel",
+        ),
+        Recipe(
+            "2dgs-matched",
+            LowPass(matched=True),
+            "aaplug: 2DGS with its low-pass filter carried to the rate being rendered, and samples a pixel as auto has",
+            "scenes of 2D Gaussians at other sizes",
+            samples=0.5,
+            pixel="surfel",
+        ),
+        Recipe(
+            "aa-2dgs",
+            LowPass(),
+            "AA-2DGS (Younes et al., NeurIPS 2025): the world-space flat kernel, then the object-space Mip filter",
+            "scenes of 2D Gaussians trained with it",
+            world=FlatSmoothing(),
+            pixel="surfel-mip",
         ),
         Recipe(
             "gaussian-blending",

@@ -26,7 +26,9 @@ MIN_COMPENSATION = (
 class Splats2D:
     """What the rasterizer draws, in no particular order.
 
-    window: side, in px, of the square that alpha is averaged over, where the pixel kernel averages at all.
+    window: side, in px, of the square that alpha is averaged over, where the pixel kernel averages at all; of the
+        screen's low-pass filter in training's pixels, where the pixel kernel is a disc's.
+    tilts: of a disc, by which share of its centre's the inverse of depth falls a px right, and a px down.
     """
 
     means: Float[Tensor, "m 2"]
@@ -36,6 +38,7 @@ class Splats2D:
     opacities: Float[Tensor, " m"]
     sources: Int[Tensor, " m"]  # index in the scene
     rgb: Float[Tensor, "m 3"] | None = None
+    tilts: Float[Tensor, "m 2"] | None = None
     window: float = 1.0
 
     def __len__(self) -> int:
@@ -57,6 +60,7 @@ class Splats2D:
             opacities=at(self.opacities),
             sources=at(self.sources),
             rgb=None if self.rgb is None else at(self.rgb),
+            tilts=None if self.tilts is None else at(self.tilts),
             window=self.window,
         )
 
@@ -70,6 +74,7 @@ class Splats2D:
             depths=self.depths.to(dtype),
             opacities=self.opacities.to(dtype),
             rgb=None if self.rgb is None else self.rgb.to(dtype),
+            tilts=None if self.tilts is None else self.tilts.to(dtype),
         )
 
     def blurred(
@@ -116,7 +121,9 @@ def joined(parts: Sequence[Splats2D]) -> Splats2D:
     }
     colours = [part.rgb for part in parts if part.rgb is not None]
     rgb = torch.cat(colours) if colours else None
-    return Splats2D(**columns, rgb=rgb, window=parts[0].window)
+    slopes = [part.tilts for part in parts if part.tilts is not None]
+    tilts = torch.cat(slopes) if slopes else None
+    return Splats2D(**columns, rgb=rgb, tilts=tilts, window=parts[0].window)
 
 
 class Render(NamedTuple):

@@ -439,16 +439,36 @@ def test_pixel_kernels_have_the_published_values(rasterize, cov, offset, logisti
         assert alpha == pytest.approx(expected, abs=2e-6), pixel
 
 
-@pytest.mark.parametrize("pixel", ["integral", "logistic", "blending"])
+@pytest.mark.parametrize(
+    "pixel", ["integral", "logistic", "square", "surfel", "surfel-mip", "blending"]
+)
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
 @pytest.mark.parametrize("window", [0.0, 0.6, 1.0])
 def test_means_over_pixels_are_the_judges(pixel, dtype, window):
     hw = (61, 83)
-    splats = replace(make_splats(500, hw, 8, (-3.0, 3.0)), window=window).to(dtype)
+    splats = replace(make_splats(500, hw, 8, (-3.0, 3.0)), window=window)
+    tilts = 0.07 * torch.randn(500, 2, generator=torch.Generator().manual_seed(3))
+    splats = replace(splats, tilts=tilts / splats.covs[:, [0, 2]].sqrt()).to(dtype)
     fast, judge = TILED(splats, hw, SKY, pixel), reference.rasterize(splats, hw, SKY, pixel)
     difference = (fast.rgb - judge.rgb).abs().amax(dim=2)
     assert (difference > 2 * TOLERANCE).double().mean() < 1e-3, "more than flips at a cut-off"
     assert difference.max() < 0.01
+
+
+@pytest.mark.parametrize(
+    "cov", [(0.3, 0.1, 0.2), (0.02, 0.0, 0.05), (1.5, -1.2, 1.1), (9.0, 2.0, 4.0)]
+)
+@pytest.mark.parametrize("offset", [(0.0, 0.0), (0.4, -0.3)])
+def test_the_mean_over_a_square_is_near_the_integral(cov, offset):
+    """Against 200 × 200 points of the pixel, within a hundredth of the opacity."""
+    splats = splats_of(((4.5 - offset[0], 4.5 - offset[1]), cov, 1.0, 0.9, WHITE))
+    ticks = (torch.arange(200, dtype=F64) + 0.5) / 200 - 0.5
+    grid = torch.cartesian_prod(ticks, ticks) + torch.tensor(offset, dtype=F64)
+    xx, xy, yy = cov
+    squared = yy * grid[:, 0] ** 2 - 2 * xy * grid.prod(dim=1) + xx * grid[:, 1] ** 2
+    expected = 0.9 * (-0.5 * squared / (xx * yy - xy * xy)).exp().mean().item()
+    alpha = TILED(splats, (8, 8), BLACK, "square").alpha[4, 4].item()
+    assert alpha == pytest.approx(expected, abs=0.009)
 
 
 def test_the_integral_of_a_small_splat_is_its_energy():

@@ -3,14 +3,22 @@
 from aaplug.filters.adaptive import ADAPTIVE_VARIANCE, Adaptive
 from aaplug.filters.dilation import Dilation
 from aaplug.filters.energy import MATCHED_VARIANCE, MatchedEnergy
+from aaplug.filters.low_pass import LowPass
 from aaplug.filters.matched import PIXEL_VARIANCE, Matched, RateChoice
-from aaplug.filters.smoothing import NYQUIST_VARIANCE, Smoothing3D, StoredSmoothing, fuse_stored
+from aaplug.filters.smoothing import (
+    NYQUIST_VARIANCE,
+    FlatSmoothing,
+    Smoothing3D,
+    StoredSmoothing,
+    fuse_stored,
+)
 from aaplug.interfaces import ScreenFilter, WorldFilter
 
 WORLD_FILTERS: dict[str, WorldFilter] = {
     "smoothing3d": Smoothing3D(),
     "smoothing3d-largest-focal": Smoothing3D(focal="largest"),
     "smoothing3d-balanced": Smoothing3D(opacity="balanced"),
+    "flat": FlatSmoothing(),
     "stored": StoredSmoothing(),
     "matched-energy": MatchedEnergy(),
 }
@@ -37,6 +45,8 @@ __all__ = [
     "WORLD_FILTERS",
     "Adaptive",
     "Dilation",
+    "FlatSmoothing",
+    "LowPass",
     "Matched",
     "MatchedEnergy",
     "RateChoice",

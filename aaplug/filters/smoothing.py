@@ -60,6 +60,32 @@ class Smoothing3D:
 
 
 @dataclass(frozen=True)
+class FlatSmoothing:
+    """Smooth discs in their own planes alone, keeping their area's integral (AA-2DGS's world-space flat kernel).
+
+    A disc lies across a Gaussian's thinnest axis.  variance: px² at the highest rate that any training camera had.
+    """
+
+    variance: float = NYQUIST_VARIANCE
+
+    def __call__(self, scene: Gaussians, training: Training) -> Gaussians:
+        """Fuse the smoothing into scales and opacities."""
+        log_sigma = (self.variance**0.5 / training.bounds.highest_or_coarsest).log()
+        smoothed = smooth(scene, log_sigma, volume=False)
+        thin = torch.zeros_like(scene.log_scales, dtype=torch.bool)
+        thin.scatter_(1, scene.log_scales.argmin(dim=1, keepdim=True), True)
+        logits = scale_opacities(
+            scene.logit_opacities, face_log_factor(scene.log_scales, log_sigma)
+        )
+        return replace(
+            smoothed,
+            log_scales=torch.where(thin, scene.log_scales, smoothed.log_scales),
+            logit_opacities=logits,
+            fused=(*scene.fused, Fusion("flat smoothing", {"variance": f"{self.variance:g}"})),
+        )
+
+
+@dataclass(frozen=True)
 class StoredSmoothing:
     """Fuse the `filter_3D` column of a Mip-Splatting checkpoint; a scene without one stays as it is."""
 

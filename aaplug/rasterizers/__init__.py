@@ -1,7 +1,7 @@
 """Rasterizers by name; a new one is a file here and a line below."""
 
 from aaplug.interfaces import Rasterizer
-from aaplug.rasterizers.pixels import grown
+from aaplug.rasterizers.extents import SURFELS, extents_of
 from aaplug.rasterizers.reference import Reference
 from aaplug.rasterizers.supersampled import averaged
 from aaplug.rasterizers.tiled import Tiled
@@ -11,4 +11,4 @@ RASTERIZERS: dict[str, Rasterizer] = {
     "reference": Reference(),
 }
 
-__all__ = ["RASTERIZERS", "Reference", "Tiled", "averaged", "grown"]
+__all__ = ["RASTERIZERS", "SURFELS", "Reference", "Tiled", "averaged", "extents_of"]

@@ -16,7 +16,8 @@ from torch.special import ndtr
 
 from aaplug.interfaces import PixelKernel
 from aaplug.kernels import EAGER, Kernels
-from aaplug.rasterizers.pixels import logistic
+from aaplug.rasterizers.extents import SURFELS
+from aaplug.rasterizers.pixels import CELLS, logistic
 from aaplug.rasterizers.rules import MAX_ALPHA, MIN_TRANSMITTANCE, over
 from aaplug.splats import MIN_ALPHA, Render, Splats2D, principal_columns, whitening
 
@@ -97,6 +98,10 @@ def alphas(
     if pixel == "point":
         white = torch.einsum("cij,pcj->pci", whitening(splats), offsets)
         values = torch.exp(-0.5 * white.square().sum(dim=2))
+    elif pixel in SURFELS:
+        values = _on_discs(splats, offsets, smoothed=pixel == "surfel-mip")
+    elif pixel == "square":
+        values = _over_squares(splats, offsets)
     else:
         values = _over_pixels(splats, offsets, logistic if pixel == "logistic" else ndtr)
     alpha = (splats.opacities * values).clamp(max=MAX_ALPHA)
@@ -117,6 +122,72 @@ def _over_pixels(
         probability = distribution(u + per_px / 2) - distribution(u - per_px / 2)
         values = values * probability * math.sqrt(2 * math.pi) / per_px
     return values
+
+
+def _on_discs(
+    splats: Splats2D, offsets: Float[Tensor, "p c 2"], smoothed: bool
+) -> Float[Tensor, "p c"]:
+    """2DGS's intersection of homogeneous planes (its eqs. 8 to 10), and AA-2DGS's filter as its paper expands it.
+
+    T_u, T_v, T_w: the disc's coordinates to the screen's, from any root of its covariance there and from its tilt.
+    """
+    assert splats.tilts is not None
+    xx, xy, _ = splats.covs.unbind(dim=1)
+    a = xx.sqrt()
+    zero, one = torch.zeros_like(a), torch.ones_like(a)
+    root = torch.stack([a, zero, xy / a, (splats.dets / xx).sqrt()], dim=1).unflatten(1, (2, 2))
+    tilt = torch.einsum("cij,ci->cj", root, splats.tilts)
+    t_u, t_v = (torch.cat([root[:, i], zero[:, None]], dim=1) for i in (0, 1))
+    t_w = torch.cat([tilt, one[:, None]], dim=1)
+    x, y = offsets[..., :1], offsets[..., 1:]
+    by_row, by_column = x * t_w - t_u, y * t_w - t_v
+    p = torch.linalg.cross(by_row, by_column)
+    in_front = p[..., 2] > 1e-12
+    depth = torch.where(in_front, p[..., 2], 1.0)
+    s, t = p[..., 0] / depth, p[..., 1] / depth
+    if not smoothed:
+        low_pass = 2 * offsets.square().sum(dim=2) / max(splats.window, NARROWEST) ** 2
+        values = torch.exp(-0.5 * torch.minimum(s * s + t * t, low_pass))
+        return torch.where(in_front, values, torch.exp(-0.5 * low_pass))
+    by_x = torch.linalg.cross(t_w.expand_as(by_column), by_column)
+    by_y = torch.linalg.cross(by_row, t_w.expand_as(by_row))
+    columns = []
+    for change in (by_x, by_y):
+        columns += [
+            (change[..., i] * depth - p[..., i] * change[..., 2]) / depth**2 for i in (0, 1)
+        ]
+    a, b, c, d = columns
+    kappa = 0.1
+    area, size = a * d - b * c, a * a + b * b + c * c + d * d
+    det = kappa**2 * area**2 + kappa * size + 1
+    rho = (s * s + t * t + kappa * ((d * s - c * t) ** 2 + (a * t - b * s) ** 2)) / det
+    values = (1 / det + 1e-8).sqrt() * torch.exp(-0.5 * rho)
+    return torch.where(in_front, values, 0.0)
+
+
+def _over_squares(splats: Splats2D, offsets: Float[Tensor, "p c 2"]) -> Float[Tensor, "p c"]:
+    """Means over the pixels' squares: a marginal of the Gaussian in strips, and what is across given each's middle."""
+    side = max(splats.window, NARROWEST)
+    xx, xy, yy = splats.covs.unbind(dim=1)
+    wide = xx >= yy
+    long = torch.where(wide, xx, yy)
+    along, across = (torch.where(wide, offsets[..., i], offsets[..., 1 - i]) for i in (0, 1))
+    values = torch.zeros_like(along)
+    for cell in range(CELLS):
+        middle = along + side * ((cell + 0.5) / CELLS - 0.5)
+        given = across - xy / long * middle
+        values = values + _mean(middle, long.sqrt(), side / CELLS) * _mean(
+            given, (splats.dets / long).sqrt(), side
+        )
+    return values / CELLS
+
+
+def _mean(
+    at: Float[Tensor, "p c"], sigma: Float[Tensor, " c"], side: float
+) -> Float[Tensor, "p c"]:
+    """Mean of exp(−x²/2σ²) over at ± side/2."""
+    probability = ndtr((at + side / 2) / sigma) - ndtr((at - side / 2) / sigma)
+    return probability * sigma * math.sqrt(2 * math.pi) / side
 
 
 def _blended_strip(

@@ -31,14 +31,17 @@ from torch import Tensor
 from aaplug.interfaces import PixelKernel
 from aaplug.kernels import EAGER, Kernel, Kernels
 from aaplug.rasterizers.blending import blended, table_of
-from aaplug.rasterizers.pixels import grown, mean_gaussian, mean_logistic
+from aaplug.rasterizers.extents import SURFELS, extents_of
+from aaplug.rasterizers.pixels import CELLS, mean_gaussian, mean_logistic
 from aaplug.rasterizers.rules import MAX_ALPHA, MIN_TRANSMITTANCE, over
+from aaplug.rasterizers.surfels import disc, smoothed_disc
 from aaplug.splats import MIN_ALPHA, Render, Splats2D, principal_columns, reach, whitening_columns
 
 TILE = 8  # px
 PASS = 8  # splats composited in one pass: more compile slowly, fewer load and store more
 CHECK_EVERY = 4  # passes between looks at which tiles are saturated
 COMPACT_BELOW = 3 / 4  # share of tiles still going at which the others leave
+NARROWEST = 1e-3  # px: of a low-pass filter, which is divided by
 BLENDED_TILES = 64  # of about equally many splats, blended together
 MEMORY = 1e9  # bytes
 PAIR_BYTES = 64  # of a candidate pair while a band is binned, measured
@@ -71,8 +74,9 @@ SQUARINGS = 3
 ROOT_OF_EXP2 = _root_of_exp2(SQUARINGS, degree=6)  # relative error of the power: 1e-6 in float32
 
 # columns of a splat's drawing parameters; the last two only where alpha is a mean over the pixel
-UX, UY, VX, VY, X, Y, OPACITY, RED, GREEN, BLUE, HALF_U, HALF_V = range(12)
-COLUMNS, MEAN_COLUMNS = 10, 12
+UX, UY, VX, VY, X, Y, OPACITY, RED, GREEN, BLUE, HALF_U, HALF_V, SLOPE = range(13)
+TILT_X, TILT_Y, LOW_PASS_WIDTH = HALF_U, HALF_V, SLOPE  # of a disc
+COLUMNS, MEAN_COLUMNS = 10, 13
 BOX = 7  # where the box of tiles begins in a row of the table
 
 
@@ -95,7 +99,7 @@ class Tiled:
     ) -> Render:
         """Draw the splats."""
         grid = (-(-hw[0] // TILE), -(-hw[1] // TILE))
-        extents = splats if pixel == "point" else grown(splats)
+        extents = extents_of(splats, pixel) or splats
         paint = self._painter(splats, pixel)
         planes = [
             _untiled(paint(bins), grid[1])[:, : hw[1]]
@@ -141,8 +145,11 @@ def drawing_of(
     columns = (splats.means, splats.covs, splats.dets, splats.opacities, splats.rgb)
     if pixel == "point":
         (rows,) = kernels.run(DRAWING, *columns)
+    elif pixel in SURFELS:
+        assert splats.tilts is not None
+        rows = _disc_rows(*columns, splats.tilts, splats.window)
     else:
-        rows = _mean_rows(*columns, splats.window)
+        rows = _mean_rows(*columns, splats.window, square=pixel == "square")
     nothing = rows.new_zeros(1, rows.shape[1])
     nothing[:, OPACITY] = LOG2_SILENT if pixel == "point" else 0.0
     return torch.cat([rows, nothing])
@@ -168,12 +175,39 @@ def _mean_rows(
     opacities: Float[Tensor, " m"],
     rgb: Float[Tensor, "m 3"],
     window: float,
-) -> Float[Tensor, "m 12"]:
-    """Rows for means over pixels: forms along the splat's own axes, and the half windows, in standard deviations."""
-    ux, uy, vx, vy = principal_columns(covs, dets)
-    halves = [0.5 * window * torch.hypot(x, y) for x, y in ((ux, uy), (vx, vy))]
+    square: bool,
+) -> Float[Tensor, "m 13"]:
+    """Rows for means over pixels: two forms, and the half windows along them, in standard deviations.
+
+    The forms run along the splat's own axes; over a square the second along x or y, whichever the splat is longer in,
+    and the first across it, with what it changes over the window along the second.
+    """
+    if square:
+        ux, uy, vx, vy = whitening_columns(covs, dets)
+        along_x = vx > 0
+        across, slope = torch.where(along_x, uy, ux), torch.where(along_x, ux, uy)
+        halves = [0.5 * window * across, 0.5 * window * (vx + vy), window * slope]
+    else:
+        ux, uy, vx, vy = principal_columns(covs, dets)
+        halves = [0.5 * window * torch.hypot(x, y) for x, y in ((ux, uy), (vx, vy))]
+        halves.append(torch.zeros_like(ux))
     columns = [ux, uy, vx, vy, *means.unbind(dim=1), opacities, *rgb.unbind(dim=1), *halves]
     return torch.stack(columns, dim=1)
+
+
+def _disc_rows(
+    means: Float[Tensor, "m 2"],
+    covs: Float[Tensor, "m 3"],
+    dets: Float[Tensor, " m"],
+    opacities: Float[Tensor, " m"],
+    rgb: Float[Tensor, "m 3"],
+    tilts: Float[Tensor, "m 2"],
+    window: float,
+) -> Float[Tensor, "m 13"]:
+    """Rows for discs: a whitening, the tilt, and the low-pass filter's width."""
+    forms = whitening_columns(covs, dets)
+    rest = [*tilts.unbind(dim=1), torch.full_like(opacities, max(window, NARROWEST))]
+    return torch.stack([*forms, *means.unbind(1), opacities, *rgb.unbind(1), *rest], dim=1)
 
 
 # --------------------------------------------------------------------------------------------------------- binning
@@ -490,6 +524,36 @@ def _over_pixel(
     return torch.threshold(alpha, BELOW_MIN_ALPHA, 0.0)
 
 
+def _on_disc(
+    smoothed: bool, row: Float[Tensor, "t c"], x: Float[Tensor, "t P"], y: Float[Tensor, "t P"]
+) -> Float[Tensor, "t P"]:
+    """Alpha, before its cap, of one disc a tile where the pixels' rays meet it."""
+    e = _forms(row, x, y)
+    dx, dy = x - row[:, X, None], y - row[:, Y, None]
+    tilts = row[:, TILT_X, None], row[:, TILT_Y, None]
+    ahead = 1 - tilts[0] * dx - tilts[1] * dy
+    if smoothed:
+        forms = tuple(row[:, i, None] for i in (UX, UY, VX, VY))
+        value = smoothed_disc(e, ahead, forms, tilts)
+    else:
+        value = disc(e, ahead, dx * dx + dy * dy, row[:, LOW_PASS_WIDTH, None])
+    return torch.threshold(row[:, OPACITY, None] * value, BELOW_MIN_ALPHA, 0.0)
+
+
+def _over_square(
+    row: Float[Tensor, "t c"], x: Float[Tensor, "t P"], y: Float[Tensor, "t P"]
+) -> Float[Tensor, "t P"]:
+    """Alpha, before its cap, of one splat a tile: opacity times its mean over the pixel's own square, in strips."""
+    across, along = _forms(row, x, y)
+    half_across, half_along, slope = (row[:, i, None] for i in (HALF_U, HALF_V, SLOPE))
+    total = torch.zeros_like(along)
+    for cell in range(CELLS):
+        from_middle = (cell - (CELLS - 1) / 2) / CELLS
+        share = mean_gaussian(along + 2 * from_middle * half_along, half_along / CELLS)
+        total = total + share * mean_gaussian(across + from_middle * slope, half_across)
+    return torch.threshold(row[:, OPACITY, None] * total / CELLS, BELOW_MIN_ALPHA, 0.0)
+
+
 def _left(alpha: Float[Tensor, "t P"], one: Float[Tensor, "t 1"]) -> Float[Tensor, "t P"]:
     """The share of the light that a splat lets through."""
     least = 1 - MAX_ALPHA
@@ -759,6 +823,9 @@ ALPHA: dict[PixelKernel, AlphaOf] = {
     "point": _at_centre,
     "integral": partial(_over_pixel, mean_gaussian),
     "logistic": partial(_over_pixel, mean_logistic),
+    "square": _over_square,
+    "surfel": partial(_on_disc, False),
+    "surfel-mip": partial(_on_disc, True),
 }
 WIDTH: dict[PixelKernel, int] = {
     name: COLUMNS if name == "point" else MEAN_COLUMNS for name in ALPHA
