@@ -113,7 +113,9 @@ def rows(report: Report, metric: Metric) -> list[list[tuple[str, bool]]]:
 
 def work(report: Report) -> list[tuple[str, list[list[str]]]]:
     """Tables of what a view costs, recipes down and scales across, as (title, lines)."""
-    columns = (("seconds a view", seconds, 3), ("million pairs a view", million_pairs, 2))
+    columns = [("seconds a view", seconds, 3)]
+    if any(m.pairs is not None for m in report.measurements):
+        columns.append(("million pairs a view", million_pairs, 2))
     return [
         (
             title,

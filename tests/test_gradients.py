@@ -32,7 +32,7 @@ WORLDS = {
     f"world {name}": Recipe(name, SCREEN_FILTERS["mip"], "", "", world=world)
     for name, world in WORLD_FILTERS.items()
 }
-SAMPLED = {"samples": replace(RECIPES["matched"], samples=1.0)}
+SAMPLED = {"samples": replace(RECIPES["sa-gs"], samples=1.0)}
 RECIPES_HERE = MATCHED | SCREENS | WORLDS | SAMPLED
 
 
