@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 from aaplug.errors import UsageError, listing
 from aaplug.filters import SCREEN_FILTERS, FlatSmoothing, LowPass, Matched, RateChoice, Smoothing3D
+from aaplug.gaussians import Gaussians
 from aaplug.interfaces import PixelKernel, ScreenFilter, WorldFilter
 
 # rate·n that a quality asks for.  A small image's cost is a Gaussian's, not a pixel's: at 1/8 of the training size 2×2
@@ -230,3 +231,10 @@ def find_recipe(
     if name == "auto":
         recipe = replace(recipe, samples=SAMPLING[quality])
     return recipe if samples is None else replace(recipe, samples=samples)
+
+
+def suited(recipe: Recipe, scene: Gaussians) -> Recipe:
+    """The same recipe, but that `auto` draws discs for a scene of 2D Gaussians (`2dgs-matched`)."""
+    if recipe.name != "auto" or not scene.flat:
+        return recipe
+    return replace(RECIPES["2dgs-matched"], name="auto", samples=recipe.samples)

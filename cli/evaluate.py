@@ -24,7 +24,7 @@ from aaplug.lpips import lpips_metric
 from aaplug.metrics import CONSISTENCY, ENERGY, FLICKER, FLIP, PSNR, SSIM, Metric
 from aaplug.nyquist import coverage
 from aaplug.protocols import PROTOCOLS, Protocol, Truth, find_protocol
-from aaplug.recipes import RECIPES, Recipe, find_recipe
+from aaplug.recipes import RECIPES, Recipe, find_recipe, suited
 from aaplug.report import Report, as_csv, per_view, results, tables
 
 from .batch import Job, finish_batch, jobs_of, run_batch
@@ -134,6 +134,7 @@ def _run(job: Job) -> Report:
     protocol, recipes = _protocol(options), _recipes(options)
     judges = _judges(options, protocol)
     scene = options.scene.read()
+    recipes = [suited(recipe, scene) for recipe in recipes]
     cameras = options.cameras.read(options.scene)
     views = options.rendering.select(cameras)
     shown = _shown(options.show, views) if options.report else ()

@@ -16,7 +16,7 @@ from aaplug.gaussians import Gaussians
 from aaplug.interfaces import Training
 from aaplug.io.atomic import check_output
 from aaplug.pipeline import rate_of, smooth
-from aaplug.recipes import RECIPES, Recipe, find_recipe
+from aaplug.recipes import RECIPES, Recipe, find_recipe, suited
 
 from .console import print_json, progress, say
 from .files import make_folder, refuse_existing
@@ -55,6 +55,7 @@ def render(options: Render) -> int:
         options.recipe, quality=options.rendering.quality, rate=options.rendering.rate
     )
     scene = options.scene.read()
+    recipe = suited(recipe, scene)
     cameras = options.cameras.read(options.scene)
     views = [size(view) for view in options.rendering.select(cameras)]
     paths = _paths(options.output, views, options.overwrite)
@@ -139,7 +140,8 @@ def _choice(recipe: Recipe, views: Sequence[Camera], scene: Gaussians, training:
     sizes = listing(sorted({f"{view.width}x{view.height}" for view in views}), most=3)
     trained = training.convention
     span = " to ".join(dict.fromkeys(f"{rate:.3g}" for rate in (min(rates), max(rates))))
+    kind = f"{trained.name} scene" + (" of 2D Gaussians" if scene.flat else "")
     return (
-        f"recipe: {recipe.name} for a {trained.name} scene, {len(views)} view{'s' * (len(views) != 1)} at {sizes}, "
+        f"recipe: {recipe.name} for a {kind}, {len(views)} view{'s' * (len(views) != 1)} at {sizes}, "
         f"{span} × the rate of training: {grid} sample{'s' * (samples != [1])} a pixel"
     )

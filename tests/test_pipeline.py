@@ -14,7 +14,7 @@ from aaplug.io.scenes import read_scene, write_scene
 from aaplug.pipeline import learn, rate_of, render, smooth
 from aaplug.projection import project
 from aaplug.rasterizers import RASTERIZERS
-from aaplug.recipes import RECIPES, find_recipe
+from aaplug.recipes import RECIPES, find_recipe, suited
 from aaplug.sampling import median_rates
 from tests.conftest import make_camera, make_scene
 
@@ -291,3 +291,13 @@ def test_matched_takes_the_interval_for_free_cameras_alone(free, like):
     other = find_recipe("matched", rate="sharpest").screen(project(scene, view), view, training)
     assert torch.equal(found.covs, expected.covs)
     assert not torch.equal(found.covs, other.covs)
+
+
+def test_auto_draws_discs_for_a_scene_of_them_alone():
+    scene = make_scene(3)
+    assert suited(RECIPES["auto"], scene) is RECIPES["auto"]
+    flat = replace(scene, flat=True)
+    best = find_recipe("auto", quality="best")
+    assert suited(best, flat).pixel == "surfel"
+    assert suited(best, flat).samples_at(0.25) == best.samples_at(0.25) == 4
+    assert suited(RECIPES["matched"], flat) is RECIPES["matched"]
