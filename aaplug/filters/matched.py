@@ -21,7 +21,7 @@ from aaplug.interfaces import Training
 from aaplug.splats import Splats2D
 
 # px²: one pixel seen as a Gaussian.  A box has 1/12 and Mip-Splatting takes 0.1; opaque splats side by side hide less
-# than their energies together should, and a narrower filter makes up for some of it (docs/quality.md).
+# than their energies together should, and a narrower filter makes up for some of it (docs/methods.md).
 PIXEL_VARIANCE = 0.07
 
 RateChoice = Literal["pose", "global", "sharpest", "interval"]
