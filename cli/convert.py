@@ -10,19 +10,26 @@ import tyro
 from aaplug.conversion import FORMS, VIEWERS, convert_for, default_form, describe
 from aaplug.conversion import convert as fuse
 from aaplug.errors import UsageError
-from aaplug.finetuning import QUICK, Candidate, Job, Truth
-from aaplug.gaussians import Gaussians
+from aaplug.filters import fuse_stored
+from aaplug.finetuning import QUICK, Candidate, Job, Truth, between
+from aaplug.gaussians import Fusion, Gaussians
 from aaplug.io.atomic import check_output
 from aaplug.io.scenes import find_scene, write_parts, write_scene
 from aaplug.io.scenes.scene_file import SceneFile
+from aaplug.metrics import PSNR
 from aaplug.recipes import RECIPES
-from aaplug.report import Report, results, tables
+from aaplug.report import Report, mean, results, tables
 from aaplug.streaming import LARGE, check_frame_of, convert_parts
 
 from .console import out, print_json, progress, say
 from .options import CameraOptions, SceneOptions, ViewOptions, flag
 from .tuning import INTERRUPTED, measured, recorded, spread, tune
 
+SHARES = (
+    0.5,
+    0.25,
+    0.125,
+)  # of the way to the tuned scene, where that is worse than the original at some scale
 JUDGED = 8  # training views, evenly spread, that the residual is measured on
 
 
@@ -133,15 +140,26 @@ def _fitted(options: Convert, scene: Gaussians, target: str) -> int:
     if not done:
         say("stopped; nothing is written")
         return INTERRUPTED
-    converted = recorded(state, job, viewer.convention, {"for": target})
+    tuned = converted = recorded(state, job, viewer.convention, {"for": target})
     write_scene(options.output, converted, overwrite=options.overwrite)
-    candidates = [
-        Candidate("original", scene, recipe),
-        Candidate("closed form", start, recipe),
-        Candidate("converted", converted, recipe),
-    ]
-    views = spread(options.viewing.select(cameras), JUDGED)
-    report = measured(candidates, views, (1.0, *settings.weights), truth)
+    views, scales = spread(options.viewing.select(cameras), JUDGED), (1.0, *settings.weights)
+
+    def judge(found: Gaussians) -> Report:
+        candidates = [
+            Candidate("original", scene, recipe),
+            Candidate("closed form", start, recipe),
+            Candidate("converted", found, recipe),
+        ]
+        return measured(candidates, views, scales, truth)
+
+    report = judge(converted)
+    for share in SHARES if state.step else ():
+        if not _worse(report):
+            break
+        say(f"worse than the original at some scale: {share:g} of the way from it instead")
+        converted = _partly(scene, tuned, share)
+        write_scene(options.output, converted, overwrite=True)
+        report = judge(converted)
     fused = "; ".join(describe(fusion) for fusion in converted.fused) or "nothing"
     if options.json:
         print_json(_facts(options, converted) | {"for": target, "residual": results(report)})
@@ -149,6 +167,23 @@ def _fitted(options: Convert, scene: Gaussians, target: str) -> int:
         _print(report)
     say(f"wrote {options.output}: fused {fused}; show it with {viewer.rule}")
     return 0
+
+
+def _partly(scene: Gaussians, tuned: Gaussians, share: float) -> Gaussians:
+    """A share of the way from the original to the tuned scene, which the record of the tuning tells."""
+    *earlier, tuning = tuned.fused
+    partly = Fusion(tuning.method, tuning.settings | {"share": f"{share:g}"})
+    return replace(between(fuse_stored(scene), tuned, share), fused=(*earlier, partly))
+
+
+def _worse(report: Report) -> bool:
+    """Whether the converted scene is below the original at any scale."""
+    for scale in report.scales:
+        names = ("original", "converted")
+        before, after = (mean(report.select(name, scale), PSNR.name) for name in names)
+        if before is not None and after is not None and after < before:
+            return True
+    return False
 
 
 def _print(report: Report) -> None:

@@ -10,7 +10,19 @@ from skimage.metrics import structural_similarity as ssim_of_skimage
 
 from aaplug.cameras import WHITE
 from aaplug.errors import FormatError, UsageError
-from aaplug.finetuning import Job, Settings, State, Truth, advance, begin, load, loss_at, run, save
+from aaplug.finetuning import (
+    Job,
+    Settings,
+    State,
+    Truth,
+    advance,
+    begin,
+    between,
+    load,
+    loss_at,
+    run,
+    save,
+)
 from aaplug.finetuning import tuning as tuning_module
 from aaplug.finetuning.densification import MIN_SHOWN, PULL, SHRINK, carried, densify
 from aaplug.finetuning.losses import LOSSES, l1_dssim, l2, structural_similarity
@@ -401,3 +413,13 @@ def test_the_extent_is_that_of_the_training_cameras():
     far = (centres - centres.mean(0)).norm(dim=1).max().item()
     assert extent(VIEWS) == pytest.approx(1.1 * far)
     assert extent(VIEWS[:1]) == 1.0
+
+
+def test_between_two_scenes_are_both_and_what_is_half_way():
+    start, end = make_scene(5, seed=1), make_scene(5, seed=2)
+    for share, expected in ((0.0, start), (1.0, end)):
+        found = between(start, end, share)
+        for name in ("means", "quats", "log_scales", "logit_opacities", "sh"):
+            torch.testing.assert_close(getattr(found, name), getattr(expected, name))
+    half = between(start, end, 0.5)
+    torch.testing.assert_close(half.means, 0.5 * (start.means + end.means))

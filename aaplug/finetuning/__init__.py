@@ -2,6 +2,7 @@
 
 from aaplug.finetuning.checkpoints import load, save
 from aaplug.finetuning.comparison import Candidate, compare
+from aaplug.finetuning.parameters import between
 from aaplug.finetuning.settings import OURS, QUICK, Settings, mipmap_gs
 from aaplug.finetuning.state import Job, State, begin
 from aaplug.finetuning.truth import Truth
@@ -18,6 +19,7 @@ __all__ = [
     "Truth",
     "advance",
     "begin",
+    "between",
     "compare",
     "find_upsampler",
     "load",

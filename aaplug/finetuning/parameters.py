@@ -51,6 +51,12 @@ def scene_of(leaves: Mapping[str, Tensor], like: Gaussians) -> Gaussians:
     return replace(like, **values, sh=sh, origin=origin)
 
 
+def between(start: Gaussians, end: Gaussians, share: float) -> Gaussians:
+    """A scene on the straight way from one to another of as many Gaussians; 0 has the start's values, 1 the end's."""
+    first, last = leaves_of(start), leaves_of(end)
+    return scene_of({n: first[n].lerp(last[n], share) for n in first}, end)
+
+
 def extent(cameras: tuple[Camera, ...]) -> float:
     """The scene's size as 3DGS has it, in world units: from the spread of its training cameras."""
     centres = torch.stack([camera.centre for camera in cameras])
