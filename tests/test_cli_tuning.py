@@ -134,7 +134,10 @@ def test_convert_for_a_viewer_tags_its_rule_and_tells_what_is_left(
     found = read_scene(Path("c.ply"))
     assert (found.convention.kernel, found.convention.compensated) == (kernel, compensated)
     assert (b"SplatRenderMode: mip" in Path("c.ply").read_bytes()) == compensated
-    assert found.fused[-1].settings == {"steps": "2", "for": viewer}
+    settings = dict(found.fused[-1].settings)
+    stepped_back = settings.pop("share", None)
+    assert settings == {"steps": "2", "for": viewer}
+    assert (stepped_back is not None) == ("of the way from it" in err)
 
 
 def test_convert_for_a_viewer_prints_the_residual_as_json(cli):
