@@ -183,5 +183,6 @@ class RenderOptions(ViewOptions):
 
     quality: Quality = "balanced"
     """Samples a pixel of recipe auto: fast is one, balanced reaches half the training rate, best all of it."""
-    rate: Annotated[Rate | None, flag("global|sharpest|interval")] = None
-    """What matched and auto compare a Gaussian's rate with: training's size, sharpest view or range of views."""
+    rate: Annotated[Rate | None, flag("pose|global|sharpest|interval")] = None
+    """What matched and auto compare a Gaussian's rate with: training's size, sharpest view or range of views; pose, the
+    default, is the size for poses of the data set and the range for free cameras."""
