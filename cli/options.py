@@ -182,7 +182,6 @@ class RenderOptions(ViewOptions):
     """How views are rendered."""
 
     quality: Quality = "balanced"
-    """Samples a pixel of recipe auto: fast is one, balanced reaches half the training rate, best all of it."""
+    """Samples a pixel of recipe auto: fast reaches a quarter of the training rate, balanced half, best all of it."""
     rate: Annotated[Rate | None, flag("pose|global|sharpest|interval")] = None
-    """What matched and auto compare a Gaussian's rate with: training's size, sharpest view or range of views; pose, the
-    default, is the size for poses of the data set and the range for free cameras."""
+    """What matched and auto compare rates with; pose: training's size at its poses, its range of rates elsewhere."""
