@@ -275,9 +275,7 @@ class _Bench:
         if ceiling is not None:
             recipe = find_recipe("auto", quality="best")
         else:
-            moved = self.task.protocol.change == "distance"
-            recipe = find_recipe("matched", rate="interval" if moved else None)
-            recipe = replace(recipe, grid=max(1, math.ceil(1 / scale)))
+            recipe = replace(find_recipe("matched"), grid=max(1, math.ceil(1 / scale)))
         return quantise(self._draw(self.own, camera, recipe).rgb)
 
     def _motion(self, view: Camera, camera: Camera, scale: float) -> list[Tensor] | None:

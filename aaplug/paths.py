@@ -15,17 +15,26 @@ from torch import Tensor
 from aaplug.cameras import Camera, CameraSet
 
 
+def zoomed(view: Camera, factor: float) -> Camera:
+    """The view with its focal length multiplied."""
+    return replace(view, fx=view.fx * factor, fy=view.fy * factor)
+
+
+def moved(view: Camera, factor: float, depth: float) -> Camera:
+    """A free camera, for training never was there, that has what lies at `depth` world units at depth/factor."""
+    pose = view.cam_from_world.clone()
+    pose[2, 3] += depth * (1 / factor - 1)
+    return replace(view, cam_from_world=pose, trained_focal=None)
+
+
 def zoom(view: Camera, t: float, start: float, end: float) -> Camera:
     """The view with its focal length multiplied; pose and size stay."""
-    factor = _factor(t, start, end)
-    return replace(view, fx=view.fx * factor, fy=view.fy * factor)
+    return zoomed(view, _factor(t, start, end))
 
 
 def dolly(view: Camera, t: float, start: float, end: float, depth: float) -> Camera:
     """The view from farther away or nearer: what lies at `depth` world units is at depth/factor; a free camera."""
-    pose = view.cam_from_world.clone()
-    pose[2, 3] += depth * (1 / _factor(t, start, end) - 1)
-    return replace(view, cam_from_world=pose, trained_focal=None)
+    return moved(view, _factor(t, start, end), depth)
 
 
 def orbit(view: Camera, t: float, depth: float, up: Float[Tensor, " 3"]) -> Camera:

@@ -57,10 +57,17 @@ def render(
     Raises:
         UsageError: a Gaussian in view has a colour that is NaN or infinite.
     """
-    samples = recipe.samples_at(rate_of(scene, camera, training))
-    fine = camera.resized(camera.width * samples, camera.height * samples)
+    fine, samples = sampled(scene, camera, recipe, training)
     splats = splats_of(scene, fine, recipe.screen, training, rasterizer, recipe.pixel)
     return averaged(rasterizer(splats, fine.hw, background, recipe.pixel), samples)
+
+
+def sampled(
+    scene: Gaussians, camera: Camera, recipe: Recipe, training: Training
+) -> tuple[Camera, int]:
+    """The larger image whose pixels are a recipe's samples, and how many of those a pixel's side has."""
+    samples = recipe.samples_at(rate_of(scene, camera, training))
+    return camera.resized(camera.width * samples, camera.height * samples), samples
 
 
 @torch.no_grad()

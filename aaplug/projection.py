@@ -62,7 +62,7 @@ def tilt(splats: Splats2D, scene: Gaussians, camera: Camera) -> Splats2D:
     """
     rotation = camera.cam_from_world[:3, :3].to(scene.means)
     thinnest = scene.log_scales.argmin(dim=1).index_select(0, splats.sources)
-    axes = _rotations(scene.unit_quats.index_select(0, splats.sources))
+    axes = rotation_matrices(scene.unit_quats.index_select(0, splats.sources))
     normals = axes.gather(2, thinnest[:, None, None].expand(-1, 3, 1)).squeeze(2) @ rotation.T
     offset = scene.means.index_select(0, splats.sources).double() - camera.centre.to(
         scene.means.device
@@ -72,16 +72,6 @@ def tilt(splats: Splats2D, scene: Gaussians, camera: Camera) -> Splats2D:
     facing = torch.where(edge_on, MIN_FACING * splats.depths, facing)
     focal = normals.new_tensor([camera.fx, camera.fy])
     return replace(splats, tilts=-(splats.depths / facing)[:, None] * normals[:, :2] / focal)
-
-
-def _rotations(quats: Float[Tensor, "m 4"]) -> Float[Tensor, "m 3 3"]:
-    w, x, y, z = quats.unbind(dim=1)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
 
 
 def shade(splats: Splats2D, scene: Gaussians, camera: Camera, kernels: Kernels = EAGER) -> Splats2D:

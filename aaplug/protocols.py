@@ -7,7 +7,7 @@ length and the image's size stay.
 "fov": the focal length is multiplied by it; pose and size stay.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import torch
@@ -16,8 +16,8 @@ from torch import Tensor
 
 from aaplug.cameras import NEAR, WHITE, Camera
 from aaplug.errors import UsageError, listing
-from aaplug.filters import RateChoice
 from aaplug.metrics import LpipsFlavour, SsimFlavour
+from aaplug.paths import moved, zoomed
 
 Change = Literal["size", "distance", "fov"]
 Truth = Literal["photographs", "self"]
@@ -32,7 +32,7 @@ class Protocol:
 
     source: where it comes from.  truth: None takes photographs where every view has one.  downscale: a name of
     `DOWNSCALES`.  whole_sizes: images of round(side·scale) px, stretched by less than one, instead of cropped ones.
-    rate: what `matched` and `auto` compare with unless told.  background: None is the scene's own.
+    background: None is the scene's own.
     """
 
     name: str
@@ -44,7 +44,6 @@ class Protocol:
     whole_sizes: bool = False
     ssim: SsimFlavour = "wang"
     lpips: LpipsFlavour = "vgg"
-    rate: RateChoice | None = None
     background: tuple[float, float, float] | None = None
 
     def camera(self, view: Camera, scale: float, depth: float) -> Camera:
@@ -55,10 +54,8 @@ class Protocol:
                 return view.resized(*sides)
             return view.scaled(scale)
         if self.change == "fov":
-            return replace(view, fx=view.fx * scale, fy=view.fy * scale)
-        pose = view.cam_from_world.clone()
-        pose[2, 3] += depth * (1 / scale - 1)
-        return replace(view, cam_from_world=pose, trained_focal=None)  # training never was there
+            return zoomed(view, scale)
+        return moved(view, scale, depth)
 
 
 def median_depth(means: Float[Tensor, "n 3"], view: Camera) -> float:
@@ -120,7 +117,6 @@ PROTOCOLS = {
             ZOOM_OUT,
             "self",
             change="distance",
-            rate="interval",
         ),
         Protocol(
             "fov",

@@ -24,7 +24,7 @@ from aaplug.lpips import lpips_metric
 from aaplug.metrics import CONSISTENCY, ENERGY, FLICKER, FLIP, PSNR, SSIM, Metric
 from aaplug.nyquist import coverage
 from aaplug.protocols import PROTOCOLS, Protocol, Truth, find_protocol
-from aaplug.recipes import RECIPES, Recipe, find_recipe, suited
+from aaplug.recipes import RECIPES, suited
 from aaplug.report import Report, as_csv, per_view, results, tables
 
 from .batch import Job, finish_batch, jobs_of, run_batch
@@ -131,7 +131,8 @@ def _check_output(options: Evaluate) -> None:
 def _run(job: Job) -> Report:
     """Evaluate one scene and write what was found."""
     options = job.options
-    protocol, recipes = _protocol(options), _recipes(options)
+    protocol = _protocol(options)
+    recipes = options.rendering.recipes(RECIPES if "all" in options.recipe else options.recipe)
     judges = _judges(options, protocol)
     scene = options.scene.read()
     recipes = [suited(recipe, scene) for recipe in recipes]
@@ -173,19 +174,6 @@ def _protocol(options: Evaluate) -> Protocol:
         ssim=options.ssim or protocol.ssim,
         lpips=options.lpips_flavour or protocol.lpips,
     )
-
-
-def _recipes(options: Evaluate) -> list[Recipe]:
-    """--rate, or else the protocol's, concerns the recipes that match one."""
-    rate = options.rendering.rate or find_protocol(options.protocol).rate
-    return [
-        find_recipe(
-            name,
-            quality=options.rendering.quality,
-            rate=rate if name in ("matched", "auto") else None,
-        )
-        for name in (RECIPES if "all" in options.recipe else options.recipe)
-    ]
 
 
 def _judges(options: Evaluate, protocol: Protocol) -> list[Metric]:
@@ -300,7 +288,7 @@ def _facts(
         "photographs": {"count": len(photos), "sha256": _sha256(photos) if photos else None},
         "options": {
             "quality": options.rendering.quality,
-            "rate": options.rendering.rate or find_protocol(options.protocol).rate or "pose",
+            "rate": options.rendering.rate or "pose",
             "shown": options.show if options.report else None,
             "layout": options.layout,
         },

@@ -4,7 +4,7 @@ Each class is a group of flags; its methods read what the flags name and say on 
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -24,7 +24,7 @@ from aaplug.io.scenes.scene_file import SceneFile
 from aaplug.pipeline import learn
 from aaplug.rasterizers import Tiled
 from aaplug.rasterizers.tiled import MEMORY
-from aaplug.recipes import SAMPLING
+from aaplug.recipes import SAMPLING, Recipe, find_recipe
 from aaplug.sampling import MIN_SEEN_SHARE, check_frame
 
 from .console import say
@@ -185,3 +185,14 @@ class RenderOptions(ViewOptions):
     """Samples a pixel of recipe auto: fast reaches a quarter of the training rate, balanced half, best all of it."""
     rate: Annotated[Rate | None, flag("pose|global|sharpest|interval")] = None
     """What matched and auto compare rates with; pose: training's size at its poses, its range of rates elsewhere."""
+
+    def recipes(self, names: Iterable[str]) -> list[Recipe]:
+        """Several by name; --rate concerns those that match one."""
+        return [
+            find_recipe(
+                name,
+                quality=self.quality,
+                rate=self.rate if name in ("matched", "auto") else None,
+            )
+            for name in names
+        ]

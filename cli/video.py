@@ -15,7 +15,7 @@ from aaplug.gaussians import Gaussians
 from aaplug.io.cameras.camera_path import read_camera_path
 from aaplug.io.video import check_video
 from aaplug.protocols import median_depth
-from aaplug.recipes import RECIPES, Recipe, find_recipe
+from aaplug.recipes import RECIPES
 from aaplug.videos import Video as Clip
 from aaplug.videos import make_video
 
@@ -64,7 +64,8 @@ class Video:
 def video(options: Video) -> int:
     """Render a camera path to a video."""
     size = size_of(options.scale, options.resolution)
-    recipes, labels = _recipes(options)
+    names = [name for name in (options.beside, options.recipe) if name != "none"]
+    recipes = options.rendering.recipes(names)
     free = None if options.path in MOVES else read_camera_path(Path(options.path))
     fps = options.fps or (FPS if free is None else free.fps)
     check_video(options.output, fps, options.overwrite)
@@ -75,7 +76,7 @@ def video(options: Video) -> int:
     background = options.rendering.background_of(cameras)
     training = options.cameras.learn(scene, cameras)
     rasterizer = options.rendering.rasterize(len(shown) * len(recipes))
-    clip = Clip(scene, training, recipes, labels, background, shown, fps)
+    clip = Clip(scene, training, recipes, _labels(names), background, shown, fps)
     say(f"{len(shown)} frames of {shown[0].width}x{shown[0].height} px a pane, {fps:g} a second")
     with progress("rendering", "images") as tell:
         make_video(
@@ -88,20 +89,8 @@ def video(options: Video) -> int:
     return 0
 
 
-def _recipes(options: Video) -> tuple[list[Recipe], list[str]]:
-    """Those shown, from left to right, and their names.  Cameras that leave the data set's poses match an interval."""
-    moves = options.path != "zoom"
-    names = [name for name in (options.beside, options.recipe) if name != "none"]
-    rate = options.rendering.rate or ("interval" if moves else None)
-    recipes = [
-        find_recipe(
-            name,
-            quality=options.rendering.quality,
-            rate=rate if name in ("matched", "auto") else None,
-        )
-        for name in names
-    ]
-    return recipes, [f"aaplug {name}" if name == "auto" else name for name in names]
+def _labels(names: Sequence[str]) -> list[str]:
+    return [f"aaplug {name}" if name == "auto" else name for name in names]
 
 
 def _along(options: Video, scene: Gaussians, cameras: CameraSet, fps: float) -> Sequence[Camera]:

@@ -10,7 +10,7 @@ from aaplug.filters import Adaptive, Smoothing3D
 from aaplug.filters.adaptive import ADAPTIVE_VARIANCE
 from aaplug.filters.smoothing import BALANCE_FLOOR
 from aaplug.pipeline import learn
-from aaplug.projection import project
+from aaplug.projection import project, rotation_matrices
 from tests.conftest import make_camera, make_scene
 
 F64 = torch.float64
@@ -44,7 +44,7 @@ def test_the_adaptive_filters_factor_is_the_change_of_area_across_the_ray():
     """The published form: r · (s_y² s_z², s_z² s_x², s_x² s_y²), r the squared direction in the Gaussian's axes."""
     training = learn(SCENE, [NEAR, FAR])
     wide = widened_in_the_world(SCENE, training, NEAR)
-    rotations = rotation_of(SCENE.unit_quats)
+    rotations = rotation_matrices(SCENE.unit_quats)
     towards = SCENE.means - NEAR.centre
     towards = towards / towards.norm(dim=1, keepdim=True)
     shares = torch.einsum("nij,ni->nj", rotations, towards) ** 2
@@ -58,16 +58,6 @@ def test_the_adaptive_filters_factor_is_the_change_of_area_across_the_ray():
     filtered = Adaptive()(raw, NEAR, training)
     expected = raw.opacities * factor.clamp(min=0.005)
     torch.testing.assert_close(filtered.opacities, expected, rtol=1e-5, atol=1e-9)
-
-
-def rotation_of(quats):
-    w, x, y, z = quats.unbind(dim=1)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
 
 
 def test_the_largest_focal_pairs_every_depth_with_it():

@@ -30,6 +30,7 @@ from aaplug.finetuning.parameters import RATES, extent, leaves_of, scene_of, thi
 from aaplug.finetuning.upsamplers import UPSAMPLERS, find_upsampler
 from aaplug.gaussians import Gaussians
 from aaplug.pipeline import learn, render
+from aaplug.projection import rotation_matrices
 from aaplug.rasterizers import RASTERIZERS
 from aaplug.recipes import RECIPES
 from tests.conftest import make_camera, make_scene
@@ -207,16 +208,7 @@ def test_halves_lie_where_the_gaussian_lies():
         many, torch.full((4000,), 1.0), 0.1, torch.Generator().manual_seed(1)
     )  # all are split
     offsets = (change.scene.means - scene.means).double()
-    w, x, y, z = scene.unit_quats[0].double().tolist()
-    R = torch.tensor(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ],
-        dtype=F64,
-    )
-    along = offsets @ R
+    along = offsets @ rotation_matrices(scene.unit_quats.double())[0]
     torch.testing.assert_close(along.std(dim=0), scene.scales[0].double(), rtol=0.05, atol=0)
 
 

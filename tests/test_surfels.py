@@ -6,13 +6,12 @@ import pytest
 import torch
 
 from aaplug.pipeline import learn, render, smooth
-from aaplug.projection import project, tilt
+from aaplug.projection import project, rotation_matrices, tilt
 from aaplug.rasterizers import extents_of
 from aaplug.rasterizers.reference import alphas
 from aaplug.recipes import RECIPES
 from aaplug.splats import MIN_ALPHA, reach, whitening
 from tests.conftest import make_camera, make_scene
-from tests.test_filters import rotation_of
 
 F64 = torch.float64
 CAMERA = make_camera((1.0, -3.0, 0.5))
@@ -31,7 +30,7 @@ def test_a_disc_is_met_where_the_ray_meets_its_plane():
     splats = tilt(project(scene, CAMERA), scene, CAMERA)
     assert splats.tilts is not None
     rotation, centre = CAMERA.cam_from_world[:3, :3], CAMERA.centre
-    axes = rotation_of(scene.unit_quats[splats.sources])
+    axes = rotation_matrices(scene.unit_quats[splats.sources])
     offset = torch.tensor([2.0, -1.5], dtype=F64)
     pixels = splats.means + offset
     x = (pixels[:, 0] - CAMERA.cx) / CAMERA.fx

@@ -20,7 +20,7 @@ from aaplug.finetuning.losses import LOSSES
 from aaplug.finetuning.parameters import Leaves, extent, leaves_of, scene_of, thinnest
 from aaplug.finetuning.settings import Settings
 from aaplug.finetuning.state import Job, State, optimizer
-from aaplug.pipeline import splats_of
+from aaplug.pipeline import sampled, splats_of
 from aaplug.rasterizers import averaged
 from aaplug.sampling import sampling_bounds
 from aaplug.splats import Splats2D
@@ -112,9 +112,7 @@ def loss_at(
     """The loss of one view at one scale, the splats that it drew, and the size they were drawn at."""
     truth, camera = job.truth(view, scale), view.scaled(scale)
     scene = scene_of(leaves, job.start)
-    rate = job.training.rate(camera)
-    samples = job.recipe.samples_at(rate)
-    fine = camera.resized(camera.width * samples, camera.height * samples)
+    fine, samples = sampled(scene, camera, job.recipe, job.training)
     pixel = job.recipe.pixel
     splats = splats_of(scene, fine, job.recipe.screen, job.training, job.rasterizer, pixel)
     if splats.means.requires_grad:

@@ -16,14 +16,16 @@ from torch.special import ndtr
 
 from aaplug.interfaces import PixelKernel
 from aaplug.kernels import EAGER, Kernels
+from aaplug.rasterizers import surfels
+from aaplug.rasterizers.blending import FARTHEST, FARTHEST_CENTRE, LEAST_VARIANCE
 from aaplug.rasterizers.extents import SURFELS
 from aaplug.rasterizers.pixels import CELLS, logistic
 from aaplug.rasterizers.rules import MAX_ALPHA, MIN_TRANSMITTANCE, over
+from aaplug.rasterizers.surfels import DISC_VARIANCE, LEAST_FACTOR, LOW_PASS
 from aaplug.splats import MIN_ALPHA, Render, Splats2D, principal_columns, whitening
 
 STRIP_PIXELS = 4096
 CHUNK_SPLATS = 512
-FARTHEST = 6.0  # standard deviations from a window's edge: a Gaussian has 1e-9 of itself beyond
 NARROWEST = 1e-5  # px: a window as narrow as this shows the value at a point, to ten digits
 
 
@@ -146,7 +148,9 @@ def _on_discs(
     depth = torch.where(in_front, p[..., 2], 1.0)
     s, t = p[..., 0] / depth, p[..., 1] / depth
     if not smoothed:
-        low_pass = 2 * offsets.square().sum(dim=2) / max(splats.window, NARROWEST) ** 2
+        low_pass = (
+            LOW_PASS * offsets.square().sum(dim=2) / max(splats.window, surfels.NARROWEST) ** 2
+        )
         values = torch.exp(-0.5 * torch.minimum(s * s + t * t, low_pass))
         return torch.where(in_front, values, torch.exp(-0.5 * low_pass))
     by_x = torch.linalg.cross(t_w.expand_as(by_column), by_column)
@@ -157,11 +161,11 @@ def _on_discs(
             (change[..., i] * depth - p[..., i] * change[..., 2]) / depth**2 for i in (0, 1)
         ]
     a, b, c, d = columns
-    kappa = 0.1
+    kappa = DISC_VARIANCE
     area, size = a * d - b * c, a * a + b * b + c * c + d * d
     det = kappa**2 * area**2 + kappa * size + 1
     rho = (s * s + t * t + kappa * ((d * s - c * t) ** 2 + (a * t - b * s) ** 2)) / det
-    values = (1 / det + 1e-8).sqrt() * torch.exp(-0.5 * rho)
+    values = (1 / det + LEAST_FACTOR).sqrt() * torch.exp(-0.5 * rho)
     return torch.where(in_front, values, 0.0)
 
 
@@ -217,8 +221,8 @@ def _blended_strip(
         share = (alpha / (1 - alpha))[:, None]
         moved = -share * hidden
         variance = sides**2 / 12 + share * (sides**2 / 12 - hidden_square) - moved**2
-        moved = (middle + moved).clamp(-0.499 * first, 0.499 * first)
-        new = (12 * variance.clamp(min=1e-8 * first**2)).sqrt()
+        moved = (middle + moved).clamp(-FARTHEST_CENTRE * first, FARTHEST_CENTRE * first)
+        new = (12 * variance.clamp(min=LEAST_VARIANCE * first**2)).sqrt()
         new = torch.minimum(new, first - 2 * moved.abs())
         grow = (left * first**2 / new.prod(dim=1)).clamp(min=1.0).sqrt()
         new = (new * grow[:, None]).clamp(max=first)

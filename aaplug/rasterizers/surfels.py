@@ -19,6 +19,7 @@ from aaplug.splats import Splats2D, reach
 LOW_PASS = 2.0  # 1/px²: 2DGS's filter of √½ px, squared and inverted
 DISC_VARIANCE = 0.1  # px²: AA-2DGS's object-space Mip filter
 LEAST_FACTOR = 1e-8  # under the root of AA-2DGS's factor, as published
+NARROWEST = 1e-3  # px: of a low-pass filter, which is divided by
 IN_FRONT = 1e-3  # of the centre's inverse depth: what is farther is taken for the horizon
 
 
@@ -74,5 +75,5 @@ def discs_reach(splats: Splats2D, smoothed: bool) -> Splats2D:
         sources=splats.sources,
         rgb=splats.rgb,
     )
-    variance = DISC_VARIANCE if smoothed else max(splats.window, IN_FRONT) ** 2 / LOW_PASS
+    variance = DISC_VARIANCE if smoothed else max(splats.window, NARROWEST) ** 2 / LOW_PASS
     return widened(ellipses, (variance * reached).sqrt())

@@ -34,14 +34,13 @@ from aaplug.rasterizers.blending import blended, table_of
 from aaplug.rasterizers.extents import SURFELS, extents_of
 from aaplug.rasterizers.pixels import CELLS, mean_gaussian, mean_logistic
 from aaplug.rasterizers.rules import MAX_ALPHA, MIN_TRANSMITTANCE, over
-from aaplug.rasterizers.surfels import disc, smoothed_disc
+from aaplug.rasterizers.surfels import NARROWEST, disc, smoothed_disc
 from aaplug.splats import MIN_ALPHA, Render, Splats2D, principal_columns, reach, whitening_columns
 
 TILE = 8  # px
 PASS = 8  # splats composited in one pass: more compile slowly, fewer load and store more
 CHECK_EVERY = 4  # passes between looks at which tiles are saturated
 COMPACT_BELOW = 3 / 4  # share of tiles still going at which the others leave
-NARROWEST = 1e-3  # px: of a low-pass filter, which is divided by
 BLENDED_TILES = 64  # of about equally many splats, blended together
 MEMORY = 1e9  # bytes
 PAIR_BYTES = 64  # of a candidate pair while a band is binned, measured
@@ -830,22 +829,23 @@ ALPHA: dict[PixelKernel, AlphaOf] = {
 WIDTH: dict[PixelKernel, int] = {
     name: COLUMNS if name == "point" else MEAN_COLUMNS for name in ALPHA
 }
-COMPOSITE: dict[PixelKernel, Kernel] = {
-    name: Kernel(
-        f"composite-{name}",
-        partial(_chunk, alpha_of),
-        partial(_tile_example, 5, WIDTH[name]),
-        ("m", "p", *8 * ("t",), None, None, "t"),
-    )
-    for name, alpha_of in ALPHA.items()
-}
-CHUNK_BACKWARD: dict[PixelKernel, Kernel] = {
-    name: Kernel(
-        f"composite-{name}-backward",
-        partial(_chunk_backward, alpha_of),
-        partial(_tile_example, 6, WIDTH[name]),
-        ("m", "p", *9 * ("t",), None, None, "t"),
-    )
-    for name, alpha_of in ALPHA.items()
-}
+
+
+def _by_pixel_kernel(
+    ending: str, chunk: Callable[..., Any], states: int
+) -> dict[PixelKernel, Kernel]:
+    """A chunk that has this many states a pixel, with each rule of what alpha is."""
+    return {
+        name: Kernel(
+            f"composite-{name}{ending}",
+            partial(chunk, alpha_of),
+            partial(_tile_example, states, WIDTH[name]),
+            ("m", "p", *(3 + states) * ("t",), None, None, "t"),
+        )
+        for name, alpha_of in ALPHA.items()
+    }
+
+
+COMPOSITE = _by_pixel_kernel("", _chunk, 5)
+CHUNK_BACKWARD = _by_pixel_kernel("-backward", _chunk_backward, 6)
 CHUNK_SUMS = Kernel("composite-sums", _chunk_sums, _sums_example, ("m", "p", *5 * ("t",)))
