@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 import torch
 import tyro
+from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from aaplug.benchmark import Figures, exponent, measure, synthetic_camera, synthetic_scene
@@ -124,10 +125,11 @@ def _scene(run: Figures) -> str:
 
 def _table(runs: list[Figures]) -> Table:
     threads = torch.get_num_threads()
-    table = Table(title=f"medians, ms; matmul is a 2048³ float32 product, {threads} threads")
+    title = f"medians, ms; matmul is a 2048³ float32 product, {threads} threads"
+    table = Table(title=title, box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     names = ("scene", "", "forward", "+ back", "matmul", "share", "Mpairs", "ns/pair", "GB")
     for name in names:
-        table.add_column(name, justify="left" if name == "" else "right")
+        table.add_column(name, justify="right" if name else "left", no_wrap=True)
     for run in runs:
         table.add_row(
             _scene(run),
@@ -144,10 +146,10 @@ def _table(runs: list[Figures]) -> Table:
 
 
 def _stages(runs: list[Figures]) -> Table:
-    table = Table(title="stages, ms")
+    table = Table(title="stages, ms", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     names = list(runs[0].stages_ms)
     for name in ("scene", "", *names):
-        table.add_column(name.replace("composite", "compose"), justify="right" if name else "left")
+        table.add_column(name, justify="right" if name else "left", no_wrap=True)
     for run in runs:
         stages = [f"{run.stages_ms[name]:.0f}" for name in names]
         table.add_row(_scene(run), run.rasterizer, *stages)
