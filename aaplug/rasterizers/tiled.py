@@ -22,7 +22,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 from math import log2
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -445,7 +445,16 @@ def _pixel_centres(like: Tensor) -> tuple[Float[Tensor, " P"], Float[Tensor, " P
     return x.flatten(), y.flatten()
 
 
-AlphaOf = Callable[[Tensor, Tensor, Tensor], Tensor]  # of a row a tile, at pixel centres x and y
+class _Pixels(NamedTuple):
+    """Where the pixels of tiles are: the tiles' corners, and the centres of a tile's pixels from its corner, in px."""
+
+    corner_x: Float[Tensor, " t"]
+    corner_y: Float[Tensor, " t"]
+    x: Float[Tensor, " P"]
+    y: Float[Tensor, " P"]
+
+
+AlphaOf = Callable[[Tensor, _Pixels], Tensor]  # of one row or several a tile, at its pixels
 
 
 def _chunk(
@@ -468,11 +477,9 @@ def _chunk(
 
     one: ones; a column of them in each step keeps the compiler to one loop over tiles.
     """
-    x, y = origins[:, 0, None] + local_x, origins[:, 1, None] + local_y
+    pixels = _Pixels(*origins.unbind(dim=1), local_x, local_y)
     before = T
-    for k in range(PASS):
-        row = _row(drawing, ids, at + k, ends)
-        alpha = alpha_of(row, x, y)
+    for row, alpha in _splats(alpha_of, drawing, ids, at, ends, pixels):
         after = before * _left(alpha, one[:, None])
         weight = _where_above(BELOW_MIN_TRANSMITTANCE, after, before - after)
         before = after
@@ -484,73 +491,94 @@ def _chunk(
     return ()
 
 
-def _row(
+def _splats(
+    alpha_of: AlphaOf,
     drawing: Float[Tensor, "m c"],
     ids: Int[Tensor, " p"],
     at: Int[Tensor, " t"],
     ends: Int[Tensor, " t"],
-) -> Float[Tensor, "t c"]:
-    """The splat that each tile draws, or the one that draws nothing after the tile's last."""
-    return drawing[torch.where(at < ends, ids[at], -1)]
+    pixels: _Pixels,
+) -> Iterator[tuple[Float[Tensor, "t c"], Float[Tensor, "t P"]]]:
+    """Row and alpha of K splats of each tile in turn, of the one that draws nothing after the tile's last.
+
+    Array code finds the alphas of all at once, a compiled loop each where it is needed.
+    """
+    if torch.compiler.is_compiling():
+        for k in range(PASS):
+            row = drawing[torch.where(at + k < ends, ids[at + k], -1)]
+            yield row, alpha_of(row, pixels)
+    else:
+        place = at + torch.arange(PASS, device=at.device)[:, None]
+        rows = drawing[torch.where(place < ends, ids[place], -1)]
+        yield from zip(rows.unbind(), alpha_of(rows, pixels).unbind(), strict=True)
 
 
-def _at_centre(
-    row: Float[Tensor, "t c"], x: Float[Tensor, "t P"], y: Float[Tensor, "t P"]
-) -> Float[Tensor, "t P"]:
-    """Alpha, before its cap, of one splat a tile at the pixels' centres."""
-    u, v = _forms(row, x, y)
-    return _audible_exp2(row[:, OPACITY, None] - u * u - v * v)
+def _at_centre(row: Float[Tensor, "*n t c"], pixels: _Pixels) -> Float[Tensor, "*n t P"]:
+    """Alpha, before its cap, of splats at the pixels' centres."""
+    u, v = _forms(row, pixels)
+    exponent = torch.addcmul(row[..., OPACITY, None], u, u, value=-1)
+    return _audible_exp2(torch.addcmul(exponent, v, v, value=-1))
 
 
 def _forms(
-    row: Float[Tensor, "t c"], x: Float[Tensor, "t P"], y: Float[Tensor, "t P"]
-) -> tuple[Float[Tensor, "t P"], Float[Tensor, "t P"]]:
-    dx, dy = x - row[:, X, None], y - row[:, Y, None]
-    u = torch.addcmul(row[:, UX, None] * dx, row[:, UY, None], dy)
-    return u, torch.addcmul(row[:, VX, None] * dx, row[:, VY, None], dy)
+    row: Float[Tensor, "*n t c"], pixels: _Pixels
+) -> tuple[Float[Tensor, "*n t P"], Float[Tensor, "*n t P"]]:
+    """The two linear forms of splats at the pixels' centres."""
+    pairs = [(row[..., i], row[..., j]) for i, j in ((UX, UY), (VX, VY))]
+    if torch.compiler.is_compiling():
+        dx, dy = _offsets(row, pixels)
+        u, v = (torch.addcmul(i[..., None] * dx, j[..., None], dy) for i, j in pairs)
+    else:  # as a product of matrices, which no operation on every pixel is faster than
+        basis = torch.stack([pixels.x, pixels.y, torch.ones_like(pixels.x)])
+        x, y = row[..., X] - pixels.corner_x, row[..., Y] - pixels.corner_y
+        u, v = (torch.stack([i, j, -(i * x + j * y)], dim=-1) @ basis for i, j in pairs)
+    return u, v
+
+
+def _offsets(
+    row: Float[Tensor, "*n t c"], pixels: _Pixels
+) -> tuple[Float[Tensor, "*n t P"], Float[Tensor, "*n t P"]]:
+    """Of the pixels' centres from splats, in px."""
+    x, y = row[..., X] - pixels.corner_x, row[..., Y] - pixels.corner_y
+    return pixels.x - x[..., None], pixels.y - y[..., None]
 
 
 def _over_pixel(
-    mean: Callable[[Tensor, Tensor], Tensor],
-    row: Float[Tensor, "t c"],
-    x: Float[Tensor, "t P"],
-    y: Float[Tensor, "t P"],
-) -> Float[Tensor, "t P"]:
-    """Alpha, before its cap, of one splat a tile: opacity times its means over a pixel's width along both axes."""
-    alpha = row[:, OPACITY, None]
-    for form, half in zip(_forms(row, x, y), (HALF_U, HALF_V), strict=True):
-        alpha = alpha * mean(form, row[:, half, None])
+    mean: Callable[[Tensor, Tensor], Tensor], row: Float[Tensor, "*n t c"], pixels: _Pixels
+) -> Float[Tensor, "*n t P"]:
+    """Alpha, before its cap, of splats: opacity times its means over a pixel's width along both axes."""
+    alpha = row[..., OPACITY, None]
+    for form, half in zip(_forms(row, pixels), (HALF_U, HALF_V), strict=True):
+        alpha = alpha * mean(form, row[..., half, None])
     return torch.threshold(alpha, BELOW_MIN_ALPHA, 0.0)
 
 
 def _on_disc(
-    smoothed: bool, row: Float[Tensor, "t c"], x: Float[Tensor, "t P"], y: Float[Tensor, "t P"]
-) -> Float[Tensor, "t P"]:
-    """Alpha, before its cap, of one disc a tile where the pixels' rays meet it."""
-    e = _forms(row, x, y)
-    dx, dy = x - row[:, X, None], y - row[:, Y, None]
-    tilts = row[:, TILT_X, None], row[:, TILT_Y, None]
+    smoothed: bool, row: Float[Tensor, "*n t c"], pixels: _Pixels
+) -> Float[Tensor, "*n t P"]:
+    """Alpha, before its cap, of discs where the pixels' rays meet them."""
+    e = _forms(row, pixels)
+    dx, dy = _offsets(row, pixels)
+    tilts = row[..., TILT_X, None], row[..., TILT_Y, None]
     ahead = 1 - tilts[0] * dx - tilts[1] * dy
     if smoothed:
-        forms = tuple(row[:, i, None] for i in (UX, UY, VX, VY))
+        forms = tuple(row[..., i, None] for i in (UX, UY, VX, VY))
         value = smoothed_disc(e, ahead, forms, tilts)
     else:
-        value = disc(e, ahead, dx * dx + dy * dy, row[:, LOW_PASS_WIDTH, None])
-    return torch.threshold(row[:, OPACITY, None] * value, BELOW_MIN_ALPHA, 0.0)
+        value = disc(e, ahead, dx * dx + dy * dy, row[..., LOW_PASS_WIDTH, None])
+    return torch.threshold(row[..., OPACITY, None] * value, BELOW_MIN_ALPHA, 0.0)
 
 
-def _over_square(
-    row: Float[Tensor, "t c"], x: Float[Tensor, "t P"], y: Float[Tensor, "t P"]
-) -> Float[Tensor, "t P"]:
-    """Alpha, before its cap, of one splat a tile: opacity times its mean over the pixel's own square, in strips."""
-    across, along = _forms(row, x, y)
-    half_across, half_along, slope = (row[:, i, None] for i in (HALF_U, HALF_V, SLOPE))
+def _over_square(row: Float[Tensor, "*n t c"], pixels: _Pixels) -> Float[Tensor, "*n t P"]:
+    """Alpha, before its cap, of splats: opacity times its mean over the pixel's own square, in strips."""
+    across, along = _forms(row, pixels)
+    half_across, half_along, slope = (row[..., i, None] for i in (HALF_U, HALF_V, SLOPE))
     total = torch.zeros_like(along)
     for cell in range(CELLS):
         from_middle = (cell - (CELLS - 1) / 2) / CELLS
         share = mean_gaussian(along + 2 * from_middle * half_along, half_along / CELLS)
         total = total + share * mean_gaussian(across + from_middle * slope, half_across)
-    return torch.threshold(row[:, OPACITY, None] * total / CELLS, BELOW_MIN_ALPHA, 0.0)
+    return torch.threshold(row[..., OPACITY, None] * total / CELLS, BELOW_MIN_ALPHA, 0.0)
 
 
 def _left(alpha: Float[Tensor, "t P"], one: Float[Tensor, "t 1"]) -> Float[Tensor, "t P"]:
@@ -565,7 +593,7 @@ def _left(alpha: Float[Tensor, "t P"], one: Float[Tensor, "t 1"]) -> Float[Tenso
 # for minima and maxima, which look for NaN.  So these three are written for each.
 
 
-def _audible_exp2(exponent: Float[Tensor, "t P"]) -> Float[Tensor, "t P"]:
+def _audible_exp2(exponent: Float[Tensor, "*n t P"]) -> Float[Tensor, "*n t P"]:
     """2^exponent where that is at least 1/255, else 0."""
     if torch.compiler.is_compiling():
         root = _polynomial(torch.relu(exponent - LOG2_SILENT), ROOT_OF_EXP2)
@@ -662,11 +690,10 @@ def _sums_by_autograd(
 ) -> tuple[Int[Tensor, "t K"], Float[Tensor, "t K c"]]:
     """What `_chunk_sums` gives, for any kernel: from the gradient of log2 alpha by autograd of alpha."""
     owners = _owners(drawing, ids, at, ends)
-    local_x, local_y = _pixel_centres(drawing)
-    x, y = origins[:, 0, None] + local_x, origins[:, 1, None] + local_y
+    pixels = _Pixels(*origins.unbind(dim=1), *_pixel_centres(drawing))
     with torch.enable_grad():
         rows = drawing[owners].detach().requires_grad_()
-        alpha = torch.stack([alpha_of(row, x, y) for row in rows.unbind(dim=1)], dim=1)
+        alpha = alpha_of(rows.transpose(0, 1), pixels).transpose(0, 1)
         grads = torch.where(alpha > 0, moves / (LN_2 * alpha), 0.0).detach()
         (added,) = torch.autograd.grad(alpha, rows, grads)
     added[..., RED : BLUE + 1] = colours
@@ -708,12 +735,10 @@ def _chunk_backward(
     one: Float[Tensor, " t"],
 ) -> tuple[Float[Tensor, "t K P"], Float[Tensor, "t K P"]]:
     """The weight of each of K splats, and the gradient of log2 alpha, at each pixel; takes its share from `rest`."""
-    x, y = origins[:, 0, None] + local_x, origins[:, 1, None] + local_y
+    pixels = _Pixels(*origins.unbind(dim=1), local_x, local_y)
     weights, gradients = [], []
     behind = rest
-    for k in range(PASS):
-        row = _row(drawing, ids, at + k, ends)
-        alpha = alpha_of(row, x, y)
+    for row, alpha in _splats(alpha_of, drawing, ids, at, ends, pixels):
         left = _left(alpha, one[:, None])
         after = T * left
         weight = _where_above(BELOW_MIN_TRANSMITTANCE, after, T - after)
