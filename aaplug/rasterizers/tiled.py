@@ -448,8 +448,7 @@ def _pixel_centres(like: Tensor) -> tuple[Float[Tensor, " P"], Float[Tensor, " P
 class _Pixels(NamedTuple):
     """Where the pixels of tiles are: the tiles' corners, and the centres of a tile's pixels from its corner, in px."""
 
-    corner_x: Float[Tensor, " t"]
-    corner_y: Float[Tensor, " t"]
+    corners: Float[Tensor, "t 2"]
     x: Float[Tensor, " P"]
     y: Float[Tensor, " P"]
 
@@ -477,7 +476,7 @@ def _chunk(
 
     one: ones; a column of them in each step keeps the compiler to one loop over tiles.
     """
-    pixels = _Pixels(*origins.unbind(dim=1), local_x, local_y)
+    pixels = _Pixels(origins, local_x, local_y)
     before = T
     for row, alpha in _splats(alpha_of, drawing, ids, at, ends, pixels):
         after = before * _left(alpha, one[:, None])
@@ -530,7 +529,7 @@ def _forms(
         u, v = (torch.addcmul(i[..., None] * dx, j[..., None], dy) for i, j in pairs)
     else:  # as a product of matrices, which no operation on every pixel is faster than
         basis = torch.stack([pixels.x, pixels.y, torch.ones_like(pixels.x)])
-        x, y = row[..., X] - pixels.corner_x, row[..., Y] - pixels.corner_y
+        x, y = row[..., X] - pixels.corners[:, 0], row[..., Y] - pixels.corners[:, 1]
         u, v = (torch.stack([i, j, -(i * x + j * y)], dim=-1) @ basis for i, j in pairs)
     return u, v
 
@@ -539,7 +538,7 @@ def _offsets(
     row: Float[Tensor, "*n t c"], pixels: _Pixels
 ) -> tuple[Float[Tensor, "*n t P"], Float[Tensor, "*n t P"]]:
     """Of the pixels' centres from splats, in px."""
-    x, y = row[..., X] - pixels.corner_x, row[..., Y] - pixels.corner_y
+    x, y = row[..., X] - pixels.corners[:, 0], row[..., Y] - pixels.corners[:, 1]
     return pixels.x - x[..., None], pixels.y - y[..., None]
 
 
@@ -690,7 +689,7 @@ def _sums_by_autograd(
 ) -> tuple[Int[Tensor, "t K"], Float[Tensor, "t K c"]]:
     """What `_chunk_sums` gives, for any kernel: from the gradient of log2 alpha by autograd of alpha."""
     owners = _owners(drawing, ids, at, ends)
-    pixels = _Pixels(*origins.unbind(dim=1), *_pixel_centres(drawing))
+    pixels = _Pixels(origins, *_pixel_centres(drawing))
     with torch.enable_grad():
         rows = drawing[owners].detach().requires_grad_()
         alpha = alpha_of(rows.transpose(0, 1), pixels).transpose(0, 1)
@@ -735,7 +734,7 @@ def _chunk_backward(
     one: Float[Tensor, " t"],
 ) -> tuple[Float[Tensor, "t K P"], Float[Tensor, "t K P"]]:
     """The weight of each of K splats, and the gradient of log2 alpha, at each pixel; takes its share from `rest`."""
-    pixels = _Pixels(*origins.unbind(dim=1), local_x, local_y)
+    pixels = _Pixels(origins, local_x, local_y)
     weights, gradients = [], []
     behind = rest
     for row, alpha in _splats(alpha_of, drawing, ids, at, ends, pixels):
