@@ -7,12 +7,15 @@ not load, or whose answer differs from the eager one, is built anew.
 
 import hashlib
 import inspect
+import multiprocessing
 import os
 import shutil
 import sys
 import tempfile
 import warnings
 from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -47,6 +50,7 @@ OPTIONS = {
     "cpp.enable_floating_point_contract_flag": "fast",  # multiply and add in one instruction
 }
 LARGEST_SIZE = 1 << 31
+MOST_PROCESSES = 4  # compilers side by side: each takes most of a GB
 FRAMES_THAT_PAY = 300  # a frame of 800² saves about 0.4 s, and compiling takes about 90 s
 TOLERANCE = (
     1e-4  # of the largest value: between a package's answer and the eager one, on the example
@@ -90,18 +94,30 @@ def load() -> CompiledKernels | None:
 def build(
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> CompiledKernels:
-    """Build what is missing, stale or broken, and load all.
+    """Build what is missing, stale or broken, in a process for each thread that torch has, and load all.
 
     progress: told (kernels done, kernels in all).
 
     Raises:
-        UsageError: there is no compiler, or the cache folder cannot be written.
+        UsageError: there is no compiler, the cache folder cannot be written, or a process died.
     """
-    for done, kernel in enumerate(KERNELS):
-        progress(done, len(KERNELS))
-        if _load(kernel) is None:
-            _build(kernel)
-    progress(len(KERNELS), len(KERNELS))
+    total = len(KERNELS)
+    missing = [kernel.name for kernel in KERNELS if _load(kernel) is None]
+    progress(total - len(missing), total)
+    if missing:
+        _check_compiler()
+        processes = min(torch.get_num_threads(), MOST_PROCESSES, len(missing))
+        pool = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"))
+        try:
+            # backwards, because the largest are the last
+            built = as_completed([pool.submit(_build_named, name) for name in missing[::-1]])
+            for done, future in enumerate(built, start=total - len(missing) + 1):
+                future.result()
+                progress(done, total)
+        except BrokenProcessPool as error:
+            raise UsageError("warmup", "a process died, which too little memory does") from error
+        finally:
+            pool.shutdown(cancel_futures=True)
     loaded = load()
     if loaded is None:
         raise UsageError("warmup", f"the packages in {cache_folder()} do not load")
@@ -161,11 +177,20 @@ def _close(found: torch.Tensor, expected: torch.Tensor) -> bool:
     return bool((found - expected).abs().max() <= TOLERANCE * (1 + expected.abs().max()))
 
 
-def _build(kernel: Kernel) -> None:
+def _check_compiler() -> None:
     if not has_compiler():
         raise UsageError(
             "warmup", "needs a C++ compiler (g++ or clang++) for torch to compile with"
         )
+
+
+def _build_named(name: str) -> None:
+    """Build one of the kernels, by its name, which other processes know too."""
+    _build({kernel.name: kernel for kernel in KERNELS}[name])
+
+
+def _build(kernel: Kernel) -> None:
+    _check_compiler()
     path = _path(kernel)
     sizes = {
         name: torch.export.Dim(f"size_{name}", min=2, max=LARGEST_SIZE)
