@@ -843,7 +843,7 @@ def test_formats_are_told_by_content(tmp_path: Path):
 
 def test_a_suffix_nobody_writes_is_refused(tmp_path: Path):
     with pytest.raises(OutputError, match=r"can be written: \.ply"):
-        write_scene(tmp_path / "out.spz", random_scene(1, 0))
+        write_scene(tmp_path / "out.sog", random_scene(1, 0))
     assert list(tmp_path.iterdir()) == []
 
 

@@ -39,9 +39,18 @@ OURS = Settings(
     anchor=3.0,
     decay=0.03,
 )
-QUICK = replace(  # a conversion's: a few minutes, and little is lost at the training size
+QUICK = replace(  # a conversion's: a few minutes; its weights are against the original's own errors
     OURS, name="quick", steps=300, weights={0.5: 1.0, 0.25: 1.0, 0.125: 1.0}, anchor=6.0
 )
+
+
+def relative(settings: Settings, errors: Mapping[float, float]) -> Settings:
+    """The same with every scale's loss in shares of a mean square error found there, the training size's (1.0) too.
+
+    A decibel then counts as much where little is wrong as where much is, and no scale pays for another.
+    """
+    weights = {scale: weight / errors[scale] for scale, weight in settings.weights.items()}
+    return replace(settings, weights=weights, anchor=settings.anchor / errors[1.0])
 
 
 def mipmap_gs(scale: float) -> Settings:
