@@ -415,14 +415,22 @@ def test_a_colmap_lens_that_distorts_is_the_pinhole_at_its_centre(tmp_path, writ
         bent = one_camera(model, (300.0, 310.0, 200.0, 100.0, *values))
         cameras = read_cameras(write(folder / "sparse", *bent).parent)
         (camera,) = cameras.train
-        assert (camera.fx, camera.fy, camera.cx, camera.cy) == (
-            150,
-            155,
-            100,
-            50,
-        )  # its photo's size
-        assert camera.photo is None
+        # its photo's size
+        assert (camera.fx, camera.fy, camera.cx, camera.cy) == (150, 155, 100, 50)
+        assert camera.photo is not None
+        assert camera.lens is not None
+        assert camera.lens.coefficients == values
+        assert camera.lens.window == (0, 0, 200, 100)
         assert f"1 cameras have a lens that distorts ({MODEL_NAMES[model]})" in cameras.notes[-1]
+
+
+def test_photos_through_a_lens_that_opencv_has_not_are_not_used(tmp_path):
+    photo(tmp_path / "images" / "a.png", 200, 100)
+    bent = one_camera(7, (300.0, 310.0, 200.0, 100.0, 0.9))
+    cameras = read_cameras(colmap_bin(tmp_path / "sparse", *bent).parent)
+    assert cameras.train[0].photo is None
+    assert "distorts (FOV)" in cameras.notes[-1]
+    assert "are not used" in cameras.notes[-1]
 
 
 def test_a_colmap_camera_that_sees_all_around_is_refused(tmp_path):
@@ -596,22 +604,33 @@ def test_transforms_name_what_is_wrong(tmp_path, frame, message):
 
 
 @pytest.mark.parametrize(
-    ("lens", "name"),
+    ("lens", "name", "coefficients"),
     [
-        ({"k1": 0.1, "camera_model": "OPENCV"}, "OPENCV"),
-        ({"distortion_params": [0, 0.1]}, "PINHOLE"),
-        ({"camera_model": "OPENCV_FISHEYE"}, "OPENCV_FISHEYE"),
-        ({"is_fisheye": True}, "fisheye"),
+        ({"k1": -0.1, "p2": 0.01, "camera_model": "OPENCV"}, "OPENCV", (-0.1, 0, 0, 0.01, 0)),
+        ({"k1": -0.1, "k3": 0.2}, "PINHOLE", (-0.1, 0, 0, 0, 0.2)),
+        ({"k4": 0.1, "camera_model": "OPENCV"}, "OPENCV", None),  # nerfstudio's own
+        ({"distortion_params": [0, 0.1]}, "PINHOLE", None),
+        ({"camera_model": "OPENCV_FISHEYE", "k4": 0.1}, "OPENCV_FISHEYE", (0, 0, 0, 0.1)),
+        ({"is_fisheye": True}, "fisheye", (0, 0, 0, 0)),
+        ({"camera_model": "ORTHOPHOTO"}, "ORTHOPHOTO", None),
     ],
     ids=str,
 )
-def test_a_lens_that_distorts_is_the_pinhole_at_its_centre(tmp_path, lens, name):
+def test_a_lens_that_distorts_is_the_pinhole_at_its_centre(tmp_path, lens, name, coefficients):
     photo(tmp_path / "a.png", 40, 20)
     frames = [{"file_path": "a.png"} | lens, {"file_path": "b.png"}]
     document = transforms(frames, w=40, h=20, fl_x=30, cx=19, cy=9)
     cameras = read_cameras(write_json(tmp_path / "transforms.json", document))
-    assert (cameras.train[0].fx, cameras.train[0].cx, cameras.train[0].photo) == (30, 19, None)
+    first, straight = cameras.train
     assert f"1 cameras have a lens that distorts ({name})" in cameras.notes[-1]
+    assert straight.lens is None
+    if coefficients is None:
+        assert (first.fx, first.cx, first.photo, first.lens) == (30, 19, None, None)
+    else:
+        assert first.lens is not None
+        left = first.lens.window[0]
+        assert (first.fx, first.cx + left, first.photo) == (30, 19, tmp_path / "a.png")
+        assert first.lens.coefficients == coefficients
 
 
 def test_nerfstudios_lists_are_the_split(tmp_path):

@@ -27,7 +27,6 @@ from aaplug.io.cameras.photos import (
     described_sizes,
     distinct,
     last_part,
-    lens_notes,
     refuse_folder,
     scaled_sizes,
     trained_at,
@@ -35,6 +34,7 @@ from aaplug.io.cameras.photos import (
     without_suffix,
 )
 from aaplug.io.images import image_size
+from aaplug.io.lenses import Distortion, lens_notes, straightened
 from aaplug.io.values import (
     Entry,
     Place,
@@ -57,6 +57,7 @@ AROUND = (
     "VR180_R",
 )
 PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV")  # OPENCV is one as long as it does not distort
+FISHEYE = "OPENCV_FISHEYE"
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 OPENCV_FROM_OPENGL = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)  # y and z change sign
 LEAST_ANGLE = 1e-9  # rad: less is no view
@@ -182,7 +183,9 @@ def _source(file: Path, options: Options) -> Source:
     cameras = [
         _camera(frame, name, spare, parser) for frame, name in zip(frames, names, strict=True)
     ]
-    notes = lens_notes([_bent(frame.entry) for frame in frames])
+    bent = [_bent(frame.entry) for frame in frames]
+    cameras = straightened(cameras, bent)
+    notes = lens_notes(bent, cameras)
     if parser:
         notes.append(
             f"frame: that of {DATAPARSER} (scale {parser.scale:g}), in which nerfstudio trains"
@@ -251,7 +254,7 @@ def _camera(frame: Frame, name: str, spare: Size | None, parser: Dataparser | No
         entry.number("cx") if "cx" in entry else width / 2,
         entry.number("cy") if "cy" in entry else height / 2,
         inverse(world_from_cam, entry.place, "transform_matrix"),
-        photo=None if _bent(entry) else frame.photo,
+        photo=frame.photo,
     )
 
 
@@ -278,19 +281,26 @@ def _focal(entry: Entry, width: int) -> float:
     return focal(width / 2 / math.tan(angle / 2), entry.place, "camera_angle_x's focal length")
 
 
-def _bent(entry: Entry) -> str | None:
-    """The lens, if it is more than a pinhole."""
+def _bent(entry: Entry) -> Distortion | None:
+    """The distortion, if the lens is more than a pinhole."""
     model = entry.text("camera_model") if "camera_model" in entry else PINHOLES[0]
     if model in AROUND:
         raise entry.place.error(f"its camera_model is {model}, which has no focal length")
-    if entry.fields.get("is_fisheye"):
-        return "fisheye"
-    values = entry.fields.get("distortion_params") or []
-    if not isinstance(values, list):
-        raise entry.place.wrong("distortion_params", "a list of numbers", values)
-    found = [number(value, entry.place, "distortion_params") for value in values]
-    found += [entry.number(key) for key in DISTORTION if key in entry]
-    return model if model not in PINHOLES or any(found) else None
+    k = {key: entry.number(key) if key in entry else 0.0 for key in DISTORTION}
+    listed = entry.fields.get("distortion_params") or []
+    if not isinstance(listed, list):
+        raise entry.place.wrong("distortion_params", "a list of numbers", listed)
+    others = [number(value, entry.place, "distortion_params") for value in listed]
+    others += [k["k5"], k["k6"]]
+    if entry.fields.get("is_fisheye") or model == FISHEYE:
+        name = model if model == FISHEYE else "fisheye"
+        angular = tuple(k[key] for key in ("k1", "k2", "k3", "k4"))
+        return Distortion(name, None if any(others) else angular, fisheye=True)
+    if model in PINHOLES and not any(others) and not any(k.values()):
+        return None
+    known = model in PINHOLES and not any(others) and not k["k4"]
+    radial = tuple(k[key] for key in ("k1", "k2", "p1", "p2", "k3"))  # in OpenCV's order
+    return Distortion(model, radial if known else None)
 
 
 def _has_alpha(photo: Path) -> bool:
