@@ -1,4 +1,4 @@
-"""Photographs straightened, against pictures of a known plane taken through lenses written out by hand; COLMAP's too."""
+"""Photographs straightened, against pictures taken of a known plane through lenses written out by hand."""
 
 from dataclasses import replace
 
