@@ -7,11 +7,11 @@ from typing import Annotated, Any, Literal
 import torch
 import tyro
 
-from aaplug.conversion import FORMS, VIEWERS, convert_for, default_form, describe
+from aaplug.conversion import FORMS, VIEWERS, Viewer, convert_for, default_form, describe
 from aaplug.conversion import convert as fuse
 from aaplug.errors import UsageError
 from aaplug.filters import fuse_stored
-from aaplug.finetuning import QUICK, Candidate, Job, Truth, between, relative
+from aaplug.finetuning import QUICK, Candidate, Job, Truth, balanced, between
 from aaplug.gaussians import Fusion, Gaussians
 from aaplug.io.scenes import check_scene_output, find_scene, write_parts, write_scene
 from aaplug.io.scenes.scene_file import SceneFile
@@ -48,7 +48,8 @@ class Convert:
     ] = None
     """Fit the scene to what a viewer does, from the closed form by a short optimization, and print what is left."""
     steps: Annotated[int | None, flag("N")] = None
-    """Steps of that optimization (default: 300); 0 keeps the closed form."""
+    """Steps of that optimization (default: 300, none for a viewer that shows what training showed); 0 keeps the closed
+    form."""
     form: Annotated[
         Literal["matched-energy", "mip-splatting"] | None, flag("matched-energy|mip-splatting")
     ] = None
@@ -139,7 +140,7 @@ def _fitted(options: Convert, scene: Gaussians, target: str) -> int:
     background = options.viewing.background_of(cameras)
     training = options.cameras.learn(scene, cameras)
     start, recipe = convert_for(scene, training, viewer), RECIPES[viewer.recipe]
-    settings = QUICK if options.steps is None else replace(QUICK, steps=options.steps)
+    settings = replace(QUICK, steps=_steps(options, scene, viewer))
     rasterizer = options.viewing.rasterize(settings.steps)
     truth = Truth(scene, training, rasterizer, background)
     views, scales = spread(options.viewing.select(cameras), JUDGED), (1.0, *settings.weights)
@@ -149,7 +150,7 @@ def _fitted(options: Convert, scene: Gaussians, target: str) -> int:
         scales,
         truth,
     )
-    settings = relative(settings, _errors(before))
+    settings = balanced(settings, _errors(before))
     job = Job(start, training, recipe, cameras.train, truth, settings, rasterizer, background)
     state, done = tune(job)
     if not done:
@@ -171,12 +172,24 @@ def _fitted(options: Convert, scene: Gaussians, target: str) -> int:
         converted = _partly(scene, tuned, share)
         _write(replace(options, overwrite=True), converted)
         report = judge(converted)
+    if state.step and _worse(report):
+        say("still worse than the original at some scale: read the table before you use the file")
     fused = "; ".join(describe(fusion) for fusion in converted.fused) or "nothing"
     if options.json:
         print_json(_facts(options, converted) | {"for": target, "residual": results(report)})
     else:
         _print(report)
     say(f"wrote {options.output}: fused {fused}; show it with {viewer.rule}")
+    return 0
+
+
+def _steps(options: Convert, scene: Gaussians, viewer: Viewer) -> int:
+    """Those asked for; else the usual number, or none for a viewer that shows what training showed."""
+    if options.steps is not None:
+        return options.steps
+    if scene.convention != viewer.convention:
+        return QUICK.steps
+    say(f"the scene was trained for this rule ({viewer.rule}): there is nothing to fit")
     return 0
 
 
@@ -203,7 +216,7 @@ def _worse(report: Report) -> bool:
     for scale in report.scales:
         names = ("original", "converted")
         before, after = (mean(report.select(name, scale), PSNR.name) for name in names)
-        if before is not None and after is not None and after < before:
+        if after is not None and (before is None or after < before):  # None is equal to the truth
             return True
     return False
 
