@@ -633,6 +633,54 @@ def test_a_lens_that_distorts_is_the_pinhole_at_its_centre(tmp_path, lens, name,
         assert first.lens.coefficients == coefficients
 
 
+EXPORTED = {
+    "file_path": "/elsewhere/a.png",
+    "transform": [[1.0, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3]],
+    "fl_x": 30.0,
+    "fl_y": 31.0,
+    "w": 40,
+    "h": 20,
+}
+
+
+def test_an_exported_list_is_in_the_trained_frame(tmp_path):
+    """nerfstudio's `ns-export cameras`; what the file of the dataparser says is in its poses already."""
+    move = {"transform": [[1.0, 0, 0, 5], [0, 1, 0, 5], [0, 0, 1, 5]], "scale": 2.0}
+    write_json(tmp_path / "dataparser_transforms.json", move)
+    path = write_json(tmp_path / "transforms_train.json", [EXPORTED])
+    for source in (path, tmp_path):
+        cameras = read_cameras(source)
+        (camera,) = cameras.train
+        assert (camera.name, camera.photo, camera.fx, camera.fy) == ("a", None, 30, 31)
+        assert (camera.width, camera.cx, camera.centre.tolist()) == (40, 20, [1, 2, 3])
+        assert camera.cam_from_world[:3, :3].diagonal().tolist() == [1, -1, -1]
+        assert "ns-export cameras" in cameras.notes[-1]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"fl_x": None}, "give nerfstudio's transforms.json"),
+        ({"w": None}, "its lens is unknown"),
+        ({"transform": None}, "item 0 should be an object with file_path and transform"),
+        ({"transform": 3}, "transform_matrix should be"),
+        ({"transform": [[1, 0, 0, 0]]}, "transform_matrix should be"),
+        ({"file_path": None}, "file_path is missing"),
+    ],
+    ids=str,
+)
+def test_an_exported_list_names_what_it_lacks(tmp_path, change, message):
+    entry = {k: v for k, v in (EXPORTED | change).items() if v is not None}
+    with pytest.raises(FormatError, match=message):
+        read_cameras(write_json(tmp_path / "transforms_train.json", [entry]))
+
+
+@pytest.mark.data
+def test_a_real_exported_list_is_read(shared_data):
+    file = shared_data / "formats/transforms/abhishek_splatfacto/transforms_train.json"
+    assert len(read_cameras(file).train) == 875
+
+
 def test_nerfstudios_lists_are_the_split(tmp_path):
     frames = [{"file_path": f"{c}.png"} for c in "abc"]
     lists = {"train_filenames": ["a.png", "c.png"], "test_filenames": ["b.png"]}

@@ -5,7 +5,8 @@ up, z backward), world units.  A file dataparser_transforms.json beside it takes
 which nerfstudio trained.  The focal length is fl_x and fl_y, in px, or comes from
 camera_angle_x, the full angle in radians; w, h, cx, cy are in px.  Keys beside `frames` hold for
 every frame that has none of its own.  Without w and h the photos give the size.  Paths are relative
-to the file.
+to the file.  `ns-export cameras` writes a bare list of {file_path, transform: 3×4} in the trained frame, which is read
+where its entries tell of the lens.
 """
 
 import math
@@ -57,6 +58,8 @@ AROUND = (
     "VR180_R",
 )
 PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV")  # OPENCV is one as long as it does not distort
+EXPORTED = "transform"  # a frame's pose, 3×4, where nerfstudio exported it
+LAST_ROW = [0.0, 0.0, 0.0, 1.0]
 FISHEYE = "OPENCV_FISHEYE"
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 OPENCV_FROM_OPENGL = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)  # y and z change sign
@@ -179,14 +182,17 @@ def _source(file: Path, options: Options) -> Source:
     paths = [frame.entry.text("file_path") for frame in frames]
     names = distinct(file, paths, (last_part, without_suffix, whole))
     spare = _spare_size(frames)
-    parser = read_dataparser(file.parent / DATAPARSER)
+    exported = any(EXPORTED in frame.entry for frame in frames)
+    parser = None if exported else read_dataparser(file.parent / DATAPARSER)
     cameras = [
         _camera(frame, name, spare, parser) for frame, name in zip(frames, names, strict=True)
     ]
     bent = [_bent(frame.entry) for frame in frames]
     cameras = straightened(cameras, bent)
     notes = lens_notes(bent, cameras)
-    if parser:
+    if exported:
+        notes.append("frame: that in which nerfstudio trained (ns-export cameras); photos unknown")
+    elif parser:
         notes.append(
             f"frame: that of {DATAPARSER} (scale {parser.scale:g}), in which nerfstudio trains"
         )
@@ -214,6 +220,8 @@ def _held_out(
 
 def _document(file: Path) -> dict[str, Any]:
     document = read_json(file)
+    if isinstance(document, list):
+        return {"frames": [_exported(file, index, row) for index, row in enumerate(document)]}
     if not isinstance(document, dict) or "frames" not in document:
         raise FormatError(
             file, "should be an object with 'frames', as Blender and nerfstudio write"
@@ -221,12 +229,31 @@ def _document(file: Path) -> dict[str, Any]:
     return document
 
 
+def _exported(file: Path, index: int, row: object) -> dict[str, Any]:
+    """A frame of `ns-export cameras`: its pose has three rows, and where photos lay when it was written is no matter."""
+    if not isinstance(row, dict) or EXPORTED not in row:
+        raise FormatError(
+            file, f"item {index} should be an object with file_path and transform, as ns-export cameras writes"
+        )  # fmt: skip
+    if not {"fl_x", "w", "h"} <= row.keys():
+        raise FormatError(
+            file,
+            f"item {index} has no fl_x, w and h, so that its lens is unknown; give nerfstudio's transforms.json, "
+            f"with the run's {DATAPARSER} beside it",
+        )
+    rows = row[EXPORTED]
+    return {**row, "transform_matrix": [*rows, LAST_ROW] if isinstance(rows, list) else rows}
+
+
 def _frames(file: Path, document: dict[str, Any]) -> list[Frame]:
     shared = {key: value for key, value in document.items() if key != "frames"}
     folder = PhotoFolder(file.parent, file.parent)
+    found = entries(file, "frame", document["frames"], shared)
     return [
-        Frame(entry, folder.find(entry.text("file_path"), entry.place))
-        for entry in entries(file, "frame", document["frames"], shared)
+        Frame(
+            entry, None if EXPORTED in entry else folder.find(entry.text("file_path"), entry.place)
+        )
+        for entry in found
     ]
 
 
