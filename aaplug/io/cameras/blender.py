@@ -230,7 +230,7 @@ def _document(file: Path) -> dict[str, Any]:
 
 
 def _exported(file: Path, index: int, row: object) -> dict[str, Any]:
-    """A frame of `ns-export cameras`: its pose has three rows, and where photos lay when it was written is no matter."""
+    """A frame of `ns-export cameras`: its pose has three rows; where photos lay when it was written is no matter."""
     if not isinstance(row, dict) or EXPORTED not in row:
         raise FormatError(
             file, f"item {index} should be an object with file_path and transform, as ns-export cameras writes"
