@@ -20,12 +20,28 @@ WHOLE_PIXEL = 1e-6  # px: slack when a scaled size is cut to whole pixels
 
 
 @dataclass(frozen=True)
+class Lens:
+    """How a photograph differs from its camera's pinhole, by OpenCV's models.
+
+    coefficients: k1, k2, p1, p2 and more as OpenCV orders them; of a fisheye k1 to k4.  size: width and height of the
+    whole photograph, in px.  pinhole: its fx, fy, cx, cy in these px.  window: left, top, width and height of the
+    camera's view in it.
+    """
+
+    coefficients: tuple[float, ...]
+    fisheye: bool
+    size: tuple[int, int]
+    pinhole: tuple[float, float, float, float]
+    window: tuple[int, int, int, int]
+
+
+@dataclass(frozen=True)
 class Camera:
     """One pinhole view.
 
     fx, fy, cx, cy: in px of this size.  trained_focal: for a pose of the data set the focal length, in px, at which
     training rendered it (or would have, for a held-out view); it stays when the view is scaled.  None for a free
-    camera.  photo: the photograph taken from here, if there is one.
+    camera.  photo: the photograph taken from here, if there is one.  lens: what it was taken through, if that distorts.
     """
 
     name: str
@@ -38,6 +54,7 @@ class Camera:
     cam_from_world: Float[Tensor, "4 4"]
     trained_focal: float | None = None
     photo: Path | None = field(default=None, compare=False)
+    lens: Lens | None = field(default=None, compare=False)
 
     @property
     def hw(self) -> tuple[int, int]:

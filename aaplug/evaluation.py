@@ -256,7 +256,8 @@ class _Bench:
         if self.task.truth == "self":
             return None
         assert view.photo is not None
-        return DOWNSCALES[self.task.protocol.downscale].read(view.photo, self.task.background)
+        downscale = DOWNSCALES[self.task.protocol.downscale]
+        return downscale.read(view.photo, self.task.background, view.lens)
 
     def _truth(
         self,

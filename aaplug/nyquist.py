@@ -6,6 +6,7 @@ bound.  What training drew is that Gaussian widened by the convention's kernel. 
 in an image r times as finely sampled, so that it meets the bound at r = √(0.2 / (σ²ν² + kernel)) and aliases below.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -15,8 +16,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.filters import NYQUIST_VARIANCE
-from aaplug.gaussians import Gaussians
+from aaplug.gaussians import MAX_LOG_SCALE, Gaussians
 from aaplug.interfaces import Training
+from aaplug.sampling import SamplingBounds
 
 BINS = 48
 LOWEST, HIGHEST = (
@@ -58,22 +60,32 @@ class Coverage:
         }
 
 
-def multiples(scene: Gaussians, training: Training) -> Float[Tensor, " seen"]:
-    """Extent over its bound at the highest training rate, of the Gaussians that any camera sees."""
-    bounds = training.bounds
-    middle = scene.scales.median(dim=1).values[bounds.seen]
-    return (middle * bounds.highest[bounds.seen] / NYQUIST_VARIANCE**0.5).double()
+def middle_log_scales(scene: Gaussians) -> Float[Tensor, " n"]:
+    """ln of the standard deviation along the middle axis; of a disc's two the smaller."""
+    return scene.log_scales.clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE).median(dim=1).values
 
 
-def aliasing_begins(sigma: float, kernel: float) -> float:
-    """The scale below which a Gaussian of standard deviation `sigma` px, as training drew it, aliases."""
-    return (NYQUIST_VARIANCE / (sigma**2 + kernel)) ** 0.5
+def log_multiples(scene: Gaussians, bounds: SamplingBounds) -> Float[Tensor, " seen"]:
+    """ln of the extent over its bound at the highest training rate, of the Gaussians that any camera sees."""
+    extents = middle_log_scales(scene)[bounds.seen].double() + bounds.highest[bounds.seen].log()
+    return extents - 0.5 * math.log(NYQUIST_VARIANCE)
+
+
+def under(multiples: Float[Tensor, " seen"]) -> int:
+    """How many of these, as `log_multiples` gives them, are below their bound."""
+    return int((multiples < 0).sum())
+
+
+def aliasing_begins(multiple: float, kernel: float) -> float:
+    """The scale below which a Gaussian of `multiple` times its bound, as training drew it, aliases."""
+    return (NYQUIST_VARIANCE / (NYQUIST_VARIANCE * multiple**2 + kernel)) ** 0.5
 
 
 def coverage(scene: Gaussians, training: Training, scales: Sequence[float]) -> Coverage:
     """How the scene sits against its bounds, at the training size and at `scales`."""
-    extents = multiples(scene, training)
-    logs = extents.clamp(min=2.0**LOWEST).log2().clamp(LOWEST, HIGHEST)
+    found = log_multiples(scene, training.bounds)
+    extents = found.exp()
+    logs = (found / math.log(2)).clamp(LOWEST, HIGHEST)
     edges = torch.linspace(LOWEST, HIGHEST, BINS + 1, dtype=torch.float64)
     counts = torch.histogram(logs.cpu(), edges).hist
     kernel = training.convention.kernel
@@ -84,7 +96,7 @@ def coverage(scene: Gaussians, training: Training, scales: Sequence[float]) -> C
         len(extents),
         tuple(edges.tolist()),
         tuple(int(count) for count in counts),
-        float((extents < 1).double().mean()) if some else None,
-        aliasing_begins(float(extents.median()) * NYQUIST_VARIANCE**0.5, kernel) if some else None,
+        under(found) / len(found) if some else None,
+        aliasing_begins(float(extents.median()), kernel) if some else None,
         tuple((s, float((drawn * s < 1).double().mean())) for s in scales) if some else (),
     )

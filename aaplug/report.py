@@ -59,6 +59,11 @@ class Report:
         """Measurements of every view."""
         return tuple(m for m in self.measurements if m.recipe == recipe and m.scale == scale)
 
+    def with_more(self, other: "Report") -> "Report":
+        """Measurements by the same protocol together."""
+        recipes = {**self.protocol["recipes"], **other.protocol["recipes"]}
+        return Report(self.measurements + other.measurements, {**self.protocol, "recipes": recipes})
+
 
 def mean(measurements: Iterable[Measurement], metric: str) -> float | None:
     """Mean over the views where the metric is defined, None if it is nowhere."""

@@ -16,10 +16,11 @@ from torch import Tensor
 
 from aaplug.cameras import Camera
 from aaplug.conversion import convert
-from aaplug.filters import NYQUIST_VARIANCE, MatchedEnergy
+from aaplug.filters import MatchedEnergy
 from aaplug.gaussians import Gaussians
 from aaplug.interfaces import Training, WorldFilter
 from aaplug.io.scenes.scene_file import PART, SceneFile
+from aaplug.nyquist import log_multiples, middle_log_scales, under
 from aaplug.sampling import SamplingBounds, check_frame, sampling_bounds
 
 LARGE = (
@@ -125,7 +126,8 @@ def _coarsest(opened: SceneFile, cameras: Sequence[Camera], drop_bad: bool, size
 class Survey:
     """Figures over all Gaussians of a scene, gathered part by part in bounded memory.
 
-    Medians come from histograms: opacities in [0, 1], scales and rates by their logarithms, right to a bin.
+    Medians come from histograms: opacities in [0, 1], scales, rates and multiples of the sampling bound by their
+    logarithms, right to a bin.
     """
 
     def __init__(self, cameras: Sequence[Camera] = ()) -> None:
@@ -135,7 +137,7 @@ class Survey:
         self.opacities = Histogram(0.0, 1.0)
         self.scales = Histogram(-35.0, 35.0)
         self.rates = Histogram(-35.0, 35.0)
-        self.sigmas = Histogram(-20.0, 20.0)
+        self.multiples = Histogram(-20.0, 20.0)
         self.largest = -math.inf
         self.filtered = False
         self.faults: dict[str, int] = {}
@@ -149,24 +151,22 @@ class Survey:
         low, high = part.means.aminmax(dim=0)
         self.low, self.high = torch.minimum(self.low, low), torch.maximum(self.high, high)
         self.opacities.add(part.opacities)
-        middle = _middle(part)
-        self.scales.add(middle)
+        self.scales.add(middle_log_scales(part))
         self.largest = max(self.largest, part.log_scales.max().item())
         self.above_zero += int((part.log_scales > 0).all(dim=1).sum())
         logits = part.logit_opacities
         self.activated += int(((logits >= 0) & (logits <= 1)).sum())
         if self.cameras:
-            self._add_rates(part, middle)
+            self._add_rates(part)
 
-    def _add_rates(self, part: Gaussians, middle: Float[Tensor, " n"]) -> None:
+    def _add_rates(self, part: Gaussians) -> None:
         bounds = sampling_bounds(part.means, self.cameras)
         seen = bounds.seen
         self.seen += int(seen.sum())
-        rates = bounds.highest[seen].log()
-        self.rates.add(rates)
-        sigma = middle[seen] + rates  # ln px at the highest training rate
-        self.sigmas.add(sigma)
-        self.under += int((sigma < 0.5 * math.log(NYQUIST_VARIANCE)).sum())
+        self.rates.add(bounds.highest[seen].log())
+        multiples = log_multiples(part, bounds)
+        self.multiples.add(multiples)
+        self.under += under(multiples)
 
 
 @dataclass
@@ -205,9 +205,3 @@ def survey(
         found.add(part)
         tell(found.count, max(1, opened.count))
     return found
-
-
-def _middle(part: Gaussians) -> Float[Tensor, " n"]:
-    """The middle log-scale: surfaces are flat, and one thin axis alone shows only edge-on.  Of a disc, the smaller."""
-    scales = part.log_scales.clamp(-30, 30)
-    return scales[:, :2].amin(dim=1) if part.flat else scales.median(dim=1).values

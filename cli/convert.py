@@ -7,14 +7,13 @@ from typing import Annotated, Any, Literal
 import torch
 import tyro
 
-from aaplug.conversion import FORMS, VIEWERS, convert_for, default_form, describe
+from aaplug.conversion import FORMS, VIEWERS, Viewer, convert_for, default_form, describe
 from aaplug.conversion import convert as fuse
 from aaplug.errors import UsageError
 from aaplug.filters import fuse_stored
-from aaplug.finetuning import QUICK, Candidate, Job, Truth, between
+from aaplug.finetuning import QUICK, Candidate, Job, Truth, balanced, between
 from aaplug.gaussians import Fusion, Gaussians
-from aaplug.io.atomic import check_output
-from aaplug.io.scenes import find_scene, write_parts, write_scene
+from aaplug.io.scenes import check_scene_output, find_scene, write_parts, write_scene
 from aaplug.io.scenes.scene_file import SceneFile
 from aaplug.metrics import PSNR
 from aaplug.recipes import RECIPES
@@ -30,6 +29,7 @@ SHARES = (
     0.25,
     0.125,
 )  # of the way to the tuned scene, where that is worse than the original at some scale
+ROUNDING = (1 / 255) ** 2 / 12  # mean square error of rounding to 8 bits
 JUDGED = 8  # training views, evenly spread, that the residual is measured on
 
 
@@ -37,8 +37,8 @@ JUDGED = 8  # training views, evenly spread, that the residual is measured on
 class Convert:
     """Fuse anti-aliasing into a plain .ply, for viewers with the 2D Mip filter (0.1 px², compensated) or another."""
 
-    output: Annotated[Path, flag("FILE.ply", "-o")]
-    """Where to write."""
+    output: Annotated[Path, flag("FILE", "-o")]
+    """Where to write: .ply, or .spz and .splat, which round values and keep less."""
     scene: SceneOptions = field(default_factory=SceneOptions)
     cameras: CameraOptions = field(default_factory=CameraOptions)
     viewing: ViewOptions = field(default_factory=lambda: ViewOptions(views="train"))
@@ -48,7 +48,8 @@ class Convert:
     ] = None
     """Fit the scene to what a viewer does, from the closed form by a short optimization, and print what is left."""
     steps: Annotated[int | None, flag("N")] = None
-    """Steps of that optimization (default: 300); 0 keeps the closed form."""
+    """Steps of that optimization (default: 300, none for a viewer that shows what training showed); 0 keeps the closed
+    form."""
     form: Annotated[
         Literal["matched-energy", "mip-splatting"] | None, flag("matched-energy|mip-splatting")
     ] = None
@@ -65,7 +66,7 @@ class Convert:
 def convert(options: Convert) -> int:
     """Fuse anti-aliasing into a plain .ply."""
     source = find_scene(options.scene.path, options.scene.iteration)
-    check_output(options.output, options.overwrite, [source])
+    check_scene_output(options.output, options.overwrite, [source])
     _check(options)
     opened = options.scene.open()
     if opened.count > LARGE and options.target is None:
@@ -81,7 +82,7 @@ def convert(options: Convert) -> int:
     if not stored:
         training = options.cameras.learn(scene, options.cameras.read(options.scene))
     converted = fuse(scene, training, form)
-    write_scene(options.output, converted, overwrite=options.overwrite)
+    _write(options, converted)
     done = "; ".join(describe(fusion) for fusion in converted.fused)
     say(f"wrote {options.output}: fused {done}; show it with the Mip rule (0.1 px², compensated)")
     if options.json:
@@ -109,7 +110,14 @@ def _convert_in_parts(options: Convert, opened: SceneFile) -> int:
             tell,
             threads=torch.get_num_threads(),
         )
-        write_parts(options.output, parts, opened.count, [opened.path], overwrite=options.overwrite)
+        write_parts(
+            options.output,
+            parts,
+            opened.count,
+            [opened.path],
+            overwrite=options.overwrite,
+            spz_axes=options.scene.spz_axes,
+        )
     say(f"wrote {options.output}, in parts; show it with the Mip rule (0.1 px², compensated)")
     if options.json:
         print_json({"output": str(options.output), "gaussians": opened.count})
@@ -132,25 +140,29 @@ def _fitted(options: Convert, scene: Gaussians, target: str) -> int:
     background = options.viewing.background_of(cameras)
     training = options.cameras.learn(scene, cameras)
     start, recipe = convert_for(scene, training, viewer), RECIPES[viewer.recipe]
-    settings = QUICK if options.steps is None else replace(QUICK, steps=options.steps)
+    settings = replace(QUICK, steps=_steps(options, scene, viewer))
     rasterizer = options.viewing.rasterize(settings.steps)
     truth = Truth(scene, training, rasterizer, background)
+    views, scales = spread(options.viewing.select(cameras), JUDGED), (1.0, *settings.weights)
+    before = measured(
+        [Candidate("original", scene, recipe), Candidate("closed form", start, recipe)],
+        views,
+        scales,
+        truth,
+    )
+    settings = balanced(settings, _errors(before))
     job = Job(start, training, recipe, cameras.train, truth, settings, rasterizer, background)
     state, done = tune(job)
     if not done:
         say("stopped; nothing is written")
         return INTERRUPTED
     tuned = converted = recorded(state, job, viewer.convention, {"for": target})
-    write_scene(options.output, converted, overwrite=options.overwrite)
-    views, scales = spread(options.viewing.select(cameras), JUDGED), (1.0, *settings.weights)
+    _write(options, converted)
 
     def judge(found: Gaussians) -> Report:
-        candidates = [
-            Candidate("original", scene, recipe),
-            Candidate("closed form", start, recipe),
-            Candidate("converted", found, recipe),
-        ]
-        return measured(candidates, views, scales, truth)
+        return before.with_more(
+            measured([Candidate("converted", found, recipe)], views, scales, truth)
+        )
 
     report = judge(converted)
     for share in SHARES if state.step else ():
@@ -158,8 +170,10 @@ def _fitted(options: Convert, scene: Gaussians, target: str) -> int:
             break
         say(f"worse than the original at some scale: {share:g} of the way from it instead")
         converted = _partly(scene, tuned, share)
-        write_scene(options.output, converted, overwrite=True)
+        _write(replace(options, overwrite=True), converted)
         report = judge(converted)
+    if state.step and _worse(report):
+        say("still worse than the original at some scale: read the table before you use the file")
     fused = "; ".join(describe(fusion) for fusion in converted.fused) or "nothing"
     if options.json:
         print_json(_facts(options, converted) | {"for": target, "residual": results(report)})
@@ -167,6 +181,27 @@ def _fitted(options: Convert, scene: Gaussians, target: str) -> int:
         _print(report)
     say(f"wrote {options.output}: fused {fused}; show it with {viewer.rule}")
     return 0
+
+
+def _steps(options: Convert, scene: Gaussians, viewer: Viewer) -> int:
+    """Those asked for; else the usual number, or none for a viewer that shows what training showed."""
+    if options.steps is not None:
+        return options.steps
+    if scene.convention != viewer.convention:
+        return QUICK.steps
+    say(f"the scene was trained for this rule ({viewer.rule}): there is nothing to fit")
+    return 0
+
+
+def _errors(report: Report) -> dict[float, float]:
+    """The original's mean square error by scale, no less than the rounding of the images compared."""
+    decibels = {s: mean(report.select("original", s), PSNR.name) for s in report.scales}
+    return {s: max(ROUNDING, 0.0 if d is None else 10 ** (-d / 10)) for s, d in decibels.items()}
+
+
+def _write(options: Convert, scene: Gaussians) -> None:
+    axes = options.scene.spz_axes
+    write_scene(options.output, scene, overwrite=options.overwrite, spz_axes=axes)
 
 
 def _partly(scene: Gaussians, tuned: Gaussians, share: float) -> Gaussians:
@@ -181,7 +216,7 @@ def _worse(report: Report) -> bool:
     for scale in report.scales:
         names = ("original", "converted")
         before, after = (mean(report.select(name, scale), PSNR.name) for name in names)
-        if before is not None and after is not None and after < before:
+        if after is not None and (before is None or after < before):  # None is equal to the truth
             return True
     return False
 

@@ -29,7 +29,7 @@ from aaplug.gaussians import Convention, Gaussians
 from aaplug.interfaces import Rasterizer, Training
 from aaplug.io.atomic import check_output, replacing
 from aaplug.io.images import write_png
-from aaplug.io.scenes import find_scene, write_scene
+from aaplug.io.scenes import check_scene_output, find_scene, write_scene
 from aaplug.pipeline import render, smooth
 from aaplug.recipes import RECIPES, Recipe
 from aaplug.report import results, scale_name, tables
@@ -112,7 +112,8 @@ def finetune(options: Finetune) -> int:
         say(f"stopped at step {state.step}; go on with the same command and --resume")
         return INTERRUPTED
     tuned = recorded(state, job, convention, {"for": target, "method": settings.name})
-    write_scene(files.scene, tuned, overwrite=options.overwrite)
+    axes = options.scene.spz_axes
+    write_scene(files.scene, tuned, overwrite=options.overwrite, spz_axes=axes)
     _report(options, files, job, state, scene, tuned, options.viewing.select(cameras))
     files.checkpoint.unlink(missing_ok=True)
     say(f"wrote {files.scene}, {files.report.name} and {files.pictures.name}")
@@ -136,7 +137,8 @@ def _files(options: Finetune) -> _Files:
         options.output,
         *(options.output.with_suffix(f".finetune.{kind}") for kind in ("json", "png", "pt")),
     )
-    for path in (files.scene, files.report, files.pictures):
+    check_scene_output(files.scene, options.overwrite, [source])
+    for path in (files.report, files.pictures):
         check_output(path, options.overwrite, [source])
     check_output(files.checkpoint, options.resume or options.overwrite, [source])
     return files

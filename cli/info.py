@@ -93,15 +93,15 @@ def _comments(opened: SceneFile) -> list[str]:
 
 
 def _sampling_facts(found: Survey, cameras: CameraSet, kernel: float) -> dict[str, Any]:
-    rate, sigma = found.rates.quantile(0.5), found.sigmas.quantile(0.5)
+    rate, multiple = found.rates.quantile(0.5), found.multiples.quantile(0.5)
     return {
         "training_cameras": len(cameras.train),
         "seen_share": found.seen / max(1, found.count),
         "median_rate_px_per_unit": None if rate is None else math.exp(rate),
         "under_sampling_bound_share": found.under / max(1, found.seen),
         "aliasing_begins_at_scale": None
-        if sigma is None
-        else aliasing_begins(math.exp(sigma), kernel),
+        if multiple is None
+        else aliasing_begins(math.exp(multiple), kernel),
         "cameras": list(cameras.notes),
     }
 

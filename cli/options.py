@@ -61,7 +61,7 @@ class SceneOptions:
     allow_checkpoint: bool = False
     """Read gsplat's .pt too: a pickle, of which nothing but tensors is taken."""
     spz_axes: SpzAxes = "opengl"
-    """Axes of a .spz: opengl by its specification; opencv as splat-transform and gsply write them."""
+    """Axes of a .spz, read or written: opengl by its specification; opencv as splat-transform and gsply have them."""
 
     @property
     def path(self) -> Path:

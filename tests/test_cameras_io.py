@@ -415,14 +415,22 @@ def test_a_colmap_lens_that_distorts_is_the_pinhole_at_its_centre(tmp_path, writ
         bent = one_camera(model, (300.0, 310.0, 200.0, 100.0, *values))
         cameras = read_cameras(write(folder / "sparse", *bent).parent)
         (camera,) = cameras.train
-        assert (camera.fx, camera.fy, camera.cx, camera.cy) == (
-            150,
-            155,
-            100,
-            50,
-        )  # its photo's size
-        assert camera.photo is None
+        # its photo's size
+        assert (camera.fx, camera.fy, camera.cx, camera.cy) == (150, 155, 100, 50)
+        assert camera.photo is not None
+        assert camera.lens is not None
+        assert camera.lens.coefficients == values
+        assert camera.lens.window == (0, 0, 200, 100)
         assert f"1 cameras have a lens that distorts ({MODEL_NAMES[model]})" in cameras.notes[-1]
+
+
+def test_photos_through_a_lens_that_opencv_has_not_are_not_used(tmp_path):
+    photo(tmp_path / "images" / "a.png", 200, 100)
+    bent = one_camera(7, (300.0, 310.0, 200.0, 100.0, 0.9))
+    cameras = read_cameras(colmap_bin(tmp_path / "sparse", *bent).parent)
+    assert cameras.train[0].photo is None
+    assert "distorts (FOV)" in cameras.notes[-1]
+    assert "are not used" in cameras.notes[-1]
 
 
 def test_a_colmap_camera_that_sees_all_around_is_refused(tmp_path):
@@ -596,22 +604,81 @@ def test_transforms_name_what_is_wrong(tmp_path, frame, message):
 
 
 @pytest.mark.parametrize(
-    ("lens", "name"),
+    ("lens", "name", "coefficients"),
     [
-        ({"k1": 0.1, "camera_model": "OPENCV"}, "OPENCV"),
-        ({"distortion_params": [0, 0.1]}, "PINHOLE"),
-        ({"camera_model": "OPENCV_FISHEYE"}, "OPENCV_FISHEYE"),
-        ({"is_fisheye": True}, "fisheye"),
+        ({"k1": -0.1, "p2": 0.01, "camera_model": "OPENCV"}, "OPENCV", (-0.1, 0, 0, 0.01, 0)),
+        ({"k1": -0.1, "k3": 0.2}, "PINHOLE", (-0.1, 0, 0, 0, 0.2)),
+        ({"k4": 0.1, "camera_model": "OPENCV"}, "OPENCV", None),  # nerfstudio's own
+        ({"distortion_params": [0, 0.1]}, "PINHOLE", None),
+        ({"camera_model": "OPENCV_FISHEYE", "k4": 0.1}, "OPENCV_FISHEYE", (0, 0, 0, 0.1)),
+        ({"is_fisheye": True}, "fisheye", (0, 0, 0, 0)),
+        ({"camera_model": "ORTHOPHOTO"}, "ORTHOPHOTO", None),
     ],
     ids=str,
 )
-def test_a_lens_that_distorts_is_the_pinhole_at_its_centre(tmp_path, lens, name):
+def test_a_lens_that_distorts_is_the_pinhole_at_its_centre(tmp_path, lens, name, coefficients):
     photo(tmp_path / "a.png", 40, 20)
     frames = [{"file_path": "a.png"} | lens, {"file_path": "b.png"}]
     document = transforms(frames, w=40, h=20, fl_x=30, cx=19, cy=9)
     cameras = read_cameras(write_json(tmp_path / "transforms.json", document))
-    assert (cameras.train[0].fx, cameras.train[0].cx, cameras.train[0].photo) == (30, 19, None)
+    first, straight = cameras.train
     assert f"1 cameras have a lens that distorts ({name})" in cameras.notes[-1]
+    assert straight.lens is None
+    if coefficients is None:
+        assert (first.fx, first.cx, first.photo, first.lens) == (30, 19, None, None)
+    else:
+        assert first.lens is not None
+        left = first.lens.window[0]
+        assert (first.fx, first.cx + left, first.photo) == (30, 19, tmp_path / "a.png")
+        assert first.lens.coefficients == coefficients
+
+
+EXPORTED = {
+    "file_path": "/elsewhere/a.png",
+    "transform": [[1.0, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3]],
+    "fl_x": 30.0,
+    "fl_y": 31.0,
+    "w": 40,
+    "h": 20,
+}
+
+
+def test_an_exported_list_is_in_the_trained_frame(tmp_path):
+    """nerfstudio's `ns-export cameras`; what the file of the dataparser says is in its poses already."""
+    move = {"transform": [[1.0, 0, 0, 5], [0, 1, 0, 5], [0, 0, 1, 5]], "scale": 2.0}
+    write_json(tmp_path / "dataparser_transforms.json", move)
+    path = write_json(tmp_path / "transforms_train.json", [EXPORTED])
+    for source in (path, tmp_path):
+        cameras = read_cameras(source)
+        (camera,) = cameras.train
+        assert (camera.name, camera.photo, camera.fx, camera.fy) == ("a", None, 30, 31)
+        assert (camera.width, camera.cx, camera.centre.tolist()) == (40, 20, [1, 2, 3])
+        assert camera.cam_from_world[:3, :3].diagonal().tolist() == [1, -1, -1]
+        assert "ns-export cameras" in cameras.notes[-1]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"fl_x": None}, "give nerfstudio's transforms.json"),
+        ({"w": None}, "its lens is unknown"),
+        ({"transform": None}, "item 0 should be an object with file_path and transform"),
+        ({"transform": 3}, "transform_matrix should be"),
+        ({"transform": [[1, 0, 0, 0]]}, "transform_matrix should be"),
+        ({"file_path": None}, "file_path is missing"),
+    ],
+    ids=str,
+)
+def test_an_exported_list_names_what_it_lacks(tmp_path, change, message):
+    entry = {k: v for k, v in (EXPORTED | change).items() if v is not None}
+    with pytest.raises(FormatError, match=message):
+        read_cameras(write_json(tmp_path / "transforms_train.json", [entry]))
+
+
+@pytest.mark.data
+def test_a_real_exported_list_is_read(shared_data):
+    file = shared_data / "formats/transforms/abhishek_splatfacto/transforms_train.json"
+    assert len(read_cameras(file).train) == 875
 
 
 def test_nerfstudios_lists_are_the_split(tmp_path):

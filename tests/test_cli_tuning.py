@@ -150,6 +150,21 @@ def test_convert_for_a_viewer_prints_the_residual_as_json(cli):
     assert residual["converted@1"]["PSNR"] > residual["original@1"]["PSNR"]
 
 
+def test_convert_for_the_rule_of_training_fits_nothing(cli):
+    code, out, err = cli("convert scene.ply --cameras . -o c.ply --for classic-viewer --json")
+    assert (code, json.loads(out)["fused"]) == (0, [])
+    assert "there is nothing to fit" in err
+    assert Path("c.ply").read_bytes() == Path("scene.ply").read_bytes()
+
+
+def test_convert_says_what_it_could_not_better(cli):
+    """By the rule of training the training size is as it should be, and every step takes away from that."""
+    code, _, err = cli("convert scene.ply --cameras . -o c.ply --for classic-viewer --steps 2")
+    assert code == 0
+    assert "0.125 of the way" in err
+    assert "still worse than the original" in err
+
+
 def test_convert_refuses_options_that_contradict_each_other(cli):
     for options in ("--steps 3", "--for gsplat --variance 0.1", "--for gsplat --steps -1"):
         code, _, err = cli(f"convert scene.ply --cameras . -o c.ply {options}")

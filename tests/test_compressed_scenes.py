@@ -12,7 +12,7 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
-from aaplug.errors import FormatError
+from aaplug.errors import FormatError, OutputError, UsageError
 from aaplug.gaussians import ANTIALIASED, CLASSIC, MAX_LOG_SCALE, MIP, Gaussians
 from aaplug.io.scenes import find_scene, open_scene, read_scene, write_scene
 from tests.scene_files import DATA, MADE, ksplat, oracle, splat, splats, spz, write_file
@@ -147,6 +147,80 @@ def test_splat_is_written_as_it_is_read(tmp_path: Path):
     )
     assert (old[:, :12] == new[:, :12]).all()
     assert np.abs(old[:, 24:].astype(int) - new[:, 24:]).max() <= 1
+
+
+@pytest.mark.parametrize("convention", [CLASSIC, ANTIALIASED, MIP])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_spz_is_written_within_its_steps_with_its_flag(
+    tmp_path: Path, expected, degree, convention
+):
+    pytest.importorskip("gsply")
+    scene = replace(expected, sh=expected.sh[:, : (degree + 1) ** 2], convention=convention)
+    write_scene(tmp_path / "a.spz", scene)
+    again = read_scene(tmp_path / "a.spz")
+    torch.testing.assert_close(again.means, scene.means, rtol=0, atol=2e-6)
+    torch.testing.assert_close(again.log_scales, scene.log_scales, rtol=0, atol=1 / 32 + 1e-6)
+    torch.testing.assert_close(again.opacities, scene.opacities, rtol=0, atol=0.5 / 255 + 1e-6)
+    shown = [(0.5 + 0.15 * s.sh[:, 0]).clamp(0, 1) for s in (again, scene)]
+    torch.testing.assert_close(*shown, rtol=0, atol=0.5 / 255 + 1e-6)
+    torch.testing.assert_close(
+        again.sh[:, 1:], scene.sh[:, 1:].clamp(-1, 127 / 128), rtol=0, atol=1 / 256 + 1e-6
+    )
+    assert (again.unit_quats * scene.unit_quats).sum(dim=1).abs().min() > 0.99999
+    assert again.convention == (ANTIALIASED if convention.compensated else CLASSIC)
+    # what is read is written back to the byte
+    write_scene(tmp_path / "b.spz", replace(again, convention=convention))
+    assert (tmp_path / "b.spz").read_bytes() == (tmp_path / "a.spz").read_bytes()
+
+
+def test_spz_is_written_in_the_axes_asked_for(tmp_path: Path, expected):
+    pytest.importorskip("gsply")
+    write_scene(tmp_path / "a.spz", expected, spz_axes="opencv")
+    same = read_scene(tmp_path / "a.spz", spz_axes="opencv")
+    torch.testing.assert_close(same.means, expected.means, rtol=0, atol=2e-6)
+    turned = read_scene(tmp_path / "a.spz")
+    assert torch.equal(turned.means, same.means * torch.tensor([1.0, -1.0, -1.0]))
+
+
+def test_spz_holds_the_ends_of_its_ranges(tmp_path: Path, expected):
+    pytest.importorskip("gsply")
+    ends = replace(
+        expected[:2],
+        means=torch.tensor([[3e6, -3e6, 0.0], [0.0, 1.0, 2.0]]),
+        log_scales=torch.tensor([[-torch.inf, 0.0, 50.0], [-10.0, 5.9375, 0.0]]),
+        logit_opacities=torch.tensor([torch.inf, -200.0]),
+    )
+    write_scene(tmp_path / "a.spz", ends)
+    again = read_scene(tmp_path / "a.spz")
+    torch.testing.assert_close(again.means, ends.means, rtol=0, atol=0.25)
+    assert again.log_scales[0].tolist() == [-10, 0, 5.9375]
+    assert again.log_scales[1].tolist() == [-10, 5.9375, 0]
+    assert again.opacities.tolist() == pytest.approx([1, 0], abs=1e-6)
+    write_scene(tmp_path / "none.spz", expected[:0])
+    assert len(read_scene(tmp_path / "none.spz")) == 0
+
+
+@pytest.mark.parametrize(
+    ("changes", "problem"),
+    [
+        ({"flat": True}, "2D Gaussians"),
+        ({"filter_3d": torch.ones(40)}, "filter_3D"),
+        ({"sh": torch.zeros(40, 25, 3)}, "up to degree 3, not 4"),
+        ({"means": torch.full((40, 3), 1e9)}, "as far as 1e"),
+    ],
+)
+def test_spz_says_what_it_cannot_hold(tmp_path: Path, expected, changes, problem):
+    pytest.importorskip("gsply")
+    with pytest.raises(OutputError, match=problem):
+        write_scene(tmp_path / "a.spz", replace(expected, **changes))
+    assert not list(tmp_path.iterdir())
+
+
+def test_spz_without_its_writer_names_the_extra(tmp_path: Path, expected, monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(UsageError, match=r"needs gsply: pip install 'aaplug\[spz\]'"):
+        write_scene(tmp_path / "a.spz", expected)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_sog_folder_is_a_scene(expected):

@@ -11,11 +11,13 @@ from skimage.metrics import structural_similarity as ssim_of_skimage
 from aaplug.cameras import WHITE
 from aaplug.errors import FormatError, UsageError
 from aaplug.finetuning import (
+    QUICK,
     Job,
     Settings,
     State,
     Truth,
     advance,
+    balanced,
     begin,
     between,
     load,
@@ -415,3 +417,10 @@ def test_between_two_scenes_are_both_and_what_is_half_way():
             torch.testing.assert_close(getattr(found, name), getattr(expected, name))
     half = between(start, end, 0.5)
     torch.testing.assert_close(half.means, 0.5 * (start.means + end.means))
+
+
+def test_balanced_weights_are_against_the_roots_of_errors():
+    errors = {1.0: 1e-4, 0.5: 4e-4, 0.25: 1e-2, 0.125: 1.0}
+    found = balanced(QUICK, errors)
+    assert found.weights == pytest.approx({0.5: 50.0, 0.25: 10.0, 0.125: 1.0})
+    assert found.anchor == pytest.approx(QUICK.anchor * 100)

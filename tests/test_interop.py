@@ -2,11 +2,13 @@
 
 import shutil
 import subprocess
+from dataclasses import replace
 
 import pytest
 import torch
 
 from aaplug.conversion import FORMS, convert
+from aaplug.gaussians import ANTIALIASED, CLASSIC
 from aaplug.io.cameras import read_cameras
 from aaplug.io.scenes import read_scene, write_scene
 from tests.scene_files import ORACLE
@@ -41,6 +43,23 @@ def test_what_splat_transform_packs_is_read_as_it_unpacks_it(suffix, tmp_path):
     assert (ours.unit_quats * theirs.unit_quats).sum(dim=1).abs().min() > 0.9999
     assert ours.convention.compensated
     assert theirs.convention.compensated
+
+
+@pytest.mark.skipif(SPLAT_TRANSFORM is None, reason="splat-transform is not installed")
+@pytest.mark.parametrize("convention", [CLASSIC, ANTIALIASED])
+def test_splat_transform_reads_our_spz(convention, tmp_path):
+    pytest.importorskip("gsply")
+    ours, path = replace(read_scene(ORACLE), convention=convention), tmp_path / "ours.spz"
+    write_scene(path, ours, spz_axes="opencv")
+    words = [SPLAT_TRANSFORM, "-q", "-w", str(path), str(tmp_path / "theirs.ply")]
+    subprocess.run(words, check=True, capture_output=True, timeout=120)
+    theirs, again = read_scene(tmp_path / "theirs.ply"), read_scene(path, spz_axes="opencv")
+    torch.testing.assert_close(theirs.means, ours.means, rtol=0, atol=2e-6)
+    torch.testing.assert_close(theirs.log_scales, ours.log_scales, rtol=0, atol=1 / 32 + 1e-5)
+    for field in ("means", "log_scales", "logit_opacities", "sh"):
+        torch.testing.assert_close(getattr(again, field), getattr(theirs, field), rtol=0, atol=1e-5)
+    assert (ours.unit_quats * theirs.unit_quats).sum(dim=1).abs().min() > 0.9999
+    assert theirs.convention.compensated == convention.compensated
 
 
 @pytest.mark.data

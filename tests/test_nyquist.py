@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from aaplug.gaussians import CLASSIC
-from aaplug.nyquist import coverage, multiples
+from aaplug.nyquist import coverage, log_multiples
 from aaplug.pipeline import learn
 from tests.conftest import make_camera, make_scene
 
@@ -23,7 +23,8 @@ def at_bound(multiple: float, n: int = 10):
 @pytest.mark.parametrize("multiple", [0.5, 1.01, 3.0])
 def test_the_multiple_is_the_extent_over_the_bound(multiple):
     scene, training = at_bound(multiple)
-    assert multiples(scene, training) == pytest.approx([multiple] * 10, rel=1e-4)
+    found = log_multiples(scene, training.bounds).exp()
+    assert found == pytest.approx([multiple] * 10, rel=1e-4)
     assert coverage(scene, training, ()).under == (multiple < 1)
 
 

@@ -536,6 +536,26 @@ def test_each_producers_comments_are_understood_and_kept(tmp_path, comments, con
     assert through(scene, tmp_path) == file.content
 
 
+@pytest.mark.parametrize("convention", [CLASSIC, ANTIALIASED, MIP])
+@pytest.mark.parametrize("kind", ["binary", ">", "text", "double", "bytes", "filter", "disc"])
+def test_every_kind_of_ply_keeps_the_convention(tmp_path: Path, kind: str, convention: Convention):
+    colours = [*(n for n in parameters(0) if not n.startswith("f_dc"))]
+    file = {
+        "double": with_type("double", "x"),
+        "bytes": plain(
+            columns=[*(("float", n) for n in colours), *(("uchar", c) for c in ("red", "green", "blue"))]
+        ),
+        "filter": filtered(),
+        "disc": without("scale_2"),
+    }.get(kind, plain("hello"))  # fmt: skip
+    path = coded(tmp_path, file, kind) if kind in (">", "text") else file.save(tmp_path)
+    through(replace(read_scene(path), convention=convention), tmp_path)
+    again = read_scene(tmp_path / "out.ply")
+    assert again.convention == convention
+    write_scene(tmp_path / "twice.ply", again)
+    assert (tmp_path / "twice.ply").read_bytes() == (tmp_path / "out.ply").read_bytes()
+
+
 # Parts
 
 
@@ -843,7 +863,7 @@ def test_formats_are_told_by_content(tmp_path: Path):
 
 def test_a_suffix_nobody_writes_is_refused(tmp_path: Path):
     with pytest.raises(OutputError, match=r"can be written: \.ply"):
-        write_scene(tmp_path / "out.spz", random_scene(1, 0))
+        write_scene(tmp_path / "out.sog", random_scene(1, 0))
     assert list(tmp_path.iterdir()) == []
 
 

@@ -3,7 +3,7 @@
 from aaplug.finetuning.checkpoints import load, save
 from aaplug.finetuning.comparison import Candidate, compare
 from aaplug.finetuning.parameters import between
-from aaplug.finetuning.settings import OURS, QUICK, Settings, mipmap_gs
+from aaplug.finetuning.settings import OURS, QUICK, Settings, balanced, mipmap_gs
 from aaplug.finetuning.state import Job, State, begin
 from aaplug.finetuning.truth import Truth
 from aaplug.finetuning.tuning import advance, loss_at, run
@@ -18,6 +18,7 @@ __all__ = [
     "State",
     "Truth",
     "advance",
+    "balanced",
     "begin",
     "between",
     "compare",

@@ -16,7 +16,8 @@ from aaplug.cameras import Camera
 from aaplug.finetuning.upsamplers import Upsampler, bicubic
 from aaplug.gaussians import Gaussians
 from aaplug.interfaces import Rasterizer, Training
-from aaplug.io.images import quantise, read_image, resampled
+from aaplug.io.images import resampled
+from aaplug.io.photographs import read_photo
 from aaplug.pipeline import render, smooth
 from aaplug.recipes import RECIPES
 
@@ -66,7 +67,7 @@ class Truth:
     def _full(self, view: Camera) -> Float[Tensor, "h w 3"]:
         if self.photographs:
             assert view.photo is not None
-            return quantise(read_image(view.photo, self.background))
+            return read_photo(view.photo, self.background, view.lens)
         return self._render(view)
 
     @torch.no_grad()

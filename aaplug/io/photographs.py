@@ -15,8 +15,10 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
+from aaplug.cameras import Lens
 from aaplug.errors import UsageError
 from aaplug.io.images import quantise, read_image, read_rgba, resampled
+from aaplug.io.lenses import straight
 
 At = Callable[[tuple[int, int], float], Float[Tensor, "h w 3"]]
 Background = tuple[float, float, float]
@@ -39,19 +41,30 @@ class Downscale:
 
     name: str
     protocol: str
-    read: Callable[[Path, Background], Photograph]
+    read: Callable[[Path, Background, Lens | None], Photograph]
 
 
-def _box(path: Path, background: Background) -> Photograph:
-    photo = quantise(read_image(path, background))
+def read_photo(
+    path: Path, background: Background, lens: Lens | None = None
+) -> Float[Tensor, "h w 3"]:
+    """A photograph over a colour, as its camera's pinhole sees it, rounded to 8 bits.
+
+    Raises:
+        FormatError: see `read_image`.
+    """
+    return quantise(straight(read_image(path, background), lens))
+
+
+def _box(path: Path, background: Background, lens: Lens | None = None) -> Photograph:
+    photo = read_photo(path, background, lens)
     return Photograph(
         (photo.shape[0], photo.shape[1]), lambda hw, factor: resampled(photo, factor, hw)
     )
 
 
-def _rgba_box(path: Path, background: Background) -> Photograph:
+def _rgba_box(path: Path, background: Background, lens: Lens | None = None) -> Photograph:
     """Mip-NeRF's multi-scale Blender data: RGBA halved in float, cut to 8 bits when saved and again when composited."""
-    levels = [read_rgba(path)]
+    levels = [straight(read_rgba(path), lens)]
     behind = torch.tensor(background)
 
     def at(hw: tuple[int, int], factor: float) -> Float[Tensor, "h w 3"]:
@@ -77,9 +90,9 @@ def _cut(values: Tensor) -> Tensor:
     return (values * LEVELS + 1e-3).floor() / LEVELS
 
 
-def _pil_bicubic(path: Path, background: Background) -> Photograph:
+def _pil_bicubic(path: Path, background: Background, lens: Lens | None = None) -> Photograph:
     """3DGS's -r: the 8-bit photograph through Pillow's antialiased bicubic, in 8 bits again."""
-    photo = quantise(read_image(path, background))
+    photo = read_photo(path, background, lens)
     picture = Image.fromarray((photo * LEVELS).round().byte().numpy())
 
     def at(hw: tuple[int, int], factor: float) -> Float[Tensor, "h w 3"]:

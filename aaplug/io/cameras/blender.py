@@ -5,7 +5,8 @@ up, z backward), world units.  A file dataparser_transforms.json beside it takes
 which nerfstudio trained.  The focal length is fl_x and fl_y, in px, or comes from
 camera_angle_x, the full angle in radians; w, h, cx, cy are in px.  Keys beside `frames` hold for
 every frame that has none of its own.  Without w and h the photos give the size.  Paths are relative
-to the file.
+to the file.  `ns-export cameras` writes a bare list of {file_path, transform: 3×4} in the trained frame, which is read
+where its entries tell of the lens.
 """
 
 import math
@@ -27,7 +28,6 @@ from aaplug.io.cameras.photos import (
     described_sizes,
     distinct,
     last_part,
-    lens_notes,
     refuse_folder,
     scaled_sizes,
     trained_at,
@@ -35,6 +35,7 @@ from aaplug.io.cameras.photos import (
     without_suffix,
 )
 from aaplug.io.images import image_size
+from aaplug.io.lenses import Distortion, lens_notes, straightened
 from aaplug.io.values import (
     Entry,
     Place,
@@ -57,6 +58,9 @@ AROUND = (
     "VR180_R",
 )
 PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV")  # OPENCV is one as long as it does not distort
+EXPORTED = "transform"  # a frame's pose, 3×4, where nerfstudio exported it
+LAST_ROW = [0.0, 0.0, 0.0, 1.0]
+FISHEYE = "OPENCV_FISHEYE"
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 OPENCV_FROM_OPENGL = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)  # y and z change sign
 LEAST_ANGLE = 1e-9  # rad: less is no view
@@ -178,12 +182,17 @@ def _source(file: Path, options: Options) -> Source:
     paths = [frame.entry.text("file_path") for frame in frames]
     names = distinct(file, paths, (last_part, without_suffix, whole))
     spare = _spare_size(frames)
-    parser = read_dataparser(file.parent / DATAPARSER)
+    exported = any(EXPORTED in frame.entry for frame in frames)
+    parser = None if exported else read_dataparser(file.parent / DATAPARSER)
     cameras = [
         _camera(frame, name, spare, parser) for frame, name in zip(frames, names, strict=True)
     ]
-    notes = lens_notes([_bent(frame.entry) for frame in frames])
-    if parser:
+    bent = [_bent(frame.entry) for frame in frames]
+    cameras = straightened(cameras, bent)
+    notes = lens_notes(bent, cameras)
+    if exported:
+        notes.append("frame: that in which nerfstudio trained (ns-export cameras); photos unknown")
+    elif parser:
         notes.append(
             f"frame: that of {DATAPARSER} (scale {parser.scale:g}), in which nerfstudio trains"
         )
@@ -211,6 +220,8 @@ def _held_out(
 
 def _document(file: Path) -> dict[str, Any]:
     document = read_json(file)
+    if isinstance(document, list):
+        return {"frames": [_exported(file, index, row) for index, row in enumerate(document)]}
     if not isinstance(document, dict) or "frames" not in document:
         raise FormatError(
             file, "should be an object with 'frames', as Blender and nerfstudio write"
@@ -218,12 +229,31 @@ def _document(file: Path) -> dict[str, Any]:
     return document
 
 
+def _exported(file: Path, index: int, row: object) -> dict[str, Any]:
+    """A frame of `ns-export cameras`: its pose has three rows; where photos lay when it was written is no matter."""
+    if not isinstance(row, dict) or EXPORTED not in row:
+        raise FormatError(
+            file, f"item {index} should be an object with file_path and transform, as ns-export cameras writes"
+        )  # fmt: skip
+    if not {"fl_x", "w", "h"} <= row.keys():
+        raise FormatError(
+            file,
+            f"item {index} has no fl_x, w and h, so that its lens is unknown; give nerfstudio's transforms.json, "
+            f"with the run's {DATAPARSER} beside it",
+        )
+    rows = row[EXPORTED]
+    return {**row, "transform_matrix": [*rows, LAST_ROW] if isinstance(rows, list) else rows}
+
+
 def _frames(file: Path, document: dict[str, Any]) -> list[Frame]:
     shared = {key: value for key, value in document.items() if key != "frames"}
     folder = PhotoFolder(file.parent, file.parent)
+    found = entries(file, "frame", document["frames"], shared)
     return [
-        Frame(entry, folder.find(entry.text("file_path"), entry.place))
-        for entry in entries(file, "frame", document["frames"], shared)
+        Frame(
+            entry, None if EXPORTED in entry else folder.find(entry.text("file_path"), entry.place)
+        )
+        for entry in found
     ]
 
 
@@ -251,7 +281,7 @@ def _camera(frame: Frame, name: str, spare: Size | None, parser: Dataparser | No
         entry.number("cx") if "cx" in entry else width / 2,
         entry.number("cy") if "cy" in entry else height / 2,
         inverse(world_from_cam, entry.place, "transform_matrix"),
-        photo=None if _bent(entry) else frame.photo,
+        photo=frame.photo,
     )
 
 
@@ -278,19 +308,26 @@ def _focal(entry: Entry, width: int) -> float:
     return focal(width / 2 / math.tan(angle / 2), entry.place, "camera_angle_x's focal length")
 
 
-def _bent(entry: Entry) -> str | None:
-    """The lens, if it is more than a pinhole."""
+def _bent(entry: Entry) -> Distortion | None:
+    """The distortion, if the lens is more than a pinhole."""
     model = entry.text("camera_model") if "camera_model" in entry else PINHOLES[0]
     if model in AROUND:
         raise entry.place.error(f"its camera_model is {model}, which has no focal length")
-    if entry.fields.get("is_fisheye"):
-        return "fisheye"
-    values = entry.fields.get("distortion_params") or []
-    if not isinstance(values, list):
-        raise entry.place.wrong("distortion_params", "a list of numbers", values)
-    found = [number(value, entry.place, "distortion_params") for value in values]
-    found += [entry.number(key) for key in DISTORTION if key in entry]
-    return model if model not in PINHOLES or any(found) else None
+    k = {key: entry.number(key) if key in entry else 0.0 for key in DISTORTION}
+    listed = entry.fields.get("distortion_params") or []
+    if not isinstance(listed, list):
+        raise entry.place.wrong("distortion_params", "a list of numbers", listed)
+    others = [number(value, entry.place, "distortion_params") for value in listed]
+    others += [k["k5"], k["k6"]]
+    if entry.fields.get("is_fisheye") or model == FISHEYE:
+        name = model if model == FISHEYE else "fisheye"
+        angular = tuple(k[key] for key in ("k1", "k2", "k3", "k4"))
+        return Distortion(name, None if any(others) else angular, fisheye=True)
+    if model in PINHOLES and not any(others) and not any(k.values()):
+        return None
+    known = model in PINHOLES and not any(others) and not k["k4"]
+    radial = tuple(k[key] for key in ("k1", "k2", "p1", "p2", "k3"))  # in OpenCV's order
+    return Distortion(model, radial if known else None)
 
 
 def _has_alpha(photo: Path) -> bool:

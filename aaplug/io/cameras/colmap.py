@@ -3,7 +3,7 @@
 The root holds `images` and a model in `sparse/0` or `sparse`: cameras (intrinsics) and images
 (poses), both .bin or both .txt.  Poses are world-to-camera, OpenCV axes, in world units; the centre
 of the first pixel is (0.5, 0.5); focal lengths and principal points are in px.  A lens that distorts
-counts as the pinhole at its centre, and its photos are of no use.  Points are not read.
+counts as the pinhole at its centre, and its photos are straightened.  Points are not read.
 """
 
 import math
@@ -25,16 +25,15 @@ from aaplug.io.cameras.photos import (
     Size,
     described_sizes,
     distinct,
-    lens_notes,
     photo_folder,
     photo_sizes,
     scaled_sizes,
-    straightened,
     trained_at,
     whole,
     with_photos,
     without_suffix,
 )
+from aaplug.io.lenses import Distortion, lens_notes, straightened
 from aaplug.io.values import (
     Place,
     focal,
@@ -45,6 +44,15 @@ from aaplug.io.values import (
 )
 
 LEAST_QUATERNION = 1e-6  # a length below this has no direction
+OPENCV = {  # which of a model's distortion parameters are OpenCV's coefficients, −1 for 0
+    "SIMPLE_RADIAL": (0, -1, -1, -1),
+    "RADIAL": (0, 1, -1, -1),
+    "OPENCV": (0, 1, 2, 3),
+    "FULL_OPENCV": (0, 1, 2, 3, 4, 5, 6, 7),
+    "OPENCV_FISHEYE": (0, 1, 2, 3),
+    "SIMPLE_RADIAL_FISHEYE": (0, -1, -1, -1),
+    "RADIAL_FISHEYE": (0, 1, -1, -1),
+}
 
 
 def sniff(path: Path) -> bool:
@@ -84,7 +92,7 @@ def read(path: Path, options: Options) -> CameraSet:
         f"{described_sizes(source)} in the file",
         split.note,
         f"training size: {described_sizes(trained)} ({why})",
-        *lens_notes(bent),
+        *lens_notes(bent, trained),
     )
     return CameraSet(split.train, split.test, notes=notes)
 
@@ -155,10 +163,15 @@ def _pinhole(lens: Intrinsics) -> tuple[float, float, float, float]:
     return fx, fy, values[n], values[n + 1]
 
 
-def _bent(lens: Intrinsics) -> str | None:
-    """The model's name, if it is more than a pinhole."""
+def _bent(lens: Intrinsics) -> Distortion | None:
+    """The distortion, if the model is more than a pinhole."""
     rest = lens.parameters[lens.model.focals + 2 :]
-    return lens.model.name if not lens.model.straight or any(rest) else None
+    if lens.model.straight and not any(rest):
+        return None
+    order = OPENCV.get(lens.model.name)
+    found = [number(value, lens.place, "parameter") for value in rest]
+    coefficients = None if order is None else tuple((*found, 0.0)[i] for i in order)
+    return Distortion(lens.model.name, coefficients, lens.model.name.endswith("FISHEYE"))
 
 
 def _rotation(image: Image) -> Float[Tensor, "3 3"]:

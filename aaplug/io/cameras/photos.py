@@ -131,24 +131,6 @@ def trained_at(cameras: Sequence[Camera], sizes: Sequence[Size]) -> list[Camera]
     return [c.resized(*size).as_trained() for c, size in zip(cameras, sizes, strict=True)]
 
 
-def straightened(cameras: Sequence[Camera], bent: Sequence[str | None]) -> list[Camera]:
-    """The cameras, without the photos of those whose lens distorts: a pinhole does not see what they show."""
-    pairs = zip(cameras, bent, strict=True)
-    return [replace(camera, photo=None) if lens else camera for camera, lens in pairs]
-
-
-def lens_notes(bent: Sequence[str | None]) -> list[str]:
-    """A line on lenses that distort, by the names of their models, if there are any."""
-    models = sorted({lens for lens in bent if lens})
-    if not models:
-        return []
-    count = sum(lens is not None for lens in bent)
-    return [
-        f"{count} cameras have a lens that distorts ({', '.join(models)}): they count as the pinholes at its centre, "
-        "and their photos are not used; undistorted ones (colmap image_undistorter) would be"
-    ]
-
-
 def described_sizes(cameras: Sequence[Camera]) -> str:
     """The cameras' sizes, for a note."""
     sizes = sorted({(c.width, c.height) for c in cameras}, key=lambda s: (s[0] * s[1], s))

@@ -5,15 +5,17 @@ A format is a module with a `name` (also its files' suffix), `sniff`, `open_scen
 writing.
 """
 
+import importlib.util
 import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal, Protocol, runtime_checkable
 
-from aaplug.errors import FormatError, OutputError
+from aaplug.errors import FormatError, OutputError, UsageError
 from aaplug.gaussians import Convention, Gaussians
 from aaplug.io.atomic import check_output
 from aaplug.io.scenes import compressed_ply, ksplat, ply, pt, sog, splat, spz
+from aaplug.io.scenes.packed import half_turn_about_x
 from aaplug.io.scenes.scene_file import SceneFile
 
 HEAD_BYTES = 64  # of a file, shown to each format's `sniff`
@@ -45,6 +47,7 @@ class WritableFormat(Protocol):
 
 
 FORMATS: tuple[SceneFormat, ...] = (compressed_ply, ply, spz, sog, pt, splat, ksplat)
+NEEDED = {"spz": "gsply"}  # by extras of ours named as the format: the package that writes it
 
 
 def open_scene(
@@ -105,15 +108,20 @@ def read_scene(
     return opened.whole(drop_bad)
 
 
-def write_scene(path: Path, scene: Gaussians, *, overwrite: bool = False) -> None:
+def write_scene(
+    path: Path, scene: Gaussians, *, overwrite: bool = False, spz_axes: SpzAxes = "opengl"
+) -> None:
     """Write a scene in the format of the path's suffix, with all else that its origin held.
+
+    spz_axes: of a .spz, as in `open_scene`.
 
     Raises:
         OutputError: the suffix is of no format that can be written, the path is the file that the
             scene was read from, exists and `overwrite` is false, or cannot be written.
+        UsageError: the package that writes the format is not installed.
     """
     source = [Path(scene.origin.path)] if scene.origin else []
-    write_parts(path, [scene], len(scene), source, overwrite=overwrite)
+    write_parts(path, [scene], len(scene), source, overwrite=overwrite, spz_axes=spz_axes)
 
 
 def write_parts(
@@ -123,20 +131,39 @@ def write_parts(
     inputs: Iterable[Path] = (),
     *,
     overwrite: bool = False,
+    spz_axes: SpzAxes = "opengl",
 ) -> None:
     """Write a scene that comes in parts, `count` Gaussians or fewer, of one convention and all with the same columns.
 
     Raises:
         OutputError: as in `write_scene`; `inputs` are the files that may not be replaced.
     """
+    writer = check_scene_output(path, overwrite, inputs)
+    if writer is spz and spz_axes == "opencv":
+        parts = map(half_turn_about_x, parts)  # which the writer turns back
+    writer.write(path, parts, count, overwrite)
+
+
+def check_scene_output(path: Path, overwrite: bool, inputs: Iterable[Path] = ()) -> WritableFormat:
+    """The format that will write `path`; refuses, before any work, what cannot be written.
+
+    Raises:
+        OutputError: as in `write_parts`.
+        UsageError: the package that writes the format is not installed.
+    """
     writers = {"." + f.name: f for f in FORMATS if isinstance(f, WritableFormat)}
-    writer = writers.get(path.suffix.lower())
-    if writer is None or path.name.lower().endswith(".compressed.ply"):
+    suffix = path.suffix.lower()
+    if suffix not in writers or path.name.lower().endswith(".compressed.ply"):
         raise OutputError(
             path, f"has no suffix of a format that can be written: {', '.join(writers)}"
         )
+    needed = NEEDED.get(suffix[1:])
+    if needed is not None and importlib.util.find_spec(needed) is None:
+        raise UsageError(
+            str(path), f"writing {suffix} needs {needed}: pip install 'aaplug[{suffix[1:]}]'"
+        )
     check_output(path, overwrite, inputs)
-    writer.write(path, parts, count, overwrite)
+    return writers[suffix]
 
 
 def find_scene(path: Path, iteration: int | None = None) -> Path:

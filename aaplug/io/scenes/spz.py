@@ -30,6 +30,8 @@ from aaplug.io.scenes.packed import (
     unzstd,
 )
 from aaplug.io.scenes.scene_file import SceneFile, check_count, library_errors
+from aaplug.io.scenes.spz_writer import ANTIALIASED_FLAG
+from aaplug.io.scenes.spz_writer import write as write
 
 MAGIC = b"NGSP"
 GZIP = b"\x1f\x8b"
@@ -41,7 +43,6 @@ STREAM = struct.Struct("<QQ")  # compressed and inflated size
 HALVES, FIXED, THREES, STREAMS = 1, 2, 3, 4  # what the versions brought
 MAX_DEGREE = 4
 MAX_FRACTION = 24  # bits of a position
-ANTIALIASED_FLAG = 1
 COLOUR_GAIN = 0.15  # of the stored colour against the harmonic of degree 0
 SCALE_STEPS, SCALE_LEAST = 16.0, -10.0  # log-scales: steps a unit, from here
 MAGNITUDE = 511  # 9 bits of a quaternion's component; a tenth is its sign
