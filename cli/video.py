@@ -15,7 +15,7 @@ from aaplug.gaussians import Gaussians
 from aaplug.io.cameras.camera_path import read_camera_path
 from aaplug.io.video import check_video
 from aaplug.protocols import median_depth
-from aaplug.recipes import RECIPES
+from aaplug.recipes import RECIPES, suited
 from aaplug.videos import Video as Clip
 from aaplug.videos import make_video
 
@@ -70,6 +70,7 @@ def video(options: Video) -> int:
     fps = options.fps or (FPS if free is None else free.fps)
     check_video(options.output, fps, options.overwrite)
     scene = options.scene.read()
+    recipes = [suited(recipe, scene) for recipe in recipes]
     cameras = options.cameras.read(options.scene)
     along = _along(options, scene, cameras, fps) if free is None else free.cameras
     shown = [size(camera) for camera in along]

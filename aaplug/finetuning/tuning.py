@@ -113,11 +113,10 @@ def loss_at(
     truth, camera = job.truth(view, scale), view.scaled(scale)
     scene = scene_of(leaves, job.start)
     fine, samples = sampled(scene, camera, job.recipe, job.training)
-    pixel = job.recipe.pixel
-    splats = splats_of(scene, fine, job.recipe.screen, job.training, job.rasterizer, pixel)
+    splats = splats_of(scene, fine, job.recipe, job.training, job.rasterizer)
     if splats.means.requires_grad:
         splats.means.retain_grad()
-    image = averaged(job.rasterizer(splats, fine.hw, job.background, pixel), samples).rgb
+    image = averaged(job.rasterizer(splats, fine.hw, job.background, job.recipe.pixel), samples).rgb
     return LOSSES[job.settings.loss](image, truth.to(image)), splats, fine.hw
 
 
