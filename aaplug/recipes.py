@@ -150,7 +150,7 @@ RECIPES: dict[str, Recipe] = {
             "matched-interval",
             Matched("interval"),
             "aaplug: matched, each Gaussian's rate against the range that the training cameras had (choice C)",
-            "cameras nearer or farther than training's; `matched` takes it for those by itself",
+            "comparison: `matched` starts from it for cameras nearer or farther than training's",
         ),
         Recipe(
             "matched-sharpest",
