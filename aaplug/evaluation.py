@@ -227,7 +227,7 @@ class _Bench:
     def _work(self, recipe: Recipe, camera: Camera) -> Hashable:
         """What a recipe does at a view's rate: `auto` is `matched` where it takes one sample, and not drawn again."""
         samples = recipe.samples_at(rate_of(self.own, camera, self.training))
-        return recipe.world, recipe.screen, samples, recipe.pixel
+        return recipe.world, recipe.selection, recipe.screen, samples, recipe.pixel
 
     def _draw(self, scene: Gaussians, camera: Camera, recipe: Recipe) -> _Drawn:
         rasterizer, counting = self.task.rasterizer, None

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 MAX_LOG_SCALE = 30.0  # |ln s| beyond this overflows float32 once squared; values are clamped on use
@@ -62,6 +62,28 @@ class Origin:
 
 
 @dataclass(frozen=True)
+class PixelSizes:
+    """In which sizes training drew each Gaussian, as Multi-Scale 3DGS (Yan et al. 2024) stores them.
+
+    smallest, largest: px of an image, at the level that the Gaussian belongs to; 0 and less where unknown.
+    base: it belongs to the coarsest level.
+    """
+
+    smallest: Float[Tensor, " n"]
+    largest: Float[Tensor, " n"]
+    base: Bool[Tensor, " n"]
+
+    def __getitem__(self, index: Tensor | slice) -> "PixelSizes":
+        """The sizes at `index`, in that order."""
+        return PixelSizes(self.smallest[index], self.largest[index], self.base[index])
+
+    def to(self, target: torch.dtype | torch.device) -> "PixelSizes":
+        """The same sizes in another precision or on another device."""
+        base = self.base if isinstance(target, torch.dtype) else self.base.to(target)
+        return PixelSizes(self.smallest.to(target), self.largest.to(target), base)
+
+
+@dataclass(frozen=True)
 class Gaussians:
     """n Gaussians and how they were trained.
 
@@ -81,6 +103,7 @@ class Gaussians:
     fused: tuple[Fusion, ...] = ()
     origin: Origin | None = None
     flat: bool = False
+    pixel_sizes: PixelSizes | None = None
 
     def __len__(self) -> int:
         return self.means.shape[0]
@@ -119,6 +142,7 @@ class Gaussians:
             logit_opacities=self.logit_opacities[index],
             sh=self.sh[index],
             filter_3d=None if self.filter_3d is None else self.filter_3d[index],
+            pixel_sizes=None if self.pixel_sizes is None else self.pixel_sizes[index],
             origin=origin,
         )
 
@@ -132,6 +156,7 @@ class Gaussians:
             logit_opacities=self.logit_opacities.to(target),
             sh=self.sh.to(target),
             filter_3d=None if self.filter_3d is None else self.filter_3d.to(target),
+            pixel_sizes=None if self.pixel_sizes is None else self.pixel_sizes.to(target),
         )
 
 

@@ -1,8 +1,9 @@
 """Every seam on one page: what a plug-in gets, what it gives back, and what it must hold to.
 
-A world filter acts once per scene; a screen filter acts per view on the projected splats; a rasterizer turns splats
-into an image.  Each is a frozen dataclass or a function, deterministic, without side effects, and never changes its
-input.  A plug-in is one file and one line in its folder's `__init__`; the laws in `tests/laws` then run over it.
+A world filter acts once per scene; a selection says which Gaussians a view draws at all; a screen filter acts per view
+on the projected splats; a rasterizer turns splats into an image.  Each is a frozen dataclass or a function,
+deterministic, without side effects, and never changes its input.  A plug-in is one file and one line in its folder's
+`__init__`; the laws in `tests/laws` then run over it.
 """
 
 import math
@@ -52,6 +53,19 @@ class WorldFilter(Protocol):
 
     def __call__(self, scene: Gaussians, training: Training) -> Gaussians:
         """Filter the scene; Gaussians keep their number and order."""
+        ...
+
+
+@runtime_checkable
+class Selection(Protocol):
+    """Chooses which splats of one view are drawn, before any screen filter."""
+
+    def __call__(self, splats: Splats2D, scene: Gaussians) -> Splats2D:
+        """The chosen ones of the splats of `scene`, unchanged and in order.
+
+        Raises:
+            UsageError: the scene does not hold what it chooses by.
+        """
         ...
 
 

@@ -15,7 +15,7 @@ from aaplug.cameras import BLACK, Camera
 from aaplug.errors import UsageError
 from aaplug.filters import fuse_stored
 from aaplug.gaussians import Gaussians
-from aaplug.interfaces import PixelKernel, Rasterizer, ScreenFilter, Training
+from aaplug.interfaces import Rasterizer, Training
 from aaplug.projection import project, shade, tilt
 from aaplug.rasterizers import RASTERIZERS, SURFELS, averaged, extents_of
 from aaplug.recipes import Recipe
@@ -50,15 +50,15 @@ def render(
     rasterizer: Rasterizer = RASTERIZERS["eager"],
     background: tuple[float, float, float] = BLACK,
 ) -> Render:
-    """One image of a smoothed scene, rgb and alpha of `camera.hw`, by the recipe's screen filter and samples.
+    """One image of a smoothed scene, rgb and alpha of `camera.hw`, by the recipe's selection, filter and samples.
 
     Differentiable in everything that the scene holds and in `camera.cam_from_world`.
 
     Raises:
-        UsageError: a Gaussian in view has a colour that is NaN or infinite.
+        UsageError: a Gaussian in view has a colour that is NaN or infinite, or the scene lacks what the recipe needs.
     """
     fine, samples = sampled(scene, camera, recipe, training)
-    splats = splats_of(scene, fine, recipe.screen, training, rasterizer, recipe.pixel)
+    splats = splats_of(scene, fine, recipe, training, rasterizer)
     return averaged(rasterizer(splats, fine.hw, background, recipe.pixel), samples)
 
 
@@ -91,12 +91,11 @@ def rate_of(scene: Gaussians, camera: Camera, training: Training) -> float:
 def splats_of(
     scene: Gaussians,
     camera: Camera,
-    screen: ScreenFilter,
+    recipe: Recipe,
     training: Training,
     rasterizer: Rasterizer = RASTERIZERS["eager"],
-    pixel: PixelKernel = "point",
 ) -> Splats2D:
-    """What a view draws: projected, filtered, inside the image, coloured.
+    """What a view draws: projected, chosen, filtered, inside the image, coloured.
 
     Gaussians go through in parts, so that what most of them leave behind never needs memory at once.
     """
@@ -104,10 +103,11 @@ def splats_of(
     for start in range(0, max(1, len(scene)), PART):
         part = scene if len(scene) <= PART else scene[start : start + PART]
         splats = project(part, camera, kernels)
-        splats = tilt(splats, part, camera) if pixel in SURFELS else splats
+        splats = splats if recipe.selection is None else recipe.selection(splats, part)
+        splats = tilt(splats, part, camera) if recipe.pixel in SURFELS else splats
         splats = replace(splats, sources=splats.sources + start)
-        splats = screen(splats, camera, training)
-        extents = extents_of(splats, pixel)
+        splats = recipe.screen(splats, camera, training)
+        extents = extents_of(splats, recipe.pixel)
         splats = drawn(splats, camera.hw, training.guard, kernels, extents)
         parts.append(shade(splats, scene, camera, kernels))
     splats = parts[0] if len(parts) == 1 else joined(parts)

@@ -8,9 +8,18 @@ import math
 from dataclasses import dataclass, replace
 
 from aaplug.errors import UsageError, listing
-from aaplug.filters import SCREEN_FILTERS, FlatSmoothing, LowPass, Matched, RateChoice, Smoothing3D
+from aaplug.filters import (
+    SCREEN_FILTERS,
+    SELECTIONS,
+    FlatSmoothing,
+    LowPass,
+    Matched,
+    RateChoice,
+    Smoothing3D,
+)
+from aaplug.filters.pixel_size import MISSING
 from aaplug.gaussians import Gaussians
-from aaplug.interfaces import PixelKernel, ScreenFilter, WorldFilter
+from aaplug.interfaces import PixelKernel, ScreenFilter, Selection, WorldFilter
 
 # rate·n that a quality asks for.  A small image's cost is a Gaussian's, not a pixel's: at 1/8 of the training size 2×2
 # samples take no more pairs than classic's one.
@@ -34,6 +43,7 @@ class Recipe:
     samples: float = 0.0
     grid: int = 1
     pixel: PixelKernel = "point"
+    selection: Selection | None = None
 
     def samples_at(self, rate: float) -> int:
         """Samples along a pixel's side for a view at `rate` against training."""
@@ -89,6 +99,13 @@ RECIPES: dict[str, Recipe] = {
             "scenes trained with it",
         ),
         Recipe(
+            "multi-scale",
+            SCREEN_FILTERS["classic"],
+            "Multi-Scale 3DGS (Yan et al. 2024): Gaussians drawn at the sizes that training drew them in, +0.3 px²",
+            "scenes trained with it, whose files hold these sizes",
+            selection=SELECTIONS["pixel-size"],
+        ),
+        Recipe(
             "analytic",
             SCREEN_FILTERS["none"],
             "Analytic-Splatting (Liang et al. 2024): no dilation, alpha integrated over the pixel by the exact normal "
@@ -133,7 +150,7 @@ RECIPES: dict[str, Recipe] = {
             "matched-interval",
             Matched("interval"),
             "aaplug: matched, each Gaussian's rate against the range that the training cameras had (choice C)",
-            "cameras nearer or farther than training's; `matched` takes it for those by itself",
+            "comparison: `matched` starts from it for cameras nearer or farther than training's",
         ),
         Recipe(
             "matched-sharpest",
@@ -233,8 +250,20 @@ def find_recipe(
     return recipe if samples is None else replace(recipe, samples=samples)
 
 
+def lacking(recipe: Recipe, scene: Gaussians) -> str | None:
+    """What a scene lacks for a recipe, in words; None if nothing."""
+    return MISSING if recipe.selection is not None and scene.pixel_sizes is None else None
+
+
 def suited(recipe: Recipe, scene: Gaussians) -> Recipe:
-    """The same recipe, but that `auto` draws discs for a scene of 2D Gaussians (`2dgs-matched`)."""
+    """The same recipe, but that `auto` draws discs for a scene of 2D Gaussians (`2dgs-matched`).
+
+    Raises:
+        UsageError: the scene lacks what the recipe needs.
+    """
+    missing = lacking(recipe, scene)
+    if missing is not None:
+        raise UsageError(f"recipe {recipe.name}", missing)
     if recipe.name != "auto" or not scene.flat:
         return recipe
     return replace(RECIPES["2dgs-matched"], name="auto", samples=recipe.samples)

@@ -24,7 +24,7 @@ from aaplug.lpips import lpips_metric
 from aaplug.metrics import CONSISTENCY, ENERGY, FLICKER, FLIP, PSNR, SSIM, Metric
 from aaplug.nyquist import coverage
 from aaplug.protocols import PROTOCOLS, Protocol, Truth, find_protocol
-from aaplug.recipes import RECIPES, suited
+from aaplug.recipes import RECIPES, Recipe, lacking, suited
 from aaplug.report import Report, as_csv, per_view, results, tables
 
 from .batch import Job, finish_batch, jobs_of, run_batch
@@ -135,6 +135,8 @@ def _run(job: Job) -> Report:
     recipes = options.rendering.recipes(RECIPES if "all" in options.recipe else options.recipe)
     judges = _judges(options, protocol)
     scene = options.scene.read()
+    if "all" in options.recipe:
+        recipes = _drawable(recipes, scene)
     recipes = [suited(recipe, scene) for recipe in recipes]
     cameras = options.cameras.read(options.scene)
     views = options.rendering.select(cameras)
@@ -174,6 +176,15 @@ def _protocol(options: Evaluate) -> Protocol:
         ssim=options.ssim or protocol.ssim,
         lpips=options.lpips_flavour or protocol.lpips,
     )
+
+
+def _drawable(recipes: Sequence[Recipe], scene: Gaussians) -> list[Recipe]:
+    """The recipes that the scene has everything for; says which are left out, and why."""
+    missing = {recipe.name: lacking(recipe, scene) for recipe in recipes}
+    for name, words in missing.items():
+        if words is not None:
+            say(f"recipe {name} left out: {words}")
+    return [recipe for recipe in recipes if missing[recipe.name] is None]
 
 
 def _judges(options: Evaluate, protocol: Protocol) -> list[Metric]:

@@ -5,6 +5,7 @@
 
 import logging
 import math
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 
@@ -13,7 +14,7 @@ import torch
 
 from aaplug import compiled
 from aaplug.cameras import Camera, CameraSet, look_at
-from aaplug.gaussians import Gaussians
+from aaplug.gaussians import Gaussians, PixelSizes
 from aaplug.interfaces import Rasterizer, Training
 from aaplug.io.cameras import read_cameras
 from aaplug.io.scenes import read_scene
@@ -96,6 +97,14 @@ def make_scene(
         logit_opacities=torch.randn(n, **rand) * 2,
         sh=torch.randn(n, (degree + 1) ** 2, 3, **rand) * 0.5,
     ).to(dtype)
+
+
+def sized(scene: Gaussians) -> Gaussians:
+    """The scene with sizes that leave out the smallest and the largest of its Gaussians in most views."""
+    n = len(scene)
+    base = torch.arange(n) % 4 == 0
+    sizes = PixelSizes(torch.full((n,), 4.0), torch.full((n,), 8.0), base)
+    return replace(scene, pixel_sizes=sizes)
 
 
 def make_splats(

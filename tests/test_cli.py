@@ -190,6 +190,14 @@ def test_evaluate_without_photographs_takes_the_scenes_own_look(cli):
     assert json.loads(out)["_aaplug"]["truth"] == "self"
 
 
+def test_evaluate_all_leaves_out_what_does_not_suit_the_scene(cli):
+    words = "evaluate scene.ply --cameras . --recipe all --scale 0.25 --json"
+    code, out, err = cli(words)
+    assert code == 0
+    assert "recipe multi-scale left out: the scene lacks" in err
+    assert set(json.loads(out)["_aaplug"]["recipes"]) == set(RECIPES) - {"multi-scale"}
+
+
 def test_evaluate_by_a_protocol_names_it_and_its_flavours(cli):
     words = (
         "evaluate scene.ply --cameras . --protocol blender --scale 1 0.5 --recipe matched --json"
@@ -318,6 +326,12 @@ REFUSED = {
         break_nothing, "render scene.ply --cameras . -o new --views r_9", ["r_9", "r_0"]),
     "unknown recipe": (
         break_nothing, "render scene.ply --cameras . -o new --recipe mipp", ["mipp", "matched"]),
+    "a recipe for other scenes": (
+        break_nothing, "render scene.ply --cameras . -o new --recipe multi-scale", ["base_mask"]),
+    "a recipe for other scenes, on evaluate": (
+        break_nothing, "evaluate scene.ply --cameras . -o new --recipe multi-scale", ["base_mask"]),
+    "a recipe for other scenes, on video": (
+        break_nothing, "video scene.ply --cameras . -o new.webm --recipe multi-scale", ["base_mask"]),
     "scale and resolution": (
         break_nothing, "render scene.ply --cameras . -o new --scale 2 --resolution 8x8", ["give one"]),
     "a report without a folder": (

@@ -11,7 +11,7 @@ from aaplug.kernels import EAGER, CompiledKernels, Kernel, Package
 from aaplug.pipeline import learn, render
 from aaplug.rasterizers import RASTERIZERS, Tiled, reference
 from aaplug.recipes import RECIPES
-from tests.conftest import make_camera, make_scene
+from tests.conftest import make_camera, make_scene, sized
 
 ANSWER = 1e-5
 
@@ -46,7 +46,7 @@ def test_compiled_kernels_give_the_eager_answer(built, kernel: Kernel):
 @pytest.mark.parametrize("recipe", RECIPES)
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_compiled_images_are_the_eager_ones(built, recipe, degree):
-    scene, camera = make_scene(400, degree=degree), make_camera(size=(150, 110))
+    scene, camera = sized(make_scene(400, degree=degree)), make_camera(size=(150, 110))
     training, view = learn(scene, [camera]), camera.scaled(0.6)
     fast, eager = (
         render(scene, view, RECIPES[recipe], training, rasterizer)

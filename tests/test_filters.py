@@ -6,12 +6,17 @@ from dataclasses import replace
 import pytest
 import torch
 
-from aaplug.filters import Adaptive, Smoothing3D
+from aaplug.errors import UsageError
+from aaplug.filters import Adaptive, ByPixelSize, Smoothing3D
 from aaplug.filters.adaptive import ADAPTIVE_VARIANCE
+from aaplug.filters.pixel_size import pixel_size
 from aaplug.filters.smoothing import BALANCE_FLOOR
-from aaplug.pipeline import learn
+from aaplug.gaussians import PixelSizes
+from aaplug.pipeline import learn, render
 from aaplug.projection import project, rotation_matrices
-from tests.conftest import make_camera, make_scene
+from aaplug.recipes import RECIPES, lacking, suited
+from aaplug.splats import Splats2D
+from tests.conftest import make_camera, make_scene, make_splats, sized
 
 F64 = torch.float64
 WIDE = make_scene(60, dtype=F64)
@@ -86,3 +91,115 @@ def test_balancing_goes_by_the_broadest_face_and_not_below_its_floor(thickness, 
     scene = replace(scene, log_scales=(sigma[:, None] * torch.tensor([thickness], dtype=F64)).log())
     balanced = Smoothing3D(opacity="balanced")(scene, training)
     assert (balanced.opacities / scene.opacities).item() == pytest.approx(expected, rel=1e-6)
+
+
+def row_of_splats(covs: list[tuple[float, float, float]]) -> Splats2D:
+    """Opaque splats of these covariances, whose size is √(2 ln 255) = 3.33 times a cross-section."""
+    packed = torch.tensor(covs, dtype=F64)
+    xx, xy, yy = packed.unbind(dim=1)
+    n = len(covs)
+    zeros, ones = torch.zeros(n, 2, dtype=F64), torch.ones(n, dtype=F64)
+    return Splats2D(zeros, packed, xx * yy - xy * xy, ones, ones, torch.arange(n))
+
+
+REACH = math.sqrt(2 * math.log(255))
+
+
+@pytest.mark.parametrize(
+    ("cov", "cross_section"),
+    [
+        ((1.0, 0.0, 1.0), 1.0),
+        ((4.0, 0.0, 1.0), 1.0),
+        ((1.0, 0.0, 9.0), 1.0),
+        ((2.5, 1.5, 2.5), math.sqrt(1.6)),  # 4 and 1 px², turned by 45°
+    ],
+)
+def test_a_pixel_size_is_a_half_width_where_alpha_ends(cov, cross_section):
+    size = pixel_size(row_of_splats([cov])).item()
+    assert size == pytest.approx(REACH * cross_section, rel=1e-12)
+
+
+def test_pixel_sizes_are_those_of_the_published_form():
+    """min(√(L/A), √(L/C)) with the diagonal of the inverse, by a matrix's own inverse."""
+    splats = make_splats(200, (40, 60)).to(F64)
+    xx, xy, yy = splats.covs.unbind(dim=1)
+    splats = replace(splats, dets=xx * yy - xy * xy)
+    splats.opacities[:9] = 0.003  # too faint to have a size
+    inverse = torch.linalg.inv(torch.stack([xx, xy, xy, yy], dim=1).view(-1, 2, 2))
+    level = (-2 * (1 / (255 * splats.opacities)).log()).clamp(min=0)
+    expected = (level[:, None] / inverse.diagonal(dim1=1, dim2=2)).sqrt().amin(dim=1)
+    torch.testing.assert_close(pixel_size(splats), expected, rtol=1e-7, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("size", "smallest", "largest", "base", "drawn"),
+    [
+        (1.0, 1.9, 5.0, False, True),
+        (1.0, 2.1, 5.0, False, False),  # below half of the smallest
+        (1.0, 2.1, 5.0, True, True),  # but of the coarsest level
+        (2.1, 9.0, 9.0, False, True),  # never too small from 2 px on
+        (1.9, 9.0, 9.0, False, False),
+        (9.9, 1.0, 5.0, False, True),
+        (10.1, 1.0, 5.0, False, False),  # above twice the largest
+        (10.1, 1.0, 5.0, True, True),
+        (0.01, 0.0, 5.0, False, True),  # unknown
+        (99.0, 1.0, 0.0, False, True),
+        (0.01, -1.0, -1.0, False, True),
+        (0.01, math.nan, math.nan, False, True),
+    ],
+)
+def test_multi_scale_draws_the_sizes_that_training_drew(size, smallest, largest, base, drawn):
+    variance = (size / REACH) ** 2
+    splats = row_of_splats([(variance, 0.0, variance)] * 2)
+    always = PixelSizes(
+        torch.ones(2) * smallest, torch.ones(2) * largest, torch.tensor([base, True])
+    )
+    chosen = ByPixelSize()(splats, replace(make_scene(2), pixel_sizes=always))
+    assert chosen.sources.tolist() == [0, 1][not drawn :]
+
+
+def test_multi_scale_goes_by_the_size_in_the_view_before_dilation():
+    """A scene with a fine and a coarse copy of a blob: near views draw the fine one, far ones the coarse one."""
+    scene = replace(
+        make_scene(2),
+        means=torch.zeros(2, 3),
+        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]] * 2),
+        log_scales=torch.tensor([[0.05] * 3, [0.2] * 3]).log(),
+        logit_opacities=torch.full((2,), 10.0),
+    )
+    camera = make_camera(size=(200, 200))
+    sizes = pixel_size(project(scene, camera))
+    level = PixelSizes(
+        sizes / 2, torch.tensor([99.0, 0.25 * sizes[1]]), torch.tensor([False, False])
+    )
+    scene = replace(scene, pixel_sizes=level)
+    drawn = {
+        scale: ByPixelSize()(project(scene, camera.scaled(scale)), scene).sources.tolist()
+        for scale in (1.0, 0.1)
+    }
+    assert drawn == {1.0: [0], 0.1: [1]}
+    training, recipe = learn(scene, [camera]), RECIPES["multi-scale"]
+    for scale, kept in drawn.items():
+        image = render(scene, camera.scaled(scale), recipe, training).rgb
+        alone = render(scene[kept[0] :][:1], camera.scaled(scale), RECIPES["classic"], training).rgb
+        torch.testing.assert_close(image, alone)
+
+
+def test_a_scene_without_recorded_sizes_is_refused_by_name():
+    scene = make_scene(3)
+    training, recipe = learn(scene, [NEAR]), RECIPES["multi-scale"]
+    for refused in (lambda: render(scene, NEAR, recipe, training), lambda: suited(recipe, scene)):
+        with pytest.raises(UsageError, match=r"multi-scale: the scene lacks .*min_pixel_sizes"):
+            refused()
+    assert lacking(RECIPES["classic"], scene) is None
+    assert suited(recipe, sized(scene)) is recipe
+
+
+def test_recorded_sizes_go_with_their_gaussians():
+    scene = sized(make_scene(8)).to(F64)
+    assert scene.pixel_sizes is not None
+    part = scene[torch.tensor([4, 1])].pixel_sizes
+    assert part is not None
+    assert part.smallest.dtype == F64
+    assert part.base.tolist() == [True, False]
+    assert len(part.largest) == 2

@@ -13,12 +13,12 @@ from aaplug.gaussians import Gaussians
 from aaplug.pipeline import learn, render, smooth
 from aaplug.rasterizers import RASTERIZERS, Reference, Tiled
 from aaplug.recipes import RECIPES, Recipe
-from tests.conftest import make_camera, make_scene, make_splats
+from tests.conftest import make_camera, make_scene, make_splats, sized
 
 F64 = torch.float64
 STEP = 1e-6
 RELATIVE = 1e-5
-SCENE = make_scene(25, seed=4, dtype=F64)
+SCENE = sized(make_scene(25, seed=4, dtype=F64))
 CAMERA = make_camera((0.5, -3.5, 0.4), size=(28, 20))
 # a free pose: at a training pose the interval of rates has its end right at the view, and a kink there
 VIEW = replace(make_camera((0.7, -3.4, 0.2), size=(28, 20)), trained_focal=None).scaled(0.75)

@@ -34,7 +34,7 @@ def cameras() -> list[Camera]:
 
 @pytest.mark.parametrize("convention", CONVENTIONS.values(), ids=lambda c: c.name)
 @pytest.mark.parametrize("name", ["matched", "auto"])
-@pytest.mark.parametrize("rate", ["global", "interval"])
+@pytest.mark.parametrize("rate", ["pose", "global", "interval"])
 def test_matched_is_training_itself_at_every_view_of_the_training_size(
     convention, name, rate, cameras
 ):
@@ -281,16 +281,17 @@ def test_a_free_camera_has_the_rate_of_its_distance(distance, rate):
 
 @pytest.mark.parametrize(("free", "like"), [(True, "interval"), (False, "global")])
 def test_matched_takes_the_interval_for_free_cameras_alone(free, like):
+    """From near; from afar both give way to a sharper rate."""
     scene, cameras = make_scene(50), [make_camera((0.0, -4.0, 0.0)), make_camera((2.0, -3.0, 1.0))]
     training = learn(scene, cameras)
-    view = make_camera((0.0, -8.0, 0.0)).scaled(0.5)
+    view = make_camera((0.0, -8.0, 0.0)).scaled(2.5)
     if free:
         view = replace(view, trained_focal=None)
     found = RECIPES["matched"].screen(project(scene, view), view, training)
     expected = find_recipe("matched", rate=like).screen(project(scene, view), view, training)
     other = find_recipe("matched", rate="sharpest").screen(project(scene, view), view, training)
-    assert torch.equal(found.covs, expected.covs)
-    assert not torch.equal(found.covs, other.covs)
+    torch.testing.assert_close(found.covs, expected.covs)
+    assert (found.covs - other.covs).abs().max() > 0.01
 
 
 def test_auto_draws_discs_for_a_scene_of_them_alone():

@@ -328,6 +328,24 @@ def test_the_user_knows_best(tmp_path: Path):
     assert scene.origin.evidence == "given by --convention"
 
 
+@pytest.mark.parametrize("mask", ["float", "uchar"])
+def test_pixel_sizes_are_read_and_kept(tmp_path: Path, mask: str):
+    sizes = [("float", "max_pixel_sizes"), ("float", "min_pixel_sizes"), (mask, "base_mask")]
+    file = plain(columns=[*File().columns, *sizes])
+    opened = open_scene(file.save(tmp_path))
+    assert "pixel sizes of Multi-Scale 3DGS, for --recipe multi-scale" in opened.notes
+    scene, stored = opened.whole(), values(file.content, file)
+    assert scene.pixel_sizes is not None
+    assert scene.pixel_sizes.smallest.tolist() == stored["min_pixel_sizes"].tolist()
+    assert scene.pixel_sizes.largest.tolist() == stored["max_pixel_sizes"].tolist()
+    assert scene.pixel_sizes.base.tolist() == (stored["base_mask"] > 0).tolist()
+    assert through(scene, tmp_path) == file.content
+    part = values(through(scene[torch.tensor([3, 1])], tmp_path), file)
+    assert part["base_mask"].tolist() == stored["base_mask"][[3, 1]].tolist()
+    lacking = replace(file, columns=file.columns[:-1])
+    assert read_scene(lacking.save(tmp_path)).pixel_sizes is None
+
+
 def test_the_filter_column_is_read_dropped_and_written(tmp_path: Path):
     file = filtered()
     scene = read_scene(file.save(tmp_path))

@@ -5,6 +5,7 @@ from aaplug.filters.dilation import Dilation
 from aaplug.filters.energy import MATCHED_VARIANCE, MatchedEnergy
 from aaplug.filters.low_pass import LowPass
 from aaplug.filters.matched import PIXEL_VARIANCE, Matched, RateChoice
+from aaplug.filters.pixel_size import ByPixelSize
 from aaplug.filters.smoothing import (
     NYQUIST_VARIANCE,
     FlatSmoothing,
@@ -12,7 +13,7 @@ from aaplug.filters.smoothing import (
     StoredSmoothing,
     fuse_stored,
 )
-from aaplug.interfaces import ScreenFilter, WorldFilter
+from aaplug.interfaces import ScreenFilter, Selection, WorldFilter
 
 WORLD_FILTERS: dict[str, WorldFilter] = {
     "smoothing3d": Smoothing3D(),
@@ -36,14 +37,18 @@ SCREEN_FILTERS: dict[str, ScreenFilter] = {
     "matched-interval": Matched("interval"),
 }
 
+SELECTIONS: dict[str, Selection] = {"pixel-size": ByPixelSize()}
+
 __all__ = [
     "ADAPTIVE_VARIANCE",
     "MATCHED_VARIANCE",
     "NYQUIST_VARIANCE",
     "PIXEL_VARIANCE",
     "SCREEN_FILTERS",
+    "SELECTIONS",
     "WORLD_FILTERS",
     "Adaptive",
+    "ByPixelSize",
     "Dilation",
     "FlatSmoothing",
     "LowPass",

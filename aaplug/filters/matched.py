@@ -24,6 +24,9 @@ from aaplug.splats import Splats2D
 # than their energies together should, and a narrower filter makes up for some of it (docs/methods.md).
 PIXEL_VARIANCE = 0.07
 
+# times: how much finer than what it is compared with a receding view may come to be compared (docs/methods.md)
+SHARPER = 1.2
+
 RateChoice = Literal["pose", "global", "sharpest", "interval"]
 
 
@@ -33,7 +36,9 @@ class Matched:
 
     rate: what a Gaussian's rate is compared with.
         "pose": as "global" at a pose of the data set, as "interval" for a free camera, whose distance no training
-            view had.
+            view had, but that the blur of far views, which came of their own pixels, gives way to that of nearer
+            ones as a view samples less finely: as its rate falls, the one compared with rises, as in a mirror, up
+            to the highest that any training view had and by no more than `SHARPER`.
         "global" (A): the view's own training size; equals training's renderer at every training view.
         "sharpest" (B): the highest rate any training view had; one world-space blur for all views, the one that can
             be fused, thinner than what most views were trained with.
@@ -62,8 +67,7 @@ class Matched:
     def rates(self, splats: Splats2D, camera: Camera, training: Training) -> Float[Tensor, " m"]:
         """Rate of each splat against the one that training saw; the view's own for Gaussians no camera saw."""
         view = torch.full_like(splats.depths, training.rate(camera))
-        known = camera.trained_focal is not None
-        if self.rate == "global" or (self.rate == "pose" and known):
+        if self.rate == "global":
             return view
         seen = training.bounds.seen[splats.sources]
         # where no camera saw a Gaussian any number but 0 will do: it is not chosen, and divides no gradient by 0
@@ -72,8 +76,14 @@ class Matched:
         if self.rate == "sharpest":
             return torch.where(seen, now / highest, view)
         lowest = training.bounds.lowest[splats.sources].to(splats.depths).where(seen, 1.0)
-        if camera.trained_focal is not None:
-            own = camera.trained_focal / splats.depths
+        own = None if camera.trained_focal is None else camera.trained_focal / splats.depths
+        if own is not None:
             lowest, highest = torch.minimum(lowest, own), torch.maximum(highest, own)
-        nearest = torch.minimum(torch.maximum(now, lowest), highest)
+        if self.rate == "interval":
+            nearest = torch.minimum(torch.maximum(now, lowest), highest)
+            return torch.where(seen, now / nearest, view)
+        low, high = (lowest, highest) if own is None else (own, own)
+        mirrored = torch.minimum(low * low / now, SHARPER * low)
+        below = torch.minimum(mirrored, highest)
+        nearest = torch.where(now < low, below, torch.minimum(now, high))
         return torch.where(seen, now / nearest, view)

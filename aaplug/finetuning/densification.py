@@ -92,7 +92,7 @@ def _halves(scene: Gaussians, generator: torch.Generator) -> Gaussians:
 def _joined(scenes: list[Gaussians]) -> Gaussians:
     names = ("means", "quats", "log_scales", "logit_opacities", "sh")
     columns = {name: torch.cat([getattr(scene, name) for scene in scenes]) for name in names}
-    return replace(scenes[0], **columns, origin=None)
+    return replace(scenes[0], **columns, origin=None, pixel_sizes=None)
 
 
 def carried(moments: Mapping[str, Tensor], change: Change) -> dict[str, Tensor]:

@@ -47,8 +47,9 @@ def scene_of(leaves: Mapping[str, Tensor], like: Gaussians) -> Gaussians:
     """The scene that the leaves stand for; what has another number of Gaussians than its file is not from there."""
     values = {n: leaves[n] for n in ("means", "quats", "log_scales", "logit_opacities")}
     sh = torch.cat([leaves["dc"], leaves["rest"]], dim=1)
-    origin = like.origin if len(sh) == len(like) else None
-    return replace(like, **values, sh=sh, origin=origin)
+    same = len(sh) == len(like)
+    origin, sizes = (like.origin, like.pixel_sizes) if same else (None, None)
+    return replace(like, **values, sh=sh, origin=origin, pixel_sizes=sizes)
 
 
 def between(start: Gaussians, end: Gaussians, share: float) -> Gaussians:

@@ -6,6 +6,7 @@ resumed is, bit for bit, one that never was.
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -112,12 +113,15 @@ def loss_at(
     """The loss of one view at one scale, the splats that it drew, and the size they were drawn at."""
     truth, camera = job.truth(view, scale), view.scaled(scale)
     scene = scene_of(leaves, job.start)
-    fine, samples = sampled(scene, camera, job.recipe, job.training)
-    pixel = job.recipe.pixel
-    splats = splats_of(scene, fine, job.recipe.screen, job.training, job.rasterizer, pixel)
+    training = job.training
+    if len(scene) != len(training.bounds.highest):  # densified: other Gaussians have other bounds
+        bounds = sampling_bounds(leaves["means"].detach(), training.cameras)
+        training = replace(training, bounds=bounds)
+    fine, samples = sampled(scene, camera, job.recipe, training)
+    splats = splats_of(scene, fine, job.recipe, training, job.rasterizer)
     if splats.means.requires_grad:
         splats.means.retain_grad()
-    image = averaged(job.rasterizer(splats, fine.hw, job.background, pixel), samples).rgb
+    image = averaged(job.rasterizer(splats, fine.hw, job.background, job.recipe.pixel), samples).rgb
     return LOSSES[job.settings.loss](image, truth.to(image)), splats, fine.hw
 
 

@@ -20,6 +20,7 @@ from aaplug.filters import (
     MatchedEnergy,
     StoredSmoothing,
 )
+from aaplug.filters.matched import SHARPER
 from aaplug.gaussians import CONVENTIONS, MIP, Convention, Gaussians
 from aaplug.interfaces import ScreenFilter, Training, WorldFilter
 from aaplug.pipeline import learn
@@ -179,7 +180,7 @@ def test_matching_restores_the_trained_look_and_keeps_its_energy(rate, sigma, pi
     torch.testing.assert_close(filtered.opacities, expected)
 
 
-@pytest.mark.parametrize("rate", ["global", "interval"])
+@pytest.mark.parametrize("rate", ["pose", "global", "interval"])
 @pytest.mark.parametrize("index", range(len(CAMERAS)))
 def test_at_a_training_view_matching_is_the_trainings_own_rule(rate, index, convention):
     view = CAMERAS[index]
@@ -206,11 +207,18 @@ def test_matching_the_sharpest_rate_is_thinner_than_the_trainings_own_rule_where
 
 
 @pytest.mark.parametrize(
-    ("depth", "in_sharpest", "in_interval"),
-    [(2.0, 2.0, 2.0), (4.0, 1.0, 1.0), (6.0, 4 / 6, 1.0), (8.0, 0.5, 1.0), (16.0, 0.25, 0.5)],
+    ("depth", "in_sharpest", "in_interval", "in_pose"),
+    [
+        (2.0, 2.0, 2.0, 2.0),
+        (4.0, 1.0, 1.0, 1.0),
+        (6.0, 4 / 6, 1.0, 1.0),
+        (8.0, 0.5, 1.0, 1.0),
+        (8.8, 4 / 8.8, 8 / 8.8, (8 / 8.8) ** 2),  # mirrored: compared with the rate at 8 · 8/8.8
+        (16.0, 0.25, 0.5, 0.5 / SHARPER),
+    ],
 )
 def test_rates_of_a_free_camera_are_compared_with_the_trained_interval(
-    depth, in_sharpest, in_interval
+    depth, in_sharpest, in_interval, in_pose
 ):
     # one Gaussian at the origin, trained from 4 and from 8 away
     scene = replace(make_scene(1, dtype=F64), means=torch.zeros(1, 3, dtype=F64))
@@ -219,14 +227,28 @@ def test_rates_of_a_free_camera_are_compared_with_the_trained_interval(
     splats = project(scene, free)
     rates = {
         name: Matched(name).rates(splats, free, training).item()
-        for name in ("global", "sharpest", "interval")
+        for name in ("global", "sharpest", "interval", "pose")
     }
     assert rates["global"] == pytest.approx(1.0)
     assert rates["sharpest"] == pytest.approx(in_sharpest)
     assert rates["interval"] == pytest.approx(in_interval)
+    assert rates["pose"] == pytest.approx(in_pose)
 
 
-@pytest.mark.parametrize("rate", ["sharpest", "interval"])
+@pytest.mark.parametrize("scale", [4.0, 1.0, 0.95, 0.5, 0.1])
+@pytest.mark.parametrize(("pose", "highest"), [(4.0, 1.0), (4.3, 4.3 / 4), (8.0, 2.0)])
+def test_rates_at_a_pose_are_its_own_and_sharper_where_it_is_small(scale, pose, highest):
+    """One Gaussian trained from 4 and from 8 away, seen from a held-out pose of the data set."""
+    scene = replace(make_scene(1, dtype=F64), means=torch.zeros(1, 3, dtype=F64))
+    training = learn(scene, [make_camera((0.0, -4.0, 0.0)), make_camera((8.0, 0.0, 0.0))])
+    view = make_camera((0.0, -pose, 0.0))
+    view = replace(view, fx=view.fx * scale, fy=view.fy * scale)
+    rate = Matched("pose").rates(project(scene, view), view, training).item()
+    against = min(highest, SHARPER, 1 / scale) if scale < 1 else 1.0
+    assert rate == pytest.approx(scale / against)
+
+
+@pytest.mark.parametrize("rate", ["pose", "sharpest", "interval"])
 def test_gaussians_no_camera_saw_are_matched_at_the_views_own_rate(rate):
     scene = replace(make_scene(1, dtype=F64), means=torch.zeros(1, 3, dtype=F64))
     elsewhere = replace(CAMERAS[0], cx=1e4)

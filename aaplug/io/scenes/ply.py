@@ -12,7 +12,7 @@ import io
 import re
 import warnings
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 from typing import BinaryIO
@@ -23,7 +23,7 @@ from plyfile import PlyData, PlyElement
 from torch import Tensor
 
 from aaplug.errors import FormatError, OutputError, listing
-from aaplug.gaussians import Gaussians
+from aaplug.gaussians import Gaussians, PixelSizes
 from aaplug.io.atomic import replacing
 from aaplug.io.scenes.ply_header import (
     BIG,
@@ -58,6 +58,7 @@ REQUIRED = (
     *("rot_0", "rot_1", "rot_2", "rot_3"),
 )
 NORMALS = ("nx", "ny", "nz")  # unused; 3DGS writes them and some readers expect them
+SIZES = ("min_pixel_sizes", "max_pixel_sizes", "base_mask")  # Multi-Scale 3DGS', of any type
 FLOATS = ("f4", "f8")
 CHUNK = (
     1 << 12
@@ -216,6 +217,11 @@ def _check_columns(header: Header) -> list[str]:
     return [
         *([f"coding: {header.coding}"] if header.coding != LITTLE else []),
         *([f"{len(double)} columns of float64, used as float32"] if double else []),
+        *(
+            ["pixel sizes of Multi-Scale 3DGS, for --recipe multi-scale"]
+            if all(column in known for column in SIZES)
+            else []
+        ),
         *(["colours from the columns red, green, blue; no harmonics"] if coloured else []),
     ]
 
@@ -313,7 +319,8 @@ def _rows(document: Document, degree: int, flat: bool, start: int, stop: int) ->
         raise FormatError(table.path, "was cut short while it was being read")
     fields = rows.dtype.names or ()
     if _one_type(rows.dtype) and COLOURS[0] in fields:
-        return scene_of(fields, torch.from_numpy(_matrix(rows)), degree, flat)
+        scene = scene_of(fields, torch.from_numpy(_matrix(rows)), degree, flat)
+        return replace(scene, pixel_sizes=_pixel_sizes(rows))
     scene = empty(len(rows), degree, FILTER_COLUMN in fields, flat)
     targets = {c: v for c, v in columns(scene).items() if c in fields}
     for begin in range(0, len(rows), CHUNK):
@@ -322,7 +329,15 @@ def _rows(document: Document, degree: int, flat: bool, start: int, stop: int) ->
             values[part] = torch.from_numpy(rows[column][part].astype(np.float32))
         if COLOURS[0] not in fields:
             scene.sh[part, 0] = sh_of_colour(_byte_colours(rows[part]))
-    return scene
+    return replace(scene, pixel_sizes=_pixel_sizes(rows))
+
+
+def _pixel_sizes(rows: np.ndarray) -> PixelSizes | None:
+    """What Multi-Scale 3DGS recorded; writing keeps these columns as it keeps all that is no parameter."""
+    if not all(column in (rows.dtype.names or ()) for column in SIZES):
+        return None
+    smallest, largest, base = (torch.from_numpy(rows[c].astype(np.float32)) for c in SIZES)
+    return PixelSizes(smallest, largest, base > 0)
 
 
 def _one_type(dtype: np.dtype) -> bool:

@@ -1,0 +1,55 @@
+"""The tables of docs/methods.md from an evaluation's folder: python -m tests.bench.method_tables FOLDER.
+
+For every scene in it a row a recipe; each cell holds the figures at all scales, one after another.
+"""
+
+import json
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from aaplug.report import method, scale_name
+
+HEADINGS = "| recipe | PSNR, dB | SSIM | pairs, M | s |\n|---|---|---|---|---|"
+MILLION = 1e6
+
+
+def main(folder: Path) -> None:
+    """Print a table for every scene."""
+    for path in sorted(folder.glob("*/per_view.json")):
+        print(f"\n{path.parent.name}\n")
+        print("\n".join(table(json.loads(path.read_text()))))
+
+
+def table(measured: Mapping[str, Any]) -> list[str]:
+    """The lines of a scene's table, from its per_view.json."""
+    protocol = measured["_aaplug"]
+    scales = protocol["scales"]
+    recipes = dict.fromkeys(name.rsplit("@")[0] for name in measured if "@" in name)
+    views = ", ".join(protocol["view_names"])
+    lines = [f"At {', '.join(scale_name(s) for s in scales)}; views {views}.", "", HEADINGS]
+    for recipe in recipes:
+        at = [measured[method(recipe, scale)] for scale in scales]
+        cells = [
+            _joined(at, "PSNR", lambda v: f"{v:.2f}"),
+            _joined(at, "SSIM", lambda v: f"{v:.4f}"),
+            _joined(at, "pairs", lambda v: f"{v / MILLION:.1f}"),
+            _joined(at, "seconds", lambda v: f"{v:.2f}"),
+        ]
+        name = recipe if " " in recipe else f"`{recipe}`"
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    return lines
+
+
+def _joined(at: list[Mapping[str, Any]], column: str, written: Callable[[float], str]) -> str:
+    """Means over the views at each scale; one dash where there is nothing at any."""
+    means = []
+    for scale in at:
+        values = [value for value in scale[column].values() if value is not None]
+        means.append(written(sum(values) / len(values)) if values else "–")
+    return "–" if set(means) == {"–"} else " / ".join(means)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
