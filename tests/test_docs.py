@@ -10,7 +10,7 @@ from aaplug.io.scenes import FORMATS
 ROOT = Path(__file__).resolve().parents[1]
 ROWS = [
     line
-    for line in (ROOT / "docs" / "formats.md").read_text().splitlines()
+    for line in (ROOT / "examples" / "guides" / "formats.md").read_text().splitlines()
     if line.startswith("|") and "---" not in line and "proven by" not in line
 ]
 SCENES = [row for row in ROWS if row.count("|") == 6]

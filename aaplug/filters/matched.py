@@ -21,10 +21,11 @@ from aaplug.interfaces import Training
 from aaplug.splats import Splats2D
 
 # px²: one pixel seen as a Gaussian.  A box has 1/12 and Mip-Splatting takes 0.1; opaque splats side by side hide less
-# than their energies together should, and a narrower filter makes up for some of it (docs/methods.md).
+# than their energies together should, and a narrower filter makes up for some of it (examples/guides/methods.md).
 PIXEL_VARIANCE = 0.07
 
-# times: how much finer than what it is compared with a receding view may come to be compared (docs/methods.md)
+# times: how much finer than its own start the rate may come to be that a receding view is compared with
+# (examples/guides/methods.md)
 SHARPER = 1.2
 
 RateChoice = Literal["pose", "global", "sharpest", "interval"]

@@ -1,4 +1,4 @@
-"""The tables of docs/methods.md from an evaluation's folder: python -m tests.bench.method_tables FOLDER.
+"""The tables of examples/guides/methods.md from an evaluation's folder: python -m tests.bench.method_tables FOLDER.
 
 For every scene in it a row a recipe; each cell holds the figures at all scales, one after another.
 """
