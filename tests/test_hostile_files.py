@@ -34,14 +34,14 @@ def test_damage_does_no_harm(tmp_path: Path, name: str):
     assert found["refused"] > 0
 
 
+@pytest.mark.parametrize("name", NAMES)
 @given(data=st.data())
 @settings(
-    max_examples=max(25, MUTATIONS),
+    max_examples=MUTATIONS,
     deadline=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
-def test_whatever_hypothesis_thinks_of_does_no_harm(tmp_path: Path, data: st.DataObject):
-    name = data.draw(st.sampled_from(NAMES))
+def test_whatever_hypothesis_thinks_of_does_no_harm(tmp_path: Path, name: str, data: st.DataObject):
     content = bytearray(content_of(name, tmp_path))
     for _ in range(data.draw(st.integers(1, 3))):
         at = data.draw(st.integers(0, len(content)))
