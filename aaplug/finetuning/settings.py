@@ -47,7 +47,7 @@ QUICK = replace(  # a conversion's: a few minutes; its weights are against the o
     name="quick",
     steps=300,
     weights={0.5: 1.0, 0.25: 1.0, 0.125: 1.0},
-    anchor=3.0,
+    anchor=4.0,
     rates={name: GENTLE * rate for name, rate in RATES.items()},
 )
 
