@@ -672,7 +672,7 @@ def _backward(
             else:
                 owners, added = _sums_by_autograd(ALPHA[pixel], *splats, moves, by_colour)
             owners = owners.view(-1, 1).expand(-1, drawing.shape[1])
-            total.scatter_add_(0, owners, added.view(-1, drawing.shape[1]))
+            total.scatter_add_(0, owners, added.reshape(-1, drawing.shape[1]))
         rest.index_copy_(0, turn.tiles, left)
     return total
 
