@@ -134,7 +134,7 @@ def _check(options: Convert) -> None:
 
 
 def _fitted(options: Convert, scene: Gaussians, target: str) -> int:
-    """Convert for a viewer: the closed form, some steps from there, and what is left."""
+    """Convert for a viewer: the closed form, or the original where that is not better, some steps, what is left."""
     viewer = VIEWERS[target]
     cameras = options.cameras.read(options.scene)
     background = options.viewing.background_of(cameras)
@@ -151,6 +151,9 @@ def _fitted(options: Convert, scene: Gaussians, target: str) -> int:
         truth,
     )
     settings = balanced(settings, _errors(before))
+    if settings.steps and _worse(before, "closed form"):
+        say("the closed form is worse than the original at some scale: starting from the original")
+        start = fuse_stored(scene)
     job = Job(start, training, recipe, cameras.train, truth, settings, rasterizer, background)
     state, done = tune(job)
     if not done:
@@ -166,13 +169,13 @@ def _fitted(options: Convert, scene: Gaussians, target: str) -> int:
 
     report = judge(converted)
     for share in SHARES if state.step else ():
-        if not _worse(report):
+        if not _worse(report, "converted"):
             break
         say(f"worse than the original at some scale: {share:g} of the way from it instead")
         converted = _partly(scene, tuned, share)
         _write(replace(options, overwrite=True), converted)
         report = judge(converted)
-    if state.step and _worse(report):
+    if state.step and _worse(report, "converted"):
         say("still worse than the original at some scale: read the table before you use the file")
     fused = "; ".join(describe(fusion) for fusion in converted.fused) or "nothing"
     if options.json:
@@ -211,10 +214,10 @@ def _partly(scene: Gaussians, tuned: Gaussians, share: float) -> Gaussians:
     return replace(between(fuse_stored(scene), tuned, share), fused=(*earlier, partly))
 
 
-def _worse(report: Report) -> bool:
-    """Whether the converted scene is below the original at any scale."""
+def _worse(report: Report, name: str) -> bool:
+    """Whether a candidate is below the original at any scale."""
     for scale in report.scales:
-        names = ("original", "converted")
+        names = ("original", name)
         before, after = (mean(report.select(name, scale), PSNR.name) for name in names)
         if after is not None and (before is None or after < before):  # None is equal to the truth
             return True
