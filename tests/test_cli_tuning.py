@@ -5,10 +5,12 @@ import json
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import pytest
+from aaplug_cli import convert
 
 from aaplug.finetuning import tuning
 from aaplug.gaussians import MIP
@@ -155,6 +157,18 @@ def test_convert_for_the_rule_of_training_fits_nothing(cli):
     assert (code, json.loads(out)["fused"]) == (0, [])
     assert "there is nothing to fit" in err
     assert Path("c.ply").read_bytes() == Path("scene.ply").read_bytes()
+
+
+def test_convert_starts_from_the_original_where_the_closed_form_is_worse(cli, monkeypatch):
+    def dim(scene, training, viewer):
+        return replace(scene, logit_opacities=scene.logit_opacities - 5, convention=MIP)
+
+    monkeypatch.setattr(convert, "convert_for", dim)
+    asked = "convert scene.ply --cameras . -o c.ply --for mip-viewer --steps 1"
+    code, _, err = cli(asked)
+    assert (code, "starting from the original" in err) == (0, True)
+    original, found = (read_scene(Path(name)).logit_opacities for name in ("scene.ply", "c.ply"))
+    assert (found - original).abs().max() < 1
 
 
 def test_convert_says_what_it_could_not_better(cli):
