@@ -105,12 +105,15 @@ def build(
     missing = [kernel.name for kernel in KERNELS if _load(kernel) is None]
     progress(total - len(missing), total)
     if missing:
-        _check_compiler()
+        if not has_compiler():
+            raise UsageError(
+                "warmup", "needs a C++ compiler (g++ or clang++) for torch to compile with"
+            )
         processes = min(torch.get_num_threads(), MOST_PROCESSES, len(missing))
         pool = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"))
         try:
             # backwards, because the largest are the last
-            built = as_completed([pool.submit(_build_named, name) for name in missing[::-1]])
+            built = as_completed([pool.submit(_build, name) for name in missing[::-1]])
             for done, future in enumerate(built, start=total - len(missing) + 1):
                 future.result()
                 progress(done, total)
@@ -177,20 +180,9 @@ def _close(found: torch.Tensor, expected: torch.Tensor) -> bool:
     return bool((found - expected).abs().max() <= TOLERANCE * (1 + expected.abs().max()))
 
 
-def _check_compiler() -> None:
-    if not has_compiler():
-        raise UsageError(
-            "warmup", "needs a C++ compiler (g++ or clang++) for torch to compile with"
-        )
-
-
-def _build_named(name: str) -> None:
+def _build(name: str) -> None:
     """Build one of the kernels, by its name, which other processes know too."""
-    _build({kernel.name: kernel for kernel in KERNELS}[name])
-
-
-def _build(kernel: Kernel) -> None:
-    _check_compiler()
+    kernel = next(kernel for kernel in KERNELS if kernel.name == name)
     path = _path(kernel)
     sizes = {
         name: torch.export.Dim(f"size_{name}", min=2, max=LARGEST_SIZE)

@@ -17,7 +17,7 @@ Bands of tile rows bound the memory: as many as the budget has room for candidat
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
@@ -72,7 +72,7 @@ def _root_of_exp2(squarings: int, degree: int) -> tuple[float, ...]:
 SQUARINGS = 3
 ROOT_OF_EXP2 = _root_of_exp2(SQUARINGS, degree=6)  # relative error of the power: 1e-6 in float32
 
-# columns of a splat's drawing parameters; the last two only where alpha is a mean over the pixel
+# columns of a splat's drawing parameters; the last three only where alpha is a mean over the pixel
 UX, UY, VX, VY, X, Y, OPACITY, RED, GREEN, BLUE, HALF_U, HALF_V, SLOPE = range(13)
 TILT_X, TILT_Y, LOW_PASS_WIDTH = HALF_U, HALF_V, SLOPE  # of a disc
 COLUMNS, MEAN_COLUMNS = 10, 13
@@ -141,14 +141,13 @@ def drawing_of(
 ) -> Float[Tensor, "m c"]:
     """Linear forms, centre, opacity and colour of each splat, and a last row that draws nothing."""
     assert splats.rgb is not None
-    columns = (splats.means, splats.covs, splats.dets, splats.opacities, splats.rgb)
     if pixel == "point":
+        columns = (splats.means, splats.covs, splats.dets, splats.opacities, splats.rgb)
         (rows,) = kernels.run(DRAWING, *columns)
     elif pixel in SURFELS:
-        assert splats.tilts is not None
-        rows = _disc_rows(*columns, splats.tilts, splats.window)
+        rows = _disc_rows(splats, splats.rgb)
     else:
-        rows = _mean_rows(*columns, splats.window, square=pixel == "square")
+        rows = _mean_rows(splats, splats.rgb, square=pixel == "square")
     nothing = rows.new_zeros(1, rows.shape[1])
     nothing[:, OPACITY] = LOG2_SILENT if pixel == "point" else 0.0
     return torch.cat([rows, nothing])
@@ -167,46 +166,38 @@ def _drawing_rows(
     return (torch.stack(columns, dim=1),)
 
 
-def _mean_rows(
-    means: Float[Tensor, "m 2"],
-    covs: Float[Tensor, "m 3"],
-    dets: Float[Tensor, " m"],
-    opacities: Float[Tensor, " m"],
-    rgb: Float[Tensor, "m 3"],
-    window: float,
-    square: bool,
-) -> Float[Tensor, "m 13"]:
+def _mean_rows(splats: Splats2D, rgb: Float[Tensor, "m 3"], square: bool) -> Float[Tensor, "m 13"]:
     """Rows for means over pixels: two forms, and the half windows along them, in standard deviations.
 
     The forms run along the splat's own axes; over a square the second along x or y, whichever the splat is longer in,
     and the first across it, with what it changes over the window along the second.
     """
+    window = splats.window
     if square:
-        ux, uy, vx, vy = whitening_columns(covs, dets)
+        ux, uy, vx, vy = whitening_columns(splats.covs, splats.dets)
         along_x = vx > 0
         across, slope = torch.where(along_x, uy, ux), torch.where(along_x, ux, uy)
         halves = [0.5 * window * across, 0.5 * window * (vx + vy), window * slope]
     else:
-        ux, uy, vx, vy = principal_columns(covs, dets)
+        ux, uy, vx, vy = principal_columns(splats.covs, splats.dets)
         halves = [0.5 * window * torch.hypot(x, y) for x, y in ((ux, uy), (vx, vy))]
         halves.append(torch.zeros_like(ux))
-    columns = [ux, uy, vx, vy, *means.unbind(dim=1), opacities, *rgb.unbind(dim=1), *halves]
-    return torch.stack(columns, dim=1)
+    return _rows_of(splats, rgb, [ux, uy, vx, vy], halves)
 
 
-def _disc_rows(
-    means: Float[Tensor, "m 2"],
-    covs: Float[Tensor, "m 3"],
-    dets: Float[Tensor, " m"],
-    opacities: Float[Tensor, " m"],
-    rgb: Float[Tensor, "m 3"],
-    tilts: Float[Tensor, "m 2"],
-    window: float,
-) -> Float[Tensor, "m 13"]:
+def _disc_rows(splats: Splats2D, rgb: Float[Tensor, "m 3"]) -> Float[Tensor, "m 13"]:
     """Rows for discs: a whitening, the tilt, and the low-pass filter's width."""
-    forms = whitening_columns(covs, dets)
-    rest = [*tilts.unbind(dim=1), torch.full_like(opacities, max(window, NARROWEST))]
-    return torch.stack([*forms, *means.unbind(1), opacities, *rgb.unbind(1), *rest], dim=1)
+    assert splats.tilts is not None
+    width = torch.full_like(splats.opacities, max(splats.window, NARROWEST))
+    forms = whitening_columns(splats.covs, splats.dets)
+    return _rows_of(splats, rgb, forms, [*splats.tilts.unbind(dim=1), width])
+
+
+def _rows_of(
+    splats: Splats2D, rgb: Float[Tensor, "m 3"], forms: Sequence[Tensor], rest: Sequence[Tensor]
+) -> Float[Tensor, "m 13"]:
+    columns = [*forms, *splats.means.unbind(dim=1), splats.opacities, *rgb.unbind(dim=1), *rest]
+    return torch.stack(columns, dim=1)
 
 
 # --------------------------------------------------------------------------------------------------------- binning
