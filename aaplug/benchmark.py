@@ -22,8 +22,11 @@ from aaplug.interfaces import Rasterizer, Training
 from aaplug.kernels import Kernels
 from aaplug.pipeline import learn, render
 from aaplug.projection import SH_C0, project, shade
-from aaplug.rasterizers import Tiled, tiled
+from aaplug.rasterizers import Tiled
+from aaplug.rasterizers.binning import TILE, bands
+from aaplug.rasterizers.compositing import composite
 from aaplug.rasterizers.counting import Counting
+from aaplug.rasterizers.tiled import drawing_of
 from aaplug.recipes import Recipe, find_recipe
 from aaplug.splats import drawn
 
@@ -195,15 +198,15 @@ def _stages(
         times[name] = _timed(work, repeats)
         return work()
 
-    hw, grid = camera.hw, (-(-camera.height // tiled.TILE), -(-camera.width // tiled.TILE))
+    hw, grid = camera.hw, (-(-camera.height // TILE), -(-camera.width // TILE))
     splats = stage("project", lambda: project(scene, camera, kernels))
     splats = stage("filter", lambda: recipe.screen(splats, camera, training))
     splats = stage("cull", lambda: drawn(splats, hw, kernels=kernels))
     splats = stage("shade", lambda: shade(splats, scene, camera, kernels))
-    bins = stage("bin", lambda: list(tiled.bands(splats, grid, kernels)))
-    drawing = stage("forms", lambda: tiled.drawing_of(splats, kernels))
-    stage("composite", lambda: [tiled.composite(drawing, band, kernels) for band in bins])
-    return times, sum(int(band.counts.sum()) for band in bins) * tiled.TILE**2
+    bins = stage("bin", lambda: list(bands(splats, grid, kernels)))
+    drawing = stage("forms", lambda: drawing_of(splats, kernels))
+    stage("composite", lambda: [composite(drawing, band, kernels) for band in bins])
+    return times, sum(int(band.counts.sum()) for band in bins) * TILE**2
 
 
 def _timed(work: Callable[[], Any], repeats: int) -> float:

@@ -27,7 +27,7 @@ from aaplug import projection, splats
 from aaplug.errors import UsageError, listing
 from aaplug.interfaces import Rasterizer
 from aaplug.kernels import CompiledKernels, Kernel, Package
-from aaplug.rasterizers import RASTERIZERS, Tiled, pixels, tiled
+from aaplug.rasterizers import RASTERIZERS, Tiled, binning, compositing, pixels, tiled
 
 KERNELS: tuple[Kernel, ...] = (
     projection.PROJECT,
@@ -36,13 +36,14 @@ KERNELS: tuple[Kernel, ...] = (
     *projection.SHADE_BACKWARD.values(),
     splats.INSIDE,
     tiled.DRAWING,
-    tiled.TABLE,
-    tiled.SPANS,
-    tiled.PAIRS,
-    tiled.COMPOSITE["point"],
-    tiled.COMPOSITE["integral"],
-    tiled.CHUNK_BACKWARD["point"],
-    tiled.CHUNK_SUMS,
+    binning.TABLE,
+    binning.SPANS,
+    binning.PAIRS,
+    compositing.OWNERS,
+    compositing.COMPOSITE["point"],
+    compositing.COMPOSITE["integral"],
+    compositing.CHUNK_BACKWARD["point"],
+    compositing.CHUNK_SUMS,
 )
 OPTIONS = {
     "max_fusion_size": 1_000_000,  # a pass is one loop, however many operations it has
@@ -59,9 +60,8 @@ TOLERANCE = (
 
 def cache_folder() -> Path:
     """Where the packages of this version on this processor are."""
-    source = "".join(
-        inspect.getsource(module) for module in (kernels_module, projection, splats, pixels, tiled)
-    )
+    modules = (kernels_module, projection, splats, pixels, binning, compositing, tiled)
+    source = "".join(inspect.getsource(module) for module in modules)
     facts = [torch.__version__, torch.backends.cpu.get_cpu_capability(), source, str(OPTIONS)]
     key = hashlib.sha256("\0".join(facts).encode()).hexdigest()[:16]
     return Path(platformdirs.user_cache_dir("aaplug", appauthor=False)) / f"kernels-{key}"
@@ -170,7 +170,7 @@ def _load(kernel: Kernel) -> Package | None:
             found = [*package(list(args)), *args]
             expected = [*kernel.function(*twins), *twins]
         close = all(_close(a, b) for a, b in zip(found, expected, strict=True))
-        return Package(package, tuple(arg.dtype for arg in args)) if close else None
+        return Package.of(package, args) if close else None
     except Exception:  # a broken package can fail in any way; it is built anew
         return None
 

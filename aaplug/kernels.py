@@ -77,16 +77,21 @@ class Kernels:
 
 @dataclass(frozen=True)
 class Package:
-    """A kernel compiled for arguments of these types on a CPU."""
+    """A kernel compiled for arguments on a CPU of these types, and shapes after the leading size."""
 
     run: Callable[[list[Tensor]], list[Tensor]]
-    dtypes: tuple[torch.dtype, ...]
+    types: tuple[tuple[torch.dtype, tuple[int, ...]], ...]
+
+    @staticmethod
+    def of(run: Callable[[list[Tensor]], list[Tensor]], example: tuple[Tensor, ...]) -> "Package":
+        """What was compiled for an example."""
+        return Package(run, tuple((arg.dtype, arg.shape[1:]) for arg in example))
 
     def takes(self, args: tuple[Tensor, ...]) -> bool:
         """Whether it can run these; sizes of one are a case of their own to compilers."""
         return all(
-            arg.dtype == dtype and arg.device.type == "cpu" and len(arg) > 1
-            for arg, dtype in zip(args, self.dtypes, strict=True)
+            (arg.dtype, arg.shape[1:]) == of and arg.device.type == "cpu" and len(arg) > 1
+            for arg, of in zip(args, self.types, strict=True)
         )
 
 
@@ -94,7 +99,7 @@ class CompiledKernels(Kernels):
     """Runs what was compiled where it can, and everything else eagerly: gradients, precisions, devices."""
 
     name = "compiled"
-    tiles = 4096
+    tiles = 2048
 
     def __init__(
         self,

@@ -23,7 +23,7 @@ from aaplug.io.scenes import SpzAxes, find_scene, open_scene
 from aaplug.io.scenes.scene_file import SceneFile
 from aaplug.pipeline import learn
 from aaplug.rasterizers import Tiled
-from aaplug.rasterizers.tiled import MEMORY
+from aaplug.rasterizers.binning import MEMORY
 from aaplug.recipes import SAMPLING, Recipe, find_recipe
 from aaplug.sampling import MIN_SEEN_SHARE, check_frame
 

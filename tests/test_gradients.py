@@ -11,7 +11,7 @@ from aaplug.cameras import Camera
 from aaplug.filters import SCREEN_FILTERS, WORLD_FILTERS
 from aaplug.gaussians import Gaussians
 from aaplug.pipeline import learn, render, smooth
-from aaplug.rasterizers import RASTERIZERS, Reference, Tiled
+from aaplug.rasterizers import RASTERIZERS, Reference, Tiled, compositing
 from aaplug.recipes import RECIPES, Recipe
 from tests.conftest import make_camera, make_scene, make_splats, sized
 
@@ -101,6 +101,19 @@ def test_stacked_capped_and_faint_splats_have_the_judges_gradients():
         )
     for a, b in zip(*found, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-9)
+
+
+def test_parts_summed_a_few_at_a_time_are_the_same_gradients(monkeypatch):
+    splats = make_splats(400, (17, 26), seed=2).to(F64)
+
+    def of_means() -> Tensor:
+        means = splats.means.clone().requires_grad_()
+        image = Tiled()(replace(splats, means=means), (17, 26), (0.0, 0.0, 0.0))
+        return torch.autograd.grad(image.rgb.square().sum(), means)[0]
+
+    whole = of_means()
+    monkeypatch.setattr(compositing, "PARTS_AT_ONCE", 200)
+    torch.testing.assert_close(of_means(), whole, rtol=1e-12, atol=1e-12)
 
 
 def test_compiled_gradients_are_the_eager_ones():

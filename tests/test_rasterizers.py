@@ -14,7 +14,7 @@ import torch
 
 from aaplug.interfaces import Rasterizer
 from aaplug.kernels import EAGER
-from aaplug.rasterizers import Tiled, reference, tiled
+from aaplug.rasterizers import Tiled, binning, compositing, reference
 from aaplug.splats import Splats2D, reach
 from tests.conftest import ALL_RASTERIZERS, make_splats
 
@@ -370,15 +370,15 @@ def test_a_smaller_memory_changes_nothing():
     splats = make_splats(200, hw, 6, (0.0, 3.0))
     whole = TILED(splats, hw, SKY)
     for pairs in (1, 30, 500):
-        parts = Tiled(memory=float(pairs * tiled.PAIR_BYTES))(splats, hw, SKY)
+        parts = Tiled(memory=float(pairs * binning.PAIR_BYTES))(splats, hw, SKY)
         assert parts.rgb.equal(whole.rgb)
         assert parts.alpha.equal(whole.alpha)
 
 
 def test_exactly_the_tiles_that_the_ellipses_reach_are_paired():
     grid = (9, 11)
-    splats = make_splats(300, (9 * tiled.TILE, 11 * tiled.TILE), 5, (-2.0, 3.5)).to(F64)
-    bins = next(tiled.bands(splats, grid, EAGER))
+    splats = make_splats(300, (9 * binning.TILE, 11 * binning.TILE), 5, (-2.0, 3.5)).to(F64)
+    bins = next(binning.bands(splats, grid, EAGER))
     listed = torch.zeros(300, grid[0] * grid[1], dtype=torch.bool)
     for tile, (first, count) in enumerate(zip(bins.first, bins.counts, strict=True)):
         mine = bins.splats[first : first + count].long()
@@ -389,14 +389,14 @@ def test_exactly_the_tiles_that_the_ellipses_reach_are_paired():
     xx, xy, yy = (column[:, None] for column in splats.covs.unbind(dim=1))
     conic = yy / splats.dets[:, None], -xy / splats.dets[:, None], xx / splats.dets[:, None]
     for tile in range(grid[0] * grid[1]):
-        corner = torch.tensor([tile % grid[1], tile // grid[1]]) * tiled.TILE + 0.5
+        corner = torch.tensor([tile % grid[1], tile // grid[1]]) * binning.TILE + 0.5
         least = torch.full((300,), math.inf, dtype=F64)
         low = corner - splats.means
-        high = low + tiled.TILE - 1
+        high = low + binning.TILE - 1
         inside = ((low <= 0) & (high >= 0)).all(dim=1)
         for fixed in (0, 1):
             for side in (low, high):
-                along = low[:, 1 - fixed, None] + (tiled.TILE - 1) * steps
+                along = low[:, 1 - fixed, None] + (binning.TILE - 1) * steps
                 across = side[:, fixed, None].expand_as(along)
                 dx, dy = (across, along) if fixed == 0 else (along, across)
                 distance = conic[0] * dx * dx + 2 * conic[1] * dx * dy + conic[2] * dy * dy
@@ -411,9 +411,9 @@ def test_exactly_the_tiles_that_the_ellipses_reach_are_paired():
 def test_the_polynomial_that_compiled_loops_use_is_exp2(monkeypatch):
     exponents = torch.linspace(-12, 0.5, 100_001)[:, None]
     monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)
-    compiled = tiled._audible_exp2(exponents)
+    compiled = compositing._audible_exp2(exponents)
     exact = torch.exp2(exponents.double())
-    heard = exponents >= tiled.LOG2_MIN_ALPHA
+    heard = exponents >= compositing.LOG2_MIN_ALPHA
     assert compiled[~heard].eq(0).all()
     relative = compiled[heard].double() / exact[heard] - 1
     assert relative.abs().max() < 2e-6

@@ -3,7 +3,8 @@
 from torch import Tensor
 
 from aaplug.kernels import Kernel, Kernels
-from aaplug.rasterizers import tiled
+from aaplug.rasterizers.binning import PASS, TILE
+from aaplug.rasterizers.compositing import COMPOSITE
 
 
 class Counting(Kernels):
@@ -14,6 +15,6 @@ class Counting(Kernels):
 
     def run(self, kernel: Kernel, *args: Tensor) -> tuple[Tensor, ...]:
         """Run a kernel."""
-        if kernel in tiled.COMPOSITE.values():
-            self.pairs += len(args[2]) * tiled.PASS * tiled.TILE**2
+        if kernel in COMPOSITE.values():
+            self.pairs += len(args[2]) * PASS * TILE**2
         return self._kernels.run(kernel, *args)

@@ -1,0 +1,589 @@
+"""Compositing: the splats of every tile over each other, as elementwise array code that compiles to one loop.
+
+t: tiles; K: splats a pass; P: pixels a tile; c: columns of a drawing row.
+
+Tiles are composited K splats a pass, those with most splats first, so that the ones that are done are the last; tiles
+whose pixels are all saturated leave now and then.
+
+The backward pass goes through the passes from the last.  With B the light from behind a splat, were the pixel clear
+down to there, ∂L/∂alpha_k = T_k (g·c_k − B_k) and B_{k−1} = B_k + alpha_k (g·c_k − B_k).  T at each pass's start is
+all that is kept.  (Carrying what is left of Σ g·w·c from the front would need a division by 1 − alpha, and loses digits
+where that is small.)
+"""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn import functional
+
+from aaplug.interfaces import PixelKernel
+from aaplug.kernels import Kernel, Kernels
+from aaplug.rasterizers.binning import PASS, TILE, Bins
+from aaplug.rasterizers.pixels import CELLS, mean_gaussian, mean_logistic
+from aaplug.rasterizers.rules import MAX_ALPHA, MIN_TRANSMITTANCE
+from aaplug.rasterizers.surfels import disc, smoothed_disc
+from aaplug.splats import MIN_ALPHA
+
+PIXELS = TILE * TILE
+CHECK_EVERY = 4  # passes between looks at which tiles are saturated
+COMPACT_BELOW = 3 / 4  # share of tiles still going at which the others leave
+PARTS_AT_ONCE = 1 << 21  # of some 100 bytes
+LN_2 = math.log(2)
+LOG2_SILENT = -9.0  # log2 of an alpha below 1/255; stops exp2 before it underflows, which is slow
+LOG2_MIN_ALPHA = torch.tensor(MIN_ALPHA).log2().item()
+
+# `threshold` keeps what is above its bound; these keep what is at the bound as well.
+BELOW_MIN_ALPHA = torch.nextafter(torch.tensor(MIN_ALPHA), torch.tensor(0.0)).item()
+BELOW_MIN_TRANSMITTANCE = torch.nextafter(torch.tensor(MIN_TRANSMITTANCE), torch.tensor(0.0)).item()
+SURELY = 1e9  # times anything that is not 0 here is over 1
+
+
+def _root_of_exp2(squarings: int, degree: int) -> tuple[float, ...]:
+    """Coefficients of a polynomial in h ≥ 0 that, squared some times, is 2^(LOG2_SILENT + h), for exponents up to 0.
+
+    It goes through the Chebyshev nodes, as good polynomials do, and has no floor, bits or calls in it.
+    """
+    angles = math.pi * (torch.arange(degree + 1, dtype=torch.float64) + 0.5) / (degree + 1)
+    h = -LOG2_SILENT / 2 * (1 + angles.cos())
+    values = torch.exp2((LOG2_SILENT + h) / 2**squarings)
+    return tuple(torch.linalg.solve(torch.linalg.vander(h), values).tolist())
+
+
+SQUARINGS = 3
+ROOT_OF_EXP2 = _root_of_exp2(SQUARINGS, degree=6)  # relative error of the power: 1e-6 in float32
+
+# columns of a splat's drawing parameters; the last three only where alpha is a mean over the pixel
+UX, UY, VX, VY, X, Y, OPACITY, RED, GREEN, BLUE, HALF_U, HALF_V, SLOPE = range(13)
+TILT_X, TILT_Y, LOW_PASS_WIDTH = HALF_U, HALF_V, SLOPE  # of a disc
+COLUMNS, MEAN_COLUMNS = 10, 13
+
+
+def composite(
+    drawing: Float[Tensor, "m c"], bins: Bins, kernels: Kernels, pixel: PixelKernel = "point"
+) -> Float[Tensor, "4 t P"]:
+    """Premultiplied red, green, blue, and alpha, of every pixel of every tile.
+
+    drawing: parameters by column; its last row draws nothing.
+    """
+    if drawing.requires_grad and torch.is_grad_enabled():
+        return _Composite.apply(drawing, bins, kernels, pixel)  # pyright: ignore[reportReturnType]
+    return _forward(drawing, bins, kernels, pixel)
+
+
+@dataclass(frozen=True)
+class _Turn:
+    """What was composited between two looks at which tiles are done.
+
+    splats: first and after last of each tile, from where the turn began.  before: of each pass the transmittance of
+    the tiles, the first of `tiles`, that took part.
+    """
+
+    tiles: Int[Tensor, " t"]
+    splats: tuple[Int[Tensor, " t"], Int[Tensor, " t"]]
+    origins: Float[Tensor, "t 2"]
+    before: list[Float[Tensor, "n P"]]
+
+
+def _forward(
+    drawing: Float[Tensor, "m c"],
+    bins: Bins,
+    kernels: Kernels,
+    pixel: PixelKernel,
+    turns: list[_Turn] | None = None,
+) -> Float[Tensor, "4 all P"]:
+    """The image; the turns that made it are put into `turns`, in order."""
+    image = drawing.new_zeros(4, len(bins.counts), PIXELS)
+    order = torch.sort(bins.counts, descending=True, stable=True).indices
+    order = order[: int((bins.counts > 0).sum())]
+    for tiles in order.split(kernels.tiles):
+        _composite_block(drawing, bins, tiles, image, kernels, COMPOSITE[pixel], turns)
+    return image
+
+
+def _composite_block(
+    drawing: Float[Tensor, "m c"],
+    bins: Bins,
+    tiles: Int[Tensor, " t"],
+    image: Float[Tensor, "4 all P"],
+    kernels: Kernels,
+    chunk: Kernel,
+    turns: list[_Turn] | None,
+) -> None:
+    """Composite some tiles, longest first, into the image, until they are drawn out or saturated."""
+    local = pixel_centres(drawing)
+    state = drawing.new_zeros(5, len(tiles), PIXELS)
+    state[0] = 1
+    start = 0
+    while len(tiles):
+        columns = [x.index_select(0, tiles) for x in (bins.first, bins.counts, bins.origins)]
+        first, counts, origins = columns
+        at, ends, ones = first + start, first + counts, torch.ones_like(origins[:, 0])
+        going = _going(counts - start)
+        left, before = tiles[:0], []
+        if turns is not None:
+            turns.append(_Turn(tiles, (at, ends), origins, before))
+        for turn, n in enumerate(going):
+            if turns is not None:
+                before.append(state[0, :n].clone())
+            where = (bins.splats, at[:n] + turn * PASS, ends[:n], origins[:n])
+            kernels.run(chunk, drawing, *where, *state[:, :n].unbind(), *local, ones[:n])
+            start += PASS
+            if turn % CHECK_EVERY == CHECK_EVERY - 1 and turn + 1 < len(going):
+                alive = state[0, : going[turn + 1]].amax(dim=1) > 0
+                if int(alive.sum()) < COMPACT_BELOW * len(alive):
+                    left = alive.nonzero().squeeze(1)
+                    break
+        image.index_copy_(1, tiles, state[1:])
+        tiles, state = tiles.index_select(0, left), state.index_select(1, left)
+
+
+def _going(counts: Int[Tensor, " t"]) -> list[int]:
+    """How many tiles take part in each pass, from their splats, most first."""
+    passes = (counts + (PASS - 1)) // PASS
+    turns = torch.arange(int(passes[0]), device=counts.device)
+    return (len(passes) - torch.searchsorted(passes.flip(0), turns, right=True)).tolist()
+
+
+def _owners(
+    drawing: Float[Tensor, "m c"],
+    ids: Int[Tensor, " p"],
+    at: Int[Tensor, " t"],
+    ends: Int[Tensor, " t"],
+) -> tuple[Int[Tensor, "t K"]]:
+    """The splats at to at + K of each tile; after its last the one that draws nothing."""
+    place = at[:, None] + torch.arange(PASS, device=at.device)
+    return (torch.where(place < ends[:, None], ids[place], drawing.shape[0] - 1),)
+
+
+def _rows(drawing: Float[Tensor, "m c"], owners: Int[Tensor, "t K"]) -> Float[Tensor, "t K c"]:
+    """Parameters of splats."""
+    return drawing.index_select(0, owners.flatten()).view(*owners.shape, -1)
+
+
+def pixel_centres(like: Tensor) -> tuple[Float[Tensor, " P"], Float[Tensor, " P"]]:
+    """x and y of a tile's pixel centres, from its corner."""
+    offset = torch.arange(TILE, dtype=like.dtype, device=like.device) + 0.5
+    y, x = torch.meshgrid(offset, offset, indexing="ij")
+    return x.flatten(), y.flatten()
+
+
+class _Pixels(NamedTuple):
+    """Where the pixels of tiles are: the tiles' corners, and the centres of a tile's pixels from its corner, in px."""
+
+    corners: Float[Tensor, "t 2"]
+    x: Float[Tensor, " P"]
+    y: Float[Tensor, " P"]
+
+
+AlphaOf = Callable[[Tensor, _Pixels], Tensor]  # of one row or several a tile, at its pixels
+
+
+def _chunk(
+    alpha_of: AlphaOf,
+    drawing: Float[Tensor, "m c"],
+    ids: Int[Tensor, " p"],
+    at: Int[Tensor, " t"],
+    ends: Int[Tensor, " t"],
+    origins: Float[Tensor, "t 2"],
+    T: Float[Tensor, "t P"],
+    red: Float[Tensor, "t P"],
+    green: Float[Tensor, "t P"],
+    blue: Float[Tensor, "t P"],
+    hidden: Float[Tensor, "t P"],
+    local_x: Float[Tensor, " P"],
+    local_y: Float[Tensor, " P"],
+    one: Float[Tensor, " t"],
+) -> tuple[()]:
+    """Composite splats at to at + K of each tile into its transmittance (0 once a pixel has stopped), colour and alpha.
+
+    one: ones; a column of them in each step keeps the compiler to one loop over tiles.
+    """
+    one = one[:, None]
+    before = T
+    if torch.compiler.is_compiling():  # each is loaded where it is needed
+        rows = [drawing[torch.where(at + k < ends, ids[at + k], -1)] for k in range(PASS)]
+    else:
+        rows = _rows(drawing, *_owners(drawing, ids, at, ends)).unbind(dim=1)
+    for row, alpha in _splats(alpha_of, rows, _Pixels(origins, local_x, local_y)):
+        after = before * _left(alpha, one)
+        weight = _where_above(BELOW_MIN_TRANSMITTANCE, after, _taken(before, after, one))
+        before = after
+        red.addcmul_(weight, row[:, RED, None])
+        green.addcmul_(weight, row[:, GREEN, None])
+        blue.addcmul_(weight, row[:, BLUE, None])
+        hidden.add_(weight)
+    T.copy_(torch.threshold(one * before, BELOW_MIN_TRANSMITTANCE, 0.0))
+    return ()
+
+
+def _splats(
+    alpha_of: AlphaOf, rows: Sequence[Float[Tensor, "t c"]], pixels: _Pixels
+) -> Iterator[tuple[Float[Tensor, "t c"], Float[Tensor, "t P"]]]:
+    """Row and alpha of K splats of each tile in turn.
+
+    Array code finds the alphas of all at once, a compiled loop each where it is needed.
+    """
+    if torch.compiler.is_compiling():
+        for row in rows:
+            yield row, alpha_of(row, pixels)
+    else:
+        yield from zip(rows, alpha_of(torch.stack(list(rows)), pixels).unbind(), strict=True)
+
+
+def _at_centre(row: Float[Tensor, "*n t c"], pixels: _Pixels) -> Float[Tensor, "*n t P"]:
+    """Alpha, before its cap, of splats at the pixels' centres."""
+    u, v = _forms(row, pixels)
+    exponent = torch.addcmul(row[..., OPACITY, None], u, u, value=-1)
+    return _audible_exp2(torch.addcmul(exponent, v, v, value=-1))
+
+
+def _forms(
+    row: Float[Tensor, "*n t c"], pixels: _Pixels
+) -> tuple[Float[Tensor, "*n t P"], Float[Tensor, "*n t P"]]:
+    """The two linear forms of splats at the pixels' centres."""
+    forms = [(row[..., i], row[..., j]) for i, j in ((UX, UY), (VX, VY))]
+    if torch.compiler.is_compiling():
+        dx, dy = _offsets(row, pixels)
+        u, v = (torch.addcmul(i[..., None] * dx, j[..., None], dy) for i, j in forms)
+    else:  # as a product of matrices, which no operation on every pixel is faster than
+        basis = torch.stack([pixels.x, pixels.y, torch.ones_like(pixels.x)])
+        x, y = row[..., X] - pixels.corners[:, 0], row[..., Y] - pixels.corners[:, 1]
+        u, v = (torch.stack([i, j, -(i * x + j * y)], dim=-1) @ basis for i, j in forms)
+    return u, v
+
+
+def _offsets(
+    row: Float[Tensor, "*n t c"], pixels: _Pixels
+) -> tuple[Float[Tensor, "*n t P"], Float[Tensor, "*n t P"]]:
+    """Of the pixels' centres from splats, in px."""
+    x, y = row[..., X] - pixels.corners[:, 0], row[..., Y] - pixels.corners[:, 1]
+    return pixels.x - x[..., None], pixels.y - y[..., None]
+
+
+def _over_pixel(
+    mean: Callable[[Tensor, Tensor], Tensor], row: Float[Tensor, "*n t c"], pixels: _Pixels
+) -> Float[Tensor, "*n t P"]:
+    """Alpha, before its cap, of splats: opacity times its means over a pixel's width along both axes."""
+    alpha = row[..., OPACITY, None]
+    for form, half in zip(_forms(row, pixels), (HALF_U, HALF_V), strict=True):
+        alpha = alpha * mean(form, row[..., half, None])
+    return torch.threshold(alpha, BELOW_MIN_ALPHA, 0.0)
+
+
+def _on_disc(
+    smoothed: bool, row: Float[Tensor, "*n t c"], pixels: _Pixels
+) -> Float[Tensor, "*n t P"]:
+    """Alpha, before its cap, of discs where the pixels' rays meet them."""
+    e = _forms(row, pixels)
+    dx, dy = _offsets(row, pixels)
+    tilts = row[..., TILT_X, None], row[..., TILT_Y, None]
+    ahead = 1 - tilts[0] * dx - tilts[1] * dy
+    if smoothed:
+        forms = tuple(row[..., i, None] for i in (UX, UY, VX, VY))
+        value = smoothed_disc(e, ahead, forms, tilts)
+    else:
+        value = disc(e, ahead, dx * dx + dy * dy, row[..., LOW_PASS_WIDTH, None])
+    return torch.threshold(row[..., OPACITY, None] * value, BELOW_MIN_ALPHA, 0.0)
+
+
+def _over_square(row: Float[Tensor, "*n t c"], pixels: _Pixels) -> Float[Tensor, "*n t P"]:
+    """Alpha, before its cap, of splats: opacity times its mean over the pixel's own square, in strips."""
+    across, along = _forms(row, pixels)
+    half_across, half_along, slope = (row[..., i, None] for i in (HALF_U, HALF_V, SLOPE))
+    total = torch.zeros_like(along)
+    for cell in range(CELLS):
+        from_middle = (cell - (CELLS - 1) / 2) / CELLS
+        share = mean_gaussian(along + 2 * from_middle * half_along, half_along / CELLS)
+        total = total + share * mean_gaussian(across + from_middle * slope, half_across)
+    return torch.threshold(row[..., OPACITY, None] * total / CELLS, BELOW_MIN_ALPHA, 0.0)
+
+
+# Array code pays for every operation and most for choosing; a compiled loop pays for calls, of which exp2 is one, and
+# for minima and maxima, which look for NaN.  So these are written for each.
+
+
+def _left(alpha: Float[Tensor, "t P"], one: Float[Tensor, "t 1"]) -> Float[Tensor, "t P"]:
+    """The share of the light that a splat lets through."""
+    least = 1 - MAX_ALPHA
+    if torch.compiler.is_compiling():
+        return torch.relu(MAX_ALPHA * one - alpha) + least
+    return (one - alpha).clamp_(min=least)
+
+
+def _taken(
+    before: Float[Tensor, "t P"], after: Float[Tensor, "t P"], one: Float[Tensor, "t 1"]
+) -> Float[Tensor, "t P"]:
+    """The light that did not get through."""
+    return one * before - after if torch.compiler.is_compiling() else before - after
+
+
+def _audible_exp2(exponent: Float[Tensor, "*n P L"]) -> Float[Tensor, "*n P L"]:
+    """2^exponent where that is at least 1/255, else 0."""
+    if torch.compiler.is_compiling():
+        root = _polynomial(torch.relu(exponent - LOG2_SILENT), ROOT_OF_EXP2)
+        return torch.where(exponent >= LOG2_MIN_ALPHA, _power(root, SQUARINGS), 0.0)
+    return torch.threshold(exponent.clamp(min=LOG2_SILENT).exp2_(), BELOW_MIN_ALPHA, 0.0)
+
+
+def _where_above(bound: float, test: Tensor, value: Tensor) -> Tensor:
+    """A value, not negative, where a test is above a bound, itself not negative; else 0."""
+    if torch.compiler.is_compiling():
+        return torch.where(test > bound, value, 0.0)
+    return torch.minimum(torch.threshold(test, bound, 0.0).mul_(SURELY), value)
+
+
+def _polynomial(x: Tensor, coefficients: tuple[float, ...]) -> Tensor:
+    *rest, last = coefficients
+    value = x * last + rest[-1]
+    for coefficient in rest[-2::-1]:
+        value = value * x + coefficient
+    return value
+
+
+def _power(x: Tensor, squarings: int) -> Tensor:
+    for _ in range(squarings):
+        x = x * x
+    return x
+
+
+# -------------------------------------------------------------------------------------------------------- backward
+
+
+class _Composite(torch.autograd.Function):
+    """Compositing with its own backward pass."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, drawing: Tensor, bins: Bins, kernels: Kernels, pixel: PixelKernel
+    ) -> Tensor:
+        turns: list[_Turn] = []
+        image = _forward(drawing, bins, kernels, pixel, turns)
+        ctx.save_for_backward(drawing)
+        ctx.rest = (bins, turns, kernels, pixel)
+        return image
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None, None, None]:
+        (drawing,) = ctx.saved_tensors
+        return _backward(drawing, grads[0], *ctx.rest), None, None, None
+
+
+def _backward(
+    drawing: Float[Tensor, "m c"],
+    grad: Float[Tensor, "4 all P"],
+    bins: Bins,
+    turns: list[_Turn],
+    kernels: Kernels,
+    pixel: PixelKernel,
+) -> Float[Tensor, "m c"]:
+    """Gradient of the drawing parameters."""
+    local = pixel_centres(drawing)
+    monomials, grad = _monomials(*local), grad.contiguous()
+    parts = _Parts(torch.zeros_like(drawing))
+    light = torch.zeros_like(grad[0])
+    for turn in reversed(turns):
+        behind, grads = light.index_select(0, turn.tiles), grad.index_select(1, turn.tiles)
+        colours, ones = grads[:3].transpose(0, 1).contiguous(), torch.ones_like(turn.origins[:, 0])
+        at, ends = turn.splats
+        for i, before in reversed(list(enumerate(turn.before))):
+            n = len(before)
+            (owners,) = kernels.run(OWNERS, drawing, bins.splats, at[:n] + i * PASS, ends[:n])
+            rows, origins = _rows(drawing, owners), turn.origins[:n]
+            pixels = (before, behind[:n], *grads[:, :n].unbind(), *local, ones[:n])
+            weights, moves = kernels.run(CHUNK_BACKWARD[pixel], rows, origins, *pixels)
+            by_colour = torch.bmm(weights, colours[:n].mT)
+            if pixel == "point":
+                (added,) = kernels.run(CHUNK_SUMS, rows, origins, moves @ monomials, by_colour)
+            else:
+                added = _sums_by_autograd(ALPHA[pixel], rows, origins, moves, by_colour)
+            parts.add(owners, added)
+        light.index_copy_(0, turn.tiles, behind)
+    return parts.total()
+
+
+class _Parts:
+    """Adds up what tiles add to the gradients of splats.
+
+    Parts are gathered and sorted by splat, which is several times as fast as adding each where it belongs.
+    """
+
+    def __init__(self, total: Float[Tensor, "m c"]):
+        self._total, self._owners, self._added, self._room = total, [], [], PARTS_AT_ONCE
+
+    def add(self, owners: Int[Tensor, "t K"], added: Float[Tensor, "t K c"]) -> None:
+        """Add some."""
+        self._owners.append(owners.flatten())
+        self._added.append(added.flatten(0, 1))
+        self._room -= owners.numel()
+        if self._room < 0:
+            self._sum()
+
+    def total(self) -> Float[Tensor, "m c"]:
+        """All that was added."""
+        if self._owners:
+            self._sum()
+        return self._total
+
+    def _sum(self) -> None:
+        keys, order = torch.sort(torch.cat(self._owners), stable=True)
+        splats = torch.arange(len(self._total), dtype=keys.dtype, device=keys.device)
+        first = torch.searchsorted(keys, splats)
+        self._total += functional.embedding_bag(order, torch.cat(self._added), first, mode="sum")
+        self._owners, self._added, self._room = [], [], PARTS_AT_ONCE
+
+
+def _monomials(x: Float[Tensor, " P"], y: Float[Tensor, " P"]) -> Float[Tensor, "P 6"]:
+    """1, x, y, x², xy, y² of a tile's pixel centres from its middle, where no digits are lost."""
+    x, y = x - TILE / 2, y - TILE / 2
+    return torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y], dim=1)
+
+
+def _chunk_backward(
+    alpha_of: AlphaOf,
+    rows: Float[Tensor, "t K c"],
+    origins: Float[Tensor, "t 2"],
+    T: Float[Tensor, "t P"],
+    behind: Float[Tensor, "t P"],
+    g_red: Float[Tensor, "t P"],
+    g_green: Float[Tensor, "t P"],
+    g_blue: Float[Tensor, "t P"],
+    g_hidden: Float[Tensor, "t P"],
+    local_x: Float[Tensor, " P"],
+    local_y: Float[Tensor, " P"],
+    one: Float[Tensor, " t"],
+) -> tuple[Float[Tensor, "t K P"], Float[Tensor, "t K P"]]:
+    """The weight of each of K splats, and the gradient of log alpha, at each pixel; puts them into `behind`."""
+    one = one[:, None]
+    before, drawn = T, []
+    for row, alpha in _splats(alpha_of, rows.unbind(dim=1), _Pixels(origins, local_x, local_y)):
+        left = _left(alpha, one)
+        after = before * left
+        hides = _where_above(BELOW_MIN_TRANSMITTANCE, after, one - left)
+        drawn.append((row, alpha, hides, before))
+        before = after
+    weights, gradients, light = [], [], behind
+    for row, alpha, hides, reaching in reversed(drawn):
+        weight = reaching * hides
+        colour = torch.addcmul(g_hidden, row[:, RED, None], g_red)
+        colour = torch.addcmul(colour, row[:, GREEN, None], g_green)
+        ahead = torch.addcmul(colour, row[:, BLUE, None], g_blue) - one * light
+        # where alpha is skipped or comes too late its weight is 0, and where it is capped it does not move
+        gradients.append(_where_above(0.0, MAX_ALPHA * one - alpha, weight) * ahead)
+        weights.append(weight)
+        light = light + hides * ahead
+    behind.copy_(one * light)
+    return torch.stack(weights[::-1], dim=1), torch.stack(gradients[::-1], dim=1)
+
+
+def _chunk_sums(
+    rows: Float[Tensor, "t K 10"],
+    origins: Float[Tensor, "t 2"],
+    moments: Float[Tensor, "t K 6"],
+    colours: Float[Tensor, "t K 3"],
+) -> tuple[Float[Tensor, "t K 10"]]:
+    """What a tile adds to the gradient of its splats' parameters, for values at points.
+
+    moments: sums over pixels of the gradient of log alpha, ln 2 (log2 o − u² − v²), times the monomials.
+    """
+    ux, uy, vx, vy, x, y, *_ = rows.unbind(dim=2)
+    dx, dy = origins[:, 0, None] + TILE / 2 - x, origins[:, 1, None] + TILE / 2 - y
+    s, sx, sy, sxx, sxy, syy = moments.unbind(dim=2)
+    forms = []
+    to_x, to_y = torch.zeros_like(s), torch.zeros_like(s)
+    for i, j in ((ux, uy), (vx, vy)):
+        middle = i * dx + j * dy
+        along = middle * s + i * sx + j * sy  # Σ s u
+        forms += [dx * along + middle * sx + i * sxx + j * sxy]  # Σ s u dx
+        forms += [dy * along + middle * sy + i * sxy + j * syy]
+        to_x, to_y = to_x + i * along, to_y + j * along
+    shape = [-2 * LN_2 * form for form in forms]
+    centre = [2 * LN_2 * to_x, 2 * LN_2 * to_y]
+    return (torch.stack([*shape, *centre, LN_2 * s, *colours.unbind(dim=2)], dim=2),)
+
+
+def _sums_by_autograd(
+    alpha_of: AlphaOf,
+    rows: Float[Tensor, "t K c"],
+    origins: Float[Tensor, "t 2"],
+    moves: Float[Tensor, "t K P"],
+    colours: Float[Tensor, "t K 3"],
+) -> Float[Tensor, "t K c"]:
+    """What `_chunk_sums` gives, for any kernel: from the gradient of log alpha by autograd of alpha."""
+    pixels = _Pixels(origins, *pixel_centres(rows))
+    with torch.enable_grad():
+        rows = rows.detach().requires_grad_()
+        alpha = alpha_of(rows.transpose(0, 1), pixels).transpose(0, 1)
+        grads = torch.where(alpha > 0, moves / alpha, 0.0).detach()
+        (added,) = torch.autograd.grad(alpha, rows, grads)
+    added[..., RED : BLUE + 1] = colours
+    return added
+
+
+# --------------------------------------------------------------------------------------------------------- kernels
+# Examples are as large as real work: the compiler decides by them which loops run in threads.
+
+EXAMPLE_TILES, EXAMPLE_SPLATS = 1024, 4096
+
+
+def _chunk_example(columns: int) -> tuple[Tensor, ...]:
+    rows, origins, *pixels = _rows_example(5, columns)
+    _, *where = _owners_example()
+    return rows.flatten(0, 1)[:EXAMPLE_SPLATS], *where, origins, *pixels
+
+
+def _rows_example(states: int, columns: int = COLUMNS) -> tuple[Tensor, ...]:
+    tiles = EXAMPLE_TILES
+    rows = torch.linspace(0.012, 0.1, tiles * PASS * columns).view(tiles, PASS, columns)
+    state = [torch.full((tiles, PIXELS), 0.5) for _ in range(states)]
+    return rows, torch.ones(tiles, 2), *state, *pixel_centres(rows), torch.ones(tiles)
+
+
+def _owners_example() -> tuple[Tensor, ...]:
+    ids = torch.arange((EXAMPLE_TILES + 1) * PASS, dtype=torch.int32) % EXAMPLE_SPLATS
+    at = torch.arange(EXAMPLE_TILES) * PASS
+    return torch.ones(EXAMPLE_SPLATS, COLUMNS), ids, at, at + PASS
+
+
+def _sums_example() -> tuple[Tensor, ...]:
+    rows, origins, *_ = _rows_example(0)
+    moments, colours = (torch.linspace(0.1, 1.0, EXAMPLE_TILES * PASS * n) for n in (6, 3))
+    return rows, origins, moments.view(-1, PASS, 6), colours.view(-1, PASS, 3)
+
+
+ALPHA: dict[PixelKernel, AlphaOf] = {
+    "point": _at_centre,
+    "integral": partial(_over_pixel, mean_gaussian),
+    "logistic": partial(_over_pixel, mean_logistic),
+    "square": _over_square,
+    "surfel": partial(_on_disc, False),
+    "surfel-mip": partial(_on_disc, True),
+}
+WIDTH: dict[PixelKernel, int] = {
+    name: COLUMNS if name == "point" else MEAN_COLUMNS for name in ALPHA
+}
+OWNERS = Kernel("owners", _owners, _owners_example, ("m", "p", "t", "t"))
+COMPOSITE: dict[PixelKernel, Kernel] = {
+    name: Kernel(
+        f"composite-{name}",
+        partial(_chunk, alpha_of),
+        partial(_chunk_example, WIDTH[name]),
+        ("m", "p", *8 * ("t",), None, None, "t"),
+    )
+    for name, alpha_of in ALPHA.items()
+}
+CHUNK_BACKWARD: dict[PixelKernel, Kernel] = {
+    name: Kernel(
+        f"composite-{name}-backward",
+        partial(_chunk_backward, alpha_of),
+        partial(_rows_example, 6, WIDTH[name]),
+        (*8 * ("t",), None, None, "t"),
+    )
+    for name, alpha_of in ALPHA.items()
+}
+CHUNK_SUMS = Kernel("composite-sums", _chunk_sums, _sums_example, ("t",) * 4)
