@@ -33,7 +33,7 @@ from aaplug.splats import MIN_ALPHA
 PIXELS = TILE * TILE
 CHECK_EVERY = 4  # passes between looks at which tiles are saturated
 COMPACT_BELOW = 3 / 4  # share of tiles still going at which the others leave
-PARTS_AT_ONCE = 1 << 21  # of some 100 bytes
+PARTS_AT_ONCE = 1 << 18  # or two a splat, lest the sums be larger than the parts
 LN_2 = math.log(2)
 LOG2_SILENT = -9.0  # log2 of an alpha below 1/255; stops exp2 before it underflows, which is slow
 LOG2_MIN_ALPHA = torch.tensor(MIN_ALPHA).log2().item()
@@ -414,7 +414,8 @@ class _Parts:
     """
 
     def __init__(self, total: Float[Tensor, "m c"]):
-        self._total, self._owners, self._added, self._room = total, [], [], PARTS_AT_ONCE
+        self._total, self._owners, self._added = total, [], []
+        self._room = self._most = max(PARTS_AT_ONCE, 2 * len(total))
 
     def add(self, owners: Int[Tensor, "t K"], added: Float[Tensor, "t K c"]) -> None:
         """Add some."""
@@ -435,7 +436,7 @@ class _Parts:
         splats = torch.arange(len(self._total), dtype=keys.dtype, device=keys.device)
         first = torch.searchsorted(keys, splats)
         self._total += functional.embedding_bag(order, torch.cat(self._added), first, mode="sum")
-        self._owners, self._added, self._room = [], [], PARTS_AT_ONCE
+        self._owners, self._added, self._room = [], [], self._most
 
 
 def _monomials(x: Float[Tensor, " P"], y: Float[Tensor, " P"]) -> Float[Tensor, "P 6"]:
