@@ -12,7 +12,7 @@ where that is small.)
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -161,7 +161,7 @@ def _owners(
     return (torch.where(place < ends[:, None], ids[place], drawing.shape[0] - 1),)
 
 
-def _rows(drawing: Float[Tensor, "m c"], owners: Int[Tensor, "t K"]) -> Float[Tensor, "t K c"]:
+def _rows(drawing: Float[Tensor, "m c"], owners: Int[Tensor, "*n"]) -> Float[Tensor, "*n c"]:
     """Parameters of splats."""
     return drawing.index_select(0, owners.flatten()).view(*owners.shape, -1)
 
@@ -206,11 +206,14 @@ def _chunk(
     """
     one = one[:, None]
     before = T
-    if torch.compiler.is_compiling():  # each is loaded where it is needed
-        rows = [drawing[torch.where(at + k < ends, ids[at + k], -1)] for k in range(PASS)]
+    pixels = _Pixels(origins, local_x, local_y)
+    if torch.compiler.is_compiling():  # each row too is loaded where it is needed
+        rows = (drawing[torch.where(at + k < ends, ids[at + k], -1)] for k in range(PASS))
+        splats = ((row, alpha_of(row, pixels)) for row in rows)
     else:
-        rows = _rows(drawing, *_owners(drawing, ids, at, ends)).unbind(dim=1)
-    for row, alpha in _splats(alpha_of, rows, _Pixels(origins, local_x, local_y)):
+        (owners,) = _owners(drawing, ids, at, ends)
+        splats = _splats(alpha_of, _rows(drawing, owners.T), pixels)
+    for row, alpha in splats:
         after = before * _left(alpha, one)
         weight = _where_above(BELOW_MIN_TRANSMITTANCE, after, _taken(before, after, one))
         before = after
@@ -223,17 +226,17 @@ def _chunk(
 
 
 def _splats(
-    alpha_of: AlphaOf, rows: Sequence[Float[Tensor, "t c"]], pixels: _Pixels
+    alpha_of: AlphaOf, rows: Float[Tensor, "K t c"], pixels: _Pixels
 ) -> Iterator[tuple[Float[Tensor, "t c"], Float[Tensor, "t P"]]]:
     """Row and alpha of K splats of each tile in turn.
 
     Array code finds the alphas of all at once, a compiled loop each where it is needed.
     """
     if torch.compiler.is_compiling():
-        for row in rows:
+        for row in rows.unbind():
             yield row, alpha_of(row, pixels)
     else:
-        yield from zip(rows, alpha_of(torch.stack(list(rows)), pixels).unbind(), strict=True)
+        yield from zip(rows.unbind(), alpha_of(rows, pixels).unbind(), strict=True)
 
 
 def _at_centre(row: Float[Tensor, "*n t c"], pixels: _Pixels) -> Float[Tensor, "*n t P"]:
@@ -462,7 +465,7 @@ def _chunk_backward(
     """The weight of each of K splats, and the gradient of log alpha, at each pixel; puts them into `behind`."""
     one = one[:, None]
     before, drawn = T, []
-    for row, alpha in _splats(alpha_of, rows.unbind(dim=1), _Pixels(origins, local_x, local_y)):
+    for row, alpha in _splats(alpha_of, rows.transpose(0, 1), _Pixels(origins, local_x, local_y)):
         left = _left(alpha, one)
         after = before * left
         hides = _where_above(BELOW_MIN_TRANSMITTANCE, after, one - left)
