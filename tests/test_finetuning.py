@@ -35,6 +35,7 @@ from aaplug.pipeline import learn, render
 from aaplug.projection import rotation_matrices
 from aaplug.rasterizers import RASTERIZERS
 from aaplug.recipes import RECIPES
+from aaplug.sampling import sampling_bounds
 from tests.conftest import make_camera, make_scene
 
 F64 = torch.float64
@@ -115,8 +116,9 @@ def test_gradients_of_the_whole_loss_are_finite_differences(loss, recipe):
     }  # away from where the training size has no error at all
 
     def total(values):
+        state = replace(begin(job), leaves=values)
         return sum(
-            w * loss_at(job, values, VIEWS[0], s)[0] for s, w in {**WEIGHTS, 1.0: 3.0}.items()
+            w * loss_at(job, state, VIEWS[0], s)[0] for s, w in {**WEIGHTS, 1.0: 3.0}.items()
         )
 
     moving = {name: value.clone().requires_grad_() for name, value in leaves.items()}
@@ -143,9 +145,9 @@ def test_steps_lower_the_loss_at_every_scale():
     job = make_job(60, replace(SETTINGS, steps=24))
 
     def losses(scene: Gaussians) -> list[float]:
-        leaves = leaves_of(scene)
+        state = replace(begin(job), leaves=leaves_of(scene))
         return [
-            sum(loss_at(job, leaves, view, scale)[0].item() for view in VIEWS) for scale in WEIGHTS
+            sum(loss_at(job, state, view, scale)[0].item() for view in VIEWS) for scale in WEIGHTS
         ]
 
     before, now = losses(job.start), losses(after(job).scene(job))
@@ -228,7 +230,9 @@ def test_a_densified_run_grows_and_goes_on():
     job = make_job(settings=replace(SETTINGS, steps=6, densify_every=2))
     state = after(job)
     assert len(state.leaves["means"]) > 60
-    assert state.thinnest.shape == state.leaves["log_scales"].shape
+    here = sampling_bounds(state.leaves["means"].detach(), job.training.cameras)
+    assert len(state.bounds.highest) == len(state.leaves["means"])
+    torch.testing.assert_close(state.bounds.highest, here.highest, rtol=0.1, atol=0.0)
     assert all(leaf.isfinite().all() for leaf in state.leaves.values())
 
 
@@ -267,8 +271,8 @@ def spoil(monkeypatch, bad_steps: set[int]) -> None:
     calls = iter(range(10**6))
     real = tuning_module.loss_at
 
-    def spoiled(job, leaves, view, scale):
-        loss, splats, hw = real(job, leaves, view, scale)
+    def spoiled(job, state, view, scale):
+        loss, splats, hw = real(job, state, view, scale)
         return (loss * math.nan if next(calls) // 2 in bad_steps else loss), splats, hw
 
     monkeypatch.setattr(tuning_module, "loss_at", spoiled)

@@ -17,8 +17,9 @@ from aaplug.finetuning.densification import Pulls
 from aaplug.finetuning.state import Job, State, optimizer
 from aaplug.gaussians import Gaussians
 from aaplug.io.atomic import replacing
+from aaplug.sampling import SamplingBounds
 
-FORMAT = "aaplug finetune 1"
+FORMAT = "aaplug finetune 2"
 DIGEST = 16  # hex digits that tell one scene from another
 
 
@@ -33,7 +34,7 @@ def packed(state: State) -> dict[str, Any]:
         "leaves": {name: leaf.detach().clone() for name, leaf in state.leaves.items()},
         "moments": moments,
         "born": state.born.clone(),
-        "thinnest": state.thinnest.clone(),
+        "bounds": {name: value.clone() for name, value in vars(state.bounds).items()},
         "pulls": (state.pulls.total.clone(), state.pulls.views.clone()),
         "bad": state.bad,
         "back_offs": state.back_offs,
@@ -55,7 +56,7 @@ def unpacked(data: Mapping[str, Any], job: Job) -> State:
         leaves=leaves,
         adam=adam,
         born=data["born"].clone(),
-        thinnest=data["thinnest"].clone(),
+        bounds=SamplingBounds(**{name: value.clone() for name, value in data["bounds"].items()}),
         pulls=Pulls(total.clone(), views.clone()),
         bad=data["bad"],
         back_offs=data["back_offs"],

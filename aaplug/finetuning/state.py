@@ -10,13 +10,13 @@ from torch import Tensor
 
 from aaplug.cameras import Camera
 from aaplug.finetuning.densification import Pulls
-from aaplug.finetuning.parameters import Leaves, leaves_of, scene_of, thinnest
+from aaplug.finetuning.parameters import Leaves, leaves_of, scene_of
 from aaplug.finetuning.settings import Settings
 from aaplug.finetuning.truth import Truth
 from aaplug.gaussians import Gaussians
 from aaplug.interfaces import Rasterizer, Training
 from aaplug.recipes import Recipe
-from aaplug.sampling import sampling_bounds
+from aaplug.sampling import SamplingBounds, sampling_bounds
 
 EPSILON = 1e-15  # of Adam (3DGS)
 
@@ -43,7 +43,7 @@ class Job:
 class State:
     """Where a run is; changed in place, step by step.
 
-    born: ln of the standard deviations that the Gaussians started with.  thinnest: ln of the least that they may have.
+    born: ln of the standard deviations that the Gaussians started with.  bounds: from where they were not long ago.
     bad: steps in a row that gave no finite gradient.
     back_offs: times that the run went back.  curve: of each step its number, view, and loss by scale.
     probes: what was measured on the way, by whoever watches.
@@ -53,7 +53,7 @@ class State:
     leaves: Leaves
     adam: torch.optim.Adam
     born: Float[Tensor, "n 3"]
-    thinnest: Float[Tensor, "n 3"]
+    bounds: SamplingBounds
     pulls: Pulls
     bad: int = 0
     back_offs: int = 0
@@ -69,8 +69,8 @@ def begin(job: Job) -> State:
     """The state before the first step."""
     leaves = leaves_of(job.start)
     born = job.start.log_scales
-    thin = thinnest(born, sampling_bounds(job.start.means, job.training.cameras))
-    return State(0, leaves, optimizer(leaves, job.settings), born, thin, Pulls.none(len(born)))
+    bounds = sampling_bounds(job.start.means, job.training.cameras)
+    return State(0, leaves, optimizer(leaves, job.settings), born, bounds, Pulls.none(len(born)))
 
 
 def optimizer(leaves: Leaves, settings: Settings) -> torch.optim.Adam:

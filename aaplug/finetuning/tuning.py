@@ -72,7 +72,7 @@ def advance(job: Job, state: State) -> None:
     state.adam.zero_grad(set_to_none=True)
     losses = {}
     for scale, weight in terms.items():
-        loss, splats, hw = loss_at(job, state.leaves, view, scale)
+        loss, splats, hw = loss_at(job, state, view, scale)
         (weight * loss).backward()
         losses[scale] = loss.item()
         if dense:
@@ -108,15 +108,12 @@ def _go_back(job: Job, state: State, good: Mapping[str, Any], say: Callable[[str
 
 
 def loss_at(
-    job: Job, leaves: Mapping[str, Tensor], view: Camera, scale: float
+    job: Job, state: State, view: Camera, scale: float
 ) -> tuple[Float[Tensor, ""], Splats2D, tuple[int, int]]:
     """The loss of one view at one scale, the splats that it drew, and the size they were drawn at."""
     truth, camera = job.truth(view, scale), view.scaled(scale)
-    scene = scene_of(leaves, job.start)
-    training = job.training
-    if len(scene) != len(training.bounds.highest):  # densified: other Gaussians have other bounds
-        bounds = sampling_bounds(leaves["means"].detach(), training.cameras)
-        training = replace(training, bounds=bounds)
+    scene = scene_of(state.leaves, job.start)
+    training = replace(job.training, bounds=state.bounds)
     fine, samples = sampled(scene, camera, job.recipe, training)
     splats = splats_of(scene, fine, job.recipe, training, job.rasterizer)
     if splats.means.requires_grad:
@@ -160,7 +157,7 @@ def _hold(state: State) -> None:
     """Keep the bounds."""
     scales, logits = state.leaves["log_scales"], state.leaves["logit_opacities"]
     if scales.requires_grad:
-        torch.maximum(scales, state.thinnest, out=scales.data)
+        torch.maximum(scales, thinnest(state.born, state.bounds), out=scales.data)
     if logits.requires_grad:
         logits.data.clamp_(max=MAX_LOGIT)
 
@@ -188,6 +185,5 @@ def _densify(job: Job, state: State) -> None:
 @torch.no_grad()
 def _bound(job: Job, state: State) -> None:
     """Find the bounds anew where the Gaussians are now, and keep them."""
-    bounds = sampling_bounds(state.leaves["means"].detach(), job.training.cameras)
-    state.thinnest = thinnest(state.born, bounds)
+    state.bounds = sampling_bounds(state.leaves["means"].detach(), job.training.cameras)
     _hold(state)
