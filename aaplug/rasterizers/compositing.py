@@ -33,7 +33,7 @@ from aaplug.splats import MIN_ALPHA
 PIXELS = TILE * TILE
 CHECK_EVERY = 4  # passes between looks at which tiles are saturated
 COMPACT_BELOW = 3 / 4  # share of tiles still going at which the others leave
-PARTS_AT_ONCE = 1 << 18  # or two a splat, lest the sums be larger than the parts
+PARTS_AT_ONCE = 1 << 18  # more than a pass has; or two a splat, if that is more
 LN_2 = math.log(2)
 LOG2_SILENT = -9.0  # log2 of an alpha below 1/255; stops exp2 before it underflows, which is slow
 LOG2_MIN_ALPHA = torch.tensor(MIN_ALPHA).log2().item()
@@ -417,29 +417,34 @@ class _Parts:
     """
 
     def __init__(self, total: Float[Tensor, "m c"]):
-        self._total, self._owners, self._added = total, [], []
-        self._room = self._most = max(PARTS_AT_ONCE, 2 * len(total))
+        room = max(PARTS_AT_ONCE, 2 * len(total))
+        self._total, self._count = total, 0
+        self._owners = total.new_empty(room, dtype=torch.int32)
+        self._parts = total.new_empty(room, total.shape[1])
 
-    def add(self, owners: Int[Tensor, "t K"], added: Float[Tensor, "t K c"]) -> None:
-        """Add some."""
-        self._owners.append(owners.flatten())
-        self._added.append(added.flatten(0, 1))
-        self._room -= owners.numel()
-        if self._room < 0:
+    def add(self, owners: Int[Tensor, "t K"], parts: Float[Tensor, "t K c"]) -> None:
+        """Add those of a pass, which are fewer than there is room for."""
+        end = self._count + owners.numel()
+        if end > len(self._owners):
             self._sum()
+            end = owners.numel()
+        self._owners[self._count : end] = owners.flatten()
+        self._parts[self._count : end] = parts.flatten(0, 1)
+        self._count = end
 
     def total(self) -> Float[Tensor, "m c"]:
         """All that was added."""
-        if self._owners:
+        if self._count:
             self._sum()
         return self._total
 
     def _sum(self) -> None:
-        keys, order = torch.sort(torch.cat(self._owners), stable=True)
+        keys, order = torch.sort(self._owners[: self._count], stable=True)
         splats = torch.arange(len(self._total), dtype=keys.dtype, device=keys.device)
         first = torch.searchsorted(keys, splats)
-        self._total += functional.embedding_bag(order, torch.cat(self._added), first, mode="sum")
-        self._owners, self._added, self._room = [], [], self._most
+        parts = self._parts[: self._count]
+        self._total += functional.embedding_bag(order, parts, first, mode="sum")
+        self._count = 0
 
 
 def _monomials(x: Float[Tensor, " P"], y: Float[Tensor, " P"]) -> Float[Tensor, "P 6"]:
