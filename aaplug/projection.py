@@ -8,6 +8,7 @@ and b, where nothing cancels.  The camera's centre is subtracted in float64; the
 from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial, reduce
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
@@ -99,9 +100,33 @@ def _shade(
     sources: Int[Tensor, " m"],
     centre: Float[Tensor, " 3"],
 ) -> tuple[Tensor]:
-    offset = (means.index_select(0, sources).double() - centre).to(means)
+    offset = (_picked(means, sources).double() - centre).to(means)
     directions = offset / offset.square().sum(dim=1, keepdim=True).sqrt()
-    return (sh_colour(sh.index_select(0, sources), directions).clamp(min=0.0),)
+    return (sh_colour(_picked(sh, sources), directions).clamp(min=0.0),)
+
+
+def _picked(x: Float[Tensor, "n *c"], rows: Int[Tensor, " m"]) -> Float[Tensor, "m *c"]:
+    """Rows of which none comes twice."""
+    return _Picked.apply(x, rows)  # pyright: ignore[reportReturnType]
+
+
+class _Picked(torch.autograd.Function):
+    """Puts gradients back where adding them, as `index_select` does, takes an atomic addition for each."""
+
+    @staticmethod
+    def forward(x: Tensor, rows: Tensor) -> Tensor:
+        return x.index_select(0, rows)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
+        x, rows = inputs
+        ctx.save_for_backward(rows)
+        ctx.shape = x.shape
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None]:
+        (rows,) = ctx.saved_tensors
+        return grads[0].new_zeros(ctx.shape).index_copy(0, rows, grads[0]), None
 
 
 def _camera_rows(
