@@ -50,6 +50,9 @@ OPTIONS = {
     "assert_indirect_indexing": False,  # indices are our own, and a check a load is slow
     "cpp.enable_floating_point_contract_flag": "fast",  # multiply and add in one instruction
 }
+DOUBTS = (
+    "cpp.enable_tiling_heuristics"  # whether the compiler leaves loops over distant numbers scalar
+)
 LARGEST_SIZE = 1 << 31
 MOST_PROCESSES = 4  # compilers side by side: each takes most of a GB
 FRAMES_THAT_PAY = 300  # a frame of 800² saves about 0.4 s, and compiling takes about 90 s
@@ -205,7 +208,9 @@ def _build(name: str) -> None:
                 module, args, dynamic_shapes=shapes if kernel.pulls_back else (shapes,)
             )
             made = torch._inductor.aoti_compile_and_package(
-                program, package_path=str(Path(folder) / "k.pt2"), inductor_configs=dict(OPTIONS)
+                program,
+                package_path=str(Path(folder) / "k.pt2"),
+                inductor_configs={**OPTIONS, DOUBTS: not kernel.gathers},
             )
             os.replace(made, path)
     except OSError as error:

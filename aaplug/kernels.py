@@ -21,15 +21,16 @@ class Kernel:
     function: tensors in, a tuple of tensors out; what it updates in place must be contiguous.
     example: arguments to compile for.
     sizes: of each argument the name of its leading size, None where that is fixed; sizes of one name are equal.
+    gathers: whether vectors pay even where their numbers lie apart, which compilers doubt: where work is much.
+    pulls_back: whether the function takes gradients itself, so that it must be traced before it is compiled.
     """
 
     name: str
     function: Callable[..., tuple[Tensor, ...]]
     example: Callable[[], tuple[Tensor, ...]]
     sizes: tuple[str | None, ...]
-    pulls_back: bool = (
-        False  # the function takes gradients itself, so that it is traced before it is compiled
-    )
+    gathers: bool = False
+    pulls_back: bool = False
 
 
 def backward_of(kernel: Kernel, answers: tuple[str, ...]) -> Kernel:
@@ -58,7 +59,8 @@ def backward_of(kernel: Kernel, answers: tuple[str, ...]) -> Kernel:
         return *args, *(torch.linspace(-1.0, 1.0, x.numel()).to(x).view_as(x) for x in found)
 
     sizes = (*kernel.sizes, *answers)
-    return Kernel(kernel.name + BACKWARD, function, example, sizes, pulls_back=True)
+    name = kernel.name + BACKWARD
+    return Kernel(name, function, example, sizes, kernel.gathers, pulls_back=True)
 
 
 class Kernels:

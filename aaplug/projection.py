@@ -253,7 +253,9 @@ def _project_example() -> tuple[Tensor, ...]:
     return means, quats, log_scales - 4, centre, torch.eye(3), lens
 
 
-PROJECT = Kernel("project", _project, _project_example, ("n", "n", "n", None, None, None))
+PROJECT = Kernel(
+    "project", _project, _project_example, ("n", "n", "n", None, None, None), gathers=True
+)
 PROJECT_BACKWARD = backward_of(PROJECT, ("n", "n", "n", "n"))
 SHADE = {
     k: Kernel(f"shade-{k}", _shade, partial(_shade_example, k), ("n", "n", "m", None))

@@ -228,4 +228,4 @@ def _inside_example() -> tuple[Tensor, ...]:
     return means, torch.ones(m, 3), torch.ones(m), torch.ones(m), torch.tensor([4.0, 4.0, 2.0])
 
 
-INSIDE = Kernel("inside", _inside, _inside_example, ("m", "m", "m", "m", None))
+INSIDE = Kernel("inside", _inside, _inside_example, ("m", "m", "m", "m", None), gathers=True)

@@ -208,7 +208,11 @@ def _pairs_example() -> tuple[Tensor, ...]:
 
 
 TABLE = Kernel(
-    "table", _table_rows, lambda: (*splat_example(), torch.full((2,), 9.0)), ("m",) * 4 + (None,)
+    "table",
+    _table_rows,
+    lambda: (*splat_example(), torch.full((2,), 9.0)),
+    ("m",) * 4 + (None,),
+    gathers=True,
 )
 SPANS = Kernel("spans", _spans, _spans_example, ("s", "m", "m", "m", None))
 PAIRS = Kernel("pairs", _pairs, _pairs_example, ("p", "s", "s", "s"))
