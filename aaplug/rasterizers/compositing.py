@@ -393,11 +393,8 @@ def _backward(
     for turn in reversed(turns):
         behind, grads = light.index_select(0, turn.tiles), grad.index_select(1, turn.tiles)
         colours, ones = grads[:3].transpose(0, 1).contiguous(), torch.ones_like(turn.origins[:, 0])
-        at, ends = turn.splats
-        for i, before in reversed(list(enumerate(turn.before))):
-            n = len(before)
-            (owners,) = kernels.run(OWNERS, drawing, bins.splats, at[:n] + i * PASS, ends[:n])
-            rows, origins = _rows(drawing, owners), turn.origins[:n]
+        for owners, rows, before in _passes(drawing, bins, turn, kernels):
+            n, origins = len(before), turn.origins[: len(before)]
             pixels = (before, behind[:n], *grads[:, :n].unbind(), *local, ones[:n])
             weights, moves = kernels.run(CHUNK_BACKWARD[pixel], rows, origins, *pixels)
             by_colour = torch.bmm(weights, colours[:n].mT)
@@ -410,6 +407,23 @@ def _backward(
     return parts.total()
 
 
+def _passes(
+    drawing: Float[Tensor, "m c"], bins: Bins, turn: _Turn, kernels: Kernels
+) -> Iterator[tuple[Int[Tensor, "n K"], Float[Tensor, "n K c"], Float[Tensor, "n P"]]]:
+    """Owners, rows and transmittance of each pass of a turn, from the last; some are looked up together."""
+    at, ends = turn.splats
+    starts = range(0, len(turn.before), CHECK_EVERY)
+    for start in reversed(starts):
+        together = turn.before[start : start + CHECK_EVERY]
+        sizes = [len(before) for before in together]
+        places = torch.cat([at[:n] + (start + i) * PASS for i, n in enumerate(sizes)])
+        last = torch.cat([ends[:n] for n in sizes])
+        (owners,) = kernels.run(OWNERS, drawing, bins.splats, places, last)
+        rows = _rows(drawing, owners)
+        passes = zip(owners.split(sizes), rows.split(sizes), together, strict=True)
+        yield from reversed(list(passes))
+
+
 class _Parts:
     """Adds up what tiles add to the gradients of splats.
 
@@ -419,7 +433,8 @@ class _Parts:
     def __init__(self, total: Float[Tensor, "m c"]):
         room = max(PARTS_AT_ONCE, 2 * len(total))
         self._total, self._count = total, 0
-        self._owners = total.new_empty(room, dtype=torch.int32)
+        few = len(total) < torch.iinfo(torch.int16).max  # half the bits sort in half the time
+        self._owners = total.new_empty(room, dtype=torch.int16 if few else torch.int32)
         self._parts = total.new_empty(room, total.shape[1])
 
     def add(self, owners: Int[Tensor, "t K"], parts: Float[Tensor, "t K c"]) -> None:
@@ -439,9 +454,10 @@ class _Parts:
         return self._total
 
     def _sum(self) -> None:
-        keys, order = torch.sort(self._owners[: self._count], stable=True)
-        splats = torch.arange(len(self._total), dtype=keys.dtype, device=keys.device)
-        first = torch.searchsorted(keys, splats)
+        owners = self._owners[: self._count]
+        order = torch.sort(owners, stable=True).indices
+        counts = torch.bincount(owners, minlength=len(self._total))
+        first = counts.cumsum(0) - counts
         parts = self._parts[: self._count]
         self._total += functional.embedding_bag(order, parts, first, mode="sum")
         self._count = 0
