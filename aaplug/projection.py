@@ -5,7 +5,7 @@ M = J W R S (Zwicker et al., "EWA splatting", 2002; 3DGS, eq. 5), and its determ
 and b, where nothing cancels.  The camera's centre is subtracted in float64; the rest runs in the scene's precision.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import partial, reduce
 from typing import Any
@@ -22,6 +22,7 @@ from aaplug.splats import Splats2D
 JACOBIAN_MARGIN = 0.3  # of half the image at depth 1: 3DGS linearises no farther out (1.3 tan(fov/2) when centred)
 MAX_SIGMA = 1e9  # px: larger splats look the same, and their determinant would overflow float32
 MIN_FACING = 1e-6  # of depth: a disc seen at a flatter angle is a line, and its tilt would overflow
+SHADED_AT_ONCE = 1 << 16  # Gaussians
 COLOUR_OFFSET = 0.5  # 3DGS stores colours around mid-grey
 
 SH_C0 = 0.28209479177387814
@@ -79,9 +80,17 @@ def shade(splats: Splats2D, scene: Gaussians, camera: Camera, kernels: Kernels =
     """Give splats their colour as seen from the camera: SH plus mid-grey, not below black (3DGS)."""
     centre = camera.centre.to(scene.means.device)
     kernel = SHADE.get(scene.sh.shape[1])
-    args = (scene.sh, scene.means, splats.sources, centre)
-    (rgb,) = _shade(*args) if kernel is None else kernels.run(kernel, *args)
-    return replace(splats, rgb=rgb)
+    shaded = []
+    for sources in _shaded_together(splats.sources, scene):
+        args = (scene.sh, scene.means, sources, centre)
+        shaded += _shade(*args) if kernel is None else kernels.run(kernel, *args)
+    return replace(splats, rgb=shaded[0] if len(shaded) == 1 else torch.cat(shaded))
+
+
+def _shaded_together(sources: Int[Tensor, " m"], scene: Gaussians) -> Sequence[Int[Tensor, " k"]]:
+    """Parts that fit the cache; all where gradients are asked for, as each part's would be as large as the scene's."""
+    tracked = scene.sh.requires_grad or scene.means.requires_grad
+    return [sources] if tracked and torch.is_grad_enabled() else sources.split(SHADED_AT_ONCE)
 
 
 def sh_colour(sh: Float[Tensor, "m k 3"], directions: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:

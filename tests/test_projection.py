@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from aaplug import projection
 from aaplug.cameras import Camera
 from aaplug.gaussians import Gaussians
 from aaplug.projection import project, rotation_matrices, sh_colour, shade
@@ -454,3 +455,27 @@ def test_the_determinants_ratio_is_the_change_of_area_across_the_ray():
 
     factor = area(scene.scales) / area(wide.scales)
     torch.testing.assert_close(before.dets / after.dets, factor, rtol=1e-9, atol=0)
+
+
+def test_colours_in_parts_are_the_same_colours(monkeypatch):
+    scene, camera = make_scene(50, degree=3), make_camera()
+    splats = project(scene, camera)
+    whole = shade(splats, scene, camera).rgb
+    monkeypatch.setattr(projection, "SHADED_AT_ONCE", 7)
+    assert len(splats.sources) > 7
+    assert shade(splats, scene, camera).rgb.equal(whole)
+
+
+def test_colours_give_gradients_to_their_own_gaussians_alone():
+    scene, camera = make_scene(50, degree=2), make_camera()
+    splats = project(scene, camera)
+    some = splats[torch.arange(0, len(splats.sources), 3)]
+    sh = scene.sh.clone().requires_grad_()
+    shade(some, replace(scene, sh=sh), camera).rgb.sum().backward()
+    touched = sh.grad.abs().amax(dim=(1, 2)) > 0
+    shown = torch.zeros(50, dtype=torch.bool)
+    shown[some.sources] = True
+    assert touched.any()
+    assert not (touched & ~shown).any()
+    constant = sh.grad[:, 0][touched]  # of the first coefficient, where no channel is held at black
+    assert constant.amax().item() == pytest.approx(0.28209479177387814)
