@@ -256,7 +256,7 @@ def _forms(
         u, v = (torch.addcmul(i[..., None] * dx, j[..., None], dy) for i, j in forms)
     else:  # as a product of matrices, which no operation on every pixel is faster than
         basis = torch.stack([pixels.x, pixels.y, torch.ones_like(pixels.x)])
-        x, y = row[..., X] - pixels.corners[:, 0], row[..., Y] - pixels.corners[:, 1]
+        x, y = _from_corner(row, pixels)
         u, v = (torch.stack([i, j, -(i * x + j * y)], dim=-1) @ basis for i, j in forms)
     return u, v
 
@@ -265,8 +265,15 @@ def _offsets(
     row: Float[Tensor, "*n t c"], pixels: _Pixels
 ) -> tuple[Float[Tensor, "*n t P"], Float[Tensor, "*n t P"]]:
     """Of the pixels' centres from splats, in px."""
-    x, y = row[..., X] - pixels.corners[:, 0], row[..., Y] - pixels.corners[:, 1]
+    x, y = _from_corner(row, pixels)
     return pixels.x - x[..., None], pixels.y - y[..., None]
+
+
+def _from_corner(
+    row: Float[Tensor, "*n t c"], pixels: _Pixels
+) -> tuple[Float[Tensor, "*n t"], Float[Tensor, "*n t"]]:
+    """Centres of splats from the tiles' corners, in px."""
+    return row[..., X] - pixels.corners[:, 0], row[..., Y] - pixels.corners[:, 1]
 
 
 def _over_pixel(
