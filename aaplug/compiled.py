@@ -65,7 +65,8 @@ def cache_folder() -> Path:
     """Where the packages of this version on this processor are."""
     modules = (kernels_module, projection, splats, pixels, binning, compositing, tiled)
     source = "".join(inspect.getsource(module) for module in modules)
-    facts = [torch.__version__, torch.backends.cpu.get_cpu_capability(), source, str(OPTIONS)]
+    options = f"{OPTIONS} {DOUBTS}"
+    facts = [torch.__version__, torch.backends.cpu.get_cpu_capability(), source, options]
     key = hashlib.sha256("\0".join(facts).encode()).hexdigest()[:16]
     return Path(platformdirs.user_cache_dir("aaplug", appauthor=False)) / f"kernels-{key}"
 

@@ -16,7 +16,7 @@ from aaplug.finetuning.truth import Truth
 from aaplug.gaussians import Gaussians
 from aaplug.interfaces import Rasterizer, Training
 from aaplug.recipes import Recipe
-from aaplug.sampling import SamplingBounds, sampling_bounds
+from aaplug.sampling import SamplingBounds
 
 EPSILON = 1e-15  # of Adam (3DGS)
 
@@ -25,7 +25,8 @@ EPSILON = 1e-15  # of Adam (3DGS)
 class Job:
     """What to tune, how it will be viewed, and what it should look like.
 
-    start: the scene as the viewer gets it at first.  recipe: the viewer's rule; it has no world filter.
+    start: the scene as the viewer gets it at first, its Gaussians where those are that training's bounds are of.
+    recipe: the viewer's rule; it has no world filter.
     views: training views, at the training size.
     """
 
@@ -68,8 +69,7 @@ class State:
 def begin(job: Job) -> State:
     """The state before the first step."""
     leaves = leaves_of(job.start)
-    born = job.start.log_scales
-    bounds = sampling_bounds(job.start.means, job.training.cameras)
+    born, bounds = job.start.log_scales, job.training.bounds
     return State(0, leaves, optimizer(leaves, job.settings), born, bounds, Pulls.none(len(born)))
 
 

@@ -215,7 +215,7 @@ def _chunk(
         splats = _splats(alpha_of, _rows(drawing, owners.T), pixels)
     for row, alpha in splats:
         after = before * _left(alpha, one)
-        weight = _where_above(BELOW_MIN_TRANSMITTANCE, after, _taken(before, after, one))
+        weight = _where_above(BELOW_MIN_TRANSMITTANCE, after, _less(before, after, one))
         before = after
         red.addcmul_(weight, row[:, RED, None])
         green.addcmul_(weight, row[:, GREEN, None])
@@ -326,11 +326,11 @@ def _left(alpha: Float[Tensor, "t P"], one: Float[Tensor, "t 1"]) -> Float[Tenso
     return (one - alpha).clamp_(min=least)
 
 
-def _taken(
-    before: Float[Tensor, "t P"], after: Float[Tensor, "t P"], one: Float[Tensor, "t 1"]
+def _less(
+    x: Float[Tensor, "t P"], y: Float[Tensor, "t P"], one: Float[Tensor, "t 1"]
 ) -> Float[Tensor, "t P"]:
-    """The light that did not get through."""
-    return one * before - after if torch.compiler.is_compiling() else before - after
+    """x − y."""
+    return one * x - y if torch.compiler.is_compiling() else x - y
 
 
 def _audible_exp2(exponent: Float[Tensor, "*n P L"]) -> Float[Tensor, "*n P L"]:
@@ -401,7 +401,8 @@ def _backward(
         behind, grads = light.index_select(0, turn.tiles), grad.index_select(1, turn.tiles)
         colours, ones = grads[:3].transpose(0, 1).contiguous(), torch.ones_like(turn.origins[:, 0])
         for owners, rows, before in _passes(drawing, bins, turn, kernels):
-            n, origins = len(before), turn.origins[: len(before)]
+            n = len(before)
+            origins = turn.origins[:n]
             pixels = (before, behind[:n], *grads[:, :n].unbind(), *local, ones[:n])
             weights, moves = kernels.run(CHUNK_BACKWARD[pixel], rows, origins, *pixels)
             by_colour = torch.bmm(weights, colours[:n].mT)
@@ -504,7 +505,8 @@ def _chunk_backward(
         weight = reaching * hides
         colour = torch.addcmul(g_hidden, row[:, RED, None], g_red)
         colour = torch.addcmul(colour, row[:, GREEN, None], g_green)
-        ahead = torch.addcmul(colour, row[:, BLUE, None], g_blue) - one * light
+        colour = torch.addcmul(colour, row[:, BLUE, None], g_blue)
+        ahead = _less(colour, light, one)
         # where alpha is skipped or comes too late its weight is 0, and where it is capped it does not move
         gradients.append(_where_above(0.0, MAX_ALPHA * one - alpha, weight) * ahead)
         weights.append(weight)
