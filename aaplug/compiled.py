@@ -43,10 +43,12 @@ KERNELS: tuple[Kernel, ...] = (
     compositing.COMPOSITE["point"],
     compositing.COMPOSITE["integral"],
     compositing.CHUNK_BACKWARD["point"],
-    compositing.CHUNK_SUMS,
+    compositing.FROM_SUMS,
 )
 OPTIONS = {
     "max_fusion_size": 1_000_000,  # a pass is one loop, however many operations it has
+    "cpp.max_horizontal_fusion_size": 1_000_000,  # and however many sums
+    "realize_reads_threshold": 30,  # what such a loop reads is found in it, however much that reads itself
     "assert_indirect_indexing": False,  # indices are our own, and a check a load is slow
     "cpp.enable_floating_point_contract_flag": "fast",  # multiply and add in one instruction
 }
@@ -103,7 +105,7 @@ def build(
     progress: told (kernels done, kernels in all).
 
     Raises:
-        UsageError: there is no compiler, the cache folder cannot be written, or a process died.
+        UsageError: there is no compiler or it fails, the cache folder cannot be written, or a process died.
     """
     total = len(KERNELS)
     missing = [kernel.name for kernel in KERNELS if _load(kernel) is None]
@@ -147,7 +149,13 @@ def choose(name: str, frames: int, say: Callable[[str], None]) -> Rasterizer:
     kernels = load()
     if kernels is None and (name == "compiled" or (frames >= FRAMES_THAT_PAY and has_compiler())):
         say("rasterizer: compiling the kernels, once for this machine (about two minutes)")
-        kernels = build()
+        try:
+            kernels = build()
+        except UsageError as error:
+            if name == "compiled":
+                raise
+            say(f"rasterizer: eager ({error})")
+            return RASTERIZERS["eager"]
     if kernels is not None:
         say("rasterizer: compiled")
         return Tiled(kernels)
@@ -208,11 +216,15 @@ def _build(name: str) -> None:
             program = torch.export.export(
                 module, args, dynamic_shapes=shapes if kernel.pulls_back else (shapes,)
             )
-            made = torch._inductor.aoti_compile_and_package(
-                program,
-                package_path=str(Path(folder) / "k.pt2"),
-                inductor_configs={**OPTIONS, DOUBTS: not kernel.gathers},
-            )
+            try:
+                made = torch._inductor.aoti_compile_and_package(
+                    program,
+                    package_path=str(Path(folder) / "k.pt2"),
+                    inductor_configs={**OPTIONS, DOUBTS: not kernel.gathers},
+                )
+            except Exception as error:  # compilers fail in ways of their own
+                problem = f"torch {torch.__version__} cannot compile '{name}' here: {error}"
+                raise UsageError("warmup", problem) from error
             os.replace(made, path)
     except OSError as error:
         raise UsageError("warmup", f"cannot write {path.parent}: {error}") from error

@@ -1,5 +1,6 @@
 """Kernels compiled ahead of time: the same answers, and a cache that nothing can break."""
 
+import zipfile
 from dataclasses import replace
 
 import pytest
@@ -41,6 +42,13 @@ def test_compiled_kernels_give_the_eager_answer(built, kernel: Kernel):
         # behind a splat of alpha 0.99 a gradient has a hundred times the rounding of its alpha
         scale = 1 + slow.double().abs().max()
         assert (fast.double() - slow.double()).abs().max() < 10 * ANSWER * scale
+
+
+@pytest.mark.parametrize("name", ["composite-point", "composite-point-backward"])
+def test_compositing_is_one_loop_over_tiles(built, name):
+    with zipfile.ZipFile(compiled.cache_folder() / f"{name}.pt2") as package:
+        sources = [package.read(n).decode() for n in package.namelist() if "kernel.cpp" in n]
+    assert sum(source.count("#pragma omp for") for source in sources) == 1
 
 
 @pytest.mark.parametrize("recipe", RECIPES)
@@ -113,6 +121,29 @@ def test_without_a_compiler_a_build_is_refused_in_words(empty_cache, monkeypatch
     monkeypatch.setattr(compiled, "has_compiler", lambda: False)
     with pytest.raises(UsageError, match=r"warmup: needs a C\+\+ compiler"):
         compiled.build()
+
+
+def test_a_build_that_fails_leaves_auto_eager_and_says_so(empty_cache, monkeypatch):
+    def fails():
+        raise UsageError("warmup", "torch cannot compile 'owners' here")
+
+    monkeypatch.setattr(compiled, "has_compiler", lambda: True)
+    monkeypatch.setattr(compiled, "build", fails)
+    said: list[str] = []
+    chosen = compiled.choose("auto", compiled.FRAMES_THAT_PAY, said.append)
+    assert chosen is RASTERIZERS["eager"]
+    assert "cannot compile 'owners'" in said[-1]
+    with pytest.raises(UsageError, match="cannot compile 'owners'"):
+        compiled.choose("compiled", 1, said.append)
+
+
+def test_a_kernel_that_does_not_compile_is_named(empty_cache, monkeypatch):
+    def fails(*args, **options):
+        raise KeyError("buf14")
+
+    monkeypatch.setattr(torch._inductor, "aoti_compile_and_package", fails)
+    with pytest.raises(UsageError, match=r"warmup: torch .* cannot compile 'owners' here"):
+        compiled._build("owners")
 
 
 def test_an_unknown_name_lists_the_known_ones():

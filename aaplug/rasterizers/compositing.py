@@ -1,14 +1,14 @@
 """Compositing: the splats of every tile over each other, as elementwise array code that compiles to one loop.
 
-t: tiles; K: splats a pass; P: pixels a tile; c: columns of a drawing row.
+t: tiles; K: splats a pass or a step; P: pixels a tile; c: columns of a drawing row.
 
-Tiles are composited K splats a pass, those with most splats first, so that the ones that are done are the last; tiles
-whose pixels are all saturated leave now and then.
+Tiles are composited PASS splats a pass, those with most splats first, so that the ones that are done are the last;
+tiles whose pixels are all saturated leave now and then.
 
-The backward pass goes through the passes from the last.  With B the light from behind a splat, were the pixel clear
-down to there, ∂L/∂alpha_k = T_k (g·c_k − B_k) and B_{k−1} = B_k + alpha_k (g·c_k − B_k).  T at each pass's start is
-all that is kept.  (Carrying what is left of Σ g·w·c from the front would need a division by 1 − alpha, and loses digits
-where that is small.)
+The backward pass goes from the last splats to the first, in steps of STEP.  With B the light from behind a splat, were
+the pixel clear down to there, ∂L/∂alpha_k = T_k (g·c_k − B_k) and B_{k−1} = B_k + alpha_k (g·c_k − B_k).  T at each
+step's start is all that is kept.  (Carrying what is left of Σ g·w·c from the front would need a division by 1 − alpha,
+and loses digits where that is small.)
 """
 
 import math
@@ -31,9 +31,12 @@ from aaplug.rasterizers.surfels import disc, smoothed_disc
 from aaplug.splats import MIN_ALPHA
 
 PIXELS = TILE * TILE
+STEP = 4  # splats that gradients go through at once: of more sums the compiler makes several loops
+assert PASS == 2 * STEP  # so that the middle of a pass is all that steps need beside its ends
 CHECK_EVERY = 4  # passes between looks at which tiles are saturated
+STEPS_TOGETHER = 8  # looked up at once
 COMPACT_BELOW = 3 / 4  # share of tiles still going at which the others leave
-PARTS_AT_ONCE = 1 << 18  # more than a pass has; or two a splat, if that is more
+PARTS_AT_ONCE = 1 << 18  # summed; or two a splat, if that is more
 LN_2 = math.log(2)
 LOG2_SILENT = -9.0  # log2 of an alpha below 1/255; stops exp2 before it underflows, which is slow
 LOG2_MIN_ALPHA = torch.tensor(MIN_ALPHA).log2().item()
@@ -66,8 +69,8 @@ COLUMNS, MEAN_COLUMNS = 10, 13
 
 def composite(
     drawing: Float[Tensor, "m c"], bins: Bins, kernels: Kernels, pixel: PixelKernel = "point"
-) -> Float[Tensor, "4 t P"]:
-    """Premultiplied red, green, blue, and alpha, of every pixel of every tile.
+) -> tuple[Float[Tensor, "3 t P"], Float[Tensor, "t P"]]:
+    """Premultiplied colour, and alpha, of every pixel of every tile.
 
     drawing: parameters by column; its last row draws nothing.
     """
@@ -80,7 +83,7 @@ def composite(
 class _Turn:
     """What was composited between two looks at which tiles are done.
 
-    splats: first and after last of each tile, from where the turn began.  before: of each pass the transmittance of
+    splats: first and after last of each tile, from where the turn began.  before: of each step the transmittance of
     the tiles, the first of `tiles`, that took part.
     """
 
@@ -96,14 +99,14 @@ def _forward(
     kernels: Kernels,
     pixel: PixelKernel,
     turns: list[_Turn] | None = None,
-) -> Float[Tensor, "4 all P"]:
-    """The image; the turns that made it are put into `turns`, in order."""
+) -> tuple[Float[Tensor, "3 all P"], Float[Tensor, "all P"]]:
+    """Colour and alpha; the turns that made it are put into `turns`, in order."""
     image = drawing.new_zeros(4, len(bins.counts), PIXELS)
     order = torch.sort(bins.counts, descending=True, stable=True).indices
     order = order[: int((bins.counts > 0).sum())]
     for tiles in order.split(kernels.tiles):
         _composite_block(drawing, bins, tiles, image, kernels, COMPOSITE[pixel], turns)
-    return image
+    return image[:3], image[3]
 
 
 def _composite_block(
@@ -117,8 +120,8 @@ def _composite_block(
 ) -> None:
     """Composite some tiles, longest first, into the image, until they are drawn out or saturated."""
     local = pixel_centres(drawing)
-    state = drawing.new_zeros(5, len(tiles), PIXELS)
-    state[0] = 1
+    T = drawing.new_ones(len(tiles), PIXELS)
+    planes = drawing.new_zeros(4, len(tiles), PIXELS)
     start = 0
     while len(tiles):
         columns = [x.index_select(0, tiles) for x in (bins.first, bins.counts, bins.origins)]
@@ -129,18 +132,21 @@ def _composite_block(
         if turns is not None:
             turns.append(_Turn(tiles, (at, ends), origins, before))
         for turn, n in enumerate(going):
-            if turns is not None:
-                before.append(state[0, :n].clone())
             where = (bins.splats, at[:n] + turn * PASS, ends[:n], origins[:n])
-            kernels.run(chunk, drawing, *where, *state[:, :n].unbind(), *local, ones[:n])
+            pixels = (T[:n], *planes[:, :n].unbind(), *local, ones[:n])
+            middle, after = kernels.run(chunk, drawing, *where, *pixels)
+            if turns is not None:
+                before += [T[:n], middle]
+            T = after
             start += PASS
             if turn % CHECK_EVERY == CHECK_EVERY - 1 and turn + 1 < len(going):
-                alive = state[0, : going[turn + 1]].amax(dim=1) > 0
+                alive = T[: going[turn + 1]].amax(dim=1) > 0
                 if int(alive.sum()) < COMPACT_BELOW * len(alive):
                     left = alive.nonzero().squeeze(1)
                     break
-        image.index_copy_(1, tiles, state[1:])
-        tiles, state = tiles.index_select(0, left), state.index_select(1, left)
+        image.index_copy_(1, tiles, planes)
+        tiles, T = tiles.index_select(0, left), T.index_select(0, left)
+        planes = planes.index_select(1, left)
 
 
 def _going(counts: Int[Tensor, " t"]) -> list[int]:
@@ -148,22 +154,6 @@ def _going(counts: Int[Tensor, " t"]) -> list[int]:
     passes = (counts + (PASS - 1)) // PASS
     turns = torch.arange(int(passes[0]), device=counts.device)
     return (len(passes) - torch.searchsorted(passes.flip(0), turns, right=True)).tolist()
-
-
-def _owners(
-    drawing: Float[Tensor, "m c"],
-    ids: Int[Tensor, " p"],
-    at: Int[Tensor, " t"],
-    ends: Int[Tensor, " t"],
-) -> tuple[Int[Tensor, "t K"]]:
-    """The splats at to at + K of each tile; after its last the one that draws nothing."""
-    place = at[:, None] + torch.arange(PASS, device=at.device)
-    return (torch.where(place < ends[:, None], ids[place], drawing.shape[0] - 1),)
-
-
-def _rows(drawing: Float[Tensor, "m c"], owners: Int[Tensor, "*n"]) -> Float[Tensor, "*n c"]:
-    """Parameters of splats."""
-    return drawing.index_select(0, owners.flatten()).view(*owners.shape, -1)
 
 
 def pixel_centres(like: Tensor) -> tuple[Float[Tensor, " P"], Float[Tensor, " P"]]:
@@ -199,21 +189,21 @@ def _chunk(
     local_x: Float[Tensor, " P"],
     local_y: Float[Tensor, " P"],
     one: Float[Tensor, " t"],
-) -> tuple[()]:
-    """Composite splats at to at + K of each tile into its transmittance (0 once a pixel has stopped), colour and alpha.
+) -> tuple[Float[Tensor, "t P"], Float[Tensor, "t P"]]:
+    """Composite splats at to at + PASS of each tile into its colour and alpha.
 
+    Returns its transmittance after half of them, and after all; 0 once a pixel has stopped.
     one: ones; a column of them in each step keeps the compiler to one loop over tiles.
     """
     one = one[:, None]
-    before = T
+    before, seen = T, []
     pixels = _Pixels(origins, local_x, local_y)
     if torch.compiler.is_compiling():  # each row too is loaded where it is needed
         rows = (drawing[torch.where(at + k < ends, ids[at + k], -1)] for k in range(PASS))
-        splats = ((row, alpha_of(row, pixels)) for row in rows)
     else:
-        (owners,) = _owners(drawing, ids, at, ends)
-        splats = _splats(alpha_of, _rows(drawing, owners.T), pixels)
-    for row, alpha in splats:
+        (owners,) = _owners(drawing, ids, at, ends, PASS)
+        rows = _rows(drawing, owners.T)
+    for row, alpha in _splats(alpha_of, rows, pixels):
         after = before * _left(alpha, one)
         weight = _where_above(BELOW_MIN_TRANSMITTANCE, after, _less(before, after, one))
         before = after
@@ -221,22 +211,25 @@ def _chunk(
         green.addcmul_(weight, row[:, GREEN, None])
         blue.addcmul_(weight, row[:, BLUE, None])
         hidden.add_(weight)
-    T.copy_(torch.threshold(one * before, BELOW_MIN_TRANSMITTANCE, 0.0))
-    return ()
+        seen.append(before)
+    middle, last = (
+        torch.threshold(one * x, BELOW_MIN_TRANSMITTANCE, 0.0) for x in (seen[STEP - 1], seen[-1])
+    )
+    return middle, last
 
 
 def _splats(
-    alpha_of: AlphaOf, rows: Float[Tensor, "K t c"], pixels: _Pixels
+    alpha_of: AlphaOf, rows: Float[Tensor, "K t c"] | Iterator[Tensor], pixels: _Pixels
 ) -> Iterator[tuple[Float[Tensor, "t c"], Float[Tensor, "t P"]]]:
     """Row and alpha of K splats of each tile in turn.
 
     Array code finds the alphas of all at once, a compiled loop each where it is needed.
     """
-    if torch.compiler.is_compiling():
-        for row in rows.unbind():
-            yield row, alpha_of(row, pixels)
-    else:
+    if isinstance(rows, Tensor) and not torch.compiler.is_compiling():
         yield from zip(rows.unbind(), alpha_of(rows, pixels).unbind(), strict=True)
+    else:
+        for row in rows:
+            yield row, alpha_of(row, pixels)
 
 
 def _at_centre(row: Float[Tensor, "*n t c"], pixels: _Pixels) -> Float[Tensor, "*n t P"]:
@@ -371,22 +364,24 @@ class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, drawing: Tensor, bins: Bins, kernels: Kernels, pixel: PixelKernel
-    ) -> Tensor:
+    ) -> tuple[Tensor, Tensor]:
         turns: list[_Turn] = []
-        image = _forward(drawing, bins, kernels, pixel, turns)
+        colour, alpha = _forward(drawing, bins, kernels, pixel, turns)
         ctx.save_for_backward(drawing)
         ctx.rest = (bins, turns, kernels, pixel)
-        return image
+        return colour, alpha
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None, None, None]:
         (drawing,) = ctx.saved_tensors
-        return _backward(drawing, grads[0], *ctx.rest), None, None, None
+        colour, alpha = (grad.contiguous() for grad in grads)
+        return _backward(drawing, colour, alpha, *ctx.rest), None, None, None
 
 
 def _backward(
     drawing: Float[Tensor, "m c"],
-    grad: Float[Tensor, "4 all P"],
+    g_colour: Float[Tensor, "3 all P"],
+    g_alpha: Float[Tensor, "all P"],
     bins: Bins,
     turns: list[_Turn],
     kernels: Kernels,
@@ -394,66 +389,78 @@ def _backward(
 ) -> Float[Tensor, "m c"]:
     """Gradient of the drawing parameters."""
     local = pixel_centres(drawing)
-    monomials, grad = _monomials(*local), grad.contiguous()
     parts = _Parts(torch.zeros_like(drawing))
-    light = torch.zeros_like(grad[0])
+    light = torch.zeros_like(g_alpha)
     for turn in reversed(turns):
-        behind, grads = light.index_select(0, turn.tiles), grad.index_select(1, turn.tiles)
-        colours, ones = grads[:3].transpose(0, 1).contiguous(), torch.ones_like(turn.origins[:, 0])
-        for owners, rows, before in _passes(drawing, bins, turn, kernels):
+        behind, hidden = (plane.index_select(0, turn.tiles) for plane in (light, g_alpha))
+        colours = g_colour.index_select(1, turn.tiles)
+        ones = torch.ones_like(turn.origins[:, 0])
+        for owners, rows, before in _steps(drawing, bins, turn, kernels):
             n = len(before)
-            origins = turn.origins[:n]
-            pixels = (before, behind[:n], *grads[:, :n].unbind(), *local, ones[:n])
-            weights, moves = kernels.run(CHUNK_BACKWARD[pixel], rows, origins, *pixels)
-            by_colour = torch.bmm(weights, colours[:n].mT)
-            if pixel == "point":
-                (added,) = kernels.run(CHUNK_SUMS, rows, origins, moves @ monomials, by_colour)
-            else:
-                added = _sums_by_autograd(ALPHA[pixel], rows, origins, moves, by_colour)
-            parts.add(owners, added)
+            grads = (*colours[:, :n].unbind(), hidden[:n])
+            pixels = (before, behind[:n], *grads, *local, ones[:n])
+            (sums,) = kernels.run(CHUNK_BACKWARD[pixel], rows, turn.origins[:n], *pixels)
+            parts.add(owners, sums)
         light.index_copy_(0, turn.tiles, behind)
-    return parts.total()
+    total = parts.total()
+    return kernels.run(FROM_SUMS, drawing, total)[0] if pixel == "point" else total
 
 
-def _passes(
+def _steps(
     drawing: Float[Tensor, "m c"], bins: Bins, turn: _Turn, kernels: Kernels
 ) -> Iterator[tuple[Int[Tensor, "n K"], Float[Tensor, "n K c"], Float[Tensor, "n P"]]]:
-    """Owners, rows and transmittance of each pass of a turn, from the last; some are looked up together."""
+    """Owners, rows and transmittance of each step of a turn, from the last; some are looked up together."""
     at, ends = turn.splats
-    starts = range(0, len(turn.before), CHECK_EVERY)
-    for start in reversed(starts):
-        together = turn.before[start : start + CHECK_EVERY]
+    for start in reversed(range(0, len(turn.before), STEPS_TOGETHER)):
+        together = turn.before[start : start + STEPS_TOGETHER]
         sizes = [len(before) for before in together]
-        places = torch.cat([at[:n] + (start + i) * PASS for i, n in enumerate(sizes)])
+        places = torch.cat([at[:n] + (start + i) * STEP for i, n in enumerate(sizes)])
         last = torch.cat([ends[:n] for n in sizes])
         (owners,) = kernels.run(OWNERS, drawing, bins.splats, places, last)
         rows = _rows(drawing, owners)
-        passes = zip(owners.split(sizes), rows.split(sizes), together, strict=True)
-        yield from reversed(list(passes))
+        steps = zip(owners.split(sizes), rows.split(sizes), together, strict=True)
+        yield from reversed(list(steps))
+
+
+def _owners(
+    drawing: Float[Tensor, "m c"],
+    ids: Int[Tensor, " p"],
+    at: Int[Tensor, " t"],
+    ends: Int[Tensor, " t"],
+    count: int = STEP,
+) -> tuple[Int[Tensor, "t K"]]:
+    """The splats at to at + count of each tile; after its last the one that draws nothing."""
+    place = at[:, None] + torch.arange(count, device=at.device)
+    return (torch.where(place < ends[:, None], ids[place], drawing.shape[0] - 1),)
+
+
+def _rows(drawing: Float[Tensor, "m c"], owners: Int[Tensor, "*n"]) -> Float[Tensor, "*n c"]:
+    """Parameters of splats."""
+    return drawing.index_select(0, owners.flatten()).view(*owners.shape, -1)
 
 
 class _Parts:
-    """Adds up what tiles add to the gradients of splats.
+    """Adds up what tiles add to the sums of splats.
 
     Parts are gathered and sorted by splat, which is several times as fast as adding each where it belongs.
     """
 
     def __init__(self, total: Float[Tensor, "m c"]):
-        room = max(PARTS_AT_ONCE, 2 * len(total))
-        self._total, self._count = total, 0
+        self._total = total
+        self._room = max(PARTS_AT_ONCE, 2 * len(total))
         few = len(total) < torch.iinfo(torch.int16).max  # half the bits sort in half the time
-        self._owners = total.new_empty(room, dtype=torch.int16 if few else torch.int32)
-        self._parts = total.new_empty(room, total.shape[1])
+        self._owner_type = torch.int16 if few else torch.int32
+        self._owners: list[Int[Tensor, "t K"]] = []
+        self._parts: list[Float[Tensor, "t c_K"]] = []
+        self._count = 0
 
-    def add(self, owners: Int[Tensor, "t K"], parts: Float[Tensor, "t K c"]) -> None:
-        """Add those of a pass, which are fewer than there is room for."""
-        end = self._count + owners.numel()
-        if end > len(self._owners):
+    def add(self, owners: Int[Tensor, "t K"], parts: Float[Tensor, "t c_K"]) -> None:
+        """Add those of some splats of some tiles."""
+        self._owners.append(owners)
+        self._parts.append(parts)
+        self._count += owners.numel()
+        if self._count >= self._room:
             self._sum()
-            end = owners.numel()
-        self._owners[self._count : end] = owners.flatten()
-        self._parts[self._count : end] = parts.flatten(0, 1)
-        self._count = end
 
     def total(self) -> Float[Tensor, "m c"]:
         """All that was added."""
@@ -462,23 +469,29 @@ class _Parts:
         return self._total
 
     def _sum(self) -> None:
-        owners = self._owners[: self._count]
+        owners = torch.cat(self._owners).flatten().to(self._owner_type)
+        parts = torch.cat(self._parts).view(-1, self._total.shape[1])
+        self._owners, self._parts, self._count = [], [], 0
         order = torch.sort(owners, stable=True).indices
         counts = torch.bincount(owners, minlength=len(self._total))
         first = counts.cumsum(0) - counts
-        parts = self._parts[: self._count]
         self._total += functional.embedding_bag(order, parts, first, mode="sum")
-        self._count = 0
 
 
-def _monomials(x: Float[Tensor, " P"], y: Float[Tensor, " P"]) -> Float[Tensor, "P 6"]:
-    """1, x, y, x², xy, y² of a tile's pixel centres from its middle, where no digits are lost."""
-    x, y = x - TILE / 2, y - TILE / 2
-    return torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y], dim=1)
+class _Move(NamedTuple):
+    """Of a splat of each tile: its row, its weight in each pixel, and the gradient of log alpha there."""
+
+    row: Float[Tensor, "t c"]
+    weight: Float[Tensor, "t P"]
+    gradient: Float[Tensor, "t P"]
+
+
+SumsOf = Callable[[list[_Move], tuple[Tensor, Tensor, Tensor], Tensor, _Pixels], Tensor]
 
 
 def _chunk_backward(
     alpha_of: AlphaOf,
+    sums_of: SumsOf,
     rows: Float[Tensor, "t K c"],
     origins: Float[Tensor, "t 2"],
     T: Float[Tensor, "t P"],
@@ -490,17 +503,18 @@ def _chunk_backward(
     local_x: Float[Tensor, " P"],
     local_y: Float[Tensor, " P"],
     one: Float[Tensor, " t"],
-) -> tuple[Float[Tensor, "t K P"], Float[Tensor, "t K P"]]:
-    """The weight of each of K splats, and the gradient of log alpha, at each pixel; puts them into `behind`."""
+) -> tuple[Float[Tensor, "t c_STEP"]]:
+    """What tiles add to the sums of K splats, one splat after the other; puts these into `behind`."""
     one = one[:, None]
     before, drawn = T, []
-    for row, alpha in _splats(alpha_of, rows.transpose(0, 1), _Pixels(origins, local_x, local_y)):
+    pixels = _Pixels(origins, local_x, local_y)
+    for row, alpha in _splats(alpha_of, rows.transpose(0, 1), pixels):
         left = _left(alpha, one)
         after = before * left
         hides = _where_above(BELOW_MIN_TRANSMITTANCE, after, one - left)
         drawn.append((row, alpha, hides, before))
         before = after
-    weights, gradients, light = [], [], behind
+    moves, light = [], behind
     for row, alpha, hides, reaching in reversed(drawn):
         weight = reaching * hides
         colour = torch.addcmul(g_hidden, row[:, RED, None], g_red)
@@ -508,55 +522,85 @@ def _chunk_backward(
         colour = torch.addcmul(colour, row[:, BLUE, None], g_blue)
         ahead = _less(colour, light, one)
         # where alpha is skipped or comes too late its weight is 0, and where it is capped it does not move
-        gradients.append(_where_above(0.0, MAX_ALPHA * one - alpha, weight) * ahead)
-        weights.append(weight)
+        move = _where_above(0.0, MAX_ALPHA * one - alpha, weight) * ahead
+        moves.append(_Move(row, weight, move))
         light = light + hides * ahead
-    behind.copy_(one * light)
-    return torch.stack(weights[::-1], dim=1), torch.stack(gradients[::-1], dim=1)
+    light = one * light
+    sums = sums_of(moves[::-1], (g_red, g_green, g_blue), T, pixels)
+    behind.copy_(light)
+    return (sums,)
 
 
-def _chunk_sums(
-    rows: Float[Tensor, "t K 10"],
-    origins: Float[Tensor, "t 2"],
-    moments: Float[Tensor, "t K 6"],
-    colours: Float[Tensor, "t K 3"],
-) -> tuple[Float[Tensor, "t K 10"]]:
-    """What a tile adds to the gradient of its splats' parameters, for values at points.
+def _sums_at_centre(
+    moves: list[_Move], colours: tuple[Tensor, Tensor, Tensor], T: Tensor, pixels: _Pixels
+) -> Float[Tensor, "t c_K"]:
+    """Sums over pixels that the gradient of values at points is made of, ten a splat.
 
-    moments: sums over pixels of the gradient of log alpha, ln 2 (log2 o − u² − v²), times the monomials.
+    With s the gradient of log alpha: of s u and s v times the offset in x and y; s u; s v; s; and of the weight times
+    the gradients of the colours.  Array code finds them as products of matrices, a compiled loop adds them up.
     """
-    ux, uy, vx, vy, x, y, *_ = rows.unbind(dim=2)
-    dx, dy = origins[:, 0, None] + TILE / 2 - x, origins[:, 1, None] + TILE / 2 - y
-    s, sx, sy, sxx, sxy, syy = moments.unbind(dim=2)
-    forms = []
-    to_x, to_y = torch.zeros_like(s), torch.zeros_like(s)
+    if not torch.compiler.is_compiling():
+        return _sums_by_products(moves, colours, pixels)
+    sums = []
+    for row, weight, gradient in moves:
+        dx, dy = _offsets(row, pixels)
+        su, sv = (gradient * form for form in _forms(row, pixels))
+        red, green, blue = (weight * colour for colour in colours)
+        # where T is 0 these are 0: that they look at it shows the compiler that all sums share enough for one loop
+        gradient, red = (torch.where(T > 0, x, 0.0) for x in (gradient, red))
+        sums += [su * dx, su * dy, sv * dx, sv * dy, su, sv, gradient, red, green, blue]
+    return torch.cat([x.sum(dim=1, keepdim=True) for x in sums], dim=1)
+
+
+def _sums_by_products(
+    moves: list[_Move], colours: tuple[Tensor, Tensor, Tensor], pixels: _Pixels
+) -> Float[Tensor, "t c_K"]:
+    """What `_sums_at_centre` gives: from moments about the tile's middle, where no digits are lost."""
+    rows, weights, gradients = (torch.stack(x, dim=1) for x in zip(*moves, strict=True))
+    x, y = pixels.x - TILE / 2, pixels.y - TILE / 2
+    monomials = torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y], dim=1)
+    s, sx, sy, sxx, sxy, syy = (gradients @ monomials).unbind(dim=2)
+    ux, uy, vx, vy, centre_x, centre_y, *_ = rows.unbind(dim=2)
+    dx = pixels.corners[:, 0, None] + TILE / 2 - centre_x
+    dy = pixels.corners[:, 1, None] + TILE / 2 - centre_y
+    by_offset, by_form = [], []
     for i, j in ((ux, uy), (vx, vy)):
         middle = i * dx + j * dy
-        along = middle * s + i * sx + j * sy  # Σ s u
-        forms += [dx * along + middle * sx + i * sxx + j * sxy]  # Σ s u dx
-        forms += [dy * along + middle * sy + i * sxy + j * syy]
-        to_x, to_y = to_x + i * along, to_y + j * along
-    shape = [-2 * LN_2 * form for form in forms]
-    centre = [2 * LN_2 * to_x, 2 * LN_2 * to_y]
-    return (torch.stack([*shape, *centre, LN_2 * s, *colours.unbind(dim=2)], dim=2),)
+        along = middle * s + i * sx + j * sy
+        by_form += [along]
+        by_offset += [dx * along + middle * sx + i * sxx + j * sxy]
+        by_offset += [dy * along + middle * sy + i * sxy + j * syy]
+    by_colour = torch.bmm(weights, torch.stack(colours, dim=2)).unbind(dim=2)
+    return torch.stack([*by_offset, *by_form, s, *by_colour], dim=2).flatten(1)
+
+
+def _from_sums(
+    drawing: Float[Tensor, "m 10"], sums: Float[Tensor, "m 10"]
+) -> tuple[Float[Tensor, "m 10"]]:
+    """The gradient of splats' parameters from their sums, log alpha being ln 2 (log2 o − u² − v²)."""
+    ux, uy, vx, vy, *_ = drawing.unbind(dim=1)
+    *by_offset, su, sv, s, red, green, blue = sums.unbind(dim=1)
+    forms = [-2 * LN_2 * form for form in by_offset]
+    centre = [2 * LN_2 * (ux * su + vx * sv), 2 * LN_2 * (uy * su + vy * sv)]
+    return (torch.stack([*forms, *centre, LN_2 * s, red, green, blue], dim=1),)
 
 
 def _sums_by_autograd(
     alpha_of: AlphaOf,
-    rows: Float[Tensor, "t K c"],
-    origins: Float[Tensor, "t 2"],
-    moves: Float[Tensor, "t K P"],
-    colours: Float[Tensor, "t K 3"],
-) -> Float[Tensor, "t K c"]:
-    """What `_chunk_sums` gives, for any kernel: from the gradient of log alpha by autograd of alpha."""
-    pixels = _Pixels(origins, *pixel_centres(rows))
+    moves: list[_Move],
+    colours: tuple[Tensor, Tensor, Tensor],
+    T: Tensor,
+    pixels: _Pixels,
+) -> Float[Tensor, "t c_K"]:
+    """For any kernel, what tiles add to the gradient itself: from the gradient of log alpha by autograd of alpha."""
+    rows, weights, gradients = (torch.stack(x, dim=1) for x in zip(*moves, strict=True))
     with torch.enable_grad():
         rows = rows.detach().requires_grad_()
         alpha = alpha_of(rows.transpose(0, 1), pixels).transpose(0, 1)
-        grads = torch.where(alpha > 0, moves / alpha, 0.0).detach()
+        grads = torch.where(alpha > 0, gradients / alpha, 0.0).detach()
         (added,) = torch.autograd.grad(alpha, rows, grads)
-    added[..., RED : BLUE + 1] = colours
-    return added
+    added[..., RED : BLUE + 1] = torch.bmm(weights, torch.stack(colours, dim=2))
+    return added.flatten(1)
 
 
 # --------------------------------------------------------------------------------------------------------- kernels
@@ -571,11 +615,11 @@ def _chunk_example(columns: int) -> tuple[Tensor, ...]:
     return rows.flatten(0, 1)[:EXAMPLE_SPLATS], *where, origins, *pixels
 
 
-def _rows_example(states: int, columns: int = COLUMNS) -> tuple[Tensor, ...]:
+def _rows_example(planes: int, columns: int) -> tuple[Tensor, ...]:
     tiles = EXAMPLE_TILES
-    rows = torch.linspace(0.012, 0.1, tiles * PASS * columns).view(tiles, PASS, columns)
-    state = [torch.full((tiles, PIXELS), 0.5) for _ in range(states)]
-    return rows, torch.ones(tiles, 2), *state, *pixel_centres(rows), torch.ones(tiles)
+    rows = torch.linspace(0.012, 0.1, tiles * STEP * columns).view(tiles, STEP, columns)
+    pixels = [torch.full((tiles, PIXELS), 0.5) for _ in range(planes)]
+    return rows, torch.ones(tiles, 2), *pixels, *pixel_centres(rows), torch.ones(tiles)
 
 
 def _owners_example() -> tuple[Tensor, ...]:
@@ -584,10 +628,9 @@ def _owners_example() -> tuple[Tensor, ...]:
     return torch.ones(EXAMPLE_SPLATS, COLUMNS), ids, at, at + PASS
 
 
-def _sums_example() -> tuple[Tensor, ...]:
-    rows, origins, *_ = _rows_example(0)
-    moments, colours = (torch.linspace(0.1, 1.0, EXAMPLE_TILES * PASS * n) for n in (6, 3))
-    return rows, origins, moments.view(-1, PASS, 6), colours.view(-1, PASS, 3)
+def _from_sums_example() -> tuple[Tensor, ...]:
+    m = 100_000
+    return tuple(torch.linspace(0.1, 1.0, m * COLUMNS).view(m, -1) for _ in range(2))
 
 
 ALPHA: dict[PixelKernel, AlphaOf] = {
@@ -614,10 +657,11 @@ COMPOSITE: dict[PixelKernel, Kernel] = {
 CHUNK_BACKWARD: dict[PixelKernel, Kernel] = {
     name: Kernel(
         f"composite-{name}-backward",
-        partial(_chunk_backward, alpha_of),
+        partial(_chunk_backward, alpha_of, sums_of),
         partial(_rows_example, 6, WIDTH[name]),
         (*8 * ("t",), None, None, "t"),
     )
     for name, alpha_of in ALPHA.items()
+    for sums_of in [_sums_at_centre if name == "point" else partial(_sums_by_autograd, alpha_of)]
 }
-CHUNK_SUMS = Kernel("composite-sums", _chunk_sums, _sums_example, ("t",) * 4)
+FROM_SUMS = Kernel("composite-sums", _from_sums, _from_sums_example, ("m", "m"))

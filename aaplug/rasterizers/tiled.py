@@ -52,14 +52,15 @@ class Tiled:
         grid = (-(-hw[0] // TILE), -(-hw[1] // TILE))
         extents = extents_of(splats, pixel) or splats
         paint = self._painter(splats, pixel)
-        planes = [
-            _untiled(paint(bins), grid[1])[:, : hw[1]]
-            for bins in bands(extents, grid, self.kernels, self.memory)
-        ]
-        image = (planes[0] if len(planes) == 1 else torch.cat(planes))[: hw[0]]
-        return over(image[..., :3], image[..., 3], background)
+        painted = [paint(bins) for bins in bands(extents, grid, self.kernels, self.memory)]
+        colours, alphas = zip(*painted, strict=True)
+        rgb = _image(colours, grid[1], hw)
+        alpha = _image([tiles[None] for tiles in alphas], grid[1], hw)
+        return over(rgb, alpha[..., 0], background)
 
-    def _painter(self, splats: Splats2D, pixel: PixelKernel) -> Callable[[Bins], Tensor]:
+    def _painter(
+        self, splats: Splats2D, pixel: PixelKernel
+    ) -> Callable[[Bins], tuple[Tensor, Tensor]]:
         """What paints the tiles of a band."""
         if pixel == "blending":
             return partial(_blend, table_of(splats), splats)
@@ -68,10 +69,16 @@ class Tiled:
         )
 
 
-def _untiled(tiles: Float[Tensor, "4 t P"], columns: int) -> Float[Tensor, "h w 4"]:
-    """Tiles of whole rows put in their places."""
-    image = tiles.view(4, -1, columns, TILE, TILE).permute(1, 3, 2, 4, 0)
-    return image.reshape(-1, columns * TILE, 4)
+def _image(
+    bands: Sequence[Float[Tensor, "k _t P"]], columns: int, hw: tuple[int, int]
+) -> Float[Tensor, "h w k"]:
+    """Tiles of whole rows, in bands from the top, put in their places."""
+    planes = []
+    for tiles in bands:
+        rows = tiles.view(len(tiles), -1, columns, TILE, TILE).permute(1, 3, 2, 4, 0)
+        planes.append(rows.reshape(-1, columns * TILE, len(tiles)))
+    image = planes[0] if len(planes) == 1 else torch.cat(planes)
+    return image[: hw[0], : hw[1]]
 
 
 def drawing_of(
@@ -138,7 +145,9 @@ def _rows_of(
     return torch.stack(columns, dim=1)
 
 
-def _blend(table: Float[Tensor, "m 12"], splats: Splats2D, bins: Bins) -> Float[Tensor, "4 t P"]:
+def _blend(
+    table: Float[Tensor, "m 12"], splats: Splats2D, bins: Bins
+) -> tuple[Float[Tensor, "3 t P"], Float[Tensor, "t P"]]:
     """The same by the rule of `blending`, in array code alone."""
     local = pixel_centres(table)
     order = torch.sort(bins.counts, descending=True, stable=True).indices
@@ -147,7 +156,8 @@ def _blend(table: Float[Tensor, "m 12"], splats: Splats2D, bins: Bins) -> Float[
         x, y = (bins.origins[tiles, i, None] + local[i] for i in (0, 1))
         lists = (bins.splats, bins.first[tiles], bins.counts[tiles])
         parts.append(blended(table, splats.window, *lists, x, y))
-    return torch.cat(parts, dim=1)[:, order.argsort()].to(splats.means)
+    image = torch.cat(parts, dim=1)[:, order.argsort()].to(splats.means)
+    return image[:3], image[3]
 
 
 DRAWING = Kernel(
