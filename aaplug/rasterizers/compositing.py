@@ -36,7 +36,7 @@ assert PASS == 2 * STEP  # so that the middle of a pass is all that steps need b
 CHECK_EVERY = 4  # passes between looks at which tiles are saturated
 STEPS_TOGETHER = 8  # looked up at once
 COMPACT_BELOW = 3 / 4  # share of tiles still going at which the others leave
-PARTS_AT_ONCE = 1 << 18  # summed; or two a splat, if that is more
+PARTS_AT_ONCE = 1 << 18  # more than a step has; or two a splat, if that is more
 LN_2 = math.log(2)
 LOG2_SILENT = -9.0  # log2 of an alpha below 1/255; stops exp2 before it underflows, which is slow
 LOG2_MIN_ALPHA = torch.tensor(MIN_ALPHA).log2().item()
@@ -446,21 +446,21 @@ class _Parts:
     """
 
     def __init__(self, total: Float[Tensor, "m c"]):
-        self._total = total
-        self._room = max(PARTS_AT_ONCE, 2 * len(total))
+        room = max(PARTS_AT_ONCE, 2 * len(total))
+        self._total, self._count = total, 0
         few = len(total) < torch.iinfo(torch.int16).max  # half the bits sort in half the time
-        self._owner_type = torch.int16 if few else torch.int32
-        self._owners: list[Int[Tensor, "t K"]] = []
-        self._parts: list[Float[Tensor, "t c_K"]] = []
-        self._count = 0
+        self._owners = total.new_empty(room, dtype=torch.int16 if few else torch.int32)
+        self._parts = total.new_empty(room, total.shape[1])
 
     def add(self, owners: Int[Tensor, "t K"], parts: Float[Tensor, "t c_K"]) -> None:
-        """Add those of some splats of some tiles."""
-        self._owners.append(owners)
-        self._parts.append(parts)
-        self._count += owners.numel()
-        if self._count >= self._room:
+        """Add those of a step, which are fewer than there is room for."""
+        end = self._count + owners.numel()
+        if end > len(self._owners):
             self._sum()
+            end = owners.numel()
+        self._owners[self._count : end] = owners.flatten()
+        self._parts[self._count : end] = parts.view(-1, self._parts.shape[1])
+        self._count = end
 
     def total(self) -> Float[Tensor, "m c"]:
         """All that was added."""
@@ -469,13 +469,13 @@ class _Parts:
         return self._total
 
     def _sum(self) -> None:
-        owners = torch.cat(self._owners).flatten().to(self._owner_type)
-        parts = torch.cat(self._parts).view(-1, self._total.shape[1])
-        self._owners, self._parts, self._count = [], [], 0
+        owners = self._owners[: self._count]
         order = torch.sort(owners, stable=True).indices
         counts = torch.bincount(owners, minlength=len(self._total))
         first = counts.cumsum(0) - counts
+        parts = self._parts[: self._count]
         self._total += functional.embedding_bag(order, parts, first, mode="sum")
+        self._count = 0
 
 
 class _Move(NamedTuple):
