@@ -9,6 +9,7 @@ the larger image that it belongs to.  The design and its measurements are aaplug
 rate is SA-GS's filter (Song et al., arXiv 2403.19615).
 """
 
+import math
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -24,9 +25,10 @@ from aaplug.splats import Splats2D
 # than their energies together should, and a narrower filter makes up for some of it (examples/guides/methods.md).
 PIXEL_VARIANCE = 0.07
 
-# times: how much finer than its own start the rate may come to be that a receding view is compared with
-# (examples/guides/methods.md)
+# times: how much finer than its own start the rate may come to be that a receding view is compared with; and at a pose
+# of the data set, the share of that start at which it is so (examples/guides/methods.md)
 SHARPER = 1.2
+SHARPEST_AT = 1 / 4
 
 RateChoice = Literal["pose", "global", "sharpest", "interval"]
 
@@ -38,8 +40,10 @@ class Matched:
     rate: what a Gaussian's rate is compared with.
         "pose": as "global" at a pose of the data set, as "interval" for a free camera, whose distance no training
             view had, but that the blur of far views, which came of their own pixels, gives way to that of nearer
-            ones as a view samples less finely: as its rate falls, the one compared with rises, as in a mirror, up
-            to the highest that any training view had and by no more than `SHARPER`.
+            ones as a view samples less finely: as its rate falls, the one compared with rises, up to the highest
+            that any training view had and by no more than `SHARPER`.  For a free camera, which starts from the lowest
+            of training's rates, it rises as fast as the other falls; at a pose of the data set, which starts from its
+            own, only so that it has risen by `SHARPER` at `SHARPEST_AT`.
         "global" (A): the view's own training size; equals training's renderer at every training view.
         "sharpest" (B): the highest rate any training view had; one world-space blur for all views, the one that can
             be fused, thinner than what most views were trained with.
@@ -84,7 +88,8 @@ class Matched:
             nearest = torch.minimum(torch.maximum(now, lowest), highest)
             return torch.where(seen, now / nearest, view)
         low, high = (lowest, highest) if own is None else (own, own)
-        mirrored = torch.minimum(low * low / now, SHARPER * low)
-        below = torch.minimum(mirrored, highest)
+        speed = 1.0 if own is None else math.log(SHARPER) / -math.log(SHARPEST_AT)
+        rise = (low / now).pow(speed).clamp(max=SHARPER)
+        below = torch.minimum(low * rise, highest)
         nearest = torch.where(now < low, below, torch.minimum(now, high))
         return torch.where(seen, now / nearest, view)

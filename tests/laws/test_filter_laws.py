@@ -20,7 +20,7 @@ from aaplug.filters import (
     MatchedEnergy,
     StoredSmoothing,
 )
-from aaplug.filters.matched import SHARPER
+from aaplug.filters.matched import SHARPER, SHARPEST_AT
 from aaplug.gaussians import CONVENTIONS, MIP, Convention, Gaussians
 from aaplug.interfaces import ScreenFilter, Training, WorldFilter
 from aaplug.pipeline import learn
@@ -213,7 +213,7 @@ def test_matching_the_sharpest_rate_is_thinner_than_the_trainings_own_rule_where
         (4.0, 1.0, 1.0, 1.0),
         (6.0, 4 / 6, 1.0, 1.0),
         (8.0, 0.5, 1.0, 1.0),
-        (8.8, 4 / 8.8, 8 / 8.8, (8 / 8.8) ** 2),  # mirrored: compared with the rate at 8 · 8/8.8
+        (8.8, 4 / 8.8, 8 / 8.8, (8 / 8.8) ** 2),  # compared with the rate at 8 · 8/8.8
         (16.0, 0.25, 0.5, 0.5 / SHARPER),
     ],
 )
@@ -244,7 +244,8 @@ def test_rates_at_a_pose_are_its_own_and_sharper_where_it_is_small(scale, pose, 
     view = make_camera((0.0, -pose, 0.0))
     view = replace(view, fx=view.fx * scale, fy=view.fy * scale)
     rate = Matched("pose").rates(project(scene, view), view, training).item()
-    against = min(highest, SHARPER, 1 / scale) if scale < 1 else 1.0
+    octaves = -math.log2(scale) / -math.log2(SHARPEST_AT)  # of those that the rate rises over
+    against = min(highest, SHARPER ** min(1.0, octaves)) if scale < 1 else 1.0
     assert rate == pytest.approx(scale / against)
 
 
