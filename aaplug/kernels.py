@@ -82,19 +82,20 @@ class Package:
     """A kernel compiled for arguments on a CPU of these types, and shapes after the leading size."""
 
     run: Callable[[list[Tensor]], list[Tensor]]
-    types: tuple[tuple[torch.dtype, tuple[int, ...]], ...]
+    types: list[tuple[torch.dtype, list[int]]]
 
     @staticmethod
     def of(run: Callable[[list[Tensor]], list[Tensor]], example: tuple[Tensor, ...]) -> "Package":
         """What was compiled for an example."""
-        return Package(run, tuple((arg.dtype, arg.shape[1:]) for arg in example))
+        return Package(run, [(arg.dtype, list(arg.shape[1:])) for arg in example])
 
     def takes(self, args: tuple[Tensor, ...]) -> bool:
         """Whether it can run these; sizes of one are a case of their own to compilers."""
-        return all(
-            (arg.dtype, arg.shape[1:]) == of and arg.device.type == "cpu" and len(arg) > 1
-            for arg, of in zip(args, self.types, strict=True)
-        )
+        for arg, (dtype, rest) in zip(args, self.types, strict=True):
+            leading, *found = arg.shape
+            if arg.dtype is not dtype or found != rest or leading < 2 or not arg.is_cpu:
+                return False
+        return True
 
 
 class CompiledKernels(Kernels):
