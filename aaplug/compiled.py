@@ -216,18 +216,17 @@ def _build(name: str) -> None:
             program = torch.export.export(
                 module, args, dynamic_shapes=shapes if kernel.pulls_back else (shapes,)
             )
-            try:
-                made = torch._inductor.aoti_compile_and_package(
-                    program,
-                    package_path=str(Path(folder) / "k.pt2"),
-                    inductor_configs={**OPTIONS, DOUBTS: not kernel.gathers},
-                )
-            except Exception as error:  # compilers fail in ways of their own
-                problem = f"torch {torch.__version__} cannot compile '{name}' here: {error}"
-                raise UsageError("warmup", problem) from error
+            made = torch._inductor.aoti_compile_and_package(
+                program,
+                package_path=str(Path(folder) / "k.pt2"),
+                inductor_configs={**OPTIONS, DOUBTS: not kernel.gathers},
+            )
             os.replace(made, path)
     except OSError as error:
         raise UsageError("warmup", f"cannot write {path.parent}: {error}") from error
+    except Exception as error:  # compilers fail in ways of their own
+        problem = f"torch {torch.__version__} cannot compile '{kernel.name}' here: {error}"
+        raise UsageError("warmup", problem) from error
 
 
 class _Module(torch.nn.Module):

@@ -52,11 +52,12 @@ class Tiled:
         grid = (-(-hw[0] // TILE), -(-hw[1] // TILE))
         extents = extents_of(splats, pixel) or splats
         paint = self._painter(splats, pixel)
-        painted = [paint(bins) for bins in bands(extents, grid, self.kernels, self.memory)]
-        colours, alphas = zip(*painted, strict=True)
-        rgb = _image(colours, grid[1], hw)
-        alpha = _image([tiles[None] for tiles in alphas], grid[1], hw)
-        return over(rgb, alpha[..., 0], background)
+        rgb, alpha = [], []
+        for bins in bands(extents, grid, self.kernels, self.memory):
+            colours, alphas = paint(bins)
+            rgb.append(_untiled(colours, grid[1]))
+            alpha.append(_untiled(alphas[None], grid[1]))
+        return over(_image(rgb, hw), _image(alpha, hw)[..., 0], background)
 
     def _painter(
         self, splats: Splats2D, pixel: PixelKernel
@@ -69,15 +70,15 @@ class Tiled:
         )
 
 
-def _image(
-    bands: Sequence[Float[Tensor, "k _t P"]], columns: int, hw: tuple[int, int]
-) -> Float[Tensor, "h w k"]:
-    """Tiles of whole rows, in bands from the top, put in their places."""
-    planes = []
-    for tiles in bands:
-        rows = tiles.view(len(tiles), -1, columns, TILE, TILE).permute(1, 3, 2, 4, 0)
-        planes.append(rows.reshape(-1, columns * TILE, len(tiles)))
-    image = planes[0] if len(planes) == 1 else torch.cat(planes)
+def _untiled(tiles: Float[Tensor, "k t P"], columns: int) -> Float[Tensor, "h w k"]:
+    """Tiles of whole rows put in their places."""
+    image = tiles.view(len(tiles), -1, columns, TILE, TILE).permute(1, 3, 2, 4, 0)
+    return image.reshape(-1, columns * TILE, len(tiles))
+
+
+def _image(bands: list[Tensor], hw: tuple[int, int]) -> Float[Tensor, "h w k"]:
+    """Bands from the top put together, and cut to size."""
+    image = bands[0] if len(bands) == 1 else torch.cat(bands)
     return image[: hw[0], : hw[1]]
 
 
