@@ -29,21 +29,21 @@ from aaplug.interfaces import Rasterizer
 from aaplug.kernels import CompiledKernels, Kernel, Package
 from aaplug.rasterizers import RASTERIZERS, Tiled, binning, compositing, pixels, tiled
 
-KERNELS: tuple[Kernel, ...] = (
+KERNELS: tuple[Kernel, ...] = (  # those that take longest to compile are the last
     projection.PROJECT,
-    projection.PROJECT_BACKWARD,
     *projection.SHADE.values(),
-    *projection.SHADE_BACKWARD.values(),
     splats.INSIDE,
     tiled.DRAWING,
     binning.TABLE,
     binning.SPANS,
     binning.PAIRS,
     compositing.OWNERS,
-    compositing.COMPOSITE["point"],
-    compositing.COMPOSITE["integral"],
-    compositing.CHUNK_BACKWARD["point"],
     compositing.FROM_SUMS,
+    *projection.SHADE_BACKWARD.values(),
+    compositing.CHUNK_BACKWARD["point"],
+    projection.PROJECT_BACKWARD,
+    compositing.PASSES["integral"].kernel,
+    compositing.PASSES["point"].kernel,
 )
 OPTIONS = {
     "max_fusion_size": 1_000_000,  # a pass is one loop, however many operations it has
@@ -118,7 +118,7 @@ def build(
         processes = min(torch.get_num_threads(), MOST_PROCESSES, len(missing))
         pool = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"))
         try:
-            # backwards, because the largest are the last
+            # backwards, so that the longest do not come when the others are done
             built = as_completed([pool.submit(_build, name) for name in missing[::-1]])
             for done, future in enumerate(built, start=total - len(missing) + 1):
                 future.result()

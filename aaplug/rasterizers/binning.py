@@ -21,7 +21,7 @@ from aaplug.kernels import Kernel, Kernels
 from aaplug.splats import Splats2D, reach
 
 TILE = 8  # px
-PASS = 8  # splats composited in one pass: more compile slowly, fewer load and store more
+PASS = 16  # splats composited in one pass, at most: more compile slowly, fewer load and store more
 MEMORY = 1e9  # bytes
 PAIR_BYTES = 64  # of a candidate pair while a band is binned, measured
 REACH_SLACK = (

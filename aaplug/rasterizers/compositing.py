@@ -2,7 +2,7 @@
 
 t: tiles; K: splats a pass or a step; P: pixels a tile; c: columns of a drawing row.
 
-Tiles are composited PASS splats a pass, those with most splats first, so that the ones that are done are the last;
+Tiles are composited some splats a pass, those with most splats first, so that the ones that are done are the last;
 tiles whose pixels are all saturated leave now and then.
 
 The backward pass goes from the last splats to the first, in steps of STEP.  With B the light from behind a splat, were
@@ -32,8 +32,8 @@ from aaplug.splats import MIN_ALPHA
 
 PIXELS = TILE * TILE
 STEP = 4  # splats that gradients go through at once: of more sums the compiler makes several loops
-assert PASS == 2 * STEP  # so that the middle of a pass is all that steps need beside its ends
-CHECK_EVERY = 4  # passes between looks at which tiles are saturated
+SHORT_PASS = 8  # where alpha is much to compile, and much work beside what a pass loads and stores
+CHECK_EVERY = 2  # passes between looks at which tiles are saturated
 STEPS_TOGETHER = 8  # looked up at once
 COMPACT_BELOW = 3 / 4  # share of tiles still going at which the others leave
 PARTS_AT_ONCE = 1 << 18  # more than a step has; or two a splat, if that is more
@@ -79,6 +79,13 @@ def composite(
     return _forward(drawing, bins, kernels, pixel)
 
 
+class Pass(NamedTuple):
+    """Some splats of every tile composited at once.  splats: a multiple of STEP, at most `binning.PASS`."""
+
+    splats: int
+    kernel: Kernel
+
+
 @dataclass(frozen=True)
 class _Turn:
     """What was composited between two looks at which tiles are done.
@@ -101,11 +108,12 @@ def _forward(
     turns: list[_Turn] | None = None,
 ) -> tuple[Float[Tensor, "3 all P"], Float[Tensor, "all P"]]:
     """Colour and alpha; the turns that made it are put into `turns`, in order."""
+    local = pixel_centres(drawing)
     image = drawing.new_zeros(4, len(bins.counts), PIXELS)
     order = torch.sort(bins.counts, descending=True, stable=True).indices
     order = order[: int((bins.counts > 0).sum())]
     for tiles in order.split(kernels.tiles):
-        _composite_block(drawing, bins, tiles, image, kernels, COMPOSITE[pixel], turns)
+        _composite_block(drawing, bins, tiles, image, local, kernels, PASSES[pixel], turns)
     return image[:3], image[3]
 
 
@@ -114,12 +122,12 @@ def _composite_block(
     bins: Bins,
     tiles: Int[Tensor, " t"],
     image: Float[Tensor, "4 all P"],
+    local: tuple[Float[Tensor, " P"], Float[Tensor, " P"]],
     kernels: Kernels,
-    chunk: Kernel,
+    one_pass: Pass,
     turns: list[_Turn] | None,
 ) -> None:
     """Composite some tiles, longest first, into the image, until they are drawn out or saturated."""
-    local = pixel_centres(drawing)
     T = drawing.new_ones(len(tiles), PIXELS)
     planes = drawing.new_zeros(4, len(tiles), PIXELS)
     start = 0
@@ -127,18 +135,18 @@ def _composite_block(
         columns = [x.index_select(0, tiles) for x in (bins.first, bins.counts, bins.origins)]
         first, counts, origins = columns
         at, ends, ones = first + start, first + counts, torch.ones_like(origins[:, 0])
-        going = _going(counts - start)
-        left, before = tiles[:0], []
+        going, left = _going(counts - start, one_pass.splats), tiles[:0]
+        before, steps = [], [] if turns is None else _going(counts - start, STEP)
         if turns is not None:
             turns.append(_Turn(tiles, (at, ends), origins, before))
         for turn, n in enumerate(going):
-            where = (bins.splats, at[:n] + turn * PASS, ends[:n], origins[:n])
+            where = (bins.splats, at[:n] + turn * one_pass.splats, ends[:n], origins[:n])
             pixels = (T[:n], *planes[:, :n].unbind(), *local, ones[:n])
-            middle, after = kernels.run(chunk, drawing, *where, *pixels)
-            if turns is not None:
-                before += [T[:n], middle]
+            *within, after = kernels.run(one_pass.kernel, drawing, *where, *pixels)
+            here = steps[turn * one_pass.splats // STEP :]
+            before += [x[:m] for x, m in zip((T, *within), here, strict=False)]
             T = after
-            start += PASS
+            start += one_pass.splats
             if turn % CHECK_EVERY == CHECK_EVERY - 1 and turn + 1 < len(going):
                 alive = T[: going[turn + 1]].amax(dim=1) > 0
                 if int(alive.sum()) < COMPACT_BELOW * len(alive):
@@ -149,9 +157,9 @@ def _composite_block(
         planes = planes.index_select(1, left)
 
 
-def _going(counts: Int[Tensor, " t"]) -> list[int]:
-    """How many tiles take part in each pass, from their splats, most first."""
-    passes = (counts + (PASS - 1)) // PASS
+def _going(counts: Int[Tensor, " t"], at_once: int) -> list[int]:
+    """How many tiles take part in each pass of some splats at once, from their splats, most first."""
+    passes = (counts + (at_once - 1)) // at_once
     turns = torch.arange(int(passes[0]), device=counts.device)
     return (len(passes) - torch.searchsorted(passes.flip(0), turns, right=True)).tolist()
 
@@ -176,6 +184,7 @@ AlphaOf = Callable[[Tensor, _Pixels], Tensor]  # of one row or several a tile, a
 
 def _chunk(
     alpha_of: AlphaOf,
+    splats: int,
     drawing: Float[Tensor, "m c"],
     ids: Int[Tensor, " p"],
     at: Int[Tensor, " t"],
@@ -189,19 +198,19 @@ def _chunk(
     local_x: Float[Tensor, " P"],
     local_y: Float[Tensor, " P"],
     one: Float[Tensor, " t"],
-) -> tuple[Float[Tensor, "t P"], Float[Tensor, "t P"]]:
-    """Composite splats at to at + PASS of each tile into its colour and alpha.
+) -> tuple[Float[Tensor, "t P"], ...]:
+    """Composite splats at to at + `splats` of each tile into its colour and alpha.
 
-    Returns its transmittance after half of them, and after all; 0 once a pixel has stopped.
+    Returns its transmittance after each STEP of them; 0 once a pixel has stopped.
     one: ones; a column of them in each step keeps the compiler to one loop over tiles.
     """
     one = one[:, None]
     before, seen = T, []
     pixels = _Pixels(origins, local_x, local_y)
     if torch.compiler.is_compiling():  # each row too is loaded where it is needed
-        rows = (drawing[torch.where(at + k < ends, ids[at + k], -1)] for k in range(PASS))
+        rows = (drawing[torch.where(at + k < ends, ids[at + k], -1)] for k in range(splats))
     else:
-        (owners,) = _owners(drawing, ids, at, ends, PASS)
+        (owners,) = _owners(drawing, ids, at, ends, splats)
         rows = _rows(drawing, owners.T)
     for row, alpha in _splats(alpha_of, rows, pixels):
         after = before * _left(alpha, one)
@@ -212,10 +221,9 @@ def _chunk(
         blue.addcmul_(weight, row[:, BLUE, None])
         hidden.add_(weight)
         seen.append(before)
-    middle, last = (
-        torch.threshold(one * x, BELOW_MIN_TRANSMITTANCE, 0.0) for x in (seen[STEP - 1], seen[-1])
+    return tuple(
+        torch.threshold(one * x, BELOW_MIN_TRANSMITTANCE, 0.0) for x in seen[STEP - 1 :: STEP]
     )
-    return middle, last
 
 
 def _splats(
@@ -645,14 +653,18 @@ WIDTH: dict[PixelKernel, int] = {
     name: COLUMNS if name == "point" else MEAN_COLUMNS for name in ALPHA
 }
 OWNERS = Kernel("owners", _owners, _owners_example, ("m", "p", "t", "t"))
-COMPOSITE: dict[PixelKernel, Kernel] = {
-    name: Kernel(
-        f"composite-{name}",
-        partial(_chunk, alpha_of),
-        partial(_chunk_example, WIDTH[name]),
-        ("m", "p", *8 * ("t",), None, None, "t"),
+PASSES: dict[PixelKernel, Pass] = {
+    name: Pass(
+        splats,
+        Kernel(
+            f"composite-{name}",
+            partial(_chunk, alpha_of, splats),
+            partial(_chunk_example, WIDTH[name]),
+            ("m", "p", *8 * ("t",), None, None, "t"),
+        ),
     )
     for name, alpha_of in ALPHA.items()
+    for splats in [PASS if name == "point" else SHORT_PASS]
 }
 CHUNK_BACKWARD: dict[PixelKernel, Kernel] = {
     name: Kernel(

@@ -3,8 +3,9 @@
 from torch import Tensor
 
 from aaplug.kernels import Kernel, Kernels
-from aaplug.rasterizers.binning import PASS, TILE
-from aaplug.rasterizers.compositing import COMPOSITE
+from aaplug.rasterizers.compositing import PASSES, PIXELS
+
+SPLATS = {one_pass.kernel.name: one_pass.splats for one_pass in PASSES.values()}
 
 
 class Counting(Kernels):
@@ -15,6 +16,6 @@ class Counting(Kernels):
 
     def run(self, kernel: Kernel, *args: Tensor) -> tuple[Tensor, ...]:
         """Run a kernel."""
-        if kernel in COMPOSITE.values():
-            self.pairs += len(args[2]) * PASS * TILE**2
+        if kernel.name in SPLATS:
+            self.pairs += len(args[2]) * SPLATS[kernel.name] * PIXELS
         return self._kernels.run(kernel, *args)
