@@ -11,6 +11,7 @@ from aaplug.errors import UsageError, listing
 from aaplug.filters import (
     SCREEN_FILTERS,
     SELECTIONS,
+    AnisotropicSmoothing,
     FlatSmoothing,
     LowPass,
     Matched,
@@ -91,6 +92,14 @@ RECIPES: dict[str, Recipe] = {
             "aaplug: Mip-Splatting with opacities balanced by the broadest face's area, not by volume, and bounded",
             "comparison: most of the dimming of mip-splatting avoided",
             world=Smoothing3D(opacity="balanced"),
+        ),
+        Recipe(
+            "mip-splatting-anisotropic",
+            SCREEN_FILTERS["mip"],
+            "aaplug: Mip-Splatting with bounds of each direction: smoothing by what all views together tell along an "
+            "axis",
+            "comparison: no better than mip-splatting where measured",
+            world=AnisotropicSmoothing(),
         ),
         Recipe(
             "aaa",

@@ -93,6 +93,24 @@ def median_rates(
     return median
 
 
+def view_information(
+    means: Float[Tensor, "n 3"], cameras: Sequence[Camera], chunk_pairs: int = CHUNK_PAIRS
+) -> Float[Tensor, "n 3 3"]:
+    """What the cameras that see each Gaussian tell of every direction: Σ ν² (I − d dᵀ), in px² per world unit².
+
+    A camera samples with its rate ν across its ray d and not at all along it; 0 where no camera sees the Gaussian.
+    """
+    origin = torch.stack([camera.centre for camera in cameras]).mean(dim=0)
+    eyes = torch.stack([camera.centre - origin for camera in cameras]).to(means)
+    information = means.new_zeros(len(means), 3, 3)
+    for part, rates in _rates_in_chunks(means, cameras, chunk_pairs):
+        local = (means[part].double() - origin).to(means)
+        rays = torch.nn.functional.normalize(local[:, None] - eyes, dim=2) * rates[:, :, None]
+        total = rates.square().sum(dim=1)[:, None, None] * torch.eye(3).to(means)
+        information[part] = total - rays.mT @ rays
+    return information
+
+
 def check_frame(
     means: Float[Tensor, "n 3"],
     cameras: Sequence[Camera],

@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from aaplug.errors import UsageError
-from aaplug.filters import Adaptive, ByPixelSize, Smoothing3D
+from aaplug.filters import Adaptive, AnisotropicSmoothing, ByPixelSize, Smoothing3D
 from aaplug.filters.adaptive import ADAPTIVE_VARIANCE
 from aaplug.filters.pixel_size import pixel_size
-from aaplug.filters.smoothing import BALANCE_FLOOR
+from aaplug.filters.smoothing import BALANCE_FLOOR, LEAST_SHARE
 from aaplug.gaussians import PixelSizes
 from aaplug.pipeline import learn, render
 from aaplug.projection import project, rotation_matrices
@@ -78,6 +78,31 @@ def test_the_largest_focal_pairs_every_depth_with_it():
     alike = learn(SCENE, [NEAR, FAR])
     same = [Smoothing3D(focal=focal)(SCENE, alike).log_scales for focal in ("own", "largest")]
     torch.testing.assert_close(*same)
+
+
+def added_variances(filter_, scene, cameras):
+    """What a filter adds to each axis, against its isotropic amount."""
+    training = learn(scene, cameras)
+    added = filter_(scene, training).scales.square() - scene.scales.square()
+    return added * training.bounds.highest.square()[:, None] / filter_.variance
+
+
+def test_anisotropic_smoothing_is_wide_along_the_ray_of_a_single_view():
+    """The camera looks along y; axes turned by half a right angle have half of what is across the ray."""
+    scene = replace(SCENE[:2], means=torch.zeros(2, 3, dtype=F64))
+    turn = [[1.0, 0.0, 0.0, 0.0], [math.cos(math.pi / 8), 0.0, 0.0, math.sin(math.pi / 8)]]
+    scene = replace(scene, quats=torch.tensor(turn, dtype=F64))
+    ahead = make_camera((0.0, -4.0, 0.0))
+    added = added_variances(AnisotropicSmoothing(), scene, [ahead])
+    expected = torch.tensor([[1.0, 1 / LEAST_SHARE, 1.0], [2.0, 2.0, 1.0]], dtype=F64)
+    torch.testing.assert_close(added, expected, rtol=1e-6, atol=0)
+
+
+def test_anisotropic_smoothing_is_isotropic_where_views_come_from_all_sides():
+    eyes = [(-4.0, 0.0, 1e-9), (0.0, -4.0, 0.0), (1e-9, 0.0, 4.0)]
+    scene = replace(SCENE, means=0 * SCENE.means)
+    added = added_variances(AnisotropicSmoothing(), scene, [make_camera(eye) for eye in eyes])
+    torch.testing.assert_close(added, torch.full_like(added, 1.5), rtol=1e-5, atol=0)
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from aaplug.cameras import Camera
 from aaplug.errors import FrameError, UsageError
 from aaplug.filters import Smoothing3D
 from aaplug.pipeline import learn
-from aaplug.sampling import check_frame, median_rates, sampling_bounds
+from aaplug.sampling import check_frame, median_rates, sampling_bounds, view_information
 from tests.conftest import make_camera, make_scene
 
 FAR = torch.tensor([5e6, -5e6, 5e6], dtype=torch.float64)
@@ -180,6 +180,44 @@ def test_bounds_agree_with_a_loop_in_float64(dtype, rtol):
     ):
         want = torch.tensor([pick(rates) if rates else 0.0 for rates in expected], dtype=dtype)
         torch.testing.assert_close(got, want, rtol=rtol, atol=0)
+
+
+def information_by_loop(mean: list[float], cameras: list[Camera]) -> list[list[float]]:
+    """What the cameras that see a point tell of every direction, in plain Python floats."""
+    total = [[0.0] * 3 for _ in range(3)]
+    for camera in cameras:
+        rate = max(rates_by_loop(mean, [camera]), default=0.0)
+        ray = [a - b for a, b in zip(mean, camera.centre.tolist(), strict=True)]
+        squared = sum(x * x for x in ray)
+        for i in range(3):
+            for j in range(3):
+                total[i][j] += rate**2 * ((i == j) - ray[i] * ray[j] / squared)
+    return total
+
+
+@pytest.mark.parametrize(
+    ("dtype", "offset", "tolerance"),
+    [(torch.float64, 0.0, 1e-12), (torch.float32, 0.0, 1e-6), (torch.float64, 1.0, 1e-8)],
+    ids=["float64", "float32", "far from the origin"],
+)
+def test_the_information_of_views_is_that_of_a_loop(dtype, offset, tolerance):
+    cameras = [moved(camera, offset * FAR) for camera in ring()]
+    means = make_scene(30, dtype=torch.float64).means
+    means[3] = torch.tensor([0.0, 0.0, 500.0])
+    means = (means + offset * FAR).to(dtype)
+    found = view_information(means, cameras, chunk_pairs=20)
+    rows = [information_by_loop(mean, cameras) for mean in means.tolist()]
+    expected = torch.tensor(rows, dtype=torch.float64)
+    assert found.dtype == dtype
+    assert (sampling_bounds(means, cameras).seen == (expected.abs().amax(dim=(1, 2)) > 0)).all()
+    scale = expected.abs().max()
+    torch.testing.assert_close(found.double(), expected, rtol=0, atol=tolerance * scale.item())
+
+
+def test_one_view_tells_everything_across_its_ray_and_nothing_along_it():
+    information = view_information(torch.tensor([[0.0, 0.0, 2.0]]), [straight_camera(focal=64.0)])
+    expected = torch.diag(torch.tensor([32.0**2, 32.0**2, 0.0]))
+    torch.testing.assert_close(information[0], expected)
 
 
 @pytest.mark.parametrize("chunk_pairs", [1, 7, 64, 350, 10**9])

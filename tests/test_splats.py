@@ -227,7 +227,7 @@ def test_splats_are_taken_whole_and_in_order():
 @pytest.mark.parametrize("sigma", [1e-8, 1e-3, 1.0, 1e3])
 def test_the_volume_factor_equals_the_published_values(scales, expected, sigma):
     log_scales = (torch.tensor([scales]) * sigma).log()
-    factor = volume_log_factor(log_scales, torch.tensor([sigma]).log()).exp().item()
+    factor = volume_log_factor(log_scales, torch.tensor([[sigma]]).log()).exp().item()
     assert factor == pytest.approx(expected, abs=5e-7 if expected > 0.01 else 5e-6)
 
 
@@ -236,7 +236,7 @@ def test_the_volume_factor_equals_the_published_values(scales, expected, sigma):
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
 def test_the_volume_factor_is_exact_for_scales_of_any_size(scale, ratio, dtype):
     log_scales = torch.full((1, 3), math.log(scale), dtype=dtype)
-    factor = volume_log_factor(log_scales, torch.tensor([math.log(scale * ratio)], dtype=dtype))
+    factor = volume_log_factor(log_scales, torch.tensor([[math.log(scale * ratio)]], dtype=dtype))
     rounding = 1e-12 if dtype == F64 else 1e-4  # ln 1e-30 is −69, known to 8e-6 in float32
     assert factor.item() == pytest.approx(-1.5 * math.log1p(ratio**2), rel=rounding)
 
@@ -244,7 +244,7 @@ def test_the_volume_factor_is_exact_for_scales_of_any_size(scale, ratio, dtype):
 @pytest.mark.parametrize("scale", [1e-12, 1e-18, 1e-24, 1e-30])
 def test_the_volume_factor_and_its_gradient_stay_finite_for_points(scale):
     log_scales = torch.full((1, 3), math.log(scale), requires_grad=True)
-    factor = volume_log_factor(log_scales, torch.zeros(1))
+    factor = volume_log_factor(log_scales, torch.zeros(1, 1))
     assert factor.item() == pytest.approx(3 * math.log(scale), rel=1e-5)
     (gradient,) = torch.autograd.grad(factor.sum(), log_scales)
     torch.testing.assert_close(gradient, torch.ones(1, 3))
@@ -258,16 +258,17 @@ def test_smoothing_by_nothing_is_the_identity_to_the_bit(volume, dtype):
         log_scales=torch.linspace(-60, 40, 600, dtype=dtype).view(200, 3),
     )
     scene.logit_opacities[:4] = torch.tensor([-100.0, -20.0, 20.0, 100.0])
-    same = smooth(scene, torch.full((200,), -math.inf, dtype=dtype), volume)
+    same = smooth(scene, torch.full((200, 1), -math.inf, dtype=dtype), volume)
     assert same.log_scales.equal(scene.log_scales)
     assert same.logit_opacities.equal(scene.logit_opacities)
 
 
-def test_smoothing_adds_variances():
+@pytest.mark.parametrize("axes", [[1.0], [1.0, 0.5, 2.0]], ids=["alike", "each its own"])
+def test_smoothing_adds_variances(axes):
     scene = make_scene(50, dtype=F64)
-    sigma = torch.linspace(0.01, 1, 50, dtype=F64)
+    sigma = torch.linspace(0.01, 1, 50, dtype=F64)[:, None] * torch.tensor(axes, dtype=F64)
     smoothed = smooth(scene, sigma.log(), volume=True)
-    variances = scene.scales.square() + sigma.square()[:, None]
+    variances = scene.scales.square() + sigma.square()
     torch.testing.assert_close(smoothed.scales.square(), variances)
     ratio = scene.scales.prod(dim=1) / smoothed.scales.prod(dim=1)
     torch.testing.assert_close(smoothed.opacities, (scene.opacities * ratio).clamp(min=MIN_OPACITY))
@@ -280,7 +281,7 @@ def test_the_smoothed_scale_is_finite_and_the_larger_of_both_where_they_differ(
     log_scale, log_sigma
 ):
     scene = replace(make_scene(1), log_scales=torch.full((1, 3), log_scale))
-    smoothed = smooth(scene, torch.tensor([log_sigma]), volume=True)
+    smoothed = smooth(scene, torch.tensor([[log_sigma]]), volume=True)
     expected = max(log_scale, log_sigma) + (0.5 * math.log(2) if log_scale == log_sigma else 0)
     assert smoothed.log_scales[0].tolist() == pytest.approx([expected] * 3, rel=1e-4, abs=1e-4)
     assert smoothed.logit_opacities.isfinite().all()

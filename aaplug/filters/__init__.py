@@ -8,6 +8,7 @@ from aaplug.filters.matched import PIXEL_VARIANCE, Matched, RateChoice
 from aaplug.filters.pixel_size import ByPixelSize
 from aaplug.filters.smoothing import (
     NYQUIST_VARIANCE,
+    AnisotropicSmoothing,
     FlatSmoothing,
     Smoothing3D,
     StoredSmoothing,
@@ -19,6 +20,7 @@ WORLD_FILTERS: dict[str, WorldFilter] = {
     "smoothing3d": Smoothing3D(),
     "smoothing3d-largest-focal": Smoothing3D(focal="largest"),
     "smoothing3d-balanced": Smoothing3D(opacity="balanced"),
+    "smoothing3d-anisotropic": AnisotropicSmoothing(),
     "flat": FlatSmoothing(),
     "stored": StoredSmoothing(),
     "matched-energy": MatchedEnergy(),
@@ -48,6 +50,7 @@ __all__ = [
     "SELECTIONS",
     "WORLD_FILTERS",
     "Adaptive",
+    "AnisotropicSmoothing",
     "ByPixelSize",
     "Dilation",
     "FlatSmoothing",

@@ -63,7 +63,7 @@ def _widened(scene: Gaussians, rates: Float[Tensor, " n"], variance: float) -> G
     """Add `variance` px² to every axis, or take it away and leave what a thin Gaussian has or `THINNEST`."""
     if variance >= 0:
         log_sigma = 0.5 * torch.tensor(variance).log() - rates.log()
-        return smooth(scene, log_sigma.where(rates > 0, -torch.inf), volume=False)
+        return smooth(scene, log_sigma.where(rates > 0, -torch.inf)[:, None], volume=False)
     px2 = (2 * (scene.log_scales + rates.log()[:, None])).exp()
     least = px2.clamp(max=THINNEST)
     share = torch.maximum(px2 + variance, least) / px2

@@ -1,4 +1,4 @@
-"""3D smoothing: convolve every Gaussian with an isotropic one, in the world (Mip-Splatting, section 5.1).
+"""3D smoothing: convolve every Gaussian with another one, in the world (Mip-Splatting, section 5.1).
 
 A variance added to every axis commutes with the rotation, so fusing it into the scales is exact:
 s' = √(s² + f²).  With the volume factor the Gaussian keeps its integral: o' = o·∏ s/s' (Mip-Splatting's choice), taken
@@ -15,10 +15,15 @@ from torch import Tensor
 
 from aaplug.gaussians import Fusion, Gaussians, scale_opacities
 from aaplug.interfaces import Training
+from aaplug.projection import rotation_matrices
+from aaplug.sampling import view_information
 
 NYQUIST_VARIANCE = (
     0.2  # px² at the highest rate: Mip-Splatting's published constant (its eq. 9 omits a square)
 )
+LEAST_SHARE = (
+    1 / 16
+)  # of the squared rate: no axis is smoothed by more than four times the finest's width
 BALANCE_FLOOR = 0.5  # of an opacity: balancing dims no Gaussian below it
 
 
@@ -47,7 +52,7 @@ class Smoothing3D:
             bounds = replace(
                 bounds, highest=torch.where(bounds.seen, largest / bounds.nearest, 0.0)
             )
-        log_sigma = (self.variance**0.5 / bounds.highest_or_coarsest).log()
+        log_sigma = (self.variance**0.5 / bounds.highest_or_coarsest).log()[:, None]
         smoothed = smooth(scene, log_sigma, self.opacity == "volume")
         if self.opacity == "balanced":
             factor = face_log_factor(scene.log_scales, log_sigma).clamp(min=math.log(BALANCE_FLOOR))
@@ -57,6 +62,32 @@ class Smoothing3D:
         if self.focal != "own":
             settings["focal"] = self.focal
         return replace(smoothed, fused=(*scene.fused, Fusion("smoothing3d", settings)))
+
+
+@dataclass(frozen=True)
+class AnisotropicSmoothing:
+    """Smooth each of a Gaussian's axes by what the views tell along it, which no view does along its own ray.
+
+    With the views' information J = Σ ν² (I − d dᵀ) the rate along an axis u is ν_u² = ν² uᵀ J u / Σ ν², ν the highest
+    that any training camera had: for one view ν across its ray and nothing along it, for views from all sides ν √⅔
+    everywhere.  The variance along u is `variance` / ν_u²; no rate counts for less than √`LEAST_SHARE` of ν.  What
+    would turn the axes of a Gaussian is left out.  aaplug's own; the volume factor is Mip-Splatting's.
+    """
+
+    variance: float = NYQUIST_VARIANCE
+
+    def __call__(self, scene: Gaussians, training: Training) -> Gaussians:
+        """Fuse the smoothing into scales and opacities."""
+        information = view_information(scene.means, training.cameras)
+        axes = rotation_matrices(scene.unit_quats)
+        along = (axes * (information @ axes)).sum(dim=1)
+        across = 0.5 * information.diagonal(dim1=1, dim2=2).sum(dim=1, keepdim=True)
+        seen = across > 0
+        share = torch.where(seen, along / across.where(seen, 1.0), 1.0).clamp(LEAST_SHARE, 1.0)
+        log_sigma = (self.variance**0.5 / training.bounds.highest_or_coarsest).log()
+        smoothed = smooth(scene, log_sigma[:, None] - 0.5 * share.log(), volume=True)
+        fusion = Fusion("anisotropic smoothing", {"variance": f"{self.variance:g}"})
+        return replace(smoothed, fused=(*scene.fused, fusion))
 
 
 @dataclass(frozen=True)
@@ -70,7 +101,7 @@ class FlatSmoothing:
 
     def __call__(self, scene: Gaussians, training: Training) -> Gaussians:
         """Fuse the smoothing into scales and opacities."""
-        log_sigma = (self.variance**0.5 / training.bounds.highest_or_coarsest).log()
+        log_sigma = (self.variance**0.5 / training.bounds.highest_or_coarsest).log()[:, None]
         smoothed = smooth(scene, log_sigma, volume=False)
         thin = torch.zeros_like(scene.log_scales, dtype=torch.bool)
         thin.scatter_(1, scene.log_scales.argmin(dim=1, keepdim=True), True)
@@ -98,13 +129,16 @@ def fuse_stored(scene: Gaussians) -> Gaussians:
     """The same scene with its stored 3D filter fused; unchanged if it has none (Mip-Splatting, fused export)."""
     if scene.filter_3d is None:
         return scene
-    smoothed = smooth(scene, scene.filter_3d.log(), volume=True)
+    smoothed = smooth(scene, scene.filter_3d.log()[:, None], volume=True)
     return replace(smoothed, filter_3d=None, fused=(*scene.fused, Fusion("filter_3D")))
 
 
-def smooth(scene: Gaussians, log_sigma: Float[Tensor, " n"], volume: bool) -> Gaussians:
-    """Convolve each Gaussian with an isotropic one of standard deviation e^log_sigma; −inf changes nothing."""
-    log_scales = 0.5 * torch.logaddexp(2 * scene.log_scales, 2 * log_sigma[:, None])
+def smooth(scene: Gaussians, log_sigma: Float[Tensor, "n k"], volume: bool) -> Gaussians:
+    """Convolve each Gaussian with one of standard deviation e^log_sigma; −inf changes nothing.
+
+    log_sigma: one for all axes of a Gaussian, or one for each.
+    """
+    log_scales = 0.5 * torch.logaddexp(2 * scene.log_scales, 2 * log_sigma)
     smoothed = replace(scene, log_scales=log_scales)
     if not volume:
         return smoothed
@@ -113,21 +147,21 @@ def smooth(scene: Gaussians, log_sigma: Float[Tensor, " n"], volume: bool) -> Ga
 
 
 def volume_log_factor(
-    log_scales: Float[Tensor, "n 3"], log_sigma: Float[Tensor, " n"]
+    log_scales: Float[Tensor, "n 3"], log_sigma: Float[Tensor, "n k"]
 ) -> Float[Tensor, " n"]:
     """ln ∏ s/√(s² + f²) = −½ Σ ln(1 + f²/s²)."""
     return _axis_log_factors(log_scales, log_sigma).sum(dim=1)
 
 
 def face_log_factor(
-    log_scales: Float[Tensor, "n 3"], log_sigma: Float[Tensor, " n"]
+    log_scales: Float[Tensor, "n 3"], log_sigma: Float[Tensor, "n k"]
 ) -> Float[Tensor, " n"]:
     """The same product over the two widest axes, which span the broadest face."""
     return _axis_log_factors(log_scales, log_sigma).topk(2, dim=1).values.sum(dim=1)
 
 
 def _axis_log_factors(
-    log_scales: Float[Tensor, "n 3"], log_sigma: Float[Tensor, " n"]
+    log_scales: Float[Tensor, "n 3"], log_sigma: Float[Tensor, "n k"]
 ) -> Float[Tensor, "n 3"]:
-    log_ratio = 2 * (log_sigma[:, None] - log_scales)
+    log_ratio = 2 * (log_sigma - log_scales)
     return -0.5 * torch.logaddexp(log_ratio, torch.zeros_like(log_ratio))

@@ -22,7 +22,8 @@ IDENTICAL = {  # training's own renderer at the training size
     *("gaussian-blending", "auto"),
 }
 WIDENED = {  # in the world, to what the finest training view could tell, and so fainter from near
-    *("mip-splatting", "mip-splatting-code", "mip-splatting-balanced", "aaa", "aa-2dgs"),
+    *("mip-splatting", "mip-splatting-code", "mip-splatting-balanced"),
+    *("mip-splatting-anisotropic", "aaa", "aa-2dgs"),
 }
 
 SIDE, APART = 256, 64  # px
