@@ -107,7 +107,7 @@ def measure(name: str, scene: Scene, rasterizer: Rasterizer) -> None:
                 if label in FIELDS
                 else moved(view, factor, median_depth(own.means, view))
             )
-            looks = {t: _look(*known, camera, rasterizer, scene) for t, known in truths.items()}
+            looks = {t: look(*known, camera, rasterizer, scene) for t, known in truths.items()}
             for rule, recipe in chosen.items():
                 image = render(own, camera, recipe, training, rasterizer, scene.background).rgb
                 for t, look in looks.items():
@@ -118,7 +118,7 @@ def measure(name: str, scene: Scene, rasterizer: Rasterizer) -> None:
             print(f"| {label} | {t} | " + " | ".join(cells) + " |", flush=True)
 
 
-def _look(
+def look(
     scene: Gaussians, training: Training, camera: Camera, rasterizer: Rasterizer, how: Scene
 ) -> torch.Tensor:
     """The look that training would have rendered there, if its pixels were as small as they were in the scene."""

@@ -1,9 +1,11 @@
-"""The tables of examples/guides/methods.md from an evaluation's folder: python -m tests.bench.method_tables FOLDER.
+"""The tables of examples/guides/methods.md: python -m tests.bench.method_tables FOLDER.
 
-For every scene in it a row a recipe; each cell holds the figures at all scales, one after another.
+Evaluates what `every_recipe.toml` names into the folder, but for what is there already.  For every scene a row a
+recipe; each cell holds the figures at all scales, one after another.
 """
 
 import json
+import subprocess
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -11,12 +13,15 @@ from typing import Any
 
 from aaplug.report import method, scale_name
 
+BATCH = Path(__file__).with_name("every_recipe.toml")
 HEADINGS = "| recipe | PSNR, dB | SSIM | pairs, M | s |\n|---|---|---|---|---|"
 MILLION = 1e6
 
 
 def main(folder: Path) -> None:
-    """Print a table for every scene."""
+    """Measure, and print a table for every scene."""
+    evaluate = ["aaplug", "evaluate", "--batch", str(BATCH), "-o", str(folder), "--resume"]
+    subprocess.run(evaluate, check=True)
     for path in sorted(folder.glob("*/per_view.json")):
         print(f"\n{path.parent.name}\n")
         print("\n".join(table(json.loads(path.read_text()))))

@@ -1,0 +1,108 @@
+"""Whether bounds of each direction beat isotropic ones: python -m tests.bench.anisotropic [SCENE ...].
+
+Checkpoints trained small, enlarged against their photographs and seen from nearer against the one trained at full size.
+The look of training is fused into the world, 0.3/ν² with nothing added on the screen, isotropic and along each axis by
+what all views together tell of it, scaled to the same volume; and both forms of Mip-Splatting's 3D filter.
+"""
+
+import math
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from aaplug import compiled
+from aaplug.cameras import Camera
+from aaplug.filters import NYQUIST_VARIANCE, AnisotropicSmoothing, Dilation, Smoothing3D
+from aaplug.gaussians import CLASSIC, Gaussians
+from aaplug.interfaces import Rasterizer, Training
+from aaplug.io.cameras import read_cameras
+from aaplug.io.images import quantise
+from aaplug.io.photographs import DOWNSCALES
+from aaplug.io.scenes import read_scene
+from aaplug.metrics import psnr
+from aaplug.paths import moved
+from aaplug.pipeline import learn, render
+from aaplug.protocols import median_depth
+from aaplug.rasterizers import RASTERIZERS, Tiled
+from aaplug.recipes import Recipe, find_recipe
+from tests.bench.away import SCENES, VIEWS, Scene, look
+from tests.conftest import SHARED_DATA
+
+TRAINED_SMALL = ("chair_eighth", "snowmiku_quarter")
+ENLARGED = (2, 4, 8)
+NEARER = (2.0, 1.4)
+AS_IT_IS = Recipe("fused", Dilation(0.0, compensated=False), "", "")
+
+
+def compared(scene: Gaussians, training: Training) -> dict[str, tuple[Gaussians, Recipe]]:
+    """The scenes and how they are drawn."""
+    look_of_training = Smoothing3D(CLASSIC.kernel, opacity="kept")(scene, training)
+    own = AnisotropicSmoothing(CLASSIC.kernel)(scene, training)
+    added = [s.scales.square() - scene.scales.square() for s in (look_of_training, own)]
+    scale = (added[0].log() - added[1].log()).mean(dim=1, keepdim=True).exp()
+    same_volume = (scene.scales.square() + scale * added[1]).log() / 2
+    mip = find_recipe("mip")
+    return {
+        "`matched`": (scene, find_recipe("matched")),
+        "fused, isotropic": (look_of_training, AS_IT_IS),
+        "fused, anisotropic, same volume": (replace(scene, log_scales=same_volume), AS_IT_IS),
+        "`mip-splatting`": (Smoothing3D(NYQUIST_VARIANCE)(scene, training), mip),
+        "`mip-splatting-anisotropic`": (AnisotropicSmoothing()(scene, training), mip),
+    }
+
+
+def main(names: Sequence[str] = TRAINED_SMALL) -> None:
+    torch.set_grad_enabled(False)
+    kernels = compiled.load()
+    rasterizer = RASTERIZERS["eager"] if kernels is None else Tiled(kernels)
+    for name in names or TRAINED_SMALL:
+        measure(name, SCENES[name], rasterizer)
+
+
+def measure(name: str, how: Scene, rasterizer: Rasterizer) -> None:
+    """Print a table of PSNR in dB, mean of the views."""
+    cameras = read_cameras((SHARED_DATA / how.file).parent, train_scale=how.scale)
+    scene = read_scene(SHARED_DATA / how.file)
+    training = learn(scene, cameras.train, how.guard)
+    views = cameras.test[:: -(-len(cameras.test) // VIEWS)]
+    chosen = compared(scene, training)
+    print(f"\n{name}, PSNR in dB\n\n| | " + " | ".join(chosen) + " |")
+    print("|---" * (len(chosen) + 1) + "|")
+    for label, shown in cases(scene, views, how, rasterizer):
+        cells = []
+        for filtered, recipe in chosen.values():
+            found = []
+            for camera, truth in shown:
+                image = render(filtered, camera, recipe, training, rasterizer, how.background)
+                found.append(psnr(quantise(image.rgb.clamp(0, 1)), truth) or math.inf)
+            cells.append(f"{sum(found) / len(found):.2f}")
+        print(f"| {label} | " + " | ".join(cells) + " |", flush=True)
+
+
+def cases(
+    scene: Gaussians, views: Sequence[Camera], how: Scene, rasterizer: Rasterizer
+) -> Iterator[tuple[str, list[tuple[Camera, Tensor]]]]:
+    """Cameras, each with what it should show."""
+    for factor in ENLARGED:
+        if factor * how.scale <= 1:
+            shown = []
+            for view in views:
+                assert view.photo is not None
+                photo = DOWNSCALES["box"].read(view.photo, how.background, view.lens)
+                camera = view.scaled(factor)
+                shown.append((camera, photo.at(camera.hw, camera.width / photo.hw[1])))
+            yield f"photographs at {factor}×", shown
+    assert how.finer is not None
+    full, folder = read_scene(SHARED_DATA / how.finer), (SHARED_DATA / how.file).parent
+    finer = learn(full, read_cameras(folder, train_scale=1.0).train, how.guard)
+    for factor in NEARER:
+        near = [moved(view, factor, median_depth(scene.means, view)) for view in views]
+        shown = [(camera, look(full, finer, camera, rasterizer, how)) for camera in near]
+        yield f"{factor:g} times nearer, finer", shown
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
