@@ -5,9 +5,12 @@ can happen are told apart by `near_a_cut_off`: all others must agree tightly, an
 """
 
 import math
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import pytest
 import torch
@@ -25,6 +28,7 @@ TOLERANCE = 1e-5
 FLIPS = 1e-4  # share of pixels that may fall on the other side of a cut-off
 UNIT = (4.0, 0.0, 4.0)
 TILED = Tiled()
+PROC_STATUS = Path("/proc/self/status")
 
 
 @pytest.fixture(params=ALL_RASTERIZERS.values(), ids=ALL_RASTERIZERS)
@@ -373,6 +377,35 @@ def test_a_smaller_memory_changes_nothing():
         parts = Tiled(memory=float(pairs * binning.PAIR_BYTES))(splats, hw, SKY)
         assert parts.rgb.equal(whole.rgb)
         assert parts.alpha.equal(whole.alpha)
+
+
+MEASURE = """
+import torch
+from aaplug.rasterizers import Tiled
+from tests.conftest import make_splats
+
+def peak():
+    lines = open("/proc/self/status").read().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM")) * 1024
+
+splats, draw = make_splats(3000, (2048, 2048), 7, (0.0, 5.0)), Tiled(memory=2e6)
+draw(splats, (64, 64), (0.0, 0.0, 0.0))
+open("/proc/self/clear_refs", "w").write("5")  # forgets the peak of importing torch
+before = peak()
+draw(splats, (2048, 2048), (0.0, 0.0, 0.0))
+print(peak() - before)
+"""
+FRAME_MEMORY = (
+    150e6  # bytes; measured: at most 105e6 band by band, 182e6 with the tiles of all bands kept
+)
+
+
+@pytest.mark.skipif(not PROC_STATUS.exists(), reason="peak memory of a process is read from /proc")
+def test_a_frame_of_several_bands_holds_little_beside_its_image():
+    root = Path(__file__).resolve().parents[1]
+    command = [sys.executable, "-c", MEASURE]
+    run = subprocess.run(command, cwd=root, capture_output=True, text=True, check=True, timeout=120)
+    assert int(run.stdout) < FRAME_MEMORY
 
 
 def test_exactly_the_tiles_that_the_ellipses_reach_are_paired():
