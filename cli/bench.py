@@ -19,6 +19,8 @@ from aaplug.rasterizers import Tiled
 from .console import out, print_json, say
 from .options import CameraOptions, SceneOptions, flag
 
+SIZES = ("800x800", "1600x1060")  # of images
+
 
 @dataclass(frozen=True)
 class Bench:
@@ -32,8 +34,9 @@ class Bench:
         1_000_000,
     )
     """Sizes of the synthetic scenes."""
-    resolution: Annotated[tuple[str, ...], tyro.conf.arg(metavar="WxH ...")] = ("800x800",)
-    """Sizes of the synthetic scenes' image."""
+    resolution: Annotated[tuple[str, ...] | None, flag("WxH ...")] = None
+    """Sizes of the synthetic scenes' image: all scenes are timed at the first, the middle one at every (default:
+    800x800, and 1600x1060 where there are several scenes)."""
     rasterizer: Literal["all", "compiled", "eager"] = "all"
     """Which to time; all is compiled, if `aaplug warmup` has run, and eager."""
     repeats: int = 5
@@ -90,12 +93,15 @@ def _work(options: Bench) -> list[tuple[Gaussians, Camera]]:
     if options.scene.scene is not None or options.scene.model_path is not None:
         scene = options.scene.read()
         return [(scene, options.cameras.read(options.scene).train[0])]
-    sizes = [re.fullmatch(r"(\d+)x(\d+)", text) for text in options.resolution]
+    several = len(options.gaussians) > 1
+    given = options.resolution or (SIZES if several else SIZES[:1])
+    sizes = [re.fullmatch(r"(\d+)x(\d+)", text) for text in given]
     if not all(sizes) or min(options.gaussians, default=0) < 1:
         raise UsageError("bench", "--gaussians takes numbers, --resolution sizes such as 800x800")
-    cameras = [synthetic_camera(int(size[1]), int(size[2])) for size in sizes if size]
+    first, *others = [synthetic_camera(int(size[1]), int(size[2])) for size in sizes if size]
     scenes = [synthetic_scene(n) for n in options.gaussians]
-    return [(scene, camera) for scene in scenes for camera in cameras]
+    middle = scenes[len(scenes) // 2]
+    return [*((scene, first) for scene in scenes), *((middle, camera) for camera in others)]
 
 
 def _exponents(runs: list[Figures]) -> dict[str, float]:
@@ -103,9 +109,9 @@ def _exponents(runs: list[Figures]) -> dict[str, float]:
     found: dict[str, float] = {}
     for name in dict.fromkeys(run.rasterizer for run in runs):
         own = [run for run in runs if run.rasterizer == name]
-        first = own[0]
+        first, last = own[0], own[-1]
         same_size = [r for r in own if (r.width, r.height) == (first.width, first.height)]
-        same_scene = [r for r in own if r.gaussians == first.gaussians]
+        same_scene = [r for r in own if r.gaussians == last.gaussians]
         if len(same_size) > 1:
             counts = [float(r.gaussians) for r in same_size]
             found[f"{name}: Gaussians"] = exponent(counts, [r.forward_ms for r in same_size])

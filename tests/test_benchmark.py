@@ -80,6 +80,17 @@ def test_several_runs_are_a_table_with_exponents(capsys):
     assert code == 0
     assert "300" in said.out
     assert "time grows as eager: Gaussians^" in said.out
+    assert "eager: pixels" not in said.out
+
+
+def test_the_middle_scene_is_drawn_at_every_size(capsys):
+    words = ("--gaussians", "300", "400", "500", "--forward-only", "--json")
+    code, said = run_bench(capsys, *words, "--resolution", "40x24", "48x32")
+    found = json.loads(said.out)
+    assert code == 0
+    sizes = [(run["gaussians"], run["width"]) for run in found["runs"]]
+    assert sizes == [(300, 40), (400, 40), (500, 40), (400, 48)]
+    assert set(found["exponents"]) == {"eager: Gaussians", "eager: pixels"}
 
 
 @pytest.mark.parametrize(
