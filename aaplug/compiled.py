@@ -177,14 +177,25 @@ def _load(kernel: Kernel) -> Package | None:
         # what `aoti_load_package` wraps; the import that it needs takes two seconds, and its calls four times as long
         loader = torch._C._aoti.AOTIModelPackageLoader  # pyright: ignore[reportAttributeAccessIssue]
         package = loader(str(path), "model", True, 1, -1).run
-        args, twins = kernel.example(), kernel.example()
-        with torch.no_grad():  # what comes back, and what was updated in place
-            found = [*package(list(args)), *args]
+        with torch.no_grad(), _one_thread():
+            args, twins = kernel.example(), kernel.example()
+            found = [*package(list(args)), *args]  # what comes back, and what was updated in place
             expected = [*kernel.function(*twins), *twins]
-        close = all(_close(a, b) for a, b in zip(found, expected, strict=True))
+            close = all(_close(a, b) for a, b in zip(found, expected, strict=True))
         return Package.of(package, args) if close else None
     except Exception:  # a broken package can fail in any way; it is built anew
         return None
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Work as small as an example's is done sooner by one thread than by several that others keep waiting."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def _close(found: torch.Tensor, expected: torch.Tensor) -> bool:

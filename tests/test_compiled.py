@@ -51,6 +51,20 @@ def test_compositing_is_one_loop_over_tiles(built, name):
     assert sum(source.count("for(int64_t x0=") for source in sources) == 1
 
 
+def test_packages_are_checked_by_one_thread_and_all_are_there_after_that(built, monkeypatch):
+    seen, close, threads = [], compiled._close, torch.get_num_threads()
+    monkeypatch.setattr(
+        compiled, "_close", lambda *x: seen.append(torch.get_num_threads()) or close(*x)
+    )
+    try:
+        torch.set_num_threads(2)
+        assert compiled.load() is not None
+        assert set(seen) == {1}
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(threads)
+
+
 @pytest.mark.parametrize("recipe", RECIPES)
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_compiled_images_are_the_eager_ones(built, recipe, degree):
