@@ -28,7 +28,7 @@ from aaplug.pipeline import learn, render
 from aaplug.protocols import median_depth
 from aaplug.rasterizers import RASTERIZERS, Tiled
 from aaplug.recipes import Recipe, find_recipe
-from tests.bench.away import SCENES, VIEWS, Scene, look
+from tests.bench.away import SCENES, VIEWS, Scene, look_there
 from tests.conftest import SHARED_DATA
 
 TRAINED_SMALL = ("chair_eighth", "snowmiku_quarter")
@@ -100,7 +100,7 @@ def cases(
     finer = learn(full, read_cameras(folder, train_scale=1.0).train, how.guard)
     for factor in NEARER:
         near = [moved(view, factor, median_depth(scene.means, view)) for view in views]
-        shown = [(camera, look(full, finer, camera, rasterizer, how)) for camera in near]
+        shown = [(camera, look_there(full, finer, camera, rasterizer, how)) for camera in near]
         yield f"{factor:g} times nearer, finer", shown
 
 

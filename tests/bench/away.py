@@ -15,6 +15,7 @@ import torch
 
 from aaplug import compiled
 from aaplug.cameras import BLACK, WHITE, Camera
+from aaplug.filters import RateChoice
 from aaplug.gaussians import Gaussians
 from aaplug.interfaces import Rasterizer, Training
 from aaplug.io.cameras import read_cameras
@@ -58,7 +59,7 @@ DISTANCES = {
     "4 times farther": 0.25,
 }
 FIELDS = {"half the field of view": 2.0, "twice the field of view": 0.5}
-RATES = {
+RATES: dict[str, RateChoice] = {
     "A, global": "global",
     "B, sharpest": "sharpest",
     "C, interval": "interval",
@@ -107,7 +108,9 @@ def measure(name: str, scene: Scene, rasterizer: Rasterizer) -> None:
                 if label in FIELDS
                 else moved(view, factor, median_depth(own.means, view))
             )
-            looks = {t: look(*known, camera, rasterizer, scene) for t, known in truths.items()}
+            looks = {
+                t: look_there(*known, camera, rasterizer, scene) for t, known in truths.items()
+            }
             for rule, recipe in chosen.items():
                 image = render(own, camera, recipe, training, rasterizer, scene.background).rgb
                 for t, look in looks.items():
@@ -118,7 +121,7 @@ def measure(name: str, scene: Scene, rasterizer: Rasterizer) -> None:
             print(f"| {label} | {t} | " + " | ".join(cells) + " |", flush=True)
 
 
-def look(
+def look_there(
     scene: Gaussians, training: Training, camera: Camera, rasterizer: Rasterizer, how: Scene
 ) -> torch.Tensor:
     """The look that training would have rendered there, if its pixels were as small as they were in the scene."""
