@@ -242,9 +242,8 @@ class _Bench:
         rgb, alpha = rgb.float(), alpha.float()
         own = rgb - (1 - alpha[..., None]) * rgb.new_tensor(behind)
         samples = recipe.samples_at(rate_of(scene, camera, self.training))
-        if counting is None or recipe.pixel == "blending":  # which is no kernel to count
-            return _Drawn(rgb, own, samples, seconds, None)
-        return _Drawn(rgb, own, samples, seconds, counting.pairs)
+        pairs = None if counting is None else counting.pairs
+        return _Drawn(rgb, own, samples, seconds, pairs)
 
     def _shrunk(self, full: Tensor, camera: Camera, scale: float) -> Float[Tensor, "h w 3"]:
         """A training-size image at the camera's size."""

@@ -146,6 +146,15 @@ def test_pairs_are_counted_and_fewer_where_images_are_smaller(world):
     assert evaluate(scene, training, reference).measurements[0].pairs is None
 
 
+@pytest.mark.parametrize("name", [n for n, r in RECIPES.items() if r.selection is None])
+def test_the_pairs_of_every_recipe_are_counted(world, name):
+    scene, training, views = world
+    chosen = replace(task(views[:1], scales=(0.5,)), recipes=[RECIPES[name]])
+    (found,) = evaluate(scene, training, chosen).select(name, 0.5)
+    assert found.pairs is not None
+    assert found.pairs > 0
+
+
 FIGURES = (CONSISTENCY, ENERGY, FLICKER)
 
 

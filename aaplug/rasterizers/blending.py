@@ -27,6 +27,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from aaplug.kernels import Kernel, Kernels
 from aaplug.rasterizers.pixels import SMALL
 from aaplug.rasterizers.rules import MAX_ALPHA, MIN_TRANSMITTANCE
 from aaplug.splats import MIN_ALPHA, Splats2D, principal_columns
@@ -76,7 +77,7 @@ def axes_of(splats: Splats2D) -> Axes:
 
 
 def through(
-    window: Window, axes: Axes, opacity: Tensor, dx: Tensor, dy: Tensor, side: float
+    window: Window, axes: Axes, opacity: Tensor, dx: Tensor, dy: Tensor, side: float | Tensor
 ) -> tuple[Tensor, Window]:
     """What a splat hides of the light that passes a pixel, and the window after it.
 
@@ -179,6 +180,7 @@ def blended(
     counts: Int[Tensor, " t"],
     x: Float[Tensor, "t P"],
     y: Float[Tensor, "t P"],
+    kernels: Kernels,
 ) -> Float[Tensor, "4 t P"]:
     """Premultiplied colour, and alpha, of pixels whose centres are x, y.
 
@@ -192,9 +194,33 @@ def blended(
             break
         drawn = (turn < counts).to(table)
         rows = table[order[(first + turn).clamp(max=len(order) - 1)].long()]
-        *axes, opacity, mean_x, mean_y, red, green, blue = (c[:, None] for c in rows.unbind(1))
-        offset = x - mean_x, y - mean_y
-        alpha = opacity * drawn[:, None]
-        hidden, window = through(window, Axes(*axes), alpha, *offset, side)
+        *shape, red, green, blue = (column[:, None] for column in rows.unbind(1))
+        hidden, *left = kernels.run(TURN, drawn[:, None], x, y, x.new_tensor(side), *shape, *window)
+        window = Window(*left)
         image = image + hidden * torch.stack([red, green, blue, torch.ones_like(red)])
     return image
+
+
+def _turn(
+    drawn: Float[Tensor, "t 1"],
+    x: Float[Tensor, "t P"],
+    y: Float[Tensor, "t P"],
+    side: Float[Tensor, ""],
+    *rest: Tensor,
+) -> tuple[Tensor, ...]:
+    """What the next splat of each row of pixels hides there, and the windows after it.
+
+    drawn: 0 where there is none.  rest: the splat's axes, opacity and centre, and the windows.
+    """
+    axes, (opacity, mean_x, mean_y), window = rest[:6], rest[6:9], Window(*rest[9:])
+    offset = x - mean_x, y - mean_y
+    hidden, window = through(window, Axes(*axes), opacity * drawn, *offset, side)
+    return hidden, *window
+
+
+def _turn_example() -> tuple[Tensor, ...]:
+    x, column = torch.full((64, 64), 0.5, dtype=torch.float64), torch.ones(64, 1).double()
+    return column, x, x, torch.ones(()).double(), *[0.5 * column] * 9, *Window.whole(x)
+
+
+TURN = Kernel("blending", _turn, _turn_example, ("t", "t", "t", None, *14 * ("t",)))

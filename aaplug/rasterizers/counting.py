@@ -3,9 +3,10 @@
 from torch import Tensor
 
 from aaplug.kernels import Kernel, Kernels
+from aaplug.rasterizers.blending import TURN
 from aaplug.rasterizers.compositing import PASSES, PIXELS
 
-SPLATS = {one_pass.kernel.name: one_pass.splats for one_pass in PASSES.values()}
+SPLATS = {TURN.name: 1} | {one.kernel.name: one.splats for one in PASSES.values()}
 
 
 class Counting(Kernels):

@@ -64,7 +64,7 @@ class Tiled:
     ) -> Callable[[Bins], tuple[Tensor, Tensor]]:
         """What paints the tiles of a band."""
         if pixel == "blending":
-            return partial(_blend, table_of(splats), splats)
+            return partial(_blend, table_of(splats), splats, kernels=self.kernels)
         return partial(
             composite, drawing_of(splats, self.kernels, pixel), kernels=self.kernels, pixel=pixel
         )
@@ -147,7 +147,7 @@ def _rows_of(
 
 
 def _blend(
-    table: Float[Tensor, "m 12"], splats: Splats2D, bins: Bins
+    table: Float[Tensor, "m 12"], splats: Splats2D, bins: Bins, kernels: Kernels
 ) -> tuple[Float[Tensor, "3 t P"], Float[Tensor, "t P"]]:
     """The same by the rule of `blending`, in array code alone."""
     local = pixel_centres(table)
@@ -156,7 +156,7 @@ def _blend(
     for tiles in order.split(BLENDED_TILES):
         x, y = (bins.origins[tiles, i, None] + local[i] for i in (0, 1))
         lists = (bins.splats, bins.first[tiles], bins.counts[tiles])
-        parts.append(blended(table, splats.window, *lists, x, y))
+        parts.append(blended(table, splats.window, *lists, x, y, kernels))
     image = torch.cat(parts, dim=1)[:, order.argsort()].to(splats.means)
     return image[:3], image[3]
 
