@@ -99,8 +99,11 @@ def view_information(
     """What the cameras that see each Gaussian tell of every direction: Σ ν² (I − d dᵀ), in px² per world unit².
 
     A camera samples with its rate ν across its ray d and not at all along it; 0 where no camera sees the Gaussian.
+
+    Raises:
+        UsageError: there are no cameras.
     """
-    origin = torch.stack([camera.centre for camera in cameras]).mean(dim=0)
+    origin = _middle(cameras)
     eyes = torch.stack([camera.centre - origin for camera in cameras]).to(means)
     information = means.new_zeros(len(means), 3, 3)
     for part, rates in _rates_in_chunks(means, cameras, chunk_pairs):
@@ -144,9 +147,7 @@ def _rates_in_chunks(
 
     The cameras' mean position is subtracted in float64 first, so that scenes far from the origin keep their digits.
     """
-    if not cameras:
-        raise UsageError("cameras", "there are none, and sampling bounds need at least one")
-    origin = torch.stack([camera.centre for camera in cameras]).mean(dim=0)
+    origin = _middle(cameras)
     poses = torch.stack([camera.cam_from_world for camera in cameras])
     offset = poses[:, :3, 3] + poses[:, :3, :3] @ origin
     rotation, offset = poses[:, :3, :3].to(means), offset.to(means)
@@ -160,6 +161,13 @@ def _rates_in_chunks(
         seen = (z > NEAR) & _inside(x.div_(z).mul_(fx).add_(cx), width)
         seen &= _inside(y.div_(z).mul_(fy).add_(cy), height)
         yield part, torch.where(seen, focal / z, 0.0)
+
+
+def _middle(cameras: Sequence[Camera]) -> Float[Tensor, " 3"]:
+    """The cameras' mean position."""
+    if not cameras:
+        raise UsageError("cameras", "there are none, and sampling bounds need at least one")
+    return torch.stack([camera.centre for camera in cameras]).mean(dim=0)
 
 
 def _inside(position: Float[Tensor, "c v"], side: Float[Tensor, " v"]) -> Bool[Tensor, "c v"]:

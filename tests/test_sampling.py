@@ -240,9 +240,10 @@ def test_a_scene_far_from_the_origin_keeps_its_digits():
     torch.testing.assert_close(bounds.lowest.double(), exact.lowest, rtol=2e-6, atol=0)
 
 
-def test_a_number_of_cameras_is_needed():
+@pytest.mark.parametrize("find", [sampling_bounds, median_rates, view_information])
+def test_a_number_of_cameras_is_needed(find):
     with pytest.raises(UsageError, match="at least one"):
-        sampling_bounds(torch.zeros(1, 3), [])
+        find(torch.zeros(1, 3), [])
 
 
 def test_an_empty_scene_has_empty_bounds():

@@ -21,9 +21,7 @@ from aaplug.sampling import view_information
 NYQUIST_VARIANCE = (
     0.2  # px² at the highest rate: Mip-Splatting's published constant (its eq. 9 omits a square)
 )
-LEAST_SHARE = (
-    1 / 16
-)  # of the squared rate: no axis is smoothed by more than four times the finest's width
+LEAST_SHARE = 1 / 16  # of the highest rate's square: no axis is smoothed over 4 times as wide
 BALANCE_FLOOR = 0.5  # of an opacity: balancing dims no Gaussian below it
 
 

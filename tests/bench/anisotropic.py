@@ -10,10 +10,8 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
-import torch
 from torch import Tensor
 
-from aaplug import compiled
 from aaplug.cameras import Camera
 from aaplug.filters import NYQUIST_VARIANCE, AnisotropicSmoothing, Dilation, Smoothing3D
 from aaplug.gaussians import CLASSIC, Gaussians
@@ -26,9 +24,8 @@ from aaplug.metrics import psnr
 from aaplug.paths import moved
 from aaplug.pipeline import learn, render
 from aaplug.protocols import median_depth
-from aaplug.rasterizers import RASTERIZERS, Tiled
 from aaplug.recipes import Recipe, find_recipe
-from tests.bench.away import SCENES, VIEWS, Scene, look_there
+from tests.bench.away import VIEWS, Scene, look_there, on_each
 from tests.conftest import SHARED_DATA
 
 TRAINED_SMALL = ("chair_eighth", "snowmiku_quarter")
@@ -55,11 +52,7 @@ def compared(scene: Gaussians, training: Training) -> dict[str, tuple[Gaussians,
 
 
 def main(names: Sequence[str] = TRAINED_SMALL) -> None:
-    torch.set_grad_enabled(False)
-    kernels = compiled.load()
-    rasterizer = RASTERIZERS["eager"] if kernels is None else Tiled(kernels)
-    for name in names or TRAINED_SMALL:
-        measure(name, SCENES[name], rasterizer)
+    on_each(names or TRAINED_SMALL, measure)
 
 
 def measure(name: str, how: Scene, rasterizer: Rasterizer) -> None:

@@ -8,7 +8,7 @@ one trained at full size as well, which knows.
 
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -74,11 +74,16 @@ def compared() -> dict[str, Recipe]:
 
 
 def main(names: Sequence[str] = tuple(SCENES)) -> None:
+    on_each(names or SCENES, measure)
+
+
+def on_each(names: Iterable[str], measured: Callable[[str, Scene, Rasterizer], None]) -> None:
+    """Measure scenes with the fastest rasterizer that is built here."""
     torch.set_grad_enabled(False)
     kernels = compiled.load()
     rasterizer = RASTERIZERS["eager"] if kernels is None else Tiled(kernels)
-    for name in names or SCENES:
-        measure(name, SCENES[name], rasterizer)
+    for name in names:
+        measured(name, SCENES[name], rasterizer)
 
 
 def measure(name: str, scene: Scene, rasterizer: Rasterizer) -> None:
