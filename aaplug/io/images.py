@@ -27,6 +27,7 @@ from aaplug.io.limits import whole_limit
 
 LOSSLESS_WEBP = 101  # OpenCV's quality for it
 SAMPLE_TYPES = {8: np.uint8, 16: np.uint16}  # by bit depth
+ROWS = 256  # of an image made ready to be stored, at once
 ALPHA_CHANNELS = 4  # RGB and alpha
 DAMAGE = ("Corrupt JPEG data", "Premature end of JPEG file")  # libjpeg's words for lost pixels
 WHOLE = 1e-6  # slack when a factor or a side is taken for a whole number
@@ -84,17 +85,15 @@ def write_png(
 
 def encode_png(rgb: Float[Tensor, "h w 3"], bit_depth: int) -> bytes:
     """The bytes of a PNG file of [0, 1]-clamped colours."""
-    samples = _samples(rgb, bit_depth).cpu().numpy().astype(SAMPLE_TYPES[bit_depth])
-    done, png = cv2.imencode(".png", samples[..., ::-1])
+    done, png = cv2.imencode(".png", _stored(rgb, bit_depth))
     assert done
     return png.tobytes()
 
 
 def encode_webp(rgb: Float[Tensor, "h w 3"], quality: int | None) -> bytes:
     """The bytes of a WebP file of [0, 1]-clamped colours in 8 bits; lossless without a quality, of 1 to 100."""
-    samples = _samples(rgb, 8).cpu().numpy().astype(np.uint8)
     setting = LOSSLESS_WEBP if quality is None else quality
-    done, webp = cv2.imencode(".webp", samples[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, setting])
+    done, webp = cv2.imencode(".webp", _stored(rgb, 8), [cv2.IMWRITE_WEBP_QUALITY, setting])
     assert done
     return webp.tobytes()
 
@@ -147,6 +146,12 @@ def stretched(rgb: Float[Tensor, "h w 3"], hw: tuple[int, int]) -> Float[Tensor,
 
 def _whole(side: float) -> int:
     return max(1, math.floor(side + WHOLE))
+
+
+def _stored(rgb: Float[Tensor, "h w 3"], bit_depth: int) -> np.ndarray:
+    """Samples as OpenCV takes them, BGR; by rows, as what comes between is several times as large as a large image."""
+    parts = (_samples(rows, bit_depth).flip(2).cpu().numpy() for rows in rgb.split(ROWS))
+    return np.concatenate([part.astype(SAMPLE_TYPES[bit_depth]) for part in parts])
 
 
 def _samples(rgb: Float[Tensor, "h w 3"], bit_depth: int) -> Float[Tensor, "h w 3"]:
