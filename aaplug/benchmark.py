@@ -26,7 +26,7 @@ from aaplug.rasterizers import Tiled
 from aaplug.rasterizers.binning import TILE, bands
 from aaplug.rasterizers.compositing import composite
 from aaplug.rasterizers.counting import Counting
-from aaplug.rasterizers.tiled import drawing_of
+from aaplug.rasterizers.drawing import drawing_of
 from aaplug.recipes import Recipe, find_recipe
 from aaplug.splats import drawn
 

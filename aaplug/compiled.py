@@ -27,13 +27,13 @@ from aaplug import projection, splats
 from aaplug.errors import UsageError, listing
 from aaplug.interfaces import Rasterizer
 from aaplug.kernels import CompiledKernels, Kernel, Package
-from aaplug.rasterizers import RASTERIZERS, Tiled, binning, compositing, pixels, tiled
+from aaplug.rasterizers import RASTERIZERS, Tiled, binning, compositing, drawing, pixels, rules
 
 KERNELS: tuple[Kernel, ...] = (  # those that take longest to compile are the last
     projection.PROJECT,
     *projection.SHADE.values(),
     splats.INSIDE,
-    tiled.DRAWING,
+    drawing.DRAWING,
     binning.TABLE,
     binning.SPANS,
     binning.PAIRS,
@@ -57,7 +57,7 @@ DOUBTS = (
 )
 LARGEST_SIZE = 1 << 31
 MOST_PROCESSES = 4  # compilers side by side: each takes most of a GB
-FRAMES_THAT_PAY = 300  # a frame of 800² saves about 0.4 s, and compiling takes about 90 s
+FRAMES_THAT_PAY = 500  # a frame of 800² saves about 0.3 s, and compiling takes about 150 s
 TOLERANCE = (
     1e-4  # of the largest value: between a package's answer and the eager one, on the example
 )
@@ -65,8 +65,10 @@ TOLERANCE = (
 
 def cache_folder() -> Path:
     """Where the packages of this version on this processor are."""
-    modules = (kernels_module, projection, splats, pixels, binning, compositing, tiled)
-    source = "".join(inspect.getsource(module) for module in modules)
+    own = (rules, pixels, binning, drawing, compositing)
+    source = "".join(
+        inspect.getsource(module) for module in (kernels_module, projection, splats, *own)
+    )
     options = f"{OPTIONS} {DOUBTS}"
     facts = [torch.__version__, torch.backends.cpu.get_cpu_capability(), source, options]
     key = hashlib.sha256("\0".join(facts).encode()).hexdigest()[:16]

@@ -17,7 +17,7 @@ import torch
 
 from aaplug.interfaces import Rasterizer
 from aaplug.kernels import EAGER
-from aaplug.rasterizers import Tiled, binning, compositing, reference
+from aaplug.rasterizers import Tiled, binning, drawing, reference
 from aaplug.splats import Splats2D, reach
 from tests.conftest import ALL_RASTERIZERS, make_splats
 
@@ -444,9 +444,9 @@ def test_exactly_the_tiles_that_the_ellipses_reach_are_paired():
 def test_the_polynomial_that_compiled_loops_use_is_exp2(monkeypatch):
     exponents = torch.linspace(-12, 0.5, 100_001)[:, None]
     monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)
-    compiled = compositing._audible_exp2(exponents)
+    compiled = drawing._audible_exp2(exponents)
     exact = torch.exp2(exponents.double())
-    heard = exponents >= compositing.LOG2_MIN_ALPHA
+    heard = exponents >= drawing.LOG2_MIN_ALPHA
     assert compiled[~heard].eq(0).all()
     relative = compiled[heard].double() / exact[heard] - 1
     assert relative.abs().max() < 2e-6

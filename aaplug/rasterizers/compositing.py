@@ -25,12 +25,22 @@ from torch.nn import functional
 from aaplug.interfaces import PixelKernel
 from aaplug.kernels import Kernel, Kernels
 from aaplug.rasterizers.binning import PASS, TILE, Bins
-from aaplug.rasterizers.pixels import CELLS, mean_gaussian, mean_logistic
+from aaplug.rasterizers.drawing import (
+    ALPHA,
+    BLUE,
+    COLUMNS,
+    GREEN,
+    PIXELS,
+    RED,
+    WIDTH,
+    AlphaOf,
+    Pixels,
+    forms_at,
+    offsets_at,
+    pixel_centres,
+)
 from aaplug.rasterizers.rules import MAX_ALPHA, MIN_TRANSMITTANCE
-from aaplug.rasterizers.surfels import disc, smoothed_disc
-from aaplug.splats import MIN_ALPHA
 
-PIXELS = TILE * TILE
 STEP = 4  # splats that gradients go through at once: of more sums the compiler makes several loops
 SHORT_PASS = 8  # where alpha is much to compile, and much work beside what a pass loads and stores
 CHECK_EVERY = 2  # passes between looks at which tiles are saturated
@@ -38,33 +48,10 @@ STEPS_TOGETHER = 8  # looked up at once
 COMPACT_BELOW = 3 / 4  # share of tiles still going at which the others leave
 PARTS_AT_ONCE = 1 << 18  # more than a step has; or two a splat, if that is more
 LN_2 = math.log(2)
-LOG2_SILENT = -9.0  # log2 of an alpha below 1/255; stops exp2 before it underflows, which is slow
-LOG2_MIN_ALPHA = torch.tensor(MIN_ALPHA).log2().item()
 
-# `threshold` keeps what is above its bound; these keep what is at the bound as well.
-BELOW_MIN_ALPHA = torch.nextafter(torch.tensor(MIN_ALPHA), torch.tensor(0.0)).item()
+# `threshold` keeps what is above its bound; this keeps what is at the bound as well.
 BELOW_MIN_TRANSMITTANCE = torch.nextafter(torch.tensor(MIN_TRANSMITTANCE), torch.tensor(0.0)).item()
 SURELY = 1e9  # times anything that is not 0 here is over 1
-
-
-def _root_of_exp2(squarings: int, degree: int) -> tuple[float, ...]:
-    """Coefficients of a polynomial in h ≥ 0 that, squared some times, is 2^(LOG2_SILENT + h), for exponents up to 0.
-
-    It goes through the Chebyshev nodes, as good polynomials do, and has no floor, bits or calls in it.
-    """
-    angles = math.pi * (torch.arange(degree + 1, dtype=torch.float64) + 0.5) / (degree + 1)
-    h = -LOG2_SILENT / 2 * (1 + angles.cos())
-    values = torch.exp2((LOG2_SILENT + h) / 2**squarings)
-    return tuple(torch.linalg.solve(torch.linalg.vander(h), values).tolist())
-
-
-SQUARINGS = 3
-ROOT_OF_EXP2 = _root_of_exp2(SQUARINGS, degree=6)  # relative error of the power: 1e-6 in float32
-
-# columns of a splat's drawing parameters; the last three only where alpha is a mean over the pixel
-UX, UY, VX, VY, X, Y, OPACITY, RED, GREEN, BLUE, HALF_U, HALF_V, SLOPE = range(13)
-TILT_X, TILT_Y, LOW_PASS_WIDTH = HALF_U, HALF_V, SLOPE  # of a disc
-COLUMNS, MEAN_COLUMNS = 10, 13
 
 
 def composite(
@@ -164,24 +151,6 @@ def _going(counts: Int[Tensor, " t"], at_once: int) -> list[int]:
     return (len(passes) - torch.searchsorted(passes.flip(0), turns, right=True)).tolist()
 
 
-def pixel_centres(like: Tensor) -> tuple[Float[Tensor, " P"], Float[Tensor, " P"]]:
-    """x and y of a tile's pixel centres, from its corner."""
-    offset = torch.arange(TILE, dtype=like.dtype, device=like.device) + 0.5
-    y, x = torch.meshgrid(offset, offset, indexing="ij")
-    return x.flatten(), y.flatten()
-
-
-class _Pixels(NamedTuple):
-    """Where the pixels of tiles are: the tiles' corners, and the centres of a tile's pixels from its corner, in px."""
-
-    corners: Float[Tensor, "t 2"]
-    x: Float[Tensor, " P"]
-    y: Float[Tensor, " P"]
-
-
-AlphaOf = Callable[[Tensor, _Pixels], Tensor]  # of one row or several a tile, at its pixels
-
-
 def _chunk(
     alpha_of: AlphaOf,
     splats: int,
@@ -206,7 +175,7 @@ def _chunk(
     """
     one = one[:, None]
     before, seen = T, []
-    pixels = _Pixels(origins, local_x, local_y)
+    pixels = Pixels(origins, local_x, local_y)
     if torch.compiler.is_compiling():  # each row too is loaded where it is needed
         rows = (drawing[torch.where(at + k < ends, ids[at + k], -1)] for k in range(splats))
     else:
@@ -227,7 +196,7 @@ def _chunk(
 
 
 def _splats(
-    alpha_of: AlphaOf, rows: Float[Tensor, "K t c"] | Iterator[Tensor], pixels: _Pixels
+    alpha_of: AlphaOf, rows: Float[Tensor, "K t c"] | Iterator[Tensor], pixels: Pixels
 ) -> Iterator[tuple[Float[Tensor, "t c"], Float[Tensor, "t P"]]]:
     """Row and alpha of K splats of each tile in turn.
 
@@ -238,81 +207,6 @@ def _splats(
     else:
         for row in rows:
             yield row, alpha_of(row, pixels)
-
-
-def _at_centre(row: Float[Tensor, "*n t c"], pixels: _Pixels) -> Float[Tensor, "*n t P"]:
-    """Alpha, before its cap, of splats at the pixels' centres."""
-    u, v = _forms(row, pixels)
-    exponent = torch.addcmul(row[..., OPACITY, None], u, u, value=-1)
-    return _audible_exp2(torch.addcmul(exponent, v, v, value=-1))
-
-
-def _forms(
-    row: Float[Tensor, "*n t c"], pixels: _Pixels
-) -> tuple[Float[Tensor, "*n t P"], Float[Tensor, "*n t P"]]:
-    """The two linear forms of splats at the pixels' centres."""
-    forms = [(row[..., i], row[..., j]) for i, j in ((UX, UY), (VX, VY))]
-    if torch.compiler.is_compiling():
-        dx, dy = _offsets(row, pixels)
-        u, v = (torch.addcmul(i[..., None] * dx, j[..., None], dy) for i, j in forms)
-    else:  # as a product of matrices, which no operation on every pixel is faster than
-        basis = torch.stack([pixels.x, pixels.y, torch.ones_like(pixels.x)])
-        x, y = _from_corner(row, pixels)
-        u, v = (torch.stack([i, j, -(i * x + j * y)], dim=-1) @ basis for i, j in forms)
-    return u, v
-
-
-def _offsets(
-    row: Float[Tensor, "*n t c"], pixels: _Pixels
-) -> tuple[Float[Tensor, "*n t P"], Float[Tensor, "*n t P"]]:
-    """Of the pixels' centres from splats, in px."""
-    x, y = _from_corner(row, pixels)
-    return pixels.x - x[..., None], pixels.y - y[..., None]
-
-
-def _from_corner(
-    row: Float[Tensor, "*n t c"], pixels: _Pixels
-) -> tuple[Float[Tensor, "*n t"], Float[Tensor, "*n t"]]:
-    """Centres of splats from the tiles' corners, in px."""
-    return row[..., X] - pixels.corners[:, 0], row[..., Y] - pixels.corners[:, 1]
-
-
-def _over_pixel(
-    mean: Callable[[Tensor, Tensor], Tensor], row: Float[Tensor, "*n t c"], pixels: _Pixels
-) -> Float[Tensor, "*n t P"]:
-    """Alpha, before its cap, of splats: opacity times its means over a pixel's width along both axes."""
-    alpha = row[..., OPACITY, None]
-    for form, half in zip(_forms(row, pixels), (HALF_U, HALF_V), strict=True):
-        alpha = alpha * mean(form, row[..., half, None])
-    return torch.threshold(alpha, BELOW_MIN_ALPHA, 0.0)
-
-
-def _on_disc(
-    smoothed: bool, row: Float[Tensor, "*n t c"], pixels: _Pixels
-) -> Float[Tensor, "*n t P"]:
-    """Alpha, before its cap, of discs where the pixels' rays meet them."""
-    e = _forms(row, pixels)
-    dx, dy = _offsets(row, pixels)
-    tilts = row[..., TILT_X, None], row[..., TILT_Y, None]
-    ahead = 1 - tilts[0] * dx - tilts[1] * dy
-    if smoothed:
-        forms = tuple(row[..., i, None] for i in (UX, UY, VX, VY))
-        value = smoothed_disc(e, ahead, forms, tilts)
-    else:
-        value = disc(e, ahead, dx * dx + dy * dy, row[..., LOW_PASS_WIDTH, None])
-    return torch.threshold(row[..., OPACITY, None] * value, BELOW_MIN_ALPHA, 0.0)
-
-
-def _over_square(row: Float[Tensor, "*n t c"], pixels: _Pixels) -> Float[Tensor, "*n t P"]:
-    """Alpha, before its cap, of splats: opacity times its mean over the pixel's own square, in strips."""
-    across, along = _forms(row, pixels)
-    half_across, half_along, slope = (row[..., i, None] for i in (HALF_U, HALF_V, SLOPE))
-    total = torch.zeros_like(along)
-    for cell in range(CELLS):
-        from_middle = (cell - (CELLS - 1) / 2) / CELLS
-        share = mean_gaussian(along + 2 * from_middle * half_along, half_along / CELLS)
-        total = total + share * mean_gaussian(across + from_middle * slope, half_across)
-    return torch.threshold(row[..., OPACITY, None] * total / CELLS, BELOW_MIN_ALPHA, 0.0)
 
 
 # Array code pays for every operation and most for choosing; a compiled loop pays for calls, of which exp2 is one, and
@@ -334,33 +228,11 @@ def _less(
     return one * x - y if torch.compiler.is_compiling() else x - y
 
 
-def _audible_exp2(exponent: Float[Tensor, "*n P L"]) -> Float[Tensor, "*n P L"]:
-    """2^exponent where that is at least 1/255, else 0."""
-    if torch.compiler.is_compiling():
-        root = _polynomial(torch.relu(exponent - LOG2_SILENT), ROOT_OF_EXP2)
-        return torch.where(exponent >= LOG2_MIN_ALPHA, _power(root, SQUARINGS), 0.0)
-    return torch.threshold(exponent.clamp(min=LOG2_SILENT).exp2_(), BELOW_MIN_ALPHA, 0.0)
-
-
 def _where_above(bound: float, test: Tensor, value: Tensor) -> Tensor:
     """A value, not negative, where a test is above a bound, itself not negative; else 0."""
     if torch.compiler.is_compiling():
         return torch.where(test > bound, value, 0.0)
     return torch.minimum(torch.threshold(test, bound, 0.0).mul_(SURELY), value)
-
-
-def _polynomial(x: Tensor, coefficients: tuple[float, ...]) -> Tensor:
-    *rest, last = coefficients
-    value = x * last + rest[-1]
-    for coefficient in rest[-2::-1]:
-        value = value * x + coefficient
-    return value
-
-
-def _power(x: Tensor, squarings: int) -> Tensor:
-    for _ in range(squarings):
-        x = x * x
-    return x
 
 
 # -------------------------------------------------------------------------------------------------------- backward
@@ -494,7 +366,7 @@ class _Move(NamedTuple):
     gradient: Float[Tensor, "t P"]
 
 
-SumsOf = Callable[[list[_Move], tuple[Tensor, Tensor, Tensor], Tensor, _Pixels], Tensor]
+SumsOf = Callable[[list[_Move], tuple[Tensor, Tensor, Tensor], Tensor, Pixels], Tensor]
 
 
 def _chunk_backward(
@@ -515,7 +387,7 @@ def _chunk_backward(
     """What tiles add to the sums of K splats, one splat after the other; puts these into `behind`."""
     one = one[:, None]
     before, drawn = T, []
-    pixels = _Pixels(origins, local_x, local_y)
+    pixels = Pixels(origins, local_x, local_y)
     for row, alpha in _splats(alpha_of, rows.transpose(0, 1), pixels):
         left = _left(alpha, one)
         after = before * left
@@ -540,7 +412,7 @@ def _chunk_backward(
 
 
 def _sums_at_centre(
-    moves: list[_Move], colours: tuple[Tensor, Tensor, Tensor], T: Tensor, pixels: _Pixels
+    moves: list[_Move], colours: tuple[Tensor, Tensor, Tensor], T: Tensor, pixels: Pixels
 ) -> Float[Tensor, "t c_K"]:
     """Sums over pixels that the gradient of values at points is made of, ten a splat.
 
@@ -551,8 +423,8 @@ def _sums_at_centre(
         return _sums_by_products(moves, colours, pixels)
     sums = []
     for row, weight, gradient in moves:
-        dx, dy = _offsets(row, pixels)
-        su, sv = (gradient * form for form in _forms(row, pixels))
+        dx, dy = offsets_at(row, pixels)
+        su, sv = (gradient * form for form in forms_at(row, pixels))
         red, green, blue = (weight * colour for colour in colours)
         # where T is 0 these are 0: that they look at it shows the compiler that all sums share enough for one loop
         gradient, red = (torch.where(T > 0, x, 0.0) for x in (gradient, red))
@@ -561,7 +433,7 @@ def _sums_at_centre(
 
 
 def _sums_by_products(
-    moves: list[_Move], colours: tuple[Tensor, Tensor, Tensor], pixels: _Pixels
+    moves: list[_Move], colours: tuple[Tensor, Tensor, Tensor], pixels: Pixels
 ) -> Float[Tensor, "t c_K"]:
     """What `_sums_at_centre` gives: from moments about the tile's middle, where no digits are lost."""
     rows, weights, gradients = (torch.stack(x, dim=1) for x in zip(*moves, strict=True))
@@ -598,7 +470,7 @@ def _sums_by_autograd(
     moves: list[_Move],
     colours: tuple[Tensor, Tensor, Tensor],
     T: Tensor,
-    pixels: _Pixels,
+    pixels: Pixels,
 ) -> Float[Tensor, "t c_K"]:
     """For any kernel, what tiles add to the gradient itself: from the gradient of log alpha by autograd of alpha."""
     rows, weights, gradients = (torch.stack(x, dim=1) for x in zip(*moves, strict=True))
@@ -641,17 +513,6 @@ def _from_sums_example() -> tuple[Tensor, ...]:
     return tuple(torch.linspace(0.1, 1.0, m * COLUMNS).view(m, -1) for _ in range(2))
 
 
-ALPHA: dict[PixelKernel, AlphaOf] = {
-    "point": _at_centre,
-    "integral": partial(_over_pixel, mean_gaussian),
-    "logistic": partial(_over_pixel, mean_logistic),
-    "square": _over_square,
-    "surfel": partial(_on_disc, False),
-    "surfel-mip": partial(_on_disc, True),
-}
-WIDTH: dict[PixelKernel, int] = {
-    name: COLUMNS if name == "point" else MEAN_COLUMNS for name in ALPHA
-}
 OWNERS = Kernel("owners", _owners, _owners_example, ("m", "p", "t", "t"))
 PASSES: dict[PixelKernel, Pass] = {
     name: Pass(

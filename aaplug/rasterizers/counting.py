@@ -4,7 +4,8 @@ from torch import Tensor
 
 from aaplug.kernels import Kernel, Kernels
 from aaplug.rasterizers.blending import TURN
-from aaplug.rasterizers.compositing import PASSES, PIXELS
+from aaplug.rasterizers.compositing import PASSES
+from aaplug.rasterizers.drawing import PIXELS
 
 SPLATS = {TURN.name: 1} | {one.kernel.name: one.splats for one in PASSES.values()}
 
