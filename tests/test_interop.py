@@ -22,8 +22,9 @@ def splat_transform() -> str | None:
     program = shutil.which("splat-transform")
     if program is None:
         return None
-    run = subprocess.run([program, "--version"], check=True, capture_output=True, text=True)
-    version = re.search(r"\bv?(\d+)\.", run.stdout)
+    command = [program, "--version"]
+    run = subprocess.run(command, check=True, capture_output=True, text=True)
+    version = re.search(r"\bv?(\d+)\.", run.stderr + run.stdout)  # it tells on stderr
     return program if version is not None and int(version[1]) >= OLDEST else None
 
 
