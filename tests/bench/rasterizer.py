@@ -1,16 +1,27 @@
 """Frames and steps for pytest-benchmark: `pytest tests/bench/rasterizer.py -n0`."""
 
+from collections.abc import Iterator
+
 import pytest
 import torch
 
 from aaplug.benchmark import gradient_step, synthetic_camera, synthetic_scene
 from aaplug.pipeline import learn, render
 from aaplug.recipes import find_recipe
+from tests.bench import take_all_threads
 from tests.conftest import ALL_RASTERIZERS
 
 CAMERA = synthetic_camera(800, 800).as_trained()
 ROUNDS = {"rounds": 5, "warmup_rounds": 1}
 RECIPE = find_recipe("classic")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def all_threads() -> Iterator[None]:
+    before = torch.get_num_threads()
+    take_all_threads()
+    yield
+    torch.set_num_threads(before)
 
 
 @pytest.fixture(params=["compiled", "eager"])
