@@ -37,6 +37,11 @@ VERBS = {
     Warmup: warmup,
     Bench: bench,
 }
+SEVERAL = {  # options that take several values, by verb
+    "evaluate": ("--recipe", "--scale"),
+    "finetune": ("--scale", "--move"),
+    "bench": ("--gaussians", "--resolution"),
+}
 
 
 def main(words: Sequence[str] | None = None) -> None:
@@ -73,10 +78,26 @@ def run(words: Sequence[str]) -> int:
         {noun.__name__.lower(): noun for noun in VERBS},
         prog="aaplug",
         description=description,
-        args=_joined(words),
+        args=_joined(_parted(words)),
         config=CONFIG,
     )
     return VERBS[type(options)](options)
+
+
+def _parted(words: Sequence[str]) -> list[str]:
+    """`--scale 1,0.25` as the parser wants it, `--scale 1 0.25`; `--views`, which may be names, has commas too."""
+    several, option = SEVERAL.get(words[0] if words else "", ()), ""
+    parted: list[str] = []
+    for word in words:
+        flag, _, value = word.partition("=")
+        option = flag if word.startswith("-") else option
+        if option not in several:
+            parted.append(word)
+        elif flag == option:
+            parted += [option, *filter(None, value.split(","))]
+        else:
+            parted += filter(None, word.split(","))
+    return parted
 
 
 def _joined(words: Sequence[str]) -> list[str]:

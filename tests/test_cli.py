@@ -183,6 +183,17 @@ def test_evaluate_writes_results_and_prints_a_table(cli):
     assert list(json.loads(Path("out/per_view.json").read_text())["classic@0.5"]["SSIM"]) == ["r_0"]
 
 
+@pytest.mark.parametrize(
+    "several", ["--recipe mip,auto --scale 1,0.5", "--scale=1,0.5 --recipe=mip,auto,"]
+)
+def test_commas_part_values_as_spaces_do(cli, several):
+    code, out, _ = cli(f"evaluate scene.ply --cameras . {several} -o a,b --json")
+    assert code == 0
+    methods = {name for name in json.loads(out) if "@" in name and " " not in name}
+    assert methods == {"mip@1", "mip@0.5", "auto@1", "auto@0.5"}
+    assert Path("a,b/results.json").is_file()
+
+
 def test_evaluate_without_photographs_takes_the_scenes_own_look(cli):
     code, out, err = cli("evaluate scene.ply --cameras . --views train --scale 0.5 --json")
     assert code == 0
