@@ -7,9 +7,10 @@ t: tiles of TILE × TILE px; P: pixels a tile.
 3. `compositing` draws them.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from itertools import chain
 
 import torch
 from jaxtyping import Float
@@ -49,12 +50,15 @@ class Tiled:
         grid = (-(-hw[0] // TILE), -(-hw[1] // TILE))
         extents = extents_of(splats, pixel) or splats
         paint = self._painter(splats, pixel)
-        rgb, alpha = [], []
-        for bins in bands(extents, grid, self.kernels, self.memory):
-            colours, alphas = paint(bins)
-            rgb.append(_untiled(colours, grid[1]))
-            alpha.append(_untiled(alphas[None], grid[1]))
-        return over(_image(rgb, hw), _image(alpha, hw)[..., 0], background)
+
+        def painted() -> Iterator[Render]:
+            for bins in bands(extents, grid, self.kernels, self.memory):
+                colours, alphas = paint(bins)
+                rgb, alpha = (_untiled(x, grid[1]) for x in (colours, alphas[None]))
+                yield over(rgb, alpha[..., 0], background)
+
+        whole = _assembled(painted(), grid[0] * TILE)
+        return Render(whole.rgb[: hw[0], : hw[1]], whole.alpha[: hw[0], : hw[1]])
 
     def _painter(
         self, splats: Splats2D, pixel: PixelKernel
@@ -73,10 +77,18 @@ def _untiled(tiles: Float[Tensor, "k t P"], columns: int) -> Float[Tensor, "h w 
     return image.reshape(-1, columns * TILE, len(tiles))
 
 
-def _image(bands: list[Tensor], hw: tuple[int, int]) -> Float[Tensor, "h w k"]:
-    """Bands from the top put together, and cut to size."""
-    image = bands[0] if len(bands) == 1 else torch.cat(bands)
-    return image[: hw[0], : hw[1]]
+def _assembled(bands: Iterator[Render], height: int) -> Render:
+    """Bands from the top in one image; each is let go when it is in its place, as a large image has but one copy."""
+    first = next(bands)
+    if len(first.rgb) == height:
+        return first
+    whole = Render(*(x.new_empty(height, *x.shape[1:]) for x in first))
+    top = 0
+    for band in chain([first], bands):
+        bottom = top + len(band.rgb)
+        whole.rgb[top:bottom], whole.alpha[top:bottom] = band
+        top = bottom
+    return whole
 
 
 def _blend(
