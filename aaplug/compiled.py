@@ -26,7 +26,7 @@ from aaplug import kernels as kernels_module
 from aaplug import projection, splats
 from aaplug.errors import UsageError, listing
 from aaplug.interfaces import Rasterizer
-from aaplug.kernels import CompiledKernels, Kernel, Package
+from aaplug.kernels import CompiledKernels, Kernel, Package, one_thread
 from aaplug.rasterizers import RASTERIZERS, Tiled, binning, compositing, drawing, pixels, rules
 
 KERNELS: tuple[Kernel, ...] = (  # those that take longest to compile are the last
@@ -65,10 +65,8 @@ TOLERANCE = (
 
 def cache_folder() -> Path:
     """Where the packages of this version on this processor are."""
-    own = (rules, pixels, binning, drawing, compositing)
-    source = "".join(
-        inspect.getsource(module) for module in (kernels_module, projection, splats, *own)
-    )
+    modules = (kernels_module, projection, splats, rules, pixels, binning, drawing, compositing)
+    source = "".join(inspect.getsource(module) for module in modules)
     options = f"{OPTIONS} {DOUBTS}"
     facts = [torch.__version__, torch.backends.cpu.get_cpu_capability(), source, options]
     key = hashlib.sha256("\0".join(facts).encode()).hexdigest()[:16]
@@ -179,7 +177,7 @@ def _load(kernel: Kernel) -> Package | None:
         # what `aoti_load_package` wraps; the import that it needs takes two seconds, and its calls four times as long
         loader = torch._C._aoti.AOTIModelPackageLoader  # pyright: ignore[reportAttributeAccessIssue]
         package = loader(str(path), "model", True, 1, -1).run
-        with torch.no_grad(), _one_thread():
+        with torch.no_grad(), one_thread():  # several would wait for each other
             args, twins = kernel.example(), kernel.example()
             found = [*package(list(args)), *args]  # what comes back, and what was updated in place
             expected = [*kernel.function(*twins), *twins]
@@ -187,17 +185,6 @@ def _load(kernel: Kernel) -> Package | None:
         return Package.of(package, args) if close else None
     except Exception:  # a broken package can fail in any way; it is built anew
         return None
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Work as small as an example's is done sooner by one thread than by several that others keep waiting."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _close(found: torch.Tensor, expected: torch.Tensor) -> bool:

@@ -4,7 +4,8 @@ A kernel is a function of tensors.  Run eagerly it is plain array code that any 
 use; `aaplug.compiled` turns the same source into one fused loop ahead of time.  A stage asks its `Kernels` to run it.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -147,3 +148,14 @@ class _Tracked(torch.autograd.Function):
 
 
 EAGER = Kernels()
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Let torch work with one thread, and with as many as before after that."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

@@ -20,6 +20,7 @@ from aaplug.filters import MatchedEnergy
 from aaplug.gaussians import Gaussians
 from aaplug.interfaces import Training, WorldFilter
 from aaplug.io.scenes.scene_file import PART, SceneFile
+from aaplug.kernels import one_thread
 from aaplug.nyquist import log_multiples, middle_log_scales, under
 from aaplug.sampling import SamplingBounds, check_frame, sampling_bounds
 
@@ -71,11 +72,10 @@ def _side_by_side(
     work: Callable[[Gaussians], Gaussians], parts: Iterator[Gaussians], threads: int
 ) -> Iterator[Gaussians]:
     """Results in order, from threads of one processor each; never more than one part a thread is waiting."""
-    before = torch.get_num_threads()
     waiting: deque[Future[Gaussians]] = deque()
-    with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+    start = torch.set_num_threads
+    with one_thread(), ThreadPoolExecutor(threads, initializer=start, initargs=(1,)) as pool:
         try:
-            torch.set_num_threads(1)
             for part in parts:
                 waiting.append(pool.submit(work, part))
                 if len(waiting) > threads:
@@ -83,7 +83,6 @@ def _side_by_side(
             while waiting:
                 yield waiting.popleft().result()
         finally:
-            torch.set_num_threads(before)
             pool.shutdown(wait=True, cancel_futures=True)
 
 

@@ -187,7 +187,7 @@ def blended(
     Each row of pixels draws the splats order[first : first + counts] of its own, one a turn.  side: of the first
     window, in px.
     """
-    window = Window.whole(x)
+    window, width = Window.whole(x), x.new_tensor(side)
     image = x.new_zeros(4, *x.shape)
     for turn in range(int(counts.max())):
         if turn % CHECK_EVERY == 0 and not window.mass.any():
@@ -195,7 +195,7 @@ def blended(
         drawn = (turn < counts).to(table)
         rows = table[order[(first + turn).clamp(max=len(order) - 1)].long()]
         *shape, red, green, blue = (column[:, None] for column in rows.unbind(1))
-        hidden, *left = kernels.run(TURN, drawn[:, None], x, y, x.new_tensor(side), *shape, *window)
+        hidden, *left = kernels.run(TURN, drawn[:, None], x, y, width, *shape, *window)
         window = Window(*left)
         image = image + hidden * torch.stack([red, green, blue, torch.ones_like(red)])
     return image

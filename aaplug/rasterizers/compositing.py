@@ -39,7 +39,7 @@ from aaplug.rasterizers.drawing import (
     offsets_at,
     pixel_centres,
 )
-from aaplug.rasterizers.rules import MAX_ALPHA, MIN_TRANSMITTANCE
+from aaplug.rasterizers.rules import MAX_ALPHA, MIN_TRANSMITTANCE, just_below
 
 STEP = 4  # splats that gradients go through at once: of more sums the compiler makes several loops
 SHORT_PASS = 8  # where alpha is much to compile, and much work beside what a pass loads and stores
@@ -48,9 +48,7 @@ STEPS_TOGETHER = 8  # looked up at once
 COMPACT_BELOW = 3 / 4  # share of tiles still going at which the others leave
 PARTS_AT_ONCE = 1 << 18  # more than a step has; or two a splat, if that is more
 LN_2 = math.log(2)
-
-# `threshold` keeps what is above its bound; this keeps what is at the bound as well.
-BELOW_MIN_TRANSMITTANCE = torch.nextafter(torch.tensor(MIN_TRANSMITTANCE), torch.tensor(0.0)).item()
+BELOW_MIN_TRANSMITTANCE = just_below(MIN_TRANSMITTANCE)
 SURELY = 1e9  # times anything that is not 0 here is over 1
 
 

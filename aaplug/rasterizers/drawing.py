@@ -20,6 +20,7 @@ from aaplug.kernels import Kernel, Kernels
 from aaplug.rasterizers.binning import TILE, splat_example
 from aaplug.rasterizers.extents import SURFELS
 from aaplug.rasterizers.pixels import CELLS, mean_gaussian, mean_logistic
+from aaplug.rasterizers.rules import just_below
 from aaplug.rasterizers.surfels import NARROWEST, disc, smoothed_disc
 from aaplug.splats import MIN_ALPHA, Splats2D, principal_columns, whitening_columns
 
@@ -28,13 +29,11 @@ UX, UY, VX, VY, X, Y, OPACITY, RED, GREEN, BLUE, HALF_U, HALF_V, SLOPE = range(1
 TILT_X, TILT_Y, LOW_PASS_WIDTH = HALF_U, HALF_V, SLOPE  # of a disc
 COLUMNS, MEAN_COLUMNS = 10, 13
 
-
 PIXELS = TILE * TILE
 HALF_LOG2_E = 0.5 * math.log2(math.e)
 LOG2_SILENT = -9.0  # log2 of an alpha below 1/255; stops exp2 before it underflows, which is slow
 LOG2_MIN_ALPHA = torch.tensor(MIN_ALPHA).log2().item()
-# `threshold` keeps what is above its bound; this keeps what is at the bound as well.
-BELOW_MIN_ALPHA = torch.nextafter(torch.tensor(MIN_ALPHA), torch.tensor(0.0)).item()
+BELOW_MIN_ALPHA = just_below(MIN_ALPHA)
 
 
 def drawing_of(
@@ -195,7 +194,7 @@ def _over_square(row: Float[Tensor, "*n t c"], pixels: Pixels) -> Float[Tensor, 
 
 
 def _audible_exp2(exponent: Float[Tensor, "*n P L"]) -> Float[Tensor, "*n P L"]:
-    """2^exponent where that is at least 1/255, else 0."""
+    """2^exponent where that is at least 1/255, else 0; compiled as a polynomial, since a loop pays for calls."""
     if torch.compiler.is_compiling():
         root = _polynomial(torch.relu(exponent - LOG2_SILENT), ROOT_OF_EXP2)
         return torch.where(exponent >= LOG2_MIN_ALPHA, _power(root, SQUARINGS), 0.0)

@@ -14,6 +14,11 @@ MIN_TRANSMITTANCE = torch.tensor(
 ).item()  # a pixel stops before the splat that would bring it under this
 
 
+def just_below(value: float) -> float:
+    """The float32 before a positive value: `threshold` keeps what is above its bound, and so the value itself too."""
+    return torch.nextafter(torch.tensor(value), torch.tensor(0.0)).item()
+
+
 def over(
     rgb: Float[Tensor, "h w 3"], alpha: Float[Tensor, "h w"], background: tuple[float, float, float]
 ) -> Render:

@@ -5,7 +5,6 @@ The look of training is fused into the world, 0.3/ν² with nothing added on the
 what all views together tell of it, scaled to the same volume; and both forms of Mip-Splatting's 3D filter.
 """
 
-import math
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -17,15 +16,13 @@ from aaplug.filters import NYQUIST_VARIANCE, AnisotropicSmoothing, Dilation, Smo
 from aaplug.gaussians import CLASSIC, Gaussians
 from aaplug.interfaces import Rasterizer, Training
 from aaplug.io.cameras import read_cameras
-from aaplug.io.images import quantise
 from aaplug.io.photographs import DOWNSCALES
 from aaplug.io.scenes import read_scene
-from aaplug.metrics import psnr
 from aaplug.paths import moved
 from aaplug.pipeline import learn, render
 from aaplug.protocols import median_depth
 from aaplug.recipes import Recipe, find_recipe
-from tests.bench.away import VIEWS, Scene, look_there, on_each
+from tests.bench.away import VIEWS, Scene, decibels, look_there, on_each
 from tests.conftest import SHARED_DATA
 
 TRAINED_SMALL = ("chair_eighth", "snowmiku_quarter")
@@ -70,7 +67,7 @@ def measure(name: str, how: Scene, rasterizer: Rasterizer) -> None:
             found = []
             for camera, truth in shown:
                 image = render(filtered, camera, recipe, training, rasterizer, how.background)
-                found.append(psnr(quantise(image.rgb.clamp(0, 1)), truth) or math.inf)
+                found.append(decibels(image.rgb, truth))
             cells.append(f"{sum(found) / len(found):.2f}")
         print(f"| {label} | " + " | ".join(cells) + " |", flush=True)
 

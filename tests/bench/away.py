@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from aaplug import compiled
 from aaplug.cameras import BLACK, WHITE, Camera
+from aaplug.compiled import choose
 from aaplug.filters import RateChoice
 from aaplug.gaussians import Gaussians
 from aaplug.interfaces import Rasterizer, Training
@@ -25,7 +25,6 @@ from aaplug.metrics import psnr
 from aaplug.paths import moved, zoomed
 from aaplug.pipeline import learn, rate_of, render
 from aaplug.protocols import median_depth
-from aaplug.rasterizers import RASTERIZERS, Tiled
 from aaplug.recipes import Recipe, find_recipe
 from tests.conftest import SHARED_DATA
 
@@ -80,8 +79,7 @@ def main(names: Sequence[str] = tuple(SCENES)) -> None:
 def on_each(names: Iterable[str], measured: Callable[[str, Scene, Rasterizer], None]) -> None:
     """Measure scenes with the fastest rasterizer that is built here."""
     torch.set_grad_enabled(False)
-    kernels = compiled.load()
-    rasterizer = RASTERIZERS["eager"] if kernels is None else Tiled(kernels)
+    rasterizer = choose("auto", 1, print)
     for name in names:
         measured(name, SCENES[name], rasterizer)
 
@@ -119,8 +117,7 @@ def measure(name: str, scene: Scene, rasterizer: Rasterizer) -> None:
             for rule, recipe in chosen.items():
                 image = render(own, camera, recipe, training, rasterizer, scene.background).rgb
                 for t, look in looks.items():
-                    decibel = psnr(quantise(image.clamp(0, 1)), look)
-                    found[t][rule].append(math.inf if decibel is None else decibel)
+                    found[t][rule].append(decibels(image, look))
         for t, rules in found.items():
             cells = (f"{sum(values) / len(values):.2f}" for values in rules.values())
             print(f"| {label} | {t} | " + " | ".join(cells) + " |", flush=True)
@@ -132,9 +129,13 @@ def look_there(
     """The look that training would have rendered there, if its pixels were as small as they were in the scene."""
     rate = rate_of(scene, replace(camera, trained_focal=None), training)
     recipe = replace(find_recipe("matched", rate="interval"), grid=max(1, math.ceil(1 / rate)))
-    return quantise(
-        render(scene, camera, recipe, training, rasterizer, how.background).rgb.clamp(0, 1)
-    )
+    return quantise(render(scene, camera, recipe, training, rasterizer, how.background).rgb)
+
+
+def decibels(image: torch.Tensor, truth: torch.Tensor) -> float:
+    """PSNR of an image as it is stored; infinite where it is the truth."""
+    found = psnr(quantise(image), truth)
+    return math.inf if found is None else found
 
 
 if __name__ == "__main__":
