@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING, Any
 import tyro
 from rich.table import Table
 
-from aaplug.errors import AaplugError, FormatError, UsageError
+from aaplug.core.errors import AaplugError, FormatError, UsageError
+from aaplug.evaluation.results import Report, as_csv, method, results, scale_name
 from aaplug.io.atomic import replacing
 from aaplug.io.batch_file import read_batch
-from aaplug.report import Report, as_csv, method, results, scale_name
 
 from .console import escape, log, out, print_json, say
 from .files import make_folder, refuse_existing

@@ -9,12 +9,12 @@ import tyro
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from aaplug.benchmark import Figures, exponent, measure, synthetic_camera, synthetic_scene
-from aaplug.cameras import Camera
-from aaplug.compiled import choose, load
-from aaplug.errors import UsageError
-from aaplug.gaussians import Gaussians
+from aaplug.core.cameras import Camera
+from aaplug.core.errors import UsageError
+from aaplug.core.gaussians import Gaussians
 from aaplug.rasterizers import Tiled
+from aaplug.rasterizers.tiled.ahead_of_time import choose, load
+from aaplug.rendering.benchmark import Figures, exponent, measure, synthetic_camera, synthetic_scene
 
 from .console import out, print_json, say
 from .options import CameraOptions, SceneOptions, flag

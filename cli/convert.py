@@ -7,18 +7,18 @@ from typing import Annotated, Any, Literal
 import torch
 import tyro
 
-from aaplug.conversion import FORMS, VIEWERS, Viewer, convert_for, default_form, describe
-from aaplug.conversion import convert as fuse
-from aaplug.errors import UsageError
-from aaplug.filters import fuse_stored
+from aaplug.core.errors import UsageError
+from aaplug.core.gaussians import Fusion, Gaussians
+from aaplug.evaluation.metrics import PSNR
+from aaplug.evaluation.results import Report, mean, results, tables
 from aaplug.finetuning import QUICK, Candidate, Job, Truth, balanced, between
-from aaplug.gaussians import Fusion, Gaussians
 from aaplug.io.scenes import check_scene_output, find_scene, write_parts, write_scene
 from aaplug.io.scenes.scene_file import SceneFile
-from aaplug.metrics import PSNR
-from aaplug.recipes import RECIPES
-from aaplug.report import Report, mean, results, tables
-from aaplug.streaming import LARGE, check_frame_of, convert_parts
+from aaplug.methods.filters import fuse_stored
+from aaplug.methods.recipes import RECIPES
+from aaplug.methods.viewers import FORMS, VIEWERS, Viewer, convert_for, default_form, describe
+from aaplug.methods.viewers import convert as fuse
+from aaplug.verbs.in_parts import LARGE, check_frame_of, convert_parts
 
 from .console import out, print_json, progress, say
 from .options import CameraOptions, SceneOptions, ViewOptions, flag

@@ -9,20 +9,20 @@ import tyro
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.cameras import WHITE, Camera
-from aaplug.contact_sheet import contact_sheet
-from aaplug.conversion import FORMS, default_form
-from aaplug.conversion import convert as fuse
-from aaplug.evaluation import Task
-from aaplug.evaluation import evaluate as measure
-from aaplug.gaussians import Gaussians
-from aaplug.interfaces import Training
+from aaplug.core.cameras import WHITE, Camera
+from aaplug.core.gaussians import Gaussians
+from aaplug.core.training import TrainingViews
+from aaplug.evaluation.engine import Task
+from aaplug.evaluation.engine import evaluate as measure
+from aaplug.evaluation.report.contact_sheet import contact_sheet
+from aaplug.evaluation.results import scale_name, tables
 from aaplug.io.cameras import read_cameras
-from aaplug.io.images import quantise, read_image, resampled, write_png
+from aaplug.io.images import quantised, read_image, resampled, write_png
 from aaplug.io.scenes import read_scene, write_scene
-from aaplug.pipeline import learn, render
-from aaplug.recipes import find_recipe
-from aaplug.report import scale_name, tables
+from aaplug.methods.recipes import find_recipe
+from aaplug.methods.viewers import FORMS, default_form
+from aaplug.methods.viewers import convert as fuse
+from aaplug.rendering.renderer import learn, render
 
 from .console import out, progress, say
 from .evaluate import write_results
@@ -55,7 +55,7 @@ def demo(options: Demo) -> int:
     )
     refuse_existing([options.output / name for name in names], options.overwrite)
     make_folder(options.output)
-    with as_file(files("aaplug.sample")) as sample:
+    with as_file(files("aaplug.io.sample")) as sample:
         scene, cameras = read_scene(sample / "chair.ply"), read_cameras(sample)
         say(
             f"sample: {len(scene):,} Gaussians, {len(cameras.train)} training cameras, 4 photographs"
@@ -79,10 +79,10 @@ def demo(options: Demo) -> int:
 
 
 def _sheet(
-    scene: Gaussians, converted: Gaussians, training: Training, view: Camera
+    scene: Gaussians, converted: Gaussians, training: TrainingViews, view: Camera
 ) -> Float[Tensor, "H W 3"]:
     assert view.photo is not None
-    photo = quantise(read_image(view.photo, WHITE))
+    photo = quantised(read_image(view.photo, WHITE))
     classic = find_recipe("classic")
     rows, left, top, right, bottom = [], *_box(render(scene, view, classic, training).alpha)
     for scale in SCALES:

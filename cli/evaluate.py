@@ -12,20 +12,20 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from aaplug.cameras import Camera, CameraSet
-from aaplug.errors import OutputError, UsageError
-from aaplug.evaluation import Task
-from aaplug.evaluation import evaluate as measure
-from aaplug.gaussians import Gaussians
-from aaplug.images import Images
-from aaplug.interfaces import Training
+from aaplug.core.cameras import Camera, CameraSet
+from aaplug.core.errors import OutputError, UsageError
+from aaplug.core.gaussians import Gaussians
+from aaplug.core.training import TrainingViews
+from aaplug.evaluation.engine import Task
+from aaplug.evaluation.engine import evaluate as measure
+from aaplug.evaluation.image_store import Images
+from aaplug.evaluation.lpips import lpips_metric
+from aaplug.evaluation.metrics import CONSISTENCY, ENERGY, FLICKER, FLIP, PSNR, SSIM, Metric
+from aaplug.evaluation.protocols import PROTOCOLS, Protocol, Truth, find_protocol
+from aaplug.evaluation.results import Report, as_csv, per_view, results, tables
+from aaplug.inspection.coverage import coverage
 from aaplug.io.atomic import replacing
-from aaplug.lpips import lpips_metric
-from aaplug.metrics import CONSISTENCY, ENERGY, FLICKER, FLIP, PSNR, SSIM, Metric
-from aaplug.nyquist import coverage
-from aaplug.protocols import PROTOCOLS, Protocol, Truth, find_protocol
-from aaplug.recipes import RECIPES, Recipe, lacking, suited
-from aaplug.report import Report, as_csv, per_view, results, tables
+from aaplug.methods.recipes import RECIPES, Recipe, lacking, suited
 
 from .batch import Job, finish_batch, jobs_of, run_batch
 from .console import out, print_json, progress, say
@@ -228,10 +228,10 @@ def _write_page(
     name: str,
     report: Report,
     scene: Gaussians,
-    training: Training,
+    training: TrainingViews,
     shown: tuple[int, ...],
 ) -> None:
-    from aaplug.webpage import write_page  # matplotlib takes most of a second
+    from aaplug.evaluation.report.webpage import write_page  # matplotlib takes most of a second
 
     assert options.output is not None
     images = _images(options, shown)

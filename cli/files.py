@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from aaplug.errors import OutputError, listing
+from aaplug.core.errors import OutputError, listing
 
 
 def refuse_existing(paths: Sequence[Path], overwrite: bool) -> None:

@@ -9,11 +9,13 @@ from typing import Annotated, Any, Literal, get_args
 
 import tyro
 
-from aaplug.cameras import Camera, CameraSet
-from aaplug.contact_sheet import contact_sheet
-from aaplug.conversion import VIEWERS, convert_for
-from aaplug.errors import UsageError
-from aaplug.filters import fuse_stored
+from aaplug.core.cameras import Camera, CameraSet
+from aaplug.core.errors import UsageError
+from aaplug.core.gaussians import Convention, Gaussians
+from aaplug.core.interfaces import Rasterizer
+from aaplug.core.training import TrainingViews
+from aaplug.evaluation.report.contact_sheet import contact_sheet
+from aaplug.evaluation.results import results, scale_name, tables
 from aaplug.finetuning import (
     OURS,
     Candidate,
@@ -25,14 +27,13 @@ from aaplug.finetuning import (
     mipmap_gs,
 )
 from aaplug.finetuning.settings import RATES
-from aaplug.gaussians import Convention, Gaussians
-from aaplug.interfaces import Rasterizer, Training
 from aaplug.io.atomic import check_output, replacing
 from aaplug.io.images import write_png
 from aaplug.io.scenes import check_scene_output, find_scene, write_scene
-from aaplug.pipeline import render, smooth
-from aaplug.recipes import RECIPES, Recipe
-from aaplug.report import results, scale_name, tables
+from aaplug.methods.filters import fuse_stored
+from aaplug.methods.recipes import RECIPES, Recipe
+from aaplug.methods.viewers import VIEWERS, convert_for
+from aaplug.rendering.renderer import render, smooth
 
 from .console import out, print_json, say
 from .options import CameraOptions, SceneOptions, ViewOptions, flag
@@ -214,7 +215,7 @@ def _truth(
     options: Finetune,
     scene: Gaussians,
     cameras: CameraSet,
-    training: Training,
+    training: TrainingViews,
     rasterizer: Rasterizer,
     background: tuple[float, float, float],
 ) -> Truth:
@@ -228,7 +229,7 @@ def _truth(
 
 
 def _target(
-    target: str, scene: Gaussians, training: Training
+    target: str, scene: Gaussians, training: TrainingViews
 ) -> tuple[Gaussians, Recipe, Convention]:
     """The scene to start from, the rule that will show it, and the convention that the file names."""
     if target == "fast":

@@ -8,14 +8,14 @@ from typing import Any
 from rich.markup import escape
 from rich.table import Table
 
-from aaplug.cameras import CameraSet
-from aaplug.conversion import describe
-from aaplug.gaussians import MAX_LOG_SCALE
+from aaplug.core.cameras import CameraSet
+from aaplug.core.gaussians import MAX_LOG_SCALE
+from aaplug.inspection.coverage import aliasing_begins
 from aaplug.io.limits import LIMITS, limit, memory_of_machine
 from aaplug.io.scenes.ply import Document
 from aaplug.io.scenes.scene_file import SceneFile
-from aaplug.nyquist import aliasing_begins
-from aaplug.streaming import Survey, check_frame_of, survey
+from aaplug.methods.viewers import describe
+from aaplug.verbs.in_parts import Survey, check_frame_of, survey
 
 from .console import out, print_json, progress
 from .options import CameraOptions, SceneOptions

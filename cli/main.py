@@ -11,7 +11,7 @@ from importlib.metadata import version
 
 import tyro
 
-from aaplug.errors import AaplugError
+from aaplug.core.errors import AaplugError
 
 from . import console
 from .bench import Bench, bench

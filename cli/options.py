@@ -12,20 +12,21 @@ from typing import Annotated, Any, Literal
 import torch
 import tyro
 
-from aaplug.cameras import BLACK, WHITE, Camera, CameraSet
-from aaplug.compiled import choose
-from aaplug.conversion import describe
-from aaplug.errors import UsageError
-from aaplug.gaussians import CONVENTIONS, Gaussians
-from aaplug.interfaces import Rasterizer, Training
+from aaplug.core.cameras import BLACK, WHITE, Camera, CameraSet
+from aaplug.core.errors import UsageError
+from aaplug.core.gaussians import CONVENTIONS, Gaussians
+from aaplug.core.interfaces import Rasterizer
+from aaplug.core.training import TrainingViews
+from aaplug.core.sampling import MIN_SEEN_SHARE, check_frame
 from aaplug.io.cameras import read_cameras, select_views
 from aaplug.io.scenes import SpzAxes, find_scene, open_scene
 from aaplug.io.scenes.scene_file import SceneFile
-from aaplug.pipeline import learn
+from aaplug.methods.recipes import SAMPLING, Recipe, find_recipe
+from aaplug.methods.viewers import describe
 from aaplug.rasterizers import Tiled
-from aaplug.rasterizers.binning import MEMORY
-from aaplug.recipes import SAMPLING, Recipe, find_recipe
-from aaplug.sampling import MIN_SEEN_SHARE, check_frame
+from aaplug.rasterizers.tiled.ahead_of_time import choose
+from aaplug.rasterizers.tiled.binning import MEMORY
+from aaplug.rendering.renderer import learn
 
 from .console import say
 
@@ -128,7 +129,7 @@ class CameraOptions:
             say(f"cameras: {note}")
         return cameras
 
-    def learn(self, scene: Gaussians, cameras: CameraSet) -> Training:
+    def learn(self, scene: Gaussians, cameras: CameraSet) -> TrainingViews:
         """Check that scene and cameras share a frame, and compute the sampling bounds."""
         assert scene.origin is not None
         check_frame(scene.means, cameras.train, scene.origin.path, self.min_seen)

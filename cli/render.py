@@ -9,14 +9,14 @@ from typing import Annotated, Literal
 import torch
 import tyro
 
-from aaplug.cameras import Camera
-from aaplug.errors import OutputError, UsageError, listing
-from aaplug.frames import Frames, write_frames
-from aaplug.gaussians import Gaussians
-from aaplug.interfaces import Training
+from aaplug.core.cameras import Camera
+from aaplug.core.errors import OutputError, UsageError, listing
+from aaplug.core.gaussians import Gaussians
+from aaplug.core.training import TrainingViews
 from aaplug.io.atomic import check_output
-from aaplug.pipeline import rate_of, smooth
-from aaplug.recipes import RECIPES, Recipe, find_recipe, suited
+from aaplug.methods.recipes import RECIPES, Recipe, find_recipe, suited
+from aaplug.rendering.frames import Frames, write_frames
+from aaplug.rendering.renderer import rate_of, smooth
 
 from .console import print_json, progress, say
 from .files import make_folder, refuse_existing
@@ -132,7 +132,7 @@ def _paths(output: Path, views: Sequence[Camera], overwrite: bool) -> list[Path]
     return paths
 
 
-def _choice(recipe: Recipe, views: Sequence[Camera], scene: Gaussians, training: Training) -> str:
+def _choice(recipe: Recipe, views: Sequence[Camera], scene: Gaussians, training: TrainingViews) -> str:
     """What is about to be rendered and why, in words."""
     rates = [rate_of(scene, view, training) for view in views]
     samples = sorted({recipe.samples_at(rate) for rate in rates})

@@ -9,11 +9,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from aaplug.cameras import Camera
-from aaplug.conversion import TUNED
+from aaplug.core.cameras import Camera
+from aaplug.core.gaussians import Convention, Fusion, Gaussians
+from aaplug.evaluation.results import Report, mean, scale_name
 from aaplug.finetuning import Candidate, Job, State, Truth, begin, compare, load, run, save
-from aaplug.gaussians import Convention, Fusion, Gaussians
-from aaplug.report import Report, mean, scale_name
+from aaplug.methods.viewers import TUNED
 
 from .console import progress, say
 

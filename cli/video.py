@@ -8,16 +8,16 @@ from typing import Annotated
 import torch
 import tyro
 
-from aaplug import paths
-from aaplug.cameras import Camera, CameraSet
-from aaplug.errors import UsageError
-from aaplug.gaussians import Gaussians
+from aaplug.core import camera_paths as paths
+from aaplug.core.cameras import Camera, CameraSet
+from aaplug.core.errors import UsageError
+from aaplug.core.gaussians import Gaussians
+from aaplug.evaluation.protocols import median_depth
 from aaplug.io.cameras.camera_path import read_camera_path
 from aaplug.io.video import check_video
-from aaplug.protocols import median_depth
-from aaplug.recipes import RECIPES, suited
-from aaplug.videos import Video as Clip
-from aaplug.videos import make_video
+from aaplug.methods.recipes import RECIPES, suited
+from aaplug.rendering.videos import Video as Clip
+from aaplug.rendering.videos import make_video
 
 from .console import print_json, progress, say
 from .options import CameraOptions, RenderOptions, SceneOptions, flag

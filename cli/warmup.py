@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from aaplug.compiled import KERNELS, build, cache_folder
+from aaplug.rasterizers.tiled.ahead_of_time import KERNELS, build, cache_folder
 
 from .console import print_json, progress, say
 

@@ -3,8 +3,8 @@
 from pathlib import Path
 
 import aaplug
-from aaplug.filters import Matched
-from aaplug.projection import project
+from aaplug.core.projection import project
+from aaplug.methods.filters import Matched
 
 SAMPLE = Path(aaplug.__file__).parent / "sample"
 

@@ -12,15 +12,16 @@ from pathlib import Path
 import pytest
 import torch
 
-from aaplug import compiled
-from aaplug.cameras import Camera, CameraSet, look_at
-from aaplug.gaussians import Gaussians, PixelSizes
-from aaplug.interfaces import Rasterizer, Training
+from aaplug.core.cameras import Camera, CameraSet, look_at
+from aaplug.core.gaussians import Gaussians, PixelSizes
+from aaplug.core.interfaces import Rasterizer
+from aaplug.core.training import TrainingViews
+from aaplug.core.splats import Splats2D
 from aaplug.io.cameras import read_cameras
 from aaplug.io.scenes import read_scene
-from aaplug.pipeline import learn
 from aaplug.rasterizers import RASTERIZERS, Tiled
-from aaplug.splats import Splats2D
+from aaplug.rasterizers.tiled import ahead_of_time as compiled
+from aaplug.rendering.renderer import learn
 
 torch.set_num_threads(
     1
@@ -33,7 +34,7 @@ ALL_RASTERIZERS: dict[str, Rasterizer] = {
 }
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
-SAMPLE = Path(str(files("aaplug.sample")))
+SAMPLE = Path(str(files("aaplug.io.sample")))
 
 
 @pytest.fixture(autouse=True)
@@ -67,7 +68,7 @@ def sample_cameras() -> CameraSet:
 
 
 @pytest.fixture(scope="session")
-def sample_training(sample_scene: Gaussians, sample_cameras: CameraSet) -> Training:
+def sample_training(sample_scene: Gaussians, sample_cameras: CameraSet) -> TrainingViews:
     return learn(sample_scene, sample_cameras.train)
 
 

@@ -19,9 +19,9 @@ from pathlib import Path
 
 import torch
 
-from aaplug.errors import AaplugError
+from aaplug.core.errors import AaplugError
 from aaplug.io.scenes import open_scene
-from aaplug.streaming import survey
+from aaplug.verbs.in_parts import survey
 from tests.scene_files import DATA, MADE, STORED, write_file
 
 SECONDS = 1.0  # of processor time a file; other processes may make the clock's run longer

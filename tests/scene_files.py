@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from aaplug.gaussians import Gaussians
+from aaplug.core.gaussians import Gaussians
 from aaplug.io.scenes import read_scene
 
 DATA = Path(__file__).resolve().parent / "data"

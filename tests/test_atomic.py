@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from aaplug.errors import OutputError
+from aaplug.core.errors import OutputError
 from aaplug.io.atomic import check_output, replacing
 
 OLD, NEW = b"old", b"new and longer"

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from aaplug.errors import FormatError
+from aaplug.core.errors import FormatError
 from aaplug.io.batch_file import read_batch
 from tests.test_cli import cli, dataset  # noqa: F401  (fixtures)
 
@@ -106,7 +106,7 @@ def test_a_killed_batch_continues_to_the_same_bytes(batch, monkeypatch, stop):
     assert batch(words)[0] == 0
     whole = timeless(Path("out"))
     shutil.rmtree("out")
-    from aaplug.record import Record
+    from aaplug.evaluation.journal import Record
 
     added, add = [], Record.add
 

@@ -6,12 +6,12 @@ import pytest
 import torch
 from aaplug_cli.main import main
 
-from aaplug.benchmark import exponent, measure, synthetic_camera, synthetic_scene
-from aaplug.pipeline import learn, render
-from aaplug.projection import rotation_matrices
+from aaplug.core.projection import rotation_matrices
+from aaplug.core.splats import MIN_ALPHA
+from aaplug.methods.recipes import RECIPES
 from aaplug.rasterizers import Tiled
-from aaplug.recipes import RECIPES
-from aaplug.splats import MIN_ALPHA
+from aaplug.rendering.benchmark import exponent, measure, synthetic_camera, synthetic_scene
+from aaplug.rendering.renderer import learn, render
 
 STAGES = ["project", "filter", "cull", "shade", "bin", "forms", "composite"]
 

@@ -6,8 +6,8 @@ from dataclasses import replace
 import pytest
 import torch
 
+from aaplug.methods.window_blending import Window, axes_of, moments, through
 from aaplug.rasterizers import RASTERIZERS
-from aaplug.rasterizers.blending import Window, axes_of, moments, through
 from tests.test_rasterizers import BLACK, WHITE, splats_of
 
 F64 = torch.float64

@@ -13,8 +13,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from aaplug.cameras import BLACK, WHITE, CameraSet
-from aaplug.errors import AaplugError, FormatError, UsageError
+from aaplug.core.cameras import BLACK, WHITE, CameraSet
+from aaplug.core.errors import AaplugError, FormatError, UsageError
 from aaplug.io.cameras import read_cameras, select_views
 from aaplug.io.cameras.cfg_args import read_cfg_args
 

@@ -15,13 +15,13 @@ import torch
 from aaplug_cli.main import main
 from plyfile import PlyData
 
-from aaplug.cameras import BLACK
-from aaplug.gaussians import MIP
+from aaplug.core.cameras import BLACK
+from aaplug.core.gaussians import MIP
 from aaplug.io.cameras import read_cameras
 from aaplug.io.images import image_size, write_png
 from aaplug.io.scenes import read_scene, write_scene
-from aaplug.pipeline import learn, render
-from aaplug.recipes import RECIPES
+from aaplug.methods.recipes import RECIPES
+from aaplug.rendering.renderer import learn, render
 from tests.conftest import make_camera, make_scene
 
 EYES = {

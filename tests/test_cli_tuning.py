@@ -12,8 +12,8 @@ import cv2
 import pytest
 from aaplug_cli import convert
 
+from aaplug.core.gaussians import MIP
 from aaplug.finetuning import tuning
-from aaplug.gaussians import MIP
 from aaplug.io.scenes import read_scene
 from tests.test_cli import cli, dataset  # noqa: F401 (fixtures)
 

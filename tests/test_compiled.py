@@ -6,12 +6,13 @@ from dataclasses import replace
 import pytest
 import torch
 
-from aaplug import compiled, kernels
-from aaplug.errors import UsageError
-from aaplug.kernels import EAGER, CompiledKernels, Kernel, Package
-from aaplug.pipeline import learn, render
+from aaplug.core import kernels
+from aaplug.core.errors import UsageError
+from aaplug.core.kernels import EAGER, CompiledKernels, Kernel, Package
+from aaplug.methods.recipes import RECIPES
 from aaplug.rasterizers import RASTERIZERS, Tiled, reference
-from aaplug.recipes import RECIPES
+from aaplug.rasterizers.tiled import ahead_of_time as compiled
+from aaplug.rendering.renderer import learn, render
 from tests.conftest import make_camera, make_scene, sized
 
 ANSWER = 1e-5

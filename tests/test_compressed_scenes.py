@@ -12,8 +12,8 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
-from aaplug.errors import FormatError, OutputError, UsageError
-from aaplug.gaussians import ANTIALIASED, CLASSIC, MAX_LOG_SCALE, MIP, Gaussians
+from aaplug.core.errors import FormatError, OutputError, UsageError
+from aaplug.core.gaussians import ANTIALIASED, CLASSIC, MAX_LOG_SCALE, MIP, Gaussians
 from aaplug.io.scenes import find_scene, open_scene, read_scene, write_scene
 from tests.scene_files import DATA, MADE, ksplat, oracle, splat, splats, spz, write_file
 
@@ -128,8 +128,8 @@ def test_spz_axes_can_be_left_as_they_are(tmp_path: Path):
 
 def test_a_half_turn_of_the_scene_is_a_half_turn_of_the_view():
     """Colours seen from turned directions are those seen before."""
+    from aaplug.core.projection import sh_colour
     from aaplug.io.scenes.packed import half_turn_about_x
-    from aaplug.projection import sh_colour
 
     scene = oracle()
     directions = torch.nn.functional.normalize(torch.randn(len(scene), 3), dim=1)

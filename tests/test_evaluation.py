@@ -6,17 +6,17 @@ from pathlib import Path
 import pytest
 import torch
 
-from aaplug.cameras import BLACK
-from aaplug.errors import UsageError
-from aaplug.evaluation import NO_PHOTOGRAPH, Task, evaluate
-from aaplug.images import Images
-from aaplug.io.images import downsample, quantise, read_image, write_png
-from aaplug.metrics import CONSISTENCY, ENERGY, FLICKER, SSIM, psnr
-from aaplug.pipeline import learn, render
-from aaplug.protocols import PROTOCOLS
+from aaplug.core.cameras import BLACK
+from aaplug.core.errors import UsageError
+from aaplug.evaluation.engine import NO_PHOTOGRAPH, Task, evaluate
+from aaplug.evaluation.image_store import Images
+from aaplug.evaluation.metrics import CONSISTENCY, ENERGY, FLICKER, SSIM, psnr
+from aaplug.evaluation.protocols import PROTOCOLS
+from aaplug.evaluation.results import CEILING, as_csv, mean, per_view, results, scale_name, tables
+from aaplug.io.images import downsample, quantised, read_image, write_png
+from aaplug.methods.recipes import RECIPES, find_recipe
 from aaplug.rasterizers import RASTERIZERS
-from aaplug.recipes import RECIPES, find_recipe
-from aaplug.report import CEILING, as_csv, mean, per_view, results, scale_name, tables
+from aaplug.rendering.renderer import learn, render
 from tests.conftest import make_camera, make_scene
 
 
@@ -44,11 +44,11 @@ def test_figures_are_those_of_the_images_compared_by_hand(world):
     scene, training, views = world
     report = evaluate(scene, training, task(views))
     for view in views:
-        photo = quantise(read_image(view.photo, None))
+        photo = quantised(read_image(view.photo, None))
         for scale, truth in ((1.0, photo), (0.5, downsample(photo, 2))):
             image = render(scene, view.scaled(scale), RECIPES["classic"], training).rgb
             found = next(m for m in report.select("classic", scale) if m.view == view.name)
-            assert found.values["PSNR"] == pytest.approx(psnr(quantise(image), truth), abs=1e-9)
+            assert found.values["PSNR"] == pytest.approx(psnr(quantised(image), truth), abs=1e-9)
 
 
 def test_the_ceiling_is_always_among_the_rows(world):
@@ -57,7 +57,7 @@ def test_the_ceiling_is_always_among_the_rows(world):
     assert report.recipes == (CEILING, "classic", "matched")
     full = render(scene, views[0], RECIPES["classic"], training).rgb.clamp(0, 1)
     expected = psnr(
-        quantise(downsample(full, 2)), downsample(quantise(read_image(views[0].photo, None)), 2)
+        quantised(downsample(full, 2)), downsample(quantised(read_image(views[0].photo, None)), 2)
     )
     assert report.select(CEILING, 0.5)[0].values["PSNR"] == pytest.approx(expected, abs=1e-9)
 
@@ -249,7 +249,8 @@ def test_an_interrupted_evaluation_continues_and_redoes_nothing(world, tmp_path,
     before = path.read_bytes()
     drawn = []
     monkeypatch.setattr(
-        "aaplug.evaluation.render", lambda *args: (drawn.append(args[1].name), render(*args))[1]
+        "aaplug.evaluation.engine.render",
+        lambda *args: (drawn.append(args[1].name), render(*args))[1],
     )
     report = evaluate(scene, training, task(views), record=path, resume=True)
     assert set(drawn) == {"b"}
@@ -276,7 +277,7 @@ def test_images_lie_where_3dgs_scripts_look(world, tmp_path):
     assert not any(path.endswith("00000.png") for path in every if path.startswith("images"))
     stored = read_image(store.path(1, "matched", 0.5), None)
     image = render(scene, views[1].scaled(0.5), RECIPES["matched"], training).rgb
-    assert stored.equal(quantise(image))
+    assert stored.equal(quantised(image))
 
 
 def test_csv_holds_a_line_a_measurement(world):

@@ -6,16 +6,16 @@ from dataclasses import replace
 import pytest
 import torch
 
-from aaplug.errors import UsageError
-from aaplug.filters import Adaptive, AnisotropicSmoothing, ByPixelSize, Smoothing3D
-from aaplug.filters.adaptive import ADAPTIVE_VARIANCE
-from aaplug.filters.pixel_size import pixel_size
-from aaplug.filters.smoothing import BALANCE_FLOOR, LEAST_SHARE
-from aaplug.gaussians import PixelSizes
-from aaplug.pipeline import learn, render
-from aaplug.projection import project, rotation_matrices
-from aaplug.recipes import RECIPES, lacking, suited
-from aaplug.splats import Splats2D
+from aaplug.core.errors import UsageError
+from aaplug.core.gaussians import PixelSizes
+from aaplug.core.projection import project, rotation_matrices
+from aaplug.core.splats import Splats2D
+from aaplug.methods.filters import Adaptive, AnisotropicSmoothing, ByPixelSize, Smoothing3D
+from aaplug.methods.filters.adaptive import ADAPTIVE_VARIANCE
+from aaplug.methods.filters.pixel_size import pixel_size
+from aaplug.methods.filters.smoothing import BALANCE_FLOOR, LEAST_SHARE
+from aaplug.methods.recipes import RECIPES, lacking, suited
+from aaplug.rendering.renderer import learn, render
 from tests.conftest import make_camera, make_scene, make_splats, sized
 
 F64 = torch.float64

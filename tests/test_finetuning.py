@@ -8,8 +8,11 @@ import pytest
 import torch
 from skimage.metrics import structural_similarity as ssim_of_skimage
 
-from aaplug.cameras import WHITE
-from aaplug.errors import FormatError, UsageError
+from aaplug.core.cameras import WHITE
+from aaplug.core.errors import FormatError, UsageError
+from aaplug.core.gaussians import Gaussians
+from aaplug.core.projection import rotation_matrices
+from aaplug.core.sampling import sampling_bounds
 from aaplug.finetuning import (
     QUICK,
     Job,
@@ -30,12 +33,9 @@ from aaplug.finetuning.densification import MIN_SHOWN, PULL, SHRINK, carried, de
 from aaplug.finetuning.losses import LOSSES, l1_dssim, l2, structural_similarity
 from aaplug.finetuning.parameters import RATES, extent, leaves_of, scene_of, thinnest
 from aaplug.finetuning.upsamplers import UPSAMPLERS, find_upsampler
-from aaplug.gaussians import Gaussians
-from aaplug.pipeline import learn, render
-from aaplug.projection import rotation_matrices
+from aaplug.methods.recipes import RECIPES
 from aaplug.rasterizers import RASTERIZERS
-from aaplug.recipes import RECIPES
-from aaplug.sampling import sampling_bounds
+from aaplug.rendering.renderer import learn, render
 from tests.conftest import make_camera, make_scene
 
 F64 = torch.float64

@@ -6,10 +6,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from aaplug.errors import FormatError, OutputError
-from aaplug.frames import Frames, write_frames
-from aaplug.pipeline import learn
-from aaplug.recipes import RECIPES
+from aaplug.core.errors import FormatError, OutputError
+from aaplug.methods.recipes import RECIPES
+from aaplug.rendering.frames import Frames, write_frames
+from aaplug.rendering.renderer import learn
 from tests.conftest import ALL_RASTERIZERS, make_camera, make_scene
 
 
@@ -50,7 +50,7 @@ def test_an_existing_file_is_refused_by_name(frames, threads):
 
 
 def test_little_work_starts_no_process(frames, monkeypatch):
-    monkeypatch.setattr("aaplug.frames.ProcessPoolExecutor", None)
+    monkeypatch.setattr("aaplug.rendering.frames.ProcessPoolExecutor", None)
     write_frames(frames, ALL_RASTERIZERS["eager"], 8)
     assert all(path.is_file() for path in frames.paths)
 
@@ -66,7 +66,7 @@ def test_errors_survive_the_way_between_processes():
 
 
 def test_threads_change_no_bit(frames):
-    from aaplug.pipeline import render
+    from aaplug.rendering.renderer import render
 
     before = torch.get_num_threads()
     images = []

@@ -6,13 +6,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from aaplug import compiled
-from aaplug.cameras import Camera
-from aaplug.filters import SCREEN_FILTERS, WORLD_FILTERS
-from aaplug.gaussians import Gaussians
-from aaplug.pipeline import learn, render, smooth
+from aaplug.core.cameras import Camera
+from aaplug.core.gaussians import Gaussians
+from aaplug.methods.filters import SCREEN_FILTERS, WORLD_FILTERS
+from aaplug.methods.recipes import RECIPES, Recipe
 from aaplug.rasterizers import RASTERIZERS, Reference, Tiled, compositing
-from aaplug.recipes import RECIPES, Recipe
+from aaplug.rasterizers.tiled import ahead_of_time as compiled
+from aaplug.rendering.renderer import learn, render, smooth
 from tests.conftest import make_camera, make_scene, make_splats, sized
 
 F64 = torch.float64

@@ -16,7 +16,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from aaplug.errors import AaplugError
+from aaplug.core.errors import AaplugError
 from aaplug.io.scenes import open_scene
 from tests.hostile import NAMES, check, content_of, cuts, flipped_digits, header_size, mutations
 

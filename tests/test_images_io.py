@@ -13,12 +13,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from aaplug.errors import FormatError, OutputError, UsageError
+from aaplug.core.errors import FormatError, OutputError, UsageError
 from aaplug.io.images import (
     downsample,
     encode_png,
     image_size,
-    quantise,
+    quantised,
     read_image,
     write_png,
 )
@@ -46,18 +46,18 @@ def png_chunk(kind: bytes, body: bytes) -> bytes:
 def test_reading_a_written_png_gives_the_quantised_image(tmp_path: Path, bit_depth: int):
     rgb = random_image() * 1.4 - 0.2
     write_png(tmp_path / "a.png", rgb, bit_depth)
-    assert torch.equal(read_image(tmp_path / "a.png", None), quantise(rgb, bit_depth))
+    assert torch.equal(read_image(tmp_path / "a.png", None), quantised(rgb, bit_depth))
     assert image_size(tmp_path / "a.png") == (7, 5)
 
 
 @pytest.mark.parametrize("bit_depth", [8, 16])
 def test_quantise_rounds_to_the_nearest_code_and_is_idempotent(bit_depth: int):
     rgb = random_image()
-    rounded = quantise(rgb, bit_depth)
+    rounded = quantised(rgb, bit_depth)
     assert (rounded - rgb).abs().max() <= 0.5001 / (2**bit_depth - 1)
-    assert torch.equal(quantise(rounded, bit_depth), rounded)
-    assert torch.equal(quantise(rgb * 0 - 3, bit_depth), rgb * 0)
-    assert torch.equal(quantise(rgb * 0 + 3, bit_depth), rgb * 0 + 1)
+    assert torch.equal(quantised(rounded, bit_depth), rounded)
+    assert torch.equal(quantised(rgb * 0 - 3, bit_depth), rgb * 0)
+    assert torch.equal(quantised(rgb * 0 + 3, bit_depth), rgb * 0 + 1)
 
 
 @pytest.mark.parametrize("bit_depth", [8, 16])

@@ -8,10 +8,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from aaplug.conversion import FORMS, convert
-from aaplug.gaussians import ANTIALIASED, CLASSIC
+from aaplug.core.gaussians import ANTIALIASED, CLASSIC
 from aaplug.io.cameras import read_cameras
 from aaplug.io.scenes import read_scene, write_scene
+from aaplug.methods.viewers import FORMS, convert
 from tests.scene_files import ORACLE
 
 OLDEST = 3  # major version: before, it wrote .spz in other axes and without a flag

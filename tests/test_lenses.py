@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from aaplug.cameras import Camera
+from aaplug.core.cameras import Camera
 from aaplug.io.lenses import Distortion, straight, straightened
 from aaplug.io.photographs import DOWNSCALES
 

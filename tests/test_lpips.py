@@ -4,8 +4,8 @@ import pytest
 import torch
 from torch.nn.functional import conv2d, max_pool2d, relu
 
-from aaplug.errors import FormatError
-from aaplug.lpips import NETS, lpips_metric
+from aaplug.core.errors import FormatError
+from aaplug.evaluation.lpips import NETS, lpips_metric
 
 CHANNELS = (4, 5, 6, 7, 8)
 

@@ -10,8 +10,8 @@ from skimage.data import astronaut
 from skimage.metrics import structural_similarity
 from torch.nn.functional import conv2d, pad
 
+from aaplug.evaluation.metrics import METRICS, energy_drift, flicker, flip, psnr, ssim
 from aaplug.io.images import downsample
-from aaplug.metrics import METRICS, energy_drift, flicker, flip, psnr, ssim
 
 
 def test_psnr_of_a_constant_error():

@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from aaplug.gaussians import CLASSIC
-from aaplug.nyquist import coverage, log_multiples
-from aaplug.pipeline import learn
+from aaplug.core.gaussians import CLASSIC
+from aaplug.inspection.coverage import coverage, log_multiples
+from aaplug.rendering.renderer import learn
 from tests.conftest import make_camera, make_scene
 
 

@@ -6,9 +6,9 @@ import math
 import pytest
 import torch
 
-from aaplug import paths
-from aaplug.cameras import CameraSet
-from aaplug.errors import FormatError
+from aaplug.core import camera_paths as paths
+from aaplug.core.cameras import CameraSet
+from aaplug.core.errors import FormatError
 from aaplug.io.cameras.camera_path import read_camera_path, sniff
 from tests.conftest import make_camera
 

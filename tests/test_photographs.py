@@ -6,8 +6,8 @@ import pytest
 import torch
 from PIL import Image
 
-from aaplug.errors import UsageError
-from aaplug.io.images import downsample, quantise, read_image
+from aaplug.core.errors import UsageError
+from aaplug.io.images import downsample, quantised, read_image
 from aaplug.io.photographs import DOWNSCALES
 
 WHITE = (1.0, 1.0, 1.0)
@@ -34,7 +34,7 @@ def test_every_way_keeps_size_and_range(rgba, name):
 
 
 def test_box_composites_rounds_and_averages(rgba):
-    expected = downsample(quantise(read_image(rgba, WHITE)), 4)
+    expected = downsample(quantised(read_image(rgba, WHITE)), 4)
     assert DOWNSCALES["box"].read(rgba, WHITE).at((4, 6), 0.25).equal(expected)
 
 
@@ -54,7 +54,7 @@ def test_rgba_box_refuses_what_is_not_halved(rgba):
 
 
 def test_pil_bicubic_is_pillows(rgba):
-    pixels = (quantise(read_image(rgba, WHITE)) * 255).round().byte().numpy()
+    pixels = (quantised(read_image(rgba, WHITE)) * 255).round().byte().numpy()
     small = np.array(Image.fromarray(pixels).resize((6, 4), Image.Resampling.BICUBIC))
     found = DOWNSCALES["pil-bicubic"].read(rgba, WHITE).at((4, 6), 0.25)
     assert torch.allclose(found, torch.from_numpy(small).float() / 255)

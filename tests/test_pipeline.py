@@ -5,17 +5,17 @@ from dataclasses import replace
 import pytest
 import torch
 
-from aaplug.cameras import WHITE, Camera
-from aaplug.conversion import FITTED_VARIANCE, FORMS, VIEWERS, convert, convert_for
-from aaplug.errors import UsageError
-from aaplug.filters import StoredSmoothing
-from aaplug.gaussians import ANTIALIASED, CLASSIC, CONVENTIONS, MIP, Gaussians
+from aaplug.core.cameras import WHITE, Camera
+from aaplug.core.errors import UsageError
+from aaplug.core.gaussians import ANTIALIASED, CLASSIC, CONVENTIONS, MIP, Gaussians
+from aaplug.core.projection import project
+from aaplug.core.sampling import median_rates
 from aaplug.io.scenes import read_scene, write_scene
-from aaplug.pipeline import learn, rate_of, render, smooth
-from aaplug.projection import project
+from aaplug.methods.filters import StoredSmoothing
+from aaplug.methods.recipes import RECIPES, find_recipe, suited
+from aaplug.methods.viewers import FITTED_VARIANCE, FORMS, VIEWERS, convert, convert_for
 from aaplug.rasterizers import RASTERIZERS
-from aaplug.recipes import RECIPES, find_recipe, suited
-from aaplug.sampling import median_rates
+from aaplug.rendering.renderer import learn, rate_of, render, smooth
 from tests.conftest import make_camera, make_scene
 
 REFERENCE = RASTERIZERS["reference"]
@@ -239,8 +239,8 @@ def test_a_free_camera_is_compared_with_the_training_cameras_focal():
     training = learn(make_scene(10), [make_camera(), make_camera(fov=1.4)])
     focals = sorted(camera.focal for camera in training.cameras)
     free = replace(make_camera(), trained_focal=None)
-    assert training.rate(free) == pytest.approx(free.focal / (sum(focals) / 2))
-    assert training.rate(make_camera(fov=1.4).scaled(0.5)) == pytest.approx(0.5)
+    assert training.relative_rate(free) == pytest.approx(free.focal / (sum(focals) / 2))
+    assert training.relative_rate(make_camera(fov=1.4).scaled(0.5)) == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize(
@@ -276,7 +276,7 @@ def test_a_free_camera_has_the_rate_of_its_distance(distance, rate):
     assert rate_of(scene, free, training) == pytest.approx(rate, rel=0.05)
     assert rate_of(scene, trained.scaled(0.25), training) == 0.25
     unseeing = replace(make_camera((0.0, -9.0, 0.0)), trained_focal=None, cx=1e6)
-    assert rate_of(scene, unseeing, training) == training.rate(unseeing)
+    assert rate_of(scene, unseeing, training) == training.relative_rate(unseeing)
 
 
 @pytest.mark.parametrize(("free", "like"), [(True, "interval"), (False, "global")])

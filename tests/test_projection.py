@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from aaplug import projection
-from aaplug.cameras import Camera
-from aaplug.gaussians import Gaussians
-from aaplug.projection import project, rotation_matrices, sh_colour, shade
+from aaplug.core import projection
+from aaplug.core.cameras import Camera
+from aaplug.core.gaussians import Gaussians
+from aaplug.core.projection import project, rotation_matrices, sh_colour, shade
 from tests.conftest import make_camera, make_scene
 
 F64 = torch.float64

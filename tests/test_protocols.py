@@ -5,10 +5,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from aaplug.errors import UsageError
+from aaplug.core.errors import UsageError
+from aaplug.evaluation.metrics import SSIM
+from aaplug.evaluation.protocols import PROTOCOLS, find_protocol, median_depth
 from aaplug.io.photographs import DOWNSCALES
-from aaplug.metrics import SSIM
-from aaplug.protocols import PROTOCOLS, find_protocol, median_depth
 from tests.conftest import make_camera, make_scene
 
 

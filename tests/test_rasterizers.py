@@ -15,10 +15,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from aaplug.interfaces import Rasterizer
-from aaplug.kernels import EAGER
+from aaplug.core.interfaces import Rasterizer
+from aaplug.core.kernels import EAGER
+from aaplug.core.ellipses import squared_cutoff
+from aaplug.core.splats import Splats2D
 from aaplug.rasterizers import Tiled, binning, drawing, reference
-from aaplug.splats import Splats2D, reach
 from tests.conftest import ALL_RASTERIZERS, make_splats
 
 F64 = torch.float64
@@ -441,7 +442,7 @@ def test_exactly_the_tiles_that_the_ellipses_reach_are_paired():
                 distance = conic[0] * dx * dx + 2 * conic[1] * dx * dy + conic[2] * dy * dy
                 least = torch.minimum(least, distance.amin(dim=1))
         least[inside] = 0
-        reached = reach(splats.opacities)
+        reached = squared_cutoff(splats.opacities)
         assert listed[least <= reached, tile].all()
         surely_missed = least > reached * 1.001 + 0.01
         assert not listed[surely_missed, tile].any()

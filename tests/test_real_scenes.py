@@ -7,18 +7,18 @@ from pathlib import Path
 import pytest
 import torch
 
-from aaplug.cameras import WHITE, Camera, CameraSet
-from aaplug.evaluation import Task, evaluate
-from aaplug.gaussians import Gaussians
-from aaplug.interfaces import Training
+from aaplug.core.cameras import WHITE, Camera, CameraSet
+from aaplug.core.gaussians import Gaussians
+from aaplug.core.training import TrainingViews
+from aaplug.core.projection import project, shade
+from aaplug.core.splats import drawn
+from aaplug.evaluation.engine import Task, evaluate
+from aaplug.evaluation.results import CEILING, mean
 from aaplug.io.cameras import read_cameras
 from aaplug.io.scenes import read_scene, write_scene
-from aaplug.pipeline import learn, render
-from aaplug.projection import project, shade
+from aaplug.methods.recipes import RECIPES, find_recipe
 from aaplug.rasterizers import RASTERIZERS
-from aaplug.recipes import RECIPES, find_recipe
-from aaplug.report import CEILING, mean
-from aaplug.splats import drawn
+from aaplug.rendering.renderer import learn, render
 from tests.conftest import SAMPLE
 
 SCENES = {"chair": "chair.ply", "snowmiku": "snowmiku.ply"}
@@ -27,13 +27,13 @@ FLIPS = 1e-4  # share of pixels near a cut-off that may differ by more
 
 
 @cache
-def load(folder: Path, file: str) -> tuple[Gaussians, CameraSet, Training]:
+def load(folder: Path, file: str) -> tuple[Gaussians, CameraSet, TrainingViews]:
     scene, cameras = read_scene(folder / file), read_cameras(folder)
     return scene, cameras, learn(scene, cameras.train)
 
 
 @pytest.fixture(params=SCENES)
-def world(request, shared_data) -> tuple[Gaussians, CameraSet, Training]:
+def world(request, shared_data) -> tuple[Gaussians, CameraSet, TrainingViews]:
     return load(shared_data / request.param, SCENES[request.param])
 
 

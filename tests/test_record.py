@@ -4,9 +4,9 @@ import json
 
 import pytest
 
-from aaplug.errors import OutputError, UsageError
-from aaplug.record import Record
-from aaplug.report import Measurement
+from aaplug.core.errors import OutputError, UsageError
+from aaplug.evaluation.journal import Record
+from aaplug.evaluation.results import Measurement
 
 REQUEST = {"views": 3, "scales": [1.0, 0.1]}
 

@@ -11,11 +11,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from aaplug.cameras import Camera
-from aaplug.errors import FrameError, UsageError
-from aaplug.filters import Smoothing3D
-from aaplug.pipeline import learn
-from aaplug.sampling import check_frame, median_rates, sampling_bounds, view_information
+from aaplug.core.cameras import Camera
+from aaplug.core.errors import FrameError, UsageError
+from aaplug.core.sampling import check_frame, median_rates, sampling_bounds, view_information
+from aaplug.methods.filters import Smoothing3D
+from aaplug.rendering.renderer import learn
 from tests.conftest import make_camera, make_scene
 
 FAR = torch.tensor([5e6, -5e6, 5e6], dtype=torch.float64)
@@ -278,8 +278,8 @@ def test_the_frame_check_samples_a_large_scene_evenly():
 
 MEASURE = """
 import json, torch
-from aaplug.cameras import Camera
-from aaplug.sampling import sampling_bounds
+from aaplug.core.cameras import Camera
+from aaplug.core.sampling import sampling_bounds
 
 def peak():
     lines = open("/proc/self/status").read().splitlines()

@@ -15,8 +15,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from plyfile import PlyData
 
-from aaplug.errors import FormatError, OutputError, UsageError
-from aaplug.gaussians import (
+from aaplug.core.errors import FormatError, OutputError, UsageError
+from aaplug.core.gaussians import (
     ANTIALIASED,
     CLASSIC,
     CONVENTIONS,

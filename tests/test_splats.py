@@ -6,9 +6,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from aaplug.filters.smoothing import smooth, volume_log_factor
-from aaplug.gaussians import Gaussians, scale_opacities
-from aaplug.splats import Splats2D, drawn, half_sizes, reach, whitening
+from aaplug.core.gaussians import Gaussians, scale_opacities
+from aaplug.core.splats import Splats2D, drawn, half_sizes, reach, whitening
+from aaplug.methods.filters.smoothing import smooth, volume_log_factor
 from tests.conftest import make_scene, make_splats
 
 F64 = torch.float64
@@ -132,7 +132,7 @@ def test_a_splat_of_no_area_has_finite_gradients_when_blurred(factor):
 
 def test_alpha_is_1_255_at_the_reach():
     splats = splat(4.0, 0.0, 9.0, opacity=0.8)
-    distance = reach(splats.opacities).item()
+    distance = squared_cutoff(splats.opacities).item()
     assert 0.8 * math.exp(-distance / 2) == pytest.approx(1 / 255)
     assert half_sizes(splats)[0].tolist() == pytest.approx([2 * distance**0.5, 3 * distance**0.5])
 
@@ -141,7 +141,7 @@ def test_a_box_touches_its_ellipse_on_every_side():
     splats = splat(4.0, 2.5, 9.0, opacity=0.8)
     angle = torch.linspace(0, 2 * math.pi, 100_001, dtype=F64)
     factor = torch.linalg.cholesky(torch.tensor([[4.0, 2.5], [2.5, 9.0]], dtype=F64))
-    rim = reach(splats.opacities).sqrt() * factor @ torch.stack([angle.cos(), angle.sin()])
+    rim = squared_cutoff(splats.opacities).sqrt() * factor @ torch.stack([angle.cos(), angle.sin()])
     torch.testing.assert_close(half_sizes(splats)[0], rim.amax(dim=1), rtol=1e-8, atol=0)
 
 
@@ -156,7 +156,7 @@ def test_whitening_is_a_square_root_of_the_inverse_covariance():
 
 def test_a_splat_too_faint_to_draw_has_a_reach_below_zero_and_no_size():
     faint = splat(4.0, 0.0, 9.0, opacity=0.003)
-    assert reach(faint.opacities).item() < 0
+    assert squared_cutoff(faint.opacities).item() < 0
     assert half_sizes(faint).tolist() == [[0.0, 0.0]]
     assert half_sizes(splat(4.0, 0.0, 9.0, opacity=0.0)).tolist() == [[0.0, 0.0]]
 

@@ -9,14 +9,14 @@ import pytest
 import torch
 from aaplug_cli.main import main
 
-from aaplug.cameras import Camera
-from aaplug.conversion import FORMS, convert
-from aaplug.errors import FormatError, FrameError, UsageError
-from aaplug.filters import NYQUIST_VARIANCE
-from aaplug.gaussians import Gaussians
+from aaplug.core.cameras import Camera
+from aaplug.core.errors import FormatError, FrameError, UsageError
+from aaplug.core.gaussians import Gaussians
 from aaplug.io.scenes import open_scene, read_scene, write_parts, write_scene
-from aaplug.pipeline import learn
-from aaplug.streaming import Histogram, check_frame_of, convert_parts, survey
+from aaplug.methods.filters import NYQUIST_VARIANCE
+from aaplug.methods.viewers import FORMS, convert
+from aaplug.rendering.renderer import learn
+from aaplug.verbs.in_parts import Histogram, check_frame_of, convert_parts, survey
 from tests.conftest import make_camera, make_scene
 
 SIZE = 37  # Gaussians a part, so that the last one is not full

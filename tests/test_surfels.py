@@ -5,12 +5,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from aaplug.pipeline import learn, render, smooth
-from aaplug.projection import project, rotation_matrices, tilt
+from aaplug.core.projection import project, rotation_matrices, tilt
+from aaplug.core.splats import MIN_ALPHA, reach, whitening
+from aaplug.methods.recipes import RECIPES
 from aaplug.rasterizers import extents_of
 from aaplug.rasterizers.reference import alphas
-from aaplug.recipes import RECIPES
-from aaplug.splats import MIN_ALPHA, reach, whitening
+from aaplug.rendering.renderer import learn, render, smooth
 from tests.conftest import make_camera, make_scene
 
 F64 = torch.float64
@@ -64,7 +64,7 @@ def test_nothing_shows_outside_a_discs_reach(pixel):
     points = torch.cartesian_prod(*ticks)
     shown = alphas(splats, points, pixel) >= MIN_ALPHA
     white = torch.einsum("cij,pcj->pci", whitening(extents), points[:, None] - extents.means)
-    inside = white.square().sum(dim=2) <= reach(extents.opacities) * (1 + 1e-9)
+    inside = white.square().sum(dim=2) <= squared_cutoff(extents.opacities) * (1 + 1e-9)
     assert shown.sum() > 1000
     assert not (shown & ~inside).any()
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from aaplug.errors import OutputError, UsageError
+from aaplug.core.errors import OutputError, UsageError
 from aaplug.io.video import write_video
 from tests.test_cli import cli, dataset  # noqa: F401  (fixtures)
 from tests.test_paths import document

@@ -10,16 +10,16 @@ import cv2
 import numpy as np
 import pytest
 
-from aaplug.cameras import BLACK
-from aaplug.evaluation import Task, evaluate
-from aaplug.images import Images
+from aaplug.core.cameras import BLACK
+from aaplug.evaluation.engine import Task, evaluate
+from aaplug.evaluation.image_store import Images
+from aaplug.evaluation.metrics import CONSISTENCY, ENERGY
+from aaplug.evaluation.report.plots import plots
+from aaplug.evaluation.report.webpage import write_page
+from aaplug.inspection.coverage import coverage
 from aaplug.io.images import image_size, write_png
-from aaplug.metrics import CONSISTENCY, ENERGY
-from aaplug.nyquist import coverage
-from aaplug.pipeline import learn, render
-from aaplug.plots import plots
-from aaplug.recipes import RECIPES
-from aaplug.webpage import write_page
+from aaplug.methods.recipes import RECIPES
+from aaplug.rendering.renderer import learn, render
 from tests.conftest import make_camera, make_scene
 
 NASTY = "</script><script>alert('x')</script>&amp;$\\frac$ “r_0”"

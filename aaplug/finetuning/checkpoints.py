@@ -12,12 +12,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from aaplug.errors import FormatError, UsageError
+from aaplug.core.errors import FormatError, UsageError
+from aaplug.core.gaussians import Gaussians
+from aaplug.core.sampling import SamplingBounds
 from aaplug.finetuning.densification import Pulls
 from aaplug.finetuning.state import Job, State, optimizer
-from aaplug.gaussians import Gaussians
 from aaplug.io.atomic import replacing
-from aaplug.sampling import SamplingBounds
 
 FORMAT = "aaplug finetune 2"
 DIGEST = 16  # hex digits that tell one scene from another

@@ -6,14 +6,14 @@ from dataclasses import dataclass
 
 import torch
 
-from aaplug.cameras import Camera
+from aaplug.core.cameras import Camera
+from aaplug.core.gaussians import Gaussians
+from aaplug.evaluation.metrics import PSNR, SSIM, psnr, ssim
+from aaplug.evaluation.results import Measurement, Report
 from aaplug.finetuning.truth import Truth
-from aaplug.gaussians import Gaussians
-from aaplug.io.images import quantise
-from aaplug.metrics import PSNR, SSIM, psnr, ssim
-from aaplug.pipeline import render, smooth
-from aaplug.recipes import Recipe
-from aaplug.report import Measurement, Report
+from aaplug.io.images import quantised
+from aaplug.methods.recipes import Recipe
+from aaplug.rendering.renderer import render, smooth
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ def compare(
     for done, view in enumerate(views):
         progress(done, len(views))
         for scale in scales:
-            camera, wanted = view.scaled(scale), quantise(truth(view, scale))
+            camera, wanted = view.scaled(scale), quantised(truth(view, scale))
             for candidate, scene in zip(candidates, smoothed, strict=True):
                 started = time.perf_counter()
                 with torch.no_grad():
@@ -51,9 +51,9 @@ def compare(
                         truth.background,
                     ).rgb
                 seconds = time.perf_counter() - started
-                image = quantise(image)
+                image = quantised(image)
                 values = {PSNR.name: psnr(image, wanted), SSIM["wang"].name: ssim(image, wanted)}
-                samples = candidate.recipe.samples_at(truth.training.rate(camera))
+                samples = candidate.recipe.samples_at(truth.training.relative_rate(camera))
                 found.append(
                     Measurement(candidate.name, scale, view.name, values, samples, seconds)
                 )

@@ -12,8 +12,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from aaplug.gaussians import Gaussians
-from aaplug.splats import Splats2D
+from aaplug.core.gaussians import Gaussians
+from aaplug.core.splats import Splats2D
 
 PULL = 2e-4  # at which a Gaussian is densified (3DGS)
 SMALL = 0.01  # of the scene's extent: larger ones are split (3DGS)

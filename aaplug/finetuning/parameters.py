@@ -12,10 +12,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.cameras import Camera
-from aaplug.filters import NYQUIST_VARIANCE
-from aaplug.gaussians import Gaussians
-from aaplug.sampling import SamplingBounds
+from aaplug.core.cameras import Camera
+from aaplug.core.gaussians import Gaussians
+from aaplug.core.sampling import SamplingBounds
+from aaplug.methods.filters import NYQUIST_VARIANCE
 
 Leaves = dict[str, Tensor]
 

@@ -8,15 +8,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.cameras import Camera
+from aaplug.core.cameras import Camera
+from aaplug.core.gaussians import Gaussians
+from aaplug.core.interfaces import Rasterizer
+from aaplug.core.sampling import SamplingBounds
+from aaplug.core.training import TrainingViews
 from aaplug.finetuning.densification import Pulls
 from aaplug.finetuning.parameters import Leaves, leaves_of, scene_of
 from aaplug.finetuning.settings import Settings
 from aaplug.finetuning.truth import Truth
-from aaplug.gaussians import Gaussians
-from aaplug.interfaces import Rasterizer, Training
-from aaplug.recipes import Recipe
-from aaplug.sampling import SamplingBounds
+from aaplug.methods.recipes import Recipe
 
 EPSILON = 1e-15  # of Adam (3DGS)
 
@@ -31,7 +32,7 @@ class Job:
     """
 
     start: Gaussians
-    training: Training
+    training: TrainingViews
     recipe: Recipe
     views: Sequence[Camera]
     truth: Truth

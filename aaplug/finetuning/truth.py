@@ -12,14 +12,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.cameras import Camera
+from aaplug.core.cameras import Camera
+from aaplug.core.gaussians import Gaussians
+from aaplug.core.interfaces import Rasterizer
+from aaplug.core.training import TrainingViews
 from aaplug.finetuning.upsamplers import Upsampler, bicubic
-from aaplug.gaussians import Gaussians
-from aaplug.interfaces import Rasterizer, Training
 from aaplug.io.images import resampled
 from aaplug.io.photographs import read_photo
-from aaplug.pipeline import render, smooth
-from aaplug.recipes import RECIPES
+from aaplug.methods.recipes import RECIPES
+from aaplug.rendering.renderer import render, smooth
 
 MEMORY = 1e9  # bytes of images kept; what does not fit is made anew each time
 KEPT = torch.float16  # as finely as 11 bits tell, ten times finer than the 8 that are compared
@@ -30,7 +31,7 @@ class Truth:
     """Images to compare with, kept in memory while there is room."""
 
     scene: Gaussians
-    training: Training
+    training: TrainingViews
     rasterizer: Rasterizer
     background: tuple[float, float, float]
     photographs: bool = False

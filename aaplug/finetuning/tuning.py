@@ -13,18 +13,18 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.cameras import Camera
-from aaplug.errors import UsageError
+from aaplug.core.cameras import Camera
+from aaplug.core.errors import UsageError
+from aaplug.core.sampling import sampling_bounds
+from aaplug.core.splats import Splats2D
 from aaplug.finetuning.checkpoints import packed, unpacked
 from aaplug.finetuning.densification import Pulls, carried, densify
 from aaplug.finetuning.losses import LOSSES
 from aaplug.finetuning.parameters import Leaves, extent, leaves_of, scene_of, thinnest
 from aaplug.finetuning.settings import Settings
 from aaplug.finetuning.state import Job, State, optimizer
-from aaplug.pipeline import sampled, splats_of
 from aaplug.rasterizers import averaged
-from aaplug.sampling import sampling_bounds
-from aaplug.splats import Splats2D
+from aaplug.rendering.renderer import sampled, splats_of
 
 BOUNDS_EVERY = 100  # steps between computations of the sampling bounds (Mip-Splatting)
 MAX_LOGIT = 9.0  # of an opacity: 0.9999, where its gradient has all but gone

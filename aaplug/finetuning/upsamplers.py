@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.errors import FormatError, UsageError
+from aaplug.core.errors import FormatError, UsageError
 
 Upsampler = Callable[[Float[Tensor, "h w 3"], tuple[int, int]], Float[Tensor, "H W 3"]]
 OPENCV_NAME = re.compile(r"(edsr|espcn|fsrcnn|lapsrn).*_x(\d)\.pb", re.IGNORECASE)

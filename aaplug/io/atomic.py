@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from aaplug.errors import OutputError
+from aaplug.core.errors import OutputError
 
 TOKEN_BYTES = 8  # random bytes in a temporary file's name: 2^64 names
 

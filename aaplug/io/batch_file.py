@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from aaplug.errors import FormatError
+from aaplug.core.errors import FormatError
 from aaplug.io.values import read_bounded
 
 LIMIT = 2**20  # bytes: thousands of scenes

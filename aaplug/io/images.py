@@ -6,7 +6,6 @@ stay where the file has them, since that is what the cameras were calibrated on.
 """
 
 import logging
-import math
 import os
 import tempfile
 from collections.abc import Iterator
@@ -21,7 +20,8 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from aaplug.errors import FormatError, UsageError
+from aaplug.core.errors import FormatError
+from aaplug.core.imaging import levels
 from aaplug.io.atomic import check_output, replacing
 from aaplug.io.limits import whole_limit
 
@@ -30,7 +30,6 @@ SAMPLE_TYPES = {8: np.uint8, 16: np.uint16}  # by bit depth
 ROWS = 256  # of an image made ready to be stored, at once
 ALPHA_CHANNELS = 4  # RGB and alpha
 DAMAGE = ("Corrupt JPEG data", "Premature end of JPEG file")  # libjpeg's words for lost pixels
-WHOLE = 1e-6  # slack when a factor or a side is taken for a whole number
 STDERR = 2  # its file descriptor, to which the codecs write directly
 
 log = logging.getLogger("aaplug")
@@ -98,66 +97,10 @@ def encode_webp(rgb: Float[Tensor, "h w 3"], quality: int | None) -> bytes:
     return webp.tobytes()
 
 
-def quantise(rgb: Float[Tensor, "h w 3"], bit_depth: int = 8) -> Float[Tensor, "h w 3"]:
-    """What reading back the PNG of these colours gives."""
-    return _samples(rgb, bit_depth) / (2**bit_depth - 1)
-
-
-def downsample(rgb: Float[Tensor, "h w 3"], factor: int) -> Float[Tensor, "h2 w2 3"]:
-    """Average boxes of factor x factor px; what is left over at bottom and right is cropped.
-
-    Raises:
-        UsageError: the factor is not positive or no box fits into the image.
-    """
-    height, width, _ = rgb.shape
-    if not 1 <= factor <= min(height, width):
-        raise UsageError(
-            f"downsampling by {factor}", f"impossible for an image of {width}x{height} px"
-        )
-    rows, columns = height // factor, width // factor
-    whole = rgb[: rows * factor, : columns * factor]
-    return whole.reshape(rows, factor, columns, factor, 3).mean(dim=(1, 3))
-
-
-def resampled(
-    rgb: Float[Tensor, "h w 3"], factor: float, hw: tuple[int, int] | None = None
-) -> Float[Tensor, "h2 w2 3"]:
-    """The image with pixels `factor` times as dense: box averages below 1, bicubic above.
-
-    Exact boxes where 1/factor is whole, area-weighted ones otherwise.  What a smaller pixel grid
-    cannot hold whole is cropped at the bottom and the right; `hw` asks for that height and width.
-    """
-    hw = hw or (_whole(rgb.shape[0] * factor), _whole(rgb.shape[1] * factor))
-    if factor == 1:
-        return rgb[: hw[0], : hw[1]]
-    if factor < 1 and abs(1 / factor - round(1 / factor)) < WHOLE:
-        return downsample(rgb, round(1 / factor))[: hw[0], : hw[1]]
-    kernel = cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC
-    used = rgb[: math.ceil(hw[0] / factor - WHOLE), : math.ceil(hw[1] / factor - WHOLE)]
-    image = cv2.resize(used.cpu().numpy(), (hw[1], hw[0]), interpolation=kernel)
-    return torch.from_numpy(image)
-
-
-def stretched(rgb: Float[Tensor, "h w 3"], hw: tuple[int, int]) -> Float[Tensor, "h2 w2 3"]:
-    """The whole image in `hw` pixels: area-weighted averages where that is fewer, bicubic where it is more."""
-    kernel = cv2.INTER_AREA if hw[0] < rgb.shape[0] else cv2.INTER_CUBIC
-    return torch.from_numpy(cv2.resize(rgb.cpu().numpy(), (hw[1], hw[0]), interpolation=kernel))
-
-
-def _whole(side: float) -> int:
-    return max(1, math.floor(side + WHOLE))
-
-
 def _stored(rgb: Float[Tensor, "h w 3"], bit_depth: int) -> np.ndarray:
     """Samples as OpenCV takes them, BGR; by rows, as what comes between is several times as large as a large image."""
-    parts = (_samples(rows, bit_depth).flip(2).cpu().numpy() for rows in rgb.split(ROWS))
+    parts = (levels(rows, bit_depth).flip(2).cpu().numpy() for rows in rgb.split(ROWS))
     return np.concatenate([part.astype(SAMPLE_TYPES[bit_depth]) for part in parts])
-
-
-def _samples(rgb: Float[Tensor, "h w 3"], bit_depth: int) -> Float[Tensor, "h w 3"]:
-    assert bit_depth in SAMPLE_TYPES, bit_depth
-    assert bool(torch.isfinite(rgb).all()), "a rendered colour is NaN or infinite"
-    return (rgb.clamp(0, 1) * (2**bit_depth - 1)).round()
 
 
 def _look(path: Path) -> tuple[tuple[int, int], bool]:

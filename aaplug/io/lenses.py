@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.cameras import Camera, Lens
+from aaplug.core.cameras import Camera, Lens
 
 HALF = 0.5  # px: OpenCV's first pixel has its centre at 0
 LEAST_SHARE = 0.5  # of a side: where a photograph shows less of its pinhole, it is of no use

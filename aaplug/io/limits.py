@@ -9,7 +9,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from aaplug.errors import UsageError
+from aaplug.core.errors import UsageError
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,10 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from aaplug.cameras import Lens
-from aaplug.errors import UsageError
-from aaplug.io.images import quantise, read_image, read_rgba, resampled
+from aaplug.core.cameras import Lens
+from aaplug.core.errors import UsageError
+from aaplug.core.imaging import box_average, quantised, resampled
+from aaplug.io.images import read_image, read_rgba
 from aaplug.io.lenses import straight
 
 At = Callable[[tuple[int, int], float], Float[Tensor, "h w 3"]]
@@ -52,7 +53,7 @@ def read_photo(
     Raises:
         FormatError: see `read_image`.
     """
-    return quantise(straight(read_image(path, background), lens))
+    return quantised(straight(read_image(path, background), lens))
 
 
 def _box(path: Path, background: Background, lens: Lens | None = None) -> Photograph:
@@ -64,7 +65,7 @@ def _box(path: Path, background: Background, lens: Lens | None = None) -> Photog
 
 def _rgba_box(path: Path, background: Background, lens: Lens | None = None) -> Photograph:
     """Mip-NeRF's multi-scale Blender data: RGBA halved in float, cut to 8 bits when saved and again when composited."""
-    levels = [straight(read_rgba(path), lens)]
+    halves = [straight(read_rgba(path), lens)]
     behind = torch.tensor(background)
 
     def at(hw: tuple[int, int], factor: float) -> Float[Tensor, "h w 3"]:
@@ -73,15 +74,12 @@ def _rgba_box(path: Path, background: Background, lens: Lens | None = None) -> P
             raise UsageError(
                 "--scale", f"multi-scale Blender data is halved; {factor:g} is no power of 1/2"
             )
-        while len(levels) <= depth:
-            last = levels[-1]
-            rows, columns = (side // HALVING for side in last.shape[:2])
-            whole = last[: rows * HALVING, : columns * HALVING]
-            levels.append(whole.reshape(rows, HALVING, columns, HALVING, 4).mean(dim=(1, 3)))
-        saved = _cut(levels[depth])[: hw[0], : hw[1]]
+        while len(halves) <= depth:
+            halves.append(box_average(halves[-1], HALVING))
+        saved = _cut(halves[depth])[: hw[0], : hw[1]]
         return _cut(saved[..., :3] * saved[..., 3:] + behind * (1 - saved[..., 3:]))
 
-    height, width, _ = levels[0].shape
+    height, width, _ = halves[0].shape
     return Photograph((height, width), at)
 
 

@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.errors import FormatError
+from aaplug.core.errors import FormatError
 from aaplug.io.limits import whole_limit
 
 HEAD_LIMIT = 64 * 2**10  # bytes: enough to meet an entry's keys when a file's format is guessed

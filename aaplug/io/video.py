@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.errors import OutputError, UsageError
+from aaplug.core.errors import OutputError, UsageError
 from aaplug.io.atomic import check_output
 from aaplug.io.images import codecs_heard
 

@@ -1,14 +1,7 @@
-"""Rasterizers by name; a new one is a file here and a line below."""
+"""Rasterizers by name: `tiled`, eager or compiled, and the slow float64 `reference` that checks it."""
 
-from aaplug.interfaces import Rasterizer
-from aaplug.rasterizers.extents import SURFELS, extents_of
+from aaplug.rasterizers.choice import RASTERIZERS, find_rasterizer
 from aaplug.rasterizers.reference import Reference
-from aaplug.rasterizers.supersampled import averaged
 from aaplug.rasterizers.tiled import Tiled
 
-RASTERIZERS: dict[str, Rasterizer] = {
-    "eager": Tiled(),
-    "reference": Reference(),
-}
-
-__all__ = ["RASTERIZERS", "SURFELS", "Reference", "Tiled", "averaged", "extents_of"]
+__all__ = ["RASTERIZERS", "Reference", "Tiled", "find_rasterizer"]

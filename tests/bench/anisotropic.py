@@ -11,17 +11,18 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from aaplug.cameras import Camera
-from aaplug.filters import NYQUIST_VARIANCE, AnisotropicSmoothing, Dilation, Smoothing3D
-from aaplug.gaussians import CLASSIC, Gaussians
-from aaplug.interfaces import Rasterizer, Training
+from aaplug.core.camera_paths import moved
+from aaplug.core.cameras import Camera
+from aaplug.core.gaussians import CLASSIC, Gaussians
+from aaplug.core.interfaces import Rasterizer
+from aaplug.core.training import TrainingViews
+from aaplug.evaluation.protocols import median_depth
 from aaplug.io.cameras import read_cameras
 from aaplug.io.photographs import DOWNSCALES
 from aaplug.io.scenes import read_scene
-from aaplug.paths import moved
-from aaplug.pipeline import learn, render
-from aaplug.protocols import median_depth
-from aaplug.recipes import Recipe, find_recipe
+from aaplug.methods.filters import NYQUIST_VARIANCE, AnisotropicSmoothing, Dilation, Smoothing3D
+from aaplug.methods.recipes import Recipe, find_recipe
+from aaplug.rendering.renderer import learn, render
 from tests.bench.away import VIEWS, Scene, decibels, look_there, on_each
 from tests.conftest import SHARED_DATA
 
@@ -31,7 +32,7 @@ NEARER = (2.0, 1.4)
 AS_IT_IS = Recipe("fused", Dilation(0.0, compensated=False), "", "")
 
 
-def compared(scene: Gaussians, training: Training) -> dict[str, tuple[Gaussians, Recipe]]:
+def compared(scene: Gaussians, training: TrainingViews) -> dict[str, tuple[Gaussians, Recipe]]:
     """The scenes and how they are drawn."""
     look_of_training = Smoothing3D(CLASSIC.kernel, opacity="kept")(scene, training)
     own = AnisotropicSmoothing(CLASSIC.kernel)(scene, training)

@@ -13,19 +13,20 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from aaplug.cameras import BLACK, WHITE, Camera
-from aaplug.compiled import choose
-from aaplug.filters import RateChoice
-from aaplug.gaussians import Gaussians
-from aaplug.interfaces import Rasterizer, Training
+from aaplug.core.camera_paths import moved, zoomed
+from aaplug.core.cameras import BLACK, WHITE, Camera
+from aaplug.core.gaussians import Gaussians
+from aaplug.core.interfaces import Rasterizer
+from aaplug.core.training import TrainingViews
+from aaplug.evaluation.metrics import psnr
+from aaplug.evaluation.protocols import median_depth
 from aaplug.io.cameras import read_cameras
-from aaplug.io.images import quantise
+from aaplug.io.images import quantised
 from aaplug.io.scenes import read_scene
-from aaplug.metrics import psnr
-from aaplug.paths import moved, zoomed
-from aaplug.pipeline import learn, rate_of, render
-from aaplug.protocols import median_depth
-from aaplug.recipes import Recipe, find_recipe
+from aaplug.methods.filters import RateChoice
+from aaplug.methods.recipes import Recipe, find_recipe
+from aaplug.rasterizers.tiled.ahead_of_time import choose
+from aaplug.rendering.renderer import learn, rate_of, render
 from tests.conftest import SHARED_DATA
 
 VIEWS = 4
@@ -124,17 +125,17 @@ def measure(name: str, scene: Scene, rasterizer: Rasterizer) -> None:
 
 
 def look_there(
-    scene: Gaussians, training: Training, camera: Camera, rasterizer: Rasterizer, how: Scene
+    scene: Gaussians, training: TrainingViews, camera: Camera, rasterizer: Rasterizer, how: Scene
 ) -> torch.Tensor:
     """The look that training would have rendered there, if its pixels were as small as they were in the scene."""
     rate = rate_of(scene, replace(camera, trained_focal=None), training)
     recipe = replace(find_recipe("matched", rate="interval"), grid=max(1, math.ceil(1 / rate)))
-    return quantise(render(scene, camera, recipe, training, rasterizer, how.background).rgb)
+    return quantised(render(scene, camera, recipe, training, rasterizer, how.background).rgb)
 
 
 def decibels(image: torch.Tensor, truth: torch.Tensor) -> float:
     """PSNR of an image as it is stored; infinite where it is the truth."""
-    found = psnr(quantise(image), truth)
+    found = psnr(quantised(image), truth)
     return math.inf if found is None else found
 
 

@@ -6,17 +6,17 @@ import time
 from dataclasses import replace
 from importlib.resources import as_file, files
 
-from aaplug.cameras import WHITE
-from aaplug.compiled import choose
+from aaplug.core.cameras import WHITE
 from aaplug.finetuning import OURS, Job, Truth, advance, begin
 from aaplug.io.cameras import read_cameras
 from aaplug.io.scenes import read_scene
-from aaplug.pipeline import learn
-from aaplug.recipes import RECIPES
+from aaplug.methods.recipes import RECIPES
+from aaplug.rasterizers.tiled.ahead_of_time import choose
+from aaplug.rendering.renderer import learn
 
 
 def main(steps: int = 9) -> None:
-    with as_file(files("aaplug.sample")) as sample:
+    with as_file(files("aaplug.io.sample")) as sample:
         scene, cameras = read_scene(sample / "chair.ply"), read_cameras(sample)
     training = learn(scene, cameras.train)
     rasterizer = choose("auto", 1, print)

@@ -12,7 +12,7 @@ from pathlib import Path
 from statistics import mean, median
 from typing import Any
 
-from aaplug.report import method, scale_name
+from aaplug.evaluation.results import method, scale_name
 
 BATCH = Path(__file__).with_name("every_recipe.toml")
 HEADINGS = "| recipe | PSNR, dB | SSIM | pairs, M | s |\n|---|---|---|---|---|"

@@ -5,9 +5,9 @@ from collections.abc import Iterator
 import pytest
 import torch
 
-from aaplug.benchmark import gradient_step, synthetic_camera, synthetic_scene
-from aaplug.pipeline import learn, render
-from aaplug.recipes import find_recipe
+from aaplug.methods.recipes import find_recipe
+from aaplug.rendering.benchmark import gradient_step, synthetic_camera, synthetic_scene
+from aaplug.rendering.renderer import learn, render
 from tests.bench import take_all_threads
 from tests.conftest import ALL_RASTERIZERS
 

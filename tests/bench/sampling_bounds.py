@@ -6,7 +6,7 @@ import time
 
 import torch
 
-from aaplug.sampling import sampling_bounds
+from aaplug.core.sampling import sampling_bounds
 from tests.bench import take_all_threads
 from tests.conftest import make_camera
 

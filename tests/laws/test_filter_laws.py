@@ -10,8 +10,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from aaplug.cameras import Camera
-from aaplug.filters import (
+from aaplug.core.cameras import Camera
+from aaplug.core.gaussians import CONVENTIONS, MIP, Convention, Gaussians
+from aaplug.core.interfaces import ScreenFilter, TrainingViews, WorldFilter
+from aaplug.core.projection import project, shade
+from aaplug.core.splats import Splats2D
+from aaplug.methods.filters import (
     PIXEL_VARIANCE,
     SCREEN_FILTERS,
     WORLD_FILTERS,
@@ -20,13 +24,9 @@ from aaplug.filters import (
     MatchedEnergy,
     StoredSmoothing,
 )
-from aaplug.filters.matched import SHARPER, SHARPEST_AT
-from aaplug.gaussians import CONVENTIONS, MIP, Convention, Gaussians
-from aaplug.interfaces import ScreenFilter, Training, WorldFilter
-from aaplug.pipeline import learn
-from aaplug.projection import project, shade
+from aaplug.methods.filters.matched import SHARPER, SHARPEST_AT
 from aaplug.rasterizers.reference import rasterize
-from aaplug.splats import Splats2D
+from aaplug.rendering.renderer import learn
 from tests.conftest import make_camera, make_scene, make_splats
 
 F64 = torch.float64
@@ -43,7 +43,7 @@ SCENE = make_scene(40, dtype=F64)
 
 
 @cache
-def trained_with(convention: Convention) -> Training:
+def trained_with(convention: Convention) -> TrainingViews:
     """What is known of the training of `SCENE`, had it been trained in that convention."""
     return learn(replace(SCENE, convention=convention), CAMERAS)
 

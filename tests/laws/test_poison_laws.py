@@ -6,10 +6,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from aaplug.errors import UsageError
-from aaplug.gaussians import Gaussians
-from aaplug.pipeline import learn, render
-from aaplug.recipes import RECIPES
+from aaplug.core.errors import UsageError
+from aaplug.core.gaussians import Gaussians
+from aaplug.methods.recipes import RECIPES
+from aaplug.rendering.renderer import learn, render
 from tests.conftest import ALL_RASTERIZERS, make_camera, make_scene
 
 CAMERA = make_camera(size=(40, 30))

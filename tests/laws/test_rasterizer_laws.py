@@ -6,8 +6,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from aaplug.interfaces import Rasterizer
-from aaplug.splats import Render, Splats2D
+from aaplug.core.interfaces import Rasterizer
+from aaplug.core.splats import Render, Splats2D
 from tests.conftest import ALL_RASTERIZERS, make_splats
 
 HW = (29, 43)

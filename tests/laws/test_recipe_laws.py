@@ -7,11 +7,11 @@ from itertools import product
 import pytest
 import torch
 
-from aaplug.cameras import Camera
-from aaplug.gaussians import Gaussians
-from aaplug.paths import zoomed
-from aaplug.pipeline import learn, render, smooth
-from aaplug.recipes import RECIPES
+from aaplug.core.camera_paths import zoomed
+from aaplug.core.cameras import Camera
+from aaplug.core.gaussians import Gaussians
+from aaplug.methods.recipes import RECIPES
+from aaplug.rendering.renderer import learn, render, smooth
 from tests.conftest import make_camera, make_scene, sized
 
 # what each recipe promises of a classic scene

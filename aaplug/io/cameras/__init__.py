@@ -2,7 +2,7 @@
 
 A format is one module.  `sniff(path) -> bool` says whether a file or folder is of the format and
 never raises; `read(path, options) -> CameraSet` reads it, at the training size, in the conventions
-of `aaplug.cameras`, and raises FormatError or UsageError and nothing else.  A new format is one
+of `aaplug.core.cameras`, and raises FormatError or UsageError and nothing else.  A new format is one
 line in `FORMATS`.
 """
 
@@ -12,8 +12,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from aaplug.cameras import Camera, CameraSet
-from aaplug.errors import FormatError, UsageError, listing
+from aaplug.core.cameras import Camera, CameraSet
+from aaplug.core.errors import FormatError, UsageError, listing
 from aaplug.io.cameras import blender, camera_path, colmap, inria, llff, multiscale, pinhole
 from aaplug.io.cameras.options import Options
 

@@ -18,8 +18,8 @@ from typing import Any
 
 import torch
 
-from aaplug.cameras import WHITE, Camera, CameraSet
-from aaplug.errors import FormatError, UsageError
+from aaplug.core.cameras import WHITE, Camera, CameraSet
+from aaplug.core.errors import FormatError, UsageError
 from aaplug.io.cameras.dataparser import DATAPARSER, Dataparser, read_dataparser
 from aaplug.io.cameras.options import Options, Split, every_nth, explicit
 from aaplug.io.cameras.photos import (

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import torch
 
-from aaplug.cameras import Camera, CameraSet
-from aaplug.errors import FormatError
+from aaplug.core.cameras import Camera, CameraSet
+from aaplug.core.errors import FormatError
 from aaplug.io.cameras.options import Options, undivided
 from aaplug.io.cameras.photos import described_sizes, refuse_folder, scaled_sizes
 from aaplug.io.values import Entry, Place, entries, focal, inverse, mentions, pose, read_json

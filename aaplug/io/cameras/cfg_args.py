@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from aaplug.errors import FormatError
+from aaplug.core.errors import FormatError
 from aaplug.io.limits import whole_limit
 from aaplug.io.values import Place, number, read_bounded, text
 

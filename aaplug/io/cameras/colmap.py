@@ -16,8 +16,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.cameras import Camera, CameraSet
-from aaplug.errors import FormatError, listing
+from aaplug.core.cameras import Camera, CameraSet
+from aaplug.core.errors import FormatError, listing
 from aaplug.io.cameras.cfg_args import WIDTH_CAP
 from aaplug.io.cameras.colmap_files import KINDS, Image, Intrinsics, read_cameras, read_images
 from aaplug.io.cameras.options import LLFF_HOLD, Options, every_nth

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, TypeVar
 
-from aaplug.errors import FormatError
+from aaplug.core.errors import FormatError
 from aaplug.io.limits import whole_limit
 from aaplug.io.values import Place, text
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.errors import FormatError
+from aaplug.core.errors import FormatError
 from aaplug.io.values import Entry, Place, pose, read_json
 
 DATAPARSER = "dataparser_transforms.json"

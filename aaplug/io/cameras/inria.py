@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from aaplug.cameras import BLACK, WHITE, Camera, CameraSet
+from aaplug.core.cameras import BLACK, WHITE, Camera, CameraSet
 from aaplug.io.cameras import cfg_args
 from aaplug.io.cameras.cfg_args import WIDTH_CAP, CfgArgs, half_up, read_cfg_args
 from aaplug.io.cameras.options import LLFF_HOLD, Options, Split, every_nth, explicit

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from aaplug.cameras import Camera, CameraSet
-from aaplug.errors import FormatError
+from aaplug.core.cameras import Camera, CameraSet
+from aaplug.core.errors import FormatError
 from aaplug.io.cameras.options import LLFF_HOLD, Options, every_nth
 from aaplug.io.cameras.photos import (
     SUFFIXES,

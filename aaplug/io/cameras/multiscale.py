@@ -9,8 +9,8 @@ from pathlib import Path
 
 import torch
 
-from aaplug.cameras import WHITE, Camera, CameraSet
-from aaplug.errors import FormatError, UsageError
+from aaplug.core.cameras import WHITE, Camera, CameraSet
+from aaplug.core.errors import FormatError, UsageError
 from aaplug.io.cameras.options import Options, explicit, undivided
 from aaplug.io.cameras.photos import (
     PhotoFolder,

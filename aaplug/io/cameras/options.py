@@ -4,8 +4,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from aaplug.cameras import Camera
-from aaplug.errors import UsageError
+from aaplug.core.cameras import Camera
+from aaplug.core.errors import UsageError
 
 LLFF_HOLD = 8  # views: every 8th by name is a test view, 3DGS --eval and LLFF
 

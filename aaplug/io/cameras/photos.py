@@ -9,8 +9,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
-from aaplug.cameras import Camera
-from aaplug.errors import FormatError, UsageError, listing
+from aaplug.core.cameras import Camera
+from aaplug.core.errors import FormatError, UsageError, listing
 from aaplug.io.images import image_size
 from aaplug.io.limits import whole_limit
 from aaplug.io.values import Place

@@ -6,7 +6,7 @@ px; world_to_camera is 4×4, row by row, OpenCV axes.
 
 from pathlib import Path
 
-from aaplug.cameras import Camera, CameraSet
+from aaplug.core.cameras import Camera, CameraSet
 from aaplug.io.cameras.options import Options, every_nth
 from aaplug.io.cameras.photos import described_sizes, refuse_folder, scaled_sizes, trained_at
 from aaplug.io.values import Entry, entries, inverse, mentions, pose, read_json, rigid

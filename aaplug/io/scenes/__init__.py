@@ -11,8 +11,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal, Protocol, runtime_checkable
 
-from aaplug.errors import FormatError, OutputError, UsageError
-from aaplug.gaussians import Convention, Gaussians
+from aaplug.core.errors import FormatError, OutputError, UsageError
+from aaplug.core.gaussians import Convention, Gaussians
 from aaplug.io.atomic import check_output
 from aaplug.io.scenes import compressed_ply, ksplat, ply, pt, sog, splat, spz
 from aaplug.io.scenes.packed import half_turn_about_x

@@ -15,8 +15,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.errors import FormatError
-from aaplug.gaussians import Gaussians
+from aaplug.core.errors import FormatError
+from aaplug.core.gaussians import Gaussians
 from aaplug.io.limits import whole_limit
 from aaplug.io.scenes.packed import byte_opacities, floats, largest_last
 from aaplug.io.scenes.ply import DEGREES

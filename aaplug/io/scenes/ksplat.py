@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from aaplug.errors import FormatError
-from aaplug.gaussians import Gaussians
+from aaplug.core.errors import FormatError
+from aaplug.core.gaussians import Gaussians
 from aaplug.io.scenes.packed import byte_opacities, floats
 from aaplug.io.scenes.scene_file import SceneFile, check_count, empty, library_errors, sh_of_colour
 from aaplug.io.scenes.splat import EVIDENCE

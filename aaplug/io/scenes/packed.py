@@ -14,8 +14,8 @@ import zstandard
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.errors import FormatError
-from aaplug.gaussians import Gaussians
+from aaplug.core.errors import FormatError
+from aaplug.core.gaussians import Gaussians
 from aaplug.io.limits import limit, whole_limit
 from aaplug.io.scenes.scene_file import logit_of
 

@@ -22,8 +22,8 @@ import torch
 from plyfile import PlyData, PlyElement
 from torch import Tensor
 
-from aaplug.errors import FormatError, OutputError, listing
-from aaplug.gaussians import Gaussians, PixelSizes
+from aaplug.core.errors import FormatError, OutputError, listing
+from aaplug.core.gaussians import Gaussians, PixelSizes
 from aaplug.io.atomic import replacing
 from aaplug.io.scenes.ply_header import (
     BIG,

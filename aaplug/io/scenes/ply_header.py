@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from aaplug.errors import FormatError
+from aaplug.core.errors import FormatError
 from aaplug.io.limits import whole_limit
 
 MAX_COUNT_DIGITS = 18  # still an int64

@@ -12,8 +12,8 @@ In each kind the last one counts.  Viewers know only the tag; our record tells 0
 import re
 from dataclasses import dataclass
 
-from aaplug.errors import FormatError
-from aaplug.gaussians import ANTIALIASED, CLASSIC, CONVENTIONS, MIP, Convention, Fusion
+from aaplug.core.errors import FormatError
+from aaplug.core.gaussians import ANTIALIASED, CLASSIC, CONVENTIONS, MIP, Convention, Fusion
 from aaplug.io.scenes.ply_header import Header
 from aaplug.io.scenes.scene_file import FILTER_COLUMN
 

@@ -15,8 +15,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from aaplug.errors import FormatError
-from aaplug.gaussians import Gaussians
+from aaplug.core.errors import FormatError
+from aaplug.core.gaussians import Gaussians
 from aaplug.io.limits import whole_limit
 from aaplug.io.scenes.ply import DEGREES
 from aaplug.io.scenes.scene_file import SceneFile, check_count, library_errors

@@ -16,8 +16,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from aaplug.errors import AaplugError, FormatError, listing
-from aaplug.gaussians import (
+from aaplug.core.errors import AaplugError, FormatError, listing
+from aaplug.core.gaussians import (
     CLASSIC,
     MAX_LOG_SCALE,
     MIN_OPACITY,

@@ -22,8 +22,8 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from aaplug.errors import FormatError
-from aaplug.gaussians import ANTIALIASED, CLASSIC, MAX_LOG_SCALE, Convention, Gaussians
+from aaplug.core.errors import FormatError
+from aaplug.core.gaussians import ANTIALIASED, CLASSIC, MAX_LOG_SCALE, Convention, Gaussians
 from aaplug.io.limits import whole_limit
 from aaplug.io.scenes.packed import byte_opacities, check_growth, floats, largest_last
 from aaplug.io.scenes.scene_file import SceneFile, check_count, library_errors

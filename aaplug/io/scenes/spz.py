@@ -17,8 +17,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.errors import FormatError
-from aaplug.gaussians import ANTIALIASED, CLASSIC, Gaussians
+from aaplug.core.errors import FormatError
+from aaplug.core.gaussians import ANTIALIASED, CLASSIC, Gaussians
 from aaplug.io.scenes.packed import (
     byte_opacities,
     check_growth,

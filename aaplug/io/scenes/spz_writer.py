@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from aaplug.errors import OutputError
-from aaplug.gaussians import Gaussians
+from aaplug.core.errors import OutputError
+from aaplug.core.gaussians import Gaussians
 from aaplug.io.atomic import replacing
 from aaplug.io.scenes.packed import half_turn_about_x
 from aaplug.io.scenes.scene_file import library_errors

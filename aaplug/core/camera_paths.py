@@ -1,0 +1,71 @@
+"""Camera paths that show aliasing: zoom, dolly and orbit from one view of the data set.
+
+t runs over [0, 1).  Zoom and dolly go from `start` to `end`, both factors on how finely the scene is sampled, and back,
+evenly in octaves and slowing at both ends; an orbit goes once around.  All three join end to start.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from aaplug.core.cameras import Camera, CameraSet
+
+
+def zoomed(view: Camera, factor: float) -> Camera:
+    """The view with its focal length multiplied."""
+    return replace(view, fx=view.fx * factor, fy=view.fy * factor)
+
+
+def moved(view: Camera, factor: float, depth: float) -> Camera:
+    """A free camera, for training never was there, that has what lies at `depth` world units at depth/factor."""
+    pose = view.cam_from_world.clone()
+    pose[2, 3] += depth * (1 / factor - 1)
+    return replace(view, cam_from_world=pose, trained_focal=None)
+
+
+def zoom(view: Camera, t: float, start: float, end: float) -> Camera:
+    """The view with its focal length multiplied; pose and size stay."""
+    return zoomed(view, _factor(t, start, end))
+
+
+def dolly(view: Camera, t: float, start: float, end: float, depth: float) -> Camera:
+    """The view from farther away or nearer: what lies at `depth` world units is at depth/factor; a free camera."""
+    return moved(view, _factor(t, start, end), depth)
+
+
+def orbit(view: Camera, t: float, depth: float, up: Float[Tensor, " 3"]) -> Camera:
+    """The view turned about the axis `up` through what lies `depth` world units before it; a free camera."""
+    pivot = view.centre + depth * view.cam_from_world[2, :3]
+    turn = torch.eye(4, dtype=torch.float64)
+    turn[:3, :3] = _rotation(up, 2 * math.pi * t)
+    turn[:3, 3] = pivot - turn[:3, :3] @ pivot
+    return replace(view, cam_from_world=view.cam_from_world @ turn, trained_focal=None)
+
+
+def up_of(cameras: CameraSet) -> Float[Tensor, " 3"]:
+    """The direction that is up in the training images, on average."""
+    up = -torch.stack([camera.cam_from_world[1, :3] for camera in cameras.train]).mean(dim=0)
+    return torch.nn.functional.normalize(up, dim=0)
+
+
+def frames(path: Callable[[float], Camera], count: int) -> list[Camera]:
+    """`count` cameras along a path, named by their number."""
+    digits = len(str(count - 1))
+    return [replace(path(i / count), name=f"{i:0{digits}}") for i in range(count)]
+
+
+def _factor(t: float, start: float, end: float) -> float:
+    way = 0.5 - 0.5 * math.cos(2 * math.pi * t)
+    return start * (end / start) ** way
+
+
+def _rotation(axis: Float[Tensor, " 3"], angle: float) -> Float[Tensor, "3 3"]:
+    """Rodrigues' formula, for a unit axis."""
+    x, y, z = axis.double().tolist()
+    cross = torch.tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]], dtype=torch.float64)
+    identity = torch.eye(3, dtype=torch.float64)
+    return identity + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross

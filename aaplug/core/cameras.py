@@ -1,0 +1,139 @@
+"""Cameras: the one home of axes, pixel centres and the order of height and width.
+
+Camera frame: x right, y down, z forward (OpenCV).  Pixel (0, 0) covers [0, 1) × [0, 1); its centre is (0.5, 0.5).
+`cam_from_world` is float64, so that scenes far from the origin lose nothing before the camera's centre is subtracted.
+A set of cameras is a plain sequence: sizes and focals may differ from view to view.
+"""
+
+import math
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+WHITE = (1.0, 1.0, 1.0)
+BLACK = (0.0, 0.0, 0.0)
+WHOLE_PIXEL = 1e-6  # px: slack when a scaled size is cut to whole pixels
+
+
+@dataclass(frozen=True)
+class Lens:
+    """How a photograph differs from its camera's pinhole, by OpenCV's models.
+
+    coefficients: k1, k2, p1, p2 and more as OpenCV orders them; of a fisheye k1 to k4.  size: width and height of the
+    whole photograph, in px.  pinhole: its fx, fy, cx, cy in these px.  window: left, top, width and height of the
+    camera's view in it.
+    """
+
+    coefficients: tuple[float, ...]
+    fisheye: bool
+    size: tuple[int, int]
+    pinhole: tuple[float, float, float, float]
+    window: tuple[int, int, int, int]
+
+
+@dataclass(frozen=True)
+class Camera:
+    """One pinhole view.
+
+    fx, fy, cx, cy: in px of this size.  trained_focal: for a pose of the data set the focal length, in px, at which
+    training rendered it (or would have, for a held-out view); it stays when the view is scaled.  None for a free
+    camera.  photo: the photograph taken from here, if there is one.  lens: what it was taken through, if that distorts.
+    """
+
+    name: str
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    cam_from_world: Float[Tensor, "4 4"]
+    trained_focal: float | None = None
+    photo: Path | None = field(default=None, compare=False)
+    lens: Lens | None = field(default=None, compare=False)
+
+    @property
+    def intrinsics(self) -> tuple[float, float, float, float, int, int]:
+        """fx, fy, cx, cy, width and height, in px."""
+        return self.fx, self.fy, self.cx, self.cy, self.width, self.height
+
+    @property
+    def hw(self) -> tuple[int, int]:
+        """Height and width, in px."""
+        return self.height, self.width
+
+    @property
+    def focal(self) -> float:
+        """One focal length for both axes, in px: the geometric mean, fx itself where pixels are square."""
+        return self.fx if self.fx == self.fy else math.sqrt(self.fx * self.fy)
+
+    @property
+    def centre(self) -> Float[Tensor, " 3"]:
+        """Position in the world."""
+        return -self.cam_from_world[:3, :3].T @ self.cam_from_world[:3, 3]
+
+    def scaled(self, factor: float) -> "Camera":
+        """The same view with pixels `factor` times as dense.
+
+        Rows and columns that would be cut in part are dropped at the bottom and the right, so that scaled(1/n) sees
+        exactly what n×n box averages of the full image see.
+        """
+        width = max(1, math.floor(self.width * factor + WHOLE_PIXEL))
+        height = max(1, math.floor(self.height * factor + WHOLE_PIXEL))
+        return self._stretched(width, height, factor, factor)
+
+    def resized(self, width: int, height: int) -> "Camera":
+        """The same field of view in `width` × `height` px; pixels stop being square if the aspect changes."""
+        return self._stretched(width, height, width / self.width, height / self.height)
+
+    def as_trained(self) -> "Camera":
+        """This view, declared to be a pose of the data set at its training size."""
+        return replace(self, trained_focal=self.focal)
+
+    def _stretched(self, width: int, height: int, x: float, y: float) -> "Camera":
+        return replace(
+            self,
+            width=width,
+            height=height,
+            fx=self.fx * x,
+            fy=self.fy * y,
+            cx=self.cx * x,
+            cy=self.cy * y,
+        )
+
+
+@dataclass(frozen=True)
+class CameraSet:
+    """Cameras of a scene at their training size, and where the facts about them came from.
+
+    train: those that sampling bounds come from.  test: those held out; the same as train where there is no split.
+    background: the colour training put behind the scene, None if the files do not say.
+    notes: one line a fact worth printing (format, split, training scale and its source).
+    """
+
+    train: tuple[Camera, ...]
+    test: tuple[Camera, ...]
+    background: tuple[float, float, float] | None = None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def all(self) -> tuple[Camera, ...]:
+        """Every camera once, training views first."""
+        known = {id(camera) for camera in self.train}
+        return self.train + tuple(camera for camera in self.test if id(camera) not in known)
+
+
+def look_at(
+    eye: Float[Tensor, " 3"], target: Float[Tensor, " 3"], up: Float[Tensor, " 3"]
+) -> Float[Tensor, "4 4"]:
+    """`cam_from_world` of a camera at `eye` that sees `target` in its centre, `up` pointing up in the image."""
+    forward = torch.nn.functional.normalize((target - eye).double(), dim=0)
+    right = torch.nn.functional.normalize(torch.linalg.cross(forward, up.double()), dim=0)
+    down = torch.linalg.cross(forward, right)
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = torch.stack([right, down, forward])
+    pose[:3, 3] = -pose[:3, :3] @ eye.double()
+    return pose

@@ -1,0 +1,77 @@
+"""Culling: which splats can change an image."""
+
+import math
+from functools import cache, partial
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from aaplug.core.ellipses import squared_cutoff
+from aaplug.core.kernels import EAGER, Kernel, Kernels
+from aaplug.core.rules import RULES_3DGS, Rules, variant
+from aaplug.core.splats import Splats2D
+
+
+def cull(
+    splats: Splats2D,
+    hw: tuple[int, int],
+    margin: float = math.inf,
+    kernels: Kernels = EAGER,
+    ellipses: Splats2D | None = None,
+    rules: Rules = RULES_3DGS,
+) -> Splats2D:
+    """The splats that can change an image of height and width `hw`; a splat without area cannot.
+
+    Args:
+        splats: candidates.
+        hw: px.
+        margin: cull splats whose centre lies farther outside the image than this share of its longer side.
+        kernels: runs the test.
+        ellipses: the same splats' bounding ellipses, where a pixel kernel shows more than the splats' own.
+        rules: for the cut-off of alpha.
+    """
+    size = splats.means.new_tensor([hw[1], hw[0], margin * max(hw)])
+    of = splats if ellipses is None else ellipses
+    (inside,) = kernels.run(
+        cull_kernel(rules.min_alpha), of.means, of.covs, of.dets, of.opacities, size
+    )
+    return splats[inside]
+
+
+@cache
+def cull_kernel(min_alpha: float = RULES_3DGS.min_alpha) -> Kernel:
+    """The test for one cut-off."""
+    return Kernel(
+        "cull" + variant((min_alpha,), (RULES_3DGS.min_alpha,)),
+        partial(_inside, min_alpha),
+        _example,
+        ("m", "m", "m", "m", None),
+        gathers=True,
+    )
+
+
+def _inside(
+    min_alpha: float,
+    means: Float[Tensor, "m 2"],
+    covs: Float[Tensor, "m 3"],
+    dets: Float[Tensor, " m"],
+    opacities: Float[Tensor, " m"],
+    size: Float[Tensor, " 3"],
+) -> tuple[Tensor]:
+    *sides, band = size.unbind()
+    inside = (opacities >= min_alpha) & (dets > 0)
+    cutoff = squared_cutoff(opacities, min_alpha).clamp(min=0.0)
+    for mean, variance, side in zip(
+        means.unbind(dim=1), (covs[:, 0], covs[:, 2]), sides, strict=True
+    ):
+        half = (cutoff * variance).sqrt()
+        inside = inside & (mean + half > 0) & (mean - half < side)
+        inside = inside & (mean >= -band) & (mean <= side + band)
+    return (inside,)
+
+
+def _example() -> tuple[Tensor, ...]:
+    m = 100_000
+    means = torch.linspace(-9.0, 9.0, 2 * m).view(m, 2)
+    return means, torch.ones(m, 3), torch.ones(m), torch.ones(m), torch.tensor([4.0, 4.0, 2.0])

@@ -1,0 +1,88 @@
+"""Ellipses of screen-space Gaussians: whitening, principal axes, the cut-off, and growing by a radius.
+
+m: splats.  d: offset (dx, dy) from a splat's centre, in px.  C: its covariance, packed (xx, xy, yy), in px².
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from aaplug.core.rules import RULES_3DGS
+from aaplug.core.splats import Splats2D
+
+Columns = tuple[Tensor, Tensor, Tensor, Tensor]
+
+
+def whitening(splats: Splats2D) -> Float[Tensor, "m 2 2"]:
+    """W of each splat with |W d|² = dᵀ C⁻¹ d."""
+    return torch.stack(whitening_columns(splats.covs, splats.dets), dim=1).unflatten(1, (2, 2))
+
+
+def whitening_columns(covs: Float[Tensor, "m 3"], dets: Float[Tensor, " m"]) -> Columns:
+    """The four entries of each splat's whitening matrix.
+
+    The row with a zero follows the axis of larger variance, so the other row's slope is at most one.  With the
+    determinant given, needles keep their digits, which yy·dx² - 2xy·dx·dy + xx·dy² loses.
+    """
+    xx, xy, yy = covs.unbind(dim=1)
+    wide = xx >= yy
+    pivot = torch.where(wide, xx, yy)
+    along, across = pivot.rsqrt(), (pivot / dets).sqrt()
+    slope, zero = -xy / pivot * across, torch.zeros_like(along)
+    return (
+        torch.where(wide, slope, across),
+        torch.where(wide, across, slope),
+        torch.where(wide, along, zero),
+        torch.where(wide, zero, along),
+    )
+
+
+def principal_columns(covs: Float[Tensor, "m 3"], dets: Float[Tensor, " m"]) -> Columns:
+    """The four entries of the whitening matrix whose rows are the principal axes, the longer one first."""
+    xx, xy, yy = covs.unbind(dim=1)
+    across, along = 2 * xy, xx - yy
+    round_ = (across == 0) & (along == 0)  # a circle: any axes do, but the angle has no gradient
+    angle = 0.5 * torch.atan2(across.where(~round_, 0.0), along.where(~round_, 1.0))
+    half = 0.5 * (xx + yy)
+    root = torch.hypot(0.5 * along.where(~round_, 1.0), xy)
+    longer = half + torch.where(round_, 0.0, root)
+    wide, thin = longer.rsqrt(), (longer / dets).sqrt()
+    cos, sin = angle.cos(), angle.sin()
+    return cos * wide, sin * wide, -sin * thin, cos * thin
+
+
+def squared_cutoff(
+    opacities: Float[Tensor, " m"], min_alpha: float = RULES_3DGS.min_alpha
+) -> Float[Tensor, " m"]:
+    """Squared Mahalanobis distance at which alpha falls to `min_alpha`; negative where it never reaches it."""
+    return 2 * torch.log(opacities / min_alpha)
+
+
+def half_sizes(splats: Splats2D) -> Float[Tensor, "m 2"]:
+    """Half width and half height of the box outside of which alpha is below 3DGS's cut-off, in px."""
+    cutoff = squared_cutoff(splats.opacities).clamp(min=0.0)
+    return (cutoff[:, None] * splats.covs[:, [0, 2]]).sqrt()
+
+
+def grown(splats: Splats2D, radius: Float[Tensor, " m"], min_alpha: float) -> Splats2D:
+    """Splats whose cut-off ellipses contain everything within `radius` px of the given ones.
+
+    For any e, (1 + e) C + (1 + 1/e) (r²/R) I contains the Minkowski sum of an ellipse (covariance C, squared cut-off R)
+    and a disc of radius r.
+    """
+    cutoff = squared_cutoff(splats.opacities, min_alpha)
+    cutoff = cutoff.clamp(min=torch.finfo(splats.means.dtype).tiny)
+    trace = splats.covs[:, 0] + splats.covs[:, 2]
+    share = radius / (0.5 * cutoff * trace).sqrt()
+    added = (1 + 1 / share) * radius**2 / cutoff
+    diagonal = splats.covs.new_tensor([1.0, 0.0, 1.0])
+    scale = 1 + share
+    return Splats2D(
+        means=splats.means,
+        covs=scale[:, None] * splats.covs + added[:, None] * diagonal,
+        dets=scale * scale * splats.dets + scale * added * trace + added * added,
+        depths=splats.depths,
+        opacities=splats.opacities,
+        sources=splats.sources,
+        rgb=splats.rgb,
+    )

@@ -1,0 +1,185 @@
+"""The scene: 3D Gaussians exactly as their file stores them.
+
+n: Gaussians; k: spherical-harmonics coefficients a channel, (degree + 1)^2.  Stored values are kept as they are
+(log-scales, opacity logits, quaternions of any length), so that reading and writing loses nothing; what a renderer
+needs (scales, opacities, unit quaternions) are properties.  Lengths are in world units.
+"""
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from aaplug.core.rules import RULES_3DGS, Rules
+
+MAX_LOG_SCALE = 30.0  # |ln s| beyond this overflows float32 once squared; values are clamped on use
+MIN_OPACITY = 1e-7  # keeps the logit finite in float32 (3DGS stores logits)
+
+
+@dataclass(frozen=True)
+class Convention:
+    """How training turned a projected covariance into pixels.
+
+    kernel: variance added to the covariance's diagonal, in px² of the training image.
+    compensated: whether opacity was then multiplied by √(det C / det(C + kernel·I)).
+    rules: of compositing.
+    """
+
+    name: str
+    kernel: float
+    compensated: bool
+    rules: Rules = RULES_3DGS
+
+
+CLASSIC = Convention("classic", 0.3, compensated=False)  # 3DGS (Kerbl et al. 2023)
+ANTIALIASED = Convention(
+    "antialiased", 0.3, compensated=True
+)  # 3DGS --antialiasing, gsplat "antialiased"
+MIP = Convention("mip", 0.1, compensated=True)  # Mip-Splatting (Yu et al. 2024), arXiv 2311.16493
+CONVENTIONS = {c.name: c for c in (CLASSIC, ANTIALIASED, MIP)}
+
+
+@dataclass(frozen=True)
+class Fusion:
+    """A record of what has been fused into the stored scales and opacities, written to and read from the file."""
+
+    method: str
+    settings: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Origin:
+    """The file a scene came from, with all of it that is not a Gaussian's parameter.
+
+    document: what the format's writer needs to give everything back (column order, unknown columns, comments).
+    rows: index in the document of each Gaussian.
+    """
+
+    path: str
+    format: str
+    evidence: str
+    document: Any
+    rows: Int[Tensor, " n"]
+
+
+@dataclass(frozen=True)
+class PixelSizes:
+    """In which sizes training drew each Gaussian, as Multi-Scale 3DGS (Yan et al. 2024) stores them.
+
+    smallest, largest: px of an image, at the level that the Gaussian belongs to; 0 and less where unknown.
+    base: it belongs to the coarsest level.
+    """
+
+    smallest: Float[Tensor, " n"]
+    largest: Float[Tensor, " n"]
+    base: Bool[Tensor, " n"]
+
+    def __getitem__(self, index: Tensor | slice) -> "PixelSizes":
+        """The sizes at `index`, in that order."""
+        return PixelSizes(self.smallest[index], self.largest[index], self.base[index])
+
+    def to(self, target: torch.dtype | torch.device) -> "PixelSizes":
+        """The same sizes in another precision or on another device."""
+        base = self.base if isinstance(target, torch.dtype) else self.base.to(target)
+        return PixelSizes(self.smallest.to(target), self.largest.to(target), base)
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """n Gaussians and how they were trained.
+
+    flat: these are 2D Gaussians (2DGS, Huang et al. 2024), discs across the third axis.  Their file has two
+    scales; the third log-scale here is −MAX_LOG_SCALE, no thickness, so that a renderer needs no special case.
+    """
+
+    means: Float[Tensor, "n 3"]
+    quats: Float[Tensor, "n 4"]  # wxyz, of any length but zero
+    log_scales: Float[Tensor, "n 3"]
+    logit_opacities: Float[Tensor, " n"]
+    sh: Float[Tensor, "n k 3"]
+    convention: Convention = CLASSIC
+    filter_3d: Float[Tensor, " n"] | None = (
+        None  # standard deviation, stored beside the scales and not yet fused
+    )
+    fused: tuple[Fusion, ...] = ()
+    origin: Origin | None = None
+    flat: bool = False
+    pixel_sizes: PixelSizes | None = None
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    @property
+    def name(self) -> str:
+        """For messages: the file it came from, or "scene"."""
+        return self.origin.path if self.origin else "scene"
+
+    @property
+    def scales(self) -> Float[Tensor, "n 3"]:
+        """Standard deviations along the Gaussian's own axes."""
+        return self.log_scales.clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE).exp()
+
+    @property
+    def opacities(self) -> Float[Tensor, " n"]:
+        """Opacity at the centre, in [0, 1]."""
+        return self.logit_opacities.sigmoid()
+
+    @property
+    def unit_quats(self) -> Float[Tensor, "n 4"]:
+        """Quaternions of length one, wxyz."""
+        return torch.nn.functional.normalize(self.quats, dim=-1)
+
+    @property
+    def sh_degree(self) -> int:
+        """Degree of the spherical harmonics, 0 to 4."""
+        return round(self.sh.shape[1] ** 0.5) - 1
+
+    def __getitem__(self, index: Tensor | slice) -> "Gaussians":
+        """The Gaussians at `index` (a mask, indices or a slice), in that order."""
+        kept = (
+            index.cpu() if isinstance(index, Tensor) else index
+        )  # the file's rows stay on the CPU
+        origin = self.origin and replace(self.origin, rows=self.origin.rows[kept])
+        return replace(
+            self,
+            means=self.means[index],
+            quats=self.quats[index],
+            log_scales=self.log_scales[index],
+            logit_opacities=self.logit_opacities[index],
+            sh=self.sh[index],
+            filter_3d=None if self.filter_3d is None else self.filter_3d[index],
+            pixel_sizes=None if self.pixel_sizes is None else self.pixel_sizes[index],
+            origin=origin,
+        )
+
+    def to(self, target: torch.dtype | torch.device) -> "Gaussians":
+        """The same Gaussians in another precision or on another device."""
+        return replace(
+            self,
+            means=self.means.to(target),
+            quats=self.quats.to(target),
+            log_scales=self.log_scales.to(target),
+            logit_opacities=self.logit_opacities.to(target),
+            sh=self.sh.to(target),
+            filter_3d=None if self.filter_3d is None else self.filter_3d.to(target),
+            pixel_sizes=None if self.pixel_sizes is None else self.pixel_sizes.to(target),
+        )
+
+
+def scale_opacities(
+    logit_opacities: Float[Tensor, " n"],
+    log_factor: Float[Tensor, " n"],
+    max_opacity: float = 1 - MIN_OPACITY,
+) -> Float[Tensor, " n"]:
+    """Logits of o·c from the logits of o and ln c: exact where o is near 0 or 1, the identity where c = 1.
+
+    With L = ln o + ln c the logit of e^L is L − ln(1 − e^L).  Where c ≠ 1 the opacity is held in
+    [MIN_OPACITY, max_opacity].
+    """
+    log_opacity = torch.nn.functional.logsigmoid(logit_opacities) + log_factor
+    log_opacity = log_opacity.clamp(math.log(MIN_OPACITY), math.log(max_opacity))
+    logits = log_opacity - torch.log(-torch.expm1(log_opacity))
+    return torch.where(log_factor == 0, logit_opacities, logits)

@@ -1,0 +1,87 @@
+"""Images as arrays: compositing over a background, resampling, and rounding to stored bits.
+
+Images are [h, w, 3] in [0, 1].  A `factor` is the density of the new pixels against the old ones.
+"""
+
+import math
+
+import cv2
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from aaplug.core.errors import UsageError
+from aaplug.core.splats import Render
+
+WHOLE = 1e-6  # slack before a size or a factor counts as fractional
+
+
+def over(
+    rgb: Float[Tensor, "h w 3"], alpha: Float[Tensor, "h w"], background: tuple[float, float, float]
+) -> Render:
+    """Composite premultiplied colours over a background."""
+    if not any(background):  # black adds nothing
+        return Render(rgb, alpha)
+    return Render(torch.addcmul(rgb, (1 - alpha)[..., None], rgb.new_tensor(background)), alpha)
+
+
+def average_samples(render: Render, n: int) -> Render:
+    """Average n x n samples per pixel; both sides must be multiples of n."""
+    if n == 1:
+        return render
+    return Render(box_average(render.rgb, n), box_average(render.alpha[..., None], n)[..., 0])
+
+
+def box_average(image: Float[Tensor, "h w c"], n: int) -> Float[Tensor, "H W c"]:
+    """Mean of each box of n x n px; a partial box at the bottom or the right is cropped."""
+    rows, columns = (side // n for side in image.shape[:2])
+    whole = image[: rows * n, : columns * n]
+    return whole.unflatten(1, (columns, n)).unflatten(0, (rows, n)).mean(dim=(1, 3))
+
+
+def resampled(
+    rgb: Float[Tensor, "h w 3"], factor: float, hw: tuple[int, int] | None = None
+) -> Float[Tensor, "h2 w2 3"]:
+    """Resample by `factor`: box averages below 1, bicubic above.
+
+    Boxes are exact where 1/factor is whole, else area-weighted.  A partial pixel at the bottom or the right is
+    cropped; `hw` asks for that height and width.
+
+    Raises:
+        UsageError: no box fits into the image.
+    """
+    height, width, _ = rgb.shape
+    hw = hw or (_whole(height * factor), _whole(width * factor))
+    if factor == 1:
+        return rgb[: hw[0], : hw[1]]
+    if factor < 1 and abs(1 / factor - round(1 / factor)) < WHOLE:
+        box = round(1 / factor)
+        if box > min(height, width):
+            raise UsageError("scale", f"{factor:g} leaves no pixel of a {width}x{height} image")
+        return box_average(rgb, box)[: hw[0], : hw[1]]
+    used = rgb[: math.ceil(hw[0] / factor - WHOLE), : math.ceil(hw[1] / factor - WHOLE)]
+    return _resized(used, hw, cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC)
+
+
+def stretched(rgb: Float[Tensor, "h w 3"], hw: tuple[int, int]) -> Float[Tensor, "h2 w2 3"]:
+    """Resize the whole image to `hw`: area-weighted averages to fewer rows, bicubic to more."""
+    return _resized(rgb, hw, cv2.INTER_AREA if hw[0] < rgb.shape[0] else cv2.INTER_CUBIC)
+
+
+def quantised(rgb: Float[Tensor, "h w 3"], bit_depth: int = 8) -> Float[Tensor, "h w 3"]:
+    """What reading back a PNG of these colours gives."""
+    return levels(rgb, bit_depth) / (2**bit_depth - 1)
+
+
+def levels(rgb: Float[Tensor, "h w 3"], bit_depth: int) -> Float[Tensor, "h w 3"]:
+    """Clamp to [0, 1] and round to whole levels, 0 to 2^bit_depth - 1."""
+    assert bool(torch.isfinite(rgb).all()), "a rendered colour is NaN or infinite"
+    return (rgb.clamp(0, 1) * (2**bit_depth - 1)).round()
+
+
+def _resized(rgb: Tensor, hw: tuple[int, int], kernel: int) -> Tensor:
+    return torch.from_numpy(cv2.resize(rgb.cpu().numpy(), (hw[1], hw[0]), interpolation=kernel))
+
+
+def _whole(side: float) -> int:
+    return max(1, math.floor(side + WHOLE))

@@ -1,0 +1,94 @@
+"""Kernels: the elementwise stages of a frame, one source that runs in two ways.
+
+A kernel is a function of tensors.  Run eagerly it is plain array code, for any device, precision and gradient;
+`rasterizers.tiled.ahead_of_time` compiles the same source into one fused loop.  A stage asks its `Kernels` to run it.
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+BACKWARD = "-backward"  # suffix of the name of a kernel's gradient kernel
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """One stage.
+
+    function: tensors in, a tuple of tensors out; what it updates in place must be contiguous.
+    example: makes the arguments to compile for, as large as real work: inductor decides by them which loops use threads.
+    sizes: per argument the name of its leading size, None where that is fixed; sizes of one name are equal.
+    gathers: the kernel gathers scattered rows.  Inductor would leave the loop scalar; set this where arithmetic
+        outweighs the gathers.
+    pulls_back: the function computes gradients itself, so it is traced before it is compiled.
+    evaluations: splat-pixel evaluations of one call, per pixel of a tile; 0 for kernels that do not composite.
+    """
+
+    name: str
+    function: Callable[..., tuple[Tensor, ...]]
+    example: Callable[[], tuple[Tensor, ...]]
+    sizes: tuple[str | None, ...]
+    gathers: bool = False
+    pulls_back: bool = False
+    evaluations: int = 0
+
+
+def backward_of(kernel: Kernel, results: tuple[str, ...]) -> Kernel:
+    """The kernel for the gradient of each floating point argument of a kernel without side effects.
+
+    It takes the arguments, then the gradients of the results, whose leading sizes are named in `results`.
+    """
+    count = len(kernel.sizes)
+
+    def function(*args: Tensor) -> tuple[Tensor, ...]:
+        inputs, grads = args[:count], args[count:]
+        moving = [i for i, arg in enumerate(inputs) if arg.is_floating_point()]
+
+        def of(*values: Tensor) -> tuple[Tensor, ...]:
+            filled = list(inputs)
+            for i, value in zip(moving, values, strict=True):
+                filled[i] = value
+            return kernel.function(*filled)
+
+        pull = torch.func.vjp(of, *(inputs[i] for i in moving))[1]
+        return tuple(pull(grads))
+
+    def example() -> tuple[Tensor, ...]:
+        args = kernel.example()
+        found = kernel.function(*args)
+        return *args, *(torch.linspace(-1.0, 1.0, x.numel()).to(x).view_as(x) for x in found)
+
+    sizes = (*kernel.sizes, *results)
+    name = kernel.name + BACKWARD
+    return Kernel(name, function, example, sizes, kernel.gathers, pulls_back=True)
+
+
+class Kernels:
+    """Runs kernels eagerly.
+
+    name: as shown to the user.  tiles: how many tiles one compositing call takes, so that its buffers fit the cache.
+    """
+
+    name = "eager"
+    tiles = 1024
+
+    def run(self, kernel: Kernel, *args: Tensor) -> tuple[Tensor, ...]:
+        """Run one stage."""
+        return kernel.function(*args)
+
+
+EAGER = Kernels()
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Limit torch to one thread inside the block."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

@@ -1,0 +1,21 @@
+"""What a long call tells while it runs."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+Tell = Callable[[int, int], None]  # (done, in all)
+
+
+class Monitor:
+    """Receives messages and progress; this one ignores them.  The command line prints them."""
+
+    def say(self, text: str) -> None:
+        """One line of log."""
+
+    @contextmanager
+    def progress(self, what: str, unit: str) -> Iterator[Tell]:
+        """Begin a task, such as ("rendering", "views"); the function it yields takes (done, in all)."""
+        yield lambda done, total: None
+
+
+SILENT = Monitor()

@@ -1,0 +1,234 @@
+"""From Gaussians and one camera to splats: EWA projection and spherical-harmonics colour.
+
+n: Gaussians of the scene, m: those in front of the near plane.  The covariance of a splat is M Mᵀ with the 2×3 factor
+M = J W R S (Zwicker et al., "EWA splatting", 2002; 3DGS, eq. 5), and its determinant |a × b|² comes from M's rows a
+and b, where nothing cancels.  The camera's centre is subtracted in float64; the rest runs in the scene's precision.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from functools import cache, partial, reduce
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from aaplug.core.cameras import Camera
+from aaplug.core.gaussians import MAX_LOG_SCALE, Gaussians
+from aaplug.core.kernels import EAGER, Kernel, Kernels, backward_of
+from aaplug.core.rules import NEAR, RULES_3DGS, Rules, variant
+from aaplug.core.spherical_harmonics import sh_colour
+from aaplug.core.splats import Splats2D
+
+JACOBIAN_MARGIN = 0.3  # of half the image at depth 1: 3DGS linearises no farther out (1.3 tan(fov/2) when centred)
+MAX_SIGMA = 1e9  # px: larger splats look the same, and their determinant would overflow float32
+MIN_FACING = (
+    1e-6  # of depth: a disc seen at a flatter angle is a line, and its slope would overflow
+)
+SHADED_AT_ONCE = 1 << 16  # Gaussians
+
+
+def project(
+    scene: Gaussians, camera: Camera, kernels: Kernels = EAGER, rules: Rules = RULES_3DGS
+) -> Splats2D:
+    """Splats of every Gaussian beyond the near plane, without colour and before any screen filter."""
+    columns = kernels.run(
+        project_kernel(rules.near),
+        *(scene.means, scene.quats, scene.log_scales),
+        *_camera_rows(scene.means, camera),
+    )
+    means, covs, dets, depths = columns
+    splats = Splats2D(
+        means, covs, dets, depths, scene.opacities, torch.arange(len(scene), device=means.device)
+    )
+    in_front = depths > rules.near
+    return splats if in_front.all() else splats[in_front]
+
+
+def with_depth_slopes(splats: Splats2D, scene: Gaussians, camera: Camera) -> Splats2D:
+    """Add the depth slopes of discs: each Gaussian is taken for the disc across its thinnest axis.
+
+    A ray meets the plane through c with normal N at the inverse depth N·ray / N·c, which is linear in the pixel.
+    """
+    rotation = camera.cam_from_world[:3, :3].to(scene.means)
+    thinnest = scene.log_scales.argmin(dim=1).index_select(0, splats.sources)
+    axes = rotation_matrices(scene.unit_quats.index_select(0, splats.sources))
+    normals = axes.gather(2, thinnest[:, None, None].expand(-1, 3, 1)).squeeze(2) @ rotation.T
+    offset = scene.means.index_select(0, splats.sources).double() - camera.centre.to(
+        scene.means.device
+    )
+    facing = (normals * (offset.to(scene.means) @ rotation.T)).sum(dim=1)
+    edge_on = facing.abs() < MIN_FACING * splats.depths
+    facing = torch.where(edge_on, MIN_FACING * splats.depths, facing)
+    focal = normals.new_tensor([camera.fx, camera.fy])
+    return replace(splats, depth_slopes=-(splats.depths / facing)[:, None] * normals[:, :2] / focal)
+
+
+def shade(splats: Splats2D, scene: Gaussians, camera: Camera, kernels: Kernels = EAGER) -> Splats2D:
+    """Add each splat's colour as seen from the camera: SH plus mid-grey, clamped below at black (3DGS)."""
+    centre = camera.centre.to(scene.means.device)
+    kernel = SHADE.get(scene.sh.shape[1])
+    shaded = []
+    for sources in _shaded_together(splats.sources, scene):
+        args = (scene.sh, scene.means, sources, centre)
+        shaded += _shade(*args) if kernel is None else kernels.run(kernel, *args)
+    return replace(splats, rgb=shaded[0] if len(shaded) == 1 else torch.cat(shaded))
+
+
+def _shaded_together(sources: Int[Tensor, " m"], scene: Gaussians) -> Sequence[Int[Tensor, " k"]]:
+    """Chunks that fit the cache; one chunk with gradients, because each chunk's gradient is as large as the scene."""
+    tracked = scene.sh.requires_grad or scene.means.requires_grad
+    return [sources] if tracked and torch.is_grad_enabled() else sources.split(SHADED_AT_ONCE)
+
+
+def _shade(
+    sh: Float[Tensor, "n k 3"],
+    means: Float[Tensor, "n 3"],
+    sources: Int[Tensor, " m"],
+    centre: Float[Tensor, " 3"],
+) -> tuple[Tensor]:
+    offset = (_picked(means, sources).double() - centre).to(means)
+    directions = offset / offset.square().sum(dim=1, keepdim=True).sqrt()
+    return (sh_colour(_picked(sh, sources), directions).clamp(min=0.0),)
+
+
+def _picked(x: Float[Tensor, "n *c"], rows: Int[Tensor, " m"]) -> Float[Tensor, "m *c"]:
+    """Select rows, each at most once."""
+    return _Picked.apply(x, rows)  # pyright: ignore[reportReturnType]
+
+
+class _Picked(torch.autograd.Function):
+    """Copies gradients to their rows; `index_select` would add them atomically, although no row repeats."""
+
+    @staticmethod
+    def forward(x: Tensor, rows: Tensor) -> Tensor:
+        return x.index_select(0, rows)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
+        x, rows = inputs
+        ctx.save_for_backward(rows)
+        ctx.shape = x.shape
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None]:
+        (rows,) = ctx.saved_tensors
+        return grads[0].new_zeros(ctx.shape).index_copy(0, rows, grads[0]), None
+
+
+def _camera_rows(
+    like: Tensor, camera: Camera
+) -> tuple[Float[Tensor, " 3"], Float[Tensor, "3 3"], Float[Tensor, " 8"]]:
+    """Centre (float64), rotation, and fx, fy, cx, cy with the slopes between which the projection is linearised."""
+    x, y = slope_limits(camera)
+    lens = like.new_tensor([camera.fx, camera.fy, camera.cx, camera.cy, *x, *y])
+    rotation = camera.cam_from_world[:3, :3].to(like)
+    return camera.centre.to(like.device), rotation, lens
+
+
+def slope_limits(camera: Camera) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Least and greatest x/z, and y/z, at which the projection is linearised; beyond, it is as at these."""
+    limits = []
+    for centre, focal, side in (
+        (camera.cx, camera.fx, camera.width),
+        (camera.cy, camera.fy, camera.height),
+    ):
+        margin = JACOBIAN_MARGIN * 0.5 * side / focal
+        limits.append((-centre / focal - margin, (side - centre) / focal + margin))
+    return limits[0], limits[1]
+
+
+def _project(
+    near: float,
+    means: Float[Tensor, "n 3"],
+    quats: Float[Tensor, "n 4"],
+    log_scales: Float[Tensor, "n 3"],
+    centre: Float[Tensor, " 3"],
+    rotation: Float[Tensor, "3 3"],
+    lens: Float[Tensor, " 8"],
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Mean, packed covariance, determinant and depth of each Gaussian, written out in columns so that it fuses."""
+    local = (means.double() - centre).to(means).unbind(dim=1)
+    fx, fy, cx, cy, left, right, top, bottom = lens.unbind()
+    world = [row.unbind() for row in rotation.unbind()]
+    x, y, z = (sum_of(r * p for r, p in zip(row, local, strict=True)) for row in world)
+    ahead = z.clamp(
+        min=near
+    )  # nearer ones are dropped later; here they must not overflow into gradients
+    slope_x, slope_y = x / ahead, y / ahead
+    # J W: the rows of the projection's derivative in the world's axes, its direction held inside the widened image
+    held_x = torch.minimum(torch.maximum(slope_x, left), right)
+    held_y = torch.minimum(torch.maximum(slope_y, top), bottom)
+    across = [fx / ahead * (i - held_x * k) for i, k in zip(world[0], world[2], strict=True)]
+    down = [fy / ahead * (j - held_y * k) for j, k in zip(world[1], world[2], strict=True)]
+    lengths = log_scales.clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE).exp().unbind(dim=1)
+    quats = quats / quats.square().sum(dim=1, keepdim=True).sqrt()
+    axes = zip(*rotation_rows(quats), strict=True)
+    a, b = [], []
+    for axis, length in zip(axes, lengths, strict=True):
+        for factor, row in ((a, across), (b, down)):
+            along = sum_of(p * q for p, q in zip(row, axis, strict=True)) * length
+            factor.append(along.clamp(-MAX_SIGMA, MAX_SIGMA))
+    covs = [sum_of(p * q for p, q in zip(*pair, strict=True)) for pair in ((a, a), (a, b), (b, b))]
+    normal = [a[i - 2] * b[i - 1] - a[i - 1] * b[i - 2] for i in range(3)]
+    dets = sum_of(side * side for side in normal)
+    centres = [fx * slope_x + cx, fy * slope_y + cy]
+    return torch.stack(centres, dim=1), torch.stack(covs, dim=1), dets, z
+
+
+def sum_of(terms: Iterable[Tensor]) -> Tensor:
+    """Sum from left to right."""
+    return reduce(torch.add, terms)
+
+
+def rotation_rows(quats: Float[Tensor, "n 4"]) -> list[list[Tensor]]:
+    """Rows of the rotation matrices of unit quaternions wxyz."""
+    w, x, y, z = quats.unbind(dim=-1)
+    return [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+
+
+def rotation_matrices(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
+    """Rotation matrices of unit quaternions wxyz."""
+    return torch.stack([torch.stack(row, dim=-1) for row in rotation_rows(quats)], dim=-2)
+
+
+EXAMPLE_SIZE = (
+    100_000  # as large as real work: the compiler decides by it which loops run in threads
+)
+
+
+def _shade_example(coefficients: int) -> tuple[Tensor, ...]:
+    sh = torch.linspace(-1.0, 1.0, EXAMPLE_SIZE * coefficients * 3)
+    means = torch.linspace(1.0, 2.0, EXAMPLE_SIZE * 3).view(-1, 3)
+    sources = torch.arange(0, EXAMPLE_SIZE, 2)
+    return sh.view(-1, coefficients, 3), means, sources, torch.zeros(3, dtype=torch.float64)
+
+
+def _project_example() -> tuple[Tensor, ...]:
+    draw = torch.Generator().manual_seed(0)
+    means, log_scales = torch.rand(2, EXAMPLE_SIZE, 3, generator=draw).unbind()
+    quats = torch.randn(EXAMPLE_SIZE, 4, generator=draw)
+    centre = torch.tensor([0.5, 0.5, -2.0], dtype=torch.float64)
+    lens = torch.tensor([90.0, 90.0, 40.0, 40.0, -0.5, 0.5, -0.5, 0.5])
+    return means, quats, log_scales - 4, centre, torch.eye(3), lens
+
+
+@cache
+def project_kernel(near: float = NEAR) -> Kernel:
+    """Projection for one near plane."""
+    sizes = ("n", "n", "n", None, None, None)
+    name, function = "project" + variant((near,), (NEAR,)), partial(_project, near)
+    return Kernel(name, function, _project_example, sizes, gathers=True)
+
+
+PROJECT_BACKWARD = backward_of(project_kernel(), ("n", "n", "n", "n"))
+SHADE = {  # by coefficients per channel
+    k: Kernel(f"shade-{k}", _shade, partial(_shade_example, k), ("n", "n", "m", None))
+    for k in (4, 9, 16)
+}
+SHADE_BACKWARD = {k: backward_of(kernel, ("m",)) for k, kernel in SHADE.items()}

@@ -1,0 +1,76 @@
+"""The rules of compositing: alpha's cap and cut-off, when a pixel stops, and the near plane.
+
+They belong to training: a scene looks right when it is composited as it was trained.
+"""
+
+from dataclasses import dataclass, field
+
+import torch
+
+from aaplug.core.errors import UsageError
+
+NEAR = 0.2  # world units of depth: nearer Gaussians are neither drawn nor counted as seen (3DGS)
+SMALLEST_CUTOFF = 1 / 500  # the compiled exp2 is a polynomial that ends at 2^-9
+
+
+@dataclass(frozen=True)
+class Rules:
+    """How splats become pixels.  Values are rounded to float32, as renderers hold them.
+
+    max_alpha: cap of one splat's alpha at a pixel.
+    min_alpha: a smaller alpha is skipped.
+    min_transmittance: a pixel stops before the splat that would bring its transmittance below this.
+    near: world units; only what lies deeper is drawn.
+
+    Raises:
+        UsageError: a value is outside of its range.
+    """
+
+    # 3DGS (Kerbl et al. 2023).  In float32 (1 - 0.99)^2 is just below 1e-4, so two splats at the cap end a pixel.
+    max_alpha: float = 0.99
+    min_alpha: float = 1 / 255
+    min_transmittance: float = 1e-4
+    near: float = NEAR
+    # derived once, because kernels are traced and must not create tensors
+    below_min_alpha: float = field(init=False, repr=False, compare=False)
+    log2_min_alpha: float = field(init=False, repr=False, compare=False)
+    below_min_transmittance: float = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        if not (
+            SMALLEST_CUTOFF <= self.min_alpha < self.max_alpha < 1
+            and 0 < self.min_transmittance < 1
+            and self.near > 0
+        ):
+            raise UsageError(
+                "rules",
+                f"expected {SMALLEST_CUTOFF:g} <= min_alpha < max_alpha < 1, 0 < min_transmittance < 1 and near > 0, "
+                f"got {self}",
+            )
+        for name in ("max_alpha", "min_transmittance"):
+            object.__setattr__(self, name, torch.tensor(getattr(self, name)).item())
+        object.__setattr__(self, "below_min_alpha", just_below(self.min_alpha))
+        object.__setattr__(self, "log2_min_alpha", torch.tensor(self.min_alpha).log2().item())
+        object.__setattr__(self, "below_min_transmittance", just_below(self.min_transmittance))
+
+    @property
+    def tag(self) -> str:
+        """Suffix of a compositing kernel's name, empty for 3DGS's rules: a kernel is compiled for one set of rules."""
+        return variant(
+            (self.max_alpha, self.min_alpha, self.min_transmittance),
+            (RULES_3DGS.max_alpha, RULES_3DGS.min_alpha, RULES_3DGS.min_transmittance),
+        )
+
+
+def variant(values: tuple[float, ...], defaults: tuple[float, ...]) -> str:
+    """Suffix of a kernel's name for the constants built into it; empty for the defaults."""
+    return "" if values == defaults else "".join(f"-{value:.7g}" for value in values)
+
+
+def just_below(value: float) -> float:
+    """The float32 below a positive value: `torch.threshold` keeps what is above its bound, so also `value` itself."""
+    return torch.nextafter(torch.tensor(value), torch.tensor(0.0)).item()
+
+
+RULES_3DGS = Rules()
+RULES_GSPLAT = Rules(max_alpha=0.999)

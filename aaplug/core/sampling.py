@@ -1,0 +1,175 @@
+"""How finely a camera set samples each Gaussian: the Nyquist bounds that every filter starts from.
+
+n: Gaussians, v: cameras.  A camera of focal length f px samples a Gaussian at depth z (along the optical axis) with
+f / z pixels per world unit.  A camera sees a Gaussian when the depth is above `NEAR` and the projected centre lies in
+the image widened by `MARGIN` of its size on every side (Mip-Splatting, arXiv 2311.16493, section 5.1 and its
+published constants).  Rates pair each camera's own focal with its own depth, as the paper's equation 7 does.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from aaplug.core.cameras import Camera
+from aaplug.core.errors import FrameError, UsageError
+from aaplug.core.rules import NEAR
+
+MARGIN = 0.15  # of the image's side; equals 3DGS's clamp of the Jacobian at 1.3 tan(fov/2)
+CHUNK_PAIRS = 4_000_000  # Gaussian-camera pairs held at once: about 150 MB
+MIN_SEEN_SHARE = 0.5  # fewer Gaussians seen than this: scene and cameras are taken for strangers
+FRAME_CHECK_GAUSSIANS = 50_000  # an even sample this large decides the frame check
+
+
+@dataclass(frozen=True)
+class SamplingBounds:
+    """What filters learn about a camera set; all zero for a Gaussian that no camera sees.
+
+    highest, lowest: sampling rates over the cameras that see the Gaussian, in px per world unit.
+    nearest: least depth in them, in world units.
+    views: how many cameras see it.
+    """
+
+    highest: Float[Tensor, " n"]
+    lowest: Float[Tensor, " n"]
+    nearest: Float[Tensor, " n"]
+    views: Int[Tensor, " n"]
+
+    @property
+    def seen(self) -> Bool[Tensor, " n"]:
+        """Whether any camera sees the Gaussian."""
+        return self.views > 0
+
+    @property
+    def highest_or_coarsest(self) -> Float[Tensor, " n"]:
+        """Highest rates, with the coarsest one found standing in for Gaussians never seen (Mip-Splatting's rule).
+
+        Raises:
+            FrameError: no camera sees any Gaussian.
+        """
+        if len(self.views) and not self.seen.any():
+            raise FrameError(
+                "sampling bounds", "no camera sees any Gaussian: there is no rate to filter by"
+            )
+        coarsest = self.highest[self.seen].min()
+        return torch.where(self.seen, self.highest, coarsest)
+
+
+def sampling_bounds(
+    means: Float[Tensor, "n 3"], cameras: Sequence[Camera], chunk_pairs: int = CHUNK_PAIRS
+) -> SamplingBounds:
+    """Highest and lowest sampling rate of each Gaussian over the cameras that see it (Mip-Splatting, eq. 7).
+
+    Memory beyond the result and one float64 copy of the means is bounded by `chunk_pairs`.
+
+    Raises:
+        UsageError: there are no cameras.
+    """
+    n = len(means)
+    highest, lowest, nearest = (means.new_zeros(n) for _ in range(3))
+    focals = means.new_tensor([camera.focal for camera in cameras])
+    views = torch.zeros(n, dtype=torch.int32, device=means.device)
+    for part, rates in _rates_in_chunks(means, cameras, chunk_pairs):
+        seen = rates > 0
+        views[part] = seen.sum(dim=1, dtype=torch.int32)
+        highest[part] = rates.amax(dim=1)
+        nearest[part] = focals[0] / highest[part]
+        if (focals != focals[0]).any():
+            nearest[part] = (focals / rates).amin(dim=1)
+        lowest[part] = rates.masked_fill_(~seen, torch.inf).amin(dim=1)
+    lowest[views == 0] = nearest[views == 0] = 0
+    return SamplingBounds(highest, lowest, nearest, views)
+
+
+def median_rates(
+    means: Float[Tensor, "n 3"], cameras: Sequence[Camera], chunk_pairs: int = CHUNK_PAIRS
+) -> Float[Tensor, " n"]:
+    """Median sampling rate of each Gaussian over the cameras that see it, in px per world unit; 0 where none does."""
+    median = means.new_zeros(len(means))
+    for part, rates in _rates_in_chunks(means, cameras, chunk_pairs):
+        middle = rates.masked_fill_(rates == 0, torch.nan).nanmedian(dim=1).values
+        median[part] = middle.nan_to_num(0.0)
+    return median
+
+
+def view_information(
+    means: Float[Tensor, "n 3"], cameras: Sequence[Camera], chunk_pairs: int = CHUNK_PAIRS
+) -> Float[Tensor, "n 3 3"]:
+    """What the cameras that see each Gaussian tell of every direction: Σ ν² (I − d dᵀ), in px² per world unit².
+
+    A camera samples with its rate ν across its ray d and not at all along it; 0 where no camera sees the Gaussian.
+
+    Raises:
+        UsageError: there are no cameras.
+    """
+    origin = _middle(cameras)
+    eyes = torch.stack([camera.centre - origin for camera in cameras]).to(means)
+    information = means.new_zeros(len(means), 3, 3)
+    for part, rates in _rates_in_chunks(means, cameras, chunk_pairs):
+        local = (means[part].double() - origin).to(means)
+        rays = torch.nn.functional.normalize(local[:, None] - eyes, dim=2) * rates[:, :, None]
+        total = rates.square().sum(dim=1)[:, None, None] * torch.eye(3).to(means)
+        information[part] = total - rays.mT @ rays
+    return information
+
+
+def check_frame(
+    means: Float[Tensor, "n 3"],
+    cameras: Sequence[Camera],
+    scene_name: str,
+    min_share: float = MIN_SEEN_SHARE,
+) -> float:
+    """Return the share of Gaussians seen by any camera, judged on an even sample of the scene.
+
+    Raises:
+        FrameError: the share is under `min_share`, so the two are likely to live in different frames.
+    """
+    if len(means) == 0:
+        return 1.0
+    sample = means[:: max(1, len(means) // FRAME_CHECK_GAUSSIANS)]
+    share = sampling_bounds(sample, cameras).seen.double().mean().item()
+    if share < min_share:
+        raise FrameError(
+            scene_name,
+            f"only {share:.1%} of its Gaussians are seen by any of the {len(cameras)} cameras (expected at least "
+            f"{min_share:.0%}): scene and cameras are in different frames. nerfstudio scenes need the transform of "
+            "dataparser_transforms.json, gsplat scenes were normalised unless trained with normalize_world_space "
+            "off; if the cameras are right all the same, lower --min-seen",
+        )
+    return share
+
+
+def _rates_in_chunks(
+    means: Float[Tensor, "n 3"], cameras: Sequence[Camera], chunk_pairs: int
+) -> Iterator[tuple[slice, Float[Tensor, "c v"]]]:
+    """Yield (part of the Gaussians, its rates in every camera); a rate of 0 stands for "not seen".
+
+    The cameras' mean position is subtracted in float64 first, so that scenes far from the origin keep their digits.
+    """
+    origin = _middle(cameras)
+    poses = torch.stack([camera.cam_from_world for camera in cameras])
+    offset = poses[:, :3, 3] + poses[:, :3, :3] @ origin
+    rotation, offset = poses[:, :3, :3].to(means), offset.to(means)
+    intrinsics = [[c.fx, c.fy, c.cx, c.cy, c.width, c.height, c.focal] for c in cameras]
+    fx, fy, cx, cy, width, height, focal = means.new_tensor(intrinsics).T
+    step = max(1, chunk_pairs // len(cameras))
+    for start in range(0, len(means), step):
+        part = slice(start, min(start + step, len(means)))
+        local = (means[part].double() - origin).to(means)
+        x, y, z = (torch.addmm(offset[:, i], local, rotation[:, i].T) for i in range(3))
+        seen = (z > NEAR) & _inside(x.div_(z).mul_(fx).add_(cx), width)
+        seen &= _inside(y.div_(z).mul_(fy).add_(cy), height)
+        yield part, torch.where(seen, focal / z, 0.0)
+
+
+def _middle(cameras: Sequence[Camera]) -> Float[Tensor, " 3"]:
+    """The cameras' mean position."""
+    if not cameras:
+        raise UsageError("cameras", "there are none, and sampling bounds need at least one")
+    return torch.stack([camera.centre for camera in cameras]).mean(dim=0)
+
+
+def _inside(position: Float[Tensor, "c v"], side: Float[Tensor, " v"]) -> Bool[Tensor, "c v"]:
+    return (position >= -MARGIN * side) & (position <= side + MARGIN * side)

@@ -1,0 +1,118 @@
+"""Screen-space Gaussians (splats) and rendered images.
+
+m: splats of one view.  Pixel (0, 0) covers [0, 1) × [0, 1); its centre is (0.5, 0.5).  Covariances are packed
+(xx, xy, yy), in px².  The determinant is stored beside the covariance: computed in float32 as xx·yy - xy² it has no
+correct digit for a needle, computed from the factors of the projection it has all of them.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+MIN_COMPENSATION = (
+    0.005  # floor of the opacity factor, so that rounding erases no splat (3DGS, gsplat)
+)
+
+
+@dataclass(frozen=True)
+class Splats2D:
+    """Splats of one view, in no particular order.
+
+    window: px.  For a pixel kernel that averages alpha, the side of the square it averages over; for a disc kernel, the
+        size of training's pixel, which sets its screen-space low-pass filter.
+    depth_slopes: for discs, the relative decrease of inverse depth per px to the right and per px down.
+    """
+
+    means: Float[Tensor, "m 2"]
+    covs: Float[Tensor, "m 3"]  # xx, xy, yy in px²
+    dets: Float[Tensor, " m"]  # px⁴
+    depths: Float[Tensor, " m"]  # world units
+    opacities: Float[Tensor, " m"]
+    sources: Int[Tensor, " m"]  # index in the scene
+    rgb: Float[Tensor, "m 3"] | None = None
+    depth_slopes: Float[Tensor, "m 2"] | None = None
+    window: float = 1.0
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    def __getitem__(self, index: Tensor | slice) -> "Splats2D":
+        """The splats at `index` (a mask, indices or a slice), in that order."""
+        if isinstance(index, Tensor) and index.dtype == torch.bool:
+            index = index.nonzero().squeeze(1)
+
+        def at(column: Tensor) -> Tensor:  # index_select is several times faster than [index]
+            return column[index] if isinstance(index, slice) else column.index_select(0, index)
+
+        return self._with({name: at(column) for name, column in self._columns().items()})
+
+    def to(self, dtype: torch.dtype) -> "Splats2D":
+        """The same splats in another precision."""
+        columns = self._columns()
+        return self._with({n: c.to(dtype) for n, c in columns.items() if c.is_floating_point()})
+
+    def blurred(
+        self,
+        variance: float | Float[Tensor, " m"],
+        compensate: bool,
+        floor: float = MIN_COMPENSATION,
+    ) -> "Splats2D":
+        """Convolve with an isotropic Gaussian of `variance` px².
+
+        det(C + vI) = det C + v·tr C + v², a sum of non-negative terms.  With `compensate`, opacity is multiplied by
+        √(det C / det(C + vI)), at least `floor`, which preserves the splat's energy (EWA splatting, Zwicker et al.
+        2002; Mip-Splatting, eq. 10).
+        """
+        trace = self.covs[:, 0] + self.covs[:, 2]
+        dets = self.dets + variance * trace + variance * variance
+        diagonal = self.covs.new_tensor([1.0, 0.0, 1.0])
+        added = variance[:, None] if isinstance(variance, Tensor) else variance
+        return self._widened(self.covs + added * diagonal, dets, compensate, floor)
+
+    def convolved(
+        self, added: Float[Tensor, "m 3"], compensate: bool, floor: float = MIN_COMPENSATION
+    ) -> "Splats2D":
+        """Convolve with a Gaussian of any covariance, packed, in px²."""
+        a, b, c = added.unbind(dim=1)
+        xx, xy, yy = self.covs.unbind(dim=1)
+        dets = self.dets + (a * c - b * b) + (xx * c + yy * a - 2 * xy * b).clamp(min=0.0)
+        return self._widened(self.covs + added, dets, compensate, floor)
+
+    def _widened(
+        self, covs: Float[Tensor, "m 3"], dets: Float[Tensor, " m"], compensate: bool, floor: float
+    ) -> "Splats2D":
+        opacities = self.opacities
+        if compensate:
+            opacities = opacities * (self.dets / dets).clamp(min=floor * floor).sqrt()
+        return replace(self, covs=covs, dets=dets, opacities=opacities)
+
+    def _columns(self) -> dict[str, Tensor]:
+        """Every per-splat tensor that is present."""
+        return {name: value for name, value in vars(self).items() if isinstance(value, Tensor)}
+
+    def _with(self, columns: dict[str, Tensor]) -> "Splats2D":
+        return Splats2D(**(vars(self) | columns))
+
+
+def concatenated(parts: Sequence[Splats2D]) -> Splats2D:
+    """The splats of several parts as one; every part has the same columns."""
+    first, *rest = parts
+    if not rest:
+        return first
+    names = [name for name, value in vars(first).items() if isinstance(value, Tensor)]
+    columns = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
+    return Splats2D(**(vars(first) | columns))
+
+
+class Render(NamedTuple):
+    """An image.
+
+    rgb: composited over its background, not clamped to 1.  alpha: the share of the background that is hidden.
+    """
+
+    rgb: Float[Tensor, "h w 3"]
+    alpha: Float[Tensor, "h w"]

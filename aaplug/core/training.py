@@ -1,0 +1,50 @@
+"""What is known at test time about training: how it drew, and how finely its cameras sampled the scene."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from statistics import median
+
+from aaplug.core.cameras import Camera, CameraSet
+from aaplug.core.gaussians import Convention, Gaussians
+from aaplug.core.sampling import SamplingBounds, sampling_bounds
+
+
+@dataclass(frozen=True)
+class TrainingViews:
+    """The training cameras of one scene and what they tell about each Gaussian.
+
+    convention: how training turned covariances into pixels.
+    cameras: at the training size.
+    bounds: highest and lowest sampling rate of each Gaussian.
+    cull_margin: share of an image's longer side; training drew no Gaussian whose centre lay farther outside the image.
+        3DGS and gsplat draw them all (infinite); a scene trained with such a margin is hazy when they are drawn.
+    """
+
+    convention: Convention
+    cameras: Sequence[Camera]
+    bounds: SamplingBounds
+    cull_margin: float = math.inf
+
+    @classmethod
+    def of(
+        cls,
+        scene: Gaussians,
+        cameras: CameraSet | Sequence[Camera],
+        cull_margin: float = math.inf,
+    ) -> "TrainingViews":
+        """Compute the sampling bounds of a scene.
+
+        Raises:
+            UsageError: there are no cameras.
+        """
+        views = cameras.train if isinstance(cameras, CameraSet) else tuple(cameras)
+        return cls(scene.convention, views, sampling_bounds(scene.means, views), cull_margin)
+
+    def relative_rate(self, camera: Camera) -> float:
+        """Sampling rate of a view against training: 1 at the training size, 1/2 at half of it.
+
+        A free camera is compared with the training cameras' median focal length.
+        """
+        trained = camera.trained_focal or median(c.focal for c in self.cameras)
+        return camera.focal / trained

@@ -1,0 +1,1 @@
+"""Measuring images against a truth: protocols, metrics, the engine, its journal and its reports."""

@@ -1,0 +1,129 @@
+"""LPIPS (Zhang et al. 2018, version 0.1) from weights that the user has: a trunk and the linear heads on it.
+
+The trunk is torchvision's VGG16 or AlexNet as a state dict (vgg16-397923af.pth, alexnet-owt-7be5be79.pth), the heads
+are the `lpips` package's (weights/v0.1/vgg.pth, alex.pth).  Neither is shipped here.  The net expects colours in
+[−1, 1]; 3DGS's scripts feed it [0, 1], and published tables inherit that, so it is a flavour of its own.
+"""
+
+import pickle
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import conv2d, max_pool2d, relu
+
+from aaplug.core.errors import FormatError
+from aaplug.evaluation.metrics import LPIPS, LpipsFlavour, Metric
+
+SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)  # of ImageNet in [−1, 1] (LPIPS)
+UNIT = 1e-10  # added to a feature's length before it is divided by it (LPIPS)
+LEAST_SIDE = 32  # px: smaller images leave nothing after five stages
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Convolutions by their number in torchvision's `features`, each (number, stride, padding), after a pooling."""
+
+    convolutions: tuple[tuple[int, int, int], ...]
+    pool: tuple[int, int] | None = None  # window and stride, in px
+
+
+NETS = {
+    "vgg": tuple(
+        Stage(tuple((number, 1, 1) for number in numbers), (2, 2) if stage else None)
+        for stage, numbers in enumerate(((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28)))
+    ),
+    "alex": (
+        Stage(((0, 4, 2),)),
+        Stage(((3, 1, 2),), (3, 2)),
+        Stage(((6, 1, 1),), (3, 2)),
+        Stage(((8, 1, 1),)),
+        Stage(((10, 1, 1),)),
+    ),
+}
+WORDS: dict[LpipsFlavour, str] = {
+    "3dgs": "3dgs: version 0.1, VGG16 fed [0, 1] as 3DGS's scripts do",
+    "vgg": "vgg: version 0.1, VGG16 fed [−1, 1]",
+    "alex": "alex: version 0.1, AlexNet fed [−1, 1]",
+}
+
+
+def lpips_metric(flavour: LpipsFlavour, trunk: Path, heads: Path) -> Metric:
+    """LPIPS as a metric, with its weights in memory.
+
+    Raises:
+        FormatError: a file is not the weights of this net.
+    """
+    net = NETS["alex" if flavour == "alex" else "vgg"]
+    weights = _trunk(trunk, net)
+    linear = _heads(heads, [weights[stage.convolutions[-1][0]][0].shape[0] for stage in net])
+    distance = _distance(net, weights, linear, from_unit=flavour == "3dgs")
+    return Metric(LPIPS.name, LPIPS.unit, LPIPS.ideal, LPIPS.digits, WORDS[flavour], distance)
+
+
+def _distance(
+    net: tuple[Stage, ...],
+    weights: dict[int, tuple[Tensor, Tensor]],
+    heads: list[Tensor],
+    from_unit: bool,
+) -> Callable[[Float[Tensor, "h w 3"], Float[Tensor, "h w 3"]], float | None]:
+    def features(image: Float[Tensor, "h w 3"]) -> list[Tensor]:
+        x = image.float() if from_unit else 2 * image.float() - 1
+        x = ((x - x.new_tensor(SHIFT)) / x.new_tensor(SCALE)).permute(2, 0, 1)[None]
+        found = []
+        for stage in net:
+            x = max_pool2d(x, *stage.pool) if stage.pool else x
+            for number, stride, padding in stage.convolutions:
+                x = relu(conv2d(x, *weights[number], stride=stride, padding=padding))
+            found.append(x / (x.square().sum(dim=1, keepdim=True).sqrt() + UNIT))
+        return found
+
+    @torch.no_grad()
+    def measure(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> float | None:
+        if min(image.shape[:2]) < LEAST_SIDE:
+            return None
+        pairs = zip(features(image), features(truth), heads, strict=True)
+        return float(sum(conv2d((a - b).square(), head).mean() for a, b, head in pairs))
+
+    return measure
+
+
+def _trunk(path: Path, net: tuple[Stage, ...]) -> dict[int, tuple[Tensor, Tensor]]:
+    state, weights, channels = _state(path), {}, 3
+    for number in (number for stage in net for number, _, _ in stage.convolutions):
+        weight, bias = (state.get(f"features.{number}.{part}") for part in ("weight", "bias"))
+        if weight is None or bias is None or weight.dim() != 4 or weight.shape[1] != channels:
+            raise FormatError(
+                path,
+                f"holds no features.{number} for {channels} channels; give torchvision's weights",
+            )
+        weights[number], channels = (weight.float(), bias.float()), weight.shape[0]
+    return weights
+
+
+def _heads(path: Path, channels: list[int]) -> list[Tensor]:
+    state, heads = _state(path), []
+    for number, count in enumerate(channels):
+        head = state.get(f"lin{number}.model.1.weight")
+        if head is None or head.shape != (1, count, 1, 1):
+            raise FormatError(
+                path, f"holds no lin{number} of {count} channels; give the lpips package's weights"
+            )
+        heads.append(head.float())
+    return heads
+
+
+def _state(path: Path) -> dict[str, Tensor]:
+    """A state dict, read without running anything that the file says."""
+    if not path.is_file():
+        raise FormatError(path, "there is no such file")
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except (RuntimeError, OSError, EOFError, ValueError, KeyError, pickle.UnpicklingError) as error:
+        raise FormatError(path, "is no file of torch weights") from error
+    if not isinstance(state, dict):
+        raise FormatError(path, "should hold a state dict")
+    return {key: value for key, value in state.items() if isinstance(value, Tensor)}

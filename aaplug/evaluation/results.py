@@ -1,0 +1,218 @@
+"""What an evaluation found, as data, and its printed forms: table, results.json, per_view.json, results.csv."""
+
+import csv
+import io
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any
+
+from rich.markup import escape
+from rich.table import Table
+
+from aaplug.evaluation.metrics import METRICS, PSNR, SSIM, Metric
+
+CEILING = "training size, resampled"  # the row that every table holds
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """One recipe at one scale on one view; values by metric, None where undefined (`note` says why).
+
+    samples: along a pixel's side.  pairs: of a splat and a pixel that compositing evaluated, None where not counted.
+    """
+
+    recipe: str
+    scale: float
+    view: str
+    values: Mapping[str, float | None]
+    samples: int
+    seconds: float
+    note: str = ""
+    pairs: int | None = None
+
+
+@dataclass(frozen=True)
+class Report:
+    """Measurements and the protocol that gives them meaning (JSON-ready)."""
+
+    measurements: tuple[Measurement, ...]
+    protocol: Mapping[str, Any]
+
+    @property
+    def metrics(self) -> tuple[Metric, ...]:
+        """What was measured, in order."""
+        names = dict.fromkeys(name for m in self.measurements for name in m.values)
+        return tuple(METRICS[name] for name in names) or (PSNR, SSIM["wang"])
+
+    @property
+    def recipes(self) -> tuple[str, ...]:
+        """Recipes in the order of measurement."""
+        return tuple(dict.fromkeys(m.recipe for m in self.measurements))
+
+    @property
+    def scales(self) -> tuple[float, ...]:
+        """Scales in the order of measurement."""
+        return tuple(dict.fromkeys(m.scale for m in self.measurements))
+
+    def select(self, recipe: str, scale: float) -> tuple[Measurement, ...]:
+        """Measurements of every view."""
+        return tuple(m for m in self.measurements if m.recipe == recipe and m.scale == scale)
+
+    def with_more(self, other: "Report") -> "Report":
+        """Measurements by the same protocol together."""
+        recipes = {**self.protocol["recipes"], **other.protocol["recipes"]}
+        return Report(self.measurements + other.measurements, {**self.protocol, "recipes": recipes})
+
+
+def mean(measurements: Iterable[Measurement], metric: str) -> float | None:
+    """Mean over the views where the metric is defined, None if it is nowhere."""
+    return _mean([value for m in measurements if (value := m.values.get(metric)) is not None])
+
+
+def scale_name(scale: float) -> str:
+    """How people write a scale: 1/4, 1, 2×, 0.3."""
+    if scale > 1:
+        return f"{scale:g}×"
+    fraction = Fraction(scale).limit_denominator(64)
+    exact = fraction.numerator == 1 and float(fraction) == scale
+    return str(fraction) if exact else f"{scale:g}"
+
+
+def tables(report: Report) -> list[Table]:
+    """A table a metric, one of seconds and one of pairs a view, recipes down and scales across; the best is bold."""
+    what = f"{report.protocol['truth']}, {report.protocol['views']} views"
+    grids = []
+    for metric in report.metrics:
+        variant = report.protocol.get("metrics", {}).get(metric.name, "").partition(":")
+        flavour = f" {variant[0]}" if variant[1] and " " not in variant[0] else ""
+        unit = f" [{metric.unit}]" if metric.unit else ""
+        grid = _grid(f"{metric.name}{flavour}{unit}, {what}", report)
+        for recipe, row in zip(report.recipes, rows(report, metric), strict=True):
+            cells = [f"[bold]{text}[/]" if best else text for text, best in row]
+            grid.add_row(recipe, *cells, style="italic" if recipe == CEILING else None)
+        grids.append(grid)
+    for title, lines in work(report):
+        grid = _grid(title, report)
+        for recipe, cells in zip(report.recipes, lines, strict=True):
+            grid.add_row(recipe, *cells)
+        grids.append(grid)
+    return grids
+
+
+def rows(report: Report, metric: Metric) -> list[list[tuple[str, bool]]]:
+    """A metric's table, recipes down and scales across: each mean as text, and whether it is the column's best."""
+    best = [_best(report, metric, scale) for scale in report.scales]
+    return [
+        [
+            (
+                _figure(value, metric.digits),
+                value is not None and value == top and recipe != CEILING,
+            )
+            for scale, top in zip(report.scales, best, strict=True)
+            for value in [mean(report.select(recipe, scale), metric.name)]
+        ]
+        for recipe in report.recipes
+    ]
+
+
+def work(report: Report) -> list[tuple[str, list[list[str]]]]:
+    """Tables of what a view costs, recipes down and scales across, as (title, lines)."""
+    columns = [("seconds a view", seconds, 3)]
+    if any(m.pairs is not None for m in report.measurements):
+        columns.append(("million pairs a view", million_pairs, 2))
+    return [
+        (
+            title,
+            [
+                [_figure(column(report, recipe, scale), digits) for scale in report.scales]
+                for recipe in report.recipes
+            ],
+        )
+        for title, column, digits in columns
+    ]
+
+
+def results(report: Report) -> dict[str, Any]:
+    """INRIA's results.json, {method: {metric: mean}} with methods named recipe@scale, and our protocol beside it."""
+    methods = {
+        method(recipe, scale): {
+            m.name: mean(report.select(recipe, scale), m.name) for m in report.metrics
+        }
+        for recipe in report.recipes
+        for scale in report.scales
+    }
+    return methods | {"_aaplug": dict(report.protocol) | {"notes": _notes(report)}}
+
+
+def per_view(report: Report) -> dict[str, Any]:
+    """INRIA's per_view.json, {method: {metric: {view: value}}}, with samples a pixel's side, seconds and pairs."""
+    methods: dict[str, Any] = {}
+    for recipe in report.recipes:
+        for scale in report.scales:
+            views = report.select(recipe, scale)
+            columns: dict[str, Any] = {
+                m.name: {v.view: v.values.get(m.name) for v in views} for m in report.metrics
+            }
+            columns["samples"] = {v.view: v.samples for v in views}
+            columns["seconds"] = {v.view: round(v.seconds, 4) for v in views}
+            columns["pairs"] = {v.view: v.pairs for v in views}
+            methods[method(recipe, scale)] = columns
+    return methods | {"_aaplug": dict(report.protocol) | {"notes": _notes(report)}}
+
+
+def as_csv(reports: Mapping[str, Report]) -> str:
+    """A line a measurement, of all scenes by name; empty where undefined."""
+    metrics = list(dict.fromkeys(m.name for report in reports.values() for m in report.metrics))
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    fixed = ("samples", "pairs", "seconds", "note")
+    table.writerow(["scene", "protocol", "recipe", "scale", "view", *metrics, *fixed])
+    for scene, report in reports.items():
+        name = report.protocol.get("protocol", {}).get("name", "")
+        for m in report.measurements:
+            values = [m.values.get(metric) for metric in metrics]
+            extra = (m.samples, m.pairs, round(m.seconds, 4), m.note)
+            table.writerow([scene, name, m.recipe, f"{m.scale:g}", m.view, *values, *extra])
+    return text.getvalue()
+
+
+def method(recipe: str, scale: float) -> str:
+    """The name of a recipe at a scale, where INRIA's files name a method."""
+    return f"{recipe}@{scale:g}"
+
+
+def seconds(report: Report, recipe: str, scale: float) -> float | None:
+    """Mean rendering time of a view."""
+    return _mean([m.seconds for m in report.select(recipe, scale)])
+
+
+def million_pairs(report: Report, recipe: str, scale: float) -> float | None:
+    """Mean number of splat and pixel pairs that compositing evaluated in a view, in millions; None if not counted."""
+    pairs = [m.pairs / 1e6 for m in report.select(recipe, scale) if m.pairs is not None]
+    return _mean(pairs)
+
+
+def _mean(values: list[float]) -> float | None:
+    return sum(values) / len(values) if values else None
+
+
+def _figure(value: float | None, digits: int) -> str:
+    return "–" if value is None else f"{value:.{digits}f}"
+
+
+def _notes(report: Report) -> list[str]:
+    return list(dict.fromkeys(m.note for m in report.measurements if m.note))
+
+
+def _best(report: Report, metric: Metric, scale: float) -> float | None:
+    values = [mean(report.select(r, scale), metric.name) for r in report.recipes if r != CEILING]
+    return min((value for value in values if value is not None), key=metric.loss, default=None)
+
+
+def _grid(title: str, report: Report) -> Table:
+    grid = Table(title=escape(title), title_justify="left")
+    grid.add_column("recipe", no_wrap=True)
+    for scale in report.scales:
+        grid.add_column(scale_name(scale), justify="right", no_wrap=True)
+    return grid

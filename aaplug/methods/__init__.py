@@ -1,0 +1,1 @@
+"""Anti-aliasing methods: filters, pixel kernels, compositors, and the recipes that combine them."""

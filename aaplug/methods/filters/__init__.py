@@ -1,0 +1,75 @@
+"""World filters, screen filters and selections by name.  A new one is a file here and a line below."""
+
+from aaplug.core.interfaces import ScreenFilter, Selection, WorldFilter
+from aaplug.core.registry import Registry
+from aaplug.methods.filters.adaptive import ADAPTIVE_VARIANCE, Adaptive
+from aaplug.methods.filters.dilation import Dilation
+from aaplug.methods.filters.energy import MATCHED_VARIANCE, MatchedEnergy
+from aaplug.methods.filters.low_pass import LowPass
+from aaplug.methods.filters.matched import PIXEL_VARIANCE, Matched, RateReference
+from aaplug.methods.filters.pixel_size import ByPixelSize
+from aaplug.methods.filters.smoothing import (
+    NYQUIST_VARIANCE,
+    AnisotropicSmoothing,
+    FlatSmoothing,
+    Smoothing3D,
+    StoredSmoothing,
+    fuse_stored,
+)
+
+WORLD_FILTERS: Registry[WorldFilter] = Registry(
+    "world filter",
+    {
+        "smoothing3d": Smoothing3D(),
+        "smoothing3d-largest-focal": Smoothing3D(focal="largest"),
+        "smoothing3d-balanced": Smoothing3D(opacity="balanced"),
+        "smoothing3d-anisotropic": AnisotropicSmoothing(),
+        "flat": FlatSmoothing(),
+        "stored": StoredSmoothing(),
+        "matched-energy": MatchedEnergy(),
+    },
+    check=lambda value: isinstance(value, WorldFilter),
+)
+
+SCREEN_FILTERS: Registry[ScreenFilter] = Registry(
+    "screen filter",
+    {
+        "classic": Dilation(0.3, compensated=False),
+        "ewa": Dilation(0.3, compensated=True),
+        "mip": Dilation(0.1, compensated=True),
+        "none": Dilation(0.0, compensated=False),
+        "aaa": Adaptive(),
+        "sa-gs": Matched("global", pixel_variance=0.0),
+        "matched": Matched(),
+        "matched-global": Matched("global"),
+        "matched-sharpest": Matched("sharpest"),
+        "matched-interval": Matched("interval"),
+    },
+    check=lambda value: isinstance(value, ScreenFilter),
+)
+
+SELECTIONS: Registry[Selection] = Registry(
+    "selection", {"pixel-size": ByPixelSize()}, check=lambda value: isinstance(value, Selection)
+)
+
+__all__ = [
+    "ADAPTIVE_VARIANCE",
+    "MATCHED_VARIANCE",
+    "NYQUIST_VARIANCE",
+    "PIXEL_VARIANCE",
+    "SCREEN_FILTERS",
+    "SELECTIONS",
+    "WORLD_FILTERS",
+    "Adaptive",
+    "AnisotropicSmoothing",
+    "ByPixelSize",
+    "Dilation",
+    "FlatSmoothing",
+    "LowPass",
+    "Matched",
+    "MatchedEnergy",
+    "RateReference",
+    "Smoothing3D",
+    "StoredSmoothing",
+    "fuse_stored",
+]

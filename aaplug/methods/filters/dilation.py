@@ -1,0 +1,23 @@
+"""Dilation by a constant: what 3DGS, its --antialiasing, gsplat and Mip-Splatting do to every projected covariance."""
+
+from dataclasses import dataclass
+
+from aaplug.core.cameras import Camera
+from aaplug.core.splats import Splats2D
+from aaplug.core.training import TrainingViews
+
+
+@dataclass(frozen=True)
+class Dilation:
+    """Add `variance` px² to the covariance, whatever the rate; with `compensated`, keep the splat's energy.
+
+    0.3 uncompensated is 3DGS (Kerbl et al. 2023); 0.3 compensated is EWA splatting as in 3DGS --antialiasing and
+    gsplat "antialiased"; 0.1 compensated is the 2D Mip filter (Mip-Splatting, eq. 10).
+    """
+
+    variance: float
+    compensated: bool
+
+    def __call__(self, splats: Splats2D, camera: Camera, training: TrainingViews) -> Splats2D:
+        """Filter the splats of one view."""
+        return splats.blurred(self.variance, self.compensated)

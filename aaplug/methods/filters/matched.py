@@ -1,0 +1,154 @@
+"""The matched screen filter: what training saw, carried to the rate being rendered, then the rest of the pixel.
+
+A classic checkpoint was fitted with +0.3 px² of dilation, so its look lives in C + 0.3 I at the training rate, and in
+C + 0.3 r² I at r times that rate.  Step one restores that look, with the training's own compensation if it had any.
+Where the rate is below training's (r < 1) a pixel is larger than training's pixel, and step two adds the part of the
+pixel's own filter, 0.07 (1 − r²) px², that training's pixel did not hold, compensating this step alone.  At r = 1 the
+result is the training's renderer itself.  Each of several samples a pixel is filtered by the same rule, as a pixel of
+the larger image that it belongs to.  The design and its measurements are aaplug's own; the first step with one global
+rate is SA-GS's filter (Song et al., arXiv 2403.19615).
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple, cast, get_args
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from aaplug.core.cameras import Camera
+from aaplug.core.errors import UsageError, listing
+from aaplug.core.splats import Splats2D
+from aaplug.core.training import TrainingViews
+
+# px²: variance of a pixel's own filter, as a Gaussian.  A box has 1/12, Mip-Splatting takes 0.1.  Opaque splats side by
+# side hide less than their energies add up to, and a narrower filter offsets some of that (examples/guides/methods.md).
+PIXEL_VARIANCE = 0.07
+
+MAX_RISE = 1.2  # how far the reference of a receding view rises over its starting rate (examples/guides/methods.md)
+FULL_RISE_AT = (
+    1 / 4
+)  # share of the training rate at which a pose of the data set has risen by all of it
+
+RateReference = Literal["pose", "global", "sharpest", "interval"]
+
+
+@dataclass(frozen=True)
+class Matched:
+    """Match training's dilation at the new rate, then integrate over what is left of the pixel.
+
+    reference: the rate that a Gaussian's sampling rate is compared with.
+        "global": the view's own training size.  Equals training's renderer at every training view.
+        "sharpest": the highest rate of any training view.  One world-space blur for all views, which can be fused, but
+            thinner than most views were trained with.
+        "interval": the nearest rate in the range of the training views, widened by this pose's own rate at the training
+            size if it is a pose of the data set.  Equals training's renderer inside the range and adapts outside, for
+            cameras that move nearer or farther.
+        "pose": "global" at a pose of the data set, "interval" for a free camera.  When a view samples more coarsely
+            than that, the reference rises by up to `MAX_RISE`, but not above the sharpest, because far views added
+            blur of their own.  For a free camera it rises as fast as the rate falls; at a pose of the data set, so
+            that it has risen by all of it at `FULL_RISE_AT`.
+    pixel_variance: px² of the whole pixel's filter; 0 matches dilation alone.
+    windowed: for pixel kernels that average, set the window instead of blurring: √(1 - r²) px, so that its variance and
+        that of training's pixel add up to one pixel's; a point where r >= 1.
+    """
+
+    reference: RateReference = "pose"
+    pixel_variance: float = PIXEL_VARIANCE
+    windowed: bool = False
+
+    def __call__(self, splats: Splats2D, camera: Camera, training: TrainingViews) -> Splats2D:
+        """Filter the splats of one view."""
+        rate = self.rates(splats, camera, training)
+        trained = training.convention
+        matched = splats.blurred(trained.kernel * rate * rate, trained.compensated)
+        if self.windowed:
+            window = max(0.0, 1 - training.relative_rate(camera) ** 2) ** 0.5
+            return replace(matched, window=window)
+        rest = self.pixel_variance * (1 - rate * rate).clamp(min=0.0)
+        return matched.blurred(rest, compensate=True)
+
+    def with_reference(self, reference: str) -> "Matched":
+        """The same filter with another reference.
+
+        Raises:
+            UsageError: there is no reference of that name.
+        """
+        known = get_args(RateReference)
+        if reference not in known:
+            raise UsageError("rate_reference", f"'{reference}' is not one of {listing(known)}")
+        return replace(self, reference=cast(RateReference, reference))
+
+    def rates(
+        self, splats: Splats2D, camera: Camera, training: TrainingViews
+    ) -> Float[Tensor, " m"]:
+        """Sampling rate of each splat against its reference; the view's own for Gaussians that no camera saw."""
+        view = torch.full_like(splats.depths, training.relative_rate(camera))
+        if self.reference == "global":
+            return view
+        seen = training.bounds.seen[splats.sources]
+        now = camera.focal / splats.depths
+        compared = REFERENCES[self.reference](now, _trained(splats, camera, training, seen))
+        return torch.where(seen, now / compared, view)
+
+
+class Trained(NamedTuple):
+    """Sampling rates of each splat in training, px per world unit.
+
+    own: at this pose's training size, None for a free camera.
+    """
+
+    lowest: Float[Tensor, " m"]
+    highest: Float[Tensor, " m"]
+    own: Float[Tensor, " m"] | None
+
+
+def _trained(
+    splats: Splats2D, camera: Camera, training: TrainingViews, seen: Bool[Tensor, " m"]
+) -> Trained:
+    """The bounds; 1 where no camera saw the Gaussian, so that nothing is divided by 0."""
+    lowest, highest = (
+        bound[splats.sources].to(splats.depths).where(seen, 1.0)
+        for bound in (training.bounds.lowest, training.bounds.highest)
+    )
+    own = None if camera.trained_focal is None else camera.trained_focal / splats.depths
+    return Trained(lowest, highest, own)
+
+
+def _sharpest(now: Float[Tensor, " m"], trained: Trained) -> Float[Tensor, " m"]:
+    return trained.highest
+
+
+def _interval(now: Float[Tensor, " m"], trained: Trained) -> Float[Tensor, " m"]:
+    lowest, highest = _range(trained)
+    return torch.minimum(torch.maximum(now, lowest), highest)
+
+
+def _pose(now: Float[Tensor, " m"], trained: Trained) -> Float[Tensor, " m"]:
+    """The nearest rate in the range, raised where `now` is below it."""
+    lowest, highest = _range(trained)
+    if trained.own is None:
+        low, high, speed = lowest, highest, 1.0
+    else:
+        low = high = trained.own
+        speed = math.log(MAX_RISE) / -math.log(FULL_RISE_AT)
+    rise = (low / now).pow(speed).clamp(max=MAX_RISE)
+    raised = torch.minimum(low * rise, highest)
+    return torch.where(now < low, raised, torch.minimum(now, high))
+
+
+def _range(trained: Trained) -> tuple[Float[Tensor, " m"], Float[Tensor, " m"]]:
+    """Lowest and highest rate in training, with this pose's own."""
+    lowest, highest, own = trained
+    if own is None:
+        return lowest, highest
+    return torch.minimum(lowest, own), torch.maximum(highest, own)
+
+
+REFERENCES: dict[str, Callable[[Tensor, Trained], Tensor]] = {
+    "pose": _pose,
+    "sharpest": _sharpest,
+    "interval": _interval,
+}

@@ -1,0 +1,61 @@
+"""How a pixel kernel's gradient is summed over the pixels of a tile.
+
+t: tiles; K: splats of a step; P: pixels per tile; c: columns of a raster row.
+"""
+
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from aaplug.core.interfaces import PixelKernel, Pixels
+from aaplug.core.kernels import Kernels
+from aaplug.core.rules import Rules
+from aaplug.methods.pixel_kernels.raster_rows import BLUE, RED
+
+
+class Move(NamedTuple):
+    """One splat per tile: its raster row, its weight at each pixel, and the gradient of log alpha there."""
+
+    row: Float[Tensor, "t c"]
+    weight: Float[Tensor, "t P"]
+    gradient: Float[Tensor, "t P"]
+
+
+@runtime_checkable
+class SumsGradients(Protocol):
+    """A pixel kernel that sums its own gradient in closed form; without it, autograd differentiates `alpha`."""
+
+    def sums(
+        self, moves: list[Move], colours: tuple[Tensor, Tensor, Tensor], T: Tensor, pixels: Pixels
+    ) -> Float[Tensor, "t c_K"]:
+        """Sums over each tile's pixels, as many per splat as a raster row has columns.
+
+        colours: gradient of the image's red, green and blue.  T: transmittance before the first of the splats.
+        """
+        ...
+
+    def from_sums(
+        self, rows: Float[Tensor, "m c"], sums: Float[Tensor, "m c"], kernels: Kernels
+    ) -> Float[Tensor, "m c"]:
+        """Gradient of the raster rows from the sums over all tiles."""
+        ...
+
+
+def sums_by_autograd(
+    pixel: PixelKernel,
+    rules: Rules,
+    moves: list[Move],
+    colours: tuple[Tensor, Tensor, Tensor],
+    pixels: Pixels,
+) -> Float[Tensor, "t c_K"]:
+    """Gradient of the raster rows themselves, for any pixel kernel: autograd of alpha from the gradient of log alpha."""
+    rows, weights, gradients = (torch.stack(x, dim=1) for x in zip(*moves, strict=True))
+    with torch.enable_grad():
+        rows = rows.detach().requires_grad_()
+        alpha = pixel.alpha(rows.transpose(0, 1), pixels, rules).transpose(0, 1)
+        grads = torch.where(alpha > 0, gradients / alpha, 0.0).detach()
+        (added,) = torch.autograd.grad(alpha, rows, grads)
+    added[..., RED : BLUE + 1] = torch.bmm(weights, torch.stack(colours, dim=2))
+    return added.flatten(1)

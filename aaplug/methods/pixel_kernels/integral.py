@@ -1,0 +1,82 @@
+"""Alpha averaged over the pixel along the splat's own axes: Analytic-Splatting (Liang et al. 2024, eqs. 8 to 11).
+
+The average is over a square of side `Splats2D.window`, turned to the splat's principal axes, where the Gaussian
+factors.  That the pixel itself is not turned is the paper's approximation.  `integral` uses the exact normal
+distribution, `logistic` the paper's approximation of it, for parity with its published figures.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from aaplug.core.ellipses import grown, principal_columns
+from aaplug.core.interfaces import Pixels
+from aaplug.core.kernels import Kernels
+from aaplug.core.rules import Rules
+from aaplug.core.splats import Splats2D
+from aaplug.methods.pixel_kernels.averages import logistic, mean_gaussian, mean_logistic, normal
+from aaplug.methods.pixel_kernels.raster_rows import COLUMNS, OPACITY, forms_at, rows_of
+
+HALF_U, HALF_V = COLUMNS, COLUMNS + 1  # half windows, in standard deviations
+NARROWEST = 1e-5  # px: a narrower window shows the value at a point, to ten digits
+THINNEST = 0.1  # px: narrowest window that the bounding ellipses allow for
+HALF_DIAGONAL = math.sqrt(0.5)  # of a unit square
+
+
+@dataclass(frozen=True)
+class Integral:
+    """Alpha is opacity times the product of two one-dimensional means.
+
+    mean: of the Gaussian over u ± h.  distribution: its cumulative distribution, for the exact twin.
+    """
+
+    name: str
+    mean: Callable[[Tensor, Tensor], Tensor]
+    distribution: Callable[[Tensor], Tensor]
+    columns: int = COLUMNS + 3
+    needs_depth_slopes: bool = False
+    splats_per_pass: int = 8
+
+    def bounding_ellipses(self, splats: Splats2D, rules: Rules) -> Splats2D | None:
+        """Ellipses that contain the centre of every pixel that touches the splat."""
+        return pixel_margin(splats, rules)
+
+    def raster_rows(self, splats: Splats2D, kernels: Kernels) -> Float[Tensor, "m c"]:
+        """Principal axes, and the half windows along them."""
+        ux, uy, vx, vy = principal_columns(splats.covs, splats.dets)
+        halves = [0.5 * splats.window * torch.hypot(x, y) for x, y in ((ux, uy), (vx, vy))]
+        return rows_of(splats, [ux, uy, vx, vy], [*halves, torch.zeros_like(ux)])
+
+    def alpha(
+        self, rows: Float[Tensor, "*n t c"], pixels: Pixels, rules: Rules
+    ) -> Float[Tensor, "*n t P"]:
+        """Opacity times the means over the window along both axes."""
+        alpha = rows[..., OPACITY, None]
+        for form, half in zip(forms_at(rows, pixels), (HALF_U, HALF_V), strict=True):
+            alpha = alpha * self.mean(form, rows[..., half, None])
+        return torch.threshold(alpha, rules.below_min_alpha, 0.0)
+
+    def exact(self, splats: Splats2D, offsets: Float[Tensor, "p c 2"]) -> Float[Tensor, "p c"]:
+        """2π σ₁ σ₂ times the probabilities of the window along each axis."""
+        values = torch.ones_like(offsets[..., 0])
+        rows = principal_columns(splats.covs, splats.dets)
+        for x, y in (rows[:2], rows[2:]):
+            width = max(splats.window, NARROWEST) * torch.hypot(x, y)  # in standard deviations
+            u = x * offsets[..., 0] + y * offsets[..., 1]
+            probability = self.distribution(u + width / 2) - self.distribution(u - width / 2)
+            values = values * probability * math.sqrt(2 * math.pi) / width
+        return values
+
+
+def pixel_margin(splats: Splats2D, rules: Rules) -> Splats2D:
+    """The splats, grown by half the diagonal of the window."""
+    radius = HALF_DIAGONAL * max(splats.window, THINNEST)
+    return grown(splats, torch.full_like(splats.dets, radius), rules.min_alpha)
+
+
+INTEGRAL = Integral("integral", mean_gaussian, normal)
+LOGISTIC_INTEGRAL = Integral("logistic", mean_logistic, logistic)

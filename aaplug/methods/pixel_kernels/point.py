@@ -1,0 +1,189 @@
+"""The value at the pixel's centre: 3DGS's own pixel kernel (Kerbl et al. 2023, eq. 4).
+
+The forms of a raster row are scaled so that u² + v² = log2(e)/2 · dᵀ C⁻¹ d, and opacity is stored as its log2: alpha is
+2^(log2 o - u² - v²).
+
+The gradient of log alpha is summed over a tile's pixels inside the compiled loop, ten sums per splat.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from aaplug.core.ellipses import whitening, whitening_columns
+from aaplug.core.interfaces import Pixels
+from aaplug.core.kernels import Kernel, Kernels
+from aaplug.core.rules import Rules
+from aaplug.core.splats import Splats2D
+from aaplug.methods.pixel_kernels.gradients import Move
+from aaplug.methods.pixel_kernels.raster_rows import (
+    COLUMNS,
+    OPACITY,
+    TILE,
+    forms_at,
+    offsets_at,
+    splat_example,
+    with_silent_row,
+)
+
+HALF_LOG2_E = 0.5 * math.log2(math.e)
+LN_2 = math.log(2)
+LOG2_SILENT = (
+    -9.0
+)  # log2 of an alpha below every cut-off; exp2 stops here, before it slows down in subnormals
+SQUARINGS = 3  # of exp2's polynomial: with degree 6 the relative error is 1e-6 in float32
+DEGREE = 6
+
+
+@dataclass(frozen=True)
+class Point:
+    """Alpha is opacity times the Gaussian's value at the pixel's centre."""
+
+    name: str = "point"
+    columns: int = COLUMNS
+    needs_depth_slopes: bool = False
+    splats_per_pass: int = 16
+
+    def bounding_ellipses(self, splats: Splats2D, rules: Rules) -> Splats2D | None:
+        """The splats themselves."""
+        return None
+
+    def raster_rows(self, splats: Splats2D, kernels: Kernels) -> Float[Tensor, "m c"]:
+        """Scaled forms, and opacity as its log2."""
+        assert splats.rgb is not None
+        columns = (splats.means, splats.covs, splats.dets, splats.opacities, splats.rgb)
+        (rows,) = kernels.run(POINT_ROWS, *columns)
+        return with_silent_row(rows, LOG2_SILENT)
+
+    def alpha(
+        self, rows: Float[Tensor, "*n t c"], pixels: Pixels, rules: Rules
+    ) -> Float[Tensor, "*n t P"]:
+        """2^(log2 o - u² - v²), 0 below the cut-off."""
+        u, v = forms_at(rows, pixels)
+        exponent = torch.addcmul(rows[..., OPACITY, None], u, u, value=-1)
+        return _exp2_above_cutoff(torch.addcmul(exponent, v, v, value=-1), rules)
+
+    def exact(self, splats: Splats2D, offsets: Float[Tensor, "p c 2"]) -> Float[Tensor, "p c"]:
+        """exp(-dᵀ C⁻¹ d / 2)."""
+        white = torch.einsum("cij,pcj->pci", whitening(splats), offsets)
+        return torch.exp(-0.5 * white.square().sum(dim=2))
+
+    def sums(
+        self, moves: list[Move], colours: tuple[Tensor, Tensor, Tensor], T: Tensor, pixels: Pixels
+    ) -> Float[Tensor, "t c_K"]:
+        """Sums over a tile's pixels that gradients are made of, ten per splat.
+
+        With s the gradient of log alpha: s·u and s·v times the offset in x and in y, s·u, s·v, s, and the weight times
+        the gradient of each colour.
+        """
+        if not torch.compiler.is_compiling():
+            return _sums_by_products(moves, colours, pixels)
+        sums = []
+        for row, weight, gradient in moves:
+            dx, dy = offsets_at(row, pixels)
+            su, sv = (gradient * form for form in forms_at(row, pixels))
+            red, green, blue = (weight * colour for colour in colours)
+            # both are 0 where T is; testing it shows the compiler that all sums belong in one loop
+            gradient, red = (torch.where(T > 0, x, 0.0) for x in (gradient, red))
+            sums += [su * dx, su * dy, sv * dx, sv * dy, su, sv, gradient, red, green, blue]
+        return torch.cat([x.sum(dim=1, keepdim=True) for x in sums], dim=1)
+
+    def from_sums(
+        self, rows: Float[Tensor, "m c"], sums: Float[Tensor, "m c"], kernels: Kernels
+    ) -> Float[Tensor, "m c"]:
+        """Gradient of the raster rows from the sums."""
+        return kernels.run(FROM_SUMS, rows, sums)[0]
+
+
+def _point_rows(
+    means: Float[Tensor, "m 2"],
+    covs: Float[Tensor, "m 3"],
+    dets: Float[Tensor, " m"],
+    opacities: Float[Tensor, " m"],
+    rgb: Float[Tensor, "m 3"],
+) -> tuple[Float[Tensor, "m 10"]]:
+    forms = [HALF_LOG2_E**0.5 * form for form in whitening_columns(covs, dets)]
+    columns = [*forms, *means.unbind(dim=1), opacities.log2(), *rgb.unbind(dim=1)]
+    return (torch.stack(columns, dim=1),)
+
+
+def _exp2_above_cutoff(exponent: Float[Tensor, "*n P L"], rules: Rules) -> Float[Tensor, "*n P L"]:
+    """2^exponent, 0 below the cut-off.  Compiled it is a polynomial, because a call in a loop stops vectorization."""
+    if torch.compiler.is_compiling():
+        root = _polynomial(torch.relu(exponent - LOG2_SILENT), ROOT_OF_EXP2)
+        return torch.where(exponent >= rules.log2_min_alpha, _power(root, SQUARINGS), 0.0)
+    return torch.threshold(exponent.clamp(min=LOG2_SILENT).exp2_(), rules.below_min_alpha, 0.0)
+
+
+def _polynomial(x: Tensor, coefficients: tuple[float, ...]) -> Tensor:
+    *rest, last = coefficients
+    value = x * last + rest[-1]
+    for coefficient in rest[-2::-1]:
+        value = value * x + coefficient
+    return value
+
+
+def _power(x: Tensor, squarings: int) -> Tensor:
+    for _ in range(squarings):
+        x = x * x
+    return x
+
+
+def _root_of_exp2(squarings: int, degree: int) -> tuple[float, ...]:
+    """Coefficients of a polynomial in h >= 0 whose repeated square is 2^(LOG2_SILENT + h), for exponents up to 0.
+
+    It interpolates at the Chebyshev nodes.
+    """
+    angles = math.pi * (torch.arange(degree + 1, dtype=torch.float64) + 0.5) / (degree + 1)
+    h = -LOG2_SILENT / 2 * (1 + angles.cos())
+    values = torch.exp2((LOG2_SILENT + h) / 2**squarings)
+    return tuple(torch.linalg.solve(torch.linalg.vander(h), values).tolist())
+
+
+def _sums_by_products(
+    moves: list[Move], colours: tuple[Tensor, Tensor, Tensor], pixels: Pixels
+) -> Float[Tensor, "t c_K"]:
+    """The same sums as matrix products, for eager mode: from moments about the tile's middle, which keep all digits."""
+    rows, weights, gradients = (torch.stack(x, dim=1) for x in zip(*moves, strict=True))
+    x, y = pixels.x - TILE / 2, pixels.y - TILE / 2
+    monomials = torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y], dim=1)
+    s, sx, sy, sxx, sxy, syy = (gradients @ monomials).unbind(dim=2)
+    ux, uy, vx, vy, centre_x, centre_y, *_ = rows.unbind(dim=2)
+    dx = pixels.corners[:, 0, None] + TILE / 2 - centre_x
+    dy = pixels.corners[:, 1, None] + TILE / 2 - centre_y
+    by_offset, by_form = [], []
+    for i, j in ((ux, uy), (vx, vy)):
+        middle = i * dx + j * dy
+        along = middle * s + i * sx + j * sy
+        by_form += [along]
+        by_offset += [dx * along + middle * sx + i * sxx + j * sxy]
+        by_offset += [dy * along + middle * sy + i * sxy + j * syy]
+    by_colour = torch.bmm(weights, torch.stack(colours, dim=2)).unbind(dim=2)
+    return torch.stack([*by_offset, *by_form, s, *by_colour], dim=2).flatten(1)
+
+
+def _from_sums(
+    rows: Float[Tensor, "m 10"], sums: Float[Tensor, "m 10"]
+) -> tuple[Float[Tensor, "m 10"]]:
+    """Chain rule for log alpha = ln 2 (log2 o - u² - v²)."""
+    ux, uy, vx, vy, *_ = rows.unbind(dim=1)
+    *by_offset, su, sv, s, red, green, blue = sums.unbind(dim=1)
+    forms = [-2 * LN_2 * form for form in by_offset]
+    centre = [2 * LN_2 * (ux * su + vx * sv), 2 * LN_2 * (uy * su + vy * sv)]
+    return (torch.stack([*forms, *centre, LN_2 * s, red, green, blue], dim=1),)
+
+
+def _from_sums_example() -> tuple[Tensor, ...]:
+    m = 100_000
+    return tuple(torch.linspace(0.1, 1.0, m * COLUMNS).view(m, -1) for _ in range(2))
+
+
+ROOT_OF_EXP2 = _root_of_exp2(SQUARINGS, DEGREE)
+POINT_ROWS = Kernel(
+    "point-rows", _point_rows, lambda: (*splat_example(), torch.ones(100_000, 3)), ("m",) * 5
+)
+FROM_SUMS = Kernel("composite-sums", _from_sums, _from_sums_example, ("m", "m"))
+POINT = Point()

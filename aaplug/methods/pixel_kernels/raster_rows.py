@@ -1,0 +1,82 @@
+"""Raster rows: what a tile needs to know of a splat, one row of numbers each.
+
+m: splats; t: tiles of TILE × TILE px; P: pixels per tile; n: rows per tile; c: columns.
+
+The first columns are the same for every pixel kernel: two linear forms u, v of the pixel's position, which whiten the
+splat, its centre, opacity and colour.  Linear forms keep the digits that the expanded quadratic form of a needle loses.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from aaplug.core.interfaces import Pixels
+from aaplug.core.splats import Splats2D
+
+TILE = 8  # px: side of a tile
+PIXELS = TILE * TILE
+
+UX, UY, VX, VY, X, Y, OPACITY, RED, GREEN, BLUE = range(10)
+COLUMNS = 10  # columns from here on are a kernel's own
+
+
+def rows_of(
+    splats: Splats2D, forms: Sequence[Tensor], own: Sequence[Tensor]
+) -> Float[Tensor, "m c"]:
+    """Assemble raster rows from the two forms and a kernel's own columns, with a last row that draws nothing."""
+    assert splats.rgb is not None
+    centre, colour = splats.means.unbind(dim=1), splats.rgb.unbind(dim=1)
+    rows = torch.stack([*forms, *centre, splats.opacities, *colour, *own], dim=1)
+    return with_silent_row(rows, 0.0)
+
+
+def with_silent_row(rows: Float[Tensor, "m c"], opacity: float) -> Float[Tensor, "m_and_1 c"]:
+    """Append a row that draws nothing: where a tile has no more splats, it draws this one."""
+    silent = rows.new_zeros(1, rows.shape[1])
+    silent[:, OPACITY] = opacity
+    return torch.cat([rows, silent])
+
+
+def tile_centres(like: Tensor) -> tuple[Float[Tensor, " P"], Float[Tensor, " P"]]:
+    """x and y of a tile's pixel centres, from its corner, in px."""
+    offset = torch.arange(TILE, dtype=like.dtype, device=like.device) + 0.5
+    y, x = torch.meshgrid(offset, offset, indexing="ij")
+    return x.flatten(), y.flatten()
+
+
+def forms_at(
+    row: Float[Tensor, "*n t c"], pixels: Pixels
+) -> tuple[Float[Tensor, "*n t P"], Float[Tensor, "*n t P"]]:
+    """The two linear forms of splats at pixel centres."""
+    forms = [(row[..., i], row[..., j]) for i, j in ((UX, UY), (VX, VY))]
+    if torch.compiler.is_compiling():
+        dx, dy = offsets_at(row, pixels)
+        u, v = (torch.addcmul(i[..., None] * dx, j[..., None], dy) for i, j in forms)
+    else:  # eagerly a matrix product is faster than any operation per pixel
+        basis = torch.stack([pixels.x, pixels.y, torch.ones_like(pixels.x)])
+        x, y = _from_corner(row, pixels)
+        u, v = (torch.stack([i, j, -(i * x + j * y)], dim=-1) @ basis for i, j in forms)
+    return u, v
+
+
+def offsets_at(
+    row: Float[Tensor, "*n t c"], pixels: Pixels
+) -> tuple[Float[Tensor, "*n t P"], Float[Tensor, "*n t P"]]:
+    """Offset of pixel centres from splats, in px."""
+    x, y = _from_corner(row, pixels)
+    return pixels.x - x[..., None], pixels.y - y[..., None]
+
+
+def _from_corner(
+    row: Float[Tensor, "*n t c"], pixels: Pixels
+) -> tuple[Float[Tensor, "*n t"], Float[Tensor, "*n t"]]:
+    return row[..., X] - pixels.corners[:, 0], row[..., Y] - pixels.corners[:, 1]
+
+
+def splat_example() -> tuple[Tensor, ...]:
+    """Means, covariances, determinants and opacities to compile for."""
+    m = 100_000
+    means = torch.linspace(0.0, 99.0, 2 * m).view(m, 2)
+    return means, torch.tensor([3.0, 1.0, 2.0]).repeat(m, 1), torch.full((m,), 5.0), torch.ones(m)

@@ -1,0 +1,184 @@
+"""Discs where rays meet them: 2DGS (Huang et al. 2024) and AA-2DGS (Younes et al., NeurIPS 2025).
+
+At its centre on the screen a disc has a covariance C.  With B a whitening of C, e = B d whitens the offset d.  Away
+from the centre perspective divides: with the depth slopes n, inverse depth falls by the factor w = 1 - n·d, and the ray
+meets the disc at s = e / w, in its standard deviations.  This is 2DGS's intersection (eq. 10) by the matrix inversion
+lemma; it needs two numbers more than a Gaussian on the screen.
+
+"surfel" is 2DGS: exp(-ρ/2) with ρ = min(|s|², 2 |d|²/r²).  The second term is a low-pass filter of √½ px of training's
+pixels, whose size is r = `Splats2D.window`.  "surfel-mip" is AA-2DGS's object-space Mip filter: with
+J = ds/dd = (B + s nᵀ)/w and V = I + 0.1 J Jᵀ it is det V^-½ exp(-sᵀ V⁻¹ s/2).
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from aaplug.core.ellipses import grown, squared_cutoff, whitening_columns
+from aaplug.core.interfaces import Pixels
+from aaplug.core.kernels import Kernels
+from aaplug.core.rules import Rules
+from aaplug.core.splats import Splats2D
+from aaplug.methods.pixel_kernels.raster_rows import (
+    COLUMNS,
+    OPACITY,
+    UX,
+    UY,
+    VX,
+    VY,
+    forms_at,
+    offsets_at,
+    rows_of,
+)
+
+SLOPE_X, SLOPE_Y, LOW_PASS_WIDTH = COLUMNS, COLUMNS + 1, COLUMNS + 2
+LOW_PASS = 2.0  # 1/px²: 2DGS's filter of √½ px, squared and inverted
+DISC_VARIANCE = 0.1  # px²: AA-2DGS's object-space Mip filter
+LEAST_FACTOR = 1e-8  # under the root of AA-2DGS's factor, as published
+NARROWEST = 1e-3  # px: of the low-pass filter, which is divided by
+IN_FRONT = 1e-3  # of the centre's inverse depth: anything farther counts as the horizon
+HORIZON = 1e-12  # the same for the exact twin
+
+
+@dataclass(frozen=True)
+class Surfel:
+    """Alpha is opacity times a disc's value where the ray meets it.
+
+    smoothed: AA-2DGS's Mip filter instead of 2DGS's low-pass filter.
+    """
+
+    name: str
+    smoothed: bool
+    columns: int = COLUMNS + 3
+    needs_depth_slopes: bool = True
+    splats_per_pass: int = 8
+
+    def bounding_ellipses(self, splats: Splats2D, rules: Rules) -> Splats2D | None:
+        """Ellipses that contain the discs and their filters; opacity 0 for a disc that meets the horizon.
+
+        |e|² <= R w² is an ellipse around -R C n / (1 - R q) with the covariance (C + R C n nᵀ C / (1 - R q)) / (1 - R q),
+        q = nᵀ C n, as long as R q < 1.
+        """
+        assert splats.depth_slopes is not None
+        cutoff = squared_cutoff(splats.opacities, rules.min_alpha)
+        cutoff = cutoff.clamp(min=torch.finfo(splats.means.dtype).tiny)
+        xx, xy, yy = splats.covs.unbind(dim=1)
+        nx, ny = splats.depth_slopes.unbind(dim=1)
+        cx, cy = xx * nx + xy * ny, xy * nx + yy * ny
+        left = 1 - cutoff * (nx * cx + ny * cy)
+        near = left > IN_FRONT
+        left = left.clamp(min=IN_FRONT)
+        shift, stretch = -cutoff / left, cutoff / left
+        covs = torch.stack(
+            [xx + stretch * cx * cx, xy + stretch * cx * cy, yy + stretch * cy * cy], dim=1
+        )
+        ellipses = replace(
+            splats,
+            means=splats.means + shift[:, None] * torch.stack([cx, cy], dim=1),
+            covs=covs / left[:, None],
+            dets=splats.dets / left**3,
+            opacities=torch.where(near, splats.opacities, 0.0),
+        )
+        width = max(splats.window, NARROWEST)
+        variance = DISC_VARIANCE if self.smoothed else width**2 / LOW_PASS
+        return grown(ellipses, (variance * cutoff).sqrt(), rules.min_alpha)
+
+    def raster_rows(self, splats: Splats2D, kernels: Kernels) -> Float[Tensor, "m c"]:
+        """A whitening, the depth slopes, and the low-pass filter's width."""
+        assert splats.depth_slopes is not None
+        width = torch.full_like(splats.opacities, max(splats.window, NARROWEST))
+        forms = whitening_columns(splats.covs, splats.dets)
+        return rows_of(splats, forms, [*splats.depth_slopes.unbind(dim=1), width])
+
+    def alpha(
+        self, rows: Float[Tensor, "*n t c"], pixels: Pixels, rules: Rules
+    ) -> Float[Tensor, "*n t P"]:
+        """Opacity times the disc's value."""
+        e = forms_at(rows, pixels)
+        dx, dy = offsets_at(rows, pixels)
+        slopes = rows[..., SLOPE_X, None], rows[..., SLOPE_Y, None]
+        ahead = (1 - slopes[0] * dx - slopes[1] * dy).clamp(min=IN_FRONT)
+        if self.smoothed:
+            whitening = tuple(rows[..., i, None] for i in (UX, UY, VX, VY))
+            value = _mip_filtered(e, ahead, whitening, slopes)
+        else:
+            value = _low_passed(e, ahead, dx * dx + dy * dy, rows[..., LOW_PASS_WIDTH, None])
+        return torch.threshold(rows[..., OPACITY, None] * value, rules.below_min_alpha, 0.0)
+
+    def exact(self, splats: Splats2D, offsets: Float[Tensor, "p c 2"]) -> Float[Tensor, "p c"]:
+        """2DGS's intersection of homogeneous planes (its eqs. 8 to 10), and AA-2DGS's filter as its paper expands it.
+
+        T_u, T_v, T_w map the disc's coordinates to the screen, from any root of its covariance and its depth slopes.
+        """
+        t_u, t_v, t_w = _planes(splats)
+        x, y = offsets[..., :1], offsets[..., 1:]
+        by_row, by_column = x * t_w - t_u, y * t_w - t_v
+        p = torch.linalg.cross(by_row, by_column)
+        in_front = p[..., 2] > HORIZON
+        depth = torch.where(in_front, p[..., 2], 1.0)
+        s, t = p[..., 0] / depth, p[..., 1] / depth
+        if not self.smoothed:
+            squared = offsets.square().sum(dim=2)
+            low_pass = LOW_PASS * squared / max(splats.window, NARROWEST) ** 2
+            values = torch.exp(-0.5 * torch.minimum(s * s + t * t, low_pass))
+            return torch.where(in_front, values, torch.exp(-0.5 * low_pass))
+        by_x = torch.linalg.cross(t_w.expand_as(by_column), by_column)
+        by_y = torch.linalg.cross(by_row, t_w.expand_as(by_row))
+        jacobian = [
+            (change[..., i] * depth - p[..., i] * change[..., 2]) / depth**2
+            for change in (by_x, by_y)
+            for i in (0, 1)
+        ]
+        return torch.where(in_front, _exact_mip_filter(s, t, jacobian), 0.0)
+
+
+def _low_passed(e: tuple[Tensor, Tensor], ahead: Tensor, squared: Tensor, width: Tensor) -> Tensor:
+    """2DGS.  e: whitened offset.  ahead: w.  squared: |d|², in px²."""
+    on_disc = (e[0] * e[0] + e[1] * e[1]) / (ahead * ahead)
+    return (-0.5 * torch.minimum(on_disc, LOW_PASS * squared / (width * width))).exp()
+
+
+def _mip_filtered(
+    e: tuple[Tensor, Tensor],
+    ahead: Tensor,
+    whitening: tuple[Tensor, ...],
+    slopes: tuple[Tensor, Tensor],
+) -> Tensor:
+    """AA-2DGS.  whitening: ux, uy, vx, vy."""
+    s, t = e[0] / ahead, e[1] / ahead
+    ux, uy, vx, vy = whitening
+    j00, j01 = (ux + s * slopes[0]) / ahead, (uy + s * slopes[1]) / ahead
+    j10, j11 = (vx + t * slopes[0]) / ahead, (vy + t * slopes[1]) / ahead
+    k = DISC_VARIANCE
+    area = j00 * j11 - j01 * j10
+    size = j00 * j00 + j01 * j01 + j10 * j10 + j11 * j11
+    det = 1 + k * size + k * k * area * area
+    across = (j10 * s - j00 * t) ** 2 + (j11 * s - j01 * t) ** 2
+    return (1 / det + LEAST_FACTOR).sqrt() * (-0.5 * (s * s + t * t + k * across) / det).exp()
+
+
+def _planes(splats: Splats2D) -> tuple[Tensor, Tensor, Tensor]:
+    """T_u, T_v, T_w of each disc."""
+    assert splats.depth_slopes is not None
+    xx, xy, _ = splats.covs.unbind(dim=1)
+    a = xx.sqrt()
+    zero, one = torch.zeros_like(a), torch.ones_like(a)
+    root = torch.stack([a, zero, xy / a, (splats.dets / xx).sqrt()], dim=1).unflatten(1, (2, 2))
+    tilt = torch.einsum("cij,ci->cj", root, splats.depth_slopes)
+    t_u, t_v = (torch.cat([root[:, i], zero[:, None]], dim=1) for i in (0, 1))
+    return t_u, t_v, torch.cat([tilt, one[:, None]], dim=1)
+
+
+def _exact_mip_filter(s: Tensor, t: Tensor, jacobian: list[Tensor]) -> Tensor:
+    a, b, c, d = jacobian
+    kappa = DISC_VARIANCE
+    area, size = a * d - b * c, a * a + b * b + c * c + d * d
+    det = kappa**2 * area**2 + kappa * size + 1
+    rho = (s * s + t * t + kappa * ((d * s - c * t) ** 2 + (a * t - b * s) ** 2)) / det
+    return (1 / det + LEAST_FACTOR).sqrt() * torch.exp(-0.5 * rho)
+
+
+SURFEL = Surfel("surfel", smoothed=False)
+SURFEL_MIP = Surfel("surfel-mip", smoothed=True)

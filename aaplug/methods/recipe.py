@@ -1,0 +1,67 @@
+"""Recipe: how a scene is rendered, as a combination of filters, a pixel kernel and samples per pixel."""
+
+import math
+from dataclasses import dataclass
+
+from aaplug.core.gaussians import Gaussians
+from aaplug.core.interfaces import (
+    Compositor,
+    PixelKernel,
+    ScreenFilter,
+    Selection,
+    WorldFilter,
+)
+from aaplug.methods.pixel_kernels import POINT
+
+SLACK = 1e-6  # before one more sample is taken
+
+
+@dataclass(frozen=True)
+class Promises:
+    """What a recipe holds to on a classic scene; laws check each one, whether it is promised or not.
+
+    equals_training: at the training size its image is training's own.
+    keeps_energy: the light of a lone splat follows its area over scales.
+    fades_when_small: a splat far smaller than a pixel fades out, rather than being hit or missed by a sample.
+    opaque_when_near: a splat seen from very near has its opacity.
+    """
+
+    equals_training: bool = False
+    keeps_energy: bool = True
+    fades_when_small: bool = True
+    opaque_when_near: bool = True
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How to render a scene.
+
+    source: the paper or design that it follows.  when: what it is for, in one line.
+    target_rate: relative sampling rate, at most 1 (training's own pixels), that the samples of a pixel reach: the
+        smallest n x n samples with rate·n >= target_rate; 0 for one sample.
+    grid: samples along a pixel's side that it takes at every rate.
+    takes_quality: `target_rate` is set by the user's choice of quality.
+    for_discs: name of the recipe that takes its place for scenes of 2D Gaussians.
+    """
+
+    name: str
+    screen: ScreenFilter
+    source: str
+    when: str
+    world: WorldFilter | None = None
+    target_rate: float = 0.0
+    grid: int = 1
+    pixel: PixelKernel = POINT
+    compositor: Compositor | None = None
+    selection: Selection | None = None
+    takes_quality: bool = False
+    for_discs: str | None = None
+    promises: Promises = Promises()
+
+    def samples_at(self, relative_rate: float) -> int:
+        """Samples along a pixel's side, for a view at `relative_rate` against training."""
+        return max(self.grid, math.ceil(min(self.target_rate, 1.0) / relative_rate - SLACK))
+
+    def lacks(self, scene: Gaussians) -> str | None:
+        """What a scene lacks for this recipe, in words; None if nothing."""
+        return None if self.selection is None else self.selection.lacks(scene)

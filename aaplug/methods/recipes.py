@@ -1,0 +1,130 @@
+"""The recipes that a user picks, each with its source; `research_recipes` has the comparisons."""
+
+from dataclasses import replace
+
+from aaplug.core.errors import UsageError
+from aaplug.core.gaussians import Gaussians
+from aaplug.core.interfaces import MatchesRates
+from aaplug.core.registry import Registry
+from aaplug.methods.filters import SCREEN_FILTERS, LowPass, Matched, Smoothing3D
+from aaplug.methods.pixel_kernels import SURFEL
+from aaplug.methods.recipe import Promises, Recipe
+from aaplug.methods.research_recipes import RESEARCH_RECIPES
+
+# Relative rate that each quality samples a pixel at.  A small image costs per Gaussian, not per pixel: at 1/8 of the
+# training size 2x2 samples take no more splat-pixel evaluations than `classic` with one.
+QUALITIES = {"fast": 0.25, "balanced": 0.5, "best": 1.0}
+
+USER_RECIPES = (
+    Recipe(
+        "auto",
+        Matched(),
+        "aaplug: matched, with the samples per pixel that --quality asks for",
+        "the default",
+        target_rate=QUALITIES["balanced"],
+        takes_quality=True,
+        for_discs="2dgs-matched",
+        promises=Promises(equals_training=True),
+    ),
+    Recipe(
+        "matched",
+        Matched(),
+        "aaplug: training's dilation carried to the new rate, then the rest of the pixel's filter",
+        "one sample per pixel: the fastest that is right",
+        promises=Promises(equals_training=True),
+    ),
+    Recipe(
+        "classic",
+        SCREEN_FILTERS["classic"],
+        "3DGS (Kerbl et al. 2023): +0.3 px²",
+        "the look to compare with; right only at the training size",
+        promises=Promises(equals_training=True, keeps_energy=False),
+    ),
+    Recipe(
+        "ewa",
+        SCREEN_FILTERS["ewa"],
+        "EWA splatting (Zwicker et al. 2002); 3DGS --antialiasing, gsplat antialiased: 0.3 px², compensated",
+        "scenes trained with it",
+    ),
+    Recipe(
+        "mip",
+        SCREEN_FILTERS["mip"],
+        "Mip-Splatting's 2D Mip filter (Yu et al. 2024, eq. 10): 0.1 px², compensated",
+        "scenes trained with it, and scenes converted by aaplug",
+    ),
+    Recipe(
+        "mip-splatting",
+        SCREEN_FILTERS["mip"],
+        "Mip-Splatting (Yu et al. 2024): 3D smoothing (eq. 9) with its volume factor, then the 2D Mip filter",
+        "comparison: it dims scenes that were not trained with it",
+        world=Smoothing3D(),
+        promises=Promises(opaque_when_near=False),
+    ),
+    Recipe(
+        "2dgs",
+        LowPass(),
+        "2DGS (Huang et al. 2024): discs where rays meet them, and a low-pass filter of √½ px",
+        "scenes of 2D Gaussians, as they were trained; Gaussians are taken for discs across their thinnest axis",
+        pixel=SURFEL,
+        promises=Promises(keeps_energy=False),
+    ),
+    Recipe(
+        "2dgs-matched",
+        LowPass(matched=True),
+        "aaplug: 2DGS with its low-pass filter carried to the rate being rendered, and samples per pixel as auto has",
+        "scenes of 2D Gaussians at other sizes",
+        target_rate=0.5,
+        pixel=SURFEL,
+    ),
+)
+
+RECIPES: Registry[Recipe] = Registry(
+    "recipe",
+    {recipe.name: recipe for recipe in (*USER_RECIPES, *RESEARCH_RECIPES)},
+    check=lambda value: isinstance(value, Recipe),
+)
+
+
+def find_recipe(
+    name: str,
+    *,
+    quality: str = "balanced",
+    rate_reference: str | None = None,
+    target_rate: float | None = None,
+) -> Recipe:
+    """A recipe by name, with the user's choices.
+
+    Args:
+        name: of `RECIPES`.
+        quality: of `QUALITIES`: how finely `auto` samples a pixel.
+        rate_reference: what `matched` and `auto` compare a Gaussian's sampling rate with.
+        target_rate: relative rate at which any recipe samples a pixel, instead of its own.
+
+    Raises:
+        UsageError: a name or a quality is not known, or the recipe compares no rates.
+    """
+    recipe = RECIPES.find(name, "recipe")
+    if quality not in QUALITIES:
+        raise UsageError("quality", f"'{quality}' is not one of {', '.join(QUALITIES)}")
+    if rate_reference is not None:
+        if not isinstance(recipe.screen, MatchesRates):
+            raise UsageError("rate_reference", f"recipe '{name}' compares no sampling rates")
+        recipe = replace(recipe, screen=recipe.screen.with_reference(rate_reference))
+    if recipe.takes_quality:
+        recipe = replace(recipe, target_rate=QUALITIES[quality])
+    return recipe if target_rate is None else replace(recipe, target_rate=target_rate)
+
+
+def suited(recipe: Recipe, scene: Gaussians) -> Recipe:
+    """The recipe as it applies to a scene: `auto` draws discs for a scene of 2D Gaussians.
+
+    Raises:
+        UsageError: the scene lacks what the recipe needs.
+    """
+    missing = recipe.lacks(scene)
+    if missing is not None:
+        raise UsageError(f"recipe {recipe.name}", missing)
+    if recipe.for_discs is None or not scene.flat:
+        return recipe
+    discs = RECIPES[recipe.for_discs]
+    return replace(discs, name=recipe.name, target_rate=recipe.target_rate)

@@ -1,0 +1,220 @@
+"""Kernels compiled ahead of time: built once, kept in the user's cache folder, loaded in milliseconds.
+
+Each kernel becomes one package of `torch._inductor`.  The folder's name is a hash of torch's version, the kernels'
+source and the processor's instruction set, so a stale package is never found.  A package that does not load, or whose
+result differs from the eager one, is built again.
+"""
+
+import hashlib
+import inspect
+import multiprocessing
+import os
+import shutil
+import sys
+import tempfile
+import warnings
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from pathlib import Path
+
+import platformdirs
+import torch
+
+from aaplug.core import culling, ellipses, kernels, projection, rules, spherical_harmonics, splats
+from aaplug.core.errors import UsageError
+from aaplug.core.kernels import Kernel, one_thread
+from aaplug.core.rules import RULES_3DGS
+from aaplug.methods.pixel_kernels import INTEGRAL, POINT, averages, integral, point, raster_rows
+from aaplug.rasterizers.tiled import backward, binning, forward
+from aaplug.rasterizers.tiled.packages import CompiledKernels, Package
+
+KERNELS: tuple[Kernel, ...] = (  # those that take longest to compile come last
+    projection.project_kernel(),
+    *projection.SHADE.values(),
+    culling.cull_kernel(),
+    point.POINT_ROWS,
+    binning.table_kernel(),
+    binning.SPANS,
+    binning.PAIRS,
+    forward.OWNERS,
+    point.FROM_SUMS,
+    *projection.SHADE_BACKWARD.values(),
+    backward.step_kernel(POINT, RULES_3DGS),
+    projection.PROJECT_BACKWARD,
+    forward.pass_kernel(INTEGRAL, RULES_3DGS),
+    forward.pass_kernel(POINT, RULES_3DGS),
+)
+SOURCES = (  # modules whose source the kernels are made of
+    *(kernels, rules, splats, ellipses, culling, projection, spherical_harmonics),
+    *(raster_rows, averages, point, integral, binning, forward, backward),
+)
+OPTIONS = {
+    "max_fusion_size": 1_000_000,  # a pass stays one loop, however many operations it has
+    "cpp.max_horizontal_fusion_size": 1_000_000,  # and however many sums it has
+    "realize_reads_threshold": 30,  # inputs are recomputed inside the loop, however much they read
+    "assert_indirect_indexing": False,  # indices are our own, and checking each load is slow
+    "cpp.enable_floating_point_contract_flag": "fast",  # multiply and add in one instruction
+}
+TILING_HEURISTIC = (
+    "cpp.enable_tiling_heuristics"  # inductor leaves loops that gather scattered numbers scalar
+)
+LARGEST_SIZE = 1 << 31
+MOST_PROCESSES = 4  # compilers side by side: each takes most of a GB
+TOLERANCE = (
+    1e-4  # of the largest value: between a package's result and the eager one, on the example
+)
+
+
+def cache_folder() -> Path:
+    """Folder of the packages for this version and this processor."""
+    source = "".join(inspect.getsource(module) for module in SOURCES)
+    options = f"{OPTIONS} {TILING_HEURISTIC}"
+    facts = [torch.__version__, torch.backends.cpu.get_cpu_capability(), source, options]
+    key = hashlib.sha256("\0".join(facts).encode()).hexdigest()[:16]
+    return Path(platformdirs.user_cache_dir("aaplug", appauthor=False)) / f"kernels-{key}"
+
+
+def has_compiler() -> bool:
+    """Whether this machine has the compiler that torch would use."""
+    standard = "clang++" if sys.platform == "darwin" else "g++"
+    return shutil.which(os.environ.get("CXX", standard)) is not None
+
+
+def load() -> CompiledKernels | None:
+    """The compiled kernels, if all are built and those for images are sound.
+
+    Kernels for gradients load when they are first needed; a broken one is replaced by its eager function.
+    """
+    if not all(_path(kernel).is_file() for kernel in KERNELS):
+        return None
+    packages = {}
+    for kernel in KERNELS:
+        if not kernel.pulls_back:
+            package = _load(kernel)
+            if package is None:
+                return None
+            packages[kernel.name] = package
+    pulling = {kernel.name: kernel for kernel in KERNELS if kernel.pulls_back}
+    return CompiledKernels(packages, lambda name: _load(pulling[name]) if name in pulling else None)
+
+
+def build(
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> CompiledKernels:
+    """Build what is missing or broken, in one process per thread of torch, and load everything.
+
+    progress: called with (kernels done, kernels in all).
+
+    Raises:
+        UsageError: there is no compiler or it fails, the cache folder cannot be written, or a process died.
+    """
+    total = len(KERNELS)
+    missing = [kernel.name for kernel in KERNELS if _load(kernel) is None]
+    progress(total - len(missing), total)
+    if missing:
+        if not has_compiler():
+            raise UsageError(
+                "warmup", "needs a C++ compiler (g++ or clang++) for torch to compile with"
+            )
+        processes = min(torch.get_num_threads(), MOST_PROCESSES, len(missing))
+        pool = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"))
+        try:
+            # longest first, so that none is left over at the end
+            built = as_completed([pool.submit(_build, name) for name in missing[::-1]])
+            for done, future in enumerate(built, start=total - len(missing) + 1):
+                future.result()
+                progress(done, total)
+        except BrokenProcessPool as error:
+            raise UsageError("warmup", "a process died, probably out of memory") from error
+        finally:
+            pool.shutdown(cancel_futures=True)
+    loaded = load()
+    if loaded is None:
+        raise UsageError("warmup", f"the packages in {cache_folder()} do not load")
+    return loaded
+
+
+def _path(kernel: Kernel) -> Path:
+    return cache_folder() / f"{kernel.name}.pt2"
+
+
+def _load(kernel: Kernel) -> Package | None:
+    """The package, if its result equals the eager one; else None."""
+    path = _path(kernel)
+    if not path.is_file():
+        return None
+    try:
+        # the loader inside `aoti_load_package`, whose import takes two seconds and whose calls take four times as long
+        loader = torch._C._aoti.AOTIModelPackageLoader  # pyright: ignore[reportAttributeAccessIssue]
+        package = loader(str(path), "model", True, 1, -1).run
+        with torch.no_grad(), one_thread():  # several threads would wait for each other
+            args, twins = kernel.example(), kernel.example()
+            found = [*package(list(args)), *args]  # results, and arguments updated in place
+            expected = [*kernel.function(*twins), *twins]
+            close = all(_close(a, b) for a, b in zip(found, expected, strict=True))
+        return Package.of(package, args) if close else None
+    except Exception:  # a broken package can fail in any way; it is built again
+        return None
+
+
+def _close(found: torch.Tensor, expected: torch.Tensor) -> bool:
+    found, expected = found.double(), expected.double()
+    return bool((found - expected).abs().max() <= TOLERANCE * (1 + expected.abs().max()))
+
+
+def _build(name: str) -> None:
+    """Build one kernel, by its name, so that it can run in another process."""
+    kernel = next(kernel for kernel in KERNELS if kernel.name == name)
+    path = _path(kernel)
+    sizes = {
+        name: torch.export.Dim(f"size_{name}", min=2, max=LARGEST_SIZE)
+        for name in kernel.sizes
+        if name is not None
+    }
+    shapes = tuple({0: sizes[name]} if name is not None else None for name in kernel.sizes)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        from torch.fx.experimental.proxy_tensor import make_fx  # takes a second
+
+        with tempfile.TemporaryDirectory(dir=path.parent) as folder, _quiet(), torch.no_grad():
+            args = kernel.example()
+            module = (
+                make_fx(kernel.function, tracing_mode="symbolic")(*args)
+                if kernel.pulls_back
+                else _Module(kernel)
+            )
+            program = torch.export.export(
+                module, args, dynamic_shapes=shapes if kernel.pulls_back else (shapes,)
+            )
+            made = torch._inductor.aoti_compile_and_package(
+                program,
+                package_path=str(Path(folder) / "k.pt2"),
+                inductor_configs={**OPTIONS, TILING_HEURISTIC: not kernel.gathers},
+            )
+            os.replace(made, path)
+    except OSError as error:
+        raise UsageError("warmup", f"cannot write {path.parent}: {error}") from error
+    except Exception as error:  # a compiler can fail in any way
+        problem = f"torch {torch.__version__} cannot compile '{kernel.name}' here: {error}"
+        raise UsageError("warmup", problem) from error
+
+
+class _Module(torch.nn.Module):
+    """A kernel as torch.export takes it."""
+
+    def __init__(self, kernel: Kernel):
+        super().__init__()
+        self._function = kernel.function
+
+    def forward(self, *args: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        return self._function(*args)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Hide torch's deprecation notices."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield

@@ -1,0 +1,92 @@
+"""Compiled kernels at run time: packages, and what runs them where they fit."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from aaplug.core.kernels import BACKWARD, EAGER, Kernel, Kernels
+
+
+@dataclass(frozen=True)
+class Package:
+    """A kernel compiled for CPU arguments of these types, and of these shapes after the leading size."""
+
+    run: Callable[[list[Tensor]], list[Tensor]]
+    types: list[tuple[torch.dtype, list[int]]]
+
+    @staticmethod
+    def of(run: Callable[[list[Tensor]], list[Tensor]], example: tuple[Tensor, ...]) -> "Package":
+        """The package that was compiled for an example."""
+        return Package(run, [(arg.dtype, list(arg.shape[1:])) for arg in example])
+
+    def takes(self, args: tuple[Tensor, ...]) -> bool:
+        """Whether it can run these arguments; a leading size of one is a separate case to the compiler."""
+        for arg, (dtype, rest) in zip(args, self.types, strict=True):
+            leading, *found = arg.shape
+            if arg.dtype is not dtype or found != rest or leading < 2 or not arg.is_cpu:
+                return False
+        return True
+
+
+class CompiledKernels(Kernels):
+    """Runs compiled packages where they fit, and everything else eagerly: other precisions and devices.
+
+    Pickled, it is only a request: whoever unpickles it loads the packages of its own machine, or runs eagerly.
+    """
+
+    name = "compiled"
+    tiles = 2048
+
+    def __init__(
+        self,
+        packages: Mapping[str, Package],
+        later: Callable[[str], Package | None] = lambda name: None,
+    ):
+        """packages: by their kernels' names.  later: loads a package when it is first needed."""
+        self._packages: dict[str, Package | None] = dict(packages)
+        self._later = later
+
+    def __reduce__(self) -> tuple[Callable[[], Kernels], tuple[()]]:
+        return load_or_eager, ()
+
+    def run(self, kernel: Kernel, *args: Tensor) -> tuple[Tensor, ...]:
+        """Run one stage."""
+        package = self._packages.get(kernel.name)
+        if package is None or not package.takes(args):
+            return super().run(kernel, *args)
+        if not (torch.is_grad_enabled() and any(arg.requires_grad for arg in args)):
+            return tuple(package.run([arg.contiguous() for arg in args]))
+        name = kernel.name + BACKWARD
+        if name not in self._packages:
+            self._packages[name] = self._later(name)
+        backward = self._packages[name]
+        if backward is None:
+            return super().run(kernel, *args)
+        return _Tracked.apply(package, backward, *args)  # pyright: ignore[reportReturnType]
+
+
+class _Tracked(torch.autograd.Function):
+    """A compiled kernel with a compiled backward pass, which recomputes the forward pass."""
+
+    @staticmethod
+    def forward(ctx: Any, package: Package, backward: Package, *args: Tensor) -> tuple[Tensor, ...]:
+        args = tuple(arg.contiguous() for arg in args)
+        ctx.save_for_backward(*args)
+        ctx.package = backward
+        return tuple(package.run(list(args)))
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        args = ctx.saved_tensors
+        found = iter(ctx.package.run([*args, *(grad.contiguous() for grad in grads)]))
+        return None, None, *(next(found) if arg.is_floating_point() else None for arg in args)
+
+
+def load_or_eager() -> Kernels:
+    """The compiled kernels of this machine, or eager ones where none are built."""
+    from aaplug.rasterizers.tiled.ahead_of_time import load  # it imports this module
+
+    return load() or EAGER

@@ -1,0 +1,124 @@
+"""The tiled rasterizer: one depth sort, tiles, and compositing as elementwise array code that compiles to one loop.
+
+t: tiles of TILE × TILE px; P: pixels per tile.
+
+1. A pixel kernel makes one raster row per splat.
+2. `binning` finds which splats each tile draws, nearest first.
+3. `forward` composites them; `backward` differentiates that.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import chain
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from aaplug.core.imaging import over
+from aaplug.core.interfaces import Colour, Compositor, PixelKernel
+from aaplug.core.kernels import EAGER, Kernels
+from aaplug.core.rules import RULES_3DGS, Rules
+from aaplug.core.splats import Render, Splats2D
+from aaplug.methods.pixel_kernels import POINT
+from aaplug.methods.pixel_kernels.raster_rows import TILE, tile_centres
+from aaplug.rasterizers.tiled.backward import composite
+from aaplug.rasterizers.tiled.binning import MEMORY, Bins, bands
+from aaplug.rasterizers.tiled.counting import CountingKernels
+from aaplug.rasterizers.tiled.forward import Compositing
+
+Painter = Callable[[Bins], tuple[Tensor, Tensor]]
+BLENDED_TILES = (
+    64  # composited together by a compositor; sorted, so that they have about equally many splats
+)
+
+
+@dataclass(frozen=True)
+class Tiled:
+    """Draws in tiles, in the splats' precision; differentiable.
+
+    kernels: run the elementwise stages.  memory: bytes that binning may take beside the scene and the image.
+    """
+
+    kernels: Kernels = EAGER
+    memory: float = MEMORY
+
+    @property
+    def name(self) -> str:
+        """How its kernels run."""
+        return self.kernels.name
+
+    def within(self, memory: float) -> "Tiled":
+        """The same rasterizer with another memory budget, in bytes."""
+        return replace(self, memory=memory)
+
+    def counting(self, add: Callable[[int], None]) -> "Tiled":
+        """The same rasterizer, which adds up the splat-pixel evaluations of compositing."""
+        return replace(self, kernels=CountingKernels(self.kernels, add))
+
+    def __call__(
+        self,
+        splats: Splats2D,
+        hw: tuple[int, int],
+        background: Colour,
+        pixel: PixelKernel = POINT,
+        compositor: Compositor | None = None,
+        rules: Rules = RULES_3DGS,
+    ) -> Render:
+        """Draw the splats."""
+        grid = (-(-hw[0] // TILE), -(-hw[1] // TILE))
+        ellipses = pixel.bounding_ellipses(splats, rules) or splats
+        if compositor is None:
+            rows = pixel.raster_rows(splats, self.kernels)
+            paint = partial(composite, rows, how=Compositing(pixel, rules, self.kernels))
+        else:
+            paint = self._blender(splats, compositor, rules)
+
+        def painted() -> Iterator[Render]:
+            for bins in bands(ellipses, grid, self.kernels, self.memory, rules):
+                colours, alphas = paint(bins)
+                rgb, alpha = (_untiled(x, grid[1]) for x in (colours, alphas[None]))
+                yield over(rgb, alpha[..., 0], background)
+
+        whole = _assembled(painted(), grid[0] * TILE)
+        return Render(whole.rgb[: hw[0], : hw[1]], whole.alpha[: hw[0], : hw[1]])
+
+    def _blender(self, splats: Splats2D, compositor: Compositor, rules: Rules) -> Painter:
+        """Paints the tiles of a band by a compositor, tiles with about equally many splats together."""
+        rows = compositor.rows(splats)
+        local = tile_centres(rows)
+
+        def paint(bins: Bins) -> tuple[Tensor, Tensor]:
+            order = torch.sort(bins.counts, descending=True, stable=True).indices
+            parts = []
+            for tiles in order.split(BLENDED_TILES):
+                x, y = (bins.origins[tiles, i, None] + local[i] for i in (0, 1))
+                lists = (bins.splats, bins.first[tiles], bins.counts[tiles])
+                parts.append(
+                    compositor.tiles(rows, splats.window, *lists, (x, y), self.kernels, rules)
+                )
+            image = torch.cat(parts, dim=1)[:, order.argsort()].to(splats.means)
+            return image[:3], image[3]
+
+        return paint
+
+
+def _untiled(tiles: Float[Tensor, "k t P"], columns: int) -> Float[Tensor, "h w k"]:
+    """Put tiles, whole rows of them, in their places."""
+    image = tiles.view(len(tiles), -1, columns, TILE, TILE).permute(1, 3, 2, 4, 0)
+    return image.reshape(-1, columns * TILE, len(tiles))
+
+
+def _assembled(bands: Iterator[Render], height: int) -> Render:
+    """Join bands from the top; each is freed once it is in place, so that a large image exists only once."""
+    first = next(bands)
+    if len(first.rgb) == height:
+        return first
+    whole = Render(*(x.new_empty(height, *x.shape[1:]) for x in first))
+    top = 0
+    for band in chain([first], bands):
+        bottom = top + len(band.rgb)
+        whole.rgb[top:bottom], whole.alpha[top:bottom] = band
+        top = bottom
+    return whole

@@ -1,0 +1,226 @@
+"""The renderer: a scene that a recipe has prepared once, called with a camera.
+
+    renderer = Renderer.of(scene, cameras)
+    image = renderer(cameras.test[0].scaled(1 / 4)).rgb
+
+This module holds the whole flow: world filter, projection, selection, screen filter, culling, shading, rasterization,
+and averaging the samples of each pixel.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from aaplug.core.cameras import BLACK, WHITE, Camera, CameraSet
+from aaplug.core.culling import cull
+from aaplug.core.errors import UsageError
+from aaplug.core.gaussians import Gaussians
+from aaplug.core.imaging import average_samples
+from aaplug.core.interfaces import Colour, Rasterizer, RunsKernels
+from aaplug.core.kernels import EAGER, Kernels
+from aaplug.core.projection import project, shade, with_depth_slopes
+from aaplug.core.sampling import check_frame, sampling_bounds
+from aaplug.core.splats import Render, Splats2D, concatenated
+from aaplug.core.training import TrainingViews
+from aaplug.methods.filters import fuse_stored
+from aaplug.methods.recipe import Recipe
+from aaplug.methods.recipes import find_recipe, suited
+from aaplug.rasterizers import RASTERIZERS, find_rasterizer
+
+CHUNK = 1 << 20  # Gaussians projected at once
+
+Background = Literal["auto", "white", "black"] | Colour
+
+
+class Drawing(NamedTuple):
+    """A render, the splats it was made of, and height and width in px of the image that they were drawn into."""
+
+    render: Render
+    splats: Splats2D
+    hw: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Renderer:
+    """A prepared scene; call it with a camera.
+
+    scene: after the world filter.  training: of the scene as it was trained.  background: red, green, blue in [0, 1].
+    """
+
+    scene: Gaussians
+    training: TrainingViews
+    recipe: Recipe
+    rasterizer: Rasterizer = RASTERIZERS["eager"]
+    background: Colour = BLACK
+    _rates: dict[tuple[object, ...], float] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
+
+    @classmethod
+    def of(
+        cls,
+        scene: Gaussians,
+        cameras: CameraSet | Sequence[Camera] | TrainingViews,
+        recipe: str | Recipe = "auto",
+        *,
+        quality: str = "balanced",
+        background: Background = "auto",
+        rasterizer: str | Rasterizer = "auto",
+        cull_margin: float = math.inf,
+    ) -> "Renderer":
+        """Prepare a scene: check that the cameras see it, compute its sampling bounds and apply the world filter.
+
+        Args:
+            scene: as it was read.
+            cameras: the training cameras, or what was computed from them before.
+            recipe: a recipe, or its name in `RECIPES`.
+            quality: "fast", "balanced" or "best": samples per pixel of recipe "auto".
+            background: a colour, or "auto" for what training had (black where the camera files do not say).
+            rasterizer: a rasterizer, or its name: "auto" is "compiled" where `aaplug warmup` has run, else "eager".
+            cull_margin: see `TrainingViews`.
+
+        Raises:
+            FrameError: the cameras see little of the scene.
+            UsageError: a name is not known, there are no cameras, or the scene lacks what the recipe needs.
+        """
+        if isinstance(cameras, TrainingViews):
+            training = cameras
+        else:
+            views = cameras.train if isinstance(cameras, CameraSet) else cameras
+            check_frame(scene.means, views, scene.name)
+            training = TrainingViews.of(scene, views, cull_margin)
+        if isinstance(recipe, str):
+            recipe = find_recipe(recipe, quality=quality)
+        if isinstance(rasterizer, str):
+            rasterizer = find_rasterizer(rasterizer)
+        recipe = suited(recipe, scene)
+        colour = background_colour(background, cameras)
+        return cls(prepared(scene, training, recipe), training, recipe, rasterizer, colour)
+
+    def __call__(self, camera: Camera) -> Render:
+        """Render one view: rgb and alpha of `camera.hw`.
+
+        Differentiable in every parameter of the scene and in `camera.cam_from_world`.
+
+        Raises:
+            UsageError: a Gaussian in view has a colour that is NaN or infinite.
+        """
+        return self.draw(camera).render
+
+    def draw(self, camera: Camera) -> Drawing:
+        """Render one view and keep its splats, for example to read their gradients."""
+        fine, samples = self.sampled(camera)
+        splats = self.splats(fine)
+        recipe, rules = self.recipe, self.training.convention.rules
+        image = self.rasterizer(
+            splats, fine.hw, self.background, recipe.pixel, recipe.compositor, rules
+        )
+        return Drawing(average_samples(image, samples), splats, fine.hw)
+
+    def sampled(self, camera: Camera) -> tuple[Camera, int]:
+        """The larger image whose pixels are the samples, and the number of samples along a pixel's side."""
+        samples = self.samples(camera)
+        return camera.resized(camera.width * samples, camera.height * samples), samples
+
+    def samples(self, camera: Camera) -> int:
+        """Number of samples along a pixel's side."""
+        if self.recipe.target_rate == 0:
+            return self.recipe.grid
+        return self.recipe.samples_at(self.relative_rate(camera))
+
+    def relative_rate(self, camera: Camera) -> float:
+        """Sampling rate of a view against training, by which its samples per pixel are chosen.
+
+        For a pose of the data set this is its size against training's.  A free camera may be nearer or farther than
+        any training camera: for it this is the median, over the Gaussians in view, of their rate against the nearest
+        rate that training had.
+        """
+        if camera.trained_focal is not None or not self.training.bounds.seen.any():
+            return self.training.relative_rate(camera)
+        key = (*camera.intrinsics, camera.cam_from_world.detach().cpu().numpy().tobytes())
+        if key not in self._rates:
+            self._rates[key] = self._median_rate(camera)
+        return self._rates[key]
+
+    @torch.no_grad()
+    def _median_rate(self, camera: Camera) -> float:
+        bounds = self.training.bounds
+        now = sampling_bounds(self.scene.means, [camera]).highest
+        both = (now > 0) & bounds.seen
+        if not both.any():
+            return self.training.relative_rate(camera)
+        now, lowest, highest = (x[both] for x in (now, bounds.lowest, bounds.highest))
+        return float((now / torch.minimum(torch.maximum(now, lowest), highest)).median())
+
+    def splats(self, camera: Camera) -> Splats2D:
+        """What a view draws: projected, selected, filtered, culled and coloured splats.
+
+        Gaussians pass in chunks, so that memory is bounded by a chunk and by the splats that stay.
+        """
+        parts = []
+        for start in range(0, max(1, len(self.scene)), CHUNK):
+            whole = len(self.scene) <= CHUNK
+            chunk = self.scene if whole else self.scene[start : start + CHUNK]
+            splats = self._projected(chunk, start, camera)
+            parts.append(shade(splats, self.scene, camera, self._kernels))
+        splats = concatenated(parts)
+        _check_colours(splats)
+        return splats
+
+    def _projected(self, chunk: Gaussians, start: int, camera: Camera) -> Splats2D:
+        """Splats of the Gaussians from `start`, without colour."""
+        recipe, training, kernels = self.recipe, self.training, self._kernels
+        rules = training.convention.rules
+        splats = project(chunk, camera, kernels, rules)
+        if recipe.selection is not None:
+            splats = recipe.selection(splats, chunk)
+        if recipe.pixel.needs_depth_slopes:
+            splats = with_depth_slopes(splats, chunk, camera)
+        splats = replace(splats, sources=splats.sources + start)
+        splats = recipe.screen(splats, camera, training)
+        ellipses = recipe.pixel.bounding_ellipses(splats, rules)
+        return cull(splats, camera.hw, training.cull_margin, kernels, ellipses, rules)
+
+    @property
+    def _kernels(self) -> Kernels:
+        return self.rasterizer.kernels if isinstance(self.rasterizer, RunsKernels) else EAGER
+
+
+def prepared(scene: Gaussians, training: TrainingViews, recipe: Recipe) -> Gaussians:
+    """Everything that acts on the scene before a view is chosen; a stored 3D filter is part of the scene itself."""
+    scene = fuse_stored(scene)
+    return scene if recipe.world is None else recipe.world(scene, training)
+
+
+def background_colour(background: Background, cameras: object = None) -> Colour:
+    """The colour behind the scene.
+
+    Raises:
+        UsageError: the name is not known.
+    """
+    if not isinstance(background, str):
+        return background
+    named: dict[str, Colour] = {"white": WHITE, "black": BLACK}
+    if background == "auto":
+        found = cameras.background if isinstance(cameras, CameraSet) else None
+        return found or BLACK
+    if background not in named:
+        raise UsageError(
+            "background", f"expected auto, white, black or a colour, got '{background}'"
+        )
+    return named[background]
+
+
+def _check_colours(splats: Splats2D) -> None:
+    """Refuse NaN colours, which would spoil every pixel they touch."""
+    colours: Tensor | None = splats.rgb
+    assert colours is not None
+    if not colours.sum().isfinite():
+        bad = ~colours.isfinite().all(dim=1)
+        if bad.any():
+            first, count = int(splats.sources[bad].min()), int(bad.sum())
+            raise UsageError(f"Gaussian {first}", f"has no finite colour (the first of {count})")
