@@ -108,7 +108,7 @@ class PixelKernel(Protocol):
     def splats_per_pass(self) -> int: ...  # noqa: D102
 
     def bounding_ellipses(self, splats: Splats2D, rules: Rules) -> Splats2D | None:
-        """Splats whose cut-off ellipses contain every pixel centre where alpha is not 0; None for the given splats."""
+        """Splats whose cut-off ellipses contain every pixel centre with alpha above 0; None for the given splats."""
         ...
 
     def raster_rows(self, splats: Splats2D, kernels: Kernels) -> Float[Tensor, "m c"]:

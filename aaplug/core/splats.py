@@ -13,9 +13,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-MIN_COMPENSATION = (
-    0.005  # floor of the opacity factor, so that rounding erases no splat (3DGS, gsplat)
-)
+# floor of the opacity factor, so that rounding erases no splat (3DGS, gsplat)
+MIN_COMPENSATION = 0.005
 
 
 @dataclass(frozen=True)

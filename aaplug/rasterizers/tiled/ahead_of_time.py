@@ -57,14 +57,12 @@ OPTIONS = {
     "assert_indirect_indexing": False,  # indices are our own, and checking each load is slow
     "cpp.enable_floating_point_contract_flag": "fast",  # multiply and add in one instruction
 }
-TILING_HEURISTIC = (
-    "cpp.enable_tiling_heuristics"  # inductor leaves loops that gather scattered numbers scalar
-)
+# inductor leaves loops that gather scattered numbers scalar
+TILING_HEURISTIC = "cpp.enable_tiling_heuristics"
 LARGEST_SIZE = 1 << 31
 MOST_PROCESSES = 4  # compilers side by side: each takes most of a GB
-TOLERANCE = (
-    1e-4  # of the largest value: between a package's result and the eager one, on the example
-)
+# of the largest value: between a package's result and the eager one, on the example
+TOLERANCE = 1e-4
 
 
 def cache_folder() -> Path:
