@@ -122,7 +122,7 @@ class PixelKernel(Protocol):
         ...
 
     def exact(self, splats: Splats2D, offsets: Float[Tensor, "p c 2"]) -> Float[Tensor, "p c"]:
-        """The slow float64 twin: alpha over opacity at `offsets` from each splat's centre, in px, without cap or cut."""
+        """The slow float64 twin: alpha over opacity at `offsets` (px) from the splats, before cap and cut-off."""
         ...
 
 

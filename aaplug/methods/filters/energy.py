@@ -17,11 +17,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.cameras import Camera
+from aaplug.core.convolution import smoothed_by
 from aaplug.core.gaussians import MIP, Convention, Fusion, Gaussians, scale_opacities
 from aaplug.core.projection import project
 from aaplug.core.sampling import median_rates, sampling_bounds
 from aaplug.core.training import TrainingViews
-from aaplug.methods.filters.smoothing import smooth
 
 MATCHED_VARIANCE = 0.2  # px² at the median training rate: 3DGS's 0.3 without the Mip viewer's 0.1
 MAX_FUSED_OPACITY = 0.9999  # energy may ask for an opacity above 1
@@ -62,7 +62,7 @@ def _widened(scene: Gaussians, rates: Float[Tensor, " n"], variance: float) -> G
     """Add `variance` px² to every axis; a negative one is subtracted, down to `THINNEST` or the axis's own variance."""
     if variance >= 0:
         log_sigma = 0.5 * torch.tensor(variance).log() - rates.log()
-        return smooth(scene, log_sigma.where(rates > 0, -torch.inf)[:, None], volume=False)
+        return smoothed_by(scene, log_sigma.where(rates > 0, -torch.inf)[:, None], volume=False)
     px2 = (2 * (scene.log_scales + rates.log()[:, None])).exp()
     least = px2.clamp(max=THINNEST)
     share = torch.maximum(px2 + variance, least) / px2

@@ -10,9 +10,8 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
+from aaplug.core.convolution import face_log_factor, smoothed_by
 from aaplug.core.gaussians import Fusion, Gaussians, scale_opacities
 from aaplug.core.projection import rotation_matrices
 from aaplug.core.sampling import view_information
@@ -50,7 +49,7 @@ class Smoothing3D:
                 bounds, highest=torch.where(bounds.seen, largest / bounds.nearest, 0.0)
             )
         log_sigma = (self.variance**0.5 / bounds.highest_or_coarsest).log()[:, None]
-        smoothed = smooth(scene, log_sigma, self.opacity == "volume")
+        smoothed = smoothed_by(scene, log_sigma, self.opacity == "volume")
         if self.opacity == "balanced":
             factor = face_log_factor(scene.log_scales, log_sigma).clamp(min=math.log(BALANCE_FLOOR))
             logits = scale_opacities(scene.logit_opacities, factor)
@@ -82,7 +81,7 @@ class AnisotropicSmoothing:
         seen = across > 0
         share = torch.where(seen, along / across.where(seen, 1.0), 1.0).clamp(LEAST_SHARE, 1.0)
         log_sigma = (self.variance**0.5 / training.bounds.highest_or_coarsest).log()
-        smoothed = smooth(scene, log_sigma[:, None] - 0.5 * share.log(), volume=True)
+        smoothed = smoothed_by(scene, log_sigma[:, None] - 0.5 * share.log(), volume=True)
         fusion = Fusion("anisotropic smoothing", {"variance": f"{self.variance:g}"})
         return replace(smoothed, fused=(*scene.fused, fusion))
 
@@ -99,7 +98,7 @@ class FlatSmoothing:
     def __call__(self, scene: Gaussians, training: TrainingViews) -> Gaussians:
         """Fuse the smoothing into scales and opacities."""
         log_sigma = (self.variance**0.5 / training.bounds.highest_or_coarsest).log()[:, None]
-        smoothed = smooth(scene, log_sigma, volume=False)
+        smoothed = smoothed_by(scene, log_sigma, volume=False)
         thin = torch.zeros_like(scene.log_scales, dtype=torch.bool)
         thin.scatter_(1, scene.log_scales.argmin(dim=1, keepdim=True), True)
         logits = scale_opacities(
@@ -126,39 +125,5 @@ def fuse_stored(scene: Gaussians) -> Gaussians:
     """The same scene with its stored 3D filter fused; unchanged if it has none (Mip-Splatting, fused export)."""
     if scene.filter_3d is None:
         return scene
-    smoothed = smooth(scene, scene.filter_3d.log()[:, None], volume=True)
+    smoothed = smoothed_by(scene, scene.filter_3d.log()[:, None], volume=True)
     return replace(smoothed, filter_3d=None, fused=(*scene.fused, Fusion("filter_3D")))
-
-
-def smooth(scene: Gaussians, log_sigma: Float[Tensor, "n k"], volume: bool) -> Gaussians:
-    """Convolve each Gaussian with one of standard deviation e^log_sigma; -inf changes nothing.
-
-    log_sigma: one for all axes of a Gaussian, or one per axis.  volume: scale opacities by the volume factor.
-    """
-    log_scales = 0.5 * torch.logaddexp(2 * scene.log_scales, 2 * log_sigma)
-    smoothed = replace(scene, log_scales=log_scales)
-    if not volume:
-        return smoothed
-    factor = volume_log_factor(scene.log_scales, log_sigma)
-    return replace(smoothed, logit_opacities=scale_opacities(scene.logit_opacities, factor))
-
-
-def volume_log_factor(
-    log_scales: Float[Tensor, "n 3"], log_sigma: Float[Tensor, "n k"]
-) -> Float[Tensor, " n"]:
-    """ln ∏ s/√(s² + f²) = −½ Σ ln(1 + f²/s²)."""
-    return _axis_log_factors(log_scales, log_sigma).sum(dim=1)
-
-
-def face_log_factor(
-    log_scales: Float[Tensor, "n 3"], log_sigma: Float[Tensor, "n k"]
-) -> Float[Tensor, " n"]:
-    """The same over the two longest axes, which span the broadest face."""
-    return _axis_log_factors(log_scales, log_sigma).topk(2, dim=1).values.sum(dim=1)
-
-
-def _axis_log_factors(
-    log_scales: Float[Tensor, "n 3"], log_sigma: Float[Tensor, "n k"]
-) -> Float[Tensor, "n 3"]:
-    log_ratio = 2 * (log_sigma - log_scales)
-    return -0.5 * torch.logaddexp(log_ratio, torch.zeros_like(log_ratio))

@@ -24,7 +24,7 @@ import torch
 
 from aaplug.core import culling, ellipses, kernels, projection, rules, spherical_harmonics, splats
 from aaplug.core.errors import UsageError
-from aaplug.core.kernels import Kernel, one_thread
+from aaplug.core.kernels import EAGER, Kernel, Kernels, one_thread
 from aaplug.core.rules import RULES_3DGS
 from aaplug.methods.pixel_kernels import INTEGRAL, POINT, averages, integral, point, raster_rows
 from aaplug.rasterizers.tiled import backward, binning, forward
@@ -95,7 +95,13 @@ def load() -> CompiledKernels | None:
                 return None
             packages[kernel.name] = package
     pulling = {kernel.name: kernel for kernel in KERNELS if kernel.pulls_back}
-    return CompiledKernels(packages, lambda name: _load(pulling[name]) if name in pulling else None)
+    later = lambda name: _load(pulling[name]) if name in pulling else None  # noqa: E731
+    return CompiledKernels(packages, later, load_or_eager)
+
+
+def load_or_eager() -> Kernels:
+    """The compiled kernels of this machine, or eager ones where they are not built."""
+    return load() or EAGER
 
 
 def build(
