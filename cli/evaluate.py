@@ -12,7 +12,7 @@ from aaplug.evaluation.metrics import METRICS, metric_option
 from aaplug.evaluation.protocols import PROTOCOLS
 from aaplug.evaluation.results import Report, results, tables
 from aaplug.verbs.batch import batch
-from aaplug.verbs.evaluate import ALL, DEFAULT_RECIPES, check_output
+from aaplug.verbs.evaluate import ALL, DEFAULT_RECIPES, Output
 from aaplug.verbs.evaluate import evaluate as measure
 
 from .batch import scenes_of
@@ -84,6 +84,8 @@ def evaluate(options: Evaluate) -> int:
     """Measure recipes over scales, of one scene or of many."""
     if options.batch is not None or options.others.more:
         return _evaluate_many(options)
+    wanted = options.output, options.report, options.layout, options.resume, options.overwrite
+    Output(*wanted).check()  # before the scene is read
     report = _run(options)
     _print(options, results(report), tables(report))
     return 0
@@ -91,11 +93,10 @@ def evaluate(options: Evaluate) -> int:
 
 def _run(options: Evaluate, **given: Any) -> Report:
     """Evaluate one scene; `given` has precedence over the options."""
-    chosen = {"name": options.scene.path.stem} | arguments(options, measure) | given
-    check_output(**arguments(options, check_output) | given)
     scene = options.scene.read()
     cameras = options.cameras.read(options.scene)
-    return measure(scene, cameras, **{"monitor": TERMINAL} | chosen)
+    own = {"name": options.scene.path.stem, "monitor": TERMINAL}
+    return measure(scene, cameras, **arguments(options, measure) | own | given)
 
 
 def _evaluate_many(options: Evaluate) -> int:

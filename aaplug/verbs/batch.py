@@ -16,9 +16,9 @@ from aaplug.core.monitor import SILENT, Monitor
 from aaplug.evaluation.report.files import as_json, write_texts
 from aaplug.evaluation.results import Report, as_csv, method, results, scale_name
 from aaplug.io.folders import refuse_existing
-from aaplug.verbs.evaluate import check_output
+from aaplug.verbs.evaluate import Output
 
-FILES = ("batch.json", "results.csv")
+SUMMARY, RESULTS = "batch.json", "results.csv"
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Batch:
                 grid.add_column(scale_name(scale), justify="right", no_wrap=True)
             for recipe in first.recipes:
                 found = [means.get(method(recipe, s), {}).get(metric.name) for s in first.scales]
-                grid.add_row(escape(recipe), *map(metric.figures, found))
+                grid.add_row(escape(recipe), *map(metric.text, found))
             grids.append(grid)
         return grids
 
@@ -98,9 +98,9 @@ def batch(
         UsageError: `resume` and `overwrite` are both given.
     """
     folders = [Path(output) / slug for slug in _slugs([name for name, _ in runs])]
-    refuse_existing([Path(output) / name for name in FILES], overwrite or resume)
+    refuse_existing([Path(output) / name for name in (SUMMARY, RESULTS)], overwrite or resume)
     for folder in folders:
-        check_output(folder, resume=resume, overwrite=overwrite)
+        Output(folder, resume=resume, overwrite=overwrite).check()
     reports: dict[str, Report] = {}
     failures: dict[str, str] = {}
     for folder, (name, run) in zip(folders, runs, strict=True):
@@ -114,10 +114,14 @@ def batch(
             monitor.say(f"failed: {name}: {outcome}")
     names = {folder.name: name for folder, (name, _) in zip(folders, runs, strict=True)}
     found = Batch(names, reports, failures)
-    texts = dict(zip(FILES, (as_json(found.summary()), as_csv(reports)), strict=True))
+    _write(found, output, monitor)
+    return found
+
+
+def _write(found: Batch, output: str | PathLike[str], monitor: Monitor) -> None:
+    texts = {SUMMARY: as_json(found.summary()), RESULTS: as_csv(found.reports)}
     for path in write_texts(output, texts, overwrite=True):  # it was checked at the start
         monitor.say(f"wrote {path}")
-    return found
 
 
 def _outcome(run: Callable[[], Report], monitor: Monitor) -> Report | str:

@@ -6,10 +6,11 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from aaplug.evaluation.image_store import Images
+from aaplug.evaluation.image_store import ImageStore
 from aaplug.evaluation.results import Report, as_csv, per_view, results
 from aaplug.inspection.coverage import Coverage
-from aaplug.io.atomic import make_folder, replacing
+from aaplug.io.atomic import replacing
+from aaplug.io.folders import make_folder
 
 RESULTS = ("results.json", "per_view.json", "results.csv")
 PAGE, PLOTS = "report.html", "plots"
@@ -28,7 +29,8 @@ def write_texts(
     Raises:
         OutputError: a file exists and `overwrite` is false, or it cannot be written.
     """
-    paths = [make_folder(folder) / name for name in texts]
+    make_folder(Path(folder))
+    paths = [Path(folder) / name for name in texts]
     for path, text in zip(paths, texts.values(), strict=True):
         with replacing(path, overwrite) as stream:
             stream.write(text.encode())
@@ -52,7 +54,7 @@ def write_page(
     name: str,
     report: Report,
     found: Coverage,
-    images: Images,
+    images: ImageStore,
     overwrite: bool,
 ) -> list[Path]:
     """Write report.html, and its plots as PNG and SVG into plots/; return both paths.
@@ -67,7 +69,8 @@ def write_page(
 
     drawn = plots(report, found)
     written = write_texts(folder, {PAGE: page(name, report, found, drawn, images)}, overwrite)
-    beside = make_folder(Path(folder) / PLOTS)
+    beside = Path(folder) / PLOTS
+    make_folder(beside)
     for plot in drawn:
         for suffix, data in ((".png", plot.png()), (".svg", plot.svg().encode())):
             with replacing(beside / (plot.name + suffix), overwrite=True) as stream:

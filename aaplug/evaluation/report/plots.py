@@ -9,6 +9,7 @@ import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import matplotlib as mpl
@@ -16,8 +17,15 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
-from aaplug.evaluation.metrics import Metric
-from aaplug.evaluation.results import CEILING, Report, mean, scale_name, work
+from aaplug.evaluation.metric import Metric
+from aaplug.evaluation.results import (
+    CEILING,
+    Report,
+    mean,
+    million_evaluations,
+    scale_name,
+    seconds,
+)
 from aaplug.inspection.coverage import Coverage
 
 # Distinct on white and on near-black; the markers help readers who do not see all colours.
@@ -132,10 +140,18 @@ class Curves:
         return [math.nan if value is None else value for value in values]
 
 
+COSTS = (
+    ("seconds", "seconds a view", seconds),
+    ("evaluations", "million splat-pixel evaluations a view", million_evaluations),
+)
+
+
 def plots(report: Report, found: Coverage) -> list[Plot]:
     """Everything that a report draws: metrics against the truth, time and work over scale, and the sampling bounds."""
-    curves = [_metric_curves(metric, report) for metric in report.metrics if metric.compares]
-    curves += [Curves(c.name, c.title, c.value, report, from_zero=True) for c in work(report)]
+    compared = [metric for metric in report.metrics if metric.measure is not None]
+    curves = [_metric_curves(metric, report) for metric in compared]
+    for name, title, value in COSTS:
+        curves.append(Curves(name, title, partial(value, report), report, from_zero=True))
     drawn = [curve.plot for curve in curves if curve.known]
     return [*drawn, Plot(BOUNDS, _bounds_words(found), lambda ink: _bounds(found, ink))]
 

@@ -14,16 +14,20 @@ from typing import Any
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
-from aaplug.evaluation.image_store import Images
+from aaplug.evaluation.image_store import ImageStore
 from aaplug.evaluation.report.plots import BOUNDS, Plot
-from aaplug.evaluation.report.webpage.gallery import gallery
+from aaplug.evaluation.report.webpage.gallery import first_compared, gallery, with_unit
 from aaplug.evaluation.results import CEILING, Report, as_csv, mean, rows, scale_name, work
 from aaplug.inspection.coverage import Coverage
 
+COSTS = (  # what the tables of `work` mean
+    "rendering alone, on the machine that the protocol names",
+    "splat-pixel evaluations of compositing",
+)
 HIDDEN = ("metrics", "view_names")  # parts of the protocol that the page shows elsewhere
 
 
-def page(name: str, report: Report, found: Coverage, drawn: list[Plot], images: Images) -> str:
+def page(name: str, report: Report, found: Coverage, drawn: list[Plot], images: ImageStore) -> str:
     """The page's text.
 
     Raises:
@@ -47,7 +51,9 @@ def page(name: str, report: Report, found: Coverage, drawn: list[Plot], images: 
         plots=[(plot, Markup(plot.inline_svg())) for plot in drawn],
         bounds=BOUNDS,
         gallery=gallery(report, images),
-        facts=[(k.replace("_", " "), _text(v)) for k, v in report.protocol.items() if k not in HIDDEN],
+        facts=[
+            (k.replace("_", " "), _text(v)) for k, v in report.protocol.items() if k not in HIDDEN
+        ],
         csv=as_csv({name: report}),
         style=Markup(style),
         script=Markup(script),
@@ -56,29 +62,27 @@ def page(name: str, report: Report, found: Coverage, drawn: list[Plot], images: 
 
 
 def _source(name: str) -> str:
-    return files(__package__).joinpath(name).read_text(encoding="utf-8")
+    return files("aaplug.evaluation.report.webpage").joinpath(name).read_text(encoding="utf-8")
 
 
 def _headline(report: Report) -> dict[str, str] | None:
     """Best and worst recipe at the scale farthest below the training size; None where nothing was compared."""
-    metric = report.headline_metric
-    for scale in sorted(report.scales, key=lambda s: min(s, 1 / s)) if metric else ():
-        known = {
-            recipe: value
-            for recipe in report.recipes
-            if (value := mean(report.select(recipe, scale), metric.name)) is not None
-        }
-        ceiling = known.pop(CEILING, None)
-        if len(known) > 1:
-            losses = {recipe: metric.loss(value) for recipe, value in known.items()}
+    metric = first_compared(report)
+    if metric is None:
+        return None
+    for scale in sorted(report.scales, key=lambda s: min(s, 1 / s)):
+        means = {r: mean(report.select(r, scale), metric.name) for r in report.recipes}
+        ceiling = means.pop(CEILING, None)
+        losses = {r: metric.loss(value) for r, value in means.items() if value is not None}
+        if len(losses) > 1:
             best, worst = min(losses, key=losses.__getitem__), max(losses, key=losses.__getitem__)
             return {
                 "scale": scale_name(scale),
                 "best": best,
-                "best_value": metric.text(known[best]),
+                "best_value": with_unit(metric, means[best]),
                 "worst": worst,
-                "worst_value": metric.text(known[worst]),
-                "ceiling_value": "" if ceiling is None else metric.text(ceiling),
+                "worst_value": with_unit(metric, means[worst]),
+                "ceiling_value": "" if ceiling is None else with_unit(metric, ceiling),
             }
     return None
 
@@ -90,8 +94,8 @@ def _tables(report: Report) -> list[dict[str, Any]]:
         (metric.title, variants.get(metric.name, metric.protocol), rows(report, metric))
         for metric in report.metrics
     ]
-    for cost in work(report):
-        tables.append((cost.title, cost.about, [[(t, False) for t in line] for line in cost.rows]))
+    for about, (title, lines) in zip(COSTS, work(report), strict=False):
+        tables.append((title, about, [[(text, False) for text in line] for line in lines]))
     return [
         {"title": title, "about": about, "rows": list(zip(report.recipes, cells, strict=True))}
         for title, about, cells in tables

@@ -4,7 +4,8 @@ import base64
 from pathlib import Path
 from typing import Any
 
-from aaplug.evaluation.image_store import TRUTHS, Images
+from aaplug.evaluation.image_store import TRUTHS, ImageStore
+from aaplug.evaluation.metric import Metric
 from aaplug.evaluation.results import CEILING, Report, scale_name
 from aaplug.io.images import encode_webp, image_size, read_image
 
@@ -15,7 +16,7 @@ TRUTH = "truth"  # the role of the true image, beside the recipes
 Key = tuple[int, float, str]  # view, scale, and a recipe or TRUTH
 
 
-def gallery(report: Report, images: Images) -> dict[str, Any]:
+def gallery(report: Report, images: ImageStore) -> dict[str, Any]:
     """JSON-ready data for page.js.
 
     Raises:
@@ -33,7 +34,17 @@ def gallery(report: Report, images: Images) -> dict[str, Any]:
     }
 
 
-def _shots(report: Report, images: Images) -> list[dict[str, Any]]:
+def first_compared(report: Report) -> Metric | None:
+    """The first of the report's metrics that compares with the truth: the headline and the viewer show it."""
+    return next((metric for metric in report.metrics if metric.measure is not None), None)
+
+
+def with_unit(metric: Metric, value: float | None) -> str:
+    """A value in words: 31.20 dB."""
+    return f"{metric.text(value)} {metric.unit}".rstrip()
+
+
+def _shots(report: Report, images: ImageStore) -> list[dict[str, Any]]:
     """The images of every view at every scale."""
     files = _files(report, images)
     uris, scores = _uris(files), _scores(report)
@@ -55,7 +66,7 @@ def _shots(report: Report, images: Images) -> list[dict[str, Any]]:
     return shots
 
 
-def _files(report: Report, images: Images) -> dict[Key, Path]:
+def _files(report: Report, images: ImageStore) -> dict[Key, Path]:
     files: dict[Key, Path] = {}
     for view in images.shown:
         for scale in report.scales:
@@ -82,9 +93,9 @@ def _webp(path: Path, quality: int | None) -> bytes:
 
 def _scores(report: Report) -> dict[tuple[str, float, str], str]:
     """By view, scale and recipe: the value of the report's first metric against the truth, as text."""
-    metric = report.headline_metric
+    metric = first_compared(report)
     return {
-        (m.view, m.scale, m.recipe): metric.text(value)
+        (m.view, m.scale, m.recipe): with_unit(metric, value)
         for m in report.measurements
         if metric is not None and (value := m.values.get(metric.name)) is not None
     }
