@@ -155,9 +155,7 @@ def test_alpha_is_between_0_and_1(rasterize, log_sigmas):
     assert 0.5 < alpha.max() <= 1
 
 
-def test_the_background_is_added_by_one_minus_alpha(
-    rasterize, splats
-):
+def test_the_background_is_added_by_one_minus_alpha(rasterize, splats):
     on_black, on_sky = rasterize(splats, HW, (0.0, 0.0, 0.0)), rasterize(splats, HW, SKY)
     assert on_black.alpha.equal(on_sky.alpha)
     sky = (1 - on_black.alpha)[..., None] * torch.tensor(SKY)
