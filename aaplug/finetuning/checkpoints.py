@@ -100,7 +100,7 @@ def facts(job: TuningJob) -> dict[str, str]:
     start, truth = job.start, job.truth
     return settings | {
         "scene": _digest(start.scene),
-        "truth": f"{_digest(truth.renderer.scene)} photographs={truth.photographs}",
+        "truth": f"{_digest(truth.own.scene)} {truth.source}",
         "recipe": start.recipe.name,
         "views": _hash(repr([(v.name, v.hw, v.focal) for v in job.views]).encode()),
         "background": str(start.background),
