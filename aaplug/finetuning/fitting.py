@@ -9,11 +9,12 @@ from aaplug.core.monitor import SILENT, Monitor
 from aaplug.evaluation.engine import Candidate, compare
 from aaplug.evaluation.metrics import PSNR
 from aaplug.evaluation.results import Report, mean
-from aaplug.evaluation.truth import Truth
+from aaplug.evaluation.truth import MEMORY, Truth, back_projected
 from aaplug.finetuning.parameters import between
 from aaplug.finetuning.session import recorded, spread, tune
 from aaplug.finetuning.settings import QUICK, balanced
 from aaplug.finetuning.state import TuningJob
+from aaplug.methods.recipes import RECIPES
 from aaplug.methods.viewers import Viewer, fuse_for
 from aaplug.rendering.renderer import Renderer
 
@@ -39,8 +40,7 @@ def steps_for(scene: Gaussians, viewer: Viewer) -> int:
 def fit(
     scene: Gaussians,
     viewer: Viewer,
-    original: Renderer,
-    truth: Truth,
+    look: Renderer,
     views: Sequence[Camera],
     steps: int,
     monitor: Monitor = SILENT,
@@ -50,8 +50,7 @@ def fit(
     Args:
         scene: as it was read.
         viewer: that will show it.
-        original: draws the scene as the viewer would, unconverted.
-        truth: what the viewer should show.
+        look: draws the scene as training showed it, which the viewer should show.
         views: to measure on; a few of them are taken.
         steps: of the optimization; 0 keeps the closed form.
         monitor: receives messages and progress.
@@ -60,6 +59,8 @@ def fit(
         UsageError: something is fused already, or no gradient is finite.
         KeyboardInterrupt: Ctrl-C was pressed.
     """
+    truth = Truth(look, enlarge=back_projected, memory=MEMORY)
+    original = replace(look, recipe=RECIPES[viewer.recipe])
     residual = _Residual(spread(views, MEASURED), (1.0, *QUICK.weights), truth, monitor)
     start = replace(original, scene=fuse_for(scene, original.training, viewer))
     before = residual.of({ORIGINAL: original, CLOSED_FORM: start})

@@ -67,6 +67,7 @@ class Viewer:
 
 
 CLASSIC_VIEWER = Viewer("classic-viewer", "classic", CLASSIC, "0.3 px², not compensated")
+MIP_VIEWER = Viewer("mip-viewer", "mip", MIP, "0.1 px², compensated")
 VIEWERS: Registry[Viewer] = Registry(
     "viewer",
     {
@@ -74,7 +75,7 @@ VIEWERS: Registry[Viewer] = Registry(
         for viewer in (
             CLASSIC_VIEWER,
             Viewer("antialiased-viewer", "ewa", ANTIALIASED, "0.3 px², compensated"),
-            Viewer("mip-viewer", "mip", MIP, "0.1 px², compensated"),
+            MIP_VIEWER,
             Viewer("gsplat", "ewa", ANTIALIASED, 'rasterize_mode="antialiased": 0.3 px², compensated'),
         )
     },
