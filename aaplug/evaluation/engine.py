@@ -6,7 +6,7 @@ before they are compared.  Views stream: only the numbers of finished views are 
 """
 
 import math
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from os import PathLike
@@ -131,7 +131,7 @@ def evaluate(
     written = None if journal is None else Journal(Path(journal), request, resume)
     measurements = list[Measurement]()
     with written or nullcontext():
-        for index, measured in _by_view(task, written, images, tell):
+        for measured in _by_view(task, written, images, tell):
             measurements += measured
     order = task.names
     measurements.sort(key=lambda m: (order.index(m.recipe), task.scales.index(m.scale)))

@@ -9,8 +9,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.evaluation.metric import Metric
-from aaplug.evaluation.similarity import psnr
 from aaplug.evaluation.series import Series
+from aaplug.evaluation.similarity import psnr
 
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709, on the values as stored
 

@@ -96,68 +96,64 @@ def median_depth(means: Float[Tensor, "n 3"], view: Camera) -> float:
     return float(torch.median(depth[inside]))
 
 
+_OWN = (
+    Protocol("default", "aaplug: photographs where every view has one, else self", ZOOM_OUT),
+    Protocol(
+        "blender",
+        "NeRF-synthetic, single-train multi-test (Mip-Splatting, section 6.2): trained at full size, tested "
+        "down to 1/8, on white",
+        ZOOM_OUT,
+        "photographs",
+        downscale="rgba-box",
+        ssim="3dgs",
+        lpips="3dgs",
+        background=WHITE,
+    ),
+    Protocol(
+        "360-zoom-out",
+        "Mip-NeRF 360 trained at full size, rendered at 1, 1/2, 1/4 and 1/8 of it (3DGS's -r 1, 2, 4, 8)",
+        ZOOM_OUT,
+        "photographs",
+        downscale="pil-bicubic",
+        whole_sizes=True,
+        ssim="3dgs",
+        lpips="3dgs",
+    ),
+    Protocol(
+        "360-zoom-in",
+        "Mip-NeRF 360, single-train multi-test (Mip-Splatting, section 6.3): trained at -r 8, rendered at -r 8, 4, "
+        "2 and 1",
+        ZOOM_IN,
+        "photographs",
+        downscale="pil-bicubic",
+        whole_sizes=True,
+        ssim="3dgs",
+        lpips="3dgs",
+    ),
+    Protocol(
+        "distance",
+        "the camera moves away and nearer, the focal length stays (the argument of LOD-GS, arXiv 2507.00554); "
+        "against the scene's own supersampled look",
+        ZOOM_OUT,
+        "self",
+        change="distance",
+    ),
+    Protocol(
+        "fov",
+        "the focal length changes, pose and image size stay; against the scene's own supersampled look",
+        ZOOM_OUT,
+        "self",
+        change="fov",
+    ),
+    Protocol(
+        "self",
+        "no photographs: against the scene's own training-size look, averaged down, and `matched` above that size",
+        ZOOM_OUT,
+        "self",
+    ),
+)
 PROTOCOLS: Registry[Protocol] = Registry(
     "protocol",
-    {
-        protocol.name: protocol
-        for protocol in (
-            Protocol(
-                "default", "aaplug: photographs where every view has one, else self", ZOOM_OUT
-            ),
-            Protocol(
-                "blender",
-                "NeRF-synthetic, single-train multi-test (Mip-Splatting, section 6.2): trained at full size, tested "
-                "down to 1/8, on white",
-                ZOOM_OUT,
-                "photographs",
-                downscale="rgba-box",
-                ssim="3dgs",
-                lpips="3dgs",
-                background=WHITE,
-            ),
-            Protocol(
-                "360-zoom-out",
-                "Mip-NeRF 360 trained at full size, rendered at 1, 1/2, 1/4 and 1/8 of it (3DGS's -r 1, 2, 4, 8)",
-                ZOOM_OUT,
-                "photographs",
-                downscale="pil-bicubic",
-                whole_sizes=True,
-                ssim="3dgs",
-                lpips="3dgs",
-            ),
-            Protocol(
-                "360-zoom-in",
-                "Mip-NeRF 360, single-train multi-test (Mip-Splatting, section 6.3): trained at -r 8, rendered at -r 8, 4, "
-                "2 and 1",
-                ZOOM_IN,
-                "photographs",
-                downscale="pil-bicubic",
-                whole_sizes=True,
-                ssim="3dgs",
-                lpips="3dgs",
-            ),
-            Protocol(
-                "distance",
-                "the camera moves away and nearer, the focal length stays (the argument of LOD-GS, arXiv 2507.00554); "
-                "against the scene's own supersampled look",
-                ZOOM_OUT,
-                "self",
-                change="distance",
-            ),
-            Protocol(
-                "fov",
-                "the focal length changes, pose and image size stay; against the scene's own supersampled look",
-                ZOOM_OUT,
-                "self",
-                change="fov",
-            ),
-            Protocol(
-                "self",
-                "no photographs: against the scene's own training-size look, averaged down, and `matched` above that size",
-                ZOOM_OUT,
-                "self",
-            ),
-        )
-    },
+    {protocol.name: protocol for protocol in _OWN},
     check=lambda value: isinstance(value, Protocol),
 )

@@ -138,7 +138,7 @@ def work(report: Report) -> list[tuple[str, list[list[str]]]]:
 
 
 def results(report: Report) -> dict[str, Any]:
-    """INRIA's results.json, {method: {metric: mean}} with methods named recipe@scale; the protocol is under "_aaplug"."""
+    """INRIA's results.json, {method: {metric: mean}}, methods named recipe@scale; the protocol is "_aaplug"."""
     methods = {
         method(recipe, scale): {
             m.name: mean(report.select(recipe, scale), m.name) for m in report.metrics
@@ -150,7 +150,7 @@ def results(report: Report) -> dict[str, Any]:
 
 
 def per_view(report: Report) -> dict[str, Any]:
-    """INRIA's per_view.json, {method: {metric: {view: value}}}, with samples per pixel side, seconds and evaluations."""
+    """INRIA's per_view.json, {method: {metric: {view: value}}}, and samples per pixel side, seconds, evaluations."""
     methods: dict[str, Any] = {}
     for recipe in report.recipes:
         for scale in report.scales:

@@ -9,6 +9,7 @@ script does, and so reads higher the smaller the image (by 0.003 at 512 px, 0.00
 
 import importlib.util
 import math
+from typing import Any
 
 import cv2
 import numpy as np
@@ -42,7 +43,7 @@ def ssim(
     if flavour == "3dgs":  # scikit-image crops the border that is added here, and nothing else
         border = SSIM_WINDOW // 2
         a, b = (np.pad(x, ((border, border), (border, border), (0, 0))) for x in (a, b))
-    value = structural_similarity(
+    value: Any = structural_similarity(
         a,
         b,
         channel_axis=2,

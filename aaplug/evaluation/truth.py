@@ -1,8 +1,8 @@
 """The truth: the image that a view should show at a scale.
 
-It is made from one larger image, the photograph or the scene's own look at the training size.  Below that size the truth
-is this image averaged down.  Above it there is none: the scene's own supersampled look stands in, or an estimate
-(`Enlarge`), or nothing.  Where a protocol moves the camera, the truth is the scene's own supersampled look there.
+It comes from one larger image: the photograph, or the scene's own look at the training size.  Below that size the
+truth is this image averaged down.  Above it, the truth is the scene's own supersampled look, an estimate (`Enlarge`),
+or undefined.  Where a protocol moves the camera, the truth is the scene's own supersampled look from there.
 """
 
 import math
@@ -124,7 +124,7 @@ class Truth:
 
 
 class ViewTruth:
-    """The truth of one view: its photograph is read and its training-size look drawn at most once, and only if needed."""
+    """The truth of one view.  Its photograph is read, and its training-size look drawn, at most once and on demand."""
 
     def __init__(self, truth: Truth, view: Camera):
         self.truth, self.view = truth, view
