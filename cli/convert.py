@@ -4,8 +4,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-import tyro
-
 from aaplug.evaluation.results import results, tables
 from aaplug.methods.viewers import FORMS, VIEWERS, fused_in
 from aaplug.verbs import convert as verb
@@ -16,7 +14,7 @@ from .options import CameraOptions, SceneOptions, ViewOptions, arguments, flag
 
 @dataclass(frozen=True)
 class Convert:
-    """Fuse anti-aliasing into a plain scene file, for viewers with the 2D Mip filter (0.1 px², compensated) or another."""
+    """Fuse anti-aliasing into a plain scene file, for the 2D Mip filter (0.1 px², compensated) or a named viewer."""
 
     output: Annotated[Path, flag("FILE", "-o")]
     """Where to write: .ply, or .spz or .splat, which round values and keep less."""

@@ -17,7 +17,7 @@ from .options import CameraOptions, SceneOptions, ViewOptions, arguments, choice
 
 @dataclass(frozen=True)
 class Finetune:
-    """Optimize the Gaussians until every scale looks like the training size, averaged down, and write a plain scene file.
+    """Optimize the Gaussians until every scale looks like the training size, averaged down; write a plain scene file.
 
     A report (.finetune.json), pictures (.finetune.png) and a checkpoint go beside it.  Ctrl-C stops after the current
     step; --resume continues.

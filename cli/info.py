@@ -19,7 +19,7 @@ HIDDEN = ("fused", "comments")  # keys for programs; the table has words for the
 
 @dataclass(frozen=True)
 class Info:
-    """What a scene is: its convention and why, what is fused, what is odd, and with cameras how finely they sample it."""
+    """What a scene is: its convention and why, what is fused, what is odd; with cameras, how finely they sample it."""
 
     scene: SceneOptions = field(default_factory=SceneOptions)
     cameras: CameraOptions = field(default_factory=CameraOptions)

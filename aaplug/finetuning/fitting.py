@@ -18,7 +18,11 @@ from aaplug.methods.recipes import RECIPES
 from aaplug.methods.viewers import Viewer, fuse_for
 from aaplug.rendering.renderer import Renderer
 
-SHARES = (0.5, 0.25, 0.125)  # of the way to the tuned scene, tried while a scale is worse than the original
+SHARES = (
+    0.5,
+    0.25,
+    0.125,
+)  # of the way to the tuned scene, tried while a scale is worse than the original
 ROUNDING = (1 / 255) ** 2 / 12  # mean square error of rounding to 8 bits
 MEASURED = 8  # views, evenly spaced, that scenes are compared on
 ORIGINAL, CLOSED_FORM, CONVERTED = "original", "closed form", "converted"  # rows of the report

@@ -25,10 +25,16 @@ from aaplug.rendering.renderer import Drawing
 
 BOUNDS_EVERY = 100  # steps between computations of the sampling bounds (Mip-Splatting)
 MAX_LOGIT = 9.0  # of an opacity: 0.9999, where its gradient has vanished
-MAX_BAD_STEPS = 3  # in a row without a finite gradient, after which the run returns to its last good state
+MAX_BAD_STEPS = (
+    3  # in a row without a finite gradient, after which the run returns to its last good state
+)
 BACK_OFF = 0.5  # factor on the learning rates after each rollback
 MAX_ROLLBACKS = 5
-SEEDS, SCALE_SEEDS, SPLIT_SEEDS = 10_000_019, 3_000_000, 6_000_000  # offsets that keep the draws apart
+SEEDS, SCALE_SEEDS, SPLIT_SEEDS = (
+    10_000_019,
+    3_000_000,
+    6_000_000,
+)  # offsets that keep the draws apart
 
 
 def run(

@@ -1,8 +1,8 @@
 """The scene as leaves that an optimizer moves, 3DGS's learning rates, and the bounds that the leaves keep.
 
-n: Gaussians.  Colours are two leaves, the constant (dc) and the other harmonics (rest), because 3DGS gives them learning
-rates of their own.  No Gaussian may become thinner than its sampling bound, or than it was if it was thinner: no training
-view could resolve less than √0.2 px at its highest rate (Mip-Splatting, section 5.1).
+n: Gaussians.  Colours are two leaves, the constant (dc) and the other harmonics (rest), because 3DGS gives them
+learning rates of their own.  No Gaussian may become thinner than its sampling bound, or than it was if it was thinner:
+no training view could resolve less than √0.2 px at its highest rate (Mip-Splatting, section 5.1).
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,7 +19,9 @@ from aaplug.methods.filters import NYQUIST_VARIANCE
 
 Leaves = dict[str, Tensor]
 
-RATES: Mapping[str, float] = {  # 3DGS's, per step; that of the means is a share of the scene's extent
+RATES: Mapping[
+    str, float
+] = {  # 3DGS's, per step; that of the means is a share of the scene's extent
     "means": 1.6e-4,
     "quats": 1e-3,
     "log_scales": 5e-3,

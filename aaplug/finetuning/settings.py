@@ -47,13 +47,15 @@ OURS = Settings(
 )
 # 3DGS's rates worsen a scene that is nearly right, and 300 steps are too few to recover
 GENTLE = 0.3
-QUICK = replace(  # for conversion, a few minutes; `balanced` divides its weights by the scene's errors
-    OURS,
-    name="quick",
-    steps=300,
-    weights={0.5: 1.0, 0.25: 1.0, 0.125: 1.0},
-    anchor=4.0,
-    rates={name: GENTLE * rate for name, rate in RATES.items()},
+QUICK = (
+    replace(  # for conversion, a few minutes; `balanced` divides its weights by the scene's errors
+        OURS,
+        name="quick",
+        steps=300,
+        weights={0.5: 1.0, 0.25: 1.0, 0.125: 1.0},
+        anchor=4.0,
+        rates={name: GENTLE * rate for name, rate in RATES.items()},
+    )
 )
 
 
@@ -92,7 +94,8 @@ def mipmap_gs(scales: Sequence[float], move: Sequence[str] = (), anchor: float =
 class Method:
     """A way to fine-tune.
 
-    settings: from the scales, the parameters that move and the anchor.  viewer: that it tunes for unless asked otherwise.
+    settings: from the scales, the parameters that move and the anchor.
+    viewer: the default target.
     """
 
     settings: Callable[[Sequence[float], Sequence[str], float], Settings]

@@ -1,7 +1,7 @@
 """Conversion in closed form: anti-aliasing fused into a plain scene, for a viewer that knows nothing of it.
 
 A viewer draws by a rule of its own: a 2D kernel, compensated or not.  `fuse` makes a scene for the Mip rule (0.1 px²,
-compensated), `fuse_for` one for a named viewer.  Both look at one Gaussian at a time; `aaplug.finetuning` can start from
+compensated), `fuse_for` one for a named viewer.  Both treat each Gaussian alone; `aaplug.finetuning` can start from
 their result and optimize all Gaussians together.
 """
 
@@ -14,7 +14,9 @@ from aaplug.core.registry import Registry
 from aaplug.core.training import TrainingViews
 from aaplug.methods.filters import MatchedEnergy, Smoothing3D, fuse_stored
 
-FITTED_VARIANCE = 0.1  # px²; measured: a scene trained without compensation, for a compensating viewer
+FITTED_VARIANCE = (
+    0.1  # px²; measured: a scene trained without compensation, for a compensating viewer
+)
 TUNED = "finetune"  # the method that fine-tuning records; it adds no blur
 
 

@@ -19,8 +19,8 @@ from aaplug.core.monitor import SILENT, Monitor
 from aaplug.core.sampling import MIN_SEEN_SHARE, sampling_bounds
 from aaplug.core.training import TrainingViews
 from aaplug.evaluation.engine import Candidate, compare
-from aaplug.evaluation.report.contact_sheet import contact_sheet
 from aaplug.evaluation.protocols import TruthSource
+from aaplug.evaluation.report.contact_sheet import contact_sheet
 from aaplug.evaluation.results import Report, results, scale_name
 from aaplug.evaluation.truth import (
     MEMORY,
@@ -121,7 +121,8 @@ def finetune(
         move: parameters that move, names in `RATES`.
         learning_rate: factor on the method's learning rates.
         densify_every: steps between densifications, 0 for none; None for the method's own.
-        truth: "self", the scene's own render, "photographs", or "auto" for photographs where all training views have one.
+        truth: "self" (the scene's own render), "photographs", or "auto" for photographs where every training view has
+            one.
         upsampler: for scales above 1 without photographs that large: "bicubic", "lanczos" or a network's file; None for
             the scene's own render there, corrected to the averages of the training size.
         seed: of what the steps draw.
@@ -134,8 +135,8 @@ def finetune(
         monitor: receives messages and progress.
 
     Raises:
-        AaplugError: an input cannot be read, an argument does not fit, there is nothing to resume, no gradient is finite,
-            or an output cannot be written.
+        AaplugError: an input cannot be read, an argument does not fit, there is nothing to resume, no gradient is
+            finite, or an output cannot be written.
         KeyboardInterrupt: Ctrl-C stopped the run; its checkpoint is written.
     """
     chosen = METHODS.find(method, "method")

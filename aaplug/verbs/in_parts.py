@@ -1,8 +1,8 @@
 """Conversion of scenes larger than memory, part by part, with the values that converting the whole would give.
 
 A closed form treats each Gaussian alone, so parts can be read, converted and written one after the other.  One value
-depends on all of them: the coarsest sampling rate, which stands in for Gaussians that no camera sees.  A first pass over
-the file finds it.
+depends on all of them: the coarsest sampling rate, which stands in for Gaussians that no camera sees.  A first pass
+over the file finds it.
 """
 
 import math

@@ -36,7 +36,7 @@ def info(
 
     Args:
         scene: a scene's file, opened or not, or a model folder.
-        cameras: training cameras, their file or folder: also tell how finely they sample the scene.  None tells nothing.
+        cameras: training cameras, their file or folder, to tell also how finely they sample the scene.
         min_seen: share of the Gaussians that the cameras must see.
         monitor: receives progress.
 
