@@ -15,7 +15,7 @@ from aaplug.core.errors import AaplugError
 from aaplug.core.monitor import SILENT, Monitor
 from aaplug.evaluation.report.files import as_json, write_texts
 from aaplug.evaluation.results import Report, as_csv, method, results, scale_name
-from aaplug.io.folders import refuse_existing
+from aaplug.io.atomic import refuse_existing
 from aaplug.verbs.evaluate import Output
 
 SUMMARY, RESULTS = "batch.json", "results.csv"

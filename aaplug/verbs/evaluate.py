@@ -28,8 +28,8 @@ from aaplug.evaluation.report.files import PAGE, RESULTS, write_page, write_resu
 from aaplug.evaluation.results import Report
 from aaplug.evaluation.truth import Truth, own_look, source_of
 from aaplug.inspection.coverage import coverage
+from aaplug.io.atomic import refuse_existing
 from aaplug.io.cameras import select_views
-from aaplug.io.folders import refuse_existing
 from aaplug.methods.recipe import Recipe
 from aaplug.methods.recipes import RECIPES, USER_RECIPES, find_recipe, suited
 from aaplug.rendering.renderer import Background

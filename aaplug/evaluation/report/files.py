@@ -9,8 +9,7 @@ from typing import Any
 from aaplug.evaluation.image_store import ImageStore
 from aaplug.evaluation.results import Report, as_csv, per_view, results
 from aaplug.inspection.coverage import Coverage
-from aaplug.io.atomic import replacing
-from aaplug.io.folders import make_folder
+from aaplug.io.atomic import make_folder, replacing
 
 RESULTS = ("results.json", "per_view.json", "results.csv")
 PAGE, PLOTS = "report.html", "plots"
