@@ -126,3 +126,18 @@ def make_splats(
         sources=torch.arange(m),
         rgb=torch.rand(m, 3, generator=g),
     )
+
+
+def splats_of(*rows: tuple) -> Splats2D:
+    """Splats of (mean, covariance, depth, opacity, colour), in float64."""
+    means, covs, depths, opacities, colours = zip(*rows, strict=True)
+    covs = torch.tensor(covs, dtype=torch.float64)
+    return Splats2D(
+        means=torch.tensor(means, dtype=torch.float64),
+        covs=covs,
+        dets=covs[:, 0] * covs[:, 2] - covs[:, 1].square(),
+        depths=torch.tensor(depths, dtype=torch.float64),
+        opacities=torch.tensor(opacities, dtype=torch.float64),
+        sources=torch.arange(len(rows)),
+        rgb=torch.tensor(colours, dtype=torch.float64),
+    )

@@ -41,7 +41,7 @@ def task(views, **changes) -> Task:
 
 
 def test_figures_are_those_of_the_images_compared_by_hand(world):
-    scene, training, views = world
+    look, views = world
     report = evaluate(scene, training, task(views))
     for view in views:
         photo = quantised(read_image(view.photo, None))
@@ -52,7 +52,7 @@ def test_figures_are_those_of_the_images_compared_by_hand(world):
 
 
 def test_the_ceiling_is_always_among_the_rows(world):
-    scene, training, views = world
+    look, views = world
     report = evaluate(scene, training, task(views))
     assert report.recipes == (CEILING, "classic", "matched")
     full = render(scene, views[0], RECIPES["classic"], training).rgb.clamp(0, 1)
@@ -63,7 +63,7 @@ def test_the_ceiling_is_always_among_the_rows(world):
 
 
 def test_above_the_photographs_size_metrics_are_undefined_and_say_why(world):
-    scene, training, views = world
+    look, views = world
     report = evaluate(scene, training, task(views))
     assert mean(report.select("matched", 2.0), "PSNR") is None
     assert results(report)["matched@2"] == {"PSNR": None, "SSIM": None}
@@ -71,7 +71,7 @@ def test_above_the_photographs_size_metrics_are_undefined_and_say_why(world):
 
 
 def test_self_truth_needs_no_photographs_and_makes_the_ceiling_perfect(world):
-    scene, training, views = world
+    look, views = world
     bare = [replace(view, photo=None) for view in views]
     report = evaluate(scene, training, task(bare, truth="self"))
     assert mean(report.select(CEILING, 0.5), "PSNR") is None  # equal images
@@ -84,20 +84,20 @@ def test_self_truth_needs_no_photographs_and_makes_the_ceiling_perfect(world):
 
 
 def test_photographs_are_demanded_where_they_are_the_truth(world):
-    scene, training, views = world
+    look, views = world
     with pytest.raises(UsageError, match="a: has no photograph"):
         evaluate(scene, training, task([replace(views[0], photo=None)]))
 
 
 @pytest.mark.parametrize("changes", [{"scales": ()}, {"scales": (0.0,)}, {"scales": (1.0, 1.0)}])
 def test_empty_or_doubled_work_is_refused(world, changes):
-    scene, training, views = world
+    look, views = world
     with pytest.raises(UsageError):
         evaluate(scene, training, task(views, **changes))
 
 
 def test_per_view_has_every_view_and_results_their_mean(world):
-    scene, training, views = world
+    look, views = world
     report = evaluate(scene, training, task(views, scales=(0.5,)))
     values = per_view(report)["matched@0.5"]["PSNR"]
     assert list(values) == ["a", "b"]
@@ -105,7 +105,7 @@ def test_per_view_has_every_view_and_results_their_mean(world):
 
 
 def test_tables_show_every_recipe_and_scale(world):
-    scene, training, views = world
+    look, views = world
     report = evaluate(scene, training, task(views))
     for table in tables(report):
         assert table.row_count == 3
@@ -113,7 +113,7 @@ def test_tables_show_every_recipe_and_scale(world):
 
 
 def test_progress_counts_views(world):
-    scene, training, views = world
+    look, views = world
     told = []
     evaluate(
         scene, training, task(views, scales=(0.5,)), progress=lambda *counts: told.append(counts)
@@ -129,7 +129,7 @@ def test_scales_are_written_as_people_do(scale, name):
 
 
 def test_evaluation_is_deterministic(world):
-    scene, training, views = world
+    look, views = world
     reports = [evaluate(scene, training, task(views, scales=(0.5,))) for _ in range(2)]
     values = [[m.values for m in report.measurements] for report in reports]
     assert values[0] == values[1]
@@ -137,7 +137,7 @@ def test_evaluation_is_deterministic(world):
 
 
 def test_pairs_are_counted_and_fewer_where_images_are_smaller(world):
-    scene, training, views = world
+    look, views = world
     report = evaluate(scene, training, task(views))
     for recipe in ("classic", "matched"):
         small, full = (report.select(recipe, scale)[0].pairs for scale in (0.5, 1.0))
@@ -148,7 +148,7 @@ def test_pairs_are_counted_and_fewer_where_images_are_smaller(world):
 
 @pytest.mark.parametrize("name", [n for n, r in RECIPES.items() if r.selection is None])
 def test_the_pairs_of_every_recipe_are_counted(world, name):
-    scene, training, views = world
+    look, views = world
     chosen = replace(task(views[:1], scales=(0.5,)), recipes=[RECIPES[name]])
     (found,) = evaluate(scene, training, chosen).select(name, 0.5)
     assert found.pairs is not None
@@ -159,7 +159,7 @@ FIGURES = (CONSISTENCY, ENERGY, FLICKER)
 
 
 def test_figures_without_a_photograph_are_those_taken_by_hand(world):
-    scene, training, views = world
+    look, views = world
     report = evaluate(scene, training, task(views, figures=FIGURES))
     full = render(scene, views[0], RECIPES["classic"], training)
     small = render(scene, views[0].scaled(0.5), RECIPES["classic"], training)
@@ -174,7 +174,7 @@ def test_figures_without_a_photograph_are_those_taken_by_hand(world):
 
 
 def test_flicker_of_supersampling_is_nearer_to_motion_alone(world):
-    scene, training, views = world
+    look, views = world
     recipes = [RECIPES["ewa"], find_recipe("auto", quality="best")]
     work = replace(task(views[:1], scales=(0.25,), figures=(FLICKER,)), recipes=recipes)
     report = evaluate(scene, training, work)
@@ -184,7 +184,7 @@ def test_flicker_of_supersampling_is_nearer_to_motion_alone(world):
 
 
 def test_figures_need_scale_1_and_are_null_without(world):
-    scene, training, views = world
+    look, views = world
     report = evaluate(scene, training, task(views[:1], scales=(0.5,), figures=FIGURES[:2]))
     assert mean(report.select("classic", 0.5), "consistency") is None
     assert mean(report.select("classic", 0.5), "energy drift") is None
@@ -192,7 +192,7 @@ def test_figures_need_scale_1_and_are_null_without(world):
 
 @pytest.mark.parametrize("name", ["distance", "fov"])
 def test_moved_cameras_are_judged_by_the_supersampled_look(world, name):
-    scene, training, views = world
+    look, views = world
     recipes = [RECIPES["classic"], find_recipe("matched", rate="interval")]
     work = replace(
         task(views, scales=(1.0, 0.25), truth="self", protocol=PROTOCOLS[name]), recipes=recipes
@@ -205,7 +205,7 @@ def test_moved_cameras_are_judged_by_the_supersampled_look(world, name):
 
 
 def test_a_protocol_names_its_flavours_in_every_result(world):
-    scene, training, views = world
+    look, views = world
     work = task(views[:1], scales=(1.0, 0.5), protocol=PROTOCOLS["360-zoom-out"])
     report = evaluate(scene, training, work)
     assert results(report)["_aaplug"]["metrics"]["SSIM"] == SSIM["3dgs"].protocol
@@ -219,13 +219,13 @@ def test_a_protocol_names_its_flavours_in_every_result(world):
 
 
 def test_photographs_do_not_show_moved_cameras(world):
-    scene, training, views = world
+    look, views = world
     with pytest.raises(UsageError, match="moves the camera"):
         evaluate(scene, training, task(views, protocol=PROTOCOLS["fov"]))
 
 
 def test_views_of_one_name_are_told_apart(world):
-    scene, training, views = world
+    look, views = world
     twins = [replace(view, name="same") for view in views]
     report = evaluate(scene, training, task(twins, scales=(0.5,)))
     assert list(per_view(report)["classic@0.5"]["PSNR"]) == ["00000_same", "00001_same"]
@@ -236,7 +236,7 @@ class StoppedError(Exception):
 
 
 def test_an_interrupted_evaluation_continues_and_redoes_nothing(world, tmp_path, monkeypatch):
-    scene, training, views = world
+    look, views = world
     whole = evaluate(scene, training, task(views), record=tmp_path / "whole.jsonl")
     path = tmp_path / "progress.jsonl"
 
@@ -266,7 +266,7 @@ def test_an_interrupted_evaluation_continues_and_redoes_nothing(world, tmp_path,
 
 
 def test_images_lie_where_3dgs_scripts_look(world, tmp_path):
-    scene, training, views = world
+    look, views = world
     store = Images(tmp_path, shown=(1,), everything=True)
     evaluate(scene, training, task(views), images=store)
     every = sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.png"))
@@ -281,7 +281,7 @@ def test_images_lie_where_3dgs_scripts_look(world, tmp_path):
 
 
 def test_csv_holds_a_line_a_measurement(world):
-    scene, training, views = world
+    look, views = world
     report = evaluate(scene, training, task(views))
     lines = as_csv({'a "scene"': report}).splitlines()
     assert lines[0] == "scene,protocol,recipe,scale,view,PSNR,SSIM,samples,pairs,seconds,note"

@@ -97,6 +97,7 @@ def test_lpips_of_equal_images_is_zero_and_of_tiny_ones_undefined(weights):
     assert metric.measure(image, image) == 0
     assert metric.measure(image, 1 - image) > 0
     assert metric.measure(image[:20], image[:20]) is None
+    assert "32 px" in metric.undefined
 
 
 def test_other_files_are_refused(weights, tmp_path):

@@ -11,7 +11,7 @@ from skimage.metrics import structural_similarity
 from torch.nn.functional import conv2d, pad
 
 from aaplug.evaluation.metrics import METRICS, energy_drift, flicker, flip, psnr, ssim
-from aaplug.io.images import downsample
+from aaplug.core.imaging import box_average
 
 
 def test_psnr_of_a_constant_error():
@@ -79,7 +79,7 @@ BORDER = [
 def test_the_border_reads_higher_the_smaller_the_image():
     photo, noise = torch.from_numpy(astronaut() / 255), np.random.default_rng(0)
     for side, padded, cropped in BORDER:
-        truth = downsample(photo, 512 // side)
+        truth = box_average(photo, 512 // side)
         blurred = gaussian_filter(truth.numpy(), (0.7, 0.7, 0))
         image = torch.from_numpy(np.clip(blurred + noise.normal(0, 0.02, truth.shape), 0, 1))
         assert ssim(image, truth, "3dgs") == pytest.approx(padded, abs=6e-5)

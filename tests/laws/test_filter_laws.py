@@ -240,7 +240,9 @@ def test_rates_of_a_free_camera_are_compared_with_the_range_of_training(
 ):
     # one Gaussian at the origin, trained from 4 and from 8 away
     scene = replace(make_scene(1, dtype=F64), means=torch.zeros(1, 3, dtype=F64))
-    training = TrainingViews.of(scene, [make_camera((0.0, -4.0, 0.0)), make_camera((8.0, 0.0, 0.0))])
+    training = TrainingViews.of(
+        scene, [make_camera((0.0, -4.0, 0.0)), make_camera((8.0, 0.0, 0.0))]
+    )
     free = replace(make_camera((0.0, -depth, 0.0)), trained_focal=None)
     splats = project(scene, free)
     rates = {
@@ -255,10 +257,14 @@ def test_rates_of_a_free_camera_are_compared_with_the_range_of_training(
 
 @pytest.mark.parametrize("scale", [4.0, 1.0, 0.95, 0.5, 0.1])
 @pytest.mark.parametrize(("pose", "highest"), [(4.0, 1.0), (4.3, 4.3 / 4), (8.0, 2.0)])
-def test_rates_at_a_pose_are_its_own_and_the_reference_rises_where_it_is_small(scale, pose, highest):
+def test_rates_at_a_pose_are_its_own_and_the_reference_rises_where_it_is_small(
+    scale, pose, highest
+):
     """One Gaussian trained from 4 and from 8 away, seen from a held-out pose of the data set."""
     scene = replace(make_scene(1, dtype=F64), means=torch.zeros(1, 3, dtype=F64))
-    training = TrainingViews.of(scene, [make_camera((0.0, -4.0, 0.0)), make_camera((8.0, 0.0, 0.0))])
+    training = TrainingViews.of(
+        scene, [make_camera((0.0, -4.0, 0.0)), make_camera((8.0, 0.0, 0.0))]
+    )
     view = make_camera((0.0, -pose, 0.0))
     view = replace(view, fx=view.fx * scale, fy=view.fy * scale)
     rate = Matched("pose").rates(project(scene, view), view, training).item()
@@ -398,7 +404,9 @@ def test_a_world_filter_records_its_variance(world):
     assert changed.fused[0].settings["variance"] == "0.125"
 
 
-@pytest.mark.parametrize("world", [Smoothing3D(), FlatSmoothing(), StoredSmoothing(), MatchedEnergy()])
+@pytest.mark.parametrize(
+    "world", [Smoothing3D(), FlatSmoothing(), StoredSmoothing(), MatchedEnergy()]
+)
 def test_isotropic_smoothing_keeps_the_order_of_the_axes(world):
     scene = world_scene()
     filtered = world(scene, TrainingViews.of(scene, CAMERAS))

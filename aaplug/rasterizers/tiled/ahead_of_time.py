@@ -7,15 +7,12 @@ result differs from the eager one, is built again.
 
 import hashlib
 import inspect
-import multiprocessing
 import os
 import shutil
 import sys
 import tempfile
 import warnings
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -24,7 +21,8 @@ import torch
 
 from aaplug.core import culling, ellipses, kernels, projection, rules, spherical_harmonics, splats
 from aaplug.core.errors import UsageError
-from aaplug.core.kernels import Kernel, one_thread
+from aaplug.core.executors import Processes
+from aaplug.core.kernels import EAGER, Kernel, Kernels, one_thread
 from aaplug.core.rules import RULES_3DGS
 from aaplug.methods.pixel_kernels import INTEGRAL, POINT, averages, integral, point, raster_rows
 from aaplug.rasterizers.tiled import backward, binning, forward
@@ -57,14 +55,12 @@ OPTIONS = {
     "assert_indirect_indexing": False,  # indices are our own, and checking each load is slow
     "cpp.enable_floating_point_contract_flag": "fast",  # multiply and add in one instruction
 }
-TILING_HEURISTIC = (
-    "cpp.enable_tiling_heuristics"  # inductor leaves loops that gather scattered numbers scalar
-)
+# inductor leaves loops that gather scattered numbers scalar
+TILING_HEURISTIC = "cpp.enable_tiling_heuristics"
 LARGEST_SIZE = 1 << 31
 MOST_PROCESSES = 4  # compilers side by side: each takes most of a GB
-TOLERANCE = (
-    1e-4  # of the largest value: between a package's result and the eager one, on the example
-)
+# of the largest value: between a package's result and the eager one, on the example
+TOLERANCE = 1e-4
 
 
 def cache_folder() -> Path:
@@ -97,7 +93,13 @@ def load() -> CompiledKernels | None:
                 return None
             packages[kernel.name] = package
     pulling = {kernel.name: kernel for kernel in KERNELS if kernel.pulls_back}
-    return CompiledKernels(packages, lambda name: _load(pulling[name]) if name in pulling else None)
+    later = lambda name: _load(pulling[name]) if name in pulling else None  # noqa: E731
+    return CompiledKernels(packages, later, load_or_eager)
+
+
+def load_or_eager() -> Kernels:
+    """The compiled kernels of this machine, or eager ones where they are not built."""
+    return load() or EAGER
 
 
 def build(
@@ -119,17 +121,11 @@ def build(
                 "warmup", "needs a C++ compiler (g++ or clang++) for torch to compile with"
             )
         processes = min(torch.get_num_threads(), MOST_PROCESSES, len(missing))
-        pool = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"))
-        try:
-            # longest first, so that none is left over at the end
-            built = as_completed([pool.submit(_build, name) for name in missing[::-1]])
-            for done, future in enumerate(built, start=total - len(missing) + 1):
-                future.result()
-                progress(done, total)
-        except BrokenProcessPool as error:
-            raise UsageError("warmup", "a process died, probably out of memory") from error
-        finally:
-            pool.shutdown(cancel_futures=True)
+        # longest first, so that none is left over at the end; torch's default threads, for which kernels are compiled
+        pool = Processes(processes, torch_threads=None, ordered=False)
+        built = pool.map(_build, missing[::-1])
+        for done, _ in enumerate(built, start=total - len(missing) + 1):
+            progress(done, total)
     loaded = load()
     if loaded is None:
         raise UsageError("warmup", f"the packages in {cache_folder()} do not load")
