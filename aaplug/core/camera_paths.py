@@ -1,7 +1,7 @@
 """Camera paths that show aliasing: zoom, dolly and orbit from one view of the data set.
 
-t runs over [0, 1).  Zoom and dolly go from `start` to `end`, both factors on how finely the scene is sampled, and back,
-evenly in octaves and slowing at both ends; an orbit goes once around.  All three join end to start.
+t runs over [0, 1).  Zoom and dolly go from `start` to `end` and back; both are factors on the sampling rate.  Speed is
+even in octaves and eases at both ends.  An orbit goes once around.  All three are loops.
 """
 
 import math
@@ -21,7 +21,7 @@ def zoomed(view: Camera, factor: float) -> Camera:
 
 
 def moved(view: Camera, factor: float, depth: float) -> Camera:
-    """A free camera, for training never was there, that has what lies at `depth` world units at depth/factor."""
+    """A free camera, moved along the view's axis so that a point at `depth` (world units) is at depth / factor."""
     pose = view.cam_from_world.clone()
     pose[2, 3] += depth * (1 / factor - 1)
     return replace(view, cam_from_world=pose, trained_focal=None)
@@ -33,12 +33,12 @@ def zoom(view: Camera, t: float, start: float, end: float) -> Camera:
 
 
 def dolly(view: Camera, t: float, start: float, end: float, depth: float) -> Camera:
-    """The view from farther away or nearer: what lies at `depth` world units is at depth/factor; a free camera."""
+    """The view from farther away or nearer, as a free camera: see `moved`."""
     return moved(view, _factor(t, start, end), depth)
 
 
 def orbit(view: Camera, t: float, depth: float, up: Float[Tensor, " 3"]) -> Camera:
-    """The view turned about the axis `up` through what lies `depth` world units before it; a free camera."""
+    """The view turned about the axis `up` through the point `depth` world units ahead, as a free camera."""
     pivot = view.centre + depth * view.cam_from_world[2, :3]
     turn = torch.eye(4, dtype=torch.float64)
     turn[:3, :3] = _rotation(up, 2 * math.pi * t)
@@ -47,7 +47,7 @@ def orbit(view: Camera, t: float, depth: float, up: Float[Tensor, " 3"]) -> Came
 
 
 def up_of(cameras: CameraSet) -> Float[Tensor, " 3"]:
-    """The direction that is up in the training images, on average."""
+    """Mean up direction of the training images."""
     up = -torch.stack([camera.cam_from_world[1, :3] for camera in cameras.train]).mean(dim=0)
     return torch.nn.functional.normalize(up, dim=0)
 

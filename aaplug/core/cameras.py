@@ -1,8 +1,8 @@
-"""Cameras: the one home of axes, pixel centres and the order of height and width.
+"""Pinhole cameras: the conventions for axes, pixel centres, and the order of height and width.
 
 Camera frame: x right, y down, z forward (OpenCV).  Pixel (0, 0) covers [0, 1) × [0, 1); its centre is (0.5, 0.5).
-`cam_from_world` is float64, so that scenes far from the origin lose nothing before the camera's centre is subtracted.
-A set of cameras is a plain sequence: sizes and focals may differ from view to view.
+`cam_from_world` is float64: scenes far from the origin keep their digits until the camera's centre is subtracted.
+Sizes and focal lengths may differ from view to view.
 """
 
 import math
@@ -15,16 +15,16 @@ from torch import Tensor
 
 WHITE = (1.0, 1.0, 1.0)
 BLACK = (0.0, 0.0, 0.0)
-WHOLE_PIXEL = 1e-6  # px: slack when a scaled size is cut to whole pixels
+WHOLE_PIXEL = 1e-6  # px: slack before a scaled size is rounded down
 
 
 @dataclass(frozen=True)
 class Lens:
-    """How a photograph differs from its camera's pinhole, by OpenCV's models.
+    """Distortion of a photograph against its camera's pinhole, by OpenCV's models.
 
-    coefficients: k1, k2, p1, p2 and more as OpenCV orders them; of a fisheye k1 to k4.  size: width and height of the
-    whole photograph, in px.  pinhole: its fx, fy, cx, cy in these px.  window: left, top, width and height of the
-    camera's view in it.
+    coefficients: k1, k2, p1, p2 and more in OpenCV's order; for a fisheye lens k1 to k4.
+    size: width and height of the whole photograph, in px.  pinhole: its fx, fy, cx, cy, in the same px.
+    window: left, top, width and height of the camera's view in it, in px.
     """
 
     coefficients: tuple[float, ...]
@@ -38,9 +38,10 @@ class Lens:
 class Camera:
     """One pinhole view.
 
-    fx, fy, cx, cy: in px of this size.  trained_focal: for a pose of the data set the focal length, in px, at which
-    training rendered it (or would have, for a held-out view); it stays when the view is scaled.  None for a free
-    camera.  photo: the photograph taken from here, if there is one.  lens: what it was taken through, if that distorts.
+    fx, fy, cx, cy: in px of this size.
+    trained_focal: px.  For a pose of the data set, the focal length at which training rendered it (or would have, for
+        a held-out view); scaling the view keeps it.  None for a free camera.
+    photo: the photograph taken from here, if any.  lens: its distortion, if any.
     """
 
     name: str
@@ -87,8 +88,8 @@ class Camera:
     def scaled(self, factor: float) -> "Camera":
         """The same view with pixels `factor` times as dense.
 
-        Rows and columns that would be cut in part are dropped at the bottom and the right, so that scaled(1/n) sees
-        exactly what n×n box averages of the full image see.
+        A partial row at the bottom or column at the right is dropped, so that scaled(1/n) sees exactly what n×n box
+        averages of the full image see.
         """
         width = max(1, math.floor(self.width * factor + WHOLE_PIXEL))
         height = max(1, math.floor(self.height * factor + WHOLE_PIXEL))
@@ -118,9 +119,9 @@ class Camera:
 class CameraSet:
     """Cameras of a scene at their training size, and where the facts about them came from.
 
-    train: those that sampling bounds come from.  test: those held out; the same as train where there is no split.
-    background: the colour training put behind the scene, None if the files do not say.
-    notes: one line a fact worth printing (format, split, training scale and its source).
+    train: the cameras that sampling bounds come from.  test: held-out views; the same as `train` without a split.
+    background: the colour that training put behind the scene; None if the files do not say.
+    notes: facts worth printing, one line each (format, split, training scale and its source).
     """
 
     train: tuple[Camera, ...]
@@ -138,7 +139,7 @@ class CameraSet:
 def look_at(
     eye: Float[Tensor, " 3"], target: Float[Tensor, " 3"], up: Float[Tensor, " 3"]
 ) -> Float[Tensor, "4 4"]:
-    """`cam_from_world` of a camera at `eye` that sees `target` in its centre, `up` pointing up in the image."""
+    """`cam_from_world` of a camera at `eye` that looks at `target`, with `up` pointing up in the image."""
     forward = torch.nn.functional.normalize((target - eye).double(), dim=0)
     right = torch.nn.functional.normalize(torch.linalg.cross(forward, up.double()), dim=0)
     down = torch.linalg.cross(forward, right)

@@ -1,8 +1,8 @@
 """The scene: 3D Gaussians exactly as their file stores them.
 
-n: Gaussians; k: spherical-harmonics coefficients a channel, (degree + 1)^2.  Stored values are kept as they are
-(log-scales, opacity logits, quaternions of any length), so that reading and writing loses nothing; what a renderer
-needs (scales, opacities, unit quaternions) are properties.  Lengths are in world units.
+n: Gaussians; k: spherical-harmonics coefficients per channel, (degree + 1)².  Lengths are in world units.  Stored
+values (log-scales, opacity logits, quaternions of any length) are kept, so that reading and writing loses nothing.
+Activated values (scales, opacities, unit quaternions) are properties.
 """
 
 import math
@@ -15,8 +15,8 @@ from torch import Tensor
 
 from aaplug.core.rules import RULES_3DGS, Rules
 
-MAX_LOG_SCALE = 30.0  # |ln s| beyond this overflows float32 once squared; values are clamped on use
-MIN_OPACITY = 1e-7  # keeps the logit finite in float32 (3DGS stores logits)
+MAX_LOG_SCALE = 30.0  # larger |ln s| overflow float32 once squared; values are clamped on use
+MIN_OPACITY = 1e-7  # keeps the logit finite in float32
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ CONVENTIONS = {c.name: c for c in (CLASSIC, ANTIALIASED, MIP)}
 
 @dataclass(frozen=True)
 class Fusion:
-    """A record of what has been fused into the stored scales and opacities, written to and read from the file."""
+    """Something that was fused into the stored scales and opacities; it is recorded in the file."""
 
     method: str
     settings: dict[str, str] = field(default_factory=dict)
@@ -52,10 +52,10 @@ class Fusion:
 
 @dataclass(frozen=True)
 class Origin:
-    """The file a scene came from, with all of it that is not a Gaussian's parameter.
+    """The file that a scene came from, with everything in it that is not a parameter of a Gaussian.
 
-    document: what the format's writer needs to give everything back (column order, unknown columns, comments).
-    rows: index in the document of each Gaussian.
+    document: what the format's writer needs to restore the file (column order, unknown columns, comments).
+    rows: index of each Gaussian in the document.
     """
 
     path: str
@@ -67,10 +67,10 @@ class Origin:
 
 @dataclass(frozen=True)
 class PixelSizes:
-    """In which sizes training drew each Gaussian, as Multi-Scale 3DGS (Yan et al. 2024) stores them.
+    """The sizes at which training drew each Gaussian, as Multi-Scale 3DGS (Yan et al. 2024) stores them.
 
-    smallest, largest: px of an image, at the level that the Gaussian belongs to; 0 and less where unknown.
-    base: it belongs to the coarsest level.
+    smallest, largest: px, in images of the Gaussian's level; not above 0 where unknown.
+    base: whether it belongs to the coarsest level.
     """
 
     smallest: Float[Tensor, " n"]
@@ -91,8 +91,9 @@ class PixelSizes:
 class Gaussians:
     """n Gaussians and how they were trained.
 
-    flat: these are 2D Gaussians (2DGS, Huang et al. 2024), discs across the third axis.  Their file has two
-    scales; the third log-scale here is −MAX_LOG_SCALE, no thickness, so that a renderer needs no special case.
+    flat: 2D Gaussians (2DGS, Huang et al. 2024), discs across the third axis.  Their file has two scales; the third
+        log-scale here is -MAX_LOG_SCALE, no thickness, so that renderers need no special case.
+    filter_3d: standard deviation of Mip-Splatting's 3D filter, stored beside the scales and not yet fused.
     """
 
     means: Float[Tensor, "n 3"]
@@ -101,9 +102,7 @@ class Gaussians:
     logit_opacities: Float[Tensor, " n"]
     sh: Float[Tensor, "n k 3"]
     convention: Convention = CLASSIC
-    filter_3d: Float[Tensor, " n"] | None = (
-        None  # standard deviation, stored beside the scales and not yet fused
-    )
+    filter_3d: Float[Tensor, " n"] | None = None
     fused: tuple[Fusion, ...] = ()
     origin: Origin | None = None
     flat: bool = False
@@ -174,9 +173,9 @@ def scale_opacities(
     log_factor: Float[Tensor, " n"],
     max_opacity: float = 1 - MIN_OPACITY,
 ) -> Float[Tensor, " n"]:
-    """Logits of o·c from the logits of o and ln c: exact where o is near 0 or 1, the identity where c = 1.
+    """Logits of o·c from the logits of o and ln c: exact for o near 0 or 1, the identity for c = 1.
 
-    With L = ln o + ln c the logit of e^L is L − ln(1 − e^L).  Where c ≠ 1 the opacity is held in
+    With L = ln o + ln c the logit of e^L is L - ln(1 - e^L).  For c ≠ 1 the opacity is clamped to
     [MIN_OPACITY, max_opacity].
     """
     log_opacity = torch.nn.functional.logsigmoid(logit_opacities) + log_factor

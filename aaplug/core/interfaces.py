@@ -108,7 +108,7 @@ class PixelKernel(Protocol):
     def splats_per_pass(self) -> int: ...  # noqa: D102
 
     def bounding_ellipses(self, splats: Splats2D, rules: Rules) -> Splats2D | None:
-        """Splats whose cut-off ellipses contain every pixel centre where alpha is not 0; None for the given splats."""
+        """Splats whose cut-off ellipses contain every pixel centre with alpha above 0; None for the given splats."""
         ...
 
     def raster_rows(self, splats: Splats2D, kernels: Kernels) -> Float[Tensor, "m c"]:
@@ -122,7 +122,7 @@ class PixelKernel(Protocol):
         ...
 
     def exact(self, splats: Splats2D, offsets: Float[Tensor, "p c 2"]) -> Float[Tensor, "p c"]:
-        """The slow float64 twin: alpha over opacity at `offsets` from each splat's centre, in px, without cap or cut."""
+        """The slow float64 twin: alpha over opacity at `offsets` (px) from the splats, before cap and cut-off."""
         ...
 
 

@@ -19,7 +19,8 @@ class Kernel:
     """One stage.
 
     function: tensors in, a tuple of tensors out; what it updates in place must be contiguous.
-    example: makes the arguments to compile for, as large as real work: inductor decides by them which loops use threads.
+    example: makes the arguments to compile for, as large as real work: inductor decides by them which loops use
+    threads.
     sizes: per argument the name of its leading size, None where that is fixed; sizes of one name are equal.
     gathers: the kernel gathers scattered rows.  Inductor would leave the loop scalar; set this where arithmetic
         outweighs the gathers.

@@ -1,8 +1,8 @@
-"""From Gaussians and one camera to splats: EWA projection and spherical-harmonics colour.
+"""From Gaussians and a camera to splats: EWA projection and spherical-harmonics colour.
 
-n: Gaussians of the scene, m: those in front of the near plane.  The covariance of a splat is M Mᵀ with the 2×3 factor
-M = J W R S (Zwicker et al., "EWA splatting", 2002; 3DGS, eq. 5), and its determinant |a × b|² comes from M's rows a
-and b, where nothing cancels.  The camera's centre is subtracted in float64; the rest runs in the scene's precision.
+n: Gaussians of the scene, m: those beyond the near plane.  A splat's covariance is M Mᵀ with the 2×3 factor M = J W R S
+(Zwicker et al., "EWA splatting", 2002; 3DGS, eq. 5).  Its determinant |a × b|² comes from the rows a and b of M, where
+nothing cancels.  The camera's centre is subtracted in float64; the rest runs in the scene's precision.
 """
 
 from collections.abc import Iterable, Sequence
@@ -21,11 +21,9 @@ from aaplug.core.rules import NEAR, RULES_3DGS, Rules, variant
 from aaplug.core.spherical_harmonics import sh_colour
 from aaplug.core.splats import Splats2D
 
-JACOBIAN_MARGIN = 0.3  # of half the image at depth 1: 3DGS linearises no farther out (1.3 tan(fov/2) when centred)
-MAX_SIGMA = 1e9  # px: larger splats look the same, and their determinant would overflow float32
-MIN_FACING = (
-    1e-6  # of depth: a disc seen at a flatter angle is a line, and its slope would overflow
-)
+JACOBIAN_MARGIN = 0.3  # of half the image: 3DGS linearises no farther out (1.3 tan(fov/2))
+MAX_SIGMA = 1e9  # px: larger splats look the same, but their determinant overflows float32
+MIN_FACING = 1e-6  # of depth: a disc at a flatter angle is a line, and its slope overflows
 SHADED_AT_ONCE = 1 << 16  # Gaussians
 
 
@@ -120,7 +118,7 @@ class _Picked(torch.autograd.Function):
 def _camera_rows(
     like: Tensor, camera: Camera
 ) -> tuple[Float[Tensor, " 3"], Float[Tensor, "3 3"], Float[Tensor, " 8"]]:
-    """Centre (float64), rotation, and fx, fy, cx, cy with the slopes between which the projection is linearised."""
+    """Centre (float64), rotation, and fx, fy, cx, cy with the slopes between which projection is linearised."""
     x, y = slope_limits(camera)
     lens = like.new_tensor([camera.fx, camera.fy, camera.cx, camera.cy, *x, *y])
     rotation = camera.cam_from_world[:3, :3].to(like)
@@ -128,7 +126,7 @@ def _camera_rows(
 
 
 def slope_limits(camera: Camera) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Least and greatest x/z, and y/z, at which the projection is linearised; beyond, it is as at these."""
+    """Smallest and largest x/z, and y/z, at which projection is linearised; slopes beyond are clamped."""
     limits = []
     for centre, focal, side in (
         (camera.cx, camera.fx, camera.width),
@@ -148,7 +146,7 @@ def _project(
     rotation: Float[Tensor, "3 3"],
     lens: Float[Tensor, " 8"],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Mean, packed covariance, determinant and depth of each Gaussian, written out in columns so that it fuses."""
+    """Mean, packed covariance, determinant and depth of each Gaussian, written in columns so that the loop fuses."""
     local = (means.double() - centre).to(means).unbind(dim=1)
     fx, fy, cx, cy, left, right, top, bottom = lens.unbind()
     world = [row.unbind() for row in rotation.unbind()]
@@ -157,7 +155,7 @@ def _project(
         min=near
     )  # nearer ones are dropped later; here they must not overflow into gradients
     slope_x, slope_y = x / ahead, y / ahead
-    # J W: the rows of the projection's derivative in the world's axes, its direction held inside the widened image
+    # J W: rows of the projection's derivative along the world's axes, its direction clamped to the widened image
     held_x = torch.minimum(torch.maximum(slope_x, left), right)
     held_y = torch.minimum(torch.maximum(slope_y, top), bottom)
     across = [fx / ahead * (i - held_x * k) for i, k in zip(world[0], world[2], strict=True)]
@@ -197,9 +195,7 @@ def rotation_matrices(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
     return torch.stack([torch.stack(row, dim=-1) for row in rotation_rows(quats)], dim=-2)
 
 
-EXAMPLE_SIZE = (
-    100_000  # as large as real work: the compiler decides by it which loops run in threads
-)
+EXAMPLE_SIZE = 100_000  # as large as real work: inductor decides by it which loops use threads
 
 
 def _shade_example(coefficients: int) -> tuple[Tensor, ...]:

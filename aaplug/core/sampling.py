@@ -1,9 +1,10 @@
-"""How finely a camera set samples each Gaussian: the Nyquist bounds that every filter starts from.
+"""How finely a set of cameras samples each Gaussian: the Nyquist bounds that every filter starts from.
 
-n: Gaussians, v: cameras.  A camera of focal length f px samples a Gaussian at depth z (along the optical axis) with
-f / z pixels per world unit.  A camera sees a Gaussian when the depth is above `NEAR` and the projected centre lies in
-the image widened by `MARGIN` of its size on every side (Mip-Splatting, arXiv 2311.16493, section 5.1 and its
-published constants).  Rates pair each camera's own focal with its own depth, as the paper's equation 7 does.
+n: Gaussians, v: cameras, c: Gaussians of a chunk.  A camera of focal length f px samples a Gaussian at depth z (along
+the optical axis) with f / z pixels per world unit.  It sees the Gaussian when the depth is above `NEAR` and the
+projected centre lies in the image widened by `MARGIN` of its size on every side (Mip-Splatting, arXiv 2311.16493,
+section 5.1 and its published constants).  Each rate pairs a camera's own focal length with its own depth, as in the
+paper's equation 7.
 """
 
 from collections.abc import Iterator, Sequence
@@ -19,17 +20,18 @@ from aaplug.core.rules import NEAR
 
 MARGIN = 0.15  # of the image's side; equals 3DGS's clamp of the Jacobian at 1.3 tan(fov/2)
 CHUNK_PAIRS = 4_000_000  # Gaussian-camera pairs held at once: about 150 MB
-MIN_SEEN_SHARE = 0.5  # fewer Gaussians seen than this: scene and cameras are taken for strangers
-FRAME_CHECK_GAUSSIANS = 50_000  # an even sample this large decides the frame check
+# below this share of Gaussians seen, scene and cameras are taken to be in different frames
+MIN_SEEN_SHARE = 0.5
+FRAME_CHECK_GAUSSIANS = 50_000  # size of the even sample for the frame check
 
 
 @dataclass(frozen=True)
 class SamplingBounds:
-    """What filters learn about a camera set; all zero for a Gaussian that no camera sees.
+    """What filters know about a camera set.  Everything is zero for a Gaussian that no camera sees.
 
-    highest, lowest: sampling rates over the cameras that see the Gaussian, in px per world unit.
-    nearest: least depth in them, in world units.
-    views: how many cameras see it.
+    highest, lowest: sampling rate over the cameras that see the Gaussian, in px per world unit.
+    nearest: smallest depth in these cameras, in world units.
+    views: number of cameras that see it.
     """
 
     highest: Float[Tensor, " n"]
@@ -44,7 +46,7 @@ class SamplingBounds:
 
     @property
     def highest_or_coarsest(self) -> Float[Tensor, " n"]:
-        """Highest rates, with the coarsest one found standing in for Gaussians never seen (Mip-Splatting's rule).
+        """Highest rates; a Gaussian that was never seen gets the coarsest of them (Mip-Splatting's rule).
 
         Raises:
             FrameError: no camera sees any Gaussian.
@@ -86,7 +88,7 @@ def sampling_bounds(
 def median_rates(
     means: Float[Tensor, "n 3"], cameras: Sequence[Camera], chunk_pairs: int = CHUNK_PAIRS
 ) -> Float[Tensor, " n"]:
-    """Median sampling rate of each Gaussian over the cameras that see it, in px per world unit; 0 where none does."""
+    """Median sampling rate of each Gaussian over the cameras that see it, in px per world unit; 0 if none does."""
     median = means.new_zeros(len(means))
     for part, rates in _rates_in_chunks(means, cameras, chunk_pairs):
         middle = rates.masked_fill_(rates == 0, torch.nan).nanmedian(dim=1).values
@@ -97,9 +99,9 @@ def median_rates(
 def view_information(
     means: Float[Tensor, "n 3"], cameras: Sequence[Camera], chunk_pairs: int = CHUNK_PAIRS
 ) -> Float[Tensor, "n 3 3"]:
-    """What the cameras that see each Gaussian tell of every direction: Σ ν² (I − d dᵀ), in px² per world unit².
+    """Sampling of each Gaussian by direction: Σ ν² (I - d dᵀ) over the cameras that see it, in px² per world unit².
 
-    A camera samples with its rate ν across its ray d and not at all along it; 0 where no camera sees the Gaussian.
+    A camera samples at its rate ν across its ray d, and not at all along it.  0 where no camera sees the Gaussian.
 
     Raises:
         UsageError: there are no cameras.
@@ -121,10 +123,10 @@ def check_frame(
     scene_name: str,
     min_share: float = MIN_SEEN_SHARE,
 ) -> float:
-    """Return the share of Gaussians seen by any camera, judged on an even sample of the scene.
+    """Share of Gaussians that any camera sees, on an even sample of the scene.
 
     Raises:
-        FrameError: the share is under `min_share`, so the two are likely to live in different frames.
+        FrameError: the share is below `min_share`: scene and cameras are probably in different frames.
     """
     if len(means) == 0:
         return 1.0
@@ -136,7 +138,7 @@ def check_frame(
             f"only {share:.1%} of its Gaussians are seen by any of the {len(cameras)} cameras (expected at least "
             f"{min_share:.0%}): scene and cameras are in different frames. nerfstudio scenes need the transform of "
             "dataparser_transforms.json, gsplat scenes were normalised unless trained with normalize_world_space "
-            "off; if the cameras are right all the same, lower `min_seen`",
+            "off; if the cameras are right nevertheless, lower `min_seen`",
         )
     return share
 
@@ -144,7 +146,7 @@ def check_frame(
 def _rates_in_chunks(
     means: Float[Tensor, "n 3"], cameras: Sequence[Camera], chunk_pairs: int
 ) -> Iterator[tuple[slice, Float[Tensor, "c v"]]]:
-    """Yield (part of the Gaussians, its rates in every camera); a rate of 0 stands for "not seen".
+    """Yield (chunk of the Gaussians, its rate in every camera); a rate of 0 means "not seen".
 
     The cameras' mean position is subtracted in float64 first, so that scenes far from the origin keep their digits.
     """

@@ -13,9 +13,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-MIN_COMPENSATION = (
-    0.005  # floor of the opacity factor, so that rounding erases no splat (3DGS, gsplat)
-)
+# floor of the opacity factor, so that rounding erases no splat (3DGS, gsplat)
+MIN_COMPENSATION = 0.005
 
 
 @dataclass(frozen=True)
@@ -48,12 +47,12 @@ class Splats2D:
         def at(column: Tensor) -> Tensor:  # index_select is several times faster than [index]
             return column[index] if isinstance(index, slice) else column.index_select(0, index)
 
-        return self._with({name: at(column) for name, column in self._columns().items()})
+        return replace(self, **{name: at(column) for name, column in self._columns().items()})
 
     def to(self, dtype: torch.dtype) -> "Splats2D":
         """The same splats in another precision."""
-        columns = self._columns()
-        return self._with({n: c.to(dtype) for n, c in columns.items() if c.is_floating_point()})
+        columns = self._columns().items()
+        return replace(self, **{n: c.to(dtype) for n, c in columns if c.is_floating_point()})
 
     def blurred(
         self,
@@ -94,9 +93,6 @@ class Splats2D:
         """Every per-splat tensor that is present."""
         return {name: value for name, value in vars(self).items() if isinstance(value, Tensor)}
 
-    def _with(self, columns: dict[str, Tensor]) -> "Splats2D":
-        return Splats2D(**(vars(self) | columns))
-
 
 def concatenated(parts: Sequence[Splats2D]) -> Splats2D:
     """The splats of several parts as one; every part has the same columns."""
@@ -105,7 +101,7 @@ def concatenated(parts: Sequence[Splats2D]) -> Splats2D:
         return first
     names = [name for name, value in vars(first).items() if isinstance(value, Tensor)]
     columns = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
-    return Splats2D(**(vars(first) | columns))
+    return replace(first, **columns)
 
 
 class Render(NamedTuple):

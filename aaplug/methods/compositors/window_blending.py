@@ -1,21 +1,23 @@
 """Window blending: transmittance kept as a window inside the pixel, so that splats side by side leak no light.
 
-Gaussian Blending (arXiv 2511.15102) keeps a level on a rectangle inside the pixel instead of one transmittance, and takes
-from it what each splat hides there.  This update of the rectangle is aaplug's own:
+Gaussian Blending (arXiv 2511.15102) keeps a level on a rectangle inside the pixel instead of one transmittance, and
+takes from it what each splat hides there.  This update of the rectangle is aaplug's own:
 
 1. Light passes the pixel on a window of sides l and centre c with transmittance T(x) = level, and nowhere else.  At
    first the window is the square that alpha is averaged over, `Splats2D.window` wide, and the level is 1.
 2. A splat hides p = mean of min(max_alpha, o g(x)) over the window, taken as min(max_alpha, o · mean of g).  On the
    window turned to the splat's axes (by at most 45°, as Analytic-Splatting turns its pixel) g factors, and so do the
    moments of what it hides: mass p, mean d and variance s about the window's centre.
-3. The remaining light T (1 - o g) has the mass M' = M (1 - p), and about the window's centre the mean -p d / (1 - p) and
+3. The remaining light T (1 - o g) has the mass M' = M (1 - p), and about the window's centre the mean -p d / (1 - p)
+and
    the second moments (l²/12 - p (s + d²)) / (1 - p).
-4. The next window is the rectangle along the pixel's axes with that mean and variance, cut symmetrically where it leaves
+4. The next window is the rectangle along the pixel's axes with that mean and variance, cut symmetrically where it
+leaves
    the first one, and no smaller than M' (a level is at most 1).  Its level follows from M'.  Keeping the mean rather
    than the size is worth 2 dB at 1/8.
 
-With a first window of no size this is 3DGS's rule.  Steps run in float64, because the variance of the remaining light is
-a small difference.
+With a first window of no size this is 3DGS's rule.  Steps run in float64, because the variance of the remaining light
+is a small difference.
 
 u, v: position along a splat's axes; h: half a window; both in the splat's standard deviations.
 """

@@ -1,8 +1,8 @@
 """AAA-Gaussians' adaptive 3D filter (ICCV 2025, arXiv 2504.12811), at test time.
 
-A Gaussian is widened in the world by F = max(0.3 / ν², 0.3 (z/f)²): by the finest training pixel or by this view's
-pixel, whichever is larger, and dimmed by the change of its area across the ray.  Both happen on the screen: F projects
-to F J Jᵀ, and the areas are in the ratio of the determinants.  Gaussians that no camera saw are widened by this view's
+A Gaussian is widened in the world by F = max(0.3 / ν², 0.3 (z/f)²), the finest training pixel or this view's pixel,
+whichever is larger.  It is dimmed by the change of its area across the ray.  Both act on the screen: F projects to
+F J Jᵀ, and the ratio of areas is the ratio of determinants.  Gaussians that no camera saw are widened by this view's
 pixel alone, as in the published code.
 """
 
@@ -22,7 +22,7 @@ ADAPTIVE_VARIANCE = 0.3  # px² of either pixel: AAA-Gaussians' published consta
 
 @dataclass(frozen=True)
 class Adaptive:
-    """Widen by the coarser of the finest training pixel and this view's, keeping the projected energy."""
+    """Widen by the finest training pixel or this view's pixel, whichever is larger, and keep the projected energy."""
 
     variance: float = ADAPTIVE_VARIANCE
 
@@ -36,7 +36,7 @@ class Adaptive:
 
 
 def _sphere(splats: Splats2D, camera: Camera) -> Float[Tensor, "m 3"]:
-    """Covariance on the screen of a sphere in the world that is 1 px wide on the optical axis: (z/f)² J Jᵀ."""
+    """Projected covariance of a sphere whose standard deviation is 1 px on the optical axis: (z/f)² J Jᵀ."""
     centre = splats.means.new_tensor([camera.cx, camera.cy])
     focal = splats.means.new_tensor([camera.fx, camera.fy])
     slopes = ((splats.means - centre) / focal).unbind(dim=1)

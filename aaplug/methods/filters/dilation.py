@@ -1,4 +1,4 @@
-"""Dilation by a constant: what 3DGS, its --antialiasing, gsplat and Mip-Splatting do to every projected covariance."""
+"""Dilation by a constant: the screen filter of 3DGS, its --antialiasing, gsplat and Mip-Splatting."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ from aaplug.core.training import TrainingViews
 
 @dataclass(frozen=True)
 class Dilation:
-    """Add `variance` px² to the covariance, whatever the rate; with `compensated`, keep the splat's energy.
+    """Add `variance` px² to the covariance at every sampling rate; with `compensated`, preserve the splat's energy.
 
     0.3 uncompensated is 3DGS (Kerbl et al. 2023); 0.3 compensated is EWA splatting as in 3DGS --antialiasing and
     gsplat "antialiased"; 0.1 compensated is the 2D Mip filter (Mip-Splatting, eq. 10).

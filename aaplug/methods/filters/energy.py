@@ -1,12 +1,12 @@
-"""A scene in a plain file for a viewer with another rule than training's, in closed form.
+"""Matched energy: a scene for a viewer whose rule is not training's, in closed form.
 
-A viewer that adds K px² and compensates shows a splat with the energy o'·√det C' whatever K is, while training's own
-rule showed o·√det(C + 0.3 I) at the training rate (times its compensation, if it had one).  So widen every Gaussian in
-the world by `variance`·(z/f)² with its median rate f/z, and set o' to keep that energy, averaged in log space over
-training views.  With a variance of 0.2 and K = 0.1 a Mip viewer then shows what `matched` shows with one sample, up to
-the bound on opacity and the factor's dependence on the view.  For a viewer that does not compensate the energy is
-o'·√det(C' + K).  A negative variance makes Gaussians thinner, for a viewer that blurs more than training did.  The form
-is aaplug's own.
+A viewer that adds K px² and compensates shows a splat with the energy o'·√det C', for any K.  Training showed o·√det(C
++ 0.3 I) at the training rate (times its compensation, if it had one).  So every Gaussian is widened in the world by
+`variance`·(z/f)², with its median rate f/z, and o' is set to keep that energy, averaged in log space over training
+views.  With a variance of 0.2 and K = 0.1 a Mip viewer shows what `matched` shows with one sample, except where
+opacity reaches its bound and as far as the factor depends on the view.  For a viewer that does not compensate, the
+energy is o'·√det(C' + K).  A negative variance makes Gaussians thinner, for a viewer that blurs more than training
+did.  This form is aaplug's own.
 """
 
 from collections.abc import Sequence
@@ -17,32 +17,31 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.cameras import Camera
+from aaplug.core.convolution import smoothed_by
 from aaplug.core.gaussians import MIP, Convention, Fusion, Gaussians, scale_opacities
 from aaplug.core.projection import project
 from aaplug.core.sampling import median_rates, sampling_bounds
 from aaplug.core.training import TrainingViews
-from aaplug.methods.filters.smoothing import smooth
 
-MATCHED_VARIANCE = (
-    0.2  # px² at the median training rate: what 0.3 leaves beside the Mip viewer's 0.1
-)
-MAX_FUSED_OPACITY = 0.9999  # energy may ask for more than an opacity can give
-THINNEST = 0.01  # px²: energy needs some area, and no viewer tells less from it
-FIT_VIEWS = 25  # training views, evenly spread, that the factor is averaged over
+MATCHED_VARIANCE = 0.2  # px² at the median training rate: 3DGS's 0.3 without the Mip viewer's 0.1
+MAX_FUSED_OPACITY = 0.9999  # energy may ask for an opacity above 1
+# px²: smallest variance that thinning leaves; no viewer shows the difference to less
+THINNEST = 0.01
+FIT_VIEWS = 25  # evenly spread training views over which the opacity factor is averaged
 
 
 @dataclass(frozen=True)
 class MatchedEnergy:
     """Widen the Gaussians and set opacities so that a viewer shows the energy that training showed.
 
-    variance: px² at the median training rate.  shown: the viewer's rule.
+    variance: px² at the median training rate.  shown: the viewer's convention.
     """
 
     variance: float = MATCHED_VARIANCE
     shown: Convention = MIP
 
     def __call__(self, scene: Gaussians, training: TrainingViews) -> Gaussians:
-        """Fuse into scales and opacities; Gaussians that none of the fitted views sees keep their opacity."""
+        """Fuse into scales and opacities.  A Gaussian that none of the fitted views sees keeps its opacity."""
         views = training.cameras[:: -(-len(training.cameras) // FIT_VIEWS)]
         rates = median_rates(scene.means, training.cameras)
         widened = _widened(scene, rates, self.variance)
@@ -60,10 +59,10 @@ class MatchedEnergy:
 
 
 def _widened(scene: Gaussians, rates: Float[Tensor, " n"], variance: float) -> Gaussians:
-    """Add `variance` px² to every axis, or take it away and leave what a thin Gaussian has or `THINNEST`."""
+    """Add `variance` px² to every axis; a negative one is subtracted, down to `THINNEST` or the axis's own variance."""
     if variance >= 0:
         log_sigma = 0.5 * torch.tensor(variance).log() - rates.log()
-        return smooth(scene, log_sigma.where(rates > 0, -torch.inf)[:, None], volume=False)
+        return smoothed_by(scene, log_sigma.where(rates > 0, -torch.inf)[:, None], volume=False)
     px2 = (2 * (scene.log_scales + rates.log()[:, None])).exp()
     least = px2.clamp(max=THINNEST)
     share = torch.maximum(px2 + variance, least) / px2
@@ -78,7 +77,7 @@ def _mean_log_factor(
     training: TrainingViews,
     shown: Convention,
 ) -> Float[Tensor, " n"]:
-    """Mean over the views that see a Gaussian of ln √(det trained / det shown)."""
+    """ln √(det trained / det shown), averaged over the views that see a Gaussian."""
     blur = 0.0 if shown.compensated else shown.kernel
     total = torch.zeros_like(scene.logit_opacities, dtype=torch.float64)
     count = torch.zeros_like(total)

@@ -1,4 +1,4 @@
-"""2DGS's low-pass filter on the screen, as wide as training's pixel at the rate being rendered."""
+"""2DGS's screen-space low-pass filter, scaled with training's pixel."""
 
 from dataclasses import dataclass, replace
 
@@ -9,10 +9,10 @@ from aaplug.core.training import TrainingViews
 
 @dataclass(frozen=True)
 class LowPass:
-    """Say how wide a disc's low-pass filter is: √½ px of the image, or with `matched` √½ px of training's."""
+    """Set the width of a disc's low-pass filter: √½ px of the image or, with `matched`, √½ px of training's image."""
 
     matched: bool = False
 
     def __call__(self, splats: Splats2D, camera: Camera, training: TrainingViews) -> Splats2D:
-        """Set the width; covariances and opacities stay."""
+        """Set the width; covariances and opacities do not change."""
         return replace(splats, window=training.relative_rate(camera) if self.matched else 1.0)

@@ -1,12 +1,13 @@
-"""The matched screen filter: what training saw, carried to the rate being rendered, then the rest of the pixel.
+"""The matched screen filter: training's dilation at the new sampling rate, then the rest of the pixel's own filter.
 
-A classic checkpoint was fitted with +0.3 px² of dilation, so its look lives in C + 0.3 I at the training rate, and in
-C + 0.3 r² I at r times that rate.  Step one restores that look, with the training's own compensation if it had any.
-Where the rate is below training's (r < 1) a pixel is larger than training's pixel, and step two adds the part of the
-pixel's own filter, 0.07 (1 − r²) px², that training's pixel did not hold, compensating this step alone.  At r = 1 the
-result is the training's renderer itself.  Each of several samples a pixel is filtered by the same rule, as a pixel of
-the larger image that it belongs to.  The design and its measurements are aaplug's own; the first step with one global
-rate is SA-GS's filter (Song et al., arXiv 2403.19615).
+A classic checkpoint was fitted with 0.3 px² of dilation: what it should look like is C + 0.3 I at the training rate,
+and so C + 0.3 r² I at r times that rate.  Step one restores this, with training's compensation if it had one.  Below
+the training rate (r < 1) a pixel is larger than training's.  Step two then adds the part of the pixel's filter that
+training's pixel did not contain, 0.07 (1 - r²) px², and compensates for this step alone.  At r = 1 the result is
+training's own renderer.  With several samples per pixel, each sample is filtered as a pixel of the larger image.
+
+Design and measurements are aaplug's own.  Step one with one global rate is SA-GS's filter (Song et al., arXiv
+2403.19615).
 """
 
 import math

@@ -1,15 +1,15 @@
 """Multi-Scale 3DGS' selection by pixel size (Yan et al., CVPR 2024, arXiv 2311.17089), at test time.
 
-Its checkpoints hold every surface several times, in Gaussians of finer and coarser levels, and of each Gaussian the
-sizes at which training drew it.  A view draws those that it sees at about these sizes.  The size of a Gaussian is its
-half-width where alpha falls to 1/255, S = min(√(L/A), √(L/C)) with the diagonal A, C of the inverse covariance before
-any dilation and L = 2 ln(255 o), as in the published code.  Left out are
-    too small: S < 2 px and S below half of the smallest size,
-    too large: S above twice the largest,
-but never those of the coarsest level, nor by a size that is unknown.
+Its checkpoints contain every surface several times, as Gaussians of finer and coarser levels, and store the sizes at
+which training drew each Gaussian.  A view draws the Gaussians that it sees at about these sizes.  The size of a
+Gaussian is its half-width where alpha falls to 1/255, S = min(√(L/A), √(L/C)), with the diagonal A, C of the inverse
+covariance before any dilation and L = 2 ln(255 o), as in the published code.  It is not drawn if it is
+    too small: S < 2 px and S below half of the smallest size, or
+    too large: S above twice the largest size.
+Gaussians of the coarsest level are always drawn, and an unknown size excludes nothing.
 
-Written from the method's description; no checkpoint of its own was at hand, so that the columns' use is verified on
-made-up scenes alone.  A scene trained otherwise does not have them.
+Written from the method's description.  No checkpoint trained by it was available, so the columns are tested on
+synthetic scenes only.
 """
 
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ from aaplug.core.errors import UsageError
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.splats import Splats2D
 
-SMALL = 2.0  # px: what is larger is never too small.  These three are Multi-Scale 3DGS' published constants
+SMALL = 2.0  # px: larger splats are never too small.  These three are Multi-Scale 3DGS's published constants
 LEAST_SHARE = 0.5  # of the smallest size
 MOST_SHARE = 2.0  # of the largest
 MISSING = "the scene lacks Multi-Scale 3DGS' columns max_pixel_sizes, min_pixel_sizes and base_mask"

@@ -1,8 +1,8 @@
 """3D smoothing: convolve every Gaussian with another one, in the world (Mip-Splatting, section 5.1).
 
-A variance added to every axis commutes with the rotation, so fusing it into the scales is exact:
-s' = √(s² + f²).  With the volume factor the Gaussian keeps its integral: o' = o·∏ s/s' (Mip-Splatting's choice), taken
-in log space, where scales of 1e-12 and below are exact and have gradients.
+A variance added to every axis commutes with the rotation, so fusing it into the scales is exact: s' = √(s² + f²).  The
+volume factor o' = o·∏ s/s' keeps the Gaussian's integral (Mip-Splatting's choice).  It is computed in log space, where
+scales of 1e-12 and less are exact and have gradients.
 """
 
 import math
@@ -10,19 +10,17 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
+from aaplug.core.convolution import face_log_factor, smoothed_by
 from aaplug.core.gaussians import Fusion, Gaussians, scale_opacities
 from aaplug.core.projection import rotation_matrices
 from aaplug.core.sampling import view_information
 from aaplug.core.training import TrainingViews
 
-NYQUIST_VARIANCE = (
-    0.2  # px² at the highest rate: Mip-Splatting's published constant (its eq. 9 omits a square)
-)
-LEAST_SHARE = 1 / 16  # of the highest rate's square: no axis is smoothed over 4 times as wide
-BALANCE_FLOOR = 0.5  # of an opacity: balancing dims no Gaussian below it
+# px² at the highest rate: Mip-Splatting's published constant (its eq. 9 omits a square)
+NYQUIST_VARIANCE = 0.2
+LEAST_SHARE = 1 / 16  # of the highest rate squared: no axis is smoothed more than 4 times as wide
+BALANCE_FLOOR = 0.5  # of an opacity: balancing dims no Gaussian further
 
 
 @dataclass(frozen=True)
@@ -30,12 +28,12 @@ class Smoothing3D:
     """Smooth by `variance` / ν², ν the highest rate at which any training camera sampled the Gaussian.
 
     variance: px² at that rate.
-    opacity: "volume" keeps the integral, "kept" leaves opacity alone.  "balanced" keeps the area of the broadest face,
-        down to half of the opacity: the volume of a surfel says little of what it hides.  It is aaplug's own;
-        AA-Splat's opacity balancing (arXiv 2603.29394) has no published formula.
+    opacity: "volume" keeps the integral, "kept" keeps the opacity.  "balanced" keeps the integral over the broadest
+        face, but at least half of the opacity, because a surfel's volume says little about what it hides.  It is
+        aaplug's own; AA-Splat's opacity balancing (arXiv 2603.29394) has no published formula.
     focal: "own" pairs each camera's depth with its own focal length, as Mip-Splatting's equation 7 does; "largest"
         pairs every depth with the largest of all, as its published code does.
-    Gaussians that no camera saw get the coarsest rate found.
+    A Gaussian that no camera saw gets the coarsest rate of all.
     """
 
     variance: float = NYQUIST_VARIANCE
@@ -51,7 +49,7 @@ class Smoothing3D:
                 bounds, highest=torch.where(bounds.seen, largest / bounds.nearest, 0.0)
             )
         log_sigma = (self.variance**0.5 / bounds.highest_or_coarsest).log()[:, None]
-        smoothed = smooth(scene, log_sigma, self.opacity == "volume")
+        smoothed = smoothed_by(scene, log_sigma, self.opacity == "volume")
         if self.opacity == "balanced":
             factor = face_log_factor(scene.log_scales, log_sigma).clamp(min=math.log(BALANCE_FLOOR))
             logits = scale_opacities(scene.logit_opacities, factor)
@@ -64,12 +62,12 @@ class Smoothing3D:
 
 @dataclass(frozen=True)
 class AnisotropicSmoothing:
-    """Smooth each of a Gaussian's axes by what the views tell along it, which no view does along its own ray.
+    """Smooth each axis of a Gaussian by how finely the views sample along it; no view samples along its own ray.
 
-    With the views' information J = Σ ν² (I − d dᵀ) the rate along an axis u is ν_u² = ν² uᵀ J u / Σ ν², ν the highest
-    that any training camera had: for one view ν across its ray and nothing along it, for views from all sides ν √⅔
-    everywhere.  The variance along u is `variance` / ν_u²; no rate counts for less than √`LEAST_SHARE` of ν.  What
-    would turn the axes of a Gaussian is left out.  aaplug's own; the volume factor is Mip-Splatting's.
+    With J = Σ ν² (I - d dᵀ), the rate along an axis u is ν_u² = ν² uᵀ J u / Σ ν², where ν is the highest rate of any
+    training camera.  One view gives ν across its ray and 0 along it; views from all sides give ν √⅔ everywhere.  The
+    variance along u is `variance` / ν_u², with ν_u at least ν √`LEAST_SHARE`.  Terms that would turn a Gaussian's axes
+    are dropped.  aaplug's own; the volume factor is Mip-Splatting's.
     """
 
     variance: float = NYQUIST_VARIANCE
@@ -83,16 +81,16 @@ class AnisotropicSmoothing:
         seen = across > 0
         share = torch.where(seen, along / across.where(seen, 1.0), 1.0).clamp(LEAST_SHARE, 1.0)
         log_sigma = (self.variance**0.5 / training.bounds.highest_or_coarsest).log()
-        smoothed = smooth(scene, log_sigma[:, None] - 0.5 * share.log(), volume=True)
+        smoothed = smoothed_by(scene, log_sigma[:, None] - 0.5 * share.log(), volume=True)
         fusion = Fusion("anisotropic smoothing", {"variance": f"{self.variance:g}"})
         return replace(smoothed, fused=(*scene.fused, fusion))
 
 
 @dataclass(frozen=True)
 class FlatSmoothing:
-    """Smooth discs in their own planes alone, keeping their area's integral (AA-2DGS's world-space flat kernel).
+    """Smooth discs within their own planes and keep their integral (AA-2DGS's world-space flat kernel).
 
-    A disc lies across a Gaussian's thinnest axis.  variance: px² at the highest rate that any training camera had.
+    A disc lies across a Gaussian's thinnest axis.  variance: px² at the highest rate of any training camera.
     """
 
     variance: float = NYQUIST_VARIANCE
@@ -100,7 +98,7 @@ class FlatSmoothing:
     def __call__(self, scene: Gaussians, training: TrainingViews) -> Gaussians:
         """Fuse the smoothing into scales and opacities."""
         log_sigma = (self.variance**0.5 / training.bounds.highest_or_coarsest).log()[:, None]
-        smoothed = smooth(scene, log_sigma, volume=False)
+        smoothed = smoothed_by(scene, log_sigma, volume=False)
         thin = torch.zeros_like(scene.log_scales, dtype=torch.bool)
         thin.scatter_(1, scene.log_scales.argmin(dim=1, keepdim=True), True)
         logits = scale_opacities(
@@ -116,10 +114,10 @@ class FlatSmoothing:
 
 @dataclass(frozen=True)
 class StoredSmoothing:
-    """Fuse the `filter_3D` column of a Mip-Splatting checkpoint; a scene without one stays as it is."""
+    """Fuse the `filter_3D` column of a Mip-Splatting checkpoint; a scene without one does not change."""
 
     def __call__(self, scene: Gaussians, training: TrainingViews) -> Gaussians:
-        """Fuse the stored standard deviations into scales and opacities, and forget them."""
+        """Fuse the stored standard deviations into scales and opacities, and drop the column."""
         return fuse_stored(scene)
 
 
@@ -127,39 +125,5 @@ def fuse_stored(scene: Gaussians) -> Gaussians:
     """The same scene with its stored 3D filter fused; unchanged if it has none (Mip-Splatting, fused export)."""
     if scene.filter_3d is None:
         return scene
-    smoothed = smooth(scene, scene.filter_3d.log()[:, None], volume=True)
+    smoothed = smoothed_by(scene, scene.filter_3d.log()[:, None], volume=True)
     return replace(smoothed, filter_3d=None, fused=(*scene.fused, Fusion("filter_3D")))
-
-
-def smooth(scene: Gaussians, log_sigma: Float[Tensor, "n k"], volume: bool) -> Gaussians:
-    """Convolve each Gaussian with one of standard deviation e^log_sigma; −inf changes nothing.
-
-    log_sigma: one for all axes of a Gaussian, or one for each.
-    """
-    log_scales = 0.5 * torch.logaddexp(2 * scene.log_scales, 2 * log_sigma)
-    smoothed = replace(scene, log_scales=log_scales)
-    if not volume:
-        return smoothed
-    factor = volume_log_factor(scene.log_scales, log_sigma)
-    return replace(smoothed, logit_opacities=scale_opacities(scene.logit_opacities, factor))
-
-
-def volume_log_factor(
-    log_scales: Float[Tensor, "n 3"], log_sigma: Float[Tensor, "n k"]
-) -> Float[Tensor, " n"]:
-    """ln ∏ s/√(s² + f²) = −½ Σ ln(1 + f²/s²)."""
-    return _axis_log_factors(log_scales, log_sigma).sum(dim=1)
-
-
-def face_log_factor(
-    log_scales: Float[Tensor, "n 3"], log_sigma: Float[Tensor, "n k"]
-) -> Float[Tensor, " n"]:
-    """The same product over the two widest axes, which span the broadest face."""
-    return _axis_log_factors(log_scales, log_sigma).topk(2, dim=1).values.sum(dim=1)
-
-
-def _axis_log_factors(
-    log_scales: Float[Tensor, "n 3"], log_sigma: Float[Tensor, "n k"]
-) -> Float[Tensor, "n 3"]:
-    log_ratio = 2 * (log_sigma - log_scales)
-    return -0.5 * torch.logaddexp(log_ratio, torch.zeros_like(log_ratio))

@@ -50,7 +50,7 @@ def sums_by_autograd(
     colours: tuple[Tensor, Tensor, Tensor],
     pixels: Pixels,
 ) -> Float[Tensor, "t c_K"]:
-    """Gradient of the raster rows themselves, for any pixel kernel: autograd of alpha from the gradient of log alpha."""
+    """Gradient of the raster rows for any pixel kernel: autograd of alpha, from the gradient of log alpha."""
     rows, weights, gradients = (torch.stack(x, dim=1) for x in zip(*moves, strict=True))
     with torch.enable_grad():
         rows = rows.detach().requires_grad_()

@@ -58,8 +58,8 @@ class Surfel:
     def bounding_ellipses(self, splats: Splats2D, rules: Rules) -> Splats2D | None:
         """Ellipses that contain the discs and their filters; opacity 0 for a disc that meets the horizon.
 
-        |e|² <= R w² is an ellipse around -R C n / (1 - R q) with the covariance (C + R C n nᵀ C / (1 - R q)) / (1 - R q),
-        q = nᵀ C n, as long as R q < 1.
+        |e|² <= R w² is an ellipse around -R C n / (1 - R q) with the covariance (C + R C n nᵀ C / (1 - R q)) / (1 - R
+        q), q = nᵀ C n, as long as R q < 1.
         """
         assert splats.depth_slopes is not None
         cutoff = squared_cutoff(splats.opacities, rules.min_alpha)

@@ -22,7 +22,7 @@ import torch
 from aaplug.core import culling, ellipses, kernels, projection, rules, spherical_harmonics, splats
 from aaplug.core.errors import UsageError
 from aaplug.core.executors import Processes
-from aaplug.core.kernels import Kernel, one_thread
+from aaplug.core.kernels import EAGER, Kernel, Kernels, one_thread
 from aaplug.core.rules import RULES_3DGS
 from aaplug.methods.pixel_kernels import INTEGRAL, POINT, averages, integral, point, raster_rows
 from aaplug.rasterizers.tiled import backward, binning, forward
@@ -55,12 +55,12 @@ OPTIONS = {
     "assert_indirect_indexing": False,  # indices are our own, and checking each load is slow
     "cpp.enable_floating_point_contract_flag": "fast",  # multiply and add in one instruction
 }
-TILING_HEURISTIC = (
-    "cpp.enable_tiling_heuristics"  # inductor leaves loops that gather scattered numbers scalar
-)
+# inductor leaves loops that gather scattered numbers scalar
+TILING_HEURISTIC = "cpp.enable_tiling_heuristics"
 LARGEST_SIZE = 1 << 31
 MOST_PROCESSES = 4  # compilers side by side: each takes most of a GB
-TOLERANCE = 1e-4  # of the largest value: from a package's result to the eager one, on the example
+# of the largest value: between a package's result and the eager one, on the example
+TOLERANCE = 1e-4
 
 
 def cache_folder() -> Path:
@@ -93,7 +93,13 @@ def load() -> CompiledKernels | None:
                 return None
             packages[kernel.name] = package
     pulling = {kernel.name: kernel for kernel in KERNELS if kernel.pulls_back}
-    return CompiledKernels(packages, lambda name: _load(pulling[name]) if name in pulling else None)
+    later = lambda name: _load(pulling[name]) if name in pulling else None  # noqa: E731
+    return CompiledKernels(packages, later, load_or_eager)
+
+
+def load_or_eager() -> Kernels:
+    """The compiled kernels of this machine, or eager ones where they are not built."""
+    return load() or EAGER
 
 
 def build(

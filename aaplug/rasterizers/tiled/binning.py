@@ -1,12 +1,12 @@
 """Binning: which splats each tile of TILE × TILE px draws, nearest first.
 
-m: splats; s: spans, p: pairs of a splat and a tile; t: tiles.
+m: splats; s: spans; p: pairs of a splat and a tile; t: tiles.
 
-Splats are paired, nearest first, with the tiles that their alpha ≥ 1/255 ellipse reaches.  What an ellipse has in a row
-of tiles is convex, so the tiles are a run of columns between its two ends there: a splat becomes spans, a span becomes
-pairs, and one stable sort of the pairs by tile does the rest.
+Splats are paired, nearest first, with the tiles that their cut-off ellipse overlaps.  An ellipse is convex, so in one
+row of tiles it covers a run of columns.  A splat becomes one span per row, a span becomes pairs, and a stable sort of
+the pairs by tile does the rest.
 
-Bands of tile rows bound the memory: as many as the budget has room for candidate pairs.
+Bands of tile rows bound the memory: each has as many candidate pairs as the budget allows.
 """
 
 from collections.abc import Iterator
@@ -26,16 +26,16 @@ from aaplug.methods.pixel_kernels.raster_rows import TILE, splat_example
 
 LONGEST_PASS = 16  # splats composited in one pass: more compile slowly, fewer load and store more
 MEMORY = 1e9  # bytes
-PAIR_BYTES = 64  # of a candidate pair while a band is binned, measured
+PAIR_BYTES = 64  # per candidate pair while a band is binned, measured
 CUTOFF_SLACK = 1e-4  # relative, on the squared cut-off: float32 rounding drops no pixel that counts
-BOX = 7  # where the box of tiles begins in a row of the table
+BOX = 7  # first column of the box of tiles in the table
 
 
 @dataclass(frozen=True)
 class Bins:
-    """Which splats each tile of a band draws: `splats[first[t] : first[t] + counts[t]]`, nearest first.
+    """Tile t of a band draws the splats `splats[first[t] : first[t] + counts[t]]`, nearest first.
 
-    splats: with LONGEST_PASS more at the end, so that a pass may read on.
+    splats: padded by LONGEST_PASS, so that a pass may read past the end.
     origins: the tiles' top left corners, in px.
     """
 
@@ -61,7 +61,7 @@ def bands(
 
 
 def _depth_order(depths: Float[Tensor, " m"]) -> Int[Tensor, " m"]:
-    """Nearest first, in scene order where equal.  Positive floats sort as their bits, and integers sort faster."""
+    """Nearest first, equal depths in scene order.  Positive floats sort like their bits, and integers sort faster."""
     keys = depths.contiguous().view(torch.int32) if depths.dtype == torch.float32 else depths
     return torch.sort(keys, stable=True).indices
 
@@ -69,9 +69,9 @@ def _depth_order(depths: Float[Tensor, " m"]) -> Int[Tensor, " m"]:
 def _table(
     splats: Splats2D, grid: tuple[int, int], kernels: Kernels, rules: Rules
 ) -> Float[Tensor, "m 11"]:
-    """What the spans of each splat are made of, with the box of tiles around its ellipse in the last four columns.
+    """What spans are computed from.  The last four columns are the box of tiles around the ellipse.
 
-    A box is its first tile in x and y and the ones after its last.
+    A box is its first tile in x and y, then one past its last tile.
     """
     limit = splats.means.new_tensor([grid[1], grid[0]])
     columns = (splats.means, splats.covs, splats.dets, splats.opacities)
@@ -87,10 +87,10 @@ def _table_rows(
     opacities: Float[Tensor, " m"],
     limit: Float[Tensor, " 2"],
 ) -> tuple[Float[Tensor, "m 11"]]:
-    """Centre; of x given y the slope and the variance; yy; squared reach; height of the rightmost point; box."""
+    """Columns: centre; slope and variance of x given y; yy; squared cut-off; height of the rightmost point; box."""
     xx, xy, yy = covs.unbind(dim=1)
     cutoff = squared_cutoff(opacities, min_alpha) * (1 + CUTOFF_SLACK)
-    cutoff = torch.where(((xx + yy) / dets).isfinite(), cutoff, -1.0)  # no width: not drawn
+    cutoff = torch.where(((xx + yy) / dets).isfinite(), cutoff, -1.0)  # no width: never drawn
     lows, highs = [], []
     for mean, variance, end in zip(means.unbind(dim=1), (xx, yy), limit.unbind(), strict=True):
         half = (cutoff.clamp(min=0.0) * variance).sqrt()
@@ -104,7 +104,7 @@ def _table_rows(
 
 
 def _rows(table: Float[Tensor, "m 11"], rows: int, budget: int) -> list[tuple[int, int]]:
-    """Cut the grid into runs of tile rows of about `budget` candidate pairs, at least a row each."""
+    """Cut the grid into runs of tile rows with about `budget` candidate pairs each, at least one row."""
     left, top, right, bottom = table[:, BOX:].long().unbind(dim=1)
     change = top.new_zeros(rows + 1)
     change.index_add_(0, top, right - left).index_add_(0, bottom, left - right)
@@ -121,7 +121,7 @@ def _bin(
     columns: int,
     kernels: Kernels,
 ) -> Bins:
-    """Pair splats, nearest first, with the tiles that they reach in a band of rows."""
+    """Pair splats, nearest first, with the tiles that they overlap in a band of rows."""
     _, top, _, bottom = table[:, BOX:].unbind(dim=1)
     heights = (bottom.clamp(*rows) - top.clamp(*rows)).long().index_select(0, order)
     ranks = torch.repeat_interleave(heights)
@@ -132,7 +132,7 @@ def _bin(
     tiles, splats = kernels.run(PAIRS, spans, _starts(widths), first, owners)
     size = (rows[1] - rows[0]) * columns
     if size < torch.iinfo(torch.int16).max:
-        tiles = tiles.short()  # half the bits sort in half the time
+        tiles = tiles.short()  # half as many bits sort in half the time
     sorted_tiles, pairs = torch.sort(tiles, stable=True)
     tile = torch.arange(size, device=table.device)
     ends = torch.searchsorted(sorted_tiles, tile.to(tiles), right=True)
@@ -153,11 +153,11 @@ def _spans(
     table: Float[Tensor, "m 11"],
     band: Int[Tensor, " 2"],
 ) -> tuple[Int[Tensor, " s"], Int[Tensor, " s"], Int[Tensor, " s"]]:
-    """First tile of the band, number of tiles, and splat, of what a splat reaches in one row of tiles.
+    """First tile, number of tiles, and splat of each span: what a splat overlaps in one row of tiles.
 
-    At height h over its centre the ellipse goes from slope·h − w to slope·h + w, w² = variance (reach − h²/yy).  Its
-    right end grows up to the rightmost point and shrinks after it, so that over the pixel centres of a row it is
-    farthest at the height nearest to that point's.
+    At height h over its centre the ellipse spans slope·h ± w, with w² = variance (cutoff - h²/yy).  Its right end grows
+    up to the rightmost point and shrinks after it.  So over the pixel centres of a row it is farthest at the height
+    nearest to that point's.
     """
     top_row, columns = band.unbind()
     owners = order[ranks]
@@ -193,7 +193,6 @@ def _pairs(
 
 
 # --------------------------------------------------------------------------------------------------------- kernels
-# Examples are as large as real work: the compiler decides by them which loops run in threads.
 
 
 def _spans_example() -> tuple[Tensor, ...]:

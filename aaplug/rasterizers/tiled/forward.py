@@ -117,7 +117,7 @@ def _composite_block(
 
 
 def _going(counts: Int[Tensor, " t"], at_once: int) -> list[int]:
-    """Number of tiles that take part in each pass of `at_once` splats, from the tiles' splat counts in falling order."""
+    """Number of tiles in each pass of `at_once` splats, from the tiles' splat counts in falling order."""
     passes = (counts + (at_once - 1)) // at_once
     turns = torch.arange(int(passes[0]), device=counts.device)
     return (len(passes) - torch.searchsorted(passes.flip(0), turns, right=True)).tolist()

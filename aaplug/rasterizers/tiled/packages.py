@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from aaplug.core.kernels import BACKWARD, EAGER, Kernel, Kernels
+from aaplug.core.kernels import BACKWARD, Kernel, Kernels
 
 
 @dataclass(frozen=True)
@@ -44,13 +44,15 @@ class CompiledKernels(Kernels):
         self,
         packages: Mapping[str, Package],
         later: Callable[[str], Package | None] = lambda name: None,
+        reload: Callable[[], Kernels] = Kernels,
     ):
-        """packages: by their kernels' names.  later: loads a package when it is first needed."""
+        """packages: by their kernels' names.  later: loads one when it is first needed.  reload: for unpickling."""
+        self._reload = reload
         self._packages: dict[str, Package | None] = dict(packages)
         self._later = later
 
     def __reduce__(self) -> tuple[Callable[[], Kernels], tuple[()]]:
-        return load_or_eager, ()
+        return self._reload, ()
 
     def run(self, kernel: Kernel, *args: Tensor) -> tuple[Tensor, ...]:
         """Run one stage."""
@@ -83,10 +85,3 @@ class _Tracked(torch.autograd.Function):
         args = ctx.saved_tensors
         found = iter(ctx.package.run([*args, *(grad.contiguous() for grad in grads)]))
         return None, None, *(next(found) if arg.is_floating_point() else None for arg in args)
-
-
-def load_or_eager() -> Kernels:
-    """The compiled kernels of this machine, or eager ones where none are built."""
-    from aaplug.rasterizers.tiled.ahead_of_time import load  # it imports this module
-
-    return load() or EAGER

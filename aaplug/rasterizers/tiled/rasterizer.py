@@ -29,9 +29,8 @@ from aaplug.rasterizers.tiled.counting import CountingKernels
 from aaplug.rasterizers.tiled.forward import Compositing
 
 Painter = Callable[[Bins], tuple[Tensor, Tensor]]
-BLENDED_TILES = (
-    64  # composited together by a compositor; sorted, so that they have about equally many splats
-)
+# composited together by a compositor; sorted, so that they have about equally many splats
+BLENDED_TILES = 64
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,46 @@
+"""Convolution of Gaussians in the world, fused into scales and opacities.
+
+n: Gaussians; k: 1, or 3 for one value per axis.
+"""
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from aaplug.core.gaussians import Gaussians, scale_opacities
+
+
+def smoothed_by(scene: Gaussians, log_sigma: Float[Tensor, "n k"], volume: bool) -> Gaussians:
+    """Convolve each Gaussian with one of standard deviation e^log_sigma; -inf changes nothing.
+
+    log_sigma: one for all axes of a Gaussian, or one per axis.  volume: scale opacities by the volume factor.
+    """
+    log_scales = 0.5 * torch.logaddexp(2 * scene.log_scales, 2 * log_sigma)
+    smoothed = replace(scene, log_scales=log_scales)
+    if not volume:
+        return smoothed
+    factor = volume_log_factor(scene.log_scales, log_sigma)
+    return replace(smoothed, logit_opacities=scale_opacities(scene.logit_opacities, factor))
+
+
+def volume_log_factor(
+    log_scales: Float[Tensor, "n 3"], log_sigma: Float[Tensor, "n k"]
+) -> Float[Tensor, " n"]:
+    """ln ∏ s/√(s² + f²) = −½ Σ ln(1 + f²/s²)."""
+    return _axis_log_factors(log_scales, log_sigma).sum(dim=1)
+
+
+def face_log_factor(
+    log_scales: Float[Tensor, "n 3"], log_sigma: Float[Tensor, "n k"]
+) -> Float[Tensor, " n"]:
+    """The same over the two longest axes, which span the broadest face."""
+    return _axis_log_factors(log_scales, log_sigma).topk(2, dim=1).values.sum(dim=1)
+
+
+def _axis_log_factors(
+    log_scales: Float[Tensor, "n 3"], log_sigma: Float[Tensor, "n k"]
+) -> Float[Tensor, "n 3"]:
+    log_ratio = 2 * (log_sigma - log_scales)
+    return -0.5 * torch.logaddexp(log_ratio, torch.zeros_like(log_ratio))
