@@ -15,19 +15,17 @@ import torch
 from aaplug.core.cameras import Camera, CameraSet, look_at
 from aaplug.core.gaussians import Gaussians, PixelSizes
 from aaplug.core.interfaces import Rasterizer
-from aaplug.core.training import TrainingViews
 from aaplug.core.splats import Splats2D
+from aaplug.core.training import TrainingViews
 from aaplug.io.cameras import read_cameras
 from aaplug.io.scenes import read_scene
 from aaplug.rasterizers import RASTERIZERS, Tiled
-from aaplug.rasterizers.tiled import ahead_of_time as compiled
-from aaplug.rendering.renderer import learn
+from aaplug.rasterizers.tiled.ahead_of_time import load
 
-torch.set_num_threads(
-    1
-)  # test processes run side by side, and threads that wait for each other would stall them all
+# Test processes run side by side; threads that wait for each other would stall them all.
+torch.set_num_threads(1)
 
-COMPILED = compiled.load()
+COMPILED = load()
 ALL_RASTERIZERS: dict[str, Rasterizer] = {
     **RASTERIZERS,
     **({} if COMPILED is None else {"compiled": Tiled(COMPILED)}),
@@ -39,7 +37,7 @@ SAMPLE = Path(str(files("aaplug.io.sample")))
 
 @pytest.fixture(autouse=True)
 def own_log(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Give the library's log back as it was: the program replaces its handlers."""
+    """Restore the library's log handlers after each test: the command line replaces them."""
     logger = logging.getLogger("aaplug")
     monkeypatch.setattr(logger, "handlers", list(logger.handlers))
     monkeypatch.setattr(logger, "propagate", True)
@@ -48,7 +46,7 @@ def own_log(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     if not SHARED_DATA.is_dir():
-        pytest.skip("the real scenes are not here")
+        pytest.skip("no folder of real scenes beside the repository")
     return SHARED_DATA
 
 
@@ -69,7 +67,7 @@ def sample_cameras() -> CameraSet:
 
 @pytest.fixture(scope="session")
 def sample_training(sample_scene: Gaussians, sample_cameras: CameraSet) -> TrainingViews:
-    return learn(sample_scene, sample_cameras.train)
+    return TrainingViews.of(sample_scene, sample_cameras)
 
 
 def make_camera(
@@ -78,7 +76,7 @@ def make_camera(
     fov: float = 0.7,
     name: str = "view",
 ) -> Camera:
-    """A camera of the data set that looks at the origin; size is width, height."""
+    """A pose of the data set that looks at the origin; size is width and height in px."""
     focal = 0.5 * size[0] / math.tan(fov / 2)
     pose = look_at(torch.tensor(eye), torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
     centre = size[0] / 2, size[1] / 2
@@ -88,7 +86,7 @@ def make_camera(
 def make_scene(
     n: int, seed: int = 0, dtype: torch.dtype = torch.float32, degree: int = 1
 ) -> Gaussians:
-    """Random Gaussians around the origin, a few tenths of a unit large."""
+    """Random Gaussians around the origin with scales near 0.1 world units."""
     g = torch.Generator().manual_seed(seed)
     rand = {"generator": g, "dtype": torch.float64}
     return Gaussians(
@@ -101,7 +99,7 @@ def make_scene(
 
 
 def sized(scene: Gaussians) -> Gaussians:
-    """The scene with sizes that leave out the smallest and the largest of its Gaussians in most views."""
+    """The scene with the pixel sizes of Multi-Scale 3DGS; in most views some Gaussians are too small or too large."""
     n = len(scene)
     base = torch.arange(n) % 4 == 0
     sizes = PixelSizes(torch.full((n,), 4.0), torch.full((n,), 8.0), base)
@@ -111,7 +109,7 @@ def sized(scene: Gaussians) -> Gaussians:
 def make_splats(
     m: int, hw: tuple[int, int], seed: int = 0, log_sigmas: tuple[float, float] = (-1.0, 2.0)
 ) -> Splats2D:
-    """Random coloured ellipses in and around an image; log_sigmas is the range of ln standard deviations in px."""
+    """Random coloured splats in and around an image; log_sigmas: range of the natural log of standard deviations in px."""
     g = torch.Generator().manual_seed(seed)
     low, high = log_sigmas
     sigmas = torch.exp(low + (high - low) * torch.rand(m, 2, generator=g))

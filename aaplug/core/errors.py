@@ -41,3 +41,9 @@ def listing(names: Sequence[str], most: int = 6) -> str:
     """Join names for a message, cut short where there are many."""
     shown = ", ".join(names[:most])
     return shown if len(names) <= most else f"{shown} and {len(names) - most} more"
+
+
+def reason(error: Exception) -> str:
+    """Why a library or the system failed, in lower case: an OSError's own words without its number and path."""
+    strerror = error.strerror if isinstance(error, OSError) else None
+    return (strerror or str(error)).lower()

@@ -1,1 +1,5 @@
-"""Everything that touches the disk: scenes, cameras, images, and the writing of whole files."""
+"""Files: scenes, cameras, images and videos are read and written here and nowhere else.
+
+Every public function takes paths as `str | os.PathLike[str]`.  No file makes a reader run code, leave its data set's
+folder, or allocate more than `limits` allows.
+"""

@@ -1,55 +1,89 @@
 """Files that appear whole or not at all.
 
-Bytes go to a temporary file beside the output, which takes the output's name only once all of them
-are on the disk.  Whatever interrupts the writing, the old file stays as it was and the temporary
-one is removed.
+A temporary file beside the output takes the output's name once all of its bytes are on the disk.  If writing fails or
+is interrupted, the old file is unchanged and the temporary file is removed.
 """
 
 import os
 import secrets
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
+from os import PathLike
 from pathlib import Path
 from typing import BinaryIO
 
-from aaplug.core.errors import OutputError
+from aaplug.core.errors import OutputError, reason
 
 TOKEN_BYTES = 8  # random bytes in a temporary file's name: 2^64 names
 
 
 @contextmanager
-def replacing(path: Path, overwrite: bool) -> Iterator[BinaryIO]:
-    """A binary stream whose content becomes `path` when the block ends without an exception.
+def replacing(path: str | PathLike[str], overwrite: bool) -> Iterator[BinaryIO]:
+    """Yield a binary stream whose content becomes `path` when the block ends without an exception.
 
-    Keep the block to writing: any OSError in it is reported as a failure to write `path`.
+    The block should only write: any OSError in it is reported as a failure to write `path`.
 
     Raises:
-        OutputError: the output exists and `overwrite` is false, or nothing can be written there.
+        OutputError: the output exists and `overwrite` is false, or it cannot be written.
     """
-    _check_target(path, overwrite)
-    target = Path(os.path.realpath(path))  # a link stays a link and its target is replaced
-    temporary = target.with_name(f".aaplug-{secrets.token_hex(TOKEN_BYTES)}.tmp")
-    with _worded_for_users(path):
-        with _removed_on_failure(temporary):
-            with open(temporary, "xb") as stream:  # "x": never through somebody else's file or link
-                yield stream
-                stream.flush()
-                os.fsync(stream.fileno())
-            os.replace(temporary, target)
-        _sync_folder(target.parent)
+    # "x" never opens somebody else's file or link
+    with replacing_file(path, overwrite) as temporary, open(temporary, "xb") as stream:
+        yield stream
 
 
-def check_output(path: Path, overwrite: bool, inputs: Iterable[Path] = ()) -> None:
-    """Refuse an output that must not be written, before any work and creating nothing.
+@contextmanager
+def replacing_file(
+    path: str | PathLike[str], overwrite: bool, suffix: str = ".tmp"
+) -> Iterator[Path]:
+    """Like `replacing`, for libraries that open their file themselves: yields a path that ends in `suffix`.
 
     Raises:
-        OutputError: the output is one of the inputs (whatever `overwrite` says), exists and
-            `overwrite` is false, or has no folder.
+        OutputError: the output exists and `overwrite` is false, or it cannot be written.
+    """
+    path = Path(path)
+    _check_target(path, overwrite)
+    target = Path(os.path.realpath(path))  # a link stays a link; its target is replaced
+    temporary = target.with_name(f".aaplug-{secrets.token_hex(TOKEN_BYTES)}{suffix}")
+    try:
+        yield temporary
+        _sync(temporary, os.O_RDWR)
+        os.replace(temporary, target)
+    except BaseException as error:  # Ctrl-C too
+        with suppress(OSError):
+            temporary.unlink()
+        if isinstance(error, OSError):
+            raise OutputError(path, f"cannot be written: {reason(error)}") from error
+        raise
+    with suppress(OSError):  # makes the new name permanent; some systems cannot open a folder
+        _sync(target.parent, os.O_RDONLY)
+
+
+def check_output(
+    path: str | PathLike[str], overwrite: bool, inputs: Iterable[str | PathLike[str]] = ()
+) -> None:
+    """Refuse an output that must not be written, before any work and without creating anything.
+
+    Raises:
+        OutputError: the output is one of the inputs (whatever `overwrite` says), exists and `overwrite` is false, or
+            has no folder.
     """
     for source in inputs:
         if _same_file(path, source):
             raise OutputError(path, f"is also the input {source}; give the output another name")
-    _check_target(path, overwrite)
+    _check_target(Path(path), overwrite)
+
+
+def make_folder(path: str | PathLike[str]) -> Path:
+    """Make a folder and its parents where they do not exist, and return it.
+
+    Raises:
+        OutputError: it cannot be made.
+    """
+    try:
+        Path(path).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(path, f"cannot be made: {reason(error)}") from error
+    return Path(path)
 
 
 def _check_target(path: Path, overwrite: bool) -> None:
@@ -59,47 +93,22 @@ def _check_target(path: Path, overwrite: bool) -> None:
         if path.exists() and not path.is_file():
             raise OutputError(path, "is not an ordinary file")
         if path.exists() and not overwrite:
-            raise OutputError(path, "exists; pass --overwrite to replace it")
+            raise OutputError(path, "exists; pass overwrite to replace it")
         if not Path(os.path.realpath(path)).parent.is_dir():
             raise OutputError(path, "cannot be written: its folder does not exist; make it first")
-    except (OSError, ValueError) as error:  # no access, a name too long, or one with a NUL in it
-        raise OutputError(path, f"cannot be written: {_reason(error)}") from error
+    except (OSError, ValueError) as error:  # no access, a name too long, or a NUL in it
+        raise OutputError(path, f"cannot be written: {reason(error)}") from error
 
 
-def _same_file(a: Path, b: Path) -> bool:
-    with suppress(OSError, ValueError):  # one of them does not exist: they are not the same
+def _same_file(a: str | PathLike[str], b: str | PathLike[str]) -> bool:
+    with suppress(OSError, ValueError):  # a file that does not exist is the same as no other
         return os.path.samefile(a, b)
     return False
 
 
-@contextmanager
-def _removed_on_failure(temporary: Path) -> Iterator[None]:
+def _sync(path: Path, mode: int) -> None:
+    descriptor = os.open(path, mode)
     try:
-        yield
-    except BaseException:  # Ctrl-C too
-        with suppress(OSError):
-            temporary.unlink()
-        raise
-
-
-@contextmanager
-def _worded_for_users(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise OutputError(path, f"cannot be written: {_reason(error)}") from error
-
-
-def _reason(error: Exception) -> str:
-    strerror = error.strerror if isinstance(error, OSError) else None
-    return (strerror or str(error)).lower()
-
-
-def _sync_folder(folder: Path) -> None:
-    """Make the new name itself last; systems that cannot open a folder do this on their own."""
-    with suppress(OSError):
-        descriptor = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,8 +1,7 @@
-"""Images as float tensors, and back to PNG.
+"""Image files as float tensors, and tensors as PNG and WebP.
 
-Tensors are RGB, float32, [height, width, 3], row 0 at the top, values in [0, 1] exactly as stored
-in the file (no gamma is undone).  Bit depths are 8 or 16.  Orientation tags are ignored: pixels
-stay where the file has them, since that is what the cameras were calibrated on.
+Tensors are RGB, float32, [height, width, 3], row 0 at the top, values in [0, 1] as stored (gamma-encoded).  Bit depths
+are 8 or 16.  Orientation tags are ignored: cameras were calibrated on the pixels as they stand in the file.
 """
 
 import logging
@@ -10,6 +9,7 @@ import os
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from os import PathLike
 from pathlib import Path
 from typing import IO
 
@@ -27,51 +27,55 @@ from aaplug.io.limits import whole_limit
 
 LOSSLESS_WEBP = 101  # OpenCV's quality for it
 SAMPLE_TYPES = {8: np.uint8, 16: np.uint16}  # by bit depth
-ROWS = 256  # of an image made ready to be stored, at once
+ROWS = 256  # of an image converted to samples at once
 ALPHA_CHANNELS = 4  # RGB and alpha
-DAMAGE = ("Corrupt JPEG data", "Premature end of JPEG file")  # libjpeg's words for lost pixels
-STDERR = 2  # its file descriptor, to which the codecs write directly
+DAMAGE = ("Corrupt JPEG data", "Premature end of JPEG file")  # libjpeg's messages for lost pixels
+STDERR = 2  # file descriptor, which the codecs write to directly
 
 log = logging.getLogger("aaplug")
 
 
-def image_size(path: Path) -> tuple[int, int]:
+def image_size(path: str | PathLike[str]) -> tuple[int, int]:
     """Width and height in px as stored, from the header alone.
 
     Raises:
-        FormatError: the file is missing, is no image, or has more than 2^28 pixels.
+        FormatError: the file is missing, is not an image, or has more pixels than the limit IMAGE.
     """
-    return _look(path)[0]
+    return _look(Path(path))[0]
 
 
-def read_image(path: Path, background: tuple[float, float, float] | None) -> Float[Tensor, "h w 3"]:
-    """Read an 8- or 16-bit image; transparency is composited on `background` in float.
+def read_image(
+    path: str | PathLike[str], background: tuple[float, float, float] | None = None
+) -> Float[Tensor, "h w 3"]:
+    """Read an 8- or 16-bit image; a transparent one is composited over `background` in float.
 
     Raises:
-        FormatError: the file is missing, damaged or too large, or it is transparent and no
-            background is given.
+        FormatError: the file is missing, damaged or too large, or it is transparent and `background` is None.
     """
-    pixels = _read(path)
+    pixels = _read(Path(path))
     if pixels.shape[2] == ALPHA_CHANNELS and background is None:
-        raise FormatError(path, "is transparent; say what lies behind it with --background")
+        raise FormatError(path, "is transparent; pass background, the colour behind it")
     return torch.from_numpy(pixels if background is None else _composite(pixels, background))
 
 
-def read_rgba(path: Path) -> Float[Tensor, "h w 4"]:
-    """Read an 8- or 16-bit image with its transparency, not multiplied into the colours; opaque where it has none.
+def read_rgba(path: str | PathLike[str]) -> Float[Tensor, "h w 4"]:
+    """Read an 8- or 16-bit image with straight (not premultiplied) alpha; 1 where the file has none.
 
     Raises:
         FormatError: the file is missing, damaged or too large.
     """
-    pixels = torch.from_numpy(_read(path))
+    pixels = torch.from_numpy(_read(Path(path)))
     opaque = torch.ones_like(pixels[..., :1])
     return pixels if pixels.shape[2] == ALPHA_CHANNELS else torch.cat([pixels, opaque], dim=2)
 
 
 def write_png(
-    path: Path, rgb: Float[Tensor, "h w 3"], bit_depth: int = 8, overwrite: bool = False
+    path: str | PathLike[str],
+    rgb: Float[Tensor, "h w 3"],
+    bit_depth: int = 8,
+    overwrite: bool = False,
 ) -> None:
-    """Write a PNG of [0, 1]-clamped colours, whole or not at all.
+    """Write colours, clamped to [0, 1], as a PNG, whole or not at all.
 
     Raises:
         OutputError: the file exists and `overwrite` is false, or it cannot be written.
@@ -83,14 +87,14 @@ def write_png(
 
 
 def encode_png(rgb: Float[Tensor, "h w 3"], bit_depth: int) -> bytes:
-    """The bytes of a PNG file of [0, 1]-clamped colours."""
+    """A PNG file of colours clamped to [0, 1]."""
     done, png = cv2.imencode(".png", _stored(rgb, bit_depth))
     assert done
     return png.tobytes()
 
 
 def encode_webp(rgb: Float[Tensor, "h w 3"], quality: int | None) -> bytes:
-    """The bytes of a WebP file of [0, 1]-clamped colours in 8 bits; lossless without a quality, of 1 to 100."""
+    """A WebP file of colours clamped to [0, 1], in 8 bits.  quality: 1 to 100; None is lossless."""
     setting = LOSSLESS_WEBP if quality is None else quality
     done, webp = cv2.imencode(".webp", _stored(rgb, 8), [cv2.IMWRITE_WEBP_QUALITY, setting])
     assert done
@@ -98,21 +102,21 @@ def encode_webp(rgb: Float[Tensor, "h w 3"], quality: int | None) -> bytes:
 
 
 def _stored(rgb: Float[Tensor, "h w 3"], bit_depth: int) -> np.ndarray:
-    """Samples as OpenCV takes them, BGR; by rows, as what comes between is several times as large as a large image."""
+    """Samples in OpenCV's BGR order, converted in bands of rows to keep the float copies small."""
     parts = (levels(rows, bit_depth).flip(2).cpu().numpy() for rows in rgb.split(ROWS))
     return np.concatenate([part.astype(SAMPLE_TYPES[bit_depth]) for part in parts])
 
 
 def _look(path: Path) -> tuple[tuple[int, int], bool]:
-    """Width and height, and whether the file promises transparency, from the header alone."""
+    """Width and height, and whether the header declares transparency."""
     try:
         with _no_pillow_limit(), Image.open(path) as header:
             size, transparent = header.size, header.has_transparency_data
     except FileNotFoundError as error:
         raise FormatError(path, "does not exist") from error
-    except Exception as error:  # Pillow's parsers raise whatever they stumble over
+    except Exception as error:  # Pillow's parsers raise all kinds
         raise FormatError(path, "is not an image that can be read") from error
-    most = whole_limit("IMAGE")  # more is taken for a decompression bomb
+    most = whole_limit("IMAGE")  # an image above it counts as a decompression bomb
     if size[0] * size[1] > most:
         raise FormatError(path, f"has {size[0]}x{size[1]} px, more than the {most:,} allowed")
     return size, transparent
@@ -120,7 +124,7 @@ def _look(path: Path) -> tuple[tuple[int, int], bool]:
 
 @contextmanager
 def _no_pillow_limit() -> Iterator[None]:
-    """Pillow's own limit lies below ours and comes as a warning that nobody sees."""
+    """Disable Pillow's own limit, which is lower than ours and only warns."""
     limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
     try:
         yield
@@ -136,7 +140,7 @@ def _read(path: Path) -> np.ndarray:
         raise FormatError(path, f"holds {pixels.dtype} samples; save it with 8 or 16 bits")
     if transparent != (pixels.shape[2] == ALPHA_CHANNELS):
         raise FormatError(
-            path, "has colours or transparency that OpenCV does not read; save it as RGB(A) PNG"
+            path, "has colours or transparency that OpenCV cannot read; save it as RGB(A) PNG"
         )
     return _to_rgb(pixels)
 
@@ -144,8 +148,8 @@ def _read(path: Path) -> np.ndarray:
 def _decode(path: Path) -> np.ndarray:
     """Samples as stored, [h, w, channels], BGR(A) or gray."""
     try:
-        with codecs_heard() as words:
-            # UNCHANGED keeps 16 bits and alpha, and leaves the orientation tag alone
+        with captured_stderr() as words:
+            # UNCHANGED keeps 16 bits and alpha, and ignores the orientation tag
             pixels = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
             damage = _damage(words)
     except (OSError, MemoryError, cv2.error) as error:
@@ -158,8 +162,8 @@ def _decode(path: Path) -> np.ndarray:
 
 
 @contextmanager
-def codecs_heard() -> Iterator[IO[bytes]]:
-    """Catch what libpng, libjpeg and FFmpeg print: they name no file and would tear a progress bar."""
+def captured_stderr() -> Iterator[IO[bytes]]:
+    """Capture what libpng, libjpeg and FFmpeg print: it names no file and would break a progress bar."""
     with tempfile.TemporaryFile() as words:
         saved = os.dup(STDERR)
         os.dup2(words.fileno(), STDERR)

@@ -1,7 +1,7 @@
-"""Photographs through lenses that distort, straightened to what a pinhole at their centre sees, by OpenCV.
+"""Lens distortion: cameras and photographs as an undistorted pinhole sees them, by OpenCV.
 
-A pinhole keeps the lens's focal length and centre, so that rates are those of the photograph's middle; it is cut to
-what the photograph shows of it.  Here the centre of the first pixel is (0.5, 0.5), in OpenCV (0, 0).
+The pinhole keeps the lens's focal length and principal point, so sampling rates are those at the photograph's centre.
+Its view is cropped to what the photograph covers.  The centre of the first pixel is (0.5, 0.5) here, (0, 0) in OpenCV.
 """
 
 from collections.abc import Sequence
@@ -16,16 +16,16 @@ from torch import Tensor
 
 from aaplug.core.cameras import Camera, Lens
 
-HALF = 0.5  # px: OpenCV's first pixel has its centre at 0
-LEAST_SHARE = 0.5  # of a side: where a photograph shows less of its pinhole, it is of no use
-MAPS = 8  # of lenses, kept for the photographs that share one
+HALF = 0.5  # px: the centre of OpenCV's first pixel is 0
+LEAST_SHARE = 0.5  # of a side: a photograph that covers less of its pinhole's view is not used
+MAPS = 8  # of lenses kept, since most photographs share one
 
 
 @dataclass(frozen=True)
 class Distortion:
-    """A lens's model by its name, and OpenCV's coefficients, None for one that OpenCV has not.
+    """A lens model.
 
-    coefficients: k1, k2, p1, p2 and more; of a fisheye k1 to k4.
+    coefficients: OpenCV's, k1, k2, p1, p2 and more, or k1 to k4 of a fisheye; None for a model that OpenCV lacks.
     """
 
     name: str
@@ -33,18 +33,20 @@ class Distortion:
     fisheye: bool = False
 
 
-def straightened(cameras: Sequence[Camera], bent: Sequence[Distortion | None]) -> list[Camera]:
-    """The cameras; those that distort as the pinholes that their photographs show, or without them."""
+def undistorted_cameras(
+    cameras: Sequence[Camera], distortions: Sequence[Distortion | None]
+) -> list[Camera]:
+    """The cameras as pinholes, cropped to what their photographs cover; without photographs that cannot be used."""
     return [
-        camera if lens is None else _straightened(camera, lens)
-        for camera, lens in zip(cameras, bent, strict=True)
+        camera if lens is None else _undistorted(camera, lens)
+        for camera, lens in zip(cameras, distortions, strict=True)
     ]
 
 
-def straight(image: Float[Tensor, "h w c"], lens: Lens | None) -> Float[Tensor, "H W c"]:
-    """A photograph as the pinhole of its lens sees it; the photograph itself without a lens.
+def undistorted(image: Float[Tensor, "h w c"], lens: Lens | None) -> Float[Tensor, "H W c"]:
+    """A photograph as the pinhole of its lens sees it; unchanged without a lens.
 
-    Interpolation is bilinear, as in COLMAP, nerfstudio and gsplat, whose scenes were trained on such images.
+    Interpolation is bilinear, as in COLMAP, nerfstudio and gsplat, which train on such images.
     """
     if lens is None:
         return image
@@ -54,26 +56,24 @@ def straight(image: Float[Tensor, "h w c"], lens: Lens | None) -> Float[Tensor, 
     return torch.from_numpy(pixels)
 
 
-def lens_notes(bent: Sequence[Distortion | None], cameras: Sequence[Camera]) -> list[str]:
-    """Lines on lenses that distort, by the names of their models, if there are any."""
-    pairs = [(lens, camera) for lens, camera in zip(bent, cameras, strict=True) if lens]
+def lens_notes(distortions: Sequence[Distortion | None], cameras: Sequence[Camera]) -> list[str]:
+    """A note on the lenses that distort, with the names of their models, if there are any."""
+    pairs = [(lens, camera) for lens, camera in zip(distortions, cameras, strict=True) if lens]
     if not pairs:
         return []
     models = ", ".join(sorted({lens.name for lens, _ in pairs}))
     photographed = [camera for _, camera in pairs if camera.photo]
-    what = "their photos are straightened to that (OpenCV) and cut to what they show"
+    what = "their photos are undistorted (OpenCV) and cropped to what they cover"
     if len(photographed) < len(pairs):
-        what = (
-            "photos without OpenCV's distortion are not used; colmap image_undistorter makes some"
-        )
+        what = "photos whose distortion OpenCV lacks are not used; colmap image_undistorter converts them"
         if photographed:
-            what = f"{len(photographed)} photos are straightened to that; other {what}"
+            what = f"{len(photographed)} photos are undistorted; other {what}"
     return [
-        f"{len(pairs)} cameras have a lens that distorts ({models}): renders show the pinhole at its centre; {what}"
+        f"{len(pairs)} cameras have a lens that distorts ({models}): renders are of the pinhole at its centre; {what}"
     ]
 
 
-def _straightened(camera: Camera, lens: Distortion) -> Camera:
+def _undistorted(camera: Camera, lens: Distortion) -> Camera:
     if camera.photo is None or lens.coefficients is None:
         return replace(camera, photo=None)
     whole = Lens(
@@ -99,7 +99,7 @@ def _straightened(camera: Camera, lens: Distortion) -> Camera:
 
 @lru_cache(MAPS)
 def _window(whole: Lens) -> tuple[int, int, int, int] | None:
-    """Left, top, width and height of what the photograph shows of its pinhole, None if that is little."""
+    """Left, top, width and height of the pinhole's view that the photograph covers; None if less than LEAST_SHARE."""
     width, height = whole.size
     x, y = _maps(whole, width, height)
     outside = ~((x >= -HALF) & (x <= width - HALF) & (y >= -HALF) & (y <= height - HALF))
@@ -121,7 +121,7 @@ def _window(whole: Lens) -> tuple[int, int, int, int] | None:
 
 @lru_cache(MAPS)
 def _maps(lens: Lens, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
-    """Where in a photograph of width × height px each pixel of the pinhole's window lies, in OpenCV's pixels."""
+    """For each pixel of the pinhole's window, x and y in a photograph of width × height px, in OpenCV's pixels."""
     scale = width / lens.size[0], height / lens.size[1]
     left, top, *window = lens.window
     size = tuple(max(1, round(side * s)) for side, s in zip(window, scale, strict=True))

@@ -1,7 +1,7 @@
-"""Every bound on what a file may ask for, in one table; `aaplug info --limits` prints it.
+"""Limits on what a file may make a reader allocate; `aaplug info --limits` prints them.
 
-A limit is raised or lowered by an environment variable, AAPLUG_ and its name: AAPLUG_GAUSSIANS=2e8.  Sizes are in
-bytes.  Most were set after failures of other readers: counts that allocate terabytes, inflation bombs, endless headers.
+The environment variable AAPLUG_<NAME> overrides a limit: AAPLUG_GAUSSIANS=2e8.  Most of them answer failures of other
+readers: counts that allocate terabytes, decompression bombs, endless headers.
 """
 
 import math
@@ -14,7 +14,7 @@ from aaplug.core.errors import UsageError
 
 @dataclass(frozen=True)
 class Limit:
-    """The most that is accepted of something."""
+    """The largest accepted value of something."""
 
     value: int | float
     unit: str
@@ -42,7 +42,7 @@ def limit(name: str) -> int | float:
     """The limit in force.
 
     Raises:
-        UsageError: the environment holds something else than a positive number.
+        UsageError: the environment variable is not a positive number.
     """
     variable = f"AAPLUG_{name}"
     text = os.environ.get(variable)
@@ -58,9 +58,8 @@ def limit(name: str) -> int | float:
 
 
 def whole_limit(name: str) -> int:
-    """The limit in force, of things that are counted."""
-    value = limit(name)
-    return int(min(value, 2**62))
+    """The limit in force, as an integer."""
+    return int(min(limit(name), 2**62))
 
 
 def memory_of_machine() -> float | None:

@@ -1,7 +1,7 @@
-"""Values from files that nobody vouches for: bounded, typed, finite, and named when they are wrong.
+"""Values from untrusted files: their size, type and range are checked before they are used.
 
-Lengths are in world units, sizes and focal lengths in px.  Every complaint is a `FormatError` that
-gives the file, the entry, the field, what was expected and what was found.
+Sizes and focal lengths are in px.  Every error is a `FormatError` that names the file, the entry and the field, and
+says what was expected and what was found.
 """
 
 import json
@@ -17,36 +17,32 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.errors import FormatError
+from aaplug.core.errors import FormatError, reason
 from aaplug.io.limits import whole_limit
 
-HEAD_LIMIT = 64 * 2**10  # bytes: enough to meet an entry's keys when a file's format is guessed
-MAX_FOCAL = 1e9  # px: no lens sees so little, and what follows from it stays finite
-ORTHONORMAL = 1e-3  # the most that an entry of R·Rᵀ may be off the identity's
+HEAD_LIMIT = 64 * 2**10  # bytes searched for keys when a format is guessed
+MAX_FOCAL = 1e9  # px: far above any real lens; what is computed from it stays finite
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where in a file a value stands, for messages."""
+    """The place of a value in a file, for error messages."""
 
     file: Path
     entry: str
 
     def error(self, problem: str) -> FormatError:
-        """A complaint about this entry as a whole."""
+        """An error about the whole entry."""
         return FormatError(self.file, f"{self.entry}: {problem}")
 
     def wrong(self, field: str, expected: str, got: object) -> FormatError:
-        """A complaint about one field."""
+        """An error about one field."""
         return self.error(f"{field} should be {expected}, not {reprlib.repr(got)}")
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One JSON object, read field by field.
-
-    Each reading raises FormatError if the field is not what it should be.
-    """
+    """One JSON object.  Each method reads one field and raises FormatError if it is missing or not of that kind."""
 
     place: Place
     fields: dict[str, Any]
@@ -55,7 +51,7 @@ class Entry:
         return field in self.fields
 
     def value(self, field: str) -> Any:
-        """The field as it stands."""
+        """The field, unchecked."""
         if field not in self.fields:
             raise self.place.error(f"{field} is missing")
         return self.fields[field]
@@ -69,7 +65,7 @@ class Entry:
         return focal(self.value(field), self.place, field)
 
     def pixels(self, field: str) -> int:
-        """The length of an image's side, in px."""
+        """The side of an image, in px."""
         return pixels(self.value(field), self.place, field)
 
     def text(self, field: str) -> str:
@@ -77,12 +73,12 @@ class Entry:
         return text(self.value(field), self.place, field)
 
     def vector(self, field: str, length: int) -> Float[Tensor, " length"]:
-        """Finite numbers, `length` of them."""
+        """A list of `length` finite numbers."""
         cells = numbers(self.value(field), length, self.place, field)
         return torch.tensor(cells, dtype=torch.float64)
 
     def matrix(self, field: str, rows: int, columns: int) -> Float[Tensor, "rows columns"]:
-        """Finite numbers, a list a row."""
+        """A list of rows, each a list of finite numbers."""
         value = self.value(field)
         expected = f"{rows} rows of {columns} numbers"
         if not isinstance(value, list) or len(value) != rows:
@@ -95,7 +91,7 @@ def number(value: object, place: Place, field: str) -> float:
     """`value` as a finite number.
 
     Raises:
-        FormatError: it is none.
+        FormatError: it is not.
     """
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise place.wrong(field, "a number", value)
@@ -108,7 +104,7 @@ def numbers(value: object, length: int, place: Place, field: str) -> list[float]
     """`value` as a list of `length` finite numbers.
 
     Raises:
-        FormatError: it is none.
+        FormatError: it is not.
     """
     if not isinstance(value, list) or len(value) != length:
         raise place.wrong(field, f"{length} numbers", value)
@@ -119,7 +115,7 @@ def focal(value: object, place: Place, field: str) -> float:
     """`value` as a focal length, in px.
 
     Raises:
-        FormatError: it is none.
+        FormatError: it is not.
     """
     real = number(value, place, field)
     if not 0 < real <= MAX_FOCAL:
@@ -128,10 +124,10 @@ def focal(value: object, place: Place, field: str) -> float:
 
 
 def pixels(value: object, place: Place, field: str) -> int:
-    """`value` as the length of an image's side, in px.
+    """`value` as the side of an image, in px.
 
     Raises:
-        FormatError: it is none.
+        FormatError: it is not.
     """
     real, most = number(value, place, field), whole_limit("CAMERA_SIDE")
     if not (1 <= real <= most and real.is_integer()):
@@ -140,82 +136,31 @@ def pixels(value: object, place: Place, field: str) -> int:
 
 
 def text(value: object, place: Place, field: str) -> str:
-    """`value` as printable text, so that nothing odd ends up in a terminal or a path.
+    """`value` as printable text: no control characters reach a terminal or a path.
 
     Raises:
-        FormatError: it is none.
+        FormatError: it is not.
     """
     if not isinstance(value, str) or not value or not value.isprintable():
         raise place.wrong(field, "printable text", value)
     return value
 
 
-def pose(
-    rotation: Float[Tensor, "3 3"], translation: Float[Tensor, " 3"], place: Place, field: str
-) -> Float[Tensor, "4 4"]:
-    """A rigid motion whose rotation is exactly orthonormal.
-
-    Raises:
-        FormatError: `rotation` is further from a rotation than rounding explains.
-    """
-    error = (rotation @ rotation.T - torch.eye(3, dtype=torch.float64)).abs().max().item()
-    if not error <= ORTHONORMAL:
-        raise place.error(
-            f"{field} should be a rotation: R·Rᵀ is {error:.2g} off the identity, "
-            f"{ORTHONORMAL:g} allowed"
-        )
-    if torch.linalg.det(rotation) <= 0:
-        raise place.error(f"{field} should be a rotation, but it mirrors (its determinant is -1)")
-    left, _, right = torch.linalg.svd(rotation)
-    motion = torch.eye(4, dtype=torch.float64)
-    motion[:3, :3] = left @ right
-    motion[:3, 3] = translation
-    return motion
-
-
-def inverse(motion: Float[Tensor, "4 4"], place: Place, field: str) -> Float[Tensor, "4 4"]:
-    """The rigid motion back.
-
-    Raises:
-        FormatError: it leaves the range of numbers.
-    """
-    back = torch.eye(4, dtype=torch.float64)
-    back[:3, :3] = motion[:3, :3].T
-    back[:3, 3] = -back[:3, :3] @ motion[:3, 3]
-    if not back.isfinite().all():
-        raise place.wrong(field, "a position within reach", motion[:3, 3].tolist())
-    return back
-
-
-def rigid(entry: Entry, field: str) -> Float[Tensor, "4 4"]:
-    """A field that holds a 4×4 rigid motion, with 0 0 0 1 in its last row.
-
-    Raises:
-        FormatError: it holds none.
-    """
-    motion = entry.matrix(field, 4, 4)
-    if not torch.allclose(motion[3], torch.eye(4, dtype=torch.float64)[3]):
-        raise entry.place.wrong(f"{field}'s last row", "0 0 0 1", motion[3].tolist())
-    return motion
-
-
 def read_bounded(path: Path, limit: int) -> bytes:
     """A file's bytes.
 
     Raises:
-        FormatError: it is longer than `limit`, no file, or may not be read.
+        FormatError: it is longer than `limit`, is not a file, or cannot be read.
     """
-    if not os.path.isfile(path):  # a pipe would make us wait for ever
+    if not os.path.isfile(path):  # reading a pipe would block
         raise FormatError(path, "there is no such file")
     try:
         with path.open("rb") as file:
             data = file.read(limit + 1)
     except OSError as error:
-        raise FormatError(path, f"cannot be read: {error.strerror}") from error
+        raise FormatError(path, f"cannot be read: {reason(error)}") from error
     if len(data) > limit:
-        raise FormatError(
-            path, f"is longer than {limit} bytes, the most that is read of such a file"
-        )
+        raise FormatError(path, f"is longer than {limit} bytes, the limit for such a file")
     return data
 
 
@@ -223,16 +168,16 @@ def read_json(path: Path) -> Any:
     """A JSON document.
 
     Raises:
-        FormatError: the file is none, is longer than the limit, or holds NaN or Infinity.
+        FormatError: the file is not JSON, is longer than the limit, or holds NaN or Infinity.
     """
     return parse_json(read_bounded(path, whole_limit("JSON")), path)
 
 
 def parse_json(data: bytes, path: Path) -> Any:
-    """The JSON document in these bytes of the file `path`.
+    """Parse the JSON in these bytes of the file `path`.
 
     Raises:
-        FormatError: they are none, or hold NaN or Infinity.
+        FormatError: they are not JSON, or hold NaN or Infinity.
     """
     try:
         return json.loads(data.decode("utf-8-sig"), parse_constant=_refuse)
@@ -245,7 +190,7 @@ def parse_json(data: bytes, path: Path) -> Any:
 def entries(
     path: Path, what: str, items: object, shared: dict[str, Any] | None = None
 ) -> list[Entry]:
-    """A JSON list's objects, each laid over the fields that all share.
+    """The objects of a JSON list; `shared` fields apply where an object does not have its own.
 
     Raises:
         FormatError: it is not a list of objects, or is empty.
@@ -258,7 +203,7 @@ def entries(
 
 
 def head(path: Path) -> bytes:
-    """A file's first bytes, none if it cannot be read; to guess a format, so nothing is raised."""
+    """A file's first bytes, empty if it cannot be read: `sniff` functions never raise."""
     if not os.path.isfile(path):
         return b""
     try:
@@ -269,7 +214,7 @@ def head(path: Path) -> bytes:
 
 
 def mentions(path: Path, keys: Sequence[str]) -> bool:
-    """Whether one of the keys of a JSON object is met early in the file."""
+    """Whether one of these JSON keys stands in the first bytes of the file."""
     start = head(path)
     return any(f'"{key}"'.encode() in start for key in keys)
 
@@ -281,4 +226,4 @@ def _entry(place: Place, item: object, shared: dict[str, Any]) -> Entry:
 
 
 def _refuse(constant: str) -> NoReturn:
-    raise ValueError(f"{constant} is no finite number")
+    raise ValueError(f"{constant} is not a finite number")

@@ -1,78 +1,115 @@
-"""Cameras from files: what kind of file it is, and which of the cameras are wanted.
+"""Cameras from files.
 
-A format is one module.  `sniff(path) -> bool` says whether a file or folder is of the format and
-never raises; `read(path, options) -> CameraSet` reads it, at the training size, in the conventions
-of `aaplug.core.cameras`, and raises FormatError or UsageError and nothing else.  A new format is one
-line in `FORMATS`.
+A camera format is a module or object like the `CameraFormat` below.  aaplug's own are in `OWN`; a plug-in adds one by
+an entry point in the group "aaplug.camera_formats" (see `core.registry`).  `read_cameras` takes the first format whose
+`sniff` accepts the path: plug-ins first, as they may read a dialect of a file that an own format would accept too.
 """
 
 import difflib
 import os
-from collections.abc import Callable
-from dataclasses import dataclass
+from os import PathLike
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.errors import FormatError, UsageError, listing
-from aaplug.io.cameras import blender, camera_path, colmap, inria, llff, multiscale, pinhole
+from aaplug.core.registry import Registry
+from aaplug.io.cameras import (
+    blender,
+    camera_path,
+    colmap,
+    inria,
+    inria_model,
+    llff,
+    multiscale,
+    pinhole,
+    transforms,
+)
 from aaplug.io.cameras.options import Options
 
-CLOSE_NAMES = 3  # names to offer for one that is unknown
+CLOSE_NAMES = 3  # names suggested for an unknown one
 
 
-@dataclass(frozen=True)
-class CameraFormat:
-    """One kind of file or folder that cameras come in.  sign: what it is known by, for the user."""
+@runtime_checkable
+class CameraFormat(Protocol):
+    """One kind of file or folder that holds cameras.
 
-    sign: str
-    sniff: Callable[[Path], bool]
-    read: Callable[[Path, Options], CameraSet]
+    name: unique.
+    sign: what the format is recognized by, for the error that lists all formats.
+    """
+
+    @property
+    def name(self) -> str: ...  # noqa: D102
+
+    @property
+    def sign(self) -> str: ...  # noqa: D102
+
+    def sniff(self, path: Path) -> bool:
+        """Whether a file or folder is of this format.  Never raises."""
+        ...
+
+    def read(self, path: Path, options: Options) -> CameraSet:
+        """The cameras at their training size, with the axes and pixel centres of `aaplug.core.cameras`.
+
+        Raises:
+            FormatError: the file breaks its format.
+            UsageError: an option does not fit.
+        """
+        ...
 
 
-FORMATS = (  # the first that fits is taken
-    CameraFormat("a JSON file with world_to_camera", pinhole.sniff, pinhole.read),
-    CameraFormat("a JSON file with camera_path (nerfstudio)", camera_path.sniff, camera_path.read),
-    CameraFormat("cameras.json with cfg_args (INRIA)", inria.sniff_model, inria.read),
-    CameraFormat("sparse/0 or sparse (COLMAP)", colmap.sniff, colmap.read),
-    CameraFormat("transforms_train.json (Blender)", blender.sniff_split, blender.read_split),
-    CameraFormat("cameras.json (INRIA)", inria.sniff, inria.read),
-    CameraFormat("metadata.json (multi-scale Blender)", multiscale.sniff, multiscale.read),
-    CameraFormat("transforms.json (nerfstudio, instant-ngp)", blender.sniff, blender.read),
-    CameraFormat("poses_bounds.npy (LLFF)", llff.sniff, llff.read),
+# the first that accepts a path is used
+OWN: tuple[CameraFormat, ...] = (
+    pinhole,
+    camera_path,
+    inria_model,
+    colmap,
+    blender,
+    inria,
+    multiscale,
+    transforms,
+    llff,
+)
+CAMERA_FORMATS: Registry[CameraFormat] = Registry(
+    "camera format", {f.name: f for f in OWN}, lambda value: isinstance(value, CameraFormat)
 )
 
 
 def read_cameras(
-    path: Path,
+    path: str | PathLike[str],
     *,
     train_scale: float | None = None,
     images: str | None = None,
     test_every: int | None = None,
 ) -> CameraSet:
-    """The cameras of a file or folder at their training size.
+    """Read the cameras of a file or folder at their training size.
 
-    train_scale: training size over the source's, overrides what the files say.  images: the folder
-    of the photos, relative to the dataset's root.  test_every: every n-th by name is a test view, 0
-    for no split.
+    Args:
+        path: a file or folder of any format in `CAMERA_FORMATS`.
+        train_scale: training size over the size in the files; overrides what the files say.
+        images: the folder of the photos, relative to the dataset's root.
+        test_every: every n-th view by name is a test view; 0 for no split.
 
     Raises:
-        FormatError: there are no cameras, or a file is not what it should be.
+        FormatError: there are no cameras, or a file breaks its format.
         UsageError: an option does not fit.
     """
     options = Options(train_scale, images, test_every)
     if not os.path.exists(path):
         raise FormatError(path, "there is no such file or folder")
-    for kind in FORMATS:
-        if kind.sniff(path):
-            return kind.read(path, options)
-    signs = "; ".join(kind.sign for kind in FORMATS)
+    path = Path(path)
+    formats = sorted(CAMERA_FORMATS.values(), key=OWN.__contains__)  # plug-ins first
+    for format in formats:
+        if format.sniff(path):
+            return format.read(path, options)
+    signs = "; ".join(format.sign for format in formats)
     raise FormatError(path, f"holds no cameras of a known format; looked for: {signs}")
 
 
 def select_views(cameras: CameraSet, spec: str) -> tuple[Camera, ...]:
-    """The views that `spec` asks for: train, test, all, or names with commas between.
+    """The views named by `spec`: train, test, all, or view names separated by commas.
 
-    A name that both splits use means the test view.
+    A name in both splits means the test view.
 
     Raises:
         UsageError: a name is unknown.
@@ -90,6 +127,6 @@ def select_views(cameras: CameraSet, spec: str) -> tuple[Camera, ...]:
 def _unknown(name: str, known: list[str]) -> Camera:
     close = difflib.get_close_matches(name, known, CLOSE_NAMES, cutoff=0) if name else known
     raise UsageError(
-        "--views",
+        "views",
         f"there is no view {name!r}; train, test, all or names such as {listing(close, 3)}",
     )

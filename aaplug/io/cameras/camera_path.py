@@ -1,68 +1,72 @@
 """nerfstudio's `camera_path.json`: free cameras along a path, the frames of a video.
 
-{render_width, render_height, fps, camera_type, camera_path: [{camera_to_world, fov}]}.  camera_to_world:
-16 numbers, row by row, OpenGL axes, in the frame of the trained scene; fov: the vertical angle in degrees; sizes in px.
+{render_width, render_height, fps, camera_type, camera_path: [{camera_to_world, fov}]}.  camera_to_world: 16 numbers,
+row by row, OpenGL axes, in the frame of the trained scene; fov: the vertical angle in degrees; sizes in px.
 """
 
 import math
 import os
 from dataclasses import dataclass
+from os import PathLike
 from pathlib import Path
-
-import torch
 
 from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.errors import FormatError
 from aaplug.io.cameras.options import Options, undivided
-from aaplug.io.cameras.photos import described_sizes, refuse_folder, scaled_sizes
-from aaplug.io.values import Entry, Place, entries, focal, inverse, mentions, pose, read_json
+from aaplug.io.cameras.photos import refuse_folder
+from aaplug.io.cameras.poses import inverse, pose_of_opengl
+from aaplug.io.cameras.sizes import described_sizes, file_sizes
+from aaplug.io.values import Entry, Place, entries, focal, mentions, read_json
 
-OPENCV_FROM_OPENGL = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
 KEY = "camera_path"
 PERSPECTIVE = "perspective"
-USUAL_FPS = 24.0  # where the file does not say
-HALF_TURN = 180.0  # degrees: a pinhole sees less
+USUAL_FPS = 24.0  # if the file does not say
+HALF_TURN = 180.0  # degrees: the angle of view of a pinhole is less
+
+name = "camera_path"
+sign = "a JSON file with camera_path (nerfstudio)"
 
 
 @dataclass(frozen=True)
 class CameraPath:
-    """Cameras in order, and how many are shown a second."""
+    """Cameras in order, and the frame rate, in 1/s."""
 
     cameras: tuple[Camera, ...]
     fps: float
 
 
 def sniff(path: Path) -> bool:
-    """Whether a file's keys are those of a camera path."""
+    """Whether a file has the keys of a camera path."""
     return not os.path.isdir(path) and mentions(path, [KEY, "camera_to_world"])
 
 
 def read(path: Path, options: Options) -> CameraSet:
-    """The cameras, free ones: they are no poses of a data set, so they tell nothing of training's sampling.
+    """The cameras.  They are free: not poses of a dataset, so they say nothing about the sampling of training.
 
     Raises:
-        FormatError: the file is not what it should be.
+        FormatError: the file breaks its format.
         UsageError: the options do not fit.
     """
-    refuse_folder(options.images)
+    refuse_folder(options)
     cameras = read_camera_path(path).cameras
-    scale = 1.0 if options.train_scale is None else options.train_scale
-    cameras = [c.resized(*s) for c, s in zip(cameras, scaled_sizes(cameras, scale), strict=True)]
+    sizes, _ = file_sizes(cameras, options)
+    cameras = [camera.resized(*size) for camera, size in zip(cameras, sizes, strict=True)]
     split = undivided(cameras, "a path has no split")
     notes = (
         f"camera path: {len(cameras)} free cameras, {described_sizes(cameras)}; "
-        "they stand in for training cameras, which give better bounds",
+        "used in place of training cameras, which would give better sampling bounds",
         split.note,
     )
     return CameraSet(split.train, split.test, notes=notes)
 
 
-def read_camera_path(path: Path) -> CameraPath:
-    """The frames of a video.
+def read_camera_path(path: str | PathLike[str]) -> CameraPath:
+    """Read the frames of a video.
 
     Raises:
-        FormatError: the file is not what it should be.
+        FormatError: the file breaks its format.
     """
+    path = Path(path)
     document = read_json(path)
     if not isinstance(document, dict) or KEY not in document:
         raise FormatError(path, f"should be an object with '{KEY}', as nerfstudio writes")
@@ -86,7 +90,6 @@ def _camera(entry: Entry, name: str, width: int, height: int) -> Camera:
         raise entry.place.wrong("fov", f"above 0 and below {HALF_TURN:g} degrees", angle)
     f = focal(height / 2 / math.tan(math.radians(angle) / 2), entry.place, "fov's focal length")
     motion = entry.vector("camera_to_world", 16).reshape(4, 4)
-    rotation = motion[:3, :3] * OPENCV_FROM_OPENGL
-    world_from_cam = pose(rotation, motion[:3, 3], entry.place, "camera_to_world")
+    world_from_cam = pose_of_opengl(motion, entry.place, "camera_to_world")
     cam_from_world = inverse(world_from_cam, entry.place, "camera_to_world")
     return Camera(name, width, height, f, f, width / 2, height / 2, cam_from_world)

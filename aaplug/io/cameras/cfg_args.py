@@ -1,8 +1,7 @@
 """The settings of an INRIA training run: `cfg_args`, the text of a Python `Namespace(...)`.
 
-The text ships with scenes that come from anywhere, so it is parsed and never evaluated: one call of
-`Namespace` whose keywords are literals, or nothing.  `source_path` is of no use on another machine
-and is not read.
+The text comes with downloaded scenes, so it is parsed and never evaluated: one call of `Namespace` whose keywords are
+literals.  `source_path` names a folder of another machine and is not read.
 """
 
 import ast
@@ -27,9 +26,10 @@ DIVISORS = (1, 2, 4, 8)  # resolutions that divide the size; others are a width 
 class CfgArgs:
     """What a run says about its images.
 
-    resolution: a divisor of DIVISORS, CAPPED, or a width in px.  images: the folder of the photos.
-    white_background: None if the file does not say.  held_out: whether every 8th view was kept from
-    training (eval).
+    resolution: a divisor in DIVISORS, CAPPED, or a width in px.
+    images: the folder of the photos.
+    white_background: None if the file does not say.
+    held_out: whether every 8th view was kept from training (eval).
     """
 
     resolution: float = CAPPED
@@ -39,23 +39,23 @@ class CfgArgs:
 
     @property
     def divisor(self) -> int:
-        """What the photos' folder says they were divided by: 4 for images_4."""
+        """The divisor in the name of the photos' folder: 4 for images_4."""
         match = re.search(r"_([1-9][0-9]?)$", self.images)
         return int(match[1]) if match else 1
 
     def size(self, width: int, height: int) -> tuple[int, int]:
-        """The size at which 3DGS trains on an image of `width` × `height` px."""
+        """The size at which 3DGS trains on an image of this size."""
         if self.resolution in DIVISORS:
             return max(1, round(width / self.resolution)), max(1, round(height / self.resolution))
         target = min(width, WIDTH_CAP) if self.resolution == CAPPED else int(self.resolution)
-        return target, max(1, height * target // width)  # 3DGS cuts here and rounds above
+        return target, max(1, height * target // width)  # 3DGS truncates here, and rounds above
 
 
 def read_cfg_args(path: Path) -> CfgArgs:
-    """The settings that matter for cameras, at their defaults where the file does not mention them.
+    """Read the settings that concern cameras; those that the file does not mention have their defaults.
 
     Raises:
-        FormatError: the file is anything but a Namespace of literals, or a setting is wrong.
+        FormatError: the file is not a Namespace of literals, or a setting is wrong.
     """
     found = _literals(path, _parsed(path))
     place = Place(path, "Namespace")
@@ -72,12 +72,12 @@ def _parsed(path: Path) -> ast.Call:
     source = read_bounded(path, whole_limit("CFG_ARGS"))
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # a path's backslashes are no concern of the user's
+            warnings.simplefilter("ignore")  # Python's, about backslashes in Windows paths
             call = ast.parse(source.decode().strip(), mode="eval").body
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
         raise FormatError(path, f"should be a Python Namespace(...): {error}") from error
     if not (isinstance(call, ast.Call) and isinstance(call.func, ast.Name)):
-        raise FormatError(path, "should be a Python Namespace(...), and is something else")
+        raise FormatError(path, "should be a Python Namespace(...)")
     plain = not call.args and all(keyword.arg for keyword in call.keywords)
     if call.func.id != "Namespace" or not plain:
         raise FormatError(path, f"should be Namespace(name=value, ...), not {call.func.id}(...)")
@@ -113,5 +113,5 @@ def _flag(found: dict[str, Any], name: str, place: Place) -> bool | None:
 
 
 def half_up(value: float) -> int:
-    """Rounding as image tools do it to make an images_N folder; Python goes to the even number."""
+    """Round halves up, as the tools that make images_N folders do; Python rounds them to even."""
     return max(1, math.floor(value + 0.5))

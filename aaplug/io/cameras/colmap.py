@@ -1,9 +1,9 @@
 """COLMAP datasets.
 
-The root holds `images` and a model in `sparse/0` or `sparse`: cameras (intrinsics) and images
-(poses), both .bin or both .txt.  Poses are world-to-camera, OpenCV axes, in world units; the centre
-of the first pixel is (0.5, 0.5); focal lengths and principal points are in px.  A lens that distorts
-counts as the pinhole at its centre, and its photos are straightened.  Points are not read.
+The root holds `images`, and a model in `sparse/0` or `sparse`: cameras (intrinsics) and images (poses), both .bin or
+both .txt.  Poses are world-to-camera, OpenCV axes, in world units; the centre of the first pixel is (0.5, 0.5); focal
+lengths and principal points are in px.  A camera with distortion becomes the pinhole at its principal point, and its
+photos are undistorted.  Points are not read.
 """
 
 import math
@@ -22,29 +22,19 @@ from aaplug.io.cameras.cfg_args import WIDTH_CAP
 from aaplug.io.cameras.colmap_files import KINDS, Image, Intrinsics, read_cameras, read_images
 from aaplug.io.cameras.options import LLFF_HOLD, Options, every_nth
 from aaplug.io.cameras.photos import (
-    Size,
-    described_sizes,
     distinct,
     photo_folder,
-    photo_sizes,
-    scaled_sizes,
-    trained_at,
     whole,
     with_photos,
     without_suffix,
 )
-from aaplug.io.lenses import Distortion, lens_notes, straightened
-from aaplug.io.values import (
-    Place,
-    focal,
-    inverse,
-    number,
-    pixels,
-    pose,
-)
+from aaplug.io.cameras.poses import inverse, pose
+from aaplug.io.cameras.sizes import Size, camera_set, file_sizes, photo_sizes, trained_at
+from aaplug.io.lenses import Distortion, lens_notes, undistorted_cameras
+from aaplug.io.values import Place, focal, number, pixels
 
-LEAST_QUATERNION = 1e-6  # a length below this has no direction
-OPENCV = {  # which of a model's distortion parameters are OpenCV's coefficients, −1 for 0
+LEAST_QUATERNION = 1e-6  # shortest quaternion that counts as a rotation
+OPENCV = {  # for each of OpenCV's coefficients, the index of the model's distortion parameter; -1 for 0
     "SIMPLE_RADIAL": (0, -1, -1, -1),
     "RADIAL": (0, 1, -1, -1),
     "OPENCV": (0, 1, 2, 3),
@@ -54,9 +44,12 @@ OPENCV = {  # which of a model's distortion parameters are OpenCV's coefficients
     "RADIAL_FISHEYE": (0, 1, -1, -1),
 }
 
+name = "colmap"
+sign = "sparse/0 or sparse (COLMAP)"
+
 
 def sniff(path: Path) -> bool:
-    """Whether it is a dataset's root, the folder of a model, or one of a model's files."""
+    """Whether it is a dataset's root, a model's folder, or one of a model's files."""
     return _model_folder(path) is not None
 
 
@@ -64,37 +57,24 @@ def read(path: Path, options: Options) -> CameraSet:
     """The cameras at the size of their photos.
 
     Raises:
-        FormatError: a file is not what it should be, or a camera sees all around.
+        FormatError: a file breaks its format, or a camera has no focal length.
         UsageError: the options do not fit.
     """
     folder = _model_folder(path) or path
     cameras_file, images_file = _files(folder)
     intrinsics = read_cameras(cameras_file)
     images = sorted(read_images(images_file), key=lambda image: image.name)
-    photos = photo_folder(
-        _root(folder),
-        options.images,
-        "images",
-        Place(folder, "images"),
-    )
+    photos = photo_folder(_root(folder), options, "images", Place(folder, "images"))
     source = [_camera(image, intrinsics) for image in images]
     source = with_photos(source, [image.place for image in images], photos)
     names = distinct(images_file, [image.name for image in images], (without_suffix, whole))
     source = [replace(camera, name=name) for camera, name in zip(source, names, strict=True)]
     sizes, why = _training_sizes(source, options)
-    bent = [_bent(intrinsics[image.camera_id]) for image in images]
-    trained = straightened(trained_at(source, sizes), bent)
-    split = every_nth(
-        trained, options, LLFF_HOLD, "3DGS --eval's rule; --test-every 0 for no split"
-    )
-    notes = (
-        f"COLMAP ({images_file.suffix[1:]}): {len(source)} cameras, "
-        f"{described_sizes(source)} in the file",
-        split.note,
-        f"training size: {described_sizes(trained)} ({why})",
-        *lens_notes(bent, trained),
-    )
-    return CameraSet(split.train, split.test, notes=notes)
+    lenses = [_distortion(intrinsics[image.camera_id]) for image in images]
+    trained = undistorted_cameras(trained_at(source, sizes), lenses)
+    split = every_nth(trained, options, LLFF_HOLD, "3DGS --eval's rule; test_every=0 for no split")
+    kind = f"COLMAP ({images_file.suffix[1:]})"
+    return camera_set(kind, source, split, why, more=lens_notes(lenses, trained))
 
 
 def _model_folder(path: Path) -> Path | None:
@@ -128,13 +108,12 @@ def _root(folder: Path) -> Path:
 
 def _training_sizes(cameras: Sequence[Camera], options: Options) -> tuple[list[Size], str]:
     if options.train_scale is not None:
-        why = f"size in the file × {options.train_scale:g}: --train-scale"
-        return scaled_sizes(cameras, options.train_scale), why
+        return file_sizes(cameras, options)
     there = sum(camera.photo is not None for camera in cameras)
     sizes = photo_sizes(cameras)
     why = f"size of the {there} photos found" if there else "size in the file, no photos found"
     if max(width for width, _ in sizes) > WIDTH_CAP:
-        why += f"; 3DGS itself would have capped the width at {WIDTH_CAP}: --train-scale sets it"
+        why += f"; 3DGS itself would have capped the width at {WIDTH_CAP}: train_scale sets it"
     return sizes, why
 
 
@@ -149,12 +128,12 @@ def _camera(image: Image, intrinsics: dict[int, Intrinsics]) -> Camera:
     cam_from_world = pose(
         _rotation(image), torch.tensor(translation, dtype=torch.float64), image.place, "quaternion"
     )
-    inverse(cam_from_world, image.place, "translation")  # the centre must be within reach
+    inverse(cam_from_world, image.place, "translation")  # refuses a centre that overflows
     return Camera(image.name, width, height, fx, fy, cx, cy, cam_from_world)
 
 
 def _pinhole(lens: Intrinsics) -> tuple[float, float, float, float]:
-    """Fx, fy, cx, cy: the lens without its distortion."""
+    """fx, fy, cx, cy, without the distortion."""
     values = [number(value, lens.place, "parameter") for value in lens.parameters]
     n = lens.model.focals
     if not n:
@@ -163,8 +142,8 @@ def _pinhole(lens: Intrinsics) -> tuple[float, float, float, float]:
     return fx, fy, values[n], values[n + 1]
 
 
-def _bent(lens: Intrinsics) -> Distortion | None:
-    """The distortion, if the model is more than a pinhole."""
+def _distortion(lens: Intrinsics) -> Distortion | None:
+    """The distortion, None for a pinhole."""
     rest = lens.parameters[lens.model.focals + 2 :]
     if lens.model.straight and not any(rest):
         return None
@@ -175,7 +154,7 @@ def _bent(lens: Intrinsics) -> Distortion | None:
 
 
 def _rotation(image: Image) -> Float[Tensor, "3 3"]:
-    """The rotation of a quaternion wxyz of any length: I + 2w[v]ₓ + 2[v]ₓ² once it has length 1."""
+    """The rotation of a quaternion wxyz: I + 2w[v]ₓ + 2[v]ₓ² after normalization."""
     length = math.hypot(*image.quaternion)
     if not LEAST_QUATERNION <= length < math.inf:
         raise image.place.wrong("quaternion", "finite and not zero", image.quaternion)

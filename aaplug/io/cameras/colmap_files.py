@@ -1,8 +1,7 @@
-"""The records of COLMAP's model files, binary and text, as they stand there.
+"""The records of COLMAP's model files, binary and text, unchecked.
 
-cameras: id, projection, size in px, the projection's parameters (focal lengths, principal point,
-distortion; px). images: id, world-to-camera pose as quaternion wxyz and translation, camera id,
-name; then their points, passed over.
+cameras: id, model, size in px, parameters (focal lengths, principal point, distortion; px).
+images: id, world-to-camera pose as quaternion wxyz and translation, camera id, name; their points are skipped.
 """
 
 import os
@@ -12,30 +11,31 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, TypeVar
 
-from aaplug.core.errors import FormatError
+from aaplug.core.errors import FormatError, reason
 from aaplug.io.limits import whole_limit
 from aaplug.io.values import Place, text
 
 Record = TypeVar("Record")
 
 KINDS = (".bin", ".txt")
-LINE_LIMIT = 64 * 2**20  # bytes: one image's points
+LINE_LIMIT = 64 * 2**20  # bytes: a line lists the points of one image
 POINT_SIZE = 24  # bytes: x, y (float64) and the 3D point's id
 COUNT = struct.Struct("<Q")
 CAMERA = struct.Struct("<IiQQ")  # id, model, width, height; the parameters follow
 IMAGE = struct.Struct("<I7dI")  # id, quaternion, translation, camera id; name and points follow
-LEAST_CAMERA = CAMERA.size + 2 * 8  # bytes: the model with the fewest parameters has 2
-LEAST_IMAGE = IMAGE.size + 1 + COUNT.size  # bytes: an empty name still ends
+LEAST_CAMERA = CAMERA.size + 2 * 8  # bytes: every model has 2 parameters or more
+LEAST_IMAGE = IMAGE.size + 1 + COUNT.size  # bytes: an empty name has its NUL
 CAMERA_FIELDS = 4  # id, model, width, height
 IMAGE_FIELDS = 10  # id, 4 of the quaternion, 3 of the translation, camera id, name
 
 
 @dataclass(frozen=True)
 class Model:
-    """One of COLMAP's projections.
+    """One of COLMAP's camera models.
 
-    parameters: how many.  focals: how many of them lead as focal lengths; cx and cy follow, then
-    distortion. straight: whether it is a pinhole once its distortion is zero.
+    parameters: how many.
+    focals: how many of them are focal lengths, which come first; cx and cy follow, then distortion.
+    straight: whether it is a pinhole if all distortion is zero.
     """
 
     name: str
@@ -69,7 +69,7 @@ MODEL_NAMES = {model.name: model for model in MODELS}
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """One of the model's cameras as its file has it; checked when an image uses it."""
+    """A camera as its file has it; values are checked when an image uses it."""
 
     place: Place
     key: int
@@ -81,7 +81,7 @@ class Intrinsics:
 
 @dataclass(frozen=True)
 class Image:
-    """One of the model's images as its file has it."""
+    """An image as its file has it."""
 
     place: Place
     name: str
@@ -91,33 +91,33 @@ class Image:
 
 
 def read_cameras(file: Path) -> dict[int, Intrinsics]:
-    """The intrinsics by camera id.
+    """Read the intrinsics, by camera id.
 
     Raises:
-        FormatError: the file is not what it should be.
+        FormatError: the file breaks its format.
     """
     found: dict[int, Intrinsics] = {}
     for intrinsics in _records(file, _binary_cameras, _text_cameras):
         if intrinsics.key in found:
-            raise intrinsics.place.error("ids should be unique, and this one is there twice")
+            raise intrinsics.place.error("ids should be unique, but this one is there twice")
         found[intrinsics.key] = intrinsics
     return found
 
 
 def read_images(file: Path) -> list[Image]:
-    """The images, in the file's order.
+    """Read the images, in the order of the file.
 
     Raises:
-        FormatError: the file is not what it should be, or holds no image.
+        FormatError: the file breaks its format, or holds no image.
     """
     found = list(_records(file, _binary_images, _text_images))
     if not found:
-        raise FormatError(file, "holds no image; the model has no camera that was placed")
+        raise FormatError(file, "holds no image: the reconstruction placed no camera")
     return found
 
 
 class _Reader:
-    """A binary file that is never asked for more than it holds."""
+    """A binary file whose remaining size is checked before each read."""
 
     def __init__(self, path: Path, file: BinaryIO) -> None:
         self.path = path
@@ -130,18 +130,18 @@ class _Reader:
         return record.unpack(self.file.read(record.size))
 
     def count(self, least: int, what: str) -> int:
-        """A number of records of at least `least` bytes each, which the file can hold."""
+        """A number of records, checked against the bytes that are left, `least` or more for each."""
         (n,) = self.unpack(COUNT, f"number of {what}")
         if n * least > self.left:
             raise FormatError(
                 self.path,
                 f"{n} {what} need {n * least} bytes at least, and {self.left} are left; "
-                "the file is cut short or no COLMAP file",
+                "the file is cut short or is not COLMAP's",
             )
         return n
 
     def skip(self, size: int, what: str) -> None:
-        """Pass over bytes that are of no use."""
+        """Skip bytes."""
         self._need(size, what)
         self.file.seek(size, os.SEEK_CUR)
 
@@ -176,7 +176,7 @@ def _records(
         with file.open("rb") as stream:
             yield from (binary if file.suffix == KINDS[0] else lines)(file, stream)
     except OSError as error:
-        raise FormatError(file, f"cannot be read: {error.strerror}") from error
+        raise FormatError(file, f"cannot be read: {reason(error)}") from error
 
 
 def _binary_cameras(file: Path, stream: BinaryIO) -> Iterator[Intrinsics]:
@@ -245,7 +245,7 @@ def _text_image(line: bytes, place: Place) -> Image:
 
 
 def _lines(file: Path, stream: BinaryIO) -> Iterator[tuple[int, bytes]]:
-    """Numbered lines, none of them longer than memory bears."""
+    """Numbered lines of bounded length."""
     row = 0
     while line := stream.readline(LINE_LIMIT + 1):
         row += 1

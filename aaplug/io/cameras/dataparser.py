@@ -1,6 +1,6 @@
-"""nerfstudio's `dataparser_transforms.json`: from the frame of `transforms.json` to that of the trained scene.
+"""nerfstudio's `dataparser_transforms.json`: maps the frame of `transforms.json` to that of the trained scene.
 
-{transform: 3×4, rotation and translation, row by row; scale}.  A point p goes to scale · (R p + t).
+{transform: 3×4, rotation and translation, row by row; scale}.  A point p becomes scale · (R p + t).
 """
 
 import os
@@ -11,14 +11,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.errors import FormatError
-from aaplug.io.values import Entry, Place, pose, read_json
+from aaplug.io.cameras.poses import pose
+from aaplug.io.values import Entry, Place, read_json
 
 DATAPARSER = "dataparser_transforms.json"
 
 
 @dataclass(frozen=True)
 class Dataparser:
-    """The motion and the scale that follows it."""
+    """A rigid motion, followed by a scale."""
 
     motion: Float[Tensor, "4 4"]
     scale: float
@@ -31,10 +32,10 @@ class Dataparser:
 
 
 def read_dataparser(path: Path) -> Dataparser | None:
-    """What the file says, None without one.
+    """Read the file; None if there is none.
 
     Raises:
-        FormatError: the file is not what it should be.
+        FormatError: the file breaks its format.
     """
     if not os.path.isfile(path):
         return None

@@ -1,9 +1,8 @@
-"""INRIA's `cameras.json`, with the run's `cfg_args` where it lies beside: a 3DGS model folder.
+"""INRIA's `cameras.json`, with the training run's `cfg_args` if that lies beside it.
 
-A list of {id, img_name, width, height, position, rotation, fx, fy}.  position: the camera's centre,
-in world units; rotation: camera-to-world, OpenCV axes; fx, fy: in px.  The principal point is the
-image's centre.  Sizes are those of the source, written before training shrank the photos, so the
-training size is worked out as 3DGS does it.
+A list of {id, img_name, width, height, position, rotation, fx, fy}.  position: the camera's centre, in world units;
+rotation: camera-to-world, OpenCV axes; fx, fy: in px.  The principal point is the image's centre.  Sizes are those of
+the photos before training scaled them, so the training size is computed by 3DGS's rule.
 """
 
 import os
@@ -16,38 +15,29 @@ from aaplug.core.cameras import BLACK, WHITE, Camera, CameraSet
 from aaplug.io.cameras import cfg_args
 from aaplug.io.cameras.cfg_args import WIDTH_CAP, CfgArgs, half_up, read_cfg_args
 from aaplug.io.cameras.options import LLFF_HOLD, Options, Split, every_nth, explicit
-from aaplug.io.cameras.photos import (
-    Size,
-    described_sizes,
-    photo_folder,
-    photo_sizes,
-    scaled_sizes,
-    trained_at,
-    with_photos,
-)
-from aaplug.io.values import Entry, Place, entries, inverse, mentions, pose, read_json
+from aaplug.io.cameras.photos import photo_folder, with_photos
+from aaplug.io.cameras.poses import inverse, pose
+from aaplug.io.cameras.sizes import Size, camera_set, file_sizes, photo_sizes, trained_at
+from aaplug.io.values import Entry, Place, entries, mentions, read_json
 
 FILE = "cameras.json"
 
+name = "inria"
+sign = "cameras.json (INRIA)"
+
 
 def sniff(path: Path) -> bool:
-    """Whether a folder holds cameras.json, or a file is one by name or by its keys."""
+    """Whether a folder holds cameras.json, or a file is one by its name or keys."""
     if os.path.isdir(path):
         return os.path.isfile(path / FILE)
     return path.name == FILE or mentions(path, ["img_name"])
 
 
-def sniff_model(path: Path) -> bool:
-    """Whether it is a model folder, cameras.json and cfg_args side by side, or its cfg_args."""
-    folder = path.parent if path.name == cfg_args.NAME else path
-    return all(os.path.isfile(folder / name) for name in (FILE, cfg_args.NAME))
-
-
 def read(path: Path, options: Options) -> CameraSet:
-    """The cameras at the size at which 3DGS trained on them.
+    """The cameras at the size at which 3DGS trained.
 
     Raises:
-        FormatError: a file is not what it should be.
+        FormatError: a file breaks its format.
         UsageError: the options do not fit.
     """
     file = _file(path)
@@ -55,7 +45,7 @@ def read(path: Path, options: Options) -> CameraSet:
     settings = _settings(file.parent)
     folder = photo_folder(
         file.parent,
-        options.images,
+        options,
         (settings or CfgArgs()).images,
         Place(file.parent / cfg_args.NAME, "images"),
     )
@@ -64,12 +54,7 @@ def read(path: Path, options: Options) -> CameraSet:
     sizes, why = _training_sizes(source, settings, options)
     trained = trained_at(source, sizes)
     split = _split(trained, settings, options)
-    notes = (
-        f"INRIA cameras.json: {len(source)} cameras, {described_sizes(source)} in the file",
-        split.note,
-        f"training size: {described_sizes(trained)} ({why})",
-    )
-    return CameraSet(split.train, split.test, _background(settings), notes)
+    return camera_set("INRIA cameras.json", source, split, why, _background(settings))
 
 
 def _file(path: Path) -> Path:
@@ -106,7 +91,7 @@ def _camera(entry: Entry) -> Camera:
 
 
 def _without_copies(cameras: Sequence[Camera]) -> list[Camera]:
-    """Runs that write a view into more than one split list it more than once."""
+    """Drop repeated views: some runs list a view once per split."""
     first: dict[tuple[object, ...], Camera] = {}
     for camera in cameras:
         first.setdefault((camera.name, *camera.cam_from_world.flatten().tolist()), camera)
@@ -117,18 +102,17 @@ def _training_sizes(
     cameras: Sequence[Camera], settings: CfgArgs | None, options: Options
 ) -> tuple[list[Size], str]:
     if options.train_scale is not None:
-        why = f"size in the file × {options.train_scale:g}: --train-scale"
-        return scaled_sizes(cameras, options.train_scale), why
+        return file_sizes(cameras, options)
     run = settings or CfgArgs()
     base, base_why = _base_sizes(cameras, run)
     rule = f"resolution {run.resolution:g} in cfg_args"
     if settings is None:
-        rule = f"3DGS's cap at {WIDTH_CAP} px, assumed without cfg_args: --train-scale sets it"
+        rule = f"3DGS's cap at {WIDTH_CAP} px, assumed without cfg_args: train_scale sets it"
     return [run.size(*size) for size in base], f"{base_why}, {rule}"
 
 
 def _base_sizes(cameras: Sequence[Camera], run: CfgArgs) -> tuple[list[Size], str]:
-    """The size of the photos that training loaded, before its own resolution rule."""
+    """The sizes of the photos that training loaded, before its resolution rule."""
     if any(camera.photo for camera in cameras):
         return photo_sizes(cameras), "size of the photos"
     n = run.divisor
@@ -144,20 +128,20 @@ def _split(cameras: Sequence[Camera], settings: CfgArgs | None, options: Options
         return explicit(cameras[second:], cameras[:second], "names repeat: test views come first")
     ordered = sorted(_renamed(cameras), key=lambda camera: camera.name)
     if settings is None:
-        return every_nth(ordered, options, 0, "no cfg_args says which; --test-every 8 is 3DGS's")
+        return every_nth(ordered, options, 0, "no cfg_args; test_every=8 is 3DGS's rule")
     hold = LLFF_HOLD if held_out else 0
     return every_nth(ordered, options, hold, f"eval={held_out} in cfg_args")
 
 
 def _second_run(names: Sequence[str]) -> int | None:
-    """Where names start anew, if just once: Blender's test views r_0 ..., then training r_0 ..."""
+    """Index at which the names begin again, if they do once: Blender's test views r_0, ..., then training r_0, ..."""
     if not (start := next((i for i, n in enumerate(_times_met(names)) if n > 1), None)):
         return None
     return start if len(set(names[start:])) == len(names[start:]) else None
 
 
 def _renamed(cameras: Sequence[Camera]) -> list[Camera]:
-    """Views that share a name are told apart by a number."""
+    """Append a number to repeated names."""
     times = _times_met([camera.name for camera in cameras])
     return [
         camera if n == 1 else replace(camera, name=f"{camera.name}~{n}")
@@ -166,7 +150,7 @@ def _renamed(cameras: Sequence[Camera]) -> list[Camera]:
 
 
 def _times_met(names: Sequence[str]) -> list[int]:
-    """How often each name has been met by its place in the list, itself included."""
+    """How often each name has occurred up to its place in the list, itself included."""
     met: Counter[str] = Counter()
     times = []
     for name in names:

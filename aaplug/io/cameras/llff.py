@@ -1,7 +1,7 @@
-"""LLFF's `poses_bounds.npy`: a row of 17 numbers a view, in the order of the photos' names.
+"""LLFF's `poses_bounds.npy`: a row of 17 numbers per view, in the order of the photos' names.
 
-3×5, row by row: camera-to-world rotation and position, and (height, width, focal) in px; then the nearest and the
-farthest depth.  The rotation's columns are the camera's axes down, right and back.
+3×5, row by row: camera-to-world rotation and position, and (height, width, focal) in px; then the nearest and farthest
+depth.  The rotation's columns are the camera's axes down, right and back.
 """
 
 import os
@@ -14,25 +14,21 @@ import torch
 from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.errors import FormatError
 from aaplug.io.cameras.options import LLFF_HOLD, Options, every_nth
-from aaplug.io.cameras.photos import (
-    SUFFIXES,
-    described_sizes,
-    last_part,
-    photo_folder,
-    photo_sizes,
-    scaled_sizes,
-    trained_at,
-    with_photos,
-)
+from aaplug.io.cameras.photos import SUFFIXES, last_part, photo_folder, with_photos
+from aaplug.io.cameras.poses import inverse, pose
+from aaplug.io.cameras.sizes import camera_set, file_sizes, photo_sizes, trained_at
 from aaplug.io.limits import whole_limit
-from aaplug.io.values import Place, focal, inverse, number, pixels, pose, read_bounded
+from aaplug.io.values import Place, focal, number, pixels, read_bounded
 
 FILE = "poses_bounds.npy"
 COLUMNS = 17
 
+name = "llff"
+sign = "poses_bounds.npy (LLFF)"
+
 
 def sniff(path: Path) -> bool:
-    """Whether it is LLFF's file or a folder that holds it."""
+    """Whether it is the file, or a folder that holds it."""
     return path.name == FILE or os.path.isfile(path / FILE)
 
 
@@ -40,39 +36,32 @@ def read(path: Path, options: Options) -> CameraSet:
     """The cameras at the size of their photos, every 8th a test view.
 
     Raises:
-        FormatError: the file is not what it should be.
+        FormatError: the file breaks its format.
         UsageError: the options do not fit.
     """
     file = path / FILE if os.path.isdir(path) else path
     rows = _rows(file)
-    folder = photo_folder(file.parent, options.images, "images", Place(file, "images"))
+    folder = photo_folder(file.parent, options, "images", Place(file, "images"))
     names = _names(folder.folder, len(rows))
     places = [Place(file, f"row {i}") for i in range(len(rows))]
     source = [_camera(*each) for each in zip(rows, names, places, strict=True)]
     source = with_photos(source, places, folder)
-    source = [_renamed(camera) for camera in source]
+    source = [replace(camera, name=last_part(camera.name)) for camera in source]
+    sizes, why = photo_sizes(source), "size of the photos, or in the file"
     if options.train_scale is not None:
-        sizes, why = scaled_sizes(source, options.train_scale), f"× {options.train_scale:g}: --train-scale"  # fmt: skip
-    else:
-        sizes, why = photo_sizes(source), "size of the photos, or in the file"
+        sizes, why = file_sizes(source, options)
     trained = trained_at(source, sizes)
-    split = every_nth(trained, options, LLFF_HOLD, "LLFF's rule; --test-every 0 for no split")
-    notes = (
-        f"LLFF {FILE}: {len(source)} cameras, {described_sizes(source)} in the file",
-        split.note,
-        f"training size: {described_sizes(trained)} ({why})",
-    )
-    return CameraSet(split.train, split.test, notes=notes)
+    split = every_nth(trained, options, LLFF_HOLD, "LLFF's rule; test_every=0 for no split")
+    return camera_set(f"LLFF {FILE}", source, split, why)
 
 
 def _rows(file: Path) -> np.ndarray:
     read_bounded(file, whole_limit("JSON"))
     try:
-        rows = np.load(
-            file, mmap_mode="r", allow_pickle=False
-        )  # mapped: a lie about the size is noticed
+        # mapping the file refuses a size that it does not have
+        rows = np.load(file, mmap_mode="r", allow_pickle=False)
     except Exception as error:  # numpy raises ValueError, EOFError, SyntaxError and others
-        raise FormatError(file, "is no .npy file of numbers") from error
+        raise FormatError(file, "is not a .npy file of numbers") from error
     if not (isinstance(rows, np.ndarray) and rows.ndim == 2 and rows.shape[1] == COLUMNS and len(rows)):  # fmt: skip
         shape = getattr(rows, "shape", "?")
         raise FormatError(file, f"should hold rows of {COLUMNS} numbers, not the shape {shape}")
@@ -82,16 +71,12 @@ def _rows(file: Path) -> np.ndarray:
 
 
 def _names(folder: Path, count: int) -> list[str]:
-    """The photos' names in order, or numbers where there are not as many as rows."""
+    """The photos' names in order; numbers if there are not as many photos as rows."""
     try:
         found = sorted(p.name for p in folder.iterdir() if p.suffix.lower() in SUFFIXES)
     except OSError:
         found = []
     return found if len(found) == count else [f"{i:03}" for i in range(count)]
-
-
-def _renamed(camera: Camera) -> Camera:
-    return replace(camera, name=last_part(camera.name))
 
 
 def _camera(row: np.ndarray, name: str, place: Place) -> Camera:

@@ -1,68 +1,65 @@
-"""Mip-NeRF's multi-scale Blender sets: `metadata.json`, a column a fact and a split.
+"""Mip-NeRF's multi-scale Blender datasets: `metadata.json`, a list per property and split.
 
-{train: {file_path, cam2world, width, height, focal, label, ...}, test: ...}, each a list, an entry a photo.  cam2world:
-4×4, OpenGL axes; sizes and focal in px.  Every scale is a view of its own, trained at its own size.
+{train: {file_path, cam2world, width, height, focal, label, ...}, test: ...}, each value a list with an entry per photo.
+cam2world: 4×4, OpenGL axes; sizes and focal length in px.  A photo at another scale is a view of its own, trained at
+its own size.
 """
 
 import os
 from pathlib import Path
-
-import torch
 
 from aaplug.core.cameras import WHITE, Camera, CameraSet
 from aaplug.core.errors import FormatError, UsageError
 from aaplug.io.cameras.options import Options, explicit, undivided
 from aaplug.io.cameras.photos import (
     PhotoFolder,
-    described_sizes,
     distinct,
     last_part,
     refuse_folder,
-    scaled_sizes,
-    trained_at,
     whole,
     without_suffix,
 )
-from aaplug.io.values import Entry, Place, inverse, mentions, pose, read_json, rigid
+from aaplug.io.cameras.poses import inverse, pose_of_opengl, rigid
+from aaplug.io.cameras.sizes import described_sizes, file_sizes, trained_at
+from aaplug.io.values import Entry, Place, mentions, read_json
 
 FILE = "metadata.json"
-OPENCV_FROM_OPENGL = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
 COLUMNS = ("file_path", "cam2world", "width", "height", "focal")
+
+name = "multiscale"
+sign = "metadata.json (multi-scale Blender)"
 
 
 def sniff(path: Path) -> bool:
-    """Whether a folder holds such a metadata.json, or a file is one by its keys."""
+    """Whether a folder's metadata.json, or the file, has these keys."""
     file = path / FILE if os.path.isdir(path) else path
     return mentions(file, ["cam2world"]) and mentions(file, ["file_path"])
 
 
 def read(path: Path, options: Options) -> CameraSet:
-    """The cameras of all scales, split as the file says.
+    """The cameras of all scales, with the split that the file gives.
 
     Raises:
-        FormatError: the file is not what it should be.
+        FormatError: the file breaks its format.
         UsageError: the options do not fit.
     """
-    refuse_folder(options.images)
+    refuse_folder(options)
     if options.test_every is not None:
-        raise UsageError("--test-every", f"{FILE} gives the split; leave the option out")
+        raise UsageError("test_every", f"{FILE} gives the split; leave it out")
     file = path / FILE if os.path.isdir(path) else path
     document = read_json(file)
     if not isinstance(document, dict) or not isinstance(document.get("train"), dict):
         raise FormatError(
-            file, "should be an object with 'train', as multi-scale Blender sets have"
+            file, "should be an object with 'train', as multi-scale Blender datasets have"
         )
     train = _cameras(file, "train", document["train"])
     test = _cameras(file, "test", document["test"]) if "test" in document else []
-    scale = 1.0 if options.train_scale is None else options.train_scale
-    trained, held = (
-        trained_at(views, scaled_sizes(views, scale)) if views else [] for views in (train, test)
-    )
+    trained, held = (trained_at(v, file_sizes(v, options)[0]) for v in (train, test))
     split = explicit(trained, held, FILE) if held else undivided(trained, f"no test in {FILE}")
     notes = (
         f"multi-scale Blender: {len(train) + len(test)} cameras, {described_sizes(train)}",
         split.note,
-        "training size: each photo's own, all scales were trained on",
+        "training size: each photo's own, as all scales were trained on",
         "background: white, Blender's custom",
     )
     return CameraSet(split.train, split.test, WHITE, notes)
@@ -89,8 +86,7 @@ def _cameras(file: Path, split: str, columns: object) -> list[Camera]:
 
 def _camera(entry: Entry, name: str, folder: PhotoFolder) -> Camera:
     motion = rigid(entry, "cam2world")
-    rotation = motion[:3, :3] * OPENCV_FROM_OPENGL
-    world_from_cam = pose(rotation, motion[:3, 3], entry.place, "cam2world")
+    world_from_cam = pose_of_opengl(motion, entry.place, "cam2world")
     width, height, f = entry.pixels("width"), entry.pixels("height"), entry.focal("focal")
     return Camera(
         name,

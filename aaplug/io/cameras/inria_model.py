@@ -1,0 +1,21 @@
+"""A 3DGS model folder: `cameras.json` with the training run's `cfg_args` beside it.
+
+It is read as `inria` reads it, but recognized before a COLMAP dataset in the same folder: the model's files alone tell
+the training size.
+"""
+
+import os
+from pathlib import Path
+
+from aaplug.io.cameras import cfg_args
+from aaplug.io.cameras.inria import FILE
+from aaplug.io.cameras.inria import read as read
+
+name = "inria_model"
+sign = "cameras.json with cfg_args (INRIA)"
+
+
+def sniff(path: Path) -> bool:
+    """Whether it is a folder that holds both files, or its cfg_args."""
+    folder = path.parent if path.name == cfg_args.NAME else path
+    return all(os.path.isfile(folder / file) for file in (FILE, cfg_args.NAME))

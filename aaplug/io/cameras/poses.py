@@ -1,0 +1,68 @@
+"""Camera poses from files: rigid motions in OpenCV's axes, as float64 4×4 matrices."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from aaplug.io.values import Entry, Place
+
+ORTHONORMAL = 1e-3  # largest error of an entry of R·Rᵀ that counts as rounding
+OPENCV_FROM_OPENGL = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)  # y and z change sign
+
+
+def pose_of_opengl(motion: Float[Tensor, "4 4"], place: Place, field: str) -> Float[Tensor, "4 4"]:
+    """`world_from_cam` from a camera-to-world matrix whose camera axes are OpenGL's (x right, y up, z backward).
+
+    Raises:
+        FormatError: it does not hold a rotation.
+    """
+    return pose(motion[:3, :3] * OPENCV_FROM_OPENGL, motion[:3, 3], place, field)
+
+
+def pose(
+    rotation: Float[Tensor, "3 3"], translation: Float[Tensor, " 3"], place: Place, field: str
+) -> Float[Tensor, "4 4"]:
+    """The rigid motion with this translation and the rotation nearest to `rotation`.
+
+    Raises:
+        FormatError: `rotation` differs from a rotation by more than rounding.
+    """
+    error = (rotation @ rotation.T - torch.eye(3, dtype=torch.float64)).abs().max().item()
+    if not error <= ORTHONORMAL:
+        raise place.error(
+            f"{field} should be a rotation: R·Rᵀ is {error:.2g} off the identity, "
+            f"{ORTHONORMAL:g} allowed"
+        )
+    if torch.linalg.det(rotation) <= 0:
+        raise place.error(f"{field} should be a rotation, but it mirrors (its determinant is -1)")
+    left, _, right = torch.linalg.svd(rotation)
+    motion = torch.eye(4, dtype=torch.float64)
+    motion[:3, :3] = left @ right
+    motion[:3, 3] = translation
+    return motion
+
+
+def inverse(motion: Float[Tensor, "4 4"], place: Place, field: str) -> Float[Tensor, "4 4"]:
+    """The inverse of a rigid motion.
+
+    Raises:
+        FormatError: it overflows.
+    """
+    back = torch.eye(4, dtype=torch.float64)
+    back[:3, :3] = motion[:3, :3].T
+    back[:3, 3] = -back[:3, :3] @ motion[:3, 3]
+    if not back.isfinite().all():
+        raise place.wrong(field, "a smaller position", motion[:3, 3].tolist())
+    return back
+
+
+def rigid(entry: Entry, field: str) -> Float[Tensor, "4 4"]:
+    """A field that holds a 4×4 matrix whose last row is 0 0 0 1.
+
+    Raises:
+        FormatError: it does not.
+    """
+    motion = entry.matrix(field, 4, 4)
+    if not torch.allclose(motion[3], torch.eye(4, dtype=torch.float64)[3]):
+        raise entry.place.wrong(f"{field}'s last row", "0 0 0 1", motion[3].tolist())
+    return motion

@@ -1,0 +1,289 @@
+"""`transforms*.json` of Blender (NeRF-synthetic), instant-ngp and nerfstudio.
+
+frames: [{file_path, transform_matrix}].  transform_matrix: camera-to-world, OpenGL axes, world units.  The focal length
+is fl_x and fl_y, in px, or follows from camera_angle_x, the full horizontal angle in radians; w, h, cx, cy are in px.
+Keys beside `frames` are defaults for all frames.  Without w and h, the photos give the size.  Paths are relative to the
+file.  A dataparser_transforms.json beside the file maps poses to the frame in which nerfstudio trained.
+`ns-export cameras` writes a bare list of {file_path, transform: 3×4} in the trained frame, which is read if its entries
+have fl_x, w and h.
+"""
+
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from aaplug.core.cameras import WHITE, Camera, CameraSet
+from aaplug.core.errors import FormatError, reason
+from aaplug.io.cameras.dataparser import DATAPARSER, Dataparser, read_dataparser
+from aaplug.io.cameras.options import Options, Split, every_nth, explicit
+from aaplug.io.cameras.photos import (
+    PhotoFolder,
+    distinct,
+    last_part,
+    refuse_folder,
+    whole,
+    without_suffix,
+)
+from aaplug.io.cameras.poses import inverse, pose_of_opengl, rigid
+from aaplug.io.cameras.sizes import Size, camera_set, file_sizes, trained_at
+from aaplug.io.images import image_size
+from aaplug.io.lenses import Distortion, lens_notes, undistorted_cameras
+from aaplug.io.values import Entry, Place, entries, focal, mentions, number, read_json
+
+FILE = "transforms.json"
+AROUND = (
+    "EQUIRECTANGULAR",
+    "OMNIDIRECTIONALSTEREO_L",
+    "OMNIDIRECTIONALSTEREO_R",
+    "VR180_L",
+    "VR180_R",
+)
+PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV")  # OPENCV is one if its coefficients are 0
+EXPORTED = "transform"  # key of a frame's 3×4 pose in `ns-export cameras`
+LAST_ROW = [0.0, 0.0, 0.0, 1.0]
+FISHEYE = "OPENCV_FISHEYE"
+DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+LEAST_ANGLE = 1e-9  # rad: the smallest angle of view
+SPLITS = ("train_filenames", "val_filenames", "test_filenames")  # nerfstudio's lists
+PNG = b"\x89PNG\r\n\x1a\n"
+PNG_COLOUR_TYPE = 25  # byte of the header
+PNG_ALPHA = (4, 6)  # colour types with alpha: gray and RGB
+
+name = "transforms"
+sign = "transforms.json (nerfstudio, instant-ngp)"
+
+
+@dataclass(frozen=True)
+class Source:
+    """The cameras of a file.  held_out: whether each is a test view, None if the file does not say."""
+
+    cameras: tuple[Camera, ...]
+    held_out: tuple[bool, ...] | None = None
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A frame and its photo, if there is one."""
+
+    entry: Entry
+    photo: Path | None
+
+
+def sniff(path: Path) -> bool:
+    """Whether a folder holds transforms.json, or a file is one by its name or keys."""
+    if os.path.isdir(path):
+        return os.path.isfile(path / FILE)
+    named = path.name.startswith("transforms") and path.suffix == ".json"
+    return named or mentions(path, ["transform_matrix", "frames"])
+
+
+def read(path: Path, options: Options) -> CameraSet:
+    """The cameras of one file.
+
+    Raises:
+        FormatError: the file breaks its format.
+        UsageError: the options do not fit.
+    """
+    file = path / FILE if os.path.isdir(path) else path
+    source = read_source(file, options)
+    cameras = trained(source, options)
+    if source.held_out is not None and options.test_every is None:
+        pairs = list(zip(cameras, source.held_out, strict=True))
+        train, test = ([c for c, out in pairs if out == held] for held in (False, True))
+        return set_of(source, explicit(train, test, "lists of file names"), options)
+    if options.test_every:
+        cameras = sorted(cameras, key=lambda camera: camera.name)
+    return set_of(source, every_nth(cameras, options, 0, f"only {file.name} read"), options)
+
+
+def set_of(source: Source, split: Split, options: Options) -> CameraSet:
+    """The set of a split of the source's cameras; photos with alpha mean a white background, Blender's custom."""
+    alpha = any(camera.photo and _has_alpha(camera.photo) for camera in source.cameras)
+    more = ["background: white, Blender's custom, as photos have alpha"] if alpha else []
+    return camera_set(
+        "transforms JSON",
+        source.cameras,
+        split,
+        file_sizes(source.cameras, options)[1],
+        WHITE if alpha else None,
+        [*more, *source.notes],
+    )
+
+
+def trained(source: Source, options: Options) -> list[Camera]:
+    """The source's cameras at their training size."""
+    return trained_at(source.cameras, file_sizes(source.cameras, options)[0])
+
+
+def read_source(file: Path, options: Options) -> Source:
+    """The cameras at the size that the file or the photos give, in the frame of the trained scene.
+
+    Raises:
+        FormatError: the file breaks its format.
+        UsageError: the options do not fit.
+    """
+    refuse_folder(options)
+    document = _document(file)
+    frames = _frames(file, document)
+    paths = [frame.entry.text("file_path") for frame in frames]
+    names = distinct(file, paths, (last_part, without_suffix, whole))
+    spare = _spare_size(frames)
+    exported = any(EXPORTED in frame.entry for frame in frames)
+    parser = None if exported else read_dataparser(file.parent / DATAPARSER)
+    cameras = [
+        _camera(frame, name, spare, parser) for frame, name in zip(frames, names, strict=True)
+    ]
+    lenses = [_distortion(frame.entry) for frame in frames]
+    cameras = undistorted_cameras(cameras, lenses)
+    notes = (*lens_notes(lenses, cameras), *_frame_notes(document, exported, parser))
+    return Source(tuple(cameras), _held_out(file, document, paths), notes)
+
+
+def _frame_notes(document: dict[str, Any], exported: bool, parser: Dataparser | None) -> list[str]:
+    if exported:
+        return ["frame: that in which nerfstudio trained (ns-export cameras); photos unknown"]
+    if parser:
+        return [f"frame: that of {DATAPARSER} (scale {parser.scale:g}), in which nerfstudio trains"]
+    if "applied_transform" in document:
+        return [
+            f"frame: as in the file; a scene that nerfstudio trained needs its {DATAPARSER} beside it"
+        ]
+    return []
+
+
+def _held_out(
+    file: Path, document: dict[str, Any], paths: Sequence[str]
+) -> tuple[bool, ...] | None:
+    """Whether nerfstudio's lists of file names keep each frame from training; None without lists."""
+    place = Place(file, "lists of file names")
+    lists = {key: document[key] for key in SPLITS if key in document}
+    if SPLITS[0] not in lists:
+        return None
+    for key, listed in lists.items():
+        if not isinstance(listed, list) or not all(isinstance(p, str) for p in listed):
+            raise place.wrong(key, "a list of paths", listed)
+    train = set(lists[SPLITS[0]])
+    return tuple(path not in train for path in paths)
+
+
+def _document(file: Path) -> dict[str, Any]:
+    document = read_json(file)
+    if isinstance(document, list):
+        return {"frames": [_exported(file, index, row) for index, row in enumerate(document)]}
+    if not isinstance(document, dict) or "frames" not in document:
+        raise FormatError(
+            file, "should be an object with 'frames', as Blender and nerfstudio write"
+        )
+    return document
+
+
+def _exported(file: Path, index: int, row: object) -> dict[str, Any]:
+    """A frame of `ns-export cameras`, whose pose has three rows, with the fourth added."""
+    if not isinstance(row, dict) or EXPORTED not in row:
+        raise FormatError(
+            file, f"item {index} should be an object with file_path and transform, as ns-export cameras writes"
+        )  # fmt: skip
+    if not {"fl_x", "w", "h"} <= row.keys():
+        raise FormatError(
+            file,
+            f"item {index} has no fl_x, w and h, so its lens is unknown; give nerfstudio's transforms.json, "
+            f"with the run's {DATAPARSER} beside it",
+        )
+    rows = row[EXPORTED]
+    return {**row, "transform_matrix": [*rows, LAST_ROW] if isinstance(rows, list) else rows}
+
+
+def _frames(file: Path, document: dict[str, Any]) -> list[Frame]:
+    shared = {key: value for key, value in document.items() if key != "frames"}
+    folder = PhotoFolder(file.parent, file.parent)
+    found = entries(file, "frame", document["frames"], shared)
+    return [
+        Frame(
+            entry, None if EXPORTED in entry else folder.find(entry.text("file_path"), entry.place)
+        )
+        for entry in found
+    ]
+
+
+def _spare_size(frames: Sequence[Frame]) -> Size | None:
+    """The size of the first photo, for frames without w, h and photo."""
+    photo = next((frame.photo for frame in frames if frame.photo), None)
+    return image_size(photo) if photo else None
+
+
+def _camera(frame: Frame, name: str, spare: Size | None, parser: Dataparser | None) -> Camera:
+    entry = frame.entry
+    width, height = _size(frame, spare)
+    fx = _focal(entry, width)
+    motion = rigid(entry, "transform_matrix")
+    world_from_cam = pose_of_opengl(motion, entry.place, "transform_matrix")
+    world_from_cam = world_from_cam if parser is None else parser.moved(world_from_cam)
+    return Camera(
+        name,
+        width,
+        height,
+        fx,
+        entry.focal("fl_y") if "fl_y" in entry else fx,
+        entry.number("cx") if "cx" in entry else width / 2,
+        entry.number("cy") if "cy" in entry else height / 2,
+        inverse(world_from_cam, entry.place, "transform_matrix"),
+        photo=frame.photo,
+    )
+
+
+def _size(frame: Frame, spare: Size | None) -> Size:
+    entry = frame.entry
+    if "w" in entry and "h" in entry:
+        return entry.pixels("w"), entry.pixels("h")
+    if frame.photo:
+        return image_size(frame.photo)
+    if spare is None:
+        raise entry.place.error(
+            "its size is unknown: the file has no w and h, and there are no photos; "
+            "put the photos where file_path says, or add w and h (px) beside frames"
+        )
+    return spare
+
+
+def _focal(entry: Entry, width: int) -> float:
+    if "fl_x" in entry or "camera_angle_x" not in entry:
+        return entry.focal("fl_x")
+    angle = entry.number("camera_angle_x")
+    if not LEAST_ANGLE <= angle < math.pi:
+        raise entry.place.wrong("camera_angle_x", "above 0 and below π, in radians", angle)
+    return focal(width / 2 / math.tan(angle / 2), entry.place, "camera_angle_x's focal length")
+
+
+def _distortion(entry: Entry) -> Distortion | None:
+    """The distortion, None for a pinhole."""
+    model = entry.text("camera_model") if "camera_model" in entry else PINHOLES[0]
+    if model in AROUND:
+        raise entry.place.error(f"its camera_model is {model}, which has no focal length")
+    k = {key: entry.number(key) if key in entry else 0.0 for key in DISTORTION}
+    listed = entry.fields.get("distortion_params") or []
+    if not isinstance(listed, list):
+        raise entry.place.wrong("distortion_params", "a list of numbers", listed)
+    others = [number(value, entry.place, "distortion_params") for value in listed]
+    others += [k["k5"], k["k6"]]
+    if entry.fields.get("is_fisheye") or model == FISHEYE:
+        name = model if model == FISHEYE else "fisheye"
+        angular = tuple(k[key] for key in ("k1", "k2", "k3", "k4"))
+        return Distortion(name, None if any(others) else angular, fisheye=True)
+    if model in PINHOLES and not any(others) and not any(k.values()):
+        return None
+    known = model in PINHOLES and not any(others) and not k["k4"]
+    radial = tuple(k[key] for key in ("k1", "k2", "p1", "p2", "k3"))  # in OpenCV's order
+    return Distortion(model, radial if known else None)
+
+
+def _has_alpha(photo: Path) -> bool:
+    try:
+        with photo.open("rb") as file:
+            header = file.read(PNG_COLOUR_TYPE + 1)
+    except OSError as error:
+        raise FormatError(photo, f"cannot be read: {reason(error)}") from error
+    return header.startswith(PNG) and header[PNG_COLOUR_TYPE:] in [bytes([t]) for t in PNG_ALPHA]
