@@ -106,21 +106,21 @@ def test_a_killed_batch_continues_to_the_same_bytes(batch, monkeypatch, stop):
     assert batch(words)[0] == 0
     whole = timeless(Path("out"))
     shutil.rmtree("out")
-    from aaplug.evaluation.journal import Record
+    from aaplug.evaluation.journal import Journal
 
-    added, add = [], Record.add
+    added, add = [], Journal.add
 
-    def killed(record, view, measurements):
+    def killed(journal, view, measurements):
         if len(added) == stop:
             raise KeyboardInterrupt
         added.append(view)
-        add(record, view, measurements)
+        add(journal, view, measurements)
 
-    monkeypatch.setattr(Record, "add", killed)
+    monkeypatch.setattr(Journal, "add", killed)
     assert batch(words)[0] == 130
-    monkeypatch.setattr(Record, "add", add)
-    if (record := Path("out/whole/progress.jsonl")).exists():
-        with record.open("ab") as stream:
+    monkeypatch.setattr(Journal, "add", add)
+    if (journal := Path("out/whole/progress.jsonl")).exists():
+        with journal.open("ab") as stream:
             stream.write(b'{"view": 2, "meas')  # what a kill leaves
         assert batch(words)[0] == 2  # without --resume nothing is lost
     assert batch(words + " --resume")[0] == 0
@@ -161,9 +161,9 @@ def test_a_batch_file_that_does_not_fit_is_refused_by_key(batch, case):
 
 def test_paths_start_at_the_file_and_names_at_the_scenes(tmp_path):
     path = tmp_path / "b.toml"
-    path.write_text("guard = 0.3\n[[scene]]\nscene = 'x/a.ply'\ncameras = '/abs'\ntest-every = 8")
+    path.write_text("cull_margin = 0.3\n[[scene]]\nscene = 'x/a.ply'\ncameras = '/abs'\ntest-every = 8")
     file = read_batch(path)
-    assert file.shared == {"guard": 0.3}
+    assert file.shared == {"cull_margin": 0.3}
     expected = {"scene": str(tmp_path / "x/a.ply"), "cameras": "/abs", "test_every": 8}
     assert file.scenes == {"a": expected}
 
@@ -175,12 +175,13 @@ def test_a_file_can_take_back_what_the_command_line_sets(batch):
 [[scene]]
 scene = "scene.ply"
 cameras = "."
-flicker = false
+report = false
 drop-bad = false
 """
     )
-    assert batch("evaluate --batch batch.toml --flicker --drop-bad")[0] == 0
-    assert "flicker" not in Path("out/scene/results.json").read_text()
+    assert batch("evaluate --batch batch.toml --report --drop-bad")[0] == 0
+    assert Path("out/scene/results.json").is_file()
+    assert not Path("out/scene/report.html").exists()
 
 
 def test_a_missing_batch_file_is_named(tmp_path):

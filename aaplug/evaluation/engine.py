@@ -241,7 +241,7 @@ class _Bench:
         camera = truth.camera(scale)
         drawings: dict[Hashable, Drawn] = {}
         if self.task.ceiling and self.sized:
-            yield CEILING, replace(truth.look, rgb=truth.resized_look(scale), samples=1)
+            yield CEILING, truth.look.resampled_to(truth.resized_look(scale))
             if scale == 1:
                 drawings[_work(truth.truth.own, camera)] = truth.look
         for name, timed in self.timed.items():

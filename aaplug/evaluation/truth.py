@@ -32,7 +32,8 @@ MEMORY = 1e9  # bytes of images to keep; what does not fit is made again each ti
 KEPT = torch.float16  # 11 significant bits, against the 8 that are compared
 
 Image = Float[Tensor, "h w 3"]
-Enlarge = Callable[[Renderer, Image, Camera], Image]  # own look, image at hand, larger camera
+Larger = Float[Tensor, "H W 3"]
+Enlarge = Callable[[Renderer, Image, Camera], Larger]  # own look, image at hand, larger camera
 
 
 def own_look(
@@ -47,7 +48,7 @@ def own_look(
     )
 
 
-def back_projected(own: Renderer, full: Image, camera: Camera) -> Image:
+def back_projected(own: Renderer, full: Image, camera: Camera) -> Larger:
     """The scene's own render, corrected so that its averages are the image at hand (Irani and Peleg 1991)."""
     with torch.no_grad():
         image = own(camera).rgb.clamp(0.0, 1.0)
