@@ -109,7 +109,7 @@ def sized(scene: Gaussians) -> Gaussians:
 def make_splats(
     m: int, hw: tuple[int, int], seed: int = 0, log_sigmas: tuple[float, float] = (-1.0, 2.0)
 ) -> Splats2D:
-    """Random coloured splats in and around an image; log_sigmas: range of the natural log of standard deviations in px."""
+    """Random coloured splats in and around an image; log_sigmas: range of ln standard deviations, in px."""
     g = torch.Generator().manual_seed(seed)
     low, high = log_sigmas
     sigmas = torch.exp(low + (high - low) * torch.rand(m, 2, generator=g))

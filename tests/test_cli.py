@@ -80,10 +80,8 @@ def test_render_writes_a_view_at_a_scale(cli):
     code, out, err = cli("render scene.ply --cameras . -o out --scale 0.5")
     assert (code, out) == (0, "")
     assert image_size(Path("out/r_0.png")) == (32, 24)
-    assert (
-        "recipe: auto for a classic scene, 1 view at 32x24, 0.5 × the rate of training: 1×1 sample a pixel"
-        in err
-    )
+    chosen = "1 view at 32x24, 0.5 × the training rate: 1×1 sample per pixel"
+    assert f"recipe: auto for a classic scene, {chosen}" in err
     assert "background: black" in err
 
 
@@ -186,11 +184,11 @@ def test_drop_bad_leaves_bad_gaussians_out_and_counts_them(cli):
     assert "warning:" in err
 
 
-def test_guard_leaves_out_what_is_centred_far_outside(cli):
+def test_cull_margin_leaves_out_what_is_centred_far_outside(cli):
     cli("render scene.ply --cameras . -o all.png")
-    cli("render scene.ply --cameras . -o guarded.png --guard -0.2")
-    assert Path("all.png").read_bytes() != Path("guarded.png").read_bytes()
-    cli("render scene.ply --cameras . -o wide.png --guard 100")
+    cli("render scene.ply --cameras . -o culled.png --cull-margin -0.2")
+    assert Path("all.png").read_bytes() != Path("culled.png").read_bytes()
+    cli("render scene.ply --cameras . -o wide.png --cull-margin 100")
     assert Path("all.png").read_bytes() == Path("wide.png").read_bytes()
 
 
@@ -318,13 +316,13 @@ def test_interrupting_ends_with_130_and_leaves_no_file(cli, monkeypatch):
     def interrupted(*args, **kwargs):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("aaplug_cli.convert.write_scene", interrupted)
+    monkeypatch.setattr("aaplug.verbs.convert.write_scene", interrupted)
     assert cli(CONVERT)[0] == 130
     assert not Path("new.ply").exists()
 
 
 def test_demo_does_the_whole_job(cli, monkeypatch):
-    monkeypatch.setattr("aaplug_cli.demo.SCALES", (0.25, 0.125))
+    monkeypatch.setattr("aaplug.verbs.demo.SCALES", (0.25, 0.125))
     code, out, _ = cli("demo -o shown")
     assert code == 0
     assert "auto" in out

@@ -6,11 +6,11 @@ from dataclasses import replace
 import pytest
 import torch
 
+from aaplug.core.convolution import smoothed_by, volume_log_factor
 from aaplug.core.culling import cull
 from aaplug.core.ellipses import half_sizes, squared_cutoff, whitening
 from aaplug.core.gaussians import MIN_OPACITY, Gaussians, scale_opacities
 from aaplug.core.splats import Splats2D
-from aaplug.methods.filters.smoothing import smooth, volume_log_factor
 from tests.conftest import make_scene, make_splats
 
 F64 = torch.float64
@@ -259,7 +259,7 @@ def test_smoothing_by_zero_changes_no_bit(volume, dtype):
         log_scales=torch.linspace(-60, 40, 600, dtype=dtype).view(200, 3),
     )
     scene.logit_opacities[:4] = torch.tensor([-100.0, -20.0, 20.0, 100.0])
-    same = smooth(scene, torch.full((200, 1), -math.inf, dtype=dtype), volume)
+    same = smoothed_by(scene, torch.full((200, 1), -math.inf, dtype=dtype), volume)
     assert same.log_scales.equal(scene.log_scales)
     assert same.logit_opacities.equal(scene.logit_opacities)
 
@@ -268,12 +268,12 @@ def test_smoothing_by_zero_changes_no_bit(volume, dtype):
 def test_smoothing_adds_variances(axes):
     scene = make_scene(50, dtype=F64)
     sigma = torch.linspace(0.01, 1, 50, dtype=F64)[:, None] * torch.tensor(axes, dtype=F64)
-    smoothed = smooth(scene, sigma.log(), volume=True)
+    smoothed = smoothed_by(scene, sigma.log(), volume=True)
     variances = scene.scales.square() + sigma.square()
     torch.testing.assert_close(smoothed.scales.square(), variances)
     ratio = scene.scales.prod(dim=1) / smoothed.scales.prod(dim=1)
     torch.testing.assert_close(smoothed.opacities, (scene.opacities * ratio).clamp(min=MIN_OPACITY))
-    assert smooth(scene, sigma.log(), volume=False).logit_opacities is scene.logit_opacities
+    assert smoothed_by(scene, sigma.log(), volume=False).logit_opacities is scene.logit_opacities
 
 
 @pytest.mark.parametrize("log_scale", [-70.0, -28.0, -5.0, 0.0, 30.0])
@@ -282,7 +282,7 @@ def test_the_smoothed_scale_is_finite_and_the_larger_of_both_where_they_differ(
     log_scale, log_sigma
 ):
     scene = replace(make_scene(1), log_scales=torch.full((1, 3), log_scale))
-    smoothed = smooth(scene, torch.tensor([[log_sigma]]), volume=True)
+    smoothed = smoothed_by(scene, torch.tensor([[log_sigma]]), volume=True)
     expected = max(log_scale, log_sigma) + (0.5 * math.log(2) if log_scale == log_sigma else 0)
     assert smoothed.log_scales[0].tolist() == pytest.approx([expected] * 3, rel=1e-4, abs=1e-4)
     assert smoothed.logit_opacities.isfinite().all()
