@@ -154,7 +154,7 @@ class RenderOptions(ViewOptions):
     quality: Annotated[str, choice(QUALITIES)] = "balanced"
     """How finely recipe auto samples: fast reaches a quarter of the training rate, balanced half, best all of it."""
     rate_reference: Annotated[str | None, flag("|".join(get_args(RateReference)))] = None
-    """What matched and auto compare sampling rates with (default: pose, which is interval for free cameras, else global)."""
+    """Sampling rate that matched and auto compare with (default: pose: global, or interval for a free camera)."""
 
 
 def values_of(options: Any) -> dict[str, Any]:

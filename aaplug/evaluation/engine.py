@@ -30,7 +30,7 @@ from aaplug.evaluation.metrics import PSNR, SSIM
 from aaplug.evaluation.protocols import Protocol
 from aaplug.evaluation.results import CEILING, Measurement, Report
 from aaplug.evaluation.series import Drawn, Series, TimedRenderer
-from aaplug.evaluation.truth import Truth, ViewTruth
+from aaplug.evaluation.truth import Truth, ViewTruth, source_of
 from aaplug.io.photographs import DOWNSCALES
 from aaplug.methods.recipe import Recipe
 from aaplug.methods.recipes import suited
@@ -135,7 +135,7 @@ def evaluate(
             measurements += measured
     order = task.names
     measurements.sort(key=lambda m: (order.index(m.recipe), task.scales.index(m.scale)))
-    return Report(tuple(measurements), request)
+    return Report(tuple(measurements), request, task.measured)
 
 
 def compare(
@@ -179,21 +179,11 @@ def _check(task: Task) -> None:
         raise UsageError("scale", f"sizes must be above 0, got {min(task.scales):g}")
     if len(set(task.names)) != len(task.names) or len(set(task.scales)) != len(task.scales):
         raise UsageError("evaluate", "a recipe or a scale is named twice")
-    if task.truth.source == "photographs":
-        _check_photographs(task)
-
-
-def _check_photographs(task: Task) -> None:
-    if task.protocol.change != "size":
+    if task.truth.source == "photographs" and task.protocol.change != "size":
         raise UsageError(
             "truth", f"protocol {task.protocol.name} moves the camera: no photograph shows that"
         )
-    missing = [view.name for view in task.views if view.photo is None]
-    if missing:
-        raise UsageError(
-            missing[0],
-            "has no photograph to compare with; truth 'self' compares with the scene's own look",
-        )
+    source_of(task.views, task.truth.source)
 
 
 def _request(task: Task) -> dict[str, Any]:
@@ -251,7 +241,7 @@ class _Bench:
         camera = truth.camera(scale)
         drawings: dict[Hashable, Drawn] = {}
         if self.task.ceiling and self.sized:
-            yield CEILING, replace(truth.look, rgb=truth.resized_look(scale), samples=1)
+            yield CEILING, truth.look.resampled_to(truth.resized_look(scale))
             if scale == 1:
                 drawings[_work(truth.truth.own, camera)] = truth.look
         for name, timed in self.timed.items():

@@ -113,7 +113,7 @@ def _check_same(path: Path, before: Any, now: Mapping[str, Any]) -> None:
         names = listing(list(dict.fromkeys(changed)))
         raise UsageError(
             str(path),
-            f"is of another request ({names} changed since); repeat that request, or start again with overwrite",
+            f"is of another request ({names} changed since); repeat that request, or start again with `overwrite`",
         )
 
 

@@ -15,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.cameras import Camera
+from aaplug.core.errors import UsageError
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.imaging import quantised, resampled
 from aaplug.core.interfaces import Colour, Rasterizer
@@ -26,11 +27,13 @@ from aaplug.io.photographs import DOWNSCALES, Photograph
 from aaplug.methods.recipes import find_recipe
 from aaplug.rendering.renderer import Background, Renderer
 
+NO_PHOTOGRAPH = "has no photograph to compare with; truth 'self' compares with the scene's own look"
 MEMORY = 1e9  # bytes of images to keep; what does not fit is made again each time
 KEPT = torch.float16  # 11 significant bits, against the 8 that are compared
 
 Image = Float[Tensor, "h w 3"]
-Enlarge = Callable[[Renderer, Image, Camera], Image]  # own look, image at hand, larger camera
+Larger = Float[Tensor, "H W 3"]
+Enlarge = Callable[[Renderer, Image, Camera], Larger]  # own look, image at hand, larger camera
 
 
 def own_look(
@@ -45,7 +48,7 @@ def own_look(
     )
 
 
-def back_projected(own: Renderer, full: Image, camera: Camera) -> Image:
+def back_projected(own: Renderer, full: Image, camera: Camera) -> Larger:
     """The scene's own render, corrected so that its averages are the image at hand (Irani and Peleg 1991)."""
     with torch.no_grad():
         image = own(camera).rgb.clamp(0.0, 1.0)
@@ -58,9 +61,20 @@ def upsampled(upsampler: Upsampler) -> Enlarge:
     return lambda own, full, camera: upsampler(full, camera.hw)
 
 
-def source_of(views: Sequence[Camera]) -> TruthSource:
-    """Photographs where every view has one."""
-    return "photographs" if all(view.photo for view in views) else "self"
+def source_of(views: Sequence[Camera], asked: str = "auto") -> TruthSource:
+    """The source that is asked for; for "auto" photographs where every view has one, else the own look.
+
+    Raises:
+        UsageError: there is no source of that name, or a view has no photograph.
+    """
+    missing = [view.name for view in views if view.photo is None]
+    if asked == "self" or (asked == "auto" and missing):
+        return "self"
+    if asked not in ("auto", "photographs"):
+        raise UsageError("truth", f"'{asked}' is not one of auto, photographs, self")
+    if missing:
+        raise UsageError(missing[0], NO_PHOTOGRAPH)
+    return "photographs"
 
 
 @dataclass(frozen=True)

@@ -100,7 +100,7 @@ def fuse(
     if scene.filter_3d is not None:
         converted = fuse_stored(scene)
     elif training is None:
-        raise UsageError(scene.name, "converting it needs the training cameras: give cameras")
+        raise UsageError(scene.name, "converting it needs the training cameras: give `cameras`")
     else:
         converted = form.filter(scene, training)
     return replace(converted, convention=MIP)

@@ -15,8 +15,8 @@ from aaplug.core.monitor import SILENT, Monitor
 from aaplug.core.training import TrainingViews
 from aaplug.evaluation.report.contact_sheet import contact_sheet
 from aaplug.evaluation.results import Report, scale_name
+from aaplug.io.atomic import make_folder, refuse_existing
 from aaplug.io.cameras import read_cameras
-from aaplug.io.folders import make_folder, refuse_existing
 from aaplug.io.images import read_image, write_png
 from aaplug.io.scenes import read_scene
 from aaplug.rendering.renderer import Renderer

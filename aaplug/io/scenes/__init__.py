@@ -1,177 +1,211 @@
-"""Scene files of any known format, read into `Gaussians` whole or part by part, and written back.
+"""Scene files, read into `Gaussians` whole or part by part, and written.
 
-A format is a module with a `name` (also its files' suffix), `sniff`, `open_scene` and, where it can be written,
-`write`; it is added by one line in `FORMATS`.  Formats are told apart by content when reading and by suffix when
-writing.
+A scene format is a module or object like the protocols below.  aaplug's own are in `OWN`; a plug-in adds one by an
+entry point in the group "aaplug.scene_formats" (see `core.registry`).  A file is read by the first format whose `sniff`
+accepts it: plug-ins first, as they may read a dialect of a file that an own format would accept too.  A file is written
+in the format whose name ends the file's name.
 """
 
 import importlib.util
 import re
 from collections.abc import Iterable
+from os import PathLike
 from pathlib import Path
-from typing import Literal, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
-from aaplug.core.errors import FormatError, OutputError, UsageError
+from aaplug.core.errors import FormatError, OutputError, UsageError, reason
 from aaplug.core.gaussians import Convention, Gaussians
+from aaplug.core.registry import Registry
 from aaplug.io.atomic import check_output
 from aaplug.io.scenes import compressed_ply, ksplat, ply, pt, sog, splat, spz
-from aaplug.io.scenes.packed import half_turn_about_x
+from aaplug.io.scenes.options import Options, SpzAxes
 from aaplug.io.scenes.scene_file import SceneFile
 
-HEAD_BYTES = 64  # of a file, shown to each format's `sniff`
-SpzAxes = Literal["opengl", "opencv"]
-SOG_FOLDER = "meta.json"  # what a folder of SOG images is known by
+HEAD_BYTES = 64  # of a file, passed to each format's `sniff`
+SOG_FOLDER = "meta.json"  # marks a folder of SOG images
 
 
+@runtime_checkable
 class SceneFormat(Protocol):
-    """A format that can be read."""
+    """A format that can be read.  name: its files' suffix without the first dot."""
 
-    name: str
+    @property
+    def name(self) -> str: ...  # noqa: D102
 
     def sniff(self, path: Path, head: bytes) -> bool:
-        """Whether a file that begins with `head` looks like this format."""
+        """Whether a file that begins with `head` is of this format.  Never raises."""
         ...
 
-    def open_scene(self, path: Path) -> SceneFile:
-        """Look at the scene in the file."""
+    def open_scene(self, path: Path, options: Options) -> SceneFile:
+        """Read what the file says about the scene; Gaussians are loaded when `SceneFile.load` is called.
+
+        Raises:
+            FormatError: the file breaks its format.
+        """
         ...
 
 
 @runtime_checkable
-class WritableFormat(Protocol):
-    """A format that can be written too."""
+class WritableFormat(SceneFormat, Protocol):
+    """A format that can be written too.  needs: a package that writing imports, from aaplug's extra `name`; or None."""
 
-    def write(self, path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool) -> None:
-        """Write the parts of a scene, `count` Gaussians at most, whole or not at all."""
+    @property
+    def needs(self) -> str | None: ...  # noqa: D102
+
+    def write(
+        self, path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: Options
+    ) -> None:
+        """Write a scene of at least one part and at most `count` Gaussians, whole or not at all.
+
+        Raises:
+            OutputError: the format cannot hold the scene, the file exists and `overwrite` is false, or writing fails.
+        """
         ...
 
 
-FORMATS: tuple[SceneFormat, ...] = (compressed_ply, ply, spz, sog, pt, splat, ksplat)
-NEEDED = {"spz": "gsply"}  # by extras of ours named as the format: the package that writes it
+# the first that accepts a file is used
+OWN: tuple[SceneFormat, ...] = (compressed_ply, ply, spz, sog, pt, splat, ksplat)
+SCENE_FORMATS: Registry[SceneFormat] = Registry(
+    "scene format", {f.name: f for f in OWN}, lambda value: isinstance(value, SceneFormat)
+)
 
 
 def open_scene(
-    path: Path,
+    path: str | PathLike[str],
     *,
+    iteration: int | None = None,
     convention: Convention | None = None,
     allow_checkpoint: bool = False,
     spz_axes: SpzAxes = "opengl",
 ) -> SceneFile:
-    """Look at the scene in the file `path` without reading its Gaussians.
+    """Open a scene without reading its Gaussians.
 
     Args:
-        path: a file; for a folder see `find_scene`.
-        convention: how the scene was trained, where the file does not know or is wrong.
-        allow_checkpoint: open a .pt file too, a pickle, of which nothing but tensors is taken.
-        spz_axes: those of a .spz: "opengl" by its specification, "opencv" as splat-transform and gsply write them.
+        path: a scene file, an INRIA model folder or a folder of SOG images; see `find_scene`.
+        iteration: which iteration of a model folder; None for the last.
+        convention: how the scene was trained, if the file does not say or is wrong.
+        allow_checkpoint: open a .pt too, a pickle, of which only tensors are read.
+        spz_axes: of a .spz: "opengl" by its specification, "opencv" as splat-transform and gsply write them.
 
     Raises:
         FormatError: the file is missing, of no known format, or breaks its format.
     """
+    options = Options(allow_checkpoint, spz_axes)
+    path = find_scene(path, iteration)
     head = _head(path)
-    for format in FORMATS:
+    formats = sorted(SCENE_FORMATS.values(), key=OWN.__contains__)  # plug-ins first
+    for format in formats:
         if format.sniff(path, head):
-            if format.name == "pt" and not allow_checkpoint:
-                raise FormatError(
-                    path,
-                    "is a training checkpoint (a pickle); --allow-checkpoint reads it, or export it as .ply",
-                )
-            opened = format.open_scene(path).stated(convention)
-            return spz.as_stored(opened) if format is spz and spz_axes == "opencv" else opened
-    known = ", ".join("." + format.name for format in FORMATS)
+            return format.open_scene(path, options).stated(convention)
+    known = ", ".join("." + format.name for format in formats)
     raise FormatError(path, f"is of no known scene format; aaplug reads {known}")
 
 
 def read_scene(
-    path: Path,
+    path: str | PathLike[str],
     *,
+    iteration: int | None = None,
     convention: Convention | None = None,
     drop_bad: bool = False,
     allow_checkpoint: bool = False,
     spz_axes: SpzAxes = "opengl",
 ) -> Gaussians:
-    """Read the scene in the file `path`.
+    """Read a scene.
 
     Args:
-        path: a file; for a folder see `find_scene`.
-        convention: how the scene was trained, where the file does not know or is wrong.
-        drop_bad: leave out Gaussians with NaN, infinite or unusable values, and log a warning with
-            their number, instead of refusing.
-        allow_checkpoint, spz_axes: see `open_scene`.
+        path, iteration, convention, allow_checkpoint, spz_axes: see `open_scene`.
+        drop_bad: leave out Gaussians with NaN, infinite or unusable values and log a warning with their number; without
+            it they are an error.
 
     Raises:
         FormatError: the file is missing, of no known format, breaks its format, or is too large for this machine.
     """
-    opened = open_scene(
-        path, convention=convention, allow_checkpoint=allow_checkpoint, spz_axes=spz_axes
-    )
-    return opened.whole(drop_bad)
+    return open_scene(
+        path,
+        iteration=iteration,
+        convention=convention,
+        allow_checkpoint=allow_checkpoint,
+        spz_axes=spz_axes,
+    ).whole(drop_bad)
 
 
 def write_scene(
-    path: Path, scene: Gaussians, *, overwrite: bool = False, spz_axes: SpzAxes = "opengl"
-) -> None:
-    """Write a scene in the format of the path's suffix, with all else that its origin held.
-
-    spz_axes: of a .spz, as in `open_scene`.
-
-    Raises:
-        OutputError: the suffix is of no format that can be written, the path is the file that the
-            scene was read from, exists and `overwrite` is false, or cannot be written.
-        UsageError: the package that writes the format is not installed.
-    """
-    source = [Path(scene.origin.path)] if scene.origin else []
-    write_parts(path, [scene], len(scene), source, overwrite=overwrite, spz_axes=spz_axes)
-
-
-def write_parts(
-    path: Path,
-    parts: Iterable[Gaussians],
-    count: int,
-    inputs: Iterable[Path] = (),
+    path: str | PathLike[str],
+    scene: Gaussians,
     *,
     overwrite: bool = False,
     spz_axes: SpzAxes = "opengl",
 ) -> None:
-    """Write a scene that comes in parts, `count` Gaussians or fewer, of one convention and all with the same columns.
+    """Write a scene in the format of the path's suffix, with everything else that its source file held.
+
+    Args:
+        path: the file to write.
+        scene: the Gaussians; their `origin` links them to their source file.
+        overwrite: replace an existing file.
+        spz_axes: of a .spz; see `open_scene`.
 
     Raises:
-        OutputError: as in `write_scene`; `inputs` are the files that may not be replaced.
-    """
-    writer = check_scene_output(path, overwrite, inputs)
-    if writer is spz and spz_axes == "opencv":
-        parts = map(half_turn_about_x, parts)  # which the writer turns back
-    writer.write(path, parts, count, overwrite)
-
-
-def check_scene_output(path: Path, overwrite: bool, inputs: Iterable[Path] = ()) -> WritableFormat:
-    """The format that will write `path`; refuses, before any work, what cannot be written.
-
-    Raises:
-        OutputError: as in `write_parts`.
+        OutputError: no writable format has this suffix, the format cannot hold the scene, or the path is the scene's
+            source file, exists and `overwrite` is false, or cannot be written.
         UsageError: the package that writes the format is not installed.
     """
-    writers = {"." + f.name: f for f in FORMATS if isinstance(f, WritableFormat)}
-    suffix = path.suffix.lower()
-    if suffix not in writers or path.name.lower().endswith(".compressed.ply"):
-        raise OutputError(
-            path, f"has no suffix of a format that can be written: {', '.join(writers)}"
-        )
-    needed = NEEDED.get(suffix[1:])
-    if needed is not None and importlib.util.find_spec(needed) is None:
-        raise UsageError(
-            str(path), f"writing {suffix} needs {needed}: pip install 'aaplug[{suffix[1:]}]'"
-        )
-    check_output(path, overwrite, inputs)
-    return writers[suffix]
+    source = [scene.origin.path] if scene.origin else []
+    write_parts(path, [scene], len(scene), source, overwrite=overwrite, spz_axes=spz_axes)
 
 
-def find_scene(path: Path, iteration: int | None = None) -> Path:
-    """The scene file itself, a folder's SOG, or the last (or given) iteration of an INRIA model folder.
+def write_parts(
+    path: str | PathLike[str],
+    parts: Iterable[Gaussians],
+    count: int,
+    inputs: Iterable[str | PathLike[str]] = (),
+    *,
+    overwrite: bool = False,
+    spz_axes: SpzAxes = "opengl",
+) -> None:
+    """Write a scene that comes in parts, at most `count` Gaussians of one convention and with the same columns.
+
+    inputs: files that are being read and may not be replaced.
 
     Raises:
-        FormatError: nothing there, or not that iteration.
+        OutputError, UsageError: see `write_scene`.
     """
+    writer = check_scene_output(path, overwrite, inputs)
+    writer.write(Path(path), parts, count, overwrite, Options(spz_axes=spz_axes))
+
+
+def check_scene_output(
+    path: str | PathLike[str], overwrite: bool, inputs: Iterable[str | PathLike[str]] = ()
+) -> WritableFormat:
+    """The format that will write `path`; refuses an output that cannot be written, before any work.
+
+    Raises:
+        OutputError, UsageError: see `write_scene`.
+    """
+    name = Path(path).name.lower()
+    suffixes = {"." + format.name: format for format in SCENE_FORMATS.values()}
+    found = max(filter(name.endswith, suffixes), key=len, default=None)
+    writer = suffixes[found] if found else None
+    if not isinstance(writer, WritableFormat):
+        known = [s for s, format in suffixes.items() if isinstance(format, WritableFormat)]
+        raise OutputError(
+            path, f"has no suffix of a format that can be written: {', '.join(known)}"
+        )
+    if writer.needs is not None and importlib.util.find_spec(writer.needs) is None:
+        extra = f"pip install 'aaplug[{writer.name}]'"
+        raise UsageError(str(path), f"writing .{writer.name} needs {writer.needs}: {extra}")
+    check_output(path, overwrite, inputs)
+    return writer
+
+
+def find_scene(path: str | PathLike[str], iteration: int | None = None) -> Path:
+    """The scene file that a path means.
+
+    A file means itself.  A folder means the last (or the given) iteration of an INRIA model, or its SOG images.
+
+    Raises:
+        FormatError: the folder holds no scene, or not that iteration.
+    """
+    path = Path(path)
     if not path.is_dir():
         return path
     scenes = _iterations(path)
@@ -199,15 +233,12 @@ def _iterations(model: Path) -> dict[int, Path]:
 
 def _head(path: Path) -> bytes:
     try:
-        if path.is_dir():
-            raise FormatError(path, "is a folder; name the scene's file")
         if path.exists() and not path.is_file():
-            raise FormatError(path, "is not an ordinary file")  # opening a pipe would wait for ever
+            raise FormatError(path, "is not an ordinary file")  # reading a pipe would block
         with path.open("rb") as stream:
             head = stream.read(HEAD_BYTES)
     except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else None
-        raise FormatError(path, f"cannot be read: {(reason or str(error)).lower()}") from error
+        raise FormatError(path, f"cannot be read: {reason(error)}") from error
     if not head:
         raise FormatError(path, "is empty")
     return head

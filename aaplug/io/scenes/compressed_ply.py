@@ -1,13 +1,11 @@
-"""PlayCanvas' .compressed.ply (SuperSplat, splat-transform, gsplat): four words a Gaussian.
+"""PlayCanvas' .compressed.ply (SuperSplat, splat-transform, gsplat): four 32-bit words per Gaussian.
 
-Element "chunk": for every 256 Gaussians the least and most of position, log-scale and, in newer files, colour.
+Element "chunk": for every 256 Gaussians the smallest and largest position, log-scale and, in newer files, colour.
 Element "vertex": packed_position and packed_scale (11, 10, 11 bits between those), packed_rotation (2 bits for the
 largest component, 3 × 10 for the others), packed_color (4 bytes).  Element "sh", if any: a byte for each f_rest.
 The header's comments say how the scene was trained, as in a plain .ply.
 """
 
-import re
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,60 +15,36 @@ from torch import Tensor
 
 from aaplug.core.errors import FormatError
 from aaplug.core.gaussians import Gaussians
-from aaplug.io.limits import whole_limit
+from aaplug.io.scenes.options import Options
 from aaplug.io.scenes.packed import byte_opacities, floats, largest_last
-from aaplug.io.scenes.ply import DEGREES
-from aaplug.io.scenes.ply_header import LITTLE, Element, Header, check_size, read_header
+from aaplug.io.scenes.ply_document import Table, stamp_of
+from aaplug.io.scenes.ply_header import LITTLE, Element, Header, check_size, is_packed, read_header
 from aaplug.io.scenes.ply_tags import meaning
-from aaplug.io.scenes.scene_file import SceneFile, check_count, library_errors, sh_of_colour
+from aaplug.io.scenes.scene_file import (
+    DEGREES,
+    SceneFile,
+    check_count,
+    library_errors,
+    sh_of_colour,
+)
 
-SIGN = re.compile(rb"property\s+uint\w*\s+packed_position")
 WORDS = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 BOUNDS = [f"{end}_{axis}" for end in ("min", "max") for axis in ("x", "y", "z")]
 SCALE_BOUNDS = [f"{end}_scale_{axis}" for end in ("min", "max") for axis in ("x", "y", "z")]
 COLOUR_BOUNDS = [f"{end}_{c}" for end in ("min", "max") for c in ("r", "g", "b")]
 PER_CHUNK = 256  # Gaussians
-SH_SPAN = 8.0  # harmonics lie in ±4
+SH_SPAN = 8.0  # harmonics lie between -4 and 4
 
 name = "compressed.ply"
 
 
-@dataclass(frozen=True)
-class Table:
-    """An element's rows in the file."""
-
-    path: Path
-    dtype: np.dtype
-    offset: int
-    count: int
-
-    def read(self, start: int, stop: int) -> np.ndarray:
-        """The rows from start up to stop."""
-        at = self.offset + start * self.dtype.itemsize
-        rows = np.fromfile(self.path, self.dtype, stop - start, offset=at)
-        if len(rows) != stop - start:
-            raise FormatError(self.path, "was cut short while it was being read")
-        return rows
-
-
 def sniff(path: Path, head: bytes) -> bool:
     """Whether this is a .ply with packed words."""
-    if not head.startswith((b"ply\n", b"ply\r")):
-        return False
-    try:
-        with path.open("rb") as stream:
-            start = stream.read(whole_limit("HEADER"))
-    except OSError:
-        return False
-    return bool(SIGN.search(start.partition(b"end_header")[0]))
+    return head.startswith((b"ply\n", b"ply\r")) and is_packed(path)
 
 
-def open_scene(path: Path) -> SceneFile:
-    """Look at a scene; see `aaplug.io.scenes.open_scene`.
-
-    Raises:
-        FormatError: the file is damaged.
-    """
+def open_scene(path: Path, options: Options) -> SceneFile:
+    """See `SceneFormat`."""
     with library_errors(path):
         header = read_header(path)
         check_size(header, path.stat().st_size)
@@ -94,11 +68,11 @@ def open_scene(path: Path) -> SceneFile:
 
 def _tables(path: Path, header: Header) -> dict[str, Table]:
     if header.coding != LITTLE or any(e.lists for e in header.elements):
-        raise FormatError(path, f"is packed, and should be {LITTLE} without lists")
-    tables, at = {}, header.size
+        raise FormatError(path, f"is a packed .ply, which should be {LITTLE} without lists")
+    tables, at, stamp = {}, header.size, stamp_of(path)
     for element in header.elements:
         dtype = np.dtype([(p.name, "<" + p.code) for p in element.properties])
-        tables[element.name] = Table(path, dtype, at, element.count)
+        tables[element.name] = Table(path, at, element.count, dtype, stamp)
         at += element.least_size
     return tables
 
@@ -135,9 +109,8 @@ def _need(
 def _rows(
     tables: dict[str, Table], bounds: np.ndarray, degree: int, start: int, stop: int
 ) -> Gaussians:
-    with library_errors(tables["vertex"].path):
-        words = tables["vertex"].read(start, stop)
-        rest = tables["sh"].read(start, stop) if degree else None
+    words = tables["vertex"].read(start, stop)
+    rest = tables["sh"].read(start, stop) if degree else None
     of_row = np.arange(start, stop) // PER_CHUNK
     colour = words["packed_color"]
     rgb = _bytes(colour, (24, 16, 8))
@@ -186,7 +159,7 @@ def _quaternions(words: np.ndarray) -> Float[Tensor, "n 4"]:
 
 
 def _harmonic(values: np.ndarray) -> Float[Tensor, " n"]:
-    """Bytes stand for the middles of 256 steps, the first and the last for the ends."""
+    """Bytes stand for the centres of 256 steps, the first and the last byte for the ends of the range."""
     middle = (floats(values) + 0.5) / 256
     ends = torch.from_numpy(values == 255).float()
     share = torch.where(torch.from_numpy((values == 0) | (values == 255)), ends, middle)

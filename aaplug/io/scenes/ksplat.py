@@ -1,13 +1,13 @@
 """mkkellogg's .ksplat, compression levels 0 to 2 (github.com/mkkellogg/GaussianSplats3D).
 
-A header of 4096 bytes, then one of 1024 for each section, then the sections.  A section holds the sizes of its last,
-partly filled buckets, the buckets' centres, and a record for each Gaussian: position (float32, or 16 bits around its
-bucket's centre), scales (linear; float32 or float16), quaternion wxyz, colour with opacity (bytes), harmonics (float32,
-float16 or bytes), degree by degree and in each channel by channel.
+A header of 4096 bytes, then one of 1024 for each section, then the sections.  A section holds the sizes of its partly
+filled buckets, the buckets' centres, and a record per Gaussian: position (float32, or 16 bits around its bucket's
+centre), scales (linear; float32 or float16), quaternion wxyz, colour and opacity (bytes), harmonics (float32, float16
+or bytes), ordered by degree, then channel.
 """
 
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,20 +15,20 @@ import torch
 
 from aaplug.core.errors import FormatError
 from aaplug.core.gaussians import Gaussians
+from aaplug.io.scenes.options import Options
 from aaplug.io.scenes.packed import byte_opacities, floats
 from aaplug.io.scenes.scene_file import SceneFile, check_count, empty, library_errors, sh_of_colour
 from aaplug.io.scenes.splat import EVIDENCE
 
-MAIN = struct.Struct(
-    "<BBxxI8xIH14xff"
-)  # version, sections, Gaussians, level, harmonics' least and most
+# version, sections, Gaussians, level, smallest and largest harmonic
+MAIN = struct.Struct("<BBxxI8xIH14xff")
 MAIN_SIZE, SECTION_SIZE = 4096, 1024
 SECTION = struct.Struct("<IIIIfH2xI4xIIH")  # see Section
 FLOATS = ("<f4", "<f2", "<f2")  # of scales and quaternions, by level
 POSITIONS = ("<f4", "<u2", "<u2")
 HARMONICS = ("<f4", "<f2", "u1")
-RANGES = (1, 32767, 32767)  # of positions, where the section does not say
-SH_RANGE = (-1.5, 1.5)  # of harmonics in bytes, where the file does not say
+RANGES = (1, 32767, 32767)  # of positions, if the section does not say
+SH_RANGE = (-1.5, 1.5)  # of harmonics in bytes, if the file does not say
 MAX_DEGREE = 3
 
 name = "ksplat"
@@ -36,7 +36,11 @@ name = "ksplat"
 
 @dataclass(frozen=True)
 class Section:
-    """A section's header: Gaussians there and room for them, buckets, and the length of a block around a centre."""
+    """A section's header.
+
+    count, room: Gaussians, and records reserved.  capacity: Gaussians per bucket.  block: side of a bucket's cube.
+    full, partial: numbers of full and partly filled buckets.
+    """
 
     count: int
     room: int
@@ -52,7 +56,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Records:
-    """A section's Gaussians: their records, and the centre of each one's bucket."""
+    """A section's records, and the centre of each record's bucket."""
 
     section: Section
     rows: np.ndarray
@@ -60,16 +64,12 @@ class Records:
 
 
 def sniff(path: Path, head: bytes) -> bool:
-    """Whether the file is called .ksplat; its content has no sign."""
+    """Whether the suffix is .ksplat; the format has no magic number."""
     return path.suffix.lower() == ".ksplat"
 
 
-def open_scene(path: Path) -> SceneFile:
-    """Read a scene's records; see `aaplug.io.scenes.open_scene`.
-
-    Raises:
-        FormatError: the file is damaged, or promises more than it holds.
-    """
+def open_scene(path: Path, options: Options) -> SceneFile:
+    """See `SceneFormat`."""
     with library_errors(path):
         data = path.read_bytes()
         level, sh_range, sections = _sections(path, data)
@@ -89,7 +89,7 @@ def open_scene(path: Path) -> SceneFile:
 
 def _sections(path: Path, data: bytes) -> tuple[int, tuple[float, float], list[Records]]:
     if len(data) < MAIN_SIZE:
-        raise FormatError(path, f"is cut short: a header has {MAIN_SIZE:,} bytes, {len(data):,} are there")  # fmt: skip
+        raise FormatError(path, f"is cut short: a header has {MAIN_SIZE:,} bytes, the file {len(data):,}")  # fmt: skip
     major, minor, number, count, level, least, most = MAIN.unpack_from(data)
     if (major, level) not in ((0, 0), (0, 1), (0, 2)) or minor < 1:
         raise FormatError(
@@ -106,7 +106,9 @@ def _sections(path: Path, data: bytes) -> tuple[int, tuple[float, float], list[R
         if section.count:
             found.append(records)
     if sum(len(s.rows) for s in found) != count:
-        raise FormatError(path, f"promises {count:,} Gaussians, and its sections hold others")
+        raise FormatError(
+            path, f"promises {count:,} Gaussians, and its sections hold another number"
+        )
     return level, (least or SH_RANGE[0], most or SH_RANGE[1]), found
 
 
@@ -172,12 +174,10 @@ def _decoded(records: Records, level: int, sh_range: tuple[float, float], degree
 
 
 def _joined(scenes: list[Gaussians], degree: int) -> Gaussians:
-    if not scenes:
-        return empty(0, degree)
-    return Gaussians(
-        torch.cat([s.means for s in scenes]),
-        torch.cat([s.quats for s in scenes]),
-        torch.cat([s.log_scales for s in scenes]),
-        torch.cat([s.logit_opacities for s in scenes]),
-        torch.cat([s.sh for s in scenes]),
-    )
+    parts = [empty(0, degree), *scenes]
+
+    def column(name: str) -> torch.Tensor:
+        return torch.cat([getattr(part, name) for part in parts])
+
+    names = ("means", "quats", "log_scales", "logit_opacities", "sh")
+    return replace(parts[0], **{name: column(name) for name in names})

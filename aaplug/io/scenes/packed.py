@@ -1,6 +1,6 @@
-"""What the compressed formats share: bounded inflation, quaternions of three components, and other axes.
+"""Shared by the compressed formats: bounded decompression, packed quaternions, and axes.
 
-Arrays are numpy's as they come from files; n: rows.
+n: rows.  Arrays are numpy's, as they come from files.
 """
 
 import io
@@ -19,32 +19,32 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.io.limits import limit, whole_limit
 from aaplug.io.scenes.scene_file import logit_of
 
-GZIP_WINDOW = 31  # zlib's word for a gzip stream with the largest window
-MAX_WINDOW = 1 << 27  # bytes: zstd's own most
+GZIP_WINDOW = 31  # zlib's code for a gzip stream with the largest window
+MAX_WINDOW = 1 << 27  # bytes: zstd's own maximum
 BYTE = 255
 
 
 def check_growth(path: Path, inflated: int, compressed: int) -> None:
-    """Refuse to inflate `compressed` bytes to more than a real scene would.
+    """Refuse compressed bytes that announce a larger size than a real scene would have.
 
     Raises:
-        FormatError: it would grow by more than the limit.
+        FormatError: `inflated` is above the limit INFLATE.
     """
     if inflated > limit("INFLATE") * compressed + limit("SLACK"):
         raise FormatError(
             path,
             f"its {compressed:,} compressed bytes announce {inflated:,}, more than {limit('INFLATE'):g} times as many; "
-            "it is damaged or a bomb (AAPLUG_INFLATE raises the limit)",
+            "it is damaged or a decompression bomb (AAPLUG_INFLATE raises the limit)",
         )
 
 
 def gunzip_start(data: bytes, size: int) -> bytes:
-    """The first bytes of a gzip stream, fewer if it has fewer."""
+    """The first bytes of a gzip stream, or all if it has fewer."""
     return zlib.decompressobj(GZIP_WINDOW).decompress(data, size)
 
 
 def gunzip(data: bytes, size: int, path: Path) -> bytes:
-    """A gzip stream that should hold `size` bytes; some more are let pass.
+    """Decompress a gzip stream of `size` bytes; a few more are accepted.
 
     Raises:
         FormatError: it holds fewer, or many more.
@@ -60,7 +60,7 @@ def gunzip(data: bytes, size: int, path: Path) -> bytes:
 
 
 def unzstd(data: bytes, size: int, path: Path) -> bytes:
-    """A zstd stream that should hold `size` bytes.
+    """Decompress a zstd stream of `size` bytes.
 
     Raises:
         FormatError: it holds another number.
@@ -76,7 +76,7 @@ def unzstd(data: bytes, size: int, path: Path) -> bytes:
 
 
 def largest_last(rest: Float[Tensor, "n 3"], largest: Tensor) -> Float[Tensor, "n 4"]:
-    """Unit quaternions from three components, in order, and the index of the largest, which is left out."""
+    """Unit quaternions from three components in order, and the index of the largest, which is not stored."""
     missing = (1 - rest.square().sum(dim=1)).clamp(min=0).sqrt()
     order = torch.tensor([[3, 0, 1, 2], [0, 3, 1, 2], [0, 1, 3, 2], [0, 1, 2, 3]])
     return torch.cat([rest, missing[:, None]], dim=1).gather(1, order[largest.long()])
@@ -88,14 +88,14 @@ def byte_opacities(alpha: np.ndarray) -> Float[Tensor, " n"]:
 
 
 def floats(values: np.ndarray) -> Tensor:
-    """A tensor of float32 of its own."""
+    """A copy as a float32 tensor."""
     return torch.from_numpy(values.astype(np.float32))
 
 
 def half_turn_about_x(scene: Gaussians) -> Gaussians:
-    """The scene with y and z negated, from OpenGL's axes to OpenCV's or back.
+    """The scene with y and z negated: from OpenGL's axes to OpenCV's, or back.
 
-    A harmonic of degree l and order m changes by (−1)^(m < 0) for y and (−1)^(l − |m|) for z.
+    A harmonic of degree l and order m is multiplied by (−1)^(m < 0) for y and by (−1)^(l − |m|) for z.
     """
     orders = [(d, m) for d in range(scene.sh_degree + 1) for m in range(-d, d + 1)]
     signs = torch.tensor([(-1.0) ** ((m < 0) + d - abs(m)) for d, m in orders])

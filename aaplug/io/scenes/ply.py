@@ -1,42 +1,40 @@
-"""The .ply scenes of INRIA's 3DGS and its many relatives, read and written so that nothing in them is lost.
+"""The .ply scenes of INRIA's 3DGS and its dialects, read and written so that nothing in them is lost.
 
-A Gaussian is a row of the element "vertex": x y z, f_dc_0..2, f_rest_*, opacity (a logit),
-scale_0..2 (natural logarithms), rot_0..3 (wxyz, any length), in any order and between any other columns, in any of
-PLY's three codings.  Dialects: float64 columns (converted), red green blue in place of f_dc_* (nerfstudio's rgb mode),
-scale_0..1 alone (2DGS), filter_3D (Mip-Splatting).  What is not a Gaussian's parameter stays in the document and is
-written back to the byte; what is written is little-endian binary.  plyfile reads text, checks lists and converts
-big-endian tables; numpy reads the Gaussians' rows.
+A Gaussian is a row of the element "vertex": x y z, f_dc_0..2, f_rest_*, opacity (a logit), scale_0..2 (natural
+logarithms), rot_0..3 (wxyz, any length), in any order and among any other columns, in any of PLY's three codings.
+Dialects: float64 columns (converted), red green blue in place of f_dc_* (nerfstudio's rgb mode), scale_0..1 alone
+(2DGS), filter_3D (Mip-Splatting).  Everything that is not a Gaussian's parameter stays in the document and is written
+back unchanged.  Output is little-endian binary.
 """
 
-import io
 import re
-import warnings
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
 import torch
-from plyfile import PlyData, PlyElement
 from torch import Tensor
 
 from aaplug.core.errors import FormatError, OutputError, listing
 from aaplug.core.gaussians import Gaussians, PixelSizes
 from aaplug.io.atomic import replacing
+from aaplug.io.scenes.options import Options
+from aaplug.io.scenes.ply_document import Document, document_of, stamp_of
 from aaplug.io.scenes.ply_header import (
-    BIG,
     LITTLE,
-    TEXT,
     Header,
     Property,
     check_size,
+    is_packed,
     parse,
     read_header,
 )
 from aaplug.io.scenes.ply_tags import meaning, stating
 from aaplug.io.scenes.scene_file import (
+    DEGREES,
     FILTER_COLUMN,
     SceneFile,
     check_count,
@@ -48,98 +46,36 @@ from aaplug.io.scenes.scene_file import (
     sh_of_colour,
 )
 
-DEGREES = {3 * ((d + 1) ** 2 - 1): d for d in range(5)}  # by the number of f_rest columns
 REST = re.compile(r"f_rest_\d+")
 COLOURS = ("f_dc_0", "f_dc_1", "f_dc_2")
 BYTE_COLOURS = ("red", "green", "blue")  # uchar
 SCALES = ("scale_0", "scale_1", "scale_2")
-REQUIRED = (
-    *("x", "y", "z", *COLOURS, "opacity", *SCALES),
-    *("rot_0", "rot_1", "rot_2", "rot_3"),
-)
-NORMALS = ("nx", "ny", "nz")  # unused; 3DGS writes them and some readers expect them
-SIZES = ("min_pixel_sizes", "max_pixel_sizes", "base_mask")  # Multi-Scale 3DGS', of any type
+REQUIRED = (*("x", "y", "z", *COLOURS, "opacity", *SCALES), *("rot_0", "rot_1", "rot_2", "rot_3"))
+NORMALS = ("nx", "ny", "nz")  # unused; 3DGS writes them, and some readers expect them
+SIZES = ("min_pixel_sizes", "max_pixel_sizes", "base_mask")  # of Multi-Scale 3DGS, of any type
 FLOATS = ("f4", "f8")
-CHUNK = (
-    1 << 12
-)  # rows taken apart at a time: 1 MB, so that a column's stride stays within the cache
-SPARSE = 16  # rows that span more than this many times their number are fetched one by one
-BATCH = 1 << 16  # rows written at a time: 16 MB
-BLOCK = 1 << 20  # bytes copied at a time
+CHUNK = 1 << 12  # rows converted at once: 1 MB, so that a column's stride stays within the cache
+BATCH = 1 << 16  # rows written at once: 16 MB
 
 name = "ply"
-
-
-@dataclass(frozen=True)
-class Table:
-    """The Gaussians' rows in a file, read when asked for, or held where they had to be parsed.
-
-    stamp: the file's size and time of change, for what is read later must be what was there before.
-    """
-
-    path: Path
-    offset: int
-    count: int
-    dtype: np.dtype
-    stamp: tuple[int, int]
-    held: np.ndarray | None = None
-
-    def read(self, start: int, stop: int) -> np.ndarray:
-        """The rows from start up to stop."""
-        if self.held is not None:
-            return self.held[start:stop]
-        self._check_unchanged()
-        offset = self.offset + start * self.dtype.itemsize
-        return np.fromfile(self.path, self.dtype, stop - start, offset=offset)
-
-    def take(self, rows: Tensor) -> np.ndarray:
-        """The rows of these indices."""
-        if len(rows) == 0:
-            return np.empty(0, self.dtype)
-        first, last = int(rows.min()), int(rows.max())
-        if self.held is None and last - first > SPARSE * len(rows):
-            self._check_unchanged()
-            table = np.memmap(self.path, self.dtype, "r", self.offset, (self.count,))
-            return np.array(table[rows.numpy()])
-        return self.read(first, last + 1)[(rows - first).numpy()]
-
-    def _check_unchanged(self) -> None:
-        if _stamp(self.path) != self.stamp:
-            raise FormatError(self.path, "changed while it was being read")
-
-
-@dataclass(frozen=True)
-class Document:
-    """A whole file: its header, the Gaussians' table, and all other tables as little-endian bytes.
-
-    before, after: the bytes themselves, or where in the file they stand (start, stop).
-    """
-
-    header: Header
-    table: Table | None = None
-    before: bytes | tuple[int, int] = b""
-    after: bytes | tuple[int, int] = b""
+needs = None
 
 
 def sniff(path: Path, head: bytes) -> bool:
-    """Whether this is a .ply file, be it a scene or not."""
-    return head.startswith((b"ply\n", b"ply\r"))
+    """Whether this is a .ply file that is not packed, whether it holds a scene or not."""
+    return head.startswith((b"ply\n", b"ply\r")) and not is_packed(path)
 
 
-def open_scene(path: Path) -> SceneFile:
-    """Look at a scene; see `aaplug.io.scenes.open_scene`.
-
-    Raises:
-        FormatError: the file is no scene, or is damaged.
-    """
+def open_scene(path: Path, options: Options) -> SceneFile:
+    """See `SceneFormat`."""
     with library_errors(path):
         header = read_header(path)
-        stamp = _stamp(path)
+        stamp = stamp_of(path)
         check_size(header, stamp[0])
         notes = _check_columns(header)
         check_count(path, header.vertex.count)
         said = meaning(header)
-        document = _document(path, header, stamp)
+        document = document_of(path, header, stamp)
     degree = DEGREES[len(_rest(header))]
     return SceneFile(
         path,
@@ -156,19 +92,17 @@ def open_scene(path: Path) -> SceneFile:
     )
 
 
-def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool) -> None:
-    """Write a scene part by part; see `aaplug.io.scenes.write_parts`.
-
-    Raises:
-        OutputError: the file exists and `overwrite` is false, or it cannot be written.
-    """
+def write(
+    path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: Options
+) -> None:
+    """Write a scene part by part, with the columns, tables and comments of its source file."""
     parts = iter(parts)
     first = next(parts)
     document = _document_of(first) or Document(_plain_header(first))
     header = _updated(document.header, first, count, new=document.table is None)
     with replacing(path, overwrite) as stream:
         stream.write(header.content)
-        _copy(stream, document, document.before)
+        document.copy(document.before, stream)
         start, written = stream.tell(), 0
         for part in chain([first], parts):
             _write_rows(stream, header, part)
@@ -176,16 +110,11 @@ def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool) -
         size = start + written * header.vertex.stride
         if stream.tell() != size:
             raise OutputError(path, f"{stream.tell():,} bytes were written instead of {size:,}")
-        _copy(stream, document, document.after)
-        if written != count:  # fewer than thought, so the number takes no more room
+        document.copy(document.after, stream)
+        if written != count:  # rows were left out: the number has no more digits than before
             assert written < count
             stream.seek(0)
             stream.write(header.with_padded_count(written).content)
-
-
-def _stamp(path: Path) -> tuple[int, int]:
-    status = path.stat()
-    return status.st_size, status.st_mtime_ns
 
 
 def _rest(header: Header) -> list[str]:
@@ -193,7 +122,7 @@ def _rest(header: Header) -> list[str]:
 
 
 def _check_columns(header: Header) -> list[str]:
-    """What is unusual about the columns and still understood."""
+    """Check the columns; notes on unusual ones that are understood."""
     vertex = header.vertex
     known = {p.name: p for p in vertex.properties}
     if vertex.lists:
@@ -205,7 +134,8 @@ def _check_columns(header: Header) -> list[str]:
     optional = {*(COLOURS if coloured else ()), SCALES[2]}
     missing = [c for c in REQUIRED if c not in known and c not in optional]
     if missing:
-        raise FormatError(header.path, _about_missing(missing))
+        lacks = f"vertex lacks {', '.join(missing)}, which a 3DGS .ply has"
+        raise FormatError(header.path, f"{lacks}; is it a point cloud or a mesh?")
     used = [p for p in known.values() if _is_parameter(p.name)]
     wrong = [p.name for p in used if p.code not in FLOATS]
     if wrong:
@@ -214,27 +144,20 @@ def _check_columns(header: Header) -> list[str]:
         )
     _check_rest(header.path, _rest(header))
     double = [p.name for p in used if p.code == "f8"]
-    return [
-        *([f"coding: {header.coding}"] if header.coding != LITTLE else []),
-        *([f"{len(double)} columns of float64, used as float32"] if double else []),
-        *(
-            ["pixel sizes of Multi-Scale 3DGS, for --recipe multi-scale"]
-            if all(column in known for column in SIZES)
-            else []
+    notes = {
+        f"coding: {header.coding}": header.coding != LITTLE,
+        f"{len(double)} columns of float64, used as float32": double,
+        "pixel sizes of Multi-Scale 3DGS, for the recipe multi-scale": all(
+            c in known for c in SIZES
         ),
-        *(["colours from the columns red, green, blue; no harmonics"] if coloured else []),
-    ]
+        "colours from the columns red, green, blue; no harmonics": coloured,
+    }
+    return [note for note, applies in notes.items() if applies]
 
 
 def _has_byte_colours(known: dict[str, Property]) -> bool:
     there = all(c in known and known[c].code == "u1" for c in BYTE_COLOURS)
     return there and not any(c in known for c in COLOURS)
-
-
-def _about_missing(missing: list[str]) -> str:
-    return (
-        f"vertex lacks {', '.join(missing)}, which a 3DGS .ply has; is it a point cloud or a mesh?"
-    )
 
 
 def _check_rest(path: str, rest: list[str]) -> None:
@@ -251,72 +174,11 @@ def _is_parameter(column: str) -> bool:
     return column in REQUIRED or column == FILTER_COLUMN or bool(REST.fullmatch(column))
 
 
-def _document(path: Path, header: Header, stamp: tuple[int, int]) -> Document:
-    """Where everything stands; plyfile parses what numpy cannot."""
-    order = ">" if header.coding == BIG else "<"
-    dtype = np.dtype([(p.name, order + p.code) for p in header.vertex.properties])
-    at = header.elements.index(header.vertex)
-    offset = header.size + sum(e.least_size for e in header.elements[:at])
-    lists = any(e.lists for e in header.elements)
-    if header.coding == LITTLE and not lists:
-        return _by_offsets(path, header, stamp, offset, dtype)
-    if header.coding == BIG and len(header.elements) == 1:
-        table = Table(path, offset, header.vertex.count, dtype, stamp)
-        return Document(header, table)
-    if not header.plain:
-        raise FormatError(
-            path, "its header has empty lines or letters beyond ASCII; take them out to read it"
-        )
-    elements = _parsed(path, stamp[0], header.coding)
-    data = elements[at].data
-    if header.coding == LITTLE:
-        offset = int(getattr(data, "offset", offset))
-        return _by_offsets(path, header, stamp, offset, dtype)
-    before, after = (_little(part) for part in (elements[:at], elements[at + 1 :]))
-    return Document(
-        header, Table(path, 0, len(data), data.dtype, stamp, np.asarray(data)), before, after
-    )
-
-
-def _by_offsets(
-    path: Path, header: Header, stamp: tuple[int, int], offset: int, dtype: np.dtype
-) -> Document:
-    table = Table(path, offset, header.vertex.count, dtype, stamp)
-    end = offset + header.vertex.least_size
-    return Document(header, table, (header.size, offset), (end, stamp[0]))
-
-
-def _parsed(path: Path, size: int, coding: str) -> tuple[PlyElement, ...]:
-    if coding == TEXT:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # numpy's, of empty lists
-            return PlyData.read(str(path)).elements
-    with path.open("rb") as stream:
-        elements = PlyData.read(stream, mmap="r").elements
-        end = stream.tell()
-    if end != size:  # without lists a binary file's size is known before
-        raise FormatError(path, f"has {size - end:,} bytes after its last element; it is damaged")
-    return elements
-
-
-def _little(elements: Iterable[PlyElement]) -> bytes:
-    elements = list(elements)
-    if not elements:
-        return b""
-    stream = io.BytesIO()
-    data = PlyData(elements, byte_order="<")
-    data.write(stream)
-    return stream.getvalue()[len(data.header) + 1 :]
-
-
 def _rows(document: Document, degree: int, flat: bool, start: int, stop: int) -> Gaussians:
-    """Parameters as tensors, a chunk at a time as a row's values lie together in the file."""
+    """The parameters as tensors, converted in chunks of rows."""
     table = document.table
     assert table is not None
-    with library_errors(table.path):
-        rows = table.read(start, stop)
-    if len(rows) != stop - start:
-        raise FormatError(table.path, "was cut short while it was being read")
+    rows = table.read(start, stop)
     fields = rows.dtype.names or ()
     if _one_type(rows.dtype) and COLOURS[0] in fields:
         scene = scene_of(fields, torch.from_numpy(_matrix(rows)), degree, flat)
@@ -333,7 +195,7 @@ def _rows(document: Document, degree: int, flat: bool, start: int, stop: int) ->
 
 
 def _pixel_sizes(rows: np.ndarray) -> PixelSizes | None:
-    """What Multi-Scale 3DGS recorded; writing keeps these columns as it keeps all that is no parameter."""
+    """The columns of Multi-Scale 3DGS; writing keeps them like all columns that are not parameters."""
     if not all(column in (rows.dtype.names or ()) for column in SIZES):
         return None
     smallest, largest, base = (torch.from_numpy(rows[c].astype(np.float32)) for c in SIZES)
@@ -341,7 +203,7 @@ def _pixel_sizes(rows: np.ndarray) -> PixelSizes | None:
 
 
 def _one_type(dtype: np.dtype) -> bool:
-    """Whether all columns are little-endian float32, so that rows make a matrix."""
+    """Whether all columns are little-endian float32, so that the rows are a matrix."""
     return all(dtype[i] == np.dtype("<f4") for i in range(len(dtype.names or ())))
 
 
@@ -355,7 +217,7 @@ def _byte_colours(rows: np.ndarray) -> Tensor:
 
 
 def _plain_header(scene: Gaussians) -> Header:
-    """3DGS's own header, in its order of columns."""
+    """The header that 3DGS writes, with its order of columns."""
     rest = [f"f_rest_{i}" for i in range(3 * (scene.sh.shape[1] - 1))]
     order = [*REQUIRED[:3], *NORMALS, *COLOURS, *rest, *REQUIRED[6:]]
     properties = [f"property float {c}" for c in order if c in NORMALS or c in columns(scene)]
@@ -364,7 +226,7 @@ def _plain_header(scene: Gaussians) -> Header:
 
 
 def _updated(old: Header, scene: Gaussians, count: int, new: bool) -> Header:
-    """The header for this scene: number, columns, and what it says of convention and fusions."""
+    """The header for this scene: count, columns, convention and fusions."""
     wanted = columns(scene)
     known = old.vertex.names
     kept = SCALES[2] if scene.flat else None
@@ -387,7 +249,7 @@ def _write_rows(stream: BinaryIO, header: Header, scene: Gaussians) -> None:
 def _records(header: Header, scene: Gaussians) -> np.ndarray:
     """Rows of the Gaussians' table: parameters from the scene, other columns from the document.
 
-    A column of another type than float32 keeps what it had where the scene's value is what was read from it.
+    In a column that is not float32, a value that is still what was read keeps the file's digits.
     """
     properties = header.vertex.properties
     records = np.zeros(len(scene), np.dtype([(p.name, "<" + p.code) for p in properties]))
@@ -409,7 +271,7 @@ def _records(header: Header, scene: Gaussians) -> np.ndarray:
 
 
 def _filled(records: np.ndarray, scene: Gaussians) -> np.ndarray:
-    """The same for float32 alone, all columns at once."""
+    """`_records` if all columns are float32: all at once."""
     names, fields = list(records.dtype.names or ()), _matrix(records)
     known, values = matrix_of(scene)
     values = values.detach().cpu().numpy()
@@ -428,19 +290,3 @@ def _old_rows(scene: Gaussians) -> np.ndarray | None:
         return None
     assert scene.origin is not None
     return document.table.take(scene.origin.rows.cpu())
-
-
-def _copy(stream: BinaryIO, document: Document, content: bytes | tuple[int, int]) -> None:
-    """Other tables, from memory or from where they stand in the file."""
-    if isinstance(content, bytes):
-        stream.write(content)
-        return
-    start, stop = content
-    if start == stop:
-        return
-    assert document.table is not None
-    with document.table.path.open("rb") as source:
-        source.seek(start)
-        while start < stop and (data := source.read(min(BLOCK, stop - start))):
-            stream.write(data)
-            start += len(data)

@@ -1,9 +1,8 @@
-"""A .ply file's header: a bounded look before anything is allocated, and edits that keep the rest.
+"""The header of a .ply file: read with bounds and checked before anything is allocated, and edited line by line.
 
-A header is lines of text from "ply" to "end_header", here without their line ends and without empty lines.  Only
-comments may hold other letters than ASCII, in whatever encoding: each byte is kept as one letter.  It declares
-elements (tables) of `count` rows, each row made of properties (columns): scalars, or lists of a
-stored length.  Sizes are in bytes.
+A header is lines of text from "ply" to "end_header", here without line ends and empty lines.  Comments may use any
+encoding: each byte is kept as one character.  The header declares elements (tables) of `count` rows; a row consists of
+properties (columns): scalars, or lists with a stored length.  Sizes are in bytes.
 """
 
 import re
@@ -16,10 +15,11 @@ from aaplug.core.errors import FormatError
 from aaplug.io.limits import whole_limit
 
 MAX_COUNT_DIGITS = 18  # still an int64
-BYTES = "latin-1"  # a letter a byte
+BYTES = "latin-1"  # one character per byte
 MAX_SHOWN = 60  # characters of an offending line in a message
 LITTLE, BIG, TEXT = "binary_little_endian", "binary_big_endian", "ascii"
-LEAST_TEXT = 2  # bytes of a value in text: a digit and a space or line end
+LEAST_TEXT = 2  # bytes of a value in text: a digit and a separator
+PACKED = re.compile(rb"property\s+uint\w*\s+packed_position")  # in a .compressed.ply
 CODES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
     "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
@@ -30,7 +30,7 @@ CODES = {
 
 @dataclass(frozen=True)
 class Property:
-    """A column: its values' type and, for lists, the type of their stored length."""
+    """A column: the type of its values and, for lists, of their stored length."""
 
     name: str
     code: str
@@ -52,17 +52,17 @@ class Element:
 
     @property
     def stride(self) -> int:
-        """Size of a row, lists counted as empty."""
+        """Size of a row whose lists are empty."""
         return sum(p.least_size for p in self.properties)
 
     @property
     def least_size(self) -> int:
-        """Size of the table, lists counted as empty."""
+        """Size of the table if all lists are empty."""
         return self.count * self.stride
 
     @property
     def least_text(self) -> int:
-        """The same for a table in text."""
+        """Least size of the table in text."""
         return self.count * len(self.properties) * LEAST_TEXT
 
     @property
@@ -78,9 +78,11 @@ class Element:
 
 @dataclass(frozen=True)
 class Header:
-    """The header's lines as they stand in the file `path`, and what they declare.
+    """A header's lines and what they declare.
 
-    coding: LITTLE, BIG or TEXT.  size: of the header in its file.
+    path: the file, for messages.
+    coding: LITTLE, BIG or TEXT.
+    size: of the header in its file.
     """
 
     path: str
@@ -92,22 +94,22 @@ class Header:
 
     @cached_property
     def text(self) -> str:
-        """All of it, up to the last line's end."""
+        """The lines with their ends."""
         return _text(self.lines, self.newline)
 
     @property
     def content(self) -> bytes:
-        """The text as it stands in a file."""
+        """The text as bytes."""
         return self.text.encode(BYTES)
 
     @property
     def plain(self) -> bool:
-        """Whether a strict reader takes it: ASCII, and nothing left out."""
+        """Whether plyfile can read it: all ASCII, no empty lines."""
         return self.text.isascii() and len(self.text) == self.size
 
     @property
     def comments(self) -> list[str]:
-        """The comments' words, in order."""
+        """The comments, in order, without the word "comment"."""
         return [_comment(line) for line in self.lines if _keyword(line) == "comment"]
 
     @property
@@ -123,7 +125,7 @@ class Header:
         raise FormatError(self.path, "has no element 'vertex'; is it a Gaussian splatting scene?")
 
     def without_comments(self, unwanted: Callable[[str], object]) -> "Header":
-        """The header less the comments for which `unwanted` holds."""
+        """The header without the comments for which `unwanted` is true."""
         kept = (x for x in self.lines if _keyword(x) != "comment" or not unwanted(_comment(x)))
         return parse(self.path, kept, self.newline)
 
@@ -136,13 +138,13 @@ class Header:
         return parse(self.path, [*self.lines[:first], *added, *self.lines[first:]], self.newline)
 
     def little(self) -> "Header":
-        """The header of the same tables in binary, little-endian."""
+        """The header of the same tables in little-endian binary."""
         words = f"format {LITTLE} 1.0"
         lines = (words if _keyword(line) == "format" else line for line in self.lines)
         return parse(self.path, lines, self.newline)
 
     def with_padded_count(self, count: int) -> "Header":
-        """The header with fewer vertices and not a byte less: spaces make up for lost digits."""
+        """The header with fewer vertices and the same size: spaces replace lost digits."""
         old = str(self.vertex.count)
         lines = (
             re.sub(rf"^(\s*element\s+vertex\s+){old}", rf"\g<1>{count:>{len(old)}}", x)
@@ -151,7 +153,7 @@ class Header:
         return parse(self.path, lines, self.newline)
 
     def with_vertex(self, count: int, dropped: Collection[str], added: Iterable[str]) -> "Header":
-        """The header with `count` vertices, columns `dropped`, and float columns `added` last."""
+        """The header with `count` vertices, without the columns `dropped`, with float columns `added` at the end."""
         lines: list[str] = []
         inside = False
         for line in self.lines:
@@ -167,10 +169,10 @@ class Header:
 
 
 def read_header(path: Path) -> Header:
-    """Read and check the header, looking at no more of the file than the limit.
+    """Read and check the header, within the limits HEADER and HEADER_LINES.
 
     Raises:
-        FormatError: it is not a header, ends nowhere, or declares something twice or impossible.
+        FormatError: it is not a header, has no end, or declares something twice or impossible.
     """
     most, most_lines = whole_limit("HEADER"), whole_limit("HEADER_LINES")
     with path.open("rb") as stream:
@@ -181,7 +183,7 @@ def read_header(path: Path) -> Header:
     end = head.find(newline + b"end_header" + newline)
     if end < 0:
         where = f"in its first {most:,} bytes" if len(head) == most else "in the file"
-        raise FormatError(path, f"no line 'end_header' {where}; it is cut short or no .ply")
+        raise FormatError(path, f"no line 'end_header' {where}; it is cut short or not a .ply")
     lines = (head[:end] + newline + b"end_header").split(newline)
     if len(lines) > most_lines:
         raise FormatError(
@@ -191,8 +193,18 @@ def read_header(path: Path) -> Header:
     return parse(str(path), [line.decode(BYTES) for line in lines if line], newline.decode(), size)
 
 
+def is_packed(path: Path) -> bool:
+    """Whether a .ply's header declares the packed words of a .compressed.ply.  Never raises."""
+    try:
+        with path.open("rb") as stream:
+            start = stream.read(whole_limit("HEADER"))
+    except OSError:
+        return False
+    return bool(PACKED.search(start.partition(b"end_header")[0]))
+
+
 def parse(path: str, lines: Iterable[str], newline: str, size: int | None = None) -> Header:
-    """Understand a header's lines; `size` is that of the header in its file.
+    """Parse a header's lines; `size` is that of the header in its file.
 
     Raises:
         FormatError: a line is not PLY, or a count, type or name is impossible or appears twice.
@@ -226,14 +238,14 @@ def parse(path: str, lines: Iterable[str], newline: str, size: int | None = None
 
 
 def check_size(header: Header, actual: int) -> None:
-    """Compare the file's size with what the header promises; nothing is allocated for a lie.
+    """Compare the file's size with what the header promises, before anything is allocated.
 
     Raises:
         FormatError: the file is shorter or longer.
     """
     text = header.coding == TEXT
     least = header.size + sum(e.least_text if text else e.least_size for e in header.elements)
-    if text and actual < least - 1:  # the last line may end without a line end
+    if text and actual < least - 1:  # the last line may lack its line end
         raise FormatError(
             header.path,
             f"is cut short: the values that its header promises need {least:,} bytes at least, and it has {actual:,}",

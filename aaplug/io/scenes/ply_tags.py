@@ -1,12 +1,13 @@
-"""What a .ply header says about how a scene was trained and what has been fused into it.
+"""What a .ply header's comments and columns say about how a scene was trained and what has been fused into it.
 
-Understood, strongest first:
-    comment aaplug [fused=<method>] key=value ... [convention=<name>]   our own record
+Sources, strongest first:
+    comment aaplug [fused=<method>] key=value ... [convention=<name>]   aaplug's own record
     a vertex column filter_3D                                           Mip-Splatting, not yet fused
-    two scales, or comment SplatRenderMode: 2dgs                        2D Gaussians, drawn as classic ones
+    two scales, or comment SplatRenderMode: 2dgs                        2D Gaussians, treated as classic
     comment SplatRenderMode: mip | antialiased | default                Brush, splat-transform
     comment antialiased 1 | 0                                           Postshot
-In each kind the last one counts.  Viewers know only the tag; our record tells 0.1 from 0.3 px².
+Of several comments of a kind the last one counts.  Viewers know only SplatRenderMode; aaplug's record tells a kernel of
+0.1 px² from one of 0.3 px².
 """
 
 import re
@@ -25,13 +26,13 @@ FLAT = "2dgs"  # the mode of 2D Gaussians
 WORD = re.compile(r"[!-~]+")  # printable ASCII without spaces
 KEY = re.compile(r"[!-<>-~]+")  # the same without "="
 
-# Brush, whose tag it is, blurs by 0.1 px² in "mip"; "antialiased" is gsplat's word for 0.3 px²
+# In Brush, which introduced the tag, "mip" blurs by 0.1 px²; "antialiased" is gsplat's word for 0.3 px²
 MODES = {"mip": MIP, "antialiased": ANTIALIASED, "default": CLASSIC}
 
 
 @dataclass(frozen=True)
 class Meaning:
-    """What the header says, with the sentence that tells a user why."""
+    """What the header says; evidence: its source, for the user."""
 
     convention: Convention
     evidence: str
@@ -40,7 +41,7 @@ class Meaning:
 
 
 def meaning(header: Header, compressed: bool = False) -> Meaning:
-    """Read the header's tags; `compressed` columns say nothing themselves.
+    """Read the header's tags; `compressed`: the columns are packed and say nothing about scales.
 
     Raises:
         FormatError: a record is damaged or names an unknown convention.
@@ -66,7 +67,7 @@ def meaning(header: Header, compressed: bool = False) -> Meaning:
 def stating(
     header: Header, read: Header | None, convention: Convention, fused: tuple[Fusion, ...]
 ) -> Header:
-    """The header made to say this; untouched if it does and so did the one that was `read`."""
+    """The header with tags for this convention and these fusions; unchanged if both it and `read` already say so."""
     assert convention in CONVENTIONS.values(), convention
     if read and _said(read) == _said(header) == (convention, fused):
         return header
@@ -76,7 +77,7 @@ def stating(
     elif _tagged(header).compensated:
         header = header.without_comments(_is_tag)
     header = header.with_comments(_fused_line(fusion, convention) for fusion in fused)
-    if meaning(header).convention != convention:  # nobody's tag tells, so ours must
+    if meaning(header).convention != convention:  # no common tag says this
         header = header.with_comments([f"aaplug convention={convention.name}"])
     return header
 
@@ -91,9 +92,12 @@ def _from_others(header: Header, mode: str | None, two: bool) -> tuple[Conventio
     if FILTER_COLUMN in header.vertex.names:
         return MIP, f"column {FILTER_COLUMN} in the file: Mip-Splatting, not yet fused"
     if mode is not None and mode.lower() == FLAT:
-        return CLASSIC, f"tag in the file, SplatRenderMode: {mode}: 2D Gaussians, taken for classic"
+        return (
+            CLASSIC,
+            f"tag in the file, SplatRenderMode: {mode}: 2D Gaussians, treated as classic",
+        )
     if mode is None and two:
-        return CLASSIC, "two scales in the file: 2D Gaussians (2DGS), taken for classic"
+        return CLASSIC, "two scales in the file: 2D Gaussians (2DGS), treated as classic"
     if mode is not None and mode.lower() in MODES:
         return MODES[mode.lower()], f"tag in the file: SplatRenderMode: {mode}"
     if mode is not None:
@@ -106,7 +110,7 @@ def _from_others(header: Header, mode: str | None, two: bool) -> tuple[Conventio
 
 
 def _tagged(header: Header) -> Convention:
-    """What the tags alone say."""
+    """What the viewers' tags alone say."""
     mode, postshot = _last(header, RENDER_MODE), _last(header, POSTSHOT)
     if mode is not None:
         return MODES.get(mode.lower(), CLASSIC)

@@ -1,8 +1,8 @@
-"""gsplat's checkpoints (.pt), a pickle in a zip, of which torch's restricted loader takes tensors and nothing else.
+"""gsplat's checkpoints (.pt): a pickle in a zip, from which torch's restricted loader reads tensors only.
 
 Under the key "splats": means, scales (natural logarithms), quats (wxyz), opacities (logits), sh0 and shN.  The loader
-has had holes (CVE-2025-32434, CVE-2026-24747), so an older torch than 2.10 is refused, there is no way around the
-restriction, and the user must ask for this format by --allow-checkpoint.
+has had holes (CVE-2025-32434, CVE-2026-24747), so torch older than 2.10 is refused, and the user must ask for this
+format by `allow_checkpoint`.
 """
 
 import pickle
@@ -18,8 +18,8 @@ from torch import Tensor
 from aaplug.core.errors import FormatError
 from aaplug.core.gaussians import Gaussians
 from aaplug.io.limits import whole_limit
-from aaplug.io.scenes.ply import DEGREES
-from aaplug.io.scenes.scene_file import SceneFile, check_count, library_errors
+from aaplug.io.scenes.options import Options
+from aaplug.io.scenes.scene_file import DEGREES, SceneFile, check_count, library_errors
 
 SAFE_TORCH = (2, 10)  # the first release without CVE-2026-24747
 SUFFIXES = (".pt", ".pth", ".ckpt")
@@ -31,16 +31,17 @@ name = "pt"
 
 
 def sniff(path: Path, head: bytes) -> bool:
-    """Whether the file is called like a checkpoint."""
+    """Whether the suffix is a checkpoint's."""
     return path.suffix.lower() in SUFFIXES
 
 
-def open_scene(path: Path) -> SceneFile:
-    """Look at a checkpoint; see `aaplug.io.scenes.open_scene`.
-
-    Raises:
-        FormatError: torch is too old, or the file is no gsplat checkpoint.
-    """
+def open_scene(path: Path, options: Options) -> SceneFile:
+    """See `SceneFormat`."""
+    if not options.allow_checkpoint:
+        raise FormatError(
+            path,
+            "is a training checkpoint (a pickle); pass allow_checkpoint to read it, or export it as .ply",
+        )
     found = re.match(r"(\d+)\.(\d+)", torch.__version__)
     if found is None or (int(found[1]), int(found[2])) < SAFE_TORCH:
         raise FormatError(
@@ -60,7 +61,7 @@ def open_scene(path: Path) -> SceneFile:
 
 
 def _check_archive(path: Path, size: int) -> None:
-    """Torch stores members as they are; a compressed one would be inflated without a bound."""
+    """Refuse compressed members, which torch would inflate without a limit; torch itself stores them uncompressed."""
     if size > whole_limit("CHECKPOINT"):
         raise FormatError(path, f"has {size:,} bytes; AAPLUG_CHECKPOINT raises the limit")
     with zipfile.ZipFile(path) as archive:
@@ -70,14 +71,14 @@ def _check_archive(path: Path, size: int) -> None:
 
 
 def _load(path: Path) -> Any:
-    """Tensors and plain containers of them; torch's own words would advise to load all the rest."""
+    """Tensors and plain containers of them.  torch's own error would advise loading everything else too."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # torch's, of what a damaged pickle asks for
+            warnings.simplefilter("ignore")  # torch's, about a damaged pickle
             return torch.load(path, "cpu", weights_only=True, mmap=True)
     except pickle.UnpicklingError as error:
         raise FormatError(
-            path, "is damaged, or holds more than tensors, of which nothing was run"
+            path, "is damaged, or holds more than tensors; nothing of it was run"
         ) from error
 
 
@@ -90,7 +91,7 @@ def _splats(path: Path, document: Any) -> dict[str, Tensor]:
         raise FormatError(path, f"means has the shape {list(means.shape)}")
     rest = splats.get("shN", torch.zeros(len(means), 0, 3))
     if not isinstance(rest, Tensor):
-        raise FormatError(path, "shN is no tensor")
+        raise FormatError(path, "shN is not a tensor")
     return {**{key: splats[key] for key in SHAPES}, "shN": rest}
 
 

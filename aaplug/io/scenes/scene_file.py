@@ -1,7 +1,7 @@
-"""A scene on disk, whatever its format: what the file says, and its Gaussians whole or part by part.
+"""An opened scene file of any format: what it says, and its Gaussians whole or part by part.
 
-A format decodes rows; this module checks their values, names those that no renderer can use, and joins parts.  Rows
-are counted from 0.  Nothing of the size of the scene is held unless the whole is asked for.
+A format decodes rows; this module checks their values, reports unusable ones, and joins parts.  Rows are counted from
+0.  Nothing of the size of the scene is held in memory unless the whole scene is asked for.
 """
 
 import logging
@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from aaplug.core.errors import AaplugError, FormatError, listing
+from aaplug.core.errors import AaplugError, FormatError, listing, reason
 from aaplug.core.gaussians import (
     CLASSIC,
     MAX_LOG_SCALE,
@@ -26,21 +26,22 @@ from aaplug.core.gaussians import (
     Gaussians,
     Origin,
 )
+from aaplug.core.spherical_harmonics import COLOUR_OFFSET, SH_C0
 from aaplug.io.limits import limit, memory_of_machine, whole_limit
 
-SHORTEST_QUATERNION = 1e-12  # below this torch's `normalize` gives no unit quaternion
-PART = 1 << 16  # Gaussians read at once: 15 MB of degree 3
-C0 = 0.28209479177387814  # 1/(2√π): the harmonic of degree 0
+SHORTEST_QUATERNION = 1e-12  # torch's `normalize` does not normalize a shorter one
+PART = 1 << 16  # Gaussians per part: 15 MB at degree 3
 FLOAT = 4  # bytes
-MAX_REASON = 200  # letters of a library's message
-FILTER_COLUMN = "filter_3D"  # Mip-Splatting's smoothing, a standard deviation in world units
+MAX_REASON = 200  # characters of a library's message
+FILTER_COLUMN = "filter_3D"  # Mip-Splatting's 3D filter: a standard deviation in world units
+DEGREES = {3 * ((d + 1) ** 2 - 1): d for d in range(5)}  # SH degree by number of f_rest columns
 
 log = logging.getLogger("aaplug")
 
 
 @dataclass(frozen=True)
 class Fault:
-    """Rows of a column that no renderer can use."""
+    """Rows with a value that no renderer can use; text: which value."""
 
     text: str
     rows: Bool[Tensor, " n"]
@@ -48,11 +49,13 @@ class Fault:
 
 @dataclass(frozen=True)
 class SceneFile:
-    """An opened scene.
+    """An opened scene file.
 
-    load: the rows from start up to stop, exactly as stored, without convention or origin.
+    load: decodes the rows from start up to stop exactly as stored, without convention and origin.
+    evidence: the convention's source in the file.
     document: what the format's writer needs to give everything back.
-    flat: see `Gaussians`.  notes: what a user should know of how the file was understood, a line each.
+    flat: see `Gaussians`.
+    notes: facts worth printing about how the file was understood, a line each.
     """
 
     path: Path
@@ -68,35 +71,31 @@ class SceneFile:
     notes: tuple[str, ...] = field(default=())
 
     def stated(self, convention: Convention | None) -> "SceneFile":
-        """The same file, of the convention that the user states, if any."""
+        """The same file with another convention, stated by the user; unchanged for None."""
         if convention is None:
             return self
-        return replace(self, convention=convention, evidence="given by --convention")
+        return replace(self, convention=convention, evidence="stated by the user")
 
     def raw(self, start: int, stop: int) -> Gaussians:
-        """Rows with all that the file says of them, their values not yet checked."""
+        """The rows from start up to stop, with convention and origin; their values are not checked."""
         origin = Origin(
             str(self.path), self.format, self.evidence, self.document, torch.arange(start, stop)
         )
         with library_errors(self.path):
             rows = self.load(start, stop)
-        return replace(
-            rows,
-            convention=self.convention,
-            fused=self.fused,
-            flat=self.flat,
-            origin=origin,
-        )
+        said = {"convention": self.convention, "fused": self.fused, "flat": self.flat}
+        return replace(rows, **said, origin=origin)
 
     def parts(
         self, drop_bad: bool = False, size: int = PART, found: dict[str, int] | None = None
     ) -> Iterator[Gaussians]:
         """The scene part by part, at least one, checked.
 
-        found: to be given what was wrong with rows left out, and how many they are, instead of the log.
+        size: Gaussians per part.
+        found: receives the faults of rows that are left out and their numbers; None logs them.
 
         Raises:
-            FormatError: a row cannot be used and not `drop_bad`, or the file cannot be read.
+            FormatError: a row cannot be used and `drop_bad` is false, or the file cannot be read.
         """
         dropped: dict[str, int] = {} if found is None else found
         left_out = 0
@@ -113,7 +112,7 @@ class SceneFile:
         """The whole scene.
 
         Raises:
-            FormatError: it cannot be used, or would take more than its share of the machine's memory.
+            FormatError: it cannot be used, or takes more than the limit MEMORY_SHARE of the machine's memory.
         """
         self._check_memory()
         (scene,) = self.parts(drop_bad, max(1, self.count))
@@ -132,25 +131,36 @@ class SceneFile:
 
 @contextmanager
 def library_errors(path: Path) -> Iterator[None]:
-    """Whatever a library raises over a damaged file, in one line for the user."""
+    """Report whatever a library raises about a damaged file as one FormatError."""
     try:
-        with np.errstate(all="ignore"):  # numbers that are none are found and counted later
+        with np.errstate(all="ignore"):  # NaN is reported by `faults_of`
             yield
     except AaplugError:
         raise
     except MemoryError as error:
         raise FormatError(path, "does not fit into memory") from error
     except OSError as error:
-        raise FormatError(
-            path, f"cannot be read: {(error.strerror or str(error)).lower()}"
-        ) from error
+        raise FormatError(path, f"cannot be read: {reason(error)}") from error
     except Exception as error:  # plyfile, numpy, zlib, zipfile, Pillow and torch raise all kinds
-        reason = " ".join(str(error).split())[:MAX_REASON]
-        raise FormatError(path, f"is damaged and cannot be read: {reason}") from error
+        what = " ".join(str(error).split())[:MAX_REASON]
+        raise FormatError(path, f"is damaged and cannot be read: {what}") from error
+
+
+def read_rows(path: Path, dtype: np.dtype, start: int, stop: int, offset: int = 0) -> np.ndarray:
+    """The rows from start up to stop of a table that begins at the byte `offset`.
+
+    Raises:
+        FormatError: the file cannot be read, or has become shorter.
+    """
+    with library_errors(path):
+        rows = np.fromfile(path, dtype, stop - start, offset=offset + start * dtype.itemsize)
+    if len(rows) != stop - start:
+        raise FormatError(path, "was cut short while it was being read")
+    return rows
 
 
 def check_count(path: Path, count: int) -> None:
-    """Refuse a scene of more Gaussians than the limit.
+    """Refuse a scene of more Gaussians than the limit GAUSSIANS.
 
     Raises:
         FormatError: it has more.
@@ -163,7 +173,7 @@ def check_count(path: Path, count: int) -> None:
 
 
 def empty(n: int, degree: int, filtered: bool = False, flat: bool = False) -> Gaussians:
-    """Room for n Gaussians, to be filled; flat ones have no thickness."""
+    """n Gaussians with uninitialized values, to be filled; flat ones have no thickness."""
     return Gaussians(
         means=torch.empty(n, 3),
         quats=torch.empty(n, 4),
@@ -176,7 +186,7 @@ def empty(n: int, degree: int, filtered: bool = False, flat: bool = False) -> Ga
 
 
 def columns(scene: Gaussians) -> dict[str, Float[Tensor, " n"]]:
-    """A view of each parameter under its name in a .ply: the one place that knows that layout.
+    """A view of each parameter by its column's name in a .ply.
 
     f_rest is channel-major: f_rest_(c·(k − 1) + j) is coefficient 1 + j of channel c.  A flat scene has two scales.
     """
@@ -193,7 +203,7 @@ def columns(scene: Gaussians) -> dict[str, Float[Tensor, " n"]]:
 
 
 def matrix_of(scene: Gaussians) -> tuple[list[str], Float[Tensor, "n p"]]:
-    """The same as `columns`, names and values side by side in one matrix, which is faster to take apart."""
+    """`columns` as names and one matrix, which is faster to write."""
     rest = scene.sh[:, 1:].transpose(1, 2).flatten(1)
     scales = scene.log_scales[:, : 2 if scene.flat else 3]
     parts = [scene.means, scene.sh[:, 0], rest, scene.logit_opacities[:, None], scales, scene.quats]
@@ -205,7 +215,7 @@ def matrix_of(scene: Gaussians) -> tuple[list[str], Float[Tensor, "n p"]]:
 def scene_of(
     names: Sequence[str], values: Float[Tensor, "n c"], degree: int, flat: bool
 ) -> Gaussians:
-    """The inverse: the scene in a matrix that has at least a scene's columns, in any order."""
+    """The scene in a matrix of named columns, in any order and among others: the inverse of `matrix_of`."""
     at = {name: i for i, name in enumerate(names)}
     k = (degree + 1) ** 2
 
@@ -228,19 +238,19 @@ def scene_of(
 
 
 def logit_of(opacity: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
-    """Logits of stored opacities, finite where they are 0 or 1."""
+    """Logits of opacities; finite at 0 and 1."""
     return opacity.clamp(MIN_OPACITY, 1 - MIN_OPACITY).logit()
 
 
 def sh_of_colour(rgb: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
-    """Coefficients of degree 0 from colours in [0, 1]."""
-    return (rgb - 0.5) / C0
+    """Harmonics of degree 0 of colours in [0, 1]."""
+    return (rgb - COLOUR_OFFSET) / SH_C0
 
 
 def faults_of(scene: Gaussians) -> list[Fault]:
     """What no renderer can use: NaN, infinities, quaternions without a direction, negative filters.
 
-    A log-scale of -inf (no thickness) and a logit of +inf (opaque) have a meaning and are none.
+    A log-scale of -inf (no thickness) and a logit of +inf (opaque) are valid.
     """
     faults = []
     suspects = {} if _finite(scene) else columns(scene)
@@ -270,14 +280,14 @@ def _finite(scene: Gaussians) -> bool:
 def _check(
     part: Gaussians, path: Path, drop_bad: bool, dropped: dict[str, int]
 ) -> Bool[Tensor, " n"] | None:
-    """Unusable rows, if there are any; counts them by what is wrong."""
+    """A mask of unusable rows, None if there are none; counts them by fault in `dropped`."""
     faults = faults_of(part)
     if not faults:
         return None
     assert part.origin is not None
     if not drop_bad:
         what = listing([_described(fault, part.origin.rows) for fault in faults])
-        raise FormatError(path, f"{what}; pass --drop-bad to leave such rows out")
+        raise FormatError(path, f"{what}; pass drop_bad to leave such rows out")
     for fault in faults:
         dropped[fault.text] = dropped.get(fault.text, 0) + int(fault.rows.sum())
     return torch.stack([fault.rows for fault in faults]).any(dim=0)

@@ -1,9 +1,9 @@
 """PlayCanvas' SOG, versions 1 and 2: meta.json and lossless WebP images, in a folder or in a .sog zip.
 
-A Gaussian is a pixel of each image, row by row.  means: 16 bits a coordinate in two images, between mins and maxs of
-sign(x)·ln(1 + |x|); quats: three bytes and the index of the largest; scales and sh0 (colour, opacity): entries of a
-codebook, in version 1 bytes between mins and maxs; shN: 16 bits that choose one of a palette, 64 entries a row.
-Images are read only where meta.json names plain files beside it.
+A Gaussian is a pixel of each image, row by row.  means: 16 bits per coordinate in two images, between mins and maxs of
+sign(x)·ln(1 + |x|); quats: three bytes and the index of the largest component; scales and sh0 (colour, opacity):
+indices into a codebook, in version 1 bytes between mins and maxs; shN: 16-bit indices into a palette of 64 entries per
+row.  Images are read only if meta.json names plain files beside it.
 """
 
 import io
@@ -25,6 +25,7 @@ from torch import Tensor
 from aaplug.core.errors import FormatError
 from aaplug.core.gaussians import ANTIALIASED, CLASSIC, MAX_LOG_SCALE, Convention, Gaussians
 from aaplug.io.limits import whole_limit
+from aaplug.io.scenes.options import Options
 from aaplug.io.scenes.packed import byte_opacities, check_growth, floats, largest_last
 from aaplug.io.scenes.scene_file import SceneFile, check_count, library_errors
 from aaplug.io.values import Entry, Place, parse_json, read_bounded
@@ -33,9 +34,9 @@ META = "meta.json"
 FILE = re.compile(r"[\w\-][\w\-.]{0,99}", re.ASCII)
 ZIP = b"PK\x03\x04"
 PALETTE_ROW = 64  # entries
-LARGEST = 252  # the alpha of a quaternion whose w is largest; 253 to 255 are x, y, z
-IMAGE_MEMORY = 4  # bytes a pixel
-SPARE_PIXELS = 1 << 16  # that an image may have beyond twice those in use
+LARGEST = 252  # alpha of a quaternion whose w is largest; 253 to 255 stand for x, y, z
+IMAGE_MEMORY = 4  # bytes per pixel
+SPARE_PIXELS = 1 << 16  # pixels allowed beyond twice the number of Gaussians
 
 name = "sog"
 
@@ -44,39 +45,35 @@ Fetch = Callable[[str, int], bytes]
 
 @dataclass(frozen=True)
 class Part:
-    """One of meta.json's entries, with its images as RGBA rows, a row a pixel."""
+    """An entry of meta.json, with its images as RGBA, a row per pixel."""
 
     entry: Entry
     pixels: list[np.ndarray]
     widths: list[int]
 
     def between(self, image: int, channels: int, rows: slice) -> Float[Tensor, "n c"]:
-        """Version 1: bytes between mins and maxs."""
+        """Version 1: bytes as fractions from mins to maxs."""
         low, high = (self.entry.vector(key, channels).float() for key in ("mins", "maxs"))
         return torch.lerp(low, high, floats(self.pixels[image][rows, :channels]) / 255)
 
     def coded(self, image: int, rows: slice) -> Float[Tensor, "n 3"]:
-        """Version 2: bytes that choose from a codebook."""
+        """Version 2: bytes as indices into the codebook."""
         return self.codebook[torch.from_numpy(self.pixels[image][rows, :3].astype(np.int64))]
 
     @property
     def codebook(self) -> Float[Tensor, " 256"]:
-        """The values that bytes stand for."""
+        """The values of the 256 bytes."""
         return self.entry.vector("codebook", 256).float()
 
 
 def sniff(path: Path, head: bytes) -> bool:
-    """Whether this looks like a SOG's meta.json, or a zip by that name."""
+    """Whether it is a meta.json, or a zip with the suffix .sog or .zip."""
     zipped = head.startswith(ZIP) and path.suffix.lower() in (".sog", ".zip")
     return zipped or (path.name == META and head.lstrip().startswith(b"{"))
 
 
-def open_scene(path: Path) -> SceneFile:
-    """Decode a scene's images; see `aaplug.io.scenes.open_scene`.
-
-    Raises:
-        FormatError: the file is damaged, names files elsewhere, or promises more than it can hold.
-    """
+def open_scene(path: Path, options: Options) -> SceneFile:
+    """See `SceneFormat`."""
     with library_errors(path):
         if path.name == META:
             meta = parse_json(read_bounded(path, whole_limit("JSON")), path)
@@ -163,7 +160,7 @@ def _part(path: Path, root: Entry, key: str, count: int, fetch: Fetch) -> Part:
         if not isinstance(file, str) or not FILE.fullmatch(file):
             raise entry.place.wrong("files", "names of plain files beside meta.json", file)
         palette = key == "shN" and index == 0
-        noisy = key == "means" and index == 0  # low bytes do not compress, so they tell the size
+        noisy = key == "means" and index == 0  # low bytes do not compress: the size tells the count
         rgba, width = _image(path, file, fetch, None if palette else count, noisy)
         pixels.append(rgba)
         widths.append(width)
@@ -173,13 +170,13 @@ def _part(path: Path, root: Entry, key: str, count: int, fetch: Fetch) -> Part:
 def _image(
     path: Path, file: str, fetch: Fetch, count: int | None, noisy: bool
 ) -> tuple[np.ndarray, int]:
-    """RGBA of a lossless WebP, a row a pixel; no larger than `count` pixels ask for."""
+    """RGBA of a lossless WebP, a row per pixel, and its width; refuses more pixels than `count` Gaussians need."""
     most = 2 * count + SPARE_PIXELS if count is not None else PALETTE_ROW * 15 * (1 << 10)
     data = fetch(file, IMAGE_MEMORY * most + whole_limit("SLACK"))
     if noisy:
         check_growth(path, IMAGE_MEMORY * (count or 0), len(data))
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # Pillow's, of large images; ours is the bound below
+        warnings.simplefilter("ignore")  # Pillow's, about large images; the check below is stricter
         with Image.open(io.BytesIO(data), formats=["WEBP"]) as image:
             width, height = image.size
             if width * height > most or width * height < (count or 1):
@@ -202,7 +199,7 @@ def _meaning(meta: dict[str, Any]) -> tuple[Convention, str, bool]:
 
 
 def _palette(part: Part, version: int) -> Float[Tensor, "p c 3"]:
-    """The harmonics that labels choose from."""
+    """The harmonics that labels index."""
     width = part.widths[0]
     coefficients = {3: 3, 8: 8, 15: 15}.get(width // PALETTE_ROW)
     if coefficients is None or width % PALETTE_ROW:
@@ -217,11 +214,7 @@ def _palette(part: Part, version: int) -> Float[Tensor, "p c 3"]:
 
 
 def _rows(
-    parts: dict[str, Part],
-    palette: Float[Tensor, "p c 3"],
-    version: int,
-    flat: bool,
-    rows: slice,
+    parts: dict[str, Part], palette: Float[Tensor, "p c 3"], version: int, flat: bool, rows: slice
 ) -> Gaussians:
     means, quats, scales, sh0 = (parts[key] for key in ("means", "quats", "scales", "sh0"))
     alpha = sh0.pixels[0][rows, 3]

@@ -1,15 +1,15 @@
 """Niantic's .spz, versions 1 to 4 (github.com/nianticlabs/spz, README), read through zlib and zstandard.
 
 Header: magic "NGSP", version, count (uint32 each), SH degree, bits of a position's fraction, flags, reserved (bytes).
-Then, each for all Gaussians in turn: positions (3 × 24-bit fixed point; float16 in version 1), opacities, colours,
-log-scales, quaternions, harmonics, mostly a byte a number.  Versions 1 to 3 are one gzip stream; version 4 has a
-longer header, a table of sizes, and a zstd stream for each.  Axes are x right, y up, z back; a scene here has y down
-and z forward.  Flag 1: trained with antialiasing; the file does not say by which kernel.
+Then sections, each for all Gaussians: positions (3 × 24-bit fixed point; float16 in version 1), opacities, colours,
+log-scales, quaternions, harmonics, mostly a byte per number.  Versions 1 to 3 are one gzip stream; version 4 has a
+longer header, a table of sizes, and a zstd stream per section.  Axes are x right, y up, z back; a scene here has y down
+and z forward.  Flag 1: trained with antialiasing; the file does not say with which kernel.
 """
 
 import struct
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,18 +19,18 @@ from torch import Tensor
 
 from aaplug.core.errors import FormatError
 from aaplug.core.gaussians import ANTIALIASED, CLASSIC, Gaussians
+from aaplug.io.scenes.options import Options
 from aaplug.io.scenes.packed import (
     byte_opacities,
     check_growth,
     floats,
     gunzip,
     gunzip_start,
-    half_turn_about_x,
     largest_last,
     unzstd,
 )
 from aaplug.io.scenes.scene_file import SceneFile, check_count, library_errors
-from aaplug.io.scenes.spz_writer import ANTIALIASED_FLAG
+from aaplug.io.scenes.spz_writer import ANTIALIASED_FLAG, TURNS
 from aaplug.io.scenes.spz_writer import write as write
 
 MAGIC = b"NGSP"
@@ -38,16 +38,22 @@ GZIP = b"\x1f\x8b"
 HEADER = struct.Struct("<4sIIBBBB")  # magic, version, count, degree, fraction bits, flags, reserved
 HEADER_4 = struct.Struct(
     "<4sIIBBBBI12x"
-)  # the reserved byte counts the streams; then the table's place
-STREAM = struct.Struct("<QQ")  # compressed and inflated size
-HALVES, FIXED, THREES, STREAMS = 1, 2, 3, 4  # what the versions brought
+)  # the reserved byte counts streams; then the table's place
+STREAM = struct.Struct("<QQ")  # compressed and decompressed size
+HALVES, FIXED, THREES, STREAMS = 1, 2, 3, 4  # versions, by what each introduced
 MAX_DEGREE = 4
 MAX_FRACTION = 24  # bits of a position
-COLOUR_GAIN = 0.15  # of the stored colour against the harmonic of degree 0
-SCALE_STEPS, SCALE_LEAST = 16.0, -10.0  # log-scales: steps a unit, from here
-MAGNITUDE = 511  # 9 bits of a quaternion's component; a tenth is its sign
+COLOUR_GAIN = 0.15  # stored colour over the harmonic of degree 0
+SCALE_STEPS, SCALE_LEAST = 16.0, -10.0  # log-scales: steps per unit, and the smallest
+MAGNITUDE = 511  # 9 bits of a quaternion's component; the tenth is its sign
+AXES_NOTES = {
+    "opengl": "axes turned from OpenGL's to OpenCV's, by the specification "
+    "(spz_axes=opencv if the writer did not turn them, as splat-transform and gsply)",
+    "opencv": "axes as stored (spz_axes=opencv)",
+}
 
 name = "spz"
+needs = "gsply"
 
 
 @dataclass(frozen=True)
@@ -62,27 +68,24 @@ class Header:
 
     @property
     def widths(self) -> tuple[int, ...]:
-        """Bytes of a Gaussian in each section: positions, opacities, colours, scales, quaternions, harmonics."""
+        """Bytes per Gaussian in each section: positions, opacities, colours, scales, quaternions, harmonics."""
         position = 6 if self.version == HALVES else 9
         quaternion = 4 if self.version >= THREES else 3
         return position, 1, 3, 3, quaternion, 3 * ((self.degree + 1) ** 2 - 1)
 
 
 def sniff(path: Path, head: bytes) -> bool:
-    """Whether this looks like .spz: its magic, bare or in a gzip stream."""
+    """Whether the file begins with the magic, or is a gzip stream with the suffix .spz."""
     return head.startswith(MAGIC) or (head.startswith(GZIP) and path.suffix.lower() == ".spz")
 
 
-def open_scene(path: Path) -> SceneFile:
-    """Inflate a scene; see `aaplug.io.scenes.open_scene`.
-
-    Raises:
-        FormatError: the file is damaged, or promises more than it can hold.
-    """
+def open_scene(path: Path, options: Options) -> SceneFile:
+    """Decompress a scene; see `SceneFormat`."""
     with library_errors(path):
         header, sections = _sections(path)
+    turn = TURNS[options.spz_axes]
     antialiased = bool(header.flags & ANTIALIASED_FLAG)
-    evidence = "the flag antialiased is not set: taken for classic"
+    evidence = "the flag antialiased is not set: assumed classic"
     if antialiased:
         evidence = "the flag antialiased is set; its kernel is not recorded, 0.3 px² assumed"
     return SceneFile(
@@ -90,21 +93,10 @@ def open_scene(path: Path) -> SceneFile:
         name,
         header.count,
         header.degree,
-        lambda start, stop: _rows(header, [s[start:stop] for s in sections]),
+        lambda start, stop: turn(_rows(header, [s[start:stop] for s in sections])),
         evidence,
         ANTIALIASED if antialiased else CLASSIC,
-        notes=(
-            f"version {header.version}; axes turned from OpenGL's to OpenCV's, as the format has it "
-            "(--spz-axes opencv: they already are, as splat-transform and gsply write)",
-        ),
-    )
-
-
-def as_stored(scene: SceneFile) -> SceneFile:
-    """The scene in the axes of its file, for those whose writers did not turn them."""
-    notes = (scene.notes[0].split(";")[0] + "; axes as stored (--spz-axes)",)
-    return replace(
-        scene, load=lambda start, stop: half_turn_about_x(scene.load(start, stop)), notes=notes
+        notes=(f"version {header.version}; {AXES_NOTES[options.spz_axes]}",),
     )
 
 
@@ -127,7 +119,7 @@ def _sections(path: Path) -> tuple[Header, list[np.ndarray]]:
 
 def _header(path: Path, data: bytes) -> Header:
     if len(data) < HEADER.size or not data.startswith(MAGIC):
-        raise FormatError(path, "is no .spz: its header is missing")
+        raise FormatError(path, "is not an .spz: its header is missing")
     _, version, count, degree, fraction, flags, _ = HEADER.unpack(data)
     if not HALVES <= version <= STREAMS:
         raise FormatError(path, f"is .spz of version {version}; known are 1 to {STREAMS}")
@@ -157,7 +149,7 @@ def _split(payload: bytes, sizes: list[int]) -> Iterable[bytes]:
 
 
 def _streams(path: Path, data: bytes, sizes: list[int]) -> Iterable[bytes]:
-    """The sections of version 4; those of no size have no stream."""
+    """The sections of version 4; an empty section has no stream."""
     if len(data) < HEADER_4.size:
         raise FormatError(path, "is cut short in its header")
     *_, number, table = HEADER_4.unpack_from(data)
@@ -191,14 +183,13 @@ def _rows(header: Header, sections: list[np.ndarray]) -> Gaussians:
     sh = torch.zeros(n, k, 3)
     sh[:, 0] = (floats(colours) / 255 - 0.5) / COLOUR_GAIN
     sh[:, 1:] = (floats(harmonics.reshape(n, k - 1, 3)) - 128) / 128
-    scene = Gaussians(
+    return Gaussians(
         _positions(header, positions),
         _threes(quats) if header.version >= THREES else _first_three(quats),
         floats(scales) / SCALE_STEPS + SCALE_LEAST,
         byte_opacities(alphas[:, 0]),
         sh,
     )
-    return half_turn_about_x(scene)
 
 
 def _positions(header: Header, data: np.ndarray) -> Float[Tensor, "n 3"]:
@@ -210,13 +201,13 @@ def _positions(header: Header, data: np.ndarray) -> Float[Tensor, "n 3"]:
 
 
 def _first_three(data: np.ndarray) -> Float[Tensor, "n 4"]:
-    """The components x, y, z; w is what is left, and not negative."""
+    """Versions 1 and 2: components x, y, z; w follows and is not negative."""
     xyz = floats(data) / 127.5 - 1
     return largest_last(xyz, torch.zeros(len(xyz)))
 
 
 def _threes(data: np.ndarray) -> Float[Tensor, "n 4"]:
-    """10 bits for each component but the largest, from w's neighbour down; 2 bits say which that is (xyzw)."""
+    """2 bits for the index of the largest component (xyzw), then 10 bits for each of the others."""
     words = np.ascontiguousarray(data).view("<u4")[:, 0].astype(np.int64)
     fields = [(words >> shift) & 1023 for shift in (20, 10, 0)]
     parts = [(f & MAGNITUDE) * np.where(f > MAGNITUDE, -1, 1) for f in fields]

@@ -1,14 +1,14 @@
-"""Scenes as .spz of version 3, the one that every reader of the format knows, by gsply (the extra `spz`).
+"""Writes .spz of version 3, which every reader of the format knows, by gsply (the extra `spz`).
 
-gsply packs the numbers.  What it leaves out is done here: the axes of the specification (see `spz`), the flag that
-training anti-aliased, as many bits of a position's fraction as the scene leaves room for, and a file that appears
-whole or not at all.  Its kernel and what aaplug fused into a scene have no place in the format.
+gsply packs the numbers.  This module adds what it leaves out: the axes of the specification (see `spz`), the flag for
+antialiased training, as many bits of a position's fraction as the scene allows, and atomic writing.  The format cannot
+record the kernel or what aaplug fused into a scene.
 """
 
 import gzip
 import math
 import tempfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -17,43 +17,47 @@ import torch
 from aaplug.core.errors import OutputError
 from aaplug.core.gaussians import Gaussians
 from aaplug.io.atomic import replacing
+from aaplug.io.scenes.options import Options
 from aaplug.io.scenes.packed import half_turn_about_x
 from aaplug.io.scenes.scene_file import library_errors
 
 VERSION = 3
-MOST_GAUSSIANS = 10_000_000  # that readers of versions before 4 take (nianticlabs/spz)
-MOST_DEGREE = 3  # of harmonics, in gsply
+MOST_GAUSSIANS = 10_000_000  # accepted by readers of versions before 4 (nianticlabs/spz)
+MOST_DEGREE = 3  # of harmonics that gsply writes
 POSITION_BITS = 23  # of a position's fixed-point number, beside its sign
 MOST_FRACTION = 20  # bits: a millionth of a unit
-FLAGS = 14  # the byte of the header
+FLAGS = 14  # byte of the header
 ANTIALIASED_FLAG = 1
-MAX_LOGIT = 30.0  # an opacity of 0 or 1 to float32
+MAX_LOGIT = 30.0  # in float32 its opacity is 1
+# between the axes of the file and OpenCV's, in both directions
+TURNS: Mapping[str, Callable[[Gaussians], Gaussians]] = {
+    "opengl": half_turn_about_x,
+    "opencv": lambda scene: scene,
+}
 
 
-def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool) -> None:
-    """Write a scene; values are rounded to the format's steps.
-
-    Raises:
-        OutputError: the format cannot hold the scene, or the file exists and `overwrite` is false, or it cannot be
-            written.
-    """
-    scenes = [_plain(path, part) for part in parts]
+def write(
+    path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: Options
+) -> None:
+    """Write a scene, with values rounded to the format's steps."""
+    turn = TURNS[options.spz_axes]
+    scenes = [turn(_checked(path, part)) for part in parts]
     content = _packed(path, scenes)
     with replacing(path, overwrite) as stream:
         stream.write(content)
 
 
-def _plain(path: Path, part: Gaussians) -> Gaussians:
-    """The scene in the format's axes, if there is room for all that it is."""
+def _checked(path: Path, part: Gaussians) -> Gaussians:
+    """The part; refuses what the format cannot hold."""
     if part.flat:
         raise OutputError(path, "cannot hold 2D Gaussians; write a .ply")
     if part.filter_3d is not None:
-        raise OutputError(path, "has no room for a filter_3D; aaplug convert fuses it")
+        raise OutputError(path, "cannot hold a filter_3D; aaplug convert fuses it")
     if part.sh_degree > MOST_DEGREE:
         raise OutputError(
             path, f"gsply writes harmonics up to degree {MOST_DEGREE}, not {part.sh_degree}; write a .ply"
         )  # fmt: skip
-    return half_turn_about_x(part)
+    return part
 
 
 def _packed(path: Path, scenes: list[Gaussians]) -> bytes:
@@ -62,7 +66,7 @@ def _packed(path: Path, scenes: list[Gaussians]) -> bytes:
         raise OutputError(
             path, f"readers take {MOST_GAUSSIANS:,} Gaussians, not {count:,}; write a .ply"
         )
-    from gsply.gsdata import GSData  # an extra, and slow to load
+    from gsply.gsdata import GSData  # an optional package, and slow to import
     from gsply.spz import write_spz
 
     def column(values: Callable[[Gaussians], torch.Tensor]) -> np.ndarray:
@@ -87,7 +91,7 @@ def _packed(path: Path, scenes: list[Gaussians]) -> bytes:
 
 
 def _fraction(path: Path, means: np.ndarray) -> int:
-    """Bits of the fraction that leave room for the farthest position."""
+    """Bits of the fraction with which the farthest position still fits."""
     farthest = float(np.abs(means).max(initial=0.0))
     room = POSITION_BITS - math.frexp(farthest)[1] if farthest else MOST_FRACTION
     if room < 1:

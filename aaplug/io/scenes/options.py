@@ -1,0 +1,28 @@
+"""Options for reading and writing scene files; each format uses those that concern it."""
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from aaplug.core.errors import UsageError
+
+SpzAxes = Literal["opengl", "opencv"]
+
+
+@dataclass(frozen=True)
+class Options:
+    """The user's choices.
+
+    allow_checkpoint: open a .pt, a pickle, of which only tensors are read.
+    spz_axes: axes of the numbers in a .spz: "opengl" by its specification, "opencv" as splat-transform and gsply write.
+
+    Raises:
+        UsageError: there are no such axes.
+    """
+
+    allow_checkpoint: bool = False
+    spz_axes: SpzAxes = "opengl"
+
+    def __post_init__(self) -> None:
+        known = get_args(SpzAxes)
+        if self.spz_axes not in known:
+            raise UsageError("spz_axes", f"should be {' or '.join(known)}, not {self.spz_axes!r}")

@@ -1,0 +1,151 @@
+"""A .ply file as tables: the Gaussians' rows, read when asked for, and everything else, kept to be written back.
+
+numpy reads the Gaussians' rows; plyfile reads text, skips lists and converts big-endian tables.
+"""
+
+import io
+import warnings
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from plyfile import PlyData, PlyElement
+from torch import Tensor
+
+from aaplug.core.errors import FormatError
+from aaplug.io.scenes.ply_header import BIG, LITTLE, TEXT, Header
+from aaplug.io.scenes.scene_file import read_rows
+
+SPARSE = 16  # rows spread over more than this many times their number are read one by one
+BLOCK = 1 << 20  # bytes copied at once
+
+
+@dataclass(frozen=True)
+class Table:
+    """The Gaussians' rows in a file, or in memory if they had to be parsed.
+
+    stamp: the file's size and time of change when it was opened.
+    """
+
+    path: Path
+    offset: int
+    count: int
+    dtype: np.dtype
+    stamp: tuple[int, int]
+    held: np.ndarray | None = None
+
+    def read(self, start: int, stop: int) -> np.ndarray:
+        """The rows from start up to stop."""
+        if self.held is not None:
+            return self.held[start:stop]
+        self._check_unchanged()
+        return read_rows(self.path, self.dtype, start, stop, self.offset)
+
+    def take(self, rows: Tensor) -> np.ndarray:
+        """The rows with these indices."""
+        if len(rows) == 0:
+            return np.empty(0, self.dtype)
+        first, last = int(rows.min()), int(rows.max())
+        if self.held is None and last - first > SPARSE * len(rows):
+            self._check_unchanged()
+            table = np.memmap(self.path, self.dtype, "r", self.offset, (self.count,))
+            return np.array(table[rows.numpy()])
+        return self.read(first, last + 1)[(rows - first).numpy()]
+
+    def _check_unchanged(self) -> None:
+        if stamp_of(self.path) != self.stamp:
+            raise FormatError(self.path, "changed while it was being read")
+
+
+@dataclass(frozen=True)
+class Document:
+    """A whole file: its header, the Gaussians' table, and all other tables as little-endian bytes.
+
+    before, after: these bytes, or their place in the file (start, stop).
+    """
+
+    header: Header
+    table: Table | None = None
+    before: bytes | tuple[int, int] = b""
+    after: bytes | tuple[int, int] = b""
+
+    def copy(self, content: bytes | tuple[int, int], stream: BinaryIO) -> None:
+        """Write `before` or `after`."""
+        if isinstance(content, bytes):
+            stream.write(content)
+            return
+        start, stop = content
+        if start == stop:
+            return
+        assert self.table is not None
+        with self.table.path.open("rb") as source:
+            source.seek(start)
+            while start < stop and (data := source.read(min(BLOCK, stop - start))):
+                stream.write(data)
+                start += len(data)
+
+
+def stamp_of(path: Path) -> tuple[int, int]:
+    """A file's size and time of change."""
+    status = path.stat()
+    return status.st_size, status.st_mtime_ns
+
+
+def document_of(path: Path, header: Header, stamp: tuple[int, int]) -> Document:
+    """Locate the tables of a file; parse those that numpy cannot read.
+
+    Raises:
+        FormatError: the file is damaged.
+    """
+    order = ">" if header.coding == BIG else "<"
+    dtype = np.dtype([(p.name, order + p.code) for p in header.vertex.properties])
+    at = header.elements.index(header.vertex)
+    offset = header.size + sum(e.least_size for e in header.elements[:at])
+    table = Table(path, offset, header.vertex.count, dtype, stamp)
+    lists = any(e.lists for e in header.elements)
+    if header.coding == LITTLE and not lists:
+        return _located(header, table)
+    if header.coding == BIG and len(header.elements) == 1:
+        return Document(header, table)
+    if not header.plain:
+        raise FormatError(
+            path, "its header has empty lines or is not all ASCII; take them out to read it"
+        )
+    elements = _parsed(path, stamp[0], header.coding)
+    data = elements[at].data
+    if header.coding == LITTLE:
+        offset = int(getattr(data, "offset", offset))
+        return _located(header, Table(path, offset, table.count, dtype, stamp))
+    before, after = (_little(part) for part in (elements[:at], elements[at + 1 :]))
+    held = Table(path, 0, len(data), data.dtype, stamp, np.asarray(data))
+    return Document(header, held, before, after)
+
+
+def _located(header: Header, table: Table) -> Document:
+    end = table.offset + header.vertex.least_size
+    return Document(header, table, (header.size, table.offset), (end, table.stamp[0]))
+
+
+def _parsed(path: Path, size: int, coding: str) -> tuple[PlyElement, ...]:
+    if coding == TEXT:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # numpy's, about empty lists
+            return PlyData.read(str(path)).elements
+    with path.open("rb") as stream:
+        elements = PlyData.read(stream, mmap="r").elements
+        end = stream.tell()
+    if end != size:  # with lists, the header does not tell the size
+        raise FormatError(path, f"has {size - end:,} bytes after its last element; it is damaged")
+    return elements
+
+
+def _little(elements: Iterable[PlyElement]) -> bytes:
+    elements = list(elements)
+    if not elements:
+        return b""
+    stream = io.BytesIO()
+    data = PlyData(elements, byte_order="<")
+    data.write(stream)
+    return stream.getvalue()[len(data.header) + 1 :]
