@@ -136,7 +136,7 @@ def test_convert_then_info_shows_what_was_fused(cli):
     code, out, err = cli("convert scene.ply --cameras . -o converted.ply --json")
     assert code == 0
     assert json.loads(out)["fused"][0]["method"] == "matched-energy"
-    assert "Mip rule" in err
+    assert "mip-viewer" in err
     facts = json.loads(cli("info converted.ply --json")[1])
     assert facts["convention"] == "mip"
     assert facts["fused"] == [

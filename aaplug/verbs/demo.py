@@ -65,6 +65,7 @@ def demo(
             scale=SCALES,
             output=folder,
             overwrite=overwrite,
+            metric=("psnr", "ssim"),
             name="chair",
             monitor=monitor,
         )
