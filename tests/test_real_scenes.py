@@ -9,9 +9,9 @@ import torch
 
 from aaplug.core.cameras import WHITE, Camera, CameraSet
 from aaplug.core.gaussians import Gaussians
-from aaplug.core.training import TrainingViews
 from aaplug.core.projection import project, shade
 from aaplug.core.splats import drawn
+from aaplug.core.training import TrainingViews
 from aaplug.evaluation.engine import Task, evaluate
 from aaplug.evaluation.results import CEILING, mean
 from aaplug.io.cameras import read_cameras
