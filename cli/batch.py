@@ -23,7 +23,7 @@ from aaplug.io.atomic import replacing
 from aaplug.io.batch_file import read_batch
 
 from .console import escape, log, out, print_json, say
-from .files import make_folder, refuse_existing
+from aaplug.io.folders import make_folder, refuse_existing
 from .options import CONFIG
 
 if TYPE_CHECKING:

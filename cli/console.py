@@ -4,13 +4,15 @@ import json
 import logging
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from aaplug.core.monitor import Monitor, Tell
 
 LINE_SECONDS = 10.0  # between progress lines where there is no terminal
 
@@ -29,26 +31,32 @@ def set_up() -> None:
     logger.handlers, logger.propagate = [_Warnings()], False
 
 
-def say(text: str) -> None:
-    """One line of log."""
-    log.print(escape(text))
+class Terminal(Monitor):
+    """Prints messages and progress on stderr: a bar on a terminal, a line now and then elsewhere."""
+
+    def say(self, text: str) -> None:
+        """One line of log."""
+        log.print(escape(text))
+
+    @contextmanager
+    def progress(self, what: str, unit: str) -> Iterator[Tell]:
+        """Show progress and the time left."""
+        if not log.is_terminal:
+            yield _Lines(what, unit)
+            return
+        columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TextColumn(unit))
+        with Progress(*columns, TimeRemainingColumn(), console=log, transient=True) as bar:
+            task = bar.add_task(what, total=None)
+            yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+TERMINAL = Terminal()
+say, progress = TERMINAL.say, TERMINAL.progress
 
 
 def print_json(data: Any) -> None:
     """One object on stdout, strict JSON."""
     sys.stdout.write(json.dumps(data, indent=1, allow_nan=False) + "\n")
-
-
-@contextmanager
-def progress(what: str, unit: str) -> Iterator[Callable[[int, int], None]]:
-    """A function to tell (done, total): a bar with an estimate on a terminal, a line now and then elsewhere."""
-    if not log.is_terminal:
-        yield _Lines(what, unit)
-        return
-    columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TextColumn(unit))
-    with Progress(*columns, TimeRemainingColumn(), console=log, transient=True) as bar:
-        task = bar.add_task(what, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
 class _Lines:

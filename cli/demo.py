@@ -26,7 +26,7 @@ from aaplug.rendering.renderer import learn, render
 
 from .console import out, progress, say
 from .evaluate import write_results
-from .files import make_folder, refuse_existing
+from aaplug.io.folders import make_folder, refuse_existing
 
 SCALES = (1.0, 0.5, 0.25, 0.125)
 RECIPES = ("classic", "mip", "matched", "auto")

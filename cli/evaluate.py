@@ -29,7 +29,7 @@ from aaplug.methods.recipes import RECIPES, Recipe, lacking, suited
 
 from .batch import Job, finish_batch, jobs_of, run_batch
 from .console import out, print_json, progress, say
-from .files import make_folder, refuse_existing
+from aaplug.io.folders import make_folder, refuse_existing
 from .options import CameraOptions, RenderOptions, SceneOptions, flag
 
 HASH_BLOCK = 1 << 20  # bytes read at once

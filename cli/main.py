@@ -6,42 +6,16 @@ Exit codes: 0 all done, 1 some of the work failed, 2 the request cannot be carri
 import os
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import fields
+from importlib import import_module
 from importlib.metadata import version
+from typing import Any, get_args, get_origin, get_type_hints
 
-import tyro
-
-from aaplug.core.errors import AaplugError
-
-from . import console
-from .bench import Bench, bench
-from .convert import Convert, convert
-from .demo import Demo, demo
-from .evaluate import Evaluate, evaluate
-from .finetune import Finetune, finetune
-from .info import Info, info
-from .options import CONFIG
-from .render import Render, render
-from .video import Video, video
-from .warmup import Warmup, warmup
+from aaplug.core.errors import AaplugError, UsageError
 
 FAILED, REFUSED, INTERRUPTED = 1, 2, 130
-VERBS = {
-    Info: info,
-    Convert: convert,
-    Render: render,
-    Evaluate: evaluate,
-    Video: video,
-    Finetune: finetune,
-    Demo: demo,
-    Warmup: warmup,
-    Bench: bench,
-}
-SEVERAL = {  # options that take several values, by verb
-    "evaluate": ("--recipe", "--scale"),
-    "finetune": ("--scale", "--move"),
-    "bench": ("--gaussians", "--resolution"),
-}
+VERBS = ("info", "convert", "render", "evaluate", "video", "finetune", "demo", "warmup", "bench")
 
 
 def main(words: Sequence[str] | None = None) -> None:
@@ -50,11 +24,13 @@ def main(words: Sequence[str] | None = None) -> None:
     if words == ["--version"]:
         print(f"aaplug {version('aaplug')}")
         sys.exit(0)
+    from . import console
+
     console.set_up()
     try:
         sys.exit(run(words))
     except AaplugError as error:
-        console.log.print(f"[red]error:[/] {console.escape(str(error))}")
+        console.log.print(f"[red]error:[/] {console.escape(_worded(error, words))}")
         sys.exit(REFUSED)
     except MemoryError:
         console.log.print(
@@ -64,29 +40,76 @@ def main(words: Sequence[str] | None = None) -> None:
     except KeyboardInterrupt:
         console.say("interrupted")
         sys.exit(INTERRUPTED)
-    except (
-        BrokenPipeError
-    ):  # whoever read our output has seen enough; nothing may be flushed to them at exit
+    except BrokenPipeError:  # the reader of our output has gone; flush nothing to it at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(FAILED)
 
 
 def run(words: Sequence[str]) -> int:
     """Run one verb with its options; its result is the exit code."""
-    description = "Test-time anti-aliasing for pretrained 3D Gaussian Splatting scenes."
+    import tyro
+
+    from .options import CONFIG
+
+    words = _joined(_parted(words))
+    if words and words[0] in VERBS:  # loading one verb is faster than loading all
+        noun, verb = _verb(words[0])
+        return verb(tyro.cli(noun, prog=f"aaplug {words[0]}", args=words[1:], config=CONFIG))
     options = tyro.extras.subcommand_cli_from_dict(
-        {noun.__name__.lower(): noun for noun in VERBS},
+        {verb: _verb(verb)[0] for verb in VERBS},
         prog="aaplug",
-        description=description,
-        args=_joined(_parted(words)),
+        description="Test-time anti-aliasing for pretrained 3D Gaussian Splatting scenes.",
+        args=words,
         config=CONFIG,
     )
-    return VERBS[type(options)](options)
+    raise AssertionError(options)  # no verb: tyro has shown the help or refused the words
+
+
+def _verb(name: str) -> tuple[type, Callable[[Any], int]]:
+    """A verb's options and its function."""
+    module = import_module(f".{name}", __package__)
+    return getattr(module, name.capitalize()), getattr(module, name)
+
+
+def _types(noun: type) -> dict[str, Any]:
+    """Types of all options of a verb by name, those of its groups included."""
+    found: dict[str, Any] = {}
+    hints = get_type_hints(noun)
+    for field in fields(noun):
+        kind = hints[field.name]
+        found |= _types(kind) if hasattr(kind, "__dataclass_fields__") else {field.name: kind}
+    return found
+
+
+def _worded(error: AaplugError, words: Sequence[str]) -> str:
+    """The library's error with parameters as the command line writes them: `cull_margin` is --cull-margin."""
+    known = _types(_verb(words[0])[0]) if words and words[0] in VERBS else {}
+
+    def worded(name: str) -> str:
+        if name not in known:
+            return f"`{name}`"
+        return "SCENE" if name == "scene" else "--" + name.replace("_", "-")
+
+    where, problem = error.where, re.sub(r"`(\w+)`", lambda m: worded(m[1]), error.problem)
+    if isinstance(error, UsageError) and where in known:
+        where = worded(where)
+    return f"{where}: {problem}"
+
+
+def _several(verb: str) -> list[str]:
+    """Options of a verb that take any number of names or numbers."""
+    found = []
+    for name, kind in _types(_verb(verb)[0]).items():
+        for one in (kind, *get_args(kind)):
+            if get_origin(one) is tuple and get_args(one)[1:] == (...,):
+                found.append("--" + name.replace("_", "-"))
+    return found
 
 
 def _parted(words: Sequence[str]) -> list[str]:
-    """`--scale 1,0.25` as the parser wants it, `--scale 1 0.25`; `--views`, which may be names, has commas too."""
-    several, option = SEVERAL.get(words[0] if words else "", ()), ""
+    """`--scale 1,0.25` as the parser wants it, `--scale 1 0.25`; `--views`, whose names hold commas, stays."""
+    several = _several(words[0]) if words and words[0] in VERBS else []
+    option = ""
     parted: list[str] = []
     for word in words:
         flag, _, value = word.partition("=")
@@ -101,7 +124,7 @@ def _parted(words: Sequence[str]) -> list[str]:
 
 
 def _joined(words: Sequence[str]) -> list[str]:
-    """`--resolution -1x720` as one word, for the parser would take the value for a flag."""
+    """`--resolution -1x720` as one word, because the parser would take the value for an option."""
     joined: list[str] = []
     for word in words:
         if joined and joined[-1] == "--resolution" and re.fullmatch(r"-?\d+x-?\d+", word):

@@ -6,74 +6,98 @@ from pathlib import Path
 import pytest
 import torch
 
-from aaplug.core.cameras import BLACK
+from aaplug.core.cameras import CameraSet
 from aaplug.core.errors import UsageError
-from aaplug.evaluation.engine import NO_PHOTOGRAPH, Task, evaluate
-from aaplug.evaluation.image_store import Images
-from aaplug.evaluation.metrics import CONSISTENCY, ENERGY, FLICKER, SSIM, psnr
+from aaplug.core.imaging import box_average, quantised
+from aaplug.core.training import TrainingViews
+from aaplug.evaluation.engine import (
+    NO_PHOTOGRAPH,
+    Candidate,
+    Task,
+    candidates_of,
+    compare,
+    evaluate,
+)
+from aaplug.evaluation.image_store import ImageStore
+from aaplug.evaluation.metric import Metric
+from aaplug.evaluation.metrics import CONSISTENCY, ENERGY, FLICKER, METRICS, PSNR, SSIM, psnr
 from aaplug.evaluation.protocols import PROTOCOLS
 from aaplug.evaluation.results import CEILING, as_csv, mean, per_view, results, scale_name, tables
-from aaplug.io.images import downsample, quantised, read_image, write_png
+from aaplug.evaluation.series import TimedRenderer
+from aaplug.evaluation.truth import KEPT, Truth, back_projected, own_look
+from aaplug.io.images import read_image, write_png
 from aaplug.methods.recipes import RECIPES, find_recipe
 from aaplug.rasterizers import RASTERIZERS
-from aaplug.rendering.renderer import learn, render
+from aaplug.rendering.renderer import Renderer
+from aaplug.verbs.compare import compare as compare_scenes
 from tests.conftest import make_camera, make_scene
 
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory):
-    """A scene, its training and two views whose photographs are slightly brightened renders."""
+    """The scene's own look, and two views whose photographs are slightly brightened renders."""
     folder: Path = tmp_path_factory.mktemp("photos")
-    scene = make_scene(150)
     views = [make_camera((0.0, -4.0, 0.0), name="a"), make_camera((2.0, -4.0, 1.0), name="b")]
-    training = learn(scene, views)
+    scene = make_scene(150)
+    look = own_look(scene, TrainingViews.of(scene, views), "eager")
     for i, view in enumerate(views):
-        image = render(scene, view, RECIPES["classic"], training).rgb
-        write_png(folder / f"{view.name}.png", image * 0.9 + 0.05)
+        write_png(folder / f"{view.name}.png", drawn(look, view) * 0.9 + 0.05)
         views[i] = replace(view, photo=folder / f"{view.name}.png")
-    return scene, training, views
+    return look, views
 
 
-def task(views, **changes) -> Task:
-    recipes = [RECIPES["classic"], RECIPES["matched"]]
-    defaults = {"background": BLACK, "truth": "photographs", "scales": (1.0, 0.5, 2.0)}
-    return Task(recipes=recipes, views=views, **(defaults | changes))
+def drawn(look, view, recipe="classic"):
+    return replace(look, recipe=RECIPES[recipe])(view).rgb
+
+
+def task(
+    look, views, source="photographs", protocol="default", recipes=("classic", "matched"), **changes
+):
+    recipes = [find_recipe(recipe) if isinstance(recipe, str) else recipe for recipe in recipes]
+    candidates = candidates_of(look.scene, look.training, recipes, look.rasterizer)
+    truth = Truth(look, source, PROTOCOLS[protocol])
+    return Task(
+        **(
+            {"candidates": candidates, "scales": (1.0, 0.5, 2.0), "views": views, "truth": truth}
+            | changes
+        )
+    )
 
 
 def test_figures_are_those_of_the_images_compared_by_hand(world):
-    scene, training, views = world
-    report = evaluate(scene, training, task(views))
+    look, views = world
+    report = evaluate(task(look, views))
     for view in views:
         photo = quantised(read_image(view.photo, None))
-        for scale, truth in ((1.0, photo), (0.5, downsample(photo, 2))):
-            image = render(scene, view.scaled(scale), RECIPES["classic"], training).rgb
+        for scale, truth in ((1.0, photo), (0.5, box_average(photo, 2))):
+            image = drawn(look, view.scaled(scale), "classic")
             found = next(m for m in report.select("classic", scale) if m.view == view.name)
             assert found.values["PSNR"] == pytest.approx(psnr(quantised(image), truth), abs=1e-9)
 
 
 def test_the_ceiling_is_always_among_the_rows(world):
-    scene, training, views = world
-    report = evaluate(scene, training, task(views))
+    look, views = world
+    report = evaluate(task(look, views))
     assert report.recipes == (CEILING, "classic", "matched")
-    full = render(scene, views[0], RECIPES["classic"], training).rgb.clamp(0, 1)
+    full = drawn(look, views[0], "classic").clamp(0, 1)
     expected = psnr(
-        quantised(downsample(full, 2)), downsample(quantised(read_image(views[0].photo, None)), 2)
+        quantised(box_average(full, 2)), box_average(quantised(read_image(views[0].photo, None)), 2)
     )
     assert report.select(CEILING, 0.5)[0].values["PSNR"] == pytest.approx(expected, abs=1e-9)
 
 
 def test_above_the_photographs_size_metrics_are_undefined_and_say_why(world):
-    scene, training, views = world
-    report = evaluate(scene, training, task(views))
+    look, views = world
+    report = evaluate(task(look, views))
     assert mean(report.select("matched", 2.0), "PSNR") is None
     assert results(report)["matched@2"] == {"PSNR": None, "SSIM": None}
     assert results(report)["_aaplug"]["notes"] == [NO_PHOTOGRAPH]
 
 
 def test_self_truth_needs_no_photographs_and_makes_the_ceiling_perfect(world):
-    scene, training, views = world
+    look, views = world
     bare = [replace(view, photo=None) for view in views]
-    report = evaluate(scene, training, task(bare, truth="self"))
+    report = evaluate(task(look, bare, "self"))
     assert mean(report.select(CEILING, 0.5), "PSNR") is None  # equal images
     assert mean(report.select(CEILING, 0.5), "SSIM") == pytest.approx(1.0)
     assert (
@@ -84,40 +108,37 @@ def test_self_truth_needs_no_photographs_and_makes_the_ceiling_perfect(world):
 
 
 def test_photographs_are_demanded_where_they_are_the_truth(world):
-    scene, training, views = world
+    look, views = world
     with pytest.raises(UsageError, match="a: has no photograph"):
-        evaluate(scene, training, task([replace(views[0], photo=None)]))
+        evaluate(task(look, [replace(views[0], photo=None)]))
 
 
 @pytest.mark.parametrize("changes", [{"scales": ()}, {"scales": (0.0,)}, {"scales": (1.0, 1.0)}])
 def test_empty_or_doubled_work_is_refused(world, changes):
-    scene, training, views = world
+    look, views = world
     with pytest.raises(UsageError):
-        evaluate(scene, training, task(views, **changes))
+        evaluate(task(look, views, **changes))
 
 
 def test_per_view_has_every_view_and_results_their_mean(world):
-    scene, training, views = world
-    report = evaluate(scene, training, task(views, scales=(0.5,)))
+    look, views = world
+    report = evaluate(task(look, views, scales=(0.5,)))
     values = per_view(report)["matched@0.5"]["PSNR"]
     assert list(values) == ["a", "b"]
     assert results(report)["matched@0.5"]["PSNR"] == pytest.approx(sum(values.values()) / 2)
 
 
 def test_tables_show_every_recipe_and_scale(world):
-    scene, training, views = world
-    report = evaluate(scene, training, task(views))
+    look, views = world
+    report = evaluate(task(look, views))
     for table in tables(report):
         assert table.row_count == 3
         assert [column.header for column in table.columns] == ["recipe", "1", "1/2", "2×"]
 
 
 def test_progress_counts_views(world):
-    scene, training, views = world
     told = []
-    evaluate(
-        scene, training, task(views, scales=(0.5,)), progress=lambda *counts: told.append(counts)
-    )
+    evaluate(task(*world, scales=(0.5,)), tell=lambda *counts: told.append(counts))
     assert told == [(0, 2), (1, 2), (2, 2)]
 
 
@@ -129,88 +150,79 @@ def test_scales_are_written_as_people_do(scale, name):
 
 
 def test_evaluation_is_deterministic(world):
-    scene, training, views = world
-    reports = [evaluate(scene, training, task(views, scales=(0.5,))) for _ in range(2)]
+    look, views = world
+    reports = [evaluate(task(look, views, scales=(0.5,))) for _ in range(2)]
     values = [[m.values for m in report.measurements] for report in reports]
     assert values[0] == values[1]
     assert all(torch.tensor(m.seconds) > 0 for m in reports[0].measurements)
 
 
-def test_pairs_are_counted_and_fewer_where_images_are_smaller(world):
-    scene, training, views = world
-    report = evaluate(scene, training, task(views))
+def test_evaluations_are_counted_and_fewer_where_images_are_smaller(world):
+    look, views = world
+    report = evaluate(task(look, views))
     for recipe in ("classic", "matched"):
-        small, full = (report.select(recipe, scale)[0].pairs for scale in (0.5, 1.0))
+        small, full = (report.select(recipe, scale)[0].evaluations for scale in (0.5, 1.0))
         assert 0 < small < full
-    reference = task(views[:1], scales=(0.5,), rasterizer=RASTERIZERS["reference"])
-    assert evaluate(scene, training, reference).measurements[0].pairs is None
+    slow = replace(look, rasterizer=RASTERIZERS["reference"])
+    assert evaluate(task(slow, views[:1], scales=(0.5,))).measurements[0].evaluations is None
 
 
 @pytest.mark.parametrize("name", [n for n, r in RECIPES.items() if r.selection is None])
-def test_the_pairs_of_every_recipe_are_counted(world, name):
-    scene, training, views = world
-    chosen = replace(task(views[:1], scales=(0.5,)), recipes=[RECIPES[name]])
-    (found,) = evaluate(scene, training, chosen).select(name, 0.5)
-    assert found.pairs is not None
-    assert found.pairs > 0
+def test_the_evaluations_of_every_recipe_are_counted(world, name):
+    look, views = world
+    report = evaluate(task(look, views[:1], recipes=(name,), scales=(0.5,), ceiling=False))
+    assert report.measurements[0].evaluations > 0
 
 
 FIGURES = (CONSISTENCY, ENERGY, FLICKER)
 
 
 def test_figures_without_a_photograph_are_those_taken_by_hand(world):
-    scene, training, views = world
-    report = evaluate(scene, training, task(views, figures=FIGURES))
-    full = render(scene, views[0], RECIPES["classic"], training)
-    small = render(scene, views[0].scaled(0.5), RECIPES["classic"], training)
+    look, views = world
+    report = evaluate(task(look, views, metrics=FIGURES))
+    full, small = drawn(look, views[0]), drawn(look, views[0].scaled(0.5))
     values = report.select("classic", 0.5)[0].values
-    expected = psnr(small.rgb.clamp(0, 1), downsample(full.rgb.clamp(0, 1), 2))
+    expected = psnr(small.clamp(0, 1), box_average(full.clamp(0, 1), 2))
     assert values["consistency"] == pytest.approx(expected, abs=1e-6)
     light = torch.tensor([0.2126, 0.7152, 0.0722]).double()
-    gained = (small.rgb.double() @ light).mean() / (full.rgb.double() @ light).mean() - 1
+    gained = (small.double() @ light).mean() / (full.double() @ light).mean() - 1
     assert values["energy drift"] == pytest.approx(float(gained), abs=1e-6)
     assert report.select("classic", 1.0)[0].values["energy drift"] == 0
     assert report.select("classic", 1.0)[0].values["consistency"] is None
 
 
 def test_flicker_of_supersampling_is_nearer_to_motion_alone(world):
-    scene, training, views = world
+    look, views = world
     recipes = [RECIPES["ewa"], find_recipe("auto", quality="best")]
-    work = replace(task(views[:1], scales=(0.25,), figures=(FLICKER,)), recipes=recipes)
-    report = evaluate(scene, training, work)
+    report = evaluate(task(look, views[:1], recipes=recipes, scales=(0.25,), metrics=(FLICKER,)))
     far, near = (abs(report.select(r.name, 0.25)[0].values["flicker"] - 1) for r in recipes)
     assert near < far
     assert near < 0.05
 
 
 def test_figures_need_scale_1_and_are_null_without(world):
-    scene, training, views = world
-    report = evaluate(scene, training, task(views[:1], scales=(0.5,), figures=FIGURES[:2]))
+    look, views = world
+    report = evaluate(task(look, views[:1], scales=(0.5,), metrics=FIGURES[:2]))
     assert mean(report.select("classic", 0.5), "consistency") is None
     assert mean(report.select("classic", 0.5), "energy drift") is None
 
 
 @pytest.mark.parametrize("name", ["distance", "fov"])
-def test_moved_cameras_are_judged_by_the_supersampled_look(world, name):
-    scene, training, views = world
-    recipes = [RECIPES["classic"], find_recipe("matched", rate="interval")]
-    work = replace(
-        task(views, scales=(1.0, 0.25), truth="self", protocol=PROTOCOLS[name]), recipes=recipes
-    )
-    report = evaluate(scene, training, work)
+def test_moved_cameras_are_compared_with_the_supersampled_look(world, name):
+    recipes = ["classic", find_recipe("matched", rate_reference="interval")]
+    report = evaluate(task(*world, "self", name, recipes, scales=(1.0, 0.25)))
     assert report.recipes == ("classic", "matched")  # the truth is its own ceiling
-    classic, matched = (mean(report.select(r.name, 0.25), "PSNR") for r in recipes)
+    classic, matched = (mean(report.select(r, 0.25), "PSNR") for r in report.recipes)
     assert matched > classic + 3
     assert report.protocol["protocol"]["scale changes"] == name
 
 
 def test_a_protocol_names_its_flavours_in_every_result(world):
-    scene, training, views = world
-    work = task(views[:1], scales=(1.0, 0.5), protocol=PROTOCOLS["360-zoom-out"])
-    report = evaluate(scene, training, work)
+    look, views = world
+    report = evaluate(task(look, views[:1], protocol="360-zoom-out", scales=(1.0, 0.5)))
     assert results(report)["_aaplug"]["metrics"]["SSIM"] == SSIM["3dgs"].protocol
     assert "Pillow" in per_view(report)["_aaplug"]["downscale"]
-    plain = evaluate(scene, training, task(views[:1], scales=(1.0, 0.5)))
+    plain = evaluate(task(look, views[:1], scales=(1.0, 0.5)))
     for r in (1.0, 0.5):
         assert (
             report.select("classic", r)[0].values["SSIM"]
@@ -219,15 +231,15 @@ def test_a_protocol_names_its_flavours_in_every_result(world):
 
 
 def test_photographs_do_not_show_moved_cameras(world):
-    scene, training, views = world
+    look, views = world
     with pytest.raises(UsageError, match="moves the camera"):
-        evaluate(scene, training, task(views, protocol=PROTOCOLS["fov"]))
+        evaluate(task(look, views, protocol="fov"))
 
 
 def test_views_of_one_name_are_told_apart(world):
-    scene, training, views = world
+    look, views = world
     twins = [replace(view, name="same") for view in views]
-    report = evaluate(scene, training, task(twins, scales=(0.5,)))
+    report = evaluate(task(look, twins, scales=(0.5,)))
     assert list(per_view(report)["classic@0.5"]["PSNR"]) == ["00000_same", "00001_same"]
 
 
@@ -236,8 +248,8 @@ class StoppedError(Exception):
 
 
 def test_an_interrupted_evaluation_continues_and_redoes_nothing(world, tmp_path, monkeypatch):
-    scene, training, views = world
-    whole = evaluate(scene, training, task(views), record=tmp_path / "whole.jsonl")
+    look, views = world
+    whole = evaluate(task(look, views), journal=tmp_path / "whole.jsonl")
     path = tmp_path / "progress.jsonl"
 
     def stop(done: int, total: int) -> None:
@@ -245,30 +257,29 @@ def test_an_interrupted_evaluation_continues_and_redoes_nothing(world, tmp_path,
             raise StoppedError
 
     with pytest.raises(StoppedError):
-        evaluate(scene, training, task(views), progress=stop, record=path)
+        evaluate(task(look, views), tell=stop, journal=path)
     before = path.read_bytes()
-    drawn = []
+    seen, render = [], Renderer.draw
     monkeypatch.setattr(
-        "aaplug.evaluation.engine.render",
-        lambda *args: (drawn.append(args[1].name), render(*args))[1],
+        Renderer, "draw", lambda self, view: (seen.append(view.name), render(self, view))[1]
     )
-    report = evaluate(scene, training, task(views), record=path, resume=True)
-    assert set(drawn) == {"b"}
+    report = evaluate(task(look, views), journal=path, resume=True)
+    assert set(seen) == {"b"}
     assert path.read_bytes().startswith(before)
 
     def timeless(report):
         return [replace(m, seconds=0.0) for m in report.measurements]
 
     assert timeless(report) == timeless(whole)
-    drawn.clear()
-    assert evaluate(scene, training, task(views), record=path, resume=True) == report
-    assert not drawn
+    seen.clear()
+    assert evaluate(task(look, views), journal=path, resume=True) == report
+    assert not seen
 
 
 def test_images_lie_where_3dgs_scripts_look(world, tmp_path):
-    scene, training, views = world
-    store = Images(tmp_path, shown=(1,), everything=True)
-    evaluate(scene, training, task(views), images=store)
+    look, views = world
+    store = ImageStore(tmp_path, shown=(1,), everything=True)
+    evaluate(task(look, views), images=store)
     every = sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.png"))
     assert "test/classic@0.5/renders/00000.png" in every
     assert "test/classic@0.5/gt/00001.png" in every
@@ -276,14 +287,115 @@ def test_images_lie_where_3dgs_scripts_look(world, tmp_path):
     assert "images/ceiling@0.5/renders/00001.png" in every
     assert not any(path.endswith("00000.png") for path in every if path.startswith("images"))
     stored = read_image(store.path(1, "matched", 0.5), None)
-    image = render(scene, views[1].scaled(0.5), RECIPES["matched"], training).rgb
+    image = drawn(look, views[1].scaled(0.5), "matched")
     assert stored.equal(quantised(image))
 
 
 def test_csv_holds_a_line_a_measurement(world):
-    scene, training, views = world
-    report = evaluate(scene, training, task(views))
+    look, views = world
+    report = evaluate(task(look, views))
     lines = as_csv({'a "scene"': report}).splitlines()
-    assert lines[0] == "scene,protocol,recipe,scale,view,PSNR,SSIM,samples,pairs,seconds,note"
+    assert lines[0] == "scene,protocol,recipe,scale,view,PSNR,SSIM,samples,evaluations,seconds,note"
     assert len(lines) == 1 + len(report.measurements)
     assert lines[1].startswith('"a ""scene""",default,"training size, resampled",1,a,')
+
+
+# metrics that the registry does not know beforehand
+
+
+def test_a_new_metric_that_is_undefined_is_reported_with_its_own_words(world, monkeypatch):
+    monkeypatch.setattr(METRICS, "_entries", dict(METRICS))
+    odd = Metric("odd", "", 1.0, 2, "its protocol", lambda image, truth: None, undefined="too odd")
+    nan = replace(
+        odd, name="nan", measure=lambda image, truth: float("nan"), undefined="not finite"
+    )
+    METRICS.register("odd", odd)  # and `nan` is given from Python alone
+    look, views = world
+    work = task(look, views[:1], scales=(0.5,), metrics=(PSNR, odd, nan))
+    report = evaluate(work, journal=views[0].photo.with_name("odd.jsonl"))
+    found = report.select("classic", 0.5)[0]
+    assert (found.values["odd"], found.values["nan"]) == (None, None)
+    assert found.note == "too odd; not finite"
+    assert results(report)["_aaplug"]["notes"] == ["too odd; not finite"]
+    assert len(tables(report)) == 5
+
+
+# candidates side by side
+
+
+def test_candidates_compare_as_by_hand(world):
+    look, views = world
+    other = replace(look, recipe=RECIPES["mip"], background=(1.0, 1.0, 1.0))
+    truth = Truth(look, memory=1e9)
+    candidates = [Candidate("own", look), Candidate("other", other)]
+    report = compare(candidates, views, (1.0, 0.5), truth)
+    assert report.recipes == ("own", "other")
+    small = views[1].scaled(0.5)
+    wanted = quantised(box_average(look(views[1]).rgb.clamp(0, 1), 2).to(KEPT).float())
+    found = report.select("other", 0.5)[1].values["PSNR"]
+    assert found == pytest.approx(psnr(quantised(other(small).rgb), wanted), abs=1e-9)
+
+
+def test_each_candidate_is_drawn_with_the_bounds_of_its_own_scene(world):
+    look, views = world
+    grown = make_scene(200, seed=1)
+    bare = [replace(view, photo=None) for view in views]
+    report = compare_scenes(
+        {"original": look.scene, "again": look.scene, "grown": grown},
+        CameraSet(tuple(bare), tuple(bare)),
+        recipe="matched",
+        scale=(1.0, 0.5),
+        rasterizer="eager",
+    )
+    assert report.protocol["truth"] == "self"
+    assert mean(report.select("original", 1.0), "SSIM") == pytest.approx(1.0)
+    assert report.select("again", 0.5)[0].values == report.select("original", 0.5)[0].values
+    assert mean(report.select("grown", 0.5), "PSNR") < mean(report.select("original", 0.5), "PSNR")
+
+
+def test_a_candidate_of_another_background_is_drawn_anew(world):
+    look, views = world
+    white = replace(look, background=(1.0, 1.0, 1.0))
+    candidates = [Candidate("black", look), Candidate("white", white)]
+    report = evaluate(Task(candidates, (1.0,), views[:1], Truth(look)))
+    black, white = (report.select(name, 1.0)[0].values["PSNR"] for name in ("black", "white"))
+    assert black is None
+    assert white < 30
+
+
+# the truth
+
+
+def test_the_truth_without_photographs_draws_its_look_once(world, monkeypatch):
+    look, views = world
+    drawings = []
+    call = TimedRenderer.__call__
+    monkeypatch.setattr(
+        TimedRenderer, "__call__", lambda self, view: (drawings.append(view), call(self, view))[1]
+    )
+    work = task(look, views[:1], "self", recipes=("matched", "auto"), scales=(1.0, 0.5))
+    evaluate(work)
+    assert [view.hw for view in drawings] == [(48, 64), (24, 32)]
+
+
+def test_a_kept_truth_is_made_once_and_a_full_memory_keeps_nothing(world):
+    look, views = world
+    kept, forgetful = Truth(look, memory=1e9), Truth(look, memory=0.0)
+    image = kept(views[0], 0.25)
+    assert kept(views[0], 0.25).equal(image)
+    assert len(kept._kept) == 1
+    assert forgetful(views[0], 0.25).equal(image)
+    assert not forgetful._kept
+    assert image.equal(Truth(look)(views[0], 0.25).to(KEPT).float())
+    namesake = replace(views[1], name=views[0].name)  # as in Blender's splits
+    assert not kept(namesake, 0.25).equal(image)
+
+
+def test_larger_truth_has_the_averages_of_the_training_size(world):
+    look, views = world
+    full, larger = look(views[0]).rgb, Truth(look, enlarge=back_projected)(views[0], 2.0)
+    off = [
+        (box_average(image, 2) - full).square().mean()
+        for image in (larger, look(views[0].scaled(2.0)).rgb)
+    ]
+    assert off[0] < 0.2 * off[1]

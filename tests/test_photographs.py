@@ -7,7 +7,8 @@ import torch
 from PIL import Image
 
 from aaplug.core.errors import UsageError
-from aaplug.io.images import downsample, quantised, read_image
+from aaplug.core.imaging import box_average, quantised
+from aaplug.io.images import read_image
 from aaplug.io.photographs import DOWNSCALES
 
 WHITE = (1.0, 1.0, 1.0)
@@ -34,7 +35,7 @@ def test_every_way_keeps_size_and_range(rgba, name):
 
 
 def test_box_composites_rounds_and_averages(rgba):
-    expected = downsample(quantised(read_image(rgba, WHITE)), 4)
+    expected = box_average(quantised(read_image(rgba, WHITE)), 4)
     assert DOWNSCALES["box"].read(rgba, WHITE).at((4, 6), 0.25).equal(expected)
 
 

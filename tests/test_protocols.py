@@ -7,7 +7,7 @@ import torch
 
 from aaplug.core.errors import UsageError
 from aaplug.evaluation.metrics import SSIM
-from aaplug.evaluation.protocols import PROTOCOLS, find_protocol, median_depth
+from aaplug.evaluation.protocols import PROTOCOLS, median_depth
 from aaplug.io.photographs import DOWNSCALES
 from tests.conftest import make_camera, make_scene
 
@@ -34,7 +34,7 @@ def test_a_protocol_names_what_exists(protocol):
     assert protocol.downscale in DOWNSCALES
     assert protocol.ssim in SSIM
     assert protocol.source
-    assert find_protocol(protocol.name) is protocol
+    assert PROTOCOLS.find(protocol.name) is protocol
 
 
 def test_a_moved_camera_is_free():
@@ -62,4 +62,4 @@ def test_median_depth_is_of_what_the_view_shows():
 
 def test_an_unknown_protocol_is_refused():
     with pytest.raises(UsageError, match="'blendr' is not one of default, blender"):
-        find_protocol("blendr")
+        PROTOCOLS.find("blendr", "protocol")

@@ -76,6 +76,15 @@ class Camera:
         """Position in the world."""
         return -self.cam_from_world[:3, :3].T @ self.cam_from_world[:3, 3]
 
+    def project(
+        self, points: Float[Tensor, "n 3"]
+    ) -> tuple[Float[Tensor, "n 2"], Float[Tensor, " n"]]:
+        """Positions in px and depths in world units of world points, in float64."""
+        pose = self.cam_from_world
+        local = points.double() @ pose[:3, :3].T + pose[:3, 3]
+        x, y, z = local.unbind(dim=1)
+        return torch.stack([x / z * self.fx + self.cx, y / z * self.fy + self.cy], dim=1), z
+
     def scaled(self, factor: float) -> "Camera":
         """The same view with pixels `factor` times as dense.
 

@@ -138,7 +138,7 @@ def check_frame(
             f"only {share:.1%} of its Gaussians are seen by any of the {len(cameras)} cameras (expected at least "
             f"{min_share:.0%}): scene and cameras are in different frames. nerfstudio scenes need the transform of "
             "dataparser_transforms.json, gsplat scenes were normalised unless trained with normalize_world_space "
-            "off; if the cameras are right nevertheless, lower min_seen",
+            "off; if the cameras are right nevertheless, lower `min_seen`",
         )
     return share
 

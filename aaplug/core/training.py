@@ -7,7 +7,7 @@ from statistics import median
 
 from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.gaussians import Convention, Gaussians
-from aaplug.core.sampling import SamplingBounds, sampling_bounds
+from aaplug.core.sampling import SamplingBounds, check_frame, sampling_bounds
 
 
 @dataclass(frozen=True)
@@ -32,13 +32,19 @@ class TrainingViews:
         scene: Gaussians,
         cameras: CameraSet | Sequence[Camera],
         cull_margin: float = math.inf,
+        min_seen: float = 0.0,
     ) -> "TrainingViews":
         """Compute the sampling bounds of a scene.
 
+        min_seen: share of the Gaussians that the cameras must see, as a check that both are in the same frame.
+
         Raises:
+            FrameError: the cameras see less of the scene.
             UsageError: there are no cameras.
         """
         views = cameras.train if isinstance(cameras, CameraSet) else tuple(cameras)
+        if min_seen > 0:
+            check_frame(scene.means, views, scene.name, min_seen)
         return cls(scene.convention, views, sampling_bounds(scene.means, views), cull_margin)
 
     def relative_rate(self, camera: Camera) -> float:

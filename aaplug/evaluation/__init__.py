@@ -1,1 +1,1 @@
-"""Measuring images against a truth: protocols, metrics, the engine, its journal and its reports."""
+"""Measuring images against a truth: protocols, metrics, the truth, the engine, its journal and its reports."""

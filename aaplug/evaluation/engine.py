@@ -1,372 +1,309 @@
-"""Multi-scale evaluation: every recipe at every scale against one truth, as a protocol says.
+"""Multi-scale evaluation: candidates, each a name and a renderer, at every scale against one truth.
 
-What a scale changes, where the truth comes from and how it is made smaller is the protocol's (`aaplug.evaluation.protocols`).
-Truth "self" is the scene's own look: for sizes its training-size render averaged down, and `matched` above that size;
-for distances and fields of view `matched` with as many samples as reach training's rate.  Renders are clamped and
-rounded to 8 bits before they are compared.  Views stream: nothing grows with their number but the numbers, and a
-photograph is read once for all scales.
+For every view and scale: make the truth, draw each candidate, compare, note a `Measurement`.  A protocol says what a
+scale changes and where the truth comes from (`evaluation.protocols`).  Renders are clamped and rounded to 8 bits
+before they are compared.  Views stream: only the numbers of finished views are kept.
 """
 
 import math
-import time
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.cameras import Camera
 from aaplug.core.errors import UsageError
 from aaplug.core.gaussians import Gaussians
-from aaplug.core.interfaces import Rasterizer
+from aaplug.core.imaging import quantised
+from aaplug.core.interfaces import Rasterizer, WorldFilter
+from aaplug.core.monitor import Tell
 from aaplug.core.training import TrainingViews
-from aaplug.evaluation.image_store import Images
-from aaplug.evaluation.journal import Record
-from aaplug.evaluation.metrics import (
-    CONSISTENCY,
-    ENERGY,
-    FLICKER,
-    PSNR,
-    SSIM,
-    Metric,
-    energy_drift,
-    flicker,
-    psnr,
-)
-from aaplug.evaluation.protocols import PROTOCOLS, Protocol, Truth, median_depth
+from aaplug.evaluation.image_store import ImageStore
+from aaplug.evaluation.journal import Journal
+from aaplug.evaluation.metric import Metric
+from aaplug.evaluation.metrics import PSNR, SSIM
+from aaplug.evaluation.protocols import Protocol
 from aaplug.evaluation.results import CEILING, Measurement, Report
-from aaplug.io.images import quantised, resampled, stretched
-from aaplug.io.photographs import DOWNSCALES, Photograph
-from aaplug.methods.recipes import Recipe, find_recipe
-from aaplug.rasterizers import RASTERIZERS, Tiled
-from aaplug.rasterizers.tiled.counting import Counting
-from aaplug.rendering.renderer import rate_of, render, smooth
+from aaplug.evaluation.series import Drawn, Series, TimedRenderer
+from aaplug.evaluation.truth import Truth, ViewTruth, source_of
+from aaplug.io.photographs import DOWNSCALES
+from aaplug.methods.recipe import Recipe
+from aaplug.methods.recipes import suited
+from aaplug.rendering.renderer import Background, Renderer
 
 NO_PHOTOGRAPH = "no photograph is this large: metrics above the photographs' own size are undefined"
-EQUAL_IMAGES = "equal images: PSNR is infinite and left out of the mean"
-TOO_SMALL = "image smaller than the SSIM window"
-FLICKER_STEPS = 4  # frames, a step of 1/4 px right and down between them
+
+Values = Mapping[str, float | None]
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A scene as one recipe shows it, under a name of its own."""
+
+    name: str
+    renderer: Renderer
+
+
+def candidates_of(
+    scene: Gaussians,
+    training: TrainingViews,
+    recipes: Sequence[Recipe],
+    rasterizer: str | Rasterizer = "auto",
+    background: Background = "auto",
+) -> list[Candidate]:
+    """One scene by several recipes; those with the same world filter share the filtered scene."""
+    prepared: dict[WorldFilter | None, Renderer] = {}
+    found = []
+    for recipe in (suited(recipe, scene) for recipe in recipes):
+        if recipe.world not in prepared:
+            prepared[recipe.world] = Renderer.of(
+                scene, training, recipe, rasterizer=rasterizer, background=background
+            )
+        found.append(Candidate(recipe.name, replace(prepared[recipe.world], recipe=recipe)))
+    return found
 
 
 @dataclass(frozen=True)
 class Task:
     """What to evaluate and against which truth.
 
-    metrics: None takes PSNR and the protocol's SSIM.  figures: what is measured without a photograph, out of
-    CONSISTENCY, ENERGY and FLICKER.
+    views: at the training size.
+    metrics: None takes PSNR and the protocol's SSIM.
+    ceiling: add a row for the scene's own training-size look, resampled (where the protocol changes the size).
     """
 
-    recipes: Sequence[Recipe]
+    candidates: Sequence[Candidate]
     scales: Sequence[float]
     views: Sequence[Camera]
-    background: tuple[float, float, float]
     truth: Truth
-    rasterizer: Rasterizer = RASTERIZERS["eager"]
-    protocol: Protocol = PROTOCOLS["default"]
     metrics: Sequence[Metric] | None = None
-    figures: Sequence[Metric] = ()
+    ceiling: bool = True
 
     @property
-    def judges(self) -> tuple[Metric, ...]:
-        """The metrics that compare with the truth."""
-        own = (PSNR, SSIM[self.protocol.ssim])
-        return own if self.metrics is None else tuple(self.metrics)
+    def protocol(self) -> Protocol:
+        """The truth's protocol."""
+        return self.truth.protocol
+
+    @property
+    def measured(self) -> tuple[Metric, ...]:
+        """Every metric, first those that compare with the truth."""
+        if self.metrics is None:
+            return (PSNR, SSIM[self.protocol.ssim])
+        return tuple(sorted(self.metrics, key=lambda metric: metric.measure is None))
+
+    @property
+    def names(self) -> list[str]:
+        """Rows of the report."""
+        return [CEILING, *(candidate.name for candidate in self.candidates)]
 
 
 def evaluate(
-    scene: Gaussians,
-    training: TrainingViews,
     task: Task,
     facts: Mapping[str, Any] | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
-    record: Path | None = None,
+    tell: Tell = lambda done, total: None,
+    journal: str | PathLike[str] | None = None,
     resume: bool = False,
-    images: Images | None = None,
+    images: ImageStore | None = None,
 ) -> Report:
-    """Measure every recipe at every scale on every view.
+    """Measure every candidate at every scale on every view.
 
-    facts: JSON-ready entries for the protocol (versions, hashes).  progress: told (views done, views in all).
-    record: a file that holds what is finished; with `resume` the views that it holds are not measured again.
-    images: where images are stored.
+    Args:
+        task: what to measure.
+        facts: JSON-ready entries to add to the report's protocol (versions, hashes).
+        tell: called with (views done, views in all).
+        journal: file that keeps what is finished.
+        resume: do not measure the views again that the journal holds.
+        images: where to store images.
 
     Raises:
-        UsageError: nothing to measure, the truth is photographs and a view has none, or the record is of another
-            request.
+        UsageError: nothing to measure, a view lacks the photograph it needs, or the journal is of another request.
         FormatError: a photograph cannot be read.
-        OutputError: the record or an image cannot be written.
+        OutputError: the journal or an image cannot be written.
     """
     task = replace(task, views=_distinct(task.views))
     _check(task)
-    protocol = _protocol(task) | dict(facts or {})
-    finished = None if record is None else Record(record, protocol, resume)
-    known = {} if finished is None else finished.known
-    try:
-        bench = _Bench(scene, training, task, images)
-        measurements: list[Measurement] = []
-        for index, view in enumerate(task.views):
-            progress(index, len(task.views))
-            measured = known.get(index) or tuple(bench.measure(index, view))
-            if finished is not None and index not in known:
-                finished.add(index, measured)
+    request = _request(task) | dict(facts or {})
+    written = None if journal is None else Journal(Path(journal), request, resume)
+    measurements = list[Measurement]()
+    with written or nullcontext():
+        for measured in _by_view(task, written, images, tell):
             measurements += measured
-    finally:
-        if finished is not None:
-            finished.close()
-    progress(len(task.views), len(task.views))
-    order = [CEILING, *(recipe.name for recipe in task.recipes)]
+    order = task.names
     measurements.sort(key=lambda m: (order.index(m.recipe), task.scales.index(m.scale)))
-    return Report(tuple(measurements), protocol)
+    return Report(tuple(measurements), request, task.measured)
+
+
+def compare(
+    candidates: Sequence[Candidate],
+    views: Sequence[Camera],
+    scales: Sequence[float],
+    truth: Truth,
+    tell: Tell = lambda done, total: None,
+) -> Report:
+    """Candidates side by side, in PSNR and SSIM."""
+    return evaluate(Task(candidates, scales, views, truth, ceiling=False), tell=tell)
+
+
+def _by_view(
+    task: Task, journal: Journal | None, images: ImageStore | None, tell: Tell
+) -> Iterator[Sequence[Measurement]]:
+    """The measurements of every view, from the journal or new."""
+    bench = _Bench(task, images)
+    for index, view in enumerate(task.views):
+        tell(index, len(task.views))
+        measured = None if journal is None else journal.known.get(index)
+        if measured is None:
+            measured = tuple(bench.measure(index, view))
+            if journal is not None:
+                journal.add(index, measured)
+        yield measured
+    tell(len(task.views), len(task.views))
 
 
 def _distinct(views: Sequence[Camera]) -> Sequence[Camera]:
-    """Views of the same name, as two splits may hold, get their place before it."""
+    """Number the views where two have the same name, as views of two splits may."""
     if len({view.name for view in views}) == len(views):
         return views
     return [replace(view, name=f"{i:05d}_{view.name}") for i, view in enumerate(views)]
 
 
 def _check(task: Task) -> None:
-    if not (task.recipes and task.scales and task.views):
+    if not (task.candidates and task.scales and task.views):
         raise UsageError("evaluate", "needs at least one recipe, one scale and one view")
     if any(not (scale > 0 and math.isfinite(scale)) for scale in task.scales):
-        raise UsageError("--scale", f"sizes must be above 0, got {min(task.scales):g}")
-    names = [recipe.name for recipe in task.recipes]
-    if len(set(names)) != len(names) or len(set(task.scales)) != len(task.scales):
+        raise UsageError("scale", f"sizes must be above 0, got {min(task.scales):g}")
+    if len(set(task.names)) != len(task.names) or len(set(task.scales)) != len(task.scales):
         raise UsageError("evaluate", "a recipe or a scale is named twice")
-    if task.truth == "photographs" and task.protocol.change != "size":
+    if task.truth.source == "photographs" and task.protocol.change != "size":
         raise UsageError(
-            "--truth", f"protocol {task.protocol.name} moves the camera: no photograph shows that"
+            "truth", f"protocol {task.protocol.name} moves the camera: no photograph shows that"
         )
-    missing = [view.name for view in task.views if view.photo is None]
-    if task.truth == "photographs" and missing:
-        raise UsageError(
-            missing[0],
-            "has no photograph to compare with; --truth self compares with the scene's own look",
-        )
+    source_of(task.views, task.truth.source)
 
 
-def _protocol(task: Task) -> dict[str, Any]:
-    protocol = task.protocol
-    downscale = DOWNSCALES[protocol.downscale] if task.truth == "photographs" else DOWNSCALES["box"]
+def _request(task: Task) -> dict[str, Any]:
+    """What the numbers mean; a journal is of the same request if these are equal."""
+    photographs = task.truth.source == "photographs"
     return {
-        "protocol": {
-            "name": protocol.name,
-            "source": protocol.source,
-            "scale changes": protocol.change,
-            "sizes": "rounded, pixels stretched by less than one"
-            if protocol.whole_sizes
-            else "what does not fill a pixel is cropped",
-        },
-        "truth": task.truth,
-        "downscale": downscale.protocol,
+        "protocol": task.protocol.facts,
+        "truth": task.truth.source,
+        "downscale": DOWNSCALES[task.protocol.downscale if photographs else "box"].protocol,
         "rounding": "renders clamped to [0, 1] and rounded to 8 bits",
-        "background": list(task.background),
-        "metrics": {m.name: m.protocol for m in (*task.judges, *task.figures)},
+        "background": list(task.truth.background),
+        "metrics": {metric.name: metric.protocol for metric in task.measured},
         "views": len(task.views),
         "view_names": [view.name for view in task.views],
         "scales": list(task.scales),
-        "recipes": {recipe.name: recipe.source for recipe in task.recipes},
-        "rasterizer": task.rasterizer.kernels.name
-        if isinstance(task.rasterizer, Tiled)
-        else type(task.rasterizer).__name__.lower(),
+        "recipes": {c.name: c.renderer.recipe.source for c in task.candidates},
+        "rasterizer": task.candidates[0].renderer.rasterizer.name,
     }
 
 
-class _Drawn(NamedTuple):
-    """A timed render.  own: its light without the background, for energy."""
-
-    rgb: Float[Tensor, "h w 3"]
-    own: Float[Tensor, "h w 3"]
-    samples: int
-    seconds: float
-    pairs: int | None
-
-
 class _Bench:
-    """What all views share, and the measuring of one."""
+    """Measures one view after another."""
 
-    def __init__(
-        self, scene: Gaussians, training: TrainingViews, task: Task, images: Images | None
-    ):
-        self.training, self.task, self.images = training, task, images
-        self.smoothed = {r.name: smooth(scene, training, r) for r in task.recipes}
-        self.own = smooth(scene, training, find_recipe("matched"))
+    def __init__(self, task: Task, images: ImageStore | None):
+        self.task, self.images = task, images
+        self.timed = {c.name: TimedRenderer(c.renderer) for c in task.candidates}
+        self.sized = task.protocol.change == "size"
 
     def measure(self, index: int, view: Camera) -> Iterator[Measurement]:
-        """Measure one view; its photograph is read and its training-size render made once for all scales."""
-        task, protocol = self.task, self.task.protocol
-        photo = self._photograph(view)
-        depth = median_depth(self.own.means, view) if protocol.change == "distance" else 1.0
-        sized = protocol.change == "size"
-        full = self._draw(self.own, view, find_recipe("matched")) if sized else None
-        fulls: dict[str, _Drawn] = {}
-        for scale in sorted(task.scales, key=lambda scale: scale != 1):  # figures look back at 1
-            camera = protocol.camera(view, scale, depth)
-            ceiling = None if full is None else self._shrunk(full.rgb.clamp(0, 1), camera, scale)
-            truth = self._truth(photo, view, camera, scale, ceiling)
-            judge = _Judge(self.task.judges, truth)
-            if full is not None and ceiling is not None:
-                row = full._replace(rgb=ceiling, samples=1)
-                values = judge(ceiling)
-                yield self._noted(index, CEILING, scale, view, row, truth, values, {})
-            motion = self._motion(view, camera, scale)
-            drawings: dict[Hashable, _Drawn] = {}
-            if full is not None and scale == 1:
-                drawings[self._work(find_recipe("matched"), view)] = full
-            for recipe in task.recipes:
-                work = self._work(recipe, camera)
-                if work not in drawings:
-                    drawings[work] = self._draw(self.smoothed[recipe.name], camera, recipe)
-                drawn = drawings[work]
-                if scale == 1:
-                    fulls[recipe.name] = drawn
-                figures = self._figures(recipe, camera, scale, drawn, fulls, motion)
-                values = judge(drawn.rgb)
-                yield self._noted(index, recipe.name, scale, view, drawn, truth, values, figures)
+        """Measure every candidate at every scale."""
+        truth = ViewTruth(self.task.truth, view)
+        fulls: dict[str, Drawn] = {}
+        for scale in sorted(self.task.scales, key=lambda scale: scale != 1):  # figures need scale 1
+            judge = _Judge(self.task.measured, truth.compared(scale))
+            for name, drawn in self._drawn(truth, scale):
+                if scale == 1 and self.sized:
+                    fulls[name] = drawn
+                series = self._series(truth, name, scale, drawn, fulls.get(name))
+                values = judge.values(drawn, series)
+                if self.images is not None:
+                    self.images.keep(index, name, scale, drawn.rgb, judge.truth)
+                yield Measurement(
+                    name,
+                    scale,
+                    view.name,
+                    values,
+                    drawn.samples,
+                    drawn.seconds,
+                    judge.note(values),
+                    drawn.evaluations,
+                )
 
-    def _work(self, recipe: Recipe, camera: Camera) -> Hashable:
-        """What a recipe does at a view's rate: `auto` is `matched` where it takes one sample, and not drawn again."""
-        samples = recipe.samples_at(rate_of(self.own, camera, self.training))
-        return recipe.world, recipe.selection, recipe.screen, samples, recipe.pixel
+    def _drawn(self, truth: ViewTruth, scale: float) -> Iterator[tuple[str, Drawn]]:
+        """The rows' images at a scale; candidates that draw alike, as several do at the training size, draw once."""
+        camera = truth.camera(scale)
+        drawings: dict[Hashable, Drawn] = {}
+        if self.task.ceiling and self.sized:
+            yield CEILING, truth.look.resampled_to(truth.resized_look(scale))
+            if scale == 1:
+                drawings[_work(truth.truth.own, camera)] = truth.look
+        for name, timed in self.timed.items():
+            work = _work(timed.renderer, camera)
+            if work not in drawings:
+                drawings[work] = timed(camera)
+            yield name, drawings[work]
 
-    def _draw(self, scene: Gaussians, camera: Camera, recipe: Recipe) -> _Drawn:
-        rasterizer, counting = self.task.rasterizer, None
-        if isinstance(rasterizer, Tiled):
-            counting = Counting(rasterizer.kernels)
-            rasterizer = replace(rasterizer, kernels=counting)
-        behind = self.task.background
-        started = time.perf_counter()
-        with torch.no_grad():
-            rgb, alpha = render(scene, camera, recipe, self.training, rasterizer, behind)
-        seconds = time.perf_counter() - started
-        rgb, alpha = rgb.float(), alpha.float()
-        own = rgb - (1 - alpha[..., None]) * rgb.new_tensor(behind)
-        samples = recipe.samples_at(rate_of(scene, camera, self.training))
-        pairs = None if counting is None else counting.pairs
-        return _Drawn(rgb, own, samples, seconds, pairs)
-
-    def _shrunk(self, full: Tensor, camera: Camera, scale: float) -> Float[Tensor, "h w 3"]:
-        """A training-size image at the camera's size."""
-        if self.task.protocol.whole_sizes:
-            return stretched(full, camera.hw)
-        return resampled(full, scale)
-
-    def _photograph(self, view: Camera) -> Photograph | None:
-        if self.task.truth == "self":
+    def _series(
+        self, truth: ViewTruth, name: str, scale: float, drawn: Drawn, full: Drawn | None
+    ) -> Series | None:
+        """What figures look at; None for the ceiling, which has none."""
+        if name == CEILING:
             return None
-        assert view.photo is not None
-        downscale = DOWNSCALES[self.task.protocol.downscale]
-        return downscale.read(view.photo, self.task.background, view.lens)
-
-    def _truth(
-        self,
-        photo: Photograph | None,
-        view: Camera,
-        camera: Camera,
-        scale: float,
-        ceiling: Float[Tensor, "h w 3"] | None,
-    ) -> Float[Tensor, "h w 3"] | None:
-        """What the images are compared with; None where the render is larger than the photograph."""
-        if photo is not None:
-            factor = scale * view.width / photo.hw[1]
-            return None if factor > 1 else photo.at(camera.hw, factor)
-        if ceiling is not None and self.training.relative_rate(camera) <= 1:
-            return quantised(ceiling)
-        if ceiling is not None:
-            recipe = find_recipe("auto", quality="best")
-        else:
-            recipe = replace(find_recipe("matched"), grid=max(1, math.ceil(1 / scale)))
-        return quantised(self._draw(self.own, camera, recipe).rgb)
-
-    def _motion(self, view: Camera, camera: Camera, scale: float) -> list[Tensor] | None:
-        """The training-size look, averaged down, as it moves by steps of a part of a pixel."""
-        if FLICKER not in self.task.figures or scale >= 1 or self.task.protocol.change != "size":
-            return None
-        recipe = find_recipe("matched")
-        moved = [_moved(view, step / scale) for step in range(FLICKER_STEPS)]
-        fulls = [self._draw(self.own, shifted, recipe).rgb.clamp(0, 1) for shifted in moved]
-        return [self._shrunk(full, camera, scale) for full in fulls]
-
-    def _figures(
-        self,
-        recipe: Recipe,
-        camera: Camera,
-        scale: float,
-        drawn: _Drawn,
-        fulls: Mapping[str, _Drawn],
-        motion: list[Tensor] | None,
-    ) -> dict[str, float | None]:
-        """What needs no photograph."""
-        figures: dict[str, float | None] = {metric.name: None for metric in self.task.figures}
-        full = fulls.get(recipe.name) if self.task.protocol.change == "size" else None
-        if full is not None and CONSISTENCY.name in figures and scale < 1:
-            expected = self._shrunk(full.rgb.clamp(0, 1), camera, scale)
-            figures[CONSISTENCY.name] = psnr(drawn.rgb.clamp(0, 1), expected)
-        if full is not None and ENERGY.name in figures:
-            rows, columns = (math.ceil(side / scale) for side in camera.hw)
-            figures[ENERGY.name] = energy_drift(drawn.own, full.own[:rows, :columns])
-        if motion is not None:
-            scene = self.smoothed[recipe.name]
-            moved = [_moved(camera, float(step)) for step in range(FLICKER_STEPS)]
-            frames = [self._draw(scene, shifted, recipe).rgb.clamp(0, 1) for shifted in moved]
-            figures[FLICKER.name] = flicker(frames, motion)
-        return figures
-
-    def _noted(
-        self,
-        index: int,
-        recipe: str,
-        scale: float,
-        view: Camera,
-        drawn: _Drawn,
-        truth: Tensor | None,
-        values: Mapping[str, float | None],
-        figures: Mapping[str, float | None],
-    ) -> Measurement:
-        """The measurement, once its images are in place."""
-        if self.images is not None:
-            self.images.keep(index, recipe, scale, drawn.rgb, truth)
-        found = {**values, **{m.name: figures.get(m.name) for m in self.task.figures}}
-        note = _note(values, truth is None)
-        return Measurement(
-            recipe, scale, view.name, found, drawn.samples, drawn.seconds, note, drawn.pairs
+        camera, timed = truth.camera(scale), self.timed[name]
+        return Series(
+            scale,
+            drawn,
+            full,
+            smaller=lambda image: self.task.protocol.resized(image, camera, scale),
+            frames=(lambda: (timed.motion(camera), truth.motion(scale))) if self.sized else None,
         )
 
 
+def _work(renderer: Renderer, camera: Camera) -> Hashable:
+    """Equal for renderers that draw the same image of a view."""
+    recipe = renderer.recipe
+    method = recipe.selection, recipe.screen, recipe.pixel, recipe.compositor
+    how = renderer.samples(camera), renderer.background, renderer.rasterizer.name
+    return id(renderer.scene), id(renderer.training), method, how
+
+
 class _Judge:
-    """Compares images with one truth; what recipes draw alike, as they do at the training rate, is compared once."""
+    """Compares images with one truth; equal images are compared once."""
 
-    def __init__(self, metrics: Sequence[Metric], truth: Tensor | None):
+    def __init__(self, metrics: Sequence[Metric], truth: Float[Tensor, "h w 3"] | None):
         self.metrics, self.truth = metrics, truth
-        self.seen: list[tuple[Tensor, dict[str, float | None]]] = []
+        self._known: list[tuple[Tensor, Values]] = []
 
-    def __call__(self, rgb: Float[Tensor, "h w 3"]) -> dict[str, float | None]:
-        """Every metric's value, None for all where there is no truth."""
+    def values(self, drawn: Drawn, series: Series | None) -> Values:
+        """Every metric's value."""
+        compared = self._compared(drawn.rgb)
+        return {
+            m.name: compared[m.name] if m.measure else (series and m.of(series))
+            for m in self.metrics
+        }
+
+    def note(self, values: Values) -> str:
+        """Why values are undefined, each reason once."""
         if self.truth is None:
-            return {metric.name: None for metric in self.metrics}
+            return NO_PHOTOGRAPH
+        undefined = [m.undefined for m in self.metrics if m.measure and values[m.name] is None]
+        return "; ".join(dict.fromkeys(undefined))
+
+    def _compared(self, rgb: Float[Tensor, "h w 3"]) -> Values:
+        metrics = [metric for metric in self.metrics if metric.measure]
+        if self.truth is None:
+            return {metric.name: None for metric in metrics}
         image = quantised(rgb)
-        for known, values in self.seen:
+        for known, values in self._known:
             if image.equal(known):
                 return values
-        values: dict[str, float | None] = {}
-        for metric in self.metrics:
-            assert metric.measure is not None
-            values[metric.name] = metric.measure(image, self.truth)
-        self.seen.append((image, values))
+        values = {metric.name: metric.compare(image, self.truth) for metric in metrics}
+        self._known.append((image, values))
         return values
-
-
-def _moved(camera: Camera, steps: float) -> Camera:
-    """The image content moved right and down by `steps` quarters of a pixel."""
-    step = steps / FLICKER_STEPS
-    return replace(camera, cx=camera.cx + step, cy=camera.cy + step)
-
-
-def _note(values: Mapping[str, float | None], no_photograph: bool) -> str:
-    if no_photograph:
-        return NO_PHOTOGRAPH
-    notes = {"PSNR": EQUAL_IMAGES, "SSIM": TOO_SMALL, "LPIPS": TOO_SMALL, "FLIP": TOO_SMALL}
-    return "; ".join(dict.fromkeys(notes[name] for name, value in values.items() if value is None))

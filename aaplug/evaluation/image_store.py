@@ -1,8 +1,8 @@
-"""Where an evaluation's images lie: test/<recipe>@<scale>/renders/00003.png and the truth in gt/ beside it.
+"""Where an evaluation stores images: test/<recipe>@<scale>/renders/00003.png, and the truth in gt/ beside it.
 
-That is the layout of 3DGS's own scripts in a model's folder, so that other metric scripts run on it; the few images
-that a report shows lie alike in images/.  The number is the view's place in the request.  An image that is there
-already is replaced: who continues an evaluation writes the same one.
+This is the layout of 3DGS's own scripts in a model folder, so other metric scripts can read it.  The few images that a
+report shows have the same layout in images/.  The number is the view's place in the request.  An existing image is
+replaced: a continued evaluation writes the same one again.
 """
 
 from collections.abc import Iterator
@@ -21,11 +21,11 @@ SHOWN, EVERYTHING = "images", "test"  # folders
 
 
 @dataclass(frozen=True)
-class Images:
+class ImageStore:
     """A store of rendered and true images.
 
-    shown: places of the views that go to images/, with the ceiling.  everything: put all views that have a truth into
-    test/, as 3DGS's scripts do.
+    shown: places of the views that go to images/, with the ceiling.
+    everything: store all views that have a truth in test/, as 3DGS's scripts do.
     """
 
     folder: Path
@@ -51,7 +51,7 @@ class Images:
                     _write(_path(folder, view, recipe, scale, kind), pixels)
 
     def path(self, view: int, recipe: str, scale: float, kind: str = RENDERS) -> Path:
-        """Where a shown render or, by kind, its truth lies."""
+        """Path of a shown render, or by kind of its truth."""
         return _path(self.folder / SHOWN, view, recipe, scale, kind)
 
     def _folders(self, view: int, recipe: str, truth: Tensor | None) -> Iterator[Path]:

@@ -1,8 +1,8 @@
-"""What an evaluation has finished, on disk as it goes, so that a killed one continues where it was.
+"""The journal of an evaluation: finished views on disk, so that an interrupted evaluation can continue.
 
-A file of JSON lines: the request first, then one line a view, written through to the disk once the view's images are
-in place.  A line that a kill tore is ignored and written again.  Numbers survive as they are, so that a continued
-evaluation gives what an uninterrupted one does.
+A file of JSON lines: the request first, then one line per view, synced to disk once the view's images are stored.  A
+line that was cut short is dropped and written again.  Numbers come back exactly, so a continued evaluation gives what
+an uninterrupted one does.
 """
 
 import json
@@ -17,14 +17,14 @@ from aaplug.core.errors import OutputError, UsageError, listing
 from aaplug.evaluation.results import Measurement
 
 
-class Record:
-    """An open record.  known: the measurements of the finished views, by their place in the request."""
+class Journal:
+    """An open journal; a context manager.  known: measurements of the finished views, by their place in the request."""
 
     def __init__(self, path: Path, request: Mapping[str, Any], resume: bool):
-        """A new record, made with the first view's line, or the one that `path` holds if `resume` asks for it.
+        """Continue the journal at `path` if `resume` is set and there is one; else start it with the first `add`.
 
         Raises:
-            UsageError: it is the record of another request, or another process is writing it.
+            UsageError: the journal is of another request, or another process is writing it.
             OutputError: it cannot be written.
         """
         self.path, self.known = path, dict[int, tuple[Measurement, ...]]()
@@ -33,24 +33,30 @@ class Record:
         if resume and path.exists():
             self._continue()
 
+    def __enter__(self) -> "Journal":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
     def add(self, view: int, measurements: Sequence[Measurement]) -> None:
-        """Note a finished view.
+        """Add a finished view.
 
         Raises:
-            UsageError: another process is writing the record.
+            UsageError: another process is writing the journal.
             OutputError: it cannot be written.
         """
         with _worded(self.path):
             if self._stream is None:
                 self.path.parent.mkdir(parents=True, exist_ok=True)
-                self._stream = self.path.open("ab")  # not emptied before it is ours
+                self._stream = self.path.open("ab")  # emptied only after it is locked
                 _lock(self._stream, self.path)
                 self._stream.truncate(0)
                 self._write({"request": self._request})
             self._write({"view": view, "measurements": [asdict(m) for m in measurements]})
 
     def close(self) -> None:
-        """Let others write."""
+        """Close the file, which lets other processes write it."""
         if self._stream is not None:
             self._stream.close()
 
@@ -64,7 +70,7 @@ class Record:
             _check_same(self.path, lines[0].get("request"), self._request)
             for line in lines[1:]:
                 self.known[line["view"]] = tuple(Measurement(**m) for m in line["measurements"])
-            stack.pop_all()  # it stays open
+            stack.pop_all()  # keeps the stream open
             self._stream = stream
 
     def _write(self, line: Mapping[str, Any]) -> None:
@@ -84,7 +90,7 @@ def _worded(path: Path) -> Iterator[None]:
 
 
 def _whole_lines(stream: BinaryIO) -> list[dict[str, Any]]:
-    """The lines that were written whole; the stream stands after them and ends there."""
+    """The complete lines; cuts the file after them."""
     stream.seek(0)
     found, end = list[dict[str, Any]](), 0
     for line in stream:
@@ -92,7 +98,7 @@ def _whole_lines(stream: BinaryIO) -> list[dict[str, Any]]:
             break
         try:
             found.append(json.loads(line))
-        except ValueError:  # a disk that was pulled can leave zeros
+        except ValueError:  # a power loss can leave zeros
             break
         end += len(line)
     stream.seek(end)
@@ -107,12 +113,12 @@ def _check_same(path: Path, before: Any, now: Mapping[str, Any]) -> None:
         names = listing(list(dict.fromkeys(changed)))
         raise UsageError(
             str(path),
-            f"is of another request ({names} changed since); ask as before, or start anew with --overwrite",
+            f"is of another request ({names} changed since); repeat that request, or start again with overwrite",
         )
 
 
 def _lock(stream: BinaryIO, path: Path) -> None:
-    """One process a record; the system lets go when that process ends, however it ends."""
+    """Lock the journal for this process; the system releases the lock when the process ends."""
     with suppress(ImportError):
         import fcntl
 

@@ -1,13 +1,14 @@
-"""LPIPS (Zhang et al. 2018, version 0.1) from weights that the user has: a trunk and the linear heads on it.
+"""LPIPS (Zhang et al. 2018, version 0.1) from weight files of the user: a trunk and the linear heads on it.
 
 The trunk is torchvision's VGG16 or AlexNet as a state dict (vgg16-397923af.pth, alexnet-owt-7be5be79.pth), the heads
 are the `lpips` package's (weights/v0.1/vgg.pth, alex.pth).  Neither is shipped here.  The net expects colours in
-[−1, 1]; 3DGS's scripts feed it [0, 1], and published tables inherit that, so it is a flavour of its own.
+[−1, 1].  3DGS's scripts feed it [0, 1], and published tables follow them, so that is a flavour of its own.
 """
 
 import pickle
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from os import PathLike
 from pathlib import Path
 
 import torch
@@ -15,17 +16,17 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import conv2d, max_pool2d, relu
 
-from aaplug.core.errors import FormatError
-from aaplug.evaluation.metrics import LPIPS, LpipsFlavour, Metric
+from aaplug.core.errors import FormatError, UsageError
+from aaplug.evaluation.metric import LpipsFlavour, Metric, MetricOptions
 
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)  # of ImageNet in [−1, 1] (LPIPS)
-UNIT = 1e-10  # added to a feature's length before it is divided by it (LPIPS)
+EPSILON = 1e-10  # added to a feature's length before dividing by it (LPIPS)
 LEAST_SIDE = 32  # px: smaller images leave nothing after five stages
 
 
 @dataclass(frozen=True)
 class Stage:
-    """Convolutions by their number in torchvision's `features`, each (number, stride, padding), after a pooling."""
+    """A pooling, then convolutions: (number in torchvision's `features`, stride, padding) each."""
 
     convolutions: tuple[tuple[int, int, int], ...]
     pool: tuple[int, int] | None = None  # window and stride, in px
@@ -51,17 +52,46 @@ WORDS: dict[LpipsFlavour, str] = {
 }
 
 
-def lpips_metric(flavour: LpipsFlavour, trunk: Path, heads: Path) -> Metric:
+def lpips_metric(
+    flavour: LpipsFlavour, trunk: str | PathLike[str], heads: str | PathLike[str]
+) -> Metric:
     """LPIPS as a metric, with its weights in memory.
+
+    Args:
+        flavour: which net, and the range of colours that it is fed.
+        trunk: torchvision's state dict.
+        heads: the `lpips` package's weights.
 
     Raises:
         FormatError: a file is not the weights of this net.
     """
     net = NETS["alex" if flavour == "alex" else "vgg"]
-    weights = _trunk(trunk, net)
-    linear = _heads(heads, [weights[stage.convolutions[-1][0]][0].shape[0] for stage in net])
+    weights = _trunk(Path(trunk), net)
+    linear = _heads(Path(heads), [weights[stage.convolutions[-1][0]][0].shape[0] for stage in net])
     distance = _distance(net, weights, linear, from_unit=flavour == "3dgs")
-    return Metric(LPIPS.name, LPIPS.unit, LPIPS.ideal, LPIPS.digits, WORDS[flavour], distance)
+    return replace(LPIPS, protocol=WORDS[flavour], measure=distance)
+
+
+def _prepared(options: MetricOptions) -> Metric:
+    if options.lpips_weights is None:
+        raise UsageError("LPIPS", "needs weights: --lpips TRUNK HEADS")
+    return lpips_metric(options.lpips, *options.lpips_weights)
+
+
+def _without_weights(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> None:
+    raise UsageError("LPIPS", "needs weights: see `lpips_metric`")
+
+
+LPIPS = Metric(
+    "LPIPS",
+    "",
+    0.0,
+    4,
+    "version 0.1",
+    _without_weights,
+    undefined=f"image smaller than the {LEAST_SIDE} px that LPIPS needs",
+    prepare=_prepared,
+)
 
 
 def _distance(
@@ -78,7 +108,7 @@ def _distance(
             x = max_pool2d(x, *stage.pool) if stage.pool else x
             for number, stride, padding in stage.convolutions:
                 x = relu(conv2d(x, *weights[number], stride=stride, padding=padding))
-            found.append(x / (x.square().sum(dim=1, keepdim=True).sqrt() + UNIT))
+            found.append(x / (x.square().sum(dim=1, keepdim=True).sqrt() + EPSILON))
         return found
 
     @torch.no_grad()
@@ -117,13 +147,13 @@ def _heads(path: Path, channels: list[int]) -> list[Tensor]:
 
 
 def _state(path: Path) -> dict[str, Tensor]:
-    """A state dict, read without running anything that the file says."""
+    """A state dict; reading it runs no code from the file."""
     if not path.is_file():
         raise FormatError(path, "there is no such file")
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
     except (RuntimeError, OSError, EOFError, ValueError, KeyError, pickle.UnpicklingError) as error:
-        raise FormatError(path, "is no file of torch weights") from error
+        raise FormatError(path, "is not a file of torch weights") from error
     if not isinstance(state, dict):
         raise FormatError(path, "should hold a state dict")
     return {key: value for key, value in state.items() if isinstance(value, Tensor)}

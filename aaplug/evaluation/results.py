@@ -1,4 +1,4 @@
-"""What an evaluation found, as data, and its printed forms: table, results.json, per_view.json, results.csv."""
+"""The results of an evaluation as data and in print: tables, results.json, per_view.json, results.csv."""
 
 import csv
 import io
@@ -10,16 +10,20 @@ from typing import Any
 from rich.markup import escape
 from rich.table import Table
 
-from aaplug.evaluation.metrics import METRICS, PSNR, SSIM, Metric
+from aaplug.evaluation.metric import Metric
+from aaplug.evaluation.metrics import METRICS, PSNR, SSIM
 
-CEILING = "training size, resampled"  # the row that every table holds
+CEILING = "training size, resampled"  # a row of every table: the own training-size look
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """One recipe at one scale on one view; values by metric, None where undefined (`note` says why).
+    """One candidate at one scale on one view.
 
-    samples: along a pixel's side.  pairs: of a splat and a pixel that compositing evaluated, None where not counted.
+    recipe: the candidate's name.
+    values: by metric; None where undefined, and `note` says why.
+    samples: along a pixel's side.
+    evaluations: splat-pixel evaluations of compositing; None where not counted.
     """
 
     recipe: str
@@ -29,21 +33,26 @@ class Measurement:
     samples: int
     seconds: float
     note: str = ""
-    pairs: int | None = None
+    evaluations: int | None = None
 
 
 @dataclass(frozen=True)
 class Report:
-    """Measurements and the protocol that gives them meaning (JSON-ready)."""
+    """Measurements and the protocol that gives them meaning (JSON-ready).
+
+    measured: the metrics; those of `METRICS` need not be given.
+    """
 
     measurements: tuple[Measurement, ...]
     protocol: Mapping[str, Any]
+    measured: tuple[Metric, ...] = ()
 
     @property
     def metrics(self) -> tuple[Metric, ...]:
-        """What was measured, in order."""
+        """The metrics measured, in order."""
         names = dict.fromkeys(name for m in self.measurements for name in m.values)
-        return tuple(METRICS[name] for name in names) or (PSNR, SSIM["wang"])
+        given = {metric.name: metric for metric in self.measured}
+        return tuple(given.get(name) or METRICS[name] for name in names) or (PSNR, SSIM["wang"])
 
     @property
     def recipes(self) -> tuple[str, ...]:
@@ -60,9 +69,13 @@ class Report:
         return tuple(m for m in self.measurements if m.recipe == recipe and m.scale == scale)
 
     def with_more(self, other: "Report") -> "Report":
-        """Measurements by the same protocol together."""
+        """Join two reports of the same protocol."""
         recipes = {**self.protocol["recipes"], **other.protocol["recipes"]}
-        return Report(self.measurements + other.measurements, {**self.protocol, "recipes": recipes})
+        measurements, protocol = (
+            self.measurements + other.measurements,
+            {**self.protocol, "recipes": recipes},
+        )
+        return Report(measurements, protocol, self.measured + other.measured)
 
 
 def mean(measurements: Iterable[Measurement], metric: str) -> float | None:
@@ -71,7 +84,7 @@ def mean(measurements: Iterable[Measurement], metric: str) -> float | None:
 
 
 def scale_name(scale: float) -> str:
-    """How people write a scale: 1/4, 1, 2×, 0.3."""
+    """A scale in words: 1/4, 1, 2×, 0.3."""
     if scale > 1:
         return f"{scale:g}×"
     fraction = Fraction(scale).limit_denominator(64)
@@ -80,7 +93,7 @@ def scale_name(scale: float) -> str:
 
 
 def tables(report: Report) -> list[Table]:
-    """A table a metric, one of seconds and one of pairs a view, recipes down and scales across; the best is bold."""
+    """A table per metric, then seconds and evaluations per view; recipes down, scales across, the best value bold."""
     what = f"{report.protocol['truth']}, {report.protocol['views']} views"
     grids = []
     for metric in report.metrics:
@@ -117,10 +130,10 @@ def rows(report: Report, metric: Metric) -> list[list[tuple[str, bool]]]:
 
 
 def work(report: Report) -> list[tuple[str, list[list[str]]]]:
-    """Tables of what a view costs, recipes down and scales across, as (title, lines)."""
+    """Tables of a view's cost, recipes down and scales across, as (title, lines)."""
     columns = [("seconds a view", seconds, 3)]
-    if any(m.pairs is not None for m in report.measurements):
-        columns.append(("million pairs a view", million_pairs, 2))
+    if any(m.evaluations is not None for m in report.measurements):
+        columns.append(("million evaluations a view", million_evaluations, 2))
     return [
         (
             title,
@@ -134,7 +147,7 @@ def work(report: Report) -> list[tuple[str, list[list[str]]]]:
 
 
 def results(report: Report) -> dict[str, Any]:
-    """INRIA's results.json, {method: {metric: mean}} with methods named recipe@scale, and our protocol beside it."""
+    """INRIA's results.json, {method: {metric: mean}}, methods named recipe@scale; the protocol is "_aaplug"."""
     methods = {
         method(recipe, scale): {
             m.name: mean(report.select(recipe, scale), m.name) for m in report.metrics
@@ -146,7 +159,7 @@ def results(report: Report) -> dict[str, Any]:
 
 
 def per_view(report: Report) -> dict[str, Any]:
-    """INRIA's per_view.json, {method: {metric: {view: value}}}, with samples a pixel's side, seconds and pairs."""
+    """INRIA's per_view.json, {method: {metric: {view: value}}}, and samples per pixel side, seconds, evaluations."""
     methods: dict[str, Any] = {}
     for recipe in report.recipes:
         for scale in report.scales:
@@ -156,23 +169,23 @@ def per_view(report: Report) -> dict[str, Any]:
             }
             columns["samples"] = {v.view: v.samples for v in views}
             columns["seconds"] = {v.view: round(v.seconds, 4) for v in views}
-            columns["pairs"] = {v.view: v.pairs for v in views}
+            columns["evaluations"] = {v.view: v.evaluations for v in views}
             methods[method(recipe, scale)] = columns
     return methods | {"_aaplug": dict(report.protocol) | {"notes": _notes(report)}}
 
 
 def as_csv(reports: Mapping[str, Report]) -> str:
-    """A line a measurement, of all scenes by name; empty where undefined."""
+    """One line per measurement, of all scenes by name; empty where undefined."""
     metrics = list(dict.fromkeys(m.name for report in reports.values() for m in report.metrics))
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
-    fixed = ("samples", "pairs", "seconds", "note")
+    fixed = ("samples", "evaluations", "seconds", "note")
     table.writerow(["scene", "protocol", "recipe", "scale", "view", *metrics, *fixed])
     for scene, report in reports.items():
         name = report.protocol.get("protocol", {}).get("name", "")
         for m in report.measurements:
             values = [m.values.get(metric) for metric in metrics]
-            extra = (m.samples, m.pairs, round(m.seconds, 4), m.note)
+            extra = (m.samples, m.evaluations, round(m.seconds, 4), m.note)
             table.writerow([scene, name, m.recipe, f"{m.scale:g}", m.view, *values, *extra])
     return text.getvalue()
 
@@ -187,10 +200,10 @@ def seconds(report: Report, recipe: str, scale: float) -> float | None:
     return _mean([m.seconds for m in report.select(recipe, scale)])
 
 
-def million_pairs(report: Report, recipe: str, scale: float) -> float | None:
-    """Mean number of splat and pixel pairs that compositing evaluated in a view, in millions; None if not counted."""
-    pairs = [m.pairs / 1e6 for m in report.select(recipe, scale) if m.pairs is not None]
-    return _mean(pairs)
+def million_evaluations(report: Report, recipe: str, scale: float) -> float | None:
+    """Mean splat-pixel evaluations of a view, in millions; None if not counted."""
+    counts = [m.evaluations for m in report.select(recipe, scale)]
+    return _mean([count / 1e6 for count in counts if count is not None])
 
 
 def _mean(values: list[float]) -> float | None:

@@ -23,7 +23,7 @@ from aaplug.core.imaging import average_samples
 from aaplug.core.interfaces import Colour, Rasterizer, RunsKernels
 from aaplug.core.kernels import EAGER, Kernels
 from aaplug.core.projection import project, shade, with_depth_slopes
-from aaplug.core.sampling import check_frame, sampling_bounds
+from aaplug.core.sampling import MIN_SEEN_SHARE, sampling_bounds
 from aaplug.core.splats import Render, Splats2D, concatenated
 from aaplug.core.training import TrainingViews
 from aaplug.methods.filters import fuse_stored
@@ -71,6 +71,7 @@ class Renderer:
         background: Background = "auto",
         rasterizer: str | Rasterizer = "auto",
         cull_margin: float = math.inf,
+        min_seen: float = MIN_SEEN_SHARE,
     ) -> "Renderer":
         """Prepare a scene: check that the cameras see it, compute its sampling bounds and apply the world filter.
 
@@ -82,6 +83,7 @@ class Renderer:
             background: a colour, or "auto" for what training had (black where the camera files do not say).
             rasterizer: a rasterizer, or its name: "auto" is "compiled" where `aaplug warmup` has run, else "eager".
             cull_margin: see `TrainingViews`.
+            min_seen: share of the Gaussians that the cameras must see.
 
         Raises:
             FrameError: the cameras see little of the scene.
@@ -90,9 +92,7 @@ class Renderer:
         if isinstance(cameras, TrainingViews):
             training = cameras
         else:
-            views = cameras.train if isinstance(cameras, CameraSet) else cameras
-            check_frame(scene.means, views, scene.name)
-            training = TrainingViews.of(scene, views, cull_margin)
+            training = TrainingViews.of(scene, cameras, cull_margin, min_seen)
         if isinstance(recipe, str):
             recipe = find_recipe(recipe, quality=quality)
         if isinstance(rasterizer, str):

@@ -1,90 +1,57 @@
-"""A camera path as a video: one recipe, or two side by side with their names."""
+"""A camera path as a video: one renderer's images, or those of several in one frame."""
 
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from os import PathLike
 from pathlib import Path
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.cameras import Camera
-from aaplug.core.gaussians import Gaussians
-from aaplug.core.interfaces import Rasterizer
-from aaplug.core.training import TrainingViews
-from aaplug.evaluation.report.contact_sheet import labelled
+from aaplug.core.monitor import Tell
 from aaplug.io.images import read_image
 from aaplug.io.video import check_video, write_video
-from aaplug.methods.recipes import Recipe
-from aaplug.rendering.frames import Frames, write_frames
-from aaplug.rendering.renderer import smooth
+from aaplug.rendering.frames import write_frames
+from aaplug.rendering.renderer import Renderer
 
-GAP = 4  # px between two panes
-
-
-@dataclass(frozen=True)
-class Video:
-    """What is shown.  recipes: one, or several from left to right.  labels: a text for each pane."""
-
-    scene: Gaussians
-    training: TrainingViews
-    recipes: Sequence[Recipe]
-    labels: Sequence[str]
-    background: tuple[float, float, float]
-    cameras: Sequence[Camera]
-    fps: float
+Image = Float[Tensor, "h w 3"]
 
 
 def make_video(
-    video: Video,
-    path: Path,
-    rasterizer: Rasterizer,
-    threads: int,
+    path: str | PathLike[str],
+    renderers: Sequence[Renderer],
+    cameras: Sequence[Camera],
+    fps: float,
+    compose: Callable[[Sequence[Image]], Image] = lambda images: images[0],
+    *,
+    threads: int = 1,
     overwrite: bool = False,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    tell: Tell = lambda done, total: None,
 ) -> None:
-    """Render the frames, in processes side by side where that pays, and write the video.
+    """Render every camera with every renderer and write the video.
 
-    progress: told (images done, images in all).
+    compose: makes one frame of the renderers' images.  threads: as for `write_frames`.
+    tell: called with (images done, images in all).
 
     Raises:
         OutputError: the video or a frame cannot be written.
         UsageError: the codec is not installed, or a process died.
     """
-    check_video(path, video.fps, overwrite)
-    count = len(video.cameras)
-    total = count * len(video.recipes)
+    path = Path(path)
+    check_video(path, fps, overwrite)
+    count = len(cameras)
     with tempfile.TemporaryDirectory(prefix="aaplug-") as name:
         panes: list[list[Path]] = []
-        for place, recipe in enumerate(video.recipes):
-            paths = [Path(name) / f"{place}-{index:06d}.png" for index in range(count)]
-            frames = Frames(
-                smooth(video.scene, video.training, recipe),
-                video.training,
-                recipe,
-                video.background,
-                video.cameras,
-                paths,
-            )
-            write_frames(
-                frames,
-                rasterizer,
-                threads,
-                lambda done, _, before=place * count: progress(before + done, total),
-            )
-            panes.append(paths)
-        write_video(path, _composed(panes, video.labels), video.fps, overwrite)
+        for place, renderer in enumerate(renderers):
+            panes.append([Path(name) / f"{place}-{index:06d}.png" for index in range(count)])
 
+            def tell_all(done: int, _: int, before: int = place * count) -> None:
+                tell(before + done, count * len(renderers))
 
-def _composed(
-    panes: Sequence[Sequence[Path]], labels: Sequence[str]
-) -> Iterator[Float[Tensor, "h w 3"]]:
-    for paths in zip(*panes, strict=True):
-        images = [read_image(path, None) for path in paths]
-        if len(images) == 1:
-            yield images[0]
-            continue
-        shown = [labelled(image, label) for image, label in zip(images, labels, strict=True)]
-        gap = torch.zeros(shown[0].shape[0], GAP, 3)
-        yield torch.cat([part for image in shown for part in (gap, image)][1:], dim=1)
+            write_frames(renderer, cameras, panes[-1], threads=threads, tell=tell_all)
+        frames = (
+            compose([read_image(file, None) for file in files])
+            for files in zip(*panes, strict=True)
+        )
+        write_video(path, frames, fps, overwrite)

@@ -1,11 +1,11 @@
-"""The record of an evaluation: what survives a kill, and what it refuses."""
+"""The journal of an evaluation: what survives an interruption, and what it refuses."""
 
 import json
 
 import pytest
 
 from aaplug.core.errors import OutputError, UsageError
-from aaplug.evaluation.journal import Record
+from aaplug.evaluation.journal import Journal
 from aaplug.evaluation.results import Measurement
 
 REQUEST = {"views": 3, "scales": [1.0, 0.1]}
@@ -17,75 +17,75 @@ def measured(view: str) -> Measurement:
 
 @pytest.fixture
 def path(tmp_path):
-    """A record of two finished views."""
-    record = Record(tmp_path / "r" / "progress.jsonl", REQUEST, resume=False)
+    """A journal of two finished views."""
+    journal = Journal(tmp_path / "r" / "progress.jsonl", REQUEST, resume=False)
     for i, name in enumerate("ab"):
-        record.add(i, [measured(name)])
-    record.close()
-    return record.path
+        journal.add(i, [measured(name)])
+    journal.close()
+    return journal.path
 
 
 def test_what_is_finished_comes_back_to_the_bit(path):
-    record = Record(path, REQUEST, resume=True)
-    assert record.known == {0: (measured("a"),), 1: (measured("b"),)}
-    record.close()
+    journal = Journal(path, REQUEST, resume=True)
+    assert journal.known == {0: (measured("a"),), 1: (measured("b"),)}
+    journal.close()
 
 
 @pytest.mark.parametrize("lost", [1, 20, 60])
 def test_a_torn_line_is_forgotten_and_written_again(path, lost):
     whole = path.read_bytes()
     path.write_bytes(whole[:-lost])
-    record = Record(path, REQUEST, resume=True)
-    assert list(record.known) == [0]
-    record.add(1, [measured("b")])
-    record.close()
+    journal = Journal(path, REQUEST, resume=True)
+    assert list(journal.known) == [0]
+    journal.add(1, [measured("b")])
+    journal.close()
     assert path.read_bytes() == whole
 
 
 def test_zeros_that_a_lost_disk_leaves_are_forgotten(path):
     whole = path.read_bytes()
     path.write_bytes(whole + b"\0" * 50 + b"\n")
-    record = Record(path, REQUEST, resume=True)
-    record.close()
-    assert sorted(record.known) == [0, 1]
+    journal = Journal(path, REQUEST, resume=True)
+    journal.close()
+    assert sorted(journal.known) == [0, 1]
     assert path.read_bytes() == whole
 
 
 def test_a_torn_first_line_starts_anew(path):
     path.write_bytes(path.read_bytes()[:10])
-    record = Record(path, REQUEST, resume=True)
-    assert not record.known
-    record.add(0, [measured("a")])
-    record.close()
+    journal = Journal(path, REQUEST, resume=True)
+    assert not journal.known
+    journal.add(0, [measured("a")])
+    journal.close()
     assert json.loads(path.read_text().splitlines()[0])["request"] == REQUEST
 
 
 def test_another_request_is_refused_by_what_changed(path):
     with pytest.raises(UsageError, match=r"another request \(scales changed"):
-        Record(path, REQUEST | {"scales": [1.0]}, resume=True)
+        Journal(path, REQUEST | {"scales": [1.0]}, resume=True)
 
 
 def test_without_resume_it_starts_anew(path):
-    record = Record(path, REQUEST | {"views": 9}, resume=False)
-    record.add(0, [measured("c")])
-    record.close()
+    journal = Journal(path, REQUEST | {"views": 9}, resume=False)
+    journal.add(0, [measured("c")])
+    journal.close()
     assert len(path.read_text().splitlines()) == 2
 
 
-def test_two_processes_do_not_share_a_record(path):
-    first = Record(path, REQUEST, resume=True)
+def test_two_processes_do_not_share_a_journal(path):
+    first = Journal(path, REQUEST, resume=True)
     with pytest.raises(UsageError, match="another process"):
-        Record(path, REQUEST, resume=True)
+        Journal(path, REQUEST, resume=True)
     first.close()
 
 
 def test_nothing_is_made_before_the_first_view_is_done(tmp_path):
-    Record(tmp_path / "deep" / "progress.jsonl", REQUEST, resume=True).close()
+    Journal(tmp_path / "deep" / "progress.jsonl", REQUEST, resume=True).close()
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_place_that_cannot_be_written_is_named(tmp_path):
     (tmp_path / "file").write_text("")
-    record = Record(tmp_path / "file" / "progress.jsonl", REQUEST, resume=False)
+    journal = Journal(tmp_path / "file" / "progress.jsonl", REQUEST, resume=False)
     with pytest.raises(OutputError, match=r"progress\.jsonl: cannot be written"):
-        record.add(0, [measured("a")])
+        journal.add(0, [measured("a")])

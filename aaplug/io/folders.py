@@ -1,4 +1,4 @@
-"""Output folders and the refusal to replace what stands in them."""
+"""Output folders: making them, and refusing to replace what they hold."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -7,7 +7,7 @@ from aaplug.core.errors import OutputError, listing
 
 
 def refuse_existing(paths: Sequence[Path], overwrite: bool) -> None:
-    """Stop before any work if one of the files, all in one folder, exists and may not be replaced.
+    """Check, before any work, that none of these files of one folder exists, unless they may be replaced.
 
     Raises:
         OutputError: a file exists and `overwrite` is false, or the folder is a file.
@@ -17,11 +17,11 @@ def refuse_existing(paths: Sequence[Path], overwrite: bool) -> None:
         raise OutputError(folder, "is a file; name a folder")
     existing = [path.name for path in paths if path.exists()]
     if existing and not overwrite:
-        raise OutputError(folder, f"holds {listing(existing, most=3)} already; pass --overwrite")
+        raise OutputError(folder, f"already holds {listing(existing, most=3)}; pass `overwrite`")
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder and those above it.
+    """Make a folder and its parents.
 
     Raises:
         OutputError: it cannot be made.

@@ -1,9 +1,8 @@
-"""Larger images from smaller ones, for views larger than training's: a guess that fine-tuning takes for the truth.
+"""Upsamplers: an estimate of the truth for views larger than training's.
 
-Built in are bicubic and Lanczos; learned ones come as the user's file of weights: a network of OpenCV's
-`dnn_superres` named as theirs are (ESPCN_x4.pb), or a torch program (.pt2, `torch.export`) that takes [1, 3, h, w] in
-[0, 1] and gives [1, 3, H, W].  What a network gives is brought to the size asked for: averaged where it is larger,
-bicubic where it is smaller.
+Bicubic and Lanczos are built in.  A learned one is a file of the user: a network for OpenCV's `dnn_superres` under its
+usual name (ESPCN_x4.pb), or a torch program (.pt2, `torch.export`) that maps [1, 3, h, w] in [0, 1] to [1, 3, H, W].
+The network's image is resized to the size asked for: averaged where it is larger, bicubic where it is smaller.
 """
 
 import re
@@ -34,10 +33,10 @@ UPSAMPLERS: dict[str, Upsampler] = {"bicubic": bicubic, "lanczos": lanczos}
 
 
 def find_upsampler(name: str) -> Upsampler:
-    """One that is built in, or the network in a file.
+    """A built-in upsampler by name, or the network in a file.
 
     Raises:
-        UsageError: neither is meant.
+        UsageError: the name is neither.
         FormatError: the file cannot be read as what its name says.
     """
     if name in UPSAMPLERS:
@@ -45,18 +44,18 @@ def find_upsampler(name: str) -> Upsampler:
     path = Path(name)
     if path.suffix not in (".pb", ".pt2"):
         raise UsageError(
-            "--upsampler", f"expected {', '.join(UPSAMPLERS)} or a .pb or .pt2 file, got '{name}'"
+            "upsampler", f"expected {', '.join(UPSAMPLERS)} or a .pb or .pt2 file, got '{name}'"
         )
     if not path.is_file():
         raise FormatError(path, "does not exist")
     network = _opencv(path) if path.suffix == ".pb" else _torch(path)
-    return lambda image, hw: _brought_to(network(image), hw)
+    return lambda image, hw: _at_size(network(image), hw)
 
 
 def _opencv(path: Path) -> Callable[[Tensor], Tensor]:
     match = OPENCV_NAME.fullmatch(path.name)
     if match is None:
-        raise FormatError(path, "has no name such as ESPCN_x4.pb, which tells network and factor")
+        raise FormatError(path, "needs a name such as ESPCN_x4.pb, which gives network and factor")
     network = cv2.dnn_superres.DnnSuperResImpl.create()
     try:
         network.readModel(str(path))
@@ -78,7 +77,7 @@ def _opencv(path: Path) -> Callable[[Tensor], Tensor]:
 def _torch(path: Path) -> Callable[[Tensor], Tensor]:
     try:
         module = torch.export.load(path).module()
-    except Exception as error:  # a file of anything fails in any way
+    except Exception as error:  # torch fails in many ways on a wrong file
         raise FormatError(path, "is not a program of torch.export") from error
 
     def enlarge(image: Tensor) -> Tensor:
@@ -94,7 +93,7 @@ def _torch(path: Path) -> Callable[[Tensor], Tensor]:
     return enlarge
 
 
-def _brought_to(image: Tensor, hw: tuple[int, int]) -> Tensor:
+def _at_size(image: Tensor, hw: tuple[int, int]) -> Tensor:
     if tuple(image.shape[:2]) == hw:
         return image
     kernel = cv2.INTER_AREA if image.shape[0] > hw[0] else cv2.INTER_CUBIC

@@ -1,0 +1,158 @@
+"""Worker pools: apply one function to many items in this process, in threads or in processes.
+
+Results come in the order of the items, and a pool reads only a few items ahead of its workers, so memory does not grow
+with the number of items.  Leaving the loop early, also by an exception, ends the workers.
+"""
+
+import multiprocessing
+import os
+import shutil
+import tempfile
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+    wait,
+)
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+
+import torch
+
+from aaplug.core.errors import UsageError
+
+T, R = TypeVar("T"), TypeVar("R")
+
+
+class Executor(Protocol):
+    """Applies a function to items."""
+
+    def map(self, work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+        """Yield `work(item)` of every item, in order; an exception of `work` is raised here."""
+        ...
+
+
+class Serial:
+    """One item after the other, in this thread."""
+
+    def map(self, work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+        """Yield `work(item)` of every item."""
+        return map(work, items)
+
+
+@dataclass(frozen=True)
+class Threads:
+    """Threads of this process, each with one torch thread.  At most one item per thread waits."""
+
+    workers: int
+
+    def map(self, work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+        """Yield `work(item)` of every item, in order."""
+        pool = ThreadPoolExecutor(self.workers, initializer=torch.set_num_threads, initargs=(1,))
+        with torch_threads(1), pool:
+            try:
+                yield from _results(lambda item: pool.submit(work, item), items, self.workers + 1)
+            finally:
+                pool.shutdown(cancel_futures=True)
+
+
+@dataclass(frozen=True)
+class Processes:
+    """Fresh (spawned) processes.
+
+    `work` is pickled once, to a file that all of them map, so it can hold a large scene; items and results travel
+    through pipes.  A script that uses processes needs `if __name__ == "__main__":` around its calls.
+
+    torch_threads: of each process; None leaves torch's default.
+    ordered: whether results come in the order of the items, or else as they finish.
+    """
+
+    workers: int
+    torch_threads: int | None = 1
+    ordered: bool = True
+
+    def map(self, work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+        """Yield `work(item)` of every item.
+
+        Raises:
+            UsageError: a process died, for example for lack of memory.
+        """
+        with tempfile.TemporaryDirectory(prefix="aaplug-", ignore_cleanup_errors=True) as folder:
+            torch.save(work, Path(folder) / "work.pt")
+            start = (folder, self.torch_threads)
+            spawn = multiprocessing.get_context("spawn")
+            pool = ProcessPoolExecutor(self.workers, spawn, _start, start)
+            try:
+                most = 2 * self.workers
+                yield from _results(lambda i: pool.submit(_call, i), items, most, self.ordered)
+            except BrokenProcessPool as error:
+                raise UsageError(
+                    "worker process",
+                    "died: out of memory (fewer threads need less), or started by a script "
+                    'without `if __name__ == "__main__":`',
+                ) from error
+            finally:
+                pool.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def torch_threads(count: int) -> Iterator[None]:
+    """Let torch use `count` threads inside the block."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def _results(
+    submit: Callable[[T], "Future[R]"], items: Iterable[T], most: int, ordered: bool = True
+) -> Iterator[R]:
+    """The results, with at most `most` items submitted and not yet yielded."""
+    waiting: deque[Future[R]] = deque()
+    for item in items:
+        waiting.append(submit(item))
+        if len(waiting) >= most:
+            yield _next(waiting, ordered)
+    while waiting:
+        yield _next(waiting, ordered)
+
+
+def _next(waiting: "deque[Future[R]]", ordered: bool) -> R:
+    done = waiting[0] if ordered else next(iter(wait(waiting, return_when=FIRST_COMPLETED).done))
+    waiting.remove(done)
+    return done.result()
+
+
+_work: Callable[[Any], Any] | None = None  # what this worker process does
+
+
+def _start(folder: str, threads: int | None) -> None:
+    """Begin a worker process: load the work, and watch the parent."""
+    global _work
+    threading.Thread(target=_end_with_parent, args=(folder,), daemon=True).start()
+    if threads is not None:
+        torch.set_num_threads(threads)
+    _work = torch.load(Path(folder) / "work.pt", mmap=True, weights_only=False)  # our own file
+
+
+def _end_with_parent(folder: str) -> None:
+    """End this process when its parent has died without shutting the pool down."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    shutil.rmtree(folder, ignore_errors=True)
+    os._exit(1)
+
+
+def _call(item: Any) -> Any:
+    assert _work is not None
+    return _work(item)

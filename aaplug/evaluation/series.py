@@ -1,0 +1,93 @@
+"""Drawing with a stopwatch, and the images of one candidate that a figure without a truth looks at."""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from aaplug.core.cameras import Camera
+from aaplug.core.interfaces import Colour, CountsEvaluations
+from aaplug.rendering.renderer import Renderer
+
+SHIFT_STEPS = 4  # frames of a motion; between two of them the image moves 1/4 px right and down
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A timed render.
+
+    samples: along a pixel's side.  seconds: wall clock.  evaluations: of a splat at a pixel; None if not counted.
+    """
+
+    rgb: Float[Tensor, "h w 3"]
+    alpha: Float[Tensor, "h w"]
+    background: Colour
+    samples: int
+    seconds: float
+    evaluations: int | None
+
+    @property
+    def light(self) -> Float[Tensor, "h w 3"]:
+        """The colours without the background."""
+        return self.rgb - (1 - self.alpha[..., None]) * self.rgb.new_tensor(self.background)
+
+    def resampled_to(self, rgb: Float[Tensor, "h2 w2 3"]) -> "Drawn":
+        """An opaque image made from this render, at the cost of this render."""
+        return replace(self, rgb=rgb, alpha=rgb.new_ones(rgb.shape[:2]), samples=1)
+
+
+class TimedRenderer:
+    """A renderer that times its images and counts their splat-pixel evaluations where its rasterizer can."""
+
+    def __init__(self, renderer: Renderer):
+        self._evaluations: list[int] | None = None
+        if isinstance(renderer.rasterizer, CountsEvaluations):
+            self._evaluations = []
+            counting = renderer.rasterizer.counting(self._evaluations.append)
+            renderer = replace(renderer, rasterizer=counting)
+        self.renderer = renderer
+
+    def __call__(self, camera: Camera) -> Drawn:
+        """Render one view, without gradients."""
+        if self._evaluations is not None:
+            self._evaluations.clear()
+        started = time.perf_counter()
+        with torch.no_grad():
+            rgb, alpha = self.renderer(camera)
+        seconds = time.perf_counter() - started
+        evaluations = None if self._evaluations is None else sum(self._evaluations)
+        samples = self.renderer.samples(camera)
+        background = self.renderer.background
+        return Drawn(rgb.float(), alpha.float(), background, samples, seconds, evaluations)
+
+    def motion(self, camera: Camera, scale: float = 1.0) -> list[Float[Tensor, "h w 3"]]:
+        """Frames, clamped to [0, 1], whose content moves by 1/4 px of the image that is `scale` times as large."""
+        shifted = (_shifted(camera, step / scale) for step in range(SHIFT_STEPS))
+        return [self(view).rgb.clamp(0, 1) for view in shifted]
+
+
+@dataclass(frozen=True)
+class Series:
+    """Images of one candidate in one view at one scale.
+
+    drawn: at that scale.
+    full: by the same candidate at the training size; None if scale 1 is not measured or a scale moves the camera.
+    smaller: averages a training-size image down to that scale.
+    frames: draws the candidate's frames of a small motion, and those of the scene's own look, averaged down; None if a
+        scale moves the camera.
+    """
+
+    scale: float
+    drawn: Drawn
+    full: Drawn | None
+    smaller: Callable[[Float[Tensor, "H W 3"]], Float[Tensor, "h w 3"]]
+    frames: Callable[[], tuple[Sequence[Tensor], Sequence[Tensor]]] | None
+
+
+def _shifted(camera: Camera, steps: float) -> Camera:
+    """The view with its image moved right and down by `steps` quarters of a pixel."""
+    step = steps / SHIFT_STEPS
+    return replace(camera, cx=camera.cx + step, cy=camera.cy + step)

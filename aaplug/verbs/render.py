@@ -1,0 +1,127 @@
+"""Images of a scene at new resolutions."""
+
+import math
+from collections.abc import Sequence
+from os import PathLike
+from pathlib import Path
+from typing import NamedTuple
+
+from aaplug.core.cameras import Camera
+from aaplug.core.errors import listing
+from aaplug.core.interfaces import Rasterizer
+from aaplug.core.monitor import SILENT, Monitor
+from aaplug.core.sampling import MIN_SEEN_SHARE
+from aaplug.core.training import TrainingViews
+from aaplug.io.cameras import select_views
+from aaplug.io.folders import make_folder
+from aaplug.methods.recipe import Recipe
+from aaplug.methods.recipes import find_recipe, suited
+from aaplug.rendering.frames import write_frames
+from aaplug.rendering.renderer import Background, Renderer
+from aaplug.verbs.inputs import (
+    CamerasLike,
+    SceneLike,
+    background_of,
+    cameras_of,
+    processor,
+    rasterizer_of,
+    scene_of,
+)
+from aaplug.verbs.views import image_paths, resized
+
+
+class Written(NamedTuple):
+    """A rendered view and its file."""
+
+    view: Camera
+    file: Path
+
+
+def render(
+    scene: SceneLike,
+    cameras: CamerasLike = None,
+    output: str | PathLike[str] = "images",
+    *,
+    views: str = "test",
+    recipe: str | Recipe = "auto",
+    quality: str = "balanced",
+    rate_reference: str | None = None,
+    scale: float | None = None,
+    resolution: str | None = None,
+    background: Background = "auto",
+    rasterizer: str | Rasterizer = "auto",
+    threads: int | None = None,
+    memory: float | None = None,
+    bit_depth: int = 8,
+    cull_margin: float = math.inf,
+    min_seen: float = MIN_SEEN_SHARE,
+    overwrite: bool = False,
+    monitor: Monitor = SILENT,
+) -> list[Written]:
+    """Render views at any resolution to PNG.
+
+    Args:
+        scene: Gaussians, a scene's file or a model folder.
+        cameras: a camera set, its file or folder, or None for those of the scene's model folder.
+        output: a folder, or one .png for one view.
+        views: "train", "test", "all", or names separated by commas.
+        recipe: a recipe, or its name in `RECIPES`.
+        quality: "fast", "balanced" or "best": samples per pixel of recipe "auto".
+        rate_reference: what "matched" and "auto" compare sampling rates with; see `Matched`.
+        scale: size relative to the training size.
+        resolution: "WIDTHxHEIGHT" in px instead; -1 on one side keeps the aspect.
+        background: "auto" (what training had), "white", "black" or a colour.
+        rasterizer: a rasterizer, or its name: "auto", "compiled" or one in `RASTERIZERS`.
+        threads: processor threads; None for all.
+        memory: GB per frame beside the scene and the image; None for the rasterizer's default.
+        bit_depth: 8 or 16 bits per colour channel.
+        cull_margin: see `TrainingViews`.
+        min_seen: share of the Gaussians that the cameras must see.
+        overwrite: replace existing images.
+        monitor: receives messages and progress.
+
+    Raises:
+        AaplugError: an input cannot be read, an argument does not fit, or an image cannot be written.
+    """
+    if isinstance(recipe, str):
+        recipe = find_recipe(recipe, quality=quality, rate_reference=rate_reference)
+    cameras = cameras_of(cameras, scene)
+    scene = scene_of(scene)
+    recipe = suited(recipe, scene)
+    shown = resized(select_views(cameras, views), scale, resolution)
+    paths = image_paths(Path(output), shown, overwrite)
+    colour = background_of(background, cameras, monitor)
+    with processor(threads) as workers:
+        drawing = rasterizer_of(rasterizer, len(shown), memory, monitor)
+        training = TrainingViews.of(scene, cameras, cull_margin, min_seen)
+        renderer = Renderer.of(scene, training, recipe, background=colour, rasterizer=drawing)
+        monitor.say(described(renderer, shown))
+        if not Path(output).suffix:
+            make_folder(Path(output))
+        with monitor.progress("rendering", "views") as tell:
+            write_frames(
+                renderer,
+                shown,
+                paths,
+                threads=workers,
+                bit_depth=bit_depth,
+                overwrite=overwrite,
+                tell=tell,
+            )
+    return [Written(*pair) for pair in zip(shown, paths, strict=True)]
+
+
+def described(renderer: Renderer, views: Sequence[Camera]) -> str:
+    """What is about to be rendered, in words."""
+    rates = [renderer.relative_rate(view) for view in views]
+    samples = sorted({renderer.samples(view) for view in views})
+    grid = " or ".join(f"{n}×{n}" for n in samples)
+    sizes = listing(sorted({f"{view.width}x{view.height}" for view in views}), most=3)
+    span = " to ".join(dict.fromkeys(f"{rate:.3g}" for rate in (min(rates), max(rates))))
+    kind = f"{renderer.training.convention.name} scene"
+    if renderer.scene.flat:
+        kind += " of 2D Gaussians"
+    return (
+        f"recipe: {renderer.recipe.name} for a {kind}, {len(views)} view{'s' * (len(views) != 1)} at {sizes}, "
+        f"{span} × the training rate: {grid} sample{'s' * (samples != [1])} per pixel"
+    )
