@@ -109,7 +109,7 @@ def sized(scene: Gaussians) -> Gaussians:
 def make_splats(
     m: int, hw: tuple[int, int], seed: int = 0, log_sigmas: tuple[float, float] = (-1.0, 2.0)
 ) -> Splats2D:
-    """Random coloured splats in and around an image; log_sigmas: range of the natural log of standard deviations in px."""
+    """Random coloured splats in and around an image; log_sigmas: range of ln standard deviations, in px."""
     g = torch.Generator().manual_seed(seed)
     low, high = log_sigmas
     sigmas = torch.exp(low + (high - low) * torch.rand(m, 2, generator=g))
@@ -125,4 +125,19 @@ def make_splats(
         opacities=torch.rand(m, generator=g),
         sources=torch.arange(m),
         rgb=torch.rand(m, 3, generator=g),
+    )
+
+
+def splats_of(*rows: tuple) -> Splats2D:
+    """Splats of (mean, covariance, depth, opacity, colour), in float64."""
+    means, covs, depths, opacities, colours = zip(*rows, strict=True)
+    covs = torch.tensor(covs, dtype=torch.float64)
+    return Splats2D(
+        means=torch.tensor(means, dtype=torch.float64),
+        covs=covs,
+        dets=covs[:, 0] * covs[:, 2] - covs[:, 1].square(),
+        depths=torch.tensor(depths, dtype=torch.float64),
+        opacities=torch.tensor(opacities, dtype=torch.float64),
+        sources=torch.arange(len(rows)),
+        rgb=torch.tensor(colours, dtype=torch.float64),
     )

@@ -1,4 +1,4 @@
-"""Projection by hand, against finite differences, and colour against a table of spherical harmonics."""
+"""Projection worked by hand and by finite differences; colour by a table of spherical harmonics."""
 
 import math
 from dataclasses import replace
@@ -10,7 +10,8 @@ import torch
 from aaplug.core import projection
 from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import Gaussians
-from aaplug.core.projection import project, rotation_matrices, sh_colour, shade
+from aaplug.core.projection import project, rotation_matrices, shade
+from aaplug.core.spherical_harmonics import sh_colour
 from tests.conftest import make_camera, make_scene
 
 F64 = torch.float64
@@ -54,7 +55,7 @@ def sandwich(jacobian: list[list[float]], covariance: torch.Tensor) -> torch.Ten
 
 
 def world_covariance(scene: Gaussians) -> torch.Tensor:
-    """R S Sᵀ Rᵀ of the first Gaussian, R built by turning the axes with the quaternion's own product."""
+    """R S Sᵀ Rᵀ of the first Gaussian; R rotates the axes by the quaternion product."""
     w, x, y, z = (scene.quats[0] / scene.quats[0].norm()).tolist()
     v, eye = torch.tensor([x, y, z], dtype=F64), torch.eye(3, dtype=F64)
     turned = [
@@ -116,7 +117,7 @@ def test_rotations_are_orthonormal_and_right_handed():
     torch.testing.assert_close(torch.linalg.det(rotations), torch.ones(20, dtype=F64))
 
 
-def test_integer_pixels_of_3dgs_are_half_a_pixel_less_than_ours():
+def test_pixel_coordinates_of_3dgs_are_half_a_pixel_less():
     camera = straight_camera(fx=90.0, fy=70.0)
     x, y, z = 0.7, -0.4, 3.0
     ndc = x / z * camera.fx / (camera.width / 2), y / z * camera.fy / (camera.height / 2)
@@ -137,7 +138,7 @@ def test_the_near_plane_itself_is_not_drawn(dtype):
     torch.testing.assert_close(splats.opacities, scene.opacities[[1, 4]])
 
 
-def test_nothing_in_front_of_the_camera_is_no_splats():
+def test_a_scene_behind_the_camera_has_no_splats():
     splats = project(one_gaussian((0.0, 0.0, -1.0)), straight_camera())
     assert len(splats) == 0
     assert shade(splats, one_gaussian((0.0, 0.0, -1.0)), straight_camera()).rgb.shape == (0, 3)
@@ -147,7 +148,7 @@ def test_nothing_in_front_of_the_camera_is_no_splats():
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_off_the_axis_a_covariance_follows_the_derivative_of_the_pinhole(seed):
+def test_off_axis_covariances_follow_the_derivative_of_the_pinhole(seed):
     camera = replace(make_camera((2.0, -3.0, 1.0)), fy=50.0, cx=20.0, cy=31.0)
     scene = make_scene(1, seed=seed, dtype=F64)
     scene = replace(scene, means=scene.means * 0.5)
@@ -188,7 +189,7 @@ def test_off_the_axis_a_covariance_follows_the_derivative_of_the_pinhole(seed):
         ((40.0, 45.0), (0.0, -0.9), (0.0, -0.54)),
     ],
 )
-def test_the_derivative_is_taken_no_farther_out_than_the_widened_image(centre, slope, held):
+def test_the_jacobian_is_clamped_to_the_widened_image(centre, slope, held):
     camera, depth = straight_camera(centre=centre), 2.0
     half = math.radians(50) / 2
     scene = one_gaussian(
@@ -203,7 +204,7 @@ def test_the_derivative_is_taken_no_farther_out_than_the_widened_image(centre, s
     torch.testing.assert_close(splats.means[0], torch.tensor(landed, dtype=F64))
 
 
-def test_for_a_centred_camera_the_derivative_stops_at_1_3_times_the_field_of_view():
+def test_for_a_centred_camera_the_jacobian_is_clamped_at_1_3_times_the_field_of_view():
     camera = straight_camera(fx=64.0, fy=64.0)
     tangent = camera.width / 2 / camera.fx
     scene = one_gaussian((20.0, 0.0, 2.0), scales=(1e-9, 1e-9, 0.1))
@@ -241,13 +242,13 @@ def needles(n: int, long: float, thin: float) -> tuple[Gaussians, Camera]:
 
 
 @pytest.mark.parametrize(("long", "thin"), [(200.0, 0.1), (200.0, 0.01), (2000.0, 0.01)])
-def test_the_determinant_of_a_needle_has_its_digits_in_float32(long, thin):
+def test_the_determinant_of_a_needle_is_exact_in_float32(long, thin):
     scene, camera = needles(500, long, thin)
     scene = scene.to(torch.float32)
     single, exact = project(scene, camera), project(scene.to(F64), camera)
     from_covariance = single.covs[:, 0] * single.covs[:, 2] - single.covs[:, 1].square()
     lost = (from_covariance.double() / exact.dets - 1).abs()
-    assert lost.median() > 1e-3, "a needle this thin is meant to defeat the plain formula"
+    assert lost.median() > 1e-3, "the plain formula should fail for a needle this thin"
     error = (single.dets.double() / exact.dets - 1).abs()
     assert error.max() < 1e-5
 
@@ -258,7 +259,7 @@ def test_the_determinant_is_that_of_the_covariance():
     torch.testing.assert_close(splats.dets, xx * yy - xy * xy, rtol=1e-8, atol=0)
 
 
-def test_a_flat_gaussian_seen_from_its_side_has_a_determinant_of_no_less_than_zero():
+def test_the_determinant_of_a_disc_seen_edge_on_is_not_negative():
     scene = one_gaussian((0.0, 0.0, 2.0), scales=(1.0, 1e-20, 1.0))
     splats = project(scene.to(torch.float32), straight_camera())
     assert splats.dets.item() >= 0
@@ -334,7 +335,7 @@ DIRECTIONS = {
     "diagonal": (D, D, D),
     "thirds": (2 / 3, -1 / 3, 2 / 3),
 }
-# every function of the basis, worked out on paper in these directions
+# every basis function in these directions, worked by hand
 TABLE = [
     ("0", C0, {"+x": 1, "+y": 1, "+z": 1, "diagonal": 1, "thirds": 1}),
     ("-y", -C1, {"+y": 1, "diagonal": D, "thirds": -1 / 3}),
@@ -356,7 +357,7 @@ TABLE = [
 
 
 def basis(directions: torch.Tensor, functions: int = 16) -> torch.Tensor:
-    """Value of each function in each direction, read off the colour of scenes that hold one function alone."""
+    """Value of each function in each direction, from the colour of scenes with that function only."""
     m = len(directions)
     columns = []
     for k in range(functions):
@@ -367,7 +368,7 @@ def basis(directions: torch.Tensor, functions: int = 16) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("direction", DIRECTIONS)
-def test_spherical_harmonics_have_their_values_on_paper(direction):
+def test_spherical_harmonics_have_the_values_of_the_table(direction):
     values = basis(torch.tensor([DIRECTIONS[direction]], dtype=F64))[0]
     expected = [factor * where.get(direction, 0.0) for _, factor, where in TABLE]
     torch.testing.assert_close(values, torch.tensor(expected, dtype=F64), atol=1e-9, rtol=1e-9)
@@ -386,13 +387,13 @@ def test_spherical_harmonics_are_orthonormal():
 
 
 @pytest.mark.parametrize("functions", [1, 4, 9, 16])
-def test_a_lower_degree_is_the_beginning_of_a_higher_one(functions):
+def test_a_lower_degree_is_a_prefix_of_a_higher_one(functions):
     directions = torch.nn.functional.normalize(make_scene(10, dtype=F64).means, dim=1)
     torch.testing.assert_close(basis(directions, functions), basis(directions, 25)[:, :functions])
 
 
-def test_the_functions_of_degree_4_turn_with_the_order_they_have():
-    """Orders m and −m are one function, turned by a quarter of its period, as in the lower degrees."""
+def test_orders_m_and_minus_m_are_rotations_of_one_function():
+    """Order −m is order m rotated by a quarter of its period about z."""
     z = torch.tensor([0.3], dtype=F64)
     r = (1 - z * z).sqrt()
 
@@ -409,7 +410,7 @@ def test_the_functions_of_degree_4_turn_with_the_order_they_have():
         assert pole[middle] == pytest.approx(((2 * degree + 1) / (4 * PI)) ** 0.5)
 
 
-def test_channels_keep_apart():
+def test_channels_do_not_mix():
     sh = torch.zeros(1, 4, 3, dtype=F64)
     sh[0, 2] = torch.tensor([1.0, 2.0, -3.0])
     rgb = sh_colour(sh, torch.tensor([[0.0, 0.0, 1.0]], dtype=F64))
@@ -425,13 +426,13 @@ def test_colour_is_seen_along_the_ray_from_the_camera_to_the_gaussian():
     torch.testing.assert_close(rgb, expected)
 
 
-def test_colour_is_held_above_black_but_not_below_white():
+def test_colour_is_clamped_below_at_black_but_not_above():
     scene = one_gaussian((0.0, 0.0, 2.0), sh=torch.tensor([[[-9.0, 0.0, 9.0]]], dtype=F64))
     rgb = shade(project(scene, straight_camera()), scene, straight_camera()).rgb
     torch.testing.assert_close(rgb, torch.tensor([[0.0, 0.5, 0.5 + 9 * C0]], dtype=F64))
 
 
-def test_colours_go_with_their_gaussians_when_some_are_behind_the_camera():
+def test_colours_follow_their_gaussians_when_some_are_behind_the_camera():
     scene = make_scene(3, dtype=F64, degree=0)
     means = torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, 3.0], [0.1, 0.0, 2.0]], dtype=F64)
     scene = replace(scene, means=means)
@@ -439,9 +440,9 @@ def test_colours_go_with_their_gaussians_when_some_are_behind_the_camera():
     torch.testing.assert_close(splats.rgb, (scene.sh[1:, 0] * C0 + 0.5).clamp(min=0))
 
 
-def test_the_determinants_ratio_is_the_change_of_area_across_the_ray():
+def test_the_ratio_of_determinants_is_the_change_of_area_across_the_ray():
     # AAA-Gaussians' opacity factor, arXiv 2504.12811: with r = (Rᵀ·ray)², r·(s_y²s_z², s_z²s_x², s_x²s_y²) is the
-    # squared area orthogonal to the ray up to a factor of the view alone, as long as the Jacobian is not held.
+    # squared area orthogonal to the ray up to a factor of the view, as long as the Jacobian is not clamped.
     scene, camera = make_scene(200, seed=3, dtype=F64), make_camera((0.3, -6.0, 0.4), fov=1.2)
     wide = replace(scene, log_scales=0.5 * (scene.scales.square() + 0.05**2).log())
     before, after = project(scene, camera), project(wide, camera)
@@ -457,7 +458,7 @@ def test_the_determinants_ratio_is_the_change_of_area_across_the_ray():
     torch.testing.assert_close(before.dets / after.dets, factor, rtol=1e-9, atol=0)
 
 
-def test_colours_in_parts_are_the_same_colours(monkeypatch):
+def test_shading_in_chunks_gives_the_same_colours(monkeypatch):
     scene, camera = make_scene(50, degree=3), make_camera()
     splats = project(scene, camera)
     whole = shade(splats, scene, camera).rgb
@@ -466,7 +467,7 @@ def test_colours_in_parts_are_the_same_colours(monkeypatch):
     assert shade(splats, scene, camera).rgb.equal(whole)
 
 
-def test_colours_give_gradients_to_their_own_gaussians_alone():
+def test_gradients_of_colours_reach_only_the_gaussians_drawn():
     scene, camera = make_scene(50, degree=2), make_camera()
     splats = project(scene, camera)
     some = splats[torch.arange(0, len(splats.sources), 3)]
@@ -477,5 +478,5 @@ def test_colours_give_gradients_to_their_own_gaussians_alone():
     shown[some.sources] = True
     assert touched.any()
     assert not (touched & ~shown).any()
-    constant = sh.grad[:, 0][touched]  # of the first coefficient, where no channel is held at black
+    constant = sh.grad[:, 0][touched]  # of the first coefficient, where no channel is clamped at black
     assert constant.amax().item() == pytest.approx(0.28209479177387814)

@@ -1,7 +1,7 @@
-"""The rules of compositing by hand, the judge against a plain loop, and the fast rasterizer against the judge.
+"""Compositing worked by hand, the reference against a plain loop, and the tiled rasterizer against the reference.
 
-At a cut-off (alpha at 1/255, transmittance at 1e-4) float32 and float64 may decide differently.  Pixels where that
-can happen are told apart by `near_a_cut_off`: all others must agree tightly, and those that differ are counted.
+At a cut-off (alpha at 1/255, transmittance at 1e-4) float32 and float64 may decide differently.  `near_a_cutoff` finds
+the pixels where that can happen: all others must agree tightly, and those that differ are counted.
 """
 
 import math
@@ -9,18 +9,21 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
+from itertools import product
 from pathlib import Path
 
 import pytest
 import torch
 
-from aaplug.core.interfaces import Rasterizer
-from aaplug.core.kernels import EAGER
 from aaplug.core.ellipses import squared_cutoff
-from aaplug.core.splats import Splats2D
-from aaplug.rasterizers import Tiled, binning, drawing, reference
-from tests.conftest import ALL_RASTERIZERS, make_splats
+from aaplug.core.kernels import EAGER
+from aaplug.core.splats import Render, Splats2D
+from aaplug.methods.pixel_kernels import POINT
+from aaplug.methods.pixel_kernels.raster_rows import TILE
+from aaplug.rasterizers import Reference, Tiled, reference
+from aaplug.rasterizers.tiled import binning
+from tests.conftest import ALL_RASTERIZERS, make_splats, splats_of
 
 F64 = torch.float64
 BLACK, WHITE, SKY = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (0.25, 0.5, 1.0)
@@ -28,28 +31,13 @@ RED, GREEN, BLUE = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 TOLERANCE = 1e-5
 FLIPS = 1e-4  # share of pixels that may fall on the other side of a cut-off
 UNIT = (4.0, 0.0, 4.0)
-TILED = Tiled()
+TILED, REFERENCE = Tiled(), Reference()
 PROC_STATUS = Path("/proc/self/status")
 
 
 @pytest.fixture(params=ALL_RASTERIZERS.values(), ids=ALL_RASTERIZERS)
-def rasterize(request: pytest.FixtureRequest) -> Rasterizer:
-    return request.param
-
-
-def splats_of(*rows: tuple) -> Splats2D:
-    """Splats of (mean, covariance, depth, opacity, colour)."""
-    means, covs, depths, opacities, colours = zip(*rows, strict=True)
-    covs = torch.tensor(covs, dtype=F64)
-    return Splats2D(
-        means=torch.tensor(means, dtype=F64),
-        covs=covs,
-        dets=covs[:, 0] * covs[:, 2] - covs[:, 1].square(),
-        depths=torch.tensor(depths, dtype=F64),
-        opacities=torch.tensor(opacities, dtype=F64),
-        sources=torch.arange(len(rows)),
-        rgb=torch.tensor(colours, dtype=F64),
-    )
+def rasterize(request: pytest.FixtureRequest) -> Callable[..., Render]:
+    return partial(request.param, pixel=POINT)
 
 
 def stack(*layers: tuple[float, tuple[float, float, float]]) -> Splats2D:
@@ -91,7 +79,7 @@ def test_a_pixel_is_sampled_at_its_centre_x_along_columns_and_y_along_rows(raste
     close(between[3:5, 10:12], torch.full((2, 2), 0.9 * math.exp(-0.5 * (0.25 + 0.25) / 0.2)))
 
 
-def test_what_shines_through_is_the_background(rasterize):
+def test_the_background_has_the_remaining_transmittance(rasterize):
     image = rasterize(stack((0.75, RED)), (9, 9), SKY)
     close(image.rgb[4, 4], [0.75 + 0.25 * 0.25, 0.25 * 0.5, 0.25 * 1.0])
     close(image.alpha[4, 4], 0.75)
@@ -100,7 +88,7 @@ def test_what_shines_through_is_the_background(rasterize):
 
 
 @pytest.mark.parametrize("near_first", [True, False])
-def test_the_nearer_splat_hides_the_farther_whatever_their_order(rasterize, near_first):
+def test_nearer_splats_are_composited_first_in_any_order_of_input(rasterize, near_first):
     both = stack((0.6, RED), (0.5, GREEN))
     both = both if near_first else both[torch.tensor([1, 0])]
     image = rasterize(both, (9, 9), SKY)
@@ -121,15 +109,15 @@ def test_splats_of_equal_depth_are_drawn_in_scene_order(rasterize, order):
 
 
 @pytest.mark.parametrize("opacity", [0.991, 0.999, 1.0])
-def test_no_splat_hides_more_than_99_percent(rasterize, opacity):
+def test_alpha_is_capped_at_99_percent(rasterize, opacity):
     image = rasterize(stack((opacity, RED)), (9, 9), SKY)
     close(image.alpha[4, 4], 0.99)
     close(image.rgb[4, 4], [0.99 + 0.01 * 0.25, 0.01 * 0.5, 0.01])
-    close(image.alpha[4, 5], opacity * math.exp(-1 / 8))  # below the cap nothing is changed
+    close(image.alpha[4, 5], opacity * math.exp(-1 / 8))  # below the cap
 
 
 @pytest.mark.parametrize(("alpha", "drawn"), [(1.001 / 255, True), (0.999 / 255, False)])
-def test_contributions_under_1_255_are_skipped(rasterize, alpha, drawn):
+def test_alphas_below_1_255_are_skipped(rasterize, alpha, drawn):
     variance = 2.0**2 / (2 * math.log(0.5 / alpha))  # alpha two pixels from the centre
     splats = splats_of(((4.5, 4.5), (variance, 0.0, variance), 1.0, 0.5, RED))
     image = rasterize(splats, (9, 9), BLACK)
@@ -138,7 +126,7 @@ def test_contributions_under_1_255_are_skipped(rasterize, alpha, drawn):
     close(rasterize(stack((alpha, RED)), (9, 9), BLACK).alpha[4, 4], alpha if drawn else 0.0)
 
 
-def test_a_pixel_stops_before_the_splat_that_would_bring_it_under_1e_4(rasterize):
+def test_a_pixel_stops_before_its_transmittance_would_fall_below_1e_4(rasterize):
     # transmittances 0.1, 0.01, 0.001, then 5e-5: not drawn, nor is the faint green one that would leave 9.9e-4
     layers = [(0.9, RED)] * 3 + [(0.95, BLUE), (0.01, GREEN)]
     image = rasterize(stack(*layers), (9, 9), WHITE)
@@ -162,7 +150,7 @@ def test_two_capped_splats_stop_a_pixel_as_they_do_in_3dgs(rasterize):
     close(image.rgb[4, 4], [0.99, 0.0, 0.0])
 
 
-def test_pixels_stop_one_by_one(rasterize):
+def test_pixels_stop_independently(rasterize):
     wall = [((2.5, 4.5), (1.0, 0.0, 1e4), 1.0 + i / 10, 0.98, RED) for i in range(3)]
     far = ((4.5, 4.5), (1e6, 0.0, 1e6), 9.0, 0.5, GREEN)
     green = rasterize(splats_of(*wall, far), (9, 9), BLACK).rgb[4, :, 1]
@@ -170,13 +158,13 @@ def test_pixels_stop_one_by_one(rasterize):
     close(green[8], 0.5, atol=1e-4)
 
 
-# the judge and a plain loop ---------------------------------------------------------------------
+# the reference and a plain loop -----------------------------------------------------------------
 
 
 def draw_by_loop(
     splats: Splats2D, hw: tuple[int, int], background: tuple[float, float, float]
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Every rule of the interface, one pixel and one splat at a time, in Python's floats."""
+    """3DGS's rules, one pixel and one splat at a time, in Python floats."""
     rgb, alphas = torch.zeros(*hw, 3, dtype=F64), torch.zeros(hw, dtype=F64)
     assert splats.rgb is not None
     order = sorted(range(len(splats)), key=lambda i: splats.depths[i].item())
@@ -206,7 +194,7 @@ def draw_by_loop(
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("opaque", [False, True])
-def test_the_judge_equals_a_plain_loop(seed, opaque):
+def test_the_reference_equals_a_plain_loop(seed, opaque):
     hw = (7, 9)
     splats = make_splats(25, hw, seed, (-1.0, 1.5)).to(F64)
     if opaque:
@@ -215,25 +203,25 @@ def test_the_judge_equals_a_plain_loop(seed, opaque):
     splats = replace(splats, dets=xx * yy - xy * xy)
     rgb, alpha = draw_by_loop(splats, hw, SKY)
     assert (alpha.max() > 0.999) == opaque, "only the opaque ones should stop pixels"
-    image = reference.rasterize(splats, hw, SKY)
+    image = REFERENCE(splats, hw, SKY)
     close(image.rgb, rgb, atol=1e-12)
     close(image.alpha, alpha, atol=1e-12)
 
 
-def test_strips_and_chunks_of_the_judge_change_nothing(monkeypatch):
+def test_strips_and_chunks_of_the_reference_change_nothing(monkeypatch):
     hw = (12, 17)
     splats = make_splats(120, hw, 5, (0.0, 2.5)).to(F64)
     splats = replace(splats, opacities=splats.opacities * 0.98)
-    whole = reference.rasterize(splats, hw, SKY)
+    whole = REFERENCE(splats, hw, SKY)
     assert (whole.alpha > 0.999).any(), "some pixels should stop inside a chunk"
     monkeypatch.setattr(reference, "STRIP_PIXELS", 50)
     monkeypatch.setattr(reference, "CHUNK_SPLATS", 7)
-    parts = reference.rasterize(splats, hw, SKY)
+    parts = REFERENCE(splats, hw, SKY)
     close(parts.rgb, whole.rgb, atol=1e-12)
     close(parts.alpha, whole.alpha, atol=1e-12)
 
 
-# the fast rasterizer and the judge --------------------------------------------------------------
+# the tiled rasterizer and the reference ---------------------------------------------------------
 
 
 def needles(m: int, hw: tuple[int, int], seed: int, long: float, thin: float) -> Splats2D:
@@ -248,10 +236,7 @@ def needles(m: int, hw: tuple[int, int], seed: int, long: float, thin: float) ->
 
 
 def dense(m: int, hw: tuple[int, int], seed: int) -> Splats2D:
-    """Nearly opaque splats, many deep.
-
-    The cap on alpha is left out: two capped splats stand at the stopping rule's very edge.
-    """
+    """Many layers of nearly opaque splats, below the cap: two capped splats lie on the edge of the stopping rule."""
     splats = make_splats(m, hw, seed, (1.0, 2.0))
     return replace(splats, opacities=0.8 + 0.18 * splats.opacities)
 
@@ -278,17 +263,17 @@ REGIMES: dict[str, tuple[tuple[int, int], Callable[[tuple[int, int]], Splats2D]]
 
 
 @cache
-def drawn_twice(regime: str) -> tuple[torch.Tensor, torch.Tensor]:
-    """Largest difference of the two rasterizers at each pixel, and where a cut-off may explain one."""
+def compared(regime: str) -> tuple[torch.Tensor, torch.Tensor]:
+    """Largest difference of the two rasterizers at each pixel, and where a cut-off may explain it."""
     hw, make = REGIMES[regime]
     splats = make(hw).to(F64)
-    fast, judge = TILED(splats.to(torch.float32), hw, SKY), reference.rasterize(splats, hw, SKY)
-    difference = (fast.rgb - judge.rgb).abs().amax(dim=2)
-    difference = torch.maximum(difference, (fast.alpha - judge.alpha).abs())
-    return difference, near_a_cut_off(splats, hw)
+    tiled, exact = TILED(splats.to(torch.float32), hw, SKY), REFERENCE(splats, hw, SKY)
+    difference = (tiled.rgb - exact.rgb).abs().amax(dim=2)
+    difference = torch.maximum(difference, (tiled.alpha - exact.alpha).abs())
+    return difference, near_a_cutoff(splats, hw)
 
 
-def near_a_cut_off(splats: Splats2D, hw: tuple[int, int], band: float = 1e-3) -> torch.Tensor:
+def near_a_cutoff(splats: Splats2D, hw: tuple[int, int], band: float = 1e-3) -> torch.Tensor:
     """Pixels where some alpha is within a share of `band` of 1/255, or some transmittance of 1e-4."""
     splats = splats[splats.depths.argsort(stable=True)]
     row, column = torch.meshgrid(*(torch.arange(side) + 0.5 for side in hw), indexing="ij")
@@ -303,34 +288,33 @@ def near_a_cut_off(splats: Splats2D, hw: tuple[int, int], band: float = 1e-3) ->
 
 
 @pytest.mark.parametrize("regime", REGIMES)
-def test_the_fast_rasterizer_equals_the_judge_away_from_cut_offs(regime):
-    difference, excused = drawn_twice(regime)
+def test_tiled_equals_the_reference_away_from_cutoffs(regime):
+    difference, excused = compared(regime)
     assert difference[~excused].max() < TOLERANCE
 
 
-def test_hardly_a_pixel_flips_at_a_cut_off():
-    differences = torch.cat([drawn_twice(regime)[0].flatten() for regime in REGIMES])
+def test_few_pixels_flip_at_a_cutoff():
+    differences = torch.cat([compared(regime)[0].flatten() for regime in REGIMES])
     assert (differences > TOLERANCE).double().mean() < FLIPS
 
 
-def test_a_needle_rounded_to_float32_looks_as_it_did_before():
+def test_needles_rounded_to_float32_are_accurate():
     hw = (64, 64)
     exact = needles(60, hw, 0, 200.0, 0.6)
     for name, rasterize in ALL_RASTERIZERS.items():
-        image = rasterize(exact.to(torch.float32), hw, WHITE)
-        difference = (image.rgb - reference.rasterize(exact, hw, WHITE).rgb).abs().amax(dim=2)
-        worst = difference[~near_a_cut_off(exact, hw)].max().item()
+        image = rasterize(exact.to(torch.float32), hw, WHITE, POINT)
+        difference = (image.rgb - REFERENCE(exact, hw, WHITE).rgb).abs().amax(dim=2)
+        worst = difference[~near_a_cutoff(exact, hw)].max().item()
         assert worst < TOLERANCE, f"{name} is {worst:.1e} off"
 
 
-@pytest.mark.parametrize("x", [0.0, 7.5, 8.0, 8.5, 16.0, 24.0, -0.5, 24.5])
-@pytest.mark.parametrize("y", [0.0, 8.0, 15.5, 16.5])
 @pytest.mark.parametrize("sigma", [0.3, 1.0, 5.0])
-def test_splats_on_the_edges_of_tiles_are_drawn_whole(x, y, sigma):
-    splats = splats_of(((x, y), (sigma**2, 0.0, sigma**2), 1.0, 0.77, RED))
-    fast, judge = TILED(splats, (16, 24), SKY), reference.rasterize(splats, (16, 24), SKY)
-    close(fast.rgb, judge.rgb)
-    close(fast.alpha, judge.alpha)
+def test_splats_on_the_edges_of_tiles_are_drawn_in_every_tile(sigma):
+    for x, y in product((0.0, 7.5, 8.0, 8.5, 16.0, 24.0, -0.5, 24.5), (0.0, 8.0, 15.5, 16.5)):
+        splats = splats_of(((x, y), (sigma**2, 0.0, sigma**2), 1.0, 0.77, RED))
+        tiled, exact = TILED(splats, (16, 24), SKY), REFERENCE(splats, (16, 24), SKY)
+        close(tiled.rgb, exact.rgb)
+        close(tiled.alpha, exact.alpha)
 
 
 @pytest.mark.parametrize(
@@ -345,32 +329,32 @@ def test_a_splat_reaches_the_first_pixel_of_the_next_tile(way, alpha):
     splats = splats_of((tuple(mean), (variance, 0.0, variance), 1.0, 0.9, RED))
     image = TILED(splats, (24, 24), BLACK)
     close(image.alpha[int(first[1]), int(first[0])], alpha)
-    close(image.alpha, reference.rasterize(splats, (24, 24), BLACK).alpha)
+    close(image.alpha, REFERENCE(splats, (24, 24), BLACK).alpha)
 
 
 def test_thin_splats_that_only_cross_the_corner_of_a_tile_are_drawn_there():
     # along x + y = 17 the line cuts the tile at (8, 8) in its first pixel alone
     splats = splats_of(((2.5, 14.5), (72.0, -71.9, 72.0), 1.0, 0.9, RED))
-    fast, judge = (
+    tiled, exact = (
         TILED(splats, (24, 24), BLACK),
-        reference.rasterize(splats, (24, 24), BLACK),
+        REFERENCE(splats, (24, 24), BLACK),
     )
-    assert judge.alpha[8, 8] > 0.1
-    close(fast.alpha, judge.alpha, atol=1e-5)
+    assert exact.alpha[8, 8] > 0.1
+    close(tiled.alpha, exact.alpha, atol=1e-5)
 
 
 @pytest.mark.parametrize("opacity", [0.005, 0.02, 0.3])
 def test_thousands_of_splats_on_one_tile(opacity):
     splats = make_splats(4000, (8, 8), 3, (2.0, 3.0)).to(F64)
     splats = replace(splats, opacities=torch.full((4000,), opacity, dtype=F64))
-    fast, judge = TILED(splats, (8, 8), SKY), reference.rasterize(splats, (8, 8), SKY)
-    difference = (fast.rgb - judge.rgb).abs().amax(dim=2)
+    tiled, exact = TILED(splats, (8, 8), SKY), REFERENCE(splats, (8, 8), SKY)
+    difference = (tiled.rgb - exact.rgb).abs().amax(dim=2)
     assert difference.max() < 1e-3, "a flip is worth no more than what it leaves out"
     assert difference.median() < TOLERANCE
-    assert difference[~near_a_cut_off(splats, (8, 8), band=1e-5)].max() < TOLERANCE
+    assert difference[~near_a_cutoff(splats, (8, 8), band=1e-5)].max() < TOLERANCE
 
 
-def test_a_smaller_memory_changes_nothing():
+def test_a_smaller_memory_budget_changes_nothing():
     hw = (40, 50)
     splats = make_splats(200, hw, 6, (0.0, 3.0))
     leaf = splats.means.requires_grad_()
@@ -415,9 +399,9 @@ def test_a_frame_of_several_bands_holds_little_beside_its_image():
     assert int(run.stdout) < FRAME_MEMORY
 
 
-def test_exactly_the_tiles_that_the_ellipses_reach_are_paired():
+def test_splats_are_paired_with_exactly_the_tiles_that_their_ellipses_reach():
     grid = (9, 11)
-    splats = make_splats(300, (9 * binning.TILE, 11 * binning.TILE), 5, (-2.0, 3.5)).to(F64)
+    splats = make_splats(300, (9 * TILE, 11 * TILE), 5, (-2.0, 3.5)).to(F64)
     bins = next(binning.bands(splats, grid, EAGER))
     listed = torch.zeros(300, grid[0] * grid[1], dtype=torch.bool)
     for tile, (first, count) in enumerate(zip(bins.first, bins.counts, strict=True)):
@@ -429,14 +413,14 @@ def test_exactly_the_tiles_that_the_ellipses_reach_are_paired():
     xx, xy, yy = (column[:, None] for column in splats.covs.unbind(dim=1))
     conic = yy / splats.dets[:, None], -xy / splats.dets[:, None], xx / splats.dets[:, None]
     for tile in range(grid[0] * grid[1]):
-        corner = torch.tensor([tile % grid[1], tile // grid[1]]) * binning.TILE + 0.5
+        corner = torch.tensor([tile % grid[1], tile // grid[1]]) * TILE + 0.5
         least = torch.full((300,), math.inf, dtype=F64)
         low = corner - splats.means
-        high = low + binning.TILE - 1
+        high = low + TILE - 1
         inside = ((low <= 0) & (high >= 0)).all(dim=1)
         for fixed in (0, 1):
             for side in (low, high):
-                along = low[:, 1 - fixed, None] + (binning.TILE - 1) * steps
+                along = low[:, 1 - fixed, None] + (TILE - 1) * steps
                 across = side[:, fixed, None].expand_as(along)
                 dx, dy = (across, along) if fixed == 0 else (along, across)
                 distance = conic[0] * dx * dx + 2 * conic[1] * dx * dy + conic[2] * dy * dy
@@ -448,79 +432,8 @@ def test_exactly_the_tiles_that_the_ellipses_reach_are_paired():
         assert not listed[surely_missed, tile].any()
 
 
-def test_the_polynomial_that_compiled_loops_use_is_exp2(monkeypatch):
-    exponents = torch.linspace(-12, 0.5, 100_001)[:, None]
-    monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)
-    compiled = drawing._audible_exp2(exponents)
-    exact = torch.exp2(exponents.double())
-    heard = exponents >= drawing.LOG2_MIN_ALPHA
-    assert compiled[~heard].eq(0).all()
-    relative = compiled[heard].double() / exact[heard] - 1
-    assert relative.abs().max() < 2e-6
-
-
-# algorithms of Analytic-Splatting, o = 0.8: covariance, offset, and alpha by its logistic, exactly, and at the centre
-ANALYTIC = [
-    ((0.36, 0.0, 0.36), (0.0, 0.0), 0.642785, 0.641368, 0.800000),
-    ((0.36, 0.0, 0.36), (0.7, 0.2), 0.357458, 0.357462, 0.383178),
-    ((1.0, 0.3, 0.5), (0.0, 0.0), 0.693060, 0.690872, 0.800000),
-    ((1.0, 0.3, 0.5), (0.7, 0.2), 0.552017, 0.551579, 0.626087),
-    ((0.05, 0.0, 0.05), (0.0, 0.0), 0.238807, 0.238748, 0.800000),
-    ((0.05, 0.0, 0.05), (0.7, 0.2), 0.042340, 0.042402, 0.003993),
-]
-
-
-@pytest.mark.parametrize(("cov", "offset", "logistic", "exact", "point"), ANALYTIC)
-def test_pixel_kernels_have_the_published_values(rasterize, cov, offset, logistic, exact, point):
-    centre = (4.5 - offset[0], 4.5 - offset[1])
-    splats = splats_of((centre, cov, 1.0, 0.8, WHITE))
-    for pixel, expected in (("logistic", logistic), ("integral", exact), ("point", point)):
-        alpha = rasterize(splats, (8, 8), BLACK, pixel).alpha[4, 4].item()
-        assert alpha == pytest.approx(expected, abs=2e-6), pixel
-
-
-@pytest.mark.parametrize(
-    "pixel", ["integral", "logistic", "square", "surfel", "surfel-mip", "blending"]
-)
-@pytest.mark.parametrize("dtype", [torch.float32, F64])
-@pytest.mark.parametrize("window", [0.0, 0.6, 1.0])
-def test_means_over_pixels_are_the_judges(pixel, dtype, window):
-    hw = (61, 83)
-    splats = replace(make_splats(500, hw, 8, (-3.0, 3.0)), window=window)
-    tilts = 0.07 * torch.randn(500, 2, generator=torch.Generator().manual_seed(3))
-    splats = replace(splats, tilts=tilts / splats.covs[:, [0, 2]].sqrt()).to(dtype)
-    fast, judge = TILED(splats, hw, SKY, pixel), reference.rasterize(splats, hw, SKY, pixel)
-    difference = (fast.rgb - judge.rgb).abs().amax(dim=2)
-    assert (difference > 2 * TOLERANCE).double().mean() < 1e-3, "more than flips at a cut-off"
-    assert difference.max() < 0.01
-
-
-@pytest.mark.parametrize(
-    "cov", [(0.3, 0.1, 0.2), (0.02, 0.0, 0.05), (1.5, -1.2, 1.1), (9.0, 2.0, 4.0)]
-)
-@pytest.mark.parametrize("offset", [(0.0, 0.0), (0.4, -0.3)])
-def test_the_mean_over_a_square_is_near_the_integral(cov, offset):
-    """Against 200 × 200 points of the pixel, within a hundredth of the opacity."""
-    splats = splats_of(((4.5 - offset[0], 4.5 - offset[1]), cov, 1.0, 0.9, WHITE))
-    ticks = (torch.arange(200, dtype=F64) + 0.5) / 200 - 0.5
-    grid = torch.cartesian_prod(ticks, ticks) + torch.tensor(offset, dtype=F64)
-    xx, xy, yy = cov
-    squared = yy * grid[:, 0] ** 2 - 2 * xy * grid.prod(dim=1) + xx * grid[:, 1] ** 2
-    expected = 0.9 * (-0.5 * squared / (xx * yy - xy * xy)).exp().mean().item()
-    alpha = TILED(splats, (8, 8), BLACK, "square").alpha[4, 4].item()
-    assert alpha == pytest.approx(expected, abs=0.009)
-
-
-def test_the_integral_of_a_small_splat_is_its_energy():
-    splats = splats_of(((4.3, 4.6), (1e-6, 3e-7, 1e-6), 1.0, 0.9, WHITE))
-    energy = 0.9 * 2 * math.pi * math.sqrt(1e-12 - 9e-14)
-    many = replace(splats, opacities=splats.opacities * 1e5)
-    alpha = TILED(many, (8, 8), BLACK, "integral").alpha
-    assert alpha.sum().item() == pytest.approx(energy * 1e5, rel=1e-5)
-
-
 @pytest.mark.parametrize("which", ["none at all", "none in the image", "none opaque enough"])
-def test_without_splats_there_is_the_background(rasterize, which):
+def test_without_splats_the_image_is_the_background(rasterize, which):
     splats = stack((0.5, RED))
     splats = {
         "none at all": splats[:0],

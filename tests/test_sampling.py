@@ -1,4 +1,4 @@
-"""Sampling bounds by hand, at the edges of what a camera sees, and against a loop in float64."""
+"""Sampling bounds by hand, at the edges of the visible region, and against a loop in float64."""
 
 import json
 import math
@@ -14,8 +14,8 @@ import torch
 from aaplug.core.cameras import Camera
 from aaplug.core.errors import FrameError, UsageError
 from aaplug.core.sampling import check_frame, median_rates, sampling_bounds, view_information
+from aaplug.core.training import TrainingViews
 from aaplug.methods.filters import Smoothing3D
-from aaplug.rendering.renderer import learn
 from tests.conftest import make_camera, make_scene
 
 FAR = torch.tensor([5e6, -5e6, 5e6], dtype=torch.float64)
@@ -44,7 +44,7 @@ def ring(n: int = 7, focal_step: float = 0.2) -> list[Camera]:
 
 
 def moved(camera: Camera, offset: torch.Tensor) -> Camera:
-    """The camera carried along by `offset` in the world."""
+    """The camera moved by `offset` in the world."""
     pose = camera.cam_from_world.clone()
     pose[:3, 3] -= pose[:3, :3] @ offset.double()
     return replace(camera, cam_from_world=pose)
@@ -126,7 +126,7 @@ def test_each_camera_pairs_its_own_focal_length_with_its_own_depth():
     assert bounds.views.tolist() == [2]
 
 
-def test_of_equal_focal_lengths_the_nearest_camera_samples_highest_and_the_farthest_lowest():
+def test_with_one_focal_length_the_nearest_camera_has_the_highest_rate():
     cameras = [straight_camera(64.0, back=back) for back in (4.0, 2.0, 8.0)]
     bounds = sampling_bounds(torch.zeros(1, 3), cameras)
     assert bounds.highest.item() == pytest.approx(32.0)
@@ -134,13 +134,13 @@ def test_of_equal_focal_lengths_the_nearest_camera_samples_highest_and_the_farth
     assert median_rates(torch.zeros(1, 3), cameras).item() == pytest.approx(16.0)
 
 
-def test_a_camera_that_does_not_see_a_gaussian_has_no_say():
+def test_a_camera_that_does_not_see_a_gaussian_does_not_count():
     blind = straight_camera(1e6, back=-50.0)
     bounds = sampling_bounds(torch.tensor([[0.0, 0.0, 4.0]]), [blind, straight_camera(64.0)])
     assert (bounds.highest.item(), bounds.lowest.item(), bounds.views.item()) == (16.0, 16.0, 1)
 
 
-def test_unseen_gaussians_are_zero_and_may_stand_in_with_the_coarsest_rate():
+def test_unseen_gaussians_have_rate_zero_or_by_choice_the_coarsest():
     points = torch.tensor([[0.0, 0.0, 2.0], [0.0, 0.0, 8.0], [0.0, 0.0, -1.0], [99.0, 0.0, 1.0]])
     bounds = sampling_bounds(points, [straight_camera(64.0)])
     assert bounds.seen.tolist() == [True, True, False, False]
@@ -153,7 +153,7 @@ def test_unseen_gaussians_are_zero_and_may_stand_in_with_the_coarsest_rate():
 
 def test_a_scene_that_no_camera_sees_is_no_crash_of_a_library():
     scene = make_scene(3)
-    training = learn(scene, [straight_camera(back=-1e3)])
+    training = TrainingViews.of(scene, [straight_camera(back=-1e3)])
     assert not training.bounds.seen.any()
     try:
         smoothed = Smoothing3D()(scene, training)
@@ -183,7 +183,7 @@ def test_bounds_agree_with_a_loop_in_float64(dtype, rtol):
 
 
 def information_by_loop(mean: list[float], cameras: list[Camera]) -> list[list[float]]:
-    """What the cameras that see a point tell of every direction, in plain Python floats."""
+    """View information at a point, in plain Python floats."""
     total = [[0.0] * 3 for _ in range(3)]
     for camera in cameras:
         rate = max(rates_by_loop(mean, [camera]), default=0.0)
@@ -200,7 +200,7 @@ def information_by_loop(mean: list[float], cameras: list[Camera]) -> list[list[f
     [(torch.float64, 0.0, 1e-12), (torch.float32, 0.0, 1e-6), (torch.float64, 1.0, 1e-8)],
     ids=["float64", "float32", "far from the origin"],
 )
-def test_the_information_of_views_is_that_of_a_loop(dtype, offset, tolerance):
+def test_view_information_agrees_with_a_loop_in_float64(dtype, offset, tolerance):
     cameras = [moved(camera, offset * FAR) for camera in ring()]
     means = make_scene(30, dtype=torch.float64).means
     means[3] = torch.tensor([0.0, 0.0, 500.0])
@@ -214,7 +214,7 @@ def test_the_information_of_views_is_that_of_a_loop(dtype, offset, tolerance):
     torch.testing.assert_close(found.double(), expected, rtol=0, atol=tolerance * scale.item())
 
 
-def test_one_view_tells_everything_across_its_ray_and_nothing_along_it():
+def test_one_view_has_information_across_its_ray_and_none_along_it():
     information = view_information(torch.tensor([[0.0, 0.0, 2.0]]), [straight_camera(focal=64.0)])
     expected = torch.diag(torch.tensor([32.0**2, 32.0**2, 0.0]))
     torch.testing.assert_close(information[0], expected)
@@ -229,7 +229,7 @@ def test_the_size_of_chunks_changes_nothing(chunk_pairs):
     assert parts.views.equal(whole.views)
 
 
-def test_a_scene_far_from_the_origin_keeps_its_digits():
+def test_bounds_of_a_scene_far_from_the_origin_are_exact():
     means = (make_scene(100).means.double() * 3 + FAR).float()  # rounded to half units out there
     cameras = [moved(camera, FAR) for camera in ring()]
     exact = sampling_bounds(means.double(), cameras)
@@ -241,7 +241,7 @@ def test_a_scene_far_from_the_origin_keeps_its_digits():
 
 
 @pytest.mark.parametrize("find", [sampling_bounds, median_rates, view_information])
-def test_a_number_of_cameras_is_needed(find):
+def test_at_least_one_camera_is_needed(find):
     with pytest.raises(UsageError, match="at least one"):
         find(torch.zeros(1, 3), [])
 
@@ -252,12 +252,12 @@ def test_an_empty_scene_has_empty_bounds():
     assert check_frame(torch.zeros(0, 3), [straight_camera()], "empty") == 1.0
 
 
-def test_the_frame_check_gives_the_share_of_gaussians_seen():
+def test_the_frame_check_returns_the_share_of_gaussians_seen():
     points = torch.tensor([[0.0, 0.0, 1.0]] * 3 + [[0.0, 0.0, -1.0]])
     assert check_frame(points, [straight_camera()], "scene.ply") == 0.75
 
 
-def test_cameras_of_another_scene_are_refused_by_name_and_cause():
+def test_cameras_of_another_scene_are_refused():
     means = make_scene(500).means
     strangers = [moved(camera, torch.tensor([0.0, 0.0, 200.0])) for camera in ring()]
     assert check_frame(means, ring(), "garden.ply") > 0.9

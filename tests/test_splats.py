@@ -1,4 +1,4 @@
-"""Convolution on the screen and in the world: published numbers, needles and extremes."""
+"""Blurring on the screen and smoothing in the world: published values, needles and extremes."""
 
 import math
 from dataclasses import replace
@@ -6,13 +6,14 @@ from dataclasses import replace
 import pytest
 import torch
 
-from aaplug.core.gaussians import Gaussians, scale_opacities
-from aaplug.core.splats import Splats2D, drawn, half_sizes, reach, whitening
 from aaplug.core.convolution import smoothed_by, volume_log_factor
+from aaplug.core.culling import cull
+from aaplug.core.ellipses import half_sizes, squared_cutoff, whitening
+from aaplug.core.gaussians import MIN_OPACITY, Gaussians, scale_opacities
+from aaplug.core.splats import Splats2D
 from tests.conftest import make_scene, make_splats
 
 F64 = torch.float64
-MIN_OPACITY = 1e-7  # keeps a logit finite in float32
 
 
 def splat(xx: float, xy: float, yy: float, opacity: float = 1.0, dtype=F64) -> Splats2D:
@@ -38,7 +39,7 @@ VECTORS = [
 
 
 @pytest.mark.parametrize(("covariance", "mip", "mip_wide", "floored"), VECTORS)
-def test_compensation_equals_the_published_forms(covariance, mip, mip_wide, floored):
+def test_compensation_equals_the_published_values(covariance, mip, mip_wide, floored):
     # Mip-Splatting takes √(det₀ / (det₁ + 1e-6) + 1e-6); without both 1e-6 the square is off by no more than this
     for variance, published in ((0.1, mip), (0.3, mip_wide)):
         blurred = splat(*covariance).blurred(variance, compensate=True)
@@ -50,7 +51,7 @@ def test_compensation_equals_the_published_forms(covariance, mip, mip_wide, floo
     assert factor == pytest.approx(floored, abs=5e-7)
 
 
-def test_compensation_has_a_floor_so_that_no_splat_vanishes_by_rounding():
+def test_compensation_has_a_floor():
     # Mip-Splatting drops this one: its determinant of 1e-6 hits a floor there
     speck = splat(1e-3, 0.0, 1e-3)
     assert speck.blurred(0.3, compensate=True).opacities.item() == 0.005
@@ -58,7 +59,7 @@ def test_compensation_has_a_floor_so_that_no_splat_vanishes_by_rounding():
     assert speck.blurred(0.3, True, floor=0.0).opacities.item() == pytest.approx(1e-3 / 0.301)
 
 
-def test_blurring_adds_its_variance_to_the_diagonal_alone():
+def test_blurring_adds_its_variance_to_the_diagonal_only():
     blurred = splat(1.0, 0.3, 0.5, opacity=0.7).blurred(0.25, compensate=False)
     torch.testing.assert_close(blurred.covs, torch.tensor([[1.25, 0.3, 0.75]], dtype=F64))
     torch.testing.assert_close(blurred.dets, torch.tensor([1.25 * 0.75 - 0.09], dtype=F64))
@@ -94,7 +95,7 @@ def test_compensation_keeps_the_energy():
 
 
 @pytest.mark.parametrize(("long", "thin"), [(200.0, 0.1), (200.0, 0.01), (2000.0, 0.01)])
-def test_a_needle_is_compensated_right_in_any_direction_in_float32(long, thin):
+def test_compensation_of_needles_is_exact_in_float32(long, thin):
     angle = torch.linspace(0, math.pi, 181, dtype=F64)
     cos, sin = angle.cos(), angle.sin()
     a = torch.stack([cos * long, -sin * thin], dim=1)
@@ -127,17 +128,17 @@ def test_a_splat_of_no_area_has_finite_gradients_when_blurred(factor):
     assert all(g.isfinite().all() for g in gradients if g is not None)
 
 
-# extents ----------------------------------------------------------------------------------------
+# ellipses ---------------------------------------------------------------------------------------
 
 
-def test_alpha_is_1_255_at_the_reach():
+def test_alpha_is_1_255_at_the_cutoff():
     splats = splat(4.0, 0.0, 9.0, opacity=0.8)
     distance = squared_cutoff(splats.opacities).item()
     assert 0.8 * math.exp(-distance / 2) == pytest.approx(1 / 255)
     assert half_sizes(splats)[0].tolist() == pytest.approx([2 * distance**0.5, 3 * distance**0.5])
 
 
-def test_a_box_touches_its_ellipse_on_every_side():
+def test_half_sizes_are_those_of_the_box_around_the_ellipse():
     splats = splat(4.0, 2.5, 9.0, opacity=0.8)
     angle = torch.linspace(0, 2 * math.pi, 100_001, dtype=F64)
     factor = torch.linalg.cholesky(torch.tensor([[4.0, 2.5], [2.5, 9.0]], dtype=F64))
@@ -154,7 +155,7 @@ def test_whitening_is_a_square_root_of_the_inverse_covariance():
     torch.testing.assert_close((white.mT @ white).flatten(1), inverse, rtol=1e-9, atol=1e-12)
 
 
-def test_a_splat_too_faint_to_draw_has_a_reach_below_zero_and_no_size():
+def test_a_splat_too_faint_to_draw_has_a_negative_cutoff_and_no_size():
     faint = splat(4.0, 0.0, 9.0, opacity=0.003)
     assert squared_cutoff(faint.opacities).item() < 0
     assert half_sizes(faint).tolist() == [[0.0, 0.0]]
@@ -175,10 +176,10 @@ def test_a_splat_too_faint_to_draw_has_a_reach_below_zero_and_no_size():
         (5.0, 21.1, False),
     ],
 )
-def test_drawn_keeps_what_reaches_into_the_image(x, y, kept):
+def test_culling_keeps_splats_that_reach_into_the_image(x, y, kept):
     side = 1 / (2 * math.log(255))  # variance of a splat that reaches 1 px
     splats = replace(splat(side, 0.0, side), means=torch.tensor([[x, y]], dtype=F64))
-    assert len(drawn(splats, (20, 40))) == kept
+    assert len(cull(splats, (20, 40))) == kept
 
 
 @pytest.mark.parametrize(
@@ -193,18 +194,18 @@ def test_drawn_keeps_what_reaches_into_the_image(x, y, kept):
     ],
     ids=["faint", "transparent", "flat", "nan opacity", "nan mean", "nan covariance"],
 )
-def test_drawn_drops_what_cannot_be_drawn(change):
+def test_culling_drops_splats_that_cannot_be_drawn(change):
     good = splat(4.0, 0.0, 4.0, dtype=torch.float32)
-    assert len(drawn(good, (40, 40))) == 1
-    assert len(drawn(replace(good, **change), (40, 40))) == 0
+    assert len(cull(good, (40, 40))) == 1
+    assert len(cull(replace(good, **change), (40, 40))) == 0
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
-def test_an_opacity_of_exactly_1_255_is_drawn(dtype):
-    assert len(drawn(splat(4.0, 0.0, 4.0, opacity=1 / 255, dtype=dtype), (40, 40))) == 1
+def test_an_opacity_of_exactly_1_255_is_kept(dtype):
+    assert len(cull(splat(4.0, 0.0, 4.0, opacity=1 / 255, dtype=dtype), (40, 40))) == 1
 
 
-def test_splats_are_taken_whole_and_in_order():
+def test_indexing_keeps_every_column_and_the_order():
     splats = make_splats(6, (20, 20))
     for index in (torch.tensor([4, 1, 1]), torch.arange(6) % 2 == 0, slice(2, 5)):
         part = splats[index]
@@ -252,7 +253,7 @@ def test_the_volume_factor_and_its_gradient_stay_finite_for_points(scale):
 
 @pytest.mark.parametrize("volume", [False, True])
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
-def test_smoothing_by_nothing_is_the_identity_to_the_bit(volume, dtype):
+def test_smoothing_by_zero_changes_no_bit(volume, dtype):
     scene = replace(
         make_scene(200, dtype=dtype),
         log_scales=torch.linspace(-60, 40, 600, dtype=dtype).view(200, 3),
@@ -307,7 +308,7 @@ def scaled_logit(logit: float, factor: float, most: float = 1 - MIN_OPACITY) -> 
 
 @pytest.mark.parametrize("logit", [-100.0, -20.0, -5.5, -1.0, 0.0, 1.0, 5.0, 12.0, 20.0, 100.0])
 @pytest.mark.parametrize("factor", [1e-30, 1e-6, 0.005, 0.5, 0.999, 1 - 2**-20])
-def test_opacities_are_scaled_right_near_0_and_near_1(logit, factor):
+def test_scaled_opacities_are_exact_near_0_and_near_1(logit, factor):
     for dtype, tolerance in ((F64, 1e-8), (torch.float32, 1e-4)):
         log_factor = torch.tensor([math.log(factor)], dtype=dtype)
         got = scale_opacities(torch.tensor([logit], dtype=dtype), log_factor).item()
@@ -315,19 +316,19 @@ def test_opacities_are_scaled_right_near_0_and_near_1(logit, factor):
 
 
 @pytest.mark.parametrize("logit", [-3.0, 0.0, 2.0, 9.0])
-def test_an_opacity_may_grow_up_to_its_limit(logit):
+def test_an_opacity_grows_up_to_its_limit(logit):
     logits, doubled = torch.tensor([logit], dtype=F64), torch.tensor([math.log(2)], dtype=F64)
     opacity = min(2 / (1 + math.exp(-logit)), 0.9999)
     expected = math.log(opacity / (1 - opacity))
     assert scale_opacities(logits, doubled, 0.9999).item() == pytest.approx(expected, rel=1e-9)
 
 
-def test_a_factor_of_one_leaves_every_opacity_to_the_bit():
+def test_a_factor_of_one_changes_no_bit_of_an_opacity():
     logits = torch.tensor([-math.inf, -100.0, -20.0, -0.3, 0.0, 17.0, 20.0, 100.0, math.inf])
     assert scale_opacities(logits, torch.zeros(9)).equal(logits)
 
 
-def test_scaled_opacities_are_finite_whatever_they_were():
+def test_scaled_opacities_are_finite():
     logits = torch.tensor([-math.inf, -100.0, 0.0, 100.0, math.inf])
     for log_factor in (-math.inf, -100.0, -1e-7, 1e-7, 100.0):
         scaled = scale_opacities(logits, torch.full((5,), log_factor))
@@ -342,7 +343,7 @@ def test_scaled_opacities_have_the_gradient_of_their_formula():
     assert torch.autograd.gradcheck(scale_opacities, (logits, log_factor))
 
 
-def test_opacity_and_scale_of_a_gaussian_are_the_activations_of_what_is_stored():
+def test_opacities_and_scales_are_activations_of_stored_values():
     scene: Gaussians = make_scene(5, dtype=F64)
     torch.testing.assert_close(scene.opacities, 1 / (1 + torch.exp(-scene.logit_opacities)))
     torch.testing.assert_close(scene.scales, torch.exp(scene.log_scales))

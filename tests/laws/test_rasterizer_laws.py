@@ -1,24 +1,26 @@
-"""What every rasterizer must hold to, whatever its method."""
+"""Laws of every rasterizer: those of the registry, plug-ins among them, and the compiled one."""
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
 
-from aaplug.core.interfaces import Rasterizer
 from aaplug.core.splats import Render, Splats2D
+from aaplug.methods.pixel_kernels import POINT
 from tests.conftest import ALL_RASTERIZERS, make_splats
 
 HW = (29, 43)
 SKY = (0.25, 0.5, 1.0)
 NAMES = ("means", "covs", "dets", "depths", "opacities", "sources", "rgb")
-SAME = 1e-6  # adding nothing may change the order of a sum, no more
+SAME = 1e-6  # the order of a sum may change
 
 
 @pytest.fixture(params=ALL_RASTERIZERS.values(), ids=ALL_RASTERIZERS)
-def rasterize(request: pytest.FixtureRequest) -> Rasterizer:
-    return request.param
+def rasterize(request: pytest.FixtureRequest) -> Callable[..., Render]:
+    return partial(request.param, pixel=POINT)
 
 
 @pytest.fixture
@@ -61,7 +63,7 @@ def assert_same(image: Render, other: Render, atol: float = SAME) -> None:
 
 
 def background_share(image: Render) -> torch.Tensor:
-    """How far the image is from its background, at most."""
+    """Largest difference between an image and its background."""
     away = (image.rgb - torch.tensor(SKY, dtype=image.rgb.dtype)).abs().max()
     return torch.maximum(away, image.alpha.abs().max())
 
@@ -82,22 +84,24 @@ def test_splats_behind_an_opaque_wall_change_nothing(rasterize, splats):
     assert_same(rasterize(wall, HW, SKY), before)
 
 
-def test_splats_behind_a_wall_show_where_it_is_not(rasterize, splats):
+def test_splats_behind_a_wall_are_visible_beside_it(rasterize, splats):
     wall = joined(*[one(covariance=(4.0, 0.0, 4.0), opacity=1.0)] * 3)
     alone, together = rasterize(wall, HW, SKY), rasterize(joined(wall, splats), HW, SKY)
     assert (alone.rgb - together.rgb).abs().amax() > 0.1
 
 
-@pytest.mark.parametrize("way", [(-1, 0), (1, 0), (0, -1), (0, 1), (1, 1), (-1, -1)])
 @pytest.mark.parametrize("distance", [3.0, 100.0, 1e5, 1e9])
-def test_splats_off_the_screen_change_nothing(rasterize, splats, way, distance):
-    # a splat of opacity 1 and 0.6 px reaches 2 px
+def test_splats_off_the_screen_change_nothing(rasterize, splats, distance):
+    # a splat of opacity 1 with sigma 0.6 px ends at 2 px
     rows, columns = HW
     middle = (columns / 2, rows / 2)
-    mean = [m + step * (m + distance) for m, step in zip(middle, way, strict=True)]
-    outside = replace(one(tuple(mean), (0.36, 0.1, 0.36), 1.0), rgb=torch.full((1, 3), 100.0))
+    outside = []
+    for way in ((-1, 0), (1, 0), (0, -1), (0, 1), (1, 1), (-1, -1)):
+        mean = [m + step * (m + distance) for m, step in zip(middle, way, strict=True)]
+        splat = one((mean[0], mean[1]), (0.36, 0.1, 0.36), 1.0)
+        outside.append(replace(splat, rgb=torch.full((1, 3), 100.0)))
     before = rasterize(splats, HW, SKY)
-    assert_same(rasterize(joined(outside, splats), HW, SKY), before)
+    assert_same(rasterize(joined(*outside, splats), HW, SKY), before)
 
 
 @pytest.mark.parametrize("opacity", [0.0, 1e-40, 1e-9, 0.9999 / 255])
@@ -108,24 +112,24 @@ def test_transparent_splats_change_nothing(rasterize, splats, opacity):
     assert_same(rasterize(shuffled(joined(ghosts, splats)), HW, SKY), before)
 
 
-def test_the_order_of_splats_of_distinct_depths_changes_nothing(rasterize, splats):
+def test_the_order_of_input_does_not_matter_for_distinct_depths(rasterize, splats):
     assert splats.depths.unique().numel() == len(splats)
     before = rasterize(splats, HW, SKY)
     for seed in range(3):
         assert_same(rasterize(shuffled(splats, seed), HW, SKY), before)
 
 
-def test_depths_count_by_their_order_alone(rasterize, splats):
+def test_only_the_order_of_depths_matters(rasterize, splats):
     before = rasterize(splats, HW, SKY)
     assert_same(rasterize(replace(splats, depths=splats.depths.exp() * 1e3), HW, SKY), before)
 
 
-def test_no_splats_give_the_background(rasterize, splats):
+def test_an_image_without_splats_is_the_background(rasterize, splats):
     assert background_share(rasterize(splats[:0], HW, SKY)) == 0
 
 
 @pytest.mark.parametrize("opacity", [0.0, 0.003])
-def test_splats_of_no_effect_give_the_background(rasterize, opacity):
+def test_an_image_of_invisible_splats_is_the_background(rasterize, opacity):
     assert background_share(rasterize(one(opacity=opacity), HW, SKY)) == 0
     assert background_share(rasterize(one(mean=(-500.0, 12.5)), HW, SKY)) == 0
 
@@ -151,16 +155,14 @@ def test_alpha_is_between_0_and_1(rasterize, log_sigmas):
     assert 0.5 < alpha.max() <= 1
 
 
-def test_the_image_is_what_the_splats_show_plus_what_alpha_leaves_of_the_background(
-    rasterize, splats
-):
+def test_the_background_is_added_by_one_minus_alpha(rasterize, splats):
     on_black, on_sky = rasterize(splats, HW, (0.0, 0.0, 0.0)), rasterize(splats, HW, SKY)
     assert on_black.alpha.equal(on_sky.alpha)
     sky = (1 - on_black.alpha)[..., None] * torch.tensor(SKY)
     torch.testing.assert_close(on_sky.rgb, on_black.rgb + sky.to(on_sky.rgb), rtol=0, atol=SAME)
 
 
-def test_splats_of_one_colour_show_it_in_the_measure_of_alpha(rasterize, splats):
+def test_white_splats_over_black_give_alpha(rasterize, splats):
     white = replace(splats, rgb=torch.ones(len(splats), 3))
     image = rasterize(white, HW, (0.0, 0.0, 0.0))
     torch.testing.assert_close(
@@ -203,7 +205,7 @@ POISON = {
 
 
 @pytest.mark.parametrize("poison", POISON)
-def test_extreme_splats_render_finite_and_spoil_no_other(rasterize, splats, poison):
+def test_extreme_splats_give_finite_images(rasterize, splats, poison):
     alone = rasterize(POISON[poison], HW, SKY)
     together = rasterize(joined(splats, POISON[poison]), HW, SKY)
     for image in (alone, together):
@@ -224,6 +226,6 @@ def test_extreme_splats_render_finite_and_spoil_no_other(rasterize, splats, pois
         ("a denormal covariance", 0.5),
     ],
 )
-def test_extreme_splats_show_what_they_should_at_their_centre(rasterize, poison, alpha):
+def test_extreme_splats_have_their_alpha_at_the_centre(rasterize, poison, alpha):
     centre = rasterize(POISON[poison], HW, SKY).alpha[12, 20].item()
     assert centre == pytest.approx(alpha, rel=1e-4)

@@ -1,0 +1,166 @@
+"""The rules of compositing as values: every rasterizer and pixel kernel follows them, and wrong ones are refused."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from aaplug.core.culling import cull, cull_kernel
+from aaplug.core.errors import UsageError
+from aaplug.core.gaussians import CLASSIC
+from aaplug.core.projection import project, project_kernel
+from aaplug.core.rules import RULES_3DGS, RULES_GSPLAT, Rules
+from aaplug.methods.compositors import COMPOSITORS
+from aaplug.methods.pixel_kernels import INTEGRAL, PIXEL_KERNELS, POINT
+from aaplug.methods.recipes import RECIPES
+from aaplug.rasterizers import Reference, Tiled
+from aaplug.rasterizers.tiled.backward import step_kernel
+from aaplug.rasterizers.tiled.binning import table_kernel
+from aaplug.rasterizers.tiled.forward import pass_kernel
+from aaplug.rendering.renderer import Renderer
+from tests.conftest import ALL_RASTERIZERS, make_camera, make_scene, make_splats, splats_of
+
+F64 = torch.float64
+BLACK, SKY = (0.0, 0.0, 0.0), (0.25, 0.5, 1.0)
+RED, GREEN = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
+OTHERS = {
+    "gsplat": RULES_GSPLAT,
+    "low cap": Rules(max_alpha=0.6),
+    "high cut-off": Rules(min_alpha=0.05),
+    "low cut-off": Rules(min_alpha=1 / 400),
+    "early stop": Rules(min_transmittance=0.05),
+    "all": Rules(max_alpha=0.9, min_alpha=0.02, min_transmittance=0.01),
+}
+HW = (29, 43)
+
+
+@pytest.fixture(params=OTHERS.values(), ids=OTHERS)
+def rules(request: pytest.FixtureRequest) -> Rules:
+    return request.param
+
+
+def opaque_splats():
+    """Splats of which many reach every cap, cut-off and stop."""
+    splats = make_splats(300, HW, 4, (0.0, 2.0)).to(F64)
+    slopes = torch.zeros(300, 2, dtype=F64)
+    return replace(
+        splats, opacities=(1.1 * splats.opacities.sqrt()).clamp(max=1), depth_slopes=slopes
+    )
+
+
+@pytest.mark.parametrize("pixel", PIXEL_KERNELS.values(), ids=PIXEL_KERNELS)
+def test_tiled_equals_the_reference_under_other_rules(pixel, rules):
+    splats = opaque_splats()
+    tiled, exact = (draw(splats, HW, SKY, pixel, None, rules) for draw in (Tiled(), Reference()))
+    torch.testing.assert_close(tiled.rgb, exact.rgb, rtol=0, atol=1e-6)
+    usual = Reference()(splats, HW, SKY, pixel)
+    assert (exact.rgb - usual.rgb).abs().max() > 1e-5, "these rules should matter here"
+
+
+@pytest.mark.parametrize("compositor", COMPOSITORS.values(), ids=COMPOSITORS)
+def test_compositors_equal_their_exact_twins_under_other_rules(compositor, rules):
+    splats = opaque_splats()
+    tiled, exact = (
+        draw(splats, HW, SKY, INTEGRAL, compositor, rules) for draw in (Tiled(), Reference())
+    )
+    difference = (tiled.rgb - exact.rgb).abs().amax(dim=2)
+    assert (difference > 2e-5).double().mean() < 1e-3
+
+
+def test_gradients_follow_the_rules(rules):
+    splats = opaque_splats()
+    found = []
+    for rasterizer in (Tiled(), Reference()):
+        means = splats.means.clone().requires_grad_()
+        image = rasterizer(replace(splats, means=means), HW, BLACK, POINT, None, rules)
+        found.append(torch.autograd.grad(image.rgb.square().sum(), means)[0])
+    torch.testing.assert_close(*found, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("rasterizer", ALL_RASTERIZERS.values(), ids=ALL_RASTERIZERS)
+def test_rules_worked_by_hand(rasterizer):
+    def centre(*opacities: float, rules: Rules) -> float:
+        layers = [((4.5, 4.5), (4.0, 0.0, 4.0), 1.0 + i, o, RED) for i, o in enumerate(opacities)]
+        splats = splats_of(*layers).to(torch.float32)
+        return rasterizer(splats, (16, 16), BLACK, POINT, None, rules).alpha[4, 4].item()
+
+    assert centre(1.0, rules=RULES_GSPLAT) == pytest.approx(0.999, abs=1e-6)
+    assert centre(1.0, rules=RULES_3DGS) == pytest.approx(0.99, abs=1e-6)
+    assert centre(0.04, rules=Rules(min_alpha=0.05)) == 0
+    assert centre(0.06, rules=Rules(min_alpha=0.05)) == pytest.approx(0.06, abs=1e-6)
+    assert centre(0.003, rules=Rules(min_alpha=1 / 400)) == pytest.approx(0.003, abs=1e-6)
+    stop = Rules(min_transmittance=0.05)
+    assert centre(0.9, 0.6, 0.4, rules=stop) == pytest.approx(0.9, abs=1e-6)  # not down to 0.04
+    assert centre(0.9, 0.4, 0.4, rules=stop) == pytest.approx(0.94, abs=1e-6)
+
+
+def test_a_lower_cutoff_keeps_splats_and_pixels_that_a_higher_one_drops():
+    splats = splats_of(((4.5, 4.5), (4.0, 0.0, 4.0), 1.0, 0.003, RED))
+    assert len(cull(splats, (9, 9))) == 0
+    assert len(cull(splats, (9, 9), rules=Rules(min_alpha=1 / 400))) == 1
+    # 0.5 exp(-d²/8) falls to 1/255 at 6.2 px and to 1/400 at 6.5 px
+    splats = splats_of(((-6.35, 4.5), (4.0, 0.0, 4.0), 1.0, 0.5, RED))
+    assert len(cull(splats, (9, 9))) == 0
+    assert len(cull(splats, (9, 9), rules=Rules(min_alpha=1 / 400))) == 1
+
+
+@pytest.mark.parametrize("near", [0.01, 0.5, 2.0])
+def test_only_what_lies_beyond_the_near_plane_is_drawn(near):
+    scene, camera = make_scene(200), make_camera((0.0, -1.0, 0.0))
+    splats = project(scene, camera, rules=Rules(near=near))
+    depths = (scene.means.double() - camera.centre) @ camera.cam_from_world[2, :3]
+    assert splats.sources.tolist() == (depths > near).nonzero().flatten().tolist()
+    assert 0 < len(splats) < 200
+
+
+def test_the_renderer_follows_the_rules_of_training():
+    scene, camera = make_scene(100), make_camera()
+    scene = replace(scene, logit_opacities=scene.logit_opacities + 8)
+    images = []
+    for rules in (RULES_3DGS, RULES_GSPLAT):
+        trained = replace(scene, convention=replace(CLASSIC, rules=rules))
+        renderer = Renderer.of(trained, [camera], RECIPES["classic"], rasterizer="eager")
+        images.append(renderer(camera))
+    assert images[1].alpha.max() > 0.9985
+    assert images[0].alpha.max() > 0.98
+    assert (images[0].rgb - images[1].rgb).abs().max() > 1e-3
+
+
+def test_kernels_of_other_rules_have_other_names(rules):
+    """Compiled kernels are found by name, and the values are built into them."""
+    for kernel in (pass_kernel, step_kernel):
+        assert kernel(POINT, rules).name != kernel(POINT, RULES_3DGS).name
+        assert kernel(POINT, rules).name != kernel(INTEGRAL, rules).name
+        assert kernel(POINT, RULES_3DGS).name == kernel(POINT, Rules()).name
+    assert len({pass_kernel(POINT, r).name for r in OTHERS.values()}) == len(OTHERS)
+    for kernel in (table_kernel, cull_kernel):
+        same_cutoff = rules.min_alpha == RULES_3DGS.min_alpha
+        assert (kernel(rules.min_alpha).name == kernel().name) == same_cutoff
+    assert project_kernel(0.01).name != project_kernel().name
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"max_alpha": 1.0},
+        {"max_alpha": math.nan},
+        {"min_alpha": 0.0},
+        {"min_alpha": 1 / 600},
+        {"min_alpha": 0.995},
+        {"min_transmittance": 0.0},
+        {"min_transmittance": 1.0},
+        {"near": 0.0},
+        {"near": -1.0},
+    ],
+    ids=str,
+)
+def test_wrong_rules_are_refused(wrong):
+    with pytest.raises(UsageError, match="rules: expected"):
+        Rules(**wrong)
+
+
+def test_rules_are_equal_by_value():
+    assert Rules() == RULES_3DGS
+    assert hash(Rules(max_alpha=0.999)) == hash(RULES_GSPLAT)
+    assert RULES_GSPLAT != RULES_3DGS
