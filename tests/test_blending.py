@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import pytest
 import torch
-
 from aaplug.methods.window_blending import Window, axes_of, moments, through
+
 from aaplug.rasterizers import RASTERIZERS
 from tests.test_rasterizers import BLACK, WHITE, splats_of
 

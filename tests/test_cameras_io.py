@@ -119,18 +119,6 @@ def test_inria_photos_count_more_than_the_sizes_in_the_file(tmp_path):
     assert (without.width, without.photo) == (100, None)
 
 
-def test_train_scale_overrides_everything(tmp_path):
-    photo(tmp_path / "images" / "a.png", 200, 100)
-    inria(tmp_path, cfg="Namespace(resolution=8)")
-    (camera,) = read_cameras(tmp_path, train_scale=0.25).train
-    assert (camera.width, camera.height, camera.fx, camera.trained_focal) == (
-        100,
-        50,
-        75.0,
-        camera.focal,
-    )
-
-
 def test_photo_of_another_shape_is_refused(tmp_path):
     photo(tmp_path / "images" / "a.png", 100, 200)
     with pytest.raises(FormatError, match="100×200 px, which is not the shape"):
@@ -430,17 +418,10 @@ def test_colmap_cut_anywhere_is_refused(tmp_path):
         data = (tmp_path / name).read_bytes()
         for length in [*range(0, len(data), 11), len(data) - 1]:
             (tmp_path / name).write_bytes(data[:length])
-            with pytest.raises(FormatError, match=name):
+            with pytest.raises(FormatError, match=name) as caught:
                 read_cameras(tmp_path)
         (tmp_path / name).write_bytes(data)
-
-
-def test_colmap_truncation_names_record_and_bytes(tmp_path):
-    colmap_bin(tmp_path)
-    data = (tmp_path / "images.bin").read_bytes()
-    (tmp_path / "images.bin").write_bytes(data[:-1])
-    with pytest.raises(FormatError, match=r"points of image record 1 need 48 bytes .* 47 are left"):
-        read_cameras(tmp_path)
+    assert "points of image record 1 need 48 bytes at least, and 47 are left" in str(caught.value)
 
 
 def test_photo_behind_a_link_out_of_the_dataset_is_refused(tmp_path):
@@ -831,12 +812,7 @@ def test_a_folder_without_cameras_says_what_was_looked_for(tmp_path):
 
 @pytest.mark.parametrize(
     "options",
-    [
-        {"train_scale": 0.0},
-        {"train_scale": math.nan},
-        {"train_scale": 1e9},
-        {"test_every": 1},
-    ],
+    [{"train_scale": 0.0}, {"train_scale": math.nan}, {"train_scale": 1e9}, {"test_every": 1}],
     ids=str,
 )
 def test_odd_options_are_refused(tmp_path, options):
@@ -850,16 +826,12 @@ def test_views_are_chosen_by_split_or_name(tmp_path):
     assert select_views(cameras, "test") == cameras.test
     assert len(select_views(cameras, "all")) == 17
     assert names(select_views(cameras, "v08, v01,v08")) == ["v08", "v01"]
-    with pytest.raises(UsageError, match=r"no view 'v1'.*v1"):
+    with pytest.raises(UsageError, match=r"views: there is no view 'v1'.*v1"):
         select_views(cameras, "v01,v1")
     with pytest.raises(UsageError):
         select_views(cameras, "")
-
-
-def test_a_name_in_both_splits_is_the_test_view(tmp_path):
-    cameras = read_cameras(blender(tmp_path))
-    assert select_views(cameras, "r_0") == (cameras.test[0],)
-    assert select_views(cameras, "r_2") == (cameras.train[2],)
+    both = read_cameras(blender(tmp_path / "blender"))
+    assert select_views(both, "r_0") == (both.test[0],), "a name in both splits is the test view"
 
 
 # Hostile bytes ----------------------------------------------------------------------------------
@@ -889,20 +861,11 @@ FIXTURES = {  # how to make each format's files, the path to read, and the file 
 
 
 @pytest.mark.parametrize("name", [format.name for format in OWN])
-def test_each_format_is_recognized_and_no_format_before_it_takes_its_files(tmp_path, name):
-    make, file = FIXTURES[name]
-    if name == "inria":  # with cfg_args it is a model folder
-        make = inria
-    path = make(tmp_path / "set")
+def test_each_format_is_recognized_and_no_other_takes_its_files(tmp_path, name):
+    path = FIXTURES[name][0](tmp_path / "set") if name != "inria" else inria(tmp_path / "set")
     takers = [format.name for format in OWN if format.sniff(path)]
-    assert takers[0] == name
-    assert set(takers) <= {name, "inria"}, (
-        "a model folder is also a cameras.json, and nothing else is two"
-    )
+    assert takers == ([name, "inria"] if name == "inria_model" else [name])
     assert read_cameras(path).all
-    if name == "pinhole":
-        assert not any(format.sniff(tmp_path) for format in OWN)
-        assert file == ""
 
 
 @dataclass(frozen=True)
@@ -978,16 +941,6 @@ def test_one_scene_has_the_same_poses_in_all_its_formats(shared_data):
 
 
 @pytest.mark.data
-def test_chair(shared_data):
-    cameras = read_cameras(shared_data / "chair")
-    assert (len(cameras.train), len(cameras.test)) == (100, 25)
-    assert cameras.background == WHITE
-    assert all(c.hw == (800, 800) and c.photo for c in cameras.all)
-    eighth = read_cameras(shared_data / "chair", train_scale=1 / 8)
-    assert all(c.hw == (100, 100) and c.trained_focal == c.focal for c in eighth.all)
-
-
-@pytest.mark.data
 def test_test_views_by_name_are_those_that_3dgs_lists_first(shared_data):
     folders = sorted((shared_data / "formats" / "inria").rglob("original_3dgs_train/*"))
     folder = min(folders, key=lambda folder: (folder / "cameras.json").stat().st_size)
@@ -999,23 +952,15 @@ def test_test_views_by_name_are_those_that_3dgs_lists_first(shared_data):
 @pytest.mark.data
 @pytest.mark.parametrize("kind", ["colmap", "inria", "transforms"])
 def test_real_files_read_or_raise_our_errors(shared_data, kind):
-    """A folder stands for the files in it that its format reads; the largest take seconds and show nothing new."""
-    files = [path for path in (shared_data / "formats" / kind).rglob("*") if path.is_file()]
-    small = [path for path in files if path.stat().st_size < 100_000]
+    """Small folders only: large ones take seconds and show nothing new."""
     outcomes = set()
-    for path in {*small, *(file.parent for file in small)}:
-        if path.name in ("cameras.json", "cfg_args") or any(
-            p.stat().st_size > 300_000 for p in path.parent.glob("*.*")
-        ):
+    for folder in {path.parent for path in (shared_data / "formats" / kind).rglob("*.*")}:
+        files = [path for path in folder.iterdir() if path.is_file()]
+        if any(path.stat().st_size > 300_000 for path in files):
             continue
-        try:
-            outcomes.add(bool(read_cameras(path).all))
-        except FormatError:
-            outcomes.add(False)
+        for path in [folder, *files]:
+            try:
+                outcomes.add(bool(read_cameras(path).all))
+            except FormatError:
+                outcomes.add(False)
     assert outcomes == {True, False} or kind == "inria"
-
-
-@pytest.mark.data
-def test_truncated_model_is_refused(shared_data):
-    with pytest.raises(FormatError, match=r"images\.bin: 10040 points of image record \d+ need"):
-        read_cameras(shared_data / "formats" / "colmap" / "jianzhengjie" / "data")

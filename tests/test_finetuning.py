@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from aaplug.finetuning.upsamplers import UPSAMPLERS, find_upsampler
 from skimage.metrics import structural_similarity as ssim_of_skimage
 
 from aaplug.core.cameras import WHITE
@@ -32,7 +33,6 @@ from aaplug.finetuning import tuning as tuning_module
 from aaplug.finetuning.densification import MIN_SHOWN, PULL, SHRINK, carried, densify
 from aaplug.finetuning.losses import LOSSES, l1_dssim, l2, structural_similarity
 from aaplug.finetuning.parameters import RATES, extent, leaves_of, scene_of, thinnest
-from aaplug.finetuning.upsamplers import UPSAMPLERS, find_upsampler
 from aaplug.methods.recipes import RECIPES
 from aaplug.rasterizers import RASTERIZERS
 from aaplug.rendering.renderer import learn, render

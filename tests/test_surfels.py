@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from aaplug.core.projection import project, rotation_matrices, tilt
-from aaplug.core.splats import MIN_ALPHA, reach, whitening
+from aaplug.core.splats import MIN_ALPHA, whitening
 from aaplug.methods.recipes import RECIPES
 from aaplug.rasterizers import extents_of
 from aaplug.rasterizers.reference import alphas
