@@ -1,7 +1,6 @@
 """Options that several verbs share, and reading what they name.
 
-Each class is a group of options.  `arguments` passes them on: an option and the parameter of the library's verb have the
-same name.
+Each class is a group of options.  `arguments` passes them to the library's verb, whose parameters have the same names.
 """
 
 import inspect
@@ -155,7 +154,7 @@ class RenderOptions(ViewOptions):
     quality: Annotated[str, choice(QUALITIES)] = "balanced"
     """How finely recipe auto samples: fast reaches a quarter of the training rate, balanced half, best all of it."""
     rate_reference: Annotated[str | None, flag("|".join(get_args(RateReference)))] = None
-    """What matched and auto compare sampling rates with (default: pose; global at a data set's poses, else interval)."""
+    """Sampling rate that matched and auto compare with (default: pose: global, or interval for a free camera)."""
 
 
 def values_of(options: Any) -> dict[str, Any]:

@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass
 
-from aaplug.rasterizers.tiled.ahead_of_time import KERNELS, build, cache_folder
+from aaplug.verbs import warmup as verb
 
-from .console import print_json, progress, say
+from .console import TERMINAL, print_json, say
 
 
 @dataclass(frozen=True)
@@ -17,9 +17,8 @@ class Warmup:
 
 def warmup(options: Warmup) -> int:
     """Compile what is missing and say where it is."""
-    with progress("compiling", "kernels") as tell:
-        build(tell)
-    say(f"{len(KERNELS)} kernels in {cache_folder()}")
+    folder, names = verb.warmup(monitor=TERMINAL)
+    say(f"{len(names)} kernels in {folder}")
     if options.json:
-        print_json({"folder": str(cache_folder()), "kernels": [kernel.name for kernel in KERNELS]})
+        print_json({"folder": str(folder), "kernels": names})
     return 0

@@ -5,7 +5,6 @@ import math
 import shutil
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -16,12 +15,10 @@ from aaplug_cli.main import main
 from plyfile import PlyData
 
 from aaplug.core.cameras import BLACK
-from aaplug.core.gaussians import MIP
 from aaplug.io.cameras import read_cameras
 from aaplug.io.images import image_size, write_png
 from aaplug.io.scenes import read_scene, write_scene
-from aaplug.methods.recipes import RECIPES
-from aaplug.rendering.renderer import learn, render
+from aaplug.rendering.renderer import Renderer
 from tests.conftest import make_camera, make_scene
 
 EYES = {
@@ -42,7 +39,7 @@ def dataset(tmp_path_factory) -> Path:
     write_png(folder / "test" / "r_0.png", torch.zeros(SIZE[1], SIZE[0], 3))
     cameras = read_cameras(folder)
     scene = read_scene(folder / "scene.ply")
-    image = render(scene, cameras.test[0], RECIPES["classic"], learn(scene, cameras.train)).rgb
+    image = Renderer.of(scene, cameras, "classic", rasterizer="eager")(cameras.test[0]).rgb
     write_png(folder / "test" / "r_0.png", image, overwrite=True)
     return folder
 
@@ -81,10 +78,8 @@ def test_render_writes_a_view_at_a_scale(cli):
     code, out, err = cli("render scene.ply --cameras . -o out --scale 0.5")
     assert (code, out) == (0, "")
     assert image_size(Path("out/r_0.png")) == (32, 24)
-    assert (
-        "recipe: auto for a classic scene, 1 view at 32x24, 0.5 × the rate of training: 1×1 sample a pixel"
-        in err
-    )
+    chosen = "1 view at 32x24, 0.5 × the training rate: 1×1 sample per pixel"
+    assert f"recipe: auto for a classic scene, {chosen}" in err
     assert "background: black" in err
 
 
@@ -135,130 +130,11 @@ def test_render_takes_an_inria_model_folder_as_it_is(cli):
     assert (code, "has no iteration 8; it has 7, 30" in err) == (2, True)
 
 
-def test_convert_then_info_shows_what_was_fused(cli):
-    code, out, err = cli("convert scene.ply --cameras . -o converted.ply --json")
-    assert code == 0
-    assert json.loads(out)["fused"][0]["method"] == "matched-energy"
-    assert "Mip rule" in err
-    facts = json.loads(cli("info converted.ply --json")[1])
-    assert facts["convention"] == "mip"
-    assert facts["fused"] == [
-        {"method": "matched-energy", "variance": "0.2", "views": "3", "from": "classic"}
-    ]
-    assert "matched-energy (variance=0.2" in cli("info converted.ply")[1]
-
-
-def test_convert_fuses_plain_mip_splatting_by_flag(cli):
-    assert cli("convert scene.ply --cameras . -o converted.ply --form mip-splatting")[0] == 0
-    fused = json.loads(cli("info converted.ply --json")[1])["fused"]
-    assert fused == [{"method": "smoothing3d", "variance": "0.2", "opacity": "volume"}]
-
-
-def test_convert_fuses_a_stored_filter_without_cameras(cli):
-    scene = replace(make_scene(20), filter_3d=torch.full((20,), 0.01), convention=MIP)
-    write_scene(Path("unfused.ply"), scene)
-    assert cli("convert unfused.ply -o fused.ply")[0] == 0
-    facts = json.loads(cli("info fused.ply --json")[1])
-    assert facts["fused"] == [{"method": "filter_3D"}]
-    assert not facts["stored_filter_3d"]
-
-
-def test_info_with_cameras_tells_the_sampling(cli):
-    facts = json.loads(cli("info scene.ply --cameras . --json")[1])
-    assert facts["gaussians"] == 150
-    assert facts["training_cameras"] == 3
-    assert 0.5 < facts["seen_share"] <= 1
-
-
-def test_evaluate_writes_results_and_prints_a_table(cli):
-    code, out, _ = cli("evaluate scene.ply --cameras . -o out --recipe classic auto --scale 1 0.5")
-    assert code == 0
-    assert "training size, resampled" in out
-    results = json.loads(Path("out/results.json").read_text())
-    assert results["auto@1"]["PSNR"] is None or results["auto@1"]["PSNR"] > 45
-    about = results["_aaplug"]
-    assert about["truth"] == "photographs"
-    assert len(about["scene"]["sha256"]) == 64
-    assert {"aaplug", "torch"} <= set(about["versions"])
-    assert list(json.loads(Path("out/per_view.json").read_text())["classic@0.5"]["SSIM"]) == ["r_0"]
-
-
-@pytest.mark.parametrize(
-    "several", ["--recipe mip,auto --scale 1,0.5", "--scale=1,0.5 --recipe=mip,auto,"]
-)
-def test_commas_part_values_as_spaces_do(cli, several):
-    code, out, _ = cli(f"evaluate scene.ply --cameras . {several} -o a,b --json")
-    assert code == 0
-    methods = {name for name in json.loads(out) if "@" in name and " " not in name}
-    assert methods == {"mip@1", "mip@0.5", "auto@1", "auto@0.5"}
-    assert Path("a,b/results.json").is_file()
-
-
-def test_evaluate_without_photographs_takes_the_scenes_own_look(cli):
-    code, out, err = cli("evaluate scene.ply --cameras . --views train --scale 0.5 --json")
-    assert code == 0
-    assert "truth: self" in err
-    assert json.loads(out)["_aaplug"]["truth"] == "self"
-
-
-def test_evaluate_all_leaves_out_what_does_not_suit_the_scene(cli):
-    words = "evaluate scene.ply --cameras . --recipe all --scale 0.25 --json"
-    code, out, err = cli(words)
-    assert code == 0
-    assert "recipe multi-scale left out: the scene lacks" in err
-    assert set(json.loads(out)["_aaplug"]["recipes"]) == set(RECIPES) - {"multi-scale"}
-
-
-def test_evaluate_by_a_protocol_names_it_and_its_flavours(cli):
-    words = (
-        "evaluate scene.ply --cameras . --protocol blender --scale 1 0.5 --recipe matched --json"
-    )
-    about = json.loads(cli(words)[1])["_aaplug"]
-    assert about["protocol"]["name"] == "blender"
-    assert about["background"] == [1, 1, 1]
-    assert about["metrics"]["SSIM"].startswith("3dgs")
-    assert "RGBA halved" in about["downscale"]
-    overridden = json.loads(cli(words + " --ssim wang")[1])["_aaplug"]
-    assert overridden["metrics"]["SSIM"].startswith("wang")
-
-
-def test_evaluate_writes_a_report_and_inrias_folders(cli):
-    words = (
-        "evaluate scene.ply --cameras . -o out --recipe classic auto --scale 1 0.5 --flip --flicker"
-    )
-    pytest.importorskip("flip_evaluator")
-    code, out, err = cli(f"{words} --report --layout inria --show r_0")
-    assert code == 0, err
-    page = Path("out/report.html").read_text()
-    assert "FLIP" in out
-    assert "flicker" in page
-    assert Path("out/plots/psnr.png").is_file()
-    assert image_size(Path("out/test/classic@0.5/gt/00000.png")) == (32, 24)
-    assert Path("out/results.csv").read_text().count("\n") == 7
-
-
-def test_data_goes_to_stdout_and_the_log_to_stderr(cli):
-    _, out, err = cli("info scene.ply --json")
-    json.loads(out)
-    assert err.startswith("scene: scene.ply: 150 Gaussians, SH degree 1, classic (no tag")
-
-
-def test_drop_bad_leaves_bad_gaussians_out_and_counts_them(cli):
-    break_nan(Path())
-    code, out, _ = cli("info scene.ply --json")
-    facts = json.loads(out)
-    assert (code, facts["gaussians"], facts["unusable_gaussians"]) == (0, 150, 2)
-    assert "--drop-bad" in facts["problems"][0]
-    code, out, err = cli("convert scene.ply --cameras . -o out.ply --json --drop-bad")
-    assert (code, json.loads(out)["gaussians"]) == (0, 148)
-    assert "warning:" in err
-
-
-def test_guard_leaves_out_what_is_centred_far_outside(cli):
+def test_cull_margin_leaves_out_what_is_centred_far_outside(cli):
     cli("render scene.ply --cameras . -o all.png")
-    cli("render scene.ply --cameras . -o guarded.png --guard -0.2")
-    assert Path("all.png").read_bytes() != Path("guarded.png").read_bytes()
-    cli("render scene.ply --cameras . -o wide.png --guard 100")
+    cli("render scene.ply --cameras . -o culled.png --cull-margin -0.2")
+    assert Path("all.png").read_bytes() != Path("culled.png").read_bytes()
+    cli("render scene.ply --cameras . -o wide.png --cull-margin 100")
     assert Path("all.png").read_bytes() == Path("wide.png").read_bytes()
 
 
@@ -324,49 +200,22 @@ REFUSED = {
     "cameras of another scene": (break_frame, CONVERT, ["scene.ply", "different frames"]),
     "frame, on render": (
         break_frame, "render scene.ply --cameras . -o new", ["scene.ply", "different frames"]),
-    "frame, on evaluate": (
-        break_frame, "evaluate scene.ply --cameras . -o new", ["scene.ply", "different frames"]),
     "output is input": (
         break_nothing, "convert scene.ply --cameras . -o ./scene.ply --overwrite", ["scene.ply", "input"]),
     "existing output": (
         break_nothing, "convert scene.ply --cameras . -o present.ply", ["present.ply", "--overwrite"]),
     "existing image": (
         break_nothing, "render scene.ply --cameras . -o test", ["test", "r_0.png", "--overwrite"]),
-    "unreadable photograph": (break_photo, "evaluate scene.ply --cameras . -o new", ["r_0.png"]),
     "unknown view": (
         break_nothing, "render scene.ply --cameras . -o new --views r_9", ["r_9", "r_0"]),
     "unknown recipe": (
         break_nothing, "render scene.ply --cameras . -o new --recipe mipp", ["mipp", "matched"]),
     "a recipe for other scenes": (
         break_nothing, "render scene.ply --cameras . -o new --recipe multi-scale", ["base_mask"]),
-    "a recipe for other scenes, on evaluate": (
-        break_nothing, "evaluate scene.ply --cameras . -o new --recipe multi-scale", ["base_mask"]),
     "a recipe for other scenes, on video": (
         break_nothing, "video scene.ply --cameras . -o new.webm --recipe multi-scale", ["base_mask"]),
     "scale and resolution": (
         break_nothing, "render scene.ply --cameras . -o new --scale 2 --resolution 8x8", ["give one"]),
-    "a report without a folder": (
-        break_nothing, "evaluate scene.ply --cameras . --report", ["--report", "-o FOLDER"]),
-    "resume and overwrite": (
-        break_nothing, "evaluate scene.ply --cameras . -o new --resume --overwrite", ["contradict"]),
-    "unknown protocol": (
-        break_nothing, "evaluate scene.ply --cameras . -o new --protocol blendr", ["blendr", "blender"]),
-    "unknown shown view": (
-        break_nothing, "evaluate scene.ply --cameras . -o new --report --show r_9", ["--show", "r_9"]),
-    "scene and batch": (
-        break_nothing, "evaluate scene.ply --batch b.toml -o new", ["--batch", "scene.ply"]),
-    "several scenes without a folder": (
-        break_nothing, "evaluate scene.ply scene.ply --cameras .", ["-o FOLDER", "several"]),
-    "scenes without cameras": (
-        break_nothing, "evaluate scene.ply scene.ply -o new", ["--cameras", "model folders"]),
-    "photographs of a moved camera": (
-        break_nothing, "evaluate scene.ply --cameras . --protocol fov --truth photographs -o new", ["fov"]),
-    "a scale that does not halve": (
-        break_nothing, "evaluate scene.ply --cameras . --protocol blender --scale 0.3 -o new", ["1/2"]),
-    "no weights": (
-        break_nothing, "evaluate scene.ply --cameras . --lpips a.pth b.pth -o new", ["a.pth"]),
-    "a flavour without weights": (
-        break_nothing, "evaluate scene.ply --cameras . --lpips-flavour vgg -o new", ["--lpips TRUNK HEADS"]),
     "a video of no kind": (
         break_nothing, "video scene.ply --cameras . -o new.gif", ["new.gif", ".webm"]),
     "a video of no length": (
@@ -389,7 +238,11 @@ REFUSED = {
 
 @pytest.mark.parametrize("case", REFUSED)
 def test_refusals_name_file_and_cause_and_write_nothing(cli, case):
-    spoil, words, named = REFUSED[case]
+    assert_refused(cli, *REFUSED[case])
+
+
+def assert_refused(cli, spoil, words: str, named: list[str]) -> None:
+    """One line that names what is wrong, exit code 2, and no file written or changed."""
     spoil(Path())
     before = {path: path.stat().st_mtime_ns for path in Path().rglob("*")}
     code, out, err = cli(words)
@@ -409,13 +262,13 @@ def test_interrupting_ends_with_130_and_leaves_no_file(cli, monkeypatch):
     def interrupted(*args, **kwargs):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("aaplug_cli.convert.write_scene", interrupted)
+    monkeypatch.setattr("aaplug.verbs.convert.write_scene", interrupted)
     assert cli(CONVERT)[0] == 130
     assert not Path("new.ply").exists()
 
 
 def test_demo_does_the_whole_job(cli, monkeypatch):
-    monkeypatch.setattr("aaplug_cli.demo.SCALES", (0.25, 0.125))
+    monkeypatch.setattr("aaplug.verbs.demo.SCALES", (0.25, 0.125))
     code, out, _ = cli("demo -o shown")
     assert code == 0
     assert "auto" in out

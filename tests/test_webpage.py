@@ -10,16 +10,13 @@ import cv2
 import numpy as np
 import pytest
 
-from aaplug.core.cameras import BLACK
-from aaplug.evaluation.engine import Task, evaluate
-from aaplug.evaluation.image_store import Images
-from aaplug.evaluation.metrics import CONSISTENCY, ENERGY
+from aaplug.core.cameras import CameraSet
+from aaplug.core.training import TrainingViews
 from aaplug.evaluation.report.plots import plots
-from aaplug.evaluation.report.webpage import write_page
 from aaplug.inspection.coverage import coverage
 from aaplug.io.images import image_size, write_png
-from aaplug.methods.recipes import RECIPES
-from aaplug.rendering.renderer import learn, render
+from aaplug.rendering.renderer import Renderer
+from aaplug.verbs.evaluate import evaluate
 from tests.conftest import make_camera, make_scene
 
 NASTY = "</script><script>alert('x')</script>&amp;$\\frac$ “r_0”"
@@ -32,28 +29,30 @@ FLAGS = [
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
-    """A report of two views with nasty names, and the folder that it lies in."""
+    """The folder of a report of two views with nasty names, the report and the sampling bounds it shows."""
     folder: Path = tmp_path_factory.mktemp("report")
     scene = make_scene(150)
     views = [
         make_camera((0.0, -4.0, 0.0), name=NASTY),
         make_camera((2.0, -4.0, 1.0), name="b"),
     ]
-    training = learn(scene, views)
+    training = TrainingViews.of(scene, views)
+    renderer = Renderer.of(scene, training, "classic", rasterizer="eager")
     for i, view in enumerate(views):
-        image = render(scene, view, RECIPES["classic"], training).rgb
-        write_png(folder / f"{i}.png", image * 0.9 + 0.05)
+        write_png(folder / f"{i}.png", renderer(view).rgb * 0.9 + 0.05)
         views[i] = replace(view, photo=folder / f"{i}.png")
-    recipes = [RECIPES["classic"], replace(RECIPES["auto"], name="auto")]
-    task = Task(
-        recipes, (1.0, 0.5, 2.0), views, BLACK, "photographs", figures=(CONSISTENCY, ENERGY)
+    report = evaluate(
+        scene,
+        CameraSet(tuple(views), tuple(views), notes=(NASTY,)),
+        recipe=("classic", "auto"),
+        scale=(1.0, 0.5, 2.0),
+        background="black",
+        rasterizer="eager",
+        output=folder,
+        report=True,
+        name=f"scene {NASTY}",
     )
-    images = Images(folder, shown=(0, 1))
-    facts = {"versions": {"aaplug": "0"}, "scene": {"file": NASTY}}
-    report = evaluate(scene, training, task, facts, images=images)
-    found = coverage(scene, training, report.scales)
-    write_page(folder, f"scene {NASTY}", report, found, images, overwrite=False)
-    return folder, report, found
+    return folder, report, coverage(scene, training, report.scales)
 
 
 class Tags(HTMLParser):
@@ -96,7 +95,7 @@ def test_the_best_is_bold_and_the_ceiling_beside_it(written):
 
 def test_plots_are_files_too_and_do_not_change(written):
     folder, report, found = written
-    names = ["psnr", "ssim", "seconds", "pairs", "sampling-bounds"]
+    names = ["psnr", "ssim", "seconds", "evaluations", "sampling-bounds"]
     for plot, name in zip(plots(report, found), names, strict=True):
         assert (folder / "plots" / f"{name}.svg").read_text() == plot.svg()
         assert min(image_size(folder / "plots" / f"{name}.png")) > 300

@@ -28,7 +28,8 @@ import torch
 
 from aaplug.core.errors import UsageError
 
-T, R = TypeVar("T"), TypeVar("R")
+T = TypeVar("T")
+R = TypeVar("R")
 
 
 class Executor(Protocol):

@@ -71,6 +71,15 @@ class Metric:
         assert self.figure is not None
         return _finite(self.figure(series))
 
+    @property
+    def title(self) -> str:
+        """Name and unit."""
+        return self.name + (f" [{self.unit}]" if self.unit else "")
+
+    def text(self, value: float | None) -> str:
+        """A value as tables show it."""
+        return "–" if value is None else f"{value:.{self.digits}f}"
+
     def loss(self, value: float) -> float:
         """Lower is better."""
         return -value if math.isinf(self.ideal) else abs(value - self.ideal)

@@ -1,6 +1,6 @@
-"""A run on disk: everything that its next step depends on, in one file that appears whole or not at all.
+"""Checkpoints: everything that the next step of a run depends on, in one file that is written whole or not at all.
 
-The file is torch's own, of tensors, numbers and words alone, and is read as such: nothing in it is executed.
+The file is torch's, of tensors, numbers and strings only.  It is read as such: nothing in it is executed.
 """
 
 import hashlib
@@ -15,73 +15,67 @@ from torch import Tensor
 from aaplug.core.errors import FormatError, UsageError
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.sampling import SamplingBounds
-from aaplug.finetuning.densification import Pulls
-from aaplug.finetuning.state import Job, State, optimizer
+from aaplug.finetuning.densification import ScreenGradients
+from aaplug.finetuning.state import State, TuningJob, optimizer
 from aaplug.io.atomic import replacing
 
-FORMAT = "aaplug finetune 2"
-DIGEST = 16  # hex digits that tell one scene from another
+FORMAT = "aaplug finetune 3"
+DIGEST = 16  # hex digits of a hash
+COUNTERS = ("step", "bad_steps", "rollbacks")
 
 
 def packed(state: State) -> dict[str, Any]:
-    """A copy of the state that later steps do not change, of types that files hold."""
+    """A copy of the state, which later steps do not change, in types that a file can hold."""
     moments = {
         group["name"]: {k: v.clone() for k, v in state.adam.state[group["params"][0]].items()}
         for group in state.adam.param_groups
     }
-    return {
-        "step": state.step,
+    return {name: getattr(state, name) for name in COUNTERS} | {
         "leaves": {name: leaf.detach().clone() for name, leaf in state.leaves.items()},
         "moments": moments,
-        "born": state.born.clone(),
-        "bounds": {name: value.clone() for name, value in vars(state.bounds).items()},
-        "pulls": (state.pulls.total.clone(), state.pulls.views.clone()),
-        "bad": state.bad,
-        "back_offs": state.back_offs,
+        "first_log_scales": state.first_log_scales.clone(),
+        "bounds": _cloned(vars(state.bounds)),
+        "gradients": _cloned(vars(state.gradients)),
         "curve": list(state.curve),
         "probes": list(state.probes),
     }
 
 
-def unpacked(data: Mapping[str, Any], job: Job) -> State:
-    """The state again; it shares nothing with what it was made from."""
-    leaves = {name: leaf.clone() for name, leaf in data["leaves"].items()}
+def unpacked(data: Mapping[str, Any], job: TuningJob) -> State:
+    """The state again; it shares no tensor with `data`."""
+    leaves = _cloned(data["leaves"])
     adam = optimizer(leaves, job.settings)
     for group in adam.param_groups:
-        moments = data["moments"][group["name"]]
-        adam.state[group["params"][0]] = {k: v.clone() for k, v in moments.items()}
-    total, views = data["pulls"]
+        adam.state[group["params"][0]] = _cloned(data["moments"][group["name"]])
     return State(
-        step=data["step"],
         leaves=leaves,
         adam=adam,
-        born=data["born"].clone(),
-        bounds=SamplingBounds(**{name: value.clone() for name, value in data["bounds"].items()}),
-        pulls=Pulls(total.clone(), views.clone()),
-        bad=data["bad"],
-        back_offs=data["back_offs"],
+        first_log_scales=data["first_log_scales"].clone(),
+        bounds=SamplingBounds(**_cloned(data["bounds"])),
+        gradients=ScreenGradients(**_cloned(data["gradients"])),
         curve=list(data["curve"]),
         probes=list(data["probes"]),
+        **{name: data[name] for name in COUNTERS},
     )
 
 
-def save(path: Path, job: Job, state: State, good: Mapping[str, Any]) -> None:
-    """Write the state, and the one to go back to, over what is there.
+def save(path: Path, job: TuningJob, state: State, good: Mapping[str, Any]) -> None:
+    """Write the state and the last good one, replacing an older checkpoint.
 
     Raises:
-        OutputError: it cannot be written; an older file is then still whole.
+        OutputError: it cannot be written; an older checkpoint is then still whole.
     """
     content = {"format": FORMAT, "job": facts(job), "state": packed(state), "good": dict(good)}
     with replacing(path, overwrite=True) as stream:
         torch.save(content, stream)
 
 
-def load(path: Path, job: Job) -> tuple[State, dict[str, Any]]:
-    """The state of a run of this very job, and the one to go back to.
+def load(path: Path, job: TuningJob) -> tuple[State, dict[str, Any]]:
+    """The state of a run of this job, and the last good one, packed.
 
     Raises:
         FormatError: the file is missing, damaged or something else.
-        UsageError: it is of another job; the first difference is named.
+        UsageError: it is of another job; the message names the first difference.
     """
     try:
         content = torch.load(path, weights_only=True)
@@ -90,8 +84,8 @@ def load(path: Path, job: Job) -> tuple[State, dict[str, Any]]:
         state, found = unpacked(content["state"], job), content["job"]
     except FileNotFoundError as error:
         raise FormatError(path, "does not exist: there is no run to resume") from error
-    except Exception as error:  # whatever torch stumbles over in a damaged file
-        raise FormatError(path, "is not a checkpoint of `aaplug finetune`, or damaged") from error
+    except Exception as error:  # torch raises all kinds over a damaged file
+        raise FormatError(path, "is damaged, or no checkpoint of this version") from error
     for key, value in facts(job).items():
         if found.get(key) != value:
             raise UsageError(
@@ -100,26 +94,30 @@ def load(path: Path, job: Job) -> tuple[State, dict[str, Any]]:
     return state, content["good"]
 
 
-def facts(job: Job) -> dict[str, str]:
-    """What a run is a function of, in words that can be compared."""
+def facts(job: TuningJob) -> dict[str, str]:
+    """Everything that a run depends on, as text that can be compared."""
     settings = {key: str(value) for key, value in asdict(job.settings).items()}
+    start, truth = job.start, job.truth
     return settings | {
-        "scene": _digest(job.start),
-        "truth": f"{_digest(job.truth.scene)} photographs={job.truth.photographs}",
-        "recipe": job.recipe.name,
+        "scene": _digest(start.scene),
+        "truth": f"{_digest(truth.own.scene)} {truth.source}",
+        "recipe": start.recipe.name,
         "views": _hash(repr([(v.name, v.hw, v.focal) for v in job.views]).encode()),
-        "background": str(job.background),
-        "guard": str(job.training.guard),
-        "rasterizer": job.rasterizer.kernels.name,
-        "number of threads": str(torch.get_num_threads()),  # sums are taken in another order
+        "background": str(start.background),
+        "cull margin": str(start.training.cull_margin),
+        "rasterizer": start.rasterizer.name,
+        "number of threads": str(torch.get_num_threads()),  # it changes the order of sums
     }
 
 
+def _cloned(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    return {name: value.clone() for name, value in tensors.items()}
+
+
 def _digest(scene: Gaussians) -> str:
-    columns: list[Tensor] = [
-        *(scene.means, scene.quats, scene.log_scales, scene.logit_opacities, scene.sh)
-    ]
-    return _hash(b"".join(c.detach().contiguous().numpy().tobytes() for c in columns))
+    names = ("means", "quats", "log_scales", "logit_opacities", "sh")
+    columns = [getattr(scene, name).detach().contiguous() for name in names]
+    return _hash(b"".join(column.numpy().tobytes() for column in columns))
 
 
 def _hash(data: bytes) -> str:

@@ -1,6 +1,6 @@
-"""What a fine-tuning step minimises: how far a render is from the image that it should be.
+"""Losses that a fine-tuning step minimises.
 
-Images are [h, w, 3].  A loss is a scalar, 0 where both are equal, and differentiable in the first argument.
+Images are [h, w, 3].  A loss is a scalar, 0 for equal images, and differentiable in the first argument.
 """
 
 from collections.abc import Callable
@@ -11,8 +11,8 @@ from torch import Tensor
 
 from aaplug.evaluation.similarity import SSIM_SIGMA, SSIM_WINDOW
 
-SSIM_SHARE = 0.2  # of D-SSIM beside L1 (3DGS, eq. 7)
-SSIM_K = (0.01, 0.03)  # of the value range, squared: Wang et al. 2004
+SSIM_SHARE = 0.2  # weight of D-SSIM against L1 (3DGS, eq. 7)
+SSIM_K = (0.01, 0.03)  # for values in [0, 1]; squared in the formula (Wang et al. 2004)
 
 Loss = Callable[[Float[Tensor, "h w 3"], Float[Tensor, "h w 3"]], Float[Tensor, ""]]
 
@@ -23,7 +23,7 @@ def l2(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> Float[Te
 
 
 def l1_dssim(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
-    """0.8 mean absolute error + 0.2 (1 − SSIM): what 3DGS is trained with (its eq. 7)."""
+    """3DGS's training loss (eq. 7): 0.8 mean absolute error + 0.2 (1 - SSIM)."""
     absolute = (image - truth).abs().mean()
     return (1 - SSIM_SHARE) * absolute + SSIM_SHARE * (1 - structural_similarity(image, truth))
 
@@ -31,7 +31,7 @@ def l1_dssim(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> Fl
 def structural_similarity(
     image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]
 ) -> Float[Tensor, ""]:
-    """Mean SSIM over the windows that lie in the image whole, or over one as large as a smaller image."""
+    """Mean SSIM over the windows that lie inside the image; the window shrinks to fit a smaller image."""
     a, b = (x.permute(2, 0, 1)[:, None] for x in (image, truth))
     rows, columns = (_window(min(SSIM_WINDOW, side)).to(image) for side in a.shape[2:])
 

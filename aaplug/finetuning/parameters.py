@@ -1,11 +1,11 @@
-"""The scene as leaves that an optimizer moves, with 3DGS's learning rates, and the bounds that they keep.
+"""The scene as leaves that an optimizer moves, 3DGS's learning rates, and the bounds that the leaves keep.
 
-n: Gaussians.  Colours are two leaves, the constant (dc) and the rest of the harmonics, for 3DGS moves them at rates of
-their own.  A Gaussian may become no thinner than its sampling bound lets it be, or than it was if it was thinner:
-below √0.2 px at the highest rate of any training camera nothing could be told from noise (Mip-Splatting, section 5.1).
+n: Gaussians.  Colours are two leaves, the constant (dc) and the other harmonics (rest), because 3DGS gives them
+learning rates of their own.  No Gaussian may become thinner than its sampling bound, or than it was if it was thinner:
+no training view could resolve less than √0.2 px at its highest rate (Mip-Splatting, section 5.1).
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import torch
@@ -19,7 +19,9 @@ from aaplug.methods.filters import NYQUIST_VARIANCE
 
 Leaves = dict[str, Tensor]
 
-RATES: Mapping[str, float] = {  # 3DGS's, a step; means' in shares of the scene's extent
+RATES: Mapping[
+    str, float
+] = {  # 3DGS's, per step; that of the means is a share of the scene's extent
     "means": 1.6e-4,
     "quats": 1e-3,
     "log_scales": 5e-3,
@@ -27,11 +29,11 @@ RATES: Mapping[str, float] = {  # 3DGS's, a step; means' in shares of the scene'
     "dc": 2.5e-3,
     "rest": 2.5e-3 / 20,
 }
-EXTENT_MARGIN = 1.1  # of the training cameras' farthest distance from their mean (3DGS)
+EXTENT_MARGIN = 1.1  # times the training cameras' farthest distance from their mean (3DGS)
 
 
 def leaves_of(scene: Gaussians) -> Leaves:
-    """Copies of everything that can move."""
+    """Copies of every parameter."""
     leaves = {
         "means": scene.means,
         "quats": scene.quats,
@@ -44,7 +46,10 @@ def leaves_of(scene: Gaussians) -> Leaves:
 
 
 def scene_of(leaves: Mapping[str, Tensor], like: Gaussians) -> Gaussians:
-    """The scene that the leaves stand for; what has another number of Gaussians than its file is not from there."""
+    """The scene that the leaves stand for.
+
+    If densification changed the number of Gaussians, the link to the rows of the source file is dropped.
+    """
     values = {n: leaves[n] for n in ("means", "quats", "log_scales", "logit_opacities")}
     sh = torch.cat([leaves["dc"], leaves["rest"]], dim=1)
     same = len(sh) == len(like)
@@ -53,19 +58,19 @@ def scene_of(leaves: Mapping[str, Tensor], like: Gaussians) -> Gaussians:
 
 
 def between(start: Gaussians, end: Gaussians, share: float) -> Gaussians:
-    """A scene on the straight way from one to another of as many Gaussians; 0 has the start's values, 1 the end's."""
+    """Interpolate two scenes of equally many Gaussians, parameter by parameter: 0 gives the start, 1 the end."""
     first, last = leaves_of(start), leaves_of(end)
     return scene_of({n: first[n].lerp(last[n], share) for n in first}, end)
 
 
-def extent(cameras: tuple[Camera, ...]) -> float:
-    """The scene's size as 3DGS has it, in world units: from the spread of its training cameras."""
+def extent(cameras: Sequence[Camera]) -> float:
+    """The scene's size in world units, from the spread of its training cameras (3DGS)."""
     centres = torch.stack([camera.centre for camera in cameras])
     spread = (centres - centres.mean(dim=0)).norm(dim=1).max().item()
     return EXTENT_MARGIN * spread if spread > 0 else 1.0
 
 
-def thinnest(born: Float[Tensor, "n 3"], bounds: SamplingBounds) -> Float[Tensor, "n 3"]:
-    """ln of the least standard deviation that each axis may take, from the one that it started with."""
+def least_log_scales(first: Float[Tensor, "n 3"], bounds: SamplingBounds) -> Float[Tensor, "n 3"]:
+    """ln of the least standard deviation that each axis may take, given the one it had at first."""
     floor = 0.5 * torch.log(torch.tensor(NYQUIST_VARIANCE)) - bounds.highest_or_coarsest.log()
-    return torch.minimum(born, floor.to(born)[:, None])
+    return torch.minimum(first, floor.to(first)[:, None])

@@ -1,9 +1,14 @@
-"""How to fine-tune: ours and Mipmap-GS's."""
+"""How to fine-tune: aaplug's method and Mipmap-GS's."""
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+from aaplug.core.errors import UsageError
+from aaplug.core.registry import Registry
+from aaplug.finetuning.losses import LOSSES
 from aaplug.finetuning.parameters import RATES
+from aaplug.methods.viewers import CLASSIC_VIEWER, FAST, Viewer
 
 MIPMAP_STEPS = 1000
 MIPMAP_EVERY = 100  # steps between densifications
@@ -13,10 +18,11 @@ MIPMAP_EVERY = 100  # steps between densifications
 class Settings:
     """Everything that a run depends on beside its scene and cameras.
 
-    weights: of the loss, by scale against training's size; each step draws one of the scales.
-    anchor: weight of the training size's loss, which is added to every step.
-    rates: learning rate by leaf; a leaf without one stays.  decay: share of them that is left at the end.
-    loss: a name of `losses.LOSSES`.
+    weights: of the loss, by scale against the training size; each step draws one of the scales.
+    anchor: weight of the loss at the training size, which every step adds.
+    rates: learning rate by parameter; a parameter without one stays fixed.
+    decay: factor that the learning rates have reached at the end.
+    loss: a name in `losses.LOSSES`.
     densify_every: steps between densifications, 0 for none.
     """
 
@@ -39,33 +45,105 @@ OURS = Settings(
     anchor=3.0,
     decay=0.03,
 )
-GENTLE = (
-    0.3  # of the rates: 3DGS's own shake a scene that is nearly right, and 300 steps do not calm it
-)
-QUICK = replace(  # a conversion's: a few minutes; its weights are against the original's own errors
-    OURS,
-    name="quick",
-    steps=300,
-    weights={0.5: 1.0, 0.25: 1.0, 0.125: 1.0},
-    anchor=4.0,
-    rates={name: GENTLE * rate for name, rate in RATES.items()},
+# 3DGS's rates worsen a scene that is nearly right, and 300 steps are too few to recover
+GENTLE = 0.3
+QUICK = (
+    replace(  # for conversion, a few minutes; `balanced` divides its weights by the scene's errors
+        OURS,
+        name="quick",
+        steps=300,
+        weights={0.5: 1.0, 0.25: 1.0, 0.125: 1.0},
+        anchor=4.0,
+        rates={name: GENTLE * rate for name, rate in RATES.items()},
+    )
 )
 
 
 def balanced(settings: Settings, errors: Mapping[float, float]) -> Settings:
-    """The same with every scale's loss over the root of a mean square error found there, the training size's (1.0) too.
+    """Divide the weight of every scale by the root of the mean square error found there; errors[1.0] is the anchor's.
 
-    Half way between errors as they are, where scales with little wrong would pay for those with much, and shares of
-    errors, where those would gain nothing.
+    This lies between two extremes.  Undivided losses would sacrifice scales with small errors to those with large
+    ones; losses as shares of the errors would leave the large ones where they are.
     """
     weights = {scale: weight / errors[scale] ** 0.5 for scale, weight in settings.weights.items()}
     return replace(settings, weights=weights, anchor=settings.anchor / errors[1.0] ** 0.5)
 
 
-def mipmap_gs(scale: float) -> Settings:
+def consistency(scales: Sequence[float], move: Sequence[str], anchor: float) -> Settings:
+    """One model for all scales and the training size."""
+    weights = {scale: OURS.weights.get(scale, 1.0) for scale in scales}
+    return replace(OURS, weights=weights, rates={name: RATES[name] for name in move}, anchor=anchor)
+
+
+def mipmap_gs(scales: Sequence[float], move: Sequence[str] = (), anchor: float = 0.0) -> Settings:
     """Mipmap-GS (Li et al. 2024), one model for one scale: all parameters at 3DGS's rates, 1000 steps of L2.
 
-    Its truth is a bilinear resize, of the poses to be tested; here it is the box average, of the training poses.
+    Its truth is a bilinear resize at the test poses; here it is the box average at the training poses.  It moves every
+    parameter and has no anchor.
+
+    Raises:
+        UsageError: there is not exactly one scale.
     """
-    weights = {scale: 1.0}
+    if len(scales) != 1:
+        raise UsageError("scale", "mipmap-gs makes one model for one scale; give one")
+    weights = {scales[0]: 1.0}
     return Settings("mipmap-gs", MIPMAP_STEPS, weights, RATES, densify_every=MIPMAP_EVERY)
+
+
+@dataclass(frozen=True)
+class Method:
+    """A way to fine-tune.
+
+    settings: from the scales, the parameters that move and the anchor.
+    viewer: the default target.
+    """
+
+    settings: Callable[[Sequence[float], Sequence[str], float], Settings]
+    viewer: Viewer
+
+
+METHODS: Registry[Method] = Registry(
+    "method",
+    {"consistency": Method(consistency, FAST), "mipmap-gs": Method(mipmap_gs, CLASSIC_VIEWER)},
+    check=lambda value: isinstance(value, Method),
+)
+
+
+def settings_of(
+    method: Method,
+    *,
+    scale: Sequence[float],
+    steps: int | None,
+    loss: str,
+    anchor: float,
+    move: Sequence[str],
+    learning_rate: float,
+    densify_every: int | None,
+    seed: int,
+) -> Settings:
+    """A method's settings with the user's choices; None takes the method's own.
+
+    Raises:
+        UsageError: a choice is out of its range, or does not fit the method.
+    """
+    for name, value in (("steps", steps), ("densify_every", densify_every), ("anchor", anchor)):
+        if value is not None and not value >= 0:
+            raise UsageError(name, f"must be 0 or more, got {value:g}")
+    if not (scale and all(0 < s < math.inf for s in scale)):
+        raise UsageError("scale", "needs sizes above 0")
+    if not learning_rate > 0:
+        raise UsageError("learning_rate", f"must be above 0, got {learning_rate:g}")
+    unknown = [name for name in move if name not in RATES]
+    if unknown or not move:
+        raise UsageError("move", f"needs parameters out of {', '.join(RATES)}")
+    if loss not in LOSSES:
+        raise UsageError("loss", f"'{loss}' is not one of {', '.join(LOSSES)}")
+    own = method.settings(scale, move, anchor)
+    return replace(
+        own,
+        steps=own.steps if steps is None else steps,
+        rates={name: rate * learning_rate for name, rate in own.rates.items()},
+        loss=loss,
+        seed=seed,
+        densify_every=own.densify_every if densify_every is None else densify_every,
+    )

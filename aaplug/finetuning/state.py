@@ -1,7 +1,7 @@
-"""What a run is about, and where it is."""
+"""What a run works on, and how far it has come."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -10,68 +10,75 @@ from torch import Tensor
 
 from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import Gaussians
-from aaplug.core.interfaces import Rasterizer
 from aaplug.core.sampling import SamplingBounds
-from aaplug.core.training import TrainingViews
-from aaplug.finetuning.densification import Pulls
-from aaplug.finetuning.parameters import Leaves, leaves_of, scene_of
+from aaplug.evaluation.truth import Truth
+from aaplug.finetuning.densification import ScreenGradients
+from aaplug.finetuning.parameters import Leaves, extent, leaves_of, scene_of
 from aaplug.finetuning.settings import Settings
-from aaplug.finetuning.truth import Truth
-from aaplug.methods.recipes import Recipe
+from aaplug.rendering.renderer import Renderer
 
 EPSILON = 1e-15  # of Adam (3DGS)
 
 
 @dataclass(frozen=True)
-class Job:
+class TuningJob:
     """What to tune, how it will be viewed, and what it should look like.
 
-    start: the scene as the viewer gets it at first, its Gaussians where those are that training's bounds are of.
-    recipe: the viewer's rule; it has no world filter.
+    start: draws the scene that the run starts from as the viewer will; its recipe has no world filter.
     views: training views, at the training size.
+    truth: the images that renders are compared with.
     """
 
-    start: Gaussians
-    training: TrainingViews
-    recipe: Recipe
+    start: Renderer
     views: Sequence[Camera]
     truth: Truth
     settings: Settings
-    rasterizer: Rasterizer
-    background: tuple[float, float, float]
+
+    @property
+    def extent(self) -> float:
+        """The scene's size, in world units."""
+        return extent(self.start.training.cameras)
 
 
 @dataclass
 class State:
-    """Where a run is; changed in place, step by step.
+    """How far a run has come; changed in place, step by step.
 
-    born: ln of the standard deviations that the Gaussians started with.  bounds: from where they were not long ago.
-    bad: steps in a row that gave no finite gradient.
-    back_offs: times that the run went back.  curve: of each step its number, view, and loss by scale.
-    probes: what was measured on the way, by whoever watches.
+    first_log_scales: of each Gaussian when the run or densification made it.
+    bounds: sampling bounds; they are computed anew every `loop.BOUNDS_EVERY` steps and after each densification.
+    bad_steps: steps in a row without a finite gradient.
+    rollbacks: how often the run returned to an earlier state.
+    curve: number, view and loss by scale of each step.
+    probes: PSNR measured on the way.
     """
 
     step: int
     leaves: Leaves
     adam: torch.optim.Adam
-    born: Float[Tensor, "n 3"]
+    first_log_scales: Float[Tensor, "n 3"]
     bounds: SamplingBounds
-    pulls: Pulls
-    bad: int = 0
-    back_offs: int = 0
+    gradients: ScreenGradients
+    bad_steps: int = 0
+    rollbacks: int = 0
     curve: list[dict[str, Any]] = field(default_factory=list)
     probes: list[dict[str, Any]] = field(default_factory=list)
 
-    def scene(self, job: Job) -> Gaussians:
+    def scene(self, job: TuningJob) -> Gaussians:
         """The scene as it is now."""
-        return scene_of({name: leaf.detach() for name, leaf in self.leaves.items()}, job.start)
+        return scene_of({n: leaf.detach() for n, leaf in self.leaves.items()}, job.start.scene)
+
+    def renderer(self, job: TuningJob) -> Renderer:
+        """Draws the scene as it is now; differentiable in the leaves."""
+        training = replace(job.start.training, bounds=self.bounds)
+        return replace(job.start, scene=scene_of(self.leaves, job.start.scene), training=training)
 
 
-def begin(job: Job) -> State:
+def begin(job: TuningJob) -> State:
     """The state before the first step."""
-    leaves = leaves_of(job.start)
-    born, bounds = job.start.log_scales, job.training.bounds
-    return State(0, leaves, optimizer(leaves, job.settings), born, bounds, Pulls.none(len(born)))
+    scene = job.start.scene
+    leaves = leaves_of(scene)
+    adam, gradients = optimizer(leaves, job.settings), ScreenGradients.none(len(scene))
+    return State(0, leaves, adam, scene.log_scales, job.start.training.bounds, gradients)
 
 
 def optimizer(leaves: Leaves, settings: Settings) -> torch.optim.Adam:

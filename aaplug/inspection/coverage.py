@@ -1,9 +1,10 @@
-"""How a scene's Gaussians sit against their sampling bounds, and at which scale each begins to alias.
+"""How finely training sampled a scene's Gaussians, and at which scale each begins to alias.
 
-A Gaussian is held to be sampled well where its standard deviation along its middle axis (surfaces are flat, and the
-thin axis alone shows only edge-on) is at least √0.2 px at the highest rate of any training view: Mip-Splatting's
-bound.  What training drew is that Gaussian widened by the convention's kernel.  Its variance is r²(σ²ν² + kernel) px²
-in an image r times as finely sampled, so that it meets the bound at r = √(0.2 / (σ²ν² + kernel)) and aliases below.
+A Gaussian is sampled well where its standard deviation along its middle axis is at least √0.2 px at the highest
+sampling rate of any training view: Mip-Splatting's bound (arXiv 2311.16493).  The middle axis is the one that counts
+on surfaces, whose thin axis shows only edge-on.  Training drew that Gaussian widened by the convention's dilation.  At
+relative rate r its variance is r²(σ²ν² + dilation) px², which meets the bound at r = √(0.2 / (σ²ν² + dilation)): below
+that scale it aliases.
 """
 
 import math
@@ -21,19 +22,18 @@ from aaplug.core.training import TrainingViews
 from aaplug.methods.filters import NYQUIST_VARIANCE
 
 BINS = 48
-LOWEST, HIGHEST = (
-    -7.0,
-    5.0,
-)  # log2 of the multiple of the bound that the histogram shows; the rest is in its ends
+# Range of the histogram: log2 of extent over bound.  What lies outside is counted in the end bins.
+LOWEST, HIGHEST = -7.0, 5.0
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """How Gaussians that any camera sees sit against their bounds; JSON-ready but for its name.
+    """How the extents of the Gaussians that any training camera sees compare with their sampling bounds.
 
-    edges, counts: histogram of the extent over its bound at the highest training rate, edges as log2.
-    under: share below the bound.  begins: the scale under which half of the Gaussians, as training drew them, alias.
-    aliased: by scale, the share of Gaussians, as training drew them, that are below the bound there.
+    gaussians, seen: how many there are, and how many a camera sees.
+    edges, counts: histogram of extent over bound at the highest training rate; edges as log2.
+    under: share below the bound.  begins: the scale below which half of the Gaussians, as training drew them, alias.
+    aliased: (scale, share of the Gaussians, as training drew them, that are below the bound at that scale).
     """
 
     gaussians: int
@@ -61,42 +61,45 @@ class Coverage:
 
 
 def middle_log_scales(scene: Gaussians) -> Float[Tensor, " n"]:
-    """ln of the standard deviation along the middle axis; of a disc's two the smaller."""
+    """ln of the standard deviation along the middle axis; for a disc, the smaller of its two."""
     return scene.log_scales.clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE).median(dim=1).values
 
 
 def log_multiples(scene: Gaussians, bounds: SamplingBounds) -> Float[Tensor, " seen"]:
-    """ln of the extent over its bound at the highest training rate, of the Gaussians that any camera sees."""
+    """ln of extent over bound at the highest training rate, of the Gaussians that any training camera sees."""
     extents = middle_log_scales(scene)[bounds.seen].double() + bounds.highest[bounds.seen].log()
     return extents - 0.5 * math.log(NYQUIST_VARIANCE)
 
 
 def under(multiples: Float[Tensor, " seen"]) -> int:
-    """How many of these, as `log_multiples` gives them, are below their bound."""
+    """How many Gaussians are below their bound; multiples: as `log_multiples` gives them."""
     return int((multiples < 0).sum())
 
 
-def aliasing_begins(multiple: float, kernel: float) -> float:
-    """The scale below which a Gaussian of `multiple` times its bound, as training drew it, aliases."""
-    return (NYQUIST_VARIANCE / (NYQUIST_VARIANCE * multiple**2 + kernel)) ** 0.5
+def aliasing_begins(multiple: float, dilation: float) -> float:
+    """The scale below which a Gaussian of `multiple` times its bound, drawn with `dilation` in px², aliases."""
+    return (NYQUIST_VARIANCE / (NYQUIST_VARIANCE * multiple**2 + dilation)) ** 0.5
 
 
 def coverage(scene: Gaussians, training: TrainingViews, scales: Sequence[float]) -> Coverage:
-    """How the scene sits against its bounds, at the training size and at `scales`."""
-    found = log_multiples(scene, training.bounds)
-    extents = found.exp()
-    logs = (found / math.log(2)).clamp(LOWEST, HIGHEST)
+    """Compare the scene's extents with their bounds, at the training size and at `scales`."""
+    multiples = log_multiples(scene, training.bounds)
+    seen = len(multiples)
+    edges, counts = _histogram(multiples)
+    if seen == 0:
+        return Coverage(len(scene), 0, edges, counts, None, None, ())
+    extents, dilation = multiples.exp(), training.convention.kernel
+    drawn = (extents.square() + dilation / NYQUIST_VARIANCE).sqrt()
+    begins = aliasing_begins(float(extents.median()), dilation)
+    aliased = tuple((s, float((drawn * s < 1).double().mean())) for s in scales)
+    return Coverage(len(scene), seen, edges, counts, under(multiples) / seen, begins, aliased)
+
+
+def _histogram(
+    multiples: Float[Tensor, " seen"],
+) -> tuple[tuple[float, ...], tuple[int, ...]]:
+    """Edges and counts."""
+    logs = (multiples / math.log(2)).clamp(LOWEST, HIGHEST)
     edges = torch.linspace(LOWEST, HIGHEST, BINS + 1, dtype=torch.float64)
     counts = torch.histogram(logs.cpu(), edges).hist
-    kernel = training.convention.kernel
-    drawn = (extents.square() + kernel / NYQUIST_VARIANCE).sqrt()
-    some = len(extents) > 0
-    return Coverage(
-        len(scene),
-        len(extents),
-        tuple(edges.tolist()),
-        tuple(int(count) for count in counts),
-        under(found) / len(found) if some else None,
-        aliasing_begins(float(extents.median()), kernel) if some else None,
-        tuple((s, float((drawn * s < 1).double().mean())) for s in scales) if some else (),
-    )
+    return tuple(edges.tolist()), tuple(int(count) for count in counts)

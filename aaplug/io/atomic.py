@@ -6,13 +6,13 @@ is interrupted, the old file is unchanged and the temporary file is removed.
 
 import os
 import secrets
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from os import PathLike
 from pathlib import Path
 from typing import BinaryIO
 
-from aaplug.core.errors import OutputError, reason
+from aaplug.core.errors import OutputError, listing, reason
 
 TOKEN_BYTES = 8  # random bytes in a temporary file's name: 2^64 names
 
@@ -86,6 +86,21 @@ def make_folder(path: str | PathLike[str]) -> Path:
     return Path(path)
 
 
+def refuse_existing(paths: Sequence[Path], overwrite: bool) -> None:
+    """Check, before any work, that none of these files of one folder exists, unless they may be replaced.
+
+    Raises:
+        OutputError: a file exists and `overwrite` is false, or the folder is a file.
+    """
+    folder = paths[0].parent
+    if folder.exists() and not folder.is_dir():
+        raise OutputError(folder, "is a file; name a folder")
+    existing = [path.name for path in paths if path.exists()]
+    if existing and not overwrite:
+        holds = listing(existing, most=3)
+        raise OutputError(folder, f"already holds {holds}; pass `overwrite` to replace files")
+
+
 def _check_target(path: Path, overwrite: bool) -> None:
     try:
         if path.is_dir():
@@ -93,7 +108,7 @@ def _check_target(path: Path, overwrite: bool) -> None:
         if path.exists() and not path.is_file():
             raise OutputError(path, "is not an ordinary file")
         if path.exists() and not overwrite:
-            raise OutputError(path, "exists; pass overwrite to replace it")
+            raise OutputError(path, "exists; pass `overwrite` to replace it")
         if not Path(os.path.realpath(path)).parent.is_dir():
             raise OutputError(path, "cannot be written: its folder does not exist; make it first")
     except (OSError, ValueError) as error:  # no access, a name too long, or a NUL in it

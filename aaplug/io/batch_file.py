@@ -1,12 +1,13 @@
-"""Batch files: TOML that names scenes and how each is evaluated.
+"""Batch files: TOML that names scenes and how to evaluate each.
 
-Keys at the top hold for every scene; a [[scene]] table names one and may set its own.  What the keys mean is the
-command line's to say, whose flags they are: here they are only found, and paths made to start at the file.
+Keys at the top hold for every scene; a [[scene]] table names one scene and may set its own.  Keys are the options of
+`aaplug evaluate`; this module does not know them.  It reads the tables and resolves relative paths against the file.
 """
 
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -20,18 +21,19 @@ PATHS = ("scene", "model_path", "cameras", "output", "lpips")  # keys whose valu
 
 @dataclass(frozen=True)
 class BatchFile:
-    """Settings of all scenes, and of each scene by its name."""
+    """The settings of all scenes, and each scene's own by its name; keys have underscores."""
 
     shared: Mapping[str, Any]
     scenes: Mapping[str, Mapping[str, Any]]
 
 
-def read_batch(path: Path) -> BatchFile:
-    """Read a batch file; a scene without a name has its file's or folder's.
+def read_batch(path: str | PathLike[str]) -> BatchFile:
+    """Read a batch file.  A scene without a name gets that of its file or folder.
 
     Raises:
-        FormatError: it is not TOML, names no scene, or one name twice.
+        FormatError: it is not TOML, names no scene, or names two scenes alike.
     """
+    path = Path(path)
     try:
         document = tomllib.loads(read_bounded(path, LIMIT).decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:
@@ -41,15 +43,14 @@ def read_batch(path: Path) -> BatchFile:
         raise FormatError(path, "names no scene; it needs a [[scene]] table for each")
     scenes: dict[str, Mapping[str, Any]] = {}
     for number, table in enumerate(tables, start=1):
-        settings = {key.replace("-", "_"): value for key, value in table.items()}
+        settings = _settings(table, path.parent)
         name = settings.pop("name", None) or _own_name(path, number, settings)
-        if not isinstance(name, str) or name.casefold() in (known.casefold() for known in scenes):
+        if not isinstance(name, str) or name.casefold() in map(str.casefold, scenes):
             raise FormatError(
                 path, f"[[scene]] {number}: needs a name of its own, not {name!r}; add name = ..."
             )
-        scenes[name] = _located(settings, path.parent)
-    shared = {key.replace("-", "_"): value for key, value in document.items()}
-    return BatchFile(_located(shared, path.parent), scenes)
+        scenes[name] = settings
+    return BatchFile(_settings(document, path.parent), scenes)
 
 
 def _own_name(path: Path, number: int, settings: Mapping[str, Any]) -> str:
@@ -59,12 +60,13 @@ def _own_name(path: Path, number: int, settings: Mapping[str, Any]) -> str:
     return Path(file).stem or file
 
 
-def _located(settings: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """The settings with relative paths starting at the folder."""
+def _settings(table: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """The table with underscores in its keys, and relative paths resolved against `folder`."""
+    settings = {key.replace("-", "_"): value for key, value in table.items()}
+    return {k: _resolved(v, folder) if k in PATHS else v for k, v in settings.items()}
 
-    def located(value: Any) -> Any:
-        if isinstance(value, list):
-            return [located(item) for item in value]
-        return str(folder / value) if isinstance(value, str) else value
 
-    return {key: located(value) if key in PATHS else value for key, value in settings.items()}
+def _resolved(value: Any, folder: Path) -> Any:
+    if isinstance(value, list):
+        return [_resolved(item, folder) for item in value]
+    return str(folder / value) if isinstance(value, str) else value

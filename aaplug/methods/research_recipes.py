@@ -1,6 +1,6 @@
-"""Recipes for comparison: the field's other methods, and variants that measurement found to be no better.
+"""Recipes for comparison: other methods of the field, and variants that were measured to be no better.
 
-`aaplug evaluate --recipe all` measures them beside the others; examples/guides/methods.md has their figures.
+`aaplug evaluate --recipe all` measures them with the others; examples/guides/methods.md has their figures.
 """
 
 from aaplug.methods.compositors import WindowBlending
@@ -20,8 +20,8 @@ RESEARCH_RECIPES = (
     Recipe(
         "mip-splatting-code",
         SCREEN_FILTERS["mip"],
-        "Mip-Splatting as its published code has it: the largest focal length for every camera",
-        "parity; differs where cameras' focal lengths do",
+        "Mip-Splatting as in its published code: the largest focal length for every camera",
+        "parity with its published code; differs if focal lengths differ",
         world=Smoothing3D(focal="largest"),
         promises=Promises(opaque_when_near=False),
     ),
@@ -29,16 +29,15 @@ RESEARCH_RECIPES = (
         "mip-splatting-balanced",
         SCREEN_FILTERS["mip"],
         "aaplug: Mip-Splatting with opacities balanced by the broadest face's area, not by volume, and bounded",
-        "comparison: most of the dimming of mip-splatting avoided",
+        "comparison: avoids most of mip-splatting's dimming",
         world=Smoothing3D(opacity="balanced"),
         promises=Promises(opaque_when_near=False),
     ),
     Recipe(
         "mip-splatting-anisotropic",
         SCREEN_FILTERS["mip"],
-        "aaplug: Mip-Splatting with bounds of each direction: smoothing by what all views together tell along an "
-        "axis",
-        "comparison: no better than mip-splatting where measured",
+        "aaplug: Mip-Splatting with directional bounds: smooths each axis by the information of all views along it",
+        "comparison: measured to be no better than mip-splatting",
         world=AnisotropicSmoothing(),
         promises=Promises(opaque_when_near=False),
     ),
@@ -52,8 +51,8 @@ RESEARCH_RECIPES = (
     Recipe(
         "multi-scale",
         SCREEN_FILTERS["classic"],
-        "Multi-Scale 3DGS (Yan et al. 2024): Gaussians drawn at the sizes that training drew them in, +0.3 px²",
-        "scenes trained with it, whose files hold these sizes",
+        "Multi-Scale 3DGS (Yan et al. 2024): draws a Gaussian only at the pixel sizes it was trained for, +0.3 px²",
+        "scenes trained with it, whose files have its columns",
         selection=ByPixelSize(),
         promises=Promises(keeps_energy=False),
     ),
@@ -82,14 +81,14 @@ RESEARCH_RECIPES = (
     Recipe(
         "sa-gs-integral",
         SCREEN_FILTERS["sa-gs"],
-        "SA-GS's filter and integration, by standard deviation (its code divides by the variance)",
-        "comparison: it blurs what training had already blurred",
+        "SA-GS's filter and integration; divides by the standard deviation (its code by the variance)",
+        "comparison: it repeats blur that training applied already",
         pixel=INTEGRAL,
     ),
     Recipe(
         "sa-gs-samples",
         SCREEN_FILTERS["sa-gs"],
-        "SA-GS's filter and super-sampling, the background with the true transmittance",
+        "SA-GS's filter and supersampling; composites the background with the true transmittance",
         "comparison: nine samples per pixel at every rate",
         grid=3,
         promises=Promises(fades_when_small=False),
@@ -97,28 +96,28 @@ RESEARCH_RECIPES = (
     Recipe(
         "matched-interval",
         Matched("interval"),
-        "aaplug: matched, each Gaussian's rate against the range that the training cameras had (choice C)",
-        "comparison: `matched` starts from it for cameras nearer or farther than training's",
+        "aaplug: matched, with rates relative to the range of the training cameras (reference C)",
+        "comparison: matched uses it for free cameras",
         promises=Promises(equals_training=True),
     ),
     Recipe(
         "matched-sharpest",
         Matched("sharpest"),
-        "aaplug: matched, each Gaussian's rate against the highest that a training camera had (choice B)",
-        "comparison: the one blur that can be fused, thinner than training's at most views",
+        "aaplug: matched, with rates relative to the highest of any training camera (reference B)",
+        "comparison: the only reference whose blur can be fused; thinner than training's at most views",
     ),
     Recipe(
         "matched-samples",
         Matched(),
         "aaplug: matched, with 3×3 samples per pixel at every rate",
-        "comparison",
+        "comparison: nine samples per pixel at every rate",
         grid=3,
     ),
     Recipe(
         "matched-integral",
         Matched(windowed=True),
         "aaplug: matched, with Analytic-Splatting's integral over the rest of the pixel",
-        "one sample per pixel, a little sharper and slower",
+        "comparison: slower than matched and no better",
         pixel=INTEGRAL,
         promises=Promises(equals_training=True),
     ),
@@ -126,8 +125,8 @@ RESEARCH_RECIPES = (
         "matched-square",
         Matched(windowed=True),
         "aaplug, after MipSLAM's elliptical integration (arXiv 2603.06989), whose constants are not published: "
-        "matched, with the mean over the rest of the pixel's own square",
-        "comparison: as matched-integral, for splats askew",
+        "matched, with the mean over the rest of the pixel's unrotated square",
+        "comparison: as matched-integral, without rotating the pixel to the splat",
         pixel=SQUARE,
         promises=Promises(equals_training=True),
     ),
@@ -143,8 +142,8 @@ RESEARCH_RECIPES = (
     Recipe(
         "gaussian-blending",
         Matched(windowed=True),
-        "after Gaussian Blending (arXiv 2511.15102), whose update is not published: this one is aaplug's own",
-        "comparison: the best of one sample per pixel, slower than several",
+        "after Gaussian Blending (arXiv 2511.15102), with aaplug's own update of the window",
+        "comparison: the best with one sample per pixel, but slower than several samples",
         pixel=INTEGRAL,
         compositor=WindowBlending(),
         promises=Promises(equals_training=True),

@@ -1,75 +1,95 @@
-"""A plain scene file in which the anti-aliasing of training is fused, for a viewer that follows another rule.
+"""Conversion in closed form: anti-aliasing fused into a plain scene, for a viewer that knows nothing of it.
 
-Without a viewer named it is the Mip rule's, 0.1 px² with compensation (or, for a stored 3D filter, what Mip-Splatting's
-own fused export needs, which is the same).  A closed form looks at one Gaussian at a time; `aaplug.finetuning` can take
-its result as a start.
+A viewer draws by a rule of its own: a 2D kernel, compensated or not.  `fuse` makes a scene for the Mip rule (0.1 px²,
+compensated), `fuse_for` one for a named viewer.  Both treat each Gaussian alone; `aaplug.finetuning` can start from
+their result and optimize all Gaussians together.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 from aaplug.core.errors import UsageError
 from aaplug.core.gaussians import ANTIALIASED, CLASSIC, MIP, Convention, Fusion, Gaussians
-from aaplug.core.interfaces import WorldFilter
+from aaplug.core.registry import Registry
 from aaplug.core.training import TrainingViews
 from aaplug.methods.filters import MatchedEnergy, Smoothing3D, fuse_stored
 
-FORMS: Mapping[str, WorldFilter] = {
-    "matched-energy": MatchedEnergy(),
-    "mip-splatting": Smoothing3D(),
-}
-FITTED_VARIANCE = 0.1  # px²: of a scene trained without compensation for a viewer with it, measured
-TUNED = "finetune"  # the record of fine-tuning, which blurs nothing
+FITTED_VARIANCE = (
+    0.1  # px²; measured: a scene trained without compensation, for a compensating viewer
+)
+TUNED = "finetune"  # the method that fine-tuning records; it adds no blur
+
+
+@dataclass(frozen=True)
+class Form:
+    """A closed form for the Mip rule.
+
+    uses_bounds: the filter reads the sampling bounds of the scene, not the cameras alone.
+    skips: the convention of scenes that it would leave as they are; None if it changes all.
+    """
+
+    filter: MatchedEnergy | Smoothing3D
+    uses_bounds: bool
+    skips: Convention | None = None
+
+    def with_variance(self, variance: float) -> "Form":
+        """The same form with another fused variance, in px² at the training rate."""
+        changed: Any = replace(self.filter, variance=variance)
+        return replace(self, filter=changed)
+
+
+MATCHED_ENERGY = Form(MatchedEnergy(), uses_bounds=False, skips=MIP)
+FORMS: Registry[Form] = Registry(
+    "form",
+    {
+        "matched-energy": MATCHED_ENERGY,
+        "mip-splatting": Form(Smoothing3D(), uses_bounds=True),
+    },
+    check=lambda value: isinstance(value, Form),
+)
 
 
 @dataclass(frozen=True)
 class Viewer:
-    """A program that shows scenes by one rule: the recipe of that rule, and what a file says to ask for it."""
+    """A program that shows scenes by one rule.
+
+    recipe: name of the recipe that draws by this rule.
+    convention: what a file must say to ask for the rule; None for a viewer that reads how the scene was trained.
+    rule: in words.
+    """
 
     name: str
     recipe: str
-    convention: Convention
+    convention: Convention | None
     rule: str
 
-
-VIEWERS: Mapping[str, Viewer] = {
-    viewer.name: viewer
-    for viewer in (
-        Viewer("classic-viewer", "classic", CLASSIC, "0.3 px², not compensated"),
-        Viewer("antialiased-viewer", "ewa", ANTIALIASED, "0.3 px², compensated"),
-        Viewer("mip-viewer", "mip", MIP, "0.1 px², compensated"),
-        Viewer("gsplat", "ewa", ANTIALIASED, 'rasterize_mode="antialiased": 0.3 px², compensated'),
-    )
-}
+    def convention_of(self, scene: Gaussians) -> Convention:
+        """What the file of a scene for this viewer says."""
+        return self.convention or scene.convention
 
 
-def form_for(scene: Gaussians, viewer: Viewer) -> MatchedEnergy:
-    """The closed form that brings a scene to a viewer's rule: its missing blur, the energy that training showed."""
-    trained, shown = scene.convention, viewer.convention
-    fitted = shown.compensated and not trained.compensated
-    return MatchedEnergy(FITTED_VARIANCE if fitted else trained.kernel - shown.kernel, shown)
+CLASSIC_VIEWER = Viewer("classic-viewer", "classic", CLASSIC, "0.3 px², not compensated")
+MIP_VIEWER = Viewer("mip-viewer", "mip", MIP, "0.1 px², compensated")
+VIEWERS: Registry[Viewer] = Registry(
+    "viewer",
+    {
+        viewer.name: viewer
+        for viewer in (
+            CLASSIC_VIEWER,
+            Viewer("antialiased-viewer", "ewa", ANTIALIASED, "0.3 px², compensated"),
+            MIP_VIEWER,
+            Viewer("gsplat", "ewa", ANTIALIASED, 'rasterize_mode="antialiased": 0.3 px², compensated'),
+        )
+    },
+    check=lambda value: isinstance(value, Viewer),
+)  # fmt: skip
+FAST = Viewer("fast", "matched", None, "aaplug's recipe matched, one sample per pixel")
 
 
-def convert_for(scene: Gaussians, training: TrainingViews, viewer: Viewer) -> Gaussians:
-    """A scene for a viewer, in closed form; unchanged where the viewer follows training's own rule.
-
-    Raises:
-        UsageError: something is fused already that a second conversion would blur again.
-    """
-    _check_fused(scene)
-    scene = fuse_stored(scene)
-    if scene.convention == viewer.convention:
-        return scene
-    return form_for(scene, viewer)(scene, training)
-
-
-def default_form(scene: Gaussians) -> str:
-    """mip-splatting for a scene that stores a 3D filter, matched-energy for all else."""
-    return "matched-energy" if scene.filter_3d is None else "mip-splatting"
-
-
-def convert(scene: Gaussians, training: TrainingViews | None, form: WorldFilter) -> Gaussians:
-    """Fuse the stored 3D filter if there is one, else what `form` says, and mark the scene for the Mip rule.
+def fuse(
+    scene: Gaussians, training: TrainingViews | None, form: Form = MATCHED_ENERGY
+) -> Gaussians:
+    """Convert a scene for the Mip rule: fuse its stored 3D filter if it has one, else what `form` says.
 
     training may be None where the scene stores its filter.
 
@@ -80,10 +100,31 @@ def convert(scene: Gaussians, training: TrainingViews | None, form: WorldFilter)
     if scene.filter_3d is not None:
         converted = fuse_stored(scene)
     elif training is None:
-        raise UsageError(_name(scene), "fusing needs the training cameras; pass --cameras")
+        raise UsageError(scene.name, "converting it needs the training cameras: give `cameras`")
     else:
-        converted = form(scene, training)
+        converted = form.filter(scene, training)
     return replace(converted, convention=MIP)
+
+
+def fuse_for(scene: Gaussians, training: TrainingViews, viewer: Viewer) -> Gaussians:
+    """Convert a scene for a viewer; unchanged where the viewer draws as training did.
+
+    Raises:
+        UsageError: something is fused already, which a second conversion would blur again.
+    """
+    if viewer.convention is None:
+        return fuse_stored(scene)
+    _check_fused(scene)
+    scene = fuse_stored(scene)
+    if scene.convention == viewer.convention:
+        return scene
+    return _energy_kept(scene.convention, viewer.convention)(scene, training)
+
+
+def _energy_kept(trained: Convention, shown: Convention) -> MatchedEnergy:
+    """The filter that adds the blur a viewer lacks against training, and keeps the energy that training showed."""
+    fitted = shown.compensated and not trained.compensated
+    return MatchedEnergy(FITTED_VARIANCE if fitted else trained.kernel - shown.kernel, shown)
 
 
 def describe(fusion: Fusion) -> str:
@@ -92,28 +133,28 @@ def describe(fusion: Fusion) -> str:
     return f"{fusion.method} ({settings})" if settings else fusion.method
 
 
-def _check(scene: Gaussians, form: WorldFilter) -> None:
+def fused_in(scene: Gaussians) -> str:
+    """Everything that is fused in a scene, in words."""
+    return "; ".join(describe(fusion) for fusion in scene.fused) or "nothing"
+
+
+def _check(scene: Gaussians, form: Form) -> None:
     if scene.flat:
         raise UsageError(
-            _name(scene),
-            "holds 2D Gaussians, which no filter here can thicken and stay 2D Gaussians",
+            scene.name, "holds 2D Gaussians: no filter here can widen them and keep them flat"
         )
     _check_fused(scene)
-    if scene.convention == MIP and scene.filter_3d is None and isinstance(form, MatchedEnergy):
+    if form.skips == scene.convention and scene.filter_3d is None:
         raise UsageError(
-            _name(scene),
+            scene.name,
             "was trained by the Mip rule and stores no 3D filter: there is nothing to fuse",
         )
 
 
 def _check_fused(scene: Gaussians) -> None:
-    blurs = [fusion for fusion in scene.fused if fusion.method != TUNED]
+    blurs = [describe(fusion) for fusion in scene.fused if fusion.method != TUNED]
     if blurs:
-        done = "; ".join(describe(fusion) for fusion in blurs)
         raise UsageError(
-            _name(scene), f"already has {done} fused; converting it again would blur it twice"
+            scene.name,
+            f"already has {'; '.join(blurs)} fused; converting it again would blur it twice",
         )
-
-
-def _name(scene: Gaussians) -> str:
-    return scene.origin.path if scene.origin else "scene"

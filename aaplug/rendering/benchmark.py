@@ -1,6 +1,6 @@
-"""Timing the rasterizer: stage by stage, forward and backward, beside a matrix product of this machine.
+"""Timing the tiled rasterizer: stage by stage, forward and backward, beside a matrix product of this machine.
 
-Times are medians in ms.  Machines differ and drift, so that what counts is the share of the matrix product.
+Times are medians in ms.  Machines differ and their speed drifts, so compare the share of the matrix product.
 """
 
 import math
@@ -16,20 +16,20 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.cameras import BLACK, Camera, look_at
+from aaplug.core.cameras import Camera, look_at
+from aaplug.core.culling import cull
 from aaplug.core.gaussians import Gaussians
-from aaplug.core.interfaces import Rasterizer
 from aaplug.core.kernels import Kernels
-from aaplug.core.projection import SH_C0, project, shade
-from aaplug.core.splats import drawn
+from aaplug.core.projection import project, shade
+from aaplug.core.spherical_harmonics import SH_C0
 from aaplug.core.training import TrainingViews
-from aaplug.methods.pixel_kernels.raster_rows import drawing_of
-from aaplug.methods.recipes import Recipe, find_recipe
+from aaplug.methods.pixel_kernels.raster_rows import TILE
+from aaplug.methods.recipes import find_recipe
 from aaplug.rasterizers import Tiled
-from aaplug.rasterizers.tiled.binning import TILE, bands
-from aaplug.rasterizers.tiled.compositing import composite
-from aaplug.rasterizers.tiled.counting import Counting
-from aaplug.rendering.renderer import learn, render
+from aaplug.rasterizers.tiled.backward import composite
+from aaplug.rasterizers.tiled.binning import bands
+from aaplug.rasterizers.tiled.forward import Compositing
+from aaplug.rendering.renderer import Renderer
 
 MATRIX_SIDE = 2048
 FIELD_OF_VIEW = 50.0  # degrees, of the synthetic camera
@@ -38,10 +38,10 @@ SEED = 0
 
 @dataclass(frozen=True)
 class Figures:
-    """What was measured of one scene at one size.
+    """Measurements of one scene at one size.
 
-    pairs: splat and pixel pairs that compositing evaluated.  tile_pairs: pairs in the tiles that ellipses reach.
-    peak_bytes: the most memory that the process has held so far.
+    evaluations: splat-pixel evaluations of compositing.  tile_evaluations: those of whole tiles that ellipses touch.
+    peak_bytes: the most memory that the process has used so far.
     """
 
     rasterizer: str
@@ -50,9 +50,9 @@ class Figures:
     height: int
     forward_ms: float
     forward_backward_ms: float | None
-    pairs: int
-    tile_pairs: int
-    ns_per_pair: float
+    evaluations: int
+    tile_evaluations: int
+    ns_per_evaluation: float
     stages_ms: dict[str, float]
     peak_bytes: int
     matmul_ms: float
@@ -70,51 +70,46 @@ class Figures:
 def measure(
     scene: Gaussians,
     camera: Camera,
-    rasterizer: Tiled,
+    kernels: Kernels,
     repeats: int = 5,
     backward: bool = True,
 ) -> Figures:
-    """Time one view of a scene by the classic recipe."""
-    training, recipe = learn(scene, [camera.as_trained()]), find_recipe("classic")
-    camera = camera.as_trained()
+    """Time one view of a scene by recipe "classic".
+
+    kernels: run the stages, eagerly or compiled.  backward: also time the gradients of all parameters.
+    """
+    camera, rasterizer = camera.as_trained(), Tiled(kernels)
+    training = TrainingViews.of(scene, [camera])
+    renderer = Renderer(scene, training, find_recipe("classic"), rasterizer)
+    counts: list[int] = []
     with torch.no_grad():
-        stages, tile_pairs = _stages(scene, camera, rasterizer.kernels, training, recipe, repeats)
-        counting = Counting(rasterizer.kernels)
-        render(scene, camera, recipe, training, replace(rasterizer, kernels=counting))
+        stages, tile_evaluations = _stages(renderer, camera, kernels, repeats)
+        replace(renderer, rasterizer=rasterizer.counting(counts.append))(camera)
         a = torch.ones(MATRIX_SIDE, MATRIX_SIDE)
-        frame, product = _timed_in_turn(
-            repeats, lambda: render(scene, camera, recipe, training, rasterizer), lambda: a @ a
-        )
-    both = None
-    if backward:
-        both = _timed(lambda: gradient_step(scene, camera, recipe, training, rasterizer), repeats)
+        frame, product = _timed_in_turn(repeats, lambda: renderer(camera), lambda: a @ a)
+    both = _timed(lambda: gradient_step(renderer, camera), repeats) if backward else None
     return Figures(
-        rasterizer=rasterizer.kernels.name,
+        rasterizer=kernels.name,
         gaussians=len(scene),
         width=camera.width,
         height=camera.height,
         forward_ms=frame,
         forward_backward_ms=both,
-        pairs=counting.pairs,
-        tile_pairs=tile_pairs,
-        ns_per_pair=stages["composite"] * 1e6 / max(1, counting.pairs),
+        evaluations=sum(counts),
+        tile_evaluations=tile_evaluations,
+        ns_per_evaluation=stages["composite"] * 1e6 / max(1, sum(counts)),
         stages_ms=stages,
         peak_bytes=_peak_bytes(),
         matmul_ms=product,
     )
 
 
-def gradient_step(
-    scene: Gaussians,
-    camera: Camera,
-    recipe: Recipe,
-    training: TrainingViews,
-    rasterizer: Rasterizer,
-) -> dict[str, Tensor]:
-    """One render, and the gradient of its mean square to everything that the scene holds."""
+def gradient_step(renderer: Renderer, camera: Camera) -> dict[str, Tensor]:
+    """One render, and the gradient of its mean square with respect to all parameters of the scene."""
+    scene = renderer.scene
     names = ("means", "quats", "log_scales", "logit_opacities", "sh")
     leaves = {name: getattr(scene, name).detach().requires_grad_() for name in names}
-    image = render(replace(scene, **leaves), camera, recipe, training, rasterizer, BLACK)
+    image = replace(renderer, scene=replace(scene, **leaves))(camera)
     grads = torch.autograd.grad(image.rgb.square().mean(), list(leaves.values()))
     return dict(zip(names, grads, strict=True))
 
@@ -136,31 +131,44 @@ def synthetic_camera(width: int, height: int) -> Camera:
 
 
 def synthetic_scene(n: int, seed: int = SEED) -> Gaussians:
-    """n Gaussians as trained scenes have them: flat on surfaces, overlapping alike at every n, opacities at both ends.
+    """n Gaussians as trained scenes have them: flat on surfaces, overlapping alike at every n, opacities near 0 and 1.
 
-    A ball, the ground and a dome around them; a few needles and a few large faint ones make the tail.
+    A ball, the ground and a dome around them; a few needles and a few large faint ones form the tail.
     """
     draw = torch.Generator().manual_seed(seed)
+    means, normals, spacing = _surfaces(n, draw)
+    log_scales = (0.85 * spacing).log()[:, None] + 0.6 * torch.randn(n, 3, generator=draw)
+    log_scales[:, 2] -= 1.6  # flat along the normal
+    needles = torch.rand(n, generator=draw) < 0.1
+    log_scales[needles] += torch.tensor([0.9, -0.9, 0.0])
+    large = torch.rand(n, generator=draw) < 0.004
+    log_scales[large] += 1.3
+    sides = torch.rand(n, generator=draw) < 0.5
+    low = torch.rand(n, generator=draw).square()
+    opacities = torch.where(sides, low, 1 - 0.2 * torch.rand(n, generator=draw))
+    opacities = torch.where(large, 0.5 * opacities, opacities).clamp(0.006, 0.998)
+    base = 0.5 * torch.randn(n, 1, 3, generator=draw).tanh() / SH_C0
+    sh = torch.cat([base, 0.06 * torch.randn(n, 15, 3, generator=draw)], dim=1)
+    quats = _turned_to(normals, torch.randn(n, generator=draw))
+    return Gaussians(means, quats, log_scales, opacities.logit(), sh)
 
-    def normal(*shape: int) -> Tensor:
-        return torch.randn(*shape, generator=draw)
 
-    def uniform(*shape: int) -> Tensor:
-        return torch.rand(*shape, generator=draw)
-
+def _surfaces(
+    n: int, draw: torch.Generator
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"], Float[Tensor, " n"]]:
+    """Points on a unit ball, on the ground and on a dome, their normals, and the spacing of their surface."""
     ball, ground = int(0.5 * n), int(0.27 * n)
     dome = n - ball - ground
-    directions = torch.nn.functional.normalize(normal(n, 3), dim=1)
-    on_ball = directions[:ball]
-    radius, angle = 5 * uniform(ground).sqrt(), 2 * math.pi * uniform(ground)
-    on_ground = torch.stack(
-        [radius * angle.cos(), radius * angle.sin(), torch.full_like(radius, -1.25)], dim=1
-    )
-    far = 9 + 7 * uniform(dome, 1).square()
-    means = torch.cat([on_ball, on_ground, directions[ball + ground :] * far])
-    normals = torch.cat(
-        [on_ball, torch.tensor([[0.0, 0.0, 1.0]]).repeat(ground, 1), directions[ball + ground :]]
-    )
+    directions = torch.nn.functional.normalize(torch.randn(n, 3, generator=draw), dim=1)
+    radius = 5 * torch.rand(ground, generator=draw).sqrt()
+    angle = 2 * math.pi * torch.rand(ground, generator=draw)
+    height = torch.full_like(radius, -1.25)
+    on_ground = torch.stack([radius * angle.cos(), radius * angle.sin(), height], dim=1)
+    far = 9 + 7 * torch.rand(dome, 1, generator=draw).square()
+    outer = directions[ball + ground :]
+    means = torch.cat([directions[:ball], on_ground, outer * far])
+    up = torch.tensor([[0.0, 0.0, 1.0]]).repeat(ground, 1)
+    normals = torch.cat([directions[:ball], up, outer])
     spacing = torch.cat(
         [
             torch.full((ball,), math.sqrt(4 * math.pi / max(1, ball))),
@@ -168,49 +176,38 @@ def synthetic_scene(n: int, seed: int = SEED) -> Gaussians:
             math.sqrt(4 * math.pi / max(1, dome)) * far[:, 0],
         ]
     )
-    log_scales = (0.85 * spacing).log()[:, None] + 0.6 * normal(n, 3)
-    log_scales[:, 2] -= 1.6  # flat along the normal
-    log_scales[uniform(n) < 0.1] += torch.tensor([0.9, -0.9, 0.0])
-    large = uniform(n) < 0.004
-    log_scales[large] += 1.3
-    opacities = torch.where(uniform(n) < 0.5, uniform(n).square(), 1 - 0.2 * uniform(n))
-    opacities = torch.where(large, 0.5 * opacities, opacities).clamp(0.006, 0.998)
-    sh = torch.cat([(0.5 * normal(n, 1, 3).tanh()) / SH_C0, 0.06 * normal(n, 15, 3)], dim=1)
-    return Gaussians(means, _turned_to(normals, normal(n)), log_scales, opacities.logit(), sh)
+    return means, normals, spacing
 
 
 def _turned_to(normals: Float[Tensor, "n 3"], roll: Float[Tensor, " n"]) -> Float[Tensor, "n 4"]:
     """Quaternions that turn z to the normals, after a roll about z."""
     x, y, z = normals.unbind(dim=1)
-    # the half-way rotation from z: w = 1 + z, axis (−y, x, 0)
+    # half the angle from z: w = 1 + z, axis (-y, x, 0)
     w, i, j = (1 + z).clamp(min=1e-3), -y, x
     cos, sin = roll.cos(), roll.sin()
     return torch.stack([w * cos, i * cos + j * sin, j * cos - i * sin, w * sin], dim=1)
 
 
 def _stages(
-    scene: Gaussians,
-    camera: Camera,
-    kernels: Kernels,
-    training: TrainingViews,
-    recipe: Recipe,
-    repeats: int,
+    renderer: Renderer, camera: Camera, kernels: Kernels, repeats: int
 ) -> tuple[dict[str, float], int]:
-    """Milliseconds of each stage, and the pairs of pixels and splats in the tiles that are reached."""
+    """Milliseconds of each stage of the renderer, and the evaluations in all tiles that ellipses touch."""
     times: dict[str, float] = {}
 
     def stage(name: str, work: Callable[[], Any]) -> Any:
         times[name] = _timed(work, repeats)
         return work()
 
+    scene, recipe, training = renderer.scene, renderer.recipe, renderer.training
     hw, grid = camera.hw, (-(-camera.height // TILE), -(-camera.width // TILE))
+    how = Compositing(recipe.pixel, training.convention.rules, kernels)
     splats = stage("project", lambda: project(scene, camera, kernels))
     splats = stage("filter", lambda: recipe.screen(splats, camera, training))
-    splats = stage("cull", lambda: drawn(splats, hw, kernels=kernels))
+    splats = stage("cull", lambda: cull(splats, hw, kernels=kernels))
     splats = stage("shade", lambda: shade(splats, scene, camera, kernels))
     bins = stage("bin", lambda: list(bands(splats, grid, kernels)))
-    drawing = stage("forms", lambda: drawing_of(splats, kernels))
-    stage("composite", lambda: [composite(drawing, band, kernels) for band in bins])
+    rows = stage("forms", lambda: recipe.pixel.raster_rows(splats, kernels))
+    stage("composite", lambda: [composite(rows, band, how) for band in bins])
     return times, sum(int(band.counts.sum()) for band in bins) * TILE**2
 
 
@@ -220,7 +217,7 @@ def _timed(work: Callable[[], Any], repeats: int) -> float:
 
 
 def _timed_in_turn(repeats: int, *works: Callable[[], Any]) -> list[float]:
-    """Median milliseconds of each, run in turn so that a machine's moods meet all of them alike."""
+    """Median milliseconds of each, run in turn so that drift of the machine affects all alike."""
     times: list[list[float]] = [[] for _ in works]
     for work in works:
         work()

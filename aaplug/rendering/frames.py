@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -70,7 +71,7 @@ class _Writer:
         image = self.renderer(self.views[index]).rgb.float()
         write_png(self.paths[index], image, self.bit_depth, self.overwrite)
 
-    def __getstate__(self) -> dict[str, object]:
+    def __getstate__(self) -> dict[str, Any]:
         """For another process: without the scene's file, which may be open."""
         scene = replace(self.renderer.scene, origin=None)
         return self.__dict__ | {"renderer": replace(self.renderer, scene=scene)}

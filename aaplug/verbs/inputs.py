@@ -1,6 +1,6 @@
 """What verbs take: scenes and cameras as objects or paths, backgrounds, rasterizers and threads by name."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
@@ -11,10 +11,12 @@ from aaplug.core.cameras import BLACK, WHITE, CameraSet
 from aaplug.core.errors import UsageError
 from aaplug.core.executors import torch_threads
 from aaplug.core.gaussians import Gaussians
-from aaplug.core.interfaces import Colour, Rasterizer, TakesMemory
+from aaplug.core.interfaces import Colour, MatchesRates, Rasterizer, TakesMemory
 from aaplug.core.monitor import SILENT, Monitor
 from aaplug.io.cameras import read_cameras
 from aaplug.io.scenes import find_scene, read_scene
+from aaplug.methods.recipe import Recipe
+from aaplug.methods.recipes import RECIPES, find_recipe
 from aaplug.rasterizers import find_rasterizer
 from aaplug.rendering.renderer import Background, background_colour
 
@@ -77,6 +79,22 @@ def rasterizer_of(
     if memory is not None and isinstance(rasterizer, TakesMemory):
         return rasterizer.within(memory * 1e9)
     return rasterizer
+
+
+def recipes_of(
+    names: Sequence[str], quality: str = "balanced", rate_reference: str | None = None
+) -> list[Recipe]:
+    """Recipes by name; the rate reference goes to those that compare rates.
+
+    Raises:
+        UsageError: a name is not known.
+    """
+    found = []
+    for name in names:
+        matches = isinstance(RECIPES.find(name, "recipe").screen, MatchesRates)
+        reference = rate_reference if matches else None
+        found.append(find_recipe(name, quality=quality, rate_reference=reference))
+    return found
 
 
 @contextmanager

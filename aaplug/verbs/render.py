@@ -12,8 +12,8 @@ from aaplug.core.interfaces import Rasterizer
 from aaplug.core.monitor import SILENT, Monitor
 from aaplug.core.sampling import MIN_SEEN_SHARE
 from aaplug.core.training import TrainingViews
+from aaplug.io.atomic import make_folder
 from aaplug.io.cameras import select_views
-from aaplug.io.folders import make_folder
 from aaplug.methods.recipe import Recipe
 from aaplug.methods.recipes import find_recipe, suited
 from aaplug.rendering.frames import write_frames

@@ -6,8 +6,7 @@ from pathlib import Path
 
 from aaplug.core.cameras import Camera
 from aaplug.core.errors import OutputError, UsageError
-from aaplug.io.atomic import check_output
-from aaplug.io.folders import refuse_existing
+from aaplug.io.atomic import check_output, refuse_existing
 
 MAX_SIDE = 16384  # px
 

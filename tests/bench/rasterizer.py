@@ -5,9 +5,10 @@ from collections.abc import Iterator
 import pytest
 import torch
 
+from aaplug.core.training import TrainingViews
 from aaplug.methods.recipes import find_recipe
 from aaplug.rendering.benchmark import gradient_step, synthetic_camera, synthetic_scene
-from aaplug.rendering.renderer import learn, render
+from aaplug.rendering.renderer import Renderer
 from tests.bench import take_all_threads
 from tests.conftest import ALL_RASTERIZERS
 
@@ -37,15 +38,13 @@ def scene(request: pytest.FixtureRequest):
 
 
 def test_forward(benchmark, scene, rasterizer):
-    training = learn(scene, [CAMERA])
+    renderer = Renderer(scene, TrainingViews.of(scene, [CAMERA]), RECIPE, rasterizer)
     with torch.no_grad():
-        image = benchmark.pedantic(render, (scene, CAMERA, RECIPE, training, rasterizer), **ROUNDS)
+        image = benchmark.pedantic(renderer, (CAMERA,), **ROUNDS)
     assert image.alpha.mean() > 0.5
 
 
 def test_forward_and_backward(benchmark, scene, rasterizer):
-    training = learn(scene, [CAMERA])
-    grads = benchmark.pedantic(
-        gradient_step, (scene, CAMERA, RECIPE, training, rasterizer), **ROUNDS
-    )
+    renderer = Renderer(scene, TrainingViews.of(scene, [CAMERA]), RECIPE, rasterizer)
+    grads = benchmark.pedantic(gradient_step, (renderer, CAMERA), **ROUNDS)
     assert all(grad.abs().sum() > 0 for grad in grads.values())

@@ -1,6 +1,6 @@
-"""Curves over scale, and how Gaussians sit against their sampling bounds, as matplotlib figures.
+"""Curves over scale, and a histogram of sampling bounds, as matplotlib figures.
 
-Text is drawn as it is (no TeX), so that any name may stand in it.  Drawing is the same on every run.
+Text is drawn literally (no TeX), so that names may hold any character.  Output is the same on every run.
 """
 
 import io
@@ -9,24 +9,34 @@ import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import matplotlib as mpl
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
-from aaplug.evaluation.metrics import PSNR, SSIM
-from aaplug.evaluation.results import CEILING, Report, mean, million_pairs, scale_name, seconds
+from aaplug.evaluation.metric import Metric
+from aaplug.evaluation.results import (
+    CEILING,
+    Report,
+    mean,
+    million_evaluations,
+    scale_name,
+    seconds,
+)
 from aaplug.inspection.coverage import Coverage
 
-# told apart on white and on near-black, by people who see few colours also by marker
+# Distinct on white and on near-black; the markers help readers who do not see all colours.
 COLOURS = ("#3b82f6", "#d97706", "#16a34a", "#db2777", "#8b5cf6", "#0d9aa8", "#a3713d", "#7b8794")
 MARKERS = "osD^vPX*"
-INK = "#010203"  # stands for the text's colour in a page that is light or dark
+INK = "#010203"  # placeholder for the colour of the page's text, which is light or dark
 PAPER_INK = "#1c2733"
 SIZE = (5.2, 3.3)  # inches
 DPI = 160  # of a PNG
-RULES: dict[Any, Any] = {
+BOUNDS = "sampling-bounds"
+STYLE: dict[Any, Any] = {
     "text.parse_math": False,
     "svg.fonttype": "none",
     "svg.hashsalt": "aaplug",
@@ -42,26 +52,26 @@ RULES: dict[Any, Any] = {
 
 @dataclass(frozen=True)
 class Plot:
-    """A figure that draws itself in a given ink.  name: for a file.  says: what it shows, in words."""
+    """A figure, drawn on demand in a given ink.  name: for its file.  says: what it shows, for a screen reader."""
 
     name: str
     says: str
     draw: Callable[[str], Figure]
 
     def png(self) -> bytes:
-        """A file's bytes."""
+        """Content of a PNG file."""
         return self._saved("png", PAPER_INK, dpi=DPI, metadata={"Software": None})
 
     def svg(self) -> str:
-        """A file's text."""
+        """Content of an SVG file."""
         return self._saved("svg", PAPER_INK, metadata={"Date": None}).decode()
 
     def inline_svg(self) -> str:
-        """An element for a page, in the colour of the text around it, that grows with its box."""
+        """An SVG element for a page: it has the colour of the text around it and fills the width of its box."""
         text = self._saved("svg", INK, transparent=True, metadata={"Date": None}).decode()
         text = text[text.index("<svg") :].replace(INK, "currentColor")
         text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
-        text = re.sub(r'<g id="[^"]*"', "<g", text)  # several figures share a page
+        text = re.sub(r'<g id="[^"]*"', "<g", text)  # ids would clash with those of other figures
         return re.sub(r'<svg ([^>]*?)width="[^"]*" height="[^"]*"', r"<svg \1", text, count=1)
 
     def _saved(self, kind: str, ink: str, **settings: Any) -> bytes:
@@ -74,74 +84,85 @@ class Plot:
 @contextmanager
 def _style(ink: str) -> Iterator[None]:
     parts = ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color")
-    with mpl.rc_context({**RULES, **dict.fromkeys(parts, ink)}):
+    with mpl.rc_context({**STYLE, **dict.fromkeys(parts, ink)}):
         yield
 
 
+@dataclass(frozen=True)
+class Curves:
+    """One line per recipe over scale.  from_zero: whether the axis starts at 0."""
+
+    name: str
+    title: str
+    value: Callable[[str, float], float | None]
+    report: Report
+    from_zero: bool = False
+
+    @property
+    def known(self) -> bool:
+        """Whether there is anything to draw."""
+        report = self.report
+        return any(self.value(r, s) is not None for r in report.recipes for s in report.scales)
+
+    @property
+    def plot(self) -> Plot:
+        """The curves as a figure."""
+        return Plot(self.name, f"{self.title} over scale, one line per recipe", self._draw)
+
+    def _draw(self, ink: str) -> Figure:
+        figure = Figure(SIZE)
+        axes = figure.add_subplot(title=self.title)
+        self._lines(axes, ink)
+        scales = sorted(self.report.scales)
+        axes.set_xscale("log", base=2)
+        axes.set_xticks(scales, [scale_name(scale) for scale in scales])
+        axes.minorticks_off()
+        axes.grid(axis="y", color=ink, alpha=0.12)
+        axes.set_xlabel("scale against training")
+        if self.from_zero:
+            axes.set_ylim(bottom=0)
+        axes.legend(fontsize=8.5, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=3)
+        return figure
+
+    def _lines(self, axes: Axes, ink: str) -> None:
+        scales = sorted(self.report.scales)
+        for place, recipe in enumerate(name for name in self.report.recipes if name != CEILING):
+            colour, marker = COLOURS[place % len(COLOURS)], MARKERS[place % len(MARKERS)]
+            values = self._values(recipe)
+            axes.plot(scales, values, marker=marker, ms=5, color=colour, label=recipe)
+        if CEILING in self.report.recipes:
+            values = self._values(CEILING)
+            axes.plot(scales, values, color=ink, ls=(0, (4, 3)), lw=1, label=CEILING, zorder=1)
+
+    def _values(self, recipe: str) -> list[float]:
+        """Values by rising scale; NaN, which matplotlib leaves out, where undefined."""
+        values = [self.value(recipe, scale) for scale in sorted(self.report.scales)]
+        return [math.nan if value is None else value for value in values]
+
+
+COSTS = (
+    ("seconds", "seconds a view", seconds),
+    ("evaluations", "million splat-pixel evaluations a view", million_evaluations),
+)
+
+
 def plots(report: Report, found: Coverage) -> list[Plot]:
-    """Everything that a report draws: PSNR, SSIM, time and pairs over scale, and the sampling bounds."""
-    curves = [
-        ("psnr", "PSNR [dB]", lambda r, s: mean(report.select(r, s), PSNR.name), False),
-        ("ssim", "SSIM", lambda r, s: mean(report.select(r, s), SSIM["wang"].name), False),
-        ("seconds", "seconds a view", lambda r, s: seconds(report, r, s), True),
-        ("pairs", "million pairs of splat and pixel a view", lambda r, s: million_pairs(report, r, s), True),
-    ]  # fmt: skip
-    drawn = [
-        _curve_plot(name, title, value, report, from_zero)
-        for name, title, value, from_zero in curves
-        if any(value(r, s) is not None for r in report.recipes for s in report.scales)
-    ]
-    return [*drawn, Plot("sampling-bounds", _bounds_words(found), lambda ink: _bounds(found, ink))]
+    """Everything that a report draws: metrics against the truth, time and work over scale, and the sampling bounds."""
+    compared = [metric for metric in report.metrics if metric.measure is not None]
+    curves = [_metric_curves(metric, report) for metric in compared]
+    for name, title, value in COSTS:
+        curves.append(Curves(name, title, partial(value, report), report, from_zero=True))
+    drawn = [curve.plot for curve in curves if curve.known]
+    return [*drawn, Plot(BOUNDS, _bounds_words(found), lambda ink: _bounds(found, ink))]
 
 
-def colour_of(report: Report, recipe: str) -> str:
-    """The colour that a recipe has in every plot."""
-    place = [name for name in report.recipes if name != CEILING].index(recipe)
-    return COLOURS[place % len(COLOURS)]
-
-
-def _curve_plot(
-    name: str,
-    title: str,
-    value: Callable[[str, float], float | None],
-    report: Report,
-    from_zero: bool,
-) -> Plot:
-    says = f"{title} over scale, a line a recipe"
-    return Plot(name, says, lambda ink: _curves(title, value, report, from_zero, ink))
-
-
-def _curves(
-    title: str,
-    value: Callable[[str, float], float | None],
-    report: Report,
-    from_zero: bool,
-    ink: str,
-) -> Figure:
-    figure = Figure(SIZE)
-    axes = figure.add_subplot(title=title)
-    scales = sorted(report.scales)
-    for place, recipe in enumerate(name for name in report.recipes if name != CEILING):
-        ys = [_nan(value(recipe, scale)) for scale in scales]
-        marker = MARKERS[place % len(MARKERS)]
-        axes.plot(scales, ys, marker=marker, ms=5, color=colour_of(report, recipe), label=recipe)
-    if CEILING in report.recipes:
-        ys = [_nan(value(CEILING, scale)) for scale in scales]
-        axes.plot(scales, ys, color=ink, ls=(0, (4, 3)), lw=1, label=CEILING, zorder=1)
-    axes.set_xscale("log", base=2)
-    axes.set_xticks(scales, [scale_name(scale) for scale in scales])
-    axes.minorticks_off()
-    axes.grid(axis="y", color=ink, alpha=0.12)
-    axes.set_xlabel("scale against training")
-    if from_zero:
-        axes.set_ylim(bottom=0)
-    axes.legend(fontsize=8.5, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=3)
-    return figure
-
-
-def _nan(value: float | None) -> float:
-    """matplotlib leaves out what is no number."""
-    return math.nan if value is None else value
+def _metric_curves(metric: Metric, report: Report) -> Curves:
+    return Curves(
+        re.sub(r"\W+", "-", metric.name.lower()),
+        metric.title,
+        lambda recipe, scale: mean(report.select(recipe, scale), metric.name),
+        report,
+    )
 
 
 def _bounds(found: Coverage, ink: str) -> Figure:

@@ -39,7 +39,7 @@ class PhotoFolder:
         found = next((p for p in (self.folder / t for t in tries) if os.path.isfile(p)), None)
         if found is not None and not _within(found, self.home):
             raise place.error(
-                f"photo {name!r} lies outside {self.home}; pass images to allow another folder"
+                f"photo {name!r} lies outside {self.home}; pass `images` to allow another folder"
             )
         return found
 

@@ -7,15 +7,12 @@ result differs from the eager one, is built again.
 
 import hashlib
 import inspect
-import multiprocessing
 import os
 import shutil
 import sys
 import tempfile
 import warnings
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -24,6 +21,7 @@ import torch
 
 from aaplug.core import culling, ellipses, kernels, projection, rules, spherical_harmonics, splats
 from aaplug.core.errors import UsageError
+from aaplug.core.executors import Processes
 from aaplug.core.kernels import EAGER, Kernel, Kernels, one_thread
 from aaplug.core.rules import RULES_3DGS
 from aaplug.methods.pixel_kernels import INTEGRAL, POINT, averages, integral, point, raster_rows
@@ -123,17 +121,11 @@ def build(
                 "warmup", "needs a C++ compiler (g++ or clang++) for torch to compile with"
             )
         processes = min(torch.get_num_threads(), MOST_PROCESSES, len(missing))
-        pool = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"))
-        try:
-            # longest first, so that none is left over at the end
-            built = as_completed([pool.submit(_build, name) for name in missing[::-1]])
-            for done, future in enumerate(built, start=total - len(missing) + 1):
-                future.result()
-                progress(done, total)
-        except BrokenProcessPool as error:
-            raise UsageError("warmup", "a process died, probably out of memory") from error
-        finally:
-            pool.shutdown(cancel_futures=True)
+        # longest first, so that none is left over at the end; torch's default threads, for which kernels are compiled
+        pool = Processes(processes, torch_threads=None, ordered=False)
+        built = pool.map(_build, missing[::-1])
+        for done, _ in enumerate(built, start=total - len(missing) + 1):
+            progress(done, total)
     loaded = load()
     if loaded is None:
         raise UsageError("warmup", f"the packages in {cache_folder()} do not load")

@@ -58,8 +58,8 @@
   }
 
   function tag(role, images) {
-    const value = images[role].psnr;
-    return nameOf(role) + (typeof value === "number" ? ` · ${value.toFixed(2)} dB` : "");
+    const {score} = images[role];
+    return nameOf(role) + (score && ` · ${score}`);
   }
 
   let turn = 0;

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from aaplug.core.gaussians import CLASSIC
+from aaplug.core.training import TrainingViews
 from aaplug.inspection.coverage import coverage, log_multiples
-from aaplug.rendering.renderer import learn
 from tests.conftest import make_camera, make_scene
 
 
@@ -17,7 +17,7 @@ def at_bound(multiple: float, n: int = 10):
     scene = replace(make_scene(n), means=torch.zeros(n, 3))
     sigma = multiple * 0.2**0.5 / (view.focal / 4.0)
     scene = replace(scene, log_scales=torch.full((n, 3), sigma).log())
-    return scene, learn(scene, [view])
+    return scene, TrainingViews.of(scene, [view])
 
 
 @pytest.mark.parametrize("multiple", [0.5, 1.01, 3.0])
@@ -40,7 +40,7 @@ def test_aliasing_begins_where_what_training_drew_meets_the_bound():
 def test_every_seen_gaussian_is_in_the_histogram():
     scene = make_scene(400)
     scene = replace(scene, log_scales=scene.log_scales * 6)  # far into both ends
-    training = learn(scene, [make_camera()])
+    training = TrainingViews.of(scene, [make_camera()])
     found = coverage(scene, training, (1.0,))
     assert sum(found.counts) == found.seen == int(training.bounds.seen.sum())
     assert found.as_json()["gaussians"] == 400
@@ -48,5 +48,5 @@ def test_every_seen_gaussian_is_in_the_histogram():
 
 def test_a_scene_that_nothing_sees_has_no_share():
     scene = replace(make_scene(5), means=torch.full((5, 3), 1e6))
-    found = coverage(scene, learn(scene, [make_camera()]), (1.0,))
+    found = coverage(scene, TrainingViews.of(scene, [make_camera()]), (1.0,))
     assert (found.seen, found.under, found.begins, found.aliased) == (0, None, None, ())

@@ -1,0 +1,128 @@
+"""Fitting a scene to a viewer: the closed form, a short optimization, and a check that no scale became worse."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from aaplug.core.cameras import Camera
+from aaplug.core.gaussians import Fusion, Gaussians
+from aaplug.core.monitor import SILENT, Monitor
+from aaplug.evaluation.engine import Candidate, compare
+from aaplug.evaluation.metrics import PSNR
+from aaplug.evaluation.results import Report, mean
+from aaplug.evaluation.truth import MEMORY, Truth, back_projected
+from aaplug.finetuning.parameters import between
+from aaplug.finetuning.session import recorded, spread, tune
+from aaplug.finetuning.settings import QUICK, balanced
+from aaplug.finetuning.state import TuningJob
+from aaplug.methods.recipes import RECIPES
+from aaplug.methods.viewers import Viewer, fuse_for
+from aaplug.rendering.renderer import Renderer
+
+SHARES = (
+    0.5,
+    0.25,
+    0.125,
+)  # of the way to the tuned scene, tried while a scale is worse than the original
+ROUNDING = (1 / 255) ** 2 / 12  # mean square error of rounding to 8 bits
+MEASURED = 8  # views, evenly spaced, that scenes are compared on
+ORIGINAL, CLOSED_FORM, CONVERTED = "original", "closed form", "converted"  # rows of the report
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A scene for a viewer.  report: original, closed form and result as the viewer shows them."""
+
+    scene: Gaussians
+    report: Report
+
+
+def steps_for(scene: Gaussians, viewer: Viewer) -> int:
+    """The usual number of steps: none for a viewer that draws as training did."""
+    return 0 if scene.convention == viewer.convention_of(scene) else QUICK.steps
+
+
+def fit(
+    scene: Gaussians,
+    viewer: Viewer,
+    look: Renderer,
+    views: Sequence[Camera],
+    steps: int,
+    monitor: Monitor = SILENT,
+) -> Fitted:
+    """Convert a scene for a viewer.
+
+    Args:
+        scene: as it was read.
+        viewer: that will show it.
+        look: draws the scene as training showed it, which the viewer should show.
+        views: to measure on; a few of them are taken.
+        steps: of the optimization; 0 keeps the closed form.
+        monitor: receives messages and progress.
+
+    Raises:
+        UsageError: something is fused already, or no gradient is finite.
+        KeyboardInterrupt: Ctrl-C was pressed.
+    """
+    truth = Truth(look, enlarge=back_projected, memory=MEMORY)
+    original = replace(look, recipe=RECIPES[viewer.recipe])
+    residual = _Residual(spread(views, MEASURED), (1.0, *QUICK.weights), truth, monitor)
+    start = replace(original, scene=fuse_for(scene, original.training, viewer))
+    before = residual.of({ORIGINAL: original, CLOSED_FORM: start})
+    if steps and _is_worse(before, CLOSED_FORM):
+        monitor.say(
+            "the closed form is worse than the original at some scale: starting from the original"
+        )
+        start = original
+    settings = balanced(replace(QUICK, steps=steps), _errors(before))
+    job = TuningJob(start, original.training.cameras, truth, settings)
+    state = tune(job, monitor=monitor)
+    convention = viewer.convention_of(scene)
+    tuned = found = recorded(state, job, convention, {"for": viewer.name})
+    report = before.with_more(residual.of({CONVERTED: replace(original, scene=found)}))
+    for share in SHARES if state.step else ():
+        if not _is_worse(report, CONVERTED):
+            break
+        monitor.say(f"worse than the original at some scale: taking {share:g} of the change")
+        found = _partly(original.scene, tuned, share)
+        report = before.with_more(residual.of({CONVERTED: replace(original, scene=found)}))
+    if state.step and _is_worse(report, CONVERTED):
+        monitor.say("still worse than the original at some scale: read the table before you use it")
+    return Fitted(found, report)
+
+
+@dataclass(frozen=True)
+class _Residual:
+    """What is left between renders and the truth."""
+
+    views: Sequence[Camera]
+    scales: Sequence[float]
+    truth: Truth
+    monitor: Monitor
+
+    def of(self, renderers: Mapping[str, Renderer]) -> Report:
+        """Measure renderers, with progress."""
+        candidates = [Candidate(name, renderer) for name, renderer in renderers.items()]
+        with self.monitor.progress("measuring", "views") as tell:
+            return compare(candidates, self.views, self.scales, self.truth, tell)
+
+
+def _errors(report: Report) -> dict[float, float]:
+    """The original's mean square error by scale, at least that of rounding."""
+    psnr = {s: mean(report.select(ORIGINAL, s), PSNR.name) for s in report.scales}
+    return {s: max(ROUNDING, 0.0 if d is None else 10 ** (-d / 10)) for s, d in psnr.items()}
+
+
+def _is_worse(report: Report, name: str) -> bool:
+    """Whether a row has a lower PSNR than the original at any scale; None means equal to the truth."""
+    for scale in report.scales:
+        before, after = (mean(report.select(n, scale), PSNR.name) for n in (ORIGINAL, name))
+        if after is not None and (before is None or after < before):
+            return True
+    return False
+
+
+def _partly(original: Gaussians, tuned: Gaussians, share: float) -> Gaussians:
+    """A share of the way from the original to the tuned scene; the record of the tuning says so."""
+    *earlier, tuning = tuned.fused
+    partly = Fusion(tuning.method, tuning.settings | {"share": f"{share:g}"})
+    return replace(between(original, tuned, share), fused=(*earlier, partly))

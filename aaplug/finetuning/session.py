@@ -1,0 +1,143 @@
+"""A run as a user sees it: progress, measurements on the way, checkpoints and Ctrl-C."""
+
+import math
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from aaplug.core.cameras import Camera
+from aaplug.core.gaussians import Convention, Fusion, Gaussians
+from aaplug.core.monitor import SILENT, Monitor
+from aaplug.evaluation.engine import Candidate, compare
+from aaplug.evaluation.results import mean, scale_name
+from aaplug.finetuning.checkpoints import load, save
+from aaplug.finetuning.loop import run
+from aaplug.finetuning.state import State, TuningJob, begin
+from aaplug.methods.viewers import TUNED
+
+PROBES = 3  # training views, evenly spaced, that progress is measured on
+RECENT = 20  # steps over which the reported loss is averaged
+
+
+def tune(
+    job: TuningJob,
+    checkpoint: Path | None = None,
+    every: int = 100,
+    resume: bool = False,
+    monitor: Monitor = SILENT,
+) -> State:
+    """Run a job to its end.
+
+    Ctrl-C stops it after the current step, once the checkpoint is written; a second Ctrl-C stops it at once.
+
+    Raises:
+        KeyboardInterrupt: Ctrl-C was pressed.
+        FormatError, UsageError: there is nothing to resume, or it is of another run; or no gradient is finite.
+        OutputError: the checkpoint cannot be written.
+    """
+    state, good = load(checkpoint, job) if resume and checkpoint else (begin(job), None)
+    if resume:
+        monitor.say(f"resumed at step {state.step}")
+    steps = job.settings.steps
+    with monitor.progress("tuning", "steps") as tell, _interruptible(monitor.say) as stopped:
+        watch = _Watch(job, checkpoint, monitor, time.monotonic(), state.step)
+
+        def stop() -> bool:
+            tell(state.step, steps)
+            return stopped()
+
+        done = run(job, state, good, every=every, keep=watch.keep, stop=stop, say=monitor.say)
+        if done:
+            tell(steps, steps)
+    if not done:
+        kept = "nothing is written" if checkpoint is None else "the checkpoint is written; resume it"
+        monitor.say(f"stopped at step {state.step}; {kept}")
+        raise KeyboardInterrupt
+    return state
+
+
+@dataclass(frozen=True)
+class _Watch:
+    """Measures a run and writes its checkpoints.  started: of the clock, at step `first`."""
+
+    job: TuningJob
+    checkpoint: Path | None
+    monitor: Monitor
+    started: float
+    first: int
+
+    def keep(self, state: State, good: Mapping[str, Any]) -> None:
+        """Measure a few training views, write the checkpoint, and report both."""
+        job, scales = self.job, _ends(self.job)
+        views = spread(job.views, PROBES)
+        now = Candidate("now", state.renderer(job))
+        report = compare([now], views, scales, job.truth)
+        psnr = {scale: mean(report.select("now", scale), "PSNR") for scale in scales}
+        state.probes.append({"step": state.step, "psnr": {f"{s:g}": v for s, v in psnr.items()}})
+        if self.checkpoint is not None:
+            save(self.checkpoint, job, state, good)
+        told = ", ".join(f"{_decibels(v)} dB at {scale_name(s)}" for s, v in psnr.items())
+        pace = (time.monotonic() - self.started) / max(1, state.step - self.first)
+        loss = f", loss {_recent_loss(state):.2e}" if state.curve else ""
+        self.monitor.say(
+            f"step {state.step} of {job.settings.steps}{loss}: {told}; {pace:.2f} s per step"
+        )
+
+
+def recorded(
+    state: State, job: TuningJob, convention: Convention, settings: Mapping[str, str]
+) -> Gaussians:
+    """The tuned scene with a record of its tuning; after no steps the start itself."""
+    if state.step == 0:
+        return replace(job.start.scene, convention=convention)
+    scene = state.scene(job)
+    fusion = Fusion(TUNED, {"steps": str(state.step), **settings})
+    return replace(scene, convention=convention, fused=(*scene.fused, fusion))
+
+
+def spread(views: Sequence[Camera], most: int) -> Sequence[Camera]:
+    """At most this many of the views, evenly spaced."""
+    return views[:: max(1, -(-len(views) // most))]
+
+
+@contextmanager
+def _interruptible(say: Callable[[str], None]) -> Iterator[Callable[[], bool]]:
+    """Yield a function that tells whether Ctrl-C was pressed; a second press raises KeyboardInterrupt.
+
+    Python lets only the main thread handle signals; in others nothing changes.
+    """
+    pressed: list[int] = []
+
+    def note(number: int, frame: Any) -> None:
+        if pressed:
+            raise KeyboardInterrupt
+        pressed.append(number)
+        say("stopping after this step; press again to stop at once")
+
+    if threading.current_thread() is not threading.main_thread():
+        yield lambda: False
+        return
+    before = signal.signal(signal.SIGINT, note)
+    try:
+        yield lambda: bool(pressed)
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _ends(job: TuningJob) -> list[float]:
+    """The training size and the scale farthest from it."""
+    return list(dict.fromkeys([1.0, max(job.settings.weights, key=lambda s: abs(math.log(s)))]))
+
+
+def _recent_loss(state: State) -> float:
+    losses = [loss for step in state.curve[-RECENT:] for loss in step["loss"].values()]
+    return sum(losses) / len(losses)
+
+
+def _decibels(psnr: float | None) -> str:
+    return "infinite" if psnr is None else f"{psnr:.2f}"

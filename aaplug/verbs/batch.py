@@ -1,0 +1,150 @@
+"""Batch: evaluate many scenes.  One that fails stops no other; the summary names it."""
+
+import re
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+from rich.markup import escape
+from rich.table import Table
+
+from aaplug.core.errors import AaplugError
+from aaplug.core.monitor import SILENT, Monitor
+from aaplug.evaluation.report.files import as_json, write_texts
+from aaplug.evaluation.results import Report, as_csv, method, results, scale_name
+from aaplug.io.atomic import refuse_existing
+from aaplug.verbs.evaluate import Output
+
+SUMMARY, RESULTS = "batch.json", "results.csv"
+
+
+@dataclass(frozen=True)
+class Batch:
+    """What became of the scenes, by the names of their folders: a report, or in words why there is none."""
+
+    names: Mapping[str, str]
+    reports: Mapping[str, Report]
+    failures: Mapping[str, str]
+
+    def summary(self) -> dict[str, Any]:
+        """Status of every scene, and means over the finished ones of what all of them measured; JSON-ready."""
+        scenes = {
+            folder: {"name": name, "status": "failed", "error": self.failures[folder]}
+            if folder in self.failures
+            else {"name": name, "status": "done"}
+            for folder, name in self.names.items()
+        }
+        return {"scenes": scenes, "mean_over": list(self.reports), "mean": self._means()}
+
+    def _means(self) -> dict[str, dict[str, float | None]]:
+        """By method and metric; None where a scene has no value, as means over different scenes do not compare."""
+        found = [results(report) for report in self.reports.values()]
+        shared = [name for name in (found[0] if found else ()) if all(name in one for one in found)]
+        return {
+            name: {key: _mean([one[name].get(key) for one in found]) for key in found[0][name]}
+            for name in shared
+            if name != "_aaplug"
+        }
+
+    def tables(self) -> list[Table]:
+        """The means, one table per metric, and the status of every scene."""
+        scenes = Table(title="scenes", title_justify="left")
+        for heading in ("scene", "status", "why"):
+            scenes.add_column(heading, overflow="fold")
+        for folder, name in self.names.items():
+            why = self.failures.get(folder)
+            status = "done" if why is None else "[red]failed[/]"
+            scenes.add_row(escape(name), status, escape(why or ""))
+        return [*self._mean_tables(), scenes]
+
+    def _mean_tables(self) -> list[Table]:
+        if not self.reports:
+            return []
+        first, means = next(iter(self.reports.values())), self._means()
+        over = f"mean of {len(self.reports)} scene{'s' * (len(self.reports) != 1)}"
+        grids = []
+        for metric in first.metrics:
+            grid = Table(title=escape(f"{metric.title}, {over}"), title_justify="left")
+            grid.add_column("recipe", no_wrap=True)
+            for scale in first.scales:
+                grid.add_column(scale_name(scale), justify="right", no_wrap=True)
+            for recipe in first.recipes:
+                found = [means.get(method(recipe, s), {}).get(metric.name) for s in first.scales]
+                grid.add_row(escape(recipe), *map(metric.text, found))
+            grids.append(grid)
+        return grids
+
+
+def batch(
+    runs: Sequence[tuple[str, Callable[..., Report]]],
+    output: str | PathLike[str],
+    *,
+    resume: bool = False,
+    overwrite: bool = False,
+    monitor: Monitor = SILENT,
+) -> Batch:
+    """Evaluate scenes into folders of their own, and write batch.json and results.csv beside these.
+
+    Args:
+        runs: scenes by name, each as `functools.partial(evaluate, scene, cameras, ...)`; called with `name`,
+            `output`, `resume`, `overwrite` and `monitor`.
+        output: folder of the scenes' folders.
+
+    Raises:
+        OutputError: there are results already, or the summary cannot be written.
+        UsageError: `resume` and `overwrite` are both given.
+    """
+    folders = [Path(output) / slug for slug in _slugs([name for name, _ in runs])]
+    refuse_existing([Path(output) / name for name in (SUMMARY, RESULTS)], overwrite or resume)
+    for folder in folders:
+        Output(folder, resume=resume, overwrite=overwrite).check()
+    reports: dict[str, Report] = {}
+    failures: dict[str, str] = {}
+    for folder, (name, run) in zip(folders, runs, strict=True):
+        monitor.say(f"--- {name}")
+        given = {"name": name, "output": folder, "resume": resume, "overwrite": overwrite}
+        outcome = _outcome(lambda: run(**given, monitor=monitor), monitor)  # noqa: B023
+        if isinstance(outcome, Report):
+            reports[folder.name] = outcome
+        else:
+            failures[folder.name] = outcome
+            monitor.say(f"failed: {name}: {outcome}")
+    names = {folder.name: name for folder, (name, _) in zip(folders, runs, strict=True)}
+    found = Batch(names, reports, failures)
+    _write(found, output, monitor)
+    return found
+
+
+def _write(found: Batch, output: str | PathLike[str], monitor: Monitor) -> None:
+    texts = {SUMMARY: as_json(found.summary()), RESULTS: as_csv(found.reports)}
+    for path in write_texts(output, texts, overwrite=True):  # it was checked at the start
+        monitor.say(f"wrote {path}")
+
+
+def _outcome(run: Callable[[], Report], monitor: Monitor) -> Report | str:
+    """The report, or why there is none."""
+    try:
+        return run()
+    except AaplugError as error:
+        return str(error)
+    except MemoryError:
+        return "out of memory"
+    except Exception as error:  # a mistake in aaplug must not cost the other scenes
+        monitor.say(traceback.format_exc())
+        return f"unexpected {type(error).__name__}: {error}"
+
+
+def _slugs(names: Sequence[str]) -> list[str]:
+    """Names of folders; numbered where two would be the same."""
+    slugs = [re.sub(r"[^\w.\-]+", "_", name).lstrip(".") or "scene" for name in names]
+    if len({slug.casefold() for slug in slugs}) < len(slugs):
+        return [f"{index:03d}_{slug}" for index, slug in enumerate(slugs)]
+    return slugs
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return sum(known) / len(known) if len(known) == len(values) else None

@@ -1,0 +1,101 @@
+"""The whole job on the bundled sample: a pretrained chair and four photographs."""
+
+from importlib.resources import as_file, files
+from os import PathLike
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from aaplug.core.cameras import WHITE, Camera
+from aaplug.core.gaussians import Gaussians
+from aaplug.core.imaging import quantised, resampled
+from aaplug.core.monitor import SILENT, Monitor
+from aaplug.core.training import TrainingViews
+from aaplug.evaluation.report.contact_sheet import contact_sheet
+from aaplug.evaluation.results import Report, scale_name
+from aaplug.io.atomic import make_folder, refuse_existing
+from aaplug.io.cameras import read_cameras
+from aaplug.io.images import read_image, write_png
+from aaplug.io.scenes import read_scene
+from aaplug.rendering.renderer import Renderer
+from aaplug.verbs.convert import convert
+from aaplug.verbs.evaluate import evaluate
+
+SCALES = (1.0, 0.5, 0.25, 0.125)
+RECIPES = ("classic", "mip", "matched", "auto")
+SHOWN = "r_136"  # the view on the contact sheet
+COLUMNS = ("photograph", "classic 3DGS", "aaplug", "converted .ply, Mip viewer")
+CONVERTED, SHEET = "chair-converted.ply", "contact-sheet.png"
+RESULTS = ("results.json", "per_view.json", "results.csv")
+
+
+def demo(
+    output: str | PathLike[str] = "demo-out",
+    *,
+    overwrite: bool = False,
+    monitor: Monitor = SILENT,
+) -> Report:
+    """Convert, render and measure the bundled scene; write the converted scene, a contact sheet and the results.
+
+    output: a folder.
+
+    Raises:
+        OutputError: a file exists and `overwrite` is false, or it cannot be written.
+    """
+    folder = Path(output)
+    refuse_existing([folder / name for name in (CONVERTED, SHEET, *RESULTS)], overwrite)
+    make_folder(folder)
+    with as_file(files("aaplug.io.sample")) as sample:
+        scene, cameras = read_scene(sample / "chair.ply"), read_cameras(sample)
+        counts = f"{len(scene):,} Gaussians, {len(cameras.train)} training cameras"
+        monitor.say(f"sample: {counts}, {len(cameras.test)} photographs")
+        converted = folder / CONVERTED
+        convert(scene, cameras, output=converted, overwrite=overwrite, monitor=monitor)
+        view = next(camera for camera in cameras.test if camera.name == SHOWN)
+        training = TrainingViews.of(scene, cameras)
+        sheet = _sheet(scene, read_scene(converted), training, view)
+        write_png(folder / SHEET, sheet, overwrite=overwrite)
+        monitor.say(f"wrote {folder / SHEET}")
+        return evaluate(
+            scene,
+            cameras,
+            recipe=RECIPES,
+            scale=SCALES,
+            output=folder,
+            overwrite=overwrite,
+            name="chair",
+            monitor=monitor,
+        )
+
+
+@torch.no_grad()
+def _sheet(
+    scene: Gaussians, converted: Gaussians, training: TrainingViews, view: Camera
+) -> Float[Tensor, "H W 3"]:
+    """The view at every scale: the photograph, and each way to render it."""
+    assert view.photo is not None
+    photo = quantised(read_image(view.photo, WHITE))
+    renderers = [
+        Renderer.of(shown, training, recipe, background=WHITE)
+        for shown, recipe in ((scene, "classic"), (scene, "auto"), (converted, "mip"))
+    ]
+    rows, (left, top, right, bottom) = [], _box(renderers[0](view).alpha)
+    for scale in SCALES:
+        camera = view.scaled(scale)
+        images = [resampled(photo, scale), *(renderer(camera).rgb for renderer in renderers)]
+        y = slice(round(top * scale), round(bottom * scale))
+        x = slice(round(left * scale), round(right * scale))
+        label = f"{scale_name(scale)}: {camera.width}x{camera.height}"
+        rows.append((label, [image[y, x] for image in images]))
+    return contact_sheet(COLUMNS, rows)
+
+
+def _box(alpha: Float[Tensor, "h w"]) -> tuple[int, int, int, int]:
+    """Left, top, right and bottom of what is opaque, on whole pixels of the smallest scale."""
+    rows, columns = (alpha > 0.5).any(dim=1).nonzero(), (alpha > 0.5).any(dim=0).nonzero()
+    step = round(1 / min(SCALES))
+    low = [int(side.min()) // step * step for side in (columns, rows)]
+    high = [-(-(int(side.max()) + 1) // step) * step for side in (columns, rows)]
+    return low[0], low[1], high[0], high[1]

@@ -1,0 +1,134 @@
+"""aaplug evaluate as its users meet it: words, files, exit codes, one-line errors that leave nothing behind."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from aaplug.io.images import image_size
+from aaplug.methods.recipes import RECIPES
+from aaplug.verbs.evaluate import evaluate
+from tests.test_cli import (  # noqa: F401  (fixtures)
+    assert_refused,
+    break_frame,
+    break_nothing,
+    break_photo,
+    cli,
+    dataset,
+)
+
+
+def test_it_writes_results_and_prints_a_table(cli):  # noqa: F811
+    words = "evaluate scene.ply --cameras . -o out --recipe classic auto --scale 1 0.5"
+    code, out, _ = cli(words)
+    assert code == 0
+    assert "training size, resampled" in out
+    results = json.loads(Path("out/results.json").read_text())
+    assert results["auto@1"]["PSNR"] is None or results["auto@1"]["PSNR"] > 45
+    about = results["_aaplug"]
+    assert about["truth"] == "photographs"
+    assert len(about["scene"]["sha256"]) == 64
+    assert {"aaplug", "torch"} <= set(about["versions"])
+    assert list(json.loads(Path("out/per_view.json").read_text())["classic@0.5"]["SSIM"]) == ["r_0"]
+
+
+def test_the_library_gives_what_the_command_line_gives(cli):  # noqa: F811
+    own = evaluate("scene.ply", ".", recipe=["mip"], scale=[0.5], rasterizer="eager")
+    words = "evaluate scene.ply --cameras . --recipe mip --scale 0.5 --rasterizer eager -o out"
+    assert cli(words)[0] == 0
+    found = json.loads(Path("out/results.json").read_text())
+    assert found["mip@0.5"] == dict(own.select("mip", 0.5)[0].values)
+    assert {key: found["_aaplug"][key] for key in own.protocol} == own.protocol
+
+
+@pytest.mark.parametrize(
+    "several", ["--recipe mip,auto --scale 1,0.5", "--scale=1,0.5 --recipe=mip,auto,"]
+)
+def test_commas_part_values_as_spaces_do(cli, several):  # noqa: F811
+    code, out, _ = cli(f"evaluate scene.ply --cameras . {several} -o a,b --json")
+    assert code == 0
+    methods = {name for name in json.loads(out) if "@" in name and " " not in name}
+    assert methods == {"mip@1", "mip@0.5", "auto@1", "auto@0.5"}
+    assert Path("a,b/results.json").is_file()
+
+
+def test_without_photographs_it_takes_the_scenes_own_look(cli):  # noqa: F811
+    words = "evaluate scene.ply --cameras . --views train --scale 0.5 --recipe mip --json"
+    code, out, err = cli(words)
+    assert code == 0
+    assert "truth: self" in err
+    assert json.loads(out)["_aaplug"]["truth"] == "self"
+
+
+def test_all_leaves_out_what_does_not_suit_the_scene(cli):  # noqa: F811
+    code, out, err = cli("evaluate scene.ply --cameras . --recipe all --scale 0.25 --json")
+    assert code == 0
+    assert "recipe multi-scale left out: the scene lacks" in err
+    assert set(json.loads(out)["_aaplug"]["recipes"]) == set(RECIPES) - {"multi-scale"}
+
+
+def test_a_protocol_names_itself_and_its_flavours(cli):  # noqa: F811
+    words = "evaluate scene.ply --cameras . --protocol blender --scale 0.5 --recipe matched --json"
+    about = json.loads(cli(words)[1])["_aaplug"]
+    assert about["protocol"]["name"] == "blender"
+    assert about["background"] == [1, 1, 1]
+    assert about["metrics"]["SSIM"].startswith("3dgs")
+    assert "RGBA halved" in about["downscale"]
+    overridden = json.loads(cli(words + " --metric ssim:wang")[1])["_aaplug"]
+    assert list(overridden["metrics"]) == ["SSIM"]
+    assert overridden["metrics"]["SSIM"].startswith("wang")
+
+
+def test_it_writes_a_report_and_inrias_folders(cli):  # noqa: F811
+    pytest.importorskip("flip_evaluator")
+    words = "evaluate scene.ply --cameras . -o out --recipe classic auto --scale 1 0.5"
+    options = "--metric psnr,ssim,flip,flicker --report --layout inria --show r_0"
+    code, out, err = cli(f"{words} {options}")
+    assert code == 0, err
+    page = Path("out/report.html").read_text()
+    assert "FLIP" in out
+    assert "flicker" in page
+    assert Path("out/plots/psnr.png").is_file()
+    assert image_size(Path("out/test/classic@0.5/gt/00000.png")) == (32, 24)
+    assert Path("out/results.csv").read_text().count("\n") == 7
+
+
+def test_help_shows_the_recipes_for_users_and_says_that_there_are_more(cli):  # noqa: F811
+    text = cli("evaluate --help")[1]
+    assert "2dgs-matched|all|..." in text.replace("\n", "").replace(" ", "")
+    assert "analytic-logistic" not in text
+
+
+EVALUATE = "evaluate scene.ply --cameras . -o new"
+REFUSED = {
+    "cameras of another scene": (break_frame, EVALUATE, ["scene.ply", "different frames"]),
+    "unreadable photograph": (break_photo, EVALUATE, ["r_0.png"]),
+    "a recipe for other scenes": (
+        break_nothing, f"{EVALUATE} --recipe multi-scale", ["base_mask"]),
+    "unknown metric": (break_nothing, f"{EVALUATE} --metric psnrr", ["--metric", "psnrr", "flip"]),
+    "unknown flavour": (break_nothing, f"{EVALUATE} --metric ssim:alex", ["--metric", "ssim:3dgs"]),
+    "a report without a folder": (
+        break_nothing, "evaluate scene.ply --cameras . --report", ["--report", "--output"]),
+    "resume and overwrite": (break_nothing, f"{EVALUATE} --resume --overwrite", ["contradict"]),
+    "unknown protocol": (
+        break_nothing, f"{EVALUATE} --protocol blendr", ["--protocol", "blendr", "blender"]),
+    "unknown shown view": (
+        break_nothing, f"{EVALUATE} --report --show r_9", ["--show", "r_9"]),
+    "scene and batch": (
+        break_nothing, "evaluate scene.ply --batch b.toml -o new", ["--batch", "scene.ply"]),
+    "several scenes without a folder": (
+        break_nothing, "evaluate scene.ply scene.ply --cameras .", ["-o FOLDER", "several"]),
+    "scenes without cameras": (
+        break_nothing, "evaluate scene.ply scene.ply -o new", ["--cameras", "model folders"]),
+    "photographs of a moved camera": (
+        break_nothing, f"{EVALUATE} --protocol fov --truth photographs", ["fov"]),
+    "a scale that does not halve": (
+        break_nothing, f"{EVALUATE} --protocol blender --scale 0.3", ["1/2"]),
+    "no weights": (break_nothing, f"{EVALUATE} --lpips a.pth b.pth", ["a.pth"]),
+    "LPIPS without weights": (break_nothing, f"{EVALUATE} --metric lpips:alex", ["--lpips"]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_refusals_name_file_and_cause_and_write_nothing(cli, case):  # noqa: F811
+    assert_refused(cli, *REFUSED[case])
