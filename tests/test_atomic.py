@@ -38,7 +38,7 @@ def test_a_new_file_holds_what_was_written(tmp_path: Path):
 
 
 def test_an_existing_file_needs_overwrite(output: Path):
-    with pytest.raises(OutputError, match="pass overwrite"):
+    with pytest.raises(OutputError, match="pass `overwrite`"):
         write(output, NEW)
     assert only_the_old_file_is_there(output)
     write(output, NEW, overwrite=True)

@@ -410,7 +410,7 @@ def test_ksplat_counts_that_lie_do_no_harm(tmp_path: Path, level: int):
 
 def test_a_checkpoint_needs_the_users_word(tmp_path: Path):
     path = write_file(tmp_path, "run.pt")
-    with pytest.raises(FormatError, match="pass allow_checkpoint"):
+    with pytest.raises(FormatError, match="pass `allow_checkpoint`"):
         read_scene(path)
 
 

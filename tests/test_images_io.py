@@ -75,7 +75,7 @@ def test_sixteen_bit_alpha_is_composited(tmp_path: Path):
 
 def test_a_transparent_image_needs_a_background(tmp_path: Path):
     path = save(tmp_path / "a.png", np.full((2, 2, 4), 255, np.uint8))
-    with pytest.raises(FormatError, match=r"a\.png: is transparent.*pass background"):
+    with pytest.raises(FormatError, match=r"a\.png: is transparent.*pass `background`"):
         read_image(path, None)
 
 
@@ -177,7 +177,7 @@ def test_an_existing_png_stays_unless_overwritten(tmp_path: Path):
     path = tmp_path / "a.png"
     write_png(path, random_image())
     before = path.read_bytes()
-    with pytest.raises(OutputError, match="pass overwrite"):
+    with pytest.raises(OutputError, match="pass `overwrite`"):
         write_png(path, random_image() * 0)
     assert path.read_bytes() == before
     write_png(path, random_image() * 0, overwrite=True)

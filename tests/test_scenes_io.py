@@ -732,7 +732,7 @@ def test_a_bad_number_is_found_in_every_kind_of_column(tmp_path: Path, column: s
         assert len(read_scene(path)) == 5
         return
     what = "NaN" if np.isnan(value) else "Inf"
-    problem = f"in.ply: row 3 has {what} in {column}[;,].*pass drop_bad"
+    problem = f"in.ply: row 3 has {what} in {column}[;,].*pass `drop_bad`"
     with pytest.raises(FormatError, match=problem):
         read_scene(path)
     origin = read_scene(path, drop_bad=True).origin
