@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass, replace
 
+from aaplug.core.convolution import smoothed_by
 from aaplug.core.gaussians import Fusion, Gaussians
 from aaplug.core.training import TrainingViews
-from aaplug.methods.filters.smoothing import smooth
 
 
 @dataclass(frozen=True)
@@ -17,7 +17,7 @@ class Coarse:
         """Fuse the smoothing into scales and opacities."""
         rates = training.bounds.lowest.where(training.bounds.seen, float("inf"))
         log_sigma = (self.variance**0.5 / rates).log()[:, None]  # -inf changes nothing
-        smoothed = smooth(scene, log_sigma, volume=True)
+        smoothed = smoothed_by(scene, log_sigma, volume=True)
         record = Fusion("coarse", {"variance": f"{self.variance:g}"})
         return replace(smoothed, fused=(*scene.fused, record))
 
