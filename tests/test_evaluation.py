@@ -9,9 +9,7 @@ import torch
 from aaplug.core.cameras import CameraSet
 from aaplug.core.errors import UsageError
 from aaplug.core.imaging import box_average, quantised
-from aaplug.core.registry import Registry
 from aaplug.core.training import TrainingViews
-from aaplug.evaluation import results as results_module
 from aaplug.evaluation.engine import (
     NO_PHOTOGRAPH,
     Candidate,
@@ -306,14 +304,12 @@ def test_csv_holds_a_line_a_measurement(world):
 
 
 def test_a_new_metric_that_is_undefined_is_reported_with_its_own_words(world, monkeypatch):
-    known = Registry("metric", dict(METRICS))
-    monkeypatch.setattr(results_module, "METRICS", known)
+    monkeypatch.setattr(METRICS, "_entries", dict(METRICS))
     odd = Metric("odd", "", 1.0, 2, "its protocol", lambda image, truth: None, undefined="too odd")
     nan = replace(
         odd, name="nan", measure=lambda image, truth: float("nan"), undefined="not finite"
     )
-    for metric in (odd, nan):
-        known.register(metric.name, metric)
+    METRICS.register("odd", odd)  # and `nan` is given from Python alone
     look, views = world
     work = task(look, views[:1], scales=(0.5,), metrics=(PSNR, odd, nan))
     report = evaluate(work, journal=views[0].photo.with_name("odd.jsonl"))

@@ -1,5 +1,7 @@
 """LPIPS from weights that the user gives: the published formula, and files that are not what they should be."""
 
+from pathlib import Path
+
 import pytest
 import torch
 from torch.nn.functional import conv2d, max_pool2d, relu
@@ -12,7 +14,11 @@ CHANNELS = (4, 5, 6, 7, 8)
 
 @pytest.fixture
 def weights(tmp_path):
-    """Random weights of few channels, in the layout of torchvision and of the lpips package, by net."""
+    return lpips_weights(tmp_path)
+
+
+def lpips_weights(folder: Path) -> dict[str, tuple[Path, Path]]:
+    """Files of random weights of few channels, in the layout of torchvision and of the lpips package, by net."""
     files = {}
     for name, net in NETS.items():
         g = torch.Generator().manual_seed(3)
@@ -28,7 +34,7 @@ def weights(tmp_path):
             f"lin{i}.model.1.weight": torch.rand(1, c, 1, 1, generator=g)
             for i, c in enumerate(CHANNELS)
         }
-        files[name] = tmp_path / f"{name}.pth", tmp_path / f"{name}-heads.pth"
+        files[name] = folder / f"{name}.pth", folder / f"{name}-heads.pth"
         torch.save(trunk, files[name][0])
         torch.save(heads, files[name][1])
     return files
@@ -41,25 +47,7 @@ def by_hand(image, truth, trunk, heads, low):
     for x in (image, truth):
         x = (((x if low == 0 else 2 * x - 1) - mean) / std).permute(2, 0, 1)[None]
         found = []
-        for number in (
-            0,
-            2,
-            "pool",
-            5,
-            7,
-            "pool",
-            10,
-            12,
-            14,
-            "pool",
-            17,
-            19,
-            21,
-            "pool",
-            24,
-            26,
-            28,
-        ):
+        for number in (0, 2, "pool", 5, 7, "pool", 10, 12, 14, "pool", 17, 19, 21, "pool", 24, 26, 28):  # fmt: skip
             if number == "pool":
                 found.append(x)
                 x = max_pool2d(x, 2)

@@ -1,5 +1,6 @@
 """Metrics against their definitions."""
 
+import importlib.util
 import math
 
 import numpy as np
@@ -10,8 +11,14 @@ from skimage.data import astronaut
 from skimage.metrics import structural_similarity
 from torch.nn.functional import conv2d, pad
 
-from aaplug.evaluation.metrics import METRICS, energy_drift, flicker, flip, psnr, ssim
+from aaplug.core.errors import UsageError
 from aaplug.core.imaging import box_average
+from aaplug.evaluation.figures import energy_drift, flicker
+from aaplug.evaluation.metric import Metric
+from aaplug.evaluation.metrics import METRICS, SSIM, default_metrics, find_metrics, metric_option
+from aaplug.evaluation.protocols import PROTOCOLS
+from aaplug.evaluation.similarity import flip, psnr, ssim
+from tests.test_lpips import lpips_weights
 
 
 def test_psnr_of_a_constant_error():
@@ -23,28 +30,12 @@ def test_psnr_of_equal_images_is_undefined():
     assert psnr(torch.ones(4, 4, 3), torch.ones(4, 4, 3)) is None
 
 
-def test_ssim_is_the_one_of_wang_with_cropped_border():
-    g = torch.Generator().manual_seed(0)
-    a, b = torch.rand(40, 32, 3, generator=g), torch.rand(40, 32, 3, generator=g)
-    channels = [brute_force_ssim(a[..., c].double(), b[..., c].double()) for c in range(3)]
-    assert ssim(a, b) == pytest.approx(np.mean(channels), abs=1e-6)
-
-
 @pytest.mark.parametrize("hw", [(11, 11), (40, 32), (97, 130)])
-def test_ssim_wang_is_scikit_images_with_gaussian_weights(hw):
-    g = torch.Generator().manual_seed(1)
-    a, b = (torch.rand(*hw, 3, generator=g) for _ in "ab")
-    b = (a + 0.2 * (b - 0.5)).clamp(0, 1)
-    expected = structural_similarity(
-        a.double().numpy(),
-        b.double().numpy(),
-        gaussian_weights=True,
-        sigma=1.5,
-        use_sample_covariance=False,
-        data_range=1.0,
-        channel_axis=2,
-    )
-    assert ssim(a, b, "wang") == pytest.approx(expected, abs=1e-9)
+def test_ssim_is_the_one_of_wang_with_cropped_border(hw):
+    g = torch.Generator().manual_seed(0)
+    a, b = torch.rand(*hw, 3, generator=g), torch.rand(*hw, 3, generator=g)
+    channels = [brute_force_ssim(a[..., c].double(), b[..., c].double()) for c in range(3)]
+    assert ssim(a, b) == pytest.approx(np.mean(channels), abs=1e-9)
 
 
 def test_ssim_3dgs_is_the_zero_padded_convolution():
@@ -107,10 +98,92 @@ def test_flicker_of_motion_alone_is_one_and_of_twice_the_change_two():
     assert flicker(frames, [frames[0]] * 3) is None
 
 
+# laws of every metric
+
+
 @pytest.mark.parametrize("metric", METRICS.values(), ids=lambda metric: metric.name)
 def test_a_metrics_loss_is_least_at_its_ideal(metric):
     ideal = 1e9 if math.isinf(metric.ideal) else metric.ideal
     assert metric.loss(ideal) < metric.loss(ideal - 0.5)
+
+
+@pytest.fixture(scope="module")
+def comparing(tmp_path_factory):
+    """Every metric that compares with a truth, by name; LPIPS with random weights."""
+    weights = lpips_weights(tmp_path_factory.mktemp("weights"))["vgg"]
+    names = [m.name for m in METRICS.values() if m.measure is not None]
+    if importlib.util.find_spec("flip_evaluator") is None:
+        names.remove("FLIP")
+    found = find_metrics(names, PROTOCOLS["default"], weights)
+    return {metric.name: metric for metric in found}
+
+
+COMPARING = [m.name for m in METRICS.values() if m.measure is not None]
+
+
+@pytest.mark.parametrize("hw", [(1, 1), (3, 2), (10, 40), (64, 48)])
+@pytest.mark.parametrize("name", COMPARING)
+def test_a_metric_is_ideal_or_undefined_for_equal_images(comparing, name, hw):
+    if name not in comparing:
+        pytest.skip("its package is not installed")
+    metric = comparing[name]
+    image = torch.rand(*hw, 3, generator=torch.Generator().manual_seed(1))
+    value = metric.compare(image, image)
+    if value is None:
+        assert metric.undefined
+        assert math.isinf(metric.ideal) or min(hw) < 32
+    else:
+        assert value == pytest.approx(metric.ideal, abs=1e-6)
+
+
+@pytest.mark.parametrize("name", COMPARING)
+def test_a_metric_is_defined_for_unequal_images_and_worse_the_farther_they_are(comparing, name):
+    if name not in comparing:
+        pytest.skip("its package is not installed")
+    metric = comparing[name]
+    g = torch.Generator().manual_seed(2)
+    image, noise = torch.rand(64, 48, 3, generator=g), torch.rand(64, 48, 3, generator=g)
+    near, far = (metric.compare(image.lerp(noise, share), image) for share in (0.1, 0.9))
+    assert near is not None
+    assert far is not None
+    assert metric.loss(near) < metric.loss(far)
+
+
+def test_a_metric_compares_with_a_truth_or_looks_at_one_candidate():
+    for metric in METRICS.values():
+        assert (metric.measure is None) != (metric.figure is None)
+        assert metric.protocol
+    with pytest.raises(UsageError, match="is not a metric"):
+        METRICS.register("nothing", Metric("nothing", "", 1.0, 2, "neither"))
+
+
+# metrics by name
+
+
+def test_metrics_are_found_by_name_in_the_flavour_of_the_protocol():
+    blender = PROTOCOLS["blender"]
+    found = find_metrics(["psnr", "SSIM", "energy-drift"], blender)
+    assert [m.name for m in found] == ["PSNR", "SSIM", "energy drift"]
+    assert found[1] is SSIM["3dgs"]
+    assert default_metrics(blender) == ("psnr", "ssim", "consistency", "energy-drift")
+    assert default_metrics(PROTOCOLS["fov"]) == ("psnr", "ssim")
+    assert all(metric_option(name) == name for name in default_metrics(blender))
+
+
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [
+        (["vmaf"], "'vmaf' is not one of psnr, ssim, lpips"),
+        (["psnr", "PSNR"], "twice"),
+        (["lpips"], "needs weights"),
+    ],
+)
+def test_metrics_that_cannot_be_had_are_refused(names, words):
+    with pytest.raises(UsageError, match=words):
+        find_metrics(names, PROTOCOLS["default"])
+
+
+# SSIM
 
 
 def test_ssim_is_not_scikit_images_default():

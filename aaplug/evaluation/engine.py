@@ -135,7 +135,7 @@ def evaluate(
             measurements += measured
     order = task.names
     measurements.sort(key=lambda m: (order.index(m.recipe), task.scales.index(m.scale)))
-    return Report(tuple(measurements), request)
+    return Report(tuple(measurements), request, task.measured)
 
 
 def compare(

@@ -38,16 +38,21 @@ class Measurement:
 
 @dataclass(frozen=True)
 class Report:
-    """Measurements and the protocol that gives them meaning (JSON-ready)."""
+    """Measurements and the protocol that gives them meaning (JSON-ready).
+
+    measured: the metrics; those of `METRICS` need not be given.
+    """
 
     measurements: tuple[Measurement, ...]
     protocol: Mapping[str, Any]
+    measured: tuple[Metric, ...] = ()
 
     @property
     def metrics(self) -> tuple[Metric, ...]:
         """The metrics measured, in order."""
         names = dict.fromkeys(name for m in self.measurements for name in m.values)
-        return tuple(METRICS[name] for name in names) or (PSNR, SSIM["wang"])
+        given = {metric.name: metric for metric in self.measured}
+        return tuple(given.get(name) or METRICS[name] for name in names) or (PSNR, SSIM["wang"])
 
     @property
     def recipes(self) -> tuple[str, ...]:
@@ -66,7 +71,11 @@ class Report:
     def with_more(self, other: "Report") -> "Report":
         """Join two reports of the same protocol."""
         recipes = {**self.protocol["recipes"], **other.protocol["recipes"]}
-        return Report(self.measurements + other.measurements, {**self.protocol, "recipes": recipes})
+        measurements, protocol = (
+            self.measurements + other.measurements,
+            {**self.protocol, "recipes": recipes},
+        )
+        return Report(measurements, protocol, self.measured + other.measured)
 
 
 def mean(measurements: Iterable[Measurement], metric: str) -> float | None:

@@ -87,14 +87,9 @@ def _undistorted(camera: Camera, lens: Distortion) -> Camera:
     if window is None:
         return replace(camera, photo=None)
     left, top, width, height = window
-    return replace(
-        camera,
-        width=width,
-        height=height,
-        cx=camera.cx - left,
-        cy=camera.cy - top,
-        lens=replace(whole, window=window),
-    )
+    cx, cy = camera.cx - left, camera.cy - top
+    lens_of_window = replace(whole, window=window)
+    return replace(camera, width=width, height=height, cx=cx, cy=cy, lens=lens_of_window)
 
 
 @lru_cache(MAPS)

@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from os import PathLike
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -43,7 +44,7 @@ class Downscale:
 
     name: str
     protocol: str
-    read: Callable[[str | PathLike[str], Background, Lens | None], Photograph]
+    read: Callable[[Path, Background, Lens | None], Photograph]
 
 
 def read_photo(
@@ -57,16 +58,14 @@ def read_photo(
     return quantised(undistorted(read_image(path, background), lens))
 
 
-def _box(path: str | PathLike[str], background: Background, lens: Lens | None = None) -> Photograph:
+def _box(path: Path, background: Background, lens: Lens | None = None) -> Photograph:
     photo = read_photo(path, background, lens)
     return Photograph(
         (photo.shape[0], photo.shape[1]), lambda hw, factor: resampled(photo, factor, hw)
     )
 
 
-def _rgba_box(
-    path: str | PathLike[str], background: Background, lens: Lens | None = None
-) -> Photograph:
+def _rgba_box(path: Path, background: Background, lens: Lens | None = None) -> Photograph:
     """Mip-NeRF's multi-scale Blender data: RGBA halved in float, truncated to 8 bits when saved and when composited."""
     halves = [undistorted(read_rgba(path), lens)]
     behind = torch.tensor(background)
@@ -91,9 +90,7 @@ def _truncated(values: Tensor) -> Tensor:
     return (values * LEVELS + 1e-3).floor() / LEVELS
 
 
-def _pil_bicubic(
-    path: str | PathLike[str], background: Background, lens: Lens | None = None
-) -> Photograph:
+def _pil_bicubic(path: Path, background: Background, lens: Lens | None = None) -> Photograph:
     """3DGS's -r: Pillow's antialiased bicubic on the 8-bit photograph, rounded to 8 bits again."""
     photo = read_photo(path, background, lens)
     picture = Image.fromarray(levels(photo, 8).byte().numpy())

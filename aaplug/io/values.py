@@ -1,7 +1,7 @@
 """Values from untrusted files: their size, type and range are checked before they are used.
 
-Sizes and focal lengths are in px.  Every error is a `FormatError` that names the file, the entry and the field, and
-says what was expected and what was found.
+Sizes and focal lengths are in px.  Every function but `mentions` raises `FormatError` and nothing else; it
+names the file, the entry and the field, and says what was expected and what was found.
 """
 
 import json
@@ -42,7 +42,7 @@ class Place:
 
 @dataclass(frozen=True)
 class Entry:
-    """One JSON object.  Each method reads one field and raises FormatError if it is missing or not of that kind."""
+    """One JSON object.  Each method reads one field of a kind."""
 
     place: Place
     fields: dict[str, Any]
@@ -88,11 +88,7 @@ class Entry:
 
 
 def number(value: object, place: Place, field: str) -> float:
-    """`value` as a finite number.
-
-    Raises:
-        FormatError: it is not.
-    """
+    """`value` as a finite number."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise place.wrong(field, "a number", value)
     if not -math.inf < value < math.inf or abs(value) > torch.finfo(torch.float64).max:
@@ -101,22 +97,14 @@ def number(value: object, place: Place, field: str) -> float:
 
 
 def numbers(value: object, length: int, place: Place, field: str) -> list[float]:
-    """`value` as a list of `length` finite numbers.
-
-    Raises:
-        FormatError: it is not.
-    """
+    """`value` as a list of `length` finite numbers."""
     if not isinstance(value, list) or len(value) != length:
         raise place.wrong(field, f"{length} numbers", value)
     return [number(item, place, field) for item in value]
 
 
 def focal(value: object, place: Place, field: str) -> float:
-    """`value` as a focal length, in px.
-
-    Raises:
-        FormatError: it is not.
-    """
+    """`value` as a focal length, in px."""
     real = number(value, place, field)
     if not 0 < real <= MAX_FOCAL:
         raise place.wrong(field, f"above 0 and at most {MAX_FOCAL:g} px", value)
@@ -124,11 +112,7 @@ def focal(value: object, place: Place, field: str) -> float:
 
 
 def pixels(value: object, place: Place, field: str) -> int:
-    """`value` as the side of an image, in px.
-
-    Raises:
-        FormatError: it is not.
-    """
+    """`value` as the side of an image, in px."""
     real, most = number(value, place, field), whole_limit("CAMERA_SIDE")
     if not (1 <= real <= most and real.is_integer()):
         raise place.wrong(field, f"a whole number of px from 1 to {most}", value)
@@ -136,11 +120,7 @@ def pixels(value: object, place: Place, field: str) -> int:
 
 
 def text(value: object, place: Place, field: str) -> str:
-    """`value` as printable text: no control characters reach a terminal or a path.
-
-    Raises:
-        FormatError: it is not.
-    """
+    """`value` as printable text: no control characters reach a terminal or a path."""
     if not isinstance(value, str) or not value or not value.isprintable():
         raise place.wrong(field, "printable text", value)
     return value
@@ -202,20 +182,15 @@ def entries(
     return [_entry(Place(path, f"{what} {i}"), item, shared or {}) for i, item in enumerate(items)]
 
 
-def head(path: Path) -> bytes:
-    """A file's first bytes, empty if it cannot be read: `sniff` functions never raise."""
+def mentions(path: Path, keys: Sequence[str]) -> bool:
+    """Whether one of these JSON keys stands in the first bytes of the file; False if it cannot be read."""
     if not os.path.isfile(path):
-        return b""
+        return False
     try:
         with path.open("rb") as file:
-            return file.read(HEAD_LIMIT)
+            start = file.read(HEAD_LIMIT)
     except OSError:
-        return b""
-
-
-def mentions(path: Path, keys: Sequence[str]) -> bool:
-    """Whether one of these JSON keys stands in the first bytes of the file."""
-    start = head(path)
+        return False
     return any(f'"{key}"'.encode() in start for key in keys)
 
 

@@ -127,6 +127,5 @@ def select_views(cameras: CameraSet, spec: str) -> tuple[Camera, ...]:
 def _unknown(name: str, known: list[str]) -> Camera:
     close = difflib.get_close_matches(name, known, CLOSE_NAMES, cutoff=0) if name else known
     raise UsageError(
-        "views",
-        f"there is no view {name!r}; train, test, all or names such as {listing(close, 3)}",
+        "views", f"there is no view {name!r}; train, test, all or names such as {listing(close, 3)}"
     )

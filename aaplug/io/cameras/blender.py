@@ -22,12 +22,7 @@ def sniff(path: Path) -> bool:
 
 
 def read(path: Path, options: Options) -> CameraSet:
-    """The cameras, with the split that the files give.
-
-    Raises:
-        FormatError: a file breaks its format.
-        UsageError: the options do not fit.
-    """
+    """The cameras, with the split that the files give."""
     cameras = _cameras(path, options)
     if not os.path.isfile(path / VAL):
         return cameras

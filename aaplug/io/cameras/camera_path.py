@@ -41,12 +41,7 @@ def sniff(path: Path) -> bool:
 
 
 def read(path: Path, options: Options) -> CameraSet:
-    """The cameras.  They are free: not poses of a dataset, so they say nothing about the sampling of training.
-
-    Raises:
-        FormatError: the file breaks its format.
-        UsageError: the options do not fit.
-    """
+    """The cameras.  They are free: not poses of a dataset, so they say nothing about the sampling of training."""
     refuse_folder(options)
     cameras = read_camera_path(path).cameras
     sizes, _ = file_sizes(cameras, options)

@@ -92,8 +92,7 @@ def _literals(path: Path, call: ast.Call) -> dict[str, Any]:
             found[name] = ast.literal_eval(keyword.value)
         except (ValueError, TypeError, SyntaxError, RecursionError, MemoryError) as error:
             raise FormatError(
-                path,
-                f"{name} should be a literal (number, text, True, list); code is never run",
+                path, f"{name} should be a literal (number, text, True, list); code is never run"
             ) from error
     return found
 

@@ -21,13 +21,7 @@ from aaplug.core.errors import FormatError, listing
 from aaplug.io.cameras.cfg_args import WIDTH_CAP
 from aaplug.io.cameras.colmap_files import KINDS, Image, Intrinsics, read_cameras, read_images
 from aaplug.io.cameras.options import LLFF_HOLD, Options, every_nth
-from aaplug.io.cameras.photos import (
-    distinct,
-    photo_folder,
-    whole,
-    with_photos,
-    without_suffix,
-)
+from aaplug.io.cameras.photos import distinct, photo_folder, whole, with_photos, without_suffix
 from aaplug.io.cameras.poses import inverse, pose
 from aaplug.io.cameras.sizes import Size, camera_set, file_sizes, photo_sizes, trained_at
 from aaplug.io.lenses import Distortion, lens_notes, undistorted_cameras
@@ -54,12 +48,7 @@ def sniff(path: Path) -> bool:
 
 
 def read(path: Path, options: Options) -> CameraSet:
-    """The cameras at the size of their photos.
-
-    Raises:
-        FormatError: a file breaks its format, or a camera has no focal length.
-        UsageError: the options do not fit.
-    """
+    """The cameras at the size of their photos."""
     folder = _model_folder(path) or path
     cameras_file, images_file = _files(folder)
     intrinsics = read_cameras(cameras_file)

@@ -197,7 +197,7 @@ def _binary_images(file: Path, stream: BinaryIO) -> Iterator[Image]:
         what = f"image record {index}"
         key, *motion, camera_id = reader.unpack(IMAGE, what)
         place = Place(reader.path, f"image {key}")
-        name = _decoded(reader.name(what), place)
+        name = text(_decoded(reader.name(what), place), place, "name")
         points = reader.count(POINT_SIZE, f"points of {what}")
         reader.skip(points * POINT_SIZE, what)
         yield Image(place, name, camera_id, tuple(motion[:4]), tuple(motion[4:]))
@@ -205,7 +205,7 @@ def _binary_images(file: Path, stream: BinaryIO) -> Iterator[Image]:
 
 def _text_cameras(file: Path, stream: BinaryIO) -> Iterator[Intrinsics]:
     for row, line in _lines(file, stream):
-        fields = _decoded_line(line, Place(file, f"line {row}")).split()
+        fields = _decoded(line, Place(file, f"line {row}")).split()
         if not fields or fields[0].startswith("#"):
             continue
         place = Place(file, f"camera {fields[0][:20]!s} in line {row}")
@@ -236,7 +236,7 @@ def _text_images(file: Path, stream: BinaryIO) -> Iterator[Image]:
 
 
 def _text_image(line: bytes, place: Place) -> Image:
-    fields = _decoded_line(line, place).split(maxsplit=IMAGE_FIELDS - 1)
+    fields = _decoded(line, place).split(maxsplit=IMAGE_FIELDS - 1)
     if len(fields) != IMAGE_FIELDS:
         raise place.wrong("it", "id, quaternion, translation, camera id and name", line)
     motion = tuple(_real(field, place) for field in fields[1:8])
@@ -254,11 +254,7 @@ def _lines(file: Path, stream: BinaryIO) -> Iterator[tuple[int, bytes]]:
         yield row, line
 
 
-def _decoded(name: bytes, place: Place) -> str:
-    return text(_decoded_line(name, place), place, "name")
-
-
-def _decoded_line(line: bytes, place: Place) -> str:
+def _decoded(line: bytes, place: Place) -> str:
     try:
         return line.decode()
     except UnicodeDecodeError as error:

@@ -34,12 +34,7 @@ def sniff(path: Path) -> bool:
 
 
 def read(path: Path, options: Options) -> CameraSet:
-    """The cameras at the size at which 3DGS trained.
-
-    Raises:
-        FormatError: a file breaks its format.
-        UsageError: the options do not fit.
-    """
+    """The cameras at the size at which 3DGS trained."""
     file = _file(path)
     found = entries(file, "camera", read_json(file))
     settings = _settings(file.parent)

@@ -33,12 +33,7 @@ def sniff(path: Path) -> bool:
 
 
 def read(path: Path, options: Options) -> CameraSet:
-    """The cameras at the size of their photos, every 8th a test view.
-
-    Raises:
-        FormatError: the file breaks its format.
-        UsageError: the options do not fit.
-    """
+    """The cameras at the size of their photos, every 8th a test view."""
     file = path / FILE if os.path.isdir(path) else path
     rows = _rows(file)
     folder = photo_folder(file.parent, options, "images", Place(file, "images"))

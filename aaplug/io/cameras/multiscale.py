@@ -37,12 +37,7 @@ def sniff(path: Path) -> bool:
 
 
 def read(path: Path, options: Options) -> CameraSet:
-    """The cameras of all scales, with the split that the file gives.
-
-    Raises:
-        FormatError: the file breaks its format.
-        UsageError: the options do not fit.
-    """
+    """The cameras of all scales, with the split that the file gives."""
     refuse_folder(options)
     if options.test_every is not None:
         raise UsageError("test_every", f"{FILE} gives the split; leave it out")

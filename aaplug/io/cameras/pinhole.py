@@ -23,12 +23,7 @@ def sniff(path: Path) -> bool:
 
 
 def read(path: Path, options: Options) -> CameraSet:
-    """The cameras; a single one is named after its file, those of a list by their numbers.
-
-    Raises:
-        FormatError: the file breaks its format.
-        UsageError: the options do not fit.
-    """
+    """The cameras; a single one is named after its file, those of a list by their numbers."""
     refuse_folder(options)
     document = read_json(path)
     alone = isinstance(document, dict)

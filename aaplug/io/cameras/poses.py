@@ -1,4 +1,7 @@
-"""Camera poses from files: rigid motions in OpenCV's axes, as float64 4×4 matrices."""
+"""Camera poses from files: rigid motions in OpenCV's axes, as float64 4×4 matrices.
+
+Every function raises FormatError for values that are not a rigid motion.
+"""
 
 import torch
 from jaxtyping import Float
@@ -11,22 +14,14 @@ OPENCV_FROM_OPENGL = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)  # y a
 
 
 def pose_of_opengl(motion: Float[Tensor, "4 4"], place: Place, field: str) -> Float[Tensor, "4 4"]:
-    """`world_from_cam` from a camera-to-world matrix whose camera axes are OpenGL's (x right, y up, z backward).
-
-    Raises:
-        FormatError: it does not hold a rotation.
-    """
+    """`world_from_cam` from a camera-to-world matrix whose camera axes are OpenGL's (x right, y up, z backward)."""
     return pose(motion[:3, :3] * OPENCV_FROM_OPENGL, motion[:3, 3], place, field)
 
 
 def pose(
     rotation: Float[Tensor, "3 3"], translation: Float[Tensor, " 3"], place: Place, field: str
 ) -> Float[Tensor, "4 4"]:
-    """The rigid motion with this translation and the rotation nearest to `rotation`.
-
-    Raises:
-        FormatError: `rotation` differs from a rotation by more than rounding.
-    """
+    """The rigid motion with this translation and the rotation nearest to `rotation`."""
     error = (rotation @ rotation.T - torch.eye(3, dtype=torch.float64)).abs().max().item()
     if not error <= ORTHONORMAL:
         raise place.error(
@@ -43,11 +38,7 @@ def pose(
 
 
 def inverse(motion: Float[Tensor, "4 4"], place: Place, field: str) -> Float[Tensor, "4 4"]:
-    """The inverse of a rigid motion.
-
-    Raises:
-        FormatError: it overflows.
-    """
+    """The inverse of a rigid motion."""
     back = torch.eye(4, dtype=torch.float64)
     back[:3, :3] = motion[:3, :3].T
     back[:3, 3] = -back[:3, :3] @ motion[:3, 3]
@@ -57,11 +48,7 @@ def inverse(motion: Float[Tensor, "4 4"], place: Place, field: str) -> Float[Ten
 
 
 def rigid(entry: Entry, field: str) -> Float[Tensor, "4 4"]:
-    """A field that holds a 4×4 matrix whose last row is 0 0 0 1.
-
-    Raises:
-        FormatError: it does not.
-    """
+    """A field that holds a 4×4 matrix whose last row is 0 0 0 1."""
     motion = entry.matrix(field, 4, 4)
     if not torch.allclose(motion[3], torch.eye(4, dtype=torch.float64)[3]):
         raise entry.place.wrong(f"{field}'s last row", "0 0 0 1", motion[3].tolist())

@@ -82,12 +82,7 @@ def sniff(path: Path) -> bool:
 
 
 def read(path: Path, options: Options) -> CameraSet:
-    """The cameras of one file.
-
-    Raises:
-        FormatError: the file breaks its format.
-        UsageError: the options do not fit.
-    """
+    """The cameras of one file."""
     file = path / FILE if os.path.isdir(path) else path
     source = read_source(file, options)
     cameras = trained(source, options)

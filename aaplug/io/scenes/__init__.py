@@ -53,12 +53,7 @@ class WritableFormat(SceneFormat, Protocol):
     def needs(self) -> str | None: ...  # noqa: D102
 
     def write(
-        self,
-        path: Path,
-        parts: Iterable[Gaussians],
-        count: int,
-        overwrite: bool,
-        options: Options,
+        self, path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: Options
     ) -> None:
         """Write a scene of at least one part and at most `count` Gaussians, whole or not at all.
 

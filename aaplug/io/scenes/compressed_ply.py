@@ -6,7 +6,6 @@ largest component, 3 × 10 for the others), packed_color (4 bytes).  Element "sh
 The header's comments say how the scene was trained, as in a plain .ply.
 """
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -18,21 +17,14 @@ from aaplug.core.errors import FormatError
 from aaplug.core.gaussians import Gaussians
 from aaplug.io.scenes.options import Options
 from aaplug.io.scenes.packed import byte_opacities, floats, largest_last
-from aaplug.io.scenes.ply_header import (
-    LITTLE,
-    Element,
-    Header,
-    check_size,
-    is_packed,
-    read_header,
-)
+from aaplug.io.scenes.ply_document import Table, stamp_of
+from aaplug.io.scenes.ply_header import LITTLE, Element, Header, check_size, is_packed, read_header
 from aaplug.io.scenes.ply_tags import meaning
 from aaplug.io.scenes.scene_file import (
     DEGREES,
     SceneFile,
     check_count,
     library_errors,
-    read_rows,
     sh_of_colour,
 )
 
@@ -46,31 +38,13 @@ SH_SPAN = 8.0  # harmonics lie between -4 and 4
 name = "compressed.ply"
 
 
-@dataclass(frozen=True)
-class Table:
-    """The rows of an element in the file."""
-
-    path: Path
-    dtype: np.dtype
-    offset: int
-    count: int
-
-    def read(self, start: int, stop: int) -> np.ndarray:
-        """The rows from start up to stop."""
-        return read_rows(self.path, self.dtype, start, stop, self.offset)
-
-
 def sniff(path: Path, head: bytes) -> bool:
     """Whether this is a .ply with packed words."""
     return head.startswith((b"ply\n", b"ply\r")) and is_packed(path)
 
 
 def open_scene(path: Path, options: Options) -> SceneFile:
-    """See `SceneFormat`.
-
-    Raises:
-        FormatError: the file is damaged.
-    """
+    """See `SceneFormat`."""
     with library_errors(path):
         header = read_header(path)
         check_size(header, path.stat().st_size)
@@ -95,10 +69,10 @@ def open_scene(path: Path, options: Options) -> SceneFile:
 def _tables(path: Path, header: Header) -> dict[str, Table]:
     if header.coding != LITTLE or any(e.lists for e in header.elements):
         raise FormatError(path, f"is a packed .ply, which should be {LITTLE} without lists")
-    tables, at = {}, header.size
+    tables, at, stamp = {}, header.size, stamp_of(path)
     for element in header.elements:
         dtype = np.dtype([(p.name, "<" + p.code) for p in element.properties])
-        tables[element.name] = Table(path, dtype, at, element.count)
+        tables[element.name] = Table(path, at, element.count, dtype, stamp)
         at += element.least_size
     return tables
 

@@ -7,7 +7,7 @@ or bytes), ordered by degree, then channel.
 """
 
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -69,11 +69,7 @@ def sniff(path: Path, head: bytes) -> bool:
 
 
 def open_scene(path: Path, options: Options) -> SceneFile:
-    """See `SceneFormat`.
-
-    Raises:
-        FormatError: the file is damaged, or promises more than it holds.
-    """
+    """See `SceneFormat`."""
     with library_errors(path):
         data = path.read_bytes()
         level, sh_range, sections = _sections(path, data)
@@ -178,12 +174,10 @@ def _decoded(records: Records, level: int, sh_range: tuple[float, float], degree
 
 
 def _joined(scenes: list[Gaussians], degree: int) -> Gaussians:
-    if not scenes:
-        return empty(0, degree)
-    return Gaussians(
-        torch.cat([s.means for s in scenes]),
-        torch.cat([s.quats for s in scenes]),
-        torch.cat([s.log_scales for s in scenes]),
-        torch.cat([s.logit_opacities for s in scenes]),
-        torch.cat([s.sh for s in scenes]),
-    )
+    parts = [empty(0, degree), *scenes]
+
+    def column(name: str) -> torch.Tensor:
+        return torch.cat([getattr(part, name) for part in parts])
+
+    names = ("means", "quats", "log_scales", "logit_opacities", "sh")
+    return replace(parts[0], **{name: column(name) for name in names})

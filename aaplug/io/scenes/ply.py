@@ -50,10 +50,7 @@ REST = re.compile(r"f_rest_\d+")
 COLOURS = ("f_dc_0", "f_dc_1", "f_dc_2")
 BYTE_COLOURS = ("red", "green", "blue")  # uchar
 SCALES = ("scale_0", "scale_1", "scale_2")
-REQUIRED = (
-    *("x", "y", "z", *COLOURS, "opacity", *SCALES),
-    *("rot_0", "rot_1", "rot_2", "rot_3"),
-)
+REQUIRED = (*("x", "y", "z", *COLOURS, "opacity", *SCALES), *("rot_0", "rot_1", "rot_2", "rot_3"))
 NORMALS = ("nx", "ny", "nz")  # unused; 3DGS writes them, and some readers expect them
 SIZES = ("min_pixel_sizes", "max_pixel_sizes", "base_mask")  # of Multi-Scale 3DGS, of any type
 FLOATS = ("f4", "f8")
@@ -70,11 +67,7 @@ def sniff(path: Path, head: bytes) -> bool:
 
 
 def open_scene(path: Path, options: Options) -> SceneFile:
-    """See `SceneFormat`.
-
-    Raises:
-        FormatError: the file holds no scene, or is damaged.
-    """
+    """See `SceneFormat`."""
     with library_errors(path):
         header = read_header(path)
         stamp = stamp_of(path)
@@ -102,11 +95,7 @@ def open_scene(path: Path, options: Options) -> SceneFile:
 def write(
     path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: Options
 ) -> None:
-    """Write a scene part by part, with the columns, tables and comments of its source file.
-
-    Raises:
-        OutputError: the file exists and `overwrite` is false, or it cannot be written.
-    """
+    """Write a scene part by part, with the columns, tables and comments of its source file."""
     parts = iter(parts)
     first = next(parts)
     document = _document_of(first) or Document(_plain_header(first))
@@ -145,7 +134,8 @@ def _check_columns(header: Header) -> list[str]:
     optional = {*(COLOURS if coloured else ()), SCALES[2]}
     missing = [c for c in REQUIRED if c not in known and c not in optional]
     if missing:
-        raise FormatError(header.path, _about_missing(missing))
+        lacks = f"vertex lacks {', '.join(missing)}, which a 3DGS .ply has"
+        raise FormatError(header.path, f"{lacks}; is it a point cloud or a mesh?")
     used = [p for p in known.values() if _is_parameter(p.name)]
     wrong = [p.name for p in used if p.code not in FLOATS]
     if wrong:
@@ -154,27 +144,20 @@ def _check_columns(header: Header) -> list[str]:
         )
     _check_rest(header.path, _rest(header))
     double = [p.name for p in used if p.code == "f8"]
-    return [
-        *([f"coding: {header.coding}"] if header.coding != LITTLE else []),
-        *([f"{len(double)} columns of float64, used as float32"] if double else []),
-        *(
-            ["pixel sizes of Multi-Scale 3DGS, for the recipe multi-scale"]
-            if all(column in known for column in SIZES)
-            else []
+    notes = {
+        f"coding: {header.coding}": header.coding != LITTLE,
+        f"{len(double)} columns of float64, used as float32": double,
+        "pixel sizes of Multi-Scale 3DGS, for the recipe multi-scale": all(
+            c in known for c in SIZES
         ),
-        *(["colours from the columns red, green, blue; no harmonics"] if coloured else []),
-    ]
+        "colours from the columns red, green, blue; no harmonics": coloured,
+    }
+    return [note for note, applies in notes.items() if applies]
 
 
 def _has_byte_colours(known: dict[str, Property]) -> bool:
     there = all(c in known and known[c].code == "u1" for c in BYTE_COLOURS)
     return there and not any(c in known for c in COLOURS)
-
-
-def _about_missing(missing: list[str]) -> str:
-    return (
-        f"vertex lacks {', '.join(missing)}, which a 3DGS .ply has; is it a point cloud or a mesh?"
-    )
 
 
 def _check_rest(path: str, rest: list[str]) -> None:

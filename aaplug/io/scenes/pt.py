@@ -36,11 +36,7 @@ def sniff(path: Path, head: bytes) -> bool:
 
 
 def open_scene(path: Path, options: Options) -> SceneFile:
-    """See `SceneFormat`.
-
-    Raises:
-        FormatError: the user did not allow a checkpoint, torch is too old, or the file is not a gsplat checkpoint.
-    """
+    """See `SceneFormat`."""
     if not options.allow_checkpoint:
         raise FormatError(
             path,

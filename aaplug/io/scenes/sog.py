@@ -73,11 +73,7 @@ def sniff(path: Path, head: bytes) -> bool:
 
 
 def open_scene(path: Path, options: Options) -> SceneFile:
-    """See `SceneFormat`.
-
-    Raises:
-        FormatError: the file is damaged, names files elsewhere, or promises more than it can hold.
-    """
+    """See `SceneFormat`."""
     with library_errors(path):
         if path.name == META:
             meta = parse_json(read_bounded(path, whole_limit("JSON")), path)
@@ -164,9 +160,7 @@ def _part(path: Path, root: Entry, key: str, count: int, fetch: Fetch) -> Part:
         if not isinstance(file, str) or not FILE.fullmatch(file):
             raise entry.place.wrong("files", "names of plain files beside meta.json", file)
         palette = key == "shN" and index == 0
-        noisy = (
-            key == "means" and index == 0
-        )  # low bytes do not compress, so the file size bounds the count
+        noisy = key == "means" and index == 0  # low bytes do not compress: the size tells the count
         rgba, width = _image(path, file, fetch, None if palette else count, noisy)
         pixels.append(rgba)
         widths.append(width)
@@ -220,11 +214,7 @@ def _palette(part: Part, version: int) -> Float[Tensor, "p c 3"]:
 
 
 def _rows(
-    parts: dict[str, Part],
-    palette: Float[Tensor, "p c 3"],
-    version: int,
-    flat: bool,
-    rows: slice,
+    parts: dict[str, Part], palette: Float[Tensor, "p c 3"], version: int, flat: bool, rows: slice
 ) -> Gaussians:
     means, quats, scales, sh0 = (parts[key] for key in ("means", "quats", "scales", "sh0"))
     alpha = sh0.pixels[0][rows, 3]

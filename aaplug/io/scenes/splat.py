@@ -40,11 +40,7 @@ def sniff(path: Path, head: bytes) -> bool:
 
 
 def open_scene(path: Path, options: Options) -> SceneFile:
-    """See `SceneFormat`.
-
-    Raises:
-        FormatError: the file does not hold whole records.
-    """
+    """See `SceneFormat`."""
     with library_errors(path):
         size = path.stat().st_size
     if size % RECORD.itemsize:
@@ -59,11 +55,7 @@ def open_scene(path: Path, options: Options) -> SceneFile:
 def write(
     path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: Options
 ) -> None:
-    """Write a scene part by part; harmonics above degree 0 and the convention are lost.
-
-    Raises:
-        OutputError: the file exists and `overwrite` is false, or it cannot be written.
-    """
+    """Write a scene part by part; harmonics above degree 0 and the convention are lost."""
     with replacing(path, overwrite) as stream:
         for part in parts:
             stream.write(_records(part).tobytes())

@@ -80,11 +80,7 @@ def sniff(path: Path, head: bytes) -> bool:
 
 
 def open_scene(path: Path, options: Options) -> SceneFile:
-    """Decompress a scene; see `SceneFormat`.
-
-    Raises:
-        FormatError: the file is damaged, or promises more than it can hold.
-    """
+    """Decompress a scene; see `SceneFormat`."""
     with library_errors(path):
         header, sections = _sections(path)
     turn = TURNS[options.spz_axes]

@@ -39,12 +39,7 @@ TURNS: Mapping[str, Callable[[Gaussians], Gaussians]] = {
 def write(
     path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: Options
 ) -> None:
-    """Write a scene, with values rounded to the format's steps.
-
-    Raises:
-        OutputError: the format cannot hold the scene, or the file exists and `overwrite` is false, or it cannot be
-            written.
-    """
+    """Write a scene, with values rounded to the format's steps."""
     turn = TURNS[options.spz_axes]
     scenes = [turn(_checked(path, part)) for part in parts]
     content = _packed(path, scenes)

@@ -1,0 +1,114 @@
+"""Conversion in closed form: the files, the energy that a viewer shows, and what is refused."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from aaplug.core.cameras import Camera
+from aaplug.core.errors import UsageError
+from aaplug.core.gaussians import ANTIALIASED, CLASSIC, CONVENTIONS, MIP
+from aaplug.core.projection import project
+from aaplug.core.sampling import median_rates
+from aaplug.core.training import TrainingViews
+from aaplug.io.scenes import read_scene, write_scene
+from aaplug.methods.recipes import RECIPES
+from aaplug.methods.viewers import FITTED_VARIANCE, FORMS, VIEWERS, fuse, fuse_for
+from aaplug.rendering.renderer import Renderer
+from tests.conftest import make_camera, make_scene
+
+EYES = [(0.0, -4.0, 0.0), (3.0, -3.5, 1.0), (-1.0, -2.5, 1.5), (0.5, 5.0, -1.0)]
+
+
+@pytest.fixture(scope="module")
+def cameras() -> list[Camera]:
+    return [make_camera(eye, name=f"view_{i}") for i, eye in enumerate(EYES)]
+
+
+@pytest.mark.parametrize("form", FORMS.values(), ids=FORMS.keys())
+def test_a_converted_scene_renders_the_same_from_its_file(form, tmp_path, cameras):
+    scene = make_scene(200)
+    training = TrainingViews.of(scene, cameras)
+    converted = fuse(scene, training, form)
+    write_scene(tmp_path / "converted.ply", converted)
+    again = read_scene(tmp_path / "converted.ply")
+    assert (again.convention, again.fused) == (MIP, converted.fused)
+    images = [Renderer(s, training, RECIPES["mip"])(cameras[0]).rgb for s in (converted, again)]
+    assert torch.equal(*images)
+
+
+def test_converting_twice_is_refused(cameras):
+    scene = make_scene(50)
+    training = TrainingViews.of(scene, cameras)
+    converted = fuse(scene, training, FORMS["matched-energy"])
+    for form in FORMS.values():
+        with pytest.raises(UsageError, match="already has matched-energy"):
+            fuse(converted, training, form)
+
+
+def test_converting_a_classic_scene_needs_cameras():
+    with pytest.raises(UsageError, match="needs the training cameras"):
+        fuse(make_scene(3), None, FORMS["matched-energy"])
+
+
+def test_a_mip_scene_without_stored_filter_has_nothing_to_fuse(cameras):
+    scene = replace(make_scene(3), convention=MIP)
+    with pytest.raises(UsageError, match="nothing to fuse"):
+        fuse(scene, TrainingViews.of(scene, cameras), FORMS["matched-energy"])
+
+
+@pytest.mark.parametrize("convention", [CLASSIC, ANTIALIASED], ids=lambda c: c.name)
+def test_converted_splats_show_the_energy_that_training_showed(convention):
+    """With one camera nothing is averaged: the Mip viewer's o√det is that of training."""
+    scene = replace(make_scene(100, dtype=torch.float64), convention=convention)
+    scene = replace(
+        scene, logit_opacities=scene.logit_opacities - 4
+    )  # far from the bound on opacity
+    camera = make_camera()
+    training = TrainingViews.of(scene, [camera])
+    converted = fuse(scene, training, FORMS["matched-energy"])
+    trained = project(scene, camera).blurred(convention.kernel, convention.compensated)
+    shown = project(converted, camera)
+    seen = training.bounds.seen[shown.sources]
+    energy = (shown.opacities * shown.dets.sqrt())[seen]
+    torch.testing.assert_close(
+        energy, (trained.opacities * trained.dets.sqrt())[seen], rtol=1e-6, atol=0
+    )
+
+
+@pytest.mark.parametrize("viewer", VIEWERS.values(), ids=VIEWERS)
+@pytest.mark.parametrize("trained", CONVENTIONS.values(), ids=CONVENTIONS)
+def test_converted_for_a_viewer_shows_the_energy_that_training_showed(viewer, trained):
+    """With one camera and splats wide enough, the viewer's o√det and width are those of training."""
+    scene = replace(make_scene(100, dtype=torch.float64), convention=trained)
+    scene = replace(
+        scene,
+        logit_opacities=scene.logit_opacities - 4,
+        log_scales=scene.log_scales[:, :1].repeat(1, 3).clamp(min=-2.5),
+        means=scene.means * 0.1,
+    )
+    camera = make_camera()
+    training = TrainingViews.of(scene, [camera])
+    converted = fuse_for(scene, training, viewer)
+    assert converted.convention == viewer.convention
+    assert (converted is scene) == (trained == viewer.convention)
+    rules = (scene, trained), (converted, viewer.convention)
+    then, now = (project(s, camera).blurred(c.kernel, c.compensated) for s, c in rules)
+    energies = [splats.opacities * splats.dets.sqrt() for splats in (then, now)]
+    torch.testing.assert_close(*energies, rtol=1e-6, atol=0)
+    fitted = viewer.convention.compensated and not trained.compensated
+    missing = FITTED_VARIANCE + viewer.convention.kernel - trained.kernel if fitted else 0.0
+    trace = [splats.covs[:, 0] + splats.covs[:, 2] for splats in (then, now)]
+    torch.testing.assert_close(trace[0] + 2 * missing, trace[1], rtol=0.01, atol=0)
+
+
+def test_a_scene_thinner_than_a_viewers_blur_keeps_some_area(cameras):
+    scene = replace(make_scene(40), convention=MIP)
+    scene = replace(scene, log_scales=scene.log_scales - 4)
+    converted = fuse_for(scene, TrainingViews.of(scene, cameras), VIEWERS["antialiased-viewer"])
+    assert (converted.log_scales <= scene.log_scales).all()
+    assert converted.log_scales.isfinite().all()
+    px = converted.scales * median_rates(scene.means, cameras)[:, None]
+    least = (scene.scales * median_rates(scene.means, cameras)[:, None]).clamp(max=0.1)
+    assert (px >= 0.999 * least).all()
+    assert (px < 0.999 * scene.scales * median_rates(scene.means, cameras)[:, None]).any()

@@ -1,0 +1,317 @@
+"""The renderer: how it is prepared, and what recipes promise about the training size, energy and samples."""
+
+import pickle
+from dataclasses import replace
+
+import pytest
+import torch
+
+from aaplug.core.cameras import WHITE, Camera, CameraSet
+from aaplug.core.errors import FrameError, UsageError
+from aaplug.core.gaussians import CONVENTIONS, MIP, Gaussians
+from aaplug.core.imaging import box_average
+from aaplug.core.projection import project
+from aaplug.core.training import TrainingViews
+from aaplug.methods.filters import Smoothing3D, fuse_stored
+from aaplug.methods.pixel_kernels import SURFEL
+from aaplug.methods.recipes import QUALITIES, RECIPES, find_recipe, suited
+from aaplug.rasterizers import RASTERIZERS
+from aaplug.rendering import renderer as rendering
+from aaplug.rendering.renderer import Renderer
+from tests.conftest import make_camera, make_scene
+
+REFERENCE = RASTERIZERS["reference"]
+OWN_RECIPE = {"classic": "classic", "antialiased": "ewa", "mip": "mip"}  # of each convention
+EYES = [(0.0, -4.0, 0.0), (3.0, -3.5, 1.0), (-1.0, -2.5, 1.5), (0.5, 5.0, -1.0)]
+
+
+@pytest.fixture(scope="module")
+def cameras() -> list[Camera]:
+    return [make_camera(eye, name=f"view_{i}") for i, eye in enumerate(EYES)]
+
+
+def free(camera: Camera) -> Camera:
+    return replace(camera, trained_focal=None)
+
+
+def one_gaussian(sigma: float, opacity: float) -> Gaussians:
+    return Gaussians(
+        means=torch.zeros(1, 3),
+        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        log_scales=torch.full((1, 3), sigma).log(),
+        logit_opacities=torch.logit(torch.tensor([opacity])),
+        sh=torch.zeros(1, 1, 3),
+    )
+
+
+# preparing --------------------------------------------------------------------------------------
+
+
+def test_a_world_filter_is_applied_once_when_the_renderer_is_made(cameras):
+    scene = make_scene(200)
+    renderer = Renderer.of(scene, cameras, "mip-splatting", rasterizer="eager")
+    training = TrainingViews.of(scene, cameras)
+    filtered = Smoothing3D()(scene, training)
+    assert renderer.scene.log_scales.equal(filtered.log_scales)
+    assert renderer.scene.fused == filtered.fused
+    by_hand = Renderer(filtered, training, RECIPES["mip"])(cameras[0])
+    unprepared = Renderer(scene, training, RECIPES["mip-splatting"])(cameras[0])
+    assert renderer(cameras[0]).rgb.equal(by_hand.rgb)
+    assert (renderer(cameras[0]).rgb - unprepared.rgb).abs().max() > 0.1
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_a_stored_3d_filter_is_fused_for_every_recipe(name, cameras):
+    scene = replace(make_scene(200), filter_3d=torch.full((200,), 0.2), convention=MIP)
+    if RECIPES[name].lacks(scene) is not None:
+        with pytest.raises(UsageError, match=name):
+            Renderer.of(scene, cameras, name)
+        return
+    renderer = Renderer.of(scene, cameras, name, rasterizer="eager")
+    assert renderer.scene.filter_3d is None
+    assert renderer.scene.fused[0].method == "filter_3D"
+    assert (renderer.scene.log_scales >= scene.log_scales).all()
+    assert not renderer.scene.log_scales.equal(scene.log_scales)
+
+
+def test_a_stored_3d_filter_renders_the_same_fused_before_and_by_the_renderer(cameras):
+    scene = replace(make_scene(200), filter_3d=torch.full((200,), 0.05), convention=MIP)
+    images = [
+        Renderer.of(s, cameras, rasterizer="eager")(cameras[0]).rgb
+        for s in (scene, fuse_stored(scene), replace(scene, filter_3d=None))
+    ]
+    assert images[0].equal(images[1])
+    assert not images[0].equal(images[2])
+
+
+def test_auto_draws_discs_for_a_scene_of_2d_gaussians_only(cameras):
+    scene = make_scene(60)
+    flat = replace(scene, flat=True, log_scales=scene.log_scales.clone())
+    flat.log_scales[:, 2] = -30.0
+    renderer = Renderer.of(flat, cameras, rasterizer="eager")
+    assert renderer.recipe.pixel is SURFEL
+    assert renderer.recipe.name == "auto"
+    discs = Renderer.of(flat, cameras, "2dgs-matched", rasterizer="eager")
+    assert renderer(cameras[0]).rgb.equal(discs(cameras[0]).rgb)
+    assert Renderer.of(scene, cameras, rasterizer="eager").recipe.pixel is not SURFEL
+    matched = Renderer.of(flat, cameras, "matched", rasterizer="eager")
+    assert matched.recipe is RECIPES["matched"], "a named recipe is kept"
+    best = suited(find_recipe("auto", quality="best"), flat)
+    assert best.samples_at(0.25) == 4
+
+
+def test_cameras_of_another_scene_are_refused(cameras):
+    scene = make_scene(200)
+    elsewhere = replace(scene, means=scene.means + 100)
+    with pytest.raises(FrameError, match="different frames"):
+        Renderer.of(elsewhere, cameras)
+    training = TrainingViews.of(elsewhere, cameras)  # whoever computes it has checked it
+    assert Renderer.of(elsewhere, training, "classic", rasterizer="eager").training is training
+
+
+def test_no_cameras_are_refused():
+    with pytest.raises(UsageError, match="cameras: there are none"):
+        Renderer.of(make_scene(3), [])
+
+
+def test_a_camera_set_gives_its_training_cameras_and_its_background(cameras):
+    scene = make_scene(30)
+    found = CameraSet(tuple(cameras[:2]), tuple(cameras[2:]), WHITE)
+    renderer = Renderer.of(scene, found, "classic", rasterizer="eager")
+    assert list(renderer.training.cameras) == cameras[:2]
+    assert renderer.background == WHITE
+    assert Renderer.of(scene, cameras, "classic").background == (0.0, 0.0, 0.0)
+    for background, colour in (("white", WHITE), ((0.1, 0.2, 0.3), (0.1, 0.2, 0.3))):
+        assert Renderer.of(scene, cameras, "classic", background=background).background == colour
+    black, white = (
+        Renderer.of(scene, cameras, "classic", background=b, rasterizer="eager")(cameras[0])
+        for b in ("black", "white")
+    )
+    behind = (1 - black.alpha)[..., None]
+    torch.testing.assert_close(white.rgb, black.rgb + behind, rtol=0, atol=1e-6)
+
+
+def test_quality_is_that_of_auto(cameras):
+    scene = make_scene(30)
+    for quality, rate in QUALITIES.items():
+        renderer = Renderer.of(scene, cameras, quality=quality)
+        assert renderer.recipe.target_rate == rate
+    assert Renderer.of(scene, cameras, "matched", quality="best").recipe.target_rate == 0
+
+
+def test_a_renderer_can_be_sent_to_another_process(cameras):
+    renderer = Renderer.of(make_scene(50), cameras, rasterizer="eager")
+    again = pickle.loads(pickle.dumps(renderer))
+    assert again(cameras[0]).rgb.equal(renderer(cameras[0]).rgb)
+
+
+def test_a_drawing_holds_the_splats_of_the_image_that_has_the_samples(cameras):
+    renderer = Renderer.of(make_scene(50), cameras, quality="best", rasterizer="eager")
+    view = cameras[0].scaled(0.5)
+    drawing = renderer.draw(view)
+    assert renderer.samples(view) == 2
+    assert drawing.hw == (2 * view.height, 2 * view.width)
+    assert drawing.render.rgb.shape == (*view.hw, 3)
+    assert drawing.render.rgb.equal(renderer(view).rgb)
+    fine = renderer.sampled(view)[0]
+    assert drawing.splats.means.equal(renderer.splats(fine).means)
+
+
+def test_scenes_are_projected_in_chunks_without_a_change(cameras, monkeypatch):
+    renderer = Renderer.of(make_scene(200), cameras, rasterizer="eager")
+    whole = renderer(cameras[0]).rgb
+    monkeypatch.setattr(rendering, "CHUNK", 33)
+    torch.testing.assert_close(renderer(cameras[0]).rgb, whole, rtol=0, atol=1e-6)
+
+
+# rates ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("distance", "rate"), [(4.0, 1.0), (2.0, 2.0), (16.0, 0.25)])
+def test_a_free_camera_has_the_rate_of_its_distance(distance, rate):
+    scene = make_scene(50, dtype=torch.float64)
+    scene = replace(scene, means=0.01 * scene.means)
+    trained = make_camera((0.0, -4.0, 0.0))
+    renderer = Renderer.of(scene, [trained])
+    view = free(make_camera((0.0, -distance, 0.0)))
+    assert renderer.relative_rate(view) == pytest.approx(rate, rel=0.05)
+    assert renderer.relative_rate(trained.scaled(0.25)) == 0.25
+    unseeing = replace(free(make_camera((0.0, -9.0, 0.0))), cx=1e6)
+    assert renderer.relative_rate(unseeing) == renderer.training.relative_rate(unseeing)
+
+
+def test_the_rate_of_a_free_camera_is_computed_once_per_pose(cameras, monkeypatch):
+    renderer = Renderer.of(make_scene(50), cameras, rasterizer="eager")
+    calls = []
+    compute = rendering.sampling_bounds
+    monkeypatch.setattr(
+        rendering, "sampling_bounds", lambda *args: calls.append(args) or compute(*args)
+    )
+    view = free(make_camera((0.3, -9.0, 0.2)))
+    rate = renderer.relative_rate(view)
+    renderer.samples(view)
+    renderer.draw(view)
+    renderer(replace(view, name="the same pose again"))
+    assert renderer.relative_rate(view) == rate
+    assert len(calls) == 1
+    assert renderer.relative_rate(free(make_camera((0.3, -18.0, 0.2)))) < rate
+    assert renderer.relative_rate(view.scaled(0.5)) == pytest.approx(rate / 2, rel=0.05)
+    assert len(calls) == 3
+    renderer(cameras[0])
+    assert len(calls) == 3, "a pose of the data set needs no bounds"
+
+
+def test_without_a_look_at_the_scene_a_free_camera_is_compared_by_focal_length():
+    training = TrainingViews.of(make_scene(10), [make_camera(), make_camera(fov=1.4)])
+    focals = sorted(camera.focal for camera in training.cameras)
+    assert training.relative_rate(free(make_camera())) == pytest.approx(
+        make_camera().focal / (sum(focals) / 2)
+    )
+    assert training.relative_rate(make_camera(fov=1.4).scaled(0.5)) == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize(
+    ("rate", "fast", "balanced", "best"),
+    [
+        (1.0, 1, 1, 1),
+        (2.0, 1, 1, 1),
+        (0.5, 1, 1, 2),
+        (0.25, 1, 2, 4),
+        (0.125, 2, 4, 8),
+        (0.3, 1, 2, 4),
+    ],
+)
+def test_quality_takes_the_fewest_samples_that_reach_its_rate(rate, fast, balanced, best):
+    counts = [find_recipe("auto", quality=quality).samples_at(rate) for quality in QUALITIES]
+    assert counts == [fast, balanced, best]
+
+
+# images -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS.values(), ids=CONVENTIONS)
+@pytest.mark.parametrize("reference", ["pose", "global", "interval"])
+def test_matched_is_training_itself_at_every_view_of_the_training_size(
+    convention, reference, cameras
+):
+    scene = replace(make_scene(200), convention=convention)
+    training = TrainingViews.of(scene, cameras[1:])  # the first view is held out
+    trained = Renderer(scene, training, RECIPES[OWN_RECIPE[convention.name]])
+    ours = [
+        Renderer(scene, training, find_recipe(name, rate_reference=reference))
+        for name in ("matched", "auto")
+    ]
+    for camera in cameras:
+        expected = trained(camera).rgb
+        assert all((r(camera).rgb - expected).abs().max() <= 1e-5 for r in ours)
+
+
+def test_matched_to_the_sharpest_view_is_thinner_at_the_others(cameras):
+    scene = make_scene(200)
+    training = TrainingViews.of(scene, cameras)
+    sharpest = Renderer(scene, training, find_recipe("matched", rate_reference="sharpest"))
+    trained = Renderer(scene, training, RECIPES["classic"])
+    assert max((sharpest(c).rgb - trained(c).rgb).abs().max() for c in cameras) > 1e-3
+
+
+@pytest.mark.parametrize(("is_free", "like"), [(True, "interval"), (False, "global")])
+def test_matched_takes_the_interval_for_free_cameras_only(is_free, like):
+    """From near; from afar both rise to a sharper rate."""
+    scene, cameras = make_scene(50), [make_camera((0.0, -4.0, 0.0)), make_camera((2.0, -3.0, 1.0))]
+    training = TrainingViews.of(scene, cameras)
+    view = make_camera((0.0, -8.0, 0.0)).scaled(2.5)
+    view = free(view) if is_free else view
+    found, expected, other = (
+        find_recipe("matched", rate_reference=r).screen(project(scene, view), view, training)
+        for r in ("pose", like, "sharpest")
+    )
+    torch.testing.assert_close(found.covs, expected.covs)
+    assert (found.covs - other.covs).abs().max() > 0.01
+
+
+@pytest.mark.parametrize("rate", [0.5, 0.25, 0.125, 2.0, 4.0])
+def test_matched_keeps_the_light_of_a_lone_splat_at_every_rate(rate):
+    """Alpha summed over the image, in units of training's pixel, averaged over positions inside a pixel."""
+    scene, camera = one_gaussian(sigma=0.05, opacity=0.6), make_camera(size=(64, 64))
+    renderer = Renderer.of(scene, [camera], "matched", rasterizer=REFERENCE)
+    trained = renderer(camera).alpha.sum()
+    view = camera.scaled(rate)
+    shifts = [0.125, 0.375, 0.625, 0.875]
+    moved = [replace(view, cx=view.cx + dx, cy=view.cy + dy) for dx in shifts for dy in shifts]
+    total = sum(renderer(camera).alpha.sum() for camera in moved) / len(moved)
+    assert total / rate**2 == pytest.approx(trained.item(), rel=0.03)
+
+
+def test_classic_bloats_a_lone_splat_when_zoomed_out():
+    scene, camera = one_gaussian(sigma=0.002, opacity=0.6), make_camera(size=(512, 512))
+    classic, ours = (
+        Renderer.of(scene, [camera], name, rasterizer=REFERENCE)(camera.scaled(1 / 8)).alpha.sum()
+        for name in ("classic", "matched")
+    )
+    assert classic > 10 * ours  # (v r² + 0.3) / (v r² + 0.3 r²) approaches 1/r² = 64
+
+
+def test_best_is_the_average_of_the_image_of_the_training_size():
+    scene, camera = make_scene(200), make_camera(size=(64, 64))
+    full = Renderer.of(scene, [camera], "classic", rasterizer="eager")(camera).rgb
+    best = Renderer.of(scene, [camera], quality="best", rasterizer="eager")(camera.scaled(1 / 4))
+    boxes = full.unflatten(1, (-1, 4)).unflatten(0, (-1, 4)).mean(dim=(1, 3))
+    torch.testing.assert_close(best.rgb, boxes, atol=1e-6, rtol=0)
+    torch.testing.assert_close(box_average(full, 4), boxes, atol=1e-6, rtol=0)
+
+
+# names ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("words", "culprit"),
+    [
+        ({"name": "mipp"}, "recipe: 'mipp' is not one of"),
+        ({"name": "auto", "quality": "great"}, "quality: 'great'"),
+        ({"name": "classic", "rate_reference": "global"}, "rate_reference: .*classic"),
+        ({"name": "matched", "rate_reference": "newest"}, "rate_reference: 'newest'"),
+    ],
+)
+def test_unknown_names_are_refused(words, culprit):
+    with pytest.raises(UsageError, match=culprit):
+        find_recipe(**words)
