@@ -71,19 +71,19 @@ def _verb(name: str) -> tuple[type, Callable[[Any], int]]:
     return getattr(module, name.capitalize()), getattr(module, name)
 
 
-def _types(noun: type) -> dict[str, Any]:
+def option_types(noun: type) -> dict[str, Any]:
     """Types of all options of a verb by name, those of its groups included."""
     found: dict[str, Any] = {}
     hints = get_type_hints(noun)
     for field in fields(noun):
         kind = hints[field.name]
-        found |= _types(kind) if hasattr(kind, "__dataclass_fields__") else {field.name: kind}
+        found |= option_types(kind) if hasattr(kind, "__dataclass_fields__") else {field.name: kind}
     return found
 
 
 def _worded(error: AaplugError, words: Sequence[str]) -> str:
     """The library's error with parameters as the command line writes them: `cull_margin` is --cull-margin."""
-    known = _types(_verb(words[0])[0]) if words and words[0] in VERBS else {}
+    known = option_types(_verb(words[0])[0]) if words and words[0] in VERBS else {}
 
     def worded(name: str) -> str:
         if name not in known:
@@ -99,7 +99,7 @@ def _worded(error: AaplugError, words: Sequence[str]) -> str:
 def _several(verb: str) -> list[str]:
     """Options of a verb that take any number of names or numbers."""
     found = []
-    for name, kind in _types(_verb(verb)[0]).items():
+    for name, kind in option_types(_verb(verb)[0]).items():
         for one in (kind, *get_args(kind)):
             if get_origin(one) is tuple and get_args(one)[1:] == (...,):
                 found.append("--" + name.replace("_", "-"))

@@ -1,23 +1,19 @@
-"""Render a classic checkpoint at a quarter of its training size, as it would look if training's image were averaged."""
+"""Render a classic checkpoint at a quarter of its training size, aliased and anti-aliased."""
 
 from pathlib import Path
 
 import aaplug
 
-SAMPLE = Path(aaplug.__file__).parent / "sample"
+SAMPLE = Path(aaplug.__file__).parent / "io" / "sample"
 
 
 def main(folder: Path) -> None:
-    scene = aaplug.read_scene(SAMPLE / "chair.ply")
-    cameras = aaplug.read_cameras(SAMPLE)
-    training = aaplug.learn(scene, cameras.train)
-
+    scene, cameras = aaplug.read_scene(SAMPLE / "chair.ply"), aaplug.read_cameras(SAMPLE)
     view = cameras.test[0].scaled(1 / 4)
-    for name in ("classic", "auto"):
-        recipe = aaplug.find_recipe(name)
-        image = aaplug.render(scene, view, recipe, training, background=(1.0, 1.0, 1.0))
-        aaplug.write_png(folder / f"{name}.png", image.rgb, overwrite=True)
-        print(f"wrote {folder / name}.png")
+    for recipe in ("classic", "auto"):
+        renderer = aaplug.Renderer.of(scene, cameras, recipe)
+        aaplug.write_png(folder / f"{recipe}.png", renderer(view).rgb, overwrite=True)
+        print(f"wrote {folder / recipe}.png")
 
 
 if __name__ == "__main__":

@@ -4,16 +4,14 @@ from pathlib import Path
 
 import aaplug
 
-SAMPLE = Path(aaplug.__file__).parent / "sample"
+SAMPLE = Path(aaplug.__file__).parent / "io" / "sample"
 
 
 def main(folder: Path) -> None:
-    scene = aaplug.read_scene(SAMPLE / "chair.ply")
-    training = aaplug.learn(scene, aaplug.read_cameras(SAMPLE).train)
-
-    converted = aaplug.convert(scene, training, aaplug.FORMS["matched-energy"])
-    aaplug.write_scene(folder / "chair-converted.ply", converted, overwrite=True)
-    print(f"fused {converted.fused[0]}; the file says {converted.convention.name}")
+    output = folder / "chair-converted.ply"
+    aaplug.convert(SAMPLE / "chair.ply", SAMPLE, output, overwrite=True)
+    converted = aaplug.read_scene(output)
+    print(f"fused {converted.fused[0]}; trained as the file says: {converted.convention.name}")
 
 
 if __name__ == "__main__":

@@ -20,8 +20,8 @@ from pathlib import Path
 import torch
 
 from aaplug.core.errors import AaplugError
+from aaplug.inspection.survey import survey
 from aaplug.io.scenes import open_scene
-from aaplug.verbs.in_parts import survey
 from tests.scene_files import DATA, MADE, STORED, write_file
 
 SECONDS = 1.0  # of processor time a file; other processes may make the clock's run longer

@@ -2,12 +2,16 @@
 
 import json
 import shutil
+from itertools import count
 from pathlib import Path
 
 import pytest
 
 from aaplug.core.errors import FormatError
+from aaplug.evaluation.journal import Journal
+from aaplug.evaluation.results import Measurement, Report
 from aaplug.io.batch_file import read_batch
+from aaplug.verbs.batch import batch as evaluate_all
 from tests.test_cli import cli, dataset  # noqa: F401  (fixtures)
 
 SETTINGS = """
@@ -99,32 +103,35 @@ def test_scenes_of_the_command_line_share_their_cameras(batch):
     assert json.loads(out)["mean"]["matched@0.5"]["SSIM"] > 0.5
 
 
-@pytest.mark.parametrize("stop", [0, 4])
-def test_a_killed_batch_continues_to_the_same_bytes(batch, monkeypatch, stop):
+def test_a_killed_batch_continues_to_the_same_bytes(batch, monkeypatch):
     words = "evaluate --batch batch.toml --layout inria"
+    Path("batch.toml").write_text(SETTINGS.replace('"train"', '"r_1,r_2"'))
     shutil.copy("scene.ply", "broken.ply")
     assert batch(words)[0] == 0
     whole = timeless(Path("out"))
-    shutil.rmtree("out")
-    from aaplug.evaluation.journal import Journal
+    for stop in (0, 3):  # before the first view, and in the second scene
+        shutil.rmtree("out")
+        with monkeypatch.context() as patch:
+            patch.setattr(Journal, "add", killed_at(stop))
+            assert batch(words)[0] == 130
+        if (journal := Path("out/whole/progress.jsonl")).exists():
+            with journal.open("ab") as stream:
+                stream.write(b'{"view": 1, "meas')  # what a kill leaves
+            assert batch(words)[0] == 2  # without --resume nothing is lost
+        assert batch(words + " --resume")[0] == 0
+        assert timeless(Path("out")) == whole
 
-    added, add = [], Journal.add
 
-    def killed(journal, view, measurements):
-        if len(added) == stop:
+def killed_at(stop: int):
+    """`Journal.add`, interrupted at the call of that number."""
+    calls, add = count(), Journal.add
+
+    def adding(journal, view, measurements):
+        if next(calls) == stop:
             raise KeyboardInterrupt
-        added.append(view)
         add(journal, view, measurements)
 
-    monkeypatch.setattr(Journal, "add", killed)
-    assert batch(words)[0] == 130
-    monkeypatch.setattr(Journal, "add", add)
-    if (journal := Path("out/whole/progress.jsonl")).exists():
-        with journal.open("ab") as stream:
-            stream.write(b'{"view": 2, "meas')  # what a kill leaves
-        assert batch(words)[0] == 2  # without --resume nothing is lost
-    assert batch(words + " --resume")[0] == 0
-    assert timeless(Path("out")) == whole
+    return adding
 
 
 def test_resuming_another_request_is_refused(batch):
@@ -161,7 +168,9 @@ def test_a_batch_file_that_does_not_fit_is_refused_by_key(batch, case):
 
 def test_paths_start_at_the_file_and_names_at_the_scenes(tmp_path):
     path = tmp_path / "b.toml"
-    path.write_text("cull_margin = 0.3\n[[scene]]\nscene = 'x/a.ply'\ncameras = '/abs'\ntest-every = 8")
+    path.write_text(
+        "cull_margin = 0.3\n[[scene]]\nscene = 'x/a.ply'\ncameras = '/abs'\ntest-every = 8"
+    )
     file = read_batch(path)
     assert file.shared == {"cull_margin": 0.3}
     expected = {"scene": str(tmp_path / "x/a.ply"), "cameras": "/abs", "test_every": 8}
@@ -187,3 +196,29 @@ drop-bad = false
 def test_a_missing_batch_file_is_named(tmp_path):
     with pytest.raises(FormatError, match="no such file"):
         read_batch(tmp_path / "gone.toml")
+
+
+def report_of(**values: float | None):
+    """A run that measures these values without rendering."""
+    measured = Measurement("auto", 1.0, "view", values, 1, 0.1)
+    return lambda **settings: Report((measured,), {"recipes": {}})
+
+
+def mistaken(**settings):
+    raise ValueError("oh")
+
+
+def full(**settings):
+    raise MemoryError
+
+
+def test_no_failure_of_a_scene_costs_another(tmp_path):
+    runs = [("x", mistaken), ("y", full), ("x", report_of(PSNR=30.0)), ("z", report_of(PSNR=None))]
+    found = evaluate_all(runs, tmp_path / "out")
+    assert list(found.names.values()) == ["x", "y", "x", "z"]
+    assert len(set(found.names)) == 4  # folders of their own
+    assert list(found.failures.values()) == ["unexpected ValueError: oh", "out of memory"]
+    assert [report.recipes for report in found.reports.values()] == [("auto",), ("auto",)]
+    # a mean over fewer scenes would not compare
+    assert found.summary()["mean"] == {"auto@1": {"PSNR": None}}
+    assert json.loads((tmp_path / "out/batch.json").read_text()) == found.summary()

@@ -6,27 +6,28 @@ import pytest
 import torch
 from aaplug_cli.main import main
 
+from aaplug.core.kernels import EAGER
 from aaplug.core.projection import rotation_matrices
-from aaplug.core.splats import MIN_ALPHA
-from aaplug.methods.recipes import RECIPES
-from aaplug.rasterizers import Tiled
+from aaplug.core.rules import RULES_3DGS
 from aaplug.rendering.benchmark import exponent, measure, synthetic_camera, synthetic_scene
-from aaplug.rendering.renderer import learn, render
+from aaplug.rendering.renderer import Renderer
 
 STAGES = ["project", "filter", "cull", "shade", "bin", "forms", "composite"]
 
 
 def test_figures_of_a_small_scene():
-    run = measure(synthetic_scene(500), synthetic_camera(40, 24), Tiled(), repeats=1)
+    run = measure(synthetic_scene(500), synthetic_camera(40, 24), EAGER, repeats=1)
     assert run.rasterizer == "eager"
     assert (run.gaussians, run.width, run.height) == (500, 40, 24)
     assert list(run.stages_ms) == STAGES
     assert min(run.stages_ms.values()) > 0
     assert run.forward_ms > 0
     assert run.forward_backward_ms > run.forward_ms
-    assert run.pairs % 64 == 0
-    assert run.tile_pairs > 0
-    assert run.ns_per_pair == pytest.approx(run.stages_ms["composite"] * 1e6 / run.pairs)
+    assert run.evaluations % 64 == 0
+    assert run.tile_evaluations > 0
+    assert run.ns_per_evaluation == pytest.approx(
+        run.stages_ms["composite"] * 1e6 / run.evaluations
+    )
     assert run.peak_bytes > 1e7
     assert run.share == run.forward_ms / run.matmul_ms
 
@@ -38,9 +39,7 @@ def test_synthetic_scenes_cover_the_image_alike_at_every_size():
         scene = synthetic_scene(n)
         assert len(scene) == n
         assert scene.means.isfinite().all()
-        alphas.append(
-            render(scene, camera, RECIPES["classic"], learn(scene, [camera])).alpha.mean().item()
-        )
+        alphas.append(Renderer.of(scene, [camera], "classic")(camera).alpha.mean().item())
     assert min(alphas) > 0.8
     assert alphas[0] == pytest.approx(alphas[1], abs=0.1)
 
@@ -51,7 +50,7 @@ def test_synthetic_gaussians_lie_flat_on_the_ground():
     assert ground.sum() == 270
     normals = rotation_matrices(scene.unit_quats)[ground][:, :, 2]
     torch.testing.assert_close(normals, torch.tensor([0.0, 0.0, 1.0]).expand(270, 3))
-    assert (scene.opacities > MIN_ALPHA).all()
+    assert (scene.opacities > RULES_3DGS.min_alpha).all()
 
 
 @pytest.mark.parametrize("power", [0.5, 1.0, 2.0])
@@ -70,7 +69,7 @@ def test_one_run_is_one_object(capsys):
     code, said = run_bench(capsys, "--gaussians", "300", "--json")
     figures = json.loads(said.out)
     assert code == 0
-    names = "rasterizer forward_ms forward_backward_ms pairs ns_per_pair stages_ms peak_bytes"
+    names = "rasterizer forward_ms forward_backward_ms evaluations ns_per_evaluation stages_ms peak_bytes"
     assert set(names.split()) <= set(figures)
     assert figures["gaussians"] == 300
 

@@ -5,7 +5,6 @@ import math
 import shutil
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -16,7 +15,6 @@ from aaplug_cli.main import main
 from plyfile import PlyData
 
 from aaplug.core.cameras import BLACK
-from aaplug.core.gaussians import MIP
 from aaplug.io.cameras import read_cameras
 from aaplug.io.images import image_size, write_png
 from aaplug.io.scenes import read_scene, write_scene
@@ -80,10 +78,8 @@ def test_render_writes_a_view_at_a_scale(cli):
     code, out, err = cli("render scene.ply --cameras . -o out --scale 0.5")
     assert (code, out) == (0, "")
     assert image_size(Path("out/r_0.png")) == (32, 24)
-    assert (
-        "recipe: auto for a classic scene, 1 view at 32x24, 0.5 × the rate of training: 1×1 sample a pixel"
-        in err
-    )
+    chosen = "1 view at 32x24, 0.5 × the training rate: 1×1 sample per pixel"
+    assert f"recipe: auto for a classic scene, {chosen}" in err
     assert "background: black" in err
 
 
@@ -134,63 +130,11 @@ def test_render_takes_an_inria_model_folder_as_it_is(cli):
     assert (code, "has no iteration 8; it has 7, 30" in err) == (2, True)
 
 
-def test_convert_then_info_shows_what_was_fused(cli):
-    code, out, err = cli("convert scene.ply --cameras . -o converted.ply --json")
-    assert code == 0
-    assert json.loads(out)["fused"][0]["method"] == "matched-energy"
-    assert "Mip rule" in err
-    facts = json.loads(cli("info converted.ply --json")[1])
-    assert facts["convention"] == "mip"
-    assert facts["fused"] == [
-        {"method": "matched-energy", "variance": "0.2", "views": "3", "from": "classic"}
-    ]
-    assert "matched-energy (variance=0.2" in cli("info converted.ply")[1]
-
-
-def test_convert_fuses_plain_mip_splatting_by_flag(cli):
-    assert cli("convert scene.ply --cameras . -o converted.ply --form mip-splatting")[0] == 0
-    fused = json.loads(cli("info converted.ply --json")[1])["fused"]
-    assert fused == [{"method": "smoothing3d", "variance": "0.2", "opacity": "volume"}]
-
-
-def test_convert_fuses_a_stored_filter_without_cameras(cli):
-    scene = replace(make_scene(20), filter_3d=torch.full((20,), 0.01), convention=MIP)
-    write_scene(Path("unfused.ply"), scene)
-    assert cli("convert unfused.ply -o fused.ply")[0] == 0
-    facts = json.loads(cli("info fused.ply --json")[1])
-    assert facts["fused"] == [{"method": "filter_3D"}]
-    assert not facts["stored_filter_3d"]
-
-
-def test_info_with_cameras_tells_the_sampling(cli):
-    facts = json.loads(cli("info scene.ply --cameras . --json")[1])
-    assert facts["gaussians"] == 150
-    assert facts["training_cameras"] == 3
-    assert 0.5 < facts["seen_share"] <= 1
-
-
-def test_data_goes_to_stdout_and_the_log_to_stderr(cli):
-    _, out, err = cli("info scene.ply --json")
-    json.loads(out)
-    assert err.startswith("scene: scene.ply: 150 Gaussians, SH degree 1, classic (no tag")
-
-
-def test_drop_bad_leaves_bad_gaussians_out_and_counts_them(cli):
-    break_nan(Path())
-    code, out, _ = cli("info scene.ply --json")
-    facts = json.loads(out)
-    assert (code, facts["gaussians"], facts["unusable_gaussians"]) == (0, 150, 2)
-    assert "--drop-bad" in facts["problems"][0]
-    code, out, err = cli("convert scene.ply --cameras . -o out.ply --json --drop-bad")
-    assert (code, json.loads(out)["gaussians"]) == (0, 148)
-    assert "warning:" in err
-
-
-def test_guard_leaves_out_what_is_centred_far_outside(cli):
+def test_cull_margin_leaves_out_what_is_centred_far_outside(cli):
     cli("render scene.ply --cameras . -o all.png")
-    cli("render scene.ply --cameras . -o guarded.png --guard -0.2")
-    assert Path("all.png").read_bytes() != Path("guarded.png").read_bytes()
-    cli("render scene.ply --cameras . -o wide.png --guard 100")
+    cli("render scene.ply --cameras . -o culled.png --cull-margin -0.2")
+    assert Path("all.png").read_bytes() != Path("culled.png").read_bytes()
+    cli("render scene.ply --cameras . -o wide.png --cull-margin 100")
     assert Path("all.png").read_bytes() == Path("wide.png").read_bytes()
 
 
@@ -318,13 +262,13 @@ def test_interrupting_ends_with_130_and_leaves_no_file(cli, monkeypatch):
     def interrupted(*args, **kwargs):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("aaplug_cli.convert.write_scene", interrupted)
+    monkeypatch.setattr("aaplug.verbs.convert.write_scene", interrupted)
     assert cli(CONVERT)[0] == 130
     assert not Path("new.ply").exists()
 
 
 def test_demo_does_the_whole_job(cli, monkeypatch):
-    monkeypatch.setattr("aaplug_cli.demo.SCALES", (0.25, 0.125))
+    monkeypatch.setattr("aaplug.verbs.demo.SCALES", (0.25, 0.125))
     code, out, _ = cli("demo -o shown")
     assert code == 0
     assert "auto" in out

@@ -11,7 +11,7 @@ import torch
 from aaplug.core.errors import OutputError, UsageError
 from aaplug.io.video import write_video
 from tests.test_cli import cli, dataset  # noqa: F401  (fixtures)
-from tests.test_paths import document
+from tests.test_camera_paths import document
 
 
 def read(path: Path) -> tuple[np.ndarray, float]:
@@ -58,11 +58,11 @@ def test_a_video_that_fails_leaves_nothing(tmp_path):
 def test_what_cannot_be_written_is_refused(tmp_path, monkeypatch):
     (tmp_path / "there.webm").write_bytes(b"mine")
     frames = ramp(1, 8, 8)
-    with pytest.raises(OutputError, match="--overwrite"):
+    with pytest.raises(OutputError, match="overwrite"):
         write_video(tmp_path / "there.webm", frames, 25.0)
     with pytest.raises(OutputError, match=r"\.webm or \.mp4"):
         write_video(tmp_path / "v.avi", frames, 25.0)
-    with pytest.raises(UsageError, match="--fps"):
+    with pytest.raises(UsageError, match="fps"):
         write_video(tmp_path / "v.webm", frames, 0.0)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(UsageError, match=r"aaplug\[mp4\]"):

@@ -119,7 +119,7 @@ def rows(report: Report, metric: Metric) -> list[list[tuple[str, bool]]]:
     return [
         [
             (
-                _figure(value, metric.digits),
+                metric.text(value),
                 value is not None and value == top and recipe != CEILING,
             )
             for scale, top in zip(report.scales, best, strict=True)

@@ -1,6 +1,6 @@
-"""A grid of images of different sizes, each shown at the same size with its pixels visible.
+"""A grid of images of different sizes, all shown at one height, so that the pixels of small ones are visible.
 
-Images are [h, w, 3] in [0, 1].  Text is drawn with OpenCV's built-in font, which knows ASCII alone.
+Images are [h, w, 3] in [0, 1].  Labels must be ASCII, the only characters of OpenCV's built-in font.
 """
 
 from collections.abc import Sequence
@@ -11,7 +11,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-CELL = 320  # px: height of a shown image
+from aaplug.core.imaging import levels
+
+CELL = 320  # px: height of an image on the sheet
 GAP = 12  # px
 HEADING = 36  # px: height of a line of text
 INK = (40, 40, 40)
@@ -21,7 +23,7 @@ LIGHT_INK = (245, 245, 245)
 def contact_sheet(
     columns: Sequence[str], rows: Sequence[tuple[str, Sequence[Float[Tensor, "_ _ 3"]]]]
 ) -> Float[Tensor, "H W 3"]:
-    """The images with a heading over every column and a label left of every row; widths follow the first row."""
+    """Images with a heading over every column and a label left of every row; widths are those of the first row."""
     cells = [[_enlarged(image) for image in images] for _, images in rows]
     widths = [cell.shape[1] for cell in cells[0]]
     margin = max(_text_width(label) for label, _ in rows) + 2 * GAP
@@ -41,8 +43,8 @@ def contact_sheet(
 
 
 def labelled(image: Float[Tensor, "h w 3"], label: str) -> Float[Tensor, "h w 3"]:
-    """The image with a label on a dark strip in its top left corner."""
-    pixels = (image.clamp(0, 1) * 255).round().byte().cpu().numpy().copy()
+    """A copy of the image with a label on a dark strip in its top left corner."""
+    pixels = _bytes(image)
     strip = pixels[:HEADING, : _text_width(label) + 2 * GAP]
     strip[:] = strip // 4
     _write(pixels, label, GAP, HEADING - GAP, LIGHT_INK)
@@ -50,11 +52,15 @@ def labelled(image: Float[Tensor, "h w 3"], label: str) -> Float[Tensor, "h w 3"
 
 
 def _enlarged(image: Float[Tensor, "h w 3"]) -> np.ndarray:
-    """8-bit, CELL px high; small images keep hard pixels, large ones are averaged."""
-    pixels = (image.clamp(0, 1) * 255).round().byte().cpu().numpy()
+    """8 bits, CELL px high; pixels of small images stay sharp squares, those of large ones are averaged."""
+    pixels = _bytes(image)
     width = max(1, round(pixels.shape[1] * CELL / pixels.shape[0]))
     kernel = cv2.INTER_NEAREST if pixels.shape[0] < CELL else cv2.INTER_AREA
     return cv2.resize(pixels, (width, CELL), interpolation=kernel)
+
+
+def _bytes(image: Float[Tensor, "h w 3"]) -> np.ndarray:
+    return levels(image, 8).byte().cpu().numpy()
 
 
 def _text_width(text: str) -> int:

@@ -28,8 +28,7 @@ def write_texts(
     Raises:
         OutputError: a file exists and `overwrite` is false, or it cannot be written.
     """
-    make_folder(Path(folder))
-    paths = [Path(folder) / name for name in texts]
+    paths = [make_folder(folder) / name for name in texts]
     for path, text in zip(paths, texts.values(), strict=True):
         with replacing(path, overwrite) as stream:
             stream.write(text.encode())
@@ -68,8 +67,7 @@ def write_page(
 
     drawn = plots(report, found)
     written = write_texts(folder, {PAGE: page(name, report, found, drawn, images)}, overwrite)
-    beside = Path(folder) / PLOTS
-    make_folder(beside)
+    beside = make_folder(Path(folder) / PLOTS)
     for plot in drawn:
         for suffix, data in ((".png", plot.png()), (".svg", plot.svg().encode())):
             with replacing(beside / (plot.name + suffix), overwrite=True) as stream:

@@ -1,0 +1,90 @@
+"""The library gives what the command line gives: same names, defaults and images."""
+
+import inspect
+import re
+import runpy
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+from aaplug_cli.main import VERBS, option_types
+
+import aaplug
+from aaplug.core.errors import FrameError, UsageError
+from tests.conftest import SAMPLE, make_camera, make_scene
+from tests.test_cli import EYES, SIZE, cli, dataset, inria_model  # noqa: F401  (fixtures)
+
+README = Path(__file__).parents[1] / "README.md"
+
+
+def test_python_in_the_readme_gives_the_command_lines_image(cli):  # noqa: F811
+    Path("scene.ply").unlink()
+    Path("scene.ply").symlink_to(SAMPLE / "chair.ply")
+    Path("path/to").mkdir(parents=True)
+    Path("path/to/colmap").symlink_to(SAMPLE)
+    found = re.search(r"```python\n(.*?)```", README.read_text(), re.S)
+    assert found
+    Path("readme.py").write_text(found[1])
+    image = runpy.run_path("readme.py")["image"]
+    words = "render scene.ply --cameras path/to/colmap --views r_8 -o one.png --scale 0.25"
+    assert cli(f"{words} --bit-depth 16")[0] == 0
+    aaplug.write_png("two.png", image, bit_depth=16)
+    assert Path("two.png").read_bytes() == Path("one.png").read_bytes()
+    assert image[0, 0].min() == 1  # the chair's cameras say white
+
+
+@pytest.mark.parametrize("recipe", ["mip-splatting", "matched"])
+def test_a_renderer_applies_the_recipes_world_filter(cli, recipe):  # noqa: F811
+    scene, cameras = aaplug.read_scene("scene.ply"), aaplug.read_cameras(".")
+    image = aaplug.Renderer.of(scene, cameras, recipe)(cameras.test[0].scaled(0.5)).rgb
+    words = f"render scene.ply --cameras . -o one.png --scale 0.5 --recipe {recipe}"
+    assert cli(f"{words} --bit-depth 16")[0] == 0
+    aaplug.write_png("two.png", image, bit_depth=16)
+    assert Path("two.png").read_bytes() == Path("one.png").read_bytes()
+
+
+def test_the_world_filter_changes_the_chair(sample_scene, sample_cameras):
+    view = sample_cameras.test[0].scaled(1 / 8)
+    image = aaplug.Renderer.of(sample_scene, sample_cameras, "mip-splatting")(view).rgb
+    mip = aaplug.Renderer.of(sample_scene, sample_cameras, "mip")(view).rgb
+    assert (image - mip).abs().max() > 0.1
+
+
+def test_a_renderer_refuses_cameras_of_another_frame():
+    views = [make_camera(eye) for eye in EYES["train"]]
+    scene = make_scene(50)
+    scene.means[:] += 1000
+    with pytest.raises(FrameError, match="different frames"):
+        aaplug.Renderer.of(scene, views)
+    with pytest.raises(FrameError, match=r"0\.0%"):
+        aaplug.Renderer.of(scene, views, min_seen=1e-6)
+
+
+def test_render_takes_paths_as_strings(cli):  # noqa: F811
+    (written,) = aaplug.render("scene.ply", ".", "out", scale=0.5)
+    assert (written.view.width, written.view.height) == (SIZE[0] / 2, SIZE[1] / 2)
+    assert cli("render scene.ply --cameras . -o again --scale 0.5")[0] == 0
+    assert written.file.read_bytes() == Path("again/r_0.png").read_bytes()
+
+
+def test_a_model_folder_brings_its_own_cameras(cli):  # noqa: F811
+    model = inria_model(
+        Path("model"), "Namespace(white_background=True, resolution=2, images='images', eval=False)"
+    )
+    by_folder = aaplug.render(str(model), output="one", views="a")
+    scene = aaplug.read_scene(model / "point_cloud/iteration_30/point_cloud.ply")
+    by_scene = aaplug.render(scene, output="two", views="a")
+    assert by_folder[0].file.read_bytes() == by_scene[0].file.read_bytes()
+    with pytest.raises(UsageError, match="cameras"):
+        aaplug.render("scene.ply", output="three")
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_verbs_have_the_options_of_the_command_line(verb):
+    parameters = inspect.signature(getattr(aaplug, verb)).parameters
+    options = option_types(getattr(import_module(f"aaplug_cli.{verb}"), verb.capitalize()))
+    missing = parameters.keys() - options.keys() - {"monitor", "name"}
+    assert not missing
+    for name, parameter in parameters.items():
+        keyword = parameter.kind is inspect.Parameter.KEYWORD_ONLY
+        assert not keyword or parameter.default is not inspect.Parameter.empty, name

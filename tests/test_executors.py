@@ -1,0 +1,75 @@
+"""Worker pools: results in order, few items read ahead, errors that come back whole, no worker outlives its parent."""
+
+import os
+import pickle
+import subprocess
+import sys
+from itertools import count
+
+import psutil
+import pytest
+import torch
+
+from aaplug.core.errors import FormatError, UsageError
+from aaplug.core.executors import Processes, Serial, Threads, torch_threads
+
+PARENT = """
+import time
+from aaplug.core.executors import Processes
+if __name__ == "__main__":
+    for _ in Processes(1).map(time.sleep, [0, 1000]):
+        print("working", flush=True)
+"""
+
+
+def refuse_three(item: int) -> int:
+    if item == 3:
+        raise FormatError("scene.ply", "is short")
+    return item * item
+
+
+@pytest.mark.parametrize("executor", [Serial(), Threads(2), Processes(2)], ids=repr)
+def test_results_come_in_order_until_the_first_error(executor):
+    found = []
+    with pytest.raises(FormatError, match=r"scene\.ply: is short"):
+        found.extend(executor.map(refuse_three, range(6)))
+    assert found == [0, 1, 4]
+
+
+def test_threads_read_few_items_ahead():
+    items = count()
+    results = Threads(2).map(str, items)
+    assert next(results) == "0"
+    assert next(items) <= 3
+    results.close()
+
+
+def test_a_process_that_dies_is_one_clear_error():
+    with pytest.raises(UsageError, match="worker process: died"):
+        list(Processes(1).map(os._exit, [3]))
+
+
+def test_a_worker_ends_when_its_parent_is_killed(tmp_path):
+    script = tmp_path / "parent.py"
+    script.write_text(PARENT)
+    with subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE) as parent:
+        assert parent.stdout is not None
+        assert parent.stdout.readline() == b"working\n"
+        workers = psutil.Process(parent.pid).children()
+        parent.kill()
+        gone, alive = psutil.wait_procs(workers, timeout=30)
+    assert gone
+    assert not alive
+
+
+def test_errors_can_be_pickled():
+    error = pickle.loads(pickle.dumps(FormatError("scene.ply", "is short")))
+    assert isinstance(error, FormatError)
+    assert (error.where, error.problem) == ("scene.ply", "is short")
+
+
+def test_torch_threads_are_given_back():
+    before = torch.get_num_threads()
+    with torch_threads(before + 1):
+        assert torch.get_num_threads() == before + 1
+    assert torch.get_num_threads() == before
