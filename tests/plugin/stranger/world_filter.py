@@ -8,7 +8,7 @@ from aaplug.core.training import TrainingViews
 
 
 @dataclass(frozen=True)
-class Coarse:
+class Dull:
     """Widen every Gaussian by `variance` px² at its lowest training rate, and keep its integral."""
 
     variance: float = 0.05
@@ -18,8 +18,8 @@ class Coarse:
         rates = training.bounds.lowest.where(training.bounds.seen, float("inf"))
         log_sigma = (self.variance**0.5 / rates).log()[:, None]  # -inf changes nothing
         smoothed = smoothed_by(scene, log_sigma, volume=True)
-        record = Fusion("coarse", {"variance": f"{self.variance:g}"})
+        record = Fusion("dull", {"variance": f"{self.variance:g}"})
         return replace(smoothed, fused=(*scene.fused, record))
 
 
-COARSE = Coarse()
+DULL = Dull()
