@@ -66,6 +66,7 @@ def demo(
             metric=("psnr", "ssim"),
             output=folder,
             overwrite=overwrite,
+            metric=("psnr", "ssim"),
             name="chair",
             monitor=monitor,
         )
