@@ -35,7 +35,7 @@ class OtherScenes:
     """More scenes."""
 
     more: Annotated[tuple[Path, ...], tyro.conf.Positional, flag("[SCENE ...]")] = ()
-    """More scenes, with the same --cameras or each a model folder.  Each gets a folder of its own for its results."""
+    """More scenes, with the same --cameras or each a model folder.  Each gets its own folder of results."""
 
 
 @dataclass(frozen=True)
@@ -53,19 +53,15 @@ class Evaluate:
     protocol: Annotated[str, choice(PROTOCOLS)] = "default"
     """Scales, truth, downscaling and flavours of metrics, by name."""
     recipe: Annotated[tuple[str, ...], choice([*RECIPE_NAMES, ALL, "..."])] = DEFAULT_RECIPES
-    """One or more recipes, or all.  There are research recipes too, for comparison: all includes them, and
-    examples/guides/methods.md names them."""
+    """One or more recipes.  all adds the research recipes, which examples/guides/methods.md lists."""
     scale: Annotated[tuple[float, ...] | None, flag("FACTOR [FACTOR ...]")] = None
-    """One or more sizes against the training size, below or above 1 (default: the protocol's)."""
+    """One or more sizes relative to the training size (default: the protocol's)."""
     truth: Literal["auto", "photographs", "self"] = "auto"
     """Compare with photographs, or with the scene's own supersampled look; auto leaves it to the protocol."""
     metric: Annotated[tuple[str, ...] | None, flag("|".join(map(metric_option, METRICS)))] = None
-    """One or more metrics (default: psnr, ssim, and consistency and energy-drift where scales change the size).
-    ssim:wang crops the border (scikit-image), ssim:3dgs pads with zeros (3DGS); lpips:3dgs feeds VGG [0, 1],
-    lpips:vgg and lpips:alex feed [-1, 1]; without a flavour it is the protocol's.  flip needs flip-evaluator; flicker
-    renders every image four more times."""
+    """Metrics, with flavours ssim:wang|3dgs, lpips:3dgs|vgg|alex (default: psnr ssim consistency energy-drift)."""
     lpips: Annotated[tuple[Path, Path] | None, flag("TRUNK HEADS")] = None
-    """Measure LPIPS with these weights: torchvision's VGG16 (AlexNet), and the lpips package's heads for it."""
+    """Weights of LPIPS, which is then measured: torchvision's VGG16 (AlexNet), and the lpips package's heads for it."""
     report: bool = False
     """Write report.html, one page with tables, curves and a before/after viewer, and its plots."""
     show: Annotated[str, tyro.conf.arg(metavar="N|NAME,...")] = "3"

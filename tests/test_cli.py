@@ -5,7 +5,6 @@ import math
 import shutil
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -16,7 +15,6 @@ from aaplug_cli.main import main
 from plyfile import PlyData
 
 from aaplug.core.cameras import BLACK
-from aaplug.core.gaussians import MIP
 from aaplug.io.cameras import read_cameras
 from aaplug.io.images import image_size, write_png
 from aaplug.io.scenes import read_scene, write_scene
@@ -130,58 +128,6 @@ def test_render_takes_an_inria_model_folder_as_it_is(cli):
     assert cli(f"render {model} -o again --iteration 7 --views a")[0] == 0
     code, _, err = cli(f"render {model} -o again --iteration 8 --views a --overwrite")
     assert (code, "has no iteration 8; it has 7, 30" in err) == (2, True)
-
-
-def test_convert_then_info_shows_what_was_fused(cli):
-    code, out, err = cli("convert scene.ply --cameras . -o converted.ply --json")
-    assert code == 0
-    assert json.loads(out)["fused"][0]["method"] == "matched-energy"
-    assert "mip-viewer" in err
-    facts = json.loads(cli("info converted.ply --json")[1])
-    assert facts["convention"] == "mip"
-    assert facts["fused"] == [
-        {"method": "matched-energy", "variance": "0.2", "views": "3", "from": "classic"}
-    ]
-    assert "matched-energy (variance=0.2" in cli("info converted.ply")[1]
-
-
-def test_convert_fuses_plain_mip_splatting_by_flag(cli):
-    assert cli("convert scene.ply --cameras . -o converted.ply --form mip-splatting")[0] == 0
-    fused = json.loads(cli("info converted.ply --json")[1])["fused"]
-    assert fused == [{"method": "smoothing3d", "variance": "0.2", "opacity": "volume"}]
-
-
-def test_convert_fuses_a_stored_filter_without_cameras(cli):
-    scene = replace(make_scene(20), filter_3d=torch.full((20,), 0.01), convention=MIP)
-    write_scene(Path("unfused.ply"), scene)
-    assert cli("convert unfused.ply -o fused.ply")[0] == 0
-    facts = json.loads(cli("info fused.ply --json")[1])
-    assert facts["fused"] == [{"method": "filter_3D"}]
-    assert not facts["stored_filter_3d"]
-
-
-def test_info_with_cameras_tells_the_sampling(cli):
-    facts = json.loads(cli("info scene.ply --cameras . --json")[1])
-    assert facts["gaussians"] == 150
-    assert facts["training_cameras"] == 3
-    assert 0.5 < facts["seen_share"] <= 1
-
-
-def test_data_goes_to_stdout_and_the_log_to_stderr(cli):
-    _, out, err = cli("info scene.ply --json")
-    json.loads(out)
-    assert err.startswith("scene: scene.ply: 150 Gaussians, SH degree 1, classic (no tag")
-
-
-def test_drop_bad_leaves_bad_gaussians_out_and_counts_them(cli):
-    break_nan(Path())
-    code, out, _ = cli("info scene.ply --json")
-    facts = json.loads(out)
-    assert (code, facts["gaussians"], facts["unusable_gaussians"]) == (0, 150, 2)
-    assert "--drop-bad" in facts["problems"][0]
-    code, out, err = cli("convert scene.ply --cameras . -o out.ply --json --drop-bad")
-    assert (code, json.loads(out)["gaussians"]) == (0, 148)
-    assert "warning:" in err
 
 
 def test_cull_margin_leaves_out_what_is_centred_far_outside(cli):

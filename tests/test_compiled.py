@@ -1,18 +1,21 @@
-"""Kernels compiled ahead of time: the same answers, and a cache that nothing can break."""
+"""Kernels compiled ahead of time: the same results as eager code, and a cache that survives damage."""
 
+import pickle
 import zipfile
 from dataclasses import replace
 
 import pytest
 import torch
 
-from aaplug.core import kernels
 from aaplug.core.errors import UsageError
-from aaplug.core.kernels import EAGER, CompiledKernels, Kernel, Package
+from aaplug.core.kernels import EAGER, Kernel
+from aaplug.core.rules import RULES_GSPLAT
+from aaplug.core.training import TrainingViews
 from aaplug.methods.recipes import RECIPES
-from aaplug.rasterizers import RASTERIZERS, Tiled, reference
+from aaplug.rasterizers import RASTERIZERS, Tiled, choice, find_rasterizer
 from aaplug.rasterizers.tiled import ahead_of_time as compiled
-from aaplug.rendering.renderer import learn, render
+from aaplug.rasterizers.tiled.packages import CompiledKernels, Package
+from aaplug.rendering.renderer import Renderer
 from tests.conftest import make_camera, make_scene, sized
 
 ANSWER = 1e-5
@@ -33,12 +36,12 @@ def empty_cache(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("kernel", compiled.KERNELS, ids=lambda kernel: kernel.name)
-def test_compiled_kernels_give_the_eager_answer(built, kernel: Kernel):
+def test_compiled_kernels_give_the_eager_results(built, kernel: Kernel):
     args, twins = kernel.example(), kernel.example()
     answers = zip(
         [*built.run(kernel, *args), *args], [*EAGER.run(kernel, *twins), *twins], strict=True
     )
-    for fast, slow in answers:  # what comes back, and what was updated in place
+    for fast, slow in answers:  # results, and arguments updated in place
         assert fast.dtype == slow.dtype
         # behind a splat of alpha 0.99 a gradient has a hundred times the rounding of its alpha
         scale = 1 + slow.double().abs().max()
@@ -52,7 +55,7 @@ def test_compositing_is_one_loop_over_tiles(built, name):
     assert sum(source.count("for(int64_t x0=") for source in sources) == 1
 
 
-def test_packages_are_checked_by_one_thread_and_all_are_there_after_that(built, monkeypatch):
+def test_packages_are_checked_by_one_thread_which_is_undone_after_that(built, monkeypatch):
     seen, close, threads = [], compiled._close, torch.get_num_threads()
     monkeypatch.setattr(
         compiled, "_close", lambda *x: seen.append(torch.get_num_threads()) or close(*x)
@@ -66,40 +69,59 @@ def test_packages_are_checked_by_one_thread_and_all_are_there_after_that(built, 
         torch.set_num_threads(threads)
 
 
-@pytest.mark.parametrize("recipe", RECIPES)
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+IMAGES = [(name, 1) for name in RECIPES] + [("matched", degree) for degree in (0, 2, 3)]
+
+
+@pytest.mark.parametrize(("recipe", "degree"), IMAGES)
 def test_compiled_images_are_the_eager_ones(built, recipe, degree):
+    """The recipe chooses the kernels of a pixel, the degree that of colours."""
     scene, camera = sized(make_scene(400, degree=degree)), make_camera(size=(150, 110))
-    training, view = learn(scene, [camera]), camera.scaled(0.6)
+    view = camera.scaled(0.6)
     fast, eager = (
-        render(scene, view, RECIPES[recipe], training, rasterizer)
-        for rasterizer in (Tiled(built), RASTERIZERS["eager"])
+        Renderer.of(scene, [camera], recipe, rasterizer=rasterizer)(view)
+        for rasterizer in (Tiled(built), Tiled())
     )
     difference = (fast.rgb - eager.rgb).abs().amax(dim=2)
     assert (difference > ANSWER).double().mean() < 1e-3, "more than flips at a cut-off"
     assert difference.max() < 0.02
 
 
-def test_compiled_kernels_leave_gradients_and_other_precisions_to_the_eager_ones(built):
-    scene = make_scene(100, dtype=torch.float64)
-    camera = make_camera()
-    training = learn(scene, [camera])
-    exact = render(scene, camera, RECIPES["classic"], training, Tiled(built)).rgb
-    assert exact.dtype == torch.float64
-    eager = render(scene, camera, RECIPES["classic"], training).rgb
-    assert exact.equal(eager)
+def test_other_rules_and_precisions_are_left_to_the_eager_functions(built):
+    scene, camera = make_scene(100), make_camera()
+    scene = replace(scene, logit_opacities=scene.logit_opacities + 6)
+    gsplat = replace(scene, convention=replace(scene.convention, rules=RULES_GSPLAT))
+    for given in (scene.to(torch.float64), gsplat):
+        training = TrainingViews.of(given, [camera])
+        fast, eager = (
+            Renderer(given, training, RECIPES["classic"], rasterizer)(camera).rgb
+            for rasterizer in (Tiled(built), Tiled())
+        )
+        assert fast.dtype == given.means.dtype
+        torch.testing.assert_close(fast, eager, rtol=0, atol=ANSWER)
+    assert (fast - Renderer(scene, training, RECIPES["classic"])(camera).rgb).abs().max() > 1e-3
+
+
+def test_compiled_kernels_have_gradients(built):
+    scene, camera = make_scene(100), make_camera()
     means = scene.means.clone().requires_grad_()
-    image = render(replace(scene, means=means), camera, RECIPES["classic"], training, Tiled(built))
-    image.rgb.sum().backward()
+    training = TrainingViews.of(scene, [camera])
+    renderer = Renderer(replace(scene, means=means), training, RECIPES["classic"], Tiled(built))
+    renderer(camera).rgb.sum().backward()
     assert means.grad is not None
     assert means.grad.abs().sum() > 0
 
 
-def test_an_empty_cache_gives_nothing(empty_cache):
+def test_a_pickled_rasterizer_loads_the_packages_of_its_machine(built, empty_cache):
+    packed = pickle.dumps(Tiled(built))
+    assert pickle.loads(packed).name == "eager", "nothing is built in the empty cache"
+    assert len(packed) < 1000
+
+
+def test_an_empty_cache_loads_nothing(empty_cache):
     assert compiled.load() is None
 
 
-def test_a_broken_package_gives_nothing_and_does_not_raise(built, empty_cache):
+def test_broken_packages_load_nothing(built, empty_cache):
     folder = compiled.cache_folder()
     folder.mkdir(parents=True)
     for kernel in compiled.KERNELS:
@@ -107,7 +129,7 @@ def test_a_broken_package_gives_nothing_and_does_not_raise(built, empty_cache):
     assert compiled.load() is None
 
 
-def test_another_source_is_another_folder(monkeypatch):
+def test_other_options_have_another_folder(monkeypatch):
     before = compiled.cache_folder()
     assert compiled.cache_folder() == before
     monkeypatch.setattr(compiled, "OPTIONS", {"max_fusion_size": 1})
@@ -115,41 +137,41 @@ def test_another_source_is_another_folder(monkeypatch):
 
 
 @pytest.mark.parametrize("compiler", [True, False])
-def test_without_packages_auto_runs_eagerly_and_says_why(empty_cache, monkeypatch, compiler):
-    monkeypatch.setattr(compiled, "has_compiler", lambda: compiler)
+def test_without_packages_auto_is_eager_and_says_why(empty_cache, monkeypatch, compiler):
+    monkeypatch.setattr(choice, "has_compiler", lambda: compiler)
     said: list[str] = []
-    assert compiled.choose("auto", 1, said.append) is RASTERIZERS["eager"]
+    assert find_rasterizer("auto", 1, said.append) is RASTERIZERS["eager"]
     assert len(said) == 1
     assert ("warmup" if compiler else "no C++ compiler") in said[0]
 
 
 def test_many_frames_build_what_is_missing(empty_cache, monkeypatch):
     made = CompiledKernels({})
-    monkeypatch.setattr(compiled, "has_compiler", lambda: True)
-    monkeypatch.setattr(compiled, "build", lambda: made)
-    chosen = compiled.choose("auto", compiled.FRAMES_THAT_PAY, lambda text: None)
+    monkeypatch.setattr(choice, "has_compiler", lambda: True)
+    monkeypatch.setattr(choice, "build", lambda: made)
+    chosen = find_rasterizer("auto", choice.FRAMES_THAT_PAY, lambda text: None)
     assert isinstance(chosen, Tiled)
     assert chosen.kernels is made
 
 
-def test_without_a_compiler_a_build_is_refused_in_words(empty_cache, monkeypatch):
+def test_without_a_compiler_a_build_is_refused(empty_cache, monkeypatch):
     monkeypatch.setattr(compiled, "has_compiler", lambda: False)
     with pytest.raises(UsageError, match=r"warmup: needs a C\+\+ compiler"):
         compiled.build()
 
 
-def test_a_build_that_fails_leaves_auto_eager_and_says_so(empty_cache, monkeypatch):
+def test_after_a_failed_build_auto_is_eager_and_says_why(empty_cache, monkeypatch):
     def fails():
         raise UsageError("warmup", "torch cannot compile 'owners' here")
 
-    monkeypatch.setattr(compiled, "has_compiler", lambda: True)
-    monkeypatch.setattr(compiled, "build", fails)
+    monkeypatch.setattr(choice, "has_compiler", lambda: True)
+    monkeypatch.setattr(choice, "build", fails)
     said: list[str] = []
-    chosen = compiled.choose("auto", compiled.FRAMES_THAT_PAY, said.append)
+    chosen = find_rasterizer("auto", choice.FRAMES_THAT_PAY, said.append)
     assert chosen is RASTERIZERS["eager"]
     assert "cannot compile 'owners'" in said[-1]
     with pytest.raises(UsageError, match="cannot compile 'owners'"):
-        compiled.choose("compiled", 1, said.append)
+        find_rasterizer("compiled", 1, said.append)
 
 
 def test_a_kernel_that_does_not_compile_is_named(empty_cache, monkeypatch):
@@ -163,7 +185,7 @@ def test_a_kernel_that_does_not_compile_is_named(empty_cache, monkeypatch):
 
 def test_an_unknown_name_lists_the_known_ones():
     with pytest.raises(UsageError, match="'fast' is not one of auto, compiled, eager, reference"):
-        compiled.choose("fast", 1, lambda text: None)
+        find_rasterizer("fast", 1, lambda text: None)
 
 
 def test_one_row_is_left_to_the_eager_function():
@@ -172,9 +194,4 @@ def test_one_row_is_left_to_the_eager_function():
     assert ran.run(double, torch.ones(1))[0].item() == 2
     assert ran.run(double, torch.ones(2))[0].tolist() == [3, 3]
     assert ran.run(double, torch.ones(2).double())[0].tolist() == [2, 2]
-    assert kernels.EAGER.run(double, torch.ones(2))[0].tolist() == [2, 2]
-
-
-def test_the_judge_runs_no_compiled_stage():
-    assert RASTERIZERS["reference"].kernels is EAGER
-    assert reference.Reference().kernels is EAGER
+    assert EAGER.run(double, torch.ones(2))[0].tolist() == [2, 2]

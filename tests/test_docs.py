@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from aaplug.io.scenes import FORMATS
+from aaplug.io.scenes import SCENE_FORMATS
 
 ROOT = Path(__file__).resolve().parents[1]
 ROWS = [
@@ -49,5 +49,5 @@ def test_each_row_of_scenes_proves_reading_writing_and_the_tag(row: str):
 def test_every_format_has_a_row():
     text = "\n".join(ROWS)
     assert len(ROWS) >= 20
-    for format in FORMATS:
+    for format in SCENE_FORMATS.values():
         assert format.name in text.lower(), format.name

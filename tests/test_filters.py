@@ -1,4 +1,4 @@
-"""What single filters promise beyond the laws that all of them keep."""
+"""Single filters beyond the laws that hold for all of them."""
 
 import math
 from dataclasses import replace
@@ -10,12 +10,13 @@ from aaplug.core.errors import UsageError
 from aaplug.core.gaussians import PixelSizes
 from aaplug.core.projection import project, rotation_matrices
 from aaplug.core.splats import Splats2D
+from aaplug.core.training import TrainingViews
 from aaplug.methods.filters import Adaptive, AnisotropicSmoothing, ByPixelSize, Smoothing3D
 from aaplug.methods.filters.adaptive import ADAPTIVE_VARIANCE
 from aaplug.methods.filters.pixel_size import pixel_size
 from aaplug.methods.filters.smoothing import BALANCE_FLOOR, LEAST_SHARE
-from aaplug.methods.recipes import RECIPES, lacking, suited
-from aaplug.rendering.renderer import learn, render
+from aaplug.methods.recipes import RECIPES, suited
+from aaplug.rendering.renderer import Renderer
 from tests.conftest import make_camera, make_scene, make_splats, sized
 
 F64 = torch.float64
@@ -34,8 +35,8 @@ def widened_in_the_world(scene, training, camera):
 
 
 @pytest.mark.parametrize("scale", [0.2, 1.0, 3.0])
-def test_the_adaptive_filter_is_a_variance_in_the_world(scale):
-    training, camera = learn(SCENE, [NEAR, FAR]), NEAR.scaled(scale)
+def test_the_adaptive_filter_equals_a_variance_in_the_world(scale):
+    training, camera = TrainingViews.of(SCENE, [NEAR, FAR]), NEAR.scaled(scale)
     raw = project(SCENE, camera)
     assert len(raw) == len(SCENE), "the test needs all of them"
     assert training.bounds.seen.all()
@@ -47,7 +48,7 @@ def test_the_adaptive_filter_is_a_variance_in_the_world(scale):
 
 def test_the_adaptive_filters_factor_is_the_change_of_area_across_the_ray():
     """The published form: r · (s_y² s_z², s_z² s_x², s_x² s_y²), r the squared direction in the Gaussian's axes."""
-    training = learn(SCENE, [NEAR, FAR])
+    training = TrainingViews.of(SCENE, [NEAR, FAR])
     wide = widened_in_the_world(SCENE, training, NEAR)
     rotations = rotation_matrices(SCENE.unit_quats)
     towards = SCENE.means - NEAR.centre
@@ -65,9 +66,9 @@ def test_the_adaptive_filters_factor_is_the_change_of_area_across_the_ray():
     torch.testing.assert_close(filtered.opacities, expected, rtol=1e-5, atol=1e-9)
 
 
-def test_the_largest_focal_pairs_every_depth_with_it():
+def test_the_largest_focal_length_is_paired_with_every_depth():
     """Mip-Splatting's code takes max f / min z, its paper max f/z: they differ where focal lengths do."""
-    training = learn(SCENE, [NEAR, LONG])
+    training = TrainingViews.of(SCENE, [NEAR, LONG])
     depths = torch.stack([project(SCENE, camera).depths for camera in (NEAR, LONG)])
     filtered = Smoothing3D(focal="largest")(SCENE, training)
     sigma = math.sqrt(0.2) * depths.amin(dim=0) / LONG.focal
@@ -75,14 +76,14 @@ def test_the_largest_focal_pairs_every_depth_with_it():
     torch.testing.assert_close(filtered.log_scales, expected)
     own = Smoothing3D()(SCENE, training)
     assert (own.log_scales - filtered.log_scales).max() > 0.01
-    alike = learn(SCENE, [NEAR, FAR])
+    alike = TrainingViews.of(SCENE, [NEAR, FAR])
     same = [Smoothing3D(focal=focal)(SCENE, alike).log_scales for focal in ("own", "largest")]
     torch.testing.assert_close(*same)
 
 
 def added_variances(filter_, scene, cameras):
-    """What a filter adds to each axis, against its isotropic amount."""
-    training = learn(scene, cameras)
+    """The variance that a filter adds to each axis, relative to the isotropic one."""
+    training = TrainingViews.of(scene, cameras)
     added = filter_(scene, training).scales.square() - scene.scales.square()
     return added * training.bounds.highest.square()[:, None] / filter_.variance
 
@@ -108,10 +109,10 @@ def test_anisotropic_smoothing_is_isotropic_where_views_come_from_all_sides():
 @pytest.mark.parametrize(
     ("thickness", "expected"), [((2.0, 2.0, 1e-3), 4 / 5), ((0.1, 0.1, 0.1), BALANCE_FLOOR)]
 )
-def test_balancing_goes_by_the_broadest_face_and_not_below_its_floor(thickness, expected):
-    """Scales in units of the smoothing's own: a surfel twice as wide keeps 4/5, whatever its thickness."""
+def test_balanced_opacity_follows_the_broadest_face_down_to_its_floor(thickness, expected):
+    """Scales relative to the smoothing: a disc twice as wide keeps 4/5 of its opacity."""
     scene = SCENE[:1]
-    training = learn(scene, [NEAR])
+    training = TrainingViews.of(scene, [NEAR])
     sigma = math.sqrt(0.2) / training.bounds.highest
     scene = replace(scene, log_scales=(sigma[:, None] * torch.tensor([thickness], dtype=F64)).log())
     balanced = Smoothing3D(opacity="balanced")(scene, training)
@@ -127,7 +128,7 @@ def row_of_splats(covs: list[tuple[float, float, float]]) -> Splats2D:
     return Splats2D(zeros, packed, xx * yy - xy * xy, ones, ones, torch.arange(n))
 
 
-REACH = math.sqrt(2 * math.log(255))
+CUTOFF = math.sqrt(2 * math.log(255))
 
 
 @pytest.mark.parametrize(
@@ -141,7 +142,7 @@ REACH = math.sqrt(2 * math.log(255))
 )
 def test_a_pixel_size_is_a_half_width_where_alpha_ends(cov, cross_section):
     size = pixel_size(row_of_splats([cov])).item()
-    assert size == pytest.approx(REACH * cross_section, rel=1e-12)
+    assert size == pytest.approx(CUTOFF * cross_section, rel=1e-12)
 
 
 def test_pixel_sizes_are_those_of_the_published_form():
@@ -173,8 +174,8 @@ def test_pixel_sizes_are_those_of_the_published_form():
         (0.01, math.nan, math.nan, False, True),
     ],
 )
-def test_multi_scale_draws_the_sizes_that_training_drew(size, smallest, largest, base, drawn):
-    variance = (size / REACH) ** 2
+def test_multi_scale_draws_gaussians_at_the_sizes_of_training(size, smallest, largest, base, drawn):
+    variance = (size / CUTOFF) ** 2
     splats = row_of_splats([(variance, 0.0, variance)] * 2)
     always = PixelSizes(
         torch.ones(2) * smallest, torch.ones(2) * largest, torch.tensor([base, True])
@@ -183,7 +184,7 @@ def test_multi_scale_draws_the_sizes_that_training_drew(size, smallest, largest,
     assert chosen.sources.tolist() == [0, 1][not drawn :]
 
 
-def test_multi_scale_goes_by_the_size_in_the_view_before_dilation():
+def test_multi_scale_selects_by_the_size_in_the_view_before_dilation():
     """A scene with a fine and a coarse copy of a blob: near views draw the fine one, far ones the coarse one."""
     scene = replace(
         make_scene(2),
@@ -203,24 +204,26 @@ def test_multi_scale_goes_by_the_size_in_the_view_before_dilation():
         for scale in (1.0, 0.1)
     }
     assert drawn == {1.0: [0], 0.1: [1]}
-    training, recipe = learn(scene, [camera]), RECIPES["multi-scale"]
+    training = TrainingViews.of(scene, [camera])
     for scale, kept in drawn.items():
-        image = render(scene, camera.scaled(scale), recipe, training).rgb
-        alone = render(scene[kept[0] :][:1], camera.scaled(scale), RECIPES["classic"], training).rgb
+        view, alone = camera.scaled(scale), scene[kept[0] :][:1]
+        image = Renderer(scene, training, RECIPES["multi-scale"])(view).rgb
+        alone = Renderer(alone, training, RECIPES["classic"])(view).rgb
         torch.testing.assert_close(image, alone)
 
 
-def test_a_scene_without_recorded_sizes_is_refused_by_name():
+def test_a_scene_without_pixel_sizes_is_refused():
     scene = make_scene(3)
-    training, recipe = learn(scene, [NEAR]), RECIPES["multi-scale"]
-    for refused in (lambda: render(scene, NEAR, recipe, training), lambda: suited(recipe, scene)):
+    training, recipe = TrainingViews.of(scene, [NEAR]), RECIPES["multi-scale"]
+    unprepared = Renderer(scene, training, recipe)
+    for refused in (lambda: unprepared(NEAR), lambda: suited(recipe, scene)):
         with pytest.raises(UsageError, match=r"multi-scale: the scene lacks .*min_pixel_sizes"):
             refused()
-    assert lacking(RECIPES["classic"], scene) is None
+    assert RECIPES["classic"].lacks(scene) is None
     assert suited(recipe, sized(scene)) is recipe
 
 
-def test_recorded_sizes_go_with_their_gaussians():
+def test_pixel_sizes_follow_their_gaussians():
     scene = sized(make_scene(8)).to(F64)
     assert scene.pixel_sizes is not None
     part = scene[torch.tensor([4, 1])].pixel_sizes

@@ -11,7 +11,7 @@ import torch
 from aaplug.core.gaussians import ANTIALIASED, CLASSIC
 from aaplug.io.cameras import read_cameras
 from aaplug.io.scenes import read_scene, write_scene
-from aaplug.methods.viewers import FORMS, convert
+from aaplug.methods.viewers import FORMS, fuse
 from tests.scene_files import ORACLE
 
 OLDEST = 3  # major version: before, it wrote .spz in other axes and without a flag
@@ -34,7 +34,7 @@ SPLAT_TRANSFORM = splat_transform()
 @pytest.mark.skipif(SPLAT_TRANSFORM is None, reason="splat-transform 3 is not installed")
 @pytest.mark.parametrize("form", FORMS)
 def test_splat_transform_reads_a_converted_scene(form, sample_scene, sample_training, tmp_path):
-    write_scene(tmp_path / "converted.ply", convert(sample_scene, sample_training, FORMS[form]))
+    write_scene(tmp_path / "converted.ply", fuse(sample_scene, sample_training, FORMS[form]))
     words = [SPLAT_TRANSFORM, "-w", str(tmp_path / "converted.ply"), str(tmp_path / "theirs.ply")]
     subprocess.run(words, check=True, capture_output=True, timeout=120)
     ours, theirs = (read_scene(tmp_path / name) for name in ("converted.ply", "theirs.ply"))

@@ -217,14 +217,14 @@ class _Bench:
         truth = ViewTruth(self.task.truth, view)
         fulls: dict[str, Drawn] = {}
         for scale in sorted(self.task.scales, key=lambda scale: scale != 1):  # figures need scale 1
-            judge = _Judge(self.task.measured, truth.compared(scale))
+            comparison = _Comparison(self.task.measured, truth.compared(scale))
             for name, drawn in self._drawn(truth, scale):
                 if scale == 1 and self.sized:
                     fulls[name] = drawn
                 series = self._series(truth, name, scale, drawn, fulls.get(name))
-                values = judge.values(drawn, series)
+                values = comparison.values(drawn, series)
                 if self.images is not None:
-                    self.images.keep(index, name, scale, drawn.rgb, judge.truth)
+                    self.images.keep(index, name, scale, drawn.rgb, comparison.truth)
                 yield Measurement(
                     name,
                     scale,
@@ -232,7 +232,7 @@ class _Bench:
                     values,
                     drawn.samples,
                     drawn.seconds,
-                    judge.note(values),
+                    comparison.note(values),
                     drawn.evaluations,
                 )
 
@@ -274,7 +274,7 @@ def _work(renderer: Renderer, camera: Camera) -> Hashable:
     return id(renderer.scene), id(renderer.training), method, how
 
 
-class _Judge:
+class _Comparison:
     """Compares images with one truth; equal images are compared once."""
 
     def __init__(self, metrics: Sequence[Metric], truth: Float[Tensor, "h w 3"] | None):

@@ -12,8 +12,8 @@ from pathlib import Path
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.errors import OutputError
 from aaplug.evaluation.results import CEILING, method
+from aaplug.io.atomic import make_folder
 from aaplug.io.images import write_png
 
 RENDERS, TRUTHS = "renders", "gt"
@@ -67,10 +67,5 @@ def _path(folder: Path, view: int, recipe: str, scale: float, kind: str) -> Path
 
 
 def _write(path: Path, pixels: Float[Tensor, "h w 3"]) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(
-            path.parent, f"cannot be made: {(error.strerror or str(error)).lower()}"
-        ) from error
+    make_folder(path.parent)
     write_png(path, pixels, overwrite=True)

@@ -13,7 +13,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from aaplug.core.errors import OutputError, UsageError, listing
+from aaplug.core.errors import OutputError, UsageError, listing, reason
 from aaplug.evaluation.results import Measurement
 
 
@@ -85,8 +85,7 @@ def _worded(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise OutputError(path, f"cannot be written: {reason}") from error
+        raise OutputError(path, f"cannot be written: {reason(error)}") from error
 
 
 def _whole_lines(stream: BinaryIO) -> list[dict[str, Any]]:

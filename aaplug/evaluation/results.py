@@ -71,8 +71,11 @@ class Report:
     def with_more(self, other: "Report") -> "Report":
         """Join two reports of the same protocol."""
         recipes = {**self.protocol["recipes"], **other.protocol["recipes"]}
-        measurements, protocol = self.measurements + other.measurements, {**self.protocol}
-        return Report(measurements, protocol | {"recipes": recipes}, self.measured + other.measured)
+        measurements, protocol = (
+            self.measurements + other.measurements,
+            {**self.protocol, "recipes": recipes},
+        )
+        return Report(measurements, protocol, self.measured + other.measured)
 
 
 def mean(measurements: Iterable[Measurement], metric: str) -> float | None:
@@ -116,7 +119,7 @@ def rows(report: Report, metric: Metric) -> list[list[tuple[str, bool]]]:
     return [
         [
             (
-                _figure(value, metric.digits),
+                metric.text(value),
                 value is not None and value == top and recipe != CEILING,
             )
             for scale, top in zip(report.scales, best, strict=True)

@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 from aaplug.core.errors import UsageError
+from aaplug.core.gaussians import Gaussians
 from aaplug.core.interfaces import Rasterizer
 from aaplug.core.monitor import SILENT, Monitor
 from aaplug.core.sampling import MIN_SEEN_SHARE
@@ -71,18 +72,17 @@ def compare(
     with processor(threads), monitor.progress("comparing", "views") as tell:
         frames = len(chosen) * len(scale) * len(candidates)
         drawing = rasterizer_of(rasterizer, frames, memory, monitor)
-        scenes = {name: scene_of(scene) for name, scene in candidates.items()}
-        trained = {
-            name: TrainingViews.of(scene, cameras, cull_margin, min_seen)
-            for name, scene in scenes.items()
-        }
+        scenes = [scene_of(scene) for scene in candidates.values()]
+        trained = [TrainingViews.of(scene, cameras, cull_margin, min_seen) for scene in scenes]
+        looks = [own_look(*pair, drawing, colour) for pair in zip(scenes, trained, strict=True)]
         shown = [
-            Candidate(
-                name,
-                Renderer.of(scene, trained[name], recipe, rasterizer=drawing, background=colour),
-            )
-            for name, scene in scenes.items()
+            Candidate(name, _shown(scene, recipe, look))
+            for name, scene, look in zip(candidates, scenes, looks, strict=True)
         ]
-        original = next(iter(scenes))
-        look = own_look(scenes[original], trained[original], drawing, colour)
-        return compared(shown, chosen, scale, Truth(look, source), tell)
+        return compared(shown, chosen, scale, Truth(looks[0], source), tell)
+
+
+def _shown(scene: Gaussians, recipe: Recipe, look: Renderer) -> Renderer:
+    """The scene by a recipe, otherwise drawn as its own look is."""
+    rasterizer, background = look.rasterizer, look.background
+    return Renderer.of(scene, look.training, recipe, rasterizer=rasterizer, background=background)

@@ -63,6 +63,7 @@ def demo(
             cameras,
             recipe=RECIPES,
             scale=SCALES,
+            metric=("psnr", "ssim"),
             output=folder,
             overwrite=overwrite,
             metric=("psnr", "ssim"),

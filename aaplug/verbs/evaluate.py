@@ -63,7 +63,7 @@ def evaluate(
     views: str = "test",
     protocol: str | Protocol = "default",
     truth: str = "auto",
-    metric: Sequence[str] | None = None,
+    metric: str | Sequence[str] | None = None,
     lpips: Weights | None = None,
     quality: str = "balanced",
     rate_reference: str | None = None,
@@ -111,28 +111,26 @@ def evaluate(
     metrics, rules = _metrics(metric, rules, lpips)
     cameras, scene = cameras_of(cameras, scene), scene_of(scene)
     recipes = _recipes(recipe, scene, quality, rate_reference, monitor)
-    chosen, scales = select_views(cameras, views), scale or rules.scales
-    shown = _shown(show, chosen) if report else ()
-    source = _source(truth, rules, chosen, monitor)
+    seen, scales = select_views(cameras, views), scale or rules.scales
+    shown = _shown(show, seen) if report else ()
+    source = _source(truth, rules, seen, monitor)
     if background == "auto" and rules.background is not None:
         background = rules.background
     colour = background_of(background, cameras, monitor)
     training = TrainingViews.of(scene, cameras, cull_margin, min_seen)
-    facts = _facts(scene, cameras, chosen, source) | {
-        "options": {
-            "quality": quality,
-            "rate_reference": rate_reference or "pose",
-            "shown": show if report else None,
-            "layout": layout,
-        },
+    facts = _facts(scene, cameras, seen, source) | {
+        "options": {"quality": quality, "rate_reference": rate_reference or "pose"}
+        | out.facts(show),
         "cull_margin": cull_margin if math.isfinite(cull_margin) else None,
     }
-    with processor(threads), monitor.progress(f"evaluating {name}", "views") as tell:
-        drawing = rasterizer_of(rasterizer, len(chosen) * len(recipes) * len(scales), memory, monitor)  # fmt: skip
+    with processor(threads):
+        frames = len(seen) * len(recipes) * len(scales)
+        drawing = rasterizer_of(rasterizer, frames, memory, monitor)
         candidates = candidates_of(scene, training, recipes, drawing, colour)
         against = Truth(own_look(scene, training, drawing, colour), source, rules)
-        task = Task(candidates, scales, chosen, against, metrics)
-        found = measure(task, facts, tell, out.journal, resume, out.images(shown))
+        task = Task(candidates, scales, seen, against, metrics)
+        with monitor.progress(f"evaluating {name}", "views") as tell:
+            found = measure(task, facts, tell, out.journal, resume, out.images(shown))
     out.write(found, name, scene, training, shown, monitor)
     return found
 
@@ -169,6 +167,10 @@ class Output:
             raise OutputError(self.folder, problem)
         files = (*RESULTS, PAGE) if self.report else RESULTS
         refuse_existing([self.folder / name for name in files], overwrite=False)
+
+    def facts(self, show: str) -> dict[str, Any]:
+        """What a journal must agree on, besides the measurements."""
+        return {"shown": show if self.report else None, "layout": self.layout}
 
     @property
     def replaces(self) -> bool:
@@ -212,9 +214,10 @@ class Output:
 
 
 def _metrics(
-    names: Sequence[str] | None, protocol: Protocol, weights: Weights | None
+    names: str | Sequence[str] | None, protocol: Protocol, weights: Weights | None
 ) -> tuple[list[Metric], Protocol]:
     """Metrics by name, and the protocol with the flavours that the names ask for; weights add LPIPS."""
+    names = (names,) if isinstance(names, str) else names
     chosen = list(default_metrics(protocol) if names is None else names)
     if weights is not None and not any(metric_option(n).startswith("lpips") for n in chosen):
         chosen.append("lpips")
@@ -274,14 +277,12 @@ def _shown(text: str, views: Sequence[Camera]) -> tuple[int, ...]:
 def _source(
     truth: str, protocol: Protocol, views: Sequence[Camera], monitor: Monitor
 ) -> TruthSource:
-    for known in get_args(TruthSource):
-        if truth == known:
-            return known
-    if truth != "auto":
-        known = ", ".join(("auto", *get_args(TruthSource)))
-        raise UsageError("truth", f"'{truth}' is not one of {known}")
-    if protocol.truth is not None:
-        return protocol.truth
+    known: dict[str, TruthSource | None] = {"auto": protocol.truth}
+    known |= {name: name for name in get_args(TruthSource)}
+    if truth not in known:
+        raise UsageError("truth", f"'{truth}' is not one of {', '.join(known)}")
+    if chosen := known[truth]:
+        return chosen
     source = source_of(views)
     why = "" if source == "photographs" else " (not every view has a photograph)"
     monitor.say(f"truth: {source}{why}")

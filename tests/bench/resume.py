@@ -1,6 +1,6 @@
-"""Kill a batch at random moments, continue it, and compare with an uninterrupted one: `python -m tests.bench.resume`.
+"""Kill a batch at random moments, resume it, and compare it with an uninterrupted one: `python -m tests.bench.resume`.
 
-Every result and image must be the same byte for byte, times aside.
+Every result and image must be the same byte for byte, except for times.
 """
 
 import argparse

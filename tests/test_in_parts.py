@@ -1,22 +1,21 @@
 """What is done part by part is what would be done with the whole."""
 
-import json
 import math
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-from aaplug_cli.main import main
 
 from aaplug.core.cameras import Camera
 from aaplug.core.errors import FormatError, FrameError, UsageError
 from aaplug.core.gaussians import Gaussians
+from aaplug.core.training import TrainingViews
+from aaplug.inspection.survey import Histogram, check_frame_of, survey
 from aaplug.io.scenes import open_scene, read_scene, write_parts, write_scene
 from aaplug.methods.filters import NYQUIST_VARIANCE
-from aaplug.methods.viewers import FORMS, convert
-from aaplug.rendering.renderer import learn
-from aaplug.verbs.in_parts import Histogram, check_frame_of, convert_parts, survey
+from aaplug.methods.viewers import FORMS, fuse
+from aaplug.verbs.in_parts import convert_parts
 from tests.conftest import make_camera, make_scene
 
 SIZE = 37  # Gaussians a part, so that the last one is not full
@@ -43,9 +42,9 @@ def wide_scene() -> Gaussians:
 def test_parts_are_converted_as_the_whole_is(tmp_path: Path, wide_scene, cameras, form: str):
     path = saved(tmp_path, wide_scene)
     scene = read_scene(path)
-    training = learn(scene, cameras)
+    training = TrainingViews.of(scene, cameras)
     assert 0 < training.bounds.seen.sum() < len(scene)
-    write_scene(tmp_path / "whole.ply", convert(scene, training, FORMS[form]))
+    write_scene(tmp_path / "whole.ply", fuse(scene, training, FORMS[form]))
     opened, told = open_scene(path), []
     parts = convert_parts(
         opened, cameras, FORMS[form], tell=lambda *x: told.append(x), size=SIZE, threads=2
@@ -70,7 +69,7 @@ def test_parts_are_converted_as_the_whole_is(tmp_path: Path, wide_scene, cameras
 
 def test_a_stored_filter_is_fused_in_parts_without_cameras(tmp_path: Path):
     path = saved(tmp_path, replace(make_scene(100), filter_3d=torch.rand(100) * 0.1))
-    whole = convert(read_scene(path), None, FORMS["mip-splatting"])
+    whole = fuse(read_scene(path), None, FORMS["mip-splatting"])
     parts = list(convert_parts(open_scene(path), (), FORMS["mip-splatting"], size=SIZE))
     for field in ("log_scales", "logit_opacities"):
         together = torch.cat([getattr(part, field) for part in parts])
@@ -118,7 +117,7 @@ def test_strangers_are_noticed_on_a_sample(tmp_path: Path, cameras):
 def test_a_survey_finds_what_the_whole_shows(tmp_path: Path, wide_scene, cameras):
     opened = open_scene(saved(tmp_path, wide_scene))
     found, scene = survey(opened, cameras), read_scene(opened.path)
-    bounds = learn(scene, cameras).bounds
+    bounds = TrainingViews.of(scene, cameras).bounds
     middle = scene.scales.median(dim=1).values
     under = middle[bounds.seen] < NYQUIST_VARIANCE**0.5 / bounds.highest[bounds.seen]
     assert (found.count, found.seen, found.under) == (150, bounds.seen.sum(), under.sum())
@@ -148,54 +147,3 @@ def test_a_histogram_has_the_quantiles_of_its_values():
         histogram.add(part)
     for share in (0.1, 0.5, 0.9):
         assert histogram.quantile(share) == pytest.approx(values.quantile(share).item(), abs=1e-3)
-
-
-@pytest.mark.parametrize("kind", ["scales", "opacities", "tags", "filter", "empty"])
-def test_info_names_problems(tmp_path: Path, capsys, kind: str):
-    scene = make_scene(0 if kind == "empty" else 10)
-    if kind == "scales":
-        scene = replace(scene, log_scales=scene.log_scales.exp())
-    if kind == "opacities":
-        scene = replace(scene, logit_opacities=scene.opacities)
-    if kind == "filter":
-        scene = replace(scene, filter_3d=torch.rand(10))
-    path = saved(tmp_path, scene)
-    if kind == "tags":
-        both = b"comment SplatRenderMode: mip\ncomment SplatRenderMode: default\nelement vertex"
-        path.write_bytes(path.read_bytes().replace(b"element vertex", both, 1))
-    with pytest.raises(SystemExit) as stop:
-        main(["info", str(path), "--json"])
-    assert stop.value.code == 0
-    (problem,) = json.loads(capsys.readouterr().out)["problems"]
-    words = {
-        "scales": "exponentiated",
-        "opacities": "activated",
-        "tags": "contradict",
-        "filter": "aaplug convert",
-        "empty": "empty",
-    }
-    assert words[kind] in problem
-
-
-def test_large_scenes_go_through_the_program_in_parts(tmp_path: Path, monkeypatch, capsys):
-    path = saved(tmp_path, replace(make_scene(50), filter_3d=torch.rand(50) * 0.1))
-    monkeypatch.setattr("aaplug_cli.convert.LARGE", 49)
-    for output in ("parts.ply", "whole.ply"):
-        with pytest.raises(SystemExit) as stop:
-            main(["convert", str(path), "-o", str(tmp_path / output)])
-        assert stop.value.code == 0
-        monkeypatch.setattr("aaplug_cli.convert.LARGE", 50)
-    assert "in parts" in capsys.readouterr().err
-    together, whole = (read_scene(tmp_path / name) for name in ("parts.ply", "whole.ply"))
-    torch.testing.assert_close(together.log_scales, whole.log_scales)
-    assert together.fused == whole.fused
-
-
-def test_limits_are_printed(monkeypatch, capsys):
-    monkeypatch.setenv("AAPLUG_GAUSSIANS", "123")
-    with pytest.raises(SystemExit):
-        main(["info", "--limits", "--json"])
-    assert json.loads(capsys.readouterr().out)["GAUSSIANS"] == 123
-    with pytest.raises(SystemExit):
-        main(["info", "--limits"])
-    assert "AAPLUG_INFLATE" in capsys.readouterr().out

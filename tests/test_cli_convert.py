@@ -1,0 +1,126 @@
+# ruff: noqa: F811 (fixtures come from another file)
+"""Converting from the command line: files, tags, what is left for a viewer."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from aaplug.core.gaussians import MIP, Fusion
+from aaplug.io.scenes import read_scene, write_scene
+from tests.conftest import make_scene
+from tests.test_cli import cli, dataset  # noqa: F401 (fixtures)
+
+CONVERT = "convert scene.ply --cameras . -o c.ply"
+
+
+def fused(name: str = "c.ply") -> list[str]:
+    return [fusion.method for fusion in read_scene(Path(name)).fused]
+
+
+def test_convert_writes_what_was_fused(cli):
+    code, out, err = cli(f"{CONVERT} --json")
+    assert code == 0
+    expected = {"method": "matched-energy", "variance": "0.2", "views": "3", "from": "classic"}
+    assert json.loads(out) == {"output": "c.ply", "gaussians": 150, "fused": [expected]}
+    assert "show it with 0.1 px², compensated (mip-viewer)" in err
+    again = read_scene(Path("c.ply"))
+    assert (again.convention, fused()) == (MIP, ["matched-energy"])
+    assert "matched-energy (variance=0.2" in cli("info c.ply")[1]
+
+
+def test_convert_fuses_plain_mip_splatting_and_another_variance(cli):
+    assert cli(f"{CONVERT} --form mip-splatting --variance 0.1")[0] == 0
+    expected = Fusion("smoothing3d", {"variance": "0.1", "opacity": "volume"})
+    assert read_scene(Path("c.ply")).fused == (expected,)
+
+
+@pytest.mark.parametrize("large", [False, True])
+def test_convert_fuses_a_stored_filter_without_cameras(cli, monkeypatch, large):
+    monkeypatch.setattr("aaplug.verbs.convert.LARGE", 19 if large else 20)
+    scene = replace(make_scene(20), filter_3d=torch.full((20,), 0.01), convention=MIP)
+    write_scene(Path("unfused.ply"), scene)
+    code, _, err = cli("convert unfused.ply -o c.ply")
+    assert (code, "in parts" in err) == (0, large)
+    found = read_scene(Path("c.ply"))
+    assert (fused(), found.filter_3d) == (["filter_3D"], None)
+    expected = 0.5 * (scene.scales.square() + 0.01**2).log()
+    torch.testing.assert_close(found.log_scales, expected)
+
+
+def test_convert_needs_cameras_for_what_it_computes(cli):
+    code, _, err = cli("convert scene.ply -o c.ply")
+    assert (code, "error: --cameras:" in err) == (2, True)
+
+
+@pytest.mark.parametrize("viewer", ["classic-viewer", "gsplat"])
+def test_convert_for_a_viewer_tags_its_rule_and_prints_what_is_left(cli, viewer):
+    """A viewer that draws as training did is right at the training size, and every step takes away from that."""
+    code, out, err = cli(f"{CONVERT} --for {viewer} --steps 1 --threads 1")
+    assert code == 0, err
+    assert [line for line in out.splitlines() if "converted" in line]
+    found, compensated = read_scene(Path("c.ply")), viewer == "gsplat"
+    assert (found.convention.kernel, found.convention.compensated) == (0.3, compensated)
+    assert (b"SplatRenderMode: mip" in Path("c.ply").read_bytes()) == compensated
+    settings = dict(found.fused[-1].settings)
+    partly = settings.pop("share", None)
+    assert settings == {"steps": "1", "for": viewer}
+    assert (partly is not None) == ("of the change" in err)
+    if not compensated:
+        assert partly == "0.125"
+        assert "still worse than the original" in err
+
+
+def test_convert_for_a_viewer_prints_the_residual_as_json(cli):
+    code, out, _ = cli(f"{CONVERT} --viewer mip-viewer --steps 0 --json")
+    found = json.loads(out)
+    assert code == 0
+    assert [f["method"] for f in found["fused"]] == ["matched-energy"]
+    residual = found["residual"]
+    assert residual["_aaplug"]["truth"] == "self"
+    assert residual["converted@1"]["PSNR"] > residual["original@1"]["PSNR"]
+
+
+def test_convert_for_the_rule_of_training_changes_no_byte(cli):
+    code, out, _ = cli(f"{CONVERT} --for classic-viewer --json")
+    assert (code, json.loads(out)["fused"]) == (0, [])
+    assert Path("c.ply").read_bytes() == Path("scene.ply").read_bytes()
+
+
+def test_convert_starts_from_the_original_where_the_closed_form_is_worse(cli, monkeypatch):
+    def dim(scene, training, viewer):
+        return replace(scene, logit_opacities=scene.logit_opacities - 5, convention=MIP)
+
+    monkeypatch.setattr("aaplug.finetuning.fitting.fuse_for", dim)
+    code, _, err = cli(f"{CONVERT} --for mip-viewer --steps 1")
+    assert (code, "starting from the original" in err) == (0, True)
+    original, found = (read_scene(Path(name)).logit_opacities for name in ("scene.ply", "c.ply"))
+    assert (found - original).abs().max() < 1
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ("--steps 3", "--steps: belongs to the optimization for a --viewer"),
+        ("--for gsplat --variance 0.1", "leave out --form, --variance"),
+        ("--for gsplat --steps -1", "--steps: must be 0 or more"),
+        ("--for web", "--viewer: 'web' is not one of classic-viewer"),
+        ("--form web", "--form: 'web' is not one of matched-energy"),
+    ],
+)
+def test_convert_refuses_options_that_do_not_fit(cli, options, words):
+    code, _, err = cli(f"{CONVERT} {options}")
+    assert code == 2
+    assert f"error: {words}" in err or words in err
+    assert not Path("c.ply").exists()
+
+
+def test_what_was_tuned_converts_and_what_was_converted_does_not_again(cli):
+    tuned = replace(read_scene(Path("scene.ply")), fused=(Fusion("finetune"),))
+    write_scene(Path("tuned.ply"), tuned)
+    assert cli("convert tuned.ply --cameras . -o c.ply")[0] == 0
+    assert fused() == ["finetune", "matched-energy"]
+    code, _, err = cli("convert c.ply --cameras . -o d.ply --for mip-viewer --steps 0")
+    assert (code, "already has matched-energy" in err) == (2, True)

@@ -1,0 +1,125 @@
+# ruff: noqa: F811 (fixtures come from another file)
+"""Fine-tuning from the command line: files, tags, interruptions."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import pytest
+from aaplug_cli.main import main
+
+from aaplug.core.gaussians import MIP
+from aaplug.finetuning import loop
+from aaplug.io.scenes import read_scene
+from tests.test_cli import cli, dataset  # noqa: F401 (fixtures)
+
+TUNE = "finetune scene.ply --cameras . -o tuned.ply --scale 0.5 --threads 1 --for mip-viewer --rasterizer eager"
+RUN = f"{TUNE} --steps 3 --checkpoint-every 2"
+
+
+@pytest.fixture(scope="module")
+def whole(dataset, tmp_path_factory) -> Path:
+    """A folder with the outputs of an uninterrupted run."""
+    folder = tmp_path_factory.mktemp("whole")
+    shutil.copytree(dataset, folder, dirs_exist_ok=True)
+    here = Path.cwd()
+    os.chdir(folder)
+    with pytest.raises(SystemExit, match="0"):
+        main(RUN.split())
+    os.chdir(here)
+    return folder
+
+
+def test_finetune_without_steps_changes_no_byte(cli):
+    words = "finetune scene.ply --cameras . -o tuned.ply --scale 0.5 --method mipmap-gs --steps 0"
+    assert cli(words)[0] == 0
+    assert Path("tuned.ply").read_bytes() == Path("scene.ply").read_bytes()
+
+
+def test_finetune_writes_scene_report_and_pictures(whole):
+    found = read_scene(whole / "tuned.ply")
+    assert found.convention == MIP
+    assert [fusion.method for fusion in found.fused] == ["matched-energy", "finetune"]
+    settings = {"steps": "3", "for": "mip-viewer", "method": "consistency"}
+    assert found.fused[1].settings == settings
+    report = json.loads((whole / "tuned.finetune.json").read_text())
+    assert [entry["step"] for entry in report["curve"]] == [1, 2, 3]
+    assert [probe["step"] for probe in report["probes"]] == [2, 3]
+    assert report["after@0.5"]["PSNR"] != report["before@0.5"]["PSNR"]
+    assert report["closed form@0.5"]["PSNR"]
+    assert report["settings"]["weights"] == {"0.5": 1.0}
+    assert cv2.imread(str(whole / "tuned.finetune.png")).shape[1] > 4 * 320
+    assert not (whole / "tuned.finetune.pt").exists()
+
+
+def test_a_run_stopped_by_ctrl_c_and_resumed_writes_what_an_uninterrupted_one_does(
+    cli, monkeypatch, whole
+):
+    real = loop.advance
+
+    def pressed(job, state):
+        if state.step == 0:
+            signal.raise_signal(signal.SIGINT)
+        real(job, state)
+
+    monkeypatch.setattr(loop, "advance", pressed)
+    code, out, err = cli(RUN)
+    assert (code, out) == (130, "")
+    assert "stopped at step 1; the checkpoint is written" in err
+    assert [path.name for path in Path().glob("tuned.*")] == ["tuned.finetune.pt"]
+    monkeypatch.setattr(loop, "advance", real)
+    code, out, err = cli(f"{RUN} --resume")
+    assert (code, "resumed at step 1" in err, "before" in out) == (0, True, True)
+    assert "step 3 of 3, loss" in err
+    assert Path("tuned.ply").read_bytes() == (whole / "tuned.ply").read_bytes()
+    reports = [json.loads((p / "tuned.finetune.json").read_text()) for p in (Path(), whole)]
+    assert reports[0]["curve"] == reports[1]["curve"]
+
+
+def test_a_run_killed_outright_resumes_from_its_checkpoint(cli, tmp_path, whole):
+    program = (
+        "import os, sys; from aaplug.finetuning import loop; from aaplug_cli.main import main\n"
+        "real = loop.advance\n"
+        "def advance(job, state):\n"
+        "    if state.step == 2: os.kill(os.getpid(), 9)\n"
+        "    real(job, state)\n"
+        "loop.advance = advance\n"
+        "main(sys.argv[1:])"
+    )
+    words = [sys.executable, "-c", program, *RUN.split()]
+    assert subprocess.run(words, cwd=tmp_path, check=False).returncode == -9
+    assert not Path("tuned.ply").exists()
+    code, _, err = cli(f"{RUN} --resume")
+    assert (code, "resumed at step 2" in err) == (0, True)
+    assert Path("tuned.ply").read_bytes() == (whole / "tuned.ply").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ("--steps -1", "--steps: must be 0 or more"),
+        ("--method mipmap-gs --scale 0.5 0.25", "one model for one scale"),
+        ("--scale 0", "--scale: needs sizes above 0"),
+        ("--upsampler nearest", "expected bicubic, lanczos"),
+        ("--resume", "there is no run to resume"),
+        ("--truth photographs", "has no photograph; --truth self"),
+        ("--checkpoint-every 0", "--checkpoint-every: must be 1 or more"),
+        ("--learning-rate 0", "--learning-rate: must be above 0"),
+        ("--move size", "--move: needs parameters out of means"),
+        ("--loss l3", "--loss: 'l3' is not one of l2"),
+        ("--for web", "--target: 'web' is not one of fast"),
+        ("--overwrite -o scene.ply", "is also the input"),
+    ],
+)
+def test_finetune_refuses_what_cannot_be(cli, options, words):
+    code, out, err = cli(
+        f"finetune scene.ply --cameras . -o tuned.ply --rasterizer eager {options}"
+    )
+    assert (code, out) == (2, "")
+    assert words in err
+    assert not list(Path().glob("tuned*"))

@@ -1,0 +1,242 @@
+"""Golden images: two other renderers' conventions worked out in plain float64 loops, independently of aaplug's code.
+
+gsplat: a world-to-camera matrix and K with pixel centres at +0.5; the Jacobian's slopes clamped to the image widened by
+0.15 of its size; eps2d = 0.3; alpha = min(0.999, o exp(-sigma)), skipped below 1/255; a pixel stops when the next
+transmittance is at most 1e-4; "antialiased" multiplies opacity by the root of the ratio of determinants.
+3DGS: clip space from fields of view, integer pixels at ((ndc + 1) S - 1) / 2, the Jacobian clamped at 1.3 tan(fov/2), a
+cap of 0.99, a near plane at 0.2.  Its limit to tiles within three standard deviations is not part of this.
+Both clamp colours of spherical harmonics plus 1/2 below at 0.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+import torch
+
+from aaplug.core.cameras import Camera
+from aaplug.core.gaussians import ANTIALIASED, CLASSIC, Gaussians
+from aaplug.core.rules import RULES_GSPLAT
+from aaplug.core.training import TrainingViews
+from aaplug.rasterizers import Reference, Tiled
+from aaplug.rendering.renderer import Renderer
+from tests.conftest import ALL_RASTERIZERS, make_camera, make_scene
+
+SKY = (0.25, 0.5, 1.0)
+RULES = replace(RULES_GSPLAT, near=0.01)  # gsplat's default near plane
+GSPLAT = replace(CLASSIC, rules=RULES)
+GSPLAT_ANTIALIASED = replace(ANTIALIASED, rules=RULES)
+
+
+@dataclass
+class Stored:
+    """One Gaussian as plain arrays, activated."""
+
+    mean: np.ndarray
+    covariance: np.ndarray
+    opacity: float
+    sh: np.ndarray  # coefficients x 3
+
+
+@dataclass
+class Flat:
+    """A Gaussian on the screen: (x, y) with pixel centres at +0.5, inverse covariance, and what is composited."""
+
+    x: float
+    y: float
+    conic: tuple[float, float, float]
+    depth: float
+    opacity: float
+    rgb: np.ndarray
+
+
+def stored(scene: Gaussians) -> list[Stored]:
+    quats = scene.quats.double().numpy()
+    scales = np.exp(scene.log_scales.double().numpy())
+    found = []
+    for i in range(len(scene)):
+        w, x, y, z = quats[i] / np.linalg.norm(quats[i])
+        rotation = np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+            ]
+        )
+        covariance = rotation @ np.diag(scales[i] ** 2) @ rotation.T
+        opacity = 1 / (1 + math.exp(-scene.logit_opacities[i].item()))
+        mean = scene.means[i].double().numpy()
+        found.append(Stored(mean, covariance, opacity, scene.sh[i].double().numpy()))
+    return found
+
+
+def sh_colour(sh: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """The published constants and order, degree 0 to 3."""
+    x, y, z = direction / np.linalg.norm(direction)
+    basis = [0.28209479177387814]
+    basis += [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
+    basis += [
+        1.0925484305920792 * x * y,
+        -1.0925484305920792 * y * z,
+        0.31539156525252005 * (2 * z * z - x * x - y * y),
+        -1.0925484305920792 * x * z,
+        0.5462742152960396 * (x * x - y * y),
+        -0.5900435899266435 * y * (3 * x * x - y * y),
+        2.890611442640554 * x * y * z,
+        -0.4570457994644658 * y * (4 * z * z - x * x - y * y),
+        0.3731763325901154 * z * (2 * z * z - 3 * x * x - 3 * y * y),
+        -0.4570457994644658 * x * (4 * z * z - x * x - y * y),
+        1.445305721320277 * z * (x * x - y * y),
+        -0.5900435899266435 * x * (x * x - 3 * y * y),
+    ]
+    return np.maximum(np.array(basis[: len(sh)]) @ sh + 0.5, 0.0)
+
+
+def dilated(covariance: np.ndarray, compensated: bool) -> tuple[tuple[float, float, float], float]:
+    """Inverse of the covariance plus 0.3 px², and the factor on opacity."""
+    before = np.linalg.det(covariance)
+    a, b, c = covariance[0, 0] + 0.3, covariance[0, 1], covariance[1, 1] + 0.3
+    det = a * c - b * b
+    factor = math.sqrt(max(0.005**2, before / det)) if compensated else 1.0
+    return (c / det, -b / det, a / det), factor
+
+
+def gsplat_projected(gaussian: Stored, camera: Camera, compensated: bool) -> Flat | None:
+    viewmat = camera.cam_from_world.numpy()
+    k = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
+    x, y, z = viewmat[:3, :3] @ gaussian.mean + viewmat[:3, 3]
+    if z < 0.01:
+        return None
+    fx, fy, cx, cy = k[0, 0], k[1, 1], k[0, 2], k[1, 2]
+    width, height = camera.width, camera.height
+    tan_x, tan_y = 0.5 * width / fx, 0.5 * height / fy
+    tx = z * min(max(x / z, -(cx / fx + 0.3 * tan_x)), (width - cx) / fx + 0.3 * tan_x)
+    ty = z * min(max(y / z, -(cy / fy + 0.3 * tan_y)), (height - cy) / fy + 0.3 * tan_y)
+    jacobian = np.array([[fx / z, 0, -fx * tx / z**2], [0, fy / z, -fy * ty / z**2]])
+    to_screen = jacobian @ viewmat[:3, :3]
+    conic, factor = dilated(to_screen @ gaussian.covariance @ to_screen.T, compensated)
+    centre = -viewmat[:3, :3].T @ viewmat[:3, 3]
+    rgb = sh_colour(gaussian.sh, gaussian.mean - centre)
+    u, v = fx * x / z + cx, fy * y / z + cy
+    return Flat(u, v, conic, z, gaussian.opacity * factor, rgb)
+
+
+def inria_projected(gaussian: Stored, camera: Camera) -> Flat | None:
+    """The principal point is the middle of the image: 3DGS knows fields of view only."""
+    view = camera.cam_from_world.numpy()
+    width, height = camera.width, camera.height
+    tan_x, tan_y = 0.5 * width / camera.fx, 0.5 * height / camera.fy
+    x, y, z = view[:3, :3] @ gaussian.mean + view[:3, 3]
+    if z <= 0.2:
+        return None
+    pixel_x = ((x / (z * tan_x) + 1) * width - 1) / 2
+    pixel_y = ((y / (z * tan_y) + 1) * height - 1) / 2
+    focal_x, focal_y = width / (2 * tan_x), height / (2 * tan_y)
+    tx = min(1.3 * tan_x, max(-1.3 * tan_x, x / z)) * z
+    ty = min(1.3 * tan_y, max(-1.3 * tan_y, y / z)) * z
+    jacobian = np.array(
+        [[focal_x / z, 0, -focal_x * tx / z**2], [0, focal_y / z, -focal_y * ty / z**2]]
+    )
+    to_screen = jacobian @ view[:3, :3]
+    conic, _ = dilated(to_screen @ gaussian.covariance @ to_screen.T, compensated=False)
+    centre = np.linalg.inv(view)[:3, 3]
+    rgb = sh_colour(gaussian.sh, gaussian.mean - centre)
+    return Flat(pixel_x + 0.5, pixel_y + 0.5, conic, z, gaussian.opacity, rgb)
+
+
+def composited(
+    splats: list[Flat], camera: Camera, cap: float, stops: Callable[[float], bool]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Colour over SKY, alpha, and whether a pixel is near a cut-off, where rounding may decide."""
+    splats = sorted(splats, key=lambda splat: splat.depth)
+    image = np.zeros((camera.height, camera.width, 3))
+    alphas, close = np.zeros(image.shape[:2]), np.zeros(image.shape[:2], dtype=bool)
+    for row in range(camera.height):
+        for column in range(camera.width):
+            left, colour = 1.0, np.zeros(3)
+            for splat in splats:
+                dx, dy = column + 0.5 - splat.x, row + 0.5 - splat.y
+                a, b, c = splat.conic
+                sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
+                alpha = min(cap, splat.opacity * math.exp(-sigma))
+                close[row, column] |= abs(alpha * 255 - 1) < 1e-3
+                if sigma < 0 or alpha < 1 / 255:
+                    continue
+                after = left * (1 - alpha)
+                close[row, column] |= abs(after * 1e4 - 1) < 1e-3
+                if stops(after):
+                    break
+                colour += splat.rgb * alpha * left
+                left = after
+            image[row, column] = colour + left * np.array(SKY)
+            alphas[row, column] = 1 - left
+    return image, alphas, close
+
+
+def scene_of(seed: int, degree: int) -> Gaussians:
+    """Some Gaussians in front of, beside and behind the camera, many of them opaque."""
+    scene = make_scene(70, seed, degree=degree)
+    return replace(
+        scene,
+        means=1.3 * scene.means,
+        log_scales=scene.log_scales + 1,
+        logit_opacities=3 * scene.logit_opacities + 4,
+    )
+
+
+def agree(
+    scene: Gaussians, camera: Camera, recipe: str, golden: tuple[np.ndarray, np.ndarray, np.ndarray]
+) -> None:
+    """Every rasterizer draws the golden image: in float64 to rounding, in float32 away from cut-offs."""
+    expected, alpha, close = (torch.from_numpy(x) for x in golden)
+    assert alpha.max() > 0.9998, "some pixels should stop"
+    assert close.double().mean() < 0.03
+    for name, rasterizer in {**ALL_RASTERIZERS, "float64": Tiled(), "exact": Reference()}.items():
+        exact = name in ("float64", "exact")
+        given = scene.to(torch.float64) if exact else scene
+        training = TrainingViews.of(
+            given, [camera]
+        )  # without the check that it sees most of the scene
+        image = Renderer.of(given, training, recipe, background=SKY, rasterizer=rasterizer)(camera)
+        for found, wanted in ((image.rgb, expected), (image.alpha, alpha)):
+            difference = (found.double() - wanted).abs()[~close].max()
+            assert difference < (2e-7 if exact else 1e-4), f"{name}: {difference:.1e}"
+
+
+@pytest.mark.parametrize(("seed", "degree"), [(0, 0), (1, 1), (2, 2), (3, 3)])
+@pytest.mark.parametrize("compensated", [False, True], ids=["classic", "antialiased"])
+def test_images_are_those_of_gsplat(seed, degree, compensated):
+    camera = make_camera((0.4, -1.1, 0.2), size=(36, 27), fov=1.0)
+    camera = replace(camera, fy=1.3 * camera.fy, cx=14.0, cy=16.5).as_trained()
+    scene = scene_of(seed, degree)
+    scene = replace(scene, convention=GSPLAT_ANTIALIASED if compensated else GSPLAT)
+    flat = [gsplat_projected(gaussian, camera, compensated) for gaussian in stored(scene)]
+    drawn = [splat for splat in flat if splat is not None]
+    assert 20 < len(drawn) < 70
+    golden = composited(drawn, camera, 0.999, lambda after: after <= 1e-4)
+    agree(scene, camera, "ewa" if compensated else "classic", golden)
+
+
+@pytest.mark.parametrize(("seed", "degree"), [(4, 0), (5, 1), (6, 2), (7, 3)])
+def test_images_are_those_of_3dgs(seed, degree):
+    camera = make_camera((0.4, -1.1, 0.2), size=(36, 27), fov=1.0)
+    scene = scene_of(seed, degree)
+    flat = [inria_projected(gaussian, camera) for gaussian in stored(scene)]
+    drawn = [splat for splat in flat if splat is not None]
+    assert 20 < len(drawn) < 70
+    golden = composited(drawn, camera, 0.99, lambda after: after < 1e-4)
+    agree(scene, camera, "classic", golden)
+
+
+def test_the_two_caps_give_different_images():
+    """So that the tests above would notice the wrong rules."""
+    camera = make_camera((0.4, -1.1, 0.2), size=(36, 27), fov=1.0)
+    scene = scene_of(4, 0)
+    images = []
+    for convention in (CLASSIC, GSPLAT):
+        trained = replace(scene, convention=convention)
+        training = TrainingViews.of(trained, [camera])
+        images.append(Renderer.of(trained, training, "classic", rasterizer="eager")(camera))
+    assert (images[0].rgb - images[1].rgb).abs().max() > 1e-3
