@@ -63,7 +63,6 @@ def demo(
             cameras,
             recipe=RECIPES,
             scale=SCALES,
-            metric=("psnr", "ssim"),
             output=folder,
             overwrite=overwrite,
             metric=("psnr", "ssim"),
