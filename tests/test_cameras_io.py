@@ -952,15 +952,18 @@ def test_test_views_by_name_are_those_that_3dgs_lists_first(shared_data):
 @pytest.mark.data
 @pytest.mark.parametrize("kind", ["colmap", "inria", "transforms"])
 def test_real_files_read_or_raise_our_errors(shared_data, kind):
-    """Small folders only: large ones take seconds and show nothing new."""
+    """The smallest folders only: large ones take seconds and show nothing new."""
+
+    def size(folder):
+        return sum(path.stat().st_size for path in folder.iterdir())
+
+    folders = {path.parent for path in (shared_data / "formats" / kind).rglob("*.*")}
     outcomes = set()
-    for folder in {path.parent for path in (shared_data / "formats" / kind).rglob("*.*")}:
-        files = [path for path in folder.iterdir() if path.is_file()]
-        if any(path.stat().st_size > 300_000 for path in files):
-            continue
-        for path in [folder, *files]:
+    for folder in sorted(folders, key=size)[:3]:
+        for path in [folder, *folder.iterdir()]:
             try:
                 outcomes.add(bool(read_cameras(path).all))
             except FormatError:
                 outcomes.add(False)
-    assert outcomes == {True, False} or kind == "inria"
+    assert True in outcomes
+    assert False in outcomes or kind == "inria"

@@ -1,5 +1,6 @@
 """What verbs take: scenes and cameras as objects or paths, backgrounds, rasterizers and threads by name."""
 
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from os import PathLike
@@ -13,12 +14,14 @@ from aaplug.core.executors import torch_threads
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.interfaces import Colour, MatchesRates, Rasterizer, TakesMemory
 from aaplug.core.monitor import SILENT, Monitor
+from aaplug.core.sampling import MIN_SEEN_SHARE
+from aaplug.core.training import TrainingViews
 from aaplug.io.cameras import read_cameras
 from aaplug.io.scenes import find_scene, read_scene
 from aaplug.methods.recipe import Recipe
 from aaplug.methods.recipes import RECIPES, find_recipe
 from aaplug.rasterizers import find_rasterizer
-from aaplug.rendering.renderer import Background, background_colour
+from aaplug.rendering.renderer import Background, Renderer, background_colour
 
 SceneLike = Gaussians | str | PathLike[str]
 CamerasLike = CameraSet | str | PathLike[str] | None
@@ -95,6 +98,35 @@ def recipes_of(
         reference = rate_reference if matches else None
         found.append(find_recipe(name, quality=quality, rate_reference=reference))
     return found
+
+
+def renderers_of(
+    scene: Gaussians,
+    cameras: CameraSet,
+    recipes: Sequence[Recipe],
+    frames: int,
+    background: Background = "auto",
+    rasterizer: str | Rasterizer = "auto",
+    memory: float | None = None,
+    cull_margin: float = math.inf,
+    min_seen: float = MIN_SEEN_SHARE,
+    monitor: Monitor = SILENT,
+) -> list[Renderer]:
+    """One renderer per recipe, with the training views, background and rasterizer in common.
+
+    frames: how many images they will render in all.  The others: see `Renderer.of` and `rasterizer_of`.
+
+    Raises:
+        FrameError: the cameras see little of the scene.
+        UsageError: an argument does not fit, or the scene lacks what a recipe needs.
+    """
+    colour = background_of(background, cameras, monitor)
+    training = TrainingViews.of(scene, cameras, cull_margin, min_seen)
+    drawing = rasterizer_of(rasterizer, frames, memory, monitor)
+    return [
+        Renderer.of(scene, training, recipe, background=colour, rasterizer=drawing)
+        for recipe in recipes
+    ]
 
 
 @contextmanager

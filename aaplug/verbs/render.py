@@ -11,20 +11,18 @@ from aaplug.core.errors import listing
 from aaplug.core.interfaces import Rasterizer
 from aaplug.core.monitor import SILENT, Monitor
 from aaplug.core.sampling import MIN_SEEN_SHARE
-from aaplug.core.training import TrainingViews
 from aaplug.io.atomic import make_folder
 from aaplug.io.cameras import select_views
 from aaplug.methods.recipe import Recipe
-from aaplug.methods.recipes import find_recipe, suited
+from aaplug.methods.recipes import find_recipe
 from aaplug.rendering.frames import write_frames
 from aaplug.rendering.renderer import Background, Renderer
 from aaplug.verbs.inputs import (
     CamerasLike,
     SceneLike,
-    background_of,
     cameras_of,
     processor,
-    rasterizer_of,
+    renderers_of,
     scene_of,
 )
 from aaplug.verbs.views import image_paths, resized
@@ -38,26 +36,15 @@ class Written(NamedTuple):
 
 
 def render(
-    scene: SceneLike,
-    cameras: CamerasLike = None,
-    output: str | PathLike[str] = "images",
-    *,
-    views: str = "test",
-    recipe: str | Recipe = "auto",
-    quality: str = "balanced",
-    rate_reference: str | None = None,
-    scale: float | None = None,
-    resolution: str | None = None,
-    background: Background = "auto",
-    rasterizer: str | Rasterizer = "auto",
-    threads: int | None = None,
-    memory: float | None = None,
-    bit_depth: int = 8,
-    cull_margin: float = math.inf,
-    min_seen: float = MIN_SEEN_SHARE,
-    overwrite: bool = False,
-    monitor: Monitor = SILENT,
-) -> list[Written]:
+    scene: SceneLike, cameras: CamerasLike = None, output: str | PathLike[str] = "images", *,
+    views: str = "test", recipe: str | Recipe = "auto",
+    quality: str = "balanced", rate_reference: str | None = None,
+    scale: float | None = None, resolution: str | None = None, bit_depth: int = 8,
+    background: Background = "auto", rasterizer: str | Rasterizer = "auto",
+    threads: int | None = None, memory: float | None = None,
+    cull_margin: float = math.inf, min_seen: float = MIN_SEEN_SHARE,
+    overwrite: bool = False, monitor: Monitor = SILENT,
+) -> list[Written]:  # fmt: skip
     """Render views at any resolution to PNG.
 
     Args:
@@ -65,18 +52,11 @@ def render(
         cameras: a camera set, its file or folder, or None for those of the scene's model folder.
         output: a folder, or one .png for one view.
         views: "train", "test", "all", or names separated by commas.
-        recipe: a recipe, or its name in `RECIPES`.
-        quality: "fast", "balanced" or "best": samples per pixel of recipe "auto".
+        recipe, quality, background, rasterizer, cull_margin, min_seen: see `Renderer.of`.
         rate_reference: what "matched" and "auto" compare sampling rates with; see `Matched`.
-        scale: size relative to the training size.
-        resolution: "WIDTHxHEIGHT" in px instead; -1 on one side keeps the aspect.
-        background: "auto" (what training had), "white", "black" or a colour.
-        rasterizer: a rasterizer, or its name: "auto", "compiled" or one in `RASTERIZERS`.
-        threads: processor threads; None for all.
-        memory: GB per frame beside the scene and the image; None for the rasterizer's default.
+        scale, resolution: size relative to the training size (default: 1), or "WIDTHxHEIGHT" in px with -1 for any.
         bit_depth: 8 or 16 bits per colour channel.
-        cull_margin: see `TrainingViews`.
-        min_seen: share of the Gaussians that the cameras must see.
+        threads, memory: processor threads (None for all); GB per frame, beside the scene and the image.
         overwrite: replace existing images.
         monitor: receives messages and progress.
 
@@ -85,29 +65,18 @@ def render(
     """
     if isinstance(recipe, str):
         recipe = find_recipe(recipe, quality=quality, rate_reference=rate_reference)
-    cameras = cameras_of(cameras, scene)
-    scene = scene_of(scene)
-    recipe = suited(recipe, scene)
+    cameras, scene = cameras_of(cameras, scene), scene_of(scene)
     shown = resized(select_views(cameras, views), scale, resolution)
-    paths = image_paths(Path(output), shown, overwrite)
-    colour = background_of(background, cameras, monitor)
+    folder, paths = Path(output), image_paths(Path(output), shown, overwrite)
+    look = (background, rasterizer, memory, cull_margin, min_seen, monitor)
     with processor(threads) as workers:
-        drawing = rasterizer_of(rasterizer, len(shown), memory, monitor)
-        training = TrainingViews.of(scene, cameras, cull_margin, min_seen)
-        renderer = Renderer.of(scene, training, recipe, background=colour, rasterizer=drawing)
+        (renderer,) = renderers_of(scene, cameras, [recipe], len(shown), *look)
         monitor.say(described(renderer, shown))
-        if not Path(output).suffix:
-            make_folder(Path(output))
+        if not folder.suffix:
+            make_folder(folder)
         with monitor.progress("rendering", "views") as tell:
-            write_frames(
-                renderer,
-                shown,
-                paths,
-                threads=workers,
-                bit_depth=bit_depth,
-                overwrite=overwrite,
-                tell=tell,
-            )
+            options = {"bit_depth": bit_depth, "overwrite": overwrite, "tell": tell}
+            write_frames(renderer, shown, paths, threads=workers, **options)
     return [Written(*pair) for pair in zip(shown, paths, strict=True)]
 
 

@@ -18,22 +18,20 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.core.interfaces import Rasterizer
 from aaplug.core.monitor import SILENT, Monitor
 from aaplug.core.sampling import MIN_SEEN_SHARE
-from aaplug.core.training import TrainingViews
 from aaplug.evaluation.protocols import median_depth
 from aaplug.evaluation.report.contact_sheet import labelled
 from aaplug.io.cameras import select_views
 from aaplug.io.cameras.camera_path import read_camera_path
 from aaplug.io.video import check_video
-from aaplug.rendering.renderer import Background, Renderer
+from aaplug.rendering.renderer import Background
 from aaplug.rendering.videos import make_video
 from aaplug.verbs.inputs import (
     CamerasLike,
     SceneLike,
-    background_of,
     cameras_of,
     processor,
-    rasterizer_of,
     recipes_of,
+    renderers_of,
     scene_of,
 )
 from aaplug.verbs.views import resized
@@ -66,40 +64,24 @@ class Move(NamedTuple):
 
 
 def video(
-    scene: SceneLike,
-    cameras: CamerasLike = None,
-    output: str | PathLike[str] = "video.webm",
-    *,
-    path: str | PathLike[str] = "zoom",
-    recipe: str = "auto",
-    beside: str | None = "classic",
-    views: str = "test",
-    start: float = 1.0,
-    end: float = 0.125,
-    seconds: float = 6.0,
-    fps: float | None = None,
-    quality: str = "balanced",
-    rate_reference: str | None = None,
-    scale: float | None = None,
-    resolution: str | None = None,
-    background: Background = "auto",
-    rasterizer: str | Rasterizer = "auto",
-    threads: int | None = None,
-    memory: float | None = None,
-    cull_margin: float = math.inf,
-    min_seen: float = MIN_SEEN_SHARE,
-    overwrite: bool = False,
-    monitor: Monitor = SILENT,
-) -> Clip:
-    """Render a camera path to a video; parameters that are not listed are those of `verbs.render`.
+    scene: SceneLike, cameras: CamerasLike = None, output: str | PathLike[str] = "video.webm", *,
+    path: str | PathLike[str] = "zoom", recipe: str = "auto", beside: str | None = "classic",
+    views: str = "test", start: float = 1.0, end: float = 0.125, seconds: float = 6.0,
+    fps: float | None = None, quality: str = "balanced", rate_reference: str | None = None,
+    scale: float | None = None, resolution: str | None = None,
+    background: Background = "auto", rasterizer: str | Rasterizer = "auto",
+    threads: int | None = None, memory: float | None = None,
+    cull_margin: float = math.inf, min_seen: float = MIN_SEEN_SHARE,
+    overwrite: bool = False, monitor: Monitor = SILENT,
+) -> Clip:  # fmt: skip
+    """Render a camera path to a video; parameters that are not listed are those of `render`.
 
     Args:
         scene: Gaussians, a scene's file or a model folder.
         cameras: a camera set, its file or folder, or None for those of the scene's model folder.
         output: a .webm file (VP9), or .mp4 (H.264) with the extra `mp4`.
         path: "zoom", "dolly" or "orbit" from the first of `views`, or nerfstudio's camera_path.json.
-        recipe: name of the recipe.
-        beside: name of a recipe to show to its left, or None.
+        recipe, beside: names of the recipe, and of one to show to its left, or None.
         start, end: sampling rate relative to training at both ends of a zoom or dolly.
         seconds: length of a zoom, dolly or orbit.
         fps: frames per second; None for the path file's, or 30.
@@ -110,39 +92,22 @@ def video(
     """
     names = [name for name in (beside, recipe) if name is not None]
     recipes = recipes_of(names, quality, rate_reference)
-    free = None if path in MOVES else read_camera_path(Path(path))
+    free = None if str(path) in MOVES else read_camera_path(Path(path))
     fps = fps or (FPS if free is None else free.fps)
     check_video(Path(output), fps, overwrite)
-    cameras = cameras_of(cameras, scene)
-    scene = scene_of(scene)
-    if free is None:
-        view = select_views(cameras, views)[0]
-        monitor.say(f"path: {path} from view {view.name}")
-        along = _along(str(path), scene, cameras, view, Move(start, end, seconds), fps)
-    else:
-        along = free.cameras
+    cameras, scene = cameras_of(cameras, scene), scene_of(scene)
+    move = Move(start, end, seconds)
+    along = free.cameras if free else _along(path, scene, cameras, views, move, fps, monitor)
     shown = resized(along, scale, resolution)
-    colour = background_of(background, cameras, monitor)
+    compose = partial(side_by_side, labels=[_label(name) for name in names])
+    look = (background, rasterizer, memory, cull_margin, min_seen, monitor)
     with processor(threads) as workers:
-        training = TrainingViews.of(scene, cameras, cull_margin, min_seen)
-        drawing = rasterizer_of(rasterizer, len(shown) * len(names), memory, monitor)
-        renderers = [
-            Renderer.of(scene, training, recipe, background=colour, rasterizer=drawing)
-            for recipe in recipes
-        ]
+        renderers = renderers_of(scene, cameras, recipes, len(shown) * len(names), *look)
         size = f"{shown[0].width}x{shown[0].height}"
         monitor.say(f"{len(shown)} frames of {size} px per pane, {fps:g} per second")
         with monitor.progress("rendering", "images") as tell:
-            make_video(
-                output,
-                renderers,
-                shown,
-                fps,
-                partial(side_by_side, labels=[_label(name) for name in names]),
-                threads=workers,
-                overwrite=overwrite,
-                tell=tell,
-            )
+            options = {"threads": workers, "overwrite": overwrite, "tell": tell}
+            make_video(output, renderers, shown, fps, compose, **options)
     return Clip(Path(output), len(shown), fps)
 
 
@@ -162,14 +127,22 @@ def _label(recipe: str) -> str:
 
 
 def _along(
-    name: str, scene: Gaussians, cameras: CameraSet, view: Camera, move: Move, fps: float
+    path: str | PathLike[str],
+    scene: Gaussians,
+    cameras: CameraSet,
+    views: str,
+    move: Move,
+    fps: float,
+    monitor: Monitor,
 ) -> list[Camera]:
     """The cameras of a built-in path."""
     move.check()
     count = max(1, round(move.seconds * fps))
     if count > MOST_FRAMES:
         raise UsageError("seconds", f"makes {count:,} frames; the limit is {MOST_FRAMES:,}")
-    return camera_paths.frames(MOVES[name](scene, cameras, view, move), count)
+    view = select_views(cameras, views)[0]
+    monitor.say(f"path: {path} from view {view.name}")
+    return camera_paths.frames(MOVES[str(path)](scene, cameras, view, move), count)
 
 
 Along = Callable[[float], Camera]  # of t in [0, 1)

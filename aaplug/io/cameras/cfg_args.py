@@ -2,6 +2,8 @@
 
 The text comes with downloaded scenes, so it is parsed and never evaluated: one call of `Namespace` whose keywords are
 literals.  `source_path` names a folder of another machine and is not read.
+
+Functions raise FormatError for a file that breaks its format.
 """
 
 import ast
@@ -52,11 +54,7 @@ class CfgArgs:
 
 
 def read_cfg_args(path: Path) -> CfgArgs:
-    """Read the settings that concern cameras; those that the file does not mention have their defaults.
-
-    Raises:
-        FormatError: the file is not a Namespace of literals, or a setting is wrong.
-    """
+    """Read the settings that concern cameras; those that the file does not mention have their defaults."""
     found = _literals(path, _parsed(path))
     place = Place(path, "Namespace")
     settings = CfgArgs()

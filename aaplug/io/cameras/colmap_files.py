@@ -2,6 +2,8 @@
 
 cameras: id, model, size in px, parameters (focal lengths, principal point, distortion; px).
 images: id, world-to-camera pose as quaternion wxyz and translation, camera id, name; their points are skipped.
+
+Functions raise FormatError for a file that breaks its format.
 """
 
 import os
@@ -91,11 +93,7 @@ class Image:
 
 
 def read_cameras(file: Path) -> dict[int, Intrinsics]:
-    """Read the intrinsics, by camera id.
-
-    Raises:
-        FormatError: the file breaks its format.
-    """
+    """Read the intrinsics, by camera id."""
     found: dict[int, Intrinsics] = {}
     for intrinsics in _records(file, _binary_cameras, _text_cameras):
         if intrinsics.key in found:
@@ -105,11 +103,7 @@ def read_cameras(file: Path) -> dict[int, Intrinsics]:
 
 
 def read_images(file: Path) -> list[Image]:
-    """Read the images, in the order of the file.
-
-    Raises:
-        FormatError: the file breaks its format, or holds no image.
-    """
+    """Read the images, in the order of the file."""
     found = list(_records(file, _binary_images, _text_images))
     if not found:
         raise FormatError(file, "holds no image: the reconstruction placed no camera")

@@ -1,6 +1,8 @@
 """nerfstudio's `dataparser_transforms.json`: maps the frame of `transforms.json` to that of the trained scene.
 
 {transform: 3×4, rotation and translation, row by row; scale}.  A point p becomes scale · (R p + t).
+
+Functions raise FormatError for a file that breaks its format.
 """
 
 import os
@@ -32,11 +34,7 @@ class Dataparser:
 
 
 def read_dataparser(path: Path) -> Dataparser | None:
-    """Read the file; None if there is none.
-
-    Raises:
-        FormatError: the file breaks its format.
-    """
+    """Read the file; None if there is none."""
     if not os.path.isfile(path):
         return None
     document = read_json(path)

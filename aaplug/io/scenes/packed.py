@@ -1,6 +1,8 @@
 """Shared by the compressed formats: bounded decompression, packed quaternions, and axes.
 
 n: rows.  Arrays are numpy's, as they come from files.
+
+Functions raise FormatError for a file that breaks its format.
 """
 
 import io
@@ -25,11 +27,7 @@ BYTE = 255
 
 
 def check_growth(path: Path, inflated: int, compressed: int) -> None:
-    """Refuse compressed bytes that announce a larger size than a real scene would have.
-
-    Raises:
-        FormatError: `inflated` is above the limit INFLATE.
-    """
+    """Refuse compressed bytes that announce a larger size than a real scene would have."""
     if inflated > limit("INFLATE") * compressed + limit("SLACK"):
         raise FormatError(
             path,
@@ -44,11 +42,7 @@ def gunzip_start(data: bytes, size: int) -> bytes:
 
 
 def gunzip(data: bytes, size: int, path: Path) -> bytes:
-    """Decompress a gzip stream of `size` bytes; a few more are accepted.
-
-    Raises:
-        FormatError: it holds fewer, or many more.
-    """
+    """Decompress a gzip stream of `size` bytes; a few more are accepted."""
     most = size + whole_limit("SLACK")
     inflated = zlib.decompressobj(GZIP_WINDOW).decompress(data, most + 1)
     if not size <= len(inflated) <= most:
@@ -60,11 +54,7 @@ def gunzip(data: bytes, size: int, path: Path) -> bytes:
 
 
 def unzstd(data: bytes, size: int, path: Path) -> bytes:
-    """Decompress a zstd stream of `size` bytes.
-
-    Raises:
-        FormatError: it holds another number.
-    """
+    """Decompress a zstd stream of `size` bytes."""
     inflater = zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW)
     with inflater.stream_reader(io.BytesIO(data)) as stream:
         inflated = stream.read(size + 1)

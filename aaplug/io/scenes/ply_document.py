@@ -1,6 +1,8 @@
 """A .ply file as tables: the Gaussians' rows, read when asked for, and everything else, kept to be written back.
 
 numpy reads the Gaussians' rows; plyfile reads text, skips lists and converts big-endian tables.
+
+Functions raise FormatError for a file that breaks its format.
 """
 
 import io
@@ -94,11 +96,7 @@ def stamp_of(path: Path) -> tuple[int, int]:
 
 
 def document_of(path: Path, header: Header, stamp: tuple[int, int]) -> Document:
-    """Locate the tables of a file; parse those that numpy cannot read.
-
-    Raises:
-        FormatError: the file is damaged.
-    """
+    """Locate the tables of a file; parse those that numpy cannot read."""
     order = ">" if header.coding == BIG else "<"
     dtype = np.dtype([(p.name, order + p.code) for p in header.vertex.properties])
     at = header.elements.index(header.vertex)

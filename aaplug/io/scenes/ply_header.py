@@ -3,6 +3,8 @@
 A header is lines of text from "ply" to "end_header", here without line ends and empty lines.  Comments may use any
 encoding: each byte is kept as one character.  The header declares elements (tables) of `count` rows; a row consists of
 properties (columns): scalars, or lists with a stored length.  Sizes are in bytes.
+
+Functions raise FormatError for a file that breaks its format.
 """
 
 import re
@@ -114,11 +116,7 @@ class Header:
 
     @property
     def vertex(self) -> Element:
-        """The table of Gaussians.
-
-        Raises:
-            FormatError: there is none.
-        """
+        """The table of Gaussians."""
         for element in self.elements:
             if element.name == "vertex":
                 return element
@@ -169,11 +167,7 @@ class Header:
 
 
 def read_header(path: Path) -> Header:
-    """Read and check the header, within the limits HEADER and HEADER_LINES.
-
-    Raises:
-        FormatError: it is not a header, has no end, or declares something twice or impossible.
-    """
+    """Read and check the header, within the limits HEADER and HEADER_LINES."""
     most, most_lines = whole_limit("HEADER"), whole_limit("HEADER_LINES")
     with path.open("rb") as stream:
         head = stream.read(most)
@@ -204,11 +198,7 @@ def is_packed(path: Path) -> bool:
 
 
 def parse(path: str, lines: Iterable[str], newline: str, size: int | None = None) -> Header:
-    """Parse a header's lines; `size` is that of the header in its file.
-
-    Raises:
-        FormatError: a line is not PLY, or a count, type or name is impossible or appears twice.
-    """
+    """Parse a header's lines; `size` is that of the header in its file."""
     lines = tuple(lines)
     elements: list[Element] = []
     formats: list[list[str]] = []
@@ -238,11 +228,7 @@ def parse(path: str, lines: Iterable[str], newline: str, size: int | None = None
 
 
 def check_size(header: Header, actual: int) -> None:
-    """Compare the file's size with what the header promises, before anything is allocated.
-
-    Raises:
-        FormatError: the file is shorter or longer.
-    """
+    """Compare the file's size with what the header promises, before anything is allocated."""
     text = header.coding == TEXT
     least = header.size + sum(e.least_text if text else e.least_size for e in header.elements)
     if text and actual < least - 1:  # the last line may lack its line end

@@ -8,6 +8,8 @@ Sources, strongest first:
     comment antialiased 1 | 0                                           Postshot
 Of several comments of a kind the last one counts.  Viewers know only SplatRenderMode; aaplug's record tells a kernel of
 0.1 px² from one of 0.3 px².
+
+Functions raise FormatError for a file that breaks its format.
 """
 
 import re
@@ -41,11 +43,7 @@ class Meaning:
 
 
 def meaning(header: Header, compressed: bool = False) -> Meaning:
-    """Read the header's tags; `compressed`: the columns are packed and say nothing about scales.
-
-    Raises:
-        FormatError: a record is damaged or names an unknown convention.
-    """
+    """Read the header's tags; `compressed`: the columns are packed and say nothing about scales."""
     records = [_record(header.path, m[1]) for m in _matches(header, RECORD)]
     fused = tuple(
         Fusion(
