@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.evaluation.results import CEILING, method
-from aaplug.io.folders import make_folder
+from aaplug.io.atomic import make_folder
 from aaplug.io.images import write_png
 
 RENDERS, TRUTHS = "renders", "gt"
