@@ -1,9 +1,9 @@
-"""A worker for files that mean harm: reads each in a child of its own limits, and says what came of it.
+"""Reads hostile files in child processes with limits on memory and time.
 
     python -m tests.hostile all|NAME,... N [SEED]      N random mutations of each small scene, figures on stdout
 
 A child process is forked once a batch, after everything is imported, and may take `MEMORY` more address space than it
-has.  Each file must end as a scene or as an error of ours, within `SECONDS` and `GROWTH` of resident memory.
+has.  Each file must end as a scene or in one of our errors, within `SECONDS` and `GROWTH` of resident memory.
 """
 
 import multiprocessing

@@ -1,4 +1,4 @@
-"""One small scene in every format: by splat-transform where it writes it (tests/data), else packed by hand."""
+"""One small scene in every format: written by splat-transform where it can (tests/data), or else packed here."""
 
 import gzip
 import struct
@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from aaplug.core.gaussians import Gaussians
+from aaplug.core.spherical_harmonics import SH_C0
 from aaplug.io.scenes import read_scene
 
 DATA = Path(__file__).resolve().parent / "data"
@@ -56,7 +57,7 @@ def splat() -> bytes:
     s = oracle()
     rows = []
     for i in range(len(s)):
-        rgb = 0.5 + 0.28209479177387814 * s.sh[i, 0]
+        rgb = 0.5 + SH_C0 * s.sh[i, 0]
         rows.append(struct.pack("<6f", *s.means[i].tolist(), *s.scales[i].tolist()))
         rows.append(bytes_of(torch.cat([rgb, s.opacities[i : i + 1]]), 255, 0).tobytes())
         rows.append(bytes_of(s.unit_quats[i], 128, 128).tobytes())
@@ -90,7 +91,7 @@ def ksplat(level: int, degree: int = 2, per_bucket: int = 16) -> bytes:
         means if level == 0 else np.round((means - centres[0]) * steps / (block / 2) + steps)
     )
     rows["s"], rows["q"] = s.scales.numpy(), s.unit_quats.numpy()
-    rgb = 0.5 + 0.28209479177387814 * s.sh[:, 0]
+    rgb = 0.5 + SH_C0 * s.sh[:, 0]
     rows["c"] = bytes_of(torch.cat([rgb, s.opacities[:, None]], 1), 255, 0)
     rows["h"] = rest if level < 2 else np.round((rest + 1.5) / 3 * 255).clip(0, 255)
     main = bytearray(4096)

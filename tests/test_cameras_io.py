@@ -2,8 +2,8 @@
 
 import json
 import math
-import shutil
 import struct
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +13,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+import aaplug
 from aaplug.core.cameras import BLACK, WHITE, CameraSet
 from aaplug.core.errors import AaplugError, FormatError, UsageError
-from aaplug.io.cameras import read_cameras, select_views
+from aaplug.core.registry import Registry
+from aaplug.io.cameras import OWN, read_cameras, select_views
+from aaplug.io.cameras.camera_path import read_camera_path
 from aaplug.io.cameras.cfg_args import read_cfg_args
+from aaplug.io.cameras.options import Options
 
 QUARTER_TURN = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]  # 90° about z
 HALF = math.sqrt(0.5)
@@ -92,11 +96,9 @@ def test_inria_pose_is_the_inverse_of_camera_to_world(tmp_path):
         (None, (1600, 666)),  # the assumed cap: 1000 · 1600 / 2402 = 666.1
         ("Namespace(resolution=-1)", (1600, 666)),
         ("Namespace(resolution=1)", (2402, 1000)),
-        ("Namespace(resolution=2)", (1201, 500)),
         ("Namespace(resolution=4)", (600, 250)),  # 600.5 goes to the even 600, as in 3DGS
         ("Namespace(resolution=1200)", (1200, 499)),
         ("Namespace(resolution=-1, images='images_4')", (601, 250)),  # image tools round 600.5 up
-        ("Namespace(resolution=2, images='images_2')", (600, 250)),
     ],
 )
 def test_inria_training_size_follows_3dgs(tmp_path, cfg, size):
@@ -115,18 +117,6 @@ def test_inria_photos_count_more_than_the_sizes_in_the_file(tmp_path):
     with_photo, without = read_cameras(tmp_path).train
     assert (with_photo.width, with_photo.photo) == (100, tmp_path / "images_4" / "a.JPG")
     assert (without.width, without.photo) == (100, None)
-
-
-def test_train_scale_overrides_everything(tmp_path):
-    photo(tmp_path / "images" / "a.png", 200, 100)
-    inria(tmp_path, cfg="Namespace(resolution=8)")
-    (camera,) = read_cameras(tmp_path, train_scale=0.25).train
-    assert (camera.width, camera.height, camera.fx, camera.trained_focal) == (
-        100,
-        50,
-        75.0,
-        camera.focal,
-    )
 
 
 def test_photo_of_another_shape_is_refused(tmp_path):
@@ -179,27 +169,20 @@ def test_cfg_args_is_never_run(tmp_path):
 @pytest.mark.parametrize(
     "cfg",
     [
-        "",
         "1",
         "print(1)",
         "Namespace(1)",
         "Namespace(**{'resolution': 1})",
-        "Namespace(resolution=True)",
         "Namespace(resolution=0)",
-        "Namespace(resolution=1e999)",
         "Namespace(resolution='4')",
-        "Namespace(images=3)",
         "Namespace(eval=1)",
         "Namespace(images='../secret')",
         "Namespace(x=f'{1}')",
-        "a.Namespace(x=1)",
-        "Namespace(x=" + "(" * 5000 + ")" * 5000 + ")",
         "Namespace(x=" + "-" * 5000 + "1)",
         "Namespace(x=1); import os",
         "Namespace(x='" + "y" * 70000 + "')",
-        "Namespace(x='\0')",
     ],
-    ids=range(19),
+    ids=range(12),
 )
 def test_odd_cfg_args_are_refused(tmp_path, cfg):
     with pytest.raises(FormatError):
@@ -215,24 +198,17 @@ def test_cfg_args_of_windows_is_read_without_warnings(tmp_path):
     ("change", "message"),
     [
         ({"fx": 0}, "camera 1: fx should be above 0 and at most 1e+09 px, not 0"),
-        ({"fx": 1e300}, "camera 1: fx should be above 0 and at most"),
         ({"fx": True}, "camera 1: fx should be a number, not True"),
         ({"fx": 10**400}, "camera 1: fx should be a finite number"),
         ({"width": 0}, "camera 1: width should be a whole number of px from 1 to 65536, not 0"),
-        ({"width": 70000}, "width should be a whole number"),
-        ({"width": 1.5}, "width should be a whole number"),
         ({"position": [1, 2]}, "camera 1: position should be 3 numbers"),
         ({"position": [1e308, 1e308, 1e308]}, None),
         ({"rotation": [[1, 0, 0], [0, 1, 0]]}, "rotation should be 3 rows of 3 numbers"),
         ({"rotation": [[2, 0, 0], [0, 1, 0], [0, 0, 1]]}, "R·Rᵀ is 3 off the identity"),
         ({"rotation": [[-1, 0, 0], [0, 1, 0], [0, 0, 1]]}, "it mirrors"),
-        ({"rotation": [[1e200, 0, 0], [0, 1, 0], [0, 0, 1]]}, "should be a rotation"),
         ({"img_name": "../a"}, "path '../a' should stay within the dataset"),
-        ({"img_name": "/etc/passwd"}, "should stay within the dataset"),
         ({"img_name": "C:\\a"}, "should stay within the dataset"),
-        ({"img_name": "a\0b"}, "img_name should be printable text"),
         ({"img_name": "\ud800"}, "img_name should be printable text"),
-        ({"img_name": ""}, "img_name should be printable text"),
         ({"img_name": "y" * 5000}, None),
     ],
     ids=str,
@@ -248,13 +224,6 @@ def test_inria_names_what_is_wrong(tmp_path, change, message):
     assert "cameras.json" in str(caught.value)
 
 
-def test_missing_field_is_named(tmp_path):
-    entry = inria_entry()
-    del entry["fy"]
-    with pytest.raises(FormatError, match="camera 0: fy is missing"):
-        read_cameras(inria(tmp_path, entry))
-
-
 def test_rotation_is_made_orthonormal(tmp_path):
     rough = [[0.0, -1.0002, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.9999]]
     (camera,) = read_cameras(inria(tmp_path, inria_entry(rotation=rough))).train
@@ -264,18 +233,8 @@ def test_rotation_is_made_orthonormal(tmp_path):
 
 @pytest.mark.parametrize(
     "text",
-    [
-        "",
-        "{}",
-        "[]",
-        "[1]",
-        "null",
-        "[" * 100_000,
-        '[{"img_name": NaN}]',
-        '[{"img_name": "a", "width": ' + "9" * 5000 + "}]",
-        "\xff",
-    ],
-    ids=range(9),
+    ["", "{}", "[]", "[1]", "[" * 100_000, '[{"width": ' + "9" * 5000 + "}]", "\xff"],
+    ids=range(7),
 )
 def test_odd_json_is_refused(tmp_path, text):
     (tmp_path / "cameras.json").write_text(text, encoding="latin-1")
@@ -283,10 +242,9 @@ def test_odd_json_is_refused(tmp_path, text):
         read_cameras(tmp_path)
 
 
-@pytest.mark.parametrize("constant", ["NaN", "Infinity", "-Infinity"])
-def test_json_holds_no_constants_even_where_they_are_not_used(tmp_path, constant):
-    inria(tmp_path, inria_entry(id=float(constant)))
-    with pytest.raises(FormatError, match=f"{constant} is no finite number"):
+def test_json_holds_no_constants_even_where_they_are_not_used(tmp_path):
+    inria(tmp_path, inria_entry(id=math.inf))
+    with pytest.raises(FormatError, match="Infinity is not a finite number"):
         read_cameras(tmp_path)
 
 
@@ -353,18 +311,7 @@ def test_colmap_values(tmp_path, write):
     assert (first.hw, first.trained_focal) == ((200, 400), 250)
 
 
-@pytest.mark.parametrize("points", ["", "1 2 3"])
-def test_colmap_text_is_the_same_as_binary(tmp_path, points):
-    binary = read_cameras(colmap_bin(tmp_path / "bin"))
-    text = read_cameras(colmap_txt(tmp_path / "txt", points=points))
-    for a, b in zip(binary.all, text.all, strict=True):
-        assert torch.equal(a.cam_from_world, b.cam_from_world)
-        assert (a.name, a.hw, a.fx, a.fy, a.cx, a.cy) == (b.name, b.hw, b.fx, b.fy, b.cx, b.cy)
-
-
-@pytest.mark.parametrize(
-    "path", [".", "sparse", "sparse/0", "sparse/0/images.bin", "sparse/0/cameras.bin"]
-)
+@pytest.mark.parametrize("path", [".", "sparse", "sparse/0", "sparse/0/images.bin"])
 def test_colmap_is_found_from_anywhere_in_it(tmp_path, path):
     colmap_bin(tmp_path / "sparse" / "0")
     photo(tmp_path / "images" / "a.b.png", 400, 200)
@@ -440,27 +387,21 @@ def test_a_colmap_camera_that_sees_all_around_is_refused(tmp_path):
         read_cameras(tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("model", "count"),
-    list(enumerate([3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6, 2])),
-)
-def test_colmap_models_have_their_number_of_parameters(tmp_path, model, count):
-    """A second camera is met only if the first one's parameters were all read and no more."""
-    cameras = ((2, model, 400, 200, (1.0,) * count), *CAMERAS)
-    assert len(read_cameras(colmap_bin(tmp_path, cameras)).all) == 2
+def test_colmap_models_have_their_number_of_parameters(tmp_path):
+    """The cameras that follow are read only if each one's parameters were all read and no more."""
+    counts = [3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6, 2]
+    first = [(10 + model, model, 400, 200, (1.0,) * count) for model, count in enumerate(counts)]
+    assert len(read_cameras(colmap_bin(tmp_path, (*first, *CAMERAS))).all) == 2
 
 
 @pytest.mark.parametrize(
     ("image", "message"),
     [
         ((1, (0.0, 0, 0, 0), (0.0, 0, 0), 1, "a"), "image 1: quaternion should be finite"),
-        ((1, (math.nan, 0, 0, 0), (0.0, 0, 0), 1, "a"), "image 1: quaternion should be finite"),
         ((1, (1.0, 0, 0, 0), (math.inf, 0, 0), 1, "a"), "translation should be a finite number"),
         ((1, (1.0, 0, 0, 0), (0.0, 0, 0), 9, "a"), "uses camera 9"),
         ((1, (1.0, 0, 0, 0), (0.0, 0, 0), 1, "../a"), "should stay within the dataset"),
-        ((1, (1.0, 0, 0, 0), (0.0, 0, 0), 1, "/a"), "should stay within the dataset"),
         ((1, (1.0, 0, 0, 0), (0.0, 0, 0), 1, "a\nb"), "name should be printable"),
-        ((1, (1.0, 0, 0, 0), (0.0, 0, 0), 1, ""), "name should be printable"),
         ((1, (1.0, 0, 0, 0), (0.0, 0, 0), 1, "n" * 5000), "should end within 4096 bytes"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
@@ -475,19 +416,12 @@ def test_colmap_cut_anywhere_is_refused(tmp_path):
     colmap_bin(tmp_path)
     for name in ("cameras.bin", "images.bin"):
         data = (tmp_path / name).read_bytes()
-        for length in range(len(data)):
+        for length in [*range(0, len(data), 11), len(data) - 1]:
             (tmp_path / name).write_bytes(data[:length])
-            with pytest.raises(FormatError, match=name):
+            with pytest.raises(FormatError, match=name) as caught:
                 read_cameras(tmp_path)
         (tmp_path / name).write_bytes(data)
-
-
-def test_colmap_truncation_names_record_and_bytes(tmp_path):
-    colmap_bin(tmp_path)
-    data = (tmp_path / "images.bin").read_bytes()
-    (tmp_path / "images.bin").write_bytes(data[:-1])
-    with pytest.raises(FormatError, match=r"points of image record 1 need 48 bytes .* 47 are left"):
-        read_cameras(tmp_path)
+    assert "points of image record 1 need 48 bytes at least, and 47 are left" in str(caught.value)
 
 
 def test_photo_behind_a_link_out_of_the_dataset_is_refused(tmp_path):
@@ -584,20 +518,14 @@ def test_transforms_intrinsics_of_a_frame_come_first(tmp_path):
         ({"distortion_params": 3}, "distortion_params should be a list"),
         ({"camera_model": "EQUIRECTANGULAR"}, "camera_model is EQUIRECTANGULAR"),
         ({"camera_angle_x": 3.2}, "camera_angle_x should be above 0 and below π"),
-        ({"camera_angle_x": 5e-324}, "camera_angle_x should be above 0 and below π"),
         ({"file_path": "../x"}, "should stay within the dataset"),
-        ({"file_path": "/x"}, "should stay within the dataset"),
-        ({"file_path": 3}, "file_path should be printable text"),
         ({"transform_matrix": OPENGL[:3]}, "transform_matrix should be 4 rows of 4 numbers"),
         ({"transform_matrix": [*OPENGL[:3], [0, 0, 0, 2]]}, "last row should be 0 0 0 1"),
-        ({"w": "40"}, "w should be a number"),
     ],
     ids=str,
 )
 def test_transforms_name_what_is_wrong(tmp_path, frame, message):
     document = transforms([{"file_path": "a"} | frame], w=40, h=20)
-    if "w" in frame:
-        del document["w"]
     with pytest.raises(FormatError) as caught:
         read_cameras(write_json(tmp_path / "transforms.json", document))
     assert message in str(caught.value)
@@ -609,7 +537,6 @@ def test_transforms_name_what_is_wrong(tmp_path, frame, message):
         ({"k1": -0.1, "p2": 0.01, "camera_model": "OPENCV"}, "OPENCV", (-0.1, 0, 0, 0.01, 0)),
         ({"k1": -0.1, "k3": 0.2}, "PINHOLE", (-0.1, 0, 0, 0, 0.2)),
         ({"k4": 0.1, "camera_model": "OPENCV"}, "OPENCV", None),  # nerfstudio's own
-        ({"distortion_params": [0, 0.1]}, "PINHOLE", None),
         ({"camera_model": "OPENCV_FISHEYE", "k4": 0.1}, "OPENCV_FISHEYE", (0, 0, 0, 0.1)),
         ({"is_fisheye": True}, "fisheye", (0, 0, 0, 0)),
         ({"camera_model": "ORTHOPHOTO"}, "ORTHOPHOTO", None),
@@ -661,10 +588,8 @@ def test_an_exported_list_is_in_the_trained_frame(tmp_path):
     ("change", "message"),
     [
         ({"fl_x": None}, "give nerfstudio's transforms.json"),
-        ({"w": None}, "its lens is unknown"),
         ({"transform": None}, "item 0 should be an object with file_path and transform"),
         ({"transform": 3}, "transform_matrix should be"),
-        ({"transform": [[1, 0, 0, 0]]}, "transform_matrix should be"),
         ({"file_path": None}, "file_path is missing"),
     ],
     ids=str,
@@ -673,12 +598,6 @@ def test_an_exported_list_names_what_it_lacks(tmp_path, change, message):
     entry = {k: v for k, v in (EXPORTED | change).items() if v is not None}
     with pytest.raises(FormatError, match=message):
         read_cameras(write_json(tmp_path / "transforms_train.json", [entry]))
-
-
-@pytest.mark.data
-def test_a_real_exported_list_is_read(shared_data):
-    file = shared_data / "formats/transforms/abhishek_splatfacto/transforms_train.json"
-    assert len(read_cameras(file).train) == 875
 
 
 def test_nerfstudios_lists_are_the_split(tmp_path):
@@ -767,11 +686,9 @@ def test_a_camera_path_is_free_cameras(tmp_path):
     "change",
     [
         {"camera_type": "equirectangular"},
-        {"render_width": 0},
         {"camera_path": []},
         {"camera_path": [{"fov": 180, "camera_to_world": [0] * 16}]},
         {"camera_path": [{"fov": 50, "camera_to_world": [0] * 16}]},
-        {"camera_path": [{"fov": 50, "camera_to_world": [1] * 15}]},
     ],
     ids=str,
 )
@@ -820,7 +737,7 @@ def test_odd_llff_files_are_refused(tmp_path):
             read_cameras(tmp_path)
     header = llff(tmp_path / "good") / "poses_bounds.npy"
     file.write_bytes(header.read_bytes().replace(b"(9, 17)", b"(999999999, 17)"))
-    with pytest.raises(FormatError, match=r"no \.npy file"):
+    with pytest.raises(FormatError, match=r"not a \.npy file"):
         read_cameras(tmp_path)
 
 
@@ -849,8 +766,17 @@ def test_multiscale_blender_has_a_view_a_scale(tmp_path):
         read_cameras(tmp_path, test_every=8)
 
 
-@pytest.mark.parametrize("key", ["file_path", "cam2world", "width", "height", "focal"])
-@pytest.mark.parametrize("value", [None, 3, [], [1], ["../x", "y"], [1e999, 1]], ids=str)
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("file_path", ["../x", "y"]),
+        ("cam2world", None),
+        ("width", []),
+        ("height", [1]),
+        ("focal", [1e999, 1]),
+    ],
+    ids=str,
+)
 def test_odd_multiscale_sets_are_refused(tmp_path, key, value):
     document = json.loads(multiscale(tmp_path).read_text())
     document["train"][key] = value
@@ -886,13 +812,7 @@ def test_a_folder_without_cameras_says_what_was_looked_for(tmp_path):
 
 @pytest.mark.parametrize(
     "options",
-    [
-        {"train_scale": 0.0},
-        {"train_scale": math.nan},
-        {"train_scale": 1e9},
-        {"test_every": 1},
-        {"test_every": -8},
-    ],
+    [{"train_scale": 0.0}, {"train_scale": math.nan}, {"train_scale": 1e9}, {"test_every": 1}],
     ids=str,
 )
 def test_odd_options_are_refused(tmp_path, options):
@@ -906,56 +826,99 @@ def test_views_are_chosen_by_split_or_name(tmp_path):
     assert select_views(cameras, "test") == cameras.test
     assert len(select_views(cameras, "all")) == 17
     assert names(select_views(cameras, "v08, v01,v08")) == ["v08", "v01"]
-    with pytest.raises(UsageError, match=r"no view 'v1'.*v1"):
+    with pytest.raises(UsageError, match=r"views: there is no view 'v1'.*v1"):
         select_views(cameras, "v01,v1")
     with pytest.raises(UsageError):
         select_views(cameras, "")
-
-
-def test_a_name_in_both_splits_is_the_test_view(tmp_path):
-    cameras = read_cameras(blender(tmp_path))
-    assert select_views(cameras, "r_0") == (cameras.test[0],)
-    assert select_views(cameras, "r_2") == (cameras.train[2],)
+    both = read_cameras(blender(tmp_path / "blender"))
+    assert select_views(both, "r_0") == (both.test[0],), "a name in both splits is the test view"
 
 
 # Hostile bytes ----------------------------------------------------------------------------------
 
 
-def fixtures(folder):
-    """Each format once, and the file of it to spoil."""
-    yield inria(folder / "inria", cfg="Namespace(eval=True, resolution=4)"), "cameras.json"
-    yield folder / "inria", "cfg_args"
-    yield colmap_bin(folder / "bin"), "cameras.bin"
-    yield folder / "bin", "images.bin"
-    yield colmap_txt(folder / "txt"), "cameras.txt"
-    yield folder / "txt", "images.txt"
-    yield blender(folder / "blender"), "transforms_train.json"
-    yield write_json(folder / "pinhole" / "p.json", pinhole()), ""
-    yield write_json(folder / "path" / "camera_path.json", camera_path()), ""
-    yield llff(folder / "llff"), "poses_bounds.npy"
-    yield multiscale(folder / "multiscale").parent, "metadata.json"
+FIXTURES = {  # how to make each format's files, the path to read, and the file to spoil
+    "inria": (lambda folder: inria(folder, cfg="Namespace(eval=True)"), "cameras.json"),
+    "inria_model": (lambda folder: inria(folder, cfg="Namespace(eval=True)"), "cfg_args"),
+    "colmap": (colmap_bin, "cameras.bin"),
+    "images.bin": (colmap_bin, "images.bin"),
+    "cameras.txt": (colmap_txt, "cameras.txt"),
+    "images.txt": (colmap_txt, "images.txt"),
+    "blender": (blender, "transforms_train.json"),
+    "transforms": (
+        lambda folder: (
+            write_json(
+                folder / "transforms.json", transforms([{"file_path": "a"}], w=4, h=2)
+            ).parent
+        ),
+        "transforms.json",
+    ),
+    "pinhole": (lambda folder: write_json(folder / "p.json", pinhole()), ""),
+    "camera_path": (lambda folder: write_json(folder / "path.json", camera_path()), ""),
+    "llff": (llff, "poses_bounds.npy"),
+    "multiscale": (lambda folder: multiscale(folder).parent, "metadata.json"),
+}
 
 
+@pytest.mark.parametrize("name", [format.name for format in OWN])
+def test_each_format_is_recognized_and_no_other_takes_its_files(tmp_path, name):
+    path = FIXTURES[name][0](tmp_path / "set") if name != "inria" else inria(tmp_path / "set")
+    takers = [format.name for format in OWN if format.sniff(path)]
+    assert takers == ([name, "inria"] if name == "inria_model" else [name])
+    assert read_cameras(path).all
+
+
+@dataclass(frozen=True)
+class Dialect:
+    """A plug-in that reads transforms.json in its own way."""
+
+    name: str = "dialect"
+    sign: str = "a dialect"
+
+    def sniff(self, path: Path) -> bool:
+        return path.name == "transforms.json"
+
+    def read(self, path: Path, options: Options) -> CameraSet:
+        return CameraSet((), (), notes=("by the plug-in",))
+
+
+def test_a_plug_in_is_asked_before_the_own_formats(tmp_path, monkeypatch):
+    own = {format.name: format for format in OWN}
+    monkeypatch.setattr(
+        "aaplug.io.cameras.CAMERA_FORMATS", Registry("camera format", own | {"dialect": Dialect()})
+    )
+    path = write_json(tmp_path / "transforms.json", transforms([{"file_path": "a"}], w=4, h=2))
+    assert read_cameras(path).notes == ("by the plug-in",)
+    assert read_cameras(tmp_path).notes != ("by the plug-in",)
+
+
+def test_a_path_is_text_too(tmp_path):
+    assert len(aaplug.read_cameras(str(inria(tmp_path))).all) == 1
+    assert (
+        len(read_camera_path(str(write_json(tmp_path / "path.json", camera_path()))).cameras) == 1
+    )
+
+
+@pytest.mark.parametrize("name", FIXTURES)
 @settings(
-    max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(data=st.data())
-def test_spoiled_files_read_or_raise_our_errors(tmp_path, data):
-    shutil.rmtree(tmp_path / "spoil", ignore_errors=True)
-    path, name = data.draw(st.sampled_from(list(fixtures(tmp_path / "spoil"))))
-    file = path / name if name else path
-    spoiled = bytearray(file.read_bytes())
+def test_spoiled_files_read_or_raise_our_errors(tmp_path, name, data):
+    make, spoil = FIXTURES[name]
+    path = make(tmp_path)
+    file = path / spoil if spoil else path
+    whole = file.read_bytes()
+    spoiled = bytearray(whole)
     for _ in range(data.draw(st.integers(1, 4))):
-        at = data.draw(st.integers(0, len(spoiled) - 1))
-        length = data.draw(st.integers(0, 4))
-        spoiled[at : at + length] = data.draw(st.binary(max_size=8))
-        if not spoiled:
-            break
+        at = data.draw(st.integers(0, max(0, len(spoiled) - 1)))
+        spoiled[at : at + data.draw(st.integers(0, 4))] = data.draw(st.binary(max_size=8))
     file.write_bytes(spoiled)
     try:
         assert isinstance(read_cameras(path), CameraSet)
     except AaplugError as error:
         str(error).encode()
+    file.write_bytes(whole)
 
 
 # Real scenes ------------------------------------------------------------------------------------
@@ -978,37 +941,26 @@ def test_one_scene_has_the_same_poses_in_all_its_formats(shared_data):
 
 
 @pytest.mark.data
-def test_chair(shared_data):
-    cameras = read_cameras(shared_data / "chair")
-    assert (len(cameras.train), len(cameras.test)) == (100, 25)
-    assert cameras.background == WHITE
-    assert all(c.hw == (800, 800) and c.photo for c in cameras.all)
-    eighth = read_cameras(shared_data / "chair", train_scale=1 / 8)
-    assert all(c.hw == (100, 100) and c.trained_focal == c.focal for c in eighth.all)
-
-
-@pytest.mark.data
 def test_test_views_by_name_are_those_that_3dgs_lists_first(shared_data):
-    for folder in (shared_data / "formats" / "inria").rglob("original_3dgs_train/*"):
-        listed = [entry["img_name"] for entry in json.loads((folder / "cameras.json").read_text())]
-        cameras = read_cameras(folder)
-        assert names(cameras.test) == listed[: len(cameras.test)]
+    folders = sorted((shared_data / "formats" / "inria").rglob("original_3dgs_train/*"))
+    folder = min(folders, key=lambda folder: (folder / "cameras.json").stat().st_size)
+    listed = [entry["img_name"] for entry in json.loads((folder / "cameras.json").read_text())]
+    cameras = read_cameras(folder)
+    assert names(cameras.test) == listed[: len(cameras.test)]
 
 
 @pytest.mark.data
 @pytest.mark.parametrize("kind", ["colmap", "inria", "transforms"])
 def test_real_files_read_or_raise_our_errors(shared_data, kind):
-    files = [path for path in (shared_data / "formats" / kind).rglob("*") if path.is_file()]
+    """Small folders only: large ones take seconds and show nothing new."""
     outcomes = set()
-    for path in {*files, *(file.parent for file in files)}:
-        try:
-            outcomes.add(bool(read_cameras(path).all))
-        except FormatError:
-            outcomes.add(False)
+    for folder in {path.parent for path in (shared_data / "formats" / kind).rglob("*.*")}:
+        files = [path for path in folder.iterdir() if path.is_file()]
+        if any(path.stat().st_size > 300_000 for path in files):
+            continue
+        for path in [folder, *files]:
+            try:
+                outcomes.add(bool(read_cameras(path).all))
+            except FormatError:
+                outcomes.add(False)
     assert outcomes == {True, False} or kind == "inria"
-
-
-@pytest.mark.data
-def test_truncated_model_is_refused(shared_data):
-    with pytest.raises(FormatError, match=r"images\.bin: 10040 points of image record \d+ need"):
-        read_cameras(shared_data / "formats" / "colmap" / "jianzhengjie" / "data")

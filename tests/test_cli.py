@@ -5,6 +5,7 @@ import math
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -15,6 +16,7 @@ from aaplug_cli.main import main
 from plyfile import PlyData
 
 from aaplug.core.cameras import BLACK
+from aaplug.core.gaussians import MIP
 from aaplug.io.cameras import read_cameras
 from aaplug.io.images import image_size, write_png
 from aaplug.io.scenes import read_scene, write_scene

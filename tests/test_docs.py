@@ -1,11 +1,11 @@
-"""What the documents promise is what tests prove."""
+"""Every claim of the tables in formats.md names the tests that prove it."""
 
 import re
 from pathlib import Path
 
 import pytest
 
-from aaplug.io.scenes import FORMATS
+from aaplug.io.scenes import SCENE_FORMATS
 
 ROOT = Path(__file__).resolve().parents[1]
 ROWS = [
@@ -34,7 +34,7 @@ def test_each_row_of_the_table_of_formats_names_its_proof(row: str):
 
 @pytest.mark.parametrize("row", SCENES, ids=lambda row: row.split("|")[1].strip())
 def test_each_row_of_scenes_proves_reading_writing_and_the_tag(row: str):
-    """As many proofs as claims: a test may prove several, but what can be written names a test that writes it."""
+    """One test may prove several claims, but a format that can be written names a test that writes it."""
     _, _, _, written, tag, proofs, _ = row.split("|")
     bodies = [
         _body(file, name) for file, name in re.findall(r"`(test_\w+\.py)::(test_\w+)`", proofs)
@@ -49,5 +49,5 @@ def test_each_row_of_scenes_proves_reading_writing_and_the_tag(row: str):
 def test_every_format_has_a_row():
     text = "\n".join(ROWS)
     assert len(ROWS) >= 20
-    for format in FORMATS:
+    for format in SCENE_FORMATS.values():
         assert format.name in text.lower(), format.name

@@ -9,19 +9,15 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from aaplug.core.errors import FormatError, OutputError, UsageError
-from aaplug.io.images import (
-    downsample,
-    encode_png,
-    image_size,
-    quantised,
-    read_image,
-    write_png,
-)
+import aaplug
+from aaplug.core.errors import FormatError, OutputError
+from aaplug.core.imaging import quantised
+from aaplug.io.images import encode_png, image_size, read_image, read_rgba, write_png
+from aaplug.io.photographs import read_photo
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the real scenes are not here")
@@ -48,16 +44,6 @@ def test_reading_a_written_png_gives_the_quantised_image(tmp_path: Path, bit_dep
     write_png(tmp_path / "a.png", rgb, bit_depth)
     assert torch.equal(read_image(tmp_path / "a.png", None), quantised(rgb, bit_depth))
     assert image_size(tmp_path / "a.png") == (7, 5)
-
-
-@pytest.mark.parametrize("bit_depth", [8, 16])
-def test_quantise_rounds_to_the_nearest_code_and_is_idempotent(bit_depth: int):
-    rgb = random_image()
-    rounded = quantised(rgb, bit_depth)
-    assert (rounded - rgb).abs().max() <= 0.5001 / (2**bit_depth - 1)
-    assert torch.equal(quantised(rounded, bit_depth), rounded)
-    assert torch.equal(quantised(rgb * 0 - 3, bit_depth), rgb * 0)
-    assert torch.equal(quantised(rgb * 0 + 3, bit_depth), rgb * 0 + 1)
 
 
 @pytest.mark.parametrize("bit_depth", [8, 16])
@@ -89,12 +75,11 @@ def test_sixteen_bit_alpha_is_composited(tmp_path: Path):
 
 def test_a_transparent_image_needs_a_background(tmp_path: Path):
     path = save(tmp_path / "a.png", np.full((2, 2, 4), 255, np.uint8))
-    with pytest.raises(FormatError, match=r"a\.png: is transparent.*--background"):
+    with pytest.raises(FormatError, match=r"a\.png: is transparent.*pass `background`"):
         read_image(path, None)
 
 
-@pytest.mark.parametrize("suffix", [".png", ".tiff"])
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize(("suffix", "dtype"), [(".png", np.uint8), (".tiff", np.uint16)])
 def test_gray_becomes_three_equal_channels(tmp_path: Path, suffix: str, dtype: type):
     top = np.iinfo(dtype).max
     path = save(tmp_path / f"a{suffix}", np.array([[0, top // 5, top]], dtype))
@@ -183,8 +168,8 @@ def test_between_pillows_limit_and_ours_a_size_is_just_a_size(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 1000)
-    Image.new("1", (16384, 16384)).save(tmp_path / "large.png")
-    assert image_size(tmp_path / "large.png") == (16384, 16384)
+    Image.new("1", (16384, 4096)).save(tmp_path / "large.png")
+    assert image_size(tmp_path / "large.png") == (16384, 4096)
     assert Image.MAX_IMAGE_PIXELS == 1000
 
 
@@ -192,37 +177,14 @@ def test_an_existing_png_stays_unless_overwritten(tmp_path: Path):
     path = tmp_path / "a.png"
     write_png(path, random_image())
     before = path.read_bytes()
-    with pytest.raises(OutputError, match="--overwrite"):
+    with pytest.raises(OutputError, match="pass `overwrite`"):
         write_png(path, random_image() * 0)
     assert path.read_bytes() == before
     write_png(path, random_image() * 0, overwrite=True)
     assert read_image(path, None).max() == 0
 
 
-def test_downsample_averages_boxes_and_crops_the_rest():
-    rgb = torch.arange(7 * 8 * 3, dtype=torch.float64).reshape(7, 8, 3)
-    got = downsample(rgb, 3)
-    assert got.shape == (2, 2, 3)
-    for row in range(2):
-        for column in range(2):
-            box = rgb[3 * row : 3 * row + 3, 3 * column : 3 * column + 3].reshape(9, 3)
-            assert torch.allclose(got[row, column], box.mean(0))
-
-
-@given(st.integers(1, 9), st.integers(1, 9), st.integers(-1, 10))
-def test_downsample_gives_an_image_or_a_usage_error(height: int, width: int, factor: int):
-    try:
-        got = downsample(torch.ones(height, width, 3), factor)
-    except UsageError:
-        assert not 1 <= factor <= min(height, width)
-    else:
-        assert torch.equal(got, torch.ones(height // factor, width // factor, 3))
-
-
-def test_downsampling_by_one_changes_nothing():
-    assert torch.equal(downsample(random_image(), 1), random_image())
-
-
+@settings(max_examples=40, deadline=None)
 @given(st.binary(max_size=200), st.sampled_from(["PNG", "JPEG", "TIFF", "WEBP", "BMP"]))
 def test_noise_in_an_image_never_escapes(tmp_path_factory, noise: bytes, kind: str):
     content = io.BytesIO()
@@ -235,6 +197,15 @@ def test_noise_in_an_image_never_escapes(tmp_path_factory, noise: bytes, kind: s
         assert read_image(path, WHITE).shape[2] == 3
     except FormatError:
         return  # and nothing else
+
+
+def test_paths_are_text_too(tmp_path: Path):
+    path, rgb = str(tmp_path / "a.png"), quantised(random_image())
+    aaplug.write_png(path, rgb)
+    assert image_size(path) == (7, 5)
+    assert torch.equal(aaplug.read_image(path), rgb)
+    assert torch.equal(read_photo(path, WHITE), rgb)
+    assert torch.equal(read_rgba(path)[..., :3], rgb)
 
 
 @needs_data

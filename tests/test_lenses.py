@@ -1,4 +1,4 @@
-"""Photographs straightened, against pictures taken of a known plane through lenses written out by hand."""
+"""Photographs undistorted, against images of a known plane through lens models written out here."""
 
 from dataclasses import replace
 
@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from aaplug.core.cameras import Camera
-from aaplug.io.lenses import Distortion, straight, straightened
+from aaplug.io.lenses import Distortion, undistorted, undistorted_cameras
 from aaplug.io.photographs import DOWNSCALES
 
 SIZE = 160, 120
@@ -71,7 +71,7 @@ def camera_of(tmp_path, lens: Distortion, times: int = 1) -> Camera:
     fx, fy, cx, cy = PINHOLE
     pose = torch.eye(4, dtype=torch.float64)
     camera = Camera("a", *SIZE, fx, fy, cx, cy, pose, photo=tmp_path / "a.png")
-    return straightened([camera], [lens])[0]
+    return undistorted_cameras([camera], [lens])[0]
 
 
 def seen_by(camera: Camera, times: int = 1) -> np.ndarray:
@@ -82,8 +82,9 @@ def seen_by(camera: Camera, times: int = 1) -> np.ndarray:
     return plane(rays).reshape(height, width, 3)
 
 
-@pytest.mark.parametrize("times", [1, 2])
-@pytest.mark.parametrize("name", LENSES)
+@pytest.mark.parametrize(
+    ("name", "times"), [("barrel", 1), ("pincushion", 2), ("full", 1), ("fisheye", 2)]
+)
 def test_a_straightened_photograph_is_what_the_pinhole_sees(tmp_path, name, times):
     camera = camera_of(tmp_path, LENSES[name], times)
     photo = DOWNSCALES["box"].read(camera.photo, (0.0, 0.0, 0.0), camera.lens)
@@ -116,13 +117,13 @@ def test_a_barrel_shows_all_of_its_pinhole_and_a_pincushion_most(tmp_path):
 def test_a_lens_that_shows_little_of_its_pinhole_has_no_photograph(tmp_path):
     camera = replace(camera_of(tmp_path, LENSES["barrel"]), lens=None)
     strong = Distortion("OPENCV", (30.0, 0.0, 0.0, 0.0))
-    (found,) = straightened([camera], [strong])
+    (found,) = undistorted_cameras([camera], [strong])
     assert (found.photo, found.lens, found.width) == (None, None, SIZE[0])
 
 
 def test_a_photograph_without_a_lens_is_itself():
     image = torch.rand(4, 5, 3)
-    assert straight(image, None) is image
+    assert undistorted(image, None) is image
 
 
 @pytest.mark.parametrize("name", LENSES)

@@ -1,4 +1,4 @@
-"""Scene files lose nothing on the way through, and damaged ones end in one line."""
+"""Scene files are read and written without loss, and damaged ones end in one line of error."""
 
 import logging
 import random
@@ -15,6 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from plyfile import PlyData
 
+import aaplug
 from aaplug.core.errors import FormatError, OutputError, UsageError
 from aaplug.core.gaussians import (
     ANTIALIASED,
@@ -136,7 +137,7 @@ ROUND_TRIPS = {
     "long type names": plain(columns=[("float32", n) for _, n in File().columns]),
     "filter_3D": filtered("hello"),
     "record": plain("aaplug fused=mip convention=antialiased k=1", "aaplug was here"),
-    **{f"degree {d}": plain(degree=d) for d in range(4)},
+    **{f"degree {d}": plain(degree=d) for d in (0, 3, 4)},
 }
 
 
@@ -176,7 +177,7 @@ def test_an_unchanged_scene_is_written_back_to_the_byte(tmp_path: Path, file: Fi
 
 
 @given(st.integers(0, 3), st.integers(0, 20), st.sampled_from([*CONVENTIONS.values()]), st.data())
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=12, deadline=None)
 def test_what_was_written_is_read(tmp_path_factory, degree, n, convention, data):
     folder = tmp_path_factory.getbasetemp()
     word = st.text("abcXYZ019._-+", min_size=1, max_size=8)
@@ -229,17 +230,12 @@ def test_only_changed_columns_differ(tmp_path: Path):
     assert [n for n in old.dtype.names or () if (old[n] != new[n]).any()] == ["scale_1"]
 
 
-@pytest.mark.parametrize("index", [[3, 1], [], [4, 4, 0]])
+@pytest.mark.parametrize("index", [[], [4, 4, 0]])
 def test_chosen_rows_keep_their_unknown_columns(tmp_path: Path, index: list[int]):
     file = File(columns=shuffled, after=(box, bytes(range(10))))
     scene = read_scene(file.save(tmp_path))[torch.tensor(index, dtype=torch.int64)]
     expected = replace(file, count=str(len(index))).header + file.rows[index].tobytes()
     assert through(scene, tmp_path) == expected + file.after[1]
-
-
-def test_double_precision_is_written_as_float(tmp_path: Path):
-    scene = read_scene(File().save(tmp_path))
-    assert through(scene.to(torch.float64), tmp_path) == File().content
 
 
 def test_fewer_harmonics_drop_their_columns(tmp_path: Path):
@@ -260,10 +256,8 @@ def test_large_scenes_are_copied_in_whole(tmp_path: Path):
 @pytest.mark.parametrize(
     ("name", "n", "degree"),
     [
-        ("chair/chair.ply", 49_295, 3),
         ("splats/train-1000.ply", 1000, 3),
         ("splats/flowers_lod3_sh2.ply", 26_895, 2),
-        ("small_splats/supersplat_pr291/fruit_drops_minimal.ply", 4721, 3),
         ("small_splats/metalsplatter/SplatIO/TestData/test-splat.3-points-from-train.ply", 3, 3),
     ],
 )
@@ -280,8 +274,6 @@ def test_real_scenes_are_written_back_to_the_byte(tmp_path: Path, name, n, degre
     ("name", "problem"),
     [
         ("formats/inria/dngs/model/input.ply", "point cloud or a mesh"),
-        ("formats/small_splats/metalsplatter/PLYIO/TestData/beetle.ascii.ply", "lacks f_dc_0"),
-        ("formats/small_splats/metalsplatter/PLYIO/TestData/beetle.binary.ply", "lacks f_dc_0"),
         ("formats/small_splats/cvlab_pc_short/public/pc_short.ply", "14,029 bytes more"),
     ],
 )
@@ -298,15 +290,11 @@ def test_real_files_that_are_no_scenes_are_refused(name: str, problem: str):
     [
         (plain(), CLASSIC, "no tag in the file: assumed classic"),
         (plain("SplatRenderMode: mip"), MIP, "SplatRenderMode: mip"),
-        (plain("splatrendermode:MIP"), MIP, "MIP"),
-        (plain("SplatRenderMode: default"), CLASSIC, "default"),
         (plain("SplatRenderMode: antialiased"), ANTIALIASED, "antialiased"),
         (plain("SplatRenderMode: mip", "SplatRenderMode: default"), CLASSIC, "default"),
         (plain("SplatRenderMode: fancy"), CLASSIC, "fancy, is unknown"),
-        (plain("antialiased 1"), ANTIALIASED, "antialiased 1"),
         (plain("antialiased 1", "antialiased 0"), CLASSIC, "antialiased 0"),
         (plain("SplatRenderMode: mip", "antialiased 0"), MIP, "SplatRenderMode"),
-        (plain("not antialiased 1"), CLASSIC, "no tag"),
         (filtered("SplatRenderMode: default"), MIP, "filter_3D"),
         (filtered("aaplug fused=x convention=antialiased"), ANTIALIASED, "aaplug's record"),
         (plain("aaplug fused=x a=b", "antialiased 1"), ANTIALIASED, "antialiased 1"),
@@ -325,15 +313,14 @@ def test_the_user_knows_best(tmp_path: Path):
     scene = read_scene(path, convention=ANTIALIASED)
     assert scene.convention == ANTIALIASED
     assert scene.origin
-    assert scene.origin.evidence == "given by --convention"
+    assert scene.origin.evidence == "stated by the user"
 
 
-@pytest.mark.parametrize("mask", ["float", "uchar"])
-def test_pixel_sizes_are_read_and_kept(tmp_path: Path, mask: str):
-    sizes = [("float", "max_pixel_sizes"), ("float", "min_pixel_sizes"), (mask, "base_mask")]
+def test_pixel_sizes_are_read_and_kept(tmp_path: Path):
+    sizes = [("float", "max_pixel_sizes"), ("float", "min_pixel_sizes"), ("uchar", "base_mask")]
     file = plain(columns=[*File().columns, *sizes])
     opened = open_scene(file.save(tmp_path))
-    assert "pixel sizes of Multi-Scale 3DGS, for --recipe multi-scale" in opened.notes
+    assert "pixel sizes of Multi-Scale 3DGS, for the recipe multi-scale" in opened.notes
     scene, stored = opened.whole(), values(file.content, file)
     assert scene.pixel_sizes is not None
     assert scene.pixel_sizes.smallest.tolist() == stored["min_pixel_sizes"].tolist()
@@ -361,27 +348,12 @@ def test_the_filter_column_is_read_dropped_and_written(tmp_path: Path):
     )
 
 
-def test_other_elements_keep_their_columns(tmp_path: Path):
-    other = (["element cell 1", "property float filter_3D"], bytes(4))
-    scene = read_scene(replace(filtered(), before=other).save(tmp_path))
-    content = through(replace(scene, filter_3d=None), tmp_path)
-    assert content.count(b"property float filter_3D") == 1
-    assert b"element cell 1\nproperty float filter_3D\nelement vertex 5\n" in content
-    scene = read_scene(replace(plain(), after=other).save(tmp_path))
-    content = through(replace(scene, filter_3d=torch.ones(5)), tmp_path)
-    assert b"rot_3\nproperty float filter_3D\nelement cell 1\nproperty float filter_3D" in content
-    assert read_scene(tmp_path / "out.ply").filter_3d is not None
-
-
 @pytest.mark.parametrize(
     ("before", "convention", "after"),
     [
         (["hi", "SplatRenderMode: default"], MIP, ["hi", "SplatRenderMode: mip"]),
         (["antialiased 0", "splatrendermode: x"], MIP, ["SplatRenderMode: mip"]),
-        (["SplatRenderMode: mip", "hi"], CLASSIC, ["hi"]),
         (["antialiased 1", "hi"], CLASSIC, ["hi"]),
-        (["antialiased 1", "SplatRenderMode: default"], CLASSIC, None),
-        (["antialiased 1"], ANTIALIASED, None),
         (["SplatRenderMode: mip", "SplatRenderMode: mip"], MIP, None),
         (
             ["SplatRenderMode: mip", "SplatRenderMode: MIP"],
@@ -429,7 +401,6 @@ def test_a_fusion_is_recorded_and_read_back(tmp_path: Path):
     [
         ("aaplug fused=mip convention=fancy", "convention=fancy; known are classic"),
         ("aaplug fused=mip kernel", "expected key=value"),
-        ("aaplug fused=", "expected key=value"),
     ],
 )
 def test_comments_that_cannot_be_obeyed_are_refused(tmp_path: Path, comment: str, problem: str):
@@ -453,8 +424,8 @@ def coded(folder: Path, file: File, order: str) -> Path:
 @pytest.mark.parametrize("order", [">", "text"])
 @pytest.mark.parametrize(
     "file",
-    [plain("hello"), filtered(), File(columns=shuffled, before=(box, bytes(range(10))), after=(faces, face_rows))],
-    ids=["plain", "filtered", "tables"],
+    [filtered("hello"), File(columns=shuffled, before=(box, bytes(range(10))), after=(faces, face_rows))],
+    ids=["filtered", "tables"],
 )  # fmt: skip
 def test_every_coding_gives_the_same_scene(tmp_path: Path, file: File, order: str):
     path = coded(tmp_path, file, order)
@@ -466,14 +437,14 @@ def test_every_coding_gives_the_same_scene(tmp_path: Path, file: File, order: st
     assert open_scene(path).notes[0] == f"coding: {expected}"
 
 
-@pytest.mark.parametrize("column", ["x", "f_rest_3", "scale_1", "opacity"])
+@pytest.mark.parametrize("column", ["f_rest_3", "scale_1"])
 def test_double_columns_are_read_as_float_and_kept_where_unchanged(tmp_path: Path, column: str):
     file = with_type("double", column)
     scene = read_scene(file.save(tmp_path))
     assert through(scene, tmp_path) == file.content
     moved = through(replace(scene, means=scene.means + 1, sh=scene.sh + 1), tmp_path)
     old, new = values(file.content, file), values(moved, file)
-    changed = column in ("x", "f_rest_3")
+    changed = column == "f_rest_3"
     assert (old[column] != new[column]).all() == changed
     assert (old[column] == new[column]).all() != changed
 
@@ -492,13 +463,6 @@ def test_colours_in_bytes_become_harmonics_of_degree_0(tmp_path: Path):
     content = through(scene, tmp_path)
     assert b"property uchar red" in content
     assert torch.equal(read_scene(tmp_path / "out.ply").sh, scene.sh)
-
-
-def test_degree_4_is_read_and_written(tmp_path: Path):
-    file = plain(degree=4)
-    scene = read_scene(file.save(tmp_path))
-    assert (scene.sh.shape, scene.sh_degree) == ((5, 25, 3), 4)
-    assert through(scene, tmp_path) == file.content
 
 
 @pytest.mark.parametrize(
@@ -522,7 +486,7 @@ def test_2d_gaussians_without_an_origin_have_two_scales(tmp_path: Path):
     assert read_scene(tmp_path / "out.ply").flat
 
 
-@pytest.mark.parametrize("text", ["Müller", "\x85 \xa0", "日本"])
+@pytest.mark.parametrize("text", ["\x85 \xa0", "日本"])
 def test_comments_of_any_alphabet_are_kept(tmp_path: Path, text: str):
     file = plain(text)
     scene = read_scene(file.save(tmp_path))
@@ -554,22 +518,21 @@ def test_each_producers_comments_are_understood_and_kept(tmp_path, comments, con
     assert through(scene, tmp_path) == file.content
 
 
-@pytest.mark.parametrize("convention", [CLASSIC, ANTIALIASED, MIP])
 @pytest.mark.parametrize("kind", ["binary", ">", "text", "double", "bytes", "filter", "disc"])
-def test_every_kind_of_ply_keeps_the_convention(tmp_path: Path, kind: str, convention: Convention):
-    colours = [*(n for n in parameters(0) if not n.startswith("f_dc"))]
+def test_every_kind_of_ply_keeps_the_convention(tmp_path: Path, kind: str):
+    """Antialiased is the one that needs both a viewer's tag and aaplug's own comment."""
+    names = [n for n in parameters(0) if not n.startswith("f_dc")]
+    colours = [("uchar", c) for c in ("red", "green", "blue")]
     file = {
         "double": with_type("double", "x"),
-        "bytes": plain(
-            columns=[*(("float", n) for n in colours), *(("uchar", c) for c in ("red", "green", "blue"))]
-        ),
+        "bytes": plain(columns=[*(("float", n) for n in names), *colours]),
         "filter": filtered(),
         "disc": without("scale_2"),
-    }.get(kind, plain("hello"))  # fmt: skip
+    }.get(kind, plain("hello"))
     path = coded(tmp_path, file, kind) if kind in (">", "text") else file.save(tmp_path)
-    through(replace(read_scene(path), convention=convention), tmp_path)
+    through(replace(read_scene(path), convention=ANTIALIASED), tmp_path)
     again = read_scene(tmp_path / "out.ply")
-    assert again.convention == convention
+    assert again.convention == ANTIALIASED
     write_scene(tmp_path / "twice.ply", again)
     assert (tmp_path / "twice.ply").read_bytes() == (tmp_path / "out.ply").read_bytes()
 
@@ -616,41 +579,28 @@ def test_a_file_that_changes_while_it_is_read_is_noticed(tmp_path: Path):
 
 BAD_HEADERS = {
     "count 10^12": (File(count=str(10**12)), "promises .* bytes and it has"),
-    "count 2^63": (File(count=str(2**63)), "impossible count"),
     "count of 5000 digits": (File(count="9" * 5000), "impossible count '9{60}'"),
     "count -5": (File(count="-5"), "impossible count '-5'"),
-    "count 5.0": (File(count="5.0"), "impossible count"),
     "one row too many promised": (File(count="6"), "5 of 6 Gaussians are whole"),
     "one row too few promised": (File(count="4"), "92 bytes more"),
     "missing columns": (without("x", "rot_3", "opacity"), "lacks x, opacity, rot_3, which"),
     "one scale": (without("scale_1", "scale_2"), "lacks scale_1, which"),
-    "short position": (with_type("short", "x"), "x must be float"),
     "int harmonics": (with_type("int32", "f_rest_3"), "f_rest_3 must be float"),
     "duplicate property": (extended("x"), "property of vertex 'x' is declared twice"),
-    "duplicate element": (File(after=(box + box, bytes(20))), "element 'chunk' is declared twice"),
     "duplicate list": (File(after=([*faces, faces[1]], face_rows)), "declared twice"),
     "8 f_rest": (with_rest([f"f_rest_{i}" for i in range(8)]), "8 f_rest"),
     "f_rest with a gap": (with_rest([f"f_rest_{i}" for i in range(1, 10)]), "not f_rest_0"),
     "ascii that is binary": (File(top=["format ascii 1.0"]), "is damaged and cannot be read"),
-    "ascii 10^12": (File(top=["format ascii 1.0"], count=str(10**12)), "is cut short"),
     "big endian": (File(top=["format binary_big_endian 1.0"]), "quaternion"),
     "version": (File(top=["format binary_little_endian 2.0"]), "2.0; known are"),
     "no format": (File(top=[]), "its format is none"),
-    "two formats": (File(top=[*File().top, *File().top]), "1.0 and binary"),
     "unknown type": (File(after=(["element a 1", "property half b"], b"")), "not PLY"),
-    "unknown keyword": (File(top=[*File().top, "surprise"]), "line 3 .* 'surprise'"),
-    "property first": (File(top=[*File().top, "property float q"]), "not PLY"),
     "name not ASCII": (extended("é"), "line 27 of the header is not ASCII"),
     "1001 lines": (plain(*["c"] * 1000), "lines, more than the 1000"),
     "long header": (plain(*["c" * 1000] * 200), "no line 'end_header' in its first 131,072"),
     "old Mac line ends": (File(newline=b"\r"), "first line"),
-    "trailing bytes": (File(after=([], b"x")), "1 bytes more"),
     "trailing after lists": (File(after=(faces, face_rows + b"x")), "1 bytes after"),
     "short lists": (File(after=(faces, face_rows[:-1])), "is damaged and cannot be read"),
-    "faces 10^12": (
-        File(after=(["element face 1000000000000", *faces[1:]], face_rows)),
-        "is cut short",
-    ),
     "list of 2^31": (
         File(after=(["element face 1", "property list int int v"], b"\xff\xff\xff\x7f")),
         "is damaged and cannot be read",
@@ -685,49 +635,27 @@ def test_a_file_without_vertices_is_refused(tmp_path: Path):
         read_scene(path)
 
 
-@pytest.mark.parametrize("kind", ["header line", "body"])
-def test_64_mib_of_nothing_is_refused_at_once(tmp_path: Path, kind: str):
-    path = tmp_path / "in.ply"
-    start = b"ply\nformat binary_little_endian 1.0\ncomment " if kind == "header line" else b"p"
-    with path.open("wb") as stream:
-        stream.write(start)
-        stream.write(b"a" * (64 << 20))
-    begin = time.perf_counter()
-    with pytest.raises(FormatError):
-        read_scene(path)
-    assert time.perf_counter() - begin < QUICK
-
-
-@pytest.mark.parametrize("file", [File(), File(newline=b"\r\n"), File(n=0, count="0")])
-def test_a_header_cut_anywhere_is_refused(tmp_path: Path, file: File):
-    path = tmp_path / "in.ply"
-    for size in range(len(file.header)):
+def test_a_header_cut_anywhere_is_refused(tmp_path: Path):
+    file, path = File(n=0, count="0", newline=b"\r\n"), tmp_path / "in.ply"
+    for size in [*range(0, len(file.header), 17), len(file.header) - 1]:
         path.write_bytes(file.content[:size])
         with pytest.raises(FormatError, match=r"in\.ply: "):
             read_scene(path)
 
 
-@pytest.mark.parametrize(("kept", "whole"), [(0, 0), (91, 0), (92, 1), (300, 3), (459, 4)])
+@pytest.mark.parametrize(("kept", "whole"), [(0, 0), (91, 0), (459, 4)])
 def test_a_cut_body_says_how_much_is_whole(tmp_path: Path, kept: int, whole: int):
-    path = tmp_path / "in.ply"
-    path.write_bytes(File().header + File().rows.tobytes()[:kept])
-    sizes = f"{len(File().content)} bytes and it has {len(File().header) + kept}"
+    file, path = File(before=(box, bytes(10))), tmp_path / "in.ply"
+    path.write_bytes(file.header + file.before[1] + file.rows.tobytes()[:kept])
+    sizes = f"{len(file.content)} bytes and it has {len(file.header) + 10 + kept}"
     with pytest.raises(FormatError) as caught:
         read_scene(path)
     assert sizes in str(caught.value).replace(",", "")
     assert f"{whole} of 5 Gaussians are whole" in str(caught.value)
 
 
-def test_whole_rows_are_counted_after_the_elements_before(tmp_path: Path):
-    path = tmp_path / "in.ply"
-    file = File(before=(box, bytes(10)))
-    path.write_bytes(file.content[:-1])
-    with pytest.raises(FormatError, match="4 of 5 Gaussians are whole"):
-        read_scene(path)
-
-
 @given(st.data())
-@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=50, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 def test_flipped_bytes_in_a_header_end_in_a_scene_or_one_error(tmp_path_factory, data):
     file = plain("SplatRenderMode: mip", "aaplug fused=x convention=mip", after=(faces, face_rows))
     content = bytearray(file.content)
@@ -745,7 +673,7 @@ def test_flipped_bytes_in_a_header_end_in_a_scene_or_one_error(tmp_path_factory,
 
 
 @given(st.binary(max_size=300))
-@settings(deadline=None)
+@settings(max_examples=30, deadline=None)
 def test_noise_after_ply_is_refused(tmp_path_factory, noise: bytes):
     path = tmp_path_factory.getbasetemp() / "noise.ply"
     path.write_bytes(b"ply\n" + noise)
@@ -785,9 +713,6 @@ def damaged(folder: Path, file: File, **cells: tuple[int, float]) -> Path:
     return path
 
 
-MEANT = {("scale", -np.inf), ("opaci", np.inf)}  # no thickness; opaque
-
-
 @pytest.mark.parametrize("column", ["scale_1", "opacity"])
 def test_infinities_that_have_a_meaning_are_kept(tmp_path: Path, column: str):
     path = damaged(tmp_path, plain(), **{column: (3, -np.inf if column == "scale_1" else np.inf)})
@@ -797,18 +722,22 @@ def test_infinities_that_have_a_meaning_are_kept(tmp_path: Path, column: str):
     assert through(scene, tmp_path) == path.read_bytes()
 
 
-@pytest.mark.parametrize("column", [*parameters(1), "filter_3D"])
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_a_bad_number_is_found_in_every_column(tmp_path: Path, column: str, value: float):
-    if (column[:5], value) in MEANT:
-        pytest.skip("has a meaning")
+@pytest.mark.parametrize(
+    "column", ["x", "f_dc_1", "f_rest_8", "opacity", "scale_2", "rot_0", "filter_3D"]
+)
+def test_a_bad_number_is_found_in_every_kind_of_column(tmp_path: Path, column: str, value: float):
     path = damaged(tmp_path, filtered(), **{column: (3, value)})
+    if (column, value) in {("scale_2", -np.inf), ("opacity", np.inf)}:  # no thickness; opaque
+        assert len(read_scene(path)) == 5
+        return
     what = "NaN" if np.isnan(value) else "Inf"
-    with pytest.raises(
-        FormatError, match=f"in.ply: row 3 has {what} in {column}[;,].*pass --drop-bad"
-    ):
+    problem = f"in.ply: row 3 has {what} in {column}[;,].*pass `drop_bad`"
+    with pytest.raises(FormatError, match=problem):
         read_scene(path)
-    assert read_scene(path, drop_bad=True).origin.rows.tolist() == [0, 1, 2, 4]  # type: ignore[union-attr]
+    origin = read_scene(path, drop_bad=True).origin
+    assert origin is not None
+    assert origin.rows.tolist() == [0, 1, 2, 4]
 
 
 def test_a_bad_number_in_an_unknown_column_is_kept(tmp_path: Path):
@@ -816,20 +745,13 @@ def test_a_bad_number_in_an_unknown_column_is_kept(tmp_path: Path):
     assert through(read_scene(path), tmp_path) == path.read_bytes()
 
 
-@pytest.mark.parametrize(
-    ("length", "problem"), [(0.0, "length zero"), (1e-20, "length zero"), (3e38, "too long")]
-)
+@pytest.mark.parametrize(("length", "problem"), [(1e-20, "length zero"), (3e38, "too long")])
 def test_a_quaternion_without_direction_is_refused(tmp_path: Path, length: float, problem: str):
     cells = {f"rot_{i}": (1, length) for i in range(4)}
     path = damaged(tmp_path, File(), **cells)
     with pytest.raises(FormatError, match=f"row 1 has a quaternion.*{problem}"):
         read_scene(path)
     assert len(read_scene(path, drop_bad=True)) == 4
-
-
-def test_a_negative_filter_is_refused(tmp_path: Path):
-    with pytest.raises(FormatError, match="row 0 has a negative filter_3D"):
-        read_scene(damaged(tmp_path, filtered(), filter_3D=(0, -1.0)))
 
 
 def test_dropped_rows_are_counted_aloud_and_stay_dropped(
@@ -860,7 +782,7 @@ def test_dropped_rows_are_counted_aloud_and_stay_dropped(
     ("name", "problem"),
     [
         ("missing.ply", "cannot be read: no such file"),
-        (".", "is a folder"),
+        (".", "holds no point_cloud/iteration_<N>"),
         ("empty.ply", "is empty"),
         ("junk.ply", r"no known scene format; aaplug reads \.compressed\.ply, \.ply, \.spz"),
         ("nul\0.ply", "cannot be read"),
@@ -879,12 +801,6 @@ def test_formats_are_told_by_content(tmp_path: Path):
     assert len(read_scene(path)) == 5
 
 
-def test_a_suffix_nobody_writes_is_refused(tmp_path: Path):
-    with pytest.raises(OutputError, match=r"can be written: \.ply"):
-        write_scene(tmp_path / "out.sog", random_scene(1, 0))
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_scene_is_never_written_over_its_own_file(tmp_path: Path):
     path = File().save(tmp_path)
     (tmp_path / "link.ply").symlink_to(path)
@@ -893,15 +809,6 @@ def test_a_scene_is_never_written_over_its_own_file(tmp_path: Path):
         with pytest.raises(OutputError, match="is also the input"):
             write_scene(output, scene, overwrite=True)
     assert path.read_bytes() == File().content
-
-
-def test_an_existing_scene_needs_overwrite(tmp_path: Path):
-    write_scene(tmp_path / "out.ply", random_scene(1, 0))
-    with pytest.raises(OutputError, match="--overwrite"):
-        write_scene(tmp_path / "out.ply", random_scene(2, 0))
-    assert len(read_scene(tmp_path / "out.ply")) == 1
-    write_scene(tmp_path / "out.ply", random_scene(2, 0), overwrite=True)
-    assert len(read_scene(tmp_path / "out.ply")) == 2
 
 
 def test_a_failure_while_writing_leaves_the_old_scene(
@@ -942,10 +849,14 @@ def test_a_model_folder_means_its_last_iteration(tmp_path: Path):
 
 def test_a_folder_without_scenes_is_refused(tmp_path: Path):
     with pytest.raises(FormatError, match="holds no point_cloud/iteration_<N>"):
-        find_scene(inria_model(tmp_path))
+        read_scene(inria_model(tmp_path))
 
 
-def test_a_file_is_its_own_scene(tmp_path: Path):
-    path = File().save(tmp_path)
-    assert find_scene(path) == path
-    assert find_scene(tmp_path / "missing.ply") == tmp_path / "missing.ply"
+def test_paths_are_text_too_and_a_folder_is_a_scene(tmp_path: Path):
+    model = str(inria_model(tmp_path / "model", "7000", "30000"))
+    assert len(read_scene(model)) == open_scene(model, iteration=7000).count == 5
+    assert find_scene(model, 7000).parent.name == "iteration_7000"
+    scene = aaplug.read_scene(str(File().save(tmp_path)))
+    write_scene(str(tmp_path / "text.ply"), scene)
+    write_parts(str(tmp_path / "parts.ply"), [scene], 5, [str(tmp_path / "in.ply")])
+    assert (tmp_path / "text.ply").read_bytes() == (tmp_path / "parts.ply").read_bytes()

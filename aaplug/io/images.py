@@ -54,7 +54,7 @@ def read_image(
     """
     pixels = _read(Path(path))
     if pixels.shape[2] == ALPHA_CHANNELS and background is None:
-        raise FormatError(path, "is transparent; pass background, the colour behind it")
+        raise FormatError(path, "is transparent; pass `background`, the colour behind it")
     return torch.from_numpy(pixels if background is None else _composite(pixels, background))
 
 

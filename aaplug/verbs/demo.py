@@ -63,9 +63,9 @@ def demo(
             cameras,
             recipe=RECIPES,
             scale=SCALES,
-            metric=("psnr", "ssim"),
             output=folder,
             overwrite=overwrite,
+            metric=("psnr", "ssim"),
             name="chair",
             monitor=monitor,
         )

@@ -61,7 +61,9 @@ def read(path: Path, options: Options) -> CameraSet:
     sizes, why = _training_sizes(source, options)
     lenses = [_distortion(intrinsics[image.camera_id]) for image in images]
     trained = undistorted_cameras(trained_at(source, sizes), lenses)
-    split = every_nth(trained, options, LLFF_HOLD, "3DGS --eval's rule; test_every=0 for no split")
+    split = every_nth(
+        trained, options, LLFF_HOLD, "3DGS --eval's rule; `test_every` 0 for no split"
+    )
     kind = f"COLMAP ({images_file.suffix[1:]})"
     return camera_set(kind, source, split, why, more=lens_notes(lenses, trained))
 
@@ -102,7 +104,7 @@ def _training_sizes(cameras: Sequence[Camera], options: Options) -> tuple[list[S
     sizes = photo_sizes(cameras)
     why = f"size of the {there} photos found" if there else "size in the file, no photos found"
     if max(width for width, _ in sizes) > WIDTH_CAP:
-        why += f"; 3DGS itself would have capped the width at {WIDTH_CAP}: train_scale sets it"
+        why += f"; 3DGS itself would have capped the width at {WIDTH_CAP}: `train_scale` sets it"
     return sizes, why
 
 

@@ -102,7 +102,7 @@ def _training_sizes(
     base, base_why = _base_sizes(cameras, run)
     rule = f"resolution {run.resolution:g} in cfg_args"
     if settings is None:
-        rule = f"3DGS's cap at {WIDTH_CAP} px, assumed without cfg_args: train_scale sets it"
+        rule = f"3DGS's cap at {WIDTH_CAP} px, assumed without cfg_args: `train_scale` sets it"
     return [run.size(*size) for size in base], f"{base_why}, {rule}"
 
 
@@ -123,7 +123,7 @@ def _split(cameras: Sequence[Camera], settings: CfgArgs | None, options: Options
         return explicit(cameras[second:], cameras[:second], "names repeat: test views come first")
     ordered = sorted(_renamed(cameras), key=lambda camera: camera.name)
     if settings is None:
-        return every_nth(ordered, options, 0, "no cfg_args; test_every=8 is 3DGS's rule")
+        return every_nth(ordered, options, 0, "no cfg_args; `test_every` 8 is 3DGS's rule")
     hold = LLFF_HOLD if held_out else 0
     return every_nth(ordered, options, hold, f"eval={held_out} in cfg_args")
 

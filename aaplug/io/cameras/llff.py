@@ -46,7 +46,7 @@ def read(path: Path, options: Options) -> CameraSet:
     if options.train_scale is not None:
         sizes, why = file_sizes(source, options)
     trained = trained_at(source, sizes)
-    split = every_nth(trained, options, LLFF_HOLD, "LLFF's rule; test_every=0 for no split")
+    split = every_nth(trained, options, LLFF_HOLD, "LLFF's rule; `test_every` 0 for no split")
     return camera_set(f"LLFF {FILE}", source, split, why)
 
 

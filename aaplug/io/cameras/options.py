@@ -62,7 +62,7 @@ def every_nth(cameras: Sequence[Camera], options: Options, custom: int, source: 
     """
     n = custom
     if options.test_every is not None:
-        n, source = options.test_every, f"test_every {options.test_every}"
+        n, source = options.test_every, f"`test_every` {options.test_every}"
     if not n:
         return undivided(cameras, source)
     if len(cameras) == 1:

@@ -29,7 +29,7 @@ def file_sizes(cameras: Sequence[Camera], options: Options) -> tuple[list[Size],
     most = whole_limit("CAMERA_SIDE")
     if max(map(max, sizes), default=0) > most:
         raise UsageError("train_scale", f"makes an image of more than {most} px a side")
-    return sizes, "size in the file" + ("" if scale is None else f" × {scale:g}: train_scale")
+    return sizes, "size in the file" + ("" if scale is None else f" × {scale:g}: `train_scale`")
 
 
 def photo_sizes(cameras: Sequence[Camera]) -> list[Size]:

@@ -40,7 +40,7 @@ def open_scene(path: Path, options: Options) -> SceneFile:
     if not options.allow_checkpoint:
         raise FormatError(
             path,
-            "is a training checkpoint (a pickle); pass allow_checkpoint to read it, or export it as .ply",
+            "is a training checkpoint (a pickle); pass `allow_checkpoint` to read it, or export it as .ply",
         )
     found = re.match(r"(\d+)\.(\d+)", torch.__version__)
     if found is None or (int(found[1]), int(found[2])) < SAFE_TORCH:

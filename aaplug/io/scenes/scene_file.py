@@ -287,7 +287,7 @@ def _check(
     assert part.origin is not None
     if not drop_bad:
         what = listing([_described(fault, part.origin.rows) for fault in faults])
-        raise FormatError(path, f"{what}; pass drop_bad to leave such rows out")
+        raise FormatError(path, f"{what}; pass `drop_bad` to leave such rows out")
     for fault in faults:
         dropped[fault.text] = dropped.get(fault.text, 0) + int(fault.rows.sum())
     return torch.stack([fault.rows for fault in faults]).any(dim=0)

@@ -48,8 +48,8 @@ SCALE_STEPS, SCALE_LEAST = 16.0, -10.0  # log-scales: steps per unit, and the sm
 MAGNITUDE = 511  # 9 bits of a quaternion's component; the tenth is its sign
 AXES_NOTES = {
     "opengl": "axes turned from OpenGL's to OpenCV's, by the specification "
-    "(spz_axes=opencv if the writer did not turn them, as splat-transform and gsply)",
-    "opencv": "axes as stored (spz_axes=opencv)",
+    "(`spz_axes` opencv if the writer did not turn them, as splat-transform and gsply)",
+    "opencv": "axes as stored (`spz_axes` opencv)",
 }
 
 name = "spz"

@@ -26,6 +26,7 @@ from aaplug.methods.pixel_kernels.raster_rows import (
 
 QUARTER = COLUMNS  # our own column: a quarter of the pixel's side, in px
 POINTS = tuple(product((-1, 1), repeat=2))  # in quarters of the pixel, from its centre
+SMALLEST = 1e-3  # px: a window can be 0, but `grown` needs a radius above 0
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ class FourPoints:
 
     def bounding_ellipses(self, splats: Splats2D, rules: Rules) -> Splats2D:
         """Ellipses that contain the centre of every pixel with one of its points in the splat."""
-        radius = math.sqrt(2) * splats.window / 4
+        radius = max(math.sqrt(2) * splats.window / 4, SMALLEST)
         return grown(splats, torch.full_like(splats.dets, radius), rules.min_alpha)
 
     def raster_rows(self, splats: Splats2D, kernels: Kernels) -> Float[Tensor, "m c"]:

@@ -6,10 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from aaplug.core.errors import FormatError
 from aaplug.core.gaussians import Gaussians
+from aaplug.core.spherical_harmonics import COLOUR_OFFSET, SH_C0
 from aaplug.io.atomic import replacing
+from aaplug.io.scenes.options import Options
 from aaplug.io.scenes.scene_file import (
     SceneFile,
     check_count,
@@ -19,42 +23,40 @@ from aaplug.io.scenes.scene_file import (
 )
 
 COLUMNS = 8
-C0 = 0.28209479177387814  # 1/(2√π): the spherical harmonic of degree 0
+EVIDENCE = "the format does not say: assumed classic (3DGS default)"
 
 
 @dataclass(frozen=True)
 class Balls:
     """Spheres of one colour; position and radius in world units, colour and opacity in [0, 1]."""
 
-    name: str = "balls"
+    name: str = "balls"  # also the files' suffix
+    needs: str | None = None  # a package that writing imports
 
     def sniff(self, path: Path, head: bytes) -> bool:
-        """Whether a file is of this format: text has no signature, so its name decides."""
+        """Whether the suffix is .balls; a text file has no signature."""
         return path.suffix.lower() == ".balls"
 
-    def open_scene(self, path: Path) -> SceneFile:
-        """Look at the scene in the file.
+    def open_scene(self, path: Path, options: Options) -> SceneFile:
+        """Read what the file says about the scene.
 
         Raises:
             FormatError: a line is not what it should be.
         """
         with library_errors(path):
-            rows = np.loadtxt(path, dtype=np.float32, ndmin=2)
+            rows = torch.from_numpy(np.loadtxt(path, dtype=np.float32, ndmin=2))
         if rows.shape[1] != COLUMNS:
             raise FormatError(path, f"has {rows.shape[1]} numbers per line instead of {COLUMNS}")
         check_count(path, len(rows))
-        table = torch.from_numpy(rows)
-        evidence = "the format does not say: assumed classic (3DGS default)"
-        return SceneFile(
-            path,
-            self.name,
-            len(rows),
-            0,
-            lambda start, stop: _gaussians(table[start:stop]),
-            evidence,
-        )
 
-    def write(self, path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool) -> None:
+        def load(start: int, stop: int) -> Gaussians:
+            return _gaussians(rows[start:stop])
+
+        return SceneFile(path, self.name, len(rows), 0, load, EVIDENCE)
+
+    def write(
+        self, path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: Options
+    ) -> None:
         """Write a scene; the widest axis becomes the radius.
 
         Raises:
@@ -63,16 +65,15 @@ class Balls:
         with replacing(path, overwrite) as stream:
             for part in parts:
                 radius = part.scales.amax(dim=1, keepdim=True)
-                colour = (0.5 + C0 * part.sh[:, 0]).clamp(0, 1)
+                colour = (COLOUR_OFFSET + SH_C0 * part.sh[:, 0]).clamp(0, 1)
                 columns = [part.means, radius, colour, part.opacities[:, None]]
                 np.savetxt(stream, torch.cat(columns, dim=1).numpy(), fmt="%.9g")
 
 
-def _gaussians(rows: torch.Tensor) -> Gaussians:
-    upright = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(rows), 1)
+def _gaussians(rows: Float[Tensor, "n 8"]) -> Gaussians:
     return Gaussians(
         means=rows[:, :3],
-        quats=upright,
+        quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(rows), 1),
         log_scales=rows[:, 3:4].log().expand(-1, 3),
         logit_opacities=logit_of(rows[:, 7]),
         sh=sh_of_colour(rows[:, 4:7])[:, None],

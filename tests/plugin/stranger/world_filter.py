@@ -2,13 +2,13 @@
 
 from dataclasses import dataclass, replace
 
+from aaplug.core.convolution import smoothed_by
 from aaplug.core.gaussians import Fusion, Gaussians
 from aaplug.core.training import TrainingViews
-from aaplug.methods.filters.smoothing import smooth
 
 
 @dataclass(frozen=True)
-class Coarse:
+class Dull:
     """Widen every Gaussian by `variance` px² at its lowest training rate, and keep its integral."""
 
     variance: float = 0.05
@@ -17,9 +17,9 @@ class Coarse:
         """Fuse the smoothing into scales and opacities."""
         rates = training.bounds.lowest.where(training.bounds.seen, float("inf"))
         log_sigma = (self.variance**0.5 / rates).log()[:, None]  # -inf changes nothing
-        smoothed = smooth(scene, log_sigma, volume=True)
-        record = Fusion("coarse", {"variance": f"{self.variance:g}"})
+        smoothed = smoothed_by(scene, log_sigma, volume=True)
+        record = Fusion("dull", {"variance": f"{self.variance:g}"})
         return replace(smoothed, fused=(*scene.fused, record))
 
 
-COARSE = Coarse()
+DULL = Dull()

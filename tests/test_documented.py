@@ -1,0 +1,225 @@
+"""Whatever README and the guides show runs: every fenced block as it stands, with small files of the names it uses."""
+
+import json
+import os
+import re
+import runpy
+import shlex
+import shutil
+import tomllib
+from dataclasses import replace
+from itertools import chain
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+from aaplug_cli.main import main
+from PIL import Image
+
+from aaplug.core.gaussians import Gaussians
+from aaplug.io.cameras import read_cameras
+from aaplug.io.scenes import read_scene, write_scene
+from tests.conftest import SAMPLE
+
+ROOT = Path(__file__).resolve().parents[1]
+GUIDES = sorted((ROOT / "examples" / "guides").glob("*.md"))
+GAUSSIANS = 400
+SIZE = 48  # px: side of the photographs
+TRAINING = 6  # cameras
+RUN_BY_THE_GATE = "<!-- "  # stands before README's blocks that .ci/run executes
+SHORTER = {  # options that make a documented command quicker; they come last, so they take precedence
+    "finetune": ["--steps", "2"],
+    "video": ["--seconds", "0.1"],
+    "bench": ["--repeats", "1", "--gaussians", "100"],
+}
+FITTING = ["--steps", "2"]  # of `convert --for`, likewise
+ELSEWHERE = {  # commands of the tests and benches themselves, and what runs them instead
+    "python -m tests.bench.method_tables every_recipe": "ten minutes; needs scenes beside the repository",
+    "AAPLUG_FUZZ=10000 python -m pytest tests/test_hostile_files.py": "pytest runs it with fewer mutations",
+    "python -m tests.hostile all 10000": "test_hostile_files.py runs it with fewer mutations",
+    "python -m tests.guided -max_total_time=60": ".ci/run",
+}
+
+
+class Block(NamedTuple):
+    """A fenced block.  file: its name in the guide, from a first comment line."""
+
+    document: str
+    number: int
+    language: str
+    text: str
+
+    def __str__(self) -> str:
+        return f"{self.document}-{self.number}-{self.language}"
+
+
+def blocks_of(path: Path) -> list[Block]:
+    found = re.finditer(r"(^<!-- .*-->\n)?^```(\w*)\n(.*?)^```$", path.read_text(), re.M | re.S)
+    return [
+        Block(path.stem, number, match[2], match[3])
+        for number, match in enumerate(found, 1)
+        if not (match[1] or "").startswith(RUN_BY_THE_GATE)
+    ]
+
+
+BLOCKS = [
+    block
+    for path in (ROOT / "README.md", *GUIDES)
+    if path.stem != "contributing"  # test_plugin.py runs its blocks, with its plug-in installed
+    for block in blocks_of(path)
+]
+COMMANDS = [block for block in BLOCKS if block.language == "bash"]
+PROGRAMS = [block for block in BLOCKS if block.language == "python"]
+TABLES = [block for block in BLOCKS if block.language == "toml"]
+
+
+def few(scene: Gaussians) -> Gaussians:
+    """The largest Gaussians of a scene, which any view shows."""
+    return scene[scene.log_scales.sum(dim=1).topk(GAUSSIANS).indices.sort().values]
+
+
+@pytest.fixture(scope="module")
+def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder that holds every file that the documents name."""
+    folder = tmp_path_factory.mktemp("documented")
+    scene = replace(few(read_scene(SAMPLE / "chair.ply")), origin=None)
+    for name in ("scene.ply", "a.ply", "b.ply", "chair.ply", "toy/point_cloud.ply"):
+        (folder / name).parent.mkdir(exist_ok=True)
+        write_scene(folder / name, scene)
+    for name in ("path/to/colmap", "chair", "toy"):
+        write_cameras(folder / name)
+    for name in ("scene", "garden", "bicycle"):
+        write_model(folder / "output" / name, scene, folder / "chair")
+    (folder / "camera_path.json").write_text(json.dumps(camera_path(folder / "chair")))
+    for block in TABLES:
+        name = re.match(r"# (\S+)\n", block.text)
+        assert name is not None, f"{block} does not say in a first comment which file it is"
+        (folder / name[1]).write_text(block.text)
+    return folder
+
+
+def write_cameras(folder: Path) -> None:
+    """The sample's cameras, a few of them, with small photographs of two test views."""
+    (folder / "test").mkdir(parents=True)
+    for split, count in (("train", TRAINING), ("test", 2)):
+        data = json.loads((SAMPLE / f"transforms_{split}.json").read_text())
+        step = len(data["frames"]) // count if split == "train" else 1
+        data |= {"frames": data["frames"][::step][:count], "w": SIZE, "h": SIZE}
+        (folder / f"transforms_{split}.json").write_text(json.dumps(data))
+    for name in ("r_8", "r_24"):
+        small(SAMPLE / "test" / f"{name}.png", folder / "test" / f"{name}.png")
+
+
+def small(source: Path, target: Path) -> None:
+    with Image.open(source) as image:
+        image.resize((SIZE, SIZE)).save(target)
+
+
+def write_model(folder: Path, scene: Gaussians, photographs: Path) -> None:
+    """An INRIA model folder with the test cameras and their photographs."""
+    (folder / "point_cloud" / "iteration_7").mkdir(parents=True)
+    write_scene(folder / "point_cloud" / "iteration_7" / "point_cloud.ply", scene)
+    cameras = read_cameras(photographs)
+    entries = []
+    for number, camera in enumerate((*cameras.test, *cameras.train)):
+        rotation = camera.cam_from_world[:3, :3].T
+        entries.append(
+            {"id": number, "img_name": camera.name, "width": SIZE, "height": SIZE}
+            | {"position": camera.centre.tolist(), "rotation": rotation.tolist()}
+            | {"fx": camera.fx, "fy": camera.fy}
+        )
+    (folder / "cameras.json").write_text(json.dumps(entries))
+    shutil.copytree(photographs / "test", folder / "images")
+    for camera in cameras.train:
+        shutil.copy(photographs / "test" / "r_8.png", folder / "images" / f"{camera.name}.png")
+    arguments = "eval=True, images='images', resolution=1, white_background=True"
+    (folder / "cfg_args").write_text(f"Namespace({arguments})")
+
+
+def camera_path(folder: Path) -> dict[str, object]:
+    """Two frames of nerfstudio's camera path, at poses of a Blender data set, whose axes are the same."""
+    frames = json.loads((folder / "transforms_test.json").read_text())["frames"]
+    path = [
+        {"camera_to_world": list(chain(*frame["transform_matrix"])), "fov": 40.0}
+        for frame in frames
+    ]
+    return {"render_width": SIZE, "render_height": SIZE, "fps": 10, "camera_path": path}
+
+
+@pytest.fixture
+def here(prepared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A fresh copy of the folder, to run in."""
+    shutil.copytree(prepared, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_there_are_blocks_of_every_kind():
+    assert len(COMMANDS) > 15
+    assert PROGRAMS
+    assert TABLES
+    assert {block.language for block in BLOCKS} <= {"bash", "python", "toml", "json"}
+    assert set(ELSEWHERE) <= {line for block in COMMANDS for line in lines_of(block)}
+
+
+@pytest.mark.parametrize("block", COMMANDS, ids=str)
+def test_documented_commands_run(block, here, capsys):
+    before = set(here.rglob("*"))
+    for line in lines_of(block):
+        if line in ELSEWHERE:
+            continue
+        program, verb, *words = shlex.split(line)
+        assert program == "aaplug", f"{line}: run this too, or say in ELSEWHERE who does"
+        shorter = FITTING if verb == "convert" and "--for" in words else SHORTER.get(verb, [])
+        with pytest.raises(SystemExit) as stop:
+            main([verb, *words, *shorter])
+        printed = capsys.readouterr()
+        assert not stop.value.code, f"{line}\n{printed.err}"
+        if {"-o"} & set(words):
+            output = here / words[words.index("-o") + 1]
+            assert output.exists(), f"{line} wrote no {output.name}"
+            assert output not in before, f"{line} names an input as its output"
+        else:
+            assert printed.out, f"{line} printed nothing"
+
+
+def lines_of(block: Block) -> list[str]:
+    """The commands of a block, without comments and with continued lines joined."""
+    joined = block.text.replace("\\\n", " ").splitlines()
+    return [line.strip() for line in joined if line.strip() and not line.startswith("#")]
+
+
+@pytest.mark.parametrize("block", PROGRAMS, ids=str)
+def test_documented_programs_run(block, here):
+    before = set(os.listdir(here))
+    (here / "program.py").write_text(block.text)
+    variables = runpy.run_path("program.py")
+    image = variables.get("image")
+    wrote = set(os.listdir(here)) - before - {"program.py"}
+    assert wrote or (image is not None and image.std() > 0.01), "the program shows nothing"
+
+
+@pytest.mark.parametrize("block", TABLES, ids=str)
+def test_documented_tables_are_used_by_a_command(block):
+    assert tomllib.loads(block.text)
+    name = block.text.split()[1]
+    assert any(name in command.text for command in COMMANDS)
+
+
+def test_links_between_documents_lead_somewhere():
+    for path in (ROOT / "README.md", ROOT / "CHANGELOG.md", *GUIDES):
+        for target in re.findall(r"\]\((?!http)([^)#]+)(?:#[^)]*)?\)", path.read_text()):
+            assert (path.parent / target).exists(), f"{path.name}: {target}"
+
+
+def test_every_option_in_the_documents_exists(capsys):
+    text = "\n".join(path.read_text() for path in (ROOT / "README.md", *GUIDES))
+    helps = ""
+    for verb in ("info", "convert", "render", "evaluate", "video", "finetune", "demo", "bench"):
+        with pytest.raises(SystemExit):
+            main([verb, "--help"])
+        helps += capsys.readouterr().out
+    known = set(re.findall(r"--[a-z][a-z-]+", helps))
+    named = set(re.findall(r"`(--[a-z][a-z-]+)", text))
+    others = {"--antialiasing"}  # of 3DGS's own scripts
+    assert named - known - others == set()

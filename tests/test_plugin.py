@@ -1,0 +1,125 @@
+"""A package that is not part of aaplug adds one of everything: the steps of examples/guides/contributing.md."""
+
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from aaplug.io.images import image_size
+from aaplug.io.scenes import read_scene, write_scene
+from tests.conftest import SAMPLE
+
+ROOT = Path(__file__).resolve().parents[1]
+PLUGIN = ROOT / "tests" / "plugin"
+GUIDE = ROOT / "examples" / "guides" / "contributing.md"
+PROGRAM = """
+import json, sys
+from aaplug_cli.main import main
+for words in json.loads(sys.argv[1]):
+    try:
+        main(words)
+    except SystemExit as stop:
+        if stop.code:
+            raise
+"""
+FILES = {path.name for path in (PLUGIN / "stranger").glob("[!_]*.py")}
+GROUPS = tomllib.loads((PLUGIN / "pyproject.toml").read_text())["project"]["entry-points"]
+LOOK = "{name} 40 30 50  {x} -4 1  0 0 0  {held_out}\n"  # see camera_format.py
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """The environment of a process that has the plug-in installed, without pip: a .dist-info on the path is enough."""
+    folder = tmp_path_factory.mktemp("site")
+    (folder / "stranger").symlink_to(PLUGIN / "stranger")
+    record = folder / "stranger-1.0.dist-info"
+    record.mkdir()
+    (record / "METADATA").write_text("Metadata-Version: 2.1\nName: stranger\nVersion: 1.0\n")
+    lines = [
+        line
+        for group, points in GROUPS.items()
+        for line in (f"[{group}]", *(f"{name} = {value}" for name, value in points.items()))
+    ]
+    (record / "entry_points.txt").write_text("\n".join(lines))
+    path = os.pathsep.join([str(folder), str(ROOT), os.environ.get("PYTHONPATH", "")])
+    return {**os.environ, "PYTHONPATH": path, "COLUMNS": "400"}
+
+
+@pytest.fixture(scope="module")
+def finished(installed: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder in which one process with the plug-in has run the guide's commands and `aaplug evaluate --help`."""
+    folder = tmp_path_factory.mktemp("theirs")
+    scene = read_scene(SAMPLE / "chair.ply")
+    largest = scene.log_scales.sum(dim=1).topk(300).indices.sort().values
+    write_scene(folder / "scene.ply", scene[largest])
+    (folder / "path" / "to").mkdir(parents=True)
+    (folder / "path" / "to" / "colmap").symlink_to(SAMPLE)
+    views = [("left", -1, 0), ("right", 1, 0), ("held", 0, 1)]
+    lines = (LOOK.format(name=name, x=x, held_out=held) for name, x, held in views)
+    (folder / "views.look").write_text("".join(lines))
+    commands = [line for line in GUIDE.read_text().splitlines() if line.startswith("aaplug ")]
+    words = [shlex.split(command)[1:] for command in [*commands, "aaplug evaluate --help"]]
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM, json.dumps(words)],
+        cwd=folder,
+        env=installed,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    (folder / "stdout").write_text(done.stdout)
+    return folder
+
+
+def test_the_guide_shows_the_files_of_the_plug_in():
+    shown = dict(
+        re.findall(r"`stranger/(\w+\.py)`:\n\n```python\n(.*?)```$", GUIDE.read_text(), re.M | re.S)
+    )
+    assert shown.keys() == FILES
+    for name, text in shown.items():
+        assert text == (PLUGIN / "stranger" / name).read_text(), name
+    (project,) = re.findall(
+        r"`pyproject.toml`:\n\n```toml\n(.*?)```$", GUIDE.read_text(), re.M | re.S
+    )
+    assert project == (PLUGIN / "pyproject.toml").read_text()
+
+
+def test_every_file_of_the_plug_in_is_registered_by_one_line():
+    registered = [value for points in GROUPS.values() for value in points.values()]
+    modules = [value.removeprefix("stranger.").split(":")[0] + ".py" for value in registered]
+    assert sorted(modules) == sorted(FILES)
+
+
+def test_evaluate_knows_their_recipe_and_metric(finished):
+    results = json.loads((finished / "results" / "results.json").read_text())
+    (found,) = (value for name, value in results.items() if "soft-points" in name)
+    assert 0 < found["MAE"] < 0.5
+
+
+def test_render_knows_their_formats_and_rasterizer(finished):
+    assert (finished / "scene.balls").read_text().count("\n") == 300
+    assert [path.name for path in (finished / "images").iterdir()] == ["held.png"]
+    assert image_size(finished / "images" / "held.png") == (40, 30)
+
+
+def test_help_knows_their_names(finished):
+    text = (finished / "stdout").read_text()
+    for name in ("soft-points", "mae", "row-by-row"):
+        assert re.search(rf"[|{{,]{name}\b", text), name
+
+
+def test_the_laws_run_over_what_the_plug_in_adds(installed):
+    (command,) = re.findall(r"^python (-m pytest tests/laws.*)$", GUIDE.read_text(), re.M)
+    words = [*shlex.split(command), "-v", "-n", "0", "-p", "no:cacheprovider"]
+    done = subprocess.run(
+        [sys.executable, *words], cwd=ROOT, env=installed, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stdout[-5000:]
+    for name in ("soft", "dull", "four-points", "row-by-row", "soft-points"):
+        assert re.search(rf"\[.*{name}.*\] PASSED", done.stdout), f"no law ran over {name}"
