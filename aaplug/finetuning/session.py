@@ -55,7 +55,9 @@ def tune(
         if done:
             tell(steps, steps)
     if not done:
-        kept = "nothing is written" if checkpoint is None else "the checkpoint is written; resume it"
+        kept = (
+            "nothing is written" if checkpoint is None else "the checkpoint is written; resume it"
+        )
         monitor.say(f"stopped at step {state.step}; {kept}")
         raise KeyboardInterrupt
     return state
