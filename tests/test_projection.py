@@ -478,5 +478,7 @@ def test_gradients_of_colours_reach_only_the_gaussians_drawn():
     shown[some.sources] = True
     assert touched.any()
     assert not (touched & ~shown).any()
-    constant = sh.grad[:, 0][touched]  # of the first coefficient, where no channel is clamped at black
+    constant = sh.grad[:, 0][
+        touched
+    ]  # of the first coefficient, where no channel is clamped at black
     assert constant.amax().item() == pytest.approx(0.28209479177387814)
