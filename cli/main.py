@@ -62,7 +62,7 @@ def run(words: Sequence[str]) -> int:
         args=words,
         config=CONFIG,
     )
-    raise AssertionError(options)  # no verb: tyro has shown the help or refused the words
+    return _verb(type(options).__name__.lower())[1](options)
 
 
 def _verb(name: str) -> tuple[type, Callable[[Any], int]]:
@@ -82,18 +82,14 @@ def option_types(noun: type) -> dict[str, Any]:
 
 
 def _worded(error: AaplugError, words: Sequence[str]) -> str:
-    """The library's error with parameters as the command line writes them: `cull_margin` is --cull-margin."""
+    """The library's error, with parameters of the verb as its options."""
+    from .options import worded
+
     known = option_types(_verb(words[0])[0]) if words and words[0] in VERBS else {}
-
-    def worded(name: str) -> str:
-        if name not in known:
-            return f"`{name}`"
-        return "SCENE" if name == "scene" else "--" + name.replace("_", "-")
-
-    where, problem = error.where, re.sub(r"`(\w+)`", lambda m: worded(m[1]), error.problem)
-    if isinstance(error, UsageError) and where in known:
-        where = worded(where)
-    return f"{where}: {problem}"
+    where = error.where
+    if isinstance(error, UsageError):
+        where = worded(f"`{where}`", known).strip("`")
+    return f"{where}: {worded(error.problem, known)}"
 
 
 def _several(verb: str) -> list[str]:

@@ -5,7 +5,8 @@ Each class is a group of options.  `arguments` passes them to the library's verb
 
 import inspect
 import math
-from collections.abc import Callable, Iterable
+import re
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Annotated, Any, get_args
@@ -28,6 +29,18 @@ from aaplug.rasterizers import RASTERIZERS
 from .console import say
 
 CONFIG = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)  # how classes become options
+
+
+def worded(text: str, names: Collection[str]) -> str:
+    """The library's text with parameters as options: min_seen or `min_seen` becomes --min-seen."""
+
+    def option(match: re.Match[str]) -> str:
+        name = match[1] or match[2]
+        if name not in names:
+            return match[0]
+        return "SCENE" if name == "scene" else "--" + name.replace("_", "-")
+
+    return re.sub(r"`(\w+)`|\b([a-z]+(?:_[a-z]+)+)\b", option, text)
 
 
 def flag(metavar: str, *aliases: str) -> Any:
@@ -89,7 +102,7 @@ class SceneOptions:
             f"{opened.convention.name} ({opened.evidence})"
         )
         for note in opened.notes:
-            say(f"scene: {note}")
+            say(worded(f"scene: {note}", SceneOptions.__dataclass_fields__))
         for fusion in opened.fused:
             say(f"fused: {describe(fusion)}")
         return opened
@@ -127,7 +140,7 @@ class CameraOptions:
             path, train_scale=self.train_scale, images=self.images, test_every=self.test_every
         )
         for note in cameras.notes:
-            say(f"cameras: {note}")
+            say(worded(f"cameras: {note}", CameraOptions.__dataclass_fields__))
         return cameras
 
 

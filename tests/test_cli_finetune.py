@@ -18,7 +18,7 @@ from aaplug.finetuning import loop
 from aaplug.io.scenes import read_scene
 from tests.test_cli import cli, dataset  # noqa: F401 (fixtures)
 
-TUNE = "finetune scene.ply --cameras . -o tuned.ply --scale 0.5 --threads 1 --for mip-viewer"
+TUNE = "finetune scene.ply --cameras . -o tuned.ply --scale 0.5 --threads 1 --for mip-viewer --rasterizer eager"
 RUN = f"{TUNE} --steps 3 --checkpoint-every 2"
 
 
@@ -117,7 +117,9 @@ def test_a_run_killed_outright_resumes_from_its_checkpoint(cli, tmp_path, whole)
     ],
 )
 def test_finetune_refuses_what_cannot_be(cli, options, words):
-    code, out, err = cli(f"finetune scene.ply --cameras . -o tuned.ply {options}")
+    code, out, err = cli(
+        f"finetune scene.ply --cameras . -o tuned.ply --rasterizer eager {options}"
+    )
     assert (code, out) == (2, "")
     assert words in err
     assert not list(Path().glob("tuned*"))

@@ -10,8 +10,8 @@ import torch
 
 from aaplug.core.errors import OutputError, UsageError
 from aaplug.io.video import write_video
-from tests.test_cli import cli, dataset  # noqa: F401  (fixtures)
 from tests.test_camera_paths import document
+from tests.test_cli import cli, dataset  # noqa: F401  (fixtures)
 
 
 def read(path: Path) -> tuple[np.ndarray, float]:

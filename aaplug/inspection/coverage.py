@@ -95,9 +95,7 @@ def coverage(scene: Gaussians, training: TrainingViews, scales: Sequence[float])
     return Coverage(len(scene), seen, edges, counts, under(multiples) / seen, begins, aliased)
 
 
-def _histogram(
-    multiples: Float[Tensor, " seen"],
-) -> tuple[tuple[float, ...], tuple[int, ...]]:
+def _histogram(multiples: Float[Tensor, " seen"]) -> tuple[tuple[float, ...], tuple[int, ...]]:
     """Edges and counts."""
     logs = (multiples / math.log(2)).clamp(LOWEST, HIGHEST)
     edges = torch.linspace(LOWEST, HIGHEST, BINS + 1, dtype=torch.float64)

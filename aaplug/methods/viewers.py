@@ -5,6 +5,7 @@ compensated), `fuse_for` one for a named viewer.  Both treat each Gaussian alone
 their result and optimize all Gaussians together.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -127,6 +128,11 @@ def _energy_kept(trained: Convention, shown: Convention) -> MatchedEnergy:
     return MatchedEnergy(FITTED_VARIANCE if fitted else trained.kernel - shown.kernel, shown)
 
 
+def blurring(fused: Sequence[Fusion]) -> list[Fusion]:
+    """What added blur; fine-tuning adds none."""
+    return [fusion for fusion in fused if fusion.method != TUNED]
+
+
 def describe(fusion: Fusion) -> str:
     """One printable phrase, such as "matched-energy (variance=0.2, views=25)"."""
     settings = ", ".join(f"{key}={value}" for key, value in fusion.settings.items())
@@ -152,9 +158,9 @@ def _check(scene: Gaussians, form: Form) -> None:
 
 
 def _check_fused(scene: Gaussians) -> None:
-    blurs = [describe(fusion) for fusion in scene.fused if fusion.method != TUNED]
+    blurs = blurring(scene.fused)
     if blurs:
+        done = "; ".join(map(describe, blurs))
         raise UsageError(
-            scene.name,
-            f"already has {'; '.join(blurs)} fused; converting it again would blur it twice",
+            scene.name, f"already has {done} fused; converting it again would blur it twice"
         )

@@ -28,7 +28,16 @@ from aaplug.io.scenes import (
     write_scene,
 )
 from aaplug.io.scenes.scene_file import SceneFile
-from aaplug.methods.viewers import FORMS, MATCHED_ENERGY, MIP_VIEWER, VIEWERS, Form, Viewer, fuse
+from aaplug.methods.viewers import (
+    FORMS,
+    MATCHED_ENERGY,
+    MIP_VIEWER,
+    VIEWERS,
+    Form,
+    Viewer,
+    blurring,
+    fuse,
+)
 from aaplug.rendering.renderer import Background
 from aaplug.verbs.in_parts import LARGE, convert_parts
 from aaplug.verbs.inputs import (
@@ -165,7 +174,7 @@ def _sources(scene: Gaussians | SceneFile) -> list[Path]:
 
 def _train_of(opened: SceneFile, cameras: CamerasLike, min_seen: float) -> Sequence[Camera]:
     """The training cameras; none where the scene needs none, or is refused anyway."""
-    if opened.fused or opened.raw(0, min(1, opened.count)).filter_3d is not None:
+    if blurring(opened.fused) or opened.raw(0, min(1, opened.count)).filter_3d is not None:
         return ()
     train = cameras_of(cameras, str(opened.path)).train
     check_frame_of(opened, train, min_seen)
@@ -174,7 +183,7 @@ def _train_of(opened: SceneFile, cameras: CamerasLike, min_seen: float) -> Seque
 
 def _fused(scene: Gaussians, cameras: CamerasLike, form: Form, min_seen: float) -> Gaussians:
     """The closed form for the Mip rule."""
-    if scene.fused or scene.filter_3d is not None:  # no cameras needed, or refused anyway
+    if blurring(scene.fused) or scene.filter_3d is not None:  # needs none, or is refused anyway
         return fuse(scene, None, form)
     known = cameras_of(cameras, scene)
     return fuse(scene, TrainingViews.of(scene, known, min_seen=min_seen), form)

@@ -63,8 +63,10 @@ def demo(
             cameras,
             recipe=RECIPES,
             scale=SCALES,
+            metric=("psnr", "ssim"),
             output=folder,
             overwrite=overwrite,
+            metric=("psnr", "ssim"),
             name="chair",
             monitor=monitor,
         )

@@ -277,14 +277,12 @@ def _shown(text: str, views: Sequence[Camera]) -> tuple[int, ...]:
 def _source(
     truth: str, protocol: Protocol, views: Sequence[Camera], monitor: Monitor
 ) -> TruthSource:
-    for known in get_args(TruthSource):
-        if truth == known:
-            return known
-    if truth != "auto":
-        known = ", ".join(("auto", *get_args(TruthSource)))
-        raise UsageError("truth", f"'{truth}' is not one of {known}")
-    if protocol.truth is not None:
-        return protocol.truth
+    known: dict[str, TruthSource | None] = {"auto": protocol.truth}
+    known |= {name: name for name in get_args(TruthSource)}
+    if truth not in known:
+        raise UsageError("truth", f"'{truth}' is not one of {', '.join(known)}")
+    if chosen := known[truth]:
+        return chosen
     source = source_of(views)
     why = "" if source == "photographs" else " (not every view has a photograph)"
     monitor.say(f"truth: {source}{why}")

@@ -24,6 +24,7 @@ from aaplug.evaluation.report.contact_sheet import contact_sheet
 from aaplug.evaluation.results import Report, results, scale_name
 from aaplug.evaluation.truth import (
     MEMORY,
+    Enlarge,
     Truth,
     back_projected,
     own_look,
@@ -157,6 +158,7 @@ def finetune(
         raise UsageError("checkpoint_every", f"must be 1 or more, got {checkpoint_every}")
     files = _Files.of(output, scene, resume, overwrite)
     shown = select_views(cameras, views)
+    source, enlarge = _source(truth, cameras), _enlarge(upsampler)
     colour = background_of(background, cameras, monitor)
     with processor(threads):
         drawing = rasterizer_of(rasterizer, settings.steps, memory, monitor)
@@ -164,7 +166,8 @@ def finetune(
         look = own_look(scene, training, drawing, colour)
         before = replace(look, recipe=RECIPES[viewer.recipe])
         start = replace(before, scene=fuse_for(scene, training, viewer))
-        job = TuningJob(start, cameras.train, _truth(truth, upsampler, look, cameras), settings)
+        reference = Truth(look, source, enlarge=enlarge, memory=MEMORY)
+        job = TuningJob(start, cameras.train, reference, settings)
         monitor.say(_described(job))
         state = tune(job, files and files.checkpoint, checkpoint_every, resume, monitor)
         how = {"for": viewer.name, "method": settings.name}
@@ -261,20 +264,23 @@ def _viewer(target: str | Viewer) -> Viewer:
     return known[target]
 
 
-def _truth(source: str, upsampler: str | None, look: Renderer, cameras: CameraSet) -> Truth:
-    """What renders are compared with."""
+def _source(truth: str, cameras: CameraSet) -> TruthSource:
+    """Where the images that renders are compared with come from."""
     sources: dict[str, TruthSource] = {
         "self": "self",
         "photographs": "photographs",
         "auto": source_of(cameras.train),
     }
-    if source not in sources:
-        raise UsageError("truth", f"'{source}' is not one of {', '.join(sources)}")
+    if truth not in sources:
+        raise UsageError("truth", f"'{truth}' is not one of {', '.join(sources)}")
     missing = [view.name for view in cameras.train if view.photo is None]
-    if sources[source] == "photographs" and missing:
+    if sources[truth] == "photographs" and missing:
         raise UsageError(missing[0], "has no photograph; `truth` self needs none")
-    enlarge = back_projected if upsampler is None else upsampled(find_upsampler(upsampler))
-    return Truth(look, sources[source], enlarge=enlarge, memory=MEMORY)
+    return sources[truth]
+
+
+def _enlarge(upsampler: str | None) -> Enlarge:
+    return back_projected if upsampler is None else upsampled(find_upsampler(upsampler))
 
 
 def _described(job: TuningJob) -> str:

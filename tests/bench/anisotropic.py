@@ -1,8 +1,8 @@
-"""Whether bounds of each direction beat isotropic ones: python -m tests.bench.anisotropic [SCENE ...].
+"""Whether bounds per direction beat isotropic ones: python -m tests.bench.anisotropic [SCENE ...].
 
-Checkpoints trained small, enlarged against their photographs and seen from nearer against the one trained at full size.
-The look of training is fused into the world, 0.3/ν² with nothing added on the screen, isotropic and along each axis by
-what all views together tell of it, scaled to the same volume; and both forms of Mip-Splatting's 3D filter.
+Checkpoints trained at a small size are enlarged and compared with their photographs, and seen from nearer and compared
+with the checkpoint trained at full size.  Candidates: training's dilation fused in the world as 0.3/ν², isotropic, and
+per axis by the views' information at the same volume; and both forms of Mip-Splatting's 3D filter.
 """
 
 import sys
@@ -21,9 +21,10 @@ from aaplug.io.cameras import read_cameras
 from aaplug.io.photographs import DOWNSCALES
 from aaplug.io.scenes import read_scene
 from aaplug.methods.filters import NYQUIST_VARIANCE, AnisotropicSmoothing, Dilation, Smoothing3D
-from aaplug.methods.recipes import Recipe, find_recipe
-from aaplug.rendering.renderer import learn, render
-from tests.bench.away import VIEWS, Scene, decibels, look_there, on_each
+from aaplug.methods.recipe import Recipe
+from aaplug.methods.recipes import find_recipe
+from aaplug.rendering.renderer import Renderer
+from tests.bench.away import MATCHED, VIEWS, Scene, decibels, look_there, on_each
 from tests.conftest import SHARED_DATA
 
 TRAINED_SMALL = ("chair_eighth", "snowmiku_quarter")
@@ -33,7 +34,7 @@ AS_IT_IS = Recipe("fused", Dilation(0.0, compensated=False), "", "")
 
 
 def compared(scene: Gaussians, training: TrainingViews) -> dict[str, tuple[Gaussians, Recipe]]:
-    """The scenes and how they are drawn."""
+    """Filtered scenes and their recipes."""
     look_of_training = Smoothing3D(CLASSIC.kernel, opacity="kept")(scene, training)
     own = AnisotropicSmoothing(CLASSIC.kernel)(scene, training)
     added = [s.scales.square() - scene.scales.square() for s in (look_of_training, own)]
@@ -57,7 +58,7 @@ def measure(name: str, how: Scene, rasterizer: Rasterizer) -> None:
     """Print a table of PSNR in dB, mean of the views."""
     cameras = read_cameras((SHARED_DATA / how.file).parent, train_scale=how.scale)
     scene = read_scene(SHARED_DATA / how.file)
-    training = learn(scene, cameras.train, how.guard)
+    training = TrainingViews.of(scene, cameras, how.cull_margin)
     views = cameras.test[:: -(-len(cameras.test) // VIEWS)]
     chosen = compared(scene, training)
     print(f"\n{name}, PSNR in dB\n\n| | " + " | ".join(chosen) + " |")
@@ -65,10 +66,8 @@ def measure(name: str, how: Scene, rasterizer: Rasterizer) -> None:
     for label, shown in cases(scene, views, how, rasterizer):
         cells = []
         for filtered, recipe in chosen.values():
-            found = []
-            for camera, truth in shown:
-                image = render(filtered, camera, recipe, training, rasterizer, how.background)
-                found.append(decibels(image.rgb, truth))
+            renderer = Renderer(filtered, training, recipe, rasterizer, how.background)
+            found = [decibels(renderer(camera).rgb, truth) for camera, truth in shown]
             cells.append(f"{sum(found) / len(found):.2f}")
         print(f"| {label} | " + " | ".join(cells) + " |", flush=True)
 
@@ -88,10 +87,11 @@ def cases(
             yield f"photographs at {factor}×", shown
     assert how.finer is not None
     full, folder = read_scene(SHARED_DATA / how.finer), (SHARED_DATA / how.file).parent
-    finer = learn(full, read_cameras(folder, train_scale=1.0).train, how.guard)
+    training = TrainingViews.of(full, read_cameras(folder, train_scale=1.0), how.cull_margin)
+    finer = Renderer(full, training, MATCHED, rasterizer, how.background)
     for factor in NEARER:
         near = [moved(view, factor, median_depth(scene.means, view)) for view in views]
-        shown = [(camera, look_there(full, finer, camera, rasterizer, how)) for camera in near]
+        shown = [(camera, look_there(finer, camera)) for camera in near]
         yield f"{factor:g} times nearer, finer", shown
 
 

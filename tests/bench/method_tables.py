@@ -1,7 +1,7 @@
 """The tables of examples/guides/methods.md: python -m tests.bench.method_tables FOLDER.
 
-Evaluates what `every_recipe.toml` names into the folder, but for what is there already.  For every scene a row a
-recipe; each cell holds the figures at all scales, one after another: means of the views, and medians of their seconds.
+Evaluates what `every_recipe.toml` names into the folder, except what is there already.  Each scene has a table with a
+row per recipe; a cell has the figures of all scales: means over the views, and medians of their seconds.
 """
 
 import json
@@ -15,7 +15,7 @@ from typing import Any
 from aaplug.evaluation.results import method, scale_name
 
 BATCH = Path(__file__).with_name("every_recipe.toml")
-HEADINGS = "| recipe | PSNR, dB | SSIM | pairs, M | s |\n|---|---|---|---|---|"
+HEADINGS = "| recipe | PSNR, dB | SSIM | evaluations, M | s |\n|---|---|---|---|---|"
 MILLION = 1e6
 
 
@@ -40,7 +40,7 @@ def table(measured: Mapping[str, Any]) -> list[str]:
         cells = [
             _joined(at, "PSNR", mean, lambda v: f"{v:.2f}"),
             _joined(at, "SSIM", mean, lambda v: f"{v:.4f}"),
-            _joined(at, "pairs", mean, lambda v: f"{v / MILLION:.1f}"),
+            _joined(at, "evaluations", mean, lambda v: f"{v / MILLION:.1f}"),
             _joined(at, "seconds", median, lambda v: f"{v:.2f}"),
         ]
         name = recipe if " " in recipe else f"`{recipe}`"

@@ -1,0 +1,56 @@
+"""Upsamplers, which stand in for the truth above the training size."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from aaplug.core.errors import FormatError, UsageError
+from aaplug.core.imaging import box_average
+from aaplug.evaluation.upsamplers import UPSAMPLERS, find_upsampler
+
+
+@pytest.mark.parametrize("name", UPSAMPLERS)
+def test_upsamplers_keep_what_is_smooth(name):
+    x = torch.linspace(0.2, 0.8, 16)
+    image = x[None, :, None].repeat(12, 1, 3)
+    larger = find_upsampler(name)(image, (24, 32))
+    assert larger.shape == (24, 32, 3)
+    torch.testing.assert_close(
+        box_average(larger, 2)[2:-2, 2:-2], image[2:-2, 2:-2], atol=2e-3, rtol=0
+    )
+
+
+class Doubling(torch.nn.Module):
+    def forward(self, x):
+        return torch.nn.functional.interpolate(x, scale_factor=2.0, mode="nearest")
+
+
+def test_a_torch_program_upsamples(tmp_path):
+    path = tmp_path / "network.pt2"
+    sides = {2: torch.export.Dim("h", min=2), 3: torch.export.Dim("w", min=2)}
+    program = torch.export.export(Doubling(), (torch.rand(1, 3, 6, 5),), dynamic_shapes=(sides,))
+    torch.export.save(program, path)
+    image = torch.rand(8, 9, 3)
+    doubled = image.repeat_interleave(2, dim=0).repeat_interleave(2, dim=1)
+    upsample = find_upsampler(str(path))
+    torch.testing.assert_close(upsample(image, (16, 18)), doubled)
+    torch.testing.assert_close(upsample(image, (8, 9)), image, atol=1e-6, rtol=0)  # brought back
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("nearest", "expected bicubic, lanczos"),
+        ("missing.pb", "does not exist"),
+        ("ESPCN_x4.pb", "not a network"),
+        ("other.pb", "needs a name such as"),
+        ("network.pt2", "not a program"),
+    ],
+)
+def test_what_is_no_upsampler_is_refused(name, words, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    if not name.startswith("missing"):
+        Path(name).write_bytes(b"nonsense")
+    with pytest.raises((FormatError, UsageError), match=words):
+        find_upsampler(name)
