@@ -30,15 +30,10 @@ def scenes_of(path: Path, base: T) -> list[tuple[str, T]]:
     file = read_batch(path)
     shared = _set(path, "at the top", base, file.shared, NOT_IN_A_FILE)
     refused = (*NOT_IN_A_FILE, *ONCE)
-    return [
-        (name, _set(path, f"scene '{name}'", shared, settings, refused))
-        for name, settings in file.scenes.items()
-    ]
+    return [(name, _set(path, f"scene '{name}'", shared, settings, refused)) for name, settings in file.scenes.items()]
 
 
-def _set(
-    path: Path, where: str, options: T, settings: Mapping[str, Any], refused: Sequence[str]
-) -> T:
+def _set(path: Path, where: str, options: T, settings: Mapping[str, Any], refused: Sequence[str]) -> T:
     """The options with a table's settings."""
     known = [key for key in values_of(options) if key not in refused]
     for key, value in settings.items():

@@ -17,15 +17,7 @@ from aaplug.verbs.evaluate import evaluate as measure
 
 from .batch import scenes_of
 from .console import TERMINAL, out, print_json
-from .options import (
-    RECIPE_NAMES,
-    CameraOptions,
-    RenderOptions,
-    SceneOptions,
-    arguments,
-    choice,
-    flag,
-)
+from .options import RECIPE_NAMES, CameraOptions, RenderOptions, SceneOptions, arguments, choice, flag
 
 FAILED = 1  # exit code
 
@@ -101,9 +93,7 @@ def _evaluate_many(options: Evaluate) -> int:
     if output is None:
         raise UsageError("output", "name a folder for the results of several scenes: -o FOLDER")
     runs = [(name, partial(_run, own)) for name, own in scenes]
-    found = batch(
-        runs, output, resume=options.resume, overwrite=options.overwrite, monitor=TERMINAL
-    )
+    found = batch(runs, output, resume=options.resume, overwrite=options.overwrite, monitor=TERMINAL)
     _print(options, found.summary(), found.tables())
     return FAILED if found.failures else 0
 

@@ -33,9 +33,7 @@ def main(words: Sequence[str] | None = None) -> None:
         console.log.print(f"[red]error:[/] {console.escape(_worded(error, words))}")
         sys.exit(REFUSED)
     except MemoryError:
-        console.log.print(
-            "[red]error:[/] out of memory; a smaller --scale or fewer Gaussians need less"
-        )
+        console.log.print("[red]error:[/] out of memory; a smaller --scale or fewer Gaussians need less")
         sys.exit(REFUSED)
     except KeyboardInterrupt:
         console.say("interrupted")

@@ -136,9 +136,7 @@ class CameraOptions:
             path = options.path
         if path is None:
             raise UsageError("cameras", "name cameras.json, a COLMAP model or transforms_*.json")
-        cameras = read_cameras(
-            path, train_scale=self.train_scale, images=self.images, test_every=self.test_every
-        )
+        cameras = read_cameras(path, train_scale=self.train_scale, images=self.images, test_every=self.test_every)
         for note in cameras.notes:
             say(worded(f"cameras: {note}", CameraOptions.__dataclass_fields__))
         return cameras

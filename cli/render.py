@@ -38,10 +38,7 @@ def render(options: Render) -> int:
     scene, cameras = options.scene.read(), options.cameras.read(options.scene)
     written = verb.render(scene, cameras, monitor=TERMINAL, **arguments(options, verb.render))
     if options.json:
-        images = [
-            {"view": v.name, "file": str(p), "width": v.width, "height": v.height}
-            for v, p in written
-        ]
+        images = [{"view": v.name, "file": str(p), "width": v.width, "height": v.height} for v, p in written]
         print_json({"recipe": options.recipe, "images": images})
     else:
         say(f"wrote {len(written)} image{'s' * (len(written) != 1)} to {options.output}")

@@ -9,16 +9,7 @@ import tyro
 from aaplug.verbs import video as verb
 
 from .console import TERMINAL, print_json, say
-from .options import (
-    RECIPE_NAMES,
-    CameraOptions,
-    RecipeName,
-    RenderOptions,
-    SceneOptions,
-    arguments,
-    choice,
-    flag,
-)
+from .options import RECIPE_NAMES, CameraOptions, RecipeName, RenderOptions, SceneOptions, arguments, choice, flag
 
 
 @dataclass(frozen=True)

@@ -26,10 +26,7 @@ from aaplug.rasterizers.tiled.ahead_of_time import load
 torch.set_num_threads(1)
 
 COMPILED = load()
-ALL_RASTERIZERS: dict[str, Rasterizer] = {
-    **RASTERIZERS,
-    **({} if COMPILED is None else {"compiled": Tiled(COMPILED)}),
-}
+ALL_RASTERIZERS: dict[str, Rasterizer] = {**RASTERIZERS, **({} if COMPILED is None else {"compiled": Tiled(COMPILED)})}
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 SAMPLE = Path(str(files("aaplug.io.sample")))
@@ -83,9 +80,7 @@ def make_camera(
     return Camera(name, *size, focal, focal, *centre, pose).as_trained()
 
 
-def make_scene(
-    n: int, seed: int = 0, dtype: torch.dtype = torch.float32, degree: int = 1
-) -> Gaussians:
+def make_scene(n: int, seed: int = 0, dtype: torch.dtype = torch.float32, degree: int = 1) -> Gaussians:
     """Random Gaussians around the origin with scales near 0.1 world units."""
     g = torch.Generator().manual_seed(seed)
     rand = {"generator": g, "dtype": torch.float64}
@@ -106,9 +101,7 @@ def sized(scene: Gaussians) -> Gaussians:
     return replace(scene, pixel_sizes=sizes)
 
 
-def make_splats(
-    m: int, hw: tuple[int, int], seed: int = 0, log_sigmas: tuple[float, float] = (-1.0, 2.0)
-) -> Splats2D:
+def make_splats(m: int, hw: tuple[int, int], seed: int = 0, log_sigmas: tuple[float, float] = (-1.0, 2.0)) -> Splats2D:
     """Random coloured splats in and around an image; log_sigmas: range of ln standard deviations, in px."""
     g = torch.Generator().manual_seed(seed)
     low, high = log_sigmas

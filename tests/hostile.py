@@ -25,9 +25,7 @@ from aaplug.io.scenes import open_scene
 from tests.scene_files import DATA, MADE, STORED, write_file
 
 SECONDS = 1.0  # of processor time a file; other processes may make the clock's run longer
-GROWTH = (
-    100 * 2**20
-)  # bytes of resident memory beyond what the program itself has, which is about 200 MB
+GROWTH = 100 * 2**20  # bytes of resident memory beyond what the program itself has, which is about 200 MB
 MEMORY = 2**30  # bytes of address space beyond what the worker has when it starts
 BATCH = 500  # files a child
 NAMES = (*STORED, "run.pt", *MADE)
@@ -94,11 +92,7 @@ def check(name: str, files: Iterable[bytes]) -> Counter[str]:
 
 
 def _spoil(data: bytearray, rng: random.Random) -> bytearray:
-    at = (
-        rng.randrange(len(data) + 1)
-        if rng.random() < 0.5
-        else rng.randrange(min(len(data), 300) + 1)
-    )
+    at = rng.randrange(len(data) + 1) if rng.random() < 0.5 else rng.randrange(min(len(data), 300) + 1)
     kind = rng.randrange(6)
     if kind == 0 and at < len(data):
         data[at] ^= 1 << rng.randrange(8)

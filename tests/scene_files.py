@@ -13,9 +13,7 @@ from aaplug.core.spherical_harmonics import SH_C0
 from aaplug.io.scenes import read_scene
 
 DATA = Path(__file__).resolve().parent / "data"
-ORACLE = (
-    DATA / "oracle.ply"
-)  # random, 40 Gaussians of degree 3, tagged mip; the others are made of it
+ORACLE = DATA / "oracle.ply"  # random, 40 Gaussians of degree 3, tagged mip; the others are made of it
 
 
 def oracle() -> Gaussians:
@@ -70,9 +68,7 @@ def ksplat(level: int, degree: int = 2, per_bucket: int = 16) -> bytes:
     n, k = len(s), (degree + 1) ** 2
     full, left = divmod(n, per_bucket)
     centres = np.array([[0.1, -0.2, 0.3]] * (full + 1), "<f4")
-    bands = [
-        s.sh[:, d * d : (d + 1) ** 2].transpose(1, 2).reshape(n, -1) for d in range(1, degree + 1)
-    ]
+    bands = [s.sh[:, d * d : (d + 1) ** 2].transpose(1, 2).reshape(n, -1) for d in range(1, degree + 1)]
     rest = torch.cat([torch.zeros(n, 0), *bands], dim=1).numpy()
     assert rest.shape[1] == 3 * (k - 1)
     wide, sh_type = ("<f4", "<f4") if level == 0 else ("<f2", "<f2" if level == 1 else "u1")
@@ -87,9 +83,7 @@ def ksplat(level: int, degree: int = 2, per_bucket: int = 16) -> bytes:
     )
     rows = np.zeros(n, record)
     means = s.means.numpy()
-    rows["p"] = (
-        means if level == 0 else np.round((means - centres[0]) * steps / (block / 2) + steps)
-    )
+    rows["p"] = means if level == 0 else np.round((means - centres[0]) * steps / (block / 2) + steps)
     rows["s"], rows["q"] = s.scales.numpy(), s.unit_quats.numpy()
     rgb = 0.5 + SH_C0 * s.sh[:, 0]
     rows["c"] = bytes_of(torch.cat([rgb, s.opacities[:, None]], 1), 255, 0)
@@ -100,17 +94,7 @@ def ksplat(level: int, degree: int = 2, per_bucket: int = 16) -> bytes:
     section = bytearray(1024)
     buckets = (0, 0, 0, 0) if level == 0 else (per_bucket, full + 1, full, 1)
     struct.pack_into(
-        "<IIIIfHxxIxxxxIIH",
-        section,
-        0,
-        n,
-        n,
-        *buckets[:2],
-        block,
-        12 * (level > 0),
-        steps,
-        *buckets[2:],
-        degree,
+        "<IIIIfHxxIxxxxIIH", section, 0, n, n, *buckets[:2], block, 12 * (level > 0), steps, *buckets[2:], degree
     )
     body = b"" if level == 0 else struct.pack("<I", left) + centres.tobytes()
     return bytes(main + section) + body + rows.tobytes()
@@ -143,14 +127,7 @@ MADE: Mapping[str, Callable[[], bytes]] = {
     "level1.ksplat": lambda: ksplat(1),
     "level2.ksplat": lambda: ksplat(2),
 }
-STORED = (
-    "oracle.ply",
-    "oracle.compressed.ply",
-    "oracle_v3.spz",
-    "oracle_v4.spz",
-    "oracle.sog",
-    "oracle_sog/meta.json",
-)
+STORED = ("oracle.ply", "oracle.compressed.ply", "oracle_v3.spz", "oracle_v4.spz", "oracle.sog", "oracle_sog/meta.json")
 
 
 def write_file(folder: Path, name: str) -> Path:

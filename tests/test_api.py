@@ -68,9 +68,7 @@ def test_render_takes_paths_as_strings(cli):  # noqa: F811
 
 
 def test_a_model_folder_brings_its_own_cameras(cli):  # noqa: F811
-    model = inria_model(
-        Path("model"), "Namespace(white_background=True, resolution=2, images='images', eval=False)"
-    )
+    model = inria_model(Path("model"), "Namespace(white_background=True, resolution=2, images='images', eval=False)")
     by_folder = aaplug.render(str(model), output="one", views="a")
     scene = aaplug.read_scene(model / "point_cloud/iteration_30/point_cloud.ply")
     by_scene = aaplug.render(scene, output="two", views="a")

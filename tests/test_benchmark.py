@@ -25,9 +25,7 @@ def test_figures_of_a_small_scene():
     assert run.forward_backward_ms > run.forward_ms
     assert run.evaluations % 64 == 0
     assert run.tile_evaluations > 0
-    assert run.ns_per_evaluation == pytest.approx(
-        run.stages_ms["composite"] * 1e6 / run.evaluations
-    )
+    assert run.ns_per_evaluation == pytest.approx(run.stages_ms["composite"] * 1e6 / run.evaluations)
     assert run.peak_bytes > 1e7
     assert run.share == run.forward_ms / run.matmul_ms
 
@@ -92,9 +90,7 @@ def test_the_middle_scene_is_drawn_at_every_size(capsys):
     assert set(found["exponents"]) == {"eager: Gaussians", "eager: pixels"}
 
 
-@pytest.mark.parametrize(
-    "words", [("--gaussians", "0"), ("--resolution", "big"), ("--repeats", "0")]
-)
+@pytest.mark.parametrize("words", [("--gaussians", "0"), ("--resolution", "big"), ("--repeats", "0")])
 def test_bad_sizes_are_refused(capsys, words):
     code, said = run_bench(capsys, *words)
     assert code == 2

@@ -81,9 +81,7 @@ def many(count):
 
 def test_inria_pose_is_the_inverse_of_camera_to_world(tmp_path):
     (camera,) = read_cameras(inria(tmp_path)).train
-    expected = torch.tensor(
-        [[0, 1, 0, -2], [-1, 0, 0, 1], [0, 0, 1, -3], [0, 0, 0, 1]], dtype=torch.float64
-    )
+    expected = torch.tensor([[0, 1, 0, -2], [-1, 0, 0, 1], [0, 0, 1, -3], [0, 0, 0, 1]], dtype=torch.float64)
     assert torch.equal(camera.cam_from_world, expected)
     assert camera.centre.tolist() == [1, 2, 3]
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (300, 310, 200, 100)
@@ -232,9 +230,7 @@ def test_rotation_is_made_orthonormal(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "text",
-    ["", "{}", "[]", "[1]", "[" * 100_000, '[{"width": ' + "9" * 5000 + "}]", "\xff"],
-    ids=range(7),
+    "text", ["", "{}", "[]", "[1]", "[" * 100_000, '[{"width": ' + "9" * 5000 + "}]", "\xff"], ids=range(7)
 )
 def test_odd_json_is_refused(tmp_path, text):
     (tmp_path / "cameras.json").write_text(text, encoding="latin-1")
@@ -303,9 +299,7 @@ def test_colmap_values(tmp_path, write):
     assert (first.name, second.name) == ("a.b", "cam b/with space")
     assert (first.fx, first.fy, first.cx, first.cy) == (250, 250, 200, 100)
     assert (second.fx, second.fy, second.cx, second.cy) == (300, 310, 199, 101)
-    turned = torch.tensor(
-        [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]], dtype=torch.float64
-    )
+    turned = torch.tensor([[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]], dtype=torch.float64)
     assert torch.allclose(second.cam_from_world, turned, atol=1e-15)
     assert first.cam_from_world[:3, 3].tolist() == [0, 0.5, 0.25]
     assert (first.hw, first.trained_focal) == ((200, 400), 250)
@@ -342,9 +336,7 @@ def test_colmap_split_is_every_eighth_by_name(tmp_path):
 
 
 def test_colmap_names_that_collide_keep_their_suffix(tmp_path):
-    views = tuple(
-        (i, (1.0, 0, 0, 0), (0.0, 0, 0), 1, f"a.{s}") for i, s in enumerate(["jpg", "png"])
-    )
+    views = tuple((i, (1.0, 0, 0, 0), (0.0, 0, 0), 1, f"a.{s}") for i, s in enumerate(["jpg", "png"]))
     assert names(read_cameras(colmap_bin(tmp_path, images=views)).all) == ["a.png", "a.jpg"]
     with pytest.raises(FormatError, match=r"'a\.jpg' is there twice"):
         read_cameras(colmap_bin(tmp_path, images=views[:1] * 2))
@@ -663,20 +655,13 @@ def test_pinhole_values(tmp_path):
 def camera_path(**changes):
     motion = [cell for row in OPENGL for cell in row]
     view = {"camera_to_world": motion, "fov": 90.0, "aspect": 2.0}
-    return {
-        "render_width": 40,
-        "render_height": 20,
-        "camera_type": "perspective",
-        "camera_path": [view],
-    } | changes
+    return {"render_width": 40, "render_height": 20, "camera_type": "perspective", "camera_path": [view]} | changes
 
 
 def test_a_camera_path_is_free_cameras(tmp_path):
     path = write_json(tmp_path / "camera_path.json", camera_path())
     (camera,) = read_cameras(path).train
-    same = read_cameras(
-        write_json(tmp_path / "transforms.json", transforms([{"file_path": "a"}], w=40, h=20))
-    ).train[0]
+    same = read_cameras(write_json(tmp_path / "transforms.json", transforms([{"file_path": "a"}], w=40, h=20))).train[0]
     assert torch.equal(camera.cam_from_world, same.cam_from_world)
     assert (camera.fx, camera.fy, camera.hw) == (pytest.approx(10), pytest.approx(10), (20, 40))
     assert camera.trained_focal is None
@@ -709,9 +694,7 @@ def llff(folder, count=9):
 
 def test_llff_axes_are_down_right_and_back(tmp_path):
     cameras = read_cameras(llff(tmp_path))
-    same = read_cameras(
-        write_json(tmp_path / "transforms.json", transforms([{"file_path": "a"}], w=40, h=20))
-    ).train[0]
+    same = read_cameras(write_json(tmp_path / "transforms.json", transforms([{"file_path": "a"}], w=40, h=20))).train[0]
     camera = cameras.train[0]
     assert torch.allclose(camera.cam_from_world, same.cam_from_world, atol=1e-15)
     assert (camera.fx, camera.hw, camera.name) == (30, (20, 40), "001")
@@ -757,10 +740,7 @@ def multiscale(folder):
 def test_multiscale_blender_has_a_view_a_scale(tmp_path):
     cameras = read_cameras(multiscale(tmp_path).parent)
     assert names(cameras.train) == ["r_0", "r_0_d1"]
-    assert [(c.fx, c.hw, c.trained_focal) for c in cameras.train] == [
-        (30, (20, 40), 30),
-        (15, (10, 20), 15),
-    ]
+    assert [(c.fx, c.hw, c.trained_focal) for c in cameras.train] == [(30, (20, 40), 30), (15, (10, 20), 15)]
     assert (len(cameras.test), cameras.background) == (1, WHITE)
     with pytest.raises(UsageError, match="gives the split"):
         read_cameras(tmp_path, test_every=8)
@@ -768,13 +748,7 @@ def test_multiscale_blender_has_a_view_a_scale(tmp_path):
 
 @pytest.mark.parametrize(
     ("key", "value"),
-    [
-        ("file_path", ["../x", "y"]),
-        ("cam2world", None),
-        ("width", []),
-        ("height", [1]),
-        ("focal", [1e999, 1]),
-    ],
+    [("file_path", ["../x", "y"]), ("cam2world", None), ("width", []), ("height", [1]), ("focal", [1e999, 1])],
     ids=str,
 )
 def test_odd_multiscale_sets_are_refused(tmp_path, key, value):
@@ -811,9 +785,7 @@ def test_a_folder_without_cameras_says_what_was_looked_for(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "options",
-    [{"train_scale": 0.0}, {"train_scale": math.nan}, {"train_scale": 1e9}, {"test_every": 1}],
-    ids=str,
+    "options", [{"train_scale": 0.0}, {"train_scale": math.nan}, {"train_scale": 1e9}, {"test_every": 1}], ids=str
 )
 def test_odd_options_are_refused(tmp_path, options):
     with pytest.raises(UsageError):
@@ -846,11 +818,7 @@ FIXTURES = {  # how to make each format's files, the path to read, and the file 
     "images.txt": (colmap_txt, "images.txt"),
     "blender": (blender, "transforms_train.json"),
     "transforms": (
-        lambda folder: (
-            write_json(
-                folder / "transforms.json", transforms([{"file_path": "a"}], w=4, h=2)
-            ).parent
-        ),
+        lambda folder: write_json(folder / "transforms.json", transforms([{"file_path": "a"}], w=4, h=2)).parent,
         "transforms.json",
     ),
     "pinhole": (lambda folder: write_json(folder / "p.json", pinhole()), ""),
@@ -884,9 +852,7 @@ class Dialect:
 
 def test_a_plug_in_is_asked_before_the_own_formats(tmp_path, monkeypatch):
     own = {format.name: format for format in OWN}
-    monkeypatch.setattr(
-        "aaplug.io.cameras.CAMERA_FORMATS", Registry("camera format", own | {"dialect": Dialect()})
-    )
+    monkeypatch.setattr("aaplug.io.cameras.CAMERA_FORMATS", Registry("camera format", own | {"dialect": Dialect()}))
     path = write_json(tmp_path / "transforms.json", transforms([{"file_path": "a"}], w=4, h=2))
     assert read_cameras(path).notes == ("by the plug-in",)
     assert read_cameras(tmp_path).notes != ("by the plug-in",)
@@ -894,15 +860,11 @@ def test_a_plug_in_is_asked_before_the_own_formats(tmp_path, monkeypatch):
 
 def test_a_path_is_text_too(tmp_path):
     assert len(aaplug.read_cameras(str(inria(tmp_path))).all) == 1
-    assert (
-        len(read_camera_path(str(write_json(tmp_path / "path.json", camera_path()))).cameras) == 1
-    )
+    assert len(read_camera_path(str(write_json(tmp_path / "path.json", camera_path()))).cameras) == 1
 
 
 @pytest.mark.parametrize("name", FIXTURES)
-@settings(
-    max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_spoiled_files_read_or_raise_our_errors(tmp_path, name, data):
     make, spoil = FIXTURES[name]

@@ -21,10 +21,7 @@ from aaplug.io.scenes import read_scene, write_scene
 from aaplug.rendering.renderer import Renderer
 from tests.conftest import make_camera, make_scene
 
-EYES = {
-    "train": [(0.0, -4.0, 0.0), (2.0, -3.5, 1.0), (-3.0, -3.0, 0.5)],
-    "test": [(1.0, -4.0, 0.0)],
-}
+EYES = {"train": [(0.0, -4.0, 0.0), (2.0, -3.5, 1.0), (-3.0, -3.0, 0.5)], "test": [(1.0, -4.0, 0.0)]}
 SIZE = (64, 48)
 
 
@@ -83,9 +80,7 @@ def test_render_writes_a_view_at_a_scale(cli):
     assert "background: black" in err
 
 
-@pytest.mark.parametrize(
-    ("resolution", "size"), [("40x40", (40, 40)), ("-1x24", (32, 24)), ("128x-1", (128, 96))]
-)
+@pytest.mark.parametrize(("resolution", "size"), [("40x40", (40, 40)), ("-1x24", (32, 24)), ("128x-1", (128, 96))])
 def test_render_writes_a_resolution(cli, resolution, size):
     assert cli(f"render scene.ply --cameras . -o one.png --resolution {resolution}")[0] == 0
     assert image_size(Path("one.png")) == size
@@ -117,14 +112,9 @@ def test_render_one_file_of_cameras_serves_as_both(cli):
 
 
 def test_render_takes_an_inria_model_folder_as_it_is(cli):
-    model = inria_model(
-        Path("model"), "Namespace(white_background=True, resolution=2, images='images', eval=False)"
-    )
+    model = inria_model(Path("model"), "Namespace(white_background=True, resolution=2, images='images', eval=False)")
     assert cli(f"render -m {model} -o out --views all")[0] == 0
-    assert image_size(Path("out/a.png")) == (
-        32,
-        24,
-    )  # cameras.json holds the source's size; training was at -r 2
+    assert image_size(Path("out/a.png")) == (32, 24)  # cameras.json holds the source's size; training was at -r 2
     assert cli(f"render {model} -o again --iteration 7 --views a")[0] == 0
     code, _, err = cli(f"render {model} -o again --iteration 8 --views a --overwrite")
     assert (code, "has no iteration 8; it has 7, 30" in err) == (2, True)
@@ -158,9 +148,7 @@ def break_count(folder: Path) -> None:
 
 def break_column(folder: Path) -> None:
     data = (folder / "scene.ply").read_bytes()
-    (folder / "scene.ply").write_bytes(
-        data.replace(b"property float rot_3", b"property float spin_")
-    )
+    (folder / "scene.ply").write_bytes(data.replace(b"property float rot_3", b"property float spin_"))
 
 
 def break_nan(folder: Path) -> None:
@@ -299,9 +287,7 @@ def inria_model(folder: Path, config: str) -> Path:
 
 
 def test_background_comes_from_cfg_args(cli):
-    model = inria_model(
-        Path("model"), "Namespace(white_background=True, resolution=1, images='images', eval=False)"
-    )
+    model = inria_model(Path("model"), "Namespace(white_background=True, resolution=1, images='images', eval=False)")
     _, _, err = cli(f"render -m {model} -o out --views a")
     assert "background: white (from the camera files)" in err
     corner = cv2.imread("out/a.png")[0, 0]

@@ -8,14 +8,7 @@ import pytest
 from aaplug.io.images import image_size
 from aaplug.methods.recipes import RECIPES
 from aaplug.verbs.evaluate import evaluate
-from tests.test_cli import (  # noqa: F401  (fixtures)
-    assert_refused,
-    break_frame,
-    break_nothing,
-    break_photo,
-    cli,
-    dataset,
-)
+from tests.test_cli import assert_refused, break_frame, break_nothing, break_photo, cli, dataset  # noqa: F401  (fixtures)
 
 
 def test_it_writes_results_and_prints_a_table(cli):  # noqa: F811
@@ -41,9 +34,7 @@ def test_the_library_gives_what_the_command_line_gives(cli):  # noqa: F811
     assert {key: found["_aaplug"][key] for key in own.protocol} == own.protocol
 
 
-@pytest.mark.parametrize(
-    "several", ["--recipe mip,auto --scale 1,0.5", "--scale=1,0.5 --recipe=mip,auto,"]
-)
+@pytest.mark.parametrize("several", ["--recipe mip,auto --scale 1,0.5", "--scale=1,0.5 --recipe=mip,auto,"])
 def test_commas_part_values_as_spaces_do(cli, several):  # noqa: F811
     code, out, _ = cli(f"evaluate scene.ply --cameras . {several} -o a,b --json")
     assert code == 0

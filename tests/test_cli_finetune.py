@@ -57,9 +57,7 @@ def test_finetune_writes_scene_report_and_pictures(whole):
     assert not (whole / "tuned.finetune.pt").exists()
 
 
-def test_a_run_stopped_by_ctrl_c_and_resumed_writes_what_an_uninterrupted_one_does(
-    cli, monkeypatch, whole
-):
+def test_a_run_stopped_by_ctrl_c_and_resumed_writes_what_an_uninterrupted_one_does(cli, monkeypatch, whole):
     real = loop.advance
 
     def pressed(job, state):
@@ -117,9 +115,7 @@ def test_a_run_killed_outright_resumes_from_its_checkpoint(cli, tmp_path, whole)
     ],
 )
 def test_finetune_refuses_what_cannot_be(cli, options, words):
-    code, out, err = cli(
-        f"finetune scene.ply --cameras . -o tuned.ply --rasterizer eager {options}"
-    )
+    code, out, err = cli(f"finetune scene.ply --cameras . -o tuned.ply --rasterizer eager {options}")
     assert (code, out) == (2, "")
     assert words in err
     assert not list(Path().glob("tuned*"))

@@ -38,9 +38,7 @@ def empty_cache(tmp_path, monkeypatch):
 @pytest.mark.parametrize("kernel", compiled.KERNELS, ids=lambda kernel: kernel.name)
 def test_compiled_kernels_give_the_eager_results(built, kernel: Kernel):
     args, twins = kernel.example(), kernel.example()
-    answers = zip(
-        [*built.run(kernel, *args), *args], [*EAGER.run(kernel, *twins), *twins], strict=True
-    )
+    answers = zip([*built.run(kernel, *args), *args], [*EAGER.run(kernel, *twins), *twins], strict=True)
     for fast, slow in answers:  # results, and arguments updated in place
         assert fast.dtype == slow.dtype
         # behind a splat of alpha 0.99 a gradient has a hundred times the rounding of its alpha
@@ -57,9 +55,7 @@ def test_compositing_is_one_loop_over_tiles(built, name):
 
 def test_packages_are_checked_by_one_thread_which_is_undone_after_that(built, monkeypatch):
     seen, close, threads = [], compiled._close, torch.get_num_threads()
-    monkeypatch.setattr(
-        compiled, "_close", lambda *x: seen.append(torch.get_num_threads()) or close(*x)
-    )
+    monkeypatch.setattr(compiled, "_close", lambda *x: seen.append(torch.get_num_threads()) or close(*x))
     try:
         torch.set_num_threads(2)
         assert compiled.load() is not None
@@ -78,8 +74,7 @@ def test_compiled_images_are_the_eager_ones(built, recipe, degree):
     scene, camera = sized(make_scene(400, degree=degree)), make_camera(size=(150, 110))
     view = camera.scaled(0.6)
     fast, eager = (
-        Renderer.of(scene, [camera], recipe, rasterizer=rasterizer)(view)
-        for rasterizer in (Tiled(built), Tiled())
+        Renderer.of(scene, [camera], recipe, rasterizer=rasterizer)(view) for rasterizer in (Tiled(built), Tiled())
     )
     difference = (fast.rgb - eager.rgb).abs().amax(dim=2)
     assert (difference > ANSWER).double().mean() < 1e-3, "more than flips at a cut-off"

@@ -129,9 +129,7 @@ WRITABLE = [f.name for f in OWN if isinstance(f, WritableFormat)]
 @pytest.mark.parametrize("convention", [CLASSIC, ANTIALIASED, MIP])
 @pytest.mark.parametrize("degree", [0, 3])
 @pytest.mark.parametrize("name", WRITABLE)
-def test_what_is_written_is_read_and_written_to_the_same_bytes(
-    tmp_path: Path, expected, name, degree, convention
-):
+def test_what_is_written_is_read_and_written_to_the_same_bytes(tmp_path: Path, expected, name, degree, convention):
     """Writing rounds once: what is read back is a scene that the format holds exactly."""
     if name == "spz":
         pytest.importorskip("gsply")
@@ -170,9 +168,7 @@ class Toy:
         ply.write(path, parts, count, overwrite, options)
 
 
-def test_a_plug_in_is_asked_before_the_own_formats_and_written_by_its_suffix(
-    tmp_path: Path, expected, monkeypatch
-):
+def test_a_plug_in_is_asked_before_the_own_formats_and_written_by_its_suffix(tmp_path: Path, expected, monkeypatch):
     formats = Registry("scene format", {f.name: f for f in OWN})
     formats.register("toy", Toy())
     monkeypatch.setattr("aaplug.io.scenes.SCENE_FORMATS", formats)
@@ -221,18 +217,13 @@ def test_a_half_turn_of_the_scene_is_a_half_turn_of_the_view():
 def test_splat_is_written_as_it_is_read(tmp_path: Path):
     (tmp_path / "in.splat").write_bytes(splat())
     write_scene(tmp_path / "out.splat", read_scene(tmp_path / "in.splat"))
-    old, new = (
-        np.frombuffer((tmp_path / n).read_bytes(), np.uint8).reshape(-1, 32)
-        for n in ("in.splat", "out.splat")
-    )
+    old, new = (np.frombuffer((tmp_path / n).read_bytes(), np.uint8).reshape(-1, 32) for n in ("in.splat", "out.splat"))
     assert (old[:, :12] == new[:, :12]).all()
     assert np.abs(old[:, 24:].astype(int) - new[:, 24:]).max() <= 1
 
 
 @pytest.mark.parametrize(("degree", "convention"), [(1, CLASSIC), (2, MIP), (3, ANTIALIASED)])
-def test_spz_is_written_within_its_steps_with_its_flag(
-    tmp_path: Path, expected, degree, convention
-):
+def test_spz_is_written_within_its_steps_with_its_flag(tmp_path: Path, expected, degree, convention):
     pytest.importorskip("gsply")
     scene = replace(expected, sh=expected.sh[:, : (degree + 1) ** 2], convention=convention)
     write_scene(tmp_path / "a.spz", scene)
@@ -242,9 +233,7 @@ def test_spz_is_written_within_its_steps_with_its_flag(
     torch.testing.assert_close(again.opacities, scene.opacities, rtol=0, atol=0.5 / 255 + 1e-6)
     shown = [(0.5 + 0.15 * s.sh[:, 0]).clamp(0, 1) for s in (again, scene)]
     torch.testing.assert_close(*shown, rtol=0, atol=0.5 / 255 + 1e-6)
-    torch.testing.assert_close(
-        again.sh[:, 1:], scene.sh[:, 1:].clamp(-1, 127 / 128), rtol=0, atol=1 / 256 + 1e-6
-    )
+    torch.testing.assert_close(again.sh[:, 1:], scene.sh[:, 1:].clamp(-1, 127 / 128), rtol=0, atol=1 / 256 + 1e-6)
     assert (again.unit_quats * scene.unit_quats).sum(dim=1).abs().min() > 0.99999
     assert again.convention == (ANTIALIASED if convention.compensated else CLASSIC)
     # what is read is written back to the byte
@@ -419,9 +408,7 @@ class Trap:
         return Path.touch, (Path("trap"),)
 
 
-@pytest.mark.parametrize(
-    "content", [Trap(), {"splats": Trap()}, [1], {"splats": {"means": 3}}], ids=range(4)
-)
+@pytest.mark.parametrize("content", [Trap(), {"splats": Trap()}, [1], {"splats": {"means": 3}}], ids=range(4))
 def test_a_checkpoint_runs_nothing(tmp_path: Path, monkeypatch, content: object):
     monkeypatch.chdir(tmp_path)
     torch.save(content, tmp_path / "a.pt")
@@ -498,10 +485,7 @@ def test_real_compressed_scenes_are_read(shared_data, name: str, n: int, degree:
 @pytest.mark.data
 def test_sog_is_the_ply_that_it_was_made_of(shared_data):
     folder = shared_data / "formats/splats"
-    sog, ply = (
-        read_scene(folder / "flowers_lod3_sog/meta.json"),
-        read_scene(folder / "flowers_lod3_sh2.ply"),
-    )
+    sog, ply = (read_scene(folder / "flowers_lod3_sog/meta.json"), read_scene(folder / "flowers_lod3_sh2.ply"))
     twin = in_the_same_order_of(sog, ply)
     assert (sog.means - twin.means).abs().max() < 1e-3
 

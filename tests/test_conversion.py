@@ -61,9 +61,7 @@ def test_a_mip_scene_without_stored_filter_has_nothing_to_fuse(cameras):
 def test_converted_splats_show_the_energy_that_training_showed(convention):
     """With one camera nothing is averaged: the Mip viewer's o√det is that of training."""
     scene = replace(make_scene(100, dtype=torch.float64), convention=convention)
-    scene = replace(
-        scene, logit_opacities=scene.logit_opacities - 4
-    )  # far from the bound on opacity
+    scene = replace(scene, logit_opacities=scene.logit_opacities - 4)  # far from the bound on opacity
     camera = make_camera()
     training = TrainingViews.of(scene, [camera])
     converted = fuse(scene, training, FORMS["matched-energy"])
@@ -71,9 +69,7 @@ def test_converted_splats_show_the_energy_that_training_showed(convention):
     shown = project(converted, camera)
     seen = training.bounds.seen[shown.sources]
     energy = (shown.opacities * shown.dets.sqrt())[seen]
-    torch.testing.assert_close(
-        energy, (trained.opacities * trained.dets.sqrt())[seen], rtol=1e-6, atol=0
-    )
+    torch.testing.assert_close(energy, (trained.opacities * trained.dets.sqrt())[seen], rtol=1e-6, atol=0)
 
 
 @pytest.mark.parametrize("viewer", VIEWERS.values(), ids=VIEWERS)

@@ -36,9 +36,7 @@ def test_each_row_of_the_table_of_formats_names_its_proof(row: str):
 def test_each_row_of_scenes_proves_reading_writing_and_the_tag(row: str):
     """One test may prove several claims, but a format that can be written names a test that writes it."""
     _, _, _, written, tag, proofs, _ = row.split("|")
-    bodies = [
-        _body(file, name) for file, name in re.findall(r"`(test_\w+\.py)::(test_\w+)`", proofs)
-    ]
+    bodies = [_body(file, name) for file, name in re.findall(r"`(test_\w+\.py)::(test_\w+)`", proofs)]
     assert any("read_scene" in body or "open_scene" in body for body in bodies)
     if written.strip() != "no":
         assert any("write_scene" in body or "through(" in body for body in bodies), proofs

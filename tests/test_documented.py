@@ -139,10 +139,7 @@ def write_model(folder: Path, scene: Gaussians, photographs: Path) -> None:
 def camera_path(folder: Path) -> dict[str, object]:
     """Two frames of nerfstudio's camera path, at poses of a Blender data set, whose axes are the same."""
     frames = json.loads((folder / "transforms_test.json").read_text())["frames"]
-    path = [
-        {"camera_to_world": list(chain(*frame["transform_matrix"])), "fov": 40.0}
-        for frame in frames
-    ]
+    path = [{"camera_to_world": list(chain(*frame["transform_matrix"])), "fov": 40.0} for frame in frames]
     return {"render_width": SIZE, "render_height": SIZE, "fps": 10, "camera_path": path}
 
 

@@ -10,14 +10,7 @@ from aaplug.core.cameras import CameraSet
 from aaplug.core.errors import UsageError
 from aaplug.core.imaging import box_average, quantised
 from aaplug.core.training import TrainingViews
-from aaplug.evaluation.engine import (
-    NO_PHOTOGRAPH,
-    Candidate,
-    Task,
-    candidates_of,
-    compare,
-    evaluate,
-)
+from aaplug.evaluation.engine import NO_PHOTOGRAPH, Candidate, Task, candidates_of, compare, evaluate
 from aaplug.evaluation.image_store import ImageStore
 from aaplug.evaluation.metric import Metric
 from aaplug.evaluation.metrics import CONSISTENCY, ENERGY, FLICKER, METRICS, PSNR, SSIM, psnr
@@ -50,18 +43,11 @@ def drawn(look, view, recipe="classic"):
     return replace(look, recipe=RECIPES[recipe])(view).rgb
 
 
-def task(
-    look, views, source="photographs", protocol="default", recipes=("classic", "matched"), **changes
-):
+def task(look, views, source="photographs", protocol="default", recipes=("classic", "matched"), **changes):
     recipes = [find_recipe(recipe) if isinstance(recipe, str) else recipe for recipe in recipes]
     candidates = candidates_of(look.scene, look.training, recipes, look.rasterizer)
     truth = Truth(look, source, PROTOCOLS[protocol])
-    return Task(
-        **(
-            {"candidates": candidates, "scales": (1.0, 0.5, 2.0), "views": views, "truth": truth}
-            | changes
-        )
-    )
+    return Task(**({"candidates": candidates, "scales": (1.0, 0.5, 2.0), "views": views, "truth": truth} | changes))
 
 
 def test_figures_are_those_of_the_images_compared_by_hand(world):
@@ -80,9 +66,7 @@ def test_the_ceiling_is_always_among_the_rows(world):
     report = evaluate(task(look, views))
     assert report.recipes == (CEILING, "classic", "matched")
     full = drawn(look, views[0], "classic").clamp(0, 1)
-    expected = psnr(
-        quantised(box_average(full, 2)), box_average(quantised(read_image(views[0].photo, None)), 2)
-    )
+    expected = psnr(quantised(box_average(full, 2)), box_average(quantised(read_image(views[0].photo, None)), 2))
     assert report.select(CEILING, 0.5)[0].values["PSNR"] == pytest.approx(expected, abs=1e-9)
 
 
@@ -100,9 +84,7 @@ def test_self_truth_needs_no_photographs_and_makes_the_ceiling_perfect(world):
     report = evaluate(task(look, bare, "self"))
     assert mean(report.select(CEILING, 0.5), "PSNR") is None  # equal images
     assert mean(report.select(CEILING, 0.5), "SSIM") == pytest.approx(1.0)
-    assert (
-        mean(report.select("matched", 2.0), "PSNR") is None
-    )  # its own truth above the training size
+    assert mean(report.select("matched", 2.0), "PSNR") is None  # its own truth above the training size
     assert mean(report.select("classic", 2.0), "PSNR") < 40
     assert mean(report.select("matched", 0.5), "PSNR") > mean(report.select("classic", 0.5), "PSNR")
 
@@ -142,9 +124,7 @@ def test_progress_counts_views(world):
     assert told == [(0, 2), (1, 2), (2, 2)]
 
 
-@pytest.mark.parametrize(
-    ("scale", "name"), [(1.0, "1"), (0.25, "1/4"), (2.0, "2×"), (0.3, "0.3"), (1 / 3, "1/3")]
-)
+@pytest.mark.parametrize(("scale", "name"), [(1.0, "1"), (0.25, "1/4"), (2.0, "2×"), (0.3, "0.3"), (1 / 3, "1/3")])
 def test_scales_are_written_as_people_do(scale, name):
     assert scale_name(scale) == name
 
@@ -224,10 +204,7 @@ def test_a_protocol_names_its_flavours_in_every_result(world):
     assert "Pillow" in per_view(report)["_aaplug"]["downscale"]
     plain = evaluate(task(look, views[:1], scales=(1.0, 0.5)))
     for r in (1.0, 0.5):
-        assert (
-            report.select("classic", r)[0].values["SSIM"]
-            != plain.select("classic", r)[0].values["SSIM"]
-        )
+        assert report.select("classic", r)[0].values["SSIM"] != plain.select("classic", r)[0].values["SSIM"]
 
 
 def test_photographs_do_not_show_moved_cameras(world):
@@ -260,9 +237,7 @@ def test_an_interrupted_evaluation_continues_and_redoes_nothing(world, tmp_path,
         evaluate(task(look, views), tell=stop, journal=path)
     before = path.read_bytes()
     seen, render = [], Renderer.draw
-    monkeypatch.setattr(
-        Renderer, "draw", lambda self, view: (seen.append(view.name), render(self, view))[1]
-    )
+    monkeypatch.setattr(Renderer, "draw", lambda self, view: (seen.append(view.name), render(self, view))[1])
     report = evaluate(task(look, views), journal=path, resume=True)
     assert set(seen) == {"b"}
     assert path.read_bytes().startswith(before)
@@ -306,9 +281,7 @@ def test_csv_holds_a_line_a_measurement(world):
 def test_a_new_metric_that_is_undefined_is_reported_with_its_own_words(world, monkeypatch):
     monkeypatch.setattr(METRICS, "_entries", dict(METRICS))
     odd = Metric("odd", "", 1.0, 2, "its protocol", lambda image, truth: None, undefined="too odd")
-    nan = replace(
-        odd, name="nan", measure=lambda image, truth: float("nan"), undefined="not finite"
-    )
+    nan = replace(odd, name="nan", measure=lambda image, truth: float("nan"), undefined="not finite")
     METRICS.register("odd", odd)  # and `nan` is given from Python alone
     look, views = world
     work = task(look, views[:1], scales=(0.5,), metrics=(PSNR, odd, nan))
@@ -370,9 +343,7 @@ def test_the_truth_without_photographs_draws_its_look_once(world, monkeypatch):
     look, views = world
     drawings = []
     call = TimedRenderer.__call__
-    monkeypatch.setattr(
-        TimedRenderer, "__call__", lambda self, view: (drawings.append(view), call(self, view))[1]
-    )
+    monkeypatch.setattr(TimedRenderer, "__call__", lambda self, view: (drawings.append(view), call(self, view))[1])
     work = task(look, views[:1], "self", recipes=("matched", "auto"), scales=(1.0, 0.5))
     evaluate(work)
     assert [view.hw for view in drawings] == [(48, 64), (24, 32)]
@@ -394,8 +365,5 @@ def test_a_kept_truth_is_made_once_and_a_full_memory_keeps_nothing(world):
 def test_larger_truth_has_the_averages_of_the_training_size(world):
     look, views = world
     full, larger = look(views[0]).rgb, Truth(look, enlarge=back_projected)(views[0], 2.0)
-    off = [
-        (box_average(image, 2) - full).square().mean()
-        for image in (larger, look(views[0].scaled(2.0)).rgb)
-    ]
+    off = [(box_average(image, 2) - full).square().mean() for image in (larger, look(views[0].scaled(2.0)).rgb)]
     assert off[0] < 0.2 * off[1]

@@ -106,9 +106,7 @@ def test_anisotropic_smoothing_is_isotropic_where_views_come_from_all_sides():
     torch.testing.assert_close(added, torch.full_like(added, 1.5), rtol=1e-5, atol=0)
 
 
-@pytest.mark.parametrize(
-    ("thickness", "expected"), [((2.0, 2.0, 1e-3), 4 / 5), ((0.1, 0.1, 0.1), BALANCE_FLOOR)]
-)
+@pytest.mark.parametrize(("thickness", "expected"), [((2.0, 2.0, 1e-3), 4 / 5), ((0.1, 0.1, 0.1), BALANCE_FLOOR)])
 def test_balanced_opacity_follows_the_broadest_face_down_to_its_floor(thickness, expected):
     """Scales relative to the smoothing: a disc twice as wide keeps 4/5 of its opacity."""
     scene = SCENE[:1]
@@ -177,9 +175,7 @@ def test_pixel_sizes_are_those_of_the_published_form():
 def test_multi_scale_draws_gaussians_at_the_sizes_of_training(size, smallest, largest, base, drawn):
     variance = (size / CUTOFF) ** 2
     splats = row_of_splats([(variance, 0.0, variance)] * 2)
-    always = PixelSizes(
-        torch.ones(2) * smallest, torch.ones(2) * largest, torch.tensor([base, True])
-    )
+    always = PixelSizes(torch.ones(2) * smallest, torch.ones(2) * largest, torch.tensor([base, True]))
     chosen = ByPixelSize()(splats, replace(make_scene(2), pixel_sizes=always))
     assert chosen.sources.tolist() == [0, 1][not drawn :]
 
@@ -195,14 +191,9 @@ def test_multi_scale_selects_by_the_size_in_the_view_before_dilation():
     )
     camera = make_camera(size=(200, 200))
     sizes = pixel_size(project(scene, camera))
-    level = PixelSizes(
-        sizes / 2, torch.tensor([99.0, 0.25 * sizes[1]]), torch.tensor([False, False])
-    )
+    level = PixelSizes(sizes / 2, torch.tensor([99.0, 0.25 * sizes[1]]), torch.tensor([False, False]))
     scene = replace(scene, pixel_sizes=level)
-    drawn = {
-        scale: ByPixelSize()(project(scene, camera.scaled(scale)), scene).sources.tolist()
-        for scale in (1.0, 0.1)
-    }
+    drawn = {scale: ByPixelSize()(project(scene, camera.scaled(scale)), scene).sources.tolist() for scale in (1.0, 0.1)}
     assert drawn == {1.0: [0], 0.1: [1]}
     training = TrainingViews.of(scene, [camera])
     for scale, kept in drawn.items():

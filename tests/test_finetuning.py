@@ -19,14 +19,7 @@ from aaplug.finetuning.checkpoints import load, save
 from aaplug.finetuning.densification import MIN_OPACITY, SHRINK, THRESHOLD, carried, densify
 from aaplug.finetuning.loop import advance, loss_at, run
 from aaplug.finetuning.losses import LOSSES, l1_dssim, l2, structural_similarity
-from aaplug.finetuning.parameters import (
-    RATES,
-    between,
-    extent,
-    least_log_scales,
-    leaves_of,
-    scene_of,
-)
+from aaplug.finetuning.parameters import RATES, between, extent, least_log_scales, leaves_of, scene_of
 from aaplug.finetuning.settings import QUICK, Settings, balanced
 from aaplug.finetuning.state import State, TuningJob, begin
 from aaplug.methods.recipes import RECIPES
@@ -36,19 +29,14 @@ from tests.conftest import make_camera, make_scene
 
 F64 = torch.float64
 EYES = [(0.5, -3.5, 0.4), (2.0, -3.0, 1.0), (-2.5, -3.0, 0.2)]
-VIEWS = tuple(
-    make_camera(eye, size=(32, 24), name=f"view{i}", fov=0.9) for i, eye in enumerate(EYES)
-)
+VIEWS = tuple(make_camera(eye, size=(32, 24), name=f"view{i}", fov=0.9) for i, eye in enumerate(EYES))
 WEIGHTS = {0.5: 1.0, 0.25: 2.0}
 SETTINGS = Settings("test", 6, WEIGHTS, RATES, anchor=3.0, decay=0.1)
 GREY = (0.5, 0.5, 0.5)
 
 
 def make_job(
-    n: int = 60,
-    settings: Settings = SETTINGS,
-    dtype: torch.dtype = torch.float32,
-    recipe: str = "matched",
+    n: int = 60, settings: Settings = SETTINGS, dtype: torch.dtype = torch.float32, recipe: str = "matched"
 ) -> TuningJob:
     scene = make_scene(n, seed=4, dtype=dtype)
     look = own_look(scene, TrainingViews.of(scene, VIEWS), RASTERIZERS["eager"], GREY)
@@ -76,9 +64,7 @@ def assert_same(a: State, b: State) -> None:
 def test_ssim_is_skimages():
     a, b = torch.rand(2, 30, 41, 3, dtype=F64)
     options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
-    _, full = ssim_of_skimage(
-        a.numpy(), b.numpy(), data_range=1.0, channel_axis=2, full=True, **options
-    )
+    _, full = ssim_of_skimage(a.numpy(), b.numpy(), data_range=1.0, channel_axis=2, full=True, **options)
     assert structural_similarity(a, b).item() == pytest.approx(full[5:-5, 5:-5].mean(), abs=1e-9)
 
 
@@ -99,8 +85,7 @@ def test_losses_are_the_papers():
 
 
 @pytest.mark.parametrize(
-    ("loss", "recipe"),
-    [("l2", "matched"), ("l1-dssim", "matched"), ("l2", "mip"), ("l1-dssim", "classic")],
+    ("loss", "recipe"), [("l2", "matched"), ("l1-dssim", "matched"), ("l2", "mip"), ("l1-dssim", "classic")]
 )
 def test_gradients_of_the_whole_loss_are_finite_differences(loss, recipe):
     job = make_job(25, replace(SETTINGS, loss=loss), F64, recipe)
@@ -114,9 +99,7 @@ def test_gradients_of_the_whole_loss_are_finite_differences(loss, recipe):
 
     def total(values):
         state = replace(begin(job), leaves=values)
-        return sum(
-            w * loss_at(job, state, VIEWS[0], s)[0] for s, w in {**WEIGHTS, 1.0: 3.0}.items()
-        )
+        return sum(w * loss_at(job, state, VIEWS[0], s)[0] for s, w in {**WEIGHTS, 1.0: 3.0}.items())
 
     moving = {name: value.clone().requires_grad_() for name, value in leaves.items()}
     grads = torch.autograd.grad(total(moving), list(moving.values()))
@@ -143,9 +126,7 @@ def test_steps_lower_the_loss_at_every_scale():
 
     def losses(scene: Gaussians) -> list[float]:
         state = replace(begin(job), leaves=leaves_of(scene))
-        return [
-            sum(loss_at(job, state, view, scale)[0].item() for view in VIEWS) for scale in WEIGHTS
-        ]
+        return [sum(loss_at(job, state, view, scale)[0].item() for view in VIEWS) for scale in WEIGHTS]
 
     before, now = losses(job.start.scene), losses(after(job).scene(job))
     assert all(b < 0.9 * a for a, b in zip(before, now, strict=True)), (before, now)
@@ -205,18 +186,14 @@ def test_halves_lie_where_the_gaussian_lies():
     scene = make_scene(1)
     scene = replace(scene, log_scales=torch.tensor([[1.0, -3.0, -5.0]]))
     many = scene[torch.zeros(4000, dtype=torch.long)]
-    change = densify(
-        many, torch.full((4000,), 1.0), 0.1, torch.Generator().manual_seed(1)
-    )  # all are split
+    change = densify(many, torch.full((4000,), 1.0), 0.1, torch.Generator().manual_seed(1))  # all are split
     offsets = (change.scene.means - scene.means).double()
     along = offsets @ rotation_matrices(scene.unit_quats.double())[0]
     torch.testing.assert_close(along.std(dim=0), scene.scales[0].double(), rtol=0.05, atol=0)
 
 
 def test_the_optimizer_forgets_what_is_new_alone():
-    change = densify(
-        make_scene(3), torch.tensor([1.0, 0.0, 0.0]), 1e9, torch.Generator().manual_seed(0)
-    )
+    change = densify(make_scene(3), torch.tensor([1.0, 0.0, 0.0]), 1e9, torch.Generator().manual_seed(0))
     moments = {"step": torch.tensor(5.0), "exp_avg": torch.arange(1.0, 4.0)[:, None]}
     found = carried(moments, change)
     assert found["exp_avg"][:, 0].tolist() == [1.0, 2.0, 3.0, 0.0]
@@ -256,9 +233,7 @@ def test_a_densified_scene_is_reported_with_its_own_bounds():
 
 
 @pytest.mark.parametrize(("densify_every", "stopped_at"), [(0, 2), (2, 3)])
-def test_a_run_that_was_stopped_and_resumed_is_one_that_never_was(
-    densify_every, stopped_at, tmp_path
-):
+def test_a_run_that_was_stopped_and_resumed_is_one_that_never_was(densify_every, stopped_at, tmp_path):
     job = make_job(settings=replace(SETTINGS, densify_every=densify_every))
     whole = begin(job)
     assert run(job, whole, every=2)
@@ -314,9 +289,7 @@ def test_after_three_bad_steps_a_run_rolls_back_and_says_so(monkeypatch):
     spoil(monkeypatch, {3, 4, 5})
     state = begin(job)
     assert run(job, state, every=2, say=said.append)
-    assert said == [
-        "step 6: 3 steps without a finite gradient; back to step 2, at half the learning rates"
-    ]
+    assert said == ["step 6: 3 steps without a finite gradient; back to step 2, at half the learning rates"]
     assert (state.step, state.rollbacks) == (8, 1)
     assert [entry["step"] for entry in state.curve] == [1, 2, 7, 8]
 

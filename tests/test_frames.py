@@ -14,9 +14,7 @@ FASTEST = ALL_RASTERIZERS.get("compiled", ALL_RASTERIZERS["eager"])
 
 @pytest.fixture
 def renderer() -> Renderer:
-    return Renderer.of(
-        make_scene(60), VIEWS, "matched", background=(0.2, 0.3, 0.4), rasterizer=FASTEST
-    )
+    return Renderer.of(make_scene(60), VIEWS, "matched", background=(0.2, 0.3, 0.4), rasterizer=FASTEST)
 
 
 @pytest.fixture

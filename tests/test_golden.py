@@ -136,9 +136,7 @@ def inria_projected(gaussian: Stored, camera: Camera) -> Flat | None:
     focal_x, focal_y = width / (2 * tan_x), height / (2 * tan_y)
     tx = min(1.3 * tan_x, max(-1.3 * tan_x, x / z)) * z
     ty = min(1.3 * tan_y, max(-1.3 * tan_y, y / z)) * z
-    jacobian = np.array(
-        [[focal_x / z, 0, -focal_x * tx / z**2], [0, focal_y / z, -focal_y * ty / z**2]]
-    )
+    jacobian = np.array([[focal_x / z, 0, -focal_x * tx / z**2], [0, focal_y / z, -focal_y * ty / z**2]])
     to_screen = jacobian @ view[:3, :3]
     conic, _ = dilated(to_screen @ gaussian.covariance @ to_screen.T, compensated=False)
     centre = np.linalg.inv(view)[:3, 3]
@@ -179,16 +177,11 @@ def scene_of(seed: int, degree: int) -> Gaussians:
     """Some Gaussians in front of, beside and behind the camera, many of them opaque."""
     scene = make_scene(70, seed, degree=degree)
     return replace(
-        scene,
-        means=1.3 * scene.means,
-        log_scales=scene.log_scales + 1,
-        logit_opacities=3 * scene.logit_opacities + 4,
+        scene, means=1.3 * scene.means, log_scales=scene.log_scales + 1, logit_opacities=3 * scene.logit_opacities + 4
     )
 
 
-def agree(
-    scene: Gaussians, camera: Camera, recipe: str, golden: tuple[np.ndarray, np.ndarray, np.ndarray]
-) -> None:
+def agree(scene: Gaussians, camera: Camera, recipe: str, golden: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
     """Every rasterizer draws the golden image: in float64 to rounding, in float32 away from cut-offs."""
     expected, alpha, close = (torch.from_numpy(x) for x in golden)
     assert alpha.max() > 0.9998, "some pixels should stop"
@@ -196,9 +189,7 @@ def agree(
     for name, rasterizer in {**ALL_RASTERIZERS, "float64": Tiled(), "exact": Reference()}.items():
         exact = name in ("float64", "exact")
         given = scene.to(torch.float64) if exact else scene
-        training = TrainingViews.of(
-            given, [camera]
-        )  # without the check that it sees most of the scene
+        training = TrainingViews.of(given, [camera])  # without the check that it sees most of the scene
         image = Renderer.of(given, training, recipe, background=SKY, rasterizer=rasterizer)(camera)
         for found, wanted in ((image.rgb, expected), (image.alpha, alpha)):
             difference = (found.double() - wanted).abs()[~close].max()

@@ -31,12 +31,9 @@ VIEW = replace(make_camera((0.7, -3.4, 0.2), size=(28, 20)), trained_focal=None)
 TRAINING = TrainingViews.of(SCENE, [CAMERA, make_camera((2.0, -3.0, 1.0), size=(28, 20))])
 TILED, BLACK = Tiled(), (0.0, 0.0, 0.0)
 NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh", "pose")
-SCREENS = {
-    f"screen {name}": Recipe(name, screen, "", "") for name, screen in SCREEN_FILTERS.items()
-}
+SCREENS = {f"screen {name}": Recipe(name, screen, "", "") for name, screen in SCREEN_FILTERS.items()}
 WORLDS = {
-    f"world {name}": Recipe(name, SCREEN_FILTERS["mip"], "", "", world=world)
-    for name, world in WORLD_FILTERS.items()
+    f"world {name}": Recipe(name, SCREEN_FILTERS["mip"], "", "", world=world) for name, world in WORLD_FILTERS.items()
 }
 SAMPLED = {"samples": replace(RECIPES["sa-gs"], target_rate=1.0)}
 
@@ -50,9 +47,7 @@ def way(recipe: Recipe) -> tuple[object, ...]:
 
 
 NAMED = {f"recipe {name}": recipe for name, recipe in RECIPES.items()} | SCREENS | WORLDS | SAMPLED
-NAMES_BY_WAY = {
-    way(recipe): name for name, recipe in NAMED.items()
-}  # one name where several are alike
+NAMES_BY_WAY = {way(recipe): name for name, recipe in NAMED.items()}  # one name where several are alike
 DIFFERENT = {name: NAMED[name] for name in NAMES_BY_WAY.values()}
 
 
@@ -88,10 +83,7 @@ def test_gradients_are_finite_differences(recipe):
     grads = torch.autograd.grad(loss(chosen, values), list(values.values()))
     for (name, value), grad in zip(values.items(), grads, strict=True):
         way = direction(name, value.detach())
-        ends = [
-            loss(chosen, values | {name: value.detach() + sign * STEP * way}).item()
-            for sign in (1, -1)
-        ]
+        ends = [loss(chosen, values | {name: value.detach() + sign * STEP * way}).item() for sign in (1, -1)]
         slope = (ends[0] - ends[1]) / (2 * STEP)
         assert (grad * way).sum().item() == pytest.approx(slope, rel=RELATIVE, abs=1e-6), name
         assert abs(slope) > 1e-3, f"{name} does not matter here"
@@ -106,9 +98,7 @@ def test_gradients_of_stacked_capped_and_faint_splats_are_those_of_the_reference
     for rasterizer in (Tiled(), Reference()):
         values = {name: getattr(splats, name).clone().requires_grad_() for name in names}
         image = rasterizer(replace(splats, **values), hw, BLACK, POINT)
-        found.append(
-            torch.autograd.grad(image.rgb.square().sum() + image.alpha.sum(), list(values.values()))
-        )
+        found.append(torch.autograd.grad(image.rgb.square().sum() + image.alpha.sum(), list(values.values())))
     for a, b in zip(*found, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-9)
 

@@ -37,9 +37,7 @@ def test_damage_does_no_harm(tmp_path: Path, name: str):
 @pytest.mark.parametrize("name", NAMES)
 @given(data=st.data())
 @settings(
-    max_examples=max(8, MUTATIONS // 3),
-    deadline=None,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
+    max_examples=max(8, MUTATIONS // 3), deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 def test_whatever_hypothesis_thinks_of_does_no_harm(tmp_path: Path, name: str, data: st.DataObject):
     content = bytearray(content_of(name, tmp_path))

@@ -108,9 +108,7 @@ def test_samples_that_would_be_misread_are_refused(tmp_path: Path, mode: str, su
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
-def test_a_damaged_image_is_one_silent_error(
-    tmp_path: Path, suffix: str, capfd: pytest.CaptureFixture[str]
-):
+def test_a_damaged_image_is_one_silent_error(tmp_path: Path, suffix: str, capfd: pytest.CaptureFixture[str]):
     whole = save(tmp_path / f"a{suffix}", (random_image(64, 64).numpy() * 255).astype(np.uint8))
     content = whole.read_bytes()
     for cut in [*range(0, 40, 3), len(content) // 2, len(content) - 30]:
@@ -164,9 +162,7 @@ def test_a_huge_image_is_refused_by_its_header(tmp_path: Path):
         read_image(tmp_path / "bomb.png", None)
 
 
-def test_between_pillows_limit_and_ours_a_size_is_just_a_size(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_between_pillows_limit_and_ours_a_size_is_just_a_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 1000)
     Image.new("1", (16384, 4096)).save(tmp_path / "large.png")
     assert image_size(tmp_path / "large.png") == (16384, 4096)

@@ -46,24 +46,13 @@ def test_parts_are_converted_as_the_whole_is(tmp_path: Path, wide_scene, cameras
     assert 0 < training.bounds.seen.sum() < len(scene)
     write_scene(tmp_path / "whole.ply", fuse(scene, training, FORMS[form]))
     opened, told = open_scene(path), []
-    parts = convert_parts(
-        opened, cameras, FORMS[form], tell=lambda *x: told.append(x), size=SIZE, threads=2
-    )
+    parts = convert_parts(opened, cameras, FORMS[form], tell=lambda *x: told.append(x), size=SIZE, threads=2)
     write_parts(tmp_path / "parts.ply", parts, opened.count)
-    heads = [
-        (tmp_path / n).read_bytes().split(b"end_header")[0] for n in ("parts.ply", "whole.ply")
-    ]
+    heads = [(tmp_path / n).read_bytes().split(b"end_header")[0] for n in ("parts.ply", "whole.ply")]
     assert heads[0] == heads[1]
     together, whole = (read_scene(tmp_path / name) for name in ("parts.ply", "whole.ply"))
-    for field in (
-        "means",
-        "log_scales",
-        "logit_opacities",
-        "sh",
-    ):  # products of matrices round by their size
-        torch.testing.assert_close(
-            getattr(together, field), getattr(whole, field), rtol=1e-5, atol=1e-6
-        )
+    for field in ("means", "log_scales", "logit_opacities", "sh"):  # products of matrices round by their size
+        torch.testing.assert_close(getattr(together, field), getattr(whole, field), rtol=1e-5, atol=1e-6)
     assert told[-1] == (150, 150)
 
 
@@ -91,11 +80,7 @@ def test_a_failure_in_a_late_part_leaves_no_file(tmp_path: Path, cameras):
     path.write_bytes(data)
     opened = open_scene(path)
     with pytest.raises(FormatError, match="row 90 has NaN in x"):
-        write_parts(
-            tmp_path / "out.ply",
-            convert_parts(opened, cameras, FORMS["matched-energy"], size=SIZE),
-            100,
-        )
+        write_parts(tmp_path / "out.ply", convert_parts(opened, cameras, FORMS["matched-energy"], size=SIZE), 100)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["in.ply"]
 
 
@@ -124,9 +109,7 @@ def test_a_survey_finds_what_the_whole_shows(tmp_path: Path, wide_scene, cameras
     assert torch.equal(found.low, scene.means.amin(0))
     assert found.opacities.quantile(0.5) == pytest.approx(scene.opacities.median().item(), abs=1e-3)
     assert found.scales.quantile(0.5) == pytest.approx(middle.log().median().item(), abs=0.02)
-    assert found.rates.quantile(0.5) == pytest.approx(
-        bounds.highest[bounds.seen].log().median().item(), abs=0.02
-    )
+    assert found.rates.quantile(0.5) == pytest.approx(bounds.highest[bounds.seen].log().median().item(), abs=0.02)
 
 
 def test_a_survey_counts_what_cannot_be_used(tmp_path: Path):

@@ -79,8 +79,7 @@ def test_splat_transform_reads_our_spz(convention, tmp_path):
 
 @pytest.mark.data
 @pytest.mark.parametrize(
-    "model",
-    ["myhan/sparse/0", "upup/sparse/0", "bartoszek/sparse/0", "colmap_multicam/colmap_sparse/0"],
+    "model", ["myhan/sparse/0", "upup/sparse/0", "bartoszek/sparse/0", "colmap_multicam/colmap_sparse/0"]
 )
 def test_colmap_models_are_read_as_pycolmap_reads_them(model, shared_data):
     pycolmap = pytest.importorskip("pycolmap")
@@ -92,12 +91,7 @@ def test_colmap_models_are_read_as_pycolmap_reads_them(model, shared_data):
     for camera, image in zip(ours, images, strict=True):
         lens, motion = image.camera, image.cam_from_world()
         assert (camera.width, camera.height) == (lens.width, lens.height)
-        expected = (
-            lens.focal_length_x,
-            lens.focal_length_y,
-            lens.principal_point_x,
-            lens.principal_point_y,
-        )
+        expected = (lens.focal_length_x, lens.focal_length_y, lens.principal_point_x, lens.principal_point_y)
         assert (camera.fx, camera.fy, camera.cx, camera.cy) == pytest.approx(expected)
         pose = torch.from_numpy(motion.matrix())
         torch.testing.assert_close(camera.cam_from_world[:3], pose, rtol=0, atol=1e-9)

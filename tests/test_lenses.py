@@ -33,10 +33,7 @@ def bend(xy: np.ndarray, lens: Distortion) -> np.ndarray:
     k1, k2, p1, p2, k3, k4, k5, k6 = (*lens.coefficients, 0, 0, 0, 0)[:8]
     radial = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + k4 * r2 + k5 * r2**2 + k6 * r2**3)
     return np.stack(
-        [
-            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-        ],
+        [x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y],
         axis=1,
     )
 
@@ -82,9 +79,7 @@ def seen_by(camera: Camera, times: int = 1) -> np.ndarray:
     return plane(rays).reshape(height, width, 3)
 
 
-@pytest.mark.parametrize(
-    ("name", "times"), [("barrel", 1), ("pincushion", 2), ("full", 1), ("fisheye", 2)]
-)
+@pytest.mark.parametrize(("name", "times"), [("barrel", 1), ("pincushion", 2), ("full", 1), ("fisheye", 2)])
 def test_a_straightened_photograph_is_what_the_pinhole_sees(tmp_path, name, times):
     camera = camera_of(tmp_path, LENSES[name], times)
     photo = DOWNSCALES["box"].read(camera.photo, (0.0, 0.0, 0.0), camera.lens)
@@ -130,9 +125,7 @@ def test_a_photograph_without_a_lens_is_itself():
 def test_the_lenses_are_colmaps(name):
     pycolmap = pytest.importorskip("pycolmap")
     lens = LENSES[name]
-    theirs = pycolmap.Camera(
-        model=lens.name, width=SIZE[0], height=SIZE[1], params=[*PINHOLE, *lens.coefficients]
-    )
+    theirs = pycolmap.Camera(model=lens.name, width=SIZE[0], height=SIZE[1], params=[*PINHOLE, *lens.coefficients])
     rays = np.random.default_rng(0).uniform(-0.4, 0.4, (50, 2))
     points = theirs.img_from_cam(np.concatenate([rays, np.ones((50, 1))], axis=1))
     np.testing.assert_allclose(points, bend(rays, lens) * PINHOLE[:2] + PINHOLE[2:], atol=1e-9)

@@ -25,15 +25,10 @@ def lpips_weights(folder: Path) -> dict[str, tuple[Path, Path]]:
         trunk, before, size = {}, 3, {"vgg": 3, "alex": 3}[name]
         for stage, channels in zip(net, CHANNELS, strict=True):
             for number, *_ in stage.convolutions:
-                trunk[f"features.{number}.weight"] = torch.randn(
-                    channels, before, size, size, generator=g
-                )
+                trunk[f"features.{number}.weight"] = torch.randn(channels, before, size, size, generator=g)
                 trunk[f"features.{number}.bias"] = torch.randn(channels, generator=g)
                 before = channels
-        heads = {
-            f"lin{i}.model.1.weight": torch.rand(1, c, 1, 1, generator=g)
-            for i, c in enumerate(CHANNELS)
-        }
+        heads = {f"lin{i}.model.1.weight": torch.rand(1, c, 1, 1, generator=g) for i, c in enumerate(CHANNELS)}
         files[name] = folder / f"{name}.pth", folder / f"{name}-heads.pth"
         torch.save(trunk, files[name][0])
         torch.save(heads, files[name][1])
@@ -52,14 +47,7 @@ def by_hand(image, truth, trunk, heads, low):
                 found.append(x)
                 x = max_pool2d(x, 2)
             else:
-                x = relu(
-                    conv2d(
-                        x,
-                        trunk[f"features.{number}.weight"],
-                        trunk[f"features.{number}.bias"],
-                        padding=1,
-                    )
-                )
+                x = relu(conv2d(x, trunk[f"features.{number}.weight"], trunk[f"features.{number}.bias"], padding=1))
         maps.append([*found, x])  # fmt: skip
     total = 0.0
     for i, (a, b) in enumerate(zip(*maps, strict=True)):

@@ -59,12 +59,7 @@ def test_ssim_3dgs_is_the_zero_padded_convolution():
 
 
 # image side in px, SSIM zero-padded and cropped: published with the 3DGS family's border effect
-BORDER = [
-    (512, 0.7997, 0.7965),
-    (256, 0.8336, 0.8291),
-    (128, 0.8611, 0.8547),
-    (64, 0.8877, 0.8792),
-]
+BORDER = [(512, 0.7997, 0.7965), (256, 0.8336, 0.8291), (128, 0.8611, 0.8547), (64, 0.8877, 0.8792)]
 
 
 def test_the_border_reads_higher_the_smaller_the_image():
@@ -172,11 +167,7 @@ def test_metrics_are_found_by_name_in_the_flavour_of_the_protocol():
 
 @pytest.mark.parametrize(
     ("names", "words"),
-    [
-        (["vmaf"], "'vmaf' is not one of psnr, ssim, lpips"),
-        (["psnr", "PSNR"], "twice"),
-        (["lpips"], "needs weights"),
-    ],
+    [(["vmaf"], "'vmaf' is not one of psnr, ssim, lpips"), (["psnr", "PSNR"], "twice"), (["lpips"], "needs weights")],
 )
 def test_metrics_that_cannot_be_had_are_refused(names, words):
     with pytest.raises(UsageError, match=words):
@@ -210,8 +201,4 @@ def brute_force_ssim(a: torch.Tensor, b: torch.Tensor) -> float:
     ma, mb = windowed(a), windowed(b)
     va, vb, cov = windowed(a * a) - ma**2, windowed(b * b) - mb**2, windowed(a * b) - ma * mb
     c1, c2 = 0.01**2, 0.03**2
-    return (
-        (((2 * ma * mb + c1) * (2 * cov + c2)) / ((ma**2 + mb**2 + c1) * (va + vb + c2)))
-        .mean()
-        .item()
-    )
+    return (((2 * ma * mb + c1) * (2 * cov + c2)) / ((ma**2 + mb**2 + c1) * (va + vb + c2))).mean().item()

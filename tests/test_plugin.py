@@ -66,11 +66,7 @@ def finished(installed: dict[str, str], tmp_path_factory: pytest.TempPathFactory
     commands = [line for line in GUIDE.read_text().splitlines() if line.startswith("aaplug ")]
     words = [shlex.split(command)[1:] for command in [*commands, "aaplug evaluate --help"]]
     done = subprocess.run(
-        [sys.executable, "-c", PROGRAM, json.dumps(words)],
-        cwd=folder,
-        env=installed,
-        capture_output=True,
-        text=True,
+        [sys.executable, "-c", PROGRAM, json.dumps(words)], cwd=folder, env=installed, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr[-3000:]
     (folder / "stdout").write_text(done.stdout)
@@ -78,15 +74,11 @@ def finished(installed: dict[str, str], tmp_path_factory: pytest.TempPathFactory
 
 
 def test_the_guide_shows_the_files_of_the_plug_in():
-    shown = dict(
-        re.findall(r"`stranger/(\w+\.py)`:\n\n```python\n(.*?)```$", GUIDE.read_text(), re.M | re.S)
-    )
+    shown = dict(re.findall(r"`stranger/(\w+\.py)`:\n\n```python\n(.*?)```$", GUIDE.read_text(), re.M | re.S))
     assert shown.keys() == FILES
     for name, text in shown.items():
         assert text == (PLUGIN / "stranger" / name).read_text(), name
-    (project,) = re.findall(
-        r"`pyproject.toml`:\n\n```toml\n(.*?)```$", GUIDE.read_text(), re.M | re.S
-    )
+    (project,) = re.findall(r"`pyproject.toml`:\n\n```toml\n(.*?)```$", GUIDE.read_text(), re.M | re.S)
     assert project == (PLUGIN / "pyproject.toml").read_text()
 
 
@@ -117,9 +109,7 @@ def test_help_knows_their_names(finished):
 def test_the_laws_run_over_what_the_plug_in_adds(installed):
     (command,) = re.findall(r"^python (-m pytest tests/laws.*)$", GUIDE.read_text(), re.M)
     words = [*shlex.split(command), "-v", "-n", "0", "-p", "no:cacheprovider"]
-    done = subprocess.run(
-        [sys.executable, *words], cwd=ROOT, env=installed, capture_output=True, text=True
-    )
+    done = subprocess.run([sys.executable, *words], cwd=ROOT, env=installed, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout[-5000:]
     for name in ("soft", "dull", "four-points", "row-by-row", "soft-points"):
         assert re.search(rf"\[.*{name}.*\] PASSED", done.stdout), f"no law ran over {name}"

@@ -19,10 +19,7 @@ IDENTITY = (1.0, 0.0, 0.0, 0.0)
 
 
 def straight_camera(
-    fx: float = 100.0,
-    fy: float = 100.0,
-    size: tuple[int, int] = (80, 60),
-    centre: tuple[float, float] | None = None,
+    fx: float = 100.0, fy: float = 100.0, size: tuple[int, int] = (80, 60), centre: tuple[float, float] | None = None
 ) -> Camera:
     """At the origin, looking along +z, with x and y as in the image."""
     cx, cy = centre or (size[0] / 2, size[1] / 2)
@@ -58,9 +55,7 @@ def world_covariance(scene: Gaussians) -> torch.Tensor:
     """R S Sᵀ Rᵀ of the first Gaussian; R rotates the axes by the quaternion product."""
     w, x, y, z = (scene.quats[0] / scene.quats[0].norm()).tolist()
     v, eye = torch.tensor([x, y, z], dtype=F64), torch.eye(3, dtype=F64)
-    turned = [
-        axis + 2 * torch.linalg.cross(v, torch.linalg.cross(v, axis) + w * axis) for axis in eye
-    ]
+    turned = [axis + 2 * torch.linalg.cross(v, torch.linalg.cross(v, axis) + w * axis) for axis in eye]
     rotation = torch.stack(turned, dim=1)
     return rotation @ scene.log_scales[0].exp().square().diag() @ rotation.T
 
@@ -104,9 +99,7 @@ def test_a_gaussian_turned_about_the_optical_axis_turns_in_the_image():
 def test_the_length_of_a_quaternion_does_not_matter():
     scene = make_scene(5, dtype=F64)
     longer = replace(scene, quats=scene.quats * torch.tensor([0.01, 0.5, 2.0, 30.0, -1.0])[:, None])
-    torch.testing.assert_close(
-        project(longer, make_camera()).covs, project(scene, make_camera()).covs
-    )
+    torch.testing.assert_close(project(longer, make_camera()).covs, project(scene, make_camera()).covs)
 
 
 def test_rotations_are_orthonormal_and_right_handed():
@@ -229,9 +222,7 @@ def needles(n: int, long: float, thin: float) -> tuple[Gaussians, Camera]:
     sizes = torch.tensor([long, thin, thin], dtype=F64) * depth / 100
     return (
         Gaussians(
-            means=torch.nn.functional.pad(
-                torch.randn(n, 2, generator=g, dtype=F64), (0, 1), value=5.0
-            ),
+            means=torch.nn.functional.pad(torch.randn(n, 2, generator=g, dtype=F64), (0, 1), value=5.0),
             quats=quats,
             log_scales=sizes.log().expand(n, 3),
             logit_opacities=zero,
@@ -282,9 +273,7 @@ def test_float32_agrees_with_float64():
         ("rgb", 1e-5, 1e-5),
     ):
         got, want = getattr(single, name).double(), getattr(exact, name)
-        torch.testing.assert_close(
-            got, want, rtol=rtol, atol=atol, msg=lambda m, n=name: f"{n}: {m}"
-        )
+        torch.testing.assert_close(got, want, rtol=rtol, atol=atol, msg=lambda m, n=name: f"{n}: {m}")
 
 
 def test_a_scene_far_from_the_origin_projects_as_if_it_were_near():
@@ -478,7 +467,5 @@ def test_gradients_of_colours_reach_only_the_gaussians_drawn():
     shown[some.sources] = True
     assert touched.any()
     assert not (touched & ~shown).any()
-    constant = sh.grad[:, 0][
-        touched
-    ]  # of the first coefficient, where no channel is clamped at black
+    constant = sh.grad[:, 0][touched]  # of the first coefficient, where no channel is clamped at black
     assert constant.amax().item() == pytest.approx(0.28209479177387814)

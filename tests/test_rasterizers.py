@@ -47,9 +47,7 @@ def stack(*layers: tuple[float, tuple[float, float, float]]) -> Splats2D:
 
 
 def close(image: torch.Tensor, expected, atol: float = 1e-6) -> None:
-    torch.testing.assert_close(
-        image.double(), torch.as_tensor(expected, dtype=F64), rtol=0, atol=atol
-    )
+    torch.testing.assert_close(image.double(), torch.as_tensor(expected, dtype=F64), rtol=0, atol=atol)
 
 
 # by hand ----------------------------------------------------------------------------------------
@@ -135,10 +133,7 @@ def test_a_pixel_stops_before_its_transmittance_would_fall_below_1e_4(rasterize)
 
 
 def test_a_splat_that_leaves_more_than_1e_4_is_drawn(rasterize):
-    layers = [(0.9, RED)] * 3 + [
-        (0.89, BLUE),
-        (0.2, GREEN),
-    ]  # 1.1e-4 is left by blue, 8.8e-5 by green
+    layers = [(0.9, RED)] * 3 + [(0.89, BLUE), (0.2, GREEN)]  # 1.1e-4 is left by blue, 8.8e-5 by green
     image = rasterize(stack(*layers), (9, 9), BLACK)
     close(image.rgb[4, 4], [0.999, 0.0, 0.00089], atol=5e-7)
     close(image.alpha[4, 4], 1 - 1.1e-4, atol=5e-7)
@@ -183,9 +178,7 @@ def draw_by_loop(
                 if left * (1 - alpha) < 1e-4:
                     break
                 weight = alpha * left
-                colour = [
-                    c + weight * s for c, s in zip(colour, splats.rgb[i].tolist(), strict=True)
-                ]
+                colour = [c + weight * s for c, s in zip(colour, splats.rgb[i].tolist(), strict=True)]
                 left *= 1 - alpha
             over = [c + left * b for c, b in zip(colour, background, strict=True)]
             rgb[row, column], alphas[row, column] = torch.tensor(over, dtype=F64), 1 - left
@@ -249,10 +242,7 @@ REGIMES: dict[str, tuple[tuple[int, int], Callable[[tuple[int, int]], Splats2D]]
     "needles": ((65, 63), lambda hw: needles(150, hw, 5, 40.0, 0.6)),
     "long needles": ((63, 100), lambda hw: needles(100, hw, 6, 300.0, 0.6)),
     "dense": ((47, 56), lambda hw: dense(500, hw, 7)),
-    "faint": (
-        (40, 41),
-        lambda hw: replace(m := make_splats(300, hw, 8), opacities=m.opacities / 9),
-    ),
+    "faint": ((40, 41), lambda hw: replace(m := make_splats(300, hw, 8), opacities=m.opacities / 9)),
     "one row": ((1, 130), lambda hw: make_splats(80, hw, 9, (0.0, 2.0))),
     "one column": ((130, 1), lambda hw: make_splats(80, hw, 10, (0.0, 2.0))),
     "one pixel": ((1, 1), lambda hw: make_splats(20, hw, 11, (-1.0, 1.0))),
@@ -317,9 +307,7 @@ def test_splats_on_the_edges_of_tiles_are_drawn_in_every_tile(sigma):
         close(tiled.alpha, exact.alpha)
 
 
-@pytest.mark.parametrize(
-    "way", [(1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1)]
-)
+@pytest.mark.parametrize("way", [(1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1)])
 @pytest.mark.parametrize("alpha", [1.0001 / 255, 2 / 255])
 def test_a_splat_reaches_the_first_pixel_of_the_next_tile(way, alpha):
     # the middle tile reaches from 8 to 16; its neighbours' nearest pixel centres are at 7.5 and 16.5
@@ -335,10 +323,7 @@ def test_a_splat_reaches_the_first_pixel_of_the_next_tile(way, alpha):
 def test_thin_splats_that_only_cross_the_corner_of_a_tile_are_drawn_there():
     # along x + y = 17 the line cuts the tile at (8, 8) in its first pixel alone
     splats = splats_of(((2.5, 14.5), (72.0, -71.9, 72.0), 1.0, 0.9, RED))
-    tiled, exact = (
-        TILED(splats, (24, 24), BLACK),
-        REFERENCE(splats, (24, 24), BLACK),
-    )
+    tiled, exact = (TILED(splats, (24, 24), BLACK), REFERENCE(splats, (24, 24), BLACK))
     assert exact.alpha[8, 8] > 0.1
     close(tiled.alpha, exact.alpha, atol=1e-5)
 

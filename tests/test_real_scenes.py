@@ -20,10 +20,7 @@ from aaplug.rasterizers import RASTERIZERS
 from aaplug.rendering.renderer import Renderer
 from tests.conftest import SAMPLE
 
-SCENES = {
-    "chair": ("chair.ply", 25),
-    "snowmiku": ("snowmiku.ply", 13),
-}  # file, number of test views
+SCENES = {"chair": ("chair.ply", 25), "snowmiku": ("snowmiku.ply", 13)}  # file, number of test views
 TOLERANCE = 1e-5  # of an image's range, away from cut-offs
 FLIPS = 1e-4  # share of pixels near a cut-off that may differ by more
 
@@ -35,9 +32,7 @@ def test_matched_is_classic_at_the_training_size_for_every_test_view(name, share
     file, views = SCENES[name]
     scene, cameras = read_scene(shared_data / name / file), read_cameras(shared_data / name)
     training = TrainingViews.of(scene, cameras)
-    filters = [
-        find_recipe("matched", rate_reference=rate).screen for rate in ("global", "interval")
-    ]
+    filters = [find_recipe("matched", rate_reference=rate).screen for rate in ("global", "interval")]
     assert len(cameras.test) == views
     for view in cameras.test:
         splats = project(scene, view)
@@ -48,13 +43,9 @@ def test_matched_is_classic_at_the_training_size_for_every_test_view(name, share
 
 
 @pytest.mark.parametrize("rate", ["global", "interval"])
-def test_matched_draws_classic_pixels_on_the_sample(
-    rate, sample_scene, sample_cameras, sample_training
-):
+def test_matched_draws_classic_pixels_on_the_sample(rate, sample_scene, sample_cameras, sample_training):
     recipes = find_recipe("matched", rate_reference=rate), RECIPES["classic"]
-    renderers = [
-        Renderer(sample_scene, sample_training, recipe, background=WHITE) for recipe in recipes
-    ]
+    renderers = [Renderer(sample_scene, sample_training, recipe, background=WHITE) for recipe in recipes]
     view = window(sample_cameras.test[0], 200, 200, 400)
     ours, theirs = (renderer(view).rgb for renderer in renderers)
     assert (ours - theirs).abs().max() <= TOLERANCE
@@ -68,9 +59,7 @@ def test_tiled_equals_the_reference_on_the_sample(sample_scene, sample_cameras, 
         splats = RECIPES["classic"].screen(project(sample_scene, part), part, sample_training)
         splats = shade(cull(splats, part.hw), sample_scene, part)
         pixel = RECIPES["classic"].pixel
-        fast, exact = (
-            RASTERIZERS[name](splats, part.hw, WHITE, pixel) for name in ("eager", "reference")
-        )
+        fast, exact = (RASTERIZERS[name](splats, part.hw, WHITE, pixel) for name in ("eager", "reference"))
         assert exact.alpha.min() < 0.5 < exact.alpha.max()  # an edge is in sight
         differences.append((fast.rgb - exact.rgb).abs().amax(dim=2).flatten())
     difference = torch.cat(differences)

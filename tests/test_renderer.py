@@ -124,8 +124,7 @@ def test_a_camera_set_gives_its_training_cameras_and_its_background(cameras):
     for background, colour in (("white", WHITE), ((0.1, 0.2, 0.3), (0.1, 0.2, 0.3))):
         assert Renderer.of(scene, cameras, "classic", background=background).background == colour
     black, white = (
-        Renderer.of(scene, cameras, "classic", background=b, rasterizer="eager")(cameras[0])
-        for b in ("black", "white")
+        Renderer.of(scene, cameras, "classic", background=b, rasterizer="eager")(cameras[0]) for b in ("black", "white")
     )
     behind = (1 - black.alpha)[..., None]
     torch.testing.assert_close(white.rgb, black.rgb + behind, rtol=0, atol=1e-6)
@@ -184,9 +183,7 @@ def test_the_rate_of_a_free_camera_is_computed_once_per_pose(cameras, monkeypatc
     renderer = Renderer.of(make_scene(50), cameras, rasterizer="eager")
     calls = []
     compute = rendering.sampling_bounds
-    monkeypatch.setattr(
-        rendering, "sampling_bounds", lambda *args: calls.append(args) or compute(*args)
-    )
+    monkeypatch.setattr(rendering, "sampling_bounds", lambda *args: calls.append(args) or compute(*args))
     view = free(make_camera((0.3, -9.0, 0.2)))
     rate = renderer.relative_rate(view)
     renderer.samples(view)
@@ -204,22 +201,13 @@ def test_the_rate_of_a_free_camera_is_computed_once_per_pose(cameras, monkeypatc
 def test_without_a_look_at_the_scene_a_free_camera_is_compared_by_focal_length():
     training = TrainingViews.of(make_scene(10), [make_camera(), make_camera(fov=1.4)])
     focals = sorted(camera.focal for camera in training.cameras)
-    assert training.relative_rate(free(make_camera())) == pytest.approx(
-        make_camera().focal / (sum(focals) / 2)
-    )
+    assert training.relative_rate(free(make_camera())) == pytest.approx(make_camera().focal / (sum(focals) / 2))
     assert training.relative_rate(make_camera(fov=1.4).scaled(0.5)) == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize(
     ("rate", "fast", "balanced", "best"),
-    [
-        (1.0, 1, 1, 1),
-        (2.0, 1, 1, 1),
-        (0.5, 1, 1, 2),
-        (0.25, 1, 2, 4),
-        (0.125, 2, 4, 8),
-        (0.3, 1, 2, 4),
-    ],
+    [(1.0, 1, 1, 1), (2.0, 1, 1, 1), (0.5, 1, 1, 2), (0.25, 1, 2, 4), (0.125, 2, 4, 8), (0.3, 1, 2, 4)],
 )
 def test_quality_takes_the_fewest_samples_that_reach_its_rate(rate, fast, balanced, best):
     counts = [find_recipe("auto", quality=quality).samples_at(rate) for quality in QUALITIES]
@@ -231,16 +219,11 @@ def test_quality_takes_the_fewest_samples_that_reach_its_rate(rate, fast, balanc
 
 @pytest.mark.parametrize("convention", CONVENTIONS.values(), ids=CONVENTIONS)
 @pytest.mark.parametrize("reference", ["pose", "global", "interval"])
-def test_matched_is_training_itself_at_every_view_of_the_training_size(
-    convention, reference, cameras
-):
+def test_matched_is_training_itself_at_every_view_of_the_training_size(convention, reference, cameras):
     scene = replace(make_scene(200), convention=convention)
     training = TrainingViews.of(scene, cameras[1:])  # the first view is held out
     trained = Renderer(scene, training, RECIPES[OWN_RECIPE[convention.name]])
-    ours = [
-        Renderer(scene, training, find_recipe(name, rate_reference=reference))
-        for name in ("matched", "auto")
-    ]
+    ours = [Renderer(scene, training, find_recipe(name, rate_reference=reference)) for name in ("matched", "auto")]
     for camera in cameras:
         expected = trained(camera).rgb
         assert all((r(camera).rgb - expected).abs().max() <= 1e-5 for r in ours)

@@ -44,9 +44,7 @@ def opaque_splats():
     """Splats of which many reach every cap, cut-off and stop."""
     splats = make_splats(300, HW, 4, (0.0, 2.0)).to(F64)
     slopes = torch.zeros(300, 2, dtype=F64)
-    return replace(
-        splats, opacities=(1.1 * splats.opacities.sqrt()).clamp(max=1), depth_slopes=slopes
-    )
+    return replace(splats, opacities=(1.1 * splats.opacities.sqrt()).clamp(max=1), depth_slopes=slopes)
 
 
 @pytest.mark.parametrize("pixel", PIXEL_KERNELS.values(), ids=PIXEL_KERNELS)
@@ -61,9 +59,7 @@ def test_tiled_equals_the_reference_under_other_rules(pixel, rules):
 @pytest.mark.parametrize("compositor", COMPOSITORS.values(), ids=COMPOSITORS)
 def test_compositors_equal_their_exact_twins_under_other_rules(compositor, rules):
     splats = opaque_splats()
-    tiled, exact = (
-        draw(splats, HW, SKY, INTEGRAL, compositor, rules) for draw in (Tiled(), Reference())
-    )
+    tiled, exact = (draw(splats, HW, SKY, INTEGRAL, compositor, rules) for draw in (Tiled(), Reference()))
     difference = (tiled.rgb - exact.rgb).abs().amax(dim=2)
     assert (difference > 2e-5).double().mean() < 1e-3
 

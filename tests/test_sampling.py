@@ -24,10 +24,7 @@ PROC_STATUS = Path("/proc/self/status")
 
 
 def straight_camera(
-    focal: float = 64.0,
-    size: tuple[int, int] = (80, 40),
-    centre: tuple[float, float] | None = None,
-    back: float = 0.0,
+    focal: float = 64.0, size: tuple[int, int] = (80, 40), centre: tuple[float, float] | None = None, back: float = 0.0
 ) -> Camera:
     """At (0, 0, -back), looking along +z, with x and y as in the image."""
     cx, cy = centre or (size[0] / 2, size[1] / 2)
@@ -162,9 +159,7 @@ def test_a_scene_that_no_camera_sees_is_no_crash_of_a_library():
     assert smoothed.log_scales.isfinite().all()
 
 
-@pytest.mark.parametrize(
-    ("dtype", "rtol"), [(torch.float64, 1e-12), (torch.float32, 2e-6)], ids=str
-)
+@pytest.mark.parametrize(("dtype", "rtol"), [(torch.float64, 1e-12), (torch.float32, 2e-6)], ids=str)
 def test_bounds_agree_with_a_loop_in_float64(dtype, rtol):
     means = (make_scene(200, seed=3).means * 3).to(dtype)
     cameras = ring()
@@ -173,11 +168,7 @@ def test_bounds_agree_with_a_loop_in_float64(dtype, rtol):
     counts = [len(rates) for rates in expected]
     assert len(set(counts)) == len(cameras) + 1, "the scene should try every number of views"
     assert bounds.views.tolist() == counts
-    for got, pick in (
-        (bounds.highest, max),
-        (bounds.lowest, min),
-        (median, statistics.median_low),
-    ):
+    for got, pick in ((bounds.highest, max), (bounds.lowest, min), (median, statistics.median_low)):
         want = torch.tensor([pick(rates) if rates else 0.0 for rates in expected], dtype=dtype)
         torch.testing.assert_close(got, want, rtol=rtol, atol=0)
 

@@ -17,29 +17,13 @@ from plyfile import PlyData
 
 import aaplug
 from aaplug.core.errors import FormatError, OutputError, UsageError
-from aaplug.core.gaussians import (
-    ANTIALIASED,
-    CLASSIC,
-    CONVENTIONS,
-    MAX_LOG_SCALE,
-    MIP,
-    Convention,
-    Fusion,
-    Gaussians,
-)
+from aaplug.core.gaussians import ANTIALIASED, CLASSIC, CONVENTIONS, MAX_LOG_SCALE, MIP, Convention, Fusion, Gaussians
 from aaplug.io.scenes import find_scene, open_scene, read_scene, write_parts, write_scene
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the real scenes are not here")
 QUICK = 0.5  # s, for a refusal
-NUMPY = {
-    "float": "<f4",
-    "float32": "<f4",
-    "double": "<f8",
-    "uchar": "u1",
-    "short": "<i2",
-    "int32": "<i4",
-}
+NUMPY = {"float": "<f4", "float32": "<f4", "double": "<f8", "uchar": "u1", "short": "<i2", "int32": "<i4"}
 
 
 def parameters(degree: int) -> list[str]:
@@ -94,9 +78,7 @@ def plain(*extra: str, degree: int = 1, **changes) -> File:
 
 
 def filtered(*comments: str) -> File:
-    return plain(
-        *comments, columns=[("float", name) for name in [*parameters(1), "filter_3D", "nx"]]
-    )
+    return plain(*comments, columns=[("float", name) for name in [*parameters(1), "filter_3D", "nx"]])
 
 
 def without(*missing: str) -> File:
@@ -452,9 +434,7 @@ def test_double_columns_are_read_as_float_and_kept_where_unchanged(tmp_path: Pat
 def test_colours_in_bytes_become_harmonics_of_degree_0(tmp_path: Path):
     names = [n for n in parameters(0) if not n.startswith("f_dc")]
     colours = [("uchar", c) for c in ("red", "green", "blue")]
-    file = plain(
-        columns=[*(("float", n) for n in names[:3]), *colours, *(("float", n) for n in names[3:])]
-    )
+    file = plain(columns=[*(("float", n) for n in names[:3]), *colours, *(("float", n) for n in names[3:])])
     scene = read_scene(file.save(tmp_path))
     rows = values(file.content, file)
     expected = np.stack([rows[c] for c in ("red", "green", "blue")], 1) / 255
@@ -465,9 +445,7 @@ def test_colours_in_bytes_become_harmonics_of_degree_0(tmp_path: Path):
     assert torch.equal(read_scene(tmp_path / "out.ply").sh, scene.sh)
 
 
-@pytest.mark.parametrize(
-    "file", [without("scale_2"), plain("SplatRenderMode: 2DGS")], ids=["two scales", "tag"]
-)
+@pytest.mark.parametrize("file", [without("scale_2"), plain("SplatRenderMode: 2DGS")], ids=["two scales", "tag"])
 def test_2d_gaussians_are_discs(tmp_path: Path, file: File):
     scene = read_scene(file.save(tmp_path))
     assert scene.flat
@@ -723,9 +701,7 @@ def test_infinities_that_have_a_meaning_are_kept(tmp_path: Path, column: str):
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize(
-    "column", ["x", "f_dc_1", "f_rest_8", "opacity", "scale_2", "rot_0", "filter_3D"]
-)
+@pytest.mark.parametrize("column", ["x", "f_dc_1", "f_rest_8", "opacity", "scale_2", "rot_0", "filter_3D"])
 def test_a_bad_number_is_found_in_every_kind_of_column(tmp_path: Path, column: str, value: float):
     path = damaged(tmp_path, filtered(), **{column: (3, value)})
     if (column, value) in {("scale_2", -np.inf), ("opacity", np.inf)}:  # no thickness; opaque
@@ -754,9 +730,7 @@ def test_a_quaternion_without_direction_is_refused(tmp_path: Path, length: float
     assert len(read_scene(path, drop_bad=True)) == 4
 
 
-def test_dropped_rows_are_counted_aloud_and_stay_dropped(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-):
+def test_dropped_rows_are_counted_aloud_and_stay_dropped(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     file = File(columns=shuffled)
     rows = file.rows.copy()
     names = [name for _, name in file.columns]
@@ -764,9 +738,7 @@ def test_dropped_rows_are_counted_aloud_and_stay_dropped(
         rows[str(names.index(column))][row] = np.nan
     path = tmp_path / "in.ply"
     path.write_bytes(file.header + rows.tobytes())
-    with pytest.raises(
-        FormatError, match=r"row 1 \(and 1 more\) has NaN in x, row 2 has NaN in op"
-    ):
+    with pytest.raises(FormatError, match=r"row 1 \(and 1 more\) has NaN in x, row 2 has NaN in op"):
         read_scene(path)
     with caplog.at_level(logging.WARNING, logger="aaplug"):
         scene = read_scene(path, drop_bad=True)
@@ -811,9 +783,7 @@ def test_a_scene_is_never_written_over_its_own_file(tmp_path: Path):
     assert path.read_bytes() == File().content
 
 
-def test_a_failure_while_writing_leaves_the_old_scene(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_failure_while_writing_leaves_the_old_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     from aaplug.io.scenes import ply
 
     def half(stream, *_: object) -> None:

@@ -112,9 +112,7 @@ def test_compensation_of_needles_is_exact_in_float32(long, thin):
     ).to(torch.float32)
     blurred = needles.blurred(0.3, compensate=True)
     dets = (long**2 + 0.3) * (thin**2 + 0.3)
-    torch.testing.assert_close(
-        blurred.dets.double(), torch.full((n,), dets).double(), rtol=1e-6, atol=0
-    )
+    torch.testing.assert_close(blurred.dets.double(), torch.full((n,), dets).double(), rtol=1e-6, atol=0)
     factor = torch.full((n,), long * thin / math.sqrt(dets)).double()
     torch.testing.assert_close(blurred.opacities.double(), factor, rtol=1e-6, atol=0)
 
@@ -218,12 +216,7 @@ def test_indexing_keeps_every_column_and_the_order():
 
 @pytest.mark.parametrize(
     ("scales", "expected"),
-    [
-        ((1.0, 1.0, 1.0), 0.353553),
-        ((1.0, 1.0, 0.01), 0.0050),
-        ((2.0, 2.0, 2.0), 0.715542),
-        ((5.0, 5.0, 0.1), 0.095677),
-    ],
+    [((1.0, 1.0, 1.0), 0.353553), ((1.0, 1.0, 0.01), 0.0050), ((2.0, 2.0, 2.0), 0.715542), ((5.0, 5.0, 0.1), 0.095677)],
 )
 @pytest.mark.parametrize("sigma", [1e-8, 1e-3, 1.0, 1e3])
 def test_the_volume_factor_equals_the_published_values(scales, expected, sigma):
@@ -254,10 +247,7 @@ def test_the_volume_factor_and_its_gradient_stay_finite_for_points(scale):
 @pytest.mark.parametrize("volume", [False, True])
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
 def test_smoothing_by_zero_changes_no_bit(volume, dtype):
-    scene = replace(
-        make_scene(200, dtype=dtype),
-        log_scales=torch.linspace(-60, 40, 600, dtype=dtype).view(200, 3),
-    )
+    scene = replace(make_scene(200, dtype=dtype), log_scales=torch.linspace(-60, 40, 600, dtype=dtype).view(200, 3))
     scene.logit_opacities[:4] = torch.tensor([-100.0, -20.0, 20.0, 100.0])
     same = smoothed_by(scene, torch.full((200, 1), -math.inf, dtype=dtype), volume)
     assert same.log_scales.equal(scene.log_scales)
@@ -278,9 +268,7 @@ def test_smoothing_adds_variances(axes):
 
 @pytest.mark.parametrize("log_scale", [-70.0, -28.0, -5.0, 0.0, 30.0])
 @pytest.mark.parametrize("log_sigma", [-70.0, -28.0, -5.0, 0.0, 30.0])
-def test_the_smoothed_scale_is_finite_and_the_larger_of_both_where_they_differ(
-    log_scale, log_sigma
-):
+def test_the_smoothed_scale_is_finite_and_the_larger_of_both_where_they_differ(log_scale, log_sigma):
     scene = replace(make_scene(1), log_scales=torch.full((1, 3), log_scale))
     smoothed = smoothed_by(scene, torch.tensor([[log_sigma]]), volume=True)
     expected = max(log_scale, log_sigma) + (0.5 * math.log(2) if log_scale == log_sigma else 0)

@@ -16,9 +16,7 @@ def test_upsamplers_keep_what_is_smooth(name):
     image = x[None, :, None].repeat(12, 1, 3)
     larger = find_upsampler(name)(image, (24, 32))
     assert larger.shape == (24, 32, 3)
-    torch.testing.assert_close(
-        box_average(larger, 2)[2:-2, 2:-2], image[2:-2, 2:-2], atol=2e-3, rtol=0
-    )
+    torch.testing.assert_close(box_average(larger, 2)[2:-2, 2:-2], image[2:-2, 2:-2], atol=2e-3, rtol=0)
 
 
 class Doubling(torch.nn.Module):

@@ -32,10 +32,7 @@ def written(tmp_path_factory):
     """The folder of a report of two views with nasty names, the report and the sampling bounds it shows."""
     folder: Path = tmp_path_factory.mktemp("report")
     scene = make_scene(150)
-    views = [
-        make_camera((0.0, -4.0, 0.0), name=NASTY),
-        make_camera((2.0, -4.0, 1.0), name="b"),
-    ]
+    views = [make_camera((0.0, -4.0, 0.0), name=NASTY), make_camera((2.0, -4.0, 1.0), name="b")]
     training = TrainingViews.of(scene, views)
     renderer = Renderer.of(scene, training, "classic", rasterizer="eager")
     for i, view in enumerate(views):
@@ -122,9 +119,7 @@ def opened(browser, written):
     troubles, contexts, asked = [], [], []
 
     def open_page(width=1280, height=900, scheme="light"):
-        context = browser.new_context(
-            viewport={"width": width, "height": height}, color_scheme=scheme
-        )
+        context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=scheme)
         contexts.append(context)
         page = context.new_page()
         page.on("console", lambda message: troubles.append(message.text))

@@ -76,10 +76,7 @@ def test_splats_side_by_side_let_less_light_through_than_independent_ones():
 
 
 def test_a_window_of_no_size_gives_point_samples():
-    splats = splats_of(
-        ((4.2, 4.6), (0.5, 0.2, 0.4), 1.0, 0.7, WHITE),
-        ((4.4, 3.9), (2.0, 0.0, 1.0), 2.0, 0.9, WHITE),
-    )
+    splats = splats_of(((4.2, 4.6), (0.5, 0.2, 0.4), 1.0, 0.7, WHITE), ((4.4, 3.9), (2.0, 0.0, 1.0), 2.0, 0.9, WHITE))
     draw = RASTERIZERS["eager"]
     point = draw(splats, (9, 9), BLACK, POINT)
     blended = draw(replace(splats, window=0.0), (9, 9), BLACK, INTEGRAL, BLENDING)

@@ -76,9 +76,7 @@ class Camera:
         """Position in the world."""
         return -self.cam_from_world[:3, :3].T @ self.cam_from_world[:3, 3]
 
-    def project(
-        self, points: Float[Tensor, "n 3"]
-    ) -> tuple[Float[Tensor, "n 2"], Float[Tensor, " n"]]:
+    def project(self, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 2"], Float[Tensor, " n"]]:
         """Positions in px and depths in world units of world points, in float64."""
         pose = self.cam_from_world
         local = points.double() @ pose[:3, :3].T + pose[:3, 3]
@@ -104,15 +102,7 @@ class Camera:
         return replace(self, trained_focal=self.focal)
 
     def _stretched(self, width: int, height: int, x: float, y: float) -> "Camera":
-        return replace(
-            self,
-            width=width,
-            height=height,
-            fx=self.fx * x,
-            fy=self.fy * y,
-            cx=self.cx * x,
-            cy=self.cy * y,
-        )
+        return replace(self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y)
 
 
 @dataclass(frozen=True)
@@ -136,9 +126,7 @@ class CameraSet:
         return self.train + tuple(camera for camera in self.test if id(camera) not in known)
 
 
-def look_at(
-    eye: Float[Tensor, " 3"], target: Float[Tensor, " 3"], up: Float[Tensor, " 3"]
-) -> Float[Tensor, "4 4"]:
+def look_at(eye: Float[Tensor, " 3"], target: Float[Tensor, " 3"], up: Float[Tensor, " 3"]) -> Float[Tensor, "4 4"]:
     """`cam_from_world` of a camera at `eye` that looks at `target`, with `up` pointing up in the image."""
     forward = torch.nn.functional.normalize((target - eye).double(), dim=0)
     right = torch.nn.functional.normalize(torch.linalg.cross(forward, up.double()), dim=0)

@@ -25,22 +25,16 @@ def smoothed_by(scene: Gaussians, log_sigma: Float[Tensor, "n k"], volume: bool)
     return replace(smoothed, logit_opacities=scale_opacities(scene.logit_opacities, factor))
 
 
-def volume_log_factor(
-    log_scales: Float[Tensor, "n 3"], log_sigma: Float[Tensor, "n k"]
-) -> Float[Tensor, " n"]:
+def volume_log_factor(log_scales: Float[Tensor, "n 3"], log_sigma: Float[Tensor, "n k"]) -> Float[Tensor, " n"]:
     """ln ∏ s/√(s² + f²) = −½ Σ ln(1 + f²/s²)."""
     return _axis_log_factors(log_scales, log_sigma).sum(dim=1)
 
 
-def face_log_factor(
-    log_scales: Float[Tensor, "n 3"], log_sigma: Float[Tensor, "n k"]
-) -> Float[Tensor, " n"]:
+def face_log_factor(log_scales: Float[Tensor, "n 3"], log_sigma: Float[Tensor, "n k"]) -> Float[Tensor, " n"]:
     """The same over the two longest axes, which span the broadest face."""
     return _axis_log_factors(log_scales, log_sigma).topk(2, dim=1).values.sum(dim=1)
 
 
-def _axis_log_factors(
-    log_scales: Float[Tensor, "n 3"], log_sigma: Float[Tensor, "n k"]
-) -> Float[Tensor, "n 3"]:
+def _axis_log_factors(log_scales: Float[Tensor, "n 3"], log_sigma: Float[Tensor, "n k"]) -> Float[Tensor, "n 3"]:
     log_ratio = 2 * (log_sigma - log_scales)
     return -0.5 * torch.logaddexp(log_ratio, torch.zeros_like(log_ratio))

@@ -33,9 +33,7 @@ def cull(
     """
     size = splats.means.new_tensor([hw[1], hw[0], margin * max(hw)])
     of = splats if ellipses is None else ellipses
-    (inside,) = kernels.run(
-        cull_kernel(rules.min_alpha), of.means, of.covs, of.dets, of.opacities, size
-    )
+    (inside,) = kernels.run(cull_kernel(rules.min_alpha), of.means, of.covs, of.dets, of.opacities, size)
     return splats[inside]
 
 
@@ -62,9 +60,7 @@ def _inside(
     *sides, band = size.unbind()
     inside = (opacities >= min_alpha) & (dets > 0)
     cutoff = squared_cutoff(opacities, min_alpha).clamp(min=0.0)
-    for mean, variance, side in zip(
-        means.unbind(dim=1), (covs[:, 0], covs[:, 2]), sides, strict=True
-    ):
+    for mean, variance, side in zip(means.unbind(dim=1), (covs[:, 0], covs[:, 2]), sides, strict=True):
         half = (cutoff * variance).sqrt()
         inside = inside & (mean + half > 0) & (mean - half < side)
         inside = inside & (mean >= -band) & (mean <= side + band)

@@ -51,9 +51,7 @@ def principal_columns(covs: Float[Tensor, "m 3"], dets: Float[Tensor, " m"]) -> 
     return cos * wide, sin * wide, -sin * thin, cos * thin
 
 
-def squared_cutoff(
-    opacities: Float[Tensor, " m"], min_alpha: float = RULES_3DGS.min_alpha
-) -> Float[Tensor, " m"]:
+def squared_cutoff(opacities: Float[Tensor, " m"], min_alpha: float = RULES_3DGS.min_alpha) -> Float[Tensor, " m"]:
     """Squared Mahalanobis distance at which alpha falls to `min_alpha`; negative where it never reaches it."""
     return 2 * torch.log(opacities / min_alpha)
 

@@ -11,13 +11,7 @@ import tempfile
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import (
-    FIRST_COMPLETED,
-    Future,
-    ProcessPoolExecutor,
-    ThreadPoolExecutor,
-    wait,
-)
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -114,9 +108,7 @@ def torch_threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def _results(
-    submit: Callable[[T], "Future[R]"], items: Iterable[T], most: int, ordered: bool = True
-) -> Iterator[R]:
+def _results(submit: Callable[[T], "Future[R]"], items: Iterable[T], most: int, ordered: bool = True) -> Iterator[R]:
     """The results, with at most `most` items submitted and not yet yielded."""
     waiting: deque[Future[R]] = deque()
     for item in items:

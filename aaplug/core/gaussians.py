@@ -35,9 +35,7 @@ class Convention:
 
 
 CLASSIC = Convention("classic", 0.3, compensated=False)  # 3DGS (Kerbl et al. 2023)
-ANTIALIASED = Convention(
-    "antialiased", 0.3, compensated=True
-)  # 3DGS --antialiasing, gsplat "antialiased"
+ANTIALIASED = Convention("antialiased", 0.3, compensated=True)  # 3DGS --antialiasing, gsplat "antialiased"
 MIP = Convention("mip", 0.1, compensated=True)  # Mip-Splatting (Yu et al. 2024), arXiv 2311.16493
 CONVENTIONS = {c.name: c for c in (CLASSIC, ANTIALIASED, MIP)}
 
@@ -138,9 +136,7 @@ class Gaussians:
 
     def __getitem__(self, index: Tensor | slice) -> "Gaussians":
         """The Gaussians at `index` (a mask, indices or a slice), in that order."""
-        kept = (
-            index.cpu() if isinstance(index, Tensor) else index
-        )  # the file's rows stay on the CPU
+        kept = index.cpu() if isinstance(index, Tensor) else index  # the file's rows stay on the CPU
         origin = self.origin and replace(self.origin, rows=self.origin.rows[kept])
         return replace(
             self,
@@ -169,9 +165,7 @@ class Gaussians:
 
 
 def scale_opacities(
-    logit_opacities: Float[Tensor, " n"],
-    log_factor: Float[Tensor, " n"],
-    max_opacity: float = 1 - MIN_OPACITY,
+    logit_opacities: Float[Tensor, " n"], log_factor: Float[Tensor, " n"], max_opacity: float = 1 - MIN_OPACITY
 ) -> Float[Tensor, " n"]:
     """Logits of o·c from the logits of o and ln c: exact for o near 0 or 1, the identity for c = 1.
 

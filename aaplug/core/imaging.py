@@ -16,9 +16,7 @@ from aaplug.core.splats import Render
 WHOLE = 1e-6  # slack before a size or a factor counts as fractional
 
 
-def over(
-    rgb: Float[Tensor, "h w 3"], alpha: Float[Tensor, "h w"], background: tuple[float, float, float]
-) -> Render:
+def over(rgb: Float[Tensor, "h w 3"], alpha: Float[Tensor, "h w"], background: tuple[float, float, float]) -> Render:
     """Composite premultiplied colours over a background."""
     if not any(background):  # black adds nothing
         return Render(rgb, alpha)

@@ -115,9 +115,7 @@ class PixelKernel(Protocol):
         """One row per splat: everything that `alpha` needs, and the colour.  A row of zeros draws nothing."""
         ...
 
-    def alpha(
-        self, rows: Float[Tensor, "*n t c"], pixels: Pixels, rules: Rules
-    ) -> Float[Tensor, "*n t P"]:
+    def alpha(self, rows: Float[Tensor, "*n t c"], pixels: Pixels, rules: Rules) -> Float[Tensor, "*n t P"]:
         """Alpha at each tile's pixels before the cap; 0 below the cut-off."""
         ...
 

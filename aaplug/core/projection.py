@@ -27,19 +27,13 @@ MIN_FACING = 1e-6  # of depth: a disc at a flatter angle is a line, and its slop
 SHADED_AT_ONCE = 1 << 16  # Gaussians
 
 
-def project(
-    scene: Gaussians, camera: Camera, kernels: Kernels = EAGER, rules: Rules = RULES_3DGS
-) -> Splats2D:
+def project(scene: Gaussians, camera: Camera, kernels: Kernels = EAGER, rules: Rules = RULES_3DGS) -> Splats2D:
     """Splats of every Gaussian beyond the near plane, without colour and before any screen filter."""
     columns = kernels.run(
-        project_kernel(rules.near),
-        *(scene.means, scene.quats, scene.log_scales),
-        *_camera_rows(scene.means, camera),
+        project_kernel(rules.near), *(scene.means, scene.quats, scene.log_scales), *_camera_rows(scene.means, camera)
     )
     means, covs, dets, depths = columns
-    splats = Splats2D(
-        means, covs, dets, depths, scene.opacities, torch.arange(len(scene), device=means.device)
-    )
+    splats = Splats2D(means, covs, dets, depths, scene.opacities, torch.arange(len(scene), device=means.device))
     in_front = depths > rules.near
     return splats if in_front.all() else splats[in_front]
 
@@ -53,9 +47,7 @@ def with_depth_slopes(splats: Splats2D, scene: Gaussians, camera: Camera) -> Spl
     thinnest = scene.log_scales.argmin(dim=1).index_select(0, splats.sources)
     axes = rotation_matrices(scene.unit_quats.index_select(0, splats.sources))
     normals = axes.gather(2, thinnest[:, None, None].expand(-1, 3, 1)).squeeze(2) @ rotation.T
-    offset = scene.means.index_select(0, splats.sources).double() - camera.centre.to(
-        scene.means.device
-    )
+    offset = scene.means.index_select(0, splats.sources).double() - camera.centre.to(scene.means.device)
     facing = (normals * (offset.to(scene.means) @ rotation.T)).sum(dim=1)
     edge_on = facing.abs() < MIN_FACING * splats.depths
     facing = torch.where(edge_on, MIN_FACING * splats.depths, facing)
@@ -81,10 +73,7 @@ def _shaded_together(sources: Int[Tensor, " m"], scene: Gaussians) -> Sequence[I
 
 
 def _shade(
-    sh: Float[Tensor, "n k 3"],
-    means: Float[Tensor, "n 3"],
-    sources: Int[Tensor, " m"],
-    centre: Float[Tensor, " 3"],
+    sh: Float[Tensor, "n k 3"], means: Float[Tensor, "n 3"], sources: Int[Tensor, " m"], centre: Float[Tensor, " 3"]
 ) -> tuple[Tensor]:
     offset = (_picked(means, sources).double() - centre).to(means)
     directions = offset / offset.square().sum(dim=1, keepdim=True).sqrt()
@@ -115,9 +104,7 @@ class _Picked(torch.autograd.Function):
         return grads[0].new_zeros(ctx.shape).index_copy(0, rows, grads[0]), None
 
 
-def _camera_rows(
-    like: Tensor, camera: Camera
-) -> tuple[Float[Tensor, " 3"], Float[Tensor, "3 3"], Float[Tensor, " 8"]]:
+def _camera_rows(like: Tensor, camera: Camera) -> tuple[Float[Tensor, " 3"], Float[Tensor, "3 3"], Float[Tensor, " 8"]]:
     """Centre (float64), rotation, and fx, fy, cx, cy with the slopes between which projection is linearised."""
     x, y = slope_limits(camera)
     lens = like.new_tensor([camera.fx, camera.fy, camera.cx, camera.cy, *x, *y])
@@ -128,10 +115,7 @@ def _camera_rows(
 def slope_limits(camera: Camera) -> tuple[tuple[float, float], tuple[float, float]]:
     """Smallest and largest x/z, and y/z, at which projection is linearised; slopes beyond are clamped."""
     limits = []
-    for centre, focal, side in (
-        (camera.cx, camera.fx, camera.width),
-        (camera.cy, camera.fy, camera.height),
-    ):
+    for centre, focal, side in ((camera.cx, camera.fx, camera.width), (camera.cy, camera.fy, camera.height)):
         margin = JACOBIAN_MARGIN * 0.5 * side / focal
         limits.append((-centre / focal - margin, (side - centre) / focal + margin))
     return limits[0], limits[1]
@@ -151,9 +135,7 @@ def _project(
     fx, fy, cx, cy, left, right, top, bottom = lens.unbind()
     world = [row.unbind() for row in rotation.unbind()]
     x, y, z = (sum_of(r * p for r, p in zip(row, local, strict=True)) for row in world)
-    ahead = z.clamp(
-        min=near
-    )  # nearer ones are dropped later; here they must not overflow into gradients
+    ahead = z.clamp(min=near)  # nearer ones are dropped later; here they must not overflow into gradients
     slope_x, slope_y = x / ahead, y / ahead
     # J W: rows of the projection's derivative along the world's axes, its direction clamped to the widened image
     held_x = torch.minimum(torch.maximum(slope_x, left), right)
@@ -224,7 +206,6 @@ def project_kernel(near: float = NEAR) -> Kernel:
 
 PROJECT_BACKWARD = backward_of(project_kernel(), ("n", "n", "n", "n"))
 SHADE = {  # by coefficients per channel
-    k: Kernel(f"shade-{k}", _shade, partial(_shade_example, k), ("n", "n", "m", None))
-    for k in (4, 9, 16)
+    k: Kernel(f"shade-{k}", _shade, partial(_shade_example, k), ("n", "n", "m", None)) for k in (4, 9, 16)
 }
 SHADE_BACKWARD = {k: backward_of(kernel, ("m",)) for k, kernel in SHADE.items()}

@@ -23,9 +23,7 @@ class Registry(Mapping[str, T]):
     kind: in words, singular ("screen filter"); its plural with underscores ends the entry point group's name.
     """
 
-    def __init__(
-        self, kind: str, own: Mapping[str, T], check: Callable[[T], bool] = lambda value: True
-    ):
+    def __init__(self, kind: str, own: Mapping[str, T], check: Callable[[T], bool] = lambda value: True):
         """own: the entries of aaplug.  check: whether an object is of this kind."""
         self.kind, self._entries, self._check = kind, dict(own), check
         self._loaded = False
@@ -77,9 +75,7 @@ class Registry(Mapping[str, T]):
         if name in self._entries:
             raise UsageError(where, f"a {self.kind} named '{name}' exists already")
         if not self._check(value):
-            raise UsageError(
-                where, f"is not a {self.kind}: {type(value).__name__} lacks its methods"
-            )
+            raise UsageError(where, f"is not a {self.kind}: {type(value).__name__} lacks its methods")
         own = getattr(value, "name", name)
         if own != name:
             raise UsageError(where, f"is registered as '{name}' but calls itself '{own}'")

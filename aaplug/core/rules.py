@@ -38,9 +38,7 @@ class Rules:
 
     def __post_init__(self) -> None:
         if not (
-            SMALLEST_CUTOFF <= self.min_alpha < self.max_alpha < 1
-            and 0 < self.min_transmittance < 1
-            and self.near > 0
+            SMALLEST_CUTOFF <= self.min_alpha < self.max_alpha < 1 and 0 < self.min_transmittance < 1 and self.near > 0
         ):
             raise UsageError(
                 "rules",

@@ -52,9 +52,7 @@ class SamplingBounds:
             FrameError: no camera sees any Gaussian.
         """
         if len(self.views) and not self.seen.any():
-            raise FrameError(
-                "sampling bounds", "no camera sees any Gaussian: there is no rate to filter by"
-            )
+            raise FrameError("sampling bounds", "no camera sees any Gaussian: there is no rate to filter by")
         coarsest = self.highest[self.seen].min()
         return torch.where(self.seen, self.highest, coarsest)
 
@@ -118,10 +116,7 @@ def view_information(
 
 
 def check_frame(
-    means: Float[Tensor, "n 3"],
-    cameras: Sequence[Camera],
-    scene_name: str,
-    min_share: float = MIN_SEEN_SHARE,
+    means: Float[Tensor, "n 3"], cameras: Sequence[Camera], scene_name: str, min_share: float = MIN_SEEN_SHARE
 ) -> float:
     """Share of Gaussians that any camera sees, on an even sample of the scene.
 

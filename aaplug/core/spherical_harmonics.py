@@ -12,13 +12,7 @@ COLOUR_OFFSET = 0.5  # 3DGS stores colours around mid-grey
 SH_C0 = 0.28209479177387814
 SH_C1 = 0.4886025119029199
 SH_C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
-SH_C3 = (
-    0.5900435899266435,
-    2.890611442640554,
-    0.4570457994644658,
-    0.3731763325901154,
-    1.445305721320277,
-)
+SH_C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277)
 SH_C4 = (  # 3/4·√(35/π), 3/4·√(35/2π), 3/4·√(5/π), 3/4·√(5/2π), 3/16·√(1/π)
     2.5033429417967046,
     1.7701307697799304,
@@ -31,9 +25,7 @@ SH_C4 = (  # 3/4·√(35/π), 3/4·√(35/2π), 3/4·√(5/π), 3/4·√(5/2π),
 def sh_colour(sh: Float[Tensor, "m k 3"], directions: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:
     """Colour of real spherical harmonics of degree 0 to 4 in unit directions from the camera, not clamped."""
     colour = torch.full_like(directions, COLOUR_OFFSET)
-    for basis, coefficients in zip(
-        _sh_basis(directions, sh.shape[1]), sh.unbind(dim=1), strict=True
-    ):
+    for basis, coefficients in zip(_sh_basis(directions, sh.shape[1]), sh.unbind(dim=1), strict=True):
         colour = colour + basis[:, None] * coefficients
     return colour
 
@@ -48,11 +40,7 @@ def _sh_basis(directions: Float[Tensor, "m 3"], coefficients: int) -> list[Float
         basis += [SH_C2[0] * x * y, -SH_C2[0] * y * z, SH_C2[1] * (2 * zz - xx - yy)]
         basis += [-SH_C2[0] * x * z, SH_C2[2] * (xx - yy)]
     if coefficients > 9:
-        basis += [
-            -SH_C3[0] * y * (3 * xx - yy),
-            SH_C3[1] * x * y * z,
-            -SH_C3[2] * y * (4 * zz - xx - yy),
-        ]
+        basis += [-SH_C3[0] * y * (3 * xx - yy), SH_C3[1] * x * y * z, -SH_C3[2] * y * (4 * zz - xx - yy)]
         basis += [SH_C3[3] * z * (2 * zz - 3 * xx - 3 * yy), -SH_C3[2] * x * (4 * zz - xx - yy)]
         basis += [SH_C3[4] * z * (xx - yy), -SH_C3[0] * x * (xx - 3 * yy)]
     if coefficients > 16:

@@ -55,10 +55,7 @@ class Splats2D:
         return replace(self, **{n: c.to(dtype) for n, c in columns if c.is_floating_point()})
 
     def blurred(
-        self,
-        variance: float | Float[Tensor, " m"],
-        compensate: bool,
-        floor: float = MIN_COMPENSATION,
+        self, variance: float | Float[Tensor, " m"], compensate: bool, floor: float = MIN_COMPENSATION
     ) -> "Splats2D":
         """Convolve with an isotropic Gaussian of `variance` px².
 
@@ -72,9 +69,7 @@ class Splats2D:
         added = variance[:, None] if isinstance(variance, Tensor) else variance
         return self._widened(self.covs + added * diagonal, dets, compensate, floor)
 
-    def convolved(
-        self, added: Float[Tensor, "m 3"], compensate: bool, floor: float = MIN_COMPENSATION
-    ) -> "Splats2D":
+    def convolved(self, added: Float[Tensor, "m 3"], compensate: bool, floor: float = MIN_COMPENSATION) -> "Splats2D":
         """Convolve with a Gaussian of any covariance, packed, in px²."""
         a, b, c = added.unbind(dim=1)
         xx, xy, yy = self.covs.unbind(dim=1)

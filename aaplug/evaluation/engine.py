@@ -61,9 +61,7 @@ def candidates_of(
     found = []
     for recipe in (suited(recipe, scene) for recipe in recipes):
         if recipe.world not in prepared:
-            prepared[recipe.world] = Renderer.of(
-                scene, training, recipe, rasterizer=rasterizer, background=background
-            )
+            prepared[recipe.world] = Renderer.of(scene, training, recipe, rasterizer=rasterizer, background=background)
         found.append(Candidate(recipe.name, replace(prepared[recipe.world], recipe=recipe)))
     return found
 
@@ -180,9 +178,7 @@ def _check(task: Task) -> None:
     if len(set(task.names)) != len(task.names) or len(set(task.scales)) != len(task.scales):
         raise UsageError("evaluate", "a recipe or a scale is named twice")
     if task.truth.source == "photographs" and task.protocol.change != "size":
-        raise UsageError(
-            "truth", f"protocol {task.protocol.name} moves the camera: no photograph shows that"
-        )
+        raise UsageError("truth", f"protocol {task.protocol.name} moves the camera: no photograph shows that")
     source_of(task.views, task.truth.source)
 
 
@@ -250,9 +246,7 @@ class _Bench:
                 drawings[work] = timed(camera)
             yield name, drawings[work]
 
-    def _series(
-        self, truth: ViewTruth, name: str, scale: float, drawn: Drawn, full: Drawn | None
-    ) -> Series | None:
+    def _series(self, truth: ViewTruth, name: str, scale: float, drawn: Drawn, full: Drawn | None) -> Series | None:
         """What figures look at; None for the ceiling, which has none."""
         if name == CEILING:
             return None
@@ -284,10 +278,7 @@ class _Comparison:
     def values(self, drawn: Drawn, series: Series | None) -> Values:
         """Every metric's value."""
         compared = self._compared(drawn.rgb)
-        return {
-            m.name: compared[m.name] if m.measure else (series and m.of(series))
-            for m in self.metrics
-        }
+        return {m.name: compared[m.name] if m.measure else (series and m.of(series)) for m in self.metrics}
 
     def note(self, values: Values) -> str:
         """Why values are undefined, each reason once."""

@@ -27,17 +27,12 @@ def energy_drift(drawn: Float[Tensor, "h w 3"], expected: Float[Tensor, "H W 3"]
     return None if before == 0 else energy(drawn) / before - 1
 
 
-def flicker(
-    frames: Sequence[Float[Tensor, "h w 3"]], motion: Sequence[Float[Tensor, "h w 3"]]
-) -> float | None:
+def flicker(frames: Sequence[Float[Tensor, "h w 3"]], motion: Sequence[Float[Tensor, "h w 3"]]) -> float | None:
     """RMS change from frame to frame, over that of `motion` alone; None where nothing moves.
 
     Above 1 the image shimmers, below 1 it is blurred.
     """
-    own, expected = (
-        sum(float((b - a).double().square().mean()) for a, b in pairwise(x))
-        for x in (frames, motion)
-    )
+    own, expected = (sum(float((b - a).double().square().mean()) for a, b in pairwise(x)) for x in (frames, motion))
     return None if expected == 0 else math.sqrt(own / expected)
 
 

@@ -33,12 +33,7 @@ class ImageStore:
     everything: bool = False
 
     def keep(
-        self,
-        view: int,
-        recipe: str,
-        scale: float,
-        image: Float[Tensor, "h w 3"],
-        truth: Float[Tensor, "h w 3"] | None,
+        self, view: int, recipe: str, scale: float, image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"] | None
     ) -> None:
         """Store one image and its truth.
 

@@ -52,9 +52,7 @@ WORDS: dict[LpipsFlavour, str] = {
 }
 
 
-def lpips_metric(
-    flavour: LpipsFlavour, trunk: str | PathLike[str], heads: str | PathLike[str]
-) -> Metric:
+def lpips_metric(flavour: LpipsFlavour, trunk: str | PathLike[str], heads: str | PathLike[str]) -> Metric:
     """LPIPS as a metric, with its weights in memory.
 
     Args:
@@ -95,10 +93,7 @@ LPIPS = Metric(
 
 
 def _distance(
-    net: tuple[Stage, ...],
-    weights: dict[int, tuple[Tensor, Tensor]],
-    heads: list[Tensor],
-    from_unit: bool,
+    net: tuple[Stage, ...], weights: dict[int, tuple[Tensor, Tensor]], heads: list[Tensor], from_unit: bool
 ) -> Callable[[Float[Tensor, "h w 3"], Float[Tensor, "h w 3"]], float | None]:
     def features(image: Float[Tensor, "h w 3"]) -> list[Tensor]:
         x = image.float() if from_unit else 2 * image.float() - 1
@@ -126,10 +121,7 @@ def _trunk(path: Path, net: tuple[Stage, ...]) -> dict[int, tuple[Tensor, Tensor
     for number in (number for stage in net for number, _, _ in stage.convolutions):
         weight, bias = (state.get(f"features.{number}.{part}") for part in ("weight", "bias"))
         if weight is None or bias is None or weight.dim() != 4 or weight.shape[1] != channels:
-            raise FormatError(
-                path,
-                f"holds no features.{number} for {channels} channels; give torchvision's weights",
-            )
+            raise FormatError(path, f"holds no features.{number} for {channels} channels; give torchvision's weights")
         weights[number], channels = (weight.float(), bias.float()), weight.shape[0]
     return weights
 
@@ -139,9 +131,7 @@ def _heads(path: Path, channels: list[int]) -> list[Tensor]:
     for number, count in enumerate(channels):
         head = state.get(f"lin{number}.model.1.weight")
         if head is None or head.shape != (1, count, 1, 1):
-            raise FormatError(
-                path, f"holds no lin{number} of {count} channels; give the lpips package's weights"
-            )
+            raise FormatError(path, f"holds no lin{number} of {count} channels; give the lpips package's weights")
         heads.append(head.float())
     return heads
 

@@ -48,20 +48,13 @@ FLIP = Metric("FLIP", "", 0.0, 4, f"LDR-FLIP, mean, {FLIP_DEGREE} px a degree", 
 
 METRICS: Registry[Metric] = Registry(
     "metric",
-    {
-        metric.name: metric
-        for metric in (PSNR, SSIM["wang"], LPIPS, FLIP, CONSISTENCY, ENERGY, FLICKER)
-    },
-    check=lambda value: (
-        isinstance(value, Metric) and (value.measure is None) != (value.figure is None)
-    ),
+    {metric.name: metric for metric in (PSNR, SSIM["wang"], LPIPS, FLIP, CONSISTENCY, ENERGY, FLICKER)},
+    check=lambda value: isinstance(value, Metric) and (value.measure is None) != (value.figure is None),
 )
 
 
 def find_metrics(
-    names: Sequence[str],
-    protocol: Protocol,
-    lpips_weights: tuple[Path, Path] | None = None,
+    names: Sequence[str], protocol: Protocol, lpips_weights: tuple[Path, Path] | None = None
 ) -> list[Metric]:
     """Metrics by name, in the flavours of a protocol.
 

@@ -61,9 +61,7 @@ class Protocol:
             return view.scaled(scale)
         return view.resized(*(max(1, round(side * scale)) for side in (view.width, view.height)))
 
-    def resized(
-        self, full: Float[Tensor, "h w 3"], camera: Camera, scale: float
-    ) -> Float[Tensor, "h2 w2 3"]:
+    def resized(self, full: Float[Tensor, "h w 3"], camera: Camera, scale: float) -> Float[Tensor, "h2 w2 3"]:
         """An image of the training size at the size of `camera`, which is that of `scale`."""
         if self.whole_sizes:
             return stretched(full, camera.hw)
@@ -153,7 +151,5 @@ _OWN = (
     ),
 )
 PROTOCOLS: Registry[Protocol] = Registry(
-    "protocol",
-    {protocol.name: protocol for protocol in _OWN},
-    check=lambda value: isinstance(value, Protocol),
+    "protocol", {protocol.name: protocol for protocol in _OWN}, check=lambda value: isinstance(value, Protocol)
 )

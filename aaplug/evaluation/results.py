@@ -71,10 +71,7 @@ class Report:
     def with_more(self, other: "Report") -> "Report":
         """Join two reports of the same protocol."""
         recipes = {**self.protocol["recipes"], **other.protocol["recipes"]}
-        measurements, protocol = (
-            self.measurements + other.measurements,
-            {**self.protocol, "recipes": recipes},
-        )
+        measurements, protocol = (self.measurements + other.measurements, {**self.protocol, "recipes": recipes})
         return Report(measurements, protocol, self.measured + other.measured)
 
 
@@ -118,10 +115,7 @@ def rows(report: Report, metric: Metric) -> list[list[tuple[str, bool]]]:
     best = [_best(report, metric, scale) for scale in report.scales]
     return [
         [
-            (
-                metric.text(value),
-                value is not None and value == top and recipe != CEILING,
-            )
+            (metric.text(value), value is not None and value == top and recipe != CEILING)
             for scale, top in zip(report.scales, best, strict=True)
             for value in [mean(report.select(recipe, scale), metric.name)]
         ]
@@ -137,10 +131,7 @@ def work(report: Report) -> list[tuple[str, list[list[str]]]]:
     return [
         (
             title,
-            [
-                [_figure(column(report, recipe, scale), digits) for scale in report.scales]
-                for recipe in report.recipes
-            ],
+            [[_figure(column(report, recipe, scale), digits) for scale in report.scales] for recipe in report.recipes],
         )
         for title, column, digits in columns
     ]
@@ -149,9 +140,7 @@ def work(report: Report) -> list[tuple[str, list[list[str]]]]:
 def results(report: Report) -> dict[str, Any]:
     """INRIA's results.json, {method: {metric: mean}}, methods named recipe@scale; the protocol is "_aaplug"."""
     methods = {
-        method(recipe, scale): {
-            m.name: mean(report.select(recipe, scale), m.name) for m in report.metrics
-        }
+        method(recipe, scale): {m.name: mean(report.select(recipe, scale), m.name) for m in report.metrics}
         for recipe in report.recipes
         for scale in report.scales
     }
@@ -164,9 +153,7 @@ def per_view(report: Report) -> dict[str, Any]:
     for recipe in report.recipes:
         for scale in report.scales:
             views = report.select(recipe, scale)
-            columns: dict[str, Any] = {
-                m.name: {v.view: v.values.get(m.name) for v in views} for m in report.metrics
-            }
+            columns: dict[str, Any] = {m.name: {v.view: v.values.get(m.name) for v in views} for m in report.metrics}
             columns["samples"] = {v.view: v.samples for v in views}
             columns["seconds"] = {v.view: round(v.seconds, 4) for v in views}
             columns["evaluations"] = {v.view: v.evaluations for v in views}

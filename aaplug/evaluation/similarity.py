@@ -31,9 +31,7 @@ def psnr(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> float 
     return None if error == 0 else -10 * math.log10(error)
 
 
-def ssim(
-    image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], flavour: SsimFlavour = "wang"
-) -> float | None:
+def ssim(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], flavour: SsimFlavour = "wang") -> float | None:
     """Structural similarity (Wang et al. 2004, eq. 13), the channels' mean; None for images smaller than the window."""
     if min(image.shape[:2]) < SSIM_WINDOW:
         return None
@@ -44,13 +42,7 @@ def ssim(
         border = SSIM_WINDOW // 2
         a, b = (np.pad(x, ((border, border), (border, border), (0, 0))) for x in (a, b))
     value: Any = structural_similarity(
-        a,
-        b,
-        channel_axis=2,
-        data_range=1.0,
-        gaussian_weights=True,
-        sigma=SSIM_SIGMA,
-        use_sample_covariance=False,
+        a, b, channel_axis=2, data_range=1.0, gaussian_weights=True, sigma=SSIM_SIGMA, use_sample_covariance=False
     )
     return float(value)
 

@@ -37,15 +37,10 @@ Enlarge = Callable[[Renderer, Image, Camera], Larger]  # own look, image at hand
 
 
 def own_look(
-    scene: Gaussians,
-    training: TrainingViews,
-    rasterizer: str | Rasterizer = "auto",
-    background: Background = "auto",
+    scene: Gaussians, training: TrainingViews, rasterizer: str | Rasterizer = "auto", background: Background = "auto"
 ) -> Renderer:
     """The scene as training showed it, at any size."""
-    return Renderer.of(
-        scene, training, find_recipe("matched"), rasterizer=rasterizer, background=background
-    )
+    return Renderer.of(scene, training, find_recipe("matched"), rasterizer=rasterizer, background=background)
 
 
 def back_projected(own: Renderer, full: Image, camera: Camera) -> Larger:
@@ -92,9 +87,7 @@ class Truth:
     protocol: Protocol = PROTOCOLS["default"]
     enlarge: Enlarge | None = None
     memory: float | None = None
-    _kept: dict[tuple[object, ...], Tensor] = field(
-        default_factory=dict, init=False, repr=False, compare=False
-    )
+    _kept: dict[tuple[object, ...], Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @property
     def background(self) -> Colour:
@@ -117,9 +110,7 @@ class Truth:
         """The scene's own look."""
         return TimedRenderer(self.own)
 
-    def remembered(
-        self, view: Camera, scale: float, make: Callable[[], Image | None]
-    ) -> Image | None:
+    def remembered(self, view: Camera, scale: float, make: Callable[[], Image | None]) -> Image | None:
         """The image that is kept, or a new one, kept while there is room."""
         if self.memory is None:
             return make()

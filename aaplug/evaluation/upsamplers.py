@@ -43,9 +43,7 @@ def find_upsampler(name: str) -> Upsampler:
         return UPSAMPLERS[name]
     path = Path(name)
     if path.suffix not in (".pb", ".pt2"):
-        raise UsageError(
-            "upsampler", f"expected {', '.join(UPSAMPLERS)} or a .pb or .pt2 file, got '{name}'"
-        )
+        raise UsageError("upsampler", f"expected {', '.join(UPSAMPLERS)} or a .pb or .pt2 file, got '{name}'")
     if not path.is_file():
         raise FormatError(path, "does not exist")
     network = _opencv(path) if path.suffix == ".pb" else _torch(path)
@@ -86,9 +84,7 @@ def _torch(path: Path) -> Callable[[Tensor], Tensor]:
                 larger = module(image.permute(2, 0, 1)[None])
                 return larger[0].permute(1, 2, 0).contiguous()
             except Exception as error:
-                raise FormatError(
-                    path, f"does not take an image of {image.shape[1]}x{image.shape[0]} px"
-                ) from error
+                raise FormatError(path, f"does not take an image of {image.shape[1]}x{image.shape[0]} px") from error
 
     return enlarge
 

@@ -88,9 +88,7 @@ def load(path: Path, job: TuningJob) -> tuple[State, dict[str, Any]]:
         raise FormatError(path, "is damaged, or no checkpoint of this version") from error
     for key, value in facts(job).items():
         if found.get(key) != value:
-            raise UsageError(
-                str(path), f"is of another run: its {key} was {found.get(key)}, now it is {value}"
-            )
+            raise UsageError(str(path), f"is of another run: its {key} was {found.get(key)}, now it is {value}")
     return state, content["good"]
 
 

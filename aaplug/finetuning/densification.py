@@ -61,9 +61,7 @@ class Densified:
     new: Bool[Tensor, " m"]
 
 
-def densify(
-    scene: Gaussians, gradients: Float[Tensor, " n"], extent: float, generator: torch.Generator
-) -> Densified:
+def densify(scene: Gaussians, gradients: Float[Tensor, " n"], extent: float, generator: torch.Generator) -> Densified:
     """Clone, split and prune; Gaussians that stay come first, in their order."""
     dense = gradients >= THRESHOLD
     large = scene.scales.amax(dim=1) > SMALL * extent

@@ -18,11 +18,7 @@ from aaplug.methods.recipes import RECIPES
 from aaplug.methods.viewers import Viewer, fuse_for
 from aaplug.rendering.renderer import Renderer
 
-SHARES = (
-    0.5,
-    0.25,
-    0.125,
-)  # of the way to the tuned scene, tried while a scale is worse than the original
+SHARES = (0.5, 0.25, 0.125)  # of the way to the tuned scene, tried while a scale is worse than the original
 ROUNDING = (1 / 255) ** 2 / 12  # mean square error of rounding to 8 bits
 MEASURED = 8  # views, evenly spaced, that scenes are compared on
 ORIGINAL, CLOSED_FORM, CONVERTED = "original", "closed form", "converted"  # rows of the report
@@ -42,12 +38,7 @@ def steps_for(scene: Gaussians, viewer: Viewer) -> int:
 
 
 def fit(
-    scene: Gaussians,
-    viewer: Viewer,
-    look: Renderer,
-    views: Sequence[Camera],
-    steps: int,
-    monitor: Monitor = SILENT,
+    scene: Gaussians, viewer: Viewer, look: Renderer, views: Sequence[Camera], steps: int, monitor: Monitor = SILENT
 ) -> Fitted:
     """Convert a scene for a viewer.
 
@@ -69,9 +60,7 @@ def fit(
     start = replace(original, scene=fuse_for(scene, original.training, viewer))
     before = residual.of({ORIGINAL: original, CLOSED_FORM: start})
     if steps and _is_worse(before, CLOSED_FORM):
-        monitor.say(
-            "the closed form is worse than the original at some scale: starting from the original"
-        )
+        monitor.say("the closed form is worse than the original at some scale: starting from the original")
         start = original
     settings = balanced(replace(QUICK, steps=steps), _errors(before))
     job = TuningJob(start, original.training.cameras, truth, settings)

@@ -25,16 +25,10 @@ from aaplug.rendering.renderer import Drawing
 
 BOUNDS_EVERY = 100  # steps between computations of the sampling bounds (Mip-Splatting)
 MAX_LOGIT = 9.0  # of an opacity: 0.9999, where its gradient has vanished
-MAX_BAD_STEPS = (
-    3  # in a row without a finite gradient, after which the run returns to its last good state
-)
+MAX_BAD_STEPS = 3  # in a row without a finite gradient, after which the run returns to its last good state
 BACK_OFF = 0.5  # factor on the learning rates after each rollback
 MAX_ROLLBACKS = 5
-SEEDS, SCALE_SEEDS, SPLIT_SEEDS = (
-    10_000_019,
-    3_000_000,
-    6_000_000,
-)  # offsets that keep the draws apart
+SEEDS, SCALE_SEEDS, SPLIT_SEEDS = (10_000_019, 3_000_000, 6_000_000)  # offsets that keep the draws apart
 
 
 def run(
@@ -101,9 +95,7 @@ def advance(job: TuningJob, state: State) -> None:
         _update_bounds(job, state)
 
 
-def loss_at(
-    job: TuningJob, state: State, view: Camera, scale: float
-) -> tuple[Float[Tensor, ""], Drawing]:
+def loss_at(job: TuningJob, state: State, view: Camera, scale: float) -> tuple[Float[Tensor, ""], Drawing]:
     """The loss of one view at one scale, and the drawing, whose splats' means retain their gradients."""
     truth = job.truth(view, scale)
     drawing = state.renderer(job).draw(view.scaled(scale))
@@ -113,15 +105,11 @@ def loss_at(
     return LOSSES[job.settings.loss](image, truth.to(image)), drawing
 
 
-def _roll_back(
-    job: TuningJob, state: State, good: Mapping[str, Any], say: Callable[[str], None]
-) -> None:
+def _roll_back(job: TuningJob, state: State, good: Mapping[str, Any], say: Callable[[str], None]) -> None:
     """Restore the last good state at half the learning rates; the step number goes on, so that other draws follow."""
     step, rollbacks = state.step, state.rollbacks + 1
     if rollbacks > MAX_ROLLBACKS:
-        raise UsageError(
-            "finetune", f"has no finite gradient at step {step}, after {MAX_ROLLBACKS} rollbacks"
-        )
+        raise UsageError("finetune", f"has no finite gradient at step {step}, after {MAX_ROLLBACKS} rollbacks")
     vars(state).update(vars(unpacked(good, job)))
     state.step, state.bad_steps, state.rollbacks = step, 0, rollbacks
     say(
@@ -130,9 +118,7 @@ def _roll_back(
     )
 
 
-def _drawn(
-    settings: Settings, views: Sequence[Camera], step: int
-) -> tuple[Camera, dict[float, float]]:
+def _drawn(settings: Settings, views: Sequence[Camera], step: int) -> tuple[Camera, dict[float, float]]:
     """The view of a step, and its scales with their weights; all views come once before any comes again."""
     count = len(views)
     epoch = torch.Generator().manual_seed(settings.seed * SEEDS + step // count)
@@ -177,8 +163,7 @@ def _densify(job: TuningJob, state: State) -> None:
     with torch.no_grad():
         densified = densify(state.scene(job), state.gradients.mean, job.extent, generator)
         moments = {
-            group["name"]: carried(state.adam.state[group["params"][0]], densified)
-            for group in state.adam.param_groups
+            group["name"]: carried(state.adam.state[group["params"][0]], densified) for group in state.adam.param_groups
         }
     state.leaves = leaves_of(densified.scene)
     state.adam = optimizer(state.leaves, job.settings)

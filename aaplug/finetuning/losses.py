@@ -28,9 +28,7 @@ def l1_dssim(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> Fl
     return (1 - SSIM_SHARE) * absolute + SSIM_SHARE * (1 - structural_similarity(image, truth))
 
 
-def structural_similarity(
-    image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]
-) -> Float[Tensor, ""]:
+def structural_similarity(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
     """Mean SSIM over the windows that lie inside the image; the window shrinks to fit a smaller image."""
     a, b = (x.permute(2, 0, 1)[:, None] for x in (image, truth))
     rows, columns = (_window(min(SSIM_WINDOW, side)).to(image) for side in a.shape[2:])

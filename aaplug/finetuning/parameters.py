@@ -19,9 +19,7 @@ from aaplug.methods.filters import NYQUIST_VARIANCE
 
 Leaves = dict[str, Tensor]
 
-RATES: Mapping[
-    str, float
-] = {  # 3DGS's, per step; that of the means is a share of the scene's extent
+RATES: Mapping[str, float] = {  # 3DGS's, per step; that of the means is a share of the scene's extent
     "means": 1.6e-4,
     "quats": 1e-3,
     "log_scales": 5e-3,

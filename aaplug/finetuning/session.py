@@ -25,11 +25,7 @@ RECENT = 20  # steps over which the reported loss is averaged
 
 
 def tune(
-    job: TuningJob,
-    checkpoint: Path | None = None,
-    every: int = 100,
-    resume: bool = False,
-    monitor: Monitor = SILENT,
+    job: TuningJob, checkpoint: Path | None = None, every: int = 100, resume: bool = False, monitor: Monitor = SILENT
 ) -> State:
     """Run a job to its end.
 
@@ -55,9 +51,7 @@ def tune(
         if done:
             tell(steps, steps)
     if not done:
-        kept = (
-            "nothing is written" if checkpoint is None else "the checkpoint is written; resume it"
-        )
+        kept = "nothing is written" if checkpoint is None else "the checkpoint is written; resume it"
         monitor.say(f"stopped at step {state.step}; {kept}")
         raise KeyboardInterrupt
     return state
@@ -86,14 +80,10 @@ class _Watch:
         told = ", ".join(f"{_decibels(v)} dB at {scale_name(s)}" for s, v in psnr.items())
         pace = (time.monotonic() - self.started) / max(1, state.step - self.first)
         loss = f", loss {_recent_loss(state):.2e}" if state.curve else ""
-        self.monitor.say(
-            f"step {state.step} of {job.settings.steps}{loss}: {told}; {pace:.2f} s per step"
-        )
+        self.monitor.say(f"step {state.step} of {job.settings.steps}{loss}: {told}; {pace:.2f} s per step")
 
 
-def recorded(
-    state: State, job: TuningJob, convention: Convention, settings: Mapping[str, str]
-) -> Gaussians:
+def recorded(state: State, job: TuningJob, convention: Convention, settings: Mapping[str, str]) -> Gaussians:
     """The tuned scene with a record of its tuning; after no steps the start itself."""
     if state.step == 0:
         return replace(job.start.scene, convention=convention)

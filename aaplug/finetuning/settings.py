@@ -47,15 +47,13 @@ OURS = Settings(
 )
 # 3DGS's rates worsen a scene that is nearly right, and 300 steps are too few to recover
 GENTLE = 0.3
-QUICK = (
-    replace(  # for conversion, a few minutes; `balanced` divides its weights by the scene's errors
-        OURS,
-        name="quick",
-        steps=300,
-        weights={0.5: 1.0, 0.25: 1.0, 0.125: 1.0},
-        anchor=4.0,
-        rates={name: GENTLE * rate for name, rate in RATES.items()},
-    )
+QUICK = replace(  # for conversion, a few minutes; `balanced` divides its weights by the scene's errors
+    OURS,
+    name="quick",
+    steps=300,
+    weights={0.5: 1.0, 0.25: 1.0, 0.125: 1.0},
+    anchor=4.0,
+    rates={name: GENTLE * rate for name, rate in RATES.items()},
 )
 
 

@@ -94,9 +94,7 @@ class Survey:
         self.under += under(multiples)
 
 
-def survey(
-    opened: SceneFile, cameras: Sequence[Camera] = (), tell: Tell = lambda done, total: None
-) -> Survey:
+def survey(opened: SceneFile, cameras: Sequence[Camera] = (), tell: Tell = lambda done, total: None) -> Survey:
     """Survey a scene; unusable rows are counted and left out.  `tell` is called with Gaussians done and in all."""
     found = Survey(cameras)
     for part in opened.parts(drop_bad=True, found=found.faults):

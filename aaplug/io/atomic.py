@@ -32,9 +32,7 @@ def replacing(path: str | PathLike[str], overwrite: bool) -> Iterator[BinaryIO]:
 
 
 @contextmanager
-def replacing_file(
-    path: str | PathLike[str], overwrite: bool, suffix: str = ".tmp"
-) -> Iterator[Path]:
+def replacing_file(path: str | PathLike[str], overwrite: bool, suffix: str = ".tmp") -> Iterator[Path]:
     """Like `replacing`, for libraries that open their file themselves: yields a path that ends in `suffix`.
 
     Raises:
@@ -58,9 +56,7 @@ def replacing_file(
         _sync(target.parent, os.O_RDONLY)
 
 
-def check_output(
-    path: str | PathLike[str], overwrite: bool, inputs: Iterable[str | PathLike[str]] = ()
-) -> None:
+def check_output(path: str | PathLike[str], overwrite: bool, inputs: Iterable[str | PathLike[str]] = ()) -> None:
     """Refuse an output that must not be written, before any work and without creating anything.
 
     Raises:

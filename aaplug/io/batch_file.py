@@ -46,9 +46,7 @@ def read_batch(path: str | PathLike[str]) -> BatchFile:
         settings = _settings(table, path.parent)
         name = settings.pop("name", None) or _own_name(path, number, settings)
         if not isinstance(name, str) or name.casefold() in map(str.casefold, scenes):
-            raise FormatError(
-                path, f"[[scene]] {number}: needs a name of its own, not {name!r}; add name = ..."
-            )
+            raise FormatError(path, f"[[scene]] {number}: needs a name of its own, not {name!r}; add name = ...")
         scenes[name] = settings
     return BatchFile(_settings(document, path.parent), scenes)
 

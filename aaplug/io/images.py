@@ -70,10 +70,7 @@ def read_rgba(path: str | PathLike[str]) -> Float[Tensor, "h w 4"]:
 
 
 def write_png(
-    path: str | PathLike[str],
-    rgb: Float[Tensor, "h w 3"],
-    bit_depth: int = 8,
-    overwrite: bool = False,
+    path: str | PathLike[str], rgb: Float[Tensor, "h w 3"], bit_depth: int = 8, overwrite: bool = False
 ) -> None:
     """Write colours, clamped to [0, 1], as a PNG, whole or not at all.
 
@@ -139,9 +136,7 @@ def _read(path: Path) -> np.ndarray:
     if pixels.dtype not in SAMPLE_TYPES.values():
         raise FormatError(path, f"holds {pixels.dtype} samples; save it with 8 or 16 bits")
     if transparent != (pixels.shape[2] == ALPHA_CHANNELS):
-        raise FormatError(
-            path, "has colours or transparency that OpenCV cannot read; save it as RGB(A) PNG"
-        )
+        raise FormatError(path, "has colours or transparency that OpenCV cannot read; save it as RGB(A) PNG")
     return _to_rgb(pixels)
 
 

@@ -33,9 +33,7 @@ class Distortion:
     fisheye: bool = False
 
 
-def undistorted_cameras(
-    cameras: Sequence[Camera], distortions: Sequence[Distortion | None]
-) -> list[Camera]:
+def undistorted_cameras(cameras: Sequence[Camera], distortions: Sequence[Distortion | None]) -> list[Camera]:
     """The cameras as pinholes, cropped to what their photographs cover; without photographs that cannot be used."""
     return [
         camera if lens is None else _undistorted(camera, lens)
@@ -121,9 +119,7 @@ def _maps(lens: Lens, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
     left, top, *window = lens.window
     size = tuple(max(1, round(side * s)) for side, s in zip(window, scale, strict=True))
     own = _matrix(lens.pinhole, (0, 0), scale)
-    seen = _matrix(
-        lens.pinhole, (left, top), tuple(a / b for a, b in zip(size, window, strict=True))
-    )
+    seen = _matrix(lens.pinhole, (left, top), tuple(a / b for a, b in zip(size, window, strict=True)))
     coefficients = np.array(lens.coefficients)
     find = cv2.fisheye.initUndistortRectifyMap if lens.fisheye else cv2.initUndistortRectifyMap
     x, y = find(own, coefficients, np.eye(3), seen, size, cv2.CV_32FC1)

@@ -47,9 +47,7 @@ class Downscale:
     read: Callable[[Path, Background, Lens | None], Photograph]
 
 
-def read_photo(
-    path: str | PathLike[str], background: Background, lens: Lens | None = None
-) -> Float[Tensor, "h w 3"]:
+def read_photo(path: str | PathLike[str], background: Background, lens: Lens | None = None) -> Float[Tensor, "h w 3"]:
     """Read a photograph: composite it over `background`, undistort it by its lens, round it to 8 bits.
 
     Raises:
@@ -60,9 +58,7 @@ def read_photo(
 
 def _box(path: Path, background: Background, lens: Lens | None = None) -> Photograph:
     photo = read_photo(path, background, lens)
-    return Photograph(
-        (photo.shape[0], photo.shape[1]), lambda hw, factor: resampled(photo, factor, hw)
-    )
+    return Photograph((photo.shape[0], photo.shape[1]), lambda hw, factor: resampled(photo, factor, hw))
 
 
 def _rgba_box(path: Path, background: Background, lens: Lens | None = None) -> Photograph:
@@ -73,9 +69,7 @@ def _rgba_box(path: Path, background: Background, lens: Lens | None = None) -> P
     def at(hw: tuple[int, int], factor: float) -> Float[Tensor, "h w 3"]:
         depth = round(math.log2(1 / factor))
         if abs(factor * 2**depth - 1) > WHOLE:
-            raise UsageError(
-                "scale", f"{factor:g} is not a power of 1/2, as multi-scale Blender data needs"
-            )
+            raise UsageError("scale", f"{factor:g} is not a power of 1/2, as multi-scale Blender data needs")
         while len(halves) <= depth:
             halves.append(box_average(halves[-1], 2))
         saved = _truncated(halves[depth])[: hw[0], : hw[1]]
@@ -116,9 +110,7 @@ DOWNSCALES = {
             _rgba_box,
         ),
         Downscale(
-            "pil-bicubic",
-            "Pillow's antialiased bicubic on the 8-bit photograph, in 8 bits (3DGS's -r)",
-            _pil_bicubic,
+            "pil-bicubic", "Pillow's antialiased bicubic on the 8-bit photograph, in 8 bits (3DGS's -r)", _pil_bicubic
         ),
     )
 }

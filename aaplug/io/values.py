@@ -167,18 +167,14 @@ def parse_json(data: bytes, path: Path) -> Any:
         raise FormatError(path, f"should be JSON: {error}") from error
 
 
-def entries(
-    path: Path, what: str, items: object, shared: dict[str, Any] | None = None
-) -> list[Entry]:
+def entries(path: Path, what: str, items: object, shared: dict[str, Any] | None = None) -> list[Entry]:
     """The objects of a JSON list; `shared` fields apply where an object does not have its own.
 
     Raises:
         FormatError: it is not a list of objects, or is empty.
     """
     if not isinstance(items, list) or not items:
-        raise FormatError(
-            path, f"should hold a list of {what}s, at least one, not {reprlib.repr(items)}"
-        )
+        raise FormatError(path, f"should hold a list of {what}s, at least one, not {reprlib.repr(items)}")
     return [_entry(Place(path, f"{what} {i}"), item, shared or {}) for i, item in enumerate(items)]
 
 

@@ -35,19 +35,14 @@ def check_video(path: str | PathLike[str], fps: float, overwrite: bool) -> None:
     if suffix not in (WEBM, MP4):
         raise OutputError(path, f"name a {WEBM} or {MP4} file")
     if suffix == MP4 and importlib.util.find_spec("av") is None:
-        raise UsageError(
-            str(path), f"H.264 needs PyAV: pip install 'aaplug[mp4]'; {WEBM} needs nothing"
-        )
+        raise UsageError(str(path), f"H.264 needs PyAV: pip install 'aaplug[mp4]'; {WEBM} needs nothing")
     if not 0 < fps <= MOST_FPS:
         raise UsageError("fps", f"must be above 0 and at most {MOST_FPS}, got {fps:g}")
     check_output(path, overwrite)
 
 
 def write_video(
-    path: str | PathLike[str],
-    frames: Iterable[Float[Tensor, "h w 3"]],
-    fps: float,
-    overwrite: bool = False,
+    path: str | PathLike[str], frames: Iterable[Float[Tensor, "h w 3"]], fps: float, overwrite: bool = False
 ) -> None:
     """Write a video of at least one frame.
 

@@ -4,13 +4,7 @@ import math
 from dataclasses import dataclass
 
 from aaplug.core.gaussians import Gaussians
-from aaplug.core.interfaces import (
-    Compositor,
-    PixelKernel,
-    ScreenFilter,
-    Selection,
-    WorldFilter,
-)
+from aaplug.core.interfaces import Compositor, PixelKernel, ScreenFilter, Selection, WorldFilter
 from aaplug.methods.pixel_kernels import POINT
 
 SLACK = 1e-6  # before one more sample is taken

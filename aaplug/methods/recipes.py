@@ -86,11 +86,7 @@ RECIPES: Registry[Recipe] = Registry(
 
 
 def find_recipe(
-    name: str,
-    *,
-    quality: str = "balanced",
-    rate_reference: str | None = None,
-    target_rate: float | None = None,
+    name: str, *, quality: str = "balanced", rate_reference: str | None = None, target_rate: float | None = None
 ) -> Recipe:
     """A recipe by name, with the user's choices.
 

@@ -15,9 +15,7 @@ from aaplug.core.registry import Registry
 from aaplug.core.training import TrainingViews
 from aaplug.methods.filters import MatchedEnergy, Smoothing3D, fuse_stored
 
-FITTED_VARIANCE = (
-    0.1  # px²; measured: a scene trained without compensation, for a compensating viewer
-)
+FITTED_VARIANCE = 0.1  # px²; measured: a scene trained without compensation, for a compensating viewer
 TUNED = "finetune"  # the method that fine-tuning records; it adds no blur
 
 
@@ -42,10 +40,7 @@ class Form:
 MATCHED_ENERGY = Form(MatchedEnergy(), uses_bounds=False, skips=MIP)
 FORMS: Registry[Form] = Registry(
     "form",
-    {
-        "matched-energy": MATCHED_ENERGY,
-        "mip-splatting": Form(Smoothing3D(), uses_bounds=True),
-    },
+    {"matched-energy": MATCHED_ENERGY, "mip-splatting": Form(Smoothing3D(), uses_bounds=True)},
     check=lambda value: isinstance(value, Form),
 )
 
@@ -87,9 +82,7 @@ VIEWERS: Registry[Viewer] = Registry(
 FAST = Viewer("fast", "matched", None, "aaplug's recipe matched, one sample per pixel")
 
 
-def fuse(
-    scene: Gaussians, training: TrainingViews | None, form: Form = MATCHED_ENERGY
-) -> Gaussians:
+def fuse(scene: Gaussians, training: TrainingViews | None, form: Form = MATCHED_ENERGY) -> Gaussians:
     """Convert a scene for the Mip rule: fuse its stored 3D filter if it has one, else what `form` says.
 
     training may be None where the scene stores its filter.
@@ -146,21 +139,14 @@ def fused_in(scene: Gaussians) -> str:
 
 def _check(scene: Gaussians, form: Form) -> None:
     if scene.flat:
-        raise UsageError(
-            scene.name, "holds 2D Gaussians: no filter here can widen them and keep them flat"
-        )
+        raise UsageError(scene.name, "holds 2D Gaussians: no filter here can widen them and keep them flat")
     _check_fused(scene)
     if form.skips == scene.convention and scene.filter_3d is None:
-        raise UsageError(
-            scene.name,
-            "was trained by the Mip rule and stores no 3D filter: there is nothing to fuse",
-        )
+        raise UsageError(scene.name, "was trained by the Mip rule and stores no 3D filter: there is nothing to fuse")
 
 
 def _check_fused(scene: Gaussians) -> None:
     blurs = blurring(scene.fused)
     if blurs:
         done = "; ".join(map(describe, blurs))
-        raise UsageError(
-            scene.name, f"already has {done} fused; converting it again would blur it twice"
-        )
+        raise UsageError(scene.name, f"already has {done} fused; converting it again would blur it twice")

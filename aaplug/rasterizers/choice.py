@@ -11,14 +11,10 @@ from aaplug.rasterizers.tiled.ahead_of_time import build, has_compiler, load
 
 FRAMES_THAT_PAY = 500  # compiling takes about 150 s and saves about 0.3 s per 800 x 800 frame
 
-RASTERIZERS: Registry[Rasterizer] = Registry(
-    "rasterizer", {"eager": Tiled(), "reference": Reference()}
-)
+RASTERIZERS: Registry[Rasterizer] = Registry("rasterizer", {"eager": Tiled(), "reference": Reference()})
 
 
-def find_rasterizer(
-    name: str = "auto", frames: int = 1, say: Callable[[str], None] = lambda text: None
-) -> Rasterizer:
+def find_rasterizer(name: str = "auto", frames: int = 1, say: Callable[[str], None] = lambda text: None) -> Rasterizer:
     """A rasterizer by name; "auto" is compiled where kernels are built, and builds them where `frames` repay it.
 
     say: called with the choice, in words.

@@ -40,9 +40,7 @@ class Reference:
         splats = splats[torch.sort(splats.depths, stable=True).indices]
         centres = _pixel_centres(hw).to(splats.means.device)
         strips = [
-            _strip(splats, strip, pixel, rules)
-            if compositor is None
-            else compositor.exact(splats, strip, rules)
+            _strip(splats, strip, pixel, rules) if compositor is None else compositor.exact(splats, strip, rules)
             for strip in centres.split(STRIP_PIXELS)
         ]
         rgb = torch.cat([rgb for rgb, _ in strips]).reshape(*hw, 3)
@@ -77,10 +75,7 @@ def _strip(
 
 
 def alphas(
-    splats: Splats2D,
-    centres: Float[Tensor, "p 2"],
-    pixel: PixelKernel = POINT,
-    rules: Rules = RULES_3DGS,
+    splats: Splats2D, centres: Float[Tensor, "p 2"], pixel: PixelKernel = POINT, rules: Rules = RULES_3DGS
 ) -> Float[Tensor, "p c"]:
     """Alpha of each splat at each pixel, capped, and 0 below the cut-off (3DGS, eq. 4)."""
     values = pixel.exact(splats, centres[:, None] - splats.means)

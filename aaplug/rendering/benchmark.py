@@ -67,13 +67,7 @@ class Figures:
         return {**self.__dict__, "forward_share_of_matmul": self.share}
 
 
-def measure(
-    scene: Gaussians,
-    camera: Camera,
-    kernels: Kernels,
-    repeats: int = 5,
-    backward: bool = True,
-) -> Figures:
+def measure(scene: Gaussians, camera: Camera, kernels: Kernels, repeats: int = 5, backward: bool = True) -> Figures:
     """Time one view of a scene by recipe "classic".
 
     kernels: run the stages, eagerly or compiled.  backward: also time the gradients of all parameters.
@@ -153,9 +147,7 @@ def synthetic_scene(n: int, seed: int = SEED) -> Gaussians:
     return Gaussians(means, quats, log_scales, opacities.logit(), sh)
 
 
-def _surfaces(
-    n: int, draw: torch.Generator
-) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"], Float[Tensor, " n"]]:
+def _surfaces(n: int, draw: torch.Generator) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"], Float[Tensor, " n"]]:
     """Points on a unit ball, on the ground and on a dome, their normals, and the spacing of their surface."""
     ball, ground = int(0.5 * n), int(0.27 * n)
     dome = n - ball - ground
@@ -188,9 +180,7 @@ def _turned_to(normals: Float[Tensor, "n 3"], roll: Float[Tensor, " n"]) -> Floa
     return torch.stack([w * cos, i * cos + j * sin, j * cos - i * sin, w * sin], dim=1)
 
 
-def _stages(
-    renderer: Renderer, camera: Camera, kernels: Kernels, repeats: int
-) -> tuple[dict[str, float], int]:
+def _stages(renderer: Renderer, camera: Camera, kernels: Kernels, repeats: int) -> tuple[dict[str, float], int]:
     """Milliseconds of each stage of the renderer, and the evaluations in all tiles that ellipses touch."""
     times: dict[str, float] = {}
 

@@ -56,9 +56,7 @@ class Renderer:
     recipe: Recipe
     rasterizer: Rasterizer = RASTERIZERS["eager"]
     background: Colour = BLACK
-    _rates: dict[tuple[object, ...], float] = field(
-        default_factory=dict, init=False, repr=False, compare=False
-    )
+    _rates: dict[tuple[object, ...], float] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @classmethod
     def of(
@@ -116,9 +114,7 @@ class Renderer:
         fine, samples = self.sampled(camera)
         splats = self.splats(fine)
         recipe, rules = self.recipe, self.training.convention.rules
-        image = self.rasterizer(
-            splats, fine.hw, self.background, recipe.pixel, recipe.compositor, rules
-        )
+        image = self.rasterizer(splats, fine.hw, self.background, recipe.pixel, recipe.compositor, rules)
         return Drawing(average_samples(image, samples), splats, fine.hw)
 
     def sampled(self, camera: Camera) -> tuple[Camera, int]:
@@ -209,9 +205,7 @@ def background_colour(background: Background, cameras: object = None) -> Colour:
         found = cameras.background if isinstance(cameras, CameraSet) else None
         return found or BLACK
     if background not in named:
-        raise UsageError(
-            "background", f"expected auto, white, black or a colour, got '{background}'"
-        )
+        raise UsageError("background", f"expected auto, white, black or a colour, got '{background}'")
     return named[background]
 
 

@@ -50,8 +50,5 @@ def make_video(
                 tell(before + done, count * len(renderers))
 
             write_frames(renderer, cameras, panes[-1], threads=threads, tell=tell_all)
-        frames = (
-            compose([read_image(file, None) for file in files])
-            for files in zip(*panes, strict=True)
-        )
+        frames = (compose([read_image(file, None) for file in files]) for files in zip(*panes, strict=True))
         write_video(path, frames, fps, overwrite)

@@ -87,9 +87,7 @@ def _kernels(rasterizer: str, monitor: Monitor) -> list[Kernels]:
     return [compiled, EAGER]
 
 
-def _synthetic(
-    gaussians: Sequence[int], resolution: Sequence[str] | None
-) -> list[tuple[Gaussians, Camera]]:
+def _synthetic(gaussians: Sequence[int], resolution: Sequence[str] | None) -> list[tuple[Gaussians, Camera]]:
     """Every scene at the first size, and the middle one at the others."""
     given = resolution or (SIZES if len(gaussians) > 1 else SIZES[:1])
     sizes = [re.fullmatch(r"([1-9]\d*)x([1-9]\d*)", text) for text in given]

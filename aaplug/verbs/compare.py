@@ -17,15 +17,7 @@ from aaplug.io.cameras import select_views
 from aaplug.methods.recipe import Recipe
 from aaplug.methods.recipes import find_recipe
 from aaplug.rendering.renderer import Background, Renderer
-from aaplug.verbs.inputs import (
-    CamerasLike,
-    SceneLike,
-    background_of,
-    cameras_of,
-    processor,
-    rasterizer_of,
-    scene_of,
-)
+from aaplug.verbs.inputs import CamerasLike, SceneLike, background_of, cameras_of, processor, rasterizer_of, scene_of
 
 SCALES = (1.0, 0.5, 0.25, 0.125)
 

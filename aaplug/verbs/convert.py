@@ -19,35 +19,12 @@ from aaplug.evaluation.truth import own_look
 from aaplug.finetuning.fitting import fit, steps_for
 from aaplug.inspection.survey import check_frame_of
 from aaplug.io.cameras import select_views
-from aaplug.io.scenes import (
-    SpzAxes,
-    check_scene_output,
-    find_scene,
-    open_scene,
-    write_parts,
-    write_scene,
-)
+from aaplug.io.scenes import SpzAxes, check_scene_output, find_scene, open_scene, write_parts, write_scene
 from aaplug.io.scenes.scene_file import SceneFile
-from aaplug.methods.viewers import (
-    FORMS,
-    MATCHED_ENERGY,
-    MIP_VIEWER,
-    VIEWERS,
-    Form,
-    Viewer,
-    blurring,
-    fuse,
-)
+from aaplug.methods.viewers import FORMS, MATCHED_ENERGY, MIP_VIEWER, VIEWERS, Form, Viewer, blurring, fuse
 from aaplug.rendering.renderer import Background
 from aaplug.verbs.in_parts import LARGE, convert_parts
-from aaplug.verbs.inputs import (
-    CamerasLike,
-    SceneLike,
-    background_of,
-    cameras_of,
-    processor,
-    rasterizer_of,
-)
+from aaplug.verbs.inputs import CamerasLike, SceneLike, background_of, cameras_of, processor, rasterizer_of
 
 
 @dataclass(frozen=True)
@@ -139,9 +116,7 @@ def convert(
     return found
 
 
-def _chosen(
-    viewer: str | Viewer | None, steps: int | None, form: str | None, variance: float | None
-) -> Form | Viewer:
+def _chosen(viewer: str | Viewer | None, steps: int | None, form: str | None, variance: float | None) -> Form | Viewer:
     """What to convert for: a viewer, or the Mip rule by a closed form."""
     if viewer is None:
         if steps is not None:

@@ -31,12 +31,7 @@ CONVERTED, SHEET = "chair-converted.ply", "contact-sheet.png"
 RESULTS = ("results.json", "per_view.json", "results.csv")
 
 
-def demo(
-    output: str | PathLike[str] = "demo-out",
-    *,
-    overwrite: bool = False,
-    monitor: Monitor = SILENT,
-) -> Report:
+def demo(output: str | PathLike[str] = "demo-out", *, overwrite: bool = False, monitor: Monitor = SILENT) -> Report:
     """Convert, render and measure the bundled scene; write the converted scene, a contact sheet and the results.
 
     output: a folder.
@@ -72,9 +67,7 @@ def demo(
 
 
 @torch.no_grad()
-def _sheet(
-    scene: Gaussians, converted: Gaussians, training: TrainingViews, view: Camera
-) -> Float[Tensor, "H W 3"]:
+def _sheet(scene: Gaussians, converted: Gaussians, training: TrainingViews, view: Camera) -> Float[Tensor, "H W 3"]:
     """The view at every scale: the photograph, and each way to render it."""
     assert view.photo is not None
     photo = quantised(read_image(view.photo, WHITE))

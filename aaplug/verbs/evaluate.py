@@ -33,15 +33,7 @@ from aaplug.io.cameras import select_views
 from aaplug.methods.recipe import Recipe
 from aaplug.methods.recipes import RECIPES, USER_RECIPES, find_recipe, suited
 from aaplug.rendering.renderer import Background
-from aaplug.verbs.inputs import (
-    CamerasLike,
-    SceneLike,
-    background_of,
-    cameras_of,
-    processor,
-    rasterizer_of,
-    scene_of,
-)
+from aaplug.verbs.inputs import CamerasLike, SceneLike, background_of, cameras_of, processor, rasterizer_of, scene_of
 
 ALL = "all"  # instead of recipes' names: every recipe that the scene suits
 DEFAULT_RECIPES = ("classic", "mip", "matched", "auto")
@@ -119,8 +111,7 @@ def evaluate(
     colour = background_of(background, cameras, monitor)
     training = TrainingViews.of(scene, cameras, cull_margin, min_seen)
     facts = _facts(scene, cameras, seen, source) | {
-        "options": {"quality": quality, "rate_reference": rate_reference or "pose"}
-        | out.facts(show),
+        "options": {"quality": quality, "rate_reference": rate_reference or "pose"} | out.facts(show),
         "cull_margin": cull_margin if math.isfinite(cull_margin) else None,
     }
     with processor(threads):
@@ -232,11 +223,7 @@ def _metrics(
 
 
 def _recipes(
-    names: str | Sequence[str | Recipe],
-    scene: Gaussians,
-    quality: str,
-    rate_reference: str | None,
-    monitor: Monitor,
+    names: str | Sequence[str | Recipe], scene: Gaussians, quality: str, rate_reference: str | None, monitor: Monitor
 ) -> list[Recipe]:
     """The recipes with the user's choices; of "all", those that the scene has everything for."""
     names = [names] if isinstance(names, str) else names
@@ -274,9 +261,7 @@ def _shown(text: str, views: Sequence[Camera]) -> tuple[int, ...]:
     return tuple(places[name] for name in text.split(","))
 
 
-def _source(
-    truth: str, protocol: Protocol, views: Sequence[Camera], monitor: Monitor
-) -> TruthSource:
+def _source(truth: str, protocol: Protocol, views: Sequence[Camera], monitor: Monitor) -> TruthSource:
     known: dict[str, TruthSource | None] = {"auto": protocol.truth}
     known |= {name: name for name in get_args(TruthSource)}
     if truth not in known:
@@ -289,15 +274,12 @@ def _source(
     return source
 
 
-def _facts(
-    scene: Gaussians, cameras: CameraSet, views: Sequence[Camera], truth: TruthSource
-) -> dict[str, Any]:
+def _facts(scene: Gaussians, cameras: CameraSet, views: Sequence[Camera], truth: TruthSource) -> dict[str, Any]:
     """What the numbers depend on besides the request: versions, and hashes of what was read."""
     photos = [view.photo for view in views if view.photo] if truth == "photographs" else []
     origin = scene.origin
     return {
-        "versions": {name: version(name) for name in PACKAGES}
-        | {"python": platform.python_version()},
+        "versions": {name: version(name) for name in PACKAGES} | {"python": platform.python_version()},
         "platform": f"{platform.system()} {platform.machine()}",
         "scene": {
             "file": origin and Path(origin.path).name,
@@ -327,8 +309,5 @@ def _sha256(paths: Sequence[Path]) -> str:
 
 def _cameras_sha256(views: Sequence[Camera]) -> str:
     """Hash of the views as they were understood: names, sizes, intrinsics and poses."""
-    understood = [
-        [v.name, v.width, v.height, v.fx, v.fy, v.cx, v.cy, v.cam_from_world.tolist()]
-        for v in views
-    ]
+    understood = [[v.name, v.width, v.height, v.fx, v.fy, v.cx, v.cy, v.cam_from_world.tolist()] for v in views]
     return hashlib.sha256(json.dumps(understood).encode()).hexdigest()

@@ -22,15 +22,7 @@ from aaplug.evaluation.engine import Candidate, compare
 from aaplug.evaluation.protocols import TruthSource
 from aaplug.evaluation.report.contact_sheet import contact_sheet
 from aaplug.evaluation.results import Report, results, scale_name
-from aaplug.evaluation.truth import (
-    MEMORY,
-    Enlarge,
-    Truth,
-    back_projected,
-    own_look,
-    source_of,
-    upsampled,
-)
+from aaplug.evaluation.truth import MEMORY, Enlarge, Truth, back_projected, own_look, source_of, upsampled
 from aaplug.evaluation.upsamplers import find_upsampler
 from aaplug.finetuning.parameters import RATES
 from aaplug.finetuning.session import recorded, tune
@@ -43,15 +35,7 @@ from aaplug.io.scenes import SpzAxes, check_scene_output, write_scene
 from aaplug.methods.recipes import RECIPES
 from aaplug.methods.viewers import FAST, VIEWERS, Viewer, fuse_for
 from aaplug.rendering.renderer import Background, Renderer
-from aaplug.verbs.inputs import (
-    CamerasLike,
-    SceneLike,
-    background_of,
-    cameras_of,
-    processor,
-    rasterizer_of,
-    scene_of,
-)
+from aaplug.verbs.inputs import CamerasLike, SceneLike, background_of, cameras_of, processor, rasterizer_of, scene_of
 
 
 @dataclass(frozen=True)
@@ -191,9 +175,7 @@ class _Files:
     scene: Path
 
     @classmethod
-    def of(
-        cls, output: str | PathLike[str] | None, scene: Gaussians, resume: bool, overwrite: bool
-    ) -> "_Files | None":
+    def of(cls, output: str | PathLike[str] | None, scene: Gaussians, resume: bool, overwrite: bool) -> "_Files | None":
         """The files beside an output, after a check, before any work, that they may be written."""
         if output is None:
             if resume:
@@ -229,11 +211,7 @@ class _Comparison:
     """Candidates beside the truth, at the training size and at the scales of a run."""
 
     def __init__(
-        self,
-        candidates: Sequence[Candidate],
-        views: Sequence[Camera],
-        scales: Iterable[float],
-        truth: Truth,
+        self, candidates: Sequence[Candidate], views: Sequence[Camera], scales: Iterable[float], truth: Truth
     ) -> None:
         self.candidates, self.views = candidates, views
         self.scales = sorted({1.0, *scales}, reverse=True)
@@ -266,11 +244,7 @@ def _viewer(target: str | Viewer) -> Viewer:
 
 def _source(truth: str, cameras: CameraSet) -> TruthSource:
     """Where the images that renders are compared with come from."""
-    sources: dict[str, TruthSource] = {
-        "self": "self",
-        "photographs": "photographs",
-        "auto": source_of(cameras.train),
-    }
+    sources: dict[str, TruthSource] = {"self": "self", "photographs": "photographs", "auto": source_of(cameras.train)}
     if truth not in sources:
         raise UsageError("truth", f"'{truth}' is not one of {', '.join(sources)}")
     missing = [view.name for view in cameras.train if view.photo is None]

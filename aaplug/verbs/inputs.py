@@ -84,9 +84,7 @@ def rasterizer_of(
     return rasterizer
 
 
-def recipes_of(
-    names: Sequence[str], quality: str = "balanced", rate_reference: str | None = None
-) -> list[Recipe]:
+def recipes_of(names: Sequence[str], quality: str = "balanced", rate_reference: str | None = None) -> list[Recipe]:
     """Recipes by name; the rate reference goes to those that compare rates.
 
     Raises:
@@ -123,10 +121,7 @@ def renderers_of(
     colour = background_of(background, cameras, monitor)
     training = TrainingViews.of(scene, cameras, cull_margin, min_seen)
     drawing = rasterizer_of(rasterizer, frames, memory, monitor)
-    return [
-        Renderer.of(scene, training, recipe, background=colour, rasterizer=drawing)
-        for recipe in recipes
-    ]
+    return [Renderer.of(scene, training, recipe, background=colour, rasterizer=drawing) for recipe in recipes]
 
 
 @contextmanager

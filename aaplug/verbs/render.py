@@ -17,14 +17,7 @@ from aaplug.methods.recipe import Recipe
 from aaplug.methods.recipes import find_recipe
 from aaplug.rendering.frames import write_frames
 from aaplug.rendering.renderer import Background, Renderer
-from aaplug.verbs.inputs import (
-    CamerasLike,
-    SceneLike,
-    cameras_of,
-    processor,
-    renderers_of,
-    scene_of,
-)
+from aaplug.verbs.inputs import CamerasLike, SceneLike, cameras_of, processor, renderers_of, scene_of
 from aaplug.verbs.views import image_paths, resized
 
 

@@ -25,15 +25,7 @@ from aaplug.io.cameras.camera_path import read_camera_path
 from aaplug.io.video import check_video
 from aaplug.rendering.renderer import Background
 from aaplug.rendering.videos import make_video
-from aaplug.verbs.inputs import (
-    CamerasLike,
-    SceneLike,
-    cameras_of,
-    processor,
-    recipes_of,
-    renderers_of,
-    scene_of,
-)
+from aaplug.verbs.inputs import CamerasLike, SceneLike, cameras_of, processor, recipes_of, renderers_of, scene_of
 from aaplug.verbs.views import resized
 
 FPS = 30.0  # frames per second, where neither the caller nor a path file says
@@ -111,9 +103,7 @@ def video(
     return Clip(Path(output), len(shown), fps)
 
 
-def side_by_side(
-    images: Sequence[Float[Tensor, "h _ 3"]], labels: Sequence[str]
-) -> Float[Tensor, "h w 3"]:
+def side_by_side(images: Sequence[Float[Tensor, "h _ 3"]], labels: Sequence[str]) -> Float[Tensor, "h w 3"]:
     """Images from left to right, each with its label; a single image stays as it is."""
     if len(images) == 1:
         return images[0]

@@ -11,9 +11,7 @@ from aaplug.io.atomic import check_output, refuse_existing
 MAX_SIDE = 16384  # px
 
 
-def resized(
-    views: Sequence[Camera], scale: float | None = None, resolution: str | None = None
-) -> list[Camera]:
+def resized(views: Sequence[Camera], scale: float | None = None, resolution: str | None = None) -> list[Camera]:
     """The views at another size.
 
     scale: relative to the training size; 1 where neither is given.

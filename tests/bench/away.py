@@ -47,17 +47,10 @@ SCENES = {
     "chair": Scene("chair/chair.ply"),
     "chair_eighth": Scene("chair/chair_eighth.ply", "chair/chair.ply", 1 / 8),
     "snowmiku": Scene("snowmiku/snowmiku.ply", cull_margin=0.3, background=BLACK),
-    "snowmiku_quarter": Scene(
-        "snowmiku/snowmiku_quarter.ply", "snowmiku/snowmiku.ply", 1 / 4, 0.3, BLACK
-    ),
+    "snowmiku_quarter": Scene("snowmiku/snowmiku_quarter.ply", "snowmiku/snowmiku.ply", 1 / 4, 0.3, BLACK),
 }
 # how finely a view samples against the view that it is made of
-DISTANCES = {
-    "2 times nearer": 2.0,
-    "same distance": 1.0,
-    "2 times farther": 0.5,
-    "4 times farther": 0.25,
-}
+DISTANCES = {"2 times nearer": 2.0, "same distance": 1.0, "2 times farther": 0.5, "4 times farther": 0.25}
 FIELDS = {"half the field of view": 2.0, "twice the field of view": 0.5}
 MATCHED = find_recipe("matched", rate_reference="interval")
 RATES: dict[str, RateReference] = {
@@ -95,29 +88,18 @@ def measure(name: str, scene: Scene, rasterizer: Rasterizer) -> None:
     finer = training if scene.finer is None else TrainingViews.of(full, large, scene.cull_margin)
     views = small.test[:: -(-len(small.test) // VIEWS)]
     chosen = {
-        rule: Renderer(own, training, recipe, rasterizer, scene.background)
-        for rule, recipe in compared().items()
+        rule: Renderer(own, training, recipe, rasterizer, scene.background) for rule, recipe in compared().items()
     }
     looks_own = Renderer(own, training, MATCHED, rasterizer, scene.background)
     looks_finer = Renderer(full, finer, MATCHED, rasterizer, scene.background)
-    print(
-        f"\n{name}, {len(views)} views, PSNR in dB\n\n| camera | truth | "
-        + " | ".join(chosen)
-        + " |"
-    )
+    print(f"\n{name}, {len(views)} views, PSNR in dB\n\n| camera | truth | " + " | ".join(chosen) + " |")
     print("|---" * (len(chosen) + 2) + "|")
     for label, factor in {**DISTANCES, **FIELDS}.items():
         truths = {"own look": looks_own} if factor < 1 else {}
         truths |= {} if scene.finer is None else {"finer": looks_finer}
-        found: dict[str, dict[str, list[float]]] = {
-            t: {rule: [] for rule in chosen} for t in truths
-        }
+        found: dict[str, dict[str, list[float]]] = {t: {rule: [] for rule in chosen} for t in truths}
         for view in views:
-            camera = (
-                zoomed(view, factor)
-                if label in FIELDS
-                else moved(view, factor, median_depth(own.means, view))
-            )
+            camera = zoomed(view, factor) if label in FIELDS else moved(view, factor, median_depth(own.means, view))
             looks = {t: look_there(renderer, camera) for t, renderer in truths.items()}
             for rule, renderer in chosen.items():
                 image = renderer(camera).rgb

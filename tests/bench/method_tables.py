@@ -49,10 +49,7 @@ def table(measured: Mapping[str, Any]) -> list[str]:
 
 
 def _joined(
-    at: list[Mapping[str, Any]],
-    column: str,
-    middle: Callable[[list[float]], float],
-    written: Callable[[float], str],
+    at: list[Mapping[str, Any]], column: str, middle: Callable[[list[float]], float], written: Callable[[float], str]
 ) -> str:
     """The middle of the views at each scale; one dash where there is nothing at any."""
     cells = []

@@ -59,7 +59,7 @@ NOT_COMPARED = ("*.jsonl", "*.html", "plots/*")  # journals, pages and plots, wh
 
 # Places that may differ, as "CASE/FILE#PLACE", and why: what 0.2 mends.
 EXPECTED: Mapping[str, str] = {
-    "finetune-densify/*": "0.1 fails with an IndexError: it keeps the sampling bounds of the scene before it grew",
+    "finetune-densify/*": "0.1 fails with an IndexError: it keeps the sampling bounds of the scene before it grew"
 }
 
 RECIPES = (  # of 0db394d, but for multi-scale, which needs columns that no scene here has
@@ -351,9 +351,7 @@ def key(case: Case) -> list[str]:
     return [*case.words, *packages, platform.python_version(), platform.machine(), processor]
 
 
-def spoken_by(
-    driver: Driver, folder: Path, verbs: Iterable[str]
-) -> Callable[[Sequence[str]], list[str]]:
+def spoken_by(driver: Driver, folder: Path, verbs: Iterable[str]) -> Callable[[Sequence[str]], list[str]]:
     """A function that puts a command in the words that a checkout's --help has."""
     names: dict[str, Mapping[str, str]] = {}
     for verb in verbs:
@@ -387,12 +385,7 @@ def differences(case: Case, base: Side, new: Side) -> list[Difference]:
 def files_of(case: Case, *sides: Side) -> list[str]:
     """The files that any side made, by their place in its folder."""
     folders = [side.folder / case.slug for side in sides]
-    files = {
-        path.relative_to(folder).as_posix()
-        for folder in folders
-        for path in folder.rglob("*")
-        if path.is_file()
-    }
+    files = {path.relative_to(folder).as_posix() for folder in folders for path in folder.rglob("*") if path.is_file()}
     return sorted(f for f in files if not any(fnmatch(f, f"*{left}") for left in NOT_COMPARED))
 
 
@@ -444,9 +437,7 @@ def leaves(data: Any, place: str = "") -> Iterator[tuple[str, Any]]:
         yield place, Prose(data) if isinstance(data, str) and " " in data else data
 
 
-def apart(
-    place: str, before: Mapping[str, Any], after: Mapping[str, Any], name: str
-) -> Difference | None:
+def apart(place: str, before: Mapping[str, Any], after: Mapping[str, Any], name: str) -> Difference | None:
     """How two contents differ at a place; None if they are equal to the bit."""
     if name not in before or name not in after:
         value, where = (after[name], "new") if name in after else (before[name], "base")
@@ -480,9 +471,7 @@ def arrays_apart(place: str, a: np.ndarray, b: np.ndarray) -> Difference | None:
     if a.tobytes() == b.tobytes():
         return None
     apart = np.abs(a.astype(np.float64) - b.astype(np.float64))
-    return Difference(
-        place, f"{np.count_nonzero(apart)} of {a.size} values", float(np.nanmax(apart))
-    )
+    return Difference(place, f"{np.count_nonzero(apart)} of {a.size} values", float(np.nanmax(apart)))
 
 
 # Telling
@@ -647,9 +636,7 @@ def check_revision(checkout: Path, commit: str) -> None:
 
 def git(*words: str, folder: Path = REPOSITORY) -> bytes:
     """What git prints."""
-    return subprocess.run(
-        ["git", "-C", str(folder), *words], check=True, capture_output=True
-    ).stdout
+    return subprocess.run(["git", "-C", str(folder), *words], check=True, capture_output=True).stdout
 
 
 def timed(side: Side, outcomes: Mapping[str, Outcome], wall: float) -> str:

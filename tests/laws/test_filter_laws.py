@@ -121,9 +121,7 @@ def spheres(sigma: float, opacities: tuple[float, ...] = (0.0, 0.1, 0.5, 0.9, 1.
 # screen filters ---------------------------------------------------------------------------------
 
 
-def test_a_screen_filter_keeps_its_input_and_changes_only_covariances_and_opacities(
-    screen, situation
-):
+def test_a_screen_filter_keeps_its_input_and_changes_only_covariances_and_opacities(screen, situation):
     splats = shade(project(SCENE, situation.view), SCENE, situation.view)
     before = copies_of(splats)
     filtered = screen(splats, situation.view, situation.training)
@@ -164,12 +162,9 @@ def test_a_huge_splat_keeps_its_opacity_and_shape(screen, situation):
 
 
 @pytest.mark.parametrize(
-    ("name", "variance", "compensated"),
-    [("classic", 0.3, False), ("ewa", 0.3, True), ("mip", 0.1, True)],
+    ("name", "variance", "compensated"), [("classic", 0.3, False), ("ewa", 0.3, True), ("mip", 0.1, True)]
 )
-def test_a_dilation_has_its_published_constant_at_every_rate(
-    name, variance, compensated, situation
-):
+def test_a_dilation_has_its_published_constant_at_every_rate(name, variance, compensated, situation):
     splats = project(SCENE, situation.view)
     expected = splats.blurred(variance, compensated)
     filtered = SCREEN_FILTERS[name](splats, situation.view, situation.training)
@@ -235,19 +230,14 @@ def test_matching_the_sharpest_rate_is_thinner_where_another_view_sampled_more_f
         (16.0, 0.25, 0.5, 0.5 / MAX_RISE),
     ],
 )
-def test_rates_of_a_free_camera_are_compared_with_the_range_of_training(
-    depth, in_sharpest, in_interval, in_pose
-):
+def test_rates_of_a_free_camera_are_compared_with_the_range_of_training(depth, in_sharpest, in_interval, in_pose):
     # one Gaussian at the origin, trained from 4 and from 8 away
     scene = replace(make_scene(1, dtype=F64), means=torch.zeros(1, 3, dtype=F64))
-    training = TrainingViews.of(
-        scene, [make_camera((0.0, -4.0, 0.0)), make_camera((8.0, 0.0, 0.0))]
-    )
+    training = TrainingViews.of(scene, [make_camera((0.0, -4.0, 0.0)), make_camera((8.0, 0.0, 0.0))])
     free = replace(make_camera((0.0, -depth, 0.0)), trained_focal=None)
     splats = project(scene, free)
     rates = {
-        name: Matched(name).rates(splats, free, training).item()
-        for name in ("global", "sharpest", "interval", "pose")
+        name: Matched(name).rates(splats, free, training).item() for name in ("global", "sharpest", "interval", "pose")
     }
     assert rates["global"] == pytest.approx(1.0)
     assert rates["sharpest"] == pytest.approx(in_sharpest)
@@ -257,14 +247,10 @@ def test_rates_of_a_free_camera_are_compared_with_the_range_of_training(
 
 @pytest.mark.parametrize("scale", [4.0, 1.0, 0.95, 0.5, 0.1])
 @pytest.mark.parametrize(("pose", "highest"), [(4.0, 1.0), (4.3, 4.3 / 4), (8.0, 2.0)])
-def test_rates_at_a_pose_are_its_own_and_the_reference_rises_where_it_is_small(
-    scale, pose, highest
-):
+def test_rates_at_a_pose_are_its_own_and_the_reference_rises_where_it_is_small(scale, pose, highest):
     """One Gaussian trained from 4 and from 8 away, seen from a held-out pose of the data set."""
     scene = replace(make_scene(1, dtype=F64), means=torch.zeros(1, 3, dtype=F64))
-    training = TrainingViews.of(
-        scene, [make_camera((0.0, -4.0, 0.0)), make_camera((8.0, 0.0, 0.0))]
-    )
+    training = TrainingViews.of(scene, [make_camera((0.0, -4.0, 0.0)), make_camera((8.0, 0.0, 0.0))])
     view = make_camera((0.0, -pose, 0.0))
     view = replace(view, fx=view.fx * scale, fy=view.fy * scale)
     rate = Matched("pose").rates(project(scene, view), view, training).item()
@@ -404,9 +390,7 @@ def test_a_world_filter_records_its_variance(world):
     assert changed.fused[0].settings["variance"] == "0.125"
 
 
-@pytest.mark.parametrize(
-    "world", [Smoothing3D(), FlatSmoothing(), StoredSmoothing(), MatchedEnergy()]
-)
+@pytest.mark.parametrize("world", [Smoothing3D(), FlatSmoothing(), StoredSmoothing(), MatchedEnergy()])
 def test_isotropic_smoothing_keeps_the_order_of_the_axes(world):
     scene = world_scene()
     filtered = world(scene, TrainingViews.of(scene, CAMERAS))
@@ -537,9 +521,7 @@ def test_the_gradient_of_a_world_filter_is_that_of_its_formula(world):
     training = TrainingViews.of(scene, CAMERAS)
 
     def filtered(log_scales: Tensor, logit_opacities: Tensor, filter_3d: Tensor):
-        given = replace(
-            scene, log_scales=log_scales, logit_opacities=logit_opacities, filter_3d=filter_3d
-        )
+        given = replace(scene, log_scales=log_scales, logit_opacities=logit_opacities, filter_3d=filter_3d)
         out = world(given, training)
         return out.log_scales, out.logit_opacities
 

@@ -90,9 +90,7 @@ def away_from_cutoff(alpha: Tensor, rules: Rules, band: float = 1e-3) -> Tensor:
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
 @pytest.mark.parametrize("window", [0.0, 0.6, 1.0])
 @pytest.mark.parametrize("rules", [RULES_3DGS, COARSE], ids=["3dgs", "coarse"])
-def test_alpha_from_raster_rows_is_the_exact_one(
-    pixel, rules, window, dtype, compiling, monkeypatch
-):
+def test_alpha_from_raster_rows_is_the_exact_one(pixel, rules, window, dtype, compiling, monkeypatch):
     splats = some_splats(60, (4 * TILE, 5 * TILE), window=window)
     given = splats.to(dtype)
     corners = torch.cartesian_prod(torch.arange(5), torch.arange(4)).to(dtype) * TILE

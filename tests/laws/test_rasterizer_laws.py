@@ -165,9 +165,7 @@ def test_the_background_is_added_by_one_minus_alpha(rasterize, splats):
 def test_white_splats_over_black_give_alpha(rasterize, splats):
     white = replace(splats, rgb=torch.ones(len(splats), 3))
     image = rasterize(white, HW, (0.0, 0.0, 0.0))
-    torch.testing.assert_close(
-        image.rgb, image.alpha[..., None].expand(*HW, 3), rtol=0, atol=2 * SAME
-    )
+    torch.testing.assert_close(image.rgb, image.alpha[..., None].expand(*HW, 3), rtol=0, atol=2 * SAME)
 
 
 def test_moving_everything_by_a_pixel_moves_the_image(rasterize, splats):

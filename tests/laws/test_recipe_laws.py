@@ -95,11 +95,7 @@ def test_a_lone_splat_seen_from_very_near_has_its_opacity(recipe):
 def test_at_the_training_size_the_image_is_that_of_training(recipe):
     cameras = [make_camera(eye) for eye in ((0.0, -4.0, 0.0), (3.0, -4.0, 1.0), (-2.0, -6.0, 0.5))]
     scene = sized(make_scene(200))
-    ours, trained = (
-        Renderer.of(scene, cameras, r, rasterizer="eager") for r in (recipe, RECIPES["classic"])
-    )
-    difference = max(
-        (ours(camera).rgb - trained(camera).rgb).abs().max().item() for camera in cameras
-    )
+    ours, trained = (Renderer.of(scene, cameras, r, rasterizer="eager") for r in (recipe, RECIPES["classic"]))
+    difference = max((ours(camera).rgb - trained(camera).rgb).abs().max().item() for camera in cameras)
     assert (difference <= 1e-5) == recipe.promises.equals_training, difference
     assert math.isfinite(difference)

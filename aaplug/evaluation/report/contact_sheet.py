@@ -67,7 +67,5 @@ def _text_width(text: str) -> int:
     return cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.6, 1)[0][0]
 
 
-def _write(
-    sheet: np.ndarray, text: str, left: int, bottom: int, ink: tuple[int, int, int] = INK
-) -> None:
+def _write(sheet: np.ndarray, text: str, left: int, bottom: int, ink: tuple[int, int, int] = INK) -> None:
     cv2.putText(sheet, text, (left, bottom), cv2.FONT_HERSHEY_SIMPLEX, 0.6, ink, 1, cv2.LINE_AA)

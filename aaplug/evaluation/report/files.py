@@ -20,9 +20,7 @@ def as_json(data: Any) -> str:
     return json.dumps(data, indent=1, allow_nan=False) + "\n"
 
 
-def write_texts(
-    folder: str | PathLike[str], texts: Mapping[str, str], overwrite: bool
-) -> list[Path]:
+def write_texts(folder: str | PathLike[str], texts: Mapping[str, str], overwrite: bool) -> list[Path]:
     """Write texts, by file name, into a folder, which is made if needed; return the paths.
 
     Raises:
@@ -35,9 +33,7 @@ def write_texts(
     return paths
 
 
-def write_results(
-    report: Report, folder: str | PathLike[str], overwrite: bool, name: str = "scene"
-) -> list[Path]:
+def write_results(report: Report, folder: str | PathLike[str], overwrite: bool, name: str = "scene") -> list[Path]:
     """Write results.json, per_view.json and results.csv; return their paths.
 
     Raises:
@@ -48,12 +44,7 @@ def write_results(
 
 
 def write_page(
-    folder: str | PathLike[str],
-    name: str,
-    report: Report,
-    found: Coverage,
-    images: ImageStore,
-    overwrite: bool,
+    folder: str | PathLike[str], name: str, report: Report, found: Coverage, images: ImageStore, overwrite: bool
 ) -> list[Path]:
     """Write report.html, and its plots as PNG and SVG into plots/; return both paths.
 

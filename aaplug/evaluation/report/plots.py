@@ -18,14 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
 from aaplug.evaluation.metric import Metric
-from aaplug.evaluation.results import (
-    CEILING,
-    Report,
-    mean,
-    million_evaluations,
-    scale_name,
-    seconds,
-)
+from aaplug.evaluation.results import CEILING, Report, mean, million_evaluations, scale_name, seconds
 from aaplug.inspection.coverage import Coverage
 
 # Distinct on white and on near-black; the markers help readers who do not see all colours.

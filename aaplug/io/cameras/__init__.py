@@ -14,17 +14,7 @@ from typing import Protocol, runtime_checkable
 from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.errors import FormatError, UsageError, listing
 from aaplug.core.registry import Registry
-from aaplug.io.cameras import (
-    blender,
-    camera_path,
-    colmap,
-    inria,
-    inria_model,
-    llff,
-    multiscale,
-    pinhole,
-    transforms,
-)
+from aaplug.io.cameras import blender, camera_path, colmap, inria, inria_model, llff, multiscale, pinhole, transforms
 from aaplug.io.cameras.options import Options
 
 CLOSE_NAMES = 3  # names suggested for an unknown one
@@ -126,6 +116,4 @@ def select_views(cameras: CameraSet, spec: str) -> tuple[Camera, ...]:
 
 def _unknown(name: str, known: list[str]) -> Camera:
     close = difflib.get_close_matches(name, known, CLOSE_NAMES, cutoff=0) if name else known
-    raise UsageError(
-        "views", f"there is no view {name!r}; train, test, all or names such as {listing(close, 3)}"
-    )
+    raise UsageError("views", f"there is no view {name!r}; train, test, all or names such as {listing(close, 3)}")

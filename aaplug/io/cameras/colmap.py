@@ -61,9 +61,7 @@ def read(path: Path, options: Options) -> CameraSet:
     sizes, why = _training_sizes(source, options)
     lenses = [_distortion(intrinsics[image.camera_id]) for image in images]
     trained = undistorted_cameras(trained_at(source, sizes), lenses)
-    split = every_nth(
-        trained, options, LLFF_HOLD, "3DGS --eval's rule; `test_every` 0 for no split"
-    )
+    split = every_nth(trained, options, LLFF_HOLD, "3DGS --eval's rule; `test_every` 0 for no split")
     kind = f"COLMAP ({images_file.suffix[1:]})"
     return camera_set(kind, source, split, why, more=lens_notes(lenses, trained))
 
@@ -116,9 +114,7 @@ def _camera(image: Image, intrinsics: dict[int, Intrinsics]) -> Camera:
     width = pixels(lens.width, lens.place, "width")
     height = pixels(lens.height, lens.place, "height")
     translation = [number(value, image.place, "translation") for value in image.translation]
-    cam_from_world = pose(
-        _rotation(image), torch.tensor(translation, dtype=torch.float64), image.place, "quaternion"
-    )
+    cam_from_world = pose(_rotation(image), torch.tensor(translation, dtype=torch.float64), image.place, "quaternion")
     inverse(cam_from_world, image.place, "translation")  # refuses a centre that overflows
     return Camera(image.name, width, height, fx, fy, cx, cy, cam_from_world)
 

@@ -145,19 +145,14 @@ class _Reader:
         chunk = self.file.read(min(most + 1, self.left))
         name, end, _ = chunk.partition(b"\0")
         if not end:
-            raise FormatError(
-                self.path,
-                f"{what}: its name should end within {most} bytes, not after {len(chunk)}",
-            )
+            raise FormatError(self.path, f"{what}: its name should end within {most} bytes, not after {len(chunk)}")
         self.file.seek(start + len(name) + 1)
         self.left -= len(name) + 1
         return name
 
     def _need(self, size: int, what: str) -> None:
         if size > self.left:
-            raise FormatError(
-                self.path, f"{what}: {size} bytes expected, {self.left} left; the file is cut short"
-            )
+            raise FormatError(self.path, f"{what}: {size} bytes expected, {self.left} left; the file is cut short")
         self.left -= size
 
 
@@ -214,9 +209,7 @@ def _text_camera(fields: Sequence[str], place: Place) -> Intrinsics:
     key, width, height = (_integer(fields[i], place) for i in (0, 2, 3))
     parameters = tuple(_real(field, place) for field in fields[CAMERA_FIELDS:])
     if len(parameters) != model.parameters:
-        raise place.wrong(
-            "it", f"{model.name} with {model.parameters} parameters", f"{len(parameters)} of them"
-        )
+        raise place.wrong("it", f"{model.name} with {model.parameters} parameters", f"{len(parameters)} of them")
     return Intrinsics(place, key, model, width, height, parameters)
 
 

@@ -39,10 +39,7 @@ def read(path: Path, options: Options) -> CameraSet:
     found = entries(file, "camera", read_json(file))
     settings = _settings(file.parent)
     folder = photo_folder(
-        file.parent,
-        options,
-        (settings or CfgArgs()).images,
-        Place(file.parent / cfg_args.NAME, "images"),
+        file.parent, options, (settings or CfgArgs()).images, Place(file.parent / cfg_args.NAME, "images")
     )
     source = with_photos([_camera(e) for e in found], [e.place for e in found], folder)
     source = _without_copies(source)
@@ -93,9 +90,7 @@ def _without_copies(cameras: Sequence[Camera]) -> list[Camera]:
     return list(first.values())
 
 
-def _training_sizes(
-    cameras: Sequence[Camera], settings: CfgArgs | None, options: Options
-) -> tuple[list[Size], str]:
+def _training_sizes(cameras: Sequence[Camera], settings: CfgArgs | None, options: Options) -> tuple[list[Size], str]:
     if options.train_scale is not None:
         return file_sizes(cameras, options)
     run = settings or CfgArgs()

@@ -11,14 +11,7 @@ from pathlib import Path
 from aaplug.core.cameras import WHITE, Camera, CameraSet
 from aaplug.core.errors import FormatError, UsageError
 from aaplug.io.cameras.options import Options, explicit, undivided
-from aaplug.io.cameras.photos import (
-    PhotoFolder,
-    distinct,
-    last_part,
-    refuse_folder,
-    whole,
-    without_suffix,
-)
+from aaplug.io.cameras.photos import PhotoFolder, distinct, last_part, refuse_folder, whole, without_suffix
 from aaplug.io.cameras.poses import inverse, pose_of_opengl, rigid
 from aaplug.io.cameras.sizes import described_sizes, file_sizes, trained_at
 from aaplug.io.values import Entry, Place, mentions, read_json
@@ -44,9 +37,7 @@ def read(path: Path, options: Options) -> CameraSet:
     file = path / FILE if os.path.isdir(path) else path
     document = read_json(file)
     if not isinstance(document, dict) or not isinstance(document.get("train"), dict):
-        raise FormatError(
-            file, "should be an object with 'train', as multi-scale Blender datasets have"
-        )
+        raise FormatError(file, "should be an object with 'train', as multi-scale Blender datasets have")
     train = _cameras(file, "train", document["train"])
     test = _cameras(file, "test", document["test"]) if "test" in document else []
     trained, held = (trained_at(v, file_sizes(v, options)[0]) for v in (train, test))
@@ -69,10 +60,7 @@ def _cameras(file: Path, split: str, columns: object) -> list[Camera]:
     if any(not isinstance(values, list) for values in lists) or len(lengths) != 1 or 0 in lengths:
         raise place.error(f"{', '.join(COLUMNS)} should be lists of one length")
     rows = zip(*(values for values in lists if isinstance(values, list)), strict=True)
-    found = [
-        Entry(Place(file, f"{split} {i}"), dict(zip(COLUMNS, row, strict=True)))
-        for i, row in enumerate(rows)
-    ]
+    found = [Entry(Place(file, f"{split} {i}"), dict(zip(COLUMNS, row, strict=True))) for i, row in enumerate(rows)]
     paths = [entry.text("file_path") for entry in found]
     names = distinct(file, paths, (last_part, without_suffix, whole))
     folder = PhotoFolder(file.parent, file.parent)

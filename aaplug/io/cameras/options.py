@@ -42,17 +42,13 @@ class Split:
 
 def explicit(train: Sequence[Camera], test: Sequence[Camera], source: str) -> Split:
     """A split that the files give."""
-    return Split(
-        tuple(train), tuple(test), f"split: {len(train)} train, {len(test)} test ({source})"
-    )
+    return Split(tuple(train), tuple(test), f"split: {len(train)} train, {len(test)} test ({source})")
 
 
 def undivided(cameras: Sequence[Camera], source: str) -> Split:
     """No split: every camera is both a training and a test view."""
     views = tuple(cameras)
-    return Split(
-        views, views, f"split: none, all {len(views)} cameras are train and test ({source})"
-    )
+    return Split(views, views, f"split: none, all {len(views)} cameras are train and test ({source})")
 
 
 def every_nth(cameras: Sequence[Camera], options: Options, custom: int, source: str) -> Split:

@@ -38,9 +38,7 @@ class PhotoFolder:
         tries = (name, *(bare + suffix for suffix in COMMON))
         found = next((p for p in (self.folder / t for t in tries) if os.path.isfile(p)), None)
         if found is not None and not _within(found, self.home):
-            raise place.error(
-                f"photo {name!r} lies outside {self.home}; pass `images` to allow another folder"
-            )
+            raise place.error(f"photo {name!r} lies outside {self.home}; pass `images` to allow another folder")
         return found
 
 
@@ -70,9 +68,7 @@ def refuse_folder(options: Options) -> None:
         raise UsageError("images", "this format gives each photo's path itself; leave it out")
 
 
-def with_photos(
-    cameras: Sequence[Camera], places: Sequence[Place], folder: PhotoFolder
-) -> list[Camera]:
+def with_photos(cameras: Sequence[Camera], places: Sequence[Place], folder: PhotoFolder) -> list[Camera]:
     """The cameras with their photos, found by the cameras' names.
 
     Raises:
@@ -80,8 +76,7 @@ def with_photos(
         FormatError: a name leads out of the dataset.
     """
     found = [
-        replace(camera, photo=folder.find(camera.name, place))
-        for camera, place in zip(cameras, places, strict=True)
+        replace(camera, photo=folder.find(camera.name, place)) for camera, place in zip(cameras, places, strict=True)
     ]
     if folder.chosen and not any(camera.photo for camera in found):
         names = listing([camera.name for camera in cameras], most=3)

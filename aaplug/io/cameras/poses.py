@@ -25,8 +25,7 @@ def pose(
     error = (rotation @ rotation.T - torch.eye(3, dtype=torch.float64)).abs().max().item()
     if not error <= ORTHONORMAL:
         raise place.error(
-            f"{field} should be a rotation: R·Rᵀ is {error:.2g} off the identity, "
-            f"{ORTHONORMAL:g} allowed"
+            f"{field} should be a rotation: R·Rᵀ is {error:.2g} off the identity, {ORTHONORMAL:g} allowed"
         )
     if torch.linalg.det(rotation) <= 0:
         raise place.error(f"{field} should be a rotation, but it mirrors (its determinant is -1)")

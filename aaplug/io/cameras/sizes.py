@@ -11,9 +11,7 @@ from aaplug.io.cameras.options import Options, Split
 from aaplug.io.images import image_size
 from aaplug.io.limits import whole_limit
 
-SAME_SHAPE = (
-    0.01  # relative difference between a photo's aspect and its camera's that rounding explains
-)
+SAME_SHAPE = 0.01  # relative difference between a photo's aspect and its camera's that rounding explains
 
 Size = tuple[int, int]
 

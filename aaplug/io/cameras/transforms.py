@@ -19,14 +19,7 @@ from aaplug.core.cameras import WHITE, Camera, CameraSet
 from aaplug.core.errors import FormatError, reason
 from aaplug.io.cameras.dataparser import DATAPARSER, Dataparser, read_dataparser
 from aaplug.io.cameras.options import Options, Split, every_nth, explicit
-from aaplug.io.cameras.photos import (
-    PhotoFolder,
-    distinct,
-    last_part,
-    refuse_folder,
-    whole,
-    without_suffix,
-)
+from aaplug.io.cameras.photos import PhotoFolder, distinct, last_part, refuse_folder, whole, without_suffix
 from aaplug.io.cameras.poses import inverse, pose_of_opengl, rigid
 from aaplug.io.cameras.sizes import Size, camera_set, file_sizes, trained_at
 from aaplug.io.images import image_size
@@ -34,13 +27,7 @@ from aaplug.io.lenses import Distortion, lens_notes, undistorted_cameras
 from aaplug.io.values import Entry, Place, entries, focal, mentions, number, read_json
 
 FILE = "transforms.json"
-AROUND = (
-    "EQUIRECTANGULAR",
-    "OMNIDIRECTIONALSTEREO_L",
-    "OMNIDIRECTIONALSTEREO_R",
-    "VR180_L",
-    "VR180_R",
-)
+AROUND = ("EQUIRECTANGULAR", "OMNIDIRECTIONALSTEREO_L", "OMNIDIRECTIONALSTEREO_R", "VR180_L", "VR180_R")
 PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV")  # OPENCV is one if its coefficients are 0
 EXPORTED = "transform"  # key of a frame's 3×4 pose in `ns-export cameras`
 LAST_ROW = [0.0, 0.0, 0.0, 1.0]
@@ -129,9 +116,7 @@ def read_source(file: Path, options: Options) -> Source:
     spare = _spare_size(frames)
     exported = any(EXPORTED in frame.entry for frame in frames)
     parser = None if exported else read_dataparser(file.parent / DATAPARSER)
-    cameras = [
-        _camera(frame, name, spare, parser) for frame, name in zip(frames, names, strict=True)
-    ]
+    cameras = [_camera(frame, name, spare, parser) for frame, name in zip(frames, names, strict=True)]
     lenses = [_distortion(frame.entry) for frame in frames]
     cameras = undistorted_cameras(cameras, lenses)
     notes = (*lens_notes(lenses, cameras), *_frame_notes(document, exported, parser))
@@ -144,15 +129,11 @@ def _frame_notes(document: dict[str, Any], exported: bool, parser: Dataparser | 
     if parser:
         return [f"frame: that of {DATAPARSER} (scale {parser.scale:g}), in which nerfstudio trains"]
     if "applied_transform" in document:
-        return [
-            f"frame: as in the file; a scene that nerfstudio trained needs its {DATAPARSER} beside it"
-        ]
+        return [f"frame: as in the file; a scene that nerfstudio trained needs its {DATAPARSER} beside it"]
     return []
 
 
-def _held_out(
-    file: Path, document: dict[str, Any], paths: Sequence[str]
-) -> tuple[bool, ...] | None:
+def _held_out(file: Path, document: dict[str, Any], paths: Sequence[str]) -> tuple[bool, ...] | None:
     """Whether nerfstudio's lists of file names keep each frame from training; None without lists."""
     place = Place(file, "lists of file names")
     lists = {key: document[key] for key in SPLITS if key in document}
@@ -170,9 +151,7 @@ def _document(file: Path) -> dict[str, Any]:
     if isinstance(document, list):
         return {"frames": [_exported(file, index, row) for index, row in enumerate(document)]}
     if not isinstance(document, dict) or "frames" not in document:
-        raise FormatError(
-            file, "should be an object with 'frames', as Blender and nerfstudio write"
-        )
+        raise FormatError(file, "should be an object with 'frames', as Blender and nerfstudio write")
     return document
 
 
@@ -197,9 +176,7 @@ def _frames(file: Path, document: dict[str, Any]) -> list[Frame]:
     folder = PhotoFolder(file.parent, file.parent)
     found = entries(file, "frame", document["frames"], shared)
     return [
-        Frame(
-            entry, None if EXPORTED in entry else folder.find(entry.text("file_path"), entry.place)
-        )
+        Frame(entry, None if EXPORTED in entry else folder.find(entry.text("file_path"), entry.place))
         for entry in found
     ]
 

@@ -52,9 +52,7 @@ class WritableFormat(SceneFormat, Protocol):
     @property
     def needs(self) -> str | None: ...  # noqa: D102
 
-    def write(
-        self, path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: Options
-    ) -> None:
+    def write(self, path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: Options) -> None:
         """Write a scene of at least one part and at most `count` Gaussians, whole or not at all.
 
         Raises:
@@ -121,20 +119,12 @@ def read_scene(
         FormatError: the file is missing, of no known format, breaks its format, or is too large for this machine.
     """
     return open_scene(
-        path,
-        iteration=iteration,
-        convention=convention,
-        allow_checkpoint=allow_checkpoint,
-        spz_axes=spz_axes,
+        path, iteration=iteration, convention=convention, allow_checkpoint=allow_checkpoint, spz_axes=spz_axes
     ).whole(drop_bad)
 
 
 def write_scene(
-    path: str | PathLike[str],
-    scene: Gaussians,
-    *,
-    overwrite: bool = False,
-    spz_axes: SpzAxes = "opengl",
+    path: str | PathLike[str], scene: Gaussians, *, overwrite: bool = False, spz_axes: SpzAxes = "opengl"
 ) -> None:
     """Write a scene in the format of the path's suffix, with everything else that its source file held.
 
@@ -187,9 +177,7 @@ def check_scene_output(
     writer = suffixes[found] if found else None
     if not isinstance(writer, WritableFormat):
         known = [s for s, format in suffixes.items() if isinstance(format, WritableFormat)]
-        raise OutputError(
-            path, f"has no suffix of a format that can be written: {', '.join(known)}"
-        )
+        raise OutputError(path, f"has no suffix of a format that can be written: {', '.join(known)}")
     if writer.needs is not None and importlib.util.find_spec(writer.needs) is None:
         extra = f"pip install 'aaplug[{writer.name}]'"
         raise UsageError(str(path), f"writing .{writer.name} needs {writer.needs}: {extra}")
@@ -212,9 +200,7 @@ def find_scene(path: str | PathLike[str], iteration: int | None = None) -> Path:
     if not scenes and (path / SOG_FOLDER).is_file():
         return path / SOG_FOLDER
     if not scenes:
-        raise FormatError(
-            path, "holds no point_cloud/iteration_<N>/point_cloud.ply; name the scene's file"
-        )
+        raise FormatError(path, "holds no point_cloud/iteration_<N>/point_cloud.ply; name the scene's file")
     chosen = max(scenes) if iteration is None else iteration
     if chosen not in scenes:
         available = ", ".join(map(str, sorted(scenes)))

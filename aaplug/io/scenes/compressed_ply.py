@@ -20,13 +20,7 @@ from aaplug.io.scenes.packed import byte_opacities, floats, largest_last
 from aaplug.io.scenes.ply_document import Table, stamp_of
 from aaplug.io.scenes.ply_header import LITTLE, Element, Header, check_size, is_packed, read_header
 from aaplug.io.scenes.ply_tags import meaning
-from aaplug.io.scenes.scene_file import (
-    DEGREES,
-    SceneFile,
-    check_count,
-    library_errors,
-    sh_of_colour,
-)
+from aaplug.io.scenes.scene_file import DEGREES, SceneFile, check_count, library_errors, sh_of_colour
 
 WORDS = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 BOUNDS = [f"{end}_{axis}" for end in ("min", "max") for axis in ("x", "y", "z")]
@@ -91,24 +85,18 @@ def _check(header: Header, tables: dict[str, Table]) -> None:
     if sh := elements.get("sh"):
         rest = len(sh.properties)
         if sh.count != count or rest not in DEGREES:
-            raise FormatError(
-                header.path, f"has {sh.count:,} rows of {rest} harmonics for {count:,} Gaussians"
-            )
+            raise FormatError(header.path, f"has {sh.count:,} rows of {rest} harmonics for {count:,} Gaussians")
         _need(header, sh, [f"f_rest_{i}" for i in range(rest)], "u1")
 
 
-def _need(
-    header: Header, element: Element, columns: list[str] | tuple[str, ...], code: str
-) -> None:
+def _need(header: Header, element: Element, columns: list[str] | tuple[str, ...], code: str) -> None:
     known = {p.name: p.code for p in element.properties}
     missing = [c for c in columns if known.get(c) != code]
     if missing:
         raise FormatError(header.path, f"element {element.name!r} needs {missing[0]} as {code}")
 
 
-def _rows(
-    tables: dict[str, Table], bounds: np.ndarray, degree: int, start: int, stop: int
-) -> Gaussians:
+def _rows(tables: dict[str, Table], bounds: np.ndarray, degree: int, start: int, stop: int) -> Gaussians:
     words = tables["vertex"].read(start, stop)
     rest = tables["sh"].read(start, stop) if degree else None
     of_row = np.arange(start, stop) // PER_CHUNK
@@ -135,16 +123,13 @@ def _between(
     bounds: np.ndarray, names: list[str], of_row: np.ndarray, share: Float[Tensor, "n 3"]
 ) -> Float[Tensor, "n 3"]:
     low, high = (
-        torch.from_numpy(np.stack([bounds[c][of_row] for c in part], axis=1))
-        for part in (names[:3], names[3:])
+        torch.from_numpy(np.stack([bounds[c][of_row] for c in part], axis=1)) for part in (names[:3], names[3:])
     )
     return torch.lerp(low, high, share)
 
 
 def _eleven_ten_eleven(words: np.ndarray) -> Float[Tensor, "n 3"]:
-    fields = [
-        (words >> shift & (1 << bits) - 1, bits) for shift, bits in ((21, 11), (11, 10), (0, 11))
-    ]
+    fields = [(words >> shift & (1 << bits) - 1, bits) for shift, bits in ((21, 11), (11, 10), (0, 11))]
     return torch.stack([floats(field) / ((1 << bits) - 1) for field, bits in fields], dim=1)
 
 

@@ -92,9 +92,7 @@ def _sections(path: Path, data: bytes) -> tuple[int, tuple[float, float], list[R
         raise FormatError(path, f"is cut short: a header has {MAIN_SIZE:,} bytes, the file {len(data):,}")  # fmt: skip
     major, minor, number, count, level, least, most = MAIN.unpack_from(data)
     if (major, level) not in ((0, 0), (0, 1), (0, 2)) or minor < 1:
-        raise FormatError(
-            path, f"has version {major}.{minor}, level {level}; known are 0.1 and levels 0 to 2"
-        )
+        raise FormatError(path, f"has version {major}.{minor}, level {level}; known are 0.1 and levels 0 to 2")
     check_count(path, count)
     at = MAIN_SIZE + number * SECTION_SIZE
     if at > len(data):
@@ -106,9 +104,7 @@ def _sections(path: Path, data: bytes) -> tuple[int, tuple[float, float], list[R
         if section.count:
             found.append(records)
     if sum(len(s.rows) for s in found) != count:
-        raise FormatError(
-            path, f"promises {count:,} Gaussians, and its sections hold another number"
-        )
+        raise FormatError(path, f"promises {count:,} Gaussians, and its sections hold another number")
     return level, (least or SH_RANGE[0], most or SH_RANGE[1]), found
 
 
@@ -165,11 +161,7 @@ def _decoded(records: Records, level: int, sh_range: tuple[float, float], degree
         band = rest[:, 3 * (d * d - 1) : 3 * ((d + 1) ** 2 - 1)]
         sh[:, d * d : (d + 1) ** 2] = band.reshape(len(rows), 3, 2 * d + 1).transpose(1, 2)
     return Gaussians(
-        floats(means),
-        floats(rows["quats"]),
-        floats(rows["scales"]).log(),
-        byte_opacities(rows["rgba"][:, 3]),
-        sh,
+        floats(means), floats(rows["quats"]), floats(rows["scales"]).log(), byte_opacities(rows["rgba"][:, 3]), sh
     )
 
 

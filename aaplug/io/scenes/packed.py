@@ -47,9 +47,7 @@ def gunzip(data: bytes, size: int, path: Path) -> bytes:
     inflated = zlib.decompressobj(GZIP_WINDOW).decompress(data, most + 1)
     if not size <= len(inflated) <= most:
         many = "more than " * (len(inflated) > most)
-        raise FormatError(
-            path, f"inflates to {many}{len(inflated):,} bytes where its header promises {size:,}"
-        )
+        raise FormatError(path, f"inflates to {many}{len(inflated):,} bytes where its header promises {size:,}")
     return inflated
 
 
@@ -59,9 +57,7 @@ def unzstd(data: bytes, size: int, path: Path) -> bytes:
     with inflater.stream_reader(io.BytesIO(data)) as stream:
         inflated = stream.read(size + 1)
     if len(inflated) != size:
-        raise FormatError(
-            path, f"a stream inflates to {len(inflated):,} bytes where {size:,} are promised"
-        )
+        raise FormatError(path, f"a stream inflates to {len(inflated):,} bytes where {size:,} are promised")
     return inflated
 
 

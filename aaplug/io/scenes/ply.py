@@ -23,15 +23,7 @@ from aaplug.core.gaussians import Gaussians, PixelSizes
 from aaplug.io.atomic import replacing
 from aaplug.io.scenes.options import Options
 from aaplug.io.scenes.ply_document import Document, document_of, stamp_of
-from aaplug.io.scenes.ply_header import (
-    LITTLE,
-    Header,
-    Property,
-    check_size,
-    is_packed,
-    parse,
-    read_header,
-)
+from aaplug.io.scenes.ply_header import LITTLE, Header, Property, check_size, is_packed, parse, read_header
 from aaplug.io.scenes.ply_tags import meaning, stating
 from aaplug.io.scenes.scene_file import (
     DEGREES,
@@ -92,9 +84,7 @@ def open_scene(path: Path, options: Options) -> SceneFile:
     )
 
 
-def write(
-    path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: Options
-) -> None:
+def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: Options) -> None:
     """Write a scene part by part, with the columns, tables and comments of its source file."""
     parts = iter(parts)
     first = next(parts)
@@ -126,10 +116,7 @@ def _check_columns(header: Header) -> list[str]:
     vertex = header.vertex
     known = {p.name: p for p in vertex.properties}
     if vertex.lists:
-        raise FormatError(
-            header.path,
-            f"vertex property {listing(vertex.lists)} is a list; a scene has numbers only",
-        )
+        raise FormatError(header.path, f"vertex property {listing(vertex.lists)} is a list; a scene has numbers only")
     coloured = _has_byte_colours(known)
     optional = {*(COLOURS if coloured else ()), SCALES[2]}
     missing = [c for c in REQUIRED if c not in known and c not in optional]
@@ -139,17 +126,13 @@ def _check_columns(header: Header) -> list[str]:
     used = [p for p in known.values() if _is_parameter(p.name)]
     wrong = [p.name for p in used if p.code not in FLOATS]
     if wrong:
-        raise FormatError(
-            header.path, f"{listing(wrong)} must be float; convert the file to float32"
-        )
+        raise FormatError(header.path, f"{listing(wrong)} must be float; convert the file to float32")
     _check_rest(header.path, _rest(header))
     double = [p.name for p in used if p.code == "f8"]
     notes = {
         f"coding: {header.coding}": header.coding != LITTLE,
         f"{len(double)} columns of float64, used as float32": double,
-        "pixel sizes of Multi-Scale 3DGS, for the recipe multi-scale": all(
-            c in known for c in SIZES
-        ),
+        "pixel sizes of Multi-Scale 3DGS, for the recipe multi-scale": all(c in known for c in SIZES),
         "colours from the columns red, green, blue; no harmonics": coloured,
     }
     return [note for note, applies in notes.items() if applies]
@@ -162,9 +145,7 @@ def _has_byte_colours(known: dict[str, Property]) -> bool:
 
 def _check_rest(path: str, rest: list[str]) -> None:
     if len(rest) not in DEGREES:
-        raise FormatError(
-            path, f"has {len(rest)} f_rest columns; degrees 0 to 4 have 0, 9, 24, 45 or 72"
-        )
+        raise FormatError(path, f"has {len(rest)} f_rest columns; degrees 0 to 4 have 0, 9, 24, 45 or 72")
     gaps = [f"f_rest_{i}" for i in range(len(rest)) if f"f_rest_{i}" not in rest]
     if gaps:
         raise FormatError(path, f"has {len(rest)} f_rest columns, but not {listing(gaps)}")

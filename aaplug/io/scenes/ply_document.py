@@ -108,9 +108,7 @@ def document_of(path: Path, header: Header, stamp: tuple[int, int]) -> Document:
     if header.coding == BIG and len(header.elements) == 1:
         return Document(header, table)
     if not header.plain:
-        raise FormatError(
-            path, "its header has empty lines or is not all ASCII; take them out to read it"
-        )
+        raise FormatError(path, "its header has empty lines or is not all ASCII; take them out to read it")
     elements = _parsed(path, stamp[0], header.coding)
     data = elements[at].data
     if header.coding == LITTLE:

@@ -129,9 +129,7 @@ class Header:
 
     def with_comments(self, comments: Iterable[str]) -> "Header":
         """The header with comments added before the first element."""
-        first = next(
-            i for i, x in enumerate(self.lines) if _keyword(x) in ("element", "end_header")
-        )
+        first = next(i for i, x in enumerate(self.lines) if _keyword(x) in ("element", "end_header"))
         added = [f"comment {comment}" for comment in comments]
         return parse(self.path, [*self.lines[:first], *added, *self.lines[first:]], self.newline)
 
@@ -144,10 +142,7 @@ class Header:
     def with_padded_count(self, count: int) -> "Header":
         """The header with fewer vertices and the same size: spaces replace lost digits."""
         old = str(self.vertex.count)
-        lines = (
-            re.sub(rf"^(\s*element\s+vertex\s+){old}", rf"\g<1>{count:>{len(old)}}", x)
-            for x in self.lines
-        )
+        lines = (re.sub(rf"^(\s*element\s+vertex\s+){old}", rf"\g<1>{count:>{len(old)}}", x) for x in self.lines)
         return parse(self.path, lines, self.newline)
 
     def with_vertex(self, count: int, dropped: Collection[str], added: Iterable[str]) -> "Header":
@@ -180,9 +175,7 @@ def read_header(path: Path) -> Header:
         raise FormatError(path, f"no line 'end_header' {where}; it is cut short or not a .ply")
     lines = (head[:end] + newline + b"end_header").split(newline)
     if len(lines) > most_lines:
-        raise FormatError(
-            path, f"the header has {len(lines)} lines, more than the {most_lines} allowed"
-        )
+        raise FormatError(path, f"the header has {len(lines)} lines, more than the {most_lines} allowed")
     size = end + len(newline + b"end_header" + newline)
     return parse(str(path), [line.decode(BYTES) for line in lines if line], newline.decode(), size)
 
@@ -207,9 +200,7 @@ def parse(path: str, lines: Iterable[str], newline: str, size: int | None = None
             case ["comment" | "obj_info", *_] | []:
                 pass
             case _ if not line.isascii():
-                raise FormatError(
-                    path, f"line {number} of the header is not ASCII: {line[:MAX_SHOWN]!r}"
-                )
+                raise FormatError(path, f"line {number} of the header is not ASCII: {line[:MAX_SHOWN]!r}")
             case ["format", *words]:
                 formats.append(words)
             case ["element", name, count]:
@@ -218,9 +209,7 @@ def parse(path: str, lines: Iterable[str], newline: str, size: int | None = None
                 grown = (*elements[-1].properties, column)
                 elements[-1] = Element(elements[-1].name, elements[-1].count, grown)
             case _:
-                raise FormatError(
-                    path, f"line {number} of the header is not PLY: {line[:MAX_SHOWN]!r}"
-                )
+                raise FormatError(path, f"line {number} of the header is not PLY: {line[:MAX_SHOWN]!r}")
     coding = _coding(path, formats)
     _check_unique(path, elements)
     size = len(_text(lines, newline)) if size is None else size
@@ -291,9 +280,7 @@ def _coding(path: str, formats: list[list[str]]) -> str:
         case [[("binary_little_endian" | "binary_big_endian" | "ascii") as coding, "1.0"]]:
             return coding
     found = " and ".join(" ".join(words)[:MAX_SHOWN] for words in formats) or "none"
-    raise FormatError(
-        path, f"its format is {found}; known are {LITTLE}, {BIG} and {TEXT}, each 1.0"
-    )
+    raise FormatError(path, f"its format is {found}; known are {LITTLE}, {BIG} and {TEXT}, each 1.0")
 
 
 def _check_unique(path: str, elements: list[Element]) -> None:

@@ -46,9 +46,7 @@ def meaning(header: Header, compressed: bool = False) -> Meaning:
     """Read the header's tags; `compressed`: the columns are packed and say nothing about scales."""
     records = [_record(header.path, m[1]) for m in _matches(header, RECORD)]
     fused = tuple(
-        Fusion(
-            record["fused"], {k: v for k, v in record.items() if k not in ("fused", "convention")}
-        )
+        Fusion(record["fused"], {k: v for k, v in record.items() if k not in ("fused", "convention")})
         for record in records
         if "fused" in record
     )
@@ -62,9 +60,7 @@ def meaning(header: Header, compressed: bool = False) -> Meaning:
     return Meaning(*_from_others(header, mode, two), fused, flat)
 
 
-def stating(
-    header: Header, read: Header | None, convention: Convention, fused: tuple[Fusion, ...]
-) -> Header:
+def stating(header: Header, read: Header | None, convention: Convention, fused: tuple[Fusion, ...]) -> Header:
     """The header with tags for this convention and these fusions; unchanged if both it and `read` already say so."""
     assert convention in CONVENTIONS.values(), convention
     if read and _said(read) == _said(header) == (convention, fused):
@@ -90,10 +86,7 @@ def _from_others(header: Header, mode: str | None, two: bool) -> tuple[Conventio
     if FILTER_COLUMN in header.vertex.names:
         return MIP, f"column {FILTER_COLUMN} in the file: Mip-Splatting, not yet fused"
     if mode is not None and mode.lower() == FLAT:
-        return (
-            CLASSIC,
-            f"tag in the file, SplatRenderMode: {mode}: 2D Gaussians, treated as classic",
-        )
+        return (CLASSIC, f"tag in the file, SplatRenderMode: {mode}: 2D Gaussians, treated as classic")
     if mode is None and two:
         return CLASSIC, "two scales in the file: 2D Gaussians (2DGS), treated as classic"
     if mode is not None and mode.lower() in MODES:
@@ -101,9 +94,7 @@ def _from_others(header: Header, mode: str | None, two: bool) -> tuple[Conventio
     if mode is not None:
         return CLASSIC, f"tag in the file, SplatRenderMode: {mode}, is unknown: assumed classic"
     if postshot is not None:
-        return (
-            ANTIALIASED if postshot == "1" else CLASSIC
-        ), f"tag in the file: antialiased {postshot}"
+        return (ANTIALIASED if postshot == "1" else CLASSIC), f"tag in the file: antialiased {postshot}"
     return CLASSIC, "no tag in the file: assumed classic (3DGS default)"
 
 
@@ -132,9 +123,7 @@ def _record(path: str, words: str) -> dict[str, str]:
     pairs = [word.partition("=") for word in words.split()]
     for key, equals, value in pairs:
         if not (key and equals and value):
-            raise FormatError(
-                path, f"comment 'aaplug {words}' is damaged: expected key=value pairs"
-            )
+            raise FormatError(path, f"comment 'aaplug {words}' is damaged: expected key=value pairs")
     return {key: value for key, _, value in pairs}
 
 

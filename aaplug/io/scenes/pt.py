@@ -39,14 +39,11 @@ def open_scene(path: Path, options: Options) -> SceneFile:
     """See `SceneFormat`."""
     if not options.allow_checkpoint:
         raise FormatError(
-            path,
-            "is a training checkpoint (a pickle); pass `allow_checkpoint` to read it, or export it as .ply",
+            path, "is a training checkpoint (a pickle); pass `allow_checkpoint` to read it, or export it as .ply"
         )
     found = re.match(r"(\d+)\.(\d+)", torch.__version__)
     if found is None or (int(found[1]), int(found[2])) < SAFE_TORCH:
-        raise FormatError(
-            path, f"needs torch 2.10 or newer to be read safely; this is {torch.__version__}"
-        )
+        raise FormatError(path, f"needs torch 2.10 or newer to be read safely; this is {torch.__version__}")
     with library_errors(path):
         size = path.stat().st_size
         _check_archive(path, size)
@@ -55,9 +52,7 @@ def open_scene(path: Path, options: Options) -> SceneFile:
     check_count(path, count)
     tensors = {key: _checked(path, splats, key, count, size) for key in splats}
     degree = DEGREES[3 * tensors["shN"].shape[1]]
-    return SceneFile(
-        path, name, count, degree, lambda start, stop: _rows(tensors, start, stop), EVIDENCE
-    )
+    return SceneFile(path, name, count, degree, lambda start, stop: _rows(tensors, start, stop), EVIDENCE)
 
 
 def _check_archive(path: Path, size: int) -> None:
@@ -77,9 +72,7 @@ def _load(path: Path) -> Any:
             warnings.simplefilter("ignore")  # torch's, about a damaged pickle
             return torch.load(path, "cpu", weights_only=True, mmap=True)
     except pickle.UnpicklingError as error:
-        raise FormatError(
-            path, "is damaged, or holds more than tensors; nothing of it was run"
-        ) from error
+        raise FormatError(path, "is damaged, or holds more than tensors; nothing of it was run") from error
 
 
 def _splats(path: Path, document: Any) -> dict[str, Tensor]:

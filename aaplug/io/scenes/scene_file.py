@@ -17,15 +17,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from aaplug.core.errors import AaplugError, FormatError, listing, reason
-from aaplug.core.gaussians import (
-    CLASSIC,
-    MAX_LOG_SCALE,
-    MIN_OPACITY,
-    Convention,
-    Fusion,
-    Gaussians,
-    Origin,
-)
+from aaplug.core.gaussians import CLASSIC, MAX_LOG_SCALE, MIN_OPACITY, Convention, Fusion, Gaussians, Origin
 from aaplug.core.spherical_harmonics import COLOUR_OFFSET, SH_C0
 from aaplug.io.limits import limit, memory_of_machine, whole_limit
 
@@ -78,9 +70,7 @@ class SceneFile:
 
     def raw(self, start: int, stop: int) -> Gaussians:
         """The rows from start up to stop, with convention and origin; their values are not checked."""
-        origin = Origin(
-            str(self.path), self.format, self.evidence, self.document, torch.arange(start, stop)
-        )
+        origin = Origin(str(self.path), self.format, self.evidence, self.document, torch.arange(start, stop))
         with library_errors(self.path):
             rows = self.load(start, stop)
         said = {"convention": self.convention, "fused": self.fused, "flat": self.flat}
@@ -167,9 +157,7 @@ def check_count(path: Path, count: int) -> None:
     """
     most = whole_limit("GAUSSIANS")
     if count > most:
-        raise FormatError(
-            path, f"holds {count:,} Gaussians and the limit is {most:,}; AAPLUG_GAUSSIANS raises it"
-        )
+        raise FormatError(path, f"holds {count:,} Gaussians and the limit is {most:,}; AAPLUG_GAUSSIANS raises it")
 
 
 def empty(n: int, degree: int, filtered: bool = False, flat: bool = False) -> Gaussians:
@@ -193,9 +181,7 @@ def columns(scene: Gaussians) -> dict[str, Float[Tensor, " n"]]:
     k = scene.sh.shape[1]
     named = {axis: scene.means[:, i] for i, axis in enumerate("xyz")}
     named |= {f"f_dc_{c}": scene.sh[:, 0, c] for c in range(3)}
-    named |= {
-        f"f_rest_{c * (k - 1) + j}": scene.sh[:, 1 + j, c] for c in range(3) for j in range(k - 1)
-    }
+    named |= {f"f_rest_{c * (k - 1) + j}": scene.sh[:, 1 + j, c] for c in range(3) for j in range(k - 1)}
     named |= {"opacity": scene.logit_opacities}
     named |= {f"scale_{i}": scene.log_scales[:, i] for i in range(2 if scene.flat else 3)}
     named |= {f"rot_{i}": scene.quats[:, i] for i in range(4)}
@@ -212,9 +198,7 @@ def matrix_of(scene: Gaussians) -> tuple[list[str], Float[Tensor, "n p"]]:
     return list(columns(scene[:0])), torch.cat(parts, dim=1)
 
 
-def scene_of(
-    names: Sequence[str], values: Float[Tensor, "n c"], degree: int, flat: bool
-) -> Gaussians:
+def scene_of(names: Sequence[str], values: Float[Tensor, "n c"], degree: int, flat: bool) -> Gaussians:
     """The scene in a matrix of named columns, in any order and among others: the inverse of `matrix_of`."""
     at = {name: i for i, name in enumerate(names)}
     k = (degree + 1) ** 2
@@ -277,9 +261,7 @@ def _finite(scene: Gaussians) -> bool:
     return all(bool(v.sum().isfinite()) or bool(v.isfinite().all()) for v in values)
 
 
-def _check(
-    part: Gaussians, path: Path, drop_bad: bool, dropped: dict[str, int]
-) -> Bool[Tensor, " n"] | None:
+def _check(part: Gaussians, path: Path, drop_bad: bool, dropped: dict[str, int]) -> Bool[Tensor, " n"] | None:
     """A mask of unusable rows, None if there are none; counts them by fault in `dropped`."""
     faults = faults_of(part)
     if not faults:

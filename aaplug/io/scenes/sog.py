@@ -133,9 +133,7 @@ def _scene(path: Path, meta: Any, fetch: Fetch) -> SceneFile:
 
 
 def _count(root: Entry, version: int) -> int:
-    value = (
-        root.number("count") if version > 1 else _section(root, "means").fields.get("shape", [0])
-    )
+    value = root.number("count") if version > 1 else _section(root, "means").fields.get("shape", [0])
     number = value[0] if isinstance(value, list) and value else value
     if not isinstance(number, int | float) or number < 0 or number != int(number):
         raise root.place.wrong("count", "a whole number", number)
@@ -167,9 +165,7 @@ def _part(path: Path, root: Entry, key: str, count: int, fetch: Fetch) -> Part:
     return Part(entry, pixels, widths)
 
 
-def _image(
-    path: Path, file: str, fetch: Fetch, count: int | None, noisy: bool
-) -> tuple[np.ndarray, int]:
+def _image(path: Path, file: str, fetch: Fetch, count: int | None, noisy: bool) -> tuple[np.ndarray, int]:
     """RGBA of a lossless WebP, a row per pixel, and its width; refuses more pixels than `count` Gaussians need."""
     most = 2 * count + SPARE_PIXELS if count is not None else PALETTE_ROW * 15 * (1 << 10)
     data = fetch(file, IMAGE_MEMORY * most + whole_limit("SLACK"))
@@ -180,9 +176,7 @@ def _image(
         with Image.open(io.BytesIO(data), formats=["WEBP"]) as image:
             width, height = image.size
             if width * height > most or width * height < (count or 1):
-                raise FormatError(
-                    path, f"{file} has {width}x{height} px, and {count or most:,} are wanted"
-                )
+                raise FormatError(path, f"{file} has {width}x{height} px, and {count or most:,} are wanted")
             return np.asarray(image.convert("RGBA")).reshape(-1, 4), width
 
 
@@ -203,9 +197,7 @@ def _palette(part: Part, version: int) -> Float[Tensor, "p c 3"]:
     width = part.widths[0]
     coefficients = {3: 3, 8: 8, 15: 15}.get(width // PALETTE_ROW)
     if coefficients is None or width % PALETTE_ROW:
-        raise part.entry.place.error(
-            f"the palette's image is {width} px wide; 192, 512 or 960 expected"
-        )
+        raise part.entry.place.error(f"the palette's image is {width} px wide; 192, 512 or 960 expected")
     pixels = part.pixels[0][:, :3].reshape(-1, coefficients, 3)
     if version > 1:
         return part.codebook[torch.from_numpy(pixels.astype(np.int64))]
@@ -213,9 +205,7 @@ def _palette(part: Part, version: int) -> Float[Tensor, "p c 3"]:
     return floats(pixels) / 255 * (high - low) + low
 
 
-def _rows(
-    parts: dict[str, Part], palette: Float[Tensor, "p c 3"], version: int, flat: bool, rows: slice
-) -> Gaussians:
+def _rows(parts: dict[str, Part], palette: Float[Tensor, "p c 3"], version: int, flat: bool, rows: slice) -> Gaussians:
     means, quats, scales, sh0 = (parts[key] for key in ("means", "quats", "scales", "sh0"))
     alpha = sh0.pixels[0][rows, 3]
     if version > 1:

@@ -16,17 +16,9 @@ from aaplug.core.spherical_harmonics import COLOUR_OFFSET, SH_C0
 from aaplug.io.atomic import replacing
 from aaplug.io.scenes.options import Options
 from aaplug.io.scenes.packed import byte_opacities, floats
-from aaplug.io.scenes.scene_file import (
-    SceneFile,
-    check_count,
-    library_errors,
-    read_rows,
-    sh_of_colour,
-)
+from aaplug.io.scenes.scene_file import SceneFile, check_count, library_errors, read_rows, sh_of_colour
 
-RECORD = np.dtype(
-    [("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)]
-)
+RECORD = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
 ZERO = 128  # the byte that stands for a quaternion component of 0
 EVIDENCE = "the format does not say: assumed classic (3DGS default)"
 
@@ -52,9 +44,7 @@ def open_scene(path: Path, options: Options) -> SceneFile:
     return SceneFile(path, name, count, 0, lambda a, b: _rows(path, a, b), EVIDENCE)
 
 
-def write(
-    path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: Options
-) -> None:
+def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: Options) -> None:
     """Write a scene part by part; harmonics above degree 0 and the convention are lost."""
     with replacing(path, overwrite) as stream:
         for part in parts:

@@ -20,15 +20,7 @@ from torch import Tensor
 from aaplug.core.errors import FormatError
 from aaplug.core.gaussians import ANTIALIASED, CLASSIC, Gaussians
 from aaplug.io.scenes.options import Options
-from aaplug.io.scenes.packed import (
-    byte_opacities,
-    check_growth,
-    floats,
-    gunzip,
-    gunzip_start,
-    largest_last,
-    unzstd,
-)
+from aaplug.io.scenes.packed import byte_opacities, check_growth, floats, gunzip, gunzip_start, largest_last, unzstd
 from aaplug.io.scenes.scene_file import SceneFile, check_count, library_errors
 from aaplug.io.scenes.spz_writer import ANTIALIASED_FLAG, TURNS
 from aaplug.io.scenes.spz_writer import write as write
@@ -36,9 +28,7 @@ from aaplug.io.scenes.spz_writer import write as write
 MAGIC = b"NGSP"
 GZIP = b"\x1f\x8b"
 HEADER = struct.Struct("<4sIIBBBB")  # magic, version, count, degree, fraction bits, flags, reserved
-HEADER_4 = struct.Struct(
-    "<4sIIBBBBI12x"
-)  # the reserved byte counts streams; then the table's place
+HEADER_4 = struct.Struct("<4sIIBBBBI12x")  # the reserved byte counts streams; then the table's place
 STREAM = struct.Struct("<QQ")  # compressed and decompressed size
 HALVES, FIXED, THREES, STREAMS = 1, 2, 3, 4  # versions, by what each introduced
 MAX_DEGREE = 4
@@ -124,9 +114,7 @@ def _header(path: Path, data: bytes) -> Header:
     if not HALVES <= version <= STREAMS:
         raise FormatError(path, f"is .spz of version {version}; known are 1 to {STREAMS}")
     if degree > MAX_DEGREE or fraction > MAX_FRACTION:
-        raise FormatError(
-            path, f"has the impossible SH degree {degree} or {fraction} bits of fraction"
-        )
+        raise FormatError(path, f"has the impossible SH degree {degree} or {fraction} bits of fraction")
     check_count(path, count)
     return Header(version, count, degree, fraction, flags)
 
@@ -157,8 +145,7 @@ def _streams(path: Path, data: bytes, sizes: list[int]) -> Iterable[bytes]:
     at = table + number * STREAM.size
     if number != wanted or table < HEADER_4.size or at > len(data):
         raise FormatError(
-            path,
-            f"has {number} streams listed at byte {table:,}; {wanted} and a place within the file expected",
+            path, f"has {number} streams listed at byte {table:,}; {wanted} and a place within the file expected"
         )
     check_growth(path, sum(sizes), len(data))
     listed = iter(STREAM.unpack_from(data, table + i * STREAM.size) for i in range(number))

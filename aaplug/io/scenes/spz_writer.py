@@ -30,15 +30,10 @@ FLAGS = 14  # byte of the header
 ANTIALIASED_FLAG = 1
 MAX_LOGIT = 30.0  # in float32 its opacity is 1
 # between the axes of the file and OpenCV's, in both directions
-TURNS: Mapping[str, Callable[[Gaussians], Gaussians]] = {
-    "opengl": half_turn_about_x,
-    "opencv": lambda scene: scene,
-}
+TURNS: Mapping[str, Callable[[Gaussians], Gaussians]] = {"opengl": half_turn_about_x, "opencv": lambda scene: scene}
 
 
-def write(
-    path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: Options
-) -> None:
+def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: Options) -> None:
     """Write a scene, with values rounded to the format's steps."""
     turn = TURNS[options.spz_axes]
     scenes = [turn(_checked(path, part)) for part in parts]
@@ -63,9 +58,7 @@ def _checked(path: Path, part: Gaussians) -> Gaussians:
 def _packed(path: Path, scenes: list[Gaussians]) -> bytes:
     count = sum(map(len, scenes))
     if count > MOST_GAUSSIANS:
-        raise OutputError(
-            path, f"readers take {MOST_GAUSSIANS:,} Gaussians, not {count:,}; write a .ply"
-        )
+        raise OutputError(path, f"readers take {MOST_GAUSSIANS:,} Gaussians, not {count:,}; write a .ply")
     from gsply.gsdata import GSData  # an optional package, and slow to import
     from gsply.spz import write_spz
 
@@ -95,7 +88,5 @@ def _fraction(path: Path, means: np.ndarray) -> int:
     farthest = float(np.abs(means).max(initial=0.0))
     room = POSITION_BITS - math.frexp(farthest)[1] if farthest else MOST_FRACTION
     if room < 1:
-        raise OutputError(
-            path, f"cannot hold positions as far as {farthest:g} from the origin; write a .ply"
-        )
+        raise OutputError(path, f"cannot hold positions as far as {farthest:g} from the origin; write a .ply")
     return min(room, MOST_FRACTION)

@@ -35,12 +35,7 @@ from aaplug.core.ellipses import principal_columns
 from aaplug.core.kernels import Kernel, Kernels
 from aaplug.core.rules import RULES_3DGS, Rules
 from aaplug.core.splats import Splats2D
-from aaplug.methods.compositors.window_blending_exact import (
-    FARTHEST,
-    FARTHEST_CENTRE,
-    LEAST_VARIANCE,
-    exact_strip,
-)
+from aaplug.methods.compositors.window_blending_exact import FARTHEST, FARTHEST_CENTRE, LEAST_VARIANCE, exact_strip
 from aaplug.methods.pixel_kernels.averages import SMALL
 
 THINNEST = 1e-6  # standard deviations: of half the first window, which is divided by
@@ -85,12 +80,7 @@ def axes_of(splats: Splats2D) -> Axes:
 
 
 def through(
-    window: Window,
-    axes: Axes,
-    opacity: Tensor,
-    offset: tuple[Tensor, Tensor],
-    side: float | Tensor,
-    rules: Rules,
+    window: Window, axes: Axes, opacity: Tensor, offset: tuple[Tensor, Tensor], side: float | Tensor, rules: Rules
 ) -> tuple[Tensor, Window]:
     """What a splat hides of the light that passes a pixel, and the window after it.
 
@@ -149,10 +139,7 @@ def _rest(
     square_u = along_u[2] / (2 * axes.half_u) ** 2
     square_v = along_v[2] / (2 * axes.half_v) ** 2
     sides = []
-    for i, j, centre, side in (
-        (cos, across, window.x, window.width),
-        (sin, up, window.y, window.height),
-    ):
+    for i, j, centre, side in ((cos, across, window.x, window.width), (sin, up, window.y, window.height)):
         hidden_mean = i * mean_u + j * mean_v
         hidden_square = i * i * square_u + j * j * square_v + hidden_mean * hidden_mean
         mean = -alpha * hidden_mean / (1 - alpha)

@@ -47,15 +47,9 @@ class MatchedEnergy:
         widened = _widened(scene, rates, self.variance)
         factor = _mean_log_factor(scene, widened, views, training, self.shown)
         logits = scale_opacities(scene.logit_opacities, factor, MAX_FUSED_OPACITY)
-        settings = {
-            "variance": f"{self.variance:g}",
-            "views": str(len(views)),
-            "from": training.convention.name,
-        }
+        settings = {"variance": f"{self.variance:g}", "views": str(len(views)), "from": training.convention.name}
         fusion = Fusion("matched-energy", settings)
-        return replace(
-            widened, logit_opacities=logits, convention=self.shown, fused=(*scene.fused, fusion)
-        )
+        return replace(widened, logit_opacities=logits, convention=self.shown, fused=(*scene.fused, fusion))
 
 
 def _widened(scene: Gaussians, rates: Float[Tensor, " n"], variance: float) -> Gaussians:
@@ -71,11 +65,7 @@ def _widened(scene: Gaussians, rates: Float[Tensor, " n"], variance: float) -> G
 
 
 def _mean_log_factor(
-    scene: Gaussians,
-    widened: Gaussians,
-    views: Sequence[Camera],
-    training: TrainingViews,
-    shown: Convention,
+    scene: Gaussians, widened: Gaussians, views: Sequence[Camera], training: TrainingViews, shown: Convention
 ) -> Float[Tensor, " n"]:
     """ln √(det trained / det shown), averaged over the views that see a Gaussian."""
     blur = 0.0 if shown.compensated else shown.kernel

@@ -29,9 +29,7 @@ from aaplug.core.training import TrainingViews
 PIXEL_VARIANCE = 0.07
 
 MAX_RISE = 1.2  # how far the reference of a receding view rises over its starting rate (examples/guides/methods.md)
-FULL_RISE_AT = (
-    1 / 4
-)  # share of the training rate at which a pose of the data set has risen by all of it
+FULL_RISE_AT = 1 / 4  # share of the training rate at which a pose of the data set has risen by all of it
 
 RateReference = Literal["pose", "global", "sharpest", "interval"]
 
@@ -82,9 +80,7 @@ class Matched:
             raise UsageError("rate_reference", f"'{reference}' is not one of {listing(known)}")
         return replace(self, reference=cast(RateReference, reference))
 
-    def rates(
-        self, splats: Splats2D, camera: Camera, training: TrainingViews
-    ) -> Float[Tensor, " m"]:
+    def rates(self, splats: Splats2D, camera: Camera, training: TrainingViews) -> Float[Tensor, " m"]:
         """Sampling rate of each splat against its reference; the view's own for Gaussians that no camera saw."""
         view = torch.full_like(splats.depths, training.relative_rate(camera))
         if self.reference == "global":
@@ -106,9 +102,7 @@ class Trained(NamedTuple):
     own: Float[Tensor, " m"] | None
 
 
-def _trained(
-    splats: Splats2D, camera: Camera, training: TrainingViews, seen: Bool[Tensor, " m"]
-) -> Trained:
+def _trained(splats: Splats2D, camera: Camera, training: TrainingViews, seen: Bool[Tensor, " m"]) -> Trained:
     """The bounds; 1 where no camera saw the Gaussian, so that nothing is divided by 0."""
     lowest, highest = (
         bound[splats.sources].to(splats.depths).where(seen, 1.0)

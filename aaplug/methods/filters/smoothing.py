@@ -45,9 +45,7 @@ class Smoothing3D:
         bounds = training.bounds
         if self.focal == "largest":
             largest = max(camera.focal for camera in training.cameras)
-            bounds = replace(
-                bounds, highest=torch.where(bounds.seen, largest / bounds.nearest, 0.0)
-            )
+            bounds = replace(bounds, highest=torch.where(bounds.seen, largest / bounds.nearest, 0.0))
         log_sigma = (self.variance**0.5 / bounds.highest_or_coarsest).log()[:, None]
         smoothed = smoothed_by(scene, log_sigma, self.opacity == "volume")
         if self.opacity == "balanced":
@@ -101,9 +99,7 @@ class FlatSmoothing:
         smoothed = smoothed_by(scene, log_sigma, volume=False)
         thin = torch.zeros_like(scene.log_scales, dtype=torch.bool)
         thin.scatter_(1, scene.log_scales.argmin(dim=1, keepdim=True), True)
-        logits = scale_opacities(
-            scene.logit_opacities, face_log_factor(scene.log_scales, log_sigma)
-        )
+        logits = scale_opacities(scene.logit_opacities, face_log_factor(scene.log_scales, log_sigma))
         return replace(
             smoothed,
             log_scales=torch.where(thin, scene.log_scales, smoothed.log_scales),

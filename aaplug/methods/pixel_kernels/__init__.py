@@ -8,19 +8,7 @@ from aaplug.methods.pixel_kernels.square import SQUARE
 from aaplug.methods.pixel_kernels.surfel import SURFEL, SURFEL_MIP
 
 PIXEL_KERNELS: Registry[PixelKernel] = Registry(
-    "pixel kernel",
-    {
-        kernel.name: kernel
-        for kernel in (POINT, INTEGRAL, LOGISTIC_INTEGRAL, SQUARE, SURFEL, SURFEL_MIP)
-    },
+    "pixel kernel", {kernel.name: kernel for kernel in (POINT, INTEGRAL, LOGISTIC_INTEGRAL, SQUARE, SURFEL, SURFEL_MIP)}
 )
 
-__all__ = [
-    "INTEGRAL",
-    "LOGISTIC_INTEGRAL",
-    "PIXEL_KERNELS",
-    "POINT",
-    "SQUARE",
-    "SURFEL",
-    "SURFEL_MIP",
-]
+__all__ = ["INTEGRAL", "LOGISTIC_INTEGRAL", "PIXEL_KERNELS", "POINT", "SQUARE", "SURFEL", "SURFEL_MIP"]

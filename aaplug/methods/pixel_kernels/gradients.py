@@ -44,11 +44,7 @@ class SumsGradients(Protocol):
 
 
 def sums_by_autograd(
-    pixel: PixelKernel,
-    rules: Rules,
-    moves: list[Move],
-    colours: tuple[Tensor, Tensor, Tensor],
-    pixels: Pixels,
+    pixel: PixelKernel, rules: Rules, moves: list[Move], colours: tuple[Tensor, Tensor, Tensor], pixels: Pixels
 ) -> Float[Tensor, "t c_K"]:
     """Gradient of the raster rows for any pixel kernel: autograd of alpha, from the gradient of log alpha."""
     rows, weights, gradients = (torch.stack(x, dim=1) for x in zip(*moves, strict=True))

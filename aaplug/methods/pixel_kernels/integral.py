@@ -51,9 +51,7 @@ class Integral:
         halves = [0.5 * splats.window * torch.hypot(x, y) for x, y in ((ux, uy), (vx, vy))]
         return rows_of(splats, [ux, uy, vx, vy], [*halves, torch.zeros_like(ux)])
 
-    def alpha(
-        self, rows: Float[Tensor, "*n t c"], pixels: Pixels, rules: Rules
-    ) -> Float[Tensor, "*n t P"]:
+    def alpha(self, rows: Float[Tensor, "*n t c"], pixels: Pixels, rules: Rules) -> Float[Tensor, "*n t P"]:
         """Opacity times the means over the window along both axes."""
         alpha = rows[..., OPACITY, None]
         for form, half in zip(forms_at(rows, pixels), (HALF_U, HALF_V), strict=True):

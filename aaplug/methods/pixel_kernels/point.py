@@ -31,9 +31,7 @@ from aaplug.methods.pixel_kernels.raster_rows import (
 
 HALF_LOG2_E = 0.5 * math.log2(math.e)
 LN_2 = math.log(2)
-LOG2_SILENT = (
-    -9.0
-)  # log2 of an alpha below every cut-off; exp2 stops here, before it slows down in subnormals
+LOG2_SILENT = -9.0  # log2 of an alpha below every cut-off; exp2 stops here, before it slows down in subnormals
 SQUARINGS = 3  # of exp2's polynomial: with degree 6 the relative error is 1e-6 in float32
 DEGREE = 6
 
@@ -58,9 +56,7 @@ class Point:
         (rows,) = kernels.run(POINT_ROWS, *columns)
         return with_silent_row(rows, LOG2_SILENT)
 
-    def alpha(
-        self, rows: Float[Tensor, "*n t c"], pixels: Pixels, rules: Rules
-    ) -> Float[Tensor, "*n t P"]:
+    def alpha(self, rows: Float[Tensor, "*n t c"], pixels: Pixels, rules: Rules) -> Float[Tensor, "*n t P"]:
         """2^(log2 o - u² - v²), 0 below the cut-off."""
         u, v = forms_at(rows, pixels)
         exponent = torch.addcmul(rows[..., OPACITY, None], u, u, value=-1)
@@ -165,9 +161,7 @@ def _sums_by_products(
     return torch.stack([*by_offset, *by_form, s, *by_colour], dim=2).flatten(1)
 
 
-def _from_sums(
-    rows: Float[Tensor, "m 10"], sums: Float[Tensor, "m 10"]
-) -> tuple[Float[Tensor, "m 10"]]:
+def _from_sums(rows: Float[Tensor, "m 10"], sums: Float[Tensor, "m 10"]) -> tuple[Float[Tensor, "m 10"]]:
     """Chain rule for log alpha = ln 2 (log2 o - u² - v²)."""
     ux, uy, vx, vy, *_ = rows.unbind(dim=1)
     *by_offset, su, sv, s, red, green, blue = sums.unbind(dim=1)
@@ -182,8 +176,6 @@ def _from_sums_example() -> tuple[Tensor, ...]:
 
 
 ROOT_OF_EXP2 = _root_of_exp2(SQUARINGS, DEGREE)
-POINT_ROWS = Kernel(
-    "point-rows", _point_rows, lambda: (*splat_example(), torch.ones(100_000, 3)), ("m",) * 5
-)
+POINT_ROWS = Kernel("point-rows", _point_rows, lambda: (*splat_example(), torch.ones(100_000, 3)), ("m",) * 5)
 FROM_SUMS = Kernel("composite-sums", _from_sums, _from_sums_example, ("m", "m"))
 POINT = Point()

@@ -22,9 +22,7 @@ UX, UY, VX, VY, X, Y, OPACITY, RED, GREEN, BLUE = range(10)
 COLUMNS = 10  # columns from here on are a kernel's own
 
 
-def rows_of(
-    splats: Splats2D, forms: Sequence[Tensor], own: Sequence[Tensor]
-) -> Float[Tensor, "m c"]:
+def rows_of(splats: Splats2D, forms: Sequence[Tensor], own: Sequence[Tensor]) -> Float[Tensor, "m c"]:
     """Assemble raster rows from the two forms and a kernel's own columns, with a last row that draws nothing."""
     assert splats.rgb is not None
     centre, colour = splats.means.unbind(dim=1), splats.rgb.unbind(dim=1)
@@ -46,9 +44,7 @@ def tile_centres(like: Tensor) -> tuple[Float[Tensor, " P"], Float[Tensor, " P"]
     return x.flatten(), y.flatten()
 
 
-def forms_at(
-    row: Float[Tensor, "*n t c"], pixels: Pixels
-) -> tuple[Float[Tensor, "*n t P"], Float[Tensor, "*n t P"]]:
+def forms_at(row: Float[Tensor, "*n t c"], pixels: Pixels) -> tuple[Float[Tensor, "*n t P"], Float[Tensor, "*n t P"]]:
     """The two linear forms of splats at pixel centres."""
     forms = [(row[..., i], row[..., j]) for i, j in ((UX, UY), (VX, VY))]
     if torch.compiler.is_compiling():
@@ -61,17 +57,13 @@ def forms_at(
     return u, v
 
 
-def offsets_at(
-    row: Float[Tensor, "*n t c"], pixels: Pixels
-) -> tuple[Float[Tensor, "*n t P"], Float[Tensor, "*n t P"]]:
+def offsets_at(row: Float[Tensor, "*n t c"], pixels: Pixels) -> tuple[Float[Tensor, "*n t P"], Float[Tensor, "*n t P"]]:
     """Offset of pixel centres from splats, in px."""
     x, y = _from_corner(row, pixels)
     return pixels.x - x[..., None], pixels.y - y[..., None]
 
 
-def _from_corner(
-    row: Float[Tensor, "*n t c"], pixels: Pixels
-) -> tuple[Float[Tensor, "*n t"], Float[Tensor, "*n t"]]:
+def _from_corner(row: Float[Tensor, "*n t c"], pixels: Pixels) -> tuple[Float[Tensor, "*n t"], Float[Tensor, "*n t"]]:
     return row[..., X] - pixels.corners[:, 0], row[..., Y] - pixels.corners[:, 1]
 
 

@@ -52,14 +52,10 @@ class Square:
         own = [0.5 * window * across, 0.5 * window * (vx + vy), window * slope]
         return rows_of(splats, [ux, uy, vx, vy], own)
 
-    def alpha(
-        self, rows: Float[Tensor, "*n t c"], pixels: Pixels, rules: Rules
-    ) -> Float[Tensor, "*n t P"]:
+    def alpha(self, rows: Float[Tensor, "*n t c"], pixels: Pixels, rules: Rules) -> Float[Tensor, "*n t P"]:
         """Opacity times the mean of the strips."""
         across, along = forms_at(rows, pixels)
-        half_across, half_along, slope = (
-            rows[..., i, None] for i in (HALF_ACROSS, HALF_ALONG, SLOPE)
-        )
+        half_across, half_along, slope = (rows[..., i, None] for i in (HALF_ACROSS, HALF_ALONG, SLOPE))
         total = torch.zeros_like(along)
         for strip in range(STRIPS):
             from_middle = (strip - (STRIPS - 1) / 2) / STRIPS
@@ -85,9 +81,7 @@ class Square:
         return values / STRIPS
 
 
-def _mean(
-    at: Float[Tensor, "p c"], sigma: Float[Tensor, " c"], side: float
-) -> Float[Tensor, "p c"]:
+def _mean(at: Float[Tensor, "p c"], sigma: Float[Tensor, " c"], side: float) -> Float[Tensor, "p c"]:
     """Mean of exp(-x²/2σ²) over at ± side/2."""
     probability = ndtr((at + side / 2) / sigma) - ndtr((at - side / 2) / sigma)
     return probability * sigma * math.sqrt(2 * math.pi) / side

@@ -21,17 +21,7 @@ from aaplug.core.interfaces import Pixels
 from aaplug.core.kernels import Kernels
 from aaplug.core.rules import Rules
 from aaplug.core.splats import Splats2D
-from aaplug.methods.pixel_kernels.raster_rows import (
-    COLUMNS,
-    OPACITY,
-    UX,
-    UY,
-    VX,
-    VY,
-    forms_at,
-    offsets_at,
-    rows_of,
-)
+from aaplug.methods.pixel_kernels.raster_rows import COLUMNS, OPACITY, UX, UY, VX, VY, forms_at, offsets_at, rows_of
 
 SLOPE_X, SLOPE_Y, LOW_PASS_WIDTH = COLUMNS, COLUMNS + 1, COLUMNS + 2
 LOW_PASS = 2.0  # 1/px²: 2DGS's filter of √½ px, squared and inverted
@@ -71,9 +61,7 @@ class Surfel:
         near = left > IN_FRONT
         left = left.clamp(min=IN_FRONT)
         shift, stretch = -cutoff / left, cutoff / left
-        covs = torch.stack(
-            [xx + stretch * cx * cx, xy + stretch * cx * cy, yy + stretch * cy * cy], dim=1
-        )
+        covs = torch.stack([xx + stretch * cx * cx, xy + stretch * cx * cy, yy + stretch * cy * cy], dim=1)
         ellipses = replace(
             splats,
             means=splats.means + shift[:, None] * torch.stack([cx, cy], dim=1),
@@ -92,9 +80,7 @@ class Surfel:
         forms = whitening_columns(splats.covs, splats.dets)
         return rows_of(splats, forms, [*splats.depth_slopes.unbind(dim=1), width])
 
-    def alpha(
-        self, rows: Float[Tensor, "*n t c"], pixels: Pixels, rules: Rules
-    ) -> Float[Tensor, "*n t P"]:
+    def alpha(self, rows: Float[Tensor, "*n t c"], pixels: Pixels, rules: Rules) -> Float[Tensor, "*n t P"]:
         """Opacity times the disc's value."""
         e = forms_at(rows, pixels)
         dx, dy = offsets_at(rows, pixels)
@@ -127,9 +113,7 @@ class Surfel:
         by_x = torch.linalg.cross(t_w.expand_as(by_column), by_column)
         by_y = torch.linalg.cross(by_row, t_w.expand_as(by_row))
         jacobian = [
-            (change[..., i] * depth - p[..., i] * change[..., 2]) / depth**2
-            for change in (by_x, by_y)
-            for i in (0, 1)
+            (change[..., i] * depth - p[..., i] * change[..., 2]) / depth**2 for change in (by_x, by_y) for i in (0, 1)
         ]
         return torch.where(in_front, _exact_mip_filter(s, t, jacobian), 0.0)
 
@@ -141,10 +125,7 @@ def _low_passed(e: tuple[Tensor, Tensor], ahead: Tensor, squared: Tensor, width:
 
 
 def _mip_filtered(
-    e: tuple[Tensor, Tensor],
-    ahead: Tensor,
-    whitening: tuple[Tensor, ...],
-    slopes: tuple[Tensor, Tensor],
+    e: tuple[Tensor, Tensor], ahead: Tensor, whitening: tuple[Tensor, ...], slopes: tuple[Tensor, Tensor]
 ) -> Tensor:
     """AA-2DGS.  whitening: ux, uy, vx, vy."""
     s, t = e[0] / ahead, e[1] / ahead

@@ -102,9 +102,7 @@ def load_or_eager() -> Kernels:
     return load() or EAGER
 
 
-def build(
-    progress: Callable[[int, int], None] = lambda done, total: None,
-) -> CompiledKernels:
+def build(progress: Callable[[int, int], None] = lambda done, total: None) -> CompiledKernels:
     """Build what is missing or broken, in one process per thread of torch, and load everything.
 
     progress: called with (kernels done, kernels in all).
@@ -117,9 +115,7 @@ def build(
     progress(total - len(missing), total)
     if missing:
         if not has_compiler():
-            raise UsageError(
-                "warmup", "needs a C++ compiler (g++ or clang++) for torch to compile with"
-            )
+            raise UsageError("warmup", "needs a C++ compiler (g++ or clang++) for torch to compile with")
         processes = min(torch.get_num_threads(), MOST_PROCESSES, len(missing))
         # longest first, so that none is left over at the end; torch's default threads, for which kernels are compiled
         pool = Processes(processes, torch_threads=None, ordered=False)
@@ -165,9 +161,7 @@ def _build(name: str) -> None:
     kernel = next(kernel for kernel in KERNELS if kernel.name == name)
     path = _path(kernel)
     sizes = {
-        name: torch.export.Dim(f"size_{name}", min=2, max=LARGEST_SIZE)
-        for name in kernel.sizes
-        if name is not None
+        name: torch.export.Dim(f"size_{name}", min=2, max=LARGEST_SIZE) for name in kernel.sizes if name is not None
     }
     shapes = tuple({0: sizes[name]} if name is not None else None for name in kernel.sizes)
     try:
@@ -176,14 +170,8 @@ def _build(name: str) -> None:
 
         with tempfile.TemporaryDirectory(dir=path.parent) as folder, _quiet(), torch.no_grad():
             args = kernel.example()
-            module = (
-                make_fx(kernel.function, tracing_mode="symbolic")(*args)
-                if kernel.pulls_back
-                else _Module(kernel)
-            )
-            program = torch.export.export(
-                module, args, dynamic_shapes=shapes if kernel.pulls_back else (shapes,)
-            )
+            module = make_fx(kernel.function, tracing_mode="symbolic")(*args) if kernel.pulls_back else _Module(kernel)
+            program = torch.export.export(module, args, dynamic_shapes=shapes if kernel.pulls_back else (shapes,))
             made = torch._inductor.aoti_compile_and_package(
                 program,
                 package_path=str(Path(folder) / "k.pt2"),

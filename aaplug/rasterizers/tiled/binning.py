@@ -47,11 +47,7 @@ class Bins:
 
 @torch.no_grad()
 def bands(
-    splats: Splats2D,
-    grid: tuple[int, int],
-    kernels: Kernels,
-    memory: float = MEMORY,
-    rules: Rules = RULES_3DGS,
+    splats: Splats2D, grid: tuple[int, int], kernels: Kernels, memory: float = MEMORY, rules: Rules = RULES_3DGS
 ) -> Iterator[Bins]:
     """Bins of bands of tile rows, from the top."""
     order = _depth_order(splats.depths)
@@ -66,9 +62,7 @@ def _depth_order(depths: Float[Tensor, " m"]) -> Int[Tensor, " m"]:
     return torch.sort(keys, stable=True).indices
 
 
-def _table(
-    splats: Splats2D, grid: tuple[int, int], kernels: Kernels, rules: Rules
-) -> Float[Tensor, "m 11"]:
+def _table(splats: Splats2D, grid: tuple[int, int], kernels: Kernels, rules: Rules) -> Float[Tensor, "m 11"]:
     """What spans are computed from.  The last four columns are the box of tiles around the ellipse.
 
     A box is its first tile in x and y, then one past its last tile.
@@ -115,11 +109,7 @@ def _rows(table: Float[Tensor, "m 11"], rows: int, budget: int) -> list[tuple[in
 
 
 def _bin(
-    table: Float[Tensor, "m 11"],
-    order: Int[Tensor, " m"],
-    rows: tuple[int, int],
-    columns: int,
-    kernels: Kernels,
+    table: Float[Tensor, "m 11"], order: Int[Tensor, " m"], rows: tuple[int, int], columns: int, kernels: Kernels
 ) -> Bins:
     """Pair splats, nearest first, with the tiles that they overlap in a band of rows."""
     _, top, _, bottom = table[:, BOX:].unbind(dim=1)
@@ -182,10 +172,7 @@ def _spans(
 
 
 def _pairs(
-    spans: Int[Tensor, " p"],
-    starts: Int[Tensor, " s"],
-    first: Int[Tensor, " s"],
-    owners: Int[Tensor, " s"],
+    spans: Int[Tensor, " p"], starts: Int[Tensor, " s"], first: Int[Tensor, " s"], owners: Int[Tensor, " s"]
 ) -> tuple[Int[Tensor, " p"], Int[Tensor, " p"]]:
     """Tile and splat of each pair."""
     place = torch.arange(spans.shape[0], device=spans.device)

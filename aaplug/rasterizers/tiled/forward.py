@@ -24,10 +24,7 @@ STEP = 4  # splats per backward step; transmittance is kept before each one.  Mo
 CHECK_EVERY = 2  # passes between checks for saturated tiles
 COMPACT_BELOW = 3 / 4  # share of unsaturated tiles below which the others are dropped
 SURELY = 1e9  # anything that is not 0 here, times this, is above 1
-EXAMPLE_TILES, EXAMPLE_SPLATS = (
-    1024,
-    4096,
-)  # as large as real work: inductor chooses by them which loops use threads
+EXAMPLE_TILES, EXAMPLE_SPLATS = (1024, 4096)  # as large as real work: inductor chooses by them which loops use threads
 
 
 @dataclass(frozen=True)
@@ -59,10 +56,7 @@ class Turn:
 
 
 def composite_forward(
-    rows: Float[Tensor, "m c"],
-    bins: Bins,
-    how: Compositing,
-    turns: list[Turn] | None = None,
+    rows: Float[Tensor, "m c"], bins: Bins, how: Compositing, turns: list[Turn] | None = None
 ) -> tuple[Float[Tensor, "3 all P"], Float[Tensor, "all P"]]:
     """Premultiplied colour, and alpha, of every pixel of every tile; appends to `turns` what backward needs.
 
@@ -167,10 +161,7 @@ def _pass(
 
 
 def in_turn(
-    pixel: PixelKernel,
-    rules: Rules,
-    rows: Float[Tensor, "K t c"] | Iterator[Tensor],
-    pixels: Pixels,
+    pixel: PixelKernel, rules: Rules, rows: Float[Tensor, "K t c"] | Iterator[Tensor], pixels: Pixels
 ) -> Iterator[tuple[Float[Tensor, "t c"], Float[Tensor, "t P"]]]:
     """Row and alpha of K splats of each tile, one after the other.
 
@@ -187,9 +178,7 @@ def in_turn(
 # test for NaN.  So these three are written for each.
 
 
-def transmitted(
-    alpha: Float[Tensor, "t P"], one: Float[Tensor, "t 1"], rules: Rules
-) -> Float[Tensor, "t P"]:
+def transmitted(alpha: Float[Tensor, "t P"], one: Float[Tensor, "t 1"], rules: Rules) -> Float[Tensor, "t P"]:
     """The share of the light that a splat lets through."""
     least = 1 - rules.max_alpha
     if torch.compiler.is_compiling():
@@ -197,9 +186,7 @@ def transmitted(
     return (one - alpha).clamp_(min=least)
 
 
-def less(
-    x: Float[Tensor, "t P"], y: Float[Tensor, "t P"], one: Float[Tensor, "t 1"]
-) -> Float[Tensor, "t P"]:
+def less(x: Float[Tensor, "t P"], y: Float[Tensor, "t P"], one: Float[Tensor, "t 1"]) -> Float[Tensor, "t P"]:
     """x − y."""
     return one * x - y if torch.compiler.is_compiling() else x - y
 

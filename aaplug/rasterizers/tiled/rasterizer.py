@@ -94,9 +94,7 @@ class Tiled:
             for tiles in order.split(BLENDED_TILES):
                 x, y = (bins.origins[tiles, i, None] + local[i] for i in (0, 1))
                 lists = (bins.splats, bins.first[tiles], bins.counts[tiles])
-                parts.append(
-                    compositor.tiles(rows, splats.window, *lists, (x, y), self.kernels, rules)
-                )
+                parts.append(compositor.tiles(rows, splats.window, *lists, (x, y), self.kernels, rules))
             image = torch.cat(parts, dim=1)[:, order.argsort()].to(splats.means)
             return image[:3], image[3]
 

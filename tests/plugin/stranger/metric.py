@@ -6,9 +6,7 @@ from torch import Tensor
 from aaplug.evaluation.metric import Metric
 
 
-def mean_absolute_error(
-    image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]
-) -> float | None:
+def mean_absolute_error(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> float | None:
     """Mean over pixels and channels; undefined for an empty image."""
     return None if image.numel() == 0 else float((image - truth).abs().mean())
 

@@ -13,16 +13,7 @@ from aaplug.core.interfaces import Pixels
 from aaplug.core.kernels import Kernels
 from aaplug.core.rules import Rules
 from aaplug.core.splats import Splats2D
-from aaplug.methods.pixel_kernels.raster_rows import (
-    COLUMNS,
-    OPACITY,
-    UX,
-    UY,
-    VX,
-    VY,
-    forms_at,
-    rows_of,
-)
+from aaplug.methods.pixel_kernels.raster_rows import COLUMNS, OPACITY, UX, UY, VX, VY, forms_at, rows_of
 
 QUARTER = COLUMNS  # our own column: a quarter of the pixel's side, in px
 POINTS = tuple(product((-1, 1), repeat=2))  # in quarters of the pixel, from its centre
@@ -48,14 +39,10 @@ class FourPoints:
         quarter = torch.full_like(splats.dets, splats.window / 4)
         return rows_of(splats, whitening_columns(splats.covs, splats.dets), [quarter])
 
-    def alpha(
-        self, rows: Float[Tensor, "*n t c"], pixels: Pixels, rules: Rules
-    ) -> Float[Tensor, "*n t P"]:
+    def alpha(self, rows: Float[Tensor, "*n t c"], pixels: Pixels, rules: Rules) -> Float[Tensor, "*n t P"]:
         """Opacity times the mean, 0 below the cut-off."""
         u, v = forms_at(rows, pixels)
-        ux, uy, vx, vy, opacity, quarter = (
-            rows[..., i, None] for i in (UX, UY, VX, VY, OPACITY, QUARTER)
-        )
+        ux, uy, vx, vy, opacity, quarter = (rows[..., i, None] for i in (UX, UY, VX, VY, OPACITY, QUARTER))
         total = torch.zeros_like(u)
         for right, down in POINTS:
             du, dv = quarter * (right * ux + down * uy), quarter * (right * vx + down * vy)

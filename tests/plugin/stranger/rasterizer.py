@@ -34,9 +34,7 @@ class RowByRow:
         x = torch.arange(hw[1], dtype=torch.float64) + 0.5
         lines = [torch.stack([x, torch.full_like(x, y + 0.5)], dim=1) for y in range(hw[0])]
         drawn = [
-            _row(splats, line, pixel, rules)
-            if compositor is None
-            else compositor.exact(splats, line, rules)
+            _row(splats, line, pixel, rules) if compositor is None else compositor.exact(splats, line, rules)
             for line in lines
         ]
         rgb, transmittance = (torch.stack(parts) for parts in zip(*drawn, strict=True))
@@ -51,9 +49,7 @@ def _row(
     alpha = (splats.opacities * values).clamp(max=rules.max_alpha)
     alpha = torch.where(alpha >= rules.min_alpha, alpha, 0.0)
     one = centres.new_ones(len(centres), 1)
-    light = torch.cat(
-        [one, one * (1 - alpha).cumprod(dim=1)], dim=1
-    )  # before each splat, and after
+    light = torch.cat([one, one * (1 - alpha).cumprod(dim=1)], dim=1)  # before each splat, and after
     kept = light[:, 1:] >= rules.min_transmittance  # a pixel stops before it becomes opaque
     assert splats.rgb is not None
     rgb = torch.where(kept, alpha * light[:, :-1], 0.0) @ splats.rgb

@@ -14,13 +14,7 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.core.spherical_harmonics import COLOUR_OFFSET, SH_C0
 from aaplug.io.atomic import replacing
 from aaplug.io.scenes.options import Options
-from aaplug.io.scenes.scene_file import (
-    SceneFile,
-    check_count,
-    library_errors,
-    logit_of,
-    sh_of_colour,
-)
+from aaplug.io.scenes.scene_file import SceneFile, check_count, library_errors, logit_of, sh_of_colour
 
 COLUMNS = 8
 EVIDENCE = "the format does not say: assumed classic (3DGS default)"
@@ -54,9 +48,7 @@ class Balls:
 
         return SceneFile(path, self.name, len(rows), 0, load, EVIDENCE)
 
-    def write(
-        self, path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: Options
-    ) -> None:
+    def write(self, path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: Options) -> None:
         """Write a scene; the widest axis becomes the radius.
 
         Raises:

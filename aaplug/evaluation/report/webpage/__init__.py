@@ -34,9 +34,7 @@ def page(name: str, report: Report, found: Coverage, drawn: list[Plot], images: 
         FormatError: an image that the page shows is missing.
     """
     template, style, script = map(_source, ("page.html.j2", "page.css", "page.js"))
-    environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     return environment.from_string(template).render(
         name=name,
         report=report,
@@ -51,9 +49,7 @@ def page(name: str, report: Report, found: Coverage, drawn: list[Plot], images: 
         plots=[(plot, Markup(plot.inline_svg())) for plot in drawn],
         bounds=BOUNDS,
         gallery=gallery(report, images),
-        facts=[
-            (k.replace("_", " "), _text(v)) for k, v in report.protocol.items() if k not in HIDDEN
-        ],
+        facts=[(k.replace("_", " "), _text(v)) for k, v in report.protocol.items() if k not in HIDDEN],
         csv=as_csv({name: report}),
         style=Markup(style),
         script=Markup(script),
@@ -91,8 +87,7 @@ def _tables(report: Report) -> list[dict[str, Any]]:
     """Title, what it means, and rows of (recipe, cells of (text, whether it is the best))."""
     variants = report.protocol.get("metrics", {})
     tables = [
-        (metric.title, variants.get(metric.name, metric.protocol), rows(report, metric))
-        for metric in report.metrics
+        (metric.title, variants.get(metric.name, metric.protocol), rows(report, metric)) for metric in report.metrics
     ]
     for about, (title, lines) in zip(COSTS, work(report), strict=False):
         tables.append((title, about, [[(text, False) for text in line] for line in lines]))

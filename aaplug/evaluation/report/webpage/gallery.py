@@ -55,10 +55,7 @@ def _shots(report: Report, images: ImageStore) -> list[dict[str, Any]]:
             width, height = image_size(files[view, scale, report.recipes[-1]])
             roles = [key[2] for key in files if key[:2] == (view, scale)]
             shown = {
-                role: {
-                    "uri": uris[view, scale, role],
-                    "score": scores.get((names[view], scale, role), ""),
-                }
+                role: {"uri": uris[view, scale, role], "score": scores.get((names[view], scale, role), "")}
                 for role in roles
             }
             shot = {"view": names[view], "scale": scale_name(scale)}
