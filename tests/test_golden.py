@@ -25,7 +25,7 @@ from aaplug.rendering.renderer import Renderer
 from tests.conftest import ALL_RASTERIZERS, make_camera, make_scene
 
 SKY = (0.25, 0.5, 1.0)
-RULES = replace(RULES_GSPLAT, near=0.01)  # gsplat's default near plane
+RULES = RULES_GSPLAT
 GSPLAT = replace(CLASSIC, rules=RULES)
 GSPLAT_ANTIALIASED = replace(ANTIALIASED, rules=RULES)
 

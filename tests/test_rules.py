@@ -158,5 +158,5 @@ def test_wrong_rules_are_refused(wrong):
 
 def test_rules_are_equal_by_value():
     assert Rules() == RULES_3DGS
-    assert hash(Rules(max_alpha=0.999)) == hash(RULES_GSPLAT)
+    assert hash(Rules(max_alpha=0.999, near=0.01)) == hash(RULES_GSPLAT)
     assert RULES_GSPLAT != RULES_3DGS

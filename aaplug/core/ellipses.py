@@ -3,6 +3,8 @@
 m: splats.  d: offset (dx, dy) from a splat's centre, in px.  C: its covariance, packed (xx, xy, yy), in px².
 """
 
+from dataclasses import replace
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -70,17 +72,11 @@ def grown(splats: Splats2D, radius: Float[Tensor, " m"], min_alpha: float) -> Sp
     """
     cutoff = squared_cutoff(splats.opacities, min_alpha)
     cutoff = cutoff.clamp(min=torch.finfo(splats.means.dtype).tiny)
+    radius = radius.clamp(min=torch.finfo(splats.means.dtype).eps)  # it is divided by
     trace = splats.covs[:, 0] + splats.covs[:, 2]
     share = radius / (0.5 * cutoff * trace).sqrt()
     added = (1 + 1 / share) * radius**2 / cutoff
     diagonal = splats.covs.new_tensor([1.0, 0.0, 1.0])
     scale = 1 + share
-    return Splats2D(
-        means=splats.means,
-        covs=scale[:, None] * splats.covs + added[:, None] * diagonal,
-        dets=scale * scale * splats.dets + scale * added * trace + added * added,
-        depths=splats.depths,
-        opacities=splats.opacities,
-        sources=splats.sources,
-        rgb=splats.rgb,
-    )
+    dets = scale * scale * splats.dets + scale * added * trace + added * added
+    return replace(splats, covs=scale[:, None] * splats.covs + added[:, None] * diagonal, dets=dets)

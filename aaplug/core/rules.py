@@ -71,4 +71,4 @@ def just_below(value: float) -> float:
 
 
 RULES_3DGS = Rules()
-RULES_GSPLAT = Rules(max_alpha=0.999)
+RULES_GSPLAT = Rules(max_alpha=0.999, near=0.01)  # gsplat until February 2026; since then its cap is 0.99
