@@ -94,7 +94,7 @@ def fuse(scene: Gaussians, training: TrainingViews | None, form: Form = MATCHED_
     if scene.filter_3d is not None:
         converted = fuse_stored(scene)
     elif training is None:
-        raise UsageError(scene.name, "has no stored 3D filter, so its conversion needs the training `cameras`")
+        raise UsageError(scene.name, "has no stored 3D filter: its conversion needs the training cameras")
     else:
         converted = form.filter(scene, training)
     return replace(converted, convention=MIP)
