@@ -11,7 +11,7 @@ cannot be used is left out with a warning, so that it does not stop everything e
 
 import difflib
 import logging
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
 
@@ -33,10 +33,11 @@ class Registry(Mapping[str, T]):
     kind: one of `KINDS`.
     """
 
-    def __init__(self, kind: str, own: Mapping[str, T], check: Callable[[T], bool] = lambda value: True):
-        """own: the entries of aaplug.  check: whether an object is of this kind."""
+    def __init__(self, kind: str, own: Mapping[str, T], check: type | Callable[[T], bool] = object):
+        """own: the entries of aaplug, by name.  check: the type of such objects, or a test of them."""
         assert kind in KINDS, kind
-        self.kind, self._entries, self._check = kind, dict(own), check
+        self.kind, self._entries = kind, dict(own)
+        self._fits = (lambda value: isinstance(value, check)) if isinstance(check, type) else check
         self._loaded = False
 
     def __getitem__(self, name: str) -> T:
@@ -92,13 +93,18 @@ class Registry(Mapping[str, T]):
     def _add(self, name: str, value: T, where: str) -> None:
         if name in self._entries:
             raise UsageError(where, f"a {self.kind} named '{name}' exists already")
-        if isinstance(value, type) or not self._check(value):
+        if isinstance(value, type) or not self._fits(value):
             found = f"the class {value.__name__}" if isinstance(value, type) else f"a {type(value).__name__}"
             raise UsageError(where, f"is {found}, which is not a {self.kind}; see examples/guides/contributing.md")
         own = getattr(value, "name", name)
         if own != name:
             raise UsageError(where, f"is registered as '{name}' but calls itself '{own}'")
         self._entries[name] = value
+
+
+def named(objects: Iterable[T]) -> dict[str, T]:
+    """Objects by their `name`."""
+    return {getattr(value, "name"): value for value in objects}  # noqa: B009
 
 
 def group_of(kind: str) -> str:

@@ -11,7 +11,7 @@ from typing import Any
 
 from aaplug.core.errors import UsageError
 from aaplug.core.gaussians import ANTIALIASED, CLASSIC, MIP, Convention, Fusion, Gaussians
-from aaplug.core.registry import Registry
+from aaplug.core.registry import Registry, named
 from aaplug.core.training import TrainingViews
 from aaplug.methods.filters import MatchedEnergy, Smoothing3D, fuse_stored
 
@@ -39,9 +39,7 @@ class Form:
 
 MATCHED_ENERGY = Form(MatchedEnergy(), uses_bounds=False, skips=MIP)
 FORMS: Registry[Form] = Registry(
-    "form",
-    {"matched-energy": MATCHED_ENERGY, "mip-splatting": Form(Smoothing3D(), uses_bounds=True)},
-    check=lambda value: isinstance(value, Form),
+    "form", {"matched-energy": MATCHED_ENERGY, "mip-splatting": Form(Smoothing3D(), uses_bounds=True)}, Form
 )
 
 
@@ -68,17 +66,16 @@ CLASSIC_VIEWER = Viewer("classic-viewer", "classic", CLASSIC, "0.3 px², not com
 MIP_VIEWER = Viewer("mip-viewer", "mip", MIP, "0.1 px², compensated")
 VIEWERS: Registry[Viewer] = Registry(
     "viewer",
-    {
-        viewer.name: viewer
-        for viewer in (
+    named(
+        (
             CLASSIC_VIEWER,
             Viewer("antialiased-viewer", "ewa", ANTIALIASED, "0.3 px², compensated"),
             MIP_VIEWER,
             Viewer("gsplat", "ewa", ANTIALIASED, 'rasterize_mode="antialiased": 0.3 px², compensated'),
         )
-    },
-    check=lambda value: isinstance(value, Viewer),
-)  # fmt: skip
+    ),
+    Viewer,
+)
 FAST = Viewer("fast", "matched", None, "aaplug's recipe matched, one sample per pixel")
 
 

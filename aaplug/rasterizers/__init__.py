@@ -3,5 +3,3 @@
 from aaplug.rasterizers.choice import RASTERIZERS, find_rasterizer
 from aaplug.rasterizers.reference import Reference
 from aaplug.rasterizers.tiled import Tiled
-
-__all__ = ["RASTERIZERS", "Reference", "Tiled", "find_rasterizer"]

@@ -4,14 +4,14 @@ from collections.abc import Callable
 
 from aaplug.core.errors import UsageError, listing
 from aaplug.core.interfaces import Rasterizer
-from aaplug.core.registry import Registry
+from aaplug.core.registry import Registry, named
 from aaplug.rasterizers.reference import Reference
 from aaplug.rasterizers.tiled import Tiled
 from aaplug.rasterizers.tiled.ahead_of_time import build, has_compiler, load
 
 FRAMES_THAT_PAY = 500  # compiling takes about 150 s and saves about 0.3 s per 800 x 800 frame
 
-RASTERIZERS: Registry[Rasterizer] = Registry("rasterizer", {"eager": Tiled(), "reference": Reference()})
+RASTERIZERS: Registry[Rasterizer] = Registry("rasterizer", named((Tiled(), Reference())), Rasterizer)
 
 
 def find_rasterizer(name: str = "auto", frames: int = 1, say: Callable[[str], None] = lambda text: None) -> Rasterizer:
