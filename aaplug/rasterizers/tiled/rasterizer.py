@@ -26,8 +26,8 @@ from aaplug.methods.pixel_kernels import POINT
 from aaplug.methods.pixel_kernels.raster_rows import TILE, tile_centres
 from aaplug.rasterizers.tiled.backward import composite
 from aaplug.rasterizers.tiled.binning import MEMORY, Bins, bands
-from aaplug.rasterizers.tiled.counting import CountingKernels
 from aaplug.rasterizers.tiled.forward import Compositing
+from aaplug.rasterizers.tiled.packages import CountingKernels
 
 Painter = Callable[[Bins], tuple[Tensor, Tensor]]
 # composited together by a compositor; sorted, so that they have about equally many splats
