@@ -15,7 +15,7 @@ from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.errors import FormatError
 from aaplug.io.cameras.options import LLFF_HOLD, Options, every_nth
 from aaplug.io.cameras.photos import SUFFIXES, last_part, photo_folder, with_photos
-from aaplug.io.cameras.poses import inverse, pose
+from aaplug.io.cameras.poses import centred, inverse, pose
 from aaplug.io.cameras.sizes import camera_set, file_sizes, photo_sizes, trained_at
 from aaplug.io.limits import whole_limit
 from aaplug.io.values import Place, focal, number, pixels, read_bounded
@@ -57,7 +57,7 @@ def _rows(file: Path) -> np.ndarray:
         rows = np.load(file, mmap_mode="r", allow_pickle=False)
     except Exception as error:  # numpy raises ValueError, EOFError, SyntaxError and others
         raise FormatError(file, "is not a .npy file of numbers") from error
-    if not (isinstance(rows, np.ndarray) and rows.ndim == 2 and rows.shape[1] == COLUMNS and len(rows)):  # fmt: skip
+    if not (isinstance(rows, np.ndarray) and rows.ndim == 2 and rows.shape[1] == COLUMNS and len(rows)):
         shape = getattr(rows, "shape", "?")
         raise FormatError(file, f"should hold rows of {COLUMNS} numbers, not the shape {shape}")
     if rows.dtype.kind != "f":
@@ -83,4 +83,4 @@ def _camera(row: np.ndarray, name: str, place: Place) -> Camera:
     down, right, back = matrix[:, :3].unbind(dim=1)
     world_from_cam = pose(torch.stack([right, down, -back], dim=1), matrix[:, 3], place, "rotation")
     cam_from_world = inverse(world_from_cam, place, "position")
-    return Camera(name, width, height, f, f, width / 2, height / 2, cam_from_world)
+    return centred(name, (width, height), (f, f), cam_from_world)
