@@ -161,9 +161,3 @@ def captured_stderr() -> Iterator[IO[bytes]]:
         finally:
             os.dup2(saved, STDERR)
             os.close(saved)
-
-
-def _damage(words: IO[bytes]) -> str:
-    words.seek(0)
-    lines = words.read().decode("ascii", "replace").splitlines()
-    return next((line for line in lines if line.startswith(DAMAGE)), "")

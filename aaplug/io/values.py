@@ -165,7 +165,11 @@ def entries(path: Path, what: str, items: object, shared: dict[str, Any] | None 
     """The objects of a JSON list, at least one; `shared` fields apply where an object does not have its own."""
     if not isinstance(items, list) or not items:
         raise FormatError(path, f"should hold a list of {what}s, at least one, not {reprlib.repr(items)}")
-    return [_entry(Place(path, f"{what} {i}"), item, shared or {}) for i, item in enumerate(items)]
+    places = [Place(path, f"{what} {i}") for i in range(len(items))]
+    for place, item in zip(places, items, strict=True):
+        if not isinstance(item, dict):
+            raise place.wrong("it", "an object", item)
+    return [Entry(place, {**(shared or {}), **item}) for place, item in zip(places, items, strict=True)]
 
 
 def mentions(path: Path, keys: Sequence[str]) -> bool:
@@ -178,12 +182,6 @@ def mentions(path: Path, keys: Sequence[str]) -> bool:
     except OSError:
         return False
     return any(f'"{key}"'.encode() in start for key in keys)
-
-
-def _entry(place: Place, item: object, shared: dict[str, Any]) -> Entry:
-    if not isinstance(item, dict):
-        raise place.wrong("it", "an object", item)
-    return Entry(place, {**shared, **item})
 
 
 def _refuse(constant: str) -> NoReturn:

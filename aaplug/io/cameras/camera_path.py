@@ -46,20 +46,13 @@ def read(path: Path, options: Options) -> CameraSet:
     sizes, _ = file_sizes(cameras, options)
     cameras = [camera.resized(*size) for camera, size in zip(cameras, sizes, strict=True)]
     split = undivided(cameras, "a path has no split")
-    notes = (
-        f"camera path: {len(cameras)} free cameras, {described_sizes(cameras)}; "
-        "used in place of training cameras, which would give better sampling bounds",
-        split.note,
-    )
-    return CameraSet(split.train, split.test, notes=notes)
+    what = f"camera path: {len(cameras)} free cameras, {described_sizes(cameras)}"
+    note = f"{what}; used in place of training cameras, which would give better sampling bounds"
+    return CameraSet(split.train, split.test, notes=(note, split.note))
 
 
 def read_camera_path(path: str | PathLike[str]) -> CameraPath:
-    """Read the frames of a video.
-
-    Raises:
-        FormatError: the file breaks its format.
-    """
+    """Read the frames of a video; raises FormatError for a file that breaks its format."""
     path = Path(path)
     about = object_of(read_json(path), path, "the path", f"'{KEY}', as nerfstudio writes", KEY)
     kind = about.fields.get("camera_type", PERSPECTIVE)

@@ -64,8 +64,7 @@ def read_cfg_args(path: Path) -> CfgArgs:
 def _parsed(path: Path) -> ast.Call:
     source = read_bounded(path, whole_limit("CFG_ARGS"))
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # Python's, about backslashes in Windows paths
+        with warnings.catch_warnings(action="ignore"):  # Python's, about backslashes in Windows paths
             call = ast.parse(source.decode().strip(), mode="eval").body
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
         raise FormatError(path, f"should be a Python Namespace(...): {error}") from error

@@ -47,13 +47,8 @@ def read(path: Path, options: Options) -> CameraSet:
     sizes, why = _training_sizes(source, settings, options)
     trained = trained_at(source, sizes)
     split = _split(trained, settings, options)
-    return camera_set("INRIA cameras.json", source, split, why, _background(settings))
-
-
-def _background(settings: CfgArgs | None) -> tuple[float, float, float] | None:
-    if settings is None or settings.white_background is None:
-        return None
-    return WHITE if settings.white_background else BLACK
+    background = {None: None, True: WHITE, False: BLACK}[settings.white_background if settings else None]
+    return camera_set("INRIA cameras.json", source, split, why, background)
 
 
 def _camera(entry: Entry) -> Camera:

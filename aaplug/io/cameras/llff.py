@@ -42,9 +42,8 @@ def read(path: Path, options: Options) -> CameraSet:
     source = [_camera(*each) for each in zip(rows, names, places, strict=True)]
     source = with_photos(source, places, folder)
     source = [replace(camera, name=last_part(camera.name)) for camera in source]
-    sizes, why = photo_sizes(source), "size of the photos, or in the file"
-    if options.train_scale is not None:
-        sizes, why = file_sizes(source, options)
+    photographed = photo_sizes(source), "size of the photos, or in the file"
+    sizes, why = photographed if options.train_scale is None else file_sizes(source, options)
     trained = trained_at(source, sizes)
     split = every_nth(trained, options, LLFF_HOLD, "LLFF's rule; `test_every` 0 for no split")
     return camera_set(f"LLFF {FILE}", source, split, why)
@@ -58,8 +57,7 @@ def _rows(file: Path) -> np.ndarray:
     except Exception as error:  # numpy raises ValueError, EOFError, SyntaxError and others
         raise FormatError(file, "is not a .npy file of numbers") from error
     if not (isinstance(rows, np.ndarray) and rows.ndim == 2 and rows.shape[1] == COLUMNS and len(rows)):
-        shape = getattr(rows, "shape", "?")
-        raise FormatError(file, f"should hold rows of {COLUMNS} numbers, not the shape {shape}")
+        raise FormatError(file, f"should hold rows of {COLUMNS} numbers, not the shape {getattr(rows, 'shape', '?')}")
     if rows.dtype.kind != "f":
         raise FormatError(file, f"should hold floats, not {rows.dtype}")
     return np.array(rows, np.float64)

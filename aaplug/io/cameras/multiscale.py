@@ -39,13 +39,9 @@ def read(path: Path, options: Options) -> CameraSet:
     train, test = (_cameras(document, split) if split in document else [] for split in ("train", "test"))
     trained, held = (trained_at(v, file_sizes(v, options)[0]) for v in (train, test))
     split = explicit(trained, held, FILE) if held else undivided(trained, f"no test in {FILE}")
-    notes = (
-        f"multi-scale Blender: {len(train) + len(test)} cameras, {described_sizes(train)}",
-        split.note,
-        "training size: each photo's own, as all scales were trained on",
-        "background: white, Blender's custom",
-    )
-    return CameraSet(split.train, split.test, WHITE, notes)
+    what = f"multi-scale Blender: {len(train) + len(test)} cameras, {described_sizes(train)}"
+    size = "training size: each photo's own, as all scales were trained on"
+    return CameraSet(split.train, split.test, WHITE, (what, split.note, size, "background: white, Blender's custom"))
 
 
 def _cameras(document: Entry, split: str) -> list[Camera]:

@@ -63,7 +63,7 @@ class WritableFormat(SceneFormat, Protocol):
 
 # the first that accepts a file is used
 OWN: tuple[SceneFormat, ...] = (compressed_ply, ply, spz, sog, pt, splat, ksplat)
-SCENE_FORMATS: Registry[SceneFormat] = Registry(
+SCENE_FORMATS = Registry[SceneFormat](
     "scene format", {f.name: f for f in OWN}, lambda value: isinstance(value, SceneFormat)
 )
 
@@ -192,18 +192,14 @@ def find_scene(path: str | PathLike[str], iteration: int | None = None) -> Path:
         raise FormatError(path, "holds no point_cloud/iteration_<N>/point_cloud.ply; name the scene's file")
     chosen = max(scenes) if iteration is None else iteration
     if chosen not in scenes:
-        available = ", ".join(map(str, sorted(scenes)))
-        raise FormatError(path, f"has no iteration {chosen}; it has {available}")
+        raise FormatError(path, f"has no iteration {chosen}; it has {', '.join(map(str, sorted(scenes)))}")
     return scenes[chosen]
 
 
 def _iterations(model: Path) -> dict[int, Path]:
-    found = {}
-    for scene in model.glob("point_cloud/iteration_*/point_cloud.ply"):
-        number = re.fullmatch(r"iteration_(\d+)", scene.parent.name, re.ASCII)
-        if number:
-            found[int(number[1])] = scene
-    return found
+    pattern = re.compile(r"iteration_(\d+)", re.ASCII)
+    scenes = model.glob("point_cloud/iteration_*/point_cloud.ply")
+    return {int(m[1]): scene for scene in scenes if (m := pattern.fullmatch(scene.parent.name))}
 
 
 def _head(path: Path) -> bytes:

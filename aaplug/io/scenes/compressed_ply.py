@@ -57,11 +57,10 @@ def open_scene(path: Path, options: Options) -> SceneFile:
 def _tables(path: Path, header: Header) -> dict[str, Table]:
     if header.coding != LITTLE or any(e.lists for e in header.elements):
         raise FormatError(path, f"is a packed .ply, which should be {LITTLE} without lists")
-    tables, at, stamp = {}, header.size, stamp_of(path)
+    tables, stamp = {}, stamp_of(path)
     for element in header.elements:
         dtype = np.dtype([(p.name, "<" + p.code) for p in element.properties])
-        tables[element.name] = Table(path, at, element.count, dtype, stamp)
-        at += element.least_size
+        tables[element.name] = Table(path, header.start_of(element), element.count, dtype, stamp)
     return tables
 
 

@@ -120,8 +120,7 @@ def _records(path: Path, data: bytes, at: int, section: Section, level: int) -> 
     fill = np.minimum(np.concatenate([full, partial]), section.count)
     if fill.sum() < section.count:
         raise FormatError(path, f"has buckets for {fill.sum():,} of {section.count:,} Gaussians")
-    ends = np.cumsum(fill)
-    bucket = np.searchsorted(ends, np.arange(section.count), side="right")
+    bucket = np.searchsorted(np.cumsum(fill), np.arange(section.count), side="right")
     centres = np.frombuffer(data, "<f4", 3 * section.buckets, at + sizes).reshape(-1, 3)
     return Records(section, rows, centres[bucket]), end
 

@@ -23,7 +23,7 @@ from aaplug.core.gaussians import Gaussians, PixelSizes
 from aaplug.io.atomic import replacing
 from aaplug.io.scenes.options import Options
 from aaplug.io.scenes.ply_document import Document, document_of, stamp_of
-from aaplug.io.scenes.ply_header import LITTLE, Header, Property, check_size, is_packed, parse, read_header
+from aaplug.io.scenes.ply_header import LITTLE, Header, check_size, is_packed, parse, read_header
 from aaplug.io.scenes.ply_tags import meaning, stating
 from aaplug.io.scenes.scene_file import (
     DEGREES,
@@ -104,7 +104,7 @@ def _check_columns(header: Header) -> list[str]:
     known = {p.name: p for p in vertex.properties}
     if vertex.lists:
         raise FormatError(header.path, f"vertex property {listing(vertex.lists)} is a list; a scene has numbers only")
-    coloured = _has_byte_colours(known)
+    coloured = all(c in known and known[c].code == "u1" for c in BYTE_COLOURS) and not known.keys() & {*COLOURS}
     optional = {*(COLOURS if coloured else ()), SCALES[2]}
     missing = [c for c in REQUIRED if c not in known and c not in optional]
     if missing:
@@ -123,11 +123,6 @@ def _check_columns(header: Header) -> list[str]:
         "colours from the columns red, green, blue; no harmonics": coloured,
     }
     return [note for note, applies in notes.items() if applies]
-
-
-def _has_byte_colours(known: dict[str, Property]) -> bool:
-    there = all(c in known and known[c].code == "u1" for c in BYTE_COLOURS)
-    return there and not any(c in known for c in COLOURS)
 
 
 def _check_rest(path: str, rest: list[str]) -> None:

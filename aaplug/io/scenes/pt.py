@@ -69,8 +69,7 @@ def _check_archive(path: Path, size: int) -> None:
 def _load(path: Path) -> Any:
     """Tensors and plain containers of them.  torch's own error would advise loading everything else too."""
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # torch's, about a damaged pickle
+        with warnings.catch_warnings(action="ignore"):  # torch's, about a damaged pickle
             return torch.load(path, "cpu", weights_only=True, mmap=True)
     except pickle.UnpicklingError as error:
         raise FormatError(path, "is damaged, or holds more than tensors; nothing of it was run") from error

@@ -46,11 +46,11 @@ Fetch = Callable[[str, int], bytes]
 
 @dataclass(frozen=True)
 class Part:
-    """An entry of meta.json, with its images as RGBA, a row per pixel."""
+    """An entry of meta.json, with its images as RGBA, a row per pixel, and the width of the first."""
 
     entry: Entry
     pixels: list[np.ndarray]
-    widths: list[int]
+    width: int
 
     def between(self, image: int, channels: int, rows: slice) -> Float[Tensor, "n c"]:
         """Version 1: bytes as fractions from mins to maxs."""
@@ -104,17 +104,16 @@ def _from_zip(path: Path, archive: zipfile.ZipFile, file: str, most: int) -> byt
 
 def _scene(path: Path, meta: Any, fetch: Fetch) -> SceneFile:
     root = object_of(meta, path, META, "means, scales, quats and sh0")
-    place = root.place
     version = root.fields.get("version", 1)
     if version not in (1, 2) or (version == 2) != ("version" in meta):
-        raise place.wrong("version", "2, or left out", version)
+        raise root.place.wrong("version", "2, or left out", version)
     count = _count(root, version)
     check_count(path, count)
     used = [key for key in ("means", "quats", "scales", "sh0", "shN") if meta.get(key)]
     parts = {key: _part(path, root, key, count, fetch) for key in used}
     lacking = [key for key in ("means", "quats", "scales", "sh0") if key not in parts]
     if lacking:
-        raise place.error(f"{lacking[0]} is missing")
+        raise root.place.error(f"{lacking[0]} is missing")
     palette = _palette(parts["shN"], version) if "shN" in parts else torch.zeros(1, 0, 3)
     degree = round((palette.shape[1] + 1) ** 0.5) - 1
     convention, evidence, flat = _meaning(meta)
@@ -136,16 +135,14 @@ def _part(path: Path, root: Entry, key: str, count: int, fetch: Fetch) -> Part:
     wanted = 2 if key in ("means", "shN") else 1
     if not isinstance(files, list) or len(files) != wanted:
         raise entry.place.wrong("files", f"{wanted} names", files)
-    pixels, widths = [], []
+    images = []
     for index, file in enumerate(files):
         if not isinstance(file, str) or not FILE.fullmatch(file):
             raise entry.place.wrong("files", "names of plain files beside meta.json", file)
         palette = key == "shN" and index == 0
         noisy = key == "means" and index == 0  # low bytes do not compress: the size tells the count
-        rgba, width = _image(path, file, fetch, None if palette else count, noisy)
-        pixels.append(rgba)
-        widths.append(width)
-    return Part(entry, pixels, widths)
+        images.append(_image(path, file, fetch, None if palette else count, noisy))
+    return Part(entry, [pixels for pixels, _ in images], images[0][1])
 
 
 def _image(path: Path, file: str, fetch: Fetch, count: int | None, noisy: bool) -> tuple[np.ndarray, int]:
@@ -154,13 +151,12 @@ def _image(path: Path, file: str, fetch: Fetch, count: int | None, noisy: bool) 
     data = fetch(file, IMAGE_MEMORY * most + whole_limit("SLACK"))
     if noisy:
         check_growth(path, IMAGE_MEMORY * (count or 0), len(data))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # Pillow's, about large images; the check below is stricter
-        with Image.open(io.BytesIO(data), formats=["WEBP"]) as image:
-            width, height = image.size
-            if width * height > most or width * height < (count or 1):
-                raise FormatError(path, f"{file} has {width}x{height} px, and {count or most:,} are wanted")
-            return np.asarray(image.convert("RGBA")).reshape(-1, 4), width
+    # Pillow warns about large images; the check below is stricter
+    with warnings.catch_warnings(action="ignore"), Image.open(io.BytesIO(data), formats=["WEBP"]) as image:
+        width, height = image.size
+        if width * height > most or width * height < (count or 1):
+            raise FormatError(path, f"{file} has {width}x{height} px, and {count or most:,} are wanted")
+        return np.asarray(image.convert("RGBA")).reshape(-1, 4), width
 
 
 def _meaning(meta: dict[str, Any]) -> tuple[Convention, str, bool]:
@@ -177,7 +173,7 @@ def _meaning(meta: dict[str, Any]) -> tuple[Convention, str, bool]:
 
 def _palette(part: Part, version: int) -> Float[Tensor, "p c 3"]:
     """The harmonics that labels index."""
-    width = part.widths[0]
+    width = part.width
     coefficients = {3: 3, 8: 8, 15: 15}.get(width // PALETTE_ROW)
     if coefficients is None or width % PALETTE_ROW:
         raise part.entry.place.error(f"the palette's image is {width} px wide; 192, 512 or 960 expected")
