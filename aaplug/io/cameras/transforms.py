@@ -154,13 +154,12 @@ def _frame_notes(document: dict[str, Any], exported: bool, parser: Dataparser | 
 
 def _held_out(file: Path, document: dict[str, Any], paths: Sequence[str]) -> tuple[bool, ...] | None:
     """Whether nerfstudio's lists of file names keep each frame from training; None without lists."""
-    place = Place(file, "lists of file names")
     lists = {key: document[key] for key in SPLITS if key in document}
     if SPLITS[0] not in lists:
         return None
     for key, listed in lists.items():
         if not isinstance(listed, list) or not all(isinstance(p, str) for p in listed):
-            raise place.wrong(key, "a list of paths", listed)
+            raise Place(file, "lists of file names").wrong(key, "a list of paths", listed)
     train = set(lists[SPLITS[0]])
     return tuple(path not in train for path in paths)
 

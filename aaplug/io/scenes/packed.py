@@ -41,8 +41,7 @@ def gunzip(data: bytes, size: int) -> bytes:
 
 def unzstd(data: bytes, size: int, path: Path) -> bytes:
     """Decompress a zstd stream of `size` bytes."""
-    inflater = zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW)
-    with inflater.stream_reader(io.BytesIO(data)) as stream:
+    with zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW).stream_reader(io.BytesIO(data)) as stream:
         inflated = stream.read(size + 1)
     if len(inflated) != size:
         raise FormatError(path, f"a stream inflates to {len(inflated):,} bytes where {size:,} are promised")

@@ -46,8 +46,7 @@ def open_scene(path: Path, options: Options) -> SceneFile:
 def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: Options) -> None:
     """Write a scene part by part; harmonics above degree 0 and the convention are lost."""
     with replacing(path, overwrite) as stream:
-        for part in parts:
-            stream.write(_records(part).tobytes())
+        stream.writelines(_records(part).tobytes() for part in parts)
 
 
 def _rows(path: Path, start: int, stop: int) -> Gaussians:
