@@ -47,7 +47,7 @@ def read_batch(path: str | PathLike[str]) -> BatchFile:
         file = settings.get("scene") or settings.get("model_path")
         if not (named := settings.pop("name", None)) and not isinstance(file, str):
             raise FormatError(path, f"[[scene]] {number}: names no scene; add scene = ... as text")
-        name = named or Path(file).stem or file
+        name = named or Path(str(file)).stem or file
         if not isinstance(name, str) or name.casefold() in map(str.casefold, scenes):
             raise FormatError(path, f"[[scene]] {number}: needs a name of its own, not {name!r}; add name = ...")
         scenes[name] = settings

@@ -153,4 +153,5 @@ def _decoded(records: Records, level: int, sh_range: tuple[float, float], degree
 def _joined(scenes: list[Gaussians], degree: int) -> Gaussians:
     none = [torch.zeros(0, *shape) for shape in ((3,), (4,), (3,), (), ((degree + 1) ** 2, 3))]
     parts = [(s.means, s.quats, s.log_scales, s.logit_opacities, s.sh) for s in scenes]
-    return Gaussians(*(torch.cat(columns) for columns in zip(none, *parts, strict=True)))
+    means, quats, log_scales, logits, sh = (torch.cat(columns) for columns in zip(none, *parts, strict=True))
+    return Gaussians(means, quats, log_scales, logits, sh)

@@ -223,8 +223,9 @@ def _records(header: Header, scene: Gaussians) -> np.ndarray:
         was = old[p.name] if old is not None and p.name in (old.dtype.names or ()) else None
         if p.name in known and not at_once:
             new = values[:, known.index(p.name)]
-            kept = was is not None and p.code != "f4"
-            records[p.name] = np.where(was.astype(np.float32) == new, was, new) if kept else new
+            if was is not None and p.code != "f4":
+                new = np.where(was.astype(np.float32) == new, was, new)
+            records[p.name] = new
         elif p.name not in known and was is not None:
             records[p.name] = was
     return records

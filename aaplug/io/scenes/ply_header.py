@@ -215,8 +215,9 @@ def check_size(header: Header, actual: int) -> None:
             need = f"the values that its header promises need {least:,} bytes at least"
             raise FormatError(header.path, f"is cut short: {need}, and it has {actual:,}")
         return
-    least, vertex = header.size + sum(e.least_size for e in header.elements), header.vertex
+    least = header.size + sum(e.least_size for e in header.elements)
     if actual < least:
+        vertex = header.vertex
         room = (actual - header.start_of(vertex)) // max(1, vertex.stride)
         what = f"its header promises {least:,} bytes and it has {actual:,}"
         whole = f"{max(0, min(vertex.count, room)):,} of {vertex.count:,} Gaussians are whole"
