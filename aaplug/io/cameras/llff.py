@@ -52,8 +52,7 @@ def read(path: Path, options: Options) -> CameraSet:
 def _rows(file: Path) -> np.ndarray:
     read_bounded(file, whole_limit("JSON"))
     try:
-        # mapping the file refuses a size that it does not have
-        rows = np.load(file, mmap_mode="r", allow_pickle=False)
+        rows = np.load(file, mmap_mode="r", allow_pickle=False)  # mapping refuses a size that the file does not have
     except Exception as error:  # numpy raises ValueError, EOFError, SyntaxError and others
         raise FormatError(file, "is not a .npy file of numbers") from error
     if not (isinstance(rows, np.ndarray) and rows.ndim == 2 and rows.shape[1] == COLUMNS and len(rows)):
