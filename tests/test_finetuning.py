@@ -15,13 +15,12 @@ from aaplug.core.sampling import sampling_bounds
 from aaplug.core.training import TrainingViews
 from aaplug.evaluation.truth import MEMORY, Truth, back_projected, own_look
 from aaplug.finetuning import loop
-from aaplug.finetuning.checkpoints import load, save
 from aaplug.finetuning.densification import MIN_OPACITY, SHRINK, THRESHOLD, carried, densify
 from aaplug.finetuning.loop import advance, loss_at, run
 from aaplug.finetuning.losses import LOSSES, l1_dssim, l2, structural_similarity
 from aaplug.finetuning.parameters import RATES, between, extent, least_log_scales, leaves_of, scene_of
 from aaplug.finetuning.settings import QUICK, Settings, balanced
-from aaplug.finetuning.state import State, TuningJob, begin
+from aaplug.finetuning.state import State, TuningJob, begin, load, save
 from aaplug.methods.recipes import RECIPES
 from aaplug.rasterizers import RASTERIZERS
 from aaplug.verbs.finetune import finetune

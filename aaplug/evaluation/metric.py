@@ -53,12 +53,7 @@ class Metric:
     prepare: Callable[[MetricOptions], "Metric"] | None = None
 
     def prepared(self, options: MetricOptions) -> "Metric":
-        """The metric as the options ask for it.
-
-        Raises:
-            UsageError: an option that it needs is missing.
-            FormatError: a file that an option names cannot be read.
-        """
+        """The metric as the options ask for it; raises UsageError or FormatError where it lacks what it needs."""
         return self if self.prepare is None else self.prepare(options)
 
     def compare(self, image: Image, truth: Image) -> float | None:

@@ -2,7 +2,7 @@
 
 import csv
 import io
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
@@ -64,6 +64,11 @@ class Report:
         """Scales in the order of measurement."""
         return tuple(dict.fromkeys(m.scale for m in self.measurements))
 
+    @property
+    def notes(self) -> list[str]:
+        """Why values are undefined, each reason once."""
+        return list(dict.fromkeys(m.note for m in self.measurements if m.note))
+
     def select(self, recipe: str, scale: float) -> tuple[Measurement, ...]:
         """Measurements of every view."""
         return tuple(m for m in self.measurements if m.recipe == recipe and m.scale == scale)
@@ -71,8 +76,8 @@ class Report:
     def with_more(self, other: "Report") -> "Report":
         """Join two reports of the same protocol."""
         recipes = {**self.protocol["recipes"], **other.protocol["recipes"]}
-        measurements, protocol = (self.measurements + other.measurements, {**self.protocol, "recipes": recipes})
-        return Report(measurements, protocol, self.measured + other.measured)
+        protocol = {**self.protocol, "recipes": recipes}
+        return Report(self.measurements + other.measurements, protocol, self.measured + other.measured)
 
 
 def mean(measurements: Iterable[Measurement], metric: str) -> float | None:
@@ -97,17 +102,9 @@ def tables(report: Report) -> list[Table]:
         variant = report.protocol.get("metrics", {}).get(metric.name, "").partition(":")
         flavour = f" {variant[0]}" if variant[1] and " " not in variant[0] else ""
         unit = f" [{metric.unit}]" if metric.unit else ""
-        grid = _grid(f"{metric.name}{flavour}{unit}, {what}", report)
-        for recipe, row in zip(report.recipes, rows(report, metric), strict=True):
-            cells = [f"[bold]{text}[/]" if best else text for text, best in row]
-            grid.add_row(recipe, *cells, style="italic" if recipe == CEILING else None)
-        grids.append(grid)
-    for title, lines in work(report):
-        grid = _grid(title, report)
-        for recipe, cells in zip(report.recipes, lines, strict=True):
-            grid.add_row(recipe, *cells)
-        grids.append(grid)
-    return grids
+        lines = [[f"[bold]{text}[/]" if best else text for text, best in row] for row in rows(report, metric)]
+        grids.append(_grid(f"{metric.name}{flavour}{unit}, {what}", report, lines, "italic"))
+    return grids + [_grid(title, report, lines) for title, lines in work(report)]
 
 
 def rows(report: Report, metric: Metric) -> list[list[tuple[str, bool]]]:
@@ -128,37 +125,39 @@ def work(report: Report) -> list[tuple[str, list[list[str]]]]:
     columns = [("seconds a view", seconds, 3)]
     if any(m.evaluations is not None for m in report.measurements):
         columns.append(("million evaluations a view", million_evaluations, 2))
+
+    def text(value: float | None, digits: int) -> str:
+        return "–" if value is None else f"{value:.{digits}f}"
+
     return [
-        (
-            title,
-            [[_figure(column(report, recipe, scale), digits) for scale in report.scales] for recipe in report.recipes],
-        )
+        (title, [[text(column(report, recipe, scale), digits) for scale in report.scales] for recipe in report.recipes])
         for title, column, digits in columns
     ]
 
 
 def results(report: Report) -> dict[str, Any]:
     """INRIA's results.json, {method: {metric: mean}}, methods named recipe@scale; the protocol is "_aaplug"."""
-    methods = {
-        method(recipe, scale): {m.name: mean(report.select(recipe, scale), m.name) for m in report.metrics}
-        for recipe in report.recipes
-        for scale in report.scales
-    }
-    return methods | {"_aaplug": dict(report.protocol) | {"notes": _notes(report)}}
+    return _by_method(report, lambda views: {m.name: mean(views, m.name) for m in report.metrics})
 
 
 def per_view(report: Report) -> dict[str, Any]:
     """INRIA's per_view.json, {method: {metric: {view: value}}}, and samples per pixel side, seconds, evaluations."""
-    methods: dict[str, Any] = {}
-    for recipe in report.recipes:
-        for scale in report.scales:
-            views = report.select(recipe, scale)
-            columns: dict[str, Any] = {m.name: {v.view: v.values.get(m.name) for v in views} for m in report.metrics}
-            columns["samples"] = {v.view: v.samples for v in views}
-            columns["seconds"] = {v.view: round(v.seconds, 4) for v in views}
-            columns["evaluations"] = {v.view: v.evaluations for v in views}
-            methods[method(recipe, scale)] = columns
-    return methods | {"_aaplug": dict(report.protocol) | {"notes": _notes(report)}}
+    return _by_method(
+        report,
+        lambda views: (
+            {m.name: {v.view: v.values.get(m.name) for v in views} for m in report.metrics}
+            | {
+                "samples": {v.view: v.samples for v in views},
+                "seconds": {v.view: round(v.seconds, 4) for v in views},
+                "evaluations": {v.view: v.evaluations for v in views},
+            }
+        ),
+    )
+
+
+def _by_method(report: Report, content: Callable[[tuple[Measurement, ...]], dict[str, Any]]) -> dict[str, Any]:
+    methods = {method(r, s): content(report.select(r, s)) for r in report.recipes for s in report.scales}
+    return methods | {"_aaplug": dict(report.protocol) | {"notes": report.notes}}
 
 
 def as_csv(reports: Mapping[str, Report]) -> str:
@@ -197,22 +196,17 @@ def _mean(values: list[float]) -> float | None:
     return sum(values) / len(values) if values else None
 
 
-def _figure(value: float | None, digits: int) -> str:
-    return "–" if value is None else f"{value:.{digits}f}"
-
-
-def _notes(report: Report) -> list[str]:
-    return list(dict.fromkeys(m.note for m in report.measurements if m.note))
-
-
 def _best(report: Report, metric: Metric, scale: float) -> float | None:
     values = [mean(report.select(r, scale), metric.name) for r in report.recipes if r != CEILING]
     return min((value for value in values if value is not None), key=metric.loss, default=None)
 
 
-def _grid(title: str, report: Report) -> Table:
+def _grid(title: str, report: Report, lines: list[list[str]], ceiling: str | None = None) -> Table:
+    """A table of one line per recipe; ceiling: style of that row."""
     grid = Table(title=escape(title), title_justify="left")
     grid.add_column("recipe", no_wrap=True)
     for scale in report.scales:
         grid.add_column(scale_name(scale), justify="right", no_wrap=True)
+    for recipe, cells in zip(report.recipes, lines, strict=True):
+        grid.add_row(recipe, *cells, style=ceiling if recipe == CEILING else None)
     return grid

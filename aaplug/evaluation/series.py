@@ -46,8 +46,7 @@ class TimedRenderer:
         self._evaluations: list[int] | None = None
         if isinstance(renderer.rasterizer, CountsEvaluations):
             self._evaluations = []
-            counting = renderer.rasterizer.counting(self._evaluations.append)
-            renderer = replace(renderer, rasterizer=counting)
+            renderer = replace(renderer, rasterizer=renderer.rasterizer.counting(self._evaluations.append))
         self.renderer = renderer
 
     def __call__(self, camera: Camera) -> Drawn:
@@ -59,14 +58,14 @@ class TimedRenderer:
             rgb, alpha = self.renderer(camera)
         seconds = time.perf_counter() - started
         evaluations = None if self._evaluations is None else sum(self._evaluations)
-        samples = self.renderer.samples(camera)
-        background = self.renderer.background
+        samples, background = self.renderer.samples(camera), self.renderer.background
         return Drawn(rgb.float(), alpha.float(), background, samples, seconds, evaluations)
 
     def motion(self, camera: Camera, scale: float = 1.0) -> list[Float[Tensor, "h w 3"]]:
         """Frames, clamped to [0, 1], whose content moves by 1/4 px of the image that is `scale` times as large."""
-        shifted = (_shifted(camera, step / scale) for step in range(SHIFT_STEPS))
-        return [self(view).rgb.clamp(0, 1) for view in shifted]
+        steps = [step / scale / SHIFT_STEPS for step in range(SHIFT_STEPS)]
+        views = (replace(camera, cx=camera.cx + step, cy=camera.cy + step) for step in steps)
+        return [self(view).rgb.clamp(0, 1) for view in views]
 
 
 @dataclass(frozen=True)
@@ -85,9 +84,3 @@ class Series:
     full: Drawn | None
     smaller: Callable[[Float[Tensor, "H W 3"]], Float[Tensor, "h w 3"]]
     frames: Callable[[], tuple[Sequence[Tensor], Sequence[Tensor]]] | None
-
-
-def _shifted(camera: Camera, steps: float) -> Camera:
-    """The view with its image moved right and down by `steps` quarters of a pixel."""
-    step = steps / SHIFT_STEPS
-    return replace(camera, cx=camera.cx + step, cy=camera.cy + step)
