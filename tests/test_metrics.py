@@ -13,11 +13,20 @@ from torch.nn.functional import conv2d, pad
 
 from aaplug.core.errors import UsageError
 from aaplug.core.imaging import box_average
-from aaplug.evaluation.figures import energy_drift, flicker
 from aaplug.evaluation.metric import Metric
-from aaplug.evaluation.metrics import METRICS, SSIM, default_metrics, find_metrics, metric_option
+from aaplug.evaluation.metrics import (
+    METRICS,
+    SSIM,
+    default_metrics,
+    energy_drift,
+    find_metrics,
+    flicker,
+    flip,
+    metric_option,
+    psnr,
+    ssim,
+)
 from aaplug.evaluation.protocols import PROTOCOLS
-from aaplug.evaluation.similarity import flip, psnr, ssim
 from tests.test_lpips import lpips_weights
 
 

@@ -16,7 +16,8 @@ from torch import Tensor
 from torch.nn.functional import conv2d, max_pool2d, relu
 
 from aaplug.core.errors import FormatError, UsageError
-from aaplug.evaluation.metric import Image, LpipsFlavour, Metric, MetricOptions
+from aaplug.evaluation.metric import Image, LpipsFiles, Metric
+from aaplug.evaluation.protocols import LpipsFlavour, Protocol
 
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)  # of ImageNet in [−1, 1] (LPIPS)
 EPSILON = 1e-10  # added to a feature's length before dividing by it (LPIPS)
@@ -61,10 +62,10 @@ def lpips_metric(flavour: LpipsFlavour, trunk: str | PathLike[str], heads: str |
     return replace(LPIPS, protocol=WORDS[flavour], measure=distance)
 
 
-def _prepared(options: MetricOptions) -> Metric:
-    if options.lpips_weights is None:
+def _prepared(protocol: Protocol, files: LpipsFiles | None) -> Metric:
+    if files is None:
         raise UsageError("LPIPS", "needs weights: --lpips TRUNK HEADS")
-    return lpips_metric(options.lpips, *options.lpips_weights)
+    return lpips_metric(protocol.lpips, *files)
 
 
 def _without_weights(image: Image, truth: Image) -> None:

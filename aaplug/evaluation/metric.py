@@ -7,25 +7,15 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from jaxtyping import Float
 from torch import Tensor
 
+from aaplug.evaluation.protocols import Protocol
 from aaplug.evaluation.series import Series
 
-SsimFlavour = Literal["wang", "3dgs"]
-LpipsFlavour = Literal["3dgs", "vgg", "alex"]
 Image = Float[Tensor, "h w 3"]
-
-
-@dataclass(frozen=True)
-class MetricOptions:
-    """What a user chooses about metrics.  lpips_weights: files of the trunk and of the heads."""
-
-    ssim: SsimFlavour = "wang"
-    lpips: LpipsFlavour = "vgg"
-    lpips_weights: tuple[Path, Path] | None = None
+LpipsFiles = tuple[Path, Path]  # of the trunk and of the heads
 
 
 @dataclass(frozen=True)
@@ -39,7 +29,7 @@ class Metric:
     measure: the value for an image and the truth, both of 8 bits; None where it is undefined.
     figure: the value for images of one candidate, without a truth; None where it is undefined.
     undefined: why a value can be None, in words; reports print it as a note.
-    prepare: makes the metric that the user's options ask for; None if no option concerns it.
+    prepare: makes the metric as a protocol asks for it, with LPIPS's files; None if neither concerns it.
     """
 
     name: str
@@ -50,21 +40,15 @@ class Metric:
     measure: Callable[[Image, Image], float | None] | None = None
     figure: Callable[[Series], float | None] | None = None
     undefined: str = "undefined for this image"
-    prepare: Callable[[MetricOptions], "Metric"] | None = None
-
-    def prepared(self, options: MetricOptions) -> "Metric":
-        """The metric as the options ask for it; raises UsageError or FormatError where it lacks what it needs."""
-        return self if self.prepare is None else self.prepare(options)
+    prepare: Callable[[Protocol, LpipsFiles | None], "Metric"] | None = None
 
     def compare(self, image: Image, truth: Image) -> float | None:
         """The value of `measure`; None where that is undefined, NaN or infinite."""
-        assert self.measure is not None
-        return _finite(self.measure(image, truth))
+        return _finite(self.measure(image, truth)) if self.measure else None
 
     def of(self, series: Series) -> float | None:
         """The value of `figure`; None where that is undefined, NaN or infinite."""
-        assert self.figure is not None
-        return _finite(self.figure(series))
+        return _finite(self.figure(series)) if self.figure else None
 
     @property
     def title(self) -> str:

@@ -13,7 +13,6 @@ import math
 from collections.abc import Sequence
 from functools import partial
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -24,8 +23,8 @@ from torch import Tensor
 from aaplug.core.errors import UsageError, listing
 from aaplug.core.registry import Registry
 from aaplug.evaluation.lpips import LPIPS
-from aaplug.evaluation.metric import Image, Metric, MetricOptions, SsimFlavour
-from aaplug.evaluation.protocols import Protocol
+from aaplug.evaluation.metric import Image, LpipsFiles, Metric
+from aaplug.evaluation.protocols import Protocol, SsimFlavour
 from aaplug.evaluation.series import Series
 
 SSIM_WINDOW = 11  # px: the Gaussian of SSIM_SIGMA, cut at 3.5 sigma (Wang et al. 2004)
@@ -132,7 +131,7 @@ def _ssim(flavour: SsimFlavour, border: str) -> Metric:
         f"{flavour}: {SSIM_WINDOW}×{SSIM_WINDOW} Gaussian, sigma 1.5, {border}, channel mean",
         partial(ssim, flavour=flavour),
         undefined="image smaller than the SSIM window",
-        prepare=lambda options: SSIM[options.ssim],
+        prepare=lambda protocol, _: SSIM[protocol.ssim],
     )
 
 
@@ -176,9 +175,7 @@ METRICS: Registry[Metric] = Registry(
 )
 
 
-def find_metrics(
-    names: Sequence[str], protocol: Protocol, lpips_weights: tuple[Path, Path] | None = None
-) -> list[Metric]:
+def find_metrics(names: Sequence[str], protocol: Protocol, lpips_weights: LpipsFiles | None = None) -> list[Metric]:
     """Metrics by name, in the flavours of a protocol.
 
     names: of `METRICS`, in any case, "-" for a space: "psnr", "energy-drift".
@@ -194,8 +191,8 @@ def find_metrics(
         raise UsageError("metric", f"'{unknown[0]}' is not one of {listing(list(known), most=len(known))}")
     if len(set(wanted)) != len(wanted):
         raise UsageError("metric", "a metric is named twice")
-    options = MetricOptions(protocol.ssim, protocol.lpips, lpips_weights)
-    return [known[name].prepared(options) for name in wanted]
+    found = [known[name] for name in wanted]
+    return [metric.prepare(protocol, lpips_weights) if metric.prepare else metric for metric in found]
 
 
 def default_metrics(protocol: Protocol) -> tuple[str, ...]:

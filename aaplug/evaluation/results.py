@@ -82,7 +82,7 @@ class Report:
 
 def mean(measurements: Iterable[Measurement], metric: str) -> float | None:
     """Mean over the views where the metric is defined, None if it is nowhere."""
-    return _mean([value for m in measurements if (value := m.values.get(metric)) is not None])
+    return _mean(m.values.get(metric) for m in measurements)
 
 
 def scale_name(scale: float) -> str:
@@ -183,17 +183,17 @@ def method(recipe: str, scale: float) -> str:
 
 def seconds(report: Report, recipe: str, scale: float) -> float | None:
     """Mean rendering time of a view."""
-    return _mean([m.seconds for m in report.select(recipe, scale)])
+    return _mean(m.seconds for m in report.select(recipe, scale))
 
 
 def million_evaluations(report: Report, recipe: str, scale: float) -> float | None:
     """Mean splat-pixel evaluations of a view, in millions; None if not counted."""
-    counts = [m.evaluations for m in report.select(recipe, scale)]
-    return _mean([count / 1e6 for count in counts if count is not None])
+    return _mean(m.evaluations and m.evaluations / 1e6 for m in report.select(recipe, scale))
 
 
-def _mean(values: list[float]) -> float | None:
-    return sum(values) / len(values) if values else None
+def _mean(values: Iterable[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return sum(known) / len(known) if known else None
 
 
 def _best(report: Report, metric: Metric, scale: float) -> float | None:

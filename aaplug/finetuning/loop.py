@@ -42,14 +42,11 @@ def run(
 ) -> bool:
     """Step until the job is done or `stop()` is true; return whether it is done.
 
-    Args:
-        job: what to do.
-        state: where to begin; changed in place.
-        good: the state to return to, packed; None for the given one.
-        every: steps between calls of `keep`.
-        keep: called with the state and the last good one, also when the run stops.
-        stop: asked before every step.
-        say: called when the run rolls back.
+    state: where to begin; changed in place.
+    good: the state to return to, packed; None for the given one.
+    every: steps between calls of `keep`.
+    keep: called with the state and the last good one, also when the run stops.
+    stop: asked before every step.  say: called when the run rolls back.
 
     Raises:
         UsageError: no step has a finite gradient, at any learning rate.

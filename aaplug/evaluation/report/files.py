@@ -34,11 +34,7 @@ def write_texts(folder: str | PathLike[str], texts: Mapping[str, str], overwrite
 
 
 def write_results(report: Report, folder: str | PathLike[str], overwrite: bool, name: str = "scene") -> list[Path]:
-    """Write results.json, per_view.json and results.csv; return their paths.
-
-    Raises:
-        OutputError: a file exists and `overwrite` is false, or it cannot be written.
-    """
+    """Write results.json, per_view.json and results.csv, as `write_texts` does; return their paths."""
     texts = (as_json(results(report)), as_json(per_view(report)), as_csv({name: report}))
     return write_texts(folder, dict(zip(RESULTS, texts, strict=True)), overwrite)
 
@@ -48,9 +44,7 @@ def write_page(
 ) -> list[Path]:
     """Write report.html, and its plots as PNG and SVG into plots/; return both paths.
 
-    Raises:
-        OutputError: a file exists and `overwrite` is false, or it cannot be written.
-        FormatError: an image that the page shows is missing.
+    Raises OutputError as `write_texts` does, and FormatError where an image that the page shows is missing.
     """
     # matplotlib takes most of a second to import
     from aaplug.evaluation.report.plots import plots
