@@ -12,11 +12,10 @@ from aaplug.core.imaging import box_average, quantised
 from aaplug.core.training import TrainingViews
 from aaplug.evaluation.engine import NO_PHOTOGRAPH, Candidate, Task, candidates_of, compare, evaluate
 from aaplug.evaluation.image_store import ImageStore
-from aaplug.evaluation.metric import Metric
+from aaplug.evaluation.metric import Metric, TimedRenderer
 from aaplug.evaluation.metrics import CONSISTENCY, ENERGY, FLICKER, METRICS, PSNR, SSIM, psnr
 from aaplug.evaluation.protocols import PROTOCOLS
 from aaplug.evaluation.results import CEILING, as_csv, mean, per_view, results, scale_name, tables
-from aaplug.evaluation.series import TimedRenderer
 from aaplug.evaluation.truth import KEPT, Truth, back_projected, own_look
 from aaplug.io.images import read_image, write_png
 from aaplug.methods.recipes import RECIPES, find_recipe

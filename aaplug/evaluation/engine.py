@@ -24,11 +24,10 @@ from aaplug.core.monitor import Tell
 from aaplug.core.training import TrainingViews
 from aaplug.evaluation.image_store import ImageStore
 from aaplug.evaluation.journal import Journal
-from aaplug.evaluation.metric import Image, Metric
+from aaplug.evaluation.metric import Drawn, Image, Metric, Series, TimedRenderer
 from aaplug.evaluation.metrics import PSNR, SSIM
 from aaplug.evaluation.protocols import Protocol
 from aaplug.evaluation.results import CEILING, Measurement, Report
-from aaplug.evaluation.series import Drawn, Series, TimedRenderer
 from aaplug.evaluation.truth import Truth, ViewTruth, source_of
 from aaplug.io.photographs import DOWNSCALES
 from aaplug.methods.recipe import Recipe
@@ -116,8 +115,6 @@ def evaluate(
 
     Raises:
         UsageError: nothing to measure, a view lacks the photograph it needs, or the journal is of another request.
-        FormatError: a photograph cannot be read.
-        OutputError: the journal or an image cannot be written.
     """
     task = replace(task, views=_distinct(task.views))
     _check(task)

@@ -30,11 +30,7 @@ class ImageStore:
     everything: bool = False
 
     def keep(self, view: int, recipe: str, scale: float, image: Image, truth: Image | None) -> None:
-        """Store one image and its truth, wherever they belong.
-
-        Raises:
-            OutputError: it cannot be written.
-        """
+        """Store one image and its truth, wherever they belong."""
         folders = [SHOWN] if view in self.shown else []
         if self.everything and truth is not None and recipe != CEILING:
             folders.append(EVERYTHING)

@@ -59,7 +59,12 @@ class Journal:
             lines = _whole_lines(stream)
             if not lines:
                 return
-            _check_same(self.path, lines[0].get("request"), self._request)
+            before, now = lines[0].get("request"), self._request
+            before = before if isinstance(before, dict) else {}
+            changed = dict.fromkeys(key for key in (*now, *before) if before.get(key) != now.get(key))
+            if changed:
+                what = f"is of another request ({listing(list(changed))} changed since)"
+                raise UsageError(str(self.path), f"{what}; repeat that request, or start again with `overwrite`")
             for line in lines[1:]:
                 self.known[line["view"]] = tuple(Measurement(**m) for m in line["measurements"])
             stack.pop_all()  # keeps the stream open
@@ -95,14 +100,6 @@ def _whole_lines(stream: BinaryIO) -> list[dict[str, Any]]:
     stream.seek(end)
     stream.truncate()
     return found
-
-
-def _check_same(path: Path, before: Any, now: Mapping[str, Any]) -> None:
-    before = before if isinstance(before, dict) else {}
-    changed = dict.fromkeys(key for key in (*now, *before) if before.get(key) != now.get(key))
-    if changed:
-        what = f"is of another request ({listing(list(changed))} changed since)"
-        raise UsageError(str(path), f"{what}; repeat that request, or start again with `overwrite`")
 
 
 def _lock(stream: BinaryIO, path: Path) -> None:

@@ -23,9 +23,8 @@ from torch import Tensor
 from aaplug.core.errors import UsageError, listing
 from aaplug.core.registry import Registry
 from aaplug.evaluation.lpips import LPIPS
-from aaplug.evaluation.metric import Image, LpipsFiles, Metric
+from aaplug.evaluation.metric import Image, LpipsFiles, Metric, Series
 from aaplug.evaluation.protocols import Protocol, SsimFlavour
-from aaplug.evaluation.series import Series
 
 SSIM_WINDOW = 11  # px: the Gaussian of SSIM_SIGMA, cut at 3.5 sigma (Wang et al. 2004)
 SSIM_SIGMA = 1.5  # px

@@ -10,7 +10,7 @@ from typing import Any
 from rich.markup import escape
 from rich.table import Table
 
-from aaplug.evaluation.metric import Metric
+from aaplug.evaluation.metric import Metric, number
 from aaplug.evaluation.metrics import METRICS, PSNR, SSIM
 
 CEILING = "training size, resampled"  # a row of every table: the own training-size look
@@ -53,6 +53,11 @@ class Report:
         names = dict.fromkeys(name for m in self.measurements for name in m.values)
         given = {metric.name: metric for metric in self.measured}
         return tuple(given.get(name) or METRICS[name] for name in names) or (PSNR, SSIM["wang"])
+
+    @property
+    def compared(self) -> tuple[Metric, ...]:
+        """Those that compare with the truth; reports show the first of them most."""
+        return tuple(metric for metric in self.metrics if metric.measure is not None)
 
     @property
     def recipes(self) -> tuple[str, ...]:
@@ -125,12 +130,11 @@ def work(report: Report) -> list[tuple[str, list[list[str]]]]:
     columns = [("seconds a view", seconds, 3)]
     if any(m.evaluations is not None for m in report.measurements):
         columns.append(("million evaluations a view", million_evaluations, 2))
-
-    def text(value: float | None, digits: int) -> str:
-        return "–" if value is None else f"{value:.{digits}f}"
-
     return [
-        (title, [[text(column(report, recipe, scale), digits) for scale in report.scales] for recipe in report.recipes])
+        (
+            title,
+            [[number(column(report, recipe, scale), digits) for scale in report.scales] for recipe in report.recipes],
+        )
         for title, column, digits in columns
     ]
 

@@ -20,9 +20,8 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.core.imaging import quantised, resampled
 from aaplug.core.interfaces import Colour, Rasterizer
 from aaplug.core.training import TrainingViews
-from aaplug.evaluation.metric import Image
+from aaplug.evaluation.metric import Drawn, Image, TimedRenderer
 from aaplug.evaluation.protocols import PROTOCOLS, Protocol, TruthSource, median_depth
-from aaplug.evaluation.series import Drawn, TimedRenderer
 from aaplug.evaluation.upsamplers import Upsampler, bicubic
 from aaplug.io.photographs import DOWNSCALES, Photograph
 from aaplug.methods.recipe import Recipe
@@ -95,11 +94,6 @@ class Truth:
         """The colour behind the scene."""
         return self.own.background
 
-    @property
-    def rounds(self) -> bool:
-        """Whether images are rounded to 8 bits before they are compared; photographs are of 8 bits already."""
-        return self.source == "self" or self.memory is not None
-
     def __call__(self, view: Camera, scale: float) -> Image:
         """The image of a view, given at the training size, at a scale where there is a truth."""
         image = ViewTruth(self, view).image(scale)
@@ -149,9 +143,10 @@ class ViewTruth:
         return self.truth.protocol.resized(self.look.rgb.clamp(0, 1), self.camera(scale), scale)
 
     def compared(self, scale: float) -> Image | None:
-        """The image that renders are compared with; None where there is no truth."""
+        """The image that renders are compared with, in 8 bits as photographs are; None where there is no truth."""
         image = self.image(scale)
-        return quantised(image) if image is not None and self.truth.rounds else image
+        rounds = self.truth.source == "self" or self.truth.memory is not None
+        return quantised(image) if image is not None and rounds else image
 
     def image(self, scale: float) -> Image | None:
         """The truth at a scale, before rounding; None where there is none."""
@@ -176,15 +171,10 @@ class ViewTruth:
         elif truth.own.training.relative_rate(camera) <= 1:
             return self.resized_look(scale)
         if truth.enlarge is not None:
-            return truth.enlarge(truth.own, self._full, camera).clamp(0.0, 1.0)
+            photographed = truth.source == "photographs"
+            full = self._photograph.at(self._photograph.hw, 1.0) if photographed else self.look.rgb.clamp(0.0, 1.0)
+            return truth.enlarge(truth.own, full, camera).clamp(0.0, 1.0)
         return None if truth.source == "photographs" else self._shown(camera, find_recipe("auto", quality="best"))
-
-    @property
-    def _full(self) -> Image:
-        """The larger image that the truth is made from."""
-        if self.truth.source == "photographs":
-            return self._photograph.at(self._photograph.hw, 1.0)
-        return self.look.rgb.clamp(0.0, 1.0)
 
     @cached_property
     def _photograph(self) -> Photograph:

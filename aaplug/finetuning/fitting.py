@@ -40,19 +40,11 @@ def steps_for(scene: Gaussians, viewer: Viewer) -> int:
 def fit(
     scene: Gaussians, viewer: Viewer, look: Renderer, views: Sequence[Camera], steps: int, monitor: Monitor = SILENT
 ) -> Fitted:
-    """Convert a scene for a viewer.
+    """Convert a scene for a viewer; raises as `fuse_for` and `tune` do.
 
-    Args:
-        scene: as it was read.
-        viewer: that will show it.
-        look: draws the scene as training showed it, which the viewer should show.
-        views: to measure on; a few of them are taken.
-        steps: of the optimization; 0 keeps the closed form.
-        monitor: receives messages and progress.
-
-    Raises:
-        UsageError: something is fused already, or no gradient is finite.
-        KeyboardInterrupt: Ctrl-C was pressed.
+    look: draws the scene as training showed it, which the viewer should show.
+    views: to measure on; a few of them are taken.
+    steps: of the optimization; 0 keeps the closed form.
     """
     truth = Truth(look, enlarge=back_projected, memory=MEMORY)
     original = replace(look, recipe=RECIPES[viewer.recipe])

@@ -108,10 +108,8 @@ def _roll_back(job: TuningJob, state: State, good: Mapping[str, Any], say: Calla
         raise UsageError("finetune", f"has no finite gradient at step {step}, after {MAX_ROLLBACKS} rollbacks")
     vars(state).update(vars(unpacked(good, job)))
     state.step, state.bad_steps, state.rollbacks = step, 0, rollbacks
-    say(
-        f"step {step}: {MAX_BAD_STEPS} steps without a finite gradient; "
-        f"back to step {good['step']}, at half the learning rates"
-    )
+    back = f"back to step {good['step']}, at half the learning rates"
+    say(f"step {step}: {MAX_BAD_STEPS} steps without a finite gradient; {back}")
 
 
 def _drawn(settings: Settings, views: Sequence[Camera], step: int) -> tuple[Camera, dict[float, float]]:

@@ -26,14 +26,10 @@ RECENT = 20  # steps over which the reported loss is averaged
 def tune(
     job: TuningJob, checkpoint: Path | None = None, every: int = 100, resume: bool = False, monitor: Monitor = SILENT
 ) -> State:
-    """Run a job to its end.
+    """Run a job to its end, from the checkpoint if `resume`; see `load` and `run` for what they raise.
 
-    Ctrl-C stops it after the current step, once the checkpoint is written; a second Ctrl-C stops it at once.
-
-    Raises:
-        KeyboardInterrupt: Ctrl-C was pressed.
-        FormatError, UsageError: there is nothing to resume, or it is of another run; or no gradient is finite.
-        OutputError: the checkpoint cannot be written.
+    Ctrl-C stops it after the current step, once the checkpoint is written; a second Ctrl-C stops it at once.  Both
+    raise KeyboardInterrupt.
     """
     state, good = load(checkpoint, job) if resume and checkpoint else (begin(job), None)
     if resume:

@@ -116,11 +116,7 @@ def unpacked(data: Mapping[str, Any], job: TuningJob) -> State:
 
 
 def save(path: Path, job: TuningJob, state: State, good: Mapping[str, Any]) -> None:
-    """Write the state and the last good one, replacing an older checkpoint.
-
-    Raises:
-        OutputError: it cannot be written; an older checkpoint is then still whole.
-    """
+    """Write the state and the last good one; if that fails, an older checkpoint is still whole."""
     content = {"format": FORMAT, "job": _facts(job), "state": packed(state), "good": dict(good)}
     with replacing(path, overwrite=True) as stream:
         torch.save(content, stream)

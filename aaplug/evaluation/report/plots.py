@@ -6,8 +6,7 @@ Text is drawn literally (no TeX), so that names may hold any character.  Output 
 import io
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import cycle
 from typing import Any
@@ -29,6 +28,7 @@ PAPER_INK = "#1c2733"
 SIZE = (5.2, 3.3)  # inches
 DPI = 160  # of a PNG
 BOUNDS = "sampling-bounds"
+INKED = ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color")
 STYLE: dict[Any, Any] = {
     "text.parse_math": False,
     "svg.fonttype": "none",
@@ -69,23 +69,15 @@ class Plot:
         return re.sub(r'<svg ([^>]*?)width="[^"]*" height="[^"]*"', r"<svg \1", text, count=1)
 
     def _saved(self, kind: str, ink: str, **settings: Any) -> bytes:
-        stream = io.BytesIO()
-        with _style(ink):
+        stream, parts = io.BytesIO(), dict.fromkeys(INKED, ink)
+        with mpl.rc_context({**STYLE, **parts}):
             self.draw(ink).savefig(stream, format=kind, bbox_inches="tight", **settings)
         return stream.getvalue()
 
 
-@contextmanager
-def _style(ink: str) -> Iterator[None]:
-    parts = ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color")
-    with mpl.rc_context({**STYLE, **dict.fromkeys(parts, ink)}):
-        yield
-
-
 def plots(report: Report, found: Coverage) -> list[Plot]:
     """Everything that a report draws: metrics against the truth, time and work over scale, and the sampling bounds."""
-    compared = [metric for metric in report.metrics if metric.measure is not None]
-    curves = [_metric_curves(metric, report) for metric in compared]
+    curves = [_metric_curves(metric, report) for metric in report.compared]
     curves.append(_curves("seconds", "seconds a view", seconds, report, from_zero=True))
     title = "million splat-pixel evaluations a view"
     curves.append(_curves("evaluations", title, million_evaluations, report, from_zero=True))

@@ -9,6 +9,7 @@ import hashlib
 import json
 from collections.abc import Mapping
 from importlib.resources import files
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -35,12 +36,9 @@ Key = tuple[int, float, str]  # view, scale, and a recipe or TRUTH
 
 
 def page(name: str, report: Report, found: Coverage, drawn: list[Plot], images: ImageStore) -> str:
-    """The page's text.
-
-    Raises:
-        FormatError: an image that the page shows is missing.
-    """
-    template, style, script = map(_source, ("page.html.j2", "page.css", "page.js"))
+    """The page's text; raises FormatError where an image that it shows is missing."""
+    sources = (files(__name__).joinpath(name) for name in ("page.html.j2", "page.css", "page.js"))
+    template, style, script = (source.read_text(encoding="utf-8") for source in sources)
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     return environment.from_string(template).render(
         name=name,
@@ -64,13 +62,9 @@ def page(name: str, report: Report, found: Coverage, drawn: list[Plot], images: 
     )
 
 
-def _source(name: str) -> str:
-    return files("aaplug.evaluation.report.webpage").joinpath(name).read_text(encoding="utf-8")
-
-
 def _headline(report: Report) -> dict[str, str] | None:
     """Best and worst recipe at the scale farthest below the training size; None where nothing was compared."""
-    metric = _first_compared(report)
+    metric = next(iter(report.compared), None)
     if metric is None:
         return None
     for scale in sorted(report.scales, key=lambda s: min(s, 1 / s)):
@@ -129,11 +123,6 @@ def _gallery(report: Report, images: ImageStore) -> dict[str, Any]:
     }
 
 
-def _first_compared(report: Report) -> Metric | None:
-    """The first of the report's metrics that compares with the truth: the headline and the viewer show it."""
-    return next((metric for metric in report.metrics if metric.measure is not None), None)
-
-
 def _with_unit(metric: Metric, value: float | None) -> str:
     """A value in words: 31.20 dB."""
     return f"{metric.text(value)} {metric.unit}".rstrip()
@@ -141,32 +130,28 @@ def _with_unit(metric: Metric, value: float | None) -> str:
 
 def _shots(report: Report, images: ImageStore) -> list[dict[str, Any]]:
     """The images of every view at every scale, with their scores."""
-    files = _files(report, images)
-    uris, scores = _uris(files), _scores(report)
-    shots = []
-    for view in images.shown:
+    files, scores, shots = _files(report, images), _scores(report), []
+    uris = _uris(files)
+    for view, scale in product(images.shown, report.scales):
         name = report.protocol["view_names"][view]
-        for scale in report.scales:
-            width, height = image_size(files[view, scale, report.recipes[-1]])
-            shown = {
-                role: {"uri": uri, "score": scores.get((name, scale, role), "")}
-                for (of, at, role), uri in uris.items()
-                if (of, at) == (view, scale)
-            }
-            size = {"width": width, "height": height}
-            shots.append({"view": name, "scale": scale_name(scale), **size, "images": shown})
+        width, height = image_size(files[view, scale, report.recipes[-1]])
+        shown = {
+            role: {"uri": uri, "score": scores.get((name, scale, role), "")}
+            for (of, at, role), uri in uris.items()
+            if (of, at) == (view, scale)
+        }
+        size = {"width": width, "height": height}
+        shots.append({"view": name, "scale": scale_name(scale), **size, "images": shown})
     return shots
 
 
 def _files(report: Report, images: ImageStore) -> dict[Key, Path]:
     files: dict[Key, Path] = {}
-    for view in images.shown:
-        for scale in report.scales:
-            for recipe in report.recipes:
-                files[view, scale, recipe] = images.path(view, recipe, scale)
-            truth = images.path(view, report.recipes[-1], scale, TRUTHS)
-            if truth.is_file():
-                files[view, scale, TRUTH] = truth
+    for view, scale in product(images.shown, report.scales):
+        files |= {(view, scale, recipe): images.path(view, recipe, scale) for recipe in report.recipes}
+        truth = images.path(view, report.recipes[-1], scale, TRUTHS)
+        if truth.is_file():
+            files[view, scale, TRUTH] = truth
     return files
 
 
@@ -185,7 +170,7 @@ def _uris(files: dict[Key, Path]) -> dict[Key, str]:
 
 def _scores(report: Report) -> dict[tuple[str, float, str], str]:
     """By view, scale and recipe: the value of the report's first metric against the truth, as text."""
-    metric = _first_compared(report)
+    metric = next(iter(report.compared), None)
     return {
         (m.view, m.scale, m.recipe): _with_unit(metric, value)
         for m in report.measurements
