@@ -9,6 +9,7 @@ import math
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -225,14 +226,8 @@ class _Bench:
 
     def _series(self, truth: ViewTruth, name: str, scale: float, drawn: Drawn, full: Drawn | None) -> Series:
         camera, timed = truth.camera(scale), self.timed[name]
-
-        def smaller(image: Tensor) -> Tensor:
-            return self.task.protocol.resized(image, camera, scale)
-
-        def frames() -> tuple[list[Tensor], list[Tensor]]:
-            return timed.motion(camera), truth.motion(scale)
-
-        return Series(scale, drawn, full, smaller, frames if self.sized else None)
+        frames = (lambda: (timed.motion(camera), truth.motion(scale))) if self.sized else None
+        return Series(scale, drawn, full, partial(self.task.protocol.resized, camera=camera, scale=scale), frames)
 
 
 def _work(renderer: Renderer, camera: Camera) -> Hashable:

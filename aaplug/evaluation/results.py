@@ -114,14 +114,13 @@ def tables(report: Report) -> list[Table]:
 
 def rows(report: Report, metric: Metric) -> list[list[tuple[str, bool]]]:
     """A metric's table, recipes down and scales across: each mean as text, and whether it is the column's best."""
-    best = [_best(report, metric, scale) for scale in report.scales]
+    means = {r: [mean(report.select(r, s), metric.name) for s in report.scales] for r in report.recipes}
+    judged = [line for recipe, line in means.items() if recipe != CEILING]
+    columns = ([v for line in judged if (v := line[place]) is not None] for place in range(len(report.scales)))
+    best = [min(column, key=metric.loss, default=None) for column in columns]
     return [
-        [
-            (metric.text(value), value is not None and value == top and recipe != CEILING)
-            for scale, top in zip(report.scales, best, strict=True)
-            for value in [mean(report.select(recipe, scale), metric.name)]
-        ]
-        for recipe in report.recipes
+        [(metric.text(v), v is not None and v == top and recipe != CEILING) for v, top in zip(line, best, strict=True)]
+        for recipe, line in means.items()
     ]
 
 
@@ -198,11 +197,6 @@ def million_evaluations(report: Report, recipe: str, scale: float) -> float | No
 def _mean(values: Iterable[float | None]) -> float | None:
     known = [value for value in values if value is not None]
     return sum(known) / len(known) if known else None
-
-
-def _best(report: Report, metric: Metric, scale: float) -> float | None:
-    values = [mean(report.select(r, scale), metric.name) for r in report.recipes if r != CEILING]
-    return min((value for value in values if value is not None), key=metric.loss, default=None)
 
 
 def _grid(title: str, report: Report, lines: list[list[str]], ceiling: str | None = None) -> Table:

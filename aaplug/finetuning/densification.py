@@ -65,8 +65,8 @@ def densify(scene: Gaussians, gradients: Float[Tensor, " n"], extent: float, gen
     """Clone, split and prune; Gaussians that stay come first, in their order."""
     dense = gradients >= THRESHOLD
     large = scene.scales.amax(dim=1) > SMALL * extent
-    cloned, split = (dense & ~large).nonzero()[:, 0], (dense & large).nonzero()[:, 0]
-    kept = (~(dense & large)).nonzero()[:, 0]
+    masks = ~(dense & large), dense & ~large, dense & large
+    kept, cloned, split = (mask.nonzero()[:, 0] for mask in masks)
     sources = torch.cat([kept, cloned, split, split])
     parts = [scene[kept], scene[cloned], _halves(scene[split.repeat(2)], generator)]
     columns = {name: torch.cat([getattr(part, name) for part in parts]) for name in (*WHOLE, "sh")}

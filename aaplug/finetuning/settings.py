@@ -60,8 +60,8 @@ QUICK = replace(  # for conversion, a few minutes; `balanced` divides its weight
 def balanced(settings: Settings, errors: Mapping[float, float]) -> Settings:
     """Divide the weight of every scale by the root of the mean square error found there; errors[1.0] is the anchor's.
 
-    This lies between two extremes.  Undivided losses would sacrifice scales with small errors to those with large
-    ones; losses as shares of the errors would leave the large ones where they are.
+    Undivided losses would sacrifice scales with small errors to those with large ones; losses as shares of the errors
+    would leave the large ones where they are.
     """
     weights = {scale: weight / errors[scale] ** 0.5 for scale, weight in settings.weights.items()}
     return replace(settings, weights=weights, anchor=settings.anchor / errors[1.0] ** 0.5)

@@ -55,11 +55,6 @@ def log_multiples(scene: Gaussians, bounds: SamplingBounds) -> Float[Tensor, " s
     return extents - 0.5 * math.log(NYQUIST_VARIANCE)
 
 
-def under(multiples: Float[Tensor, " seen"]) -> int:
-    """How many Gaussians are below their bound; multiples: as `log_multiples` gives them."""
-    return int((multiples < 0).sum())
-
-
 def aliasing_begins(multiple: float, dilation: float) -> float:
     """The scale below which a Gaussian of `multiple` times its bound, drawn with `dilation` in px², aliases."""
     return (NYQUIST_VARIANCE / (NYQUIST_VARIANCE * multiple**2 + dilation)) ** 0.5
@@ -77,5 +72,6 @@ def coverage(scene: Gaussians, training: TrainingViews, scales: Sequence[float])
     extents, dilation = multiples.exp(), training.convention.kernel
     drawn = (extents.square() + dilation / NYQUIST_VARIANCE).sqrt()
     begins = aliasing_begins(float(extents.median()), dilation)
+    under = int((multiples < 0).sum())
     aliased = tuple((s, float((drawn * s < 1).double().mean())) for s in scales)
-    return Coverage(len(scene), seen, edges, counts, under(multiples) / seen, begins, aliased)
+    return Coverage(len(scene), seen, edges, counts, under / seen, begins, aliased)

@@ -12,7 +12,7 @@ from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.monitor import Tell
 from aaplug.core.sampling import check_frame, sampling_bounds
-from aaplug.inspection.coverage import log_multiples, middle_log_scales, under
+from aaplug.inspection.coverage import log_multiples, middle_log_scales
 from aaplug.io.scenes.scene_file import SceneFile
 
 PROBES = 512  # evenly spaced places in the file, from which the frame check samples
@@ -88,7 +88,7 @@ class Survey:
         self.rates.add(bounds.highest[bounds.seen].log())
         multiples = log_multiples(part, bounds)
         self.multiples.add(multiples)
-        self.under += under(multiples)
+        self.under += int((multiples < 0).sum())
 
 
 def survey(opened: SceneFile, cameras: Sequence[Camera] = (), tell: Tell = lambda done, total: None) -> Survey:

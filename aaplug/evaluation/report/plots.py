@@ -82,7 +82,9 @@ def plots(report: Report, found: Coverage) -> list[Plot]:
     title = "million splat-pixel evaluations a view"
     curves.append(_curves("evaluations", title, million_evaluations, report, from_zero=True))
     drawn = [plot for plot in curves if plot is not None]
-    return [*drawn, Plot(BOUNDS, _bounds_words(found), lambda ink: _bounds(found, ink))]
+    share = "" if found.under is None else f": {found.under:.0%} are under it"
+    words = f"Histogram of the Gaussians' extent over their sampling bound{share}"
+    return [*drawn, Plot(BOUNDS, words, lambda ink: _bounds(found, ink))]
 
 
 def _metric_curves(metric: Metric, report: Report) -> Plot | None:
@@ -140,8 +142,3 @@ def _bounds(found: Coverage, ink: str) -> Figure:
     axes.set_ylabel("Gaussians")
     axes.grid(axis="y", color=ink, alpha=0.12)
     return figure
-
-
-def _bounds_words(found: Coverage) -> str:
-    share = "" if found.under is None else f": {found.under:.0%} are under it"
-    return f"Histogram of the Gaussians' extent over their sampling bound{share}"
