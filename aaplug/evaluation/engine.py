@@ -176,7 +176,7 @@ def _request(task: Task) -> dict[str, Any]:
         "truth": task.truth.source,
         "downscale": DOWNSCALES[task.protocol.downscale if photographs else "box"].protocol,
         "rounding": "renders clamped to [0, 1] and rounded to 8 bits",
-        "background": list(task.truth.background),
+        "background": list(task.truth.own.background),
         "metrics": {metric.name: metric.protocol for metric in task.measured},
         "views": len(task.views),
         "view_names": [view.name for view in task.views],

@@ -18,7 +18,7 @@ from aaplug.core.cameras import Camera
 from aaplug.core.errors import UsageError
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.imaging import quantised, resampled
-from aaplug.core.interfaces import Colour, Rasterizer
+from aaplug.core.interfaces import Rasterizer
 from aaplug.core.training import TrainingViews
 from aaplug.evaluation.metric import Drawn, Image, TimedRenderer
 from aaplug.evaluation.protocols import PROTOCOLS, Protocol, TruthSource, median_depth
@@ -88,11 +88,6 @@ class Truth:
     enlarge: Enlarge | None = None
     memory: float | None = None
     _kept: dict[tuple[object, ...], Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
-
-    @property
-    def background(self) -> Colour:
-        """The colour behind the scene."""
-        return self.own.background
 
     def __call__(self, view: Camera, scale: float) -> Image:
         """The image of a view, given at the training size, at a scale where there is a truth."""
@@ -180,7 +175,7 @@ class ViewTruth:
     def _photograph(self) -> Photograph:
         assert self.view.photo is not None
         downscale = DOWNSCALES[self.truth.protocol.downscale]
-        return downscale.read(self.view.photo, self.truth.background, self.view.lens)
+        return downscale.read(self.view.photo, self.truth.own.background, self.view.lens)
 
     @cached_property
     def _depth(self) -> float:

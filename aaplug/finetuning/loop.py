@@ -17,7 +17,7 @@ from aaplug.core.errors import UsageError
 from aaplug.core.sampling import sampling_bounds
 from aaplug.finetuning.densification import ScreenGradients, carried, densify
 from aaplug.finetuning.losses import LOSSES
-from aaplug.finetuning.parameters import Leaves, least_log_scales, leaves_of
+from aaplug.finetuning.parameters import Leaves, extent, least_log_scales, leaves_of
 from aaplug.finetuning.settings import Settings
 from aaplug.finetuning.state import State, TuningJob, optimizer, packed, unpacked
 from aaplug.rendering.renderer import Drawing
@@ -133,7 +133,7 @@ def _finite(losses: Mapping[float, float], leaves: Leaves) -> bool:
 def _set_rates(job: TuningJob, state: State) -> None:
     share = job.settings.decay ** (state.step / job.settings.steps) * BACK_OFF**state.rollbacks
     for group in state.adam.param_groups:
-        size = job.extent if group["name"] == "means" else 1.0
+        size = extent(job.start.training.cameras) if group["name"] == "means" else 1.0
         group["lr"] = job.settings.rates[group["name"]] * size * share
 
 
@@ -152,7 +152,7 @@ def _densify(job: TuningJob, state: State) -> None:
     """Change the number of Gaussians; those that stay keep their Adam moments."""
     generator = torch.Generator().manual_seed(job.settings.seed * SEEDS + SPLIT_SEEDS + state.step)
     with torch.no_grad():
-        densified = densify(state.scene(job), state.gradients.mean, job.extent, generator)
+        densified = densify(state.scene(job), state.gradients.mean, extent(job.start.training.cameras), generator)
         moments = {
             group["name"]: carried(state.adam.state[group["params"][0]], densified) for group in state.adam.param_groups
         }

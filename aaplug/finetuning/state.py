@@ -21,7 +21,7 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.core.sampling import SamplingBounds
 from aaplug.evaluation.truth import Truth
 from aaplug.finetuning.densification import ScreenGradients
-from aaplug.finetuning.parameters import WHOLE, Leaves, extent, leaves_of, scene_of
+from aaplug.finetuning.parameters import WHOLE, Leaves, leaves_of, scene_of
 from aaplug.finetuning.settings import Settings
 from aaplug.io.atomic import replacing
 from aaplug.rendering.renderer import Renderer
@@ -44,11 +44,6 @@ class TuningJob:
     views: Sequence[Camera]
     truth: Truth
     settings: Settings
-
-    @property
-    def extent(self) -> float:
-        """The scene's size, in world units."""
-        return extent(self.start.training.cameras)
 
 
 @dataclass

@@ -103,8 +103,7 @@ def survey(opened: SceneFile, cameras: Sequence[Camera] = (), tell: Tell = lambd
 def check_frame_of(opened: SceneFile, cameras: Sequence[Camera], min_seen: float) -> float:
     """`sampling.check_frame` on Gaussians from evenly spaced places of the file."""
     step = max(PROBE_ROWS, opened.count // PROBES)
-    starts = range(0, opened.count, step)
-    means = [opened.load(a, min(a + PROBE_ROWS, opened.count)).means for a in starts]
+    means = [opened.load(a, min(a + PROBE_ROWS, opened.count)).means for a in range(0, opened.count, step)]
     sample = torch.cat(means) if means else torch.zeros(0, 3)
     sample = sample[sample.isfinite().all(dim=1)]
     return check_frame(sample, cameras, str(opened.path), min_seen)
