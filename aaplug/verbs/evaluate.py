@@ -21,9 +21,9 @@ from aaplug.core.training import TrainingViews
 from aaplug.evaluation.engine import Task, candidates_of
 from aaplug.evaluation.engine import evaluate as measure
 from aaplug.evaluation.image_store import ImageStore
-from aaplug.evaluation.metric import LpipsFlavour, Metric, SsimFlavour
+from aaplug.evaluation.metric import Metric
 from aaplug.evaluation.metrics import default_metrics, find_metrics, metric_option
-from aaplug.evaluation.protocols import PROTOCOLS, Protocol, TruthSource
+from aaplug.evaluation.protocols import PROTOCOLS, LpipsFlavour, Protocol, SsimFlavour, TruthSource
 from aaplug.evaluation.report.files import PAGE, RESULTS, write_page, write_results
 from aaplug.evaluation.results import Report
 from aaplug.evaluation.truth import Truth, own_look, source_of
