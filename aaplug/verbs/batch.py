@@ -16,7 +16,7 @@ from aaplug.core.monitor import SILENT, Monitor
 from aaplug.evaluation.report.files import as_json, write_texts
 from aaplug.evaluation.results import Report, as_csv, method, results, scale_name
 from aaplug.io.atomic import refuse_existing
-from aaplug.verbs.evaluate import Output
+from aaplug.verbs.evaluate import EvaluateOptions, Output
 
 SUMMARY, RESULTS = "batch.json", "results.csv"
 
@@ -100,7 +100,7 @@ def batch(
     folders = [Path(output) / slug for slug in _slugs([name for name, _ in runs])]
     refuse_existing([Path(output) / name for name in (SUMMARY, RESULTS)], overwrite or resume)
     for folder in folders:
-        Output(folder, resume=resume, overwrite=overwrite).check()
+        Output(folder, EvaluateOptions(resume=resume, overwrite=overwrite)).check()
     reports: dict[str, Report] = {}
     failures: dict[str, str] = {}
     for folder, (name, run) in zip(folders, runs, strict=True):

@@ -53,17 +53,8 @@ def demo(output: str | PathLike[str] = "demo-out", *, overwrite: bool = False, m
         sheet = _sheet(scene, read_scene(converted), training, view)
         write_png(folder / SHEET, sheet, overwrite=overwrite)
         monitor.say(f"wrote {folder / SHEET}")
-        return evaluate(
-            scene,
-            cameras,
-            recipe=RECIPES,
-            scale=SCALES,
-            output=folder,
-            overwrite=overwrite,
-            metric=("psnr", "ssim"),
-            name="chair",
-            monitor=monitor,
-        )
+        how = {"recipe": RECIPES, "scale": SCALES, "metric": ("psnr", "ssim"), "name": "chair"}
+        return evaluate(scene, cameras, folder, overwrite=overwrite, monitor=monitor, **how)
 
 
 @torch.no_grad()

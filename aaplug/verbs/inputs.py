@@ -1,7 +1,6 @@
 """What verbs take: scenes and cameras as objects or paths, backgrounds, rasterizers and threads by name."""
 
-import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
@@ -14,14 +13,15 @@ from aaplug.core.executors import torch_threads
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.interfaces import Colour, MatchesRates, Rasterizer, TakesMemory
 from aaplug.core.monitor import SILENT, Monitor
-from aaplug.core.sampling import MIN_SEEN_SHARE
 from aaplug.core.training import TrainingViews
+from aaplug.evaluation.truth import own_look
 from aaplug.io.cameras import read_cameras
 from aaplug.io.scenes import find_scene, read_scene
 from aaplug.methods.recipe import Recipe
 from aaplug.methods.recipes import RECIPES, find_recipe
 from aaplug.rasterizers import find_rasterizer
 from aaplug.rendering.renderer import Background, Renderer, background_colour
+from aaplug.verbs.options import RecipeOptions, ViewOptions
 
 SceneLike = Gaussians | str | PathLike[str]
 CamerasLike = CameraSet | str | PathLike[str] | None
@@ -84,44 +84,39 @@ def rasterizer_of(
     return rasterizer
 
 
-def recipes_of(names: Sequence[str], quality: str = "balanced", rate_reference: str | None = None) -> list[Recipe]:
-    """Recipes by name; the rate reference goes to those that compare rates.
+def recipe_of(recipe: str | Recipe, o: RecipeOptions) -> Recipe:
+    """A recipe as it is, or by name as the options say; the rate reference goes to those that compare rates.
 
     Raises:
         UsageError: a name is not known.
     """
-    found = []
-    for name in names:
-        matches = isinstance(RECIPES.find(name, "recipe").screen, MatchesRates)
-        reference = rate_reference if matches else None
-        found.append(find_recipe(name, quality=quality, rate_reference=reference))
-    return found
+    if isinstance(recipe, Recipe):
+        return recipe
+    matches = isinstance(RECIPES.find(recipe, "recipe").screen, MatchesRates)
+    return find_recipe(recipe, quality=o.quality, rate_reference=o.rate_reference if matches else None)
 
 
-def renderers_of(
-    scene: Gaussians,
-    cameras: CameraSet,
-    recipes: Sequence[Recipe],
-    frames: int,
-    background: Background = "auto",
-    rasterizer: str | Rasterizer = "auto",
-    memory: float | None = None,
-    cull_margin: float = math.inf,
-    min_seen: float = MIN_SEEN_SHARE,
-    monitor: Monitor = SILENT,
-) -> list[Renderer]:
-    """One renderer per recipe, with the training views, background and rasterizer in common.
+def look_of(scene: Gaussians, cameras: CameraSet, frames: int, o: ViewOptions, monitor: Monitor) -> Renderer:
+    """The scene as training showed it, with the training views, background and rasterizer that the options say.
 
-    frames: how many images they will render in all.  The others: see `Renderer.of` and `rasterizer_of`.
+    frames: how many images will be rendered in all.
 
     Raises:
         FrameError: the cameras see little of the scene.
-        UsageError: an argument does not fit, or the scene lacks what a recipe needs.
+        UsageError: an option does not fit.
     """
-    colour = background_of(background, cameras, monitor)
-    training = TrainingViews.of(scene, cameras, cull_margin, min_seen)
-    drawing = rasterizer_of(rasterizer, frames, memory, monitor)
-    return [Renderer.of(scene, training, recipe, background=colour, rasterizer=drawing) for recipe in recipes]
+    colour = background_of(o.background, cameras, monitor)
+    drawing = rasterizer_of(o.rasterizer, frames, o.memory, monitor)
+    return own_look(scene, TrainingViews.of(scene, cameras, o.cull_margin, o.min_seen), drawing, colour)
+
+
+def drawn_by(recipe: Recipe, scene: Gaussians, look: Renderer) -> Renderer:
+    """The scene as it was read, by a recipe and otherwise as its own look is drawn.
+
+    Raises:
+        UsageError: the scene lacks what the recipe needs.
+    """
+    return Renderer.of(scene, look.training, recipe, background=look.background, rasterizer=look.rasterizer)
 
 
 @contextmanager
