@@ -7,7 +7,8 @@ from importlib import import_module
 from pathlib import Path
 
 import pytest
-from aaplug_cli.main import VERBS, option_types
+from aaplug_cli.main import VERBS
+from aaplug_cli.options import option_types
 
 import aaplug
 from aaplug.core.errors import FrameError, UsageError

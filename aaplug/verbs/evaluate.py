@@ -26,7 +26,7 @@ from aaplug.evaluation.protocols import PROTOCOLS, Protocol, TruthSource
 from aaplug.evaluation.report.files import PAGE, RESULTS, write_page, write_results
 from aaplug.evaluation.results import Report
 from aaplug.evaluation.truth import Truth, source_of
-from aaplug.inspection.coverage import coverage
+from aaplug.inspection.coverage import Coverage, coverage
 from aaplug.io.atomic import refuse_existing
 from aaplug.io.cameras import select_views
 from aaplug.methods.recipe import Recipe
@@ -42,6 +42,7 @@ JOURNAL = "progress.jsonl"
 USER_NAMES = [recipe.name for recipe in USER_RECIPES]
 PACKAGES = ("aaplug", "torch", "numpy", "scikit-image", "opencv-contrib-python-headless")
 
+Layout = Literal["plain", "inria"]
 AnyPath = str | PathLike[str]
 
 
@@ -67,7 +68,7 @@ class EvaluateOptions(RecipeOptions):
     """Write report.html, one page with tables, curves and a before/after viewer, and its plots."""
     show: Annotated[str, tyro.conf.arg(metavar="N|NAME,...")] = "3"
     """Views in the report's viewer: how many, or which."""
-    layout: Literal["plain", "inria"] = "plain"
+    layout: Layout = "plain"
     """inria stores every render and its truth in test/METHOD/{renders,gt}, where other metric scripts look."""
     resume: bool = False
     """Continue an interrupted evaluation; finished views are not measured again."""
@@ -115,7 +116,8 @@ def evaluate(
         task = Task(candidates, scales, seen, Truth(look, source, rules), metrics)
         with monitor.progress(f"evaluating {name}", "views") as tell:
             found = measure(task, facts, tell, out.journal, o.resume, out.images(shown))
-    out.write(found, name, scene, look, shown, monitor)
+    bounds = coverage(scene, look.training, found.scales) if o.report else None
+    out.write(found, name, bounds, shown, monitor)
     return found
 
 
@@ -134,8 +136,8 @@ class Output:
             OutputError: the folder holds results that may not be replaced.
         """
         o = self.options
-        if o.layout not in ("plain", "inria"):
-            raise UsageError("layout", f"'{o.layout}' is not one of plain, inria")
+        if o.layout not in get_args(Layout):
+            raise UsageError("layout", f"'{o.layout}' is not one of {', '.join(get_args(Layout))}")
         needs = {"report": o.report, "layout": o.layout != "plain", "resume": o.resume}
         for parameter in (parameter for parameter, given in needs.items() if given):
             if self.folder is None:
@@ -167,13 +169,7 @@ class Output:
         return ImageStore(self.folder, shown, everything=self.options.layout == "inria")
 
     def write(
-        self,
-        report: Report,
-        name: str,
-        scene: Gaussians,
-        training: TrainingViews,
-        shown: tuple[int, ...],
-        monitor: Monitor,
+        self, report: Report, name: str, bounds: Coverage | None, shown: tuple[int, ...], monitor: Monitor
     ) -> None:
         """Write the results, and the report if it was asked for.
 
@@ -184,8 +180,7 @@ class Output:
         if self.folder is None or images is None:
             return
         written = write_results(report, self.folder, self.replaces, name)
-        if self.options.report:
-            bounds = coverage(scene, look.training, report.scales)
+        if bounds is not None:
             written += write_page(self.folder, name, report, bounds, images, self.replaces)
         for path in written:
             monitor.say(f"wrote {path}")

@@ -5,7 +5,7 @@ import inspect
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Annotated, Any, Self, TypeVar, get_args
+from typing import Annotated, Any, TypeVar, get_args
 
 import tyro
 
@@ -19,6 +19,7 @@ from aaplug.methods.research_recipes import RESEARCH_RECIPES
 from aaplug.rasterizers import RASTERIZERS
 from aaplug.rendering.renderer import Background
 
+Chosen = TypeVar("Chosen", bound="Options")
 Verb = TypeVar("Verb", bound=Callable[..., Any])
 
 
@@ -50,7 +51,7 @@ class Options:
     """The options of a verb."""
 
     @classmethod
-    def of(cls, given: Mapping[str, Any]) -> Self:
+    def of(cls: type[Chosen], given: Mapping[str, Any]) -> Chosen:
         """The options that a caller gave, and the defaults.
 
         Raises:
