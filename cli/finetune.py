@@ -31,8 +31,9 @@ class Finetune:
 def finetune(options: Finetune) -> int:
     """Optimize the Gaussians until every scale looks like the training size."""
     scene, cameras = options.scene.read(), options.cameras.read(options.scene)
-    own = {"spz_axes": options.scene.spz_axes} | vars(options.how)
-    found = verb.finetune(scene, cameras, options.output, monitor=TERMINAL, **own)
+    found = verb.finetune(
+        scene, cameras, options.output, spz_axes=options.scene.spz_axes, monitor=TERMINAL, **vars(options.how)
+    )
     if options.json:
         print_json(found.as_json())
     else:

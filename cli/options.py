@@ -5,7 +5,7 @@ The options that the library's verbs have too are stated there, in `aaplug.verbs
 
 import re
 from collections.abc import Collection
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
 
@@ -126,5 +126,5 @@ def option_types(noun: type) -> dict[str, Any]:
     hints = get_type_hints(noun)
     for field in fields(noun):
         kind = hints[field.name]
-        found |= option_types(kind) if is_dataclass(kind) else {field.name: kind}
+        found |= option_types(kind) if hasattr(kind, "__dataclass_fields__") else {field.name: kind}
     return found

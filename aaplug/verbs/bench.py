@@ -57,9 +57,6 @@ def bench(
     Args:
         scene, cameras, monitor: see `render`; without a scene, synthetic ones.
         options: fields of `BenchOptions`.
-
-    Raises:
-        AaplugError: an input cannot be read, or an option does not fit.
     """
     o = BenchOptions.of(options)
     if o.repeats < 1:

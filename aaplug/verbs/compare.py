@@ -40,9 +40,6 @@ def compare(
         cameras: a camera set, its file or folder, or None for those of the first scene's model folder.
         monitor: receives messages and progress.
         options: fields of `CompareOptions`.
-
-    Raises:
-        AaplugError: an input cannot be read, or an option does not fit.
     """
     o = CompareOptions.of(options)
     if not candidates:

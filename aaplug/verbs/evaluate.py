@@ -162,20 +162,16 @@ class Output:
         """The file that keeps what is finished."""
         return self.folder and self.folder / JOURNAL
 
-    def images(self, shown: tuple[int, ...]) -> ImageStore | None:
+    def images(self, shown: Sequence[int]) -> ImageStore | None:
         """Where images are stored: those that the report shows, and in INRIA's layout all of them."""
         if self.folder is None:
             return None
-        return ImageStore(self.folder, shown, everything=self.options.layout == "inria")
+        return ImageStore(self.folder, tuple(shown), everything=self.options.layout == "inria")
 
     def write(
         self, report: Report, name: str, bounds: Coverage | None, shown: tuple[int, ...], monitor: Monitor
     ) -> None:
-        """Write the results, and the report if it was asked for.
-
-        Raises:
-            OutputError: a file cannot be written.
-        """
+        """Write the results, and the report if it was asked for."""
         images = self.images(shown)
         if self.folder is None or images is None:
             return

@@ -34,11 +34,7 @@ def scene_of(scene: SceneLike) -> Gaussians:
 
 
 def cameras_of(cameras: CamerasLike, scene: SceneLike) -> CameraSet:
-    """The cameras themselves, those at a path, or those of the model folder that the scene is in.
-
-    Raises:
-        UsageError: no cameras are given, and the scene is in no model folder.
-    """
+    """The cameras themselves, those at a path, or those of the model folder that the scene is in."""
     if isinstance(cameras, CameraSet):
         return cameras
     if cameras is not None:
@@ -52,11 +48,7 @@ def cameras_of(cameras: CamerasLike, scene: SceneLike) -> CameraSet:
 
 
 def background_of(background: Background, cameras: CameraSet, monitor: Monitor = SILENT) -> Colour:
-    """The colour behind the scene; "auto" is reported, with its source.
-
-    Raises:
-        UsageError: the name is not known.
-    """
+    """The colour behind the scene; "auto" is reported, with its source."""
     colour = background_colour(background, cameras)
     if background == "auto":
         name = {WHITE: "white", BLACK: "black"}.get(colour, str(colour))
@@ -71,9 +63,6 @@ def rasterizer_of(
     """A rasterizer, or the one of that name for so many frames, within a memory budget.
 
     memory: GB that a frame may take beside the scene and the image; None for the rasterizer's default.
-
-    Raises:
-        UsageError: the name is not known, or the memory is not above 0.
     """
     if memory is not None and not memory > 0:
         raise UsageError("memory", f"must be above 0, got {memory:g}")
@@ -85,11 +74,7 @@ def rasterizer_of(
 
 
 def recipe_of(recipe: str | Recipe, o: RecipeOptions) -> Recipe:
-    """A recipe as it is, or by name as the options say; the rate reference goes to those that compare rates.
-
-    Raises:
-        UsageError: a name is not known.
-    """
+    """A recipe as it is, or by name as the options say; the rate reference goes to those that compare rates."""
     if isinstance(recipe, Recipe):
         return recipe
     matches = isinstance(RECIPES.find(recipe, "recipe").screen, MatchesRates)
@@ -100,10 +85,6 @@ def look_of(scene: Gaussians, cameras: CameraSet, frames: int, o: ViewOptions, m
     """The scene as training showed it, with the training views, background and rasterizer that the options say.
 
     frames: how many images will be rendered in all.
-
-    Raises:
-        FrameError: the cameras see little of the scene.
-        UsageError: an option does not fit.
     """
     colour = background_of(o.background, cameras, monitor)
     drawing = rasterizer_of(o.rasterizer, frames, o.memory, monitor)
@@ -111,21 +92,13 @@ def look_of(scene: Gaussians, cameras: CameraSet, frames: int, o: ViewOptions, m
 
 
 def drawn_by(recipe: Recipe, scene: Gaussians, look: Renderer) -> Renderer:
-    """The scene as it was read, by a recipe and otherwise as its own look is drawn.
-
-    Raises:
-        UsageError: the scene lacks what the recipe needs.
-    """
+    """The scene as it was read, by a recipe and otherwise as its own look is drawn."""
     return Renderer.of(scene, look.training, recipe, background=look.background, rasterizer=look.rasterizer)
 
 
 @contextmanager
 def processor(threads: int | None) -> Iterator[int]:
-    """Limit torch to `threads` threads inside the block (None for its own default); yields their number.
-
-    Raises:
-        UsageError: the number is below 1.
-    """
+    """Limit torch to `threads` threads inside the block (None for its own default); yields their number."""
     if threads is not None and threads < 1:
         raise UsageError("threads", f"must be 1 or more, got {threads}")
     count = torch.get_num_threads() if threads is None else threads
