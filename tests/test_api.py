@@ -78,6 +78,11 @@ def test_a_model_folder_brings_its_own_cameras(cli):  # noqa: F811
         aaplug.render("scene.ply", output="three")
 
 
+def test_an_option_that_is_none_is_refused_with_the_nearest_name():
+    with pytest.raises(UsageError, match="scal: is no option here; did you mean scale"):
+        aaplug.render("scene.ply", scal=0.5)
+
+
 @pytest.mark.parametrize("verb", VERBS)
 def test_verbs_have_the_options_of_the_command_line(verb):
     parameters = inspect.signature(getattr(aaplug, verb)).parameters

@@ -4,7 +4,6 @@ import re
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ from aaplug.evaluation.report.files import as_json, write_texts
 from aaplug.evaluation.results import Report, as_csv, method, results, scale_name
 from aaplug.io.atomic import refuse_existing
 from aaplug.verbs.evaluate import EvaluateOptions, Output
+from aaplug.verbs.inputs import AnyPath
 
 SUMMARY, RESULTS = "batch.json", "results.csv"
 
@@ -80,7 +80,7 @@ class Batch:
 
 def batch(
     runs: Sequence[tuple[str, Callable[..., Report]]],
-    output: str | PathLike[str],
+    output: AnyPath,
     *,
     resume: bool = False,
     overwrite: bool = False,
@@ -118,7 +118,7 @@ def batch(
     return found
 
 
-def _write(found: Batch, output: str | PathLike[str], monitor: Monitor) -> None:
+def _write(found: Batch, output: AnyPath, monitor: Monitor) -> None:
     texts = {SUMMARY: as_json(found.summary()), RESULTS: as_csv(found.reports)}
     for path in write_texts(output, texts, overwrite=True):  # it was checked at the start
         monitor.say(f"wrote {path}")

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from os import PathLike
 from pathlib import Path
 from typing import Annotated, Any, TypeGuard
 
@@ -21,7 +20,7 @@ from aaplug.io.scenes import SpzAxes, check_scene_output, find_scene, open_scene
 from aaplug.io.scenes.scene_file import SceneFile
 from aaplug.methods.viewers import FORMS, MATCHED_ENERGY, MIP_VIEWER, VIEWERS, Form, Viewer, blurring, fuse
 from aaplug.verbs.in_parts import LARGE, convert_parts
-from aaplug.verbs.inputs import CamerasLike, SceneLike, cameras_of, look_of, processor
+from aaplug.verbs.inputs import AnyPath, CamerasLike, SceneLike, cameras_of, look_of, processor
 from aaplug.verbs.options import ViewOptions, flag
 
 
@@ -80,7 +79,7 @@ class ConvertOptions(ViewOptions):
 def convert(
     scene: SceneLike | SceneFile,
     cameras: CamerasLike = None,
-    output: str | PathLike[str] | None = None,
+    output: AnyPath | None = None,
     *,
     drop_bad: bool = False,
     spz_axes: SpzAxes = "opengl",

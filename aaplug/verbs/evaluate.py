@@ -7,7 +7,6 @@ import platform
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import version
-from os import PathLike
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
@@ -31,7 +30,7 @@ from aaplug.io.atomic import refuse_existing
 from aaplug.io.cameras import select_views
 from aaplug.methods.recipe import Recipe
 from aaplug.methods.recipes import RECIPES, USER_RECIPES, suited
-from aaplug.verbs.inputs import CamerasLike, SceneLike, cameras_of, look_of, processor, recipe_of, scene_of
+from aaplug.verbs.inputs import AnyPath, CamerasLike, SceneLike, cameras_of, look_of, processor, recipe_of, scene_of
 from aaplug.verbs.options import RECIPE_NAMES, RecipeOptions, choice, choices, flag
 
 ALL = "all"  # instead of recipes' names: every recipe that the scene suits
@@ -43,7 +42,6 @@ USER_NAMES = [recipe.name for recipe in USER_RECIPES]
 PACKAGES = ("aaplug", "torch", "numpy", "scikit-image", "opencv-contrib-python-headless")
 
 Layout = Literal["plain", "inria"]
-AnyPath = str | PathLike[str]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,7 +3,6 @@
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from os import PathLike
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -33,7 +32,7 @@ from aaplug.io.scenes import SpzAxes, check_scene_output, write_scene
 from aaplug.methods.recipes import RECIPES
 from aaplug.methods.viewers import FAST, VIEWERS, Viewer, fuse_for
 from aaplug.rendering.renderer import Renderer
-from aaplug.verbs.inputs import CamerasLike, SceneLike, cameras_of, look_of, processor, scene_of
+from aaplug.verbs.inputs import AnyPath, CamerasLike, SceneLike, cameras_of, look_of, processor, scene_of
 from aaplug.verbs.options import ViewOptions, choice, choices, flag
 
 
@@ -101,7 +100,7 @@ class FinetuneOptions(ViewOptions):
 def finetune(
     scene: SceneLike,
     cameras: CamerasLike = None,
-    output: str | PathLike[str] | None = None,
+    output: AnyPath | None = None,
     *,
     spz_axes: SpzAxes = "opengl",
     monitor: Monitor = SILENT,
@@ -162,7 +161,7 @@ class _Files:
     scene: Path
 
     @classmethod
-    def of(cls, output: str | PathLike[str] | None, scene: Gaussians, o: FinetuneOptions) -> "_Files | None":
+    def of(cls, output: AnyPath | None, scene: Gaussians, o: FinetuneOptions) -> "_Files | None":
         """The files beside an output, after a check, before any work, that they may be written."""
         if output is None:
             if o.resume:

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Iterator
-from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ from aaplug.io.scenes import find_scene, open_scene
 from aaplug.io.scenes.ply import Document
 from aaplug.io.scenes.scene_file import SceneFile
 from aaplug.methods.viewers import describe
-from aaplug.verbs.inputs import CamerasLike
+from aaplug.verbs.inputs import AnyPath, CamerasLike
 from aaplug.verbs.options import FrameOptions
 
 EXPONENTIATED = 20.0  # larger log-scales are taken for scales
@@ -25,7 +24,7 @@ ULP = 2.0**-23  # of float32, relative
 
 @FrameOptions.shown
 def info(
-    scene: SceneFile | str | PathLike[str], cameras: CamerasLike = None, *, monitor: Monitor = SILENT, **options: Any
+    scene: SceneFile | AnyPath, cameras: CamerasLike = None, *, monitor: Monitor = SILENT, **options: Any
 ) -> dict[str, Any]:
     """Describe a scene's file: its convention and why, what is fused, what is odd.
 

@@ -23,8 +23,9 @@ from aaplug.rasterizers import find_rasterizer
 from aaplug.rendering.renderer import Background, Renderer, background_colour
 from aaplug.verbs.options import RecipeOptions, ViewOptions
 
-SceneLike = Gaussians | str | PathLike[str]
-CamerasLike = CameraSet | str | PathLike[str] | None
+AnyPath = str | PathLike[str]
+SceneLike = Gaussians | AnyPath
+CamerasLike = CameraSet | AnyPath | None
 MODEL_SCENE = "point_cloud/iteration_*/point_cloud.ply"  # in an INRIA model folder
 
 

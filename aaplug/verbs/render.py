@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from os import PathLike
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -14,7 +13,7 @@ from aaplug.io.cameras import select_views
 from aaplug.methods.recipes import find_recipe
 from aaplug.rendering.frames import write_frames
 from aaplug.rendering.renderer import Renderer
-from aaplug.verbs.inputs import CamerasLike, SceneLike, cameras_of, drawn_by, look_of, processor, scene_of
+from aaplug.verbs.inputs import AnyPath, CamerasLike, SceneLike, cameras_of, drawn_by, look_of, processor, scene_of
 from aaplug.verbs.options import ImageOptions, RecipeOptions
 from aaplug.verbs.views import image_paths, resized
 
@@ -38,7 +37,7 @@ class RenderOptions(RecipeOptions, ImageOptions):
 def render(
     scene: SceneLike,
     cameras: CamerasLike = None,
-    output: str | PathLike[str] = "images",
+    output: AnyPath = "images",
     *,
     monitor: Monitor = SILENT,
     **options: Any,

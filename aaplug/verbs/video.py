@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from os import PathLike
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -22,7 +21,17 @@ from aaplug.io.cameras import select_views
 from aaplug.io.cameras.camera_path import read_camera_path
 from aaplug.io.video import check_video
 from aaplug.rendering.videos import make_video
-from aaplug.verbs.inputs import CamerasLike, SceneLike, cameras_of, drawn_by, look_of, processor, recipe_of, scene_of
+from aaplug.verbs.inputs import (
+    AnyPath,
+    CamerasLike,
+    SceneLike,
+    cameras_of,
+    drawn_by,
+    look_of,
+    processor,
+    recipe_of,
+    scene_of,
+)
 from aaplug.verbs.options import RECIPE_NAMES, ImageOptions, RecipeOptions, choice, flag
 from aaplug.verbs.views import resized
 
@@ -43,7 +52,7 @@ class Clip(NamedTuple):
 class VideoOptions(RecipeOptions, ImageOptions):
     """Rendering, and the camera path."""
 
-    path: Annotated[str | PathLike[str], choice(["zoom", "dolly", "orbit", "FILE.json"])] = "zoom"
+    path: Annotated[AnyPath, choice(["zoom", "dolly", "orbit", "FILE.json"])] = "zoom"
     """zoom (focal length), dolly (distance) or orbit from the first of --views, or nerfstudio's camera_path.json."""
     beside: Annotated[str | None, choice(["none", *RECIPE_NAMES, "..."])] = "classic"
     """Recipe to show on the left."""
@@ -61,7 +70,7 @@ class VideoOptions(RecipeOptions, ImageOptions):
 def video(
     scene: SceneLike,
     cameras: CamerasLike = None,
-    output: str | PathLike[str] = "video.webm",
+    output: AnyPath = "video.webm",
     *,
     monitor: Monitor = SILENT,
     **options: Any,
