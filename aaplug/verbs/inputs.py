@@ -14,7 +14,6 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.core.interfaces import Colour, MatchesRates, Rasterizer, TakesMemory
 from aaplug.core.monitor import SILENT, Monitor
 from aaplug.core.training import TrainingViews
-from aaplug.evaluation.truth import own_look
 from aaplug.io.cameras import read_cameras
 from aaplug.io.scenes import find_scene, read_scene
 from aaplug.methods.recipe import Recipe
@@ -87,6 +86,9 @@ def look_of(scene: Gaussians, cameras: CameraSet, frames: int, o: ViewOptions, m
 
     frames: how many images will be rendered in all.
     """
+    # its packages take a third of a second to import, which `--help` need not wait for
+    from aaplug.evaluation.truth import own_look
+
     colour = background_of(o.background, cameras, monitor)
     drawing = rasterizer_of(o.rasterizer, frames, o.memory, monitor)
     return own_look(scene, TrainingViews.of(scene, cameras, o.cull_margin, o.min_seen), drawing, colour)
