@@ -3,8 +3,10 @@
 `shared_data` is a folder of real scenes that may lie beside the repository; tests that use it skip where it is absent.
 """
 
+import ctypes
 import logging
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
@@ -30,6 +32,8 @@ ALL_RASTERIZERS: dict[str, Rasterizer] = {**RASTERIZERS, **({} if COMPILED is No
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 SAMPLE = Path(str(files("aaplug.io.sample")))
+CLEAR_REFS = Path("/proc/self/clear_refs")
+needs_peak_memory = pytest.mark.skipif(not CLEAR_REFS.exists(), reason="peak memory of a process is read from /proc")
 
 
 @pytest.fixture(autouse=True)
@@ -65,6 +69,20 @@ def sample_cameras() -> CameraSet:
 @pytest.fixture(scope="session")
 def sample_training(sample_scene: Gaussians, sample_cameras: CameraSet) -> TrainingViews:
     return TrainingViews.of(sample_scene, sample_cameras)
+
+
+def memory_taken(work: Callable[[], object]) -> int:
+    """Bytes by which a call raises this process's peak above what was resident before it."""
+
+    def peak() -> int:
+        words = Path("/proc/self/status").read_text().split()
+        return int(words[words.index("VmHWM:") + 1]) * 1024
+
+    ctypes.CDLL(None).malloc_trim(0)  # free memory goes back to the system, so that taking it again shows
+    CLEAR_REFS.write_text("5")  # resets the peak
+    before = peak()
+    work()
+    return peak() - before
 
 
 def make_camera(

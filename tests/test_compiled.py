@@ -16,17 +16,16 @@ from aaplug.rasterizers import RASTERIZERS, Tiled, choice, find_rasterizer
 from aaplug.rasterizers.tiled import ahead_of_time as compiled
 from aaplug.rasterizers.tiled.packages import CompiledKernels, Package
 from aaplug.rendering.renderer import Renderer
-from tests.conftest import make_camera, make_scene, sized
+from tests.conftest import COMPILED, make_camera, make_scene, sized
 
 ANSWER = 1e-5
 
 
 @pytest.fixture
 def built() -> CompiledKernels:
-    found = compiled.load()
-    if found is None:
+    if COMPILED is None:
         pytest.skip("the kernels are not compiled here (aaplug warmup)")
-    return found
+    return COMPILED
 
 
 @pytest.fixture
@@ -65,7 +64,8 @@ def test_packages_are_checked_by_one_thread_which_is_undone_after_that(built, mo
         torch.set_num_threads(threads)
 
 
-IMAGES = [(name, 1) for name in RECIPES] + [("matched", degree) for degree in (0, 2, 3)]
+WAYS = {(r.pixel.name, r.compositor, r.selection): name for name, r in RECIPES.items()}
+IMAGES = [(name, 1) for name in WAYS.values()] + [("matched", degree) for degree in (0, 2, 3)]
 
 
 @pytest.mark.parametrize(("recipe", "degree"), IMAGES)

@@ -23,9 +23,9 @@ from tests.conftest import SAMPLE
 
 ROOT = Path(__file__).resolve().parents[1]
 GUIDES = sorted((ROOT / "examples" / "guides").glob("*.md"))
-GAUSSIANS = 400
-SIZE = 48  # px: side of the photographs
-TRAINING = 6  # cameras
+GAUSSIANS = 80
+SIZE = 24  # px: side of the photographs
+TRAINING = 3  # cameras
 RUN_BY_THE_GATE = "<!-- "  # stands before README's blocks that .ci/run executes
 SHORTER = {  # options that make a documented command quicker; they come last, so they take precedence
     "finetune": ["--steps", "2"],

@@ -196,12 +196,11 @@ def agree(scene: Gaussians, camera: Camera, recipe: str, golden: tuple[np.ndarra
             assert difference < (2e-7 if exact else 1e-4), f"{name}: {difference:.1e}"
 
 
-@pytest.mark.parametrize(("seed", "degree"), [(0, 0), (1, 1), (2, 2), (3, 3)])
-@pytest.mark.parametrize("compensated", [False, True], ids=["classic", "antialiased"])
-def test_images_are_those_of_gsplat(seed, degree, compensated):
+@pytest.mark.parametrize(("degree", "compensated"), [(0, True), (1, False), (2, True), (3, False)])
+def test_images_are_those_of_gsplat(degree, compensated):
     camera = make_camera((0.4, -1.1, 0.2), size=(36, 27), fov=1.0)
     camera = replace(camera, fy=1.3 * camera.fy, cx=14.0, cy=16.5).as_trained()
-    scene = scene_of(seed, degree)
+    scene = scene_of(degree, degree)
     scene = replace(scene, convention=GSPLAT_ANTIALIASED if compensated else GSPLAT)
     flat = [gsplat_projected(gaussian, camera, compensated) for gaussian in stored(scene)]
     drawn = [splat for splat in flat if splat is not None]

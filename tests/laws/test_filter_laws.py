@@ -289,7 +289,7 @@ def test_the_gradient_of_a_blur_is_that_of_its_formula(compensate, floor):
 def test_the_gradient_of_a_screen_filter_is_that_of_its_formula(screen, name):
     """Not at the training size, where the range of rates ends at the view itself: that is a kink."""
     view, training = SITUATIONS[name].view, SITUATIONS[name].training
-    splats = make_splats(6, (48, 64), log_sigmas=(-1.0, 1.0)).to(F64)
+    splats = make_splats(3, (48, 64), log_sigmas=(-1.0, 1.0)).to(F64)
 
     def filtered(covs: Tensor, dets: Tensor, depths: Tensor, opacities: Tensor):
         given = replace(splats, covs=covs, dets=dets, depths=depths, opacities=opacities)
@@ -517,7 +517,7 @@ def test_matched_energy_gives_a_mip_viewer_the_classic_look_of_a_sphere():
 
 
 def test_the_gradient_of_a_world_filter_is_that_of_its_formula(world):
-    scene = world_scene()[torch.arange(4)]
+    scene = world_scene()[torch.arange(2)]
     training = TrainingViews.of(scene, CAMERAS)
 
     def filtered(log_scales: Tensor, logit_opacities: Tensor, filter_3d: Tensor):
