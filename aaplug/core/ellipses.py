@@ -58,12 +58,6 @@ def squared_cutoff(opacities: Float[Tensor, " m"], min_alpha: float = RULES_3DGS
     return 2 * torch.log(opacities / min_alpha)
 
 
-def half_sizes(splats: Splats2D) -> Float[Tensor, "m 2"]:
-    """Half width and half height, in px, of the box outside which alpha is below 3DGS's cut-off of 1/255."""
-    cutoff = squared_cutoff(splats.opacities).clamp(min=0.0)
-    return (cutoff[:, None] * splats.covs[:, [0, 2]]).sqrt()
-
-
 def grown(splats: Splats2D, radius: Float[Tensor, " m"], min_alpha: float) -> Splats2D:
     """Splats whose cut-off ellipses contain every point within `radius` px of the given ones; for bounding only.
 

@@ -13,7 +13,6 @@ from aaplug.methods.filters.smoothing import (
     AnisotropicSmoothing,
     FlatSmoothing,
     Smoothing3D,
-    StoredSmoothing,
     fuse_stored,
 )
 
@@ -25,7 +24,6 @@ WORLD_FILTERS: Registry[WorldFilter] = Registry(
         "smoothing3d-balanced": Smoothing3D(opacity="balanced"),
         "smoothing3d-anisotropic": AnisotropicSmoothing(),
         "flat": FlatSmoothing(),
-        "stored": StoredSmoothing(),
         "matched-energy": MatchedEnergy(),
     },
     WorldFilter,
