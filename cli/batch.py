@@ -1,6 +1,5 @@
 """Batch files as options: each setting is read as the option of its name, so that both mean the same."""
 
-import difflib
 from collections.abc import Mapping, Sequence
 from contextlib import redirect_stderr
 from dataclasses import is_dataclass, replace
@@ -12,8 +11,9 @@ import tyro
 
 from aaplug.core.errors import FormatError
 from aaplug.io.batch_file import read_batch
+from aaplug.verbs.options import did_you_mean
 
-from .options import CONFIG, values_of
+from .options import CONFIG, option_types
 
 NOT_IN_A_FILE = ("batch", "more", "json", "resume", "overwrite")
 ONCE = ("output", "threads", "memory", "rasterizer")  # for the whole batch, not for one scene
@@ -35,12 +35,10 @@ def scenes_of(path: Path, base: T) -> list[tuple[str, T]]:
 
 def _set(path: Path, where: str, options: T, settings: Mapping[str, Any], refused: Sequence[str]) -> T:
     """The options with a table's settings."""
-    known = [key for key in values_of(options) if key not in refused]
+    known = [key for key in option_types(type(options)) if key not in refused]
     for key, value in settings.items():
         if key not in known:
-            close = difflib.get_close_matches(key, known, 1)
-            hint = f"; did you mean {close[0]}?" if close else ""
-            raise FormatError(path, f"{where}: {key} is no setting here{hint}")
+            raise FormatError(path, f"{where}: {key} is no setting here{did_you_mean(key, known)}")
         if value is False:
             options = _off(options, key)
             continue

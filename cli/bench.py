@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 import torch
-import tyro
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
@@ -13,7 +12,7 @@ from aaplug.rendering.benchmark import Figures
 from aaplug.verbs import bench as verb
 
 from .console import TERMINAL, out, print_json
-from .options import CameraOptions, SceneOptions, arguments, choice, flag
+from .options import CameraOptions, Flat, SceneOptions
 
 
 @dataclass(frozen=True)
@@ -22,19 +21,7 @@ class Bench:
 
     scene: SceneOptions = field(default_factory=SceneOptions)
     cameras: CameraOptions = field(default_factory=CameraOptions)
-    gaussians: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N ...")] = verb.GAUSSIANS
-    """Sizes of the synthetic scenes."""
-    resolution: Annotated[tuple[str, ...] | None, flag("WxH ...")] = None
-    """Sizes of the synthetic scenes' image: all scenes at the first, the middle one at each (default: 800x800, and
-    1600x1060 if there are several scenes)."""
-    rasterizer: Annotated[str, choice(verb.CHOICES)] = "all"
-    """Which to time; all: compiled, if `aaplug warmup` has run, and eager."""
-    repeats: int = 5
-    """Runs per median."""
-    threads: Annotated[int | None, flag("N")] = None
-    """Processor threads (default: all)."""
-    forward_only: bool = False
-    """Leave out the backward pass."""
+    how: Annotated[verb.BenchOptions, Flat] = field(default_factory=verb.BenchOptions)
     json: bool = False
     """Print one JSON object on stdout: the figures, or {"runs": [...]} of several."""
 
@@ -44,13 +31,12 @@ def bench(options: Bench) -> int:
     scene = cameras = None
     if options.scene.scene is not None or options.scene.model_path is not None:
         scene, cameras = options.scene.read(), options.cameras.read(options.scene)
-    chosen = arguments(options, verb.bench)
-    runs, exponents = verb.bench(scene, cameras, monitor=TERMINAL, **chosen)
+    runs, exponents = verb.bench(scene, cameras, monitor=TERMINAL, **vars(options.how))
     if options.json:
         several = {"runs": [run.as_json() for run in runs], "exponents": exponents}
         print_json(runs[0].as_json() if len(runs) == 1 else several)
         return 0
-    out.print(_table(runs, options.threads or torch.get_num_threads()), _stages(runs))
+    out.print(_table(runs, options.how.threads or torch.get_num_threads()), _stages(runs))
     for name, value in exponents.items():
         out.print(f"time grows as {name}^{value:.2f}")
     return 0

@@ -5,11 +5,11 @@ from pathlib import Path
 from typing import Annotated
 
 from aaplug.evaluation.results import results, tables
-from aaplug.methods.viewers import FORMS, VIEWERS, fused_in
+from aaplug.methods.viewers import fused_in
 from aaplug.verbs import convert as verb
 
 from .console import TERMINAL, out, print_json, say
-from .options import CameraOptions, SceneOptions, ViewOptions, arguments, flag
+from .options import CameraOptions, Flat, SceneOptions, flag
 
 
 @dataclass(frozen=True)
@@ -20,19 +20,7 @@ class Convert:
     """Where to write: .ply, or .spz or .splat, which round values and keep less."""
     scene: SceneOptions = field(default_factory=SceneOptions)
     cameras: CameraOptions = field(default_factory=CameraOptions)
-    viewing: ViewOptions = field(default_factory=lambda: ViewOptions(views="train"))
-    viewer: Annotated[str | None, flag("|".join(VIEWERS), "--for")] = None
-    """Fit the scene to this viewer by a short optimization from the closed form, and print the remaining error."""
-    steps: Annotated[int | None, flag("N")] = None
-    """With --viewer: steps of the optimization (default: 300, or 0 if the viewer draws as training did); 0 keeps the
-    closed form."""
-    form: Annotated[str | None, flag("|".join(FORMS))] = None
-    """Without --viewer, what to fuse: matched-energy (the default) keeps the energy that training showed;
-    mip-splatting is Mip-Splatting's 3D smoothing.  A stored filter_3D is fused as it is."""
-    variance: Annotated[float | None, flag("PX2")] = None
-    """Without --viewer: variance to fuse, in px² at the training rate (default: 0.2)."""
-    overwrite: bool = False
-    """Replace an existing output."""
+    how: Annotated[verb.ConvertOptions, Flat] = field(default_factory=verb.ConvertOptions)
     json: bool = False
     """Print what was done as one JSON object on stdout."""
 
@@ -42,7 +30,8 @@ def convert(options: Convert) -> int:
     opened = options.scene.open()
     named = options.cameras.cameras is not None or options.scene.path.is_dir()
     cameras = options.cameras.read(options.scene) if named else None
-    found = verb.convert(opened, cameras, monitor=TERMINAL, **arguments(options, verb.convert))
+    own = {"drop_bad": options.scene.drop_bad, "spz_axes": options.scene.spz_axes} | vars(options.how)
+    found = verb.convert(opened, cameras, options.output, monitor=TERMINAL, **own)
     scene, report = found.scene, found.report
     if options.json:
         facts = {"output": str(options.output), "gaussians": opened.count}

@@ -3,21 +3,19 @@
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import tyro
 
 from aaplug.core.errors import UsageError
-from aaplug.evaluation.metrics import METRICS, metric_option
-from aaplug.evaluation.protocols import PROTOCOLS
 from aaplug.evaluation.results import Report, results, tables
 from aaplug.verbs.batch import batch
-from aaplug.verbs.evaluate import ALL, DEFAULT_RECIPES, Output
+from aaplug.verbs.evaluate import EvaluateOptions, Output
 from aaplug.verbs.evaluate import evaluate as measure
 
 from .batch import scenes_of
 from .console import TERMINAL, out, print_json
-from .options import RECIPE_NAMES, CameraOptions, RenderOptions, SceneOptions, arguments, choice, flag
+from .options import CameraOptions, Flat, SceneOptions, flag
 
 FAILED = 1  # exit code
 
@@ -39,31 +37,9 @@ class Evaluate:
     batch: Annotated[Path | None, flag("FILE.toml")] = None
     """Scenes and their settings from a file; what it does not say is as on the command line."""
     cameras: CameraOptions = field(default_factory=CameraOptions)
-    rendering: RenderOptions = field(default_factory=RenderOptions)
     output: Annotated[Path | None, flag("FOLDER", "-o")] = None
     """Folder for results.json, per_view.json and results.csv."""
-    protocol: Annotated[str, choice(PROTOCOLS)] = "default"
-    """Scales, truth, downscaling and flavours of metrics, by name."""
-    recipe: Annotated[tuple[str, ...], choice([*RECIPE_NAMES, ALL, "..."])] = DEFAULT_RECIPES
-    """One or more recipes.  all adds the research recipes, which examples/guides/methods.md lists."""
-    scale: Annotated[tuple[float, ...] | None, flag("FACTOR [FACTOR ...]")] = None
-    """One or more sizes relative to the training size (default: the protocol's)."""
-    truth: Literal["auto", "photographs", "self"] = "auto"
-    """Compare with photographs, or with the scene's own supersampled look; auto leaves it to the protocol."""
-    metric: Annotated[tuple[str, ...] | None, flag("|".join(map(metric_option, METRICS)))] = None
-    """Metrics, with flavours ssim:wang|3dgs, lpips:3dgs|vgg|alex (default: psnr ssim consistency energy-drift)."""
-    lpips: Annotated[tuple[Path, Path] | None, flag("TRUNK HEADS")] = None
-    """Weights of LPIPS, which is then measured: torchvision's VGG16 (AlexNet), and the lpips package's heads for it."""
-    report: bool = False
-    """Write report.html, one page with tables, curves and a before/after viewer, and its plots."""
-    show: Annotated[str, tyro.conf.arg(metavar="N|NAME,...")] = "3"
-    """Views in the report's viewer: how many, or which."""
-    layout: Literal["plain", "inria"] = "plain"
-    """inria stores every render and its truth in test/METHOD/{renders,gt}, where other metric scripts look."""
-    resume: bool = False
-    """Continue an interrupted evaluation; finished views are not measured again."""
-    overwrite: bool = False
-    """Replace existing results."""
+    how: Annotated[EvaluateOptions, Flat] = field(default_factory=EvaluateOptions)
     json: bool = False
     """Print results.json on stdout instead of the table."""
 
@@ -72,8 +48,7 @@ def evaluate(options: Evaluate) -> int:
     """Measure recipes over scales, of one scene or of many."""
     if options.batch is not None or options.others.more:
         return _evaluate_many(options)
-    wanted = options.output, options.report, options.layout, options.resume, options.overwrite
-    Output(*wanted).check()  # before the scene is read
+    Output(options.output, options.how).check()  # before the scene is read
     report = _run(options)
     _print(options, results(report), tables(report))
     return 0
@@ -83,8 +58,8 @@ def _run(options: Evaluate, **given: Any) -> Report:
     """Evaluate one scene; `given` has precedence over the options."""
     scene = options.scene.read()
     cameras = options.cameras.read(options.scene)
-    own = {"name": options.scene.path.stem, "monitor": TERMINAL}
-    return measure(scene, cameras, **arguments(options, measure) | own | given)
+    own = {"output": options.output, "name": options.scene.path.stem, "monitor": TERMINAL}
+    return measure(scene, cameras, **vars(options.how) | own | given)
 
 
 def _evaluate_many(options: Evaluate) -> int:
@@ -93,7 +68,7 @@ def _evaluate_many(options: Evaluate) -> int:
     if output is None:
         raise UsageError("output", "name a folder for the results of several scenes: -o FOLDER")
     runs = [(name, partial(_run, own)) for name, own in scenes]
-    found = batch(runs, output, resume=options.resume, overwrite=options.overwrite, monitor=TERMINAL)
+    found = batch(runs, output, resume=options.how.resume, overwrite=options.how.overwrite, monitor=TERMINAL)
     _print(options, found.summary(), found.tables())
     return FAILED if found.failures else 0
 

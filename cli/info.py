@@ -1,7 +1,7 @@
 """aaplug info: what a scene is."""
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
 from rich.markup import escape
 from rich.table import Table
@@ -9,10 +9,11 @@ from rich.table import Table
 from aaplug.core.gaussians import MAX_LOG_SCALE
 from aaplug.io.limits import LIMITS, limit, memory_of_machine
 from aaplug.verbs import info as verb
+from aaplug.verbs.options import FrameOptions
 from aaplug.verbs.views import MAX_SIDE
 
 from .console import TERMINAL, out, print_json
-from .options import CameraOptions, SceneOptions
+from .options import CameraOptions, Flat, SceneOptions
 
 HIDDEN = ("fused", "comments")  # keys for programs; the table has words for the first
 
@@ -23,6 +24,7 @@ class Info:
 
     scene: SceneOptions = field(default_factory=SceneOptions)
     cameras: CameraOptions = field(default_factory=CameraOptions)
+    how: Annotated[FrameOptions, Flat] = field(default_factory=FrameOptions)
     limits: bool = False
     """Show every limit on files instead, and the environment variable that changes it."""
     json: bool = False
@@ -36,7 +38,7 @@ def info(options: Info) -> int:
     opened = options.scene.open()
     named = options.cameras.cameras is not None
     cameras = options.cameras.read(options.scene) if named else None
-    facts = verb.info(opened, cameras, min_seen=options.cameras.min_seen, monitor=TERMINAL)
+    facts = verb.info(opened, cameras, monitor=TERMINAL, **vars(options.how))
     if options.json:
         print_json(facts)
     else:

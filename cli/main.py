@@ -7,10 +7,9 @@ import os
 import re
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import fields
 from importlib import import_module
 from importlib.metadata import version
-from typing import Any, get_args, get_origin, get_type_hints
+from typing import Any, get_args, get_origin
 
 from aaplug.core.errors import AaplugError, UsageError
 
@@ -69,19 +68,9 @@ def _verb(name: str) -> tuple[type, Callable[[Any], int]]:
     return getattr(module, name.capitalize()), getattr(module, name)
 
 
-def option_types(noun: type) -> dict[str, Any]:
-    """Types of all options of a verb by name, those of its groups included."""
-    found: dict[str, Any] = {}
-    hints = get_type_hints(noun)
-    for field in fields(noun):
-        kind = hints[field.name]
-        found |= option_types(kind) if hasattr(kind, "__dataclass_fields__") else {field.name: kind}
-    return found
-
-
 def _worded(error: AaplugError, words: Sequence[str]) -> str:
     """The library's error, with parameters of the verb as its options."""
-    from .options import worded
+    from .options import option_types, worded
 
     known = option_types(_verb(words[0])[0]) if words and words[0] in VERBS else {}
     where = error.where
@@ -92,12 +81,15 @@ def _worded(error: AaplugError, words: Sequence[str]) -> str:
 
 def _several(verb: str) -> list[str]:
     """Options of a verb that take any number of names or numbers."""
-    found = []
-    for name, kind in option_types(_verb(verb)[0]).items():
-        for one in (kind, *get_args(kind)):
-            if get_origin(one) is tuple and get_args(one)[1:] == (...,):
-                found.append("--" + name.replace("_", "-"))
-    return found
+    from .options import option_types
+
+    several = {
+        name
+        for name, kind in option_types(_verb(verb)[0]).items()
+        for one in (kind, *get_args(kind))
+        if get_origin(one) is Sequence
+    }
+    return ["--" + name.replace("_", "-") for name in several]
 
 
 def _parted(words: Sequence[str]) -> list[str]:

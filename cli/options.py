@@ -1,30 +1,24 @@
 """Options that several verbs share, and reading what they name.
 
-Each class is a group of options.  `arguments` passes them to the library's verb, whose parameters have the same names.
+The options that the library's verbs have too are stated there, in `aaplug.verbs`.
 """
 
-import inspect
-import math
 import re
-from collections.abc import Callable, Collection, Iterable
-from dataclasses import dataclass, fields, is_dataclass
+from collections.abc import Collection
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any, get_type_hints
 
 import tyro
 
 from aaplug.core.cameras import CameraSet
 from aaplug.core.errors import UsageError, listing
 from aaplug.core.gaussians import CONVENTIONS, Gaussians
-from aaplug.core.sampling import MIN_SEEN_SHARE
 from aaplug.io.cameras import read_cameras
 from aaplug.io.scenes import SpzAxes, find_scene, open_scene
 from aaplug.io.scenes.scene_file import SceneFile
-from aaplug.methods.filters.matched import RateReference
-from aaplug.methods.recipes import QUALITIES, RECIPES
-from aaplug.methods.research_recipes import RESEARCH_RECIPES
 from aaplug.methods.viewers import describe
-from aaplug.rasterizers import RASTERIZERS
+from aaplug.verbs.options import flag
 
 from .console import say
 
@@ -43,19 +37,7 @@ def worded(text: str, names: Collection[str]) -> str:
     return re.sub(r"`(\w+)`|\b([a-z]+(?:_[a-z]+)+)\b", option, text)
 
 
-def flag(metavar: str, *aliases: str) -> Any:
-    """An option whose help shows `metavar` and no default, for what is absent unless given."""
-    return tyro.conf.arg(metavar=metavar, aliases=aliases, help_behavior_hint="")
-
-
-def choice(names: Iterable[str]) -> Any:
-    """An option that takes one of these names; the library refuses others."""
-    return tyro.conf.arg(metavar="|".join(names))
-
-
-_RESEARCH = {recipe.name for recipe in RESEARCH_RECIPES}
-RECIPE_NAMES = [name for name in RECIPES if name not in _RESEARCH]  # a user's, and plug-ins'
-RecipeName = Annotated[str, choice([*RECIPE_NAMES, "..."])]
+Flat = tyro.conf.arg(name="")  # a group whose options stand among the verb's own
 
 
 @dataclass(frozen=True)
@@ -124,10 +106,6 @@ class CameraOptions:
     """Folder of photographs inside the data set (default: the format's own)."""
     test_every: Annotated[int | None, flag("N")] = None
     """Hold out every N-th view by name; 0 for no split (default: as usual for the format)."""
-    min_seen: float = MIN_SEEN_SHARE
-    """Stop if the cameras see a smaller share of the Gaussians than this."""
-    cull_margin: Annotated[float, flag("SHARE")] = math.inf
-    """Cull Gaussians centred farther outside the image than this share of its longer side, if training did."""
 
     def read(self, options: SceneOptions) -> CameraSet:
         """Read the cameras and say where sizes and split come from."""
@@ -142,42 +120,11 @@ class CameraOptions:
         return cameras
 
 
-@dataclass(frozen=True)
-class ViewOptions:
-    """Views, background and rasterizer."""
-
-    views: Annotated[str, tyro.conf.arg(metavar="NAME,...|test|train|all")] = "test"
-    """Views, by name or split."""
-    background: Annotated[str, choice(("auto", "white", "black"))] = "auto"
-    """Colour behind the scene; auto is what training had."""
-    rasterizer: Annotated[str, choice(("auto", "compiled", *RASTERIZERS))] = "auto"
-    """auto: compiled if `aaplug warmup` has run, else eager.  reference: slow, exact, float64."""
-    threads: Annotated[int | None, flag("N")] = None
-    """Processor threads (default: all)."""
-    memory: Annotated[float | None, flag("GB")] = None
-    """Memory per frame, beside the scene and the image (default: 1)."""
-
-
-@dataclass(frozen=True)
-class RenderOptions(ViewOptions):
-    """Rendering."""
-
-    quality: Annotated[str, choice(QUALITIES)] = "balanced"
-    """How finely recipe auto samples: fast reaches a quarter of the training rate, balanced half, best all of it."""
-    rate_reference: Annotated[str | None, flag("|".join(get_args(RateReference)))] = None
-    """Sampling rate that matched and auto compare with (default: pose: global, or interval for a free camera)."""
-
-
-def values_of(options: Any) -> dict[str, Any]:
-    """All options of a verb by name, those of its groups included."""
+def option_types(noun: type) -> dict[str, Any]:
+    """Types of all options of a verb by name, those of its groups included."""
     found: dict[str, Any] = {}
-    for field in fields(options):
-        value = getattr(options, field.name)
-        found |= values_of(value) if is_dataclass(value) else {field.name: value}
+    hints = get_type_hints(noun)
+    for field in fields(noun):
+        kind = hints[field.name]
+        found |= option_types(kind) if hasattr(kind, "__dataclass_fields__") else {field.name: kind}
     return found
-
-
-def arguments(options: Any, verb: Callable[..., Any]) -> dict[str, Any]:
-    """The options that a function of the library takes by name; scene and cameras are passed as objects instead."""
-    known = inspect.signature(verb).parameters.keys() - {"scene", "cameras"}
-    return {name: value for name, value in values_of(options).items() if name in known}

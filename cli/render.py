@@ -2,12 +2,12 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from aaplug.verbs import render as verb
 
 from .console import TERMINAL, print_json, say
-from .options import CameraOptions, RecipeName, RenderOptions, SceneOptions, arguments, flag
+from .options import CameraOptions, Flat, SceneOptions, flag
 
 
 @dataclass(frozen=True)
@@ -18,17 +18,7 @@ class Render:
     """A folder for the images, or one .png for one view."""
     scene: SceneOptions = field(default_factory=SceneOptions)
     cameras: CameraOptions = field(default_factory=CameraOptions)
-    rendering: RenderOptions = field(default_factory=RenderOptions)
-    recipe: RecipeName = "auto"
-    """How to render; examples/guides/methods.md lists further recipes, for research."""
-    scale: Annotated[float | None, flag("FACTOR")] = None
-    """Size relative to the training size (default: 1)."""
-    resolution: Annotated[str | None, flag("WxH")] = None
-    """Size in px, such as 400x400; -1 on one side keeps the aspect (-1x720)."""
-    bit_depth: Literal[8, 16] = 8
-    """Bits per colour channel."""
-    overwrite: bool = False
-    """Replace existing images."""
+    how: Annotated[verb.RenderOptions, Flat] = field(default_factory=verb.RenderOptions)
     json: bool = False
     """Print what was written as one JSON object on stdout."""
 
@@ -36,10 +26,10 @@ class Render:
 def render(options: Render) -> int:
     """Render views at any resolution to PNG."""
     scene, cameras = options.scene.read(), options.cameras.read(options.scene)
-    written = verb.render(scene, cameras, monitor=TERMINAL, **arguments(options, verb.render))
+    written = verb.render(scene, cameras, options.output, monitor=TERMINAL, **vars(options.how))
     if options.json:
         images = [{"view": v.name, "file": str(p), "width": v.width, "height": v.height} for v, p in written]
-        print_json({"recipe": options.recipe, "images": images})
+        print_json({"recipe": options.how.recipe, "images": images})
     else:
         say(f"wrote {len(written)} image{'s' * (len(written) != 1)} to {options.output}")
     return 0

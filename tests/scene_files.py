@@ -72,15 +72,9 @@ def ksplat(level: int, degree: int = 2, per_bucket: int = 16) -> bytes:
     rest = torch.cat([torch.zeros(n, 0), *bands], dim=1).numpy()
     assert rest.shape[1] == 3 * (k - 1)
     wide, sh_type = ("<f4", "<f4") if level == 0 else ("<f2", "<f2" if level == 1 else "u1")
-    record = np.dtype(
-        [
-            ("p", "<f4" if level == 0 else "<u2", 3),
-            ("s", wide, 3),
-            ("q", wide, 4),
-            ("c", "u1", 4),
-            ("h", sh_type, rest.shape[1]),
-        ]
-    )
+    position = "<f4" if level == 0 else "<u2"
+    shapes = [("p", position, 3), ("s", wide, 3), ("q", wide, 4), ("c", "u1", 4), ("h", sh_type, rest.shape[1])]
+    record = np.dtype(shapes)
     rows = np.zeros(n, record)
     means = s.means.numpy()
     rows["p"] = means if level == 0 else np.round((means - centres[0]) * steps / (block / 2) + steps)

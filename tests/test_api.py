@@ -7,7 +7,8 @@ from importlib import import_module
 from pathlib import Path
 
 import pytest
-from aaplug_cli.main import VERBS, option_types
+from aaplug_cli.main import VERBS
+from aaplug_cli.options import option_types
 
 import aaplug
 from aaplug.core.errors import FrameError, UsageError
@@ -75,6 +76,11 @@ def test_a_model_folder_brings_its_own_cameras(cli):  # noqa: F811
     assert by_folder[0].file.read_bytes() == by_scene[0].file.read_bytes()
     with pytest.raises(UsageError, match="cameras"):
         aaplug.render("scene.ply", output="three")
+
+
+def test_an_option_that_is_none_is_refused_with_the_nearest_name():
+    with pytest.raises(UsageError, match="scal: is no option here; did you mean scale"):
+        aaplug.render("scene.ply", scal=0.5)
 
 
 @pytest.mark.parametrize("verb", VERBS)

@@ -53,17 +53,8 @@ def names(cameras):
 
 
 def inria_entry(name="a", **changes):
-    entry = {
-        "id": 0,
-        "img_name": name,
-        "width": 400,
-        "height": 200,
-        "position": [1.0, 2.0, 3.0],
-        "rotation": QUARTER_TURN,
-        "fx": 300.0,
-        "fy": 310.0,
-    }
-    return entry | changes
+    pose = {"position": [1.0, 2.0, 3.0], "rotation": QUARTER_TURN}
+    return {"id": 0, "img_name": name, "width": 400, "height": 200, "fx": 300.0, "fy": 310.0} | pose | changes
 
 
 def inria(folder, *entries, cfg=None):
@@ -167,18 +158,9 @@ def test_cfg_args_is_never_run(tmp_path):
 @pytest.mark.parametrize(
     "cfg",
     [
-        "1",
-        "print(1)",
-        "Namespace(1)",
-        "Namespace(**{'resolution': 1})",
-        "Namespace(resolution=0)",
-        "Namespace(resolution='4')",
-        "Namespace(eval=1)",
-        "Namespace(images='../secret')",
-        "Namespace(x=f'{1}')",
-        "Namespace(x=" + "-" * 5000 + "1)",
-        "Namespace(x=1); import os",
-        "Namespace(x='" + "y" * 70000 + "')",
+        *("1", "print(1)", "Namespace(1)", "Namespace(**{'resolution': 1})", "Namespace(x=1); import os"),
+        *("Namespace(resolution=0)", "Namespace(resolution='4')", "Namespace(eval=1)", "Namespace(x=f'{1}')"),
+        *("Namespace(images='../secret')", f"Namespace(x={'-' * 5000}1)", f"Namespace(x='{'y' * 70000}')"),
     ],
     ids=range(12),
 )
@@ -230,17 +212,13 @@ def test_rotation_is_made_orthonormal(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "text", ["", "{}", "[]", "[1]", "[" * 100_000, '[{"width": ' + "9" * 5000 + "}]", "\xff"], ids=range(7)
+    "text",
+    ["", "{}", "[]", "[1]", "[" * 100_000, '[{"id": Infinity}]', '[{"width": ' + "9" * 5000 + "}]", "\xff"],
+    ids=range(8),
 )
 def test_odd_json_is_refused(tmp_path, text):
     (tmp_path / "cameras.json").write_text(text, encoding="latin-1")
     with pytest.raises(FormatError):
-        read_cameras(tmp_path)
-
-
-def test_json_holds_no_constants_even_where_they_are_not_used(tmp_path):
-    inria(tmp_path, inria_entry(id=math.inf))
-    with pytest.raises(FormatError, match="Infinity is not a finite number"):
         read_cameras(tmp_path)
 
 
@@ -324,15 +302,6 @@ def test_colmap_trains_at_the_size_of_its_photos(tmp_path):
     assert second.trained_focal == second.focal
     (scaled, _) = read_cameras(tmp_path, images="images_4", test_every=0, train_scale=0.5).train
     assert (scaled.width, scaled.fx) == (200, 125)
-
-
-def test_colmap_split_is_every_eighth_by_name(tmp_path):
-    views = tuple((i, (1.0, 0, 0, 0), (0.0, 0, i), 1, f"v{i:02}.png") for i in range(16, -1, -1))
-    colmap_bin(tmp_path, images=views)
-    cameras = read_cameras(tmp_path)
-    assert names(cameras.test) == ["v00", "v08", "v16"]
-    assert names(cameras.train)[:2] == ["v01", "v02"]
-    assert names(read_cameras(tmp_path, test_every=10).test) == ["v00", "v10"]
 
 
 def test_colmap_names_that_collide_keep_their_suffix(tmp_path):
@@ -552,14 +521,8 @@ def test_a_lens_that_distorts_is_the_pinhole_at_its_centre(tmp_path, lens, name,
         assert first.lens.coefficients == coefficients
 
 
-EXPORTED = {
-    "file_path": "/elsewhere/a.png",
-    "transform": [[1.0, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3]],
-    "fl_x": 30.0,
-    "fl_y": 31.0,
-    "w": 40,
-    "h": 20,
-}
+EXPORTED = {"file_path": "/elsewhere/a.png", "fl_x": 30.0, "fl_y": 31.0, "w": 40, "h": 20}
+EXPORTED |= {"transform": [[1.0, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3]]}
 
 
 def test_an_exported_list_is_in_the_trained_frame(tmp_path):
@@ -707,14 +670,8 @@ def test_llff_axes_are_down_right_and_back(tmp_path):
 
 def test_odd_llff_files_are_refused(tmp_path):
     file = tmp_path / "poses_bounds.npy"
-    for rows in (
-        np.zeros((2, 16)),
-        np.zeros(17),
-        np.zeros((0, 17)),
-        np.zeros((2, 17)),
-        np.ones((2, 17), int),
-        np.array([{}] * 17)[None],
-    ):
+    shapes = [np.zeros((2, 16)), np.zeros(17), np.zeros((0, 17)), np.zeros((2, 17))]
+    for rows in (*shapes, np.ones((2, 17), int), np.array([{}] * 17)[None]):
         np.save(file, rows)
         with pytest.raises(FormatError, match=r"poses_bounds\.npy"):
             read_cameras(tmp_path)
@@ -725,14 +682,8 @@ def test_odd_llff_files_are_refused(tmp_path):
 
 
 def multiscale(folder):
-    row = {
-        "file_path": ["train/r_0.png", "train/r_0_d1.png"],
-        "cam2world": [OPENGL] * 2,
-        "width": [40, 20],
-        "height": [20, 10],
-        "focal": [30.0, 15.0],
-        "label": [0, 1],
-    }
+    row = {"file_path": ["train/r_0.png", "train/r_0_d1.png"], "cam2world": [OPENGL] * 2, "label": [0, 1]}
+    row |= {"width": [40, 20], "height": [20, 10], "focal": [30.0, 15.0]}
     test = {key: values[:1] for key, values in row.items()}
     return write_json(folder / "metadata.json", {"train": row, "test": test})
 
@@ -864,7 +815,7 @@ def test_a_path_is_text_too(tmp_path):
 
 
 @pytest.mark.parametrize("name", FIXTURES)
-@settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=4, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_spoiled_files_read_or_raise_our_errors(tmp_path, name, data):
     make, spoil = FIXTURES[name]
@@ -909,23 +860,3 @@ def test_test_views_by_name_are_those_that_3dgs_lists_first(shared_data):
     listed = [entry["img_name"] for entry in json.loads((folder / "cameras.json").read_text())]
     cameras = read_cameras(folder)
     assert names(cameras.test) == listed[: len(cameras.test)]
-
-
-@pytest.mark.data
-@pytest.mark.parametrize(("kind", "count"), [("colmap", 6), ("inria", 2), ("transforms", 6)])
-def test_real_files_read_or_raise_our_errors(shared_data, kind, count):
-    """The smallest folders only: large ones take seconds and show nothing new."""
-
-    def size(folder):
-        return sum(path.stat().st_size for path in folder.iterdir())
-
-    folders = {path.parent for path in (shared_data / "formats" / kind).rglob("*.*")}
-    outcomes = set()
-    for folder in sorted(folders, key=size)[:count]:
-        for path in [folder, *folder.iterdir()]:
-            try:
-                outcomes.add(bool(read_cameras(path).all))
-            except FormatError:
-                outcomes.add(False)
-    assert True in outcomes
-    assert False in outcomes or kind == "inria"

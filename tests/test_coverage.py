@@ -43,7 +43,7 @@ def test_every_seen_gaussian_is_in_the_histogram():
     training = TrainingViews.of(scene, [make_camera()])
     found = coverage(scene, training, (1.0,))
     assert sum(found.counts) == found.seen == int(training.bounds.seen.sum())
-    assert found.as_json()["gaussians"] == 400
+    assert found.gaussians == 400
 
 
 def test_a_scene_that_nothing_sees_has_no_share():

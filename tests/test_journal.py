@@ -18,45 +18,35 @@ def measured(view: str) -> Measurement:
 @pytest.fixture
 def path(tmp_path):
     """A journal of two finished views."""
-    journal = Journal(tmp_path / "r" / "progress.jsonl", REQUEST, resume=False)
-    for i, name in enumerate("ab"):
-        journal.add(i, [measured(name)])
-    journal.close()
+    with Journal(tmp_path / "r" / "progress.jsonl", REQUEST, resume=False) as journal:
+        for i, name in enumerate("ab"):
+            journal.add(i, [measured(name)])
     return journal.path
 
 
-def test_what_is_finished_comes_back_to_the_bit(path):
-    journal = Journal(path, REQUEST, resume=True)
-    assert journal.known == {0: (measured("a"),), 1: (measured("b"),)}
-    journal.close()
+def test_what_is_finished_comes_back_to_the_bit_and_zeros_of_a_lost_disk_do_not(path):
+    whole = path.read_bytes()
+    path.write_bytes(whole + b"\0" * 50 + b"\n")
+    with Journal(path, REQUEST, resume=True) as journal:
+        assert journal.known == {0: (measured("a"),), 1: (measured("b"),)}
+    assert path.read_bytes() == whole
 
 
 @pytest.mark.parametrize("lost", [1, 20, 60])
 def test_a_torn_line_is_forgotten_and_written_again(path, lost):
     whole = path.read_bytes()
     path.write_bytes(whole[:-lost])
-    journal = Journal(path, REQUEST, resume=True)
-    assert list(journal.known) == [0]
-    journal.add(1, [measured("b")])
-    journal.close()
-    assert path.read_bytes() == whole
-
-
-def test_zeros_that_a_lost_disk_leaves_are_forgotten(path):
-    whole = path.read_bytes()
-    path.write_bytes(whole + b"\0" * 50 + b"\n")
-    journal = Journal(path, REQUEST, resume=True)
-    journal.close()
-    assert sorted(journal.known) == [0, 1]
+    with Journal(path, REQUEST, resume=True) as journal:
+        assert list(journal.known) == [0]
+        journal.add(1, [measured("b")])
     assert path.read_bytes() == whole
 
 
 def test_a_torn_first_line_starts_anew(path):
     path.write_bytes(path.read_bytes()[:10])
-    journal = Journal(path, REQUEST, resume=True)
-    assert not journal.known
-    journal.add(0, [measured("a")])
-    journal.close()
+    with Journal(path, REQUEST, resume=True) as journal:
+        assert not journal.known
+        journal.add(0, [measured("a")])
     assert json.loads(path.read_text().splitlines()[0])["request"] == REQUEST
 
 
@@ -66,25 +56,19 @@ def test_another_request_is_refused_by_what_changed(path):
 
 
 def test_without_resume_it_starts_anew(path):
-    journal = Journal(path, REQUEST | {"views": 9}, resume=False)
-    journal.add(0, [measured("c")])
-    journal.close()
+    with Journal(path, REQUEST | {"views": 9}, resume=False) as journal:
+        journal.add(0, [measured("c")])
     assert len(path.read_text().splitlines()) == 2
 
 
 def test_two_processes_do_not_share_a_journal(path):
-    first = Journal(path, REQUEST, resume=True)
-    with pytest.raises(UsageError, match="another process"):
+    with Journal(path, REQUEST, resume=True), pytest.raises(UsageError, match="another process"):
         Journal(path, REQUEST, resume=True)
-    first.close()
 
 
-def test_nothing_is_made_before_the_first_view_is_done(tmp_path):
-    Journal(tmp_path / "deep" / "progress.jsonl", REQUEST, resume=True).close()
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_place_that_cannot_be_written_is_named(tmp_path):
+def test_nothing_is_made_before_the_first_view_and_a_place_that_cannot_be_written_is_named(tmp_path):
+    with Journal(tmp_path / "deep" / "progress.jsonl", REQUEST, resume=True):
+        assert list(tmp_path.iterdir()) == []
     (tmp_path / "file").write_text("")
     journal = Journal(tmp_path / "file" / "progress.jsonl", REQUEST, resume=False)
     with pytest.raises(OutputError, match=r"progress\.jsonl: cannot be written"):

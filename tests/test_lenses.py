@@ -79,7 +79,7 @@ def seen_by(camera: Camera, times: int = 1) -> np.ndarray:
     return plane(rays).reshape(height, width, 3)
 
 
-@pytest.mark.parametrize(("name", "times"), [("barrel", 1), ("pincushion", 2), ("full", 1), ("fisheye", 2)])
+@pytest.mark.parametrize(("name", "times"), [("barrel", 1), ("pincushion", 2), ("full", 1), ("fisheye", 1)])
 def test_a_straightened_photograph_is_what_the_pinhole_sees(tmp_path, name, times):
     camera = camera_of(tmp_path, LENSES[name], times)
     photo = DOWNSCALES["box"].read(camera.photo, (0.0, 0.0, 0.0), camera.lens)

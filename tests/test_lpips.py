@@ -42,18 +42,14 @@ def by_hand(image, truth, trunk, heads, low):
     for x in (image, truth):
         x = (((x if low == 0 else 2 * x - 1) - mean) / std).permute(2, 0, 1)[None]
         found = []
-        for number in (0, 2, "pool", 5, 7, "pool", 10, 12, 14, "pool", 17, 19, 21, "pool", 24, 26, 28):  # fmt: skip
-            if number == "pool":
-                found.append(x)
-                x = max_pool2d(x, 2)
-            else:
+        for numbers in ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28)):
+            x = max_pool2d(x, 2) if found else x
+            for number in numbers:
                 x = relu(conv2d(x, trunk[f"features.{number}.weight"], trunk[f"features.{number}.bias"], padding=1))
-        maps.append([*found, x])  # fmt: skip
-    total = 0.0
-    for i, (a, b) in enumerate(zip(*maps, strict=True)):
-        a, b = (m / (m.norm(dim=1, keepdim=True) + 1e-10) for m in (a, b))
-        total += ((a - b) ** 2 * heads[f"lin{i}.model.1.weight"]).sum(dim=1).mean().item()
-    return total
+            found.append(x / (x.norm(dim=1, keepdim=True) + 1e-10))
+        maps.append(found)
+    pairs = enumerate(zip(*maps, strict=True))
+    return sum(((a - b) ** 2 * heads[f"lin{i}.model.1.weight"]).sum(dim=1).mean().item() for i, (a, b) in pairs)
 
 
 @pytest.mark.parametrize(("flavour", "low"), [("vgg", -1), ("3dgs", 0)])
@@ -78,12 +74,12 @@ def test_lpips_of_equal_images_is_zero_and_of_tiny_ones_undefined(weights):
 
 def test_other_files_are_refused(weights, tmp_path):
     (trunk, heads), other = weights["vgg"], weights["alex"]
-    with pytest.raises(FormatError, match=r"alex\.pth: holds no features\.2"):
-        lpips_metric("vgg", other[0], heads)
-    with pytest.raises(FormatError, match="lin0"):
-        lpips_metric("vgg", trunk, trunk)
     (tmp_path / "text").write_text("not weights")
-    with pytest.raises(FormatError, match="torch weights"):
-        lpips_metric("vgg", tmp_path / "text", heads)
-    with pytest.raises(FormatError, match="no such file"):
-        lpips_metric("vgg", tmp_path / "gone", heads)
+    for files, words in (
+        ((other[0], heads), r"alex\.pth: holds no features\.2"),
+        ((trunk, trunk), "lin0"),
+        ((tmp_path / "text", heads), "torch weights"),
+        ((tmp_path / "gone", heads), "no such file"),
+    ):
+        with pytest.raises(FormatError, match=words):
+            lpips_metric("vgg", *files)

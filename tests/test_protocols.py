@@ -13,11 +13,14 @@ from tests.conftest import make_camera, make_scene
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS.values(), ids=lambda p: p.name)
-def test_scale_one_is_the_view_itself(protocol):
+def test_scale_one_is_the_view_itself_and_names_exist(protocol):
     view = make_camera()
     camera = protocol.camera(view, 1.0, 4.0)
     assert (camera.hw, camera.fx, camera.cx) == (view.hw, view.fx, view.cx)
     assert camera.cam_from_world.equal(view.cam_from_world)
+    assert protocol.downscale in DOWNSCALES
+    assert protocol.ssim in SSIM
+    assert protocol.source
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS.values(), ids=lambda p: p.name)
@@ -29,23 +32,11 @@ def test_every_protocol_samples_what_is_in_the_middle_by_the_scale(protocol, sca
     assert camera.fx / depth == pytest.approx(scale * view.fx / 4.0)
 
 
-@pytest.mark.parametrize("protocol", PROTOCOLS.values(), ids=lambda p: p.name)
-def test_a_protocol_names_what_exists(protocol):
-    assert protocol.downscale in DOWNSCALES
-    assert protocol.ssim in SSIM
-    assert protocol.source
-    assert PROTOCOLS.find(protocol.name) is protocol
-
-
-def test_a_moved_camera_is_free():
-    view = make_camera()
+def test_cameras_of_moved_and_of_whole_sized_protocols():
+    view = make_camera(size=(987, 743))
     assert PROTOCOLS["distance"].camera(view, 0.5, 4.0).trained_focal is None
     assert PROTOCOLS["fov"].camera(view, 0.5, 4.0).trained_focal == view.trained_focal
-
-
-def test_whole_sizes_are_rounded_as_3dgs_does():
-    view = make_camera(size=(987, 743))
-    assert PROTOCOLS["360-zoom-out"].camera(view, 0.25, 1.0).hw == (186, 247)
+    assert PROTOCOLS["360-zoom-out"].camera(view, 0.25, 1.0).hw == (186, 247)  # rounded, as 3DGS does
     assert PROTOCOLS["default"].camera(view, 0.25, 1.0).hw == (185, 246)
 
 
@@ -58,8 +49,3 @@ def test_median_depth_is_of_what_the_view_shows():
     away = replace(view, cam_from_world=backwards @ view.cam_from_world)
     with pytest.raises(UsageError, match="sees no Gaussian"):
         median_depth(scene.means, away)
-
-
-def test_an_unknown_protocol_is_refused():
-    with pytest.raises(UsageError, match="'blendr' is not one of default, blender"):
-        PROTOCOLS.find("blendr", "protocol")

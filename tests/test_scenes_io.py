@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from plyfile import PlyData
 
@@ -159,7 +159,7 @@ def test_an_unchanged_scene_is_written_back_to_the_byte(tmp_path: Path, file: Fi
 
 
 @given(st.integers(0, 3), st.integers(0, 20), st.sampled_from([*CONVENTIONS.values()]), st.data())
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=6, deadline=None)
 def test_what_was_written_is_read(tmp_path_factory, degree, n, convention, data):
     folder = tmp_path_factory.getbasetemp()
     word = st.text("abcXYZ019._-+", min_size=1, max_size=8)
@@ -250,20 +250,6 @@ def test_real_scenes_are_written_back_to_the_byte(tmp_path: Path, name, n, degre
     assert through(scene, tmp_path) == path.read_bytes()
 
 
-@needs_data
-@pytest.mark.data
-@pytest.mark.parametrize(
-    ("name", "problem"),
-    [
-        ("formats/inria/dngs/model/input.ply", "point cloud or a mesh"),
-        ("formats/small_splats/cvlab_pc_short/public/pc_short.ply", "14,029 bytes more"),
-    ],
-)
-def test_real_files_that_are_no_scenes_are_refused(name: str, problem: str):
-    with pytest.raises(FormatError, match=problem):
-        read_scene(DATA / name)
-
-
 # Conventions and records
 
 
@@ -337,11 +323,7 @@ def test_the_filter_column_is_read_dropped_and_written(tmp_path: Path):
         (["antialiased 0", "splatrendermode: x"], MIP, ["SplatRenderMode: mip"]),
         (["antialiased 1", "hi"], CLASSIC, ["hi"]),
         (["SplatRenderMode: mip", "SplatRenderMode: mip"], MIP, None),
-        (
-            ["SplatRenderMode: mip", "SplatRenderMode: MIP"],
-            ANTIALIASED,
-            ["SplatRenderMode: mip", "aaplug convention=antialiased"],
-        ),
+        (["SplatRenderMode: MIP"], ANTIALIASED, ["SplatRenderMode: mip", "aaplug convention=antialiased"]),
         (["aaplug convention=antialiased", "SplatRenderMode: mip"], CLASSIC, []),
     ],
 )
@@ -350,13 +332,6 @@ def test_tags_follow_the_convention(tmp_path, before, convention: Convention, af
     content = through(replace(scene, convention=convention), tmp_path)
     assert comments(content) == (before if after is None else after)
     assert read_scene(tmp_path / "out.ply").convention == convention
-
-
-def test_a_new_filter_column_and_convention_come_with_a_tag(tmp_path: Path):
-    scene = replace(read_scene(plain().save(tmp_path)), filter_3d=torch.ones(5), convention=MIP)
-    assert comments(through(scene, tmp_path)) == ["SplatRenderMode: mip"]
-    classic = replace(scene, convention=CLASSIC)
-    assert comments(through(classic, tmp_path)) == ["aaplug convention=classic"]
 
 
 def test_a_fusion_is_recorded_and_read_back(tmp_path: Path):
@@ -376,18 +351,6 @@ def test_a_fusion_is_recorded_and_read_back(tmp_path: Path):
         "aaplug fused=mip kernel=0.1 compensated=1 convention=mip",
         "aaplug fused=b convention=mip",
     ]
-
-
-@pytest.mark.parametrize(
-    ("comment", "problem"),
-    [
-        ("aaplug fused=mip convention=fancy", "convention=fancy; known are classic"),
-        ("aaplug fused=mip kernel", "expected key=value"),
-    ],
-)
-def test_comments_that_cannot_be_obeyed_are_refused(tmp_path: Path, comment: str, problem: str):
-    with pytest.raises(FormatError, match=problem):
-        read_scene(plain(comment).save(tmp_path))
 
 
 # Dialects of .ply
@@ -557,15 +520,12 @@ def test_a_file_that_changes_while_it_is_read_is_noticed(tmp_path: Path):
 
 BAD_HEADERS = {
     "count 10^12": (File(count=str(10**12)), "promises .* bytes and it has"),
-    "count of 5000 digits": (File(count="9" * 5000), "impossible count '9{60}'"),
     "count -5": (File(count="-5"), "impossible count '-5'"),
     "one row too many promised": (File(count="6"), "5 of 6 Gaussians are whole"),
     "one row too few promised": (File(count="4"), "92 bytes more"),
     "missing columns": (without("x", "rot_3", "opacity"), "lacks x, opacity, rot_3, which"),
-    "one scale": (without("scale_1", "scale_2"), "lacks scale_1, which"),
     "int harmonics": (with_type("int32", "f_rest_3"), "f_rest_3 must be float"),
     "duplicate property": (extended("x"), "property of vertex 'x' is declared twice"),
-    "duplicate list": (File(after=([*faces, faces[1]], face_rows)), "declared twice"),
     "8 f_rest": (with_rest([f"f_rest_{i}" for i in range(8)]), "8 f_rest"),
     "f_rest with a gap": (with_rest([f"f_rest_{i}" for i in range(1, 10)]), "not f_rest_0"),
     "ascii that is binary": (File(top=["format ascii 1.0"]), "is damaged and cannot be read"),
@@ -579,10 +539,8 @@ BAD_HEADERS = {
     "old Mac line ends": (File(newline=b"\r"), "first line"),
     "trailing after lists": (File(after=(faces, face_rows + b"x")), "1 bytes after"),
     "short lists": (File(after=(faces, face_rows[:-1])), "is damaged and cannot be read"),
-    "list of 2^31": (
-        File(after=(["element face 1", "property list int int v"], b"\xff\xff\xff\x7f")),
-        "is damaged and cannot be read",
-    ),
+    "convention": (plain("aaplug fused=mip convention=fancy"), "convention=fancy; known are classic"),
+    "record": (plain("aaplug fused=mip kernel"), "expected key=value"),
     "empty vertex": (File(columns=[]), "lacks x"),
 }
 
@@ -598,26 +556,13 @@ def test_bad_headers_are_one_quick_line(tmp_path: Path, file: File, problem: str
     assert str(caught.value).startswith(str(path))
 
 
-def test_a_list_among_the_gaussians_is_named(tmp_path: Path):
+def test_a_list_among_the_gaussians_and_a_file_without_any_are_named(tmp_path: Path):
     path = tmp_path / "in.ply"
-    header = File().header.replace(b"property float x\n", b"property list uchar float x\n")
-    path.write_bytes(header + File().rows.tobytes())
-    with pytest.raises(FormatError, match="vertex property x is a list"):
-        read_scene(path)
-
-
-def test_a_file_without_vertices_is_refused(tmp_path: Path):
-    path = tmp_path / "in.ply"
-    path.write_bytes(b"ply\nformat binary_little_endian 1.0\nend_header\n")
-    with pytest.raises(FormatError, match="no element 'vertex'"):
-        read_scene(path)
-
-
-def test_a_header_cut_anywhere_is_refused(tmp_path: Path):
-    file, path = File(n=0, count="0", newline=b"\r\n"), tmp_path / "in.ply"
-    for size in [*range(0, len(file.header), 17), len(file.header) - 1]:
-        path.write_bytes(file.content[:size])
-        with pytest.raises(FormatError, match=r"in\.ply: "):
+    listed = File().content.replace(b"property float x\n", b"property list uchar float x\n")
+    empty = b"ply\nformat binary_little_endian 1.0\nend_header\n"
+    for content, problem in ((listed, "vertex property x is a list"), (empty, "no element 'vertex'")):
+        path.write_bytes(content)
+        with pytest.raises(FormatError, match=problem):
             read_scene(path)
 
 
@@ -630,33 +575,6 @@ def test_a_cut_body_says_how_much_is_whole(tmp_path: Path, kept: int, whole: int
         read_scene(path)
     assert sizes in str(caught.value).replace(",", "")
     assert f"{whole} of 5 Gaussians are whole" in str(caught.value)
-
-
-@given(st.data())
-@settings(max_examples=50, deadline=None, suppress_health_check=[HealthCheck.too_slow])
-def test_flipped_bytes_in_a_header_end_in_a_scene_or_one_error(tmp_path_factory, data):
-    file = plain("SplatRenderMode: mip", "aaplug fused=x convention=mip", after=(faces, face_rows))
-    content = bytearray(file.content)
-    for _ in range(data.draw(st.integers(1, 3))):
-        at = data.draw(st.integers(0, len(file.header) - 1))
-        content[at] = data.draw(st.integers(0, 255) | st.sampled_from(b"0123456789 \n\r=xyz"))
-    path = tmp_path_factory.getbasetemp() / "flipped.ply"
-    path.write_bytes(content)
-    try:
-        scene = read_scene(path)
-    except FormatError:
-        return
-    assert len(scene) == 5
-    assert through(scene, tmp_path_factory.getbasetemp()) == content
-
-
-@given(st.binary(max_size=300))
-@settings(max_examples=30, deadline=None)
-def test_noise_after_ply_is_refused(tmp_path_factory, noise: bytes):
-    path = tmp_path_factory.getbasetemp() / "noise.ply"
-    path.write_bytes(b"ply\n" + noise)
-    with pytest.raises(FormatError):
-        read_scene(path)
 
 
 def test_more_gaussians_than_allowed_are_refused(tmp_path: Path, monkeypatch):
@@ -815,11 +733,6 @@ def test_a_model_folder_means_its_last_iteration(tmp_path: Path):
     assert len(read_scene(find_scene(model))) == 5
     with pytest.raises(FormatError, match="no iteration 5; it has 7000, 30000"):
         find_scene(model, 5)
-
-
-def test_a_folder_without_scenes_is_refused(tmp_path: Path):
-    with pytest.raises(FormatError, match="holds no point_cloud/iteration_<N>"):
-        read_scene(inria_model(tmp_path))
 
 
 def test_paths_are_text_too_and_a_folder_is_a_scene(tmp_path: Path):

@@ -21,15 +21,10 @@ def cull(
     ellipses: Splats2D | None = None,
     rules: Rules = RULES_3DGS,
 ) -> Splats2D:
-    """The splats that can change an image of height and width `hw`; a splat without area cannot.
+    """The splats that can change an image of height and width `hw` px; a splat without area cannot.
 
-    Args:
-        splats: candidates.
-        hw: px.
-        margin: cull splats whose centre lies farther outside the image than this share of its longer side.
-        kernels: runs the test.
-        ellipses: the same splats' bounding ellipses, where a pixel kernel shows more than the splats' own.
-        rules: for the cut-off of alpha.
+    margin: cull splats whose centre lies farther outside the image than this share of its longer side.
+    ellipses: the same splats' bounding ellipses, where a pixel kernel shows more than the splats' own.
     """
     size = splats.means.new_tensor([hw[1], hw[0], margin * max(hw)])
     of = splats if ellipses is None else ellipses

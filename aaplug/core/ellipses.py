@@ -21,10 +21,10 @@ def whitening(splats: Splats2D) -> Float[Tensor, "m 2 2"]:
 
 
 def whitening_columns(covs: Float[Tensor, "m 3"], dets: Float[Tensor, " m"]) -> Columns:
-    """The four entries of each splat's whitening matrix.
+    """ux, uy, vx, vy: the rows of a matrix W with |W d|² = dᵀ C⁻¹ d, so that u = ux·dx + uy·dy, and v likewise.
 
-    The row with a zero follows the axis of larger variance, so the other row's slope is at most one.  With the
-    determinant given, needles keep their digits, which yy·dx² - 2xy·dx·dy + xx·dy² loses.
+    W is triangular, up to the order of its columns: v depends only on the axis of larger variance, so u's slope
+    against it is at most 1.  With the given determinant a needle keeps its precision; expanding dᵀ C⁻¹ d cancels.
     """
     xx, xy, yy = covs.unbind(dim=1)
     wide = xx >= yy
@@ -40,7 +40,7 @@ def whitening_columns(covs: Float[Tensor, "m 3"], dets: Float[Tensor, " m"]) -> 
 
 
 def principal_columns(covs: Float[Tensor, "m 3"], dets: Float[Tensor, " m"]) -> Columns:
-    """The four entries of the whitening matrix whose rows are the principal axes, the longer one first."""
+    """ux, uy, vx, vy of a whitening whose rows are the principal axes over their standard deviations, longer first."""
     xx, xy, yy = covs.unbind(dim=1)
     across, along = 2 * xy, xx - yy
     round_ = (across == 0) & (along == 0)  # a circle: any axes do, but the angle has no gradient
@@ -58,17 +58,11 @@ def squared_cutoff(opacities: Float[Tensor, " m"], min_alpha: float = RULES_3DGS
     return 2 * torch.log(opacities / min_alpha)
 
 
-def half_sizes(splats: Splats2D) -> Float[Tensor, "m 2"]:
-    """Half width and half height of the box outside of which alpha is below 3DGS's cut-off, in px."""
-    cutoff = squared_cutoff(splats.opacities).clamp(min=0.0)
-    return (cutoff[:, None] * splats.covs[:, [0, 2]]).sqrt()
-
-
 def grown(splats: Splats2D, radius: Float[Tensor, " m"], min_alpha: float) -> Splats2D:
-    """Splats whose cut-off ellipses contain everything within `radius` px of the given ones.
+    """Splats whose cut-off ellipses contain every point within `radius` px of the given ones; for bounding only.
 
-    For any e, (1 + e) C + (1 + 1/e) (r²/R) I contains the Minkowski sum of an ellipse (covariance C, squared cut-off R)
-    and a disc of radius r.
+    For any e > 0, the covariance (1 + e) C + (1 + 1/e) (r²/R) I bounds the Minkowski sum of an ellipse (C, squared
+    cut-off R) and a disc of radius r.  e = r / √(R tr C / 2) makes the bound's trace smallest.
     """
     cutoff = squared_cutoff(splats.opacities, min_alpha)
     cutoff = cutoff.clamp(min=torch.finfo(splats.means.dtype).tiny)

@@ -79,11 +79,6 @@ class PixelSizes:
         """The sizes at `index`, in that order."""
         return PixelSizes(self.smallest[index], self.largest[index], self.base[index])
 
-    def to(self, target: torch.dtype | torch.device) -> "PixelSizes":
-        """The same sizes in another precision or on another device."""
-        base = self.base if isinstance(target, torch.dtype) else self.base.to(target)
-        return PixelSizes(self.smallest.to(target), self.largest.to(target), base)
-
 
 @dataclass(frozen=True)
 class Gaussians:
@@ -138,30 +133,17 @@ class Gaussians:
         """The Gaussians at `index` (a mask, indices or a slice), in that order."""
         kept = index.cpu() if isinstance(index, Tensor) else index  # the file's rows stay on the CPU
         origin = self.origin and replace(self.origin, rows=self.origin.rows[kept])
-        return replace(
-            self,
-            means=self.means[index],
-            quats=self.quats[index],
-            log_scales=self.log_scales[index],
-            logit_opacities=self.logit_opacities[index],
-            sh=self.sh[index],
-            filter_3d=None if self.filter_3d is None else self.filter_3d[index],
-            pixel_sizes=None if self.pixel_sizes is None else self.pixel_sizes[index],
-            origin=origin,
-        )
+        columns = {name: column[index] for name, column in self._columns().items()}
+        sizes = None if self.pixel_sizes is None else self.pixel_sizes[index]
+        return replace(self, **columns, pixel_sizes=sizes, origin=origin)
 
-    def to(self, target: torch.dtype | torch.device) -> "Gaussians":
-        """The same Gaussians in another precision or on another device."""
-        return replace(
-            self,
-            means=self.means.to(target),
-            quats=self.quats.to(target),
-            log_scales=self.log_scales.to(target),
-            logit_opacities=self.logit_opacities.to(target),
-            sh=self.sh.to(target),
-            filter_3d=None if self.filter_3d is None else self.filter_3d.to(target),
-            pixel_sizes=None if self.pixel_sizes is None else self.pixel_sizes.to(target),
-        )
+    def to(self, dtype: torch.dtype) -> "Gaussians":
+        """The same Gaussians in another precision; recorded pixel sizes keep theirs."""
+        return replace(self, **{name: column.to(dtype) for name, column in self._columns().items()})
+
+    def _columns(self) -> dict[str, Tensor]:
+        """Every parameter that is present, by name."""
+        return {name: value for name, value in vars(self).items() if isinstance(value, Tensor)}
 
 
 def scale_opacities(

@@ -1,11 +1,13 @@
-"""Every seam on one page: what a plug-in receives, what it returns, and what it must hold to.
+"""The rendering interfaces: what a plug-in receives, what it returns, and what it must guarantee.
 
-A selection chooses the Gaussians that a view draws.  A world filter acts once per scene, a screen filter once per
-view on the projected splats.  A pixel kernel turns a splat into alpha at a pixel, a compositor turns alphas into light,
-and a rasterizer does both for a whole image.  A metric compares two images.
+A world filter acts once per scene.  Per view, a selection picks the splats to draw and a screen filter changes their
+covariances and opacities.  A pixel kernel gives a splat's alpha at a pixel, a compositor turns alphas into colour, and
+a rasterizer does both for a whole image.  Recipes, metrics and file formats have their interfaces in `methods.recipe`,
+`evaluation.metric`, `io.scenes` and `io.cameras`.
 
 Plug-ins are frozen dataclasses or functions.  They are deterministic, have no side effects and never change their
-input.  `core.registry` lists them; the laws in `tests/laws` run over every one that is registered.
+input.  Each kind has a `core.registry.Registry`; `tests/laws` checks every registered filter, pixel kernel,
+compositor, rasterizer and recipe.
 """
 
 from collections.abc import Callable
@@ -35,10 +37,10 @@ class WorldFilter(Protocol):
 
 @runtime_checkable
 class Selection(Protocol):
-    """Chooses which splats of one view are drawn, before any screen filter."""
+    """Picks the splats of one view to draw, after projection and before the screen filter."""
 
     def __call__(self, splats: Splats2D, scene: Gaussians) -> Splats2D:
-        """Return the chosen splats of `scene`, unchanged and in order.
+        """Return a subset of `splats`, unchanged and in their order; `splats.sources` index `scene`.
 
         Raises:
             UsageError: the scene lacks what it chooses by.
@@ -46,7 +48,7 @@ class Selection(Protocol):
         ...
 
     def lacks(self, scene: Gaussians) -> str | None:
-        """What the scene lacks to be chosen from, in words; None if nothing."""
+        """What this selection needs and the scene lacks, in words; None if nothing."""
         ...
 
 
@@ -55,28 +57,28 @@ class ScreenFilter(Protocol):
     """Changes the covariances and opacities of one view's splats."""
 
     def __call__(self, splats: Splats2D, camera: Camera, training: TrainingViews) -> Splats2D:
-        """Filter the splats of `camera`, whose sampling rate against training is `training.relative_rate(camera)`.
+        """Filter the view's splats; `training.relative_rate(camera)` is the view's rate relative to training.
 
-        With several samples per pixel, `camera` is the larger image that has the samples as its pixels.
+        With several samples per pixel, `camera` is that of the supersampled image.
         """
         ...
 
 
 @runtime_checkable
 class MatchesRates(Protocol):
-    """A screen filter that compares each Gaussian's sampling rate with a chosen reference (`--rate-reference`)."""
+    """A screen filter that divides each Gaussian's sampling rate by a selectable reference rate."""
 
     def with_reference(self, reference: str) -> ScreenFilter:
         """The same filter with another reference.
 
         Raises:
-            UsageError: it knows no reference of that name.
+            UsageError: there is no reference of that name.
         """
         ...
 
 
 class Pixels(NamedTuple):
-    """Pixels of square tiles: the tiles' top left corners, and one tile's pixel centres from its corner, in px."""
+    """Pixel centres of square tiles, in px: each tile's top left corner, and x and y of its P centres from there."""
 
     corners: Float[Tensor, "t 2"]
     x: Float[Tensor, " P"]
@@ -85,14 +87,16 @@ class Pixels(NamedTuple):
 
 @runtime_checkable
 class PixelKernel(Protocol):
-    """What a splat's alpha is at a pixel.
+    """Gives a splat's alpha at a pixel.
 
-    m: splats; t: tiles; P: pixels per tile; c: columns of a raster row, laid out as in `pixel_kernels.raster_rows`.
+    m: splats; t: tiles; P: pixels per tile; p: pixels; c: columns of a raster row (`pixel_kernels.raster_rows`);
+    *n: splats per tile, or nothing.
 
-    name: unique.
-    columns: of a raster row.
+    name: unique among pixel kernels.
+    columns: number of columns of a raster row.
     needs_depth_slopes: whether it draws discs, which need `Splats2D.depth_slopes`.
-    splats_per_pass: how many splats of a tile one compiled pass composites; 8 suits all but the cheapest kernels.
+    splats_per_pass: splats of a tile that one compiled pass composites: a multiple of `forward.STEP`, at most
+        `binning.LONGEST_PASS`; 8 suits all but the cheapest kernels.
     """
 
     @property
@@ -108,31 +112,35 @@ class PixelKernel(Protocol):
     def splats_per_pass(self) -> int: ...  # noqa: D102
 
     def bounding_ellipses(self, splats: Splats2D, rules: Rules) -> Splats2D | None:
-        """Splats whose cut-off ellipses contain every pixel centre with alpha above 0; None for the given splats."""
+        """Splats whose cut-off ellipses contain every pixel centre where alpha > 0; None if the given ones do."""
         ...
 
-    def raster_rows(self, splats: Splats2D, kernels: Kernels) -> Float[Tensor, "m c"]:
-        """One row per splat: everything that `alpha` needs, and the colour.  A row of zeros draws nothing."""
+    def raster_rows(self, splats: Splats2D, kernels: Kernels) -> Float[Tensor, "m_and_1 c"]:
+        """One row per splat, with all that `alpha` needs and the colour, then one padding row.
+
+        The padding row's alpha is 0 everywhere: tiles that have run out of splats read it.  `raster_rows.rows_of`
+        appends it.
+        """
         ...
 
     def alpha(self, rows: Float[Tensor, "*n t c"], pixels: Pixels, rules: Rules) -> Float[Tensor, "*n t P"]:
         """Alpha at each tile's pixels before the cap; 0 below the cut-off."""
         ...
 
-    def exact(self, splats: Splats2D, offsets: Float[Tensor, "p c 2"]) -> Float[Tensor, "p c"]:
-        """The slow float64 twin: alpha over opacity at `offsets` (px) from the splats, before cap and cut-off."""
+    def exact(self, splats: Splats2D, offsets: Float[Tensor, "p m 2"]) -> Float[Tensor, "p m"]:
+        """The same formula in float64, by its definition: alpha / opacity at `offsets` (px), uncapped and uncut."""
         ...
 
 
 @runtime_checkable
 class Compositor(Protocol):
-    """Another way to turn alphas into light than 3DGS's front-to-back product of transmittances."""
+    """Replaces 3DGS's alpha compositing.  t: tiles; P: pixels per tile; p: pixels, or entries of `order`."""
 
     @property
     def name(self) -> str: ...  # noqa: D102
 
     def rows(self, splats: Splats2D) -> Float[Tensor, "m c"]:
-        """One row per splat for `tiles`."""
+        """One row per splat, in a layout of its own; only `tiles` reads it."""
         ...
 
     def tiles(
@@ -146,22 +154,22 @@ class Compositor(Protocol):
         kernels: Kernels,
         rules: Rules,
     ) -> Float[Tensor, "4 t P"]:
-        """Premultiplied colour, and alpha, of tiles; tile t draws the splats `order[first[t] : first[t] + counts[t]]`.
+        """Premultiplied red, green, blue, and alpha; tile t composites `order[first[t] : first[t] + counts[t]]`.
 
-        centres: x and y of the pixels' centres, in px.  window: side of a pixel, in px.
+        centres: x and y of the pixel centres, in px.  window: `Splats2D.window`, in px.
         """
         ...
 
     def exact(
         self, splats: Splats2D, centres: Float[Tensor, "p 2"], rules: Rules
     ) -> tuple[Float[Tensor, "p 3"], Float[Tensor, " p"]]:
-        """The slow float64 twin: premultiplied colour and transmittance of pixels, for splats sorted by depth."""
+        """Float64 reference: premultiplied colour and transmittance (not alpha), for splats sorted nearest first."""
         ...
 
 
 @runtime_checkable
 class Rasterizer(Protocol):
-    """Composites splats front to back over a background; splats of equal depth are drawn in scene order."""
+    """Composites splats front to back over a background; splats of equal depth keep the given order."""
 
     @property
     def name(self) -> str:
@@ -183,7 +191,7 @@ class Rasterizer(Protocol):
 
 @runtime_checkable
 class RunsKernels(Protocol):
-    """A rasterizer that says how the elementwise stages before it should run (default: eagerly)."""
+    """A rasterizer that chooses how the elementwise stages before it run; without this they run eagerly."""
 
     @property
     def kernels(self) -> Kernels: ...  # noqa: D102
@@ -191,16 +199,16 @@ class RunsKernels(Protocol):
 
 @runtime_checkable
 class CountsEvaluations(Protocol):
-    """A rasterizer that can count the splat-pixel evaluations of compositing: the work of a frame on any machine."""
+    """A rasterizer that can count splat-pixel evaluations, a machine-independent cost of a frame."""
 
     def counting(self, add: Callable[[int], None]) -> Rasterizer:
-        """The same rasterizer; it calls `add` with the number of evaluations of every pass."""
+        """The same rasterizer; after each pass it calls `add` with that pass's evaluations."""
         ...
 
 
 @runtime_checkable
 class TakesMemory(Protocol):
-    """A rasterizer that works in bands, within a memory budget."""
+    """A rasterizer whose working memory can be bounded."""
 
     def within(self, memory: float) -> Rasterizer:
         """The same rasterizer with a budget in bytes, beside the scene and the image."""

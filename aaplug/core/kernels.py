@@ -4,8 +4,7 @@ A kernel is a function of tensors.  Run eagerly it is plain array code, for any 
 `rasterizers.tiled.ahead_of_time` compiles the same source into one fused loop.  A stage asks its `Kernels` to run it.
 """
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -82,14 +81,3 @@ class Kernels:
 
 
 EAGER = Kernels()
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Limit torch to one thread inside the block."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)

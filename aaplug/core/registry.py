@@ -1,31 +1,43 @@
-"""Registries: what can be chosen by name, from here and from installed plug-ins.
+"""Registries: what can be chosen by name, from aaplug and from installed plug-ins.
 
-A package adds an entry by an entry point in the group "aaplug.<kind>", for example in its pyproject.toml:
+A package adds an entry by an entry point in the group "aaplug.<kind>s", for example in its pyproject.toml:
 
     [project.entry-points."aaplug.screen_filters"]
     sharp = "their_package.sharp:SHARP"
 
-The entry's name is the name in the registry.  An object with a `name` of its own must agree with it.
+The entry's name is the name in the registry.  An object with a `name` of its own must agree with it.  A plug-in that
+cannot be used is left out with a warning, so that it does not stop everything else.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+import difflib
+import logging
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
 
 from aaplug.core.errors import UsageError, listing
 
+KINDS = (  # each is a registry and, with underscores and an s, an entry point group
+    *("world filter", "screen filter", "selection", "pixel kernel", "compositor", "recipe", "viewer", "form"),
+    *("rasterizer", "metric", "protocol", "method", "scene format", "camera format"),
+)
+PREFIX = "aaplug."
+
+log = logging.getLogger("aaplug")
 T = TypeVar("T")
 
 
 class Registry(Mapping[str, T]):
     """Named objects of one kind; plug-ins are loaded when the registry is first read.
 
-    kind: in words, singular ("screen filter"); its plural with underscores ends the entry point group's name.
+    kind: one of `KINDS`.
     """
 
-    def __init__(self, kind: str, own: Mapping[str, T], check: Callable[[T], bool] = lambda value: True):
-        """own: the entries of aaplug.  check: whether an object is of this kind."""
-        self.kind, self._entries, self._check = kind, dict(own), check
+    def __init__(self, kind: str, own: Mapping[str, T], check: type | Callable[[T], bool] = object):
+        """own: the entries of aaplug, by name.  check: the type of such objects, or a test of them."""
+        assert kind in KINDS, kind
+        self.kind, self._entries = kind, dict(own)
+        self._fits = (lambda value: isinstance(value, check)) if isinstance(check, type) else check
         self._loaded = False
 
     def __getitem__(self, name: str) -> T:
@@ -41,13 +53,15 @@ class Registry(Mapping[str, T]):
         """An entry by name.
 
         Raises:
-            UsageError: there is none; the error names `parameter`, or else the kind.
+            UsageError: there is none; the error names `parameter`, or else the kind, and the closest names.
         """
         entries = self._all()
-        if name not in entries:
-            known = listing(list(entries), most=len(entries))
-            raise UsageError(parameter or self.kind, f"'{name}' is not one of {known}")
-        return entries[name]
+        if name in entries:
+            return entries[name]
+        close = difflib.get_close_matches(name, entries, 1)
+        hint = f" (did you mean '{close[0]}'?)" if close else ""
+        known = listing(list(entries), most=len(entries))
+        raise UsageError(parameter or self.kind, f"'{name}' is not one of {known}{hint}")
 
     def register(self, name: str, value: T) -> None:
         """Add an entry from Python, for this process.
@@ -61,25 +75,50 @@ class Registry(Mapping[str, T]):
     @property
     def group(self) -> str:
         """Name of the entry point group."""
-        return f"aaplug.{self.kind.replace(' ', '_')}s"
+        return group_of(self.kind)
 
     def _all(self) -> dict[str, T]:
         if not self._loaded:
             self._loaded = True
+            _warn_of_unknown_groups()
             for point in entry_points(group=self.group):
-                where = f"plug-in {point.value} ({self.group})"
-                self._add(point.name, _load(point, where), where)
+                package = f" of package {point.dist.name}" if point.dist else ""
+                where = f"plug-in {point.value}{package} ({self.group})"
+                try:
+                    self._add(point.name, _load(point, where), where)
+                except UsageError as error:
+                    log.warning("%s; it is left out", error)
         return self._entries
 
     def _add(self, name: str, value: T, where: str) -> None:
         if name in self._entries:
             raise UsageError(where, f"a {self.kind} named '{name}' exists already")
-        if not self._check(value):
-            raise UsageError(where, f"is not a {self.kind}: {type(value).__name__} lacks its methods")
+        if isinstance(value, type) or not self._fits(value):
+            found = f"the class {value.__name__}" if isinstance(value, type) else f"a {type(value).__name__}"
+            raise UsageError(where, f"is {found}, which is not a {self.kind}; see examples/guides/contributing.md")
         own = getattr(value, "name", name)
         if own != name:
             raise UsageError(where, f"is registered as '{name}' but calls itself '{own}'")
         self._entries[name] = value
+
+
+def named(objects: Iterable[T]) -> dict[str, T]:
+    """Objects by their `name`."""
+    return {getattr(value, "name"): value for value in objects}  # noqa: B009
+
+
+def group_of(kind: str) -> str:
+    """Name of the entry point group of a kind."""
+    return f"{PREFIX}{kind.replace(' ', '_')}s"
+
+
+def _warn_of_unknown_groups() -> None:
+    known = set(map(group_of, KINDS))
+    for group in sorted(entry_points().groups):
+        if group.startswith(PREFIX) and group not in known:
+            close = difflib.get_close_matches(group, known, 1)
+            hint = f"; did you mean {close[0]}?" if close else ""
+            log.warning("entry point group %s is not known%s", group, hint)
 
 
 def _load(point: EntryPoint, where: str) -> Any:

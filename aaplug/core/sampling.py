@@ -1,4 +1,4 @@
-"""How finely a set of cameras samples each Gaussian: the Nyquist bounds that every filter starts from.
+"""How finely a set of cameras samples each Gaussian: the sampling rates that rate-aware filters start from.
 
 n: Gaussians, v: cameras, c: Gaussians of a chunk.  A camera of focal length f px samples a Gaussian at depth z (along
 the optical axis) with f / z pixels per world unit.  It sees the Gaussian when the depth is above `NEAR` and the
@@ -46,12 +46,14 @@ class SamplingBounds:
 
     @property
     def highest_or_coarsest(self) -> Float[Tensor, " n"]:
-        """Highest rates; a Gaussian that was never seen gets the coarsest of them (Mip-Splatting's rule).
+        """Highest rates; a Gaussian that no camera sees gets the lowest of all highest rates (Mip-Splatting's code).
 
         Raises:
             FrameError: no camera sees any Gaussian.
         """
-        if len(self.views) and not self.seen.any():
+        if not len(self.views):
+            return self.highest
+        if not self.seen.any():
             raise FrameError("sampling bounds", "no camera sees any Gaussian: there is no rate to filter by")
         coarsest = self.highest[self.seen].min()
         return torch.where(self.seen, self.highest, coarsest)
@@ -60,7 +62,7 @@ class SamplingBounds:
 def sampling_bounds(
     means: Float[Tensor, "n 3"], cameras: Sequence[Camera], chunk_pairs: int = CHUNK_PAIRS
 ) -> SamplingBounds:
-    """Highest and lowest sampling rate of each Gaussian over the cameras that see it (Mip-Splatting, eq. 7).
+    """Lowest and highest sampling rate of each Gaussian over the cameras that see it (highest: Mip-Splatting, eq. 7).
 
     Memory beyond the result and one float64 copy of the means is bounded by `chunk_pairs`.
 
@@ -97,9 +99,9 @@ def median_rates(
 def view_information(
     means: Float[Tensor, "n 3"], cameras: Sequence[Camera], chunk_pairs: int = CHUNK_PAIRS
 ) -> Float[Tensor, "n 3 3"]:
-    """Sampling of each Gaussian by direction: Σ ν² (I - d dᵀ) over the cameras that see it, in px² per world unit².
+    """Directional sampling density of each Gaussian: Σ ν² (I - d dᵀ) over the cameras that see it, in px² per unit².
 
-    A camera samples at its rate ν across its ray d, and not at all along it.  0 where no camera sees the Gaussian.
+    Along u, uᵀ M u is the summed squared rate; a camera adds nothing along its own ray d.  0 if no camera sees it.
 
     Raises:
         UsageError: there are no cameras.

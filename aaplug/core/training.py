@@ -1,4 +1,4 @@
-"""What is known at test time about training: how it drew, and how finely its cameras sampled the scene."""
+"""What is known about training: its rasterization convention, and how finely its cameras sampled the scene."""
 
 import math
 from collections.abc import Sequence
@@ -16,9 +16,9 @@ class TrainingViews:
 
     convention: how training turned covariances into pixels.
     cameras: at the training size.
-    bounds: highest and lowest sampling rate of each Gaussian.
-    cull_margin: share of an image's longer side; training drew no Gaussian whose centre lay farther outside the image.
-        3DGS and gsplat draw them all (infinite); a scene trained with such a margin is hazy when they are drawn.
+    bounds: lowest and highest sampling rate of each Gaussian, in px per world unit.
+    cull_margin: training culled Gaussians whose centre lay farther outside the image than this share of its longer
+        side.  inf for 3DGS and gsplat, which cull none by centre.  A scene trained with a margin looks hazy without it.
     """
 
     convention: Convention
@@ -48,7 +48,7 @@ class TrainingViews:
         return cls(scene.convention, views, sampling_bounds(scene.means, views), cull_margin)
 
     def relative_rate(self, camera: Camera) -> float:
-        """Sampling rate of a view against training: 1 at the training size, 1/2 at half of it.
+        """A view's focal length over training's: 1 at the training size, 1/2 at half of it.  Depth plays no part.
 
         A free camera is compared with the training cameras' median focal length.
         """

@@ -9,11 +9,11 @@ import math
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.cameras import Camera
@@ -25,11 +25,10 @@ from aaplug.core.monitor import Tell
 from aaplug.core.training import TrainingViews
 from aaplug.evaluation.image_store import ImageStore
 from aaplug.evaluation.journal import Journal
-from aaplug.evaluation.metric import Metric
+from aaplug.evaluation.metric import Drawn, Image, Metric, Series, TimedRenderer
 from aaplug.evaluation.metrics import PSNR, SSIM
 from aaplug.evaluation.protocols import Protocol
 from aaplug.evaluation.results import CEILING, Measurement, Report
-from aaplug.evaluation.series import Drawn, Series, TimedRenderer
 from aaplug.evaluation.truth import Truth, ViewTruth, source_of
 from aaplug.io.photographs import DOWNSCALES
 from aaplug.methods.recipe import Recipe
@@ -110,27 +109,30 @@ def evaluate(
 ) -> Report:
     """Measure every candidate at every scale on every view.
 
-    Args:
-        task: what to measure.
-        facts: JSON-ready entries to add to the report's protocol (versions, hashes).
-        tell: called with (views done, views in all).
-        journal: file that keeps what is finished.
-        resume: do not measure the views again that the journal holds.
-        images: where to store images.
+    facts: JSON-ready entries to add to the report's protocol (versions, hashes).
+    tell: called with (views done, views in all).
+    journal: file that keeps what is finished; resume: do not measure the views again that it holds.
+    images: where to store images.
 
     Raises:
         UsageError: nothing to measure, a view lacks the photograph it needs, or the journal is of another request.
-        FormatError: a photograph cannot be read.
-        OutputError: the journal or an image cannot be written.
     """
     task = replace(task, views=_distinct(task.views))
     _check(task)
     request = _request(task) | dict(facts or {})
     written = None if journal is None else Journal(Path(journal), request, resume)
-    measurements = list[Measurement]()
+    known = {} if written is None else written.known
+    bench, measurements = _Bench(task, images), list[Measurement]()
     with written or nullcontext():
-        for measured in _by_view(task, written, images, tell):
+        for index, view in enumerate(task.views):
+            tell(index, len(task.views))
+            measured = known.get(index)
+            if measured is None:
+                measured = tuple(bench.measure(index, view))
+                if written is not None:
+                    written.add(index, measured)
             measurements += measured
+        tell(len(task.views), len(task.views))
     order = task.names
     measurements.sort(key=lambda m: (order.index(m.recipe), task.scales.index(m.scale)))
     return Report(tuple(measurements), request, task.measured)
@@ -145,22 +147,6 @@ def compare(
 ) -> Report:
     """Candidates side by side, in PSNR and SSIM."""
     return evaluate(Task(candidates, scales, views, truth, ceiling=False), tell=tell)
-
-
-def _by_view(
-    task: Task, journal: Journal | None, images: ImageStore | None, tell: Tell
-) -> Iterator[Sequence[Measurement]]:
-    """The measurements of every view, from the journal or new."""
-    bench = _Bench(task, images)
-    for index, view in enumerate(task.views):
-        tell(index, len(task.views))
-        measured = None if journal is None else journal.known.get(index)
-        if measured is None:
-            measured = tuple(bench.measure(index, view))
-            if journal is not None:
-                journal.add(index, measured)
-        yield measured
-    tell(len(task.views), len(task.views))
 
 
 def _distinct(views: Sequence[Camera]) -> Sequence[Camera]:
@@ -190,7 +176,7 @@ def _request(task: Task) -> dict[str, Any]:
         "truth": task.truth.source,
         "downscale": DOWNSCALES[task.protocol.downscale if photographs else "box"].protocol,
         "rounding": "renders clamped to [0, 1] and rounded to 8 bits",
-        "background": list(task.truth.background),
+        "background": list(task.truth.own.background),
         "metrics": {metric.name: metric.protocol for metric in task.measured},
         "views": len(task.views),
         "view_names": [view.name for view in task.views],
@@ -217,20 +203,12 @@ class _Bench:
             for name, drawn in self._drawn(truth, scale):
                 if scale == 1 and self.sized:
                     fulls[name] = drawn
-                series = self._series(truth, name, scale, drawn, fulls.get(name))
-                values = comparison.values(drawn, series)
+                series = None if name == CEILING else self._series(truth, name, scale, drawn, fulls.get(name))
+                values, note = comparison.values(drawn, series)
                 if self.images is not None:
                     self.images.keep(index, name, scale, drawn.rgb, comparison.truth)
-                yield Measurement(
-                    name,
-                    scale,
-                    view.name,
-                    values,
-                    drawn.samples,
-                    drawn.seconds,
-                    comparison.note(values),
-                    drawn.evaluations,
-                )
+                cost = drawn.samples, drawn.seconds
+                yield Measurement(name, scale, view.name, values, *cost, note, drawn.evaluations)
 
     def _drawn(self, truth: ViewTruth, scale: float) -> Iterator[tuple[str, Drawn]]:
         """The rows' images at a scale; candidates that draw alike, as several do at the training size, draw once."""
@@ -246,18 +224,10 @@ class _Bench:
                 drawings[work] = timed(camera)
             yield name, drawings[work]
 
-    def _series(self, truth: ViewTruth, name: str, scale: float, drawn: Drawn, full: Drawn | None) -> Series | None:
-        """What figures look at; None for the ceiling, which has none."""
-        if name == CEILING:
-            return None
+    def _series(self, truth: ViewTruth, name: str, scale: float, drawn: Drawn, full: Drawn | None) -> Series:
         camera, timed = truth.camera(scale), self.timed[name]
-        return Series(
-            scale,
-            drawn,
-            full,
-            smaller=lambda image: self.task.protocol.resized(image, camera, scale),
-            frames=(lambda: (timed.motion(camera), truth.motion(scale))) if self.sized else None,
-        )
+        frames = (lambda: (timed.motion(camera), truth.motion(scale))) if self.sized else None
+        return Series(scale, drawn, full, partial(self.task.protocol.resized, camera=camera, scale=scale), frames)
 
 
 def _work(renderer: Renderer, camera: Camera) -> Hashable:
@@ -271,26 +241,23 @@ def _work(renderer: Renderer, camera: Camera) -> Hashable:
 class _Comparison:
     """Compares images with one truth; equal images are compared once."""
 
-    def __init__(self, metrics: Sequence[Metric], truth: Float[Tensor, "h w 3"] | None):
+    def __init__(self, metrics: Sequence[Metric], truth: Image | None):
         self.metrics, self.truth = metrics, truth
         self._known: list[tuple[Tensor, Values]] = []
 
-    def values(self, drawn: Drawn, series: Series | None) -> Values:
-        """Every metric's value."""
+    def values(self, drawn: Drawn, series: Series | None) -> tuple[Values, str]:
+        """Every metric's value, and why values are undefined; the ceiling has no series, and so no figures."""
         compared = self._compared(drawn.rgb)
-        return {m.name: compared[m.name] if m.measure else (series and m.of(series)) for m in self.metrics}
-
-    def note(self, values: Values) -> str:
-        """Why values are undefined, each reason once."""
+        values = {m.name: compared[m.name] if m.measure else (series and m.of(series)) for m in self.metrics}
         if self.truth is None:
-            return NO_PHOTOGRAPH
+            return values, NO_PHOTOGRAPH
         undefined = [m.undefined for m in self.metrics if m.measure and values[m.name] is None]
-        return "; ".join(dict.fromkeys(undefined))
+        return values, "; ".join(dict.fromkeys(undefined))
 
-    def _compared(self, rgb: Float[Tensor, "h w 3"]) -> Values:
+    def _compared(self, rgb: Image) -> Values:
         metrics = [metric for metric in self.metrics if metric.measure]
         if self.truth is None:
-            return {metric.name: None for metric in metrics}
+            return dict.fromkeys(metric.name for metric in metrics)
         image = quantised(rgb)
         for known, values in self._known:
             if image.equal(known):

@@ -5,13 +5,10 @@ report shows have the same layout in images/.  The number is the view's place in
 replaced: a continued evaluation writes the same one again.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from jaxtyping import Float
-from torch import Tensor
-
+from aaplug.evaluation.metric import Image
 from aaplug.evaluation.results import CEILING, method
 from aaplug.io.atomic import make_folder
 from aaplug.io.images import write_png
@@ -32,35 +29,19 @@ class ImageStore:
     shown: tuple[int, ...]
     everything: bool = False
 
-    def keep(
-        self, view: int, recipe: str, scale: float, image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"] | None
-    ) -> None:
-        """Store one image and its truth.
-
-        Raises:
-            OutputError: it cannot be written.
-        """
-        for folder in self._folders(view, recipe, truth):
+    def keep(self, view: int, recipe: str, scale: float, image: Image, truth: Image | None) -> None:
+        """Store one image and its truth, wherever they belong."""
+        folders = [SHOWN] if view in self.shown else []
+        if self.everything and truth is not None and recipe != CEILING:
+            folders.append(EVERYTHING)
+        for folder in folders:
             for kind, pixels in ((RENDERS, image), (TRUTHS, truth)):
                 if pixels is not None:
-                    _write(_path(folder, view, recipe, scale, kind), pixels)
+                    path = self.path(view, recipe, scale, kind, folder)
+                    make_folder(path.parent)
+                    write_png(path, pixels, overwrite=True)
 
-    def path(self, view: int, recipe: str, scale: float, kind: str = RENDERS) -> Path:
-        """Path of a shown render, or by kind of its truth."""
-        return _path(self.folder / SHOWN, view, recipe, scale, kind)
-
-    def _folders(self, view: int, recipe: str, truth: Tensor | None) -> Iterator[Path]:
-        if view in self.shown:
-            yield self.folder / SHOWN
-        if self.everything and truth is not None and recipe != CEILING:
-            yield self.folder / EVERYTHING
-
-
-def _path(folder: Path, view: int, recipe: str, scale: float, kind: str) -> Path:
-    name = "ceiling" if recipe == CEILING else recipe
-    return folder / method(name, scale) / kind / f"{view:05d}.png"
-
-
-def _write(path: Path, pixels: Float[Tensor, "h w 3"]) -> None:
-    make_folder(path.parent)
-    write_png(path, pixels, overwrite=True)
+    def path(self, view: int, recipe: str, scale: float, kind: str = RENDERS, folder: str = SHOWN) -> Path:
+        """Path of a render, or by kind of its truth; of those shown unless the other folder is named."""
+        name = "ceiling" if recipe == CEILING else recipe
+        return self.folder / folder / method(name, scale) / kind / f"{view:05d}.png"

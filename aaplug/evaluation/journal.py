@@ -37,15 +37,12 @@ class Journal:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self.close()
+        """Close the file, which lets other processes write it."""
+        if self._stream is not None:
+            self._stream.close()
 
     def add(self, view: int, measurements: Sequence[Measurement]) -> None:
-        """Add a finished view.
-
-        Raises:
-            UsageError: another process is writing the journal.
-            OutputError: it cannot be written.
-        """
+        """Add a finished view; raises as the constructor does."""
         with _worded(self.path):
             if self._stream is None:
                 self.path.parent.mkdir(parents=True, exist_ok=True)
@@ -55,11 +52,6 @@ class Journal:
                 self._write({"request": self._request})
             self._write({"view": view, "measurements": [asdict(m) for m in measurements]})
 
-    def close(self) -> None:
-        """Close the file, which lets other processes write it."""
-        if self._stream is not None:
-            self._stream.close()
-
     def _continue(self) -> None:
         with _worded(self.path), ExitStack() as stack:
             stream = stack.enter_context(self.path.open("r+b"))
@@ -67,7 +59,12 @@ class Journal:
             lines = _whole_lines(stream)
             if not lines:
                 return
-            _check_same(self.path, lines[0].get("request"), self._request)
+            before, now = lines[0].get("request"), self._request
+            before = before if isinstance(before, dict) else {}
+            changed = dict.fromkeys(key for key in (*now, *before) if before.get(key) != now.get(key))
+            if changed:
+                what = f"is of another request ({listing(list(changed))} changed since)"
+                raise UsageError(str(self.path), f"{what}; repeat that request, or start again with `overwrite`")
             for line in lines[1:]:
                 self.known[line["view"]] = tuple(Measurement(**m) for m in line["measurements"])
             stack.pop_all()  # keeps the stream open
@@ -103,17 +100,6 @@ def _whole_lines(stream: BinaryIO) -> list[dict[str, Any]]:
     stream.seek(end)
     stream.truncate()
     return found
-
-
-def _check_same(path: Path, before: Any, now: Mapping[str, Any]) -> None:
-    before = before if isinstance(before, dict) else {}
-    changed = [key for key in (*now, *before) if before.get(key) != now.get(key)]
-    if changed:
-        names = listing(list(dict.fromkeys(changed)))
-        raise UsageError(
-            str(path),
-            f"is of another request ({names} changed since); repeat that request, or start again with `overwrite`",
-        )
 
 
 def _lock(stream: BinaryIO, path: Path) -> None:

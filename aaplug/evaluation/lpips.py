@@ -12,12 +12,12 @@ from os import PathLike
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import conv2d, max_pool2d, relu
 
 from aaplug.core.errors import FormatError, UsageError
-from aaplug.evaluation.metric import LpipsFlavour, Metric, MetricOptions
+from aaplug.evaluation.metric import Image, LpipsFiles, Metric
+from aaplug.evaluation.protocols import LpipsFlavour, Protocol
 
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)  # of ImageNet in [−1, 1] (LPIPS)
 EPSILON = 1e-10  # added to a feature's length before dividing by it (LPIPS)
@@ -37,12 +37,9 @@ NETS = {
         Stage(tuple((number, 1, 1) for number in numbers), (2, 2) if stage else None)
         for stage, numbers in enumerate(((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28)))
     ),
-    "alex": (
-        Stage(((0, 4, 2),)),
-        Stage(((3, 1, 2),), (3, 2)),
-        Stage(((6, 1, 1),), (3, 2)),
-        Stage(((8, 1, 1),)),
-        Stage(((10, 1, 1),)),
+    "alex": tuple(
+        Stage((convolution,), (3, 2) if stage in (1, 2) else None)
+        for stage, convolution in enumerate(((0, 4, 2), (3, 1, 2), (6, 1, 1), (8, 1, 1), (10, 1, 1)))
     ),
 }
 WORDS: dict[LpipsFlavour, str] = {
@@ -53,12 +50,7 @@ WORDS: dict[LpipsFlavour, str] = {
 
 
 def lpips_metric(flavour: LpipsFlavour, trunk: str | PathLike[str], heads: str | PathLike[str]) -> Metric:
-    """LPIPS as a metric, with its weights in memory.
-
-    Args:
-        flavour: which net, and the range of colours that it is fed.
-        trunk: torchvision's state dict.
-        heads: the `lpips` package's weights.
+    """LPIPS as a metric, with its weights (torchvision's and the `lpips` package's) in memory.
 
     Raises:
         FormatError: a file is not the weights of this net.
@@ -70,13 +62,13 @@ def lpips_metric(flavour: LpipsFlavour, trunk: str | PathLike[str], heads: str |
     return replace(LPIPS, protocol=WORDS[flavour], measure=distance)
 
 
-def _prepared(options: MetricOptions) -> Metric:
-    if options.lpips_weights is None:
+def _prepared(protocol: Protocol, files: LpipsFiles | None) -> Metric:
+    if files is None:
         raise UsageError("LPIPS", "needs weights: --lpips TRUNK HEADS")
-    return lpips_metric(options.lpips, *options.lpips_weights)
+    return lpips_metric(protocol.lpips, *files)
 
 
-def _without_weights(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> None:
+def _without_weights(image: Image, truth: Image) -> None:
     raise UsageError("LPIPS", "needs weights: see `lpips_metric`")
 
 
@@ -94,8 +86,8 @@ LPIPS = Metric(
 
 def _distance(
     net: tuple[Stage, ...], weights: dict[int, tuple[Tensor, Tensor]], heads: list[Tensor], from_unit: bool
-) -> Callable[[Float[Tensor, "h w 3"], Float[Tensor, "h w 3"]], float | None]:
-    def features(image: Float[Tensor, "h w 3"]) -> list[Tensor]:
+) -> Callable[[Image, Image], float | None]:
+    def features(image: Image) -> list[Tensor]:
         x = image.float() if from_unit else 2 * image.float() - 1
         x = ((x - x.new_tensor(SHIFT)) / x.new_tensor(SCALE)).permute(2, 0, 1)[None]
         found = []
@@ -107,7 +99,7 @@ def _distance(
         return found
 
     @torch.no_grad()
-    def measure(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> float | None:
+    def measure(image: Image, truth: Image) -> float | None:
         if min(image.shape[:2]) < LEAST_SIDE:
             return None
         pairs = zip(features(image), features(truth), heads, strict=True)

@@ -1,31 +1,97 @@
-"""Metric: a named number about an image.
+"""Metric: a named number about an image; and the timed images of one candidate that it can look at.
 
 Images are [h, w, 3] in [0, 1].
 """
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.evaluation.series import Series
+from aaplug.core.cameras import Camera
+from aaplug.core.interfaces import Colour, CountsEvaluations
+from aaplug.evaluation.protocols import Protocol
+from aaplug.rendering.renderer import Renderer
 
-SsimFlavour = Literal["wang", "3dgs"]
-LpipsFlavour = Literal["3dgs", "vgg", "alex"]
 Image = Float[Tensor, "h w 3"]
+LpipsFiles = tuple[Path, Path]  # of the trunk and of the heads
+SHIFT_STEPS = 4  # frames of a motion; between two of them the image moves 1/4 px right and down
 
 
 @dataclass(frozen=True)
-class MetricOptions:
-    """What a user chooses about metrics.  lpips_weights: files of the trunk and of the heads."""
+class Drawn:
+    """A timed render.
 
-    ssim: SsimFlavour = "wang"
-    lpips: LpipsFlavour = "vgg"
-    lpips_weights: tuple[Path, Path] | None = None
+    samples: along a pixel's side.  seconds: wall clock.  evaluations: of a splat at a pixel; None if not counted.
+    """
+
+    rgb: Float[Tensor, "h w 3"]
+    alpha: Float[Tensor, "h w"]
+    background: Colour
+    samples: int
+    seconds: float
+    evaluations: int | None
+
+    @property
+    def light(self) -> Float[Tensor, "h w 3"]:
+        """The colours without the background."""
+        return self.rgb - (1 - self.alpha[..., None]) * self.rgb.new_tensor(self.background)
+
+    def resampled_to(self, rgb: Float[Tensor, "h2 w2 3"]) -> "Drawn":
+        """An opaque image made from this render, at the cost of this render."""
+        return replace(self, rgb=rgb, alpha=rgb.new_ones(rgb.shape[:2]), samples=1)
+
+
+class TimedRenderer:
+    """A renderer that times its images and counts their splat-pixel evaluations where its rasterizer can."""
+
+    def __init__(self, renderer: Renderer):
+        self._evaluations: list[int] | None = None
+        if isinstance(renderer.rasterizer, CountsEvaluations):
+            self._evaluations = []
+            renderer = replace(renderer, rasterizer=renderer.rasterizer.counting(self._evaluations.append))
+        self.renderer = renderer
+
+    def __call__(self, camera: Camera) -> Drawn:
+        """Render one view, without gradients."""
+        if self._evaluations is not None:
+            self._evaluations.clear()
+        started = time.perf_counter()
+        with torch.no_grad():
+            rgb, alpha = self.renderer(camera)
+        seconds = time.perf_counter() - started
+        evaluations = None if self._evaluations is None else sum(self._evaluations)
+        samples, background = self.renderer.samples(camera), self.renderer.background
+        return Drawn(rgb.float(), alpha.float(), background, samples, seconds, evaluations)
+
+    def motion(self, camera: Camera, scale: float = 1.0) -> list[Float[Tensor, "h w 3"]]:
+        """Frames, clamped to [0, 1], whose content moves by 1/4 px of the image that is `scale` times as large."""
+        steps = [step / scale / SHIFT_STEPS for step in range(SHIFT_STEPS)]
+        views = (replace(camera, cx=camera.cx + step, cy=camera.cy + step) for step in steps)
+        return [self(view).rgb.clamp(0, 1) for view in views]
+
+
+@dataclass(frozen=True)
+class Series:
+    """Images of one candidate in one view at one scale.
+
+    drawn: at that scale.
+    full: by the same candidate at the training size; None if scale 1 is not measured or a scale moves the camera.
+    smaller: averages a training-size image down to that scale.
+    frames: draws the candidate's frames of a small motion, and those of the scene's own look, averaged down; None if a
+        scale moves the camera.
+    """
+
+    scale: float
+    drawn: Drawn
+    full: Drawn | None
+    smaller: Callable[[Float[Tensor, "H W 3"]], Float[Tensor, "h w 3"]]
+    frames: Callable[[], tuple[Sequence[Tensor], Sequence[Tensor]]] | None
 
 
 @dataclass(frozen=True)
@@ -39,7 +105,7 @@ class Metric:
     measure: the value for an image and the truth, both of 8 bits; None where it is undefined.
     figure: the value for images of one candidate, without a truth; None where it is undefined.
     undefined: why a value can be None, in words; reports print it as a note.
-    prepare: makes the metric that the user's options ask for; None if no option concerns it.
+    prepare: makes the metric as a protocol asks for it, with LPIPS's files; None if neither concerns it.
     """
 
     name: str
@@ -50,26 +116,15 @@ class Metric:
     measure: Callable[[Image, Image], float | None] | None = None
     figure: Callable[[Series], float | None] | None = None
     undefined: str = "undefined for this image"
-    prepare: Callable[[MetricOptions], "Metric"] | None = None
-
-    def prepared(self, options: MetricOptions) -> "Metric":
-        """The metric as the options ask for it.
-
-        Raises:
-            UsageError: an option that it needs is missing.
-            FormatError: a file that an option names cannot be read.
-        """
-        return self if self.prepare is None else self.prepare(options)
+    prepare: Callable[[Protocol, LpipsFiles | None], "Metric"] | None = None
 
     def compare(self, image: Image, truth: Image) -> float | None:
         """The value of `measure`; None where that is undefined, NaN or infinite."""
-        assert self.measure is not None
-        return _finite(self.measure(image, truth))
+        return _finite(self.measure(image, truth)) if self.measure else None
 
     def of(self, series: Series) -> float | None:
         """The value of `figure`; None where that is undefined, NaN or infinite."""
-        assert self.figure is not None
-        return _finite(self.figure(series))
+        return _finite(self.figure(series)) if self.figure else None
 
     @property
     def title(self) -> str:
@@ -78,11 +133,16 @@ class Metric:
 
     def text(self, value: float | None) -> str:
         """A value as tables show it."""
-        return "–" if value is None else f"{value:.{self.digits}f}"
+        return number(value, self.digits)
 
     def loss(self, value: float) -> float:
         """Lower is better."""
         return -value if math.isinf(self.ideal) else abs(value - self.ideal)
+
+
+def number(value: float | None, digits: int) -> str:
+    """A value as tables show it."""
+    return "–" if value is None else f"{value:.{digits}f}"
 
 
 def _finite(value: float | None) -> float | None:

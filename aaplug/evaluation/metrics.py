@@ -1,20 +1,114 @@
-"""Metrics by name.
+"""Metrics by name: those that compare an image with a truth, and figures of one candidate, which need no truth.
 
-A package adds one by an entry point in the group "aaplug.metrics": a `Metric` with a `measure` of image and truth.
+Images are [h, w, 3] in [0, 1].  A value that is not defined (images too small) or infinite (equal images) is None.
+A package adds a metric by an entry point in the group "aaplug.metrics": a `Metric` with a `measure` of image and truth.
+
+SSIM comes in the two flavours that the field's tables mix: "wang" crops the border that the window overhangs, as
+scikit-image with Gaussian weights and torchmetrics do; "3dgs" pads with zeros and keeps the border, as 3DGS's own
+script does, and so reads higher the smaller the image (by 0.003 at 512 px, 0.0085 at 64 px).
 """
 
+import importlib.util
 import math
 from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
+from itertools import pairwise
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+from torch import Tensor
 
 from aaplug.core.errors import UsageError, listing
 from aaplug.core.registry import Registry
-from aaplug.evaluation.figures import CONSISTENCY, ENERGY, FLICKER
 from aaplug.evaluation.lpips import LPIPS
-from aaplug.evaluation.metric import Metric, MetricOptions, SsimFlavour
-from aaplug.evaluation.protocols import Protocol
-from aaplug.evaluation.similarity import FLIP_DEGREE, SSIM_WINDOW, flip, psnr, ssim
+from aaplug.evaluation.metric import Image, LpipsFiles, Metric, Series
+from aaplug.evaluation.protocols import Protocol, SsimFlavour
+
+SSIM_WINDOW = 11  # px: the Gaussian of SSIM_SIGMA, cut at 3.5 sigma (Wang et al. 2004)
+SSIM_SIGMA = 1.5  # px
+FLIP_DEGREE = 67  # px per degree: FLIP's default, a 0.7 m wide 4K screen seen from 0.7 m
+LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709, on the values as stored
+
+
+def psnr(image: Image, truth: Image) -> float | None:
+    """Peak signal-to-noise ratio over all channels, in dB, for a peak of 1; None for equal images."""
+    a, b = image.cpu().numpy(), truth.to(image.dtype).cpu().numpy()
+    error = cv2.norm(a, b, cv2.NORM_L2SQR) / a.size  # summed in float64
+    return None if error == 0 else -10 * math.log10(error)
+
+
+def ssim(image: Image, truth: Image, flavour: SsimFlavour = "wang") -> float | None:
+    """Structural similarity (Wang et al. 2004, eq. 13), the channels' mean; None for images smaller than the window."""
+    if min(image.shape[:2]) < SSIM_WINDOW:
+        return None
+    from skimage.metrics import structural_similarity  # takes half a second to import
+
+    a, b = (x.double().cpu().numpy() for x in (image, truth))
+    if flavour == "3dgs":  # scikit-image crops the border that is added here, and nothing else
+        border = SSIM_WINDOW // 2
+        a, b = (np.pad(x, ((border, border), (border, border), (0, 0))) for x in (a, b))
+    value: Any = structural_similarity(
+        a, b, channel_axis=2, data_range=1.0, gaussian_weights=True, sigma=SSIM_SIGMA, use_sample_covariance=False
+    )
+    return float(value)
+
+
+def flip(image: Image, truth: Image) -> float | None:
+    """Mean of the LDR-FLIP map (Andersson et al. 2020) at the default viewing distance; 0 for equal images.
+
+    Raises:
+        UsageError: the package that computes it is not installed.
+    """
+    if importlib.util.find_spec("flip_evaluator") is None:
+        raise UsageError("FLIP", "needs the package flip-evaluator: pip install 'aaplug[flip]'")
+    import flip_evaluator  # pyright: ignore[reportMissingImports]
+
+    a, b = (np.ascontiguousarray(x.float().cpu().numpy()) for x in (truth, image))
+    _, value, _ = flip_evaluator.evaluate(a, b, "LDR", True, False, True, {"ppd": FLIP_DEGREE})
+    return float(value)
+
+
+def energy(rgb: Float[Tensor, "h w 3"]) -> float:
+    """Mean luminance (Rec. 709)."""
+    means = cv2.mean(rgb.cpu().numpy())  # summed in float64
+    return sum(weight * mean for weight, mean in zip(LUMINANCE, means, strict=False))
+
+
+def energy_drift(drawn: Float[Tensor, "h w 3"], expected: Float[Tensor, "H W 3"]) -> float | None:
+    """Relative excess of an image's light over the expected light; None where none is expected."""
+    before = energy(expected)
+    return None if before == 0 else energy(drawn) / before - 1
+
+
+def flicker(frames: Sequence[Float[Tensor, "h w 3"]], motion: Sequence[Float[Tensor, "h w 3"]]) -> float | None:
+    """RMS change from frame to frame, over that of `motion` alone; None where nothing moves.
+
+    Above 1 the image shimmers, below 1 it is blurred.
+    """
+    own, expected = (sum(float((b - a).double().square().mean()) for a, b in pairwise(x)) for x in (frames, motion))
+    return None if expected == 0 else math.sqrt(own / expected)
+
+
+def _consistency(series: Series) -> float | None:
+    if series.full is None or series.scale >= 1:
+        return None
+    return psnr(series.drawn.rgb.clamp(0, 1), series.smaller(series.full.rgb.clamp(0, 1)))
+
+
+def _energy_drift(series: Series) -> float | None:
+    if series.full is None:
+        return None
+    rows, columns = (math.ceil(side / series.scale) for side in series.drawn.rgb.shape[:2])
+    return energy_drift(series.drawn.light, series.full.light[:rows, :columns])
+
+
+def _flicker(series: Series) -> float | None:
+    if series.frames is None or series.scale >= 1:
+        return None
+    return flicker(*series.frames())
+
 
 PSNR = Metric(
     "PSNR",
@@ -36,7 +130,7 @@ def _ssim(flavour: SsimFlavour, border: str) -> Metric:
         f"{flavour}: {SSIM_WINDOW}×{SSIM_WINDOW} Gaussian, sigma 1.5, {border}, channel mean",
         partial(ssim, flavour=flavour),
         undefined="image smaller than the SSIM window",
-        prepare=lambda options: SSIM[options.ssim],
+        prepare=lambda protocol, _: SSIM[protocol.ssim],
     )
 
 
@@ -45,6 +139,33 @@ SSIM: dict[SsimFlavour, Metric] = {
     "3dgs": _ssim("3dgs", "zero-padded, border kept"),
 }
 FLIP = Metric("FLIP", "", 0.0, 4, f"LDR-FLIP, mean, {FLIP_DEGREE} px a degree", flip)
+CONSISTENCY = Metric(
+    "consistency",
+    "dB",
+    math.inf,
+    2,
+    "PSNR of the image against the recipe's own training-size image, box-averaged; null at and above that size, where "
+    "the two are equal, and where scale 1 is not measured",
+    figure=_consistency,
+)
+ENERGY = Metric(
+    "energy drift",
+    "",
+    0.0,
+    4,
+    "luminance of what is drawn, without the background, over the recipe's own at the training size, minus 1; "
+    "null where scale 1 is not measured",
+    figure=_energy_drift,
+)
+FLICKER = Metric(
+    "flicker",
+    "",
+    1.0,
+    3,
+    "frame-to-frame change over three steps of 1/4 px, over that of the training-size image, averaged down: 1 is "
+    "motion alone; null at and above the training size",
+    figure=_flicker,
+)
 
 METRICS: Registry[Metric] = Registry(
     "metric",
@@ -53,15 +174,11 @@ METRICS: Registry[Metric] = Registry(
 )
 
 
-def find_metrics(
-    names: Sequence[str], protocol: Protocol, lpips_weights: tuple[Path, Path] | None = None
-) -> list[Metric]:
+def find_metrics(names: Sequence[str], protocol: Protocol, lpips_weights: LpipsFiles | None = None) -> list[Metric]:
     """Metrics by name, in the flavours of a protocol.
 
-    Args:
-        names: of `METRICS`, in any case, "-" for a space: "psnr", "energy-drift".
-        protocol: see `PROTOCOLS`.
-        lpips_weights: files of LPIPS's trunk and heads; only LPIPS needs them.
+    names: of `METRICS`, in any case, "-" for a space: "psnr", "energy-drift".
+    lpips_weights: files of LPIPS's trunk and heads; only LPIPS needs them.
 
     Raises:
         UsageError: a name is not known or given twice, or a metric lacks what it needs.
@@ -69,14 +186,12 @@ def find_metrics(
     """
     known = {metric_option(name): metric for name, metric in METRICS.items()}
     wanted = [metric_option(name) for name in names]
-    for name in wanted:
-        if name not in known:
-            options = listing(list(known), most=len(known))
-            raise UsageError("metric", f"'{name}' is not one of {options}")
+    if unknown := [name for name in wanted if name not in known]:
+        raise UsageError("metric", f"'{unknown[0]}' is not one of {listing(list(known), most=len(known))}")
     if len(set(wanted)) != len(wanted):
         raise UsageError("metric", "a metric is named twice")
-    options = MetricOptions(protocol.ssim, protocol.lpips, lpips_weights)
-    return [known[name].prepared(options) for name in wanted]
+    found = [known[name] for name in wanted]
+    return [metric.prepare(protocol, lpips_weights) if metric.prepare else metric for metric in found]
 
 
 def default_metrics(protocol: Protocol) -> tuple[str, ...]:

@@ -7,7 +7,7 @@ and image size stay.
 "fov": the focal length is multiplied by it; pose and size stay.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import torch
@@ -20,8 +20,9 @@ from aaplug.core.errors import UsageError
 from aaplug.core.imaging import resampled, stretched
 from aaplug.core.registry import Registry
 from aaplug.core.rules import NEAR
-from aaplug.evaluation.metric import LpipsFlavour, SsimFlavour
 
+SsimFlavour = Literal["wang", "3dgs"]
+LpipsFlavour = Literal["3dgs", "vgg", "alex"]
 Change = Literal["size", "distance", "fov"]
 TruthSource = Literal["photographs", "self"]
 
@@ -63,21 +64,14 @@ class Protocol:
 
     def resized(self, full: Float[Tensor, "h w 3"], camera: Camera, scale: float) -> Float[Tensor, "h2 w2 3"]:
         """An image of the training size at the size of `camera`, which is that of `scale`."""
-        if self.whole_sizes:
-            return stretched(full, camera.hw)
-        return resampled(full, scale, camera.hw)
+        return stretched(full, camera.hw) if self.whole_sizes else resampled(full, scale, camera.hw)
 
     @property
     def facts(self) -> dict[str, Any]:
         """What a report says about the protocol."""
-        cropped = "what does not fill a pixel is cropped"
-        rounded = "rounded, pixels stretched by less than one"
-        return {
-            "name": self.name,
-            "source": self.source,
-            "scale changes": self.change,
-            "sizes": rounded if self.whole_sizes else cropped,
-        }
+        cropped, rounded = "what does not fill a pixel is cropped", "rounded, pixels stretched by less than one"
+        sizes = rounded if self.whole_sizes else cropped
+        return {"name": self.name, "source": self.source, "scale changes": self.change, "sizes": sizes}
 
 
 def median_depth(means: Float[Tensor, "n 3"], view: Camera) -> float:
@@ -94,6 +88,16 @@ def median_depth(means: Float[Tensor, "n 3"], view: Camera) -> float:
     return float(torch.median(depth[inside]))
 
 
+_360_OUT = Protocol(
+    "360-zoom-out",
+    "Mip-NeRF 360 trained at full size, rendered at 1, 1/2, 1/4 and 1/8 of it (3DGS's -r 1, 2, 4, 8)",
+    ZOOM_OUT,
+    "photographs",
+    downscale="pil-bicubic",
+    whole_sizes=True,
+    ssim="3dgs",
+    lpips="3dgs",
+)
 _OWN = (
     Protocol("default", "aaplug: photographs where every view has one, else self", ZOOM_OUT),
     Protocol(
@@ -107,26 +111,13 @@ _OWN = (
         lpips="3dgs",
         background=WHITE,
     ),
-    Protocol(
-        "360-zoom-out",
-        "Mip-NeRF 360 trained at full size, rendered at 1, 1/2, 1/4 and 1/8 of it (3DGS's -r 1, 2, 4, 8)",
-        ZOOM_OUT,
-        "photographs",
-        downscale="pil-bicubic",
-        whole_sizes=True,
-        ssim="3dgs",
-        lpips="3dgs",
-    ),
-    Protocol(
-        "360-zoom-in",
-        "Mip-NeRF 360, single-train multi-test (Mip-Splatting, section 6.3): trained at -r 8, rendered at -r 8, 4, "
-        "2 and 1",
-        ZOOM_IN,
-        "photographs",
-        downscale="pil-bicubic",
-        whole_sizes=True,
-        ssim="3dgs",
-        lpips="3dgs",
+    _360_OUT,
+    replace(
+        _360_OUT,
+        name="360-zoom-in",
+        source="Mip-NeRF 360, single-train multi-test (Mip-Splatting, section 6.3): trained at -r 8, rendered at -r 8, "
+        "4, 2 and 1",
+        scales=ZOOM_IN,
     ),
     Protocol(
         "distance",
@@ -134,14 +125,14 @@ _OWN = (
         "against the scene's own supersampled look",
         ZOOM_OUT,
         "self",
-        change="distance",
+        "distance",
     ),
     Protocol(
         "fov",
         "the focal length changes, pose and image size stay; against the scene's own supersampled look",
         ZOOM_OUT,
         "self",
-        change="fov",
+        "fov",
     ),
     Protocol(
         "self",

@@ -2,7 +2,7 @@
 
 import csv
 import io
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
@@ -10,7 +10,7 @@ from typing import Any
 from rich.markup import escape
 from rich.table import Table
 
-from aaplug.evaluation.metric import Metric
+from aaplug.evaluation.metric import Metric, number
 from aaplug.evaluation.metrics import METRICS, PSNR, SSIM
 
 CEILING = "training size, resampled"  # a row of every table: the own training-size look
@@ -55,6 +55,11 @@ class Report:
         return tuple(given.get(name) or METRICS[name] for name in names) or (PSNR, SSIM["wang"])
 
     @property
+    def compared(self) -> tuple[Metric, ...]:
+        """Those that compare with the truth; reports show the first of them most."""
+        return tuple(metric for metric in self.metrics if metric.measure is not None)
+
+    @property
     def recipes(self) -> tuple[str, ...]:
         """Recipes in the order of measurement."""
         return tuple(dict.fromkeys(m.recipe for m in self.measurements))
@@ -64,6 +69,11 @@ class Report:
         """Scales in the order of measurement."""
         return tuple(dict.fromkeys(m.scale for m in self.measurements))
 
+    @property
+    def notes(self) -> list[str]:
+        """Why values are undefined, each reason once."""
+        return list(dict.fromkeys(m.note for m in self.measurements if m.note))
+
     def select(self, recipe: str, scale: float) -> tuple[Measurement, ...]:
         """Measurements of every view."""
         return tuple(m for m in self.measurements if m.recipe == recipe and m.scale == scale)
@@ -71,13 +81,13 @@ class Report:
     def with_more(self, other: "Report") -> "Report":
         """Join two reports of the same protocol."""
         recipes = {**self.protocol["recipes"], **other.protocol["recipes"]}
-        measurements, protocol = (self.measurements + other.measurements, {**self.protocol, "recipes": recipes})
-        return Report(measurements, protocol, self.measured + other.measured)
+        protocol = {**self.protocol, "recipes": recipes}
+        return Report(self.measurements + other.measurements, protocol, self.measured + other.measured)
 
 
 def mean(measurements: Iterable[Measurement], metric: str) -> float | None:
     """Mean over the views where the metric is defined, None if it is nowhere."""
-    return _mean([value for m in measurements if (value := m.values.get(metric)) is not None])
+    return _mean(m.values.get(metric) for m in measurements)
 
 
 def scale_name(scale: float) -> str:
@@ -97,29 +107,20 @@ def tables(report: Report) -> list[Table]:
         variant = report.protocol.get("metrics", {}).get(metric.name, "").partition(":")
         flavour = f" {variant[0]}" if variant[1] and " " not in variant[0] else ""
         unit = f" [{metric.unit}]" if metric.unit else ""
-        grid = _grid(f"{metric.name}{flavour}{unit}, {what}", report)
-        for recipe, row in zip(report.recipes, rows(report, metric), strict=True):
-            cells = [f"[bold]{text}[/]" if best else text for text, best in row]
-            grid.add_row(recipe, *cells, style="italic" if recipe == CEILING else None)
-        grids.append(grid)
-    for title, lines in work(report):
-        grid = _grid(title, report)
-        for recipe, cells in zip(report.recipes, lines, strict=True):
-            grid.add_row(recipe, *cells)
-        grids.append(grid)
-    return grids
+        lines = [[f"[bold]{text}[/]" if best else text for text, best in row] for row in rows(report, metric)]
+        grids.append(_grid(f"{metric.name}{flavour}{unit}, {what}", report, lines, "italic"))
+    return grids + [_grid(title, report, lines) for title, lines in work(report)]
 
 
 def rows(report: Report, metric: Metric) -> list[list[tuple[str, bool]]]:
     """A metric's table, recipes down and scales across: each mean as text, and whether it is the column's best."""
-    best = [_best(report, metric, scale) for scale in report.scales]
+    means = {r: [mean(report.select(r, s), metric.name) for s in report.scales] for r in report.recipes}
+    judged = [line for recipe, line in means.items() if recipe != CEILING]
+    columns = ([v for line in judged if (v := line[place]) is not None] for place in range(len(report.scales)))
+    best = [min(column, key=metric.loss, default=None) for column in columns]
     return [
-        [
-            (metric.text(value), value is not None and value == top and recipe != CEILING)
-            for scale, top in zip(report.scales, best, strict=True)
-            for value in [mean(report.select(recipe, scale), metric.name)]
-        ]
-        for recipe in report.recipes
+        [(metric.text(v), v is not None and v == top and recipe != CEILING) for v, top in zip(line, best, strict=True)]
+        for recipe, line in means.items()
     ]
 
 
@@ -131,7 +132,7 @@ def work(report: Report) -> list[tuple[str, list[list[str]]]]:
     return [
         (
             title,
-            [[_figure(column(report, recipe, scale), digits) for scale in report.scales] for recipe in report.recipes],
+            [[number(column(report, recipe, scale), digits) for scale in report.scales] for recipe in report.recipes],
         )
         for title, column, digits in columns
     ]
@@ -139,26 +140,27 @@ def work(report: Report) -> list[tuple[str, list[list[str]]]]:
 
 def results(report: Report) -> dict[str, Any]:
     """INRIA's results.json, {method: {metric: mean}}, methods named recipe@scale; the protocol is "_aaplug"."""
-    methods = {
-        method(recipe, scale): {m.name: mean(report.select(recipe, scale), m.name) for m in report.metrics}
-        for recipe in report.recipes
-        for scale in report.scales
-    }
-    return methods | {"_aaplug": dict(report.protocol) | {"notes": _notes(report)}}
+    return _by_method(report, lambda views: {m.name: mean(views, m.name) for m in report.metrics})
 
 
 def per_view(report: Report) -> dict[str, Any]:
     """INRIA's per_view.json, {method: {metric: {view: value}}}, and samples per pixel side, seconds, evaluations."""
-    methods: dict[str, Any] = {}
-    for recipe in report.recipes:
-        for scale in report.scales:
-            views = report.select(recipe, scale)
-            columns: dict[str, Any] = {m.name: {v.view: v.values.get(m.name) for v in views} for m in report.metrics}
-            columns["samples"] = {v.view: v.samples for v in views}
-            columns["seconds"] = {v.view: round(v.seconds, 4) for v in views}
-            columns["evaluations"] = {v.view: v.evaluations for v in views}
-            methods[method(recipe, scale)] = columns
-    return methods | {"_aaplug": dict(report.protocol) | {"notes": _notes(report)}}
+    return _by_method(
+        report,
+        lambda views: (
+            {m.name: {v.view: v.values.get(m.name) for v in views} for m in report.metrics}
+            | {
+                "samples": {v.view: v.samples for v in views},
+                "seconds": {v.view: round(v.seconds, 4) for v in views},
+                "evaluations": {v.view: v.evaluations for v in views},
+            }
+        ),
+    )
+
+
+def _by_method(report: Report, content: Callable[[tuple[Measurement, ...]], dict[str, Any]]) -> dict[str, Any]:
+    methods = {method(r, s): content(report.select(r, s)) for r in report.recipes for s in report.scales}
+    return methods | {"_aaplug": dict(report.protocol) | {"notes": report.notes}}
 
 
 def as_csv(reports: Mapping[str, Report]) -> str:
@@ -184,35 +186,25 @@ def method(recipe: str, scale: float) -> str:
 
 def seconds(report: Report, recipe: str, scale: float) -> float | None:
     """Mean rendering time of a view."""
-    return _mean([m.seconds for m in report.select(recipe, scale)])
+    return _mean(m.seconds for m in report.select(recipe, scale))
 
 
 def million_evaluations(report: Report, recipe: str, scale: float) -> float | None:
     """Mean splat-pixel evaluations of a view, in millions; None if not counted."""
-    counts = [m.evaluations for m in report.select(recipe, scale)]
-    return _mean([count / 1e6 for count in counts if count is not None])
+    return _mean(m.evaluations and m.evaluations / 1e6 for m in report.select(recipe, scale))
 
 
-def _mean(values: list[float]) -> float | None:
-    return sum(values) / len(values) if values else None
+def _mean(values: Iterable[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return sum(known) / len(known) if known else None
 
 
-def _figure(value: float | None, digits: int) -> str:
-    return "–" if value is None else f"{value:.{digits}f}"
-
-
-def _notes(report: Report) -> list[str]:
-    return list(dict.fromkeys(m.note for m in report.measurements if m.note))
-
-
-def _best(report: Report, metric: Metric, scale: float) -> float | None:
-    values = [mean(report.select(r, scale), metric.name) for r in report.recipes if r != CEILING]
-    return min((value for value in values if value is not None), key=metric.loss, default=None)
-
-
-def _grid(title: str, report: Report) -> Table:
+def _grid(title: str, report: Report, lines: list[list[str]], ceiling: str | None = None) -> Table:
+    """A table of one line per recipe; ceiling: style of that row."""
     grid = Table(title=escape(title), title_justify="left")
     grid.add_column("recipe", no_wrap=True)
     for scale in report.scales:
         grid.add_column(scale_name(scale), justify="right", no_wrap=True)
+    for recipe, cells in zip(report.recipes, lines, strict=True):
+        grid.add_row(recipe, *cells, style=ceiling if recipe == CEILING else None)
     return grid

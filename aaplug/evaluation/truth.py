@@ -18,12 +18,13 @@ from aaplug.core.cameras import Camera
 from aaplug.core.errors import UsageError
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.imaging import quantised, resampled
-from aaplug.core.interfaces import Colour, Rasterizer
+from aaplug.core.interfaces import Rasterizer
 from aaplug.core.training import TrainingViews
+from aaplug.evaluation.metric import Drawn, Image, TimedRenderer
 from aaplug.evaluation.protocols import PROTOCOLS, Protocol, TruthSource, median_depth
-from aaplug.evaluation.series import Drawn, TimedRenderer
 from aaplug.evaluation.upsamplers import Upsampler, bicubic
 from aaplug.io.photographs import DOWNSCALES, Photograph
+from aaplug.methods.recipe import Recipe
 from aaplug.methods.recipes import find_recipe
 from aaplug.rendering.renderer import Background, Renderer
 
@@ -31,7 +32,6 @@ NO_PHOTOGRAPH = "has no photograph to compare with; truth 'self' compares with t
 MEMORY = 1e9  # bytes of images to keep; what does not fit is made again each time
 KEPT = torch.float16  # 11 significant bits, against the 8 that are compared
 
-Image = Float[Tensor, "h w 3"]
 Larger = Float[Tensor, "H W 3"]
 Enlarge = Callable[[Renderer, Image, Camera], Larger]  # own look, image at hand, larger camera
 
@@ -89,16 +89,6 @@ class Truth:
     memory: float | None = None
     _kept: dict[tuple[object, ...], Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
 
-    @property
-    def background(self) -> Colour:
-        """The colour behind the scene."""
-        return self.own.background
-
-    @property
-    def rounds(self) -> bool:
-        """Whether images are rounded to 8 bits before they are compared; photographs are of 8 bits already."""
-        return self.source == "self" or self.memory is not None
-
     def __call__(self, view: Camera, scale: float) -> Image:
         """The image of a view, given at the training size, at a scale where there is a truth."""
         image = ViewTruth(self, view).image(scale)
@@ -116,16 +106,15 @@ class Truth:
             return make()
         pose = view.cam_from_world.detach().cpu().numpy().tobytes()  # names recur in other splits
         key = *view.intrinsics, pose, scale
-        if key not in self._kept:
-            made = make()
-            if made is None:
-                return None
-            image = made.to(KEPT)
-            used = sum(x.numel() * x.element_size() for x in self._kept.values())
-            if used + image.numel() * image.element_size() > self.memory:
-                return image.float()
+        if key in self._kept:
+            return self._kept[key].float()
+        made = make()
+        if made is None:
+            return None
+        image = made.to(KEPT)
+        if sum(kept.nbytes for kept in self._kept.values()) + image.nbytes <= self.memory:
             self._kept[key] = image
-        return self._kept[key].float()
+        return image.float()
 
 
 class ViewTruth:
@@ -146,30 +135,30 @@ class ViewTruth:
 
     def resized_look(self, scale: float) -> Image:
         """The training-size look, averaged down (bicubic above scale 1)."""
-        camera = self.camera(scale)
-        return self.truth.protocol.resized(self.look.rgb.clamp(0, 1), camera, scale)
+        return self.truth.protocol.resized(self.look.rgb.clamp(0, 1), self.camera(scale), scale)
 
     def compared(self, scale: float) -> Image | None:
-        """The image that renders are compared with; None where there is no truth."""
+        """The image that renders are compared with, in 8 bits as photographs are; None where there is no truth."""
         image = self.image(scale)
-        return quantised(image) if image is not None and self.truth.rounds else image
+        rounds = self.truth.source == "self" or self.truth.memory is not None
+        return quantised(image) if image is not None and rounds else image
 
     def image(self, scale: float) -> Image | None:
         """The truth at a scale, before rounding; None where there is none."""
         return self.truth.remembered(self.view, scale, lambda: self._made(scale))
 
-    def motion(self, scale: float) -> list[Float[Tensor, "h w 3"]]:
+    def motion(self, scale: float) -> list[Image]:
         """The training-size look, averaged down, as it moves by steps of 1/4 px of the smaller image."""
         if scale not in self._motions:
-            camera, protocol = self.camera(scale), self.truth.protocol
-            frames = self.truth.timed.motion(self.view, scale)
-            self._motions[scale] = [protocol.resized(frame, camera, scale) for frame in frames]
+            camera, frames = self.camera(scale), self.truth.timed.motion(self.view, scale)
+            self._motions[scale] = [self.truth.protocol.resized(frame, camera, scale) for frame in frames]
         return self._motions[scale]
 
     def _made(self, scale: float) -> Image | None:
         truth, camera = self.truth, self.camera(scale)
         if truth.protocol.change != "size":
-            return self._supersampled(camera, scale)
+            samples = max(1, math.ceil(1 / scale))  # as dense as training's pixels
+            return self._shown(camera, replace(truth.own.recipe, grid=samples))
         if truth.source == "photographs":
             factor = scale * self.view.width / self._photograph.hw[1]
             if factor <= 1:
@@ -177,21 +166,16 @@ class ViewTruth:
         elif truth.own.training.relative_rate(camera) <= 1:
             return self.resized_look(scale)
         if truth.enlarge is not None:
-            return truth.enlarge(truth.own, self._full, camera).clamp(0.0, 1.0)
-        return None if truth.source == "photographs" else self._best(camera)
-
-    @property
-    def _full(self) -> Image:
-        """The larger image that the truth is made from."""
-        if self.truth.source == "photographs":
-            return self._photograph.at(self._photograph.hw, 1.0)
-        return self.look.rgb.clamp(0.0, 1.0)
+            photographed = truth.source == "photographs"
+            full = self._photograph.at(self._photograph.hw, 1.0) if photographed else self.look.rgb.clamp(0.0, 1.0)
+            return truth.enlarge(truth.own, full, camera).clamp(0.0, 1.0)
+        return None if truth.source == "photographs" else self._shown(camera, find_recipe("auto", quality="best"))
 
     @cached_property
     def _photograph(self) -> Photograph:
         assert self.view.photo is not None
         downscale = DOWNSCALES[self.truth.protocol.downscale]
-        return downscale.read(self.view.photo, self.truth.background, self.view.lens)
+        return downscale.read(self.view.photo, self.truth.own.background, self.view.lens)
 
     @cached_property
     def _depth(self) -> float:
@@ -200,12 +184,6 @@ class ViewTruth:
             return 1.0
         return median_depth(self.truth.own.scene.means, self.view)
 
-    def _supersampled(self, camera: Camera, scale: float) -> Image:
-        """The own look with samples as dense as training's pixels."""
-        own = self.truth.own
-        recipe = replace(own.recipe, grid=max(1, math.ceil(1 / scale)))
-        return TimedRenderer(replace(own, recipe=recipe))(camera).rgb
-
-    def _best(self, camera: Camera) -> Image:
-        recipe = find_recipe("auto", quality="best")
+    def _shown(self, camera: Camera, recipe: Recipe) -> Image:
+        """The scene by a recipe."""
         return TimedRenderer(replace(self.truth.own, recipe=recipe))(camera).rgb

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from aaplug.core.gaussians import Gaussians
+from aaplug.finetuning.parameters import WHOLE
 from aaplug.rendering.renderer import Drawing
 
 THRESHOLD = 2e-4  # gradient from which a Gaussian is densified (3DGS)
@@ -35,10 +36,9 @@ class ScreenGradients:
 
     def add(self, drawing: Drawing) -> None:
         """Add a view after its backward pass; its splats' means must have retained their gradients."""
-        splats, hw = drawing.splats, drawing.hw
+        splats, (height, width) = drawing.splats, drawing.hw
         assert splats.means.grad is not None
-        half = splats.means.new_tensor([hw[1] / 2, hw[0] / 2])
-        length = (splats.means.grad * half).norm(dim=1)
+        length = (splats.means.grad * splats.means.new_tensor([width / 2, height / 2])).norm(dim=1)
         self.total.index_add_(0, splats.sources, length.to(self.total))
         self.views.index_add_(0, splats.sources, torch.ones_like(length).to(self.views))
 
@@ -65,14 +65,15 @@ def densify(scene: Gaussians, gradients: Float[Tensor, " n"], extent: float, gen
     """Clone, split and prune; Gaussians that stay come first, in their order."""
     dense = gradients >= THRESHOLD
     large = scene.scales.amax(dim=1) > SMALL * extent
-    cloned, split = (dense & ~large).nonzero()[:, 0], (dense & large).nonzero()[:, 0]
-    kept = (~(dense & large)).nonzero()[:, 0]
-    halves = split.repeat(2)
-    grown = _joined([scene[kept], scene[cloned], _halves(scene[halves], generator)])
-    sources = torch.cat([kept, cloned, halves])
+    masks = ~(dense & large), dense & ~large, dense & large
+    kept, cloned, split = (mask.nonzero()[:, 0] for mask in masks)
+    sources = torch.cat([kept, cloned, split, split])
+    parts = [scene[kept], scene[cloned], _halves(scene[split.repeat(2)], generator)]
+    columns = {name: torch.cat([getattr(part, name) for part in parts]) for name in (*WHOLE, "sh")}
+    grown = replace(parts[0], **columns, origin=None, pixel_sizes=None)
     new = torch.arange(len(sources)) >= len(kept)
     visible = (grown.opacities >= MIN_OPACITY).nonzero()[:, 0]
-    if len(visible) == 0:
+    if not len(visible):
         return Densified(scene, torch.arange(len(scene)), torch.zeros(len(scene), dtype=torch.bool))
     return Densified(grown[visible], sources[visible], new[visible])
 
@@ -88,20 +89,9 @@ def _halves(scene: Gaussians, generator: torch.Generator) -> Gaussians:
     return replace(scene, means=scene.means + offset, log_scales=smaller)
 
 
-def _joined(scenes: list[Gaussians]) -> Gaussians:
-    names = ("means", "quats", "log_scales", "logit_opacities", "sh")
-    columns = {name: torch.cat([getattr(scene, name) for scene in scenes]) for name in names}
-    return replace(scenes[0], **columns, origin=None, pixel_sizes=None)
-
-
 def carried(moments: Mapping[str, Tensor], densified: Densified) -> dict[str, Tensor]:
     """An optimizer's moments after densification: kept for Gaussians that stay, 0 for new ones."""
-    found = {}
-    for name, column in moments.items():
-        if column.ndim == 0:
-            found[name] = column
-            continue
-        moved = column[densified.sources].clone()
-        moved[densified.new] = 0
-        found[name] = moved
+    found = {name: column[densified.sources] if column.ndim else column for name, column in moments.items()}
+    for column in (column for column in found.values() if column.ndim):
+        column[densified.new] = 0
     return found

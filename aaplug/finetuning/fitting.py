@@ -1,6 +1,6 @@
 """Fitting a scene to a viewer: the closed form, a short optimization, and a check that no scale became worse."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from aaplug.core.cameras import Camera
@@ -40,59 +40,41 @@ def steps_for(scene: Gaussians, viewer: Viewer) -> int:
 def fit(
     scene: Gaussians, viewer: Viewer, look: Renderer, views: Sequence[Camera], steps: int, monitor: Monitor = SILENT
 ) -> Fitted:
-    """Convert a scene for a viewer.
+    """Convert a scene for a viewer; raises as `fuse_for` and `tune` do.
 
-    Args:
-        scene: as it was read.
-        viewer: that will show it.
-        look: draws the scene as training showed it, which the viewer should show.
-        views: to measure on; a few of them are taken.
-        steps: of the optimization; 0 keeps the closed form.
-        monitor: receives messages and progress.
-
-    Raises:
-        UsageError: something is fused already, or no gradient is finite.
-        KeyboardInterrupt: Ctrl-C was pressed.
+    look: draws the scene as training showed it, which the viewer should show.
+    views: to measure on; a few of them are taken.
+    steps: of the optimization; 0 keeps the closed form.
     """
     truth = Truth(look, enlarge=back_projected, memory=MEMORY)
     original = replace(look, recipe=RECIPES[viewer.recipe])
-    residual = _Residual(spread(views, MEASURED), (1.0, *QUICK.weights), truth, monitor)
+
+    def measured(*candidates: Candidate) -> Report:
+        with monitor.progress("measuring", "views") as tell:
+            return compare(candidates, spread(views, MEASURED), (1.0, *QUICK.weights), truth, tell)
+
+    def with_result(found: Gaussians) -> Report:
+        return before.with_more(measured(Candidate(CONVERTED, replace(original, scene=found))))
+
     start = replace(original, scene=fuse_for(scene, original.training, viewer))
-    before = residual.of({ORIGINAL: original, CLOSED_FORM: start})
+    before = measured(Candidate(ORIGINAL, original), Candidate(CLOSED_FORM, start))
     if steps and _is_worse(before, CLOSED_FORM):
         monitor.say("the closed form is worse than the original at some scale: starting from the original")
         start = original
     settings = balanced(replace(QUICK, steps=steps), _errors(before))
     job = TuningJob(start, original.training.cameras, truth, settings)
     state = tune(job, monitor=monitor)
-    convention = viewer.convention_of(scene)
-    tuned = found = recorded(state, job, convention, {"for": viewer.name})
-    report = before.with_more(residual.of({CONVERTED: replace(original, scene=found)}))
+    tuned = found = recorded(state, job, viewer.convention_of(scene), {"for": viewer.name})
+    report = with_result(found)
     for share in SHARES if state.step else ():
         if not _is_worse(report, CONVERTED):
             break
         monitor.say(f"worse than the original at some scale: taking {share:g} of the change")
         found = _partly(original.scene, tuned, share)
-        report = before.with_more(residual.of({CONVERTED: replace(original, scene=found)}))
+        report = with_result(found)
     if state.step and _is_worse(report, CONVERTED):
         monitor.say("still worse than the original at some scale: read the table before you use it")
     return Fitted(found, report)
-
-
-@dataclass(frozen=True)
-class _Residual:
-    """What is left between renders and the truth."""
-
-    views: Sequence[Camera]
-    scales: Sequence[float]
-    truth: Truth
-    monitor: Monitor
-
-    def of(self, renderers: Mapping[str, Renderer]) -> Report:
-        """Measure renderers, with progress."""
-        candidates = [Candidate(name, renderer) for name, renderer in renderers.items()]
-        with self.monitor.progress("measuring", "views") as tell:
-            return compare(candidates, self.views, self.scales, self.truth, tell)
 
 
 def _errors(report: Report) -> dict[float, float]:

@@ -15,12 +15,11 @@ from torch import Tensor
 from aaplug.core.cameras import Camera
 from aaplug.core.errors import UsageError
 from aaplug.core.sampling import sampling_bounds
-from aaplug.finetuning.checkpoints import packed, unpacked
 from aaplug.finetuning.densification import ScreenGradients, carried, densify
 from aaplug.finetuning.losses import LOSSES
-from aaplug.finetuning.parameters import Leaves, least_log_scales, leaves_of
+from aaplug.finetuning.parameters import Leaves, extent, least_log_scales, leaves_of
 from aaplug.finetuning.settings import Settings
-from aaplug.finetuning.state import State, TuningJob, optimizer
+from aaplug.finetuning.state import State, TuningJob, optimizer, packed, unpacked
 from aaplug.rendering.renderer import Drawing
 
 BOUNDS_EVERY = 100  # steps between computations of the sampling bounds (Mip-Splatting)
@@ -28,7 +27,7 @@ MAX_LOGIT = 9.0  # of an opacity: 0.9999, where its gradient has vanished
 MAX_BAD_STEPS = 3  # in a row without a finite gradient, after which the run returns to its last good state
 BACK_OFF = 0.5  # factor on the learning rates after each rollback
 MAX_ROLLBACKS = 5
-SEEDS, SCALE_SEEDS, SPLIT_SEEDS = (10_000_019, 3_000_000, 6_000_000)  # offsets that keep the draws apart
+SEEDS, SCALE_SEEDS, SPLIT_SEEDS = 10_000_019, 3_000_000, 6_000_000  # offsets that keep the draws apart
 
 
 def run(
@@ -43,19 +42,16 @@ def run(
 ) -> bool:
     """Step until the job is done or `stop()` is true; return whether it is done.
 
-    Args:
-        job: what to do.
-        state: where to begin; changed in place.
-        good: the state to return to, packed; None for the given one.
-        every: steps between calls of `keep`.
-        keep: called with the state and the last good one, also when the run stops.
-        stop: asked before every step.
-        say: called when the run rolls back.
+    state: where to begin; changed in place.
+    good: the state to return to, packed; None for the given one.
+    every: steps between calls of `keep`.
+    keep: called with the state and the last good one, also when the run stops.
+    stop: asked before every step.  say: called when the run rolls back.
 
     Raises:
         UsageError: no step has a finite gradient, at any learning rate.
     """
-    good = packed(state) if good is None else good
+    good = good or packed(state)
     while state.step < job.settings.steps and not stop():
         advance(job, state)
         if state.bad_steps >= MAX_BAD_STEPS:
@@ -112,10 +108,8 @@ def _roll_back(job: TuningJob, state: State, good: Mapping[str, Any], say: Calla
         raise UsageError("finetune", f"has no finite gradient at step {step}, after {MAX_ROLLBACKS} rollbacks")
     vars(state).update(vars(unpacked(good, job)))
     state.step, state.bad_steps, state.rollbacks = step, 0, rollbacks
-    say(
-        f"step {step}: {MAX_BAD_STEPS} steps without a finite gradient; "
-        f"back to step {good['step']}, at half the learning rates"
-    )
+    back = f"back to step {good['step']}, at half the learning rates"
+    say(f"step {step}: {MAX_BAD_STEPS} steps without a finite gradient; {back}")
 
 
 def _drawn(settings: Settings, views: Sequence[Camera], step: int) -> tuple[Camera, dict[float, float]]:
@@ -123,25 +117,23 @@ def _drawn(settings: Settings, views: Sequence[Camera], step: int) -> tuple[Came
     count = len(views)
     epoch = torch.Generator().manual_seed(settings.seed * SEEDS + step // count)
     view = views[int(torch.randperm(count, generator=epoch)[step % count])]
-    scales = list(settings.weights)
     own = torch.Generator().manual_seed(settings.seed * SEEDS + SCALE_SEEDS + step)
-    scale = scales[int(torch.randint(len(scales), (), generator=own))]
-    terms = {scale: settings.weights[scale]}
+    place = int(torch.randint(len(settings.weights), (), generator=own))
+    terms = dict([list(settings.weights.items())[place]])
     if settings.anchor:
         terms[1.0] = terms.get(1.0, 0.0) + settings.anchor
     return view, terms
 
 
 def _finite(losses: Mapping[float, float], leaves: Leaves) -> bool:
-    grads = [leaf.grad for leaf in leaves.values() if leaf.grad is not None]
-    found = [math.isfinite(loss) for loss in losses.values()]
-    return all(found) and all(bool(grad.sum().isfinite()) for grad in grads)
+    grads = (leaf.grad for leaf in leaves.values() if leaf.grad is not None)
+    return all(map(math.isfinite, losses.values())) and all(bool(grad.sum().isfinite()) for grad in grads)
 
 
 def _set_rates(job: TuningJob, state: State) -> None:
     share = job.settings.decay ** (state.step / job.settings.steps) * BACK_OFF**state.rollbacks
     for group in state.adam.param_groups:
-        size = job.extent if group["name"] == "means" else 1.0
+        size = extent(job.start.training.cameras) if group["name"] == "means" else 1.0
         group["lr"] = job.settings.rates[group["name"]] * size * share
 
 
@@ -158,10 +150,9 @@ def _keep_bounds(state: State) -> None:
 
 def _densify(job: TuningJob, state: State) -> None:
     """Change the number of Gaussians; those that stay keep their Adam moments."""
-    seed = job.settings.seed * SEEDS + SPLIT_SEEDS + state.step
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(job.settings.seed * SEEDS + SPLIT_SEEDS + state.step)
     with torch.no_grad():
-        densified = densify(state.scene(job), state.gradients.mean, job.extent, generator)
+        densified = densify(state.scene(job), state.gradients.mean, extent(job.start.training.cameras), generator)
         moments = {
             group["name"]: carried(state.adam.state[group["params"][0]], densified) for group in state.adam.param_groups
         }
@@ -169,16 +160,14 @@ def _densify(job: TuningJob, state: State) -> None:
     state.adam = optimizer(state.leaves, job.settings)
     for group in state.adam.param_groups:
         state.adam.state[group["params"][0]] = moments[group["name"]]
-    own = state.leaves["log_scales"].detach().clone()
     first = state.first_log_scales[densified.sources]
-    state.first_log_scales = torch.where(densified.new[:, None], own, first)
+    state.first_log_scales = torch.where(densified.new[:, None], densified.scene.log_scales, first)
     _update_bounds(job, state)
-    state.gradients = ScreenGradients.none(len(own))
+    state.gradients = ScreenGradients.none(len(first))
 
 
 @torch.no_grad()
 def _update_bounds(job: TuningJob, state: State) -> None:
     """Compute the sampling bounds where the Gaussians are now, and keep them."""
-    cameras = job.start.training.cameras
-    state.bounds = sampling_bounds(state.leaves["means"].detach(), cameras)
+    state.bounds = sampling_bounds(state.leaves["means"].detach(), job.start.training.cameras)
     _keep_bounds(state)

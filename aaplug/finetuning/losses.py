@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.evaluation.similarity import SSIM_SIGMA, SSIM_WINDOW
+from aaplug.evaluation.metrics import SSIM_SIGMA, SSIM_WINDOW
 
 SSIM_SHARE = 0.2  # weight of D-SSIM against L1 (3DGS, eq. 7)
 SSIM_K = (0.01, 0.03)  # for values in [0, 1]; squared in the formula (Wang et al. 2004)

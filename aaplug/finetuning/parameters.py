@@ -18,6 +18,7 @@ from aaplug.core.sampling import SamplingBounds
 from aaplug.methods.filters import NYQUIST_VARIANCE
 
 Leaves = dict[str, Tensor]
+WHOLE = ("means", "quats", "log_scales", "logit_opacities")  # leaves that are columns of the scene
 
 RATES: Mapping[str, float] = {  # 3DGS's, per step; that of the means is a share of the scene's extent
     "means": 1.6e-4,
@@ -32,14 +33,7 @@ EXTENT_MARGIN = 1.1  # times the training cameras' farthest distance from their 
 
 def leaves_of(scene: Gaussians) -> Leaves:
     """Copies of every parameter."""
-    leaves = {
-        "means": scene.means,
-        "quats": scene.quats,
-        "log_scales": scene.log_scales,
-        "logit_opacities": scene.logit_opacities,
-        "dc": scene.sh[:, :1],
-        "rest": scene.sh[:, 1:],
-    }
+    leaves = {name: getattr(scene, name) for name in WHOLE} | {"dc": scene.sh[:, :1], "rest": scene.sh[:, 1:]}
     return {name: value.detach().clone() for name, value in leaves.items()}
 
 
@@ -48,7 +42,7 @@ def scene_of(leaves: Mapping[str, Tensor], like: Gaussians) -> Gaussians:
 
     If densification changed the number of Gaussians, the link to the rows of the source file is dropped.
     """
-    values = {n: leaves[n] for n in ("means", "quats", "log_scales", "logit_opacities")}
+    values = {name: leaves[name] for name in WHOLE}
     sh = torch.cat([leaves["dc"], leaves["rest"]], dim=1)
     same = len(sh) == len(like)
     origin, sizes = (like.origin, like.pixel_sizes) if same else (None, None)

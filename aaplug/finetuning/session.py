@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +15,8 @@ from aaplug.core.gaussians import Convention, Fusion, Gaussians
 from aaplug.core.monitor import SILENT, Monitor
 from aaplug.evaluation.engine import Candidate, compare
 from aaplug.evaluation.results import mean, scale_name
-from aaplug.finetuning.checkpoints import load, save
 from aaplug.finetuning.loop import run
-from aaplug.finetuning.state import State, TuningJob, begin
+from aaplug.finetuning.state import State, TuningJob, begin, load, save
 from aaplug.methods.viewers import TUNED
 
 PROBES = 3  # training views, evenly spaced, that progress is measured on
@@ -27,27 +26,31 @@ RECENT = 20  # steps over which the reported loss is averaged
 def tune(
     job: TuningJob, checkpoint: Path | None = None, every: int = 100, resume: bool = False, monitor: Monitor = SILENT
 ) -> State:
-    """Run a job to its end.
+    """Run a job to its end, from the checkpoint if `resume`; see `load` and `run` for what they raise.
 
-    Ctrl-C stops it after the current step, once the checkpoint is written; a second Ctrl-C stops it at once.
-
-    Raises:
-        KeyboardInterrupt: Ctrl-C was pressed.
-        FormatError, UsageError: there is nothing to resume, or it is of another run; or no gradient is finite.
-        OutputError: the checkpoint cannot be written.
+    Ctrl-C stops it after the current step, once the checkpoint is written; a second Ctrl-C stops it at once.  Both
+    raise KeyboardInterrupt.
     """
     state, good = load(checkpoint, job) if resume and checkpoint else (begin(job), None)
     if resume:
         monitor.say(f"resumed at step {state.step}")
-    steps = job.settings.steps
+    steps, first, started = job.settings.steps, state.step, time.monotonic()
+
+    def keep(state: State, good: Mapping[str, Any]) -> None:
+        """Measure a few training views, write the checkpoint, and report both."""
+        told = _probed(job, state)
+        if checkpoint is not None:
+            save(checkpoint, job, state, good)
+        pace = (time.monotonic() - started) / max(1, state.step - first)
+        monitor.say(f"step {state.step} of {steps}{told}; {pace:.2f} s per step")
+
     with monitor.progress("tuning", "steps") as tell, _interruptible(monitor.say) as stopped:
-        watch = _Watch(job, checkpoint, monitor, time.monotonic(), state.step)
 
         def stop() -> bool:
             tell(state.step, steps)
             return stopped()
 
-        done = run(job, state, good, every=every, keep=watch.keep, stop=stop, say=monitor.say)
+        done = run(job, state, good, every=every, keep=keep, stop=stop, say=monitor.say)
         if done:
             tell(steps, steps)
     if not done:
@@ -57,30 +60,16 @@ def tune(
     return state
 
 
-@dataclass(frozen=True)
-class _Watch:
-    """Measures a run and writes its checkpoints.  started: of the clock, at step `first`."""
-
-    job: TuningJob
-    checkpoint: Path | None
-    monitor: Monitor
-    started: float
-    first: int
-
-    def keep(self, state: State, good: Mapping[str, Any]) -> None:
-        """Measure a few training views, write the checkpoint, and report both."""
-        job, scales = self.job, _ends(self.job)
-        views = spread(job.views, PROBES)
-        now = Candidate("now", state.renderer(job))
-        report = compare([now], views, scales, job.truth)
-        psnr = {scale: mean(report.select("now", scale), "PSNR") for scale in scales}
-        state.probes.append({"step": state.step, "psnr": {f"{s:g}": v for s, v in psnr.items()}})
-        if self.checkpoint is not None:
-            save(self.checkpoint, job, state, good)
-        told = ", ".join(f"{_decibels(v)} dB at {scale_name(s)}" for s, v in psnr.items())
-        pace = (time.monotonic() - self.started) / max(1, state.step - self.first)
-        loss = f", loss {_recent_loss(state):.2e}" if state.curve else ""
-        self.monitor.say(f"step {state.step} of {job.settings.steps}{loss}: {told}; {pace:.2f} s per step")
+def _probed(job: TuningJob, state: State) -> str:
+    """Measure a few training views at the training size and the scale farthest from it; the result in words."""
+    scales = list(dict.fromkeys([1.0, max(job.settings.weights, key=lambda s: abs(math.log(s)))]))
+    report = compare([Candidate("now", state.renderer(job))], spread(job.views, PROBES), scales, job.truth)
+    psnr = {scale: mean(report.select("now", scale), "PSNR") for scale in scales}
+    state.probes.append({"step": state.step, "psnr": {f"{s:g}": v for s, v in psnr.items()}})
+    losses = [loss for step in state.curve[-RECENT:] for loss in step["loss"].values()]
+    loss = f", loss {sum(losses) / len(losses):.2e}" if losses else ""
+    values = {s: "infinite" if v is None else f"{v:.2f}" for s, v in psnr.items()}
+    return f"{loss}: " + ", ".join(f"{value} dB at {scale_name(s)}" for s, value in values.items())
 
 
 def recorded(state: State, job: TuningJob, convention: Convention, settings: Mapping[str, str]) -> Gaussians:
@@ -112,24 +101,10 @@ def _interruptible(say: Callable[[str], None]) -> Iterator[Callable[[], bool]]:
         say("stopping after this step; press again to stop at once")
 
     if threading.current_thread() is not threading.main_thread():
-        yield lambda: False
+        yield lambda: bool(pressed)
         return
     before = signal.signal(signal.SIGINT, note)
     try:
         yield lambda: bool(pressed)
     finally:
         signal.signal(signal.SIGINT, before)
-
-
-def _ends(job: TuningJob) -> list[float]:
-    """The training size and the scale farthest from it."""
-    return list(dict.fromkeys([1.0, max(job.settings.weights, key=lambda s: abs(math.log(s)))]))
-
-
-def _recent_loss(state: State) -> float:
-    losses = [loss for step in state.curve[-RECENT:] for loss in step["loss"].values()]
-    return sum(losses) / len(losses)
-
-
-def _decibels(psnr: float | None) -> str:
-    return "infinite" if psnr is None else f"{psnr:.2f}"

@@ -60,8 +60,8 @@ QUICK = replace(  # for conversion, a few minutes; `balanced` divides its weight
 def balanced(settings: Settings, errors: Mapping[float, float]) -> Settings:
     """Divide the weight of every scale by the root of the mean square error found there; errors[1.0] is the anchor's.
 
-    This lies between two extremes.  Undivided losses would sacrifice scales with small errors to those with large
-    ones; losses as shares of the errors would leave the large ones where they are.
+    Undivided losses would sacrifice scales with small errors to those with large ones; losses as shares of the errors
+    would leave the large ones where they are.
     """
     weights = {scale: weight / errors[scale] ** 0.5 for scale, weight in settings.weights.items()}
     return replace(settings, weights=weights, anchor=settings.anchor / errors[1.0] ** 0.5)
@@ -84,17 +84,12 @@ def mipmap_gs(scales: Sequence[float], move: Sequence[str] = (), anchor: float =
     """
     if len(scales) != 1:
         raise UsageError("scale", "mipmap-gs makes one model for one scale; give one")
-    weights = {scales[0]: 1.0}
-    return Settings("mipmap-gs", MIPMAP_STEPS, weights, RATES, densify_every=MIPMAP_EVERY)
+    return Settings("mipmap-gs", MIPMAP_STEPS, {scales[0]: 1.0}, RATES, densify_every=MIPMAP_EVERY)
 
 
 @dataclass(frozen=True)
 class Method:
-    """A way to fine-tune.
-
-    settings: from the scales, the parameters that move and the anchor.
-    viewer: the default target.
-    """
+    """A way to fine-tune: settings, from the scales, the parameters that move and the anchor; and the usual viewer."""
 
     settings: Callable[[Sequence[float], Sequence[str], float], Settings]
     viewer: Viewer
@@ -124,24 +119,19 @@ def settings_of(
     Raises:
         UsageError: a choice is out of its range, or does not fit the method.
     """
-    for name, value in (("steps", steps), ("densify_every", densify_every), ("anchor", anchor)):
+    counts = {"steps": steps, "densify_every": densify_every}
+    for name, value in (counts | {"anchor": anchor}).items():
         if value is not None and not value >= 0:
             raise UsageError(name, f"must be 0 or more, got {value:g}")
     if not (scale and all(0 < s < math.inf for s in scale)):
         raise UsageError("scale", "needs sizes above 0")
     if not learning_rate > 0:
         raise UsageError("learning_rate", f"must be above 0, got {learning_rate:g}")
-    unknown = [name for name in move if name not in RATES]
-    if unknown or not move:
+    if not move or any(name not in RATES for name in move):
         raise UsageError("move", f"needs parameters out of {', '.join(RATES)}")
     if loss not in LOSSES:
         raise UsageError("loss", f"'{loss}' is not one of {', '.join(LOSSES)}")
     own = method.settings(scale, move, anchor)
-    return replace(
-        own,
-        steps=own.steps if steps is None else steps,
-        rates={name: rate * learning_rate for name, rate in own.rates.items()},
-        loss=loss,
-        seed=seed,
-        densify_every=own.densify_every if densify_every is None else densify_every,
-    )
+    given = {name: value for name, value in counts.items() if value is not None}
+    rates = {name: rate * learning_rate for name, rate in own.rates.items()}
+    return replace(own, rates=rates, loss=loss, seed=seed, **given)

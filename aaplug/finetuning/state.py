@@ -1,7 +1,14 @@
-"""What a run works on, and how far it has come."""
+"""What a run works on, how far it has come, and its checkpoints.
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+A checkpoint is one file of everything that the next step depends on, written whole or not at all.  It is torch's, of
+tensors, numbers and strings only, and is read as such: nothing in it is executed.
+"""
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from copy import deepcopy
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -9,15 +16,19 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.cameras import Camera
+from aaplug.core.errors import FormatError, UsageError
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.sampling import SamplingBounds
 from aaplug.evaluation.truth import Truth
 from aaplug.finetuning.densification import ScreenGradients
-from aaplug.finetuning.parameters import Leaves, extent, leaves_of, scene_of
+from aaplug.finetuning.parameters import WHOLE, Leaves, leaves_of, scene_of
 from aaplug.finetuning.settings import Settings
+from aaplug.io.atomic import replacing
 from aaplug.rendering.renderer import Renderer
 
 EPSILON = 1e-15  # of Adam (3DGS)
+FORMAT = "aaplug finetune 3"
+DIGEST = 16  # hex digits of a hash
 
 
 @dataclass(frozen=True)
@@ -33,11 +44,6 @@ class TuningJob:
     views: Sequence[Camera]
     truth: Truth
     settings: Settings
-
-    @property
-    def extent(self) -> float:
-        """The scene's size, in world units."""
-        return extent(self.start.training.cameras)
 
 
 @dataclass
@@ -83,9 +89,77 @@ def begin(job: TuningJob) -> State:
 
 def optimizer(leaves: Leaves, settings: Settings) -> torch.optim.Adam:
     """Adam over the leaves that move."""
-    groups = [
-        {"params": [leaves[name].requires_grad_()], "lr": 0.0, "name": name}
-        for name in settings.rates
-        if leaves[name].numel()
-    ]
+    moving = [name for name in settings.rates if leaves[name].numel()]
+    groups = [{"params": [leaves[name].requires_grad_()], "lr": 0.0, "name": name} for name in moving]
     return torch.optim.Adam(groups, eps=EPSILON)
+
+
+def packed(state: State) -> dict[str, Any]:
+    """A copy of the state, which later steps do not change, in types that a file can hold."""
+    leaves = {name: leaf.detach() for name, leaf in state.leaves.items()}
+    held = {"adam": state.adam.state_dict(), "bounds": vars(state.bounds), "gradients": vars(state.gradients)}
+    return deepcopy({**vars(state), "leaves": leaves, **held})
+
+
+def unpacked(data: Mapping[str, Any], job: TuningJob) -> State:
+    """The state again; it shares no tensor with `data`."""
+    values = deepcopy(dict(data))
+    adam = optimizer(values["leaves"], job.settings)
+    adam.load_state_dict(values["adam"])
+    bounds, gradients = SamplingBounds(**values["bounds"]), ScreenGradients(**values["gradients"])
+    return State(**values | {"adam": adam, "bounds": bounds, "gradients": gradients})
+
+
+def save(path: Path, job: TuningJob, state: State, good: Mapping[str, Any]) -> None:
+    """Write the state and the last good one; if that fails, an older checkpoint is still whole."""
+    content = {"format": FORMAT, "job": _facts(job), "state": packed(state), "good": dict(good)}
+    with replacing(path, overwrite=True) as stream:
+        torch.save(content, stream)
+
+
+def load(path: Path, job: TuningJob) -> tuple[State, dict[str, Any]]:
+    """The state of a run of this job, and the last good one, packed.
+
+    Raises:
+        FormatError: the file is missing, damaged or something else.
+        UsageError: it is of another job; the message names the first difference.
+    """
+    try:
+        content = torch.load(path, weights_only=True)
+        if content["format"] != FORMAT:
+            raise ValueError(content["format"])
+        for key, value in _facts(job).items():
+            if (found := content["job"].get(key)) != value:
+                raise UsageError(str(path), f"is of another run: its {key} was {found}, now it is {value}")
+        return unpacked(content["state"], job), content["good"]
+    except UsageError:
+        raise
+    except FileNotFoundError as error:
+        raise FormatError(path, "does not exist: there is no run to resume") from error
+    except Exception as error:  # torch raises all kinds over a damaged file
+        raise FormatError(path, "is damaged, or no checkpoint of this version") from error
+
+
+def _facts(job: TuningJob) -> dict[str, str]:
+    """Everything that a run depends on, as text that can be compared."""
+    settings = {key: str(value) for key, value in asdict(job.settings).items()}
+    start, truth = job.start, job.truth
+    return settings | {
+        "scene": _digest(start.scene),
+        "truth": f"{_digest(truth.own.scene)} {truth.source}",
+        "recipe": start.recipe.name,
+        "views": _hash(repr([(v.name, v.hw, v.focal) for v in job.views]).encode()),
+        "background": str(start.background),
+        "cull margin": str(start.training.cull_margin),
+        "rasterizer": start.rasterizer.name,
+        "number of threads": str(torch.get_num_threads()),  # it changes the order of sums
+    }
+
+
+def _digest(scene: Gaussians) -> str:
+    columns = [getattr(scene, name).detach().contiguous() for name in (*WHOLE, "sh")]
+    return _hash(b"".join(column.numpy().tobytes() for column in columns))
+
+
+def _hash(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()[:DIGEST]

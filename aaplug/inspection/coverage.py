@@ -10,7 +10,6 @@ that scale it aliases.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -44,21 +43,6 @@ class Coverage:
     begins: float | None
     aliased: tuple[tuple[float, float], ...]
 
-    def as_json(self) -> dict[str, Any]:
-        """One JSON-ready object."""
-        return {
-            "gaussians": self.gaussians,
-            "seen": self.seen,
-            "under_sampling_bound_share": self.under,
-            "aliasing_begins_at_scale": self.begins,
-            "aliased_share_at_scale": {f"{scale:g}": share for scale, share in self.aliased},
-            "histogram": {
-                "of": "log2 of extent over sampling bound",
-                "edges": list(self.edges),
-                "counts": list(self.counts),
-            },
-        }
-
 
 def middle_log_scales(scene: Gaussians) -> Float[Tensor, " n"]:
     """ln of the standard deviation along the middle axis; for a disc, the smaller of its two."""
@@ -71,11 +55,6 @@ def log_multiples(scene: Gaussians, bounds: SamplingBounds) -> Float[Tensor, " s
     return extents - 0.5 * math.log(NYQUIST_VARIANCE)
 
 
-def under(multiples: Float[Tensor, " seen"]) -> int:
-    """How many Gaussians are below their bound; multiples: as `log_multiples` gives them."""
-    return int((multiples < 0).sum())
-
-
 def aliasing_begins(multiple: float, dilation: float) -> float:
     """The scale below which a Gaussian of `multiple` times its bound, drawn with `dilation` in px², aliases."""
     return (NYQUIST_VARIANCE / (NYQUIST_VARIANCE * multiple**2 + dilation)) ** 0.5
@@ -85,19 +64,14 @@ def coverage(scene: Gaussians, training: TrainingViews, scales: Sequence[float])
     """Compare the scene's extents with their bounds, at the training size and at `scales`."""
     multiples = log_multiples(scene, training.bounds)
     seen = len(multiples)
-    edges, counts = _histogram(multiples)
+    logs = (multiples / math.log(2)).clamp(LOWEST, HIGHEST)
+    histogram = torch.histogram(logs.cpu(), torch.linspace(LOWEST, HIGHEST, BINS + 1, dtype=torch.float64))
+    edges, counts = tuple(histogram.bin_edges.tolist()), tuple(map(int, histogram.hist))
     if seen == 0:
         return Coverage(len(scene), 0, edges, counts, None, None, ())
     extents, dilation = multiples.exp(), training.convention.kernel
     drawn = (extents.square() + dilation / NYQUIST_VARIANCE).sqrt()
     begins = aliasing_begins(float(extents.median()), dilation)
+    under = int((multiples < 0).sum())
     aliased = tuple((s, float((drawn * s < 1).double().mean())) for s in scales)
-    return Coverage(len(scene), seen, edges, counts, under(multiples) / seen, begins, aliased)
-
-
-def _histogram(multiples: Float[Tensor, " seen"]) -> tuple[tuple[float, ...], tuple[int, ...]]:
-    """Edges and counts."""
-    logs = (multiples / math.log(2)).clamp(LOWEST, HIGHEST)
-    edges = torch.linspace(LOWEST, HIGHEST, BINS + 1, dtype=torch.float64)
-    counts = torch.histogram(logs.cpu(), edges).hist
-    return tuple(edges.tolist()), tuple(int(count) for count in counts)
+    return Coverage(len(scene), seen, edges, counts, under / seen, begins, aliased)

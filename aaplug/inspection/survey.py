@@ -12,7 +12,7 @@ from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.monitor import Tell
 from aaplug.core.sampling import check_frame, sampling_bounds
-from aaplug.inspection.coverage import log_multiples, middle_log_scales, under
+from aaplug.inspection.coverage import log_multiples, middle_log_scales
 from aaplug.io.scenes.scene_file import SceneFile
 
 PROBES = 512  # evenly spaced places in the file, from which the frame check samples
@@ -35,8 +35,7 @@ class Histogram:
 
     def quantile(self, share: float) -> float | None:
         """Middle of the bin that holds this quantile; None without values."""
-        total = int(self.counts.sum())
-        if not total:
+        if not (total := int(self.counts.sum())):
             return None
         place = int(torch.searchsorted(self.counts.cumsum(0), max(1, math.ceil(share * total))))
         return self.low + (place + 0.5) * (self.high - self.low) / BINS
@@ -82,16 +81,14 @@ class Survey:
         self.above_zero += int((part.log_scales > 0).all(dim=1).sum())
         logits = part.logit_opacities
         self.activated += int(((logits >= 0) & (logits <= 1)).sum())
-        if self.cameras:
-            self._add_rates(part)
-
-    def _add_rates(self, part: Gaussians) -> None:
+        if not self.cameras:
+            return
         bounds = sampling_bounds(part.means, self.cameras)
         self.seen += int(bounds.seen.sum())
         self.rates.add(bounds.highest[bounds.seen].log())
         multiples = log_multiples(part, bounds)
         self.multiples.add(multiples)
-        self.under += under(multiples)
+        self.under += int((multiples < 0).sum())
 
 
 def survey(opened: SceneFile, cameras: Sequence[Camera] = (), tell: Tell = lambda done, total: None) -> Survey:
@@ -104,14 +101,9 @@ def survey(opened: SceneFile, cameras: Sequence[Camera] = (), tell: Tell = lambd
 
 
 def check_frame_of(opened: SceneFile, cameras: Sequence[Camera], min_seen: float) -> float:
-    """`sampling.check_frame` on Gaussians from evenly spaced places of the file.
-
-    Raises:
-        FrameError: the cameras see less than `min_seen` of them.
-    """
+    """`sampling.check_frame` on Gaussians from evenly spaced places of the file."""
     step = max(PROBE_ROWS, opened.count // PROBES)
-    starts = range(0, opened.count, step)
-    means = [opened.load(a, min(a + PROBE_ROWS, opened.count)).means for a in starts]
+    means = [opened.load(a, min(a + PROBE_ROWS, opened.count)).means for a in range(0, opened.count, step)]
     sample = torch.cat(means) if means else torch.zeros(0, 3)
     sample = sample[sample.isfinite().all(dim=1)]
     return check_frame(sample, cameras, str(opened.path), min_seen)

@@ -2,6 +2,8 @@
 
 A temporary file beside the output takes the output's name once all of its bytes are on the disk.  If writing fails or
 is interrupted, the old file is unchanged and the temporary file is removed.
+
+Functions raise OutputError for an output that exists while `overwrite` is false, has no folder or cannot be written.
 """
 
 import os
@@ -22,9 +24,6 @@ def replacing(path: str | PathLike[str], overwrite: bool) -> Iterator[BinaryIO]:
     """Yield a binary stream whose content becomes `path` when the block ends without an exception.
 
     The block should only write: any OSError in it is reported as a failure to write `path`.
-
-    Raises:
-        OutputError: the output exists and `overwrite` is false, or it cannot be written.
     """
     # "x" never opens somebody else's file or link
     with replacing_file(path, overwrite) as temporary, open(temporary, "xb") as stream:
@@ -33,11 +32,7 @@ def replacing(path: str | PathLike[str], overwrite: bool) -> Iterator[BinaryIO]:
 
 @contextmanager
 def replacing_file(path: str | PathLike[str], overwrite: bool, suffix: str = ".tmp") -> Iterator[Path]:
-    """Like `replacing`, for libraries that open their file themselves: yields a path that ends in `suffix`.
-
-    Raises:
-        OutputError: the output exists and `overwrite` is false, or it cannot be written.
-    """
+    """Like `replacing`, for libraries that open their file themselves: yields a path that ends in `suffix`."""
     path = Path(path)
     _check_target(path, overwrite)
     target = Path(os.path.realpath(path))  # a link stays a link; its target is replaced
@@ -57,24 +52,16 @@ def replacing_file(path: str | PathLike[str], overwrite: bool, suffix: str = ".t
 
 
 def check_output(path: str | PathLike[str], overwrite: bool, inputs: Iterable[str | PathLike[str]] = ()) -> None:
-    """Refuse an output that must not be written, before any work and without creating anything.
-
-    Raises:
-        OutputError: the output is one of the inputs (whatever `overwrite` says), exists and `overwrite` is false, or
-            has no folder.
-    """
+    """Refuse an output that must not be written, before any work: one of the inputs too, whatever `overwrite` says."""
     for source in inputs:
-        if _same_file(path, source):
-            raise OutputError(path, f"is also the input {source}; give the output another name")
+        with suppress(OSError, ValueError):  # a file that does not exist is the same as no other
+            if os.path.samefile(path, source):
+                raise OutputError(path, f"is also the input {source}; give the output another name")
     _check_target(Path(path), overwrite)
 
 
 def make_folder(path: str | PathLike[str]) -> Path:
-    """Make a folder and its parents where they do not exist, and return it.
-
-    Raises:
-        OutputError: it cannot be made.
-    """
+    """Make a folder and its parents where they do not exist, and return it."""
     try:
         Path(path).mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -83,11 +70,7 @@ def make_folder(path: str | PathLike[str]) -> Path:
 
 
 def refuse_existing(paths: Sequence[Path], overwrite: bool) -> None:
-    """Check, before any work, that none of these files of one folder exists, unless they may be replaced.
-
-    Raises:
-        OutputError: a file exists and `overwrite` is false, or the folder is a file.
-    """
+    """Check, before any work, that none of these files of one folder exists, unless they may be replaced."""
     folder = paths[0].parent
     if folder.exists() and not folder.is_dir():
         raise OutputError(folder, "is a file; name a folder")
@@ -109,12 +92,6 @@ def _check_target(path: Path, overwrite: bool) -> None:
             raise OutputError(path, "cannot be written: its folder does not exist; make it first")
     except (OSError, ValueError) as error:  # no access, a name too long, or a NUL in it
         raise OutputError(path, f"cannot be written: {reason(error)}") from error
-
-
-def _same_file(a: str | PathLike[str], b: str | PathLike[str]) -> bool:
-    with suppress(OSError, ValueError):  # a file that does not exist is the same as no other
-        return os.path.samefile(a, b)
-    return False
 
 
 def _sync(path: Path, mode: int) -> None:

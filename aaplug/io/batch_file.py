@@ -44,18 +44,14 @@ def read_batch(path: str | PathLike[str]) -> BatchFile:
     scenes: dict[str, Mapping[str, Any]] = {}
     for number, table in enumerate(tables, start=1):
         settings = _settings(table, path.parent)
-        name = settings.pop("name", None) or _own_name(path, number, settings)
+        file = settings.get("scene") or settings.get("model_path")
+        if not (named := settings.pop("name", None)) and not isinstance(file, str):
+            raise FormatError(path, f"[[scene]] {number}: names no scene; add scene = ... as text")
+        name = named or Path(str(file)).stem or file
         if not isinstance(name, str) or name.casefold() in map(str.casefold, scenes):
             raise FormatError(path, f"[[scene]] {number}: needs a name of its own, not {name!r}; add name = ...")
         scenes[name] = settings
     return BatchFile(_settings(document, path.parent), scenes)
-
-
-def _own_name(path: Path, number: int, settings: Mapping[str, Any]) -> str:
-    file = settings.get("scene") or settings.get("model_path")
-    if not isinstance(file, str):
-        raise FormatError(path, f"[[scene]] {number}: names no scene; add scene = ... as text")
-    return Path(file).stem or file
 
 
 def _settings(table: Mapping[str, Any], folder: Path) -> dict[str, Any]:

@@ -2,6 +2,8 @@
 
 Tensors are RGB, float32, [height, width, 3], row 0 at the top, values in [0, 1] as stored (gamma-encoded).  Bit depths
 are 8 or 16.  Orientation tags are ignored: cameras were calibrated on the pixels as they stand in the file.
+
+Readers raise FormatError for a file that is missing, not an image, damaged, or above the limit IMAGE.
 """
 
 import logging
@@ -36,34 +38,25 @@ log = logging.getLogger("aaplug")
 
 
 def image_size(path: str | PathLike[str]) -> tuple[int, int]:
-    """Width and height in px as stored, from the header alone.
-
-    Raises:
-        FormatError: the file is missing, is not an image, or has more pixels than the limit IMAGE.
-    """
+    """Width and height in px as stored, from the header alone."""
     return _look(Path(path))[0]
 
 
 def read_image(
     path: str | PathLike[str], background: tuple[float, float, float] | None = None
 ) -> Float[Tensor, "h w 3"]:
-    """Read an 8- or 16-bit image; a transparent one is composited over `background` in float.
-
-    Raises:
-        FormatError: the file is missing, damaged or too large, or it is transparent and `background` is None.
-    """
-    pixels = _read(Path(path))
-    if pixels.shape[2] == ALPHA_CHANNELS and background is None:
+    """Read an 8- or 16-bit image; a transparent one is composited over `background` in float, and refused if None."""
+    pixels = torch.from_numpy(_read(Path(path)))
+    if pixels.shape[2] < ALPHA_CHANNELS:
+        return pixels
+    if background is None:
         raise FormatError(path, "is transparent; pass `background`, the colour behind it")
-    return torch.from_numpy(pixels if background is None else _composite(pixels, background))
+    rgb, alpha = pixels[..., :3], pixels[..., 3:]
+    return rgb * alpha + torch.tensor(background, dtype=torch.float32) * (1 - alpha)
 
 
 def read_rgba(path: str | PathLike[str]) -> Float[Tensor, "h w 4"]:
-    """Read an 8- or 16-bit image with straight (not premultiplied) alpha; 1 where the file has none.
-
-    Raises:
-        FormatError: the file is missing, damaged or too large.
-    """
+    """Read an 8- or 16-bit image with straight (not premultiplied) alpha; 1 where the file has none."""
     pixels = torch.from_numpy(_read(Path(path)))
     opaque = torch.ones_like(pixels[..., :1])
     return pixels if pixels.shape[2] == ALPHA_CHANNELS else torch.cat([pixels, opaque], dim=2)
@@ -72,11 +65,7 @@ def read_rgba(path: str | PathLike[str]) -> Float[Tensor, "h w 4"]:
 def write_png(
     path: str | PathLike[str], rgb: Float[Tensor, "h w 3"], bit_depth: int = 8, overwrite: bool = False
 ) -> None:
-    """Write colours, clamped to [0, 1], as a PNG, whole or not at all.
-
-    Raises:
-        OutputError: the file exists and `overwrite` is false, or it cannot be written.
-    """
+    """Write colours, clamped to [0, 1], as a PNG; see `replacing`."""
     check_output(path, overwrite)
     png = encode_png(rgb, bit_depth)
     with replacing(path, overwrite) as stream:
@@ -85,17 +74,19 @@ def write_png(
 
 def encode_png(rgb: Float[Tensor, "h w 3"], bit_depth: int) -> bytes:
     """A PNG file of colours clamped to [0, 1]."""
-    done, png = cv2.imencode(".png", _stored(rgb, bit_depth))
-    assert done
-    return png.tobytes()
+    return _encoded(".png", _stored(rgb, bit_depth))
 
 
 def encode_webp(rgb: Float[Tensor, "h w 3"], quality: int | None) -> bytes:
     """A WebP file of colours clamped to [0, 1], in 8 bits.  quality: 1 to 100; None is lossless."""
     setting = LOSSLESS_WEBP if quality is None else quality
-    done, webp = cv2.imencode(".webp", _stored(rgb, 8), [cv2.IMWRITE_WEBP_QUALITY, setting])
+    return _encoded(".webp", _stored(rgb, 8), cv2.IMWRITE_WEBP_QUALITY, setting)
+
+
+def _encoded(suffix: str, samples: np.ndarray, *settings: int) -> bytes:
+    done, file = cv2.imencode(suffix, samples, settings)
     assert done
-    return webp.tobytes()
+    return file.tobytes()
 
 
 def _stored(rgb: Float[Tensor, "h w 3"], bit_depth: int) -> np.ndarray:
@@ -137,7 +128,9 @@ def _read(path: Path) -> np.ndarray:
         raise FormatError(path, f"holds {pixels.dtype} samples; save it with 8 or 16 bits")
     if transparent != (pixels.shape[2] == ALPHA_CHANNELS):
         raise FormatError(path, "has colours or transparency that OpenCV cannot read; save it as RGB(A) PNG")
-    return _to_rgb(pixels)
+    image = pixels.astype(np.float32) / np.iinfo(pixels.dtype).max
+    order = [0, 0, 0] if image.shape[2] == 1 else [2, 1, 0, 3][: image.shape[2]]
+    return np.ascontiguousarray(image[..., order])
 
 
 def _decode(path: Path) -> np.ndarray:
@@ -146,12 +139,13 @@ def _decode(path: Path) -> np.ndarray:
         with captured_stderr() as words:
             # UNCHANGED keeps 16 bits and alpha, and ignores the orientation tag
             pixels = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
-            damage = _damage(words)
+            words.seek(0)
+            lines = words.read().decode("ascii", "replace").splitlines()
     except (OSError, MemoryError, cv2.error) as error:
         raise FormatError(path, "cannot be read or is damaged") from error
     if pixels is None:
         raise FormatError(path, "is damaged or cut short")
-    if damage:
+    if damage := next((line for line in lines if line.startswith(DAMAGE)), ""):
         log.warning("%s: is damaged (%s)", path, damage)
     return pixels[..., None] if pixels.ndim == 2 else pixels
 
@@ -167,25 +161,3 @@ def captured_stderr() -> Iterator[IO[bytes]]:
         finally:
             os.dup2(saved, STDERR)
             os.close(saved)
-
-
-def _damage(words: IO[bytes]) -> str:
-    words.seek(0)
-    lines = words.read().decode("ascii", "replace").splitlines()
-    return next((line for line in lines if line.startswith(DAMAGE)), "")
-
-
-def _to_rgb(pixels: np.ndarray) -> np.ndarray:
-    """Float32 in [0, 1], RGB or RGBA."""
-    image = pixels.astype(np.float32) / np.iinfo(pixels.dtype).max
-    if image.shape[2] == 1:
-        return np.repeat(image, 3, axis=2)
-    order = [2, 1, 0, 3][: image.shape[2]]
-    return np.ascontiguousarray(image[..., order])
-
-
-def _composite(image: np.ndarray, background: tuple[float, float, float]) -> np.ndarray:
-    if image.shape[2] < ALPHA_CHANNELS:
-        return image
-    rgb, alpha = image[..., :3], image[..., 3:]
-    return rgb * alpha + np.asarray(background, np.float32) * (1 - alpha)

@@ -35,10 +35,8 @@ class Distortion:
 
 def undistorted_cameras(cameras: Sequence[Camera], distortions: Sequence[Distortion | None]) -> list[Camera]:
     """The cameras as pinholes, cropped to what their photographs cover; without photographs that cannot be used."""
-    return [
-        camera if lens is None else _undistorted(camera, lens)
-        for camera, lens in zip(cameras, distortions, strict=True)
-    ]
+    pairs = zip(cameras, distortions, strict=True)
+    return [camera if lens is None else _undistorted(camera, lens) for camera, lens in pairs]
 
 
 def undistorted(image: Float[Tensor, "h w c"], lens: Lens | None) -> Float[Tensor, "H W c"]:
@@ -49,9 +47,8 @@ def undistorted(image: Float[Tensor, "h w c"], lens: Lens | None) -> Float[Tenso
     if lens is None:
         return image
     height, width = image.shape[:2]
-    maps = _maps(lens, width, height)
-    pixels = cv2.remap(image.numpy(), *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return torch.from_numpy(pixels)
+    x, y = _maps(lens, width, height)
+    return torch.from_numpy(cv2.remap(image.numpy(), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
 
 def lens_notes(distortions: Sequence[Distortion | None], cameras: Sequence[Camera]) -> list[str]:
@@ -66,28 +63,21 @@ def lens_notes(distortions: Sequence[Distortion | None], cameras: Sequence[Camer
         what = "photos whose distortion OpenCV lacks are not used; colmap image_undistorter converts them"
         if photographed:
             what = f"{len(photographed)} photos are undistorted; other {what}"
-    return [
-        f"{len(pairs)} cameras have a lens that distorts ({models}): renders are of the pinhole at its centre; {what}"
-    ]
+    distort = f"{len(pairs)} cameras have a lens that distorts ({models})"
+    return [f"{distort}: renders are of the pinhole at its centre; {what}"]
 
 
 def _undistorted(camera: Camera, lens: Distortion) -> Camera:
     if camera.photo is None or lens.coefficients is None:
         return replace(camera, photo=None)
-    whole = Lens(
-        lens.coefficients,
-        lens.fisheye,
-        (camera.width, camera.height),
-        (camera.fx, camera.fy, camera.cx, camera.cy),
-        (0, 0, camera.width, camera.height),
-    )
+    size, pinhole = (camera.width, camera.height), (camera.fx, camera.fy, camera.cx, camera.cy)
+    whole = Lens(lens.coefficients, lens.fisheye, size, pinhole, (0, 0, *size))
     window = _window(whole)
     if window is None:
         return replace(camera, photo=None)
     left, top, width, height = window
     cx, cy = camera.cx - left, camera.cy - top
-    lens_of_window = replace(whole, window=window)
-    return replace(camera, width=width, height=height, cx=cx, cy=cy, lens=lens_of_window)
+    return replace(camera, width=width, height=height, cx=cx, cy=cy, lens=replace(whole, window=window))
 
 
 @lru_cache(MAPS)
@@ -98,12 +88,8 @@ def _window(whole: Lens) -> tuple[int, int, int, int] | None:
     outside = ~((x >= -HALF) & (x <= width - HALF) & (y >= -HALF) & (y <= height - HALF))
     x0, y0, x1, y1 = 0, 0, width, height
     while x1 - x0 >= LEAST_SHARE * width and y1 - y0 >= LEAST_SHARE * height:
-        sides = (
-            outside[y0:y1, x0].mean(),
-            outside[y0, x0:x1].mean(),
-            outside[y0:y1, x1 - 1].mean(),
-            outside[y1 - 1, x0:x1].mean(),
-        )
+        seen = outside[y0:y1, x0:x1]
+        sides = [side.mean() for side in (seen[:, 0], seen[0], seen[:, -1], seen[-1])]
         worst = int(np.argmax(sides))
         if sides[worst] == 0:
             return x0, y0, x1 - x0, y1 - y0
@@ -130,10 +116,5 @@ def _matrix(
     pinhole: tuple[float, float, float, float], corner: tuple[int, int], scale: tuple[float, ...]
 ) -> np.ndarray:
     fx, fy, cx, cy = pinhole
-    return np.array(
-        [
-            [fx * scale[0], 0, (cx - corner[0]) * scale[0] - HALF],
-            [0, fy * scale[1], (cy - corner[1]) * scale[1] - HALF],
-            [0, 0, 1],
-        ]
-    )
+    x, y = (cx - corner[0]) * scale[0] - HALF, (cy - corner[1]) * scale[1] - HALF
+    return np.array([[fx * scale[0], 0, x], [0, fy * scale[1], y], [0, 0, 1]])

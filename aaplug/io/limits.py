@@ -39,11 +39,7 @@ LIMITS: Mapping[str, Limit] = {
 
 
 def limit(name: str) -> int | float:
-    """The limit in force.
-
-    Raises:
-        UsageError: the environment variable is not a positive number.
-    """
+    """The limit in force; raises UsageError if the environment variable is not a positive number."""
     variable = f"AAPLUG_{name}"
     text = os.environ.get(variable)
     if text is None:

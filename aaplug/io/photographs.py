@@ -48,11 +48,7 @@ class Downscale:
 
 
 def read_photo(path: str | PathLike[str], background: Background, lens: Lens | None = None) -> Float[Tensor, "h w 3"]:
-    """Read a photograph: composite it over `background`, undistort it by its lens, round it to 8 bits.
-
-    Raises:
-        FormatError: see `read_image`.
-    """
+    """Read a photograph: composite it over `background`, undistort it by its lens, round it to 8 bits."""
     return quantised(undistorted(read_image(path, background), lens))
 
 
@@ -96,21 +92,11 @@ def _pil_bicubic(path: Path, background: Background, lens: Lens | None = None) -
     return Photograph((photo.shape[0], photo.shape[1]), at)
 
 
+BOX = "box average (area-weighted where the factor is not whole), after compositing and 8-bit rounding"
+RGBA_BOX = "RGBA halved by 2×2 box means in float, cut to 8 bits, composited, cut again (multi-scale Blender data)"
+PIL_BICUBIC = "Pillow's antialiased bicubic on the 8-bit photograph, in 8 bits (3DGS's -r)"
 DOWNSCALES = {
-    way.name: way
-    for way in (
-        Downscale(
-            "box",
-            "box average (area-weighted where the factor is not whole), after compositing and 8-bit rounding",
-            _box,
-        ),
-        Downscale(
-            "rgba-box",
-            "RGBA halved by 2×2 box means in float, cut to 8 bits, composited, cut again (multi-scale Blender data)",
-            _rgba_box,
-        ),
-        Downscale(
-            "pil-bicubic", "Pillow's antialiased bicubic on the 8-bit photograph, in 8 bits (3DGS's -r)", _pil_bicubic
-        ),
-    )
+    "box": Downscale("box", BOX, _box),
+    "rgba-box": Downscale("rgba-box", RGBA_BOX, _rgba_box),
+    "pil-bicubic": Downscale("pil-bicubic", PIL_BICUBIC, _pil_bicubic),
 }

@@ -1,17 +1,17 @@
 """Values from untrusted files: their size, type and range are checked before they are used.
 
-Sizes and focal lengths are in px.  Every function but `mentions` raises `FormatError` and nothing else; it
-names the file, the entry and the field, and says what was expected and what was found.
+Sizes and focal lengths are in px.  Every function but `mentions` raises `FormatError` and nothing else; it names the
+file, the entry and the field, and says what was expected and what was found.
 """
 
 import json
 import math
 import os
 import reprlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
 
 import torch
 from jaxtyping import Float
@@ -19,6 +19,8 @@ from torch import Tensor
 
 from aaplug.core.errors import FormatError, reason
 from aaplug.io.limits import whole_limit
+
+Value = TypeVar("Value")
 
 HEAD_LIMIT = 64 * 2**10  # bytes searched for keys when a format is guessed
 MAX_FOCAL = 1e9  # px: far above any real lens; what is computed from it stays finite
@@ -42,7 +44,7 @@ class Place:
 
 @dataclass(frozen=True)
 class Entry:
-    """One JSON object.  Each method reads one field of a kind."""
+    """One JSON object."""
 
     place: Place
     fields: dict[str, Any]
@@ -56,21 +58,18 @@ class Entry:
             raise self.place.error(f"{field} is missing")
         return self.fields[field]
 
-    def number(self, field: str) -> float:
-        """A finite number."""
-        return number(self.value(field), self.place, field)
+    def get(self, field: str, check: Callable[[object, Place, str], Value], default: Value | None = None) -> Value:
+        """The field as `check`, one of the functions below, returns it; `default` where it is missing, unless None."""
+        if default is not None and field not in self.fields:
+            return default
+        return check(self.value(field), self.place, field)
 
-    def focal(self, field: str) -> float:
-        """A focal length, in px."""
-        return focal(self.value(field), self.place, field)
-
-    def pixels(self, field: str) -> int:
-        """The side of an image, in px."""
-        return pixels(self.value(field), self.place, field)
-
-    def text(self, field: str) -> str:
-        """Printable text."""
-        return text(self.value(field), self.place, field)
+    def entry(self, field: str) -> "Entry":
+        """A JSON object."""
+        value = self.value(field)
+        if not isinstance(value, dict):
+            raise self.place.wrong(field, "an object", value)
+        return Entry(Place(self.place.file, field), value)
 
     def vector(self, field: str, length: int) -> Float[Tensor, " length"]:
         """A list of `length` finite numbers."""
@@ -127,11 +126,7 @@ def text(value: object, place: Place, field: str) -> str:
 
 
 def read_bounded(path: Path, limit: int) -> bytes:
-    """A file's bytes.
-
-    Raises:
-        FormatError: it is longer than `limit`, is not a file, or cannot be read.
-    """
+    """The bytes of a file that is not longer than `limit`."""
     if not os.path.isfile(path):  # reading a pipe would block
         raise FormatError(path, "there is no such file")
     try:
@@ -145,20 +140,12 @@ def read_bounded(path: Path, limit: int) -> bytes:
 
 
 def read_json(path: Path) -> Any:
-    """A JSON document.
-
-    Raises:
-        FormatError: the file is not JSON, is longer than the limit, or holds NaN or Infinity.
-    """
+    """A JSON document without NaN and Infinity."""
     return parse_json(read_bounded(path, whole_limit("JSON")), path)
 
 
 def parse_json(data: bytes, path: Path) -> Any:
-    """Parse the JSON in these bytes of the file `path`.
-
-    Raises:
-        FormatError: they are not JSON, or hold NaN or Infinity.
-    """
+    """The JSON in these bytes of the file `path`."""
     try:
         return json.loads(data.decode("utf-8-sig"), parse_constant=_refuse)
     except (RecursionError, MemoryError) as error:
@@ -167,15 +154,22 @@ def parse_json(data: bytes, path: Path) -> Any:
         raise FormatError(path, f"should be JSON: {error}") from error
 
 
-def entries(path: Path, what: str, items: object, shared: dict[str, Any] | None = None) -> list[Entry]:
-    """The objects of a JSON list; `shared` fields apply where an object does not have its own.
+def object_of(document: object, path: Path, entry: str, what: str, key: str | None = None) -> Entry:
+    """A JSON document that should be an object with `what`, or at least with `key`."""
+    if not isinstance(document, dict) or (key is not None and key not in document):
+        raise FormatError(path, f"should be an object with {what}")
+    return Entry(Place(path, entry), document)
 
-    Raises:
-        FormatError: it is not a list of objects, or is empty.
-    """
+
+def entries(path: Path, what: str, items: object, shared: dict[str, Any] | None = None) -> list[Entry]:
+    """The objects of a JSON list, at least one; `shared` fields apply where an object does not have its own."""
     if not isinstance(items, list) or not items:
         raise FormatError(path, f"should hold a list of {what}s, at least one, not {reprlib.repr(items)}")
-    return [_entry(Place(path, f"{what} {i}"), item, shared or {}) for i, item in enumerate(items)]
+    places = [Place(path, f"{what} {i}") for i in range(len(items))]
+    for place, item in zip(places, items, strict=True):
+        if not isinstance(item, dict):
+            raise place.wrong("it", "an object", item)
+    return [Entry(place, {**(shared or {}), **item}) for place, item in zip(places, items, strict=True)]
 
 
 def mentions(path: Path, keys: Sequence[str]) -> bool:
@@ -188,12 +182,6 @@ def mentions(path: Path, keys: Sequence[str]) -> bool:
     except OSError:
         return False
     return any(f'"{key}"'.encode() in start for key in keys)
-
-
-def _entry(place: Place, item: object, shared: dict[str, Any]) -> Entry:
-    if not isinstance(item, dict):
-        raise place.wrong("it", "an object", item)
-    return Entry(place, {**shared, **item})
 
 
 def _refuse(constant: str) -> NoReturn:

@@ -44,12 +44,7 @@ def check_video(path: str | PathLike[str], fps: float, overwrite: bool) -> None:
 def write_video(
     path: str | PathLike[str], frames: Iterable[Float[Tensor, "h w 3"]], fps: float, overwrite: bool = False
 ) -> None:
-    """Write a video of at least one frame.
-
-    Raises:
-        OutputError: it exists and `overwrite` is false, or it cannot be written.
-        UsageError: its codec is not installed, or `fps` is out of range.
-    """
+    """Write a video of at least one frame; errors as in `check_video`, and OutputError if it cannot be written."""
     check_video(path, fps, overwrite)
     suffix = Path(path).suffix.lower()
     write = _write_mp4 if suffix == MP4 else _write_webm

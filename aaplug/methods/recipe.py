@@ -12,12 +12,12 @@ SLACK = 1e-6  # before one more sample is taken
 
 @dataclass(frozen=True)
 class Promises:
-    """What a recipe holds to on a classic scene; laws check each one, whether it is promised or not.
+    """Properties of a recipe on a classic scene; `tests/laws` checks that each holds if true and fails if false.
 
-    equals_training: at the training size its image is training's own.
-    keeps_energy: the light of a lone splat follows its area over scales.
-    fades_when_small: a splat far smaller than a pixel fades out, rather than being hit or missed by a sample.
-    opaque_when_near: a splat seen from very near has its opacity.
+    equals_training: at the training size the image equals training's.
+    keeps_energy: a lone splat's summed alpha scales with the square of the sampling rate.
+    fades_when_small: a splat much smaller than a pixel fades out; no sample hits it at full opacity.
+    opaque_when_near: at high magnification, alpha at a splat's centre equals its opacity.
     """
 
     equals_training: bool = False
@@ -31,9 +31,9 @@ class Recipe:
     """How to render a scene.
 
     source: the paper or design that it follows.  when: what it is for, in one line.
-    target_rate: relative sampling rate, at most 1 (training's own pixels), that the samples of a pixel reach: the
-        smallest n x n samples with rate·n >= target_rate; 0 for one sample.
-    grid: samples along a pixel's side that it takes at every rate.
+    target_rate: relative sampling rate, at most 1 (training's own), that the samples must reach: n × n samples per
+        pixel, with the smallest n for which n · relative rate >= target_rate.  0: no such demand.
+    grid: smallest number of samples along a pixel's side, at any rate.
     takes_quality: `target_rate` is set by the user's choice of quality.
     for_discs: name of the recipe that takes its place for scenes of 2D Gaussians.
     """

@@ -5,7 +5,7 @@ from dataclasses import replace
 from aaplug.core.errors import UsageError
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.interfaces import MatchesRates
-from aaplug.core.registry import Registry
+from aaplug.core.registry import Registry, named
 from aaplug.methods.filters import SCREEN_FILTERS, LowPass, Matched, Smoothing3D
 from aaplug.methods.pixel_kernels import SURFEL
 from aaplug.methods.recipe import Promises, Recipe
@@ -78,11 +78,7 @@ USER_RECIPES = (
     ),
 )
 
-RECIPES: Registry[Recipe] = Registry(
-    "recipe",
-    {recipe.name: recipe for recipe in (*USER_RECIPES, *RESEARCH_RECIPES)},
-    check=lambda value: isinstance(value, Recipe),
-)
+RECIPES: Registry[Recipe] = Registry("recipe", named((*USER_RECIPES, *RESEARCH_RECIPES)), Recipe)
 
 
 def find_recipe(

@@ -1,8 +1,8 @@
-"""Conversion in closed form: anti-aliasing fused into a plain scene, for a viewer that knows nothing of it.
+"""Closed-form conversion: fuse anti-aliasing into a plain scene, for viewers that have only a fixed 2D filter.
 
-A viewer draws by a rule of its own: a 2D kernel, compensated or not.  `fuse` makes a scene for the Mip rule (0.1 px²,
-compensated), `fuse_for` one for a named viewer.  Both treat each Gaussian alone; `aaplug.finetuning` can start from
-their result and optimize all Gaussians together.
+A viewer adds a constant variance to every projected covariance, with or without compensation: its rule.  `fuse` targets
+the Mip rule (0.1 px², compensated), `fuse_for` a named viewer.  Each Gaussian is converted independently;
+`aaplug.finetuning` can then optimize all of them together.
 """
 
 from collections.abc import Sequence
@@ -11,20 +11,20 @@ from typing import Any
 
 from aaplug.core.errors import UsageError
 from aaplug.core.gaussians import ANTIALIASED, CLASSIC, MIP, Convention, Fusion, Gaussians
-from aaplug.core.registry import Registry
+from aaplug.core.registry import Registry, named
 from aaplug.core.training import TrainingViews
 from aaplug.methods.filters import MatchedEnergy, Smoothing3D, fuse_stored
 
-FITTED_VARIANCE = 0.1  # px²; measured: a scene trained without compensation, for a compensating viewer
-TUNED = "finetune"  # the method that fine-tuning records; it adds no blur
+FITTED_VARIANCE = 0.1  # px² at the median training rate, best measured; from uncompensated training to compensation
+TUNED = "finetune"  # method that fine-tuning records in `Gaussians.fused`; it adds no blur
 
 
 @dataclass(frozen=True)
 class Form:
-    """A closed form for the Mip rule.
+    """A closed-form conversion to the Mip rule.
 
-    uses_bounds: the filter reads the sampling bounds of the scene, not the cameras alone.
-    skips: the convention of scenes that it would leave as they are; None if it changes all.
+    uses_bounds: whether the filter reads `TrainingViews.bounds`; if not, only the cameras.
+    skips: convention of the scenes that need no conversion; None if all need one.
     """
 
     filter: MatchedEnergy | Smoothing3D
@@ -39,9 +39,7 @@ class Form:
 
 MATCHED_ENERGY = Form(MatchedEnergy(), uses_bounds=False, skips=MIP)
 FORMS: Registry[Form] = Registry(
-    "form",
-    {"matched-energy": MATCHED_ENERGY, "mip-splatting": Form(Smoothing3D(), uses_bounds=True)},
-    check=lambda value: isinstance(value, Form),
+    "form", {"matched-energy": MATCHED_ENERGY, "mip-splatting": Form(Smoothing3D(), uses_bounds=True)}, Form
 )
 
 
@@ -49,9 +47,9 @@ FORMS: Registry[Form] = Registry(
 class Viewer:
     """A program that shows scenes by one rule.
 
-    recipe: name of the recipe that draws by this rule.
-    convention: what a file must say to ask for the rule; None for a viewer that reads how the scene was trained.
-    rule: in words.
+    recipe: name of the recipe that implements the rule.
+    convention: what the file must declare for this rule; None keeps the scene's own convention.
+    rule: the rule in words, for the user.
     """
 
     name: str
@@ -68,24 +66,23 @@ CLASSIC_VIEWER = Viewer("classic-viewer", "classic", CLASSIC, "0.3 px², not com
 MIP_VIEWER = Viewer("mip-viewer", "mip", MIP, "0.1 px², compensated")
 VIEWERS: Registry[Viewer] = Registry(
     "viewer",
-    {
-        viewer.name: viewer
-        for viewer in (
+    named(
+        (
             CLASSIC_VIEWER,
             Viewer("antialiased-viewer", "ewa", ANTIALIASED, "0.3 px², compensated"),
             MIP_VIEWER,
             Viewer("gsplat", "ewa", ANTIALIASED, 'rasterize_mode="antialiased": 0.3 px², compensated'),
         )
-    },
-    check=lambda value: isinstance(value, Viewer),
-)  # fmt: skip
+    ),
+    Viewer,
+)
 FAST = Viewer("fast", "matched", None, "aaplug's recipe matched, one sample per pixel")
 
 
 def fuse(scene: Gaussians, training: TrainingViews | None, form: Form = MATCHED_ENERGY) -> Gaussians:
-    """Convert a scene for the Mip rule: fuse its stored 3D filter if it has one, else what `form` says.
+    """Convert a scene to the Mip rule: fuse its stored 3D filter, or apply `form` if it stores none.
 
-    training may be None where the scene stores its filter.
+    training: may be None if the scene stores a 3D filter.
 
     Raises:
         UsageError: something is fused already, the scene needs nothing, or cameras are missing.
@@ -94,21 +91,21 @@ def fuse(scene: Gaussians, training: TrainingViews | None, form: Form = MATCHED_
     if scene.filter_3d is not None:
         converted = fuse_stored(scene)
     elif training is None:
-        raise UsageError(scene.name, "converting it needs the training cameras: give `cameras`")
+        raise UsageError(scene.name, "has no stored 3D filter: its conversion needs the training cameras")
     else:
         converted = form.filter(scene, training)
     return replace(converted, convention=MIP)
 
 
 def fuse_for(scene: Gaussians, training: TrainingViews, viewer: Viewer) -> Gaussians:
-    """Convert a scene for a viewer; unchanged where the viewer draws as training did.
+    """Convert a scene for a viewer; if the viewer draws as training did, only a stored 3D filter is fused.
 
     Raises:
-        UsageError: something is fused already, which a second conversion would blur again.
+        UsageError: the viewer has a rule of its own, and the scene holds 2D Gaussians or blur is already fused.
     """
     if viewer.convention is None:
         return fuse_stored(scene)
-    _check_fused(scene)
+    _check_convertible(scene)
     scene = fuse_stored(scene)
     if scene.convention == viewer.convention:
         return scene
@@ -116,13 +113,13 @@ def fuse_for(scene: Gaussians, training: TrainingViews, viewer: Viewer) -> Gauss
 
 
 def _energy_kept(trained: Convention, shown: Convention) -> MatchedEnergy:
-    """The filter that adds the blur a viewer lacks against training, and keeps the energy that training showed."""
+    """Matched energy with the variance that training adds and the viewer does not."""
     fitted = shown.compensated and not trained.compensated
     return MatchedEnergy(FITTED_VARIANCE if fitted else trained.kernel - shown.kernel, shown)
 
 
 def blurring(fused: Sequence[Fusion]) -> list[Fusion]:
-    """What added blur; fine-tuning adds none."""
+    """The fusions that added blur: all but fine-tuning."""
     return [fusion for fusion in fused if fusion.method != TUNED]
 
 
@@ -138,14 +135,14 @@ def fused_in(scene: Gaussians) -> str:
 
 
 def _check(scene: Gaussians, form: Form) -> None:
-    if scene.flat:
-        raise UsageError(scene.name, "holds 2D Gaussians: no filter here can widen them and keep them flat")
-    _check_fused(scene)
+    _check_convertible(scene)
     if form.skips == scene.convention and scene.filter_3d is None:
         raise UsageError(scene.name, "was trained by the Mip rule and stores no 3D filter: there is nothing to fuse")
 
 
-def _check_fused(scene: Gaussians) -> None:
+def _check_convertible(scene: Gaussians) -> None:
+    if scene.flat:
+        raise UsageError(scene.name, "holds 2D Gaussians, which closed-form conversion does not support")
     blurs = blurring(scene.fused)
     if blurs:
         done = "; ".join(map(describe, blurs))

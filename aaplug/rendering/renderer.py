@@ -37,7 +37,7 @@ Background = Literal["auto", "white", "black"] | Colour
 
 
 class Drawing(NamedTuple):
-    """A render, the splats it was made of, and height and width in px of the image that they were drawn into."""
+    """A render, its splats, and the height and width in px of the supersampled image that they were drawn into."""
 
     render: Render
     splats: Splats2D
@@ -48,7 +48,8 @@ class Drawing(NamedTuple):
 class Renderer:
     """A prepared scene; call it with a camera.
 
-    scene: after the world filter.  training: of the scene as it was trained.  background: red, green, blue in [0, 1].
+    scene: the scene after the world filter.  training: the training views of the unfiltered scene.
+    background: red, green, blue in [0, 1].
     """
 
     scene: Gaussians
@@ -71,14 +72,15 @@ class Renderer:
         cull_margin: float = math.inf,
         min_seen: float = MIN_SEEN_SHARE,
     ) -> "Renderer":
-        """Prepare a scene: check that the cameras see it, compute its sampling bounds and apply the world filter.
+        """Prepare a scene: check its frame, compute its sampling bounds and apply the world filter.
 
         Args:
-            scene: as it was read.
-            cameras: the training cameras, or what was computed from them before.
+            scene: the scene as its file stores it, before any world filter.
+            cameras: the training cameras.  With a `TrainingViews` nothing is checked or computed, and `cull_margin`
+                and `min_seen` are ignored.
             recipe: a recipe, or its name in `RECIPES`.
-            quality: "fast", "balanced" or "best": samples per pixel of recipe "auto".
-            background: a colour, or "auto" for what training had (black where the camera files do not say).
+            quality: "fast", "balanced" or "best": how finely recipe "auto" supersamples.
+            background: a colour, "white", "black", or "auto": the colour that a `CameraSet` records, else black.
             rasterizer: a rasterizer, or its name: "auto" is "compiled" where `aaplug warmup` has run, else "eager".
             cull_margin: see `TrainingViews`.
             min_seen: share of the Gaussians that the cameras must see.
@@ -118,7 +120,7 @@ class Renderer:
         return Drawing(average_samples(image, samples), splats, fine.hw)
 
     def sampled(self, camera: Camera) -> tuple[Camera, int]:
-        """The larger image whose pixels are the samples, and the number of samples along a pixel's side."""
+        """Camera of the supersampled image, and the samples along a pixel's side."""
         samples = self.samples(camera)
         return camera.resized(camera.width * samples, camera.height * samples), samples
 
@@ -129,11 +131,11 @@ class Renderer:
         return self.recipe.samples_at(self.relative_rate(camera))
 
     def relative_rate(self, camera: Camera) -> float:
-        """Sampling rate of a view against training, by which its samples per pixel are chosen.
+        """A view's sampling rate relative to training, which sets the samples per pixel.
 
-        For a pose of the data set this is its size against training's.  A free camera may be nearer or farther than
-        any training camera: for it this is the median, over the Gaussians in view, of their rate against the nearest
-        rate that training had.
+        At a data-set pose it is the ratio of focal lengths.  For a free camera, which may be nearer or farther than
+        any training camera, it is the median over visible Gaussians of (rate now / nearest rate in the Gaussian's
+        training range); without any, the ratio of focal lengths.
         """
         if camera.trained_focal is not None or not self.training.bounds.seen.any():
             return self.training.relative_rate(camera)
@@ -153,7 +155,7 @@ class Renderer:
         return float((now / torch.minimum(torch.maximum(now, lowest), highest)).median())
 
     def splats(self, camera: Camera) -> Splats2D:
-        """What a view draws: projected, selected, filtered, culled and coloured splats.
+        """The splats of one view: projected, selected, filtered, culled and coloured.
 
         Gaussians pass in chunks, so that memory is bounded by a chunk and by the splats that stay.
         """
@@ -187,7 +189,10 @@ class Renderer:
 
 
 def prepared(scene: Gaussians, training: TrainingViews, recipe: Recipe) -> Gaussians:
-    """Everything that acts on the scene before a view is chosen; a stored 3D filter is part of the scene itself."""
+    """Apply what acts once per scene: its stored 3D filter, which is part of it, then the recipe's world filter.
+
+    A world filter is applied even if the scene already contains one: use `mip` if it stores `filter_3D`.
+    """
     scene = fuse_stored(scene)
     return scene if recipe.world is None else recipe.world(scene, training)
 
@@ -210,7 +215,7 @@ def background_colour(background: Background, cameras: object = None) -> Colour:
 
 
 def _check_colours(splats: Splats2D) -> None:
-    """Refuse NaN colours, which would spoil every pixel they touch."""
+    """Raise on NaN or infinite colours, which would contaminate every pixel that they touch."""
     colours: Tensor | None = splats.rgb
     assert colours is not None
     if not colours.sum().isfinite():

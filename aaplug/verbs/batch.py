@@ -4,7 +4,6 @@ import re
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,8 @@ from aaplug.core.monitor import SILENT, Monitor
 from aaplug.evaluation.report.files import as_json, write_texts
 from aaplug.evaluation.results import Report, as_csv, method, results, scale_name
 from aaplug.io.atomic import refuse_existing
-from aaplug.verbs.evaluate import Output
+from aaplug.verbs.evaluate import EvaluateOptions, Output
+from aaplug.verbs.inputs import AnyPath
 
 SUMMARY, RESULTS = "batch.json", "results.csv"
 
@@ -80,7 +80,7 @@ class Batch:
 
 def batch(
     runs: Sequence[tuple[str, Callable[..., Report]]],
-    output: str | PathLike[str],
+    output: AnyPath,
     *,
     resume: bool = False,
     overwrite: bool = False,
@@ -100,7 +100,7 @@ def batch(
     folders = [Path(output) / slug for slug in _slugs([name for name, _ in runs])]
     refuse_existing([Path(output) / name for name in (SUMMARY, RESULTS)], overwrite or resume)
     for folder in folders:
-        Output(folder, resume=resume, overwrite=overwrite).check()
+        Output(folder, EvaluateOptions(resume=resume, overwrite=overwrite)).check()
     reports: dict[str, Report] = {}
     failures: dict[str, str] = {}
     for folder, (name, run) in zip(folders, runs, strict=True):
@@ -118,7 +118,7 @@ def batch(
     return found
 
 
-def _write(found: Batch, output: str | PathLike[str], monitor: Monitor) -> None:
+def _write(found: Batch, output: AnyPath, monitor: Monitor) -> None:
     texts = {SUMMARY: as_json(found.summary()), RESULTS: as_csv(found.reports)}
     for path in write_texts(output, texts, overwrite=True):  # it was checked at the start
         monitor.say(f"wrote {path}")

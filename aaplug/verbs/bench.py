@@ -2,7 +2,11 @@
 
 import re
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
+from itertools import product
+from typing import Annotated, Any, NamedTuple
+
+import tyro
 
 from aaplug.core.cameras import Camera
 from aaplug.core.errors import UsageError
@@ -12,8 +16,8 @@ from aaplug.core.monitor import SILENT, Monitor
 from aaplug.rasterizers.tiled.ahead_of_time import build, load
 from aaplug.rendering.benchmark import Figures, exponent, measure, synthetic_camera, synthetic_scene
 from aaplug.verbs.inputs import CamerasLike, SceneLike, cameras_of, processor, scene_of
+from aaplug.verbs.options import Options, choice, flag
 
-GAUSSIANS = (10_000, 100_000, 1_000_000)
 SIZES = ("800x800", "1600x1060")  # of images
 CHOICES = ("all", "compiled", "eager")
 
@@ -25,50 +29,50 @@ class Bench(NamedTuple):
     exponents: dict[str, float]
 
 
+@dataclass(frozen=True, kw_only=True)
+class BenchOptions(Options):
+    """What to time."""
+
+    gaussians: Annotated[Sequence[int], tyro.conf.arg(metavar="N ...")] = (10_000, 100_000, 1_000_000)
+    """Sizes of the synthetic scenes."""
+    resolution: Annotated[Sequence[str] | None, flag("WxH ...")] = None
+    """Sizes of the synthetic scenes' image: all scenes at the first, the middle one at each (default: 800x800, and
+    1600x1060 if there are several scenes)."""
+    rasterizer: Annotated[str, choice(CHOICES)] = "all"
+    """Which to time; all: compiled, if `aaplug warmup` has run, and eager."""
+    repeats: int = 5
+    """Runs per median."""
+    threads: Annotated[int | None, flag("N")] = None
+    """Processor threads (default: all)."""
+    forward_only: bool = False
+    """Leave out the backward pass."""
+
+
+@BenchOptions.shown
 def bench(
-    scene: SceneLike | None = None,
-    cameras: CamerasLike = None,
-    *,
-    gaussians: Sequence[int] = GAUSSIANS,
-    resolution: Sequence[str] | None = None,
-    rasterizer: str = "all",
-    repeats: int = 5,
-    threads: int | None = None,
-    forward_only: bool = False,
-    monitor: Monitor = SILENT,
+    scene: SceneLike | None = None, cameras: CamerasLike = None, *, monitor: Monitor = SILENT, **options: Any
 ) -> Bench:
     """Time the rasterizer on synthetic scenes, or on the first training view of a scene.
 
     Args:
-        scene: Gaussians, a scene's file or a model folder; None for synthetic scenes.
-        cameras: of `scene`.
-        gaussians: sizes of the synthetic scenes.
-        resolution: sizes of their images, "WIDTHxHEIGHT": all scenes at the first, the middle one at each; None for
-            800x800, and also 1600x1060 if there are several scenes.
-        rasterizer: "compiled", "eager", or "all": compiled if it is built, and eager.
-        repeats: runs per median.
-        threads: processor threads; None for all.
-        forward_only: leave out the backward pass.
-        monitor: receives messages and progress.
-
-    Raises:
-        AaplugError: an input cannot be read, or an argument does not fit.
+        scene, cameras, monitor: see `render`; without a scene, synthetic ones.
+        options: fields of `BenchOptions`.
     """
-    if repeats < 1:
-        raise UsageError("repeats", f"must be 1 or more, got {repeats}")
+    o = BenchOptions.of(options)
+    if o.repeats < 1:
+        raise UsageError("repeats", f"must be 1 or more, got {o.repeats}")
     runs: list[Figures] = []
-    with processor(threads):
+    with processor(o.threads):
         if scene is None:
-            work = _synthetic(gaussians, resolution)
+            work = _synthetic(o.gaussians, o.resolution)
         else:
             work = [(scene_of(scene), cameras_of(cameras, scene).train[0])]
-        kernels = _kernels(rasterizer, monitor)
-        for shown, camera in work:
-            for each in kernels:
-                run = measure(shown, camera, each, repeats, not forward_only)
-                size = f"{run.gaussians:,} Gaussians, {run.width}x{run.height}"
-                monitor.say(f"{size}, {run.rasterizer}: {run.forward_ms:.0f} ms")
-                runs.append(run)
+        kernels = _kernels(o.rasterizer, monitor)
+        for (shown, camera), each in product(work, kernels):
+            run = measure(shown, camera, each, o.repeats, not o.forward_only)
+            size = f"{run.gaussians:,} Gaussians, {run.width}x{run.height}"
+            monitor.say(f"{size}, {run.rasterizer}: {run.forward_ms:.0f} ms")
+            runs.append(run)
     return Bench(runs, _exponents(runs))
 
 

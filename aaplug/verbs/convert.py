@@ -1,30 +1,27 @@
 """Conversion: a plain scene file with anti-aliasing fused in."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from os import PathLike
 from pathlib import Path
-from typing import TypeGuard
+from typing import Annotated, Any, TypeGuard
+
+import tyro
 
 from aaplug.core.cameras import Camera
 from aaplug.core.errors import UsageError
 from aaplug.core.gaussians import Gaussians
-from aaplug.core.interfaces import Rasterizer
 from aaplug.core.monitor import SILENT, Monitor
-from aaplug.core.sampling import MIN_SEEN_SHARE
 from aaplug.core.training import TrainingViews
 from aaplug.evaluation.results import Report
-from aaplug.evaluation.truth import own_look
 from aaplug.finetuning.fitting import fit, steps_for
 from aaplug.inspection.survey import check_frame_of
 from aaplug.io.cameras import select_views
 from aaplug.io.scenes import SpzAxes, check_scene_output, find_scene, open_scene, write_parts, write_scene
 from aaplug.io.scenes.scene_file import SceneFile
 from aaplug.methods.viewers import FORMS, MATCHED_ENERGY, MIP_VIEWER, VIEWERS, Form, Viewer, blurring, fuse
-from aaplug.rendering.renderer import Background
 from aaplug.verbs.in_parts import LARGE, convert_parts
-from aaplug.verbs.inputs import CamerasLike, SceneLike, background_of, cameras_of, processor, rasterizer_of
+from aaplug.verbs.inputs import AnyPath, CamerasLike, SceneLike, cameras_of, look_of, processor
+from aaplug.verbs.options import ViewOptions, flag
 
 
 @dataclass(frozen=True)
@@ -41,26 +38,53 @@ class Converted:
     report: Report | None = None
 
 
+@dataclass(frozen=True, kw_only=True)
+class ConvertOptions(ViewOptions):
+    """What to fuse, and how to measure it."""
+
+    views: Annotated[str, tyro.conf.arg(metavar="NAME,...|test|train|all")] = "train"
+    """Views that --viewer is measured on, by name or split."""
+    viewer: Annotated[str | Viewer | None, flag("|".join(VIEWERS), "--for", kind=str | None)] = None
+    """Fit the scene to this viewer by a short optimization from the closed form, and print the remaining error."""
+    steps: Annotated[int | None, flag("N")] = None
+    """With --viewer: steps of the optimization (default: 300, or 0 if the viewer draws as training did); 0 keeps the
+    closed form."""
+    form: Annotated[str | None, flag("|".join(FORMS))] = None
+    """Without --viewer, what to fuse: matched-energy (the default) keeps the energy that training showed;
+    mip-splatting is Mip-Splatting's 3D smoothing.  A stored filter_3D is fused as it is."""
+    variance: Annotated[float | None, flag("PX2")] = None
+    """Without --viewer: variance to fuse, in px² at the training rate (default: 0.2)."""
+    overwrite: bool = False
+    """Replace an existing output."""
+
+    def chosen(self) -> Form | Viewer:
+        """What to convert for: a viewer, or the Mip rule by a closed form.
+
+        Raises:
+            UsageError: an option does not fit.
+        """
+        if self.viewer is None:
+            if self.steps is not None:
+                raise UsageError("steps", "belongs to the optimization for a `viewer`; name one")
+            found = MATCHED_ENERGY if self.form is None else FORMS.find(self.form, "form")
+            return found if self.variance is None else found.with_variance(self.variance)
+        if self.form is not None or self.variance is not None:
+            raise UsageError("viewer", "sets form and variance itself; leave out `form`, `variance`")
+        if self.steps is not None and self.steps < 0:
+            raise UsageError("steps", f"must be 0 or more, got {self.steps}")
+        return VIEWERS.find(self.viewer, "viewer") if isinstance(self.viewer, str) else self.viewer
+
+
+@ConvertOptions.shown
 def convert(
     scene: SceneLike | SceneFile,
     cameras: CamerasLike = None,
-    output: str | PathLike[str] | None = None,
+    output: AnyPath | None = None,
     *,
-    viewer: str | Viewer | None = None,
-    steps: int | None = None,
-    form: str | None = None,
-    variance: float | None = None,
-    views: str = "train",
-    background: Background = "auto",
-    rasterizer: str | Rasterizer = "auto",
-    threads: int | None = None,
-    memory: float | None = None,
-    cull_margin: float = math.inf,
-    min_seen: float = MIN_SEEN_SHARE,
     drop_bad: bool = False,
     spz_axes: SpzAxes = "opengl",
-    overwrite: bool = False,
     monitor: Monitor = SILENT,
+    **options: Any,
 ) -> Converted:
     """Fuse anti-aliasing into a plain scene, in closed form for the Mip rule or fitted to a named viewer.
 
@@ -68,66 +92,48 @@ def convert(
 
     Args:
         scene: Gaussians, a scene's file, opened or not, or a model folder.
-        cameras: a camera set, its file or folder, or None for those of the scene's model folder; not needed where the
-            scene stores a 3D filter.
+        cameras: see `render`; not needed where the scene stores a 3D filter.
         output: file to write, .ply, .spz or .splat; None writes none.
-        viewer: a viewer, or its name in `VIEWERS`: fit the scene to it by a short optimization from the closed form.
-        steps: of that optimization; None for 300, or for 0 where the viewer draws as training did.
-        form: without a viewer, what to fuse: a name in `FORMS`; None for "matched-energy".
-        variance: without a viewer, the variance to fuse, in px² at the training rate; None for 0.2.
-        views: to measure the fit on: "train", "test", "all", or names separated by commas.
-        background, rasterizer, threads, memory, cull_margin, min_seen: see `render`.
         drop_bad: leave out Gaussians of a file that cannot be used.
         spz_axes: of a .spz to write; see `open_scene`.
-        overwrite: replace an existing output.
         monitor: receives messages and progress.
+        options: fields of `ConvertOptions`.
 
     Raises:
-        AaplugError: an input cannot be read, an argument does not fit, something is fused already, or the output cannot
+        AaplugError: an input cannot be read, an option does not fit, something is fused already, or the output cannot
             be written.
         KeyboardInterrupt: Ctrl-C stopped the optimization; nothing is written.
     """
-    chosen = _chosen(viewer, steps, form, variance)
-    opened, path = _opened(scene), None if output is None else Path(output)
+    o = ConvertOptions.of(options)
+    chosen, opened, path = o.chosen(), _opened(scene), None if output is None else Path(output)
     if path is not None:
-        check_scene_output(path, overwrite, _sources(opened))
-    with processor(threads) as workers:
+        check_scene_output(path, o.overwrite, _sources(opened))
+    writing = {"overwrite": o.overwrite, "spz_axes": spz_axes}
+    with processor(o.threads) as workers:
         if path and isinstance(chosen, Form) and _is_large(opened):
-            train = _train_of(opened, cameras, min_seen)
+            train = _train_of(opened, cameras, o.min_seen)
             with monitor.progress("converting", "Gaussians") as tell:
                 parts = convert_parts(opened, train, chosen, drop_bad, tell, threads=workers)
-                write_parts(path, parts, opened.count, overwrite=overwrite, spz_axes=spz_axes)
+                write_parts(path, parts, opened.count, **writing)
             return Converted(None, MIP_VIEWER)
         whole = opened.whole(drop_bad) if isinstance(opened, SceneFile) else opened
         if isinstance(chosen, Form):
-            found = Converted(_fused(whole, cameras, chosen, min_seen), MIP_VIEWER)
+            found = Converted(_fused(whole, cameras, chosen, o.min_seen), MIP_VIEWER)
         else:
-            known = cameras_of(cameras, whole)
-            colour = background_of(background, known, monitor)
-            steps = steps_for(whole, chosen) if steps is None else steps
-            drawing = rasterizer_of(rasterizer, steps, memory, monitor)
-            training = TrainingViews.of(whole, known, cull_margin, min_seen)
-            look = own_look(whole, training, drawing, colour)
-            fitted = fit(whole, chosen, look, select_views(known, views), steps, monitor)
-            found = Converted(fitted.scene, chosen, fitted.report)
+            found = _fitted(whole, cameras, chosen, o, monitor)
     if path is not None:
         assert found.scene is not None
-        write_scene(path, found.scene, overwrite=overwrite, spz_axes=spz_axes)
+        write_scene(path, found.scene, **writing)
     return found
 
 
-def _chosen(viewer: str | Viewer | None, steps: int | None, form: str | None, variance: float | None) -> Form | Viewer:
-    """What to convert for: a viewer, or the Mip rule by a closed form."""
-    if viewer is None:
-        if steps is not None:
-            raise UsageError("steps", "belongs to the optimization for a `viewer`; name one")
-        found = MATCHED_ENERGY if form is None else FORMS.find(form, "form")
-        return found if variance is None else found.with_variance(variance)
-    if form is not None or variance is not None:
-        raise UsageError("viewer", "sets form and variance itself; leave out `form`, `variance`")
-    if steps is not None and steps < 0:
-        raise UsageError("steps", f"must be 0 or more, got {steps}")
-    return VIEWERS.find(viewer, "viewer") if isinstance(viewer, str) else viewer
+def _fitted(scene: Gaussians, cameras: CamerasLike, viewer: Viewer, o: ConvertOptions, monitor: Monitor) -> Converted:
+    """The scene fitted to a viewer by optimization."""
+    known = cameras_of(cameras, scene)
+    steps = steps_for(scene, viewer) if o.steps is None else o.steps
+    look = look_of(scene, known, steps, o, monitor)
+    fitted = fit(scene, viewer, look, select_views(known, o.views), steps, monitor)
+    return Converted(fitted.scene, viewer, fitted.report)
 
 
 def _opened(scene: SceneLike | SceneFile) -> Gaussians | SceneFile:

@@ -1,7 +1,6 @@
 """The whole job on the bundled sample: a pretrained chair and four photographs."""
 
 from importlib.resources import as_file, files
-from os import PathLike
 from pathlib import Path
 
 import torch
@@ -22,6 +21,7 @@ from aaplug.io.scenes import read_scene
 from aaplug.rendering.renderer import Renderer
 from aaplug.verbs.convert import convert
 from aaplug.verbs.evaluate import evaluate
+from aaplug.verbs.inputs import AnyPath
 
 SCALES = (1.0, 0.5, 0.25, 0.125)
 RECIPES = ("classic", "mip", "matched", "auto")
@@ -31,7 +31,7 @@ CONVERTED, SHEET = "chair-converted.ply", "contact-sheet.png"
 RESULTS = ("results.json", "per_view.json", "results.csv")
 
 
-def demo(output: str | PathLike[str] = "demo-out", *, overwrite: bool = False, monitor: Monitor = SILENT) -> Report:
+def demo(output: AnyPath = "demo-out", *, overwrite: bool = False, monitor: Monitor = SILENT) -> Report:
     """Convert, render and measure the bundled scene; write the converted scene, a contact sheet and the results.
 
     output: a folder.
@@ -53,17 +53,8 @@ def demo(output: str | PathLike[str] = "demo-out", *, overwrite: bool = False, m
         sheet = _sheet(scene, read_scene(converted), training, view)
         write_png(folder / SHEET, sheet, overwrite=overwrite)
         monitor.say(f"wrote {folder / SHEET}")
-        return evaluate(
-            scene,
-            cameras,
-            recipe=RECIPES,
-            scale=SCALES,
-            output=folder,
-            overwrite=overwrite,
-            metric=("psnr", "ssim"),
-            name="chair",
-            monitor=monitor,
-        )
+        how = {"recipe": RECIPES, "scale": SCALES, "metric": ("psnr", "ssim"), "name": "chair"}
+        return evaluate(scene, cameras, folder, overwrite=overwrite, monitor=monitor, **how)
 
 
 @torch.no_grad()

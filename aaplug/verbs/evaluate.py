@@ -7,33 +7,31 @@ import platform
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import version
-from os import PathLike
 from pathlib import Path
-from typing import Any, get_args
+from typing import Annotated, Any, Literal, get_args
+
+import tyro
 
 from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.errors import OutputError, UsageError
 from aaplug.core.gaussians import Gaussians
-from aaplug.core.interfaces import MatchesRates, Rasterizer
 from aaplug.core.monitor import SILENT, Monitor
-from aaplug.core.sampling import MIN_SEEN_SHARE
-from aaplug.core.training import TrainingViews
 from aaplug.evaluation.engine import Task, candidates_of
 from aaplug.evaluation.engine import evaluate as measure
 from aaplug.evaluation.image_store import ImageStore
-from aaplug.evaluation.metric import LpipsFlavour, Metric, SsimFlavour
-from aaplug.evaluation.metrics import default_metrics, find_metrics, metric_option
-from aaplug.evaluation.protocols import PROTOCOLS, Protocol, TruthSource
+from aaplug.evaluation.metric import Metric
+from aaplug.evaluation.metrics import METRICS, default_metrics, find_metrics, metric_option
+from aaplug.evaluation.protocols import PROTOCOLS, LpipsFlavour, Protocol, SsimFlavour, TruthSource
 from aaplug.evaluation.report.files import PAGE, RESULTS, write_page, write_results
 from aaplug.evaluation.results import Report
-from aaplug.evaluation.truth import Truth, own_look, source_of
-from aaplug.inspection.coverage import coverage
+from aaplug.evaluation.truth import Truth, source_of
+from aaplug.inspection.coverage import Coverage, coverage
 from aaplug.io.atomic import refuse_existing
 from aaplug.io.cameras import select_views
 from aaplug.methods.recipe import Recipe
-from aaplug.methods.recipes import RECIPES, USER_RECIPES, find_recipe, suited
-from aaplug.rendering.renderer import Background
-from aaplug.verbs.inputs import CamerasLike, SceneLike, background_of, cameras_of, processor, rasterizer_of, scene_of
+from aaplug.methods.recipes import RECIPES, USER_RECIPES, suited
+from aaplug.verbs.inputs import AnyPath, CamerasLike, SceneLike, cameras_of, look_of, processor, recipe_of, scene_of
+from aaplug.verbs.options import RECIPE_NAMES, RecipeOptions, choice, choices, flag
 
 ALL = "all"  # instead of recipes' names: every recipe that the scene suits
 DEFAULT_RECIPES = ("classic", "mip", "matched", "auto")
@@ -43,86 +41,81 @@ JOURNAL = "progress.jsonl"
 USER_NAMES = [recipe.name for recipe in USER_RECIPES]
 PACKAGES = ("aaplug", "torch", "numpy", "scikit-image", "opencv-contrib-python-headless")
 
-Weights = tuple[str | PathLike[str], str | PathLike[str]]
+Layout = Literal["plain", "inria"]
 
 
+@dataclass(frozen=True, kw_only=True)
+class EvaluateOptions(RecipeOptions):
+    """Recipes, scales, truth and metrics."""
+
+    protocol: Annotated[str | Protocol, choice(PROTOCOLS)] = "default"
+    """Scales, truth, downscaling and flavours of metrics, by name."""
+    recipe: Annotated[str | Sequence[str | Recipe], choices([*RECIPE_NAMES, ALL, "..."])] = DEFAULT_RECIPES
+    """One or more recipes.  all adds the research recipes, which examples/guides/methods.md lists."""
+    scale: Annotated[Sequence[float] | None, flag("FACTOR [FACTOR ...]")] = None
+    """One or more sizes relative to the training size (default: the protocol's)."""
+    truth: Literal["auto", "photographs", "self"] = "auto"
+    """Compare with photographs, or with the scene's own supersampled look; auto leaves it to the protocol."""
+    metric: Annotated[
+        str | Sequence[str] | None, flag("|".join(map(metric_option, METRICS)), kind=tuple[str, ...] | None)
+    ] = None
+    """Metrics, with flavours ssim:wang|3dgs, lpips:3dgs|vgg|alex (default: psnr ssim consistency energy-drift)."""
+    lpips: Annotated[tuple[AnyPath, AnyPath] | None, flag("TRUNK HEADS", kind=tuple[str, str] | None)] = None
+    """Weights of LPIPS, which is then measured: torchvision's VGG16 (AlexNet), and the lpips package's heads for it."""
+    report: bool = False
+    """Write report.html, one page with tables, curves and a before/after viewer, and its plots."""
+    show: Annotated[str, tyro.conf.arg(metavar="N|NAME,...")] = "3"
+    """Views in the report's viewer: how many, or which."""
+    layout: Layout = "plain"
+    """inria stores every render and its truth in test/METHOD/{renders,gt}, where other metric scripts look."""
+    resume: bool = False
+    """Continue an interrupted evaluation; finished views are not measured again."""
+    overwrite: bool = False
+    """Replace existing results."""
+
+
+@EvaluateOptions.shown
 def evaluate(
     scene: SceneLike,
     cameras: CamerasLike = None,
+    output: AnyPath | None = None,
     *,
-    recipe: str | Sequence[str | Recipe] = DEFAULT_RECIPES,
-    scale: Sequence[float] | None = None,
-    views: str = "test",
-    protocol: str | Protocol = "default",
-    truth: str = "auto",
-    metric: str | Sequence[str] | None = None,
-    lpips: Weights | None = None,
-    quality: str = "balanced",
-    rate_reference: str | None = None,
-    background: Background = "auto",
-    rasterizer: str | Rasterizer = "auto",
-    threads: int | None = None,
-    memory: float | None = None,
-    cull_margin: float = math.inf,
-    min_seen: float = MIN_SEEN_SHARE,
-    output: str | PathLike[str] | None = None,
-    report: bool = False,
-    show: str = "3",
-    layout: str = "plain",
-    resume: bool = False,
-    overwrite: bool = False,
     name: str | None = None,
     monitor: Monitor = SILENT,
+    **options: Any,
 ) -> Report:
     """Measure recipes at several scales.
 
     Args:
-        scene, cameras, views, quality, rate_reference, background, rasterizer, threads, memory, cull_margin, min_seen,
-            monitor: see `render`.
-        recipe: recipes or names in `RECIPES`; "all" for every one that the scene suits.
-        scale: sizes relative to the training size; None for the protocol's.
-        protocol: a protocol, or its name in `PROTOCOLS`.
-        truth: "photographs", "self" (the scene's own supersampled look), or "auto" for the protocol's.
-        metric: names in `METRICS`, with a flavour where it matters ("ssim:3dgs"); None for `default_metrics`.
-        lpips: files of LPIPS's trunk and heads.
-        output: folder for results.json, per_view.json and results.csv.
-        report: write report.html too.
-        show: views in the report's viewer: how many, or names separated by commas.
-        layout: "inria" stores every render and its truth in test/METHOD/{renders,gt}.
-        resume: do not measure the views again that an interrupted evaluation finished.
-        overwrite: replace existing results.
+        scene, cameras, monitor: see `render`.
+        output: folder for results.json, per_view.json and results.csv; None writes nothing.
         name: the scene's name in the results; None for its file's.
+        options: fields of `EvaluateOptions`.
 
     Raises:
-        AaplugError: an input cannot be read, an argument does not fit, or a result cannot be written.
+        AaplugError: an input cannot be read, an option does not fit, or a result cannot be written.
     """
-    out = Output(None if output is None else Path(output), report, layout, resume, overwrite)
+    o = EvaluateOptions.of(options)
+    out = Output(None if output is None else Path(output), o)
     out.check()
     name = name or Path(scene.name if isinstance(scene, Gaussians) else scene).stem
-    rules = PROTOCOLS.find(protocol, "protocol") if isinstance(protocol, str) else protocol
-    metrics, rules = _metrics(metric, rules, lpips)
+    metrics, rules = _metrics(o)
+    if o.background == "auto" and rules.background is not None:
+        o = replace(o, background=rules.background)
     cameras, scene = cameras_of(cameras, scene), scene_of(scene)
-    recipes = _recipes(recipe, scene, quality, rate_reference, monitor)
-    seen, scales = select_views(cameras, views), scale or rules.scales
-    shown = _shown(show, seen) if report else ()
-    source = _source(truth, rules, seen, monitor)
-    if background == "auto" and rules.background is not None:
-        background = rules.background
-    colour = background_of(background, cameras, monitor)
-    training = TrainingViews.of(scene, cameras, cull_margin, min_seen)
-    facts = _facts(scene, cameras, seen, source) | {
-        "options": {"quality": quality, "rate_reference": rate_reference or "pose"} | out.facts(show),
-        "cull_margin": cull_margin if math.isfinite(cull_margin) else None,
-    }
-    with processor(threads):
-        frames = len(seen) * len(recipes) * len(scales)
-        drawing = rasterizer_of(rasterizer, frames, memory, monitor)
-        candidates = candidates_of(scene, training, recipes, drawing, colour)
-        against = Truth(own_look(scene, training, drawing, colour), source, rules)
-        task = Task(candidates, scales, seen, against, metrics)
+    recipes = _recipes(o, scene, monitor)
+    seen, scales = select_views(cameras, o.views), o.scale or rules.scales
+    shown = _shown(o.show, seen) if o.report else ()
+    source = _source(o.truth, rules, seen, monitor)
+    facts = _facts(scene, cameras, seen, source) | _facts_of(o)
+    with processor(o.threads):
+        look = look_of(scene, cameras, len(seen) * len(recipes) * len(scales), o, monitor)
+        candidates = candidates_of(scene, look.training, recipes, look.rasterizer, look.background)
+        task = Task(candidates, scales, seen, Truth(look, source, rules), metrics)
         with monitor.progress(f"evaluating {name}", "views") as tell:
-            found = measure(task, facts, tell, out.journal, resume, out.images(shown))
-    out.write(found, name, scene, training, shown, monitor)
+            found = measure(task, facts, tell, out.journal, o.resume, out.images(shown))
+    bounds = coverage(scene, look.training, found.scales) if o.report else None
+    out.write(found, name, bounds, shown, monitor)
     return found
 
 
@@ -131,10 +124,7 @@ class Output:
     """Where an evaluation goes.  folder: None writes nothing."""
 
     folder: Path | None
-    report: bool = False
-    layout: str = "plain"
-    resume: bool = False
-    overwrite: bool = False
+    options: EvaluateOptions
 
     def check(self) -> None:
         """Refuse, before any work, what cannot be written.
@@ -143,74 +133,59 @@ class Output:
             UsageError: what was asked for needs a folder, or contradicts itself.
             OutputError: the folder holds results that may not be replaced.
         """
-        if self.layout not in ("plain", "inria"):
-            raise UsageError("layout", f"'{self.layout}' is not one of plain, inria")
-        needs = {"report": self.report, "layout": self.layout != "plain", "resume": self.resume}
+        o = self.options
+        if o.layout not in get_args(Layout):
+            raise UsageError("layout", f"'{o.layout}' is not one of {', '.join(get_args(Layout))}")
+        needs = {"report": o.report, "layout": o.layout != "plain", "resume": o.resume}
         for parameter in (parameter for parameter, given in needs.items() if given):
             if self.folder is None:
                 raise UsageError(parameter, "needs a folder; give `output`")
-        if self.resume and self.overwrite:
+        if o.resume and o.overwrite:
             raise UsageError("resume", "and `overwrite` contradict each other; give one")
         if self.folder is None or self.replaces:
             return
         if (self.folder / JOURNAL).exists():
             problem = "holds an evaluation; `resume` continues it, `overwrite` starts anew"
             raise OutputError(self.folder, problem)
-        files = (*RESULTS, PAGE) if self.report else RESULTS
+        files = (*RESULTS, PAGE) if o.report else RESULTS
         refuse_existing([self.folder / name for name in files], overwrite=False)
-
-    def facts(self, show: str) -> dict[str, Any]:
-        """What a journal must agree on, besides the measurements."""
-        return {"shown": show if self.report else None, "layout": self.layout}
 
     @property
     def replaces(self) -> bool:
         """Whether existing results are replaced."""
-        return self.overwrite or self.resume
+        return self.options.overwrite or self.options.resume
 
     @property
     def journal(self) -> Path | None:
         """The file that keeps what is finished."""
         return self.folder and self.folder / JOURNAL
 
-    def images(self, shown: tuple[int, ...]) -> ImageStore | None:
+    def images(self, shown: Sequence[int]) -> ImageStore | None:
         """Where images are stored: those that the report shows, and in INRIA's layout all of them."""
         if self.folder is None:
             return None
-        return ImageStore(self.folder, shown, everything=self.layout == "inria")
+        return ImageStore(self.folder, tuple(shown), everything=self.options.layout == "inria")
 
     def write(
-        self,
-        report: Report,
-        name: str,
-        scene: Gaussians,
-        training: TrainingViews,
-        shown: tuple[int, ...],
-        monitor: Monitor,
+        self, report: Report, name: str, bounds: Coverage | None, shown: tuple[int, ...], monitor: Monitor
     ) -> None:
-        """Write the results, and the report if it was asked for.
-
-        Raises:
-            OutputError: a file cannot be written.
-        """
+        """Write the results, and the report if it was asked for."""
         images = self.images(shown)
         if self.folder is None or images is None:
             return
         written = write_results(report, self.folder, self.replaces, name)
-        if self.report:
-            bounds = coverage(scene, training, report.scales)
+        if bounds is not None:
             written += write_page(self.folder, name, report, bounds, images, self.replaces)
         for path in written:
             monitor.say(f"wrote {path}")
 
 
-def _metrics(
-    names: str | Sequence[str] | None, protocol: Protocol, weights: Weights | None
-) -> tuple[list[Metric], Protocol]:
+def _metrics(o: EvaluateOptions) -> tuple[list[Metric], Protocol]:
     """Metrics by name, and the protocol with the flavours that the names ask for; weights add LPIPS."""
-    names = (names,) if isinstance(names, str) else names
+    protocol = PROTOCOLS.find(o.protocol, "protocol") if isinstance(o.protocol, str) else o.protocol
+    names = (o.metric,) if isinstance(o.metric, str) else o.metric
     chosen = list(default_metrics(protocol) if names is None else names)
-    if weights is not None and not any(metric_option(n).startswith("lpips") for n in chosen):
+    if o.lpips is not None and not any(metric_option(n).startswith("lpips") for n in chosen):
         chosen.append("lpips")
     parts = [metric_option(name).partition(":") for name in chosen]
     for metric, colon, flavour in parts:
@@ -218,20 +193,17 @@ def _metrics(
             known = ", ".join(f"{name}:{f}" for name in FLAVOURS for f in FLAVOURS[name])
             raise UsageError("metric", f"'{metric}:{flavour}' is not one of {known}")
     protocol = replace(protocol, **{metric: flavour for metric, _, flavour in parts if flavour})
-    files = None if weights is None else (Path(weights[0]), Path(weights[1]))
+    files = None if o.lpips is None else (Path(o.lpips[0]), Path(o.lpips[1]))
     return find_metrics([metric for metric, _, _ in parts], protocol, files), protocol
 
 
-def _recipes(
-    names: str | Sequence[str | Recipe], scene: Gaussians, quality: str, rate_reference: str | None, monitor: Monitor
-) -> list[Recipe]:
+def _recipes(o: EvaluateOptions, scene: Gaussians, monitor: Monitor) -> list[Recipe]:
     """The recipes with the user's choices; of "all", those that the scene has everything for."""
-    names = [names] if isinstance(names, str) else names
+    names = [o.recipe] if isinstance(o.recipe, str) else o.recipe
     if ALL not in names:
-        recipes = [_recipe(name, quality, rate_reference) for name in names]
-        return [suited(recipe, scene) for recipe in recipes]
+        return [suited(_recipe(name, o), scene) for name in names]
     fitting = []
-    for recipe in (_recipe(name, quality, rate_reference) for name in RECIPES):
+    for recipe in (_recipe(name, o) for name in RECIPES):
         missing = recipe.lacks(scene)
         if missing is None:
             fitting.append(suited(recipe, scene))
@@ -240,13 +212,9 @@ def _recipes(
     return fitting
 
 
-def _recipe(name: str | Recipe, quality: str, rate_reference: str | None) -> Recipe:
+def _recipe(recipe: str | Recipe, o: EvaluateOptions) -> Recipe:
     """A recipe with the user's choices; research recipes keep their own rate reference, which is what they compare."""
-    if isinstance(name, Recipe):
-        return name
-    compares = name in USER_NAMES and isinstance(RECIPES.find(name, "recipe").screen, MatchesRates)
-    reference = rate_reference if compares else None
-    return find_recipe(name, quality=quality, rate_reference=reference)
+    return recipe_of(recipe, o if recipe in USER_NAMES else replace(o, rate_reference=None))
 
 
 def _shown(text: str, views: Sequence[Camera]) -> tuple[int, ...]:
@@ -272,6 +240,15 @@ def _source(truth: str, protocol: Protocol, views: Sequence[Camera], monitor: Mo
     why = "" if source == "photographs" else " (not every view has a photograph)"
     monitor.say(f"truth: {source}{why}")
     return source
+
+
+def _facts_of(o: EvaluateOptions) -> dict[str, Any]:
+    """What of the request a journal must agree on, besides scales, recipes and metrics."""
+    shown = {"shown": o.show if o.report else None, "layout": o.layout}
+    return {
+        "options": {"quality": o.quality, "rate_reference": o.rate_reference or "pose"} | shown,
+        "cull_margin": o.cull_margin if math.isfinite(o.cull_margin) else None,
+    }
 
 
 def _facts(scene: Gaussians, cameras: CameraSet, views: Sequence[Camera], truth: TruthSource) -> dict[str, Any]:

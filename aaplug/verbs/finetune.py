@@ -1,12 +1,10 @@
 """Fine-tuning: a plain scene file that looks right at every scale by the rule that will show it."""
 
 import json
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from jaxtyping import Float
 from torch import Tensor
@@ -14,16 +12,15 @@ from torch import Tensor
 from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.errors import UsageError
 from aaplug.core.gaussians import Gaussians
-from aaplug.core.interfaces import Rasterizer
 from aaplug.core.monitor import SILENT, Monitor
-from aaplug.core.sampling import MIN_SEEN_SHARE, sampling_bounds
-from aaplug.core.training import TrainingViews
+from aaplug.core.sampling import sampling_bounds
 from aaplug.evaluation.engine import Candidate, compare
 from aaplug.evaluation.protocols import TruthSource
 from aaplug.evaluation.report.contact_sheet import contact_sheet
 from aaplug.evaluation.results import Report, results, scale_name
-from aaplug.evaluation.truth import MEMORY, Enlarge, Truth, back_projected, own_look, source_of, upsampled
+from aaplug.evaluation.truth import MEMORY, Enlarge, Truth, back_projected, source_of, upsampled
 from aaplug.evaluation.upsamplers import find_upsampler
+from aaplug.finetuning.losses import LOSSES
 from aaplug.finetuning.parameters import RATES
 from aaplug.finetuning.session import recorded, tune
 from aaplug.finetuning.settings import METHODS, OURS, Settings, settings_of
@@ -34,8 +31,9 @@ from aaplug.io.images import write_png
 from aaplug.io.scenes import SpzAxes, check_scene_output, write_scene
 from aaplug.methods.recipes import RECIPES
 from aaplug.methods.viewers import FAST, VIEWERS, Viewer, fuse_for
-from aaplug.rendering.renderer import Background, Renderer
-from aaplug.verbs.inputs import CamerasLike, SceneLike, background_of, cameras_of, processor, rasterizer_of, scene_of
+from aaplug.rendering.renderer import Renderer
+from aaplug.verbs.inputs import AnyPath, CamerasLike, SceneLike, cameras_of, look_of, processor, scene_of
+from aaplug.verbs.options import ViewOptions, choice, choices, flag
 
 
 @dataclass(frozen=True)
@@ -59,113 +57,101 @@ class Tuned:
         return results(self.report) | {"settings": settings, "probes": list(self.probes)}
 
 
+@dataclass(frozen=True, kw_only=True)
+class FinetuneOptions(ViewOptions):
+    """The optimization."""
+
+    target: Annotated[str | Viewer | None, flag("|".join([FAST.name, *VIEWERS]), "--for", kind=str | None)] = None
+    """What will show the scene: fast (aaplug's recipe matched, one sample per pixel; the default of consistency) or a
+    viewer with a rule of its own (default of mipmap-gs: classic-viewer)."""
+    method: Annotated[str, choice(METHODS)] = "consistency"
+    """consistency makes one model for all scales; mipmap-gs makes one for a single --scale, as Mipmap-GS does."""
+    scale: Sequence[float] = tuple(OURS.weights)
+    """Sizes against the training size that must look right, beside the training size itself."""
+    steps: Annotated[int | None, flag("N")] = None
+    """Number of steps (default: 1000)."""
+    loss: Annotated[str, choice(LOSSES)] = OURS.loss
+    """l2, or 3DGS's 0.8 L1 + 0.2 D-SSIM."""
+    anchor: float = OURS.anchor
+    """Weight of the training size in every step, against 1 for the other scales."""
+    move: Annotated[Sequence[str], choices(RATES)] = tuple(RATES)
+    """Parameters that move."""
+    learning_rate: float = 1.0
+    """Factor on the method's learning rates."""
+    densify_every: Annotated[int | None, flag("N")] = None
+    """Clone, split and prune every N steps; 0 for never (default: the method's own)."""
+    truth: Annotated[str, choice(("auto", "self", "photographs"))] = "auto"
+    """What the training size should look like: the scene's own render (self) or the photographs; auto takes
+    photographs if every training view has one."""
+    upsampler: Annotated[str | None, flag("bicubic|lanczos|FILE")] = None
+    """For scales above 1 without photographs that large: an interpolation, or a network's weights (ESPCN_x4.pb, a
+    torch.export .pt2); default: the scene's own render there, corrected to the averages of the training size."""
+    seed: int = 0
+    """Seed of the views and scales that the steps draw."""
+    checkpoint_every: Annotated[int, flag("N")] = 100
+    """Steps between checkpoints."""
+    resume: bool = False
+    """Continue an interrupted run from its checkpoint."""
+    overwrite: bool = False
+    """Replace existing outputs."""
+
+
+@FinetuneOptions.shown
 def finetune(
     scene: SceneLike,
     cameras: CamerasLike = None,
-    output: str | PathLike[str] | None = None,
+    output: AnyPath | None = None,
     *,
-    target: str | Viewer | None = None,
-    method: str = "consistency",
-    scale: Sequence[float] = tuple(OURS.weights),
-    steps: int | None = None,
-    loss: str = OURS.loss,
-    anchor: float = OURS.anchor,
-    move: Sequence[str] = tuple(RATES),
-    learning_rate: float = 1.0,
-    densify_every: int | None = None,
-    truth: str = "auto",
-    upsampler: str | None = None,
-    seed: int = 0,
-    checkpoint_every: int = 100,
-    resume: bool = False,
-    views: str = "test",
-    background: Background = "auto",
-    rasterizer: str | Rasterizer = "auto",
-    threads: int | None = None,
-    memory: float | None = None,
-    cull_margin: float = math.inf,
-    min_seen: float = MIN_SEEN_SHARE,
     spz_axes: SpzAxes = "opengl",
-    overwrite: bool = False,
     monitor: Monitor = SILENT,
+    **options: Any,
 ) -> Tuned:
     """Optimize the Gaussians until every scale looks like the training size, averaged down.
 
     Args:
-        scene: Gaussians, a scene's file or a model folder.
-        cameras: a camera set, its file or folder, or None for those of the scene's model folder.
+        scene, cameras, monitor: see `render`.
         output: scene file to write; a report (.finetune.json), pictures (.finetune.png) and, until the run ends, a
             checkpoint (.finetune.pt) go beside it.  None writes nothing.
-        target: what will show the scene: a viewer, its name in `VIEWERS`, or "fast" for aaplug's recipe matched with
-            one sample per pixel; None for the method's own.
-        method: "consistency" makes one model for all scales, "mipmap-gs" one for a single scale.
-        scale: sizes against the training size that must look right, beside the training size itself.
-        steps: number of steps; None for the method's own.
-        loss: "l2" or "l1-dssim", 3DGS's.
-        anchor: weight of the training size in every step, against 1 for the other scales.
-        move: parameters that move, names in `RATES`.
-        learning_rate: factor on the method's learning rates.
-        densify_every: steps between densifications, 0 for none; None for the method's own.
-        truth: "self" (the scene's own render), "photographs", or "auto" for photographs where every training view has
-            one.
-        upsampler: for scales above 1 without photographs that large: "bicubic", "lanczos" or a network's file; None for
-            the scene's own render there, corrected to the averages of the training size.
-        seed: of what the steps draw.
-        checkpoint_every: steps between checkpoints.
-        resume: continue from the checkpoint.
-        views: for the report: "train", "test", "all", or names separated by commas.
-        background, rasterizer, threads, memory, cull_margin, min_seen: see `render`.
         spz_axes: of a .spz to write; see `open_scene`.
-        overwrite: replace existing outputs.
-        monitor: receives messages and progress.
+        options: fields of `FinetuneOptions`.
 
     Raises:
-        AaplugError: an input cannot be read, an argument does not fit, there is nothing to resume, no gradient is
+        AaplugError: an input cannot be read, an option does not fit, there is nothing to resume, no gradient is
             finite, or an output cannot be written.
         KeyboardInterrupt: Ctrl-C stopped the run; its checkpoint is written.
     """
-    chosen = METHODS.find(method, "method")
-    settings = settings_of(
-        chosen,
-        scale=scale,
-        steps=steps,
-        loss=loss,
-        anchor=anchor,
-        move=move,
-        learning_rate=learning_rate,
-        densify_every=densify_every,
-        seed=seed,
-    )
-    viewer = chosen.viewer if target is None else _viewer(target)
+    o = FinetuneOptions.of(options)
+    settings, viewer = _settings(o), _viewer(o)
     cameras, scene = cameras_of(cameras, scene), scene_of(scene)
-    if checkpoint_every < 1:
-        raise UsageError("checkpoint_every", f"must be 1 or more, got {checkpoint_every}")
-    files = _Files.of(output, scene, resume, overwrite)
-    shown = select_views(cameras, views)
-    source, enlarge = _source(truth, cameras), _enlarge(upsampler)
-    colour = background_of(background, cameras, monitor)
-    with processor(threads):
-        drawing = rasterizer_of(rasterizer, settings.steps, memory, monitor)
-        training = TrainingViews.of(scene, cameras, cull_margin, min_seen)
-        look = own_look(scene, training, drawing, colour)
+    if o.checkpoint_every < 1:
+        raise UsageError("checkpoint_every", f"must be 1 or more, got {o.checkpoint_every}")
+    files = _Files.of(output, scene, o)
+    shown = select_views(cameras, o.views)
+    source, enlarge = _source(o.truth, cameras), _enlarge(o.upsampler)
+    with processor(o.threads):
+        look = look_of(scene, cameras, settings.steps, o, monitor)
         before = replace(look, recipe=RECIPES[viewer.recipe])
-        start = replace(before, scene=fuse_for(scene, training, viewer))
-        reference = Truth(look, source, enlarge=enlarge, memory=MEMORY)
-        job = TuningJob(start, cameras.train, reference, settings)
+        start = replace(before, scene=fuse_for(scene, look.training, viewer))
+        job = TuningJob(start, cameras.train, Truth(look, source, enlarge=enlarge, memory=MEMORY), settings)
         monitor.say(_described(job))
-        state = tune(job, files and files.checkpoint, checkpoint_every, resume, monitor)
-        how = {"for": viewer.name, "method": settings.name}
-        tuned = recorded(state, job, viewer.convention_of(scene), how)
+        state = tune(job, files and files.checkpoint, o.checkpoint_every, o.resume, monitor)
+        tuned = recorded(state, job, viewer.convention_of(scene), {"for": viewer.name, "method": settings.name})
         if files is not None:
-            write_scene(files.scene, tuned, overwrite=overwrite, spz_axes=spz_axes)
+            write_scene(files.scene, tuned, overwrite=o.overwrite, spz_axes=spz_axes)
         candidates = [Candidate("before", before), Candidate("after", _drawn(tuned, start))]
         if len(start.scene.fused) > len(scene.fused):
             candidates.insert(1, Candidate("closed form", start))
         compared = _Comparison(candidates, shown, settings.weights, job.truth)
         found = Tuned(tuned, compared.report(monitor), settings, state.curve, state.probes)
         if files is not None:
-            files.write(found, compared, overwrite)
+            files.write(found, compared, o.overwrite)
     return found
+
+
+def _settings(o: FinetuneOptions) -> Settings:
+    """The method's settings with the user's choices."""
+    names = ("scale", "steps", "loss", "anchor", "move", "learning_rate", "densify_every", "seed")
+    return settings_of(METHODS.find(o.method, "method"), **{name: getattr(o, name) for name in names})
 
 
 @dataclass(frozen=True)
@@ -175,18 +161,18 @@ class _Files:
     scene: Path
 
     @classmethod
-    def of(cls, output: str | PathLike[str] | None, scene: Gaussians, resume: bool, overwrite: bool) -> "_Files | None":
+    def of(cls, output: AnyPath | None, scene: Gaussians, o: FinetuneOptions) -> "_Files | None":
         """The files beside an output, after a check, before any work, that they may be written."""
         if output is None:
-            if resume:
+            if o.resume:
                 raise UsageError("resume", "needs the `output` of the interrupted run")
             return None
         files = cls(Path(output))
         sources = [Path(scene.origin.path)] if scene.origin else []
-        check_scene_output(files.scene, overwrite, sources)
-        check_output(files.beside("json"), overwrite, sources)
-        check_output(files.beside("png"), overwrite, sources)
-        check_output(files.checkpoint, resume or overwrite, sources)
+        check_scene_output(files.scene, o.overwrite, sources)
+        check_output(files.beside("json"), o.overwrite, sources)
+        check_output(files.beside("png"), o.overwrite, sources)
+        check_output(files.checkpoint, o.resume or o.overwrite, sources)
         return files
 
     def beside(self, kind: str) -> Path:
@@ -233,13 +219,14 @@ class _Comparison:
         return contact_sheet(("truth", *(c.name for c in self.candidates)), rows)
 
 
-def _viewer(target: str | Viewer) -> Viewer:
-    if isinstance(target, Viewer):
-        return target
+def _viewer(o: FinetuneOptions) -> Viewer:
+    """What will show the scene: as asked, or the method's own."""
+    if not isinstance(o.target, str):
+        return o.target or METHODS[o.method].viewer
     known = {FAST.name: FAST, **VIEWERS}
-    if target not in known:
-        raise UsageError("target", f"'{target}' is not one of {', '.join(known)}")
-    return known[target]
+    if o.target not in known:
+        raise UsageError("target", f"'{o.target}' is not one of {', '.join(known)}")
+    return known[o.target]
 
 
 def _source(truth: str, cameras: CameraSet) -> TruthSource:

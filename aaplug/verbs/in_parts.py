@@ -42,9 +42,6 @@ def convert_parts(
         tell: called with Gaussians done and in all.
         size: Gaussians per part.
         threads: parts converted at once.
-
-    Raises:
-        UsageError, FormatError: see `viewers.fuse` and `SceneFile.parts`.
     """
     coarsest = None
     if cameras and form.uses_bounds:

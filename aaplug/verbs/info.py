@@ -2,13 +2,11 @@
 
 import math
 from collections.abc import Iterator
-from os import PathLike
 from pathlib import Path
 from typing import Any
 
 from aaplug.core.cameras import CameraSet
 from aaplug.core.monitor import SILENT, Monitor
-from aaplug.core.sampling import MIN_SEEN_SHARE
 from aaplug.inspection.coverage import aliasing_begins
 from aaplug.inspection.survey import Survey, check_frame_of, survey
 from aaplug.io.cameras import read_cameras
@@ -16,19 +14,17 @@ from aaplug.io.scenes import find_scene, open_scene
 from aaplug.io.scenes.ply import Document
 from aaplug.io.scenes.scene_file import SceneFile
 from aaplug.methods.viewers import describe
-from aaplug.verbs.inputs import CamerasLike
+from aaplug.verbs.inputs import AnyPath, CamerasLike
+from aaplug.verbs.options import FrameOptions
 
 EXPONENTIATED = 20.0  # larger log-scales are taken for scales
 FEW_STEPS = 1e4  # float32 steps across the scene's extent: with fewer, positions are coarse
 ULP = 2.0**-23  # of float32, relative
 
 
+@FrameOptions.shown
 def info(
-    scene: SceneFile | str | PathLike[str],
-    cameras: CamerasLike = None,
-    *,
-    min_seen: float = MIN_SEEN_SHARE,
-    monitor: Monitor = SILENT,
+    scene: SceneFile | AnyPath, cameras: CamerasLike = None, *, monitor: Monitor = SILENT, **options: Any
 ) -> dict[str, Any]:
     """Describe a scene's file: its convention and why, what is fused, what is odd.
 
@@ -37,8 +33,8 @@ def info(
     Args:
         scene: a scene's file, opened or not, or a model folder.
         cameras: training cameras, their file or folder, to tell also how finely they sample the scene.
-        min_seen: share of the Gaussians that the cameras must see.
         monitor: receives progress.
+        options: fields of `FrameOptions`.
 
     Returns:
         JSON-ready facts by name; "problems" lists what is odd, each with what to do.
@@ -47,11 +43,12 @@ def info(
         FormatError: a file cannot be read.
         FrameError: the cameras see little of the scene.
     """
+    o = FrameOptions.of(options)
     opened = scene if isinstance(scene, SceneFile) else open_scene(find_scene(Path(scene)))
     if cameras is not None and not isinstance(cameras, CameraSet):
         cameras = read_cameras(Path(cameras))
     if cameras is not None:
-        check_frame_of(opened, cameras.train, min_seen)
+        check_frame_of(opened, cameras.train, o.min_seen)
     with monitor.progress("reading", "Gaussians") as tell:
         found = survey(opened, () if cameras is None else cameras.train, tell)
     facts = _scene_facts(opened, found)

@@ -1,7 +1,6 @@
 """What verbs take: scenes and cameras as objects or paths, backgrounds, rasterizers and threads by name."""
 
-import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
@@ -14,7 +13,6 @@ from aaplug.core.executors import torch_threads
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.interfaces import Colour, MatchesRates, Rasterizer, TakesMemory
 from aaplug.core.monitor import SILENT, Monitor
-from aaplug.core.sampling import MIN_SEEN_SHARE
 from aaplug.core.training import TrainingViews
 from aaplug.io.cameras import read_cameras
 from aaplug.io.scenes import find_scene, read_scene
@@ -22,9 +20,11 @@ from aaplug.methods.recipe import Recipe
 from aaplug.methods.recipes import RECIPES, find_recipe
 from aaplug.rasterizers import find_rasterizer
 from aaplug.rendering.renderer import Background, Renderer, background_colour
+from aaplug.verbs.options import RecipeOptions, ViewOptions
 
-SceneLike = Gaussians | str | PathLike[str]
-CamerasLike = CameraSet | str | PathLike[str] | None
+AnyPath = str | PathLike[str]
+SceneLike = Gaussians | AnyPath
+CamerasLike = CameraSet | AnyPath | None
 MODEL_SCENE = "point_cloud/iteration_*/point_cloud.ply"  # in an INRIA model folder
 
 
@@ -34,11 +34,7 @@ def scene_of(scene: SceneLike) -> Gaussians:
 
 
 def cameras_of(cameras: CamerasLike, scene: SceneLike) -> CameraSet:
-    """The cameras themselves, those at a path, or those of the model folder that the scene is in.
-
-    Raises:
-        UsageError: no cameras are given, and the scene is in no model folder.
-    """
+    """The cameras themselves, those at a path, or those of the model folder that the scene is in."""
     if isinstance(cameras, CameraSet):
         return cameras
     if cameras is not None:
@@ -52,11 +48,7 @@ def cameras_of(cameras: CamerasLike, scene: SceneLike) -> CameraSet:
 
 
 def background_of(background: Background, cameras: CameraSet, monitor: Monitor = SILENT) -> Colour:
-    """The colour behind the scene; "auto" is reported, with its source.
-
-    Raises:
-        UsageError: the name is not known.
-    """
+    """The colour behind the scene; "auto" is reported, with its source."""
     colour = background_colour(background, cameras)
     if background == "auto":
         name = {WHITE: "white", BLACK: "black"}.get(colour, str(colour))
@@ -71,9 +63,6 @@ def rasterizer_of(
     """A rasterizer, or the one of that name for so many frames, within a memory budget.
 
     memory: GB that a frame may take beside the scene and the image; None for the rasterizer's default.
-
-    Raises:
-        UsageError: the name is not known, or the memory is not above 0.
     """
     if memory is not None and not memory > 0:
         raise UsageError("memory", f"must be above 0, got {memory:g}")
@@ -84,53 +73,35 @@ def rasterizer_of(
     return rasterizer
 
 
-def recipes_of(names: Sequence[str], quality: str = "balanced", rate_reference: str | None = None) -> list[Recipe]:
-    """Recipes by name; the rate reference goes to those that compare rates.
+def recipe_of(recipe: str | Recipe, o: RecipeOptions) -> Recipe:
+    """A recipe as it is, or by name as the options say; the rate reference goes to those that compare rates."""
+    if isinstance(recipe, Recipe):
+        return recipe
+    matches = isinstance(RECIPES.find(recipe, "recipe").screen, MatchesRates)
+    return find_recipe(recipe, quality=o.quality, rate_reference=o.rate_reference if matches else None)
 
-    Raises:
-        UsageError: a name is not known.
+
+def look_of(scene: Gaussians, cameras: CameraSet, frames: int, o: ViewOptions, monitor: Monitor) -> Renderer:
+    """The scene as training showed it, with the training views, background and rasterizer that the options say.
+
+    frames: how many images will be rendered in all.
     """
-    found = []
-    for name in names:
-        matches = isinstance(RECIPES.find(name, "recipe").screen, MatchesRates)
-        reference = rate_reference if matches else None
-        found.append(find_recipe(name, quality=quality, rate_reference=reference))
-    return found
+    # its packages take a third of a second to import, which `--help` need not wait for
+    from aaplug.evaluation.truth import own_look
+
+    colour = background_of(o.background, cameras, monitor)
+    drawing = rasterizer_of(o.rasterizer, frames, o.memory, monitor)
+    return own_look(scene, TrainingViews.of(scene, cameras, o.cull_margin, o.min_seen), drawing, colour)
 
 
-def renderers_of(
-    scene: Gaussians,
-    cameras: CameraSet,
-    recipes: Sequence[Recipe],
-    frames: int,
-    background: Background = "auto",
-    rasterizer: str | Rasterizer = "auto",
-    memory: float | None = None,
-    cull_margin: float = math.inf,
-    min_seen: float = MIN_SEEN_SHARE,
-    monitor: Monitor = SILENT,
-) -> list[Renderer]:
-    """One renderer per recipe, with the training views, background and rasterizer in common.
-
-    frames: how many images they will render in all.  The others: see `Renderer.of` and `rasterizer_of`.
-
-    Raises:
-        FrameError: the cameras see little of the scene.
-        UsageError: an argument does not fit, or the scene lacks what a recipe needs.
-    """
-    colour = background_of(background, cameras, monitor)
-    training = TrainingViews.of(scene, cameras, cull_margin, min_seen)
-    drawing = rasterizer_of(rasterizer, frames, memory, monitor)
-    return [Renderer.of(scene, training, recipe, background=colour, rasterizer=drawing) for recipe in recipes]
+def drawn_by(recipe: Recipe, scene: Gaussians, look: Renderer) -> Renderer:
+    """The scene as it was read, by a recipe and otherwise as its own look is drawn."""
+    return Renderer.of(scene, look.training, recipe, background=look.background, rasterizer=look.rasterizer)
 
 
 @contextmanager
 def processor(threads: int | None) -> Iterator[int]:
-    """Limit torch to `threads` threads inside the block (None for its own default); yields their number.
-
-    Raises:
-        UsageError: the number is below 1.
-    """
+    """Limit torch to `threads` threads inside the block (None for its own default); yields their number."""
     if threads is not None and threads < 1:
         raise UsageError("threads", f"must be 1 or more, got {threads}")
     count = torch.get_num_threads() if threads is None else threads

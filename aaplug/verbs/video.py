@@ -1,11 +1,10 @@
 """A video of a scene along a camera path, one recipe or two side by side."""
 
-import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
-from os import PathLike
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -15,17 +14,25 @@ from aaplug.core import camera_paths
 from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.errors import UsageError
 from aaplug.core.gaussians import Gaussians
-from aaplug.core.interfaces import Rasterizer
 from aaplug.core.monitor import SILENT, Monitor
-from aaplug.core.sampling import MIN_SEEN_SHARE
 from aaplug.evaluation.protocols import median_depth
 from aaplug.evaluation.report.contact_sheet import labelled
 from aaplug.io.cameras import select_views
 from aaplug.io.cameras.camera_path import read_camera_path
 from aaplug.io.video import check_video
-from aaplug.rendering.renderer import Background
 from aaplug.rendering.videos import make_video
-from aaplug.verbs.inputs import CamerasLike, SceneLike, cameras_of, processor, recipes_of, renderers_of, scene_of
+from aaplug.verbs.inputs import (
+    AnyPath,
+    CamerasLike,
+    SceneLike,
+    cameras_of,
+    drawn_by,
+    look_of,
+    processor,
+    recipe_of,
+    scene_of,
+)
+from aaplug.verbs.options import RECIPE_NAMES, ImageOptions, RecipeOptions, choice, flag
 from aaplug.verbs.views import resized
 
 FPS = 30.0  # frames per second, where neither the caller nor a path file says
@@ -41,65 +48,60 @@ class Clip(NamedTuple):
     fps: float
 
 
-class Move(NamedTuple):
-    """A built-in camera path: start and end relative to the training rate, and its length in seconds."""
+@dataclass(frozen=True, kw_only=True)
+class VideoOptions(RecipeOptions, ImageOptions):
+    """Rendering, and the camera path."""
 
-    start: float
-    end: float
-    seconds: float
+    path: Annotated[AnyPath, choice(["zoom", "dolly", "orbit", "FILE.json"])] = "zoom"
+    """zoom (focal length), dolly (distance) or orbit from the first of --views, or nerfstudio's camera_path.json."""
+    beside: Annotated[str | None, choice(["none", *RECIPE_NAMES, "..."])] = "classic"
+    """Recipe to show on the left."""
+    start: float = 1.0
+    """Sampling rate at the start of a zoom or dolly, relative to training."""
+    end: float = 0.125
+    """Sampling rate where it turns back."""
+    seconds: float = 6.0
+    """Length of a zoom, dolly or orbit."""
+    fps: Annotated[float | None, flag("N")] = None
+    """Frames per second (default: the path file's, or 30)."""
 
-    def check(self) -> None:
-        """Refuse values that are not above 0."""
-        for name, value in self._asdict().items():
-            if not value > 0:
-                raise UsageError(name, f"must be above 0, got {value:g}")
 
-
+@VideoOptions.shown
 def video(
-    scene: SceneLike, cameras: CamerasLike = None, output: str | PathLike[str] = "video.webm", *,
-    path: str | PathLike[str] = "zoom", recipe: str = "auto", beside: str | None = "classic",
-    views: str = "test", start: float = 1.0, end: float = 0.125, seconds: float = 6.0,
-    fps: float | None = None, quality: str = "balanced", rate_reference: str | None = None,
-    scale: float | None = None, resolution: str | None = None,
-    background: Background = "auto", rasterizer: str | Rasterizer = "auto",
-    threads: int | None = None, memory: float | None = None,
-    cull_margin: float = math.inf, min_seen: float = MIN_SEEN_SHARE,
-    overwrite: bool = False, monitor: Monitor = SILENT,
-) -> Clip:  # fmt: skip
-    """Render a camera path to a video; parameters that are not listed are those of `render`.
+    scene: SceneLike,
+    cameras: CamerasLike = None,
+    output: AnyPath = "video.webm",
+    *,
+    monitor: Monitor = SILENT,
+    **options: Any,
+) -> Clip:
+    """Render a camera path to a video.
 
     Args:
-        scene: Gaussians, a scene's file or a model folder.
-        cameras: a camera set, its file or folder, or None for those of the scene's model folder.
+        scene, cameras, monitor: see `render`.
         output: a .webm file (VP9), or .mp4 (H.264) with the extra `mp4`.
-        path: "zoom", "dolly" or "orbit" from the first of `views`, or nerfstudio's camera_path.json.
-        recipe, beside: names of the recipe, and of one to show to its left, or None.
-        start, end: sampling rate relative to training at both ends of a zoom or dolly.
-        seconds: length of a zoom, dolly or orbit.
-        fps: frames per second; None for the path file's, or 30.
-        scale: size of a pane relative to the training size, or to the path file's.
+        options: fields of `VideoOptions`; `beside` may be None.
 
     Raises:
-        AaplugError: an input cannot be read, an argument does not fit, or the video cannot be written.
+        AaplugError: an input cannot be read, an option does not fit, or the video cannot be written.
     """
-    names = [name for name in (beside, recipe) if name is not None]
-    recipes = recipes_of(names, quality, rate_reference)
-    free = None if str(path) in MOVES else read_camera_path(Path(path))
-    fps = fps or (FPS if free is None else free.fps)
-    check_video(Path(output), fps, overwrite)
+    o = VideoOptions.of(options)
+    chosen = [recipe for recipe in (o.beside, o.recipe) if recipe not in (None, "none")]
+    recipes = [recipe_of(recipe, o) for recipe in chosen if recipe is not None]
+    free = None if str(o.path) in MOVES else read_camera_path(Path(o.path))
+    fps = o.fps or (FPS if free is None else free.fps)
+    check_video(Path(output), fps, o.overwrite)
     cameras, scene = cameras_of(cameras, scene), scene_of(scene)
-    move = Move(start, end, seconds)
-    along = free.cameras if free else _along(path, scene, cameras, views, move, fps, monitor)
-    shown = resized(along, scale, resolution)
-    compose = partial(side_by_side, labels=[_label(name) for name in names])
-    look = (background, rasterizer, memory, cull_margin, min_seen, monitor)
-    with processor(threads) as workers:
-        renderers = renderers_of(scene, cameras, recipes, len(shown) * len(names), *look)
+    shown = resized(free.cameras if free else _along(scene, cameras, o, fps, monitor), o.scale, o.resolution)
+    compose = partial(side_by_side, labels=[_label(recipe.name) for recipe in recipes])
+    with processor(o.threads) as workers:
+        look = look_of(scene, cameras, len(shown) * len(recipes), o, monitor)
+        renderers = [drawn_by(recipe, scene, look) for recipe in recipes]
         size = f"{shown[0].width}x{shown[0].height}"
         monitor.say(f"{len(shown)} frames of {size} px per pane, {fps:g} per second")
         with monitor.progress("rendering", "images") as tell:
-            options = {"threads": workers, "overwrite": overwrite, "tell": tell}
-            make_video(output, renderers, shown, fps, compose, **options)
+            how = {"threads": workers, "overwrite": o.overwrite, "tell": tell}
+            make_video(output, renderers, shown, fps, compose, **how)
     return Clip(Path(output), len(shown), fps)
 
 
@@ -116,38 +118,32 @@ def _label(recipe: str) -> str:
     return f"aaplug {recipe}" if recipe == "auto" else recipe
 
 
-def _along(
-    path: str | PathLike[str],
-    scene: Gaussians,
-    cameras: CameraSet,
-    views: str,
-    move: Move,
-    fps: float,
-    monitor: Monitor,
-) -> list[Camera]:
+def _along(scene: Gaussians, cameras: CameraSet, o: VideoOptions, fps: float, monitor: Monitor) -> list[Camera]:
     """The cameras of a built-in path."""
-    move.check()
-    count = max(1, round(move.seconds * fps))
+    for name in ("start", "end", "seconds"):
+        if not getattr(o, name) > 0:
+            raise UsageError(name, f"must be above 0, got {getattr(o, name):g}")
+    count = max(1, round(o.seconds * fps))
     if count > MOST_FRAMES:
         raise UsageError("seconds", f"makes {count:,} frames; the limit is {MOST_FRAMES:,}")
-    view = select_views(cameras, views)[0]
-    monitor.say(f"path: {path} from view {view.name}")
-    return camera_paths.frames(MOVES[str(path)](scene, cameras, view, move), count)
+    view = select_views(cameras, o.views)[0]
+    monitor.say(f"path: {o.path} from view {view.name}")
+    return camera_paths.frames(MOVES[str(o.path)](scene, cameras, view, o), count)
 
 
 Along = Callable[[float], Camera]  # of t in [0, 1)
 
 
-def _zoom(scene: Gaussians, cameras: CameraSet, view: Camera, move: Move) -> Along:
-    return lambda t: camera_paths.zoom(view, t, move.start, move.end)
+def _zoom(scene: Gaussians, cameras: CameraSet, view: Camera, o: VideoOptions) -> Along:
+    return lambda t: camera_paths.zoom(view, t, o.start, o.end)
 
 
-def _dolly(scene: Gaussians, cameras: CameraSet, view: Camera, move: Move) -> Along:
+def _dolly(scene: Gaussians, cameras: CameraSet, view: Camera, o: VideoOptions) -> Along:
     depth = median_depth(scene.means, view)
-    return lambda t: camera_paths.dolly(view, t, move.start, move.end, depth)
+    return lambda t: camera_paths.dolly(view, t, o.start, o.end, depth)
 
 
-def _orbit(scene: Gaussians, cameras: CameraSet, view: Camera, move: Move) -> Along:
+def _orbit(scene: Gaussians, cameras: CameraSet, view: Camera, o: VideoOptions) -> Along:
     depth, up = median_depth(scene.means, view), camera_paths.up_of(cameras)
     return lambda t: camera_paths.orbit(view, t, depth, up)
 

@@ -31,7 +31,7 @@ from aaplug.methods.filters import (
     Matched,
     MatchedEnergy,
     Smoothing3D,
-    StoredSmoothing,
+    fuse_stored,
 )
 from aaplug.methods.filters.matched import FULL_RISE_AT, MAX_RISE
 from aaplug.methods.recipes import RECIPES
@@ -362,7 +362,7 @@ def test_a_stronger_world_filter_widens_more_and_is_fainter(name):
             results.append(world(scene, training))
         else:
             given = replace(scene, filter_3d=scene.filter_3d * factor**0.5)
-            results.append(WORLD_FILTERS[name](given, training))
+            results.append(fuse_stored(given))
     for weak, strong in pairwise(results):
         wider = strong.log_scales > weak.log_scales
         assert (strong.log_scales >= weak.log_scales).all()
@@ -390,7 +390,7 @@ def test_a_world_filter_records_its_variance(world):
     assert changed.fused[0].settings["variance"] == "0.125"
 
 
-@pytest.mark.parametrize("world", [Smoothing3D(), FlatSmoothing(), StoredSmoothing(), MatchedEnergy()])
+@pytest.mark.parametrize("world", [Smoothing3D(), FlatSmoothing(), MatchedEnergy()])
 def test_isotropic_smoothing_keeps_the_order_of_the_axes(world):
     scene = world_scene()
     filtered = world(scene, TrainingViews.of(scene, CAMERAS))
@@ -401,7 +401,7 @@ def test_isotropic_smoothing_keeps_the_order_of_the_axes(world):
     "world",
     [
         *(Smoothing3D(0.0, opacity) for opacity in ("volume", "balanced", "kept")),
-        *(AnisotropicSmoothing(0.0), FlatSmoothing(0.0), StoredSmoothing()),
+        *(AnisotropicSmoothing(0.0), FlatSmoothing(0.0)),
     ],
 )
 def test_smoothing_by_zero_changes_no_bit(world):
@@ -416,7 +416,7 @@ def test_a_gaussian_whose_stored_filter_is_0_does_not_change_a_bit():
     assert scene.filter_3d is not None
     still = torch.arange(40) % 3 == 0
     scene = replace(scene, filter_3d=scene.filter_3d.masked_fill(still, 0.0))
-    fused = StoredSmoothing()(scene, TrainingViews.of(scene, CAMERAS))
+    fused = fuse_stored(scene)
     for name in ("log_scales", "logit_opacities"):
         moved = getattr(fused, name) != getattr(scene, name)
         assert not moved[still].any()
@@ -425,19 +425,19 @@ def test_a_gaussian_whose_stored_filter_is_0_does_not_change_a_bit():
 
 def test_a_scene_without_a_stored_filter_stays_itself():
     scene = make_scene(3)
-    assert StoredSmoothing()(scene, TrainingViews.of(scene, CAMERAS)) is scene
+    assert fuse_stored(scene) is scene
 
 
 def test_a_stored_filter_is_fused_and_removed():
     scene = world_scene()
-    fused = StoredSmoothing()(scene, TrainingViews.of(scene, CAMERAS))
+    fused = fuse_stored(scene)
     assert scene.filter_3d is not None
     assert fused.filter_3d is None
     variances = scene.scales.square() + scene.filter_3d.square()[:, None]
     torch.testing.assert_close(fused.scales.square(), variances)
     factor = (scene.scales.prod(dim=1) / fused.scales.prod(dim=1)).clamp(min=1e-7)
     torch.testing.assert_close(fused.opacities, scene.opacities * factor)
-    assert StoredSmoothing()(fused, TrainingViews.of(scene, CAMERAS)) is fused
+    assert fuse_stored(fused) is fused
 
 
 def test_smoothing_has_the_nyquist_variance_at_the_highest_rate():

@@ -110,7 +110,7 @@ def test_alpha_from_raster_rows_is_the_exact_one(pixel, rules, window, dtype, co
     assert difference < (2e-5 if dtype == torch.float32 else 2e-6 if compiling else 1e-9)
 
 
-def test_a_silent_row_draws_nothing_and_rows_hold_the_colours(pixel):
+def test_the_padding_row_draws_nothing_and_rows_hold_the_colours(pixel):
     splats = some_splats(9, (TILE, TILE))
     assert splats.rgb is not None
     rows = pixel.raster_rows(splats, EAGER)

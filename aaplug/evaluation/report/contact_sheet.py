@@ -4,6 +4,7 @@ Images are [h, w, 3] in [0, 1].  Labels must be ASCII, the only characters of Op
 """
 
 from collections.abc import Sequence
+from itertools import accumulate
 
 import cv2
 import numpy as np
@@ -27,10 +28,8 @@ def contact_sheet(
     cells = [[_enlarged(image) for image in images] for _, images in rows]
     widths = [cell.shape[1] for cell in cells[0]]
     margin = max(_text_width(label) for label, _ in rows) + 2 * GAP
-    width = margin + sum(widths) + GAP * len(widths)
-    height = HEADING + len(rows) * (CELL + GAP)
-    sheet = np.full((height, width, 3), 255, dtype=np.uint8)
-    lefts = [margin + sum(widths[:i]) + GAP * i for i in range(len(widths))]
+    *lefts, width = accumulate((w + GAP for w in widths), initial=margin)
+    sheet = np.full((HEADING + len(rows) * (CELL + GAP), width, 3), 255, dtype=np.uint8)
     for left, heading in zip(lefts, columns, strict=True):
         _write(sheet, heading, left, HEADING - GAP)
     for r, ((label, _), images) in enumerate(zip(rows, cells, strict=True)):

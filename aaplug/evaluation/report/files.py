@@ -21,11 +21,7 @@ def as_json(data: Any) -> str:
 
 
 def write_texts(folder: str | PathLike[str], texts: Mapping[str, str], overwrite: bool) -> list[Path]:
-    """Write texts, by file name, into a folder, which is made if needed; return the paths.
-
-    Raises:
-        OutputError: a file exists and `overwrite` is false, or it cannot be written.
-    """
+    """Write texts, by file name, into a folder, which is made if needed; return the paths."""
     paths = [make_folder(folder) / name for name in texts]
     for path, text in zip(paths, texts.values(), strict=True):
         with replacing(path, overwrite) as stream:
@@ -34,11 +30,7 @@ def write_texts(folder: str | PathLike[str], texts: Mapping[str, str], overwrite
 
 
 def write_results(report: Report, folder: str | PathLike[str], overwrite: bool, name: str = "scene") -> list[Path]:
-    """Write results.json, per_view.json and results.csv; return their paths.
-
-    Raises:
-        OutputError: a file exists and `overwrite` is false, or it cannot be written.
-    """
+    """Write results.json, per_view.json and results.csv; return their paths."""
     texts = (as_json(results(report)), as_json(per_view(report)), as_csv({name: report}))
     return write_texts(folder, dict(zip(RESULTS, texts, strict=True)), overwrite)
 
@@ -46,12 +38,7 @@ def write_results(report: Report, folder: str | PathLike[str], overwrite: bool, 
 def write_page(
     folder: str | PathLike[str], name: str, report: Report, found: Coverage, images: ImageStore, overwrite: bool
 ) -> list[Path]:
-    """Write report.html, and its plots as PNG and SVG into plots/; return both paths.
-
-    Raises:
-        OutputError: a file exists and `overwrite` is false, or it cannot be written.
-        FormatError: an image that the page shows is missing.
-    """
+    """Write report.html, and its plots as PNG and SVG into plots/; return both paths."""
     # matplotlib takes most of a second to import
     from aaplug.evaluation.report.plots import plots
     from aaplug.evaluation.report.webpage import page

@@ -6,10 +6,9 @@ Text is drawn literally (no TeX), so that names may hold any character.  Output 
 import io
 import math
 import re
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
+from itertools import cycle
 from typing import Any
 
 import matplotlib as mpl
@@ -29,6 +28,7 @@ PAPER_INK = "#1c2733"
 SIZE = (5.2, 3.3)  # inches
 DPI = 160  # of a PNG
 BOUNDS = "sampling-bounds"
+INKED = ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color")
 STYLE: dict[Any, Any] = {
     "text.parse_math": False,
     "svg.fonttype": "none",
@@ -41,6 +41,7 @@ STYLE: dict[Any, Any] = {
     "axes.titlelocation": "left",
     "legend.frameon": False,
 }
+Value = Callable[[Report, str, float], float | None]  # by recipe and scale
 
 
 @dataclass(frozen=True)
@@ -68,94 +69,61 @@ class Plot:
         return re.sub(r'<svg ([^>]*?)width="[^"]*" height="[^"]*"', r"<svg \1", text, count=1)
 
     def _saved(self, kind: str, ink: str, **settings: Any) -> bytes:
-        stream = io.BytesIO()
-        with _style(ink):
+        stream, parts = io.BytesIO(), dict.fromkeys(INKED, ink)
+        with mpl.rc_context({**STYLE, **parts}):
             self.draw(ink).savefig(stream, format=kind, bbox_inches="tight", **settings)
         return stream.getvalue()
 
 
-@contextmanager
-def _style(ink: str) -> Iterator[None]:
-    parts = ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color")
-    with mpl.rc_context({**STYLE, **dict.fromkeys(parts, ink)}):
-        yield
+def plots(report: Report, found: Coverage) -> list[Plot]:
+    """Everything that a report draws: metrics against the truth, time and work over scale, and the sampling bounds."""
+    curves = [_metric_curves(metric, report) for metric in report.compared]
+    curves.append(_curves("seconds", "seconds a view", seconds, report, from_zero=True))
+    title = "million splat-pixel evaluations a view"
+    curves.append(_curves("evaluations", title, million_evaluations, report, from_zero=True))
+    drawn = [plot for plot in curves if plot is not None]
+    share = "" if found.under is None else f": {found.under:.0%} are under it"
+    words = f"Histogram of the Gaussians' extent over their sampling bound{share}"
+    return [*drawn, Plot(BOUNDS, words, lambda ink: _bounds(found, ink))]
 
 
-@dataclass(frozen=True)
-class Curves:
-    """One line per recipe over scale.  from_zero: whether the axis starts at 0."""
+def _metric_curves(metric: Metric, report: Report) -> Plot | None:
+    name = re.sub(r"\W+", "-", metric.name.lower())
+    return _curves(name, metric.title, lambda _, r, s: mean(report.select(r, s), metric.name), report)
 
-    name: str
-    title: str
-    value: Callable[[str, float], float | None]
-    report: Report
-    from_zero: bool = False
 
-    @property
-    def known(self) -> bool:
-        """Whether there is anything to draw."""
-        report = self.report
-        return any(self.value(r, s) is not None for r in report.recipes for s in report.scales)
+def _curves(name: str, title: str, value: Value, report: Report, from_zero: bool = False) -> Plot | None:
+    """One line per recipe over scale, from 0 if `from_zero`; None if there is nothing to draw."""
+    scales = sorted(report.scales)
+    values = {recipe: [value(report, recipe, scale) for scale in scales] for recipe in report.recipes}
+    if all(v is None for line in values.values() for v in line):
+        return None
 
-    @property
-    def plot(self) -> Plot:
-        """The curves as a figure."""
-        return Plot(self.name, f"{self.title} over scale, one line per recipe", self._draw)
-
-    def _draw(self, ink: str) -> Figure:
+    def draw(ink: str) -> Figure:
         figure = Figure(SIZE)
-        axes = figure.add_subplot(title=self.title)
-        self._lines(axes, ink)
-        scales = sorted(self.report.scales)
+        axes = figure.add_subplot(title=title)
+        _lines(axes, ink, scales, values)
         axes.set_xscale("log", base=2)
         axes.set_xticks(scales, [scale_name(scale) for scale in scales])
         axes.minorticks_off()
         axes.grid(axis="y", color=ink, alpha=0.12)
         axes.set_xlabel("scale against training")
-        if self.from_zero:
+        if from_zero:
             axes.set_ylim(bottom=0)
         axes.legend(fontsize=8.5, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=3)
         return figure
 
-    def _lines(self, axes: Axes, ink: str) -> None:
-        scales = sorted(self.report.scales)
-        for place, recipe in enumerate(name for name in self.report.recipes if name != CEILING):
-            colour, marker = COLOURS[place % len(COLOURS)], MARKERS[place % len(MARKERS)]
-            values = self._values(recipe)
-            axes.plot(scales, values, marker=marker, ms=5, color=colour, label=recipe)
-        if CEILING in self.report.recipes:
-            values = self._values(CEILING)
-            axes.plot(scales, values, color=ink, ls=(0, (4, 3)), lw=1, label=CEILING, zorder=1)
-
-    def _values(self, recipe: str) -> list[float]:
-        """Values by rising scale; NaN, which matplotlib leaves out, where undefined."""
-        values = [self.value(recipe, scale) for scale in sorted(self.report.scales)]
-        return [math.nan if value is None else value for value in values]
+    return Plot(name, f"{title} over scale, one line per recipe", draw)
 
 
-COSTS = (
-    ("seconds", "seconds a view", seconds),
-    ("evaluations", "million splat-pixel evaluations a view", million_evaluations),
-)
-
-
-def plots(report: Report, found: Coverage) -> list[Plot]:
-    """Everything that a report draws: metrics against the truth, time and work over scale, and the sampling bounds."""
-    compared = [metric for metric in report.metrics if metric.measure is not None]
-    curves = [_metric_curves(metric, report) for metric in compared]
-    for name, title, value in COSTS:
-        curves.append(Curves(name, title, partial(value, report), report, from_zero=True))
-    drawn = [curve.plot for curve in curves if curve.known]
-    return [*drawn, Plot(BOUNDS, _bounds_words(found), lambda ink: _bounds(found, ink))]
-
-
-def _metric_curves(metric: Metric, report: Report) -> Curves:
-    return Curves(
-        re.sub(r"\W+", "-", metric.name.lower()),
-        metric.title,
-        lambda recipe, scale: mean(report.select(recipe, scale), metric.name),
-        report,
-    )
+def _lines(axes: Axes, ink: str, scales: list[float], values: Mapping[str, list[float | None]]) -> None:
+    """Lines by recipe, with gaps where a value is undefined; the ceiling's is dashed and lies behind the others."""
+    known = {name: [math.nan if v is None else v for v in line] for name, line in values.items()}
+    ceiling = known.pop(CEILING, None)
+    for (recipe, line), colour, marker in zip(known.items(), cycle(COLOURS), cycle(MARKERS), strict=False):
+        axes.plot(scales, line, marker=marker, ms=5, color=colour, label=recipe)
+    if ceiling is not None:
+        axes.plot(scales, ceiling, color=ink, ls=(0, (4, 3)), lw=1, label=CEILING, zorder=1)
 
 
 def _bounds(found: Coverage, ink: str) -> Figure:
@@ -174,8 +142,3 @@ def _bounds(found: Coverage, ink: str) -> Figure:
     axes.set_ylabel("Gaussians")
     axes.grid(axis="y", color=ink, alpha=0.12)
     return figure
-
-
-def _bounds_words(found: Coverage) -> str:
-    share = "" if found.under is None else f": {found.under:.0%} are under it"
-    return f"Histogram of the Gaussians' extent over their sampling bound{share}"

@@ -49,18 +49,9 @@ class CameraFormat(Protocol):
 
 
 # the first that accepts a path is used
-OWN: tuple[CameraFormat, ...] = (
-    pinhole,
-    camera_path,
-    inria_model,
-    colmap,
-    blender,
-    inria,
-    multiscale,
-    transforms,
-    llff,
-)
-CAMERA_FORMATS: Registry[CameraFormat] = Registry(
+OWN: tuple[CameraFormat, ...]
+OWN = (pinhole, camera_path, inria_model, colmap, blender, inria, multiscale, transforms, llff)
+CAMERA_FORMATS = Registry[CameraFormat](
     "camera format", {f.name: f for f in OWN}, lambda value: isinstance(value, CameraFormat)
 )
 

@@ -24,9 +24,8 @@ def sniff(path: Path) -> bool:
 def read(path: Path, options: Options) -> CameraSet:
     """The cameras, with the split that the files give."""
     cameras = _cameras(path, options)
-    if not os.path.isfile(path / VAL):
-        return cameras
-    return replace(cameras, notes=(*cameras.notes, f"{VAL} is not read"))
+    more = (f"{VAL} is not read",) if os.path.isfile(path / VAL) else ()
+    return replace(cameras, notes=cameras.notes + more)
 
 
 def _cameras(path: Path, options: Options) -> CameraSet:

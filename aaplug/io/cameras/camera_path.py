@@ -11,12 +11,11 @@ from os import PathLike
 from pathlib import Path
 
 from aaplug.core.cameras import Camera, CameraSet
-from aaplug.core.errors import FormatError
 from aaplug.io.cameras.options import Options, undivided
 from aaplug.io.cameras.photos import refuse_folder
-from aaplug.io.cameras.poses import inverse, pose_of_opengl
+from aaplug.io.cameras.poses import centred, inverse, pose_of_opengl
 from aaplug.io.cameras.sizes import described_sizes, file_sizes
-from aaplug.io.values import Entry, Place, entries, focal, mentions, read_json
+from aaplug.io.values import Entry, entries, focal, mentions, number, object_of, pixels, read_json
 
 KEY = "camera_path"
 PERSPECTIVE = "perspective"
@@ -47,44 +46,34 @@ def read(path: Path, options: Options) -> CameraSet:
     sizes, _ = file_sizes(cameras, options)
     cameras = [camera.resized(*size) for camera, size in zip(cameras, sizes, strict=True)]
     split = undivided(cameras, "a path has no split")
-    notes = (
-        f"camera path: {len(cameras)} free cameras, {described_sizes(cameras)}; "
-        "used in place of training cameras, which would give better sampling bounds",
-        split.note,
-    )
-    return CameraSet(split.train, split.test, notes=notes)
+    what = f"camera path: {len(cameras)} free cameras, {described_sizes(cameras)}"
+    note = f"{what}; used in place of training cameras, which would give better sampling bounds"
+    return CameraSet(split.train, split.test, notes=(note, split.note))
 
 
 def read_camera_path(path: str | PathLike[str]) -> CameraPath:
-    """Read the frames of a video.
-
-    Raises:
-        FormatError: the file breaks its format.
-    """
+    """Read the frames of a video; raises FormatError for a file that breaks its format."""
     path = Path(path)
-    document = read_json(path)
-    if not isinstance(document, dict) or KEY not in document:
-        raise FormatError(path, f"should be an object with '{KEY}', as nerfstudio writes")
-    kind = document.get("camera_type", PERSPECTIVE)
-    about = Entry(Place(path, "the path"), document)
+    about = object_of(read_json(path), path, "the path", f"'{KEY}', as nerfstudio writes", KEY)
+    kind = about.fields.get("camera_type", PERSPECTIVE)
     if kind != PERSPECTIVE:
         raise about.place.wrong("camera_type", PERSPECTIVE, kind)
-    size = about.pixels("render_width"), about.pixels("render_height")
-    fps = about.number("fps") if "fps" in document else USUAL_FPS
+    size = about.get("render_width", pixels), about.get("render_height", pixels)
+    fps = about.get("fps", number, USUAL_FPS)
     if not fps > 0:
         raise about.place.wrong("fps", "above 0", fps)
-    frames = entries(path, "frame", document[KEY])
+    frames = entries(path, "frame", about.fields[KEY])
     digits = len(str(len(frames) - 1))
     cameras = (_camera(entry, f"{i:0{digits}}", *size) for i, entry in enumerate(frames))
     return CameraPath(tuple(cameras), fps)
 
 
 def _camera(entry: Entry, name: str, width: int, height: int) -> Camera:
-    angle = entry.number("fov")
+    angle = entry.get("fov", number)
     if not 0 < angle < HALF_TURN:
         raise entry.place.wrong("fov", f"above 0 and below {HALF_TURN:g} degrees", angle)
     f = focal(height / 2 / math.tan(math.radians(angle) / 2), entry.place, "fov's focal length")
     motion = entry.vector("camera_to_world", 16).reshape(4, 4)
     world_from_cam = pose_of_opengl(motion, entry.place, "camera_to_world")
     cam_from_world = inverse(world_from_cam, entry.place, "camera_to_world")
-    return Camera(name, width, height, f, f, width / 2, height / 2, cam_from_world)
+    return centred(name, (width, height), (f, f), cam_from_world)

@@ -16,10 +16,10 @@ from typing import Any
 
 from aaplug.core.errors import FormatError
 from aaplug.io.limits import whole_limit
-from aaplug.io.values import Place, number, read_bounded, text
+from aaplug.io.values import Entry, Place, number, read_bounded, text
 
 NAME = "cfg_args"
-CAPPED = -1  # 3DGS's default resolution: the width capped at WIDTH_CAP
+CAPPED = -1.0  # 3DGS's default resolution: the width capped at WIDTH_CAP
 WIDTH_CAP = 1600  # px: 3DGS, utils/camera_utils.py
 DIVISORS = (1, 2, 4, 8)  # resolutions that divide the size; others are a width in px
 
@@ -55,29 +55,22 @@ class CfgArgs:
 
 def read_cfg_args(path: Path) -> CfgArgs:
     """Read the settings that concern cameras; those that the file does not mention have their defaults."""
-    found = _literals(path, _parsed(path))
-    place = Place(path, "Namespace")
-    settings = CfgArgs()
-    return CfgArgs(
-        _resolution(found.get("resolution", settings.resolution), place),
-        text(found.get("images", settings.images), place, "images"),
-        _flag(found, "white_background", place),
-        bool(_flag(found, "eval", place)),
-    )
+    entry = Entry(Place(path, "Namespace"), _literals(path, _parsed(path)))
+    resolution, images = entry.get("resolution", _resolution, CAPPED), entry.get("images", text, CfgArgs.images)
+    white, held_out = (_flag(entry, name) for name in ("white_background", "eval"))
+    return CfgArgs(resolution, images, white, bool(held_out))
 
 
 def _parsed(path: Path) -> ast.Call:
     source = read_bounded(path, whole_limit("CFG_ARGS"))
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # Python's, about backslashes in Windows paths
+        with warnings.catch_warnings(action="ignore"):  # Python's, about backslashes in Windows paths
             call = ast.parse(source.decode().strip(), mode="eval").body
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
         raise FormatError(path, f"should be a Python Namespace(...): {error}") from error
     if not (isinstance(call, ast.Call) and isinstance(call.func, ast.Name)):
         raise FormatError(path, "should be a Python Namespace(...)")
-    plain = not call.args and all(keyword.arg for keyword in call.keywords)
-    if call.func.id != "Namespace" or not plain:
+    if call.func.id != "Namespace" or call.args or not all(keyword.arg for keyword in call.keywords):
         raise FormatError(path, f"should be Namespace(name=value, ...), not {call.func.id}(...)")
     return call
 
@@ -89,23 +82,22 @@ def _literals(path: Path, call: ast.Call) -> dict[str, Any]:
         try:
             found[name] = ast.literal_eval(keyword.value)
         except (ValueError, TypeError, SyntaxError, RecursionError, MemoryError) as error:
-            raise FormatError(
-                path, f"{name} should be a literal (number, text, True, list); code is never run"
-            ) from error
+            problem = f"{name} should be a literal (number, text, True, list); code is never run"
+            raise FormatError(path, problem) from error
     return found
 
 
-def _resolution(value: object, place: Place) -> float:
-    real, most = number(value, place, "resolution"), whole_limit("CAMERA_SIDE")
+def _resolution(value: object, place: Place, field: str) -> float:
+    real, most = number(value, place, field), whole_limit("CAMERA_SIDE")
     if real != CAPPED and not 1 <= real <= most:
-        raise place.wrong("resolution", f"-1, 1, 2, 4, 8 or a width up to {most} px", value)
+        raise place.wrong(field, f"-1, 1, 2, 4, 8 or a width up to {most} px", value)
     return real
 
 
-def _flag(found: dict[str, Any], name: str, place: Place) -> bool | None:
-    value = found.get(name)
+def _flag(entry: Entry, field: str) -> bool | None:
+    value = entry.fields.get(field)
     if value is not None and not isinstance(value, bool):
-        raise place.wrong(name, "True or False", value)
+        raise entry.place.wrong(field, "True or False", value)
     return value
 
 

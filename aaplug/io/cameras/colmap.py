@@ -21,7 +21,7 @@ from aaplug.core.errors import FormatError, listing
 from aaplug.io.cameras.cfg_args import WIDTH_CAP
 from aaplug.io.cameras.colmap_files import KINDS, Image, Intrinsics, read_cameras, read_images
 from aaplug.io.cameras.options import LLFF_HOLD, Options, every_nth
-from aaplug.io.cameras.photos import distinct, photo_folder, whole, with_photos, without_suffix
+from aaplug.io.cameras.photos import distinct, photo_folder, with_photos, without_suffix
 from aaplug.io.cameras.poses import inverse, pose
 from aaplug.io.cameras.sizes import Size, camera_set, file_sizes, photo_sizes, trained_at
 from aaplug.io.lenses import Distortion, lens_notes, undistorted_cameras
@@ -56,7 +56,7 @@ def read(path: Path, options: Options) -> CameraSet:
     photos = photo_folder(_root(folder), options, "images", Place(folder, "images"))
     source = [_camera(image, intrinsics) for image in images]
     source = with_photos(source, [image.place for image in images], photos)
-    names = distinct(images_file, [image.name for image in images], (without_suffix, whole))
+    names = distinct(images_file, [image.name for image in images], (without_suffix, str))
     source = [replace(camera, name=name) for camera, name in zip(source, names, strict=True)]
     sizes, why = _training_sizes(source, options)
     lenses = [_distortion(intrinsics[image.camera_id]) for image in images]
@@ -80,11 +80,8 @@ def _files(folder: Path) -> tuple[Path, Path]:
         if all(os.path.isfile(file) for file in pair):
             return pair
     there = [file.name for pair in pairs for file in pair if os.path.isfile(file)]
-    raise FormatError(
-        folder,
-        "a COLMAP model needs cameras.bin and images.bin, or cameras.txt and images.txt; "
-        f"found {listing(there) or 'neither'}",
-    )
+    needs = "a COLMAP model needs cameras.bin and images.bin, or cameras.txt and images.txt"
+    raise FormatError(folder, f"{needs}; found {listing(there) or 'neither'}")
 
 
 def _root(folder: Path) -> Path:

@@ -8,7 +8,7 @@ Functions raise FormatError for a file that breaks its format.
 
 import os
 import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, TypeVar
@@ -18,6 +18,8 @@ from aaplug.io.limits import whole_limit
 from aaplug.io.values import Place, text
 
 Record = TypeVar("Record")
+Number = TypeVar("Number", int, float)
+Parser = Callable[[Path, BinaryIO], Iterator[Record]]
 
 KINDS = (".bin", ".txt")
 LINE_LIMIT = 64 * 2**20  # bytes: a line lists the points of one image
@@ -114,29 +116,28 @@ class _Reader:
     """A binary file whose remaining size is checked before each read."""
 
     def __init__(self, path: Path, file: BinaryIO) -> None:
-        self.path = path
-        self.file = file
+        self.path, self.file = path, file
         self.left = os.fstat(file.fileno()).st_size
 
     def unpack(self, record: struct.Struct, what: str) -> tuple:
         """One record of fixed size."""
-        self._need(record.size, what)
-        return record.unpack(self.file.read(record.size))
+        size = record.size
+        if size > self.left:
+            raise FormatError(self.path, f"{what}: {size} bytes expected, {self.left} left; the file is cut short")
+        self.left -= size
+        return record.unpack(self.file.read(size))
 
     def count(self, least: int, what: str) -> int:
         """A number of records, checked against the bytes that are left, `least` or more for each."""
         (n,) = self.unpack(COUNT, f"number of {what}")
         if n * least > self.left:
-            raise FormatError(
-                self.path,
-                f"{n} {what} need {n * least} bytes at least, and {self.left} are left; "
-                "the file is cut short or is not COLMAP's",
-            )
+            need = f"{n} {what} need {n * least} bytes at least, and {self.left} are left"
+            raise FormatError(self.path, f"{need}; the file is cut short or is not COLMAP's")
         return n
 
-    def skip(self, size: int, what: str) -> None:
-        """Skip bytes."""
-        self._need(size, what)
+    def skip(self, size: int) -> None:
+        """Skip bytes, which `count` has found to be there."""
+        self.left -= size
         self.file.seek(size, os.SEEK_CUR)
 
     def name(self, what: str) -> bytes:
@@ -150,17 +151,8 @@ class _Reader:
         self.left -= len(name) + 1
         return name
 
-    def _need(self, size: int, what: str) -> None:
-        if size > self.left:
-            raise FormatError(self.path, f"{what}: {size} bytes expected, {self.left} left; the file is cut short")
-        self.left -= size
 
-
-def _records(
-    file: Path,
-    binary: Callable[[Path, BinaryIO], Iterator[Record]],
-    lines: Callable[[Path, BinaryIO], Iterator[Record]],
-) -> Iterator[Record]:
+def _records(file: Path, binary: Parser[Record], lines: Parser[Record]) -> Iterator[Record]:
     try:
         with file.open("rb") as stream:
             yield from (binary if file.suffix == KINDS[0] else lines)(file, stream)
@@ -187,8 +179,7 @@ def _binary_images(file: Path, stream: BinaryIO) -> Iterator[Image]:
         key, *motion, camera_id = reader.unpack(IMAGE, what)
         place = Place(reader.path, f"image {key}")
         name = text(_decoded(reader.name(what), place), place, "name")
-        points = reader.count(POINT_SIZE, f"points of {what}")
-        reader.skip(points * POINT_SIZE, what)
+        reader.skip(reader.count(POINT_SIZE, f"points of {what}") * POINT_SIZE)
         yield Image(place, name, camera_id, tuple(motion[:4]), tuple(motion[4:]))
 
 
@@ -198,19 +189,15 @@ def _text_cameras(file: Path, stream: BinaryIO) -> Iterator[Intrinsics]:
         if not fields or fields[0].startswith("#"):
             continue
         place = Place(file, f"camera {fields[0][:20]!s} in line {row}")
-        yield _text_camera(fields, place)
-
-
-def _text_camera(fields: Sequence[str], place: Place) -> Intrinsics:
-    if len(fields) < CAMERA_FIELDS:
-        raise place.wrong("it", "id, model, width, height and parameters", " ".join(fields))
-    if (model := MODEL_NAMES.get(fields[1])) is None:
-        raise place.wrong("model", "one of COLMAP's", fields[1])
-    key, width, height = (_integer(fields[i], place) for i in (0, 2, 3))
-    parameters = tuple(_real(field, place) for field in fields[CAMERA_FIELDS:])
-    if len(parameters) != model.parameters:
-        raise place.wrong("it", f"{model.name} with {model.parameters} parameters", f"{len(parameters)} of them")
-    return Intrinsics(place, key, model, width, height, parameters)
+        if len(fields) < CAMERA_FIELDS:
+            raise place.wrong("it", "id, model, width, height and parameters", " ".join(fields))
+        if (model := MODEL_NAMES.get(fields[1])) is None:
+            raise place.wrong("model", "one of COLMAP's", fields[1])
+        key, width, height = (_parsed(int, fields[i], place) for i in (0, 2, 3))
+        parameters = tuple(_parsed(float, field, place) for field in fields[CAMERA_FIELDS:])
+        if len(parameters) != model.parameters:
+            raise place.wrong("it", f"{model.name} with {model.parameters} parameters", f"{len(parameters)} of them")
+        yield Intrinsics(place, key, model, width, height, parameters)
 
 
 def _text_images(file: Path, stream: BinaryIO) -> Iterator[Image]:
@@ -218,24 +205,19 @@ def _text_images(file: Path, stream: BinaryIO) -> Iterator[Image]:
     for row, line in lines:
         if not line.strip() or line.lstrip().startswith(b"#"):
             continue
-        yield _text_image(line, Place(file, f"image in line {row}"))
+        place = Place(file, f"image in line {row}")
+        fields = _decoded(line, place).split(maxsplit=IMAGE_FIELDS - 1)
+        if len(fields) != IMAGE_FIELDS:
+            raise place.wrong("it", "id, quaternion, translation, camera id and name", line)
+        motion = tuple(_parsed(float, field, place) for field in fields[1:8])
+        name = text(fields[-1].strip(), place, "name")
+        yield Image(place, name, _parsed(int, fields[8], place), motion[:4], motion[4:])
         next(lines, None)  # the image's points, an empty line if there are none
-
-
-def _text_image(line: bytes, place: Place) -> Image:
-    fields = _decoded(line, place).split(maxsplit=IMAGE_FIELDS - 1)
-    if len(fields) != IMAGE_FIELDS:
-        raise place.wrong("it", "id, quaternion, translation, camera id and name", line)
-    motion = tuple(_real(field, place) for field in fields[1:8])
-    name = text(fields[-1].strip(), place, "name")
-    return Image(place, name, _integer(fields[8], place), motion[:4], motion[4:])
 
 
 def _lines(file: Path, stream: BinaryIO) -> Iterator[tuple[int, bytes]]:
     """Numbered lines of bounded length."""
-    row = 0
-    while line := stream.readline(LINE_LIMIT + 1):
-        row += 1
+    for row, line in enumerate(iter(lambda: stream.readline(LINE_LIMIT + 1), b""), start=1):
         if len(line) > LINE_LIMIT:
             raise FormatError(file, f"line {row} is longer than {LINE_LIMIT} bytes")
         yield row, line
@@ -248,15 +230,8 @@ def _decoded(line: bytes, place: Place) -> str:
         raise place.wrong("it", "UTF-8", line) from error
 
 
-def _real(field: str, place: Place) -> float:
+def _parsed(kind: Callable[[str], Number], field: str, place: Place) -> Number:
     try:
-        return float(field)
+        return kind(field)
     except ValueError as error:
-        raise place.wrong("it", "numbers", field) from error
-
-
-def _integer(field: str, place: Place) -> int:
-    try:
-        return int(field)
-    except ValueError as error:
-        raise place.wrong("it", "whole numbers for id and size", field) from error
+        raise place.wrong("it", "whole numbers for id and size" if kind is int else "numbers", field) from error

@@ -6,9 +6,10 @@ the photos before training scaled them, so the training size is computed by 3DGS
 """
 
 import os
-from collections import Counter
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 
 from aaplug.core.cameras import BLACK, WHITE, Camera, CameraSet
@@ -16,9 +17,9 @@ from aaplug.io.cameras import cfg_args
 from aaplug.io.cameras.cfg_args import WIDTH_CAP, CfgArgs, half_up, read_cfg_args
 from aaplug.io.cameras.options import LLFF_HOLD, Options, Split, every_nth, explicit
 from aaplug.io.cameras.photos import photo_folder, with_photos
-from aaplug.io.cameras.poses import inverse, pose
+from aaplug.io.cameras.poses import centred, inverse, pose
 from aaplug.io.cameras.sizes import Size, camera_set, file_sizes, photo_sizes, trained_at
-from aaplug.io.values import Entry, Place, entries, mentions, read_json
+from aaplug.io.values import Entry, Place, entries, focal, mentions, pixels, read_json, text
 
 FILE = "cameras.json"
 
@@ -35,51 +36,27 @@ def sniff(path: Path) -> bool:
 
 def read(path: Path, options: Options) -> CameraSet:
     """The cameras at the size at which 3DGS trained."""
-    file = _file(path)
+    folder = path if os.path.isdir(path) else path.parent
+    file = folder / FILE if path == folder or path.name == cfg_args.NAME else path
     found = entries(file, "camera", read_json(file))
-    settings = _settings(file.parent)
-    folder = photo_folder(
-        file.parent, options, (settings or CfgArgs()).images, Place(file.parent / cfg_args.NAME, "images")
-    )
-    source = with_photos([_camera(e) for e in found], [e.place for e in found], folder)
+    run = folder / cfg_args.NAME
+    settings = read_cfg_args(run) if os.path.isfile(run) else None
+    photos = photo_folder(folder, options, (settings or CfgArgs()).images, Place(run, "images"))
+    source = with_photos([_camera(e) for e in found], [e.place for e in found], photos)
     source = _without_copies(source)
     sizes, why = _training_sizes(source, settings, options)
     trained = trained_at(source, sizes)
     split = _split(trained, settings, options)
-    return camera_set("INRIA cameras.json", source, split, why, _background(settings))
-
-
-def _file(path: Path) -> Path:
-    if os.path.isdir(path):
-        return path / FILE
-    return path.with_name(FILE) if path.name == cfg_args.NAME else path
-
-
-def _settings(folder: Path) -> CfgArgs | None:
-    file = folder / cfg_args.NAME
-    return read_cfg_args(file) if os.path.isfile(file) else None
-
-
-def _background(settings: CfgArgs | None) -> tuple[float, float, float] | None:
-    if settings is None or settings.white_background is None:
-        return None
-    return WHITE if settings.white_background else BLACK
+    background = {None: None, True: WHITE, False: BLACK}[settings.white_background if settings else None]
+    return camera_set("INRIA cameras.json", source, split, why, background)
 
 
 def _camera(entry: Entry) -> Camera:
     rotation, position = entry.matrix("rotation", 3, 3), entry.vector("position", 3)
-    width, height = entry.pixels("width"), entry.pixels("height")
-    world_from_cam = pose(rotation, position, entry.place, "rotation")
-    return Camera(
-        entry.text("img_name"),
-        width,
-        height,
-        entry.focal("fx"),
-        entry.focal("fy"),
-        width / 2,
-        height / 2,
-        inverse(world_from_cam, entry.place, "position"),
-    )
+    size = entry.get("width", pixels), entry.get("height", pixels)
+    focals = entry.get("fx", focal), entry.get("fy", focal)
+    cam_from_world = inverse(pose(rotation, position, entry.place, "rotation"), entry.place, "position")
+    return centred(entry.get("img_name", text), size, focals, cam_from_world)
 
 
 def _without_copies(cameras: Sequence[Camera]) -> list[Camera]:
@@ -133,17 +110,10 @@ def _second_run(names: Sequence[str]) -> int | None:
 def _renamed(cameras: Sequence[Camera]) -> list[Camera]:
     """Append a number to repeated names."""
     times = _times_met([camera.name for camera in cameras])
-    return [
-        camera if n == 1 else replace(camera, name=f"{camera.name}~{n}")
-        for camera, n in zip(cameras, times, strict=True)
-    ]
+    return [c if n == 1 else replace(c, name=f"{c.name}~{n}") for c, n in zip(cameras, times, strict=True)]
 
 
 def _times_met(names: Sequence[str]) -> list[int]:
     """How often each name has occurred up to its place in the list, itself included."""
-    met: Counter[str] = Counter()
-    times = []
-    for name in names:
-        met[name] += 1
-        times.append(met[name])
-    return times
+    met = defaultdict[str, Iterator[int]](lambda: count(1))
+    return [next(met[name]) for name in names]

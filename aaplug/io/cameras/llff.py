@@ -15,7 +15,7 @@ from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.errors import FormatError
 from aaplug.io.cameras.options import LLFF_HOLD, Options, every_nth
 from aaplug.io.cameras.photos import SUFFIXES, last_part, photo_folder, with_photos
-from aaplug.io.cameras.poses import inverse, pose
+from aaplug.io.cameras.poses import centred, inverse, pose
 from aaplug.io.cameras.sizes import camera_set, file_sizes, photo_sizes, trained_at
 from aaplug.io.limits import whole_limit
 from aaplug.io.values import Place, focal, number, pixels, read_bounded
@@ -42,9 +42,8 @@ def read(path: Path, options: Options) -> CameraSet:
     source = [_camera(*each) for each in zip(rows, names, places, strict=True)]
     source = with_photos(source, places, folder)
     source = [replace(camera, name=last_part(camera.name)) for camera in source]
-    sizes, why = photo_sizes(source), "size of the photos, or in the file"
-    if options.train_scale is not None:
-        sizes, why = file_sizes(source, options)
+    photographed = photo_sizes(source), "size of the photos, or in the file"
+    sizes, why = photographed if options.train_scale is None else file_sizes(source, options)
     trained = trained_at(source, sizes)
     split = every_nth(trained, options, LLFF_HOLD, "LLFF's rule; `test_every` 0 for no split")
     return camera_set(f"LLFF {FILE}", source, split, why)
@@ -53,13 +52,11 @@ def read(path: Path, options: Options) -> CameraSet:
 def _rows(file: Path) -> np.ndarray:
     read_bounded(file, whole_limit("JSON"))
     try:
-        # mapping the file refuses a size that it does not have
-        rows = np.load(file, mmap_mode="r", allow_pickle=False)
+        rows = np.load(file, mmap_mode="r", allow_pickle=False)  # mapping refuses a size that the file does not have
     except Exception as error:  # numpy raises ValueError, EOFError, SyntaxError and others
         raise FormatError(file, "is not a .npy file of numbers") from error
-    if not (isinstance(rows, np.ndarray) and rows.ndim == 2 and rows.shape[1] == COLUMNS and len(rows)):  # fmt: skip
-        shape = getattr(rows, "shape", "?")
-        raise FormatError(file, f"should hold rows of {COLUMNS} numbers, not the shape {shape}")
+    if not (isinstance(rows, np.ndarray) and rows.ndim == 2 and rows.shape[1] == COLUMNS and len(rows)):
+        raise FormatError(file, f"should hold rows of {COLUMNS} numbers, not the shape {getattr(rows, 'shape', '?')}")
     if rows.dtype.kind != "f":
         raise FormatError(file, f"should hold floats, not {rows.dtype}")
     return np.array(rows, np.float64)
@@ -83,4 +80,4 @@ def _camera(row: np.ndarray, name: str, place: Place) -> Camera:
     down, right, back = matrix[:, :3].unbind(dim=1)
     world_from_cam = pose(torch.stack([right, down, -back], dim=1), matrix[:, 3], place, "rotation")
     cam_from_world = inverse(world_from_cam, place, "position")
-    return Camera(name, width, height, f, f, width / 2, height / 2, cam_from_world)
+    return centred(name, (width, height), (f, f), cam_from_world)

@@ -1,4 +1,8 @@
-"""Photos of cameras, found by name and never outside their dataset's folder; and names of views."""
+"""Photos of cameras, found by name and never outside their dataset's folder; and names of views.
+
+Functions raise FormatError for names that lead out of the dataset or are there twice, and UsageError for a folder that
+the user chose in vain.
+"""
 
 import os
 from collections import Counter
@@ -28,11 +32,7 @@ class PhotoFolder:
     chosen: bool = False
 
     def find(self, name: str, place: Place) -> Path | None:
-        """The photo of that name, or of that name with another suffix, if there is one.
-
-        Raises:
-            FormatError: the name or a link leads out of `home`.
-        """
+        """The photo of that name, or of that name with another suffix, if there is one."""
         _refuse_escape(name, place)
         bare = without_suffix(name)
         tries = (name, *(bare + suffix for suffix in COMMON))
@@ -43,12 +43,7 @@ class PhotoFolder:
 
 
 def photo_folder(root: Path, options: Options, custom: str, place: Place) -> PhotoFolder:
-    """The folder that the user chose, or else `custom`: what the files name, or the format's usual one.
-
-    Raises:
-        UsageError: the user chose a folder that does not exist.
-        FormatError: the files name one outside `root`.
-    """
+    """The folder that the user chose, or else `custom`: what the files name, or the format's usual one."""
     if options.images is None:
         _refuse_escape(custom, place)
         return PhotoFolder(root / custom, root)
@@ -59,25 +54,15 @@ def photo_folder(root: Path, options: Options, custom: str, place: Place) -> Pho
 
 
 def refuse_folder(options: Options) -> None:
-    """Refuse a folder of photos, for formats that give each photo's path.
-
-    Raises:
-        UsageError: one was chosen.
-    """
+    """Refuse a folder of photos, for formats that give each photo's path."""
     if options.images is not None:
         raise UsageError("images", "this format gives each photo's path itself; leave it out")
 
 
 def with_photos(cameras: Sequence[Camera], places: Sequence[Place], folder: PhotoFolder) -> list[Camera]:
-    """The cameras with their photos, found by the cameras' names.
-
-    Raises:
-        UsageError: the user chose a folder that holds none of them.
-        FormatError: a name leads out of the dataset.
-    """
-    found = [
-        replace(camera, photo=folder.find(camera.name, place)) for camera, place in zip(cameras, places, strict=True)
-    ]
+    """The cameras with their photos, found by the cameras' names."""
+    pairs = zip(cameras, places, strict=True)
+    found = [replace(camera, photo=folder.find(camera.name, place)) for camera, place in pairs]
     if folder.chosen and not any(camera.photo for camera in found):
         names = listing([camera.name for camera in cameras], most=3)
         raise UsageError("images", f"{folder.folder} holds no photo of these cameras ({names})")
@@ -95,17 +80,8 @@ def last_part(name: str) -> str:
     return without_suffix(PurePosixPath(name).name)
 
 
-def whole(name: str) -> str:
-    """The name unchanged."""
-    return name
-
-
 def distinct(file: Path, names: Sequence[str], forms: Sequence[Callable[[str], str]]) -> list[str]:
-    """The names in the first of these forms in which no two are equal.
-
-    Raises:
-        FormatError: a name is there twice.
-    """
+    """The names in the first of these forms in which no two are equal."""
     for form in forms:
         short = [form(name) for name in names]
         if len(set(short)) == len(short):

@@ -11,7 +11,7 @@ from aaplug.io.cameras.options import Options, every_nth
 from aaplug.io.cameras.photos import refuse_folder
 from aaplug.io.cameras.poses import inverse, pose, rigid
 from aaplug.io.cameras.sizes import camera_set, file_sizes, trained_at
-from aaplug.io.values import Entry, entries, mentions, read_json
+from aaplug.io.values import Entry, entries, focal, mentions, number, pixels, read_json
 
 name = "pinhole"
 sign = "a JSON file with world_to_camera"
@@ -40,13 +40,9 @@ def _camera(entry: Entry, name: str) -> Camera:
     motion = rigid(entry, "world_to_camera")
     cam_from_world = pose(motion[:3, :3], motion[:3, 3], entry.place, "world_to_camera")
     inverse(cam_from_world, entry.place, "world_to_camera")  # refuses a centre that overflows
-    return Camera(
-        name,
-        entry.pixels("width"),
-        entry.pixels("height"),
-        entry.focal("fx"),
-        entry.focal("fy"),
-        entry.number("cx"),
-        entry.number("cy"),
-        cam_from_world,
+    size = entry.get("width", pixels), entry.get("height", pixels)
+    focals, centre = (
+        (entry.get("fx", focal), entry.get("fy", focal)),
+        (entry.get("cx", number), entry.get("cy", number)),
     )
+    return Camera(name, *size, *focals, *centre, cam_from_world)

@@ -3,10 +3,13 @@
 Every function raises FormatError for values that are not a rigid motion.
 """
 
+from pathlib import Path
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from aaplug.core.cameras import Camera
 from aaplug.io.values import Entry, Place
 
 ORTHONORMAL = 1e-3  # largest error of an entry of R·Rᵀ that counts as rounding
@@ -24,9 +27,8 @@ def pose(
     """The rigid motion with this translation and the rotation nearest to `rotation`."""
     error = (rotation @ rotation.T - torch.eye(3, dtype=torch.float64)).abs().max().item()
     if not error <= ORTHONORMAL:
-        raise place.error(
-            f"{field} should be a rotation: R·Rᵀ is {error:.2g} off the identity, {ORTHONORMAL:g} allowed"
-        )
+        off = f"R·Rᵀ is {error:.2g} off the identity, {ORTHONORMAL:g} allowed"
+        raise place.error(f"{field} should be a rotation: {off}")
     if torch.linalg.det(rotation) <= 0:
         raise place.error(f"{field} should be a rotation, but it mirrors (its determinant is -1)")
     left, _, right = torch.linalg.svd(rotation)
@@ -44,6 +46,17 @@ def inverse(motion: Float[Tensor, "4 4"], place: Place, field: str) -> Float[Ten
     if not back.isfinite().all():
         raise place.wrong(field, "a smaller position", motion[:3, 3].tolist())
     return back
+
+
+def centred(
+    name: str,
+    size: tuple[int, int],
+    focals: tuple[float, float],
+    cam_from_world: Float[Tensor, "4 4"],
+    photo: Path | None = None,
+) -> Camera:
+    """A camera whose principal point is the image's centre.  size: width and height; focals: fx and fy; all in px."""
+    return Camera(name, *size, *focals, size[0] / 2, size[1] / 2, cam_from_world, photo=photo)
 
 
 def rigid(entry: Entry, field: str) -> Float[Tensor, "4 4"]:

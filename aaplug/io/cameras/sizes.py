@@ -1,6 +1,7 @@
 """Training sizes of cameras, and the set of cameras that a reader returns.
 
-Sizes are (width, height), in px.
+Sizes are (width, height), in px.  Functions raise UsageError for a side above the limit CAMERA_SIDE, and FormatError
+for a photo that cannot be read or whose aspect differs from its camera's.
 """
 
 from collections.abc import Sequence
@@ -17,11 +18,7 @@ Size = tuple[int, int]
 
 
 def file_sizes(cameras: Sequence[Camera], options: Options) -> tuple[list[Size], str]:
-    """Each camera's size in the file, times `train_scale` if the user chose one; and why, for a note.
-
-    Raises:
-        UsageError: a side is above the limit CAMERA_SIDE.
-    """
+    """Each camera's size in the file, times `train_scale` if the user chose one; and why, for a note."""
     scale = options.train_scale
     sizes = [scaled(camera, 1.0 if scale is None else scale) for camera in cameras]
     most = whole_limit("CAMERA_SIDE")
@@ -31,11 +28,7 @@ def file_sizes(cameras: Sequence[Camera], options: Options) -> tuple[list[Size],
 
 
 def photo_sizes(cameras: Sequence[Camera]) -> list[Size]:
-    """The size of each camera's photo; a camera without one is scaled like the first that has one.
-
-    Raises:
-        FormatError: a photo cannot be read, or its aspect differs from its camera's.
-    """
+    """The size of each camera's photo; a camera without one is scaled like the first that has one."""
     known = [_photo_size(camera) for camera in cameras]
     rate = next((s[0] / c.width for s, c in zip(known, cameras, strict=True) if s), 1.0)
     return [size or scaled(camera, rate) for size, camera in zip(known, cameras, strict=True)]
@@ -70,14 +63,9 @@ def camera_set(
 
     source: the cameras as the file has them.  why: where the training size came from.  more: notes to add.
     """
-    trained = described_sizes([*split.train, *split.test])
-    notes = (
-        f"{kind}: {len(source)} cameras, {described_sizes(source)} in the file",
-        split.note,
-        f"training size: {trained} ({why})",
-        *more,
-    )
-    return CameraSet(split.train, split.test, background, notes)
+    format = f"{kind}: {len(source)} cameras, {described_sizes(source)} in the file"
+    size = f"training size: {described_sizes([*split.train, *split.test])} ({why})"
+    return CameraSet(split.train, split.test, background, (format, split.note, size, *more))
 
 
 def _photo_size(camera: Camera) -> Size | None:
@@ -86,9 +74,7 @@ def _photo_size(camera: Camera) -> Size | None:
     width, height = image_size(camera.photo)
     expected = camera.height * width / camera.width
     if abs(height - expected) > 1 + SAME_SHAPE * expected:
-        raise FormatError(
-            camera.photo,
-            f"is {width}×{height} px, which is not the shape of its camera "
-            f"({camera.width}×{camera.height} px); is it the wrong folder, or is the photo turned?",
-        )
+        shape = f"the shape of its camera ({camera.width}×{camera.height} px)"
+        what = f"is {width}×{height} px, which is not {shape}"
+        raise FormatError(camera.photo, f"{what}; is it the wrong folder, or is the photo turned?")
     return width, height

@@ -3,7 +3,8 @@
 frames: [{file_path, transform_matrix}].  transform_matrix: camera-to-world, OpenGL axes, world units.  The focal length
 is fl_x and fl_y, in px, or follows from camera_angle_x, the full horizontal angle in radians; w, h, cx, cy are in px.
 Keys beside `frames` are defaults for all frames.  Without w and h, the photos give the size.  Paths are relative to the
-file.  A dataparser_transforms.json beside the file maps poses to the frame in which nerfstudio trained.
+file.  nerfstudio's dataparser_transforms.json, {transform: 3×4, scale}, beside the file maps poses to the frame of the
+trained scene: with the rotation R and the translation t, a point p becomes scale · (R p + t).
 `ns-export cameras` writes a bare list of {file_path, transform: 3×4} in the trained frame, which is read if its entries
 have fl_x, w and h.
 """
@@ -15,16 +16,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from jaxtyping import Float
+from torch import Tensor
+
 from aaplug.core.cameras import WHITE, Camera, CameraSet
 from aaplug.core.errors import FormatError, reason
-from aaplug.io.cameras.dataparser import DATAPARSER, Dataparser, read_dataparser
 from aaplug.io.cameras.options import Options, Split, every_nth, explicit
-from aaplug.io.cameras.photos import PhotoFolder, distinct, last_part, refuse_folder, whole, without_suffix
-from aaplug.io.cameras.poses import inverse, pose_of_opengl, rigid
+from aaplug.io.cameras.photos import PhotoFolder, distinct, last_part, refuse_folder, without_suffix
+from aaplug.io.cameras.poses import inverse, pose, pose_of_opengl, rigid
 from aaplug.io.cameras.sizes import Size, camera_set, file_sizes, trained_at
 from aaplug.io.images import image_size
 from aaplug.io.lenses import Distortion, lens_notes, undistorted_cameras
-from aaplug.io.values import Entry, Place, entries, focal, mentions, number, read_json
+from aaplug.io.values import Entry, Place, entries, focal, mentions, number, object_of, pixels, read_json, text
 
 FILE = "transforms.json"
 AROUND = ("EQUIRECTANGULAR", "OMNIDIRECTIONALSTEREO_L", "OMNIDIRECTIONALSTEREO_R", "VR180_L", "VR180_R")
@@ -38,6 +41,7 @@ SPLITS = ("train_filenames", "val_filenames", "test_filenames")  # nerfstudio's 
 PNG = b"\x89PNG\r\n\x1a\n"
 PNG_COLOUR_TYPE = 25  # byte of the header
 PNG_ALPHA = (4, 6)  # colour types with alpha: gray and RGB
+DATAPARSER = "dataparser_transforms.json"
 
 name = "transforms"
 sign = "transforms.json (nerfstudio, instant-ngp)"
@@ -58,6 +62,20 @@ class Frame:
 
     entry: Entry
     photo: Path | None
+
+
+@dataclass(frozen=True)
+class Dataparser:
+    """A rigid motion, followed by a scale."""
+
+    motion: Float[Tensor, "4 4"]
+    scale: float
+
+    def moved(self, world_from_cam: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
+        """A camera's pose in the trained frame."""
+        moved = self.motion @ world_from_cam
+        moved[:3, 3] *= self.scale
+        return moved
 
 
 def sniff(path: Path) -> bool:
@@ -86,14 +104,8 @@ def set_of(source: Source, split: Split, options: Options) -> CameraSet:
     """The set of a split of the source's cameras; photos with alpha mean a white background, Blender's custom."""
     alpha = any(camera.photo and _has_alpha(camera.photo) for camera in source.cameras)
     more = ["background: white, Blender's custom, as photos have alpha"] if alpha else []
-    return camera_set(
-        "transforms JSON",
-        source.cameras,
-        split,
-        file_sizes(source.cameras, options)[1],
-        WHITE if alpha else None,
-        [*more, *source.notes],
-    )
+    why, background = file_sizes(source.cameras, options)[1], WHITE if alpha else None
+    return camera_set("transforms JSON", source.cameras, split, why, background, [*more, *source.notes])
 
 
 def trained(source: Source, options: Options) -> list[Camera]:
@@ -102,25 +114,32 @@ def trained(source: Source, options: Options) -> list[Camera]:
 
 
 def read_source(file: Path, options: Options) -> Source:
-    """The cameras at the size that the file or the photos give, in the frame of the trained scene.
-
-    Raises:
-        FormatError: the file breaks its format.
-        UsageError: the options do not fit.
-    """
+    """The cameras at the size that the file or the photos give, in the frame of the trained scene."""
     refuse_folder(options)
     document = _document(file)
     frames = _frames(file, document)
-    paths = [frame.entry.text("file_path") for frame in frames]
-    names = distinct(file, paths, (last_part, without_suffix, whole))
-    spare = _spare_size(frames)
+    paths = [frame.entry.get("file_path", text) for frame in frames]
+    names = distinct(file, paths, (last_part, without_suffix, str))
+    photo = next((frame.photo for frame in frames if frame.photo), None)
+    spare = image_size(photo) if photo else None  # for frames without w, h and photo
     exported = any(EXPORTED in frame.entry for frame in frames)
-    parser = None if exported else read_dataparser(file.parent / DATAPARSER)
+    parser = None if exported else _dataparser(file.parent / DATAPARSER)
     cameras = [_camera(frame, name, spare, parser) for frame, name in zip(frames, names, strict=True)]
     lenses = [_distortion(frame.entry) for frame in frames]
     cameras = undistorted_cameras(cameras, lenses)
     notes = (*lens_notes(lenses, cameras), *_frame_notes(document, exported, parser))
     return Source(tuple(cameras), _held_out(file, document, paths), notes)
+
+
+def _dataparser(path: Path) -> Dataparser | None:
+    """Read the file; None if there is none."""
+    if not os.path.isfile(path):
+        return None
+    entry = object_of(read_json(path), path, "it", "transform and scale")
+    matrix, scale = entry.matrix("transform", 3, 4), entry.get("scale", number)
+    if not scale > 0:
+        raise entry.place.wrong("scale", "above 0", scale)
+    return Dataparser(pose(matrix[:, :3], matrix[:, 3], entry.place, "transform"), scale)
 
 
 def _frame_notes(document: dict[str, Any], exported: bool, parser: Dataparser | None) -> list[str]:
@@ -135,13 +154,12 @@ def _frame_notes(document: dict[str, Any], exported: bool, parser: Dataparser | 
 
 def _held_out(file: Path, document: dict[str, Any], paths: Sequence[str]) -> tuple[bool, ...] | None:
     """Whether nerfstudio's lists of file names keep each frame from training; None without lists."""
-    place = Place(file, "lists of file names")
     lists = {key: document[key] for key in SPLITS if key in document}
     if SPLITS[0] not in lists:
         return None
     for key, listed in lists.items():
         if not isinstance(listed, list) or not all(isinstance(p, str) for p in listed):
-            raise place.wrong(key, "a list of paths", listed)
+            raise Place(file, "lists of file names").wrong(key, "a list of paths", listed)
     train = set(lists[SPLITS[0]])
     return tuple(path not in train for path in paths)
 
@@ -150,23 +168,17 @@ def _document(file: Path) -> dict[str, Any]:
     document = read_json(file)
     if isinstance(document, list):
         return {"frames": [_exported(file, index, row) for index, row in enumerate(document)]}
-    if not isinstance(document, dict) or "frames" not in document:
-        raise FormatError(file, "should be an object with 'frames', as Blender and nerfstudio write")
-    return document
+    return object_of(document, file, "it", "'frames', as Blender and nerfstudio write", "frames").fields
 
 
 def _exported(file: Path, index: int, row: object) -> dict[str, Any]:
     """A frame of `ns-export cameras`, whose pose has three rows, with the fourth added."""
     if not isinstance(row, dict) or EXPORTED not in row:
-        raise FormatError(
-            file, f"item {index} should be an object with file_path and transform, as ns-export cameras writes"
-        )  # fmt: skip
+        what = "an object with file_path and transform, as ns-export cameras writes"
+        raise FormatError(file, f"item {index} should be {what}")
     if not {"fl_x", "w", "h"} <= row.keys():
-        raise FormatError(
-            file,
-            f"item {index} has no fl_x, w and h, so its lens is unknown; give nerfstudio's transforms.json, "
-            f"with the run's {DATAPARSER} beside it",
-        )
+        lacks = f"item {index} has no fl_x, w and h, so its lens is unknown"
+        raise FormatError(file, f"{lacks}; give nerfstudio's transforms.json, with the run's {DATAPARSER} beside it")
     rows = row[EXPORTED]
     return {**row, "transform_matrix": [*rows, LAST_ROW] if isinstance(rows, list) else rows}
 
@@ -175,56 +187,44 @@ def _frames(file: Path, document: dict[str, Any]) -> list[Frame]:
     shared = {key: value for key, value in document.items() if key != "frames"}
     folder = PhotoFolder(file.parent, file.parent)
     found = entries(file, "frame", document["frames"], shared)
-    return [
-        Frame(entry, None if EXPORTED in entry else folder.find(entry.text("file_path"), entry.place))
-        for entry in found
-    ]
-
-
-def _spare_size(frames: Sequence[Frame]) -> Size | None:
-    """The size of the first photo, for frames without w, h and photo."""
-    photo = next((frame.photo for frame in frames if frame.photo), None)
-    return image_size(photo) if photo else None
+    photos = [None if EXPORTED in e else folder.find(e.get("file_path", text), e.place) for e in found]
+    return [Frame(entry, photo) for entry, photo in zip(found, photos, strict=True)]
 
 
 def _camera(frame: Frame, name: str, spare: Size | None, parser: Dataparser | None) -> Camera:
     entry = frame.entry
     width, height = _size(frame, spare)
     fx = _focal(entry, width)
+    intrinsics = (
+        fx,
+        entry.get("fl_y", focal, fx),
+        entry.get("cx", number, width / 2),
+        entry.get("cy", number, height / 2),
+    )
     motion = rigid(entry, "transform_matrix")
     world_from_cam = pose_of_opengl(motion, entry.place, "transform_matrix")
     world_from_cam = world_from_cam if parser is None else parser.moved(world_from_cam)
-    return Camera(
-        name,
-        width,
-        height,
-        fx,
-        entry.focal("fl_y") if "fl_y" in entry else fx,
-        entry.number("cx") if "cx" in entry else width / 2,
-        entry.number("cy") if "cy" in entry else height / 2,
-        inverse(world_from_cam, entry.place, "transform_matrix"),
-        photo=frame.photo,
-    )
+    cam_from_world = inverse(world_from_cam, entry.place, "transform_matrix")
+    return Camera(name, width, height, *intrinsics, cam_from_world, photo=frame.photo)
 
 
 def _size(frame: Frame, spare: Size | None) -> Size:
     entry = frame.entry
     if "w" in entry and "h" in entry:
-        return entry.pixels("w"), entry.pixels("h")
+        return entry.get("w", pixels), entry.get("h", pixels)
     if frame.photo:
         return image_size(frame.photo)
     if spare is None:
-        raise entry.place.error(
-            "its size is unknown: the file has no w and h, and there are no photos; "
-            "put the photos where file_path says, or add w and h (px) beside frames"
-        )
+        unknown = "its size is unknown: the file has no w and h, and there are no photos"
+        advice = "put the photos where file_path says, or add w and h (px) beside frames"
+        raise entry.place.error(f"{unknown}; {advice}")
     return spare
 
 
 def _focal(entry: Entry, width: int) -> float:
     if "fl_x" in entry or "camera_angle_x" not in entry:
-        return entry.focal("fl_x")
-    angle = entry.number("camera_angle_x")
+        return entry.get("fl_x", focal)
+    angle = entry.get("camera_angle_x", number)
     if not LEAST_ANGLE <= angle < math.pi:
         raise entry.place.wrong("camera_angle_x", "above 0 and below π, in radians", angle)
     return focal(width / 2 / math.tan(angle / 2), entry.place, "camera_angle_x's focal length")
@@ -232,10 +232,10 @@ def _focal(entry: Entry, width: int) -> float:
 
 def _distortion(entry: Entry) -> Distortion | None:
     """The distortion, None for a pinhole."""
-    model = entry.text("camera_model") if "camera_model" in entry else PINHOLES[0]
+    model = entry.get("camera_model", text, PINHOLES[0])
     if model in AROUND:
         raise entry.place.error(f"its camera_model is {model}, which has no focal length")
-    k = {key: entry.number(key) if key in entry else 0.0 for key in DISTORTION}
+    k = {key: entry.get(key, number, 0.0) for key in DISTORTION}
     listed = entry.fields.get("distortion_params") or []
     if not isinstance(listed, list):
         raise entry.place.wrong("distortion_params", "a list of numbers", listed)

@@ -63,7 +63,7 @@ class WritableFormat(SceneFormat, Protocol):
 
 # the first that accepts a file is used
 OWN: tuple[SceneFormat, ...] = (compressed_ply, ply, spz, sog, pt, splat, ksplat)
-SCENE_FORMATS: Registry[SceneFormat] = Registry(
+SCENE_FORMATS = Registry[SceneFormat](
     "scene format", {f.name: f for f in OWN}, lambda value: isinstance(value, SceneFormat)
 )
 
@@ -110,17 +110,14 @@ def read_scene(
 ) -> Gaussians:
     """Read a scene.
 
-    Args:
-        path, iteration, convention, allow_checkpoint, spz_axes: see `open_scene`.
-        drop_bad: leave out Gaussians with NaN, infinite or unusable values and log a warning with their number; without
-            it they are an error.
+    drop_bad: leave out Gaussians with NaN, infinite or unusable values and log a warning with their number; without it
+    they are an error.  Other arguments: see `open_scene`.
 
     Raises:
         FormatError: the file is missing, of no known format, breaks its format, or is too large for this machine.
     """
-    return open_scene(
-        path, iteration=iteration, convention=convention, allow_checkpoint=allow_checkpoint, spz_axes=spz_axes
-    ).whole(drop_bad)
+    how = {"allow_checkpoint": allow_checkpoint, "spz_axes": spz_axes}
+    return open_scene(path, iteration=iteration, convention=convention, **how).whole(drop_bad)
 
 
 def write_scene(
@@ -128,11 +125,7 @@ def write_scene(
 ) -> None:
     """Write a scene in the format of the path's suffix, with everything else that its source file held.
 
-    Args:
-        path: the file to write.
-        scene: the Gaussians; their `origin` links them to their source file.
-        overwrite: replace an existing file.
-        spz_axes: of a .spz; see `open_scene`.
+    overwrite: replace an existing file.  spz_axes: see `open_scene`.
 
     Raises:
         OutputError: no writable format has this suffix, the format cannot hold the scene, or the path is the scene's
@@ -154,10 +147,7 @@ def write_parts(
 ) -> None:
     """Write a scene that comes in parts, at most `count` Gaussians of one convention and with the same columns.
 
-    inputs: files that are being read and may not be replaced.
-
-    Raises:
-        OutputError, UsageError: see `write_scene`.
+    inputs: files that are being read and may not be replaced.  Errors: see `write_scene`.
     """
     writer = check_scene_output(path, overwrite, inputs)
     writer.write(Path(path), parts, count, overwrite, Options(spz_axes=spz_axes))
@@ -168,8 +158,7 @@ def check_scene_output(
 ) -> WritableFormat:
     """The format that will write `path`; refuses an output that cannot be written, before any work.
 
-    Raises:
-        OutputError, UsageError: see `write_scene`.
+    Errors: see `write_scene`.
     """
     name = Path(path).name.lower()
     suffixes = {"." + format.name: format for format in SCENE_FORMATS.values()}
@@ -203,18 +192,14 @@ def find_scene(path: str | PathLike[str], iteration: int | None = None) -> Path:
         raise FormatError(path, "holds no point_cloud/iteration_<N>/point_cloud.ply; name the scene's file")
     chosen = max(scenes) if iteration is None else iteration
     if chosen not in scenes:
-        available = ", ".join(map(str, sorted(scenes)))
-        raise FormatError(path, f"has no iteration {chosen}; it has {available}")
+        raise FormatError(path, f"has no iteration {chosen}; it has {', '.join(map(str, sorted(scenes)))}")
     return scenes[chosen]
 
 
 def _iterations(model: Path) -> dict[int, Path]:
-    found = {}
-    for scene in model.glob("point_cloud/iteration_*/point_cloud.ply"):
-        number = re.fullmatch(r"iteration_(\d+)", scene.parent.name, re.ASCII)
-        if number:
-            found[int(number[1])] = scene
-    return found
+    pattern = re.compile(r"iteration_(\d+)", re.ASCII)
+    scenes = model.glob("point_cloud/iteration_*/point_cloud.ply")
+    return {int(m[1]): scene for scene in scenes if (m := pattern.fullmatch(scene.parent.name))}
 
 
 def _head(path: Path) -> bytes:

@@ -6,6 +6,7 @@ largest component, 3 × 10 for the others), packed_color (4 bytes).  Element "sh
 The header's comments say how the scene was trained, as in a plain .ply.
 """
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,7 @@ WORDS = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 BOUNDS = [f"{end}_{axis}" for end in ("min", "max") for axis in ("x", "y", "z")]
 SCALE_BOUNDS = [f"{end}_scale_{axis}" for end in ("min", "max") for axis in ("x", "y", "z")]
 COLOUR_BOUNDS = [f"{end}_{c}" for end in ("min", "max") for c in ("r", "g", "b")]
+ELEVEN_TEN_ELEVEN = ((21, 11), (11, 10), (0, 11))
 PER_CHUNK = 256  # Gaussians
 SH_SPAN = 8.0  # harmonics lie between -4 and 4
 
@@ -48,26 +50,17 @@ def open_scene(path: Path, options: Options) -> SceneFile:
         bounds = tables["chunk"].read(0, tables["chunk"].count)
     sh = tables.get("sh")
     degree = DEGREES[len(sh.dtype.names or ())] if sh else 0
-    return SceneFile(
-        path,
-        name,
-        header.vertex.count,
-        degree,
-        lambda start, stop: _rows(tables, bounds, degree, start, stop),
-        said.evidence,
-        said.convention,
-        said.fused,
-    )
+    load, count = partial(_rows, tables, bounds, degree), header.vertex.count
+    return SceneFile(path, name, count, degree, load, said.evidence, said.convention, said.fused)
 
 
 def _tables(path: Path, header: Header) -> dict[str, Table]:
     if header.coding != LITTLE or any(e.lists for e in header.elements):
         raise FormatError(path, f"is a packed .ply, which should be {LITTLE} without lists")
-    tables, at, stamp = {}, header.size, stamp_of(path)
+    tables, stamp = {}, stamp_of(path)
     for element in header.elements:
         dtype = np.dtype([(p.name, "<" + p.code) for p in element.properties])
-        tables[element.name] = Table(path, at, element.count, dtype, stamp)
-        at += element.least_size
+        tables[element.name] = Table(path, header.start_of(element), element.count, dtype, stamp)
     return tables
 
 
@@ -101,7 +94,7 @@ def _rows(tables: dict[str, Table], bounds: np.ndarray, degree: int, start: int,
     rest = tables["sh"].read(start, stop) if degree else None
     of_row = np.arange(start, stop) // PER_CHUNK
     colour = words["packed_color"]
-    rgb = _bytes(colour, (24, 16, 8))
+    rgb = _fractions(colour, (24, 8), (16, 8), (8, 8))
     if COLOUR_BOUNDS[0] in (bounds.dtype.names or ()):
         rgb = _between(bounds, COLOUR_BOUNDS, of_row, rgb)
     sh = torch.zeros(len(words), (degree + 1) ** 2, 3)
@@ -110,37 +103,24 @@ def _rows(tables: dict[str, Table], bounds: np.ndarray, degree: int, start: int,
         k = sh.shape[1] - 1
         for i in range(3 * k):
             sh[:, 1 + i % k, i // k] = _harmonic(rest[f"f_rest_{i}"])
-    return Gaussians(
-        _between(bounds, BOUNDS, of_row, _eleven_ten_eleven(words["packed_position"])),
-        _quaternions(words["packed_rotation"]),
-        _between(bounds, SCALE_BOUNDS, of_row, _eleven_ten_eleven(words["packed_scale"])),
-        byte_opacities(colour & 255),
-        sh,
-    )
+    means = _between(bounds, BOUNDS, of_row, _fractions(words["packed_position"], *ELEVEN_TEN_ELEVEN))
+    scales = _between(bounds, SCALE_BOUNDS, of_row, _fractions(words["packed_scale"], *ELEVEN_TEN_ELEVEN))
+    three = (_fractions(words["packed_rotation"], (20, 10), (10, 10), (0, 10)) - 0.5) * 2**0.5
+    quats = largest_last(three, floats(words["packed_rotation"] >> 30))
+    return Gaussians(means, quats, scales, byte_opacities(colour & 255), sh)
 
 
 def _between(
     bounds: np.ndarray, names: list[str], of_row: np.ndarray, share: Float[Tensor, "n 3"]
 ) -> Float[Tensor, "n 3"]:
-    low, high = (
-        torch.from_numpy(np.stack([bounds[c][of_row] for c in part], axis=1)) for part in (names[:3], names[3:])
-    )
-    return torch.lerp(low, high, share)
+    ends = torch.from_numpy(np.stack([bounds[c][of_row] for c in names], axis=1))
+    return torch.lerp(ends[:, :3], ends[:, 3:], share)
 
 
-def _eleven_ten_eleven(words: np.ndarray) -> Float[Tensor, "n 3"]:
-    fields = [(words >> shift & (1 << bits) - 1, bits) for shift, bits in ((21, 11), (11, 10), (0, 11))]
-    return torch.stack([floats(field) / ((1 << bits) - 1) for field, bits in fields], dim=1)
-
-
-def _bytes(words: np.ndarray, shifts: tuple[int, ...]) -> Float[Tensor, "n c"]:
-    return torch.stack([floats(words >> shift & 255) / 255 for shift in shifts], dim=1)
-
-
-def _quaternions(words: np.ndarray) -> Float[Tensor, "n 4"]:
-    fields = [floats(words >> shift & 1023) / 1023 for shift in (20, 10, 0)]
-    rest = (torch.stack(fields, dim=1) - 0.5) * 2**0.5
-    return largest_last(rest, floats(words >> 30))
+def _fractions(words: np.ndarray, *fields: tuple[int, int]) -> Float[Tensor, "n c"]:
+    """Fields of the words, each a place and a number of bits, as fractions of the largest value."""
+    most = [(shift, (1 << bits) - 1) for shift, bits in fields]
+    return torch.stack([floats(words >> shift & largest) / largest for shift, largest in most], dim=1)
 
 
 def _harmonic(values: np.ndarray) -> Float[Tensor, " n"]:

@@ -7,7 +7,7 @@ or bytes), ordered by degree, then channel.
 """
 
 import struct
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,7 @@ from aaplug.core.errors import FormatError
 from aaplug.core.gaussians import Gaussians
 from aaplug.io.scenes.options import Options
 from aaplug.io.scenes.packed import byte_opacities, floats
-from aaplug.io.scenes.scene_file import SceneFile, check_count, empty, library_errors, sh_of_colour
+from aaplug.io.scenes.scene_file import SceneFile, check_count, library_errors, sh_of_colour
 from aaplug.io.scenes.splat import EVIDENCE
 
 # version, sections, Gaussians, level, smallest and largest harmonic
@@ -76,20 +76,13 @@ def open_scene(path: Path, options: Options) -> SceneFile:
         count = sum(len(s.rows) for s in sections)
         degree = max((s.section.degree for s in sections), default=0)
         scene = _joined([_decoded(s, level, sh_range, degree) for s in sections], degree)
-    return SceneFile(
-        path,
-        name,
-        count,
-        degree,
-        lambda start, stop: scene[start:stop],
-        EVIDENCE,
-        notes=(f"compression level {level}",),
-    )
+    notes = (f"compression level {level}",)
+    return SceneFile(path, name, count, degree, lambda start, stop: scene[start:stop], EVIDENCE, notes=notes)
 
 
 def _sections(path: Path, data: bytes) -> tuple[int, tuple[float, float], list[Records]]:
     if len(data) < MAIN_SIZE:
-        raise FormatError(path, f"is cut short: a header has {MAIN_SIZE:,} bytes, the file {len(data):,}")  # fmt: skip
+        raise FormatError(path, f"is cut short: a header has {MAIN_SIZE:,} bytes, the file {len(data):,}")
     major, minor, number, count, level, least, most = MAIN.unpack_from(data)
     if (major, level) not in ((0, 0), (0, 1), (0, 2)) or minor < 1:
         raise FormatError(path, f"has version {major}.{minor}, level {level}; known are 0.1 and levels 0 to 2")
@@ -127,23 +120,16 @@ def _records(path: Path, data: bytes, at: int, section: Section, level: int) -> 
     fill = np.minimum(np.concatenate([full, partial]), section.count)
     if fill.sum() < section.count:
         raise FormatError(path, f"has buckets for {fill.sum():,} of {section.count:,} Gaussians")
-    ends = np.cumsum(fill)
-    bucket = np.searchsorted(ends, np.arange(section.count), side="right")
+    bucket = np.searchsorted(np.cumsum(fill), np.arange(section.count), side="right")
     centres = np.frombuffer(data, "<f4", 3 * section.buckets, at + sizes).reshape(-1, 3)
     return Records(section, rows, centres[bucket]), end
 
 
 def _record(degree: int, level: int) -> np.dtype:
     rest = 3 * ((degree + 1) ** 2 - 1)
-    return np.dtype(
-        [
-            ("means", POSITIONS[level], 3),
-            ("scales", FLOATS[level], 3),
-            ("quats", FLOATS[level], 4),
-            ("rgba", "u1", 4),
-            ("sh", HARMONICS[level], rest),
-        ]
-    )
+    floating, position = FLOATS[level], POSITIONS[level]
+    shapes = [("means", position, 3), ("scales", floating, 3), ("quats", floating, 4), ("rgba", "u1", 4)]
+    return np.dtype([*shapes, ("sh", HARMONICS[level], rest)])
 
 
 def _decoded(records: Records, level: int, sh_range: tuple[float, float], degree: int) -> Gaussians:
@@ -160,16 +146,12 @@ def _decoded(records: Records, level: int, sh_range: tuple[float, float], degree
     for d in range(1, section.degree + 1):
         band = rest[:, 3 * (d * d - 1) : 3 * ((d + 1) ** 2 - 1)]
         sh[:, d * d : (d + 1) ** 2] = band.reshape(len(rows), 3, 2 * d + 1).transpose(1, 2)
-    return Gaussians(
-        floats(means), floats(rows["quats"]), floats(rows["scales"]).log(), byte_opacities(rows["rgba"][:, 3]), sh
-    )
+    opacities = byte_opacities(rows["rgba"][:, 3])
+    return Gaussians(floats(means), floats(rows["quats"]), floats(rows["scales"]).log(), opacities, sh)
 
 
 def _joined(scenes: list[Gaussians], degree: int) -> Gaussians:
-    parts = [empty(0, degree), *scenes]
-
-    def column(name: str) -> torch.Tensor:
-        return torch.cat([getattr(part, name) for part in parts])
-
-    names = ("means", "quats", "log_scales", "logit_opacities", "sh")
-    return replace(parts[0], **{name: column(name) for name in names})
+    none = [torch.zeros(0, *shape) for shape in ((3,), (4,), (3,), (), ((degree + 1) ** 2, 3))]
+    parts = [(s.means, s.quats, s.log_scales, s.logit_opacities, s.sh) for s in scenes]
+    means, quats, log_scales, logits, sh = (torch.cat(columns) for columns in zip(none, *parts, strict=True))
+    return Gaussians(means, quats, log_scales, logits, sh)

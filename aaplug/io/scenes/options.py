@@ -10,13 +10,10 @@ SpzAxes = Literal["opengl", "opencv"]
 
 @dataclass(frozen=True)
 class Options:
-    """The user's choices.
+    """The user's choices; raises UsageError for unknown axes.
 
     allow_checkpoint: open a .pt, a pickle, of which only tensors are read.
     spz_axes: axes of the numbers in a .spz: "opengl" by its specification, "opencv" as splat-transform and gsply write.
-
-    Raises:
-        UsageError: there are no such axes.
     """
 
     allow_checkpoint: bool = False

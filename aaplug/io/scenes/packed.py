@@ -18,7 +18,7 @@ from torch import Tensor
 
 from aaplug.core.errors import FormatError
 from aaplug.core.gaussians import Gaussians
-from aaplug.io.limits import limit, whole_limit
+from aaplug.io.limits import limit
 from aaplug.io.scenes.scene_file import logit_of
 
 GZIP_WINDOW = 31  # zlib's code for a gzip stream with the largest window
@@ -29,32 +29,19 @@ BYTE = 255
 def check_growth(path: Path, inflated: int, compressed: int) -> None:
     """Refuse compressed bytes that announce a larger size than a real scene would have."""
     if inflated > limit("INFLATE") * compressed + limit("SLACK"):
-        raise FormatError(
-            path,
-            f"its {compressed:,} compressed bytes announce {inflated:,}, more than {limit('INFLATE'):g} times as many; "
-            "it is damaged or a decompression bomb (AAPLUG_INFLATE raises the limit)",
-        )
+        many = f"announce {inflated:,}, more than {limit('INFLATE'):g} times as many"
+        bomb = "it is damaged or a decompression bomb (AAPLUG_INFLATE raises the limit)"
+        raise FormatError(path, f"its {compressed:,} compressed bytes {many}; {bomb}")
 
 
-def gunzip_start(data: bytes, size: int) -> bytes:
+def gunzip(data: bytes, size: int) -> bytes:
     """The first bytes of a gzip stream, or all if it has fewer."""
     return zlib.decompressobj(GZIP_WINDOW).decompress(data, size)
 
 
-def gunzip(data: bytes, size: int, path: Path) -> bytes:
-    """Decompress a gzip stream of `size` bytes; a few more are accepted."""
-    most = size + whole_limit("SLACK")
-    inflated = zlib.decompressobj(GZIP_WINDOW).decompress(data, most + 1)
-    if not size <= len(inflated) <= most:
-        many = "more than " * (len(inflated) > most)
-        raise FormatError(path, f"inflates to {many}{len(inflated):,} bytes where its header promises {size:,}")
-    return inflated
-
-
 def unzstd(data: bytes, size: int, path: Path) -> bytes:
     """Decompress a zstd stream of `size` bytes."""
-    inflater = zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW)
-    with inflater.stream_reader(io.BytesIO(data)) as stream:
+    with zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW).stream_reader(io.BytesIO(data)) as stream:
         inflated = stream.read(size + 1)
     if len(inflated) != size:
         raise FormatError(path, f"a stream inflates to {len(inflated):,} bytes where {size:,} are promised")

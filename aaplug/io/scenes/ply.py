@@ -10,28 +10,26 @@ back unchanged.  Output is little-endian binary.
 import re
 from collections.abc import Iterable
 from dataclasses import replace
+from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from aaplug.core.errors import FormatError, OutputError, listing
 from aaplug.core.gaussians import Gaussians, PixelSizes
 from aaplug.io.atomic import replacing
 from aaplug.io.scenes.options import Options
 from aaplug.io.scenes.ply_document import Document, document_of, stamp_of
-from aaplug.io.scenes.ply_header import LITTLE, Header, Property, check_size, is_packed, parse, read_header
+from aaplug.io.scenes.ply_header import LITTLE, Header, check_size, is_packed, parse, read_header
 from aaplug.io.scenes.ply_tags import meaning, stating
 from aaplug.io.scenes.scene_file import (
     DEGREES,
     FILTER_COLUMN,
     SceneFile,
     check_count,
-    columns,
-    empty,
     library_errors,
     matrix_of,
     scene_of,
@@ -69,19 +67,8 @@ def open_scene(path: Path, options: Options) -> SceneFile:
         said = meaning(header)
         document = document_of(path, header, stamp)
     degree = DEGREES[len(_rest(header))]
-    return SceneFile(
-        path,
-        name,
-        header.vertex.count,
-        degree,
-        lambda start, stop: _rows(document, degree, said.flat, start, stop),
-        said.evidence,
-        said.convention,
-        said.fused,
-        said.flat,
-        document,
-        tuple(notes),
-    )
+    load, count = partial(_rows, document, degree, said.flat), header.vertex.count
+    return SceneFile(path, name, count, degree, load, **vars(said), document=document, notes=tuple(notes))
 
 
 def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: Options) -> None:
@@ -117,7 +104,7 @@ def _check_columns(header: Header) -> list[str]:
     known = {p.name: p for p in vertex.properties}
     if vertex.lists:
         raise FormatError(header.path, f"vertex property {listing(vertex.lists)} is a list; a scene has numbers only")
-    coloured = _has_byte_colours(known)
+    coloured = all(c in known and known[c].code == "u1" for c in BYTE_COLOURS) and not known.keys() & {*COLOURS}
     optional = {*(COLOURS if coloured else ()), SCALES[2]}
     missing = [c for c in REQUIRED if c not in known and c not in optional]
     if missing:
@@ -138,11 +125,6 @@ def _check_columns(header: Header) -> list[str]:
     return [note for note, applies in notes.items() if applies]
 
 
-def _has_byte_colours(known: dict[str, Property]) -> bool:
-    there = all(c in known and known[c].code == "u1" for c in BYTE_COLOURS)
-    return there and not any(c in known for c in COLOURS)
-
-
 def _check_rest(path: str, rest: list[str]) -> None:
     if len(rest) not in DEGREES:
         raise FormatError(path, f"has {len(rest)} f_rest columns; degrees 0 to 4 have 0, 9, 24, 45 or 72")
@@ -160,19 +142,21 @@ def _rows(document: Document, degree: int, flat: bool, start: int, stop: int) ->
     table = document.table
     assert table is not None
     rows = table.read(start, stop)
-    fields = rows.dtype.names or ()
-    if _one_type(rows.dtype) and COLOURS[0] in fields:
-        scene = scene_of(fields, torch.from_numpy(_matrix(rows)), degree, flat)
-        return replace(scene, pixel_sizes=_pixel_sizes(rows))
-    scene = empty(len(rows), degree, FILTER_COLUMN in fields, flat)
-    targets = {c: v for c, v in columns(scene).items() if c in fields}
-    for begin in range(0, len(rows), CHUNK):
-        part = slice(begin, begin + CHUNK)
-        for column, values in targets.items():
-            values[part] = torch.from_numpy(rows[column][part].astype(np.float32))
-        if COLOURS[0] not in fields:
-            scene.sh[part, 0] = sh_of_colour(_byte_colours(rows[part]))
-    return replace(scene, pixel_sizes=_pixel_sizes(rows))
+    names = rows.dtype.names or ()
+    if _one_type(rows.dtype):
+        values = torch.from_numpy(_matrix(rows))
+    else:
+        names = tuple(name for name in names if _is_parameter(name))
+        values = torch.empty(len(rows), len(names))
+        for begin in range(0, len(rows), CHUNK):
+            part = slice(begin, begin + CHUNK)
+            for i, column in enumerate(names):
+                values[part, i] = torch.from_numpy(rows[column][part].astype(np.float32))
+    if COLOURS[0] not in names:
+        colours = np.stack([rows[c].astype(np.float32) for c in BYTE_COLOURS], axis=1)
+        harmonics = sh_of_colour(torch.from_numpy(colours) / np.iinfo(np.uint8).max)
+        names, values = (*names, *COLOURS), torch.cat([values, harmonics], dim=1)
+    return replace(scene_of(names, values, degree, flat), pixel_sizes=_pixel_sizes(rows))
 
 
 def _pixel_sizes(rows: np.ndarray) -> PixelSizes | None:
@@ -192,23 +176,18 @@ def _matrix(rows: np.ndarray) -> np.ndarray:
     return rows.view("<f4").reshape(len(rows), len(rows.dtype.names or ()))
 
 
-def _byte_colours(rows: np.ndarray) -> Tensor:
-    colours = np.stack([rows[c].astype(np.float32) for c in BYTE_COLOURS], axis=1)
-    return torch.from_numpy(colours) / np.iinfo(np.uint8).max
-
-
 def _plain_header(scene: Gaussians) -> Header:
     """The header that 3DGS writes, with its order of columns."""
     rest = [f"f_rest_{i}" for i in range(3 * (scene.sh.shape[1] - 1))]
     order = [*REQUIRED[:3], *NORMALS, *COLOURS, *rest, *REQUIRED[6:]]
-    properties = [f"property float {c}" for c in order if c in NORMALS or c in columns(scene)]
+    properties = [f"property float {c}" for c in order if c in NORMALS or c in matrix_of(scene[:0])[0]]
     start = ["ply", f"format {LITTLE} 1.0", f"element vertex {len(scene)}"]
     return parse("scene", [*start, *properties, "end_header"], "\n")
 
 
 def _updated(old: Header, scene: Gaussians, count: int, new: bool) -> Header:
     """The header for this scene: count, columns, convention and fusions."""
-    wanted = columns(scene)
+    wanted, _ = matrix_of(scene[:0])
     known = old.vertex.names
     kept = SCALES[2] if scene.flat else None
     dropped = [c for c in known if _is_parameter(c) and c not in wanted and c != kept]
@@ -232,36 +211,23 @@ def _records(header: Header, scene: Gaussians) -> np.ndarray:
 
     In a column that is not float32, a value that is still what was read keeps the file's digits.
     """
-    properties = header.vertex.properties
-    records = np.zeros(len(scene), np.dtype([(p.name, "<" + p.code) for p in properties]))
-    if _one_type(records.dtype) and scene.means.dtype == torch.float32:
-        return _filled(records, scene)
-    values = columns(scene)
-    old = _old_rows(scene)
-    for p in properties:
-        was = old[p.name] if old is not None and p.name in (old.dtype.names or ()) else None
-        if p.name not in values:
-            records[p.name] = 0 if was is None else was
-            continue
-        assert not values[p.name].isnan().any(), f"{p.name} is NaN"
-        new = values[p.name].detach().cpu().numpy()
-        if was is not None and p.code != "f4":
-            new = np.where(was.astype(np.float32) == new, was, new)
-        records[p.name] = new
-    return records
-
-
-def _filled(records: np.ndarray, scene: Gaussians) -> np.ndarray:
-    """`_records` if all columns are float32: all at once."""
-    names, fields = list(records.dtype.names or ()), _matrix(records)
-    known, values = matrix_of(scene)
-    values = values.detach().cpu().numpy()
+    records = np.zeros(len(scene), np.dtype([(p.name, "<" + p.code) for p in header.vertex.properties]))
+    known, matrix = matrix_of(scene)
+    values = matrix.detach().cpu().numpy()
     assert not np.isnan(values).any(), "a parameter is NaN"
-    if set(names) != set(known) and (old := _old_rows(scene)) is not None:
-        for i, column in enumerate(names):
-            if column not in known and column in (old.dtype.names or ()):
-                fields[:, i] = old[column]
-    fields[:, [names.index(column) for column in known]] = values
+    names, at_once = header.vertex.names, _one_type(records.dtype)
+    if at_once:
+        _matrix(records)[:, [names.index(column) for column in known]] = values
+    old = None if at_once and set(names) == set(known) else _old_rows(scene)
+    for p in header.vertex.properties:
+        was = old[p.name] if old is not None and p.name in (old.dtype.names or ()) else None
+        if p.name in known and not at_once:
+            new = values[:, known.index(p.name)]
+            if was is not None and p.code != "f4":
+                new = np.where(was.astype(np.float32) == new, was, new)
+            records[p.name] = new
+        elif p.name not in known and was is not None:
+            records[p.name] = was
     return records
 
 

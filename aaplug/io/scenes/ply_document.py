@@ -99,11 +99,9 @@ def document_of(path: Path, header: Header, stamp: tuple[int, int]) -> Document:
     """Locate the tables of a file; parse those that numpy cannot read."""
     order = ">" if header.coding == BIG else "<"
     dtype = np.dtype([(p.name, order + p.code) for p in header.vertex.properties])
-    at = header.elements.index(header.vertex)
-    offset = header.size + sum(e.least_size for e in header.elements[:at])
+    at, offset = header.elements.index(header.vertex), header.start_of(header.vertex)
     table = Table(path, offset, header.vertex.count, dtype, stamp)
-    lists = any(e.lists for e in header.elements)
-    if header.coding == LITTLE and not lists:
+    if header.coding == LITTLE and not any(e.lists for e in header.elements):
         return _located(header, table)
     if header.coding == BIG and len(header.elements) == 1:
         return Document(header, table)
@@ -126,8 +124,7 @@ def _located(header: Header, table: Table) -> Document:
 
 def _parsed(path: Path, size: int, coding: str) -> tuple[PlyElement, ...]:
     if coding == TEXT:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # numpy's, about empty lists
+        with warnings.catch_warnings(action="ignore"):  # numpy's, about empty lists
             return PlyData.read(str(path)).elements
     with path.open("rb") as stream:
         elements = PlyData.read(stream, mmap="r").elements
@@ -138,10 +135,6 @@ def _parsed(path: Path, size: int, coding: str) -> tuple[PlyElement, ...]:
 
 
 def _little(elements: Iterable[PlyElement]) -> bytes:
-    elements = list(elements)
-    if not elements:
-        return b""
-    stream = io.BytesIO()
-    data = PlyData(elements, byte_order="<")
+    stream, data = io.BytesIO(), PlyData(list(elements), byte_order="<")
     data.write(stream)
     return stream.getvalue()[len(data.header) + 1 :]

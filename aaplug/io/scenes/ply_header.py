@@ -8,6 +8,7 @@ Functions raise FormatError for a file that breaks its format.
 """
 
 import re
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from functools import cached_property
@@ -38,11 +39,6 @@ class Property:
     code: str
     length_code: str | None = None
 
-    @property
-    def least_size(self) -> int:
-        """Size of the value, or of an empty list."""
-        return int((self.length_code or self.code)[1:])
-
 
 @dataclass(frozen=True)
 class Element:
@@ -55,17 +51,12 @@ class Element:
     @property
     def stride(self) -> int:
         """Size of a row whose lists are empty."""
-        return sum(p.least_size for p in self.properties)
+        return sum(int((p.length_code or p.code)[1:]) for p in self.properties)
 
     @property
     def least_size(self) -> int:
         """Size of the table if all lists are empty."""
         return self.count * self.stride
-
-    @property
-    def least_text(self) -> int:
-        """Least size of the table in text."""
-        return self.count * len(self.properties) * LEAST_TEXT
 
     @property
     def lists(self) -> list[str]:
@@ -95,19 +86,14 @@ class Header:
     size: int
 
     @cached_property
-    def text(self) -> str:
-        """The lines with their ends."""
-        return _text(self.lines, self.newline)
-
-    @property
     def content(self) -> bytes:
-        """The text as bytes."""
-        return self.text.encode(BYTES)
+        """The lines with their ends."""
+        return _content(self.lines, self.newline)
 
     @property
     def plain(self) -> bool:
         """Whether plyfile can read it: all ASCII, no empty lines."""
-        return self.text.isascii() and len(self.text) == self.size
+        return self.content.isascii() and len(self.content) == self.size
 
     @property
     def comments(self) -> list[str]:
@@ -117,10 +103,14 @@ class Header:
     @property
     def vertex(self) -> Element:
         """The table of Gaussians."""
-        for element in self.elements:
-            if element.name == "vertex":
-                return element
-        raise FormatError(self.path, "has no element 'vertex'; is it a Gaussian splatting scene?")
+        found = [element for element in self.elements if element.name == "vertex"]
+        if not found:
+            raise FormatError(self.path, "has no element 'vertex'; is it a Gaussian splatting scene?")
+        return found[0]
+
+    def start_of(self, element: Element) -> int:
+        """Where a table begins in the file, if the tables before it have no lists."""
+        return self.size + sum(e.least_size for e in self.elements[: self.elements.index(element)])
 
     def without_comments(self, unwanted: Callable[[str], object]) -> "Header":
         """The header without the comments for which `unwanted` is true."""
@@ -169,15 +159,16 @@ def read_header(path: Path) -> Header:
     newline = b"\r\n" if head.startswith(b"ply\r\n") else b"\n"
     if not head.startswith(b"ply" + newline):
         raise FormatError(path, "is not a .ply file: its first line is not 'ply'")
-    end = head.find(newline + b"end_header" + newline)
+    last = newline + b"end_header"
+    end = head.find(last + newline)
     if end < 0:
         where = f"in its first {most:,} bytes" if len(head) == most else "in the file"
         raise FormatError(path, f"no line 'end_header' {where}; it is cut short or not a .ply")
-    lines = (head[:end] + newline + b"end_header").split(newline)
+    lines = (head[:end] + last).split(newline)
     if len(lines) > most_lines:
         raise FormatError(path, f"the header has {len(lines)} lines, more than the {most_lines} allowed")
-    size = end + len(newline + b"end_header" + newline)
-    return parse(str(path), [line.decode(BYTES) for line in lines if line], newline.decode(), size)
+    decoded = (line.decode(BYTES) for line in lines if line)
+    return parse(str(path), decoded, newline.decode(), end + len(last + newline))
 
 
 def is_packed(path: Path) -> bool:
@@ -212,40 +203,28 @@ def parse(path: str, lines: Iterable[str], newline: str, size: int | None = None
                 raise FormatError(path, f"line {number} of the header is not PLY: {line[:MAX_SHOWN]!r}")
     coding = _coding(path, formats)
     _check_unique(path, elements)
-    size = len(_text(lines, newline)) if size is None else size
+    size = len(_content(lines, newline)) if size is None else size
     return Header(path, lines, newline, tuple(elements), coding, size)
 
 
 def check_size(header: Header, actual: int) -> None:
     """Compare the file's size with what the header promises, before anything is allocated."""
-    text = header.coding == TEXT
-    least = header.size + sum(e.least_text if text else e.least_size for e in header.elements)
-    if text and actual < least - 1:  # the last line may lack its line end
-        raise FormatError(
-            header.path,
-            f"is cut short: the values that its header promises need {least:,} bytes at least, and it has {actual:,}",
-        )
-    if text:
+    if header.coding == TEXT:
+        least = header.size + sum(e.count * len(e.properties) * LEAST_TEXT for e in header.elements)
+        if actual < least - 1:  # the last line may lack its line end
+            need = f"the values that its header promises need {least:,} bytes at least"
+            raise FormatError(header.path, f"is cut short: {need}, and it has {actual:,}")
         return
+    least = header.size + sum(e.least_size for e in header.elements)
     if actual < least:
-        whole, promised = _whole_rows(header, actual), header.vertex.count
-        raise FormatError(
-            header.path,
-            f"is cut short: its header promises {least:,} bytes and it has {actual:,}; "
-            f"{whole:,} of {promised:,} Gaussians are whole; get the file again",
-        )
+        vertex = header.vertex
+        room = (actual - header.start_of(vertex)) // max(1, vertex.stride)
+        what = f"its header promises {least:,} bytes and it has {actual:,}"
+        whole = f"{max(0, min(vertex.count, room)):,} of {vertex.count:,} Gaussians are whole"
+        raise FormatError(header.path, f"is cut short: {what}; {whole}; get the file again")
     if actual > least and not any(e.lists for e in header.elements):
-        raise FormatError(
-            header.path,
-            f"has {actual - least:,} bytes more than the {least:,} its header promises; "
-            "it is damaged or was padded, cut it to that size if you trust it",
-        )
-
-
-def _whole_rows(header: Header, actual: int) -> int:
-    before = header.elements[: header.elements.index(header.vertex)]
-    room = actual - header.size - sum(e.least_size for e in before)
-    return max(0, min(header.vertex.count, room // max(1, header.vertex.stride)))
+        what = f"has {actual - least:,} bytes more than the {least:,} its header promises"
+        raise FormatError(header.path, f"{what}; it is damaged or was padded, cut it to that size if you trust it")
 
 
 def _keyword(line: str) -> str:
@@ -256,8 +235,8 @@ def _comment(line: str) -> str:
     return line.strip()[len("comment") :].strip()
 
 
-def _text(lines: Iterable[str], newline: str) -> str:
-    return "".join(line + newline for line in lines)
+def _content(lines: Iterable[str], newline: str) -> bytes:
+    return "".join(line + newline for line in lines).encode(BYTES)
 
 
 def _count(path: str, name: str, count: str) -> int:
@@ -272,22 +251,19 @@ def _property(words: list[str]) -> Property | None:
             return Property(name, CODES[kind], CODES[length])
         case [kind, name] if kind in CODES:
             return Property(name, CODES[kind])
-    return None
 
 
 def _coding(path: str, formats: list[list[str]]) -> str:
-    match formats:
-        case [[("binary_little_endian" | "binary_big_endian" | "ascii") as coding, "1.0"]]:
+    for coding in (LITTLE, BIG, TEXT):
+        if formats == [[coding, "1.0"]]:
             return coding
     found = " and ".join(" ".join(words)[:MAX_SHOWN] for words in formats) or "none"
     raise FormatError(path, f"its format is {found}; known are {LITTLE}, {BIG} and {TEXT}, each 1.0")
 
 
 def _check_unique(path: str, elements: list[Element]) -> None:
-    names = [("element", e.name) for e in elements]
-    names += [(f"property of {e.name}", name) for e in elements for name in e.names]
-    seen: set[tuple[str, str]] = set()
-    for kind, name in names:
-        if (kind, name) in seen:
-            raise FormatError(path, f"{kind} {name!r} is declared twice")
-        seen.add((kind, name))
+    names = [f"element {e.name!r}" for e in elements]
+    names += [f"property of {e.name} {name!r}" for e in elements for name in e.names]
+    for name, times in Counter(names).items():
+        if times > 1:
+            raise FormatError(path, f"{name} is declared twice")

@@ -44,7 +44,7 @@ class Meaning:
 
 def meaning(header: Header, compressed: bool = False) -> Meaning:
     """Read the header's tags; `compressed`: the columns are packed and say nothing about scales."""
-    records = [_record(header.path, m[1]) for m in _matches(header, RECORD)]
+    records = [_record(header.path, words) for words in _found(header, RECORD)]
     fused = tuple(
         Fusion(record["fused"], {k: v for k, v in record.items() if k not in ("fused", "convention")})
         for record in records
@@ -55,7 +55,10 @@ def meaning(header: Header, compressed: bool = False) -> Meaning:
     flat = two or bool(mode and mode.lower() == FLAT)
     recorded = [record["convention"] for record in records if "convention" in record]
     if recorded:
-        convention = _convention(header.path, recorded[-1])
+        if recorded[-1] not in CONVENTIONS:
+            known = ", ".join(CONVENTIONS)
+            raise FormatError(header.path, f"its aaplug comment has convention={recorded[-1]}; known are {known}")
+        convention = CONVENTIONS[recorded[-1]]
         return Meaning(convention, f"aaplug's record in the file: {convention.name}", fused, flat)
     return Meaning(*_from_others(header, mode, two), fused, flat)
 
@@ -63,7 +66,8 @@ def meaning(header: Header, compressed: bool = False) -> Meaning:
 def stating(header: Header, read: Header | None, convention: Convention, fused: tuple[Fusion, ...]) -> Header:
     """The header with tags for this convention and these fusions; unchanged if both it and `read` already say so."""
     assert convention in CONVENTIONS.values(), convention
-    if read and _said(read) == _said(header) == (convention, fused):
+    said = [(m.convention, m.fused) for m in (meaning(each) for each in (header, read) if each)]
+    if read and all(each == (convention, fused) for each in said):
         return header
     header = header.without_comments(RECORD.fullmatch)
     if convention.compensated:
@@ -76,17 +80,12 @@ def stating(header: Header, read: Header | None, convention: Convention, fused: 
     return header
 
 
-def _said(header: Header) -> tuple[Convention, tuple[Fusion, ...]]:
-    said = meaning(header)
-    return said.convention, said.fused
-
-
 def _from_others(header: Header, mode: str | None, two: bool) -> tuple[Convention, str]:
     postshot = _last(header, POSTSHOT)
     if FILTER_COLUMN in header.vertex.names:
         return MIP, f"column {FILTER_COLUMN} in the file: Mip-Splatting, not yet fused"
     if mode is not None and mode.lower() == FLAT:
-        return (CLASSIC, f"tag in the file, SplatRenderMode: {mode}: 2D Gaussians, treated as classic")
+        return CLASSIC, f"tag in the file, SplatRenderMode: {mode}: 2D Gaussians, treated as classic"
     if mode is None and two:
         return CLASSIC, "two scales in the file: 2D Gaussians (2DGS), treated as classic"
     if mode is not None and mode.lower() in MODES:
@@ -110,13 +109,12 @@ def _is_tag(comment: str) -> bool:
     return bool(RENDER_MODE.fullmatch(comment) or POSTSHOT.fullmatch(comment))
 
 
-def _matches(header: Header, pattern: re.Pattern[str]) -> list[re.Match[str]]:
-    return [m for comment in header.comments if (m := pattern.fullmatch(comment))]
+def _found(header: Header, pattern: re.Pattern[str]) -> list[str]:
+    return [m[1] for comment in header.comments if (m := pattern.fullmatch(comment))]
 
 
 def _last(header: Header, pattern: re.Pattern[str]) -> str | None:
-    found = _matches(header, pattern)
-    return found[-1][1] if found else None
+    return (_found(header, pattern) or [None])[-1]
 
 
 def _record(path: str, words: str) -> dict[str, str]:
@@ -125,13 +123,6 @@ def _record(path: str, words: str) -> dict[str, str]:
         if not (key and equals and value):
             raise FormatError(path, f"comment 'aaplug {words}' is damaged: expected key=value pairs")
     return {key: value for key, _, value in pairs}
-
-
-def _convention(path: str, name: str) -> Convention:
-    if name not in CONVENTIONS:
-        known = ", ".join(CONVENTIONS)
-        raise FormatError(path, f"its aaplug comment has convention={name}; known are {known}")
-    return CONVENTIONS[name]
 
 
 def _fused_line(fusion: Fusion, convention: Convention) -> str:

@@ -9,6 +9,7 @@ import pickle
 import re
 import warnings
 import zipfile
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -38,9 +39,8 @@ def sniff(path: Path, head: bytes) -> bool:
 def open_scene(path: Path, options: Options) -> SceneFile:
     """See `SceneFormat`."""
     if not options.allow_checkpoint:
-        raise FormatError(
-            path, "is a training checkpoint (a pickle); pass `allow_checkpoint` to read it, or export it as .ply"
-        )
+        what = "is a training checkpoint (a pickle)"
+        raise FormatError(path, f"{what}; pass `allow_checkpoint` to read it, or export it as .ply")
     found = re.match(r"(\d+)\.(\d+)", torch.__version__)
     if found is None or (int(found[1]), int(found[2])) < SAFE_TORCH:
         raise FormatError(path, f"needs torch 2.10 or newer to be read safely; this is {torch.__version__}")
@@ -50,9 +50,10 @@ def open_scene(path: Path, options: Options) -> SceneFile:
         splats = _splats(path, _load(path))
     count = len(splats["means"])
     check_count(path, count)
-    tensors = {key: _checked(path, splats, key, count, size) for key in splats}
-    degree = DEGREES[3 * tensors["shN"].shape[1]]
-    return SceneFile(path, name, count, degree, lambda start, stop: _rows(tensors, start, stop), EVIDENCE)
+    for key, tensor in splats.items():
+        _check(path, key, tensor, count, size)
+    degree = DEGREES[3 * splats["shN"].shape[1]]
+    return SceneFile(path, name, count, degree, partial(_rows, splats), EVIDENCE)
 
 
 def _check_archive(path: Path, size: int) -> None:
@@ -68,8 +69,7 @@ def _check_archive(path: Path, size: int) -> None:
 def _load(path: Path) -> Any:
     """Tensors and plain containers of them.  torch's own error would advise loading everything else too."""
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # torch's, about a damaged pickle
+        with warnings.catch_warnings(action="ignore"):  # torch's, about a damaged pickle
             return torch.load(path, "cpu", weights_only=True, mmap=True)
     except pickle.UnpicklingError as error:
         raise FormatError(path, "is damaged, or holds more than tensors; nothing of it was run") from error
@@ -88,8 +88,7 @@ def _splats(path: Path, document: Any) -> dict[str, Tensor]:
     return {**{key: splats[key] for key in SHAPES}, "shN": rest}
 
 
-def _checked(path: Path, splats: dict[str, Tensor], key: str, count: int, size: int) -> Tensor:
-    tensor = splats[key]
+def _check(path: Path, key: str, tensor: Tensor, count: int, size: int) -> None:
     if key in SHAPES:
         fits = tensor.shape[1:] == SHAPES[key]
     else:
@@ -100,15 +99,9 @@ def _checked(path: Path, splats: dict[str, Tensor], key: str, count: int, size: 
         raise FormatError(path, f"{key} is {kind}, for {count:,} Gaussians")
     if tensor.numel() * tensor.element_size() > size:
         raise FormatError(path, f"{key} has {tensor.numel():,} values, more than the file holds")
-    return tensor
 
 
 def _rows(tensors: dict[str, Tensor], start: int, stop: int) -> Gaussians:
     parts = {key: tensor[start:stop].detach().float().clone() for key, tensor in tensors.items()}
-    return Gaussians(
-        parts["means"],
-        parts["quats"],
-        parts["scales"],
-        parts["opacities"],
-        torch.cat([parts["sh0"], parts["shN"]], dim=1),
-    )
+    means, quats, scales, opacities = (parts[key] for key in ("means", "quats", "scales", "opacities"))
+    return Gaussians(means, quats, scales, opacities, torch.cat([parts["sh0"], parts["shN"]], dim=1))

@@ -7,7 +7,7 @@ A format decodes rows; this module checks their values, reports unusable ones, a
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +38,12 @@ class Fault:
     text: str
     rows: Bool[Tensor, " n"]
 
+    def described(self, numbers: Tensor) -> str:
+        """The fault with the first of its rows, whose numbers in the file are given."""
+        bad = numbers[self.rows]
+        more = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
+        return f"row {int(bad[0])}{more} has {self.text}"
+
 
 @dataclass(frozen=True)
 class SceneFile:
@@ -60,7 +66,7 @@ class SceneFile:
     fused: tuple[Fusion, ...] = ()
     flat: bool = False
     document: Any = None
-    notes: tuple[str, ...] = field(default=())
+    notes: tuple[str, ...] = ()
 
     def stated(self, convention: Convention | None) -> "SceneFile":
         """The same file with another convention, stated by the user; unchanged for None."""
@@ -96,7 +102,7 @@ class SceneFile:
             yield part if bad is None else part[~bad]
         if left_out and found is None:
             counts = listing([f"{text}: {number:,}" for text, number in dropped.items()])
-            log.warning("%s: left out %d of %d Gaussians (%s)", self.path, left_out, self.count, counts)  # fmt: skip
+            log.warning("%s: left out %d of %d Gaussians (%s)", self.path, left_out, self.count, counts)
 
     def whole(self, drop_bad: bool = False) -> Gaussians:
         """The whole scene.
@@ -104,11 +110,6 @@ class SceneFile:
         Raises:
             FormatError: it cannot be used, or takes more than the limit MEMORY_SHARE of the machine's memory.
         """
-        self._check_memory()
-        (scene,) = self.parts(drop_bad, max(1, self.count))
-        return scene
-
-    def _check_memory(self) -> None:
         needed = self.count * FLOAT * (11 + 3 * (self.sh_degree + 1) ** 2)
         memory, share = memory_of_machine(), limit("MEMORY_SHARE")
         if memory is not None and needed > share * memory:
@@ -117,6 +118,8 @@ class SceneFile:
                 f"its {self.count:,} Gaussians take {needed / 1e9:.1f} GB, more than {share:.0%} of this machine's "
                 f"{memory / 1e9:.0f} GB; info and convert read it in parts, AAPLUG_MEMORY_SHARE=1 allows all",
             )
+        (scene,) = self.parts(drop_bad, max(1, self.count))
+        return scene
 
 
 @contextmanager
@@ -137,11 +140,7 @@ def library_errors(path: Path) -> Iterator[None]:
 
 
 def read_rows(path: Path, dtype: np.dtype, start: int, stop: int, offset: int = 0) -> np.ndarray:
-    """The rows from start up to stop of a table that begins at the byte `offset`.
-
-    Raises:
-        FormatError: the file cannot be read, or has become shorter.
-    """
+    """The rows from start up to stop of a table that begins at the byte `offset`."""
     with library_errors(path):
         rows = np.fromfile(path, dtype, stop - start, offset=offset + start * dtype.itemsize)
     if len(rows) != stop - start:
@@ -150,52 +149,28 @@ def read_rows(path: Path, dtype: np.dtype, start: int, stop: int, offset: int = 
 
 
 def check_count(path: Path, count: int) -> None:
-    """Refuse a scene of more Gaussians than the limit GAUSSIANS.
-
-    Raises:
-        FormatError: it has more.
-    """
+    """Refuse a scene of more Gaussians than the limit GAUSSIANS."""
     most = whole_limit("GAUSSIANS")
     if count > most:
         raise FormatError(path, f"holds {count:,} Gaussians and the limit is {most:,}; AAPLUG_GAUSSIANS raises it")
 
 
-def empty(n: int, degree: int, filtered: bool = False, flat: bool = False) -> Gaussians:
-    """n Gaussians with uninitialized values, to be filled; flat ones have no thickness."""
-    return Gaussians(
-        means=torch.empty(n, 3),
-        quats=torch.empty(n, 4),
-        log_scales=torch.full((n, 3), -MAX_LOG_SCALE),
-        logit_opacities=torch.empty(n),
-        sh=torch.empty(n, (degree + 1) ** 2, 3),
-        filter_3d=torch.empty(n) if filtered else None,
-        flat=flat,
-    )
-
-
-def columns(scene: Gaussians) -> dict[str, Float[Tensor, " n"]]:
-    """A view of each parameter by its column's name in a .ply.
-
-    f_rest is channel-major: f_rest_(c·(k − 1) + j) is coefficient 1 + j of channel c.  A flat scene has two scales.
-    """
-    k = scene.sh.shape[1]
-    named = {axis: scene.means[:, i] for i, axis in enumerate("xyz")}
-    named |= {f"f_dc_{c}": scene.sh[:, 0, c] for c in range(3)}
-    named |= {f"f_rest_{c * (k - 1) + j}": scene.sh[:, 1 + j, c] for c in range(3) for j in range(k - 1)}
-    named |= {"opacity": scene.logit_opacities}
-    named |= {f"scale_{i}": scene.log_scales[:, i] for i in range(2 if scene.flat else 3)}
-    named |= {f"rot_{i}": scene.quats[:, i] for i in range(4)}
-    return named if scene.filter_3d is None else named | {FILTER_COLUMN: scene.filter_3d}
-
-
 def matrix_of(scene: Gaussians) -> tuple[list[str], Float[Tensor, "n p"]]:
-    """`columns` as names and one matrix, which is faster to write."""
+    """The parameters as columns of a .ply: their names, and a matrix.  A flat scene has two scales.
+
+    f_rest is channel-major: f_rest_(c·(k − 1) + j) is coefficient 1 + j of channel c.
+    """
     rest = scene.sh[:, 1:].transpose(1, 2).flatten(1)
     scales = scene.log_scales[:, : 2 if scene.flat else 3]
     parts = [scene.means, scene.sh[:, 0], rest, scene.logit_opacities[:, None], scales, scene.quats]
+    stems = {"f_dc": 3, "f_rest": rest.shape[1], "opacity": None, "scale": scales.shape[1], "rot": 4}
+    names = list("xyz")
+    for stem, number in stems.items():
+        names += [stem] if number is None else [f"{stem}_{i}" for i in range(number)]
     if scene.filter_3d is not None:
+        names.append(FILTER_COLUMN)
         parts.append(scene.filter_3d[:, None])
-    return list(columns(scene[:0])), torch.cat(parts, dim=1)
+    return names, torch.cat(parts, dim=1)
 
 
 def scene_of(names: Sequence[str], values: Float[Tensor, "n c"], degree: int, flat: bool) -> Gaussians:
@@ -237,10 +212,8 @@ def faults_of(scene: Gaussians) -> list[Fault]:
     A log-scale of -inf (no thickness) and a logit of +inf (opaque) are valid.
     """
     faults = []
-    suspects = {} if _finite(scene) else columns(scene)
-    for name, values in suspects.items():
-        if bool(values.isfinite().all()):
-            continue
+    names, matrix = ([], torch.empty(0, 0)) if _finite(scene) else matrix_of(scene)
+    for name, values in zip(names, matrix.T, strict=True):
         allowed = {"opacity": torch.inf, "scale": -torch.inf}.get(name.split("_")[0])
         infinite = values.isinf() if allowed is None else values.isinf() & (values != allowed)
         faults.append(Fault(f"NaN in {name}", values.isnan()))
@@ -268,14 +241,8 @@ def _check(part: Gaussians, path: Path, drop_bad: bool, dropped: dict[str, int])
         return None
     assert part.origin is not None
     if not drop_bad:
-        what = listing([_described(fault, part.origin.rows) for fault in faults])
+        what = listing([fault.described(part.origin.rows) for fault in faults])
         raise FormatError(path, f"{what}; pass `drop_bad` to leave such rows out")
     for fault in faults:
         dropped[fault.text] = dropped.get(fault.text, 0) + int(fault.rows.sum())
     return torch.stack([fault.rows for fault in faults]).any(dim=0)
-
-
-def _described(fault: Fault, rows: Tensor) -> str:
-    bad = rows[fault.rows]
-    more = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
-    return f"row {int(bad[0])}{more} has {fault.text}"

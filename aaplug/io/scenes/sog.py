@@ -13,6 +13,7 @@ import warnings
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ from aaplug.io.limits import whole_limit
 from aaplug.io.scenes.options import Options
 from aaplug.io.scenes.packed import byte_opacities, check_growth, floats, largest_last
 from aaplug.io.scenes.scene_file import SceneFile, check_count, library_errors
-from aaplug.io.values import Entry, Place, parse_json, read_bounded
+from aaplug.io.values import Entry, number, object_of, parse_json, read_bounded
 
 META = "meta.json"
 FILE = re.compile(r"[\w\-][\w\-.]{0,99}", re.ASCII)
@@ -45,11 +46,11 @@ Fetch = Callable[[str, int], bytes]
 
 @dataclass(frozen=True)
 class Part:
-    """An entry of meta.json, with its images as RGBA, a row per pixel."""
+    """An entry of meta.json, with its images as RGBA, a row per pixel, and the width of the first."""
 
     entry: Entry
     pixels: list[np.ndarray]
-    widths: list[int]
+    width: int
 
     def between(self, image: int, channels: int, rows: slice) -> Float[Tensor, "n c"]:
         """Version 1: bytes as fractions from mins to maxs."""
@@ -102,67 +103,46 @@ def _from_zip(path: Path, archive: zipfile.ZipFile, file: str, most: int) -> byt
 
 
 def _scene(path: Path, meta: Any, fetch: Fetch) -> SceneFile:
-    if not isinstance(meta, dict):
-        raise FormatError(path, "should be an object with means, scales, quats and sh0")
-    place = Place(path, META)
-    root = Entry(place, meta)
+    root = object_of(meta, path, META, "means, scales, quats and sh0")
     version = root.fields.get("version", 1)
     if version not in (1, 2) or (version == 2) != ("version" in meta):
-        raise place.wrong("version", "2, or left out", version)
+        raise root.place.wrong("version", "2, or left out", version)
     count = _count(root, version)
     check_count(path, count)
     used = [key for key in ("means", "quats", "scales", "sh0", "shN") if meta.get(key)]
     parts = {key: _part(path, root, key, count, fetch) for key in used}
     lacking = [key for key in ("means", "quats", "scales", "sh0") if key not in parts]
     if lacking:
-        raise place.error(f"{lacking[0]} is missing")
+        raise root.place.error(f"{lacking[0]} is missing")
     palette = _palette(parts["shN"], version) if "shN" in parts else torch.zeros(1, 0, 3)
     degree = round((palette.shape[1] + 1) ** 0.5) - 1
     convention, evidence, flat = _meaning(meta)
-    return SceneFile(
-        path,
-        name,
-        count,
-        degree,
-        lambda start, stop: _rows(parts, palette, version, flat, slice(start, stop)),
-        evidence,
-        convention,
-        flat=flat,
-        notes=(f"version {version}",),
-    )
+    load, notes = partial(_rows, parts, palette, version, flat), (f"version {version}",)
+    return SceneFile(path, name, count, degree, load, evidence, convention, flat=flat, notes=notes)
 
 
 def _count(root: Entry, version: int) -> int:
-    value = root.number("count") if version > 1 else _section(root, "means").fields.get("shape", [0])
-    number = value[0] if isinstance(value, list) and value else value
-    if not isinstance(number, int | float) or number < 0 or number != int(number):
-        raise root.place.wrong("count", "a whole number", number)
-    return int(number)
-
-
-def _section(root: Entry, key: str) -> Entry:
-    value = root.value(key)
-    if not isinstance(value, dict):
-        raise root.place.wrong(key, "an object", value)
-    return Entry(Place(root.place.file, key), value)
+    value = root.get("count", number) if version > 1 else root.entry("means").fields.get("shape", [0])
+    count = value[0] if isinstance(value, list) and value else value
+    if not isinstance(count, int | float) or count < 0 or count != int(count):
+        raise root.place.wrong("count", "a whole number", count)
+    return int(count)
 
 
 def _part(path: Path, root: Entry, key: str, count: int, fetch: Fetch) -> Part:
-    entry = _section(root, key)
+    entry = root.entry(key)
     files = entry.value("files")
     wanted = 2 if key in ("means", "shN") else 1
     if not isinstance(files, list) or len(files) != wanted:
         raise entry.place.wrong("files", f"{wanted} names", files)
-    pixels, widths = [], []
+    images = []
     for index, file in enumerate(files):
         if not isinstance(file, str) or not FILE.fullmatch(file):
             raise entry.place.wrong("files", "names of plain files beside meta.json", file)
         palette = key == "shN" and index == 0
         noisy = key == "means" and index == 0  # low bytes do not compress: the size tells the count
-        rgba, width = _image(path, file, fetch, None if palette else count, noisy)
-        pixels.append(rgba)
-        widths.append(width)
-    return Part(entry, pixels, widths)
+        images.append(_image(path, file, fetch, None if palette else count, noisy))
+    return Part(entry, [pixels for pixels, _ in images], images[0][1])
 
 
 def _image(path: Path, file: str, fetch: Fetch, count: int | None, noisy: bool) -> tuple[np.ndarray, int]:
@@ -171,13 +151,12 @@ def _image(path: Path, file: str, fetch: Fetch, count: int | None, noisy: bool) 
     data = fetch(file, IMAGE_MEMORY * most + whole_limit("SLACK"))
     if noisy:
         check_growth(path, IMAGE_MEMORY * (count or 0), len(data))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # Pillow's, about large images; the check below is stricter
-        with Image.open(io.BytesIO(data), formats=["WEBP"]) as image:
-            width, height = image.size
-            if width * height > most or width * height < (count or 1):
-                raise FormatError(path, f"{file} has {width}x{height} px, and {count or most:,} are wanted")
-            return np.asarray(image.convert("RGBA")).reshape(-1, 4), width
+    # Pillow warns about large images; the check below is stricter
+    with warnings.catch_warnings(action="ignore"), Image.open(io.BytesIO(data), formats=["WEBP"]) as image:
+        width, height = image.size
+        if width * height > most or width * height < (count or 1):
+            raise FormatError(path, f"{file} has {width}x{height} px, and {count or most:,} are wanted")
+        return np.asarray(image.convert("RGBA")).reshape(-1, 4), width
 
 
 def _meaning(meta: dict[str, Any]) -> tuple[Convention, str, bool]:
@@ -194,18 +173,21 @@ def _meaning(meta: dict[str, Any]) -> tuple[Convention, str, bool]:
 
 def _palette(part: Part, version: int) -> Float[Tensor, "p c 3"]:
     """The harmonics that labels index."""
-    width = part.widths[0]
+    width = part.width
     coefficients = {3: 3, 8: 8, 15: 15}.get(width // PALETTE_ROW)
     if coefficients is None or width % PALETTE_ROW:
         raise part.entry.place.error(f"the palette's image is {width} px wide; 192, 512 or 960 expected")
     pixels = part.pixels[0][:, :3].reshape(-1, coefficients, 3)
     if version > 1:
         return part.codebook[torch.from_numpy(pixels.astype(np.int64))]
-    low, high = part.entry.number("mins"), part.entry.number("maxs")
+    low, high = (part.entry.get(key, number) for key in ("mins", "maxs"))
     return floats(pixels) / 255 * (high - low) + low
 
 
-def _rows(parts: dict[str, Part], palette: Float[Tensor, "p c 3"], version: int, flat: bool, rows: slice) -> Gaussians:
+def _rows(
+    parts: dict[str, Part], palette: Float[Tensor, "p c 3"], version: int, flat: bool, start: int, stop: int
+) -> Gaussians:
+    rows = slice(start, stop)
     means, quats, scales, sh0 = (parts[key] for key in ("means", "quats", "scales", "sh0"))
     alpha = sh0.pixels[0][rows, 3]
     if version > 1:

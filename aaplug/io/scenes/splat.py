@@ -36,9 +36,8 @@ def open_scene(path: Path, options: Options) -> SceneFile:
     with library_errors(path):
         size = path.stat().st_size
     if size % RECORD.itemsize:
-        raise FormatError(
-            path, f"has {size:,} bytes, which is not a multiple of {RECORD.itemsize}; it is cut short or not a .splat"
-        )  # fmt: skip
+        what = f"has {size:,} bytes, which is not a multiple of {RECORD.itemsize}"
+        raise FormatError(path, f"{what}; it is cut short or not a .splat")
     count = size // RECORD.itemsize
     check_count(path, count)
     return SceneFile(path, name, count, 0, lambda a, b: _rows(path, a, b), EVIDENCE)
@@ -47,20 +46,15 @@ def open_scene(path: Path, options: Options) -> SceneFile:
 def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: Options) -> None:
     """Write a scene part by part; harmonics above degree 0 and the convention are lost."""
     with replacing(path, overwrite) as stream:
-        for part in parts:
-            stream.write(_records(part).tobytes())
+        stream.writelines(_records(part).tobytes() for part in parts)
 
 
 def _rows(path: Path, start: int, stop: int) -> Gaussians:
     records = read_rows(path, RECORD, start, stop)
     rgba = records["rgba"]
-    return Gaussians(
-        floats(records["means"]),
-        (floats(records["quats"]) - ZERO) / ZERO,
-        floats(records["scales"]).log(),
-        byte_opacities(rgba[:, 3]),
-        sh_of_colour(floats(rgba[:, :3]) / 255)[:, None],
-    )
+    means, quats = floats(records["means"]), (floats(records["quats"]) - ZERO) / ZERO
+    sh = sh_of_colour(floats(rgba[:, :3]) / 255)[:, None]
+    return Gaussians(means, quats, floats(records["scales"]).log(), byte_opacities(rgba[:, 3]), sh)
 
 
 def _records(scene: Gaussians) -> np.ndarray:

@@ -5,11 +5,18 @@ Then sections, each for all Gaussians: positions (3 × 24-bit fixed point; float
 log-scales, quaternions, harmonics, mostly a byte per number.  Versions 1 to 3 are one gzip stream; version 4 has a
 longer header, a table of sizes, and a zstd stream per section.  Axes are x right, y up, z back; a scene here has y down
 and z forward.  Flag 1: trained with antialiasing; the file does not say with which kernel.
+
+gsply (the extra `spz`) writes version 3, which every reader of the format knows.  It packs the numbers; this module
+adds the axes, the flag, and as many bits of a position's fraction as the scene allows.
 """
 
+import gzip
+import math
 import struct
-from collections.abc import Iterable
+import tempfile
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,13 +24,21 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.errors import FormatError
+from aaplug.core.errors import FormatError, OutputError
 from aaplug.core.gaussians import ANTIALIASED, CLASSIC, Gaussians
+from aaplug.io.atomic import replacing
+from aaplug.io.limits import whole_limit
 from aaplug.io.scenes.options import Options
-from aaplug.io.scenes.packed import byte_opacities, check_growth, floats, gunzip, gunzip_start, largest_last, unzstd
+from aaplug.io.scenes.packed import (
+    byte_opacities,
+    check_growth,
+    floats,
+    gunzip,
+    half_turn_about_x,
+    largest_last,
+    unzstd,
+)
 from aaplug.io.scenes.scene_file import SceneFile, check_count, library_errors
-from aaplug.io.scenes.spz_writer import ANTIALIASED_FLAG, TURNS
-from aaplug.io.scenes.spz_writer import write as write
 
 MAGIC = b"NGSP"
 GZIP = b"\x1f\x8b"
@@ -36,6 +51,16 @@ MAX_FRACTION = 24  # bits of a position
 COLOUR_GAIN = 0.15  # stored colour over the harmonic of degree 0
 SCALE_STEPS, SCALE_LEAST = 16.0, -10.0  # log-scales: steps per unit, and the smallest
 MAGNITUDE = 511  # 9 bits of a quaternion's component; the tenth is its sign
+WRITTEN = 3  # version
+MOST_GAUSSIANS = 10_000_000  # accepted by readers of versions before 4 (nianticlabs/spz)
+MOST_DEGREE = 3  # of harmonics that gsply writes
+POSITION_BITS = 23  # of a position's fixed-point number, beside its sign
+MOST_FRACTION = 20  # bits: a millionth of a unit
+FLAGS = 14  # byte of the header
+ANTIALIASED_FLAG = 1
+MAX_LOGIT = 30.0  # in float32 its opacity is 1
+# between the axes of the file and OpenCV's, in both directions
+TURNS: Mapping[str, Callable[[Gaussians], Gaussians]] = {"opengl": half_turn_about_x, "opencv": lambda scene: scene}
 AXES_NOTES = {
     "opengl": "axes turned from OpenGL's to OpenCV's, by the specification "
     "(`spz_axes` opencv if the writer did not turn them, as splat-transform and gsply)",
@@ -73,38 +98,29 @@ def open_scene(path: Path, options: Options) -> SceneFile:
     """Decompress a scene; see `SceneFormat`."""
     with library_errors(path):
         header, sections = _sections(path)
-    turn = TURNS[options.spz_axes]
-    antialiased = bool(header.flags & ANTIALIASED_FLAG)
-    evidence = "the flag antialiased is not set: assumed classic"
-    if antialiased:
+    convention, evidence = CLASSIC, "the flag antialiased is not set: assumed classic"
+    if header.flags & ANTIALIASED_FLAG:
+        convention = ANTIALIASED
         evidence = "the flag antialiased is set; its kernel is not recorded, 0.3 px² assumed"
-    return SceneFile(
-        path,
-        name,
-        header.count,
-        header.degree,
-        lambda start, stop: turn(_rows(header, [s[start:stop] for s in sections])),
-        evidence,
-        ANTIALIASED if antialiased else CLASSIC,
-        notes=(f"version {header.version}; {AXES_NOTES[options.spz_axes]}",),
-    )
+    load = partial(_rows, header, sections, TURNS[options.spz_axes])
+    notes = (f"version {header.version}; {AXES_NOTES[options.spz_axes]}",)
+    return SceneFile(path, name, header.count, header.degree, load, evidence, convention, notes=notes)
 
 
 def _sections(path: Path) -> tuple[Header, list[np.ndarray]]:
     data = path.read_bytes()
     zipped = data.startswith(GZIP)
-    start = gunzip_start(data, HEADER.size) if zipped else data[: HEADER.size]
-    header = _header(path, start)
+    header = _header(path, gunzip(data, HEADER.size) if zipped else data[: HEADER.size])
     sizes = [width * header.count for width in header.widths]
     if header.version >= STREAMS:
         if zipped:
             raise FormatError(path, f"version {header.version} should not be one gzip stream")
         parts: Iterable[bytes] = _streams(path, data, sizes)
     else:
-        parts = _split(_payload(path, data, sum(sizes), zipped), sizes)
-    arrays = [np.frombuffer(part, np.uint8) for part in parts]
-    shaped = zip(arrays, header.widths, strict=True)
-    return header, [array.reshape(header.count, width) for array, width in shaped]
+        payload, ends = _payload(path, data, sum(sizes), zipped), np.cumsum(sizes).tolist()
+        parts = (payload[end - size : end] for size, end in zip(sizes, ends, strict=True))
+    shaped = zip(parts, header.widths, strict=True)
+    return header, [np.frombuffer(part, np.uint8).reshape(header.count, width) for part, width in shaped]
 
 
 def _header(path: Path, data: bytes) -> Header:
@@ -123,17 +139,14 @@ def _payload(path: Path, data: bytes, size: int, zipped: bool) -> bytes:
     whole = HEADER.size + size
     if zipped:
         check_growth(path, whole, len(data))
-        return gunzip(data, whole, path)[HEADER.size :]
+        inflated = gunzip(data, whole + (slack := whole_limit("SLACK")) + 1)
+        if not whole <= len(inflated) <= whole + slack:  # a few bytes more are accepted
+            many = "more than " * (len(inflated) > whole + slack)
+            raise FormatError(path, f"inflates to {many}{len(inflated):,} bytes where its header promises {whole:,}")
+        return inflated[HEADER.size :]
     if len(data) < whole:
         raise FormatError(path, f"is cut short: {whole:,} bytes promised, {len(data):,} there")
     return data[HEADER.size :]
-
-
-def _split(payload: bytes, sizes: list[int]) -> Iterable[bytes]:
-    at = 0
-    for size in sizes:
-        yield payload[at : at + size]
-        at += size
 
 
 def _streams(path: Path, data: bytes, sizes: list[int]) -> Iterable[bytes]:
@@ -144,9 +157,8 @@ def _streams(path: Path, data: bytes, sizes: list[int]) -> Iterable[bytes]:
     wanted = sum(size > 0 for size in sizes)
     at = table + number * STREAM.size
     if number != wanted or table < HEADER_4.size or at > len(data):
-        raise FormatError(
-            path, f"has {number} streams listed at byte {table:,}; {wanted} and a place within the file expected"
-        )
+        what = f"has {number} streams listed at byte {table:,}"
+        raise FormatError(path, f"{what}; {wanted} and a place within the file expected")
     check_growth(path, sum(sizes), len(data))
     listed = iter(STREAM.unpack_from(data, table + i * STREAM.size) for i in range(number))
     for size in sizes:
@@ -155,28 +167,23 @@ def _streams(path: Path, data: bytes, sizes: list[int]) -> Iterable[bytes]:
             continue
         compressed, inflated = next(listed)
         if inflated != size or at + compressed > len(data):
-            raise FormatError(
-                path,
-                f"lists a stream of {compressed:,} bytes for {inflated:,}; {size:,} expected, "
-                f"and {len(data) - at:,} bytes are left",
-            )
+            what = f"lists a stream of {compressed:,} bytes for {inflated:,}"
+            raise FormatError(path, f"{what}; {size:,} expected, and {len(data) - at:,} bytes are left")
         yield unzstd(data[at : at + compressed], size, path)
         at += compressed
 
 
-def _rows(header: Header, sections: list[np.ndarray]) -> Gaussians:
-    positions, alphas, colours, scales, quats, harmonics = sections
+def _rows(
+    header: Header, sections: list[np.ndarray], turn: Callable[[Gaussians], Gaussians], start: int, stop: int
+) -> Gaussians:
+    positions, alphas, colours, scales, quats, harmonics = (section[start:stop] for section in sections)
     n, k = len(positions), (header.degree + 1) ** 2
     sh = torch.zeros(n, k, 3)
     sh[:, 0] = (floats(colours) / 255 - 0.5) / COLOUR_GAIN
     sh[:, 1:] = (floats(harmonics.reshape(n, k - 1, 3)) - 128) / 128
-    return Gaussians(
-        _positions(header, positions),
-        _threes(quats) if header.version >= THREES else _first_three(quats),
-        floats(scales) / SCALE_STEPS + SCALE_LEAST,
-        byte_opacities(alphas[:, 0]),
-        sh,
-    )
+    unit = _threes(quats) if header.version >= THREES else _first_three(quats)
+    log_scales = floats(scales) / SCALE_STEPS + SCALE_LEAST
+    return turn(Gaussians(_positions(header, positions), unit, log_scales, byte_opacities(alphas[:, 0]), sh))
 
 
 def _positions(header: Header, data: np.ndarray) -> Float[Tensor, "n 3"]:
@@ -201,3 +208,61 @@ def _threes(data: np.ndarray) -> Float[Tensor, "n 4"]:
     rest = floats(np.stack(parts, axis=1)) / MAGNITUDE / 2**0.5
     xyzw = largest_last(rest, torch.from_numpy(words >> 30))
     return xyzw[:, [3, 0, 1, 2]]
+
+
+def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: Options) -> None:
+    """Write a scene, with values rounded to the format's steps."""
+    turn = TURNS[options.spz_axes]
+    scenes = [turn(_checked(path, part)) for part in parts]
+    content = _packed(path, scenes)
+    with replacing(path, overwrite) as stream:
+        stream.write(content)
+
+
+def _checked(path: Path, part: Gaussians) -> Gaussians:
+    """The part; refuses what the format cannot hold."""
+    if part.flat:
+        raise OutputError(path, "cannot hold 2D Gaussians; write a .ply")
+    if part.filter_3d is not None:
+        raise OutputError(path, "cannot hold a filter_3D; aaplug convert fuses it")
+    if part.sh_degree > MOST_DEGREE:
+        degrees = f"up to degree {MOST_DEGREE}, not {part.sh_degree}"
+        raise OutputError(path, f"gsply writes harmonics {degrees}; write a .ply")
+    return part
+
+
+def _packed(path: Path, scenes: list[Gaussians]) -> bytes:
+    count = sum(map(len, scenes))
+    if count > MOST_GAUSSIANS:
+        raise OutputError(path, f"readers take {MOST_GAUSSIANS:,} Gaussians, not {count:,}; write a .ply")
+    from gsply.gsdata import GSData  # an optional package, and slow to import
+    from gsply.spz import write_spz
+
+    def column(values: Callable[[Gaussians], torch.Tensor]) -> np.ndarray:
+        return torch.cat([values(scene) for scene in scenes]).contiguous().numpy()
+
+    means = column(lambda s: s.means)
+    with library_errors(path), tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "scene.spz"
+        data = GSData.from_arrays(
+            means=means,
+            scales=column(lambda s: s.log_scales),
+            quats=column(lambda s: s.unit_quats),
+            opacities=column(lambda s: s.logit_opacities.clamp(-MAX_LOGIT, MAX_LOGIT)),
+            sh0=column(lambda s: s.sh[:, 0]),
+            shN=column(lambda s: s.sh[:, 1:]),
+            format="ply",
+        )
+        write_spz(file, data, version=WRITTEN, fractional_bits=_fraction(path, means))
+        content = bytearray(gzip.decompress(file.read_bytes()))
+    content[FLAGS] = ANTIALIASED_FLAG * scenes[0].convention.compensated
+    return gzip.compress(content, mtime=0)
+
+
+def _fraction(path: Path, means: np.ndarray) -> int:
+    """Bits of the fraction with which the farthest position still fits."""
+    farthest = float(np.abs(means).max(initial=0.0))
+    room = POSITION_BITS - math.frexp(farthest)[1] if farthest else MOST_FRACTION
+    if room < 1:
+        raise OutputError(path, f"cannot hold positions as far as {farthest:g} from the origin; write a .ply")
+    return min(room, MOST_FRACTION)

@@ -1,9 +1,7 @@
 """Compositors: other ways to turn alphas into light than 3DGS's product of transmittances."""
 
 from aaplug.core.interfaces import Compositor
-from aaplug.core.registry import Registry
+from aaplug.core.registry import Registry, named
 from aaplug.methods.compositors.window_blending import WindowBlending
 
-COMPOSITORS: Registry[Compositor] = Registry("compositor", {"window-blending": WindowBlending()})
-
-__all__ = ["COMPOSITORS", "WindowBlending"]
+COMPOSITORS: Registry[Compositor] = Registry("compositor", named([WindowBlending()]), Compositor)

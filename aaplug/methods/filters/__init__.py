@@ -13,7 +13,6 @@ from aaplug.methods.filters.smoothing import (
     AnisotropicSmoothing,
     FlatSmoothing,
     Smoothing3D,
-    StoredSmoothing,
     fuse_stored,
 )
 
@@ -25,10 +24,9 @@ WORLD_FILTERS: Registry[WorldFilter] = Registry(
         "smoothing3d-balanced": Smoothing3D(opacity="balanced"),
         "smoothing3d-anisotropic": AnisotropicSmoothing(),
         "flat": FlatSmoothing(),
-        "stored": StoredSmoothing(),
         "matched-energy": MatchedEnergy(),
     },
-    check=lambda value: isinstance(value, WorldFilter),
+    WorldFilter,
 )
 
 SCREEN_FILTERS: Registry[ScreenFilter] = Registry(
@@ -45,31 +43,7 @@ SCREEN_FILTERS: Registry[ScreenFilter] = Registry(
         "matched-sharpest": Matched("sharpest"),
         "matched-interval": Matched("interval"),
     },
-    check=lambda value: isinstance(value, ScreenFilter),
+    ScreenFilter,
 )
 
-SELECTIONS: Registry[Selection] = Registry(
-    "selection", {"pixel-size": ByPixelSize()}, check=lambda value: isinstance(value, Selection)
-)
-
-__all__ = [
-    "ADAPTIVE_VARIANCE",
-    "MATCHED_VARIANCE",
-    "NYQUIST_VARIANCE",
-    "PIXEL_VARIANCE",
-    "SCREEN_FILTERS",
-    "SELECTIONS",
-    "WORLD_FILTERS",
-    "Adaptive",
-    "AnisotropicSmoothing",
-    "ByPixelSize",
-    "Dilation",
-    "FlatSmoothing",
-    "LowPass",
-    "Matched",
-    "MatchedEnergy",
-    "RateReference",
-    "Smoothing3D",
-    "StoredSmoothing",
-    "fuse_stored",
-]
+SELECTIONS: Registry[Selection] = Registry("selection", {"pixel-size": ByPixelSize()}, Selection)

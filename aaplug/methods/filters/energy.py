@@ -1,12 +1,14 @@
-"""Matched energy: a scene for a viewer whose rule is not training's, in closed form.
+"""Matched energy: converts a scene, in closed form, for a viewer whose rule differs from training's.
 
-A viewer that adds K px² and compensates shows a splat with the energy o'·√det C', for any K.  Training showed o·√det(C
-+ 0.3 I) at the training rate (times its compensation, if it had one).  So every Gaussian is widened in the world by
-`variance`·(z/f)², with its median rate f/z, and o' is set to keep that energy, averaged in log space over training
-views.  With a variance of 0.2 and K = 0.1 a Mip viewer shows what `matched` shows with one sample, except where
-opacity reaches its bound and as far as the factor depends on the view.  For a viewer that does not compensate, the
-energy is o'·√det(C' + K).  A negative variance makes Gaussians thinner, for a viewer that blurs more than training
-did.  This form is aaplug's own.
+A splat's energy is its opacity times √det of its covariance.  A viewer that adds K px² and compensates shows
+o'·√det C', whatever K is; one that does not compensate shows o'·√det(C' + K I).  Training showed o·√det(C + 0.3 I) at
+the training rate, times its compensation if it had one.  So every Gaussian is widened in the world by the variance
+`variance` / ν², with ν its median training rate (px per world unit).  Its opacity is then multiplied by the ratio of
+the two energies, as a geometric mean over at most FIT_VIEWS training views.
+
+With a variance of 0.2, a Mip viewer (K = 0.1) shows every splat with the energy that `matched` gives it with one
+sample, except where opacity is capped or the ratio varies between views.  A negative variance narrows the Gaussians,
+for a viewer that blurs more than training did.  The method is aaplug's own.
 """
 
 from collections.abc import Sequence
@@ -23,9 +25,9 @@ from aaplug.core.projection import project
 from aaplug.core.sampling import median_rates, sampling_bounds
 from aaplug.core.training import TrainingViews
 
-MATCHED_VARIANCE = 0.2  # px² at the median training rate: 3DGS's 0.3 without the Mip viewer's 0.1
-MAX_FUSED_OPACITY = 0.9999  # energy may ask for an opacity above 1
-# px²: smallest variance that thinning leaves; no viewer shows the difference to less
+MATCHED_VARIANCE = 0.2  # px² at the median training rate: 3DGS's 0.3 minus the Mip viewer's 0.1
+MAX_FUSED_OPACITY = 0.9999  # cap: matching energy can demand an opacity above 1
+# px² at the median training rate: thinning stops here; below it no image changes visibly
 THINNEST = 0.01
 FIT_VIEWS = 25  # evenly spread training views over which the opacity factor is averaged
 
@@ -34,7 +36,7 @@ FIT_VIEWS = 25  # evenly spread training views over which the opacity factor is 
 class MatchedEnergy:
     """Widen the Gaussians and set opacities so that a viewer shows the energy that training showed.
 
-    variance: px² at the median training rate.  shown: the viewer's convention.
+    variance: px² at the median training rate.  shown: the convention that the viewer draws by.
     """
 
     variance: float = MATCHED_VARIANCE
@@ -53,7 +55,7 @@ class MatchedEnergy:
 
 
 def _widened(scene: Gaussians, rates: Float[Tensor, " n"], variance: float) -> Gaussians:
-    """Add `variance` px² to every axis; a negative one is subtracted, down to `THINNEST` or the axis's own variance."""
+    """Add `variance` px² to every axis; a negative one thins it to at least `THINNEST`, and leaves thinner axes."""
     if variance >= 0:
         log_sigma = 0.5 * torch.tensor(variance).log() - rates.log()
         return smoothed_by(scene, log_sigma.where(rates > 0, -torch.inf)[:, None], volume=False)
@@ -67,7 +69,7 @@ def _widened(scene: Gaussians, rates: Float[Tensor, " n"], variance: float) -> G
 def _mean_log_factor(
     scene: Gaussians, widened: Gaussians, views: Sequence[Camera], training: TrainingViews, shown: Convention
 ) -> Float[Tensor, " n"]:
-    """ln √(det trained / det shown), averaged over the views that see a Gaussian."""
+    """ln of (energy in training / energy in the viewer at unchanged opacity), averaged over the views that see it."""
     blur = 0.0 if shown.compensated else shown.kernel
     total = torch.zeros_like(scene.logit_opacities, dtype=torch.float64)
     count = torch.zeros_like(total)

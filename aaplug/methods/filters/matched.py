@@ -1,10 +1,11 @@
 """The matched screen filter: training's dilation at the new sampling rate, then the rest of the pixel's own filter.
 
-A classic checkpoint was fitted with 0.3 px² of dilation: what it should look like is C + 0.3 I at the training rate,
-and so C + 0.3 r² I at r times that rate.  Step one restores this, with training's compensation if it had one.  Below
-the training rate (r < 1) a pixel is larger than training's.  Step two then adds the part of the pixel's filter that
-training's pixel did not contain, 0.07 (1 - r²) px², and compensates for this step alone.  At r = 1 the result is
-training's own renderer.  With several samples per pixel, each sample is filtered as a pixel of the larger image.
+A classic checkpoint was fitted with 0.3 px² of dilation: in px of the training image it looks like C + 0.3 I.  At r
+times that sampling rate, where the projected covariance is C' = r² C, the same look is C' + 0.3 r² I.  Step one
+restores it, with training's compensation if it had one.  Below the training rate (r < 1) a pixel covers more of the
+scene than training's did.  Step two adds the part of its filter that training's pixel did not contain, 0.07 (1 - r²)
+px², and compensates for this step alone.  At r = 1 the result is training's own renderer.  With several samples per
+pixel, each sample is filtered as a pixel of the supersampled image.
 
 Design and measurements are aaplug's own.  Step one with one global rate is SA-GS's filter (Song et al., arXiv
 2403.19615).
@@ -28,30 +29,30 @@ from aaplug.core.training import TrainingViews
 # side hide less than their energies add up to, and a narrower filter offsets some of that (examples/guides/methods.md).
 PIXEL_VARIANCE = 0.07
 
-MAX_RISE = 1.2  # how far the reference of a receding view rises over its starting rate (examples/guides/methods.md)
-FULL_RISE_AT = 1 / 4  # share of the training rate at which a pose of the data set has risen by all of it
+MAX_RISE = 1.2  # largest factor by which "pose" raises the reference of a coarser view (examples/guides/methods.md)
+FULL_RISE_AT = 1 / 4  # relative rate at which the factor reaches MAX_RISE, at a pose of the data set
 
 RateReference = Literal["pose", "global", "sharpest", "interval"]
 
 
 @dataclass(frozen=True)
 class Matched:
-    """Match training's dilation at the new rate, then integrate over what is left of the pixel.
+    """Rescale training's dilation to the new rate, then filter by the part of the pixel that training's did not cover.
 
-    reference: the rate that a Gaussian's sampling rate is compared with.
-        "global": the view's own training size.  Equals training's renderer at every training view.
-        "sharpest": the highest rate of any training view.  One world-space blur for all views, which can be fused, but
-            thinner than most views were trained with.
-        "interval": the nearest rate in the range of the training views, widened by this pose's own rate at the training
-            size if it is a pose of the data set.  Equals training's renderer inside the range and adapts outside, for
-            cameras that move nearer or farther.
-        "pose": "global" at a pose of the data set, "interval" for a free camera.  When a view samples more coarsely
-            than that, the reference rises by up to `MAX_RISE`, but not above the sharpest, because far views added
-            blur of their own.  For a free camera it rises as fast as the rate falls; at a pose of the data set, so
-            that it has risen by all of it at `FULL_RISE_AT`.
-    pixel_variance: px² of the whole pixel's filter; 0 matches dilation alone.
-    windowed: for pixel kernels that average, set the window instead of blurring: √(1 - r²) px, so that its variance and
-        that of training's pixel add up to one pixel's; a point where r >= 1.
+    reference: the training rate that a splat's current rate is divided by, to give r.
+        "global": this view's rate at its training size.  Equals training's renderer at every training view.
+        "sharpest": the Gaussian's highest training rate.  The blur is then the same in the world for every view, so
+            it could be fused; it is thinner than what most views were trained with.
+        "interval": the current rate clamped to the Gaussian's range of training rates (at a data-set pose, the range
+            includes that pose's training rate).  Equals training's renderer inside the range.
+        "pose": "global" at a data-set pose, "interval" for a free camera.  Where a view samples more coarsely than
+            that, the reference is raised, by a factor of up to `MAX_RISE` and at most to the highest rate: training's
+            far views blurred in their own, larger pixels, and only their smallest blur belongs to the Gaussian.  For
+            a free camera the factor is (lowest rate / current rate); at a data-set pose it grows more slowly and
+            reaches `MAX_RISE` at `FULL_RISE_AT` of the training rate.
+    pixel_variance: variance of a pixel's filter, in px²; 0 rescales the dilation only.
+    windowed: for pixel kernels that average: instead of step two's blur, set `Splats2D.window` to √(1 - r²) px, with
+        r the view's own relative rate.  Its variance and that of training's pixel add up to one pixel's.  0 if r >= 1.
     """
 
     reference: RateReference = "pose"
@@ -81,7 +82,7 @@ class Matched:
         return replace(self, reference=cast(RateReference, reference))
 
     def rates(self, splats: Splats2D, camera: Camera, training: TrainingViews) -> Float[Tensor, " m"]:
-        """Sampling rate of each splat against its reference; the view's own for Gaussians that no camera saw."""
+        """Relative sampling rate r of each splat; the view's own r for Gaussians that no training camera saw."""
         view = torch.full_like(splats.depths, training.relative_rate(camera))
         if self.reference == "global":
             return view
@@ -103,7 +104,7 @@ class Trained(NamedTuple):
 
 
 def _trained(splats: Splats2D, camera: Camera, training: TrainingViews, seen: Bool[Tensor, " m"]) -> Trained:
-    """The bounds; 1 where no camera saw the Gaussian, so that nothing is divided by 0."""
+    """Training rates of each splat; bounds of 1 for Gaussians that no camera saw, only to avoid dividing by 0."""
     lowest, highest = (
         bound[splats.sources].to(splats.depths).where(seen, 1.0)
         for bound in (training.bounds.lowest, training.bounds.highest)
@@ -122,7 +123,7 @@ def _interval(now: Float[Tensor, " m"], trained: Trained) -> Float[Tensor, " m"]
 
 
 def _pose(now: Float[Tensor, " m"], trained: Trained) -> Float[Tensor, " m"]:
-    """The nearest rate in the range, raised where `now` is below it."""
+    """The pose's own training rate, or for a free camera the clamped current rate; raised where `now` is lower."""
     lowest, highest = _range(trained)
     if trained.own is None:
         low, high, speed = lowest, highest, 1.0

@@ -108,15 +108,6 @@ class FlatSmoothing:
         )
 
 
-@dataclass(frozen=True)
-class StoredSmoothing:
-    """Fuse the `filter_3D` column of a Mip-Splatting checkpoint; a scene without one does not change."""
-
-    def __call__(self, scene: Gaussians, training: TrainingViews) -> Gaussians:
-        """Fuse the stored standard deviations into scales and opacities, and drop the column."""
-        return fuse_stored(scene)
-
-
 def fuse_stored(scene: Gaussians) -> Gaussians:
     """The same scene with its stored 3D filter fused; unchanged if it has none (Mip-Splatting, fused export)."""
     if scene.filter_3d is None:

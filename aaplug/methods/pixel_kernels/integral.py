@@ -1,8 +1,9 @@
-"""Alpha averaged over the pixel along the splat's own axes: Analytic-Splatting (Liang et al. 2024, eqs. 8 to 11).
+"""Alpha averaged over the pixel: Analytic-Splatting (Liang et al. 2024, eqs. 8 to 11).
 
-The average is over a square of side `Splats2D.window`, turned to the splat's principal axes, where the Gaussian
-factors.  That the pixel itself is not turned is the paper's approximation.  `integral` uses the exact normal
-distribution, `logistic` the paper's approximation of it, for parity with its published figures.
+Along the splat's principal axes the Gaussian is a product, and its mean over an aligned square is the product of two
+one-dimensional means.  The paper therefore rotates the pixel's square, of side `Splats2D.window`, to these axes: an
+approximation, because the real pixel is not rotated.  "integral" uses the exact normal distribution function,
+"logistic" the paper's approximation of it, for parity with its published figures.
 """
 
 import math
@@ -22,8 +23,8 @@ from aaplug.methods.pixel_kernels.averages import logistic, mean_gaussian, mean_
 from aaplug.methods.pixel_kernels.raster_rows import COLUMNS, OPACITY, forms_at, rows_of
 
 HALF_U, HALF_V = COLUMNS, COLUMNS + 1  # half windows, in standard deviations
-NARROWEST = 1e-5  # px: a narrower window shows the value at a point, to ten digits
-THINNEST = 0.1  # px: narrowest window that the bounding ellipses allow for
+NARROWEST = 1e-5  # px: at this width the mean equals the value at the centre to ten digits
+THINNEST = 0.1  # px: bounding ellipses are grown as for a window at least this wide
 HALF_DIAGONAL = math.sqrt(0.5)  # of a unit square
 
 
@@ -31,7 +32,7 @@ HALF_DIAGONAL = math.sqrt(0.5)  # of a unit square
 class Integral:
     """Alpha is opacity times the product of two one-dimensional means.
 
-    mean: of the Gaussian over u ± h.  distribution: its cumulative distribution, for the exact twin.
+    mean: of exp(-x²/2) over u ± h.  distribution: the cumulative distribution function that `exact` uses.
     """
 
     name: str
@@ -42,7 +43,7 @@ class Integral:
     splats_per_pass: int = 8
 
     def bounding_ellipses(self, splats: Splats2D, rules: Rules) -> Splats2D | None:
-        """Ellipses that contain the centre of every pixel that touches the splat."""
+        """Ellipses that contain every pixel centre whose window, at any rotation, touches the cut-off ellipse."""
         return pixel_margin(splats, rules)
 
     def raster_rows(self, splats: Splats2D, kernels: Kernels) -> Float[Tensor, "m c"]:
@@ -59,7 +60,7 @@ class Integral:
         return torch.threshold(alpha, rules.below_min_alpha, 0.0)
 
     def exact(self, splats: Splats2D, offsets: Float[Tensor, "p c 2"]) -> Float[Tensor, "p c"]:
-        """2π σ₁ σ₂ times the probabilities of the window along each axis."""
+        """2π σ₁ σ₂ P₁ P₂ / window²: Pᵢ is the normal distribution's probability of the window along axis i."""
         values = torch.ones_like(offsets[..., 0])
         rows = principal_columns(splats.covs, splats.dets)
         for x, y in (rows[:2], rows[2:]):

@@ -1,9 +1,10 @@
 """The value at the pixel's centre: 3DGS's own pixel kernel (Kerbl et al. 2023, eq. 4).
 
-The forms of a raster row are scaled so that u² + v² = log2(e)/2 · dᵀ C⁻¹ d, and opacity is stored as its log2: alpha is
-2^(log2 o - u² - v²).
+u and v are the raster row's linear forms, scaled so that u² + v² = log2(e)/2 · dᵀ C⁻¹ d.  Opacity o is stored as log2:
+alpha is 2^(log2 o - u² - v²).
 
-The gradient of log alpha is summed over a tile's pixels inside the compiled loop, ten sums per splat.
+The backward pass reduces over a tile's pixels inside the compiled loop: seven sums of the gradient of log alpha and
+three of the colour gradient per splat.
 """
 
 import math
@@ -26,13 +27,13 @@ from aaplug.methods.pixel_kernels.raster_rows import (
     forms_at,
     offsets_at,
     splat_example,
-    with_silent_row,
+    with_padding_row,
 )
 
 HALF_LOG2_E = 0.5 * math.log2(math.e)
 LN_2 = math.log(2)
-LOG2_SILENT = -9.0  # log2 of an alpha below every cut-off; exp2 stops here, before it slows down in subnormals
-SQUARINGS = 3  # of exp2's polynomial: with degree 6 the relative error is 1e-6 in float32
+LOG2_PADDING = -9.0  # log2 alpha of the padding row, below every cut-off; clamped here to avoid slow subnormals
+SQUARINGS = 3  # 2^x is computed as p(x)^(2^SQUARINGS), p of degree DEGREE: relative error 1e-6 in float32
 DEGREE = 6
 
 
@@ -54,7 +55,7 @@ class Point:
         assert splats.rgb is not None
         columns = (splats.means, splats.covs, splats.dets, splats.opacities, splats.rgb)
         (rows,) = kernels.run(POINT_ROWS, *columns)
-        return with_silent_row(rows, LOG2_SILENT)
+        return with_padding_row(rows, LOG2_PADDING)
 
     def alpha(self, rows: Float[Tensor, "*n t c"], pixels: Pixels, rules: Rules) -> Float[Tensor, "*n t P"]:
         """2^(log2 o - u² - v²), 0 below the cut-off."""
@@ -70,10 +71,10 @@ class Point:
     def sums(
         self, moves: list[Move], colours: tuple[Tensor, Tensor, Tensor], T: Tensor, pixels: Pixels
     ) -> Float[Tensor, "t c_K"]:
-        """Sums over a tile's pixels that gradients are made of, ten per splat.
+        """Per splat, ten sums over the tile's pixels, from which `from_sums` makes the gradient of its raster row.
 
-        With s the gradient of log alpha: s·u and s·v times the offset in x and in y, s·u, s·v, s, and the weight times
-        the gradient of each colour.
+        With s the gradient of log alpha and (dx, dy) the offset from the splat, in px: s·u·dx, s·u·dy, s·v·dx, s·v·dy,
+        s·u, s·v, s, and the compositing weight times the gradient of red, green and blue.
         """
         if not torch.compiler.is_compiling():
             return _sums_by_products(moves, colours, pixels)
@@ -82,7 +83,7 @@ class Point:
             dx, dy = offsets_at(row, pixels)
             su, sv = (gradient * form for form in forms_at(row, pixels))
             red, green, blue = (weight * colour for colour in colours)
-            # both are 0 where T is; testing it shows the compiler that all sums belong in one loop
+            # no-op, as both are 0 where T is 0; the test on T makes the compiler fuse all sums into one loop
             gradient, red = (torch.where(T > 0, x, 0.0) for x in (gradient, red))
             sums += [su * dx, su * dy, sv * dx, sv * dy, su, sv, gradient, red, green, blue]
         return torch.cat([x.sum(dim=1, keepdim=True) for x in sums], dim=1)
@@ -109,9 +110,9 @@ def _point_rows(
 def _exp2_above_cutoff(exponent: Float[Tensor, "*n P L"], rules: Rules) -> Float[Tensor, "*n P L"]:
     """2^exponent, 0 below the cut-off.  Compiled it is a polynomial, because a call in a loop stops vectorization."""
     if torch.compiler.is_compiling():
-        root = _polynomial(torch.relu(exponent - LOG2_SILENT), ROOT_OF_EXP2)
+        root = _polynomial(torch.relu(exponent - LOG2_PADDING), ROOT_OF_EXP2)
         return torch.where(exponent >= rules.log2_min_alpha, _power(root, SQUARINGS), 0.0)
-    return torch.threshold(exponent.clamp(min=LOG2_SILENT).exp2_(), rules.below_min_alpha, 0.0)
+    return torch.threshold(exponent.clamp(min=LOG2_PADDING).exp2_(), rules.below_min_alpha, 0.0)
 
 
 def _polynomial(x: Tensor, coefficients: tuple[float, ...]) -> Tensor:
@@ -129,20 +130,20 @@ def _power(x: Tensor, squarings: int) -> Tensor:
 
 
 def _root_of_exp2(squarings: int, degree: int) -> tuple[float, ...]:
-    """Coefficients of a polynomial in h >= 0 whose repeated square is 2^(LOG2_SILENT + h), for exponents up to 0.
+    """Coefficients of p with p(h)^(2^squarings) ≈ 2^(LOG2_PADDING + h) for 0 <= h <= -LOG2_PADDING.
 
-    It interpolates at the Chebyshev nodes.
+    p interpolates at the Chebyshev nodes.
     """
     angles = math.pi * (torch.arange(degree + 1, dtype=torch.float64) + 0.5) / (degree + 1)
-    h = -LOG2_SILENT / 2 * (1 + angles.cos())
-    values = torch.exp2((LOG2_SILENT + h) / 2**squarings)
+    h = -LOG2_PADDING / 2 * (1 + angles.cos())
+    values = torch.exp2((LOG2_PADDING + h) / 2**squarings)
     return tuple(torch.linalg.solve(torch.linalg.vander(h), values).tolist())
 
 
 def _sums_by_products(
     moves: list[Move], colours: tuple[Tensor, Tensor, Tensor], pixels: Pixels
 ) -> Float[Tensor, "t c_K"]:
-    """The same sums as matrix products, for eager mode: from moments about the tile's middle, which keep all digits."""
+    """The same sums, for eager mode: matrix products of moments about the tile's centre, to keep precision."""
     rows, weights, gradients = (torch.stack(x, dim=1) for x in zip(*moves, strict=True))
     x, y = pixels.x - TILE / 2, pixels.y - TILE / 2
     monomials = torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y], dim=1)

@@ -1,13 +1,14 @@
 """Discs where rays meet them: 2DGS (Huang et al. 2024) and AA-2DGS (Younes et al., NeurIPS 2025).
 
-At its centre on the screen a disc has a covariance C.  With B a whitening of C, e = B d whitens the offset d.  Away
-from the centre perspective divides: with the depth slopes n, inverse depth falls by the factor w = 1 - n·d, and the ray
-meets the disc at s = e / w, in its standard deviations.  This is 2DGS's intersection (eq. 10) by the matrix inversion
-lemma; it needs two numbers more than a Gaussian on the screen.
+d: offset of a pixel from the disc's projected centre, in px.  C: covariance of the disc's linearised projection, in
+px².  B: a whitening of C, Bᵀ B = C⁻¹.  n: depth slopes, in 1/px.  Inverse depth on the disc's plane is linear in the
+pixel: w = 1 - n·d times that of the centre.  The ray meets the plane at s = B d / w, in standard deviations of the
+disc: 2DGS's intersection (eq. 10), by the Sherman-Morrison formula.  Beyond a 2D Gaussian it needs only n.
 
-"surfel" is 2DGS: exp(-ρ/2) with ρ = min(|s|², 2 |d|²/r²).  The second term is a low-pass filter of √½ px of training's
-pixels, whose size is r = `Splats2D.window`.  "surfel-mip" is AA-2DGS's object-space Mip filter: with
-J = ds/dd = (B + s nᵀ)/w and V = I + 0.1 J Jᵀ it is det V^-½ exp(-sᵀ V⁻¹ s/2).
+"surfel" is 2DGS: exp(-ρ/2) with ρ = min(|s|², 2 |d|²/r²).  The second term is a screen-space low-pass filter with a
+standard deviation of √½ r px, where r = `Splats2D.window`: 1 in `2dgs`, training's pixel in `2dgs-matched`.
+"surfel-mip" is AA-2DGS's object-space Mip filter: with J = ds/dd = (B + s nᵀ)/w and V = I + 0.1 J Jᵀ it is
+det V^-½ exp(-sᵀ V⁻¹ s / 2).
 """
 
 from dataclasses import dataclass, replace
@@ -24,17 +25,17 @@ from aaplug.core.splats import Splats2D
 from aaplug.methods.pixel_kernels.raster_rows import COLUMNS, OPACITY, UX, UY, VX, VY, forms_at, offsets_at, rows_of
 
 SLOPE_X, SLOPE_Y, LOW_PASS_WIDTH = COLUMNS, COLUMNS + 1, COLUMNS + 2
-LOW_PASS = 2.0  # 1/px²: 2DGS's filter of √½ px, squared and inverted
-DISC_VARIANCE = 0.1  # px²: AA-2DGS's object-space Mip filter
-LEAST_FACTOR = 1e-8  # under the root of AA-2DGS's factor, as published
-NARROWEST = 1e-3  # px: of the low-pass filter, which is divided by
-IN_FRONT = 1e-3  # of the centre's inverse depth: anything farther counts as the horizon
-HORIZON = 1e-12  # the same for the exact twin
+LOW_PASS = 2.0  # 1/px²: inverse variance of 2DGS's low-pass filter, whose σ is √½ px
+DISC_VARIANCE = 0.1  # px²: variance of AA-2DGS's object-space Mip filter
+LEAST_FACTOR = 1e-8  # AA-2DGS adds this to 1/det V before the square root, as published
+NARROWEST = 1e-3  # px: lower bound of the low-pass filter's width, which is a divisor
+IN_FRONT = 1e-3  # lower bound of w, and of 1 - R q for a disc near the camera plane
+HORIZON = 1e-12  # lower bound of w in `exact`
 
 
 @dataclass(frozen=True)
 class Surfel:
-    """Alpha is opacity times a disc's value where the ray meets it.
+    """Alpha is opacity times the disc's Gaussian where the pixel's ray meets its plane.
 
     smoothed: AA-2DGS's Mip filter instead of 2DGS's low-pass filter.
     """
@@ -46,10 +47,11 @@ class Surfel:
     splats_per_pass: int = 8
 
     def bounding_ellipses(self, splats: Splats2D, rules: Rules) -> Splats2D | None:
-        """Ellipses that contain the discs and their filters; opacity 0 for a disc that meets the horizon.
+        """Ellipses that contain the discs and their filters.
 
-        |e|² <= R w² is an ellipse around -R C n / (1 - R q) with the covariance (C + R C n nᵀ C / (1 - R q)) / (1 - R
-        q), q = nᵀ C n, as long as R q < 1.
+        A disc that reaches the camera plane within its cut-off gets opacity 0 and is culled: its image is unbounded.
+        With e = B d and R the squared cut-off, a disc in front of it covers |e|² <= R w².  With q = nᵀ C n < 1/R this
+        is an ellipse around -R C n / (1 - R q) with the covariance (C + R C n nᵀ C / (1 - R q)) / (1 - R q).
         """
         assert splats.depth_slopes is not None
         cutoff = squared_cutoff(splats.opacities, rules.min_alpha)
@@ -74,7 +76,7 @@ class Surfel:
         return grown(ellipses, (variance * cutoff).sqrt(), rules.min_alpha)
 
     def raster_rows(self, splats: Splats2D, kernels: Kernels) -> Float[Tensor, "m c"]:
-        """A whitening, the depth slopes, and the low-pass filter's width."""
+        """Whitening forms, depth slopes, and the width of the low-pass filter."""
         assert splats.depth_slopes is not None
         width = torch.full_like(splats.opacities, max(splats.window, NARROWEST))
         forms = whitening_columns(splats.covs, splats.dets)

@@ -12,8 +12,6 @@ import shutil
 import sys
 import tempfile
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import platformdirs
@@ -21,8 +19,9 @@ import torch
 
 from aaplug.core import culling, ellipses, kernels, projection, rules, spherical_harmonics, splats
 from aaplug.core.errors import UsageError
-from aaplug.core.executors import Processes
-from aaplug.core.kernels import EAGER, Kernel, Kernels, one_thread
+from aaplug.core.executors import Processes, torch_threads
+from aaplug.core.kernels import EAGER, Kernel, Kernels
+from aaplug.core.monitor import Tell
 from aaplug.core.rules import RULES_3DGS
 from aaplug.methods.pixel_kernels import INTEGRAL, POINT, averages, integral, point, raster_rows
 from aaplug.rasterizers.tiled import backward, binning, forward
@@ -102,10 +101,8 @@ def load_or_eager() -> Kernels:
     return load() or EAGER
 
 
-def build(progress: Callable[[int, int], None] = lambda done, total: None) -> CompiledKernels:
+def build(progress: Tell = lambda done, total: None) -> CompiledKernels:
     """Build what is missing or broken, in one process per thread of torch, and load everything.
-
-    progress: called with (kernels done, kernels in all).
 
     Raises:
         UsageError: there is no compiler or it fails, the cache folder cannot be written, or a process died.
@@ -141,7 +138,7 @@ def _load(kernel: Kernel) -> Package | None:
         # the loader inside `aoti_load_package`, whose import takes two seconds and whose calls take four times as long
         loader = torch._C._aoti.AOTIModelPackageLoader  # pyright: ignore[reportAttributeAccessIssue]
         package = loader(str(path), "model", True, 1, -1).run
-        with torch.no_grad(), one_thread():  # several threads would wait for each other
+        with torch.no_grad(), torch_threads(1):  # several threads would wait for each other
             args, twins = kernel.example(), kernel.example()
             found = [*package(list(args)), *args]  # results, and arguments updated in place
             expected = [*kernel.function(*twins), *twins]
@@ -168,7 +165,11 @@ def _build(name: str) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         from torch.fx.experimental.proxy_tensor import make_fx  # takes a second
 
-        with tempfile.TemporaryDirectory(dir=path.parent) as folder, _quiet(), torch.no_grad():
+        with (
+            tempfile.TemporaryDirectory(dir=path.parent) as folder,
+            warnings.catch_warnings(action="ignore"),
+            torch.no_grad(),
+        ):
             args = kernel.example()
             module = make_fx(kernel.function, tracing_mode="symbolic")(*args) if kernel.pulls_back else _Module(kernel)
             program = torch.export.export(module, args, dynamic_shapes=shapes if kernel.pulls_back else (shapes,))
@@ -194,11 +195,3 @@ class _Module(torch.nn.Module):
 
     def forward(self, *args: torch.Tensor) -> tuple[torch.Tensor, ...]:
         return self._function(*args)
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Hide torch's deprecation notices."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        yield

@@ -2,9 +2,13 @@
 
 t: tiles; K: splats per step; P: pixels per tile; c: columns of a raster row.
 
-With B the light from behind a splat, were the pixel transparent down to there, ∂L/∂alpha_k = T_k (g·c_k - B_k) and
-B_(k-1) = B_k + alpha_k (g·c_k - B_k).  Only T at the start of each step is kept from the forward pass.  (Carrying the
-rest of Σ g·w·c from the front would divide by 1 - alpha, and lose digits where that is small.)
+g: the loss's gradient in the pixel's premultiplied colour and alpha.  c_k: colour of splat k, extended by a 1 for
+alpha.  T_k: transmittance in front of it.  B_k: g · (what the splats behind k composite to, with nothing in front).
+
+    ∂L/∂alpha_k = T_k (g·c_k - B_k),    B_(k-1) = B_k + alpha_k (g·c_k - B_k)
+
+The forward pass stores T only at the start of each step; within a step T is recomputed front to back.  Walking front
+to back with the remaining Σ g·w·c instead would divide by 1 - alpha, which loses digits where alpha is near 1.
 """
 
 from collections.abc import Iterator
@@ -26,7 +30,7 @@ from aaplug.rasterizers.tiled.forward import (
     OWNERS,
     STEP,
     Compositing,
-    Turn,
+    Segment,
     composite_forward,
     in_turn,
     less,
@@ -36,8 +40,8 @@ from aaplug.rasterizers.tiled.forward import (
     where_above,
 )
 
-STEPS_TOGETHER = 8  # steps whose rows are looked up at once
-BUFFERED = 1 << 18  # contributions; two per splat, if that is more
+STEPS_TOGETHER = 8  # backward steps whose raster rows are gathered at once
+BUFFERED = 1 << 18  # contributions that are buffered before a sum; at least two per splat
 
 
 def composite(
@@ -45,7 +49,7 @@ def composite(
 ) -> tuple[Float[Tensor, "3 t P"], Float[Tensor, "t P"]]:
     """Premultiplied colour, and alpha, of every pixel of every tile; differentiable in the raster rows.
 
-    rows: the last one draws nothing.
+    rows: the last one is the padding row.
     """
     if rows.requires_grad and torch.is_grad_enabled():
         return _Composite.apply(rows, bins, how)  # pyright: ignore[reportReturnType]
@@ -57,10 +61,10 @@ class _Composite(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, rows: Tensor, bins: Bins, how: Compositing) -> tuple[Tensor, Tensor]:
-        turns: list[Turn] = []
-        colour, alpha = composite_forward(rows, bins, how, turns)
+        segments: list[Segment] = []
+        colour, alpha = composite_forward(rows, bins, how, segments)
         ctx.save_for_backward(rows)
-        ctx.rest = (bins, turns, how)
+        ctx.rest = (bins, segments, how)
         return colour, alpha
 
     @staticmethod
@@ -75,24 +79,24 @@ def _backward(
     g_colour: Float[Tensor, "3 all P"],
     g_alpha: Float[Tensor, "all P"],
     bins: Bins,
-    turns: list[Turn],
+    segments: list[Segment],
     how: Compositing,
 ) -> Float[Tensor, "m c"]:
     """Gradient of the raster rows."""
     local, kernel = tile_centres(rows), step_kernel(how.pixel, how.rules)
     sums_of_splats = _Scatter(torch.zeros_like(rows))
     light = torch.zeros_like(g_alpha)
-    for turn in reversed(turns):
-        behind, hidden = (plane.index_select(0, turn.tiles) for plane in (light, g_alpha))
-        colours = g_colour.index_select(1, turn.tiles)
-        ones = torch.ones_like(turn.origins[:, 0])
-        for owners, drawn, before in _steps(rows, bins, turn, how.kernels):
+    for segment in reversed(segments):
+        behind, hidden = (plane.index_select(0, segment.tiles) for plane in (light, g_alpha))
+        colours = g_colour.index_select(1, segment.tiles)
+        ones = torch.ones_like(segment.origins[:, 0])
+        for owners, drawn, before in _steps(rows, bins, segment, how.kernels):
             n = len(before)
             grads = (*colours[:, :n].unbind(), hidden[:n])
             pixels = (before, behind[:n], *grads, *local, ones[:n])
-            (sums,) = how.kernels.run(kernel, drawn, turn.origins[:n], *pixels)
+            (sums,) = how.kernels.run(kernel, drawn, segment.origins[:n], *pixels)
             sums_of_splats.add(owners, sums)
-        light.index_copy_(0, turn.tiles, behind)
+        light.index_copy_(0, segment.tiles, behind)
     total = sums_of_splats.total()
     if isinstance(how.pixel, SumsGradients):
         return how.pixel.from_sums(rows, total, how.kernels)
@@ -100,12 +104,12 @@ def _backward(
 
 
 def _steps(
-    rows: Float[Tensor, "m c"], bins: Bins, turn: Turn, kernels: Kernels
+    rows: Float[Tensor, "m c"], bins: Bins, segment: Segment, kernels: Kernels
 ) -> Iterator[tuple[Int[Tensor, "n K"], Float[Tensor, "n K c"], Float[Tensor, "n P"]]]:
-    """Owners, raster rows and transmittance of each step of a turn, from the last; several are looked up at once."""
-    at, ends = turn.splats
-    for start in reversed(range(0, len(turn.before), STEPS_TOGETHER)):
-        together = turn.before[start : start + STEPS_TOGETHER]
+    """Owners, raster rows and transmittance of each step of a segment, from the last; several are looked up at once."""
+    at, ends = segment.splats
+    for start in reversed(range(0, len(segment.before), STEPS_TOGETHER)):
+        together = segment.before[start : start + STEPS_TOGETHER]
         sizes = [len(before) for before in together]
         places = torch.cat([at[:n] + (start + i) * STEP for i, n in enumerate(sizes)])
         last = torch.cat([ends[:n] for n in sizes])
@@ -139,7 +143,7 @@ class _Scatter:
         self._count = end
 
     def total(self) -> Float[Tensor, "m c"]:
-        """The sums."""
+        """Add up what is buffered and return the sum per splat."""
         if self._count:
             self._sum()
         return self._total
@@ -169,7 +173,7 @@ def _step(
     local_y: Float[Tensor, " P"],
     one: Float[Tensor, " t"],
 ) -> tuple[Float[Tensor, "t c_STEP"]]:
-    """Each tile's contributions to the gradients of K splats; updates `behind`, the light from behind them."""
+    """Each tile's contributions to the gradients of K splats; updates `behind`, B_k in the module's docstring."""
     one = one[:, None]
     before, drawn = T, []
     pixels = Pixels(origins, local_x, local_y)
@@ -186,7 +190,7 @@ def _step(
         colour = torch.addcmul(colour, row[:, GREEN, None], g_green)
         colour = torch.addcmul(colour, row[:, BLUE, None], g_blue)
         ahead = less(colour, light, one)
-        # alpha below the cut-off or behind the stop has no weight; alpha at the cap has no gradient
+        # weight is 0 below the cut-off and after the stop; at the cap alpha has no gradient
         move = where_above(0.0, rules.max_alpha * one - alpha, weight) * ahead
         moves.append(Move(row, weight, move))
         light = light + hides * ahead

@@ -2,11 +2,11 @@
 
 m: splats; s: spans; p: pairs of a splat and a tile; t: tiles.
 
-Splats are paired, nearest first, with the tiles that their cut-off ellipse overlaps.  An ellipse is convex, so in one
+Each splat, nearest first, is paired with the tiles that its cut-off ellipse overlaps.  An ellipse is convex, so in one
 row of tiles it covers a run of columns.  A splat becomes one span per row, a span becomes pairs, and a stable sort of
 the pairs by tile does the rest.
 
-Bands of tile rows bound the memory: each has as many candidate pairs as the budget allows.
+Bands of whole tile rows bound the memory: each exceeds the budget of candidate pairs by at most its last row.
 """
 
 from collections.abc import Iterator
@@ -24,11 +24,11 @@ from aaplug.core.rules import RULES_3DGS, Rules, variant
 from aaplug.core.splats import Splats2D
 from aaplug.methods.pixel_kernels.raster_rows import TILE, splat_example
 
-LONGEST_PASS = 16  # splats composited in one pass: more compile slowly, fewer load and store more
+LONGEST_PASS = 16  # most splats per pass: more compile slowly, fewer reload the pixels' state more often
 MEMORY = 1e9  # bytes
-PAIR_BYTES = 64  # per candidate pair while a band is binned, measured
-CUTOFF_SLACK = 1e-4  # relative, on the squared cut-off: float32 rounding drops no pixel that counts
-BOX = 7  # first column of the box of tiles in the table
+PAIR_BYTES = 64  # bytes per candidate pair while a band is binned, measured
+CUTOFF_SLACK = 1e-4  # relative margin of the squared cut-off, so that float32 rounding never drops a pixel above it
+BOX = 7  # index of the table's first tile box column
 
 
 @dataclass(frozen=True)
@@ -57,15 +57,18 @@ def bands(
 
 
 def _depth_order(depths: Float[Tensor, " m"]) -> Int[Tensor, " m"]:
-    """Nearest first, equal depths in scene order.  Positive floats sort like their bits, and integers sort faster."""
+    """Indices, nearest first; equal depths keep the given order.
+
+    The bits of positive floats sort like the floats, and integers sort faster.
+    """
     keys = depths.contiguous().view(torch.int32) if depths.dtype == torch.float32 else depths
     return torch.sort(keys, stable=True).indices
 
 
 def _table(splats: Splats2D, grid: tuple[int, int], kernels: Kernels, rules: Rules) -> Float[Tensor, "m 11"]:
-    """What spans are computed from.  The last four columns are the box of tiles around the ellipse.
+    """Per splat, what its spans are computed from; see `_table_rows`.
 
-    A box is its first tile in x and y, then one past its last tile.
+    The last four columns are its tile box: first tile in x and y, then one past the last in x and y.
     """
     limit = splats.means.new_tensor([grid[1], grid[0]])
     columns = (splats.means, splats.covs, splats.dets, splats.opacities)
@@ -81,7 +84,7 @@ def _table_rows(
     opacities: Float[Tensor, " m"],
     limit: Float[Tensor, " 2"],
 ) -> tuple[Float[Tensor, "m 11"]]:
-    """Columns: centre; slope and variance of x given y; yy; squared cut-off; height of the rightmost point; box."""
+    """Columns: x, y; slope xy/yy and variance det/yy of x given y; yy; squared cut-off; rightmost point's dy; box."""
     xx, xy, yy = covs.unbind(dim=1)
     cutoff = squared_cutoff(opacities, min_alpha) * (1 + CUTOFF_SLACK)
     cutoff = torch.where(((xx + yy) / dets).isfinite(), cutoff, -1.0)  # no width: never drawn
@@ -98,7 +101,7 @@ def _table_rows(
 
 
 def _rows(table: Float[Tensor, "m 11"], rows: int, budget: int) -> list[tuple[int, int]]:
-    """Cut the grid into runs of tile rows with about `budget` candidate pairs each, at least one row."""
+    """Cut the grid into bands of whole tile rows with about `budget` candidate pairs each."""
     left, top, right, bottom = table[:, BOX:].long().unbind(dim=1)
     change = top.new_zeros(rows + 1)
     change.index_add_(0, top, right - left).index_add_(0, bottom, left - right)
@@ -143,11 +146,11 @@ def _spans(
     table: Float[Tensor, "m 11"],
     band: Int[Tensor, " 2"],
 ) -> tuple[Int[Tensor, " s"], Int[Tensor, " s"], Int[Tensor, " s"]]:
-    """First tile, number of tiles, and splat of each span: what a splat overlaps in one row of tiles.
+    """Per span: its first tile in the band, its number of tiles, its splat.  A span is one splat in one row of tiles.
 
-    At height h over its centre the ellipse spans slope·h ± w, with w² = variance (cutoff - h²/yy).  Its right end grows
-    up to the rightmost point and shrinks after it.  So over the pixel centres of a row it is farthest at the height
-    nearest to that point's.
+    At dy = h px below its centre the ellipse covers dx = slope·h ± w, with w² = variance (cutoff - h²/yy).  Its right
+    edge is farthest at the rightmost point and recedes monotonically on both sides.  Among a row's pixel centres,
+    the one nearest to that point's dy therefore bounds the span; the left edge is symmetric.
     """
     top_row, columns = band.unbind()
     owners = order[ranks]

@@ -1,9 +1,10 @@
-"""Compositing, forward: the splats of every tile over each other, as elementwise array code that compiles to one loop.
+"""Compositing, forward: front-to-back alpha compositing of all tiles at once, as array code that compiles to one loop.
 
-t: tiles; K: splats per pass or step; P: pixels per tile; c: columns of a raster row.
+t: tiles of a block; all: tiles of a band; n: the first of t; P: pixels per tile; K: splats per pass or step;
+m: raster rows; p: entries of `Bins.splats`; c: columns of a raster row.
 
-A pass composites a few splats of every tile.  Tiles with the most splats come first, so that those that finish are the
-last ones; from time to time tiles whose pixels are all saturated are dropped.
+A pass composites the next splats of every tile.  Tiles are sorted by falling splat count, so tiles with splats left
+are always a prefix.  Every few passes, tiles whose pixels are all saturated may be dropped (compaction).
 """
 
 from collections.abc import Iterator
@@ -20,16 +21,16 @@ from aaplug.core.rules import Rules
 from aaplug.methods.pixel_kernels.raster_rows import BLUE, COLUMNS, GREEN, PIXELS, RED, tile_centres
 from aaplug.rasterizers.tiled.binning import LONGEST_PASS, Bins
 
-STEP = 4  # splats per backward step; transmittance is kept before each one.  More, and the compiler splits the loop
+STEP = 4  # splats per backward step; transmittance is stored before each step.  With more the compiler splits the loop
 CHECK_EVERY = 2  # passes between checks for saturated tiles
-COMPACT_BELOW = 3 / 4  # share of unsaturated tiles below which the others are dropped
-SURELY = 1e9  # anything that is not 0 here, times this, is above 1
+COMPACT_BELOW = 3 / 4  # saturated tiles are dropped once the share of unsaturated ones is below this
+GATE = 1e9  # lifts any nonzero output of `threshold` above 1, so that min(output · GATE, value) is `value` or 0
 EXAMPLE_TILES, EXAMPLE_SPLATS = (1024, 4096)  # as large as real work: inductor chooses by them which loops use threads
 
 
 @dataclass(frozen=True)
 class Compositing:
-    """What stays the same for every tile of a frame.  kernels: run its stages."""
+    """Settings of one frame's compositing.  kernels: runs its stages."""
 
     pixel: PixelKernel
     rules: Rules
@@ -42,11 +43,12 @@ class Compositing:
 
 
 @dataclass(frozen=True)
-class Turn:
-    """What was composited between two checks for saturated tiles.
+class Segment:
+    """The passes between two compactions of the list of tiles; kept for the backward pass.
 
-    splats: first, and one past the last, of each tile, from where the turn began.
-    before: per step, the transmittance of the tiles that took part; these are the first of `tiles`.
+    tiles: tiles that were composited, those with the most splats first.
+    splats: per tile, where its splats begin and end in `Bins.splats`, counted from this segment's first splat.
+    before: per backward step, transmittance before it, for the first n of `tiles`: those that had splats left.
     """
 
     tiles: Int[Tensor, " t"]
@@ -56,18 +58,18 @@ class Turn:
 
 
 def composite_forward(
-    rows: Float[Tensor, "m c"], bins: Bins, how: Compositing, turns: list[Turn] | None = None
+    rows: Float[Tensor, "m c"], bins: Bins, how: Compositing, segments: list[Segment] | None = None
 ) -> tuple[Float[Tensor, "3 all P"], Float[Tensor, "all P"]]:
-    """Premultiplied colour, and alpha, of every pixel of every tile; appends to `turns` what backward needs.
+    """Premultiplied colour, and alpha, of every pixel; appends what the backward pass needs to `segments`.
 
-    rows: raster rows; the last one draws nothing.
+    rows: raster rows; the last one is the padding row.
     """
     local = tile_centres(rows)
     image = rows.new_zeros(4, len(bins.counts), PIXELS)
     order = torch.sort(bins.counts, descending=True, stable=True).indices
     order = order[: int((bins.counts > 0).sum())]
     for tiles in order.split(how.kernels.tiles):
-        _composite_block(rows, bins, tiles, image, local, how, turns)
+        _composite_block(rows, bins, tiles, image, local, how, segments)
     return image[:3], image[3]
 
 
@@ -78,9 +80,9 @@ def _composite_block(
     image: Float[Tensor, "4 all P"],
     local: tuple[Float[Tensor, " P"], Float[Tensor, " P"]],
     how: Compositing,
-    turns: list[Turn] | None,
+    segments: list[Segment] | None,
 ) -> None:
-    """Composite some tiles, longest first, into the image, until they run out of splats or saturate."""
+    """Composite one block of tiles into `image`, until their splats run out or every pixel is saturated."""
     T = rows.new_ones(len(tiles), PIXELS)
     planes = rows.new_zeros(4, len(tiles), PIXELS)
     start, splats = 0, how.pixel.splats_per_pass
@@ -89,19 +91,19 @@ def _composite_block(
         first, counts, origins = columns
         at, ends, ones = first + start, first + counts, torch.ones_like(origins[:, 0])
         going, rest = _going(counts - start, splats), tiles[:0]
-        before, steps = [], [] if turns is None else _going(counts - start, STEP)
-        if turns is not None:
-            turns.append(Turn(tiles, (at, ends), origins, before))
-        for turn, n in enumerate(going):
-            where = (bins.splats, at[:n] + turn * splats, ends[:n], origins[:n])
+        before, steps = [], [] if segments is None else _going(counts - start, STEP)
+        if segments is not None:
+            segments.append(Segment(tiles, (at, ends), origins, before))
+        for i, n in enumerate(going):
+            where = (bins.splats, at[:n] + i * splats, ends[:n], origins[:n])
             pixels = (T[:n], *planes[:, :n].unbind(), *local, ones[:n])
             *within, after = how.kernels.run(how.kernel, rows, *where, *pixels)
-            here = steps[turn * splats // STEP :]
+            here = steps[i * splats // STEP :]
             before += [x[:m] for x, m in zip((T, *within), here, strict=False)]
             T = after
             start += splats
-            if turn % CHECK_EVERY == CHECK_EVERY - 1 and turn + 1 < len(going):
-                alive = T[: going[turn + 1]].amax(dim=1) > 0
+            if i % CHECK_EVERY == CHECK_EVERY - 1 and i + 1 < len(going):
+                alive = T[: going[i + 1]].amax(dim=1) > 0
                 if int(alive.sum()) < COMPACT_BELOW * len(alive):
                     rest = alive.nonzero().squeeze(1)
                     break
@@ -111,7 +113,7 @@ def _composite_block(
 
 
 def _going(counts: Int[Tensor, " t"], at_once: int) -> list[int]:
-    """Number of tiles in each pass of `at_once` splats, from the tiles' splat counts in falling order."""
+    """How many tiles take part in each pass of `at_once` splats; `counts`: splats left per tile, falling."""
     passes = (counts + (at_once - 1)) // at_once
     turns = torch.arange(int(passes[0]), device=counts.device)
     return (len(passes) - torch.searchsorted(passes.flip(0), turns, right=True)).tolist()
@@ -134,10 +136,10 @@ def _pass(
     local_y: Float[Tensor, " P"],
     one: Float[Tensor, " t"],
 ) -> tuple[Float[Tensor, "t P"], ...]:
-    """Composite the splats from `at` of each tile into its colour and alpha, as many as a pass has.
+    """Composite the next `splats_per_pass` splats of each tile, from `at`, into red, green, blue and alpha, in place.
 
-    Returns the transmittance after each STEP of them, 0 once a pixel has stopped.
-    one: ones; a column of them in each step keeps the compiler to one loop over tiles.
+    Returns the transmittance after every STEP of them, 0 where a pixel has stopped.
+    one: 1 per tile; multiplying by it makes the compiler keep one loop over tiles.
     """
     one, splats = one[:, None], pixel.splats_per_pass
     before, seen = T, []
@@ -163,7 +165,7 @@ def _pass(
 def in_turn(
     pixel: PixelKernel, rules: Rules, rows: Float[Tensor, "K t c"] | Iterator[Tensor], pixels: Pixels
 ) -> Iterator[tuple[Float[Tensor, "t c"], Float[Tensor, "t P"]]]:
-    """Row and alpha of K splats of each tile, one after the other.
+    """Raster row and alpha of each tile's k-th splat, for k = 0 … K - 1.
 
     Eager code computes all alphas at once, a compiled loop each one where it is needed.
     """
@@ -174,12 +176,12 @@ def in_turn(
             yield row, pixel.alpha(row, pixels, rules)
 
 
-# Eager code pays per operation, and most for `where`.  A compiled loop pays for calls and for minima and maxima, which
-# test for NaN.  So these three are written for each.
+# Eager code costs one pass over memory per operation, and `where` costs most.  In a compiled loop, function calls and
+# min/max are slow, because min/max propagate NaN.  So the next three functions have one form for each.
 
 
 def transmitted(alpha: Float[Tensor, "t P"], one: Float[Tensor, "t 1"], rules: Rules) -> Float[Tensor, "t P"]:
-    """The share of the light that a splat lets through."""
+    """1 - alpha, with alpha capped."""
     least = 1 - rules.max_alpha
     if torch.compiler.is_compiling():
         return torch.relu(rules.max_alpha * one - alpha) + least
@@ -192,10 +194,10 @@ def less(x: Float[Tensor, "t P"], y: Float[Tensor, "t P"], one: Float[Tensor, "t
 
 
 def where_above(bound: float, test: Tensor, value: Tensor) -> Tensor:
-    """`value` where `test` is above `bound`, else 0; none of them is negative."""
+    """`value` where `test` > `bound`, else 0; needs bound >= 0 and 0 <= value <= 1."""
     if torch.compiler.is_compiling():
         return torch.where(test > bound, value, 0.0)
-    return torch.minimum(torch.threshold(test, bound, 0.0).mul_(SURELY), value)
+    return torch.minimum(torch.threshold(test, bound, 0.0).mul_(GATE), value)
 
 
 def owners_of(
@@ -205,7 +207,7 @@ def owners_of(
     ends: Int[Tensor, " t"],
     count: int = STEP,
 ) -> tuple[Int[Tensor, "t K"]]:
-    """The splats `at` to `at + count` of each tile; past its last one, the row that draws nothing."""
+    """Raster row indices of splats `at` to `at + count` of each tile; the padding row past the tile's last splat."""
     place = at[:, None] + torch.arange(count, device=at.device)
     return (torch.where(place < ends[:, None], ids[place], rows.shape[0] - 1),)
 

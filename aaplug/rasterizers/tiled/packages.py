@@ -1,4 +1,4 @@
-"""Compiled kernels at run time: packages, and what runs them where they fit."""
+"""Kernels that do more than run eagerly: compiled packages where they fit, and counting the work of compositing."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from aaplug.core.kernels import BACKWARD, Kernel, Kernels
+from aaplug.methods.pixel_kernels.raster_rows import PIXELS
 
 
 @dataclass(frozen=True)
@@ -85,3 +86,18 @@ class _Tracked(torch.autograd.Function):
         args = ctx.saved_tensors
         found = iter(ctx.package.run([*args, *(grad.contiguous() for grad in grads)]))
         return None, None, *(next(found) if arg.is_floating_point() else None for arg in args)
+
+
+class CountingKernels(Kernels):
+    """Runs kernels as the given ones do, and tells how many evaluations each compositing pass makes."""
+
+    def __init__(self, kernels: Kernels, add: Callable[[int], None]):
+        """add: called with the number of splat-pixel evaluations of each pass."""
+        self._kernels, self._add = kernels, add
+        self.name, self.tiles = kernels.name, kernels.tiles
+
+    def run(self, kernel: Kernel, *args: Tensor) -> tuple[Tensor, ...]:
+        """Run a kernel."""
+        if kernel.evaluations:
+            self._add(len(args[2]) * kernel.evaluations * PIXELS)
+        return self._kernels.run(kernel, *args)

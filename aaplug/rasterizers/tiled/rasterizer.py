@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from aaplug.core.errors import UsageError
 from aaplug.core.imaging import over
 from aaplug.core.interfaces import Colour, Compositor, PixelKernel
 from aaplug.core.kernels import EAGER, Kernels
@@ -25,8 +26,8 @@ from aaplug.methods.pixel_kernels import POINT
 from aaplug.methods.pixel_kernels.raster_rows import TILE, tile_centres
 from aaplug.rasterizers.tiled.backward import composite
 from aaplug.rasterizers.tiled.binning import MEMORY, Bins, bands
-from aaplug.rasterizers.tiled.counting import CountingKernels
 from aaplug.rasterizers.tiled.forward import Compositing
+from aaplug.rasterizers.tiled.packages import CountingKernels
 
 Painter = Callable[[Bins], tuple[Tensor, Tensor]]
 # composited together by a compositor; sorted, so that they have about equally many splats
@@ -70,6 +71,11 @@ class Tiled:
         ellipses = pixel.bounding_ellipses(splats, rules) or splats
         if compositor is None:
             rows = pixel.raster_rows(splats, self.kernels)
+            if rows.shape != (len(splats) + 1, pixel.columns):
+                expected = f"{len(splats) + 1} rows (one per splat and a padding row) of {pixel.columns} columns"
+                raise UsageError(
+                    f"pixel kernel {pixel.name}", f"raster_rows should return {expected}, got {tuple(rows.shape)}"
+                )
             paint = partial(composite, rows, how=Compositing(pixel, rules, self.kernels))
         else:
             paint = self._blender(splats, compositor, rules)

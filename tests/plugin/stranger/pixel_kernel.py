@@ -17,7 +17,6 @@ from aaplug.methods.pixel_kernels.raster_rows import COLUMNS, OPACITY, UX, UY, V
 
 QUARTER = COLUMNS  # our own column: a quarter of the pixel's side, in px
 POINTS = tuple(product((-1, 1), repeat=2))  # in quarters of the pixel, from its centre
-SMALLEST = 1e-3  # px: a window can be 0, but `grown` needs a radius above 0
 
 
 @dataclass(frozen=True)
@@ -31,11 +30,11 @@ class FourPoints:
 
     def bounding_ellipses(self, splats: Splats2D, rules: Rules) -> Splats2D:
         """Ellipses that contain the centre of every pixel with one of its points in the splat."""
-        radius = max(math.sqrt(2) * splats.window / 4, SMALLEST)
+        radius = math.sqrt(2) * splats.window / 4
         return grown(splats, torch.full_like(splats.dets, radius), rules.min_alpha)
 
-    def raster_rows(self, splats: Splats2D, kernels: Kernels) -> Float[Tensor, "m c"]:
-        """Two forms u, v with exp(-(u² + v²) / 2) as the Gaussian's value, and our own column."""
+    def raster_rows(self, splats: Splats2D, kernels: Kernels) -> Float[Tensor, "m_and_1 c"]:
+        """Two forms u, v with exp(-(u² + v²) / 2) as the Gaussian's value, our own column, and the padding row."""
         quarter = torch.full_like(splats.dets, splats.window / 4)
         return rows_of(splats, whitening_columns(splats.covs, splats.dets), [quarter])
 
@@ -50,7 +49,7 @@ class FourPoints:
         return torch.threshold(opacity * total / len(POINTS), rules.below_min_alpha, 0.0)
 
     def exact(self, splats: Splats2D, offsets: Float[Tensor, "p c 2"]) -> Float[Tensor, "p c"]:
-        """The mean in float64, from the definition."""
+        """The same mean in float64, from the definition."""
         points = offsets.new_tensor(POINTS) * splats.window / 4
         at = offsets[:, :, None] + points  # [p, c, 4, 2]
         white = torch.einsum("cij,pckj->pcki", whitening(splats), at)

@@ -1,0 +1,129 @@
+"""Options of the verbs, each stated once: a field is a verb's keyword, its docstring the help of the command line."""
+
+import difflib
+import inspect
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Annotated, Any, TypeVar, get_args
+
+import tyro
+
+from aaplug.core.errors import UsageError
+from aaplug.core.interfaces import Rasterizer
+from aaplug.core.sampling import MIN_SEEN_SHARE
+from aaplug.methods.filters.matched import RateReference
+from aaplug.methods.recipe import Recipe
+from aaplug.methods.recipes import QUALITIES, RECIPES
+from aaplug.methods.research_recipes import RESEARCH_RECIPES
+from aaplug.rasterizers import RASTERIZERS
+from aaplug.rendering.renderer import Background
+
+Chosen = TypeVar("Chosen", bound="Options")
+Verb = TypeVar("Verb", bound=Callable[..., Any])
+
+
+def flag(metavar: str, *aliases: str, kind: Any = None) -> Any:
+    """An option whose help shows `metavar` and no default, for what is absent unless given."""
+    return tyro.conf.arg(metavar=metavar, aliases=aliases, help_behavior_hint="", constructor=kind)
+
+
+def choice(names: Iterable[str]) -> Any:
+    """An option that takes one of these names, or in Python an object; the library refuses other names."""
+    return tyro.constructors.PrimitiveConstructorSpec(
+        1, "|".join(names), lambda words: words[0], lambda value: True, lambda value: [str(value)]
+    )
+
+
+def choices(names: Iterable[str]) -> Any:
+    """An option that takes some of these names, or in Python objects."""
+    return tyro.constructors.PrimitiveConstructorSpec(
+        "*", "|".join(names), tuple, lambda value: True, lambda values: [str(value) for value in values]
+    )
+
+
+_RESEARCH = {recipe.name for recipe in RESEARCH_RECIPES}
+RECIPE_NAMES = [name for name in RECIPES if name not in _RESEARCH]  # a user's, and plug-ins'
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """The options of a verb."""
+
+    @classmethod
+    def of(cls: type[Chosen], given: Mapping[str, Any]) -> Chosen:
+        """The options that a caller gave, and the defaults.
+
+        Raises:
+            UsageError: there is no such option.
+        """
+        known = [field.name for field in fields(cls)]
+        for name in given.keys() - known:
+            raise UsageError(name, f"is no option here{did_you_mean(name, known)}")
+        return cls(**given)
+
+    @classmethod
+    def shown(cls, verb: Verb) -> Verb:
+        """Decorate a verb: its signature shows these options instead of `**options`."""
+        signature = inspect.signature(verb)
+        own = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
+        keyword = inspect.Parameter.KEYWORD_ONLY
+        options = [inspect.Parameter(f.name, keyword, default=f.default, annotation=f.type) for f in fields(cls)]
+        vars(verb)["__signature__"] = signature.replace(parameters=own + options)
+        return verb
+
+
+def did_you_mean(name: str, known: Sequence[str]) -> str:
+    """The end of an error about a name that is not known."""
+    close = difflib.get_close_matches(name, known, 1)
+    return f"; did you mean {close[0]}?" if close else ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameOptions(Options):
+    """Whether scene and cameras belong together."""
+
+    min_seen: float = MIN_SEEN_SHARE
+    """Stop if the cameras see a smaller share of the Gaussians than this."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewOptions(FrameOptions):
+    """Views, background and rasterizer."""
+
+    views: Annotated[str, tyro.conf.arg(metavar="NAME,...|test|train|all")] = "test"
+    """Views, by name or split."""
+    background: Annotated[Background, choice(("auto", "white", "black"))] = "auto"
+    """Colour behind the scene; auto is what training had."""
+    rasterizer: Annotated[str | Rasterizer, choice(("auto", "compiled", *RASTERIZERS))] = "auto"
+    """auto: compiled if `aaplug warmup` has run, else eager.  reference: slow, exact, float64."""
+    threads: Annotated[int | None, flag("N")] = None
+    """Processor threads (default: all)."""
+    memory: Annotated[float | None, flag("GB")] = None
+    """Memory per frame, beside the scene and the image (default: 1)."""
+    cull_margin: Annotated[float, flag("SHARE")] = math.inf
+    """Cull Gaussians centred farther outside the image than this share of its longer side, if training did."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecipeOptions(ViewOptions):
+    """What a recipe samples, and compares with."""
+
+    quality: Annotated[str, choice(QUALITIES)] = "balanced"
+    """How finely recipe auto samples: fast reaches a quarter of the training rate, balanced half, best all of it."""
+    rate_reference: Annotated[str | None, flag("|".join(get_args(RateReference)))] = None
+    """Sampling rate that matched and auto compare with (default: pose: global, or interval for a free camera)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageOptions(Options):
+    """Images by one recipe at one size."""
+
+    recipe: Annotated[str | Recipe, choice([*RECIPE_NAMES, "..."])] = "auto"
+    """How to render; examples/guides/methods.md lists further recipes, for research."""
+    scale: Annotated[float | None, flag("FACTOR")] = None
+    """Size relative to the training size, or to that of a path file (default: 1)."""
+    resolution: Annotated[str | None, flag("WxH")] = None
+    """Size in px, such as 400x400; -1 on one side keeps the aspect (-1x720)."""
+    overwrite: bool = False
+    """Replace existing outputs."""
