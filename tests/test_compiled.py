@@ -7,12 +7,13 @@ from dataclasses import replace
 import pytest
 import torch
 
+from aaplug import rasterizers as choice
 from aaplug.core.errors import UsageError
 from aaplug.core.kernels import EAGER, Kernel
 from aaplug.core.rules import RULES_GSPLAT
 from aaplug.core.training import TrainingViews
 from aaplug.methods.recipes import RECIPES
-from aaplug.rasterizers import RASTERIZERS, Tiled, choice, find_rasterizer
+from aaplug.rasterizers import RASTERIZERS, Tiled, find_rasterizer
 from aaplug.rasterizers.tiled import ahead_of_time as compiled
 from aaplug.rasterizers.tiled.packages import CompiledKernels, Package
 from aaplug.rendering.renderer import Renderer

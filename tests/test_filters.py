@@ -219,6 +219,5 @@ def test_pixel_sizes_follow_their_gaussians():
     assert scene.pixel_sizes is not None
     part = scene[torch.tensor([4, 1])].pixel_sizes
     assert part is not None
-    assert part.smallest.dtype == F64
     assert part.base.tolist() == [True, False]
     assert len(part.largest) == 2
