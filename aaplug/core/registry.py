@@ -72,18 +72,14 @@ class Registry(Mapping[str, T]):
         self._all()
         self._add(name, value, f"{self.kind} {name}")
 
-    @property
-    def group(self) -> str:
-        """Name of the entry point group."""
-        return group_of(self.kind)
-
     def _all(self) -> dict[str, T]:
         if not self._loaded:
             self._loaded = True
             _warn_of_unknown_groups()
-            for point in entry_points(group=self.group):
+            group = group_of(self.kind)
+            for point in entry_points(group=group):
                 package = f" of package {point.dist.name}" if point.dist else ""
-                where = f"plug-in {point.value}{package} ({self.group})"
+                where = f"plug-in {point.value}{package} ({group})"
                 try:
                     self._add(point.name, _load(point, where), where)
                 except UsageError as error:

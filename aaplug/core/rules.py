@@ -54,10 +54,8 @@ class Rules:
     @property
     def tag(self) -> str:
         """Suffix of a compositing kernel's name, empty for 3DGS's rules: a kernel is compiled for one set of rules."""
-        return variant(
-            (self.max_alpha, self.min_alpha, self.min_transmittance),
-            (RULES_3DGS.max_alpha, RULES_3DGS.min_alpha, RULES_3DGS.min_transmittance),
-        )
+        values, usual = ((r.max_alpha, r.min_alpha, r.min_transmittance) for r in (self, RULES_3DGS))
+        return variant(values, usual)
 
 
 def variant(values: tuple[float, ...], defaults: tuple[float, ...]) -> str:

@@ -4,7 +4,7 @@ n: Gaussians, v: cameras, c: Gaussians of a chunk.  A camera of focal length f p
 the optical axis) with f / z pixels per world unit.  It sees the Gaussian when the depth is above `NEAR` and the
 projected centre lies in the image widened by `MARGIN` of its size on every side (Mip-Splatting, arXiv 2311.16493,
 section 5.1 and its published constants).  Each rate pairs a camera's own focal length with its own depth, as in the
-paper's equation 7.
+paper's equation 7.  Functions that take cameras raise UsageError if there are none.
 """
 
 from collections.abc import Iterator, Sequence
@@ -65,9 +65,6 @@ def sampling_bounds(
     """Lowest and highest sampling rate of each Gaussian over the cameras that see it (highest: Mip-Splatting, eq. 7).
 
     Memory beyond the result and one float64 copy of the means is bounded by `chunk_pairs`.
-
-    Raises:
-        UsageError: there are no cameras.
     """
     n = len(means)
     highest, lowest, nearest = (means.new_zeros(n) for _ in range(3))
@@ -102,9 +99,6 @@ def view_information(
     """Directional sampling density of each Gaussian: Σ ν² (I - d dᵀ) over the cameras that see it, in px² per unit².
 
     Along u, uᵀ M u is the summed squared rate; a camera adds nothing along its own ray d.  0 if no camera sees it.
-
-    Raises:
-        UsageError: there are no cameras.
     """
     origin = _middle(cameras)
     eyes = torch.stack([camera.centre - origin for camera in cameras]).to(means)
