@@ -72,16 +72,8 @@ def _without_weights(image: Image, truth: Image) -> None:
     raise UsageError("LPIPS", "needs weights: see `lpips_metric`")
 
 
-LPIPS = Metric(
-    "LPIPS",
-    "",
-    0.0,
-    4,
-    "version 0.1",
-    _without_weights,
-    undefined=f"image smaller than the {LEAST_SIDE} px that LPIPS needs",
-    prepare=_prepared,
-)
+SMALL = f"image smaller than the {LEAST_SIDE} px that LPIPS needs"
+LPIPS = Metric("LPIPS", "", 0.0, 4, "version 0.1", _without_weights, undefined=SMALL, prepare=_prepared)
 
 
 def _distance(
