@@ -52,8 +52,7 @@ WORDS: dict[LpipsFlavour, str] = {
 def lpips_metric(flavour: LpipsFlavour, trunk: str | PathLike[str], heads: str | PathLike[str]) -> Metric:
     """LPIPS as a metric, with its weights (torchvision's and the `lpips` package's) in memory.
 
-    Raises:
-        FormatError: a file is not the weights of this net.
+    Raises FormatError if a file is not the weights of this net.
     """
     net = NETS["alex" if flavour == "alex" else "vgg"]
     weights = _trunk(Path(trunk), net)

@@ -58,8 +58,7 @@ def ssim(image: Image, truth: Image, flavour: SsimFlavour = "wang") -> float | N
 def flip(image: Image, truth: Image) -> float | None:
     """Mean of the LDR-FLIP map (Andersson et al. 2020) at the default viewing distance; 0 for equal images.
 
-    Raises:
-        UsageError: the package that computes it is not installed.
+    Raises UsageError if the package that computes it is not installed.
     """
     if importlib.util.find_spec("flip_evaluator") is None:
         raise UsageError("FLIP", "needs the package flip-evaluator: pip install 'aaplug[flip]'")

@@ -75,11 +75,7 @@ class Protocol:
 
 
 def median_depth(means: Float[Tensor, "n 3"], view: Camera) -> float:
-    """Median depth of the Gaussians that project into the view, in world units.
-
-    Raises:
-        UsageError: none does.
-    """
+    """Median depth of the Gaussians that project into the view, in world units; raises UsageError if none does."""
     pixels, depth = view.project(means)
     x, y = pixels.unbind(dim=1)
     inside = (depth > NEAR) & (x >= 0) & (x <= view.width) & (y >= 0) & (y <= view.height)

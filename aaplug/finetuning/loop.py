@@ -48,8 +48,7 @@ def run(
     keep: called with the state and the last good one, also when the run stops.
     stop: asked before every step.  say: called when the run rolls back.
 
-    Raises:
-        UsageError: no step has a finite gradient, at any learning rate.
+    Raises UsageError if no step has a finite gradient, at any learning rate.
     """
     good = good or packed(state)
     while state.step < job.settings.steps and not stop():

@@ -62,10 +62,7 @@ def mipmap_gs(scales: Sequence[float], move: Sequence[str] = (), anchor: float =
     """Mipmap-GS (Li et al. 2024), one model for one scale: all parameters at 3DGS's rates, 1000 steps of L2.
 
     Its truth is a bilinear resize at the test poses; here it is the box average at the training poses.  It moves every
-    parameter and has no anchor.
-
-    Raises:
-        UsageError: there is not exactly one scale.
+    parameter and has no anchor.  More than one scale raises UsageError.
     """
     if len(scales) != 1:
         raise UsageError("scale", "mipmap-gs makes one model for one scale; give one")
@@ -101,8 +98,7 @@ def settings_of(
 ) -> Settings:
     """A method's settings with the user's choices; None takes the method's own.
 
-    Raises:
-        UsageError: a choice is out of its range, or does not fit the method.
+    Raises UsageError if a choice is out of its range, or does not fit the method.
     """
     counts = {"steps": steps, "densify_every": densify_every}
     for name, value in (counts | {"anchor": anchor}).items():

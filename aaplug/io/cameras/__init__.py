@@ -90,10 +90,7 @@ def read_cameras(
 def select_views(cameras: CameraSet, spec: str) -> tuple[Camera, ...]:
     """The views named by `spec`: train, test, all, or view names separated by commas.
 
-    A name in both splits means the test view.
-
-    Raises:
-        UsageError: a name is unknown.
+    A name in both splits means the test view.  An unknown name raises UsageError.
     """
     groups = {"train": cameras.train, "test": cameras.test, "all": cameras.all}
     if spec in groups:

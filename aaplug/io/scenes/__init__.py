@@ -13,13 +13,14 @@ from os import PathLike
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-from aaplug.core.errors import FormatError, OutputError, UsageError, reason
+from aaplug.core.errors import FormatError, OutputError, UsageError
 from aaplug.core.gaussians import Convention, Gaussians
 from aaplug.core.registry import Registry
 from aaplug.io.atomic import check_output
 from aaplug.io.scenes import compressed_ply, ksplat, ply, pt, sog, splat, spz
 from aaplug.io.scenes.options import Options, SpzAxes
 from aaplug.io.scenes.scene_file import SceneFile
+from aaplug.io.values import read_start
 
 HEAD_BYTES = 64  # of a file, passed to each format's `sniff`
 SOG_FOLDER = "meta.json"  # marks a folder of SOG images
@@ -39,8 +40,7 @@ class SceneFormat(Protocol):
     def open_scene(self, path: Path, options: Options) -> SceneFile:
         """Read what the file says about the scene; Gaussians are loaded when `SceneFile.load` is called.
 
-        Raises:
-            FormatError: the file breaks its format.
+        Raises FormatError if the file breaks its format.
         """
         ...
 
@@ -55,8 +55,7 @@ class WritableFormat(SceneFormat, Protocol):
     def write(self, path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: Options) -> None:
         """Write a scene of at least one part and at most `count` Gaussians, whole or not at all.
 
-        Raises:
-            OutputError: the format cannot hold the scene, the file exists and `overwrite` is false, or writing fails.
+        Raises OutputError if the format cannot hold the scene, the file exists and `overwrite` is false, or it fails.
         """
         ...
 
@@ -90,7 +89,9 @@ def open_scene(
     """
     options = Options(allow_checkpoint, spz_axes)
     path = find_scene(path, iteration)
-    head = _head(path)
+    head = read_start(path, HEAD_BYTES)
+    if not head:
+        raise FormatError(path, "is empty")
     formats = sorted(SCENE_FORMATS.values(), key=OWN.__contains__)  # plug-ins first
     for format in formats:
         if format.sniff(path, head):
@@ -168,8 +169,7 @@ def check_scene_output(
         known = [s for s, format in suffixes.items() if isinstance(format, WritableFormat)]
         raise OutputError(path, f"has no suffix of a format that can be written: {', '.join(known)}")
     if writer.needs is not None and importlib.util.find_spec(writer.needs) is None:
-        extra = f"pip install 'aaplug[{writer.name}]'"
-        raise UsageError(str(path), f"writing .{writer.name} needs {writer.needs}: {extra}")
+        raise UsageError(str(path), f"writing .{writer.name} needs {writer.needs}: pip install 'aaplug[{writer.name}]'")
     check_output(path, overwrite, inputs)
     return writer
 
@@ -178,9 +178,7 @@ def find_scene(path: str | PathLike[str], iteration: int | None = None) -> Path:
     """The scene file that a path means.
 
     A file means itself.  A folder means the last (or the given) iteration of an INRIA model, or its SOG images.
-
-    Raises:
-        FormatError: the folder holds no scene, or not that iteration.
+    Raises FormatError if the folder holds no scene, or not that iteration.
     """
     path = Path(path)
     if not path.is_dir():
@@ -200,16 +198,3 @@ def _iterations(model: Path) -> dict[int, Path]:
     pattern = re.compile(r"iteration_(\d+)", re.ASCII)
     scenes = model.glob("point_cloud/iteration_*/point_cloud.ply")
     return {int(m[1]): scene for scene in scenes if (m := pattern.fullmatch(scene.parent.name))}
-
-
-def _head(path: Path) -> bytes:
-    try:
-        if path.exists() and not path.is_file():
-            raise FormatError(path, "is not an ordinary file")  # reading a pipe would block
-        with path.open("rb") as stream:
-            head = stream.read(HEAD_BYTES)
-    except (OSError, ValueError) as error:
-        raise FormatError(path, f"cannot be read: {reason(error)}") from error
-    if not head:
-        raise FormatError(path, "is empty")
-    return head

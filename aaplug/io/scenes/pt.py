@@ -95,8 +95,7 @@ def _check(path: Path, key: str, tensor: Tensor, count: int, size: int) -> None:
         fits = tensor.ndim == 3 and tensor.shape[2] == 3 and 3 * tensor.shape[1] in DEGREES
     plain = tensor.is_floating_point() and tensor.layout == torch.strided
     if not (fits and plain and len(tensor) == count):
-        kind = f"{tensor.dtype} of shape {list(tensor.shape)}"
-        raise FormatError(path, f"{key} is {kind}, for {count:,} Gaussians")
+        raise FormatError(path, f"{key} is {tensor.dtype} of shape {list(tensor.shape)}, for {count:,} Gaussians")
     if tensor.numel() * tensor.element_size() > size:
         raise FormatError(path, f"{key} has {tensor.numel():,} values, more than the file holds")
 
