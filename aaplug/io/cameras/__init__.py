@@ -52,7 +52,7 @@ class CameraFormat(Protocol):
 OWN: tuple[CameraFormat, ...]
 OWN = (pinhole, camera_path, inria_model, colmap, blender, inria, multiscale, transforms, llff)
 CAMERA_FORMATS = Registry[CameraFormat](
-    "camera format", {f.name: f for f in OWN}, lambda value: isinstance(value, CameraFormat)
+    "camera format", {f.name: f for f in OWN}, lambda f: isinstance(f, CameraFormat)
 )
 
 

@@ -238,9 +238,8 @@ def _distortion(entry: Entry) -> Distortion | None:
     others = [number(value, entry.place, "distortion_params") for value in listed]
     others += [k["k5"], k["k6"]]
     if entry.fields.get("is_fisheye") or model == FISHEYE:
-        name = model if model == FISHEYE else "fisheye"
         angular = tuple(k[key] for key in ("k1", "k2", "k3", "k4"))
-        return Distortion(name, None if any(others) else angular, fisheye=True)
+        return Distortion(model if model == FISHEYE else "fisheye", None if any(others) else angular, fisheye=True)
     if model in PINHOLES and not any(others) and not any(k.values()):
         return None
     known = model in PINHOLES and not any(others) and not k["k4"]

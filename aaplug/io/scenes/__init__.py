@@ -9,6 +9,7 @@ in the format whose name ends the file's name.
 import importlib.util
 import re
 from collections.abc import Iterable
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -62,9 +63,7 @@ class WritableFormat(SceneFormat, Protocol):
 
 # the first that accepts a file is used
 OWN: tuple[SceneFormat, ...] = (compressed_ply, ply, spz, sog, pt, splat, ksplat)
-SCENE_FORMATS = Registry[SceneFormat](
-    "scene format", {f.name: f for f in OWN}, lambda value: isinstance(value, SceneFormat)
-)
+SCENE_FORMATS = Registry[SceneFormat]("scene format", {f.name: f for f in OWN}, lambda f: isinstance(f, SceneFormat))
 
 
 def open_scene(
@@ -95,7 +94,8 @@ def open_scene(
     formats = sorted(SCENE_FORMATS.values(), key=OWN.__contains__)  # plug-ins first
     for format in formats:
         if format.sniff(path, head):
-            return format.open_scene(path, options).stated(convention)
+            file = format.open_scene(path, options)
+            return file if convention is None else replace(file, convention=convention, evidence="stated by the user")
     known = ", ".join("." + format.name for format in formats)
     raise FormatError(path, f"is of no known scene format; aaplug reads {known}")
 
@@ -183,7 +183,8 @@ def find_scene(path: str | PathLike[str], iteration: int | None = None) -> Path:
     path = Path(path)
     if not path.is_dir():
         return path
-    scenes = _iterations(path)
+    pattern, files = re.compile(r"iteration_(\d+)", re.ASCII), path.glob("point_cloud/iteration_*/point_cloud.ply")
+    scenes = {int(match[1]): file for file in files if (match := pattern.fullmatch(file.parent.name))}
     if not scenes and (path / SOG_FOLDER).is_file():
         return path / SOG_FOLDER
     if not scenes:
@@ -192,9 +193,3 @@ def find_scene(path: str | PathLike[str], iteration: int | None = None) -> Path:
     if chosen not in scenes:
         raise FormatError(path, f"has no iteration {chosen}; it has {', '.join(map(str, sorted(scenes)))}")
     return scenes[chosen]
-
-
-def _iterations(model: Path) -> dict[int, Path]:
-    pattern = re.compile(r"iteration_(\d+)", re.ASCII)
-    scenes = model.glob("point_cloud/iteration_*/point_cloud.ply")
-    return {int(m[1]): scene for scene in scenes if (m := pattern.fullmatch(scene.parent.name))}

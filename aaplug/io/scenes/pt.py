@@ -79,10 +79,9 @@ def _splats(path: Path, document: Any) -> dict[str, Tensor]:
     splats = document.get("splats", document) if isinstance(document, dict) else None
     if not isinstance(splats, dict) or not all(isinstance(splats.get(k), Tensor) for k in SHAPES):
         raise FormatError(path, f"holds no splats with {', '.join(SHAPES)}, as gsplat writes them")
-    means = splats["means"]
-    if means.ndim != 2:
-        raise FormatError(path, f"means has the shape {list(means.shape)}")
-    rest = splats.get("shN", torch.zeros(len(means), 0, 3))
+    if splats["means"].ndim != 2:
+        raise FormatError(path, f"means has the shape {list(splats['means'].shape)}")
+    rest = splats.get("shN", torch.zeros(len(splats["means"]), 0, 3))
     if not isinstance(rest, Tensor):
         raise FormatError(path, "shN is not a tensor")
     return {**{key: splats[key] for key in SHAPES}, "shN": rest}

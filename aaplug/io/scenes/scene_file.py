@@ -54,12 +54,6 @@ class SceneFile:
     document: Any = None
     notes: tuple[str, ...] = ()
 
-    def stated(self, convention: Convention | None) -> "SceneFile":
-        """The same file with another convention, stated by the user; unchanged for None."""
-        if convention is None:
-            return self
-        return replace(self, convention=convention, evidence="stated by the user")
-
     def raw(self, start: int, stop: int) -> Gaussians:
         """The rows from start up to stop, with convention and origin; their values are not checked."""
         origin = Origin(str(self.path), self.format, self.evidence, self.document, torch.arange(start, stop))
