@@ -27,7 +27,6 @@ from aaplug.evaluation.image_store import ImageStore
 from aaplug.evaluation.journal import Journal
 from aaplug.evaluation.metric import Drawn, Image, Metric, Series, TimedRenderer
 from aaplug.evaluation.metrics import PSNR, SSIM
-from aaplug.evaluation.protocols import Protocol
 from aaplug.evaluation.results import CEILING, Measurement, Report
 from aaplug.evaluation.truth import Truth, ViewTruth, source_of
 from aaplug.io.photographs import DOWNSCALES
@@ -82,15 +81,10 @@ class Task:
     ceiling: bool = True
 
     @property
-    def protocol(self) -> Protocol:
-        """The truth's protocol."""
-        return self.truth.protocol
-
-    @property
     def measured(self) -> tuple[Metric, ...]:
         """Every metric, first those that compare with the truth."""
         if self.metrics is None:
-            return (PSNR, SSIM[self.protocol.ssim])
+            return (PSNR, SSIM[self.truth.protocol.ssim])
         return tuple(sorted(self.metrics, key=lambda metric: metric.measure is None))
 
     @property
@@ -163,8 +157,8 @@ def _check(task: Task) -> None:
         raise UsageError("scale", f"sizes must be above 0, got {min(task.scales):g}")
     if len(set(task.names)) != len(task.names) or len(set(task.scales)) != len(task.scales):
         raise UsageError("evaluate", "a recipe or a scale is named twice")
-    if task.truth.source == "photographs" and task.protocol.change != "size":
-        raise UsageError("truth", f"protocol {task.protocol.name} moves the camera: no photograph shows that")
+    if task.truth.source == "photographs" and task.truth.protocol.change != "size":
+        raise UsageError("truth", f"protocol {task.truth.protocol.name} moves the camera: no photograph shows that")
     source_of(task.views, task.truth.source)
 
 
@@ -172,9 +166,9 @@ def _request(task: Task) -> dict[str, Any]:
     """What the numbers mean; a journal is of the same request if these are equal."""
     photographs = task.truth.source == "photographs"
     return {
-        "protocol": task.protocol.facts,
+        "protocol": task.truth.protocol.facts,
         "truth": task.truth.source,
-        "downscale": DOWNSCALES[task.protocol.downscale if photographs else "box"].protocol,
+        "downscale": DOWNSCALES[task.truth.protocol.downscale if photographs else "box"].protocol,
         "rounding": "renders clamped to [0, 1] and rounded to 8 bits",
         "background": list(task.truth.own.background),
         "metrics": {metric.name: metric.protocol for metric in task.measured},
@@ -192,7 +186,7 @@ class _Bench:
     def __init__(self, task: Task, images: ImageStore | None):
         self.task, self.images = task, images
         self.timed = {c.name: TimedRenderer(c.renderer) for c in task.candidates}
-        self.sized = task.protocol.change == "size"
+        self.sized = task.truth.protocol.change == "size"
 
     def measure(self, index: int, view: Camera) -> Iterator[Measurement]:
         """Measure every candidate at every scale."""
@@ -227,7 +221,7 @@ class _Bench:
     def _series(self, truth: ViewTruth, name: str, scale: float, drawn: Drawn, full: Drawn | None) -> Series:
         camera, timed = truth.camera(scale), self.timed[name]
         frames = (lambda: (timed.motion(camera), truth.motion(scale))) if self.sized else None
-        return Series(scale, drawn, full, partial(self.task.protocol.resized, camera=camera, scale=scale), frames)
+        return Series(scale, drawn, full, partial(self.task.truth.protocol.resized, camera=camera, scale=scale), frames)
 
 
 def _work(renderer: Renderer, camera: Camera) -> Hashable:

@@ -52,8 +52,7 @@ WORDS: dict[LpipsFlavour, str] = {
 def lpips_metric(flavour: LpipsFlavour, trunk: str | PathLike[str], heads: str | PathLike[str]) -> Metric:
     """LPIPS as a metric, with its weights (torchvision's and the `lpips` package's) in memory.
 
-    Raises:
-        FormatError: a file is not the weights of this net.
+    Raises FormatError if a file is not the weights of this net.
     """
     net = NETS["alex" if flavour == "alex" else "vgg"]
     weights = _trunk(Path(trunk), net)
@@ -72,16 +71,8 @@ def _without_weights(image: Image, truth: Image) -> None:
     raise UsageError("LPIPS", "needs weights: see `lpips_metric`")
 
 
-LPIPS = Metric(
-    "LPIPS",
-    "",
-    0.0,
-    4,
-    "version 0.1",
-    _without_weights,
-    undefined=f"image smaller than the {LEAST_SIDE} px that LPIPS needs",
-    prepare=_prepared,
-)
+SMALL = f"image smaller than the {LEAST_SIDE} px that LPIPS needs"
+LPIPS = Metric("LPIPS", "", 0.0, 4, "version 0.1", _without_weights, undefined=SMALL, prepare=_prepared)
 
 
 def _distance(

@@ -58,8 +58,7 @@ def ssim(image: Image, truth: Image, flavour: SsimFlavour = "wang") -> float | N
 def flip(image: Image, truth: Image) -> float | None:
     """Mean of the LDR-FLIP map (Andersson et al. 2020) at the default viewing distance; 0 for equal images.
 
-    Raises:
-        UsageError: the package that computes it is not installed.
+    Raises UsageError if the package that computes it is not installed.
     """
     if importlib.util.find_spec("flip_evaluator") is None:
         raise UsageError("FLIP", "needs the package flip-evaluator: pip install 'aaplug[flip]'")
@@ -110,27 +109,15 @@ def _flicker(series: Series) -> float | None:
     return flicker(*series.frames())
 
 
-PSNR = Metric(
-    "PSNR",
-    "dB",
-    math.inf,
-    2,
-    "peak 1, over all channels, mean of per-view values",
-    psnr,
-    undefined="equal images: PSNR is infinite and left out of the mean",
-)
+EQUAL = "equal images: PSNR is infinite and left out of the mean"
+PSNR = Metric("PSNR", "dB", math.inf, 2, "peak 1, over all channels, mean of per-view values", psnr, undefined=EQUAL)
 
 
 def _ssim(flavour: SsimFlavour, border: str) -> Metric:
+    variant = f"{flavour}: {SSIM_WINDOW}×{SSIM_WINDOW} Gaussian, sigma 1.5, {border}, channel mean"
+    small, measure = "image smaller than the SSIM window", partial(ssim, flavour=flavour)
     return Metric(
-        "SSIM",
-        "",
-        1.0,
-        4,
-        f"{flavour}: {SSIM_WINDOW}×{SSIM_WINDOW} Gaussian, sigma 1.5, {border}, channel mean",
-        partial(ssim, flavour=flavour),
-        undefined="image smaller than the SSIM window",
-        prepare=lambda protocol, _: SSIM[protocol.ssim],
+        "SSIM", "", 1.0, 4, variant, measure, undefined=small, prepare=lambda protocol, _: SSIM[protocol.ssim]
     )
 
 
@@ -139,33 +126,21 @@ SSIM: dict[SsimFlavour, Metric] = {
     "3dgs": _ssim("3dgs", "zero-padded, border kept"),
 }
 FLIP = Metric("FLIP", "", 0.0, 4, f"LDR-FLIP, mean, {FLIP_DEGREE} px a degree", flip)
-CONSISTENCY = Metric(
-    "consistency",
-    "dB",
-    math.inf,
-    2,
+_OWN_DOWNSCALED = (
     "PSNR of the image against the recipe's own training-size image, box-averaged; null at and above that size, where "
-    "the two are equal, and where scale 1 is not measured",
-    figure=_consistency,
+    "the two are equal, and where scale 1 is not measured"
 )
-ENERGY = Metric(
-    "energy drift",
-    "",
-    0.0,
-    4,
+CONSISTENCY = Metric("consistency", "dB", math.inf, 2, _OWN_DOWNSCALED, figure=_consistency)
+_OWN_LIGHT = (
     "luminance of what is drawn, without the background, over the recipe's own at the training size, minus 1; "
-    "null where scale 1 is not measured",
-    figure=_energy_drift,
+    "null where scale 1 is not measured"
 )
-FLICKER = Metric(
-    "flicker",
-    "",
-    1.0,
-    3,
+ENERGY = Metric("energy drift", "", 0.0, 4, _OWN_LIGHT, figure=_energy_drift)
+_OWN_MOTION = (
     "frame-to-frame change over three steps of 1/4 px, over that of the training-size image, averaged down: 1 is "
-    "motion alone; null at and above the training size",
-    figure=_flicker,
+    "motion alone; null at and above the training size"
 )
+FLICKER = Metric("flicker", "", 1.0, 3, _OWN_MOTION, figure=_flicker)
 
 METRICS: Registry[Metric] = Registry(
     "metric",

@@ -75,11 +75,7 @@ class Protocol:
 
 
 def median_depth(means: Float[Tensor, "n 3"], view: Camera) -> float:
-    """Median depth of the Gaussians that project into the view, in world units.
-
-    Raises:
-        UsageError: none does.
-    """
+    """Median depth of the Gaussians that project into the view, in world units; raises UsageError if none does."""
     pixels, depth = view.project(means)
     x, y = pixels.unbind(dim=1)
     inside = (depth > NEAR) & (x >= 0) & (x <= view.width) & (y >= 0) & (y <= view.height)
@@ -88,59 +84,30 @@ def median_depth(means: Float[Tensor, "n 3"], view: Camera) -> float:
     return float(torch.median(depth[inside]))
 
 
-_360_OUT = Protocol(
-    "360-zoom-out",
-    "Mip-NeRF 360 trained at full size, rendered at 1, 1/2, 1/4 and 1/8 of it (3DGS's -r 1, 2, 4, 8)",
-    ZOOM_OUT,
-    "photographs",
-    downscale="pil-bicubic",
-    whole_sizes=True,
-    ssim="3dgs",
-    lpips="3dgs",
-)
+_SOURCES = {
+    "default": "aaplug: photographs where every view has one, else self",
+    "blender": "NeRF-synthetic, single-train multi-test (Mip-Splatting, section 6.2): trained at full size, tested "
+    "down to 1/8, on white",
+    "360-zoom-out": "Mip-NeRF 360 trained at full size, rendered at 1, 1/2, 1/4 and 1/8 of it (3DGS's -r 1, 2, 4, 8)",
+    "360-zoom-in": "Mip-NeRF 360, single-train multi-test (Mip-Splatting, section 6.3): trained at -r 8, rendered at "
+    "-r 8, 4, 2 and 1",
+    "distance": "the camera moves away and nearer, the focal length stays (the argument of LOD-GS, arXiv 2507.00554); "
+    "against the scene's own supersampled look",
+    "fov": "the focal length changes, pose and image size stay; against the scene's own supersampled look",
+    "self": "no photographs: against the scene's own training-size look, averaged down, and `matched` above that size",
+}
+_SELF = Protocol("self", "", ZOOM_OUT, "self")
+_3DGS = Protocol("", "", ZOOM_OUT, "photographs", ssim="3dgs", lpips="3dgs")
+_360 = replace(_3DGS, name="360-zoom-out", downscale="pil-bicubic", whole_sizes=True)
 _OWN = (
-    Protocol("default", "aaplug: photographs where every view has one, else self", ZOOM_OUT),
-    Protocol(
-        "blender",
-        "NeRF-synthetic, single-train multi-test (Mip-Splatting, section 6.2): trained at full size, tested "
-        "down to 1/8, on white",
-        ZOOM_OUT,
-        "photographs",
-        downscale="rgba-box",
-        ssim="3dgs",
-        lpips="3dgs",
-        background=WHITE,
-    ),
-    _360_OUT,
-    replace(
-        _360_OUT,
-        name="360-zoom-in",
-        source="Mip-NeRF 360, single-train multi-test (Mip-Splatting, section 6.3): trained at -r 8, rendered at -r 8, "
-        "4, 2 and 1",
-        scales=ZOOM_IN,
-    ),
-    Protocol(
-        "distance",
-        "the camera moves away and nearer, the focal length stays (the argument of LOD-GS, arXiv 2507.00554); "
-        "against the scene's own supersampled look",
-        ZOOM_OUT,
-        "self",
-        "distance",
-    ),
-    Protocol(
-        "fov",
-        "the focal length changes, pose and image size stay; against the scene's own supersampled look",
-        ZOOM_OUT,
-        "self",
-        "fov",
-    ),
-    Protocol(
-        "self",
-        "no photographs: against the scene's own training-size look, averaged down, and `matched` above that size",
-        ZOOM_OUT,
-        "self",
-    ),
+    Protocol("default", "", ZOOM_OUT),
+    replace(_3DGS, name="blender", downscale="rgba-box", background=WHITE),
+    _360,
+    replace(_360, name="360-zoom-in", scales=ZOOM_IN),
+    replace(_SELF, name="distance", change="distance"),
+    replace(_SELF, name="fov", change="fov"),
+    _SELF,
 )
 PROTOCOLS: Registry[Protocol] = Registry(
-    "protocol", {protocol.name: protocol for protocol in _OWN}, check=lambda value: isinstance(value, Protocol)
+    "protocol", {p.name: replace(p, source=_SOURCES[p.name]) for p in _OWN}, lambda value: isinstance(value, Protocol)
 )

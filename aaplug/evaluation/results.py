@@ -130,10 +130,7 @@ def work(report: Report) -> list[tuple[str, list[list[str]]]]:
     if any(m.evaluations is not None for m in report.measurements):
         columns.append(("million evaluations a view", million_evaluations, 2))
     return [
-        (
-            title,
-            [[number(column(report, recipe, scale), digits) for scale in report.scales] for recipe in report.recipes],
-        )
+        (title, [[number(column(report, r, s), digits) for s in report.scales] for r in report.recipes])
         for title, column, digits in columns
     ]
 
@@ -145,17 +142,14 @@ def results(report: Report) -> dict[str, Any]:
 
 def per_view(report: Report) -> dict[str, Any]:
     """INRIA's per_view.json, {method: {metric: {view: value}}}, and samples per pixel side, seconds, evaluations."""
-    return _by_method(
-        report,
-        lambda views: (
-            {m.name: {v.view: v.values.get(m.name) for v in views} for m in report.metrics}
-            | {
-                "samples": {v.view: v.samples for v in views},
-                "seconds": {v.view: round(v.seconds, 4) for v in views},
-                "evaluations": {v.view: v.evaluations for v in views},
-            }
-        ),
-    )
+
+    def content(views: tuple[Measurement, ...]) -> dict[str, Any]:
+        values = {m.name: {v.view: v.values.get(m.name) for v in views} for m in report.metrics}
+        samples, evaluations = ({v.view: getattr(v, name) for v in views} for name in ("samples", "evaluations"))
+        times = {v.view: round(v.seconds, 4) for v in views}
+        return values | {"samples": samples, "seconds": times, "evaluations": evaluations}
+
+    return _by_method(report, content)
 
 
 def _by_method(report: Report, content: Callable[[tuple[Measurement, ...]], dict[str, Any]]) -> dict[str, Any]:

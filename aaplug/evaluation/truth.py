@@ -59,8 +59,7 @@ def upsampled(upsampler: Upsampler) -> Enlarge:
 def source_of(views: Sequence[Camera], asked: str = "auto") -> TruthSource:
     """The source that is asked for; for "auto" photographs where every view has one, else the own look.
 
-    Raises:
-        UsageError: there is no source of that name, or a view has no photograph.
+    Raises UsageError if there is no source of that name, or a view has no photograph.
     """
     missing = [view.name for view in views if view.photo is None]
     if asked == "self" or (asked == "auto" and missing):

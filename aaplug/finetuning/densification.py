@@ -29,11 +29,6 @@ class ScreenGradients:
     total: Float[Tensor, " n"]
     views: Float[Tensor, " n"]
 
-    @classmethod
-    def none(cls, n: int) -> "ScreenGradients":
-        """Zeros for n Gaussians."""
-        return cls(torch.zeros(n), torch.zeros(n))
-
     def add(self, drawing: Drawing) -> None:
         """Add a view after its backward pass; its splats' means must have retained their gradients."""
         splats, (height, width) = drawing.splats, drawing.hw

@@ -70,7 +70,9 @@ def fit(
         if not _is_worse(report, CONVERTED):
             break
         monitor.say(f"worse than the original at some scale: taking {share:g} of the change")
-        found = _partly(original.scene, tuned, share)
+        *earlier, tuning = tuned.fused
+        partly = Fusion(tuning.method, tuning.settings | {"share": f"{share:g}"})
+        found = replace(between(original.scene, tuned, share), fused=(*earlier, partly))
         report = with_result(found)
     if state.step and _is_worse(report, CONVERTED):
         monitor.say("still worse than the original at some scale: read the table before you use it")
@@ -90,10 +92,3 @@ def _is_worse(report: Report, name: str) -> bool:
         if after is not None and (before is None or after < before):
             return True
     return False
-
-
-def _partly(original: Gaussians, tuned: Gaussians, share: float) -> Gaussians:
-    """A share of the way from the original to the tuned scene; the record of the tuning says so."""
-    *earlier, tuning = tuned.fused
-    partly = Fusion(tuning.method, tuning.settings | {"share": f"{share:g}"})
-    return replace(between(original, tuned, share), fused=(*earlier, partly))

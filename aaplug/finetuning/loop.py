@@ -48,8 +48,7 @@ def run(
     keep: called with the state and the last good one, also when the run stops.
     stop: asked before every step.  say: called when the run rolls back.
 
-    Raises:
-        UsageError: no step has a finite gradient, at any learning rate.
+    Raises UsageError if no step has a finite gradient, at any learning rate.
     """
     good = good or packed(state)
     while state.step < job.settings.steps and not stop():
@@ -153,9 +152,7 @@ def _densify(job: TuningJob, state: State) -> None:
     generator = torch.Generator().manual_seed(job.settings.seed * SEEDS + SPLIT_SEEDS + state.step)
     with torch.no_grad():
         densified = densify(state.scene(job), state.gradients.mean, extent(job.start.training.cameras), generator)
-        moments = {
-            group["name"]: carried(state.adam.state[group["params"][0]], densified) for group in state.adam.param_groups
-        }
+        moments = {g["name"]: carried(state.adam.state[g["params"][0]], densified) for g in state.adam.param_groups}
     state.leaves = leaves_of(densified.scene)
     state.adam = optimizer(state.leaves, job.settings)
     for group in state.adam.param_groups:
@@ -163,7 +160,7 @@ def _densify(job: TuningJob, state: State) -> None:
     first = state.first_log_scales[densified.sources]
     state.first_log_scales = torch.where(densified.new[:, None], densified.scene.log_scales, first)
     _update_bounds(job, state)
-    state.gradients = ScreenGradients.none(len(first))
+    state.gradients = ScreenGradients(torch.zeros(len(first)), torch.zeros(len(first)))
 
 
 @torch.no_grad()

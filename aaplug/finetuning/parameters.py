@@ -44,9 +44,8 @@ def scene_of(leaves: Mapping[str, Tensor], like: Gaussians) -> Gaussians:
     """
     values = {name: leaves[name] for name in WHOLE}
     sh = torch.cat([leaves["dc"], leaves["rest"]], dim=1)
-    same = len(sh) == len(like)
-    origin, sizes = (like.origin, like.pixel_sizes) if same else (None, None)
-    return replace(like, **values, sh=sh, origin=origin, pixel_sizes=sizes)
+    dropped = {} if len(sh) == len(like) else {"origin": None, "pixel_sizes": None}
+    return replace(like, **values, **dropped, sh=sh)
 
 
 def between(start: Gaussians, end: Gaussians, share: float) -> Gaussians:

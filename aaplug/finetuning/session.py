@@ -76,8 +76,7 @@ def recorded(state: State, job: TuningJob, convention: Convention, settings: Map
     """The tuned scene with a record of its tuning; after no steps the start itself."""
     if state.step == 0:
         return replace(job.start.scene, convention=convention)
-    scene = state.scene(job)
-    fusion = Fusion(TUNED, {"steps": str(state.step), **settings})
+    scene, fusion = state.scene(job), Fusion(TUNED, {"steps": str(state.step), **settings})
     return replace(scene, convention=convention, fused=(*scene.fused, fusion))
 
 

@@ -10,9 +10,6 @@ from aaplug.finetuning.losses import LOSSES
 from aaplug.finetuning.parameters import RATES
 from aaplug.methods.viewers import CLASSIC_VIEWER, FAST, Viewer
 
-MIPMAP_STEPS = 1000
-MIPMAP_EVERY = 100  # steps between densifications
-
 
 @dataclass(frozen=True)
 class Settings:
@@ -37,24 +34,12 @@ class Settings:
     seed: int = 0
 
 
-OURS = Settings(
-    "consistency",
-    1000,
-    {0.5: 1.0, 0.25: 2.0, 0.125: 1.0},  # these, and that all parameters move, were measured
-    RATES,
-    anchor=3.0,
-    decay=0.03,
-)
+# these scales and weights, and that all parameters move, were measured
+OURS = Settings("consistency", 1000, {0.5: 1.0, 0.25: 2.0, 0.125: 1.0}, RATES, anchor=3.0, decay=0.03)
 # 3DGS's rates worsen a scene that is nearly right, and 300 steps are too few to recover
-GENTLE = 0.3
-QUICK = replace(  # for conversion, a few minutes; `balanced` divides its weights by the scene's errors
-    OURS,
-    name="quick",
-    steps=300,
-    weights={0.5: 1.0, 0.25: 1.0, 0.125: 1.0},
-    anchor=4.0,
-    rates={name: GENTLE * rate for name, rate in RATES.items()},
-)
+GENTLE = {name: 0.3 * rate for name, rate in RATES.items()}
+# for conversion, a few minutes; `balanced` divides its weights by the scene's errors
+QUICK = replace(OURS, name="quick", steps=300, weights=dict.fromkeys(OURS.weights, 1.0), anchor=4.0, rates=GENTLE)
 
 
 def balanced(settings: Settings, errors: Mapping[float, float]) -> Settings:
@@ -77,14 +62,11 @@ def mipmap_gs(scales: Sequence[float], move: Sequence[str] = (), anchor: float =
     """Mipmap-GS (Li et al. 2024), one model for one scale: all parameters at 3DGS's rates, 1000 steps of L2.
 
     Its truth is a bilinear resize at the test poses; here it is the box average at the training poses.  It moves every
-    parameter and has no anchor.
-
-    Raises:
-        UsageError: there is not exactly one scale.
+    parameter and has no anchor.  More than one scale raises UsageError.
     """
     if len(scales) != 1:
         raise UsageError("scale", "mipmap-gs makes one model for one scale; give one")
-    return Settings("mipmap-gs", MIPMAP_STEPS, {scales[0]: 1.0}, RATES, densify_every=MIPMAP_EVERY)
+    return Settings("mipmap-gs", 1000, {scales[0]: 1.0}, RATES, densify_every=100)
 
 
 @dataclass(frozen=True)
@@ -116,8 +98,7 @@ def settings_of(
 ) -> Settings:
     """A method's settings with the user's choices; None takes the method's own.
 
-    Raises:
-        UsageError: a choice is out of its range, or does not fit the method.
+    Raises UsageError if a choice is out of its range, or does not fit the method.
     """
     counts = {"steps": steps, "densify_every": densify_every}
     for name, value in (counts | {"anchor": anchor}).items():

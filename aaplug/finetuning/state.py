@@ -83,8 +83,8 @@ def begin(job: TuningJob) -> State:
     """The state before the first step."""
     scene = job.start.scene
     leaves = leaves_of(scene)
-    adam, gradients = optimizer(leaves, job.settings), ScreenGradients.none(len(scene))
-    return State(0, leaves, adam, scene.log_scales, job.start.training.bounds, gradients)
+    gradients = ScreenGradients(torch.zeros(len(scene)), torch.zeros(len(scene)))
+    return State(0, leaves, optimizer(leaves, job.settings), scene.log_scales, job.start.training.bounds, gradients)
 
 
 def optimizer(leaves: Leaves, settings: Settings) -> torch.optim.Adam:

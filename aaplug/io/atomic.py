@@ -76,8 +76,7 @@ def refuse_existing(paths: Sequence[Path], overwrite: bool) -> None:
         raise OutputError(folder, "is a file; name a folder")
     existing = [path.name for path in paths if path.exists()]
     if existing and not overwrite:
-        holds = listing(existing, most=3)
-        raise OutputError(folder, f"already holds {holds}; pass `overwrite` to replace files")
+        raise OutputError(folder, f"already holds {listing(existing, most=3)}; pass `overwrite` to replace files")
 
 
 def _check_target(path: Path, overwrite: bool) -> None:

@@ -30,8 +30,7 @@ class BatchFile:
 def read_batch(path: str | PathLike[str]) -> BatchFile:
     """Read a batch file.  A scene without a name gets that of its file or folder.
 
-    Raises:
-        FormatError: it is not TOML, names no scene, or names two scenes alike.
+    Raises FormatError if it is not TOML, names no scene, or names two scenes alike.
     """
     path = Path(path)
     try:

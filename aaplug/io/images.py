@@ -24,7 +24,7 @@ from torch import Tensor
 
 from aaplug.core.errors import FormatError
 from aaplug.core.imaging import levels
-from aaplug.io.atomic import check_output, replacing
+from aaplug.io.atomic import replacing
 from aaplug.io.limits import whole_limit
 
 LOSSLESS_WEBP = 101  # OpenCV's quality for it
@@ -66,15 +66,9 @@ def write_png(
     path: str | PathLike[str], rgb: Float[Tensor, "h w 3"], bit_depth: int = 8, overwrite: bool = False
 ) -> None:
     """Write colours, clamped to [0, 1], as a PNG; see `replacing`."""
-    check_output(path, overwrite)
-    png = encode_png(rgb, bit_depth)
+    png = _encoded(".png", _stored(rgb, bit_depth))
     with replacing(path, overwrite) as stream:
         stream.write(png)
-
-
-def encode_png(rgb: Float[Tensor, "h w 3"], bit_depth: int) -> bytes:
-    """A PNG file of colours clamped to [0, 1]."""
-    return _encoded(".png", _stored(rgb, bit_depth))
 
 
 def encode_webp(rgb: Float[Tensor, "h w 3"], quality: int | None) -> bytes:

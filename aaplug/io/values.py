@@ -5,7 +5,6 @@ file, the entry and the field, and says what was expected and what was found.
 """
 
 import json
-import math
 import os
 import reprlib
 from collections.abc import Callable, Sequence
@@ -41,6 +40,11 @@ class Place:
         """An error about one field."""
         return self.error(f"{field} should be {expected}, not {reprlib.repr(got)}")
 
+    def expect(self, right: bool, field: str, expected: str, got: object) -> None:
+        """Raise `wrong` unless the value of a field is right."""
+        if not right:
+            raise self.wrong(field, expected, got)
+
 
 @dataclass(frozen=True)
 class Entry:
@@ -67,21 +71,18 @@ class Entry:
     def entry(self, field: str) -> "Entry":
         """A JSON object."""
         value = self.value(field)
-        if not isinstance(value, dict):
-            raise self.place.wrong(field, "an object", value)
+        self.place.expect(isinstance(value, dict), field, "an object", value)
         return Entry(Place(self.place.file, field), value)
 
     def vector(self, field: str, length: int) -> Float[Tensor, " length"]:
         """A list of `length` finite numbers."""
-        cells = numbers(self.value(field), length, self.place, field)
-        return torch.tensor(cells, dtype=torch.float64)
+        return torch.tensor(numbers(self.value(field), length, self.place, field), dtype=torch.float64)
 
     def matrix(self, field: str, rows: int, columns: int) -> Float[Tensor, "rows columns"]:
         """A list of rows, each a list of finite numbers."""
         value = self.value(field)
-        expected = f"{rows} rows of {columns} numbers"
-        if not isinstance(value, list) or len(value) != rows:
-            raise self.place.wrong(field, expected, value)
+        right = isinstance(value, list) and len(value) == rows
+        self.place.expect(right, field, f"{rows} rows of {columns} numbers", value)
         cells = [numbers(row, columns, self.place, field) for row in value]
         return torch.tensor(cells, dtype=torch.float64)
 
@@ -90,8 +91,7 @@ def number(value: object, place: Place, field: str) -> float:
     """`value` as a finite number."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise place.wrong(field, "a number", value)
-    if not -math.inf < value < math.inf or abs(value) > torch.finfo(torch.float64).max:
-        raise place.wrong(field, "a finite number", value)
+    place.expect(abs(value) <= torch.finfo(torch.float64).max, field, "a finite number", value)
     return float(value)
 
 
@@ -105,16 +105,14 @@ def numbers(value: object, length: int, place: Place, field: str) -> list[float]
 def focal(value: object, place: Place, field: str) -> float:
     """`value` as a focal length, in px."""
     real = number(value, place, field)
-    if not 0 < real <= MAX_FOCAL:
-        raise place.wrong(field, f"above 0 and at most {MAX_FOCAL:g} px", value)
+    place.expect(0 < real <= MAX_FOCAL, field, f"above 0 and at most {MAX_FOCAL:g} px", value)
     return real
 
 
 def pixels(value: object, place: Place, field: str) -> int:
     """`value` as the side of an image, in px."""
     real, most = number(value, place, field), whole_limit("CAMERA_SIDE")
-    if not (1 <= real <= most and real.is_integer()):
-        raise place.wrong(field, f"a whole number of px from 1 to {most}", value)
+    place.expect(1 <= real <= most and real.is_integer(), field, f"a whole number of px from 1 to {most}", value)
     return int(real)
 
 
@@ -125,15 +123,20 @@ def text(value: object, place: Place, field: str) -> str:
     return value
 
 
-def read_bounded(path: Path, limit: int) -> bytes:
-    """The bytes of a file that is not longer than `limit`."""
+def read_start(path: Path, size: int) -> bytes:
+    """The first bytes of a file, or all if it has fewer."""
     if not os.path.isfile(path):  # reading a pipe would block
-        raise FormatError(path, "there is no such file")
+        raise FormatError(path, "is not an ordinary file" if os.path.exists(path) else "cannot be read: no such file")
     try:
         with path.open("rb") as file:
-            data = file.read(limit + 1)
+            return file.read(size)
     except OSError as error:
         raise FormatError(path, f"cannot be read: {reason(error)}") from error
+
+
+def read_bounded(path: Path, limit: int) -> bytes:
+    """The bytes of a file that is not longer than `limit`."""
+    data = read_start(path, limit + 1)
     if len(data) > limit:
         raise FormatError(path, f"is longer than {limit} bytes, the limit for such a file")
     return data
@@ -167,19 +170,15 @@ def entries(path: Path, what: str, items: object, shared: dict[str, Any] | None 
         raise FormatError(path, f"should hold a list of {what}s, at least one, not {reprlib.repr(items)}")
     places = [Place(path, f"{what} {i}") for i in range(len(items))]
     for place, item in zip(places, items, strict=True):
-        if not isinstance(item, dict):
-            raise place.wrong("it", "an object", item)
+        place.expect(isinstance(item, dict), "it", "an object", item)
     return [Entry(place, {**(shared or {}), **item}) for place, item in zip(places, items, strict=True)]
 
 
 def mentions(path: Path, keys: Sequence[str]) -> bool:
     """Whether one of these JSON keys stands in the first bytes of the file; False if it cannot be read."""
-    if not os.path.isfile(path):
-        return False
     try:
-        with path.open("rb") as file:
-            start = file.read(HEAD_LIMIT)
-    except OSError:
+        start = read_start(path, HEAD_LIMIT)
+    except FormatError:
         return False
     return any(f'"{key}"'.encode() in start for key in keys)
 

@@ -52,7 +52,7 @@ class CameraFormat(Protocol):
 OWN: tuple[CameraFormat, ...]
 OWN = (pinhole, camera_path, inria_model, colmap, blender, inria, multiscale, transforms, llff)
 CAMERA_FORMATS = Registry[CameraFormat](
-    "camera format", {f.name: f for f in OWN}, lambda value: isinstance(value, CameraFormat)
+    "camera format", {f.name: f for f in OWN}, lambda f: isinstance(f, CameraFormat)
 )
 
 
@@ -90,10 +90,7 @@ def read_cameras(
 def select_views(cameras: CameraSet, spec: str) -> tuple[Camera, ...]:
     """The views named by `spec`: train, test, all, or view names separated by commas.
 
-    A name in both splits means the test view.
-
-    Raises:
-        UsageError: a name is unknown.
+    A name in both splits means the test view.  An unknown name raises UsageError.
     """
     groups = {"train": cameras.train, "test": cameras.test, "all": cameras.all}
     if spec in groups:

@@ -56,12 +56,10 @@ def read_camera_path(path: str | PathLike[str]) -> CameraPath:
     path = Path(path)
     about = object_of(read_json(path), path, "the path", f"'{KEY}', as nerfstudio writes", KEY)
     kind = about.fields.get("camera_type", PERSPECTIVE)
-    if kind != PERSPECTIVE:
-        raise about.place.wrong("camera_type", PERSPECTIVE, kind)
+    about.place.expect(kind == PERSPECTIVE, "camera_type", PERSPECTIVE, kind)
     size = about.get("render_width", pixels), about.get("render_height", pixels)
     fps = about.get("fps", number, USUAL_FPS)
-    if not fps > 0:
-        raise about.place.wrong("fps", "above 0", fps)
+    about.place.expect(fps > 0, "fps", "above 0", fps)
     frames = entries(path, "frame", about.fields[KEY])
     digits = len(str(len(frames) - 1))
     cameras = (_camera(entry, f"{i:0{digits}}", *size) for i, entry in enumerate(frames))
@@ -70,8 +68,7 @@ def read_camera_path(path: str | PathLike[str]) -> CameraPath:
 
 def _camera(entry: Entry, name: str, width: int, height: int) -> Camera:
     angle = entry.get("fov", number)
-    if not 0 < angle < HALF_TURN:
-        raise entry.place.wrong("fov", f"above 0 and below {HALF_TURN:g} degrees", angle)
+    entry.place.expect(0 < angle < HALF_TURN, "fov", f"above 0 and below {HALF_TURN:g} degrees", angle)
     f = focal(height / 2 / math.tan(math.radians(angle) / 2), entry.place, "fov's focal length")
     motion = entry.vector("camera_to_world", 16).reshape(4, 4)
     world_from_cam = pose_of_opengl(motion, entry.place, "camera_to_world")

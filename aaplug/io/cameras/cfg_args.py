@@ -89,15 +89,14 @@ def _literals(path: Path, call: ast.Call) -> dict[str, Any]:
 
 def _resolution(value: object, place: Place, field: str) -> float:
     real, most = number(value, place, field), whole_limit("CAMERA_SIDE")
-    if real != CAPPED and not 1 <= real <= most:
-        raise place.wrong(field, f"-1, 1, 2, 4, 8 or a width up to {most} px", value)
+    right = real == CAPPED or 1 <= real <= most
+    place.expect(right, field, f"-1, 1, 2, 4, 8 or a width up to {most} px", value)
     return real
 
 
 def _flag(entry: Entry, field: str) -> bool | None:
     value = entry.fields.get(field)
-    if value is not None and not isinstance(value, bool):
-        raise entry.place.wrong(field, "True or False", value)
+    entry.place.expect(value is None or isinstance(value, bool), field, "True or False", value)
     return value
 
 

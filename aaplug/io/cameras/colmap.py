@@ -140,8 +140,8 @@ def _distortion(lens: Intrinsics) -> Distortion | None:
 def _rotation(image: Image) -> Float[Tensor, "3 3"]:
     """The rotation of a quaternion wxyz: I + 2w[v]ₓ + 2[v]ₓ² after normalization."""
     length = math.hypot(*image.quaternion)
-    if not LEAST_QUATERNION <= length < math.inf:
-        raise image.place.wrong("quaternion", "finite and not zero", image.quaternion)
+    right = LEAST_QUATERNION <= length < math.inf
+    image.place.expect(right, "quaternion", "finite and not zero", image.quaternion)
     w, x, y, z = (value / length for value in image.quaternion)
     cross = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
     return torch.eye(3, dtype=torch.float64) + 2 * w * cross + 2 * cross @ cross

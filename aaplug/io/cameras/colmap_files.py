@@ -116,15 +116,18 @@ class _Reader:
     """A binary file whose remaining size is checked before each read."""
 
     def __init__(self, path: Path, file: BinaryIO) -> None:
-        self.path, self.file = path, file
-        self.left = os.fstat(file.fileno()).st_size
+        self.path, self.file, self.size = path, file, os.fstat(file.fileno()).st_size
+
+    @property
+    def left(self) -> int:
+        """Bytes that were not read yet."""
+        return self.size - self.file.tell()
 
     def unpack(self, record: struct.Struct, what: str) -> tuple:
         """One record of fixed size."""
         size = record.size
         if size > self.left:
             raise FormatError(self.path, f"{what}: {size} bytes expected, {self.left} left; the file is cut short")
-        self.left -= size
         return record.unpack(self.file.read(size))
 
     def count(self, least: int, what: str) -> int:
@@ -135,11 +138,6 @@ class _Reader:
             raise FormatError(self.path, f"{need}; the file is cut short or is not COLMAP's")
         return n
 
-    def skip(self, size: int) -> None:
-        """Skip bytes, which `count` has found to be there."""
-        self.left -= size
-        self.file.seek(size, os.SEEK_CUR)
-
     def name(self, what: str) -> bytes:
         """Bytes up to a NUL."""
         start, most = self.file.tell(), whole_limit("NAME")
@@ -148,7 +146,6 @@ class _Reader:
         if not end:
             raise FormatError(self.path, f"{what}: its name should end within {most} bytes, not after {len(chunk)}")
         self.file.seek(start + len(name) + 1)
-        self.left -= len(name) + 1
         return name
 
 
@@ -179,7 +176,7 @@ def _binary_images(file: Path, stream: BinaryIO) -> Iterator[Image]:
         key, *motion, camera_id = reader.unpack(IMAGE, what)
         place = Place(reader.path, f"image {key}")
         name = text(_decoded(reader.name(what), place), place, "name")
-        reader.skip(reader.count(POINT_SIZE, f"points of {what}") * POINT_SIZE)
+        stream.seek(reader.count(POINT_SIZE, f"points of {what}") * POINT_SIZE, os.SEEK_CUR)
         yield Image(place, name, camera_id, tuple(motion[:4]), tuple(motion[4:]))
 
 

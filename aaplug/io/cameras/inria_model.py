@@ -1,7 +1,6 @@
 """A 3DGS model folder: `cameras.json` with the training run's `cfg_args` beside it.
 
-It is read as `inria` reads it, but recognized before a COLMAP dataset in the same folder: the model's files alone tell
-the training size.
+Read as by `inria`, but recognized before a COLMAP dataset in the same folder: only the model tells the training size.
 """
 
 import os

@@ -44,8 +44,7 @@ def read(path: Path, options: Options) -> CameraSet:
     source = [replace(camera, name=last_part(camera.name)) for camera in source]
     photographed = photo_sizes(source), "size of the photos, or in the file"
     sizes, why = photographed if options.train_scale is None else file_sizes(source, options)
-    trained = trained_at(source, sizes)
-    split = every_nth(trained, options, LLFF_HOLD, "LLFF's rule; `test_every` 0 for no split")
+    split = every_nth(trained_at(source, sizes), options, LLFF_HOLD, "LLFF's rule; `test_every` 0 for no split")
     return camera_set(f"LLFF {FILE}", source, split, why)
 
 

@@ -40,9 +40,6 @@ def _camera(entry: Entry, name: str) -> Camera:
     motion = rigid(entry, "world_to_camera")
     cam_from_world = pose(motion[:3, :3], motion[:3, 3], entry.place, "world_to_camera")
     inverse(cam_from_world, entry.place, "world_to_camera")  # refuses a centre that overflows
-    size = entry.get("width", pixels), entry.get("height", pixels)
-    focals, centre = (
-        (entry.get("fx", focal), entry.get("fy", focal)),
-        (entry.get("cx", number), entry.get("cy", number)),
-    )
-    return Camera(name, *size, *focals, *centre, cam_from_world)
+    width, height = entry.get("width", pixels), entry.get("height", pixels)
+    fx, fy, cx, cy = entry.get("fx", focal), entry.get("fy", focal), entry.get("cx", number), entry.get("cy", number)
+    return Camera(name, width, height, fx, fy, cx, cy, cam_from_world)

@@ -43,8 +43,7 @@ def inverse(motion: Float[Tensor, "4 4"], place: Place, field: str) -> Float[Ten
     back = torch.eye(4, dtype=torch.float64)
     back[:3, :3] = motion[:3, :3].T
     back[:3, 3] = -back[:3, :3] @ motion[:3, 3]
-    if not back.isfinite().all():
-        raise place.wrong(field, "a smaller position", motion[:3, 3].tolist())
+    place.expect(bool(back.isfinite().all()), field, "a smaller position", motion[:3, 3].tolist())
     return back
 
 
@@ -62,6 +61,6 @@ def centred(
 def rigid(entry: Entry, field: str) -> Float[Tensor, "4 4"]:
     """A field that holds a 4×4 matrix whose last row is 0 0 0 1."""
     motion = entry.matrix(field, 4, 4)
-    if not torch.allclose(motion[3], torch.eye(4, dtype=torch.float64)[3]):
-        raise entry.place.wrong(f"{field}'s last row", "0 0 0 1", motion[3].tolist())
+    right = torch.allclose(motion[3], torch.eye(4, dtype=torch.float64)[3])
+    entry.place.expect(right, f"{field}'s last row", "0 0 0 1", motion[3].tolist())
     return motion

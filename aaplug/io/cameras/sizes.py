@@ -74,7 +74,6 @@ def _photo_size(camera: Camera) -> Size | None:
     width, height = image_size(camera.photo)
     expected = camera.height * width / camera.width
     if abs(height - expected) > 1 + SAME_SHAPE * expected:
-        shape = f"the shape of its camera ({camera.width}×{camera.height} px)"
-        what = f"is {width}×{height} px, which is not {shape}"
+        what = f"is {width}×{height} px, which is not the shape of its camera ({camera.width}×{camera.height} px)"
         raise FormatError(camera.photo, f"{what}; is it the wrong folder, or is the photo turned?")
     return width, height

@@ -20,14 +20,26 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.cameras import WHITE, Camera, CameraSet
-from aaplug.core.errors import FormatError, reason
+from aaplug.core.errors import FormatError
 from aaplug.io.cameras.options import Options, Split, every_nth, explicit
 from aaplug.io.cameras.photos import PhotoFolder, distinct, last_part, refuse_folder, without_suffix
 from aaplug.io.cameras.poses import inverse, pose, pose_of_opengl, rigid
 from aaplug.io.cameras.sizes import Size, camera_set, file_sizes, trained_at
 from aaplug.io.images import image_size
 from aaplug.io.lenses import Distortion, lens_notes, undistorted_cameras
-from aaplug.io.values import Entry, Place, entries, focal, mentions, number, object_of, pixels, read_json, text
+from aaplug.io.values import (
+    Entry,
+    Place,
+    entries,
+    focal,
+    mentions,
+    number,
+    object_of,
+    pixels,
+    read_json,
+    read_start,
+    text,
+)
 
 FILE = "transforms.json"
 AROUND = ("EQUIRECTANGULAR", "OMNIDIRECTIONALSTEREO_L", "OMNIDIRECTIONALSTEREO_R", "VR180_L", "VR180_R")
@@ -38,6 +50,7 @@ FISHEYE = "OPENCV_FISHEYE"
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 LEAST_ANGLE = 1e-9  # rad: the smallest angle of view
 SPLITS = ("train_filenames", "val_filenames", "test_filenames")  # nerfstudio's lists
+Frame = tuple[Entry, Path | None]  # with its photo, if there is one
 PNG = b"\x89PNG\r\n\x1a\n"
 PNG_COLOUR_TYPE = 25  # byte of the header
 PNG_ALPHA = (4, 6)  # colour types with alpha: gray and RGB
@@ -54,14 +67,6 @@ class Source:
     cameras: tuple[Camera, ...]
     held_out: tuple[bool, ...] | None = None
     notes: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class Frame:
-    """A frame and its photo, if there is one."""
-
-    entry: Entry
-    photo: Path | None
 
 
 @dataclass(frozen=True)
@@ -118,14 +123,14 @@ def read_source(file: Path, options: Options) -> Source:
     refuse_folder(options)
     document = _document(file)
     frames = _frames(file, document)
-    paths = [frame.entry.get("file_path", text) for frame in frames]
+    paths = [entry.get("file_path", text) for entry, _ in frames]
     names = distinct(file, paths, (last_part, without_suffix, str))
-    photo = next((frame.photo for frame in frames if frame.photo), None)
+    photo = next((photo for _, photo in frames if photo), None)
     spare = image_size(photo) if photo else None  # for frames without w, h and photo
-    exported = any(EXPORTED in frame.entry for frame in frames)
+    exported = any(EXPORTED in entry for entry, _ in frames)
     parser = None if exported else _dataparser(file.parent / DATAPARSER)
     cameras = [_camera(frame, name, spare, parser) for frame, name in zip(frames, names, strict=True)]
-    lenses = [_distortion(frame.entry) for frame in frames]
+    lenses = [_distortion(entry) for entry, _ in frames]
     cameras = undistorted_cameras(cameras, lenses)
     notes = (*lens_notes(lenses, cameras), *_frame_notes(document, exported, parser))
     return Source(tuple(cameras), _held_out(file, document, paths), notes)
@@ -137,8 +142,7 @@ def _dataparser(path: Path) -> Dataparser | None:
         return None
     entry = object_of(read_json(path), path, "it", "transform and scale")
     matrix, scale = entry.matrix("transform", 3, 4), entry.get("scale", number)
-    if not scale > 0:
-        raise entry.place.wrong("scale", "above 0", scale)
+    entry.place.expect(scale > 0, "scale", "above 0", scale)
     return Dataparser(pose(matrix[:, :3], matrix[:, 3], entry.place, "transform"), scale)
 
 
@@ -158,8 +162,8 @@ def _held_out(file: Path, document: dict[str, Any], paths: Sequence[str]) -> tup
     if SPLITS[0] not in lists:
         return None
     for key, listed in lists.items():
-        if not isinstance(listed, list) or not all(isinstance(p, str) for p in listed):
-            raise Place(file, "lists of file names").wrong(key, "a list of paths", listed)
+        right = isinstance(listed, list) and all(isinstance(p, str) for p in listed)
+        Place(file, "lists of file names").expect(right, key, "a list of paths", listed)
     train = set(lists[SPLITS[0]])
     return tuple(path not in train for path in paths)
 
@@ -188,36 +192,29 @@ def _frames(file: Path, document: dict[str, Any]) -> list[Frame]:
     folder = PhotoFolder(file.parent, file.parent)
     found = entries(file, "frame", document["frames"], shared)
     photos = [None if EXPORTED in e else folder.find(e.get("file_path", text), e.place) for e in found]
-    return [Frame(entry, photo) for entry, photo in zip(found, photos, strict=True)]
+    return list(zip(found, photos, strict=True))
 
 
 def _camera(frame: Frame, name: str, spare: Size | None, parser: Dataparser | None) -> Camera:
-    entry = frame.entry
-    width, height = _size(frame, spare)
+    entry, photo = frame
+    width, height = _size(entry, photo, spare)
     fx = _focal(entry, width)
-    intrinsics = (
-        fx,
-        entry.get("fl_y", focal, fx),
-        entry.get("cx", number, width / 2),
-        entry.get("cy", number, height / 2),
-    )
+    fy, cx, cy = entry.get("fl_y", focal, fx), entry.get("cx", number, width / 2), entry.get("cy", number, height / 2)
     motion = rigid(entry, "transform_matrix")
     world_from_cam = pose_of_opengl(motion, entry.place, "transform_matrix")
     world_from_cam = world_from_cam if parser is None else parser.moved(world_from_cam)
     cam_from_world = inverse(world_from_cam, entry.place, "transform_matrix")
-    return Camera(name, width, height, *intrinsics, cam_from_world, photo=frame.photo)
+    return Camera(name, width, height, fx, fy, cx, cy, cam_from_world, photo=photo)
 
 
-def _size(frame: Frame, spare: Size | None) -> Size:
-    entry = frame.entry
+def _size(entry: Entry, photo: Path | None, spare: Size | None) -> Size:
     if "w" in entry and "h" in entry:
         return entry.get("w", pixels), entry.get("h", pixels)
-    if frame.photo:
-        return image_size(frame.photo)
+    if photo:
+        return image_size(photo)
     if spare is None:
         unknown = "its size is unknown: the file has no w and h, and there are no photos"
-        advice = "put the photos where file_path says, or add w and h (px) beside frames"
-        raise entry.place.error(f"{unknown}; {advice}")
+        raise entry.place.error(f"{unknown}; put the photos where file_path says, or add w and h (px) beside frames")
     return spare
 
 
@@ -225,8 +222,8 @@ def _focal(entry: Entry, width: int) -> float:
     if "fl_x" in entry or "camera_angle_x" not in entry:
         return entry.get("fl_x", focal)
     angle = entry.get("camera_angle_x", number)
-    if not LEAST_ANGLE <= angle < math.pi:
-        raise entry.place.wrong("camera_angle_x", "above 0 and below π, in radians", angle)
+    right = LEAST_ANGLE <= angle < math.pi
+    entry.place.expect(right, "camera_angle_x", "above 0 and below π, in radians", angle)
     return focal(width / 2 / math.tan(angle / 2), entry.place, "camera_angle_x's focal length")
 
 
@@ -237,14 +234,12 @@ def _distortion(entry: Entry) -> Distortion | None:
         raise entry.place.error(f"its camera_model is {model}, which has no focal length")
     k = {key: entry.get(key, number, 0.0) for key in DISTORTION}
     listed = entry.fields.get("distortion_params") or []
-    if not isinstance(listed, list):
-        raise entry.place.wrong("distortion_params", "a list of numbers", listed)
+    entry.place.expect(isinstance(listed, list), "distortion_params", "a list of numbers", listed)
     others = [number(value, entry.place, "distortion_params") for value in listed]
     others += [k["k5"], k["k6"]]
     if entry.fields.get("is_fisheye") or model == FISHEYE:
-        name = model if model == FISHEYE else "fisheye"
         angular = tuple(k[key] for key in ("k1", "k2", "k3", "k4"))
-        return Distortion(name, None if any(others) else angular, fisheye=True)
+        return Distortion(model if model == FISHEYE else "fisheye", None if any(others) else angular, fisheye=True)
     if model in PINHOLES and not any(others) and not any(k.values()):
         return None
     known = model in PINHOLES and not any(others) and not k["k4"]
@@ -253,9 +248,5 @@ def _distortion(entry: Entry) -> Distortion | None:
 
 
 def _has_alpha(photo: Path) -> bool:
-    try:
-        with photo.open("rb") as file:
-            header = file.read(PNG_COLOUR_TYPE + 1)
-    except OSError as error:
-        raise FormatError(photo, f"cannot be read: {reason(error)}") from error
+    header = read_start(photo, PNG_COLOUR_TYPE + 1)
     return header.startswith(PNG) and header[PNG_COLOUR_TYPE:] in [bytes([t]) for t in PNG_ALPHA]

@@ -9,17 +9,19 @@ in the format whose name ends the file's name.
 import importlib.util
 import re
 from collections.abc import Iterable
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-from aaplug.core.errors import FormatError, OutputError, UsageError, reason
+from aaplug.core.errors import FormatError, OutputError, UsageError
 from aaplug.core.gaussians import Convention, Gaussians
 from aaplug.core.registry import Registry
 from aaplug.io.atomic import check_output
 from aaplug.io.scenes import compressed_ply, ksplat, ply, pt, sog, splat, spz
 from aaplug.io.scenes.options import Options, SpzAxes
 from aaplug.io.scenes.scene_file import SceneFile
+from aaplug.io.values import read_start
 
 HEAD_BYTES = 64  # of a file, passed to each format's `sniff`
 SOG_FOLDER = "meta.json"  # marks a folder of SOG images
@@ -39,8 +41,7 @@ class SceneFormat(Protocol):
     def open_scene(self, path: Path, options: Options) -> SceneFile:
         """Read what the file says about the scene; Gaussians are loaded when `SceneFile.load` is called.
 
-        Raises:
-            FormatError: the file breaks its format.
+        Raises FormatError if the file breaks its format.
         """
         ...
 
@@ -55,17 +56,14 @@ class WritableFormat(SceneFormat, Protocol):
     def write(self, path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: Options) -> None:
         """Write a scene of at least one part and at most `count` Gaussians, whole or not at all.
 
-        Raises:
-            OutputError: the format cannot hold the scene, the file exists and `overwrite` is false, or writing fails.
+        Raises OutputError if the format cannot hold the scene, the file exists and `overwrite` is false, or it fails.
         """
         ...
 
 
 # the first that accepts a file is used
 OWN: tuple[SceneFormat, ...] = (compressed_ply, ply, spz, sog, pt, splat, ksplat)
-SCENE_FORMATS = Registry[SceneFormat](
-    "scene format", {f.name: f for f in OWN}, lambda value: isinstance(value, SceneFormat)
-)
+SCENE_FORMATS = Registry[SceneFormat]("scene format", {f.name: f for f in OWN}, lambda f: isinstance(f, SceneFormat))
 
 
 def open_scene(
@@ -90,11 +88,14 @@ def open_scene(
     """
     options = Options(allow_checkpoint, spz_axes)
     path = find_scene(path, iteration)
-    head = _head(path)
+    head = read_start(path, HEAD_BYTES)
+    if not head:
+        raise FormatError(path, "is empty")
     formats = sorted(SCENE_FORMATS.values(), key=OWN.__contains__)  # plug-ins first
     for format in formats:
         if format.sniff(path, head):
-            return format.open_scene(path, options).stated(convention)
+            file = format.open_scene(path, options)
+            return file if convention is None else replace(file, convention=convention, evidence="stated by the user")
     known = ", ".join("." + format.name for format in formats)
     raise FormatError(path, f"is of no known scene format; aaplug reads {known}")
 
@@ -168,8 +169,7 @@ def check_scene_output(
         known = [s for s, format in suffixes.items() if isinstance(format, WritableFormat)]
         raise OutputError(path, f"has no suffix of a format that can be written: {', '.join(known)}")
     if writer.needs is not None and importlib.util.find_spec(writer.needs) is None:
-        extra = f"pip install 'aaplug[{writer.name}]'"
-        raise UsageError(str(path), f"writing .{writer.name} needs {writer.needs}: {extra}")
+        raise UsageError(str(path), f"writing .{writer.name} needs {writer.needs}: pip install 'aaplug[{writer.name}]'")
     check_output(path, overwrite, inputs)
     return writer
 
@@ -178,14 +178,13 @@ def find_scene(path: str | PathLike[str], iteration: int | None = None) -> Path:
     """The scene file that a path means.
 
     A file means itself.  A folder means the last (or the given) iteration of an INRIA model, or its SOG images.
-
-    Raises:
-        FormatError: the folder holds no scene, or not that iteration.
+    Raises FormatError if the folder holds no scene, or not that iteration.
     """
     path = Path(path)
     if not path.is_dir():
         return path
-    scenes = _iterations(path)
+    pattern, files = re.compile(r"iteration_(\d+)", re.ASCII), path.glob("point_cloud/iteration_*/point_cloud.ply")
+    scenes = {int(match[1]): file for file in files if (match := pattern.fullmatch(file.parent.name))}
     if not scenes and (path / SOG_FOLDER).is_file():
         return path / SOG_FOLDER
     if not scenes:
@@ -194,22 +193,3 @@ def find_scene(path: str | PathLike[str], iteration: int | None = None) -> Path:
     if chosen not in scenes:
         raise FormatError(path, f"has no iteration {chosen}; it has {', '.join(map(str, sorted(scenes)))}")
     return scenes[chosen]
-
-
-def _iterations(model: Path) -> dict[int, Path]:
-    pattern = re.compile(r"iteration_(\d+)", re.ASCII)
-    scenes = model.glob("point_cloud/iteration_*/point_cloud.ply")
-    return {int(m[1]): scene for scene in scenes if (m := pattern.fullmatch(scene.parent.name))}
-
-
-def _head(path: Path) -> bytes:
-    try:
-        if path.exists() and not path.is_file():
-            raise FormatError(path, "is not an ordinary file")  # reading a pipe would block
-        with path.open("rb") as stream:
-            head = stream.read(HEAD_BYTES)
-    except (OSError, ValueError) as error:
-        raise FormatError(path, f"cannot be read: {reason(error)}") from error
-    if not head:
-        raise FormatError(path, "is empty")
-    return head

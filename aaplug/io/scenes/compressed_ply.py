@@ -71,8 +71,7 @@ def _check(header: Header, tables: dict[str, Table]) -> None:
     _need(header, header.vertex, WORDS, "u4")
     chunk = elements.get("chunk")
     if chunk is None or chunk.count * PER_CHUNK < count:
-        there = 0 if chunk is None else chunk.count
-        raise FormatError(header.path, f"has {there:,} chunks, too few for {count:,} Gaussians")
+        raise FormatError(header.path, f"has {chunk.count if chunk else 0:,} chunks, too few for {count:,} Gaussians")
     coloured = COLOUR_BOUNDS if COLOUR_BOUNDS[0] in chunk.names else []
     _need(header, chunk, [*BOUNDS, *SCALE_BOUNDS, *coloured], "f4")
     if sh := elements.get("sh"):

@@ -54,13 +54,7 @@ class Section:
     degree: int
 
 
-@dataclass(frozen=True)
-class Records:
-    """A section's records, and the centre of each record's bucket."""
-
-    section: Section
-    rows: np.ndarray
-    centres: np.ndarray
+Records = tuple[Section, np.ndarray, np.ndarray]  # a section, its records, and the centre of each record's bucket
 
 
 def sniff(path: Path, head: bytes) -> bool:
@@ -73,8 +67,8 @@ def open_scene(path: Path, options: Options) -> SceneFile:
     with library_errors(path):
         data = path.read_bytes()
         level, sh_range, sections = _sections(path, data)
-        count = sum(len(s.rows) for s in sections)
-        degree = max((s.section.degree for s in sections), default=0)
+        count = sum(section.count for section, *_ in sections)
+        degree = max((section.degree for section, *_ in sections), default=0)
         scene = _joined([_decoded(s, level, sh_range, degree) for s in sections], degree)
     notes = (f"compression level {level}",)
     return SceneFile(path, name, count, degree, lambda start, stop: scene[start:stop], EVIDENCE, notes=notes)
@@ -96,7 +90,7 @@ def _sections(path: Path, data: bytes) -> tuple[int, tuple[float, float], list[R
         records, at = _records(path, data, at, section, level)
         if section.count:
             found.append(records)
-    if sum(len(s.rows) for s in found) != count:
+    if sum(section.count for section, *_ in found) != count:
         raise FormatError(path, f"promises {count:,} Gaussians, and its sections hold another number")
     return level, (least or SH_RANGE[0], most or SH_RANGE[1]), found
 
@@ -114,7 +108,7 @@ def _records(path: Path, data: bytes, at: int, section: Section, level: int) -> 
         raise FormatError(path, f"has a damaged section at byte {at:,}: {section}")
     rows = np.frombuffer(data, record, section.count, start)
     if not level:
-        return Records(section, rows, np.zeros((len(rows), 3), np.float32)), end
+        return (section, rows, np.zeros((len(rows), 3), np.float32)), end
     full = np.full(section.full, section.capacity, np.int64)
     partial = np.frombuffer(data, "<u4", section.partial, at).astype(np.int64)
     fill = np.minimum(np.concatenate([full, partial]), section.count)
@@ -122,7 +116,7 @@ def _records(path: Path, data: bytes, at: int, section: Section, level: int) -> 
         raise FormatError(path, f"has buckets for {fill.sum():,} of {section.count:,} Gaussians")
     bucket = np.searchsorted(np.cumsum(fill), np.arange(section.count), side="right")
     centres = np.frombuffer(data, "<f4", 3 * section.buckets, at + sizes).reshape(-1, 3)
-    return Records(section, rows, centres[bucket]), end
+    return (section, rows, centres[bucket]), end
 
 
 def _record(degree: int, level: int) -> np.dtype:
@@ -133,11 +127,11 @@ def _record(degree: int, level: int) -> np.dtype:
 
 
 def _decoded(records: Records, level: int, sh_range: tuple[float, float], degree: int) -> Gaussians:
-    section, rows = records.section, records.rows
+    section, rows, centres = records
     means = rows["means"].astype(np.float64)
     if level:
         steps = section.range or RANGES[level]
-        means = (means - steps) * (section.block / 2 / steps) + records.centres
+        means = (means - steps) * (section.block / 2 / steps) + centres
     sh = torch.zeros(len(rows), (degree + 1) ** 2, 3)
     sh[:, 0] = sh_of_colour(floats(rows["rgba"][:, :3]) / 255)
     rest = floats(rows["sh"])

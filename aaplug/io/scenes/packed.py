@@ -5,14 +5,11 @@ n: rows.  Arrays are numpy's, as they come from files.
 Functions raise FormatError for a file that breaks its format.
 """
 
-import io
-import zlib
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
-import zstandard
 from jaxtyping import Float
 from torch import Tensor
 
@@ -21,8 +18,6 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.io.limits import limit
 from aaplug.io.scenes.scene_file import logit_of
 
-GZIP_WINDOW = 31  # zlib's code for a gzip stream with the largest window
-MAX_WINDOW = 1 << 27  # bytes: zstd's own maximum
 BYTE = 255
 
 
@@ -32,20 +27,6 @@ def check_growth(path: Path, inflated: int, compressed: int) -> None:
         many = f"announce {inflated:,}, more than {limit('INFLATE'):g} times as many"
         bomb = "it is damaged or a decompression bomb (AAPLUG_INFLATE raises the limit)"
         raise FormatError(path, f"its {compressed:,} compressed bytes {many}; {bomb}")
-
-
-def gunzip(data: bytes, size: int) -> bytes:
-    """The first bytes of a gzip stream, or all if it has fewer."""
-    return zlib.decompressobj(GZIP_WINDOW).decompress(data, size)
-
-
-def unzstd(data: bytes, size: int, path: Path) -> bytes:
-    """Decompress a zstd stream of `size` bytes."""
-    with zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW).stream_reader(io.BytesIO(data)) as stream:
-        inflated = stream.read(size + 1)
-    if len(inflated) != size:
-        raise FormatError(path, f"a stream inflates to {len(inflated):,} bytes where {size:,} are promised")
-    return inflated
 
 
 def largest_last(rest: Float[Tensor, "n 3"], largest: Tensor) -> Float[Tensor, "n 4"]:

@@ -202,8 +202,7 @@ def _document_of(scene: Gaussians) -> Document | None:
 
 def _write_rows(stream: BinaryIO, header: Header, scene: Gaussians) -> None:
     for start in range(0, len(scene), BATCH):
-        part = scene[start : start + BATCH] if len(scene) > BATCH else scene
-        stream.write(_records(header, part).tobytes())
+        stream.write(_records(header, scene[start : start + BATCH]).tobytes())
 
 
 def _records(header: Header, scene: Gaussians) -> np.ndarray:
@@ -218,7 +217,9 @@ def _records(header: Header, scene: Gaussians) -> np.ndarray:
     names, at_once = header.vertex.names, _one_type(records.dtype)
     if at_once:
         _matrix(records)[:, [names.index(column) for column in known]] = values
-    old = None if at_once and set(names) == set(known) else _old_rows(scene)
+    old, document = None, _document_of(scene)
+    if document and document.table and scene.origin and not (at_once and set(names) == set(known)):
+        old = document.table.take(scene.origin.rows.cpu())
     for p in header.vertex.properties:
         was = old[p.name] if old is not None and p.name in (old.dtype.names or ()) else None
         if p.name in known and not at_once:
@@ -229,11 +230,3 @@ def _records(header: Header, scene: Gaussians) -> np.ndarray:
         elif p.name not in known and was is not None:
             records[p.name] = was
     return records
-
-
-def _old_rows(scene: Gaussians) -> np.ndarray | None:
-    document = _document_of(scene)
-    if document is None or document.table is None:
-        return None
-    assert scene.origin is not None
-    return document.table.take(scene.origin.rows.cpu())

@@ -16,6 +16,7 @@ from pathlib import Path
 
 from aaplug.core.errors import FormatError
 from aaplug.io.limits import whole_limit
+from aaplug.io.values import read_start
 
 MAX_COUNT_DIGITS = 18  # still an int64
 BYTES = "latin-1"  # one character per byte
@@ -174,9 +175,8 @@ def read_header(path: Path) -> Header:
 def is_packed(path: Path) -> bool:
     """Whether a .ply's header declares the packed words of a .compressed.ply.  Never raises."""
     try:
-        with path.open("rb") as stream:
-            start = stream.read(whole_limit("HEADER"))
-    except OSError:
+        start = read_start(path, whole_limit("HEADER"))
+    except FormatError:
         return False
     return bool(PACKED.search(start.partition(b"end_header")[0]))
 

@@ -45,11 +45,8 @@ class Meaning:
 def meaning(header: Header, compressed: bool = False) -> Meaning:
     """Read the header's tags; `compressed`: the columns are packed and say nothing about scales."""
     records = [_record(header.path, words) for words in _found(header, RECORD)]
-    fused = tuple(
-        Fusion(record["fused"], {k: v for k, v in record.items() if k not in ("fused", "convention")})
-        for record in records
-        if "fused" in record
-    )
+    settings = [{k: v for k, v in record.items() if k != "convention"} for record in records if "fused" in record]
+    fused = tuple(Fusion(each.pop("fused"), each) for each in settings)
     mode = _last(header, RENDER_MODE)
     two = not compressed and "scale_2" not in header.vertex.names
     flat = two or bool(mode and mode.lower() == FLAT)

@@ -79,10 +79,9 @@ def _splats(path: Path, document: Any) -> dict[str, Tensor]:
     splats = document.get("splats", document) if isinstance(document, dict) else None
     if not isinstance(splats, dict) or not all(isinstance(splats.get(k), Tensor) for k in SHAPES):
         raise FormatError(path, f"holds no splats with {', '.join(SHAPES)}, as gsplat writes them")
-    means = splats["means"]
-    if means.ndim != 2:
-        raise FormatError(path, f"means has the shape {list(means.shape)}")
-    rest = splats.get("shN", torch.zeros(len(means), 0, 3))
+    if splats["means"].ndim != 2:
+        raise FormatError(path, f"means has the shape {list(splats['means'].shape)}")
+    rest = splats.get("shN", torch.zeros(len(splats["means"]), 0, 3))
     if not isinstance(rest, Tensor):
         raise FormatError(path, "shN is not a tensor")
     return {**{key: splats[key] for key in SHAPES}, "shN": rest}
@@ -95,8 +94,7 @@ def _check(path: Path, key: str, tensor: Tensor, count: int, size: int) -> None:
         fits = tensor.ndim == 3 and tensor.shape[2] == 3 and 3 * tensor.shape[1] in DEGREES
     plain = tensor.is_floating_point() and tensor.layout == torch.strided
     if not (fits and plain and len(tensor) == count):
-        kind = f"{tensor.dtype} of shape {list(tensor.shape)}"
-        raise FormatError(path, f"{key} is {kind}, for {count:,} Gaussians")
+        raise FormatError(path, f"{key} is {tensor.dtype} of shape {list(tensor.shape)}, for {count:,} Gaussians")
     if tensor.numel() * tensor.element_size() > size:
         raise FormatError(path, f"{key} has {tensor.numel():,} values, more than the file holds")
 

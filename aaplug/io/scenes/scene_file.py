@@ -32,20 +32,6 @@ log = logging.getLogger("aaplug")
 
 
 @dataclass(frozen=True)
-class Fault:
-    """Rows with a value that no renderer can use; text: which value."""
-
-    text: str
-    rows: Bool[Tensor, " n"]
-
-    def described(self, numbers: Tensor) -> str:
-        """The fault with the first of its rows, whose numbers in the file are given."""
-        bad = numbers[self.rows]
-        more = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
-        return f"row {int(bad[0])}{more} has {self.text}"
-
-
-@dataclass(frozen=True)
 class SceneFile:
     """An opened scene file.
 
@@ -68,12 +54,6 @@ class SceneFile:
     document: Any = None
     notes: tuple[str, ...] = ()
 
-    def stated(self, convention: Convention | None) -> "SceneFile":
-        """The same file with another convention, stated by the user; unchanged for None."""
-        if convention is None:
-            return self
-        return replace(self, convention=convention, evidence="stated by the user")
-
     def raw(self, start: int, stop: int) -> Gaussians:
         """The rows from start up to stop, with convention and origin; their values are not checked."""
         origin = Origin(str(self.path), self.format, self.evidence, self.document, torch.arange(start, stop))
@@ -89,9 +69,7 @@ class SceneFile:
 
         size: Gaussians per part.
         found: receives the faults of rows that are left out and their numbers; None logs them.
-
-        Raises:
-            FormatError: a row cannot be used and `drop_bad` is false, or the file cannot be read.
+        A row that cannot be used raises FormatError if `drop_bad` is false.
         """
         dropped: dict[str, int] = {} if found is None else found
         left_out = 0
@@ -105,11 +83,7 @@ class SceneFile:
             log.warning("%s: left out %d of %d Gaussians (%s)", self.path, left_out, self.count, counts)
 
     def whole(self, drop_bad: bool = False) -> Gaussians:
-        """The whole scene.
-
-        Raises:
-            FormatError: it cannot be used, or takes more than the limit MEMORY_SHARE of the machine's memory.
-        """
+        """The whole scene; raises FormatError as `parts`, and above the limit MEMORY_SHARE of the machine's memory."""
         needed = self.count * FLOAT * (11 + 3 * (self.sh_degree + 1) ** 2)
         memory, share = memory_of_machine(), limit("MEMORY_SHARE")
         if memory is not None and needed > share * memory:
@@ -206,26 +180,24 @@ def sh_of_colour(rgb: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
     return (rgb - COLOUR_OFFSET) / SH_C0
 
 
-def faults_of(scene: Gaussians) -> list[Fault]:
-    """What no renderer can use: NaN, infinities, quaternions without a direction, negative filters.
+def faults_of(scene: Gaussians) -> dict[str, Bool[Tensor, " n"]]:
+    """What no renderer can use, and in which rows: NaN, infinities, quaternions without a direction, negative filters.
 
     A log-scale of -inf (no thickness) and a logit of +inf (opaque) are valid.
     """
-    faults = []
+    nans, infinities = dict[str, Tensor](), dict[str, Tensor]()
     names, matrix = ([], torch.empty(0, 0)) if _finite(scene) else matrix_of(scene)
     for name, values in zip(names, matrix.T, strict=True):
-        allowed = {"opacity": torch.inf, "scale": -torch.inf}.get(name.split("_")[0])
-        infinite = values.isinf() if allowed is None else values.isinf() & (values != allowed)
-        faults.append(Fault(f"NaN in {name}", values.isnan()))
-        faults.append(Fault(f"Inf in {name}", infinite))
-    faults.sort(key=lambda fault: fault.text.startswith("Inf"))
+        allowed = {"opacity": torch.inf, "scale": -torch.inf}.get(name.split("_")[0], torch.nan)
+        nans[f"NaN in {name}"] = values.isnan()
+        infinities[f"Inf in {name}"] = values.isinf() & (values != allowed)
     length = torch.linalg.vector_norm(scene.quats, dim=-1)
     finite = scene.quats.isfinite().all(dim=-1)
-    faults.append(Fault("a quaternion of length zero", length <= SHORTEST_QUATERNION))
-    faults.append(Fault("a quaternion too long for float32", length.isinf() & finite))
+    faults = {**nans, **infinities, "a quaternion of length zero": length <= SHORTEST_QUATERNION}
+    faults["a quaternion too long for float32"] = length.isinf() & finite
     if scene.filter_3d is not None:
-        faults.append(Fault(f"a negative {FILTER_COLUMN}", scene.filter_3d < 0))
-    return [fault for fault in faults if fault.rows.any()]
+        faults[f"a negative {FILTER_COLUMN}"] = scene.filter_3d < 0
+    return {text: rows for text, rows in faults.items() if rows.any()}
 
 
 def _finite(scene: Gaussians) -> bool:
@@ -241,8 +213,10 @@ def _check(part: Gaussians, path: Path, drop_bad: bool, dropped: dict[str, int])
         return None
     assert part.origin is not None
     if not drop_bad:
-        what = listing([fault.described(part.origin.rows) for fault in faults])
+        bad = {text: part.origin.rows[rows] for text, rows in faults.items()}
+        more = {text: f" (and {len(rows) - 1} more)" if len(rows) > 1 else "" for text, rows in bad.items()}
+        what = listing([f"row {int(rows[0])}{more[text]} has {text}" for text, rows in bad.items()])
         raise FormatError(path, f"{what}; pass `drop_bad` to leave such rows out")
-    for fault in faults:
-        dropped[fault.text] = dropped.get(fault.text, 0) + int(fault.rows.sum())
-    return torch.stack([fault.rows for fault in faults]).any(dim=0)
+    for text, rows in faults.items():
+        dropped[text] = dropped.get(text, 0) + int(rows.sum())
+    return torch.stack(list(faults.values())).any(dim=0)

@@ -52,14 +52,14 @@ class Part:
     pixels: list[np.ndarray]
     width: int
 
-    def between(self, image: int, channels: int, rows: slice) -> Float[Tensor, "n c"]:
+    def between(self, channels: int, rows: slice) -> Float[Tensor, "n c"]:
         """Version 1: bytes as fractions from mins to maxs."""
         low, high = (self.entry.vector(key, channels).float() for key in ("mins", "maxs"))
-        return torch.lerp(low, high, floats(self.pixels[image][rows, :channels]) / 255)
+        return torch.lerp(low, high, floats(self.pixels[0][rows, :channels]) / 255)
 
-    def coded(self, image: int, rows: slice) -> Float[Tensor, "n 3"]:
+    def coded(self, rows: slice) -> Float[Tensor, "n 3"]:
         """Version 2: bytes as indices into the codebook."""
-        return self.codebook[torch.from_numpy(self.pixels[image][rows, :3].astype(np.int64))]
+        return self.codebook[torch.from_numpy(self.pixels[0][rows, :3].astype(np.int64))]
 
     @property
     def codebook(self) -> Float[Tensor, " 256"]:
@@ -105,8 +105,8 @@ def _from_zip(path: Path, archive: zipfile.ZipFile, file: str, most: int) -> byt
 def _scene(path: Path, meta: Any, fetch: Fetch) -> SceneFile:
     root = object_of(meta, path, META, "means, scales, quats and sh0")
     version = root.fields.get("version", 1)
-    if version not in (1, 2) or (version == 2) != ("version" in meta):
-        raise root.place.wrong("version", "2, or left out", version)
+    right = version in (1, 2) and (version == 2) == ("version" in meta)
+    root.place.expect(right, "version", "2, or left out", version)
     count = _count(root, version)
     check_count(path, count)
     used = [key for key in ("means", "quats", "scales", "sh0", "shN") if meta.get(key)]
@@ -133,12 +133,11 @@ def _part(path: Path, root: Entry, key: str, count: int, fetch: Fetch) -> Part:
     entry = root.entry(key)
     files = entry.value("files")
     wanted = 2 if key in ("means", "shN") else 1
-    if not isinstance(files, list) or len(files) != wanted:
-        raise entry.place.wrong("files", f"{wanted} names", files)
+    entry.place.expect(isinstance(files, list) and len(files) == wanted, "files", f"{wanted} names", files)
     images = []
     for index, file in enumerate(files):
-        if not isinstance(file, str) or not FILE.fullmatch(file):
-            raise entry.place.wrong("files", "names of plain files beside meta.json", file)
+        right = isinstance(file, str) and bool(FILE.fullmatch(file))
+        entry.place.expect(right, "files", "names of plain files beside meta.json", file)
         palette = key == "shN" and index == 0
         noisy = key == "means" and index == 0  # low bytes do not compress: the size tells the count
         images.append(_image(path, file, fetch, None if palette else count, noisy))
@@ -173,10 +172,9 @@ def _meaning(meta: dict[str, Any]) -> tuple[Convention, str, bool]:
 
 def _palette(part: Part, version: int) -> Float[Tensor, "p c 3"]:
     """The harmonics that labels index."""
-    width = part.width
-    coefficients = {3: 3, 8: 8, 15: 15}.get(width // PALETTE_ROW)
-    if coefficients is None or width % PALETTE_ROW:
-        raise part.entry.place.error(f"the palette's image is {width} px wide; 192, 512 or 960 expected")
+    coefficients, rest = divmod(part.width, PALETTE_ROW)
+    if coefficients not in (3, 8, 15) or rest:
+        raise part.entry.place.error(f"the palette's image is {part.width} px wide; 192, 512 or 960 expected")
     pixels = part.pixels[0][:, :3].reshape(-1, coefficients, 3)
     if version > 1:
         return part.codebook[torch.from_numpy(pixels.astype(np.int64))]
@@ -191,10 +189,9 @@ def _rows(
     means, quats, scales, sh0 = (parts[key] for key in ("means", "quats", "scales", "sh0"))
     alpha = sh0.pixels[0][rows, 3]
     if version > 1:
-        log_scales, colours = scales.coded(0, rows), sh0.coded(0, rows)
-        logits = byte_opacities(alpha)
+        log_scales, colours, logits = scales.coded(rows), sh0.coded(rows), byte_opacities(alpha)
     else:
-        log_scales, both = scales.between(0, 3, rows), sh0.between(0, 4, rows)
+        log_scales, both = scales.between(3, rows), sh0.between(4, rows)
         colours, logits = both[:, :3], both[:, 3]
     sh = torch.zeros(len(alpha), 1 + palette.shape[1], 3)
     sh[:, 0] = colours

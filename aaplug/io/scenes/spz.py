@@ -11,9 +11,11 @@ adds the axes, the flag, and as many bits of a position's fraction as the scene 
 """
 
 import gzip
+import io
 import math
 import struct
 import tempfile
+import zlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -21,6 +23,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+import zstandard
 from jaxtyping import Float
 from torch import Tensor
 
@@ -29,19 +32,13 @@ from aaplug.core.gaussians import ANTIALIASED, CLASSIC, Gaussians
 from aaplug.io.atomic import replacing
 from aaplug.io.limits import whole_limit
 from aaplug.io.scenes.options import Options
-from aaplug.io.scenes.packed import (
-    byte_opacities,
-    check_growth,
-    floats,
-    gunzip,
-    half_turn_about_x,
-    largest_last,
-    unzstd,
-)
+from aaplug.io.scenes.packed import byte_opacities, check_growth, floats, half_turn_about_x, largest_last
 from aaplug.io.scenes.scene_file import SceneFile, check_count, library_errors
 
 MAGIC = b"NGSP"
 GZIP = b"\x1f\x8b"
+GZIP_WINDOW = 31  # zlib's code for a gzip stream with the largest window
+MAX_WINDOW = 1 << 27  # bytes: zstd's own maximum
 HEADER = struct.Struct("<4sIIBBBB")  # magic, version, count, degree, fraction bits, flags, reserved
 HEADER_4 = struct.Struct("<4sIIBBBBI12x")  # the reserved byte counts streams; then the table's place
 STREAM = struct.Struct("<QQ")  # compressed and decompressed size
@@ -110,7 +107,7 @@ def open_scene(path: Path, options: Options) -> SceneFile:
 def _sections(path: Path) -> tuple[Header, list[np.ndarray]]:
     data = path.read_bytes()
     zipped = data.startswith(GZIP)
-    header = _header(path, gunzip(data, HEADER.size) if zipped else data[: HEADER.size])
+    header = _header(path, _gunzip(data, HEADER.size) if zipped else data[: HEADER.size])
     sizes = [width * header.count for width in header.widths]
     if header.version >= STREAMS:
         if zipped:
@@ -139,7 +136,7 @@ def _payload(path: Path, data: bytes, size: int, zipped: bool) -> bytes:
     whole = HEADER.size + size
     if zipped:
         check_growth(path, whole, len(data))
-        inflated = gunzip(data, whole + (slack := whole_limit("SLACK")) + 1)
+        inflated = _gunzip(data, whole + (slack := whole_limit("SLACK")) + 1)
         if not whole <= len(inflated) <= whole + slack:  # a few bytes more are accepted
             many = "more than " * (len(inflated) > whole + slack)
             raise FormatError(path, f"inflates to {many}{len(inflated):,} bytes where its header promises {whole:,}")
@@ -169,8 +166,21 @@ def _streams(path: Path, data: bytes, sizes: list[int]) -> Iterable[bytes]:
         if inflated != size or at + compressed > len(data):
             what = f"lists a stream of {compressed:,} bytes for {inflated:,}"
             raise FormatError(path, f"{what}; {size:,} expected, and {len(data) - at:,} bytes are left")
-        yield unzstd(data[at : at + compressed], size, path)
+        yield _unzstd(data[at : at + compressed], size, path)
         at += compressed
+
+
+def _gunzip(data: bytes, size: int) -> bytes:
+    """The first bytes of a gzip stream, or all if it has fewer."""
+    return zlib.decompressobj(GZIP_WINDOW).decompress(data, size)
+
+
+def _unzstd(data: bytes, size: int, path: Path) -> bytes:
+    with zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW).stream_reader(io.BytesIO(data)) as stream:
+        inflated = stream.read(size + 1)
+    if len(inflated) != size:
+        raise FormatError(path, f"a stream inflates to {len(inflated):,} bytes where {size:,} are promised")
+    return inflated
 
 
 def _rows(
@@ -181,7 +191,8 @@ def _rows(
     sh = torch.zeros(n, k, 3)
     sh[:, 0] = (floats(colours) / 255 - 0.5) / COLOUR_GAIN
     sh[:, 1:] = (floats(harmonics.reshape(n, k - 1, 3)) - 128) / 128
-    unit = _threes(quats) if header.version >= THREES else _first_three(quats)
+    # before version 3: x, y, z; w follows and is not negative
+    unit = _threes(quats) if header.version >= THREES else largest_last(floats(quats) / 127.5 - 1, torch.zeros(n))
     log_scales = floats(scales) / SCALE_STEPS + SCALE_LEAST
     return turn(Gaussians(_positions(header, positions), unit, log_scales, byte_opacities(alphas[:, 0]), sh))
 
@@ -192,12 +203,6 @@ def _positions(header: Header, data: np.ndarray) -> Float[Tensor, "n 3"]:
     low, middle, high = (data[:, i::3].astype(np.int32) for i in range(3))
     fixed = low | middle << 8 | high.astype(np.uint8).view(np.int8).astype(np.int32) << 16
     return torch.from_numpy(fixed.astype(np.float64) / 2**header.fraction).float()
-
-
-def _first_three(data: np.ndarray) -> Float[Tensor, "n 4"]:
-    """Versions 1 and 2: components x, y, z; w follows and is not negative."""
-    xyz = floats(data) / 127.5 - 1
-    return largest_last(xyz, torch.zeros(len(xyz)))
 
 
 def _threes(data: np.ndarray) -> Float[Tensor, "n 4"]:
