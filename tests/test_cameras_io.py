@@ -3,7 +3,7 @@
 import json
 import math
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +21,7 @@ from aaplug.io.cameras import OWN, read_cameras, select_views
 from aaplug.io.cameras.camera_path import read_camera_path
 from aaplug.io.cameras.cfg_args import read_cfg_args
 from aaplug.io.cameras.options import Options
+from tests.conftest import make_camera
 
 QUARTER_TURN = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]  # 90° about z
 HALF = math.sqrt(0.5)
@@ -807,6 +808,27 @@ def test_a_plug_in_is_asked_before_the_own_formats(tmp_path, monkeypatch):
     path = write_json(tmp_path / "transforms.json", transforms([{"file_path": "a"}], w=4, h=2))
     assert read_cameras(path).notes == ("by the plug-in",)
     assert read_cameras(tmp_path).notes != ("by the plug-in",)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"fx": math.nan}, "camera view: fx should be a finite number"),
+        ({"height": 0}, "camera view: height should be a whole number of px"),
+        ({"cy": math.inf}, "camera view: cx, cy and translation should be"),
+        ({"cam_from_world": 2 * torch.eye(4, dtype=torch.float64)}, "camera view: cam_from_world should be a rotation"),
+    ],
+    ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
+)
+def test_what_a_plug_in_reads_is_checked(tmp_path, monkeypatch, change, message):
+    class Careless(Dialect):
+        def read(self, path: Path, options: Options) -> CameraSet:
+            cameras = (replace(make_camera(), **change),)
+            return CameraSet(cameras, cameras)
+
+    monkeypatch.setattr("aaplug.io.cameras.CAMERA_FORMATS", Registry("camera format", {"dialect": Careless()}))
+    with pytest.raises(FormatError, match=message):
+        read_cameras(write_json(tmp_path / "transforms.json", {}))
 
 
 def test_a_path_is_text_too(tmp_path):

@@ -1,8 +1,9 @@
-"""The truth: the image that a view should show at a scale.
+"""Ground truth: the image that a view should show at a scale.
 
-It comes from one larger image: the photograph, or the scene's own look at the training size.  Below that size the
-truth is this image averaged down.  Above it, the truth is the scene's own supersampled look, an estimate (`Enlarge`),
-or undefined.  Where a protocol moves the camera, the truth is the scene's own supersampled look from there.
+Its source image is the photograph, or the scene's own render at the training size.  Up to the source's size, ground
+truth is the source downsampled.  Above it, ground truth is the estimate of `enlarge`, if one is given; else the scene's
+own render at that size, or, with photographs, undefined.  Where a protocol moves the camera or changes its focal
+length, ground truth is the scene's own render of that view, supersampled where it is coarser than training.
 """
 
 import math
@@ -28,23 +29,26 @@ from aaplug.methods.recipe import Recipe
 from aaplug.methods.recipes import find_recipe
 from aaplug.rendering.renderer import Background, Renderer
 
-NO_PHOTOGRAPH = "has no photograph to compare with; truth 'self' compares with the scene's own look"
+NO_PHOTOGRAPH = "has no photograph to compare with; truth 'self' compares with the scene's own render"
 MEMORY = 1e9  # bytes of images to keep; what does not fit is made again each time
 KEPT = torch.float16  # 11 significant bits, against the 8 that are compared
 
 Larger = Float[Tensor, "H W 3"]
-Enlarge = Callable[[Renderer, Image, Camera], Larger]  # own look, image at hand, larger camera
+Enlarge = Callable[[Renderer, Image, Camera], Larger]  # (the scene's own renderer, source image, target camera)
 
 
 def own_look(
     scene: Gaussians, training: TrainingViews, rasterizer: str | Rasterizer = "auto", background: Background = "auto"
 ) -> Renderer:
-    """The scene as training showed it, at any size."""
+    """A renderer of the scene by training's own rule, at any size (recipe `matched`)."""
     return Renderer.of(scene, training, find_recipe("matched"), rasterizer=rasterizer, background=background)
 
 
 def back_projected(own: Renderer, full: Image, camera: Camera) -> Larger:
-    """The scene's own render, corrected so that its averages are the image at hand (Irani and Peleg 1991)."""
+    """The scene's own render after one step of iterative back-projection towards the source image.
+
+    (Irani and Peleg 1991.)  The bicubically enlarged residual is added, so box averages match only approximately.
+    """
     with torch.no_grad():
         image = own(camera).rgb.clamp(0.0, 1.0)
     averages = resampled(image, full.shape[1] / camera.width, (full.shape[0], full.shape[1]))
@@ -52,12 +56,12 @@ def back_projected(own: Renderer, full: Image, camera: Camera) -> Larger:
 
 
 def upsampled(upsampler: Upsampler) -> Enlarge:
-    """The image at hand, enlarged by an upsampler."""
+    """Estimate ground truth by enlarging the source image with an upsampler."""
     return lambda own, full, camera: upsampler(full, camera.hw)
 
 
 def source_of(views: Sequence[Camera], asked: str = "auto") -> TruthSource:
-    """The source that is asked for; for "auto" photographs where every view has one, else the own look.
+    """The requested source; for "auto", photographs if every view has one, else the scene's own render ("self").
 
     Raises UsageError if there is no source of that name, or a view has no photograph.
     """
@@ -75,10 +79,10 @@ def source_of(views: Sequence[Camera], asked: str = "auto") -> TruthSource:
 class Truth:
     """The images to compare with.
 
-    own: see `own_look`.
-    enlarge: makes the truth above the size of the larger image.  None: the scene's own look with as many samples as
-        reach training's rate; with photographs there is no truth.
-    memory: bytes of images to keep, in float16, for calls that come again and again; None keeps none and rounds none.
+    own: renders the scene by training's rule; see `own_look`.
+    enlarge: estimates ground truth above the source's size.  None: the scene's own render at that size; with
+        photographs, undefined.
+    memory: bytes of float16 images to cache between calls; None caches none.
     """
 
     own: Renderer
@@ -89,18 +93,18 @@ class Truth:
     _kept: dict[tuple[object, ...], Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __call__(self, view: Camera, scale: float) -> Image:
-        """The image of a view, given at the training size, at a scale where there is a truth."""
+        """Ground truth of `view` (given at the training size) at `scale`; it must be defined there."""
         image = ViewTruth(self, view).image(scale)
         assert image is not None
         return image
 
     @cached_property
     def timed(self) -> TimedRenderer:
-        """The scene's own look."""
+        """A TimedRenderer of `own`; made once."""
         return TimedRenderer(self.own)
 
-    def remembered(self, view: Camera, scale: float, make: Callable[[], Image | None]) -> Image | None:
-        """The image that is kept, or a new one, kept while there is room."""
+    def cached(self, view: Camera, scale: float, make: Callable[[], Image | None]) -> Image | None:
+        """The cached image, or a new one, cached while there is room."""
         if self.memory is None:
             return make()
         pose = view.cam_from_world.detach().cpu().numpy().tobytes()  # names recur in other splits
@@ -117,7 +121,7 @@ class Truth:
 
 
 class ViewTruth:
-    """The truth of one view.  Its photograph is read, and its training-size look drawn, at most once and on demand."""
+    """Ground truth of one view; its photograph and its training-size render are each made at most once, on demand."""
 
     def __init__(self, truth: Truth, view: Camera):
         self.truth, self.view = truth, view
@@ -129,25 +133,25 @@ class ViewTruth:
 
     @cached_property
     def look(self) -> Drawn:
-        """The scene's own look at the training size."""
+        """The scene's own render at the training size."""
         return self.truth.timed(self.view)
 
     def resized_look(self, scale: float) -> Image:
-        """The training-size look, averaged down (bicubic above scale 1)."""
+        """The training-size render resampled to this scale: downsampled below 1, bicubic above."""
         return self.truth.protocol.resized(self.look.rgb.clamp(0, 1), self.camera(scale), scale)
 
     def compared(self, scale: float) -> Image | None:
-        """The image that renders are compared with, in 8 bits as photographs are; None where there is no truth."""
+        """What renders are compared with; None where it is undefined.  The scene's own renders are rounded to 8 bits."""
         image = self.image(scale)
         rounds = self.truth.source == "self" or self.truth.memory is not None
         return quantised(image) if image is not None and rounds else image
 
     def image(self, scale: float) -> Image | None:
         """The truth at a scale, before rounding; None where there is none."""
-        return self.truth.remembered(self.view, scale, lambda: self._made(scale))
+        return self.truth.cached(self.view, scale, lambda: self._made(scale))
 
     def motion(self, scale: float) -> list[Image]:
-        """The training-size look, averaged down, as it moves by steps of 1/4 px of the smaller image."""
+        """Frames of a small motion: training-size renders shifted by steps of 1/4 px of this scale, then resampled."""
         if scale not in self._motions:
             camera, frames = self.camera(scale), self.truth.timed.motion(self.view, scale)
             self._motions[scale] = [self.truth.protocol.resized(frame, camera, scale) for frame in frames]

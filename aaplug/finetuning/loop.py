@@ -1,7 +1,7 @@
-"""The loop: draw a view at a scale, compare the render with the truth, move the leaves, keep their bounds.
+"""The optimization loop: render a view at a scale, compare it with ground truth, take an Adam step, clamp parameters.
 
-A run depends on its job alone: what step t draws depends on the seed and on t.  A run that was stopped and resumed is
-therefore bit for bit one that was not.
+Runs are reproducible: the view and scale of step t depend only on the seed and t.  A run that was stopped and resumed
+therefore equals an uninterrupted one, bit for bit.
 """
 
 import math
@@ -23,11 +23,11 @@ from aaplug.finetuning.state import State, TuningJob, optimizer, packed, unpacke
 from aaplug.rendering.renderer import Drawing
 
 BOUNDS_EVERY = 100  # steps between computations of the sampling bounds (Mip-Splatting)
-MAX_LOGIT = 9.0  # of an opacity: 0.9999, where its gradient has vanished
-MAX_BAD_STEPS = 3  # in a row without a finite gradient, after which the run returns to its last good state
-BACK_OFF = 0.5  # factor on the learning rates after each rollback
+MAX_LOGIT = 9.0  # largest opacity logit: opacity 0.9999, where the sigmoid's gradient is nearly 0
+MAX_BAD_STEPS = 3  # consecutive steps without finite gradients before the run rolls back
+BACK_OFF = 0.5  # factor on all learning rates per rollback
 MAX_ROLLBACKS = 5
-SEEDS, SCALE_SEEDS, SPLIT_SEEDS = 10_000_019, 3_000_000, 6_000_000  # offsets that keep the draws apart
+SEEDS, SCALE_SEEDS, SPLIT_SEEDS = 10_000_019, 3_000_000, 6_000_000  # stride of user seeds; offsets for scales, splits
 
 
 def run(
@@ -64,26 +64,27 @@ def run(
 
 
 def advance(job: TuningJob, state: State) -> None:
-    """Take one step; without a finite gradient it only counts."""
+    """Take one step; if a loss or gradient is not finite, only the step is counted."""
     settings, dense = job.settings, job.settings.densify_every
     view, terms = _drawn(settings, job.views, state.step)
     state.adam.zero_grad(set_to_none=True)
-    losses = {}
+    losses, drawings = {}, []
     for scale, weight in terms.items():
         loss, drawing = loss_at(job, state, view, scale)
         (weight * loss).backward()
         losses[scale] = loss.item()
-        if dense:
-            state.gradients.add(drawing)
+        drawings += [drawing] if dense else []
     state.step += 1
     if not _finite(losses, state.leaves):
         state.bad_steps += 1
         return
     state.bad_steps = 0
+    for drawing in drawings:
+        state.gradients.add(drawing)
     state.curve.append({"step": state.step, "view": view.name, "loss": losses})
-    _set_rates(job, state)
+    _set_learning_rates(job, state)
     state.adam.step()
-    _keep_bounds(state)
+    _clamp_parameters(state)
     if dense and state.step % dense == 0 and state.step < settings.steps:
         _densify(job, state)
     elif state.step % BOUNDS_EVERY == 0 and "means" in settings.rates:
@@ -91,7 +92,7 @@ def advance(job: TuningJob, state: State) -> None:
 
 
 def loss_at(job: TuningJob, state: State, view: Camera, scale: float) -> tuple[Float[Tensor, ""], Drawing]:
-    """The loss of one view at one scale, and the drawing, whose splats' means retain their gradients."""
+    """Loss of one view at one scale, and its drawing, whose screen-space means retain their gradients."""
     truth = job.truth(view, scale)
     drawing = state.renderer(job).draw(view.scaled(scale))
     if drawing.splats.means.requires_grad:
@@ -101,7 +102,7 @@ def loss_at(job: TuningJob, state: State, view: Camera, scale: float) -> tuple[F
 
 
 def _roll_back(job: TuningJob, state: State, good: Mapping[str, Any], say: Callable[[str], None]) -> None:
-    """Restore the last good state at half the learning rates; the step number goes on, so that other draws follow."""
+    """Restore the last good state and halve the learning rates; the step count continues, so other views follow."""
     step, rollbacks = state.step, state.rollbacks + 1
     if rollbacks > MAX_ROLLBACKS:
         raise UsageError("finetune", f"has no finite gradient at step {step}, after {MAX_ROLLBACKS} rollbacks")
@@ -112,7 +113,7 @@ def _roll_back(job: TuningJob, state: State, good: Mapping[str, Any], say: Calla
 
 
 def _drawn(settings: Settings, views: Sequence[Camera], step: int) -> tuple[Camera, dict[float, float]]:
-    """The view of a step, and its scales with their weights; all views come once before any comes again."""
+    """View of a step, and weight by scale; a random permutation per epoch uses every view once before any repeats."""
     count = len(views)
     epoch = torch.Generator().manual_seed(settings.seed * SEEDS + step // count)
     view = views[int(torch.randperm(count, generator=epoch)[step % count])]
@@ -129,7 +130,7 @@ def _finite(losses: Mapping[float, float], leaves: Leaves) -> bool:
     return all(map(math.isfinite, losses.values())) and all(bool(grad.sum().isfinite()) for grad in grads)
 
 
-def _set_rates(job: TuningJob, state: State) -> None:
+def _set_learning_rates(job: TuningJob, state: State) -> None:
     share = job.settings.decay ** (state.step / job.settings.steps) * BACK_OFF**state.rollbacks
     for group in state.adam.param_groups:
         size = extent(job.start.training.cameras) if group["name"] == "means" else 1.0
@@ -137,8 +138,8 @@ def _set_rates(job: TuningJob, state: State) -> None:
 
 
 @torch.no_grad()
-def _keep_bounds(state: State) -> None:
-    """Clamp what the step moved out of its bounds."""
+def _clamp_parameters(state: State) -> None:
+    """Clamp scales from below by their sampling bound, and opacity logits from above."""
     scales, logits = state.leaves["log_scales"], state.leaves["logit_opacities"]
     if scales.requires_grad:
         least = least_log_scales(state.first_log_scales, state.bounds)
@@ -167,4 +168,4 @@ def _densify(job: TuningJob, state: State) -> None:
 def _update_bounds(job: TuningJob, state: State) -> None:
     """Compute the sampling bounds where the Gaussians are now, and keep them."""
     state.bounds = sampling_bounds(state.leaves["means"].detach(), job.start.training.cameras)
-    _keep_bounds(state)
+    _clamp_parameters(state)

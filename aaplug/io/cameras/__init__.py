@@ -16,6 +16,8 @@ from aaplug.core.errors import FormatError, UsageError, listing
 from aaplug.core.registry import Registry
 from aaplug.io.cameras import blender, camera_path, colmap, inria, inria_model, llff, multiscale, pinhole, transforms
 from aaplug.io.cameras.options import Options
+from aaplug.io.cameras.poses import pose
+from aaplug.io.values import Place, focal, numbers, pixels
 
 CLOSE_NAMES = 3  # names suggested for an unknown one
 
@@ -82,9 +84,20 @@ def read_cameras(
     formats = sorted(CAMERA_FORMATS.values(), key=OWN.__contains__)  # plug-ins first
     for format in formats:
         if format.sniff(path):
-            return format.read(path, options)
+            return _checked(format.read(path, options), path)
     signs = "; ".join(format.sign for format in formats)
     raise FormatError(path, f"holds no cameras of a known format; looked for: {signs}")
+
+
+def _checked(found: CameraSet, path: Path) -> CameraSet:
+    """The cameras, after a check of what a format may have let through: sizes, focal lengths and rigid poses."""
+    for camera in found.all:
+        place, motion = Place(path, f"camera {camera.name}"), camera.cam_from_world
+        for field, check in (("width", pixels), ("height", pixels), ("fx", focal), ("fy", focal)):
+            check(getattr(camera, field), place, field)
+        numbers([camera.cx, camera.cy, *motion[:3, 3].tolist()], 5, place, "cx, cy and translation")
+        pose(motion[:3, :3], motion[:3, 3], place, "cam_from_world")
+    return found
 
 
 def select_views(cameras: CameraSet, spec: str) -> tuple[Camera, ...]:
