@@ -141,7 +141,7 @@ class ViewTruth:
         return self.truth.protocol.resized(self.look.rgb.clamp(0, 1), self.camera(scale), scale)
 
     def compared(self, scale: float) -> Image | None:
-        """What renders are compared with; None where it is undefined.  The scene's own renders are rounded to 8 bits."""
+        """What renders are compared with, None if undefined; the scene's own renders are rounded to 8 bits."""
         image = self.image(scale)
         rounds = self.truth.source == "self" or self.truth.memory is not None
         return quantised(image) if image is not None and rounds else image
