@@ -1,6 +1,5 @@
 """Batch: evaluate many scenes.  One that fails stops no other; the summary names it."""
 
-import re
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from aaplug.evaluation.results import Report, as_csv, method, results, scale_nam
 from aaplug.io.atomic import refuse_existing
 from aaplug.verbs.evaluate import EvaluateOptions, Output
 from aaplug.verbs.inputs import AnyPath
+from aaplug.verbs.views import file_names
 
 SUMMARY, RESULTS = "batch.json", "results.csv"
 
@@ -31,12 +31,9 @@ class Batch:
 
     def summary(self) -> dict[str, Any]:
         """Status of every scene, and means over the finished ones of what all of them measured; JSON-ready."""
-        scenes = {
-            folder: {"name": name, "status": "failed", "error": self.failures[folder]}
-            if folder in self.failures
-            else {"name": name, "status": "done"}
-            for folder, name in self.names.items()
-        }
+        scenes = {folder: {"name": name, "status": "done"} for folder, name in self.names.items()}
+        for folder, error in self.failures.items():
+            scenes[folder] |= {"status": "failed", "error": error}
         return {"scenes": scenes, "mean_over": list(self.reports), "mean": self._means()}
 
     def _means(self) -> dict[str, dict[str, float | None]]:
@@ -97,7 +94,7 @@ def batch(
         OutputError: there are results already, or the summary cannot be written.
         UsageError: `resume` and `overwrite` are both given.
     """
-    folders = [Path(output) / slug for slug in _slugs([name for name, _ in runs])]
+    folders = [Path(output) / slug for slug in file_names([name for name, _ in runs], "scene", 3)]
     refuse_existing([Path(output) / name for name in (SUMMARY, RESULTS)], overwrite or resume)
     for folder in folders:
         Output(folder, EvaluateOptions(resume=resume, overwrite=overwrite)).check()
@@ -114,14 +111,10 @@ def batch(
             monitor.say(f"failed: {name}: {outcome}")
     names = {folder.name: name for folder, (name, _) in zip(folders, runs, strict=True)}
     found = Batch(names, reports, failures)
-    _write(found, output, monitor)
-    return found
-
-
-def _write(found: Batch, output: AnyPath, monitor: Monitor) -> None:
     texts = {SUMMARY: as_json(found.summary()), RESULTS: as_csv(found.reports)}
     for path in write_texts(output, texts, overwrite=True):  # it was checked at the start
         monitor.say(f"wrote {path}")
+    return found
 
 
 def _outcome(run: Callable[[], Report], monitor: Monitor) -> Report | str:
@@ -135,14 +128,6 @@ def _outcome(run: Callable[[], Report], monitor: Monitor) -> Report | str:
     except Exception as error:  # a mistake in aaplug must not cost the other scenes
         monitor.say(traceback.format_exc())
         return f"unexpected {type(error).__name__}: {error}"
-
-
-def _slugs(names: Sequence[str]) -> list[str]:
-    """Names of folders; numbered where two would be the same."""
-    slugs = [re.sub(r"[^\w.\-]+", "_", name).lstrip(".") or "scene" for name in names]
-    if len({slug.casefold() for slug in slugs}) < len(slugs):
-        return [f"{index:03d}_{slug}" for index, slug in enumerate(slugs)]
-    return slugs
 
 
 def _mean(values: Sequence[float | None]) -> float | None:

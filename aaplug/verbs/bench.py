@@ -70,8 +70,8 @@ def bench(
         kernels = _kernels(o.rasterizer, monitor)
         for (shown, camera), each in product(work, kernels):
             run = measure(shown, camera, each, o.repeats, not o.forward_only)
-            size = f"{run.gaussians:,} Gaussians, {run.width}x{run.height}"
-            monitor.say(f"{size}, {run.rasterizer}: {run.forward_ms:.0f} ms")
+            scene_and_size = f"{run.gaussians:,} Gaussians, {run.width}x{run.height}"
+            monitor.say(f"{scene_and_size}, {run.rasterizer}: {run.forward_ms:.0f} ms")
             runs.append(run)
     return Bench(runs, _exponents(runs))
 
@@ -110,13 +110,10 @@ def _exponents(runs: Sequence[Figures]) -> dict[str, float]:
     found: dict[str, float] = {}
     for name in dict.fromkeys(run.rasterizer for run in runs):
         own = [run for run in runs if run.rasterizer == name]
-        first, last = own[0], own[-1]
-        same_size = [r for r in own if (r.width, r.height) == (first.width, first.height)]
-        same_scene = [r for r in own if r.gaussians == last.gaussians]
-        if len(same_size) > 1:
-            counts = [float(r.gaussians) for r in same_size]
-            found[f"{name}: Gaussians"] = exponent(counts, [r.forward_ms for r in same_size])
-        if len(same_scene) > 1:
-            pixels = [float(r.width * r.height) for r in same_scene]
-            found[f"{name}: pixels"] = exponent(pixels, [r.forward_ms for r in same_scene])
+        sized = [r for r in own if (r.width, r.height) == (own[0].width, own[0].height)]
+        alike = [r for r in own if r.gaussians == own[-1].gaussians]
+        counts, pixels = [float(r.gaussians) for r in sized], [float(r.width * r.height) for r in alike]
+        for what, runs_of, sizes in (("Gaussians", sized, counts), ("pixels", alike, pixels)):
+            if len(sizes) > 1:
+                found[f"{name}: {what}"] = exponent(sizes, [r.forward_ms for r in runs_of])
     return found

@@ -37,8 +37,7 @@ def compare(
 
     Args:
         candidates: scenes by the names that the report gives them; the first is the original.
-        cameras: a camera set, its file or folder, or None for those of the first scene's model folder.
-        monitor: receives messages and progress.
+        cameras, monitor: see `render`; None for the cameras of the first scene's model folder.
         options: fields of `CompareOptions`.
     """
     o = CompareOptions.of(options)

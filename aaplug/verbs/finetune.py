@@ -1,10 +1,10 @@
 """Fine-tuning: a plain scene file that looks right at every scale by the rule that will show it."""
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 from jaxtyping import Float
 from torch import Tensor
@@ -18,7 +18,7 @@ from aaplug.evaluation.engine import Candidate, compare
 from aaplug.evaluation.protocols import TruthSource
 from aaplug.evaluation.report.contact_sheet import contact_sheet
 from aaplug.evaluation.results import Report, results, scale_name
-from aaplug.evaluation.truth import MEMORY, Enlarge, Truth, back_projected, source_of, upsampled
+from aaplug.evaluation.truth import MEMORY, Truth, back_projected, source_of, upsampled
 from aaplug.evaluation.upsamplers import find_upsampler
 from aaplug.finetuning.losses import LOSSES
 from aaplug.finetuning.parameters import RATES
@@ -32,7 +32,7 @@ from aaplug.io.scenes import SpzAxes, check_scene_output, write_scene
 from aaplug.methods.recipes import RECIPES
 from aaplug.methods.viewers import FAST, VIEWERS, Viewer, fuse_for
 from aaplug.rendering.renderer import Renderer
-from aaplug.verbs.inputs import AnyPath, CamerasLike, SceneLike, cameras_of, look_of, processor, scene_of
+from aaplug.verbs.inputs import AnyPath, CamerasLike, SceneLike, cameras_of, look_of, processor, scene_of, sources_of
 from aaplug.verbs.options import ViewOptions, choice, choices, flag
 
 
@@ -116,92 +116,67 @@ def finetune(
         options: fields of `FinetuneOptions`.
 
     Raises:
-        AaplugError: an input cannot be read, an option does not fit, there is nothing to resume, no gradient is
-            finite, or an output cannot be written.
+        AaplugError: as `render`; also, there is nothing to resume, or no gradient is finite.
         KeyboardInterrupt: Ctrl-C stopped the run; its checkpoint is written.
     """
     o = FinetuneOptions.of(options)
-    settings, viewer = _settings(o), _viewer(o)
+    names = ("scale", "steps", "loss", "anchor", "move", "learning_rate", "densify_every", "seed")
+    settings = settings_of(METHODS.find(o.method, "method"), **{name: getattr(o, name) for name in names})
+    viewer, path = _viewer(o), None if output is None else Path(output)
     cameras, scene = cameras_of(cameras, scene), scene_of(scene)
     if o.checkpoint_every < 1:
         raise UsageError("checkpoint_every", f"must be 1 or more, got {o.checkpoint_every}")
-    files = _Files.of(output, scene, o)
-    shown = select_views(cameras, o.views)
-    source, enlarge = _source(o.truth, cameras), _enlarge(o.upsampler)
+    if path is not None:
+        _check_files(path, sources_of(scene), o)
+    elif o.resume:
+        raise UsageError("resume", "needs the `output` of the interrupted run")
+    shown, source = select_views(cameras, o.views), _source(o.truth, cameras)
+    enlarge = back_projected if o.upsampler is None else upsampled(find_upsampler(o.upsampler))
     with processor(o.threads):
         look = look_of(scene, cameras, settings.steps, o, monitor)
         before = replace(look, recipe=RECIPES[viewer.recipe])
         start = replace(before, scene=fuse_for(scene, look.training, viewer))
         job = TuningJob(start, cameras.train, Truth(look, source, enlarge=enlarge, memory=MEMORY), settings)
-        monitor.say(_described(job))
-        state = tune(job, files and files.checkpoint, o.checkpoint_every, o.resume, monitor)
+        how = f"{settings.name}, {settings.steps} steps, truth: {source}"
+        monitor.say(f"tuning for {start.recipe.name} ({start.recipe.source}): {how}")
+        state = tune(job, path and _beside(path, "pt"), o.checkpoint_every, o.resume, monitor)
         tuned = recorded(state, job, viewer.convention_of(scene), {"for": viewer.name, "method": settings.name})
-        if files is not None:
-            write_scene(files.scene, tuned, overwrite=o.overwrite, spz_axes=spz_axes)
+        if path is not None:
+            write_scene(path, tuned, overwrite=o.overwrite, spz_axes=spz_axes)
         candidates = [Candidate("before", before), Candidate("after", _drawn(tuned, start))]
         if len(start.scene.fused) > len(scene.fused):
             candidates.insert(1, Candidate("closed form", start))
-        compared = _Comparison(candidates, shown, settings.weights, job.truth)
+        scales = sorted({1.0, *settings.weights}, reverse=True)
+        compared = _Comparison(candidates, shown, scales, replace(job.truth, source=source_of(shown)))
         found = Tuned(tuned, compared.report(monitor), settings, state.curve, state.probes)
-        if files is not None:
-            files.write(found, compared, o.overwrite)
+        if path is not None:
+            report = json.dumps(found.as_json() | {"curve": list(found.curve)}, indent=1)
+            with replacing(_beside(path, "json"), o.overwrite) as stream:
+                stream.write(report.encode())
+            write_png(_beside(path, "png"), compared.sheet(), overwrite=o.overwrite)
+            _beside(path, "pt").unlink(missing_ok=True)
     return found
 
 
-def _settings(o: FinetuneOptions) -> Settings:
-    """The method's settings with the user's choices."""
-    names = ("scale", "steps", "loss", "anchor", "move", "learning_rate", "densify_every", "seed")
-    return settings_of(METHODS.find(o.method, "method"), **{name: getattr(o, name) for name in names})
+def _beside(scene: Path, kind: str) -> Path:
+    """A file beside the scene, by its suffix; .pt is the checkpoint."""
+    return scene.with_suffix(f".finetune.{kind}")
 
 
-@dataclass(frozen=True)
-class _Files:
-    """The files of a run."""
-
-    scene: Path
-
-    @classmethod
-    def of(cls, output: AnyPath | None, scene: Gaussians, o: FinetuneOptions) -> "_Files | None":
-        """The files beside an output, after a check, before any work, that they may be written."""
-        if output is None:
-            if o.resume:
-                raise UsageError("resume", "needs the `output` of the interrupted run")
-            return None
-        files = cls(Path(output))
-        sources = [Path(scene.origin.path)] if scene.origin else []
-        check_scene_output(files.scene, o.overwrite, sources)
-        check_output(files.beside("json"), o.overwrite, sources)
-        check_output(files.beside("png"), o.overwrite, sources)
-        check_output(files.checkpoint, o.resume or o.overwrite, sources)
-        return files
-
-    def beside(self, kind: str) -> Path:
-        """A file beside the scene, by its suffix."""
-        return self.scene.with_suffix(f".finetune.{kind}")
-
-    @property
-    def checkpoint(self) -> Path:
-        """Of the run, until it ends."""
-        return self.beside("pt")
-
-    def write(self, found: Tuned, compared: "_Comparison", overwrite: bool) -> None:
-        """Write the report and the pictures, and remove the checkpoint."""
-        report = json.dumps(found.as_json() | {"curve": list(found.curve)}, indent=1)
-        with replacing(self.beside("json"), overwrite) as stream:
-            stream.write(report.encode())
-        write_png(self.beside("png"), compared.sheet(), overwrite=overwrite)
-        self.checkpoint.unlink(missing_ok=True)
+def _check_files(path: Path, sources: Sequence[Path], o: FinetuneOptions) -> None:
+    """Check, before any work, that the scene and the files beside it may be written."""
+    check_scene_output(path, o.overwrite, sources)
+    for kind, replaces in (("json", o.overwrite), ("png", o.overwrite), ("pt", o.resume or o.overwrite)):
+        check_output(_beside(path, kind), replaces, sources)
 
 
-class _Comparison:
-    """Candidates beside the truth, at the training size and at the scales of a run."""
+class _Comparison(NamedTuple):
+    """Candidates beside the truth."""
 
-    def __init__(
-        self, candidates: Sequence[Candidate], views: Sequence[Camera], scales: Iterable[float], truth: Truth
-    ) -> None:
-        self.candidates, self.views = candidates, views
-        self.scales = sorted({1.0, *scales}, reverse=True)
-        self.truth = replace(truth, source=source_of(views))
+    candidates: Sequence[Candidate]
+    views: Sequence[Camera]
+    scales: Sequence[float]
+    truth: Truth
 
     def report(self, monitor: Monitor) -> Report:
         """Measure all views."""
@@ -238,18 +213,6 @@ def _source(truth: str, cameras: CameraSet) -> TruthSource:
     if sources[truth] == "photographs" and missing:
         raise UsageError(missing[0], "has no photograph; `truth` self needs none")
     return sources[truth]
-
-
-def _enlarge(upsampler: str | None) -> Enlarge:
-    return back_projected if upsampler is None else upsampled(find_upsampler(upsampler))
-
-
-def _described(job: TuningJob) -> str:
-    recipe, settings = job.start.recipe, job.settings
-    return (
-        f"tuning for {recipe.name} ({recipe.source}): {settings.name}, {settings.steps} steps, "
-        f"truth: {job.truth.source}"
-    )
 
 
 def _drawn(tuned: Gaussians, start: Renderer) -> Renderer:

@@ -34,18 +34,11 @@ def convert_parts(
 ) -> Iterator[Gaussians]:
     """Yield the parts of the scene, each converted as `viewers.fuse` would convert the whole.
 
-    Args:
-        opened: the scene.
-        cameras: training cameras; none where the scene stores its 3D filter.
-        form: what to fuse.
-        drop_bad: leave out unusable rows.
-        tell: called with Gaussians done and in all.
-        size: Gaussians per part.
-        threads: parts converted at once.
+    cameras: training cameras; none where the scene stores its 3D filter.
+    tell: called with (Gaussians done, Gaussians in all).
+    size: Gaussians per part.  threads: parts converted at once.
     """
-    coarsest = None
-    if cameras and form.uses_bounds:
-        coarsest = _coarsest(opened, cameras, drop_bad, size)
+    coarsest = _coarsest(opened, cameras, drop_bad, size) if cameras and form.uses_bounds else None
 
     def converted(part: Gaussians) -> Gaussians:
         if not cameras:
