@@ -9,7 +9,7 @@ import tyro
 from aaplug.core.errors import UsageError
 from aaplug.evaluation.results import Report, results, tables
 from aaplug.verbs.batch import batch
-from aaplug.verbs.evaluate import EvaluateOptions, Output
+from aaplug.verbs.evaluate import EvaluateOptions, check_results
 from aaplug.verbs.evaluate import evaluate as measure
 
 from .batch import scenes_of
@@ -46,7 +46,7 @@ class Evaluate:
         """Measure one scene or many."""
         if self.batch is not None or self.others.more:
             return self._many()
-        Output(self.output, self.how).check()  # before the scene is read
+        check_results(self.output, self.how)  # before the scene is read
         report = self._run()
         self._print(results(report), tables(report))
         return 0

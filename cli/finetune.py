@@ -30,8 +30,8 @@ class Finetune:
     def __call__(self) -> int:
         """Optimize, and say what was written."""
         scene, cameras = self.scene.read(), self.cameras.read(self.scene)
-        how = {"spz_axes": self.scene.spz_axes} | vars(self.how)
-        found = verb.finetune(scene, cameras, self.output, monitor=TERMINAL, **how)
+        axes = self.scene.spz_axes
+        found = verb.finetune(scene, cameras, self.output, spz_axes=axes, monitor=TERMINAL, **vars(self.how))
         if self.json:
             print_json(found.as_json())
         else:

@@ -6,7 +6,7 @@ Exit codes: 0 all done, 1 some of the work failed, 2 the request cannot be carri
 import os
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from importlib import import_module
 from importlib.metadata import version
 from typing import Any, get_args, get_origin
@@ -60,7 +60,7 @@ def run(words: Sequence[str]) -> int:
     )()
 
 
-def _verb(name: str) -> type[Callable[[], int]]:
+def _verb(name: str) -> type[Any]:
     """A verb's options; an instance is called to do the work."""
     return getattr(import_module(f".{name}", __package__), name.capitalize())
 
@@ -88,7 +88,7 @@ def _parted(words: Sequence[str]) -> list[str]:
     one word, because the parser would take the value for an option.
     """
     types = _option_types(words).items()
-    several = {"--" + n.replace("_", "-") for n, t in types if Sequence in map(get_origin, (t, *get_args(t)))}
+    several = {"--" + n.replace("_", "-") for n, t in types if Sequence in list(map(get_origin, (t, *get_args(t))))}
     option = ""
     parted: list[str] = []
     for word in words:

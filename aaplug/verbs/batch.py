@@ -12,9 +12,9 @@ from rich.table import Table
 from aaplug.core.errors import AaplugError
 from aaplug.core.monitor import SILENT, Monitor
 from aaplug.evaluation.report.files import as_json, write_texts
-from aaplug.evaluation.results import Report, as_csv, method, results, scale_name
+from aaplug.evaluation.results import Report, as_csv, grid, method, results
 from aaplug.io.atomic import refuse_existing
-from aaplug.verbs.evaluate import EvaluateOptions, Output
+from aaplug.verbs.evaluate import EvaluateOptions, check_results
 from aaplug.verbs.inputs import AnyPath
 from aaplug.verbs.views import file_names
 
@@ -64,14 +64,9 @@ class Batch:
         over = f"mean of {len(self.reports)} scene{'s' * (len(self.reports) != 1)}"
         grids = []
         for metric in first.metrics:
-            grid = Table(title=escape(f"{metric.title}, {over}"), title_justify="left")
-            grid.add_column("recipe", no_wrap=True)
-            for scale in first.scales:
-                grid.add_column(scale_name(scale), justify="right", no_wrap=True)
-            for recipe in first.recipes:
-                found = [means.get(method(recipe, s), {}).get(metric.name) for s in first.scales]
-                grid.add_row(escape(recipe), *map(metric.text, found))
-            grids.append(grid)
+            found = [[means.get(method(r, s), {}).get(metric.name) for s in first.scales] for r in first.recipes]
+            lines = [[metric.text(value) for value in line] for line in found]
+            grids.append(grid(f"{metric.title}, {over}", first, lines))
         return grids
 
 
@@ -97,7 +92,7 @@ def batch(
     folders = [Path(output) / slug for slug in file_names([name for name, _ in runs], "scene", 3)]
     refuse_existing([Path(output) / name for name in (SUMMARY, RESULTS)], overwrite or resume)
     for folder in folders:
-        Output(folder, EvaluateOptions(resume=resume, overwrite=overwrite)).check()
+        check_results(folder, EvaluateOptions(resume=resume, overwrite=overwrite))
     reports: dict[str, Report] = {}
     failures: dict[str, str] = {}
     for folder, (name, run) in zip(folders, runs, strict=True):

@@ -25,7 +25,7 @@ from aaplug.evaluation.protocols import PROTOCOLS, LpipsFlavour, Protocol, SsimF
 from aaplug.evaluation.report.files import PAGE, RESULTS, write_page, write_results
 from aaplug.evaluation.results import Report
 from aaplug.evaluation.truth import Truth, source_of
-from aaplug.inspection.coverage import Coverage, coverage
+from aaplug.inspection.coverage import coverage
 from aaplug.io.atomic import refuse_existing
 from aaplug.io.cameras import select_views
 from aaplug.methods.recipe import Recipe
@@ -92,8 +92,8 @@ def evaluate(
         options: fields of `EvaluateOptions`.
     """
     o = EvaluateOptions.of(options)
-    out = Output(None if output is None else Path(output), o)
-    out.check()
+    folder = None if output is None else Path(output)
+    check_results(folder, o)
     name = name or Path(scene.name if isinstance(scene, Gaussians) else scene).stem
     metrics, rules = _metrics(o)
     if o.background == "auto" and rules.background is not None:
@@ -104,67 +104,43 @@ def evaluate(
     shown = _shown(o.show, seen) if o.report else ()
     source = _source(o.truth, rules, seen, monitor)
     facts = _facts(scene, cameras, seen, source, o)
+    images = folder and ImageStore(folder, shown, everything=o.layout == "inria")
     with processor(o.threads):
         look = look_of(scene, cameras, len(seen) * len(recipes) * len(scales), o, monitor)
         candidates = candidates_of(scene, look.training, recipes, look.rasterizer, look.background)
         task = Task(candidates, scales, seen, Truth(look, source, rules), metrics)
         with monitor.progress(f"evaluating {name}", "views") as tell:
-            found = measure(task, facts, tell, out.folder and out.folder / JOURNAL, o.resume, out.images(shown))
-    bounds = coverage(scene, look.training, found.scales) if o.report else None
-    out.write(found, name, bounds, out.images(shown), monitor)
+            found = measure(task, facts, tell, folder and folder / JOURNAL, o.resume, images)
+    if folder and images:
+        replaces = o.overwrite or o.resume
+        written = write_results(found, folder, replaces, name)
+        if o.report:
+            bounds = coverage(scene, look.training, found.scales)
+            written += write_page(folder, name, found, bounds, images, replaces)
+        for path in written:
+            monitor.say(f"wrote {path}")
     return found
 
 
-@dataclass(frozen=True)
-class Output:
-    """Where an evaluation goes.  folder: None writes nothing."""
+def check_results(folder: Path | None, o: EvaluateOptions) -> None:
+    """Refuse, before any work, what cannot be written.
 
-    folder: Path | None
-    options: EvaluateOptions
-
-    def check(self) -> None:
-        """Refuse, before any work, what cannot be written.
-
-        Raises:
-            AaplugError: what was asked for needs a folder or contradicts itself, or the folder holds results.
-        """
-        o = self.options
-        if o.layout not in get_args(Layout):
-            raise UsageError("layout", f"'{o.layout}' is not one of {', '.join(get_args(Layout))}")
-        needs = {"report": o.report, "layout": o.layout != "plain", "resume": o.resume}
-        for parameter, given in needs.items():
-            if given and self.folder is None:
-                raise UsageError(parameter, "needs a folder; give `output`")
-        if o.resume and o.overwrite:
-            raise UsageError("resume", "and `overwrite` contradict each other; give one")
-        if self.folder is None or self.replaces:
-            return
-        if (self.folder / JOURNAL).exists():
-            raise OutputError(self.folder, "holds an evaluation; `resume` continues it, `overwrite` starts anew")
-        refuse_existing([self.folder / name for name in (*RESULTS, *[PAGE] * o.report)], overwrite=False)
-
-    @property
-    def replaces(self) -> bool:
-        """Whether existing results are replaced."""
-        return self.options.overwrite or self.options.resume
-
-    def images(self, shown: Sequence[int]) -> ImageStore | None:
-        """Where images are stored: those that the report shows, and in INRIA's layout all of them."""
-        if self.folder is None:
-            return None
-        return ImageStore(self.folder, tuple(shown), everything=self.options.layout == "inria")
-
-    def write(
-        self, report: Report, name: str, bounds: Coverage | None, images: ImageStore | None, monitor: Monitor
-    ) -> None:
-        """Write the results, and the report if it was asked for."""
-        if self.folder is None:
-            return
-        written = write_results(report, self.folder, self.replaces, name)
-        if bounds is not None and images is not None:
-            written += write_page(self.folder, name, report, bounds, images, self.replaces)
-        for path in written:
-            monitor.say(f"wrote {path}")
+    Raises:
+        AaplugError: what was asked for needs a folder or contradicts itself, or the folder holds results.
+    """
+    if o.layout not in get_args(Layout):
+        raise UsageError("layout", f"'{o.layout}' is not one of {', '.join(get_args(Layout))}")
+    needs = {"report": o.report, "layout": o.layout != "plain", "resume": o.resume}
+    for parameter, given in needs.items():
+        if given and folder is None:
+            raise UsageError(parameter, "needs a folder; give `output`")
+    if o.resume and o.overwrite:
+        raise UsageError("resume", "and `overwrite` contradict each other; give one")
+    if folder is None or o.overwrite or o.resume:
+        return
+    if (folder / JOURNAL).exists():
+        raise OutputError(folder, "holds an evaluation; `resume` continues it, `overwrite` starts anew")
+    refuse_existing([folder / name for name in ((*RESULTS, PAGE) if o.report else RESULTS)], overwrite=False)
 
 
 def _metrics(o: EvaluateOptions) -> tuple[list[Metric], Protocol]:
@@ -216,14 +192,11 @@ def _shown(text: str, views: Sequence[Camera]) -> tuple[int, ...]:
 
 
 def _source(truth: str, protocol: Protocol, views: Sequence[Camera], monitor: Monitor) -> TruthSource:
-    known: dict[str, TruthSource | None] = {"auto": protocol.truth, **{n: n for n in get_args(TruthSource)}}
-    if truth not in known:
-        raise UsageError("truth", f"'{truth}' is not one of {', '.join(known)}")
-    if chosen := known[truth]:
-        return chosen
-    source = source_of(views)
-    why = "" if source == "photographs" else " (not every view has a photograph)"
-    monitor.say(f"truth: {source}{why}")
+    asked = protocol.truth or "auto" if truth == "auto" else truth
+    source = source_of(views, asked)
+    if asked == "auto":
+        why = "" if source == "photographs" else " (not every view has a photograph)"
+        monitor.say(f"truth: {source}{why}")
     return source
 
 

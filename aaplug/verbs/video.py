@@ -83,7 +83,8 @@ def video(
         options: fields of `VideoOptions`; `beside` may be None.
     """
     o = VideoOptions.of(options)
-    recipes = [recipe_of(recipe, o) for recipe in (o.beside or "none", o.recipe) if recipe != "none"]
+    left = "none" if o.beside is None else o.beside
+    recipes = [recipe_of(recipe, o) for recipe in (left, o.recipe) if recipe != "none"]
     free = None if str(o.path) in MOVES else read_camera_path(Path(o.path))
     fps = o.fps or (FPS if free is None else free.fps)
     check_video(Path(output), fps, o.overwrite)
