@@ -206,5 +206,5 @@ def grid(title: str, report: Report, lines: list[list[str]], ceiling: str | None
     for scale in report.scales:
         grid.add_column(scale_name(scale), justify="right", no_wrap=True)
     for recipe, cells in zip(report.recipes, lines, strict=True):
-        grid.add_row(recipe, *cells, style=ceiling if recipe == CEILING else None)
+        grid.add_row(escape(recipe), *cells, style=ceiling if recipe == CEILING else None)
     return grid

@@ -3,6 +3,7 @@
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -55,19 +56,15 @@ class Batch:
             why = self.failures.get(folder)
             status = "done" if why is None else "[red]failed[/]"
             scenes.add_row(escape(name), status, escape(why or ""))
-        return [*self._mean_tables(), scenes]
-
-    def _mean_tables(self) -> list[Table]:
         if not self.reports:
-            return []
-        first, means = next(iter(self.reports.values())), self._means()
+            return [scenes]
+        first, means, grids = next(iter(self.reports.values())), self._means(), []
         over = f"mean of {len(self.reports)} scene{'s' * (len(self.reports) != 1)}"
-        grids = []
         for metric in first.metrics:
             found = [[means.get(method(r, s), {}).get(metric.name) for s in first.scales] for r in first.recipes]
             lines = [[metric.text(value) for value in line] for line in found]
             grids.append(grid(f"{metric.title}, {over}", first, lines))
-        return grids
+        return [*grids, scenes]
 
 
 def batch(
@@ -86,8 +83,7 @@ def batch(
         output: folder of the scenes' folders.
 
     Raises:
-        OutputError: there are results already, or the summary cannot be written.
-        UsageError: `resume` and `overwrite` are both given.
+        AaplugError: there are results already, an option does not fit, or the summary cannot be written.
     """
     folders = [Path(output) / slug for slug in file_names([name for name, _ in runs], "scene", 3)]
     refuse_existing([Path(output) / name for name in (SUMMARY, RESULTS)], overwrite or resume)
@@ -98,7 +94,7 @@ def batch(
     for folder, (name, run) in zip(folders, runs, strict=True):
         monitor.say(f"--- {name}")
         given = {"name": name, "output": folder, "resume": resume, "overwrite": overwrite}
-        outcome = _outcome(lambda: run(**given, monitor=monitor), monitor)  # noqa: B023
+        outcome = _outcome(partial(run, **given, monitor=monitor), monitor)
         if isinstance(outcome, Report):
             reports[folder.name] = outcome
         else:

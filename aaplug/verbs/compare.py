@@ -53,6 +53,6 @@ def compare(
         look = look_of(scenes[0], cameras, len(chosen) * len(o.scale) * len(scenes), o, monitor)
         trained = [TrainingViews.of(scene, cameras, o.cull_margin, o.min_seen) for scene in scenes[1:]]
         looks = [look, *(replace(look, training=training) for training in trained)]
-        renderers = [drawn_by(recipe, *pair) for pair in zip(scenes, looks, strict=True)]
-        shown = [Candidate(*pair) for pair in zip(candidates, renderers, strict=True)]
+        each = zip(candidates, scenes, looks, strict=True)
+        shown = [Candidate(name, drawn_by(recipe, scene, look)) for name, scene, look in each]
         return compared(shown, chosen, o.scale, Truth(look, source), tell)

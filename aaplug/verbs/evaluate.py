@@ -30,7 +30,7 @@ from aaplug.io.atomic import refuse_existing
 from aaplug.io.cameras import select_views
 from aaplug.methods.recipe import Recipe
 from aaplug.methods.recipes import RECIPES, USER_RECIPES, suited
-from aaplug.verbs.inputs import AnyPath, CamerasLike, SceneLike, cameras_of, look_of, processor, recipe_of, scene_of
+from aaplug.verbs.inputs import AnyPath, CamerasLike, SceneLike, inputs_of, look_of, processor, recipe_of
 from aaplug.verbs.options import RECIPE_NAMES, RecipeOptions, choice, choices, flag
 
 ALL = "all"  # instead of recipes' names: every recipe that the scene suits
@@ -98,7 +98,7 @@ def evaluate(
     metrics, rules = _metrics(o)
     if o.background == "auto" and rules.background is not None:
         o = replace(o, background=rules.background)
-    cameras, scene = cameras_of(cameras, scene), scene_of(scene)
+    scene, cameras = inputs_of(scene, cameras)
     recipes = _recipes(o, scene, monitor)
     seen, scales = select_views(cameras, o.views), o.scale or rules.scales
     shown = _shown(o.show, seen) if o.report else ()

@@ -1,10 +1,10 @@
 """Fine-tuning: a plain scene file that looks right at every scale by the rule that will show it."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 from jaxtyping import Float
 from torch import Tensor
@@ -32,8 +32,10 @@ from aaplug.io.scenes import SpzAxes, check_scene_output, write_scene
 from aaplug.methods.recipes import RECIPES
 from aaplug.methods.viewers import FAST, VIEWERS, Viewer, fuse_for
 from aaplug.rendering.renderer import Renderer
-from aaplug.verbs.inputs import AnyPath, CamerasLike, SceneLike, cameras_of, look_of, processor, scene_of, sources_of
+from aaplug.verbs.inputs import AnyPath, CamerasLike, SceneLike, inputs_of, look_of, processor, sources_of
 from aaplug.verbs.options import ViewOptions, choice, choices, flag
+
+Image = Float[Tensor, "h w 3"]
 
 
 @dataclass(frozen=True)
@@ -123,7 +125,7 @@ def finetune(
     names = ("scale", "steps", "loss", "anchor", "move", "learning_rate", "densify_every", "seed")
     settings = settings_of(METHODS.find(o.method, "method"), **{name: getattr(o, name) for name in names})
     viewer, path = _viewer(o), None if output is None else Path(output)
-    cameras, scene = cameras_of(cameras, scene), scene_of(scene)
+    scene, cameras = inputs_of(scene, cameras)
     if o.checkpoint_every < 1:
         raise UsageError("checkpoint_every", f"must be 1 or more, got {o.checkpoint_every}")
     if path is not None:
@@ -147,14 +149,12 @@ def finetune(
         if len(start.scene.fused) > len(scene.fused):
             candidates.insert(1, Candidate("closed form", start))
         scales = sorted({1.0, *settings.weights}, reverse=True)
-        compared = _Comparison(candidates, shown, scales, replace(job.truth, source=source_of(shown)))
-        found = Tuned(tuned, compared.report(monitor), settings, state.curve, state.probes)
+        truth = replace(job.truth, source=source_of(shown))
+        with monitor.progress("measuring", "views") as tell:
+            report = compare(candidates, shown, scales, truth, tell)
+        found = Tuned(tuned, report, settings, state.curve, state.probes)
         if path is not None:
-            report = json.dumps(found.as_json() | {"curve": list(found.curve)}, indent=1)
-            with replacing(_beside(path, "json"), o.overwrite) as stream:
-                stream.write(report.encode())
-            write_png(_beside(path, "png"), compared.sheet(), overwrite=o.overwrite)
-            _beside(path, "pt").unlink(missing_ok=True)
+            _write(path, found, _sheet(candidates, shown[0], scales, truth), o.overwrite)
     return found
 
 
@@ -170,28 +170,22 @@ def _check_files(path: Path, sources: Sequence[Path], o: FinetuneOptions) -> Non
         check_output(_beside(path, kind), replaces, sources)
 
 
-class _Comparison(NamedTuple):
-    """Candidates beside the truth."""
+def _sheet(candidates: Sequence[Candidate], view: Camera, scales: Iterable[float], truth: Truth) -> Image:
+    """A view at every scale: the truth, and each candidate."""
+    rows = []
+    for scale in scales:
+        camera = view.scaled(scale)
+        drawn = [candidate.renderer(camera).rgb for candidate in candidates]
+        rows.append((f"{scale_name(scale)}: {camera.width}x{camera.height}", [truth(view, scale), *drawn]))
+    return contact_sheet(("truth", *(c.name for c in candidates)), rows)
 
-    candidates: Sequence[Candidate]
-    views: Sequence[Camera]
-    scales: Sequence[float]
-    truth: Truth
 
-    def report(self, monitor: Monitor) -> Report:
-        """Measure all views."""
-        with monitor.progress("measuring", "views") as tell:
-            return compare(self.candidates, self.views, self.scales, self.truth, tell)
-
-    def sheet(self) -> Float[Tensor, "h w 3"]:
-        """The first view at every scale."""
-        view, rows = self.views[0], []
-        for scale in self.scales:
-            camera = view.scaled(scale)
-            drawn = [candidate.renderer(camera).rgb for candidate in self.candidates]
-            label = f"{scale_name(scale)}: {camera.width}x{camera.height}"
-            rows.append((label, [self.truth(view, scale), *drawn]))
-        return contact_sheet(("truth", *(c.name for c in self.candidates)), rows)
+def _write(path: Path, found: Tuned, sheet: Image, overwrite: bool) -> None:
+    """Write the report and the pictures, and remove the checkpoint."""
+    with replacing(_beside(path, "json"), overwrite) as stream:
+        stream.write(json.dumps(found.as_json() | {"curve": list(found.curve)}, indent=1).encode())
+    write_png(_beside(path, "png"), sheet, overwrite=overwrite)
+    _beside(path, "pt").unlink(missing_ok=True)
 
 
 def _viewer(o: FinetuneOptions) -> Viewer:
@@ -206,13 +200,10 @@ def _viewer(o: FinetuneOptions) -> Viewer:
 
 def _source(truth: str, cameras: CameraSet) -> TruthSource:
     """Where the images that renders are compared with come from."""
-    sources: dict[str, TruthSource] = {"self": "self", "photographs": "photographs", "auto": source_of(cameras.train)}
-    if truth not in sources:
-        raise UsageError("truth", f"'{truth}' is not one of {', '.join(sources)}")
     missing = [view.name for view in cameras.train if view.photo is None]
-    if sources[truth] == "photographs" and missing:
+    if truth == "photographs" and missing:
         raise UsageError(missing[0], "has no photograph; `truth` self needs none")
-    return sources[truth]
+    return source_of(cameras.train, truth)
 
 
 def _drawn(tuned: Gaussians, start: Renderer) -> Renderer:

@@ -64,9 +64,5 @@ def _bounds(part: Gaussians, cameras: Sequence[Camera], coarsest: float | None) 
 
 
 def _coarsest(opened: SceneFile, cameras: Sequence[Camera], drop_bad: bool, size: int) -> float:
-    coarsest = math.inf
-    for part in opened.parts(drop_bad, size):
-        bounds = sampling_bounds(part.means, cameras)
-        if bounds.seen.any():
-            coarsest = min(coarsest, bounds.highest[bounds.seen].min().item())
-    return coarsest
+    found = (sampling_bounds(part.means, cameras) for part in opened.parts(drop_bad, size))
+    return min((part.highest[part.seen].min().item() for part in found if part.seen.any()), default=math.inf)

@@ -30,15 +30,13 @@ def info(
     Args:
         scene: a scene's file, opened or not, or a model folder.
         cameras: training cameras, their file or folder, to tell also how finely they sample the scene.
-        monitor: receives progress.
         options: fields of `FrameOptions`.
 
     Returns:
         JSON-ready facts by name; "problems" lists what is odd, each with what to do.
 
     Raises:
-        FormatError: a file cannot be read.
-        FrameError: the cameras see little of the scene.
+        AaplugError: a file cannot be read, or the cameras see little of the scene.
     """
     o = FrameOptions.of(options)
     opened = opened_of(scene)
@@ -78,8 +76,7 @@ def _scene_facts(opened: SceneFile, found: Survey) -> dict[str, Any]:
 
 
 def _comments(opened: SceneFile) -> list[str]:
-    document = opened.document
-    return document.header.comments if isinstance(document, Document) else []
+    return opened.document.header.comments if isinstance(opened.document, Document) else []
 
 
 def _sampling_facts(found: Survey, cameras: CameraSet, kernel: float) -> dict[str, Any]:

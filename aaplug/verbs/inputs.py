@@ -60,6 +60,12 @@ def cameras_of(cameras: CamerasLike, scene: SceneLike) -> CameraSet:
     return read_cameras(path)
 
 
+def inputs_of(scene: SceneLike, cameras: CamerasLike) -> tuple[Gaussians, CameraSet]:
+    """The scene and its cameras; the cameras are read first, as they are small."""
+    known = cameras_of(cameras, scene)
+    return scene_of(scene), known
+
+
 def recipe_of(recipe: str | Recipe, o: RecipeOptions) -> Recipe:
     """A recipe as it is, or by name as the options say; the rate reference goes to those that compare rates."""
     if isinstance(recipe, Recipe):

@@ -21,17 +21,7 @@ from aaplug.io.cameras import select_views
 from aaplug.io.cameras.camera_path import read_camera_path
 from aaplug.io.video import check_video
 from aaplug.rendering.videos import make_video
-from aaplug.verbs.inputs import (
-    AnyPath,
-    CamerasLike,
-    SceneLike,
-    cameras_of,
-    drawn_by,
-    look_of,
-    processor,
-    recipe_of,
-    scene_of,
-)
+from aaplug.verbs.inputs import AnyPath, CamerasLike, SceneLike, drawn_by, inputs_of, look_of, processor, recipe_of
 from aaplug.verbs.options import RECIPE_NAMES, ImageOptions, RecipeOptions, choice, flag
 from aaplug.verbs.views import resized
 
@@ -88,7 +78,7 @@ def video(
     free = None if str(o.path) in MOVES else read_camera_path(Path(o.path))
     fps = o.fps or (FPS if free is None else free.fps)
     check_video(Path(output), fps, o.overwrite)
-    cameras, scene = cameras_of(cameras, scene), scene_of(scene)
+    scene, cameras = inputs_of(scene, cameras)
     shown = resized(free.cameras if free else _along(scene, cameras, o, fps, monitor), o.scale, o.resolution)
     compose = partial(
         side_by_side, labels=[{"auto": "aaplug auto"}.get(recipe.name, recipe.name) for recipe in recipes]

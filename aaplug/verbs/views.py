@@ -12,10 +12,7 @@ MAX_SIDE = 16384  # px
 
 
 def resized(views: Sequence[Camera], scale: float | None = None, resolution: str | None = None) -> list[Camera]:
-    """The views at another size.
-
-    scale: relative to the training size; 1 where neither is given.
-    resolution: "WIDTHxHEIGHT" in px; -1 on one side keeps the aspect.
+    """The views at the size that `ImageOptions` describes.
 
     Raises:
         UsageError: both are given, one is not a size, or an image would be larger than `MAX_SIDE`.
@@ -64,7 +61,5 @@ def _size(text: str, view: Camera) -> tuple[int, int]:
     if max(width, height) < 1 or min(width, height) == 0:
         raise UsageError("resolution", f"expected WIDTHxHEIGHT such as 400x400 or -1x720, got '{text}'")
     if width < 0:
-        width = max(1, round(view.width * height / view.height))
-    if height < 0:
-        height = max(1, round(view.height * width / view.width))
-    return width, height
+        return max(1, round(view.width * height / view.height)), height
+    return width, max(1, round(view.height * width / view.width)) if height < 0 else height
