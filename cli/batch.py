@@ -23,9 +23,8 @@ T = TypeVar("T")
 
 def scenes_of(path: Path, base: T) -> list[tuple[str, T]]:
     """The scenes of a batch file with their options; `base` has what the file does not say."""
-    file = read_batch(path)
+    file, refused = read_batch(path), (*NOT_IN_A_FILE, *ONCE)
     shared = _set(path, "at the top", base, file.shared, NOT_IN_A_FILE)
-    refused = (*NOT_IN_A_FILE, *ONCE)
     return [(name, _set(path, f"scene '{name}'", shared, settings, refused)) for name, settings in file.scenes.items()]
 
 

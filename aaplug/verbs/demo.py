@@ -33,10 +33,8 @@ CONVERTED, SHEET = "chair-converted.ply", "contact-sheet.png"
 def demo(output: AnyPath = "demo-out", *, overwrite: bool = False, monitor: Monitor = SILENT) -> Report:
     """Convert, render and measure the bundled scene; write the converted scene, a contact sheet and the results.
 
-    output: a folder.
-
     Raises:
-        OutputError: a file exists and `overwrite` is false, or it cannot be written.
+        OutputError: in the folder `output` a file exists and `overwrite` is false, or cannot be written.
     """
     folder = Path(output)
     refuse_existing([folder / name for name in (CONVERTED, SHEET, *RESULTS)], overwrite)
@@ -69,8 +67,7 @@ def _sheet(scene: Gaussians, converted: Gaussians, training: TrainingViews, view
         images = [resampled(photo, scale), *(renderer(camera).rgb for renderer in renderers)]
         y = slice(round(top * scale), round(bottom * scale))
         x = slice(round(left * scale), round(right * scale))
-        label = f"{scale_name(scale)}: {camera.width}x{camera.height}"
-        rows.append((label, [image[y, x] for image in images]))
+        rows.append((f"{scale_name(scale)}: {camera.width}x{camera.height}", [image[y, x] for image in images]))
     return contact_sheet(COLUMNS, rows)
 
 

@@ -123,15 +123,10 @@ def evaluate(
 
 
 def check_results(folder: Path | None, o: EvaluateOptions) -> None:
-    """Refuse, before any work, what cannot be written.
-
-    Raises:
-        AaplugError: what was asked for needs a folder or contradicts itself, or the folder holds results.
-    """
+    """Refuse, before any work, what needs a folder, contradicts itself or would replace results."""
     if o.layout not in get_args(Layout):
         raise UsageError("layout", f"'{o.layout}' is not one of {', '.join(get_args(Layout))}")
-    needs = {"report": o.report, "layout": o.layout != "plain", "resume": o.resume}
-    for parameter, given in needs.items():
+    for parameter, given in {"report": o.report, "layout": o.layout != "plain", "resume": o.resume}.items():
         if given and folder is None:
             raise UsageError(parameter, "needs a folder; give `output`")
     if o.resume and o.overwrite:
@@ -195,8 +190,7 @@ def _source(truth: str, protocol: Protocol, views: Sequence[Camera], monitor: Mo
     asked = protocol.truth or "auto" if truth == "auto" else truth
     source = source_of(views, asked)
     if asked == "auto":
-        why = "" if source == "photographs" else " (not every view has a photograph)"
-        monitor.say(f"truth: {source}{why}")
+        monitor.say(f"truth: {source}{' (not every view has a photograph)' * (source == 'self')}")
     return source
 
 

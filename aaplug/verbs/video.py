@@ -89,8 +89,7 @@ def video(
         size = f"{shown[0].width}x{shown[0].height}"
         monitor.say(f"{len(shown)} frames of {size} px per pane, {fps:g} per second")
         with monitor.progress("rendering", "images") as tell:
-            how = {"threads": workers, "overwrite": o.overwrite, "tell": tell}
-            make_video(output, renderers, shown, fps, compose, **how)
+            make_video(output, renderers, shown, fps, compose, threads=workers, overwrite=o.overwrite, tell=tell)
     return Clip(Path(output), len(shown), fps)
 
 
