@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from aaplug.core.cameras import Camera
+from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.errors import UsageError
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.monitor import SILENT, Monitor
@@ -116,15 +116,18 @@ def convert(
         if isinstance(chosen, Form):
             found = Converted(_fused(whole, cameras, chosen, o.min_seen), MIP_VIEWER)
         else:
-            known = cameras_of(cameras, whole)
-            steps = steps_for(whole, chosen) if o.steps is None else o.steps
-            look = look_of(whole, known, steps, o, monitor)
-            fitted = fit(whole, chosen, look, select_views(known, o.views), steps, monitor)
-            found = Converted(fitted.scene, chosen, fitted.report)
+            found = _fitted(whole, cameras_of(cameras, whole), chosen, o, monitor)
     if path is not None:
         assert found.scene is not None
         write_scene(path, found.scene, **writing)
     return found
+
+
+def _fitted(scene: Gaussians, cameras: CameraSet, viewer: Viewer, o: ConvertOptions, monitor: Monitor) -> Converted:
+    steps = steps_for(scene, viewer) if o.steps is None else o.steps
+    look = look_of(scene, cameras, steps, o, monitor)
+    fitted = fit(scene, viewer, look, select_views(cameras, o.views), steps, monitor)
+    return Converted(fitted.scene, viewer, fitted.report)
 
 
 def _train_of(opened: SceneFile, cameras: CamerasLike, min_seen: float) -> Sequence[Camera]:

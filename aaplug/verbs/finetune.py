@@ -122,16 +122,9 @@ def finetune(
         KeyboardInterrupt: Ctrl-C stopped the run; its checkpoint is written.
     """
     o = FinetuneOptions.of(options)
-    names = ("scale", "steps", "loss", "anchor", "move", "learning_rate", "densify_every", "seed")
-    settings = settings_of(METHODS.find(o.method, "method"), **{name: getattr(o, name) for name in names})
-    viewer, path = _viewer(o), None if output is None else Path(output)
+    settings, viewer, path = _settings(o), _viewer(o), None if output is None else Path(output)
     scene, cameras = inputs_of(scene, cameras)
-    if o.checkpoint_every < 1:
-        raise UsageError("checkpoint_every", f"must be 1 or more, got {o.checkpoint_every}")
-    if path is not None:
-        _check_files(path, sources_of(scene), o)
-    elif o.resume:
-        raise UsageError("resume", "needs the `output` of the interrupted run")
+    _check(path, sources_of(scene), o)
     shown, source = select_views(cameras, o.views), _source(o.truth, cameras)
     enlarge = back_projected if o.upsampler is None else upsampled(find_upsampler(o.upsampler))
     with processor(o.threads):
@@ -145,9 +138,8 @@ def finetune(
         tuned = recorded(state, job, viewer.convention_of(scene), {"for": viewer.name, "method": settings.name})
         if path is not None:
             write_scene(path, tuned, overwrite=o.overwrite, spz_axes=spz_axes)
-        candidates = [Candidate("before", before), Candidate("after", _drawn(tuned, start))]
-        if len(start.scene.fused) > len(scene.fused):
-            candidates.insert(1, Candidate("closed form", start))
+        closed = [Candidate("closed form", start)] * (len(start.scene.fused) > len(scene.fused))
+        candidates = [Candidate("before", before), *closed, Candidate("after", _drawn(tuned, start))]
         scales = sorted({1.0, *settings.weights}, reverse=True)
         truth = replace(job.truth, source=source_of(shown))
         with monitor.progress("measuring", "views") as tell:
@@ -163,8 +155,19 @@ def _beside(scene: Path, kind: str) -> Path:
     return scene.with_suffix(f".finetune.{kind}")
 
 
-def _check_files(path: Path, sources: Sequence[Path], o: FinetuneOptions) -> None:
-    """Check, before any work, that the scene and the files beside it may be written."""
+def _settings(o: FinetuneOptions) -> Settings:
+    names = ("scale", "steps", "loss", "anchor", "move", "learning_rate", "densify_every", "seed")
+    return settings_of(METHODS.find(o.method, "method"), **{name: getattr(o, name) for name in names})
+
+
+def _check(path: Path | None, sources: Sequence[Path], o: FinetuneOptions) -> None:
+    """Check, before any work, the checkpoints, and that the scene and the files beside it may be written."""
+    if o.checkpoint_every < 1:
+        raise UsageError("checkpoint_every", f"must be 1 or more, got {o.checkpoint_every}")
+    if path is None:
+        if o.resume:
+            raise UsageError("resume", "needs the `output` of the interrupted run")
+        return
     check_scene_output(path, o.overwrite, sources)
     for kind, replaces in (("json", o.overwrite), ("png", o.overwrite), ("pt", o.resume or o.overwrite)):
         check_output(_beside(path, kind), replaces, sources)
