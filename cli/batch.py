@@ -22,14 +22,9 @@ T = TypeVar("T")
 
 
 def scenes_of(path: Path, base: T) -> list[tuple[str, T]]:
-    """The scenes of a batch file with their options; `base` has what the file does not say.
-
-    Raises:
-        FormatError: the batch file names no scenes, or a setting is not known or does not fit.
-    """
-    file = read_batch(path)
+    """The scenes of a batch file with their options; `base` has what the file does not say."""
+    file, refused = read_batch(path), (*NOT_IN_A_FILE, *ONCE)
     shared = _set(path, "at the top", base, file.shared, NOT_IN_A_FILE)
-    refused = (*NOT_IN_A_FILE, *ONCE)
     return [(name, _set(path, f"scene '{name}'", shared, settings, refused)) for name, settings in file.scenes.items()]
 
 
@@ -44,8 +39,7 @@ def _set(path: Path, where: str, options: T, settings: Mapping[str, Any], refuse
             continue
         try:
             with redirect_stderr(StringIO()):  # tyro's own message speaks of the command line
-                words = _words(key, value)
-                options = tyro.cli(type(options), args=words, default=options, config=CONFIG)
+                options = tyro.cli(type(options), args=_words(key, value), default=options, config=CONFIG)
         except SystemExit as error:
             problem = f"{where}: {key} = {value!r} does not fit; see `aaplug evaluate --help`"
             raise FormatError(path, problem) from error

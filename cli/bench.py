@@ -1,7 +1,8 @@
 """aaplug bench: how fast this machine renders, stage by stage."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Annotated
 
 import torch
@@ -25,21 +26,23 @@ class Bench:
     json: bool = False
     """Print one JSON object on stdout: the figures, or {"runs": [...]} of several."""
 
-
-def bench(options: Bench) -> int:
-    """Time every rasterizer on every scene."""
-    scene = cameras = None
-    if options.scene.scene is not None or options.scene.model_path is not None:
-        scene, cameras = options.scene.read(), options.cameras.read(options.scene)
-    runs, exponents = verb.bench(scene, cameras, monitor=TERMINAL, **vars(options.how))
-    if options.json:
-        several = {"runs": [run.as_json() for run in runs], "exponents": exponents}
-        print_json(runs[0].as_json() if len(runs) == 1 else several)
+    def __call__(self) -> int:
+        """Time every rasterizer on every scene."""
+        scene = cameras = None
+        if self.scene.scene is not None or self.scene.model_path is not None:
+            scene, cameras = self.scene.read(), self.cameras.read(self.scene)
+        runs, exponents = verb.bench(scene, cameras, monitor=TERMINAL, **vars(self.how))
+        if self.json:
+            several = {"runs": [run.as_json() for run in runs], "exponents": exponents}
+            print_json(runs[0].as_json() if len(runs) == 1 else several)
+            return 0
+        threads = self.how.threads or torch.get_num_threads()
+        figures = _table(f"medians, ms; matmul is a 2048³ float32 product, {threads} threads", FIGURES, runs)
+        stages = {name: partial(_stage, name) for name in runs[0].stages_ms}
+        out.print(figures, _table("stages, ms", stages, runs))
+        for name, value in exponents.items():
+            out.print(f"time grows as {name}^{value:.2f}")
         return 0
-    out.print(_table(runs, options.how.threads or torch.get_num_threads()), _stages(runs))
-    for name, value in exponents.items():
-        out.print(f"time grows as {name}^{value:.2f}")
-    return 0
 
 
 def _scene(run: Figures) -> str:
@@ -50,33 +53,26 @@ def _scene(run: Figures) -> str:
     return f"{run.gaussians} {run.width}x{run.height}"
 
 
-def _table(runs: Sequence[Figures], threads: int) -> Table:
-    title = f"medians, ms; matmul is a 2048³ float32 product, {threads} threads"
+def _stage(name: str, run: Figures) -> str:
+    return f"{run.stages_ms[name]:.0f}"
+
+
+Columns = Mapping[str, Callable[[Figures], str]]
+FIGURES: Columns = {
+    "forward": lambda run: f"{run.forward_ms:.0f}",
+    "+ back": lambda run: "" if run.forward_backward_ms is None else f"{run.forward_backward_ms:.0f}",
+    "matmul": lambda run: f"{run.matmul_ms:.0f}",
+    "share": lambda run: f"{run.share:.2f}",
+    "Mevals": lambda run: f"{run.evaluations / 1e6:.0f}",
+    "ns/eval": lambda run: f"{run.ns_per_evaluation:.2f}",
+    "GB": lambda run: f"{run.peak_bytes / 1e9:.1f}",
+}
+
+
+def _table(title: str, columns: Columns, runs: Sequence[Figures]) -> Table:
     table = Table(title=title, box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    names = ("scene", "", "forward", "+ back", "matmul", "share", "Mevals", "ns/eval", "GB")
-    for name in names:
+    for name in ("scene", "", *columns):
         table.add_column(name, justify="right" if name else "left", no_wrap=True)
     for run in runs:
-        table.add_row(
-            _scene(run),
-            run.rasterizer,
-            f"{run.forward_ms:.0f}",
-            "" if run.forward_backward_ms is None else f"{run.forward_backward_ms:.0f}",
-            f"{run.matmul_ms:.0f}",
-            f"{run.share:.2f}",
-            f"{run.evaluations / 1e6:.0f}",
-            f"{run.ns_per_evaluation:.2f}",
-            f"{run.peak_bytes / 1e9:.1f}",
-        )
-    return table
-
-
-def _stages(runs: Sequence[Figures]) -> Table:
-    table = Table(title="stages, ms", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    names = list(runs[0].stages_ms)
-    for name in ("scene", "", *names):
-        table.add_column(name, justify="right" if name else "left", no_wrap=True)
-    for run in runs:
-        stages = [f"{run.stages_ms[name]:.0f}" for name in names]
-        table.add_row(_scene(run), run.rasterizer, *stages)
+        table.add_row(_scene(run), run.rasterizer, *(text(run) for text in columns.values()))
     return table

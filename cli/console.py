@@ -42,7 +42,7 @@ class Terminal(Monitor):
     def progress(self, what: str, unit: str) -> Iterator[Tell]:
         """Show progress and the time left."""
         if not log.is_terminal:
-            yield _Lines(what, unit)
+            yield _lines(what, unit)
             return
         columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TextColumn(unit))
         with Progress(*columns, TimeRemainingColumn(), console=log, transient=True) as bar:
@@ -51,7 +51,7 @@ class Terminal(Monitor):
 
 
 TERMINAL = Terminal()
-say, progress = TERMINAL.say, TERMINAL.progress
+say = TERMINAL.say
 
 
 def print_json(data: Any) -> None:
@@ -59,17 +59,17 @@ def print_json(data: Any) -> None:
     sys.stdout.write(json.dumps(data, indent=1, allow_nan=False) + "\n")
 
 
-class _Lines:
+def _lines(what: str, unit: str) -> Tell:
     """Progress for logs: a line every LINE_SECONDS and one at the end."""
+    started = told = time.monotonic()
 
-    def __init__(self, what: str, unit: str) -> None:
-        self.what, self.unit = what, unit
-        self.started = self.told = time.monotonic()
-
-    def __call__(self, done: int, total: int) -> None:
+    def tell(done: int, total: int) -> None:
+        nonlocal told
         now = time.monotonic()
-        if done == total or now - self.told >= LINE_SECONDS:
-            left = (now - self.started) / max(done, 1) * (total - done)
+        if done == total or now - told >= LINE_SECONDS:
+            left = (now - started) / max(done, 1) * (total - done)
             eta = f", about {left:.0f} s left" if 0 < done < total else ""
-            say(f"{self.what}: {done} of {total} {self.unit}{eta}")
-            self.told = now
+            say(f"{what}: {done} of {total} {unit}{eta}")
+            told = now
+
+    return tell

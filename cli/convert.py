@@ -24,26 +24,24 @@ class Convert:
     json: bool = False
     """Print what was done as one JSON object on stdout."""
 
-
-def convert(options: Convert) -> int:
-    """Fuse anti-aliasing into a plain scene file."""
-    opened = options.scene.open()
-    named = options.cameras.cameras is not None or options.scene.path.is_dir()
-    cameras = options.cameras.read(options.scene) if named else None
-    own = {"drop_bad": options.scene.drop_bad, "spz_axes": options.scene.spz_axes} | vars(options.how)
-    found = verb.convert(opened, cameras, options.output, monitor=TERMINAL, **own)
-    scene, report = found.scene, found.report
-    if options.json:
-        facts = {"output": str(options.output), "gaussians": opened.count}
-        if scene is not None:
-            fused = [{"method": f.method, **f.settings} for f in scene.fused]
-            facts |= {"gaussians": len(scene), "fused": fused}
-        if report is not None:
-            facts |= {"for": found.viewer.name, "residual": results(report)}
-        print_json(facts)
-    elif report is not None:
-        out.print("As the viewer draws it, against the scene's own training-size render:")
-        out.print(tables(report)[0])
-    how = "in parts" if scene is None else f"fused {fused_in(scene)}"
-    say(f"wrote {options.output}: {how}; show it with {found.viewer.rule} ({found.viewer.name})")
-    return 0
+    def __call__(self) -> int:
+        """Fuse, and say what was done."""
+        opened = self.scene.open()
+        cameras = self.cameras.read(self.scene) if self.cameras.cameras or self.scene.path.is_dir() else None
+        own = {"drop_bad": self.scene.drop_bad, "spz_axes": self.scene.spz_axes} | vars(self.how)
+        found = verb.convert(opened, cameras, self.output, monitor=TERMINAL, **own)
+        scene, report = found.scene, found.report
+        if self.json:
+            facts = {"output": str(self.output), "gaussians": opened.count}
+            if scene is not None:
+                fused = [{"method": f.method, **f.settings} for f in scene.fused]
+                facts |= {"gaussians": len(scene), "fused": fused}
+            if report is not None:
+                facts |= {"for": found.viewer.name, "residual": results(report)}
+            print_json(facts)
+        elif report is not None:
+            out.print("As the viewer draws it, against the scene's own training-size render:")
+            out.print(tables(report)[0])
+        how = "in parts" if scene is None else f"fused {fused_in(scene)}"
+        say(f"wrote {self.output}: {how}; show it with {found.viewer.rule} ({found.viewer.name})")
+        return 0

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import tyro
+from tyro.conf import arg
 
 from aaplug.evaluation.results import tables
 from aaplug.verbs import demo as verb
@@ -16,15 +16,14 @@ from .console import TERMINAL, out, say
 class Demo:
     """Convert, render and measure the bundled scene: a pretrained chair and four photographs."""
 
-    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")] = Path("demo-out")
+    output: Annotated[Path, arg(aliases=["-o"], metavar="FOLDER")] = Path("demo-out")
     """Folder for the converted scene, the contact sheet and the results."""
     overwrite: bool = False
     """Replace the files of an earlier demo."""
 
-
-def demo(options: Demo) -> int:
-    """Convert, render and measure the bundled scene."""
-    report = verb.demo(options.output, overwrite=options.overwrite, monitor=TERMINAL)
-    out.print(*tables(report))
-    say(f"look at {options.output / verb.SHEET}")
-    return 0
+    def __call__(self) -> int:
+        """Convert, render and measure."""
+        report = verb.demo(self.output, overwrite=self.overwrite, monitor=TERMINAL)
+        out.print(*tables(report))
+        say(f"look at {self.output / verb.SHEET}")
+        return 0

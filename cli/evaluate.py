@@ -1,7 +1,6 @@
 """aaplug evaluate: every recipe at every scale, measured."""
 
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,7 +9,7 @@ import tyro
 from aaplug.core.errors import UsageError
 from aaplug.evaluation.results import Report, results, tables
 from aaplug.verbs.batch import batch
-from aaplug.verbs.evaluate import EvaluateOptions, Output
+from aaplug.verbs.evaluate import EvaluateOptions, check_results
 from aaplug.verbs.evaluate import evaluate as measure
 
 from .batch import scenes_of
@@ -43,60 +42,46 @@ class Evaluate:
     json: bool = False
     """Print results.json on stdout instead of the table."""
 
+    def __call__(self) -> int:
+        """Measure one scene or many."""
+        if self.batch is not None or self.others.more:
+            return self._many()
+        check_results(self.output, self.how)  # before the scene is read
+        report = self._run()
+        self._print(results(report), tables(report))
+        return 0
 
-def evaluate(options: Evaluate) -> int:
-    """Measure recipes over scales, of one scene or of many."""
-    if options.batch is not None or options.others.more:
-        return _evaluate_many(options)
-    Output(options.output, options.how).check()  # before the scene is read
-    report = _run(options)
-    _print(options, results(report), tables(report))
-    return 0
+    def _run(self, **given: Any) -> Report:
+        """Evaluate one scene; `given` has precedence over the options."""
+        scene, cameras = self.scene.read(), self.cameras.read(self.scene)
+        own = {"output": self.output, "name": self.scene.path.stem, "monitor": TERMINAL}
+        return measure(scene, cameras, **vars(self.how) | own | given)
 
+    def _many(self) -> int:
+        scenes = self._scenes()
+        output = scenes[0][1].output
+        if output is None:
+            raise UsageError("output", "name a folder for the results of several scenes: -o FOLDER")
+        runs = [(name, own._run) for name, own in scenes]
+        found = batch(runs, output, resume=self.how.resume, overwrite=self.how.overwrite, monitor=TERMINAL)
+        self._print(found.summary(), found.tables())
+        return FAILED if found.failures else 0
 
-def _run(options: Evaluate, **given: Any) -> Report:
-    """Evaluate one scene; `given` has precedence over the options."""
-    scene = options.scene.read()
-    cameras = options.cameras.read(options.scene)
-    own = {"output": options.output, "name": options.scene.path.stem, "monitor": TERMINAL}
-    return measure(scene, cameras, **vars(options.how) | own | given)
+    def _scenes(self) -> list[tuple[str, "Evaluate"]]:
+        """The scenes that a batch file or the command line names, with their options."""
+        if self.batch is not None:
+            if named := self.others.more or self.scene.scene or self.scene.model_path:
+                raise UsageError("batch", f"names the scenes; leave {named} out")
+            return scenes_of(self.batch, replace(self, batch=None))
+        paths = [self.scene.path, *self.others.more]
+        if self.cameras.cameras is None and any(path.is_file() for path in paths):
+            raise UsageError("cameras", "give them, or name model folders, which hold their own")
+        alone = replace(self, others=OtherScenes())
+        scenes = [replace(self.scene, scene=path, model_path=None) for path in paths]
+        return [(s.path.stem if s.path.is_file() else s.path.name, replace(alone, scene=s)) for s in scenes]
 
-
-def _evaluate_many(options: Evaluate) -> int:
-    scenes = _scenes(options)
-    output = scenes[0][1].output
-    if output is None:
-        raise UsageError("output", "name a folder for the results of several scenes: -o FOLDER")
-    runs = [(name, partial(_run, own)) for name, own in scenes]
-    found = batch(runs, output, resume=options.how.resume, overwrite=options.how.overwrite, monitor=TERMINAL)
-    _print(options, found.summary(), found.tables())
-    return FAILED if found.failures else 0
-
-
-def _scenes(options: Evaluate) -> list[tuple[str, Evaluate]]:
-    """The scenes that a batch file or the command line names, with their options.
-
-    Raises:
-        UsageError: both name scenes, or there are no cameras.
-        FormatError: the batch file names no scenes, or a setting does not fit.
-    """
-    if options.batch is not None:
-        if named := options.others.more or options.scene.scene or options.scene.model_path:
-            raise UsageError("batch", f"names the scenes; leave {named} out")
-        return scenes_of(options.batch, replace(options, batch=None))
-    paths = [options.scene.path, *options.others.more]
-    if options.cameras.cameras is None and any(path.is_file() for path in paths):
-        raise UsageError("cameras", "give them, or name model folders, which hold their own")
-    return [(path.stem if path.is_file() else path.name, _of(path, options)) for path in paths]
-
-
-def _of(path: Path, options: Evaluate) -> Evaluate:
-    scene = replace(options.scene, scene=path, model_path=None)
-    return replace(options, scene=scene, others=OtherScenes())
-
-
-def _print(options: Evaluate, data: Any, grids: Any) -> None:
-    if options.json:
-        print_json(data)
-    else:
-        out.print(*grids)
+    def _print(self, data: Any, grids: Any) -> None:
+        if self.json:
+            print_json(data)
+        else:
+            out.print(*grids)

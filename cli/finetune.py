@@ -27,17 +27,15 @@ class Finetune:
     json: bool = False
     """Print the report on stdout as JSON instead of the table."""
 
-
-def finetune(options: Finetune) -> int:
-    """Optimize the Gaussians until every scale looks like the training size."""
-    scene, cameras = options.scene.read(), options.cameras.read(options.scene)
-    found = verb.finetune(
-        scene, cameras, options.output, spz_axes=options.scene.spz_axes, monitor=TERMINAL, **vars(options.how)
-    )
-    if options.json:
-        print_json(found.as_json())
-    else:
-        out.print(*tables(found.report))
-    stem = options.output.stem
-    say(f"wrote {options.output}, {stem}.finetune.json and {stem}.finetune.png")
-    return 0
+    def __call__(self) -> int:
+        """Optimize, and say what was written."""
+        scene, cameras = self.scene.read(), self.cameras.read(self.scene)
+        axes = self.scene.spz_axes
+        found = verb.finetune(scene, cameras, self.output, spz_axes=axes, monitor=TERMINAL, **vars(self.how))
+        if self.json:
+            print_json(found.as_json())
+        else:
+            out.print(*tables(found.report))
+        stem = self.output.stem
+        say(f"wrote {self.output}, {stem}.finetune.json and {stem}.finetune.png")
+        return 0

@@ -30,37 +30,29 @@ class Info:
     json: bool = False
     """Print one JSON object on stdout instead of a table."""
 
-
-def info(options: Info) -> int:
-    """Show what a scene is."""
-    if options.limits:
-        return _show_limits(options.json)
-    opened = options.scene.open()
-    named = options.cameras.cameras is not None
-    cameras = options.cameras.read(options.scene) if named else None
-    facts = verb.info(opened, cameras, monitor=TERMINAL, **vars(options.how))
-    if options.json:
-        print_json(facts)
-    else:
-        _print(facts)
-    return 0
-
-
-def _print(facts: dict[str, Any]) -> None:
-    table = Table(show_header=False, box=None, pad_edge=False)
-    for key, value in facts.items():
-        if key in HIDDEN or value == []:
-            continue
-        name = key.removesuffix("_text").replace("_px2", " (px²)").replace("_", " ")
-        table.add_row(f"[dim]{name}[/]", escape(_text(value)))
-    out.print(table)
+    def __call__(self) -> int:
+        """Show what a scene is."""
+        if self.limits:
+            _show_limits(self.json)
+            return 0
+        opened = self.scene.open()
+        cameras = None if self.cameras.cameras is None else self.cameras.read(self.scene)
+        facts = verb.info(opened, cameras, monitor=TERMINAL, **vars(self.how))
+        if self.json:
+            print_json(facts)
+            return 0
+        table = Table(show_header=False, box=None, pad_edge=False)
+        for key, value in facts.items():
+            if key not in HIDDEN and value != []:
+                name = key.removesuffix("_text").replace("_px2", " (px²)").replace("_", " ")
+                table.add_row(f"[dim]{name}[/]", escape(_text(value)))
+        out.print(table)
+        return 0
 
 
 def _text(value: Any) -> str:
-    if value is None:
-        return "unknown"
-    if isinstance(value, bool):
-        return "yes" if value else "no"
+    if value is None or isinstance(value, bool):
+        return {None: "unknown", True: "yes", False: "no"}[value]
     if isinstance(value, float):
         return f"{value:.4g}"
     if isinstance(value, list):
@@ -69,15 +61,14 @@ def _text(value: Any) -> str:
     return f"{value:,}" if isinstance(value, int) else str(value)
 
 
-def _show_limits(as_json: bool) -> int:
+def _show_limits(as_json: bool) -> None:
     values = {name: limit(name) for name in LIMITS}
     fixed = {
         "LOG_SCALE": (MAX_LOG_SCALE, "", "a log-scale's absolute value, clamped on use"),
         "RENDER_SIDE": (MAX_SIDE, "px", "a side of a rendered image"),
     }
     if as_json:
-        print_json(values | {name: value for name, (value, *_) in fixed.items()})
-        return 0
+        return print_json(values | {name: value for name, (value, *_) in fixed.items()})
     table = Table("limit", "value", "unit", "of", "set by", box=None, pad_edge=False)
     for name, value in values.items():
         row = LIMITS[name]
@@ -85,7 +76,5 @@ def _show_limits(as_json: bool) -> int:
     for name, (value, unit, what) in fixed.items():
         table.add_row(name, f"{value:,}", unit, what, "fixed")
     out.print(table)
-    memory = memory_of_machine()
-    if memory is not None:
+    if (memory := memory_of_machine()) is not None:
         out.print(f"This machine has {memory / 1e9:.1f} GB of memory.")
-    return 0

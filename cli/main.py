@@ -6,7 +6,7 @@ Exit codes: 0 all done, 1 some of the work failed, 2 the request cannot be carri
 import os
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from importlib import import_module
 from importlib.metadata import version
 from typing import Any, get_args, get_origin
@@ -48,56 +48,53 @@ def run(words: Sequence[str]) -> int:
 
     from .options import CONFIG
 
-    words = _joined(_parted(words))
+    words = _parted(words)
     if words and words[0] in VERBS:  # loading one verb is faster than loading all
-        noun, verb = _verb(words[0])
-        return verb(tyro.cli(noun, prog=f"aaplug {words[0]}", args=words[1:], config=CONFIG))
-    options = tyro.extras.subcommand_cli_from_dict(
-        {verb: _verb(verb)[0] for verb in VERBS},
+        return tyro.cli(_verb(words[0]), prog=f"aaplug {words[0]}", args=words[1:], config=CONFIG)()
+    return tyro.extras.subcommand_cli_from_dict(
+        {verb: _verb(verb) for verb in VERBS},
         prog="aaplug",
         description="Test-time anti-aliasing for pretrained 3D Gaussian Splatting scenes.",
         args=words,
         config=CONFIG,
-    )
-    return _verb(type(options).__name__.lower())[1](options)
+    )()
 
 
-def _verb(name: str) -> tuple[type, Callable[[Any], int]]:
-    """A verb's options and its function."""
-    module = import_module(f".{name}", __package__)
-    return getattr(module, name.capitalize()), getattr(module, name)
+def _verb(name: str) -> type[Any]:
+    """A verb's options; an instance is called to do the work."""
+    return getattr(import_module(f".{name}", __package__), name.capitalize())
+
+
+def _option_types(words: Sequence[str]) -> dict[str, Any]:
+    """Types of the options, by name, of the verb that the first word names."""
+    from .options import option_types
+
+    return option_types(_verb(words[0])) if words and words[0] in VERBS else {}
 
 
 def _worded(error: AaplugError, words: Sequence[str]) -> str:
     """The library's error, with parameters of the verb as its options."""
-    from .options import option_types, worded
+    from .options import worded
 
-    known = option_types(_verb(words[0])[0]) if words and words[0] in VERBS else {}
-    where = error.where
-    if isinstance(error, UsageError):
-        where = worded(f"`{where}`", known).strip("`")
+    known = _option_types(words)
+    where = worded(f"`{error.where}`", known).strip("`") if isinstance(error, UsageError) else error.where
     return f"{where}: {worded(error.problem, known)}"
 
 
-def _several(verb: str) -> list[str]:
-    """Options of a verb that take any number of names or numbers."""
-    from .options import option_types
-
-    several = {
-        name
-        for name, kind in option_types(_verb(verb)[0]).items()
-        for one in (kind, *get_args(kind))
-        if get_origin(one) is Sequence
-    }
-    return ["--" + name.replace("_", "-") for name in several]
-
-
 def _parted(words: Sequence[str]) -> list[str]:
-    """`--scale 1,0.25` as the parser wants it, `--scale 1 0.25`; `--views`, whose names hold commas, stays."""
-    several = _several(words[0]) if words and words[0] in VERBS else []
+    """The words as the parser wants them.
+
+    `--scale 1,0.25` becomes `--scale 1 0.25`; `--views`, whose names hold commas, stays.  `--resolution -1x720` becomes
+    one word, because the parser would take the value for an option.
+    """
+    types = _option_types(words).items()
+    several = {"--" + n.replace("_", "-") for n, t in types if Sequence in list(map(get_origin, (t, *get_args(t))))}
     option = ""
     parted: list[str] = []
     for word in words:
+        if parted and parted[-1] == "--resolution" and re.fullmatch(r"-?\d+x-?\d+", word):
+            parted[-1] += "=" + word
+            continue
         flag, _, value = word.partition("=")
         option = flag if word.startswith("-") else option
         if option not in several:
@@ -107,14 +104,3 @@ def _parted(words: Sequence[str]) -> list[str]:
         else:
             parted += filter(None, word.split(","))
     return parted
-
-
-def _joined(words: Sequence[str]) -> list[str]:
-    """`--resolution -1x720` as one word, because the parser would take the value for an option."""
-    joined: list[str] = []
-    for word in words:
-        if joined and joined[-1] == "--resolution" and re.fullmatch(r"-?\d+x-?\d+", word):
-            joined[-1] += "=" + word
-        else:
-            joined.append(word)
-    return joined

@@ -7,7 +7,7 @@ import re
 from collections.abc import Collection
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated, Any, cast, get_type_hints
 
 import tyro
 
@@ -64,15 +64,12 @@ class SceneOptions:
         """What the user named."""
         if (self.scene is None) == (self.model_path is None):
             raise UsageError("scene", "name one scene: a .ply, a model folder, or -m FOLDER")
-        path = self.scene or self.model_path
-        assert path is not None
-        return path
+        return self.scene or cast(Path, self.model_path)
 
     def open(self) -> SceneFile:
         """Open the scene's file and say what it is."""
         if self.convention is not None and self.convention not in CONVENTIONS:
-            known = listing(list(CONVENTIONS))
-            raise UsageError("convention", f"'{self.convention}' is not one of {known}")
+            raise UsageError("convention", f"'{self.convention}' is not one of {listing(list(CONVENTIONS))}")
         opened = open_scene(
             find_scene(self.path, self.iteration),
             convention=None if self.convention is None else CONVENTIONS[self.convention],
@@ -109,11 +106,9 @@ class CameraOptions:
 
     def read(self, options: SceneOptions) -> CameraSet:
         """Read the cameras and say where sizes and split come from."""
-        path = self.cameras
-        if path is None and options.path.is_dir():
-            path = options.path
-        if path is None:
+        if self.cameras is None and not options.path.is_dir():
             raise UsageError("cameras", "name cameras.json, a COLMAP model or transforms_*.json")
+        path = self.cameras or options.path
         cameras = read_cameras(path, train_scale=self.train_scale, images=self.images, test_every=self.test_every)
         for note in cameras.notes:
             say(worded(f"cameras: {note}", CameraOptions.__dataclass_fields__))

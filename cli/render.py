@@ -22,14 +22,13 @@ class Render:
     json: bool = False
     """Print what was written as one JSON object on stdout."""
 
-
-def render(options: Render) -> int:
-    """Render views at any resolution to PNG."""
-    scene, cameras = options.scene.read(), options.cameras.read(options.scene)
-    written = verb.render(scene, cameras, options.output, monitor=TERMINAL, **vars(options.how))
-    if options.json:
-        images = [{"view": v.name, "file": str(p), "width": v.width, "height": v.height} for v, p in written]
-        print_json({"recipe": options.how.recipe, "images": images})
-    else:
-        say(f"wrote {len(written)} image{'s' * (len(written) != 1)} to {options.output}")
-    return 0
+    def __call__(self) -> int:
+        """Render, and say what was written."""
+        scene, cameras = self.scene.read(), self.cameras.read(self.scene)
+        written = verb.render(scene, cameras, self.output, monitor=TERMINAL, **vars(self.how))
+        if self.json:
+            images = [{"view": v.name, "file": str(p), "width": v.width, "height": v.height} for v, p in written]
+            print_json({"recipe": self.how.recipe, "images": images})
+        else:
+            say(f"wrote {len(written)} image{'s' * (len(written) != 1)} to {self.output}")
+        return 0

@@ -22,13 +22,12 @@ class Video:
     json: bool = False
     """Print what was written as one JSON object on stdout."""
 
-
-def video(options: Video) -> int:
-    """Render a camera path to a video."""
-    scene, cameras = options.scene.read(), options.cameras.read(options.scene)
-    clip = verb.video(scene, cameras, options.output, monitor=TERMINAL, **vars(options.how))
-    if options.json:
-        print_json({"file": str(clip.file), "frames": clip.frames, "fps": clip.fps})
-    else:
-        say(f"wrote {clip.file}")
-    return 0
+    def __call__(self) -> int:
+        """Render, and say what was written."""
+        scene, cameras = self.scene.read(), self.cameras.read(self.scene)
+        clip = verb.video(scene, cameras, self.output, monitor=TERMINAL, **vars(self.how))
+        if self.json:
+            print_json(clip._asdict() | {"file": str(clip.file)})
+        else:
+            say(f"wrote {clip.file}")
+        return 0

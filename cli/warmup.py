@@ -14,11 +14,10 @@ class Warmup:
     json: bool = False
     """Print where the kernels are as one JSON object on stdout."""
 
-
-def warmup(options: Warmup) -> int:
-    """Compile what is missing and say where it is."""
-    folder, names = verb.warmup(monitor=TERMINAL)
-    say(f"{len(names)} kernels in {folder}")
-    if options.json:
-        print_json({"folder": str(folder), "kernels": names})
-    return 0
+    def __call__(self) -> int:
+        """Compile what is missing and say where it is."""
+        folder, names = verb.warmup(monitor=TERMINAL)
+        say(f"{len(names)} kernels in {folder}")
+        if self.json:
+            print_json({"folder": str(folder), "kernels": names})
+        return 0

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from aaplug.core.errors import FormatError, UsageError
-from aaplug.core.executors import Processes, Serial, Threads, torch_threads
+from aaplug.core.executors import Processes, Threads, torch_threads
 
 PARENT = """
 import time
@@ -28,7 +28,7 @@ def refuse_three(item: int) -> int:
     return item * item
 
 
-@pytest.mark.parametrize("executor", [Serial(), Threads(2), Processes(2)], ids=lambda executor: type(executor).__name__)
+@pytest.mark.parametrize("executor", [Threads(2), Processes(2)], ids=lambda executor: type(executor).__name__)
 def test_results_come_in_order_until_the_first_error(executor):
     found = []
     with pytest.raises(FormatError, match=r"scene\.ply: is short"):

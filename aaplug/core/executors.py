@@ -1,4 +1,4 @@
-"""Worker pools: apply one function to many items in this process, in threads or in processes.
+"""Worker pools: apply one function to many items, in threads or in processes.
 
 Results come in the order of the items, and a pool reads only a few items ahead of its workers, so memory does not grow
 with the number of items.  Leaving the loop early, also by an exception, ends the workers.
@@ -16,7 +16,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import torch
 
@@ -24,22 +24,6 @@ from aaplug.core.errors import UsageError
 
 T = TypeVar("T")
 R = TypeVar("R")
-
-
-class Executor(Protocol):
-    """Applies a function to items."""
-
-    def map(self, work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
-        """Yield `work(item)` of every item, in order; an exception of `work` is raised here."""
-        ...
-
-
-class Serial:
-    """One item after the other, in this thread."""
-
-    def map(self, work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
-        """Yield `work(item)` of every item."""
-        return map(work, items)
 
 
 @dataclass(frozen=True)

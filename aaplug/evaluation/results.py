@@ -108,8 +108,8 @@ def tables(report: Report) -> list[Table]:
         flavour = f" {variant[0]}" if variant[1] and " " not in variant[0] else ""
         unit = f" [{metric.unit}]" if metric.unit else ""
         lines = [[f"[bold]{text}[/]" if best else text for text, best in row] for row in rows(report, metric)]
-        grids.append(_grid(f"{metric.name}{flavour}{unit}, {what}", report, lines, "italic"))
-    return grids + [_grid(title, report, lines) for title, lines in work(report)]
+        grids.append(grid(f"{metric.name}{flavour}{unit}, {what}", report, lines, "italic"))
+    return grids + [grid(title, report, lines) for title, lines in work(report)]
 
 
 def rows(report: Report, metric: Metric) -> list[list[tuple[str, bool]]]:
@@ -193,12 +193,12 @@ def _mean(values: Iterable[float | None]) -> float | None:
     return sum(known) / len(known) if known else None
 
 
-def _grid(title: str, report: Report, lines: list[list[str]], ceiling: str | None = None) -> Table:
+def grid(title: str, report: Report, lines: list[list[str]], ceiling: str | None = None) -> Table:
     """A table of one line per recipe; ceiling: style of that row."""
     grid = Table(title=escape(title), title_justify="left")
     grid.add_column("recipe", no_wrap=True)
     for scale in report.scales:
         grid.add_column(scale_name(scale), justify="right", no_wrap=True)
     for recipe, cells in zip(report.recipes, lines, strict=True):
-        grid.add_row(recipe, *cells, style=ceiling if recipe == CEILING else None)
+        grid.add_row(escape(recipe), *cells, style=ceiling if recipe == CEILING else None)
     return grid

@@ -9,7 +9,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from statistics import median
+from statistics import linear_regression, median
 from typing import Any
 
 import torch
@@ -80,8 +80,8 @@ def measure(scene: Gaussians, camera: Camera, kernels: Kernels, repeats: int = 5
         stages, tile_evaluations = _stages(renderer, camera, kernels, repeats)
         replace(renderer, rasterizer=rasterizer.counting(counts.append))(camera)
         a = torch.ones(MATRIX_SIDE, MATRIX_SIDE)
-        frame, product = _timed_in_turn(repeats, lambda: renderer(camera), lambda: a @ a)
-    both = _timed(lambda: gradient_step(renderer, camera), repeats) if backward else None
+        frame, product = _timed(repeats, lambda: renderer(camera), lambda: a @ a)
+    both = _timed(repeats, lambda: gradient_step(renderer, camera))[0] if backward else None
     return Figures(
         rasterizer=kernels.name,
         gaussians=len(scene),
@@ -93,7 +93,7 @@ def measure(scene: Gaussians, camera: Camera, kernels: Kernels, repeats: int = 5
         tile_evaluations=tile_evaluations,
         ns_per_evaluation=stages["composite"] * 1e6 / max(1, sum(counts)),
         stages_ms=stages,
-        peak_bytes=_peak_bytes(),
+        peak_bytes=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024),
         matmul_ms=product,
     )
 
@@ -110,10 +110,7 @@ def gradient_step(renderer: Renderer, camera: Camera) -> dict[str, Tensor]:
 
 def exponent(sizes: list[float], times: list[float]) -> float:
     """Slope of log time over log size, by least squares: 1 where cost grows linearly."""
-    x = torch.tensor([math.log(size) for size in sizes], dtype=torch.float64)
-    y = torch.tensor([math.log(t) for t in times], dtype=torch.float64)
-    x, y = x - x.mean(), y - y.mean()
-    return float((x * y).sum() / x.square().sum())
+    return linear_regression([*map(math.log, sizes)], [*map(math.log, times)]).slope
 
 
 def synthetic_camera(width: int, height: int) -> Camera:
@@ -161,21 +158,15 @@ def _surfaces(n: int, draw: torch.Generator) -> tuple[Float[Tensor, "n 3"], Floa
     means = torch.cat([directions[:ball], on_ground, outer * far])
     up = torch.tensor([[0.0, 0.0, 1.0]]).repeat(ground, 1)
     normals = torch.cat([directions[:ball], up, outer])
-    spacing = torch.cat(
-        [
-            torch.full((ball,), math.sqrt(4 * math.pi / max(1, ball))),
-            torch.full((ground,), math.sqrt(25 * math.pi / max(1, ground))),
-            math.sqrt(4 * math.pi / max(1, dome)) * far[:, 0],
-        ]
-    )
-    return means, normals, spacing
+    on_ball, on_dome = (math.sqrt(4 * math.pi / max(1, count)) for count in (ball, dome))
+    flat = torch.full((ground,), math.sqrt(25 * math.pi / max(1, ground)))
+    return means, normals, torch.cat([torch.full((ball,), on_ball), flat, on_dome * far[:, 0]])
 
 
 def _turned_to(normals: Float[Tensor, "n 3"], roll: Float[Tensor, " n"]) -> Float[Tensor, "n 4"]:
     """Quaternions that turn z to the normals, after a roll about z."""
     x, y, z = normals.unbind(dim=1)
-    # half the angle from z: w = 1 + z, axis (-y, x, 0)
-    w, i, j = (1 + z).clamp(min=1e-3), -y, x
+    w, i, j = (1 + z).clamp(min=1e-3), -y, x  # half the angle from z, about the axis (-y, x, 0)
     cos, sin = roll.cos(), roll.sin()
     return torch.stack([w * cos, i * cos + j * sin, j * cos - i * sin, w * sin], dim=1)
 
@@ -185,7 +176,7 @@ def _stages(renderer: Renderer, camera: Camera, kernels: Kernels, repeats: int) 
     times: dict[str, float] = {}
 
     def stage(name: str, work: Callable[[], Any]) -> Any:
-        times[name] = _timed(work, repeats)
+        [times[name]] = _timed(repeats, work)
         return work()
 
     scene, recipe, training = renderer.scene, renderer.recipe, renderer.training
@@ -201,13 +192,8 @@ def _stages(renderer: Renderer, camera: Camera, kernels: Kernels, repeats: int) 
     return times, sum(int(band.counts.sum()) for band in bins) * TILE**2
 
 
-def _timed(work: Callable[[], Any], repeats: int) -> float:
-    """Median milliseconds, after one run that is not counted."""
-    return _timed_in_turn(repeats, work)[0]
-
-
-def _timed_in_turn(repeats: int, *works: Callable[[], Any]) -> list[float]:
-    """Median milliseconds of each, run in turn so that drift of the machine affects all alike."""
+def _timed(repeats: int, *works: Callable[[], Any]) -> list[float]:
+    """Median milliseconds of each, run in turn so that drift of the machine affects all alike, after one run each."""
     times: list[list[float]] = [[] for _ in works]
     for work in works:
         work()
@@ -217,9 +203,3 @@ def _timed_in_turn(repeats: int, *works: Callable[[], Any]) -> list[float]:
             work()
             mine.append(1e3 * (time.perf_counter() - started))
     return [median(mine) for mine in times]
-
-
-def _peak_bytes() -> int:
-    """Linux counts in KiB, macOS in bytes."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else 1024 * peak

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 
 from aaplug.core.cameras import Camera
-from aaplug.core.executors import Executor, Processes, Serial
+from aaplug.core.executors import Processes
 from aaplug.core.monitor import Tell
 from aaplug.io.images import write_png
 from aaplug.rendering.renderer import Renderer
@@ -51,8 +51,8 @@ def write_frames(
     tell(1, total)
     left = (time.perf_counter() - started) * (total - 1)
     processes = min(threads, total - 1) if left > pays_after else 1
-    executor: Executor = Serial() if processes < 2 else Processes(processes)
-    for done, _ in enumerate(executor.map(write, range(1, total)), start=2):
+    written = map if processes < 2 else Processes(processes).map
+    for done, _ in enumerate(written(write, range(1, total)), start=2):
         tell(done, total)
 
 

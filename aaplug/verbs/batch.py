@@ -1,9 +1,9 @@
 """Batch: evaluate many scenes.  One that fails stops no other; the summary names it."""
 
-import re
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +13,11 @@ from rich.table import Table
 from aaplug.core.errors import AaplugError
 from aaplug.core.monitor import SILENT, Monitor
 from aaplug.evaluation.report.files import as_json, write_texts
-from aaplug.evaluation.results import Report, as_csv, method, results, scale_name
+from aaplug.evaluation.results import Report, as_csv, grid, method, results
 from aaplug.io.atomic import refuse_existing
-from aaplug.verbs.evaluate import EvaluateOptions, Output
+from aaplug.verbs.evaluate import EvaluateOptions, check_results
 from aaplug.verbs.inputs import AnyPath
+from aaplug.verbs.views import file_names
 
 SUMMARY, RESULTS = "batch.json", "results.csv"
 
@@ -31,12 +32,9 @@ class Batch:
 
     def summary(self) -> dict[str, Any]:
         """Status of every scene, and means over the finished ones of what all of them measured; JSON-ready."""
-        scenes = {
-            folder: {"name": name, "status": "failed", "error": self.failures[folder]}
-            if folder in self.failures
-            else {"name": name, "status": "done"}
-            for folder, name in self.names.items()
-        }
+        scenes = {folder: {"name": name, "status": "done"} for folder, name in self.names.items()}
+        for folder, error in self.failures.items():
+            scenes[folder] |= {"status": "failed", "error": error}
         return {"scenes": scenes, "mean_over": list(self.reports), "mean": self._means()}
 
     def _means(self) -> dict[str, dict[str, float | None]]:
@@ -58,24 +56,15 @@ class Batch:
             why = self.failures.get(folder)
             status = "done" if why is None else "[red]failed[/]"
             scenes.add_row(escape(name), status, escape(why or ""))
-        return [*self._mean_tables(), scenes]
-
-    def _mean_tables(self) -> list[Table]:
         if not self.reports:
-            return []
-        first, means = next(iter(self.reports.values())), self._means()
+            return [scenes]
+        first, means, grids = next(iter(self.reports.values())), self._means(), []
         over = f"mean of {len(self.reports)} scene{'s' * (len(self.reports) != 1)}"
-        grids = []
         for metric in first.metrics:
-            grid = Table(title=escape(f"{metric.title}, {over}"), title_justify="left")
-            grid.add_column("recipe", no_wrap=True)
-            for scale in first.scales:
-                grid.add_column(scale_name(scale), justify="right", no_wrap=True)
-            for recipe in first.recipes:
-                found = [means.get(method(recipe, s), {}).get(metric.name) for s in first.scales]
-                grid.add_row(escape(recipe), *map(metric.text, found))
-            grids.append(grid)
-        return grids
+            found = [[means.get(method(r, s), {}).get(metric.name) for s in first.scales] for r in first.recipes]
+            lines = [[metric.text(value) for value in line] for line in found]
+            grids.append(grid(f"{metric.title}, {over}", first, lines))
+        return [*grids, scenes]
 
 
 def batch(
@@ -94,19 +83,18 @@ def batch(
         output: folder of the scenes' folders.
 
     Raises:
-        OutputError: there are results already, or the summary cannot be written.
-        UsageError: `resume` and `overwrite` are both given.
+        AaplugError: there are results already, an option does not fit, or the summary cannot be written.
     """
-    folders = [Path(output) / slug for slug in _slugs([name for name, _ in runs])]
+    folders = [Path(output) / slug for slug in file_names([name for name, _ in runs], "scene", 3)]
     refuse_existing([Path(output) / name for name in (SUMMARY, RESULTS)], overwrite or resume)
     for folder in folders:
-        Output(folder, EvaluateOptions(resume=resume, overwrite=overwrite)).check()
+        check_results(folder, EvaluateOptions(resume=resume, overwrite=overwrite))
     reports: dict[str, Report] = {}
     failures: dict[str, str] = {}
     for folder, (name, run) in zip(folders, runs, strict=True):
         monitor.say(f"--- {name}")
         given = {"name": name, "output": folder, "resume": resume, "overwrite": overwrite}
-        outcome = _outcome(lambda: run(**given, monitor=monitor), monitor)  # noqa: B023
+        outcome = _outcome(partial(run, **given, monitor=monitor), monitor)
         if isinstance(outcome, Report):
             reports[folder.name] = outcome
         else:
@@ -114,14 +102,10 @@ def batch(
             monitor.say(f"failed: {name}: {outcome}")
     names = {folder.name: name for folder, (name, _) in zip(folders, runs, strict=True)}
     found = Batch(names, reports, failures)
-    _write(found, output, monitor)
-    return found
-
-
-def _write(found: Batch, output: AnyPath, monitor: Monitor) -> None:
     texts = {SUMMARY: as_json(found.summary()), RESULTS: as_csv(found.reports)}
     for path in write_texts(output, texts, overwrite=True):  # it was checked at the start
         monitor.say(f"wrote {path}")
+    return found
 
 
 def _outcome(run: Callable[[], Report], monitor: Monitor) -> Report | str:
@@ -135,14 +119,6 @@ def _outcome(run: Callable[[], Report], monitor: Monitor) -> Report | str:
     except Exception as error:  # a mistake in aaplug must not cost the other scenes
         monitor.say(traceback.format_exc())
         return f"unexpected {type(error).__name__}: {error}"
-
-
-def _slugs(names: Sequence[str]) -> list[str]:
-    """Names of folders; numbered where two would be the same."""
-    slugs = [re.sub(r"[^\w.\-]+", "_", name).lstrip(".") or "scene" for name in names]
-    if len({slug.casefold() for slug in slugs}) < len(slugs):
-        return [f"{index:03d}_{slug}" for index, slug in enumerate(slugs)]
-    return slugs
 
 
 def _mean(values: Sequence[float | None]) -> float | None:

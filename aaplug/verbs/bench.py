@@ -63,15 +63,12 @@ def bench(
         raise UsageError("repeats", f"must be 1 or more, got {o.repeats}")
     runs: list[Figures] = []
     with processor(o.threads):
-        if scene is None:
-            work = _synthetic(o.gaussians, o.resolution)
-        else:
-            work = [(scene_of(scene), cameras_of(cameras, scene).train[0])]
+        work = _synthetic(o) if scene is None else [(scene_of(scene), cameras_of(cameras, scene).train[0])]
         kernels = _kernels(o.rasterizer, monitor)
         for (shown, camera), each in product(work, kernels):
             run = measure(shown, camera, each, o.repeats, not o.forward_only)
-            size = f"{run.gaussians:,} Gaussians, {run.width}x{run.height}"
-            monitor.say(f"{size}, {run.rasterizer}: {run.forward_ms:.0f} ms")
+            shape = f"{run.gaussians:,} Gaussians, {run.width}x{run.height}"
+            monitor.say(f"{shape}, {run.rasterizer}: {run.forward_ms:.0f} ms")
             runs.append(run)
     return Bench(runs, _exponents(runs))
 
@@ -91,16 +88,16 @@ def _kernels(rasterizer: str, monitor: Monitor) -> list[Kernels]:
     return [compiled, EAGER]
 
 
-def _synthetic(gaussians: Sequence[int], resolution: Sequence[str] | None) -> list[tuple[Gaussians, Camera]]:
+def _synthetic(o: BenchOptions) -> list[tuple[Gaussians, Camera]]:
     """Every scene at the first size, and the middle one at the others."""
-    given = resolution or (SIZES if len(gaussians) > 1 else SIZES[:1])
+    given = o.resolution or (SIZES if len(o.gaussians) > 1 else SIZES[:1])
     sizes = [re.fullmatch(r"([1-9]\d*)x([1-9]\d*)", text) for text in given]
     if not all(sizes):
         raise UsageError("resolution", f"takes sizes such as 800x800, got {', '.join(given)}")
-    if min(gaussians, default=0) < 1:
+    if min(o.gaussians, default=0) < 1:
         raise UsageError("gaussians", "takes numbers above 0")
     first, *others = [synthetic_camera(int(size[1]), int(size[2])) for size in sizes if size]
-    scenes = [synthetic_scene(n) for n in gaussians]
+    scenes = [synthetic_scene(n) for n in o.gaussians]
     middle = scenes[len(scenes) // 2]
     return [*((scene, first) for scene in scenes), *((middle, c) for c in others)]
 
@@ -110,13 +107,10 @@ def _exponents(runs: Sequence[Figures]) -> dict[str, float]:
     found: dict[str, float] = {}
     for name in dict.fromkeys(run.rasterizer for run in runs):
         own = [run for run in runs if run.rasterizer == name]
-        first, last = own[0], own[-1]
-        same_size = [r for r in own if (r.width, r.height) == (first.width, first.height)]
-        same_scene = [r for r in own if r.gaussians == last.gaussians]
-        if len(same_size) > 1:
-            counts = [float(r.gaussians) for r in same_size]
-            found[f"{name}: Gaussians"] = exponent(counts, [r.forward_ms for r in same_size])
-        if len(same_scene) > 1:
-            pixels = [float(r.width * r.height) for r in same_scene]
-            found[f"{name}: pixels"] = exponent(pixels, [r.forward_ms for r in same_scene])
+        sized = [r for r in own if (r.width, r.height) == (own[0].width, own[0].height)]
+        alike = [r for r in own if r.gaussians == own[-1].gaussians]
+        counts, pixels = [float(r.gaussians) for r in sized], [float(r.width * r.height) for r in alike]
+        for what, runs_of, sizes in (("Gaussians", sized, counts), ("pixels", alike, pixels)):
+            if len(sizes) > 1:
+                found[f"{name}: {what}"] = exponent(sizes, [r.forward_ms for r in runs_of])
     return found

@@ -37,8 +37,7 @@ def compare(
 
     Args:
         candidates: scenes by the names that the report gives them; the first is the original.
-        cameras: a camera set, its file or folder, or None for those of the first scene's model folder.
-        monitor: receives messages and progress.
+        cameras, monitor: see `render`; None for the cameras of the first scene's model folder.
         options: fields of `CompareOptions`.
     """
     o = CompareOptions.of(options)
@@ -54,6 +53,6 @@ def compare(
         look = look_of(scenes[0], cameras, len(chosen) * len(o.scale) * len(scenes), o, monitor)
         trained = [TrainingViews.of(scene, cameras, o.cull_margin, o.min_seen) for scene in scenes[1:]]
         looks = [look, *(replace(look, training=training) for training in trained)]
-        renderers = [drawn_by(recipe, *pair) for pair in zip(scenes, looks, strict=True)]
-        shown = [Candidate(*pair) for pair in zip(candidates, renderers, strict=True)]
+        each = zip(candidates, scenes, looks, strict=True)
+        shown = [Candidate(name, drawn_by(recipe, scene, look)) for name, scene, look in each]
         return compared(shown, chosen, o.scale, Truth(look, source), tell)

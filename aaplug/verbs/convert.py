@@ -3,11 +3,11 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, TypeGuard
+from typing import Annotated, Any
 
 import tyro
 
-from aaplug.core.cameras import Camera
+from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.errors import UsageError
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.monitor import SILENT, Monitor
@@ -16,11 +16,11 @@ from aaplug.evaluation.results import Report
 from aaplug.finetuning.fitting import fit, steps_for
 from aaplug.inspection.survey import check_frame_of
 from aaplug.io.cameras import select_views
-from aaplug.io.scenes import SpzAxes, check_scene_output, find_scene, open_scene, write_parts, write_scene
+from aaplug.io.scenes import SpzAxes, check_scene_output, write_parts, write_scene
 from aaplug.io.scenes.scene_file import SceneFile
 from aaplug.methods.viewers import FORMS, MATCHED_ENERGY, MIP_VIEWER, VIEWERS, Form, Viewer, blurring, fuse
 from aaplug.verbs.in_parts import LARGE, convert_parts
-from aaplug.verbs.inputs import AnyPath, CamerasLike, SceneLike, cameras_of, look_of, processor
+from aaplug.verbs.inputs import AnyPath, CamerasLike, SceneLike, cameras_of, look_of, opened_of, processor, sources_of
 from aaplug.verbs.options import ViewOptions, flag
 
 
@@ -58,11 +58,7 @@ class ConvertOptions(ViewOptions):
     """Replace an existing output."""
 
     def chosen(self) -> Form | Viewer:
-        """What to convert for: a viewer, or the Mip rule by a closed form.
-
-        Raises:
-            UsageError: an option does not fit.
-        """
+        """What to convert for: a viewer, or the Mip rule by a closed form."""
         if self.viewer is None:
             if self.steps is not None:
                 raise UsageError("steps", "belongs to the optimization for a `viewer`; name one")
@@ -96,21 +92,21 @@ def convert(
         output: file to write, .ply, .spz or .splat; None writes none.
         drop_bad: leave out Gaussians of a file that cannot be used.
         spz_axes: of a .spz to write; see `open_scene`.
-        monitor: receives messages and progress.
+        monitor: see `render`.
         options: fields of `ConvertOptions`.
 
     Raises:
-        AaplugError: an input cannot be read, an option does not fit, something is fused already, or the output cannot
-            be written.
+        AaplugError: as `render`; also, something is fused already.
         KeyboardInterrupt: Ctrl-C stopped the optimization; nothing is written.
     """
     o = ConvertOptions.of(options)
-    chosen, opened, path = o.chosen(), _opened(scene), None if output is None else Path(output)
+    chosen, path = o.chosen(), None if output is None else Path(output)
+    opened = scene if isinstance(scene, Gaussians) else opened_of(scene)
     if path is not None:
-        check_scene_output(path, o.overwrite, _sources(opened))
+        check_scene_output(path, o.overwrite, sources_of(opened))
     writing = {"overwrite": o.overwrite, "spz_axes": spz_axes}
     with processor(o.threads) as workers:
-        if path and isinstance(chosen, Form) and _is_large(opened):
+        if path and isinstance(opened, SceneFile) and opened.count > LARGE and isinstance(chosen, Form):
             train = _train_of(opened, cameras, o.min_seen)
             with monitor.progress("converting", "Gaussians") as tell:
                 parts = convert_parts(opened, train, chosen, drop_bad, tell, threads=workers)
@@ -120,37 +116,18 @@ def convert(
         if isinstance(chosen, Form):
             found = Converted(_fused(whole, cameras, chosen, o.min_seen), MIP_VIEWER)
         else:
-            found = _fitted(whole, cameras, chosen, o, monitor)
+            found = _fitted(whole, cameras_of(cameras, whole), chosen, o, monitor)
     if path is not None:
         assert found.scene is not None
         write_scene(path, found.scene, **writing)
     return found
 
 
-def _fitted(scene: Gaussians, cameras: CamerasLike, viewer: Viewer, o: ConvertOptions, monitor: Monitor) -> Converted:
-    """The scene fitted to a viewer by optimization."""
-    known = cameras_of(cameras, scene)
+def _fitted(scene: Gaussians, cameras: CameraSet, viewer: Viewer, o: ConvertOptions, monitor: Monitor) -> Converted:
     steps = steps_for(scene, viewer) if o.steps is None else o.steps
-    look = look_of(scene, known, steps, o, monitor)
-    fitted = fit(scene, viewer, look, select_views(known, o.views), steps, monitor)
+    look = look_of(scene, cameras, steps, o, monitor)
+    fitted = fit(scene, viewer, look, select_views(cameras, o.views), steps, monitor)
     return Converted(fitted.scene, viewer, fitted.report)
-
-
-def _opened(scene: SceneLike | SceneFile) -> Gaussians | SceneFile:
-    if isinstance(scene, Gaussians | SceneFile):
-        return scene
-    return open_scene(find_scene(Path(scene)))
-
-
-def _is_large(scene: Gaussians | SceneFile) -> TypeGuard[SceneFile]:
-    return isinstance(scene, SceneFile) and scene.count > LARGE
-
-
-def _sources(scene: Gaussians | SceneFile) -> list[Path]:
-    """Files that the output must not replace."""
-    if isinstance(scene, SceneFile):
-        return [scene.path]
-    return [] if scene.origin is None else [Path(scene.origin.path)]
 
 
 def _train_of(opened: SceneFile, cameras: CamerasLike, min_seen: float) -> Sequence[Camera]:
@@ -166,5 +143,4 @@ def _fused(scene: Gaussians, cameras: CamerasLike, form: Form, min_seen: float) 
     """The closed form for the Mip rule."""
     if blurring(scene.fused) or scene.filter_3d is not None:  # needs none, or is refused anyway
         return fuse(scene, None, form)
-    known = cameras_of(cameras, scene)
-    return fuse(scene, TrainingViews.of(scene, known, min_seen=min_seen), form)
+    return fuse(scene, TrainingViews.of(scene, cameras_of(cameras, scene), min_seen=min_seen), form)

@@ -13,6 +13,7 @@ from aaplug.core.imaging import quantised, resampled
 from aaplug.core.monitor import SILENT, Monitor
 from aaplug.core.training import TrainingViews
 from aaplug.evaluation.report.contact_sheet import contact_sheet
+from aaplug.evaluation.report.files import RESULTS
 from aaplug.evaluation.results import Report, scale_name
 from aaplug.io.atomic import make_folder, refuse_existing
 from aaplug.io.cameras import read_cameras
@@ -24,20 +25,16 @@ from aaplug.verbs.evaluate import evaluate
 from aaplug.verbs.inputs import AnyPath
 
 SCALES = (1.0, 0.5, 0.25, 0.125)
-RECIPES = ("classic", "mip", "matched", "auto")
 SHOWN = "r_136"  # the view on the contact sheet
 COLUMNS = ("photograph", "classic 3DGS", "aaplug", "converted .ply, Mip viewer")
 CONVERTED, SHEET = "chair-converted.ply", "contact-sheet.png"
-RESULTS = ("results.json", "per_view.json", "results.csv")
 
 
 def demo(output: AnyPath = "demo-out", *, overwrite: bool = False, monitor: Monitor = SILENT) -> Report:
     """Convert, render and measure the bundled scene; write the converted scene, a contact sheet and the results.
 
-    output: a folder.
-
     Raises:
-        OutputError: a file exists and `overwrite` is false, or it cannot be written.
+        OutputError: in the folder `output` a file exists and `overwrite` is false, or cannot be written.
     """
     folder = Path(output)
     refuse_existing([folder / name for name in (CONVERTED, SHEET, *RESULTS)], overwrite)
@@ -46,14 +43,12 @@ def demo(output: AnyPath = "demo-out", *, overwrite: bool = False, monitor: Moni
         scene, cameras = read_scene(sample / "chair.ply"), read_cameras(sample)
         counts = f"{len(scene):,} Gaussians, {len(cameras.train)} training cameras"
         monitor.say(f"sample: {counts}, {len(cameras.test)} photographs")
-        converted = folder / CONVERTED
-        convert(scene, cameras, output=converted, overwrite=overwrite, monitor=monitor)
-        view = next(camera for camera in cameras.test if camera.name == SHOWN)
-        training = TrainingViews.of(scene, cameras)
-        sheet = _sheet(scene, read_scene(converted), training, view)
+        convert(scene, cameras, folder / CONVERTED, overwrite=overwrite, monitor=monitor)
+        [view] = [camera for camera in cameras.test if camera.name == SHOWN]
+        sheet = _sheet(scene, read_scene(folder / CONVERTED), TrainingViews.of(scene, cameras), view)
         write_png(folder / SHEET, sheet, overwrite=overwrite)
         monitor.say(f"wrote {folder / SHEET}")
-        how = {"recipe": RECIPES, "scale": SCALES, "metric": ("psnr", "ssim"), "name": "chair"}
+        how = {"scale": SCALES, "metric": ("psnr", "ssim"), "name": "chair"}
         return evaluate(scene, cameras, folder, overwrite=overwrite, monitor=monitor, **how)
 
 
@@ -72,8 +67,7 @@ def _sheet(scene: Gaussians, converted: Gaussians, training: TrainingViews, view
         images = [resampled(photo, scale), *(renderer(camera).rgb for renderer in renderers)]
         y = slice(round(top * scale), round(bottom * scale))
         x = slice(round(left * scale), round(right * scale))
-        label = f"{scale_name(scale)}: {camera.width}x{camera.height}"
-        rows.append((label, [image[y, x] for image in images]))
+        rows.append((f"{scale_name(scale)}: {camera.width}x{camera.height}", [image[y, x] for image in images]))
     return contact_sheet(COLUMNS, rows)
 
 

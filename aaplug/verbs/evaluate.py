@@ -25,18 +25,17 @@ from aaplug.evaluation.protocols import PROTOCOLS, LpipsFlavour, Protocol, SsimF
 from aaplug.evaluation.report.files import PAGE, RESULTS, write_page, write_results
 from aaplug.evaluation.results import Report
 from aaplug.evaluation.truth import Truth, source_of
-from aaplug.inspection.coverage import Coverage, coverage
+from aaplug.inspection.coverage import coverage
 from aaplug.io.atomic import refuse_existing
 from aaplug.io.cameras import select_views
 from aaplug.methods.recipe import Recipe
 from aaplug.methods.recipes import RECIPES, USER_RECIPES, suited
-from aaplug.verbs.inputs import AnyPath, CamerasLike, SceneLike, cameras_of, look_of, processor, recipe_of, scene_of
+from aaplug.verbs.inputs import AnyPath, CamerasLike, SceneLike, inputs_of, look_of, processor, recipe_of
 from aaplug.verbs.options import RECIPE_NAMES, RecipeOptions, choice, choices, flag
 
 ALL = "all"  # instead of recipes' names: every recipe that the scene suits
 DEFAULT_RECIPES = ("classic", "mip", "matched", "auto")
 FLAVOURS = {"ssim": get_args(SsimFlavour), "lpips": get_args(LpipsFlavour)}
-HASH_BLOCK = 1 << 20  # bytes read at once
 JOURNAL = "progress.jsonl"
 USER_NAMES = [recipe.name for recipe in USER_RECIPES]
 PACKAGES = ("aaplug", "torch", "numpy", "scikit-image", "opencv-contrib-python-headless")
@@ -87,97 +86,56 @@ def evaluate(
     """Measure recipes at several scales.
 
     Args:
-        scene, cameras, monitor: see `render`.
+        scene, cameras, monitor, and errors: see `render`.
         output: folder for results.json, per_view.json and results.csv; None writes nothing.
         name: the scene's name in the results; None for its file's.
         options: fields of `EvaluateOptions`.
-
-    Raises:
-        AaplugError: an input cannot be read, an option does not fit, or a result cannot be written.
     """
     o = EvaluateOptions.of(options)
-    out = Output(None if output is None else Path(output), o)
-    out.check()
+    folder = None if output is None else Path(output)
+    check_results(folder, o)
     name = name or Path(scene.name if isinstance(scene, Gaussians) else scene).stem
     metrics, rules = _metrics(o)
     if o.background == "auto" and rules.background is not None:
         o = replace(o, background=rules.background)
-    cameras, scene = cameras_of(cameras, scene), scene_of(scene)
+    scene, cameras = inputs_of(scene, cameras)
     recipes = _recipes(o, scene, monitor)
     seen, scales = select_views(cameras, o.views), o.scale or rules.scales
     shown = _shown(o.show, seen) if o.report else ()
     source = _source(o.truth, rules, seen, monitor)
-    facts = _facts(scene, cameras, seen, source) | _facts_of(o)
+    facts = _facts(scene, cameras, seen, source, o)
+    images = folder and ImageStore(folder, shown, everything=o.layout == "inria")
     with processor(o.threads):
         look = look_of(scene, cameras, len(seen) * len(recipes) * len(scales), o, monitor)
         candidates = candidates_of(scene, look.training, recipes, look.rasterizer, look.background)
         task = Task(candidates, scales, seen, Truth(look, source, rules), metrics)
         with monitor.progress(f"evaluating {name}", "views") as tell:
-            found = measure(task, facts, tell, out.journal, o.resume, out.images(shown))
-    bounds = coverage(scene, look.training, found.scales) if o.report else None
-    out.write(found, name, bounds, shown, monitor)
+            found = measure(task, facts, tell, folder and folder / JOURNAL, o.resume, images)
+    if folder and images:
+        replaces = o.overwrite or o.resume
+        written = write_results(found, folder, replaces, name)
+        if o.report:
+            bounds = coverage(scene, look.training, found.scales)
+            written += write_page(folder, name, found, bounds, images, replaces)
+        for path in written:
+            monitor.say(f"wrote {path}")
     return found
 
 
-@dataclass(frozen=True)
-class Output:
-    """Where an evaluation goes.  folder: None writes nothing."""
-
-    folder: Path | None
-    options: EvaluateOptions
-
-    def check(self) -> None:
-        """Refuse, before any work, what cannot be written.
-
-        Raises:
-            UsageError: what was asked for needs a folder, or contradicts itself.
-            OutputError: the folder holds results that may not be replaced.
-        """
-        o = self.options
-        if o.layout not in get_args(Layout):
-            raise UsageError("layout", f"'{o.layout}' is not one of {', '.join(get_args(Layout))}")
-        needs = {"report": o.report, "layout": o.layout != "plain", "resume": o.resume}
-        for parameter in (parameter for parameter, given in needs.items() if given):
-            if self.folder is None:
-                raise UsageError(parameter, "needs a folder; give `output`")
-        if o.resume and o.overwrite:
-            raise UsageError("resume", "and `overwrite` contradict each other; give one")
-        if self.folder is None or self.replaces:
-            return
-        if (self.folder / JOURNAL).exists():
-            problem = "holds an evaluation; `resume` continues it, `overwrite` starts anew"
-            raise OutputError(self.folder, problem)
-        files = (*RESULTS, PAGE) if o.report else RESULTS
-        refuse_existing([self.folder / name for name in files], overwrite=False)
-
-    @property
-    def replaces(self) -> bool:
-        """Whether existing results are replaced."""
-        return self.options.overwrite or self.options.resume
-
-    @property
-    def journal(self) -> Path | None:
-        """The file that keeps what is finished."""
-        return self.folder and self.folder / JOURNAL
-
-    def images(self, shown: Sequence[int]) -> ImageStore | None:
-        """Where images are stored: those that the report shows, and in INRIA's layout all of them."""
-        if self.folder is None:
-            return None
-        return ImageStore(self.folder, tuple(shown), everything=self.options.layout == "inria")
-
-    def write(
-        self, report: Report, name: str, bounds: Coverage | None, shown: tuple[int, ...], monitor: Monitor
-    ) -> None:
-        """Write the results, and the report if it was asked for."""
-        images = self.images(shown)
-        if self.folder is None or images is None:
-            return
-        written = write_results(report, self.folder, self.replaces, name)
-        if bounds is not None:
-            written += write_page(self.folder, name, report, bounds, images, self.replaces)
-        for path in written:
-            monitor.say(f"wrote {path}")
+def check_results(folder: Path | None, o: EvaluateOptions) -> None:
+    """Refuse, before any work, what needs a folder, contradicts itself or would replace results."""
+    if o.layout not in get_args(Layout):
+        raise UsageError("layout", f"'{o.layout}' is not one of {', '.join(get_args(Layout))}")
+    for parameter, given in {"report": o.report, "layout": o.layout != "plain", "resume": o.resume}.items():
+        if given and folder is None:
+            raise UsageError(parameter, "needs a folder; give `output`")
+    if o.resume and o.overwrite:
+        raise UsageError("resume", "and `overwrite` contradict each other; give one")
+    if folder is None or o.overwrite or o.resume:
+        return
+    if (folder / JOURNAL).exists():
+        raise OutputError(folder, "holds an evaluation; `resume` continues it, `overwrite` starts anew")
+    refuse_existing([folder / name for name in ((*RESULTS, PAGE) if o.report else RESULTS)], overwrite=False)
 
 
 def _metrics(o: EvaluateOptions) -> tuple[list[Metric], Protocol]:
@@ -204,11 +162,10 @@ def _recipes(o: EvaluateOptions, scene: Gaussians, monitor: Monitor) -> list[Rec
         return [suited(_recipe(name, o), scene) for name in names]
     fitting = []
     for recipe in (_recipe(name, o) for name in RECIPES):
-        missing = recipe.lacks(scene)
-        if missing is None:
-            fitting.append(suited(recipe, scene))
-        else:
+        if missing := recipe.lacks(scene):
             monitor.say(f"recipe {recipe.name} left out: {missing}")
+        else:
+            fitting.append(suited(recipe, scene))
     return fitting
 
 
@@ -230,29 +187,17 @@ def _shown(text: str, views: Sequence[Camera]) -> tuple[int, ...]:
 
 
 def _source(truth: str, protocol: Protocol, views: Sequence[Camera], monitor: Monitor) -> TruthSource:
-    known: dict[str, TruthSource | None] = {"auto": protocol.truth}
-    known |= {name: name for name in get_args(TruthSource)}
-    if truth not in known:
-        raise UsageError("truth", f"'{truth}' is not one of {', '.join(known)}")
-    if chosen := known[truth]:
-        return chosen
-    source = source_of(views)
-    why = "" if source == "photographs" else " (not every view has a photograph)"
-    monitor.say(f"truth: {source}{why}")
+    asked = protocol.truth or "auto" if truth == "auto" else truth
+    source = source_of(views, asked)
+    if asked == "auto":
+        monitor.say(f"truth: {source}{' (not every view has a photograph)' * (source == 'self')}")
     return source
 
 
-def _facts_of(o: EvaluateOptions) -> dict[str, Any]:
-    """What of the request a journal must agree on, besides scales, recipes and metrics."""
-    shown = {"shown": o.show if o.report else None, "layout": o.layout}
-    return {
-        "options": {"quality": o.quality, "rate_reference": o.rate_reference or "pose"} | shown,
-        "cull_margin": o.cull_margin if math.isfinite(o.cull_margin) else None,
-    }
-
-
-def _facts(scene: Gaussians, cameras: CameraSet, views: Sequence[Camera], truth: TruthSource) -> dict[str, Any]:
-    """What the numbers depend on besides the request: versions, and hashes of what was read."""
+def _facts(
+    scene: Gaussians, cameras: CameraSet, views: Sequence[Camera], truth: TruthSource, o: EvaluateOptions
+) -> dict[str, Any]:
+    """What a journal must agree on besides scales, recipes and metrics: versions, options, hashes of what was read."""
     photos = [view.photo for view in views if view.photo] if truth == "photographs" else []
     origin = scene.origin
     return {
@@ -271,6 +216,13 @@ def _facts(scene: Gaussians, cameras: CameraSet, views: Sequence[Camera], truth:
             "training_sha256": _cameras_sha256(cameras.train),
         },
         "photographs": {"count": len(photos), "sha256": _sha256(photos) if photos else None},
+        "options": {
+            "quality": o.quality,
+            "rate_reference": o.rate_reference or "pose",
+            "shown": o.show if o.report else None,
+            "layout": o.layout,
+        },
+        "cull_margin": o.cull_margin if math.isfinite(o.cull_margin) else None,
     }
 
 
@@ -279,8 +231,7 @@ def _sha256(paths: Sequence[Path]) -> str:
     digest = hashlib.sha256()
     for path in paths:
         with open(path, "rb") as stream:
-            while block := stream.read(HASH_BLOCK):
-                digest.update(block)
+            hashlib.file_digest(stream, lambda: digest)
     return digest.hexdigest()
 
 

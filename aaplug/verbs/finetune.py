@@ -18,7 +18,7 @@ from aaplug.evaluation.engine import Candidate, compare
 from aaplug.evaluation.protocols import TruthSource
 from aaplug.evaluation.report.contact_sheet import contact_sheet
 from aaplug.evaluation.results import Report, results, scale_name
-from aaplug.evaluation.truth import MEMORY, Enlarge, Truth, back_projected, source_of, upsampled
+from aaplug.evaluation.truth import MEMORY, Truth, back_projected, source_of, upsampled
 from aaplug.evaluation.upsamplers import find_upsampler
 from aaplug.finetuning.losses import LOSSES
 from aaplug.finetuning.parameters import RATES
@@ -32,8 +32,10 @@ from aaplug.io.scenes import SpzAxes, check_scene_output, write_scene
 from aaplug.methods.recipes import RECIPES
 from aaplug.methods.viewers import FAST, VIEWERS, Viewer, fuse_for
 from aaplug.rendering.renderer import Renderer
-from aaplug.verbs.inputs import AnyPath, CamerasLike, SceneLike, cameras_of, look_of, processor, scene_of
+from aaplug.verbs.inputs import AnyPath, CamerasLike, SceneLike, inputs_of, look_of, processor, sources_of
 from aaplug.verbs.options import ViewOptions, choice, choices, flag
+
+Image = Float[Tensor, "h w 3"]
 
 
 @dataclass(frozen=True)
@@ -116,107 +118,77 @@ def finetune(
         options: fields of `FinetuneOptions`.
 
     Raises:
-        AaplugError: an input cannot be read, an option does not fit, there is nothing to resume, no gradient is
-            finite, or an output cannot be written.
+        AaplugError: as `render`; also, there is nothing to resume, or no gradient is finite.
         KeyboardInterrupt: Ctrl-C stopped the run; its checkpoint is written.
     """
     o = FinetuneOptions.of(options)
-    settings, viewer = _settings(o), _viewer(o)
-    cameras, scene = cameras_of(cameras, scene), scene_of(scene)
-    if o.checkpoint_every < 1:
-        raise UsageError("checkpoint_every", f"must be 1 or more, got {o.checkpoint_every}")
-    files = _Files.of(output, scene, o)
-    shown = select_views(cameras, o.views)
-    source, enlarge = _source(o.truth, cameras), _enlarge(o.upsampler)
+    settings, viewer, path = _settings(o), _viewer(o), None if output is None else Path(output)
+    scene, cameras = inputs_of(scene, cameras)
+    _check(path, sources_of(scene), o)
+    shown, source = select_views(cameras, o.views), _source(o.truth, cameras)
+    enlarge = back_projected if o.upsampler is None else upsampled(find_upsampler(o.upsampler))
     with processor(o.threads):
         look = look_of(scene, cameras, settings.steps, o, monitor)
         before = replace(look, recipe=RECIPES[viewer.recipe])
         start = replace(before, scene=fuse_for(scene, look.training, viewer))
         job = TuningJob(start, cameras.train, Truth(look, source, enlarge=enlarge, memory=MEMORY), settings)
-        monitor.say(_described(job))
-        state = tune(job, files and files.checkpoint, o.checkpoint_every, o.resume, monitor)
+        how = f"{settings.name}, {settings.steps} steps, truth: {source}"
+        monitor.say(f"tuning for {start.recipe.name} ({start.recipe.source}): {how}")
+        state = tune(job, path and _beside(path, "pt"), o.checkpoint_every, o.resume, monitor)
         tuned = recorded(state, job, viewer.convention_of(scene), {"for": viewer.name, "method": settings.name})
-        if files is not None:
-            write_scene(files.scene, tuned, overwrite=o.overwrite, spz_axes=spz_axes)
-        candidates = [Candidate("before", before), Candidate("after", _drawn(tuned, start))]
-        if len(start.scene.fused) > len(scene.fused):
-            candidates.insert(1, Candidate("closed form", start))
-        compared = _Comparison(candidates, shown, settings.weights, job.truth)
-        found = Tuned(tuned, compared.report(monitor), settings, state.curve, state.probes)
-        if files is not None:
-            files.write(found, compared, o.overwrite)
+        if path is not None:
+            write_scene(path, tuned, overwrite=o.overwrite, spz_axes=spz_axes)
+        closed = [Candidate("closed form", start)] * (len(start.scene.fused) > len(scene.fused))
+        candidates = [Candidate("before", before), *closed, Candidate("after", _drawn(tuned, start))]
+        scales = sorted({1.0, *settings.weights}, reverse=True)
+        truth = replace(job.truth, source=source_of(shown))
+        with monitor.progress("measuring", "views") as tell:
+            report = compare(candidates, shown, scales, truth, tell)
+        found = Tuned(tuned, report, settings, state.curve, state.probes)
+        if path is not None:
+            _write(path, found, _sheet(candidates, shown[0], scales, truth), o.overwrite)
     return found
 
 
+def _beside(scene: Path, kind: str) -> Path:
+    """A file beside the scene, by its suffix; .pt is the checkpoint."""
+    return scene.with_suffix(f".finetune.{kind}")
+
+
 def _settings(o: FinetuneOptions) -> Settings:
-    """The method's settings with the user's choices."""
     names = ("scale", "steps", "loss", "anchor", "move", "learning_rate", "densify_every", "seed")
     return settings_of(METHODS.find(o.method, "method"), **{name: getattr(o, name) for name in names})
 
 
-@dataclass(frozen=True)
-class _Files:
-    """The files of a run."""
-
-    scene: Path
-
-    @classmethod
-    def of(cls, output: AnyPath | None, scene: Gaussians, o: FinetuneOptions) -> "_Files | None":
-        """The files beside an output, after a check, before any work, that they may be written."""
-        if output is None:
-            if o.resume:
-                raise UsageError("resume", "needs the `output` of the interrupted run")
-            return None
-        files = cls(Path(output))
-        sources = [Path(scene.origin.path)] if scene.origin else []
-        check_scene_output(files.scene, o.overwrite, sources)
-        check_output(files.beside("json"), o.overwrite, sources)
-        check_output(files.beside("png"), o.overwrite, sources)
-        check_output(files.checkpoint, o.resume or o.overwrite, sources)
-        return files
-
-    def beside(self, kind: str) -> Path:
-        """A file beside the scene, by its suffix."""
-        return self.scene.with_suffix(f".finetune.{kind}")
-
-    @property
-    def checkpoint(self) -> Path:
-        """Of the run, until it ends."""
-        return self.beside("pt")
-
-    def write(self, found: Tuned, compared: "_Comparison", overwrite: bool) -> None:
-        """Write the report and the pictures, and remove the checkpoint."""
-        report = json.dumps(found.as_json() | {"curve": list(found.curve)}, indent=1)
-        with replacing(self.beside("json"), overwrite) as stream:
-            stream.write(report.encode())
-        write_png(self.beside("png"), compared.sheet(), overwrite=overwrite)
-        self.checkpoint.unlink(missing_ok=True)
+def _check(path: Path | None, sources: Sequence[Path], o: FinetuneOptions) -> None:
+    """Check, before any work, the checkpoints, and that the scene and the files beside it may be written."""
+    if o.checkpoint_every < 1:
+        raise UsageError("checkpoint_every", f"must be 1 or more, got {o.checkpoint_every}")
+    if path is None:
+        if o.resume:
+            raise UsageError("resume", "needs the `output` of the interrupted run")
+        return
+    check_scene_output(path, o.overwrite, sources)
+    for kind, replaces in (("json", o.overwrite), ("png", o.overwrite), ("pt", o.resume or o.overwrite)):
+        check_output(_beside(path, kind), replaces, sources)
 
 
-class _Comparison:
-    """Candidates beside the truth, at the training size and at the scales of a run."""
+def _sheet(candidates: Sequence[Candidate], view: Camera, scales: Iterable[float], truth: Truth) -> Image:
+    """A view at every scale: the truth, and each candidate."""
+    rows = []
+    for scale in scales:
+        camera = view.scaled(scale)
+        drawn = [candidate.renderer(camera).rgb for candidate in candidates]
+        rows.append((f"{scale_name(scale)}: {camera.width}x{camera.height}", [truth(view, scale), *drawn]))
+    return contact_sheet(("truth", *(c.name for c in candidates)), rows)
 
-    def __init__(
-        self, candidates: Sequence[Candidate], views: Sequence[Camera], scales: Iterable[float], truth: Truth
-    ) -> None:
-        self.candidates, self.views = candidates, views
-        self.scales = sorted({1.0, *scales}, reverse=True)
-        self.truth = replace(truth, source=source_of(views))
 
-    def report(self, monitor: Monitor) -> Report:
-        """Measure all views."""
-        with monitor.progress("measuring", "views") as tell:
-            return compare(self.candidates, self.views, self.scales, self.truth, tell)
-
-    def sheet(self) -> Float[Tensor, "h w 3"]:
-        """The first view at every scale."""
-        view, rows = self.views[0], []
-        for scale in self.scales:
-            camera = view.scaled(scale)
-            drawn = [candidate.renderer(camera).rgb for candidate in self.candidates]
-            label = f"{scale_name(scale)}: {camera.width}x{camera.height}"
-            rows.append((label, [self.truth(view, scale), *drawn]))
-        return contact_sheet(("truth", *(c.name for c in self.candidates)), rows)
+def _write(path: Path, found: Tuned, sheet: Image, overwrite: bool) -> None:
+    """Write the report and the pictures, and remove the checkpoint."""
+    with replacing(_beside(path, "json"), overwrite) as stream:
+        stream.write(json.dumps(found.as_json() | {"curve": list(found.curve)}, indent=1).encode())
+    write_png(_beside(path, "png"), sheet, overwrite=overwrite)
+    _beside(path, "pt").unlink(missing_ok=True)
 
 
 def _viewer(o: FinetuneOptions) -> Viewer:
@@ -231,25 +203,10 @@ def _viewer(o: FinetuneOptions) -> Viewer:
 
 def _source(truth: str, cameras: CameraSet) -> TruthSource:
     """Where the images that renders are compared with come from."""
-    sources: dict[str, TruthSource] = {"self": "self", "photographs": "photographs", "auto": source_of(cameras.train)}
-    if truth not in sources:
-        raise UsageError("truth", f"'{truth}' is not one of {', '.join(sources)}")
     missing = [view.name for view in cameras.train if view.photo is None]
-    if sources[truth] == "photographs" and missing:
+    if truth == "photographs" and missing:
         raise UsageError(missing[0], "has no photograph; `truth` self needs none")
-    return sources[truth]
-
-
-def _enlarge(upsampler: str | None) -> Enlarge:
-    return back_projected if upsampler is None else upsampled(find_upsampler(upsampler))
-
-
-def _described(job: TuningJob) -> str:
-    recipe, settings = job.start.recipe, job.settings
-    return (
-        f"tuning for {recipe.name} ({recipe.source}): {settings.name}, {settings.steps} steps, "
-        f"truth: {job.truth.source}"
-    )
+    return source_of(cameras.train, truth)
 
 
 def _drawn(tuned: Gaussians, start: Renderer) -> Renderer:

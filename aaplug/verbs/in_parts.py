@@ -34,18 +34,11 @@ def convert_parts(
 ) -> Iterator[Gaussians]:
     """Yield the parts of the scene, each converted as `viewers.fuse` would convert the whole.
 
-    Args:
-        opened: the scene.
-        cameras: training cameras; none where the scene stores its 3D filter.
-        form: what to fuse.
-        drop_bad: leave out unusable rows.
-        tell: called with Gaussians done and in all.
-        size: Gaussians per part.
-        threads: parts converted at once.
+    cameras: training cameras; none where the scene stores its 3D filter.
+    tell: called with (Gaussians done, Gaussians in all).
+    size: Gaussians per part.  threads: parts converted at once.
     """
-    coarsest = None
-    if cameras and form.uses_bounds:
-        coarsest = _coarsest(opened, cameras, drop_bad, size)
+    coarsest = _coarsest(opened, cameras, drop_bad, size) if cameras and form.uses_bounds else None
 
     def converted(part: Gaussians) -> Gaussians:
         if not cameras:
@@ -71,9 +64,5 @@ def _bounds(part: Gaussians, cameras: Sequence[Camera], coarsest: float | None) 
 
 
 def _coarsest(opened: SceneFile, cameras: Sequence[Camera], drop_bad: bool, size: int) -> float:
-    coarsest = math.inf
-    for part in opened.parts(drop_bad, size):
-        bounds = sampling_bounds(part.means, cameras)
-        if bounds.seen.any():
-            coarsest = min(coarsest, bounds.highest[bounds.seen].min().item())
-    return coarsest
+    found = (sampling_bounds(part.means, cameras) for part in opened.parts(drop_bad, size))
+    return min((part.highest[part.seen].min().item() for part in found if part.seen.any()), default=math.inf)

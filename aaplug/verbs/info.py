@@ -2,19 +2,16 @@
 
 import math
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 from aaplug.core.cameras import CameraSet
 from aaplug.core.monitor import SILENT, Monitor
 from aaplug.inspection.coverage import aliasing_begins
 from aaplug.inspection.survey import Survey, check_frame_of, survey
-from aaplug.io.cameras import read_cameras
-from aaplug.io.scenes import find_scene, open_scene
 from aaplug.io.scenes.ply import Document
 from aaplug.io.scenes.scene_file import SceneFile
 from aaplug.methods.viewers import describe
-from aaplug.verbs.inputs import AnyPath, CamerasLike
+from aaplug.verbs.inputs import AnyPath, CamerasLike, cameras_of, opened_of
 from aaplug.verbs.options import FrameOptions
 
 EXPONENTIATED = 20.0  # larger log-scales are taken for scales
@@ -33,28 +30,23 @@ def info(
     Args:
         scene: a scene's file, opened or not, or a model folder.
         cameras: training cameras, their file or folder, to tell also how finely they sample the scene.
-        monitor: receives progress.
         options: fields of `FrameOptions`.
 
     Returns:
         JSON-ready facts by name; "problems" lists what is odd, each with what to do.
 
     Raises:
-        FormatError: a file cannot be read.
-        FrameError: the cameras see little of the scene.
+        AaplugError: a file cannot be read, or the cameras see little of the scene.
     """
     o = FrameOptions.of(options)
-    opened = scene if isinstance(scene, SceneFile) else open_scene(find_scene(Path(scene)))
-    if cameras is not None and not isinstance(cameras, CameraSet):
-        cameras = read_cameras(Path(cameras))
+    opened = opened_of(scene)
     if cameras is not None:
+        cameras = cameras_of(cameras, opened.path)
         check_frame_of(opened, cameras.train, o.min_seen)
     with monitor.progress("reading", "Gaussians") as tell:
         found = survey(opened, () if cameras is None else cameras.train, tell)
-    facts = _scene_facts(opened, found)
-    if cameras is not None:
-        facts |= _sampling_facts(found, cameras, opened.convention.kernel)
-    return facts | {"problems": list(_problems(opened, found))}
+    sampling = {} if cameras is None else _sampling_facts(found, cameras, opened.convention.kernel)
+    return _scene_facts(opened, found) | sampling | {"problems": list(_problems(opened, found))}
 
 
 def _scene_facts(opened: SceneFile, found: Survey) -> dict[str, Any]:
@@ -84,19 +76,17 @@ def _scene_facts(opened: SceneFile, found: Survey) -> dict[str, Any]:
 
 
 def _comments(opened: SceneFile) -> list[str]:
-    document = opened.document
-    return document.header.comments if isinstance(document, Document) else []
+    return opened.document.header.comments if isinstance(opened.document, Document) else []
 
 
 def _sampling_facts(found: Survey, cameras: CameraSet, kernel: float) -> dict[str, Any]:
     rate, multiple = found.rates.quantile(0.5), found.multiples.quantile(0.5)
-    begins = None if multiple is None else aliasing_begins(math.exp(multiple), kernel)
     return {
         "training_cameras": len(cameras.train),
         "seen_share": found.seen / max(1, found.count),
         "median_rate_px_per_unit": None if rate is None else math.exp(rate),
         "under_sampling_bound_share": found.under / max(1, found.seen),
-        "aliasing_begins_at_scale": begins,
+        "aliasing_begins_at_scale": None if multiple is None else aliasing_begins(math.exp(multiple), kernel),
         "cameras": list(cameras.notes),
     }
 

@@ -11,15 +11,16 @@ from aaplug.core.cameras import BLACK, WHITE, CameraSet
 from aaplug.core.errors import UsageError
 from aaplug.core.executors import torch_threads
 from aaplug.core.gaussians import Gaussians
-from aaplug.core.interfaces import Colour, MatchesRates, Rasterizer, TakesMemory
-from aaplug.core.monitor import SILENT, Monitor
+from aaplug.core.interfaces import MatchesRates, TakesMemory
+from aaplug.core.monitor import Monitor
 from aaplug.core.training import TrainingViews
 from aaplug.io.cameras import read_cameras
-from aaplug.io.scenes import find_scene, read_scene
+from aaplug.io.scenes import find_scene, open_scene, read_scene
+from aaplug.io.scenes.scene_file import SceneFile
 from aaplug.methods.recipe import Recipe
 from aaplug.methods.recipes import RECIPES, find_recipe
 from aaplug.rasterizers import find_rasterizer
-from aaplug.rendering.renderer import Background, Renderer, background_colour
+from aaplug.rendering.renderer import Renderer, background_colour
 from aaplug.verbs.options import RecipeOptions, ViewOptions
 
 AnyPath = str | PathLike[str]
@@ -31,6 +32,18 @@ MODEL_SCENE = "point_cloud/iteration_*/point_cloud.ply"  # in an INRIA model fol
 def scene_of(scene: SceneLike) -> Gaussians:
     """The scene itself, or the one in a file or model folder."""
     return scene if isinstance(scene, Gaussians) else read_scene(find_scene(Path(scene)))
+
+
+def opened_of(scene: SceneFile | AnyPath) -> SceneFile:
+    """The scene's file, opened or in a model folder."""
+    return scene if isinstance(scene, SceneFile) else open_scene(find_scene(Path(scene)))
+
+
+def sources_of(scene: Gaussians | SceneFile) -> list[Path]:
+    """Files that outputs must not replace."""
+    if isinstance(scene, SceneFile):
+        return [scene.path]
+    return [Path(scene.origin.path)] if scene.origin else []
 
 
 def cameras_of(cameras: CamerasLike, scene: SceneLike) -> CameraSet:
@@ -47,30 +60,10 @@ def cameras_of(cameras: CamerasLike, scene: SceneLike) -> CameraSet:
     return read_cameras(path)
 
 
-def background_of(background: Background, cameras: CameraSet, monitor: Monitor = SILENT) -> Colour:
-    """The colour behind the scene; "auto" is reported, with its source."""
-    colour = background_colour(background, cameras)
-    if background == "auto":
-        name = {WHITE: "white", BLACK: "black"}.get(colour, str(colour))
-        known = "from the camera files" if cameras.background else "the camera files do not say"
-        monitor.say(f"background: {name} ({known})")
-    return colour
-
-
-def rasterizer_of(
-    rasterizer: str | Rasterizer, frames: int, memory: float | None, monitor: Monitor = SILENT
-) -> Rasterizer:
-    """A rasterizer, or the one of that name for so many frames, within a memory budget.
-
-    memory: GB that a frame may take beside the scene and the image; None for the rasterizer's default.
-    """
-    if memory is not None and not memory > 0:
-        raise UsageError("memory", f"must be above 0, got {memory:g}")
-    if isinstance(rasterizer, str):
-        rasterizer = find_rasterizer(rasterizer, frames, monitor.say)
-    if memory is not None and isinstance(rasterizer, TakesMemory):
-        return rasterizer.within(memory * 1e9)
-    return rasterizer
+def inputs_of(scene: SceneLike, cameras: CamerasLike) -> tuple[Gaussians, CameraSet]:
+    """The scene and its cameras; the cameras are read first, as they are small."""
+    known = cameras_of(cameras, scene)
+    return scene_of(scene), known
 
 
 def recipe_of(recipe: str | Recipe, o: RecipeOptions) -> Recipe:
@@ -89,8 +82,18 @@ def look_of(scene: Gaussians, cameras: CameraSet, frames: int, o: ViewOptions, m
     # its packages take a third of a second to import, which `--help` need not wait for
     from aaplug.evaluation.truth import own_look
 
-    colour = background_of(o.background, cameras, monitor)
-    drawing = rasterizer_of(o.rasterizer, frames, o.memory, monitor)
+    colour = background_colour(o.background, cameras)
+    if o.background == "auto":
+        name = {WHITE: "white", BLACK: "black"}.get(colour, str(colour))
+        source = "from the camera files" if cameras.background else "the camera files do not say"
+        monitor.say(f"background: {name} ({source})")
+    if o.memory is not None and not o.memory > 0:
+        raise UsageError("memory", f"must be above 0, got {o.memory:g}")
+    drawing = o.rasterizer
+    if isinstance(drawing, str):
+        drawing = find_rasterizer(drawing, frames, monitor.say)
+    if o.memory is not None and isinstance(drawing, TakesMemory):
+        drawing = drawing.within(o.memory * 1e9)
     return own_look(scene, TrainingViews.of(scene, cameras, o.cull_margin, o.min_seen), drawing, colour)
 
 

@@ -31,14 +31,14 @@ def flag(metavar: str, *aliases: str, kind: Any = None) -> Any:
 def choice(names: Iterable[str]) -> Any:
     """An option that takes one of these names, or in Python an object; the library refuses other names."""
     return tyro.constructors.PrimitiveConstructorSpec(
-        1, "|".join(names), lambda words: words[0], lambda value: True, lambda value: [str(value)]
+        1, "|".join(names), "".join, lambda _: True, lambda one: [str(one)]
     )
 
 
 def choices(names: Iterable[str]) -> Any:
     """An option that takes some of these names, or in Python objects."""
     return tyro.constructors.PrimitiveConstructorSpec(
-        "*", "|".join(names), tuple, lambda value: True, lambda values: [str(value) for value in values]
+        "*", "|".join(names), tuple, lambda _: True, lambda some: [*map(str, some)]
     )
 
 
@@ -52,11 +52,7 @@ class Options:
 
     @classmethod
     def of(cls: type[Chosen], given: Mapping[str, Any]) -> Chosen:
-        """The options that a caller gave, and the defaults.
-
-        Raises:
-            UsageError: there is no such option.
-        """
+        """The options that a caller gave, checked by name, and the defaults."""
         known = [field.name for field in fields(cls)]
         for name in given.keys() - known:
             raise UsageError(name, f"is no option here{did_you_mean(name, known)}")
@@ -67,9 +63,8 @@ class Options:
         """Decorate a verb: its signature shows these options instead of `**options`."""
         signature = inspect.signature(verb)
         own = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
-        keyword = inspect.Parameter.KEYWORD_ONLY
-        options = [inspect.Parameter(f.name, keyword, default=f.default, annotation=f.type) for f in fields(cls)]
-        vars(verb)["__signature__"] = signature.replace(parameters=own + options)
+        options = inspect.signature(cls).parameters.values()
+        vars(verb)["__signature__"] = signature.replace(parameters=[*own, *options])
         return verb
 
 

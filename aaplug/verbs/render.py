@@ -13,7 +13,7 @@ from aaplug.io.cameras import select_views
 from aaplug.methods.recipes import find_recipe
 from aaplug.rendering.frames import write_frames
 from aaplug.rendering.renderer import Renderer
-from aaplug.verbs.inputs import AnyPath, CamerasLike, SceneLike, cameras_of, drawn_by, look_of, processor, scene_of
+from aaplug.verbs.inputs import AnyPath, CamerasLike, SceneLike, drawn_by, inputs_of, look_of, processor
 from aaplug.verbs.options import ImageOptions, RecipeOptions
 from aaplug.verbs.views import image_paths, resized
 
@@ -58,7 +58,7 @@ def render(
     recipe = o.recipe
     if isinstance(recipe, str):
         recipe = find_recipe(recipe, quality=o.quality, rate_reference=o.rate_reference)
-    cameras, scene = cameras_of(cameras, scene), scene_of(scene)
+    scene, cameras = inputs_of(scene, cameras)
     shown = resized(select_views(cameras, o.views), o.scale, o.resolution)
     folder, paths = Path(output), image_paths(Path(output), shown, o.overwrite)
     with processor(o.threads) as workers:
@@ -66,9 +66,9 @@ def render(
         monitor.say(described(renderer, shown))
         if not folder.suffix:
             make_folder(folder)
+        how = {"threads": workers, "bit_depth": o.bit_depth, "overwrite": o.overwrite}
         with monitor.progress("rendering", "views") as tell:
-            how = {"bit_depth": o.bit_depth, "overwrite": o.overwrite, "tell": tell}
-            write_frames(renderer, shown, paths, threads=workers, **how)
+            write_frames(renderer, shown, paths, **how, tell=tell)
     return [Written(*pair) for pair in zip(shown, paths, strict=True)]
 
 
@@ -79,9 +79,7 @@ def described(renderer: Renderer, views: Sequence[Camera]) -> str:
     grid = " or ".join(f"{n}×{n}" for n in samples)
     sizes = listing(sorted({f"{view.width}x{view.height}" for view in views}), most=3)
     span = " to ".join(dict.fromkeys(f"{rate:.3g}" for rate in (min(rates), max(rates))))
-    kind = f"{renderer.training.convention.name} scene"
-    if renderer.scene.flat:
-        kind += " of 2D Gaussians"
+    kind = f"{renderer.training.convention.name} scene{' of 2D Gaussians' * renderer.scene.flat}"
     return (
         f"recipe: {renderer.recipe.name} for a {kind}, {len(views)} view{'s' * (len(views) != 1)} at {sizes}, "
         f"{span} × the training rate: {grid} sample{'s' * (samples != [1])} per pixel"

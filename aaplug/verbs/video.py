@@ -21,17 +21,7 @@ from aaplug.io.cameras import select_views
 from aaplug.io.cameras.camera_path import read_camera_path
 from aaplug.io.video import check_video
 from aaplug.rendering.videos import make_video
-from aaplug.verbs.inputs import (
-    AnyPath,
-    CamerasLike,
-    SceneLike,
-    cameras_of,
-    drawn_by,
-    look_of,
-    processor,
-    recipe_of,
-    scene_of,
-)
+from aaplug.verbs.inputs import AnyPath, CamerasLike, SceneLike, drawn_by, inputs_of, look_of, processor, recipe_of
 from aaplug.verbs.options import RECIPE_NAMES, ImageOptions, RecipeOptions, choice, flag
 from aaplug.verbs.views import resized
 
@@ -78,30 +68,28 @@ def video(
     """Render a camera path to a video.
 
     Args:
-        scene, cameras, monitor: see `render`.
+        scene, cameras, monitor, and errors: see `render`.
         output: a .webm file (VP9), or .mp4 (H.264) with the extra `mp4`.
         options: fields of `VideoOptions`; `beside` may be None.
-
-    Raises:
-        AaplugError: an input cannot be read, an option does not fit, or the video cannot be written.
     """
     o = VideoOptions.of(options)
-    chosen = [recipe for recipe in (o.beside, o.recipe) if recipe not in (None, "none")]
-    recipes = [recipe_of(recipe, o) for recipe in chosen if recipe is not None]
+    left = "none" if o.beside is None else o.beside
+    recipes = [recipe_of(recipe, o) for recipe in (left, o.recipe) if recipe != "none"]
     free = None if str(o.path) in MOVES else read_camera_path(Path(o.path))
     fps = o.fps or (FPS if free is None else free.fps)
     check_video(Path(output), fps, o.overwrite)
-    cameras, scene = cameras_of(cameras, scene), scene_of(scene)
+    scene, cameras = inputs_of(scene, cameras)
     shown = resized(free.cameras if free else _along(scene, cameras, o, fps, monitor), o.scale, o.resolution)
-    compose = partial(side_by_side, labels=[_label(recipe.name) for recipe in recipes])
+    compose = partial(
+        side_by_side, labels=[{"auto": "aaplug auto"}.get(recipe.name, recipe.name) for recipe in recipes]
+    )
     with processor(o.threads) as workers:
         look = look_of(scene, cameras, len(shown) * len(recipes), o, monitor)
         renderers = [drawn_by(recipe, scene, look) for recipe in recipes]
         size = f"{shown[0].width}x{shown[0].height}"
         monitor.say(f"{len(shown)} frames of {size} px per pane, {fps:g} per second")
         with monitor.progress("rendering", "images") as tell:
-            how = {"threads": workers, "overwrite": o.overwrite, "tell": tell}
-            make_video(output, renderers, shown, fps, compose, **how)
+            make_video(output, renderers, shown, fps, compose, threads=workers, overwrite=o.overwrite, tell=tell)
     return Clip(Path(output), len(shown), fps)
 
 
@@ -112,10 +100,6 @@ def side_by_side(images: Sequence[Float[Tensor, "h _ 3"]], labels: Sequence[str]
     shown = [labelled(image, label) for image, label in zip(images, labels, strict=True)]
     gap = torch.zeros(shown[0].shape[0], GAP, 3)
     return torch.cat([part for image in shown for part in (gap, image)][1:], dim=1)
-
-
-def _label(recipe: str) -> str:
-    return f"aaplug {recipe}" if recipe == "auto" else recipe
 
 
 def _along(scene: Gaussians, cameras: CameraSet, o: VideoOptions, fps: float, monitor: Monitor) -> list[Camera]:
@@ -132,20 +116,12 @@ def _along(scene: Gaussians, cameras: CameraSet, o: VideoOptions, fps: float, mo
 
 
 Along = Callable[[float], Camera]  # of t in [0, 1)
-
-
-def _zoom(scene: Gaussians, cameras: CameraSet, view: Camera, o: VideoOptions) -> Along:
-    return lambda t: camera_paths.zoom(view, t, o.start, o.end)
-
-
-def _dolly(scene: Gaussians, cameras: CameraSet, view: Camera, o: VideoOptions) -> Along:
-    depth = median_depth(scene.means, view)
-    return lambda t: camera_paths.dolly(view, t, o.start, o.end, depth)
-
-
-def _orbit(scene: Gaussians, cameras: CameraSet, view: Camera, o: VideoOptions) -> Along:
-    depth, up = median_depth(scene.means, view), camera_paths.up_of(cameras)
-    return lambda t: camera_paths.orbit(view, t, depth, up)
-
-
-MOVES = {"zoom": _zoom, "dolly": _dolly, "orbit": _orbit}
+MOVES: dict[str, Callable[[Gaussians, CameraSet, Camera, VideoOptions], Along]] = {
+    "zoom": lambda scene, cameras, view, o: partial(camera_paths.zoom, view, start=o.start, end=o.end),
+    "dolly": lambda scene, cameras, view, o: partial(
+        camera_paths.dolly, view, start=o.start, end=o.end, depth=median_depth(scene.means, view)
+    ),
+    "orbit": lambda scene, cameras, view, o: partial(
+        camera_paths.orbit, view, depth=median_depth(scene.means, view), up=camera_paths.up_of(cameras)
+    ),
+}

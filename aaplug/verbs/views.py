@@ -12,10 +12,7 @@ MAX_SIDE = 16384  # px
 
 
 def resized(views: Sequence[Camera], scale: float | None = None, resolution: str | None = None) -> list[Camera]:
-    """The views at another size.
-
-    scale: relative to the training size; 1 where neither is given.
-    resolution: "WIDTHxHEIGHT" in px; -1 on one side keeps the aspect.
+    """The views at the size that `ImageOptions` describes.
 
     Raises:
         UsageError: both are given, one is not a size, or an image would be larger than `MAX_SIDE`.
@@ -30,8 +27,7 @@ def resized(views: Sequence[Camera], scale: float | None = None, resolution: str
         sized = [view.scaled(1.0 if scale is None else scale) for view in views]
     for view in sized:
         if max(view.hw) > MAX_SIDE:
-            size = f"{view.width}x{view.height}"
-            raise UsageError(view.name, f"would be {size} px; the limit is {MAX_SIDE} a side")
+            raise UsageError(view.name, f"would be {view.width}x{view.height} px; the limit is {MAX_SIDE} a side")
     return sized
 
 
@@ -43,26 +39,27 @@ def image_paths(output: Path, views: Sequence[Camera], overwrite: bool) -> list[
     """
     if output.suffix:
         if output.suffix.lower() != ".png" or len(views) != 1:
-            count = f"{len(views)} views asked for"
-            raise OutputError(output, f"name a folder, or one .png for one view ({count})")
+            raise OutputError(output, f"name a folder, or one .png for one view ({len(views)} views asked for)")
         check_output(output, overwrite)
         return [output]
-    names = [re.sub(r"[^\w.\-]+", "_", view.name).lstrip(".") or "view" for view in views]
-    if len({name.casefold() for name in names}) < len(names):
-        names = [f"{index:05d}_{name}" for index, name in enumerate(names)]
-    paths = [output / f"{name}.png" for name in names]
+    paths = [output / f"{name}.png" for name in file_names([view.name for view in views], "view", 5)]
     refuse_existing(paths, overwrite)
     return paths
+
+
+def file_names(names: Sequence[str], nameless: str, digits: int) -> list[str]:
+    """Names fit for files; all are numbered where two would be the same."""
+    slugs = [re.sub(r"[^\w.\-]+", "_", name).lstrip(".") or nameless for name in names]
+    if len({slug.casefold() for slug in slugs}) < len(slugs):
+        return [f"{index:0{digits}d}_{slug}" for index, slug in enumerate(slugs)]
+    return slugs
 
 
 def _size(text: str, view: Camera) -> tuple[int, int]:
     match = re.fullmatch(r"(-?\d+)x(-?\d+)", text)
     width, height = (int(match[1]), int(match[2])) if match else (0, 0)
     if max(width, height) < 1 or min(width, height) == 0:
-        expected = "expected WIDTHxHEIGHT such as 400x400 or -1x720"
-        raise UsageError("resolution", f"{expected}, got '{text}'")
+        raise UsageError("resolution", f"expected WIDTHxHEIGHT such as 400x400 or -1x720, got '{text}'")
     if width < 0:
-        width = max(1, round(view.width * height / view.height))
-    if height < 0:
-        height = max(1, round(view.height * width / view.width))
-    return width, height
+        return max(1, round(view.width * height / view.height)), height
+    return width, max(1, round(view.height * width / view.width)) if height < 0 else height
