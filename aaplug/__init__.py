@@ -1,10 +1,5 @@
 """Test-time anti-aliasing for pretrained 3D Gaussian Splatting scenes.
 
-    import aaplug
-
-    scene, cameras = aaplug.read_scene("scene.ply"), aaplug.read_cameras("path/to/colmap")
-    image = aaplug.Renderer.of(scene, cameras)(cameras.test[0].scaled(1 / 4)).rgb
-
 `__init__.pyi` beside this file lists everything that is public.  Names are imported when they are first used.
 """
 

@@ -2,19 +2,13 @@
 
 # read and write
 from .io.cameras import read_cameras as read_cameras
-from .io.images import read_image as read_image
-from .io.images import write_png as write_png
-from .io.scenes import open_scene as open_scene
-from .io.scenes import read_scene as read_scene
-from .io.scenes import write_scene as write_scene
+from .io.images import read_image as read_image, write_png as write_png
+from .io.scenes import open_scene as open_scene, read_scene as read_scene, write_scene as write_scene
 
 # nouns
-from .core.cameras import Camera as Camera
-from .core.cameras import CameraSet as CameraSet
-from .core.cameras import look_at as look_at
+from .core.cameras import Camera as Camera, CameraSet as CameraSet, look_at as look_at
 from .core.errors import AaplugError as AaplugError
-from .core.gaussians import Convention as Convention
-from .core.gaussians import Gaussians as Gaussians
+from .core.gaussians import Convention as Convention, Gaussians as Gaussians
 from .core.monitor import Monitor as Monitor
 from .core.splats import Render as Render
 from .core.training import TrainingViews as TrainingViews
@@ -40,8 +34,7 @@ from .verbs.warmup import warmup as warmup
 # what can be chosen by name
 from .evaluation.metrics import METRICS as METRICS
 from .evaluation.protocols import PROTOCOLS as PROTOCOLS
-from .methods.filters import SCREEN_FILTERS as SCREEN_FILTERS
-from .methods.filters import WORLD_FILTERS as WORLD_FILTERS
+from .methods.filters import SCREEN_FILTERS as SCREEN_FILTERS, WORLD_FILTERS as WORLD_FILTERS
 from .methods.pixel_kernels import PIXEL_KERNELS as PIXEL_KERNELS
 from .methods.recipes import RECIPES as RECIPES
 from .methods.viewers import VIEWERS as VIEWERS
