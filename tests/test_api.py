@@ -3,6 +3,7 @@
 import inspect
 import re
 import runpy
+import tomllib
 from importlib import import_module
 from pathlib import Path
 
@@ -92,3 +93,10 @@ def test_verbs_have_the_options_of_the_command_line(verb):
     for name, parameter in parameters.items():
         keyword = parameter.kind is inspect.Parameter.KEYWORD_ONLY
         assert not keyword or parameter.default is not inspect.Parameter.empty, name
+
+
+def test_every_folder_of_the_library_is_packaged():
+    root = Path(__file__).resolve().parents[1]
+    listed = tomllib.loads((root / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]
+    folders = {".".join(file.parent.relative_to(root).parts) for file in root.glob("aaplug/**/__init__.py")}
+    assert set(listed) == folders | {"aaplug_cli"}
