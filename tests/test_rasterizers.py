@@ -353,14 +353,15 @@ def test_a_smaller_memory_budget_changes_nothing():
         torch.testing.assert_close(parts[2], whole[2], rtol=1e-5, atol=1e-5)
 
 
-FRAME_MEMORY = 42e6  # bytes; measured: 27e6, of which the image is 17e6; in one band 64e6
+FRAME_MEMORY = 110e6  # bytes; measured: 94e6, of which the image is 67e6; in one band 175e6
 
 
 @needs_peak_memory
 def test_a_frame_of_several_bands_needs_little_memory_beside_its_image():
-    splats, draw = make_splats(3000, (1024, 1024), 7, (0.0, 5.0)), Tiled(memory=1e6)
+    side = 2048
+    splats, draw = make_splats(3000, (side, side), 7, (0.0, 5.0)), Tiled(memory=1e6)
     draw(splats, (64, 64), BLACK)
-    assert memory_taken(lambda: draw(splats, (1024, 1024), BLACK)) < FRAME_MEMORY
+    assert memory_taken(lambda: draw(splats, (side, side), BLACK)) < FRAME_MEMORY
 
 
 def test_splats_are_paired_with_exactly_the_tiles_that_their_ellipses_reach():
