@@ -1,10 +1,13 @@
 """Frames and steps for pytest-benchmark: `pytest tests/bench/rasterizer.py -n0`."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 import torch
 
+from aaplug.core.gaussians import Gaussians
+from aaplug.core.interfaces import Rasterizer
 from aaplug.core.training import TrainingViews
 from aaplug.methods.recipes import find_recipe
 from aaplug.rendering.benchmark import gradient_step, synthetic_camera, synthetic_scene
@@ -37,14 +40,14 @@ def scene(request: pytest.FixtureRequest):
     return synthetic_scene(request.param)
 
 
-def test_forward(benchmark, scene, rasterizer):
+def test_forward(benchmark: Any, scene: Gaussians, rasterizer: Rasterizer):
     renderer = Renderer(scene, TrainingViews.of(scene, [CAMERA]), RECIPE, rasterizer)
     with torch.no_grad():
         image = benchmark.pedantic(renderer, (CAMERA,), **ROUNDS)
     assert image.alpha.mean() > 0.5
 
 
-def test_forward_and_backward(benchmark, scene, rasterizer):
+def test_forward_and_backward(benchmark: Any, scene: Gaussians, rasterizer: Rasterizer):
     renderer = Renderer(scene, TrainingViews.of(scene, [CAMERA]), RECIPE, rasterizer)
     grads = benchmark.pedantic(gradient_step, (renderer, CAMERA), **ROUNDS)
     assert all(grad.abs().sum() > 0 for grad in grads.values())

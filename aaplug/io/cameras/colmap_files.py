@@ -11,7 +11,7 @@ import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, TypeVar
+from typing import Any, BinaryIO, TypeVar
 
 from aaplug.core.errors import FormatError, reason
 from aaplug.io.limits import whole_limit
@@ -123,7 +123,7 @@ class _Reader:
         """Bytes that were not read yet."""
         return self.size - self.file.tell()
 
-    def unpack(self, record: struct.Struct, what: str) -> tuple:
+    def unpack(self, record: struct.Struct, what: str) -> tuple[Any, ...]:
         """One record of fixed size."""
         size = record.size
         if size > self.left:
