@@ -126,9 +126,9 @@ def rows(report: Report, metric: Metric) -> list[list[tuple[str, bool]]]:
 
 def work(report: Report) -> list[tuple[str, list[list[str]]]]:
     """Tables of a view's cost, recipes down and scales across, as (title, lines)."""
-    columns = [("seconds a view", seconds, 3)]
+    columns = [("seconds per view", seconds, 3)]
     if any(m.evaluations is not None for m in report.measurements):
-        columns.append(("million evaluations a view", million_evaluations, 2))
+        columns.append(("million evaluations per view", million_evaluations, 2))
     return [
         (title, [[number(column(report, r, s), digits) for s in report.scales] for r in report.recipes])
         for title, column, digits in columns

@@ -78,8 +78,8 @@ class Plot:
 def plots(report: Report, found: Coverage) -> list[Plot]:
     """Everything that a report draws: metrics against the truth, time and work over scale, and the sampling bounds."""
     curves = [_metric_curves(metric, report) for metric in report.compared]
-    curves.append(_curves("seconds", "seconds a view", seconds, report, from_zero=True))
-    title = "million splat-pixel evaluations a view"
+    curves.append(_curves("seconds", "seconds per view", seconds, report, from_zero=True))
+    title = "million splat-pixel evaluations per view"
     curves.append(_curves("evaluations", title, million_evaluations, report, from_zero=True))
     drawn = [plot for plot in curves if plot is not None]
     share = "" if found.under is None else f": {found.under:.0%} are under it"
