@@ -3,10 +3,10 @@
 `shared_data` is a folder of real scenes that may lie beside the repository; tests that use it skip where it is absent.
 """
 
-import ctypes
 import logging
 import math
-from collections.abc import Callable
+import subprocess
+import sys
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
@@ -71,18 +71,26 @@ def sample_training(sample_scene: Gaussians, sample_cameras: CameraSet) -> Train
     return TrainingViews.of(sample_scene, sample_cameras)
 
 
-def memory_taken(work: Callable[[], object]) -> int:
-    """Bytes by which a call raises this process's peak above what was resident before it."""
+MEASURE = """
+import torch
+torch.set_num_threads(1)
+{prepare}
+def peak():
+    words = open("/proc/self/status").read().split()
+    return int(words[words.index("VmHWM:") + 1]) * 1024
+open("/proc/self/clear_refs", "w").write("5")  # resets the peak, which imports raised
+before = peak()
+{work}
+print(peak() - before)
+"""
 
-    def peak() -> int:
-        words = Path("/proc/self/status").read_text().split()
-        return int(words[words.index("VmHWM:") + 1]) * 1024
 
-    ctypes.CDLL(None).malloc_trim(0)  # free memory goes back to the system, so that taking it again shows
-    CLEAR_REFS.write_text("5")  # resets the peak
-    before = peak()
-    work()
-    return peak() - before
+def memory_taken(prepare: str, work: str) -> int:
+    """Bytes by which statements raise the peak of a fresh process; one that ran other tests has memory to reuse."""
+    command = [sys.executable, "-c", MEASURE.format(prepare=prepare, work=work)]
+    root = Path(__file__).resolve().parents[1]
+    run = subprocess.run(command, cwd=root, capture_output=True, text=True, check=True, timeout=120)
+    return int(run.stdout)
 
 
 def make_camera(
