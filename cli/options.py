@@ -15,7 +15,7 @@ from aaplug.core.cameras import CameraSet
 from aaplug.core.errors import UsageError, listing
 from aaplug.core.gaussians import CONVENTIONS, Gaussians
 from aaplug.io.cameras import read_cameras
-from aaplug.io.scenes import SpzAxes, find_scene, open_scene
+from aaplug.io.scenes import SpzAxes, open_scene
 from aaplug.io.scenes.scene_file import SceneFile
 from aaplug.methods.viewers import describe
 from aaplug.verbs.options import flag
@@ -71,7 +71,8 @@ class SceneOptions:
         if self.convention is not None and self.convention not in CONVENTIONS:
             raise UsageError("convention", f"'{self.convention}' is not one of {listing(list(CONVENTIONS))}")
         opened = open_scene(
-            find_scene(self.path, self.iteration),
+            self.path,
+            iteration=self.iteration,
             convention=None if self.convention is None else CONVENTIONS[self.convention],
             allow_checkpoint=self.allow_checkpoint,
             spz_axes=self.spz_axes,

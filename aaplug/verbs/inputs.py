@@ -15,7 +15,7 @@ from aaplug.core.interfaces import MatchesRates, TakesMemory
 from aaplug.core.monitor import Monitor
 from aaplug.core.training import TrainingViews
 from aaplug.io.cameras import read_cameras
-from aaplug.io.scenes import find_scene, open_scene, read_scene
+from aaplug.io.scenes import MODEL_SCENE, open_scene, read_scene
 from aaplug.io.scenes.scene_file import SceneFile
 from aaplug.methods.recipe import Recipe
 from aaplug.methods.recipes import RECIPES, find_recipe
@@ -26,17 +26,16 @@ from aaplug.verbs.options import RecipeOptions, ViewOptions
 AnyPath = str | PathLike[str]
 SceneLike = Gaussians | AnyPath
 CamerasLike = CameraSet | AnyPath | None
-MODEL_SCENE = "point_cloud/iteration_*/point_cloud.ply"  # in an INRIA model folder
 
 
 def scene_of(scene: SceneLike) -> Gaussians:
     """The scene itself, or the one in a file or model folder."""
-    return scene if isinstance(scene, Gaussians) else read_scene(find_scene(Path(scene)))
+    return scene if isinstance(scene, Gaussians) else read_scene(scene)
 
 
 def opened_of(scene: SceneFile | AnyPath) -> SceneFile:
     """The scene's file, opened or in a model folder."""
-    return scene if isinstance(scene, SceneFile) else open_scene(find_scene(Path(scene)))
+    return scene if isinstance(scene, SceneFile) else open_scene(scene)
 
 
 def sources_of(scene: Gaussians | SceneFile) -> list[Path]:
@@ -51,7 +50,7 @@ def cameras_of(cameras: CamerasLike, scene: SceneLike) -> CameraSet:
     if isinstance(cameras, CameraSet):
         return cameras
     if cameras is not None:
-        return read_cameras(Path(cameras))
+        return read_cameras(cameras)
     path = Path(scene.name if isinstance(scene, Gaussians) else scene)
     if path.match(MODEL_SCENE):
         path = path.parents[2]

@@ -24,6 +24,7 @@ from aaplug.io.scenes.scene_file import SceneFile
 from aaplug.io.values import read_start
 
 HEAD_BYTES = 64  # of a file, passed to each format's `sniff`
+MODEL_SCENE = "point_cloud/iteration_*/point_cloud.ply"  # in an INRIA model folder
 SOG_FOLDER = "meta.json"  # marks a folder of SOG images
 
 
@@ -183,7 +184,7 @@ def find_scene(path: str | PathLike[str], iteration: int | None = None) -> Path:
     path = Path(path)
     if not path.is_dir():
         return path
-    pattern, files = re.compile(r"iteration_(\d+)", re.ASCII), path.glob("point_cloud/iteration_*/point_cloud.ply")
+    pattern, files = re.compile(r"iteration_(\d+)", re.ASCII), path.glob(MODEL_SCENE)
     scenes = {int(match[1]): file for file in files if (match := pattern.fullmatch(file.parent.name))}
     if not scenes and (path / SOG_FOLDER).is_file():
         return path / SOG_FOLDER
