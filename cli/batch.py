@@ -9,9 +9,8 @@ from typing import Any, TypeVar
 
 import tyro
 
-from aaplug.core.errors import FormatError
+from aaplug.core.errors import FormatError, did_you_mean
 from aaplug.io.batch_file import read_batch
-from aaplug.verbs.options import did_you_mean
 
 from .options import CONFIG, option_types
 

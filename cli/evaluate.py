@@ -14,9 +14,8 @@ from aaplug.verbs.evaluate import evaluate as measure
 
 from .batch import scenes_of
 from .console import TERMINAL, out, print_json
+from .main import FAILED
 from .options import CameraOptions, Flat, SceneOptions, flag
-
-FAILED = 1  # exit code
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from typing import Annotated, Any, cast, get_type_hints
 import tyro
 
 from aaplug.core.cameras import CameraSet
-from aaplug.core.errors import UsageError, listing
+from aaplug.core.errors import UsageError, not_one_of
 from aaplug.core.gaussians import CONVENTIONS, Gaussians
 from aaplug.io.cameras import read_cameras
 from aaplug.io.scenes import SpzAxes, open_scene
@@ -69,7 +69,7 @@ class SceneOptions:
     def open(self) -> SceneFile:
         """Open the scene's file and say what it is."""
         if self.convention is not None and self.convention not in CONVENTIONS:
-            raise UsageError("convention", f"'{self.convention}' is not one of {listing(list(CONVENTIONS))}")
+            raise UsageError("convention", not_one_of(self.convention, CONVENTIONS))
         opened = open_scene(
             self.path,
             iteration=self.iteration,

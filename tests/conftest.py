@@ -7,9 +7,11 @@ import logging
 import math
 import subprocess
 import sys
+from collections.abc import Mapping
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -42,6 +44,11 @@ def own_log(monkeypatch: pytest.MonkeyPatch) -> None:
     logger = logging.getLogger("aaplug")
     monkeypatch.setattr(logger, "handlers", list(logger.handlers))
     monkeypatch.setattr(logger, "propagate", True)
+
+
+def each(entries: Mapping[str, Any]) -> Any:
+    """A fixture that is each of these in turn, by name."""
+    return pytest.fixture(params=entries.values(), ids=entries)(lambda request: request.param)
 
 
 @pytest.fixture(scope="session")

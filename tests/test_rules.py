@@ -22,7 +22,7 @@ from aaplug.rasterizers.tiled.backward import step_kernel
 from aaplug.rasterizers.tiled.binning import table_kernel
 from aaplug.rasterizers.tiled.forward import pass_kernel
 from aaplug.rendering.renderer import Renderer
-from tests.conftest import ALL_RASTERIZERS, make_camera, make_scene, make_splats, splats_of
+from tests.conftest import ALL_RASTERIZERS, each, make_camera, make_scene, make_splats, splats_of
 
 F64 = torch.float64
 BLACK, SKY = (0.0, 0.0, 0.0), (0.25, 0.5, 1.0)
@@ -38,9 +38,7 @@ OTHERS = {
 HW = (20, 27)
 
 
-@pytest.fixture(params=OTHERS.values(), ids=OTHERS)
-def rules(request: pytest.FixtureRequest) -> Rules:
-    return request.param
+rules = each(OTHERS)
 
 
 def opaque_splats():

@@ -4,7 +4,8 @@ Everything here reaches the terminal as one line and ends the program with exit 
 `assert`s and are not caught.
 """
 
-from collections.abc import Sequence
+import difflib
+from collections.abc import Iterable, Sequence
 from os import PathLike
 
 
@@ -41,6 +42,22 @@ def listing(names: Sequence[str], most: int = 6) -> str:
     """Join names for a message, cut short where there are many."""
     shown = ", ".join(names[:most])
     return shown if len(names) <= most else f"{shown} and {len(names) - most} more"
+
+
+def not_one_of(name: object, known: Iterable[str]) -> str:
+    """Message for a name that is none of the known ones."""
+    return f"'{name}' is not one of {', '.join(known)}"
+
+
+def closest(name: str, known: Iterable[str]) -> str | None:
+    """The known name that a misspelled one most likely means, if any."""
+    return next(iter(difflib.get_close_matches(name, known, 1)), None)
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """The end of a message about a misspelled name; empty if no known name is like it."""
+    close = closest(name, list(known))
+    return f"; did you mean {close}?" if close else ""
 
 
 def reason(error: Exception) -> str:

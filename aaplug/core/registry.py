@@ -9,13 +9,12 @@ The entry's name is the name in the registry.  An object with a `name` of its ow
 cannot be used is left out with a warning, so that it does not stop everything else.
 """
 
-import difflib
 import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
 
-from aaplug.core.errors import UsageError, listing
+from aaplug.core.errors import UsageError, closest, did_you_mean, not_one_of
 
 KINDS = (  # each is a registry and, with underscores and an s, an entry point group
     *("world filter", "screen filter", "selection", "pixel kernel", "compositor", "recipe", "viewer", "form"),
@@ -58,10 +57,9 @@ class Registry(Mapping[str, T]):
         entries = self._all()
         if name in entries:
             return entries[name]
-        close = difflib.get_close_matches(name, entries, 1)
-        hint = f" (did you mean '{close[0]}'?)" if close else ""
-        known = listing(list(entries), most=len(entries))
-        raise UsageError(parameter or self.kind, f"'{name}' is not one of {known}{hint}")
+        close = closest(name, entries)
+        hint = f" (did you mean '{close}'?)" if close else ""
+        raise UsageError(parameter or self.kind, not_one_of(name, entries) + hint)
 
     def register(self, name: str, value: T) -> None:
         """Add an entry from Python, for this process.
@@ -112,9 +110,7 @@ def _warn_of_unknown_groups() -> None:
     known = set(map(group_of, KINDS))
     for group in sorted(entry_points().groups):
         if group.startswith(PREFIX) and group not in known:
-            close = difflib.get_close_matches(group, known, 1)
-            hint = f"; did you mean {close[0]}?" if close else ""
-            log.warning("entry point group %s is not known%s", group, hint)
+            log.warning("entry point group %s is not known%s", group, did_you_mean(group, known))
 
 
 def _load(point: EntryPoint, where: str) -> Any:

@@ -20,8 +20,8 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.errors import UsageError, listing
-from aaplug.core.registry import Registry
+from aaplug.core.errors import UsageError, not_one_of
+from aaplug.core.registry import Registry, named
 from aaplug.evaluation.lpips import LPIPS
 from aaplug.evaluation.metric import Image, LpipsFiles, Metric, Series
 from aaplug.evaluation.protocols import Protocol, SsimFlavour
@@ -144,7 +144,7 @@ FLICKER = Metric("flicker", "", 1.0, 3, _OWN_MOTION, figure=_flicker)
 
 METRICS: Registry[Metric] = Registry(
     "metric",
-    {metric.name: metric for metric in (PSNR, SSIM["wang"], LPIPS, FLIP, CONSISTENCY, ENERGY, FLICKER)},
+    named((PSNR, SSIM["wang"], LPIPS, FLIP, CONSISTENCY, ENERGY, FLICKER)),
     check=lambda value: isinstance(value, Metric) and (value.measure is None) != (value.figure is None),
 )
 
@@ -162,7 +162,7 @@ def find_metrics(names: Sequence[str], protocol: Protocol, lpips_weights: LpipsF
     known = {metric_option(name): metric for name, metric in METRICS.items()}
     wanted = [metric_option(name) for name in names]
     if unknown := [name for name in wanted if name not in known]:
-        raise UsageError("metric", f"'{unknown[0]}' is not one of {listing(list(known), most=len(known))}")
+        raise UsageError("metric", not_one_of(unknown[0], known))
     if len(set(wanted)) != len(wanted):
         raise UsageError("metric", "a metric is named twice")
     found = [known[name] for name in wanted]

@@ -10,6 +10,7 @@ from typing import Any
 from rich.markup import escape
 from rich.table import Table
 
+from aaplug.core.registry import named
 from aaplug.evaluation.metric import Metric, number
 from aaplug.evaluation.metrics import METRICS, PSNR, SSIM
 
@@ -51,7 +52,7 @@ class Report:
     def metrics(self) -> tuple[Metric, ...]:
         """The metrics measured, in order."""
         names = dict.fromkeys(name for m in self.measurements for name in m.values)
-        given = {metric.name: metric for metric in self.measured}
+        given = named(self.measured)
         return tuple(given.get(name) or METRICS[name] for name in names) or (PSNR, SSIM["wang"])
 
     @property

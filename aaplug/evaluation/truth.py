@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.cameras import Camera
-from aaplug.core.errors import UsageError
+from aaplug.core.errors import UsageError, not_one_of
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.imaging import quantised, resampled
 from aaplug.core.interfaces import Rasterizer
@@ -69,7 +69,7 @@ def source_of(views: Sequence[Camera], asked: str = "auto") -> TruthSource:
     if asked == "self" or (asked == "auto" and missing):
         return "self"
     if asked not in ("auto", "photographs"):
-        raise UsageError("truth", f"'{asked}' is not one of auto, photographs, self")
+        raise UsageError("truth", not_one_of(asked, ("auto", "photographs", "self")))
     if missing:
         raise UsageError(missing[0], NO_PHOTOGRAPH)
     return "photographs"

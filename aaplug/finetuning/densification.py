@@ -29,6 +29,11 @@ class ScreenGradients:
     total: Float[Tensor, " n"]
     views: Float[Tensor, " n"]
 
+    @classmethod
+    def none_of(cls, count: int) -> "ScreenGradients":
+        """Before the first view."""
+        return cls(torch.zeros(count), torch.zeros(count))
+
     def add(self, drawing: Drawing) -> None:
         """Add a view after its backward pass; its splats' means must have retained their gradients."""
         splats, (height, width) = drawing.splats, drawing.hw

@@ -161,7 +161,7 @@ def _densify(job: TuningJob, state: State) -> None:
     first = state.first_log_scales[densified.sources]
     state.first_log_scales = torch.where(densified.new[:, None], densified.scene.log_scales, first)
     _update_bounds(job, state)
-    state.gradients = ScreenGradients(torch.zeros(len(first)), torch.zeros(len(first)))
+    state.gradients = ScreenGradients.none_of(len(first))
 
 
 @torch.no_grad()

@@ -14,6 +14,7 @@ from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import Convention, Fusion, Gaussians
 from aaplug.core.monitor import SILENT, Monitor
 from aaplug.evaluation.engine import Candidate, compare
+from aaplug.evaluation.metrics import PSNR
 from aaplug.evaluation.results import mean, scale_name
 from aaplug.finetuning.loop import run
 from aaplug.finetuning.state import State, TuningJob, begin, load, save
@@ -64,7 +65,7 @@ def _probed(job: TuningJob, state: State) -> str:
     """Measure a few training views at the training size and the scale farthest from it; the result in words."""
     scales = list(dict.fromkeys([1.0, max(job.settings.weights, key=lambda s: abs(math.log(s)))]))
     report = compare([Candidate("now", state.renderer(job))], spread(job.views, PROBES), scales, job.truth)
-    psnr = {scale: mean(report.select("now", scale), "PSNR") for scale in scales}
+    psnr = {scale: mean(report.select("now", scale), PSNR.name) for scale in scales}
     state.probes.append({"step": state.step, "psnr": {f"{s:g}": v for s, v in psnr.items()}})
     losses = [loss for step in state.curve[-RECENT:] for loss in step["loss"].values()]
     loss = f", loss {sum(losses) / len(losses):.2e}" if losses else ""

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from aaplug.core.errors import UsageError
+from aaplug.core.errors import UsageError, not_one_of
 from aaplug.core.registry import Registry
 from aaplug.finetuning.losses import LOSSES
 from aaplug.finetuning.parameters import RATES
@@ -111,7 +111,7 @@ def settings_of(
     if not move or any(name not in RATES for name in move):
         raise UsageError("move", f"needs parameters out of {', '.join(RATES)}")
     if loss not in LOSSES:
-        raise UsageError("loss", f"'{loss}' is not one of {', '.join(LOSSES)}")
+        raise UsageError("loss", not_one_of(loss, LOSSES))
     own = method.settings(scale, move, anchor)
     given = {name: value for name, value in counts.items() if value is not None}
     rates = {name: rate * learning_rate for name, rate in own.rates.items()}

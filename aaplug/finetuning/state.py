@@ -83,7 +83,7 @@ def begin(job: TuningJob) -> State:
     """The state before the first step."""
     scene = job.start.scene
     leaves = leaves_of(scene)
-    gradients = ScreenGradients(torch.zeros(len(scene)), torch.zeros(len(scene)))
+    gradients = ScreenGradients.none_of(len(scene))
     return State(0, leaves, optimizer(leaves, job.settings), scene.log_scales, job.start.training.bounds, gradients)
 
 

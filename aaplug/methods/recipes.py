@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from aaplug.core.errors import UsageError
+from aaplug.core.errors import UsageError, not_one_of
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.interfaces import MatchesRates
 from aaplug.core.registry import Registry, named
@@ -97,7 +97,7 @@ def find_recipe(
     """
     recipe = RECIPES.find(name, "recipe")
     if quality not in QUALITIES:
-        raise UsageError("quality", f"'{quality}' is not one of {', '.join(QUALITIES)}")
+        raise UsageError("quality", not_one_of(quality, QUALITIES))
     if rate_reference is not None:
         if not isinstance(recipe.screen, MatchesRates):
             raise UsageError("rate_reference", f"recipe '{name}' compares no sampling rates")

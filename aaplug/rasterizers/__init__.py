@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from aaplug.core.errors import UsageError, listing
+from aaplug.core.errors import UsageError, not_one_of
 from aaplug.core.interfaces import Rasterizer
 from aaplug.core.registry import Registry, named
 from aaplug.rasterizers.reference import Reference
@@ -25,8 +25,7 @@ def find_rasterizer(name: str = "auto", frames: int = 1, say: Callable[[str], No
     if name in RASTERIZERS:
         return RASTERIZERS[name]
     if name not in ("auto", "compiled"):
-        known = listing(["auto", "compiled", *RASTERIZERS])
-        raise UsageError("rasterizer", f"'{name}' is not one of {known}")
+        raise UsageError("rasterizer", not_one_of(name, ["auto", "compiled", *RASTERIZERS]))
     kernels = load()
     if kernels is None and (name == "compiled" or (frames >= FRAMES_THAT_PAY and has_compiler())):
         say("rasterizer: compiling the kernels, once for this machine (about two minutes)")

@@ -9,7 +9,7 @@ from typing import Annotated, Any, NamedTuple
 import tyro
 
 from aaplug.core.cameras import Camera
-from aaplug.core.errors import UsageError
+from aaplug.core.errors import UsageError, not_one_of
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.kernels import EAGER, Kernels
 from aaplug.core.monitor import SILENT, Monitor
@@ -75,7 +75,7 @@ def bench(
 
 def _kernels(rasterizer: str, monitor: Monitor) -> list[Kernels]:
     if rasterizer not in CHOICES:
-        raise UsageError("rasterizer", f"'{rasterizer}' is not one of {', '.join(CHOICES)}")
+        raise UsageError("rasterizer", not_one_of(rasterizer, CHOICES))
     if rasterizer == "eager":
         return [EAGER]
     compiled = load()

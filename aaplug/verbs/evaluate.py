@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, get_args
 import tyro
 
 from aaplug.core.cameras import Camera, CameraSet
-from aaplug.core.errors import OutputError, UsageError
+from aaplug.core.errors import OutputError, UsageError, not_one_of
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.monitor import SILENT, Monitor
 from aaplug.evaluation.engine import Task, candidates_of
@@ -125,7 +125,7 @@ def evaluate(
 def check_results(folder: Path | None, o: EvaluateOptions) -> None:
     """Refuse, before any work, what needs a folder, contradicts itself or would replace results."""
     if o.layout not in get_args(Layout):
-        raise UsageError("layout", f"'{o.layout}' is not one of {', '.join(get_args(Layout))}")
+        raise UsageError("layout", not_one_of(o.layout, get_args(Layout)))
     for parameter, given in {"report": o.report, "layout": o.layout != "plain", "resume": o.resume}.items():
         if given and folder is None:
             raise UsageError(parameter, "needs a folder; give `output`")
@@ -148,8 +148,8 @@ def _metrics(o: EvaluateOptions) -> tuple[list[Metric], Protocol]:
     parts = [metric_option(name).partition(":") for name in chosen]
     for metric, colon, flavour in parts:
         if colon and flavour not in FLAVOURS.get(metric, ()):
-            known = ", ".join(f"{name}:{f}" for name in FLAVOURS for f in FLAVOURS[name])
-            raise UsageError("metric", f"'{metric}:{flavour}' is not one of {known}")
+            known = [f"{name}:{f}" for name in FLAVOURS for f in FLAVOURS[name]]
+            raise UsageError("metric", not_one_of(f"{metric}:{flavour}", known))
     protocol = replace(protocol, **{metric: flavour for metric, _, flavour in parts if flavour})
     files = None if o.lpips is None else (Path(o.lpips[0]), Path(o.lpips[1]))
     return find_metrics([metric for metric, _, _ in parts], protocol, files), protocol

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.cameras import Camera, CameraSet
-from aaplug.core.errors import UsageError
+from aaplug.core.errors import UsageError, not_one_of
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.monitor import SILENT, Monitor
 from aaplug.core.sampling import sampling_bounds
@@ -197,7 +197,7 @@ def _viewer(o: FinetuneOptions) -> Viewer:
         return o.target or METHODS[o.method].viewer
     known = {FAST.name: FAST, **VIEWERS}
     if o.target not in known:
-        raise UsageError("target", f"'{o.target}' is not one of {', '.join(known)}")
+        raise UsageError("target", not_one_of(o.target, known))
     return known[o.target]
 
 

@@ -1,15 +1,14 @@
 """Options of the verbs, each stated once: a field is a verb's keyword, its docstring the help of the command line."""
 
-import difflib
 import inspect
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
 from typing import Annotated, Any, TypeVar, get_args
 
 import tyro
 
-from aaplug.core.errors import UsageError
+from aaplug.core.errors import UsageError, did_you_mean
 from aaplug.core.interfaces import Rasterizer
 from aaplug.core.sampling import MIN_SEEN_SHARE
 from aaplug.methods.filters.matched import RateReference
@@ -66,12 +65,6 @@ class Options:
         options = inspect.signature(cls).parameters.values()
         vars(verb)["__signature__"] = signature.replace(parameters=[*own, *options])
         return verb
-
-
-def did_you_mean(name: str, known: Sequence[str]) -> str:
-    """The end of an error about a name that is not known."""
-    close = difflib.get_close_matches(name, known, 1)
-    return f"; did you mean {close[0]}?" if close else ""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import ANTIALIASED, CLASSIC, CONVENTIONS, MIP, Convention, Gaussians
-from aaplug.core.interfaces import ScreenFilter, WorldFilter
+from aaplug.core.interfaces import ScreenFilter
 from aaplug.core.projection import project, shade
 from aaplug.core.splats import Splats2D
 from aaplug.core.training import TrainingViews
@@ -35,7 +35,7 @@ from aaplug.methods.filters import (
 )
 from aaplug.methods.filters.matched import FULL_RISE_AT, MAX_RISE
 from aaplug.methods.recipes import RECIPES
-from tests.conftest import make_camera, make_scene, make_splats
+from tests.conftest import each, make_camera, make_scene, make_splats
 
 F64 = torch.float64
 EYES = [(0.0, -4.0, 0.0), (3.0, -4.0, 1.0), (-2.0, -6.0, 0.5)]
@@ -77,24 +77,10 @@ def trained_with(convention: Convention) -> TrainingViews:
     return TrainingViews.of(replace(SCENE, convention=convention), CAMERAS)
 
 
-@pytest.fixture(params=SCREENS.values(), ids=SCREENS)
-def screen(request: pytest.FixtureRequest) -> ScreenFilter:
-    return request.param
-
-
-@pytest.fixture(params=WORLD_FILTERS.values(), ids=WORLD_FILTERS)
-def world(request: pytest.FixtureRequest) -> WorldFilter:
-    return request.param
-
-
-@pytest.fixture(params=SITUATIONS.values(), ids=SITUATIONS)
-def situation(request: pytest.FixtureRequest) -> Situation:
-    return request.param
-
-
-@pytest.fixture(params=CONVENTIONS.values(), ids=CONVENTIONS)
-def convention(request: pytest.FixtureRequest) -> Convention:
-    return request.param
+screen = each(SCREENS)
+world = each(WORLD_FILTERS)
+situation = each(SITUATIONS)
+convention = each(CONVENTIONS)
 
 
 def tensors_of(thing: Splats2D | Gaussians) -> dict[str, Tensor]:

@@ -12,7 +12,7 @@ from torch import Tensor
 from aaplug.core.cameras import Camera
 from aaplug.core.ellipses import squared_cutoff, whitening
 from aaplug.core.gaussians import Gaussians
-from aaplug.core.interfaces import Compositor, PixelKernel, Pixels
+from aaplug.core.interfaces import Pixels
 from aaplug.core.kernels import EAGER
 from aaplug.core.projection import project, rotation_matrices, with_depth_slopes
 from aaplug.core.rules import RULES_3DGS, Rules
@@ -33,7 +33,7 @@ from aaplug.rasterizers import Reference, Tiled
 from aaplug.rasterizers.reference import alphas
 from aaplug.rasterizers.tiled.binning import LONGEST_PASS
 from aaplug.rasterizers.tiled.forward import STEP
-from tests.conftest import ALL_RASTERIZERS, make_camera, make_scene, make_splats, splats_of
+from tests.conftest import ALL_RASTERIZERS, each, make_camera, make_scene, make_splats, splats_of
 
 F64 = torch.float64
 BLACK, WHITE, SKY = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (0.25, 0.5, 1.0)
@@ -42,14 +42,8 @@ COARSE = Rules(max_alpha=0.9, min_alpha=0.02, min_transmittance=1e-2)
 LOGISTIC_ERROR = 4e-4  # of Analytic-Splatting's approximation of the normal distribution
 
 
-@pytest.fixture(params=PIXEL_KERNELS.values(), ids=PIXEL_KERNELS)
-def pixel(request: pytest.FixtureRequest) -> PixelKernel:
-    return request.param
-
-
-@pytest.fixture(params=COMPOSITORS.values(), ids=COMPOSITORS)
-def compositor(request: pytest.FixtureRequest) -> Compositor:
-    return request.param
+pixel = each(PIXEL_KERNELS)
+compositor = each(COMPOSITORS)
 
 
 def some_splats(

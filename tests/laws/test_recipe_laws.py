@@ -15,7 +15,7 @@ from aaplug.methods.pixel_kernels import LOGISTIC_INTEGRAL
 from aaplug.methods.recipe import Recipe
 from aaplug.methods.recipes import RECIPES
 from aaplug.rendering.renderer import Renderer
-from tests.conftest import make_camera, make_scene, sized
+from tests.conftest import each, make_camera, make_scene, sized
 
 SIDE, APART = 168, 40  # px
 CAMERA = make_camera(size=(SIDE, SIDE))
@@ -26,9 +26,7 @@ CUTOFF_LOSS = 0.04  # of a splat's light: its tail below 1/255 is not drawn
 VANISHING = 1 / 512
 
 
-@pytest.fixture(params=RECIPES.values(), ids=RECIPES)
-def recipe(request: pytest.FixtureRequest) -> Recipe:
-    return request.param
+recipe = each(RECIPES)
 
 
 def alone() -> Gaussians:

@@ -13,7 +13,7 @@ from typing import Protocol, runtime_checkable
 
 from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.errors import FormatError, UsageError, listing
-from aaplug.core.registry import Registry
+from aaplug.core.registry import Registry, named
 from aaplug.io.cameras import blender, camera_path, colmap, inria, inria_model, llff, multiscale, pinhole, transforms
 from aaplug.io.cameras.options import Options
 from aaplug.io.cameras.poses import pose
@@ -53,9 +53,7 @@ class CameraFormat(Protocol):
 # the first that accepts a path is used
 OWN: tuple[CameraFormat, ...]
 OWN = (pinhole, camera_path, inria_model, colmap, blender, inria, multiscale, transforms, llff)
-CAMERA_FORMATS = Registry[CameraFormat](
-    "camera format", {f.name: f for f in OWN}, lambda f: isinstance(f, CameraFormat)
-)
+CAMERA_FORMATS = Registry[CameraFormat]("camera format", named(OWN), lambda f: isinstance(f, CameraFormat))
 
 
 def read_cameras(

@@ -16,7 +16,7 @@ from typing import Protocol, runtime_checkable
 
 from aaplug.core.errors import FormatError, OutputError, UsageError
 from aaplug.core.gaussians import Convention, Gaussians
-from aaplug.core.registry import Registry
+from aaplug.core.registry import Registry, named
 from aaplug.io.atomic import check_output
 from aaplug.io.scenes import compressed_ply, ksplat, ply, pt, sog, splat, spz
 from aaplug.io.scenes.options import Options, SpzAxes
@@ -64,7 +64,7 @@ class WritableFormat(SceneFormat, Protocol):
 
 # the first that accepts a file is used
 OWN: tuple[SceneFormat, ...] = (compressed_ply, ply, spz, sog, pt, splat, ksplat)
-SCENE_FORMATS = Registry[SceneFormat]("scene format", {f.name: f for f in OWN}, lambda f: isinstance(f, SceneFormat))
+SCENE_FORMATS = Registry[SceneFormat]("scene format", named(OWN), lambda f: isinstance(f, SceneFormat))
 
 
 def open_scene(

@@ -37,8 +37,8 @@ from aaplug.core.kernels import Kernel, Kernels
 from aaplug.core.rules import RULES_3DGS, Rules
 from aaplug.core.splats import Splats2D
 from aaplug.methods.pixel_kernels.averages import SMALL
+from aaplug.methods.pixel_kernels.integral import NARROWEST
 
-NARROWEST = 1e-5  # px: a narrower window shows the value at a point, to ten digits
 LEAST_VARIANCE = 1e-8  # of a window against the first one's: rounding never makes it vanish
 FARTHEST_CENTRE = 0.499  # of a window from the first one's: some of it is always inside
 FARTHEST = 6.0  # standard deviations from a window's edge, beyond which 2e-8 of a Gaussian is in it

@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from aaplug.core.cameras import Camera
-from aaplug.core.errors import UsageError, listing
+from aaplug.core.errors import UsageError, not_one_of
 from aaplug.core.splats import Splats2D
 from aaplug.core.training import TrainingViews
 
@@ -78,7 +78,7 @@ class Matched:
         """
         known = get_args(RateReference)
         if reference not in known:
-            raise UsageError("rate_reference", f"'{reference}' is not one of {listing(known)}")
+            raise UsageError("rate_reference", not_one_of(reference, known))
         return replace(self, reference=cast(RateReference, reference))
 
     def rates(self, splats: Splats2D, camera: Camera, training: TrainingViews) -> Float[Tensor, " m"]:
