@@ -1,18 +1,16 @@
 """Batch files as options: each setting is read as the option of its name, so that both mean the same."""
 
 from collections.abc import Mapping, Sequence
-from contextlib import redirect_stderr
 from dataclasses import is_dataclass, replace
-from io import StringIO
 from pathlib import Path
 from typing import Any, TypeVar
 
 import tyro
 
-from aaplug.core.errors import FormatError, did_you_mean
+from aaplug.core.errors import FormatError, UsageError, did_you_mean
 from aaplug.io.batch_file import read_batch
 
-from .options import CONFIG, option_types
+from .options import CONFIG, one_line, option_types
 
 NOT_IN_A_FILE = ("batch", "more", "json", "resume", "overwrite")
 ONCE = ("output", "threads", "memory", "rasterizer")  # for the whole batch, not for one scene
@@ -37,11 +35,10 @@ def _set(path: Path, where: str, options: T, settings: Mapping[str, Any], refuse
             options = _off(options, key)
             continue
         try:
-            with redirect_stderr(StringIO()):  # tyro's own message speaks of the command line
+            with one_line("aaplug evaluate"):
                 options = tyro.cli(type(options), args=_words(key, value), default=options, config=CONFIG)
-        except SystemExit as error:
-            problem = f"{where}: {key} = {value!r} does not fit; see `aaplug evaluate --help`"
-            raise FormatError(path, problem) from error
+        except UsageError as error:
+            raise FormatError(path, f"{where}: {error}") from error
     return options
 
 

@@ -46,18 +46,23 @@ def run(words: Sequence[str]) -> int:
     """Run one verb with its options; its result is the exit code."""
     import tyro
 
-    from .options import CONFIG
+    from .options import CONFIG, one_line
 
     words = _parted(words)
     if words and words[0] in VERBS:  # loading one verb is faster than loading all
-        return tyro.cli(_verb(words[0]), prog=f"aaplug {words[0]}", args=words[1:], config=CONFIG)()
-    return tyro.extras.subcommand_cli_from_dict(
-        {verb: _verb(verb) for verb in VERBS},
-        prog="aaplug",
-        description="Test-time anti-aliasing for pretrained 3D Gaussian Splatting scenes.",
-        args=words,
-        config=CONFIG,
-    )()
+        program = f"aaplug {words[0]}"
+        with one_line(program):
+            verb = tyro.cli(_verb(words[0]), prog=program, args=words[1:], config=CONFIG)
+        return verb()
+    with one_line("aaplug"):
+        verb = tyro.extras.subcommand_cli_from_dict(
+            {verb: _verb(verb) for verb in VERBS},
+            prog="aaplug",
+            description="Test-time anti-aliasing for pretrained 3D Gaussian Splatting scenes.",
+            args=words,
+            config=CONFIG,
+        )
+    return verb()
 
 
 def _verb(name: str) -> type[Any]:

@@ -4,8 +4,10 @@ The options that the library's verbs have too are stated there, in `aaplug.verbs
 """
 
 import re
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager, redirect_stderr
 from dataclasses import dataclass, fields
+from io import StringIO
 from pathlib import Path
 from typing import Annotated, Any, cast, get_type_hints
 
@@ -18,7 +20,7 @@ from aaplug.io.cameras import read_cameras
 from aaplug.io.scenes import SpzAxes, open_scene
 from aaplug.io.scenes.scene_file import SceneFile
 from aaplug.methods.viewers import describe
-from aaplug.verbs.options import flag
+from aaplug.verbs.options import SCALE, UNSET, Options, flag, number
 
 from .console import say
 
@@ -41,14 +43,14 @@ Flat = tyro.conf.arg(name="")  # a group whose options stand among the verb's ow
 
 
 @dataclass(frozen=True)
-class SceneOptions:
+class SceneOptions(Options):
     """The scene."""
 
     scene: Annotated[Path | None, tyro.conf.Positional, flag("SCENE")] = None
     """A scene (.ply, .compressed.ply, .spz, .sog, .splat, .ksplat) or its folder (INRIA model, SOG)."""
     model_path: Annotated[Path | None, flag("FOLDER", "-m")] = None
     """An INRIA model folder, instead of SCENE."""
-    iteration: Annotated[int | None, flag("N")] = None
+    iteration: Annotated[int | None, number(0, 10**9, whole=True), UNSET] = None
     """Iteration of a model folder (default: the last)."""
     convention: Annotated[str | None, flag("|".join(CONVENTIONS))] = None
     """How the scene was trained, where its file does not say."""
@@ -93,16 +95,16 @@ class SceneOptions:
 
 
 @dataclass(frozen=True)
-class CameraOptions:
+class CameraOptions(Options):
     """The cameras."""
 
     cameras: Annotated[Path | None, flag("PATH")] = None
     """cameras.json, COLMAP model, Blender transforms_*.json, or their folder (default: SCENE's model folder)."""
-    train_scale: Annotated[float | None, flag("FACTOR")] = None
+    train_scale: Annotated[float | None, SCALE, UNSET] = None
     """Training size relative to the cameras' source size, where the files do not say."""
     images: Annotated[str | None, flag("FOLDER")] = None
     """Folder of photographs inside the data set (default: the format's own)."""
-    test_every: Annotated[int | None, flag("N")] = None
+    test_every: Annotated[int | None, number(0, 1_000_000, whole=True), UNSET] = None
     """Hold out every N-th view by name; 0 for no split (default: as usual for the format)."""
 
     def read(self, options: SceneOptions) -> CameraSet:
@@ -114,6 +116,26 @@ class CameraOptions:
         for note in cameras.notes:
             say(worded(f"cameras: {note}", CameraOptions.__dataclass_fields__))
         return cameras
+
+
+@contextmanager
+def one_line(program: str) -> Iterator[None]:
+    """Turn tyro's box about words that it cannot read into an error of one line.
+
+    Raises:
+        UsageError: the words inside the block do not fit the program.
+    """
+    box = StringIO()
+    try:
+        with redirect_stderr(box):
+            yield
+    except SystemExit as end:
+        if not end.code:  # --help
+            raise
+        lines = [line.strip("│╭╮╰╯─ ") for line in box.getvalue().splitlines()]
+        said = " ".join(filter(None, lines[1:]))  # without the box's title
+        said = re.split(" For full helptext| Argument helptext", said)[0].removeprefix("Error parsing ")
+        raise UsageError(program, f"{said}; see `{program} --help`") from end
 
 
 def option_types(noun: type) -> dict[str, Any]:

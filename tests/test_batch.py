@@ -148,9 +148,9 @@ REFUSED = {
     "nameless": ("[[scene]]\ncameras = '.'", "names no scene; add scene"),
     "one name": ("[[scene]]\nscene = 'a.ply'\n[[scene]]\nscene = 'b/A.ply'", "name of its own"),
     "unknown": (SETTINGS.replace("scale", "scales"), "scales is no setting here; did you mean scale?"),
-    "misfit": (SETTINGS.replace("[0.5]", "['big']"), "scale = ['big'] does not fit"),
+    "misfit": (SETTINGS.replace("[0.5]", "['big']"), "--scale: takes 0.001..64 ..., got big"),
     "not here": (SETTINGS + "output = 'elsewhere'", "scene 'broken': output is no setting here"),
-    "a choice": (SETTINGS + "truth = 'other'", "truth = 'other' does not fit"),
+    "a choice": (SETTINGS + "truth = 'other'", "invalid choice 'other' for argument '--truth'"),
 }  # fmt: skip
 
 

@@ -122,7 +122,7 @@ def test_render_takes_an_inria_model_folder_as_it_is(cli):
 
 def test_cull_margin_leaves_out_what_is_centred_far_outside(cli):
     cli("render scene.ply --cameras . -o all.png")
-    cli("render scene.ply --cameras . -o culled.png --cull-margin -0.2")
+    cli("render scene.ply --cameras . -o culled.png --cull-margin 0")
     assert Path("all.png").read_bytes() != Path("culled.png").read_bytes()
     cli("render scene.ply --cameras . -o wide.png --cull-margin 100")
     assert Path("all.png").read_bytes() == Path("wide.png").read_bytes()
@@ -214,7 +214,7 @@ REFUSED = {
     "bad resolution": (
         break_nothing, "render scene.ply --cameras . -o new --resolution 8by8", ["--resolution", "8by8"]),
     "too large": (
-        break_nothing, "render scene.ply --cameras . -o new --scale 9999", ["16384"]),
+        break_nothing, "render scene.ply --cameras . -o new --resolution 99999x9", ["16384"]),
     "no scene": (break_nothing, "render --cameras . -o new", ["SCENE"]),
     "no cameras": (break_nothing, "render scene.ply -o new", ["--cameras"]),
     "missing scene": (break_nothing, "render gone.ply --cameras . -o new", ["gone.ply"]),

@@ -105,7 +105,7 @@ def test_convert_starts_from_the_original_where_the_closed_form_is_worse(cli, mo
     [
         ("--steps 3", "--steps: belongs to the optimization for a --viewer"),
         ("--for gsplat --variance 0.1", "leave out --form, --variance"),
-        ("--for gsplat --steps -1", "--steps: must be 0 or more"),
+        ("--for gsplat --steps -1", "--steps: takes 0..1000000, got -1"),
         ("--for web", "--viewer: 'web' is not one of classic-viewer"),
         ("--form web", "--form: 'web' is not one of matched-energy"),
     ],

@@ -97,17 +97,22 @@ def test_a_run_killed_outright_resumes_from_its_checkpoint(cli, tmp_path, whole)
     assert Path("tuned.ply").read_bytes() == (whole / "tuned.ply").read_bytes()
 
 
+def test_a_run_killed_before_its_first_checkpoint_starts_anew(cli, whole):
+    code, _, err = cli(f"{RUN} --resume")
+    assert (code, "there is no checkpoint yet: starting at step 0" in err) == (0, True)
+    assert Path("tuned.ply").read_bytes() == (whole / "tuned.ply").read_bytes()
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ("--steps -1", "--steps: must be 0 or more"),
+        ("--steps -1", "--steps: takes 0..1000000, got -1"),
         ("--method mipmap-gs --scale 0.5 0.25", "one model for one scale"),
-        ("--scale 0", "--scale: needs sizes above 0"),
+        ("--scale 0", "--scale: takes 0.001..64 ..., got 0.0"),
         ("--upsampler nearest", "expected bicubic, lanczos"),
-        ("--resume", "there is no run to resume"),
         ("--truth photographs", "has no photograph; --truth self"),
-        ("--checkpoint-every 0", "--checkpoint-every: must be 1 or more"),
-        ("--learning-rate 0", "--learning-rate: must be above 0"),
+        ("--checkpoint-every 0", "--checkpoint-every: takes 1..1000000, got 0"),
+        ("--learning-rate 0", "--learning-rate: takes 1e-06..100, got 0.0"),
         ("--move size", "--move: needs parameters out of means"),
         ("--loss l3", "--loss: 'l3' is not one of l2"),
         ("--for web", "--target: 'web' is not one of fast"),

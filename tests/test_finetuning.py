@@ -21,6 +21,7 @@ from aaplug.finetuning.losses import LOSSES, l1_dssim, l2, structural_similarity
 from aaplug.finetuning.parameters import RATES, between, extent, least_log_scales, leaves_of, scene_of
 from aaplug.finetuning.settings import QUICK, Settings, balanced
 from aaplug.finetuning.state import State, TuningJob, begin, load, save
+from aaplug.io.images import write_png
 from aaplug.methods.recipes import RECIPES
 from aaplug.rasterizers import RASTERIZERS
 from aaplug.verbs.finetune import finetune
@@ -273,8 +274,6 @@ def test_after_three_bad_steps_a_run_rolls_back_and_says_so(monkeypatch):
 
 def test_checkpoints_of_others_are_refused(tmp_path):
     job, path = make_job(), tmp_path / "run.pt"
-    with pytest.raises(FormatError, match="no run to resume"):
-        load(path, job)
     save(path, job, begin(job), {})
     for content in (b"not a checkpoint", path.read_bytes()[:-100]):
         (tmp_path / "damaged.pt").write_bytes(content)
@@ -284,6 +283,44 @@ def test_checkpoints_of_others_are_refused(tmp_path):
         load(path, replace(job, settings=replace(SETTINGS, steps=13)))
     with pytest.raises(UsageError, match="its scene was"):
         load(path, replace(job, start=replace(job.start, scene=make_scene(60, seed=5))))
+
+
+def moved(view):
+    pose = view.cam_from_world.clone()
+    pose[0, 3] += 1e-9
+    return replace(view, cam_from_world=pose)
+
+
+CHANGES = {
+    "views": lambda job: replace(job, views=[moved(job.views[0]), *job.views[1:]]),
+    "training cameras": lambda job: replace(
+        job, start=replace(job.start, training=replace(job.start.training, cameras=[*map(moved, VIEWS)]))
+    ),
+    "scene": lambda job: replace(
+        job, start=replace(job.start, scene=replace(job.start.scene, filter_3d=torch.ones(len(job.start.scene))))
+    ),
+    "truth": lambda job: replace(job, upsampler="lanczos"),
+}
+
+
+@pytest.mark.parametrize("key", CHANGES)
+def test_a_checkpoint_is_of_all_that_the_result_depends_on(tmp_path, key):
+    job, path = make_job(), tmp_path / "run.pt"
+    save(path, job, begin(job), {})
+    with pytest.raises(UsageError, match=f"its {key} was"):
+        load(path, CHANGES[key](job))
+
+
+def test_a_checkpoint_is_of_its_photographs(tmp_path):
+    photo, path = tmp_path / "photo.png", tmp_path / "run.pt"
+    write_png(photo, torch.zeros(*VIEWS[0].hw, 3))
+    job = make_job()
+    views = [replace(view, photo=photo) for view in job.views]
+    job = replace(job, views=views, truth=replace(job.truth, source="photographs"))
+    save(path, job, begin(job), {})
+    write_png(photo, torch.ones(*VIEWS[0].hw, 3), overwrite=True)
+    with pytest.raises(UsageError, match="its photographs was"):
+        load(path, job)
 
 
 def test_the_extent_is_that_of_the_training_cameras():

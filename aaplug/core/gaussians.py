@@ -133,15 +133,16 @@ class Gaussians:
         """The Gaussians at `index` (a mask, indices or a slice), in that order."""
         kept = index.cpu() if isinstance(index, Tensor) else index  # the file's rows stay on the CPU
         origin = self.origin and replace(self.origin, rows=self.origin.rows[kept])
-        columns = {name: column[index] for name, column in self._columns().items()}
+        columns = {name: column[index] for name, column in self.columns.items()}
         sizes = None if self.pixel_sizes is None else self.pixel_sizes[index]
         return replace(self, **columns, pixel_sizes=sizes, origin=origin)
 
     def to(self, dtype: torch.dtype) -> "Gaussians":
         """The same Gaussians in another precision; recorded pixel sizes keep theirs."""
-        return replace(self, **{name: column.to(dtype) for name, column in self._columns().items()})
+        return replace(self, **{name: column.to(dtype) for name, column in self.columns.items()})
 
-    def _columns(self) -> dict[str, Tensor]:
+    @property
+    def columns(self) -> dict[str, Tensor]:
         """Every parameter that is present, by name."""
         return {name: value for name, value in vars(self).items() if isinstance(value, Tensor)}
 

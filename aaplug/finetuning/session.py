@@ -32,9 +32,10 @@ def tune(
     Ctrl-C stops it after the current step, once the checkpoint is written; a second Ctrl-C stops it at once.  Both
     raise KeyboardInterrupt.
     """
-    state, good = load(checkpoint, job) if resume and checkpoint else (begin(job), None)
+    found = resume and checkpoint is not None and checkpoint.exists()
+    state, good = load(checkpoint, job) if found and checkpoint else (begin(job), None)
     if resume:
-        monitor.say(f"resumed at step {state.step}")
+        monitor.say(f"resumed at step {state.step}" if found else "there is no checkpoint yet: starting at step 0")
     steps, first, started = job.settings.steps, state.step, time.monotonic()
 
     def keep(state: State, good: Mapping[str, Any]) -> None:

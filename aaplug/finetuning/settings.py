@@ -1,6 +1,5 @@
 """How to fine-tune: aaplug's method and Mipmap-GS's."""
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -98,21 +97,13 @@ def settings_of(
 ) -> Settings:
     """A method's settings with the user's choices; None takes the method's own.
 
-    Raises UsageError if a choice is out of its range, or does not fit the method.
+    Raises UsageError if a name is not known, or a choice does not fit the method.
     """
-    counts = {"steps": steps, "densify_every": densify_every}
-    for name, value in (counts | {"anchor": anchor}).items():
-        if value is not None and not value >= 0:
-            raise UsageError(name, f"must be 0 or more, got {value:g}")
-    if not (scale and all(0 < s < math.inf for s in scale)):
-        raise UsageError("scale", "needs sizes above 0")
-    if not learning_rate > 0:
-        raise UsageError("learning_rate", f"must be above 0, got {learning_rate:g}")
     if not move or any(name not in RATES for name in move):
         raise UsageError("move", f"needs parameters out of {', '.join(RATES)}")
     if loss not in LOSSES:
         raise UsageError("loss", not_one_of(loss, LOSSES))
-    own = method.settings(scale, move, anchor)
+    own, counts = method.settings(scale, move, anchor), {"steps": steps, "densify_every": densify_every}
     given = {name: value for name, value in counts.items() if value is not None}
     rates = {name: rate * learning_rate for name, rate in own.rates.items()}
     return replace(own, rates=rates, loss=loss, seed=seed, **given)

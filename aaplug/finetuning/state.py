@@ -4,7 +4,6 @@ A checkpoint is one file of everything that the next step depends on, written wh
 tensors, numbers and strings only, and is read as such: nothing in it is executed.
 """
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import asdict, dataclass, field, replace
@@ -16,19 +15,19 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.cameras import Camera
+from aaplug.core.digests import digest_of_cameras, digest_of_files, digest_of_scene
 from aaplug.core.errors import FormatError, UsageError
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.sampling import SamplingBounds
 from aaplug.evaluation.truth import Truth
 from aaplug.finetuning.densification import ScreenGradients
-from aaplug.finetuning.parameters import WHOLE, Leaves, leaves_of, scene_of
+from aaplug.finetuning.parameters import Leaves, leaves_of, scene_of
 from aaplug.finetuning.settings import Settings
 from aaplug.io.atomic import replacing
 from aaplug.rendering.renderer import Renderer
 
 EPSILON = 1e-15  # of Adam (3DGS)
-FORMAT = "aaplug finetune 3"
-DIGEST = 16  # hex digits of a hash
+FORMAT = "aaplug finetune 4"
 
 
 @dataclass(frozen=True)
@@ -38,12 +37,14 @@ class TuningJob:
     start: draws the scene that the run starts from as the viewer will; its recipe has no world filter.
     views: training views, at the training size.
     truth: the images that renders are compared with.
+    upsampler: what makes its larger images, as text that changes if it does.
     """
 
     start: Renderer
     views: Sequence[Camera]
     truth: Truth
     settings: Settings
+    upsampler: str = ""
 
 
 @dataclass
@@ -121,7 +122,7 @@ def load(path: Path, job: TuningJob) -> tuple[State, dict[str, Any]]:
     """The state of a run of this job, and the last good one, packed.
 
     Raises:
-        FormatError: the file is missing, damaged or something else.
+        FormatError: the file is damaged or something else.
         UsageError: it is of another job; the message names the first difference.
     """
     try:
@@ -134,8 +135,6 @@ def load(path: Path, job: TuningJob) -> tuple[State, dict[str, Any]]:
         return unpacked(content["state"], job), content["good"]
     except UsageError:
         raise
-    except FileNotFoundError as error:
-        raise FormatError(path, "does not exist: there is no run to resume") from error
     except Exception as error:  # torch raises all kinds over a damaged file
         raise FormatError(path, "is damaged, or no checkpoint of this version") from error
 
@@ -144,22 +143,16 @@ def _facts(job: TuningJob) -> dict[str, str]:
     """Everything that a run depends on, as text that can be compared."""
     settings = {key: str(value) for key, value in asdict(job.settings).items()}
     start, truth = job.start, job.truth
+    photos = [view.photo for view in job.views if view.photo]
     return settings | {
-        "scene": _digest(start.scene),
-        "truth": f"{_digest(truth.own.scene)} {truth.source}",
+        "scene": digest_of_scene(start.scene),
+        "truth": f"{digest_of_scene(truth.own.scene)} {truth.source} {job.upsampler}",
         "recipe": start.recipe.name,
-        "views": _hash(repr([(v.name, v.hw, v.focal) for v in job.views]).encode()),
+        "views": digest_of_cameras(job.views),
+        "training cameras": digest_of_cameras(start.training.cameras),
+        "photographs": digest_of_files(photos) if truth.source == "photographs" else "",
         "background": str(start.background),
         "cull margin": str(start.training.cull_margin),
         "rasterizer": start.rasterizer.name,
         "number of threads": str(torch.get_num_threads()),  # it changes the order of sums
     }
-
-
-def _digest(scene: Gaussians) -> str:
-    columns = [getattr(scene, name).detach().contiguous() for name in (*WHOLE, "sh")]
-    return _hash(b"".join(column.numpy().tobytes() for column in columns))
-
-
-def _hash(data: bytes) -> str:
-    return hashlib.sha256(data).hexdigest()[:DIGEST]

@@ -25,7 +25,7 @@ LIMITS: Mapping[str, Limit] = {
     "HEADER": Limit(128 * 2**10, "bytes", "a .ply's header; scenes have about 2 KB"),
     "HEADER_LINES": Limit(1000, "lines", "a .ply's header; scenes have about 70"),
     "GAUSSIANS": Limit(1e8, "Gaussians", "of a scene; about 25 GB as .ply"),
-    "MEMORY_SHARE": Limit(0.5, "of RAM", "that a scene read whole may take"),
+    "MEMORY_SHARE": Limit(0.5, "of RAM", "that a scene read whole, or a job, may take"),
     "JSON": Limit(64 * 2**20, "bytes", "a JSON file"),
     "CFG_ARGS": Limit(64 * 2**10, "bytes", "INRIA's cfg_args"),
     "NAME": Limit(4096, "bytes", "a photograph's name"),
@@ -56,6 +56,14 @@ def limit(name: str) -> int | float:
 def whole_limit(name: str) -> int:
     """The limit in force, as an integer."""
     return int(min(limit(name), 2**62))
+
+
+def lack_of_memory(needed: int | float) -> str | None:
+    """Why this machine cannot hold so many bytes, in words; None if it can, or does not say what it has."""
+    memory, share = memory_of_machine(), limit("MEMORY_SHARE")
+    if memory is None or needed <= share * memory:
+        return None
+    return f"{needed / 1e9:.1f} GB, more than {share:.0%} of this machine's {memory / 1e9:.0f} GB"
 
 
 def memory_of_machine() -> float | None:

@@ -1,24 +1,24 @@
 """How fast this machine renders, stage by stage."""
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import Annotated, Any, NamedTuple
-
-import tyro
 
 from aaplug.core.cameras import Camera
 from aaplug.core.errors import UsageError, not_one_of
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.kernels import EAGER, Kernels
 from aaplug.core.monitor import SILENT, Monitor
+from aaplug.io.limits import lack_of_memory
 from aaplug.rasterizers.tiled.ahead_of_time import build, load
 from aaplug.rendering.benchmark import Figures, exponent, measure, synthetic_camera, synthetic_scene
 from aaplug.verbs.inputs import CamerasLike, SceneLike, cameras_of, processor, scene_of
-from aaplug.verbs.options import Options, choice, flag
+from aaplug.verbs.options import THREADS, UNSET, Options, choice, flag, number
+from aaplug.verbs.views import size_of
 
 SIZES = ("800x800", "1600x1060")  # of images
+BYTES = 1200  # a Gaussian of degree 3 with its gradients and what autograd keeps, measured
 CHOICES = ("all", "compiled", "eager")
 
 
@@ -33,16 +33,16 @@ class Bench(NamedTuple):
 class BenchOptions(Options):
     """What to time."""
 
-    gaussians: Annotated[Sequence[int], tyro.conf.arg(metavar="N ...")] = (10_000, 100_000, 1_000_000)
+    gaussians: Annotated[Sequence[int], number(1, 100_000_000, whole=True, several=True)] = (10_000, 100_000, 1_000_000)
     """Sizes of the synthetic scenes."""
     resolution: Annotated[Sequence[str] | None, flag("WxH ...")] = None
     """Sizes of the synthetic scenes' image: all scenes at the first, the middle one at each (default: 800x800, and
     1600x1060 if there are several scenes)."""
     rasterizer: Annotated[str, choice(CHOICES)] = "all"
     """Which to time; all: compiled, if `aaplug warmup` has run, and eager."""
-    repeats: int = 5
+    repeats: Annotated[int, number(1, 1000, whole=True)] = 5
     """Runs per median."""
-    threads: Annotated[int | None, flag("N")] = None
+    threads: Annotated[int | None, THREADS, UNSET] = None
     """Processor threads (default: all)."""
     forward_only: bool = False
     """Leave out the backward pass."""
@@ -59,8 +59,6 @@ def bench(
         options: fields of `BenchOptions`.
     """
     o = BenchOptions.of(options)
-    if o.repeats < 1:
-        raise UsageError("repeats", f"must be 1 or more, got {o.repeats}")
     runs: list[Figures] = []
     with processor(o.threads):
         work = _synthetic(o) if scene is None else [(scene_of(scene), cameras_of(cameras, scene).train[0])]
@@ -91,12 +89,10 @@ def _kernels(rasterizer: str, monitor: Monitor) -> list[Kernels]:
 def _synthetic(o: BenchOptions) -> list[tuple[Gaussians, Camera]]:
     """Every scene at the first size, and the middle one at the others."""
     given = o.resolution or (SIZES if len(o.gaussians) > 1 else SIZES[:1])
-    sizes = [re.fullmatch(r"([1-9]\d*)x([1-9]\d*)", text) for text in given]
-    if not all(sizes):
-        raise UsageError("resolution", f"takes sizes such as 800x800, got {', '.join(given)}")
-    if min(o.gaussians, default=0) < 1:
-        raise UsageError("gaussians", "takes numbers above 0")
-    first, *others = [synthetic_camera(int(size[1]), int(size[2])) for size in sizes if size]
+    first, *others = [synthetic_camera(*size_of(text)) for text in given]
+    most = max(o.gaussians)
+    if lacking := lack_of_memory(BYTES * most):
+        raise UsageError("gaussians", f"{most:,} with gradients take {lacking}")
     scenes = [synthetic_scene(n) for n in o.gaussians]
     middle = scenes[len(scenes) // 2]
     return [*((scene, first) for scene in scenes), *((middle, c) for c in others)]

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 from aaplug.core.errors import UsageError
 from aaplug.core.monitor import SILENT, Monitor
@@ -14,7 +14,7 @@ from aaplug.evaluation.truth import Truth, source_of
 from aaplug.io.cameras import select_views
 from aaplug.methods.recipe import Recipe
 from aaplug.verbs.inputs import CamerasLike, SceneLike, cameras_of, drawn_by, look_of, processor, recipe_of, scene_of
-from aaplug.verbs.options import RecipeOptions
+from aaplug.verbs.options import SCALES, RecipeOptions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,7 +23,7 @@ class CompareOptions(RecipeOptions):
 
     recipe: str | Recipe = "auto"
     """A recipe for all scenes."""
-    scale: Sequence[float] = (1.0, 0.5, 0.25, 0.125)
+    scale: Annotated[Sequence[float], SCALES] = (1.0, 0.5, 0.25, 0.125)
     """Sizes relative to the training size."""
     truth: str = "auto"
     """photographs, self (the first scene's own look), or auto for photographs where every view has one."""

@@ -21,7 +21,7 @@ from aaplug.io.scenes.scene_file import SceneFile
 from aaplug.methods.viewers import FORMS, MATCHED_ENERGY, MIP_VIEWER, VIEWERS, Form, Viewer, blurring, fuse
 from aaplug.verbs.in_parts import LARGE, convert_parts
 from aaplug.verbs.inputs import AnyPath, CamerasLike, SceneLike, cameras_of, look_of, opened_of, processor, sources_of
-from aaplug.verbs.options import ViewOptions, flag
+from aaplug.verbs.options import STEPS, UNSET, ViewOptions, flag, number
 
 
 @dataclass(frozen=True)
@@ -46,13 +46,13 @@ class ConvertOptions(ViewOptions):
     """Views that --viewer is measured on, by name or split."""
     viewer: Annotated[str | Viewer | None, flag("|".join(VIEWERS), "--for", kind=str | None)] = None
     """Fit the scene to this viewer by a short optimization from the closed form, and print the remaining error."""
-    steps: Annotated[int | None, flag("N")] = None
+    steps: Annotated[int | None, STEPS, UNSET] = None
     """With --viewer: steps of the optimization (default: 300, or 0 if the viewer draws as training did); 0 keeps the
     closed form."""
     form: Annotated[str | None, flag("|".join(FORMS))] = None
     """Without --viewer, what to fuse: matched-energy (the default) keeps the energy that training showed;
     mip-splatting is Mip-Splatting's 3D smoothing.  A stored filter_3D is fused as it is."""
-    variance: Annotated[float | None, flag("PX2")] = None
+    variance: Annotated[float | None, number(0.001, 100), UNSET] = None
     """Without --viewer: variance to fuse, in px² at the training rate (default: 0.2)."""
     overwrite: bool = False
     """Replace an existing output."""
@@ -66,8 +66,6 @@ class ConvertOptions(ViewOptions):
             return found if self.variance is None else found.with_variance(self.variance)
         if self.form is not None or self.variance is not None:
             raise UsageError("viewer", "sets form and variance itself; leave out `form`, `variance`")
-        if self.steps is not None and self.steps < 0:
-            raise UsageError("steps", f"must be 0 or more, got {self.steps}")
         return VIEWERS.find(self.viewer, "viewer") if isinstance(self.viewer, str) else self.viewer
 
 

@@ -1,7 +1,5 @@
 """Recipes measured at several scales, against photographs or the scene's own supersampled look."""
 
-import hashlib
-import json
 import math
 import platform
 from collections.abc import Sequence
@@ -13,6 +11,7 @@ from typing import Annotated, Any, Literal, get_args
 import tyro
 
 from aaplug.core.cameras import Camera, CameraSet
+from aaplug.core.digests import digest_of_cameras, digest_of_files
 from aaplug.core.errors import OutputError, UsageError, not_one_of
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.monitor import SILENT, Monitor
@@ -30,8 +29,9 @@ from aaplug.io.atomic import refuse_existing
 from aaplug.io.cameras import select_views
 from aaplug.methods.recipe import Recipe
 from aaplug.methods.recipes import RECIPES, USER_RECIPES, suited
+from aaplug.verbs.announce import announce
 from aaplug.verbs.inputs import AnyPath, CamerasLike, SceneLike, inputs_of, look_of, processor, recipe_of
-from aaplug.verbs.options import RECIPE_NAMES, RecipeOptions, choice, choices, flag
+from aaplug.verbs.options import RECIPE_NAMES, SCALES, UNSET, RecipeOptions, choice, choices, flag
 
 ALL = "all"  # instead of recipes' names: every recipe that the scene suits
 DEFAULT_RECIPES = ("classic", "mip", "matched", "auto")
@@ -51,7 +51,7 @@ class EvaluateOptions(RecipeOptions):
     """Scales, truth, downscaling and flavours of metrics, by name."""
     recipe: Annotated[str | Sequence[str | Recipe], choices([*RECIPE_NAMES, ALL, "..."])] = DEFAULT_RECIPES
     """One or more recipes.  all adds the research recipes, which examples/guides/methods.md lists."""
-    scale: Annotated[Sequence[float] | None, flag("FACTOR [FACTOR ...]")] = None
+    scale: Annotated[Sequence[float] | None, SCALES, UNSET] = None
     """One or more sizes relative to the training size (default: the protocol's)."""
     truth: Literal["auto", "photographs", "self"] = "auto"
     """Compare with photographs, or with the scene's own supersampled look; auto leaves it to the protocol."""
@@ -109,6 +109,8 @@ def evaluate(
         look = look_of(scene, cameras, len(seen) * len(recipes) * len(scales), o, monitor)
         candidates = candidates_of(scene, look.training, recipes, look.rasterizer, look.background)
         task = Task(candidates, scales, seen, Truth(look, source, rules), metrics)
+        drawn = [view.scaled(scale) if rules.change == "size" else view for view in seen for scale in scales]
+        announce([candidate.renderer for candidate in candidates], drawn, monitor)
         with monitor.progress(f"evaluating {name}", "views") as tell:
             found = measure(task, facts, tell, folder and folder / JOURNAL, o.resume, images)
     if folder and images:
@@ -205,17 +207,17 @@ def _facts(
         "platform": f"{platform.system()} {platform.machine()}",
         "scene": {
             "file": origin and Path(origin.path).name,
-            "sha256": origin and _sha256([Path(origin.path)]),
+            "sha256": origin and digest_of_files([origin.path]),
             "gaussians": len(scene),
             "convention": scene.convention.name,
             "evidence": origin and origin.evidence,
         },
         "cameras": {
             "notes": list(cameras.notes),
-            "sha256": _cameras_sha256(views),
-            "training_sha256": _cameras_sha256(cameras.train),
+            "sha256": digest_of_cameras(views),
+            "training_sha256": digest_of_cameras(cameras.train),
         },
-        "photographs": {"count": len(photos), "sha256": _sha256(photos) if photos else None},
+        "photographs": {"count": len(photos), "sha256": digest_of_files(photos) if photos else None},
         "options": {
             "quality": o.quality,
             "rate_reference": o.rate_reference or "pose",
@@ -224,18 +226,3 @@ def _facts(
         },
         "cull_margin": o.cull_margin if math.isfinite(o.cull_margin) else None,
     }
-
-
-def _sha256(paths: Sequence[Path]) -> str:
-    """Hash of the files' contents, one after another."""
-    digest = hashlib.sha256()
-    for path in paths:
-        with open(path, "rb") as stream:
-            hashlib.file_digest(stream, lambda: digest)
-    return digest.hexdigest()
-
-
-def _cameras_sha256(views: Sequence[Camera]) -> str:
-    """Hash of the views as they were understood: names, sizes, intrinsics and poses."""
-    understood = [[v.name, v.width, v.height, v.fx, v.fy, v.cx, v.cy, v.cam_from_world.tolist()] for v in views]
-    return hashlib.sha256(json.dumps(understood).encode()).hexdigest()

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.cameras import Camera, CameraSet
+from aaplug.core.digests import digest_of_files
 from aaplug.core.errors import UsageError, not_one_of
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.monitor import SILENT, Monitor
@@ -31,9 +32,11 @@ from aaplug.io.images import write_png
 from aaplug.io.scenes import SpzAxes, check_scene_output, write_scene
 from aaplug.methods.recipes import RECIPES
 from aaplug.methods.viewers import FAST, VIEWERS, Viewer, fuse_for
+from aaplug.rendering.cost import GRADIENTS
 from aaplug.rendering.renderer import Renderer
+from aaplug.verbs.announce import announce
 from aaplug.verbs.inputs import AnyPath, CamerasLike, SceneLike, inputs_of, look_of, processor, sources_of
-from aaplug.verbs.options import ViewOptions, choice, choices, flag
+from aaplug.verbs.options import SCALES, STEPS, UNSET, ViewOptions, choice, choices, flag, number
 
 Image = Float[Tensor, "h w 3"]
 
@@ -68,19 +71,19 @@ class FinetuneOptions(ViewOptions):
     viewer with a rule of its own (default of mipmap-gs: classic-viewer)."""
     method: Annotated[str, choice(METHODS)] = "consistency"
     """consistency makes one model for all scales; mipmap-gs makes one for a single --scale, as Mipmap-GS does."""
-    scale: Sequence[float] = tuple(OURS.weights)
+    scale: Annotated[Sequence[float], SCALES] = tuple(OURS.weights)
     """Sizes against the training size that must look right, beside the training size itself."""
-    steps: Annotated[int | None, flag("N")] = None
+    steps: Annotated[int | None, STEPS, UNSET] = None
     """Number of steps (default: 1000)."""
     loss: Annotated[str, choice(LOSSES)] = OURS.loss
     """l2, or 3DGS's 0.8 L1 + 0.2 D-SSIM."""
-    anchor: float = OURS.anchor
+    anchor: Annotated[float, number(0, 1_000_000)] = OURS.anchor
     """Weight of the training size in every step, against 1 for the other scales."""
     move: Annotated[Sequence[str], choices(RATES)] = tuple(RATES)
     """Parameters that move."""
-    learning_rate: float = 1.0
+    learning_rate: Annotated[float, number(1e-6, 100)] = 1.0
     """Factor on the method's learning rates."""
-    densify_every: Annotated[int | None, flag("N")] = None
+    densify_every: Annotated[int | None, STEPS, UNSET] = None
     """Clone, split and prune every N steps; 0 for never (default: the method's own)."""
     truth: Annotated[str, choice(("auto", "self", "photographs"))] = "auto"
     """What the training size should look like: the scene's own render (self) or the photographs; auto takes
@@ -88,9 +91,9 @@ class FinetuneOptions(ViewOptions):
     upsampler: Annotated[str | None, flag("bicubic|lanczos|FILE")] = None
     """For scales above 1 without photographs that large: an interpolation, or a network's weights (ESPCN_x4.pb, a
     torch.export .pt2); default: the scene's own render there, corrected to the averages of the training size."""
-    seed: int = 0
+    seed: Annotated[int, number(0, 2**31 - 1, whole=True)] = 0
     """Seed of the views and scales that the steps draw."""
-    checkpoint_every: Annotated[int, flag("N")] = 100
+    checkpoint_every: Annotated[int, number(1, 1_000_000, whole=True)] = 100
     """Steps between checkpoints."""
     resume: bool = False
     """Continue an interrupted run from its checkpoint."""
@@ -118,7 +121,7 @@ def finetune(
         options: fields of `FinetuneOptions`.
 
     Raises:
-        AaplugError: as `render`; also, there is nothing to resume, or no gradient is finite.
+        AaplugError: as `render`; also, the checkpoint is of another run, or no gradient is finite.
         KeyboardInterrupt: Ctrl-C stopped the run; its checkpoint is written.
     """
     o = FinetuneOptions.of(options)
@@ -127,13 +130,16 @@ def finetune(
     _check(path, sources_of(scene), o)
     shown, source = select_views(cameras, o.views), _source(o.truth, cameras)
     enlarge = back_projected if o.upsampler is None else upsampled(find_upsampler(o.upsampler))
+    named = str(o.upsampler)
+    written = digest_of_files([named]) if Path(named).is_file() else named
     with processor(o.threads):
         look = look_of(scene, cameras, settings.steps, o, monitor)
         before = replace(look, recipe=RECIPES[viewer.recipe])
         start = replace(before, scene=fuse_for(scene, look.training, viewer))
-        job = TuningJob(start, cameras.train, Truth(look, source, enlarge=enlarge, memory=MEMORY), settings)
+        job = TuningJob(start, cameras.train, Truth(look, source, enlarge=enlarge, memory=MEMORY), settings, written)
         how = f"{settings.name}, {settings.steps} steps, truth: {source}"
         monitor.say(f"tuning for {start.recipe.name} ({start.recipe.source}): {how}")
+        announce([start], cameras.train, monitor, GRADIENTS * settings.steps / len(cameras.train))
         state = tune(job, path and _beside(path, "pt"), o.checkpoint_every, o.resume, monitor)
         tuned = recorded(state, job, viewer.convention_of(scene), {"for": viewer.name, "method": settings.name})
         if path is not None:
@@ -162,8 +168,6 @@ def _settings(o: FinetuneOptions) -> Settings:
 
 def _check(path: Path | None, sources: Sequence[Path], o: FinetuneOptions) -> None:
     """Check, before any work, the checkpoints, and that the scene and the files beside it may be written."""
-    if o.checkpoint_every < 1:
-        raise UsageError("checkpoint_every", f"must be 1 or more, got {o.checkpoint_every}")
     if path is None:
         if o.resume:
             raise UsageError("resume", "needs the `output` of the interrupted run")

@@ -86,8 +86,6 @@ def look_of(scene: Gaussians, cameras: CameraSet, frames: int, o: ViewOptions, m
         name = {WHITE: "white", BLACK: "black"}.get(colour, str(colour))
         source = "from the camera files" if cameras.background else "the camera files do not say"
         monitor.say(f"background: {name} ({source})")
-    if o.memory is not None and not o.memory > 0:
-        raise UsageError("memory", f"must be above 0, got {o.memory:g}")
     drawing = o.rasterizer
     if isinstance(drawing, str):
         drawing = find_rasterizer(drawing, frames, monitor.say)
@@ -104,8 +102,6 @@ def drawn_by(recipe: Recipe, scene: Gaussians, look: Renderer) -> Renderer:
 @contextmanager
 def processor(threads: int | None) -> Iterator[int]:
     """Limit torch to `threads` threads inside the block (None for its own default); yields their number."""
-    if threads is not None and threads < 1:
-        raise UsageError("threads", f"must be 1 or more, got {threads}")
     count = torch.get_num_threads() if threads is None else threads
     with torch_threads(count):
         yield count

@@ -2,9 +2,11 @@
 
 import inspect
 import math
+import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
-from typing import Annotated, Any, TypeVar, get_args
+from functools import cache
+from typing import Annotated, Any, TypeVar, get_args, get_type_hints
 
 import tyro
 
@@ -41,13 +43,65 @@ def choices(names: Iterable[str]) -> Any:
     )
 
 
+def number(least: int | float, most: int | float, *, whole: bool = False, several: bool = False) -> Any:
+    """An option that takes a number from `least` to `most`, an integer if `whole`, or one or more if `several`.
+
+    `--help` shows the range, and `Options` refuses what is outside of it.
+    """
+    kind, shown = int if whole else float, f"{least:.10g}..{most:.10g}" + " ..." * several
+
+    def read(words: list[str]) -> Any:
+        try:
+            values = tuple(map(kind, words))
+        except ValueError as error:
+            raise ValueError(f"takes {shown}, got {' '.join(words)[:SHOWN]}") from error
+        return values if several else values[0]
+
+    def fits(value: Any) -> bool:
+        values = value if several else [value]
+        kinds = (int,) if whole else (int, float)
+        return (
+            isinstance(values, (list, tuple))
+            and len(values) > 0
+            and all(isinstance(v, kinds) and not isinstance(v, bool) and least <= v <= most for v in values)
+        )
+
+    return tyro.constructors.PrimitiveConstructorSpec(
+        "*" if several else 1,
+        shown,
+        read,
+        fits,
+        lambda value: [str(v) for v in (value if several and value else [value])],
+    )
+
+
+UNSET: Any = tyro.conf.arg(help_behavior_hint="")  # an option that is absent unless given: its help shows no default
+SCALE = number(0.001, 64)  # sizes of images against the training size
+SCALES = number(0.001, 64, several=True)
+STEPS = number(0, 1_000_000, whole=True)
+_SHARE = number(0, 1)
+THREADS = number(1, max(8, os.cpu_count() or 1), whole=True)  # more gain nothing, and can exhaust the machine
+_GIGABYTES = number(0.01, 1024)
+_MARGIN = number(0, math.inf)
+SHOWN = 60  # letters of a refused value
 _RESEARCH = {recipe.name for recipe in RESEARCH_RECIPES}
 RECIPE_NAMES = [name for name in RECIPES if name not in _RESEARCH]  # a user's, and plug-ins'
 
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """The options of a verb."""
+    """The options of a verb.
+
+    Raises:
+        UsageError: a number is outside of its option's range.
+    """
+
+    def __post_init__(self) -> None:
+        for name, spec in _specs(type(self)).items():
+            value = getattr(self, name)
+            if value is not None and not spec.is_instance(value):
+                got = ", ".join(map(str, value)) if isinstance(value, (list, tuple)) else str(value)
+                raise UsageError(name, f"takes {spec.metavar}, got {got[:SHOWN] or 'nothing'}")
 
     @classmethod
     def of(cls: type[Chosen], given: Mapping[str, Any]) -> Chosen:
@@ -67,11 +121,22 @@ class Options:
         return verb
 
 
+@cache
+def _specs(options: type[Options]) -> dict[str, Any]:
+    """How values of options are read and checked, by the option's name."""
+    found = {}
+    for name, hint in get_type_hints(options, include_extras=True).items():
+        for spec in getattr(hint, "__metadata__", ()):
+            if isinstance(spec, tyro.constructors.PrimitiveConstructorSpec):
+                found[name] = spec
+    return found
+
+
 @dataclass(frozen=True, kw_only=True)
 class FrameOptions(Options):
     """Whether scene and cameras belong together."""
 
-    min_seen: float = MIN_SEEN_SHARE
+    min_seen: Annotated[float, _SHARE] = MIN_SEEN_SHARE
     """Stop if the cameras see a smaller share of the Gaussians than this."""
 
 
@@ -85,11 +150,11 @@ class ViewOptions(FrameOptions):
     """Colour behind the scene; auto is what training had."""
     rasterizer: Annotated[str | Rasterizer, choice(("auto", "compiled", *RASTERIZERS))] = "auto"
     """auto: compiled if `aaplug warmup` has run, else eager.  reference: slow, exact, float64."""
-    threads: Annotated[int | None, flag("N")] = None
+    threads: Annotated[int | None, THREADS, UNSET] = None
     """Processor threads (default: all)."""
-    memory: Annotated[float | None, flag("GB")] = None
-    """Memory per frame, beside the scene and the image (default: 1)."""
-    cull_margin: Annotated[float, flag("SHARE")] = math.inf
+    memory: Annotated[float | None, _GIGABYTES, UNSET] = None
+    """Memory per frame in GB, beside the scene and the image (default: 1)."""
+    cull_margin: Annotated[float, _MARGIN, UNSET] = math.inf
     """Cull Gaussians centred farther outside the image than this share of its longer side, if training did."""
 
 
@@ -109,7 +174,7 @@ class ImageOptions(Options):
 
     recipe: Annotated[str | Recipe, choice([*RECIPE_NAMES, "..."])] = "auto"
     """How to render; examples/guides/methods.md lists further recipes, for research."""
-    scale: Annotated[float | None, flag("FACTOR")] = None
+    scale: Annotated[float | None, SCALE, UNSET] = None
     """Size relative to the training size, or to that of a path file (default: 1)."""
     resolution: Annotated[str | None, flag("WxH")] = None
     """Size in px, such as 400x400; -1 on one side keeps the aspect (-1x720)."""

@@ -13,6 +13,7 @@ from aaplug.io.cameras import select_views
 from aaplug.methods.recipes import find_recipe
 from aaplug.rendering.frames import write_frames
 from aaplug.rendering.renderer import Renderer
+from aaplug.verbs.announce import announce
 from aaplug.verbs.inputs import AnyPath, CamerasLike, SceneLike, drawn_by, inputs_of, look_of, processor
 from aaplug.verbs.options import ImageOptions, RecipeOptions
 from aaplug.verbs.views import image_paths, resized
@@ -64,6 +65,7 @@ def render(
     with processor(o.threads) as workers:
         renderer = drawn_by(recipe, scene, look_of(scene, cameras, len(shown), o, monitor))
         monitor.say(described(renderer, shown))
+        announce([renderer], shown, monitor, processes=workers)
         if not folder.suffix:
             make_folder(folder)
         how = {"threads": workers, "bit_depth": o.bit_depth, "overwrite": o.overwrite}

@@ -19,10 +19,11 @@ from aaplug.evaluation.protocols import median_depth
 from aaplug.evaluation.report.contact_sheet import labelled
 from aaplug.io.cameras import select_views
 from aaplug.io.cameras.camera_path import read_camera_path
-from aaplug.io.video import check_video
+from aaplug.io.video import MOST_FPS, check_video
 from aaplug.rendering.videos import make_video
+from aaplug.verbs.announce import announce
 from aaplug.verbs.inputs import AnyPath, CamerasLike, SceneLike, drawn_by, inputs_of, look_of, processor, recipe_of
-from aaplug.verbs.options import RECIPE_NAMES, ImageOptions, RecipeOptions, choice, flag
+from aaplug.verbs.options import RECIPE_NAMES, SCALE, UNSET, ImageOptions, RecipeOptions, choice, number
 from aaplug.verbs.views import resized
 
 FPS = 30.0  # frames per second, where neither the caller nor a path file says
@@ -46,13 +47,13 @@ class VideoOptions(RecipeOptions, ImageOptions):
     """zoom (focal length), dolly (distance) or orbit from the first of --views, or nerfstudio's camera_path.json."""
     beside: Annotated[str | None, choice(["none", *RECIPE_NAMES, "..."])] = "classic"
     """Recipe to show on the left."""
-    start: float = 1.0
+    start: Annotated[float, SCALE] = 1.0
     """Sampling rate at the start of a zoom or dolly, relative to training."""
-    end: float = 0.125
+    end: Annotated[float, SCALE] = 0.125
     """Sampling rate where it turns back."""
-    seconds: float = 6.0
-    """Length of a zoom, dolly or orbit."""
-    fps: Annotated[float | None, flag("N")] = None
+    seconds: Annotated[float, number(0.01, 3600)] = 6.0
+    """Length in seconds of a zoom, dolly or orbit."""
+    fps: Annotated[float | None, number(0.1, MOST_FPS), UNSET] = None
     """Frames per second (default: the path file's, or 30)."""
 
 
@@ -88,6 +89,7 @@ def video(
         renderers = [drawn_by(recipe, scene, look) for recipe in recipes]
         size = f"{shown[0].width}x{shown[0].height}"
         monitor.say(f"{len(shown)} frames of {size} px per pane, {fps:g} per second")
+        announce(renderers, shown, monitor, processes=workers)
         with monitor.progress("rendering", "images") as tell:
             make_video(output, renderers, shown, fps, compose, threads=workers, overwrite=o.overwrite, tell=tell)
     return Clip(Path(output), len(shown), fps)
@@ -104,9 +106,6 @@ def side_by_side(images: Sequence[Float[Tensor, "h _ 3"]], labels: Sequence[str]
 
 def _along(scene: Gaussians, cameras: CameraSet, o: VideoOptions, fps: float, monitor: Monitor) -> list[Camera]:
     """The cameras of a built-in path."""
-    for name in ("start", "end", "seconds"):
-        if not getattr(o, name) > 0:
-            raise UsageError(name, f"must be above 0, got {getattr(o, name):g}")
     count = max(1, round(o.seconds * fps))
     if count > MOST_FRAMES:
         raise UsageError("seconds", f"makes {count:,} frames; the limit is {MOST_FRAMES:,}")

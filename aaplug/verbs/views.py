@@ -9,6 +9,7 @@ from aaplug.core.errors import OutputError, UsageError
 from aaplug.io.atomic import check_output, refuse_existing
 
 MAX_SIDE = 16384  # px
+SHOWN = 60  # letters of a refused value
 
 
 def resized(views: Sequence[Camera], scale: float | None = None, resolution: str | None = None) -> list[Camera]:
@@ -19,16 +20,27 @@ def resized(views: Sequence[Camera], scale: float | None = None, resolution: str
     """
     if scale is not None and resolution is not None:
         raise UsageError("scale", "and `resolution` both set the size; give one")
-    if scale is not None and not scale > 0:
-        raise UsageError("scale", f"must be above 0, got {scale:g}")
     if resolution is not None:
         sized = [view.resized(*_size(resolution, view)) for view in views]
     else:
         sized = [view.scaled(1.0 if scale is None else scale) for view in views]
     for view in sized:
-        if max(view.hw) > MAX_SIDE:
-            raise UsageError(view.name, f"would be {view.width}x{view.height} px; the limit is {MAX_SIDE} a side")
+        _check_side(view.name, view.width, view.height)
     return sized
+
+
+def size_of(text: str) -> tuple[int, int]:
+    """Width and height of "400x300", in px.
+
+    Raises:
+        UsageError: it is no size, or a side is above `MAX_SIDE`.
+    """
+    match = re.fullmatch(r"([1-9]\d{0,8})x([1-9]\d{0,8})", text, re.ASCII)
+    if match is None:
+        raise UsageError("resolution", f"takes sizes such as 400x400, got {text[:SHOWN]}")
+    width, height = int(match[1]), int(match[2])
+    _check_side("resolution", width, height)
+    return width, height
 
 
 def image_paths(output: Path, views: Sequence[Camera], overwrite: bool) -> list[Path]:
@@ -56,10 +68,17 @@ def file_names(names: Sequence[str], nameless: str, digits: int) -> list[str]:
 
 
 def _size(text: str, view: Camera) -> tuple[int, int]:
-    match = re.fullmatch(r"(-?\d+)x(-?\d+)", text)
-    width, height = (int(match[1]), int(match[2])) if match else (0, 0)
-    if max(width, height) < 1 or min(width, height) == 0:
-        raise UsageError("resolution", f"expected WIDTHxHEIGHT such as 400x400 or -1x720, got '{text}'")
-    if width < 0:
+    """The size that the text means for a view: -1 on one side keeps the view's aspect."""
+    first, _, last = text.partition("x")
+    if first == "-1":
+        _, height = size_of(f"1x{last}")
         return max(1, round(view.width * height / view.height)), height
-    return width, max(1, round(view.height * width / view.width)) if height < 0 else height
+    if last == "-1":
+        width, _ = size_of(f"{first}x1")
+        return width, max(1, round(view.height * width / view.width))
+    return size_of(text)
+
+
+def _check_side(where: str, width: int, height: int) -> None:
+    if max(width, height) > MAX_SIDE:
+        raise UsageError(where, f"would be {width}x{height} px; the limit is {MAX_SIDE} a side")

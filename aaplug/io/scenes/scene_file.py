@@ -19,7 +19,7 @@ from torch import Tensor
 from aaplug.core.errors import AaplugError, FormatError, listing, reason
 from aaplug.core.gaussians import CLASSIC, MAX_LOG_SCALE, MIN_OPACITY, Convention, Fusion, Gaussians, Origin
 from aaplug.core.spherical_harmonics import COLOUR_OFFSET, SH_C0
-from aaplug.io.limits import limit, memory_of_machine, whole_limit
+from aaplug.io.limits import lack_of_memory, whole_limit
 
 SHORTEST_QUATERNION = 1e-12  # torch's `normalize` does not normalize a shorter one
 PART = 1 << 16  # Gaussians per part: 15 MB at degree 3
@@ -85,13 +85,9 @@ class SceneFile:
     def whole(self, drop_bad: bool = False) -> Gaussians:
         """The whole scene; raises FormatError as `parts`, and above the limit MEMORY_SHARE of the machine's memory."""
         needed = self.count * FLOAT * (11 + 3 * (self.sh_degree + 1) ** 2)
-        memory, share = memory_of_machine(), limit("MEMORY_SHARE")
-        if memory is not None and needed > share * memory:
-            raise FormatError(
-                self.path,
-                f"its {self.count:,} Gaussians take {needed / 1e9:.1f} GB, more than {share:.0%} of this machine's "
-                f"{memory / 1e9:.0f} GB; info and convert read it in parts, AAPLUG_MEMORY_SHARE=1 allows all",
-            )
+        if lacking := lack_of_memory(needed):
+            hint = "info and convert read it in parts, AAPLUG_MEMORY_SHARE=1 allows all"
+            raise FormatError(self.path, f"its {self.count:,} Gaussians take {lacking}; {hint}")
         (scene,) = self.parts(drop_bad, max(1, self.count))
         return scene
 

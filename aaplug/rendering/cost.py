@@ -1,0 +1,37 @@
+"""What rendering will cost, estimated before it starts.
+
+Times are those of examples/guides/speed.md, on two cores; other machines differ by a factor of two or so.
+"""
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+from aaplug.core.cameras import Camera
+from aaplug.rendering.renderer import Renderer
+
+COMPILED = 0.19e-6, 0.047e-6  # seconds per Gaussian of the scene, and per sample of the image
+EAGER = 0.64e-6, 0.29e-6
+GRADIENTS = 3.0  # a frame with gradients against one without
+SAMPLE_BYTES = 32.0  # per sample: red, green, blue and alpha in float32, and a copy
+
+
+class Cost(NamedTuple):
+    """Seconds of work; bytes of the scene, and of the largest image."""
+
+    seconds: float
+    scene: float
+    image: float
+
+
+def cost_of(renderers: Iterable[Renderer], views: Iterable[Camera]) -> Cost:
+    """The cost of rendering every view with every renderer, one after another."""
+    views, found = list(views), Cost(0.0, 0.0, 0.0)
+    for renderer in renderers:
+        per_gaussian, per_sample = COMPILED if renderer.rasterizer.name == "compiled" else EAGER
+        samples = [view.width * view.height * renderer.samples(view) ** 2 for view in views]
+        found = Cost(
+            found.seconds + per_gaussian * len(renderer.scene) * len(views) + per_sample * sum(samples),
+            max(found.scene, renderer.scene.sh.nbytes),
+            max(found.image, SAMPLE_BYTES * max(samples, default=0)),
+        )
+    return found

@@ -1,0 +1,36 @@
+"""Telling what a long or large job will take before it starts, and refusing what this machine cannot hold."""
+
+from collections.abc import Sequence
+
+from aaplug.core.cameras import Camera
+from aaplug.core.errors import UsageError, listing
+from aaplug.core.monitor import Monitor
+from aaplug.io.limits import lack_of_memory
+from aaplug.rendering.cost import cost_of
+from aaplug.rendering.frames import PAYS_AFTER
+from aaplug.rendering.renderer import Renderer
+
+LONG = 60.0  # seconds of work from which a job is announced
+LARGE = 4e9  # bytes from which it is
+
+
+def announce(
+    renderers: Sequence[Renderer], views: Sequence[Camera], monitor: Monitor, passes: float = 1.0, processes: int = 1
+) -> None:
+    """Say how long rendering the views will take, and with how much memory, where that is worth knowing.
+
+    passes: how often each view is rendered by each renderer.  processes: that share the work.
+
+    Raises:
+        UsageError: it would take more memory than the limit MEMORY_SHARE of the machine's allows.
+    """
+    cost = cost_of(renderers, views)
+    seconds = cost.seconds * passes
+    needed = cost.scene + cost.image * (processes if seconds > PAYS_AFTER else 1)
+    sizes = listing(sorted({f"{view.width}x{view.height}" for view in views}), most=3)
+    what = f"{len(views)} image{'s' * (len(views) != 1)} at {sizes}"
+    if lacking := lack_of_memory(needed):
+        raise UsageError(what, f"would take {lacking}; a smaller `scale` or fewer `threads` need less")
+    if seconds >= LONG or needed >= LARGE:
+        minutes = f"about {seconds / 60:.0f} minutes" if seconds >= LONG else "under a minute"
+        monitor.say(f"{what}: {minutes}, {needed / 1e9:.1f} GB; `views` picks fewer")
