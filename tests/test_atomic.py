@@ -5,12 +5,15 @@ import multiprocessing
 import os
 import resource
 import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 from aaplug.core.errors import OutputError
-from aaplug.io.atomic import check_output, replacing
+from aaplug.core.locks import OURS, remove_left
+from aaplug.io.atomic import check_output, claimed, output_folder, replacing
 
 OLD, NEW = b"old", b"new and longer"
 
@@ -169,3 +172,43 @@ def test_a_disk_that_fills_up_leaves_the_old_file(output: Path):
     child.join(30)
     assert child.exitcode == 0
     assert only_the_old_file_is_there(output)
+
+
+CLAIM = """
+import sys, time
+from pathlib import Path
+from aaplug.io.atomic import claimed, replacing
+path = Path(sys.argv[1])
+with claimed(path), replacing(path / "file", False) as stream:
+    stream.write(b"half")
+    print("ready", flush=True)
+    time.sleep(60)
+"""
+
+
+def test_an_output_is_written_by_one_process_and_a_killed_one_leaves_nothing(tmp_path: Path):
+    words = [sys.executable, "-c", CLAIM, str(tmp_path)]
+    with subprocess.Popen(words, stdout=subprocess.PIPE) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == b"ready\n"
+        with pytest.raises(OutputError, match="is being written by another process"), claimed(tmp_path):
+            pass
+        remove_left.cache_clear()
+        remove_left(tmp_path, OURS)
+        assert len(list(tmp_path.iterdir())) == 2  # the claim and the temporary file are held
+        other.kill()
+    assert len(list(tmp_path.iterdir())) == 2
+    remove_left.cache_clear()
+    with claimed(tmp_path):
+        write(tmp_path / "file", NEW)
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_folder_that_nothing_was_written_to_is_removed(tmp_path: Path):
+    with pytest.raises(ValueError, match="failed"), output_folder(tmp_path / "a" / "b"):
+        raise ValueError("failed")
+    assert list(tmp_path.iterdir()) == []
+    kept = tmp_path / "a" / "b" / "kept"
+    with pytest.raises(FileExistsError), output_folder(kept.parent):
+        [kept.touch(exist_ok=False) for _ in range(2)]
+    assert kept.exists()

@@ -10,6 +10,7 @@ import pytest
 from aaplug.core.errors import FormatError
 from aaplug.evaluation.journal import Journal
 from aaplug.evaluation.results import Measurement, Report
+from aaplug.io.atomic import claimed
 from aaplug.io.batch_file import read_batch
 from aaplug.verbs.batch import batch as evaluate_all
 from tests.test_cli import cli, dataset  # noqa: F401  (fixtures)
@@ -220,3 +221,12 @@ def test_no_failure_of_a_scene_costs_another(tmp_path):
     # a mean over fewer scenes would not compare
     assert found.summary()["mean"] == {"auto@1": {"PSNR": None}}
     assert json.loads((tmp_path / "out/batch.json").read_text()) == found.summary()
+
+
+def test_two_batches_do_not_share_a_folder(batch):
+    assert batch("evaluate --batch batch.toml")[0] == 1
+    before = Path("out/batch.json").read_bytes()
+    with claimed("out"):
+        code, _, err = batch("evaluate --batch batch.toml --resume")
+    assert (code, "out: is being written by another process" in err) == (2, True)
+    assert Path("out/batch.json").read_bytes() == before

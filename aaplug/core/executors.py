@@ -7,7 +7,6 @@ with the number of items.  Leaving the loop early, also by an exception, ends th
 import multiprocessing
 import os
 import shutil
-import tempfile
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
@@ -21,6 +20,7 @@ from typing import Any, TypeVar
 import torch
 
 from aaplug.core.errors import UsageError
+from aaplug.core.locks import scratch
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -63,9 +63,9 @@ class Processes:
         Raises:
             UsageError: a process died, for example for lack of memory.
         """
-        with tempfile.TemporaryDirectory(prefix="aaplug-", ignore_cleanup_errors=True) as folder:
-            torch.save(work, Path(folder) / "work.pt")
-            start = (folder, self.torch_threads)
+        with scratch() as folder:
+            torch.save(work, folder / "work.pt")
+            start = (str(folder), self.torch_threads)
             spawn = multiprocessing.get_context("spawn")
             pool = ProcessPoolExecutor(self.workers, spawn, _start, start)
             try:

@@ -8,12 +8,13 @@ an uninterrupted one does.
 import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from aaplug.core.errors import OutputError, UsageError, listing, reason
+from aaplug.core.locks import lock
 from aaplug.evaluation.results import Measurement
 
 
@@ -104,10 +105,5 @@ def _whole_lines(stream: BinaryIO) -> list[dict[str, Any]]:
 
 def _lock(stream: BinaryIO, path: Path) -> None:
     """Lock the journal for this process; the system releases the lock when the process ends."""
-    with suppress(ImportError):
-        import fcntl
-
-        try:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise UsageError(str(path), "another process is writing it") from error
+    if not lock(stream.fileno()):
+        raise UsageError(str(path), "another process is writing it")

@@ -6,17 +6,20 @@ is interrupted, the old file is unchanged and the temporary file is removed.
 Functions raise OutputError for an output that exists while `overwrite` is false, has no folder or cannot be written.
 """
 
+import hashlib
 import os
 import secrets
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from os import PathLike
 from pathlib import Path
 from typing import BinaryIO
 
 from aaplug.core.errors import OutputError, listing, reason
+from aaplug.core.locks import OURS, new_file, remove_left
 
 TOKEN_BYTES = 8  # random bytes in a temporary file's name: 2^64 names
+DIGITS = 16  # of the hash that names a claim
 
 
 @contextmanager
@@ -25,22 +28,23 @@ def replacing(path: str | PathLike[str], overwrite: bool) -> Iterator[BinaryIO]:
 
     The block should only write: any OSError in it is reported as a failure to write `path`.
     """
-    # "x" never opens somebody else's file or link
-    with replacing_file(path, overwrite) as temporary, open(temporary, "xb") as stream:
+    with replacing_file(path, overwrite) as temporary, open(temporary, "wb") as stream:
         yield stream
 
 
 @contextmanager
 def replacing_file(path: str | PathLike[str], overwrite: bool, suffix: str = ".tmp") -> Iterator[Path]:
-    """Like `replacing`, for libraries that open their file themselves: yields a path that ends in `suffix`."""
+    """Like `replacing`, for libraries that open their file themselves: yields an empty file that ends in `suffix`."""
     path = Path(path)
     _check_target(path, overwrite)
     target = Path(os.path.realpath(path))  # a link stays a link; its target is replaced
-    temporary = target.with_name(f".aaplug-{secrets.token_hex(TOKEN_BYTES)}{suffix}")
+    temporary = target.with_name(f"{OURS}{secrets.token_hex(TOKEN_BYTES)}{suffix}")
+    remove_left(target.parent, OURS)
     try:
-        yield temporary
-        _sync(temporary, os.O_RDWR)
-        os.replace(temporary, target)
+        with new_file(temporary):
+            yield temporary
+            _sync(temporary, os.O_RDWR)
+            os.replace(temporary, target)
     except BaseException as error:  # Ctrl-C too
         with suppress(OSError):
             temporary.unlink()
@@ -49,6 +53,27 @@ def replacing_file(path: str | PathLike[str], overwrite: bool, suffix: str = ".t
         raise
     with suppress(OSError):  # makes the new name permanent; some systems cannot open a folder
         _sync(target.parent, os.O_RDONLY)
+
+
+@contextmanager
+def claimed(path: str | PathLike[str]) -> Iterator[None]:
+    """Keep other processes from writing an output, a file or a folder, while the block runs.
+
+    Raises:
+        OutputError: another process is writing it, or nothing can be written beside it.
+    """
+    path = Path(os.path.realpath(path))
+    name = OURS + hashlib.sha256(os.fsencode(path.name)).hexdigest()[:DIGITS]
+    mark = path / name if path.is_dir() else path.with_name(name)
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(new_file(mark))
+        except FileExistsError as error:
+            raise OutputError(path, "is being written by another process") from error
+        except OSError as error:
+            raise OutputError(path, f"cannot be written: {reason(error)}") from error
+        stack.callback(mark.unlink, missing_ok=True)
+        yield
 
 
 def check_output(path: str | PathLike[str], overwrite: bool, inputs: Iterable[str | PathLike[str]] = ()) -> None:
@@ -67,6 +92,21 @@ def make_folder(path: str | PathLike[str]) -> Path:
     except OSError as error:
         raise OutputError(path, f"cannot be made: {reason(error)}") from error
     return Path(path)
+
+
+@contextmanager
+def output_folder(path: str | PathLike[str]) -> Iterator[Path]:
+    """Make a folder for the outputs of the block; if it fails, remove what was made and is still empty."""
+    path = Path(path)
+    made = [folder for folder in (path, *path.parents) if not folder.exists()]
+    make_folder(path)
+    try:
+        yield path
+    except BaseException:
+        with suppress(OSError):  # one that is not empty stays, and so do those that hold it
+            for folder in made:
+                folder.rmdir()
+        raise
 
 
 def refuse_existing(paths: Sequence[Path], overwrite: bool) -> None:

@@ -1,6 +1,5 @@
 """A camera path as a video: one renderer's images, or those of several in one frame."""
 
-import tempfile
 from collections.abc import Callable, Sequence
 from os import PathLike
 from pathlib import Path
@@ -9,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.cameras import Camera
+from aaplug.core.locks import scratch
 from aaplug.core.monitor import Tell
 from aaplug.io.images import read_image
 from aaplug.io.video import check_video, write_video
@@ -41,10 +41,10 @@ def make_video(
     path = Path(path)
     check_video(path, fps, overwrite)
     count = len(cameras)
-    with tempfile.TemporaryDirectory(prefix="aaplug-") as name:
+    with scratch() as folder:
         panes: list[list[Path]] = []
         for place, renderer in enumerate(renderers):
-            panes.append([Path(name) / f"{place}-{index:06d}.png" for index in range(count)])
+            panes.append([folder / f"{place}-{index:06d}.png" for index in range(count)])
 
             def tell_all(done: int, _: int, before: int = place * count) -> None:
                 tell(before + done, count * len(renderers))

@@ -14,7 +14,7 @@ from aaplug.core.errors import AaplugError
 from aaplug.core.monitor import SILENT, Monitor
 from aaplug.evaluation.report.files import as_json, write_texts
 from aaplug.evaluation.results import Report, as_csv, grid, method, results
-from aaplug.io.atomic import refuse_existing
+from aaplug.io.atomic import claimed, output_folder, refuse_existing
 from aaplug.verbs.evaluate import EvaluateOptions, check_results
 from aaplug.verbs.inputs import AnyPath
 from aaplug.verbs.views import file_names
@@ -89,6 +89,18 @@ def batch(
     refuse_existing([Path(output) / name for name in (SUMMARY, RESULTS)], overwrite or resume)
     for folder in folders:
         check_results(folder, EvaluateOptions(resume=resume, overwrite=overwrite))
+    with output_folder(output) as made, claimed(made):
+        return _batch(runs, folders, Path(output), resume, overwrite, monitor)
+
+
+def _batch(
+    runs: Sequence[tuple[str, Callable[..., Report]]],
+    folders: Sequence[Path],
+    output: Path,
+    resume: bool,
+    overwrite: bool,
+    monitor: Monitor,
+) -> Batch:
     reports: dict[str, Report] = {}
     failures: dict[str, str] = {}
     for folder, (name, run) in zip(folders, runs, strict=True):

@@ -15,7 +15,7 @@ from aaplug.core.training import TrainingViews
 from aaplug.evaluation.report.contact_sheet import contact_sheet
 from aaplug.evaluation.report.files import RESULTS
 from aaplug.evaluation.results import Report, scale_name
-from aaplug.io.atomic import make_folder, refuse_existing
+from aaplug.io.atomic import output_folder, refuse_existing
 from aaplug.io.cameras import read_cameras
 from aaplug.io.images import read_image, write_png
 from aaplug.io.scenes import read_scene
@@ -38,8 +38,7 @@ def demo(output: AnyPath = "demo-out", *, overwrite: bool = False, monitor: Moni
     """
     folder = Path(output)
     refuse_existing([folder / name for name in (CONVERTED, SHEET, *RESULTS)], overwrite)
-    make_folder(folder)
-    with as_file(files("aaplug.io.sample")) as sample:
+    with output_folder(folder), as_file(files("aaplug.io.sample")) as sample:
         scene, cameras = read_scene(sample / "chair.ply"), read_cameras(sample)
         counts = f"{len(scene):,} Gaussians, {len(cameras.train)} training cameras"
         monitor.say(f"sample: {counts}, {len(cameras.test)} photographs")

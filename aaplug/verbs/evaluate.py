@@ -2,7 +2,8 @@
 
 import math
 import platform
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -25,7 +26,7 @@ from aaplug.evaluation.report.files import PAGE, RESULTS, write_page, write_resu
 from aaplug.evaluation.results import Report
 from aaplug.evaluation.truth import Truth, source_of
 from aaplug.inspection.coverage import coverage
-from aaplug.io.atomic import refuse_existing
+from aaplug.io.atomic import claimed, output_folder, refuse_existing
 from aaplug.io.cameras import select_views
 from aaplug.methods.recipe import Recipe
 from aaplug.methods.recipes import RECIPES, USER_RECIPES, suited
@@ -105,7 +106,7 @@ def evaluate(
     source = _source(o.truth, rules, seen, monitor)
     facts = _facts(scene, cameras, seen, source, o)
     images = folder and ImageStore(folder, shown, everything=o.layout == "inria")
-    with processor(o.threads):
+    with processor(o.threads), _claimed(folder):
         look = look_of(scene, cameras, len(seen) * len(recipes) * len(scales), o, monitor)
         candidates = candidates_of(scene, look.training, recipes, look.rasterizer, look.background)
         task = Task(candidates, scales, seen, Truth(look, source, rules), metrics)
@@ -113,15 +114,25 @@ def evaluate(
         announce([candidate.renderer for candidate in candidates], drawn, monitor)
         with monitor.progress(f"evaluating {name}", "views") as tell:
             found = measure(task, facts, tell, folder and folder / JOURNAL, o.resume, images)
-    if folder and images:
-        replaces = o.overwrite or o.resume
-        written = write_results(found, folder, replaces, name)
-        if o.report:
-            bounds = coverage(scene, look.training, found.scales)
-            written += write_page(folder, name, found, bounds, images, replaces)
-        for path in written:
-            monitor.say(f"wrote {path}")
+        if folder and images:
+            replaces = o.overwrite or o.resume
+            written = write_results(found, folder, replaces, name)
+            if o.report:
+                bounds = coverage(scene, look.training, found.scales)
+                written += write_page(folder, name, found, bounds, images, replaces)
+            for path in written:
+                monitor.say(f"wrote {path}")
     return found
+
+
+@contextmanager
+def _claimed(folder: Path | None) -> Iterator[None]:
+    """The folder of the results, for this process alone; nothing without one."""
+    if folder is None:
+        yield
+        return
+    with output_folder(folder), claimed(folder):
+        yield
 
 
 def check_results(folder: Path | None, o: EvaluateOptions) -> None:

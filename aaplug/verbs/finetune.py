@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -26,7 +27,7 @@ from aaplug.finetuning.parameters import RATES
 from aaplug.finetuning.session import recorded, tune
 from aaplug.finetuning.settings import METHODS, OURS, Settings, settings_of
 from aaplug.finetuning.state import TuningJob
-from aaplug.io.atomic import check_output, replacing
+from aaplug.io.atomic import check_output, claimed, replacing
 from aaplug.io.cameras import select_views
 from aaplug.io.images import write_png
 from aaplug.io.scenes import SpzAxes, check_scene_output, write_scene
@@ -132,7 +133,7 @@ def finetune(
     enlarge = back_projected if o.upsampler is None else upsampled(find_upsampler(o.upsampler))
     named = str(o.upsampler)
     written = digest_of_files([named]) if Path(named).is_file() else named
-    with processor(o.threads):
+    with processor(o.threads), nullcontext() if path is None else claimed(path):
         look = look_of(scene, cameras, settings.steps, o, monitor)
         before = replace(look, recipe=RECIPES[viewer.recipe])
         start = replace(before, scene=fuse_for(scene, look.training, viewer))

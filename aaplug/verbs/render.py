@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple
 from aaplug.core.cameras import Camera
 from aaplug.core.errors import listing
 from aaplug.core.monitor import SILENT, Monitor
-from aaplug.io.atomic import make_folder
+from aaplug.io.atomic import output_folder
 from aaplug.io.cameras import select_views
 from aaplug.methods.recipes import find_recipe
 from aaplug.rendering.frames import write_frames
@@ -61,15 +61,13 @@ def render(
         recipe = find_recipe(recipe, quality=o.quality, rate_reference=o.rate_reference)
     scene, cameras = inputs_of(scene, cameras)
     shown = resized(select_views(cameras, o.views), o.scale, o.resolution)
-    folder, paths = Path(output), image_paths(Path(output), shown, o.overwrite)
+    paths = image_paths(Path(output), shown, o.overwrite)
     with processor(o.threads) as workers:
         renderer = drawn_by(recipe, scene, look_of(scene, cameras, len(shown), o, monitor))
         monitor.say(described(renderer, shown))
         announce([renderer], shown, monitor, processes=workers)
-        if not folder.suffix:
-            make_folder(folder)
         how = {"threads": workers, "bit_depth": o.bit_depth, "overwrite": o.overwrite}
-        with monitor.progress("rendering", "views") as tell:
+        with output_folder(paths[0].parent), monitor.progress("rendering", "views") as tell:
             write_frames(renderer, shown, paths, **how, tell=tell)
     return [Written(*pair) for pair in zip(shown, paths, strict=True)]
 

@@ -9,6 +9,8 @@ from aaplug.core.errors import OutputError, UsageError
 from aaplug.io.atomic import check_output, refuse_existing
 
 MAX_SIDE = 16384  # px
+IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".exr", ".bmp", ".gif")  # any other name is a folder
+LONGEST_NAME = 200  # bytes; file systems take 255, and a number and a suffix are added
 SHOWN = 60  # letters of a refused value
 
 
@@ -49,7 +51,7 @@ def image_paths(output: Path, views: Sequence[Camera], overwrite: bool) -> list[
     Raises:
         OutputError: an image exists and `overwrite` is false, or one .png is named for several views.
     """
-    if output.suffix:
+    if output.suffix.lower() in IMAGES:
         if output.suffix.lower() != ".png" or len(views) != 1:
             raise OutputError(output, f"name a folder, or one .png for one view ({len(views)} views asked for)")
         check_output(output, overwrite)
@@ -61,7 +63,7 @@ def image_paths(output: Path, views: Sequence[Camera], overwrite: bool) -> list[
 
 def file_names(names: Sequence[str], nameless: str, digits: int) -> list[str]:
     """Names fit for files; all are numbered where two would be the same."""
-    slugs = [re.sub(r"[^\w.\-]+", "_", name).lstrip(".") or nameless for name in names]
+    slugs = [_cut(re.sub(r"[^\w.\-]+", "_", name).lstrip(".") or nameless) for name in names]
     if len({slug.casefold() for slug in slugs}) < len(slugs):
         return [f"{index:0{digits}d}_{slug}" for index, slug in enumerate(slugs)]
     return slugs
@@ -77,6 +79,11 @@ def _size(text: str, view: Camera) -> tuple[int, int]:
         width, _ = size_of(f"{first}x1")
         return width, max(1, round(view.height * width / view.width))
     return size_of(text)
+
+
+def _cut(slug: str) -> str:
+    """The name, cut to what every file system takes."""
+    return slug.encode()[:LONGEST_NAME].decode(errors="ignore")
 
 
 def _check_side(where: str, width: int, height: int) -> None:

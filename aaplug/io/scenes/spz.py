@@ -14,7 +14,6 @@ import gzip
 import io
 import math
 import struct
-import tempfile
 import zlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -29,6 +28,7 @@ from torch import Tensor
 
 from aaplug.core.errors import FormatError, OutputError
 from aaplug.core.gaussians import ANTIALIASED, CLASSIC, Gaussians
+from aaplug.core.locks import scratch
 from aaplug.io.atomic import replacing
 from aaplug.io.limits import whole_limit
 from aaplug.io.scenes.options import Options
@@ -247,8 +247,8 @@ def _packed(path: Path, scenes: list[Gaussians]) -> bytes:
         return torch.cat([values(scene) for scene in scenes]).contiguous().numpy()
 
     means = column(lambda s: s.means)
-    with library_errors(path), tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "scene.spz"
+    with library_errors(path), scratch() as folder:
+        file = folder / "scene.spz"
         data = GSData.from_arrays(
             means=means,
             scales=column(lambda s: s.log_scales),

@@ -10,7 +10,6 @@ import inspect
 import os
 import shutil
 import sys
-import tempfile
 import warnings
 from pathlib import Path
 
@@ -21,6 +20,7 @@ from aaplug.core import culling, ellipses, kernels, projection, rules, spherical
 from aaplug.core.errors import UsageError
 from aaplug.core.executors import Processes, torch_threads
 from aaplug.core.kernels import EAGER, Kernel, Kernels
+from aaplug.core.locks import scratch
 from aaplug.core.monitor import Tell
 from aaplug.core.rules import RULES_3DGS
 from aaplug.methods.pixel_kernels import INTEGRAL, POINT, averages, integral, point, raster_rows
@@ -165,17 +165,13 @@ def _build(name: str) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         from torch.fx.experimental.proxy_tensor import make_fx  # takes a second
 
-        with (
-            tempfile.TemporaryDirectory(dir=path.parent) as folder,
-            warnings.catch_warnings(action="ignore"),
-            torch.no_grad(),
-        ):
+        with scratch(str(path.parent)) as folder, warnings.catch_warnings(action="ignore"), torch.no_grad():
             args = kernel.example()
             module = make_fx(kernel.function, tracing_mode="symbolic")(*args) if kernel.pulls_back else _Module(kernel)
             program = torch.export.export(module, args, dynamic_shapes=shapes if kernel.pulls_back else (shapes,))
             made = torch._inductor.aoti_compile_and_package(
                 program,
-                package_path=str(Path(folder) / "k.pt2"),
+                package_path=str(folder / "k.pt2"),
                 inductor_configs={**OPTIONS, TILING_HEURISTIC: not kernel.gathers},
             )
             os.replace(made, path)
