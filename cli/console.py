@@ -6,12 +6,14 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import TextIOWrapper
 from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from aaplug.core.errors import printable
 from aaplug.core.monitor import Monitor, Tell
 
 LINE_SECONDS = 10.0  # between progress lines where there is no terminal
@@ -20,15 +22,28 @@ log = Console(stderr=True, highlight=False, soft_wrap=True)
 out = Console(highlight=False)
 
 
+def plain(text: str) -> str:
+    """The text for the log: on one line, without control characters and markup."""
+    return escape(printable(text))
+
+
 class _Warnings(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
-        log.print(f"[yellow]warning:[/] {escape(record.getMessage())}")
+        log.print(f"[yellow]warning:[/] {plain(record.getMessage())}")
 
 
 def set_up() -> None:
-    """Send the library's warnings to the log."""
+    """Send the library's warnings to the log, and write names that are not UTF-8 in escaped form."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     logger = logging.getLogger("aaplug")
     logger.handlers, logger.propagate = [_Warnings()], False
+
+
+def refuse(problem: str) -> None:
+    """One line of error."""
+    log.print(f"[red]error:[/] {plain(problem)}")
 
 
 class Terminal(Monitor):
@@ -36,7 +51,7 @@ class Terminal(Monitor):
 
     def say(self, text: str) -> None:
         """One line of log."""
-        log.print(escape(text))
+        log.print(plain(text))
 
     @contextmanager
     def progress(self, what: str, unit: str) -> Iterator[Tell]:

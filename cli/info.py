@@ -6,6 +6,7 @@ from typing import Annotated, Any
 from rich.markup import escape
 from rich.table import Table
 
+from aaplug.core.errors import printable
 from aaplug.core.gaussians import MAX_LOG_SCALE
 from aaplug.io.limits import LIMITS, limit, memory_of_machine
 from aaplug.verbs import info as verb
@@ -58,7 +59,7 @@ def _text(value: Any) -> str:
     if isinstance(value, list):
         lines = any(isinstance(item, str) for item in value)
         return ("\n" if lines else "  ").join(_text(item) for item in value)
-    return f"{value:,}" if isinstance(value, int) else str(value)
+    return f"{value:,}" if isinstance(value, int) else printable(str(value))
 
 
 def _show_limits(as_json: bool) -> None:

@@ -11,7 +11,7 @@ from importlib import import_module
 from importlib.metadata import version
 from typing import Any, get_args, get_origin
 
-from aaplug.core.errors import AaplugError, UsageError
+from aaplug.core.errors import AaplugError, UsageError, reason
 
 FAILED, REFUSED, INTERRUPTED = 1, 2, 130
 VERBS = ("info", "convert", "render", "evaluate", "video", "finetune", "demo", "warmup", "bench")
@@ -19,27 +19,39 @@ VERBS = ("info", "convert", "render", "evaluate", "video", "finetune", "demo", "
 
 def main(words: Sequence[str] | None = None) -> None:
     """Run the program and exit."""
-    words = list(sys.argv[1:] if words is None else words)
+    try:
+        code = _guarded(list(sys.argv[1:] if words is None else words))
+        sys.stdout.flush()
+        sys.exit(code)
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        sys.exit(INTERRUPTED)
+    except OSError as error:
+        if error.filename is None:  # our output: its reader has gone, or the disk is full; flush nothing at exit
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if isinstance(error, BrokenPipeError):
+            sys.exit(FAILED)
+        print(f"error: {error.filename or 'output'}: {reason(error)}", file=sys.stderr)
+        sys.exit(REFUSED)
+
+
+def _guarded(words: Sequence[str]) -> int:
+    """Run one verb; mistakes of the user become a line on stderr and an exit code."""
     if words == ["--version"]:
         print(f"aaplug {version('aaplug')}")
-        sys.exit(0)
+        return 0
     from . import console
 
     console.set_up()
     try:
-        sys.exit(run(words))
+        return run(words)
     except AaplugError as error:
-        console.log.print(f"[red]error:[/] {console.escape(_worded(error, words))}")
-        sys.exit(REFUSED)
+        console.refuse(_worded(error, words))
     except MemoryError:
-        console.log.print("[red]error:[/] out of memory; a smaller --scale or fewer Gaussians need less")
-        sys.exit(REFUSED)
-    except KeyboardInterrupt:
-        console.say("interrupted")
-        sys.exit(INTERRUPTED)
-    except BrokenPipeError:  # the reader of our output has gone; flush nothing to it at exit
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(FAILED)
+        console.refuse("out of memory; a smaller --scale or fewer Gaussians need less")
+    except RecursionError:
+        console.refuse("an input is nested too deeply")
+    return REFUSED
 
 
 def run(words: Sequence[str]) -> int:

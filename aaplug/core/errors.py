@@ -60,6 +60,11 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     return f"; did you mean {close}?" if close else ""
 
 
+def printable(text: str) -> str:
+    """The text with control characters, which command a terminal, in escaped form."""
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+
+
 def reason(error: Exception) -> str:
     """Why a library or the system failed, in lower case: an OSError's own words without its number and path."""
     strerror = error.strerror if isinstance(error, OSError) else None

@@ -81,8 +81,10 @@ class State:
 
 
 def begin(job: TuningJob) -> State:
-    """The state before the first step."""
+    """The state before the first step; raises UsageError for an empty scene."""
     scene = job.start.scene
+    if not len(scene):
+        raise UsageError(scene.name, "has no Gaussians to tune")
     leaves = leaves_of(scene)
     gradients = ScreenGradients.none_of(len(scene))
     return State(0, leaves, optimizer(leaves, job.settings), scene.log_scales, job.start.training.bounds, gradients)

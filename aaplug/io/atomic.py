@@ -48,8 +48,8 @@ def replacing_file(path: str | PathLike[str], overwrite: bool, suffix: str = ".t
     except BaseException as error:  # Ctrl-C too
         with suppress(OSError):
             temporary.unlink()
-        if isinstance(error, OSError):
-            raise OutputError(path, f"cannot be written: {reason(error)}") from error
+        if cause := _of_system(error):
+            raise OutputError(path, f"cannot be written: {reason(cause)}") from error
         raise
     with suppress(OSError):  # makes the new name permanent; some systems cannot open a folder
         _sync(target.parent, os.O_RDONLY)
@@ -131,6 +131,13 @@ def _check_target(path: Path, overwrite: bool) -> None:
             raise OutputError(path, "cannot be written: its folder does not exist; make it first")
     except (OSError, ValueError) as error:  # no access, a name too long, or a NUL in it
         raise OutputError(path, f"cannot be written: {reason(error)}") from error
+
+
+def _of_system(error: BaseException | None) -> OSError | None:
+    """The system's error, also behind torch's own about a full disk."""
+    if isinstance(error, RuntimeError):
+        error = error.__context__
+    return error if isinstance(error, OSError) else None
 
 
 def _sync(path: Path, mode: int) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 from rich.markup import escape
 from rich.table import Table
 
-from aaplug.core.errors import AaplugError
+from aaplug.core.errors import AaplugError, printable
 from aaplug.core.monitor import SILENT, Monitor
 from aaplug.evaluation.report.files import as_json, write_texts
 from aaplug.evaluation.results import Report, as_csv, grid, method, results
@@ -55,7 +55,7 @@ class Batch:
         for folder, name in self.names.items():
             why = self.failures.get(folder)
             status = "done" if why is None else "[red]failed[/]"
-            scenes.add_row(escape(name), status, escape(why or ""))
+            scenes.add_row(escape(printable(name)), status, escape(printable(why or "")))
         if not self.reports:
             return [scenes]
         first, means, grids = next(iter(self.reports.values())), self._means(), []

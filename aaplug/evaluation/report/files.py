@@ -25,7 +25,7 @@ def write_texts(folder: str | PathLike[str], texts: Mapping[str, str], overwrite
     paths = [make_folder(folder) / name for name in texts]
     for path, text in zip(paths, texts.values(), strict=True):
         with replacing(path, overwrite) as stream:
-            stream.write(text.encode())
+            stream.write(text.encode(errors="backslashreplace"))  # a file's name need not be UTF-8
     return paths
 
 

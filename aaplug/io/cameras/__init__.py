@@ -17,7 +17,7 @@ from aaplug.core.registry import Registry, named
 from aaplug.io.cameras import blender, camera_path, colmap, inria, inria_model, llff, multiscale, pinhole, transforms
 from aaplug.io.cameras.options import Options
 from aaplug.io.cameras.poses import pose
-from aaplug.io.values import Place, focal, numbers, pixels
+from aaplug.io.values import MAX_FOCAL, Place, focal, number, numbers, pixels
 
 CLOSE_NAMES = 3  # names suggested for an unknown one
 
@@ -93,7 +93,10 @@ def _checked(found: CameraSet, path: Path) -> CameraSet:
         place, motion = Place(path, f"camera {camera.name}"), camera.cam_from_world
         for field, check in (("width", pixels), ("height", pixels), ("fx", focal), ("fy", focal)):
             check(getattr(camera, field), place, field)
-        numbers([camera.cx, camera.cy, *motion[:3, 3].tolist()], 5, place, "cx, cy and translation")
+        for field in ("cx", "cy"):
+            value = number(getattr(camera, field), place, field)
+            place.expect(abs(value) <= MAX_FOCAL, field, f"at most {MAX_FOCAL:g} px from 0", value)
+        numbers(motion[:3, 3].tolist(), 3, place, "translation")
         pose(motion[:3, :3], motion[:3, 3], place, "cam_from_world")
     return found
 
@@ -109,7 +112,7 @@ def select_views(cameras: CameraSet, spec: str) -> tuple[Camera, ...]:
     known = {camera.name: camera for camera in (*cameras.train, *cameras.test)}
     if spec in known:  # a name may itself hold a comma
         return (known[spec],)
-    names = dict.fromkeys(name.strip() for name in spec.split(","))
+    names = dict.fromkeys(filter(None, map(str.strip, spec.split(",")))) or {spec: None}
     return tuple(known[name] if name in known else _unknown(name, list(known)) for name in names)
 
 

@@ -116,9 +116,9 @@ def _last(header: Header, pattern: re.Pattern[str]) -> str | None:
 
 def _record(path: str, words: str) -> dict[str, str]:
     pairs = [word.partition("=") for word in words.split()]
-    for key, equals, value in pairs:
-        if not (key and equals and value):
-            raise FormatError(path, f"comment 'aaplug {words}' is damaged: expected key=value pairs")
+    for key, _, value in pairs:
+        if not (KEY.fullmatch(key) and WORD.fullmatch(value)):
+            raise FormatError(path, f"comment {'aaplug ' + words!r} is damaged: expected key=value pairs")
     return {key: value for key, _, value in pairs}
 
 

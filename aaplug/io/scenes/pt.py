@@ -79,12 +79,18 @@ def _splats(path: Path, document: Any) -> dict[str, Tensor]:
     splats = document.get("splats", document) if isinstance(document, dict) else None
     if not isinstance(splats, dict) or not all(isinstance(splats.get(k), Tensor) for k in SHAPES):
         raise FormatError(path, f"holds no splats with {', '.join(SHAPES)}, as gsplat writes them")
-    if splats["means"].ndim != 2:
-        raise FormatError(path, f"means has the shape {list(splats['means'].shape)}")
-    rest = splats.get("shN", torch.zeros(len(splats["means"]), 0, 3))
-    if not isinstance(rest, Tensor):
-        raise FormatError(path, "shN is not a tensor")
-    return {**{key: splats[key] for key in SHAPES}, "shN": rest}
+    rest = splats.get("shN")
+    found = {**{key: splats[key] for key in SHAPES}, **({} if rest is None else {"shN": rest})}
+    for key, tensor in found.items():
+        if not (isinstance(tensor, Tensor) and _holds_numbers(tensor)):
+            raise FormatError(path, f"{key} should be a tensor with a row for each Gaussian, on the CPU")
+    return {"shN": torch.zeros(len(found["means"]), 0, 3), **found}
+
+
+def _holds_numbers(tensor: Tensor) -> bool:
+    """Whether it has rows of numbers: a tensor can be a mere description, sparse, nested, quantized or a scalar."""
+    plain = tensor.layout == torch.strided and not tensor.is_nested and not tensor.is_quantized
+    return plain and tensor.device.type == "cpu" and tensor.ndim > 0
 
 
 def _check(path: Path, key: str, tensor: Tensor, count: int, size: int) -> None:
@@ -92,8 +98,7 @@ def _check(path: Path, key: str, tensor: Tensor, count: int, size: int) -> None:
         fits = tensor.shape[1:] == SHAPES[key]
     else:
         fits = tensor.ndim == 3 and tensor.shape[2] == 3 and 3 * tensor.shape[1] in DEGREES
-    plain = tensor.is_floating_point() and tensor.layout == torch.strided
-    if not (fits and plain and len(tensor) == count):
+    if not (fits and tensor.is_floating_point() and len(tensor) == count):
         raise FormatError(path, f"{key} is {tensor.dtype} of shape {list(tensor.shape)}, for {count:,} Gaussians")
     if tensor.numel() * tensor.element_size() > size:
         raise FormatError(path, f"{key} has {tensor.numel():,} values, more than the file holds")

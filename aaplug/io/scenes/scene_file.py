@@ -24,6 +24,8 @@ from aaplug.io.limits import lack_of_memory, whole_limit
 SHORTEST_QUATERNION = 1e-12  # torch's `normalize` does not normalize a shorter one
 PART = 1 << 16  # Gaussians per part: 15 MB at degree 3
 FLOAT = 4  # bytes
+HUGE_LOG_SCALE = 20.0  # half a billion units
+HUGE_HARMONIC = 1e4  # trained harmonics stay below 10
 MAX_REASON = 200  # characters of a library's message
 FILTER_COLUMN = "filter_3D"  # Mip-Splatting's 3D filter: a standard deviation in world units
 DEGREES = {3 * ((d + 1) ** 2 - 1): d for d in range(5)}  # SH degree by number of f_rest columns
@@ -72,12 +74,17 @@ class SceneFile:
         A row that cannot be used raises FormatError if `drop_bad` is false.
         """
         dropped: dict[str, int] = {} if found is None else found
-        left_out = 0
+        left_out, doubts = 0, dict[str, int]()
         for start in range(0, max(self.count, 1), size):
             part = self.raw(start, min(start + size, self.count))
             bad = _check(part, self.path, drop_bad, dropped)
             left_out += 0 if bad is None else int(bad.sum())
-            yield part if bad is None else part[~bad]
+            part = part if bad is None else part[~bad]
+            for text, number in doubts_of(part).items():
+                doubts[text] = doubts.get(text, 0) + number
+            yield part
+        for text, number in doubts.items():
+            log.warning("%s: %d of %d Gaussians have %s", self.path, number, self.count, text)
         if left_out and found is None:
             counts = listing([f"{text}: {number:,}" for text, number in dropped.items()])
             log.warning("%s: left out %d of %d Gaussians (%s)", self.path, left_out, self.count, counts)
@@ -194,6 +201,21 @@ def faults_of(scene: Gaussians) -> dict[str, Bool[Tensor, " n"]]:
     if scene.filter_3d is not None:
         faults[f"a negative {FILTER_COLUMN}"] = scene.filter_3d < 0
     return {text: rows for text, rows in faults.items() if rows.any()}
+
+
+def doubts_of(scene: Gaussians) -> dict[str, int]:
+    """What renderers can use but hardly was meant, and in how many rows."""
+    if not len(scene):
+        return {}
+    doubts = dict[str, int]()
+    if scene.log_scales.max() > HUGE_LOG_SCALE:
+        rows = (scene.log_scales > HUGE_LOG_SCALE).any(dim=1)
+        doubts[f"a log-scale above {HUGE_LOG_SCALE:g}, a size that no view shows"] = int(rows.sum())
+    low, high = scene.sh.aminmax()
+    if max(-low, high) > HUGE_HARMONIC:
+        rows = (scene.sh.abs() > HUGE_HARMONIC).flatten(1).any(dim=1)
+        doubts[f"a harmonic beyond {HUGE_HARMONIC:g}, a colour far out of range"] = int(rows.sum())
+    return doubts
 
 
 def _finite(scene: Gaussians) -> bool:

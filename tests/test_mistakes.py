@@ -1,0 +1,131 @@
+"""Odd inputs and surroundings: each ends with a result or with one line, never with a traceback or a stray file."""
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from aaplug.core.errors import FormatError
+from aaplug.io.cameras import read_cameras
+from aaplug.io.scenes import open_scene, read_scene, write_scene
+from tests.conftest import make_scene
+from tests.test_cli import cli, dataset  # noqa: F401  (fixtures)
+
+LONG = "n" * 300
+FULL = Path("/dev/full")
+
+
+def with_comment(path: Path, comment: bytes) -> None:
+    data = path.read_bytes()
+    after = data.index(b"\n", data.index(b"format")) + 1
+    path.write_bytes(data[:after] + b"comment " + comment + b"\n" + data[after:])
+
+
+def test_escapes_of_a_file_do_not_reach_the_terminal(cli):  # noqa: F811
+    with_comment(Path("scene.ply"), b"SplatRenderMode: \x1b[31mred")
+    code, out, err = cli("info scene.ply")
+    assert code == 0
+    assert "\x1b[31m" not in out + err
+    assert r"\x1b[31mred" in err
+    with_comment(Path("scene.ply"), b"aaplug fused=\x1b[31m")
+    code, _, err = cli("info scene.ply")
+    assert (code, "is damaged: expected key=value pairs" in err, "\x1b[31m" in err) == (2, True, False)
+
+
+@pytest.mark.skipif(not FULL.exists(), reason="there is no device that is always full")
+@pytest.mark.parametrize("words", ["info scene.ply --json", "info scene.ply", "--help", "--version"])
+def test_a_full_disk_behind_stdout_is_one_line(cli, tmp_path, words):  # noqa: F811
+    program = [sys.executable, "-c", "from aaplug_cli.main import main; main()", *words.split()]
+    with FULL.open("w") as full:
+        done = subprocess.run(program, cwd=tmp_path, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.splitlines()[-1] == "error: output: no space left on device"
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        f"info {LONG}.ply",
+        f"render scene.ply --cameras . -o {LONG}/x",
+        f"evaluate scene.ply --cameras . -o {LONG} --recipe classic",
+        f"convert scene.ply --cameras . -o {LONG}.ply",
+    ],
+)
+def test_names_longer_than_the_file_system_takes(cli, words):  # noqa: F811
+    before = sorted(Path().iterdir())
+    code, out, err = cli(words)
+    assert (code, out) == (2, "")
+    assert err.splitlines()[-1].startswith("error: ")
+    assert "name too long" in err.splitlines()[-1]
+    assert sorted(Path().iterdir()) == before
+
+
+def test_views_with_long_names_are_written(cli):  # noqa: F811
+    cameras = Path("transforms_test.json")
+    cameras.write_text(cameras.read_text().replace("r_0", LONG))
+    assert cli("render scene.ply --cameras transforms_test.json -o new --scale 0.5")[0] == 0
+    assert [len(path.stem) for path in Path("new").iterdir()] == [200]
+
+
+def test_names_that_are_not_utf_8(cli):  # noqa: F811
+    odd = os.fsdecode(b"\xff\xfe")
+    Path("scene.ply").rename(f"{odd}.ply")
+    assert cli(f"info {odd}.ply")[0] == 0
+    assert cli(f"convert {odd}.ply --cameras . -o c{odd}.ply")[0] == 0
+    assert cli(f"evaluate {odd}.ply --cameras . -o r{odd} --recipe classic --scale 0.5 --report")[0] == 0
+    assert Path(f"r{odd}/report.html").exists()
+
+
+def test_a_folder_may_have_a_dot(cli):  # noqa: F811
+    assert cli("render scene.ply --cameras . -o results_v1.0 --scale 0.5")[0] == 0
+    assert [path.name for path in Path("results_v1.0").iterdir()] == ["r_0.png"]
+    assert "name a folder" in cli("render scene.ply --cameras . -o new.jpg --scale 0.5")[2]
+
+
+def test_a_comma_at_the_end_names_no_view(cli):  # noqa: F811
+    assert cli("render scene.ply --cameras . -o new --views r_0, --scale 0.5")[0] == 0
+
+
+def test_an_empty_scene_is_not_tuned(cli):  # noqa: F811
+    write_scene("scene.ply", make_scene(0), overwrite=True)
+    for words in ("finetune scene.ply --cameras . -o t.ply", "convert scene.ply --cameras . -o t.ply --for gsplat"):
+        code, _, err = cli(f"{words} --steps 1 --rasterizer eager")
+        assert (code, "has no Gaussians to tune" in err) == (2, True)
+    assert cli("render scene.ply --cameras . -o new --recipe mip-splatting --scale 0.5")[0] == 0
+
+
+@pytest.mark.parametrize("change", ["log_scales", "sh"])
+def test_values_that_no_one_meant_are_told(tmp_path, change, caplog):
+    scene = make_scene(40)
+    column = getattr(scene, change).clone()
+    column[3] = 30.0 if change == "log_scales" else 1e28
+    write_scene(tmp_path / "odd.ply", replace(scene, **{change: column}))
+    read_scene(tmp_path / "odd.ply")
+    assert "1 of 40 Gaussians have a " in caplog.text
+
+
+def test_a_checkpoint_whose_tensors_hold_no_rows_is_refused(tmp_path):
+    scene = make_scene(10)
+    columns = {"means": scene.means, "quats": scene.quats, "scales": scene.log_scales}
+    columns |= {"opacities": scene.logit_opacities, "sh0": scene.sh[:, :1]}
+    for name in columns:
+        odd = (torch.tensor(1.0), columns[name].to("meta"), columns[name].to_sparse())
+        for number, tensor in enumerate(odd):
+            path = tmp_path / f"{name}-{number}.pt"
+            torch.save({"splats": {**columns, name: tensor}}, path)
+            with pytest.raises(FormatError, match=f"{name} should be a tensor with a row for each Gaussian"):
+                open_scene(path, allow_checkpoint=True)
+
+
+def test_a_principal_point_far_away_is_refused(tmp_path):
+    folder = tmp_path / "sparse" / "0"
+    folder.mkdir(parents=True)
+    (folder / "cameras.txt").write_text("1 PINHOLE 80 80 100 100 1e308 40\n")
+    (folder / "images.txt").write_text("1 1 0 0 0 0 0 4 1 a.png\n\n")
+    with pytest.raises(FormatError, match="cx should be at most 1e"):
+        read_cameras(tmp_path)
