@@ -5,10 +5,13 @@ import shutil
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from statistics import mean, stdev
+from urllib.parse import parse_qs, urlsplit
 
 import cv2
 import numpy as np
 import pytest
+from markupsafe import escape
 
 from aaplug.core.cameras import CameraSet
 from aaplug.core.training import TrainingViews
@@ -25,6 +28,8 @@ FLAGS = [
     "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
     "--disable-component-update", "--disable-sync",
 ]  # fmt: skip
+PICTURE = "#stage canvas"
+ESCAPED = NASTY.replace("\\", "\\\\")  # in a selector
 
 
 @pytest.fixture(scope="module")
@@ -80,17 +85,38 @@ def test_every_name_is_escaped_and_the_best_is_bold(written):
     assert "&lt;/script&gt;&lt;script&gt;alert(&#39;x&#39;)" in text
     assert [tag for tag, _ in Tags(text).tags].count("script") == 2  # its data and its own
     rows = re.findall(r"<tr( class=\"ceiling\")?><th scope=\"row\">(.*?)</th>(.*?)</tr>", text)
-    assert {bool(ceiling) for ceiling, _, cells in rows if '<td class="best">' in cells} == {False}
+    assert {bool(ceiling) for ceiling, _, cells in rows if '<span class="best">' in cells} == {False}
     assert any(ceiling for ceiling, _, _ in rows)
 
 
 def test_plots_are_files_too_and_do_not_change(written):
     folder, report, found = written
-    names = ["psnr", "ssim", "seconds", "evaluations", "sampling-bounds"]
+    names = ["psnr", "ssim", "evaluations", "sampling-bounds"]
     for plot, name in zip(plots(report, found), names, strict=True):
         assert (folder / "plots" / f"{name}.svg").read_text() == plot.svg()
         assert min(image_size(folder / "plots" / f"{name}.png")) > 300
         assert "currentColor" in plot.inline_svg()
+    assert not (folder / "plots" / "seconds.svg").exists()  # a curve of times would draw noise
+
+
+def test_tables_name_the_worst_view_and_show_the_spread(written):
+    _, report, _ = written
+    text = (written[0] / "report.html").read_text()
+    [row] = re.findall(r"<h3>PSNR \[dB\]</h3>.*?<th scope=\"row\">classic</th>(.*?)</tr>", text, re.DOTALL)
+    cell = row.split("</td>")[report.scales.index(0.5)]
+    values = {m.view: m.values["PSNR"] for m in report.select("classic", 0.5)}
+    worst = min(values, key=values.__getitem__)
+    figures = re.findall(r"\d+\.\d+", re.sub(r"<[^>]*>", " ", cell))
+    assert figures == [f"{v:.2f}" for v in (mean(values.values()), stdev(values.values()), values[worst])]
+    assert str(escape(worst)) in cell
+
+
+def test_times_are_medians_with_quartiles(written):
+    _, report, _ = written
+    text = (written[0] / "report.html").read_text()
+    [row] = re.findall(r"<h3>seconds per view, median</h3>.*?<th scope=\"row\">auto</th>(.*?)</tr>", text, re.DOTALL)
+    times = np.quantile([m.seconds for m in report.select("auto", 1.0)], (0.5, 0.25, 0.75))
+    assert re.findall(r"\d+\.\d+", row)[:3] == [f"{time:.3f}" for time in times]
 
 
 # ------------------------------------------------------------------------------------------------------- in a browser
@@ -112,14 +138,14 @@ def opened(browser, written):
     """A function that opens the page in a window of some size and scheme; nothing may have gone wrong in it."""
     troubles, contexts, asked = [], [], []
 
-    def open_page(width=1280, height=900, scheme="light"):
+    def open_page(width=1280, height=900, scheme="light", address=""):
         context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=scheme)
         contexts.append(context)
         page = context.new_page()
         page.on("console", lambda message: troubles.append(message.text))
         page.on("pageerror", lambda error: troubles.append(str(error)))
         page.on("request", lambda request: asked.append(request.url))
-        page.goto((written[0] / "report.html").as_uri())
+        page.goto((written[0] / "report.html").as_uri() + address)
         page.wait_for_selector("#compare[data-shown]")
         return page
 
@@ -134,71 +160,184 @@ def data(page, name: str) -> str:
     return page.get_attribute("#compare", f"data-{name}")
 
 
-def pixel(page, x: float, y: float) -> list[int]:
-    """A colour of the viewer, at a share of its width and height."""
-    shot = np.frombuffer(page.locator("#canvas").screenshot(), np.uint8)
-    image = cv2.imdecode(shot, cv2.IMREAD_COLOR)[..., ::-1]
-    return image[int(y * image.shape[0]), int(x * image.shape[1])].tolist()
+def wait(page, **parts: str):
+    """Until the viewer shows that."""
+    page.wait_for_selector("#compare" + "".join(f'[data-{name}="{value}"]' for name, value in parts.items()))
 
 
-def test_the_slider_works_by_mouse_and_by_keyboard(opened):
+def image(page, selector: str) -> np.ndarray:
+    shot = np.frombuffer(page.locator(selector).screenshot(), np.uint8)
+    return cv2.imdecode(shot, cv2.IMREAD_COLOR)[..., ::-1]
+
+
+def pixel(page, x: float, y: float, selector=f"{PICTURE} >> nth=0") -> list[int]:
+    """A colour of a picture, by default of the first one, at a share of its width and height."""
+    found = image(page, selector)
+    return found[int(y * found.shape[0]), int(x * found.shape[1])].tolist()
+
+
+def labels(page, selector="#stage") -> list[str]:
+    return page.locator(f"{selector} .labels span").all_text_contents()
+
+
+def choose(page, *roles: str):
+    """Show these, at a scale that has photographs."""
+    page.locator("#scales input").nth(1).check(force=True)
+    for box in page.locator("#roles input").all():
+        box.set_checked(box.get_attribute("value") in roles, force=True)
+
+
+def test_the_divider_works_by_mouse_and_by_keyboard(opened):
     page = opened()
-    box = page.locator("#canvas").bounding_box()
+    box = page.locator(PICTURE).bounding_box()
     assert data(page, "split") == "0.500"
     page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
     page.mouse.down()
     page.mouse.move(box["x"] + box["width"] * 0.2, box["y"] + box["height"] / 2)
     page.mouse.up()
-    assert float(data(page, "split")) == pytest.approx(0.2, abs=0.01)
+    wait(page, split="0.200")
     assert float(page.input_value("#split")) == pytest.approx(20, abs=1)
     page.focus("#split")
     page.keyboard.press("ArrowRight")
-    assert float(data(page, "split")) == pytest.approx(0.205, abs=0.01)
+    wait(page, split="0.205")
     page.keyboard.press("End")
-    assert data(page, "split") == "1.000"
-    page.focus("#canvas")
+    wait(page, split="1.000")
+    page.focus("#stage")
     page.keyboard.press("[")
-    assert data(page, "split") == "0.980"
+    wait(page, split="0.980")
 
 
 def test_the_lens_works_by_mouse_and_by_keyboard(opened):
     page = opened()
     assert data(page, "lens") == "off"
-    page.focus("#canvas")
-    bare = pixel(page, 0.4, 0.3)
+    page.focus("#stage")
     page.keyboard.press("l")
     page.keyboard.press("ArrowLeft")
     page.keyboard.press("Shift+ArrowDown")
-    assert data(page, "lens") == "0.490,0.550,4"
-    assert pixel(page, 0.4, 0.3) != bare
+    wait(page, lens="0.490,0.550,8")
     page.keyboard.press("+")
-    assert data(page, "lens").endswith(",8")
-    box = page.locator("#canvas").bounding_box()
-    page.mouse.move(box["x"] + box["width"] * 0.75, box["y"] + box["height"] * 0.25)
+    wait(page, lens="0.490,0.550,16")
+    box = page.locator(PICTURE).bounding_box()
+    page.mouse.click(box["x"] + box["width"] * 0.75, box["y"] + box["height"] * 0.25)
+    page.wait_for_function("!document.querySelector('#compare').dataset.lens.startsWith('0.49')")
     x, y, zoom = map(float, data(page, "lens").split(","))
-    assert (x, y, zoom) == (pytest.approx(0.75, abs=0.01), pytest.approx(0.25, abs=0.01), 8)
-    page.click("#stronger")
-    assert data(page, "lens").endswith(",16")
-    page.focus("#canvas")
+    assert (x, y, zoom) == (pytest.approx(0.75, abs=0.01), pytest.approx(0.25, abs=0.01), 16)
+    assert data(page, "split") == "0.500"
+    page.click("#weaker")
+    wait(page, lens=f"{x:.3f},{y:.3f},8")
+    page.focus("#stage")
     page.keyboard.press("Escape")
-    assert data(page, "lens") == "off"
+    wait(page, lens="off")
 
 
-def test_view_scale_sides_and_errors_can_be_chosen(opened):
+@pytest.mark.parametrize("size", [(1440, 900), (390, 844)])
+def test_the_lens_stands_beside_the_picture_and_names_what_it_shows(opened, size):
+    page = opened(*size)
+    choose(page, "truth", "classic", "auto")
+    page.locator("#lens").check(force=True)
+    wait(page, lens="0.500,0.500,8")
+    assert labels(page, "#crops") == ["photograph", "classic", "auto"]
+    pictures, crops = (
+        [tile.bounding_box() for tile in page.locator(f"{place} canvas").all()] for place in ("#stage", "#crops")
+    )
+    for a in pictures:
+        for b in crops:
+            apart = (a["x"] + a["width"] <= b["x"], b["x"] + b["width"] <= a["x"])
+            assert any(apart) or a["y"] + a["height"] <= b["y"]
+    width, height = pictures[0]["width"], pictures[0]["height"]
+    for share in (0.3, 0.7):  # of the crop, which shows the middle eighth of the picture's height
+        away = (share - 0.5) / 8
+        shown = pixel(page, share, share, "#crops canvas >> nth=0")
+        page.locator("#lens").uncheck(force=True)
+        wait(page, lens="off")
+        assert shown == pixel(page, 0.5 + away * height / width, 0.5 + away)
+        page.locator("#lens").check(force=True)
+        wait(page, lens="0.500,0.500,8")
+
+
+@pytest.mark.parametrize("size", [(1440, 900), (390, 844), (844, 390)])
+def test_the_pictures_fit_the_screen(opened, size):
+    page = opened(*size)
+    roles = ("truth", "training size, resampled", "classic", "auto")
+    for count in range(1, len(roles) + 1):
+        choose(page, *roles[:count])
+        wait_for_tiles(page, count)
+        boxes = [tile.bounding_box() for tile in page.locator(PICTURE).all()]
+        assert max(b["y"] + b["height"] for b in boxes) - min(b["y"] for b in boxes) < size[1]
+        assert max(b["x"] + b["width"] for b in boxes) <= size[0]
+        assert page.evaluate("document.documentElement.scrollWidth") == size[0]
+
+
+def wait_for_tiles(page, count: int):
+    page.wait_for_function(f"document.querySelectorAll('#stage canvas').length === {1 if count == 2 else count}")
+
+
+def test_any_number_of_recipes_stands_side_by_side(opened):
     page = opened()
-    assert data(page, "shown") == f"{NASTY}|2×|classic|auto|image"
-    page.locator("#scales input").nth(1).check(force=True)
-    page.select_option("#left", "truth")
-    page.select_option("#view", "b")
-    page.wait_for_selector('#compare[data-shown="b|1/2|truth|auto|image"]')
-    assert page.locator("#left-tag").text_content() == "photograph"
-    assert re.fullmatch(r"auto · \d\d\.\d\d dB", page.locator("#right-tag").text_content())
+    choose(page, "classic", "auto")
+    assert page.locator(PICTURE).count() == 1
+    assert page.locator("#split").is_visible()
+    choose(page, "truth", "training size, resampled", "classic", "auto")
+    wait_for_tiles(page, 4)
+    assert [label.partition(" · ")[0] for label in labels(page)] == [
+        "photograph", "training size, resampled", "classic", "auto",
+    ]  # fmt: skip
+    assert not page.locator("#split").is_visible()
+    choose(page, "auto")
+    wait_for_tiles(page, 1)
+    page.locator("#roles input[value=auto]").click(force=True)  # the last one stays
+    page.wait_for_function("document.querySelector('#roles input[value=auto]').checked")
+    assert data(page, "shown").endswith("|auto|image")
+
+
+def test_error_mode_explains_an_empty_side(opened):
+    page = opened()
     page.check("input[value=error]", force=True)
-    page.wait_for_selector("#error-scale", state="visible")
-    assert pixel(page, 0.1, 0.5) == [0, 0, 4]  # the truth has no error
+    wait(page, shown=f"{ESCAPED}|2×|classic+auto|error")
+    assert all("no photograph at this scale" in label for label in labels(page))
+    page.select_option("#view", "b")
+    choose(page, "truth", "auto")
+    wait(page, shown="b|1/2|truth+auto|error")
+    left, right = labels(page)
+    assert left == "photograph · compared with itself: no error"
+    assert re.fullmatch(r"auto · \d\d\.\d\d dB · largest error \d+ of 255", right)
+    assert page.locator("#error-scale").is_visible()
+    assert pixel(page, 0.1, 0.5) == [0, 0, 4]
     page.focus("#split")
     page.keyboard.press("Home")
+    wait(page, split="0.000")
     assert pixel(page, 0.1, 0.5) != [0, 0, 4]
+
+
+def test_the_address_holds_what_one_sees(opened):
+    page = opened()
+    before = page.evaluate("history.length")
+    assert urlsplit(page.url).fragment == ""
+    choose(page, "truth", "auto")
+    page.check("input[value=error]", force=True)
+    page.focus("#split")
+    for _ in range(30):
+        page.keyboard.press("ArrowRight")
+    page.locator("#lens").check(force=True)
+    page.click("#stronger")
+    page.wait_for_url("**lens**16")
+    found = parse_qs(urlsplit(page.url).fragment)
+    assert found == {
+        "view": [NASTY], "scale": ["1/2"], "show": ["truth", "auto"], "mode": ["error"], "split": ["0.650"],
+        "lens": ["0.500,0.500,16"],
+    }  # fmt: skip
+    assert page.evaluate("history.length") == before
+    again = opened(address="#" + urlsplit(page.url).fragment)
+    for name in ("shown", "split", "lens"):
+        assert data(again, name) == data(page, name)
+    assert labels(again) == labels(page)
+
+
+def test_an_address_of_a_section_or_of_nonsense_does_no_harm(opened):
+    usual = data(opened(), "shown")
+    for address in ("#figures", "#view=gone&scale=7&show=x&split=nan&lens=a,b,c&mode=", "#view=%E0%A4%A"):
+        page = opened(address=address)
+        assert (data(page, "shown"), data(page, "lens"), data(page, "split")) == (usual, "off", "0.500")
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
@@ -206,7 +345,7 @@ def test_it_is_readable_on_a_phone_in_light_and_dark(opened, scheme):
     page = opened(390, 844, scheme)
     assert page.evaluate("document.documentElement.scrollWidth") == 390
     small = page.evaluate(
-        "[...document.querySelectorAll('p, td, th, dd, dt, label, select, a, figcaption')]"
+        "[...document.querySelectorAll('p, td, small, th, dd, dt, label, select, a, .labels')]"
         ".filter(e => e.offsetParent && parseFloat(getComputedStyle(e).fontSize) < 12).length"
     )
     assert small == 0

@@ -5,6 +5,7 @@ import io
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
+from statistics import quantiles, stdev
 from typing import Any
 
 from rich.markup import escape
@@ -15,6 +16,8 @@ from aaplug.evaluation.metric import Metric, number
 from aaplug.evaluation.metrics import METRICS, PSNR, SSIM
 
 CEILING = "training size, resampled"  # a row of every table: the own training-size look
+TIME_DIGITS, COUNT_DIGITS = 3, 2  # decimals of seconds, and of million evaluations
+MILLION = 1e6
 
 
 @dataclass(frozen=True)
@@ -86,6 +89,22 @@ class Report:
         return Report(self.measurements + other.measurements, protocol, self.measured + other.measured)
 
 
+@dataclass(frozen=True)
+class Cell:
+    """A figure of a table, as text.
+
+    text: the mean over the views, or the median.
+    best: whether it is the best of its column; the ceiling never is.
+    spread: standard deviation or quartiles over the views; "" where there are fewer than two.
+    worst: value and name of the worst view; None where all are equal.
+    """
+
+    text: str
+    best: bool = False
+    spread: str = ""
+    worst: tuple[str, str] | None = None
+
+
 def mean(measurements: Iterable[Measurement], metric: str) -> float | None:
     """Mean over the views where the metric is defined, None if it is nowhere."""
     return _mean(m.values.get(metric) for m in measurements)
@@ -108,32 +127,63 @@ def tables(report: Report) -> list[Table]:
         variant = report.protocol.get("metrics", {}).get(metric.name, "").partition(":")
         flavour = f" {variant[0]}" if variant[1] and " " not in variant[0] else ""
         unit = f" [{metric.unit}]" if metric.unit else ""
-        lines = [[f"[bold]{text}[/]" if best else text for text, best in row] for row in rows(report, metric)]
+        lines = [[f"[bold]{cell.text}[/]" if cell.best else cell.text for cell in row] for row in rows(report, metric)]
         grids.append(grid(f"{metric.name}{flavour}{unit}, {what}", report, lines, "italic"))
-    return grids + [grid(title, report, lines) for title, lines in work(report)]
+    return grids + [
+        grid(title, report, [[cell.text for cell in row] for row in cells]) for title, cells in work(report)
+    ]
 
 
-def rows(report: Report, metric: Metric) -> list[list[tuple[str, bool]]]:
-    """A metric's table, recipes down and scales across: each mean as text, and whether it is the column's best."""
+def rows(report: Report, metric: Metric) -> list[list[Cell]]:
+    """A metric's table of means, recipes down and scales across."""
     means = {r: [mean(report.select(r, s), metric.name) for s in report.scales] for r in report.recipes}
     judged = [line for recipe, line in means.items() if recipe != CEILING]
     columns = ([v for line in judged if (v := line[place]) is not None] for place in range(len(report.scales)))
     best = [min(column, key=metric.loss, default=None) for column in columns]
     return [
-        [(metric.text(v), v is not None and v == top and recipe != CEILING) for v, top in zip(line, best, strict=True)]
+        [
+            _metric_cell(metric, report.select(recipe, scale), v is not None and v == top and recipe != CEILING)
+            for scale, v, top in zip(report.scales, line, best, strict=True)
+        ]
         for recipe, line in means.items()
     ]
 
 
-def work(report: Report) -> list[tuple[str, list[list[str]]]]:
-    """Tables of a view's cost, recipes down and scales across, as (title, lines)."""
-    columns = [("seconds per view", seconds, 3)]
+def work(report: Report) -> list[tuple[str, list[list[Cell]]]]:
+    """Tables of a view's cost, recipes down and scales across, as (title, rows)."""
+    columns = [("seconds per view, median", _time_cell)]
     if any(m.evaluations is not None for m in report.measurements):
-        columns.append(("million evaluations per view", million_evaluations, 2))
+        columns.append(("million evaluations per view", _evaluations_cell))
     return [
-        (title, [[number(column(report, r, s), digits) for s in report.scales] for r in report.recipes])
-        for title, column, digits in columns
+        (title, [[cell(report.select(r, s)) for s in report.scales] for r in report.recipes]) for title, cell in columns
     ]
+
+
+def _metric_cell(metric: Metric, views: Iterable[Measurement], best: bool) -> Cell:
+    known = {m.view: value for m in views if (value := m.values.get(metric.name)) is not None}
+    text = metric.text(_mean(known.values()))
+    worst = max(known, key=lambda view: metric.loss(known[view]), default="")
+    named = (metric.text(known[worst]), worst) if len(set(known.values())) > 1 else None
+    return Cell(text, best, _deviation(known.values(), metric.digits), named)
+
+
+def _time_cell(views: Iterable[Measurement]) -> Cell:
+    times = [m.seconds for m in views]
+    if len(times) < 2:
+        return Cell(number(_mean(times), TIME_DIGITS))
+    low, middle, high = (number(time, TIME_DIGITS) for time in quantiles(times, n=4, method="inclusive"))
+    return Cell(middle, spread=f"{low} to {high}")
+
+
+def _evaluations_cell(views: Iterable[Measurement]) -> Cell:
+    known = [m.evaluations / MILLION for m in views if m.evaluations is not None]
+    return Cell(number(_mean(known), COUNT_DIGITS), spread=_deviation(known, COUNT_DIGITS))
+
+
+def _deviation(values: Iterable[float], digits: int) -> str:
+    """Sample standard deviation as text; "" of fewer than two values."""
+    known = list(values)
+    return f"± {number(stdev(known), digits)}" if len(known) > 1 else ""
 
 
 def results(report: Report) -> dict[str, Any]:
@@ -179,14 +229,9 @@ def method(recipe: str, scale: float) -> str:
     return f"{recipe}@{scale:g}"
 
 
-def seconds(report: Report, recipe: str, scale: float) -> float | None:
-    """Mean rendering time of a view."""
-    return _mean(m.seconds for m in report.select(recipe, scale))
-
-
 def million_evaluations(report: Report, recipe: str, scale: float) -> float | None:
     """Mean splat-pixel evaluations of a view, in millions; None if not counted."""
-    return _mean(m.evaluations and m.evaluations / 1e6 for m in report.select(recipe, scale))
+    return _mean(m.evaluations and m.evaluations / MILLION for m in report.select(recipe, scale))
 
 
 def _mean(values: Iterable[float | None]) -> float | None:

@@ -63,7 +63,7 @@ class EvaluateOptions(RecipeOptions):
     lpips: Annotated[tuple[AnyPath, AnyPath] | None, flag("TRUNK HEADS", kind=tuple[str, str] | None)] = None
     """Weights of LPIPS, which is then measured: torchvision's VGG16 (AlexNet), and the lpips package's heads for it."""
     report: bool = False
-    """Write report.html, one page with tables, curves and a before/after viewer, and its plots."""
+    """Write report.html, one page with pictures side by side, tables and curves, and its plots."""
     show: Annotated[str, tyro.conf.arg(metavar="N|NAME,...")] = "3"
     """Views in the report's viewer: how many, or which."""
     layout: Layout = "plain"

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
 from aaplug.evaluation.metric import Metric
-from aaplug.evaluation.results import CEILING, Report, mean, million_evaluations, scale_name, seconds
+from aaplug.evaluation.results import CEILING, Report, mean, million_evaluations, scale_name
 from aaplug.inspection.coverage import Coverage
 
 # Distinct on white and on near-black; the markers help readers who do not see all colours.
@@ -76,9 +76,8 @@ class Plot:
 
 
 def plots(report: Report, found: Coverage) -> list[Plot]:
-    """Everything that a report draws: metrics against the truth, time and work over scale, and the sampling bounds."""
+    """Everything that a report draws: metrics against the truth and work over scale, and the sampling bounds."""
     curves = [_metric_curves(metric, report) for metric in report.compared]
-    curves.append(_curves("seconds", "seconds per view", seconds, report, from_zero=True))
     title = "million splat-pixel evaluations per view"
     curves.append(_curves("evaluations", title, million_evaluations, report, from_zero=True))
     drawn = [plot for plot in curves if plot is not None]

@@ -24,9 +24,10 @@ from aaplug.inspection.coverage import Coverage
 from aaplug.io.images import encode_webp, image_size, read_image
 
 COSTS = (  # what the tables of `work` mean
-    "rendering alone, on the machine that the protocol names",
-    "splat-pixel evaluations of compositing",
+    "rendering alone, on the machine that the protocol names; below, the quartiles over the views",
+    "splat-pixel evaluations of compositing; below, the standard deviation over the views",
 )
+SOURCES = ("page.html.j2", "page.css", "pictures.js", "page.js")  # the scripts become one, in this order
 BUDGET = 12_000_000  # bytes of lossless images; a larger page opens slowly and gets lossy ones
 LOSSY = 90  # WebP quality above the budget
 TRUTH = "truth"  # the role of the true image, beside the recipes
@@ -37,8 +38,8 @@ Key = tuple[int, float, str]  # view, scale, and a recipe or TRUTH
 
 def page(name: str, report: Report, found: Coverage, drawn: list[Plot], images: ImageStore) -> str:
     """The page's text; raises FormatError where an image that it shows is missing."""
-    sources = (files(__name__).joinpath(name) for name in ("page.html.j2", "page.css", "page.js"))
-    template, style, script = (source.read_text(encoding="utf-8") for source in sources)
+    template, style, *scripts = (files(__name__).joinpath(source).read_text(encoding="utf-8") for source in SOURCES)
+    script = "".join(scripts)
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     return environment.from_string(template).render(
         name=name,
@@ -85,13 +86,12 @@ def _headline(report: Report) -> dict[str, str] | None:
 
 
 def _tables(report: Report) -> list[dict[str, Any]]:
-    """Title, what it means, and rows of (recipe, cells of (text, whether it is the best))."""
+    """Title, what it means, and rows of (recipe, cells)."""
     variants = report.protocol.get("metrics", {})
     tables = [
         (metric.title, variants.get(metric.name, metric.protocol), rows(report, metric)) for metric in report.metrics
     ]
-    for about, (title, lines) in zip(COSTS, work(report), strict=False):
-        tables.append((title, about, [[(text, False) for text in line] for line in lines]))
+    tables += [(title, about, cells) for about, (title, cells) in zip(COSTS, work(report), strict=False)]
     return [
         {"title": title, "about": about, "rows": list(zip(report.recipes, cells, strict=True))}
         for title, about, cells in tables

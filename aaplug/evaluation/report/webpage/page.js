@@ -1,202 +1,197 @@
-"use strict";
-(() => {
-  const gallery = JSON.parse(document.getElementById("gallery").textContent);
-  const at = (id) => document.getElementById(id);
-  const canvas = at("canvas"), ink = canvas.getContext("2d"), figure = at("compare");
-  const ERROR_FULL = 32; // levels of 255 at the end of the error scale
-  const STOPS = [[0, 0, 4], [86, 16, 110], [187, 55, 84], [249, 140, 10], [252, 255, 164]];
-  const state = {
-    view: gallery.views[0], scale: gallery.scales[gallery.scales.length - 1], left: "", right: "",
-    error: false, split: 0.5, lens: false, x: 0.5, y: 0.5, zoom: 4,
+// The viewer: what is shown is one state, which the controls and the address change and `render` draws.
+
+const at = (id) => document.getElementById(id);
+const gallery = JSON.parse(at("gallery").textContent);
+const stage = at("stage"), crops = at("crops"), figure = at("compare");
+const STRENGTHS = [2, 32]; // of the lens: it shows this share of the picture's shorter side
+const BESIDE = 720, BETWEEN = 24; // CSS px: from this width on the crops stand right of the picture, so far away
+const CROPS = 0.4, BELOW = 0.6; // of the width: what crops beside have at least, and a row of them below in height
+const AROUND = 110, LEAST = 240; // CSS px of the screen's height: taken around the picture; a picture's least height
+const GRIP = 14; // CSS px beside the divider where it is grabbed although the lens is on
+const QUIET = 200; // ms without a change before the address follows
+
+const order = [...new Set([gallery.truth, gallery.ceiling, ...gallery.recipes])];
+const own = gallery.recipes.filter((role) => role !== gallery.ceiling);
+const preferred = (name, otherwise) => own.includes(name) ? name : otherwise;
+const state = {
+  view: gallery.views[0], scale: gallery.scales.at(-1), error: false, split: 0.5,
+  shown: [preferred("classic", own[0]), preferred("auto", own.at(-1))],
+  lens: false, x: 0.5, y: 0.5, zoom: 8, // the lens's centre, as shares of the picture
+};
+
+const nameOf = (role) => role === gallery.truth ? gallery.truthName : role;
+const shot = () => gallery.shots.find((s) => s.view === state.view && s.scale === state.scale);
+const has = (role) => role in shot().images; // not every scale has a truth
+function shown() {
+  const chosen = order.filter((role) => state.shown.includes(role) && has(role));
+  return chosen.length ? chosen : own.slice(-1);
+}
+
+function change(parts) {
+  Object.assign(state, parts);
+  for (const share of ["split", "x", "y"]) state[share] = clamp(state[share], 0, 1);
+  state.zoom = clamp(state.zoom, ...STRENGTHS);
+  render();
+  clearTimeout(change.waiting);
+  change.waiting = setTimeout(() => history.replaceState(null, "", address()), QUIET);
+}
+
+// ------------------------------------------------------------------------------------------------------- the address
+
+function address() {
+  const words = new URLSearchParams({view: state.view, scale: state.scale});
+  for (const role of shown()) words.append("show", role); // two of them are left and right
+  words.append("mode", state.error ? "error" : "image");
+  words.append("split", state.split.toFixed(3));
+  if (state.lens) words.append("lens", lensText());
+  return `#${words}`;
+}
+const lensText = () => [state.x.toFixed(3), state.y.toFixed(3), state.zoom].join();
+
+function fromAddress() { // the state that the address names, if it names one and not a section of the page
+  const words = new URLSearchParams(location.hash.slice(1));
+  if (!words.has("view")) return false;
+  const one = (name, known) => known.includes(words.get(name)) ? words.get(name) : state[name];
+  const numbers = (name) => (words.get(name) || "").split(",").map(parseFloat).filter(Number.isFinite);
+  const roles = words.getAll("show").filter((role) => order.includes(role));
+  const [split = state.split] = numbers("split"), [x = state.x, y = state.y, zoom] = numbers("lens");
+  change({
+    view: one("view", gallery.views), scale: one("scale", gallery.scales), shown: roles.length ? roles : state.shown,
+    error: words.get("mode") === "error", split, x, y, lens: zoom !== undefined, zoom: zoom ?? state.zoom,
+  });
+  return true;
+}
+
+// -------------------------------------------------------------------------------------------------------- the picture
+
+async function pane(role) { // what one side shows, and the words above it
+  const {images} = shot(), {uri, score} = images[role], words = [nameOf(role)];
+  if (score) words.push(score);
+  if (!state.error || !has(gallery.truth)) {
+    if (state.error) words.push(`no ${gallery.truthName} at this scale: the image itself`);
+    return {sheet: await picture(uri), label: words.join(" · ")};
+  }
+  const {map, largest} = await errorMap(uri, images[gallery.truth].uri);
+  const same = role === gallery.truth ? "compared with itself: no error" : `equal to the ${gallery.truthName}: no error`;
+  words.push(largest ? `largest error ${largest} of 255` : same);
+  return {sheet: map, label: words.join(" · ")};
+}
+
+function lensBox(ratio) { // the square that the lens shows, inside the picture, in shares of its width
+  const side = Math.min(1, ratio) / state.zoom;
+  return {x: clamp(state.x - side / 2, 0, 1 - side), y: clamp(state.y * ratio - side / 2, 0, ratio - side), side};
+}
+
+async function render() { // decodes what is asked for, then draws
+  const mine = render.turn = (render.turn || 0) + 1, chosen = shown();
+  const panes = await Promise.all(chosen.map(pane));
+  if (mine !== render.turn) return; // asked for something else meanwhile
+  controls(chosen);
+  draw(panes, shot().height / shot().width);
+  stage.setAttribute("aria-label", `${state.view} at scale ${state.scale}: ${panes.map((p) => p.label).join("; ")}`);
+  Object.assign(figure.dataset, {
+    split: state.split.toFixed(3), lens: state.lens ? lensText() : "off",
+    shown: [state.view, state.scale, chosen.join("+"), state.error ? "error" : "image"].join("|"),
+  });
+}
+
+function draw(panes, ratio) {
+  const box = lensBox(ratio), divided = panes.length === 2, width = figure.clientWidth, beside = width >= BESIDE;
+  const height = Math.max(LEAST, document.documentElement.clientHeight - at("controls").offsetHeight - AROUND);
+  const groups = divided ? [panes] : panes.map((p) => [p]);
+  const size = packed(groups.length, width - (state.lens && beside ? CROPS * width : 0), height, ratio);
+  const canvases = tiles(stage, groups.map((group) => group.map((p) => p.label)), size, ratio);
+  canvases.forEach((canvas, i) => {
+    drawWhole(canvas, groups[i].map((p) => p.sheet), state.split);
+    if (state.lens) drawBox(canvas, box);
+  });
+  at("split").style.width = `${size.wide}px`;
+  crops.hidden = !state.lens;
+  if (!state.lens) return;
+  const names = shown().map((role) => [nameOf(role)]);
+  const room = beside ? [width - stage.offsetWidth - BETWEEN, height] : [width, width * BELOW * Math.ceil(names.length / 2)];
+  tiles(crops, names, packed(names.length, ...room, 1), 1).forEach((canvas, i) => drawCrop(canvas, panes[i].sheet, box));
+}
+
+// ------------------------------------------------------------------------------------------------------- the controls
+
+function controls(chosen) { // show the state
+  at("view").value = state.view;
+  for (const radio of document.getElementsByName("scale")) radio.checked = radio.value === state.scale;
+  for (const radio of document.getElementsByName("mode")) radio.checked = (radio.value === "error") === state.error;
+  for (const box of document.getElementsByName("role")) {
+    box.checked = chosen.includes(box.value); box.disabled = !has(box.value);
+  }
+  at("split").value = 100 * state.split; at("split").hidden = chosen.length !== 2;
+  at("lens").checked = state.lens; at("zoom").textContent = `${state.zoom}×`;
+  at("error-scale").hidden = !state.error || !has(gallery.truth);
+}
+
+function toggles(parent, type, name, values) { // a row of radio buttons or check boxes
+  for (const value of values) {
+    const label = document.createElement("label"), input = document.createElement("input"), text = document.createElement("span");
+    Object.assign(input, {type, name, value});
+    text.textContent = name === "role" ? nameOf(value) : value;
+    label.append(input, text); at(parent).append(label);
+  }
+}
+toggles("scales", "radio", "scale", gallery.scales);
+toggles("roles", "checkbox", "role", order.filter((role) => gallery.shots.some(({images}) => role in images)));
+at("view").append(...gallery.views.map((view) => new Option(view, view)));
+
+at("controls").addEventListener("change", ({target}) => {
+  if (target.name === "role") {
+    const others = state.shown.filter((role) => role !== target.value);
+    change({shown: target.checked ? [...others, target.value] : others.length ? others : [target.value]});
+  } else if (target.name === "mode") change({error: target.value === "error"});
+  else if (target.id === "lens") change({lens: target.checked});
+  else change({[target.name]: target.value});
+});
+at("weaker").addEventListener("click", () => change({lens: true, zoom: state.zoom / 2}));
+at("stronger").addEventListener("click", () => change({lens: true, zoom: state.zoom * 2}));
+at("split").addEventListener("input", ({target}) => change({split: target.value / 100}));
+
+let grabbed = null; // what a press moves: "split" or "lens"
+function place({target, clientX, clientY}) {
+  const box = target.getBoundingClientRect();
+  return {x: (clientX - box.left) / box.width, y: (clientY - box.top) / box.height, width: box.width};
+}
+function grip(event) {
+  const {x, width} = place(event), divided = shown().length === 2;
+  if (divided && (!state.lens || Math.abs(x - state.split) * width < GRIP)) return "split";
+  return state.lens ? "lens" : null;
+}
+function move(event) {
+  const {x, y} = place(event);
+  if (grabbed === "split") change({split: x});
+  if (grabbed === "lens") change({x, y});
+}
+stage.addEventListener("pointerdown", (event) => {
+  if (event.target.tagName !== "CANVAS") return;
+  grabbed = grip(event);
+  event.target.setPointerCapture(event.pointerId);
+  move(event);
+});
+stage.addEventListener("pointermove", (event) => {
+  if (event.target.tagName !== "CANVAS") return;
+  if (event.buttons & 1) move(event);
+  else event.target.style.cursor = {split: "ew-resize", lens: "crosshair"}[grip(event)] || "default";
+});
+stage.addEventListener("keydown", (event) => {
+  if (event.ctrlKey || event.metaKey || event.altKey) return;
+  const step = event.shiftKey ? 0.05 : 0.01, {x, y, zoom, split} = state;
+  const changes = {
+    ArrowLeft: {lens: true, x: x - step}, ArrowRight: {lens: true, x: x + step},
+    ArrowUp: {lens: true, y: y - step}, ArrowDown: {lens: true, y: y + step},
+    l: {lens: !state.lens}, L: {lens: !state.lens}, Escape: {lens: false},
+    "+": {lens: true, zoom: zoom * 2}, "=": {lens: true, zoom: zoom * 2}, "-": {lens: true, zoom: zoom / 2},
+    "[": {split: split - 0.02}, "]": {split: split + 0.02},
   };
+  if (!(event.key in changes)) return;
+  change(changes[event.key]);
+  event.preventDefault();
+});
 
-  const nameOf = (role) => role === gallery.truth ? gallery.truthName : role;
-  const shot = () => gallery.shots.find((s) => s.view === state.view && s.scale === state.scale);
-  const decoded = new Map();
-
-  function picture(uri) { // a promise of a canvas that holds the image
-    if (!decoded.has(uri)) {
-      decoded.set(uri, new Promise((done, failed) => {
-        const image = new Image();
-        image.onload = () => {
-          const sheet = document.createElement("canvas");
-          sheet.width = image.naturalWidth; sheet.height = image.naturalHeight;
-          sheet.getContext("2d", {willReadFrequently: true}).drawImage(image, 0, 0);
-          done(sheet);
-        };
-        image.onerror = () => failed(new Error("an image of the page does not decode"));
-        image.src = uri;
-      }));
-    }
-    return decoded.get(uri);
-  }
-
-  function heat(level) { // colour of an error in levels of 255
-    const t = Math.min(1, level / ERROR_FULL) * (STOPS.length - 1), i = Math.min(STOPS.length - 2, Math.floor(t));
-    return STOPS[i].map((a, c) => a + (STOPS[i + 1][c] - a) * (t - i));
-  }
-  const HEAT = Array.from({length: 256}, (_, level) => heat(level));
-
-  const errors = new Map();
-  async function errorMap(role, images) { // the worst channel's difference from the truth, at each pixel
-    const key = images[role].uri;
-    if (!errors.has(key)) {
-      const [a, b] = await Promise.all([picture(key), picture(images[gallery.truth].uri)]);
-      const [x, y] = [a, b].map((sheet) => sheet.getContext("2d").getImageData(0, 0, sheet.width, sheet.height));
-      const map = document.createElement("canvas");
-      map.width = a.width; map.height = a.height;
-      const out = new ImageData(a.width, a.height);
-      for (let i = 0; i < x.data.length; i += 4) {
-        const worst = Math.max(...[0, 1, 2].map((c) => Math.abs(x.data[i + c] - y.data[i + c])));
-        const colour = HEAT[worst];
-        out.data[i] = colour[0]; out.data[i + 1] = colour[1]; out.data[i + 2] = colour[2]; out.data[i + 3] = 255;
-      }
-      map.getContext("2d").putImageData(out, 0, 0);
-      errors.set(key, map);
-    }
-    return errors.get(key);
-  }
-
-  function tag(role, images) {
-    const {score} = images[role];
-    return nameOf(role) + (score && ` · ${score}`);
-  }
-
-  let turn = 0;
-  async function show() { // decodes what is asked for, then draws
-    const mine = ++turn, {images, width, height} = shot();
-    const hasTruth = gallery.truth in images;
-    const asError = state.error && hasTruth;
-    const get = (role) => asError ? errorMap(role, images) : picture(images[role].uri);
-    const sheets = await Promise.all([get(state.left), get(state.right)]);
-    if (mine !== turn) return; // asked for something else meanwhile
-    at("left-tag").textContent = tag(state.left, images);
-    at("right-tag").textContent = tag(state.right, images);
-    at("error-scale").hidden = !asError;
-    canvas.setAttribute("aria-label",
-      `${state.view} at scale ${state.scale}, ${width} by ${height} pixels: ${nameOf(state.left)} left, ${nameOf(state.right)} right`);
-    draw.sheets = sheets;
-    draw();
-  }
-
-  function draw() {
-    if (!draw.sheets) return;
-    const [left, right] = draw.sheets;
-    const wide = canvas.clientWidth, high = wide * left.height / left.width, density = window.devicePixelRatio || 1;
-    canvas.width = Math.round(wide * density); canvas.height = Math.round(high * density);
-    const w = canvas.width, h = canvas.height, cut = Math.round(state.split * w);
-    ink.imageSmoothingEnabled = w < left.width; // pixels stay visible where there are few
-    ink.imageSmoothingQuality = "high";
-    for (const [sheet, from, to] of [[left, 0, cut], [right, cut, w]]) {
-      if (to <= from) continue;
-      ink.save(); ink.beginPath(); ink.rect(from, 0, to - from, h); ink.clip();
-      ink.drawImage(sheet, 0, 0, w, h); ink.restore();
-    }
-    ink.fillStyle = "#fff"; ink.fillRect(cut - density, 0, 2 * density, h);
-    ink.fillStyle = "rgb(15 18 22 / .55)"; ink.fillRect(cut - 2 * density, 0, density, h); ink.fillRect(cut + density, 0, density, h);
-    if (state.lens) drawLens(left, right, w, h, density);
-    figure.dataset.split = state.split.toFixed(3);
-    figure.dataset.lens = state.lens ? `${state.x.toFixed(3)},${state.y.toFixed(3)},${state.zoom}` : "off";
-    figure.dataset.shown = `${state.view}|${state.scale}|${state.left}|${state.right}|${state.error ? "error" : "image"}`;
-  }
-
-  function drawLens(left, right, w, h, density) { // the same pixels of both images, side by side
-    const side = Math.min(190 * density, w * 0.42, h * 0.6), gap = 3 * density;
-    const pixels = side / (state.zoom * density), scaled = pixels / (w / density) * left.width;
-    const cx = state.x * left.width, cy = state.y * left.height;
-    const x = Math.min(w - 2 * side - 3 * gap, Math.max(0, state.x * w - side)), above = state.y * h - side - 24 * density;
-    const y = above >= 0 ? above : Math.min(h - side - 2 * gap, state.y * h + 24 * density);
-    ink.save();
-    ink.shadowColor = "rgb(0 0 0 / .45)"; ink.shadowBlur = 14 * density;
-    ink.fillStyle = "#fff"; ink.fillRect(x, y, 2 * side + 3 * gap, side + 2 * gap);
-    ink.restore();
-    ink.imageSmoothingEnabled = false;
-    [left, right].forEach((sheet, i) => {
-      const px = x + gap + i * (side + gap), py = y + gap;
-      ink.fillStyle = "#888"; ink.fillRect(px, py, side, side);
-      ink.save(); ink.beginPath(); ink.rect(px, py, side, side); ink.clip();
-      ink.drawImage(sheet, cx - scaled / 2, cy - scaled / 2, scaled, scaled, px, py, side, side);
-      ink.restore();
-    });
-    const box = scaled / left.width * w;
-    ink.lineWidth = 1.5 * density;
-    for (const [colour, grow] of [["#000", 1.5 * density], ["#fff", 0]]) {
-      ink.strokeStyle = colour;
-      ink.strokeRect(state.x * w - box / 2 - grow, state.y * h - box / 2 - grow, box + 2 * grow, box + 2 * grow);
-    }
-  }
-
-  const clamp = (value, low, high) => Math.min(high, Math.max(low, value));
-  function split(value) { state.split = clamp(value, 0, 1); at("split").value = 100 * state.split; draw(); }
-  function lens(x, y) { state.x = clamp(x, 0, 1); state.y = clamp(y, 0, 1); draw(); }
-  function toggle(on) { state.lens = on; at("lens").checked = on; draw(); }
-  function zoom(factor) { state.zoom = clamp(state.zoom * factor, 2, 32); at("zoom").textContent = `${state.zoom}×`; draw(); }
-
-  function place(event) {
-    const box = canvas.getBoundingClientRect();
-    return [(event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height];
-  }
-  canvas.addEventListener("pointerdown", (event) => {
-    const [x, y] = place(event);
-    if (state.lens && event.pointerType === "touch") lens(x, y); else split(x);
-    canvas.setPointerCapture(event.pointerId);
-  });
-  canvas.addEventListener("pointermove", (event) => {
-    const [x, y] = place(event), touch = event.pointerType === "touch";
-    if (event.buttons & 1 && !(touch && state.lens)) split(x);
-    if (state.lens) lens(x, y);
-  });
-  canvas.addEventListener("keydown", (event) => {
-    if (event.ctrlKey || event.metaKey || event.altKey) return;
-    const step = event.shiftKey ? 0.05 : 0.01;
-    const moves = {
-      ArrowLeft: () => lens(state.x - step, state.y), ArrowRight: () => lens(state.x + step, state.y),
-      ArrowUp: () => lens(state.x, state.y - step), ArrowDown: () => lens(state.x, state.y + step),
-      l: () => toggle(!state.lens), L: () => toggle(!state.lens), Escape: () => toggle(false),
-      "+": () => zoom(2), "=": () => zoom(2), "-": () => zoom(0.5),
-      "[": () => split(state.split - 0.02), "]": () => split(state.split + 0.02),
-    };
-    if (!(event.key in moves)) return;
-    if (event.key.startsWith("Arrow") && !state.lens) toggle(true);
-    moves[event.key]();
-    event.preventDefault();
-  });
-  at("split").addEventListener("input", (event) => split(event.target.value / 100));
-  at("lens").addEventListener("change", (event) => toggle(event.target.checked));
-  at("weaker").addEventListener("click", () => zoom(0.5));
-  at("stronger").addEventListener("click", () => zoom(2));
-
-  function option(value, text) {
-    const item = document.createElement("option");
-    item.value = value; item.textContent = text;
-    return item;
-  }
-  function roles() { // what both sides can show at this scale
-    const {images} = shot(), has = Object.keys(images);
-    const order = [gallery.truth, gallery.ceiling, ...gallery.recipes].filter((role, i, all) => has.includes(role) && all.indexOf(role) === i);
-    for (const side of ["left", "right"]) {
-      if (!has.includes(state[side])) state[side] = "";
-      at(side).replaceChildren(...order.map((role) => option(role, nameOf(role))));
-    }
-    const first = gallery.recipes.find((role) => role !== gallery.ceiling);
-    const best = has.includes("auto") ? "auto" : gallery.recipes[gallery.recipes.length - 1];
-    state.left = state.left || (has.includes("classic") ? "classic" : first);
-    state.right = state.right || best;
-    at("left").value = state.left; at("right").value = state.right;
-  }
-  gallery.views.forEach((view) => at("view").append(option(view, view)));
-  gallery.scales.forEach((scale) => {
-    const label = document.createElement("label"), radio = document.createElement("input"), text = document.createElement("span");
-    radio.type = "radio"; radio.name = "scale"; radio.value = scale; radio.checked = scale === state.scale;
-    radio.addEventListener("change", () => { state.scale = scale; roles(); show(); });
-    text.textContent = scale; label.append(radio, text); at("scales").append(label);
-  });
-  at("view").addEventListener("change", (event) => { state.view = event.target.value; roles(); show(); });
-  for (const side of ["left", "right"]) at(side).addEventListener("change", (event) => { state[side] = event.target.value; show(); });
-  document.getElementsByName("mode").forEach((radio) => radio.addEventListener("change", () => {
-    state.error = radio.value === "error" && radio.checked; show();
-  }));
-  new ResizeObserver(draw).observe(canvas.parentElement);
-  roles();
-  show();
-})();
+window.addEventListener("resize", render);
+window.addEventListener("hashchange", fromAddress);
+if (fromAddress()) at("viewer").scrollIntoView(); else render();
