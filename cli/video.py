@@ -15,7 +15,7 @@ class Video:
     """Render a camera path to .webm, classic 3DGS and aaplug side by side."""
 
     output: Annotated[Path, flag("FILE.webm", "-o")]
-    """The video: VP9 .webm, or H.264 .mp4 with the extra `mp4`."""
+    """The video: VP9 .webm, or H.264 .mp4."""
     scene: SceneOptions = field(default_factory=SceneOptions)
     cameras: CameraOptions = field(default_factory=CameraOptions)
     how: Annotated[verb.VideoOptions, Flat] = field(default_factory=verb.VideoOptions)

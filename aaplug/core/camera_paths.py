@@ -15,26 +15,32 @@ from torch import Tensor
 from aaplug.core.cameras import Camera, CameraSet
 
 
-def zoomed(view: Camera, factor: float) -> Camera:
+def zoomed(view: Camera, by: float) -> Camera:
     """The view with its focal length multiplied."""
-    return replace(view, fx=view.fx * factor, fy=view.fy * factor)
+    return replace(view, fx=view.fx * by, fy=view.fy * by)
 
 
-def moved(view: Camera, factor: float, depth: float) -> Camera:
-    """A free camera, moved along the view's axis so that a point at `depth` (world units) is at depth / factor."""
+def moved(view: Camera, by: float, depth: float) -> Camera:
+    """A free camera, moved along the view's axis so that a point at `depth` (world units) is at depth / by."""
     pose = view.cam_from_world.clone()
-    pose[2, 3] += depth * (1 / factor - 1)
+    pose[2, 3] += depth * (1 / by - 1)
     return replace(view, cam_from_world=pose, trained_focal=None)
 
 
 def zoom(view: Camera, t: float, start: float, end: float) -> Camera:
     """The view with its focal length multiplied; pose and size stay."""
-    return zoomed(view, _factor(t, start, end))
+    return zoomed(view, factor(t, start, end))
 
 
 def dolly(view: Camera, t: float, start: float, end: float, depth: float) -> Camera:
     """The view from farther away or nearer, as a free camera: see `moved`."""
-    return moved(view, _factor(t, start, end), depth)
+    return moved(view, factor(t, start, end), depth)
+
+
+def factor(t: float, start: float, end: float) -> float:
+    """The factor on the sampling rate that a zoom or dolly has at t."""
+    way = 0.5 - 0.5 * math.cos(2 * math.pi * t)
+    return start * (end / start) ** way
 
 
 def orbit(view: Camera, t: float, depth: float, up: Float[Tensor, " 3"]) -> Camera:
@@ -56,11 +62,6 @@ def frames(path: Callable[[float], Camera], count: int) -> list[Camera]:
     """`count` cameras along a path, named by their number."""
     digits = len(str(count - 1))
     return [replace(path(i / count), name=f"{i:0{digits}}") for i in range(count)]
-
-
-def _factor(t: float, start: float, end: float) -> float:
-    way = 0.5 - 0.5 * math.cos(2 * math.pi * t)
-    return start * (end / start) ** way
 
 
 def _rotation(axis: Float[Tensor, " 3"], angle: float) -> Float[Tensor, "3 3"]:

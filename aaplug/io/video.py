@@ -1,16 +1,15 @@
-"""Videos: VP9 in .webm through OpenCV, H.264 in .mp4 where PyAV is installed.
+"""Videos: VP9 in .webm and H.264 in .mp4, through PyAV.
 
 Frames are RGB float32 [height, width, 3] in [0, 1], all of one size.  Codecs need even sides: the last row or column
 of an odd side is repeated, and no pixel is resampled.  A video appears whole or not at all.
 """
 
-import importlib.util
 from collections.abc import Iterable
 from fractions import Fraction
 from os import PathLike
 from pathlib import Path
+from typing import TYPE_CHECKING, cast
 
-import cv2
 import numpy as np
 from jaxtyping import Float
 from torch import Tensor
@@ -18,9 +17,19 @@ from torch import Tensor
 from aaplug.core.errors import OutputError, UsageError
 from aaplug.core.imaging import levels
 from aaplug.io.atomic import check_output, replacing_file
-from aaplug.io.images import captured_stderr
 
-WEBM, MP4 = ".webm", ".mp4"
+if TYPE_CHECKING:
+    from av import VideoStream
+    from av.container import OutputContainer
+
+CODECS = {  # by suffix: FFmpeg's name and settings; `crf` is a constant quality, which `b` must not limit
+    ".webm": ("libvpx-vp9", {"crf": "24", "b": "0", "row-mt": "1", "cpu-used": "4"}),
+    ".mp4": ("libx264", {"crf": "18"}),
+}
+PIXELS = "yuv420p"  # the pixel format that every player supports
+BT709 = 1  # its code for matrix, primaries and transfer in ITU-T H.273
+MPEG_RANGE = 1  # FFmpeg's AVCOL_RANGE_MPEG: black is 16, white is 235
+MOST_DENOMINATOR = 1001  # of frames per second, as in 30000/1001
 MOST_FPS = 1000
 
 
@@ -29,13 +38,10 @@ def check_video(path: str | PathLike[str], fps: float, overwrite: bool) -> None:
 
     Raises:
         OutputError: it exists and `overwrite` is false, has no folder, or its suffix is not .webm or .mp4.
-        UsageError: its codec is not installed, or `fps` is out of range.
+        UsageError: `fps` is out of range.
     """
-    suffix = Path(path).suffix.lower()
-    if suffix not in (WEBM, MP4):
-        raise OutputError(path, f"name a {WEBM} or {MP4} file")
-    if suffix == MP4 and importlib.util.find_spec("av") is None:
-        raise UsageError(str(path), f"H.264 needs PyAV: pip install 'aaplug[mp4]'; {WEBM} needs nothing")
+    if Path(path).suffix.lower() not in CODECS:
+        raise OutputError(path, f"name a {' or '.join(CODECS)} file")
     if not 0 < fps <= MOST_FPS:
         raise UsageError("fps", f"must be above 0 and at most {MOST_FPS}, got {fps:g}")
     check_output(path, overwrite)
@@ -46,10 +52,8 @@ def write_video(
 ) -> None:
     """Write a video of at least one frame; errors as in `check_video`, and OutputError if it cannot be written."""
     check_video(path, fps, overwrite)
-    suffix = Path(path).suffix.lower()
-    write = _write_mp4 if suffix == MP4 else _write_webm
-    with replacing_file(path, overwrite, suffix) as temporary:
-        write(temporary, (_even(frame) for frame in frames), fps)
+    with replacing_file(path, overwrite, Path(path).suffix.lower()) as temporary:
+        _encode(temporary, (_even(frame) for frame in frames), fps)
 
 
 def _even(frame: Float[Tensor, "h w 3"]) -> np.ndarray:
@@ -59,35 +63,32 @@ def _even(frame: Float[Tensor, "h w 3"]) -> np.ndarray:
     return np.pad(pixels, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
 
 
-def _write_webm(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
-    writer = None
+def _encode(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
+    """Convert to BT.709 with rounding, and say so in the file: players then show white as white."""
+    import av  # it loads FFmpeg
+    from av.error import FFmpegError
+    from av.video.reformatter import ColorRange, Colorspace
+
+    range_and_matrix = {"dst_color_range": ColorRange.MPEG, "dst_colorspace": Colorspace.ITU709}
     try:
-        for frame in frames:
-            if writer is None:
-                code = cv2.VideoWriter.fourcc(*"VP90")
-                with captured_stderr():  # FFmpeg warns about VP9's tag in WebM, which it accepts
-                    size = (frame.shape[1], frame.shape[0])
-                    writer = cv2.VideoWriter(str(path), code, fps, size)
-                if not writer.isOpened():  # OpenCV does not raise
-                    raise OSError("this build of OpenCV cannot write VP9 there")
-            writer.write(np.ascontiguousarray(frame[..., ::-1]))
-    finally:
-        if writer is not None:
-            writer.release()
-    if not (path.is_file() and path.stat().st_size):
-        raise OSError("the codec wrote nothing")
+        with av.open(str(path), "w") as container:
+            stream = None
+            for frame in frames:
+                stream = stream or _added_stream(container, path.suffix, frame.shape[1], frame.shape[0], fps)
+                picture = av.VideoFrame.from_ndarray(frame, format="rgb24")
+                container.mux(stream.encode(picture.reformat(format=PIXELS, **range_and_matrix)))
+            if stream is not None:
+                container.mux(stream.encode())
+    except FFmpegError as error:
+        raise OSError(error.errno, error.strerror) from error
 
 
-def _write_mp4(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
-    import av  # pyright: ignore[reportMissingImports]
-
-    with av.open(str(path), "w") as container:
-        stream = None
-        for frame in frames:
-            if stream is None:
-                stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001))
-                stream.height, stream.width = frame.shape[:2]
-                stream.pix_fmt = "yuv420p"  # the pixel format that every player supports
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
-        if stream is not None:
-            container.mux(stream.encode())
+def _added_stream(container: "OutputContainer", suffix: str, width: int, height: int, fps: float) -> "VideoStream":
+    name, settings = CODECS[suffix]
+    rate = Fraction(fps).limit_denominator(MOST_DENOMINATOR)
+    stream = cast("VideoStream", container.add_stream(name, rate, options=settings))
+    stream.width, stream.height, stream.pix_fmt = width, height, PIXELS
+    colours = stream.codec_context
+    colours.color_range, colours.colorspace = MPEG_RANGE, BT709
+    colours.color_primaries = colours.color_trc = BT709
+    return stream

@@ -23,7 +23,7 @@ def make_video(
     renderers: Sequence[Renderer],
     cameras: Sequence[Camera],
     fps: float,
-    compose: Callable[[Sequence[Image]], Image] = lambda images: images[0],
+    compose: Callable[[int, Sequence[Image]], Image] = lambda _, images: images[0],
     *,
     threads: int = 1,
     overwrite: bool = False,
@@ -31,7 +31,7 @@ def make_video(
 ) -> None:
     """Render every camera with every renderer and write the video.
 
-    compose: makes one frame of the renderers' images.  threads: as for `write_frames`.
+    compose: makes one frame of its number and the renderers' images.  threads: as for `write_frames`.
     tell: called with (images done, images in all).
 
     Raises:
@@ -50,5 +50,8 @@ def make_video(
                 tell(before + done, count * len(renderers))
 
             write_frames(renderer, cameras, panes[-1], threads=threads, tell=tell_all)
-        frames = (compose([read_image(file, None) for file in files]) for files in zip(*panes, strict=True))
+        frames = (
+            compose(index, [read_image(file, None) for file in files])
+            for index, files in enumerate(zip(*panes, strict=True))
+        )
         write_video(path, frames, fps, overwrite)

@@ -16,7 +16,7 @@ from aaplug.core.errors import UsageError
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.monitor import SILENT, Monitor
 from aaplug.evaluation.protocols import median_depth
-from aaplug.evaluation.report.contact_sheet import labelled
+from aaplug.evaluation.report.contact_sheet import labelled, magnified
 from aaplug.io.cameras import select_views
 from aaplug.io.cameras.camera_path import read_camera_path
 from aaplug.io.video import MOST_FPS, check_video
@@ -29,6 +29,7 @@ from aaplug.verbs.views import resized
 FPS = 30.0  # frames per second, where neither the caller nor a path file says
 GAP = 4  # px between two panes
 MOST_FRAMES = 100_000
+RECEDING = ("zoom", "dolly")  # paths on which things become small
 
 
 class Clip(NamedTuple):
@@ -70,7 +71,7 @@ def video(
 
     Args:
         scene, cameras, monitor, and errors: see `render`.
-        output: a .webm file (VP9), or .mp4 (H.264) with the extra `mp4`.
+        output: a .webm file (VP9), or .mp4 (H.264).
         options: fields of `VideoOptions`; `beside` may be None.
     """
     o = VideoOptions.of(options)
@@ -80,10 +81,14 @@ def video(
     fps = o.fps or (FPS if free is None else free.fps)
     check_video(Path(output), fps, o.overwrite)
     scene, cameras = inputs_of(scene, cameras)
-    shown = resized(free.cameras if free else _along(scene, cameras, o, fps, monitor), o.scale, o.resolution)
-    compose = partial(
-        side_by_side, labels=[{"auto": "aaplug auto"}.get(recipe.name, recipe.name) for recipe in recipes]
-    )
+    path = free.cameras if free else _along(scene, cameras, o, fps, monitor)
+    shown = resized(path, o.scale, o.resolution)
+    labels = [{"auto": "aaplug auto"}.get(recipe.name, recipe.name) for recipe in recipes]
+
+    def compose(index: int, images: Sequence[Float[Tensor, "h _ 3"]]) -> Float[Tensor, "h w 3"]:
+        rate = camera_paths.factor(index / len(shown), o.start, o.end) if str(o.path) in RECEDING else 1.0
+        return side_by_side(images, labels, rate, shown[index].width / path[index].width)
+
     with processor(o.threads) as workers:
         look = look_of(scene, cameras, len(shown) * len(recipes), o, monitor)
         renderers = [drawn_by(recipe, scene, look) for recipe in recipes]
@@ -95,11 +100,19 @@ def video(
     return Clip(Path(output), len(shown), fps)
 
 
-def side_by_side(images: Sequence[Float[Tensor, "h _ 3"]], labels: Sequence[str]) -> Float[Tensor, "h w 3"]:
-    """Images from left to right, each with its label; a single image stays as it is."""
+def side_by_side(
+    images: Sequence[Float[Tensor, "h _ 3"]], labels: Sequence[str], rate: float = 1.0, size: float = 1.0
+) -> Float[Tensor, "h w 3"]:
+    """Images from left to right, each with its label; a single image stays as it is.
+
+    rate: size of things against the data set's view; where it falls, the middle is also shown enlarged.
+    size: of the images, relative to the training size.
+    """
     if len(images) == 1:
         return images[0]
-    shown = [labelled(image, label) for image, label in zip(images, labels, strict=True)]
+    caption = f"{rate * size:.2f} of training's sampling, {{times}}x"
+    inset = [magnified(image, min(1.0, rate), caption) for image in images]
+    shown = [labelled(image, label) for image, label in zip(inset, labels, strict=True)]
     gap = torch.zeros(shown[0].shape[0], GAP, 3)
     return torch.cat([part for image in shown for part in (gap, image)][1:], dim=1)
 

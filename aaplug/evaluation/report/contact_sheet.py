@@ -19,6 +19,8 @@ GAP = 12  # px
 HEADING = 36  # px: height of a line of text
 INK = (40, 40, 40)
 LIGHT_INK = (245, 245, 245)
+FRAME, FRAME_INK = 2, (128, 128, 128)  # px: edge of an inset
+LEAST_INSET = 64  # px
 
 
 def contact_sheet(
@@ -44,10 +46,37 @@ def contact_sheet(
 def labelled(image: Float[Tensor, "h w 3"], label: str) -> Float[Tensor, "h w 3"]:
     """A copy of the image with a label on a dark strip in its top left corner."""
     pixels = _bytes(image)
-    strip = pixels[:HEADING, : _text_width(label) + 2 * GAP]
-    strip[:] = strip // 4
-    _write(pixels, label, GAP, HEADING - GAP, LIGHT_INK)
+    _write_on_strip(pixels, label, 0, 0)
     return torch.from_numpy(pixels).float() / 255
+
+
+def magnified(image: Float[Tensor, "h w 3"], part: float, label: str) -> Float[Tensor, "h w 3"]:
+    """A copy of the image with its middle enlarged in the bottom right corner, each pixel to a sharp square.
+
+    part: share of the image that is of interest, in the middle, along each side.  The inset stays outside of it and
+        shows half of it along each side, or a little more; without room for `LEAST_INSET` px there is none.
+    label: stands above the inset; {times} in it becomes the enlargement.
+    """
+    pixels = _bytes(image)
+    height, width, _ = pixels.shape
+    room = int((1 - part) / 2 * min(height, width)) - FRAME
+    times = int((1 - part) / part)
+    if times > 1 and room >= LEAST_INSET:
+        side = room // times
+        top, left = (height - side) // 2, (width - side) // 2
+        inset = pixels[top : top + side, left : left + side].repeat(times, axis=0).repeat(times, axis=1)
+        y, x = height - len(inset), width - len(inset)
+        pixels[y - FRAME :, x - FRAME :] = FRAME_INK
+        pixels[y:, x:] = inset
+        words = label.format(times=times)
+        _write_on_strip(pixels, words, max(0, width - _text_width(words) - 2 * GAP), y - FRAME - HEADING)
+    return torch.from_numpy(pixels).float() / 255
+
+
+def _write_on_strip(pixels: np.ndarray, text: str, left: int, top: int) -> None:
+    strip = pixels[top : top + HEADING, left : left + _text_width(text) + 2 * GAP]
+    strip[:] = strip // 4
+    _write(pixels, text, left + GAP, top + HEADING - GAP, LIGHT_INK)
 
 
 def _enlarged(image: Float[Tensor, "h w 3"]) -> np.ndarray:
