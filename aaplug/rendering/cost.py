@@ -31,7 +31,7 @@ def cost_of(renderers: Iterable[Renderer], views: Iterable[Camera]) -> Cost:
         samples = [view.width * view.height * renderer.samples(view) ** 2 for view in views]
         found = Cost(
             found.seconds + per_gaussian * len(renderer.scene) * len(views) + per_sample * sum(samples),
-            max(found.scene, renderer.scene.sh.nbytes),
+            max(found.scene, renderer.scene.sh.untyped_storage().nbytes()),
             max(found.image, SAMPLE_BYTES * max(samples, default=0)),
         )
     return found
