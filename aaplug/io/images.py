@@ -1,19 +1,24 @@
 """Image files as float tensors, and tensors as PNG and WebP.
 
 Tensors are RGB, float32, [height, width, 3], row 0 at the top, values in [0, 1] as stored (gamma-encoded).  Bit depths
-are 8 or 16.  Orientation tags are ignored: cameras were calibrated on the pixels as they stand in the file.
+are 8 or 16.  Orientation tags are ignored: cameras were calibrated on the pixels as they stand in the file.  An
+animation is its still picture or first frame, a file of several pictures its first.
 
-Readers raise FormatError for a file that is missing, not an image, damaged, or above the limit IMAGE.
+Readers raise FormatError for a file that is missing, not an image of `FORMATS`, damaged, or above the limits IMAGE and
+IMAGE_EXTRA.  Memory is bounded by the limits before anything is decoded: by the size in the header that Pillow reads,
+which OpenCV's pixels must have.
 """
 
 import logging
 import os
+import struct
 import tempfile
-from collections.abc import Iterator
+import warnings
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
-from typing import IO
+from typing import IO, NamedTuple
 
 import cv2
 import numpy as np
@@ -22,7 +27,7 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from aaplug.core.errors import FormatError
+from aaplug.core.errors import FormatError, listing
 from aaplug.core.imaging import levels
 from aaplug.io.atomic import replacing
 from aaplug.io.limits import whole_limit
@@ -31,35 +36,54 @@ LOSSLESS_WEBP = 101  # OpenCV's quality for it
 SAMPLE_TYPES = {8: np.uint8, 16: np.uint16}  # by bit depth
 ROWS = 256  # of an image converted to samples at once
 ALPHA_CHANNELS = 4  # RGB and alpha
-DAMAGE = ("Corrupt JPEG data", "Premature end of JPEG file")  # libjpeg's messages for lost pixels
+FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")  # of Pillow; OpenCV tells them by the same first bytes
+BYTES_A_PIXEL = 8  # four channels of 16 bits: no image takes more
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+PNG_CHUNK = struct.Struct(">I4s")  # length of the data and kind, before them
+PNG_CHECKSUM = 4  # bytes, after them
+PNG_PIXELS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")  # chunks that make a still picture
+LOST = ("Corrupt JPEG data: premature end", "Premature end of JPEG file")  # libjpeg's messages for lost pixels
+DAMAGE = "Corrupt JPEG data"  # and for what may be harmless: bytes between the markers
 STDERR = 2  # file descriptor, which the codecs write to directly
 
 log = logging.getLogger("aaplug")
 
 
+class _Header(NamedTuple):
+    """What a file says before its pixels: width and height in px, and whether it declares transparency."""
+
+    size: tuple[int, int]
+    transparent: bool
+
+
 def image_size(path: str | PathLike[str]) -> tuple[int, int]:
     """Width and height in px as stored, from the header alone."""
-    return _look(Path(path))[0]
+    return _look(Path(path)).size
 
 
 def read_image(
     path: str | PathLike[str], background: tuple[float, float, float] | None = None
 ) -> Float[Tensor, "h w 3"]:
     """Read an 8- or 16-bit image; a transparent one is composited over `background` in float, and refused if None."""
-    pixels = torch.from_numpy(_read(Path(path)))
-    if pixels.shape[2] < ALPHA_CHANNELS:
-        return pixels
-    if background is None:
-        raise FormatError(path, "is transparent; pass `background`, the colour behind it")
-    rgb, alpha = pixels[..., :3], pixels[..., 3:]
-    return rgb * alpha + torch.tensor(background, dtype=torch.float32) * (1 - alpha)
+
+    def composited(rows: Tensor) -> Tensor:
+        if rows.shape[2] < ALPHA_CHANNELS:
+            return rows
+        if background is None:
+            raise FormatError(path, "is transparent; pass `background`, the colour behind it")
+        rgb, alpha = rows[..., :3], rows[..., 3:]
+        return rgb * alpha + torch.tensor(background, dtype=torch.float32) * (1 - alpha)
+
+    return _read(Path(path), 3, composited)
 
 
 def read_rgba(path: str | PathLike[str]) -> Float[Tensor, "h w 4"]:
     """Read an 8- or 16-bit image with straight (not premultiplied) alpha; 1 where the file has none."""
-    pixels = torch.from_numpy(_read(Path(path)))
-    opaque = torch.ones_like(pixels[..., :1])
-    return pixels if pixels.shape[2] == ALPHA_CHANNELS else torch.cat([pixels, opaque], dim=2)
+
+    def with_alpha(rows: Tensor) -> Tensor:
+        return rows if rows.shape[2] == ALPHA_CHANNELS else torch.nn.functional.pad(rows, (0, 1), value=1.0)
+
+    return _read(Path(path), ALPHA_CHANNELS, with_alpha)
 
 
 def write_png(
@@ -89,19 +113,22 @@ def _stored(rgb: Float[Tensor, "h w 3"], bit_depth: int) -> np.ndarray:
     return np.concatenate([part.astype(SAMPLE_TYPES[bit_depth]) for part in parts])
 
 
-def _look(path: Path) -> tuple[tuple[int, int], bool]:
-    """Width and height, and whether the header declares transparency."""
+def _look(path: Path) -> _Header:
+    """The header, within the limits."""
     try:
-        with _no_pillow_limit(), Image.open(path) as header:
+        with _no_pillow_limit(), warnings.catch_warnings(action="ignore"), Image.open(path, formats=FORMATS) as header:
             size, transparent = header.size, header.has_transparency_data
+            stored = path.stat().st_size
     except FileNotFoundError as error:
         raise FormatError(path, "does not exist") from error
     except Exception as error:  # Pillow's parsers raise all kinds
-        raise FormatError(path, "is not an image that can be read") from error
-    most = whole_limit("IMAGE")  # an image above it counts as a decompression bomb
-    if size[0] * size[1] > most:
+        raise FormatError(path, f"is not an image that can be read ({listing(FORMATS)})") from error
+    pixels, most = size[0] * size[1], whole_limit("IMAGE")  # an image above it counts as a decompression bomb
+    if pixels > most:
         raise FormatError(path, f"has {size[0]}x{size[1]} px, more than the {most:,} allowed")
-    return size, transparent
+    if stored > BYTES_A_PIXEL * pixels + whole_limit("IMAGE_EXTRA"):
+        raise FormatError(path, f"has {stored:,} bytes, which {size[0]}x{size[1]} px do not need")
+    return _Header(size, transparent)
 
 
 @contextmanager
@@ -114,34 +141,55 @@ def _no_pillow_limit() -> Iterator[None]:
         Image.MAX_IMAGE_PIXELS = limit
 
 
-def _read(path: Path) -> np.ndarray:
-    """Float32 in [0, 1], RGB or RGBA."""
-    _, transparent = _look(path)
-    pixels = _decode(path)
-    if pixels.dtype not in SAMPLE_TYPES.values():
-        raise FormatError(path, f"holds {pixels.dtype} samples; save it with 8 or 16 bits")
-    if transparent != (pixels.shape[2] == ALPHA_CHANNELS):
+def _read(path: Path, channels: int, finished: Callable[[Tensor], Tensor]) -> Float[Tensor, "h w c"]:
+    """Values in [0, 1], RGB or RGBA, `finished` in bands of rows so that memory holds the samples and the result."""
+    header = _look(path)
+    samples = _decode(path)
+    height, width, stored = samples.shape
+    if (width, height) != header.size:
+        raise FormatError(path, f"has {width}x{height} px where its header says {header.size[0]}x{header.size[1]}")
+    if samples.dtype not in SAMPLE_TYPES.values():
+        raise FormatError(path, f"holds {samples.dtype} samples; save it with 8 or 16 bits")
+    if header.transparent != (stored == ALPHA_CHANNELS):
         raise FormatError(path, "has colours or transparency that OpenCV cannot read; save it as RGB(A) PNG")
-    image = pixels.astype(np.float32) / np.iinfo(pixels.dtype).max
-    order = [0, 0, 0] if image.shape[2] == 1 else [2, 1, 0, 3][: image.shape[2]]
-    return np.ascontiguousarray(image[..., order])
+    order = [0, 0, 0] if stored == 1 else [2, 1, 0, 3][:stored]
+    highest, image = np.iinfo(samples.dtype).max, torch.empty(height, width, channels)
+    for start in range(0, height, ROWS):
+        rows = samples[start : start + ROWS, :, order].astype(np.float32) / highest
+        image[start : start + ROWS] = finished(torch.from_numpy(rows))
+    return image
 
 
 def _decode(path: Path) -> np.ndarray:
     """Samples as stored, [h, w, channels], BGR(A) or gray."""
     try:
+        data = _still(path.read_bytes())
         with captured_stderr() as words:
             # UNCHANGED keeps 16 bits and alpha, and ignores the orientation tag
-            pixels = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+            pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
             words.seek(0)
             lines = words.read().decode("ascii", "replace").splitlines()
     except (OSError, MemoryError, cv2.error) as error:
         raise FormatError(path, "cannot be read or is damaged") from error
-    if pixels is None:
+    if pixels is None or any(line.startswith(LOST) for line in lines):
         raise FormatError(path, "is damaged or cut short")
     if damage := next((line for line in lines if line.startswith(DAMAGE)), ""):
         log.warning("%s: is damaged (%s)", path, damage)
     return pixels[..., None] if pixels.ndim == 2 else pixels
+
+
+def _still(data: bytes) -> bytes:
+    """A PNG without the chunks of an animation, with which OpenCV also takes pixels that are missing for black."""
+    if not data.startswith(PNG_SIGNATURE):
+        return data
+    kept, at = [PNG_SIGNATURE], len(PNG_SIGNATURE)
+    while at + PNG_CHUNK.size <= len(data):
+        length, kind = PNG_CHUNK.unpack_from(data, at)
+        end = at + PNG_CHUNK.size + length + PNG_CHECKSUM
+        if kind in PNG_PIXELS:
+            kept.append(data[at:end])
+        at = end
+    return b"".join(kept)
 
 
 @contextmanager

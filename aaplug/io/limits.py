@@ -30,6 +30,7 @@ LIMITS: Mapping[str, Limit] = {
     "CFG_ARGS": Limit(64 * 2**10, "bytes", "INRIA's cfg_args"),
     "NAME": Limit(4096, "bytes", "a photograph's name"),
     "IMAGE": Limit(2**28, "px", "an image; 16384 x 16384"),
+    "IMAGE_EXTRA": Limit(64 * 2**20, "bytes", "of an image's file beyond 8 a pixel: previews, metadata"),
     "CAMERA_SIDE": Limit(65536, "px", "a side of a camera's image"),
     "INFLATE": Limit(200, "times", "growth of a compressed member; gzip and zstd streams are held to the "
                      "size that their header announces"),
