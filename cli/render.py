@@ -24,8 +24,9 @@ class Render:
 
     def __call__(self) -> int:
         """Render, and say what was written."""
-        scene, cameras = self.scene.read(), self.cameras.read(self.scene)
-        written = verb.render(scene, cameras, self.output, monitor=TERMINAL, **vars(self.how))
+        opened, cameras = self.scene.open(), self.cameras.read(self.scene)
+        own = {"drop_bad": self.scene.drop_bad} | vars(self.how)
+        written = verb.render(opened, cameras, self.output, monitor=TERMINAL, **own)
         if self.json:
             images = [{"view": v.name, "file": str(p), "width": v.width, "height": v.height} for v, p in written]
             print_json({"recipe": self.how.recipe, "images": images})

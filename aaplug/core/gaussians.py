@@ -6,6 +6,7 @@ Activated values (scales, opacities, unit quaternions) are properties.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -145,6 +146,20 @@ class Gaussians:
     def columns(self) -> dict[str, Tensor]:
         """Every parameter that is present, by name."""
         return {name: value for name, value in vars(self).items() if isinstance(value, Tensor)}
+
+
+def joined(parts: Sequence[Gaussians]) -> Gaussians:
+    """The Gaussians of several parts of one scene, at least one part, each with the same columns."""
+    first = parts[0]
+    columns = {name: torch.cat([getattr(part, name) for part in parts]) for name in first._columns()}
+    sizes = [vars(part.pixel_sizes).values() for part in parts if part.pixel_sizes is not None]
+    rows = [part.origin.rows for part in parts if part.origin is not None]
+    return replace(
+        first,
+        **columns,
+        pixel_sizes=PixelSizes(*map(torch.cat, zip(*sizes, strict=True))) if sizes else None,
+        origin=first.origin and replace(first.origin, rows=torch.cat(rows)),
+    )
 
 
 def scale_opacities(

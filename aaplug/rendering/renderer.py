@@ -8,11 +8,12 @@ and averaging the samples of each pixel.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal, NamedTuple
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.cameras import BLACK, WHITE, Camera, CameraSet
@@ -34,6 +35,7 @@ from aaplug.rasterizers import RASTERIZERS, find_rasterizer
 CHUNK = 1 << 20  # Gaussians projected at once
 
 Background = Literal["auto", "white", "black"] | Colour
+Harmonics = Callable[[int, int], Float[Tensor, "c k 3"]]
 
 
 class Drawing(NamedTuple):
@@ -50,6 +52,7 @@ class Renderer:
 
     scene: the scene after the world filter.  training: the training views of the unfiltered scene.
     background: red, green, blue in [0, 1].
+    harmonics: reads those of the Gaussians from start up to stop, where `scene.sh` does not hold them; else None.
     """
 
     scene: Gaussians
@@ -57,6 +60,7 @@ class Renderer:
     recipe: Recipe
     rasterizer: Rasterizer = RASTERIZERS["eager"]
     background: Colour = BLACK
+    harmonics: Harmonics | None = None
     _rates: dict[tuple[object, ...], float] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @classmethod
@@ -164,7 +168,7 @@ class Renderer:
             whole = len(self.scene) <= CHUNK
             chunk = self.scene if whole else self.scene[start : start + CHUNK]
             splats = self._projected(chunk, start, camera)
-            parts.append(shade(splats, self.scene, camera, self._kernels))
+            parts.append(self._shaded(splats, chunk, start, camera))
         splats = concatenated(parts)
         _check_colours(splats)
         return splats
@@ -182,6 +186,14 @@ class Renderer:
         splats = recipe.screen(splats, camera, training)
         ellipses = recipe.pixel.bounding_ellipses(splats, rules)
         return cull(splats, camera.hw, training.cull_margin, kernels, ellipses, rules)
+
+    def _shaded(self, splats: Splats2D, chunk: Gaussians, start: int, camera: Camera) -> Splats2D:
+        """The same splats with colour; harmonics that the scene does not hold are read for the chunk from `start`."""
+        if self.harmonics is None or not len(splats):
+            return shade(splats, self.scene, camera, self._kernels)
+        chunk = replace(chunk, sh=self.harmonics(start, start + len(chunk)))
+        local = replace(splats, sources=splats.sources - start)
+        return replace(shade(local, chunk, camera, self._kernels), sources=splats.sources)
 
     @property
     def _kernels(self) -> Kernels:

@@ -15,17 +15,19 @@ from aaplug.core.interfaces import MatchesRates, TakesMemory
 from aaplug.core.monitor import Monitor
 from aaplug.core.training import TrainingViews
 from aaplug.io.cameras import read_cameras
-from aaplug.io.scenes import MODEL_SCENE, open_scene, read_scene
+from aaplug.io.scenes import MODEL_SCENE, open_scene, ply, read_scene
+from aaplug.io.scenes.harmonics import without_harmonics
 from aaplug.io.scenes.scene_file import SceneFile
 from aaplug.methods.recipe import Recipe
 from aaplug.methods.recipes import RECIPES, find_recipe
 from aaplug.rasterizers import find_rasterizer
-from aaplug.rendering.renderer import Renderer, background_colour
+from aaplug.rendering.renderer import Harmonics, Renderer, background_colour
 from aaplug.verbs.options import RecipeOptions, ViewOptions
 
 AnyPath = str | PathLike[str]
 SceneLike = Gaussians | AnyPath
 CamerasLike = CameraSet | AnyPath | None
+HELD_HARMONICS = 2 * 10**9  # bytes: reading more for each view costs less than holding them; 10 M Gaussians of degree 3
 
 
 def scene_of(scene: SceneLike) -> Gaussians:
@@ -43,6 +45,15 @@ def sources_of(scene: Gaussians | SceneFile) -> list[Path]:
     if isinstance(scene, SceneFile):
         return [scene.path]
     return [Path(scene.origin.path)] if scene.origin else []
+
+
+def drawable(scene: Gaussians | SceneFile, drop_bad: bool = False) -> tuple[Gaussians, Harmonics | None]:
+    """The scene, and what reads its harmonics if they are large and stay in the file; only a .ply is read by rows."""
+    if isinstance(scene, Gaussians):
+        return scene, None
+    if scene.format == ply.name and scene.harmonics_bytes > HELD_HARMONICS:
+        return without_harmonics(scene, drop_bad)
+    return scene.whole(drop_bad), None
 
 
 def cameras_of(cameras: CamerasLike, scene: SceneLike) -> CameraSet:

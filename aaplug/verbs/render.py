@@ -1,20 +1,32 @@
 """Images of a scene at new resolutions."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from aaplug.core.cameras import Camera
 from aaplug.core.errors import listing
+from aaplug.core.gaussians import Gaussians
 from aaplug.core.monitor import SILENT, Monitor
 from aaplug.io.atomic import output_folder
 from aaplug.io.cameras import select_views
+from aaplug.io.scenes.scene_file import SceneFile
 from aaplug.methods.recipes import find_recipe
 from aaplug.rendering.frames import write_frames
 from aaplug.rendering.renderer import Renderer
 from aaplug.verbs.announce import announce
-from aaplug.verbs.inputs import AnyPath, CamerasLike, SceneLike, drawn_by, inputs_of, look_of, processor
+from aaplug.verbs.inputs import (
+    AnyPath,
+    CamerasLike,
+    SceneLike,
+    cameras_of,
+    drawable,
+    drawn_by,
+    look_of,
+    opened_of,
+    processor,
+)
 from aaplug.verbs.options import ImageOptions, RecipeOptions
 from aaplug.verbs.views import image_paths, resized
 
@@ -36,19 +48,21 @@ class RenderOptions(RecipeOptions, ImageOptions):
 
 @RenderOptions.shown
 def render(
-    scene: SceneLike,
+    scene: SceneLike | SceneFile,
     cameras: CamerasLike = None,
     output: AnyPath = "images",
     *,
+    drop_bad: bool = False,
     monitor: Monitor = SILENT,
     **options: Any,
 ) -> list[Written]:
     """Render views at any resolution to PNG.
 
     Args:
-        scene: Gaussians, a scene's file or a model folder.
+        scene: Gaussians, a scene's file, opened or not, or a model folder.
         cameras: a camera set, its file or folder, or None for those of the scene's model folder.
         output: a folder, or one .png for one view.
+        drop_bad: leave out Gaussians of a file that cannot be used.
         monitor: receives messages and progress.
         options: fields of `RenderOptions`.
 
@@ -59,11 +73,13 @@ def render(
     recipe = o.recipe
     if isinstance(recipe, str):
         recipe = find_recipe(recipe, quality=o.quality, rate_reference=o.rate_reference)
-    scene, cameras = inputs_of(scene, cameras)
+    cameras = cameras_of(cameras, scene.path if isinstance(scene, SceneFile) else scene)
     shown = resized(select_views(cameras, o.views), o.scale, o.resolution)
     paths = image_paths(Path(output), shown, o.overwrite)
+    scene, harmonics = drawable(scene if isinstance(scene, Gaussians) else opened_of(scene), drop_bad)
     with processor(o.threads) as workers:
         renderer = drawn_by(recipe, scene, look_of(scene, cameras, len(shown), o, monitor))
+        renderer = replace(renderer, harmonics=harmonics)
         monitor.say(described(renderer, shown))
         announce([renderer], shown, monitor, processes=workers)
         how = {"threads": workers, "bit_depth": o.bit_depth, "overwrite": o.overwrite}

@@ -26,6 +26,7 @@ PART = 1 << 16  # Gaussians per part: 15 MB at degree 3
 FLOAT = 4  # bytes
 HUGE_LOG_SCALE = 20.0  # half a billion units
 HUGE_HARMONIC = 1e4  # trained harmonics stay below 10
+SHAPE_NUMBERS = 11  # of a Gaussian: mean, quaternion, scales, opacity
 MAX_REASON = 200  # characters of a library's message
 FILTER_COLUMN = "filter_3D"  # Mip-Splatting's 3D filter: a standard deviation in world units
 DEGREES = {3 * ((d + 1) ** 2 - 1): d for d in range(5)}  # SH degree by number of f_rest columns
@@ -91,12 +92,20 @@ class SceneFile:
 
     def whole(self, drop_bad: bool = False) -> Gaussians:
         """The whole scene; raises FormatError as `parts`, and above the limit MEMORY_SHARE of the machine's memory."""
-        needed = self.count * FLOAT * (11 + 3 * (self.sh_degree + 1) ** 2)
+        self.check_memory(self.count * FLOAT * SHAPE_NUMBERS + self.harmonics_bytes)
+        (scene,) = self.parts(drop_bad, max(1, self.count))
+        return scene
+
+    @property
+    def harmonics_bytes(self) -> int:
+        """What the harmonics take in memory."""
+        return self.count * FLOAT * 3 * (self.sh_degree + 1) ** 2
+
+    def check_memory(self, needed: int) -> None:
+        """Refuse a scene that takes more bytes than the limit MEMORY_SHARE of the machine's memory."""
         if lacking := lack_of_memory(needed):
             hint = "info and convert read it in parts, AAPLUG_MEMORY_SHARE=1 allows all"
             raise FormatError(self.path, f"its {self.count:,} Gaussians take {lacking}; {hint}")
-        (scene,) = self.parts(drop_bad, max(1, self.count))
-        return scene
 
 
 @contextmanager
