@@ -84,4 +84,4 @@ def main(count: int = 20_000_000, folder: str | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main(*(int(float(word)) for word in sys.argv[1:2]), *sys.argv[2:3])
+    main(int(float([*sys.argv, "20e6"][1])), *sys.argv[2:3])
