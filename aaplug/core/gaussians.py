@@ -151,7 +151,7 @@ class Gaussians:
 def joined(parts: Sequence[Gaussians]) -> Gaussians:
     """The Gaussians of several parts of one scene, at least one part, each with the same columns."""
     first = parts[0]
-    columns = {name: torch.cat([getattr(part, name) for part in parts]) for name in first._columns()}
+    columns = {name: torch.cat([getattr(part, name) for part in parts]) for name in first.columns}
     sizes = [vars(part.pixel_sizes).values() for part in parts if part.pixel_sizes is not None]
     rows = [part.origin.rows for part in parts if part.origin is not None]
     return replace(
