@@ -37,11 +37,13 @@ class Convert:
                 fused = [{"method": f.method, **f.settings} for f in scene.fused]
                 facts |= {"gaussians": len(scene), "fused": fused}
             if report is not None:
-                facts |= {"for": found.viewer.name, "residual": results(report)}
+                viewer = {"for": found.viewer.name, "settings": found.viewer.settings}
+                facts |= {**viewer, "residual": results(report)}
             print_json(facts)
         elif report is not None:
             out.print("As the viewer draws it, against the scene's own training-size render:")
             out.print(tables(report)[0])
         how = "in parts" if scene is None else f"fused {fused_in(scene)}"
         say(f"wrote {self.output}: {how}; show it with {found.viewer.rule} ({found.viewer.name})")
+        say(found.viewer.advice)
         return 0

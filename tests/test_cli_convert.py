@@ -25,7 +25,7 @@ def test_convert_writes_what_was_fused(cli):
     assert code == 0
     expected = {"method": "matched-energy", "variance": "0.2", "views": "3", "from": "classic"}
     assert json.loads(out) == {"output": "c.ply", "gaussians": 150, "fused": [expected]}
-    assert "show it with 0.1 px², compensated (mip-viewer)" in err
+    assert "show it with 0.1 px², compensated (mip)" in err
     again = read_scene(Path("c.ply"))
     assert (again.convention, fused()) == (MIP, ["matched-energy"])
     assert "matched-energy (variance=0.2" in cli("info c.ply")[1]
@@ -55,7 +55,7 @@ def test_convert_needs_cameras_for_what_it_computes(cli):
     assert (code, "error: --cameras:" in err) == (2, True)
 
 
-@pytest.mark.parametrize("viewer", ["classic-viewer", "gsplat"])
+@pytest.mark.parametrize("viewer", ["classic", "gsplat"])
 def test_convert_for_a_viewer_tags_its_rule_and_prints_what_is_left(cli, viewer):
     """A viewer that draws as training did is right at the training size, and every step takes away from that."""
     code, out, err = cli(f"{CONVERT} --for {viewer} --steps 1 --threads 1")
@@ -74,7 +74,7 @@ def test_convert_for_a_viewer_tags_its_rule_and_prints_what_is_left(cli, viewer)
 
 
 def test_convert_for_a_viewer_prints_the_residual_as_json(cli):
-    code, out, _ = cli(f"{CONVERT} --viewer mip-viewer --steps 0 --json")
+    code, out, _ = cli(f"{CONVERT} --viewer mip --steps 0 --json")
     found = json.loads(out)
     assert code == 0
     assert [f["method"] for f in found["fused"]] == ["matched-energy"]
@@ -84,7 +84,7 @@ def test_convert_for_a_viewer_prints_the_residual_as_json(cli):
 
 
 def test_convert_for_the_rule_of_training_changes_no_byte(cli):
-    code, out, _ = cli(f"{CONVERT} --for classic-viewer --json")
+    code, out, _ = cli(f"{CONVERT} --for classic --json")
     assert (code, json.loads(out)["fused"]) == (0, [])
     assert Path("c.ply").read_bytes() == Path("scene.ply").read_bytes()
 
@@ -94,7 +94,7 @@ def test_convert_starts_from_the_original_where_the_closed_form_is_worse(cli, mo
         return replace(scene, logit_opacities=scene.logit_opacities - 5, convention=MIP)
 
     monkeypatch.setattr("aaplug.finetuning.fitting.fuse_for", dim)
-    code, _, err = cli(f"{CONVERT} --for mip-viewer --steps 1")
+    code, _, err = cli(f"{CONVERT} --for mip --steps 1")
     assert (code, "starting from the original" in err) == (0, True)
     original, found = (read_scene(Path(name)).logit_opacities for name in ("scene.ply", "c.ply"))
     assert (found - original).abs().max() < 1
@@ -106,7 +106,7 @@ def test_convert_starts_from_the_original_where_the_closed_form_is_worse(cli, mo
         ("--steps 3", "--steps: belongs to the optimization for a --viewer"),
         ("--for gsplat --variance 0.1", "leave out --form, --variance"),
         ("--for gsplat --steps -1", "--steps: takes 0..1000000, got -1"),
-        ("--for web", "--viewer: 'web' is not one of classic-viewer"),
+        ("--for web", "--viewer: 'web' is not one of classic"),
         ("--form web", "--form: 'web' is not one of matched-energy"),
     ],
 )
@@ -122,5 +122,5 @@ def test_what_was_tuned_converts_and_what_was_converted_does_not_again(cli):
     write_scene(Path("tuned.ply"), tuned)
     assert cli("convert tuned.ply --cameras . -o c.ply")[0] == 0
     assert fused() == ["finetune", "matched-energy"]
-    code, _, err = cli("convert c.ply --cameras . -o d.ply --for mip-viewer --steps 0")
+    code, _, err = cli("convert c.ply --cameras . -o d.ply --for mip --steps 0")
     assert (code, "already has matched-energy" in err) == (2, True)

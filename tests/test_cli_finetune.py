@@ -18,7 +18,7 @@ from aaplug.finetuning import loop
 from aaplug.io.scenes import read_scene
 from tests.test_cli import cli, dataset  # noqa: F401 (fixtures)
 
-TUNE = "finetune scene.ply --cameras . -o tuned.ply --scale 0.5 --threads 1 --for mip-viewer --rasterizer eager"
+TUNE = "finetune scene.ply --cameras . -o tuned.ply --scale 0.5 --threads 1 --for mip --rasterizer eager"
 RUN = f"{TUNE} --steps 3 --checkpoint-every 2"
 
 
@@ -45,7 +45,7 @@ def test_finetune_writes_scene_report_and_pictures(whole):
     found = read_scene(whole / "tuned.ply")
     assert found.convention == MIP
     assert [fusion.method for fusion in found.fused] == ["matched-energy", "finetune"]
-    settings = {"steps": "3", "for": "mip-viewer", "method": "consistency"}
+    settings = {"steps": "3", "for": "mip", "method": "consistency"}
     assert found.fused[1].settings == settings
     report = json.loads((whole / "tuned.finetune.json").read_text())
     assert [entry["step"] for entry in report["curve"]] == [1, 2, 3]

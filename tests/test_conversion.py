@@ -101,7 +101,7 @@ def test_converted_for_a_viewer_shows_the_energy_that_training_showed(viewer, tr
 def test_a_scene_thinner_than_a_viewers_blur_keeps_some_area(cameras):
     scene = replace(make_scene(40), convention=MIP)
     scene = replace(scene, log_scales=scene.log_scales - 4)
-    converted = fuse_for(scene, TrainingViews.of(scene, cameras), VIEWERS["antialiased-viewer"])
+    converted = fuse_for(scene, TrainingViews.of(scene, cameras), VIEWERS["antialiased"])
     assert (converted.log_scales <= scene.log_scales).all()
     assert converted.log_scales.isfinite().all()
     px = converted.scales * median_rates(scene.means, cameras)[:, None]

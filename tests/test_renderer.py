@@ -21,7 +21,9 @@ from aaplug.rendering.renderer import Renderer
 from tests.conftest import make_camera, make_scene
 
 REFERENCE = RASTERIZERS["reference"]
-OWN_RECIPE = {"classic": "classic", "antialiased": "ewa", "mip": "mip"}  # of each convention
+OWN_RECIPE = dict(
+    zip(CONVENTIONS, ("classic", "ewa", "mip", "playcanvas", "playcanvas-classic"), strict=True)
+)  # of each convention
 EYES = [(0.0, -4.0, 0.0), (3.0, -3.5, 1.0), (-1.0, -2.5, 1.5), (0.5, 5.0, -1.0)]
 
 

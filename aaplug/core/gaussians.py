@@ -38,7 +38,10 @@ class Convention:
 CLASSIC = Convention("classic", 0.3, compensated=False)  # 3DGS (Kerbl et al. 2023)
 ANTIALIASED = Convention("antialiased", 0.3, compensated=True)  # 3DGS --antialiasing, gsplat "antialiased"
 MIP = Convention("mip", 0.1, compensated=True)  # Mip-Splatting (Yu et al. 2024), arXiv 2311.16493
-CONVENTIONS = {c.name: c for c in (CLASSIC, ANTIALIASED, MIP)}
+# PlayCanvas (engine 2.23.3) adds 0.3 in half pixels; what is fitted to it records that as its training
+PLAYCANVAS = Convention("playcanvas", 0.3 / 4, compensated=True)
+PLAYCANVAS_CLASSIC = Convention("playcanvas-classic", 0.3 / 4, compensated=False)  # its anti-aliasing is off
+CONVENTIONS = {c.name: c for c in (CLASSIC, ANTIALIASED, MIP, PLAYCANVAS, PLAYCANVAS_CLASSIC)}
 
 
 @dataclass(frozen=True)

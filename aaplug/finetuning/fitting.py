@@ -47,7 +47,7 @@ def fit(
     steps: of the optimization; 0 keeps the closed form.
     """
     truth = Truth(look, enlarge=back_projected, memory=MEMORY)
-    original = replace(look, recipe=RECIPES[viewer.recipe])
+    original = replace(look, scene=viewer.shown(look.scene), recipe=RECIPES[viewer.recipe])
 
     def measured(*candidates: Candidate) -> Report:
         with monitor.progress("measuring", "views") as tell:

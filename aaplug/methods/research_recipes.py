@@ -18,6 +18,19 @@ from aaplug.methods.recipe import Promises, Recipe
 
 RESEARCH_RECIPES = (
     Recipe(
+        "playcanvas",
+        SCREEN_FILTERS["playcanvas"],
+        "PlayCanvas and SuperSplat with anti-aliasing on: 0.3 in half pixels, that is 0.075 px², compensated",
+        "predicting their pictures; scenes converted for them",
+    ),
+    Recipe(
+        "playcanvas-classic",
+        SCREEN_FILTERS["playcanvas-classic"],
+        "PlayCanvas and SuperSplat with anti-aliasing off: 0.075 px²",
+        "predicting their pictures; scenes converted for them",
+        promises=Promises(keeps_energy=False),
+    ),
+    Recipe(
         "mip-splatting-code",
         SCREEN_FILTERS["mip"],
         "Mip-Splatting as in its published code: the largest focal length for every camera",

@@ -10,12 +10,22 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from aaplug.core.errors import UsageError
-from aaplug.core.gaussians import ANTIALIASED, CLASSIC, MIP, Convention, Fusion, Gaussians
+from aaplug.core.gaussians import (
+    ANTIALIASED,
+    CLASSIC,
+    MIP,
+    PLAYCANVAS,
+    PLAYCANVAS_CLASSIC,
+    Convention,
+    Fusion,
+    Gaussians,
+)
 from aaplug.core.registry import Registry, named
 from aaplug.core.training import TrainingViews
 from aaplug.methods.filters import MatchedEnergy, Smoothing3D, fuse_stored
 
 FITTED_VARIANCE = 0.1  # px² at the median training rate, best measured; from uncompensated training to compensation
+MOST_DEGREE = 4  # of spherical harmonics in any file
 TUNED = "finetune"  # method that fine-tuning records in `Gaussians.fused`; it adds no blur
 
 
@@ -45,38 +55,104 @@ FORMS: Registry[Form] = Registry(
 
 @dataclass(frozen=True)
 class Viewer:
-    """A program that shows scenes by one rule.
+    """A program with its settings, and the rule by which it then shows scenes.
 
+    program: name and version that the rule was measured on or read from.
     recipe: name of the recipe that implements the rule.
     convention: what the file must declare for this rule; None keeps the scene's own convention.
-    rule: the rule in words, for the user.
+    settings: what to choose in the program, for the user.
+    switched: whether anti-aliasing is off there until these settings turn it on.
+    sh_degree: highest degree of the harmonics that it draws.
+    cut: where a splat ends, in words.
     """
 
     name: str
+    program: str
     recipe: str
     convention: Convention | None
-    rule: str
+    settings: str
+    switched: bool = False
+    sh_degree: int = MOST_DEGREE
+    cut: str = "alpha < 1/255"
 
     def convention_of(self, scene: Gaussians) -> Convention:
         """What the file of a scene for this viewer says."""
         return self.convention or scene.convention
 
+    @property
+    def rule(self) -> str:
+        """The rule in words."""
+        if self.convention is None:
+            return f"recipe {self.recipe}"
+        return f"{self.convention.kernel:g} px², {'' if self.convention.compensated else 'not '}compensated"
 
-CLASSIC_VIEWER = Viewer("classic-viewer", "classic", CLASSIC, "0.3 px², not compensated")
-MIP_VIEWER = Viewer("mip-viewer", "mip", MIP, "0.1 px², compensated")
+    @property
+    def advice(self) -> str:
+        """What to choose in the program to see a scene that was converted for it, one line."""
+        if not self.switched:
+            return f"in {self.program}, choose {self.settings}"
+        without = "with it off, a converted scene looks worse than the original"
+        return f"in {self.program}, turn anti-aliasing on: {self.settings} ({without})"
+
+    def shown(self, scene: Gaussians) -> Gaussians:
+        """The scene with the harmonics that the program draws."""
+        coefficients = (self.sh_degree + 1) ** 2
+        return scene if scene.sh.shape[1] <= coefficients else replace(scene, sh=scene.sh[:, :coefficients])
+
+
+CLASSIC_VIEWER = Viewer("classic", "3DGS", "classic", CLASSIC, "nothing: anti-aliasing is off by default")
+MIP_VIEWER = Viewer("mip", "Mip-Splatting's viewers", "mip", MIP, "a kernel of 0.1, the default")
+
+
+def _spark(name: str, recipe: str, convention: Convention, settings: str) -> Viewer:
+    return Viewer(name, "Spark 2.2.0", recipe, convention, settings, sh_degree=3, cut="√8 σ")
+
+
+def _playcanvas(name: str, program: str, switch: str, compensated: bool) -> Viewer:
+    rule = PLAYCANVAS if compensated else PLAYCANVAS_CLASSIC
+    return Viewer(name, program, rule.name, rule, switch, compensated, sh_degree=3, cut="√8 σ, fading out")
+
+
+def _mkkellogg(name: str, recipe: str, convention: Convention, settings: str) -> Viewer:
+    chosen = f"{settings}sphericalHarmonicsDegree: 2"
+    cut = "√8 σ; widths bent by √max(0.1, ·)"
+    return Viewer(
+        name, "GaussianSplats3D 0.4.7", recipe, convention, chosen, convention.compensated, sh_degree=2, cut=cut
+    )
+
+
+def _gsplat(name: str, recipe: str, convention: Convention, settings: str) -> Viewer:
+    return Viewer(name, "gsplat 1.5.3", recipe, convention, settings, convention.compensated)
+
+
+ENGINE, SUPERSPLAT, BRUSH = "PlayCanvas engine 2.23.3", "SuperSplat viewer 1.36.2", "Brush"
 VIEWERS: Registry[Viewer] = Registry(
     "viewer",
     named(
         (
             CLASSIC_VIEWER,
-            Viewer("antialiased-viewer", "ewa", ANTIALIASED, "0.3 px², compensated"),
+            Viewer("antialiased", "3DGS", "ewa", ANTIALIASED, "--antialiasing", switched=True),
             MIP_VIEWER,
-            Viewer("gsplat", "ewa", ANTIALIASED, 'rasterize_mode="antialiased": 0.3 px², compensated'),
+            _spark("spark", "ewa", ANTIALIASED, "the defaults: preBlurAmount 0, blurAmount 0.3"),
+            _spark("spark-mip", "mip", MIP, "blurAmount: 0.1"),
+            _spark("spark-classic", "classic", CLASSIC, "preBlurAmount: 0.3, blurAmount: 0"),
+            _playcanvas("playcanvas", ENGINE, "app.scene.gsplat.antiAlias = true", True),
+            _playcanvas("playcanvas-classic", ENGINE, "the default: app.scene.gsplat.antiAlias = false", False),
+            _playcanvas("supersplat", SUPERSPLAT, "aa in the page's address (?aa; WebGL)", True),
+            _playcanvas("supersplat-classic", SUPERSPLAT, "the default: no aa in the page's address", False),
+            _mkkellogg("mkkellogg", "ewa", ANTIALIASED, "antialiased: true, "),
+            _mkkellogg("mkkellogg-mip", "mip", MIP, "antialiased: true, kernel2DSize: 0.1, "),
+            _mkkellogg("mkkellogg-classic", "classic", CLASSIC, ""),
+            _gsplat("gsplat", "ewa", ANTIALIASED, 'rasterize_mode="antialiased"'),
+            _gsplat("gsplat-mip", "mip", MIP, 'rasterize_mode="antialiased", eps2d=0.1'),
+            _gsplat("gsplat-classic", "classic", CLASSIC, 'the default: rasterize_mode="classic"'),
+            Viewer("brush", BRUSH, "mip", MIP, "nothing: it follows the tag in the file"),
+            Viewer("brush-classic", BRUSH, "classic", CLASSIC, "nothing: it follows the tag in the file"),
         )
     ),
     Viewer,
 )
-FAST = Viewer("fast", "matched", None, "aaplug's recipe matched, one sample per pixel")
+FAST = Viewer("fast", "aaplug", "matched", None, "--recipe matched")
 
 
 def fuse(scene: Gaussians, training: TrainingViews | None, form: Form = MATCHED_ENERGY) -> Gaussians:
@@ -98,7 +174,9 @@ def fuse(scene: Gaussians, training: TrainingViews | None, form: Form = MATCHED_
 
 
 def fuse_for(scene: Gaussians, training: TrainingViews, viewer: Viewer) -> Gaussians:
-    """Convert a scene for a viewer; if the viewer draws as training did, only a stored 3D filter is fused.
+    """Convert a scene for a viewer, which sees only the harmonics that it draws.
+
+    If the viewer draws as training did, only a stored 3D filter is fused.
 
     Raises:
         UsageError: the viewer has a rule of its own, and the scene holds 2D Gaussians or blur is already fused.
@@ -106,7 +184,7 @@ def fuse_for(scene: Gaussians, training: TrainingViews, viewer: Viewer) -> Gauss
     if viewer.convention is None:
         return fuse_stored(scene)
     _check_convertible(scene)
-    scene = fuse_stored(scene)
+    scene = fuse_stored(viewer.shown(scene))
     if scene.convention == viewer.convention:
         return scene
     return _energy_kept(scene.convention, viewer.convention)(scene, training)

@@ -69,7 +69,7 @@ class FinetuneOptions(ViewOptions):
 
     target: Annotated[str | Viewer | None, flag("|".join([FAST.name, *VIEWERS]), "--for", kind=str | None)] = None
     """What will show the scene: fast (aaplug's recipe matched, one sample per pixel; the default of consistency) or a
-    viewer with a rule of its own (default of mipmap-gs: classic-viewer)."""
+    viewer with a rule of its own (default of mipmap-gs: classic)."""
     method: Annotated[str, choice(METHODS)] = "consistency"
     """consistency makes one model for all scales; mipmap-gs makes one for a single --scale, as Mipmap-GS does."""
     scale: Annotated[Sequence[float], SCALES] = tuple(OURS.weights)
@@ -135,7 +135,7 @@ def finetune(
     written = digest_of_files([named]) if Path(named).is_file() else named
     with processor(o.threads), nullcontext() if path is None else claimed(path):
         look = look_of(scene, cameras, settings.steps, o, monitor)
-        before = replace(look, recipe=RECIPES[viewer.recipe])
+        before = replace(look, scene=viewer.shown(look.scene), recipe=RECIPES[viewer.recipe])
         start = replace(before, scene=fuse_for(scene, look.training, viewer))
         job = TuningJob(start, cameras.train, Truth(look, source, enlarge=enlarge, memory=MEMORY), settings, written)
         how = f"{settings.name}, {settings.steps} steps, truth: {source}"

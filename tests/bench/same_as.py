@@ -52,11 +52,12 @@ METRIC = {  # 0.2 names all metrics: these are the usual ones and what is asked 
     "--ssim": "--metric psnr consistency energy-drift",
     "3dgs": "ssim:3dgs",
 }
+VIEWER_NAMES = {"classic-viewer": "classic", "antialiased-viewer": "antialiased", "mip-viewer": "mip"}
 OPTIONS: Mapping[str, Mapping[str, str]] = {
     "render": CULL_MARGIN | RATE_REFERENCE,
     "evaluate": CULL_MARGIN | RATE_REFERENCE | METRIC,
-    "convert": CULL_MARGIN,
-    "finetune": CULL_MARGIN | {"--rate": "--learning-rate"},
+    "convert": CULL_MARGIN | VIEWER_NAMES,
+    "finetune": CULL_MARGIN | VIEWER_NAMES | {"--rate": "--learning-rate"},
 }
 KEYS = {"pairs": "evaluations", "guard": "cull_margin", "rate": "rate_reference"}  # in JSON and CSV
 TIMES_AND_VERSIONS = ("seconds", "versions", "platform")  # keys of JSON and CSV

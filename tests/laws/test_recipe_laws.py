@@ -64,7 +64,7 @@ def test_a_lone_splat_keeps_its_light_over_scales(recipe):
     if recipe.promises.keeps_energy:
         assert all(abs(change) < CUTOFF_LOSS for change in drift.values()), drift
     else:
-        assert drift[0.125] > 4
+        assert drift[0.125] > 1  # its light more than doubles, even with the 0.075 px² of playcanvas-classic
         assert sorted(drift.values(), reverse=True) == list(drift.values())
 
 

@@ -1,5 +1,6 @@
 """World filters, screen filters and selections by name.  A new one is a file here and a line below."""
 
+from aaplug.core.gaussians import ANTIALIASED, CLASSIC, MIP, PLAYCANVAS, PLAYCANVAS_CLASSIC
 from aaplug.core.interfaces import ScreenFilter, Selection, WorldFilter
 from aaplug.core.registry import Registry
 from aaplug.methods.filters.adaptive import ADAPTIVE_VARIANCE, Adaptive
@@ -32,9 +33,11 @@ WORLD_FILTERS: Registry[WorldFilter] = Registry(
 SCREEN_FILTERS: Registry[ScreenFilter] = Registry(
     "screen filter",
     {
-        "classic": Dilation(0.3, compensated=False),
-        "ewa": Dilation(0.3, compensated=True),
-        "mip": Dilation(0.1, compensated=True),
+        "classic": Dilation.of(CLASSIC),
+        "ewa": Dilation.of(ANTIALIASED),
+        "mip": Dilation.of(MIP),
+        "playcanvas": Dilation.of(PLAYCANVAS),
+        "playcanvas-classic": Dilation.of(PLAYCANVAS_CLASSIC),
         "none": Dilation(0.0, compensated=False),
         "aaa": Adaptive(),
         "sa-gs": Matched("global", pixel_variance=0.0),

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from aaplug.core.cameras import Camera
+from aaplug.core.gaussians import Convention
 from aaplug.core.splats import Splats2D
 from aaplug.core.training import TrainingViews
 
@@ -17,6 +18,11 @@ class Dilation:
 
     variance: float
     compensated: bool
+
+    @classmethod
+    def of(cls, convention: Convention) -> "Dilation":
+        """What a convention adds."""
+        return cls(convention.kernel, convention.compensated)
 
     def __call__(self, splats: Splats2D, camera: Camera, training: TrainingViews) -> Splats2D:
         """Filter the splats of one view."""
