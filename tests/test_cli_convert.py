@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from aaplug.core.gaussians import MIP, Fusion
+from aaplug.core.gaussians import MIP, PLAYCANVAS, Fusion
 from aaplug.io.scenes import read_scene, write_scene
 from tests.conftest import make_scene
 from tests.test_cli import cli, dataset  # noqa: F401 (fixtures)
@@ -71,6 +71,24 @@ def test_convert_for_a_viewer_tags_its_rule_and_prints_what_is_left(cli, viewer)
     if not compensated:
         assert partly == "0.125"
         assert "still worse than the original" in err
+
+
+@pytest.mark.parametrize(
+    ("viewer", "convention", "advice"),
+    [
+        (
+            "playcanvas",
+            PLAYCANVAS,
+            "turn anti-aliasing on: app.scene.gsplat.antiAlias = true (with it off, a converted",
+        ),
+        ("spark-mip", MIP, "in Spark 2.2.0, choose blurAmount: 0.1"),
+    ],
+)
+def test_convert_for_a_program_says_what_to_choose_there(cli, viewer, convention, advice):
+    code, _, err = cli(f"{CONVERT} --for {viewer} --steps 0 --threads 1")
+    assert code == 0, err
+    assert advice in " ".join(err.split())
+    assert read_scene(Path("c.ply")).convention == convention
 
 
 def test_convert_for_a_viewer_prints_the_residual_as_json(cli):

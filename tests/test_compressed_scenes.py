@@ -30,8 +30,8 @@ from aaplug.io.scenes.scene_file import SceneFile
 from tests.scene_files import DATA, MADE, ksplat, oracle, splat, splats, spz, write_file
 
 MADE_SPZ = ("v1.spz", "v2.spz", "raw.spz", "degree4.spz")
-CARRY_A_TAG = {"oracle.compressed.ply": MIP} | dict.fromkeys(
-    ("oracle_v3.spz", "oracle_v4.spz", "oracle.sog", "oracle_sog/meta.json", *MADE_SPZ), ANTIALIASED
+CARRY_A_TAG = dict.fromkeys(
+    ("oracle.compressed.ply", "oracle_v3.spz", "oracle_v4.spz", "oracle.sog", "oracle_sog/meta.json", *MADE_SPZ), MIP
 )
 SUFFIXES = ("compressed.ply", "ply", "spz", "splat", "ksplat", "pt")  # the longest first
 TAGLESS = ("plain.splat", "level0.ksplat", "level1.ksplat", "level2.ksplat", "run.pt")
@@ -127,7 +127,7 @@ def test_what_is_written_is_read_and_written_to_the_same_bytes(tmp_path: Path, e
     write_scene(first, replace(scene, origin=None))
     again = read_scene(first)
     assert (len(again), again.sh_degree) == (len(scene), 0 if name == "splat" else degree)
-    tags = {"ply": convention, "spz": ANTIALIASED if convention.compensated else CLASSIC}
+    tags = {"ply": convention, "spz": MIP if convention.compensated else CLASSIC}
     assert again.convention == tags.get(name, CLASSIC)
     torch.testing.assert_close(again.means, scene.means, rtol=0, atol=2e-6)
     torch.testing.assert_close(again.log_scales, scene.log_scales, rtol=0, atol=1 / 32 + 1e-5)
@@ -216,7 +216,7 @@ def test_spz_is_written_within_its_steps_with_its_flag(tmp_path: Path, expected,
     torch.testing.assert_close(*shown, rtol=0, atol=0.5 / 255 + 1e-6)
     torch.testing.assert_close(again.sh[:, 1:], scene.sh[:, 1:].clamp(-1, 127 / 128), rtol=0, atol=1 / 256 + 1e-6)
     assert (again.unit_quats * scene.unit_quats).sum(dim=1).abs().min() > 0.99999
-    assert again.convention == (ANTIALIASED if convention.compensated else CLASSIC)
+    assert again.convention == (MIP if convention.compensated else CLASSIC)
     # what is read is written back to the byte
     write_scene(tmp_path / "b.spz", replace(again, convention=convention))
     assert (tmp_path / "b.spz").read_bytes() == (tmp_path / "a.spz").read_bytes()
@@ -382,6 +382,15 @@ def test_a_checkpoint_needs_the_users_word(tmp_path: Path):
     path = write_file(tmp_path, "run.pt")
     with pytest.raises(FormatError, match="pass `allow_checkpoint`"):
         read_scene(path)
+
+
+@pytest.mark.parametrize(("stated", "convention"), [("true", ANTIALIASED), ("false", CLASSIC), ("[]", CLASSIC)])
+def test_a_checkpoint_is_what_the_cfg_of_its_run_says(tmp_path: Path, stated, convention):
+    (tmp_path / "cfg.yml").write_text(f"ssim_lambda: 0.2\nantialiased: {stated}\nports: !!python/tuple [1]\n")
+    (tmp_path / "ckpts").mkdir()
+    opened = open_scene(write_file(tmp_path / "ckpts", "run.pt"), allow_checkpoint=True)
+    assert opened.convention == convention
+    assert ("cfg.yml of its run says" in opened.evidence) == (stated != "[]")
 
 
 class Trap:

@@ -1,4 +1,4 @@
-"""Every claim of the tables in formats.md names the tests that prove it."""
+"""Every claim of the tables in formats.md names the tests that prove it; viewers.md has a row for each viewer."""
 
 import re
 from pathlib import Path
@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from aaplug.io.scenes import SCENE_FORMATS
+from aaplug.methods.viewers import MOST_DEGREE, VIEWERS, Viewer
 
 ROOT = Path(__file__).resolve().parents[1]
 ROWS = [
@@ -49,3 +50,18 @@ def test_every_format_has_a_row():
     assert len(ROWS) >= 20
     for format in SCENE_FORMATS.values():
         assert format.name in text.lower(), format.name
+
+
+def row_of(viewer: Viewer) -> str:
+    """A viewer's row of the table in viewers.md."""
+    assert viewer.convention is not None
+    kernel, compensated = f"{viewer.convention.kernel:g} px²", "yes" if viewer.convention.compensated else "no"
+    choose = f"**anti-aliasing on:** {viewer.settings}" if viewer.switched else viewer.settings
+    degree = "any" if viewer.sh_degree == MOST_DEGREE else str(viewer.sh_degree)
+    cells = f"`{viewer.name}`", viewer.program, choose, kernel, compensated, degree, viewer.cut
+    return f"| {' | '.join(cells)} |"
+
+
+@pytest.mark.parametrize("viewer", VIEWERS.values(), ids=VIEWERS)
+def test_each_viewer_has_its_row(viewer: Viewer):
+    assert row_of(viewer) in (ROOT / "examples" / "guides" / "viewers.md").read_text().splitlines()

@@ -125,7 +125,7 @@ def _gsplat(name: str, recipe: str, convention: Convention, settings: str) -> Vi
     return Viewer(name, "gsplat 1.5.3", recipe, convention, settings, convention.compensated)
 
 
-ENGINE, SUPERSPLAT, BRUSH = "PlayCanvas engine 2.23.3", "SuperSplat viewer 1.36.2", "Brush"
+ENGINE, SUPERSPLAT, BRUSH = "PlayCanvas engine 2.23.3", "SuperSplat viewer 1.36.2", "Brush 2026-08"
 VIEWERS: Registry[Viewer] = Registry(
     "viewer",
     named(

@@ -24,7 +24,7 @@ from aaplug.io.atomic import replacing
 from aaplug.io.scenes.options import Options
 from aaplug.io.scenes.ply_document import Document, document_of, stamp_of
 from aaplug.io.scenes.ply_header import LITTLE, Header, check_size, is_packed, parse, read_header
-from aaplug.io.scenes.ply_tags import meaning, stating
+from aaplug.io.scenes.ply_tags import meaning_in_run, stating
 from aaplug.io.scenes.scene_file import (
     DEGREES,
     FILTER_COLUMN,
@@ -64,11 +64,13 @@ def open_scene(path: Path, options: Options) -> SceneFile:
         check_size(header, stamp[0])
         notes = _check_columns(header)
         check_count(path, header.vertex.count)
-        said = meaning(header)
+        said, note = meaning_in_run(header)
         document = document_of(path, header, stamp)
     degree = DEGREES[len(_rest(header))]
     load, count = partial(_rows, document, degree, said.flat), header.vertex.count
-    return SceneFile(path, name, count, degree, load, **vars(said), document=document, notes=tuple(notes))
+    return SceneFile(
+        path, name, count, degree, load, **vars(said), document=document, notes=(*notes, *([note] if note else ()))
+    )
 
 
 def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: Options) -> None:

@@ -17,16 +17,17 @@ import torch
 from torch import Tensor
 
 from aaplug.core.errors import FormatError
-from aaplug.core.gaussians import Gaussians
+from aaplug.core.gaussians import CLASSIC, Gaussians
 from aaplug.io.limits import whole_limit
 from aaplug.io.scenes.options import Options
 from aaplug.io.scenes.scene_file import DEGREES, SceneFile, check_count, library_errors
+from aaplug.io.scenes.training_config import gsplat_config
 
 SAFE_TORCH = (2, 10)  # the first release without CVE-2026-24747
 SUFFIXES = (".pt", ".pth", ".ckpt")
 ZIP = b"PK\x03\x04"
 SHAPES = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (), "sh0": (1, 3)}
-EVIDENCE = "the format does not say (the run's cfg.yml has antialiased): assumed classic"
+UNKNOWN = CLASSIC, "neither the format nor a cfg.yml in the folder above says: assumed classic"
 
 name = "pt"
 
@@ -53,7 +54,8 @@ def open_scene(path: Path, options: Options) -> SceneFile:
     for key, tensor in splats.items():
         _check(path, key, tensor, count, size)
     degree = DEGREES[3 * splats["shN"].shape[1]]
-    return SceneFile(path, name, count, degree, partial(_rows, splats), EVIDENCE)
+    convention, evidence = gsplat_config(path) or UNKNOWN
+    return SceneFile(path, name, count, degree, partial(_rows, splats), evidence, convention)
 
 
 def _check_archive(path: Path, size: int) -> None:

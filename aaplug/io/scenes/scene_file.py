@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from aaplug.core.errors import AaplugError, FormatError, listing, reason
-from aaplug.core.gaussians import CLASSIC, MAX_LOG_SCALE, MIN_OPACITY, Convention, Fusion, Gaussians, Origin
+from aaplug.core.gaussians import CLASSIC, MAX_LOG_SCALE, MIN_OPACITY, MIP, Convention, Fusion, Gaussians, Origin
 from aaplug.core.spherical_harmonics import COLOUR_OFFSET, SH_C0
 from aaplug.io.limits import lack_of_memory, whole_limit
 
@@ -29,6 +29,10 @@ HUGE_HARMONIC = 1e4  # trained harmonics stay below 10
 SHAPE_NUMBERS = 11  # of a Gaussian: mean, quaternion, scales, opacity
 MAX_REASON = 200  # characters of a library's message
 FILTER_COLUMN = "filter_3D"  # Mip-Splatting's 3D filter: a standard deviation in world units
+# A tag or flag tells that training compensated, not its kernel: splat-transform turns each format's into the others'.
+# All are read as Brush's, which introduced the tag: so a scene converted for the Mip rule keeps it in every format.
+COMPENSATED = MIP
+KERNEL_LOST = f"its kernel is not recorded, {COMPENSATED.kernel:g} px² assumed"
 DEGREES = {3 * ((d + 1) ** 2 - 1): d for d in range(5)}  # SH degree by number of f_rest columns
 
 log = logging.getLogger("aaplug")

@@ -24,11 +24,11 @@ from PIL import Image
 from torch import Tensor
 
 from aaplug.core.errors import FormatError
-from aaplug.core.gaussians import ANTIALIASED, CLASSIC, MAX_LOG_SCALE, Convention, Gaussians
+from aaplug.core.gaussians import CLASSIC, MAX_LOG_SCALE, Convention, Gaussians
 from aaplug.io.limits import whole_limit
 from aaplug.io.scenes.options import Options
 from aaplug.io.scenes.packed import byte_opacities, check_growth, floats, largest_last
-from aaplug.io.scenes.scene_file import SceneFile, check_count, library_errors
+from aaplug.io.scenes.scene_file import COMPENSATED, KERNEL_LOST, SceneFile, check_count, library_errors
 from aaplug.io.values import Entry, number, object_of, parse_json, read_bounded
 
 META = "meta.json"
@@ -164,7 +164,7 @@ def _meaning(meta: dict[str, Any]) -> tuple[Convention, str, bool]:
         return CLASSIC, "no model in meta.json: assumed classic (3DGS default)", False
     said = f"model in meta.json: {json.dumps(model)[:40]}"
     if model == "antialiased":
-        return ANTIALIASED, f"{said}; its kernel is not recorded, 0.3 px² assumed", False
+        return COMPENSATED, f"{said}; {KERNEL_LOST}", False
     if model == "2dgs":
         return CLASSIC, f"{said}: 2D Gaussians, taken for classic", True
     return CLASSIC, said + ("" if model == "default" else " is unknown: assumed classic"), False

@@ -27,13 +27,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.errors import FormatError, OutputError
-from aaplug.core.gaussians import ANTIALIASED, CLASSIC, Gaussians
+from aaplug.core.gaussians import CLASSIC, Gaussians
 from aaplug.core.locks import scratch
 from aaplug.io.atomic import replacing
 from aaplug.io.limits import whole_limit
 from aaplug.io.scenes.options import Options
 from aaplug.io.scenes.packed import byte_opacities, check_growth, floats, half_turn_about_x, largest_last
-from aaplug.io.scenes.scene_file import SceneFile, check_count, library_errors
+from aaplug.io.scenes.scene_file import COMPENSATED, KERNEL_LOST, SceneFile, check_count, library_errors
 
 MAGIC = b"NGSP"
 GZIP = b"\x1f\x8b"
@@ -97,8 +97,7 @@ def open_scene(path: Path, options: Options) -> SceneFile:
         header, sections = _sections(path)
     convention, evidence = CLASSIC, "the flag antialiased is not set: assumed classic"
     if header.flags & ANTIALIASED_FLAG:
-        convention = ANTIALIASED
-        evidence = "the flag antialiased is set; its kernel is not recorded, 0.3 px² assumed"
+        convention, evidence = COMPENSATED, f"the flag antialiased is set; {KERNEL_LOST}"
     load = partial(_rows, header, sections, TURNS[options.spz_axes])
     notes = (f"version {header.version}; {AXES_NOTES[options.spz_axes]}",)
     return SceneFile(path, name, header.count, header.degree, load, evidence, convention, notes=notes)

@@ -1,0 +1,1 @@
+"""What web viewers draw, against photographs and against what aaplug predicts."""
