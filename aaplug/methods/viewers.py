@@ -91,7 +91,7 @@ class Viewer:
         """What to choose in the program to see a scene that was converted for it, one line."""
         if not self.switched:
             return f"in {self.program}, choose {self.settings}"
-        without = "with it off, a converted scene looks worse than the original"
+        without = "with it off, a converted scene can look worse than the original"
         return f"in {self.program}, turn anti-aliasing on: {self.settings} ({without})"
 
     def shown(self, scene: Gaussians) -> Gaussians:
