@@ -9,12 +9,13 @@ import torch
 from aaplug.core.cameras import WHITE, Camera, CameraSet
 from aaplug.core.errors import FrameError, UsageError
 from aaplug.core.gaussians import CONVENTIONS, MIP, Gaussians
-from aaplug.core.imaging import box_average
+from aaplug.core.imaging import box_average, softened
 from aaplug.core.projection import project
+from aaplug.core.splats import Render
 from aaplug.core.training import TrainingViews
 from aaplug.methods.filters import Smoothing3D, fuse_stored
 from aaplug.methods.pixel_kernels import SURFEL
-from aaplug.methods.recipes import QUALITIES, RECIPES, find_recipe, suited
+from aaplug.methods.recipes import NEIGHBOURS, QUALITIES, RECIPES, find_recipe, suited
 from aaplug.rasterizers import RASTERIZERS
 from aaplug.rendering import renderer as rendering
 from aaplug.rendering.renderer import Renderer
@@ -163,6 +164,47 @@ def test_scenes_are_projected_in_chunks_without_a_change(cameras, monkeypatch):
     whole = renderer(cameras[0]).rgb
     monkeypatch.setattr(rendering, "CHUNK", 33)
     torch.testing.assert_close(renderer(cameras[0]).rgb, whole, rtol=0, atol=1e-6)
+
+
+# neighbours -------------------------------------------------------------------------------------
+
+
+def test_softening_spreads_a_sample_over_its_neighbours():
+    rgb = torch.zeros(5, 6, 3)
+    rgb[2, 3] = 1.0
+    soft = softened(Render(rgb, rgb[..., 0]), 0.1)
+    down, right = torch.tensor([0, 0.1, 0.8, 0.1, 0]), torch.tensor([0, 0, 0.1, 0.8, 0.1, 0])
+    torch.testing.assert_close(soft.alpha, down.outer(right))
+    torch.testing.assert_close(soft.rgb, soft.alpha[..., None].expand(5, 6, 3))
+
+
+@pytest.mark.parametrize("hw", [(1, 1), (1, 7), (5, 6)])
+def test_softening_keeps_the_sum(hw):
+    image = Render(torch.rand(*hw, 3), torch.rand(hw))
+    soft = softened(image, 0.2)
+    for before, after in zip(image, soft, strict=True):
+        torch.testing.assert_close(after.sum(), before.sum())
+    assert softened(image, 0.0) is image
+
+
+@pytest.mark.parametrize("quality", QUALITIES)
+def test_auto_weighs_neighbours_only_where_its_samples_are_coarser_than_training(quality, cameras):
+    renderer = Renderer.of(make_scene(30), cameras, quality=quality)
+    for scale in (0.125, 0.25, 0.5, 1.0, 2.0):
+        view = cameras[0].scaled(scale)
+        sampled = min(1.0, scale * renderer.samples(view))
+        assert renderer.neighbours(view) == pytest.approx(NEIGHBOURS * (1 - sampled**2))
+        assert Renderer.of(make_scene(30), cameras, "matched").neighbours(view) == 0
+
+
+def test_auto_is_nearer_to_the_look_of_training_than_one_plain_sample(sample_scene, sample_training, sample_cameras):
+    view = sample_cameras.test[0].scaled(0.25)
+    fast, best = (Renderer.of(sample_scene, sample_training, quality=quality) for quality in ("fast", "best"))
+    plain = replace(fast, recipe=RECIPES["matched"])
+    assert plain.samples(view) == fast.samples(view) == 1
+    look = best(view).rgb
+    errors = [(renderer(view).rgb - look).square().mean() for renderer in (plain, fast)]
+    assert errors[1] < 0.9 * errors[0]
 
 
 # rates ------------------------------------------------------------------------------------------

@@ -23,6 +23,17 @@ def over(rgb: Float[Tensor, "h w 3"], alpha: Float[Tensor, "h w"], background: t
     return Render(torch.addcmul(rgb, (1 - alpha)[..., None], rgb.new_tensor(background)), alpha)
 
 
+def softened(render: Render, neighbours: float) -> Render:
+    """Weigh each sample with those beside it, (w, 1 - 2w, w) along each side for w = `neighbours`; edges repeat.
+
+    It keeps the sum of the samples.
+    """
+    if neighbours == 0:
+        return render
+    rgb, alpha = (_diffused(image, neighbours) for image in (render.rgb, render.alpha[..., None]))
+    return Render(rgb, alpha[..., 0])
+
+
 def average_samples(render: Render, n: int) -> Render:
     """Average n x n samples per pixel; both sides must be multiples of n."""
     if n == 1:
@@ -75,6 +86,18 @@ def levels(rgb: Float[Tensor, "h w 3"], bit_depth: int) -> Float[Tensor, "h w 3"
     """Clamp to [0, 1] and round to whole levels, 0 to 2^bit_depth - 1."""
     assert bool(torch.isfinite(rgb).all()), "a rendered colour is NaN or infinite"
     return (rgb.clamp(0, 1) * (2**bit_depth - 1)).round()
+
+
+def _diffused(image: Float[Tensor, "h w c"], weight: float) -> Float[Tensor, "h w c"]:
+    for dim in (0, 1):
+        last = image.shape[dim] - 1
+        mixed = image * (1 - 2 * weight)
+        for start, others in ((1, 0), (0, 1)):  # from above or the left, then from below or the right
+            mixed.narrow(dim, start, last).add_(image.narrow(dim, others, last), alpha=weight)
+        for edge in (0, last):
+            mixed.narrow(dim, edge, 1).add_(image.narrow(dim, edge, 1), alpha=weight)
+        image = mixed
+    return image
 
 
 def _resized(rgb: Tensor, hw: tuple[int, int], kernel: int) -> Tensor:

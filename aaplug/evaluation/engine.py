@@ -228,7 +228,8 @@ def _work(renderer: Renderer, camera: Camera) -> Hashable:
     """Equal for renderers that draw the same image of a view."""
     recipe = renderer.recipe
     method = recipe.selection, recipe.screen, recipe.pixel, recipe.compositor
-    how = renderer.samples(camera), renderer.background, renderer.rasterizer.name
+    samples = renderer.samples(camera), renderer.neighbours(camera)
+    how = samples, renderer.background, renderer.rasterizer.name
     return id(renderer.scene), id(renderer.training), method, how
 
 

@@ -34,6 +34,7 @@ class Recipe:
     target_rate: relative sampling rate, at most 1 (training's own), that the samples must reach: n × n samples per
         pixel, with the smallest n for which n · relative rate >= target_rate.  0: no such demand.
     grid: smallest number of samples along a pixel's side, at any rate.
+    neighbours: weight of the samples on either side of each, in the limit of a sampling rate of 0; see `neighbours_at`.
     takes_quality: `target_rate` is set by the user's choice of quality.
     for_discs: name of the recipe that takes its place for scenes of 2D Gaussians.
     """
@@ -45,6 +46,7 @@ class Recipe:
     world: WorldFilter | None = None
     target_rate: float = 0.0
     grid: int = 1
+    neighbours: float = 0.0
     pixel: PixelKernel = POINT
     compositor: Compositor | None = None
     selection: Selection | None = None
@@ -55,6 +57,14 @@ class Recipe:
     def samples_at(self, relative_rate: float) -> int:
         """Samples along a pixel's side, for a view at `relative_rate` against training."""
         return max(self.grid, math.ceil(min(self.target_rate, 1.0) / relative_rate - SLACK))
+
+    def neighbours_at(self, sampled_rate: float) -> float:
+        """Weight of the samples on either side of each, where the samples lie at `sampled_rate` against training.
+
+        It is 0 from training's own rate on, where samples are training's pixels, and grows as `Matched`'s pixel filter
+        does, with the part of a sample that training's pixel did not cover.
+        """
+        return self.neighbours * max(0.0, 1 - sampled_rate**2)
 
     def lacks(self, scene: Gaussians) -> str | None:
         """What a scene lacks for this recipe, in words; None if nothing."""

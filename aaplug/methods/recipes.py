@@ -15,13 +15,18 @@ from aaplug.methods.research_recipes import RESEARCH_RECIPES
 # training size 2x2 samples take no more splat-pixel evaluations than `classic` with one.
 QUALITIES = {"fast": 0.25, "balanced": 0.5, "best": 1.0}
 
+# Of a sample, the weight of those beside it where samples are few: it takes the noise off what compositing could not
+# resolve.  0.02 to 0.04 are best against the scenes' own look (examples/guides/methods.md).
+NEIGHBOURS = 0.03
+
 USER_RECIPES = (
     Recipe(
         "auto",
         Matched(),
-        "aaplug: matched, with more samples per pixel the smaller the image (--quality)",
+        "aaplug: matched, with more samples per pixel the smaller the image (--quality), weighed with their neighbours",
         "the default",
         target_rate=QUALITIES["balanced"],
+        neighbours=NEIGHBOURS,
         takes_quality=True,
         for_discs="2dgs-matched",
         promises=Promises(equals_training=True),

@@ -4,7 +4,7 @@
     image = renderer(cameras.test[0].scaled(1 / 4)).rgb
 
 This module holds the whole flow: world filter, projection, selection, screen filter, culling, shading, rasterization,
-and averaging the samples of each pixel.
+and weighing the samples of each pixel.
 """
 
 import math
@@ -20,7 +20,7 @@ from aaplug.core.cameras import BLACK, WHITE, Camera, CameraSet
 from aaplug.core.culling import cull
 from aaplug.core.errors import UsageError
 from aaplug.core.gaussians import Gaussians
-from aaplug.core.imaging import average_samples
+from aaplug.core.imaging import average_samples, softened
 from aaplug.core.interfaces import Colour, Rasterizer, RunsKernels
 from aaplug.core.kernels import EAGER, Kernels
 from aaplug.core.projection import project, shade, with_depth_slopes
@@ -121,6 +121,7 @@ class Renderer:
         splats = self.splats(fine)
         recipe, rules = self.recipe, self.training.convention.rules
         image = self.rasterizer(splats, fine.hw, self.background, recipe.pixel, recipe.compositor, rules)
+        image = softened(image, self.neighbours(camera))
         return Drawing(average_samples(image, samples), splats, fine.hw)
 
     def sampled(self, camera: Camera) -> tuple[Camera, int]:
@@ -133,6 +134,12 @@ class Renderer:
         if self.recipe.target_rate == 0:
             return self.recipe.grid
         return self.recipe.samples_at(self.relative_rate(camera))
+
+    def neighbours(self, camera: Camera) -> float:
+        """Weight of the samples on either side of each sample."""
+        if self.recipe.neighbours == 0:
+            return 0.0
+        return self.recipe.neighbours_at(self.samples(camera) * self.relative_rate(camera))
 
     def relative_rate(self, camera: Camera) -> float:
         """A view's sampling rate relative to training, which sets the samples per pixel.
