@@ -185,6 +185,8 @@ def test_softening_keeps_the_sum(hw):
     for before, after in zip(image, soft, strict=True):
         torch.testing.assert_close(after.sum(), before.sum())
     assert softened(image, 0.0) is image
+    white = Render(torch.ones(*hw, 3), torch.ones(hw))
+    assert softened(white, 0.03).rgb.equal(white.rgb)
 
 
 @pytest.mark.parametrize("quality", QUALITIES)

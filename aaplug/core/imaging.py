@@ -26,7 +26,7 @@ def over(rgb: Float[Tensor, "h w 3"], alpha: Float[Tensor, "h w"], background: t
 def softened(render: Render, neighbours: float) -> Render:
     """Weigh each sample with those beside it, (w, 1 - 2w, w) along each side for w = `neighbours`; edges repeat.
 
-    It keeps the sum of the samples.
+    It keeps the sum of the samples, and samples that are all equal.
     """
     if neighbours == 0:
         return render
@@ -89,14 +89,12 @@ def levels(rgb: Float[Tensor, "h w 3"], bit_depth: int) -> Float[Tensor, "h w 3"
 
 
 def _diffused(image: Float[Tensor, "h w c"], weight: float) -> Float[Tensor, "h w c"]:
+    """What is equal stays so to the bit, because only differences move."""
     for dim in (0, 1):
-        last = image.shape[dim] - 1
-        mixed = image * (1 - 2 * weight)
-        for start, others in ((1, 0), (0, 1)):  # from above or the left, then from below or the right
-            mixed.narrow(dim, start, last).add_(image.narrow(dim, others, last), alpha=weight)
-        for edge in (0, last):
-            mixed.narrow(dim, edge, 1).add_(image.narrow(dim, edge, 1), alpha=weight)
-        image = mixed
+        steps, last = image.diff(dim=dim), image.shape[dim] - 1
+        image = image.clone()
+        image.narrow(dim, 0, last).add_(steps, alpha=weight)
+        image.narrow(dim, 1, last).sub_(steps, alpha=weight)
     return image
 
 

@@ -190,7 +190,8 @@ def pixel_filters(scales: Sequence[float]) -> Ways:
     if max(scales) > 1:
         recipes = {f"{n * n} samples": replace(find_recipe("matched"), grid=n) for n in (1, 2)}
     else:
-        recipes = {f"`{quality}`": find_recipe("auto", quality=quality) for quality in QUALITIES}
+        plain = replace(find_recipe("auto"), neighbours=0.0)
+        recipes = {f"`{quality}`": replace(plain, target_rate=rate) for quality, rate in QUALITIES.items()}
     return {f"{label}, {f}": Tried(r, how) for label, r in recipes.items() for f, how in PIXEL_FILTERS.items()}
 
 
