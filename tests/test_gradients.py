@@ -42,7 +42,7 @@ def way(recipe: Recipe) -> tuple[object, ...]:
     """Everything that makes an image."""
     return (
         *(recipe.world, recipe.screen, recipe.pixel, recipe.compositor, recipe.selection),
-        *(recipe.grid, recipe.target_rate),
+        *(recipe.grid, recipe.target_rate, recipe.neighbours),
     )
 
 

@@ -33,6 +33,7 @@ from aaplug.methods.recipes import find_recipe, suited
 from aaplug.rasterizers import RASTERIZERS, find_rasterizer
 
 CHUNK = 1 << 20  # Gaussians projected at once
+RATE_DIGITS = 2  # decimals of the rate that sets the weight of neighbours, which so moves in steps
 
 Background = Literal["auto", "white", "black"] | Colour
 Harmonics = Callable[[int, int], Float[Tensor, "c k 3"]]
@@ -136,10 +137,11 @@ class Renderer:
         return self.recipe.samples_at(self.relative_rate(camera))
 
     def neighbours(self, camera: Camera) -> float:
-        """Weight of the samples on either side of each sample."""
+        """Weight of the samples on either side of each sample: like their number, a constant to gradients."""
         if self.recipe.neighbours == 0:
             return 0.0
-        return self.recipe.neighbours_at(self.samples(camera) * self.relative_rate(camera))
+        sampled_rate = self.samples(camera) * self.relative_rate(camera)
+        return self.recipe.neighbours_at(round(sampled_rate, RATE_DIGITS))
 
     def relative_rate(self, camera: Camera) -> float:
         """A view's sampling rate relative to training, which sets the samples per pixel.
