@@ -815,7 +815,7 @@ def test_a_plug_in_is_asked_before_the_own_formats(tmp_path, monkeypatch):
     [
         ({"fx": math.nan}, "camera view: fx should be a finite number"),
         ({"height": 0}, "camera view: height should be a whole number of px"),
-        ({"cy": math.inf}, "camera view: cx, cy and translation should be"),
+        ({"cy": math.inf}, "camera view: cy should be a finite number"),
         ({"cam_from_world": 2 * torch.eye(4, dtype=torch.float64)}, "camera view: cam_from_world should be a rotation"),
     ],
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
