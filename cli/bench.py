@@ -13,7 +13,7 @@ from aaplug.rendering.benchmark import Figures
 from aaplug.verbs import bench as verb
 
 from .console import TERMINAL, out, print_json
-from .options import CameraOptions, Flat, SceneOptions
+from .options import CameraOptions, Flat, SceneOptions, read_inputs
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Bench:
         """Time every rasterizer on every scene."""
         scene = cameras = None
         if self.scene.scene is not None or self.scene.model_path is not None:
-            scene, cameras = self.scene.read(), self.cameras.read(self.scene)
+            scene, cameras = read_inputs(self.scene, self.cameras)
         runs, exponents = verb.bench(scene, cameras, monitor=TERMINAL, **vars(self.how))
         if self.json:
             several = {"runs": [run.as_json() for run in runs], "exponents": exponents}

@@ -15,7 +15,7 @@ from aaplug.verbs.evaluate import evaluate as measure
 from .batch import scenes_of
 from .console import TERMINAL, out, print_json
 from .main import FAILED
-from .options import CameraOptions, Flat, SceneOptions, flag
+from .options import CameraOptions, Flat, SceneOptions, flag, read_inputs
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Evaluate:
 
     def _run(self, **given: Any) -> Report:
         """Evaluate one scene; `given` has precedence over the options."""
-        scene, cameras = self.scene.read(), self.cameras.read(self.scene)
+        scene, cameras = read_inputs(self.scene, self.cameras)
         own = {"output": self.output, "name": self.scene.path.stem, "monitor": TERMINAL}
         return measure(scene, cameras, **vars(self.how) | own | given)
 

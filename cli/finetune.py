@@ -8,7 +8,7 @@ from aaplug.evaluation.results import tables
 from aaplug.verbs import finetune as verb
 
 from .console import TERMINAL, out, print_json, say
-from .options import CameraOptions, Flat, SceneOptions, flag
+from .options import CameraOptions, Flat, SceneOptions, flag, read_inputs
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Finetune:
 
     def __call__(self) -> int:
         """Optimize, and say what was written."""
-        scene, cameras = self.scene.read(), self.cameras.read(self.scene)
+        scene, cameras = read_inputs(self.scene, self.cameras)
         axes = self.scene.spz_axes
         found = verb.finetune(scene, cameras, self.output, spz_axes=axes, monitor=TERMINAL, **vars(self.how))
         if self.json:

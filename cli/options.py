@@ -20,9 +20,10 @@ from aaplug.io.cameras import read_cameras
 from aaplug.io.scenes import SpzAxes, open_scene
 from aaplug.io.scenes.scene_file import SceneFile
 from aaplug.methods.viewers import describe
+from aaplug.verbs.agreement import settled
 from aaplug.verbs.options import SCALE, UNSET, Options, flag, number
 
-from .console import say
+from .console import TERMINAL, say
 
 CONFIG = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)  # how classes become options
 
@@ -58,8 +59,8 @@ class SceneOptions(Options):
     """Leave out Gaussians with NaN, infinite or unusable values instead of stopping."""
     allow_checkpoint: bool = False
     """Also read gsplat's .pt, a pickle; only its tensors are loaded."""
-    spz_axes: SpzAxes = "opengl"
-    """Axes of a .spz, read or written: opengl (its specification) or opencv (splat-transform, gsply)."""
+    spz_axes: SpzAxes = "auto"
+    """Axes of a .spz: opengl (its specification), opencv (splat-transform, gsply), or auto: as the cameras tell."""
 
     @property
     def path(self) -> Path:
@@ -88,10 +89,6 @@ class SceneOptions(Options):
         for fusion in opened.fused:
             say(f"fused: {describe(fusion)}")
         return opened
-
-    def read(self) -> Gaussians:
-        """Read the scene and say what it is."""
-        return self.open().whole(self.drop_bad)
 
 
 @dataclass(frozen=True)
@@ -136,6 +133,12 @@ def one_line(program: str) -> Iterator[None]:
         said = " ".join(filter(None, lines[1:]))  # without the box's title
         said = re.split(" For full helptext| Argument helptext", said)[0].removeprefix("Error parsing ")
         raise UsageError(program, f"{said}; see `{program} --help`") from end
+
+
+def read_inputs(scene: SceneOptions, cameras: CameraOptions) -> tuple[Gaussians, CameraSet]:
+    """Read a scene and its cameras, and say what they are."""
+    opened, known = scene.open(), cameras.read(scene)
+    return settled(opened, known, TERMINAL).whole(scene.drop_bad), known
 
 
 def option_types(noun: type) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from typing import Annotated
 from aaplug.verbs import video as verb
 
 from .console import TERMINAL, print_json, say
-from .options import CameraOptions, Flat, SceneOptions, flag
+from .options import CameraOptions, Flat, SceneOptions, flag, read_inputs
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Video:
 
     def __call__(self) -> int:
         """Render, and say what was written."""
-        scene, cameras = self.scene.read(), self.cameras.read(self.scene)
+        scene, cameras = read_inputs(self.scene, self.cameras)
         clip = verb.video(scene, cameras, self.output, monitor=TERMINAL, **vars(self.how))
         if self.json:
             print_json(clip._asdict() | {"file": str(clip.file)})

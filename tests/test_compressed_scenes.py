@@ -180,7 +180,7 @@ def test_spz_axes_can_be_left_as_they_are(tmp_path: Path):
     turned = read_scene(tmp_path / "a.spz")
     stored = read_scene(tmp_path / "a.spz", spz_axes="opencv")
     assert torch.equal(stored.means, turned.means * torch.tensor([1.0, -1.0, -1.0]))
-    assert "axes as stored" in open_scene(tmp_path / "a.spz", spz_axes="opencv").notes[0]
+    assert "axes as stored" in open_scene(tmp_path / "a.spz", spz_axes="opencv").notes[1]
 
 
 def test_a_half_turn_of_the_scene_is_a_half_turn_of_the_view():

@@ -6,6 +6,7 @@ Sizes and focal lengths may differ from view to view.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -124,6 +125,11 @@ class CameraSet:
         """Every camera once, training views first."""
         known = {id(camera) for camera in self.train}
         return self.train + tuple(camera for camera in self.test if id(camera) not in known)
+
+
+def spread(views: Sequence[Camera], most: int) -> Sequence[Camera]:
+    """At most this many of the views, evenly spaced."""
+    return views[:: max(1, -(-len(views) // most))]
 
 
 def look_at(eye: Float[Tensor, " 3"], target: Float[Tensor, " 3"], up: Float[Tensor, " 3"]) -> Float[Tensor, "4 4"]:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from aaplug.core.cameras import Camera
+from aaplug.core.cameras import Camera, spread
 from aaplug.core.gaussians import Fusion, Gaussians
 from aaplug.core.monitor import SILENT, Monitor
 from aaplug.evaluation.engine import Candidate, compare
@@ -11,7 +11,7 @@ from aaplug.evaluation.metrics import PSNR
 from aaplug.evaluation.results import Report, mean
 from aaplug.evaluation.truth import MEMORY, Truth, back_projected
 from aaplug.finetuning.parameters import between
-from aaplug.finetuning.session import recorded, spread, tune
+from aaplug.finetuning.session import recorded, tune
 from aaplug.finetuning.settings import QUICK, balanced
 from aaplug.finetuning.state import TuningJob
 from aaplug.methods.recipes import RECIPES

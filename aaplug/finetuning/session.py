@@ -4,13 +4,13 @@ import math
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from aaplug.core.cameras import Camera
+from aaplug.core.cameras import spread
 from aaplug.core.gaussians import Convention, Fusion, Gaussians
 from aaplug.core.monitor import SILENT, Monitor
 from aaplug.evaluation.engine import Candidate, compare
@@ -80,11 +80,6 @@ def recorded(state: State, job: TuningJob, convention: Convention, settings: Map
         return replace(job.start.scene, convention=convention)
     scene, fusion = state.scene(job), Fusion(TUNED, {"steps": str(state.step), **settings})
     return replace(scene, convention=convention, fused=(*scene.fused, fusion))
-
-
-def spread(views: Sequence[Camera], most: int) -> Sequence[Camera]:
-    """At most this many of the views, evenly spaced."""
-    return views[:: max(1, -(-len(views) // most))]
 
 
 @contextmanager

@@ -19,6 +19,7 @@ from aaplug.io.cameras import select_views
 from aaplug.io.scenes import SpzAxes, check_scene_output, write_parts, write_scene
 from aaplug.io.scenes.scene_file import SceneFile
 from aaplug.methods.viewers import FORMS, MATCHED_ENERGY, MIP_VIEWER, VIEWERS, Form, Viewer, blurring, fuse
+from aaplug.verbs.agreement import settled
 from aaplug.verbs.in_parts import LARGE, convert_parts
 from aaplug.verbs.inputs import AnyPath, CamerasLike, SceneLike, cameras_of, look_of, opened_of, processor, sources_of
 from aaplug.verbs.options import STEPS, UNSET, ViewOptions, flag, number
@@ -76,7 +77,7 @@ def convert(
     output: AnyPath | None = None,
     *,
     drop_bad: bool = False,
-    spz_axes: SpzAxes = "opengl",
+    spz_axes: SpzAxes = "auto",
     monitor: Monitor = SILENT,
     **options: Any,
 ) -> Converted:
@@ -100,6 +101,8 @@ def convert(
     o = ConvertOptions.of(options)
     chosen, path = o.chosen(), None if output is None else Path(output)
     opened = scene if isinstance(scene, Gaussians) else opened_of(scene)
+    if cameras is not None and isinstance(opened, SceneFile):
+        opened = settled(opened, cameras_of(cameras, opened), monitor)
     if path is not None:
         check_scene_output(path, o.overwrite, sources_of(opened))
     writing = {"overwrite": o.overwrite, "spz_axes": spz_axes}

@@ -99,7 +99,7 @@ def evaluate(
     metrics, rules = _metrics(o)
     if o.background == "auto" and rules.background is not None:
         o = replace(o, background=rules.background)
-    scene, cameras = inputs_of(scene, cameras)
+    scene, cameras = inputs_of(scene, cameras, monitor)
     recipes = _recipes(o, scene, monitor)
     seen, scales = select_views(cameras, o.views), o.scale or rules.scales
     shown = _shown(o.show, seen) if o.report else ()

@@ -108,7 +108,7 @@ def finetune(
     cameras: CamerasLike = None,
     output: AnyPath | None = None,
     *,
-    spz_axes: SpzAxes = "opengl",
+    spz_axes: SpzAxes = "auto",
     monitor: Monitor = SILENT,
     **options: Any,
 ) -> Tuned:
@@ -127,7 +127,7 @@ def finetune(
     """
     o = FinetuneOptions.of(options)
     settings, viewer, path = _settings(o), _viewer(o), None if output is None else Path(output)
-    scene, cameras = inputs_of(scene, cameras)
+    scene, cameras = inputs_of(scene, cameras, monitor)
     _check(path, sources_of(scene), o)
     shown, source = select_views(cameras, o.views), _source(o.truth, cameras)
     enlarge = back_projected if o.upsampler is None else upsampled(find_upsampler(o.upsampler))

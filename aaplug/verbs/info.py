@@ -11,6 +11,7 @@ from aaplug.inspection.survey import Survey, check_frame_of, survey
 from aaplug.io.scenes.ply import Document
 from aaplug.io.scenes.scene_file import SceneFile
 from aaplug.methods.viewers import describe
+from aaplug.verbs.agreement import settled
 from aaplug.verbs.inputs import AnyPath, CamerasLike, cameras_of, opened_of
 from aaplug.verbs.options import FrameOptions
 
@@ -41,7 +42,8 @@ def info(
     o = FrameOptions.of(options)
     opened = opened_of(scene)
     if cameras is not None:
-        cameras = cameras_of(cameras, opened.path)
+        cameras = cameras_of(cameras, opened)
+        opened = settled(opened, cameras, monitor)
         check_frame_of(opened, cameras.train, o.min_seen)
     with monitor.progress("reading", "Gaussians") as tell:
         found = survey(opened, () if cameras is None else cameras.train, tell)

@@ -1,5 +1,6 @@
 """What verbs take: scenes and cameras as objects or paths, backgrounds, rasterizers and threads by name."""
 
+import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from os import PathLike
@@ -22,7 +23,10 @@ from aaplug.methods.recipe import Recipe
 from aaplug.methods.recipes import RECIPES, find_recipe
 from aaplug.rasterizers import find_rasterizer
 from aaplug.rendering.renderer import Harmonics, Renderer, background_colour
+from aaplug.verbs.agreement import agreement, settled
 from aaplug.verbs.options import RecipeOptions, ViewOptions
+
+log = logging.getLogger("aaplug")
 
 AnyPath = str | PathLike[str]
 SceneLike = Gaussians | AnyPath
@@ -56,13 +60,14 @@ def drawable(scene: Gaussians | SceneFile, drop_bad: bool = False) -> tuple[Gaus
     return scene.whole(drop_bad), None
 
 
-def cameras_of(cameras: CamerasLike, scene: SceneLike) -> CameraSet:
+def cameras_of(cameras: CamerasLike, scene: SceneLike | SceneFile) -> CameraSet:
     """The cameras themselves, those at a path, or those of the model folder that the scene is in."""
     if isinstance(cameras, CameraSet):
         return cameras
     if cameras is not None:
         return read_cameras(cameras)
-    path = Path(scene.name if isinstance(scene, Gaussians) else scene)
+    named = scene.path if isinstance(scene, SceneFile) else scene
+    path = Path(named.name if isinstance(named, Gaussians) else named)
     if path.match(MODEL_SCENE):
         path = path.parents[2]
     if not path.is_dir():
@@ -70,10 +75,14 @@ def cameras_of(cameras: CamerasLike, scene: SceneLike) -> CameraSet:
     return read_cameras(path)
 
 
-def inputs_of(scene: SceneLike, cameras: CamerasLike) -> tuple[Gaussians, CameraSet]:
+def inputs_of(
+    scene: SceneLike | SceneFile, cameras: CamerasLike, monitor: Monitor, drop_bad: bool = False
+) -> tuple[Gaussians, CameraSet]:
     """The scene and its cameras; the cameras are read first, as they are small."""
     known = cameras_of(cameras, scene)
-    return scene_of(scene), known
+    if isinstance(scene, Gaussians):
+        return scene, known
+    return settled(opened_of(scene), known, monitor).whole(drop_bad), known
 
 
 def recipe_of(recipe: str | Recipe, o: RecipeOptions) -> Recipe:
@@ -102,7 +111,12 @@ def look_of(scene: Gaussians, cameras: CameraSet, frames: int, o: ViewOptions, m
         drawing = find_rasterizer(drawing, frames, monitor.say)
     if o.memory is not None and isinstance(drawing, TakesMemory):
         drawing = drawing.within(o.memory * 1e9)
-    return own_look(scene, TrainingViews.of(scene, cameras, o.cull_margin, o.min_seen), drawing, colour)
+    look = own_look(scene, TrainingViews.of(scene, cameras, o.cull_margin, o.min_seen), drawing, colour)
+    fit = agreement(look, cameras)
+    monitor.say(f"fit: {fit}")
+    if fit.doubt:
+        log.warning("%s: scene and cameras seem to be of different captures: %s", scene.name, fit.doubt)
+    return look
 
 
 def drawn_by(recipe: Recipe, scene: Gaussians, look: Renderer) -> Renderer:

@@ -15,6 +15,7 @@ from aaplug.io.scenes.scene_file import SceneFile
 from aaplug.methods.recipes import find_recipe
 from aaplug.rendering.frames import write_frames
 from aaplug.rendering.renderer import Renderer
+from aaplug.verbs.agreement import settled
 from aaplug.verbs.announce import announce
 from aaplug.verbs.inputs import (
     AnyPath,
@@ -73,10 +74,11 @@ def render(
     recipe = o.recipe
     if isinstance(recipe, str):
         recipe = find_recipe(recipe, quality=o.quality, rate_reference=o.rate_reference)
-    cameras = cameras_of(cameras, scene.path if isinstance(scene, SceneFile) else scene)
+    cameras = cameras_of(cameras, scene)
     shown = resized(select_views(cameras, o.views), o.scale, o.resolution)
     paths = image_paths(Path(output), shown, o.overwrite)
-    scene, harmonics = drawable(scene if isinstance(scene, Gaussians) else opened_of(scene), drop_bad)
+    opened = scene if isinstance(scene, Gaussians) else settled(opened_of(scene), cameras, monitor)
+    scene, harmonics = drawable(opened, drop_bad)
     with processor(o.threads) as workers:
         renderer = drawn_by(recipe, scene, look_of(scene, cameras, len(shown), o, monitor))
         renderer = replace(renderer, harmonics=harmonics)

@@ -80,7 +80,7 @@ def video(
     free = None if str(o.path) in MOVES else read_camera_path(Path(o.path))
     fps = o.fps or (FPS if free is None else free.fps)
     check_video(Path(output), fps, o.overwrite)
-    scene, cameras = inputs_of(scene, cameras)
+    scene, cameras = inputs_of(scene, cameras, monitor)
     path = free.cameras if free else _along(scene, cameras, o, fps, monitor)
     shown = resized(path, o.scale, o.resolution)
     labels = [{"auto": "aaplug auto"}.get(recipe.name, recipe.name) for recipe in recipes]

@@ -73,7 +73,7 @@ def open_scene(
     iteration: int | None = None,
     convention: Convention | None = None,
     allow_checkpoint: bool = False,
-    spz_axes: SpzAxes = "opengl",
+    spz_axes: SpzAxes = "auto",
 ) -> SceneFile:
     """Open a scene without reading its Gaussians.
 
@@ -82,7 +82,8 @@ def open_scene(
         iteration: which iteration of a model folder; None for the last.
         convention: how the scene was trained, if the file does not say or is wrong.
         allow_checkpoint: open a .pt too, a pickle, of which only tensors are read.
-        spz_axes: of a .spz: "opengl" by its specification, "opencv" as splat-transform and gsply write them.
+        spz_axes: of a .spz: "opengl" by its specification, "opencv" as splat-transform and gsply write them; "auto" is
+            the first, with the second as `SceneFile.other`.
 
     Raises:
         FormatError: the file is missing, of no known format, or breaks its format.
@@ -96,9 +97,15 @@ def open_scene(
     for format in formats:
         if format.sniff(path, head):
             file = format.open_scene(path, options)
-            return file if convention is None else replace(file, convention=convention, evidence="stated by the user")
+            return file if convention is None else _stated(file, convention)
     known = ", ".join("." + format.name for format in formats)
     raise FormatError(path, f"is of no known scene format; aaplug reads {known}")
+
+
+def _stated(file: SceneFile, convention: Convention) -> SceneFile:
+    """The file with the convention that the user states."""
+    other = file.other and _stated(file.other, convention)
+    return replace(file, convention=convention, evidence="stated by the user", other=other)
 
 
 def read_scene(
@@ -108,7 +115,7 @@ def read_scene(
     convention: Convention | None = None,
     drop_bad: bool = False,
     allow_checkpoint: bool = False,
-    spz_axes: SpzAxes = "opengl",
+    spz_axes: SpzAxes = "auto",
 ) -> Gaussians:
     """Read a scene.
 
@@ -123,7 +130,7 @@ def read_scene(
 
 
 def write_scene(
-    path: str | PathLike[str], scene: Gaussians, *, overwrite: bool = False, spz_axes: SpzAxes = "opengl"
+    path: str | PathLike[str], scene: Gaussians, *, overwrite: bool = False, spz_axes: SpzAxes = "auto"
 ) -> None:
     """Write a scene in the format of the path's suffix, with everything else that its source file held.
 
@@ -145,7 +152,7 @@ def write_parts(
     inputs: Iterable[str | PathLike[str]] = (),
     *,
     overwrite: bool = False,
-    spz_axes: SpzAxes = "opengl",
+    spz_axes: SpzAxes = "auto",
 ) -> None:
     """Write a scene that comes in parts, at most `count` Gaussians of one convention and with the same columns.
 

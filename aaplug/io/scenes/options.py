@@ -5,7 +5,7 @@ from typing import Literal, get_args
 
 from aaplug.core.errors import UsageError
 
-SpzAxes = Literal["opengl", "opencv"]
+SpzAxes = Literal["auto", "opengl", "opencv"]
 
 
 @dataclass(frozen=True)
@@ -13,11 +13,12 @@ class Options:
     """The user's choices; raises UsageError for unknown axes.
 
     allow_checkpoint: open a .pt, a pickle, of which only tensors are read.
-    spz_axes: axes of the numbers in a .spz: "opengl" by its specification, "opencv" as splat-transform and gsply write.
+    spz_axes: axes of the numbers in a .spz: "opengl" by its specification, "opencv" as splat-transform and gsply write,
+        or "auto": written by the specification, and read as fits the cameras.
     """
 
     allow_checkpoint: bool = False
-    spz_axes: SpzAxes = "opengl"
+    spz_axes: SpzAxes = "auto"
 
     def __post_init__(self) -> None:
         known = get_args(SpzAxes)

@@ -47,6 +47,7 @@ class SceneFile:
     document: what the format's writer needs to give everything back.
     flat: see `Gaussians`.
     notes: facts worth printing about how the file was understood, a line each.
+    other: the same file read in another way, where it does not say which is right; its last note says how.
     """
 
     path: Path
@@ -60,6 +61,7 @@ class SceneFile:
     flat: bool = False
     document: Any = None
     notes: tuple[str, ...] = ()
+    other: "SceneFile | None" = None
 
     def raw(self, start: int, stop: int) -> Gaussians:
         """The rows from start up to stop, with convention and origin; their values are not checked."""

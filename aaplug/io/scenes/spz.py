@@ -31,7 +31,7 @@ from aaplug.core.gaussians import CLASSIC, Gaussians
 from aaplug.core.locks import scratch
 from aaplug.io.atomic import replacing
 from aaplug.io.limits import whole_limit
-from aaplug.io.scenes.options import Options
+from aaplug.io.scenes.options import Options, SpzAxes
 from aaplug.io.scenes.packed import byte_opacities, check_growth, floats, half_turn_about_x, largest_last
 from aaplug.io.scenes.scene_file import COMPENSATED, KERNEL_LOST, SceneFile, check_count, library_errors
 
@@ -98,9 +98,14 @@ def open_scene(path: Path, options: Options) -> SceneFile:
     convention, evidence = CLASSIC, "the flag antialiased is not set: assumed classic"
     if header.flags & ANTIALIASED_FLAG:
         convention, evidence = COMPENSATED, f"the flag antialiased is set; {KERNEL_LOST}"
-    load = partial(_rows, header, sections, TURNS[options.spz_axes])
-    notes = (f"version {header.version}; {AXES_NOTES[options.spz_axes]}",)
-    return SceneFile(path, name, header.count, header.degree, load, evidence, convention, notes=notes)
+
+    def reading(axes: SpzAxes, other: SceneFile | None = None) -> SceneFile:
+        load, notes = partial(_rows, header, sections, TURNS[axes]), (f"version {header.version}", AXES_NOTES[axes])
+        return SceneFile(path, name, header.count, header.degree, load, evidence, convention, notes=notes, other=other)
+
+    if options.spz_axes == "auto":  # the header does not name its writer
+        return reading("opengl", reading("opencv"))
+    return reading(options.spz_axes)
 
 
 def _sections(path: Path) -> tuple[Header, list[np.ndarray]]:
@@ -216,7 +221,7 @@ def _threes(data: np.ndarray) -> Float[Tensor, "n 4"]:
 
 def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: Options) -> None:
     """Write a scene, with values rounded to the format's steps."""
-    turn = TURNS[options.spz_axes]
+    turn = TURNS["opengl" if options.spz_axes == "auto" else options.spz_axes]
     scenes = [turn(_checked(path, part)) for part in parts]
     content = _packed(path, scenes)
     with replacing(path, overwrite) as stream:

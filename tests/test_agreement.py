@@ -1,0 +1,73 @@
+"""Scene and cameras of different captures are told apart, and a .spz of either axes is read as fits the cameras."""
+
+import logging
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from aaplug.core.cameras import WHITE, CameraSet
+from aaplug.core.training import TrainingViews
+from aaplug.evaluation.truth import own_look
+from aaplug.io.scenes import open_scene, read_scene, write_scene
+from aaplug.io.scenes.packed import half_turn_about_x
+from aaplug.verbs.agreement import Agreement, agreement, settled
+from aaplug.verbs.render import render
+from tests.conftest import make_camera, make_scene
+
+
+def fit_of(scene, cameras) -> Agreement:
+    return agreement(own_look(scene, TrainingViews.of(scene, cameras), "eager", WHITE), cameras)
+
+
+def without_photos(cameras: CameraSet) -> CameraSet:
+    strip = [tuple(replace(view, photo=None) for view in views) for views in (cameras.train, cameras.test)]
+    return replace(cameras, train=strip[0], test=strip[1])
+
+
+def test_photographs_tell_a_scene_from_one_turned_over(sample_scene, sample_cameras):
+    right, wrong = (fit_of(scene, sample_cameras) for scene in (sample_scene, half_turn_about_x(sample_scene)))
+    assert right.doubt is None
+    assert right.gain > 10
+    assert wrong.gain < 0
+    assert "farther from the photographs than one flat colour" in wrong.doubt
+
+
+def test_without_photographs_cameras_should_look_at_the_scenes_middle():
+    scene = make_scene(200)
+    towards = [make_camera((0.3 * i - 1, -4.0, 0.0)) for i in range(5)]
+    found = fit_of(scene, CameraSet(tuple(towards), tuple(towards)))
+    assert (found.gain, found.doubt) == (None, None)
+    assert found.seen > 0.9
+    aside = [replace(camera, cx=camera.cx + 0.6 * camera.width) for camera in towards]
+    found = fit_of(scene, CameraSet(tuple(aside), tuple(aside)))
+    assert "the middle of the scene lies outside of the image" in found.doubt
+
+
+def test_doubt_is_a_warning(sample_scene, sample_cameras, tmp_path, caplog):
+    with caplog.at_level(logging.WARNING, "aaplug"):
+        render(half_turn_about_x(sample_scene), sample_cameras, tmp_path / "a", views="r_8", scale=0.05)
+    assert "seem to be of different captures" in caplog.text
+    caplog.clear()
+    with caplog.at_level(logging.WARNING, "aaplug"):
+        render(sample_scene, sample_cameras, tmp_path / "b", views="r_8", scale=0.05)
+    assert caplog.text == ""
+
+
+@pytest.mark.parametrize("axes", ["opengl", "opencv"])
+def test_a_spz_is_read_as_fits_the_cameras(sample_scene, sample_cameras, tmp_path: Path, axes):
+    pytest.importorskip("gsply")
+    scene = sample_scene[:: len(sample_scene) // 3000]
+    write_scene(tmp_path / "a.spz", scene, spz_axes=axes)
+    chosen = settled(open_scene(tmp_path / "a.spz"), sample_cameras)
+    expected = read_scene(tmp_path / "a.spz", spz_axes=axes)
+    assert torch.equal(chosen.whole().means, expected.means)
+    assert torch.equal(chosen.whole().sh, expected.sh)
+
+
+def test_without_evidence_a_spz_follows_its_specification(sample_scene, sample_cameras, tmp_path: Path):
+    pytest.importorskip("gsply")
+    write_scene(tmp_path / "a.spz", sample_scene[:100], spz_axes="opencv")
+    chosen = settled(open_scene(tmp_path / "a.spz"), without_photos(sample_cameras))
+    assert torch.equal(chosen.whole().means, read_scene(tmp_path / "a.spz", spz_axes="opengl").means)
