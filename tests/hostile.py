@@ -7,6 +7,7 @@ has.  Each file must end as a scene or in one of our errors, within `SECONDS` an
 """
 
 import multiprocessing
+import os
 import random
 import resource
 import shutil
@@ -14,7 +15,8 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
@@ -31,16 +33,53 @@ BATCH = 500  # files a child
 NAMES = (*STORED, "run.pt", *MADE)
 
 
-def outcome(path: Path) -> str:
-    """Read the scene as `aaplug info` does: "scene", "refused", or what went wrong."""
+@dataclass(frozen=True)
+class Target:
+    """A small file to damage, and its reader.
+
+    make: writes it and what belongs beside it into an empty folder; returns its path.
+    environment: variables that are set while it is read.
+    """
+
+    make: Callable[[Path], Path]
+    read: Callable[[Path], object]
+    environment: Mapping[str, str] = field(default_factory=dict)
+
+    def content(self) -> bytes:
+        """The file as it is whole."""
+        with tempfile.TemporaryDirectory() as folder:
+            return self.make(Path(folder)).read_bytes()
+
+
+def read_as_info_does(path: Path) -> None:
+    """Open a scene and look at every Gaussian."""
+    survey(open_scene(path, allow_checkpoint=True))
+
+
+def scene(name: str) -> Target:
+    """A small scene of the format that the name tells."""
+
+    def make(folder: Path) -> Path:
+        path = folder / name
+        if "/" in name:
+            shutil.copytree((DATA / name).parent, path.parent)
+        elif name in NAMES:
+            path.write_bytes(write_file(folder, name).read_bytes())
+        return path
+
+    return Target(make, read_as_info_does)
+
+
+def outcome(path: Path, read: Callable[[Path], object] = read_as_info_does) -> str:
+    """Read a file: "read", "refused", or what went wrong."""
     try:
-        survey(open_scene(path, allow_checkpoint=True))
+        read(path)
     except AaplugError as error:
         str(error).encode()
         return "refused" if "\n" not in str(error) else f"two lines: {error!r}"
     except BaseException as error:
         return f"{type(error).__name__}: {error!r:.200}"
-    return "scene"
+    return "read"
 
 
 def mutations(data: bytes, seed: int, count: int) -> Iterator[bytes]:
@@ -75,8 +114,8 @@ def header_size(name: str, data: bytes) -> int:
     return len(data) if len(data) < 512 else 256
 
 
-def check(name: str, files: Iterable[bytes]) -> Counter[str]:
-    """Read each of these as the named format, in children; counts of outcomes.
+def check(name: str, files: Iterable[bytes], target: Target | None = None) -> Counter[str]:
+    """Read each of these as the target, or as a scene of that name, in children; counts of outcomes.
 
     Raises:
         AssertionError: a file did harm.
@@ -86,9 +125,9 @@ def check(name: str, files: Iterable[bytes]) -> Counter[str]:
     for data in files:
         batch.append(data)
         if len(batch) == BATCH:
-            outcomes += _in_a_child(name, batch)
+            outcomes += _in_a_child(name, batch, target or scene(name))
             batch = []
-    return outcomes + _in_a_child(name, batch) if batch else outcomes
+    return outcomes + _in_a_child(name, batch, target or scene(name)) if batch else outcomes
 
 
 def _spoil(data: bytearray, rng: random.Random) -> bytearray:
@@ -109,9 +148,9 @@ def _spoil(data: bytearray, rng: random.Random) -> bytearray:
     return data
 
 
-def _in_a_child(name: str, files: list[bytes]) -> Counter[str]:
+def _in_a_child(name: str, files: list[bytes], target: Target) -> Counter[str]:
     receive, send = multiprocessing.Pipe(duplex=False)
-    child = multiprocessing.get_context("fork").Process(target=_work, args=(name, files, send))
+    child = multiprocessing.get_context("fork").Process(target=_work, args=(target, files, send))
     child.start()
     send.close()
     try:
@@ -120,7 +159,7 @@ def _in_a_child(name: str, files: list[bytes]) -> Counter[str]:
         child.join()
         raise AssertionError(f"{name}: the reader died with {child.exitcode}") from None
     child.join()
-    strange = {key: n for key, n in found.items() if key not in ("scene", "refused")}
+    strange = {key: n for key, n in found.items() if key not in ("read", "refused")}
     assert not strange, (name, strange)
     assert slowest < SECONDS, (name, slowest)
     assert growth < GROWTH, (name, growth)
@@ -128,8 +167,9 @@ def _in_a_child(name: str, files: list[bytes]) -> Counter[str]:
     return found
 
 
-def _work(name: str, files: list[bytes], send) -> None:
+def _work(target: Target, files: list[bytes], send) -> None:
     torch.set_num_threads(1)
+    os.environ.update(target.environment)
     space = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (space + MEMORY, space + MEMORY))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
@@ -137,14 +177,12 @@ def _work(name: str, files: list[bytes], send) -> None:
     found: Counter[str] = Counter()
     slowest = 0.0
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / name
-        if "/" in name:
-            shutil.copytree((DATA / name).parent, path.parent)
+        path = target.make(Path(folder))
         there = sorted(p.name for p in path.parent.iterdir())
         for data in files:
             path.write_bytes(data)
             start = time.process_time()
-            result = outcome(path)
+            result = outcome(path, target.read)
             found[result] += 1
             slowest = max(slowest, time.process_time() - start)
         left = [p.name for p in path.parent.iterdir() if p.name not in (*there, path.name)]
@@ -157,16 +195,10 @@ def _resident() -> int:
     return int(words[words.index("VmHWM:") + 1]) * 1024
 
 
-def content_of(name: str, folder: Path) -> bytes:
-    """The format's small scene."""
-    return write_file(folder, name).read_bytes()
-
-
 def main() -> None:
     name, count, seed = sys.argv[1], int(sys.argv[2]), int([*sys.argv, "0"][3])
     for each in NAMES if name == "all" else name.split(","):
-        with tempfile.TemporaryDirectory() as folder:
-            data = content_of(each, Path(folder))
+        data = scene(each).content()
         start = time.perf_counter()
         found = check(each, mutations(data, seed, count))
         print(each, dict(found), f"{time.perf_counter() - start:.0f} s", flush=True)

@@ -28,7 +28,11 @@ SIZE = (64, 48)
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory) -> Path:
     """A folder with scene.ply, three training cameras and a test camera with its photograph."""
-    folder = tmp_path_factory.mktemp("dataset")
+    return make_dataset(tmp_path_factory.mktemp("dataset"))
+
+
+def make_dataset(folder: Path) -> Path:
+    """A scene, training cameras, and a test camera with its photograph."""
     write_scene(folder / "scene.ply", make_scene(150))
     for split, eyes in EYES.items():
         write_transforms(folder, split, eyes)

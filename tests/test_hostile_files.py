@@ -9,11 +9,10 @@ import sys
 import zipfile
 import zlib
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 
-from tests.hostile import NAMES, check, content_of, cuts, flipped_digits, header_size, mutations
+from tests.hostile import NAMES, check, cuts, flipped_digits, header_size, mutations, scene
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="limits are Linux's")
 MUTATIONS = int(os.environ.get("AAPLUG_FUZZ", "25"))
@@ -21,8 +20,8 @@ EVERY = 1 if MUTATIONS >= 1000 else 61  # of cuts and flips, where the campaign 
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_damage_does_no_harm(tmp_path: Path, name: str):
-    data = content_of(name, tmp_path)
+def test_damage_does_no_harm(name: str):
+    data = scene(name).content()
     header = header_size(name, data)
     files = [*cuts(data, header)][::EVERY] + [*flipped_digits(data, header)][::EVERY]
     found = check(name, [*files, *mutations(data, 0, MUTATIONS)])

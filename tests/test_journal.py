@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from aaplug.core.errors import OutputError, UsageError
+from aaplug.core.errors import FormatError, OutputError, UsageError
 from aaplug.evaluation.journal import Journal
 from aaplug.evaluation.results import Measurement
 
@@ -73,3 +73,14 @@ def test_nothing_is_made_before_the_first_view_and_a_place_that_cannot_be_writte
     journal = Journal(tmp_path / "file" / "progress.jsonl", REQUEST, resume=False)
     with pytest.raises(OutputError, match=r"progress\.jsonl: cannot be written"):
         journal.add(0, [measured("a")])
+
+
+DAMAGED = ("{}", "[]", '{"view": 0}', '{"view": 0, "measurements": [{}]}', '{"view": [], "measurements": []}')
+
+
+@pytest.mark.parametrize("line", DAMAGED)
+def test_a_line_that_is_no_measurement_is_refused(tmp_path, line):
+    path = tmp_path / "progress.jsonl"
+    path.write_text('{"request": {}}\n' + line + "\n")
+    with pytest.raises(FormatError, match="its line 2 is damaged"):
+        Journal(path, {}, resume=True)

@@ -13,7 +13,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from aaplug.core.errors import OutputError, UsageError, listing, reason
+from aaplug.core.errors import FormatError, OutputError, UsageError, listing, reason
 from aaplug.core.locks import lock
 from aaplug.evaluation.results import Measurement
 
@@ -60,22 +60,42 @@ class Journal:
             lines = _whole_lines(stream)
             if not lines:
                 return
-            before, now = lines[0].get("request"), self._request
+            first, now = lines[0], self._request
+            before = first.get("request") if isinstance(first, dict) else None
             before = before if isinstance(before, dict) else {}
             changed = dict.fromkeys(key for key in (*now, *before) if before.get(key) != now.get(key))
             if changed:
                 what = f"is of another request ({listing(list(changed))} changed since)"
                 raise UsageError(str(self.path), f"{what}; repeat that request, or start again with `overwrite`")
-            for line in lines[1:]:
-                self.known[line["view"]] = tuple(Measurement(**m) for m in line["measurements"])
+            for number, line in enumerate(lines[1:], start=2):
+                view, found = self._measured(number, line)
+                self.known[view] = found
             stack.pop_all()  # keeps the stream open
             self._stream = stream
+
+    def _measured(self, number: int, line: Any) -> tuple[int, tuple[Measurement, ...]]:
+        """A finished view and its measurements, of the line of this number."""
+        try:
+            view, measurements = int(line["view"]), tuple(map(_measurement, line["measurements"]))
+        except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+            problem = f"its line {number} is damaged; start again with `overwrite`"
+            raise FormatError(self.path, problem) from error
+        return view, measurements
 
     def _write(self, line: Mapping[str, Any]) -> None:
         assert self._stream is not None
         self._stream.write(json.dumps(line, allow_nan=False).encode() + b"\n")
         self._stream.flush()
         os.fsync(self._stream.fileno())
+
+
+def _measurement(line: Any) -> Measurement:
+    """A measurement as it was written; raises TypeError or KeyError if it is none."""
+    texts, values = (line["recipe"], line["view"], line["note"]), line["values"]
+    numbers = (line["scale"], line["samples"], line["seconds"], *(v for v in values.values() if v is not None))
+    if not all(isinstance(text, str) for text in texts) or not all(isinstance(n, int | float) for n in numbers):
+        raise TypeError(line)
+    return Measurement(**line)
 
 
 @contextmanager
@@ -86,10 +106,10 @@ def _worded(path: Path) -> Iterator[None]:
         raise OutputError(path, f"cannot be written: {reason(error)}") from error
 
 
-def _whole_lines(stream: BinaryIO) -> list[dict[str, Any]]:
+def _whole_lines(stream: BinaryIO) -> list[Any]:
     """The complete lines; cuts the file after them."""
     stream.seek(0)
-    found, end = list[dict[str, Any]](), 0
+    found, end = list[Any](), 0
     for line in stream:
         if not line.endswith(b"\n"):
             break

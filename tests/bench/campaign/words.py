@@ -1,0 +1,94 @@
+"""Every option of every verb with odd values, generated from the options themselves."""
+
+import multiprocessing
+import os
+import resource
+import shutil
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+from aaplug_cli.main import VERBS, _verb, main  # pyright: ignore[reportMissingImports]
+from aaplug_cli.options import option_types  # pyright: ignore[reportMissingImports]
+
+from tests.test_cli import make_dataset
+
+ODD = ("nan", "inf", "-inf", "-1", "0", str(10**30), "", "x" * 10_000, os.fsdecode(b"\xff\xfe\x80"))
+SECONDS = 120  # of the clock, for one run
+MEMORY = 6 * 2**30  # bytes of address space
+BASE = {  # what makes each verb do a little work
+    "info": "scene.ply --cameras .",
+    "convert": "scene.ply --cameras . -o c.ply",
+    "render": "scene.ply --cameras . -o images --rasterizer eager",
+    "evaluate": "scene.ply --cameras . -o results --recipe classic --scale 0.5 --rasterizer eager",
+    "video": "scene.ply --cameras . -o v.webm --seconds 0.1 --rasterizer eager",
+    "finetune": "scene.ply --cameras . -o t.ply --steps 1 --truth self --scale 0.5 --rasterizer eager",
+    "demo": "-o demo.txt/x",
+    "bench": "--gaussians 100 --resolution 32x32 --repeats 1 --rasterizer eager",
+}
+SKIPPED = ("warmup",)  # it has no values, and compiles for minutes
+
+
+def cases() -> Iterator[tuple[str, list[str]]]:
+    """A name and the words of each run."""
+    for verb in VERBS:
+        if verb in SKIPPED:
+            continue
+        for option in option_types(_verb(verb)):
+            for value in ODD:
+                words = [verb, *BASE.get(verb, "").split()]
+                if option in ("scene", "more"):
+                    words.append(value)
+                else:
+                    words += [f"--{option.replace('_', '-')}", value]
+                yield f"{verb} --{option} {value[:12]!r}", words
+
+
+def outcome(words: list[str], data: Path) -> str:
+    """Run the program in a child; its exit code, or what went wrong."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        shutil.copytree(data, folder, dirs_exist_ok=True)
+        (folder / "demo.txt").touch()
+        child = multiprocessing.get_context("fork").Process(target=_run, args=(words, folder))
+        child.start()
+        child.join(SECONDS)
+        if child.is_alive():
+            child.kill()
+            return "endless"
+        said = (folder / "stderr").read_text(errors="backslashreplace").splitlines()
+        code = child.exitcode
+    if code not in (0, 1, 2, 130):
+        return f"exit code {code}: {said[-1:]}"
+    if any("Traceback" in line for line in said):
+        return f"traceback: {said[-1]}"
+    errors = [line for line in said if line.startswith("error: ")]
+    if code == 2 and not (len(errors) == 1 and said[-1] == errors[0]):
+        return f"refused in {len(errors)} lines: {said[-2:]}"
+    return str(code)
+
+
+def _run(words: list[str], folder: Path) -> None:
+    os.chdir(folder)
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+    for stream, descriptor in (("stdout", 1), ("stderr", 2)):
+        os.dup2(os.open(stream, os.O_WRONLY | os.O_CREAT), descriptor)
+    main(words)
+
+
+def run(workers: int) -> tuple[Counter[str], list[str]]:
+    """Run all; counts by exit code, and what went wrong."""
+    counts, wrong, started = Counter[str](), list[str](), time.perf_counter()
+    with tempfile.TemporaryDirectory() as name, ThreadPoolExecutor(workers) as pool:
+        data = make_dataset(Path(name))
+        named = list(cases())
+        for (what, _), found in zip(named, pool.map(lambda case: outcome(case[1], data), named), strict=True):
+            counts[found if found in ("0", "1", "2", "130") else "WRONG"] += 1
+            if found not in ("0", "1", "2", "130"):
+                wrong.append(f"{what}: {found}")
+                print("  " + wrong[-1].encode(errors="backslashreplace").decode()[:400], flush=True)
+    print(f"  {len(named)} runs, {time.perf_counter() - started:.0f} s")
+    return counts, wrong
