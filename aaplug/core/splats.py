@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-# floor of the opacity factor, so that rounding erases no splat (3DGS, gsplat)
+# floor of the opacity factor, so that rounding erases no splat (3DGS)
 MIN_COMPENSATION = 0.005
 
 
@@ -94,8 +94,7 @@ def concatenated(parts: Sequence[Splats2D]) -> Splats2D:
     first, *rest = parts
     if not rest:
         return first
-    names = [name for name, value in vars(first).items() if isinstance(value, Tensor)]
-    columns = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
+    columns = {name: torch.cat([getattr(part, name) for part in parts]) for name in first._columns()}
     return replace(first, **columns)
 
 

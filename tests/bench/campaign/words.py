@@ -4,8 +4,10 @@ import multiprocessing
 import os
 import resource
 import shutil
+import sys
 import tempfile
 import time
+import traceback
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -76,7 +78,16 @@ def _run(words: list[str], folder: Path) -> None:
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     for stream, descriptor in (("stdout", 1), ("stderr", 2)):
         os.dup2(os.open(stream, os.O_WRONLY | os.O_CREAT), descriptor)
-    main(words)
+    try:
+        main(words)
+    except SystemExit as end:
+        code = int(end.code or 0)
+    except BaseException:  # what would be a traceback
+        traceback.print_exc()
+        code = 1
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)  # a fork of a thread cannot end in another way
 
 
 def run(workers: int) -> tuple[Counter[str], list[str]]:
