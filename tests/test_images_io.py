@@ -3,6 +3,7 @@
 import io
 import os
 import struct
+import time
 import zlib
 from pathlib import Path
 
@@ -285,3 +286,15 @@ def test_real_photographs_are_read():
     photograph = next((DATA / "snowmiku" / "images").iterdir())
     assert image_size(photograph) == (984, 740)
     assert read_image(photograph, None).shape == (740, 984, 3)
+
+
+def test_a_chunk_longer_than_its_file_is_refused_at_once(tmp_path: Path):
+    write_png(tmp_path / "a.png", torch.zeros(12, 16, 3))
+    data = bytearray((tmp_path / "a.png").read_bytes())
+    at = data.index(b"IDAT")
+    data[at - 4 : at] = b"\xff\xff\xff\xff"
+    (tmp_path / "a.png").write_bytes(data)
+    started = time.process_time()
+    with pytest.raises(FormatError, match="is damaged or cut short"):
+        read_image(tmp_path / "a.png")
+    assert time.process_time() - started < 1.0  # OpenCV made room for 4 GB: 7 s and more

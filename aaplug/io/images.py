@@ -163,7 +163,7 @@ def _read(path: Path, channels: int, finished: Callable[[Tensor], Tensor]) -> Fl
 def _decode(path: Path) -> np.ndarray:
     """Samples as stored, [h, w, channels], BGR(A) or gray."""
     try:
-        data = _still(path.read_bytes())
+        data = _still(path, path.read_bytes())
         with captured_stderr() as words:
             # UNCHANGED keeps 16 bits and alpha, and ignores the orientation tag
             pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
@@ -178,7 +178,7 @@ def _decode(path: Path) -> np.ndarray:
     return pixels[..., None] if pixels.ndim == 2 else pixels
 
 
-def _still(data: bytes) -> bytes:
+def _still(path: Path, data: bytes) -> bytes:
     """A PNG without the chunks of an animation, with which OpenCV also takes pixels that are missing for black."""
     if not data.startswith(PNG_SIGNATURE):
         return data
@@ -186,6 +186,8 @@ def _still(data: bytes) -> bytes:
     while at + PNG_CHUNK.size <= len(data):
         length, kind = PNG_CHUNK.unpack_from(data, at)
         end = at + PNG_CHUNK.size + length + PNG_CHECKSUM
+        if end > len(data):  # OpenCV would make room for what is not there
+            raise FormatError(path, "is damaged or cut short")
         if kind in PNG_PIXELS:
             kept.append(data[at:end])
         at = end
