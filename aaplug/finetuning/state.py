@@ -16,7 +16,7 @@ from torch import Tensor
 
 from aaplug.core.cameras import Camera
 from aaplug.core.digests import digest_of_cameras, digest_of_files, digest_of_scene
-from aaplug.core.errors import FormatError, UsageError
+from aaplug.core.errors import FormatError, UsageError, printable
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.sampling import SamplingBounds
 from aaplug.evaluation.truth import Truth
@@ -133,7 +133,9 @@ def load(path: Path, job: TuningJob) -> tuple[State, dict[str, Any]]:
             raise ValueError(content["format"])
         for key, value in _facts(job).items():
             if (found := content["job"].get(key)) != value:
-                raise UsageError(str(path), f"is of another run: its {key} was {found}, now it is {value}")
+                raise UsageError(
+                    str(path), f"is of another run: its {key} was {printable(str(found))}, now it is {value}"
+                )
         return unpacked(content["state"], job), content["good"]
     except UsageError:
         raise

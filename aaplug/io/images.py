@@ -34,7 +34,7 @@ from aaplug.io.limits import whole_limit
 
 LOSSLESS_WEBP = 101  # OpenCV's quality for it
 SAMPLE_TYPES = {8: np.uint8, 16: np.uint16}  # by bit depth
-ROWS = 256  # of an image converted to samples at once
+ROWS = 64  # of an image converted to samples at once
 ALPHA_CHANNELS = 4  # RGB and alpha
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")  # of Pillow; OpenCV tells them by the same first bytes
 BYTES_A_PIXEL = 8  # four channels of 16 bits: no image takes more
@@ -190,6 +190,8 @@ def _still(path: Path, data: bytes) -> bytes:
             raise FormatError(path, "is damaged or cut short")
         if kind in PNG_PIXELS:
             kept.append(data[at:end])
+        if kind == PNG_PIXELS[-1]:
+            break
         at = end
     return b"".join(kept)
 

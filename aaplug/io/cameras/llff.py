@@ -5,6 +5,7 @@ depth.  The rotation's columns are the camera's axes down, right and back.
 """
 
 import os
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -51,7 +52,8 @@ def read(path: Path, options: Options) -> CameraSet:
 def _rows(file: Path) -> np.ndarray:
     read_bounded(file, whole_limit("JSON"))
     try:
-        rows = np.load(file, mmap_mode="r", allow_pickle=False)  # mapping refuses a size that the file does not have
+        with warnings.catch_warnings(action="ignore"):  # numpy's, about the file's age
+            rows = np.load(file, mmap_mode="r", allow_pickle=False)  # mapping refuses more than the file has
     except Exception as error:  # numpy raises ValueError, EOFError, SyntaxError and others
         raise FormatError(file, "is not a .npy file of numbers") from error
     if not (isinstance(rows, np.ndarray) and rows.ndim == 2 and rows.shape[1] == COLUMNS and len(rows)):

@@ -78,6 +78,7 @@ def _run(words: list[str], folder: Path) -> None:
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     for stream, descriptor in (("stdout", 1), ("stderr", 2)):
         os.dup2(os.open(stream, os.O_WRONLY | os.O_CREAT), descriptor)
+    code = 0
     try:
         main(words)
     except SystemExit as end:
