@@ -36,6 +36,7 @@ FITTING = ["--steps", "2"]  # of `convert --for`, likewise
 ELSEWHERE = {  # commands of the tests and benches themselves, and what runs them instead
     "python -m tests.bench.method_tables every_recipe": "ten minutes; needs scenes beside the repository",
     "python -m tests.bench.viewers": "minutes; needs Node.js and Chromium",
+    "python -m tests.bench.campaign": "about an hour",
     "AAPLUG_FUZZ=10000 python -m pytest tests/test_hostile_files.py": "pytest runs it with fewer mutations",
     "python -m tests.hostile all 10000": "test_hostile_files.py runs it with fewer mutations",
     "python -m tests.guided -max_total_time=60": ".ci/run, twice for half as long",
