@@ -27,6 +27,7 @@ from .verbs.demo import demo as demo
 from .verbs.evaluate import evaluate as evaluate
 from .verbs.finetune import finetune as finetune
 from .verbs.info import info as info
+from .verbs.lod import lod as lod
 from .verbs.render import render as render
 from .verbs.video import video as video
 from .verbs.warmup import warmup as warmup

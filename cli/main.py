@@ -14,7 +14,7 @@ from typing import Any, get_args, get_origin
 from aaplug.core.errors import AaplugError, UsageError, reason
 
 FAILED, REFUSED, INTERRUPTED = 1, 2, 130
-VERBS = ("info", "convert", "render", "evaluate", "video", "finetune", "demo", "warmup", "bench")
+VERBS = ("info", "convert", "lod", "render", "evaluate", "video", "finetune", "demo", "warmup", "bench")
 
 
 def main(words: Sequence[str] | None = None) -> None:

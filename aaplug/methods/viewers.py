@@ -27,6 +27,7 @@ from aaplug.methods.filters import MatchedEnergy, Smoothing3D, fuse_stored
 FITTED_VARIANCE = 0.1  # px² at the median training rate, best measured; from uncompensated training to compensation
 MOST_DEGREE = 4  # of spherical harmonics in any file
 TUNED = "finetune"  # method that fine-tuning records in `Gaussians.fused`; it adds no blur
+MERGED = "merge"  # method that levels of detail record; it keeps what blur there is
 
 
 @dataclass(frozen=True)
@@ -197,8 +198,8 @@ def _energy_kept(trained: Convention, shown: Convention) -> MatchedEnergy:
 
 
 def blurring(fused: Sequence[Fusion]) -> list[Fusion]:
-    """The fusions that added blur: all but fine-tuning."""
-    return [fusion for fusion in fused if fusion.method != TUNED]
+    """The fusions that added blur: all but merging and fine-tuning."""
+    return [fusion for fusion in fused if fusion.method not in (MERGED, TUNED)]
 
 
 def describe(fusion: Fusion) -> str:

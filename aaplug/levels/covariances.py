@@ -1,0 +1,95 @@
+"""Covariances in the world and their shadows: what a Gaussian covers, seen along each of the world's axes.
+
+n: Gaussians.  A covariance is packed as (xx, xy, xz, yy, yz, zz), in squared world units.  Seen from far along an axis,
+a Gaussian is a 2D one whose covariance is a minor of the packed one, so every integral below has a closed form.
+"""
+
+import math
+from collections.abc import Iterator
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from aaplug.core.gaussians import Gaussians
+from aaplug.core.projection import rotation_matrices
+
+PLACES = ((0, 1, 2), (1, 3, 4), (2, 4, 5))  # of a matrix's elements in the packed form
+DIAGONAL = tuple(PLACES[i][i] for i in range(3))
+AXES = ((0, 1), (1, 2), (2, 0))  # of the planes seen along z, x and y
+
+Packed = Float[Tensor, "n 6"]
+
+
+def covariances(scene: Gaussians) -> Packed:
+    """Covariance of each Gaussian as its file stores it."""
+    factors = rotation_matrices(scene.unit_quats) * scene.scales[:, None, :]
+    return packed(factors @ factors.mT)
+
+
+def packed(matrices: Float[Tensor, "n 3 3"]) -> Packed:
+    """The upper triangle of symmetric matrices."""
+    return torch.stack([matrices[:, i, j] for i in range(3) for j in range(i, 3)], dim=1)
+
+
+def unpacked(covs: Packed) -> Float[Tensor, "n 3 3"]:
+    """The symmetric matrices again."""
+    return covs[:, torch.tensor(PLACES)]
+
+
+def outer(offsets: Float[Tensor, "n 3"]) -> Packed:
+    """d dᵀ of each offset."""
+    return torch.stack([offsets[:, i] * offsets[:, j] for i in range(3) for j in range(i, 3)], dim=1)
+
+
+def blurred(covs: Packed, variance: Float[Tensor, " n"]) -> Packed:
+    """Covariances after an isotropic blur, or with a negative variance before one."""
+    wider = covs.clone()
+    for place in DIAGONAL:
+        wider[:, place] += variance
+    return wider
+
+
+def _minors(covs: Packed) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    for i, j in AXES:
+        yield covs[:, PLACES[i][i]], covs[:, PLACES[i][j]], covs[:, PLACES[j][j]]
+
+
+def areas(covs: Packed) -> Float[Tensor, "n 3"]:
+    """∫ of a Gaussian of height 1 over the plane across each axis: 2π √det, in squared world units."""
+    dets = [a * c - b * b for a, b, c in _minors(covs)]
+    return 2 * math.pi * torch.stack(dets, dim=1).clamp(min=0).sqrt()
+
+
+def area(covs: Packed) -> Float[Tensor, " n"]:
+    """Mean of `areas`."""
+    return areas(covs).mean(dim=1)
+
+
+def overlaps(total: Packed, offsets: Float[Tensor, "n 3"] | None = None) -> Float[Tensor, "n 3"]:
+    """∫ g h over the plane across each axis, of Gaussians g and h that integrate to 1.
+
+    total: the sum of their covariances.  offsets: between their means; None for none.
+    """
+    found = []
+    for (i, j), (a, b, c) in zip(AXES, _minors(total), strict=True):
+        det = (a * c - b * b).clamp(min=torch.finfo(a.dtype).tiny)
+        peak = 1 / (2 * math.pi * det.sqrt())
+        if offsets is not None:
+            x, y = offsets[:, i], offsets[:, j]
+            peak = peak * torch.exp(-0.5 * (c * x * x - 2 * b * x * y + a * y * y) / det)
+        found.append(peak)
+    return torch.stack(found, dim=1)
+
+
+def quats_of(rotations: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 4"]:
+    """Unit quaternions wxyz of rotation matrices, from each one's largest component (Shepperd 1978)."""
+    m = [[rotations[:, i, j] for j in range(3)] for i in range(3)]
+    x, y, z = m[2][1] - m[1][2], m[0][2] - m[2][0], m[1][0] - m[0][1]
+    xy, xz, yz = m[1][0] + m[0][1], m[2][0] + m[0][2], m[2][1] + m[1][2]
+    squares = [1 + s * m[0][0] + t * m[1][1] + s * t * m[2][2] for s, t in ((1, 1), (1, -1), (-1, 1), (-1, -1))]
+    w, xx, yy, zz = squares
+    rows = [(w, x, y, z), (x, xx, xy, xz), (y, xy, yy, yz), (z, xz, yz, zz)]
+    products = torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)  # 4 q qᵀ
+    largest = torch.stack(squares, dim=1).argmax(dim=1)
+    return torch.nn.functional.normalize(products[torch.arange(len(largest)), largest], dim=1)

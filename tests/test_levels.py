@@ -1,0 +1,286 @@
+"""Levels of detail: what merging keeps, what it does not depend on, and the files and errors of `aaplug lod`."""
+
+# ruff: noqa: F811 (fixtures come from another file)
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+import aaplug
+import aaplug.core.projection
+from aaplug.core.errors import FrameError, OutputError, UsageError
+from aaplug.core.executors import torch_threads
+from aaplug.core.gaussians import ANTIALIASED, CLASSIC, MIP, Gaussians
+from aaplug.core.projection import project
+from aaplug.evaluation.metrics import psnr
+from aaplug.io.scenes import read_scene
+from aaplug.levels.clusters import MAX_OPACITY, merged_pairs, seen
+from aaplug.levels.covariances import area, areas, covariances, packed, quats_of, unpacked
+from aaplug.levels.merging import Goal, merged
+from aaplug.levels.pairing import MOST_COST, costs, mutual_pairs
+from aaplug.levels.rates import rates_of
+from aaplug.methods.viewers import MERGED, blurring
+from aaplug.rendering.renderer import Renderer
+from tests.conftest import make_camera, make_scene
+from tests.test_cli import cli, dataset  # noqa: F401 (fixtures)
+
+RATE = 20.0  # px per world unit
+EYES = ((0.0, -4.0, 0.0), (4.0, 0.0, 0.0), (0.5, 0.0, 4.0))
+
+
+def pair(opacity: float, apart: float, size: float = 0.2) -> Gaussians:
+    """Two round Gaussians beside each other, which both appear at full alpha."""
+    scene = replace(make_scene(2), means=torch.tensor([[-apart / 2, 0, 0], [apart / 2, 0.0, 0]]))
+    scene.log_scales[:] = math.log(size)
+    scene.logit_opacities[:] = torch.tensor(opacity).logit()
+    return scene
+
+
+def merged_to(count: int, scene: Gaussians, rate: float = RATE) -> Gaussians:
+    return merged(scene, torch.full((len(scene),), rate), Goal.of_count(count, scene))
+
+
+def energies(scene: Gaussians) -> torch.Tensor:
+    """Summed alpha of a scene, in px², along each axis."""
+    views = [make_camera(eye, (64, 64), 1.0) for eye in EYES]
+    return torch.stack([Renderer.of(scene, views, "classic")(view).alpha.sum() for view in views])
+
+
+@pytest.mark.parametrize(("opacity", "apart"), [(0.2, 0.1), (0.6, 0.0), (0.6, 0.3)])
+def test_a_merged_pair_alone_keeps_its_energy_from_several_directions(opacity, apart):
+    """The cut-off of alpha takes a few per cent from faint edges."""
+    scene = pair(opacity, apart)
+    one = merged_to(1, scene, rate=64.0)
+    assert len(one) == 1
+    before, after = energies(scene), energies(one)
+    assert (after.sum() / before.sum() - 1).abs() < 0.04
+    assert (after / before - 1).abs().max() < (0.04 if apart < 0.2 else 0.12)
+
+
+def test_a_merged_pair_alone_keeps_the_integral_of_its_alpha():
+    """Against a fine grid: the closed form a + b - a b, without a renderer's cut-off."""
+    scene = pair(0.7, 0.25)
+    rates = torch.full((2,), 1e4)  # training's dilation vanishes
+    clusters = seen(scene, rates)
+    both = merged_pairs(clusters[:1], clusters[1:])
+    x = torch.linspace(-2, 2, 401, dtype=torch.float64)
+    found = []
+    for plane in ((0, 1), (1, 2), (2, 0)):
+        offsets = [
+            [x - mean for x, mean in zip((x[:, None], x[None]), m[list(plane)], strict=True)]
+            for m in scene.means.double()
+        ]
+        one, other = (0.7 * torch.exp(-0.5 * (u * u + v * v) / 0.04) for u, v in offsets)
+        found.append((1 - (1 - one) * (1 - other)).sum() * 1e-4)
+    expected = both.opacities * areas(both.covs).mean()
+    torch.testing.assert_close(torch.stack(found).mean().float(), expected[0], rtol=1e-4, atol=0)
+
+
+def test_opaque_pairs_never_exceed_the_cap_and_grow_instead():
+    scene = pair(0.99, 0.6)
+    one = merged_to(1, scene)
+    assert one.opacities.item() == pytest.approx(MAX_OPACITY, abs=1e-6)
+    plain = seen(scene, torch.full((2,), RATE))
+    moments = merged_pairs(plain[:1], plain[1:])
+    assert moments.opacities.item() > 1
+    assert area(covariances(one)).item() > area(moments.covs).item() * 1.02
+
+
+@pytest.mark.parametrize("convention", [CLASSIC, ANTIALIASED, MIP])
+def test_two_equal_gaussians_of_half_the_depth_become_one(convention):
+    """Merging halves at one place gives the shape back; the dilation is taken out again."""
+    scene = replace(make_scene(1)[torch.tensor([0, 0])], convention=convention)
+    scene.logit_opacities[:] = torch.tensor(0.1).logit()
+    one = merged_to(1, scene)
+    torch.testing.assert_close(covariances(one), covariances(scene[:1]), rtol=2e-3, atol=1e-6)
+    torch.testing.assert_close(one.sh, scene[:1].sh)
+    assert 0.18 < one.opacities.item() < 0.2  # 0.2 less what they hide of each other
+
+
+def test_a_single_gaussian_is_itself_to_the_bit():
+    scene = make_scene(30)
+    found = merged_to(20, scene)
+    rows = {tuple(row) for row in torch.cat([scene.means, scene.quats, scene.log_scales], dim=1).tolist()}
+    again = [tuple(row) in rows for row in torch.cat([found.means, found.quats, found.log_scales], dim=1).tolist()]
+    assert 10 <= sum(again) < 20
+    alone = scene[:1]
+    assert merged_to(1, alone) is alone
+
+
+def test_merging_nothing_returns_the_scene():
+    scene = make_scene(40)
+    assert merged_to(40, scene) is scene
+
+
+@pytest.mark.parametrize("count", [1, 30, 119])
+def test_counts_are_met_exactly(count):
+    scene = make_scene(120)
+    assert len(merged_to(count, scene)) == count
+
+
+def test_equal_gaussians_are_merged_too():
+    """Equal costs must not leave every cluster preferring its neighbour."""
+    scene = make_scene(1)[torch.zeros(200, dtype=torch.long)]
+    clusters = seen(scene, torch.full((200,), RATE))
+    assert len(mutual_pairs(clusters, 1.0)[0]) > 30
+    assert len(merged_to(3, scene)) == 3
+
+
+def test_the_order_of_the_scene_plays_no_part():
+    scene = make_scene(300)
+    shuffled = scene[torch.randperm(300, generator=torch.Generator().manual_seed(1))]
+    first, second = (merged_to(60, s) for s in (scene, shuffled))
+    for name, column in first.columns.items():
+        assert torch.equal(column, second.columns[name]), name
+
+
+def test_the_number_of_threads_plays_no_part(sample_scene):
+    scene = sample_scene[::3]
+    found = []
+    for threads in (1, 2):
+        with torch_threads(threads):
+            found.append(merged_to(len(scene) // 4, scene, rate=200.0))
+    for name, column in found[0].columns.items():
+        assert torch.equal(column, found[1].columns[name]), name
+
+
+def test_what_is_large_stays_and_what_is_small_is_merged():
+    large, small = make_scene(50), make_scene(400, seed=1)
+    large.log_scales[:] = math.log(0.3)
+    large.sh[:, 0] += torch.linspace(-2, 2, 50)[:, None]
+    small.means[:] = 0.02 * small.means + 3
+    small.log_scales[:] = math.log(0.002)
+    scene = Gaussians(*(torch.cat([getattr(s, n) for s in (large, small)]) for n in large.columns))
+    found = merged(scene, torch.full((450,), RATE), Goal.of_level(1))
+    near = found.means.min(dim=1).values > 2
+    assert int((~near).sum()) > 45
+    assert int(near.sum()) < 40
+
+
+def test_a_lighter_scene_looks_like_the_scene(sample_scene, sample_cameras):
+    rates = rates_of(sample_scene, sample_cameras.train)
+    view = sample_cameras.test[0]
+    truth = Renderer.of(sample_scene, sample_cameras, quality="best", background="white")(view.scaled(1 / 8)).rgb
+    level = merged(sample_scene, rates, Goal.of_level(3))
+    assert len(level) < 0.5 * len(sample_scene)
+    image = Renderer.of(level, sample_cameras, background="white")(view.scaled(1 / 8)).rgb
+    assert (psnr(image, truth) or 0) > 38
+    assert [fusion.method for fusion in level.fused] == [MERGED]
+    assert not blurring(level.fused)
+
+
+def test_without_cameras_the_median_gaussian_is_a_pixel_wide():
+    scene = make_scene(101)
+    rates = rates_of(scene, ())
+    assert (scene.scales.median(dim=1).values * rates).median().item() == pytest.approx(1.0)
+
+
+def test_gaussians_that_no_camera_sees_have_the_lowest_rate():
+    scene = make_scene(20)
+    scene.means[3] = torch.tensor([0.0, -9.0, 0.0])
+    rates = rates_of(scene, [make_camera()])
+    assert rates[3] == rates[torch.arange(20) != 3].min() > 0
+
+
+def test_extreme_sizes_and_transparent_gaussians_are_merged():
+    scene = make_scene(60)
+    scene.log_scales[:20] = 29.0
+    scene.log_scales[20:40] = -29.0
+    scene.logit_opacities[::2] = -90.0
+    found = merged_to(9, scene)
+    assert len(found) == 9
+    assert all(column.isfinite().all() for column in found.columns.values())
+    clusters = seen(scene, torch.full((60,), RATE))
+    assert (costs(clusters[:-1], clusters[1:], 1.0) <= MOST_COST).all()
+
+
+def test_rotations_become_quaternions_again():
+    scene = make_scene(50, dtype=torch.float64)
+    rotations = aaplug.core.projection.rotation_matrices(scene.unit_quats)
+    again = quats_of(rotations)
+    signs = (again * scene.unit_quats).sum(dim=1)
+    torch.testing.assert_close(signs.abs(), torch.ones_like(signs))
+    torch.testing.assert_close(unpacked(packed(rotations @ rotations.mT)), torch.eye(3).double().expand(50, 3, 3))
+
+
+def test_a_projection_along_an_axis_has_the_packed_minors():
+    """`areas` are those of splats seen from far away."""
+    scene = make_scene(5, dtype=torch.float64)
+    scene.means[:] = 0
+    splats = project(scene, make_camera((0.0, -1000.0, 0.0), (64, 64)))
+    focal = make_camera(size=(64, 64)).fx
+    expected = 2 * math.pi * splats.dets.sqrt() * (1000 / focal) ** 2
+    torch.testing.assert_close(areas(covariances(scene))[:, 2], expected.double(), rtol=1e-3, atol=0)
+
+
+# The command
+
+
+def test_one_lighter_scene(cli):
+    code, out, err = cli("lod scene.ply --cameras . -o light.ply --simplify 0.2 --json")
+    assert code == 0, err
+    assert json.loads(out)["levels"] == [{"rate": pytest.approx(0.2**0.5), "gaussians": 30}]
+    found = read_scene(Path("light.ply"))
+    assert (len(found), found.convention) == (30, CLASSIC)
+    assert found.fused[0].settings == {"rate": "0.4472", "from": "150"}
+    assert cli("lod scene.ply -o counted.ply --simplify 12")[0] == 0
+    assert len(read_scene(Path("counted.ply"))) == 12
+
+
+def test_a_budget_is_kept(cli):
+    assert cli("lod scene.ply -o light.ply --budget 0.004")[0] == 0
+    rows = Path("light.ply").read_bytes().split(b"end_header\n", 1)[1]
+    assert 3800 < len(rows) <= 4000
+
+
+def test_levels_are_files_that_nest(cli):
+    code, out, err = cli("lod scene.ply --cameras . -o levels --levels 3 --json")
+    assert code == 0, err
+    files = sorted(Path("levels").iterdir())
+    assert [file.name for file in files] == [f"scene_lod{k}.ply" for k in range(4)]
+    assert files[0].read_bytes() == Path("scene.ply").read_bytes()
+    scenes = [read_scene(file) for file in files]
+    counts = [len(scene) for scene in scenes]
+    assert counts == sorted(counts, reverse=True)
+    assert [level["rate"] for level in json.loads(out)["levels"]] == [1.0, 0.5, 0.25, 0.125]
+    assert [f.settings["rate"] for f in scenes[3].fused] == ["0.5", "0.25", "0.125"]
+    assert "merge (rate=0.5" in cli("info levels/scene_lod1.ply")[1]
+
+
+REFUSED = {
+    "-o x.ply --simplify 0": "--simplify: takes 1e-06..",
+    "-o x.ply --simplify 1000": "--simplify: asks for 1,000 Gaussians, and the scene has 150",
+    "-o x.ply --simplify 0.5 --levels 2": "--levels: cannot be combined with --simplify",
+    "-o x.ply": "x.ply: levels go to a folder; for one scene, give --simplify or --budget",
+    "-o x.obj --simplify 0.5": "has no suffix of a format that can be written",
+    "-o scene.ply --simplify 0.5 --overwrite": "is also the input",
+    "-o levels --levels 99": "--levels: takes 1..12, got 99",
+}
+
+
+@pytest.mark.parametrize(("words", "said"), REFUSED.items(), ids=REFUSED)
+def test_mistakes_are_one_line(cli, words, said):
+    before = sorted(Path().iterdir())
+    code, out, err = cli(f"lod scene.ply {words}")
+    assert (code, out) == (2, "")
+    assert said in err.splitlines()[-1]
+    assert sorted(Path().iterdir()) == before
+
+
+def test_what_cannot_be_merged_is_refused(tmp_path):
+    flat = replace(make_scene(9), flat=True)
+    with pytest.raises(UsageError, match="2D Gaussians"):
+        aaplug.lod(flat, simplify=0.5)
+    with pytest.raises(UsageError, match="no Gaussians"):
+        aaplug.lod(make_scene(0), simplify=0.5)
+    away = make_scene(9)
+    away.means[:] += 1000
+    with pytest.raises(FrameError, match="different frames"):
+        aaplug.lod(away, aaplug.CameraSet((make_camera(),), (make_camera(),)), simplify=0.5)
+    (tmp_path / "scene_lod1.ply").touch()
+    with pytest.raises(OutputError, match="already holds scene_lod1"):
+        aaplug.lod(make_scene(9), output=tmp_path, levels=1)
