@@ -42,7 +42,7 @@ def test_only_long_and_large_jobs_are_told(renderer):
     assert heard.said == []
     views = [make_camera(size=(3936, 2960))] * 97
     announce([renderer], views, heard)
-    assert heard.said == ["97 images at 3936x2960: about 5 minutes, 0.4 GB; `views` picks fewer"]
+    assert heard.said == ["97 images at 3936x2960: about 5 minutes; fewer views take less"]
 
 
 def test_what_the_machine_cannot_hold_is_refused(renderer, monkeypatch):

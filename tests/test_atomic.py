@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from aaplug.core.errors import OutputError
-from aaplug.core.locks import OURS, remove_left
+from aaplug.core.locks import remove_left, remove_scratch, scratch
 from aaplug.io.atomic import check_output, claimed, output_folder, replacing
 
 OLD, NEW = b"old", b"new and longer"
@@ -194,7 +194,7 @@ def test_an_output_is_written_by_one_process_and_a_killed_one_leaves_nothing(tmp
         with pytest.raises(OutputError, match="is being written by another process"), claimed(tmp_path):
             pass
         remove_left.cache_clear()
-        remove_left(tmp_path, OURS)
+        remove_left(tmp_path)
         assert len(list(tmp_path.iterdir())) == 2  # the claim and the temporary file are held
         other.kill()
     assert len(list(tmp_path.iterdir())) == 2
@@ -202,6 +202,26 @@ def test_an_output_is_written_by_one_process_and_a_killed_one_leaves_nothing(tmp
     with claimed(tmp_path):
         write(tmp_path / "file", NEW)
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_only_what_is_surely_ours_is_removed(tmp_path: Path):
+    mine = [tmp_path / name for name in ("aaplug-notes.txt", ".aaplug-notes", "aaplug-scratch-plan.txt")]
+    for path in mine:
+        path.touch()
+    (tmp_path / "aaplug-mine").mkdir()
+    (tmp_path / "aaplug-scratch-mine").mkdir()  # without the mark
+    os.mkfifo(tmp_path / ".aaplug-0123456789abcdef")
+    left = tmp_path / "aaplug-scratch-left"
+    left.mkdir()
+    (left / "aaplug.lock").touch()
+    (tmp_path / ".aaplug-00000000000000ff.tmp").touch()
+    remove_left.cache_clear()
+    remove_scratch.cache_clear()
+    before = set(tmp_path.iterdir())
+    remove_left(tmp_path)
+    with scratch(str(tmp_path)) as folder:
+        assert folder.exists()
+    assert before - set(tmp_path.iterdir()) == {left, tmp_path / ".aaplug-00000000000000ff.tmp"}
 
 
 def test_a_folder_that_nothing_was_written_to_is_removed(tmp_path: Path):

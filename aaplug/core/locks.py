@@ -1,39 +1,42 @@
 """Locks that end with their process, and removal of what killed processes left behind.
 
-A lock is the system's own (flock) on an open file or folder.  It ends with its process, also after kill -9, so no lock
-is ever stale.  Where the system has none, nothing is refused and nothing is removed.
+A lock is the system's own (flock) on an open file.  It ends with its process, also after kill -9, so no lock is ever
+stale.  Where the system has none, nothing is refused and nothing is removed.  Only names that aaplug alone gives are
+ever removed: hidden files beside outputs, and folders of temporary files that hold a mark.
 """
 
-import importlib.util
 import os
+import re
 import shutil
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 
-OURS = ".aaplug-"  # begins the name of every temporary file beside an output
-CAN_LOCK = importlib.util.find_spec("fcntl") is not None
-SCRATCH = "aaplug-"  # begins the name of every folder of temporary files
+OURS = ".aaplug-"  # begins the name of every temporary file beside an output; 16 hex digits and a suffix follow
+OUR_FILE = re.compile(r"\.aaplug-[0-9a-f]{16}(\.\w+)?", re.ASCII)
+SCRATCH = "aaplug-scratch-"  # begins the name of every folder of temporary files
+SAFELY = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOFOLLOW", 0)  # neither waits for a pipe nor follows a link
+MARK = "aaplug.lock"  # the locked file in such a folder
 
 
-def lock(descriptor: int, wait: bool = False) -> bool:
-    """Lock an open file or folder; false if another process, or another part of this one, holds it."""
-    if not CAN_LOCK:
-        return True
-    import fcntl
-
+def lock(descriptor: int, wait: bool = False) -> bool | None:
+    """Lock an open file: true if this process holds it now, false if another does, None if nothing locks here."""
     try:
+        import fcntl
+
         fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
     except BlockingIOError:
         return False
+    except (ImportError, OSError):  # Windows, or a file system without locks
+        return None
     return True
 
 
 @contextmanager
 def new_file(path: Path) -> Iterator[None]:
-    """Make an empty file and lock it inside the block, so that `remove_left` lets it be.
+    """Make an empty file and lock it inside the block, so that nobody removes it.
 
     Raises:
         OSError: a process holds it already, or it cannot be made.
@@ -44,7 +47,7 @@ def new_file(path: Path) -> Iterator[None]:
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
         try:
             lock(descriptor, wait=True)
-            if not path.exists():  # removed before it was locked
+            if not _is_at(descriptor, path):  # removed before it was locked
                 continue
             yield
             return
@@ -54,40 +57,57 @@ def new_file(path: Path) -> Iterator[None]:
 
 @contextmanager
 def scratch(parent: str | None = None) -> Iterator[Path]:
-    """A locked folder for temporary files, removed at the end; and remove those of dead processes beside it.
+    """A folder for temporary files, removed at the end; and remove those of dead processes beside it.
 
     parent: the folder that it is in; None for the system's.
     """
-    with tempfile.TemporaryDirectory(prefix=SCRATCH, dir=parent, ignore_cleanup_errors=True) as name:
-        descriptor = os.open(name, os.O_RDONLY)
-        try:
-            lock(descriptor, wait=True)
-            remove_left(Path(name).parent, SCRATCH)
-            yield Path(name)
-        finally:
-            os.close(descriptor)
+    while True:
+        with tempfile.TemporaryDirectory(prefix=SCRATCH, dir=parent, ignore_cleanup_errors=True) as name:
+            folder = Path(name)
+            mark = os.open(folder / MARK, os.O_RDWR | os.O_CREAT, 0o600)
+            try:
+                lock(mark, wait=True)
+                if not _is_at(mark, folder / MARK):
+                    continue
+                remove_scratch(folder.parent)
+                yield folder
+                return
+            finally:
+                os.close(mark)
 
 
 @cache
-def remove_left(folder: Path, start: str) -> None:
-    """Remove the files and folders here whose names begin so and that no process holds; once for each folder."""
+def remove_left(folder: Path) -> None:
+    """Remove the temporary files of dead processes beside outputs; once for each folder."""
     with suppress(OSError):
-        for entry in _named(folder, start):
+        for path in [folder / entry.name for entry in os.scandir(folder) if OUR_FILE.fullmatch(entry.name)]:
             with suppress(OSError):  # somebody else's, or gone
-                _remove_unless_held(entry)
+                _remove_unless_held(path)
 
 
-def _named(folder: Path, start: str) -> Iterable[Path]:
-    with os.scandir(folder) as entries:
-        return [folder / entry.name for entry in entries if entry.name.startswith(start) and not entry.is_symlink()]
+@cache
+def remove_scratch(folder: Path) -> None:
+    """Remove the folders of temporary files of dead processes; once for each folder."""
+    with suppress(OSError):
+        for path in [folder / entry.name for entry in os.scandir(folder) if entry.name.startswith(SCRATCH)]:
+            with suppress(OSError):
+                if not path.is_symlink():
+                    _remove_unless_held(path / MARK, path)
 
 
-def _remove_unless_held(path: Path) -> None:
-    if not CAN_LOCK:
-        return
-    descriptor = os.open(path, os.O_RDONLY)
+def _remove_unless_held(path: Path, folder: Path | None = None) -> None:
+    """Remove a file, or the folder that it marks, if it is ordinary and no process holds it."""
+    descriptor = os.open(path, os.O_RDWR | SAFELY)
     try:
-        if lock(descriptor):
-            shutil.rmtree(path) if path.is_dir() else path.unlink()
+        if os.path.isfile(path) and lock(descriptor) and _is_at(descriptor, path):
+            path.unlink() if folder is None else shutil.rmtree(folder)
     finally:
         os.close(descriptor)
+
+
+def _is_at(descriptor: int, path: Path) -> bool:
+    """Whether the path still names the open file."""
+    try:
+        return os.path.samestat(os.fstat(descriptor), os.lstat(path))
+    except FileNotFoundError:
+        return False

@@ -125,5 +125,5 @@ def _whole_lines(stream: BinaryIO) -> list[Any]:
 
 def _lock(stream: BinaryIO, path: Path) -> None:
     """Lock the journal for this process; the system releases the lock when the process ends."""
-    if not lock(stream.fileno()):
+    if lock(stream.fileno()) is False:
         raise UsageError(str(path), "another process is writing it")

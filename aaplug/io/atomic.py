@@ -39,7 +39,7 @@ def replacing_file(path: str | PathLike[str], overwrite: bool, suffix: str = ".t
     _check_target(path, overwrite)
     target = Path(os.path.realpath(path))  # a link stays a link; its target is replaced
     temporary = target.with_name(f"{OURS}{secrets.token_hex(TOKEN_BYTES)}{suffix}")
-    remove_left(target.parent, OURS)
+    remove_left(target.parent)
     try:
         with new_file(temporary):
             yield temporary

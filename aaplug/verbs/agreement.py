@@ -82,7 +82,8 @@ def settled(opened: SceneFile, cameras: CameraSet, monitor: Monitor = SILENT) ->
     else:
         better = second.seen > first.seen + CLEARLY or (first.doubt is not None and second.doubt is None)
     chosen, fit = readings[better], (first, second)[better]
-    monitor.say(f"{opened.path.name}: {chosen.notes[-1]}, chosen by the cameras: {fit}")
+    how, _, _ = chosen.notes[-1].partition(" (")
+    monitor.say(f"{opened.path.name}: {how}, as fits the cameras: {fit}")
     return chosen
 
 

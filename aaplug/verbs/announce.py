@@ -15,11 +15,18 @@ LARGE = 4e9  # bytes from which it is
 
 
 def announce(
-    renderers: Sequence[Renderer], views: Sequence[Camera], monitor: Monitor, passes: float = 1.0, processes: int = 1
+    renderers: Sequence[Renderer],
+    views: Sequence[Camera],
+    monitor: Monitor,
+    *,
+    passes: float = 1.0,
+    processes: int = 1,
+    fewer: str = "views",
 ) -> None:
     """Say how long rendering the views will take, and with how much memory, where that is worth knowing.
 
     passes: how often each view is rendered by each renderer.  processes: that share the work.
+    fewer: what takes less time, in words.
 
     Raises:
         UsageError: it would take more memory than the limit MEMORY_SHARE of the machine's allows.
@@ -33,4 +40,5 @@ def announce(
         raise UsageError(what, f"would take {lacking}; a smaller `scale` or fewer `threads` need less")
     if seconds >= LONG or needed >= LARGE:
         minutes = f"about {seconds / 60:.0f} minutes" if seconds >= LONG else "under a minute"
-        monitor.say(f"{what}: {minutes}, {needed / 1e9:.1f} GB; `views` picks fewer")
+        memory = f", {needed / 1e9:.1f} GB" if needed >= LARGE else ""
+        monitor.say(f"{what}: {minutes}{memory}; fewer {fewer} take less")

@@ -13,7 +13,7 @@ from aaplug.evaluation.results import Report
 from aaplug.evaluation.truth import Truth, source_of
 from aaplug.io.cameras import select_views
 from aaplug.methods.recipe import Recipe
-from aaplug.verbs.inputs import CamerasLike, SceneLike, cameras_of, drawn_by, look_of, processor, recipe_of, scene_of
+from aaplug.verbs.inputs import CamerasLike, SceneLike, cameras_of, drawn_by, inputs_of, look_of, processor, recipe_of
 from aaplug.verbs.options import SCALES, RecipeOptions
 
 
@@ -49,7 +49,7 @@ def compare(
     monitor.say(f"truth: {source}")
     recipe = recipe_of(o.recipe, o)
     with processor(o.threads), monitor.progress("comparing", "views") as tell:
-        scenes = [scene_of(scene) for scene in candidates.values()]
+        scenes = [inputs_of(scene, cameras, monitor)[0] for scene in candidates.values()]
         look = look_of(scenes[0], cameras, len(chosen) * len(o.scale) * len(scenes), o, monitor)
         trained = [TrainingViews.of(scene, cameras, o.cull_margin, o.min_seen) for scene in scenes[1:]]
         looks = [look, *(replace(look, training=training) for training in trained)]

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal, get_args
 import tyro
 
 from aaplug.core.cameras import Camera, CameraSet
-from aaplug.core.digests import digest_of_cameras, digest_of_files
+from aaplug.core.digests import digest_of_cameras, digest_of_files, digest_of_scene
 from aaplug.core.errors import OutputError, UsageError, not_one_of
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.monitor import SILENT, Monitor
@@ -106,7 +106,7 @@ def evaluate(
     source = _source(o.truth, rules, seen, monitor)
     facts = _facts(scene, cameras, seen, source, o)
     images = folder and ImageStore(folder, shown, everything=o.layout == "inria")
-    with processor(o.threads), _claimed(folder):
+    with processor(o.threads), _claimed(folder, o):
         look = look_of(scene, cameras, len(seen) * len(recipes) * len(scales), o, monitor)
         candidates = candidates_of(scene, look.training, recipes, look.rasterizer, look.background)
         task = Task(candidates, scales, seen, Truth(look, source, rules), metrics)
@@ -126,12 +126,13 @@ def evaluate(
 
 
 @contextmanager
-def _claimed(folder: Path | None) -> Iterator[None]:
+def _claimed(folder: Path | None, o: EvaluateOptions) -> Iterator[None]:
     """The folder of the results, for this process alone; nothing without one."""
     if folder is None:
         yield
         return
     with output_folder(folder), claimed(folder):
+        check_results(folder, o)  # again: another process may have written there since
         yield
 
 
@@ -218,7 +219,7 @@ def _facts(
         "platform": f"{platform.system()} {platform.machine()}",
         "scene": {
             "file": origin and Path(origin.path).name,
-            "sha256": origin and digest_of_files([origin.path]),
+            "sha256": digest_of_scene(scene),
             "gaussians": len(scene),
             "convention": scene.convention.name,
             "evidence": origin and origin.evidence,

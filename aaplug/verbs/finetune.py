@@ -140,7 +140,8 @@ def finetune(
         job = TuningJob(start, cameras.train, Truth(look, source, enlarge=enlarge, memory=MEMORY), settings, written)
         how = f"{settings.name}, {settings.steps} steps, truth: {source}"
         monitor.say(f"tuning for {start.recipe.name} ({start.recipe.source}): {how}")
-        announce([start], cameras.train, monitor, GRADIENTS * settings.steps / len(cameras.train))
+        passes = GRADIENTS * settings.steps / len(cameras.train)
+        announce([start], cameras.train, monitor, passes=passes, fewer="steps")
         state = tune(job, path and _beside(path, "pt"), o.checkpoint_every, o.resume, monitor)
         tuned = recorded(state, job, viewer.convention_of(scene), {"for": viewer.name, "method": settings.name})
         if path is not None:

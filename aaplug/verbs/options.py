@@ -6,7 +6,8 @@ import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
 from functools import cache
-from typing import Annotated, Any, TypeVar, get_args, get_type_hints
+from numbers import Integral, Real
+from typing import Annotated, Any, TypeVar, cast, get_args, get_type_hints
 
 import tyro
 
@@ -59,11 +60,13 @@ def number(least: int | float, most: int | float, *, whole: bool = False, severa
 
     def fits(value: Any) -> bool:
         values = value if several else [value]
-        kinds = (int,) if whole else (int, float)
+        kinds = Integral if whole else Real  # NumPy's too
         return (
             isinstance(values, (list, tuple))
             and len(values) > 0
-            and all(isinstance(v, kinds) and not isinstance(v, bool) and least <= v <= most for v in values)
+            and all(
+                isinstance(v, kinds) and not isinstance(v, bool) and least <= cast(float, v) <= most for v in values
+            )
         )
 
     return tyro.constructors.PrimitiveConstructorSpec(

@@ -94,7 +94,7 @@ def video(
         renderers = [drawn_by(recipe, scene, look) for recipe in recipes]
         size = f"{shown[0].width}x{shown[0].height}"
         monitor.say(f"{len(shown)} frames of {size} px per pane, {fps:g} per second")
-        announce(renderers, shown, monitor, processes=workers)
+        announce(renderers, shown, monitor, processes=workers, fewer="seconds or frames per second")
         with monitor.progress("rendering", "images") as tell:
             make_video(output, renderers, shown, fps, compose, threads=workers, overwrite=o.overwrite, tell=tell)
     return Clip(Path(output), len(shown), fps)
