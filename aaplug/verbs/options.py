@@ -58,16 +58,13 @@ def number(least: int | float, most: int | float, *, whole: bool = False, severa
             raise ValueError(f"takes {shown}, got {' '.join(words)[:SHOWN]}") from error
         return values if several else values[0]
 
+    def holds(value: Any) -> bool:
+        kinds = Integral if whole else Real  # NumPy's too
+        return isinstance(value, kinds) and type(value) is not bool and least <= cast(float, value) <= most
+
     def fits(value: Any) -> bool:
         values = value if several else [value]
-        kinds = Integral if whole else Real  # NumPy's too
-        return (
-            isinstance(values, (list, tuple))
-            and len(values) > 0
-            and all(
-                isinstance(v, kinds) and not isinstance(v, bool) and least <= cast(float, v) <= most for v in values
-            )
-        )
+        return isinstance(values, (list, tuple)) and len(values) > 0 and all(map(holds, values))
 
     return tyro.constructors.PrimitiveConstructorSpec(
         "*" if several else 1,
