@@ -60,7 +60,7 @@ def number(least: int | float, most: int | float, *, whole: bool = False, severa
 
     def holds(value: Any) -> bool:
         kinds = Integral if whole else Real  # NumPy's too
-        return isinstance(value, kinds) and type(value) is not bool and least <= cast(float, value) <= most
+        return not isinstance(value, bool) and isinstance(value, kinds) and least <= cast(float, value) <= most
 
     def fits(value: Any) -> bool:
         values = value if several else [value]
