@@ -20,7 +20,7 @@ from aaplug.io.cameras import read_cameras
 from aaplug.io.scenes import SpzAxes, open_scene
 from aaplug.io.scenes.scene_file import SceneFile
 from aaplug.methods.viewers import describe
-from aaplug.verbs.agreement import settled
+from aaplug.verbs.inputs import inputs_of
 from aaplug.verbs.options import SCALE, UNSET, Options, flag, number
 
 from .console import TERMINAL, say
@@ -137,8 +137,7 @@ def one_line(program: str) -> Iterator[None]:
 
 def read_inputs(scene: SceneOptions, cameras: CameraOptions) -> tuple[Gaussians, CameraSet]:
     """Read a scene and its cameras, and say what they are."""
-    opened, known = scene.open(), cameras.read(scene)
-    return settled(opened, known, TERMINAL).whole(scene.drop_bad), known
+    return inputs_of(scene.open(), cameras.read(scene), TERMINAL, scene.drop_bad)
 
 
 def option_types(noun: type) -> dict[str, Any]:

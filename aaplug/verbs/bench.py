@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from itertools import product
 from typing import Annotated, Any, NamedTuple
 
-from aaplug.core.cameras import Camera
+from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.errors import UsageError, not_one_of
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.kernels import EAGER, Kernels
@@ -13,7 +13,7 @@ from aaplug.core.monitor import SILENT, Monitor
 from aaplug.io.limits import lack_of_memory
 from aaplug.rasterizers.tiled.ahead_of_time import build, load
 from aaplug.rendering.benchmark import Figures, exponent, measure, synthetic_camera, synthetic_scene
-from aaplug.verbs.inputs import CamerasLike, SceneLike, cameras_of, processor, scene_of
+from aaplug.verbs.inputs import CamerasLike, SceneLike, inputs_of, processor
 from aaplug.verbs.options import THREADS, UNSET, Options, choice, flag, number
 from aaplug.verbs.views import size_of
 
@@ -61,7 +61,7 @@ def bench(
     o = BenchOptions.of(options)
     runs: list[Figures] = []
     with processor(o.threads):
-        work = _synthetic(o) if scene is None else [(scene_of(scene), cameras_of(cameras, scene).train[0])]
+        work = _synthetic(o) if scene is None else [_first_view(*inputs_of(scene, cameras, monitor))]
         kernels = _kernels(o.rasterizer, monitor)
         for (shown, camera), each in product(work, kernels):
             run = measure(shown, camera, each, o.repeats, not o.forward_only)
@@ -69,6 +69,10 @@ def bench(
             monitor.say(f"{shape}, {run.rasterizer}: {run.forward_ms:.0f} ms")
             runs.append(run)
     return Bench(runs, _exponents(runs))
+
+
+def _first_view(scene: Gaussians, cameras: CameraSet) -> tuple[Gaussians, Camera]:
+    return scene, cameras.train[0]
 
 
 def _kernels(rasterizer: str, monitor: Monitor) -> list[Kernels]:

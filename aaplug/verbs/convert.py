@@ -19,9 +19,18 @@ from aaplug.io.cameras import select_views
 from aaplug.io.scenes import SpzAxes, check_scene_output, write_parts, write_scene
 from aaplug.io.scenes.scene_file import SceneFile
 from aaplug.methods.viewers import FORMS, MATCHED_ENERGY, MIP_VIEWER, VIEWERS, Form, Viewer, blurring, fuse
-from aaplug.verbs.agreement import settled
 from aaplug.verbs.in_parts import LARGE, convert_parts
-from aaplug.verbs.inputs import AnyPath, CamerasLike, SceneLike, cameras_of, look_of, opened_of, processor, sources_of
+from aaplug.verbs.inputs import (
+    AnyPath,
+    CamerasLike,
+    SceneLike,
+    cameras_of,
+    look_of,
+    opened_with,
+    processor,
+    sources_of,
+    whole_of,
+)
 from aaplug.verbs.options import STEPS, UNSET, ViewOptions, flag, number
 
 
@@ -100,9 +109,7 @@ def convert(
     """
     o = ConvertOptions.of(options)
     chosen, path = o.chosen(), None if output is None else Path(output)
-    opened = scene if isinstance(scene, Gaussians) else opened_of(scene)
-    if cameras is not None and isinstance(opened, SceneFile):
-        opened = settled(opened, cameras_of(cameras, opened), monitor)
+    opened = opened_with(scene, None if cameras is None else cameras_of(cameras, scene), monitor)
     if path is not None:
         check_scene_output(path, o.overwrite, sources_of(opened))
     writing = {"overwrite": o.overwrite, "spz_axes": spz_axes}
@@ -113,7 +120,7 @@ def convert(
                 parts = convert_parts(opened, train, chosen, drop_bad, tell, threads=workers)
                 write_parts(path, parts, opened.count, **writing)
             return Converted(None, MIP_VIEWER)
-        whole = opened.whole(drop_bad) if isinstance(opened, SceneFile) else opened
+        whole = whole_of(opened, drop_bad)
         if isinstance(chosen, Form):
             found = Converted(_fused(whole, cameras, chosen, o.min_seen), MIP_VIEWER)
         else:

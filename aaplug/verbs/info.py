@@ -11,7 +11,6 @@ from aaplug.inspection.survey import Survey, check_frame_of, survey
 from aaplug.io.scenes.ply import Document
 from aaplug.io.scenes.scene_file import SceneFile
 from aaplug.methods.viewers import describe
-from aaplug.verbs.agreement import settled
 from aaplug.verbs.inputs import AnyPath, CamerasLike, cameras_of, opened_of
 from aaplug.verbs.options import FrameOptions
 
@@ -40,14 +39,14 @@ def info(
         AaplugError: a file cannot be read, or the cameras see little of the scene.
     """
     o = FrameOptions.of(options)
-    opened = opened_of(scene)
-    if cameras is not None:
-        cameras = cameras_of(cameras, opened)
-        opened = settled(opened, cameras, monitor)
-        check_frame_of(opened, cameras.train, o.min_seen)
+    known = None if cameras is None else cameras_of(cameras, scene)
+    train = () if known is None else known.train
+    opened = opened_of(scene, known, monitor)
+    if known is not None:
+        check_frame_of(opened, train, o.min_seen)
     with monitor.progress("reading", "Gaussians") as tell:
-        found = survey(opened, () if cameras is None else cameras.train, tell)
-    sampling = {} if cameras is None else _sampling_facts(found, cameras, opened.convention.kernel)
+        found = survey(opened, train, tell)
+    sampling = {} if known is None else _sampling_facts(found, known, opened.convention.kernel)
     return _scene_facts(opened, found) | sampling | {"problems": list(_problems(opened, found))}
 
 

@@ -16,7 +16,7 @@ from aaplug.core.interfaces import MatchesRates, TakesMemory
 from aaplug.core.monitor import Monitor
 from aaplug.core.training import TrainingViews
 from aaplug.io.cameras import read_cameras
-from aaplug.io.scenes import MODEL_SCENE, open_scene, ply, read_scene
+from aaplug.io.scenes import MODEL_SCENE, open_scene, ply
 from aaplug.io.scenes.harmonics import without_harmonics
 from aaplug.io.scenes.scene_file import SceneFile
 from aaplug.methods.recipe import Recipe
@@ -34,14 +34,20 @@ CamerasLike = CameraSet | AnyPath | None
 HELD_HARMONICS = 2 * 10**9  # bytes: reading more for each view costs less than holding them; 10 M Gaussians of degree 3
 
 
-def scene_of(scene: SceneLike) -> Gaussians:
-    """The scene itself, or the one in a file or model folder."""
-    return scene if isinstance(scene, Gaussians) else read_scene(scene)
+def opened_of(scene: SceneFile | AnyPath, cameras: CameraSet | None, monitor: Monitor) -> SceneFile:
+    """The scene's file, opened or in a model folder, by the reading that fits the cameras, if there are any."""
+    opened = scene if isinstance(scene, SceneFile) else open_scene(scene)
+    return opened if cameras is None else settled(opened, cameras, monitor)
 
 
-def opened_of(scene: SceneFile | AnyPath) -> SceneFile:
-    """The scene's file, opened or in a model folder."""
-    return scene if isinstance(scene, SceneFile) else open_scene(scene)
+def opened_with(scene: SceneLike | SceneFile, cameras: CameraSet | None, monitor: Monitor) -> Gaussians | SceneFile:
+    """The scene itself, or its opened file; see `opened_of`."""
+    return scene if isinstance(scene, Gaussians) else opened_of(scene, cameras, monitor)
+
+
+def whole_of(scene: Gaussians | SceneFile, drop_bad: bool = False) -> Gaussians:
+    """The scene itself, or all of its file."""
+    return scene if isinstance(scene, Gaussians) else scene.whole(drop_bad)
 
 
 def sources_of(scene: Gaussians | SceneFile) -> list[Path]:
@@ -53,11 +59,9 @@ def sources_of(scene: Gaussians | SceneFile) -> list[Path]:
 
 def drawable(scene: Gaussians | SceneFile, drop_bad: bool = False) -> tuple[Gaussians, Harmonics | None]:
     """The scene, and what reads its harmonics if they are large and stay in the file; only a .ply is read by rows."""
-    if isinstance(scene, Gaussians):
-        return scene, None
-    if scene.format == ply.name and scene.harmonics_bytes > HELD_HARMONICS:
+    if isinstance(scene, SceneFile) and scene.format == ply.name and scene.harmonics_bytes > HELD_HARMONICS:
         return without_harmonics(scene, drop_bad)
-    return scene.whole(drop_bad), None
+    return whole_of(scene, drop_bad), None
 
 
 def cameras_of(cameras: CamerasLike, scene: SceneLike | SceneFile) -> CameraSet:
@@ -80,9 +84,7 @@ def inputs_of(
 ) -> tuple[Gaussians, CameraSet]:
     """The scene and its cameras; the cameras are read first, as they are small."""
     known = cameras_of(cameras, scene)
-    if isinstance(scene, Gaussians):
-        return scene, known
-    return settled(opened_of(scene), known, monitor).whole(drop_bad), known
+    return whole_of(opened_with(scene, known, monitor), drop_bad), known
 
 
 def recipe_of(recipe: str | Recipe, o: RecipeOptions) -> Recipe:

@@ -13,18 +13,25 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.core.monitor import SILENT, Monitor
 from aaplug.core.sampling import check_frame
 from aaplug.io.atomic import output_folder, refuse_existing
-from aaplug.io.scenes import SpzAxes, check_scene_output, write_scene
-from aaplug.io.scenes.scene_file import SceneFile, matrix_of
+from aaplug.io.scenes import SpzAxes, check_scene_output, write_scene, written_format
+from aaplug.io.scenes.scene_file import FLOAT, SceneFile, matrix_of
 from aaplug.levels.merging import Goal, merged
 from aaplug.levels.rates import rates_of
-from aaplug.verbs.inputs import AnyPath, CamerasLike, SceneLike, cameras_of, opened_of, processor, sources_of
+from aaplug.verbs.inputs import (
+    AnyPath,
+    CamerasLike,
+    SceneLike,
+    cameras_of,
+    opened_with,
+    processor,
+    sources_of,
+    whole_of,
+)
 from aaplug.verbs.options import THREADS, UNSET, FrameOptions, number
 
 LEVELS = 4  # as many as usual: down to 1/16 of the training size
 MEGABYTE = 1e6
-FLOAT_BYTES = 4
 NORMALS = 3  # columns that a .ply has beside a Gaussian's parameters
-WRITTEN = (".ply", ".spz", ".splat")  # suffixes that name a scene's file, not a folder
 
 
 @dataclass(frozen=True)
@@ -73,7 +80,7 @@ class LodOptions(FrameOptions):
         if not self.single:
             return [Goal.of_level(level) for level in range(1, (self.levels or LEVELS) + 1)]
         if self.budget is not None:
-            each = FLOAT_BYTES * (len(matrix_of(scene[:0])[0]) + NORMALS)
+            each = FLOAT * (len(matrix_of(scene[:0])[0]) + NORMALS)
             count = min(len(scene), int(self.budget * MEGABYTE / each))
         else:
             assert self.simplify is not None
@@ -90,7 +97,7 @@ def lod(
     output: AnyPath | None = None,
     *,
     drop_bad: bool = False,
-    spz_axes: SpzAxes = "opengl",
+    spz_axes: SpzAxes = "auto",
     monitor: Monitor = SILENT,
     **options: Any,
 ) -> list[Level]:
@@ -114,10 +121,11 @@ def lod(
         AaplugError: as `render`; also, the scene holds 2D Gaussians or none at all.
     """
     o = LodOptions.of(options)
-    train = () if cameras is None else cameras_of(cameras, str(cameras)).train
-    opened = scene if isinstance(scene, Gaussians) else opened_of(scene)
+    known = None if cameras is None else cameras_of(cameras, scene)
+    train = () if known is None else known.train
+    opened = opened_with(scene, known, monitor)
     files = _files(None if output is None else Path(output), opened, o)
-    whole = opened.whole(drop_bad) if isinstance(opened, SceneFile) else opened
+    whole = whole_of(opened, drop_bad)
     if not len(whole):
         raise UsageError(whole.name, "has no Gaussians to merge")
     if train:
@@ -140,7 +148,7 @@ def _files(output: Path | None, scene: Gaussians | SceneFile, o: LodOptions) -> 
     if o.single:
         check_scene_output(output, o.overwrite, sources)
         return [output]
-    if output.suffix in WRITTEN:
+    if written_format(output):
         raise OutputError(output, "levels go to a folder; for one scene, give `simplify` or `budget`")
     stem = sources[0].stem if sources else "scene"
     files = [output / f"{stem}_lod{level}.ply" for level in range((o.levels or LEVELS) + 1)]

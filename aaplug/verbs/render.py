@@ -7,7 +7,6 @@ from typing import Any, Literal, NamedTuple
 
 from aaplug.core.cameras import Camera
 from aaplug.core.errors import listing
-from aaplug.core.gaussians import Gaussians
 from aaplug.core.monitor import SILENT, Monitor
 from aaplug.io.atomic import output_folder
 from aaplug.io.cameras import select_views
@@ -15,7 +14,6 @@ from aaplug.io.scenes.scene_file import SceneFile
 from aaplug.methods.recipes import find_recipe
 from aaplug.rendering.frames import write_frames
 from aaplug.rendering.renderer import Renderer
-from aaplug.verbs.agreement import settled
 from aaplug.verbs.announce import announce
 from aaplug.verbs.inputs import (
     AnyPath,
@@ -25,7 +23,7 @@ from aaplug.verbs.inputs import (
     drawable,
     drawn_by,
     look_of,
-    opened_of,
+    opened_with,
     processor,
 )
 from aaplug.verbs.options import ImageOptions, RecipeOptions
@@ -77,8 +75,7 @@ def render(
     cameras = cameras_of(cameras, scene)
     shown = resized(select_views(cameras, o.views), o.scale, o.resolution)
     paths = image_paths(Path(output), shown, o.overwrite)
-    opened = scene if isinstance(scene, Gaussians) else settled(opened_of(scene), cameras, monitor)
-    scene, harmonics = drawable(opened, drop_bad)
+    scene, harmonics = drawable(opened_with(scene, cameras, monitor), drop_bad)
     with processor(o.threads) as workers:
         renderer = drawn_by(recipe, scene, look_of(scene, cameras, len(shown), o, monitor))
         renderer = replace(renderer, harmonics=harmonics)

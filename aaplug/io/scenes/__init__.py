@@ -162,6 +162,14 @@ def write_parts(
     writer.write(Path(path), parts, count, overwrite, Options(spz_axes=spz_axes))
 
 
+def written_format(path: str | PathLike[str]) -> WritableFormat | None:
+    """The format that writes files of this suffix; None if none does."""
+    name = Path(path).name.lower()
+    named = [format for format in SCENE_FORMATS.values() if name.endswith("." + format.name)]
+    found = max(named, key=lambda format: len(format.name), default=None)
+    return found if isinstance(found, WritableFormat) else None
+
+
 def check_scene_output(
     path: str | PathLike[str], overwrite: bool, inputs: Iterable[str | PathLike[str]] = ()
 ) -> WritableFormat:
@@ -169,12 +177,9 @@ def check_scene_output(
 
     Errors: see `write_scene`.
     """
-    name = Path(path).name.lower()
-    suffixes = {"." + format.name: format for format in SCENE_FORMATS.values()}
-    found = max(filter(name.endswith, suffixes), key=len, default=None)
-    writer = suffixes[found] if found else None
-    if not isinstance(writer, WritableFormat):
-        known = [s for s, format in suffixes.items() if isinstance(format, WritableFormat)]
+    writer = written_format(path)
+    if writer is None:
+        known = [f".{format.name}" for format in SCENE_FORMATS.values() if isinstance(format, WritableFormat)]
         raise OutputError(path, f"has no suffix of a format that can be written: {', '.join(known)}")
     if writer.needs is not None and importlib.util.find_spec(writer.needs) is None:
         raise UsageError(str(path), f"writing .{writer.name} needs {writer.needs}: pip install 'aaplug[{writer.name}]'")
