@@ -15,12 +15,12 @@ import tyro
 
 from aaplug.core.cameras import CameraSet
 from aaplug.core.errors import UsageError, not_one_of
-from aaplug.core.gaussians import CONVENTIONS, Gaussians
+from aaplug.core.gaussians import CONVENTIONS
 from aaplug.io.cameras import read_cameras
 from aaplug.io.scenes import SpzAxes, open_scene
 from aaplug.io.scenes.scene_file import SceneFile
 from aaplug.methods.viewers import describe
-from aaplug.verbs.inputs import inputs_of
+from aaplug.verbs.inputs import Held, inputs_of
 from aaplug.verbs.options import SCALE, UNSET, Options, flag, number
 
 from .console import TERMINAL, say
@@ -135,7 +135,7 @@ def one_line(program: str) -> Iterator[None]:
         raise UsageError(program, f"{said}; see `{program} --help`") from end
 
 
-def read_inputs(scene: SceneOptions, cameras: CameraOptions) -> tuple[Gaussians, CameraSet]:
+def read_inputs(scene: SceneOptions, cameras: CameraOptions) -> tuple[Held, CameraSet]:
     """Read a scene and its cameras, and say what they are."""
     return inputs_of(scene.open(), cameras.read(scene), TERMINAL, scene.drop_bad)
 

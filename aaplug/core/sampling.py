@@ -39,6 +39,10 @@ class SamplingBounds:
     nearest: Float[Tensor, " n"]
     views: Int[Tensor, " n"]
 
+    def __getitem__(self, index: Tensor | slice) -> "SamplingBounds":
+        """The bounds of the Gaussians at `index`."""
+        return SamplingBounds(*(column[index] for column in vars(self).values()))
+
     @property
     def seen(self) -> Bool[Tensor, " n"]:
         """Whether any camera sees the Gaussian."""

@@ -22,6 +22,7 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.core.imaging import quantised
 from aaplug.core.interfaces import Rasterizer, WorldFilter
 from aaplug.core.monitor import Tell
+from aaplug.core.pyramids import Pyramid
 from aaplug.core.training import TrainingViews
 from aaplug.evaluation.image_store import ImageStore
 from aaplug.evaluation.journal import Journal
@@ -48,19 +49,20 @@ class Candidate:
 
 
 def candidates_of(
-    scene: Gaussians,
+    scene: Gaussians | Pyramid,
     training: TrainingViews,
     recipes: Sequence[Recipe],
     rasterizer: str | Rasterizer = "auto",
     background: Background = "auto",
 ) -> list[Candidate]:
     """One scene by several recipes; those with the same world filter share the filtered scene."""
-    prepared: dict[WorldFilter | None, Renderer] = {}
-    found = []
-    for recipe in (suited(recipe, scene) for recipe in recipes):
-        if recipe.world not in prepared:
-            prepared[recipe.world] = Renderer.of(scene, training, recipe, rasterizer=rasterizer, background=background)
-        found.append(Candidate(recipe.name, replace(prepared[recipe.world], recipe=recipe)))
+    prepared: dict[tuple[WorldFilter | None, bool], Renderer] = {}
+    found, finest = [], scene.finest if isinstance(scene, Pyramid) else scene
+    for recipe in (suited(recipe, finest) for recipe in recipes):
+        key = recipe.world, recipe.levels_grid > 0
+        if key not in prepared:
+            prepared[key] = Renderer.of(scene, training, recipe, rasterizer=rasterizer, background=background)
+        found.append(Candidate(recipe.name, replace(prepared[key], recipe=recipe)))
     return found
 
 

@@ -45,6 +45,7 @@ class Clusters:
     weights: summed opacity times projected area of the Gaussians, in squared world units.
     colours: weighted mean, without view dependence.
     rates: training's sampling rate, px per world unit.
+    chunks: the chunk of each; clusters of different ones are not merged.
     labels: the cluster of each Gaussian of the scene.
     """
 
@@ -54,6 +55,7 @@ class Clusters:
     weights: Float[Tensor, " n"]
     colours: Float[Tensor, "n 3"]
     rates: Float[Tensor, " n"]
+    chunks: Int[Tensor, " n"]
     labels: Int[Tensor, " m"]
 
     def __len__(self) -> int:
@@ -75,8 +77,11 @@ class Clusters:
         return replace(self, covs=self.covs * excess[:, None], opacities=self.opacities / excess)
 
 
-def seen(scene: Gaussians, rates: Float[Tensor, " n"]) -> Clusters:
-    """Every Gaussian as a cluster of its own."""
+def seen(scene: Gaussians, rates: Float[Tensor, " n"], chunks: Int[Tensor, " n"] | None = None) -> Clusters:
+    """Every Gaussian as a cluster of its own.
+
+    chunks: see `Clusters`; None for one of all.
+    """
     largest = (LARGEST / rates).log()[:, None].to(scene.log_scales)
     raw = covariances(replace(scene, log_scales=scene.log_scales.minimum(largest)))
     covs = blurred(raw, scene.convention.kernel / rates.square())
@@ -85,7 +90,9 @@ def seen(scene: Gaussians, rates: Float[Tensor, " n"]) -> Clusters:
         opacities = opacities * area(raw) / area(covs)
     weights = opacities.clamp(min=MIN_OPACITY) * area(covs)
     colours = COLOUR_OFFSET + SH_C0 * scene.sh[:, 0]
-    return Clusters(scene.means.double(), covs, opacities, weights, colours, rates, torch.arange(len(scene)))
+    own = torch.arange(len(scene))
+    chunks = torch.zeros_like(own) if chunks is None else chunks
+    return Clusters(scene.means.double(), covs, opacities, weights, colours, rates, chunks, own)
 
 
 def merged_pairs(a: Clusters, b: Clusters) -> Clusters:

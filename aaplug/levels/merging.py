@@ -5,24 +5,30 @@ the scene's order nor on the number of threads.
 """
 
 import math
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from aaplug.core.errors import UsageError
-from aaplug.core.gaussians import Fusion, Gaussians
+from aaplug.core.gaussians import Fusion, Gaussians, joined
 from aaplug.core.monitor import Tell
 from aaplug.levels.clusters import Clusters, alone, merged_pairs, seen
 from aaplug.levels.covariances import areas, blurred, covariances
-from aaplug.levels.pairing import curve, mutual_pairs
+from aaplug.levels.pairing import Edges, curve, edges_below, matched
 from aaplug.methods.filters import PIXEL_VARIANCE, fuse_stored
 from aaplug.methods.viewers import MERGED
 
-AT_ONCE = 0.08  # of the clusters merged in a round at most, so that a bad pair does not go before a better one
-ENOUGH = 0.002  # of the clusters: a round that would merge fewer is the last
+ENOUGH = 0.02  # of the clusters: after a round that merges fewer, more is allowed to change
 TOLERANCE = 1e-4  # px² of the level: squared change of the image, from 0 to 1, by one pair
+FIRST_SHARE = 0.01  # of the tolerance in the first rounds, so that a bad pair does not go before a better one
+FIRST, LAST = 1e-7, 1e3  # px²: tolerances of the first rounds and of the last but one, where a count is asked for
+STEP = 10.0  # from one tolerance to the next
+BATCH = 1 << 17  # Gaussians merged at once where chunks are kept apart: some 300 MB
 
 
 @dataclass(frozen=True)
@@ -43,10 +49,26 @@ class Goal:
         """So many Gaussians: a quarter of them is meant for half the size, as on a surface."""
         return cls(min(1.0, math.sqrt(count / max(1, len(scene)))), count)
 
+    @property
+    def tolerances(self) -> Iterator[float]:
+        """What a pair may change in the rounds, one after another."""
+        now, last = (FIRST_SHARE * self.tolerance, self.tolerance) if self.count is None else (FIRST, LAST)
+        while now < last:
+            yield now
+            now *= STEP
+        yield self.tolerance
+
     @classmethod
     def of_level(cls, level: int) -> "Goal":
         """Level k of a pyramid, for half the size of the level before."""
         return cls(0.5**level, tolerance=TOLERANCE)
+
+
+class Merged(NamedTuple):
+    """A lighter scene, and the chunk of each of its Gaussians, ascending."""
+
+    scene: Gaussians
+    chunks: Int[Tensor, " n"]
 
 
 def merged(
@@ -59,49 +81,90 @@ def merged(
     Raises:
         UsageError: the scene holds 2D Gaussians.
     """
+    if len(scene) <= (goal.count or 1) and not scene.flat:
+        return scene
+    return merged_in_chunks(scene, rates, torch.zeros(len(scene), dtype=torch.int64), goal, tell).scene
+
+
+def merged_in_chunks(
+    scene: Gaussians,
+    rates: Float[Tensor, " n"],
+    chunks: Int[Tensor, " n"],
+    goal: Goal,
+    tell: Tell = lambda done, total: None,
+) -> Merged:
+    """A lighter scene in which no Gaussian stands for those of different chunks; see `merged`."""
     if scene.flat:
         raise UsageError(scene.name, "holds 2D Gaussians, which cannot be merged")
-    if len(scene) <= (goal.count or 1):
-        return scene
     scene = fuse_stored(scene)
-    order = _order(scene)
-    scene, rates = scene[order], rates[order]
-    own = seen(scene, rates)
+    order = _order(scene, chunks)
+    parts: list[Merged] = []
+    for start, stop in _batches(chunks[order]):
+        own, said = order[start:stop], partial(_told, tell, start, len(scene) - (goal.count or 0))
+        parts.append(_merged_batch(scene[own], rates[own], chunks[own], goal, said))
+    found = replace(joined([part.scene for part in parts]), origin=None)
+    record = Fusion(MERGED, {"rate": f"{goal.rate:.4g}", "from": str(len(scene))})
+    return Merged(replace(found, fused=(*scene.fused, record)), torch.cat([part.chunks for part in parts]))
+
+
+def _told(tell: Tell, start: int, total: int, done: int) -> None:
+    tell(min(start + done, total), total)
+
+
+def _batches(chunks: Int[Tensor, " n"]) -> Iterator[tuple[int, int]]:
+    """Start and end of runs of whole chunks, of about `BATCH` Gaussians."""
+    start = 0
+    while start < len(chunks):
+        last = chunks[min(start + BATCH, len(chunks)) - 1]
+        stop = int(torch.searchsorted(chunks, last, right=True))
+        yield start, stop
+        start = stop
+
+
+def _merged_batch(
+    scene: Gaussians, rates: Float[Tensor, " n"], chunks: Int[Tensor, " n"], goal: Goal, tell: Callable[[int], None]
+) -> Merged:
+    own = seen(scene, rates, chunks)
     clusters = _rounds(own, goal, tell)
-    found = alone(clusters, scene, own.weights)
+    found, places = alone(clusters, scene, own.weights), clusters.chunks
     if goal.count is None:
-        found = found[~_hidden(found, clusters, goal.rate)]
-    settings = {"rate": f"{goal.rate:.4g}", "from": str(len(scene))}
-    return replace(found, fused=(*scene.fused, Fusion(MERGED, settings)))
+        shown = (~_hidden(found, clusters, goal.rate)).nonzero()[:, 0]
+        found, places = found[shown], places[shown]
+    tell(len(scene))
+    return Merged(found, places)
 
 
-def _order(scene: Gaussians) -> Int[Tensor, " n"]:
-    """Along a curve; Gaussians at one place by their other parameters, so that the scene's own order plays no part."""
+def _order(scene: Gaussians, chunks: Int[Tensor, " n"]) -> Int[Tensor, " n"]:
+    """By chunk, in each along a curve; Gaussians at one place by their other parameters.
+
+    So the scene's own order plays no part.
+    """
     order = torch.arange(len(scene))
     shape = [scene.logit_opacities, *scene.log_scales.unbind(dim=1), *scene.sh[:, 0].unbind(dim=1)]
-    for key in (*shape, *scene.means.unbind(dim=1), curve(scene.means.double())):
+    for key in (*shape, *scene.means.unbind(dim=1), curve(scene.means.double()), chunks):
         order = order[torch.argsort(key[order], stable=True)]
     return order
 
 
-def _rounds(clusters: Clusters, goal: Goal, tell: Tell) -> Clusters:
+def _rounds(clusters: Clusters, goal: Goal, tell: Callable[[int], None]) -> Clusters:
     first, least = len(clusters), goal.count or 1
-    while len(clusters) > least:
-        pairs, cost = mutual_pairs(clusters, goal.rate)
-        most = min(len(clusters) - least, max(1, int(AT_ONCE * len(clusters))))
-        cheapest = torch.argsort(cost, stable=True)[:most]
-        pairs = pairs[cheapest[cost[cheapest] <= goal.tolerance]]
-        if not len(pairs) or (goal.count is None and len(pairs) < ENOUGH * len(clusters)):
-            break
-        clusters = _joined(clusters, pairs)
-        tell(first - len(clusters), first - least)
-    tell(first - least, first - least)
+    for tolerance in goal.tolerances:
+        enough = 0.0 if tolerance == math.inf else ENOUGH
+        while len(clusters) > least:
+            pairs = matched(edges_below(clusters, goal.rate, tolerance), len(clusters))
+            pairs = pairs[torch.argsort(pairs.cost, stable=True)[: len(clusters) - least]]
+            few = len(pairs) <= enough * len(clusters)
+            if len(pairs):
+                clusters = _joined(clusters, pairs)
+                tell(first - len(clusters))
+            if few:
+                break
     return clusters
 
 
-def _joined(clusters: Clusters, pairs: Int[Tensor, "p 2"]) -> Clusters:
+def _joined(clusters: Clusters, pairs: Edges) -> Clusters:
     """The clusters after these pairs are merged, in the order of their first ones."""
-    one, other = pairs.unbind(dim=1)
+    one, other = pairs.one, pairs.other
     changed = {name: column.clone() for name, column in clusters.columns.items()}
     for name, values in merged_pairs(clusters[one], clusters[other]).columns.items():
         changed[name][one] = values

@@ -6,6 +6,9 @@ sum of overlaps in closed form.  It is large for clusters that lie apart by more
 cross, and so keeps what is large as it is.  Occlusion plays no part.
 """
 
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -37,32 +40,76 @@ def curve(means: Float[Tensor, "n 3"], shift: float = 0.0) -> Int[Tensor, " n"]:
     return cells[:, 0] | cells[:, 1] << 1 | cells[:, 2] << 2
 
 
-def mutual_pairs(clusters: Clusters, rate: float) -> tuple[Int[Tensor, "p 2"], Float[Tensor, " p"]]:
-    """The pairs that are each other's cheapest, and what merging them costs, in px² of the level at `rate`."""
-    best = torch.full((len(clusters),), torch.inf)
-    mates = torch.arange(len(clusters))
+@dataclass(frozen=True)
+class Edges:
+    """Pairs of clusters and what merging each costs, in px² of the level.  e: pairs."""
+
+    one: Int[Tensor, " e"]
+    other: Int[Tensor, " e"]
+    cost: Float[Tensor, " e"]
+
+    def __len__(self) -> int:
+        return len(self.cost)
+
+    def __getitem__(self, index: Tensor) -> "Edges":
+        """The pairs at `index`."""
+        return Edges(self.one[index], self.other[index], self.cost[index])
+
+    def least(self, values: Tensor, count: int) -> Tensor:
+        """Lowest value of the pairs that a cluster is in, for each of `count` clusters."""
+        highest = torch.inf if values.is_floating_point() else torch.iinfo(values.dtype).max
+        found = torch.full((count,), highest, dtype=values.dtype)
+        for ends in (self.one, self.other):
+            found.scatter_reduce_(0, ends, values, "amin")
+        return found
+
+    def lowest(self, values: Tensor, count: int) -> "Edges":
+        """The pairs whose value is the lowest of all that either cluster is in."""
+        least = self.least(values, count)
+        return self[((values == least[self.one]) & (values == least[self.other])).nonzero()[:, 0]]
+
+
+def all_of(parts: Sequence[Edges]) -> Edges:
+    """The pairs of several parts, at least one."""
+    return Edges(*(torch.cat([getattr(part, name) for part in parts]) for name in ("one", "other", "cost")))
+
+
+def matched(edges: Edges, count: int) -> Edges:
+    """Pairs out of these in which no cluster occurs twice: cheaper ones first (locally dominant edges, Preis 1999).
+
+    count: of the clusters.
+    """
+    kept = []
+    while len(edges):
+        cheapest = edges.lowest(edges.cost, count)
+        kept.append(cheapest.lowest(torch.arange(len(cheapest)), count))  # of equal costs the first
+        free = torch.ones(count, dtype=torch.bool)
+        free[kept[-1].one] = free[kept[-1].other] = False
+        edges = edges[(free[edges.one] & free[edges.other]).nonzero()[:, 0]]
+    return all_of(kept) if kept else edges
+
+
+def edges_below(clusters: Clusters, rate: float, tolerance: float) -> Edges:
+    """Neighbours in the same chunk whose merging costs at most `tolerance`, in px² of the level at `rate`."""
+    found = [Edges(clusters.labels[:0], clusters.labels[:0], clusters.opacities[:0])]
     for shift in SHIFTS:
         order = torch.argsort(curve(clusters.means, shift), stable=True)
         along = clusters[order]
         for start in range(0, len(order), CHUNK):
-            _compare(along[start : start + CHUNK + WINDOW], order[start : start + CHUNK + WINDOW], rate, best, mates)
-    mutual = (mates[mates] == torch.arange(len(mates))) & (mates > torch.arange(len(mates)))
-    first = mutual.nonzero()[:, 0]
-    return torch.stack([first, mates[first]], dim=1), best[first]
+            part = slice(start, start + CHUNK + WINDOW)
+            found.extend(_compared(along[part], order[part], rate, tolerance))
+    return all_of(found)
 
 
-def _compare(
-    along: Clusters, places: Int[Tensor, " c"], rate: float, best: Float[Tensor, " n"], mates: Int[Tensor, " n"]
-) -> None:
-    """Compare each cluster of a part of the curve with those after it, and note the cheapest of each in place."""
+def _compared(along: Clusters, places: Int[Tensor, " c"], rate: float, tolerance: float) -> Iterator[Edges]:
+    """Each cluster of a part of the curve with those after it."""
     for step in range(1, min(WINDOW, len(along) - 1) + 1):
-        cost = costs(along[:-step], along[step:], rate)
-        a, b = places[:-step], places[step:]
-        cost = cost * (1 + JITTER * _noise(torch.minimum(a, b), torch.maximum(a, b)))
-        for one, other in ((a, b), (b, a)):
-            cheaper = (cost < best[one]).nonzero()[:, 0]
-            best[one[cheaper]] = cost[cheaper]
-            mates[one[cheaper]] = other[cheaper]
+        one, other = along[:-step], along[step:]
+        cost = costs(one, other, rate)
+        near = ((cost <= tolerance) & (one.chunks == other.chunks)).nonzero()[:, 0]
+        a, b = places[:-step][near], places[step:][near]
+        a, b = torch.minimum(a, b), torch.maximum(a, b)
+        yield Edges(a, b, cost[near] * (1 + JITTER * _noise(a, b)))
 
 
 def costs(a: Clusters, b: Clusters, rate: float) -> Float[Tensor, " p"]:

@@ -36,6 +36,7 @@ class Recipe:
     grid: smallest number of samples along a pixel's side, at any rate.
     neighbours: weight of the samples on either side of each, in the limit of a sampling rate of 0; see `neighbours_at`.
     takes_quality: `target_rate` is set by the user's choice of quality.
+    levels_grid: most samples along a pixel's side where the scene has levels of detail; 0 draws the finest level alone.
     for_discs: name of the recipe that takes its place for scenes of 2D Gaussians.
     """
 
@@ -51,6 +52,7 @@ class Recipe:
     compositor: Compositor | None = None
     selection: Selection | None = None
     takes_quality: bool = False
+    levels_grid: int = 0
     for_discs: str | None = None
     promises: Promises = Promises()
 

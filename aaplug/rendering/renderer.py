@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal, NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from aaplug.core.cameras import BLACK, WHITE, Camera, CameraSet
@@ -24,6 +24,7 @@ from aaplug.core.imaging import average_samples, softened
 from aaplug.core.interfaces import Colour, Rasterizer, RunsKernels
 from aaplug.core.kernels import EAGER, Kernels
 from aaplug.core.projection import project, shade, with_depth_slopes
+from aaplug.core.pyramids import Cutter, Pyramid
 from aaplug.core.sampling import MIN_SEEN_SHARE, sampling_bounds
 from aaplug.core.splats import Render, Splats2D, concatenated
 from aaplug.core.training import TrainingViews
@@ -54,6 +55,7 @@ class Renderer:
     scene: the scene after the world filter.  training: the training views of the unfiltered scene.
     background: red, green, blue in [0, 1].
     harmonics: reads those of the Gaussians from start up to stop, where `scene.sh` does not hold them; else None.
+    cutter: picks what a view draws where `scene` has several levels of detail; else None.
     """
 
     scene: Gaussians
@@ -62,12 +64,13 @@ class Renderer:
     rasterizer: Rasterizer = RASTERIZERS["eager"]
     background: Colour = BLACK
     harmonics: Harmonics | None = None
+    cutter: Cutter | None = None
     _rates: dict[tuple[object, ...], float] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @classmethod
     def of(
         cls,
-        scene: Gaussians,
+        scene: Gaussians | Pyramid,
         cameras: CameraSet | Sequence[Camera] | TrainingViews,
         recipe: str | Recipe = "auto",
         *,
@@ -80,7 +83,8 @@ class Renderer:
         """Prepare a scene: check its frame, compute its sampling bounds and apply the world filter.
 
         Args:
-            scene: the scene as its file stores it, before any world filter.
+            scene: the scene as its file stores it, before any world filter; or a pyramid, whose levels are drawn if
+                the recipe takes them.
             cameras: the training cameras.  With a `TrainingViews` nothing is checked or computed, and `cull_margin`
                 and `min_seen` are ignored.
             recipe: a recipe, or its name in `RECIPES`.
@@ -94,17 +98,22 @@ class Renderer:
             FrameError: the cameras see little of the scene.
             UsageError: a name is not known, there are no cameras, or the scene lacks what the recipe needs.
         """
-        if isinstance(cameras, TrainingViews):
-            training = cameras
-        else:
-            training = TrainingViews.of(scene, cameras, cull_margin, min_seen)
         if isinstance(recipe, str):
             recipe = find_recipe(recipe, quality=quality)
+        pyramid = None
+        if isinstance(scene, Pyramid):
+            pyramid = scene if recipe.levels_grid else None
+            scene = scene.scene if pyramid else scene.finest
+        if isinstance(cameras, TrainingViews):
+            training = cameras if pyramid is None else TrainingViews.of(scene, cameras.cameras, cameras.cull_margin)
+        else:
+            training = TrainingViews.of(scene, cameras, cull_margin, min_seen)
         if isinstance(rasterizer, str):
             rasterizer = find_rasterizer(rasterizer)
         recipe = suited(recipe, scene)
         colour = background_colour(background, cameras)
-        return cls(prepared(scene, training, recipe), training, recipe, rasterizer, colour)
+        cutter = Cutter.of(pyramid, training) if pyramid else None
+        return cls(prepared(scene, training, recipe), training, recipe, rasterizer, colour, cutter=cutter)
 
     def __call__(self, camera: Camera) -> Render:
         """Render one view: rgb and alpha of `camera.hw`.
@@ -134,11 +143,12 @@ class Renderer:
         """Number of samples along a pixel's side."""
         if self.recipe.target_rate == 0:
             return self.recipe.grid
-        return self.recipe.samples_at(self.relative_rate(camera))
+        asked = self.recipe.samples_at(self.relative_rate(camera))
+        return asked if self.cutter is None else min(asked, self.recipe.levels_grid)
 
     def neighbours(self, camera: Camera) -> float:
         """Weight of the samples on either side of each sample: like their number, a constant to gradients."""
-        if self.recipe.neighbours == 0:
+        if self.recipe.neighbours == 0 or self.cutter is not None:
             return 0.0
         sampled_rate = self.samples(camera) * self.relative_rate(camera)
         return self.recipe.neighbours_at(round(sampled_rate, RATE_DIGITS))
@@ -159,8 +169,9 @@ class Renderer:
 
     @torch.no_grad()
     def _median_rate(self, camera: Camera) -> float:
-        bounds = self.training.bounds
-        now = sampling_bounds(self.scene.means, [camera]).highest
+        part = slice(None) if self.cutter is None else self.cutter.coarsest
+        bounds = self.training.bounds[part]
+        now = sampling_bounds(self.scene.means[part], [camera]).highest
         both = (now > 0) & bounds.seen
         if not both.any():
             return self.training.relative_rate(camera)
@@ -172,18 +183,21 @@ class Renderer:
 
         Gaussians pass in chunks, so that memory is bounded by a chunk and by the splats that stay.
         """
-        parts = []
-        for start in range(0, max(1, len(self.scene)), CHUNK):
-            whole = len(self.scene) <= CHUNK
-            chunk = self.scene if whole else self.scene[start : start + CHUNK]
-            splats = self._projected(chunk, start, camera)
+        cut = None if self.cutter is None else self.cutter(camera)
+        whole, parts = len(self.scene) if cut is None else len(cut), []
+        for start in range(0, max(1, whole), CHUNK):
+            if cut is not None:
+                chunk, places = cut[start : start + CHUNK].of(self.scene), cut.places[start:]
+            else:
+                chunk, places = self.scene if whole <= CHUNK else self.scene[start : start + CHUNK], start
+            splats = self._projected(chunk, places, camera)
             parts.append(self._shaded(splats, chunk, start, camera))
         splats = concatenated(parts)
         _check_colours(splats)
         return splats
 
-    def _projected(self, chunk: Gaussians, start: int, camera: Camera) -> Splats2D:
-        """Splats of the Gaussians from `start`, without colour."""
+    def _projected(self, chunk: Gaussians, places: Int[Tensor, " m"] | int, camera: Camera) -> Splats2D:
+        """Splats of some Gaussians, without colour; places: of each in the scene, or of the first if all follow."""
         recipe, training, kernels = self.recipe, self.training, self._kernels
         rules = training.convention.rules
         splats = project(chunk, camera, kernels, rules)
@@ -191,7 +205,8 @@ class Renderer:
             splats = recipe.selection(splats, chunk)
         if recipe.pixel.needs_depth_slopes:
             splats = with_depth_slopes(splats, chunk, camera)
-        splats = replace(splats, sources=splats.sources + start)
+        own = splats.sources
+        splats = replace(splats, sources=own + places if isinstance(places, int) else places[own])
         splats = recipe.screen(splats, camera, training)
         ellipses = recipe.pixel.bounding_ellipses(splats, rules)
         return cull(splats, camera.hw, training.cull_margin, kernels, ellipses, rules)

@@ -13,7 +13,7 @@ from aaplug.core.monitor import SILENT, Monitor
 from aaplug.io.limits import lack_of_memory
 from aaplug.rasterizers.tiled.ahead_of_time import build, load
 from aaplug.rendering.benchmark import Figures, exponent, measure, synthetic_camera, synthetic_scene
-from aaplug.verbs.inputs import CamerasLike, SceneLike, inputs_of, processor
+from aaplug.verbs.inputs import CamerasLike, Held, SceneLike, inputs_of, processor, whole_of
 from aaplug.verbs.options import THREADS, UNSET, Options, choice, flag, number
 from aaplug.verbs.views import size_of
 
@@ -71,8 +71,8 @@ def bench(
     return Bench(runs, _exponents(runs))
 
 
-def _first_view(scene: Gaussians, cameras: CameraSet) -> tuple[Gaussians, Camera]:
-    return scene, cameras.train[0]
+def _first_view(scene: Held, cameras: CameraSet) -> tuple[Gaussians, Camera]:
+    return whole_of(scene), cameras.train[0]
 
 
 def _kernels(rasterizer: str, monitor: Monitor) -> list[Kernels]:

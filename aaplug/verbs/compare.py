@@ -13,7 +13,17 @@ from aaplug.evaluation.results import Report
 from aaplug.evaluation.truth import Truth, source_of
 from aaplug.io.cameras import select_views
 from aaplug.methods.recipe import Recipe
-from aaplug.verbs.inputs import CamerasLike, SceneLike, cameras_of, drawn_by, inputs_of, look_of, processor, recipe_of
+from aaplug.verbs.inputs import (
+    CamerasLike,
+    SceneLike,
+    cameras_of,
+    drawn_by,
+    inputs_of,
+    look_of,
+    processor,
+    recipe_of,
+    whole_of,
+)
 from aaplug.verbs.options import SCALES, RecipeOptions
 
 
@@ -51,7 +61,7 @@ def compare(
     with processor(o.threads), monitor.progress("comparing", "views") as tell:
         scenes = [inputs_of(scene, cameras, monitor)[0] for scene in candidates.values()]
         look = look_of(scenes[0], cameras, len(chosen) * len(o.scale) * len(scenes), o, monitor)
-        trained = [TrainingViews.of(scene, cameras, o.cull_margin, o.min_seen) for scene in scenes[1:]]
+        trained = [TrainingViews.of(whole_of(scene), cameras, o.cull_margin, o.min_seen) for scene in scenes[1:]]
         looks = [look, *(replace(look, training=training) for training in trained)]
         each = zip(candidates, scenes, looks, strict=True)
         shown = [Candidate(name, drawn_by(recipe, scene, look)) for name, scene, look in each]

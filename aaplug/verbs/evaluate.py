@@ -16,6 +16,7 @@ from aaplug.core.digests import digest_of_cameras, digest_of_files, digest_of_sc
 from aaplug.core.errors import OutputError, UsageError, not_one_of
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.monitor import SILENT, Monitor
+from aaplug.core.pyramids import Pyramid
 from aaplug.evaluation.engine import Task, candidates_of
 from aaplug.evaluation.engine import evaluate as measure
 from aaplug.evaluation.image_store import ImageStore
@@ -31,7 +32,17 @@ from aaplug.io.cameras import select_views
 from aaplug.methods.recipe import Recipe
 from aaplug.methods.recipes import RECIPES, USER_RECIPES, suited
 from aaplug.verbs.announce import announce
-from aaplug.verbs.inputs import AnyPath, CamerasLike, SceneLike, inputs_of, look_of, processor, recipe_of
+from aaplug.verbs.inputs import (
+    AnyPath,
+    CamerasLike,
+    Held,
+    SceneLike,
+    inputs_of,
+    look_of,
+    processor,
+    recipe_of,
+    whole_of,
+)
 from aaplug.verbs.options import RECIPE_NAMES, SCALES, UNSET, RecipeOptions, choice, choices, flag
 
 ALL = "all"  # instead of recipes' names: every recipe that the scene suits
@@ -95,16 +106,17 @@ def evaluate(
     o = EvaluateOptions.of(options)
     folder = None if output is None else Path(output)
     check_results(folder, o)
-    name = name or Path(scene.name if isinstance(scene, Gaussians) else scene).stem
+    name = name or Path(whole_of(scene).name if isinstance(scene, Held) else scene).stem
     metrics, rules = _metrics(o)
     if o.background == "auto" and rules.background is not None:
         o = replace(o, background=rules.background)
     scene, cameras = inputs_of(scene, cameras, monitor)
-    recipes = _recipes(o, scene, monitor)
+    finest = whole_of(scene)
+    recipes = _recipes(o, finest, monitor)
     seen, scales = select_views(cameras, o.views), o.scale or rules.scales
     shown = _shown(o.show, seen) if o.report else ()
     source = _source(o.truth, rules, seen, monitor)
-    facts = _facts(scene, cameras, seen, source, o)
+    facts = _facts(scene.scene if isinstance(scene, Pyramid) else scene, cameras, seen, source, o)
     images = folder and ImageStore(folder, shown, everything=o.layout == "inria")
     with processor(o.threads), _claimed(folder, o):
         look = look_of(scene, cameras, len(seen) * len(recipes) * len(scales), o, monitor)
@@ -118,7 +130,7 @@ def evaluate(
             replaces = o.overwrite or o.resume
             written = write_results(found, folder, replaces, name)
             if o.report:
-                bounds = coverage(scene, look.training, found.scales)
+                bounds = coverage(finest, look.training, found.scales)
                 written += write_page(folder, name, found, bounds, images, replaces)
             for path in written:
                 monitor.say(f"wrote {path}")

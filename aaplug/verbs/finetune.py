@@ -36,7 +36,7 @@ from aaplug.methods.viewers import FAST, VIEWERS, Viewer, fuse_for
 from aaplug.rendering.cost import GRADIENTS
 from aaplug.rendering.renderer import Renderer
 from aaplug.verbs.announce import announce
-from aaplug.verbs.inputs import AnyPath, CamerasLike, SceneLike, inputs_of, look_of, processor, sources_of
+from aaplug.verbs.inputs import AnyPath, CamerasLike, SceneLike, inputs_of, look_of, processor, sources_of, whole_of
 from aaplug.verbs.options import SCALES, STEPS, UNSET, ViewOptions, choice, choices, flag, number
 
 Image = Float[Tensor, "h w 3"]
@@ -127,7 +127,8 @@ def finetune(
     """
     o = FinetuneOptions.of(options)
     settings, viewer, path = _settings(o), _viewer(o), None if output is None else Path(output)
-    scene, cameras = inputs_of(scene, cameras, monitor)
+    held, cameras = inputs_of(scene, cameras, monitor)
+    scene = whole_of(held)
     _check(path, sources_of(scene), o)
     shown, source = select_views(cameras, o.views), _source(o.truth, cameras)
     enlarge = back_projected if o.upsampler is None else upsampled(find_upsampler(o.upsampler))

@@ -14,11 +14,13 @@ from aaplug.core.executors import torch_threads
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.interfaces import MatchesRates, TakesMemory
 from aaplug.core.monitor import Monitor
+from aaplug.core.pyramids import Pyramid
 from aaplug.core.training import TrainingViews
 from aaplug.io.cameras import read_cameras
 from aaplug.io.scenes import MODEL_SCENE, open_scene, ply
 from aaplug.io.scenes.harmonics import without_harmonics
 from aaplug.io.scenes.scene_file import SceneFile
+from aaplug.levels.pyramids import read_pyramid
 from aaplug.methods.recipe import Recipe
 from aaplug.methods.recipes import RECIPES, find_recipe
 from aaplug.rasterizers import find_rasterizer
@@ -29,7 +31,8 @@ from aaplug.verbs.options import RecipeOptions, ViewOptions
 log = logging.getLogger("aaplug")
 
 AnyPath = str | PathLike[str]
-SceneLike = Gaussians | AnyPath
+SceneLike = Gaussians | Pyramid | AnyPath
+Held = Gaussians | Pyramid  # in memory
 CamerasLike = CameraSet | AnyPath | None
 HELD_HARMONICS = 2 * 10**9  # bytes: reading more for each view costs less than holding them; 10 M Gaussians of degree 3
 
@@ -40,28 +43,37 @@ def opened_of(scene: SceneFile | AnyPath, cameras: CameraSet | None, monitor: Mo
     return opened if cameras is None else settled(opened, cameras, monitor)
 
 
-def opened_with(scene: SceneLike | SceneFile, cameras: CameraSet | None, monitor: Monitor) -> Gaussians | SceneFile:
+def opened_with(scene: SceneLike | SceneFile, cameras: CameraSet | None, monitor: Monitor) -> Held | SceneFile:
     """The scene itself, or its opened file; see `opened_of`."""
-    return scene if isinstance(scene, Gaussians) else opened_of(scene, cameras, monitor)
+    return scene if isinstance(scene, Held) else opened_of(scene, cameras, monitor)
 
 
-def whole_of(scene: Gaussians | SceneFile, drop_bad: bool = False) -> Gaussians:
-    """The scene itself, or all of its file."""
+def whole_of(scene: Held | SceneFile, drop_bad: bool = False) -> Gaussians:
+    """The scene itself, or all of its file; of levels of detail the finest."""
+    if isinstance(scene, Pyramid):
+        return scene.finest
     return scene if isinstance(scene, Gaussians) else scene.whole(drop_bad)
 
 
-def sources_of(scene: Gaussians | SceneFile) -> list[Path]:
+def shown_of(scene: Held | SceneFile, drop_bad: bool = False) -> Held:
+    """The scene itself, or all of its file, with all levels of detail."""
+    if isinstance(scene, SceneFile) and scene.pyramid is not None:
+        return read_pyramid(scene.pyramid)
+    return scene if isinstance(scene, Held) else scene.whole(drop_bad)
+
+
+def sources_of(scene: Held | SceneFile) -> list[Path]:
     """Files that outputs must not replace."""
     if isinstance(scene, SceneFile):
         return [scene.path]
-    return [Path(scene.origin.path)] if scene.origin else []
+    return [Path(scene.origin.path)] if isinstance(scene, Gaussians) and scene.origin else []
 
 
-def drawable(scene: Gaussians | SceneFile, drop_bad: bool = False) -> tuple[Gaussians, Harmonics | None]:
+def drawable(scene: Held | SceneFile, drop_bad: bool = False) -> tuple[Held, Harmonics | None]:
     """The scene, and what reads its harmonics if they are large and stay in the file; only a .ply is read by rows."""
     if isinstance(scene, SceneFile) and scene.format == ply.name and scene.harmonics_bytes > HELD_HARMONICS:
         return without_harmonics(scene, drop_bad)
-    return whole_of(scene, drop_bad), None
+    return shown_of(scene, drop_bad), None
 
 
 def cameras_of(cameras: CamerasLike, scene: SceneLike | SceneFile) -> CameraSet:
@@ -71,7 +83,7 @@ def cameras_of(cameras: CamerasLike, scene: SceneLike | SceneFile) -> CameraSet:
     if cameras is not None:
         return read_cameras(cameras)
     named = scene.path if isinstance(scene, SceneFile) else scene
-    path = Path(named.name if isinstance(named, Gaussians) else named)
+    path = Path(whole_of(named).name if isinstance(named, Held) else named)
     if path.match(MODEL_SCENE):
         path = path.parents[2]
     if not path.is_dir():
@@ -81,10 +93,10 @@ def cameras_of(cameras: CamerasLike, scene: SceneLike | SceneFile) -> CameraSet:
 
 def inputs_of(
     scene: SceneLike | SceneFile, cameras: CamerasLike, monitor: Monitor, drop_bad: bool = False
-) -> tuple[Gaussians, CameraSet]:
-    """The scene and its cameras; the cameras are read first, as they are small."""
+) -> tuple[Held, CameraSet]:
+    """The scene, with its levels of detail, and its cameras; the cameras are read first, as they are small."""
     known = cameras_of(cameras, scene)
-    return whole_of(opened_with(scene, known, monitor), drop_bad), known
+    return shown_of(opened_with(scene, known, monitor), drop_bad), known
 
 
 def recipe_of(recipe: str | Recipe, o: RecipeOptions) -> Recipe:
@@ -95,7 +107,7 @@ def recipe_of(recipe: str | Recipe, o: RecipeOptions) -> Recipe:
     return find_recipe(recipe, quality=o.quality, rate_reference=o.rate_reference if matches else None)
 
 
-def look_of(scene: Gaussians, cameras: CameraSet, frames: int, o: ViewOptions, monitor: Monitor) -> Renderer:
+def look_of(scene: Held, cameras: CameraSet, frames: int, o: ViewOptions, monitor: Monitor) -> Renderer:
     """The scene as training showed it, with the training views, background and rasterizer that the options say.
 
     frames: how many images will be rendered in all.
@@ -113,6 +125,7 @@ def look_of(scene: Gaussians, cameras: CameraSet, frames: int, o: ViewOptions, m
         drawing = find_rasterizer(drawing, frames, monitor.say)
     if o.memory is not None and isinstance(drawing, TakesMemory):
         drawing = drawing.within(o.memory * 1e9)
+    scene = whole_of(scene)
     look = own_look(scene, TrainingViews.of(scene, cameras, o.cull_margin, o.min_seen), drawing, colour)
     fit = agreement(look, cameras)
     monitor.say(f"fit: {fit}")
@@ -121,7 +134,7 @@ def look_of(scene: Gaussians, cameras: CameraSet, frames: int, o: ViewOptions, m
     return look
 
 
-def drawn_by(recipe: Recipe, scene: Gaussians, look: Renderer) -> Renderer:
+def drawn_by(recipe: Recipe, scene: Held, look: Renderer) -> Renderer:
     """The scene as it was read, by a recipe and otherwise as its own look is drawn."""
     return Renderer.of(scene, look.training, recipe, background=look.background, rasterizer=look.rasterizer)
 

@@ -1,53 +1,58 @@
 """Levels of detail: lighter scene files for lower sampling rates."""
 
-from collections.abc import Iterator, Sequence
+import hashlib
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass
-from itertools import zip_longest
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from aaplug.core.cameras import Camera
+import torch
+import tyro
+
+from aaplug.core.cameras import Camera, CameraSet
+from aaplug.core.digests import digest_of_cameras, digest_of_scene
 from aaplug.core.errors import OutputError, UsageError
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.monitor import SILENT, Monitor
 from aaplug.core.sampling import check_frame
+from aaplug.finetuning.refining import STEPS as STEPS_EACH
+from aaplug.finetuning.refining import refined
 from aaplug.io.atomic import output_folder, refuse_existing
+from aaplug.io.cameras import select_views
 from aaplug.io.scenes import SpzAxes, check_scene_output, write_scene, written_format
+from aaplug.io.scenes.manifests import MANIFEST, LevelFile, Manifest, hash_of, is_pyramid, read_manifest, write_manifest
 from aaplug.io.scenes.scene_file import FLOAT, SceneFile, matrix_of
-from aaplug.levels.merging import Goal, merged
+from aaplug.levels.chunks import LARGEST, chunks_of
+from aaplug.levels.merging import Goal, merged, merged_in_chunks
+from aaplug.levels.pyramids import Level, levels_in
 from aaplug.levels.rates import rates_of
+from aaplug.methods.filters import fuse_stored
 from aaplug.verbs.inputs import (
     AnyPath,
     CamerasLike,
+    Held,
     SceneLike,
     cameras_of,
+    look_of,
     opened_with,
     processor,
     sources_of,
     whole_of,
 )
-from aaplug.verbs.options import THREADS, UNSET, FrameOptions, number
+from aaplug.verbs.options import STEPS, UNSET, ViewOptions, number
 
 LEVELS = 4  # as many as usual: down to 1/16 of the training size
 MEGABYTE = 1e6
 NORMALS = 3  # columns that a .ply has beside a Gaussian's parameters
 
 
-@dataclass(frozen=True)
-class Level:
-    """A lighter scene.
-
-    rate: sampling rate relative to training's that it is meant for.
-    """
-
-    scene: Gaussians
-    rate: float
-
-
 @dataclass(frozen=True, kw_only=True)
-class LodOptions(FrameOptions):
-    """How light."""
+class LodOptions(ViewOptions):
+    """How light, and how to tune."""
+
+    views: Annotated[str, tyro.conf.arg(metavar="NAME,...|test|train|all")] = "train"
+    """Views that levels are tuned on, with free ones between them."""
 
     simplify: Annotated[float | None, number(1e-6, 1e9), UNSET] = None
     """Write one scene with this share of the Gaussians; above 1, with so many."""
@@ -55,8 +60,15 @@ class LodOptions(FrameOptions):
     """Write one scene of as many Gaussians as fit into a .ply of so many MB (10^6 bytes)."""
     levels: Annotated[int | None, number(1, 12, whole=True), UNSET] = None
     """Write a folder of levels, each for half the size of the one before, as light as the image allows (default: 4)."""
-    threads: Annotated[int | None, THREADS, UNSET] = None
-    """Processor threads (default: all)."""
+    scale: Annotated[float | None, number(0.001, 1), UNSET] = None
+    """With --simplify or --budget: the size that the scene is meant for, relative to training's (default: the root of
+    the share)."""
+    refine: bool = True
+    """Merge alone, in seconds: do not tune what was merged to look like the scene, which takes minutes."""
+    steps: Annotated[int, STEPS] = STEPS_EACH
+    """Steps of tuning for each level."""
+    resume: bool = False
+    """Keep the levels that are there, if they were made of the same scene, cameras and options."""
     overwrite: bool = False
     """Replace existing outputs."""
 
@@ -65,6 +77,10 @@ class LodOptions(FrameOptions):
         given = [name for name in ("simplify", "budget", "levels") if getattr(self, name) is not None]
         if len(given) > 1:
             raise UsageError(given[1], f"cannot be combined with `{given[0]}`: each asks for other files")
+        if self.scale is not None and not self.single:
+            raise UsageError("scale", "belongs to `simplify` and `budget`")
+        if self.resume and self.single:
+            raise UsageError("resume", "belongs to levels")
 
     @property
     def single(self) -> bool:
@@ -87,7 +103,8 @@ class LodOptions(FrameOptions):
             count = round(self.simplify * (len(scene) if self.simplify <= 1 else 1))
         if count > len(scene):
             raise UsageError("simplify", f"asks for {count:,} Gaussians, and the scene has {len(scene):,}")
-        return [Goal.of_count(max(1, count), scene)]
+        goal = Goal.of_count(max(1, count), scene)
+        return [goal if self.scale is None else replace(goal, rate=self.scale)]
 
 
 @LodOptions.shown
@@ -124,23 +141,91 @@ def lod(
     known = None if cameras is None else cameras_of(cameras, scene)
     train = () if known is None else known.train
     opened = opened_with(scene, known, monitor)
-    files = _files(None if output is None else Path(output), opened, o)
-    whole = whole_of(opened, drop_bad)
+    path = None if output is None else Path(output)
+    files = _files(path, opened, o)
+    whole = fuse_stored(whole_of(opened, drop_bad))
     if not len(whole):
         raise UsageError(whole.name, "has no Gaussians to merge")
     if train:
         check_frame(whole.means, train, whole.name, o.min_seen)
-    folder = output_folder(files[0].parent) if files and not o.single else nullcontext()
-    found = []
-    with processor(o.threads), folder:
-        for level, file in zip_longest(_levels(whole, train, o, monitor), files):
-            if file is not None:
-                write_scene(file, level.scene, overwrite=o.overwrite, spz_axes=spz_axes)
-            found.append(level)
-    return found
+    if o.refine and known is None:
+        monitor.say("no cameras: the levels are not tuned")
+    with processor(o.threads):
+        make = _Maker(whole, train, _refiner(whole, known, o, monitor), monitor)
+        if o.single:
+            found = [make(Level(whole, 1.0), o.goals(whole)[0])]
+            if path is not None:
+                write_scene(path, found[0].scene, overwrite=o.overwrite, spz_axes=spz_axes)
+            return found
+        with output_folder(path) if path else nullcontext():
+            return list(_levels(make, path, files, _source(whole, known, o), o))
 
 
-def _files(output: Path | None, scene: Gaussians | SceneFile, o: LodOptions) -> list[Path]:
+@dataclass(frozen=True)
+class _Maker:
+    """Makes a level of the one before it."""
+
+    scene: Gaussians
+    train: Sequence[Camera]
+    refine: Callable[[Gaussians, float], Gaussians]
+    monitor: Monitor
+
+    def __call__(self, before: Level, goal: Goal) -> Level:
+        scene, rates = before.scene, rates_of(before.scene, self.train)
+        with self.monitor.progress("merging", "Gaussians") as tell:
+            if before.chunks is None:
+                found, chunks = merged(scene, rates, goal, tell), None
+            else:
+                found, chunks = merged_in_chunks(scene, rates, before.chunks, goal, tell)
+        self.monitor.say(f"{len(found):,} Gaussians for {goal.rate:.3g} × the training rate")
+        return Level(self.refine(found, goal.rate), goal.rate, chunks)
+
+
+def _refiner(
+    scene: Gaussians, cameras: CameraSet | None, o: LodOptions, monitor: Monitor
+) -> Callable[[Gaussians, float], Gaussians]:
+    """What tunes a level."""
+    if cameras is None or not o.refine or not o.steps:
+        return lambda level, rate: level
+    look, views = look_of(scene, cameras, o.steps, o, monitor), select_views(cameras, o.views)
+    return lambda level, rate: refined(level, rate, look, views, o.steps, monitor)
+
+
+def _source(scene: Gaussians, cameras: CameraSet | None, o: LodOptions) -> str:
+    """Hash of all that the levels depend on."""
+    facts = [digest_of_scene(scene), "" if cameras is None else digest_of_cameras(cameras.train)]
+    facts += [str((cameras and cameras.background, o.refine, o.steps, o.views, o.background, o.cull_margin))]
+    return hashlib.sha256(" ".join(facts).encode()).hexdigest()
+
+
+def _levels(make: _Maker, folder: Path | None, files: Sequence[Path], source: str, o: LodOptions) -> Iterator[Level]:
+    """The scene and its levels, each written before the next is made."""
+    done: list[Level] = []
+    manifest = Manifest(source, LARGEST, ())
+    if o.resume and folder is not None and is_pyramid(folder):
+        manifest = read_manifest(folder)
+        if manifest.source != source:
+            raise UsageError("resume", f"{folder} holds levels of another scene, other cameras or other options")
+        done = list(levels_in(folder, manifest))
+        make.monitor.say(f"resumed: {len(done) - 1} levels are there")
+    done = done or [Level(make.scene, 1.0, chunks_of(make.scene.means, LARGEST))]
+    goals = o.goals(make.scene)
+    for place in range(len(goals) + 1):
+        if place >= len(done):
+            done.append(make(done[-1], goals[place - 1]))
+        if folder is not None and place >= len(manifest.levels):
+            write_scene(files[place], done[place].scene, overwrite=o.overwrite or o.resume)
+            manifest = replace(manifest, levels=(*manifest.levels, _described(files[place], done[place])))
+            write_manifest(folder, manifest)
+        yield done[place]
+
+
+def _described(file: Path, level: Level) -> LevelFile:
+    assert level.chunks is not None
+    return LevelFile(file.name, level.rate, hash_of(file), tuple(torch.bincount(level.chunks).tolist()))
+
+
+def _files(output: Path | None, scene: Held | SceneFile, o: LodOptions) -> list[Path]:
     """The files to write, checked before any work."""
     if output is None:
         return []
@@ -152,16 +237,5 @@ def _files(output: Path | None, scene: Gaussians | SceneFile, o: LodOptions) -> 
         raise OutputError(output, "levels go to a folder; for one scene, give `simplify` or `budget`")
     stem = sources[0].stem if sources else "scene"
     files = [output / f"{stem}_lod{level}.ply" for level in range((o.levels or LEVELS) + 1)]
-    refuse_existing(files, o.overwrite)
+    refuse_existing([*files, output / MANIFEST], o.overwrite or o.resume)
     return files
-
-
-def _levels(scene: Gaussians, train: Sequence[Camera], o: LodOptions, monitor: Monitor) -> Iterator[Level]:
-    """The scenes that were asked for, each made of the one before."""
-    if not o.single:
-        yield Level(scene, 1.0)
-    for goal in o.goals(scene):
-        with monitor.progress("merging", "Gaussians") as tell:
-            scene = merged(scene, rates_of(scene, train), goal, tell)
-        monitor.say(f"{len(scene):,} Gaussians for {goal.rate:.3g} × the training rate")
-        yield Level(scene, goal.rate)

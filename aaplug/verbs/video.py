@@ -22,7 +22,17 @@ from aaplug.io.cameras.camera_path import read_camera_path
 from aaplug.io.video import MOST_FPS, check_video
 from aaplug.rendering.videos import make_video
 from aaplug.verbs.announce import announce
-from aaplug.verbs.inputs import AnyPath, CamerasLike, SceneLike, drawn_by, inputs_of, look_of, processor, recipe_of
+from aaplug.verbs.inputs import (
+    AnyPath,
+    CamerasLike,
+    SceneLike,
+    drawn_by,
+    inputs_of,
+    look_of,
+    processor,
+    recipe_of,
+    whole_of,
+)
 from aaplug.verbs.options import RECIPE_NAMES, SCALE, UNSET, ImageOptions, RecipeOptions, choice, number
 from aaplug.verbs.views import resized
 
@@ -81,7 +91,7 @@ def video(
     fps = o.fps or (FPS if free is None else free.fps)
     check_video(Path(output), fps, o.overwrite)
     scene, cameras = inputs_of(scene, cameras, monitor)
-    path = free.cameras if free else _along(scene, cameras, o, fps, monitor)
+    path = free.cameras if free else _along(whole_of(scene), cameras, o, fps, monitor)
     shown = resized(path, o.scale, o.resolution)
     labels = [{"auto": "aaplug auto"}.get(recipe.name, recipe.name) for recipe in recipes]
 

@@ -19,6 +19,7 @@ from aaplug.core.gaussians import Convention, Gaussians
 from aaplug.core.registry import Registry, named
 from aaplug.io.atomic import check_output
 from aaplug.io.scenes import compressed_ply, ksplat, ply, pt, sog, splat, spz
+from aaplug.io.scenes.manifests import is_pyramid, path_of, read_manifest
 from aaplug.io.scenes.options import Options, SpzAxes
 from aaplug.io.scenes.scene_file import SceneFile
 from aaplug.io.values import read_start
@@ -78,7 +79,7 @@ def open_scene(
     """Open a scene without reading its Gaussians.
 
     Args:
-        path: a scene file, an INRIA model folder or a folder of SOG images; see `find_scene`.
+        path: a scene file, an INRIA model folder, a folder of SOG images or of levels of detail; see `find_scene`.
         iteration: which iteration of a model folder; None for the last.
         convention: how the scene was trained, if the file does not say or is wrong.
         allow_checkpoint: open a .pt too, a pickle, of which only tensors are read.
@@ -89,6 +90,7 @@ def open_scene(
         FormatError: the file is missing, of no known format, or breaks its format.
     """
     options = Options(allow_checkpoint, spz_axes)
+    folder = Path(path) if is_pyramid(path) else None
     path = find_scene(path, iteration)
     head = read_start(path, HEAD_BYTES)
     if not head:
@@ -97,6 +99,8 @@ def open_scene(
     for format in formats:
         if format.sniff(path, head):
             file = format.open_scene(path, options)
+            if folder is not None:
+                file = replace(file, pyramid=folder, notes=(*file.notes, read_manifest(folder).described))
             return file if convention is None else _stated(file, convention)
     known = ", ".join("." + format.name for format in formats)
     raise FormatError(path, f"is of no known scene format; aaplug reads {known}")
@@ -190,12 +194,15 @@ def check_scene_output(
 def find_scene(path: str | PathLike[str], iteration: int | None = None) -> Path:
     """The scene file that a path means.
 
-    A file means itself.  A folder means the last (or the given) iteration of an INRIA model, or its SOG images.
+    A file means itself.  A folder means the last (or the given) iteration of an INRIA model, its SOG images, or the
+    finest of its levels of detail.
     Raises FormatError if the folder holds no scene, or not that iteration.
     """
     path = Path(path)
     if not path.is_dir():
         return path
+    if is_pyramid(path):
+        return path_of(path, read_manifest(path).levels[0])
     pattern, files = re.compile(r"iteration_(\d+)", re.ASCII), path.glob(MODEL_SCENE)
     scenes = {int(match[1]): file for file in files if (match := pattern.fullmatch(file.parent.name))}
     if not scenes and (path / SOG_FOLDER).is_file():

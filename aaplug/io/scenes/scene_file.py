@@ -48,6 +48,7 @@ class SceneFile:
     flat: see `Gaussians`.
     notes: facts worth printing about how the file was understood, a line each.
     other: the same file read in another way, where it does not say which is right; its last note says how.
+    pyramid: the folder of levels of detail whose finest level this is; else None.
     """
 
     path: Path
@@ -62,6 +63,7 @@ class SceneFile:
     document: Any = None
     notes: tuple[str, ...] = ()
     other: "SceneFile | None" = None
+    pyramid: Path | None = None
 
     def raw(self, start: int, stop: int) -> Gaussians:
         """The rows from start up to stop, with convention and origin; their values are not checked."""

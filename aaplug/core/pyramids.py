@@ -1,0 +1,222 @@
+"""Pyramids: a scene with coarser levels of itself, and the cut that a view draws.
+
+c: chunks, l: levels, n: Gaussians of all levels.  A chunk is a part of space.  No Gaussian stands for others of another
+chunk, so each chunk is drawn at a level of its own, which its sampling rate decides.  Level k is meant for rates down
+to 2⁻ᵏ of training's.  With x = -log₂ of the relative rate, level k is drawn alone from k - 1/2 to k; from k to k + 1/2
+it fades into the next.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from aaplug.core.cameras import Camera
+from aaplug.core.gaussians import MIN_OPACITY, Gaussians, joined
+from aaplug.core.projection import JACOBIAN_MARGIN
+from aaplug.core.rules import NEAR
+from aaplug.core.training import TrainingViews
+
+FADE = 0.5  # octaves of the sampling rate over which a level fades into the next
+ROUNDING = 1e-4  # octaves: what lies nearer to a level is that level
+SIGMAS = 3.33  # standard deviations to where an opaque Gaussian's alpha falls below 1/255
+PAD = 4.0  # px around the image that the filters reach at most, at training's rate and below
+STRETCH = 1 + JACOBIAN_MARGIN  # how much longer than it is a Gaussian outside of the image is projected at most
+
+
+@dataclass(frozen=True)
+class Cut:
+    """What a view draws.
+
+    places: of Gaussians among those of all levels, ascending.
+    shares: of each one's optical depth that is drawn; None for all of it.
+    """
+
+    places: Int[Tensor, " m"]
+    shares: Float[Tensor, " m"] | None
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+    def __getitem__(self, part: slice) -> "Cut":
+        """A part of it."""
+        return Cut(self.places[part], None if self.shares is None else self.shares[part])
+
+    def of(self, scene: Gaussians) -> Gaussians:
+        """The Gaussians of the cut, with their shares of opacity and without harmonics.
+
+        Scaling optical depths keeps the transmittance of two levels that agree: (1 - a)ʷ (1 - a)¹⁻ʷ = 1 - a.
+        """
+        logits = scene.logit_opacities[self.places]
+        if self.shares is not None:
+            depths = torch.nn.functional.softplus(logits)  # optical: -ln(1 - opacity)
+            faded = (-torch.expm1(-self.shares * depths)).clamp(MIN_OPACITY, 1 - MIN_OPACITY).logit()
+            logits = torch.where(self.shares == 1, logits, faded)
+        columns = {name: getattr(scene, name)[self.places] for name in ("means", "quats", "log_scales")}
+        none = scene.sh[:1].expand(len(logits), -1, -1)
+        return replace(scene, **columns, logit_opacities=logits, sh=none, origin=None, pixel_sizes=None)
+
+
+@dataclass(frozen=True)
+class Pyramid:
+    """All levels of a scene as one, the finest first.
+
+    scene: its origin is not known.
+    sizes: Gaussians of each level.
+    chunks: of each Gaussian; those of every level but the finest lie in the order of their chunks.
+    """
+
+    scene: Gaussians
+    sizes: tuple[int, ...]
+    chunks: Int[Tensor, " n"]
+
+    @classmethod
+    def of(cls, levels: Sequence[Gaussians], chunks: Sequence[Int[Tensor, " _"]]) -> "Pyramid":
+        """A pyramid of its levels, the finest first, at least one, and the chunk of each of their Gaussians."""
+        like = [replace(level, origin=None, pixel_sizes=None) for level in levels]
+        return cls(joined(like), tuple(map(len, levels)), torch.cat(list(chunks)))
+
+    def __len__(self) -> int:
+        """Number of levels."""
+        return len(self.sizes)
+
+    def level(self, number: int) -> Gaussians:
+        """One level as a scene of its own."""
+        start = sum(self.sizes[:number])
+        return self.scene[start : start + self.sizes[number]]
+
+    @property
+    def finest(self) -> Gaussians:
+        """The scene that the levels were made of."""
+        return self.level(0)
+
+    @cached_property
+    def firsts(self) -> Int[Tensor, "l c_and_1"]:
+        """Index of each chunk's first Gaussian in each level but the finest, and of that after the last."""
+        count, start, found = self.count, self.sizes[0], []
+        for size in self.sizes[1:]:
+            own = torch.bincount(self.chunks[start : start + size], minlength=count)
+            found.append(torch.cat([own.new_zeros(1), own.cumsum(0)]) + start)
+            start += size
+        return torch.stack(found) if found else torch.zeros(0, count + 1, dtype=torch.int64)
+
+    @cached_property
+    def count(self) -> int:
+        """Number of chunks."""
+        return int(self.chunks.max()) + 1 if len(self.chunks) else 0
+
+
+@dataclass(frozen=True)
+class Cutter:
+    """Picks a view's cut from bounds of the chunks.
+
+    centres, radii: of a ball around a chunk's means, in world units.
+    reach: how far beyond it one of its Gaussians can be seen.
+    lowest, highest: training's sampling rates in the chunk, px per world unit; 0 if no camera sees it.
+    """
+
+    pyramid: Pyramid
+    training: TrainingViews
+    centres: Float[Tensor, "c 3"]
+    radii: Float[Tensor, " c"]
+    reach: Float[Tensor, " c"]
+    lowest: Float[Tensor, " c"]
+    highest: Float[Tensor, " c"]
+
+    @classmethod
+    def of(cls, pyramid: Pyramid, training: TrainingViews) -> "Cutter":
+        """Compute the bounds of every chunk.
+
+        training: views of all levels.
+        """
+        scene, chunks, bounds = pyramid.scene, pyramid.chunks, training.bounds
+
+        def extreme(values: Tensor, how: str) -> Tensor:
+            places = chunks.reshape(-1, *[1] * (values.ndim - 1)).expand_as(values)
+            start = torch.full((pyramid.count, *values.shape[1:]), torch.inf if how == "amin" else -torch.inf)
+            return start.to(values).scatter_reduce(0, places, values, how)
+
+        means = scene.means.detach().double()
+        centres = (extreme(means, "amin") + extreme(means, "amax")) / 2
+        radii = extreme((means - centres[chunks]).norm(dim=1), "amax")
+        blurs = torch.where(bounds.seen, training.convention.kernel**0.5 / bounds.lowest, 0.0)
+        sizes = SIGMAS * (scene.scales.detach().amax(dim=1).square() + blurs.square()).sqrt()
+        lowest = extreme(torch.where(bounds.seen, bounds.lowest, torch.inf), "amin")
+        seen = lowest.isfinite()
+        highest = extreme(bounds.highest, "amax")
+        reach = STRETCH * extreme(sizes, "amax").double()
+        return cls(pyramid, training, centres, radii, reach, lowest.where(seen, 0.0), highest)
+
+    @torch.no_grad()
+    def __call__(self, camera: Camera) -> Cut:
+        """The cut of a view whose pixels are those of `camera`."""
+        visible, octaves = self.visible(camera), self.octaves(camera)
+        parts, shares = zip(*self._parts(visible, octaves), strict=True)
+        index, shares = torch.cat(parts), torch.cat(shares)
+        return Cut(index, None if (shares == 1).all() else shares)
+
+    @property
+    def coarsest(self) -> slice:
+        """Places of the coarsest level's Gaussians."""
+        return slice(len(self.pyramid.chunks) - self.pyramid.sizes[-1], None)
+
+    def octaves(self, camera: Camera) -> Float[Tensor, " c"]:
+        """How far each chunk's sampling rate lies below training's, in octaves; 0 where it does not.
+
+        At a data-set pose it is the ratio of focal lengths.  For a free camera the chunk's nearest point counts, and
+        the nearest rate of training.
+        """
+        own = torch.full_like(self.radii, self.training.relative_rate(camera))
+        if camera.trained_focal is None:
+            now = camera.focal / (self._places(camera)[:, 2] - self.radii).clamp(min=NEAR)
+            trained = torch.minimum(torch.maximum(now, self.lowest.double()), self.highest.double())
+            own = torch.where(self.highest > 0, now / trained, own)
+        octaves = -own.log2()
+        nearest = octaves.round()
+        octaves = torch.where((octaves - nearest).abs() < ROUNDING, nearest, octaves)
+        return octaves.clamp(0, len(self.pyramid) - 1)
+
+    def shares(self, octaves: Float[Tensor, " c"]) -> Float[Tensor, "l c"]:
+        """Share of each level in each chunk; they sum to 1."""
+        levels = torch.arange(len(self.pyramid)).to(octaves)[:, None]
+        coming = ((octaves - levels + 1) / FADE).clamp(0, 1)  # of level k: 0 up to k - 1, 1 from k - 1/2 on
+        coming[0] = 1
+        return coming - torch.cat([coming[1:], torch.zeros_like(coming[:1])])
+
+    def visible(self, camera: Camera) -> Bool[Tensor, " c"]:
+        """Chunks that can reach into the image."""
+        x, y, z = self._places(camera).unbind(dim=1)
+        room, pad = self.radii + self.reach, PAD * max(1.0, self.training.relative_rate(camera))
+        found = z + self.radii > NEAR
+        for along, focal, centre, side in (
+            (x, camera.fx, camera.cx, camera.width),
+            (y, camera.fy, camera.cy, camera.height),
+        ):
+            for sign, edge in ((1.0, -pad - centre), (-1.0, side + pad - centre)):
+                slope = edge / focal  # the plane along = slope z
+                found &= sign * (along - slope * z) > -room * (1 + slope * slope) ** 0.5
+        return found
+
+    def _places(self, camera: Camera) -> Float[Tensor, "c 3"]:
+        """The chunks' centres in the camera's frame."""
+        pose = camera.cam_from_world.detach().double()
+        return self.centres @ pose[:3, :3].T + pose[:3, 3]
+
+    def _parts(
+        self, visible: Bool[Tensor, " c"], octaves: Float[Tensor, " c"]
+    ) -> Iterator[tuple[Int[Tensor, " m"], Float[Tensor, " m"]]]:
+        """The Gaussians of every level and their shares."""
+        shares = self.shares(octaves).masked_fill(~visible, 0.0).to(self.pyramid.scene.means)
+        finest, *coarser = shares
+        if finest.any():
+            own = finest[self.pyramid.chunks[: self.pyramid.sizes[0]]]
+            index = own.nonzero()[:, 0]
+            yield index, own[index]
+        for level, share in zip(self.pyramid.firsts, coarser, strict=True):
+            chosen = share.nonzero()[:, 0]
+            starts, counts = level[chosen], level[chosen + 1] - level[chosen]
+            skipped = torch.repeat_interleave(starts - counts.cumsum(0) + counts, counts)
+            yield skipped + torch.arange(len(skipped)), torch.repeat_interleave(share[chosen], counts)

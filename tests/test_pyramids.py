@@ -1,0 +1,316 @@
+"""Pyramids: what a view draws of them, the laws that its cut keeps, and the files that hold them."""
+
+# ruff: noqa: F811 (fixtures come from another file)
+
+import itertools
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import aaplug
+from aaplug.core.cameras import CameraSet
+from aaplug.core.errors import FormatError
+from aaplug.core.free_views import between, free_views
+from aaplug.core.gaussians import Gaussians
+from aaplug.core.pyramids import Cut, Cutter, Pyramid
+from aaplug.core.training import TrainingViews
+from aaplug.io.scenes import open_scene
+from aaplug.io.scenes.manifests import MANIFEST, read_manifest
+from aaplug.levels.chunks import chunks_of
+from aaplug.levels.merging import Goal, merged_in_chunks
+from aaplug.levels.pyramids import read_pyramid
+from aaplug.rendering.renderer import Renderer
+from tests.conftest import make_camera, make_scene
+from tests.test_cli import cli, dataset  # noqa: F401 (fixtures)
+
+RATE = 20.0  # px per world unit
+VIEWS = tuple(make_camera(eye, (64, 48)) for eye in ((0.0, -4.0, 0.0), (3.0, -2.0, 1.0), (-3.0, -2.0, 0.5)))
+
+
+def rates(scene: Gaussians) -> torch.Tensor:
+    return torch.full((len(scene),), RATE)
+
+
+def pyramid(n: int = 300, levels: int = 3, largest: int = 40) -> Pyramid:
+    """Merged without tuning."""
+    scenes, chunks = [make_scene(n)], [chunks_of(make_scene(n).means, largest)]
+    for level in range(1, levels + 1):
+        made = merged_in_chunks(scenes[-1], rates(scenes[-1]), chunks[-1], Goal(0.5**level, tolerance=1e-2))
+        scenes.append(made.scene)
+        chunks.append(made.chunks)
+    return Pyramid.of(scenes, chunks)
+
+
+@pytest.fixture(scope="module")
+def levels() -> Pyramid:
+    return pyramid()
+
+
+@pytest.fixture(scope="module")
+def renderer(levels) -> Renderer:
+    return Renderer.of(levels, CameraSet(VIEWS, VIEWS), "auto", quality="fast", rasterizer="eager")
+
+
+@settings(deadline=None)
+@given(st.floats(0, 5))
+def test_the_shares_of_a_chunk_sum_to_one(octaves):
+    scene = make_scene(5)
+    whole = Pyramid.of([scene] * 6, [torch.zeros(5, dtype=torch.int64)] * 6)
+    shares = Cutter.of(whole, TrainingViews.of(scene_of(whole), VIEWS)).shares(torch.tensor([octaves]))[:, 0]
+    assert shares.sum() == pytest.approx(1, abs=1e-6)
+    assert (shares > 0).sum() <= 2
+    assert shares.min() >= 0
+    assert shares[math.ceil(octaves)] > 0 or octaves < 1e-6  # the level that is meant for this rate
+
+
+def scene_of(whole: Pyramid) -> Gaussians:
+    return whole.scene
+
+
+def test_levels_become_lighter_and_stand_for_their_own_chunk_alone(levels):
+    """Painted by chunk, every merged Gaussian keeps its chunk's colour."""
+    assert list(levels.sizes) == sorted(levels.sizes, reverse=True)
+    assert levels.sizes[-1] < levels.sizes[0] / 3
+    finest = levels.finest
+    chunks = levels.chunks[: levels.sizes[0]]
+    painted = replace(finest, sh=chunks.float()[:, None, None].expand_as(finest.sh).clone())
+    made = merged_in_chunks(painted, rates(painted), chunks, Goal(0.25, tolerance=1e3))
+    assert len(made.scene) < len(finest) / 3
+    assert torch.allclose(made.scene.sh[:, 0, 0], made.chunks.float(), atol=1e-3)
+
+
+def test_chunks_are_boxes_of_bounded_size_whatever_the_order():
+    scene = make_scene(1000)
+    chunks = chunks_of(scene.means, 50)
+    assert torch.bincount(chunks).max() <= 50
+    order = torch.randperm(1000, generator=torch.Generator().manual_seed(1))
+    assert torch.equal(chunks_of(scene.means[order], 50), chunks[order])
+    numbers = range(int(chunks.max()) + 1)
+    low, high = (
+        torch.stack([getattr(scene.means[chunks == c], how)(dim=0).values for c in numbers]) for how in ("min", "max")
+    )
+    inside = ((scene.means[:, None] >= low) & (scene.means[:, None] <= high)).all(dim=2)
+    assert (inside.sum(dim=1) == 1).all()
+    assert int(chunks_of(torch.zeros(200, 3), 50).max()) == 0  # coincident Gaussians cannot be told apart
+
+
+@pytest.mark.parametrize("scale", [1.0, 2.0])
+def test_from_the_training_rate_on_the_image_is_the_scenes_own_to_the_bit(levels, renderer, scale):
+    alone = Renderer.of(levels.finest, VIEWS, "auto", quality="fast", rasterizer="eager")
+    for view in VIEWS:
+        assert torch.equal(renderer(view.scaled(scale)).rgb, alone(view.scaled(scale)).rgb)
+
+
+def test_a_pyramid_of_one_level_is_the_scene(levels):
+    one = Pyramid.of([levels.finest], [levels.chunks[: levels.sizes[0]]])
+    view = VIEWS[0].scaled(0.25)
+    drawn, alone = (Renderer.of(s, VIEWS, "matched", rasterizer="eager")(view) for s in (one, levels.finest))
+    assert torch.equal(drawn.rgb, alone.rgb)
+    drawn = Renderer.of(one, VIEWS, "auto", quality="fast", rasterizer="eager")(view)
+    assert torch.equal(drawn.rgb, alone.rgb)
+
+
+@pytest.mark.parametrize("eye", [(0.0, -4.0, 0.0), (0.3, -0.6, 0.2), (0.0, -30.0, 4.0), (2.0, 0.0, 2.0)])
+@pytest.mark.parametrize("scale", [1.0, 0.3])
+def test_chunks_that_are_left_out_show_nothing(renderer, eye, scale):
+    """Also with the camera in the scene, and looking past it."""
+    view = replace(make_camera(eye, (48, 40), 0.5), trained_focal=None).scaled(scale)
+    assert renderer.cutter is not None
+
+    class Everything(Cutter):
+        def visible(self, camera):
+            return torch.ones_like(super().visible(camera))
+
+    whole = replace(renderer, cutter=Everything(**vars(renderer.cutter)))
+    assert torch.equal(renderer(view).rgb, whole(view).rgb)
+
+
+def test_a_view_past_the_scene_draws_nothing(renderer):
+    away = make_camera((0.0, -40.0, 0.0))
+    turned = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0], dtype=torch.float64)) @ away.cam_from_world
+    view = replace(away, cam_from_world=turned, trained_focal=None)
+    assert len(renderer.cutter(VIEWS[0])) == len(renderer.scene[: renderer.cutter.pyramid.sizes[0]])
+    assert len(renderer.cutter(view)) == 0
+    assert (renderer(view).rgb == 0).all()
+
+
+def test_a_near_part_is_fine_and_a_far_part_coarse():
+    near, far = make_scene(60), make_scene(60, seed=1)
+    near.means[:] *= 0.1
+    far.means[:] = 0.1 * far.means + torch.tensor([0.0, 40.0, 0.0])
+    both = Gaussians(**{name: torch.cat([getattr(near, name), getattr(far, name)]) for name in near.columns})
+    chunks = torch.arange(2).repeat_interleave(60)
+    coarse = merged_in_chunks(both, rates(both), chunks, Goal(0.25, tolerance=1e3))
+    whole = Pyramid.of([both, coarse.scene, coarse.scene], [chunks, coarse.chunks, coarse.chunks])
+    cutter = Cutter.of(whole, TrainingViews.of(whole.scene, [make_camera((0.0, -4.0, 0.0), (640, 480))]))
+    octaves = cutter.octaves(replace(make_camera((0.0, -4.0, 0.0), (640, 480)), trained_focal=None))
+    assert octaves[0] == octaves[1] == 0  # each as training saw it
+    octaves = cutter.octaves(replace(make_camera((0.0, -6.0, 0.0), (640, 480)), trained_focal=None))
+    assert octaves[0] > octaves[1] > 0
+
+
+def test_two_levels_that_agree_keep_the_transmittance(levels):
+    """Scaled optical depths, not alphas: (1 - a)ʷ (1 - a)¹⁻ʷ = 1 - a."""
+    scene = levels.finest
+    places = torch.arange(len(scene))
+    for share in (0.1, 0.5, 0.93):
+        w = torch.full((len(scene),), share)
+        one, other = (Cut(places, s).of(scene).opacities for s in (w, 1 - w))
+        assert torch.allclose((1 - one) * (1 - other), 1 - scene.opacities, atol=1e-5)
+    assert torch.equal(Cut(places, torch.ones(len(scene))).of(scene).logit_opacities, scene.logit_opacities)
+
+
+def test_a_dolly_does_not_pop(renderer):
+    """Steps of 1/20 octave away from the scene: no step changes the image much more than its neighbours do."""
+    view = replace(VIEWS[0], trained_focal=None)
+    images = []
+    for step in range(61):
+        pose = view.cam_from_world.clone()
+        pose[2, 3] += 4.0 * (2 ** (step / 20) - 1)
+        images.append(renderer(replace(view, cam_from_world=pose)).rgb)
+    changes = torch.stack([(b - a).abs().max() for a, b in itertools.pairwise(images)])
+    assert changes.max() < 3 * changes.median()
+
+
+def test_gradients_reach_the_levels_of_a_cut(renderer, levels):
+    """Half-way between two levels, against finite differences in float64."""
+    view = VIEWS[0].scaled(0.42)
+    scene = levels.scene.to(torch.float64)
+    weights = torch.rand(view.height, view.width, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+
+    def loss(logits: torch.Tensor) -> torch.Tensor:
+        shown = replace(renderer, scene=replace(scene, logit_opacities=logits))
+        return (shown(view).rgb * weights).sum()
+
+    logits = scene.logit_opacities.clone().requires_grad_()
+    (found,) = torch.autograd.grad(loss(logits), logits)
+    cut = renderer.cutter(view)
+    assert cut.shares is not None
+    assert 0 < cut.shares.min() < 1
+    for place in found.abs().topk(3).indices.tolist():
+        ends = []
+        for step in (1e-5, -1e-5):
+            moved = logits.detach().clone()
+            moved[place] += step
+            ends.append(loss(moved))
+        assert (ends[0] - ends[1]) / 2e-5 == pytest.approx(float(found[place]), rel=1e-4)
+
+
+def test_views_between_two_cameras():
+    first, last = VIEWS[0], VIEWS[2]
+    for share, expected in ((0.0, first), (1.0, last)):
+        assert torch.allclose(between(first, last, share).cam_from_world, expected.cam_from_world, atol=1e-9)
+    middle = between(first, last, 0.5)
+    turn = middle.cam_from_world[:3, :3]
+    assert torch.allclose(turn @ turn.T, torch.eye(3, dtype=turn.dtype), atol=1e-12)
+    assert torch.allclose(middle.centre, (first.centre + last.centre) / 2)
+    assert torch.equal(between(first, first, 0.3).cam_from_world, first.cam_from_world)
+    assert len(free_views(VIEWS, 2)) == 6
+    assert not free_views(VIEWS[:1], 2)
+    assert all(view.trained_focal is None for view in free_views(VIEWS, 1))
+
+
+# ----------------------------------------------------------------------------------------------- files and commands
+
+
+@pytest.fixture
+def folder(cli) -> Path:
+    code, _, err = cli("lod scene.ply --cameras . -o levels --levels 2 --steps 3")
+    assert code == 0, err
+    return Path("levels")
+
+
+def test_a_folder_of_levels_is_a_scene(cli, folder):
+    whole = read_pyramid(folder)
+    assert len(whole) == 3
+    assert torch.equal(whole.finest.means, open_scene("scene.ply").whole().means)
+    for words in ("--scale 0.25", "--scale 0.25 --quality fast", "--scale 0.25 --quality best"):
+        code, _, err = cli(f"render levels --cameras . -o images {words} --overwrite")
+        assert code == 0, err
+    code, _, err = cli("evaluate levels --cameras . -o results --scale 0.5 --recipe auto matched --truth self")
+    assert code == 0, err
+    facts = cli("info levels")
+    assert facts[0] == 0
+    assert "3 levels of detail" in facts[1]
+    assert cli("convert levels --cameras . -o converted.ply")[0] == 0
+    assert cli("lod levels --cameras . -o light.ply --simplify 0.5 --no-refine")[0] == 0
+
+
+def test_building_goes_on_where_it_stopped(cli, folder):
+    first = {file.name: file.read_bytes() for file in folder.iterdir()}
+    (folder / "scene_lod2.ply").unlink()
+    manifest = json.loads((folder / MANIFEST).read_text())
+    manifest["levels"].pop()
+    (folder / MANIFEST).write_text(json.dumps(manifest))
+    code, _, err = cli("lod scene.ply --cameras . -o levels --levels 2 --steps 3 --resume")
+    assert code == 0, err
+    assert "resumed: 1 level" in err
+    assert {file.name: file.read_bytes() for file in folder.iterdir()} == first
+    code, _, err = cli("lod scene.ply --cameras . -o levels --levels 2 --steps 4 --resume")
+    assert code == 2
+    assert "other options" in err
+
+
+def broken(folder: Path, how: str) -> None:
+    level, manifest = folder / "scene_lod1.ply", folder / MANIFEST
+    document = json.loads(manifest.read_text())
+    if how == "missing":
+        level.unlink()
+    elif how == "truncated":
+        level.write_bytes(level.read_bytes()[:-7])
+    elif how == "foreign":
+        level.write_bytes((folder / "scene_lod2.ply").read_bytes())
+    elif how == "newer":
+        manifest.write_text(json.dumps(document | {"aaplug_levels": 2}))
+    elif how == "outside":
+        document["levels"][1]["file"] = "../scene.ply"
+        manifest.write_text(json.dumps(document))
+    elif how == "chunks":
+        document["levels"][1]["chunks"] = [10**9]
+        manifest.write_text(json.dumps(document))
+    else:
+        manifest.write_text("{}")
+
+
+BROKEN = {
+    "missing": "scene_lod1.ply: is missing",
+    "truncated": "scene_lod1.ply: is not the level",
+    "foreign": "scene_lod1.ply: is not the level",
+    "newer": "should be version 1, not 'version 2",
+    "outside": "file should be a name without folders",
+    "chunks": "does not have the chunks",
+    "empty": "lod.json",
+}
+
+
+@pytest.mark.parametrize(("how", "said"), BROKEN.items(), ids=BROKEN)
+def test_a_broken_pyramid_is_refused_in_one_line(cli, folder, how, said):
+    broken(folder, how)
+    code, out, err = cli("render levels --cameras . -o images")
+    assert (code, out) == (2, "")
+    assert said in err.splitlines()[-1]
+    with pytest.raises(FormatError):
+        read_pyramid(folder)
+
+
+def test_the_manifest_names_every_level(folder):
+    manifest = read_manifest(folder)
+    assert [level.rate for level in manifest.levels] == [1.0, 0.5, 0.25]
+    assert [sum(level.chunks) for level in manifest.levels] == list(read_pyramid(folder).sizes)
+
+
+def test_tuning_brings_a_level_closer(sample_scene, sample_cameras):
+    few = CameraSet(sample_cameras.train[:4], sample_cameras.test[:1])
+    (merged,) = aaplug.lod(sample_scene, few, simplify=0.1, scale=0.25, refine=False)
+    (tuned,) = aaplug.lod(sample_scene, few, simplify=0.1, scale=0.25, steps=60)
+    assert len(merged.scene) == len(tuned.scene)
+    view = few.test[0].scaled(0.25)
+    truth = Renderer.of(sample_scene, few, "auto", quality="best")(view).rgb
+    before, after = ((Renderer.of(s.scene, few, "matched")(view).rgb - truth).square().mean() for s in (merged, tuned))
+    assert after < 0.8 * before
