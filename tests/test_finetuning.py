@@ -8,6 +8,7 @@ import torch
 from skimage.metrics import structural_similarity as ssim_of_skimage
 
 from aaplug.core.cameras import WHITE, CameraSet
+from aaplug.core.digests import digest_of_scene
 from aaplug.core.errors import FormatError, UsageError
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.projection import rotation_matrices
@@ -320,7 +321,16 @@ def test_a_checkpoint_is_of_its_photographs(tmp_path):
     save(path, job, begin(job), {})
     write_png(photo, torch.ones(*VIEWS[0].hw, 3), overwrite=True)
     with pytest.raises(UsageError, match="its photographs was"):
-        load(path, job)
+        load(path, replace(job))
+
+
+def test_what_a_run_depends_on_is_hashed_once(tmp_path, monkeypatch):
+    job, hashed = make_job(), []
+    told = "aaplug.finetuning.state.digest_of_scene"
+    monkeypatch.setattr(told, lambda scene: hashed.append(scene) or digest_of_scene(scene))
+    for _ in range(3):
+        save(tmp_path / "run.pt", job, begin(job), {})
+    assert len(hashed) == 2  # the start, and the truth's scene
 
 
 def test_the_extent_is_that_of_the_training_cameras():

@@ -7,6 +7,7 @@ tensors, numbers and strings only, and is read as such: nothing in it is execute
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,25 @@ class TuningJob:
     truth: Truth
     settings: Settings
     upsampler: str = ""
+
+    @cached_property
+    def facts(self) -> dict[str, str]:
+        """Everything that a run depends on, as text that can be compared; files are read once."""
+        settings = {key: str(value) for key, value in asdict(self.settings).items()}
+        start, truth = self.start, self.truth
+        photos = [view.photo for view in self.views if view.photo]
+        return settings | {
+            "scene": digest_of_scene(start.scene),
+            "truth": f"{digest_of_scene(truth.own.scene)} {truth.source} {self.upsampler}",
+            "recipe": start.recipe.name,
+            "views": digest_of_cameras(self.views),
+            "training cameras": digest_of_cameras(start.training.cameras),
+            "photographs": digest_of_files(photos) if truth.source == "photographs" else "",
+            "background": str(start.background),
+            "cull margin": str(start.training.cull_margin),
+            "rasterizer": start.rasterizer.name,
+            "number of threads": str(torch.get_num_threads()),  # it changes the order of sums
+        }
 
 
 @dataclass
@@ -115,7 +135,7 @@ def unpacked(data: Mapping[str, Any], job: TuningJob) -> State:
 
 def save(path: Path, job: TuningJob, state: State, good: Mapping[str, Any]) -> None:
     """Write the state and the last good one; if that fails, an older checkpoint is still whole."""
-    content = {"format": FORMAT, "job": _facts(job), "state": packed(state), "good": dict(good)}
+    content = {"format": FORMAT, "job": job.facts, "state": packed(state), "good": dict(good)}
     with replacing(path, overwrite=True) as stream:
         torch.save(content, stream)
 
@@ -131,7 +151,7 @@ def load(path: Path, job: TuningJob) -> tuple[State, dict[str, Any]]:
         content = torch.load(path, weights_only=True)
         if content["format"] != FORMAT:
             raise ValueError(content["format"])
-        for key, value in _facts(job).items():
+        for key, value in job.facts.items():
             if (found := content["job"].get(key)) != value:
                 raise UsageError(
                     str(path), f"is of another run: its {key} was {printable(str(found))}, now it is {value}"
@@ -141,22 +161,3 @@ def load(path: Path, job: TuningJob) -> tuple[State, dict[str, Any]]:
         raise
     except Exception as error:  # torch raises all kinds over a damaged file
         raise FormatError(path, "is damaged, or no checkpoint of this version") from error
-
-
-def _facts(job: TuningJob) -> dict[str, str]:
-    """Everything that a run depends on, as text that can be compared."""
-    settings = {key: str(value) for key, value in asdict(job.settings).items()}
-    start, truth = job.start, job.truth
-    photos = [view.photo for view in job.views if view.photo]
-    return settings | {
-        "scene": digest_of_scene(start.scene),
-        "truth": f"{digest_of_scene(truth.own.scene)} {truth.source} {job.upsampler}",
-        "recipe": start.recipe.name,
-        "views": digest_of_cameras(job.views),
-        "training cameras": digest_of_cameras(start.training.cameras),
-        "photographs": digest_of_files(photos) if truth.source == "photographs" else "",
-        "background": str(start.background),
-        "cull margin": str(start.training.cull_margin),
-        "rasterizer": start.rasterizer.name,
-        "number of threads": str(torch.get_num_threads()),  # it changes the order of sums
-    }
