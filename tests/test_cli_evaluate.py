@@ -1,11 +1,14 @@
 """aaplug evaluate as its users meet it: words, files, exit codes, one-line errors that leave nothing behind."""
 
+import hashlib
 import json
 from pathlib import Path
 
 import pytest
 
+from aaplug.core.digests import digest_of_scene
 from aaplug.io.images import image_size
+from aaplug.io.scenes import read_scene
 from aaplug.methods.recipes import RECIPES
 from aaplug.verbs.evaluate import evaluate
 from tests.test_cli import assert_refused, break_frame, break_nothing, break_photo, cli, dataset  # noqa: F401  (fixtures)
@@ -20,7 +23,8 @@ def test_it_writes_results_and_prints_a_table(cli):  # noqa: F811
     assert results["auto@1"]["PSNR"] is None or results["auto@1"]["PSNR"] > 45
     about = results["_aaplug"]
     assert about["truth"] == "photographs"
-    assert len(about["scene"]["sha256"]) == 64
+    assert about["scene"]["sha256"] == hashlib.sha256(Path("scene.ply").read_bytes()).hexdigest()
+    assert about["scene"]["gaussians_sha256"] == digest_of_scene(read_scene("scene.ply"))
     assert {"aaplug", "torch"} <= set(about["versions"])
     assert list(json.loads(Path("out/per_view.json").read_text())["classic@0.5"]["SSIM"]) == ["r_0"]
 

@@ -34,7 +34,8 @@ def digest_of_cameras(views: Sequence[Camera]) -> str:
 def digest_of_scene(scene: Gaussians) -> str:
     """Hash of the Gaussians, with everything that they are drawn by."""
     digest = hashlib.sha256(repr((scene.convention, scene.fused, scene.flat)).encode())
-    for name, column in scene.columns.items():
+    sizes = {} if scene.pixel_sizes is None else vars(scene.pixel_sizes)
+    for name, column in (scene.columns | sizes).items():
         digest.update(f"{name} {tuple(column.shape)} {column.dtype}".encode())
         digest.update(column.detach().cpu().contiguous().numpy().tobytes())
     return digest.hexdigest()

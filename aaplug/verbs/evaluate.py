@@ -231,8 +231,9 @@ def _facts(
         "platform": f"{platform.system()} {platform.machine()}",
         "scene": {
             "file": origin and Path(origin.path).name,
-            "sha256": digest_of_scene(scene),
+            "sha256": digest_of_files([origin.path]) if origin and Path(origin.path).is_file() else None,
             "gaussians": len(scene),
+            "gaussians_sha256": digest_of_scene(scene),
             "convention": scene.convention.name,
             "evidence": origin and origin.evidence,
         },
