@@ -1,11 +1,16 @@
 """Hashes that tell a continued run whether anything that its result depends on has changed."""
 
+import json
+import os
+import subprocess
+import sys
 from dataclasses import replace
 
 import pytest
 import torch
 
 from aaplug.core.digests import digest_of_scene
+from aaplug.methods.recipes import RECIPES
 from tests.conftest import make_scene, sized
 
 SCENE = sized(make_scene(5))
@@ -24,3 +29,16 @@ CHANGES = {
 def test_a_scene_is_known_by_all_that_it_is_drawn_by(change):
     assert digest_of_scene(CHANGES[change]()) != digest_of_scene(SCENE)
     assert digest_of_scene(replace(SCENE, means=SCENE.means.clone())) == digest_of_scene(SCENE)
+
+
+TOLD = "import json; from aaplug.methods.recipes import RECIPES as r; print(json.dumps({n: r[n].digest for n in r}))"
+
+
+def test_a_recipe_is_known_in_every_process_by_what_it_draws_by():
+    digests = {name: RECIPES[name].digest for name in RECIPES}
+    told = subprocess.check_output([sys.executable, "-c", TOLD], env=os.environ | {"PYTHONHASHSEED": "7"})
+    assert json.loads(told) == digests
+    assert len(set(digests.values())) == len(digests)
+    auto = RECIPES["auto"]
+    assert replace(auto, when="always").digest == auto.digest
+    assert replace(auto, target_rate=0.6).digest != auto.digest

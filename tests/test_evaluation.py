@@ -313,3 +313,11 @@ def test_larger_truth_has_the_averages_of_the_training_size(world):
     full, larger = look(views[0]).rgb, Truth(look, enlarge=back_projected)(views[0], 2.0)
     off = [(box_average(image, 2) - full).square().mean() for image in (larger, look(views[0].scaled(2.0)).rgb)]
     assert off[0] < 0.2 * off[1]
+
+
+def test_what_a_recipe_draws_by_is_part_of_the_request(world, tmp_path):
+    look, views = world
+    first, changed = (task(look, views[:1], recipes=[replace(RECIPES["mip"], grid=grid)]) for grid in (1, 2))
+    evaluate(first, journal=tmp_path / "journal")
+    with pytest.raises(UsageError, match=r"another request \(recipes_sha256 changed"):
+        evaluate(changed, journal=tmp_path / "journal", resume=True)

@@ -280,6 +280,9 @@ def test_checkpoints_of_others_are_refused(tmp_path):
         (tmp_path / "damaged.pt").write_bytes(content)
         with pytest.raises(FormatError, match="damaged"):
             load(tmp_path / "damaged.pt", job)
+    torch.save(torch.load(path) | {"version": 1}, tmp_path / "old.pt")
+    with pytest.raises(FormatError, match="another version: expected aaplug finetune 5, got aaplug finetune 1"):
+        load(tmp_path / "old.pt", job)
     with pytest.raises(UsageError, match="its steps was 6, now it is 13"):
         load(path, replace(job, settings=replace(SETTINGS, steps=13)))
     with pytest.raises(UsageError, match="its scene was"):
@@ -301,6 +304,9 @@ CHANGES = {
         job, start=replace(job.start, scene=replace(job.start.scene, filter_3d=torch.ones(len(job.start.scene))))
     ),
     "truth": lambda job: replace(job, upsampler="lanczos"),
+    "recipe": lambda job: replace(
+        job, start=replace(job.start, recipe=replace(job.start.recipe, screen=RECIPES["mip"].screen))
+    ),
 }
 
 

@@ -2,12 +2,15 @@
 
 import hashlib
 import json
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from os import PathLike
 
 from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import Gaussians
+
+ADDRESS = re.compile(r" at 0x[0-9a-fA-F]+")  # in the text of a function or of an object without a text of its own
 
 
 def digest_of_files(paths: Iterable[str | PathLike[str]]) -> str:
@@ -29,6 +32,11 @@ def digest_of_cameras(views: Sequence[Camera]) -> str:
         [v.name, *v.intrinsics, v.cam_from_world.tolist(), v.trained_focal, v.lens and asdict(v.lens)] for v in views
     ]
     return hashlib.sha256(json.dumps(understood).encode()).hexdigest()
+
+
+def digest_of_values(value: object) -> str:
+    """Hash of dataclasses, names and numbers by their text; functions in it count by name, not by address."""
+    return hashlib.sha256(ADDRESS.sub("", repr(value)).encode()).hexdigest()
 
 
 def digest_of_scene(scene: Gaussians) -> str:

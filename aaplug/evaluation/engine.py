@@ -178,6 +178,7 @@ def _request(task: Task) -> dict[str, Any]:
         "view_names": [view.name for view in task.views],
         "scales": list(task.scales),
         "recipes": {c.name: c.renderer.recipe.source for c in task.candidates},
+        "recipes_sha256": {c.name: c.renderer.recipe.digest for c in task.candidates},
         "rasterizer": task.candidates[0].renderer.rasterizer.name,
     }
 

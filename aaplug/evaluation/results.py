@@ -84,9 +84,9 @@ class Report:
 
     def with_more(self, other: "Report") -> "Report":
         """Join two reports of the same protocol."""
-        recipes = {**self.protocol["recipes"], **other.protocol["recipes"]}
-        protocol = {**self.protocol, "recipes": recipes}
-        return Report(self.measurements + other.measurements, protocol, self.measured + other.measured)
+        joined = {key: self.protocol[key] | other.protocol[key] for key in ("recipes", "recipes_sha256")}
+        measurements, measured = self.measurements + other.measurements, self.measured + other.measured
+        return Report(measurements, {**self.protocol, **joined}, measured)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from aaplug.core.cameras import Camera
 from aaplug.core.digests import digest_of_cameras, digest_of_files, digest_of_scene
-from aaplug.core.errors import FormatError, UsageError, printable
+from aaplug.core.errors import AaplugError, FormatError, UsageError, printable
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.sampling import SamplingBounds
 from aaplug.evaluation.truth import Truth
@@ -28,7 +28,7 @@ from aaplug.io.atomic import replacing
 from aaplug.rendering.renderer import Renderer
 
 EPSILON = 1e-15  # of Adam (3DGS)
-FORMAT = "aaplug finetune 4"
+FORMAT, VERSION = "aaplug finetune", 5  # of a checkpoint
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class TuningJob:
         return settings | {
             "scene": digest_of_scene(start.scene),
             "truth": f"{digest_of_scene(truth.own.scene)} {truth.source} {self.upsampler}",
-            "recipe": start.recipe.name,
+            "recipe": f"{start.recipe.name} {start.recipe.digest}",
             "views": digest_of_cameras(self.views),
             "training cameras": digest_of_cameras(start.training.cameras),
             "photographs": digest_of_files(photos) if truth.source == "photographs" else "",
@@ -135,7 +135,7 @@ def unpacked(data: Mapping[str, Any], job: TuningJob) -> State:
 
 def save(path: Path, job: TuningJob, state: State, good: Mapping[str, Any]) -> None:
     """Write the state and the last good one; if that fails, an older checkpoint is still whole."""
-    content = {"format": FORMAT, "job": job.facts, "state": packed(state), "good": dict(good)}
+    content = {"format": FORMAT, "version": VERSION, "job": job.facts, "state": packed(state), "good": dict(good)}
     with replacing(path, overwrite=True) as stream:
         torch.save(content, stream)
 
@@ -144,20 +144,25 @@ def load(path: Path, job: TuningJob) -> tuple[State, dict[str, Any]]:
     """The state of a run of this job, and the last good one, packed.
 
     Raises:
-        FormatError: the file is damaged or something else.
+        FormatError: the file is damaged, of another version or something else.
         UsageError: it is of another job; the message names the first difference.
     """
     try:
         content = torch.load(path, weights_only=True)
-        if content["format"] != FORMAT:
-            raise ValueError(content["format"])
+        _check_version(path, content)
         for key, value in job.facts.items():
             if (found := content["job"].get(key)) != value:
                 raise UsageError(
                     str(path), f"is of another run: its {key} was {printable(str(found))}, now it is {value}"
                 )
         return unpacked(content["state"], job), content["good"]
-    except UsageError:
+    except AaplugError:
         raise
     except Exception as error:  # torch raises all kinds over a damaged file
-        raise FormatError(path, "is damaged, or no checkpoint of this version") from error
+        raise FormatError(path, "is damaged, or no checkpoint") from error
+
+
+def _check_version(path: Path, content: Mapping[str, Any]) -> None:
+    found = f"{content['format']} {content.get('version', '')}".strip()
+    if found != (expected := f"{FORMAT} {VERSION}"):
+        raise FormatError(path, f"is a checkpoint of another version: expected {expected}, got {printable(found)}")

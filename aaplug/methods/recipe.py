@@ -1,8 +1,9 @@
 """Recipe: how a scene is rendered, as a combination of filters, a pixel kernel and samples per pixel."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+from aaplug.core.digests import digest_of_values
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.interfaces import Compositor, PixelKernel, ScreenFilter, Selection, WorldFilter
 from aaplug.methods.pixel_kernels import POINT
@@ -55,6 +56,11 @@ class Recipe:
     levels_grid: int = 0
     for_discs: str | None = None
     promises: Promises = Promises()
+
+    @property
+    def digest(self) -> str:
+        """Hash of what it draws by: all but the words about it."""
+        return digest_of_values(replace(self, source="", when="", promises=Promises()))
 
     def samples_at(self, relative_rate: float) -> int:
         """Samples along a pixel's side, for a view at `relative_rate` against training."""
