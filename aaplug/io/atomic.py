@@ -9,7 +9,7 @@ Functions raise OutputError for an output that exists while `overwrite` is false
 import hashlib
 import os
 import secrets
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from os import PathLike
 from pathlib import Path
@@ -56,12 +56,17 @@ def replacing_file(path: str | PathLike[str], overwrite: bool, suffix: str = ".t
 
 
 @contextmanager
-def claimed(path: str | PathLike[str]) -> Iterator[None]:
-    """Keep other processes from writing an output, a file or a folder, while the block runs.
+def claimed(path: str | PathLike[str] | None, check: Callable[[], object] = lambda: None) -> Iterator[None]:
+    """Keep other processes from writing an output, a file or a folder, while the block runs; None claims nothing.
+
+    check: refuses what must not be written.  It is called again here, as another process may have written meanwhile.
 
     Raises:
         OutputError: another process is writing it, or nothing can be written beside it.
     """
+    if path is None:
+        yield
+        return
     path = Path(os.path.realpath(path))
     name = OURS + hashlib.sha256(os.fsencode(path.name)).hexdigest()[:DIGITS]
     mark = path / name if path.is_dir() else path.with_name(name)
@@ -73,6 +78,7 @@ def claimed(path: str | PathLike[str]) -> Iterator[None]:
         except OSError as error:
             raise OutputError(path, f"cannot be written: {reason(error)}") from error
         stack.callback(mark.unlink, missing_ok=True)
+        check()
         yield
 
 

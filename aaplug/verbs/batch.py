@@ -86,11 +86,17 @@ def batch(
         AaplugError: there are results already, an option does not fit, or the summary cannot be written.
     """
     folders = [Path(output) / slug for slug in file_names([name for name, _ in runs], "scene", 3)]
-    refuse_existing([Path(output) / name for name in (SUMMARY, RESULTS)], overwrite or resume)
+    check = partial(_check, Path(output), folders, resume, overwrite)
+    check()
+    with output_folder(output) as made, claimed(made, check):
+        return _batch(runs, folders, made, resume, overwrite, monitor)
+
+
+def _check(output: Path, folders: Sequence[Path], resume: bool, overwrite: bool) -> None:
+    """Refuse what would replace results."""
+    refuse_existing([output / name for name in (SUMMARY, RESULTS)], overwrite or resume)
     for folder in folders:
         check_results(folder, EvaluateOptions(resume=resume, overwrite=overwrite))
-    with output_folder(output) as made, claimed(made):
-        return _batch(runs, folders, Path(output), resume, overwrite, monitor)
 
 
 def _batch(

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,6 +16,7 @@ from aaplug.core.training import TrainingViews
 from aaplug.evaluation.results import Report
 from aaplug.finetuning.fitting import fit, steps_for
 from aaplug.inspection.survey import check_frame_of
+from aaplug.io.atomic import claimed
 from aaplug.io.cameras import select_views
 from aaplug.io.scenes import SpzAxes, check_scene_output, write_parts, write_scene
 from aaplug.io.scenes.scene_file import SceneFile
@@ -110,10 +112,10 @@ def convert(
     o = ConvertOptions.of(options)
     chosen, path = o.chosen(), None if output is None else Path(output)
     opened = opened_with(scene, None if cameras is None else cameras_of(cameras, scene), monitor)
-    if path is not None:
-        check_scene_output(path, o.overwrite, sources_of(opened))
+    check = partial(check_scene_output, path, o.overwrite, sources_of(opened)) if path else lambda: None
+    check()
     writing = {"overwrite": o.overwrite, "spz_axes": spz_axes}
-    with processor(o.threads) as workers:
+    with processor(o.threads) as workers, claimed(path, check):
         if path and isinstance(opened, SceneFile) and opened.count > LARGE and isinstance(chosen, Form):
             train = _train_of(opened, cameras, o.min_seen)
             with monitor.progress("converting", "Gaussians") as tell:
@@ -125,9 +127,9 @@ def convert(
             found = Converted(_fused(whole, cameras, chosen, o.min_seen), MIP_VIEWER)
         else:
             found = _fitted(whole, cameras_of(cameras, whole), chosen, o, monitor)
-    if path is not None:
-        assert found.scene is not None
-        write_scene(path, found.scene, **writing)
+        if path is not None:
+            assert found.scene is not None
+            write_scene(path, found.scene, **writing)
     return found
 
 

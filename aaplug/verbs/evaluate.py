@@ -2,8 +2,8 @@
 
 import math
 import platform
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -118,7 +118,8 @@ def evaluate(
     source = _source(o.truth, rules, seen, monitor)
     facts = _facts(scene.scene if isinstance(scene, Pyramid) else scene, cameras, seen, source, o)
     images = folder and ImageStore(folder, shown, everything=o.layout == "inria")
-    with processor(o.threads), _claimed(folder, o):
+    made = nullcontext() if folder is None else output_folder(folder)
+    with processor(o.threads), made, claimed(folder, lambda: check_results(folder, o)):
         look = look_of(scene, cameras, len(seen) * len(recipes) * len(scales), o, monitor)
         candidates = candidates_of(scene, look.training, recipes, look.rasterizer, look.background)
         task = Task(candidates, scales, seen, Truth(look, source, rules), metrics)
@@ -135,17 +136,6 @@ def evaluate(
             for path in written:
                 monitor.say(f"wrote {path}")
     return found
-
-
-@contextmanager
-def _claimed(folder: Path | None, o: EvaluateOptions) -> Iterator[None]:
-    """The folder of the results, for this process alone; nothing without one."""
-    if folder is None:
-        yield
-        return
-    with output_folder(folder), claimed(folder):
-        check_results(folder, o)  # again: another process may have written there since
-        yield
 
 
 def check_results(folder: Path | None, o: EvaluateOptions) -> None:

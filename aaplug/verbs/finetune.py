@@ -2,8 +2,8 @@
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -129,12 +129,13 @@ def finetune(
     settings, viewer, path = _settings(o), _viewer(o), None if output is None else Path(output)
     held, cameras = inputs_of(scene, cameras, monitor)
     scene = whole_of(held)
-    _check(path, sources_of(scene), o)
+    check = partial(_check, path, sources_of(scene), o)
+    check()
     shown, source = select_views(cameras, o.views), _source(o.truth, cameras)
     enlarge = back_projected if o.upsampler is None else upsampled(find_upsampler(o.upsampler))
     named = str(o.upsampler)
     written = digest_of_files([named]) if Path(named).is_file() else named
-    with processor(o.threads), nullcontext() if path is None else claimed(path):
+    with processor(o.threads), claimed(path, check):
         look = look_of(scene, cameras, settings.steps, o, monitor)
         before = replace(look, scene=viewer.shown(look.scene), recipe=RECIPES[viewer.recipe])
         start = replace(before, scene=fuse_for(scene, look.training, viewer))

@@ -2,13 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from aaplug.core.cameras import Camera
 from aaplug.core.errors import listing
 from aaplug.core.monitor import SILENT, Monitor
-from aaplug.io.atomic import output_folder
+from aaplug.io.atomic import claimed, output_folder
 from aaplug.io.cameras import select_views
 from aaplug.io.scenes.scene_file import SceneFile
 from aaplug.methods.recipes import find_recipe
@@ -74,15 +75,16 @@ def render(
         recipe = find_recipe(recipe, quality=o.quality, rate_reference=o.rate_reference)
     cameras = cameras_of(cameras, scene)
     shown = resized(select_views(cameras, o.views), o.scale, o.resolution)
-    paths = image_paths(Path(output), shown, o.overwrite)
+    check = partial(image_paths, Path(output), shown, o.overwrite)
+    paths = check()
     scene, harmonics = drawable(opened_with(scene, cameras, monitor), drop_bad)
-    with processor(o.threads) as workers:
+    with processor(o.threads) as workers, output_folder(paths[0].parent), claimed(output, check):
         renderer = drawn_by(recipe, scene, look_of(scene, cameras, len(shown), o, monitor))
         renderer = replace(renderer, harmonics=harmonics)
         monitor.say(described(renderer, shown))
         announce([renderer], shown, monitor, processes=workers)
         how = {"threads": workers, "bit_depth": o.bit_depth, "overwrite": o.overwrite}
-        with output_folder(paths[0].parent), monitor.progress("rendering", "views") as tell:
+        with monitor.progress("rendering", "views") as tell:
             write_frames(renderer, shown, paths, **how, tell=tell)
     return [Written(*pair) for pair in zip(shown, paths, strict=True)]
 

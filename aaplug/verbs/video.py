@@ -17,6 +17,7 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.core.monitor import SILENT, Monitor
 from aaplug.evaluation.protocols import median_depth
 from aaplug.evaluation.report.contact_sheet import labelled, magnified
+from aaplug.io.atomic import claimed
 from aaplug.io.cameras import select_views
 from aaplug.io.cameras.camera_path import read_camera_path
 from aaplug.io.video import MOST_FPS, check_video
@@ -89,7 +90,8 @@ def video(
     recipes = [recipe_of(recipe, o) for recipe in (left, o.recipe) if recipe != "none"]
     free = None if str(o.path) in MOVES else read_camera_path(Path(o.path))
     fps = o.fps or (FPS if free is None else free.fps)
-    check_video(Path(output), fps, o.overwrite)
+    check = partial(check_video, Path(output), fps, o.overwrite)
+    check()
     scene, cameras = inputs_of(scene, cameras, monitor)
     path = free.cameras if free else _along(whole_of(scene), cameras, o, fps, monitor)
     shown = resized(path, o.scale, o.resolution)
@@ -99,7 +101,7 @@ def video(
         rate = camera_paths.factor(index / len(shown), o.start, o.end) if str(o.path) in RECEDING else 1.0
         return side_by_side(images, labels, rate, shown[index].width / path[index].width)
 
-    with processor(o.threads) as workers:
+    with processor(o.threads) as workers, claimed(output, check):
         look = look_of(scene, cameras, len(shown) * len(recipes), o, monitor)
         renderers = [drawn_by(recipe, scene, look) for recipe in recipes]
         size = f"{shown[0].width}x{shown[0].height}"

@@ -1,0 +1,64 @@
+"""An output is written by one process; what another wrote meanwhile is not replaced."""
+
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from aaplug.io import atomic
+from aaplug.io.atomic import claimed
+from tests.test_cli import cli, dataset  # noqa: F401  (fixtures)
+
+SCENE = "scene.ply --cameras . --rasterizer eager"
+OUTPUTS = {  # verb, words, what is claimed, what a rival writes there
+    "render": (f"render {SCENE} -o images", "images", "r_0.png"),
+    "one image": (f"render {SCENE} -o view.png", "view.png", ""),
+    "convert": ("convert scene.ply --cameras . -o c.ply", "c.ply", ""),
+    "video": (f"video {SCENE} -o v.webm --seconds 0.1", "v.webm", ""),
+    "finetune": (f"finetune {SCENE} -o t.ply --steps 1 --truth self --scale 0.5", "t.ply", ""),
+    "evaluate": (f"evaluate {SCENE} -o out --recipe mip --scale 0.5", "out", "results.json"),
+    "batch": ("evaluate --cameras . -o many --recipe mip --scale 0.5 --batch scenes.toml", "many", "batch.json"),
+}
+
+
+@pytest.fixture
+def job(cli):  # noqa: F811
+    """Run a verb; gives exit code and error."""
+    Path("scenes.toml").write_text('[[scene]]\nscene = "scene.ply"\n')
+
+    def run(words: str) -> tuple[int, str]:
+        code, _, err = cli(words)
+        return code, err
+
+    return run
+
+
+@pytest.mark.parametrize("name", OUTPUTS)
+def test_a_second_process_is_refused(name, job):
+    words, output, file = OUTPUTS[name]
+    if file:
+        Path(output).mkdir()
+    with claimed(output):
+        code, err = job(f"{words} --overwrite")
+    assert code == 2
+    assert f"{output}: is being written by another process" in err.splitlines()[-1]
+    assert list(Path().glob(f"{output}/*")) == []
+    assert job(f"{words} --overwrite")[0] == 0
+
+
+@pytest.mark.parametrize("name", OUTPUTS)
+def test_what_another_process_wrote_meanwhile_is_not_replaced(name, job, monkeypatch):
+    words, output, file = OUTPUTS[name]
+    real, written = atomic.new_file, Path(output) / file
+
+    @contextmanager
+    def after_a_rival(path):
+        written.write_bytes(b"rival's")
+        with real(path):
+            yield
+
+    monkeypatch.setattr(atomic, "new_file", after_a_rival)
+    code, err = job(words)
+    assert (code, written.read_bytes()) == (2, b"rival's")
+    assert "exists" in err or "already holds" in err
+    assert not any(word in err for word in ("tuning for", "rendering:", "---"))
