@@ -52,12 +52,15 @@ def test_a_process_that_dies_is_one_clear_error():
 def test_a_worker_ends_when_its_parent_is_killed(tmp_path):
     script = tmp_path / "parent.py"
     script.write_text(PARENT)
-    with subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE) as parent:
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen([sys.executable, str(script)], **streams) as parent:
         assert parent.stdout is not None
+        assert parent.stderr is not None
         assert parent.stdout.readline() == b"working\n"
         workers = psutil.Process(parent.pid).children()
         parent.kill()
         gone, alive = psutil.wait_procs(workers, timeout=30)
+        assert parent.stderr.read() == b""  # Python's resource tracker warns of what it removes
     assert gone
     assert not alive
 

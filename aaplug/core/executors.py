@@ -7,6 +7,7 @@ with the number of items.  Leaving the loop early, also by an exception, ends th
 import multiprocessing
 import os
 import shutil
+import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
@@ -14,6 +15,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, Thr
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -21,6 +23,9 @@ import torch
 
 from aaplug.core.errors import UsageError
 from aaplug.core.locks import scratch
+
+# an option of Python: its resource tracker removes what killed processes left, and need not say so
+QUIET = "ignore::UserWarning:multiprocessing.resource_tracker"
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -66,6 +71,7 @@ class Processes:
         with scratch() as folder:
             torch.save(work, folder / "work.pt")
             start = (str(folder), self.torch_threads)
+            _track_quietly()
             spawn = multiprocessing.get_context("spawn")
             pool = ProcessPoolExecutor(self.workers, spawn, _start, start)
             try:
@@ -107,6 +113,17 @@ def _next(waiting: "deque[Future[R]]", ordered: bool) -> R:
     done = waiting[0] if ordered else next(iter(wait(waiting, return_when=FIRST_COMPLETED).done))
     waiting.remove(done)
     return done.result()
+
+
+def _track_quietly() -> None:
+    """Start Python's resource tracker, which inherits the options of warnings, before the first worker does."""
+    if os.name != "posix":  # there is none
+        return
+    sys.warnoptions.append(QUIET)
+    try:
+        resource_tracker.ensure_running()
+    finally:
+        sys.warnoptions.remove(QUIET)
 
 
 _work: Callable[[Any], Any] | None = None  # what this worker process does
