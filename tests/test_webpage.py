@@ -15,6 +15,7 @@ from markupsafe import escape
 
 from aaplug.core.cameras import CameraSet
 from aaplug.core.training import TrainingViews
+from aaplug.evaluation.report import webpage
 from aaplug.evaluation.report.plots import plots
 from aaplug.inspection.coverage import coverage
 from aaplug.io.images import image_size, write_png
@@ -288,6 +289,24 @@ def test_any_number_of_recipes_stands_side_by_side(opened):
     page.locator("#roles input[value=auto]").click(force=True)  # the last one stays
     page.wait_for_function("document.querySelector('#roles input[value=auto]').checked")
     assert data(page, "shown").endswith("|auto|image")
+
+
+PICTURES = (Path(webpage.__file__).parent / "pictures.js").read_text()
+MAPS = (
+    f"async () => {{{PICTURES}"
+    + """
+  const gallery = JSON.parse(document.getElementById("gallery").textContent);
+  const {images} = gallery.shots.find((shot) => gallery.truth in shot.images);
+  const [truth, one] = [gallery.truth, "classic"].map((role) => images[role].uri);
+  const maps = await Promise.all([errorMap(one, truth), errorMap(one, one)]);
+  return maps.map(({largest}) => largest);
+}"""
+)
+
+
+def test_an_image_has_an_error_against_each_other_one(opened):
+    against_truth, against_itself = opened().evaluate(MAPS)
+    assert against_truth > 0 == against_itself
 
 
 def test_error_mode_explains_an_empty_side(opened):

@@ -18,10 +18,10 @@ function sheetOf(width, height) {
   return [sheet, sheet.getContext("2d", {willReadFrequently: true})];
 }
 
-function once(make) { // remembers what `make` promised, by its first argument
+function once(make) { // remembers what `make` promised, by its argument
   const known = new Map();
-  return (key, ...rest) => {
-    if (!known.has(key)) known.set(key, make(key, ...rest));
+  return (key) => {
+    if (!known.has(key)) known.set(key, make(key));
     return known.get(key);
   };
 }
@@ -35,7 +35,8 @@ const picture = once(async (uri) => { // a canvas that holds the image
   return sheet;
 });
 
-const errorMap = once(async (uri, truth) => { // the worst channel's difference at each pixel, and the largest of all
+const errorMap = (uri, truth) => errorsAgainst(truth)(uri);
+const errorsAgainst = once((truth) => once(async (uri) => { // the worst channel's difference at each pixel, and the largest of all
   const sheets = await Promise.all([picture(uri), picture(truth)]);
   const {width, height} = sheets[0];
   const [x, y] = sheets.map((sheet) => sheet.getContext("2d").getImageData(0, 0, width, height).data);
@@ -48,7 +49,7 @@ const errorMap = once(async (uri, truth) => { // the worst channel's difference 
   }
   ink.putImageData(out, 0, 0);
   return {map, largest};
-});
+}));
 
 function packed(count, width, height, ratio) { // how wide `count` tiles can be in a box, and in how many columns
   const choices = Array.from({length: count}, (_, i) => {
