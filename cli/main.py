@@ -3,6 +3,7 @@
 Exit codes: 0 all done, 1 some of the work failed, 2 the request cannot be carried out, 130 interrupted.
 """
 
+import errno
 import os
 import re
 import sys
@@ -11,9 +12,11 @@ from importlib import import_module
 from importlib.metadata import version
 from typing import Any, get_args, get_origin
 
-from aaplug.core.errors import AaplugError, UsageError, reason
+from aaplug.core.errors import AaplugError, UsageError, printable, reason
 
 FAILED, REFUSED, INTERRUPTED = 1, 2, 130
+UNWRITABLE = (errno.EPIPE, errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EIO)  # what writing our output meets
+FILE = re.compile(r".*/.*|.*\.[A-Za-z]\w*", re.DOTALL)  # a word that names a file, unlike names and numbers
 VERBS = ("info", "convert", "lod", "render", "evaluate", "video", "finetune", "demo", "warmup", "bench")
 
 
@@ -27,11 +30,13 @@ def main(words: Sequence[str] | None = None) -> None:
         print("interrupted", file=sys.stderr)
         sys.exit(INTERRUPTED)
     except OSError as error:
-        if error.filename is None:  # our output: its reader has gone, or the disk is full; flush nothing at exit
+        of_output = error.filename is None and error.errno in UNWRITABLE
+        if of_output:  # its reader has gone, or the disk is full; flush nothing at exit
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         if isinstance(error, BrokenPipeError):
             sys.exit(FAILED)
-        print(f"error: {error.filename or 'output'}: {reason(error)}", file=sys.stderr)
+        where = error.filename or ("output" if of_output else f"unexpected {type(error).__name__}")
+        print(f"error: {printable(f'{where}: {reason(error)}')}", file=sys.stderr)
         sys.exit(REFUSED)
 
 
@@ -101,13 +106,15 @@ def _worded(error: AaplugError, words: Sequence[str]) -> str:
 def _parted(words: Sequence[str]) -> list[str]:
     """The words as the parser wants them.
 
-    `--scale 1,0.25` becomes `--scale 1 0.25`; `--views`, whose names hold commas, stays.  `--resolution -1x720` becomes
-    one word, because the parser would take the value for an option.
+    `--scale 1,0.25` becomes `--scale 1 0.25`; `--views`, whose names hold commas, stays.  A file after such values goes
+    to the front, where the parser does not take it for one of them.  `--resolution -1x720` becomes one word, because
+    the parser would take the value for an option.
     """
     types = _option_types(words).items()
     several = {"--" + n.replace("_", "-") for n, t in types if Sequence in list(map(get_origin, (t, *get_args(t))))}
     option = ""
     parted: list[str] = []
+    files: list[str] = []
     for word in words:
         if parted and parted[-1] == "--resolution" and re.fullmatch(r"-?\d+x-?\d+", word):
             parted[-1] += "=" + word
@@ -116,8 +123,10 @@ def _parted(words: Sequence[str]) -> list[str]:
         option = flag if word.startswith("-") else option
         if option not in several:
             parted.append(word)
+        elif flag != option and FILE.fullmatch(word):
+            files.append(word)
         elif flag == option:
             parted += [option, *filter(None, value.split(","))]
         else:
             parted += filter(None, word.split(","))
-    return parted
+    return [*parted[:1], *files, *parted[1:]]

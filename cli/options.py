@@ -66,7 +66,7 @@ class SceneOptions(Options):
     def path(self) -> Path:
         """What the user named."""
         if (self.scene is None) == (self.model_path is None):
-            raise UsageError("scene", "name one scene: a .ply, a model folder, or -m FOLDER")
+            raise UsageError("scene", "name one scene, before the options: a .ply, a model folder, or -m FOLDER")
         return self.scene or cast(Path, self.model_path)
 
     def open(self) -> SceneFile:

@@ -1,5 +1,7 @@
 """Odd inputs and surroundings: each ends with a result or with one line, never with a traceback or a stray file."""
 
+import errno
+import json
 import os
 import subprocess
 import sys
@@ -8,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from aaplug_cli.main import main
 
 from aaplug.core.errors import FormatError
 from aaplug.io.cameras import read_cameras
@@ -85,6 +88,24 @@ def test_a_folder_may_have_a_dot(cli):  # noqa: F811
     assert cli("render scene.ply --cameras . -o results_v1.0 --scale 0.5")[0] == 0
     assert [path.name for path in Path("results_v1.0").iterdir()] == ["r_0.png"]
     assert "name a folder" in cli("render scene.ply --cameras . -o new.jpg --scale 0.5")[2]
+
+
+@pytest.mark.parametrize("before", ["--scale 0.5 0.25", "--scale=0.5,0.25", "--scale 0.5 0.25 --recipe mip"])
+def test_a_scene_may_follow_an_option_of_several_values(cli, before):  # noqa: F811
+    words = "--cameras . --metric psnr --json --rasterizer eager"
+    code, out, _ = cli(f"evaluate {words} --recipe mip {before} ./scene.ply")
+    assert code == 0
+    assert {"mip@0.5", "mip@0.25"} <= json.loads(out).keys()
+
+
+def test_an_error_of_the_system_is_told_by_what_it_is(monkeypatch, capsys):
+    def fails(words):
+        raise OSError(errno.ENOMEM, "Cannot allocate memory")
+
+    monkeypatch.setattr("aaplug_cli.main.run", fails)
+    with pytest.raises(SystemExit, match="2"):
+        main(["info"])
+    assert capsys.readouterr().err == "error: unexpected OSError: cannot allocate memory\n"
 
 
 def test_a_comma_at_the_end_names_no_view(cli):  # noqa: F811
