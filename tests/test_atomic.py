@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from aaplug.core.errors import OutputError
-from aaplug.core.locks import remove_left, remove_scratch, scratch
+from aaplug.core.locks import remove_left, scratch
 from aaplug.io.atomic import check_output, claimed, output_folder, replacing
 
 OLD, NEW = b"old", b"new and longer"
@@ -216,7 +216,6 @@ def test_only_what_is_surely_ours_is_removed(tmp_path: Path):
     (left / "aaplug.lock").touch()
     (tmp_path / ".aaplug-00000000000000ff.tmp").touch()
     remove_left.cache_clear()
-    remove_scratch.cache_clear()
     before = set(tmp_path.iterdir())
     remove_left(tmp_path)
     with scratch(str(tmp_path)) as folder:

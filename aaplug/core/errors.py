@@ -8,6 +8,8 @@ import difflib
 from collections.abc import Iterable, Sequence
 from os import PathLike
 
+SHOWN = 60  # characters of a refused value in a message
+
 
 class AaplugError(Exception):
     """Any mistake in the user's input, worded for the user."""

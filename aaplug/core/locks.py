@@ -69,7 +69,7 @@ def scratch(parent: str | None = None) -> Iterator[Path]:
                 lock(mark, wait=True)
                 if not _is_at(mark, folder / MARK):
                     continue
-                remove_scratch(folder.parent)
+                remove_left(folder.parent)
                 yield folder
                 return
             finally:
@@ -78,20 +78,13 @@ def scratch(parent: str | None = None) -> Iterator[Path]:
 
 @cache
 def remove_left(folder: Path) -> None:
-    """Remove the temporary files of dead processes beside outputs; once for each folder."""
+    """Remove what dead processes left in a folder: files beside outputs, folders of temporary files; once for each."""
     with suppress(OSError):
-        for path in [folder / entry.name for entry in os.scandir(folder) if OUR_FILE.fullmatch(entry.name)]:
+        for path in [folder / entry.name for entry in os.scandir(folder)]:
             with suppress(OSError):  # somebody else's, or gone
-                _remove_unless_held(path)
-
-
-@cache
-def remove_scratch(folder: Path) -> None:
-    """Remove the folders of temporary files of dead processes; once for each folder."""
-    with suppress(OSError):
-        for path in [folder / entry.name for entry in os.scandir(folder) if entry.name.startswith(SCRATCH)]:
-            with suppress(OSError):
-                if not path.is_symlink():
+                if OUR_FILE.fullmatch(path.name):
+                    _remove_unless_held(path)
+                elif path.name.startswith(SCRATCH) and not path.is_symlink():
                     _remove_unless_held(path / MARK, path)
 
 

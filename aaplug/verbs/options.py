@@ -11,7 +11,7 @@ from typing import Annotated, Any, TypeVar, cast, get_args, get_type_hints
 
 import tyro
 
-from aaplug.core.errors import UsageError, did_you_mean
+from aaplug.core.errors import SHOWN, UsageError, did_you_mean
 from aaplug.core.interfaces import Rasterizer
 from aaplug.core.sampling import MIN_SEEN_SHARE
 from aaplug.methods.filters.matched import RateReference
@@ -83,7 +83,6 @@ _SHARE = number(0, 1)
 THREADS = number(1, max(8, os.cpu_count() or 1), whole=True)  # more gain nothing, and can exhaust the machine
 _GIGABYTES = number(0.01, 1024)
 _MARGIN = number(0, math.inf)
-SHOWN = 60  # letters of a refused value
 _RESEARCH = {recipe.name for recipe in RESEARCH_RECIPES}
 RECIPE_NAMES = [name for name in RECIPES if name not in _RESEARCH]  # a user's, and plug-ins'
 

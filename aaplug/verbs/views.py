@@ -5,13 +5,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from aaplug.core.cameras import Camera
-from aaplug.core.errors import OutputError, UsageError
+from aaplug.core.errors import SHOWN, OutputError, UsageError
 from aaplug.io.atomic import check_output, refuse_existing
 
 MAX_SIDE = 16384  # px
 IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".exr", ".bmp", ".gif")  # any other name is a folder
 LONGEST_NAME = 200  # bytes; file systems take 255, and a number and a suffix are added
-SHOWN = 60  # letters of a refused value
 
 
 def resized(views: Sequence[Camera], scale: float | None = None, resolution: str | None = None) -> list[Camera]:

@@ -14,13 +14,12 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from aaplug.core.errors import FormatError
+from aaplug.core.errors import SHOWN, FormatError
 from aaplug.io.limits import whole_limit
 from aaplug.io.values import read_start
 
 MAX_COUNT_DIGITS = 18  # still an int64
 BYTES = "latin-1"  # one character per byte
-MAX_SHOWN = 60  # characters of an offending line in a message
 LITTLE, BIG, TEXT = "binary_little_endian", "binary_big_endian", "ascii"
 LEAST_TEXT = 2  # bytes of a value in text: a digit and a separator
 PACKED = re.compile(rb"property\s+uint\w*\s+packed_position")  # in a .compressed.ply
@@ -191,7 +190,7 @@ def parse(path: str, lines: Iterable[str], newline: str, size: int | None = None
             case ["comment" | "obj_info", *_] | []:
                 pass
             case _ if not line.isascii():
-                raise FormatError(path, f"line {number} of the header is not ASCII: {line[:MAX_SHOWN]!r}")
+                raise FormatError(path, f"line {number} of the header is not ASCII: {line[:SHOWN]!r}")
             case ["format", *words]:
                 formats.append(words)
             case ["element", name, count]:
@@ -200,7 +199,7 @@ def parse(path: str, lines: Iterable[str], newline: str, size: int | None = None
                 grown = (*elements[-1].properties, column)
                 elements[-1] = Element(elements[-1].name, elements[-1].count, grown)
             case _:
-                raise FormatError(path, f"line {number} of the header is not PLY: {line[:MAX_SHOWN]!r}")
+                raise FormatError(path, f"line {number} of the header is not PLY: {line[:SHOWN]!r}")
     coding = _coding(path, formats)
     _check_unique(path, elements)
     size = len(_content(lines, newline)) if size is None else size
@@ -241,7 +240,7 @@ def _content(lines: Iterable[str], newline: str) -> bytes:
 
 def _count(path: str, name: str, count: str) -> int:
     if not re.fullmatch(r"\d+", count, re.ASCII) or len(count) > MAX_COUNT_DIGITS:
-        raise FormatError(path, f"element {name!r} has the impossible count {count[:MAX_SHOWN]!r}")
+        raise FormatError(path, f"element {name!r} has the impossible count {count[:SHOWN]!r}")
     return int(count)
 
 
@@ -257,7 +256,7 @@ def _coding(path: str, formats: list[list[str]]) -> str:
     for coding in (LITTLE, BIG, TEXT):
         if formats == [[coding, "1.0"]]:
             return coding
-    found = " and ".join(" ".join(words)[:MAX_SHOWN] for words in formats) or "none"
+    found = " and ".join(" ".join(words)[:SHOWN] for words in formats) or "none"
     raise FormatError(path, f"its format is {found}; known are {LITTLE}, {BIG} and {TEXT}, each 1.0")
 
 
