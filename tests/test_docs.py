@@ -9,6 +9,7 @@ from aaplug.io.scenes import SCENE_FORMATS
 from aaplug.methods.viewers import MOST_DEGREE, VIEWERS, Viewer
 
 ROOT = Path(__file__).resolve().parents[1]
+TEXTS = [ROOT / "README.md", *sorted((ROOT / "examples").rglob("*.md"))]
 ROWS = [
     line
     for line in (ROOT / "examples" / "guides" / "formats.md").read_text().splitlines()
@@ -65,3 +66,8 @@ def row_of(viewer: Viewer) -> str:
 @pytest.mark.parametrize("viewer", VIEWERS.values(), ids=VIEWERS)
 def test_each_viewer_has_its_row(viewer: Viewer):
     assert row_of(viewer) in (ROOT / "examples" / "guides" / "viewers.md").read_text().splitlines()
+
+
+@pytest.mark.parametrize("text", TEXTS, ids=lambda path: path.name)
+def test_no_text_holds_a_placeholder(text: Path):
+    assert re.findall(r"@[A-Z]+@", text.read_text()) == []
