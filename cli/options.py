@@ -85,7 +85,9 @@ class SceneOptions(Options):
             f"{opened.convention.name} ({opened.evidence})"
         )
         for note in opened.notes:
-            say(worded(f"scene: {note}", SceneOptions.__dataclass_fields__))
+            open_yet = opened.other is not None and note == opened.notes[-1]
+            told = f"unless the cameras tell otherwise, {note}" if open_yet else note
+            say(worded(f"scene: {told}", SceneOptions.__dataclass_fields__))
         for fusion in opened.fused:
             say(f"fused: {describe(fusion)}")
         return opened

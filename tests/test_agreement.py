@@ -6,12 +6,15 @@ from pathlib import Path
 
 import pytest
 import torch
+from aaplug_cli.options import SceneOptions
 
 from aaplug.core.cameras import WHITE, CameraSet
+from aaplug.core.gaussians import Gaussians
 from aaplug.core.training import TrainingViews
 from aaplug.evaluation.truth import own_look
 from aaplug.io.scenes import open_scene, read_scene, write_scene
 from aaplug.io.scenes.packed import half_turn_about_x
+from aaplug.io.scenes.scene_file import SceneFile
 from aaplug.verbs.agreement import Agreement, agreement, settled
 from aaplug.verbs.render import render
 from tests.conftest import make_camera, make_scene
@@ -64,6 +67,38 @@ def test_a_spz_is_read_as_fits_the_cameras(sample_scene, sample_cameras, tmp_pat
     expected = read_scene(tmp_path / "a.spz", spz_axes=axes)
     assert torch.equal(chosen.whole().means, expected.means)
     assert torch.equal(chosen.whole().sh, expected.sh)
+
+
+def test_of_two_readings_each_is_decoded_once_and_what_is_odd_is_said_once(sample_scene, sample_cameras, caplog):
+    scene = replace(sample_scene[:3000], origin=None)
+    scene.means[0], scene.sh[1] = torch.nan, 1e5
+    decoded = []
+
+    def reading(turned: bool, **other) -> SceneFile:
+        def load(start: int, stop: int) -> Gaussians:
+            decoded.append(turned)
+            return (half_turn_about_x(scene) if turned else scene)[start:stop]
+
+        return SceneFile(
+            Path("a.spz"), "spz", len(scene), 3, load, "", notes=("turned" if turned else "stored",), **other
+        )
+
+    with caplog.at_level(logging.WARNING, "aaplug"):
+        chosen = settled(reading(True, other=reading(False)), sample_cameras)
+        assert caplog.messages == []
+        assert torch.equal(chosen.whole(drop_bad=True).means, scene.means[1:])
+    assert sorted(decoded) == [False, True]
+    assert [("left out" in said, "a harmonic beyond" in said) for said in caplog.messages] == [(0, 1), (1, 0)]
+    assert chosen.other is None
+
+
+def test_a_reading_that_the_cameras_may_change_is_told_as_such(sample_scene, tmp_path, capsys):
+    pytest.importorskip("gsply")
+    write_scene(tmp_path / "a.spz", sample_scene[:100], spz_axes="opencv")
+    for axes, provisional in (("auto", True), ("opencv", False)):
+        SceneOptions(scene=tmp_path / "a.spz", spz_axes=axes).open()
+        told = [line for line in capsys.readouterr().err.splitlines() if "axes" in line]
+        assert [line.startswith("scene: unless the cameras tell otherwise, ") for line in told] == [provisional]
 
 
 def test_without_evidence_a_spz_follows_its_specification(sample_scene, sample_cameras, tmp_path: Path):

@@ -16,7 +16,7 @@ from aaplug.core.monitor import SILENT, Monitor
 from aaplug.core.rules import NEAR
 from aaplug.core.training import TrainingViews
 from aaplug.io.photographs import read_photo
-from aaplug.io.scenes.scene_file import SceneFile
+from aaplug.io.scenes.scene_file import SceneFile, usable
 from aaplug.rendering.renderer import Renderer, background_colour
 
 SAMPLE = 50_000  # Gaussians whose places are looked at
@@ -72,10 +72,13 @@ def agreement(look: Renderer, cameras: CameraSet) -> Agreement:
 
 
 def settled(opened: SceneFile, cameras: CameraSet, monitor: Monitor = SILENT) -> SceneFile:
-    """The reading of a file that fits the cameras, where the file does not say which of two is meant."""
+    """The reading of a file that fits the cameras, where the file does not say which of two is meant.
+
+    Each reading is decoded once, and what is odd in it is left to whoever uses it.
+    """
     if opened.other is None:
         return opened
-    readings = opened, opened.other
+    readings = opened.held(), opened.other.held()
     first, second = (agreement(_look(reading, cameras), cameras) for reading in readings)
     if first.gain is not None and second.gain is not None:
         better = second.gain > first.gain
@@ -88,7 +91,7 @@ def settled(opened: SceneFile, cameras: CameraSet, monitor: Monitor = SILENT) ->
 
 
 def _look(opened: SceneFile, cameras: CameraSet) -> Renderer:
-    scene = opened.whole(drop_bad=True)
+    scene = usable(opened.raw(0, opened.count))
     return Renderer.of(
         scene, TrainingViews.of(scene, cameras), "matched", background=background_colour("auto", cameras)
     )

@@ -104,6 +104,12 @@ class SceneFile:
         (scene,) = self.parts(drop_bad, max(1, self.count))
         return scene
 
+    def held(self) -> "SceneFile":
+        """The same file, its rows decoded once and kept, and this reading alone; raises FormatError as `whole`."""
+        self.check_memory(self.count * FLOAT * SHAPE_NUMBERS + self.harmonics_bytes)
+        rows = self.raw(0, self.count)
+        return replace(self, load=lambda start, stop: rows[start:stop], other=None)
+
     @property
     def harmonics_bytes(self) -> int:
         """What the harmonics take in memory."""
@@ -218,6 +224,12 @@ def faults_of(scene: Gaussians) -> dict[str, Bool[Tensor, " n"]]:
     if scene.filter_3d is not None:
         faults[f"a negative {FILTER_COLUMN}"] = scene.filter_3d < 0
     return {text: rows for text, rows in faults.items() if rows.any()}
+
+
+def usable(scene: Gaussians) -> Gaussians:
+    """The Gaussians that renderers can use."""
+    faults = faults_of(scene)
+    return scene[~torch.stack(list(faults.values())).any(dim=0)] if faults else scene
 
 
 def doubts_of(scene: Gaussians) -> dict[str, int]:
