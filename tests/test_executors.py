@@ -22,6 +22,21 @@ if __name__ == "__main__":
 """
 
 
+FULL = """
+import resource
+from functools import partial
+import torch
+from aaplug.core.errors import OutputError
+from aaplug.core.executors import Processes
+if __name__ == "__main__":
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
+    try:
+        list(Processes(1).map(partial(torch.add, torch.zeros(10**6)), [1]))
+    except OutputError as error:
+        print(error)
+"""
+
+
 def refuse_three(item: int) -> int:
     if item == 3:
         raise FormatError("scene.ply", "is short")
@@ -63,6 +78,17 @@ def test_a_worker_ends_when_its_parent_is_killed(tmp_path):
         assert parent.stderr.read() == b""  # Python's resource tracker warns of what it removes
     assert gone
     assert not alive
+
+
+def test_a_disk_that_is_full_is_named(tmp_path):
+    script = tmp_path / "full.py"
+    script.write_text(FULL)
+    environment = os.environ | {"TMPDIR": str(tmp_path)}
+    done = subprocess.run(
+        [sys.executable, str(script)], env=environment, capture_output=True, text=True, check=False, timeout=60
+    )
+    assert done.stdout.endswith("work.pt: cannot be written: file too large\n")
+    assert list(tmp_path.iterdir()) == [script]
 
 
 def test_errors_can_be_pickled():

@@ -71,3 +71,10 @@ def reason(error: Exception) -> str:
     """Why a library or the system failed, in lower case: an OSError's own words without its number and path."""
     strerror = error.strerror if isinstance(error, OSError) else None
     return (strerror or str(error)).lower()
+
+
+def of_system(error: BaseException | None) -> OSError | None:
+    """The system's error, also behind torch's own about a full disk."""
+    if isinstance(error, RuntimeError):
+        error = error.__context__
+    return error if isinstance(error, OSError) else None

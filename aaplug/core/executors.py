@@ -21,11 +21,13 @@ from typing import Any, TypeVar
 
 import torch
 
-from aaplug.core.errors import UsageError
+from aaplug.core.errors import OutputError, UsageError, of_system, reason
 from aaplug.core.locks import scratch
 
 # an option of Python: its resource tracker removes what killed processes left, and need not say so
 QUIET = "ignore::UserWarning:multiprocessing.resource_tracker"
+
+WORK = "work.pt"  # the file in the folder of temporary files that holds what workers do
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -67,9 +69,10 @@ class Processes:
 
         Raises:
             UsageError: a process died, for example for lack of memory.
+            OutputError: there is no room for the file of `work`.
         """
         with scratch() as folder:
-            torch.save(work, folder / "work.pt")
+            _save(work, folder / WORK)
             start = (str(folder), self.torch_threads)
             _track_quietly()
             spawn = multiprocessing.get_context("spawn")
@@ -115,6 +118,16 @@ def _next(waiting: "deque[Future[R]]", ordered: bool) -> R:
     return done.result()
 
 
+def _save(work: object, path: Path) -> None:
+    try:
+        with path.open("wb") as stream:
+            torch.save(work, stream)
+    except (OSError, RuntimeError) as error:
+        if cause := of_system(error):
+            raise OutputError(path, f"cannot be written: {reason(cause)}") from error
+        raise
+
+
 def _track_quietly() -> None:
     """Start Python's resource tracker, which inherits the options of warnings, before the first worker does."""
     if os.name != "posix":  # there is none
@@ -135,7 +148,7 @@ def _start(folder: str, threads: int | None) -> None:
     threading.Thread(target=_end_with_parent, args=(folder,), daemon=True).start()
     if threads is not None:
         torch.set_num_threads(threads)
-    _work = torch.load(Path(folder) / "work.pt", mmap=True, weights_only=False)  # our own file
+    _work = torch.load(Path(folder) / WORK, mmap=True, weights_only=False)  # our own file
 
 
 def _end_with_parent(folder: str) -> None:

@@ -15,7 +15,7 @@ from os import PathLike
 from pathlib import Path
 from typing import BinaryIO
 
-from aaplug.core.errors import OutputError, listing, reason
+from aaplug.core.errors import OutputError, listing, of_system, reason
 from aaplug.core.locks import OURS, new_file, remove_left
 
 TOKEN_BYTES = 8  # random bytes in a temporary file's name: 2^64 names
@@ -48,7 +48,7 @@ def replacing_file(path: str | PathLike[str], overwrite: bool, suffix: str = ".t
     except BaseException as error:  # Ctrl-C too
         with suppress(OSError):
             temporary.unlink()
-        if cause := _of_system(error):
+        if cause := of_system(error):
             raise OutputError(path, f"cannot be written: {reason(cause)}") from error
         raise
     with suppress(OSError):  # makes the new name permanent; some systems cannot open a folder
@@ -137,13 +137,6 @@ def _check_target(path: Path, overwrite: bool) -> None:
             raise OutputError(path, "cannot be written: its folder does not exist; make it first")
     except (OSError, ValueError) as error:  # no access, a name too long, or a NUL in it
         raise OutputError(path, f"cannot be written: {reason(error)}") from error
-
-
-def _of_system(error: BaseException | None) -> OSError | None:
-    """The system's error, also behind torch's own about a full disk."""
-    if isinstance(error, RuntimeError):
-        error = error.__context__
-    return error if isinstance(error, OSError) else None
 
 
 def _sync(path: Path, mode: int) -> None:
