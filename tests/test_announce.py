@@ -4,12 +4,16 @@ from dataclasses import replace
 
 import pytest
 
+from aaplug.core.cameras import CameraSet
 from aaplug.core.errors import UsageError
 from aaplug.core.monitor import Monitor
-from aaplug.rendering.cost import EAGER, cost_of
+from aaplug.finetuning.settings import Settings
+from aaplug.rendering.cost import EAGER, GRADIENTS, cost_of
 from aaplug.rendering.renderer import Renderer
 from aaplug.verbs.announce import announce
 from aaplug.verbs.bench import bench
+from aaplug.verbs.evaluate import evaluate
+from aaplug.verbs.finetune import _seconds, finetune
 from tests.conftest import make_camera, make_scene
 
 
@@ -43,6 +47,26 @@ def test_only_long_and_large_jobs_are_told(renderer):
     views = [make_camera(size=(3936, 2960))] * 97
     announce([renderer], views, heard)
     assert heard.said == ["97 images at 3936x2960: about 5 minutes; fewer views take less"]
+
+
+def test_recipes_and_steps_are_told(monkeypatch):
+    monkeypatch.setattr("aaplug.verbs.announce.LONG", 0.0)
+    scene, cameras, heard = make_scene(50), [make_camera(), make_camera((2.0, -4.0, 1.0), name="b")], Heard()
+    cameras = CameraSet(tuple(cameras), tuple(cameras))
+    how = {"rasterizer": "eager", "monitor": heard}
+    evaluate(scene, cameras, recipe=("classic", "mip", "auto"), scale=(1.0, 0.5), **how)
+    finetune(scene, cameras, steps=2, scale=(0.5,), **how)
+    told = [said for said in heard.said if said.endswith("take less")]
+    assert [said.partition(":")[0] for said in told] == ["12 images at 32x24, 64x48", "2 steps at 64x48"]
+
+
+def test_a_step_is_estimated_with_its_anchor_and_its_truths(renderer):
+    view = make_camera(size=(100, 50))
+    frame, half = (cost_of([renderer], [view.scaled(scale)]).seconds for scale in (1.0, 0.5))
+    settings = Settings("test", 10, {0.5: 1.0}, {}, anchor=0.0)
+    assert _seconds(renderer, [view], settings) == pytest.approx(GRADIENTS * 10 * half + 2 * frame)
+    anchored = replace(settings, anchor=3.0)
+    assert _seconds(renderer, [view], anchored) == pytest.approx(GRADIENTS * 10 * (half + frame) + 2 * frame)
 
 
 def test_what_the_machine_cannot_hold_is_refused(renderer, monkeypatch):

@@ -19,23 +19,25 @@ def announce(
     views: Sequence[Camera],
     monitor: Monitor,
     *,
-    passes: float = 1.0,
+    work: str | None = None,
+    seconds: float | None = None,
     processes: int = 1,
     fewer: str = "views",
 ) -> None:
-    """Say how long rendering the views will take, and with how much memory, where that is worth knowing.
+    """Say how long rendering every view with every renderer will take, and how much memory, where that is much.
 
-    passes: how often each view is rendered by each renderer.  processes: that share the work.
+    work: in words, and its seconds, where it is more than these images.  processes: that share it.
     fewer: what takes less time, in words.
 
     Raises:
         UsageError: it would take more memory than the limit MEMORY_SHARE of the machine's allows.
     """
     cost = cost_of(renderers, views)
-    seconds = cost.seconds * passes
+    seconds = cost.seconds if seconds is None else seconds
     needed = cost.scene + cost.image * (processes if seconds > PAYS_AFTER else 1)
     sizes = listing(sorted({f"{view.width}x{view.height}" for view in views}), most=3)
-    what = f"{len(views)} image{'s' * (len(views) != 1)} at {sizes}"
+    images = len(views) * len(renderers)
+    what = f"{work or f'{images} image' + 's' * (images != 1)} at {sizes}"
     if lacking := lack_of_memory(needed):
         raise UsageError(what, f"would take {lacking}; a smaller `scale` or fewer `threads` need less")
     if seconds >= LONG or needed >= LARGE:

@@ -31,6 +31,7 @@ from aaplug.io.atomic import claimed, output_folder, refuse_existing
 from aaplug.io.cameras import select_views
 from aaplug.methods.recipe import Recipe
 from aaplug.methods.recipes import RECIPES, USER_RECIPES, suited
+from aaplug.rendering.cost import comparing, cost_of
 from aaplug.verbs.announce import announce
 from aaplug.verbs.inputs import (
     AnyPath,
@@ -124,7 +125,7 @@ def evaluate(
         candidates = candidates_of(scene, look.training, recipes, look.rasterizer, look.background)
         task = Task(candidates, scales, seen, Truth(look, source, rules), metrics)
         drawn = [view.scaled(scale) if rules.change == "size" else view for view in seen for scale in scales]
-        announce([candidate.renderer for candidate in candidates], drawn, monitor)
+        announce([candidate.renderer for candidate in candidates], drawn, monitor, seconds=_seconds(task, drawn))
         with monitor.progress(f"evaluating {name}", "views") as tell:
             found = measure(task, facts, tell, folder and folder / JOURNAL, o.resume, images)
         if folder and images:
@@ -136,6 +137,13 @@ def evaluate(
             for path in written:
                 monitor.say(f"wrote {path}")
     return found
+
+
+def _seconds(task: Task, drawn: Sequence[Camera]) -> float:
+    """An estimate: every candidate's images, the truths, which are as fine as training, and their comparison."""
+    truths = [*task.views] * (1 if task.truth.protocol.change == "size" else len(task.scales))
+    rendering = cost_of([c.renderer for c in task.candidates], drawn), cost_of([task.truth.own], truths)
+    return sum(cost.seconds for cost in rendering) + comparing(drawn, len(task.names))
 
 
 def check_results(folder: Path | None, o: EvaluateOptions) -> None:

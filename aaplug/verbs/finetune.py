@@ -5,6 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
+from statistics import mean
 from typing import Annotated, Any
 
 from jaxtyping import Float
@@ -33,7 +34,7 @@ from aaplug.io.images import write_png
 from aaplug.io.scenes import SpzAxes, check_scene_output, write_scene
 from aaplug.methods.recipes import RECIPES
 from aaplug.methods.viewers import FAST, VIEWERS, Viewer, fuse_for
-from aaplug.rendering.cost import GRADIENTS
+from aaplug.rendering.cost import GRADIENTS, cost_of
 from aaplug.rendering.renderer import Renderer
 from aaplug.verbs.announce import announce
 from aaplug.verbs.inputs import AnyPath, CamerasLike, SceneLike, inputs_of, look_of, processor, sources_of, whole_of
@@ -142,8 +143,8 @@ def finetune(
         job = TuningJob(start, cameras.train, Truth(look, source, enlarge=enlarge, memory=MEMORY), settings, written)
         how = f"{settings.name}, {settings.steps} steps, truth: {source}"
         monitor.say(f"tuning for {start.recipe.name} ({start.recipe.source}): {how}")
-        passes = GRADIENTS * settings.steps / len(cameras.train)
-        announce([start], cameras.train, monitor, passes=passes, fewer="steps")
+        seconds = _seconds(start, cameras.train, settings)
+        announce([start], cameras.train, monitor, work=f"{settings.steps} steps", seconds=seconds, fewer="steps")
         state = tune(job, path and _beside(path, "pt"), o.checkpoint_every, o.resume, monitor)
         tuned = recorded(state, job, viewer.convention_of(scene), {"for": viewer.name, "method": settings.name})
         if path is not None:
@@ -179,6 +180,15 @@ def _check(path: Path | None, sources: Sequence[Path], o: FinetuneOptions) -> No
     check_scene_output(path, o.overwrite, sources)
     for kind, replaces in (("json", o.overwrite), ("png", o.overwrite), ("pt", o.resume or o.overwrite)):
         check_output(_beside(path, kind), replaces, sources)
+
+
+def _seconds(start: Renderer, views: Sequence[Camera], settings: Settings) -> float:
+    """An estimate: a step draws one scale and the anchor; each view's truth is rendered once for each scale."""
+    frame = {s: cost_of([start], [v.scaled(s) for v in views]).seconds / len(views) for s in (1.0, *settings.weights)}
+    anchors = 1 if settings.anchor else 0
+    drawn = mean(frame[scale] for scale in settings.weights) + anchors * frame[1.0]
+    truths = min(settings.steps * (1 + anchors), len(views) * len(frame))
+    return GRADIENTS * settings.steps * drawn + truths * frame[1.0]
 
 
 def _sheet(candidates: Sequence[Candidate], view: Camera, scales: Iterable[float], truth: Truth) -> Image:
