@@ -15,6 +15,11 @@ from typing import Any, get_args, get_origin
 from aaplug.core.errors import AaplugError, UsageError, printable, reason
 
 FAILED, REFUSED, INTERRUPTED = 1, 2, 130
+DESCRIPTION = """Test-time anti-aliasing for pretrained 3D Gaussian Splatting scenes.
+
+  aaplug render scene.ply --cameras path/to/colmap --scale 0.25 -o images
+  aaplug convert scene.ply --cameras path/to/colmap -o converted.ply
+  aaplug VERB --help"""
 UNWRITABLE = (errno.EPIPE, errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EIO)  # what writing our output meets
 FILE = re.compile(r".*/.*|.*\.[A-Za-z]\w*", re.DOTALL)  # a word that names a file, unlike names and numbers
 VERBS = ("info", "convert", "lod", "render", "evaluate", "video", "finetune", "demo", "warmup", "bench")
@@ -73,11 +78,7 @@ def run(words: Sequence[str]) -> int:
         return verb()
     with one_line("aaplug"):
         verb = tyro.extras.subcommand_cli_from_dict(
-            {verb: _verb(verb) for verb in VERBS},
-            prog="aaplug",
-            description="Test-time anti-aliasing for pretrained 3D Gaussian Splatting scenes.",
-            args=words,
-            config=CONFIG,
+            {verb: _verb(verb) for verb in VERBS}, prog="aaplug", description=DESCRIPTION, args=words, config=CONFIG
         )
     return verb()
 

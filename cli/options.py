@@ -54,7 +54,7 @@ class SceneOptions(Options):
     iteration: Annotated[int | None, number(0, 10**9, whole=True), UNSET] = None
     """Iteration of a model folder (default: the last)."""
     convention: Annotated[str | None, flag("|".join(CONVENTIONS))] = None
-    """How the scene was trained, where its file does not say."""
+    """How the scene was trained or, for playcanvas and playcanvas-classic, converted, if its file does not say."""
     drop_bad: bool = False
     """Leave out Gaussians with NaN, infinite or unusable values instead of stopping."""
     allow_checkpoint: bool = False
@@ -131,10 +131,10 @@ def one_line(program: str) -> Iterator[None]:
     except SystemExit as end:
         if not end.code:  # --help
             raise
-        lines = [line.strip("│╭╮╰╯─ ") for line in box.getvalue().splitlines()]
-        said = " ".join(filter(None, lines[1:]))  # without the box's title
+        lines = [line.strip("│╭╮╰╯─|+ ") for line in box.getvalue().splitlines()]  # drawn in ASCII on some terminals
+        said = " ".join(filter(re.compile(r"\w").search, lines[1:]))  # without the box's title and rules
         said = re.split(" For full helptext| Argument helptext", said)[0].removeprefix("Error parsing ")
-        raise UsageError(program, f"{said}; see `{program} --help`") from end
+        raise UsageError(program, f"{said.rstrip('. ')}; see `{program} --help`") from end
 
 
 def read_inputs(scene: SceneOptions, cameras: CameraOptions) -> tuple[Held, CameraSet]:

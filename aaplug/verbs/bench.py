@@ -36,8 +36,7 @@ class BenchOptions(Options):
     gaussians: Annotated[Sequence[int], number(1, 100_000_000, whole=True, several=True)] = (10_000, 100_000, 1_000_000)
     """Sizes of the synthetic scenes."""
     resolution: Annotated[Sequence[str] | None, flag("WxH ...")] = None
-    """Sizes of the synthetic scenes' image: all scenes at the first, the middle one at each (default: 800x800, and
-    1600x1060 if there are several scenes)."""
+    """Sizes of the images: all scenes at the first, the middle one at each (default: 800x800 1600x1060)."""
     rasterizer: Annotated[str, choice(CHOICES)] = "all"
     """Which to time; all: compiled, if `aaplug warmup` has run, and eager."""
     repeats: Annotated[int, number(1, 1000, whole=True)] = 5

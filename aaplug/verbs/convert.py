@@ -55,17 +55,15 @@ class ConvertOptions(ViewOptions):
     """What to fuse, and how to measure it."""
 
     views: Annotated[str, tyro.conf.arg(metavar="NAME,...|test|train|all")] = "train"
-    """Views that --viewer is measured on, by name or split."""
-    viewer: Annotated[str | Viewer | None, flag("|".join(VIEWERS), "--for", kind=str | None)] = None
-    """Fit the scene to this viewer by a short optimization from the closed form, and print the remaining error."""
+    """Views that --for is measured on, by name or split."""
+    viewer: Annotated[str | Viewer | None, flag("VIEWER", "--for", kind=str | None)] = None
+    """Fit the scene to spark, playcanvas or another of examples/guides/viewers.md, and print the remaining error."""
     steps: Annotated[int | None, STEPS, UNSET] = None
-    """With --viewer: steps of the optimization (default: 300, or 0 if the viewer draws as training did); 0 keeps the
-    closed form."""
+    """With --for: steps of the fit, 0 for none (default: 300, or 0 if the viewer draws as training did)."""
     form: Annotated[str | None, flag("|".join(FORMS))] = None
-    """Without --viewer, what to fuse: matched-energy (the default) keeps the energy that training showed;
-    mip-splatting is Mip-Splatting's 3D smoothing.  A stored filter_3D is fused as it is."""
+    """Without --for: keep training's energy (matched-energy, the default), or smooth as Mip-Splatting does."""
     variance: Annotated[float | None, number(0.001, 100), UNSET] = None
-    """Without --viewer: variance to fuse, in px² at the training rate (default: 0.2)."""
+    """Without --for: variance to fuse, in px² at the training rate (default: 0.2)."""
     overwrite: bool = False
     """Replace an existing output."""
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from statistics import mean
 from typing import Annotated, Any
 
+import tyro
 from jaxtyping import Float
 from torch import Tensor
 
@@ -68,9 +69,10 @@ class Tuned:
 class FinetuneOptions(ViewOptions):
     """The optimization."""
 
-    target: Annotated[str | Viewer | None, flag("|".join([FAST.name, *VIEWERS]), "--for", kind=str | None)] = None
-    """What will show the scene: fast (aaplug's recipe matched, one sample per pixel; the default of consistency) or a
-    viewer with a rule of its own (default of mipmap-gs: classic)."""
+    target: Annotated[str | Viewer | None, flag("fast|VIEWER", "--for", kind=str | None)] = None
+    """Who will show the scene: fast (aaplug's matched, the default) or a viewer of examples/guides/viewers.md."""
+    views: Annotated[str, tyro.conf.arg(metavar="NAME,...|test|train|all")] = "test"
+    """Views that the result is measured on, by name or split; training views are what it is tuned on."""
     method: Annotated[str, choice(METHODS)] = "consistency"
     """consistency makes one model for all scales; mipmap-gs makes one for a single --scale, as Mipmap-GS does."""
     scale: Annotated[Sequence[float], SCALES] = tuple(OURS.weights)
@@ -88,11 +90,9 @@ class FinetuneOptions(ViewOptions):
     densify_every: Annotated[int | None, STEPS, UNSET] = None
     """Clone, split and prune every N steps; 0 for never (default: the method's own)."""
     truth: Annotated[str, choice(("auto", "self", "photographs"))] = "auto"
-    """What the training size should look like: the scene's own render (self) or the photographs; auto takes
-    photographs if every training view has one."""
+    """What the training size should look like: self is the scene's own render; auto takes photographs if all exist."""
     upsampler: Annotated[str | None, flag("bicubic|lanczos|FILE")] = None
-    """For scales above 1 without photographs that large: an interpolation, or a network's weights (ESPCN_x4.pb, a
-    torch.export .pt2); default: the scene's own render there, corrected to the averages of the training size."""
+    """For scales above the photographs': an interpolation or a network (.pb, .pt2); default: the scene's own render."""
     seed: Annotated[int, number(0, 2**31 - 1, whole=True)] = 0
     """Seed of the views and scales that the steps draw."""
     checkpoint_every: Annotated[int, number(1, 1_000_000, whole=True)] = 100

@@ -152,9 +152,9 @@ class ViewOptions(FrameOptions):
     threads: Annotated[int | None, THREADS, UNSET] = None
     """Processor threads (default: all)."""
     memory: Annotated[float | None, _GIGABYTES, UNSET] = None
-    """Memory per frame in GB, beside the scene and the image (default: 1)."""
+    """GB that drawing a frame may take, beside the scene and the image themselves (default: 1)."""
     cull_margin: Annotated[float, _MARGIN, UNSET] = math.inf
-    """Cull Gaussians centred farther outside the image than this share of its longer side, if training did."""
+    """For scenes trained so: leave out Gaussians centred off the image by more than this share of its longer side."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,7 +164,7 @@ class RecipeOptions(ViewOptions):
     quality: Annotated[str, choice(QUALITIES)] = "balanced"
     """How finely recipe auto samples: fast reaches a quarter of the training rate, balanced half, best all of it."""
     rate_reference: Annotated[str | None, flag("|".join(get_args(RateReference)))] = None
-    """Sampling rate that matched and auto compare with (default: pose: global, or interval for a free camera)."""
+    """Sampling rate that matched and auto compare with (default: pose: global, but interval for free cameras)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,7 +174,7 @@ class ImageOptions(Options):
     recipe: Annotated[str | Recipe, choice([*RECIPE_NAMES, "..."])] = "auto"
     """How to render; examples/guides/methods.md lists further recipes, for research."""
     scale: Annotated[float | None, SCALE, UNSET] = None
-    """Size relative to the training size, or to that of a path file (default: 1)."""
+    """Size relative to the training size (default: 1)."""
     resolution: Annotated[str | None, flag("WxH")] = None
     """Size in px, such as 400x400; -1 on one side keeps the aspect (-1x720)."""
     overwrite: bool = False

@@ -55,10 +55,12 @@ class Clip(NamedTuple):
 class VideoOptions(RecipeOptions, ImageOptions):
     """Rendering, and the camera path."""
 
+    scale: Annotated[float | None, SCALE, UNSET] = None
+    """Size relative to the training size, or to that of a path file (default: 1)."""
     path: Annotated[AnyPath, choice(["zoom", "dolly", "orbit", "FILE.json"])] = "zoom"
     """zoom (focal length), dolly (distance) or orbit from the first of --views, or nerfstudio's camera_path.json."""
     beside: Annotated[str | None, choice(["none", *RECIPE_NAMES, "..."])] = "classic"
-    """Recipe to show on the left."""
+    """Recipe to show on the left; none shows --recipe alone."""
     start: Annotated[float, SCALE] = 1.0
     """Sampling rate at the start of a zoom or dolly, relative to training."""
     end: Annotated[float, SCALE] = 0.125
