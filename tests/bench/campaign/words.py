@@ -24,6 +24,7 @@ MEMORY = 6 * 2**30  # bytes of address space
 BASE = {  # what makes each verb do a little work
     "info": "scene.ply --cameras .",
     "convert": "scene.ply --cameras . -o c.ply",
+    "lod": "scene.ply --cameras . -o l.ply --simplify 0.5",
     "render": "scene.ply --cameras . -o images --rasterizer eager",
     "evaluate": "scene.ply --cameras . -o results --recipe classic --scale 0.5 --rasterizer eager",
     "video": "scene.ply --cameras . -o v.webm --seconds 0.1 --rasterizer eager",
