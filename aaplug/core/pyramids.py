@@ -94,14 +94,16 @@ class Pyramid:
         return self.level(0)
 
     @cached_property
+    def counts(self) -> Int[Tensor, "l c"]:
+        """Gaussians of each chunk in each level."""
+        parts = self.chunks.split(list(self.sizes))
+        return torch.stack([torch.bincount(part, minlength=self.count) for part in parts])
+
+    @cached_property
     def firsts(self) -> Int[Tensor, "l c_and_1"]:
         """Index of each chunk's first Gaussian in each level but the finest, and of that after the last."""
-        count, start, found = self.count, self.sizes[0], []
-        for size in self.sizes[1:]:
-            own = torch.bincount(self.chunks[start : start + size], minlength=count)
-            found.append(torch.cat([own.new_zeros(1), own.cumsum(0)]) + start)
-            start += size
-        return torch.stack(found) if found else torch.zeros(0, count + 1, dtype=torch.int64)
+        ends = self.counts[1:].flatten().cumsum(0).reshape(-1, self.count) + self.sizes[0]
+        return torch.cat([ends[:, :1] - self.counts[1:, :1], ends], dim=1)
 
     @cached_property
     def count(self) -> int:
@@ -157,6 +159,12 @@ class Cutter:
         parts, shares = zip(*self._parts(visible, octaves), strict=True)
         index, shares = torch.cat(parts), torch.cat(shares)
         return Cut(index, None if (shares == 1).all() else shares)
+
+    @torch.no_grad()
+    def count(self, camera: Camera) -> int:
+        """Number of Gaussians in the cut of a view."""
+        drawn = (self.shares(self.octaves(camera)) > 0) & self.visible(camera)
+        return int(self.pyramid.counts[drawn].sum())
 
     @property
     def coarsest(self) -> slice:

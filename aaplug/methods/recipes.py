@@ -15,9 +15,10 @@ from aaplug.methods.research_recipes import RESEARCH_RECIPES
 # training size 2x2 samples take no more splat-pixel evaluations than `classic` with one.
 QUALITIES = {"fast": 0.25, "balanced": 0.5, "best": 1.0}
 
-# Most samples along a pixel's side where there are levels of detail; a level is picked for the samples' rate.  The best
-# quality draws the finest level alone.
-LEVELS_GRIDS = {"fast": 1, "balanced": 2, "best": 0}
+# Where there are levels of detail, one is picked for the samples' rate: most samples along a pixel's side, and the
+# number of Gaussians up to which more samples, of finer levels, are taken as without levels (some 20 ms on two cores).
+# The best quality draws the finest level alone.
+LEVELS = {"fast": (1, 0), "balanced": (2, 100_000), "best": (0, 0)}
 
 # Of a sample, the weight of those beside it where samples are few: it takes the noise off what compositing could not
 # resolve.  0.02 to 0.04 are best against the scenes' own look (examples/guides/methods.md).
@@ -32,7 +33,8 @@ USER_RECIPES = (
         target_rate=QUALITIES["balanced"],
         neighbours=NEIGHBOURS,
         takes_quality=True,
-        levels_grid=LEVELS_GRIDS["balanced"],
+        levels_grid=LEVELS["balanced"][0],
+        levels_budget=LEVELS["balanced"][1],
         for_discs="2dgs-matched",
         promises=Promises(equals_training=True),
     ),
@@ -113,7 +115,8 @@ def find_recipe(
             raise UsageError("rate_reference", f"recipe '{name}' compares no sampling rates")
         recipe = replace(recipe, screen=recipe.screen.with_reference(rate_reference))
     if recipe.takes_quality:
-        recipe = replace(recipe, target_rate=QUALITIES[quality], levels_grid=LEVELS_GRIDS[quality])
+        grid, budget = LEVELS[quality]
+        recipe = replace(recipe, target_rate=QUALITIES[quality], levels_grid=grid, levels_budget=budget)
     return recipe if target_rate is None else replace(recipe, target_rate=target_rate)
 
 

@@ -137,14 +137,19 @@ class Renderer:
     def sampled(self, camera: Camera) -> tuple[Camera, int]:
         """Camera of the supersampled image, and the samples along a pixel's side."""
         samples = self.samples(camera)
-        return camera.resized(camera.width * samples, camera.height * samples), samples
+        return _sampled(camera, samples), samples
 
     def samples(self, camera: Camera) -> int:
         """Number of samples along a pixel's side."""
         if self.recipe.target_rate == 0:
             return self.recipe.grid
         asked = self.recipe.samples_at(self.relative_rate(camera))
-        return asked if self.cutter is None else min(asked, self.recipe.levels_grid)
+        if self.cutter is None:
+            return asked
+        least = min(asked, self.recipe.levels_grid)
+        finer = range(asked, least, -1) if self.recipe.levels_budget else ()
+        cheap = (n for n in finer if self.cutter.count(_sampled(camera, n)) <= self.recipe.levels_budget)
+        return next(cheap, least)
 
     def neighbours(self, camera: Camera) -> float:
         """Weight of the samples on either side of each sample: like their number, a constant to gradients."""
@@ -222,6 +227,11 @@ class Renderer:
     @property
     def _kernels(self) -> Kernels:
         return self.rasterizer.kernels if isinstance(self.rasterizer, RunsKernels) else EAGER
+
+
+def _sampled(camera: Camera, samples: int) -> Camera:
+    """Camera of the image with so many samples along a pixel's side."""
+    return camera.resized(camera.width * samples, camera.height * samples)
 
 
 def prepared(scene: Gaussians, training: TrainingViews, recipe: Recipe) -> Gaussians:

@@ -1,76 +1,206 @@
-"""Lighter scenes against the scene's own look: python -m tests.bench.levels [SCENE ...], of the names in `away`.
+"""Levels of detail, measured: python -m tests.bench.levels [SCENE ...], of chair and snowmiku, or cost.
 
-Prints PSNR in dB for shares of the Gaussians, beside splat-transform's `--decimate`, and for levels, with one sample
-per pixel and with those of `auto`; and how long merging takes.
+For a scene it prints lighter scenes beside splat-transform's `--decimate`; then a pyramid, kept in a folder of the
+working directory, at sizes from 1/2 to 1/32: PSNR in dB against the scene's own look and against photographs, median
+milliseconds, and Gaussians projected, with and without levels; then a dolly.  For cost: time against Gaussians and
+pixels on synthetic scenes.
 """
 
+import statistics
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import pairwise
 
+import torch
+
+from aaplug.core.camera_paths import moved
+from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.interfaces import Rasterizer
+from aaplug.core.pyramids import Pyramid
 from aaplug.core.training import TrainingViews
+from aaplug.evaluation.protocols import median_depth
 from aaplug.evaluation.truth import Truth, ViewTruth, own_look
 from aaplug.io.cameras import read_cameras
 from aaplug.io.scenes import read_scene
+from aaplug.levels.pyramids import pyramid_of, read_pyramid
 from aaplug.methods.recipes import find_recipe
+from aaplug.rasterizers import find_rasterizer
+from aaplug.rendering.benchmark import exponent, synthetic_camera, synthetic_scene
 from aaplug.rendering.renderer import Renderer
 from aaplug.verbs.lod import lod
-from tests.bench.away import Scene, decibels, on_each
+from tests.bench.away import SCENES, Scene, decibels
 from tests.conftest import SHARED_DATA
 
 VIEWS = 5
-SCALES = (1 / 2, 1 / 4, 1 / 8)
-SHARES = (1 / 4, 1 / 16)
-LEVELS = 4
-DECIMATED = {  # measured with @playcanvas/splat-transform 3, npm; on the capture by other test views
+SCALES = (1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 32)
+LEVELS = 5
+SHARES = {1 / 4: (1 / 4, 1 / 8), 1 / 16: (1 / 8,)}  # scales that lighter scenes are tuned for
+DECIMATED = {  # at 1/2, 1/4 and 1/8, measured with @playcanvas/splat-transform 3; on the capture by other test views
     ("chair", 1 / 4): (31.9, 33.3, 33.3),
     ("chair", 1 / 16): (27.3, 28.5, 30.1),
     ("snowmiku", 1 / 4): (32.3, 32.8, 33.5),
     ("snowmiku", 1 / 16): (25.8, 26.1, 26.6),
 }
+REPEATS = 5
+OCTAVES, STEPS_EACH = 3, 20  # of the dolly, and frames in each octave
+COUNTS = (100_000, 1_000_000, 3_000_000)  # Gaussians of the synthetic scenes
+SIZES = ((100, 75), (400, 300), (800, 600), (1600, 1200))
+TRAINED = 800  # px: side of the synthetic scenes' training image
 
 
-def measure(name: str, how: Scene, rasterizer: Rasterizer) -> None:
-    """Print a scene's tables."""
-    scene = read_scene(SHARED_DATA / how.file)
-    cameras = read_cameras((SHARED_DATA / how.file).parent, train_scale=how.scale)
-    look = own_look(scene, TrainingViews.of(scene, cameras, how.cull_margin), rasterizer, how.background)
-    views = cameras.test[:: -(-len(cameras.test) // VIEWS)]
-    truths = [ViewTruth(Truth(look), view) for view in views]
+class Bench:
+    """A scene, its look, and what test views should show."""
 
-    def reached(lighter: Gaussians, scales: Sequence[float], recipe: str = "matched") -> list[str]:
-        training = TrainingViews.of(lighter, cameras, how.cull_margin)
-        shown = replace(look, scene=lighter, training=training, recipe=find_recipe(recipe))
-        return [f"{_mean(shown, truths, scale):.2f}" for scale in scales]
+    def __init__(self, name: str, how: Scene, rasterizer: Rasterizer):
+        self.name, self.how = name, how
+        self.scene = read_scene(SHARED_DATA / how.file)
+        self.cameras = read_cameras((SHARED_DATA / how.file).parent, train_scale=how.scale)
+        self.training = TrainingViews.of(self.scene, self.cameras, how.cull_margin)
+        self.look = own_look(self.scene, self.training, rasterizer, how.background)
+        self.views = self.cameras.test[:: -(-len(self.cameras.test) // VIEWS)]
+        self.own = [ViewTruth(Truth(self.look), view) for view in self.views]
+        self.photographs = [ViewTruth(Truth(self.look, "photographs"), view) for view in self.views]
 
-    print(f"\n{name}, views {', '.join(view.name for view in views)}\n\n| | Gaussians | 1/2 | 1/4 | 1/8 | s |")
-    print(f"{'|---' * 6}|\n| the scene | {len(scene):,} | {' | '.join(reached(scene, SCALES))} | |")
-    for share in SHARES:
-        started = time.perf_counter()
-        (light,) = lod(scene, cameras, simplify=share)
-        seconds = time.perf_counter() - started
-        cells = " | ".join(reached(light.scene, SCALES))
-        print(f"| `aaplug lod --simplify {share:g}` | {len(light.scene):,} | {cells} | {seconds:.1f} |", flush=True)
-        if (name, share) in DECIMATED:
-            print(f"| `--decimate` | the same | {' | '.join(f'{d:.1f}' for d in DECIMATED[name, share])} | |")
-    print("\n| level | Gaussians | one sample | `auto` | the scene: one sample | `auto` |\n" + "|---" * 6 + "|")
-    for level in lod(scene, cameras, levels=LEVELS)[1:]:
-        cells = [reached(s, (level.rate,), r)[0] for s in (level.scene, scene) for r in ("matched", "auto")]
-        print(f"| 1/{round(1 / level.rate)} | {len(level.scene):,} | {' | '.join(cells)} |", flush=True)
+    def shown(self, scene: Gaussians | Pyramid, recipe: str, quality: str = "balanced") -> Renderer:
+        """A renderer of a scene or of levels."""
+        same = isinstance(scene, Pyramid)
+        training = self.training if same else TrainingViews.of(scene, self.cameras, self.how.cull_margin)
+        how = {"rasterizer": self.look.rasterizer, "background": self.look.background}
+        return Renderer.of(scene, training, recipe, quality=quality, **how)
+
+    def light(self, share: float, scale: float, refine: bool) -> Gaussians:
+        """A lighter scene."""
+        how = {"cull_margin": self.how.cull_margin, "background": self.look.background}
+        return lod(self.scene, self.cameras, simplify=share, scale=scale, refine=refine, **how)[0].scene
 
 
-def _mean(shown: Renderer, truths: Sequence[ViewTruth], scale: float) -> float:
+@torch.no_grad()
+def psnr(shown: Renderer, truths: Sequence[ViewTruth], scale: float) -> float:
     """PSNR at a scale, mean of the views."""
     found = []
     for truth in truths:
         wanted = truth.compared(scale)
         assert wanted is not None
         found.append(decibels(shown(truth.view.scaled(scale)).rgb, wanted))
-    return sum(found) / len(found)
+    return statistics.mean(found)
+
+
+@torch.no_grad()
+def milliseconds(draw: Callable[[], object]) -> float:
+    """Median of several runs after one that does not count."""
+    draw()
+    times = []
+    for _ in range(REPEATS):
+        started = time.perf_counter()
+        draw()
+        times.append(1e3 * (time.perf_counter() - started))
+    return statistics.median(times)
+
+
+def row(*cells: object) -> None:
+    """Print a row of a table."""
+    print("| " + " | ".join(f"{c:.2f}" if isinstance(c, float) else str(c) for c in cells) + " |", flush=True)
+
+
+def lighter(bench: Bench) -> None:
+    """Lighter scenes, one sample per pixel."""
+    print(f"\n{bench.name}\n\n| | Gaussians | 1/2 | 1/4 | 1/8 |\n|---|---|---|---|---|")
+    for share, scales in SHARES.items():
+        known = DECIMATED.get((bench.name, share))
+        if known:
+            row(f"`--decimate` {share:g}", "", *known)
+        for scale, refine in [(share**0.5, False), *((scale, True) for scale in (*scales,))]:
+            scene = bench.light(share, scale, refine)
+            what = f"`--simplify {share:g}`" + (f" `--scale {scale:g}`" if refine else " `--no-refine`")
+            row(what, f"{len(scene):,}", *(psnr(bench.shown(scene, "matched"), bench.own, s) for s in SCALES[:3]))
+
+
+def levels(bench: Bench) -> Pyramid:
+    """A pyramid against the scene."""
+    folder = f"{bench.name}-lod"
+    how = {"cull_margin": bench.how.cull_margin, "background": bench.look.background}
+    started = time.perf_counter()
+    lod(bench.scene, bench.cameras, folder, levels=LEVELS, resume=True, **how)
+    print(f"\nbuilt or found in {time.perf_counter() - started:.0f} s")
+    pyramid = read_pyramid(folder)
+    print(f"levels: {', '.join(f'{size:,}' for size in pyramid.sizes)} Gaussians in {pyramid.count} chunks\n")
+    print("| | size | own look | photographs | ms | Gaussians |\n|---|---|---|---|---|---|")
+    for quality in ("fast", "balanced", "best"):
+        for name, scene in (("levels", pyramid), ("the scene", bench.scene)):
+            shown = bench.shown(scene, "auto", quality)
+            for scale in SCALES:
+                view = bench.views[0].scaled(scale)
+                fine = shown.sampled(view)[0]
+                count = len(scene) if shown.cutter is None else shown.cutter.count(fine)
+                figures = psnr(shown, bench.own, scale), psnr(shown, bench.photographs, scale)
+                took = milliseconds(lambda shown=shown, view=view: shown(view))
+                row(f"{name}, {quality}", f"1/{1 / scale:g}", *figures, round(took), f"{count:,}")
+    return pyramid
+
+
+@torch.no_grad()
+def dolly(bench: Bench, pyramid: Pyramid) -> None:
+    """Frame-to-frame changes of a view that moves away over three octaves, against those of the ceiling."""
+    view = bench.views[0]
+    depth = median_depth(bench.scene.means, view)
+    frames = [moved(view, 2 ** (-step / STEPS_EACH), depth) for step in range(OCTAVES * STEPS_EACH + 1)]
+    print("\n| dolly | largest change of a pixel | of a frame (RMS) | against the ceiling's |\n|---|---|---|---|")
+    ceiling = 0.0
+    shown = {
+        "`best`, the ceiling": bench.shown(bench.scene, "auto", "best"),
+        "levels, `balanced`": bench.shown(pyramid, "auto"),
+        "levels, `fast`": bench.shown(pyramid, "auto", "fast"),
+        "`matched`": bench.shown(bench.scene, "matched"),
+    }
+    for name, renderer in shown.items():
+        images = [renderer(frame).rgb.clamp(0, 1) for frame in frames]
+        changes = [b - a for a, b in pairwise(images)]
+        frame = max(float(change.square().mean().sqrt()) for change in changes)
+        ceiling = ceiling or frame
+        row(name, max(float(change.abs().max()) for change in changes), f"{frame:.4f}", frame / ceiling)
+
+
+@torch.no_grad()
+def cost(rasterizer: Rasterizer) -> None:
+    """Time of a frame against Gaussians and pixels, by levels that are merged alone."""
+    camera: Camera = synthetic_camera(TRAINED, TRAINED).as_trained()
+    cameras = CameraSet((camera,), (camera,))
+    print("\n| Gaussians | levels | s | size | levels, ms | Gaussians projected | without, ms |\n" + "|---" * 7 + "|")
+    by_size: dict[tuple[int, int], list[float]] = {}
+    for count in COUNTS:
+        scene = synthetic_scene(count)
+        started = time.perf_counter()
+        pyramid = pyramid_of(lod(scene, cameras, levels=LEVELS, refine=False))
+        seconds = time.perf_counter() - started
+        with_levels = Renderer.of(pyramid, cameras, "auto", quality="fast", rasterizer=rasterizer)
+        without = Renderer.of(scene, cameras, find_recipe("matched"), rasterizer=rasterizer)
+        for width, height in SIZES:
+            view = replace(camera.resized(width, width), height=height)
+            view = replace(view, cy=height / 2)
+            took = [milliseconds(lambda r=renderer, v=view: r(v)) for renderer in (with_levels, without)]
+            by_size.setdefault((width, height), []).append(took[0])
+            assert with_levels.cutter is not None
+            drawn, sizes = with_levels.cutter.count(view), ", ".join(f"{size:,}" for size in pyramid.sizes[1:])
+            row(f"{count:,}", sizes, round(seconds), f"{width}x{height}", took[0], f"{drawn:,}", took[1])
+    for size, times in by_size.items():
+        if len(times) > 1:
+            print(f"exponent of the Gaussians at {size[0]}x{size[1]}: {exponent(list(map(float, COUNTS)), times):.2f}")
+
+
+def main(names: Sequence[str]) -> None:
+    """Print the tables of these scenes."""
+    rasterizer = find_rasterizer("auto", 1000, print)
+    for name in names:
+        if name == "cost":
+            cost(rasterizer)
+            continue
+        bench = Bench(name, SCENES[name], rasterizer)
+        dolly(bench, levels(bench))
+        lighter(bench)
 
 
 if __name__ == "__main__":
-    on_each(sys.argv[1:] or ("chair", "snowmiku"), measure)
+    main(sys.argv[1:] or ("chair", "snowmiku", "cost"))
