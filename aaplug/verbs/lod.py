@@ -61,7 +61,7 @@ class LodOptions(ViewOptions):
     levels: Annotated[int | None, number(1, 12, whole=True), UNSET] = None
     """Write a folder of levels, each for half the size of the one before, as light as the image allows (default: 4)."""
     scale: Annotated[float | None, number(0.001, 1), UNSET] = None
-    """With --simplify or --budget: size that the scene is meant for, relative to training's (default: root of the share)."""
+    """With --simplify or --budget: size of the images that the scene is meant for (default: root of the share)."""
     refine: bool = True
     """Merge alone, in seconds: do not tune the result to look like the scene, which takes minutes."""
     steps: Annotated[int, STEPS] = STEPS_EACH
