@@ -4,12 +4,14 @@
 from .io.cameras import read_cameras as read_cameras
 from .io.images import read_image as read_image, write_png as write_png
 from .io.scenes import open_scene as open_scene, read_scene as read_scene, write_scene as write_scene
+from .levels.pyramids import read_pyramid as read_pyramid
 
 # nouns
 from .core.cameras import Camera as Camera, CameraSet as CameraSet, look_at as look_at
 from .core.errors import AaplugError as AaplugError
 from .core.gaussians import Convention as Convention, Gaussians as Gaussians
 from .core.monitor import Monitor as Monitor
+from .core.pyramids import Pyramid as Pyramid
 from .core.splats import Render as Render
 from .core.training import TrainingViews as TrainingViews
 
