@@ -21,6 +21,7 @@ from .methods.recipes import find_recipe as find_recipe
 from .rendering.renderer import Renderer as Renderer
 
 # the command line's verbs, each as one call
+from .verbs.assumed import Orbit as Orbit
 from .verbs.batch import batch as batch
 from .verbs.bench import bench as bench
 from .verbs.compare import compare as compare

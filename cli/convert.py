@@ -27,7 +27,7 @@ class Convert:
     def __call__(self) -> int:
         """Fuse, and say what was done."""
         opened = self.scene.open()
-        cameras = self.cameras.read(self.scene) if self.cameras.cameras or self.scene.path.is_dir() else None
+        cameras = self.cameras.read(self.scene)
         own = {"drop_bad": self.scene.drop_bad, "spz_axes": self.scene.spz_axes} | vars(self.how)
         found = verb.convert(opened, cameras, self.output, monitor=TERMINAL, **own)
         scene, report = found.scene, found.report

@@ -73,8 +73,6 @@ class Evaluate:
                 raise UsageError("batch", f"names the scenes; leave {named} out")
             return scenes_of(self.batch, replace(self, batch=None))
         paths = [self.scene.path, *self.others.more]
-        if self.cameras.cameras is None and any(path.is_file() for path in paths):
-            raise UsageError("cameras", "give them, or name model folders, which hold their own")
         alone = replace(self, others=OtherScenes())
         scenes = [replace(self.scene, scene=path, model_path=None) for path in paths]
         return [(s.path.stem if s.path.is_file() else s.path.name, replace(alone, scene=s)) for s in scenes]

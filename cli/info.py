@@ -37,7 +37,7 @@ class Info:
             _show_limits(self.json)
             return 0
         opened = self.scene.open()
-        cameras = None if self.cameras.cameras is None else self.cameras.read(self.scene)
+        cameras = self.cameras.orbit if self.cameras.cameras is None else self.cameras.read(self.scene)
         facts = verb.info(opened, cameras, monitor=TERMINAL, **vars(self.how))
         if self.json:
             print_json(facts)
@@ -59,6 +59,8 @@ def _text(value: Any) -> str:
     if isinstance(value, list):
         lines = any(isinstance(item, str) for item in value)
         return ("\n" if lines else "  ").join(_text(item) for item in value)
+    if isinstance(value, dict):
+        return "  ".join(f"{name} px: {_text(share)}" for name, share in value.items())
     return f"{value:,}" if isinstance(value, int) else printable(str(value))
 
 

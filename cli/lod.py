@@ -25,9 +25,7 @@ class Lod:
     def __call__(self) -> int:
         """Merge, and say what was written."""
         opened = self.scene.open()
-        cameras = self.cameras.read(self.scene) if self.cameras.cameras or self.scene.path.is_dir() else None
-        if cameras is None:
-            say("no cameras: the median Gaussian is taken to be a training pixel wide")
+        cameras = self.cameras.read(self.scene)
         own = {"drop_bad": self.scene.drop_bad, "spz_axes": self.scene.spz_axes} | vars(self.how)
         found = verb.lod(opened, cameras, self.output, monitor=TERMINAL, **own)
         levels = [{"rate": level.rate, "gaussians": len(level.scene)} for level in found]

@@ -22,6 +22,7 @@ DESCRIPTION = """Test-time anti-aliasing for pretrained 3D Gaussian Splatting sc
   aaplug VERB --help"""
 UNWRITABLE = (errno.EPIPE, errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EIO)  # what writing our output meets
 FILE = re.compile(r".*/.*|.*\.[A-Za-z]\w*", re.DOTALL)  # a word that names a file, unlike names and numbers
+OPTION = re.compile(r"-(?![\d.])")  # how a word that is no negative number begins
 VERBS = ("info", "convert", "lod", "render", "evaluate", "video", "finetune", "demo", "warmup", "bench")
 
 
@@ -121,7 +122,7 @@ def _parted(words: Sequence[str]) -> list[str]:
             parted[-1] += "=" + word
             continue
         flag, _, value = word.partition("=")
-        option = flag if word.startswith("-") else option
+        option = flag if OPTION.match(word) else option
         if option not in several:
             parted.append(word)
         elif flag != option and FILE.fullmatch(word):

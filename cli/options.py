@@ -6,7 +6,7 @@ The options that the library's verbs have too are stated there, in `aaplug.verbs
 import re
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager, redirect_stderr
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from io import StringIO
 from pathlib import Path
 from typing import Annotated, Any, cast, get_type_hints
@@ -20,7 +20,8 @@ from aaplug.io.cameras import read_cameras
 from aaplug.io.scenes import SpzAxes, open_scene
 from aaplug.io.scenes.scene_file import SceneFile
 from aaplug.methods.viewers import describe
-from aaplug.verbs.inputs import Held, inputs_of
+from aaplug.verbs.assumed import Orbit
+from aaplug.verbs.inputs import Held, folder_of_cameras, inputs_of
 from aaplug.verbs.options import SCALE, UNSET, Options, flag, number
 
 from .console import TERMINAL, say
@@ -106,11 +107,16 @@ class CameraOptions(Options):
     test_every: Annotated[int | None, number(0, 1_000_000, whole=True), UNSET] = None
     """Hold out every N-th view by name; 0 for no split (default: as usual for the format)."""
 
-    def read(self, options: SceneOptions) -> CameraSet:
-        """Read the cameras and say where sizes and split come from."""
-        if self.cameras is None and not options.path.is_dir():
-            raise UsageError("cameras", "name cameras.json, a COLMAP model or transforms_*.json")
-        path = self.cameras or options.path
+    orbit: Orbit = field(default_factory=Orbit)
+
+    def read(self, options: SceneOptions) -> CameraSet | Orbit:
+        """Read the cameras and say where sizes and split come from; without any, what stands in for them."""
+        path = self.cameras or folder_of_cameras(options.path)
+        if path is None:
+            return self.orbit
+        for name, usual in vars(Orbit()).items():
+            if getattr(self.orbit, name) != usual:
+                raise UsageError(name, f"is for scenes without cameras, and there are some: {path}")
         cameras = read_cameras(path, train_scale=self.train_scale, images=self.images, test_every=self.test_every)
         for note in cameras.notes:
             say(worded(f"cameras: {note}", CameraOptions.__dataclass_fields__))
@@ -146,7 +152,7 @@ def option_types(noun: type) -> dict[str, Any]:
     """Types of all options of a verb by name, those of its groups included."""
     found: dict[str, Any] = {}
     hints = get_type_hints(noun)
-    for field in fields(noun):
-        kind = hints[field.name]
-        found |= option_types(kind) if hasattr(kind, "__dataclass_fields__") else {field.name: kind}
+    for each in fields(noun):
+        kind = hints[each.name]
+        found |= option_types(kind) if hasattr(kind, "__dataclass_fields__") else {each.name: kind}
     return found

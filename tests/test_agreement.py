@@ -16,6 +16,7 @@ from aaplug.io.scenes import open_scene, read_scene, write_scene
 from aaplug.io.scenes.packed import half_turn_about_x
 from aaplug.io.scenes.scene_file import SceneFile
 from aaplug.verbs.agreement import Agreement, agreement, settled
+from aaplug.verbs.assumed import Orbit
 from aaplug.verbs.render import render
 from tests.conftest import make_camera, make_scene
 
@@ -67,6 +68,14 @@ def test_a_spz_is_read_as_fits_the_cameras(sample_scene, sample_cameras, tmp_pat
     expected = read_scene(tmp_path / "a.spz", spz_axes=axes)
     assert torch.equal(chosen.whole().means, expected.means)
     assert torch.equal(chosen.whole().sh, expected.sh)
+
+
+def test_assumed_cameras_decide_nothing(sample_scene, tmp_path: Path):
+    pytest.importorskip("gsply")
+    write_scene(tmp_path / "a.spz", sample_scene[:100], spz_axes="opencv")
+    opened = open_scene(tmp_path / "a.spz")
+    assert opened.other is not None
+    assert settled(opened, Orbit().around(opened)) is opened
 
 
 def test_of_two_readings_each_is_decoded_once_and_what_is_odd_is_said_once(sample_scene, sample_cameras, caplog):

@@ -75,8 +75,6 @@ def test_a_model_folder_brings_its_own_cameras(cli):  # noqa: F811
     scene = aaplug.read_scene(model / "point_cloud/iteration_30/point_cloud.ply")
     by_scene = aaplug.render(scene, output="two", views="a")
     assert by_folder[0].file.read_bytes() == by_scene[0].file.read_bytes()
-    with pytest.raises(UsageError, match="cameras"):
-        aaplug.render("scene.ply", output="three")
 
 
 def test_an_option_that_is_none_is_refused_with_the_nearest_name():

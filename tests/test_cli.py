@@ -220,7 +220,6 @@ REFUSED = {
     "too large": (
         break_nothing, "render scene.ply --cameras . -o new --resolution 99999x9", ["16384"]),
     "no scene": (break_nothing, "render --cameras . -o new", ["SCENE"]),
-    "no cameras": (break_nothing, "render scene.ply -o new", ["--cameras"]),
     "missing scene": (break_nothing, "render gone.ply --cameras . -o new", ["gone.ply"]),
     "missing cameras": (break_nothing, "render scene.ply --cameras gone -o new", ["gone"]),
     "one file for several views": (

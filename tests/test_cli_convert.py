@@ -50,11 +50,6 @@ def test_convert_fuses_a_stored_filter_without_cameras(cli, monkeypatch, large):
     torch.testing.assert_close(found.log_scales, expected)
 
 
-def test_convert_needs_cameras_for_what_it_computes(cli):
-    code, _, err = cli("convert scene.ply -o c.ply")
-    assert (code, "error: --cameras:" in err) == (2, True)
-
-
 @pytest.mark.parametrize("viewer", ["classic", "gsplat"])
 def test_convert_for_a_viewer_tags_its_rule_and_prints_what_is_left(cli, viewer):
     """A viewer that draws as training did is right at the training size, and every step takes away from that."""

@@ -113,8 +113,6 @@ REFUSED = {
         break_nothing, "evaluate scene.ply --batch b.toml -o new", ["--batch", "scene.ply"]),
     "several scenes without a folder": (
         break_nothing, "evaluate scene.ply scene.ply --cameras .", ["-o FOLDER", "several"]),
-    "scenes without cameras": (
-        break_nothing, "evaluate scene.ply scene.ply -o new", ["--cameras", "model folders"]),
     "photographs of a moved camera": (
         break_nothing, f"{EVALUATE} --protocol fov --truth photographs", ["fov"]),
     "a scale that does not halve": (

@@ -98,6 +98,12 @@ class Camera:
         """The same field of view in `width` × `height` px; pixels stop being square if the aspect changes."""
         return self._stretched(width, height, width / self.width, height / self.height)
 
+    def framed(self, width: int, height: int) -> "Camera":
+        """The same pose in `width` × `height` px, square as before: the shorter side keeps its field of view."""
+        factor = min(width, height) / min(self.hw)
+        middle = {"cx": width / 2, "cy": height / 2}
+        return replace(self, width=width, height=height, fx=self.fx * factor, fy=self.fy * factor, **middle)
+
     def as_trained(self) -> "Camera":
         """This view, declared to be a pose of the data set at its training size."""
         return replace(self, trained_focal=self.focal)
@@ -113,12 +119,14 @@ class CameraSet:
     train: the cameras that sampling bounds come from.  test: held-out views; the same as `train` without a split.
     background: the colour that training put behind the scene; None if the files do not say.
     notes: facts worth printing, one line each (format, split, training scale and its source).
+    assumed: whether nobody knows the cameras, and these stand in for them.
     """
 
     train: tuple[Camera, ...]
     test: tuple[Camera, ...]
     background: tuple[float, float, float] | None = None
     notes: tuple[str, ...] = ()
+    assumed: bool = False
 
     @property
     def all(self) -> tuple[Camera, ...]:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import median
 
 from aaplug.core.cameras import Camera, CameraSet
@@ -36,14 +36,15 @@ class TrainingViews:
     ) -> "TrainingViews":
         """Compute the sampling bounds of a scene.
 
-        min_seen: share of the Gaussians that the cameras must see, as a check that both are in the same frame.
+        min_seen: share of the Gaussians that the cameras must see, as a check that both are in the same frame; assumed
+            cameras are not checked.
 
         Raises:
             FrameError: the cameras see less of the scene.
             UsageError: there are no cameras.
         """
         views = cameras.train if isinstance(cameras, CameraSet) else tuple(cameras)
-        if min_seen > 0:
+        if min_seen > 0 and not (isinstance(cameras, CameraSet) and cameras.assumed):
             check_frame(scene.means, views, scene.name, min_seen)
         return cls(scene.convention, views, sampling_bounds(scene.means, views), cull_margin)
 
@@ -54,3 +55,9 @@ class TrainingViews:
         """
         trained = camera.trained_focal or median(c.focal for c in self.cameras)
         return camera.focal / trained
+
+    def finer(self, factor: float) -> "TrainingViews":
+        """The same views with pixels `factor` times as dense, so that every rate is `factor` times as high."""
+        bounds = replace(self.bounds, highest=self.bounds.highest * factor, lowest=self.bounds.lowest * factor)
+        cameras = [replace(c, fx=c.fx * factor, fy=c.fy * factor) for c in self.cameras]
+        return replace(self, cameras=cameras, bounds=bounds)

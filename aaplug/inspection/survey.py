@@ -18,6 +18,7 @@ from aaplug.io.scenes.scene_file import SceneFile
 PROBES = 512  # evenly spaced places in the file, from which the frame check samples
 PROBE_ROWS = 64  # Gaussians read at each
 BINS = 4096  # of a histogram
+NEEDLE = 10.0  # longest axis over the middle one
 
 
 class Histogram:
@@ -40,12 +41,18 @@ class Histogram:
         place = int(torch.searchsorted(self.counts.cumsum(0), max(1, math.ceil(share * total))))
         return self.low + (place + 0.5) * (self.high - self.low) / BINS
 
+    def share_below(self, value: float) -> float | None:
+        """Share of the values in bins below that of a value; None without values."""
+        place = min(BINS, max(0, round((value - self.low) / (self.high - self.low) * BINS)))
+        return int(self.counts[:place].sum()) / total if (total := int(self.counts.sum())) else None
+
 
 @dataclass
 class Survey:
     """What was counted.  Opacities lie in [0, 1]; scales, rates and multiples are natural logarithms.
 
     seen, under: Gaussians that a camera sees, and those of them below their sampling bound.
+    needles: Gaussians more than `NEEDLE` times as long as broad.
     above_zero: Gaussians with three log-scales above 0.  activated: with an opacity logit in [0, 1].
     rates: highest sampling rate in training.  multiples: extent over the sampling bound.
     largest: log-scale.  filtered: a 3D filter is stored.  faults: unusable rows by what is wrong with them.
@@ -55,6 +62,7 @@ class Survey:
     count: int = 0
     seen: int = 0
     under: int = 0
+    needles: int = 0
     above_zero: int = 0
     activated: int = 0
     low: Float[Tensor, "3"] = field(default_factory=lambda: torch.full((3,), torch.inf))
@@ -78,6 +86,8 @@ class Survey:
         self.opacities.add(part.opacities)
         self.scales.add(middle_log_scales(part))
         self.largest = max(self.largest, part.log_scales.max().item())
+        _, broad, long = part.log_scales.sort(dim=1).values.unbind(dim=1)
+        self.needles += int((long - broad > math.log(NEEDLE)).sum())
         self.above_zero += int((part.log_scales > 0).all(dim=1).sum())
         logits = part.logit_opacities
         self.activated += int(((logits >= 0) & (logits <= 1)).sum())
@@ -100,10 +110,15 @@ def survey(opened: SceneFile, cameras: Sequence[Camera] = (), tell: Tell = lambd
     return found
 
 
+def probes(count: int, each: int = PROBE_ROWS) -> list[range]:
+    """Rows at evenly spaced places of a file of so many, `each` at a place: few enough to read before the work."""
+    step = max(each, count // PROBES)
+    return [range(start, min(start + each, count)) for start in range(0, count, step)]
+
+
 def check_frame_of(opened: SceneFile, cameras: Sequence[Camera], min_seen: float) -> float:
     """`sampling.check_frame` on Gaussians from evenly spaced places of the file."""
-    step = max(PROBE_ROWS, opened.count // PROBES)
-    means = [opened.load(a, min(a + PROBE_ROWS, opened.count)).means for a in range(0, opened.count, step)]
+    means = [opened.load(rows.start, rows.stop).means for rows in probes(opened.count)]
     sample = torch.cat(means) if means else torch.zeros(0, 3)
     sample = sample[sample.isfinite().all(dim=1)]
     return check_frame(sample, cameras, str(opened.path), min_seen)

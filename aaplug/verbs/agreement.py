@@ -74,9 +74,9 @@ def agreement(look: Renderer, cameras: CameraSet) -> Agreement:
 def settled(opened: SceneFile, cameras: CameraSet, monitor: Monitor = SILENT) -> SceneFile:
     """The reading of a file that fits the cameras, where the file does not say which of two is meant.
 
-    Each reading is decoded once, and what is odd in it is left to whoever uses it.
+    Each reading is decoded once, and what is odd in it is left to whoever uses it.  Assumed cameras decide nothing.
     """
-    if opened.other is None:
+    if opened.other is None or cameras.assumed:
         return opened
     readings = opened.held(), opened.other.held()
     first, second = (agreement(_look(reading, cameras), cameras) for reading in readings)

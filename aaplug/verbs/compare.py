@@ -13,15 +13,17 @@ from aaplug.evaluation.results import Report
 from aaplug.evaluation.truth import Truth, source_of
 from aaplug.io.cameras import select_views
 from aaplug.methods.recipe import Recipe
+from aaplug.verbs.assumed import say_assumed
 from aaplug.verbs.inputs import (
     CamerasLike,
     SceneLike,
-    cameras_of,
     drawn_by,
     inputs_of,
     look_of,
+    opened_and_seen,
     processor,
     recipe_of,
+    shown_of,
     whole_of,
 )
 from aaplug.verbs.options import SCALES, RecipeOptions
@@ -47,20 +49,22 @@ def compare(
 
     Args:
         candidates: scenes by the names that the report gives them; the first is the original.
-        cameras, monitor: see `render`; None for the cameras of the first scene's model folder.
+        cameras, monitor: see `render`; None for the cameras of the first scene's model folder, or an orbit around it.
         options: fields of `CompareOptions`.
     """
     o = CompareOptions.of(options)
     if not candidates:
         raise UsageError("candidates", "needs at least one scene")
-    cameras = cameras_of(cameras, next(iter(candidates.values())))
+    first, *others = candidates.values()
+    opened, cameras = opened_and_seen(first, cameras, monitor)
     chosen = select_views(cameras, o.views)
     source = source_of(chosen, o.truth)
     monitor.say(f"truth: {source}")
     recipe = recipe_of(o.recipe, o)
     with processor(o.threads), monitor.progress("comparing", "views") as tell:
-        scenes = [inputs_of(scene, cameras, monitor)[0] for scene in candidates.values()]
+        scenes = [shown_of(opened), *(inputs_of(scene, cameras, monitor)[0] for scene in others)]
         look = look_of(scenes[0], cameras, len(chosen) * len(o.scale) * len(scenes), o, monitor)
+        say_assumed(cameras, monitor, look)
         trained = [TrainingViews.of(whole_of(scene), cameras, o.cull_margin, o.min_seen) for scene in scenes[1:]]
         looks = [look, *(replace(look, training=training) for training in trained)]
         each = zip(candidates, scenes, looks, strict=True)

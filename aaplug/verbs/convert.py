@@ -14,6 +14,7 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.core.monitor import SILENT, Monitor
 from aaplug.core.training import TrainingViews
 from aaplug.evaluation.results import Report
+from aaplug.evaluation.truth import own_look
 from aaplug.finetuning.fitting import fit, steps_for
 from aaplug.inspection.survey import check_frame_of
 from aaplug.io.atomic import claimed
@@ -21,14 +22,14 @@ from aaplug.io.cameras import select_views
 from aaplug.io.scenes import SpzAxes, check_scene_output, write_parts, write_scene
 from aaplug.io.scenes.scene_file import SceneFile
 from aaplug.methods.viewers import FORMS, MATCHED_ENERGY, MIP_VIEWER, VIEWERS, Form, Viewer, blurring, fuse
+from aaplug.verbs.assumed import say_assumed
 from aaplug.verbs.in_parts import LARGE, convert_parts
 from aaplug.verbs.inputs import (
     AnyPath,
     CamerasLike,
     SceneLike,
-    cameras_of,
     look_of,
-    opened_with,
+    opened_and_seen,
     processor,
     sources_of,
     whole_of,
@@ -109,22 +110,22 @@ def convert(
     """
     o = ConvertOptions.of(options)
     chosen, path = o.chosen(), None if output is None else Path(output)
-    opened = opened_with(scene, None if cameras is None else cameras_of(cameras, scene), monitor)
+    opened, known = opened_and_seen(scene, cameras, monitor)
     check = partial(check_scene_output, path, o.overwrite, sources_of(opened)) if path else lambda: None
     check()
     writing = {"overwrite": o.overwrite, "spz_axes": spz_axes}
     with processor(o.threads) as workers, claimed(path, check):
         if path and isinstance(opened, SceneFile) and opened.count > LARGE and isinstance(chosen, Form):
-            train = _train_of(opened, cameras, o.min_seen)
+            train = _train_of(opened, known, o.min_seen, monitor)
             with monitor.progress("converting", "Gaussians") as tell:
                 parts = convert_parts(opened, train, chosen, drop_bad, tell, threads=workers)
                 write_parts(path, parts, opened.count, **writing)
             return Converted(None, MIP_VIEWER)
         whole = whole_of(opened, drop_bad)
         if isinstance(chosen, Form):
-            found = Converted(_fused(whole, cameras, chosen, o.min_seen), MIP_VIEWER)
+            found = Converted(_fused(whole, known, chosen, o.min_seen, monitor), MIP_VIEWER)
         else:
-            found = _fitted(whole, cameras_of(cameras, whole), chosen, o, monitor)
+            found = _fitted(whole, known, chosen, o, monitor)
         if path is not None:
             assert found.scene is not None
             write_scene(path, found.scene, **writing)
@@ -134,21 +135,25 @@ def convert(
 def _fitted(scene: Gaussians, cameras: CameraSet, viewer: Viewer, o: ConvertOptions, monitor: Monitor) -> Converted:
     steps = steps_for(scene, viewer) if o.steps is None else o.steps
     look = look_of(scene, cameras, steps, o, monitor)
+    say_assumed(cameras, monitor, look)
     fitted = fit(scene, viewer, look, select_views(cameras, o.views), steps, monitor)
     return Converted(fitted.scene, viewer, fitted.report)
 
 
-def _train_of(opened: SceneFile, cameras: CamerasLike, min_seen: float) -> Sequence[Camera]:
+def _train_of(opened: SceneFile, cameras: CameraSet, min_seen: float, monitor: Monitor) -> Sequence[Camera]:
     """The training cameras; none where the scene needs none, or is refused anyway."""
     if blurring(opened.fused) or opened.raw(0, min(1, opened.count)).filter_3d is not None:
         return ()
-    train = cameras_of(cameras, str(opened.path)).train
-    check_frame_of(opened, train, min_seen)
-    return train
+    say_assumed(cameras, monitor)
+    if not cameras.assumed:
+        check_frame_of(opened, cameras.train, min_seen)
+    return cameras.train
 
 
-def _fused(scene: Gaussians, cameras: CamerasLike, form: Form, min_seen: float) -> Gaussians:
+def _fused(scene: Gaussians, cameras: CameraSet, form: Form, min_seen: float, monitor: Monitor) -> Gaussians:
     """The closed form for the Mip rule."""
     if blurring(scene.fused) or scene.filter_3d is not None:  # needs none, or is refused anyway
         return fuse(scene, None, form)
-    return fuse(scene, TrainingViews.of(scene, cameras_of(cameras, scene), min_seen=min_seen), form)
+    training = TrainingViews.of(scene, cameras, min_seen=min_seen)
+    say_assumed(cameras, monitor, own_look(scene, training))
+    return fuse(scene, training, form)

@@ -33,6 +33,7 @@ from aaplug.methods.recipe import Recipe
 from aaplug.methods.recipes import RECIPES, USER_RECIPES, suited
 from aaplug.rendering.cost import comparing, cost_of
 from aaplug.verbs.announce import announce
+from aaplug.verbs.assumed import say_assumed
 from aaplug.verbs.inputs import (
     AnyPath,
     CamerasLike,
@@ -122,6 +123,7 @@ def evaluate(
     made = nullcontext() if folder is None else output_folder(folder)
     with processor(o.threads), made, claimed(folder, lambda: check_results(folder, o)):
         look = look_of(scene, cameras, len(seen) * len(recipes) * len(scales), o, monitor)
+        say_assumed(cameras, monitor, look)
         candidates = candidates_of(scene, look.training, recipes, look.rasterizer, look.background)
         task = Task(candidates, scales, seen, Truth(look, source, rules), metrics)
         drawn = [view.scaled(scale) if rules.change == "size" else view for view in seen for scale in scales]

@@ -38,6 +38,7 @@ from aaplug.methods.viewers import FAST, VIEWERS, Viewer, fuse_for
 from aaplug.rendering.cost import GRADIENTS, cost_of
 from aaplug.rendering.renderer import Renderer
 from aaplug.verbs.announce import announce
+from aaplug.verbs.assumed import say_assumed
 from aaplug.verbs.inputs import AnyPath, CamerasLike, SceneLike, inputs_of, look_of, processor, sources_of, whole_of
 from aaplug.verbs.options import SCALES, STEPS, UNSET, ViewOptions, choice, choices, flag, number
 
@@ -138,6 +139,7 @@ def finetune(
     written = digest_of_files([named]) if Path(named).is_file() else named
     with processor(o.threads), claimed(path, check):
         look = look_of(scene, cameras, settings.steps, o, monitor)
+        say_assumed(cameras, monitor, look)
         before = replace(look, scene=viewer.shown(look.scene), recipe=RECIPES[viewer.recipe])
         start = replace(before, scene=fuse_for(scene, look.training, viewer))
         job = TuningJob(start, cameras.train, Truth(look, source, enlarge=enlarge, memory=MEMORY), settings, written)

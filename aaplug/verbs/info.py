@@ -6,16 +6,21 @@ from typing import Any
 
 from aaplug.core.cameras import CameraSet
 from aaplug.core.monitor import SILENT, Monitor
+from aaplug.core.orbits import Frame
 from aaplug.inspection.coverage import aliasing_begins
 from aaplug.inspection.survey import Survey, check_frame_of, survey
+from aaplug.io.scenes import open_scene
 from aaplug.io.scenes.ply import Document
 from aaplug.io.scenes.scene_file import SceneFile
 from aaplug.methods.viewers import describe
-from aaplug.verbs.inputs import AnyPath, CamerasLike, cameras_of, opened_of
+from aaplug.verbs.assumed import TRAINING_RATE, Orbit, probed, rate_of
+from aaplug.verbs.inputs import AnyPath, CamerasLike, opened_and_seen
 from aaplug.verbs.options import FrameOptions
 
 EXPONENTIATED = 20.0  # larger log-scales are taken for scales
 FEW_STEPS = 1e4  # float32 steps across the scene's extent: with fewer, positions are coarse
+SIZES = (3840, 1920, 1280, 640, 320)  # px: longer sides of pictures of the whole scene
+NOWHERE = CameraSet((), (), assumed=True)  # of a file without a usable Gaussian
 ULP = 2.0**-23  # of float32, relative
 
 
@@ -29,7 +34,8 @@ def info(
 
     Args:
         scene: a scene's file, opened or not, or a model folder.
-        cameras: training cameras, their file or folder, to tell also how finely they sample the scene.
+        cameras: training cameras, their file or folder, to tell also how finely they sample the scene.  None, or an
+            `Orbit`: what can be told without, under its assumption.
         options: fields of `FrameOptions`.
 
     Returns:
@@ -39,14 +45,19 @@ def info(
         AaplugError: a file cannot be read, or the cameras see little of the scene.
     """
     o = FrameOptions.of(options)
-    known = None if cameras is None else cameras_of(cameras, scene)
-    train = () if known is None else known.train
-    opened = opened_of(scene, known, monitor)
-    if known is not None:
-        check_frame_of(opened, train, o.min_seen)
+    opened = scene if isinstance(scene, SceneFile) else open_scene(scene)
+    around = Orbit() if cameras is None else cameras
+    if isinstance(around, Orbit) and not len(probed(opened)):
+        around = NOWHERE
+    opened, known = opened_and_seen(opened, around, monitor)
+    if not known.assumed:
+        check_frame_of(opened, known.train, o.min_seen)
     with monitor.progress("reading", "Gaussians") as tell:
-        found = survey(opened, train, tell)
-    sampling = {} if known is None else _sampling_facts(found, known, opened.convention.kernel)
+        found = survey(opened, known.train, tell)
+    if isinstance(around, Orbit):
+        sampling = _assumed_facts(found, known, around.frame(opened))
+    else:
+        sampling = _sampling_facts(found, known, opened.convention.kernel) if known.train else {}
     return _scene_facts(opened, found) | sampling | {"problems": list(_problems(opened, found))}
 
 
@@ -71,6 +82,7 @@ def _scene_facts(opened: SceneFile, found: Survey) -> dict[str, Any]:
         "comments": _comments(opened),
         "low_corner": found.low.tolist() if found.count else None,
         "high_corner": found.high.tolist() if found.count else None,
+        "needle_share": found.needles / max(1, found.count),
         "median_opacity": found.opacities.quantile(0.5),
         "median_scale": None if scale is None else math.exp(scale),
     }
@@ -89,6 +101,21 @@ def _sampling_facts(found: Survey, cameras: CameraSet, kernel: float) -> dict[st
         "under_sampling_bound_share": found.under / max(1, found.seen),
         "aliasing_begins_at_scale": None if multiple is None else aliasing_begins(math.exp(multiple), kernel),
         "cameras": list(cameras.notes),
+    }
+
+
+def _assumed_facts(found: Survey, cameras: CameraSet, frame: Frame) -> dict[str, Any]:
+    """What can be told without cameras."""
+    side = max(cameras.train[0].hw)
+    shares = {size: found.multiples.share_below(math.log(side / size)) for size in SIZES}
+    return {
+        "training_rate": cameras.notes[0].removeprefix(TRAINING_RATE),
+        "assumed_rate_px_per_unit": rate_of(cameras, frame),
+        "centre": frame.centre.tolist(),
+        "radius": frame.radius,
+        "up": frame.up.tolist(),
+        "surroundings_and_floaters_share": frame.outside,
+        "below_a_pixel_share": {str(size): share for size, share in shares.items() if share is not None},
     }
 
 

@@ -5,18 +5,18 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
+from typing import overload
 
 import torch
 
 from aaplug.core.cameras import BLACK, WHITE, CameraSet
-from aaplug.core.errors import UsageError
 from aaplug.core.executors import torch_threads
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.interfaces import MatchesRates, TakesMemory
 from aaplug.core.monitor import Monitor
 from aaplug.core.pyramids import Pyramid
 from aaplug.core.training import TrainingViews
-from aaplug.io.cameras import read_cameras
+from aaplug.io.cameras import holds_cameras, read_cameras
 from aaplug.io.scenes import MODEL_SCENE, open_scene, ply
 from aaplug.io.scenes.harmonics import without_harmonics
 from aaplug.io.scenes.scene_file import SceneFile
@@ -26,6 +26,7 @@ from aaplug.methods.recipes import RECIPES, find_recipe
 from aaplug.rasterizers import find_rasterizer
 from aaplug.rendering.renderer import Harmonics, Renderer, background_colour
 from aaplug.verbs.agreement import agreement, settled
+from aaplug.verbs.assumed import Orbit
 from aaplug.verbs.options import RecipeOptions, ViewOptions
 
 log = logging.getLogger("aaplug")
@@ -33,19 +34,36 @@ log = logging.getLogger("aaplug")
 AnyPath = str | PathLike[str]
 SceneLike = Gaussians | Pyramid | AnyPath
 Held = Gaussians | Pyramid  # in memory
-CamerasLike = CameraSet | AnyPath | None
+CamerasLike = CameraSet | Orbit | AnyPath | None
 HELD_HARMONICS = 2 * 10**9  # bytes: reading more for each view costs less than holding them; 10 M Gaussians of degree 3
 
 
-def opened_of(scene: SceneFile | AnyPath, cameras: CameraSet | None, monitor: Monitor) -> SceneFile:
-    """The scene's file, opened or in a model folder, by the reading that fits the cameras, if there are any."""
-    opened = scene if isinstance(scene, SceneFile) else open_scene(scene)
-    return opened if cameras is None else settled(opened, cameras, monitor)
+@overload
+def opened_and_seen(
+    scene: SceneFile | AnyPath, cameras: CamerasLike, monitor: Monitor, single: bool = False
+) -> tuple[SceneFile, CameraSet]: ...
 
 
-def opened_with(scene: SceneLike | SceneFile, cameras: CameraSet | None, monitor: Monitor) -> Held | SceneFile:
-    """The scene itself, or its opened file; see `opened_of`."""
-    return scene if isinstance(scene, Held) else opened_of(scene, cameras, monitor)
+@overload
+def opened_and_seen(
+    scene: SceneLike | SceneFile, cameras: CamerasLike, monitor: Monitor, single: bool = False
+) -> tuple[Held | SceneFile, CameraSet]: ...
+
+
+def opened_and_seen(
+    scene: SceneLike | SceneFile, cameras: CamerasLike, monitor: Monitor, single: bool = False
+) -> tuple[Held | SceneFile, CameraSet]:
+    """The scene itself, or its file, opened by the reading that fits the cameras; and its cameras.
+
+    cameras: themselves, or their path; None for those of the model folder that the scene is in, else an `Orbit`.
+    single: whether an orbit is asked for one picture.
+
+    Raises:
+        AaplugError: a file cannot be read, or there is nothing to look at.
+    """
+    opened = scene if isinstance(scene, Held | SceneFile) else open_scene(scene)
+    known = _cameras_of(cameras, opened, single)
+    return opened if isinstance(opened, Held) else settled(opened, known, monitor), known
 
 
 def whole_of(scene: Held | SceneFile, drop_bad: bool = False) -> Gaussians:
@@ -76,27 +94,29 @@ def drawable(scene: Held | SceneFile, drop_bad: bool = False) -> tuple[Held, Har
     return shown_of(scene, drop_bad), None
 
 
-def cameras_of(cameras: CamerasLike, scene: SceneLike | SceneFile) -> CameraSet:
-    """The cameras themselves, those at a path, or those of the model folder that the scene is in."""
-    if isinstance(cameras, CameraSet):
-        return cameras
-    if cameras is not None:
-        return read_cameras(cameras)
-    named = scene.path if isinstance(scene, SceneFile) else scene
+def _cameras_of(cameras: CamerasLike, scene: Held | SceneFile, single: bool) -> CameraSet:
+    found = cameras if cameras is not None else folder_of_cameras(scene) or Orbit()
+    if isinstance(found, CameraSet):
+        return found
+    if not isinstance(found, Orbit):
+        return read_cameras(found)
+    return (found.single() if single else found).around(scene if isinstance(scene, SceneFile) else whole_of(scene))
+
+
+def folder_of_cameras(scene: SceneLike | SceneFile) -> Path | None:
+    """The scene's folder, or the model folder that its file is in, if that holds cameras."""
+    named = scene.pyramid or scene.path if isinstance(scene, SceneFile) else scene
     path = Path(whole_of(named).name if isinstance(named, Held) else named)
-    if path.match(MODEL_SCENE):
-        path = path.parents[2]
-    if not path.is_dir():
-        raise UsageError("cameras", "expected cameras.json, a COLMAP model or transforms_*.json")
-    return read_cameras(path)
+    folder = path.parents[2] if path.match(MODEL_SCENE) else path
+    return folder if folder.is_dir() and holds_cameras(folder) else None
 
 
 def inputs_of(
     scene: SceneLike | SceneFile, cameras: CamerasLike, monitor: Monitor, drop_bad: bool = False
 ) -> tuple[Held, CameraSet]:
-    """The scene, with its levels of detail, and its cameras; the cameras are read first, as they are small."""
-    known = cameras_of(cameras, scene)
-    return shown_of(opened_with(scene, known, monitor), drop_bad), known
+    """The scene, with its levels of detail, and its cameras."""
+    opened, known = opened_and_seen(scene, cameras, monitor)
+    return shown_of(opened, drop_bad), known
 
 
 def recipe_of(recipe: str | Recipe, o: RecipeOptions) -> Recipe:
@@ -118,8 +138,8 @@ def look_of(scene: Held, cameras: CameraSet, frames: int, o: ViewOptions, monito
     colour = background_colour(o.background, cameras)
     if o.background == "auto":
         name = {WHITE: "white", BLACK: "black"}.get(colour, str(colour))
-        source = "from the camera files" if cameras.background else "the camera files do not say"
-        monitor.say(f"background: {name} ({source})")
+        unknown = "nothing says" if cameras.assumed else "the camera files do not say"
+        monitor.say(f"background: {name} ({'from the camera files' if cameras.background else unknown})")
     drawing = o.rasterizer
     if isinstance(drawing, str):
         drawing = find_rasterizer(drawing, frames, monitor.say)
@@ -127,6 +147,8 @@ def look_of(scene: Held, cameras: CameraSet, frames: int, o: ViewOptions, monito
         drawing = drawing.within(o.memory * 1e9)
     scene = whole_of(scene)
     look = own_look(scene, TrainingViews.of(scene, cameras, o.cull_margin, o.min_seen), drawing, colour)
+    if cameras.assumed:
+        return look
     fit = agreement(look, cameras)
     monitor.say(f"fit: {fit}")
     if fit.doubt:

@@ -28,14 +28,14 @@ from aaplug.levels.merging import Goal, merged, merged_in_chunks
 from aaplug.levels.pyramids import Level, levels_in
 from aaplug.levels.rates import rates_of
 from aaplug.methods.filters import fuse_stored
+from aaplug.verbs.assumed import say_assumed
 from aaplug.verbs.inputs import (
     AnyPath,
     CamerasLike,
     Held,
     SceneLike,
-    cameras_of,
     look_of,
-    opened_with,
+    opened_and_seen,
     processor,
     sources_of,
     whole_of,
@@ -121,8 +121,7 @@ def lod(
 
     Args:
         scene: Gaussians, a scene's file, opened or not, or a model folder.
-        cameras: training cameras, their file or folder, which tell how finely each Gaussian was sampled.  None: the
-            median Gaussian is taken to be a pixel wide.
+        cameras: see `render`; they tell how finely each Gaussian was sampled, and levels are tuned on their views.
         output: the one scene's file; or a folder for NAME_lod0.ply, the scene itself, to NAME_lodN.ply.  None writes
             nothing.
         drop_bad: leave out Gaussians of a file that cannot be used.
@@ -137,20 +136,17 @@ def lod(
         AaplugError: as `render`; also, the scene holds 2D Gaussians or none at all.
     """
     o = LodOptions.of(options)
-    known = None if cameras is None else cameras_of(cameras, scene)
-    train = () if known is None else known.train
-    opened = opened_with(scene, known, monitor)
+    opened, known = opened_and_seen(scene, cameras, monitor)
     path = None if output is None else Path(output)
     files = _files(path, opened, o)
     whole = fuse_stored(whole_of(opened, drop_bad))
     if not len(whole):
         raise UsageError(whole.name, "has no Gaussians to merge")
-    if train:
-        check_frame(whole.means, train, whole.name, o.min_seen)
-    if o.refine and known is None:
-        monitor.say("no cameras: the levels are not tuned")
+    if not known.assumed:
+        check_frame(whole.means, known.train, whole.name, o.min_seen)
+    say_assumed(known, monitor)
     with processor(o.threads):
-        make = _Maker(whole, train, _refiner(whole, known, o, monitor), monitor)
+        make = _Maker(whole, known.train, _refiner(whole, known, o, monitor), monitor)
         if o.single:
             found = [make(Level(whole, 1.0), o.goals(whole)[0])]
             if path is not None:
@@ -181,19 +177,19 @@ class _Maker:
 
 
 def _refiner(
-    scene: Gaussians, cameras: CameraSet | None, o: LodOptions, monitor: Monitor
+    scene: Gaussians, cameras: CameraSet, o: LodOptions, monitor: Monitor
 ) -> Callable[[Gaussians, float], Gaussians]:
     """What tunes a level."""
-    if cameras is None or not o.refine or not o.steps:
+    if not o.refine or not o.steps:
         return lambda level, rate: level
     look, views = look_of(scene, cameras, o.steps, o, monitor), select_views(cameras, o.views)
     return lambda level, rate: refined(level, rate, look, views, o.steps, monitor)
 
 
-def _source(scene: Gaussians, cameras: CameraSet | None, o: LodOptions) -> str:
+def _source(scene: Gaussians, cameras: CameraSet, o: LodOptions) -> str:
     """Hash of all that the levels depend on."""
-    facts = [digest_of_scene(scene), "" if cameras is None else digest_of_cameras(cameras.train)]
-    facts += [str((cameras and cameras.background, o.refine, o.steps, o.views, o.background, o.cull_margin))]
+    facts = [digest_of_scene(scene), digest_of_cameras(cameras.train)]
+    facts += [str((cameras.background, o.refine, o.steps, o.views, o.background, o.cull_margin))]
     return hashlib.sha256(" ".join(facts).encode()).hexdigest()
 
 

@@ -16,19 +16,10 @@ from aaplug.methods.recipes import find_recipe
 from aaplug.rendering.frames import write_frames
 from aaplug.rendering.renderer import Renderer
 from aaplug.verbs.announce import announce
-from aaplug.verbs.inputs import (
-    AnyPath,
-    CamerasLike,
-    SceneLike,
-    cameras_of,
-    drawable,
-    drawn_by,
-    look_of,
-    opened_with,
-    processor,
-)
+from aaplug.verbs.assumed import say_assumed
+from aaplug.verbs.inputs import AnyPath, CamerasLike, SceneLike, drawable, drawn_by, look_of, opened_and_seen, processor
 from aaplug.verbs.options import ImageOptions, RecipeOptions
-from aaplug.verbs.views import image_paths, resized
+from aaplug.verbs.views import image_paths, names_image, resized
 
 
 class Written(NamedTuple):
@@ -60,7 +51,8 @@ def render(
 
     Args:
         scene: Gaussians, a scene's file, opened or not, or a model folder.
-        cameras: a camera set, its file or folder, or None for those of the scene's model folder.
+        cameras: a camera set, its file or folder; or None for those of the scene's model folder, or without one for
+            an orbit around the scene; or an `Orbit` of your own.
         output: a folder, or one .png for one view.
         drop_bad: leave out Gaussians of a file that cannot be used.
         monitor: receives messages and progress.
@@ -73,15 +65,16 @@ def render(
     recipe = o.recipe
     if isinstance(recipe, str):
         recipe = find_recipe(recipe, quality=o.quality, rate_reference=o.rate_reference)
-    cameras = cameras_of(cameras, scene)
-    shown = resized(select_views(cameras, o.views), o.scale, o.resolution)
+    opened, cameras = opened_and_seen(scene, cameras, monitor, single=names_image(Path(output)))
+    shown = resized(select_views(cameras, o.views), o.scale, o.resolution, cameras.assumed)
     check = partial(image_paths, Path(output), shown, o.overwrite)
     paths = check()
-    scene, harmonics = drawable(opened_with(scene, cameras, monitor), drop_bad)
+    scene, harmonics = drawable(opened, drop_bad)
     with processor(o.threads) as workers, output_folder(paths[0].parent), claimed(output, check):
         renderer = drawn_by(recipe, scene, look_of(scene, cameras, len(shown), o, monitor))
         renderer = replace(renderer, harmonics=harmonics)
         monitor.say(described(renderer, shown))
+        say_assumed(cameras, monitor, renderer, shown[0])
         announce([renderer], shown, monitor, processes=workers)
         how = {"threads": workers, "bit_depth": o.bit_depth, "overwrite": o.overwrite}
         with monitor.progress("rendering", "views") as tell:

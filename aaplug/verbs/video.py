@@ -23,6 +23,7 @@ from aaplug.io.cameras.camera_path import read_camera_path
 from aaplug.io.video import MOST_FPS, check_video
 from aaplug.rendering.videos import make_video
 from aaplug.verbs.announce import announce
+from aaplug.verbs.assumed import say_assumed
 from aaplug.verbs.inputs import (
     AnyPath,
     CamerasLike,
@@ -96,7 +97,7 @@ def video(
     check()
     scene, cameras = inputs_of(scene, cameras, monitor)
     path = free.cameras if free else _along(whole_of(scene), cameras, o, fps, monitor)
-    shown = resized(path, o.scale, o.resolution)
+    shown = resized(path, o.scale, o.resolution, cameras.assumed and free is None)
     labels = [{"auto": "aaplug auto"}.get(recipe.name, recipe.name) for recipe in recipes]
 
     def compose(index: int, images: Sequence[Float[Tensor, "h _ 3"]]) -> Float[Tensor, "h w 3"]:
@@ -108,6 +109,7 @@ def video(
         renderers = [drawn_by(recipe, scene, look) for recipe in recipes]
         size = f"{shown[0].width}x{shown[0].height}"
         monitor.say(f"{len(shown)} frames of {size} px per pane, {fps:g} per second")
+        say_assumed(cameras, monitor, renderers[-1], shown[0])
         announce(renderers, shown, monitor, processes=workers, fewer="seconds or frames per second")
         with monitor.progress("rendering", "images") as tell:
             make_video(output, renderers, shown, fps, compose, threads=workers, overwrite=o.overwrite, tell=tell)

@@ -13,8 +13,12 @@ IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".exr", ".bmp", ".g
 LONGEST_NAME = 200  # bytes; file systems take 255, and a number and a suffix are added
 
 
-def resized(views: Sequence[Camera], scale: float | None = None, resolution: str | None = None) -> list[Camera]:
+def resized(
+    views: Sequence[Camera], scale: float | None = None, resolution: str | None = None, reframe: bool = False
+) -> list[Camera]:
     """The views at the size that `ImageOptions` describes.
+
+    reframe: pixels stay square where a resolution changes the aspect.
 
     Raises:
         UsageError: both are given, one is not a size, or an image would be larger than `MAX_SIDE`.
@@ -22,7 +26,7 @@ def resized(views: Sequence[Camera], scale: float | None = None, resolution: str
     if scale is not None and resolution is not None:
         raise UsageError("scale", "and `resolution` both set the size; give one")
     if resolution is not None:
-        sized = [view.resized(*_size(resolution, view)) for view in views]
+        sized = [(view.framed if reframe else view.resized)(*_size(resolution, view)) for view in views]
     else:
         sized = [view.scaled(1.0 if scale is None else scale) for view in views]
     for view in sized:
@@ -30,18 +34,23 @@ def resized(views: Sequence[Camera], scale: float | None = None, resolution: str
     return sized
 
 
-def size_of(text: str) -> tuple[int, int]:
-    """Width and height of "400x300", in px.
+def size_of(text: str, where: str = "resolution") -> tuple[int, int]:
+    """Width and height of "400x300", in px; `where` is the option that it is of.
 
     Raises:
         UsageError: it is no size, or a side is above `MAX_SIDE`.
     """
     match = re.fullmatch(r"([1-9]\d{0,8})x([1-9]\d{0,8})", text, re.ASCII)
     if match is None:
-        raise UsageError("resolution", f"takes sizes such as 400x400, got {text[:SHOWN]}")
+        raise UsageError(where, f"takes sizes such as 400x400, got {text[:SHOWN]}")
     width, height = int(match[1]), int(match[2])
-    _check_side("resolution", width, height)
+    _check_side(where, width, height)
     return width, height
+
+
+def names_image(output: Path) -> bool:
+    """Whether a name is that of one image, not of a folder."""
+    return output.suffix.lower() in IMAGES
 
 
 def image_paths(output: Path, views: Sequence[Camera], overwrite: bool) -> list[Path]:
@@ -50,7 +59,7 @@ def image_paths(output: Path, views: Sequence[Camera], overwrite: bool) -> list[
     Raises:
         OutputError: an image exists and `overwrite` is false, or one .png is named for several views.
     """
-    if output.suffix.lower() in IMAGES:
+    if names_image(output):
         if output.suffix.lower() != ".png" or len(views) != 1:
             raise OutputError(output, f"name a folder, or one .png for one view ({len(views)} views asked for)")
         check_output(output, overwrite)

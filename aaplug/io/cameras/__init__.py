@@ -87,6 +87,11 @@ def read_cameras(
     raise FormatError(path, f"holds no cameras of a known format; looked for: {signs}")
 
 
+def holds_cameras(path: str | PathLike[str]) -> bool:
+    """Whether any format recognizes cameras at this path."""
+    return any(format.sniff(Path(path)) for format in CAMERA_FORMATS.values())
+
+
 def _checked(found: CameraSet, path: Path) -> CameraSet:
     """The cameras, after a check of what a format may have let through: sizes, focal lengths and rigid poses."""
     for camera in found.all:

@@ -1,0 +1,215 @@
+"""Views of a scene of which nothing but its Gaussians is known: an orbit around what matters in it.
+
+Floaters and far surroundings are many and large, so they must not decide the frame: a Gaussian counts by its opacity,
+and less the larger it is.  Training makes small Gaussians where its cameras looked from close by.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from aaplug.core.cameras import Camera, look_at
+from aaplug.core.errors import UsageError
+from aaplug.core.gaussians import MIN_OPACITY, Gaussians
+from aaplug.core.rules import NEAR
+from aaplug.core.spherical_harmonics import COLOUR_OFFSET, sh_colour
+
+CORE = 2.0  # median distances from the centre: what lies farther is taken for surroundings
+BULK = 0.99  # share of the core that the frame's ball encloses
+MARGIN = 1.05  # of the ball's radius: room for the Gaussians' own width
+OWN_SIZE = 3.0  # standard deviations of the median Gaussian: the least radius of the ball
+LEAST_RADIUS = 1e-3 * NEAR  # world units: smaller scenes have no picture
+STEPS = 100  # of an iteration
+STILL = 1e-4  # of the points' median distance: a step of Weiszfeld's that is the last
+SHAPE_STEPS = 20
+ROUND = 0.02  # of a covariance's trace, added to each axis: a plane keeps some thickness
+SOFT = 1e-6  # of the points' median distance: what keeps a step finite where the median meets a point
+
+DOWN_IS_Y = (0.0, -1.0, 0.0)  # up where y points down, as in COLMAP's and 3DGS's cameras: the usual convention
+UPS = {(0.0, 0.0, 1.0): (0.0, -1.0, 0.0), (0.0, 1.0, 0.0): (0.0, 0.0, 1.0), DOWN_IS_Y: (0.0, 0.0, -1.0)}  # up: front
+SURE = 0.2  # lead in `looked_from` at which another axis than the usual one is taken for up
+BROAD = 1.5  # ratio of a scene's horizontal variances from which it has a broad side
+DIRECTIONS = 256  # in which colours are compared
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What a picture of the scene should show: a ball, in world units.
+
+    up, front: unit vectors at right angles; an orbit begins at `front`.
+    outside: share of the Gaussians outside of the ball, such as surroundings and floaters.
+    """
+
+    centre: Float[Tensor, " 3"]
+    radius: float
+    up: Float[Tensor, " 3"]
+    front: Float[Tensor, " 3"]
+    outside: float
+
+    def distance(self, fov: float) -> float:
+        """From where the ball fills a field of view of this angle, in radians; beyond the near plane in any case."""
+        return max(self.radius / math.sin(fov / 2), self.radius + 2 * NEAR)
+
+    def focal(self, distance: float) -> float:
+        """Focal length with which the ball at this distance fills the side of an image, over that side."""
+        return math.sqrt(distance**2 - self.radius**2) / (2 * self.radius)
+
+
+def frame_of(scene: Gaussians, up: Sequence[float] | None = None) -> Frame:
+    """The frame of a scene; with `up` given, it turns, moves and grows with the scene.
+
+    up: the direction that points up, of any length but 0; None for `likely_up`.
+
+    Raises:
+        UsageError: there are no Gaussians, or `up` is 0.
+    """
+    if not len(scene):
+        raise UsageError(scene.name, "has no Gaussians to look at")
+    points, sizes = scene.means.double(), scene.scales.amax(dim=1).double()
+    size = float(sizes.median())
+    weights = scene.opacities.double().clamp(min=MIN_OPACITY) * (size / sizes).clamp(max=1.0).square()
+    centre = _geometric_median(points, weights)
+    shape = _shape(points - centre, weights)
+    distances = _lengths(points - centre, shape)
+    core = distances <= CORE * _quantile(distances, weights, 0.5)
+    core &= distances <= _quantile(distances[core], weights[core], BULK)
+    centre, reach = _enclosing_ball(points[core])
+    radius = max(MARGIN * reach, OWN_SIZE * size, LEAST_RADIUS)
+    seen = looked_from(scene)
+    axis = _unit(likely_up(seen) if up is None else up, "up")
+    outside = float(((points - centre).norm(dim=1) > radius).double().mean())
+    return Frame(centre, radius, axis, _front(axis, seen, shape), outside)
+
+
+def orbit(
+    frame: Frame, count: int, size: tuple[int, int], elevation: float, fov: float, name: str = "orbit"
+) -> tuple[Camera, ...]:
+    """Free cameras on a circle around the frame, evenly spaced, named by their number.
+
+    size: width and height in px.  elevation: above the horizon, fov: along the image's shorter side; in radians.
+    """
+    distance = frame.distance(fov)
+    focal, side = frame.focal(distance) * min(size), torch.linalg.cross(frame.up, frame.front)
+    views = []
+    for index in range(count):
+        turn = 2 * math.pi * index / count
+        level = math.cos(turn) * frame.front + math.sin(turn) * side
+        eye = frame.centre + distance * (math.cos(elevation) * level + math.sin(elevation) * frame.up)
+        pose = look_at(eye, frame.centre, frame.up)
+        views.append(pinhole(f"{name}_{index:0{len(str(count - 1))}}", size, focal, pose))
+    return tuple(views)
+
+
+def pinhole(name: str, size: tuple[int, int], focal: float, pose: Float[Tensor, "4 4"]) -> Camera:
+    """A free camera with the principal point in the middle of its image."""
+    return Camera(name, *size, focal, focal, size[0] / 2, size[1] / 2, pose)
+
+
+def likely_up(seen: Float[Tensor, " 3"]) -> tuple[float, float, float]:
+    """The axis that points up: -y as usual, or z or y if training clearly looked from there; seen: `looked_from`."""
+    lead = {axis: float(seen @ seen.new_tensor(axis)) for axis in UPS}
+    best = max(UPS, key=lambda axis: lead[axis])
+    return best if lead[best] > max(lead[DOWN_IS_Y], 0.0) + SURE else DOWN_IS_Y
+
+
+def looked_from(scene: Gaussians) -> Float[Tensor, " 3"]:
+    """Where training looked from, as a direction of a length between 0 (anywhere, or unknown) and about 1.
+
+    Harmonics are fitted where cameras looked, so colours vary most in those directions.  This is the first moment of
+    their standard deviation over the sphere, aaplug's own measure.
+    """
+    k = scene.sh.shape[1]
+    if k == 1:
+        return torch.zeros(3, dtype=torch.float64)
+    directions = _even_directions(DIRECTIONS)
+    ones = torch.eye(k).repeat(len(directions), 1)[:, :, None].expand(-1, -1, 3)
+    basis = sh_colour(ones, directions.repeat_interleave(k, dim=0))[:, 0].view(-1, k) - COLOUR_OFFSET
+    varied = scene.sh[:, 1:].float() * scene.opacities[:, None, None].float().sqrt()
+    moments = torch.einsum("nic,njc->ij", varied, varied) / len(scene)
+    spread = torch.einsum("di,ij,dj->d", basis[:, 1:], moments, basis[:, 1:]).clamp(min=0.0).sqrt()
+    total = float(spread.mean())
+    if not 0 < total < math.inf:
+        return torch.zeros(3, dtype=torch.float64)
+    return -3 * (spread[:, None] * directions).mean(dim=0).double() / total  # directions run from the camera
+
+
+def _front(up: Float[Tensor, " 3"], seen: Float[Tensor, " 3"], shape: Float[Tensor, "3 3"]) -> Float[Tensor, " 3"]:
+    """The horizontal direction that training looked from, else that of a broad side, else the usual one."""
+    level = seen - (seen @ up) * up
+    if float(level.norm()) < SURE:
+        plane = torch.linalg.svd(up[None]).Vh[1:]  # two horizontal directions
+        usual = plane.T @ (plane @ level.new_tensor(UPS[max(UPS, key=lambda axis: float(up @ up.new_tensor(axis)))]))
+        (narrow, broad), sides = torch.linalg.eigh(plane @ shape @ plane.T)
+        clear = float(broad) > BROAD * float(narrow) or not float(usual.norm()) > 0
+        level = sides[:, 0] @ plane if clear else usual
+        level = -level if float(level @ usual) < 0 else level
+    return torch.nn.functional.normalize(level, dim=0)
+
+
+def _unit(direction: Sequence[float], where: str) -> Float[Tensor, " 3"]:
+    given = torch.tensor([float(x) for x in direction], dtype=torch.float64)
+    length = float(given.norm())
+    if not 0 < length < math.inf:
+        raise UsageError(where, f"takes a direction, got {', '.join(f'{x:g}' for x in given.tolist())}")
+    return given / length
+
+
+def _geometric_median(points: Float[Tensor, "n 3"], weights: Float[Tensor, " n"]) -> Float[Tensor, " 3"]:
+    """The place with the least weighted sum of distances to the points (Weiszfeld 1937)."""
+    centre = points.median(dim=0).values
+    for _ in range(STEPS):
+        distances = (points - centre).norm(dim=1)
+        typical = float(distances.median())
+        pull = weights / (distances + SOFT * typical).clamp(min=torch.finfo(torch.float64).tiny)
+        step = (points - centre).T @ pull / pull.sum()
+        centre = centre + step
+        if float(step.norm()) <= STILL * typical:
+            break
+    return centre
+
+
+def _shape(offsets: Float[Tensor, "n 3"], weights: Float[Tensor, " n"]) -> Float[Tensor, "3 3"]:
+    """Covariance of the directions in which the points lie, of determinant 1, whatever their distances (Tyler 1987)."""
+    identity = torch.eye(3, dtype=offsets.dtype)
+    shape = identity
+    for _ in range(SHAPE_STEPS):
+        pull = weights / _lengths(offsets, shape).square().clamp(min=torch.finfo(offsets.dtype).tiny)
+        found = (offsets * pull[:, None]).T @ offsets
+        found = found / found.trace().clamp(min=torch.finfo(offsets.dtype).tiny)
+        found = found + ROUND * identity
+        shape = found / torch.linalg.det(found) ** (1 / 3)
+    return shape
+
+
+def _lengths(offsets: Float[Tensor, "n 3"], shape: Float[Tensor, "3 3"]) -> Float[Tensor, " n"]:
+    """Distances from 0, measured by a covariance (Mahalanobis)."""
+    return (torch.linalg.solve(shape, offsets.T) * offsets.T).sum(dim=0).clamp(min=0.0).sqrt()
+
+
+def _enclosing_ball(points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, " 3"], float]:
+    """Centre and radius of nearly the smallest ball around the points (Bădoiu and Clarkson 2003)."""
+    centre = points.mean(dim=0)
+    for step in range(1, STEPS):
+        away = points - centre
+        centre = centre + away[away.square().sum(dim=1).argmax()] / (step + 1)
+    return centre, float((points - centre).norm(dim=1).max())
+
+
+def _quantile(values: Float[Tensor, " n"], weights: Float[Tensor, " n"], share: float) -> float:
+    """The value below which this share of the weight lies."""
+    order = values.argsort()
+    running = weights[order].cumsum(dim=0)
+    place = int(torch.searchsorted(running, share * running[-1]))
+    return float(values[order][min(place, len(values) - 1)])
+
+
+def _even_directions(count: int) -> Float[Tensor, "count 3"]:
+    """Unit vectors spread evenly over the sphere, on a Fibonacci spiral."""
+    index = torch.arange(count) + 0.5
+    z, angle = 1 - 2 * index / count, math.pi * (1 + math.sqrt(5)) * index
+    level = (1 - z * z).sqrt()
+    return torch.stack([level * angle.cos(), level * angle.sin(), z], dim=1)
