@@ -31,6 +31,7 @@ BT709 = 1  # its code for matrix, primaries and transfer in ITU-T H.273
 MPEG_RANGE = 1  # FFmpeg's AVCOL_RANGE_MPEG: black is 16, white is 235
 MOST_DENOMINATOR = 1001  # of frames per second, as in 30000/1001
 MOST_FPS = 1000
+SAME_BYTES = {"fflags": "+bitexact"}  # no random track number, no version: the same frames make the same file
 
 
 def check_video(path: str | PathLike[str], fps: float, overwrite: bool) -> None:
@@ -71,7 +72,7 @@ def _encode(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
 
     range_and_matrix = {"dst_color_range": ColorRange.MPEG, "dst_colorspace": Colorspace.ITU709}
     try:
-        with av.open(str(path), "w") as container:
+        with av.open(str(path), "w", options=SAME_BYTES) as container:
             stream = None
             for frame in frames:
                 stream = stream or _added_stream(container, path.suffix, frame.shape[1], frame.shape[0], fps)
