@@ -15,6 +15,8 @@ OUTPUTS = {  # verb, words, what is claimed, what a rival writes there
     "one image": (f"render {SCENE} -o view.png", "view.png", ""),
     "convert": ("convert scene.ply --cameras . -o c.ply", "c.ply", ""),
     "video": (f"video {SCENE} -o v.webm --seconds 0.1", "v.webm", ""),
+    "lod": (f"lod {SCENE} -o light.ply --simplify 0.5 --no-refine", "light.ply", ""),
+    "levels": (f"lod {SCENE} -o levels --levels 1 --no-refine", "levels", "lod.json"),
     "finetune": (f"finetune {SCENE} -o t.ply --steps 1 --truth self --scale 0.5", "t.ply", ""),
     "evaluate": (f"evaluate {SCENE} -o out --recipe mip --scale 0.5", "out", "results.json"),
     "batch": ("evaluate --cameras . -o many --recipe mip --scale 0.5 --batch scenes.toml", "many", "batch.json"),

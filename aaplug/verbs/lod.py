@@ -4,6 +4,7 @@ import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,7 +19,7 @@ from aaplug.core.monitor import SILENT, Monitor
 from aaplug.core.sampling import check_frame
 from aaplug.finetuning.refining import STEPS as STEPS_EACH
 from aaplug.finetuning.refining import refined
-from aaplug.io.atomic import output_folder, refuse_existing
+from aaplug.io.atomic import claimed, output_folder, refuse_existing
 from aaplug.io.cameras import select_views
 from aaplug.io.scenes import SpzAxes, check_scene_output, write_scene, written_format
 from aaplug.io.scenes.manifests import MANIFEST, LevelFile, Manifest, hash_of, is_pyramid, read_manifest, write_manifest
@@ -138,22 +139,23 @@ def lod(
     o = LodOptions.of(options)
     opened, known = opened_and_seen(scene, cameras, monitor)
     path = None if output is None else Path(output)
-    files = _files(path, opened, o)
+    check = partial(_files, path, opened, o)
+    files = check()
     whole = fuse_stored(whole_of(opened, drop_bad))
     if not len(whole):
         raise UsageError(whole.name, "has no Gaussians to merge")
     if not known.assumed:
         check_frame(whole.means, known.train, whole.name, o.min_seen)
     say_assumed(known, monitor)
-    with processor(o.threads):
+    folder = nullcontext() if path is None or o.single else output_folder(path)
+    with processor(o.threads), folder, claimed(path, check):
         make = _Maker(whole, known.train, _refiner(whole, known, o, monitor), monitor)
         if o.single:
             found = [make(Level(whole, 1.0), o.goals(whole)[0])]
             if path is not None:
                 write_scene(path, found[0].scene, overwrite=o.overwrite, spz_axes=spz_axes)
             return found
-        with output_folder(path) if path else nullcontext():
-            return list(_levels(make, path, files, _source(whole, known, o), o))
+        return list(_levels(make, path, files, _source(whole, known, o), o))
 
 
 @dataclass(frozen=True)
