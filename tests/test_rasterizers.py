@@ -335,6 +335,17 @@ def test_thousands_of_splats_on_one_tile(opacity):
     assert difference[~near_a_cutoff(splats, (8, 8), band=1e-5)].max() < TOLERANCE
 
 
+def test_no_pass_has_a_single_tile():
+    """Compiled kernels take no fewer than two, and eager ones are many times as slow."""
+    deep = make_splats(600, (8, 8), 3, (-1.0, 0.0)).to(F64)  # in one corner of the image
+    deep = replace(deep, opacities=torch.full((600,), 0.02, dtype=F64))
+    evaluations: list[int] = []
+    image = Tiled().counting(evaluations.append)(deep, (40, 40), SKY)
+    assert min(evaluations) >= 2 * POINT.splats_per_pass * TILE**2
+    assert len(evaluations) > 600 / POINT.splats_per_pass / 2
+    assert (image.rgb - REFERENCE(deep, (40, 40), SKY).rgb).abs().median() < TOLERANCE
+
+
 def test_a_smaller_memory_budget_changes_nothing():
     hw = (40, 50)
     splats = make_splats(100, hw, 6, (0.0, 3.0))

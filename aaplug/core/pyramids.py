@@ -6,6 +6,7 @@ to 2⁻ᵏ of training's.  With x = -log₂ of the relative rate, level k is dra
 it fades into the next.
 """
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -24,6 +25,7 @@ FADE = 0.5  # octaves of the sampling rate over which a level fades into the nex
 ROUNDING = 1e-4  # octaves: what lies nearer to a level is that level
 SIGMAS = 3.33  # standard deviations to where an opaque Gaussian's alpha falls below 1/255
 PAD = 4.0  # px around the image that the filters reach at most, at training's rate and below
+FAR_ROUNDING = 1e-6  # of the camera's distance from the origin: what float32 may lose in the camera's frame
 STRETCH = 1 + JACOBIAN_MARGIN  # how much longer than it is a Gaussian outside of the image is projected at most
 
 
@@ -50,12 +52,12 @@ class Cut:
 
         Scaling optical depths keeps the transmittance of two levels that agree: (1 - a)ʷ (1 - a)¹⁻ʷ = 1 - a.
         """
-        logits = scene.logit_opacities[self.places]
+        logits = scene.logit_opacities.index_select(0, self.places)
         if self.shares is not None:
             depths = torch.nn.functional.softplus(logits)  # optical: -ln(1 - opacity)
             faded = (-torch.expm1(-self.shares * depths)).clamp(MIN_OPACITY, 1 - MIN_OPACITY).logit()
             logits = torch.where(self.shares == 1, logits, faded)
-        columns = {name: getattr(scene, name)[self.places] for name in ("means", "quats", "log_scales")}
+        columns = {name: getattr(scene, name).index_select(0, self.places) for name in ("means", "quats", "log_scales")}
         none = scene.sh[:1].expand(len(logits), -1, -1)
         return replace(scene, **columns, logit_opacities=logits, sh=none, origin=None, pixel_sizes=None)
 
@@ -117,6 +119,7 @@ class Cutter:
 
     centres, radii: of a ball around a chunk's means, in world units.
     reach: how far beyond it one of its Gaussians can be seen.
+    sizes: how far from its mean each Gaussian of the pyramid can be seen, in world units.
     lowest, highest: training's sampling rates in the chunk, px per world unit; 0 if no camera sees it.
     """
 
@@ -125,6 +128,7 @@ class Cutter:
     centres: Float[Tensor, "c 3"]
     radii: Float[Tensor, " c"]
     reach: Float[Tensor, " c"]
+    sizes: Float[Tensor, " n"]
     lowest: Float[Tensor, " c"]
     highest: Float[Tensor, " c"]
 
@@ -145,12 +149,12 @@ class Cutter:
         centres = (extreme(means, "amin") + extreme(means, "amax")) / 2
         radii = extreme((means - centres[chunks]).norm(dim=1), "amax")
         blurs = torch.where(bounds.seen, training.convention.kernel**0.5 / bounds.lowest, 0.0)
-        sizes = SIGMAS * (scene.scales.detach().amax(dim=1).square() + blurs.square()).sqrt()
+        sizes = STRETCH * SIGMAS * (scene.scales.detach().amax(dim=1).square() + blurs.square()).sqrt()
         lowest = extreme(torch.where(bounds.seen, bounds.lowest, torch.inf), "amin")
         seen = lowest.isfinite()
         highest = extreme(bounds.highest, "amax")
-        reach = STRETCH * extreme(sizes, "amax").double()
-        return cls(pyramid, training, centres, radii, reach, lowest.where(seen, 0.0), highest)
+        reach = extreme(sizes, "amax").double()
+        return cls(pyramid, training, centres, radii, reach, sizes, lowest.where(seen, 0.0), highest)
 
     @torch.no_grad()
     def __call__(self, camera: Camera) -> Cut:
@@ -158,6 +162,9 @@ class Cutter:
         visible, octaves = self.visible(camera), self.octaves(camera)
         parts, shares = zip(*self._parts(visible, octaves), strict=True)
         index, shares = torch.cat(parts), torch.cat(shares)
+        means, sizes = (column.index_select(0, index) for column in (self.pyramid.scene.means, self.sizes))
+        shown = self._shown(camera, means, sizes).nonzero()[:, 0]
+        index, shares = index.index_select(0, shown), shares.index_select(0, shown)
         return Cut(index, None if (shares == 1).all() else shares)
 
     @torch.no_grad()
@@ -179,7 +186,9 @@ class Cutter:
         """
         own = torch.full_like(self.radii, self.training.relative_rate(camera))
         if camera.trained_focal is None:
-            now = camera.focal / (self._places(camera)[:, 2] - self.radii).clamp(min=NEAR)
+            pose = camera.cam_from_world.detach().double()
+            depths = self.centres @ pose[2, :3] + pose[2, 3]
+            now = camera.focal / (depths - self.radii).clamp(min=NEAR)
             trained = torch.minimum(torch.maximum(now, self.lowest.double()), self.highest.double())
             own = torch.where(self.highest > 0, now / trained, own)
         octaves = -own.log2()
@@ -196,22 +205,14 @@ class Cutter:
 
     def visible(self, camera: Camera) -> Bool[Tensor, " c"]:
         """Chunks that can reach into the image."""
-        x, y, z = self._places(camera).unbind(dim=1)
-        room, pad = self.radii + self.reach, PAD * max(1.0, self.training.relative_rate(camera))
-        found = z + self.radii > NEAR
-        for along, focal, centre, side in (
-            (x, camera.fx, camera.cx, camera.width),
-            (y, camera.fy, camera.cy, camera.height),
-        ):
-            for sign, edge in ((1.0, -pad - centre), (-1.0, side + pad - centre)):
-                slope = edge / focal  # the plane along = slope z
-                found &= sign * (along - slope * z) > -room * (1 + slope * slope) ** 0.5
-        return found
+        return self._shown(camera, self.centres, self.radii + self.reach)
 
-    def _places(self, camera: Camera) -> Float[Tensor, "c 3"]:
-        """The chunks' centres in the camera's frame."""
-        pose = camera.cam_from_world.detach().double()
-        return self.centres @ pose[:3, :3].T + pose[:3, 3]
+    def _shown(self, camera: Camera, places: Float[Tensor, "m 3"], room: Float[Tensor, " m"]) -> Bool[Tensor, " m"]:
+        """Whether what is seen up to `room` from a place can reach into the image."""
+        pad = PAD * max(1.0, self.training.relative_rate(camera))
+        normals, offsets = _frustum(camera, pad)
+        room = room + FAR_ROUNDING * float(camera.cam_from_world.detach()[:3, 3].norm())
+        return torch.addmm(offsets.to(places)[:, None], normals.to(places), places.T).amin(dim=0) > -room
 
     def _parts(
         self, visible: Bool[Tensor, " c"], octaves: Float[Tensor, " c"]
@@ -228,3 +229,23 @@ class Cutter:
             starts, counts = level[chosen], level[chosen + 1] - level[chosen]
             skipped = torch.repeat_interleave(starts - counts.cumsum(0) + counts, counts)
             yield skipped + torch.arange(len(skipped)), torch.repeat_interleave(share[chosen], counts)
+
+
+def _frustum(camera: Camera, pad: float) -> tuple[Float[Tensor, "5 3"], Float[Tensor, " 5"]]:
+    """Normals and offsets of the planes around what a camera sees, in the world; normals · place + offset >= 0 inside.
+
+    pad: px around the image.
+    """
+    planes = [[0.0, 0.0, 1.0, -NEAR]]
+    for axis, focal, centre, side in (
+        (0, camera.fx, camera.cx, camera.width),
+        (1, camera.fy, camera.cy, camera.height),
+    ):
+        for sign, edge in ((1.0, -pad - centre), (-1.0, side + pad - centre)):
+            slope = edge / focal  # the plane along = slope z
+            plane = [0.0, 0.0, -sign * slope, 0.0]
+            plane[axis] = sign
+            planes.append([x / math.hypot(1, slope) for x in plane])
+    found = torch.tensor(planes, dtype=torch.float64)
+    pose = camera.cam_from_world.detach().cpu().double()
+    return found[:, :3] @ pose[:3, :3], found[:, :3] @ pose[:3, 3] + found[:, 3]

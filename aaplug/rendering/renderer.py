@@ -211,7 +211,7 @@ class Renderer:
         if recipe.pixel.needs_depth_slopes:
             splats = with_depth_slopes(splats, chunk, camera)
         own = splats.sources
-        splats = replace(splats, sources=own + places if isinstance(places, int) else places[own])
+        splats = replace(splats, sources=own + places if isinstance(places, int) else places.index_select(0, own))
         splats = recipe.screen(splats, camera, training)
         ellipses = recipe.pixel.bounding_ellipses(splats, rules)
         return cull(splats, camera.hw, training.cull_margin, kernels, ellipses, rules)

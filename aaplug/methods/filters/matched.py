@@ -86,7 +86,7 @@ class Matched:
         view = torch.full_like(splats.depths, training.relative_rate(camera))
         if self.reference == "global":
             return view
-        seen = training.bounds.seen[splats.sources]
+        seen = training.bounds.seen.index_select(0, splats.sources)
         now = camera.focal / splats.depths
         compared = REFERENCES[self.reference](now, _trained(splats, camera, training, seen))
         return torch.where(seen, now / compared, view)
@@ -106,7 +106,7 @@ class Trained(NamedTuple):
 def _trained(splats: Splats2D, camera: Camera, training: TrainingViews, seen: Bool[Tensor, " m"]) -> Trained:
     """Training rates of each splat; bounds of 1 for Gaussians that no camera saw, only to avoid dividing by 0."""
     lowest, highest = (
-        bound[splats.sources].to(splats.depths).where(seen, 1.0)
+        bound.index_select(0, splats.sources).to(splats.depths).where(seen, 1.0)
         for bound in (training.bounds.lowest, training.bounds.highest)
     )
     own = None if camera.trained_focal is None else camera.trained_focal / splats.depths

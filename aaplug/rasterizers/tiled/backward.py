@@ -113,7 +113,7 @@ def _steps(
         sizes = [len(before) for before in together]
         places = torch.cat([at[:n] + (start + i) * STEP for i, n in enumerate(sizes)])
         last = torch.cat([ends[:n] for n in sizes])
-        (owners,) = kernels.run(OWNERS, rows, bins.splats, places, last)
+        (owners,) = kernels.run(OWNERS, rows, bins.splats, torch.minimum(places, last), last)
         drawn = rows_at(rows, owners)
         steps = zip(owners.split(sizes), drawn.split(sizes), together, strict=True)
         yield from reversed(list(steps))

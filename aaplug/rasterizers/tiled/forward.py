@@ -24,6 +24,7 @@ from aaplug.rasterizers.tiled.binning import LONGEST_PASS, Bins
 STEP = 4  # splats per backward step; transmittance is stored before each step.  With more the compiler splits the loop
 CHECK_EVERY = 2  # passes between checks for saturated tiles
 COMPACT_BELOW = 3 / 4  # saturated tiles are dropped once the share of unsaturated ones is below this
+FEWEST = 2  # tiles in a pass: compiled kernels take no fewer, and a tile without splats left stays as it is
 GATE = 1e9  # lifts any nonzero output of `threshold` above 1, so that min(output · GATE, value) is `value` or 0
 EXAMPLE_TILES, EXAMPLE_SPLATS = (1024, 4096)  # as large as real work: inductor chooses by them which loops use threads
 
@@ -67,8 +68,8 @@ def composite_forward(
     local = tile_centres(rows)
     image = rows.new_zeros(4, len(bins.counts), PIXELS)
     order = torch.sort(bins.counts, descending=True, stable=True).indices
-    order = order[: int((bins.counts > 0).sum())]
-    for tiles in order.split(how.kernels.tiles):
+    order = order[: max(FEWEST, int((bins.counts > 0).sum()))]
+    for tiles in order.tensor_split(-(-len(order) // how.kernels.tiles) or 1) if len(order) else ():
         _composite_block(rows, bins, tiles, image, local, how, segments)
     return image[:3], image[3]
 
@@ -95,7 +96,7 @@ def _composite_block(
         if segments is not None:
             segments.append(Segment(tiles, (at, ends), origins, before))
         for i, n in enumerate(going):
-            where = (bins.splats, at[:n] + i * splats, ends[:n], origins[:n])
+            where = (bins.splats, torch.minimum(at[:n] + i * splats, ends[:n]), ends[:n], origins[:n])
             pixels = (T[:n], *planes[:, :n].unbind(), *local, ones[:n])
             *within, after = how.kernels.run(how.kernel, rows, *where, *pixels)
             here = steps[i * splats // STEP :]
@@ -104,7 +105,10 @@ def _composite_block(
             start += splats
             if i % CHECK_EVERY == CHECK_EVERY - 1 and i + 1 < len(going):
                 alive = T[: going[i + 1]].amax(dim=1) > 0
-                if int(alive.sum()) < COMPACT_BELOW * len(alive):
+                count = int(alive.sum())
+                if count < COMPACT_BELOW * len(alive):
+                    if 0 < count < FEWEST:
+                        alive[:FEWEST] = True
                     rest = alive.nonzero().squeeze(1)
                     break
         image.index_copy_(1, tiles, planes)
@@ -116,7 +120,8 @@ def _going(counts: Int[Tensor, " t"], at_once: int) -> list[int]:
     """How many tiles take part in each pass of `at_once` splats; `counts`: splats left per tile, falling."""
     passes = (counts + (at_once - 1)) // at_once
     turns = torch.arange(int(passes[0]), device=counts.device)
-    return (len(passes) - torch.searchsorted(passes.flip(0), turns, right=True)).tolist()
+    going = (len(passes) - torch.searchsorted(passes.flip(0), turns, right=True)).tolist()
+    return [max(n, min(FEWEST, len(passes))) for n in going]
 
 
 def _pass(
