@@ -298,8 +298,9 @@ def test_background_comes_from_cfg_args(cli):
     assert BLACK == (0.0, 0.0, 0.0)
 
 
-def test_a_reader_that_leaves_early_sees_no_traceback():
-    program = "from aaplug_cli.main import main; main()"
+@pytest.mark.parametrize("entry", ["main", "program"])
+def test_a_reader_that_leaves_early_sees_no_traceback(entry):
+    program = f"from aaplug_cli.main import {entry}; {entry}()"
     words = [sys.executable, "-c", program, "render", "--help"]
     with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as run:
         assert run.stdout is not None
@@ -307,3 +308,16 @@ def test_a_reader_that_leaves_early_sees_no_traceback():
         run.stdout.close()
         err = run.stderr.read()
     assert (run.returncode, err) == (1, "")
+
+
+@pytest.mark.parametrize(
+    ("words", "code"),
+    [(["--version"], 0), (["info", "scene.ply", "--json"], 0), (["info", "none.ply"], 2), (["--x"], 2)],
+)
+def test_the_program_ends_at_once_with_all_said(dataset, words, code):
+    program = "import atexit; atexit.register(print, 'late'); from aaplug_cli.main import program; program()"
+    run = subprocess.run([sys.executable, "-c", program, *words], cwd=dataset, capture_output=True, text=True)
+    assert run.returncode == code
+    assert bool(run.stdout) == (code == 0)
+    assert "late" not in run.stdout
+    assert run.stderr.count("error: ") == (code == 2)

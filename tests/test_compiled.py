@@ -53,8 +53,9 @@ def test_compositing_is_one_loop_over_tiles(built, name):
     assert sum(source.count("for(int64_t x0=") for source in sources) == 1
 
 
-def test_packages_are_checked_by_one_thread_which_is_undone_after_that(built, monkeypatch):
+def test_packages_are_checked_by_one_thread_which_is_undone_after_that(built, tmp_path, monkeypatch):
     seen, close, threads = [], compiled._close, torch.get_num_threads()
+    monkeypatch.setattr(compiled, "_mark", lambda kernel: tmp_path / kernel.name)  # as if none were known
     monkeypatch.setattr(compiled, "_close", lambda *x: seen.append(torch.get_num_threads()) or close(*x))
     try:
         torch.set_num_threads(2)
@@ -63,6 +64,18 @@ def test_packages_are_checked_by_one_thread_which_is_undone_after_that(built, mo
         assert torch.get_num_threads() == 2
     finally:
         torch.set_num_threads(threads)
+
+
+def test_a_package_that_passed_is_compared_again_only_after_a_change(built, empty_cache, monkeypatch):
+    kernel, results = compiled.KERNELS[0], iter([True, False])
+    monkeypatch.setattr(compiled, "_passes", lambda kernel: next(results))
+    path = compiled._path(kernel)
+    assert not compiled._is_sound(kernel), "it is not there"
+    path.parent.mkdir(parents=True)
+    path.write_bytes(b"package")
+    assert all(compiled._is_sound(kernel) for _ in range(3))
+    path.write_bytes(b"another")
+    assert not compiled._is_sound(kernel)
 
 
 WAYS = {(r.pixel.name, r.compositor, r.selection): name for name, r in RECIPES.items()}

@@ -2,7 +2,8 @@
 
 Each kernel becomes one package of `torch._inductor`.  The folder's name is a hash of torch's version, the kernels'
 source and the processor's instruction set, so a stale package is never found.  A package that does not load, or whose
-result differs from the eager one, is built again.
+result differs from the eager one, is built again.  A package that passed is remembered by its hash and is not compared
+again.
 """
 
 import hashlib
@@ -11,6 +12,7 @@ import os
 import shutil
 import sys
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 
 import platformdirs
@@ -80,20 +82,14 @@ def has_compiler() -> bool:
 def load() -> CompiledKernels | None:
     """The compiled kernels, if all are built and those for images are sound.
 
-    Kernels for gradients load when they are first needed; a broken one is replaced by its eager function.
+    Each loads when it is first needed; a broken one for gradients is replaced by its eager function.
     """
+    known = {kernel.name: kernel for kernel in KERNELS}
     if not all(_path(kernel).is_file() for kernel in KERNELS):
         return None
-    packages = {}
-    for kernel in KERNELS:
-        if not kernel.pulls_back:
-            package = _load(kernel)
-            if package is None:
-                return None
-            packages[kernel.name] = package
-    pulling = {kernel.name: kernel for kernel in KERNELS if kernel.pulls_back}
-    later = lambda name: _load(pulling[name]) if name in pulling else None  # noqa: E731
-    return CompiledKernels(packages, later, load_or_eager)
+    if not all(_is_sound(kernel) for kernel in KERNELS if not kernel.pulls_back):
+        return None
+    return CompiledKernels({}, lambda name: _load(known[name]) if name in known else None, load_or_eager)
 
 
 def load_or_eager() -> Kernels:
@@ -108,7 +104,7 @@ def build(progress: Tell = lambda done, total: None) -> CompiledKernels:
         UsageError: there is no compiler or it fails, the cache folder cannot be written, or a process died.
     """
     total = len(KERNELS)
-    missing = [kernel.name for kernel in KERNELS if _load(kernel) is None]
+    missing = [kernel.name for kernel in KERNELS if not _is_sound(kernel)]
     progress(total - len(missing), total)
     if missing:
         if not has_compiler():
@@ -129,23 +125,52 @@ def _path(kernel: Kernel) -> Path:
     return cache_folder() / f"{kernel.name}.pt2"
 
 
+def _mark(kernel: Kernel) -> Path:
+    """Holds the hash of the package that passed."""
+    return _path(kernel).with_suffix(".sound")
+
+
+def _is_sound(kernel: Kernel) -> bool:
+    """Whether the package gives the eager result; found out once."""
+    mark = _mark(kernel)
+    try:
+        digest = hashlib.sha256(_path(kernel).read_bytes()).hexdigest()
+        if mark.is_file() and mark.read_text() == digest:
+            return True
+        sound = _passes(kernel)
+        if sound:
+            with scratch(str(mark.parent)) as folder:
+                (folder / mark.name).write_text(digest)
+                os.replace(folder / mark.name, mark)
+        return sound
+    except FileNotFoundError:
+        return False
+    except OSError:  # the cache cannot be written: it is found out again
+        return _passes(kernel)
+
+
 def _load(kernel: Kernel) -> Package | None:
     """The package, if its result equals the eager one; else None."""
-    path = _path(kernel)
-    if not path.is_file():
-        return None
+    return Package.of(_opened(kernel), kernel.example()) if _is_sound(kernel) else None
+
+
+def _opened(kernel: Kernel) -> Callable[[list[torch.Tensor]], list[torch.Tensor]]:
+    # the loader inside `aoti_load_package`, whose import takes two seconds and whose calls take four times as long
+    loader = torch._C._aoti.AOTIModelPackageLoader  # pyright: ignore[reportAttributeAccessIssue]
+    return loader(str(_path(kernel)), "model", True, 1, -1).run
+
+
+def _passes(kernel: Kernel) -> bool:
+    """Whether the package's result on the example equals the eager one."""
     try:
-        # the loader inside `aoti_load_package`, whose import takes two seconds and whose calls take four times as long
-        loader = torch._C._aoti.AOTIModelPackageLoader  # pyright: ignore[reportAttributeAccessIssue]
-        package = loader(str(path), "model", True, 1, -1).run
+        package = _opened(kernel)
         with torch.no_grad(), torch_threads(1):  # several threads would wait for each other
             args, twins = kernel.example(), kernel.example()
             found = [*package(list(args)), *args]  # results, and arguments updated in place
             expected = [*kernel.function(*twins), *twins]
-            close = all(_close(a, b) for a, b in zip(found, expected, strict=True))
-        return Package.of(package, args) if close else None
+            return all(_close(a, b) for a, b in zip(found, expected, strict=True))
     except Exception:  # a broken package can fail in any way; it is built again
-        return None
+        return False
 
 
 def _close(found: torch.Tensor, expected: torch.Tensor) -> bool:

@@ -47,7 +47,7 @@ class CompiledKernels(Kernels):
         later: Callable[[str], Package | None] = lambda name: None,
         reload: Callable[[], Kernels] = Kernels,
     ):
-        """packages: by their kernels' names.  later: loads one when it is first needed.  reload: for unpickling."""
+        """packages: by their kernels' names.  later: loads another when it is first needed.  reload: for unpickling."""
         self._reload = reload
         self._packages: dict[str, Package | None] = dict(packages)
         self._later = later
@@ -57,18 +57,20 @@ class CompiledKernels(Kernels):
 
     def run(self, kernel: Kernel, *args: Tensor) -> tuple[Tensor, ...]:
         """Run one stage."""
-        package = self._packages.get(kernel.name)
+        package = self._package(kernel.name)
         if package is None or not package.takes(args):
             return super().run(kernel, *args)
         if not (torch.is_grad_enabled() and any(arg.requires_grad for arg in args)):
             return tuple(package.run([arg.contiguous() for arg in args]))
-        name = kernel.name + BACKWARD
-        if name not in self._packages:
-            self._packages[name] = self._later(name)
-        backward = self._packages[name]
+        backward = self._package(kernel.name + BACKWARD)
         if backward is None:
             return super().run(kernel, *args)
         return _Tracked.apply(package, backward, *args)  # pyright: ignore[reportReturnType]
+
+    def _package(self, name: str) -> Package | None:
+        if name not in self._packages:
+            self._packages[name] = self._later(name)
+        return self._packages[name]
 
 
 class _Tracked(torch.autograd.Function):
