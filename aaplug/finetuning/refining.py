@@ -19,7 +19,8 @@ from aaplug.finetuning.loop import run
 from aaplug.finetuning.parameters import RATES
 from aaplug.finetuning.settings import Settings
 from aaplug.finetuning.state import TuningJob, begin
-from aaplug.methods.viewers import TUNED
+from aaplug.methods.recipes import RECIPES
+from aaplug.methods.viewers import TUNED, Viewer
 from aaplug.rendering.renderer import Renderer
 
 POSES = 100  # training poses at most
@@ -35,6 +36,7 @@ SHARE = 0.3
 USUAL = 0.02  # root mean square error, of colours in [0, 1]
 DECAY = 0.03
 STEPS = 800  # for a level of 1/4 of the training rate and above; a smaller one takes more, of smaller images
+LARGE = 1 / 4  # of the training rate
 MOST_TIMES = 4.0  # as many at most
 GOOD = 3.5e-5  # mean square error, 44.5 dB: a level that is so close is not tuned
 
@@ -45,14 +47,16 @@ def refined(
     look: Renderer,
     poses: Sequence[Camera],
     steps: int = STEPS,
+    viewer: Viewer | None = None,
     monitor: Monitor = SILENT,
 ) -> Gaussians:
     """The level after tuning, or as it is where that does not help.
 
     rate: the lowest sampling rate relative to training's that it is meant for.
-    steps: for a rate of 1/4 and above; see `STEPS`.
+    steps: for a rate of `LARGE` and above; see `STEPS`.
     look: draws the scene as training showed it.
     poses: views to tune on, at the training size.
+    viewer: what will draw the result; None for aaplug.
 
     Raises:
         UsageError: no step has a finite gradient.
@@ -61,12 +65,15 @@ def refined(
     views, probes = _views(poses, scales)
     truth = Truth(look, memory=MEMORY)
     known = look.training
+    if viewer is not None:
+        level = replace(viewer.shown(level), convention=viewer.convention_of(level))
+        look = replace(look, recipe=RECIPES[viewer.recipe])
     shown = replace(look, scene=level, training=TrainingViews.of(level, known.cameras, known.cull_margin))
     before = _error(shown, truth, probes, rate)
     if before < GOOD:
         return level
     _prepare(truth, views, scales, monitor)
-    steps = round(steps * min(MOST_TIMES, max(1.0, 0.25 / rate)))
+    steps = round(steps * min(MOST_TIMES, max(1.0, LARGE / rate)))
     share = SHARE * before**0.5 / USUAL
     rates = {name: share * FASTER[name] * (1 / rate if name == "means" else 1) * own for name, own in RATES.items()}
     settings = Settings("levels", steps, scales, rates, decay=DECAY)
@@ -82,7 +89,9 @@ def refined(
     found = state.scene(job)
     if _error(replace(state.renderer(job), scene=found), truth, probes, rate) >= before:
         return level
-    return replace(found, fused=(*level.fused, Fusion(TUNED, {"steps": str(steps), "for": "levels"})))
+    return replace(
+        found, fused=(*level.fused, Fusion(TUNED, {"steps": str(steps), "for": viewer.name if viewer else "levels"}))
+    )
 
 
 def _views(poses: Sequence[Camera], scales: dict[float, float]) -> tuple[list[Camera], list[Camera]]:

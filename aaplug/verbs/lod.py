@@ -1,6 +1,5 @@
 """Levels of detail: lighter scene files for lower sampling rates."""
 
-import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
@@ -12,11 +11,12 @@ import torch
 import tyro
 
 from aaplug.core.cameras import Camera, CameraSet
-from aaplug.core.digests import digest_of_cameras, digest_of_scene
+from aaplug.core.digests import digest_of_cameras, digest_of_scene, digest_of_values
 from aaplug.core.errors import OutputError, UsageError
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.monitor import SILENT, Monitor
 from aaplug.core.sampling import check_frame
+from aaplug.finetuning.fitting import fit, steps_for
 from aaplug.finetuning.refining import STEPS as STEPS_EACH
 from aaplug.finetuning.refining import refined
 from aaplug.io.atomic import claimed, output_folder, refuse_existing
@@ -29,6 +29,7 @@ from aaplug.levels.merging import Goal, merged, merged_in_chunks
 from aaplug.levels.pyramids import Level, levels_in
 from aaplug.levels.rates import rates_of
 from aaplug.methods.filters import fuse_stored
+from aaplug.methods.viewers import VIEWERS, Viewer
 from aaplug.verbs.assumed import say_assumed
 from aaplug.verbs.inputs import (
     AnyPath,
@@ -41,7 +42,7 @@ from aaplug.verbs.inputs import (
     sources_of,
     whole_of,
 )
-from aaplug.verbs.options import STEPS, UNSET, ViewOptions, number
+from aaplug.verbs.options import STEPS, UNSET, ViewOptions, flag, number
 
 LEVELS = 4  # as many as usual: down to 1/16 of the training size
 MEGABYTE = 1e6
@@ -63,6 +64,8 @@ class LodOptions(ViewOptions):
     """Write a folder of levels, each for half the size of the one before, as light as the image allows (default: 4)."""
     scale: Annotated[float | None, number(0.001, 1), UNSET] = None
     """With --simplify or --budget: size of the images that the scene is meant for (default: root of the share)."""
+    viewer: Annotated[str | Viewer | None, flag("VIEWER", "--for", kind=str | None)] = None
+    """Tune each file for spark, playcanvas or another of examples/guides/viewers.md, instead of for aaplug."""
     refine: bool = True
     """Merge alone, in seconds: do not tune the result to look like the scene, which takes minutes."""
     steps: Annotated[int, STEPS] = STEPS_EACH
@@ -79,13 +82,20 @@ class LodOptions(ViewOptions):
             raise UsageError(given[1], f"cannot be combined with `{given[0]}`: each asks for other files")
         if self.scale is not None and not self.single:
             raise UsageError("scale", "belongs to `simplify` and `budget`")
-        if self.resume and self.single:
-            raise UsageError("resume", "belongs to levels")
+        if self.resume and (self.single or self.viewer is not None):
+            raise UsageError("resume", "belongs to levels for aaplug")
+        if self.viewer is not None and not (self.refine and self.steps):
+            raise UsageError("viewer", "is what the result is tuned for: leave out `refine`, and `steps` of 0")
 
     @property
     def single(self) -> bool:
         """Whether one scene is asked for, not levels."""
         return self.simplify is not None or self.budget is not None
+
+    @property
+    def shown_by(self) -> Viewer | None:
+        """The viewer; None for aaplug."""
+        return VIEWERS.find(self.viewer, "viewer") if isinstance(self.viewer, str) else self.viewer
 
     def goals(self, scene: Gaussians) -> list[Goal]:
         """What to merge for, one scene after the other.
@@ -149,22 +159,27 @@ def lod(
     say_assumed(known, monitor)
     folder = nullcontext() if path is None or o.single else output_folder(path)
     with processor(o.threads), folder, claimed(path, check):
-        make = _Maker(whole, known.train, _refiner(whole, known, o, monitor), monitor)
+        make = _Maker(whole, known.train, *_tuners(whole, known, o, monitor), monitor)
         if o.single:
-            found = [make(Level(whole, 1.0), o.goals(whole)[0])]
+            found = make.finished(make(Level(whole, 1.0), o.goals(whole)[0]))
             if path is not None:
-                write_scene(path, found[0].scene, overwrite=o.overwrite, spz_axes=spz_axes)
-            return found
-        return list(_levels(make, path, files, _source(whole, known, o), o))
+                write_scene(path, found.scene, overwrite=o.overwrite, spz_axes=spz_axes)
+            return [found]
+        return list(_levels(make, path, files, known, o))
 
 
 @dataclass(frozen=True)
 class _Maker:
-    """Makes a level of the one before it."""
+    """Makes a level of the one before it.
+
+    tuned: for aaplug; the next level is made of the result.
+    finished: for a viewer.
+    """
 
     scene: Gaussians
     train: Sequence[Camera]
-    refine: Callable[[Gaussians, float], Gaussians]
+    tuned: Callable[[Level], Level]
+    finished: Callable[[Level], Level]
     monitor: Monitor
 
     def __call__(self, before: Level, goal: Goal) -> Level:
@@ -175,46 +190,61 @@ class _Maker:
             else:
                 found, chunks = merged_in_chunks(scene, rates, before.chunks, goal, tell)
         self.monitor.say(f"{len(found):,} Gaussians for {goal.rate:.3g} × the training rate")
-        return Level(self.refine(found, goal.rate), goal.rate, chunks)
+        return self.tuned(Level(found, goal.rate, chunks))
 
 
-def _refiner(
+def _tuners(
     scene: Gaussians, cameras: CameraSet, o: LodOptions, monitor: Monitor
-) -> Callable[[Gaussians, float], Gaussians]:
-    """What tunes a level."""
+) -> tuple[Callable[[Level], Level], Callable[[Level], Level]]:
+    """What tunes a level for aaplug, and for a viewer; one of them does nothing."""
     if not o.refine or not o.steps:
-        return lambda level, rate: level
+        return _same, _same
+    viewer = o.shown_by
     look, views = look_of(scene, cameras, o.steps, o, monitor), select_views(cameras, o.views)
-    return lambda level, rate: refined(level, rate, look, views, o.steps, monitor)
+
+    def tuned(level: Level) -> Level:
+        if viewer is not None and level.scene is scene:
+            return level._replace(scene=fit(scene, viewer, look, views, steps_for(scene, viewer), monitor).scene)
+        return level._replace(scene=refined(level.scene, level.rate, look, views, o.steps, viewer, monitor))
+
+    return (tuned, _same) if viewer is None else (_same, tuned)
 
 
-def _source(scene: Gaussians, cameras: CameraSet, o: LodOptions) -> str:
-    """Hash of all that the levels depend on."""
-    facts = [digest_of_scene(scene), digest_of_cameras(cameras.train)]
-    facts += [str((cameras.background, o.refine, o.steps, o.views, o.background, o.cull_margin))]
-    return hashlib.sha256(" ".join(facts).encode()).hexdigest()
+def _same(level: Level) -> Level:
+    return level
 
 
-def _levels(make: _Maker, folder: Path | None, files: Sequence[Path], source: str, o: LodOptions) -> Iterator[Level]:
-    """The scene and its levels, each written before the next is made."""
+def _levels(
+    make: _Maker, folder: Path | None, files: Sequence[Path], cameras: CameraSet, o: LodOptions
+) -> Iterator[Level]:
+    """The scene and its levels, each written before the next is made; levels for a viewer are no pyramid."""
     done: list[Level] = []
-    manifest = Manifest(source, LARGEST, ())
-    if o.resume and folder is not None and is_pyramid(folder):
-        manifest = read_manifest(folder)
-        if manifest.source != source:
+    pyramid = folder if o.viewer is None else None
+    manifest = Manifest(_source(make.scene, cameras, o) if pyramid else "", LARGEST, ())
+    if pyramid and o.resume and is_pyramid(pyramid):
+        found = read_manifest(pyramid)
+        if found.source != manifest.source:
             raise UsageError("resume", f"{folder} holds levels of another scene, other cameras or other options")
-        done = list(levels_in(folder, manifest))
+        manifest, done = found, list(levels_in(pyramid, found))
         make.monitor.say(f"resumed: {len(done) - 1} levels are there")
     done = done or [Level(make.scene, 1.0, chunks_of(make.scene.means, LARGEST))]
     goals = o.goals(make.scene)
     for place in range(len(goals) + 1):
         if place >= len(done):
             done.append(make(done[-1], goals[place - 1]))
+        shown = make.finished(done[place])
         if folder is not None and place >= len(manifest.levels):
-            write_scene(files[place], done[place].scene, overwrite=o.overwrite or o.resume)
-            manifest = replace(manifest, levels=(*manifest.levels, _described(files[place], done[place])))
-            write_manifest(folder, manifest)
-        yield done[place]
+            write_scene(files[place], shown.scene, overwrite=o.overwrite or o.resume)
+            if pyramid:
+                manifest = replace(manifest, levels=(*manifest.levels, _described(files[place], shown)))
+                write_manifest(pyramid, manifest)
+        yield shown
+
+
+def _source(scene: Gaussians, cameras: CameraSet, o: LodOptions) -> str:
+    """Hash of all that the levels depend on."""
+    facts = [digest_of_scene(scene), digest_of_cameras(cameras.train)]
+    return digest_of_values((*facts, cameras.background, o.refine, o.steps, o.views, o.background, o.cull_margin))
 
 
 def _described(file: Path, level: Level) -> LevelFile:
@@ -234,5 +264,6 @@ def _files(output: Path | None, scene: Held | SceneFile, o: LodOptions) -> list[
         raise OutputError(output, "levels go to a folder; for one scene, give `simplify` or `budget`")
     stem = sources[0].stem if sources else "scene"
     files = [output / f"{stem}_lod{level}.ply" for level in range((o.levels or LEVELS) + 1)]
-    refuse_existing([*files, output / MANIFEST], o.overwrite or o.resume)
+    others = [output / MANIFEST] if o.viewer is None else []
+    refuse_existing([*files, *others], o.overwrite or o.resume)
     return files
