@@ -45,6 +45,7 @@ from aaplug.verbs.inputs import (
 from aaplug.verbs.options import STEPS, UNSET, ViewOptions, flag, number
 
 LEVELS = 4  # as many as usual: down to 1/16 of the training size
+TIMES_FOR_ONE = 2  # as many steps for one scene: its counts are met, so tuning has more to mend
 MEGABYTE = 1e6
 NORMALS = 3  # columns that a .ply has beside a Gaussian's parameters
 
@@ -68,8 +69,8 @@ class LodOptions(ViewOptions):
     """Tune each file for spark, playcanvas or another of examples/guides/viewers.md, instead of for aaplug."""
     refine: bool = True
     """Merge alone, in seconds: do not tune the result to look like the scene, which takes minutes."""
-    steps: Annotated[int, STEPS] = STEPS_EACH
-    """Steps of tuning for each level."""
+    steps: Annotated[int | None, STEPS, UNSET] = None
+    """Steps of tuning for each level, more for small ones (default: 800, or 1600 for one scene)."""
     resume: bool = False
     """Keep the levels that are there, if they were made of the same scene, cameras and options."""
     overwrite: bool = False
@@ -84,13 +85,19 @@ class LodOptions(ViewOptions):
             raise UsageError("scale", "belongs to `simplify` and `budget`")
         if self.resume and (self.single or self.viewer is not None):
             raise UsageError("resume", "belongs to levels for aaplug")
-        if self.viewer is not None and not (self.refine and self.steps):
+        if self.viewer is not None and not self.tuning:
             raise UsageError("viewer", "is what the result is tuned for: leave out `refine`, and `steps` of 0")
 
     @property
     def single(self) -> bool:
         """Whether one scene is asked for, not levels."""
         return self.simplify is not None or self.budget is not None
+
+    @property
+    def tuning(self) -> int:
+        """Steps of tuning for a rate of 1/4 and above; 0 for none."""
+        usual = TIMES_FOR_ONE * STEPS_EACH if self.single else STEPS_EACH
+        return (usual if self.steps is None else self.steps) if self.refine else 0
 
     @property
     def shown_by(self) -> Viewer | None:
@@ -197,15 +204,15 @@ def _tuners(
     scene: Gaussians, cameras: CameraSet, o: LodOptions, monitor: Monitor
 ) -> tuple[Callable[[Level], Level], Callable[[Level], Level]]:
     """What tunes a level for aaplug, and for a viewer; one of them does nothing."""
-    if not o.refine or not o.steps:
+    if not o.tuning:
         return _same, _same
     viewer = o.shown_by
-    look, views = look_of(scene, cameras, o.steps, o, monitor), select_views(cameras, o.views)
+    look, views = look_of(scene, cameras, o.tuning, o, monitor), select_views(cameras, o.views)
 
     def tuned(level: Level) -> Level:
         if viewer is not None and level.scene is scene:
             return level._replace(scene=fit(scene, viewer, look, views, steps_for(scene, viewer), monitor).scene)
-        return level._replace(scene=refined(level.scene, level.rate, look, views, o.steps, viewer, monitor))
+        return level._replace(scene=refined(level.scene, level.rate, look, views, o.tuning, viewer, monitor))
 
     return (tuned, _same) if viewer is None else (_same, tuned)
 
@@ -244,7 +251,7 @@ def _levels(
 def _source(scene: Gaussians, cameras: CameraSet, o: LodOptions) -> str:
     """Hash of all that the levels depend on."""
     facts = [digest_of_scene(scene), digest_of_cameras(cameras.train)]
-    return digest_of_values((*facts, cameras.background, o.refine, o.steps, o.views, o.background, o.cull_margin))
+    return digest_of_values((*facts, cameras.background, o.tuning, o.views, o.background, o.cull_margin))
 
 
 def _described(file: Path, level: Level) -> LevelFile:

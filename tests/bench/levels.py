@@ -1,9 +1,9 @@
 """Levels of detail, measured: python -m tests.bench.levels [SCENE ...], of chair and snowmiku, or cost.
 
 For a scene it prints lighter scenes beside splat-transform's `--decimate`; then a pyramid, kept in a folder of the
-working directory, at sizes from 1/2 to 1/32: PSNR in dB against the scene's own look and against photographs, median
-milliseconds, and Gaussians projected, with and without levels; then a dolly.  For cost: time against Gaussians and
-pixels on synthetic scenes.
+working directory, at sizes from 1/2 to 1/32, with and without levels: PSNR in dB, SSIM and flicker against the scene's
+own look, PSNR against photographs, median milliseconds, Gaussians projected and evaluations of a splat in a pixel; then
+a dolly, also as a video.  For cost: time against Gaussians and pixels on synthetic scenes.
 """
 
 import statistics
@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
+from typing import Literal
 
 import torch
 
@@ -21,15 +22,19 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.core.interfaces import Rasterizer
 from aaplug.core.pyramids import Pyramid
 from aaplug.core.training import TrainingViews
+from aaplug.evaluation.metrics import METRICS
 from aaplug.evaluation.protocols import median_depth
+from aaplug.evaluation.results import Report, mean
 from aaplug.evaluation.truth import Truth, ViewTruth, own_look
 from aaplug.io.cameras import read_cameras
 from aaplug.io.scenes import read_scene
+from aaplug.io.video import write_video
 from aaplug.levels.pyramids import pyramid_of, read_pyramid
 from aaplug.methods.recipes import find_recipe
 from aaplug.rasterizers import find_rasterizer
 from aaplug.rendering.benchmark import exponent, synthetic_camera, synthetic_scene
 from aaplug.rendering.renderer import Renderer
+from aaplug.verbs.evaluate import evaluate
 from aaplug.verbs.lod import lod
 from tests.bench.away import SCENES, Scene, decibels
 from tests.conftest import SHARED_DATA
@@ -44,8 +49,10 @@ DECIMATED = {  # at 1/2, 1/4 and 1/8, measured with @playcanvas/splat-transform 
     ("snowmiku", 1 / 4): (32.3, 32.8, 33.5),
     ("snowmiku", 1 / 16): (25.8, 26.1, 26.6),
 }
+COMPARED = ("psnr", "ssim", "flicker")
 REPEATS = 5
 OCTAVES, STEPS_EACH = 3, 20  # of the dolly, and frames in each octave
+FPS = 20.0
 COUNTS = (100_000, 1_000_000, 3_000_000)  # Gaussians of the synthetic scenes
 SIZES = ((100, 75), (400, 300), (800, 600), (1600, 1200))
 TRAINED = 800  # px: side of the synthetic scenes' training image
@@ -70,6 +77,15 @@ class Bench:
         training = self.training if same else TrainingViews.of(scene, self.cameras, self.how.cull_margin)
         how = {"rasterizer": self.look.rasterizer, "background": self.look.background}
         return Renderer.of(scene, training, recipe, quality=quality, **how)
+
+    def measured(self, scene: Gaussians | Pyramid, quality: str, truth: Literal["self", "photographs"]) -> Report:
+        """Recipe auto at all sizes."""
+        return evaluate(
+            *(scene, self.cameras),
+            **{"views": ",".join(view.name for view in self.views), "scale": SCALES, "recipe": "auto"},
+            **{"quality": quality, "truth": truth, "metric": COMPARED if truth == "self" else ("psnr",)},
+            **{"background": self.look.background, "cull_margin": self.how.cull_margin},
+        )
 
     def light(self, share: float, scale: float, refine: bool) -> Gaussians:
         """A lighter scene."""
@@ -127,17 +143,19 @@ def levels(bench: Bench) -> Pyramid:
     print(f"\nbuilt or found in {time.perf_counter() - started:.0f} s")
     pyramid = read_pyramid(folder)
     print(f"levels: {', '.join(f'{size:,}' for size in pyramid.sizes)} Gaussians in {pyramid.count} chunks\n")
-    print("| | size | own look | photographs | ms | Gaussians |\n|---|---|---|---|---|---|")
+    print("| | size | own look | SSIM | flicker | photographs | ms | Gaussians | evaluations, M |\n" + "|---" * 9 + "|")
     for quality in ("fast", "balanced", "best"):
         for name, scene in (("levels", pyramid), ("the scene", bench.scene)):
             shown = bench.shown(scene, "auto", quality)
+            own, photographs = (bench.measured(scene, quality, truth) for truth in ("self", "photographs"))
             for scale in SCALES:
-                view = bench.views[0].scaled(scale)
-                fine = shown.sampled(view)[0]
+                fine = shown.sampled(bench.views[0].scaled(scale))[0]
                 count = len(scene) if shown.cutter is None else shown.cutter.count(fine)
-                figures = psnr(shown, bench.own, scale), psnr(shown, bench.photographs, scale)
-                took = milliseconds(lambda shown=shown, view=view: shown(view))
-                row(f"{name}, {quality}", f"1/{1 / scale:g}", *figures, round(took), f"{count:,}")
+                views, real = own.select("auto", scale), mean(photographs.select("auto", scale), "psnr")
+                took = round(1e3 * statistics.median(view.seconds for view in views))
+                evaluations = statistics.mean(view.evaluations or 0 for view in views) / 1e6
+                seen = [METRICS[metric].text(mean(views, metric)) for metric in COMPARED]
+                row(f"{name}, {quality}", f"1/{1 / scale:g}", *seen, real, took, f"{count:,}", evaluations)
     return pyramid
 
 
@@ -155,12 +173,16 @@ def dolly(bench: Bench, pyramid: Pyramid) -> None:
         "`matched`": bench.shown(bench.scene, "matched"),
     }
     ceiling: list[float] = []
+    sides: list[list[torch.Tensor]] = []
     for name, renderer in shown.items():
         images = [renderer(frame).rgb.clamp(0, 1) for frame in frames]
         changes = [float((b - a).square().mean().sqrt()) for a, b in pairwise(images)]
         ceiling = ceiling or changes
         worst = max(own / best for own, best in zip(changes, ceiling, strict=True))
         row(name, f"{statistics.median(changes):.4f}", worst)
+        sides = [*sides, [image.half() for image in images]][:2]
+    together = (torch.cat(pair, dim=1).float() for pair in zip(*sides, strict=True))
+    write_video(f"{bench.name}-dolly.webm", together, FPS, overwrite=True)
 
 
 @torch.no_grad()
