@@ -308,6 +308,21 @@ def test_a_kept_truth_is_made_once_and_a_full_memory_keeps_nothing(world):
     assert not kept(namesake, 0.25).equal(image)
 
 
+def test_cached_images_lie_together_in_memory():
+    """Each in a block of its own kept gigabytes of freed renders from the system."""
+    cameras = [make_camera((x, -4.0, 0.5)) for x in (0.0, 1.0, 2.0)]
+    truth = Truth(own_look(make_scene(50), TrainingViews.of(make_scene(50), cameras), "eager"), memory=1e6)
+    images = [truth(camera, scale) for camera in cameras for scale in (0.5, 0.25)]
+    kept = list(truth._kept.values())
+    assert len({image.untyped_storage().data_ptr() for image in kept}) == 1
+    for image, cached in zip(images, kept, strict=True):
+        torch.testing.assert_close(image, cached.float(), rtol=0, atol=0)
+    full = Truth(truth.own, memory=float(kept[0].nbytes))
+    for camera in cameras:
+        full(camera, 0.5)
+    assert len(full._kept) == 1
+
+
 def test_larger_truth_has_the_averages_of_the_training_size(world):
     look, views = world
     full, larger = look(views[0]).rgb, Truth(look, enlarge=back_projected)(views[0], 2.0)

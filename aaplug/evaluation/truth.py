@@ -32,6 +32,7 @@ from aaplug.rendering.renderer import Background, Renderer
 NO_PHOTOGRAPH = "has no photograph to compare with; truth 'self' compares with the scene's own render"
 MEMORY = 1e9  # bytes of images to keep; what does not fit is made again each time
 KEPT = torch.float16  # 11 significant bits, against the 8 that are compared
+SLAB = 1 << 25  # numbers of the cache allocated at once: 64 MB
 
 Larger = Float[Tensor, "H W 3"]
 Enlarge = Callable[[Renderer, Image, Camera], Larger]  # (the scene's own renderer, source image, target camera)
@@ -91,6 +92,7 @@ class Truth:
     enlarge: Enlarge | None = None
     memory: float | None = None
     _kept: dict[tuple[object, ...], Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
+    _room: list[Tensor] = field(default_factory=list, init=False, repr=False, compare=False)
 
     def __call__(self, view: Camera, scale: float) -> Image:
         """Ground truth of `view` (given at the training size) at `scale`; it must be defined there."""
@@ -116,8 +118,16 @@ class Truth:
             return None
         image = made.to(KEPT)
         if sum(kept.nbytes for kept in self._kept.values()) + image.nbytes <= self.memory:
-            self._kept[key] = image
+            self._kept[key] = self._stored(image)
         return image.float()
+
+    def _stored(self, image: Image) -> Image:
+        """A copy in a slab: small blocks that stay, between large ones that go, would keep those from the system."""
+        size = image.numel()
+        if not self._room or len(self._room[0]) < size:
+            self._room[:] = [torch.empty(max(size, SLAB), dtype=KEPT)]
+        place, self._room[0] = self._room[0].split([size, len(self._room[0]) - size])
+        return place.view(image.shape).copy_(image)
 
 
 class ViewTruth:
