@@ -37,7 +37,7 @@ USUAL = 0.02  # root mean square error, of colours in [0, 1]
 DECAY = 0.03
 STEPS = 800  # for a level of 1/4 of the training rate and above; a smaller one takes more, of smaller images
 LARGE = 1 / 4  # of the training rate
-MOST_TIMES = 4.0  # as many at most
+MOST_TIMES = 8.0  # as many at most
 GOOD = 3.5e-5  # mean square error, 44.5 dB: a level that is so close is not tuned
 
 

@@ -22,7 +22,7 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.core.interfaces import Rasterizer
 from aaplug.core.pyramids import Pyramid
 from aaplug.core.training import TrainingViews
-from aaplug.evaluation.metrics import METRICS
+from aaplug.evaluation.metrics import PSNR
 from aaplug.evaluation.protocols import median_depth
 from aaplug.evaluation.results import Report, mean
 from aaplug.evaluation.truth import Truth, ViewTruth, own_look
@@ -150,11 +150,11 @@ def levels(bench: Bench) -> Pyramid:
             own, photographs = (bench.measured(scene, quality, truth) for truth in ("self", "photographs"))
             for scale in SCALES:
                 fine = shown.sampled(bench.views[0].scaled(scale))[0]
-                count = len(scene) if shown.cutter is None else shown.cutter.count(fine)
-                views, real = own.select("auto", scale), mean(photographs.select("auto", scale), "psnr")
+                count = len(bench.scene) if shown.cutter is None else shown.cutter.count(fine)
+                views, real = own.select("auto", scale), mean(photographs.select("auto", scale), PSNR.name)
                 took = round(1e3 * statistics.median(view.seconds for view in views))
                 evaluations = statistics.mean(view.evaluations or 0 for view in views) / 1e6
-                seen = [METRICS[metric].text(mean(views, metric)) for metric in COMPARED]
+                seen = [metric.text(mean(views, metric.name)) for metric in own.metrics]
                 row(f"{name}, {quality}", f"1/{1 / scale:g}", *seen, real, took, f"{count:,}", evaluations)
     return pyramid
 
