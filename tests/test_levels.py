@@ -20,7 +20,7 @@ from aaplug.evaluation.metrics import psnr
 from aaplug.io.scenes import read_scene
 from aaplug.levels.clusters import MAX_OPACITY, merged_pairs, seen
 from aaplug.levels.covariances import area, areas, covariances, packed, quats_of, unpacked
-from aaplug.levels.merging import Goal, merged
+from aaplug.levels.merging import Goal, merged, merged_in_chunks
 from aaplug.levels.pairing import MOST_COST, costs, edges_below, matched
 from aaplug.levels.rates import rates_of
 from aaplug.methods.viewers import MERGED, blurring
@@ -161,6 +161,15 @@ def test_what_is_large_stays_and_what_is_small_is_merged():
     near = found.means.min(dim=1).values > 2
     assert int((~near).sum()) > 45
     assert int(near.sum()) < 40
+
+
+def test_what_falls_below_a_size_is_merged_whatever_it_changes():
+    near = torch.tensor([[0.0, 0.0, 0.0], [0.02, 0.0, 0.0], [3.0, 0.0, 0.0], [3.5, 0.0, 0.0]])
+    scene = replace(make_scene(4), means=near, log_scales=torch.full((4, 3), math.log(0.01)))
+    goals = [Goal(0.5, tolerance=1e-12, smallest=px) for px in (0.0, 0.5, 100.0)]
+    everywhere, one = torch.full((4,), RATE), torch.zeros(4, dtype=torch.int64)
+    counts = [len(merged_in_chunks(scene, everywhere, one, goal).scene) for goal in goals]
+    assert counts == [4, 3, 1]
 
 
 def test_a_lighter_scene_looks_like_the_scene(sample_scene, sample_cameras):

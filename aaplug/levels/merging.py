@@ -38,11 +38,14 @@ class Goal:
     rate: sampling rate relative to training's at which the result is shown.
     count: how many Gaussians to leave; None for as many as `tolerance` asks.
     tolerance: ∫ of the squared change of the image that merging a pair may make, in px² at that rate.
+    smallest: px at that rate; pairs whose merged Gaussian has no larger standard deviation are merged whatever they
+        change.
     """
 
     rate: float
     count: int | None = None
     tolerance: float = math.inf
+    smallest: float = 0.0
 
     @classmethod
     def of_count(cls, count: int, scene: Gaussians) -> "Goal":
@@ -59,9 +62,9 @@ class Goal:
         yield self.tolerance
 
     @classmethod
-    def of_level(cls, level: int) -> "Goal":
+    def of_level(cls, level: int, smallest: float = 0.0) -> "Goal":
         """Level k of a pyramid, for half the size of the level before."""
-        return cls(0.5**level, tolerance=TOLERANCE)
+        return cls(0.5**level, tolerance=TOLERANCE, smallest=smallest)
 
 
 class Merged(NamedTuple):
@@ -151,7 +154,8 @@ def _rounds(clusters: Clusters, goal: Goal, tell: Callable[[int], None]) -> Clus
     for tolerance in goal.tolerances:
         enough = 0.0 if tolerance == math.inf else ENOUGH
         while len(clusters) > least:
-            pairs = matched(edges_below(clusters, goal.rate, tolerance), len(clusters))
+            smallest = goal.smallest if tolerance == goal.tolerance else 0.0
+            pairs = matched(edges_below(clusters, goal.rate, tolerance, smallest), len(clusters))
             pairs = pairs[torch.argsort(pairs.cost, stable=True)[: len(clusters) - least]]
             few = len(pairs) <= enough * len(clusters)
             if len(pairs):

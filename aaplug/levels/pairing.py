@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from aaplug.levels.clusters import Clusters, paired
-from aaplug.levels.covariances import Packed, blurred, overlaps
+from aaplug.levels.covariances import DIAGONAL, Packed, blurred, overlaps
 
 PIXEL_BLUR = 0.3  # px²: of the level's pixel, when images of pairs are compared; 0.1 to 1 give levels as good
 ALPHA_WEIGHT = 0.5  # of squared differences of alpha, beside those of red, green and blue
@@ -89,24 +89,32 @@ def matched(edges: Edges, count: int) -> Edges:
     return all_of(kept) if kept else edges
 
 
-def edges_below(clusters: Clusters, rate: float, tolerance: float) -> Edges:
-    """Neighbours in the same chunk whose merging costs at most `tolerance`, in px² of the level at `rate`."""
+def edges_below(clusters: Clusters, rate: float, tolerance: float, smallest: float = 0.0) -> Edges:
+    """Neighbours in the same chunk whose merging costs at most `tolerance`, in px² of the level at `rate`.
+
+    smallest: px; those whose merged cluster is no larger count too.
+    """
     found = [Edges(clusters.labels[:0], clusters.labels[:0], clusters.opacities[:0])]
     for shift in SHIFTS:
         order = torch.argsort(curve(clusters.means, shift), stable=True)
         along = clusters[order]
         for start in range(0, len(order), CHUNK):
             part = slice(start, start + CHUNK + WINDOW)
-            found.extend(_compared(along[part], order[part], rate, tolerance))
+            found.extend(_compared(along[part], order[part], rate, tolerance, smallest))
     return all_of(found)
 
 
-def _compared(along: Clusters, places: Int[Tensor, " c"], rate: float, tolerance: float) -> Iterator[Edges]:
+def _compared(
+    along: Clusters, places: Int[Tensor, " c"], rate: float, tolerance: float, smallest: float
+) -> Iterator[Edges]:
     """Each cluster of a part of the curve with those after it."""
     for step in range(1, min(WINDOW, len(along) - 1) + 1):
         one, other = along[:-step], along[step:]
         cost = costs(one, other, rate)
-        near = ((cost <= tolerance) & (one.chunks == other.chunks)).nonzero()[:, 0]
+        cheap = cost <= tolerance
+        if smallest > 0:
+            cheap |= _sizes(one, other, rate) <= smallest
+        near = (cheap & (one.chunks == other.chunks)).nonzero()[:, 0]
         a, b = places[:-step][near], places[step:][near]
         a, b = torch.minimum(a, b), torch.maximum(a, b)
         yield Edges(a, b, cost[near] * (1 + JITTER * _noise(a, b)))
@@ -127,6 +135,12 @@ def costs(a: Clusters, b: Clusters, rate: float) -> Float[Tensor, " p"]:
     cost -= 2 * (aa + ab) * _overlap(one + both, (1 - share)[:, None] * offsets)
     cost -= 2 * (ab + bb) * _overlap(other + both, share[:, None] * offsets)
     return (cost.maximum(ROUNDING * whole) / px.square()).nan_to_num(MOST_COST).clamp(max=MOST_COST)
+
+
+def _sizes(a: Clusters, b: Clusters, rate: float) -> Float[Tensor, " p"]:
+    """Standard deviation of each merged cluster as a flat round one of the same total variance, in px of the level."""
+    total = paired(a, b)[2][:, DIAGONAL].sum(dim=1)
+    return (total / 2).sqrt() * torch.minimum(a.rates, b.rates) * rate
 
 
 def _overlap(covs: Packed, offsets: Float[Tensor, "p 3"] | None = None) -> Float[Tensor, " p"]:

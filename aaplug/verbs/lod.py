@@ -63,6 +63,8 @@ class LodOptions(ViewOptions):
     """Write one scene of as many Gaussians as fit into a .ply of so many MB (10^6 bytes)."""
     levels: Annotated[int | None, number(1, 12, whole=True), UNSET] = None
     """Write a folder of levels, each for half the size of the one before, as light as the image allows (default: 4)."""
+    merge_below: Annotated[float, number(0, 10)] = 0.0
+    """With levels: merge Gaussians up to so many px of the level in any case; faster to draw, and less exact."""
     scale: Annotated[float | None, number(0.001, 1), UNSET] = None
     """With --simplify or --budget: size of the images that the scene is meant for (default: root of the share)."""
     viewer: Annotated[str | Viewer | None, flag("VIEWER", "--for", kind=str | None)] = None
@@ -83,6 +85,8 @@ class LodOptions(ViewOptions):
             raise UsageError(given[1], f"cannot be combined with `{given[0]}`: each asks for other files")
         if self.scale is not None and not self.single:
             raise UsageError("scale", "belongs to `simplify` and `budget`")
+        if self.merge_below and self.single:
+            raise UsageError("merge_below", "belongs to levels")
         if self.resume and (self.single or self.viewer is not None):
             raise UsageError("resume", "belongs to levels for aaplug")
         if self.viewer is not None and not self.tuning:
@@ -111,7 +115,7 @@ class LodOptions(ViewOptions):
             UsageError: the scene has fewer Gaussians than asked for.
         """
         if not self.single:
-            return [Goal.of_level(level) for level in range(1, (self.levels or LEVELS) + 1)]
+            return [Goal.of_level(level, self.merge_below) for level in range(1, (self.levels or LEVELS) + 1)]
         if self.budget is not None:
             each = FLOAT * (len(matrix_of(scene[:0])[0]) + NORMALS)
             count = min(len(scene), int(self.budget * MEGABYTE / each))
@@ -251,7 +255,7 @@ def _levels(
 def _source(scene: Gaussians, cameras: CameraSet, o: LodOptions) -> str:
     """Hash of all that the levels depend on."""
     facts = [digest_of_scene(scene), digest_of_cameras(cameras.train)]
-    return digest_of_values((*facts, cameras.background, o.tuning, o.views, o.background, o.cull_margin))
+    return digest_of_values((*facts, cameras.background, o.merge_below, o.tuning, o.views, o.background, o.cull_margin))
 
 
 def _described(file: Path, level: Level) -> LevelFile:
