@@ -55,6 +55,7 @@ OCTAVES, STEPS_EACH = 3, 20  # of the dolly, and frames in each octave
 FPS = 20.0
 COUNTS = (100_000, 1_000_000, 3_000_000)  # Gaussians of the synthetic scenes
 SIZES = ((100, 75), (400, 300), (800, 600), (1600, 1200))
+BELOW = 0.5  # px: levels of the synthetic scenes are merged to be fast
 TRAINED = 800  # px: side of the synthetic scenes' training image
 
 
@@ -195,7 +196,7 @@ def cost(rasterizer: Rasterizer) -> None:
     for count in COUNTS:
         scene = synthetic_scene(count)
         started = time.perf_counter()
-        pyramid = pyramid_of(lod(scene, cameras, levels=LEVELS, refine=False))
+        pyramid = pyramid_of(lod(scene, cameras, levels=LEVELS, refine=False, merge_below=BELOW))
         seconds = time.perf_counter() - started
         with_levels = Renderer.of(pyramid, cameras, "auto", quality="fast", rasterizer=rasterizer)
         without = Renderer.of(scene, cameras, find_recipe("matched"), rasterizer=rasterizer)
