@@ -6,7 +6,8 @@ b: leading batch dimensions; c: cameras; n: Gaussians; k: spherical-harmonics co
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, get_args
+from enum import Enum
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -17,9 +18,11 @@ from aaplug.core.errors import UsageError, not_one_of
 from aaplug.core.gaussians import MAX_LOG_SCALE, Convention, Gaussians
 from aaplug.core.rules import Rules
 
-RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
-RasterizeMode = Literal["classic", "antialiased", "matched"]
-TrainedMode = Literal["classic", "antialiased"]
+MODES = {
+    "render_mode": ("RGB", "D", "ED", "RGB+D", "RGB+ED"),
+    "rasterize_mode": ("classic", "antialiased", "matched"),
+    "trained_mode": ("classic", "antialiased"),
+}
 
 # gsplat's arguments of which one value is supported, its default
 FIXED: dict[str, object] = {
@@ -38,7 +41,7 @@ FIXED: dict[str, object] = {
 
 @dataclass(frozen=True)
 class AnyPose(Camera):
-    """A camera whose `cam_from_world` need not be a rotation and a shift, so that its gradient is that of any matrix."""
+    """A camera whose `cam_from_world` may be any affine map, which also makes its gradient that of any matrix."""
 
     @property
     def centre(self) -> Float[Tensor, " 3"]:
@@ -63,18 +66,17 @@ class Options:
     sh_degree: int | None
     packed: bool
     tile_size: int
-    render_mode: RenderMode
+    render_mode: str
     sparse_grad: bool
     absgrad: bool
-    rasterize_mode: RasterizeMode
-    trained_mode: TrainedMode
+    rasterize_mode: str
+    trained_mode: str
     max_alpha: float
 
     def __post_init__(self) -> None:
-        modes = {"render_mode": RenderMode, "rasterize_mode": RasterizeMode, "trained_mode": TrainedMode}
-        for name, known in modes.items():
-            if getattr(self, name) not in get_args(known):
-                raise UsageError(name, not_one_of(getattr(self, name), get_args(known)))
+        for name, known in MODES.items():
+            if getattr(self, name) not in known:
+                raise UsageError(name, not_one_of(getattr(self, name), known))
         for name in ("width", "height", "near_plane", "tile_size"):
             if not getattr(self, name) > 0:
                 raise UsageError(name, f"expected a number above 0, got {getattr(self, name)}")
@@ -111,7 +113,7 @@ class View:
     opacities: Float[Tensor, " n"]
     covars: Float[Tensor, "n 3 3"] | None
     features: Float[Tensor, "n d"] | None
-    background: Float[Tensor, " d"] | None
+    background: Float[Tensor, " colours"] | None
     camera: Camera
 
 
@@ -124,7 +126,7 @@ def refuse(others: Mapping[str, object]) -> None:
     for name, value in others.items():
         if name not in FIXED:
             raise UsageError(name, "is not an argument of gsplat's rasterization that aaplug knows")
-        if getattr(value, "name", value) != FIXED[name]:  # the kind of shutter is an enumeration of gsplat's
+        if (value.name if isinstance(value, Enum) else value) != FIXED[name]:  # gsplat has an enumeration of shutters
             raise UsageError(name, f"only {FIXED[name]} is supported on the CPU (pinhole cameras), got {value}")
 
 

@@ -1,6 +1,6 @@
 """Images of any number of channels, drawn three at a time, and the absolute gradients of splats' centres.
 
-m: splats of one image; d: channels; h, w: px.
+m: splats of one image; d: channels, of which the first are colours; h, w: px.
 """
 
 from collections.abc import Callable
@@ -28,7 +28,7 @@ Told = Callable[[Float[Tensor, "m 2"]], None]
 def drawn(
     splats: Splats2D,
     features: Float[Tensor, "m d"],
-    background: Float[Tensor, " d"] | None,
+    background: Float[Tensor, " colours"] | None,
     options: Options,
     rasterizer: Rasterizer,
     tell: Told | None,

@@ -9,7 +9,7 @@ from aaplug.core.gaussians import CLASSIC
 from aaplug.core.interfaces import Rasterizer, RunsKernels
 from aaplug.core.kernels import EAGER
 from aaplug.core.rules import RULES_GSPLAT
-from aaplug.gsplat.arguments import Options, RasterizeMode, RenderMode, TrainedMode, refuse, views_of
+from aaplug.gsplat.arguments import Options, refuse, views_of
 from aaplug.gsplat.drawing import drawn
 from aaplug.gsplat.sparse import with_sparse_gradient
 from aaplug.gsplat.table import Layout, tabulated
@@ -35,10 +35,10 @@ def rasterization(
     packed: bool = True,
     tile_size: int = 16,
     backgrounds: Tensor | None = None,
-    render_mode: RenderMode = "RGB",
+    render_mode: str = "RGB",
     sparse_grad: bool = False,
     absgrad: bool = False,
-    rasterize_mode: RasterizeMode = "classic",
+    rasterize_mode: str = "classic",
     channel_chunk: int = 32,
     distributed: bool = False,
     camera_model: str = "pinhole",
@@ -46,7 +46,7 @@ def rasterization(
     covars: Tensor | None = None,
     *,
     relative_rate: float | Tensor | None = None,
-    trained_mode: TrainedMode = "classic",
+    trained_mode: str = "classic",
     max_alpha: float = RULES_GSPLAT.max_alpha,
     rasterizer: str | Rasterizer = "auto",
     **others: object,
@@ -74,7 +74,8 @@ def rasterization(
         packed: lay `meta` out by splat, not by camera and Gaussian.
         tile_size: px; of the tiles in `meta`.  It does not change the image.
         backgrounds: [..., c, d]; black if None.  Depth has none.
-        render_mode: colours, depth summed by weight (D) or expected (ED), or both, with depth as the last channel.
+        render_mode: "RGB", colours; "D" or "ED", depth summed by weight or expected; "RGB+D" or "RGB+ED", both, with
+            depth as the last channel.
         sparse_grad: with `packed`, gradients of means, quats and scales are sparse.
         absgrad: the backward pass sets `meta["means2d"].absgrad` (arXiv 2404.10484).
         rasterize_mode: "classic"; "antialiased", which also scales opacity by √(det C / det(C + eps2d·I)), without a
@@ -83,7 +84,7 @@ def rasterization(
         distributed, camera_model: only gsplat's defaults are supported.
         covars: [..., n, 3, 3], in squared world units, instead of quats and scales; the upper triangle is read.
         relative_rate: for "matched": each image's focal length over training's, one number or [..., c].
-        trained_mode: for "matched": the mode of training.
+        trained_mode: for "matched": "classic" or "antialiased", the mode of training.
         max_alpha: cap of one splat's alpha at a pixel; 0.999 in gsplat 1.5, 0.99 in 1.6.
         rasterizer: a rasterizer of aaplug, or its name.
         others: further arguments of gsplat's, of which only the defaults are supported.
@@ -107,7 +108,7 @@ def rasterization(
     chosen = find_rasterizer(rasterizer) if isinstance(rasterizer, str) else rasterizer
     kernels = chosen.kernels if isinstance(chosen, RunsKernels) else EAGER
     found = [seen(view, options, kernels) for view in views]
-    layout = Layout.of([splats for splats, _ in found], viewmats.shape[:-2], means.shape[-2], packed)
+    layout = Layout.of([part.splats for part in found], viewmats.shape[:-2], means.shape[-2], packed)
     rows.append(layout.sources.unique())
     meta, splats = tabulated(found, layout, options)
     told = layout.told(meta["means2d"]) if absgrad else len(views) * [None]

@@ -63,7 +63,7 @@ class Layout:
         return table.split(self.counts)
 
     def told(self, means2d: Tensor) -> list[Callable[[Tensor], None]]:
-        """For each image, a function that adds its absolute gradients to `means2d.absgrad`, as gsplat's users read it."""
+        """For each image, what adds its absolute gradients to `means2d.absgrad`, which gsplat's users read."""
         total = torch.zeros_like(means2d)
         means2d.absgrad = total  # pyright: ignore[reportAttributeAccessIssue]
         rows = total.view(-1, 2)
@@ -72,9 +72,9 @@ class Layout:
 
 def tabulated(found: Sequence[Seen], layout: Layout, options: Options) -> tuple[dict[str, Any], list[Splats2D]]:
     """The table, and the splats of each image read from it, so that gradients of images pass through it."""
-    splats = [part for part, _ in found]
+    splats = [part.splats for part in found]
     columns = {
-        "radii": [radii for _, radii in found],
+        "radii": [part.radii for part in found],
         "means2d": [part.means for part in splats],
         "depths": [part.depths for part in splats],
         "conics": [_conics(part) for part in splats],

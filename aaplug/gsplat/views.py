@@ -4,6 +4,7 @@ m: splats.
 """
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -24,11 +25,16 @@ LARGEST_RADIUS = 2.0**30  # px; fits 32 bits
 
 UNSEEN = SamplingBounds(*torch.zeros(3, 0).unbind(), torch.zeros(0, dtype=torch.int32))
 
-Seen = tuple[Splats2D, Int[Tensor, "m 2"]]
+
+class Seen(NamedTuple):
+    """The splats of one image, and half the sides of their bounding boxes along x and y, in px."""
+
+    splats: Splats2D
+    radii: Int[Tensor, "m 2"]
 
 
 def seen(view: View, options: Options, kernels: Kernels) -> Seen:
-    """The splats that gsplat keeps, without colour, and half the sides of their bounding boxes, in px, along x and y.
+    """The splats that gsplat keeps, without colour.
 
     It drops what lies beyond a plane, has an opacity below 1/255, a radius of at most `radius_clip` along both axes, or
     a box outside of the image.
@@ -46,7 +52,7 @@ def seen(view: View, options: Options, kernels: Kernels) -> Seen:
     kept = (splats.depths <= options.far_plane) & (splats.opacities >= rules.min_alpha) & (splats.dets > 0)
     kept = kept & (radii > options.radius_clip).any(dim=1)
     kept = kept & (high > 0).all(dim=1) & (low < low.new_tensor([options.width, options.height])).all(dim=1)
-    return splats[kept], radii[kept].int()
+    return Seen(splats[kept], radii[kept].int())
 
 
 def filtered(splats: Splats2D, view: View, options: Options) -> Splats2D:
