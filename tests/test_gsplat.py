@@ -197,7 +197,8 @@ def composited(meta: dict[str, object], features: Tensor, camera: int, cap: floa
 @pytest.mark.parametrize("channels", [1, 3, 5])
 def test_images_equal_the_formula(mode, channels):
     values, views = gaussians() | {"colors": torch.rand(40, channels, dtype=F64)}, two_views()
-    values["opacities"][:3], values["scales"][:3] = 1.0, 0.4
+    # two opaque splats, each in the middle of one image
+    values["means"][:2], values["opacities"][:2], values["scales"][:2] = 0.5 * torch.tensor(EYES), 1.0, 0.2
     image, alpha, meta = rasterization(**values, **views, packed=False, rasterize_mode=mode)
     assert image.shape == (2, SIZE[1], SIZE[0], channels)
     for camera in range(2):
@@ -462,7 +463,7 @@ def test_an_unchanged_training_loop_falls_to_the_same_loss_as_ours(packed, monke
     splats, data, views = target_and_start()
     losses, grads = loop["train"](splats, data, 12, packed)
     ours, expected = trained_by_the_renderer(splats, data, views, loop["RATES"], 12)
-    assert losses[-2] + losses[-1] < 0.7 * (losses[0] + losses[1])
+    assert losses[-2] + losses[-1] < 0.8 * (losses[0] + losses[1])
     assert losses == pytest.approx(ours, rel=1e-6)
     torch.testing.assert_close(grads, expected, rtol=1e-5, atol=1e-8)
 
@@ -472,7 +473,7 @@ def test_an_unchanged_training_loop_falls_to_the_same_loss_as_ours(packed, monke
 def test_gsplats_own_densification_reads_meta(packed, absgrad):
     strategies = pytest.importorskip("gsplat.strategy", reason="the package gsplat is not installed")
     splats, data, _ = target_and_start()
-    params = {name: torch.nn.Parameter(value.clone()) for name, value in splats.items()}
+    params = {name: torch.nn.Parameter(value.float()) for name, value in splats.items()}
     optimizers = {name: torch.optim.Adam([value], lr=1e-2) for name, value in params.items()}
     strategy = strategies.DefaultStrategy(
         refine_start_iter=2, refine_every=2, grow_grad2d=1e-6, absgrad=absgrad, refine_scale2d_stop_iter=9
@@ -480,6 +481,7 @@ def test_gsplats_own_densification_reads_meta(packed, absgrad):
     strategy.check_sanity(params, optimizers)
     state = strategy.initialize_state()
     (pose, K, *size), photograph = data[0]
+    pose, K, photograph = pose.float(), K.float(), photograph.float()
     losses = []
     for step in range(8):
         activated = params["means"], params["quats"], params["scales"].exp(), params["opacities"].sigmoid()
