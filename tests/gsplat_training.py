@@ -7,7 +7,7 @@ RATES = {"means": 1e-2, "quats": 1e-2, "scales": 1e-2, "opacities": 5e-2, "sh0":
 
 
 def train(splats, views, steps, packed, batch=2):
-    """Losses, and the mean gradient of each Gaussian's centre in the image, both as gsplat's trainer takes them.
+    """Losses, and for each Gaussian the summed gradient of its centre and in how many images it is.
 
     splats: parameters by name, scales as logarithms and opacities as logits.  views: pairs of a camera (viewmat, K,
     width, height) and its photograph.
@@ -41,7 +41,7 @@ def train(splats, views, steps, packed, batch=2):
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)
         losses.append(loss.item())
-    return losses, state["grad2d"] / state["count"].clamp(min=1)
+    return losses, state
 
 
 def update(state, info, packed):

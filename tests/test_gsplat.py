@@ -205,7 +205,8 @@ def test_images_equal_the_formula(mode, channels):
         expected = composited(meta, values["colors"], camera)
         torch.testing.assert_close(image[camera], expected[0], rtol=0, atol=1e-6)
         torch.testing.assert_close(alpha[camera], expected[1], rtol=0, atol=1e-6)
-        assert (expected[0] - composited(meta, values["colors"], camera, 0.99)[0]).abs().max() > 1e-4
+        capped = composited(meta, values["colors"], camera, 0.99)[0]
+        assert mode == "antialiased" or (expected[0] - capped).abs().max() > 1e-4, "the cap should matter here"
 
 
 @pytest.mark.parametrize("mode", ["RGB", "D", "ED", "RGB+D", "RGB+ED"])
@@ -429,11 +430,11 @@ def target_and_start() -> tuple[dict[str, Tensor], list[tuple[tuple[object, ...]
 
 
 def trained_by_the_renderer(splats, data, views, rates, steps, batch=2):
-    """The same training with aaplug's own interface; also the mean gradient of each Gaussian's centre."""
+    """The same training with aaplug's own interface; also the summed gradients of each Gaussian's centre."""
     values = {name: torch.nn.Parameter(value.clone()) for name, value in splats.items()}
     optimizers = [torch.optim.Adam([values[name]], lr=rate) for name, rate in rates.items()]
     convention = replace(CLASSIC, rules=RULES_GSPLAT)
-    grads, counts, losses = torch.zeros(60, dtype=F64), torch.zeros(60, dtype=F64), []
+    grads, losses = torch.zeros(60, dtype=F64), []
     for step in range(steps):
         sh = torch.cat([values["sh0"], values["shN"]], dim=1)
         scene = Gaussians(values["means"], values["quats"], values["scales"], values["opacities"], sh, convention)
@@ -448,12 +449,11 @@ def trained_by_the_renderer(splats, data, views, rates, steps, batch=2):
         for drawing in drawings:
             gradient = drawing.splats.means.grad * torch.tensor([24 / 2 * batch, 20 / 2 * batch])
             grads.index_add_(0, drawing.splats.sources, gradient.norm(dim=1))
-            counts.index_add_(0, drawing.splats.sources, torch.ones(len(gradient), dtype=F64))
         for optimizer in optimizers:
             optimizer.step()
             optimizer.zero_grad()
         losses.append(loss.item())
-    return losses, grads / counts.clamp(min=1)
+    return losses, grads
 
 
 @pytest.mark.parametrize("packed", [True, False])
@@ -461,11 +461,12 @@ def test_an_unchanged_training_loop_falls_to_the_same_loss_as_ours(packed, monke
     monkeypatch.setitem(sys.modules, "gsplat", aaplug.gsplat)
     loop = runpy.run_path(str(Path(__file__).with_name("gsplat_training.py")))
     splats, data, views = target_and_start()
-    losses, grads = loop["train"](splats, data, 12, packed)
+    losses, state = loop["train"](splats, data, 12, packed)
     ours, expected = trained_by_the_renderer(splats, data, views, loop["RATES"], 12)
     assert losses[-2] + losses[-1] < 0.8 * (losses[0] + losses[1])
     assert losses == pytest.approx(ours, rel=1e-6)
-    torch.testing.assert_close(grads, expected, rtol=1e-5, atol=1e-8)
+    torch.testing.assert_close(state["grad2d"], expected, rtol=1e-5, atol=1e-8)
+    assert state["count"].max() == 24
 
 
 @pytest.mark.parametrize("absgrad", [False, True])
