@@ -9,6 +9,7 @@ the data set's cameras, and saves both, with the recipe, as a checkpoint:
 """
 
 import json
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -78,9 +79,7 @@ class Aaplug:
             self.scene, self.cameras = read_scene(path), _training_cameras(train_dataset)
         red, green, blue = self.settings["background"]
         recipe, quality = self.settings["recipe"], self.settings["quality"]
-        self.renderer = Renderer.of(
-            self.scene, self.cameras, recipe, quality=quality, background=(red, green, blue)
-        )
+        self.renderer = Renderer.of(self.scene, self.cameras, recipe, quality=quality, background=(red, green, blue))
 
     @classmethod
     def get_method_info(cls) -> dict[str, Any]:
@@ -138,9 +137,10 @@ class Aaplug:
 
 
 def _training_cameras(dataset: Mapping[str, Any]) -> Sequence[Camera]:
-    """The cameras of a data set, by the names of their photographs."""
+    """The cameras of a data set, by the names of their photographs in its folder."""
+    root = dataset["image_paths_root"]
     pairs = zip(dataset["image_paths"], dataset["cameras"], strict=True)
-    return [_camera(camera, str(path)).as_trained() for path, camera in pairs]
+    return [_camera(camera, os.path.relpath(path, root)).as_trained() for path, camera in pairs]
 
 
 def _camera(camera: Any, name: str) -> Camera:
@@ -156,12 +156,7 @@ def _frame(camera: Camera) -> dict[str, Any]:
     """A camera's entry in transforms.json."""
     pose = torch.linalg.inv(camera.cam_from_world).numpy() @ OPENGL
     sizes = {"w": camera.width, "h": camera.height, "cx": camera.cx, "cy": camera.cy}
-    return sizes | {
-        "file_path": camera.name,
-        "fl_x": camera.fx,
-        "fl_y": camera.fy,
-        "transform_matrix": pose.tolist(),
-    }
+    return sizes | {"file_path": camera.name, "fl_x": camera.fx, "fl_y": camera.fy, "transform_matrix": pose.tolist()}
 
 
 register(

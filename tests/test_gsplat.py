@@ -347,8 +347,7 @@ def test_an_empty_view_is_its_background():
 # ---------------------------------------------------------------------------------------------------------- gradients
 
 
-@pytest.mark.parametrize("given", ["channels", "covars", "matched"])
-@pytest.mark.parametrize("packed", [True, False])
+@pytest.mark.parametrize(("given", "packed"), [("scales", True), ("covars", False), ("matched", True)])
 def test_gradients_equal_finite_differences(given, packed):
     values, views = gaussians(12, degree=1) | {"backgrounds": torch.rand(2, 3, dtype=F64)}, two_views()
     views |= {"width": 12, "height": 9}
@@ -381,7 +380,7 @@ def test_opaque_transparent_and_flat_gaussians_have_finite_gradients():
 
 @pytest.mark.parametrize("packed", [True, False])
 def test_absolute_gradients_are_summed_over_pixels(packed):
-    values, views = gaussians(12), cameras([make_camera(eye, (9, 7)) for eye in EYES])
+    values, views = gaussians(12), cameras([make_camera(eye, (5, 4)) for eye in EYES])
     image, alpha, meta = rasterization(**values, **views, packed=packed, absgrad=True)
     assert not image.requires_grad
     values["means"].requires_grad_()
@@ -461,12 +460,12 @@ def test_an_unchanged_training_loop_falls_to_the_same_loss_as_ours(packed, monke
     monkeypatch.setitem(sys.modules, "gsplat", aaplug.gsplat)
     loop = runpy.run_path(str(Path(__file__).with_name("gsplat_training.py")))
     splats, data, views = target_and_start()
-    losses, state = loop["train"](splats, data, 12, packed)
-    ours, expected = trained_by_the_renderer(splats, data, views, loop["RATES"], 12)
-    assert losses[-2] + losses[-1] < 0.8 * (losses[0] + losses[1])
+    losses, state = loop["train"](splats, data, 8, packed)
+    ours, expected = trained_by_the_renderer(splats, data, views, loop["RATES"], 8)
+    assert losses[-2] + losses[-1] < 0.9 * (losses[0] + losses[1])
     assert losses == pytest.approx(ours, rel=1e-6)
     torch.testing.assert_close(state["grad2d"], expected, rtol=1e-5, atol=1e-8)
-    assert state["count"].max() == 24
+    assert state["count"].max() == 16
 
 
 @pytest.mark.parametrize("absgrad", [False, True])
