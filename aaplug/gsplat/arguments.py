@@ -67,8 +67,6 @@ class Options:
     packed: bool
     tile_size: int
     render_mode: str
-    sparse_grad: bool
-    absgrad: bool
     rasterize_mode: str
     trained_mode: str
     max_alpha: float

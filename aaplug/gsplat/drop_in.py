@@ -1,5 +1,6 @@
 """The function itself; see the package's docstring."""
 
+from functools import cache
 from typing import Any
 
 import torch
@@ -97,7 +98,7 @@ def rasterization(
     """
     options = Options(
         *(width, height, near_plane, far_plane, radius_clip, eps2d, sh_degree, packed, tile_size, render_mode),
-        *(sparse_grad, absgrad, rasterize_mode, trained_mode, max_alpha),
+        *(rasterize_mode, trained_mode, max_alpha),
     )
     refuse({"distributed": distributed, "camera_model": camera_model, **others})
     rows: list[Tensor] = []
@@ -105,7 +106,7 @@ def rasterization(
         means, quats, scales = (x if x is None else with_sparse_gradient(x, rows) for x in (means, quats, scales))
     tensors = (means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars)
     views = views_of(*tensors, relative_rate, options)
-    chosen = find_rasterizer(rasterizer) if isinstance(rasterizer, str) else rasterizer
+    chosen = _named(rasterizer) if isinstance(rasterizer, str) else rasterizer
     kernels = chosen.kernels if isinstance(chosen, RunsKernels) else EAGER
     found = [seen(view, options, kernels) for view in views]
     layout = Layout.of([part.splats for part in found], viewmats.shape[:-2], means.shape[-2], packed)
@@ -118,3 +119,9 @@ def rasterization(
     ]
     colours, alphas = (torch.stack(parts).unflatten(0, layout.shape) for parts in zip(*images, strict=True))
     return colours, alphas, meta
+
+
+@cache
+def _named(name: str) -> Rasterizer:
+    """A rasterizer by name; compiled kernels are loaded and checked once, not for every image."""
+    return find_rasterizer(name)
