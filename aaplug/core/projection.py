@@ -32,9 +32,37 @@ def project(scene: Gaussians, camera: Camera, kernels: Kernels = EAGER, rules: R
     columns = kernels.run(
         project_kernel(rules.near), *(scene.means, scene.quats, scene.log_scales), *_camera_rows(scene.means, camera)
     )
+    return _beyond(rules.near, columns, scene.opacities)
+
+
+def project_covariances(
+    means: Float[Tensor, "n 3"],
+    covariances: Float[Tensor, "n 3 3"],
+    opacities: Float[Tensor, " n"],
+    camera: Camera,
+    rules: Rules = RULES_3DGS,
+) -> Splats2D:
+    """The same for Gaussians of any covariance Σ, in squared world units, of which the upper triangle is read.
+
+    With T = J W, whose rows have the cross product n, det(T Σ Tᵀ) = nᵀ cof(Σ) n (Cauchy-Binet), in float64.
+    """
+    centres, across, down, depths = _linearised(rules.near, means, *_camera_rows(means, camera))
+    (xx, xy, xz), (_, yy, yz), (_, _, zz) = (row.unbind(dim=1) for row in covariances.double().unbind(dim=1))
+    sigma = torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], dim=1).unflatten(1, (3, 3))
+    a, b = (torch.stack(row, dim=1).double() for row in (across, down))
+    covs = [torch.einsum("ni,nij,nj->n", p, sigma, q) for p, q in ((a, a), (a, b), (b, b))]
+    normal = torch.linalg.cross(a, b)
+    cofactors = torch.linalg.cross(sigma.roll(-1, dims=1), sigma.roll(-2, dims=1))
+    dets = torch.einsum("ni,nij,nj->n", normal, cofactors, normal).clamp(min=0.0)
+    columns = torch.stack(centres, dim=1), torch.stack(covs, dim=1).to(means), dets.to(means), depths
+    return _beyond(rules.near, columns, opacities)
+
+
+def _beyond(near: float, columns: tuple[Tensor, ...], opacities: Float[Tensor, " n"]) -> Splats2D:
+    """Splats of these means, covariances, determinants and depths, without those before the near plane."""
     means, covs, dets, depths = columns
-    splats = Splats2D(means, covs, dets, depths, scene.opacities, torch.arange(len(scene), device=means.device))
-    in_front = depths > rules.near
+    splats = Splats2D(means, covs, dets, depths, opacities, torch.arange(len(means), device=means.device))
+    in_front = depths > near
     return splats if in_front.all() else splats[in_front]
 
 
@@ -131,17 +159,7 @@ def _project(
     lens: Float[Tensor, " 8"],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Mean, packed covariance, determinant and depth of each Gaussian, written in columns so that the loop fuses."""
-    local = (means.double() - centre).to(means).unbind(dim=1)
-    fx, fy, cx, cy, left, right, top, bottom = lens.unbind()
-    world = [row.unbind() for row in rotation.unbind()]
-    x, y, z = (sum_of(r * p for r, p in zip(row, local, strict=True)) for row in world)
-    ahead = z.clamp(min=near)  # nearer ones are dropped later; here they must not overflow into gradients
-    slope_x, slope_y = x / ahead, y / ahead
-    # J W: rows of the projection's derivative along the world's axes, its direction clamped to the widened image
-    held_x = torch.minimum(torch.maximum(slope_x, left), right)
-    held_y = torch.minimum(torch.maximum(slope_y, top), bottom)
-    across = [fx / ahead * (i - held_x * k) for i, k in zip(world[0], world[2], strict=True)]
-    down = [fy / ahead * (j - held_y * k) for j, k in zip(world[1], world[2], strict=True)]
+    centres, across, down, z = _linearised(near, means, centre, rotation, lens)
     lengths = log_scales.clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE).exp().unbind(dim=1)
     quats = quats / quats.square().sum(dim=1, keepdim=True).sqrt()
     axes = zip(*rotation_rows(quats), strict=True)
@@ -153,8 +171,29 @@ def _project(
     covs = [sum_of(p * q for p, q in zip(*pair, strict=True)) for pair in ((a, a), (a, b), (b, b))]
     normal = [a[i - 2] * b[i - 1] - a[i - 1] * b[i - 2] for i in range(3)]
     dets = sum_of(side * side for side in normal)
-    centres = [fx * slope_x + cx, fy * slope_y + cy]
     return torch.stack(centres, dim=1), torch.stack(covs, dim=1), dets, z
+
+
+def _linearised(
+    near: float,
+    means: Float[Tensor, "n 3"],
+    centre: Float[Tensor, " 3"],
+    rotation: Float[Tensor, "3 3"],
+    lens: Float[Tensor, " 8"],
+) -> tuple[list[Tensor], list[Tensor], list[Tensor], Tensor]:
+    """x and y of the mean in px; the two rows of J W, in px per world unit along the world's axes; depth."""
+    local = (means.double() - centre).to(means).unbind(dim=1)
+    fx, fy, cx, cy, left, right, top, bottom = lens.unbind()
+    world = [row.unbind() for row in rotation.unbind()]
+    x, y, z = (sum_of(r * p for r, p in zip(row, local, strict=True)) for row in world)
+    ahead = z.clamp(min=near)  # nearer ones are dropped later; here they must not overflow into gradients
+    slope_x, slope_y = x / ahead, y / ahead
+    # rows of the projection's derivative along the world's axes, its direction clamped to the widened image
+    held_x = torch.minimum(torch.maximum(slope_x, left), right)
+    held_y = torch.minimum(torch.maximum(slope_y, top), bottom)
+    across = [fx / ahead * (i - held_x * k) for i, k in zip(world[0], world[2], strict=True)]
+    down = [fy / ahead * (j - held_y * k) for j, k in zip(world[1], world[2], strict=True)]
+    return [fx * slope_x + cx, fy * slope_y + cy], across, down, z
 
 
 def sum_of(terms: Iterable[Tensor]) -> Tensor:

@@ -1,0 +1,245 @@
+"""The arguments of gsplat's `rasterization`, checked and taken apart into one view for each image.
+
+b: leading batch dimensions; c: cameras; n: Gaussians; k: spherical-harmonics coefficients per channel; d: channels.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from enum import Enum
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from aaplug.core.cameras import Camera
+from aaplug.core.errors import UsageError, not_one_of
+from aaplug.core.gaussians import MAX_LOG_SCALE, Convention, Gaussians
+from aaplug.core.rules import Rules
+
+MODES = {
+    "render_mode": ("RGB", "D", "ED", "RGB+D", "RGB+ED"),
+    "rasterize_mode": ("classic", "antialiased", "matched"),
+    "trained_mode": ("classic", "antialiased"),
+}
+
+# gsplat's arguments of which one value is supported, its default
+FIXED: dict[str, object] = {
+    "distributed": False,
+    "camera_model": "pinhole",
+    "with_ut": False,
+    "with_eval3d": False,
+    "radial_coeffs": None,
+    "tangential_coeffs": None,
+    "thin_prism_coeffs": None,
+    "ftheta_coeffs": None,
+    "rolling_shutter": "GLOBAL",
+    "viewmats_rs": None,
+}
+
+
+@dataclass(frozen=True)
+class AnyPose(Camera):
+    """A camera whose `cam_from_world` may be any affine map, which also makes its gradient that of any matrix."""
+
+    @property
+    def centre(self) -> Float[Tensor, " 3"]:
+        """Position in the world."""
+        return -torch.linalg.solve(self.cam_from_world[:3, :3], self.cam_from_world[:3, 3])
+
+
+@dataclass(frozen=True)
+class Options:
+    """What a call says beside its tensors; names and units as in `rasterization`.
+
+    Raises:
+        UsageError: a value is outside of its range.
+    """
+
+    width: int
+    height: int
+    near_plane: float
+    far_plane: float
+    radius_clip: float
+    eps2d: float
+    sh_degree: int | None
+    packed: bool
+    tile_size: int
+    render_mode: str
+    rasterize_mode: str
+    trained_mode: str
+    max_alpha: float
+
+    def __post_init__(self) -> None:
+        for name, known in MODES.items():
+            if getattr(self, name) not in known:
+                raise UsageError(name, not_one_of(getattr(self, name), known))
+        for name in ("width", "height", "near_plane", "tile_size"):
+            if not getattr(self, name) > 0:
+                raise UsageError(name, f"expected a number above 0, got {getattr(self, name)}")
+        if not self.eps2d >= 0:
+            raise UsageError("eps2d", f"expected a variance of 0 px² or more, got {self.eps2d}")
+
+    @property
+    def hw(self) -> tuple[int, int]:
+        """Height and width, in px."""
+        return self.height, self.width
+
+    @property
+    def coloured(self) -> bool:
+        """Whether colours are drawn."""
+        return self.render_mode.startswith("RGB")
+
+    @property
+    def convention(self) -> Convention:
+        """How training turned covariances into pixels."""
+        rules = Rules(max_alpha=self.max_alpha, near=self.near_plane)
+        mode = self.trained_mode if self.rasterize_mode == "matched" else self.rasterize_mode
+        return Convention(f"gsplat {mode}", self.eps2d, mode == "antialiased", rules)
+
+
+@dataclass(frozen=True)
+class View:
+    """One image: its Gaussians and its camera.
+
+    scene: without opacities, which gsplat has activated, so that they may be 0 or 1; with harmonics if there are any.
+    features: plain colours; None with harmonics.
+    """
+
+    scene: Gaussians
+    opacities: Float[Tensor, " n"]
+    covars: Float[Tensor, "n 3 3"] | None
+    features: Float[Tensor, "n d"] | None
+    background: Float[Tensor, " colours"] | None
+    camera: Camera
+
+
+def refuse(others: Mapping[str, object]) -> None:
+    """Refuse what is not supported.
+
+    Raises:
+        UsageError: an argument is not known, or differs from gsplat's default.
+    """
+    for name, value in others.items():
+        if name not in FIXED:
+            raise UsageError(name, "is not an argument of gsplat's rasterization that aaplug knows")
+        if (value.name if isinstance(value, Enum) else value) != FIXED[name]:  # gsplat has an enumeration of shutters
+            raise UsageError(name, f"only {FIXED[name]} is supported on the CPU (pinhole cameras), got {value}")
+
+
+def views_of(
+    means: Tensor,
+    quats: Tensor | None,
+    scales: Tensor | None,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    backgrounds: Tensor | None,
+    covars: Tensor | None,
+    relative_rate: float | Tensor | None,
+    options: Options,
+) -> list[View]:
+    """One view for each camera of each batch, in this order; shapes as in `rasterization`.
+
+    Raises:
+        UsageError: shapes do not fit each other, or a camera is no pinhole camera.
+    """
+    *batch, n, _ = _shaped("means", means, (*means.shape[:-1], 3), least=2)
+    *_, c, _, _ = _shaped("viewmats", viewmats, (*batch, *viewmats.shape[-3:-2], 4, 4), least=3)
+    _shaped("Ks", Ks, (*batch, c, 3, 3))
+    _shaped("opacities", opacities, (*batch, n))
+    if covars is None:
+        if quats is None or scales is None:
+            raise UsageError("covars", "expected quats and scales, or covars")
+        _shaped("quats", quats, (*batch, n, 4))
+        _shaped("scales", scales, (*batch, n, 3))
+    else:
+        _shaped("covars", covars, (*batch, n, 3, 3))
+        quats, scales = means.new_zeros(*batch, n, 4), torch.ones_like(means)
+    own = _colours_per_camera(colors, (*batch,), c, n, options.sh_degree)
+    if backgrounds is not None:
+        _shaped("backgrounds", backgrounds, (*batch, c, 3 if options.sh_degree is not None else colors.shape[-1]))
+    shared = [_per_image(x, (*batch,), c) for x in (means, quats, scales, opacities, covars)]
+    each = [_per_image(x, (*batch,), c, per_camera=True) for x in (backgrounds, viewmats, Ks)]
+    colours = _per_image(colors, (*batch,), c, per_camera=own)
+    rates = _rates(relative_rate, (*batch, c), options)
+    return [_view(*parts, options) for parts in zip(*shared, colours, *each, rates, strict=True)]
+
+
+def _shaped(name: str, x: Tensor, shape: Sequence[int], least: int = 0) -> Sequence[int]:
+    """The shape, if it is the expected one."""
+    if tuple(x.shape) != tuple(shape) or x.dim() < least:
+        raise UsageError(name, f"expected shape [{', '.join(map(str, shape))}], got {list(x.shape)}")
+    return x.shape
+
+
+def _colours_per_camera(colors: Tensor, batch: tuple[int, ...], c: int, n: int, degree: int | None) -> bool:
+    """Whether each camera has colours of its own."""
+    inner = colors.shape[-1:] if degree is None else (*colors.shape[-2:-1], 3)
+    own = colors.dim() == len(batch) + 2 + len(inner)
+    _shaped("colors", colors, (*batch, *((c,) if own else ()), n, *inner))
+    if degree is not None and not 0 <= degree < colors.shape[-2] ** 0.5:
+        raise UsageError("sh_degree", f"{degree} needs {(degree + 1) ** 2} coefficients, colors has {colors.shape[-2]}")
+    return own
+
+
+def _per_image(x: Tensor | None, batch: tuple[int, ...], c: int, per_camera: bool = False) -> list[Any]:
+    """A tensor's part for each image, None for no tensor; per_camera: whether it has a dimension of cameras."""
+    whole = math.prod(batch)
+    if x is None:
+        return whole * c * [None]
+    parts = x.reshape(whole, *x.shape[len(batch) :]).unbind()
+    return [own for part in parts for own in (part.unbind() if per_camera else c * [part])]
+
+
+def _rates(relative_rate: float | Tensor | None, shape: tuple[int, ...], options: Options) -> list[float | None]:
+    """Each image's sampling rate relative to training; None unless it is asked for."""
+    if (relative_rate is not None) != (options.rasterize_mode == "matched"):
+        raise UsageError("relative_rate", 'belongs to rasterize_mode="matched", which needs it')
+    if relative_rate is None:
+        return math.prod(shape) * [None]
+    rates = torch.as_tensor(relative_rate, dtype=torch.float64)
+    if rates.dim() > 0:
+        _shaped("relative_rate", rates, shape)
+    if not (rates > 0).all():
+        raise UsageError("relative_rate", f"expected numbers above 0, got {relative_rate}")
+    return rates.expand(shape).flatten().tolist()
+
+
+def _view(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    covars: Tensor | None,
+    colors: Tensor,
+    background: Tensor | None,
+    viewmat: Tensor,
+    K: Tensor,
+    rate: float | None,
+    options: Options,
+) -> View:
+    """One image's part of the arguments."""
+    degree, unused = options.sh_degree, means.new_zeros(len(means), 1, 3)
+    lengths = scales.abs().clamp(min=math.exp(-MAX_LOG_SCALE)).log()
+    scene = Gaussians(
+        means,
+        quats,
+        lengths,
+        torch.zeros_like(opacities),
+        unused if degree is None else colors[:, : (degree + 1) ** 2],
+        options.convention,
+    )
+    features = colors if degree is None else None
+    return View(scene, opacities, covars, features, background, _camera(viewmat, K, rate, options))
+
+
+def _camera(viewmat: Tensor, K: Tensor, rate: float | None, options: Options) -> Camera:
+    """The pinhole camera of a pose and a matrix of intrinsics."""
+    (fx, skew, cx), (below, fy, cy), last = K.tolist()
+    if skew != 0 or below != 0 or last != [0, 0, 1] or not (fx > 0 and fy > 0):
+        raise UsageError("Ks", f"expected fx, 0, cx; 0, fy, cy; 0, 0, 1 with fx and fy above 0, got {K.tolist()}")
+    camera = AnyPose("", options.width, options.height, fx, fy, cx, cy, viewmat.double())
+    return camera if rate is None else replace(camera, trained_focal=camera.focal / rate)

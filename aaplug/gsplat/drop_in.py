@@ -1,0 +1,127 @@
+"""The function itself; see the package's docstring."""
+
+from functools import cache
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from aaplug.core.gaussians import CLASSIC
+from aaplug.core.interfaces import Rasterizer, RunsKernels
+from aaplug.core.kernels import EAGER
+from aaplug.core.rules import RULES_GSPLAT
+from aaplug.gsplat.arguments import Options, refuse, views_of
+from aaplug.gsplat.drawing import drawn
+from aaplug.gsplat.sparse import with_sparse_gradient
+from aaplug.gsplat.table import Layout, tabulated
+from aaplug.gsplat.views import features_of, seen
+from aaplug.rasterizers import find_rasterizer
+
+
+def rasterization(
+    means: Tensor,
+    quats: Tensor | None,
+    scales: Tensor | None,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    near_plane: float = RULES_GSPLAT.near,
+    far_plane: float = 1e10,
+    radius_clip: float = 0.0,
+    eps2d: float = CLASSIC.kernel,
+    sh_degree: int | None = None,
+    packed: bool = True,
+    tile_size: int = 16,
+    backgrounds: Tensor | None = None,
+    render_mode: str = "RGB",
+    sparse_grad: bool = False,
+    absgrad: bool = False,
+    rasterize_mode: str = "classic",
+    channel_chunk: int = 32,
+    distributed: bool = False,
+    camera_model: str = "pinhole",
+    segmented: bool = False,
+    covars: Tensor | None = None,
+    *,
+    relative_rate: float | Tensor | None = None,
+    trained_mode: str = "classic",
+    max_alpha: float = RULES_GSPLAT.max_alpha,
+    rasterizer: str | Rasterizer = "auto",
+    **others: object,
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """Draw Gaussians into the images of several pinhole cameras, as `gsplat.rasterization` does.
+
+    n: Gaussians; c: cameras; k: spherical-harmonics coefficients per channel; d: channels; "...": batch dimensions, or
+    none.  Differentiable in everything but `Ks`, as gsplat is.  `meta["means2d"]` has the gradients that gsplat's
+    densification reads; the gradients of the other entries are not recorded there.
+
+    Args:
+        means: [..., n, 3], in world units.
+        quats: wxyz, of any length but zero, [..., n, 4].
+        scales: standard deviations, [..., n, 3], in world units.
+        opacities: in [0, 1], [..., n].
+        colors: channels, [..., n, d] or [..., c, n, d]; with `sh_degree` coefficients, [..., n, k, 3] or
+            [..., c, n, k, 3].
+        viewmats: from world to camera (x right, y down, z forward), [..., c, 4, 4].
+        Ks: intrinsics in px, [..., c, 3, 3].
+        width, height: px.
+        near_plane, far_plane: depths between which Gaussians are drawn, in world units.
+        radius_clip: px; splats with no larger radius are not drawn.
+        eps2d: px²; variance added to every projected covariance.
+        sh_degree: degree of the harmonics to use; None for plain channels.
+        packed: lay `meta` out by splat, not by camera and Gaussian.
+        tile_size: px; of the tiles in `meta`.  It does not change the image.
+        backgrounds: [..., c, d]; black if None.  Depth has none.
+        render_mode: "RGB", colours; "D" or "ED", depth summed by weight or expected; "RGB+D" or "RGB+ED", both, with
+            depth as the last channel.
+        sparse_grad: with `packed`, gradients of means, quats and scales are sparse.
+        absgrad: the backward pass sets `meta["means2d"].absgrad` (arXiv 2404.10484).
+        rasterize_mode: "classic"; "antialiased", which also scales opacity by √(det C / det(C + eps2d·I)), without a
+            floor; or aaplug's "matched", which draws at any rate what training drew at its own (`Matched`).
+        channel_chunk, segmented: without effect here.
+        distributed, camera_model: only gsplat's defaults are supported.
+        covars: [..., n, 3, 3], in squared world units, instead of quats and scales; the upper triangle is read.
+        relative_rate: for "matched": each image's focal length over training's, one number or [..., c].
+        trained_mode: for "matched": "classic" or "antialiased", the mode of training.
+        max_alpha: cap of one splat's alpha at a pixel; 0.999 in gsplat 1.5, 0.99 in 1.6.
+        rasterizer: a rasterizer of aaplug, or its name.
+        others: further arguments of gsplat's, of which only the defaults are supported.
+
+    Returns:
+        Images [..., c, height, width, channels], alpha [..., c, height, width, 1], and `meta` with gsplat's keys.
+
+    Raises:
+        UsageError: something is not supported or out of range, or shapes do not fit each other.
+    """
+    options = Options(
+        *(width, height, near_plane, far_plane, radius_clip, eps2d, sh_degree, packed, tile_size, render_mode),
+        *(rasterize_mode, trained_mode, max_alpha),
+    )
+    refuse({"distributed": distributed, "camera_model": camera_model, **others})
+    rows: list[Tensor] = []
+    if sparse_grad and packed:
+        means, quats, scales = (x if x is None else with_sparse_gradient(x, rows) for x in (means, quats, scales))
+    tensors = (means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars)
+    views = views_of(*tensors, relative_rate, options)
+    chosen = _named(rasterizer) if isinstance(rasterizer, str) else rasterizer
+    kernels = chosen.kernels if isinstance(chosen, RunsKernels) else EAGER
+    found = [seen(view, options, kernels) for view in views]
+    layout = Layout.of([part.splats for part in found], viewmats.shape[:-2], means.shape[-2], packed)
+    rows.append(layout.sources.unique())
+    meta, splats = tabulated(found, layout, options)
+    told = layout.told(meta["means2d"]) if absgrad else len(views) * [None]
+    images = [
+        drawn(part, features_of(part, view, options, kernels), view.background, options, chosen, tell)
+        for part, view, tell in zip(splats, views, told, strict=True)
+    ]
+    colours, alphas = (torch.stack(parts).unflatten(0, layout.shape) for parts in zip(*images, strict=True))
+    return colours, alphas, meta
+
+
+@cache
+def _named(name: str) -> Rasterizer:
+    """A rasterizer by name; compiled kernels are loaded and checked once, not for every image."""
+    return find_rasterizer(name)

@@ -1,0 +1,541 @@
+"""The drop-in for gsplat's rasterization: against gsplat's own torch code, plain formulas, and aaplug's renderer."""
+
+import inspect
+import math
+import runpy
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+import aaplug.gsplat
+from aaplug.core.cameras import Camera
+from aaplug.core.errors import UsageError
+from aaplug.core.gaussians import CLASSIC, Gaussians
+from aaplug.core.projection import rotation_matrices
+from aaplug.core.rules import RULES_GSPLAT
+from aaplug.core.splats import Render
+from aaplug.core.training import TrainingViews
+from aaplug.gsplat import rasterization
+from aaplug.gsplat.arguments import FIXED
+from aaplug.methods.filters import Matched
+from aaplug.methods.recipes import RECIPES
+from aaplug.rendering.renderer import Renderer
+from tests.conftest import make_camera, make_scene
+
+F64 = torch.float64
+SIZE = (40, 28)  # width and height, px
+INPUTS = ("means", "quats", "scales", "opacities", "colors", "viewmats")
+EYES = ((0.3, -3.0, 0.4), (2.5, -1.0, -0.5))
+
+
+def gaussians(n: int = 40, dtype: torch.dtype = F64, degree: int | None = None, seed: int = 0) -> dict[str, Tensor]:
+    """Arguments of a random scene; three channels, or harmonics."""
+    scene = make_scene(n, seed, dtype, degree or 0)
+    colors = scene.sh[:, 0] + 0.7 if degree is None else scene.sh
+    values = (scene.means, scene.quats, scene.scales, scene.opacities, colors)
+    return dict(zip(INPUTS, values, strict=False))
+
+
+def cameras(views: list[Camera], dtype: torch.dtype = F64) -> dict[str, object]:
+    """Arguments of some cameras of one size."""
+    Ks = [torch.tensor([[v.fx, 0, v.cx], [0, v.fy, v.cy], [0, 0, 1]], dtype=dtype) for v in views]
+    poses = torch.stack([view.cam_from_world for view in views]).to(dtype)
+    return {"viewmats": poses, "Ks": torch.stack(Ks), "width": views[0].width, "height": views[0].height}
+
+
+@dataclass(frozen=True)
+class Nothing:
+    """A rasterizer that draws nothing, for tests of `meta`."""
+
+    name: str = "nothing"
+
+    def __call__(self, splats, hw, background, pixel, compositor=None, rules=RULES_GSPLAT) -> Render:
+        return Render(splats.means.new_zeros(*hw, 3), splats.means.new_zeros(hw))
+
+
+def two_views(dtype: torch.dtype = F64) -> dict[str, object]:
+    return cameras([make_camera(eye, SIZE) for eye in EYES], dtype)
+
+
+def unusual_views(count: int, dtype: torch.dtype = F64) -> dict[str, object]:
+    """Cameras with oblong pixels whose optical axis misses the image's middle, at random places in the scene."""
+    g = torch.Generator().manual_seed(5)
+    eyes = torch.randn(count, 3, generator=g) * 1.5
+    views = [make_camera(tuple(eye.tolist()), WIDE, 1.1) for eye in eyes]
+    return cameras([replace(v, fy=v.fx * 1.2, cx=250.0, cy=290.0) for v in views], dtype)
+
+
+# ------------------------------------------------------------------------------------------- gsplat's own torch code
+
+
+@pytest.fixture
+def reference():
+    """The module of gsplat's package with its kernels in plain torch."""
+    return pytest.importorskip("gsplat.cuda._torch_impl", reason="the package gsplat is not installed")
+
+
+def covariances(quats: Tensor, scales: Tensor) -> Tensor:
+    factor = rotation_matrices(torch.nn.functional.normalize(quats, dim=1)) * scales[:, None]
+    return factor @ factor.mT
+
+
+def projected_by(reference, values: dict[str, Tensor], views: dict[str, object]) -> tuple[Tensor, ...]:
+    """Radii, means, depths, conics and compensation by gsplat, [c, n, ...]."""
+    sigma = values["covars"] if "covars" in values else covariances(values["quats"], values["scales"])
+    size = views["width"], views["height"]
+    found = reference._fully_fused_projection(
+        values["means"], sigma, views["viewmats"], views["Ks"], *size, calc_compensations=True
+    )
+    return found
+
+
+WIDE = (640, 480)
+
+
+@pytest.mark.parametrize("given", ["scales", "covars"])
+@pytest.mark.parametrize(("dtype", "px", "relative"), [(torch.float32, 1e-4, 1e-5), (F64, 1e-9, 1e-9)])
+def test_projection_equals_gsplats_on_a_thousand_cases(reference, dtype, px, relative, given):
+    values, views = gaussians(50) | {"opacities": torch.ones(50, dtype=F64)}, unusual_views(20)
+    radii, means, depths, conics, factors = projected_by(reference, values, views)
+    if given == "covars":
+        values |= {"covars": covariances(values["quats"], values["scales"]), "quats": None, "scales": None}
+    ours = {name: x.to(dtype) if isinstance(x, Tensor) else x for name, x in (values | views).items()}
+    _, _, meta = rasterization(**ours, packed=False, rasterize_mode="antialiased", rasterizer=Nothing())
+    shown, theirs = ((x > 0).all(dim=2) for x in (meta["radii"], radii))
+    both = shown & theirs
+    assert both.sum() > 800
+    # gsplat's torch code draws every splat as far as an opaque one, so it keeps some more at the image's edge
+    assert not (shown & ~theirs).any()
+    assert (theirs & ~shown).sum() < 10
+    reach = (2 * (255 * factors[both]).log()).sqrt() / 3.33
+    assert (meta["radii"][both] - reach[:, None] * radii[both]).abs().max() < 1.5
+    inside = both & ((means > 0) & (means < torch.tensor(WIDE))).all(dim=2)
+    assert (meta["means2d"] - means)[inside].abs().max() < px
+    pairs = {"means2d": means, "depths": depths[..., None], "conics": conics, "opacities": factors[..., None]}
+    for name, expected in pairs.items():
+        error = (meta[name].view_as(expected) - expected)[both].abs().amax(dim=1) / expected[both].abs().amax(dim=1)
+        assert error.max() < relative, name
+
+
+@pytest.mark.parametrize("given", ["scales", "covars"])
+def test_gradients_of_projection_equal_gsplats(reference, given):
+    values, views = gaussians(50) | {"opacities": torch.ones(50, dtype=F64)}, unusual_views(20)
+    if given == "covars":
+        values |= {"covars": covariances(values["quats"], values["scales"]), "quats": None, "scales": None}
+    names = ["means", *(["covars"] if given == "covars" else ["quats", "scales"])]
+    leaves = [x.requires_grad_() for x in (*(values[name] for name in names), views["viewmats"])]
+    radii, means, depths, conics, factors = projected_by(reference, values, views)
+    _, _, meta = rasterization(**values, **views, packed=False, rasterize_mode="antialiased", rasterizer=Nothing())
+    both = (meta["radii"] > 0).all(dim=2) & (radii > 0).all(dim=2)
+    pairs = ((meta["means2d"], means), (meta["depths"], depths), (meta["conics"], conics), (meta["opacities"], factors))
+    weights = [torch.rand(x[both].shape, dtype=F64, generator=torch.Generator().manual_seed(1)) for x, _ in pairs]
+    ours, theirs = (
+        torch.autograd.grad(sum((pair[i][both] * w).sum() for pair, w in zip(pairs, weights, strict=True)), leaves)
+        for i in (0, 1)
+    )
+    for name, a, b in zip((*names, "viewmats"), ours, theirs, strict=True):
+        b = (b + b.mT).triu() - torch.diag_embed(b.diagonal(dim1=1, dim2=2)) if name == "covars" else b
+        assert (a - b).abs().max() < 1e-4 * b.abs().max(), name
+        torch.testing.assert_close(a, b, rtol=1e-7, atol=1e-7 * float(b.abs().max()))
+
+
+@pytest.mark.parametrize("packed", [True, False])
+def test_the_table_of_tiles_equals_gsplats(reference, packed):
+    _, _, meta = rasterization(**gaussians(), **two_views(), packed=False, tile_size=8, rasterizer=Nothing())
+    grid = meta["tile_width"], meta["tile_height"]
+    assert grid == (5, 4)
+    counts, ids, flatten = reference._isect_tiles(
+        *(meta[name].float() if name != "radii" else meta[name] for name in ("means2d", "radii", "depths")), 8, *grid
+    )
+    if packed:
+        shown = (meta["radii"] > 0).all(dim=2)
+        counts = counts[shown]
+        flatten = (shown.flatten().cumsum(0) - 1)[flatten.long()].int()
+        _, _, meta = rasterization(**gaussians(), **two_views(), tile_size=8, rasterizer=Nothing())
+    torch.testing.assert_close(meta["tiles_per_gauss"], counts.int())
+    torch.testing.assert_close(meta["isect_ids"], ids)
+    torch.testing.assert_close(meta["flatten_ids"], flatten.int())
+    offsets = reference._isect_offset_encode(ids, 2, *grid)
+    torch.testing.assert_close(meta["isect_offsets"], offsets.int())
+
+
+def test_arguments_have_gsplats_names_and_defaults():
+    theirs = inspect.signature(pytest.importorskip("gsplat", reason="the package is not installed").rasterization)
+    ours = inspect.signature(rasterization).parameters
+    order = [name for name in theirs.parameters if name in ours]
+    assert order == [name for name in ours if name in theirs.parameters] == list(theirs.parameters)[: len(order)]
+    for name, parameter in theirs.parameters.items():
+        default = FIXED[name] if name in FIXED else ours[name].default
+        expected = getattr(parameter.default, "name", parameter.default)
+        assert default == (pytest.approx(expected) if isinstance(expected, float) else expected), name
+
+
+# ------------------------------------------------------------------------------------------------------------- images
+
+
+def composited(meta: dict[str, object], features: Tensor, camera: int, cap: float = 0.999) -> tuple[Tensor, Tensor]:
+    """One image by the formula of alpha compositing from an unpacked `meta`: [h, w, d] and [h, w, 1]."""
+    width, height = SIZE
+    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    order = meta["depths"][camera].argsort()
+    order = order[(meta["radii"][camera, order] > 0).all(dim=1)]
+    image, left = torch.zeros(height, width, features.shape[1], dtype=F64), torch.ones(height, width, 1, dtype=F64)
+    for i in order.tolist():
+        mean, (xx, xy, yy) = meta["means2d"][camera, i], meta["conics"][camera, i]
+        dx, dy = x - mean[0], y - mean[1]
+        alpha = meta["opacities"][camera, i] * torch.exp(-0.5 * (xx * dx * dx + yy * dy * dy) - xy * dx * dy)
+        alpha = torch.where(alpha < 1 / 255, 0.0, alpha.clamp(max=cap))[..., None]
+        image, left = image + left * alpha * features[i], left * (1 - alpha)
+    return image, 1 - left
+
+
+@pytest.mark.parametrize("mode", ["classic", "antialiased"])
+@pytest.mark.parametrize("channels", [1, 3, 5])
+def test_images_equal_the_formula(mode, channels):
+    values, views = gaussians() | {"colors": torch.rand(40, channels, dtype=F64)}, two_views()
+    # two opaque splats, each in the middle of one image
+    values["means"][:2], values["opacities"][:2], values["scales"][:2] = 0.5 * torch.tensor(EYES), 1.0, 0.2
+    image, alpha, meta = rasterization(**values, **views, packed=False, rasterize_mode=mode)
+    assert image.shape == (2, SIZE[1], SIZE[0], channels)
+    for camera in range(2):
+        expected = composited(meta, values["colors"], camera)
+        torch.testing.assert_close(image[camera], expected[0], rtol=0, atol=1e-6)
+        torch.testing.assert_close(alpha[camera], expected[1], rtol=0, atol=1e-6)
+        capped = composited(meta, values["colors"], camera, 0.99)[0]
+        assert mode == "antialiased" or (expected[0] - capped).abs().max() > 1e-4, "the cap should matter here"
+
+
+@pytest.mark.parametrize("mode", ["RGB", "D", "ED", "RGB+D", "RGB+ED"])
+def test_images_in_float32_equal_the_reference_rasterizers(mode):
+    values, views = gaussians(300, torch.float32, degree=1), two_views(torch.float32)
+    more = {"sh_degree": 1, "render_mode": mode, "backgrounds": torch.tensor([[1.0, 0.5, 0.2], [0.0, 0.3, 0.9]])}
+    found, exact = (rasterization(**values, **views, **more, rasterizer=name) for name in ("eager", "reference"))
+    assert found[0].shape[-1] == {"RGB": 3, "D": 1, "ED": 1}.get(mode, 4)
+    for a, b in zip(found[:2], exact[:2], strict=True):
+        assert b.dtype == F64
+        assert (a - b).abs().max() < 5e-5
+
+
+def test_depth_is_summed_by_weight_and_may_be_divided_by_alpha():
+    values, views = gaussians(), two_views()
+    backgrounds = torch.ones(2, 3, dtype=F64)
+    images = {
+        mode: rasterization(**values, **views, render_mode=mode, backgrounds=backgrounds, packed=False)
+        for mode in ("RGB", "D", "ED", "RGB+D", "RGB+ED")
+    }
+    _, alpha, meta = images["D"]
+    depth, expected = images["D"][0], images["ED"][0]
+    for camera in range(2):
+        by_formula = composited(meta, meta["depths"][camera][:, None], camera)[0]
+        torch.testing.assert_close(depth[camera], by_formula, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(expected[alpha > 0.01], (depth / alpha)[alpha > 0.01])
+    assert (expected[alpha == 0] == 0).all()
+    for mode, last in (("RGB+D", depth), ("RGB+ED", expected)):
+        torch.testing.assert_close(images[mode][0], torch.cat([images["RGB"][0], last], dim=-1))
+
+
+def test_backgrounds_show_through():
+    values, views = gaussians(), two_views()
+    backgrounds = torch.rand(2, 3, dtype=F64)
+    black, alpha, _ = rasterization(**values, **views)
+    image, _, _ = rasterization(**values, **views, backgrounds=backgrounds)
+    torch.testing.assert_close(image, black + (1 - alpha) * backgrounds[:, None, None])
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_harmonics_and_rules_are_those_of_the_renderer(degree):
+    scene, views = make_scene(200, degree=3, dtype=F64), [make_camera(eye, SIZE) for eye in EYES]
+    scene = replace(scene, convention=replace(CLASSIC, rules=RULES_GSPLAT))
+    values = dict(zip(INPUTS, (scene.means, scene.quats, scene.scales, scene.opacities, scene.sh), strict=False))
+    images, alphas, _ = rasterization(**values, **cameras(views), sh_degree=degree)
+    shown = replace(scene, sh=scene.sh[:, : (degree + 1) ** 2])
+    renderer = Renderer.of(shown, views, "classic", rasterizer="eager")
+    for view, image, alpha in zip(views, images, alphas, strict=True):
+        expected = renderer(view)
+        torch.testing.assert_close(image, expected.rgb, rtol=0, atol=1e-9)
+        torch.testing.assert_close(alpha[..., 0], expected.alpha, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("trained_mode", ["classic", "antialiased"])
+@pytest.mark.parametrize("rate", [0.25, 1.0, 2.0])
+def test_matched_draws_as_the_recipe_at_the_given_rate(trained_mode, rate):
+    scene, view = make_scene(200, degree=1, dtype=F64), make_camera(EYES[0], SIZE)
+    convention = replace(CLASSIC, compensated=trained_mode == "antialiased", rules=RULES_GSPLAT)
+    scene, small = replace(scene, convention=convention), view.scaled(rate)
+    recipe = replace(RECIPES["matched"], screen=Matched("global"))
+    expected = Renderer.of(scene, [view], recipe, rasterizer="eager")(small).rgb
+    values = dict(zip(INPUTS, (scene.means, scene.quats, scene.scales, scene.opacities, scene.sh), strict=False))
+    words = {"sh_degree": 1, "rasterize_mode": "matched", "trained_mode": trained_mode}
+    image, _, _ = rasterization(**values, **cameras([small]), **words, relative_rate=rate)
+    torch.testing.assert_close(image[0], expected, rtol=0, atol=1e-9)
+    if rate == 1:
+        trained, _, _ = rasterization(**values, **cameras([view]), sh_degree=1, rasterize_mode=trained_mode)
+        torch.testing.assert_close(image, trained, rtol=0, atol=1e-6)
+
+
+# ------------------------------------------------------------------------------------------------ layouts and batches
+
+
+def test_packed_and_unpacked_tables_hold_the_same():
+    values, views = gaussians(), two_views()
+    values["means"][0] += 100  # out of sight
+    image, alpha, packed = rasterization(**values, **views)
+    others = rasterization(**values, **views, packed=False)
+    torch.testing.assert_close((image, alpha), others[:2])
+    meta, at = others[2], (packed["camera_ids"], packed["gaussian_ids"])
+    assert meta.keys() == packed.keys()
+    for name in ("radii", "means2d", "depths", "conics", "opacities", "tiles_per_gauss"):
+        torch.testing.assert_close(packed[name], meta[name][at])
+    assert meta["means2d"].shape == (2, 40, 2)
+    assert (meta["radii"][:, 0] == 0).all()
+    assert [meta[name] for name in ("batch_ids", "camera_ids", "gaussian_ids")] == [None] * 3
+    assert (meta["n_batches"], meta["n_cameras"], meta["width"], meta["height"]) == (1, 2, *SIZE)
+    assert packed["radii"].dtype == torch.int32
+
+
+def test_cameras_may_have_colours_of_their_own():
+    values, views = gaussians(), two_views()
+    colors = torch.rand(2, 40, 3, dtype=F64)
+    image, _, _ = rasterization(**values | {"colors": colors}, **views)
+    for camera in range(2):
+        other, _, _ = rasterization(**values | {"colors": colors[camera]}, **views)
+        torch.testing.assert_close(image[camera], other[camera])
+
+
+@pytest.mark.parametrize("packed", [True, False])
+def test_batches_of_scenes_are_drawn_one_by_one(packed):
+    scenes, views = [gaussians(seed=seed) for seed in (1, 2)], two_views()
+    together = {name: torch.stack([scene[name] for scene in scenes]) for name in scenes[0]}
+    poses = {name: views[name].expand(2, *views[name].shape) for name in ("viewmats", "Ks")}
+    image, alpha, meta = rasterization(**together, **views | poses, packed=packed)
+    assert alpha.shape == (2, 2, SIZE[1], SIZE[0], 1)
+    assert meta["isect_offsets"].shape == (2, 2, 2, 3)
+    assert meta["n_batches"] == 2
+    for i, scene in enumerate(scenes):
+        alone, _, own = rasterization(**scene, **views, packed=packed)
+        torch.testing.assert_close(image[i], alone)
+        part = meta["means2d"][meta["batch_ids"] == i] if packed else meta["means2d"][i]
+        torch.testing.assert_close(part, own["means2d"])
+
+
+def test_planes_and_radii_leave_splats_out():
+    values, views = gaussians(), two_views()
+    depths, radii = (rasterization(**values, **views, packed=False)[2][name] for name in ("depths", "radii"))
+    for words, kept in (
+        ({"near_plane": 3.0}, depths > 3),
+        ({"far_plane": 3.0}, (depths > 0) & (depths < 3)),
+        ({"radius_clip": 4.0}, (radii > 4).any(dim=2)),
+    ):
+        meta = rasterization(**values, **views, packed=False, **words)[2]
+        assert ((meta["radii"] > 0).all(dim=2) == kept).all(), words
+        assert 0 < kept.sum() < kept.numel()
+
+
+def test_an_empty_view_is_its_background():
+    values = gaussians()
+    values["means"][:, 1] -= 100
+    image, alpha, meta = rasterization(**values, **two_views(), backgrounds=torch.full((2, 3), 0.5, dtype=F64))
+    assert (image == 0.5).all()
+    assert (alpha == 0).all()
+    assert len(meta["means2d"]) == 0
+
+
+# ---------------------------------------------------------------------------------------------------------- gradients
+
+
+@pytest.mark.parametrize(("given", "packed"), [("scales", True), ("covars", False), ("matched", True)])
+def test_gradients_equal_finite_differences(given, packed):
+    values, views = gaussians(12, degree=1) | {"backgrounds": torch.rand(2, 3, dtype=F64)}, two_views()
+    views |= {"width": 12, "height": 9}
+    views["Ks"] = views["Ks"] * torch.tensor([12 / SIZE[0], 9 / SIZE[1], 1], dtype=F64)[:, None]
+    fixed = {"packed": packed, "render_mode": "RGB+ED", "rasterize_mode": "antialiased", "sh_degree": 1}
+    if given == "matched":
+        fixed |= {"rasterize_mode": "matched", "relative_rate": 0.5}
+    if given == "covars":
+        values |= {"covars": covariances(values.pop("quats"), values.pop("scales"))}
+        fixed |= {"quats": None, "scales": None}
+    leaves = values | {"viewmats": views.pop("viewmats")}
+
+    def draw(*args: Tensor) -> tuple[Tensor, ...]:
+        return rasterization(**dict(zip(leaves, args, strict=True)), **views, **fixed)[:2]
+
+    inputs = [x.clone().requires_grad_() for x in leaves.values()]
+    assert torch.autograd.gradcheck(draw, inputs, eps=1e-7, rtol=1e-4, atol=1e-4, fast_mode=True)
+
+
+def test_opaque_transparent_and_flat_gaussians_have_finite_gradients():
+    values, views = gaussians(), two_views()
+    values["opacities"][0], values["opacities"][1] = 0.0, 1.0
+    values["scales"][2] = 0.0
+    values["scales"][3, 0] = 0.0
+    leaves = [x.requires_grad_() for x in values.values()]
+    image, _, _ = rasterization(**values, **views, rasterize_mode="antialiased")
+    for gradient in torch.autograd.grad(image.square().sum(), leaves):
+        assert gradient.isfinite().all()
+
+
+@pytest.mark.parametrize("packed", [True, False])
+def test_absolute_gradients_are_summed_over_pixels(packed):
+    values, views = gaussians(12), cameras([make_camera(eye, (5, 4)) for eye in EYES])
+    image, alpha, meta = rasterization(**values, **views, packed=packed, absgrad=True)
+    assert not image.requires_grad
+    values["means"].requires_grad_()
+    image, alpha, meta = rasterization(**values, **views, packed=packed, absgrad=True)
+    means2d = meta["means2d"]
+    weights = torch.rand(4, dtype=F64) - 0.5
+    parts = (torch.cat([image, alpha], dim=-1) * weights).sum(dim=-1).flatten()
+    expected = sum(torch.autograd.grad(part, means2d, retain_graph=True)[0].abs() for part in parts)
+    means2d.absgrad.zero_()
+    parts.sum().backward()
+    torch.testing.assert_close(means2d.absgrad, expected)
+
+
+def test_sparse_gradients_hold_the_same_values():
+    found = []
+    for sparse in (False, True):
+        values = gaussians()
+        values["means"][0] += 100
+        names = ("means", "quats", "scales")
+        leaves = [values[name].requires_grad_() for name in names]
+        image, _, meta = rasterization(**values, **two_views(), sparse_grad=sparse)
+        found.append(torch.autograd.grad(image.square().sum(), leaves))
+    for dense, sparse in zip(*found, strict=True):
+        assert sparse.is_sparse
+        torch.testing.assert_close(sparse.to_dense(), dense)
+        torch.testing.assert_close(sparse.indices()[0], meta["gaussian_ids"].unique())
+
+
+# ----------------------------------------------------------------------------------------------------------- training
+
+
+def target_and_start() -> tuple[dict[str, Tensor], list[tuple[tuple[object, ...], Tensor]], list[Camera]]:
+    """Parameters to start from, and views of another scene with its photographs."""
+    views = [make_camera((3 * math.sin(a), -3 * math.cos(a), 0.5), (24, 20)) for a in (0.0, 0.8, 1.6, 2.4)]
+    words = cameras(views)
+    truth = make_scene(60, seed=1, dtype=F64)
+    colours = {"colors": truth.sh, "sh_degree": 1}
+    photographs = rasterization(truth.means, truth.quats, truth.scales, truth.opacities, **colours, **words)[0]
+    data = [
+        ((pose, K, 24, 20), image) for pose, K, image in zip(words["viewmats"], words["Ks"], photographs, strict=True)
+    ]
+    start = make_scene(60, seed=2, dtype=F64)
+    splats = {"means": start.means, "quats": start.quats, "scales": start.log_scales}
+    splats |= {"opacities": start.logit_opacities, "sh0": start.sh[:, :1], "shN": start.sh[:, 1:]}
+    return splats, data, views
+
+
+def trained_by_the_renderer(splats, data, views, rates, steps, batch=2):
+    """The same training with aaplug's own interface; also the summed gradients of each Gaussian's centre."""
+    values = {name: torch.nn.Parameter(value.clone()) for name, value in splats.items()}
+    optimizers = [torch.optim.Adam([values[name]], lr=rate) for name, rate in rates.items()]
+    convention = replace(CLASSIC, rules=RULES_GSPLAT)
+    grads, losses = torch.zeros(60, dtype=F64), []
+    for step in range(steps):
+        sh = torch.cat([values["sh0"], values["shN"]], dim=1)
+        scene = Gaussians(values["means"], values["quats"], values["scales"], values["opacities"], sh, convention)
+        renderer = Renderer.of(scene, TrainingViews.of(scene.to(F64), views), "classic", rasterizer="eager")
+        chosen = [(step * batch + i) % len(views) for i in range(batch)]
+        drawings = [renderer.draw(views[i]) for i in chosen]
+        for drawing in drawings:
+            drawing.splats.means.retain_grad()
+        errors = [(d.render.rgb - data[i][1]).abs().mean() for d, i in zip(drawings, chosen, strict=True)]
+        loss = torch.stack(errors).mean()
+        loss.backward()
+        for drawing in drawings:
+            gradient = drawing.splats.means.grad * torch.tensor([24 / 2 * batch, 20 / 2 * batch])
+            grads.index_add_(0, drawing.splats.sources, gradient.norm(dim=1))
+        for optimizer in optimizers:
+            optimizer.step()
+            optimizer.zero_grad()
+        losses.append(loss.item())
+    return losses, grads
+
+
+@pytest.mark.parametrize("packed", [True, False])
+def test_an_unchanged_training_loop_falls_to_the_same_loss_as_ours(packed, monkeypatch):
+    monkeypatch.setitem(sys.modules, "gsplat", aaplug.gsplat)
+    loop = runpy.run_path(str(Path(__file__).with_name("gsplat_training.py")))
+    splats, data, views = target_and_start()
+    losses, state = loop["train"](splats, data, 8, packed)
+    ours, expected = trained_by_the_renderer(splats, data, views, loop["RATES"], 8)
+    assert losses[-2] + losses[-1] < 0.9 * (losses[0] + losses[1])
+    assert losses == pytest.approx(ours, rel=1e-6)
+    torch.testing.assert_close(state["grad2d"], expected, rtol=1e-5, atol=1e-8)
+    assert state["count"].max() == 16
+
+
+@pytest.mark.parametrize("absgrad", [False, True])
+@pytest.mark.parametrize("packed", [True, False])
+def test_gsplats_own_densification_reads_meta(packed, absgrad):
+    strategies = pytest.importorskip("gsplat.strategy", reason="the package gsplat is not installed")
+    splats, data, _ = target_and_start()
+    params = {name: torch.nn.Parameter(value.float()) for name, value in splats.items()}
+    optimizers = {name: torch.optim.Adam([value], lr=1e-2) for name, value in params.items()}
+    strategy = strategies.DefaultStrategy(
+        refine_start_iter=2, refine_every=2, grow_grad2d=1e-6, absgrad=absgrad, refine_scale2d_stop_iter=9
+    )
+    strategy.check_sanity(params, optimizers)
+    state = strategy.initialize_state()
+    (pose, K, *size), photograph = data[0]
+    pose, K, photograph = pose.float(), K.float(), photograph.float()
+    losses = []
+    for step in range(8):
+        activated = params["means"], params["quats"], params["scales"].exp(), params["opacities"].sigmoid()
+        words = {"sh_degree": 1, "packed": packed, "absgrad": absgrad}
+        colours = torch.cat([params["sh0"], params["shN"]], dim=1)
+        image, _, info = rasterization(*activated, colours, pose[None], K[None], *size, **words)
+        strategy.step_pre_backward(params, optimizers, state, step, info)
+        loss = (image[0] - photograph).abs().mean()
+        loss.backward()
+        strategy.step_post_backward(params, optimizers, state, step, info, packed=packed)
+        for optimizer in optimizers.values():
+            optimizer.step()
+            optimizer.zero_grad()
+        losses.append(loss.item())
+    assert losses[-1] < losses[0]
+    assert len(params["means"]) > 60
+
+
+# ----------------------------------------------------------------------------------------------------------- mistakes
+
+WRONG = {
+    "means: expected shape [40, 3], got [40, 2]": {"means": torch.zeros(40, 2)},
+    "quats: expected shape [40, 4], got [3, 4]": {"quats": torch.ones(3, 4)},
+    "scales: expected shape [40, 3], got [40]": {"scales": torch.ones(40)},
+    "opacities: expected shape [40], got [40, 1]": {"opacities": torch.ones(40, 1)},
+    "colors: expected shape [40, 3], got [39, 3]": {"colors": torch.ones(39, 3)},
+    "colors: expected shape [2, 40, 3], got [3, 40, 3]": {"colors": torch.ones(3, 40, 3)},
+    "colors: expected shape [40, 9, 3], got [40, 9, 4]": {"colors": torch.ones(40, 9, 4), "sh_degree": 2},
+    "sh_degree: 3 needs 16 coefficients, colors has 9": {"colors": torch.ones(40, 9, 3), "sh_degree": 3},
+    "viewmats: expected shape [2, 4, 4], got [2, 3, 4]": {"viewmats": torch.zeros(2, 3, 4)},
+    "Ks: expected shape [2, 3, 3], got [1, 3, 3]": {"Ks": torch.eye(3)[None]},
+    "Ks: expected fx, 0, cx; 0, fy, cy; 0, 0, 1": {"Ks": torch.ones(2, 3, 3)},
+    "backgrounds: expected shape [2, 3], got [3]": {"backgrounds": torch.ones(3)},
+    "covars: expected quats and scales, or covars": {"quats": None},
+    "covars: expected shape [40, 3, 3], got [40, 6]": {"covars": torch.ones(40, 6)},
+    "render_mode: 'RGBD' is not one of RGB, D, ED, RGB+D, RGB+ED": {"render_mode": "RGBD"},
+    "rasterize_mode: 'mip' is not one of classic, antialiased, matched": {"rasterize_mode": "mip"},
+    "near_plane: expected a number above 0, got 0.0": {"near_plane": 0.0},
+    "width: expected a number above 0, got 0": {"width": 0},
+    "eps2d: expected a variance of 0 px² or more, got -0.1": {"eps2d": -0.1},
+    'relative_rate: belongs to rasterize_mode="matched", which needs it': {"rasterize_mode": "matched"},
+    "relative_rate: expected shape [2], got [3]": {"rasterize_mode": "matched", "relative_rate": torch.ones(3)},
+    "relative_rate: expected numbers above 0, got -1.0": {"rasterize_mode": "matched", "relative_rate": -1.0},
+    "camera_model: only pinhole is supported on the CPU (pinhole cameras), got fisheye": {"camera_model": "fisheye"},
+    "distributed: only False is supported": {"distributed": True},
+    "with_ut: only False is supported": {"with_ut": True},
+    "radial_coeffs: only None is supported": {"radial_coeffs": torch.zeros(2, 6)},
+    "heliocentric: is not an argument of gsplat's rasterization": {"heliocentric": 1},
+    "rasterizer: 'cuda' is not one of": {"rasterizer": "cuda"},
+}
+
+
+@pytest.mark.parametrize("message", WRONG)
+def test_what_is_wrong_or_not_supported_is_said(message):
+    with pytest.raises(UsageError) as error:
+        rasterization(**gaussians() | two_views() | WRONG[message])
+    assert str(error.value).startswith(message)
