@@ -37,6 +37,8 @@ from aaplug.rendering.renderer import Background, Renderer
 
 NO_PHOTOGRAPH = "no photograph is this large: metrics above the photographs' own size are undefined"
 
+CORNER = 64  # px
+
 Values = Mapping[str, float | None]
 Apply = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 
@@ -296,6 +298,8 @@ class _Comparison:
         for known, values in self._known:
             if image.equal(known):
                 return values
-        values = {metric.name: metric.compare(image, self.truth) for metric in metrics}
+        assert self.truth is not None
+        part = slice(CORNER if image.equal(self.truth) else None)  # of equal images, a corner says as much
+        values = {m.name: m.compare(image[part, part], self.truth[part, part]) for m in metrics}
         self._known.append((image, values))
         return values

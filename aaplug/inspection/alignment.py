@@ -24,12 +24,15 @@ from aaplug.core.gaussians import Gaussians
 LOOKED_UP = 1024  # places of the other scene that are judged
 KNOWN = 1 << 18  # places of the reference among which they are looked up
 CORE = 2.0  # median distances from the middle: what lies farther does not count for principal axes
-SPACINGS = 2.0  # of the reference's own: within that distance another training of the same scene lies too
+STEPS = 20  # of the iteration that finds the middle
+SURE = 0.5  # of the reference's spacing: nearer, no transform can tell more
+FITS = 5.0  # of the reference's spacing: farther, Gaussians are not of the same surfaces
 CLEARLY = 1 / 3  # of the distance as the scenes are: what a transform must reach to be believed
 PAIRED = 0.01  # of the scene's size: the median distance within which pairs are the same Gaussians
 ELSEWHERE = 1.0  # of the scene's size: the median distance from which scenes do not overlap
 AS_SIMPLE = 1.5  # times the least distance: a simpler transform that reaches this is preferred
 SAME = 0.01  # relative change of scale, and of the place over the scene's size, that is not named
+TINY = 1e-30  # world units: what lengths are divided by at least
 STRAIGHT = 0.999  # cosine of the angle within which a direction is named as an axis
 
 
@@ -59,7 +62,8 @@ class Similarity:
         if abs(self.scale - 1) > SAME:
             parts.append(f"scaled by {self.scale:.3g}")
         if float(self.shift.norm()) > SAME * size:
-            parts.append(f"moved by ({', '.join(f'{x:.3g}' for x in self.shift.tolist())})")
+            moved = [x if abs(x) > SAME * size else 0.0 for x in self.shift.tolist()]
+            parts.append(f"moved by ({', '.join(f'{x:.3g}' for x in moved)})")
         return ", ".join(parts)
 
 
@@ -76,14 +80,20 @@ class Cloud:
 
     @cached_property
     def middle(self) -> Float[Tensor, " 3"]:
-        """Median along each axis."""
-        return self.points.median(dim=0).values
+        """Nearly the place with the least sum of distances (Weiszfeld 1937); it turns and grows with the points."""
+        middle = self.points.mean(dim=0)
+        for _ in range(STEPS):
+            offsets = self.points - middle
+            distances = offsets.norm(dim=1)
+            pull = 1 / distances.clamp(min=SAME * max(float(distances.median()), TINY))
+            middle = middle + (offsets * pull[:, None]).sum(dim=0) / pull.sum()
+        return middle
 
     @cached_property
     def size(self) -> float:
         """Median distance from the middle, above 0."""
         distances = (self.points - self.middle).norm(dim=1)
-        return max(float(distances.median()), torch.finfo(torch.float64).tiny)
+        return max(float(distances.median()), TINY)
 
     @cached_property
     def axes(self) -> Float[Tensor, "3 3"]:
@@ -121,10 +131,11 @@ def mismatch(reference: Gaussians, other: Gaussians) -> str | None:
     if len(reference) == len(other) and (pairs := _paired(reference, other)) is not None:
         return pairs.described(known.size) or None
     apart = known.apart(looked_up.points)
-    if apart <= SPACINGS * known.spacing:
+    if apart <= SURE * known.spacing:
         return None
     candidates = list(_candidates(known, Cloud.of(other, KNOWN)))
-    distances = [known.apart(t.undone(looked_up.points), CLEARLY * apart) for t in candidates]
+    most = min(CLEARLY * apart, FITS * known.spacing)
+    distances = [known.apart(t.undone(looked_up.points), most) for t in candidates]
     if (least := min(distances)) < math.inf:
         simplest = next(place for place, distance in enumerate(distances) if distance <= AS_SIMPLE * least)
         return candidates[simplest].described(known.size) or None

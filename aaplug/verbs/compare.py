@@ -132,7 +132,7 @@ def compare(
     with processor(o.threads) as workers, made, claimed(folder, lambda: check_compared(folder, o)):
         sources = [first, *(s if isinstance(s, Held) else settled(s, cameras, monitor) for s in others)]
         held = [shown_of(source, drop_bad) for source in sources]
-        rows = _rows(dict(zip(named, zip(sources, held, strict=True), strict=True)), o.any_frame)
+        rows = _rows(dict(zip(named, zip(sources, held, strict=True), strict=True)), o.any_frame, monitor)
         look = look_of(held[0], cameras, len(seen) * len(o.scale) * len(held), o, monitor)
         say_assumed(cameras, monitor, look)
         looks = [look, *(_look_of(scene, look, cameras, o) for scene in held[1:])]
@@ -186,10 +186,12 @@ def _named(
                 str(file), "is named twice; a scene is compared once (with itself, if it is the first too)"
             )
     names = [f"scene {place}" if file is None else file.name for place, file in enumerate(files)]
-    if len(set(names)) < len(names):
+    if len(set(names)) < len({file or place for place, file in enumerate(files)}):
         names = [
             name if file is None else f"{file.parent.name}/{name}" for name, file in zip(names, files, strict=True)
         ]
+    itself = [place > 0 and file is not None and file == files[0] for place, file in enumerate(files)]
+    names = [name + " again" * same for name, same in zip(names, itself, strict=True)]
     return dict(zip(file_names(names, "scene", 1), opened, strict=True))
 
 
@@ -225,8 +227,10 @@ def _usable(scene: Held | SceneFile) -> Gaussians:
     return usable(scene.raw(0, scene.count)) if isinstance(scene, SceneFile) else whole_of(scene)
 
 
-def _rows(scenes: Mapping[str, tuple[Held | SceneFile, Held]], any_frame: bool) -> tuple[ComparedScene, ...]:
-    """What the scenes are, by name, the reference first."""
+def _rows(
+    scenes: Mapping[str, tuple[Held | SceneFile, Held]], any_frame: bool, monitor: Monitor
+) -> tuple[ComparedScene, ...]:
+    """What the scenes are, by name, the reference first; says what they lack."""
     (reference, (_, first)), known = next(iter(scenes.items())), list[ComparedScene]()
     for name, (source, held) in scenes.items():
         scene, file = whole_of(held), _file_of(source)
@@ -236,6 +240,9 @@ def _rows(scenes: Mapping[str, tuple[Held | SceneFile, Held]], any_frame: bool) 
             if not any_frame:
                 raise FrameError(name, f"{problem}; bring both into one frame, or pass `any_frame`")
             log.warning("%s: %s", name, problem)
+        if scene.sh_degree != (degree := whole_of(first).sh_degree):
+            told = f"{name}: has SH degree {scene.sh_degree}, {reference} {degree}"
+            monitor.say(f"{told}: what one lacks counts as a difference from 0")
         known.append(
             ComparedScene(
                 name=name,
