@@ -215,7 +215,7 @@ def test_links_between_documents_lead_somewhere():
 def test_every_option_in_the_documents_exists(capsys):
     text = "\n".join(path.read_text() for path in (ROOT / "README.md", *GUIDES))
     helps = ""
-    for verb in ("info", "convert", "lod", "render", "evaluate", "video", "finetune", "demo", "bench"):
+    for verb in ("info", "convert", "lod", "render", "evaluate", "video", "compare", "finetune", "demo", "bench"):
         with pytest.raises(SystemExit):
             main([verb, "--help"])
         helps += capsys.readouterr().out
