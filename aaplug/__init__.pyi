@@ -29,6 +29,7 @@ from .verbs.convert import convert as convert
 from .verbs.demo import demo as demo
 from .verbs.evaluate import evaluate as evaluate
 from .verbs.finetune import finetune as finetune
+from .verbs.gather import gather as gather
 from .verbs.info import info as info
 from .verbs.lod import lod as lod
 from .verbs.render import render as render

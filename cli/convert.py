@@ -27,7 +27,7 @@ class Convert:
     def __call__(self) -> int:
         """Fuse, and say what was done."""
         opened = self.scene.open()
-        cameras = self.cameras.read(self.scene)
+        cameras = self.cameras.read(self.scene.path)
         own = {"drop_bad": self.scene.drop_bad, "spz_axes": self.scene.spz_axes} | vars(self.how)
         found = verb.convert(opened, cameras, self.output, monitor=TERMINAL, **own)
         scene, report = found.scene, found.report

@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from aaplug.core.digests import digest_of_files, digest_of_values
 from aaplug.core.errors import UsageError
 from aaplug.evaluation.results import Report, results, tables
 from aaplug.verbs.batch import batch
@@ -38,6 +39,8 @@ class Evaluate:
     output: Annotated[Path | None, flag("FOLDER", "-o")] = None
     """Folder for results.json, per_view.json and results.csv."""
     how: Annotated[EvaluateOptions, Flat] = field(default_factory=EvaluateOptions)
+    shard: Annotated[str | None, flag("3/8")] = None
+    """Evaluate every 8th of several scenes, from the 3rd on; when all shards are done, aaplug gather joins them."""
     json: bool = False
     """Print results.json on stdout instead of the table."""
 
@@ -45,6 +48,8 @@ class Evaluate:
         """Measure one scene or many."""
         if self.batch is not None or self.others.more:
             return self._many()
+        if self.shard is not None:
+            raise UsageError("shard", "is a part of several scenes; name them, or give `batch`")
         check_results(self.output, self.how)  # before the scene is read
         report = self._run()
         self._print(results(report), tables(report))
@@ -62,9 +67,17 @@ class Evaluate:
         if output is None:
             raise UsageError("output", "name a folder for the results of several scenes: -o FOLDER")
         runs = [(name, own._run) for name, own in scenes]
-        found = batch(runs, output, resume=self.how.resume, overwrite=self.how.overwrite, monitor=TERMINAL)
+        kept = {"resume": self.how.resume, "overwrite": self.how.overwrite}
+        found = batch(runs, output, **kept, shard=self.shard, request=self._request(), monitor=TERMINAL)
         self._print(found.summary(), found.tables())
         return FAILED if found.failures else 0
+
+    def _request(self) -> str:
+        """Hash of the scenes and of the options that change results; the folder of results may have other names."""
+        how = replace(self.how, resume=False, overwrite=False, threads=None, memory=None)
+        same = replace(self, how=how, output=None, shard=None, json=False, batch=None)
+        file = None if self.batch is None else digest_of_files([self.batch])
+        return digest_of_values((file, same))
 
     def _scenes(self) -> list[tuple[str, "Evaluate"]]:
         """The scenes that a batch file or the command line names, with their options."""

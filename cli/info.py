@@ -37,7 +37,7 @@ class Info:
             _show_limits(self.json)
             return 0
         opened = self.scene.open()
-        cameras = self.cameras.orbit if self.cameras.cameras is None else self.cameras.read(self.scene)
+        cameras = self.cameras.orbit if self.cameras.cameras is None else self.cameras.read(self.scene.path)
         facts = verb.info(opened, cameras, monitor=TERMINAL, **vars(self.how))
         if self.json:
             print_json(facts)

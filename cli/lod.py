@@ -25,7 +25,7 @@ class Lod:
     def __call__(self) -> int:
         """Merge, and say what was written."""
         opened = self.scene.open()
-        cameras = self.cameras.read(self.scene)
+        cameras = self.cameras.read(self.scene.path)
         own = {"drop_bad": self.scene.drop_bad, "spz_axes": self.scene.spz_axes} | vars(self.how)
         found = verb.lod(opened, cameras, self.output, monitor=TERMINAL, **own)
         levels = [{"rate": level.rate, "gaussians": len(level.scene)} for level in found]

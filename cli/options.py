@@ -45,15 +45,9 @@ Flat = tyro.conf.arg(name="")  # a group whose options stand among the verb's ow
 
 
 @dataclass(frozen=True)
-class SceneOptions(Options):
-    """The scene."""
+class FileOptions(Options):
+    """How scene files are read."""
 
-    scene: Annotated[Path | None, tyro.conf.Positional, flag("SCENE")] = None
-    """A scene (.ply, .compressed.ply, .spz, .sog, .splat, .ksplat) or its folder (INRIA model, SOG)."""
-    model_path: Annotated[Path | None, flag("FOLDER", "-m")] = None
-    """An INRIA model folder, instead of SCENE."""
-    iteration: Annotated[int | None, number(0, 10**9, whole=True), UNSET] = None
-    """Iteration of a model folder (default: the last)."""
     convention: Annotated[str | None, flag("|".join(CONVENTIONS))] = None
     """How the scene was trained or, for playcanvas and playcanvas-classic, converted, if its file does not say."""
     drop_bad: bool = False
@@ -63,20 +57,13 @@ class SceneOptions(Options):
     spz_axes: SpzAxes = "auto"
     """Axes of a .spz: opengl (its specification), opencv (splat-transform, gsply), or auto: as the cameras tell."""
 
-    @property
-    def path(self) -> Path:
-        """What the user named."""
-        if (self.scene is None) == (self.model_path is None):
-            raise UsageError("scene", "name one scene, before the options: a .ply, a model folder, or -m FOLDER")
-        return self.scene or cast(Path, self.model_path)
-
-    def open(self) -> SceneFile:
-        """Open the scene's file and say what it is."""
+    def opened(self, path: Path, iteration: int | None = None) -> SceneFile:
+        """Open a scene's file and say what it is."""
         if self.convention is not None and self.convention not in CONVENTIONS:
             raise UsageError("convention", not_one_of(self.convention, CONVENTIONS))
         opened = open_scene(
-            self.path,
-            iteration=self.iteration,
+            path,
+            iteration=iteration,
             convention=None if self.convention is None else CONVENTIONS[self.convention],
             allow_checkpoint=self.allow_checkpoint,
             spz_axes=self.spz_axes,
@@ -88,10 +75,33 @@ class SceneOptions(Options):
         for note in opened.notes:
             open_yet = opened.other is not None and note == opened.notes[-1]
             told = f"unless the cameras tell otherwise, {note}" if open_yet else note
-            say(worded(f"scene: {told}", SceneOptions.__dataclass_fields__))
+            say(worded(f"scene: {told}", FileOptions.__dataclass_fields__))
         for fusion in opened.fused:
             say(f"fused: {describe(fusion)}")
         return opened
+
+
+@dataclass(frozen=True)
+class SceneOptions(FileOptions):
+    """The scene."""
+
+    scene: Annotated[Path | None, tyro.conf.Positional, flag("SCENE")] = None
+    """A scene (.ply, .compressed.ply, .spz, .sog, .splat, .ksplat) or its folder (INRIA model, SOG)."""
+    model_path: Annotated[Path | None, flag("FOLDER", "-m")] = None
+    """An INRIA model folder, instead of SCENE."""
+    iteration: Annotated[int | None, number(0, 10**9, whole=True), UNSET] = None
+    """Iteration of a model folder (default: the last)."""
+
+    @property
+    def path(self) -> Path:
+        """What the user named."""
+        if (self.scene is None) == (self.model_path is None):
+            raise UsageError("scene", "name one scene, before the options: a .ply, a model folder, or -m FOLDER")
+        return self.scene or cast(Path, self.model_path)
+
+    def open(self) -> SceneFile:
+        """Open the scene's file and say what it is."""
+        return self.opened(self.path, self.iteration)
 
 
 @dataclass(frozen=True)
@@ -109,9 +119,12 @@ class CameraOptions(Options):
 
     orbit: Orbit = field(default_factory=Orbit)
 
-    def read(self, options: SceneOptions) -> CameraSet | Orbit:
-        """Read the cameras and say where sizes and split come from; without any, what stands in for them."""
-        path = self.cameras or folder_of_cameras(options.path)
+    def read(self, scene: Path) -> CameraSet | Orbit:
+        """Read the cameras and say where sizes and split come from; without any, what stands in for them.
+
+        scene: what the user named, whose model folder may hold cameras.
+        """
+        path = self.cameras or folder_of_cameras(scene)
         if path is None:
             return self.orbit
         for name, usual in vars(Orbit()).items():
@@ -145,7 +158,7 @@ def one_line(program: str) -> Iterator[None]:
 
 def read_inputs(scene: SceneOptions, cameras: CameraOptions) -> tuple[Held, CameraSet]:
     """Read a scene and its cameras, and say what they are."""
-    return inputs_of(scene.open(), cameras.read(scene), TERMINAL, scene.drop_bad)
+    return inputs_of(scene.open(), cameras.read(scene.path), TERMINAL, scene.drop_bad)
 
 
 def option_types(noun: type) -> dict[str, Any]:

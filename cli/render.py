@@ -24,7 +24,7 @@ class Render:
 
     def __call__(self) -> int:
         """Render, and say what was written."""
-        opened, cameras = self.scene.open(), self.cameras.read(self.scene)
+        opened, cameras = self.scene.open(), self.cameras.read(self.scene.path)
         own = {"drop_bad": self.scene.drop_bad} | vars(self.how)
         written = verb.render(opened, cameras, self.output, monitor=TERMINAL, **own)
         if self.json:

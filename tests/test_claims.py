@@ -19,6 +19,7 @@ OUTPUTS = {  # verb, words, what is claimed, what a rival writes there
     "levels": (f"lod {SCENE} -o levels --levels 1 --no-refine", "levels", "lod.json"),
     "finetune": (f"finetune {SCENE} -o t.ply --steps 1 --truth self --scale 0.5", "t.ply", ""),
     "evaluate": (f"evaluate {SCENE} -o out --recipe mip --scale 0.5", "out", "results.json"),
+    "compare": (f"compare scene.ply {SCENE} -o diff --scale 0.5 --metric psnr", "diff", "compare.json"),
     "batch": ("evaluate --cameras . -o many --recipe mip --scale 0.5 --batch scenes.toml", "many", "batch.json"),
 }
 

@@ -6,6 +6,8 @@ import re
 import runpy
 import shlex
 import shutil
+import subprocess
+import sys
 import tomllib
 from dataclasses import replace
 from itertools import chain
@@ -72,6 +74,7 @@ BLOCKS = [
     for block in blocks_of(path)
 ]
 COMMANDS = [block for block in BLOCKS if block.language == "bash"]
+SCRIPTS = [block for block in BLOCKS if block.language == "sh"]  # of a cluster's scheduler
 PROGRAMS = [block for block in BLOCKS if block.language == "python"]
 TABLES = [block for block in BLOCKS if block.language == "toml"]
 
@@ -158,7 +161,7 @@ def test_there_are_blocks_of_every_kind():
     assert len(COMMANDS) > 15
     assert PROGRAMS
     assert TABLES
-    assert {block.language for block in BLOCKS} <= {"bash", "python", "toml", "json"}
+    assert {block.language for block in BLOCKS} <= {"bash", "python", "toml", "json", "sh"}
     assert set(ELSEWHERE) <= {line for block in COMMANDS for line in lines_of(block)}
 
 
@@ -181,6 +184,15 @@ def test_documented_commands_run(block, here, capsys):
             assert output not in before, f"{line} names an input as its output"
         else:
             assert printed.out, f"{line} printed nothing"
+
+
+@pytest.mark.parametrize("block", SCRIPTS, ids=str)
+def test_documented_scripts_run(block, here):
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    job = os.environ | {"PATH": path, "SLURM_ARRAY_TASK_ID": "1"}
+    done = subprocess.run(["sh", "-e"], input=block.text, text=True, env=job, capture_output=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert (here / "results" / "shard-1-of-8.json").is_file()
 
 
 def lines_of(block: Block) -> list[str]:
@@ -215,7 +227,19 @@ def test_links_between_documents_lead_somewhere():
 def test_every_option_in_the_documents_exists(capsys):
     text = "\n".join(path.read_text() for path in (ROOT / "README.md", *GUIDES))
     helps = ""
-    for verb in ("info", "convert", "lod", "render", "evaluate", "video", "finetune", "demo", "bench"):
+    for verb in (
+        "info",
+        "convert",
+        "lod",
+        "render",
+        "evaluate",
+        "video",
+        "gather",
+        "compare",
+        "finetune",
+        "demo",
+        "bench",
+    ):
         with pytest.raises(SystemExit):
             main([verb, "--help"])
         helps += capsys.readouterr().out

@@ -9,6 +9,7 @@ import os
 import shutil
 import sys
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
@@ -88,6 +89,23 @@ class Processes:
                 ) from error
             finally:
                 pool.shutdown(cancel_futures=True)
+
+
+@dataclass(frozen=True)
+class ProcessesIfLong:
+    """Processes, if the first item says that more than `pays_after` seconds of work are left; else this one."""
+
+    workers: int
+    pays_after: float
+
+    def map(self, work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+        """Yield `work(item)` of every item, in order; errors as those of `Processes`."""
+        first, *others = items
+        started = time.perf_counter()
+        yield work(first)
+        left = (time.perf_counter() - started) * len(others)
+        workers = min(self.workers, len(others)) if left > self.pays_after else 1
+        yield from (map if workers < 2 else Processes(workers).map)(work, others)
 
 
 @contextmanager

@@ -6,10 +6,10 @@ before they are compared.  Views stream: only the numbers of finished views are 
 """
 
 import math
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -37,7 +37,10 @@ from aaplug.rendering.renderer import Background, Renderer
 
 NO_PHOTOGRAPH = "no photograph is this large: metrics above the photographs' own size are undefined"
 
+CORNER = 64  # px
+
 Values = Mapping[str, float | None]
+Apply = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 
 
 @dataclass(frozen=True)
@@ -102,6 +105,7 @@ def evaluate(
     journal: str | PathLike[str] | None = None,
     resume: bool = False,
     images: ImageStore | None = None,
+    apply: Apply = map,
 ) -> Report:
     """Measure every candidate at every scale on every view.
 
@@ -109,6 +113,7 @@ def evaluate(
     tell: called with (views done, views in all).
     journal: file that keeps what is finished; resume: do not measure the views again that it holds.
     images: where to store images.
+    apply: calls a function with every item, like `map`; an executor's does so in several processes.
 
     Raises:
         UsageError: nothing to measure, a view lacks the photograph it needs, or the journal is of another request.
@@ -118,18 +123,15 @@ def evaluate(
     request = _request(task) | dict(facts or {})
     written = None if journal is None else Journal(Path(journal), request, resume)
     known = {} if written is None else written.known
-    bench, measurements = _Bench(task, images), list[Measurement]()
+    found, left = dict(known), [index for index in range(len(task.views)) if index not in known]
     with written or nullcontext():
-        for index, view in enumerate(task.views):
-            tell(index, len(task.views))
-            measured = known.get(index)
-            if measured is None:
-                measured = tuple(bench.measure(index, view))
-                if written is not None:
-                    written.add(index, measured)
-            measurements += measured
-        tell(len(task.views), len(task.views))
-    order = task.names
+        tell(len(found), len(task.views))
+        for index, measured in apply(_Measuring(task, images), left) if left else ():
+            found[index] = measured
+            if written is not None:
+                written.add(index, measured)
+            tell(len(found), len(task.views))
+    order, measurements = task.names, [m for index in sorted(found) for m in found[index]]
     measurements.sort(key=lambda m: (order.index(m.recipe), task.scales.index(m.scale)))
     return Report(tuple(measurements), request, task.measured)
 
@@ -161,7 +163,8 @@ def _check(task: Task) -> None:
         raise UsageError("evaluate", "a recipe or a scale is named twice")
     if task.truth.source == "photographs" and task.truth.protocol.change != "size":
         raise UsageError("truth", f"protocol {task.truth.protocol.name} moves the camera: no photograph shows that")
-    source_of(task.views, task.truth.source)
+    if task.truth.source == "photographs":
+        source_of(task.views, task.truth.source)
 
 
 def _request(task: Task) -> dict[str, Any]:
@@ -181,6 +184,33 @@ def _request(task: Task) -> dict[str, Any]:
         "recipes_sha256": {c.name: c.renderer.recipe.digest for c in task.candidates},
         "rasterizer": task.candidates[0].renderer.rasterizer.name,
     }
+
+
+@dataclass(frozen=True)
+class _Measuring:
+    """Measures the view of an index."""
+
+    task: Task
+    images: ImageStore | None
+
+    def __call__(self, index: int) -> tuple[int, tuple[Measurement, ...]]:
+        return index, tuple(self._bench.measure(index, self.task.views[index]))
+
+    @cached_property
+    def _bench(self) -> "_Bench":
+        return _Bench(self.task, self.images)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For another process: without the scenes' files, which may be open."""
+        bare: dict[int, Gaussians] = {}
+
+        def portable(renderer: Renderer) -> Renderer:
+            scene = bare.setdefault(id(renderer.scene), replace(renderer.scene, origin=None))  # what is shared stays so
+            return replace(renderer, scene=scene)
+
+        candidates = [Candidate(c.name, portable(c.renderer)) for c in self.task.candidates]
+        truth = replace(self.task.truth, own=portable(self.task.truth.own))
+        return {"task": replace(self.task, candidates=candidates, truth=truth), "images": self.images}
 
 
 class _Bench:
@@ -211,7 +241,9 @@ class _Bench:
         """The rows' images at a scale; candidates that draw alike, as several do at the training size, draw once."""
         camera = truth.camera(scale)
         drawings: dict[Hashable, Drawn] = {}
-        if self.task.ceiling and self.sized:
+        if truth.truth.source == "reference":
+            drawings[_work(truth.truth.own, camera)] = truth.drawn(scale)
+        elif self.task.ceiling and self.sized:
             yield CEILING, truth.look.resampled_to(truth.resized_look(scale))
             if scale == 1:
                 drawings[_work(truth.truth.own, camera)] = truth.look
@@ -223,8 +255,14 @@ class _Bench:
 
     def _series(self, truth: ViewTruth, name: str, scale: float, drawn: Drawn, full: Drawn | None) -> Series:
         camera, timed = truth.camera(scale), self.timed[name]
-        frames = (lambda: (timed.motion(camera), truth.motion(scale))) if self.sized else None
-        return Series(scale, drawn, full, partial(self.task.truth.protocol.resized, camera=camera, scale=scale), frames)
+        still = truth.truth.source == "reference" and drawn is truth.drawn(scale)  # it moves as the truth does
+
+        def frames() -> tuple[list[Image], list[Image]]:
+            expected = truth.motion(scale)
+            return (expected if still else timed.motion(camera, first=drawn)), expected
+
+        smaller = partial(self.task.truth.protocol.resized, camera=camera, scale=scale)
+        return Series(scale, drawn, full, smaller, frames if self.sized else None)
 
 
 def _work(renderer: Renderer, camera: Camera) -> Hashable:
@@ -260,6 +298,8 @@ class _Comparison:
         for known, values in self._known:
             if image.equal(known):
                 return values
-        values = {metric.name: metric.compare(image, self.truth) for metric in metrics}
+        assert self.truth is not None
+        part = slice(CORNER if image.equal(self.truth) else None)  # of equal images, a corner says as much
+        values = {m.name: m.compare(image[part, part], self.truth[part, part]) for m in metrics}
         self._known.append((image, values))
         return values

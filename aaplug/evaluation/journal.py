@@ -15,7 +15,7 @@ from typing import Any, BinaryIO
 
 from aaplug.core.errors import FormatError, OutputError, UsageError, listing, reason
 from aaplug.core.locks import lock
-from aaplug.evaluation.results import Measurement
+from aaplug.evaluation.results import CEILING, Measurement, Report
 
 
 class Journal:
@@ -87,6 +87,27 @@ class Journal:
         self._stream.write(json.dumps(line, allow_nan=False).encode() + b"\n")
         self._stream.flush()
         os.fsync(self._stream.fileno())
+
+
+def read_report(path: Path) -> Report:
+    """The report of a finished evaluation, from its journal, with the numbers that it was written with.
+
+    Raises:
+        FormatError: there is no journal, it is damaged, or views are missing.
+    """
+    try:
+        with path.open("rb") as stream:
+            request, *lines = [json.loads(line) for line in stream if line.endswith(b"\n")]
+        request = request["request"]
+        known = {int(line["view"]): tuple(map(_measurement, line["measurements"])) for line in lines}
+        rows, scales, views = [CEILING, *request["recipes"]], request["scales"], request["views"]
+        found = [m for view in range(views) for m in known[view]]
+        found.sort(key=lambda m: (rows.index(m.recipe), scales.index(m.scale)))
+    except OSError as error:
+        raise FormatError(path, f"cannot be read: {reason(error)}") from error
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise FormatError(path, "is damaged or of an unfinished evaluation; continue that with --resume") from error
+    return Report(tuple(found), request)
 
 
 def _measurement(line: Any) -> Measurement:

@@ -69,11 +69,14 @@ class TimedRenderer:
         samples, background = self.renderer.samples(camera), self.renderer.background
         return Drawn(rgb.float(), alpha.float(), background, samples, seconds, evaluations)
 
-    def motion(self, camera: Camera, scale: float = 1.0) -> list[Float[Tensor, "h w 3"]]:
-        """Frames, clamped to [0, 1], whose content moves by 1/4 px of the image that is `scale` times as large."""
-        steps = [step / scale / SHIFT_STEPS for step in range(SHIFT_STEPS)]
+    def motion(self, camera: Camera, scale: float = 1.0, first: Drawn | None = None) -> list[Float[Tensor, "h w 3"]]:
+        """Frames, clamped to [0, 1], whose content moves by 1/4 px of the image that is `scale` times as large.
+
+        first: the render of `camera` itself, if there is one.
+        """
+        steps = [step / scale / SHIFT_STEPS for step in range(1, SHIFT_STEPS)]
         views = (replace(camera, cx=camera.cx + step, cy=camera.cy + step) for step in steps)
-        return [self(view).rgb.clamp(0, 1) for view in views]
+        return [drawn.rgb.clamp(0, 1) for drawn in (first or self(camera), *map(self, views))]
 
 
 @dataclass(frozen=True)
@@ -83,8 +86,8 @@ class Series:
     drawn: at that scale.
     full: by the same candidate at the training size; None if scale 1 is not measured or a scale moves the camera.
     smaller: averages a training-size image down to that scale.
-    frames: draws the candidate's frames of a small motion, and those of the scene's own look, averaged down; None if a
-        scale moves the camera.
+    frames: draws the candidate's frames of a small motion, and those of the truth: of the scene's own look, averaged
+        down, or of the reference; None if a scale moves the camera.
     """
 
     scale: float
@@ -142,7 +145,7 @@ class Metric:
 
 def number(value: float | None, digits: int) -> str:
     """A value as tables show it."""
-    return "–" if value is None else f"{value:.{digits}f}"
+    return "–" if value is None else "∞" if value == math.inf else f"{value:.{digits}f}"
 
 
 def _finite(value: float | None) -> float | None:

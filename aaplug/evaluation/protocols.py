@@ -24,7 +24,7 @@ from aaplug.core.rules import NEAR
 SsimFlavour = Literal["wang", "3dgs"]
 LpipsFlavour = Literal["3dgs", "vgg", "alex"]
 Change = Literal["size", "distance", "fov"]
-TruthSource = Literal["photographs", "self"]
+TruthSource = Literal["photographs", "self", "reference"]
 
 ZOOM_OUT = (1.0, 0.5, 0.25, 0.125)
 ZOOM_IN = (1.0, 2.0, 4.0, 8.0)

@@ -2,7 +2,8 @@
 
 import csv
 import io
-from collections.abc import Callable, Iterable, Mapping
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from statistics import quantiles, stdev
@@ -13,11 +14,14 @@ from rich.table import Table
 
 from aaplug.core.registry import named
 from aaplug.evaluation.metric import Metric, number
-from aaplug.evaluation.metrics import METRICS, PSNR, SSIM
+from aaplug.evaluation.metrics import EQUAL, METRICS, PSNR, SSIM
 
 CEILING = "training size, resampled"  # a row of every table: the own training-size look
 TIME_DIGITS, COUNT_DIGITS = 3, 2  # decimals of seconds, and of million evaluations
 MILLION = 1e6
+
+
+Facts = tuple[str, list[str], list[list[str]]]  # a table of text: title, headings, rows
 
 
 @dataclass(frozen=True)
@@ -67,6 +71,11 @@ class Report:
     def recipes(self) -> tuple[str, ...]:
         """Recipes in the order of measurement."""
         return tuple(dict.fromkeys(m.recipe for m in self.measurements))
+
+    @property
+    def rows(self) -> str:
+        """What a row of its tables is."""
+        return self.protocol.get("rows", "recipe")
 
     @property
     def scales(self) -> tuple[float, ...]:
@@ -136,13 +145,13 @@ def tables(report: Report) -> list[Table]:
 
 def rows(report: Report, metric: Metric) -> list[list[Cell]]:
     """A metric's table of means, recipes down and scales across."""
-    means = {r: [mean(report.select(r, s), metric.name) for s in report.scales] for r in report.recipes}
+    means = {r: [_shown(metric, report.select(r, s)) for s in report.scales] for r in report.recipes}
     judged = [line for recipe, line in means.items() if recipe != CEILING]
     columns = ([v for line in judged if (v := line[place]) is not None] for place in range(len(report.scales)))
     best = [min(column, key=metric.loss, default=None) for column in columns]
     return [
         [
-            _metric_cell(metric, report.select(recipe, scale), v is not None and v == top and recipe != CEILING)
+            _metric_cell(metric, report.select(recipe, scale), v, v is not None and v == top and recipe != CEILING)
             for scale, v, top in zip(report.scales, line, best, strict=True)
         ]
         for recipe, line in means.items()
@@ -159,12 +168,18 @@ def work(report: Report) -> list[tuple[str, list[list[Cell]]]]:
     ]
 
 
-def _metric_cell(metric: Metric, views: Iterable[Measurement], best: bool) -> Cell:
+def _shown(metric: Metric, views: Sequence[Measurement]) -> float | None:
+    """The mean, or infinity where every image equals its truth."""
+    found = mean(views, metric.name)
+    equal = bool(views) and metric.undefined == EQUAL and all(EQUAL in m.note for m in views)
+    return math.inf if found is None and equal else found
+
+
+def _metric_cell(metric: Metric, views: Iterable[Measurement], average: float | None, best: bool) -> Cell:
     known = {m.view: value for m in views if (value := m.values.get(metric.name)) is not None}
-    text = metric.text(_mean(known.values()))
     worst = max(known, key=lambda view: metric.loss(known[view]), default="")
     named = (metric.text(known[worst]), worst) if len(set(known.values())) > 1 else None
-    return Cell(text, best, _deviation(known.values(), metric.digits), named)
+    return Cell(metric.text(average), best, _deviation(known.values(), metric.digits), named)
 
 
 def _time_cell(views: Iterable[Measurement]) -> Cell:
@@ -214,7 +229,8 @@ def as_csv(reports: Mapping[str, Report]) -> str:
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     fixed = ("samples", "evaluations", "seconds", "note")
-    table.writerow(["scene", "protocol", "recipe", "scale", "view", *metrics, *fixed])
+    rows = next((report.rows for report in reports.values()), "recipe")
+    table.writerow(["scene", "protocol", rows, "scale", "view", *metrics, *fixed])
     for scene, report in reports.items():
         name = report.protocol.get("protocol", {}).get("name", "")
         for m in report.measurements:
@@ -242,7 +258,7 @@ def _mean(values: Iterable[float | None]) -> float | None:
 def grid(title: str, report: Report, lines: list[list[str]], ceiling: str | None = None) -> Table:
     """A table of one line per recipe; ceiling: style of that row."""
     grid = Table(title=escape(title), title_justify="left")
-    grid.add_column("recipe", no_wrap=True)
+    grid.add_column(report.rows, no_wrap=True)
     for scale in report.scales:
         grid.add_column(scale_name(scale), justify="right", no_wrap=True)
     for recipe, cells in zip(report.recipes, lines, strict=True):

@@ -4,6 +4,8 @@ Its source image is the photograph, or the scene's own render at the training si
 truth is the source downsampled.  Above it, ground truth is the estimate of `enlarge`, if one is given; else the scene's
 own render at that size, or, with photographs, undefined.  Where a protocol moves the camera or changes its focal
 length, ground truth is the scene's own render of that view, supersampled where it is coarser than training.
+
+Where scenes are compared, ground truth is one of them, the reference, as its own recipe draws it at each scale.
 """
 
 import math
@@ -80,7 +82,7 @@ def source_of(views: Sequence[Camera], asked: str = "auto") -> TruthSource:
 class Truth:
     """The images to compare with.
 
-    own: renders the scene by training's rule; see `own_look`.
+    own: renders the scene by training's rule (see `own_look`), or the reference by its recipe.
     enlarge: estimates ground truth above the source's size.  None: the scene's own render at that size; with
         photographs, undefined.
     memory: bytes of float16 images to cache between calls; None caches none.
@@ -136,6 +138,7 @@ class ViewTruth:
     def __init__(self, truth: Truth, view: Camera):
         self.truth, self.view = truth, view
         self._motions: dict[float, list[Tensor]] = {}
+        self._drawn: dict[float, Drawn] = {}
 
     def camera(self, scale: float) -> Camera:
         """The view at a scale."""
@@ -146,6 +149,12 @@ class ViewTruth:
         """The scene's own render at the training size."""
         return self.truth.timed(self.view)
 
+    def drawn(self, scale: float) -> Drawn:
+        """The reference at a scale."""
+        if scale not in self._drawn:
+            self._drawn[scale] = self.truth.timed(self.camera(scale))
+        return self._drawn[scale]
+
     def resized_look(self, scale: float) -> Image:
         """The training-size render resampled to this scale: downsampled below 1, bicubic above."""
         return self.truth.protocol.resized(self.look.rgb.clamp(0, 1), self.camera(scale), scale)
@@ -153,7 +162,7 @@ class ViewTruth:
     def compared(self, scale: float) -> Image | None:
         """What renders are compared with, None if undefined; the scene's own renders are rounded to 8 bits."""
         image = self.image(scale)
-        rounds = self.truth.source == "self" or self.truth.memory is not None
+        rounds = self.truth.source != "photographs" or self.truth.memory is not None
         return quantised(image) if image is not None and rounds else image
 
     def image(self, scale: float) -> Image | None:
@@ -161,14 +170,22 @@ class ViewTruth:
         return self.truth.cached(self.view, scale, lambda: self._made(scale))
 
     def motion(self, scale: float) -> list[Image]:
-        """Frames of a small motion: training-size renders shifted by steps of 1/4 px of this scale, then resampled."""
+        """Frames that move by 1/4 px of this scale: of the reference, or of training-size renders, then resampled."""
         if scale not in self._motions:
-            camera, frames = self.camera(scale), self.truth.timed.motion(self.view, scale)
-            self._motions[scale] = [self.truth.protocol.resized(frame, camera, scale) for frame in frames]
+            self._motions[scale] = self._moving(scale)
         return self._motions[scale]
+
+    def _moving(self, scale: float) -> list[Image]:
+        camera, timed = self.camera(scale), self.truth.timed
+        if self.truth.source == "reference":
+            return timed.motion(camera, first=self.drawn(scale))
+        frames = timed.motion(self.view, scale, self.look)
+        return [self.truth.protocol.resized(frame, camera, scale) for frame in frames]
 
     def _made(self, scale: float) -> Image | None:
         truth, camera = self.truth, self.camera(scale)
+        if truth.source == "reference":
+            return self.drawn(scale).rgb
         if truth.protocol.change != "size":
             samples = max(1, math.ceil(1 / scale))  # as dense as training's pixels
             return self._shown(camera, replace(truth.own.recipe, grid=samples))

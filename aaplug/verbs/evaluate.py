@@ -52,7 +52,7 @@ DEFAULT_RECIPES = ("classic", "mip", "matched", "auto")
 FLAVOURS = {"ssim": get_args(SsimFlavour), "lpips": get_args(LpipsFlavour)}
 JOURNAL = "progress.jsonl"
 USER_NAMES = [recipe.name for recipe in USER_RECIPES]
-PACKAGES = ("aaplug", "torch", "numpy", "scikit-image", "opencv-contrib-python-headless")
+PACKAGES = ("aaplug", "torch", "numpy", "opencv-contrib-python-headless")
 
 Layout = Literal["plain", "inria"]
 
@@ -116,7 +116,7 @@ def evaluate(
     finest = whole_of(scene)
     recipes = _recipes(o, finest, monitor)
     seen, scales = select_views(cameras, o.views), o.scale or rules.scales
-    shown = _shown(o.show, seen) if o.report else ()
+    shown = shown_views(o.show, seen) if o.report else ()
     source = _source(o.truth, rules, seen, monitor)
     facts = _facts(scene.scene if isinstance(scene, Pyramid) else scene, cameras, seen, source, o)
     images = folder and ImageStore(folder, shown, everything=o.layout == "inria")
@@ -127,7 +127,7 @@ def evaluate(
         candidates = candidates_of(scene, look.training, recipes, look.rasterizer, look.background)
         task = Task(candidates, scales, seen, Truth(look, source, rules), metrics)
         drawn = [view.scaled(scale) if rules.change == "size" else view for view in seen for scale in scales]
-        announce([candidate.renderer for candidate in candidates], drawn, monitor, seconds=_seconds(task, drawn))
+        announce([candidate.renderer for candidate in candidates], drawn, monitor, seconds=seconds_of(task, drawn))
         with monitor.progress(f"evaluating {name}", "views") as tell:
             found = measure(task, facts, tell, folder and folder / JOURNAL, o.resume, images)
         if folder and images:
@@ -141,11 +141,26 @@ def evaluate(
     return found
 
 
-def _seconds(task: Task, drawn: Sequence[Camera]) -> float:
+def seconds_of(task: Task, drawn: Sequence[Camera]) -> float:
     """An estimate: every candidate's images, the truths, which are as fine as training, and their comparison."""
     truths = [*task.views] * (1 if task.truth.protocol.change == "size" else len(task.scales))
     rendering = cost_of([c.renderer for c in task.candidates], drawn), cost_of([task.truth.own], truths)
     return sum(cost.seconds for cost in rendering) + comparing(drawn, len(task.names))
+
+
+def environment() -> dict[str, Any]:
+    """What results depend on besides inputs and options."""
+    versions = {name: version(name) for name in PACKAGES} | {"python": platform.python_version()}
+    return {"versions": versions, "platform": f"{platform.system()} {platform.machine()}"}
+
+
+def facts_of_cameras(cameras: CameraSet, views: Sequence[Camera]) -> dict[str, Any]:
+    """What cameras and views were read."""
+    return {
+        "notes": list(cameras.notes),
+        "sha256": digest_of_cameras(views),
+        "training_sha256": digest_of_cameras(cameras.train),
+    }
 
 
 def check_results(folder: Path | None, o: EvaluateOptions) -> None:
@@ -200,7 +215,7 @@ def _recipe(recipe: str | Recipe, o: EvaluateOptions) -> Recipe:
     return recipe_of(recipe, o if recipe in USER_NAMES else replace(o, rate_reference=None))
 
 
-def _shown(text: str, views: Sequence[Camera]) -> tuple[int, ...]:
+def shown_views(text: str, views: Sequence[Camera]) -> tuple[int, ...]:
     """Places of the views in the report's viewer: that many, evenly spread, or those named."""
     if text.isdecimal():
         count = min(int(text), len(views))
@@ -227,8 +242,7 @@ def _facts(
     photos = [view.photo for view in views if view.photo] if truth == "photographs" else []
     origin = scene.origin
     return {
-        "versions": {name: version(name) for name in PACKAGES} | {"python": platform.python_version()},
-        "platform": f"{platform.system()} {platform.machine()}",
+        **environment(),
         "scene": {
             "file": origin and Path(origin.path).name,
             "sha256": digest_of_files([origin.path]) if origin and Path(origin.path).is_file() else None,
@@ -237,11 +251,7 @@ def _facts(
             "convention": scene.convention.name,
             "evidence": origin and origin.evidence,
         },
-        "cameras": {
-            "notes": list(cameras.notes),
-            "sha256": digest_of_cameras(views),
-            "training_sha256": digest_of_cameras(cameras.train),
-        },
+        "cameras": facts_of_cameras(cameras, views),
         "photographs": {"count": len(photos), "sha256": digest_of_files(photos) if photos else None},
         "options": {
             "quality": o.quality,

@@ -44,16 +44,16 @@ def choices(names: Iterable[str]) -> Any:
     )
 
 
-def number(least: int | float, most: int | float, *, whole: bool = False, several: bool = False) -> Any:
+def number(least: int | float, most: int | float, *, whole: bool = False, several: bool = False, unit: str = "") -> Any:
     """An option that takes a number from `least` to `most`, an integer if `whole`, or one or more if `several`.
 
-    `--help` shows the range, and `Options` refuses what is outside of it.
+    `--help` shows the range, and `Options` refuses what is outside of it.  unit: may follow the number as a word's end.
     """
     kind, shown = int if whole else float, f"{least:.10g}..{most:.10g}" + " ..." * several
 
     def read(words: list[str]) -> Any:
         try:
-            values = tuple(map(kind, words))
+            values = tuple(kind(word.removesuffix(unit)) for word in words)
         except ValueError as error:
             raise ValueError(f"takes {shown}, got {' '.join(words)[:SHOWN]}") from error
         return values if several else values[0]

@@ -21,6 +21,9 @@ INK = (40, 40, 40)
 LIGHT_INK = (245, 245, 245)
 FRAME, FRAME_INK = 2, (128, 128, 128)  # px: edge of an inset
 LEAST_INSET = 64  # px
+ERROR_FULL = 32  # levels of 255 at the end of the error scale, as on the report's page
+HEAT = ((0, 0, 4), (86, 16, 110), (187, 55, 84), (249, 140, 10), (252, 255, 164))  # colours of the error scale
+BYTE = 255
 
 
 def contact_sheet(
@@ -41,6 +44,13 @@ def contact_sheet(
             shown = image[:, :room]
             sheet[top : top + CELL, left : left + shown.shape[1]] = shown
     return torch.from_numpy(sheet).float() / 255
+
+
+def error_map(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
+    """The worst channel's difference at each pixel as a colour, from black to yellow at `ERROR_FULL` levels."""
+    error = (levels(image, 8) - levels(truth, 8)).abs().amax(dim=2).cpu().numpy()
+    stops, shades = np.linspace(0, ERROR_FULL, len(HEAT)), np.array(HEAT) / BYTE
+    return torch.from_numpy(np.stack([np.interp(error, stops, shade) for shade in shades.T], axis=2)).float()
 
 
 def labelled(image: Float[Tensor, "h w 3"], label: str) -> Float[Tensor, "h w 3"]:

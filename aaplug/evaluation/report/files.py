@@ -1,13 +1,13 @@
 """The files of an evaluation: results.json, per_view.json, results.csv, report.html and its plots."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
 from aaplug.evaluation.image_store import ImageStore
-from aaplug.evaluation.results import Report, as_csv, per_view, results
+from aaplug.evaluation.results import Facts, Report, as_csv, per_view, results
 from aaplug.inspection.coverage import Coverage
 from aaplug.io.atomic import make_folder, replacing
 
@@ -36,15 +36,24 @@ def write_results(report: Report, folder: str | PathLike[str], overwrite: bool, 
 
 
 def write_page(
-    folder: str | PathLike[str], name: str, report: Report, found: Coverage, images: ImageStore, overwrite: bool
+    folder: str | PathLike[str],
+    name: str,
+    report: Report,
+    found: Coverage,
+    images: ImageStore,
+    overwrite: bool,
+    facts: Sequence[Facts] = (),
 ) -> list[Path]:
-    """Write report.html, and its plots as PNG and SVG into plots/; return both paths."""
+    """Write report.html, and its plots as PNG and SVG into plots/; return both paths.
+
+    facts: further tables of text, as title, headings and rows.
+    """
     # matplotlib takes most of a second to import
     from aaplug.evaluation.report.plots import plots
     from aaplug.evaluation.report.webpage import page
 
     drawn = plots(report, found)
-    written = write_texts(folder, {PAGE: page(name, report, found, drawn, images)}, overwrite)
+    written = write_texts(folder, {PAGE: page(name, report, found, drawn, images, facts)}, overwrite)
     beside = make_folder(Path(folder) / PLOTS)
     for plot in drawn:
         for suffix, data in ((".png", plot.png()), (".svg", plot.svg().encode())):

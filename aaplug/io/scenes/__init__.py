@@ -191,6 +191,17 @@ def check_scene_output(
     return writer
 
 
+def bytes_of(path: str | PathLike[str]) -> int | None:
+    """Size of a scene's file; of levels of detail or SOG images, of their folder's files.  None if it is gone."""
+    path = Path(path)
+    folder = path.parent if path.name == SOG_FOLDER else path
+    files = [file for file in folder.iterdir() if file.is_file()] if folder.is_dir() else [path]
+    try:
+        return sum(file.stat().st_size for file in files)
+    except OSError:
+        return None
+
+
 def find_scene(path: str | PathLike[str], iteration: int | None = None) -> Path:
     """The scene file that a path means.
 

@@ -7,7 +7,7 @@ content security policy allows only what the page holds, and names its one scrip
 import base64
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from itertools import product
 from pathlib import Path
@@ -19,7 +19,7 @@ from markupsafe import Markup
 from aaplug.evaluation.image_store import TRUTHS, ImageStore
 from aaplug.evaluation.metric import Metric
 from aaplug.evaluation.report.plots import BOUNDS, Plot
-from aaplug.evaluation.results import CEILING, Report, as_csv, mean, rows, scale_name, work
+from aaplug.evaluation.results import CEILING, Facts, Report, as_csv, mean, rows, scale_name, work
 from aaplug.inspection.coverage import Coverage
 from aaplug.io.images import encode_webp, image_size, read_image
 
@@ -31,13 +31,16 @@ SOURCES = ("page.html.j2", "page.css", "pictures.js", "page.js")  # the scripts 
 BUDGET = 12_000_000  # bytes of lossless images; a larger page opens slowly and gets lossy ones
 LOSSY = 90  # WebP quality above the budget
 TRUTH = "truth"  # the role of the true image, beside the recipes
+AGAINST = {"photographs": "photographs", "self": "the scene's own supersampled look", "reference": "the first scene"}
 HIDDEN = ("metrics", "view_names")  # parts of the protocol that the page shows elsewhere
 
 Key = tuple[int, float, str]  # view, scale, and a recipe or TRUTH
 
 
-def page(name: str, report: Report, found: Coverage, drawn: list[Plot], images: ImageStore) -> str:
-    """The page's text; raises FormatError where an image that it shows is missing."""
+def page(
+    name: str, report: Report, found: Coverage, drawn: list[Plot], images: ImageStore, facts: Sequence[Facts] = ()
+) -> str:
+    """The page's text; raises FormatError where an image that it shows is missing.  facts: further tables."""
     template, style, *scripts = (files(__name__).joinpath(source).read_text(encoding="utf-8") for source in SOURCES)
     script = "".join(scripts)
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
@@ -49,6 +52,8 @@ def page(name: str, report: Report, found: Coverage, drawn: list[Plot], images: 
         ceiling=CEILING,
         headline=_headline(report),
         tables=_tables(report),
+        fact_tables=facts,
+        against=AGAINST[report.protocol["truth"]],
         notes=report.notes,
         coverage=found,
         scale_name=scale_name,

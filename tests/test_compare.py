@@ -1,0 +1,323 @@
+"""Scenes held to the first of them: what is equal, what differs, what is refused, and what is written."""
+
+import csv
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+import aaplug
+from aaplug.core.errors import AaplugError, FrameError, UsageError
+from aaplug.core.gaussians import MIP
+from aaplug.evaluation.engine import _Measuring
+from aaplug.evaluation.journal import Journal
+from aaplug.evaluation.report.contact_sheet import ERROR_FULL, HEAT, error_map
+from aaplug.inspection.alignment import mismatch
+from aaplug.inspection.differences import differences
+from aaplug.io.cameras import read_cameras
+from aaplug.io.images import image_size
+from aaplug.io.scenes import bytes_of, read_scene, write_scene
+from aaplug.io.scenes.packed import half_turn_about_x
+from tests.conftest import make_scene
+from tests.test_cli import EYES, cli, dataset  # noqa: F401  (fixtures)
+
+WORDS = "--cameras . --rasterizer eager --views train --scale 0.5 1 2"
+TURNS = {
+    "turned by 180 degrees about x": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
+    "turned by -90 degrees about z": [[0, 1, 0], [-1, 0, 0], [0, 0, 1]],
+    "mirrored along y": [[1, 0, 0], [0, -1, 0], [0, 0, 1]],
+    "turned by 120 degrees about (0.58, 0.58, 0.58)": [[0, 0, 1], [1, 0, 0], [0, 1, 0]],
+}
+
+
+@pytest.fixture(scope="module")
+def lopsided():
+    """A scene that no turn carries onto itself."""
+    scene = make_scene(2000, seed=3)
+    ball = torch.nn.functional.normalize(scene.means, dim=1)
+    return replace(scene, means=ball * torch.tensor([1.0, 1.6, 0.6]) + ball.square() * torch.tensor([0.4, 0.3, 0.2]))
+
+
+def carried(scene, turn, scale=1.0, shift=(0.0, 0.0, 0.0)):
+    means = scale * scene.means @ torch.tensor(turn, dtype=torch.float32).T + torch.tensor(shift)
+    return replace(scene, means=means)
+
+
+def shuffled(scene, seed=0):
+    return scene[torch.randperm(len(scene), generator=torch.Generator().manual_seed(seed))]
+
+
+# what is compared
+
+
+def test_a_scene_equals_itself_at_every_scale(cli):  # noqa: F811
+    code, out, _ = cli(f"compare scene.ply scene.ply {WORDS} --json --fail-under 200dB")
+    found = json.loads(out)
+    assert (code, found["guard"]["value"]) == (0, None)
+    first, again = (found["scenes"][name] for name in ("scene.ply", "scene.ply_again"))
+    assert again["differences"]["positions"] == {"rms": 0, "median": 0, "largest": 0}
+    for scale in ("0.5", "1", "2"):
+        figures = again["scales"][scale]
+        assert figures["PSNR"] is None
+        assert figures["equal_views"] == len(EYES["train"])
+        assert figures["SSIM"]["mean"] == pytest.approx(1.0)
+        assert list(figures["per_view"]) == ["r_0", "r_1", "r_2"]
+    assert again["scales"]["0.5"]["flicker"]["mean"] == 1.0
+    assert first["scales"]["1"]["PSNR"] is None
+    _, out, _ = cli(f"compare scene.ply scene.ply {WORDS}")
+    assert out.count("∞") == 6
+
+
+def test_what_a_change_costs_is_measured_and_guarded(cli):  # noqa: F811
+    scene = read_scene("scene.ply")
+    write_scene("dim.ply", replace(scene, logit_opacities=scene.logit_opacities - 0.3))
+    write_scene("grey.splat", scene)
+    code, out, err = cli(f"compare scene.ply dim.ply grey.splat {WORDS} --json --fail-under 60dB")
+    found = json.loads(out)
+    lowest = found["guard"]
+    means = {
+        (name, float(scale)): figures["PSNR"]["mean"]
+        for name in ("dim.ply", "grey.splat")
+        for scale, figures in found["scenes"][name]["scales"].items()
+    }
+    assert (lowest["scene"], lowest["scale"]) == min(means, key=lambda key: means[key])
+    assert lowest["value"] == min(means.values()) < 60
+    assert code == 1
+    assert f"{lowest['scene']} at {lowest['scale']:g}: mean PSNR {lowest['value']:.2f} dB is below 60 dB" in err
+    figures = found["scenes"]["dim.ply"]["scales"]["1"]["PSNR"]
+    values = [view["PSNR"] for view in found["scenes"]["dim.ply"]["scales"]["1"]["per_view"].values()]
+    assert figures["worst"]["value"] == min(values)
+    assert figures["mean"] == pytest.approx(sum(values) / 3)
+    assert figures["median"] == sorted(values)[1]
+    assert found["scenes"]["dim.ply"]["differences"]["opacities"]["largest"] > 0.05
+    assert found["scenes"]["dim.ply"]["differences"]["SH 0"]["rms"] == 0
+    assert found["scenes"]["grey.splat"]["bytes"] == Path("grey.splat").stat().st_size
+    assert cli(f"compare scene.ply dim.ply grey.splat {WORDS} --fail-under {min(means.values()) - 0.01}")[0] == 0
+
+
+def test_the_truth_is_the_reference_at_that_size(cli):  # noqa: F811
+    scene, cameras = read_scene("scene.ply"), read_cameras(".")
+    dim = replace(scene, logit_opacities=scene.logit_opacities - 0.3)
+    found = aaplug.compare({"a": scene, "b": dim}, cameras, scale=(0.5,), metric="psnr", rasterizer="eager")
+    a, b = (
+        aaplug.Renderer.of(s, cameras, rasterizer="eager")(cameras.test[0].scaled(0.5)).rgb.clamp(0, 1).mul(255).round()
+        for s in (scene, dim)
+    )
+    expected = -10 * math.log10(float(((a - b) / 255).double().square().mean()))
+    assert found.lowest == (pytest.approx(expected, abs=1e-4), "b", 0.5)
+
+
+def test_a_viewer_draws_all_and_the_truth_stays(cli):  # noqa: F811
+    words = f"compare scene.ply scene.ply {WORDS} --metric psnr --json"
+    shown = json.loads(cli(f"{words} --for classic")[1])["scenes"]["scene.ply"]
+    first, second = json.loads(cli(f"{words} --for mip")[1])["scenes"].values()
+    assert shown["scales"]["1"]["PSNR"] is None  # as training did
+    assert shown["scales"]["0.5"]["PSNR"]["mean"] < 60
+    assert first["scales"]["1"]["PSNR"]["mean"] == second["scales"]["1"]["PSNR"]["mean"] < 60
+    code, _, err = cli(f"{words} --for mip --recipe classic")
+    assert (code, "--for" in err or "--viewer" in err) == (2, True)
+
+
+def test_another_reference_and_levels_of_detail(cli):  # noqa: F811
+    assert cli("lod scene.ply --cameras . -o levels --levels 1 --no-refine --rasterizer eager")[0] == 0
+    code, out, _ = cli(f"compare levels scene.ply --reference scene.ply {WORDS} --metric psnr --json")
+    found = json.loads(out)
+    assert (code, found["reference"]) == (0, "scene.ply")
+    assert list(found["scenes"]) == ["scene.ply", "levels"]
+    assert found["scenes"]["levels"]["format"] == "levels"
+    assert found["scenes"]["levels"]["bytes"] == sum(file.stat().st_size for file in Path("levels").iterdir())
+
+
+def test_bare_files_are_seen_from_an_orbit(cli):  # noqa: F811
+    for name in ("transforms_train.json", "transforms_test.json"):
+        Path(name).unlink()
+    words = "--rasterizer eager --orbit 2 --train-view 48x32 --scale 0.5 --metric psnr --json"
+    code, out, err = cli(f"compare scene.ply scene.ply {words}")
+    assert (code, json.loads(out)["protocol"]["views"]) == (0, 2)
+    assert "training rate: assumed" in err
+
+
+# Gaussians
+
+
+def test_differences_are_found_in_any_order(lopsided):
+    moved = replace(lopsided, means=lopsided.means + torch.tensor([1e-4, 0.0, 0.0]), sh=lopsided.sh * 1.0)
+    moved.sh[:, 1:4] += 0.01
+    for other in (moved, shuffled(moved)):
+        found = differences(lopsided, other)
+        assert found.sorted == (other is not moved)
+        assert found.paired == 1
+        assert found.positions.median == pytest.approx(1e-4, rel=1e-2)
+        assert found.scales.largest == found.opacities.largest == found.harmonics[0].largest == 0
+        assert found.harmonics[1].rms == pytest.approx(0.01, rel=1e-3)
+    plain = replace(lopsided, sh=lopsided.sh[:, :1])
+    lost = differences(lopsided, plain).harmonics[1]
+    assert lost.largest == pytest.approx(float(lopsided.sh[:, 1:4].abs().max()))
+    assert differences(lopsided, lopsided[:-1]) is None
+
+
+@pytest.mark.parametrize("words", TURNS)
+@pytest.mark.parametrize("order", ["rows", "sorted", "pruned"])
+def test_a_turn_is_named(lopsided, words, order):
+    other = carried(lopsided, TURNS[words])
+    other = {"rows": other, "sorted": shuffled(other), "pruned": shuffled(other)[:1500]}[order]
+    assert mismatch(lopsided, other) == words
+
+
+def test_a_scale_a_shift_and_any_turn_are_named(lopsided):
+    identity, cos, sin = torch.eye(3).tolist(), math.cos(0.5), math.sin(0.5)
+    assert mismatch(lopsided, shuffled(carried(lopsided, identity, 2.0))) == "scaled by 2"
+    assert mismatch(lopsided, shuffled(carried(lopsided, identity, 1.0, (0, 3, 0)))) == "moved by (0, 3, 0)"
+    odd = [[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]]
+    both = "turned by 28.6 degrees about y, scaled by 1.5"
+    assert mismatch(lopsided, carried(lopsided, odd, 1.5)) == both
+    assert mismatch(lopsided, shuffled(carried(lopsided, odd, 1.5))).startswith(both)
+
+
+def test_scenes_in_one_frame_are_not_taken_for_turned(lopsided):
+    noise = torch.randn(len(lopsided), 3, generator=torch.Generator().manual_seed(1))
+    rough = replace(lopsided, means=lopsided.means + 0.02 * noise)
+    for other in (lopsided, shuffled(lopsided), lopsided[:50], rough, shuffled(rough), lopsided[:0]):
+        assert mismatch(lopsided, other) is None
+    line = replace(lopsided[:50], means=torch.linspace(-1, 1, 50)[:, None] * torch.ones(3) + 900)
+    assert mismatch(lopsided, line).startswith("elsewhere: half of its Gaussians lie 1")
+
+
+# what is refused
+
+
+def test_other_frames_are_refused_by_name(cli):  # noqa: F811
+    write_scene("turned.ply", half_turn_about_x(read_scene("scene.ply")))
+    code, out, err = cli(f"compare scene.ply turned.ply {WORDS}")
+    named = "turned.ply: is scene.ply turned by 180 degrees about x"
+    assert (code, out) == (2, "")
+    assert f"{named}; bring both into one frame, or pass --any-frame" in err.splitlines()[-1]
+    code, out, err = cli(f"compare scene.ply turned.ply {WORDS} --any-frame --metric psnr --json")
+    assert json.loads(out)["scenes"]["turned.ply"]["frame"] == "turned by 180 degrees about x"
+    assert f"warning: {named}" in err
+
+
+@pytest.mark.parametrize("axes", ["opengl", "opencv"])
+def test_a_spz_is_read_in_the_frame_of_the_other(cli, axes):  # noqa: F811
+    pytest.importorskip("gsply")
+    scene = read_scene("scene.ply")
+    write_scene("c.spz", scene, spz_axes=axes)
+    for words in ("scene.ply c.spz", "c.spz scene.ply"):
+        code, _, err = cli(f"compare {words} {WORDS} --metric psnr")
+        assert (code, "as fits scene.ply" in err) == (0, True)
+
+
+def test_harmonics_that_are_gone_are_said(cli):  # noqa: F811
+    write_scene("grey.splat", read_scene("scene.ply"))
+    degree = read_scene("scene.ply").sh_degree
+    _, _, err = cli(f"compare scene.ply grey.splat {WORDS} --metric psnr")
+    assert f"grey.splat: has SH degree 0, scene.ply {degree}: what one lacks counts as a difference from 0" in err
+
+
+REFUSED = {
+    "compare scene.ply": "compare: needs two scenes or more, got 1",
+    "compare": "compare: needs two scenes or more, got 0",
+    "compare scene.ply nothing.ply": "nothing.ply: cannot be read: no such file",
+    "compare scene.ply broken.ply": "broken.ply: ",
+    "compare scene.ply other.ply other.ply": "other.ply: is named twice",
+    "compare scene.ply other.ply --for nothing": "'nothing' is not one of",
+    "compare scene.ply other.ply --metric nothing": "'nothing' is not one of",
+    "compare scene.ply other.ply --fail-under 40db": "--fail-under: takes 0..200",
+    "compare scene.ply other.ply --fail-under 900dB": "--fail-under: takes 0..200",
+    "compare scene.ply other.ply --resume": "--resume: needs a folder",
+    "compare scene.ply other.ply --views nothing": "there is no view 'nothing'",
+}
+
+
+@pytest.mark.parametrize("words", REFUSED)
+def test_bad_input_is_one_line(cli, words):  # noqa: F811
+    write_scene("other.ply", read_scene("scene.ply"))
+    Path("broken.ply").write_bytes(Path("scene.ply").read_bytes()[:-100])
+    code, out, err = cli(f"{words} --cameras . --rasterizer eager --scale 0.5")
+    assert (code, out) == (2, "")
+    assert err.splitlines()[-1].startswith("error: ")
+    assert REFUSED[words] in err.splitlines()[-1]
+
+
+def test_the_library_refuses_the_same():
+    scene = make_scene(20)
+    with pytest.raises(UsageError, match="needs two scenes or more, got 1"):
+        aaplug.compare([scene])
+    with pytest.raises(FrameError, match="turned by 180 degrees about x"):
+        aaplug.compare({"a": scene, "b": half_turn_about_x(scene)})
+    with pytest.raises(AaplugError, match="fail_under: is no option here"):
+        aaplug.compare([scene, scene], fail_under=40)
+
+
+# what is written
+
+
+def test_files_and_a_continued_run(cli, monkeypatch):  # noqa: F811
+    write_scene(
+        "dim.ply", replace(read_scene("scene.ply"), logit_opacities=read_scene("scene.ply").logit_opacities - 1)
+    )
+    words = f"compare scene.ply dim.ply {WORDS} -o out --show 1"
+    real, added = Journal.add, []
+
+    def stopping(self, view, measurements):
+        if len(added) == 2:
+            raise KeyboardInterrupt
+        added.append(view)
+        real(self, view, measurements)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Journal, "add", stopping)
+        assert cli(words)[0] == 130
+    assert "resume" in cli(words)[2]
+    assert cli(f"{words} --resume")[0] == 0
+    data = json.loads(Path("out/compare.json").read_text())
+    assert json.loads(cli(f"{words} --overwrite --json")[1])["guard"] == data["guard"]
+    with Path("out/compare.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert len(rows) == 2 * 3 * 3  # scenes, scales, views
+    assert {row["compared scene"] for row in rows} == {"scene.ply", "dim.ply"}
+    page = Path("out/report.html").read_text()
+    assert "against the first scene" in page
+    assert "differences of the Gaussians" in page
+    assert "compared scene" in page
+    width, height = image_size(Path("out/contact-sheet.png"))
+    assert width > height > 3 * 320
+
+
+def test_an_error_map_runs_from_black_to_the_end_of_the_scale():
+    truth = torch.zeros(1, 3, 3)
+    image = truth.clone()
+    image[0, 1, 2], image[0, 2, 0] = ERROR_FULL / 255, 1.0
+    shown = error_map(image, truth)[0] * 255
+    for pixel, colour in zip(shown, (HEAT[0], HEAT[-1], HEAT[-1]), strict=True):
+        torch.testing.assert_close(pixel, torch.tensor(colour, dtype=torch.float32))
+
+
+def test_views_measured_in_processes_are_the_same(cli, monkeypatch):  # noqa: F811
+    scene, cameras = read_scene("scene.ply"), read_cameras(".")
+    given = {"a": scene, "b": replace(scene, convention=MIP)}
+    how = {"scale": (0.5,), "rasterizer": "eager", "threads": 2, "views": "train", "metric": "psnr"}
+    expected = aaplug.compare(given, cameras, **how).report
+    monkeypatch.setattr("aaplug.verbs.compare.PAYS_AFTER", 0.0)
+    found = aaplug.compare(given, cameras, **how).report
+    assert [m.values for m in found.measurements] == [m.values for m in expected.measurements]
+
+
+def test_what_goes_to_another_process_leaves_files_behind(cli, monkeypatch):  # noqa: F811
+    seen = []
+    monkeypatch.setattr(_Measuring, "__call__", lambda self, index: (seen.append(self.__getstate__()["task"]), 0 / 0))
+    with pytest.raises(ZeroDivisionError):
+        aaplug.compare(["scene.ply", "scene.ply"], ".", rasterizer="eager")
+    (task,) = seen
+    assert all(candidate.renderer.scene.origin is None for candidate in task.candidates)
+    assert task.truth.own.scene is task.candidates[0].renderer.scene
+
+
+def test_bytes_of_a_folder_of_images_are_those_of_all(tmp_path):
+    for name, size in (("meta.json", 3), ("means.webp", 5)):
+        (tmp_path / name).write_bytes(b"x" * size)
+    assert bytes_of(tmp_path / "meta.json") == bytes_of(tmp_path) == 8
+    assert bytes_of(tmp_path / "gone.ply") is None
