@@ -23,7 +23,7 @@ DESCRIPTION = """Test-time anti-aliasing for pretrained 3D Gaussian Splatting sc
 UNWRITABLE = (errno.EPIPE, errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EIO)  # what writing our output meets
 FILE = re.compile(r".*/.*|.*\.[A-Za-z]\w*", re.DOTALL)  # a word that names a file, unlike names and numbers
 OPTION = re.compile(r"-(?![\d.])")  # how a word that is no negative number begins
-VERBS = ("info", "convert", "lod", "render", "evaluate", "video", "finetune", "demo", "warmup", "bench")
+VERBS = ("info", "convert", "lod", "render", "evaluate", "video", "finetune", "demo", "view", "warmup", "bench")
 
 
 def main(words: Sequence[str] | None = None) -> None:
