@@ -36,7 +36,7 @@ def _words(options: Any) -> list[str]:
     found: list[str] = []
     for each in fields(options):
         value = getattr(options, each.name)
-        if value in (None, False) or value == each.default or each.name == "orbit" and not isinstance(value, int):
+        if value in (None, False) or value == each.default or (each.name == "orbit" and not isinstance(value, int)):
             continue
         flag = [] if each.name == "scene" else [f"--{each.name.replace('_', '-')}"]
         values = value if isinstance(value, list | tuple) else [] if value is True else [value]

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from markupsafe import escape
 
+from aaplug import pages
 from aaplug.core.cameras import CameraSet
 from aaplug.core.training import TrainingViews
-from aaplug import pages
 from aaplug.evaluation.report.plots import plots
 from aaplug.inspection.coverage import coverage
 from aaplug.io.images import image_size, write_png

@@ -13,8 +13,8 @@ from typing import Any
 import torch
 
 from aaplug.core.errors import SHOWN, UsageError, not_one_of
-from aaplug.methods.recipes import QUALITIES
 from aaplug.live.paints import PAINTS
+from aaplug.methods.recipes import QUALITIES
 
 MOST_BYTES = 16_384  # of a message
 MOST_SIDE = 8192  # px of a picture
@@ -109,7 +109,7 @@ def _see(body: Mapping[str, Any], recipes: Sequence[str], cameras: int) -> See:
         focal=_number(body, "focal", 1e-3, FARTHEST),
         width=width,
         height=height,
-        split=_number(body, "split", 0, 1),
+        split=_number(body, "split", 0.0, 1.0),
         sides=(left, right),
         at=None if body.get("at") is None else _whole(body, "at", 0, cameras - 1),
         moving=body.get("moving") is True,
@@ -146,7 +146,7 @@ def _number(body: Mapping[str, Any], name: str, least: float, most: float) -> fl
 
 
 def _whole(body: Mapping[str, Any], name: str, least: int, most: int) -> int:
-    value = _number(body, name, least, most)
+    value = _number(body, name, float(least), float(most))
     if value != math.floor(value):
         raise UsageError(name, f"takes a whole number, got {_short(body[name])}")
     return int(value)

@@ -108,10 +108,12 @@ def _cost(renderer: Renderer, camera: Camera, samples: int) -> Map:
 
 PAINTS = {
     "rate": Paint(
-        "sampling rate / training's", "blue: finer than training saw it; red: coarser", _rate, 1 / 8, 8, True, 1
+        "sampling rate / training's", "blue: finer than training saw it; red: coarser", _rate, 1 / 8, 8.0, True, 1.0
     ),
-    "views": Paint("training cameras that saw it", "mean over what a pixel shows", _views, 0, None),
-    "samples": Paint("samples per pixel", "the same for all pixels of a picture", _samples, 1, 64, True),
-    "cost": Paint("splat evaluations per pixel", "at most: a pixel that is opaque stops earlier", _cost, 1, None, True),
-    "alpha": Paint("alpha", "share of the background that is hidden", _alpha, 0, 1),
+    "views": Paint("training cameras that saw it", "mean over what a pixel shows", _views, 0.0, None),
+    "samples": Paint("samples per pixel", "the same for all pixels of a picture", _samples, 1.0, 64.0, True),
+    "cost": Paint(
+        "splat evaluations per pixel", "at most: a pixel that is opaque stops earlier", _cost, 1.0, None, True
+    ),
+    "alpha": Paint("alpha", "share of the background that is hidden", _alpha, 0.0, 1.0),
 }

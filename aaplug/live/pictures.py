@@ -207,7 +207,7 @@ class Pictures:
         box = max(0, left), max(0, top), min(camera.width, left + width), min(camera.height, top + height)
         seen = photo[box[1] - top : box[3] - top, box[0] - left : box[2] - left]
         values = [psnr(quantised(image[box[1] : box[3], box[0] : box[2]]), seen) for image in images]
-        part = Part("photo", (box[0], box[2]), encode_jpeg(seen, RESTING_QUALITY))
+        part = Part("photo", (box[0], box[2]), _still_file(seen))
         whole = (width, height) == (box[2] - box[0], box[3] - box[1])
         return part, {"psnr": values, "rows": [box[1], box[3]], "whole": whole}
 
@@ -230,9 +230,11 @@ def _about(samples: list[int], stage: str, started: float) -> dict[str, Any]:
 
 
 def _resting(of: str, span: Span, image: Float[Tensor, "h w 3"]) -> Part:
-    part = image[:, slice(*span)]
-    small = image.shape[0] * image.shape[1] <= LOSSLESS
-    return Part(of, span, encode_png(part) if small else encode_jpeg(part, RESTING_QUALITY))
+    return Part(of, span, _still_file(image[:, slice(*span)]))
+
+
+def _still_file(rgb: Float[Tensor, "h w 3"]) -> bytes:
+    return encode_png(rgb) if rgb.shape[0] * rgb.shape[1] <= LOSSLESS else encode_jpeg(rgb, RESTING_QUALITY)
 
 
 def _visible(see: See, width: int) -> dict[int, Span]:

@@ -14,6 +14,7 @@ import threading
 from functools import partial
 from http import HTTPStatus
 from ipaddress import ip_address
+from os import strerror
 from urllib.parse import parse_qs, urlsplit
 
 from websockets.asyncio.server import Server as Listener
@@ -66,7 +67,7 @@ class Server:
         self._started.wait()
         if self._trouble is not None:
             self._thread.join()
-            raise UsageError("port", f"{self._port} of {self._host} cannot be used: {reason(self._trouble)}")
+            raise UsageError("port", f"{self._port} of {self._host} cannot be used: {_why(self._trouble)}")
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -143,6 +144,11 @@ async def _send_all(connection: ServerConnection, waiting: "asyncio.Queue[bytes]
             await connection.send(await waiting.get())
     except ConnectionClosed:
         pass
+
+
+def _why(error: OSError) -> str:
+    """The system's own words; asyncio's name the address once more."""
+    return (strerror(error.errno) if error.errno and error.errno > 0 else reason(error)).lower()
 
 
 def _is_local(host: str) -> bool:

@@ -6,8 +6,8 @@ from typing import Any
 
 import torch
 
-from aaplug.core.cameras import Camera, CameraSet, spread
 from aaplug.core.camera_paths import up_of
+from aaplug.core.cameras import Camera, CameraSet, spread
 from aaplug.core.errors import AaplugError
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.orbits import pinhole

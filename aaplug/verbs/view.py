@@ -4,7 +4,7 @@ import threading
 import webbrowser
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.resources import as_file, files
 from importlib.util import find_spec
 from pathlib import Path
@@ -12,8 +12,9 @@ from typing import Annotated, Any
 
 from aaplug.core.errors import UsageError
 from aaplug.core.monitor import SILENT, Monitor
+from aaplug.io.scenes.scene_file import SceneFile
 from aaplug.verbs.assumed import say_assumed
-from aaplug.verbs.inputs import AnyPath, CamerasLike, SceneLike, inputs_of, processor, unchecked_look_of, whole_of
+from aaplug.verbs.inputs import CamerasLike, SceneLike, inputs_of, processor, unchecked_look_of, whole_of
 from aaplug.verbs.options import RECIPE_NAMES, ViewOptions, flag, number
 
 FRAMES = 100  # that are drawn at least; not so many that kernels are compiled first
@@ -34,7 +35,7 @@ class LiveOptions(ViewOptions):
 
 @contextmanager
 def serving(
-    scene: SceneLike | None = None,
+    scene: SceneLike | SceneFile | None = None,
     cameras: CamerasLike = None,
     *,
     words: Sequence[str] = (),
@@ -67,7 +68,7 @@ def serving(
 
 @LiveOptions.shown
 def view(
-    scene: SceneLike | None = None,
+    scene: SceneLike | SceneFile | None = None,
     cameras: CamerasLike = None,
     *,
     words: Sequence[str] = (),
@@ -98,7 +99,7 @@ def view(
 
 
 @contextmanager
-def _sample_or(scene: SceneLike | None) -> Iterator[tuple[SceneLike, Path | None]]:
+def _sample_or(scene: SceneLike | SceneFile | None) -> Iterator[tuple[SceneLike | SceneFile, Path | None]]:
     """The scene, or without one the bundled sample and its cameras."""
     if scene is not None:
         yield scene, None

@@ -156,8 +156,9 @@ const PRESSED = {
 EIGHTHS.forEach((scale, i) => { PRESSED[i + 1] = () => change({scale}); });
 
 window.addEventListener("keydown", (event) => {
-  if (event.ctrlKey || event.metaKey || event.altKey || !about || event.target.matches("select, input:not([type=checkbox])")) return;
-  const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
+  const key = event.key.length === 1 ? event.key.toLowerCase() : event.key, {target} = event;
+  if (event.ctrlKey || event.metaKey || event.altKey || !about || target.matches("select, input[inputmode]")) return;
+  if (key.length > 1 && target.matches("input[type=range], input[type=radio]")) return; // arrows are theirs
   const changes = {...(state.lens ? lensMoves(event, state) : {}), ...shortcuts(state)};
   if (key in changes) change(changes[key]);
   else if (key in HELD) change(HELD[key]());

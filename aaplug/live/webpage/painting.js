@@ -5,7 +5,7 @@ const GROWING = [[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253
 const LEVELS = 254; // from low to high; 0 says that there is no value
 const OVER = 190; // of 255: how far what is painted hides the picture
 const REACH = 18; // CSS px around a camera in which it is picked
-const CAMERA_SIZE = 0.06; // of the distance to the scene
+const CAMERA_SIZE = 0.04; // of the distance to the scene
 
 function ramp(stops, share) {
   const at = share * (stops.length - 1), i = Math.min(stops.length - 2, Math.floor(at));
@@ -19,7 +19,7 @@ function valueAt(legend, share) {
   return log ? low * (high / low) ** share : low + (high - low) * share;
 }
 
-const shown3 = (value) => value >= 100 ? value.toFixed(0) : value >= 10 ? value.toFixed(1) : value.toFixed(2);
+const shown3 = (value) => value >= 100 ? value.toFixed(0) : String(+value.toPrecision(3));
 
 function paintSheet(bitmap, legend) { // a sheet of colours, and the levels beneath
   const [sheet, ink] = sheetOf(bitmap.width, bitmap.height);
@@ -67,7 +67,7 @@ function drawCameras(canvas, found, hovered) {
     const [eye, ...corners] = points.map(([x, y]) => [x * canvas.width, y * canvas.height]);
     ink.beginPath();
     corners.forEach((corner, i) => { ink.moveTo(...eye); ink.lineTo(...corner); ink.lineTo(...corners[(i + 1) % 4]); });
-    for (const [colour, width] of [["rgb(15 18 22 / .5)", 3], [index === hovered ? "#ffb02e" : "#fff", index === hovered ? 2 : 1]]) {
+    for (const [colour, width] of [["rgb(15 18 22 / .35)", 2.5], [index === hovered ? "#ffb02e" : "#fff", index === hovered ? 2 : 1]]) {
       ink.strokeStyle = colour; ink.lineWidth = width * density; ink.stroke();
     }
     if (index !== hovered) continue;
