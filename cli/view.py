@@ -24,7 +24,7 @@ class View:
             scene, cameras = self.scene.open(), self.cameras.read(self.scene)
         words = [*_words(self.scene), *_words(self.cameras), *_words(self.cameras.orbit)]
         try:
-            own = {"drop_bad": self.scene.drop_bad} | vars(self.how)
+            own: dict[str, Any] = {"drop_bad": self.scene.drop_bad} | vars(self.how)
             verb.view(scene, cameras, words=words, monitor=TERMINAL, **own)
         except KeyboardInterrupt:  # the usual end
             say("closed")

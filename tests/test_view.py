@@ -93,6 +93,17 @@ def shown(messages) -> tuple[dict, list[torch.Tensor]]:
 # ----------------------------------------------------------------------------------------------------------- drawing
 
 
+def finished(steps):
+    """What a generator returns, and how often it yielded."""
+    taken = 0
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            return end.value, taken
+        taken += 1
+
+
 @pytest.mark.parametrize(("recipe", "scale"), [("classic", 1.0), ("auto", 0.5), ("auto", 0.125)])
 def test_strips_are_the_picture(seen, recipe, scale, monkeypatch):
     monkeypatch.setattr("aaplug.rendering.strips.SAMPLES", 1000)
@@ -102,13 +113,9 @@ def test_strips_are_the_picture(seen, recipe, scale, monkeypatch):
     middle = camera.width // 3
     for columns in (None, (0, middle), (middle, camera.width)):
         steps = strips(renderer, camera, renderer.samples(camera), columns)
-        taken = 0
-        with pytest.raises(StopIteration) as end:
-            while True:
-                next(steps)
-                taken += 1
-        for drawn, expected in zip(end.value.value, whole, strict=True):
-            torch.testing.assert_close(drawn, expected[:, slice(*(columns or (None,)))], atol=2e-5, rtol=0)
+        drawn, taken = finished(steps)
+        for found, expected in zip(drawn, whole, strict=True):
+            torch.testing.assert_close(found, expected[:, slice(*(columns or (None,)))], atol=2e-5, rtol=0)
         assert taken > 1 or scale < 0.5
 
 
@@ -302,7 +309,8 @@ REFUSED = {
     "no id": ({"id": None}, "id: takes a number"),
 }
 GARBAGE = [
-    b"\x00" * 9, "", "{", "[" * 9000, "null", "[1]", "{}", '{"see": 3}', '{"see": [], "shown": 1}', '{"open": "/etc/passwd"}',
+    b"\x00" * 9, "", "{", "[" * 9000, "null", "[1]", "{}",
+    '{"see": 3}', '{"see": [], "shown": 1}', '{"open": "/etc/passwd"}',
     '{"still": {"width": 9, "height": 9, "side": 3}}', '{"shown": "x"}', '{"shown": 1e999}',
 ]  # fmt: skip
 

@@ -25,7 +25,7 @@ class Page:
     """
 
     pictures: Pictures
-    send: Callable[[bytes], None]
+    send: Callable[[bytes], object]
     see: See | None = None
     newer: bool = False
     steps: Steps | None = None
@@ -75,7 +75,7 @@ class Studio:
             self._changed.notify()
         self._thread.join()
 
-    def enter(self, send: Callable[[bytes], None]) -> Page:
+    def enter(self, send: Callable[[bytes], object]) -> Page:
         """Begin to draw for a page."""
         page = Page(Pictures(self.subject), send)
         with self._changed:
