@@ -23,11 +23,12 @@ class View:
         if self.scene.scene is not None or self.scene.model_path is not None:
             scene, cameras = self.scene.open(), self.cameras.read(self.scene)
         words = [*_words(self.scene), *_words(self.cameras), *_words(self.cameras.orbit)]
-        try:
-            own: dict[str, Any] = {"drop_bad": self.scene.drop_bad} | vars(self.how)
-            verb.view(scene, cameras, words=words, monitor=TERMINAL, **own)
-        except KeyboardInterrupt:  # the usual end
-            say("closed")
+        own: dict[str, Any] = {"drop_bad": self.scene.drop_bad, "words": words} | vars(self.how)
+        with verb.serving(scene, cameras, monitor=TERMINAL, **own) as address:
+            try:
+                verb.attend(address, TERMINAL, self.how.no_browser)
+            except KeyboardInterrupt:  # the usual end
+                say("closed")
         return 0
 
 

@@ -42,11 +42,7 @@ ELSEWHERE = {  # commands of the tests and benches themselves, and what runs the
     "python -m tests.hostile all 10000": "test_hostile_files.py runs it with fewer mutations",
     "pip install 'aaplug[view]'": "the gate installs it from constraints.txt",
     **dict.fromkeys(
-        (
-            "aaplug view",
-            "aaplug view scene.ply",
-            "aaplug view scene.ply --cameras path/to/colmap --port 8123",
-        ),
+        ("aaplug view", "aaplug view scene.ply", "aaplug view scene.ply --cameras path/to/colmap --port 8123"),
         "test_view.py: it ends when it is interrupted",
     ),
     "python -m tests.guided -max_total_time=60": ".ci/run, twice for half as long",

@@ -5,6 +5,7 @@ import math
 import socket
 import struct
 import threading
+import webbrowser
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -16,6 +17,7 @@ import torch
 from aaplug.core.cameras import CameraSet
 from aaplug.core.errors import UsageError
 from aaplug.core.imaging import quantised
+from aaplug.core.monitor import SILENT
 from aaplug.evaluation.metrics import psnr
 from aaplug.io.images import write_png
 from aaplug.live import pictures
@@ -26,7 +28,7 @@ from aaplug.live.studio import Studio
 from aaplug.live.subject import Subject
 from aaplug.rendering.renderer import Renderer
 from aaplug.rendering.strips import strips
-from aaplug.verbs.view import serving, view
+from aaplug.verbs.view import attend, serving, view
 from tests.conftest import make_camera, make_scene
 from tests.test_cli import cli, dataset  # noqa: F401  (fixtures)
 
@@ -464,10 +466,23 @@ def test_the_command_says_where_and_ends_quietly(cli, monkeypatch):  # noqa: F81
     assert err.splitlines()[-1] == "closed"
 
 
-def test_without_a_scene_the_sample_opens():
-    told = []
-    view(port=0, no_browser=True, rasterizer="eager", until=lambda: told.append(True))
-    assert told == [True]
+def test_without_a_scene_the_sample_opens(monkeypatch):
+    opened = []
+    monkeypatch.setattr("aaplug.verbs.view.attend", lambda address, *_: opened.append(address))
+    view(port=0, rasterizer="eager")
+    assert opened[0].startswith("http://127.0.0.1:")
+
+
+def test_a_browser_in_the_terminal_is_not_opened(monkeypatch):
+    opened = []
+    windowed = type("Windowed", (), {"open": lambda self, address: opened.append(address)})()
+    event = type("Event", (), {"wait": lambda self: None})
+    monkeypatch.setattr("aaplug.verbs.view.threading", type("Threading", (), {"Event": event}))
+    for browser in (webbrowser.GenericBrowser("lynx"), windowed):
+        monkeypatch.setattr(webbrowser, "get", lambda chosen=browser: chosen)
+        attend("http://there/", SILENT, no_browser=False)
+    attend("http://there/", SILENT, no_browser=True)
+    assert opened == ["http://there/"]
 
 
 def test_without_the_extra_it_says_how_to_get_it(monkeypatch, seen):

@@ -1,6 +1,7 @@
 """The live page, driven as a person would in a real browser."""
 
 import json
+from base64 import b64decode
 from contextlib import ExitStack
 from dataclasses import replace
 from urllib.parse import unquote, urlsplit
@@ -30,7 +31,7 @@ def seen(tmp_path_factory):
     scene, folder = make_scene(200), tmp_path_factory.mktemp("photos")
     eyes = [(0.0, -4.0, 0.0), (2.0, -4.0, 1.0), (-2.0, -4.0, 1.0)]
     views = [make_camera(eye, name=f"<i>{i}") for i, eye in enumerate(eyes)]
-    views = [view.scaled(4).as_trained() for view in views]
+    views = [view.scaled(4.0).as_trained() for view in views]
     write_png(folder / "0.png", Renderer.of(scene, views, "classic", rasterizer="eager")(views[0]).rgb * 0.9)
     views[0] = replace(views[0], photo=folder / "0.png")
     return scene, CameraSet(tuple(views), tuple(views))
@@ -49,17 +50,19 @@ def opened(browser, address):  # noqa: F811
     with ExitStack() as contexts:
 
         def open_page(width=900, height=500, scheme="light", where=address, **other):
-            context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=scheme, **other)
+            how = {"color_scheme": scheme, "bypass_csp": True} | other  # playwright's waiting evaluates strings
+            context = browser.new_context(viewport={"width": width, "height": height}, **how)
             contexts.callback(context.close)
             page = context.new_page()
             page.on("console", lambda message: troubles.append(message.text))
             page.on("pageerror", lambda error: troubles.append(str(error)))
             page.goto(where)
-            at_rest(page)
+            page.wait_for_selector(f"{SEEN}[data-stage=done]", timeout=20_000)
             return page
 
         yield open_page
-    assert [text for text in troubles if "ERR_CONNECTION_REFUSED" not in text] == []
+    known = ("ERR_CONNECTION_REFUSED", "Canvas2D: Multiple readback")  # a lost server, and this file's own reading
+    assert [text for text in troubles if not any(words in text for words in known)] == []
 
 
 def at_rest(page, **parts: str):
@@ -76,20 +79,15 @@ def data(page, name: str) -> str:
 def state(page) -> dict:
     """What the address holds."""
     page.wait_for_function("location.hash.length > 10")
-    page.wait_for_timeout(350)
+    page.wait_for_timeout(250)
     return json.loads(unquote(urlsplit(page.url).fragment))
 
 
 def image(page, selector=SEEN) -> torch.Tensor:
     """The pixels of a canvas themselves."""
-    taken = page.evaluate(
-        "(s) => { const c = document.querySelector(s); const d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data;"
-        " return [c.width, c.height, Array.from(d)]; }",
-        selector,
-    )
-    width, height, values = taken
-    pixels = np.array(values, np.float32).reshape(height, width, 4)[..., :3] / 255
-    return torch.from_numpy(pixels)
+    url = page.evaluate("(s) => document.querySelector(s).toDataURL()", selector)
+    pixels = cv2.imdecode(np.frombuffer(b64decode(url.partition(",")[2]), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+    return torch.from_numpy(pixels.astype(np.float32) / 255)
 
 
 def drag(page, start, end, button="left"):
@@ -106,20 +104,27 @@ def test_a_streamed_picture_is_the_library_s_own(opened, seen):
     drag(page, (0.2, 0.5), (0.4, 0.6))
     page.keyboard.press("2")  # 1/4
     page.keyboard.press("f")
-    at_rest(page, at="", split="0.000")
+    at_rest(page, at="", split="1.000")
     width, height = map(int, data(page, "size").split("x"))
     found = state(page)
     scene, cameras = seen
     pose = torch.tensor(found["pose"], dtype=torch.float64).view(4, 4)
     camera = pinhole("seen", (width, height), found["scale"] * cameras.train[0].focal, pose)
-    for key, recipe, quality in (("0", "auto", "best"), ("1", "classic", "best")):
-        expected = Renderer.of(scene, cameras, recipe, quality=quality, rasterizer="eager")(camera).rgb
+    for recipe in ("classic", "auto"):
+        expected = Renderer.of(scene, cameras, recipe, quality="best", rasterizer="eager")(camera).rgb
         shown = image(page).permute(2, 0, 1)[None]
-        small = torch.nn.functional.interpolate(shown, (height, width), mode="nearest")[0].permute(1, 2, 0)
-        inside = slice(0, width - 4) if key == "1" else slice(4, width)  # the divider stands at the edge
+        small = torch.nn.functional.interpolate(shown, (height, width), mode="nearest-exact")[0].permute(1, 2, 0)
+        inside = slice(4, width - 4)  # the divider stands at an edge
         assert psnr(small[:, inside].contiguous(), quantised(expected)[:, inside].contiguous()) > 40
         page.keyboard.press("f")
-        at_rest(page, split="1.000")
+        page.wait_for_selector(f'{SEEN}[data-split="0.000"]')
+
+
+def test_its_own_policy_lets_it_work(opened):
+    page = opened(bypass_csp=False)
+    page.select_option("#paint", "alpha")
+    page.wait_for_selector(f"{SEEN}[data-paint=alpha]")
+    assert page.evaluate("typeof state") == "undefined"  # nothing of the page's is global
 
 
 def test_the_divider_works_by_mouse_and_by_keyboard(opened):
@@ -324,8 +329,9 @@ def test_it_fits_a_phone_and_a_tablet(opened, size, scheme):
     page = opened(*size, scheme)
     assert page.evaluate("document.documentElement.scrollWidth") == size[0]
     small = page.evaluate(
-        "[...document.querySelectorAll('#panel *, #status, #names span')].filter(e => e.offsetParent && e.childElementCount === 0 "
-        "&& e.textContent.trim() && parseFloat(getComputedStyle(e).fontSize) < 10).length"
+        "[...document.querySelectorAll('#panel *, #status, #names span')].filter(e => e.offsetParent"
+        " && e.childElementCount === 0 && e.textContent.trim()"
+        " && parseFloat(getComputedStyle(e).fontSize) < 10).length"
     )
     assert small == 0
     box = page.locator(SEEN).bounding_box()

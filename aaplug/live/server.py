@@ -11,6 +11,7 @@ import json
 import logging
 import secrets
 import threading
+from contextlib import suppress
 from functools import partial
 from http import HTTPStatus
 from ipaddress import ip_address
@@ -114,7 +115,7 @@ class Server:
     async def _talk(self, connection: ServerConnection) -> None:
         """One page, from its first word to its last."""
         waiting: asyncio.Queue[bytes] = asyncio.Queue()  # the studio puts no more than a few
-        guest = self._studio.enter(partial(self._loop.call_soon_threadsafe, waiting.put_nowait))
+        guest = self._studio.enter(partial(self._hand, waiting))
         self._open += 1
         sending = None
         try:
@@ -129,6 +130,11 @@ class Server:
             if sending is not None:
                 sending.cancel()
 
+    def _hand(self, waiting: "asyncio.Queue[bytes]", said: bytes) -> None:
+        """From the studio's thread to the page."""
+        with suppress(RuntimeError):  # the server has closed meanwhile
+            self._loop.call_soon_threadsafe(waiting.put_nowait, said)
+
     async def _listen(self, connection: ServerConnection, guest: Page) -> None:
         subject = self._studio.subject
         async for text in connection:
@@ -139,11 +145,9 @@ class Server:
 
 
 async def _send_all(connection: ServerConnection, waiting: "asyncio.Queue[bytes]") -> None:
-    try:
+    with suppress(ConnectionClosed):
         while True:
             await connection.send(await waiting.get())
-    except ConnectionClosed:
-        pass
 
 
 def _why(error: OSError) -> str:

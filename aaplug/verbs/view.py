@@ -2,8 +2,8 @@
 
 import threading
 import webbrowser
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib.resources import as_file, files
 from importlib.util import find_spec
@@ -71,10 +71,8 @@ def view(
     scene: SceneLike | SceneFile | None = None,
     cameras: CamerasLike = None,
     *,
-    words: Sequence[str] = (),
     drop_bad: bool = False,
     monitor: Monitor = SILENT,
-    until: Callable[[], object] | None = None,
     **options: Any,
 ) -> None:
     """Show a scene live in the browser, until interrupted.
@@ -82,20 +80,26 @@ def view(
     Args:
         scene: see `render`; None for the bundled sample.
         cameras: see `render`.
-        words: of a command line that name the scene and its cameras, for the page to show.
         drop_bad: leave out Gaussians of a file that cannot be used.
         monitor: receives messages.
-        until: returns when the page shall close; None never does.
         options: fields of `LiveOptions`.
 
     Raises:
         AaplugError: an input cannot be read, an option does not fit, or nothing can listen at the address.
     """
-    with serving(scene, cameras, words=words, drop_bad=drop_bad, monitor=monitor, **options) as address:
-        monitor.say(f"open {address} in a browser; Ctrl-C ends")
-        if not LiveOptions.of(options).no_browser:
-            _open(address)
-        (until or threading.Event().wait)()
+    with serving(scene, cameras, drop_bad=drop_bad, monitor=monitor, **options) as address:
+        attend(address, monitor, LiveOptions.of(options).no_browser)
+
+
+def attend(address: str, monitor: Monitor, no_browser: bool) -> None:
+    """Open the page and wait for an interruption.  A browser that runs in the terminal would take it over."""
+    monitor.say(f"open {address} in a browser; Ctrl-C ends")
+    if not no_browser:
+        with suppress(webbrowser.Error):
+            browser = webbrowser.get()
+            if type(browser) is not webbrowser.GenericBrowser:
+                browser.open(address)
+    threading.Event().wait()
 
 
 @contextmanager
@@ -106,13 +110,3 @@ def _sample_or(scene: SceneLike | SceneFile | None) -> Iterator[tuple[SceneLike 
         return
     with as_file(files("aaplug.io.sample")) as folder:
         yield folder / SAMPLE, folder
-
-
-def _open(address: str) -> None:
-    """Open a browser that has a window of its own; one that runs in the terminal would take it over."""
-    try:
-        browser = webbrowser.get()
-    except webbrowser.Error:
-        return
-    if type(browser) is not webbrowser.GenericBrowser:
-        browser.open(address)

@@ -1,7 +1,7 @@
 """The live view, measured: python -m tests.bench.view [GAUSSIANS ...] [--seconds N].
 
-A scripted flight around a synthetic scene in a window of 1280x720 px, alone and by two clients at once.  Prints frames a
-second while the camera moves, milliseconds from pose to picture (median, 95th percentile), seconds from rest to the
+A scripted flight around a synthetic scene in a window of 1280x720 px, alone and by two clients at once.  Prints frames
+a second while the camera moves, milliseconds from pose to picture (median, 95th percentile), seconds from rest to the
 first picture of full quality, megabytes a second, and the process's peak memory.  The clients are threads of the same
 process; they do not decode the pictures.
 """

@@ -7,7 +7,7 @@ const FPS = 24; // of a recorded path
 const SHAKE = 0.7, SHAKES = [1.1, 0.7]; // px to either side, and turns per second along both axes
 const MOST = {side: 8192, pixels: 1 << 25}; // of a picture, as the server bounds it
 const TURN = 0.008, MOVE = 1.2, NEARER = 0.0015; // of a drag: radians per CSS px; of the wheel: per px
-const QUIET = 300; // ms without a change before the address follows
+const QUIET = 200; // ms without a change before the address follows
 
 let about = null; // what the server told about the scene
 const state = {
