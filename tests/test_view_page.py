@@ -67,9 +67,12 @@ def opened(browser, address):  # noqa: F811
 
 def at_rest(page, **parts: str):
     """Until the page rests and shows that: with the newest picture, complete."""
-    wanted = "".join(f'[data-{name}="{value}"]' for name, value in parts.items())
-    page.wait_for_selector(f"{SEEN}[data-stage=done]{wanted}", timeout=20_000)
-    page.wait_for_function("(({asked, id}) => asked === id)(document.querySelector('#picture').dataset)")
+    shows = "Object.entries(parts).every(([name, value]) => seen[name] === value)"
+    script = f"""(parts) => {{
+      const seen = document.querySelector('{SEEN}').dataset;
+      return seen.stage === 'done' && seen.asked === seen.id && {shows};
+    }}"""
+    page.wait_for_function(script, arg=parts, timeout=20_000)
 
 
 def data(page, name: str) -> str:

@@ -65,9 +65,9 @@ function frame(now) { // asks for what has changed, and says when the camera res
     if (link.send({see: {...wanted, id, split: state.split, moving: !rests}})) {
       asked = key;
       moving = !rests;
-      canvas.dataset.asked = id;
     }
   }
+  canvas.dataset.asked = number;
   if (state.record) keepFrame(now, wanted);
   if (moving || state.shake || state.record) wake();
 }
@@ -80,6 +80,7 @@ function change(parts) {
   if (parts.pose && !("at" in parts)) parts = {...parts, at: null};
   Object.assign(state, parts);
   bound(state);
+  canvas.dataset.asked = "soon";
   controls();
   draw();
   wake();
