@@ -9,11 +9,18 @@ function linked(on) { // on.hello(about), on.message(header, files), on.lost()
   async function unpacked(data) {
     const length = new DataView(data).getUint32(0, true);
     const header = JSON.parse(words.decode(new Uint8Array(data, 4, length)));
+    try {
+      await handed(header, data, length);
+    } finally { // or the server would wait for this page
+      send({shown: header.id || 0});
+    }
+  }
+
+  async function handed(header, data, length) {
     let at = 4 + length;
     const files = (header.parts || []).map(({bytes}) => new Blob([data.slice(at, at += bytes)]));
     if (header.still) files.push(new Blob([data.slice(at)], {type: "image/png"}));
     await on.message(header, header.still ? files : await Promise.all(files.map((file) => createImageBitmap(file))));
-    send({shown: header.id || 0});
   }
 
   function open() {
