@@ -105,7 +105,10 @@ function keepFrame(now, {pose, focal, height}) {
 const STAGES = {connecting: "connecting", moving: "moving", refining: "refining", complete: "refining", done: "at rest"};
 
 function receive(header, bitmaps) {
-  if (header.problem) return say(header.problem);
+  if (header.problem) {
+    at("status").lastElementChild.textContent = header.problem;
+    return say(header.problem);
+  }
   if (header.still) return download(bitmaps[0], header.still);
   if (String(header.size) !== String(shown.size)) {
     shown.sheets = shown.sheets.map(() => sheetOf(...header.size)[0]);
