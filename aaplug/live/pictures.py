@@ -36,7 +36,7 @@ UNIT = 1 << 18, 400_000  # samples, and Gaussians, that an effort of 1 draws
 LEAST_GAUSSIANS = 40_000
 EFFORTS = 1 / 16, 16.0
 STEP = 0.6, 1.4  # by which the effort changes from frame to frame, at most
-MOST_SAMPLES = 1 << 26  # of one side: some seconds
+MOST_SAMPLES = 1 << 24  # of one side: about a second
 PROBED = 20_000  # Gaussians by which a moving picture's sampling rate is estimated
 
 Span = tuple[int, int]  # columns of the picture: the first, and one past the last
