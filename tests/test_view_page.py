@@ -118,7 +118,8 @@ def test_a_streamed_picture_is_the_library_s_own(opened, seen):
         shown = image(page).permute(2, 0, 1)[None]
         small = torch.nn.functional.interpolate(shown, (height, width), mode="nearest-exact")[0].permute(1, 2, 0)
         inside = slice(4, width - 4)  # the divider stands at an edge
-        assert psnr(small[:, inside].contiguous(), quantised(expected)[:, inside].contiguous()) > 40
+        decibels = psnr(small[:, inside].contiguous(), quantised(expected)[:, inside].contiguous())
+        assert decibels is None or decibels > 40  # None: equal
         page.keyboard.press("f")
         page.wait_for_selector(f'{SEEN}[data-split="0.000"]')
 
