@@ -34,6 +34,7 @@ from .verbs.info import info as info
 from .verbs.lod import lod as lod
 from .verbs.render import render as render
 from .verbs.video import video as video
+from .verbs.view import serving as serving, view as view
 from .verbs.warmup import warmup as warmup
 
 # what can be chosen by name

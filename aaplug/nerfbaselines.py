@@ -24,7 +24,7 @@ from aaplug.io.cameras import read_cameras
 from aaplug.io.scenes import read_scene, write_scene
 from aaplug.rendering.renderer import Renderer
 
-from nerfbaselines import register  # pyright: ignore[reportMissingImports]  # isort: skip
+from nerfbaselines import register  # pyright: ignore  # isort: skip
 
 SCENE, CAMERAS, SETTINGS = "scene.ply", "transforms.json", "aaplug.json"
 DEFAULTS = {"recipe": "auto", "quality": "balanced"}
@@ -77,8 +77,9 @@ class Aaplug:
             background = BLACK if colour is None else [float(level) / LARGEST_LEVEL for level in colour]
             self.settings = DEFAULTS | chosen | {"background": background}
             self.scene, self.cameras = read_scene(path), _training_cameras(train_dataset)
-        red, green, blue = self.settings["background"]
-        recipe, quality = self.settings["recipe"], self.settings["quality"]
+        settings: dict[str, Any] = self.settings
+        red, green, blue = settings["background"]
+        recipe, quality = settings["recipe"], settings["quality"]
         self.renderer = Renderer.of(self.scene, self.cameras, recipe, quality=quality, background=(red, green, blue))
 
     @classmethod
@@ -159,7 +160,7 @@ def _frame(camera: Camera) -> dict[str, Any]:
     return sizes | {"file_path": camera.name, "fl_x": camera.fx, "fl_y": camera.fy, "transform_matrix": pose.tolist()}
 
 
-register(
+register(  # pyright: ignore[reportCallIssue]
     {
         "id": "aaplug",
         "method_class": "aaplug.nerfbaselines:Aaplug",

@@ -35,6 +35,7 @@ VERBS = (
     "compare",
     "finetune",
     "demo",
+    "view",
     "warmup",
     "bench",
 )

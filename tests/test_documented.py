@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
-from aaplug_cli.main import main
+from aaplug_cli.main import VERBS, main
 from PIL import Image
 
 from aaplug.core.gaussians import Gaussians
@@ -42,6 +42,11 @@ ELSEWHERE = {  # commands of the tests and benches themselves, and what runs the
     "python -m tests.bench.campaign": "about an hour",
     "AAPLUG_FUZZ=10000 python -m pytest tests/test_hostile_files.py": "pytest runs it with fewer mutations",
     "python -m tests.hostile all 10000": "test_hostile_files.py runs it with fewer mutations",
+    "pip install 'aaplug[view]'": "the gate installs it from constraints.txt",
+    **dict.fromkeys(
+        ("aaplug view", "aaplug view scene.ply", "aaplug view scene.ply --cameras path/to/colmap --port 8123"),
+        "test_view.py: it ends when it is interrupted",
+    ),
     "python -m tests.guided -max_total_time=60": ".ci/run, twice for half as long",
 }
 
@@ -227,19 +232,7 @@ def test_links_between_documents_lead_somewhere():
 def test_every_option_in_the_documents_exists(capsys):
     text = "\n".join(path.read_text() for path in (ROOT / "README.md", *GUIDES))
     helps = ""
-    for verb in (
-        "info",
-        "convert",
-        "lod",
-        "render",
-        "evaluate",
-        "video",
-        "gather",
-        "compare",
-        "finetune",
-        "demo",
-        "bench",
-    ):
+    for verb in VERBS:
         with pytest.raises(SystemExit):
             main([verb, "--help"])
         helps += capsys.readouterr().out

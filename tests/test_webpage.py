@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from markupsafe import escape
 
+from aaplug import pages
 from aaplug.core.cameras import CameraSet
 from aaplug.core.training import TrainingViews
-from aaplug.evaluation.report import webpage
 from aaplug.evaluation.report.plots import plots
 from aaplug.inspection.coverage import coverage
 from aaplug.io.images import image_size, write_png
@@ -291,7 +291,7 @@ def test_any_number_of_recipes_stands_side_by_side(opened):
     assert data(page, "shown").endswith("|auto|image")
 
 
-PICTURES = (Path(webpage.__file__).parent / "pictures.js").read_text()
+PICTURES = (Path(pages.__file__).parent / "pictures.js").read_text()
 MAPS = (
     f"async () => {{{PICTURES}"
     + """

@@ -82,7 +82,7 @@ def quantised(rgb: Float[Tensor, "h w 3"], bit_depth: int = 8) -> Float[Tensor, 
     return levels(rgb, bit_depth) / (2**bit_depth - 1)
 
 
-def levels(rgb: Float[Tensor, "h w 3"], bit_depth: int) -> Float[Tensor, "h w 3"]:
+def levels(rgb: Float[Tensor, "h w c"], bit_depth: int) -> Float[Tensor, "h w c"]:
     """Clamp to [0, 1] and round to whole levels, 0 to 2^bit_depth - 1."""
     assert bool(torch.isfinite(rgb).all()), "a rendered colour is NaN or infinite"
     return (rgb.clamp(0, 1) * (2**bit_depth - 1)).round()

@@ -165,7 +165,8 @@ def views_of(
     each = [_per_image(x, (*batch,), c, per_camera=True) for x in (backgrounds, viewmats, Ks)]
     colours = _per_image(colors, (*batch,), c, per_camera=own)
     rates = _rates(relative_rate, (*batch, c), options)
-    return [_view(*parts, options) for parts in zip(*shared, colours, *each, rates, strict=True)]
+    parts = zip(*shared, colours, *each, rates, strict=True)
+    return [_view(*own, options) for own in parts]  # pyright: ignore[reportCallIssue]
 
 
 def _shaped(name: str, x: Tensor, shape: Sequence[int], least: int = 0) -> Sequence[int]:
@@ -199,7 +200,7 @@ def _rates(relative_rate: float | Tensor | None, shape: tuple[int, ...], options
     if (relative_rate is not None) != (options.rasterize_mode == "matched"):
         raise UsageError("relative_rate", 'belongs to rasterize_mode="matched", which needs it')
     if relative_rate is None:
-        return math.prod(shape) * [None]
+        return [None for _ in range(math.prod(shape))]
     rates = torch.as_tensor(relative_rate, dtype=torch.float64)
     if rates.dim() > 0:
         _shaped("relative_rate", rates, shape)

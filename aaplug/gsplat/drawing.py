@@ -22,7 +22,7 @@ AT_ONCE = 3  # channels, what a rasterizer draws
 LEAST_ALPHA = 1e-10  # what expected depth is divided by where nothing is drawn
 
 Image = tuple[Float[Tensor, "h w d"], Float[Tensor, "h w 1"]]
-Told = Callable[[Float[Tensor, "m 2"]], None]
+Told = Callable[[Float[Tensor, "m 2"]], object]
 
 
 def drawn(

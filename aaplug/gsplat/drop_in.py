@@ -103,7 +103,8 @@ def rasterization(
     refuse({"distributed": distributed, "camera_model": camera_model, **others})
     rows: list[Tensor] = []
     if sparse_grad and packed:
-        means, quats, scales = (x if x is None else with_sparse_gradient(x, rows) for x in (means, quats, scales))
+        means = with_sparse_gradient(means, rows)
+        quats, scales = (x if x is None else with_sparse_gradient(x, rows) for x in (quats, scales))
     tensors = (means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars)
     views = views_of(*tensors, relative_rate, options)
     chosen = _named(rasterizer) if isinstance(rasterizer, str) else rasterizer

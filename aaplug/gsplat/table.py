@@ -62,12 +62,15 @@ class Layout:
             table = table.flatten(0, len(self.shape)).index_select(0, self.rows)
         return table.split(self.counts)
 
-    def told(self, means2d: Tensor) -> list[Callable[[Tensor], None]]:
+    def told(self, means2d: Tensor) -> list[Callable[[Tensor], object]]:
         """For each image, what adds its absolute gradients to `means2d.absgrad`, which gsplat's users read."""
         total = torch.zeros_like(means2d)
         means2d.absgrad = total  # pyright: ignore[reportAttributeAccessIssue]
         rows = total.view(-1, 2)
-        return [partial(rows.index_add_, 0, part) for part in self.rows.split(self.counts)]
+        adders: list[Callable[[Tensor], object]] = [
+            partial(rows.index_add_, 0, part) for part in self.rows.split(self.counts)
+        ]
+        return adders
 
 
 def tabulated(found: Sequence[Seen], layout: Layout, options: Options) -> tuple[dict[str, Any], list[Splats2D]]:

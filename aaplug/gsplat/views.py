@@ -23,7 +23,8 @@ from aaplug.methods.filters import Matched
 NO_FLOOR = 1e-9
 LARGEST_RADIUS = 2.0**30  # px; fits 32 bits
 
-UNSEEN = SamplingBounds(*torch.zeros(3, 0).unbind(), torch.zeros(0, dtype=torch.int32))
+NONE = torch.zeros(0)
+UNSEEN = SamplingBounds(NONE, NONE, NONE, NONE.int())
 
 
 class Seen(NamedTuple):

@@ -101,13 +101,24 @@ def encode_webp(rgb: Float[Tensor, "h w 3"], quality: int | None) -> bytes:
     return _encoded(".webp", _stored(rgb, 8), cv2.IMWRITE_WEBP_QUALITY, setting)
 
 
+def encode_jpeg(rgb: Float[Tensor, "h w 3"], quality: int) -> bytes:
+    """A JPEG file of colours clamped to [0, 1], with colour at full resolution.  quality: 1 to 100."""
+    settings = cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444
+    return _encoded(".jpg", _stored(rgb, 8), *settings)
+
+
+def encode_png(rgb: Float[Tensor, "h w c"]) -> bytes:
+    """A PNG file of 8 bits, of colours or of one channel, clamped to [0, 1]; quick rather than small."""
+    return _encoded(".png", _stored(rgb, 8), cv2.IMWRITE_PNG_COMPRESSION, 1)
+
+
 def _encoded(suffix: str, samples: np.ndarray, *settings: int) -> bytes:
     done, file = cv2.imencode(suffix, samples, settings)
     assert done
     return file.tobytes()
 
 
-def _stored(rgb: Float[Tensor, "h w 3"], bit_depth: int) -> np.ndarray:
+def _stored(rgb: Float[Tensor, "h w c"], bit_depth: int) -> np.ndarray:
     """Samples in OpenCV's BGR order, converted in bands of rows to keep the float copies small."""
     parts = (levels(rows, bit_depth).flip(2).cpu().numpy() for rows in rgb.split(ROWS))
     return np.concatenate([part.astype(SAMPLE_TYPES[bit_depth]) for part in parts])

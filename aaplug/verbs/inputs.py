@@ -132,6 +132,18 @@ def look_of(scene: Held, cameras: CameraSet, frames: int, o: ViewOptions, monito
 
     frames: how many images will be rendered in all.
     """
+    look = unchecked_look_of(scene, cameras, frames, o, monitor)
+    if cameras.assumed:
+        return look
+    fit = agreement(look, cameras)
+    monitor.say(f"fit: {fit}")
+    if fit.doubt:
+        log.warning("%s: scene and cameras seem to be of different captures: %s", look.scene.name, fit.doubt)
+    return look
+
+
+def unchecked_look_of(scene: Held, cameras: CameraSet, frames: int, o: ViewOptions, monitor: Monitor) -> Renderer:
+    """The same without seconds spent on whether scene and cameras fit."""
     # its packages take a third of a second to import, which `--help` need not wait for
     from aaplug.evaluation.truth import own_look
 
@@ -146,14 +158,7 @@ def look_of(scene: Held, cameras: CameraSet, frames: int, o: ViewOptions, monito
     if o.memory is not None and isinstance(drawing, TakesMemory):
         drawing = drawing.within(o.memory * 1e9)
     scene = whole_of(scene)
-    look = own_look(scene, TrainingViews.of(scene, cameras, o.cull_margin, o.min_seen), drawing, colour)
-    if cameras.assumed:
-        return look
-    fit = agreement(look, cameras)
-    monitor.say(f"fit: {fit}")
-    if fit.doubt:
-        log.warning("%s: scene and cameras seem to be of different captures: %s", scene.name, fit.doubt)
-    return look
+    return own_look(scene, TrainingViews.of(scene, cameras, o.cull_margin, o.min_seen), drawing, colour)
 
 
 def drawn_by(recipe: Recipe, scene: Held, look: Renderer) -> Renderer:

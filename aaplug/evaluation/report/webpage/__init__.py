@@ -5,15 +5,12 @@ content security policy allows only what the page holds, and names its one scrip
 """
 
 import base64
-import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from importlib.resources import files
 from itertools import product
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
 from aaplug.evaluation.image_store import TRUTHS, ImageStore
@@ -22,12 +19,12 @@ from aaplug.evaluation.report.plots import BOUNDS, Plot
 from aaplug.evaluation.results import CEILING, Facts, Report, as_csv, mean, rows, scale_name, work
 from aaplug.inspection.coverage import Coverage
 from aaplug.io.images import encode_webp, image_size, read_image
+from aaplug.pages import assembled
 
 COSTS = (  # what the tables of `work` mean
     "rendering alone, on the machine that the protocol names; below, the quartiles over the views",
     "splat-pixel evaluations of compositing; below, the standard deviation over the views",
 )
-SOURCES = ("page.html.j2", "page.css", "pictures.js", "page.js")  # the scripts become one, in this order
 BUDGET = 12_000_000  # bytes of lossless images; a larger page opens slowly and gets lossy ones
 LOSSY = 90  # WebP quality above the budget
 TRUTH = "truth"  # the role of the true image, beside the recipes
@@ -41,10 +38,11 @@ def page(
     name: str, report: Report, found: Coverage, drawn: list[Plot], images: ImageStore, facts: Sequence[Facts] = ()
 ) -> str:
     """The page's text; raises FormatError where an image that it shows is missing.  facts: further tables."""
-    template, style, *scripts = (files(__name__).joinpath(source).read_text(encoding="utf-8") for source in SOURCES)
-    script = "".join(scripts)
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    return environment.from_string(template).render(
+    return assembled(
+        __name__,
+        "page.html.j2",
+        ("page.css",),
+        ("page.js",),
         name=name,
         report=report,
         protocol=dict(report.protocol),
@@ -62,9 +60,6 @@ def page(
         gallery=_gallery(report, images),
         facts=[(k.replace("_", " "), _text(v)) for k, v in report.protocol.items() if k not in HIDDEN],
         csv=as_csv({name: report}),
-        style=Markup(style),
-        script=Markup(script),
-        script_hash=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
     )
 
 

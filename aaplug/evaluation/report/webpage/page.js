@@ -3,11 +3,9 @@
 const at = (id) => document.getElementById(id);
 const gallery = JSON.parse(at("gallery").textContent);
 const stage = at("stage"), crops = at("crops"), figure = at("compare");
-const STRENGTHS = [2, 32]; // of the lens: it shows this share of the picture's shorter side
 const BESIDE = 720, BETWEEN = 24; // CSS px: from this width on the crops stand right of the picture, so far away
 const CROPS = 0.4, BELOW = 0.6; // of the width: what crops beside have at least, and a row of them below in height
 const AROUND = 110, LEAST = 240; // CSS px of the screen's height: taken around the picture; a picture's least height
-const GRIP = 14; // CSS px beside the divider where it is grabbed although the lens is on
 const QUIET = 200; // ms without a change before the address follows
 
 const order = [...new Set([gallery.truth, gallery.ceiling, ...gallery.recipes])];
@@ -29,8 +27,7 @@ function shown() {
 
 function change(parts) {
   Object.assign(state, parts);
-  for (const share of ["split", "x", "y"]) state[share] = clamp(state[share], 0, 1);
-  state.zoom = clamp(state.zoom, ...STRENGTHS);
+  bound(state);
   render();
   clearTimeout(change.waiting);
   change.waiting = setTimeout(() => history.replaceState(null, "", address()), QUIET);
@@ -43,10 +40,9 @@ function address() {
   for (const role of shown()) words.append("show", role); // two of them are left and right
   words.append("mode", state.error ? "error" : "image");
   words.append("split", state.split.toFixed(3));
-  if (state.lens) words.append("lens", lensText());
+  if (state.lens) words.append("lens", lensText(state));
   return `#${words}`;
 }
-const lensText = () => [state.x.toFixed(3), state.y.toFixed(3), state.zoom].join();
 
 function fromAddress() { // the state that the address names, if it names one and not a section of the page
   const words = new URLSearchParams(location.hash.slice(1));
@@ -77,11 +73,6 @@ async function pane(role) { // what one side shows, and the words above it
   return {sheet: map, label: words.join(" · ")};
 }
 
-function lensBox(ratio) { // the square that the lens shows, inside the picture, in shares of its width
-  const side = Math.min(1, ratio) / state.zoom;
-  return {x: clamp(state.x - side / 2, 0, 1 - side), y: clamp(state.y * ratio - side / 2, 0, ratio - side), side};
-}
-
 async function render() { // decodes what is asked for, then draws
   const mine = render.turn = (render.turn || 0) + 1, chosen = shown();
   const panes = await Promise.all(chosen.map(pane));
@@ -90,13 +81,13 @@ async function render() { // decodes what is asked for, then draws
   draw(panes, shot().height / shot().width);
   stage.setAttribute("aria-label", `${state.view} at scale ${state.scale}: ${panes.map((p) => p.label).join("; ")}`);
   Object.assign(figure.dataset, {
-    split: state.split.toFixed(3), lens: state.lens ? lensText() : "off",
+    split: state.split.toFixed(3), lens: state.lens ? lensText(state) : "off",
     shown: [state.view, state.scale, chosen.join("+"), state.error ? "error" : "image"].join("|"),
   });
 }
 
 function draw(panes, ratio) {
-  const box = lensBox(ratio), divided = panes.length === 2, width = figure.clientWidth, beside = width >= BESIDE;
+  const box = lensBox(state, ratio), divided = panes.length === 2, width = figure.clientWidth, beside = width >= BESIDE;
   const height = Math.max(LEAST, document.documentElement.clientHeight - at("controls").offsetHeight - AROUND);
   const groups = divided ? [panes] : panes.map((p) => [p]);
   const size = packed(groups.length, width - (state.lens && beside ? CROPS * width : 0), height, ratio);
@@ -152,13 +143,8 @@ at("stronger").addEventListener("click", () => change({lens: true, zoom: state.z
 at("split").addEventListener("input", ({target}) => change({split: target.value / 100}));
 
 let grabbed = null; // what a press moves: "split" or "lens"
-function place({target, clientX, clientY}) {
-  const box = target.getBoundingClientRect();
-  return {x: (clientX - box.left) / box.width, y: (clientY - box.top) / box.height, width: box.width};
-}
 function grip(event) {
-  const {x, width} = place(event), divided = shown().length === 2;
-  if (divided && (!state.lens || Math.abs(x - state.split) * width < GRIP)) return "split";
+  if (shown().length === 2 && (!state.lens || atDivider(event, state))) return "split";
   return state.lens ? "lens" : null;
 }
 function move(event) {
@@ -179,14 +165,7 @@ stage.addEventListener("pointermove", (event) => {
 });
 stage.addEventListener("keydown", (event) => {
   if (event.ctrlKey || event.metaKey || event.altKey) return;
-  const step = event.shiftKey ? 0.05 : 0.01, {x, y, zoom, split} = state;
-  const changes = {
-    ArrowLeft: {lens: true, x: x - step}, ArrowRight: {lens: true, x: x + step},
-    ArrowUp: {lens: true, y: y - step}, ArrowDown: {lens: true, y: y + step},
-    l: {lens: !state.lens}, L: {lens: !state.lens}, Escape: {lens: false},
-    "+": {lens: true, zoom: zoom * 2}, "=": {lens: true, zoom: zoom * 2}, "-": {lens: true, zoom: zoom / 2},
-    "[": {split: split - 0.02}, "]": {split: split + 0.02},
-  };
+  const changes = {...lensMoves(event, state), ...shortcuts(state)};
   if (!(event.key in changes)) return;
   change(changes[event.key]);
   event.preventDefault();

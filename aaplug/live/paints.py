@@ -1,0 +1,119 @@
+"""What aaplug knows about a picture, painted over it: one value per pixel, with a legend.
+
+h, w: of the picture, in px.  A value that nothing decides, such as the sampling rate of the background, is NaN.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from aaplug.core.cameras import BLACK, Camera
+from aaplug.core.interfaces import RunsKernels
+from aaplug.core.kernels import EAGER
+from aaplug.core.splats import Render
+from aaplug.methods.pixel_kernels.raster_rows import TILE
+from aaplug.rasterizers.tiled.binning import bands
+from aaplug.rendering.renderer import Renderer
+
+LEVELS = 254  # of 8 bits, from low to high; 0 says that there is no value
+SHOWS = 0.05  # alpha of Gaussians that training saw, from which on a pixel has their mean
+
+Map = Float[Tensor, "h w"]
+
+
+@dataclass(frozen=True)
+class Paint:
+    """A value per pixel, and its legend.
+
+    draw: called with a renderer, the camera of the picture and the samples along a pixel's side.
+    low, high: ends of the scale; high is None where the picture's own largest value is.  log: whether even in octaves.
+    middle: the value where the colours change sides; None for colours that only grow.
+    """
+
+    title: str
+    about: str
+    draw: Callable[[Renderer, Camera, int], Map]
+    low: float
+    high: float | None
+    log: bool = False
+    middle: float | None = None
+
+    def __call__(self, renderer: Renderer, camera: Camera, samples: int) -> tuple[Map, dict[str, Any]]:
+        """Levels from 0 to 1, of which 0 says that there is no value, and the legend."""
+        values = self.draw(renderer, camera, samples)
+        known = values[values.isfinite()]
+        low = self.low
+        high = max(self.high or float(known.max() if len(known) else low), low * 2 if self.log else low + 1e-6)
+        scale = torch.log2 if self.log else torch.positive
+        low_end, high_end = scale(torch.tensor([low, high], dtype=values.dtype))
+        shares = ((scale(values) - low_end) / (high_end - low_end)).clamp(0, 1)
+        levels = torch.where(values.isfinite(), (1 + LEVELS * shares) / (LEVELS + 1), 0.0)
+        legend = {"low": low, "high": high, "log": self.log, "middle": self.middle}
+        return levels, legend | {"title": self.title, "about": self.about}
+
+
+def _blended(renderer: Renderer, camera: Camera, of_training: Callable[[Tensor, Tensor], Tensor]) -> Map:
+    """Mean over what a pixel shows of a value of each Gaussian that training saw.
+
+    of_training: called with depths of splats, in world units, and their places in the scene.
+    """
+    splats, bounds = renderer.splats(camera), renderer.training.bounds
+    seen = bounds.seen[splats.sources].to(splats.depths)
+    values = torch.where(seen > 0, of_training(splats.depths, splats.sources).to(seen), 0.0)
+    rgb = torch.stack([values, seen, torch.ones_like(seen)], dim=1)
+    total, known, _ = _drawn(renderer, camera, rgb).rgb.unbind(dim=2)
+    return torch.where(known > SHOWS, total / known, torch.nan)
+
+
+def _drawn(renderer: Renderer, camera: Camera, rgb: Float[Tensor, "m 3"] | None = None) -> Render:
+    """The picture with one sample per pixel, before black; rgb: of each splat, instead of its own."""
+    splats = renderer.splats(camera)
+    splats = splats if rgb is None else replace(splats, rgb=rgb)
+    recipe, rules = renderer.recipe, renderer.training.convention.rules
+    return renderer.rasterizer(splats, camera.hw, BLACK, recipe.pixel, recipe.compositor, rules)
+
+
+def _rate(renderer: Renderer, camera: Camera, samples: int) -> Map:
+    highest = renderer.training.bounds.highest
+    return _blended(renderer, camera, lambda depths, places: (camera.focal / depths / highest[places]).log2()).exp2()
+
+
+def _views(renderer: Renderer, camera: Camera, samples: int) -> Map:
+    return _blended(renderer, camera, lambda _, places: renderer.training.bounds.views[places])
+
+
+def _alpha(renderer: Renderer, camera: Camera, samples: int) -> Map:
+    return _drawn(renderer, camera).alpha
+
+
+def _samples(renderer: Renderer, camera: Camera, samples: int) -> Map:
+    return torch.full(camera.hw, float(samples**2))
+
+
+def _cost(renderer: Renderer, camera: Camera, samples: int) -> Map:
+    """Splats that the tile of a pixel lists, for each of its samples."""
+    fine = camera.resized(camera.width * samples, camera.height * samples)
+    splats, rules = renderer.splats(fine), renderer.training.convention.rules
+    kernels = renderer.rasterizer.kernels if isinstance(renderer.rasterizer, RunsKernels) else EAGER
+    grid = -(-fine.height // TILE), -(-fine.width // TILE)
+    ellipses = renderer.recipe.pixel.bounding_ellipses(splats, rules) or splats
+    counts = torch.cat([found.counts for found in bands(ellipses, grid, kernels, rules=rules)]).view(grid)
+    rows, columns = (((torch.arange(side) + 0.5) * samples / TILE).long() for side in camera.hw)
+    return counts[rows][:, columns].float() * samples**2
+
+
+PAINTS = {
+    "rate": Paint(
+        "sampling rate / training's", "blue: finer than training saw it; red: coarser", _rate, 1 / 8, 8.0, True, 1.0
+    ),
+    "views": Paint("training cameras that saw it", "mean over what a pixel shows", _views, 0.0, None),
+    "samples": Paint("samples per pixel", "the same for all pixels of a picture", _samples, 1.0, 64.0, True),
+    "cost": Paint(
+        "splat evaluations per pixel", "at most: a pixel that is opaque stops earlier", _cost, 1.0, None, True
+    ),
+    "alpha": Paint("alpha", "share of the background that is hidden", _alpha, 0.0, 1.0),
+}

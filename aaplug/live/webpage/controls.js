@@ -1,0 +1,270 @@
+// Controls: what buttons, lists, keys, pointers and the address do to the state.
+
+const EIGHTHS = [1 / 8, 1 / 4, 1 / 2, 1, 2, 4, 8];
+const scaleName = (scale) => scale < 1 && Number.isInteger(1 / scale) ? `1/${1 / scale}` : `${+scale.toFixed(2)}`;
+const say = (text) => { at("said").textContent = text; };
+const listed = (id, names, texts = names) => at(id).replaceChildren(...names.map((name, i) => new Option(texts[i], name)));
+
+function controls() { // show the state
+  const {size} = extent();
+  state.sides.forEach(({recipe, quality}, i) => {
+    at(`recipe-${i}`).value = recipe; at(`quality-${i}`).value = quality;
+    at(`quality-${i}`).disabled = !takesQuality(recipe);
+  });
+  at("split").value = 100 * state.split;
+  at("scale").value = Math.log2(state.scale);
+  at("size").textContent = `${scaleName(state.scale)} × training · ${size.join("×")} px`;
+  for (const radio of document.getElementsByName("size")) radio.checked = Number(radio.value) === state.scale;
+  for (const radio of document.getElementsByName("enlarge")) radio.checked = (radio.value === "yes") === state.enlarge;
+  at("fov").value = state.fov; at("distance").value = Math.log2(state.depth / about.depth);
+  for (const name of ["lens", "shake", "frustums", "record"]) at(name).checked = state[name];
+  at("zoom").textContent = `${state.zoom}×`;
+  at("paint").value = state.paint || "";
+  at("view").value = state.at === null ? "" : String(state.at);
+  at("fade").value = state.fade;
+  at("fading").hidden = state.at === null || !view().photo;
+  at("path").disabled = !path.length;
+}
+
+const flip = () => change({split: state.split > 0.5 ? 0 : 1});
+const stepCamera = (by) => standIn(((state.at ?? (by > 0 ? -1 : 0)) + by + about.views.length) % about.views.length);
+
+// ----------------------------------------------------------------------------------------------------- from the server
+
+function hello(told) {
+  const first = about === null;
+  about = told;
+  at("lost").hidden = true;
+  asked = "";
+  if (!first) return wake();
+  document.title = `${told.title} · aaplug`;
+  at("title").textContent = told.title;
+  const kernels = told.rasterizer === "compiled" ? "" : `, rasterizer ${told.rasterizer}: \`aaplug warmup\` makes it faster`;
+  at("facts").textContent = `${told.gaussians.toLocaleString("en")} Gaussians${told.assumed ? ", training rate assumed" : ""}${kernels}`;
+  for (const i of [0, 1]) {
+    listed(`recipe-${i}`, told.recipes.map(({name}) => name));
+    listed(`quality-${i}`, told.qualities);
+  }
+  listed("paint", ["", ...Object.keys(told.paints)], ["nothing", ...Object.values(told.paints)]);
+  listed("view", ["", ...told.views.keys()], ["–", ...told.views.map(({name}) => name)]);
+  at("cameras").textContent = told.assumed ? "Views" : "Cameras";
+  for (const scale of EIGHTHS) {
+    const label = document.createElement("label"), input = document.createElement("input"), text = document.createElement("span");
+    Object.assign(input, {type: "radio", name: "size", value: scale});
+    text.textContent = scaleName(scale);
+    label.append(input, text);
+    at("scales").append(label);
+  }
+  const known = told.recipes.map(({name}) => name), best = told.qualities.at(-1);
+  state.sides = ["classic", "auto"].map((name, i) => ({recipe: known.includes(name) ? name : known.at(-i), quality: best}));
+  standIn(0);
+  fromAddress();
+}
+
+// ------------------------------------------------------------------------------------------------------- the controls
+
+at("panel").addEventListener("input", ({target: {id, name, value, checked}}) => {
+  const [word, side] = id.split("-");
+  if (side) change({sides: state.sides.map((one, i) => i === Number(side) ? {...one, [word]: value} : one)});
+  else if (name === "size") change({scale: Number(value)});
+  else if (name === "enlarge") change({enlarge: value === "yes"});
+  else if (id === "split") change({split: value / 100});
+  else if (id === "scale") change({scale: 2 ** (Math.abs(value - Math.round(value)) < 0.06 ? Math.round(value) : value)});
+  else if (id === "fov") change({fov: Number(value)});
+  else if (id === "distance") change(dollied(state, about.depth * 2 ** value / state.depth));
+  else if (id === "fade") change({fade: Number(value)});
+  else if (id === "paint") change({paint: value || null});
+  else if (id === "view" && value) standIn(Number(value));
+  else if (id === "record") { if (checked) path.length = 0; change({record: checked}); }
+  else if (["lens", "shake", "frustums"].includes(id)) change({[id]: checked});
+});
+const clicks = {
+  flip, half: () => change({split: 0.5}), weaker: () => change({lens: true, zoom: state.zoom / 2}),
+  stronger: () => change({lens: true, zoom: state.zoom * 2}), previous: () => stepCamera(-1), next: () => stepCamera(1),
+  path: savePath, still: saveStill, command: copyCommand, fold,
+};
+for (const [id, act] of Object.entries(clicks)) at(id).addEventListener("click", act);
+
+function fold() {
+  const folded = document.body.classList.toggle("folded");
+  at("fold").setAttribute("aria-expanded", String(!folded));
+}
+
+// ------------------------------------------------------------------------------------------------------------ keeping
+
+function download(file, name) {
+  const anchor = document.createElement("a");
+  anchor.href = URL.createObjectURL(file); anchor.download = name;
+  anchor.click();
+  setTimeout(() => URL.revokeObjectURL(anchor.href), 60_000);
+  say(`saved ${name}`);
+}
+
+function pathOf(frames) {
+  const [width, height] = extent().size;
+  const cameras = frames.map(({camera_to_world, fov}) => ({camera_to_world, fov, aspect: width / height}));
+  return JSON.stringify({camera_type: "perspective", render_width: width, render_height: height, fps: FPS, seconds: frames.length / FPS, camera_path: cameras});
+}
+
+function savePath() {
+  download(new Blob([pathOf(path)], {type: "application/json"}), "camera_path.json");
+}
+
+function saveStill() {
+  const [width, height] = ["width", "height"].map((id) => Number(at(id).value));
+  if (link.send({still: {width, height, side: 1}})) say("rendering the picture");
+}
+
+const quoted = (word) => /^[\w@%+=:,./-]+$/.test(word) ? word : `'${word.replaceAll("'", "'\\''")}'`;
+
+function commandLine() { // what renders the right side as it is seen
+  const {size: [width, height], focal} = extent(), {recipe, quality} = state.sides[1];
+  const numbers = (values) => values.map((x) => String(+x.toFixed(6)));
+  const how = ["--recipe", recipe, ...(takesQuality(recipe) ? ["--quality", quality] : [])], output = ["-o", "view.png"];
+  if (about.assumed) {
+    const eye = eyeOf(state.pose), [, down, forward] = axesOf(state.pose);
+    const look = ["--eye", ...numbers(eye), "--look-at", ...numbers(plus(eye, forward, state.depth)), "--up", ...numbers(down.map((x) => -x))];
+    const fov = Math.atan(Math.min(width, height) / 2 / focal) * 360 / Math.PI;
+    return ["aaplug", "render", ...about.words, ...look, "--fov", ...numbers([fov]), "--resolution", `${width}x${height}`, ...how, ...output].map(quoted).join(" ");
+  }
+  if (state.at !== null) {
+    return ["aaplug", "render", ...about.words, "--views", view().name, "--scale", ...numbers([state.scale]), ...how, ...output].map(quoted).join(" ");
+  }
+  const frames = [{camera_to_world: worldFromCamera(state.pose), fov: Math.atan(height / 2 / focal) * 360 / Math.PI}];
+  const video = ["aaplug", "video", ...about.words, "--path", "camera_path.json", "--beside", state.sides[0].recipe, ...how, "-o", "view.webm"];
+  return `printf '%s' ${quoted(pathOf(frames))} > camera_path.json && ${video.map(quoted).join(" ")}`;
+}
+
+async function copyCommand() {
+  const words = commandLine();
+  await navigator.clipboard.writeText(words).then(() => say(`copied: ${words}`), () => say(words));
+}
+
+// --------------------------------------------------------------------------------------------------------------- keys
+
+const HELD = { // what a held key does in each step
+  ArrowLeft: () => turned(state, 0.04, 0, about.up), ArrowRight: () => turned(state, -0.04, 0, about.up),
+  ArrowUp: () => turned(state, 0, 0.04, about.up), ArrowDown: () => turned(state, 0, -0.04, about.up),
+  w: () => dollied(state, 0.95), s: () => dollied(state, 1 / 0.95),
+  a: () => panned(state, -0.03, 0), e: () => panned(state, 0.03, 0), q: () => panned(state, 0, -0.03), z: () => panned(state, 0, 0.03),
+};
+const PRESSED = {
+  f: flip, d: () => change({split: 0.5}), x: () => change({shake: !state.shake}), c: () => change({frustums: !state.frustums}),
+  r: () => at("record").click(), p: () => change({fade: state.fade > 0 ? 0 : 1}), h: fold, Home: () => { state.pose = null; standIn(0); },
+  ",": () => stepCamera(-1), ".": () => stepCamera(1),
+};
+EIGHTHS.forEach((scale, i) => { PRESSED[i + 1] = () => change({scale}); });
+
+window.addEventListener("keydown", (event) => {
+  const key = event.key.length === 1 ? event.key.toLowerCase() : event.key, {target} = event;
+  if (event.ctrlKey || event.metaKey || event.altKey || !about || target.matches("select, input[inputmode]")) return;
+  if (key.length > 1 && target.matches("input[type=range], input[type=radio]")) return; // arrows are theirs
+  const changes = {...(state.lens ? lensMoves(event, state) : {}), ...shortcuts(state)};
+  if (key in changes) change(changes[key]);
+  else if (key in HELD) change(HELD[key]());
+  else if (key in PRESSED) PRESSED[key]();
+  else return;
+  event.preventDefault();
+});
+
+// ----------------------------------------------------------------------------------------------------------- pointers
+
+const pointers = new Map(); // those that are down
+let grabbed = null, travelled = 0; // what a press moves: "split", "turn" or "move"; CSS px since it began
+
+const over = (event) => place({target: canvas, clientX: event.clientX, clientY: event.clientY});
+const nearDivider = (event) => atDivider({target: canvas, clientX: event.clientX, clientY: event.clientY}, state);
+
+stage.addEventListener("pointerdown", (event) => {
+  if (!about || event.target.closest("button")) return;
+  canvas.focus({preventScroll: true});
+  pointers.set(event.pointerId, event);
+  try { stage.setPointerCapture(event.pointerId); } catch { /* it is up already */ }
+  grabbed = nearDivider(event) && event.button === 0 ? "split" : event.button || event.shiftKey ? "move" : "turn";
+  travelled = 0;
+  canvas.classList.toggle("turning", grabbed !== "split");
+});
+
+stage.addEventListener("pointermove", (event) => {
+  if (!about) return;
+  pointer = over(event);
+  const before = pointers.get(event.pointerId);
+  if (!before) return hover(event);
+  const dx = event.clientX - before.clientX, dy = event.clientY - before.clientY;
+  travelled += Math.hypot(dx, dy);
+  if (pointers.size === 2) pinch(before, event);
+  else if (grabbed === "split") change({split: pointer.x});
+  else if (grabbed === "turn") change(turned(state, -dx * TURN, -dy * TURN, about.up));
+  else shift(dx, dy);
+  pointers.set(event.pointerId, event);
+});
+
+function hover(event) {
+  canvas.style.cursor = nearDivider(event) ? "ew-resize" : "";
+  const box = canvas.getBoundingClientRect(), found = state.frustums ? cameraNear(cameras, pointer.x, pointer.y, box) : null;
+  if (found !== null) canvas.style.cursor = "pointer";
+  const redraws = found !== hovered || shown.painted;
+  hovered = found;
+  if (state.lens && pointer.x >= 0 && pointer.x <= 1) change({x: pointer.x, y: pointer.y});
+  else if (redraws) draw();
+}
+
+function shift(dx, dy) { // what is in front follows the pointer
+  const {focal, times, density} = extent(), by = density / times / focal;
+  change(panned(state, -dx * by, -dy * by));
+}
+
+function pinch(before, event) { // two fingers: their middle moves the scene, their distance the camera
+  const [other] = [...pointers.values()].filter(({pointerId}) => pointerId !== event.pointerId);
+  const apart = (one) => Math.max(8, Math.hypot(one.clientX - other.clientX, one.clientY - other.clientY));
+  shift((event.clientX - before.clientX) / 2, (event.clientY - before.clientY) / 2);
+  change(dollied(state, apart(before) / apart(event)));
+}
+
+function released(event) {
+  const tapped = pointers.delete(event.pointerId) && travelled < 5 && event.type === "pointerup";
+  canvas.classList.remove("turning");
+  if (!tapped || grabbed === "split") return;
+  const {x, y} = over(event);
+  const found = state.frustums ? cameraNear(cameras, x, y, canvas.getBoundingClientRect()) : null;
+  if (found !== null) standIn(found);
+  else if (state.lens) change({x, y});
+}
+stage.addEventListener("pointerup", released);
+stage.addEventListener("pointercancel", released);
+stage.addEventListener("pointerleave", () => { pointer = null; });
+stage.addEventListener("dblclick", () => change({split: 0.5}));
+stage.addEventListener("contextmenu", (event) => event.preventDefault());
+stage.addEventListener("wheel", (event) => {
+  event.preventDefault();
+  if (about) change(dollied(state, Math.exp(clamp(event.deltaY * (event.deltaMode ? 30 : 1), -400, 400) * NEARER)));
+}, {passive: false});
+new ResizeObserver(() => { if (about) { controls(); draw(); wake(); } }).observe(stage);
+
+// -------------------------------------------------------------------------------------------------------- the address
+
+const KEPT = ["pose", "depth", "at", "base", "scale", "enlarge", "fov", "sides", "split", "lens", "x", "y", "zoom", "frustums", "fade", "paint"];
+
+function address() {
+  return `#${encodeURIComponent(JSON.stringify(Object.fromEntries(KEPT.map((name) => [name, state[name]]))))}`;
+}
+
+function fromAddress() { // the state that the address names, where it can be one
+  try {
+    const found = JSON.parse(decodeURIComponent(location.hash.slice(1)));
+    const known = (index) => Number.isInteger(index) && index >= 0 && index < about.views.length;
+    const numbers = ["depth", "scale", "fov", "split", "x", "y", "zoom", "fade"].every((name) => Number.isFinite(found[name]));
+    const sides = found.sides.every(({recipe, quality}) => about.recipes.some(({name}) => name === recipe) && about.qualities.includes(quality));
+    if (!numbers || !sides || found.sides.length !== 2 || !known(found.base) || (found.at !== null && !known(found.at))) return;
+    if (found.pose.length !== 16 || !found.pose.every(Number.isFinite) || !(found.scale > 0 && found.depth > 0)) return;
+    if (found.paint !== null && !(found.paint in about.paints)) return;
+    change({...Object.fromEntries(KEPT.map((name) => [name, found[name]])), scale: clamp(found.scale, 1 / 8, 8)});
+  } catch { /* nothing, or nothing of ours */ }
+}
+
+link = linked({hello, message: receive, lost: () => {
+  at("lost").textContent = "The connection is lost. Trying again…";
+  at("lost").hidden = about === null;
+  at("status").dataset.stage = "connecting";
+  at("status").lastElementChild.textContent = "connecting";
+}});

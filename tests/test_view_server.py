@@ -1,0 +1,240 @@
+"""The live view's server: what a page may ask for, who is let in, and the command."""
+
+import json
+import math
+import socket
+import webbrowser
+from contextlib import contextmanager
+
+import pytest
+import torch
+
+from aaplug.core.errors import UsageError
+from aaplug.core.monitor import SILENT
+from aaplug.live.messages import See, Side, parsed
+from aaplug.verbs.view import attend, serving, view
+from tests.test_cli import cli, dataset  # noqa: F401  (fixtures)
+from tests.test_view import RECIPES, seen, unpacked  # noqa: F401  (a fixture)
+
+# ------------------------------------------------------------------------------------------------------- the messages
+
+POSE = torch.eye(4).flatten().tolist()
+GOOD = {
+    "id": 1, "pose": POSE, "focal": 50, "width": 40, "height": 30, "split": 0.5,
+    "sides": [{"recipe": "classic", "quality": "best"}, {"recipe": "auto", "quality": "fast"}],
+}  # fmt: skip
+REFUSED = {
+    "pose of NaN": ({"pose": [math.nan] * 16}, "pose: takes a number"),
+    "pose of infinity": ({"pose": [math.inf, *POSE[1:]]}, "pose: takes a number"),
+    "pose of words": ({"pose": ["../../etc/passwd"] * 16}, "pose: takes a number"),
+    "short pose": ({"pose": POSE[:12]}, "pose: takes 16 numbers"),
+    "mirror": ({"pose": [-1.0, *POSE[1:]]}, "pose: takes a rotation"),
+    "stretched": ({"pose": [2 * x for x in POSE]}, "pose: takes a rotation"),
+    "huge window": ({"width": 100_000, "height": 100_000}, "size: is 100000x100000 px; the limit is 8192"),
+    "many pixels": ({"width": 8000, "height": 8000}, "size: is 8000x8000 px"),
+    "no window": ({"width": 0}, "width: takes a number from 1"),
+    "half a pixel": ({"width": 1.5}, "width: takes a whole number"),
+    "focal": ({"focal": 0}, "focal: takes a number"),
+    "truth": ({"focal": True}, "focal: takes a number"),
+    "split": ({"split": 2}, "split: takes a number from 0 to 1"),
+    "camera": ({"at": 7}, "at: takes a number from 0 to 1"),
+    "one side": ({"sides": GOOD["sides"][:1]}, "sides: takes two objects"),
+    "recipe": ({"sides": [{"recipe": "evil", "quality": "best"}] * 2}, "recipe: 'evil' is not one of classic, auto"),
+    "quality": ({"sides": [{"recipe": "auto", "quality": "x" * 999}] * 2}, "is not one of fast, balanced, best"),
+    "paint": ({"paint": "../secret"}, "paint: '../secret' is not one of rate"),
+    "no id": ({"id": None}, "id: takes a number"),
+}
+GARBAGE = [
+    b"\x00" * 9, "", "{", "[" * 9000, "null", "[1]", "{}",
+    '{"see": 3}', '{"see": [], "shown": 1}', '{"open": "/etc/passwd"}',
+    '{"still": {"width": 9, "height": 9, "side": 3}}', '{"shown": "x"}', '{"shown": 1e999}',
+]  # fmt: skip
+
+
+def test_a_good_message_is_taken():
+    found = parsed(json.dumps({"see": GOOD | {"at": 1, "paint": "rate", "moving": True}}), RECIPES, 2)
+    assert isinstance(found, See)
+    assert (found.at, found.paint, found.moving, found.sides[1]) == (1, "rate", True, Side("auto", "fast"))
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_message_out_of_bounds_is_refused_in_clear_words(name):
+    other, words = REFUSED[name]
+    with pytest.raises(UsageError) as error:
+        parsed(json.dumps({"see": GOOD | other}), RECIPES, 2)
+    assert words in str(error.value)
+    assert len(str(error.value)) < 200
+
+
+@pytest.mark.parametrize("text", GARBAGE, ids=lambda text: str(text)[:20])
+def test_garbage_is_refused(text):
+    with pytest.raises(UsageError):
+        parsed(text, RECIPES, 2)
+
+
+# --------------------------------------------------------------------------------------------------------- the server
+
+
+@pytest.fixture(scope="module")
+def address(seen):  # noqa: F811
+    with serving(*seen, port=0, rasterizer="eager") as address:
+        yield address
+
+
+@contextmanager
+def connected(address: str, **how):
+    client = pytest.importorskip("websockets.sync.client")
+    target = address.replace("http", "ws", 1).partition("?")
+    how = {"origin": address.partition("/?")[0].rstrip("/")} | how
+    with client.connect(f"{target[0]}live{''.join(target[1:])}", proxy=None, max_size=None, **how) as connection:
+        yield connection
+
+
+def ask(connection, **other) -> dict:
+    """What a page hears at last."""
+    connection.send(json.dumps({"see": GOOD | other}))
+    while True:
+        header, _ = unpacked(connection.recv(timeout=20))
+        connection.send('{"shown": 1}')
+        if "problem" in header or header["stage"] == "done":
+            return header
+
+
+def raw(address: str, request: str) -> str:
+    """What the server answers to bytes."""
+    host, port = address.split("/")[2].split(":")
+    with socket.create_connection((host, int(port)), timeout=10) as stream:
+        stream.sendall(request.replace("\n", "\r\n").replace("HERE", f"{host}:{port}").encode("latin-1"))
+        return b"".join(iter(lambda: stream.recv(4096), b"")).decode("latin-1")
+
+
+def test_the_page_is_served_to_its_own_name_alone(address):
+    page = raw(address, "GET / HTTP/1.1\nHost: HERE\n\n")
+    assert page.startswith("HTTP/1.1 200")
+    assert "frame-ancestors 'none'" in page
+    assert "default-src 'none'" in page
+    for host in ("evil.example:8080", "", "127.0.0.1.evil.example"):
+        assert " 403 " in raw(address, f"GET / HTTP/1.1\nHost: {host}\n\n").splitlines()[0]
+    assert " 404 " in raw(address, "GET /../../etc/passwd HTTP/1.1\nHost: HERE\n\n").splitlines()[0]
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "null", None])
+def test_a_websocket_of_another_page_is_refused(address, origin):
+    exceptions = pytest.importorskip("websockets.exceptions")
+    with pytest.raises(exceptions.InvalidStatus, match="403"), connected(address, origin=origin):
+        pass
+
+
+def test_a_network_address_asks_for_its_token(seen):  # noqa: F811
+    exceptions = pytest.importorskip("websockets.exceptions")
+    with serving(*seen, host="0.0.0.0", port=0, rasterizer="eager") as address:
+        local = address.replace("0.0.0.0", "127.0.0.1")
+        bare, _, token = local.partition("?")
+        assert len(token) > 20
+        assert " 403 " in raw(bare, "GET / HTTP/1.1\nHost: HERE\n\n")
+        assert " 403 " in raw(bare, "GET /?token=wrong HTTP/1.1\nHost: HERE\n\n")
+        assert " 200 " in raw(bare, f"GET /?{token} HTTP/1.1\nHost: HERE\n\n")
+        with pytest.raises(exceptions.InvalidStatus, match="403"), connected(bare):
+            pass
+        with connected(local) as connection:
+            assert json.loads(connection.recv())["views"]
+
+
+def test_garbage_harms_nobody(address, capfd):
+    exceptions = pytest.importorskip("websockets.exceptions")
+    with connected(address) as good, connected(address) as bad:
+        good.recv()
+        bad.recv()
+        for text in GARBAGE:
+            bad.send(text)
+            assert "problem" in unpacked(bad.recv(timeout=10))[0]
+        assert "problem" in ask(bad, width=100_000)
+        assert ask(bad)["stage"] == "done"
+        bad.send("x" * 100_000)
+        with pytest.raises(exceptions.ConnectionClosedError, match="1009"):
+            bad.recv(timeout=10)
+        for request in (
+            "\n",
+            "POST / HTTP/1.1\nHost: HERE\n\n",
+            "\x16\x03\x01\x02\n\n",
+            "GET " + 20_000 * "a" + "\n\n",
+        ):
+            raw(address, request)
+        assert ask(good)["stage"] == "done"
+    assert capfd.readouterr().err == ""
+
+
+def test_a_pose_that_sees_nothing_has_a_picture(address):
+    with connected(address) as connection:
+        connection.recv()
+        away = [*POSE[:11], 1e8, *POSE[12:]]
+        assert ask(connection, pose=away)["stage"] == "done"
+
+
+# -------------------------------------------------------------------------------------------------------- the command
+
+
+def test_a_busy_port_is_one_clear_line(address, cli):  # noqa: F811
+    port = address.split(":")[2].rstrip("/")
+    code, _, err = cli(f"view scene.ply --cameras . --rasterizer eager --no-browser --port {port}")
+    assert code == 2
+    assert f"--port: {port} of 127.0.0.1 cannot be used: address already in use" in err.splitlines()[-1]
+
+
+def test_a_scene_that_fails_to_load_opens_no_page(cli):  # noqa: F811
+    code, _, err = cli("view missing.ply --no-browser --port 0")
+    assert (code, len(err.splitlines())) == (2, 1)
+    assert "missing.ply" in err
+
+
+def test_the_command_says_where_and_ends_quietly(cli, monkeypatch):  # noqa: F811
+    def interrupted(self, timeout=None):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(
+        "aaplug.verbs.view.threading", type("Fake", (), {"Event": type("E", (), {"wait": interrupted})})
+    )
+    code, _, err = cli("view scene.ply --cameras . --rasterizer eager --no-browser --port 0")
+    assert code == 0
+    assert "open http://127.0.0.1:" in err
+    assert err.splitlines()[-1] == "closed"
+
+
+def test_without_a_scene_the_sample_opens(monkeypatch):
+    opened = []
+    monkeypatch.setattr("aaplug.verbs.view.attend", lambda address, *_: opened.append(address))
+    view(port=0, rasterizer="eager")
+    assert opened[0].startswith("http://127.0.0.1:")
+
+
+def test_a_browser_in_the_terminal_is_not_opened(monkeypatch):
+    opened = []
+    windowed = type("Windowed", (), {"open": lambda self, address: opened.append(address)})()
+    event = type("Event", (), {"wait": lambda self: None})
+    monkeypatch.setattr("aaplug.verbs.view.threading", type("Threading", (), {"Event": event}))
+    for browser in (webbrowser.GenericBrowser("lynx"), windowed):
+        monkeypatch.setattr(webbrowser, "get", lambda chosen=browser: chosen)
+        attend("http://there/", SILENT, no_browser=False)
+    attend("http://there/", SILENT, no_browser=True)
+    assert opened == ["http://there/"]
+
+
+def test_without_the_extra_it_says_how_to_get_it(monkeypatch, seen):  # noqa: F811
+    monkeypatch.setattr("aaplug.verbs.view.find_spec", lambda name: None)
+    with pytest.raises(UsageError, match="pip install 'aaplug\\[view\\]'"):
+        view(*seen, port=0)
+
+
+def test_words_of_the_command_line_name_what_is_seen(tmp_path):
+    from aaplug_cli.options import CameraOptions, SceneOptions
+    from aaplug_cli.view import _words
+
+    scene = SceneOptions(scene=tmp_path / "s.ply", convention="mip", drop_bad=True)
+    assert _words(scene) == [str(tmp_path / "s.ply"), "--convention", "mip", "--drop-bad"]
+    assert _words(CameraOptions(cameras=tmp_path, train_scale=0.5)) == [
+        "--cameras",
+        str(tmp_path),
+        "--train-scale",
+        "0.5",
+    ]
+    assert _words(CameraOptions().orbit) == []
