@@ -35,7 +35,7 @@ class View:
 def _words(options: Any) -> list[str]:
     """The command line's words that give these options."""
     found: list[str] = []
-    for each in fields(options):
+    for each in sorted(fields(options), key=lambda each: each.name != "scene"):  # the positional one first
         value = getattr(options, each.name)
         if value in (None, False) or value == each.default or (each.name == "orbit" and not isinstance(value, int)):
             continue

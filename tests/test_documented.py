@@ -36,6 +36,12 @@ SHORTER = {  # options that make a documented command quicker; they come last, s
     "bench": ["--repeats", "1", "--gaussians", "100"],
 }
 FITTING = ["--steps", "2"]  # of `convert --for`, likewise
+NERFBASELINES = (
+    "nerfbaselines train --method aaplug --data chair --output run"
+    " --set scene=chair.ply --backend python --disable-output-artifact",
+    "nerfbaselines render --checkpoint run/checkpoint-0 --data chair --output predictions --backend python",
+    "nerfbaselines evaluate predictions --output results.json",
+)
 ELSEWHERE = {  # commands of the tests and benches themselves, and what runs them instead
     "python -m tests.bench.method_tables every_recipe": "ten minutes; needs scenes beside the repository",
     "python -m tests.bench.viewers": "minutes; needs Node.js and Chromium",
@@ -47,6 +53,7 @@ ELSEWHERE = {  # commands of the tests and benches themselves, and what runs the
         ("aaplug view", "aaplug view scene.ply", "aaplug view scene.ply --cameras path/to/colmap --port 8123"),
         "test_view.py: it ends when it is interrupted",
     ),
+    **dict.fromkeys(NERFBASELINES, "test_nerfbaselines.py, where the package is"),
     "python -m tests.guided -max_total_time=60": ".ci/run, twice for half as long",
 }
 
@@ -238,5 +245,5 @@ def test_every_option_in_the_documents_exists(capsys):
         helps += capsys.readouterr().out
     known = set(re.findall(r"--[a-z][a-z-]+", helps))
     named = set(re.findall(r"`(--[a-z][a-z-]+)", text))
-    others = {"--antialiasing", "--decimate"}  # of 3DGS's own scripts, of splat-transform
+    others = {"--antialiasing", "--decimate", "--set"}  # of 3DGS's own scripts, of splat-transform, of nerfbaselines
     assert named - known - others == set()

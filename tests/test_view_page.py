@@ -181,8 +181,7 @@ def test_the_scale_sets_the_size_in_pixels(opened):
     page.locator("input[name=enlarge]").nth(1).check(force=True)
     page.wait_for_function(f"document.querySelector('#picture').width === {width}")
     page.set_viewport_size({"width": 1000, "height": 420})
-    at_rest(page)
-    assert data(page, "size") != f"{width}x{height}"
+    page.wait_for_function(f"document.querySelector('{SEEN}').dataset.size !== '{width}x{height}'")
 
 
 def test_the_lens_shows_single_pixels_of_both_sides(opened):
