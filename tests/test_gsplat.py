@@ -472,6 +472,7 @@ def test_an_unchanged_training_loop_falls_to_the_same_loss_as_ours(packed, monke
 @pytest.mark.parametrize("packed", [True, False])
 def test_gsplats_own_densification_reads_meta(packed, absgrad):
     strategies = pytest.importorskip("gsplat.strategy", reason="the package gsplat is not installed")
+    torch.manual_seed(0)  # its densification draws numbers
     splats, data, _ = target_and_start()
     params = {name: torch.nn.Parameter(value.float()) for name, value in splats.items()}
     optimizers = {name: torch.optim.Adam([value], lr=1e-2) for name, value in params.items()}

@@ -241,7 +241,7 @@ def test_a_projection_along_an_axis_has_the_packed_minors():
 
 
 def test_one_lighter_scene(cli):
-    code, out, err = cli("lod scene.ply --cameras . -o light.ply --simplify 0.2 --json")
+    code, out, err = cli("lod scene.ply --cameras . -o light.ply --simplify 0.2 --steps 3 --json")
     assert code == 0, err
     assert json.loads(out)["levels"] == [{"rate": pytest.approx(0.2**0.5), "gaussians": 30}]
     found = read_scene(Path("light.ply"))

@@ -57,7 +57,7 @@ def opened(browser, address):  # noqa: F811
             page.on("console", lambda message: troubles.append(message.text))
             page.on("pageerror", lambda error: troubles.append(str(error)))
             page.goto(where)
-            page.wait_for_selector(f"{SEEN}[data-stage=done]", timeout=20_000)
+            at_rest(page)
             return page
 
         yield open_page
@@ -121,7 +121,7 @@ def test_a_streamed_picture_is_the_library_s_own(opened, seen):
         decibels = psnr(small[:, inside].contiguous(), quantised(expected)[:, inside].contiguous())
         assert decibels is None or decibels > 40  # None: equal
         page.keyboard.press("f")
-        page.wait_for_selector(f'{SEEN}[data-split="{flipped}"]')
+        at_rest(page, split=flipped)
 
 
 def test_its_own_policy_lets_it_work(opened):
@@ -136,12 +136,12 @@ def test_the_divider_works_by_mouse_and_by_keyboard(opened):
     assert data(page, "split") == "0.500"
     before = data(page, "asked")
     drag(page, (0.5, 0.5), (0.2, 0.5))
-    page.wait_for_selector(f'{SEEN}[data-split="0.200"]')
+    at_rest(page, split="0.200")
     page.keyboard.press("]")
-    page.wait_for_selector(f'{SEEN}[data-split="0.220"]')
+    at_rest(page, split="0.220")
     assert data(page, "asked") == before  # both sides are there; nothing is drawn anew
     page.keyboard.press("d")
-    page.wait_for_selector(f'{SEEN}[data-split="0.500"]')
+    at_rest(page, split="0.500")
     assert page.inner_text("#name-0") == "classic"
     assert page.inner_text("#name-1") == "auto · best"
     page.select_option("#recipe-0", "mip")

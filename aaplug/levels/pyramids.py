@@ -48,9 +48,12 @@ def levels_in(folder: str | PathLike[str], manifest: Manifest) -> Iterator[Level
     """The levels of a folder; see `read_pyramid`."""
     for place, entry in enumerate(manifest.levels):
         scene, sizes = read_scene(path_of(Path(folder), entry)), torch.tensor(entry.chunks)
+        problem = FormatError(Path(folder) / entry.file, f"does not have the chunks that {MANIFEST} lists")
+        if sizes.sum() != len(scene):  # before memory is taken for as many as it says
+            raise problem
         chunks = (
             torch.arange(len(sizes)).repeat_interleave(sizes) if place else chunks_of(scene.means, manifest.largest)
         )
-        if len(chunks) != len(scene) or not torch.equal(torch.bincount(chunks, minlength=len(sizes)), sizes):
-            raise FormatError(Path(folder) / entry.file, f"does not have the chunks that {MANIFEST} lists")
+        if not torch.equal(torch.bincount(chunks, minlength=len(sizes)), sizes):
+            raise problem
         yield Level(scene, entry.rate, chunks)
