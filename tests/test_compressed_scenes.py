@@ -19,6 +19,7 @@ from aaplug.io.scenes import (
     OWN,
     SCENE_FORMATS,
     WritableFormat,
+    called,
     find_scene,
     open_scene,
     ply,
@@ -274,6 +275,8 @@ def test_spz_without_its_writer_names_the_extra(tmp_path: Path, expected, monkey
 
 def test_a_sog_folder_is_a_scene(expected):
     assert find_scene(DATA / "oracle_sog").name == "meta.json"
+    assert called(find_scene(DATA / "oracle_sog")) == "oracle_sog"
+    assert called(DATA / "a.ply") == "a.ply"
     assert open_scene(find_scene(DATA / "oracle_sog")).count == len(expected)
 
 

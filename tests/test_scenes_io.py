@@ -18,7 +18,7 @@ from plyfile import PlyData
 import aaplug
 from aaplug.core.errors import FormatError, OutputError, UsageError
 from aaplug.core.gaussians import ANTIALIASED, CLASSIC, CONVENTIONS, MAX_LOG_SCALE, MIP, Convention, Fusion, Gaussians
-from aaplug.io.scenes import find_scene, open_scene, read_scene, write_parts, write_scene
+from aaplug.io.scenes import called, find_scene, open_scene, read_scene, write_parts, write_scene
 from aaplug.io.values import HEAD_LIMIT
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
@@ -774,6 +774,7 @@ def test_a_model_folder_means_its_last_iteration(tmp_path: Path):
     model = inria_model(tmp_path, "7000", "30000", "best")
     assert find_scene(model).parent.name == "iteration_30000"
     assert find_scene(model, 7000).parent.name == "iteration_7000"
+    assert called(find_scene(model)) == model.name
     assert len(read_scene(find_scene(model))) == 5
     with pytest.raises(FormatError, match="no iteration 5; it has 7000, 30000"):
         find_scene(model, 5)

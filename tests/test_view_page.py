@@ -292,6 +292,11 @@ def test_a_path_a_still_and_a_command_are_kept(opened, tmp_path):
     page.wait_for_function("document.querySelector('#said').textContent.includes('--views')")
     words = page.inner_text("#said")
     assert "aaplug render scene.ply --cameras 'a b' --views '<i>0' --scale" in words
+    assert "--recipe auto --quality best" in words
+    page.keyboard.press("f")
+    at_rest(page, split="1.000")
+    page.click("#command")  # of the side that is seen
+    page.wait_for_function("document.querySelector('#said').textContent.includes('--recipe classic -o')")
     page.fill("#width", "100000")
     page.click("#still")
     page.wait_for_function("document.querySelector('#said').textContent.startsWith('size: is 100000x48 px')")

@@ -183,18 +183,19 @@ class Pictures:
         """The photograph with figures, and what is painted over; at the end, word that all is done."""
         assert self._images is not None
         _, images, counts = self._images
-        about, parts = _about(counts, "done", started), []
+        about: dict[str, Any] = {}
+        parts: list[Part] = []
         if see.at is not None and see.photo and self._subject.views[see.at].photo is not None:
             yield None
             found, values = self._photographed(see, camera, images)
-            about, parts = about | values, [found]
+            about, parts = values, [found]
         if see.paint is not None:
             yield None
             samples = counts[1]
             levels, legend = PAINTS[see.paint](self._subject.renderer(see.sides[1]), camera, samples)
             parts.append(Part("paint", (0, camera.width), encode_png(levels[..., None])))
             about |= {"legend": legend}
-        yield picture(see, camera, parts, about)
+        yield picture(see, camera, parts, _about(counts, "done", started) | about)
 
     def _photographed(self, see: See, camera: Camera, images: list[Tensor]) -> tuple[Part, dict[str, Any]]:
         """The photograph at the picture's size, and the PSNR of both sides against what is seen of it."""

@@ -30,7 +30,7 @@ from aaplug.inspection.coverage import coverage
 from aaplug.inspection.differences import differences
 from aaplug.io.atomic import claimed, output_folder, refuse_existing
 from aaplug.io.cameras import select_views
-from aaplug.io.scenes import bytes_of, open_scene
+from aaplug.io.scenes import bytes_of, called, open_scene
 from aaplug.io.scenes.scene_file import SceneFile, usable
 from aaplug.methods.recipe import Recipe
 from aaplug.methods.recipes import RECIPES
@@ -47,6 +47,7 @@ from aaplug.verbs.inputs import (
     Held,
     SceneLike,
     drawn_by,
+    file_of,
     look_of,
     opened_and_seen,
     processor,
@@ -179,13 +180,13 @@ def _named(
     opened = [scene if isinstance(scene, Held | SceneFile) else open_scene(scene) for scene in given]
     if isinstance(scenes, Mapping):
         return dict(zip(scenes, opened, strict=True))
-    files = [_file_of(scene) for scene in opened]
+    files = [file_of(scene) for scene in opened]
     for file in filter(None, files[1:]):
         if files[1:].count(file) > 1:
             raise UsageError(
                 str(file), "is named twice; a scene is compared once (with itself, if it is the first too)"
             )
-    names = [f"scene {place}" if file is None else file.name for place, file in enumerate(files)]
+    names = [f"scene {place}" if file is None else called(file) for place, file in enumerate(files)]
     if len(set(names)) < len({file or place for place, file in enumerate(files)}):
         names = [
             name if file is None else f"{file.parent.name}/{name}" for name, file in zip(names, files, strict=True)
@@ -193,13 +194,6 @@ def _named(
     itself = [place > 0 and file is not None and file == files[0] for place, file in enumerate(files)]
     names = [name + " again" * same for name, same in zip(names, itself, strict=True)]
     return dict(zip(file_names(names, "scene", 1), opened, strict=True))
-
-
-def _file_of(scene: Held | SceneFile) -> Path | None:
-    if isinstance(scene, SceneFile):
-        return (scene.pyramid or scene.path).resolve()
-    origin = whole_of(scene).origin
-    return None if origin is None else Path(origin.path).resolve()
 
 
 def _one_reading(scenes: dict[str, Held | SceneFile], monitor: Monitor) -> dict[str, Held | SceneFile]:
@@ -233,7 +227,7 @@ def _rows(
     """What the scenes are, by name, the reference first; says what they lack."""
     (reference, (_, first)), known = next(iter(scenes.items())), list[ComparedScene]()
     for name, (source, held) in scenes.items():
-        scene, file = whole_of(held), _file_of(source)
+        scene, file = whole_of(held), file_of(source)
         odd = mismatch(whole_of(first), scene) if known else None
         if odd is not None:
             problem = f"is {reference} {odd}"

@@ -80,6 +80,14 @@ def shown_of(scene: Held | SceneFile, drop_bad: bool = False) -> Held:
     return scene if isinstance(scene, Held) else scene.whole(drop_bad)
 
 
+def file_of(scene: Held | SceneFile) -> Path | None:
+    """The file that it was read from, or its folder of levels of detail; None if it has none."""
+    if isinstance(scene, SceneFile):
+        return (scene.pyramid or scene.path).resolve()
+    origin = whole_of(scene).origin
+    return None if origin is None else Path(origin.path).resolve()
+
+
 def sources_of(scene: Held | SceneFile) -> list[Path]:
     """Files that outputs must not replace."""
     if isinstance(scene, SceneFile):

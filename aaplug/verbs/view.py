@@ -12,9 +12,10 @@ from typing import Annotated, Any
 
 from aaplug.core.errors import UsageError
 from aaplug.core.monitor import SILENT, Monitor
+from aaplug.io.scenes import called
 from aaplug.io.scenes.scene_file import SceneFile
 from aaplug.verbs.assumed import say_assumed
-from aaplug.verbs.inputs import CamerasLike, SceneLike, inputs_of, processor, unchecked_look_of, whole_of
+from aaplug.verbs.inputs import CamerasLike, SceneLike, file_of, opened_and_seen, processor, shown_of, unchecked_look_of
 from aaplug.verbs.options import RECIPE_NAMES, ViewOptions, flag, number
 
 FRAMES = 100  # that are drawn at least; not so many that kernels are compiled first
@@ -56,12 +57,13 @@ def serving(
     from aaplug.live.subject import Subject
 
     with _sample_or(scene) as (shown, where), processor(o.threads):
-        held, cameras = inputs_of(shown, where if cameras is None else cameras, monitor, drop_bad)
+        opened, cameras = opened_and_seen(shown, where if cameras is None else cameras, monitor)
+        held = shown_of(opened, drop_bad)
         look = unchecked_look_of(held, cameras, FRAMES, o, monitor)
         say_assumed(cameras, monitor)
-        name = whole_of(held).name
-        title = Path(name).name if scene is not None else "the bundled sample"
-        subject = Subject(held, cameras, look, RECIPE_NAMES, title, words or (name,))
+        file = file_of(opened)
+        title = "the bundled sample" if scene is None else "scene" if file is None else called(file)
+        subject = Subject(held, cameras, look, RECIPE_NAMES, title, words or (str(file or title),))
         with Studio(subject) as studio, Server(studio, o.host, o.port) as server:
             yield server.address
 

@@ -224,3 +224,11 @@ def find_scene(path: str | PathLike[str], iteration: int | None = None) -> Path:
     if chosen not in scenes:
         raise FormatError(path, f"has no iteration {chosen}; it has {', '.join(map(str, sorted(scenes)))}")
     return scenes[chosen]
+
+
+def called(path: Path) -> str:
+    """What people call the scene of a file or pyramid: its name, or that of its folder if its format names the file."""
+    whole = path.resolve()
+    if whole.match(MODEL_SCENE):
+        return whole.parents[2].name
+    return whole.parent.name if whole.name == SOG_FOLDER else whole.name

@@ -110,15 +110,17 @@ function savePath() {
   download(new Blob([pathOf(path)], {type: "application/json"}), "camera_path.json");
 }
 
+const sideSeen = () => state.split < 1 ? 1 : 0; // the right one, while some of it shows
+
 function saveStill() {
   const [width, height] = ["width", "height"].map((id) => Number(at(id).value));
-  if (link.send({still: {width, height, side: 1}})) say("rendering the picture");
+  if (link.send({still: {width, height, side: sideSeen()}})) say("rendering the picture");
 }
 
 const quoted = (word) => /^[\w@%+=:,./-]+$/.test(word) ? word : `'${word.replaceAll("'", "'\\''")}'`;
 
-function commandLine() { // what renders the right side as it is seen
-  const {size: [width, height], focal} = extent(), {recipe, quality} = state.sides[1];
+function commandLine() { // what renders a side as it is seen
+  const {size: [width, height], focal} = extent(), {recipe, quality} = state.sides[sideSeen()];
   const numbers = (values) => values.map((x) => String(+x.toFixed(6)));
   const how = ["--recipe", recipe, ...(takesQuality(recipe) ? ["--quality", quality] : [])], output = ["-o", "view.png"];
   if (about.assumed) {
