@@ -13,7 +13,7 @@ from playwright.sync_api import Page, sync_playwright
 
 from aaplug.verbs.view import serving
 
-WINDOW = {"width": 960, "height": 540}  # px
+WINDOW = (960, 540)  # px
 FRAMES, MILLISECONDS = 72, 90  # of a frame
 VIEW = "r_32"  # in which the capture begins
 TURN = 260  # px, how far the scene is dragged
