@@ -9,7 +9,7 @@ import io
 import math
 
 from PIL import Image
-from playwright.sync_api import Page, sync_playwright
+from playwright.sync_api import Page, ViewportSize, sync_playwright
 
 from aaplug.verbs.view import serving
 
@@ -56,9 +56,8 @@ def main() -> None:
     output = parser.parse_args().output
     with serving(port=0, no_browser=True) as address, sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        page = browser.new_context(
-            viewport=WINDOW, bypass_csp=True
-        ).new_page()  # playwright's waiting evaluates strings
+        size: ViewportSize = {"width": WINDOW[0], "height": WINDOW[1]}
+        page = browser.new_context(viewport=size, bypass_csp=True).new_page()  # playwright's waiting evaluates strings
         page.goto(address)
         rested(page)
         first, *others = captured(page)
