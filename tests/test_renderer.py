@@ -9,7 +9,7 @@ import torch
 from aaplug.core.cameras import WHITE, Camera, CameraSet
 from aaplug.core.errors import FrameError, UsageError
 from aaplug.core.gaussians import CONVENTIONS, MIP, Gaussians
-from aaplug.core.imaging import box_average, softened
+from aaplug.core.imaging import average_samples, box_average
 from aaplug.core.projection import project
 from aaplug.core.splats import Render
 from aaplug.core.training import TrainingViews
@@ -172,7 +172,7 @@ def test_scenes_are_projected_in_chunks_without_a_change(cameras, monkeypatch):
 def test_softening_spreads_a_sample_over_its_neighbours():
     rgb = torch.zeros(5, 6, 3)
     rgb[2, 3] = 1.0
-    soft = softened(Render(rgb, rgb[..., 0]), 0.1)
+    soft = average_samples(Render(rgb, rgb[..., 0]), 1, 0.1)
     down, right = torch.tensor([0, 0.1, 0.8, 0.1, 0]), torch.tensor([0, 0, 0.1, 0.8, 0.1, 0])
     torch.testing.assert_close(soft.alpha, down.outer(right))
     torch.testing.assert_close(soft.rgb, soft.alpha[..., None].expand(5, 6, 3))
@@ -181,12 +181,20 @@ def test_softening_spreads_a_sample_over_its_neighbours():
 @pytest.mark.parametrize("hw", [(1, 1), (1, 7), (5, 6)])
 def test_softening_keeps_the_sum(hw):
     image = Render(torch.rand(*hw, 3), torch.rand(hw))
-    soft = softened(image, 0.2)
+    soft = average_samples(image, 1, 0.2)
     for before, after in zip(image, soft, strict=True):
         torch.testing.assert_close(after.sum(), before.sum())
-    assert softened(image, 0.0) is image
+    assert average_samples(image, 1) is image
     white = Render(torch.ones(*hw, 3), torch.ones(hw))
-    assert softened(white, 0.03).rgb.equal(white.rgb)
+    assert average_samples(white, 1, 0.03).rgb.equal(white.rgb)
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_samples_are_softened_before_they_are_averaged(n):
+    image = Render(torch.rand(4 * n, 2 * n, 3), torch.rand(4 * n, 2 * n))
+    soft = average_samples(average_samples(image, 1, 0.1), n)
+    for expected, found in zip(soft, average_samples(image, n, 0.1), strict=True):
+        torch.testing.assert_close(found, expected)
 
 
 @pytest.mark.parametrize("quality", QUALITIES)

@@ -4,6 +4,7 @@ Images are [h, w, 3] in [0, 1].  A `factor` is the density of the new pixels aga
 """
 
 import math
+from functools import reduce
 
 import cv2
 import torch
@@ -23,29 +24,22 @@ def over(rgb: Float[Tensor, "h w 3"], alpha: Float[Tensor, "h w"], background: t
     return Render(torch.addcmul(rgb, (1 - alpha)[..., None], rgb.new_tensor(background)), alpha)
 
 
-def softened(render: Render, neighbours: float) -> Render:
-    """Weigh each sample with those beside it, (w, 1 - 2w, w) along each side for w = `neighbours`; edges repeat.
+def average_samples(render: Render, n: int, neighbours: float = 0.0) -> Render:
+    """Average n x n samples per pixel; both sides must be multiples of n.
 
-    It keeps the sum of the samples, and samples that are all equal.
+    neighbours: weight w with which each sample first takes in those on either side, (w, 1 - 2w, w) along each axis;
+    edges repeat.  It keeps the sum of the samples, and samples that are all equal.
     """
-    if neighbours == 0:
+    if n == 1 and neighbours == 0:
         return render
-    rgb, alpha = (_diffused(image, neighbours) for image in (render.rgb, render.alpha[..., None]))
+    rgb, alpha = (_pooled(image, n, neighbours) for image in (render.rgb, render.alpha[..., None]))
     return Render(rgb, alpha[..., 0])
-
-
-def average_samples(render: Render, n: int) -> Render:
-    """Average n x n samples per pixel; both sides must be multiples of n."""
-    if n == 1:
-        return render
-    return Render(box_average(render.rgb, n), box_average(render.alpha[..., None], n)[..., 0])
 
 
 def box_average(image: Float[Tensor, "h w c"], n: int) -> Float[Tensor, "H W c"]:
     """Mean of each box of n x n px; a partial box at the bottom or the right is cropped."""
     rows, columns = (side // n for side in image.shape[:2])
-    whole = image[: rows * n, : columns * n]
-    return whole.unflatten(1, (columns, n)).unflatten(0, (rows, n)).mean(dim=(1, 3))
+    return _pooled(image[: rows * n, : columns * n], n)
 
 
 def resampled(
@@ -88,14 +82,18 @@ def levels(rgb: Float[Tensor, "h w c"], bit_depth: int) -> Float[Tensor, "h w c"
     return (rgb.clamp(0, 1) * (2**bit_depth - 1)).round()
 
 
-def _diffused(image: Float[Tensor, "h w c"], weight: float) -> Float[Tensor, "h w c"]:
-    """What is equal stays so to the bit, because only differences move."""
+def _pooled(image: Float[Tensor, "h w c"], n: int, neighbours: float = 0.0) -> Float[Tensor, "H W c"]:
+    """See `average_samples`.  What neighbours exchange inside a box stays in it, so only its border samples count."""
     for dim in (0, 1):
-        steps, last = image.diff(dim=dim), image.shape[dim] - 1
-        image = image.clone()
-        image.narrow(dim, 0, last).add_(steps, alpha=weight)
-        image.narrow(dim, 1, last).sub_(steps, alpha=weight)
-    return image
+        along = image.movedim(dim, 0)
+        boxes = reduce(torch.add, (along[i::n] for i in range(n)))
+        if neighbours:
+            steps = neighbours * (along[n::n] - along[n - 1 : -1 : n])
+            boxes = boxes.clone()
+            boxes[:-1] += steps
+            boxes[1:] -= steps
+        image = boxes.movedim(0, dim)
+    return image / n**2
 
 
 def _resized(rgb: Tensor, hw: tuple[int, int], kernel: int) -> Tensor:

@@ -20,7 +20,7 @@ from aaplug.core.cameras import BLACK, WHITE, Camera, CameraSet
 from aaplug.core.culling import cull
 from aaplug.core.errors import UsageError
 from aaplug.core.gaussians import Gaussians
-from aaplug.core.imaging import average_samples, softened
+from aaplug.core.imaging import average_samples
 from aaplug.core.interfaces import Colour, Rasterizer, RunsKernels
 from aaplug.core.kernels import EAGER, Kernels
 from aaplug.core.projection import project, shade, with_depth_slopes
@@ -131,8 +131,7 @@ class Renderer:
         splats = self.splats(fine)
         recipe, rules = self.recipe, self.training.convention.rules
         image = self.rasterizer(splats, fine.hw, self.background, recipe.pixel, recipe.compositor, rules)
-        image = softened(image, self.neighbours(camera))
-        return Drawing(average_samples(image, samples), splats, fine.hw)
+        return Drawing(average_samples(image, samples, self.neighbours(camera)), splats, fine.hw)
 
     def sampled(self, camera: Camera) -> tuple[Camera, int]:
         """Camera of the supersampled image, and the samples along a pixel's side."""

@@ -7,14 +7,14 @@ import torch
 
 from aaplug.core.cameras import Camera
 from aaplug.core.culling import cull
-from aaplug.core.imaging import average_samples, softened
+from aaplug.core.imaging import average_samples
 from aaplug.core.interfaces import RunsKernels
 from aaplug.core.kernels import EAGER
 from aaplug.core.splats import Render, Splats2D
 from aaplug.rendering.renderer import Renderer
 
 SAMPLES = 1 << 19  # of a strip: some 30 ms on two cores
-HALO = 1  # samples beyond a strip, and pixels beyond its columns, that neighbours weigh in
+HALO = 1  # pixels beyond a strip, whose samples neighbours weigh in
 
 
 @torch.no_grad()
@@ -36,7 +36,7 @@ def strips(
     for top in range(0, camera.height, rows):
         yield
         bottom = min(top + rows, camera.height)
-        drawn.append(_strip(renderer, splats, fine.hw, (top * samples, bottom * samples), samples, soft))
+        drawn.append(_strip(renderer, splats, fine.hw, (top, bottom), samples, soft))
     whole = Render(*(torch.cat(parts) for parts in zip(*drawn, strict=True)))
     return Render(*(image[:, left - start : right - start] for image in whole))
 
@@ -44,16 +44,16 @@ def strips(
 def _strip(
     renderer: Renderer, splats: Splats2D, whole: tuple[int, int], rows: tuple[int, int], samples: int, soft: float
 ) -> Render:
-    """The pixels of some rows of samples; whole: height and width of all samples."""
-    top, bottom = max(0, rows[0] - HALO), min(whole[0], rows[1] + HALO)
+    """Some rows of pixels; whole: height and width of all samples."""
+    top, bottom = max(0, rows[0] - HALO), min(whole[0] // samples, rows[1] + HALO)
     recipe, rules, rasterizer = renderer.recipe, renderer.training.convention.rules, renderer.rasterizer
     kernels = rasterizer.kernels if isinstance(rasterizer, RunsKernels) else EAGER
-    moved, hw = _moved(splats, 0, -top), (bottom - top, whole[1])
+    moved, hw = _moved(splats, 0, -top * samples), ((bottom - top) * samples, whole[1])
     here = cull(moved, hw, kernels=kernels, ellipses=recipe.pixel.bounding_ellipses(moved, rules), rules=rules)
     image = rasterizer(here, hw, renderer.background, recipe.pixel, recipe.compositor, rules)
-    image = softened(image, soft)
+    pixels = average_samples(image, samples, soft)
     inner = slice(rows[0] - top, rows[1] - top)
-    return average_samples(Render(image.rgb[inner], image.alpha[inner]), samples)
+    return Render(pixels.rgb[inner], pixels.alpha[inner])
 
 
 def _moved(splats: Splats2D, right: int, down: int) -> Splats2D:

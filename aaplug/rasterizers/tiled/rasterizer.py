@@ -108,9 +108,9 @@ class Tiled:
 
 
 def _untiled(tiles: Float[Tensor, "k t P"], columns: int) -> Float[Tensor, "h w k"]:
-    """Put tiles, whole rows of them, in their places."""
-    image = tiles.view(len(tiles), -1, columns, TILE, TILE).permute(1, 3, 2, 4, 0)
-    return image.reshape(-1, columns * TILE, len(tiles))
+    """Put tiles, whole rows of them, in their places.  Each plane stays whole in memory, which copies fastest."""
+    planes = tiles.view(len(tiles), -1, columns, TILE, TILE).transpose(2, 3)
+    return planes.reshape(len(tiles), -1, columns * TILE).permute(1, 2, 0)
 
 
 def _assembled(bands: Iterator[Render], height: int) -> Render:
