@@ -25,6 +25,7 @@ class Kernel:
         outweighs the gathers.
     pulls_back: the function computes gradients itself, so it is traced before it is compiled.
     evaluations: splat-pixel evaluations of one call, per pixel of a tile; 0 for kernels that do not composite.
+    alone: up to this size "t" it runs on one thread, because waking the others takes longer.
     """
 
     name: str
@@ -34,6 +35,11 @@ class Kernel:
     gathers: bool = False
     pulls_back: bool = False
     evaluations: int = 0
+    alone: int = 0
+
+    def size(self, name: str, args: tuple[Tensor, ...]) -> int:
+        """A leading size of these arguments."""
+        return len(args[self.sizes.index(name)])
 
 
 def backward_of(kernel: Kernel, results: tuple[str, ...]) -> Kernel:

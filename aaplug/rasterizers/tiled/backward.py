@@ -27,6 +27,7 @@ from aaplug.methods.pixel_kernels.gradients import Move, SumsGradients, sums_by_
 from aaplug.methods.pixel_kernels.raster_rows import BLUE, GREEN, RED, tile_centres
 from aaplug.rasterizers.tiled.binning import Bins
 from aaplug.rasterizers.tiled.forward import (
+    ALONE,
     OWNERS,
     STEP,
     Compositing,
@@ -212,4 +213,5 @@ def step_kernel(pixel: PixelKernel, rules: Rules) -> Kernel:
         partial(_step, pixel, rules),
         partial(rows_example, 6, pixel.columns),
         (*8 * ("t",), None, None, "t"),
+        alone=ALONE,
     )

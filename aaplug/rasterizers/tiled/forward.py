@@ -25,6 +25,7 @@ STEP = 4  # splats per backward step; transmittance is stored before each step. 
 CHECK_EVERY = 2  # passes between checks for saturated tiles
 COMPACT_BELOW = 3 / 4  # saturated tiles are dropped once the share of unsaturated ones is below this
 FEWEST = 2  # tiles in a pass: compiled kernels take no fewer, and a tile without splats left stays as it is
+ALONE = 64  # tiles in a call: about what one thread composites while another wakes up
 GATE = 1e9  # lifts any nonzero output of `threshold` above 1, so that min(output · GATE, value) is `value` or 0
 EXAMPLE_TILES, EXAMPLE_SPLATS = (1024, 4096)  # as large as real work: inductor chooses by them which loops use threads
 
@@ -251,6 +252,7 @@ def pass_kernel(pixel: PixelKernel, rules: Rules) -> Kernel:
         partial(_pass_example, pixel.columns),
         ("m", "p", *8 * ("t",), None, None, "t"),
         evaluations=pixel.splats_per_pass,
+        alone=ALONE,
     )
 
 
