@@ -1,0 +1,215 @@
+"""The workers of a Dask cluster as an executor: a cluster on this machine, or any whose scheduler can be reached.
+
+What workers do, which holds the scene, is written once to a folder that all machines see.  A worker maps that file when
+its first item comes, and keeps it; only items and results pass through the scheduler.  An item whose worker dies is
+done again elsewhere, so work must bear being done twice.
+"""
+
+import logging
+import os
+import re
+import time
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import CancelledError
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from functools import lru_cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from distributed import Client, Future, KilledWorker, LocalCluster, get_worker
+from distributed import wait as wait_for
+from distributed.client import ClosedClientError
+from distributed.comm import CommClosedError
+
+from aaplug.core.errors import SHOWN, UsageError
+from aaplug.core.executors import AHEAD, WORK, results, loaded, save, torch_threads
+from aaplug.core.locks import scratch
+from aaplug.core.monitor import Monitor
+
+LOCAL = "local"  # instead of an address: a cluster on this machine, for the length of the call
+ADDRESS = re.compile(r"\w+://\S+:\d+", re.ASCII)
+ANSWER = 10.0  # seconds in which a scheduler answers and has a worker
+LOOK = 1.0  # seconds between looks at how many workers there are
+ABSENT = 60.0  # seconds without any worker after which the cluster counts as lost
+KEPT = 4  # scenes that a worker keeps: so many callers can share a cluster
+VERSIONS = {package: version(package) for package in ("aaplug", "torch")}  # on which results depend
+NOISY = ("distributed", "tornado", "asyncio")  # loggers that would write what the error says, and more
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+@dataclass
+class Cluster:
+    """A connected cluster.
+
+    name: its address, for messages.  folder: where all machines see files; None for this machine's temporary files.
+    monitor: told how many workers there are.
+    """
+
+    client: Client
+    name: str
+    folder: Path | None
+    monitor: Monitor
+    threads: int = field(default=0, init=False)
+    _seen: float = field(default_factory=time.monotonic, init=False)  # when there was a worker last
+
+    def map(self, work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+        """Yield `work(item)` of every item, in order.
+
+        Raises:
+            UsageError: the scheduler or all workers are lost, an item's worker died again and again, or a worker has
+                another version or does not see the folder.
+            OutputError: there is no room for the file of `work`.
+        """
+        self._seen = time.monotonic()
+        with scratch(self.folder and str(self.folder.absolute())) as folder, self._worded():
+            save(work, folder / WORK)
+            self.look()
+            path = str(folder / WORK)
+
+            def submit(item: T) -> "_Result[R]":
+                return _Result(self, self.client.submit(_call, path, VERSIONS, item, pure=False))
+
+            yield from results(submit, items, lambda: AHEAD * max(1, self.threads))
+
+    def look(self) -> None:
+        """Count the workers; raises UsageError if the scheduler has gone, or all of them for long."""
+        if self.client.status != "running":
+            raise self.lost()
+        facts = self.client.scheduler_info(n_workers=0)
+        self.threads = facts["total_threads"]
+        self.monitor.working(facts["n_workers"])
+        now = time.monotonic()
+        if self.threads:
+            self._seen = now
+        elif now - self._seen > ABSENT:
+            raise UsageError(f"scheduler {self.name}", f"has had no workers for {ABSENT:.0f} s")
+
+    def lost(self) -> UsageError:
+        """The error of a scheduler that has gone."""
+        return UsageError(f"scheduler {self.name}", "the connection is lost; start it again, and repeat the command")
+
+    def check(self) -> None:
+        """Refuse workers with other versions, by their addresses."""
+        for package, expected in VERSIONS.items():
+            for worker, found in sorted(self.client.run(version, package, on_error="return").items()):
+                _refuse_other(worker, package, found, expected)
+
+    @contextmanager
+    def _worded(self) -> Iterator[None]:
+        try:
+            yield
+        except KilledWorker as error:
+            died = f"died {error.allowed_failures + 1} times at one item: out of memory, for example"
+            raise UsageError(f"worker {error.last_worker.address}", died) from error
+        except (CancelledError, CommClosedError, ClosedClientError) as error:
+            raise self.lost() from error
+
+
+@dataclass(frozen=True)
+class _Result(Generic[R]):
+    """A result to come; who waits for it sees how many workers there are."""
+
+    cluster: Cluster
+    future: "Future[R]"
+
+    def result(self) -> R:
+        while True:
+            try:
+                wait_for([self.future], timeout=LOOK)
+                return self.future.result()
+            except TimeoutError:
+                if self.future.done():  # the item's own
+                    raise
+                self.cluster.look()
+
+
+@contextmanager
+def connected(scheduler: str, threads: int, folder: Path | None, monitor: Monitor) -> Iterator[Cluster]:
+    """A cluster that is there inside the block.
+
+    scheduler: "local" for one of `threads` processes on this machine; or an address such as tcp://host:8786.
+    folder: see `Cluster`.
+
+    Raises:
+        UsageError: the address is none, nothing answers there, it has no workers, or one has another version.
+    """
+    with _quietly(), ExitStack() as stack:
+        if scheduler == LOCAL:
+            own = _local(threads, stack.enter_context(scratch()))
+            cluster, folder = Cluster(stack.enter_context(Client(stack.enter_context(own))), LOCAL, None, monitor), None
+        else:
+            cluster = Cluster(stack.enter_context(_client(scheduler)), scheduler, folder, monitor)
+            if folder is None:
+                raise UsageError("output", f"name a folder that the workers of {scheduler} see, too")
+        try:
+            cluster.client.wait_for_workers(1, timeout=ANSWER)
+        except TimeoutError as error:
+            raise UsageError(f"scheduler {scheduler}", "has no workers; start some with `dask worker`") from error
+        cluster.check()
+        yield cluster
+
+
+def _client(address: str) -> Client:
+    if ADDRESS.fullmatch(address) is None:
+        raise UsageError("scheduler", f"takes local or an address such as tcp://host:8786, got {address[:SHOWN]}")
+    try:
+        return Client(address, timeout=ANSWER, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise UsageError(f"scheduler {address}", f"nothing answers there within {ANSWER:.0f} s") from error
+
+
+def _local(workers: int, folder: Path) -> LocalCluster:
+    """Processes of this machine, each with one thread and as much memory as there is."""
+    return LocalCluster(
+        n_workers=workers,
+        threads_per_worker=1,
+        dashboard_address=None,
+        memory_limit=0,
+        silence_logs=logging.CRITICAL,
+        local_directory=str(folder),
+    )
+
+
+@contextmanager
+def _quietly() -> Iterator[None]:
+    """Keep Dask's log from the terminal inside the block; what matters is told by errors."""
+    names = [name for name in logging.root.manager.loggerDict if name.split(".")[0] in NOISY]
+    before = {name: logging.getLogger(name).level for name in names}
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", module="distributed")
+        for name in before:
+            logging.getLogger(name).setLevel(logging.CRITICAL + 1)
+        try:
+            yield
+        finally:
+            for name, level in before.items():
+                logging.getLogger(name).setLevel(level)
+
+
+# on the workers
+
+
+def _refuse_other(worker: str, package: str, found: object, expected: str) -> None:
+    if found != expected:
+        got = f"{package} {found}" if isinstance(found, str) else f"no {package}"
+        raise UsageError(f"worker {worker}", f"has {got}, expected {expected}; install that there")
+
+
+def _call(path: str, versions: dict[str, str], item: Any) -> Any:
+    """One item; a worker that came after the caller's check is checked here."""
+    for package, expected in versions.items():
+        _refuse_other(get_worker().address, package, VERSIONS[package], expected)
+    with torch_threads(1):
+        return _work(path)(item)
+
+
+@lru_cache(KEPT)
+def _work(path: str) -> Callable[[Any], Any]:
+    if not os.path.exists(path):
+        raise UsageError(f"worker {get_worker().address}", f"does not see {path}: it needs the same file system")
+    return loaded(path)
