@@ -17,15 +17,14 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar, cast
 
 from distributed import Client, Future, KilledWorker, LocalCluster, get_worker
-from distributed import wait as wait_for
 from distributed.client import ClosedClientError
-from distributed.comm import CommClosedError
+from distributed.comm.core import CommClosedError
 
 from aaplug.core.errors import SHOWN, UsageError
-from aaplug.core.executors import AHEAD, WORK, results, loaded, save, torch_threads
+from aaplug.core.executors import AHEAD, WORK, loaded, results, save, torch_threads
 from aaplug.core.locks import scratch
 from aaplug.core.monitor import Monitor
 
@@ -91,13 +90,18 @@ class Cluster:
 
     def lost(self) -> UsageError:
         """The error of a scheduler that has gone."""
-        return UsageError(f"scheduler {self.name}", "the connection is lost; start it again, and repeat the command")
+        again = "start it again, and repeat the command, with `resume` where it has one"
+        return UsageError(f"scheduler {self.name}", f"the connection is lost; {again}")
 
     def check(self) -> None:
         """Refuse workers with other versions, by their addresses."""
         for package, expected in VERSIONS.items():
-            for worker, found in sorted(self.client.run(version, package, on_error="return").items()):
+            for worker, found in sorted(self._everywhere(version, package).items()):
                 _refuse_other(worker, package, found, expected)
+
+    def _everywhere(self, call: Callable[..., object], *args: object) -> dict[str, Any]:
+        """What a call returns on each worker, or the error that it raises there, by the workers' addresses."""
+        return cast(dict[str, Any], self.client.run(call, *args, on_error="return"))
 
     @contextmanager
     def _worded(self) -> Iterator[None]:
@@ -120,11 +124,10 @@ class _Result(Generic[R]):
     def result(self) -> R:
         while True:
             try:
-                wait_for([self.future], timeout=LOOK)
-                return self.future.result()
+                return self.future.result(timeout=LOOK)
             except TimeoutError:
-                if self.future.done():  # the item's own
-                    raise
+                if self.future.done():  # meanwhile, or the error is the item's own
+                    return self.future.result()
                 self.cluster.look()
 
 
@@ -168,7 +171,7 @@ def _local(workers: int, folder: Path) -> LocalCluster:
     return LocalCluster(
         n_workers=workers,
         threads_per_worker=1,
-        dashboard_address=None,
+        dashboard_address=cast(str, None),
         memory_limit=0,
         silence_logs=logging.CRITICAL,
         local_directory=str(folder),
