@@ -24,7 +24,7 @@ from distributed.client import ClosedClientError
 from distributed.comm.core import CommClosedError
 
 from aaplug.core.errors import SHOWN, UsageError
-from aaplug.core.executors import AHEAD, WORK, loaded, results, save, torch_threads
+from aaplug.core.executors import AHEAD, WORK, loaded, results, save, torch_threads, track_quietly
 from aaplug.core.locks import scratch
 from aaplug.core.monitor import Monitor
 
@@ -35,6 +35,7 @@ LOOK = 1.0  # seconds between looks at how many workers there are
 ABSENT = 60.0  # seconds without any worker after which the cluster counts as lost
 KEPT = 4  # scenes that a worker keeps: so many callers can share a cluster
 VERSIONS = {package: version(package) for package in ("aaplug", "torch")}  # on which results depend
+DEAF = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"  # to Ctrl-C, which the caller hears
 NOISY = ("distributed", "tornado", "asyncio")  # loggers that would write what the error says, and more
 
 T = TypeVar("T")
@@ -144,11 +145,11 @@ def connected(scheduler: str, threads: int, folder: Path | None, monitor: Monito
     with _quietly(), ExitStack() as stack:
         if scheduler == LOCAL:
             own = _local(threads, stack.enter_context(scratch()))
-            cluster, folder = Cluster(stack.enter_context(Client(stack.enter_context(own))), LOCAL, None, monitor), None
+            cluster = Cluster(stack.enter_context(Client(stack.enter_context(own))), LOCAL, None, monitor)
         else:
-            cluster = Cluster(stack.enter_context(_client(scheduler)), scheduler, folder, monitor)
             if folder is None:
                 raise UsageError("output", f"name a folder that the workers of {scheduler} see, too")
+            cluster = Cluster(stack.enter_context(_client(scheduler)), scheduler, folder, monitor)
         try:
             cluster.client.wait_for_workers(1, timeout=ANSWER)
         except TimeoutError as error:
@@ -168,6 +169,7 @@ def _client(address: str) -> Client:
 
 def _local(workers: int, folder: Path) -> LocalCluster:
     """Processes of this machine, each with one thread and as much memory as there is."""
+    track_quietly()
     return LocalCluster(
         n_workers=workers,
         threads_per_worker=1,
@@ -175,6 +177,7 @@ def _local(workers: int, folder: Path) -> LocalCluster:
         memory_limit=0,
         silence_logs=logging.CRITICAL,
         local_directory=str(folder),
+        preload=[DEAF],
     )
 
 

@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing import resource_tracker
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import torch
 
@@ -37,6 +37,7 @@ Result = TypeVar("Result", covariant=True)
 Apply = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]  # like `map`, and each executor's
 
 
+@runtime_checkable
 class Executor(Protocol):
     """A pool of workers: threads, processes of this machine, or a cluster's (`core.cluster`)."""
 
@@ -94,7 +95,7 @@ class Processes:
         with scratch() as folder:
             save(work, folder / WORK)
             start = (str(folder), self.torch_threads)
-            _track_quietly()
+            track_quietly()
             spawn = multiprocessing.get_context("spawn")
             pool = ProcessPoolExecutor(self.workers, spawn, _start, start)
             try:
@@ -173,7 +174,7 @@ def loaded(path: str | Path) -> Callable[[Any], Any]:
     return torch.load(path, mmap=True, weights_only=False)  # our own file
 
 
-def _track_quietly() -> None:
+def track_quietly() -> None:
     """Start Python's resource tracker, which inherits the options of warnings, before the first worker does."""
     if os.name != "posix":  # there is none
         return
