@@ -174,6 +174,7 @@ def test_an_item_whose_worker_dies_is_done_again_unless_it_kills_all(local, tmp_
 
 
 def test_a_worker_with_another_version_is_refused_by_name(local, monkeypatch):
+    local.client.wait_for_workers(1)  # another test may have killed it
     monkeypatch.setitem(cluster.VERSIONS, "aaplug", "9.9")
     found = rf"worker tcp://127\.0\.0\.1:\d+: has aaplug {version('aaplug')}, expected 9\.9; install that there"
     with pytest.raises(UsageError, match=found):

@@ -6,8 +6,10 @@ done again elsewhere, so work must bear being done twice.
 """
 
 import logging
+import math
 import os
 import re
+import threading
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
@@ -55,7 +57,8 @@ class Cluster:
     folder: Path | None
     monitor: Monitor
     threads: int = field(default=0, init=False)
-    _seen: float = field(default_factory=time.monotonic, init=False)  # when there was a worker last
+    _looked: float = field(default=-math.inf, init=False)  # when it was looked at last
+    _seen: float = field(default=math.inf, init=False)  # when it had a worker last
 
     def map(self, work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
         """Yield `work(item)` of every item, in order.
@@ -65,8 +68,8 @@ class Cluster:
                 another version or does not see the folder.
             OutputError: there is no room for the file of `work`.
         """
-        self._seen = time.monotonic()
-        with scratch(self.folder and str(self.folder.absolute())) as folder, self._worded():
+        self._looked, self._seen = -math.inf, time.monotonic()
+        with scratch(self.folder and str(self.folder.absolute())) as folder, self.worded():
             save(work, folder / WORK)
             self.look()
             path = str(folder / WORK)
@@ -77,19 +80,21 @@ class Cluster:
             yield from results(submit, items, lambda: AHEAD * max(1, self.threads))
 
     def look(self) -> None:
-        """Count the workers; raises UsageError if the scheduler has gone, or all of them for long."""
+        """Count the workers now and then; raises UsageError if the scheduler has gone, or all of them for long."""
         if self.client.status != "running":
-            raise self.lost()
+            raise self._lost()
+        if time.monotonic() - self._looked < LOOK:
+            return
         facts = self.client.scheduler_info(n_workers=0)
         self.threads = facts["total_threads"]
         self.monitor.working(facts["n_workers"])
-        now = time.monotonic()
+        self._looked = time.monotonic()
         if self.threads:
-            self._seen = now
-        elif now - self._seen > ABSENT:
+            self._seen = self._looked
+        elif self._looked - self._seen > ABSENT:
             raise UsageError(f"scheduler {self.name}", f"has had no workers for {ABSENT:.0f} s")
 
-    def lost(self) -> UsageError:
+    def _lost(self) -> UsageError:
         """The error of a scheduler that has gone."""
         again = "start it again, and repeat the command, with `resume` where it has one"
         return UsageError(f"scheduler {self.name}", f"the connection is lost; {again}")
@@ -98,21 +103,23 @@ class Cluster:
         """Refuse workers with other versions, by their addresses."""
         for package, expected in VERSIONS.items():
             for worker, found in sorted(self._everywhere(version, package).items()):
-                _refuse_other(worker, package, found, expected)
+                if not isinstance(found, OSError):  # a worker that has gone meanwhile
+                    _refuse_other(worker, package, found, expected)
 
     def _everywhere(self, call: Callable[..., object], *args: object) -> dict[str, Any]:
         """What a call returns on each worker, or the error that it raises there, by the workers' addresses."""
         return cast(dict[str, Any], self.client.run(call, *args, on_error="return"))
 
     @contextmanager
-    def _worded(self) -> Iterator[None]:
+    def worded(self) -> Iterator[None]:
+        """Turn what Dask raises inside the block into an error of one line."""
         try:
             yield
         except KilledWorker as error:
             died = f"died {error.allowed_failures + 1} times at one item: out of memory, for example"
             raise UsageError(f"worker {error.last_worker.address}", died) from error
         except (CancelledError, CommClosedError, ClosedClientError) as error:
-            raise self.lost() from error
+            raise self._lost() from error
 
 
 @dataclass(frozen=True)
@@ -124,12 +131,12 @@ class _Result(Generic[R]):
 
     def result(self) -> R:
         while True:
+            self.cluster.look()
             try:
                 return self.future.result(timeout=LOOK)
             except TimeoutError:
                 if self.future.done():  # meanwhile, or the error is the item's own
                     return self.future.result()
-                self.cluster.look()
 
 
 @contextmanager
@@ -150,11 +157,12 @@ def connected(scheduler: str, threads: int, folder: Path | None, monitor: Monito
             if folder is None:
                 raise UsageError("output", f"name a folder that the workers of {scheduler} see, too")
             cluster = Cluster(stack.enter_context(_client(scheduler)), scheduler, folder, monitor)
-        try:
-            cluster.client.wait_for_workers(1, timeout=ANSWER)
-        except TimeoutError as error:
-            raise UsageError(f"scheduler {scheduler}", "has no workers; start some with `dask worker`") from error
-        cluster.check()
+        with cluster.worded():
+            try:
+                cluster.client.wait_for_workers(1, timeout=ANSWER)
+            except TimeoutError as error:
+                raise UsageError(f"scheduler {scheduler}", "has no workers; start some with `dask worker`") from error
+            cluster.check()
         yield cluster
 
 
@@ -199,6 +207,8 @@ def _quietly() -> Iterator[None]:
 
 # on the workers
 
+_alone = threading.Lock()  # a worker with more threads does one item at a time: what it keeps is not made for two
+
 
 def _refuse_other(worker: str, package: str, found: object, expected: str) -> None:
     if found != expected:
@@ -210,7 +220,7 @@ def _call(path: str, versions: dict[str, str], item: Any) -> Any:
     """One item; a worker that came after the caller's check is checked here."""
     for package, expected in versions.items():
         _refuse_other(get_worker().address, package, VERSIONS[package], expected)
-    with torch_threads(1):
+    with _alone, torch_threads(1):
         return _work(path)(item)
 
 
