@@ -5,6 +5,7 @@ its first item comes, and keeps it; only items and results pass through the sche
 done again elsewhere, so work must bear being done twice.
 """
 
+import ctypes
 import logging
 import math
 import os
@@ -14,9 +15,9 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import CancelledError
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cache, lru_cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Generic, TypeVar, cast
@@ -38,6 +39,7 @@ ABSENT = 60.0  # seconds without any worker after which the cluster counts as lo
 KEPT = 4  # scenes that a worker keeps: so many callers can share a cluster
 VERSIONS = {package: version(package) for package in ("aaplug", "torch")}  # on which results depend
 DEAF = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"  # to Ctrl-C, which the caller hears
+MALLOC = {-3: 1 << 25, -1: 1 << 27}  # bytes for mallopt's M_MMAP_THRESHOLD and M_TRIM_THRESHOLD
 NOISY = ("distributed", "tornado", "asyncio")  # loggers that would write what the error says, and more
 
 T = TypeVar("T")
@@ -228,4 +230,13 @@ def _call(path: str, versions: dict[str, str], item: Any) -> Any:
 def _work(path: str) -> Callable[[Any], Any]:
     if not os.path.exists(path):
         raise UsageError(f"worker {get_worker().address}", f"does not see {path}: it needs the same file system")
+    _keep_memory()
     return loaded(path)
+
+
+@cache
+def _keep_memory() -> None:
+    """Let glibc keep freed memory for the next image, which Dask forbids its workers: that takes most of their time."""
+    with suppress(OSError, AttributeError, TypeError):  # another C library
+        for parameter, value in MALLOC.items():
+            ctypes.CDLL(None).mallopt(parameter, value)

@@ -1,0 +1,181 @@
+"""Clusters of this machine: `python -m tests.bench.cluster same|speed|costs`.
+
+same: kill a worker and the caller at random moments of an evaluation on three workers, resume, and compare the bytes.
+speed: the rate of `--scheduler local` against that of plain processes.
+costs: what sending a scene, an item and a line of the journal takes.
+"""
+
+import argparse
+import os
+import random
+import shutil
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from functools import partial
+from pathlib import Path
+
+import psutil
+import torch
+
+import aaplug
+from aaplug.core.cluster import connected
+from aaplug.core.executors import WORK, Executor, Processes, loaded, save
+from aaplug.core.monitor import SILENT
+from aaplug.evaluation.engine import Task, _Measuring, candidates_of
+from aaplug.evaluation.journal import Journal
+from aaplug.evaluation.results import Measurement
+from aaplug.evaluation.truth import Truth, own_look
+from aaplug.io.cameras import read_cameras
+from aaplug.io.scenes import read_scene
+from aaplug.rendering.benchmark import synthetic_scene
+from tests.conftest import SAMPLE
+from tests.test_batch import timeless
+
+PROGRAM = "from aaplug_cli.main import program; program()"
+SCALES = (1.0, 0.5, 0.25, 0.125, 0.0625)
+
+
+def same(kills: int, seed: int) -> None:
+    """Kill, resume and compare; the first moments until the workers run are left out."""
+    dice, equal = random.Random(seed), 0
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        began = time.monotonic()
+        assert _evaluation(folder / "one").wait() == 0
+        seconds, whole = time.monotonic() - began, timeless(folder / "one")
+        print(f"one process: {seconds:.1f} s, {len(whole)} files")
+        for kill in range(kills):
+            out = folder / "out"
+            shutil.rmtree(out, ignore_errors=True)
+            caller = _evaluation(out, "--scheduler", "local", "--threads", "3")
+            views = _killed(caller, out, dice.uniform(0, seconds))
+            code = _evaluation(out, "--scheduler", "local", "--threads", "3", "--resume").wait()
+            good = code == 0 and timeless(out) == whole
+            equal += good
+            print(f"{kill + 1}: caller killed with {views} views done: {'same' if good else 'DIFFERENT'}")
+    print(f"{equal} of {kills} the same")
+    sys.exit(equal != kills)
+
+
+def _evaluation(output: Path, *words: str) -> subprocess.Popen[bytes]:
+    scene = [str(SAMPLE / "chair.ply"), "--cameras", str(SAMPLE), "--views", "test"]
+    how = ["--recipe", "classic", "auto", "--scale", "0.25", "0.125", "--layout", "inria"]
+    command = [sys.executable, "-c", PROGRAM, "evaluate", *scene, *how, "-o", str(output), *words]
+    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+
+def _killed(caller: subprocess.Popen[bytes], output: Path, seconds: float) -> int:
+    """Kill a worker when the first view is done, and the caller so long after; the number of views done."""
+    journal = output / "progress.jsonl"
+    while not journal.exists() and caller.poll() is None:
+        time.sleep(0.01)
+    workers = [p for p in psutil.Process(caller.pid).children(recursive=True) if "spawn_main" in " ".join(p.cmdline())]
+    workers[0].kill()
+    time.sleep(seconds / 3)
+    caller.kill()
+    caller.wait()
+    return max(0, len(journal.read_bytes().splitlines()) - 1)
+
+
+def speed(workers: int, views: int, runs: int) -> None:
+    """Rates of both pools, by turns."""
+    work, pools = _measuring(views), {"processes": _processes, "--scheduler local": _local}
+    found: dict[str, list[tuple[float, float]]] = {name: [] for name in pools}
+    for _ in range(runs):
+        for name, pool in pools.items():
+            began = time.monotonic()
+            with pool(workers) as executor:
+                ends = [time.monotonic() for _ in executor.map(work, range(views))]
+            total = time.monotonic() - began
+            found[name].append((views / total, (views - 1) / (ends[-1] - ends[0])))
+            print(f"{name}: {total:.1f} s, after the first view {found[name][-1][1]:.2f} views a second", flush=True)
+    medians = {
+        name: [statistics.median(column) for column in zip(*rates, strict=True)] for name, rates in found.items()
+    }
+    for name, (whole, running) in medians.items():
+        print(f"{name}: {whole:.3f} views a second with start and end, {running:.3f} without")
+    ratios = [b / a for a, b in zip(*medians.values(), strict=True)]
+    print(f"ratio: {ratios[0]:.2f} with start and end, {ratios[1]:.2f} without")
+
+
+@contextmanager
+def _processes(workers: int) -> Iterator[Executor]:
+    yield Processes(workers)
+
+
+def _local(workers: int) -> AbstractContextManager[Executor]:
+    return connected("local", workers, None, SILENT)
+
+
+def _measuring(views: int) -> Callable[[int], object]:
+    """The sample's evaluation at five scales."""
+    scene, cameras = read_scene(SAMPLE / "chair.ply"), read_cameras(SAMPLE)
+    shown = cameras.train[:views]
+    renderer = aaplug.Renderer.of(scene, cameras, "auto", rasterizer="eager")
+    candidates = candidates_of(scene, renderer.training, [renderer.recipe], "eager")
+    return _Measuring(Task(candidates, SCALES, shown, Truth(own_look(scene, renderer.training))), None)
+
+
+def costs() -> None:
+    """Medians of what a batch pays besides its views."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for count in (50_000, 1_000_000):
+            scene = synthetic_scene(count)
+            work = partial(_touched, scene)
+            began = time.monotonic()
+            save(work, folder / WORK)
+            written = time.monotonic()
+            loaded(folder / WORK)(0)
+            read = time.monotonic()
+            size = (folder / WORK).stat().st_size / 1e6
+            print(
+                f"{count:,} Gaussians, {size:.0f} MB: {written - began:.2f} s to write, {read - written:.2f} s to read"
+            )
+        with Journal(folder / "j" / "progress.jsonl", {}, resume=False) as journal:
+            line = [Measurement("auto", s, "v", {"PSNR": 30.0, "SSIM": 0.9}, 4, 0.1, "", 1) for s in SCALES * 5]
+            times = []
+            for view in range(200):
+                began = time.monotonic()
+                journal.add(view, line)
+                times.append(time.monotonic() - began)
+            size = journal.path.stat().st_size / len(times)
+            print(f"journal: {1000 * statistics.median(times):.2f} ms a view, {size:.0f} bytes")
+    for workers in (1, 3):
+        with connected("local", workers, None, SILENT) as cluster:
+            list(cluster.map(os.path.basename, ["a"] * 10))
+            began = time.monotonic()
+            list(cluster.map(os.path.basename, ["a"] * 1000))
+            print(f"items, {workers} workers: {time.monotonic() - began:.2f} ms each")
+
+
+def _touched(scene: aaplug.Gaussians, _: int) -> float:
+    """Read all of a scene."""
+    return float(sum(value.double().sum() for value in vars(scene).values() if isinstance(value, torch.Tensor)))
+
+
+def main() -> None:
+    """Measure what is asked for."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("what", choices=["same", "speed", "costs"])
+    parser.add_argument("--kills", type=int, default=10)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--views", type=int, default=24)
+    parser.add_argument("--runs", type=int, default=3)
+    o = parser.parse_args()
+    if o.what == "same":
+        same(o.kills, o.seed)
+    elif o.what == "speed":
+        speed(o.workers, o.views, o.runs)
+    else:
+        costs()
+
+
+if __name__ == "__main__":
+    main()
