@@ -22,12 +22,14 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Generic, TypeVar, cast
 
+import dask
+import torch
 from distributed import Client, Future, KilledWorker, LocalCluster, get_worker
 from distributed.client import ClosedClientError
 from distributed.comm.core import CommClosedError
 
 from aaplug.core.errors import SHOWN, UsageError
-from aaplug.core.executors import AHEAD, WORK, loaded, results, save, torch_threads, track_quietly
+from aaplug.core.executors import AHEAD, WORK, loaded, results, save, track_quietly
 from aaplug.core.locks import scratch
 from aaplug.core.monitor import Monitor
 
@@ -40,6 +42,10 @@ KEPT = 4  # scenes that a worker keeps: so many callers can share a cluster
 VERSIONS = {package: version(package) for package in ("aaplug", "torch")}  # on which results depend
 DEAF = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"  # to Ctrl-C, which the caller hears
 MALLOC = {-3: 1 << 25, -1: 1 << 27}  # bytes for mallopt's M_MMAP_THRESHOLD and M_TRIM_THRESHOLD
+LEAN = {  # of workers on this machine: variables that would stay in our own environment too, and a sampling profiler
+    "distributed.nanny.pre-spawn-environ": {},
+    "distributed.worker.profile.enabled": False,
+}
 NOISY = ("distributed", "tornado", "asyncio")  # loggers that would write what the error says, and more
 
 T = TypeVar("T")
@@ -180,15 +186,16 @@ def _client(address: str) -> Client:
 def _local(workers: int, folder: Path) -> LocalCluster:
     """Processes of this machine, each with one thread and as much memory as there is."""
     track_quietly()
-    return LocalCluster(
-        n_workers=workers,
-        threads_per_worker=1,
-        dashboard_address=cast(str, None),
-        memory_limit=0,
-        silence_logs=logging.CRITICAL,
-        local_directory=str(folder),
-        preload=[DEAF],
-    )
+    with dask.config.set(LEAN):
+        return LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            dashboard_address=cast(str, None),
+            memory_limit=0,
+            silence_logs=logging.CRITICAL,
+            local_directory=str(folder),
+            preload=[DEAF],
+        )
 
 
 @contextmanager
@@ -222,7 +229,8 @@ def _call(path: str, versions: dict[str, str], item: Any) -> Any:
     """One item; a worker that came after the caller's check is checked here."""
     for package, expected in versions.items():
         _refuse_other(get_worker().address, package, VERSIONS[package], expected)
-    with _alone, torch_threads(1):
+    with _alone:
+        torch.set_num_threads(1)  # of this thread, and for good: torch takes time to change it
         return _work(path)(item)
 
 

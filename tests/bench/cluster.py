@@ -8,6 +8,7 @@ costs: what sending a scene, an item and a line of the journal takes.
 import argparse
 import os
 import random
+import resource
 import shutil
 import statistics
 import subprocess
@@ -83,24 +84,30 @@ def _killed(caller: subprocess.Popen[bytes], output: Path, seconds: float) -> in
 
 
 def speed(workers: int, views: int, runs: int) -> None:
-    """Rates of both pools, by turns."""
+    """Rates of both pools, by turns: with start and end, without, and per second of processor time with both."""
     work, pools = _measuring(views), {"processes": _processes, "--scheduler local": _local}
     found: dict[str, list[tuple[float, float]]] = {name: [] for name in pools}
     for _ in range(runs):
         for name, pool in pools.items():
-            began = time.monotonic()
+            began, used = time.monotonic(), _processor_time()
             with pool(workers) as executor:
                 ends = [time.monotonic() for _ in executor.map(work, range(views))]
             total = time.monotonic() - began
-            found[name].append((views / total, (views - 1) / (ends[-1] - ends[0])))
-            print(f"{name}: {total:.1f} s, after the first view {found[name][-1][1]:.2f} views a second", flush=True)
+            found[name].append((views / total, (views - 1) / (ends[-1] - ends[0]), views / (_processor_time() - used)))
+            print(f"{name}: {total:.1f} s; views a second:", *(f"{rate:.2f}" for rate in found[name][-1]), flush=True)
     medians = {
         name: [statistics.median(column) for column in zip(*rates, strict=True)] for name, rates in found.items()
     }
-    for name, (whole, running) in medians.items():
-        print(f"{name}: {whole:.3f} views a second with start and end, {running:.3f} without")
+    for name, rates in medians.items():
+        print(f"{name}:", *(f"{rate:.3f}" for rate in rates))
     ratios = [b / a for a, b in zip(*medians.values(), strict=True)]
-    print(f"ratio: {ratios[0]:.2f} with start and end, {ratios[1]:.2f} without")
+    print("ratio:", *(f"{ratio:.2f}" for ratio in ratios))
+
+
+def _processor_time() -> float:
+    """Seconds of this process and those that it has seen end."""
+    spent = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(each.ru_utime + each.ru_stime for each in spent)
 
 
 @contextmanager
