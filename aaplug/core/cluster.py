@@ -28,7 +28,7 @@ from distributed import Client, Future, KilledWorker, LocalCluster, get_worker
 from distributed.client import ClosedClientError
 from distributed.comm.core import CommClosedError
 
-from aaplug.core.errors import SHOWN, UsageError
+from aaplug.core.errors import SHOWN, ClusterError, UsageError
 from aaplug.core.executors import AHEAD, WORK, loaded, results, save, track_quietly
 from aaplug.core.locks import scratch
 from aaplug.core.monitor import Monitor
@@ -72,8 +72,8 @@ class Cluster:
         """Yield `work(item)` of every item, in order.
 
         Raises:
-            UsageError: the scheduler or all workers are lost, an item's worker died again and again, or a worker has
-                another version or does not see the folder.
+            ClusterError: the scheduler or all workers are lost, or one has another version or does not see the folder.
+            UsageError: the workers of one item died again and again.
             OutputError: there is no room for the file of `work`.
         """
         self._looked, self._seen = -math.inf, time.monotonic()
@@ -88,7 +88,7 @@ class Cluster:
             yield from results(submit, items, lambda: AHEAD * max(1, self.threads))
 
     def look(self) -> None:
-        """Count the workers now and then; raises UsageError if the scheduler has gone, or all of them for long."""
+        """Count the workers now and then; raises ClusterError if the scheduler has gone, or all of them for long."""
         if self.client.status != "running":
             raise self._lost()
         if time.monotonic() - self._looked < LOOK:
@@ -100,12 +100,12 @@ class Cluster:
         if self.threads:
             self._seen = self._looked
         elif self._looked - self._seen > ABSENT:
-            raise UsageError(f"scheduler {self.name}", f"has had no workers for {ABSENT:.0f} s")
+            raise ClusterError(f"scheduler {self.name}", f"has had no workers for {ABSENT:.0f} s")
 
-    def _lost(self) -> UsageError:
+    def _lost(self) -> ClusterError:
         """The error of a scheduler that has gone."""
         again = "start it again, and repeat the command, with `resume` where it has one"
-        return UsageError(f"scheduler {self.name}", f"the connection is lost; {again}")
+        return ClusterError(f"scheduler {self.name}", f"the connection is lost; {again}")
 
     def check(self) -> None:
         """Refuse workers with other versions, by their addresses."""
@@ -155,7 +155,8 @@ def connected(scheduler: str, threads: int, folder: Path | None, monitor: Monito
     folder: see `Cluster`.
 
     Raises:
-        UsageError: the address is none, nothing answers there, it has no workers, or one has another version.
+        UsageError: the address is none, or there is no folder.
+        ClusterError: nothing answers there, it has no workers, or one has another version.
     """
     with _quietly(), ExitStack() as stack:
         if scheduler == LOCAL:
@@ -169,7 +170,7 @@ def connected(scheduler: str, threads: int, folder: Path | None, monitor: Monito
             try:
                 cluster.client.wait_for_workers(1, timeout=ANSWER)
             except TimeoutError as error:
-                raise UsageError(f"scheduler {scheduler}", "has no workers; start some with `dask worker`") from error
+                raise ClusterError(f"scheduler {scheduler}", "has no workers; start some with `dask worker`") from error
             cluster.check()
         yield cluster
 
@@ -180,7 +181,7 @@ def _client(address: str) -> Client:
     try:
         return Client(address, timeout=ANSWER, set_as_default=False)
     except (OSError, ValueError) as error:
-        raise UsageError(f"scheduler {address}", f"nothing answers there within {ANSWER:.0f} s") from error
+        raise ClusterError(f"scheduler {address}", f"nothing answers there within {ANSWER:.0f} s") from error
 
 
 def _local(workers: int, folder: Path) -> LocalCluster:
@@ -222,7 +223,7 @@ _alone = threading.Lock()  # a worker with more threads does one item at a time:
 def _refuse_other(worker: str, package: str, found: object, expected: str) -> None:
     if found != expected:
         got = f"{package} {found}" if isinstance(found, str) else f"no {package}"
-        raise UsageError(f"worker {worker}", f"has {got}, expected {expected}; install that there")
+        raise ClusterError(f"worker {worker}", f"has {got}, expected {expected}; install that there")
 
 
 def _call(path: str, versions: dict[str, str], item: Any) -> Any:
@@ -237,7 +238,7 @@ def _call(path: str, versions: dict[str, str], item: Any) -> Any:
 @lru_cache(KEPT)
 def _work(path: str) -> Callable[[Any], Any]:
     if not os.path.exists(path):
-        raise UsageError(f"worker {get_worker().address}", f"does not see {path}: it needs the same file system")
+        raise ClusterError(f"worker {get_worker().address}", f"does not see {path}: it needs the same file system")
     _keep_memory()
     return loaded(path)
 

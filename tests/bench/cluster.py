@@ -6,6 +6,7 @@ costs: what sending a scene, an item and a line of the journal takes.
 """
 
 import argparse
+import json
 import os
 import random
 import resource
@@ -34,10 +35,12 @@ from aaplug.evaluation.truth import Truth, own_look
 from aaplug.io.cameras import read_cameras
 from aaplug.io.scenes import read_scene
 from aaplug.rendering.benchmark import synthetic_scene
+from tests.bench.large import cameras, write
 from tests.conftest import SAMPLE
 from tests.test_batch import timeless
 
 PROGRAM = "from aaplug_cli.main import program; program()"
+LARGE = 1_000_000  # Gaussians
 SCALES = (1.0, 0.5, 0.25, 0.125, 0.0625)
 
 
@@ -121,44 +124,63 @@ def _local(workers: int) -> AbstractContextManager[Executor]:
 
 def _measuring(views: int) -> Callable[[int], object]:
     """The sample's evaluation at five scales."""
-    scene, cameras = read_scene(SAMPLE / "chair.ply"), read_cameras(SAMPLE)
-    shown = cameras.train[:views]
-    renderer = aaplug.Renderer.of(scene, cameras, "auto", rasterizer="eager")
+    scene, known = read_scene(SAMPLE / "chair.ply"), read_cameras(SAMPLE)
+    shown = known.train[:views]
+    renderer = aaplug.Renderer.of(scene, known, "auto", rasterizer="eager")
     candidates = candidates_of(scene, renderer.training, [renderer.recipe], "eager")
     return _Measuring(Task(candidates, SCALES, shown, Truth(own_look(scene, renderer.training))), None)
 
 
 def costs() -> None:
-    """Medians of what a batch pays besides its views."""
+    """What a batch pays besides its views, and what a view costs."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        for count in (50_000, 1_000_000):
-            scene = synthetic_scene(count)
-            work = partial(_touched, scene)
-            began = time.monotonic()
-            save(work, folder / WORK)
-            written = time.monotonic()
-            loaded(folder / WORK)(0)
-            read = time.monotonic()
-            size = (folder / WORK).stat().st_size / 1e6
-            print(
-                f"{count:,} Gaussians, {size:.0f} MB: {written - began:.2f} s to write, {read - written:.2f} s to read"
-            )
-        with Journal(folder / "j" / "progress.jsonl", {}, resume=False) as journal:
-            line = [Measurement("auto", s, "v", {"PSNR": 30.0, "SSIM": 0.9}, 4, 0.1, "", 1) for s in SCALES * 5]
-            times = []
-            for view in range(200):
-                began = time.monotonic()
-                journal.add(view, line)
-                times.append(time.monotonic() - began)
-            size = journal.path.stat().st_size / len(times)
-            print(f"journal: {1000 * statistics.median(times):.2f} ms a view, {size:.0f} bytes")
+        _sending(folder)
+        _journal(folder)
+        _scene_and_view(folder)
     for workers in (1, 3):
         with connected("local", workers, None, SILENT) as cluster:
             list(cluster.map(os.path.basename, ["a"] * 10))
             began = time.monotonic()
             list(cluster.map(os.path.basename, ["a"] * 1000))
             print(f"items, {workers} workers: {time.monotonic() - began:.2f} ms each")
+
+
+def _sending(folder: Path) -> None:
+    """A scene's way to a worker: the file, written once, and its first reading."""
+    scene = synthetic_scene(LARGE)
+    began = time.monotonic()
+    save(partial(_touched, scene), folder / WORK)
+    written = time.monotonic()
+    loaded(folder / WORK)(0)
+    read, size = time.monotonic() - written, (folder / WORK).stat().st_size / 1e6
+    print(f"{LARGE:,} Gaussians, {size:.0f} MB: {written - began:.2f} s to write, {read:.2f} s to read")
+
+
+def _journal(folder: Path) -> None:
+    """A line of the journal, with five recipes at five scales."""
+    times, line = [], [Measurement("auto", s, "v", {"PSNR": 30.0, "SSIM": 0.9}, 4, 0.1, "", 1) for s in SCALES * 5]
+    with Journal(folder / "j" / "progress.jsonl", {}, resume=False) as journal:
+        for view in range(200):
+            began = time.monotonic()
+            journal.add(view, line)
+            times.append(time.monotonic() - began)
+        size = journal.path.stat().st_size / len(times)
+    print(f"journal: {1000 * statistics.median(times):.2f} ms a view, {size:.0f} bytes")
+
+
+def _scene_and_view(folder: Path) -> None:
+    """Seconds that a scene of a million Gaussians takes once, and for each of its views of 800x800 px."""
+    write(str(folder / "scene.ply"), LARGE)
+    (folder / "cameras.json").write_text(json.dumps(cameras()))
+    how = {"recipe": "auto", "scale": SCALES, "rasterizer": "eager", "threads": 1}
+    seconds = []
+    for views in ("v0", "v0,v1,v2,v3"):
+        began = time.monotonic()
+        aaplug.evaluate(folder / "scene.ply", folder / "cameras.json", views=views, **how)
+        seconds.append(time.monotonic() - began)
+    view = (seconds[1] - seconds[0]) / 3
+    print(f"{LARGE:,} Gaussians at five scales: {seconds[0] - view:.1f} s once, {view:.1f} s a view")
 
 
 def _touched(scene: aaplug.Gaussians, _: int) -> float:
