@@ -28,7 +28,7 @@ from distributed import Client, Future, KilledWorker, LocalCluster, get_worker
 from distributed.client import ClosedClientError
 from distributed.comm.core import CommClosedError
 
-from aaplug.core.errors import SHOWN, ClusterError, UsageError
+from aaplug.core.errors import SHOWN, ClusterError, UsageError, reason
 from aaplug.core.executors import AHEAD, WORK, loaded, results, save, track_quietly
 from aaplug.core.locks import scratch
 from aaplug.core.monitor import Monitor
@@ -180,23 +180,28 @@ def _client(address: str) -> Client:
         raise UsageError("scheduler", f"takes local or an address such as tcp://host:8786, got {address[:SHOWN]}")
     try:
         return Client(address, timeout=ANSWER, set_as_default=False)
-    except (OSError, ValueError) as error:
+    except OSError as error:
         raise ClusterError(f"scheduler {address}", f"nothing answers there within {ANSWER:.0f} s") from error
+    except (ValueError, TypeError, ImportError) as error:
+        raise UsageError(f"scheduler {address}", f"Dask cannot connect so: {reason(error)}") from error
 
 
 def _local(workers: int, folder: Path) -> LocalCluster:
     """Processes of this machine, each with one thread and as much memory as there is."""
     track_quietly()
-    with dask.config.set(LEAN):
-        return LocalCluster(
-            n_workers=workers,
-            threads_per_worker=1,
-            dashboard_address=cast(str, None),
-            memory_limit=0,
-            silence_logs=logging.CRITICAL,
-            local_directory=str(folder),
-            preload=[DEAF],
-        )
+    try:
+        with dask.config.set(LEAN):
+            return LocalCluster(
+                n_workers=workers,
+                threads_per_worker=1,
+                dashboard_address=cast(str, None),
+                memory_limit=0,
+                silence_logs=logging.CRITICAL,
+                local_directory=str(folder),
+                preload=[DEAF],
+            )
+    except RuntimeError as error:
+        raise ClusterError("worker process", 'did not start: a script needs `if __name__ == "__main__":`') from error
 
 
 @contextmanager
