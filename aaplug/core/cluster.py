@@ -22,7 +22,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Generic, TypeVar, cast
 
-import dask
+import dask.config
 import torch
 from distributed import Client, Future, KilledWorker, LocalCluster, get_worker
 from distributed.client import ClosedClientError

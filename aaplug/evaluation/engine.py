@@ -202,11 +202,10 @@ class _Measuring:
 
     def __getstate__(self) -> dict[str, Any]:
         """For another process, wherever it runs: without the scenes' files, which may be open."""
-        bare: dict[int, Gaussians] = {}
+        bare: dict[int, Gaussians] = {}  # what is shared stays so
 
         def portable(renderer: Renderer) -> Renderer:
-            scene = bare.setdefault(id(renderer.scene), replace(renderer.scene, origin=None))  # what is shared stays so
-            return replace(renderer, scene=scene)
+            return replace(renderer, scene=bare.setdefault(id(renderer.scene), replace(renderer.scene, origin=None)))
 
         candidates = [Candidate(c.name, portable(c.renderer)) for c in self.task.candidates]
         truth = replace(self.task.truth, own=portable(self.task.truth.own))

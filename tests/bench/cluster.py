@@ -89,7 +89,7 @@ def _killed(caller: subprocess.Popen[bytes], output: Path, seconds: float) -> in
 def speed(workers: int, views: int, runs: int) -> None:
     """Rates of both pools, by turns: with start and end, without, and per second of processor time with both."""
     work, pools = _measuring(views), {"processes": _processes, "--scheduler local": _local}
-    found: dict[str, list[tuple[float, float]]] = {name: [] for name in pools}
+    found: dict[str, list[tuple[float, ...]]] = {name: [] for name in pools}
     for _ in range(runs):
         for name, pool in pools.items():
             began, used = time.monotonic(), _processor_time()
