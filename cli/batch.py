@@ -13,7 +13,7 @@ from aaplug.io.batch_file import read_batch
 from .options import CONFIG, one_line, option_types
 
 NOT_IN_A_FILE = ("batch", "more", "shard", "json", "resume", "overwrite")
-ONCE = ("output", "threads", "memory", "rasterizer")  # for the whole batch, not for one scene
+ONCE = ("output", "threads", "memory", "rasterizer", "scheduler")  # for the whole batch, not for one scene
 
 T = TypeVar("T")
 

@@ -2,6 +2,7 @@
 
 import json
 import logging
+import math
 import sys
 import time
 from collections.abc import Iterator
@@ -49,20 +50,61 @@ def refuse(problem: str) -> None:
 class Terminal(Monitor):
     """Prints messages and progress on stderr: a bar on a terminal, a line now and then elsewhere."""
 
+    def __init__(self) -> None:
+        self._workers = ""
+
+    def working(self, workers: int) -> None:
+        """Tell it with the progress."""
+        self._workers = f", {workers} worker{'s' * (workers != 1)}"
+
     def say(self, text: str) -> None:
         """One line of log."""
         log.print(plain(text))
 
     @contextmanager
     def progress(self, what: str, unit: str) -> Iterator[Tell]:
-        """Show progress and the time left."""
+        """Show progress, rate, workers and the time left."""
         if not log.is_terminal:
-            yield _lines(what, unit)
+            yield self._lines(what, unit)
             return
-        columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TextColumn(unit))
+        columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"))
         with Progress(*columns, TimeRemainingColumn(), console=log, transient=True) as bar:
-            task = bar.add_task(what, total=None)
-            yield lambda done, total: bar.update(task, completed=done, total=total)
+            task, rate = bar.add_task(unit, total=None), _Rate()
+
+            def tell(done: int, total: int) -> None:
+                bar.update(task, completed=done, total=total, description=f"{unit}{rate(done)}{self._workers}")
+
+            yield tell
+
+    def _lines(self, what: str, unit: str) -> Tell:
+        """Progress for logs: a line every LINE_SECONDS and one at the end."""
+        rate, told = _Rate(), time.monotonic()
+
+        def tell(done: int, total: int) -> None:
+            nonlocal told
+            now, pace = time.monotonic(), rate(done)
+            if done == total or now - told >= LINE_SECONDS:
+                eta = f", about {(total - done) / rate.value:.0f} s left" if rate.value and done < total else ""
+                say(f"{what}: {done} of {total} {unit}{pace}{self._workers}{eta}")
+                told = now
+
+        return tell
+
+
+class _Rate:
+    """How many are done a second, since the first call: what an earlier run did does not count."""
+
+    def __init__(self) -> None:
+        self.value, self._start = 0.0, (math.nan, 0)
+
+    def __call__(self, done: int) -> str:
+        """In words, once there is a rate."""
+        now = time.monotonic()
+        if math.isnan(self._start[0]):
+            self._start = now, done
+        since, before = self._start
+        self.value = (done - before) / (now - since) if now > since else 0.0
+        return f", {self.value:.3g} a second" if self.value else ""
 
 
 TERMINAL = Terminal()
@@ -72,19 +114,3 @@ say = TERMINAL.say
 def print_json(data: Any) -> None:
     """One object on stdout, strict JSON."""
     sys.stdout.write(json.dumps(data, indent=1, allow_nan=False) + "\n")
-
-
-def _lines(what: str, unit: str) -> Tell:
-    """Progress for logs: a line every LINE_SECONDS and one at the end."""
-    started = told = time.monotonic()
-
-    def tell(done: int, total: int) -> None:
-        nonlocal told
-        now = time.monotonic()
-        if done == total or now - told >= LINE_SECONDS:
-            left = (now - started) / max(done, 1) * (total - done)
-            eta = f", about {left:.0f} s left" if 0 < done < total else ""
-            say(f"{what}: {done} of {total} {unit}{eta}")
-            told = now
-
-    return tell

@@ -1,6 +1,7 @@
 """aaplug evaluate: every recipe at every scale, measured."""
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,6 +13,7 @@ from aaplug.evaluation.results import Report, results, tables
 from aaplug.verbs.batch import batch
 from aaplug.verbs.evaluate import EvaluateOptions, check_results
 from aaplug.verbs.evaluate import evaluate as measure
+from aaplug.verbs.inputs import scheduled
 
 from .batch import scenes_of
 from .console import TERMINAL, out, print_json
@@ -66,15 +68,16 @@ class Evaluate:
         output = scenes[0][1].output
         if output is None:
             raise UsageError("output", "name a folder for the results of several scenes: -o FOLDER")
-        runs = [(name, own._run) for name, own in scenes]
         kept = {"resume": self.how.resume, "overwrite": self.how.overwrite}
-        found = batch(runs, output, **kept, shard=self.shard, request=self._request(), monitor=TERMINAL)
+        with scheduled(scenes[0][1].how, output, TERMINAL) as scheduler:
+            runs = [(name, partial(own._run, scheduler=scheduler)) for name, own in scenes]
+            found = batch(runs, output, **kept, shard=self.shard, request=self._request(), monitor=TERMINAL)
         self._print(found.summary(), found.tables())
         return FAILED if found.failures else 0
 
     def _request(self) -> str:
         """Hash of the scenes and of the options that change results; the folder of results may have other names."""
-        how = replace(self.how, resume=False, overwrite=False, threads=None, memory=None)
+        how = replace(self.how, resume=False, overwrite=False, threads=None, memory=None, scheduler=None)
         same = replace(self, how=how, output=None, shard=None, json=False, batch=None)
         file = None if self.batch is None else digest_of_files([self.batch])
         return digest_of_values((file, same))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from aaplug.core.errors import FormatError
+from aaplug.core.errors import ClusterError, FormatError
 from aaplug.evaluation.journal import Journal
 from aaplug.evaluation.results import Measurement, Report
 from aaplug.io.atomic import claimed
@@ -209,6 +209,15 @@ def mistaken(**settings):
 
 def full(**settings):
     raise MemoryError
+
+
+def test_a_lost_cluster_ends_the_batch(tmp_path):
+    def lost(**settings):
+        raise ClusterError("scheduler tcp://a:1", "the connection is lost")
+
+    with pytest.raises(ClusterError):
+        evaluate_all([("x", lost), ("y", report_of(PSNR=30.0))], tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_no_failure_of_a_scene_costs_another(tmp_path):

@@ -48,7 +48,17 @@ ELSEWHERE = {  # commands of the tests and benches themselves, and what runs the
     "python -m tests.bench.campaign": "about an hour",
     "AAPLUG_FUZZ=10000 python -m pytest tests/test_hostile_files.py": "pytest runs it with fewer mutations",
     "python -m tests.hostile all 10000": "test_hostile_files.py runs it with fewer mutations",
-    "pip install 'aaplug[view]'": "the gate installs it from constraints.txt",
+    **dict.fromkeys(
+        ("pip install 'aaplug[view]'", "pip install 'aaplug[cluster]'"), "the gate installs it from constraints.txt"
+    ),
+    **dict.fromkeys(
+        (
+            "dask scheduler",
+            "dask worker tcp://host:8786 --nworkers 16 --nthreads 1 --memory-limit 0",
+            "aaplug evaluate --batch batch.toml -o results --scheduler tcp://host:8786",
+        ),
+        "test_cluster.py: they do not end",
+    ),
     **dict.fromkeys(
         ("aaplug view", "aaplug view scene.ply", "aaplug view scene.ply --cameras path/to/colmap --port 8123"),
         "test_view.py: it ends when it is interrupted",
@@ -245,5 +255,6 @@ def test_every_option_in_the_documents_exists(capsys):
         helps += capsys.readouterr().out
     known = set(re.findall(r"--[a-z][a-z-]+", helps))
     named = set(re.findall(r"`(--[a-z][a-z-]+)", text))
-    others = {"--antialiasing", "--decimate", "--set"}  # of 3DGS's own scripts, of splat-transform, of nerfbaselines
+    # of 3DGS's own scripts, of splat-transform, of nerfbaselines, of Dask
+    others = {"--antialiasing", "--decimate", "--set", "--memory-limit"}
     assert named - known - others == set()

@@ -3,8 +3,8 @@
 import pytest
 
 from aaplug.core.errors import OutputError
-from aaplug.core.executors import torch_threads
-from aaplug.rendering.frames import write_frames
+from aaplug.core.executors import ProcessesIfLong, torch_threads
+from aaplug.rendering.frames import PAYS_AFTER, write_frames
 from aaplug.rendering.renderer import Renderer
 from tests.conftest import ALL_RASTERIZERS, make_camera, make_scene
 
@@ -31,10 +31,9 @@ def test_files_are_the_same_whatever_the_number_of_processes(renderer, paths):
             renderer,
             VIEWS,
             paths,
-            threads=threads,
+            ProcessesIfLong(threads, pays_after=0.0).map,
             overwrite=threads == 2,
             tell=lambda *now, tell=tell: tell.append(now),
-            pays_after=0.0,
         )
         files[threads] = [path.read_bytes() for path in paths]
     assert files[1] == files[2]
@@ -50,8 +49,8 @@ def test_an_existing_file_is_refused_by_name(renderer, paths):
 
 
 def test_little_work_starts_no_process(renderer, paths, monkeypatch):
-    monkeypatch.setattr("aaplug.rendering.frames.Processes", None)
-    write_frames(renderer, VIEWS, paths, threads=8)
+    monkeypatch.setattr("aaplug.core.executors.Processes", None)
+    write_frames(renderer, VIEWS, paths, ProcessesIfLong(8, PAYS_AFTER).map)
     assert all(path.is_file() for path in paths)
 
 

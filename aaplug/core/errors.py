@@ -40,6 +40,10 @@ class UsageError(AaplugError):
     """Options that contradict each other or name nothing."""
 
 
+class ClusterError(UsageError):
+    """A cluster that has gone or is unfit, and so ends a whole batch."""
+
+
 def listing(names: Sequence[str], most: int = 6) -> str:
     """Join names for a message, cut short where there are many."""
     shown = ", ".join(names[:most])

@@ -12,13 +12,13 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing import resource_tracker
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import torch
 
@@ -29,9 +29,29 @@ from aaplug.core.locks import scratch
 QUIET = "ignore::UserWarning:multiprocessing.resource_tracker"
 
 WORK = "work.pt"  # the file in the folder of temporary files that holds what workers do
+AHEAD = 2  # items a worker that wait or are at work, so that none is idle
 
 T = TypeVar("T")
 R = TypeVar("R")
+Result = TypeVar("Result", covariant=True)
+Apply = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]  # like `map`, and each executor's
+
+
+@runtime_checkable
+class Executor(Protocol):
+    """A pool of workers: threads, processes of this machine, or a cluster's (`core.cluster`)."""
+
+    def map(self, work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+        """Yield `work(item)` of every item."""
+        ...
+
+
+class Pending(Protocol[Result]):
+    """A result to come."""
+
+    def result(self) -> Result:
+        """Wait for it."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -45,7 +65,7 @@ class Threads:
         pool = ThreadPoolExecutor(self.workers, initializer=torch.set_num_threads, initargs=(1,))
         with torch_threads(1), pool:
             try:
-                yield from _results(lambda item: pool.submit(work, item), items, self.workers + 1)
+                yield from results(lambda item: pool.submit(work, item), items, lambda: self.workers + 1)
             finally:
                 pool.shutdown(cancel_futures=True)
 
@@ -73,14 +93,14 @@ class Processes:
             OutputError: there is no room for the file of `work`.
         """
         with scratch() as folder:
-            _save(work, folder / WORK)
+            save(work, folder / WORK)
             start = (str(folder), self.torch_threads)
-            _track_quietly()
+            track_quietly()
             spawn = multiprocessing.get_context("spawn")
             pool = ProcessPoolExecutor(self.workers, spawn, _start, start)
             try:
-                most = 2 * self.workers
-                yield from _results(lambda i: pool.submit(_call, i), items, most, self.ordered)
+                most = AHEAD * self.workers
+                yield from results(lambda i: pool.submit(_call, i), items, lambda: most, self.ordered)
             except BrokenProcessPool as error:
                 raise UsageError(
                     "worker process",
@@ -119,24 +139,27 @@ def torch_threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def _results(submit: Callable[[T], "Future[R]"], items: Iterable[T], most: int, ordered: bool = True) -> Iterator[R]:
-    """The results, with at most `most` items submitted and not yet yielded."""
-    waiting: deque[Future[R]] = deque()
+def results(
+    submit: Callable[[T], Pending[R]], items: Iterable[T], most: Callable[[], int], ordered: bool = True
+) -> Iterator[R]:
+    """The results, with at most `most()` items submitted and not yet yielded."""
+    waiting: deque[Any] = deque()
     for item in items:
         waiting.append(submit(item))
-        if len(waiting) >= most:
+        if len(waiting) >= most():
             yield _next(waiting, ordered)
     while waiting:
         yield _next(waiting, ordered)
 
 
-def _next(waiting: "deque[Future[R]]", ordered: bool) -> R:
+def _next(waiting: deque[Any], ordered: bool) -> Any:
     done = waiting[0] if ordered else next(iter(wait(waiting, return_when=FIRST_COMPLETED).done))
     waiting.remove(done)
     return done.result()
 
 
-def _save(work: object, path: Path) -> None:
+def save(work: object, path: Path) -> None:
+    """Write what workers do; raises OutputError if there is no room for it."""
     try:
         with path.open("wb") as stream:
             torch.save(work, stream)
@@ -146,7 +169,12 @@ def _save(work: object, path: Path) -> None:
         raise
 
 
-def _track_quietly() -> None:
+def loaded(path: str | Path) -> Callable[[Any], Any]:
+    """What was saved; its tensors stay in the file until they are read."""
+    return torch.load(path, mmap=True, weights_only=False)  # our own file
+
+
+def track_quietly() -> None:
     """Start Python's resource tracker, which inherits the options of warnings, before the first worker does."""
     if os.name != "posix":  # there is none
         return
@@ -166,7 +194,7 @@ def _start(folder: str, threads: int | None) -> None:
     threading.Thread(target=_end_with_parent, args=(folder,), daemon=True).start()
     if threads is not None:
         torch.set_num_threads(threads)
-    _work = torch.load(Path(folder) / WORK, mmap=True, weights_only=False)  # our own file
+    _work = loaded(Path(folder) / WORK)
 
 
 def _end_with_parent(folder: str) -> None:

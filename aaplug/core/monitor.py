@@ -17,5 +17,8 @@ class Monitor:
         """Begin a task, such as ("rendering", "views"); the function it yields takes (done, in all)."""
         yield lambda done, total: None
 
+    def working(self, workers: int) -> None:
+        """How many workers of a cluster there are; told now and then while it works."""
+
 
 SILENT = Monitor()

@@ -6,7 +6,7 @@ before they are compared.  Views stream: only the numbers of finished views are 
 """
 
 import math
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -18,6 +18,7 @@ from torch import Tensor
 
 from aaplug.core.cameras import Camera
 from aaplug.core.errors import UsageError
+from aaplug.core.executors import Apply
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.imaging import quantised
 from aaplug.core.interfaces import Rasterizer, WorldFilter
@@ -40,7 +41,6 @@ NO_PHOTOGRAPH = "no photograph is this large: metrics above the photographs' own
 CORNER = 64  # px
 
 Values = Mapping[str, float | None]
-Apply = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 
 
 @dataclass(frozen=True)
@@ -201,16 +201,17 @@ class _Measuring:
         return _Bench(self.task, self.images)
 
     def __getstate__(self) -> dict[str, Any]:
-        """For another process: without the scenes' files, which may be open."""
-        bare: dict[int, Gaussians] = {}
+        """For another process, wherever it runs: without the scenes' files, which may be open."""
+        bare: dict[int, Gaussians] = {}  # what is shared stays so
 
         def portable(renderer: Renderer) -> Renderer:
-            scene = bare.setdefault(id(renderer.scene), replace(renderer.scene, origin=None))  # what is shared stays so
-            return replace(renderer, scene=scene)
+            return replace(renderer, scene=bare.setdefault(id(renderer.scene), replace(renderer.scene, origin=None)))
 
         candidates = [Candidate(c.name, portable(c.renderer)) for c in self.task.candidates]
         truth = replace(self.task.truth, own=portable(self.task.truth.own))
-        return {"task": replace(self.task, candidates=candidates, truth=truth), "images": self.images}
+        views = [view if view.photo is None else replace(view, photo=view.photo.absolute()) for view in self.task.views]
+        images = self.images and replace(self.images, folder=self.images.folder.absolute())
+        return {"task": replace(self.task, candidates=candidates, truth=truth, views=views), "images": images}
 
 
 class _Bench:

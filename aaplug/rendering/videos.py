@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.cameras import Camera
+from aaplug.core.executors import Apply
 from aaplug.core.locks import scratch
 from aaplug.core.monitor import Tell
 from aaplug.io.images import read_image
@@ -24,14 +25,16 @@ def make_video(
     cameras: Sequence[Camera],
     fps: float,
     compose: Callable[[int, Sequence[Image]], Image] = lambda _, images: images[0],
+    apply: Apply = map,
     *,
-    threads: int = 1,
+    folder: Path | None = None,
     overwrite: bool = False,
     tell: Tell = lambda done, total: None,
 ) -> None:
     """Render every camera with every renderer and write the video.
 
-    compose: makes one frame of its number and the renderers' images.  threads: as for `write_frames`.
+    compose: makes one frame of its number and the renderers' images.  apply: as for `write_frames`.
+    folder: in which the images are kept until the video is written; None for the system's temporary files.
     tell: called with (images done, images in all).
 
     Raises:
@@ -41,15 +44,15 @@ def make_video(
     path = Path(path)
     check_video(path, fps, overwrite)
     count = len(cameras)
-    with scratch() as folder:
+    with scratch(folder and str(folder)) as images:
         panes: list[list[Path]] = []
         for place, renderer in enumerate(renderers):
-            panes.append([folder / f"{place}-{index:06d}.png" for index in range(count)])
+            panes.append([images / f"{place}-{index:06d}.png" for index in range(count)])
 
             def tell_all(done: int, _: int, before: int = place * count) -> None:
                 tell(before + done, count * len(renderers))
 
-            write_frames(renderer, cameras, panes[-1], threads=threads, tell=tell_all)
+            write_frames(renderer, cameras, panes[-1], apply, tell=tell_all)
         frames = (
             compose(index, [read_image(file, None) for file in files])
             for index, files in enumerate(zip(*panes, strict=True))

@@ -11,7 +11,7 @@ from typing import Any
 from rich.markup import escape
 from rich.table import Table
 
-from aaplug.core.errors import AaplugError, printable
+from aaplug.core.errors import AaplugError, ClusterError, printable
 from aaplug.core.monitor import SILENT, Monitor
 from aaplug.evaluation.report.files import as_json, write_texts
 from aaplug.evaluation.results import Report, as_csv, grid, method, results
@@ -147,6 +147,8 @@ def _outcome(run: Callable[[], Report], monitor: Monitor) -> Report | str:
     """The report, or why there is none."""
     try:
         return run()
+    except ClusterError:  # the next scene would end alike
+        raise
     except AaplugError as error:
         return str(error)
     except MemoryError:

@@ -52,6 +52,7 @@ from aaplug.verbs.inputs import (
     opened_and_seen,
     processor,
     recipe_of,
+    scheduled,
     shown_of,
     whole_of,
 )
@@ -146,9 +147,9 @@ def compare(
         announce(drawn, sized, monitor, seconds=seconds_of(task, sized), processes=workers)
         images = folder and ImageStore(folder, shown_views(o.show, seen))
         facts = _facts(rows, held, cameras, seen, viewer, o)
-        apply = ProcessesIfLong(workers, PAYS_AFTER).map
-        with monitor.progress("comparing", "views") as tell:
-            report = evaluate(task, facts, tell, folder and folder / JOURNAL, o.resume, images, apply)
+        with scheduled(o, folder, monitor) as cluster, monitor.progress("comparing", "views") as tell:
+            pool = cluster or ProcessesIfLong(workers, PAYS_AFTER)
+            report = evaluate(task, facts, tell, folder and folder / JOURNAL, o.resume, images, pool.map)
         found = Comparison(rows, report)
         if folder and images:
             bounds = coverage(whole_of(held[0]), look.training, found.report.scales)

@@ -43,6 +43,7 @@ from aaplug.verbs.inputs import (
     look_of,
     processor,
     recipe_of,
+    scheduled,
     whole_of,
 )
 from aaplug.verbs.options import RECIPE_NAMES, SCALES, UNSET, RecipeOptions, choice, choices, flag
@@ -128,8 +129,9 @@ def evaluate(
         task = Task(candidates, scales, seen, Truth(look, source, rules), metrics)
         drawn = [view.scaled(scale) if rules.change == "size" else view for view in seen for scale in scales]
         announce([candidate.renderer for candidate in candidates], drawn, monitor, seconds=seconds_of(task, drawn))
-        with monitor.progress(f"evaluating {name}", "views") as tell:
-            found = measure(task, facts, tell, folder and folder / JOURNAL, o.resume, images)
+        with scheduled(o, folder, monitor) as cluster, monitor.progress(f"evaluating {name}", "views") as tell:
+            apply = cluster.map if cluster else map
+            found = measure(task, facts, tell, folder and folder / JOURNAL, o.resume, images, apply)
         if folder and images:
             replaces = o.overwrite or o.resume
             written = write_results(found, folder, replaces, name)

@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 from os import PathLike
 from pathlib import Path
 from typing import overload
@@ -10,7 +11,8 @@ from typing import overload
 import torch
 
 from aaplug.core.cameras import BLACK, WHITE, CameraSet
-from aaplug.core.executors import torch_threads
+from aaplug.core.errors import UsageError
+from aaplug.core.executors import Executor, torch_threads
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.interfaces import MatchesRates, TakesMemory
 from aaplug.core.monitor import Monitor
@@ -180,3 +182,23 @@ def processor(threads: int | None) -> Iterator[int]:
     count = torch.get_num_threads() if threads is None else threads
     with torch_threads(count):
         yield count
+
+
+@contextmanager
+def scheduled(o: RecipeOptions, folder: Path | None, monitor: Monitor) -> Iterator[Executor | None]:
+    """The workers that `scheduler` names, connected inside the block, or that it is; None if it is not given.
+
+    folder: of the outputs, which all workers see.
+
+    Raises:
+        UsageError: the extra `cluster` is missing, nothing answers there, or the workers are unfit.
+    """
+    if not isinstance(o.scheduler, str):
+        yield o.scheduler
+        return
+    if find_spec("distributed") is None:
+        raise UsageError("scheduler", "needs the extra `cluster`: pip install 'aaplug[cluster]'")
+    from aaplug.core.cluster import connected  # its package is an extra
+
+    with connected(o.scheduler, o.threads or torch.get_num_threads(), folder, monitor) as cluster:
+        yield cluster

@@ -12,6 +12,7 @@ from typing import Annotated, Any, TypeVar, cast, get_args, get_type_hints
 import tyro
 
 from aaplug.core.errors import SHOWN, UsageError, did_you_mean
+from aaplug.core.executors import Executor
 from aaplug.core.interfaces import Rasterizer
 from aaplug.core.sampling import MIN_SEEN_SHARE
 from aaplug.methods.filters.matched import RateReference
@@ -159,12 +160,14 @@ class ViewOptions(FrameOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class RecipeOptions(ViewOptions):
-    """What a recipe samples, and compares with."""
+    """What a recipe samples and compares with, and who draws it."""
 
     quality: Annotated[str, choice(QUALITIES)] = "balanced"
     """How finely recipe auto samples: fast reaches a quarter of the training rate, balanced half, best all of it."""
     rate_reference: Annotated[str | None, flag("|".join(get_args(RateReference)))] = None
     """Sampling rate that matched and auto compare with (default: pose: global, but interval for free cameras)."""
+    scheduler: Annotated[str | Executor | None, flag("local|tcp://HOST:PORT", kind=str | None)] = None
+    """Draw views on a Dask cluster: of --threads processes on this machine, or of the machines at an address."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,16 +8,27 @@ from typing import Any, Literal, NamedTuple
 
 from aaplug.core.cameras import Camera
 from aaplug.core.errors import listing
+from aaplug.core.executors import ProcessesIfLong
 from aaplug.core.monitor import SILENT, Monitor
 from aaplug.io.atomic import claimed, output_folder
 from aaplug.io.cameras import select_views
 from aaplug.io.scenes.scene_file import SceneFile
 from aaplug.methods.recipes import find_recipe
-from aaplug.rendering.frames import write_frames
+from aaplug.rendering.frames import PAYS_AFTER, write_frames
 from aaplug.rendering.renderer import Renderer
 from aaplug.verbs.announce import announce
 from aaplug.verbs.assumed import say_assumed
-from aaplug.verbs.inputs import AnyPath, CamerasLike, SceneLike, drawable, drawn_by, look_of, opened_and_seen, processor
+from aaplug.verbs.inputs import (
+    AnyPath,
+    CamerasLike,
+    SceneLike,
+    drawable,
+    drawn_by,
+    look_of,
+    opened_and_seen,
+    processor,
+    scheduled,
+)
 from aaplug.verbs.options import ImageOptions, RecipeOptions
 from aaplug.verbs.views import image_paths, names_image, resized
 
@@ -76,9 +87,9 @@ def render(
         monitor.say(described(renderer, shown))
         say_assumed(cameras, monitor, renderer, shown[0])
         announce([renderer], shown, monitor, processes=workers)
-        how = {"threads": workers, "bit_depth": o.bit_depth, "overwrite": o.overwrite}
-        with monitor.progress("rendering", "views") as tell:
-            write_frames(renderer, shown, paths, **how, tell=tell)
+        with scheduled(o, paths[0].parent, monitor) as cluster, monitor.progress("rendering", "views") as tell:
+            pool = cluster or ProcessesIfLong(workers, PAYS_AFTER)
+            write_frames(renderer, shown, paths, pool.map, bit_depth=o.bit_depth, overwrite=o.overwrite, tell=tell)
     return [Written(*pair) for pair in zip(shown, paths, strict=True)]
 
 

@@ -13,6 +13,7 @@ from torch import Tensor
 from aaplug.core import camera_paths
 from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.errors import UsageError
+from aaplug.core.executors import ProcessesIfLong
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.monitor import SILENT, Monitor
 from aaplug.evaluation.protocols import median_depth
@@ -21,6 +22,7 @@ from aaplug.io.atomic import claimed
 from aaplug.io.cameras import select_views
 from aaplug.io.cameras.camera_path import read_camera_path
 from aaplug.io.video import MOST_FPS, check_video
+from aaplug.rendering.frames import PAYS_AFTER
 from aaplug.rendering.videos import make_video
 from aaplug.verbs.announce import announce
 from aaplug.verbs.assumed import say_assumed
@@ -33,6 +35,7 @@ from aaplug.verbs.inputs import (
     look_of,
     processor,
     recipe_of,
+    scheduled,
     whole_of,
 )
 from aaplug.verbs.options import RECIPE_NAMES, SCALE, UNSET, ImageOptions, RecipeOptions, choice, number
@@ -111,8 +114,11 @@ def video(
         monitor.say(f"{len(shown)} frames of {size} px per pane, {fps:g} per second")
         say_assumed(cameras, monitor, renderers[-1], shown[0])
         announce(renderers, shown, monitor, processes=workers, fewer="seconds or frames per second")
-        with monitor.progress("rendering", "images") as tell:
-            make_video(output, renderers, shown, fps, compose, threads=workers, overwrite=o.overwrite, tell=tell)
+        folder = Path(output).parent
+        with scheduled(o, folder, monitor) as cluster, monitor.progress("rendering", "images") as tell:
+            pool = cluster or ProcessesIfLong(workers, PAYS_AFTER)
+            how = {"overwrite": o.overwrite, "tell": tell, "folder": cluster and folder}
+            make_video(output, renderers, shown, fps, compose, pool.map, **how)
     return Clip(Path(output), len(shown), fps)
 
 

@@ -1,0 +1,232 @@
+"""Dask clusters of real processes: the bytes of one process, whoever is killed; and what is refused."""
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from functools import partial
+from importlib.metadata import version
+from itertools import count
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+import aaplug
+from aaplug.core.errors import FormatError, UsageError
+from aaplug.core.locks import SCRATCH, remove_left
+from aaplug.core.monitor import SILENT, Monitor
+from aaplug.evaluation.journal import Journal
+from tests.test_batch import timeless
+from tests.test_cli import cli, dataset  # noqa: F401  (fixtures)
+from tests.test_executors import refuse_three
+
+cluster = pytest.importorskip("aaplug.core.cluster")  # its package is an extra
+
+SETTINGS = "--cameras . --views all --recipe matched --scale 0.5 1 --rasterizer eager --layout inria"
+KILLED_CLIENT = """
+import os, signal, sys
+from itertools import count
+from aaplug.evaluation.journal import Journal
+from aaplug_cli.main import main
+calls, add = count(), Journal.add
+def dying(*line):
+    add(*line)
+    if next(calls) == 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+Journal.add = dying
+main(sys.argv[1:])
+"""
+
+
+class Counting(Monitor):
+    """Remembers how many workers there were."""
+
+    def __init__(self) -> None:
+        self.workers = set[int]()
+
+    def working(self, workers: int) -> None:
+        self.workers.add(workers)
+
+
+@contextmanager
+def started(*words: str) -> Iterator[subprocess.Popen[str]]:
+    """A process of Dask."""
+    command = [sys.executable, "-m", f"distributed.cli.dask_{words[0]}", *words[1:], "--no-dashboard"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def line_of(process: subprocess.Popen[str], said: str) -> str:
+    """The line of a process's log that holds these words; waits for it."""
+    assert process.stderr is not None
+    return next(line for line in process.stderr if said in line)
+
+
+def after(number: int, act: Callable[[], object]):
+    """`Journal.add` that acts after the call of that number."""
+    calls, add = count(), Journal.add
+
+    def adding(journal, view, measurements):
+        add(journal, view, measurements)
+        if next(calls) == number:
+            act()
+
+    return adding
+
+
+def deadly_once(mark: Path, item: int) -> int:
+    """The square; the first worker of item 2 dies."""
+    if item == 2 and not mark.exists():
+        mark.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return item * item
+
+
+@pytest.fixture(scope="module")
+def local() -> Iterator[Any]:
+    """A cluster of one process of this machine."""
+    with cluster.connected("local", 1, None, Counting()) as found:
+        yield found
+
+
+def test_whoever_is_killed_the_bytes_are_those_of_one_process(cli, monkeypatch):  # noqa: F811
+    assert cli(f"evaluate scene.ply {SETTINGS} -o one")[0] == 0
+    whole = timeless(Path("one"))
+    with ExitStack() as stack:
+        master = stack.enter_context(started("scheduler", "--port", "0", "--host", "127.0.0.1"))
+        address = line_of(master, "Scheduler at:").split()[-1]
+        how = ("--nthreads", "1", "--memory-limit", "0", "--no-nanny")
+        workers = [stack.enter_context(started("worker", address, *how)) for _ in range(3)]
+        for worker in workers:
+            line_of(worker, "Registered to")
+        words = f"evaluate scene.ply {SETTINGS} -o out --scheduler {address}"
+
+        def run(killed: subprocess.Popen[str]) -> tuple[int, str]:
+            """Exit code and last line of a run in which a process is killed after the first view."""
+            shutil.rmtree("out", ignore_errors=True)
+            with monkeypatch.context() as patch:
+                patch.setattr(Journal, "add", after(0, killed.kill))
+                code, _, err = cli(words)
+            return code, err.splitlines()[-1]
+
+        assert run(workers[0])[0] == 0
+        assert timeless(Path("out")) == whole
+
+        shutil.rmtree("out")
+        client = subprocess.run([sys.executable, "-c", KILLED_CLIENT, *words.split()], capture_output=True, check=False)
+        assert client.returncode == -signal.SIGKILL, client.stderr
+        assert len(Path("out/progress.jsonl").read_text().splitlines()) == 3
+        remove_left.cache_clear()
+        assert cli(f"{words} --resume")[0] == 0
+        assert timeless(Path("out")) == whole
+        assert not list(Path("out").glob(f"{SCRATCH}*"))
+
+        lost = "the connection is lost; start it again, and repeat the command, with --resume where it has one"
+        assert run(master) == (2, f"error: scheduler {address}: {lost}")
+        assert len(Path("out/progress.jsonl").read_text().splitlines()) == 2
+        assert cli(f"evaluate scene.ply {SETTINGS} -o out --resume")[0] == 0
+        assert timeless(Path("out")) == whole
+
+
+def test_a_batch_on_this_machine_has_the_bytes_of_one_process(cli):  # noqa: F811
+    shutil.copy("scene.ply", "b.ply")
+    words = f"evaluate scene.ply b.ply {SETTINGS} -o"
+    assert cli(f"{words} one")[0] == 0
+    code, _, err = cli(f"{words} out --scheduler local --threads 1")
+    assert (code, timeless(Path("out"))) == (0, timeless(Path("one")))
+    assert re.search(r"evaluating b: 4 of 4 views, \S+ a second, 1 worker\n", err)
+
+
+def test_images_and_videos_are_the_same(local, cli, monkeypatch):  # noqa: F811
+    def made(folder: str, **given: Any) -> list[bytes]:
+        Path(folder).mkdir()
+        how = {"rasterizer": "eager", "scale": 0.5, **given}
+        aaplug.render("scene.ply", ".", f"{folder}/images", views="all", **how)
+        aaplug.video("scene.ply", ".", f"{folder}/v.webm", seconds=0.1, beside=None, **how)
+        return [path.read_bytes() for path in sorted(Path(folder).rglob("*")) if path.is_file()]
+
+    assert made("out", scheduler=local) == made("one")
+    assert local.monitor.workers == {1}
+
+
+def test_items_come_in_order_until_the_first_error_and_few_are_read_ahead(local):
+    found, items = [], count()
+    with pytest.raises(FormatError, match=r"scene\.ply: is short"):
+        found.extend(local.map(refuse_three, items))
+    assert found == [0, 1, 4]
+    assert next(items) <= 6
+
+
+def test_an_item_whose_worker_dies_is_done_again_unless_it_kills_all(local, tmp_path, monkeypatch):
+    assert list(local.map(partial(deadly_once, tmp_path / "died"), range(4))) == [0, 1, 4, 9]
+    monkeypatch.setattr(local.client.cluster.scheduler, "allowed_failures", 0)
+    with pytest.raises(UsageError, match=r"worker tcp://\S+: died 1 times at one item: out of memory"):
+        list(local.map(os._exit, [3]))
+
+
+def test_a_worker_with_another_version_is_refused_by_name(local, monkeypatch):
+    local.client.wait_for_workers(1)  # another test may have killed it
+    monkeypatch.setitem(cluster.VERSIONS, "aaplug", "9.9")
+    found = rf"worker tcp://127\.0\.0\.1:\d+: has aaplug {version('aaplug')}, expected 9\.9; install that there"
+    with pytest.raises(UsageError, match=found):
+        local.check()
+    with pytest.raises(UsageError, match=found):  # a worker that came after that check
+        list(local.map(refuse_three, [1]))
+    monkeypatch.setattr(cluster, "VERSIONS", {"no-such-package": "1"})
+    with pytest.raises(UsageError, match="has no no-such-package, expected 1"):
+        local.check()
+
+
+def test_a_cluster_without_workers_is_lost_after_a_while(local, monkeypatch):
+    monkeypatch.setattr(local.client, "scheduler_info", lambda n_workers: {"n_workers": 0, "total_threads": 0})
+    assert list(local.map(refuse_three, [1])) == [1]
+    monkeypatch.setattr(cluster, "ABSENT", -1.0)
+    with pytest.raises(UsageError, match="scheduler local: has had no workers for"):
+        list(local.map(refuse_three, [1]))
+
+
+def test_a_worker_that_does_not_see_the_folder_is_named(monkeypatch, tmp_path):
+    monkeypatch.setattr(cluster, "get_worker", lambda: SimpleNamespace(address="tcp://far:1"))
+    with pytest.raises(UsageError, match=r"worker tcp://far:1: does not see .*work\.pt: it needs the same file system"):
+        cluster._work(str(tmp_path / "work.pt"))
+
+
+def test_a_cluster_that_never_had_workers_is_refused(monkeypatch):
+    monkeypatch.setattr(cluster, "ANSWER", 0.1)
+    with pytest.raises(UsageError, match="scheduler local: has no workers; start some"):
+        cluster.connected("local", 0, None, SILENT).__enter__()
+
+
+REFUSED = {
+    "tcp://127.0.0.1:9": "scheduler tcp://127.0.0.1:9: nothing answers there within 0 s",
+    "nowhere": "--scheduler: takes local or an address such as tcp://host:8786, got nowhere",
+}
+
+
+@pytest.mark.parametrize("address", REFUSED)
+def test_a_scheduler_that_is_not_there_is_one_line(address, cli, monkeypatch):  # noqa: F811
+    monkeypatch.setattr(cluster, "ANSWER", 0.2)
+    code, out, err = cli(f"render scene.ply --cameras . -o out --rasterizer eager --scheduler {address}")
+    assert (code, out, err.splitlines()[-1]) == (2, "", f"error: {REFUSED[address]}")
+    assert not Path("out").exists()
+
+
+def test_without_the_extra_its_name_is_told(cli, monkeypatch):  # noqa: F811
+    monkeypatch.setattr("aaplug.verbs.inputs.find_spec", lambda name: None)
+    code, _, err = cli("render scene.ply --cameras . -o out --rasterizer eager --scheduler local")
+    assert code == 2
+    assert err.endswith("error: --scheduler: needs the extra `cluster`: pip install 'aaplug[cluster]'\n")
+
+
+def test_evaluating_on_other_machines_needs_a_folder():
+    with pytest.raises(UsageError, match="output: name a folder that the workers of tcp://far:1 see, too"):
+        cluster.connected("tcp://far:1", 1, None, SILENT).__enter__()
