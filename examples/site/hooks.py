@@ -26,7 +26,10 @@ TOUR = ROOT / "examples" / "tour.ipynb"
 TABLED = "    options: { members: false, show_signature: false, show_bases: false, merge_init_into_class: false }\n"
 TO_IMPLEMENT = {  # topic, and what a package of one's own implements (contributing.md)
     "what a plug-in implements": [
-        *(f"core.interfaces.{name}" for name in ("ScreenFilter", "WorldFilter", "PixelKernel", "Compositor", "Rasterizer")),
+        *(
+            f"core.interfaces.{name}"
+            for name in ("ScreenFilter", "WorldFilter", "PixelKernel", "Compositor", "Rasterizer")
+        ),
         *("core.splats.Splats2D", "core.registry.Registry", "evaluation.metric.Metric"),
         *("io.scenes.SceneFormat", "io.scenes.WritableFormat", "io.cameras.CameraFormat"),
     ]
@@ -109,6 +112,16 @@ def shown(output: dict[str, Any]) -> str:
     return f"```text\n{text.rstrip()}\n```"
 
 
+def script() -> str:
+    """The gallery's script after those that aaplug's own pages share; its names stay inside."""
+    return "(() => {\n" + "".join(path.read_text() for path in (*SHARED, HERE / "sliders.js")) + "})();\n"
+
+
+def style() -> str:
+    """The theme that aaplug's own pages share, and the site's."""
+    return "".join(path.read_text() for path in (THEME, HERE / "site.css"))
+
+
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
     """Put the API's pages into the navigation."""
     assert config.nav is not None
@@ -120,11 +133,9 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add pages, scripts and styles that are made here."""
-    script = "".join(path.read_text() for path in (*SHARED, HERE / "sliders.js"))
     made = {path_of(title): page_of(title, names) for title, names in topics().items()}
     made["tour.md"] = tour()
-    made["assets/sliders.js"] = f"(() => {{\n{script}}})();\n"  # its names stay inside
-    made["assets/site.css"] = "".join(path.read_text() for path in (THEME, HERE / "site.css"))
+    made["assets/sliders.js"], made["assets/site.css"] = script(), style()
     for path, content in made.items():
         files.append(File.generated(config, path, content=content))
     return files

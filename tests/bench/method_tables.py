@@ -25,7 +25,12 @@ SHORT = (  # recipes of the short table, and the scales of each scene
     *(CEILING, "classic", "ewa", "mip", "mip-splatting", "aaa", "analytic", "sa-gs", "2dgs-matched"),
     *("gaussian-blending", "matched", "auto"),
 )
-SCALES = {"chair": (0.5, 0.25, 0.125), "snowmiku": (0.5, 0.25, 0.125), "chair-eighth": (4.0,), "snowmiku-quarter": (4.0,)}
+SCALES = {
+    "chair": (0.5, 0.25, 0.125),
+    "snowmiku": (0.5, 0.25, 0.125),
+    "chair-eighth": (4.0,),
+    "snowmiku-quarter": (4.0,),
+}
 Table = dict[tuple[str, float], dict[str, str]]  # a line of the CSV by recipe and scale
 
 

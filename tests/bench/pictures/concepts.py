@@ -8,6 +8,7 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.gaussians import Gaussians
@@ -48,13 +49,13 @@ class Subject(NamedTuple):
     scene: Gaussians
     training: TrainingViews
     view: Camera
-    index: int
+    place: int
 
     def splat(self, screen: str, rate: float) -> Splats2D:
         """It alone, after a screen filter, in px of an image at `rate`."""
         recipe = Recipe(screen, SCREEN_FILTERS[screen], source="", when="")
         splats = Renderer.of(self.scene, self.training, recipe).splats(self.view.scaled(rate))
-        return splats[splats.sources == self.index]
+        return splats[splats.sources == self.place]
 
     def seen(self, screen: str, rate: float) -> Seen:
         """It after a screen filter, measured in px of training whatever the rate."""
@@ -69,7 +70,9 @@ def concepts(scene: Gaussians, cameras: CameraSet) -> list[Plot]:
     training, view = TrainingViews.of(scene, cameras), cameras.test[0]
     subject = Subject(scene, training, view, _clear(scene, training, view))
     return [
-        Plot("matched", "A Gaussian as training drew it, and as four filters draw it at 1/4", lambda _: _matched(subject)),
+        Plot(
+            "matched", "A Gaussian as training drew it, and as four filters draw it at 1/4", lambda _: _matched(subject)
+        ),
         Plot("places", "The four places where anti-aliasing acts, on one Gaussian", lambda _: _places(subject)),
     ]
 
@@ -86,11 +89,7 @@ def _clear(scene: Gaussians, training: TrainingViews, view: Camera) -> int:
 
 
 def _sheet(height: float) -> Figure:
-    figure = Figure((10, height), layout="constrained")
-    engine = figure.get_layout_engine()
-    assert engine is not None
-    engine.set(h_pad=GAP, w_pad=GAP)
-    return figure
+    return Figure((10, height), layout=ConstrainedLayoutEngine(h_pad=GAP, w_pad=GAP))
 
 
 def _matched(subject: Subject) -> Figure:
@@ -148,7 +147,7 @@ def _places(subject: Subject) -> Figure:
 
 def _world(axes: Axes, subject: Subject) -> None:
     """The Gaussian's two longest axes, before and after Mip-Splatting's 3D smoothing; in world units."""
-    one = torch.tensor([subject.index])
+    one = torch.tensor([subject.place])
     smoothed = Renderer.of(subject.scene, subject.training, "mip-splatting").scene
     angle = np.linspace(0, 2 * math.pi, FINE)
     for scene, colour in ((subject.scene, COLOURS[1]), (smoothed, COLOURS[0])):
@@ -173,7 +172,10 @@ def _kernel(axes: Axes, subject: Subject) -> None:
     splat = subject.splat("none", RATE).to(torch.float64)
     x = torch.linspace(-2, 2, FINE, dtype=torch.float64)
     offsets = torch.stack([x, torch.zeros_like(x)], dim=1)[:, None]
-    named = (("at the pixel's centre", POINT, COLOURS[1]), ("mean over the pixel (Analytic-Splatting)", INTEGRAL, COLOURS[0]))
+    named = (
+        ("at the pixel's centre", POINT, COLOURS[1]),
+        ("mean over the pixel (Analytic-Splatting)", INTEGRAL, COLOURS[0]),
+    )
     for name, pixel, colour in named:
         alpha = splat.opacities * pixel.exact(splat, offsets)
         axes.plot(x.numpy(), alpha[:, 0].numpy(), color=colour, lw=1.8, label=name)

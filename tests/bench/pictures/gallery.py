@@ -14,7 +14,7 @@ from aaplug.rendering.renderer import Renderer
 PHOTOGRAPH = "photograph"
 SHOWN = (  # a view, its scale, and who draws it
     ("r_136", 1 / 4, ("classic", "mip", "auto", PHOTOGRAPH)),
-    ("r_136", 1 / 8, ("classic", "mip", "auto", PHOTOGRAPH)),
+    ("r_136", 1 / 8, ("classic", "auto", PHOTOGRAPH)),
     ("r_24", 1 / 8, ("classic", "auto")),
     ("r_136", 4.0, ("classic", "auto")),
 )
@@ -38,9 +38,7 @@ def gallery(scene: Gaussians, cameras: CameraSet) -> dict[str, bytes]:
 
 
 @torch.no_grad()
-def _drawn(
-    scene: Gaussians, training: TrainingViews, view: Camera, camera: Camera, who: str
-) -> Float[Tensor, "h w 3"]:
+def _drawn(scene: Gaussians, training: TrainingViews, view: Camera, camera: Camera, who: str) -> Float[Tensor, "h w 3"]:
     if who == PHOTOGRAPH:
         assert view.photo is not None
         return resampled(read_image(view.photo, WHITE), camera.width / view.width)
