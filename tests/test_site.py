@@ -177,4 +177,5 @@ def test_the_tour_as_committed_was_run_in_order_and_knows_no_machine():
     assert [cell["execution_count"] for cell in code] == list(range(1, len(code) + 1))
     assert not any("traceback" in out for cell in code for out in cell["outputs"])
     assert len(text) < 300_000
-    assert not re.search(r'"[^"]*(/home/|/root/|/tmp/|/work/|C:\\\\)', text)
+    said = re.sub(r'"image/png": "[^"]*"', "", text)
+    assert not re.search(r"[\s\"'=(](/[\w.-]+){3}", said)  # an absolute path
