@@ -44,6 +44,7 @@ NERFBASELINES = (
 )
 ELSEWHERE = {  # commands of the tests and benches themselves, and what runs them instead
     "python -m tests.bench.method_tables every_recipe": "ten minutes; needs scenes beside the repository",
+    "python -m tests.bench.pictures": "ten seconds; test_site.py draws the figure of the tables",
     "python -m tests.bench.viewers": "minutes; needs Node.js and Chromium",
     "python -m tests.bench.campaign": "about an hour",
     "AAPLUG_FUZZ=10000 python -m pytest tests/test_hostile_files.py": "pytest runs it with fewer mutations",

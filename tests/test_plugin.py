@@ -90,6 +90,16 @@ def test_the_guide_shows_the_files_of_the_plug_in():
     assert project == (PLUGIN / "pyproject.toml").read_text()
 
 
+def test_each_step_names_the_test_that_tries_it():
+    text = GUIDE.read_text()
+    rows = re.findall(r"^\| ([\d, ]+) \| (`test_.*) \|$", text, re.M)
+    tried = {step for steps, _ in rows for step in steps.split(", ")}
+    assert tried == set(re.findall(r"^## (\d+)\. ", text, re.M))
+    for _, names in rows:
+        for name in re.findall(r"`(\w+)`", names):
+            assert callable(globals().get(name)), name
+
+
 def test_every_file_of_the_plug_in_is_registered_by_one_line():
     registered = [value for points in GROUPS.values() for value in points.values()]
     modules = [value.removeprefix("stranger.").split(":")[0] + ".py" for value in registered]

@@ -54,7 +54,9 @@ def bench(
     """Time the rasterizer on synthetic scenes, or on the first training view of a scene.
 
     Args:
-        scene, cameras, monitor: see `render`; without a scene, synthetic ones.
+        scene: see `render`; without one, synthetic ones.
+        cameras: see `render`.
+        monitor: see `render`.
         options: fields of `BenchOptions`.
     """
     o = BenchOptions.of(options)

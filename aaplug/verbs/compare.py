@@ -113,8 +113,9 @@ def compare(
 
     Args:
         scenes: two or more, each as `render` takes it; or by the names that the results give them.
-        cameras, drop_bad, monitor: see `render`; None for the cameras of the first scene's model folder, or an orbit
-            around it.
+        cameras: see `render`; None for the cameras of the first scene's model folder, or an orbit around it.
+        drop_bad: see `render`.
+        monitor: see `render`.
         output: folder for compare.json, compare.csv, report.html and contact-sheet.png; None writes nothing.
         options: fields of `CompareOptions`.
 

@@ -101,10 +101,15 @@ def evaluate(
     """Measure recipes at several scales.
 
     Args:
-        scene, cameras, monitor, and errors: see `render`.
+        scene: see `render`.
+        cameras: see `render`.
+        monitor: see `render`.
         output: folder for results.json, per_view.json and results.csv; None writes nothing.
         name: the scene's name in the results; None for its file's.
         options: fields of `EvaluateOptions`.
+
+    Raises:
+        AaplugError: as `render`.
     """
     o = EvaluateOptions.of(options)
     folder = None if output is None else Path(output)

@@ -117,7 +117,9 @@ def finetune(
     """Optimize the Gaussians until every scale looks like the training size, averaged down.
 
     Args:
-        scene, cameras, monitor: see `render`.
+        scene: see `render`.
+        cameras: see `render`.
+        monitor: see `render`.
         output: scene file to write; a report (.finetune.json), pictures (.finetune.png) and, until the run ends, a
             checkpoint (.finetune.pt) go beside it.  None writes nothing.
         spz_axes: of a .spz to write; see `open_scene`.

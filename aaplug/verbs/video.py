@@ -87,9 +87,14 @@ def video(
     """Render a camera path to a video.
 
     Args:
-        scene, cameras, monitor, and errors: see `render`.
+        scene: see `render`.
+        cameras: see `render`.
+        monitor: see `render`.
         output: a .webm file (VP9), or .mp4 (H.264).
         options: fields of `VideoOptions`; `beside` may be None.
+
+    Raises:
+        AaplugError: as `render`.
     """
     o = VideoOptions.of(options)
     left = "none" if o.beside is None else o.beside

@@ -1,62 +1,80 @@
 """The tables of examples/guides/methods.md: python -m tests.bench.method_tables FOLDER.
 
-Evaluates what `every_recipe.toml` names into the folder, except what is there already.  Each scene has a table with a
-row per recipe; a cell has the figures of all scales: means over the views, and medians of their seconds.
+Evaluates what `every_recipe.toml` names into the folder, except what is there already.  Each scene has a CSV file in
+examples/guides/tables, with a line per recipe and scale: means over the views, and the median of their seconds.  The
+short table of the page is printed.
 """
 
+import csv
 import json
 import subprocess
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from statistics import mean, median
 from typing import Any
 
-from aaplug.evaluation.results import method, scale_name
+from aaplug.evaluation.results import CEILING, method, scale_name
 
 BATCH = Path(__file__).with_name("every_recipe.toml")
-HEADINGS = "| recipe | PSNR, dB | SSIM | evaluations, M | s |\n|---|---|---|---|---|"
+TABLES = Path(__file__).resolve().parents[2] / "examples" / "guides" / "tables"
+PSNR_COLUMN = "PSNR (dB)"
+COLUMNS = ("recipe", "scale", PSNR_COLUMN, "SSIM", "evaluations (M)", "seconds")
 MILLION = 1e6
+SHORT = (  # recipes of the short table, and the scales of each scene
+    *(CEILING, "classic", "ewa", "mip", "mip-splatting", "aaa", "analytic", "sa-gs", "2dgs-matched"),
+    *("gaussian-blending", "matched", "auto"),
+)
+SCALES = {
+    "chair": (0.5, 0.25, 0.125),
+    "snowmiku": (0.5, 0.25, 0.125),
+    "chair-eighth": (4.0,),
+    "snowmiku-quarter": (4.0,),
+}
+Table = dict[tuple[str, float], dict[str, str]]  # a line of the CSV by recipe and scale
 
 
 def main(folder: Path) -> None:
-    """Measure, and print a table for every scene."""
+    """Measure, write a CSV for every scene, and print the short table."""
     evaluate = ["aaplug", "evaluate", "--batch", str(BATCH), "-o", str(folder), "--resume"]
     subprocess.run(evaluate, check=True)
     for path in sorted(folder.glob("*/per_view.json")):
-        print(f"\n{path.parent.name}\n")
-        print("\n".join(table(json.loads(path.read_text()))))
+        with open(TABLES / f"{path.parent.name}.csv", "w", newline="", encoding="utf-8") as file:
+            csv.writer(file, lineterminator="\n").writerows([COLUMNS, *lines(json.loads(path.read_text()))])
+    print(short_table())
 
 
-def table(measured: Mapping[str, Any]) -> list[str]:
-    """The lines of a scene's table, from its per_view.json."""
-    protocol = measured["_aaplug"]
-    scales = protocol["scales"]
+def lines(measured: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
+    """The lines of a scene's table, from its per_view.json; a cell without a value is empty."""
     recipes = dict.fromkeys(name.rsplit("@")[0] for name in measured if "@" in name)
-    views = ", ".join(protocol["view_names"])
-    lines = [f"At {', '.join(scale_name(s) for s in scales)}; views {views}.", "", HEADINGS]
     for recipe in recipes:
-        at = [measured[method(recipe, scale)] for scale in scales]
-        cells = [
-            _joined(at, "PSNR", mean, lambda v: f"{v:.2f}"),
-            _joined(at, "SSIM", mean, lambda v: f"{v:.4f}"),
-            _joined(at, "evaluations", mean, lambda v: f"{v / MILLION:.1f}"),
-            _joined(at, "seconds", median, lambda v: f"{v:.2f}"),
-        ]
+        for scale in measured["_aaplug"]["scales"]:
+            at = measured[method(recipe, scale)]
+            values = {name: [v for v in column.values() if v is not None] for name, column in at.items()}
+            psnr, ssim, work, seconds = (values[name] for name in ("PSNR", "SSIM", "evaluations", "seconds"))
+            yield (
+                *(recipe, f"{scale:g}"),
+                *(f"{mean(psnr):.2f}" if psnr else "", f"{mean(ssim):.4f}" if ssim else ""),
+                *(f"{mean(work) / MILLION:.1f}" if work else "", f"{median(seconds):.2f}"),
+            )
+
+
+def table(scene: str) -> Table:
+    """A scene's CSV."""
+    with open(TABLES / f"{scene}.csv", newline="", encoding="utf-8") as file:
+        return {(row["recipe"], float(row["scale"])): row for row in csv.DictReader(file)}
+
+
+def short_table() -> str:
+    """PSNR of some recipes at some scales of every scene, as Markdown."""
+    shown = {scene: table(scene) for scene in SCALES}
+    columns = [(scene, scale) for scene, scales in SCALES.items() for scale in scales]
+    names = [f"{scene} {scale_name(scale)}" for scene, scale in columns]
+    rows = [["recipe", *names], ["---"] * (len(names) + 1)]
+    for recipe in SHORT:
         name = recipe if " " in recipe else f"`{recipe}`"
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    return lines
-
-
-def _joined(
-    at: list[Mapping[str, Any]], column: str, middle: Callable[[list[float]], float], written: Callable[[float], str]
-) -> str:
-    """The middle of the views at each scale; one dash where there is nothing at any."""
-    cells = []
-    for scale in at:
-        values = [value for value in scale[column].values() if value is not None]
-        cells.append(written(middle(values)) if values else "–")
-    return "–" if set(cells) == {"–"} else " / ".join(cells)
+        rows.append([name, *(shown[scene][recipe, scale][PSNR_COLUMN] for scene, scale in columns)])
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows).replace(" --- ", "---")
 
 
 if __name__ == "__main__":

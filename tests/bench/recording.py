@@ -1,4 +1,4 @@
-"""The recording above README, captured from the live page: python -m tests.bench.recording [-o examples/view.webp].
+"""The recording above README, captured from the live page: python -m tests.bench.recording [-o examples/guides/pictures/view.webp].
 
 Headless Chromium shows the bundled sample at 1/8 of its training size, enlarged.  The camera turns and the divider goes
 to and fro; each frame is a screenshot of the page at rest.
@@ -52,7 +52,7 @@ def captured(page: Page) -> list[Image.Image]:
 def main() -> None:
     """Capture and write."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("-o", "--output", default="examples/view.webp")
+    parser.add_argument("-o", "--output", default="examples/guides/pictures/view.webp")
     output = parser.parse_args().output
     with serving(port=0, no_browser=True) as address, sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])

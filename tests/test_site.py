@@ -1,0 +1,181 @@
+"""The site: its pages, its tables and figures, its sliders and its tour say what the code and the measurements say."""
+
+import importlib.util
+import json
+import re
+import runpy
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import aaplug
+from aaplug.evaluation.results import CEILING
+from aaplug.methods.recipes import RECIPES
+from tests.bench.method_tables import COLUMNS, SCALES, lines, short_table, table
+from tests.bench.pictures import FOLDER
+from tests.test_webpage import browser  # noqa: F401  (fixture)
+
+ROOT = Path(__file__).resolve().parents[1]
+GUIDES = ROOT / "examples" / "guides"
+SITE = ROOT / "examples" / "site"
+TOUR = ROOT / "examples" / "tour.ipynb"
+METHODS = (GUIDES / "methods.md").read_text()
+MOST = 2_000_000  # bytes of all pictures
+PAPER = re.compile(r"\]\(https://(arxiv\.org/abs/\d{4}\.\d{5}|doi\.org/\S+)\)")
+NOT_IN_TABLES = {"multi-scale", "playcanvas", "playcanvas-classic"}  # needs columns; are of viewers.md
+OURS = ("aaplug", "PlayCanvas")  # first words of the sources that are no papers
+
+
+@pytest.fixture(scope="module")
+def hooks() -> dict[str, object]:
+    pytest.importorskip("mkdocs")
+    return runpy.run_path(str(SITE / "hooks.py"))
+
+
+def row_of(recipe: str) -> str:
+    """A recipe's row of the first table of methods.md."""
+    rows = METHODS.split("## Measured")[0].splitlines()
+    (found,) = (row for row in rows if re.match(rf"\| [^|]*`{recipe}`[^|]* \|", row))
+    return found
+
+
+@pytest.mark.parametrize("recipe", RECIPES.values(), ids=RECIPES)
+def test_each_recipe_has_a_row_with_its_paper_beside_it(recipe):
+    assert PAPER.search(row_of(recipe.name)) or recipe.source.startswith(OURS)
+
+
+def test_links_to_papers_say_what_they_lead_to():
+    for path in GUIDES.glob("*.md"):
+        for said, led in re.findall(r"\[arXiv (\S+)\]\(https://arxiv\.org/abs/(\S+)\)", path.read_text()):
+            assert said == led, path.name
+
+
+def test_the_short_table_is_made_from_the_csv():
+    assert short_table() in METHODS
+
+
+@pytest.mark.parametrize("scene", SCALES)
+def test_each_csv_has_every_recipe(scene):
+    found = table(scene)
+    assert {recipe for recipe, _ in found} == {CEILING, *RECIPES} - NOT_IN_TABLES
+    assert all(tuple(row) == COLUMNS and None not in row.values() for row in found.values())
+    assert f"tables/{scene}.csv" in METHODS
+
+
+def test_lines_of_a_csv_are_means_and_a_median_of_seconds():
+    at = {"PSNR": {"a": 30.0, "b": 31.0, "c": None}, "SSIM": {"a": None}, "evaluations": {"a": 2e6, "b": 4e6}}
+    measured = {"_aaplug": {"scales": [0.25]}, "auto@0.25": at | {"seconds": {"a": 1.0, "b": 2.0, "c": 9.0}}}
+    assert list(lines(measured)) == [("auto", "0.25", "30.50", "", "3.0", "2.00")]
+
+
+def test_the_figure_of_the_tables_is_the_committed_one():
+    from tests.bench.pictures.scales import SHOWN, scales
+
+    def curves(svg: str) -> list[str]:
+        return re.findall(r'<path d="(M [^"]*)" clip-path', svg)
+
+    drawn, committed = curves(scales().svg()), curves((FOLDER / "scales.svg").read_text())
+    assert drawn == committed
+    assert len(drawn) >= 4 * len(SHOWN)
+
+
+def test_pictures_are_small_and_each_is_shown():
+    pictures = [path for path in FOLDER.iterdir() if path.is_file()]
+    texts = "".join(path.read_text() for path in GUIDES.glob("*.md"))
+    assert sum(path.stat().st_size for path in pictures) < MOST
+    assert [path.name for path in pictures if f"pictures/{path.name})" not in texts] == []
+
+
+def test_the_citation_is_of_this_version():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    citation = dict(re.findall(r"^([\w-]+): (.+)$", (GUIDES / "CITATION.cff").read_text(), re.M))
+    assert citation["version"] == project["version"]
+    assert citation["license"] == project["license"]
+    assert citation["cff-version"] == "1.2.0"
+
+
+def test_the_api_has_a_place_for_every_public_name(hooks):
+    topics = hooks["topics"]()
+    assert {name for names in topics.values() for name in names if "." not in name} == set(aaplug.__all__)
+    pages = {hooks["path_of"](title): hooks["page_of"](title, names) for title, names in topics.items()}
+    assert len(pages) == len(topics)
+    assert "| `auto` |" in "".join(pages.values())
+    assert "| `recipe` | `'auto'` |" in hooks["entry_of"]("render")
+
+
+def test_fields_of_a_docstring_become_a_list():
+    pytest.importorskip("griffe")
+    fields = runpy.run_path(str(SITE / "fields.py"))["listed"]
+    text = "How.\n\nname: of it.  when: always, and\n    ever.\nother: no.\n\nArgs:\n    width: in px."
+    assert fields(text) == text.replace("name:", "- `name`:").replace("  when:", "\n- `when`:").replace(
+        "other:", "- `other`:"
+    )
+
+
+@pytest.fixture
+def gallery(browser, hooks, tmp_path):  # noqa: F811
+    """One slider of the gallery, as the site shows it."""
+    names = ("chair-r_136-100-classic.webp", "chair-r_136-100-auto.webp")
+    images = "".join(f'<img alt="{name[16:-5]}" src="{(FOLDER / name).as_uri()}">' for name in names)
+    script, style = hooks["script"](), hooks["style"]()
+    (tmp_path / "page.html").write_text(
+        f"<!doctype html><style>{style}</style><div class=compare>{images}</div><script>{script}</script>"
+    )
+    page, troubles = browser.new_page(viewport={"width": 390, "height": 844}), []
+    page.on("pageerror", lambda error: troubles.append(str(error)))
+    page.goto((tmp_path / "page.html").as_uri())
+    page.wait_for_selector(".compare[data-split='0.500']")
+    yield page
+    page.close()
+    assert troubles == []
+
+
+def test_a_divider_of_the_gallery_moves_by_mouse_keys_and_slider(gallery):
+    box = gallery.locator(".stage canvas").bounding_box()
+    gallery.mouse.move(box["x"] + box["width"] / 2, box["y"] + 50)
+    gallery.mouse.down()
+    gallery.mouse.move(box["x"] + box["width"] / 4, box["y"] + 50)
+    gallery.mouse.up()
+    gallery.wait_for_selector(".compare[data-split='0.250']")
+    gallery.locator(".stage").press("]")
+    gallery.wait_for_selector(".compare[data-split='0.270']")
+    gallery.locator("input[type=range]").fill("80")
+    gallery.wait_for_selector(".compare[data-split='0.800']")
+
+
+def test_the_lens_of_the_gallery_shows_both_pictures(gallery):
+    assert gallery.locator(".crops canvas").count() == 0
+    gallery.locator("input[type=checkbox]").check()
+    assert gallery.locator(".crops canvas").count() == 2
+    assert gallery.locator(".crops").inner_text().split() == ["classic", "auto"]
+
+
+def test_the_tour_runs(tmp_path, monkeypatch):
+    for package in ("nbclient", "ipykernel"):
+        if importlib.util.find_spec(package) is None:
+            pytest.skip(f"{package} is not installed")
+    import nbformat
+    from nbclient import NotebookClient
+
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    book = nbformat.read(TOUR, as_version=4)
+    for cell in book.cells:
+        if cell.cell_type == "code":
+            cell.outputs = []
+    NotebookClient(book, timeout=120, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    text = "".join(out.get("text", "") for cell in book.cells for out in cell.get("outputs", ()))
+    figures = {name: float(value) for name, value in re.findall(r"^(\w\S*) .* (\d+\.\d+)$", text, re.M)}
+    assert figures["box-pixel"] > 30
+    assert figures["auto"] > figures["mip"] > 25
+    assert any("image/png" in out.get("data", {}) for cell in book.cells for out in cell.get("outputs", ()))
+
+
+def test_the_tour_as_committed_was_run_in_order_and_knows_no_machine():
+    text = TOUR.read_text()
+    code = [cell for cell in json.loads(text)["cells"] if cell["cell_type"] == "code"]
+    assert [cell["execution_count"] for cell in code] == list(range(1, len(code) + 1))
+    assert not any("traceback" in out for cell in code for out in cell["outputs"])
+    assert len(text) < 300_000
+    said = re.sub(r'"image/png": "[^"]*"', "", text)
+    assert not re.search(r"[\s\"'=(](/[\w.-]+){3}", said)  # an absolute path
