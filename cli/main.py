@@ -13,6 +13,7 @@ from importlib import import_module
 from importlib.metadata import version
 from typing import Any, get_args, get_origin
 
+from aaplug.core.allocator import keep_freed_memory
 from aaplug.core.errors import AaplugError, UsageError, printable, reason
 
 FAILED, REFUSED, INTERRUPTED = 1, 2, 130
@@ -63,6 +64,7 @@ def main(words: Sequence[str] | None = None) -> None:
 
 def program() -> None:
     """Run the program and end its process at once: what Python does at exit takes torch half a second."""
+    keep_freed_memory()
     try:
         main()
     except SystemExit as end:

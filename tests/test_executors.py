@@ -2,6 +2,7 @@
 
 import os
 import pickle
+import platform
 import subprocess
 import sys
 from itertools import count
@@ -102,3 +103,24 @@ def test_torch_threads_are_given_back():
     with torch_threads(before + 1):
         assert torch.get_num_threads() == before + 1
     assert torch.get_num_threads() == before
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the C library is not glibc")
+def test_kept_memory_is_not_fetched_again():
+    script = """if True:
+        import resource, sys
+        from aaplug.core.allocator import keep_freed_memory
+        if sys.argv[1] == "kept":
+            keep_freed_memory()
+        for _ in range(2):
+            before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+            for _ in range(5):
+                several = [bytearray(20_000_000) for _ in range(5)]
+                del several
+        print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+    """
+    kept, usual = (
+        int(subprocess.run([sys.executable, "-c", script, how], capture_output=True, text=True, check=True).stdout)
+        for how in ("kept", "usual")
+    )
+    assert kept < usual / 10

@@ -5,7 +5,6 @@ its first item comes, and keeps it; only items and results pass through the sche
 done again elsewhere, so work must bear being done twice.
 """
 
-import ctypes
 import logging
 import math
 import os
@@ -15,9 +14,9 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import CancelledError
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
-from functools import cache, lru_cache
+from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Generic, TypeVar, cast
@@ -28,6 +27,7 @@ from distributed import Client, Future, KilledWorker, LocalCluster, get_worker
 from distributed.client import ClosedClientError
 from distributed.comm.core import CommClosedError
 
+from aaplug.core.allocator import keep_freed_memory
 from aaplug.core.errors import SHOWN, ClusterError, UsageError, reason
 from aaplug.core.executors import AHEAD, WORK, loaded, results, save, track_quietly
 from aaplug.core.locks import scratch
@@ -41,7 +41,6 @@ ABSENT = 60.0  # seconds without any worker after which the cluster counts as lo
 KEPT = 4  # scenes that a worker keeps: so many callers can share a cluster
 VERSIONS = {package: version(package) for package in ("aaplug", "torch")}  # on which results depend
 DEAF = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"  # to Ctrl-C, which the caller hears
-MALLOC = {-3: 1 << 25, -1: 1 << 27}  # bytes for mallopt's M_MMAP_THRESHOLD and M_TRIM_THRESHOLD
 LEAN = {  # of workers on this machine: variables that would stay in our own environment too, and a sampling profiler
     "distributed.nanny.pre-spawn-environ": {},
     "distributed.worker.profile.enabled": False,
@@ -244,13 +243,5 @@ def _call(path: str, versions: dict[str, str], item: Any) -> Any:
 def _work(path: str) -> Callable[[Any], Any]:
     if not os.path.exists(path):
         raise ClusterError(f"worker {get_worker().address}", f"does not see {path}: it needs the same file system")
-    _keep_memory()
+    keep_freed_memory()  # Dask forbids its workers, which takes most of their time
     return loaded(path)
-
-
-@cache
-def _keep_memory() -> None:
-    """Let glibc keep freed memory for the next image, which Dask forbids its workers: that takes most of their time."""
-    with suppress(OSError, AttributeError, TypeError):  # another C library
-        for parameter, value in MALLOC.items():
-            ctypes.CDLL(None).mallopt(parameter, value)

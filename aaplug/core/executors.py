@@ -22,6 +22,7 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import torch
 
+from aaplug.core.allocator import keep_freed_memory
 from aaplug.core.errors import OutputError, UsageError, of_system, reason
 from aaplug.core.locks import scratch
 
@@ -192,6 +193,7 @@ def _start(folder: str, threads: int | None) -> None:
     """Begin a worker process: load the work, and watch the parent."""
     global _work
     threading.Thread(target=_end_with_parent, args=(folder,), daemon=True).start()
+    keep_freed_memory()
     if threads is not None:
         torch.set_num_threads(threads)
     _work = loaded(Path(folder) / WORK)

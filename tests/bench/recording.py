@@ -1,4 +1,4 @@
-"""The recording above README, captured from the live page: python -m tests.bench.recording [-o examples/guides/pictures/view.webp].
+"""The recording above README, captured from the live page: python -m tests.bench.recording [-o PATH].
 
 Headless Chromium shows the bundled sample at 1/8 of its training size, enlarged.  The camera turns and the divider goes
 to and fro; each frame is a screenshot of the page at rest.
