@@ -12,7 +12,7 @@ from aaplug.io.batch_file import read_batch
 
 from .options import CONFIG, one_line, option_types
 
-NOT_IN_A_FILE = ("batch", "more", "shard", "json", "resume", "overwrite")
+NOT_IN_A_FILE = ("batch", "more", "shard", "json", "resume", "overwrite", "keep")
 ONCE = ("output", "threads", "memory", "rasterizer", "scheduler")  # for the whole batch, not for one scene
 
 T = TypeVar("T")
@@ -35,7 +35,7 @@ def _set(path: Path, where: str, options: T, settings: Mapping[str, Any], refuse
             options = _off(options, key)
             continue
         try:
-            with one_line("aaplug evaluate"):
+            with one_line(f"aaplug {type(options).__name__.lower()}"):
                 options = tyro.cli(type(options), args=_words(key, value), default=options, config=CONFIG)
         except UsageError as error:
             raise FormatError(path, f"{where}: {error}") from error

@@ -23,6 +23,16 @@ log = Console(stderr=True, highlight=False, soft_wrap=True)
 out = Console(highlight=False)
 
 
+@contextmanager
+def quiet() -> Iterator[None]:
+    """A block that tells nothing on stderr."""
+    before, log.quiet = log.quiet, True
+    try:
+        yield
+    finally:
+        log.quiet = before
+
+
 def plain(text: str) -> str:
     """The text for the log: on one line, without control characters and markup."""
     return escape(printable(text))

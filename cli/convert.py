@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from aaplug.evaluation.results import results, tables
 from aaplug.methods.viewers import fused_in
@@ -10,6 +10,7 @@ from aaplug.verbs import convert as verb
 
 from .console import TERMINAL, out, print_json, say
 from .options import CameraOptions, Flat, SceneOptions, flag
+from .several import SeveralScenes, of_all
 
 
 @dataclass(frozen=True)
@@ -17,28 +18,21 @@ class Convert:
     """Fuse anti-aliasing into a plain scene file, for the 2D Mip filter (0.1 px², compensated) or a named viewer."""
 
     output: Annotated[Path, flag("FILE", "-o")]
-    """Where to write: .ply, or .spz or .splat, which round values and keep less."""
+    """Where to write: .ply, or .spz or .splat, which round values and keep less; with --batch, a folder."""
     scene: SceneOptions = field(default_factory=SceneOptions)
     cameras: CameraOptions = field(default_factory=CameraOptions)
     how: Annotated[verb.ConvertOptions, Flat] = field(default_factory=verb.ConvertOptions)
+    several: SeveralScenes = field(default_factory=SeveralScenes)
     json: bool = False
     """Print what was done as one JSON object on stdout."""
 
     def __call__(self) -> int:
         """Fuse, and say what was done."""
-        opened = self.scene.open()
-        cameras = self.cameras.read(self.scene.path)
-        own = {"drop_bad": self.scene.drop_bad, "spz_axes": self.scene.spz_axes} | vars(self.how)
-        found = verb.convert(opened, cameras, self.output, monitor=TERMINAL, **own)
+        if self.several.batch is not None:
+            return of_all(self, lambda own: ".ply")
+        facts, found = self.made()
         scene, report = found.scene, found.report
         if self.json:
-            facts = {"output": str(self.output), "gaussians": opened.count}
-            if scene is not None:
-                fused = [{"method": f.method, **f.settings} for f in scene.fused]
-                facts |= {"gaussians": len(scene), "fused": fused}
-            if report is not None:
-                viewer = {"for": found.viewer.name, "settings": found.viewer.settings}
-                facts |= {**viewer, "residual": results(report)}
             print_json(facts)
         elif report is not None:
             out.print("As the viewer draws it, against the scene's own training-size render:")
@@ -47,3 +41,18 @@ class Convert:
         say(f"wrote {self.output}: {how}; show it with {found.viewer.rule} ({found.viewer.name})")
         say(found.viewer.advice)
         return 0
+
+    def made(self) -> tuple[dict[str, Any], verb.Converted]:
+        """Fuse, and tell what was made."""
+        opened = self.scene.open()
+        cameras = self.cameras.read(self.scene.path)
+        own = {"drop_bad": self.scene.drop_bad, "spz_axes": self.scene.spz_axes} | vars(self.how)
+        found = verb.convert(opened, cameras, self.output, monitor=TERMINAL, **own)
+        facts: dict[str, Any] = {"output": str(self.output), "gaussians": opened.count}
+        if found.scene is not None:
+            fused = [{"method": f.method, **f.settings} for f in found.scene.fused]
+            facts |= {"gaussians": len(found.scene), "fused": fused}
+        if found.report is not None:
+            viewer = {"for": found.viewer.name, "settings": found.viewer.settings}
+            facts |= {**viewer, "residual": results(found.report)}
+        return facts, found

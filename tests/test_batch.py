@@ -239,3 +239,40 @@ def test_two_batches_do_not_share_a_folder(batch):
         code, _, err = batch("evaluate --batch batch.toml --resume")
     assert (code, "out: is being written by another process" in err) == (2, True)
     assert Path("out/batch.json").read_bytes() == before
+
+
+MANY = """
+[[scene]]
+scene = "scene.ply"
+cameras = "."
+
+[[scene]]
+name = "wide"
+scene = "scene.ply"
+cameras = "."
+{own}
+
+[[scene]]
+scene = "broken.ply"
+cameras = "."
+"""
+
+
+@pytest.mark.parametrize(
+    ("verb", "own", "outputs"),
+    [("convert", "variance = 0.1", ("scene.ply", "wide.ply")), ("lod --no-refine", "levels = 1", ("scene", "wide"))],
+)
+def test_many_scenes_are_made_and_a_broken_one_is_named(batch, verb, own, outputs):
+    Path("many.toml").write_text(MANY.format(own=own))
+    code, out, err = batch(f"{verb} --batch many.toml -o out --json")
+    assert code == 1, err
+    found = json.loads(out)["scenes"]
+    assert {name: facts["status"] for name, facts in found.items()} == {
+        "scene": "done", "wide": "done", "broken": "failed",
+    }  # fmt: skip
+    assert "broken.ply: is cut short" in found["broken"]["error"]
+    assert json.loads(Path("out/batch.json").read_text())["scenes"] == found
+    assert sorted(path.name for path in Path("out").iterdir()) == sorted(["batch.json", *outputs])
+    assert batch(f"{verb} --batch many.toml -o out")[0] == 2  # nothing is replaced unasked
+    code, out, _ = batch(f"{verb} --batch many.toml -o out --keep --json")
+    assert [facts["status"] for facts in json.loads(out)["scenes"].values()] == ["kept", "kept", "failed"]

@@ -146,6 +146,17 @@ def test_a_batch_on_this_machine_has_the_bytes_of_one_process(cli):  # noqa: F81
     assert re.search(r"evaluating b: 4 of 4 views, \S+ a second, 1 worker\n", err)
 
 
+def test_scenes_are_converted_to_the_same_bytes(cli):  # noqa: F811
+    Path("many.toml").write_text(
+        "[[scene]]\nscene = 'scene.ply'\ncameras = '.'\n[[scene]]\nname = 'b'\nscene = 'scene.ply'\n"
+        "cameras = '.'\nvariance = 0.1\n"
+    )
+    assert cli("convert --batch many.toml -o here")[0] == 0
+    assert cli("convert --batch many.toml -o there --scheduler local --threads 2")[0] == 0
+    for name in ("scene.ply", "b.ply"):
+        assert Path("here", name).read_bytes() == Path("there", name).read_bytes()
+
+
 def test_images_and_videos_are_the_same(local, cli, monkeypatch):  # noqa: F811
     def made(folder: str, **given: Any) -> list[bytes]:
         Path(folder).mkdir()

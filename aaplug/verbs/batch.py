@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from rich.markup import escape
 from rich.table import Table
@@ -22,6 +22,8 @@ from aaplug.verbs.shard import Record, Shard
 from aaplug.verbs.views import file_names
 
 SUMMARY, RESULTS = "batch.json", "results.csv"
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -134,17 +136,17 @@ def _batch(
     for folder, (name, run) in runs.items():
         monitor.say(f"--- {name}")
         given = {"name": name, "output": folder, "resume": resume, "overwrite": overwrite}
-        outcome = _outcome(partial(run, **given, monitor=monitor), monitor)
-        if isinstance(outcome, Report):
-            reports[folder.name] = outcome
+        found = outcome(partial(run, **given, monitor=monitor), monitor)
+        if isinstance(found, Report):
+            reports[folder.name] = found
         else:
-            failures[folder.name] = outcome
-            monitor.say(f"failed: {name}: {outcome}")
+            failures[folder.name] = found
+            monitor.say(f"failed: {name}: {found}")
     return Batch({folder.name: name for folder, (name, _) in runs.items()}, reports, failures)
 
 
-def _outcome(run: Callable[[], Report], monitor: Monitor) -> Report | str:
-    """The report, or why there is none."""
+def outcome(run: Callable[[], T], monitor: Monitor) -> T | str:
+    """What one scene of many came to, or in words why there is nothing."""
     try:
         return run()
     except ClusterError:  # the next scene would end alike
