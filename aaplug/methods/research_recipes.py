@@ -3,7 +3,7 @@
 `aaplug evaluate --recipe all` measures them with the others; examples/guides/methods.md has their figures.
 """
 
-from aaplug.methods.compositors import WindowBlending
+from aaplug.methods.compositors import GaussianBlending, WindowBlending
 from aaplug.methods.filters import (
     SCREEN_FILTERS,
     AnisotropicSmoothing,
@@ -154,6 +154,23 @@ RESEARCH_RECIPES = (
     ),
     Recipe(
         "gaussian-blending",
+        SCREEN_FILTERS["none"],
+        "Gaussian Blending (arXiv 2511.15102): no dilation, light passes through a window in the pixel",
+        "scenes trained with Analytic-Splatting or with it",
+        pixel=INTEGRAL,
+        compositor=GaussianBlending(),
+    ),
+    Recipe(
+        "matched-blending",
+        Matched(windowed=True),
+        "aaplug: matched, with Gaussian Blending over the rest of the pixel",
+        "comparison",
+        pixel=INTEGRAL,
+        compositor=GaussianBlending(),
+        promises=Promises(equals_training=True),
+    ),
+    Recipe(
+        "window-blending",
         Matched(windowed=True),
         "after Gaussian Blending (arXiv 2511.15102), with aaplug's own update of the window",
         "comparison: the best with one sample per pixel, but slower than several samples",

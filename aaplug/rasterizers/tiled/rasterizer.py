@@ -31,7 +31,7 @@ from aaplug.rasterizers.tiled.packages import CountingKernels
 
 Painter = Callable[[Bins], tuple[Tensor, Tensor]]
 # composited together by a compositor; sorted, so that they have about equally many splats
-BLENDED_TILES = 64
+BLENDED_TILES = 512
 
 
 @dataclass(frozen=True)
