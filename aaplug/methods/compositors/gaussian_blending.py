@@ -169,7 +169,8 @@ class GaussianBlending:
         turns = torch.arange(PASSES * SPLATS_PER_PASS, device=x.device).view(PASSES, 1, -1)
         while len(tiles):
             places = at[:, None] + turns
-            for drawn in rows[torch.where(places < ends[:, None], order[places], -1)]:
+            owners = torch.where(places < ends[:, None], order[places], len(rows) - 1)
+            for drawn in rows.index_select(0, owners.flatten()).view(*owners.shape, -1):
                 light = Light(*kernels.run(kernel, drawn, x, y, *light))
             at = torch.minimum(at + turns.numel(), ends)
             alive = (at < ends) & (light.share.amax(dim=1) >= rules.min_transmittance)
@@ -177,7 +178,7 @@ class GaussianBlending:
             if count >= COMPACT_BELOW * len(tiles):
                 continue
             if count == 0 or len(tiles) > FEWEST:
-                image = image.index_copy(1, tiles, torch.stack([light.red, light.green, light.blue, 1 - light.share]))
+                image.index_copy_(1, tiles, torch.stack([light.red, light.green, light.blue, 1 - light.share]))
                 alive[:FEWEST] |= 0 < count < FEWEST
                 left = alive.nonzero().squeeze(1)
                 tiles, at, ends, x, y, *light = (c.index_select(0, left) for c in (tiles, at, ends, x, y, *light))
