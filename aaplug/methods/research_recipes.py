@@ -3,7 +3,7 @@
 `aaplug evaluate --recipe all` measures them with the others; examples/guides/methods.md has their figures.
 """
 
-from aaplug.methods.compositors import GaussianBlending, WindowBlending
+from aaplug.methods.compositors import GaussianBlending
 from aaplug.methods.filters import (
     SCREEN_FILTERS,
     AnisotropicSmoothing,
@@ -156,26 +156,16 @@ RESEARCH_RECIPES = (
         "gaussian-blending",
         SCREEN_FILTERS["none"],
         "Gaussian Blending (arXiv 2511.15102): no dilation, light passes through a window in the pixel",
-        "scenes trained with Analytic-Splatting or with it",
+        "scenes trained with it or with Analytic-Splatting",
         pixel=INTEGRAL,
         compositor=GaussianBlending(),
     ),
     Recipe(
         "matched-blending",
         Matched(windowed=True),
-        "aaplug: matched, with Gaussian Blending over the rest of the pixel",
-        "comparison",
-        pixel=INTEGRAL,
-        compositor=GaussianBlending(),
-        promises=Promises(equals_training=True),
-    ),
-    Recipe(
-        "window-blending",
-        Matched(windowed=True),
-        "after Gaussian Blending (arXiv 2511.15102), with aaplug's own update of the window",
+        "aaplug: matched, with Gaussian Blending's window over the rest of the pixel",
         "comparison: the best with one sample per pixel, but slower than several samples",
         pixel=INTEGRAL,
-        compositor=WindowBlending(),
-        promises=Promises(equals_training=True),
+        compositor=GaussianBlending(),
     ),
 )

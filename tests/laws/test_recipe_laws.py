@@ -24,6 +24,7 @@ WIDTH, THICKNESS = 2.0 * PIXEL, 0.6 * PIXEL
 OPACITY = 0.9
 CUTOFF_LOSS = 0.04  # of a splat's light: its tail below 1/255 is not drawn
 VANISHING = 1 / 512
+OPAQUE = 4.0  # added to logits
 
 
 recipe = each(RECIPES)
@@ -93,9 +94,11 @@ def test_a_lone_splat_seen_from_very_near_has_its_opacity(recipe):
 
 @cache
 def drawn(recipe: Recipe) -> list[torch.Tensor]:
-    """Images of a scene at training views."""
+    """Images of a scene at training views, with pixels that stop because what they show is opaque."""
     cameras = [make_camera(eye) for eye in ((0.0, -4.0, 0.0), (3.0, -4.0, 1.0))]
-    renderer = Renderer.of(sized(make_scene(60)), cameras, recipe, rasterizer="eager")
+    scene = make_scene(60)
+    scene = sized(replace(scene, logit_opacities=scene.logit_opacities + OPAQUE))
+    renderer = Renderer.of(scene, cameras, recipe, rasterizer="eager")
     return [renderer(camera).rgb for camera in cameras]
 
 

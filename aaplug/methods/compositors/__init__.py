@@ -3,6 +3,5 @@
 from aaplug.core.interfaces import Compositor
 from aaplug.core.registry import Registry, named
 from aaplug.methods.compositors.gaussian_blending import GaussianBlending
-from aaplug.methods.compositors.window_blending import WindowBlending
 
-COMPOSITORS: Registry[Compositor] = Registry("compositor", named((GaussianBlending(), WindowBlending())), Compositor)
+COMPOSITORS: Registry[Compositor] = Registry("compositor", named([GaussianBlending()]), Compositor)
