@@ -13,7 +13,7 @@ from aaplug.methods.filters import (
     Matched,
     Smoothing3D,
 )
-from aaplug.methods.pixel_kernels import INTEGRAL, LOGISTIC_INTEGRAL, SQUARE, SURFEL_MIP
+from aaplug.methods.pixel_kernels import INTEGRAL, SURFEL_MIP
 from aaplug.methods.recipe import Promises, Recipe
 
 RESEARCH_RECIPES = (
@@ -78,13 +78,6 @@ RESEARCH_RECIPES = (
         pixel=INTEGRAL,
     ),
     Recipe(
-        "analytic-logistic",
-        SCREEN_FILTERS["none"],
-        "Analytic-Splatting (Liang et al. 2024) with its logistic approximation",
-        "parity with its published figures",
-        pixel=LOGISTIC_INTEGRAL,
-    ),
-    Recipe(
         "sa-gs",
         SCREEN_FILTERS["sa-gs"],
         "SA-GS's 2D scale-adaptive filter (Song et al., arXiv 2403.19615): 0.3 r² px², one rate per view",
@@ -132,15 +125,6 @@ RESEARCH_RECIPES = (
         "aaplug: matched, with Analytic-Splatting's integral over the rest of the pixel",
         "comparison: slower than matched and no better",
         pixel=INTEGRAL,
-        promises=Promises(equals_training=True),
-    ),
-    Recipe(
-        "matched-square",
-        Matched(windowed=True),
-        "aaplug, after MipSLAM's elliptical integration (arXiv 2603.06989), whose constants are not published: "
-        "matched, with the mean over the rest of the pixel's unrotated square",
-        "comparison: as matched-integral, without rotating the pixel to the splat",
-        pixel=SQUARE,
         promises=Promises(equals_training=True),
     ),
     Recipe(

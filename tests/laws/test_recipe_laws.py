@@ -11,7 +11,6 @@ import torch
 from aaplug.core.camera_paths import zoomed
 from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import Gaussians
-from aaplug.methods.pixel_kernels import LOGISTIC_INTEGRAL
 from aaplug.methods.recipe import Recipe
 from aaplug.methods.recipes import RECIPES
 from aaplug.rendering.renderer import Renderer
@@ -86,8 +85,7 @@ def test_a_lone_splat_seen_from_very_near_has_its_opacity(recipe):
     near = zoomed(near, CAMERA.focal / near.focal / VANISHING)
     centre = alpha(recipe, one_alone(), near)[4, 4].item()
     if recipe.promises.opaque_when_near:
-        approximate = recipe.pixel is LOGISTIC_INTEGRAL
-        assert centre == pytest.approx(OPACITY, rel=6e-3 if approximate else 1e-3)
+        assert centre == pytest.approx(OPACITY, rel=1e-3)
     else:
         assert 0.2 * OPACITY < centre < 0.99 * OPACITY
 
