@@ -15,6 +15,9 @@ first the window is the square that alpha is averaged over, `Splats2D.window` wi
 
 The cut-off is that of the rules, 1/255 in 3DGS; the published one is 1/256.
 
+A window may leave its pixel and reach splats that its tile does not draw, because their cut-off ellipses, grown by half a
+pixel's diagonal, end before.  On the chair at 1/16 this changes 1 % of the pixels, by 7e-5 in the root mean square of all.
+
 t: tiles; P: pixels per tile; m: splats; p: pixels, or entries of `order`.  u, v: position along a splat's axes, and
 h: half a window, in the splat's standard deviations.
 """
@@ -40,7 +43,9 @@ PLAIN = 0.1  # standard deviations: a window that spans less is taken as a point
 NARROW = 0.3  # standard deviations: half windows below which a series keeps more digits than a difference
 FARTHEST = 4.0  # standard deviations from a window's edge, beyond which the mean is below every cut-off
 SPLATS_PER_PASS = 4  # more compile slowly
-PASSES = 2  # whose rows are gathered at once; together at most `LONGEST_PASS` splats, by which `order` is padded
+PASSES = (
+    2  # whose rows are gathered at once; together they have at most `LONGEST_PASS` splats, by which `order` is padded
+)
 COMPACT_BELOW = 7 / 8  # tiles that are done are dropped once the share of the others is below this
 FEWEST = 2  # tiles in a pass: compiled kernels take no fewer
 EXAMPLE_TILES, EXAMPLE_SPLATS = 1024, 4096  # as large as real work: inductor chooses by them which loops use threads
