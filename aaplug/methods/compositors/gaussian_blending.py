@@ -15,8 +15,9 @@ first the window is the square that alpha is averaged over, `Splats2D.window` wi
 
 The cut-off is that of the rules, 1/255 in 3DGS; the published one is 1/256.
 
-A window may leave its pixel and reach splats that its tile does not draw, because their cut-off ellipses, grown by half a
-pixel's diagonal, end before.  On the chair at 1/16 this changes 1 % of the pixels, by 7e-5 in the root mean square of all.
+A window may leave its pixel and reach splats that its tile does not draw, because their cut-off ellipses, grown by
+half a pixel's diagonal, end before.  On the chair at 1/16 this changes 1 % of the pixels; the root mean square of all
+is 7e-5.
 
 t: tiles; P: pixels per tile; m: splats; p: pixels, or entries of `order`.  u, v: position along a splat's axes, and
 h: half a window, in the splat's standard deviations.
