@@ -47,7 +47,7 @@ def test_compiled_kernels_give_the_eager_results(built, kernel: Kernel):
         assert (fast.double() - slow.double()).abs().max() < 10 * ANSWER * scale
 
 
-@pytest.mark.parametrize("name", ["composite-point", "composite-point-backward"])
+@pytest.mark.parametrize("name", ["composite-point", "composite-point-backward", "gaussian-blending"])
 def test_compositing_is_one_loop_over_tiles(built, name):
     with zipfile.ZipFile(compiled.cache_folder() / f"{name}.pt2") as package:
         sources = [package.read(n).decode() for n in package.namelist() if "kernel.cpp" in n]

@@ -156,6 +156,7 @@ class Compositor(Protocol):
     ) -> Float[Tensor, "4 t P"]:
         """Premultiplied red, green, blue, and alpha; tile t composites `order[first[t] : first[t] + counts[t]]`.
 
+        order: padded by `binning.LONGEST_PASS`, so that a pass may read past the end.
         centres: x and y of the pixel centres, in px.  window: `Splats2D.window`, in px.
         """
         ...

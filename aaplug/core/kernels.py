@@ -23,6 +23,7 @@ class Kernel:
     sizes: per argument the name of its leading size, None where that is fixed; sizes of one name are equal.
     gathers: the kernel gathers scattered rows.  Inductor would leave the loop scalar; set this where arithmetic
         outweighs the gathers.
+    chained: each value is made of many before it, and several read it.  Inductor would write it out again for each.
     pulls_back: the function computes gradients itself, so it is traced before it is compiled.
     evaluations: splat-pixel evaluations of one call, per pixel of a tile; 0 for kernels that do not composite.
     alone: up to this size "t" it runs on one thread, because waking the others takes longer.
@@ -33,6 +34,7 @@ class Kernel:
     example: Callable[[], tuple[Tensor, ...]]
     sizes: tuple[str | None, ...]
     gathers: bool = False
+    chained: bool = False
     pulls_back: bool = False
     evaluations: int = 0
     alone: int = 0
@@ -69,7 +71,7 @@ def backward_of(kernel: Kernel, results: tuple[str, ...]) -> Kernel:
 
     sizes = (*kernel.sizes, *results)
     name = kernel.name + BACKWARD
-    return Kernel(name, function, example, sizes, kernel.gathers, pulls_back=True)
+    return Kernel(name, function, example, sizes, kernel.gathers, kernel.chained, pulls_back=True)
 
 
 class Kernels:

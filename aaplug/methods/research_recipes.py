@@ -3,7 +3,7 @@
 `aaplug evaluate --recipe all` measures them with the others; examples/guides/methods.md has their figures.
 """
 
-from aaplug.methods.compositors import WindowBlending
+from aaplug.methods.compositors import GaussianBlending
 from aaplug.methods.filters import (
     SCREEN_FILTERS,
     AnisotropicSmoothing,
@@ -13,7 +13,7 @@ from aaplug.methods.filters import (
     Matched,
     Smoothing3D,
 )
-from aaplug.methods.pixel_kernels import INTEGRAL, LOGISTIC_INTEGRAL, SQUARE, SURFEL_MIP
+from aaplug.methods.pixel_kernels import INTEGRAL, SURFEL_MIP
 from aaplug.methods.recipe import Promises, Recipe
 
 RESEARCH_RECIPES = (
@@ -78,13 +78,6 @@ RESEARCH_RECIPES = (
         pixel=INTEGRAL,
     ),
     Recipe(
-        "analytic-logistic",
-        SCREEN_FILTERS["none"],
-        "Analytic-Splatting (Liang et al. 2024) with its logistic approximation",
-        "parity with its published figures",
-        pixel=LOGISTIC_INTEGRAL,
-    ),
-    Recipe(
         "sa-gs",
         SCREEN_FILTERS["sa-gs"],
         "SA-GS's 2D scale-adaptive filter (Song et al., arXiv 2403.19615): 0.3 r² px², one rate per view",
@@ -135,15 +128,6 @@ RESEARCH_RECIPES = (
         promises=Promises(equals_training=True),
     ),
     Recipe(
-        "matched-square",
-        Matched(windowed=True),
-        "aaplug, after MipSLAM's elliptical integration (arXiv 2603.06989), whose constants are not published: "
-        "matched, with the mean over the rest of the pixel's unrotated square",
-        "comparison: as matched-integral, without rotating the pixel to the splat",
-        pixel=SQUARE,
-        promises=Promises(equals_training=True),
-    ),
-    Recipe(
         "aa-2dgs",
         LowPass(),
         "AA-2DGS (Younes et al., NeurIPS 2025): the world-space flat kernel, then the object-space Mip filter",
@@ -154,11 +138,18 @@ RESEARCH_RECIPES = (
     ),
     Recipe(
         "gaussian-blending",
+        SCREEN_FILTERS["none"],
+        "Gaussian Blending (arXiv 2511.15102): no dilation, light passes through a window in the pixel",
+        "scenes trained with it or with Analytic-Splatting",
+        pixel=INTEGRAL,
+        compositor=GaussianBlending(),
+    ),
+    Recipe(
+        "matched-blending",
         Matched(windowed=True),
-        "after Gaussian Blending (arXiv 2511.15102), with aaplug's own update of the window",
+        "aaplug: matched, with Gaussian Blending's window over the rest of the pixel",
         "comparison: the best with one sample per pixel, but slower than several samples",
         pixel=INTEGRAL,
-        compositor=WindowBlending(),
-        promises=Promises(equals_training=True),
+        compositor=GaussianBlending(),
     ),
 )

@@ -23,7 +23,7 @@ COLUMNS = ("recipe", "scale", PSNR_COLUMN, "SSIM", "evaluations (M)", "seconds")
 MILLION = 1e6
 SHORT = (  # recipes of the short table, and the scales of each scene
     *(CEILING, "classic", "ewa", "mip", "mip-splatting", "aaa", "analytic", "sa-gs", "2dgs-matched"),
-    *("gaussian-blending", "matched", "auto"),
+    *("gaussian-blending", "matched-blending", "matched", "auto"),
 )
 SCALES = {
     "chair": (0.5, 0.25, 0.125),

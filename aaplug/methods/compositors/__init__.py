@@ -2,6 +2,6 @@
 
 from aaplug.core.interfaces import Compositor
 from aaplug.core.registry import Registry, named
-from aaplug.methods.compositors.window_blending import WindowBlending
+from aaplug.methods.compositors.gaussian_blending import GaussianBlending
 
-COMPOSITORS: Registry[Compositor] = Registry("compositor", named([WindowBlending()]), Compositor)
+COMPOSITORS: Registry[Compositor] = Registry("compositor", named([GaussianBlending()]), Compositor)

@@ -2,11 +2,10 @@
 
 from aaplug.core.interfaces import PixelKernel
 from aaplug.core.registry import Registry, named
-from aaplug.methods.pixel_kernels.integral import INTEGRAL, LOGISTIC_INTEGRAL
+from aaplug.methods.pixel_kernels.integral import INTEGRAL
 from aaplug.methods.pixel_kernels.point import POINT
-from aaplug.methods.pixel_kernels.square import SQUARE
 from aaplug.methods.pixel_kernels.surfel import SURFEL, SURFEL_MIP
 
 PIXEL_KERNELS: Registry[PixelKernel] = Registry(
-    "pixel kernel", named((POINT, INTEGRAL, LOGISTIC_INTEGRAL, SQUARE, SURFEL, SURFEL_MIP)), PixelKernel
+    "pixel kernel", named((POINT, INTEGRAL, SURFEL, SURFEL_MIP)), PixelKernel
 )

@@ -2,24 +2,24 @@
 
 Along the splat's principal axes the Gaussian is a product, and its mean over an aligned square is the product of two
 one-dimensional means.  The paper therefore rotates the pixel's square, of side `Splats2D.window`, to these axes: an
-approximation, because the real pixel is not rotated.  "integral" uses the exact normal distribution function,
-"logistic" the paper's approximation of it, for parity with its published figures.
+approximation, because the real pixel is not rotated.  The normal distribution function is exact; the paper approximates
+it by a logistic one.
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.special import ndtr
 
 from aaplug.core.ellipses import grown, principal_columns
 from aaplug.core.interfaces import Pixels
 from aaplug.core.kernels import Kernels
 from aaplug.core.rules import Rules
 from aaplug.core.splats import Splats2D
-from aaplug.methods.pixel_kernels.averages import logistic, mean_gaussian, mean_logistic, normal
+from aaplug.methods.pixel_kernels.averages import mean_gaussian
 from aaplug.methods.pixel_kernels.raster_rows import COLUMNS, OPACITY, forms_at, rows_of
 
 HALF_U, HALF_V = COLUMNS, COLUMNS + 1  # half windows, in standard deviations
@@ -30,14 +30,9 @@ HALF_DIAGONAL = math.sqrt(0.5)  # of a unit square
 
 @dataclass(frozen=True)
 class Integral:
-    """Alpha is opacity times the product of two one-dimensional means.
+    """Alpha is opacity times the product of two one-dimensional means."""
 
-    mean: of exp(-x²/2) over u ± h.  distribution: the cumulative distribution function that `exact` uses.
-    """
-
-    name: str
-    mean: Callable[[Tensor, Tensor], Tensor]
-    distribution: Callable[[Tensor], Tensor]
+    name: str = "integral"
     columns: int = COLUMNS + 3
     needs_depth_slopes: bool = False
     splats_per_pass: int = 8
@@ -56,7 +51,7 @@ class Integral:
         """Opacity times the means over the window along both axes."""
         alpha = rows[..., OPACITY, None]
         for form, half in zip(forms_at(rows, pixels), (HALF_U, HALF_V), strict=True):
-            alpha = alpha * self.mean(form, rows[..., half, None])
+            alpha = alpha * mean_gaussian(form, rows[..., half, None])
         return torch.threshold(alpha, rules.below_min_alpha, 0.0)
 
     def exact(self, splats: Splats2D, offsets: Float[Tensor, "p c 2"]) -> Float[Tensor, "p c"]:
@@ -66,7 +61,7 @@ class Integral:
         for x, y in (rows[:2], rows[2:]):
             width = max(splats.window, NARROWEST) * torch.hypot(x, y)  # in standard deviations
             u = x * offsets[..., 0] + y * offsets[..., 1]
-            probability = self.distribution(u + width / 2) - self.distribution(u - width / 2)
+            probability = ndtr(u + width / 2) - ndtr(u - width / 2)
             values = values * probability * math.sqrt(2 * math.pi) / width
         return values
 
@@ -77,5 +72,4 @@ def pixel_margin(splats: Splats2D, rules: Rules) -> Splats2D:
     return grown(splats, torch.full_like(splats.dets, radius), rules.min_alpha)
 
 
-INTEGRAL = Integral("integral", mean_gaussian, normal)
-LOGISTIC_INTEGRAL = Integral("logistic", mean_logistic, logistic)
+INTEGRAL = Integral()

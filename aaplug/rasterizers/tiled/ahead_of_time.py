@@ -25,6 +25,7 @@ from aaplug.core.kernels import EAGER, Kernel, Kernels
 from aaplug.core.locks import scratch
 from aaplug.core.monitor import Tell
 from aaplug.core.rules import RULES_3DGS
+from aaplug.methods.compositors import gaussian_blending
 from aaplug.methods.pixel_kernels import INTEGRAL, POINT, averages, integral, point, raster_rows
 from aaplug.rasterizers.tiled import backward, binning, forward
 from aaplug.rasterizers.tiled.packages import CompiledKernels, Package
@@ -42,12 +43,13 @@ KERNELS: tuple[Kernel, ...] = (  # those that take longest to compile come last
     *projection.SHADE_BACKWARD.values(),
     backward.step_kernel(POINT, RULES_3DGS),
     projection.PROJECT_BACKWARD,
+    gaussian_blending.pass_kernel(),
     forward.pass_kernel(INTEGRAL, RULES_3DGS),
     forward.pass_kernel(POINT, RULES_3DGS),
 )
 SOURCES = (  # modules whose source the kernels are made of
     *(kernels, rules, splats, ellipses, culling, projection, spherical_harmonics),
-    *(raster_rows, averages, point, integral, binning, forward, backward),
+    *(raster_rows, averages, point, integral, gaussian_blending, binning, forward, backward),
 )
 OPTIONS = {
     "max_fusion_size": 1_000_000,  # a pass stays one loop, however many operations it has
@@ -58,6 +60,8 @@ OPTIONS = {
 }
 # inductor leaves loops that gather scattered numbers scalar
 TILING_HEURISTIC = "cpp.enable_tiling_heuristics"
+# operations up to which inductor writes a value out again for each of its readers, where kernels are chained
+CHAINED = {"realize_opcount_threshold": 10}
 LARGEST_SIZE = 1 << 31
 MOST_PROCESSES = 4  # compilers side by side: each takes most of a GB
 # of the largest value: between a package's result and the eager one, on the example
@@ -67,7 +71,7 @@ TOLERANCE = 1e-4
 def cache_folder() -> Path:
     """Folder of the packages for this version and this processor."""
     source = "".join(inspect.getsource(module) for module in SOURCES)
-    options = f"{OPTIONS} {TILING_HEURISTIC}"
+    options = f"{OPTIONS} {TILING_HEURISTIC} {CHAINED}"
     facts = [torch.__version__, torch.backends.cpu.get_cpu_capability(), source, options]
     key = hashlib.sha256("\0".join(facts).encode()).hexdigest()[:16]
     return Path(platformdirs.user_cache_dir("aaplug", appauthor=False)) / f"kernels-{key}"
@@ -197,7 +201,7 @@ def _build(name: str) -> None:
             made = torch._inductor.aoti_compile_and_package(
                 program,
                 package_path=str(folder / "k.pt2"),
-                inductor_configs={**OPTIONS, TILING_HEURISTIC: not kernel.gathers},
+                inductor_configs=OPTIONS | {TILING_HEURISTIC: not kernel.gathers} | (CHAINED if kernel.chained else {}),
             )
             os.replace(made, path)
     except OSError as error:

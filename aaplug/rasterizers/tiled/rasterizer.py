@@ -30,8 +30,7 @@ from aaplug.rasterizers.tiled.forward import Compositing
 from aaplug.rasterizers.tiled.packages import CountingKernels
 
 Painter = Callable[[Bins], tuple[Tensor, Tensor]]
-# composited together by a compositor; sorted, so that they have about equally many splats
-BLENDED_TILES = 64
+BLENDED_TILES = 512  # composited together by a compositor, so that what it keeps per pixel fits the cache
 
 
 @dataclass(frozen=True)
