@@ -107,8 +107,9 @@ class Aaplug:
     def render(self, camera: Any, *, options: Mapping[str, Any] | None = None) -> dict[str, np.ndarray]:
         """Render one of nerfbaselines' cameras: color [h, w, 3] and accumulation [h, w].
 
-        Colours are rounded to bytes, or in [0, 1] if `output_type_dtypes` asks for floats, which nerfbaselines would cut
-        to bytes without rounding: 0.02 dB on the chair.
+        Colours are rounded to bytes, or in [0, 1] if `output_type_dtypes` asks for floats.  Those nerfbaselines would
+        cut to bytes without rounding: 0.01 dB on the chair.
+
         A view with the focal length of the training cameras is taken for a pose of the data set, every other one for a
         free camera.
         """
