@@ -7,13 +7,10 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Protocol, TypeVar
 
-from rich.table import Table
-
-from aaplug.core.errors import printable
 from aaplug.evaluation.report.files import as_json, write_texts
 from aaplug.io.atomic import claimed, output_folder, refuse_existing
 from aaplug.io.scenes.manifests import is_pyramid
-from aaplug.verbs.batch import SUMMARY, outcome
+from aaplug.verbs.batch import SUMMARY, outcome, status_table
 from aaplug.verbs.inputs import scheduled
 from aaplug.verbs.options import RecipeOptions
 from aaplug.verbs.views import file_names
@@ -85,7 +82,8 @@ def of_all(verb: V, suffix: Callable[[V], str]) -> int:
     if verb.json:
         print_json({"scenes": found})
     else:
-        out.print(_table(found))
+        rows = [(name, each["status"], each.get("error") or each["output"]) for name, each in found.items()]
+        out.print(status_table("output or why there is none", rows))
     return FAILED if any(facts["status"] == "failed" for facts in found.values()) else 0
 
 
@@ -109,12 +107,3 @@ class _OfOne:
 
 def _is_there(output: Path) -> bool:
     return output.is_file() or is_pyramid(output)
-
-
-def _table(found: dict[str, Any]) -> Table:
-    table = Table(title="scenes", title_justify="left")
-    for heading in ("scene", "status", "output or why there is none"):
-        table.add_column(heading, overflow="fold")
-    for name, facts in found.items():
-        table.add_row(printable(name), facts["status"], printable(facts.get("error") or facts["output"]))
-    return table

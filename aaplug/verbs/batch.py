@@ -1,7 +1,7 @@
 """Batch: evaluate many scenes.  One that fails stops no other; the summary names it."""
 
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import version
@@ -53,13 +53,11 @@ class Batch:
 
     def tables(self) -> list[Table]:
         """The means, one table per metric, and the status of every scene."""
-        scenes = Table(title="scenes", title_justify="left")
-        for heading in ("scene", "status", "why"):
-            scenes.add_column(heading, overflow="fold")
-        for folder, name in self.names.items():
-            why = self.failures.get(folder)
-            status = "done" if why is None else "[red]failed[/]"
-            scenes.add_row(escape(printable(name)), status, escape(printable(why or "")))
+        why = {folder: self.failures.get(folder) for folder in self.names}
+        scenes = status_table(
+            "why",
+            [(name, "failed" if why[folder] else "done", why[folder] or "") for folder, name in self.names.items()],
+        )
         if not self.reports:
             return [scenes]
         first, means, grids = next(iter(self.reports.values())), self._means(), []
@@ -69,6 +67,17 @@ class Batch:
             lines = [[metric.text(value) for value in line] for line in found]
             grids.append(grid(f"{metric.title}, {over}", first, lines))
         return [*grids, scenes]
+
+
+def status_table(told: str, rows: Iterable[tuple[str, str, str]]) -> Table:
+    """What became of each scene: its name, its status, and what is told of it."""
+    table = Table(title="scenes", title_justify="left")
+    for heading in ("scene", "status", told):
+        table.add_column(heading, overflow="fold")
+    for name, status, text in rows:
+        shown = "[red]failed[/]" if status == "failed" else status
+        table.add_row(escape(printable(name)), shown, escape(printable(text)))
+    return table
 
 
 def batch(

@@ -12,7 +12,7 @@ import tyro
 
 from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.digests import digest_of_scene
-from aaplug.core.errors import FrameError, OutputError, UsageError
+from aaplug.core.errors import FrameError, UsageError
 from aaplug.core.executors import ProcessesIfLong
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.monitor import SILENT, Monitor
@@ -28,7 +28,7 @@ from aaplug.evaluation.truth import Truth
 from aaplug.inspection.alignment import mismatch
 from aaplug.inspection.coverage import coverage
 from aaplug.inspection.differences import differences
-from aaplug.io.atomic import claimed, output_folder, refuse_existing
+from aaplug.io.atomic import claimed, output_folder
 from aaplug.io.cameras import select_views
 from aaplug.io.scenes import bytes_of, called, open_scene
 from aaplug.io.scenes.scene_file import SceneFile, usable
@@ -40,7 +40,7 @@ from aaplug.rendering.renderer import Renderer
 from aaplug.verbs.agreement import settled
 from aaplug.verbs.announce import announce
 from aaplug.verbs.assumed import say_assumed
-from aaplug.verbs.evaluate import environment, facts_of_cameras, seconds_of, shown_views
+from aaplug.verbs.evaluate import JOURNAL, check_journalled, environment, facts_of_cameras, seconds_of, shown_views
 from aaplug.verbs.inputs import (
     AnyPath,
     CamerasLike,
@@ -64,7 +64,6 @@ METHOD = replace(
     PROTOCOLS["self"], name="compare", source="the first scene as its recipe draws it at each size", scales=SIZES
 )
 MEASURED = ("psnr", "ssim", "flicker")
-JOURNAL = "progress.jsonl"
 
 log = logging.getLogger("aaplug")
 
@@ -161,15 +160,7 @@ def compare(
 
 def check_compared(folder: Path | None, o: CompareOptions) -> None:
     """Refuse, before any work, what needs a folder, contradicts itself or would replace results."""
-    if o.resume and folder is None:
-        raise UsageError("resume", "needs a folder; give `output`")
-    if o.resume and o.overwrite:
-        raise UsageError("resume", "and `overwrite` contradict each other; give one")
-    if folder is None or o.overwrite or o.resume:
-        return
-    if (folder / JOURNAL).exists():
-        raise OutputError(folder, "holds a comparison; `resume` continues it, `overwrite` starts anew")
-    refuse_existing([folder / name for name in (*COMPARED, PAGE)], overwrite=False)
+    check_journalled(folder, (*COMPARED, PAGE), "a comparison", o.resume, o.overwrite)
 
 
 def _named(

@@ -174,16 +174,23 @@ def check_results(folder: Path | None, o: EvaluateOptions) -> None:
     """Refuse, before any work, what needs a folder, contradicts itself or would replace results."""
     if o.layout not in get_args(Layout):
         raise UsageError("layout", not_one_of(o.layout, get_args(Layout)))
-    for parameter, given in {"report": o.report, "layout": o.layout != "plain", "resume": o.resume}.items():
+    for parameter, given in {"report": o.report, "layout": o.layout != "plain"}.items():
         if given and folder is None:
             raise UsageError(parameter, "needs a folder; give `output`")
-    if o.resume and o.overwrite:
+    check_journalled(folder, (*RESULTS, PAGE) if o.report else RESULTS, "an evaluation", o.resume, o.overwrite)
+
+
+def check_journalled(folder: Path | None, files: Sequence[str], what: str, resume: bool, overwrite: bool) -> None:
+    """Refuse to resume without a folder, and to replace in it a journal of `what` or any of the files unasked."""
+    if resume and folder is None:
+        raise UsageError("resume", "needs a folder; give `output`")
+    if resume and overwrite:
         raise UsageError("resume", "and `overwrite` contradict each other; give one")
-    if folder is None or o.overwrite or o.resume:
+    if folder is None or overwrite or resume:
         return
     if (folder / JOURNAL).exists():
-        raise OutputError(folder, "holds an evaluation; `resume` continues it, `overwrite` starts anew")
-    refuse_existing([folder / name for name in ((*RESULTS, PAGE) if o.report else RESULTS)], overwrite=False)
+        raise OutputError(folder, f"holds {what}; `resume` continues it, `overwrite` starts anew")
+    refuse_existing([folder / name for name in files], overwrite=False)
 
 
 def _metrics(o: EvaluateOptions) -> tuple[list[Metric], Protocol]:
