@@ -4,6 +4,7 @@ import csv
 import json
 import math
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ import torch
 
 import aaplug
 from aaplug.core.errors import AaplugError, FrameError, UsageError
+from aaplug.core.executors import ProcessesIfLong
 from aaplug.core.gaussians import MIP
 from aaplug.evaluation.engine import _Measuring
 from aaplug.evaluation.journal import Journal
@@ -301,7 +303,7 @@ def test_views_measured_in_processes_are_the_same(cli, monkeypatch):  # noqa: F8
     given = {"a": scene, "b": replace(scene, convention=MIP)}
     how = {"scale": (0.5,), "rasterizer": "eager", "threads": 2, "views": "train", "metric": "psnr"}
     expected = aaplug.compare(given, cameras, **how).report
-    monkeypatch.setattr("aaplug.verbs.compare.PAYS_AFTER", 0.0)
+    monkeypatch.setattr("aaplug.verbs.compare.ProcessesIfLong", partial(ProcessesIfLong, pays_after=0.0))
     found = aaplug.compare(given, cameras, **how).report
     assert [m.values for m in found.measurements] == [m.values for m in expected.measurements]
 

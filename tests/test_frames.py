@@ -4,7 +4,7 @@ import pytest
 
 from aaplug.core.errors import OutputError
 from aaplug.core.executors import ProcessesIfLong, torch_threads
-from aaplug.rendering.frames import PAYS_AFTER, write_frames
+from aaplug.rendering.frames import write_frames
 from aaplug.rendering.renderer import Renderer
 from tests.conftest import ALL_RASTERIZERS, make_camera, make_scene
 
@@ -50,7 +50,7 @@ def test_an_existing_file_is_refused_by_name(renderer, paths):
 
 def test_little_work_starts_no_process(renderer, paths, monkeypatch):
     monkeypatch.setattr("aaplug.core.executors.Processes", None)
-    write_frames(renderer, VIEWS, paths, ProcessesIfLong(8, PAYS_AFTER).map)
+    write_frames(renderer, VIEWS, paths, ProcessesIfLong(8).map)
     assert all(path.is_file() for path in paths)
 
 

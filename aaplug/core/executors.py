@@ -30,6 +30,7 @@ from aaplug.core.locks import scratch
 QUIET = "ignore::UserWarning:multiprocessing.resource_tracker"
 
 WORK = "work.pt"  # the file in the folder of temporary files that holds what workers do
+PAYS_AFTER = 20.0  # seconds of work left: two processes take five to start, and save two fifths
 AHEAD = 2  # items a worker that wait or are at work, so that none is idle
 
 T = TypeVar("T")
@@ -117,7 +118,7 @@ class ProcessesIfLong:
     """Processes, if the first item says that more than `pays_after` seconds of work are left; else this one."""
 
     workers: int
-    pays_after: float
+    pays_after: float = PAYS_AFTER
 
     def map(self, work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
         """Yield `work(item)` of every item, in order; errors as those of `Processes`."""

@@ -19,8 +19,6 @@ from aaplug.io.atomic import check_output
 from aaplug.io.images import write_png
 from aaplug.rendering.renderer import Renderer
 
-PAYS_AFTER = 20.0  # seconds of work left: two processes take five to start, and save two fifths
-
 
 def write_frames(
     renderer: Renderer,

@@ -4,10 +4,10 @@ from collections.abc import Sequence
 
 from aaplug.core.cameras import Camera
 from aaplug.core.errors import UsageError, listing
+from aaplug.core.executors import PAYS_AFTER
 from aaplug.core.monitor import Monitor
 from aaplug.io.limits import lack_of_memory
 from aaplug.rendering.cost import cost_of
-from aaplug.rendering.frames import PAYS_AFTER
 from aaplug.rendering.renderer import Renderer
 
 LONG = 60.0  # seconds of work from which a job is announced

@@ -35,7 +35,6 @@ from aaplug.io.scenes.scene_file import SceneFile, usable
 from aaplug.methods.recipe import Recipe
 from aaplug.methods.recipes import RECIPES
 from aaplug.methods.viewers import VIEWERS, Viewer
-from aaplug.rendering.frames import PAYS_AFTER
 from aaplug.rendering.renderer import Renderer
 from aaplug.verbs.agreement import settled
 from aaplug.verbs.announce import announce
@@ -148,7 +147,7 @@ def compare(
         images = folder and ImageStore(folder, shown_views(o.show, seen))
         facts = _facts(rows, held, cameras, seen, viewer, o)
         with scheduled(o, folder, monitor) as cluster, monitor.progress("comparing", "views") as tell:
-            pool = cluster or ProcessesIfLong(workers, PAYS_AFTER)
+            pool = cluster or ProcessesIfLong(workers)
             report = evaluate(task, facts, tell, folder and folder / JOURNAL, o.resume, images, pool.map)
         found = Comparison(rows, report)
         if folder and images:

@@ -14,7 +14,7 @@ from aaplug.io.atomic import claimed, output_folder
 from aaplug.io.cameras import select_views
 from aaplug.io.scenes.scene_file import SceneFile
 from aaplug.methods.recipes import find_recipe
-from aaplug.rendering.frames import PAYS_AFTER, write_frames
+from aaplug.rendering.frames import write_frames
 from aaplug.rendering.renderer import Renderer
 from aaplug.verbs.announce import announce
 from aaplug.verbs.assumed import say_assumed
@@ -88,7 +88,7 @@ def render(
         say_assumed(cameras, monitor, renderer, shown[0])
         announce([renderer], shown, monitor, processes=workers)
         with scheduled(o, paths[0].parent, monitor) as cluster, monitor.progress("rendering", "views") as tell:
-            pool = cluster or ProcessesIfLong(workers, PAYS_AFTER)
+            pool = cluster or ProcessesIfLong(workers)
             write_frames(renderer, shown, paths, pool.map, bit_depth=o.bit_depth, overwrite=o.overwrite, tell=tell)
     return [Written(*pair) for pair in zip(shown, paths, strict=True)]
 

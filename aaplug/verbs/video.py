@@ -22,7 +22,6 @@ from aaplug.io.atomic import claimed
 from aaplug.io.cameras import select_views
 from aaplug.io.cameras.camera_path import read_camera_path
 from aaplug.io.video import MOST_FPS, check_video
-from aaplug.rendering.frames import PAYS_AFTER
 from aaplug.rendering.videos import make_video
 from aaplug.verbs.announce import announce
 from aaplug.verbs.assumed import say_assumed
@@ -121,7 +120,7 @@ def video(
         announce(renderers, shown, monitor, processes=workers, fewer="seconds or frames per second")
         folder = Path(output).parent
         with scheduled(o, folder, monitor) as cluster, monitor.progress("rendering", "images") as tell:
-            pool = cluster or ProcessesIfLong(workers, PAYS_AFTER)
+            pool = cluster or ProcessesIfLong(workers)
             how = {"overwrite": o.overwrite, "tell": tell, "folder": cluster and folder}
             make_video(output, renderers, shown, fps, compose, pool.map, **how)
     return Clip(Path(output), len(shown), fps)
