@@ -80,10 +80,13 @@ def data(page, name: str) -> str:
 
 
 def state(page) -> dict:
-    """What the address holds."""
+    """What the address holds, once it stays as it is: it follows the camera some time later."""
     page.wait_for_function("location.hash.length > 10")
-    page.wait_for_timeout(250)
-    return json.loads(unquote(urlsplit(page.url).fragment))
+    before = ""
+    while before != page.url:
+        before = page.url
+        page.wait_for_timeout(400)
+    return json.loads(unquote(urlsplit(before).fragment))
 
 
 def image(page, selector=SEEN) -> torch.Tensor:
@@ -267,7 +270,9 @@ def test_a_path_a_still_and_a_command_are_kept(opened, tmp_path):
     page = opened(permissions=["clipboard-read", "clipboard-write"])
     page.keyboard.press("r")
     drag(page, (0.2, 0.5), (0.4, 0.5))
-    page.wait_for_function("parseInt(document.querySelector('#path').textContent.slice(11)) > 3")
+    at_rest(page, at="")
+    kept = "parseInt(document.querySelector('#path').textContent.slice(11))"
+    page.wait_for_function(f"{kept} > {page.evaluate(kept)} + 3")  # frames of the end
     page.keyboard.press("r")
     with page.expect_download() as download:
         page.click("#path")
