@@ -173,15 +173,15 @@ def test_without_a_compiler_a_build_is_refused(empty_cache, monkeypatch):
 
 def test_after_a_failed_build_auto_is_eager_and_says_why(empty_cache, monkeypatch):
     def fails():
-        raise UsageError("warmup", "torch cannot compile 'owners' here")
+        raise UsageError("warmup", "torch cannot compile 'places' here")
 
     monkeypatch.setattr(choice, "has_compiler", lambda: True)
     monkeypatch.setattr(choice, "build", fails)
     said: list[str] = []
     chosen = find_rasterizer("auto", choice.FRAMES_THAT_PAY, said.append)
     assert chosen is RASTERIZERS["eager"]
-    assert "cannot compile 'owners'" in said[-1]
-    with pytest.raises(UsageError, match="cannot compile 'owners'"):
+    assert "cannot compile 'places'" in said[-1]
+    with pytest.raises(UsageError, match="cannot compile 'places'"):
         find_rasterizer("compiled", 1, said.append)
 
 
@@ -190,8 +190,8 @@ def test_a_kernel_that_does_not_compile_is_named(empty_cache, monkeypatch):
         raise KeyError("buf14")
 
     monkeypatch.setattr(torch._inductor, "aoti_compile_and_package", fails)
-    with pytest.raises(UsageError, match=r"warmup: torch .* cannot compile 'owners' here"):
-        compiled._build("owners")
+    with pytest.raises(UsageError, match=r"warmup: torch .* cannot compile 'places' here"):
+        compiled._build("places")
 
 
 def test_an_unknown_name_lists_the_known_ones():

@@ -373,6 +373,17 @@ draw(splats, (64, 64), (0.0, 0.0, 0.0))
 """
 
 
+@pytest.mark.parametrize("grid", [(1, 40_000), (3, 20_000)])
+def test_tiles_of_a_wide_image_are_told_apart_by_longer_numbers_or_by_bands(grid):
+    height, shift = grid[0] * TILE, (grid[1] - 8) * TILE
+    splats = make_splats(30, (height, 8 * TILE), 5, (0.0, 2.5)).to(F64)
+    moved = replace(splats, means=splats.means + splats.means.new_tensor([shift, 0.0]))
+    draw = Tiled()
+    wide = draw(moved, (height, grid[1] * TILE), (0.1, 0.2, 0.3)).rgb
+    torch.testing.assert_close(wide[:, shift:], draw(splats, (height, 8 * TILE), (0.1, 0.2, 0.3)).rgb)
+    assert len(list(binning.bands(moved, grid, EAGER))) == grid[0]
+
+
 @needs_peak_memory
 def test_a_frame_of_several_bands_needs_little_memory_beside_its_image():
     assert memory_taken(FRAME, "draw(splats, (2048, 2048), (0.0, 0.0, 0.0))") < FRAME_MEMORY

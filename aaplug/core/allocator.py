@@ -4,8 +4,8 @@ import ctypes
 from contextlib import suppress
 from functools import cache
 
-# of mallopt: M_MMAP_THRESHOLD at its largest, and M_TRIM_THRESHOLD, in bytes
-KEPT = {-3: 1 << 25, -1: 1 << 30}
+# of mallopt: M_MMAP_MAX, how many blocks come from the system by themselves, and M_TRIM_THRESHOLD, in bytes
+KEPT = {-4: 0, -1: 1 << 30}
 
 
 @cache

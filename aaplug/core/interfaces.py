@@ -95,7 +95,7 @@ class PixelKernel(Protocol):
     name: unique among pixel kernels.
     columns: number of columns of a raster row.
     needs_depth_slopes: whether it draws discs, which need `Splats2D.depth_slopes`.
-    splats_per_pass: splats of a tile that one compiled pass composites: a multiple of `forward.STEP`, at most
+    splats_per_pass: splats of a tile that one compiled pass composites: a multiple of `forward.STEP` that divides
         `binning.LONGEST_PASS`; 8 suits all but the cheapest kernels.
     """
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn import functional
 
 from aaplug.core.ellipses import whitening, whitening_columns
 from aaplug.core.interfaces import Pixels
@@ -20,15 +21,7 @@ from aaplug.core.kernels import Kernel, Kernels
 from aaplug.core.rules import Rules
 from aaplug.core.splats import Splats2D
 from aaplug.methods.pixel_kernels.gradients import Move
-from aaplug.methods.pixel_kernels.raster_rows import (
-    COLUMNS,
-    OPACITY,
-    TILE,
-    forms_at,
-    offsets_at,
-    splat_example,
-    with_padding_row,
-)
+from aaplug.methods.pixel_kernels.raster_rows import COLUMNS, OPACITY, TILE, forms_at, offsets_at, splat_example
 
 HALF_LOG2_E = 0.5 * math.log2(math.e)
 LN_2 = math.log(2)
@@ -54,8 +47,7 @@ class Point:
         """Scaled forms, and opacity as its log2."""
         assert splats.rgb is not None
         columns = (splats.means, splats.covs, splats.dets, splats.opacities, splats.rgb)
-        (rows,) = kernels.run(POINT_ROWS, *columns)
-        return with_padding_row(rows, LOG2_PADDING)
+        return kernels.run(POINT_ROWS, *columns)[0]
 
     def alpha(self, rows: Float[Tensor, "*n t c"], pixels: Pixels, rules: Rules) -> Float[Tensor, "*n t P"]:
         """2^(log2 o - u² - v²), 0 below the cut-off."""
@@ -101,10 +93,13 @@ def _point_rows(
     dets: Float[Tensor, " m"],
     opacities: Float[Tensor, " m"],
     rgb: Float[Tensor, "m 3"],
-) -> tuple[Float[Tensor, "m 10"]]:
+) -> tuple[Float[Tensor, "m_and_1 10"]]:
+    """Raster rows and the padding row."""
     forms = [HALF_LOG2_E**0.5 * form for form in whitening_columns(covs, dets)]
     columns = [*forms, *means.unbind(dim=1), opacities.log2(), *rgb.unbind(dim=1)]
-    return (torch.stack(columns, dim=1),)
+    ends = [LOG2_PADDING if i == OPACITY else 0.0 for i in range(COLUMNS)]
+    padded = [functional.pad(x, (0, 1), value=end) for x, end in zip(columns, ends, strict=True)]
+    return (torch.stack(padded, dim=1),)
 
 
 def _exp2_above_cutoff(exponent: Float[Tensor, "*n P L"], rules: Rules) -> Float[Tensor, "*n P L"]:

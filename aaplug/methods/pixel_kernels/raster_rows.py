@@ -23,18 +23,14 @@ COLUMNS = 10  # columns from here on are a kernel's own
 
 
 def rows_of(splats: Splats2D, forms: Sequence[Tensor], own: Sequence[Tensor]) -> Float[Tensor, "m c"]:
-    """Assemble raster rows from the two forms and a kernel's own columns, with a padding row at the end."""
+    """Assemble raster rows from the two forms and a kernel's own columns, and the padding row, whose alpha is 0.
+
+    A tile reads it when its splats have run out.
+    """
     assert splats.rgb is not None
     centre, colour = splats.means.unbind(dim=1), splats.rgb.unbind(dim=1)
     rows = torch.stack([*forms, *centre, splats.opacities, *colour, *own], dim=1)
-    return with_padding_row(rows, 0.0)
-
-
-def with_padding_row(rows: Float[Tensor, "m c"], opacity: float) -> Float[Tensor, "m_and_1 c"]:
-    """Append the padding row, which a tile reads when its splats have run out; `opacity` must make its alpha 0."""
-    padding = rows.new_zeros(1, rows.shape[1])
-    padding[:, OPACITY] = opacity
-    return torch.cat([rows, padding])
+    return torch.cat([rows, rows.new_zeros(1, rows.shape[1])])
 
 
 def tile_centres(like: Tensor) -> tuple[Float[Tensor, " P"], Float[Tensor, " P"]]:

@@ -38,7 +38,7 @@ KERNELS: tuple[Kernel, ...] = (  # those that take longest to compile come last
     binning.table_kernel(),
     binning.SPANS,
     binning.PAIRS,
-    forward.OWNERS,
+    binning.PLACES,
     point.FROM_SUMS,
     *projection.SHADE_BACKWARD.values(),
     backward.step_kernel(POINT, RULES_3DGS),

@@ -1,6 +1,6 @@
 """Compositing, backward: from the last splats of each tile to the first, in steps of STEP.
 
-t: tiles; K: splats per step; P: pixels per tile; c: columns of a raster row.
+t: tiles; K: splats per step; P: pixels per tile; m: raster rows; c: columns of a raster row.
 
 g: the loss's gradient in the pixel's premultiplied colour and alpha.  c_k: colour of splat k, extended by a 1 for
 alpha.  T_k: transmittance in front of it.  B_k: g · (what the splats behind k composite to, with nothing in front).
@@ -11,38 +11,33 @@ The forward pass stores T only at the start of each step; within a step T is rec
 to back with the remaining Σ g·w·c instead would divide by 1 - alpha, which loses digits where alpha is near 1.
 """
 
-from collections.abc import Iterator
 from functools import cache, partial
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
-from torch.nn import functional
 
 from aaplug.core.interfaces import PixelKernel, Pixels
-from aaplug.core.kernels import Kernel, Kernels
+from aaplug.core.kernels import Kernel
 from aaplug.core.rules import Rules
 from aaplug.methods.pixel_kernels.gradients import Move, SumsGradients, sums_by_autograd
 from aaplug.methods.pixel_kernels.raster_rows import BLUE, GREEN, RED, tile_centres
-from aaplug.rasterizers.tiled.binning import Bins
+from aaplug.rasterizers.tiled.binning import LONGEST_PASS, Bins
 from aaplug.rasterizers.tiled.forward import (
     ALONE,
-    OWNERS,
     STEP,
     Compositing,
     Segment,
     composite_forward,
     in_turn,
     less,
+    places,
     rows_at,
-    rows_example,
+    tiles_example,
     transmitted,
     where_above,
 )
-
-STEPS_TOGETHER = 8  # backward steps whose raster rows are gathered at once
-BUFFERED = 1 << 18  # contributions that are buffered before a sum; at least two per splat
 
 
 def composite(
@@ -83,80 +78,32 @@ def _backward(
     segments: list[Segment],
     how: Compositing,
 ) -> Float[Tensor, "m c"]:
-    """Gradient of the raster rows."""
+    """Gradient of the raster rows.
+
+    What a splat contributes in a tile is kept where it stands in the tile's list, and summed over tiles at the end.
+    """
+    assert bins.pairs is not None
     local, kernel = tile_centres(rows), step_kernel(how.pixel, how.rules)
-    sums_of_splats = _Scatter(torch.zeros_like(rows))
+    steps = bins.splats.view(-1, STEP)
+    parts = rows.new_zeros(len(steps), STEP * rows.shape[1])
     light = torch.zeros_like(g_alpha)
     for segment in reversed(segments):
         behind, hidden = (plane.index_select(0, segment.tiles) for plane in (light, g_alpha))
         colours = g_colour.index_select(1, segment.tiles)
         ones = torch.ones_like(segment.origins[:, 0])
-        for owners, drawn, before in _steps(rows, bins, segment, how.kernels):
+        for step, before in reversed([*enumerate(segment.before)]):
             n = len(before)
-            grads = (*colours[:, :n].unbind(), hidden[:n])
-            pixels = (before, behind[:n], *grads, *local, ones[:n])
+            at = places(segment.at[:n], step * STEP, segment.ends[:n], bins) // STEP
+            drawn = rows_at(rows, steps.index_select(0, at))
+            pixels = (before, behind[:n], *colours[:, :n].unbind(), hidden[:n], *local, ones[:n])
             (sums,) = how.kernels.run(kernel, drawn, segment.origins[:n], *pixels)
-            sums_of_splats.add(owners, sums)
+            parts.index_copy_(0, at, sums)
         light.index_copy_(0, segment.tiles, behind)
-    total = sums_of_splats.total()
+    total = torch.zeros_like(rows)
+    total.index_copy_(0, bins.pairs.nearest, bins.pairs.sums(parts.view(-1, rows.shape[1])))
     if isinstance(how.pixel, SumsGradients):
         return how.pixel.from_sums(rows, total, how.kernels)
     return total
-
-
-def _steps(
-    rows: Float[Tensor, "m c"], bins: Bins, segment: Segment, kernels: Kernels
-) -> Iterator[tuple[Int[Tensor, "n K"], Float[Tensor, "n K c"], Float[Tensor, "n P"]]]:
-    """Owners, raster rows and transmittance of each step of a segment, from the last; several are looked up at once."""
-    at, ends = segment.splats
-    for start in reversed(range(0, len(segment.before), STEPS_TOGETHER)):
-        together = segment.before[start : start + STEPS_TOGETHER]
-        sizes = [len(before) for before in together]
-        places = torch.cat([at[:n] + (start + i) * STEP for i, n in enumerate(sizes)])
-        last = torch.cat([ends[:n] for n in sizes])
-        (owners,) = kernels.run(OWNERS, rows, bins.splats, torch.minimum(places, last), last)
-        drawn = rows_at(rows, owners)
-        steps = zip(owners.split(sizes), drawn.split(sizes), together, strict=True)
-        yield from reversed(list(steps))
-
-
-class _Scatter:
-    """Accumulates per-tile gradient contributions per splat.
-
-    Contributions are buffered and sorted by splat, which is several times as fast as adding each one in place.
-    """
-
-    def __init__(self, total: Float[Tensor, "m c"]):
-        room = max(BUFFERED, 2 * len(total))
-        self._total, self._count = total, 0
-        few = len(total) < torch.iinfo(torch.int16).max  # half the bits sort in half the time
-        self._owners = total.new_empty(room, dtype=torch.int16 if few else torch.int32)
-        self._parts = total.new_empty(room, total.shape[1])
-
-    def add(self, owners: Int[Tensor, "t K"], parts: Float[Tensor, "t c_K"]) -> None:
-        """Add the contributions of a step; the buffer has room for a whole one."""
-        end = self._count + owners.numel()
-        if end > len(self._owners):
-            self._sum()
-            end = owners.numel()
-        self._owners[self._count : end] = owners.flatten()
-        self._parts[self._count : end] = parts.view(-1, self._parts.shape[1])
-        self._count = end
-
-    def total(self) -> Float[Tensor, "m c"]:
-        """Add up what is buffered and return the sum per splat."""
-        if self._count:
-            self._sum()
-        return self._total
-
-    def _sum(self) -> None:
-        owners = self._owners[: self._count]
-        order = torch.sort(owners, stable=True).indices
-        counts = torch.bincount(owners, minlength=len(self._total))
-        first = counts.cumsum(0) - counts
-        parts = self._parts[: self._count]
-        self._total += functional.embedding_bag(order, parts, first, mode="sum")
-        self._count = 0
 
 
 def _step(
@@ -176,16 +123,16 @@ def _step(
 ) -> tuple[Float[Tensor, "t c_STEP"]]:
     """Each tile's contributions to the gradients of K splats; updates `behind`, B_k in the module's docstring."""
     one = one[:, None]
-    before, drawn = T, []
+    before, passed = T, []
     pixels = Pixels(origins, local_x, local_y)
     for row, alpha in in_turn(pixel, rules, rows.transpose(0, 1), pixels):
         through = transmitted(alpha, one, rules)
         after = before * through
         hides = where_above(rules.below_min_transmittance, after, one - through)
-        drawn.append((row, alpha, hides, before))
+        passed.append((row, alpha, hides, before))
         before = after
     moves, light = [], behind
-    for row, alpha, hides, reaching in reversed(drawn):
+    for row, alpha, hides, reaching in reversed(passed):
         weight = reaching * hides
         colour = torch.addcmul(g_hidden, row[:, RED, None], g_red)
         colour = torch.addcmul(colour, row[:, GREEN, None], g_green)
@@ -205,13 +152,18 @@ def _step(
     return (sums,)
 
 
+def _step_example(columns: int) -> tuple[Tensor, ...]:
+    rows, ids, _, *rest = tiles_example(6, columns)
+    return rows_at(rows, ids.view(-1, LONGEST_PASS)[:-1, :STEP]), *rest
+
+
 @cache
 def step_kernel(pixel: PixelKernel, rules: Rules) -> Kernel:
     """A backward step of one pixel kernel by the given rules."""
     return Kernel(
         f"composite-{pixel.name}{rules.tag}-backward",
         partial(_step, pixel, rules),
-        partial(rows_example, 6, pixel.columns),
+        partial(_step_example, pixel.columns),
         (*8 * ("t",), None, None, "t"),
         alone=ALONE,
     )

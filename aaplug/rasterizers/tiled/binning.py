@@ -4,7 +4,7 @@ m: splats; s: spans; p: pairs of a splat and a tile; t: tiles.
 
 Each splat, nearest first, is paired with the tiles that its cut-off ellipse overlaps.  An ellipse is convex, so in one
 row of tiles it covers a run of columns.  A splat becomes one span per row, a span becomes pairs, and a stable sort of
-the pairs by tile does the rest.
+the pairs by tile does the rest.  Each tile's list is padded, so that a pass reads whole runs of it.
 
 Bands of whole tile rows bound the memory: each exceeds the budget of candidate pairs by at most its last row.
 """
@@ -17,6 +17,7 @@ from itertools import pairwise
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn import functional
 
 from aaplug.core.ellipses import squared_cutoff
 from aaplug.core.kernels import Kernel, Kernels
@@ -27,33 +28,70 @@ from aaplug.methods.pixel_kernels.raster_rows import TILE, splat_example
 LONGEST_PASS = 16  # most splats per pass: more compile slowly, fewer reload the pixels' state more often
 MEMORY = 1e9  # bytes
 PAIR_BYTES = 64  # bytes per candidate pair while a band is binned, measured
+MOST_PAIRS = 1 << 30  # in a band, so that their places are 32 bit integers
+SHORT = torch.iinfo(torch.int16).max  # tiles in a band, so that they are sorted by few bits
 CUTOFF_SLACK = 1e-4  # relative margin of the squared cut-off, so that float32 rounding never drops a pixel above it
 BOX = 7  # index of the table's first tile box column
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """The pairs of a band, those of one splat together and nearest splats first: the order of sums over tiles.
+
+    nearest: all splats, nearest first.  spans: the first span of each of them.  starts: the first pair of each span.
+    sorted: the pairs by tile.  places: where each of these stands in `Bins.splats`.
+    """
+
+    nearest: Int[Tensor, " m"]
+    spans: Int[Tensor, " m"]
+    starts: Int[Tensor, " s"]
+    sorted: Int[Tensor, " p"]
+    places: Int[Tensor, " p"]
+
+    def sums(self, parts: Float[Tensor, "padded_p c"]) -> Float[Tensor, "m c"]:
+        """Per splat of `nearest`, the sum of what stands at its pairs' places."""
+        places = torch.empty_like(self.places)
+        places[self.sorted] = self.places
+        starts = torch.cat([self.starts, self.starts.new_full((1,), len(places))])
+        return functional.embedding_bag(places, parts, starts.index_select(0, self.spans), mode="sum")
 
 
 @dataclass(frozen=True)
 class Bins:
     """Tile t of a band draws the splats `splats[first[t] : first[t] + counts[t]]`, nearest first.
 
-    splats: padded by LONGEST_PASS, so that a pass may read past the end.
+    splats: each tile's list is padded to a multiple of LONGEST_PASS, and as many follow them all; padding names the
+        raster row behind the last splat's.
     origins: the tiles' top left corners, in px.
+    pairs: for gradients.
     """
 
-    splats: Int[Tensor, " p_and_K"]
+    splats: Int[Tensor, " padded_p"]
     first: Int[Tensor, " t"]
     counts: Int[Tensor, " t"]
     origins: Float[Tensor, "t 2"]
+    pairs: Pairs | None
+
+    @property
+    def padding(self) -> int:
+        """Where only padding follows."""
+        return len(self.splats) - LONGEST_PASS
 
 
 @torch.no_grad()
 def bands(
-    splats: Splats2D, grid: tuple[int, int], kernels: Kernels, memory: float = MEMORY, rules: Rules = RULES_3DGS
+    splats: Splats2D,
+    grid: tuple[int, int],
+    kernels: Kernels,
+    memory: float = MEMORY,
+    rules: Rules = RULES_3DGS,
+    gradients: bool = False,
 ) -> Iterator[Bins]:
-    """Bins of bands of tile rows, from the top."""
+    """Bins of bands of tile rows, from the top; with `pairs` if `gradients`."""
     order = _depth_order(splats.depths)
-    table = _table(splats, grid, kernels, rules)
-    for rows in _rows(table, grid[0], max(1, int(memory / PAIR_BYTES))):
-        yield _bin(table, order, rows, grid[1], kernels)
+    table = _table(splats, grid, kernels, rules).index_select(0, order)
+    for rows in _rows(table, grid, min(MOST_PAIRS, max(1, int(memory / PAIR_BYTES)))):
+        yield _bin(table, order, rows, grid[1], kernels, gradients)
 
 
 def _depth_order(depths: Float[Tensor, " m"]) -> Int[Tensor, " m"]:
@@ -100,43 +138,52 @@ def _table_rows(
     return (torch.stack([*means.unbind(dim=1), *ellipse, *lows, *highs], dim=1),)
 
 
-def _rows(table: Float[Tensor, "m 11"], rows: int, budget: int) -> list[tuple[int, int]]:
-    """Cut the grid into bands of whole tile rows with about `budget` candidate pairs each."""
-    left, top, right, bottom = table[:, BOX:].long().unbind(dim=1)
-    change = top.new_zeros(rows + 1)
-    change.index_add_(0, top, right - left).index_add_(0, bottom, left - right)
-    ends = change.cumsum(0).cumsum(0)[:rows]  # candidates down to each row
-    marks = ends.new_tensor(range(budget, int(ends[-1]), budget))
-    cuts = [0, *(torch.searchsorted(ends, marks) + 1).tolist(), rows]
-    return [(a, b) for a, b in pairwise(dict.fromkeys(cuts)) if b > a]
+def _rows(table: Float[Tensor, "m 11"], grid: tuple[int, int], budget: int) -> list[tuple[int, int]]:
+    """Cut the grid into bands of whole tile rows with about `budget` candidate pairs and at most `SHORT` tiles each."""
+    left, top, right, bottom = table[:, BOX:].unbind(dim=1)
+    most, wide = max(1, SHORT // grid[1]), right - left
+    cuts = [*range(0, grid[0], most), grid[0]]
+    if (wide * (bottom - top)).sum(dtype=torch.float64) > budget:
+        change = torch.zeros(grid[0] + 1, dtype=torch.long, device=table.device)
+        change.index_add_(0, top.long(), wide.long()).index_add_(0, bottom.long(), -wide.long())
+        ends = change.cumsum(0).cumsum(0)[: grid[0]]  # candidates down to each row
+        marks = ends.new_tensor(range(budget, int(ends[-1]), budget))
+        cuts = sorted({*cuts, *(torch.searchsorted(ends, marks) + 1).tolist()})
+    return list(pairwise(cuts))
 
 
 def _bin(
-    table: Float[Tensor, "m 11"], order: Int[Tensor, " m"], rows: tuple[int, int], columns: int, kernels: Kernels
+    table: Float[Tensor, "m 11"],
+    order: Int[Tensor, " m"],
+    rows: tuple[int, int],
+    columns: int,
+    kernels: Kernels,
+    gradients: bool,
 ) -> Bins:
-    """Pair splats, nearest first, with the tiles that they overlap in a band of rows."""
+    """Pair splats, nearest first, with the tiles that they overlap in a band of rows.  table: nearest first."""
     _, top, _, bottom = table[:, BOX:].unbind(dim=1)
-    heights = (bottom.clamp(*rows) - top.clamp(*rows)).long().index_select(0, order)
-    ranks = torch.repeat_interleave(heights)
-    band = order.new_tensor([rows[0], columns])
-    args = (ranks, order, _starts(heights), table, band)
-    first, widths, owners = kernels.run(SPANS, *args)
-    spans = torch.repeat_interleave(widths)
-    tiles, splats = kernels.run(PAIRS, spans, _starts(widths), first, owners)
+    heights = (bottom.clamp(*rows) - top.clamp(*rows)).int()
+    down, band = _starts(heights), order.new_tensor([rows[0], columns])
+    first, widths, owners = kernels.run(SPANS, torch.repeat_interleave(heights), order, down, table, band)
     size = (rows[1] - rows[0]) * columns
-    if size < torch.iinfo(torch.int16).max:
-        tiles = tiles.short()  # half as many bits sort in half the time
-    sorted_tiles, pairs = torch.sort(tiles, stable=True)
+    first = first.short() if size <= SHORT else first  # half as many bits sort in half the time
+    starts = _starts(widths)
+    tiles, splats = kernels.run(PAIRS, torch.repeat_interleave(widths), starts, first, owners)
+    by_tile, pairs = torch.sort(tiles, stable=True)
     tile = torch.arange(size, device=table.device)
-    ends = torch.searchsorted(sorted_tiles, tile.to(tiles), right=True)
-    first = torch.cat([ends.new_zeros(1), ends[:-1]])
+    ends = torch.searchsorted(by_tile, tile.to(tiles), right=True)
+    counts = torch.diff(ends, prepend=ends.new_zeros(1))
+    lengths = (counts + (LONGEST_PASS - 1)) // LONGEST_PASS * LONGEST_PASS
+    begins = _starts(lengths)
+    drawn = splats.new_full((int(lengths.sum()) + LONGEST_PASS,), len(table))
+    (places,) = kernels.run(PLACES, drawn, by_tile, (begins + counts - ends).int(), pairs, splats)
     origins = torch.stack([tile % columns, tile // columns + rows[0]], dim=1) * TILE
-    drawn = torch.cat([splats.index_select(0, pairs), splats.new_zeros(LONGEST_PASS)])
-    return Bins(drawn, first, ends - first, origins.to(table.dtype))
+    kept = Pairs(order, down, starts, pairs, places) if gradients else None
+    return Bins(drawn, begins, counts, origins.to(table.dtype), kept)
 
 
 def _starts(counts: Int[Tensor, " m"]) -> Int[Tensor, " m"]:
-    return counts.cumsum(0) - counts
+    return counts.cumsum(0, dtype=counts.dtype) - counts
 
 
 def _spans(
@@ -148,13 +195,14 @@ def _spans(
 ) -> tuple[Int[Tensor, " s"], Int[Tensor, " s"], Int[Tensor, " s"]]:
     """Per span: its first tile in the band, its number of tiles, its splat.  A span is one splat in one row of tiles.
 
+    ranks: the splat's place in `order` and in the table.
+
     At dy = h px below its centre the ellipse covers dx = slope·h ± w, with w² = variance (cutoff - h²/yy).  Its right
     edge is farthest at the rightmost point and recedes monotonically on both sides.  Among a row's pixel centres,
     the one nearest to that point's dy therefore bounds the span; the left edge is symmetric.
     """
     top_row, columns = band.unbind()
-    owners = order[ranks]
-    row = table[owners]
+    row = table[ranks]
     x, y, slope, variance, yy, cutoff, rightmost, _, low_y, _, _ = row.unbind(dim=1)
     down = (torch.arange(ranks.shape[0], device=ranks.device) - starts[ranks]).to(x)
     tile_y = torch.maximum(low_y, top_row) + down
@@ -171,15 +219,31 @@ def _spans(
     left = torch.minimum(((ends[0] + 0.5 - TILE) / TILE).ceil().clamp(min=0.0), limit)
     right = torch.minimum(((ends[1] - 0.5) / TILE).floor() + 1, limit)
     width = torch.where(reaches, (right - left).clamp(min=0.0), 0.0)
-    return (tile_y.long() - top_row) * columns + left.long(), width.long(), owners.int()
+    return ((tile_y.long() - top_row) * columns + left.long()).int(), width.int(), order[ranks].int()
 
 
 def _pairs(
     spans: Int[Tensor, " p"], starts: Int[Tensor, " s"], first: Int[Tensor, " s"], owners: Int[Tensor, " s"]
 ) -> tuple[Int[Tensor, " p"], Int[Tensor, " p"]]:
     """Tile and splat of each pair."""
-    place = torch.arange(spans.shape[0], device=spans.device)
-    return (place + (first - starts)[spans]).int(), owners[spans]
+    place = torch.arange(spans.shape[0], dtype=torch.int32, device=spans.device)
+    return (place + (first - starts)[spans]).to(first.dtype), owners[spans]
+
+
+def _places(
+    drawn: Int[Tensor, " padded_p"],
+    tiles: Int[Tensor, " p"],
+    shifts: Int[Tensor, " t"],
+    pairs: Int[Tensor, " p"],
+    splats: Int[Tensor, " p"],
+) -> tuple[Int[Tensor, " p"]]:
+    """Write the splats, sorted by tile, into the padded lists; returns where each came to stand.
+
+    tiles: sorted.  shifts: how far padding moves each tile's list.
+    """
+    places = torch.arange(tiles.shape[0], dtype=torch.int32, device=tiles.device) + shifts[tiles.int()]
+    drawn.index_put_((places,), splats[pairs])
+    return (places,)
 
 
 # --------------------------------------------------------------------------------------------------------- kernels
@@ -190,12 +254,21 @@ def _spans_example() -> tuple[Tensor, ...]:
     row = [12.0, 12.0, 0.5, 1.0, 1.0, 9.0, 0.5, 0.0, 0.0, 2.0, 4.0]
     table = torch.tensor(row).repeat(boxes, 1)
     order = torch.arange(boxes)
-    return torch.arange(4 * boxes) // 4, order, 4 * order, table, torch.tensor([0, 4])
+    ranks = torch.arange(4 * boxes, dtype=torch.int32) // 4
+    return ranks, order, 4 * order.int(), table, torch.tensor([0, 4])
 
 
 def _pairs_example() -> tuple[Tensor, ...]:
-    spans = torch.arange(50_000)
-    return torch.arange(200_000) // 4, 4 * spans, spans % 999, spans.int()
+    spans = torch.arange(50_000, dtype=torch.int32)
+    return torch.arange(200_000, dtype=torch.int32) // 4, 4 * spans, (spans % 999).short(), spans
+
+
+def _places_example() -> tuple[Tensor, ...]:
+    tiles, each = 10_000, 20
+    pairs = torch.arange(tiles * each)
+    shifts = (LONGEST_PASS - each % LONGEST_PASS) * torch.arange(tiles, dtype=torch.int32)
+    drawn = torch.zeros(tiles * 2 * LONGEST_PASS, dtype=torch.int32)
+    return drawn, (pairs // each).short(), shifts, pairs.flip(0), pairs.int()
 
 
 @cache
@@ -212,3 +285,4 @@ def table_kernel(min_alpha: float = RULES_3DGS.min_alpha) -> Kernel:
 
 SPANS = Kernel("spans", _spans, _spans_example, ("s", "m", "m", "m", None))
 PAIRS = Kernel("pairs", _pairs, _pairs_example, ("p", "s", "s", "s"))
+PLACES = Kernel("places", _places, _places_example, ("padded_p", "p", "t", "p", "p"))

@@ -18,7 +18,7 @@ from torch import Tensor
 from aaplug.core.interfaces import PixelKernel, Pixels
 from aaplug.core.kernels import Kernel, Kernels
 from aaplug.core.rules import Rules
-from aaplug.methods.pixel_kernels.raster_rows import BLUE, COLUMNS, GREEN, PIXELS, RED, tile_centres
+from aaplug.methods.pixel_kernels.raster_rows import BLUE, GREEN, PIXELS, RED, tile_centres
 from aaplug.rasterizers.tiled.binning import LONGEST_PASS, Bins
 
 STEP = 4  # splats per backward step; transmittance is stored before each step.  With more the compiler splits the loop
@@ -49,12 +49,13 @@ class Segment:
     """The passes between two compactions of the list of tiles; kept for the backward pass.
 
     tiles: tiles that were composited, those with the most splats first.
-    splats: per tile, where its splats begin and end in `Bins.splats`, counted from this segment's first splat.
+    at, ends: per tile, where its splats of this segment begin and where all end in `Bins.splats`.
     before: per backward step, transmittance before it, for the first n of `tiles`: those that had splats left.
     """
 
     tiles: Int[Tensor, " t"]
-    splats: tuple[Int[Tensor, " t"], Int[Tensor, " t"]]
+    at: Int[Tensor, " t"]
+    ends: Int[Tensor, " t"]
     origins: Float[Tensor, "t 2"]
     before: list[Float[Tensor, "n P"]]
 
@@ -95,9 +96,9 @@ def _composite_block(
         going, rest = _going(counts - start, splats), tiles[:0]
         before, steps = [], [] if segments is None else _going(counts - start, STEP)
         if segments is not None:
-            segments.append(Segment(tiles, (at, ends), origins, before))
+            segments.append(Segment(tiles, at, ends, origins, before))
         for i, n in enumerate(going):
-            where = (bins.splats, torch.minimum(at[:n] + i * splats, ends[:n]), ends[:n], origins[:n])
+            where = (bins.splats, places(at[:n], i * splats, ends[:n], bins), origins[:n])
             pixels = (T[:n], *planes[:, :n].unbind(), *local, ones[:n])
             *within, after = how.kernels.run(how.kernel, rows, *where, *pixels)
             here = steps[i * splats // STEP :]
@@ -117,6 +118,12 @@ def _composite_block(
         planes = planes.index_select(1, rest)
 
 
+def places(at: Int[Tensor, " t"], ahead: int, ends: Int[Tensor, " t"], bins: Bins) -> Int[Tensor, " t"]:
+    """Where each tile's splats from `ahead` on stand; without any left, padding does."""
+    here = at + ahead
+    return torch.where(here < ends, here, bins.padding)
+
+
 def _going(counts: Int[Tensor, " t"], at_once: int) -> list[int]:
     """How many tiles take part in each pass of `at_once` splats; `counts`: splats left per tile, falling."""
     passes = (counts + (at_once - 1)) // at_once
@@ -131,7 +138,6 @@ def _pass(
     rows: Float[Tensor, "m c"],
     ids: Int[Tensor, " p"],
     at: Int[Tensor, " t"],
-    ends: Int[Tensor, " t"],
     origins: Float[Tensor, "t 2"],
     T: Float[Tensor, "t P"],
     red: Float[Tensor, "t P"],
@@ -147,14 +153,13 @@ def _pass(
     Returns the transmittance after every STEP of them, 0 where a pixel has stopped.
     one: 1 per tile; multiplying by it makes the compiler keep one loop over tiles.
     """
-    one, splats = one[:, None], pixel.splats_per_pass
+    one = one[:, None]
     before, seen = T, []
     pixels = Pixels(origins, local_x, local_y)
     if torch.compiler.is_compiling():  # each row is loaded where it is needed
-        drawn = (rows[torch.where(at + k < ends, ids[at + k], -1)] for k in range(splats))
+        drawn = (rows[ids[at + k]] for k in range(pixel.splats_per_pass))
     else:
-        (owners,) = owners_of(rows, ids, at, ends, splats)
-        drawn = rows_at(rows, owners.T)
+        drawn = rows_at(rows, ids[at + torch.arange(pixel.splats_per_pass, device=at.device)[:, None]])
     for row, alpha in in_turn(pixel, rules, drawn, pixels):
         after = before * transmitted(alpha, one, rules)
         weight = where_above(rules.below_min_transmittance, after, less(before, after, one))
@@ -182,6 +187,11 @@ def in_turn(
             yield row, pixel.alpha(row, pixels, rules)
 
 
+def rows_at(rows: Float[Tensor, "m c"], owners: Int[Tensor, "*n"]) -> Float[Tensor, "*n c"]:
+    """Raster rows of splats."""
+    return rows.index_select(0, owners.flatten()).view(*owners.shape, -1)
+
+
 # Eager code costs one pass over memory per operation, and `where` costs most.  In a compiled loop, function calls and
 # min/max are slow, because min/max propagate NaN.  So the next three functions have one form for each.
 
@@ -206,41 +216,14 @@ def where_above(bound: float, test: Tensor, value: Tensor) -> Tensor:
     return torch.minimum(torch.threshold(test, bound, 0.0).mul_(GATE), value)
 
 
-def owners_of(
-    rows: Float[Tensor, "m c"],
-    ids: Int[Tensor, " p"],
-    at: Int[Tensor, " t"],
-    ends: Int[Tensor, " t"],
-    count: int = STEP,
-) -> tuple[Int[Tensor, "t K"]]:
-    """Raster row indices of splats `at` to `at + count` of each tile; the padding row past the tile's last splat."""
-    place = at[:, None] + torch.arange(count, device=at.device)
-    return (torch.where(place < ends[:, None], ids[place], rows.shape[0] - 1),)
-
-
-def rows_at(rows: Float[Tensor, "m c"], owners: Int[Tensor, "*n"]) -> Float[Tensor, "*n c"]:
-    """Raster rows of splats."""
-    return rows.index_select(0, owners.flatten()).view(*owners.shape, -1)
-
-
-def _pass_example(columns: int) -> tuple[Tensor, ...]:
-    rows, origins, *pixels = rows_example(5, columns)
-    _, *where = _owners_example()
-    return rows.flatten(0, 1)[:EXAMPLE_SPLATS], *where, origins, *pixels
-
-
-def rows_example(planes: int, columns: int) -> tuple[Tensor, ...]:
-    """Raster rows of a step, tile corners and planes of pixels to compile for."""
+def tiles_example(planes: int, columns: int) -> tuple[Tensor, ...]:
+    """Raster rows, splats and where they begin, tile corners and planes of pixels to compile for."""
     tiles = EXAMPLE_TILES
-    rows = torch.linspace(0.012, 0.1, tiles * STEP * columns).view(tiles, STEP, columns)
+    rows = torch.linspace(0.012, 0.1, EXAMPLE_SPLATS * columns).view(EXAMPLE_SPLATS, columns)
+    ids = torch.arange((tiles + 1) * LONGEST_PASS, dtype=torch.int32) % EXAMPLE_SPLATS
+    at = torch.arange(tiles) * LONGEST_PASS
     pixels = [torch.full((tiles, PIXELS), 0.5) for _ in range(planes)]
-    return rows, torch.ones(tiles, 2), *pixels, *tile_centres(rows), torch.ones(tiles)
-
-
-def _owners_example() -> tuple[Tensor, ...]:
-    ids = torch.arange((EXAMPLE_TILES + 1) * LONGEST_PASS, dtype=torch.int32) % EXAMPLE_SPLATS
-    at = torch.arange(EXAMPLE_TILES) * LONGEST_PASS
-    return torch.ones(EXAMPLE_SPLATS, COLUMNS), ids, at, at + LONGEST_PASS
+    return rows, ids, at, torch.ones(tiles, 2), *pixels, *tile_centres(rows), torch.ones(tiles)
 
 
 @cache
@@ -249,11 +232,8 @@ def pass_kernel(pixel: PixelKernel, rules: Rules) -> Kernel:
     return Kernel(
         f"composite-{pixel.name}{rules.tag}",
         partial(_pass, pixel, rules),
-        partial(_pass_example, pixel.columns),
-        ("m", "p", *8 * ("t",), None, None, "t"),
+        partial(tiles_example, 5, pixel.columns),
+        ("m", "p", *7 * ("t",), None, None, "t"),
         evaluations=pixel.splats_per_pass,
         alone=ALONE,
     )
-
-
-OWNERS = Kernel("owners", owners_of, _owners_example, ("m", "p", "t", "t"))

@@ -76,11 +76,12 @@ class Tiled:
                     f"pixel kernel {pixel.name}", f"raster_rows should return {expected}, got {tuple(rows.shape)}"
                 )
             paint = partial(composite, rows, how=Compositing(pixel, rules, self.kernels))
+            gradients = rows.requires_grad and torch.is_grad_enabled()
         else:
-            paint = self._blender(splats, compositor, rules)
+            paint, gradients = self._blender(splats, compositor, rules), False
 
         def painted() -> Iterator[Render]:
-            for bins in bands(ellipses, grid, self.kernels, self.memory, rules):
+            for bins in bands(ellipses, grid, self.kernels, self.memory, rules, gradients):
                 colours, alphas = paint(bins)
                 rgb, alpha = (_untiled(x, grid[1]) for x in (colours, alphas[None]))
                 yield over(rgb, alpha[..., 0], background)
