@@ -10,10 +10,11 @@ cannot be used is left out with a warning, so that it does not stop everything e
 """
 
 import logging
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
 
+from aaplug.core.choices import NAMES
 from aaplug.core.errors import UsageError, closest, did_you_mean, not_one_of
 
 KINDS = (  # each is a registry and, with underscores and an s, an entry point group
@@ -21,6 +22,8 @@ KINDS = (  # each is a registry and, with underscores and an s, an entry point g
     *("rasterizer", "metric", "protocol", "method", "scene format", "camera format"),
 )
 PREFIX = "aaplug."
+
+_registered: dict[str, list[str]] = {kind: [] for kind in KINDS}  # names added from Python
 
 log = logging.getLogger("aaplug")
 T = TypeVar("T")
@@ -38,6 +41,7 @@ class Registry(Mapping[str, T]):
         self.kind, self._entries = kind, dict(own)
         self._fits = (lambda value: isinstance(value, check)) if isinstance(check, type) else check
         self._loaded = False
+        assert kind not in NAMES or NAMES[kind] == tuple(own), f"choices.NAMES has other names of a {kind}"
 
     def __getitem__(self, name: str) -> T:
         return self._all()[name]
@@ -55,11 +59,9 @@ class Registry(Mapping[str, T]):
             UsageError: there is none; the error names `parameter`, or else the kind, and the closest names.
         """
         entries = self._all()
-        if name in entries:
-            return entries[name]
-        close = closest(name, entries)
-        hint = f" (did you mean '{close}'?)" if close else ""
-        raise UsageError(parameter or self.kind, not_one_of(name, entries) + hint)
+        if name not in entries:
+            raise UsageError(parameter or self.kind, unknown(name, entries))
+        return entries[name]
 
     def register(self, name: str, value: T) -> None:
         """Add an entry from Python, for this process.
@@ -69,6 +71,7 @@ class Registry(Mapping[str, T]):
         """
         self._all()
         self._add(name, value, f"{self.kind} {name}")
+        _registered[self.kind].append(name)
 
     def _all(self) -> dict[str, T]:
         if not self._loaded:
@@ -99,6 +102,18 @@ class Registry(Mapping[str, T]):
 def named(objects: Iterable[T]) -> dict[str, T]:
     """Objects by their `name`."""
     return {getattr(value, "name"): value for value in objects}  # noqa: B009
+
+
+def names_of(kind: str) -> list[str]:
+    """Names of a kind in `choices.NAMES`, and plug-ins', also of such as cannot be used: nothing is imported."""
+    points = entry_points(group=group_of(kind))
+    return list(dict.fromkeys([*NAMES[kind], *(point.name for point in points), *_registered[kind]]))
+
+
+def unknown(name: str, known: Collection[str]) -> str:
+    """Message for a name that is none of the known ones, with the closest of them."""
+    close = closest(name, known)
+    return not_one_of(name, known) + (f" (did you mean '{close}'?)" if close else "")
 
 
 def group_of(kind: str) -> str:

@@ -1,0 +1,12 @@
+"""Types of objects that options take beside names, for the type checker alone, as their modules import torch."""
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from aaplug.core.executors import Executor
+    from aaplug.core.interfaces import Rasterizer
+    from aaplug.evaluation.protocols import Protocol
+    from aaplug.methods.recipe import Recipe
+    from aaplug.methods.viewers import Viewer
+else:
+    Executor = Rasterizer = Protocol = Recipe = Viewer = Any
