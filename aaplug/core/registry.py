@@ -11,6 +11,7 @@ cannot be used is left out with a warning, so that it does not stop everything e
 
 import logging
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
 
@@ -78,7 +79,7 @@ class Registry(Mapping[str, T]):
             self._loaded = True
             _warn_of_unknown_groups()
             group = group_of(self.kind)
-            for point in entry_points(group=group):
+            for point in _points().select(group=group):
                 package = f" of package {point.dist.name}" if point.dist else ""
                 where = f"plug-in {point.value}{package} ({group})"
                 try:
@@ -106,7 +107,7 @@ def named(objects: Iterable[T]) -> dict[str, T]:
 
 def names_of(kind: str) -> list[str]:
     """Names of a kind in `choices.NAMES`, and plug-ins', also of such as cannot be used: nothing is imported."""
-    points = entry_points(group=group_of(kind))
+    points = _points().select(group=group_of(kind))
     return list(dict.fromkeys([*NAMES[kind], *(point.name for point in points), *_registered[kind]]))
 
 
@@ -123,9 +124,15 @@ def group_of(kind: str) -> str:
 
 def _warn_of_unknown_groups() -> None:
     known = set(map(group_of, KINDS))
-    for group in sorted(entry_points().groups):
+    for group in sorted(_points().groups):
         if group.startswith(PREFIX) and group not in known:
             log.warning("entry point group %s is not known%s", group, did_you_mean(group, known))
+
+
+@cache
+def _points() -> Any:
+    """Of all installed packages; reading them takes milliseconds, and no plug-in comes while a process runs."""
+    return entry_points()
 
 
 def _load(point: EntryPoint, where: str) -> Any:

@@ -1,7 +1,7 @@
 """What options are made of: how values are read from words, checked, and shown by `--help`."""
 
 import inspect
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
 from functools import cache
 from numbers import Integral, Real
@@ -73,7 +73,7 @@ UNSET: Any = tyro.conf.arg(help_behavior_hint="")  # an option that is absent un
 class OneOf:
     """The names that an option takes: `others`, and those in the registry of a kind.  Beside them it takes objects."""
 
-    others: Collection[str] = ()
+    others: tuple[str, ...] = ()
     kind: str | None = None
 
     def check(self, option: str, value: Any) -> None:

@@ -65,7 +65,7 @@ class ViewOptions(FrameOptions):
 class RecipeOptions(ViewOptions):
     """What a recipe samples and compares with, and who draws it."""
 
-    quality: Annotated[str, choice(QUALITIES), OneOf(QUALITIES)] = "balanced"
+    quality: Annotated[str, choice(QUALITIES), OneOf(tuple(QUALITIES))] = "balanced"
     """How finely recipe auto samples: fast reaches a quarter of the training rate, balanced half, best all of it."""
     rate_reference: Annotated[str | None, flag("|".join(get_args(RateReference))), OneOf(get_args(RateReference))] = (
         None
