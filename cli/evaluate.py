@@ -50,7 +50,7 @@ class Evaluate:
             return self._many()
         if self.shard is not None:
             raise UsageError("shard", "is a part of several scenes; name them, or give `batch`")
-        _ = self.scene.path  # there is one
+        _ = self.scene.path  # refuses where none is named
         from aaplug.evaluation.results import results, tables
         from aaplug.verbs.evaluate import check_results
 

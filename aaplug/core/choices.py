@@ -34,7 +34,6 @@ Colour = tuple[float, float, float]  # red, green, blue in [0, 1]
 Background = Literal["auto", "white", "black"] | Colour
 RateReference = Literal["pose", "global", "sharpest", "interval"]
 SpzAxes = Literal["auto", "opengl", "opencv"]
-TruthChoice = Literal["auto", "photographs", "self"]
 ConventionName = Literal["classic", "antialiased", "mip", "playcanvas", "playcanvas-classic"]
 LossName = Literal["l2", "l1-dssim"]
 MOST_FPS = 1000  # frames per second of a video

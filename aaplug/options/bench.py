@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from aaplug.options.base import UNSET, OneOf, Options, choice, flag, number
-from aaplug.options.shared import THREADS
+from aaplug.options.shared import THREADS, size_of
 
 CHOICES = ("all", "compiled", "eager")
 
@@ -26,3 +26,8 @@ class BenchOptions(Options):
     """Processor threads (default: all)."""
     forward_only: bool = False
     """Leave out the backward pass."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for size in self.resolution or ():
+            size_of(size)

@@ -9,8 +9,8 @@ import tyro
 from aaplug.core.choices import metric_option
 from aaplug.core.registry import names_of
 from aaplug.options.base import UNSET, OneOf, choice, choices, flag
-from aaplug.options.objects import Protocol, Recipe
-from aaplug.options.shared import RECIPE_NAMES, SCALES, AnyPath, RecipeOptions
+from aaplug.options.objects import AnyPath, Protocol, Recipe
+from aaplug.options.shared import RECIPE_NAMES, SCALES, RecipeOptions
 
 ALL = "all"  # instead of recipes' names: every recipe that the scene suits
 DEFAULT_RECIPES = ("classic", "mip", "matched", "auto")

@@ -1,5 +1,6 @@
-"""Types of objects that options take beside names, for the type checker alone, as their modules import torch."""
+"""Types of what options take beside names; the type checker alone knows those whose modules import torch."""
 
+from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -10,3 +11,5 @@ if TYPE_CHECKING:
     from aaplug.methods.viewers import Viewer
 else:
     Executor = Rasterizer = Protocol = Recipe = Viewer = Any
+
+AnyPath = str | PathLike[str]

@@ -4,7 +4,6 @@ import math
 import os
 import re
 from dataclasses import dataclass
-from os import PathLike
 from typing import Annotated, get_args
 
 import tyro
@@ -15,8 +14,6 @@ from aaplug.core.registry import names_of
 from aaplug.options.base import UNSET, OneOf, Options, choice, flag, number
 from aaplug.options.objects import Executor, Rasterizer, Recipe, Viewer
 
-AnyPath = str | PathLike[str]
-
 SCALE = number(0.001, 64)  # sizes of images against the training size
 SCALES = number(0.001, 64, several=True)
 STEPS = number(0, 1_000_000, whole=True)
@@ -25,8 +22,8 @@ THREADS = number(1, max(8, os.cpu_count() or 1), whole=True)  # more gain nothin
 _GIGABYTES = number(0.01, 1024)
 _MARGIN = number(0, math.inf)
 RECIPE_NAMES = [name for name in names_of("recipe") if name in USER_RECIPES or name not in NAMES["recipe"]]
-RASTERIZER = ("auto", "compiled")  # beside those of the registry
-BACKGROUNDS = ("auto", "white", "black")
+_DRAWN_BY = ("auto", "compiled")  # beside those of the registry
+_REFERENCES = get_args(RateReference)
 MAX_SIDE = 16384  # px
 
 OneRecipe = Annotated[str | Recipe, choice([*RECIPE_NAMES, "..."]), OneOf(kind="recipe")]
@@ -47,10 +44,10 @@ class ViewOptions(FrameOptions):
 
     views: Annotated[str, tyro.conf.arg(metavar="NAME,...|test|train|all")] = "test"
     """Views, by name or split."""
-    background: Annotated[Background, choice(BACKGROUNDS)] = "auto"
+    background: Annotated[Background, choice(("auto", "white", "black"))] = "auto"
     """Colour behind the scene; auto is what training had."""
     rasterizer: Annotated[
-        str | Rasterizer, choice([*RASTERIZER, *names_of("rasterizer")]), OneOf(RASTERIZER, "rasterizer")
+        str | Rasterizer, choice([*_DRAWN_BY, *names_of("rasterizer")]), OneOf(_DRAWN_BY, "rasterizer")
     ] = "auto"
     """auto: compiled if `aaplug warmup` has run, else eager.  reference: slow, exact, float64."""
     threads: Annotated[int | None, THREADS, UNSET] = None
@@ -67,9 +64,7 @@ class RecipeOptions(ViewOptions):
 
     quality: Annotated[str, choice(QUALITIES), OneOf(tuple(QUALITIES))] = "balanced"
     """How finely recipe auto samples: fast reaches a quarter of the training rate, balanced half, best all of it."""
-    rate_reference: Annotated[str | None, flag("|".join(get_args(RateReference))), OneOf(get_args(RateReference))] = (
-        None
-    )
+    rate_reference: Annotated[str | None, flag("|".join(_REFERENCES)), OneOf(_REFERENCES)] = None
     """Sampling rate that matched and auto compare with (default: pose: global, but interval for free cameras)."""
     scheduler: Annotated[str | Executor | None, flag("local|tcp://HOST:PORT", kind=str | None)] = None
     """Draw views on a Dask cluster: of --threads processes on this machine, or of the machines at an address."""

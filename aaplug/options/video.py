@@ -5,7 +5,8 @@ from typing import Annotated
 
 from aaplug.core.choices import MOST_FPS
 from aaplug.options.base import UNSET, OneOf, choice, number
-from aaplug.options.shared import RECIPE_NAMES, SCALE, AnyPath, ImageOptions, RecipeOptions
+from aaplug.options.objects import AnyPath
+from aaplug.options.shared import RECIPE_NAMES, SCALE, ImageOptions, RecipeOptions
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,12 +5,12 @@ from itertools import product
 from typing import Any, NamedTuple
 
 from aaplug.core.cameras import Camera, CameraSet
-from aaplug.core.errors import UsageError, not_one_of
+from aaplug.core.errors import UsageError
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.kernels import EAGER, Kernels
 from aaplug.core.monitor import SILENT, Monitor
 from aaplug.io.limits import lack_of_memory
-from aaplug.options.bench import CHOICES, BenchOptions
+from aaplug.options.bench import BenchOptions
 from aaplug.options.shared import size_of
 from aaplug.rasterizers.tiled.ahead_of_time import build, load
 from aaplug.rendering.benchmark import Figures, exponent, measure, synthetic_camera, synthetic_scene
@@ -57,8 +57,6 @@ def _first_view(scene: Held, cameras: CameraSet) -> tuple[Gaussians, Camera]:
 
 
 def _kernels(rasterizer: str, monitor: Monitor) -> list[Kernels]:
-    if rasterizer not in CHOICES:
-        raise UsageError("rasterizer", not_one_of(rasterizer, CHOICES))
     if rasterizer == "eager":
         return [EAGER]
     compiled = load()

@@ -33,7 +33,7 @@ from aaplug.io.scenes.scene_file import SceneFile, usable
 from aaplug.methods.recipes import RECIPES
 from aaplug.methods.viewers import Viewer, find_viewer
 from aaplug.options.compare import SIZES, CompareOptions
-from aaplug.options.shared import AnyPath
+from aaplug.options.objects import AnyPath
 from aaplug.rendering.renderer import Renderer
 from aaplug.verbs.agreement import settled
 from aaplug.verbs.announce import announce

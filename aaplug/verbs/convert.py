@@ -21,7 +21,7 @@ from aaplug.io.scenes import check_scene_output, write_parts, write_scene
 from aaplug.io.scenes.scene_file import SceneFile
 from aaplug.methods.viewers import FORMS, MATCHED_ENERGY, MIP_VIEWER, Form, Viewer, blurring, find_viewer, fuse
 from aaplug.options.convert import ConvertOptions
-from aaplug.options.shared import AnyPath
+from aaplug.options.objects import AnyPath
 from aaplug.verbs.assumed import say_assumed
 from aaplug.verbs.in_parts import LARGE, convert_parts
 from aaplug.verbs.inputs import CamerasLike, SceneLike, look_of, opened_and_seen, processor, sources_of, whole_of

@@ -19,7 +19,7 @@ from aaplug.io.atomic import output_folder, refuse_existing
 from aaplug.io.cameras import read_cameras
 from aaplug.io.images import read_image, write_png
 from aaplug.io.scenes import read_scene
-from aaplug.options.shared import AnyPath
+from aaplug.options.objects import AnyPath
 from aaplug.rendering.renderer import Renderer
 from aaplug.verbs.convert import convert
 from aaplug.verbs.evaluate import evaluate

@@ -31,7 +31,7 @@ from aaplug.io.cameras import select_views
 from aaplug.methods.recipe import Recipe
 from aaplug.methods.recipes import RECIPES, suited
 from aaplug.options.evaluate import ALL, EvaluateOptions, Layout
-from aaplug.options.shared import AnyPath
+from aaplug.options.objects import AnyPath
 from aaplug.rendering.cost import comparing, cost_of
 from aaplug.verbs.announce import announce
 from aaplug.verbs.assumed import say_assumed

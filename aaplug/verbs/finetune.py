@@ -14,7 +14,7 @@ from torch import Tensor
 from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.choices import SpzAxes
 from aaplug.core.digests import digest_of_files
-from aaplug.core.errors import UsageError, not_one_of
+from aaplug.core.errors import UsageError
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.monitor import SILENT, Monitor
 from aaplug.core.sampling import sampling_bounds
@@ -34,7 +34,7 @@ from aaplug.io.scenes import check_scene_output, write_scene
 from aaplug.methods.recipes import RECIPES
 from aaplug.methods.viewers import FAST, VIEWERS, Viewer, fuse_for
 from aaplug.options.finetune import FinetuneOptions
-from aaplug.options.shared import AnyPath
+from aaplug.options.objects import AnyPath
 from aaplug.rendering.cost import GRADIENTS, cost_of
 from aaplug.rendering.renderer import Renderer
 from aaplug.verbs.announce import announce
@@ -178,10 +178,7 @@ def _viewer(o: FinetuneOptions) -> Viewer:
     """What will show the scene: as asked, or the method's own."""
     if not isinstance(o.target, str):
         return o.target or METHODS[o.method].viewer
-    known = {FAST.name: FAST, **VIEWERS}
-    if o.target not in known:
-        raise UsageError("target", not_one_of(o.target, known))
-    return known[o.target]
+    return FAST if o.target == FAST.name else VIEWERS.find(o.target, "target")
 
 
 def _source(truth: str, cameras: CameraSet) -> TruthSource:

@@ -14,7 +14,7 @@ from aaplug.core.monitor import SILENT, Monitor
 from aaplug.evaluation.journal import read_report
 from aaplug.io.atomic import claimed, refuse_existing
 from aaplug.io.values import read_json
-from aaplug.options.shared import AnyPath
+from aaplug.options.objects import AnyPath
 from aaplug.verbs.batch import RESULTS, SUMMARY, Batch, write_batch
 from aaplug.verbs.evaluate import JOURNAL
 from aaplug.verbs.shard import Record, Shard

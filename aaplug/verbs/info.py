@@ -13,7 +13,8 @@ from aaplug.io.scenes import open_scene
 from aaplug.io.scenes.ply import Document
 from aaplug.io.scenes.scene_file import SceneFile
 from aaplug.methods.viewers import describe
-from aaplug.options.shared import AnyPath, FrameOptions
+from aaplug.options.objects import AnyPath
+from aaplug.options.shared import FrameOptions
 from aaplug.verbs.assumed import TRAINING_RATE, Orbit, probed, rate_of
 from aaplug.verbs.inputs import CamerasLike, opened_and_seen
 

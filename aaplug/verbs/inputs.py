@@ -24,7 +24,8 @@ from aaplug.io.scenes.scene_file import SceneFile
 from aaplug.levels.pyramids import read_pyramid
 from aaplug.methods.recipe import Recipe
 from aaplug.methods.recipes import RECIPES, find_recipe
-from aaplug.options.shared import AnyPath, RecipeOptions, ViewOptions
+from aaplug.options.objects import AnyPath
+from aaplug.options.shared import RecipeOptions, ViewOptions
 from aaplug.rasterizers import find_rasterizer
 from aaplug.rendering.renderer import Harmonics, Renderer, background_colour
 from aaplug.verbs.agreement import agreement, settled

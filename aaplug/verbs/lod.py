@@ -30,7 +30,7 @@ from aaplug.levels.rates import rates_of
 from aaplug.methods.filters import fuse_stored
 from aaplug.methods.viewers import find_viewer
 from aaplug.options.lod import LodOptions
-from aaplug.options.shared import AnyPath
+from aaplug.options.objects import AnyPath
 from aaplug.verbs.assumed import say_assumed
 from aaplug.verbs.inputs import CamerasLike, Held, SceneLike, look_of, opened_and_seen, processor, sources_of, whole_of
 

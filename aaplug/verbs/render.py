@@ -14,8 +14,8 @@ from aaplug.io.atomic import claimed, output_folder
 from aaplug.io.cameras import select_views
 from aaplug.io.scenes.scene_file import SceneFile
 from aaplug.methods.recipes import find_recipe
+from aaplug.options.objects import AnyPath
 from aaplug.options.render import RenderOptions
-from aaplug.options.shared import AnyPath
 from aaplug.rendering.frames import write_frames
 from aaplug.rendering.renderer import Renderer
 from aaplug.verbs.announce import announce

@@ -21,7 +21,7 @@ from aaplug.io.atomic import claimed
 from aaplug.io.cameras import select_views
 from aaplug.io.cameras.camera_path import read_camera_path
 from aaplug.io.video import check_video
-from aaplug.options.shared import AnyPath
+from aaplug.options.objects import AnyPath
 from aaplug.options.video import VideoOptions
 from aaplug.rendering.videos import make_video
 from aaplug.verbs.announce import announce
