@@ -28,19 +28,18 @@ def scenes_of(path: Path, base: T) -> list[tuple[str, T]]:
 def _set(path: Path, where: str, options: T, settings: Mapping[str, Any], refused: Sequence[str]) -> T:
     """The options with a table's settings."""
     known = [key for key in option_types(type(options)) if key not in refused]
-    words: list[str] = []
-    for key, value in sorted(settings.items(), key=lambda each: each[0] != "scene"):  # the positional one first
+    for key, value in settings.items():
         if key not in known:
             raise FormatError(path, f"{where}: {key} is no setting here{did_you_mean(key, known)}")
         if value is False:
             options = _off(options, key)
-        else:
-            words += _words(key, value)
-    try:
-        with one_line(f"aaplug {type(options).__name__.lower()}"):
-            return tyro.cli(type(options), args=words, default=options, config=CONFIG)
-    except UsageError as error:
-        raise FormatError(path, f"{where}: {error}") from error
+            continue
+        try:
+            with one_line(f"aaplug {type(options).__name__.lower()}"):
+                options = tyro.cli(type(options), args=_words(key, value), default=options, config=CONFIG)
+        except UsageError as error:
+            raise FormatError(path, f"{where}: {error}") from error
+    return options
 
 
 def _off(options: Any, key: str) -> Any:

@@ -49,7 +49,7 @@ MISTAKES = [
     *("render s.ply -o out --recipe mipp", "render s.ply -o out --quality good", "video s.ply -o v.webm --beside mipp"),
     *("evaluate s.ply --recipe mip mipp", "evaluate s.ply --protocol blend", "evaluate s.ply --rasterizer fast"),
     *("render s.ply -o out --rate-reference pos", "render s.ply -o out --convention clasic"),
-    *("convert s.ply -o c.ply --for web", "convert s.ply -o c.ply --form web", "convert s.ply -o c.ply --steps 1"),
+    *("convert s.ply -o c.ply --for web", "convert s.ply -o c.ply --form web"),
     *("finetune s.ply -o t.ply --for web", "finetune s.ply -o t.ply --loss l3", "finetune s.ply -o t.ply --method m"),
     *("compare a.ply b.ply --for web", "compare a.ply b.ply --for spark --recipe mip", "lod s.ply -o l --scale 0.5"),
     *("render s.ply -o out --orbit 2 --eye 1 2 3", "bench --rasterizer fast"),

@@ -5,7 +5,6 @@ from typing import Annotated
 
 import tyro
 
-from aaplug.core.errors import UsageError
 from aaplug.core.registry import names_of
 from aaplug.options.base import UNSET, OneOf, flag, number
 from aaplug.options.shared import STEPS, OneViewer, ViewOptions
@@ -27,10 +26,3 @@ class ConvertOptions(ViewOptions):
     """Without --for: variance to fuse, in px² at the training rate (default: 0.2)."""
     overwrite: bool = False
     """Replace an existing output."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.viewer is None and self.steps is not None:
-            raise UsageError("steps", "belongs to the optimization for a `viewer`; name one")
-        if self.viewer is not None and (self.form is not None or self.variance is not None):
-            raise UsageError("viewer", "sets form and variance itself; leave out `form`, `variance`")

@@ -8,6 +8,7 @@ from typing import Any
 
 from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.choices import SpzAxes
+from aaplug.core.errors import UsageError
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.monitor import SILENT, Monitor
 from aaplug.core.training import TrainingViews
@@ -95,8 +96,13 @@ def convert(
 
 def _chosen(o: ConvertOptions) -> Form | Viewer:
     """What to convert for: a viewer, or the Mip rule by a closed form."""
-    if viewer := find_viewer(o.viewer):
+    viewer = find_viewer(o.viewer)
+    if viewer is not None:
+        if o.form is not None or o.variance is not None:
+            raise UsageError("viewer", "sets form and variance itself; leave out `form`, `variance`")
         return viewer
+    if o.steps is not None:
+        raise UsageError("steps", "belongs to the optimization for a `viewer`; name one")
     found = MATCHED_ENERGY if o.form is None else FORMS.find(o.form, "form")
     return found if o.variance is None else found.with_variance(o.variance)
 
