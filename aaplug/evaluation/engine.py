@@ -38,7 +38,6 @@ from aaplug.methods.recipes import suited
 from aaplug.rendering.renderer import Renderer
 
 NO_PHOTOGRAPH = "no photograph is this large: metrics above the photographs' own size are undefined"
-
 CORNER = 64  # px
 
 Values = Mapping[str, float | None]
