@@ -3,17 +3,19 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
-import torch
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from aaplug.rendering.benchmark import Figures
-from aaplug.verbs import bench as verb
+import aaplug
+from aaplug.options.bench import BenchOptions
 
 from .console import TERMINAL, out, print_json
 from .options import CameraOptions, Flat, SceneOptions, read_inputs
+
+if TYPE_CHECKING:
+    from aaplug.rendering.benchmark import Figures
 
 
 @dataclass(frozen=True)
@@ -22,7 +24,7 @@ class Bench:
 
     scene: SceneOptions = field(default_factory=SceneOptions)
     cameras: CameraOptions = field(default_factory=CameraOptions)
-    how: Annotated[verb.BenchOptions, Flat] = field(default_factory=verb.BenchOptions)
+    how: Annotated[BenchOptions, Flat] = field(default_factory=BenchOptions)
     json: bool = False
     """Print one JSON object on stdout: the figures, or {"runs": [...]} of several."""
 
@@ -31,11 +33,13 @@ class Bench:
         scene = cameras = None
         if self.scene.scene is not None or self.scene.model_path is not None:
             scene, cameras = read_inputs(self.scene, self.cameras)
-        runs, exponents = verb.bench(scene, cameras, monitor=TERMINAL, **vars(self.how))
+        runs, exponents = aaplug.bench(scene, cameras, monitor=TERMINAL, **vars(self.how))
         if self.json:
             several = {"runs": [run.as_json() for run in runs], "exponents": exponents}
             print_json(runs[0].as_json() if len(runs) == 1 else several)
             return 0
+        import torch
+
         threads = self.how.threads or torch.get_num_threads()
         figures = _table(f"medians, ms; matmul is a 2048³ float32 product, {threads} threads", FIGURES, runs)
         stages = {name: partial(_stage, name) for name in runs[0].stages_ms}
@@ -45,7 +49,7 @@ class Bench:
         return 0
 
 
-def _scene(run: Figures) -> str:
+def _scene(run: "Figures") -> str:
     """Sizes of the scene and of the image, short."""
     for unit, mark in ((1e6, "M"), (1e3, "k")):
         if run.gaussians >= 10 * unit or run.gaussians % unit == 0:
@@ -53,11 +57,11 @@ def _scene(run: Figures) -> str:
     return f"{run.gaussians} {run.width}x{run.height}"
 
 
-def _stage(name: str, run: Figures) -> str:
+def _stage(name: str, run: "Figures") -> str:
     return f"{run.stages_ms[name]:.0f}"
 
 
-Columns = Mapping[str, Callable[[Figures], str]]
+Columns = Mapping[str, Callable[["Figures"], str]]
 FIGURES: Columns = {
     "forward": lambda run: f"{run.forward_ms:.0f}",
     "+ back": lambda run: "" if run.forward_backward_ms is None else f"{run.forward_backward_ms:.0f}",
@@ -69,7 +73,7 @@ FIGURES: Columns = {
 }
 
 
-def _table(title: str, columns: Columns, runs: Sequence[Figures]) -> Table:
+def _table(title: str, columns: Columns, runs: Sequence["Figures"]) -> Table:
     table = Table(title=title, box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for name in ("scene", "", *columns):
         table.add_column(name, justify="right" if name else "left", no_wrap=True)

@@ -6,9 +6,10 @@ from typing import Annotated
 
 import tyro
 
+import aaplug
 from aaplug.core.errors import UsageError
-from aaplug.verbs import compare as verb
-from aaplug.verbs.options import UNSET, Options, number
+from aaplug.options.base import UNSET, Options, number
+from aaplug.options.compare import CompareOptions
 
 from .console import TERMINAL, out, print_json, say
 from .main import FAILED
@@ -48,21 +49,23 @@ class Compare:
     cameras: CameraOptions = field(default_factory=CameraOptions)
     output: Annotated[Path | None, flag("FOLDER", "-o")] = None
     """Folder for compare.json, compare.csv, report.html and contact-sheet.png."""
-    how: Annotated[verb.CompareOptions, Flat] = field(default_factory=verb.CompareOptions)
+    how: Annotated[CompareOptions, Flat] = field(default_factory=CompareOptions)
     guard: Annotated[GuardOptions, Flat] = field(default_factory=GuardOptions)
     json: bool = False
     """Print compare.json on stdout instead of the tables."""
 
     def __call__(self) -> int:
         """Compare, and guard."""
-        verb.check_compared(self.output, self.how)  # before anything is read
         paths = self.scenes.paths
         if len(paths) < 2:
             raise UsageError("compare", f"needs two scenes or more, got {len(paths)}: aaplug compare A.ply B.spz")
+        from aaplug.verbs.compare import check_compared
+
+        check_compared(self.output, self.how)  # before anything is read
         cameras = self.cameras.read(paths[0])
         opened = [self.scenes.opened(path) for path in paths]
         own = {"drop_bad": self.scenes.drop_bad, "monitor": TERMINAL}
-        found = verb.compare(opened, cameras, self.output, **vars(self.how) | own)
+        found = aaplug.compare(opened, cameras, self.output, **vars(self.how) | own)
         if self.json:
             print_json(found.summary())
         else:

@@ -2,15 +2,16 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-from aaplug.evaluation.results import results, tables
-from aaplug.methods.viewers import fused_in
-from aaplug.verbs import convert as verb
+import aaplug
+from aaplug.options.convert import ConvertOptions
 
 from .console import TERMINAL, out, print_json, say
-from .options import CameraOptions, Flat, SceneOptions, flag
-from .several import SeveralScenes, of_all
+from .options import CameraOptions, Flat, SceneOptions, SeveralScenes, flag
+
+if TYPE_CHECKING:
+    from aaplug.verbs.convert import Converted
 
 
 @dataclass(frozen=True)
@@ -21,7 +22,7 @@ class Convert:
     """Where to write: .ply, or .spz or .splat, which round values and keep less; with --batch, a folder."""
     scene: SceneOptions = field(default_factory=SceneOptions)
     cameras: CameraOptions = field(default_factory=CameraOptions)
-    how: Annotated[verb.ConvertOptions, Flat] = field(default_factory=verb.ConvertOptions)
+    how: Annotated[ConvertOptions, Flat] = field(default_factory=ConvertOptions)
     several: SeveralScenes = field(default_factory=SeveralScenes)
     json: bool = False
     """Print what was done as one JSON object on stdout."""
@@ -29,8 +30,13 @@ class Convert:
     def __call__(self) -> int:
         """Fuse, and say what was done."""
         if self.several.batch is not None:
+            from .several import of_all
+
             return of_all(self, lambda own: ".ply")
         facts, found = self.made()
+        from aaplug.evaluation.results import tables
+        from aaplug.methods.viewers import fused_in
+
         scene, report = found.scene, found.report
         if self.json:
             print_json(facts)
@@ -42,17 +48,19 @@ class Convert:
         say(found.viewer.advice)
         return 0
 
-    def made(self) -> tuple[dict[str, Any], verb.Converted]:
+    def made(self) -> "tuple[dict[str, Any], Converted]":
         """Fuse, and tell what was made."""
         opened = self.scene.open()
         cameras = self.cameras.read(self.scene.path)
         own = {"drop_bad": self.scene.drop_bad, "spz_axes": self.scene.spz_axes} | vars(self.how)
-        found = verb.convert(opened, cameras, self.output, monitor=TERMINAL, **own)
+        found = aaplug.convert(opened, cameras, self.output, monitor=TERMINAL, **own)
         facts: dict[str, Any] = {"output": str(self.output), "gaussians": opened.count}
         if found.scene is not None:
             fused = [{"method": f.method, **f.settings} for f in found.scene.fused]
             facts |= {"gaussians": len(found.scene), "fused": fused}
         if found.report is not None:
+            from aaplug.evaluation.results import results
+
             viewer = {"for": found.viewer.name, "settings": found.viewer.settings}
             facts |= {**viewer, "residual": results(found.report)}
         return facts, found

@@ -6,9 +6,6 @@ from typing import Annotated
 
 from tyro.conf import arg
 
-from aaplug.evaluation.results import tables
-from aaplug.verbs import demo as verb
-
 from .console import TERMINAL, out, say
 
 
@@ -23,6 +20,9 @@ class Demo:
 
     def __call__(self) -> int:
         """Convert, render and measure."""
+        from aaplug.evaluation.results import tables
+        from aaplug.verbs import demo as verb
+
         report = verb.demo(self.output, overwrite=self.overwrite, monitor=TERMINAL)
         out.print(*tables(report))
         say(f"look at {self.output / verb.SHEET}")

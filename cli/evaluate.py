@@ -3,22 +3,20 @@
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from aaplug.core.digests import digest_of_files, digest_of_values
+import aaplug
 from aaplug.core.errors import UsageError
-from aaplug.evaluation.results import Report, results, tables
-from aaplug.verbs.batch import batch
-from aaplug.verbs.evaluate import EvaluateOptions, check_results
-from aaplug.verbs.evaluate import evaluate as measure
-from aaplug.verbs.inputs import scheduled
+from aaplug.options.evaluate import EvaluateOptions
 
-from .batch import scenes_of
 from .console import TERMINAL, out, print_json
 from .main import FAILED
 from .options import CameraOptions, Flat, SceneOptions, flag, read_inputs
+
+if TYPE_CHECKING:
+    from aaplug.evaluation.results import Report
 
 
 @dataclass(frozen=True)
@@ -52,31 +50,39 @@ class Evaluate:
             return self._many()
         if self.shard is not None:
             raise UsageError("shard", "is a part of several scenes; name them, or give `batch`")
+        _ = self.scene.path  # refuses where none is named
+        from aaplug.evaluation.results import results, tables
+        from aaplug.verbs.evaluate import check_results
+
         check_results(self.output, self.how)  # before the scene is read
         report = self._run()
         self._print(results(report), tables(report))
         return 0
 
-    def _run(self, **given: Any) -> Report:
+    def _run(self, **given: Any) -> "Report":
         """Evaluate one scene; `given` has precedence over the options."""
         scene, cameras = read_inputs(self.scene, self.cameras)
         own = {"output": self.output, "name": self.scene.path.stem, "monitor": TERMINAL}
-        return measure(scene, cameras, **vars(self.how) | own | given)
+        return aaplug.evaluate(scene, cameras, **vars(self.how) | own | given)
 
     def _many(self) -> int:
         scenes = self._scenes()
         output = scenes[0][1].output
         if output is None:
             raise UsageError("output", "name a folder for the results of several scenes: -o FOLDER")
+        from aaplug.verbs.inputs import scheduled
+
         kept = {"resume": self.how.resume, "overwrite": self.how.overwrite}
         with scheduled(scenes[0][1].how, output, TERMINAL) as scheduler:
             runs = [(name, partial(own._run, scheduler=scheduler)) for name, own in scenes]
-            found = batch(runs, output, **kept, shard=self.shard, request=self._request(), monitor=TERMINAL)
+            found = aaplug.batch(runs, output, **kept, shard=self.shard, request=self._request(), monitor=TERMINAL)
         self._print(found.summary(), found.tables())
         return FAILED if found.failures else 0
 
     def _request(self) -> str:
         """Hash of the scenes and of the options that change results; the folder of results may have other names."""
+        from aaplug.core.digests import digest_of_files, digest_of_values
+
         how = replace(self.how, resume=False, overwrite=False, threads=None, memory=None, scheduler=None)
         same = replace(self, how=how, output=None, shard=None, json=False, batch=None)
         file = None if self.batch is None else digest_of_files([self.batch])
@@ -87,6 +93,8 @@ class Evaluate:
         if self.batch is not None:
             if named := self.others.more or self.scene.scene or self.scene.model_path:
                 raise UsageError("batch", f"names the scenes; leave {named} out")
+            from .batch import scenes_of
+
             return scenes_of(self.batch, replace(self, batch=None))
         paths = [self.scene.path, *self.others.more]
         alone = replace(self, others=OtherScenes())

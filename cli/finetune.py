@@ -4,8 +4,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-from aaplug.evaluation.results import tables
-from aaplug.verbs import finetune as verb
+import aaplug
+from aaplug.options.finetune import FinetuneOptions
 
 from .console import TERMINAL, out, print_json, say
 from .options import CameraOptions, Flat, SceneOptions, flag, read_inputs
@@ -23,7 +23,7 @@ class Finetune:
     """Where to write the scene."""
     scene: SceneOptions = field(default_factory=SceneOptions)
     cameras: CameraOptions = field(default_factory=CameraOptions)
-    how: Annotated[verb.FinetuneOptions, Flat] = field(default_factory=verb.FinetuneOptions)
+    how: Annotated[FinetuneOptions, Flat] = field(default_factory=FinetuneOptions)
     json: bool = False
     """Print the report on stdout as JSON instead of the table."""
 
@@ -31,10 +31,12 @@ class Finetune:
         """Optimize, and say what was written."""
         scene, cameras = read_inputs(self.scene, self.cameras)
         axes = self.scene.spz_axes
-        found = verb.finetune(scene, cameras, self.output, spz_axes=axes, monitor=TERMINAL, **vars(self.how))
+        found = aaplug.finetune(scene, cameras, self.output, spz_axes=axes, monitor=TERMINAL, **vars(self.how))
         if self.json:
             print_json(found.as_json())
         else:
+            from aaplug.evaluation.results import tables
+
             out.print(*tables(found.report))
         stem = self.output.stem
         say(f"wrote {self.output}, {stem}.finetune.json and {stem}.finetune.png")

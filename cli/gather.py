@@ -6,8 +6,8 @@ from typing import Annotated
 
 import tyro
 
+import aaplug
 from aaplug.core.errors import UsageError
-from aaplug.verbs import gather as verb
 
 from .console import TERMINAL, out, print_json
 from .main import FAILED
@@ -29,7 +29,7 @@ class Gather:
         """Gather, and say which scenes failed."""
         if self.folder is None:
             raise UsageError("gather", "name the folder that the shards wrote: aaplug gather results")
-        found = verb.gather(self.folder, overwrite=self.overwrite, monitor=TERMINAL)
+        found = aaplug.gather(self.folder, overwrite=self.overwrite, monitor=TERMINAL)
         if self.json:
             print_json(found.summary())
         else:

@@ -6,12 +6,9 @@ from typing import Annotated, Any
 from rich.markup import escape
 from rich.table import Table
 
+import aaplug
 from aaplug.core.errors import printable
-from aaplug.core.gaussians import MAX_LOG_SCALE
-from aaplug.io.limits import LIMITS, limit, memory_of_machine
-from aaplug.verbs import info as verb
-from aaplug.verbs.options import FrameOptions
-from aaplug.verbs.views import MAX_SIDE
+from aaplug.options.shared import MAX_SIDE, FrameOptions
 
 from .console import TERMINAL, out, print_json
 from .options import CameraOptions, Flat, SceneOptions
@@ -37,8 +34,8 @@ class Info:
             _show_limits(self.json)
             return 0
         opened = self.scene.open()
-        cameras = self.cameras.orbit if self.cameras.cameras is None else self.cameras.read(self.scene.path)
-        facts = verb.info(opened, cameras, monitor=TERMINAL, **vars(self.how))
+        cameras = self.cameras.around if self.cameras.cameras is None else self.cameras.read(self.scene.path)
+        facts = aaplug.info(opened, cameras, monitor=TERMINAL, **vars(self.how))
         if self.json:
             print_json(facts)
             return 0
@@ -65,6 +62,9 @@ def _text(value: Any) -> str:
 
 
 def _show_limits(as_json: bool) -> None:
+    from aaplug.core.gaussians import MAX_LOG_SCALE
+    from aaplug.io.limits import LIMITS, limit, memory_of_machine
+
     values = {name: limit(name) for name in LIMITS}
     fixed = {
         "LOG_SCALE": (MAX_LOG_SCALE, "", "a log-scale's absolute value, clamped on use"),

@@ -1,6 +1,7 @@
 """Options that several verbs share, and reading what they name.
 
-The options that the library's verbs have too are stated there, in `aaplug.verbs`.
+The options that the library's verbs have too are stated in `aaplug.options`.  What is read is imported when it is read,
+so that help and mistakes take no torch.
 """
 
 import re
@@ -9,22 +10,22 @@ from contextlib import contextmanager, redirect_stderr
 from dataclasses import dataclass, field, fields
 from io import StringIO
 from pathlib import Path
-from typing import Annotated, Any, cast, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, cast, get_args, get_type_hints
 
 import tyro
 
-from aaplug.core.cameras import CameraSet
-from aaplug.core.errors import UsageError, not_one_of
-from aaplug.core.gaussians import CONVENTIONS
-from aaplug.io.cameras import read_cameras
-from aaplug.io.scenes import SpzAxes, open_scene
-from aaplug.io.scenes.scene_file import SceneFile
-from aaplug.methods.viewers import describe
-from aaplug.verbs.assumed import Orbit
-from aaplug.verbs.inputs import Held, folder_of_cameras, inputs_of
-from aaplug.verbs.options import SCALE, UNSET, Options, flag, number
+import aaplug
+from aaplug.core.choices import ConventionName, SpzAxes
+from aaplug.core.errors import UsageError
+from aaplug.options.base import UNSET, OneOf, Options, flag, number
+from aaplug.options.orbit import OrbitOptions
+from aaplug.options.shared import SCALE
 
 from .console import TERMINAL, say
+
+if TYPE_CHECKING:
+    from aaplug.io.scenes.scene_file import SceneFile
+    from aaplug.verbs.inputs import Held
 
 CONFIG = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)  # how classes become options
 
@@ -41,6 +42,7 @@ def worded(text: str, names: Collection[str]) -> str:
     return re.sub(r"`(\w+)`|\b([a-z]+(?:_[a-z]+)+)\b", option, text)
 
 
+_CONVENTIONS = get_args(ConventionName)
 Flat = tyro.conf.arg(name="")  # a group whose options stand among the verb's own
 
 
@@ -48,7 +50,7 @@ Flat = tyro.conf.arg(name="")  # a group whose options stand among the verb's ow
 class FileOptions(Options):
     """How scene files are read."""
 
-    convention: Annotated[str | None, flag("|".join(CONVENTIONS))] = None
+    convention: Annotated[str | None, flag("|".join(_CONVENTIONS)), OneOf(_CONVENTIONS)] = None
     """How the scene was trained or, for playcanvas and playcanvas-classic, converted, if its file does not say."""
     drop_bad: bool = False
     """Leave out Gaussians with NaN, infinite or unusable values instead of stopping."""
@@ -57,11 +59,12 @@ class FileOptions(Options):
     spz_axes: SpzAxes = "auto"
     """Axes of a .spz: opengl (its specification), opencv (splat-transform, gsply), or auto: as the cameras tell."""
 
-    def opened(self, path: Path, iteration: int | None = None) -> SceneFile:
+    def opened(self, path: Path, iteration: int | None = None) -> "SceneFile":
         """Open a scene's file and say what it is."""
-        if self.convention is not None and self.convention not in CONVENTIONS:
-            raise UsageError("convention", not_one_of(self.convention, CONVENTIONS))
-        opened = open_scene(
+        from aaplug.core.gaussians import CONVENTIONS
+        from aaplug.methods.viewers import describe
+
+        opened = aaplug.open_scene(
             path,
             iteration=iteration,
             convention=None if self.convention is None else CONVENTIONS[self.convention],
@@ -99,7 +102,7 @@ class SceneOptions(FileOptions):
             raise UsageError("scene", "name one scene, before the options: a .ply, a model folder, or -m FOLDER")
         return self.scene or cast(Path, self.model_path)
 
-    def open(self) -> SceneFile:
+    def open(self) -> "SceneFile":
         """Open the scene's file and say what it is."""
         return self.opened(self.path, self.iteration)
 
@@ -117,23 +120,44 @@ class CameraOptions(Options):
     test_every: Annotated[int | None, number(0, 1_000_000, whole=True), UNSET] = None
     """Hold out every N-th view by name; 0 for no split (default: as usual for the format)."""
 
-    orbit: Orbit = field(default_factory=Orbit)
+    orbit: OrbitOptions = field(default_factory=OrbitOptions)
 
-    def read(self, scene: Path) -> CameraSet | Orbit:
+    @property
+    def around(self) -> "aaplug.Orbit":
+        """What stands in for cameras."""
+        return aaplug.Orbit(**vars(self.orbit))
+
+    def read(self, scene: Path) -> "aaplug.CameraSet | aaplug.Orbit":
         """Read the cameras and say where sizes and split come from; without any, what stands in for them.
 
         scene: what the user named, whose model folder may hold cameras.
         """
+        from aaplug.verbs.inputs import folder_of_cameras
+
         path = self.cameras or folder_of_cameras(scene)
         if path is None:
-            return self.orbit
-        for name, usual in vars(Orbit()).items():
+            return self.around
+        for name, usual in vars(OrbitOptions()).items():
             if getattr(self.orbit, name) != usual:
                 raise UsageError(name, f"is for scenes without cameras, and there are some: {path}")
-        cameras = read_cameras(path, train_scale=self.train_scale, images=self.images, test_every=self.test_every)
+        cameras = aaplug.read_cameras(
+            path, train_scale=self.train_scale, images=self.images, test_every=self.test_every
+        )
         for note in cameras.notes:
             say(worded(f"cameras: {note}", CameraOptions.__dataclass_fields__))
         return cameras
+
+
+@dataclass(frozen=True)
+class SeveralScenes:
+    """Several scenes."""
+
+    batch: Annotated[Path | None, flag("FILE.toml")] = None
+    """Scenes and their settings from a file; --output is then a folder for all of them."""
+    keep: bool = False
+    """With --batch: leave out scenes whose output is there."""
+    scheduler: Annotated[str | None, flag("local|tcp://HOST:PORT")] = None
+    """With --batch: a scene at a time on each worker of a Dask cluster; see examples/guides/cluster.md."""
 
 
 @contextmanager
@@ -156,9 +180,12 @@ def one_line(program: str) -> Iterator[None]:
         raise UsageError(program, f"{said.rstrip('. ')}; see `{program} --help`") from end
 
 
-def read_inputs(scene: SceneOptions, cameras: CameraOptions) -> tuple[Held, CameraSet]:
+def read_inputs(scene: SceneOptions, cameras: CameraOptions) -> "tuple[Held, aaplug.CameraSet]":
     """Read a scene and its cameras, and say what they are."""
-    return inputs_of(scene.open(), cameras.read(scene.path), TERMINAL, scene.drop_bad)
+    opened, known = scene.open(), cameras.read(scene.path)
+    from aaplug.verbs.inputs import inputs_of
+
+    return inputs_of(opened, known, TERMINAL, scene.drop_bad)
 
 
 def option_types(noun: type) -> dict[str, Any]:

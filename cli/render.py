@@ -4,7 +4,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-from aaplug.verbs import render as verb
+import aaplug
+from aaplug.options.render import RenderOptions
 
 from .console import TERMINAL, print_json, say
 from .options import CameraOptions, Flat, SceneOptions, flag
@@ -18,7 +19,7 @@ class Render:
     """A folder for the images, or one .png for one view."""
     scene: SceneOptions = field(default_factory=SceneOptions)
     cameras: CameraOptions = field(default_factory=CameraOptions)
-    how: Annotated[verb.RenderOptions, Flat] = field(default_factory=verb.RenderOptions)
+    how: Annotated[RenderOptions, Flat] = field(default_factory=RenderOptions)
     json: bool = False
     """Print what was written as one JSON object on stdout."""
 
@@ -26,7 +27,7 @@ class Render:
         """Render, and say what was written."""
         opened, cameras = self.scene.open(), self.cameras.read(self.scene.path)
         own = {"drop_bad": self.scene.drop_bad} | vars(self.how)
-        written = verb.render(opened, cameras, self.output, monitor=TERMINAL, **own)
+        written = aaplug.render(opened, cameras, self.output, monitor=TERMINAL, **own)
         if self.json:
             images = [{"view": v.name, "file": str(p), "width": v.width, "height": v.height} for v, p in written]
             print_json({"recipe": self.how.recipe, "images": images})

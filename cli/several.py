@@ -5,32 +5,20 @@ from contextlib import chdir
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from aaplug.evaluation.report.files import as_json, write_texts
 from aaplug.io.atomic import claimed, output_folder, refuse_existing
 from aaplug.io.scenes.manifests import is_pyramid
+from aaplug.options.shared import RecipeOptions
 from aaplug.verbs.batch import SUMMARY, outcome, status_table
 from aaplug.verbs.inputs import scheduled
-from aaplug.verbs.options import RecipeOptions
 from aaplug.verbs.views import file_names
 
 from .batch import scenes_of
 from .console import TERMINAL, out, print_json, quiet
 from .main import FAILED
-from .options import flag
-
-
-@dataclass(frozen=True)
-class SeveralScenes:
-    """Several scenes."""
-
-    batch: Annotated[Path | None, flag("FILE.toml")] = None
-    """Scenes and their settings from a file; --output is then a folder for all of them."""
-    keep: bool = False
-    """With --batch: leave out scenes whose output is there."""
-    scheduler: Annotated[str | None, flag("local|tcp://HOST:PORT")] = None
-    """With --batch: a scene at a time on each worker of a Dask cluster; see examples/guides/cluster.md."""
+from .options import SeveralScenes
 
 
 class OfOneScene(Protocol):

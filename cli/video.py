@@ -4,7 +4,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-from aaplug.verbs import video as verb
+import aaplug
+from aaplug.options.video import VideoOptions
 
 from .console import TERMINAL, print_json, say
 from .options import CameraOptions, Flat, SceneOptions, flag, read_inputs
@@ -18,14 +19,14 @@ class Video:
     """The video: VP9 .webm, or H.264 .mp4."""
     scene: SceneOptions = field(default_factory=SceneOptions)
     cameras: CameraOptions = field(default_factory=CameraOptions)
-    how: Annotated[verb.VideoOptions, Flat] = field(default_factory=verb.VideoOptions)
+    how: Annotated[VideoOptions, Flat] = field(default_factory=VideoOptions)
     json: bool = False
     """Print what was written as one JSON object on stdout."""
 
     def __call__(self) -> int:
         """Render, and say what was written."""
         scene, cameras = read_inputs(self.scene, self.cameras)
-        clip = verb.video(scene, cameras, self.output, monitor=TERMINAL, **vars(self.how))
+        clip = aaplug.video(scene, cameras, self.output, monitor=TERMINAL, **vars(self.how))
         if self.json:
             print_json(clip._asdict() | {"file": str(clip.file)})
         else:

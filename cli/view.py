@@ -3,7 +3,8 @@
 from dataclasses import dataclass, field, fields
 from typing import Annotated, Any
 
-from aaplug.verbs import view as verb
+import aaplug
+from aaplug.options.view import LiveOptions
 
 from .console import TERMINAL, say
 from .options import CameraOptions, Flat, SceneOptions
@@ -15,7 +16,7 @@ class View:
 
     scene: SceneOptions = field(default_factory=SceneOptions)
     cameras: CameraOptions = field(default_factory=CameraOptions)
-    how: Annotated[verb.LiveOptions, Flat] = field(default_factory=verb.LiveOptions)
+    how: Annotated[LiveOptions, Flat] = field(default_factory=LiveOptions)
 
     def __call__(self) -> int:
         """Serve the page until interrupted."""
@@ -24,9 +25,11 @@ class View:
             scene, cameras = self.scene.open(), self.cameras.read(self.scene.path)
         words = [*_words(self.scene), *_words(self.cameras), *_words(self.cameras.orbit)]
         own: dict[str, Any] = {"drop_bad": self.scene.drop_bad, "words": words} | vars(self.how)
-        with verb.serving(scene, cameras, monitor=TERMINAL, **own) as address:
+        from aaplug.verbs.view import attend
+
+        with aaplug.serving(scene, cameras, monitor=TERMINAL, **own) as address:
             try:
-                verb.attend(address, TERMINAL, self.how.no_browser)
+                attend(address, TERMINAL, self.how.no_browser)
             except KeyboardInterrupt:  # the usual end
                 say("closed")
         return 0

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from aaplug.verbs import warmup as verb
+import aaplug
 
 from .console import TERMINAL, print_json, say
 
@@ -16,7 +16,7 @@ class Warmup:
 
     def __call__(self) -> int:
         """Compile what is missing and say where it is."""
-        folder, names = verb.warmup(monitor=TERMINAL)
+        folder, names = aaplug.warmup(monitor=TERMINAL)
         say(f"{len(names)} kernels in {folder}")
         if self.json:
             print_json({"folder": str(folder), "kernels": names})

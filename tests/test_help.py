@@ -9,7 +9,7 @@ import pytest
 from tests.test_cli import cli, dataset  # noqa: F401  (fixtures)
 
 ROOT = Path(__file__).resolve().parents[1]
-FILES = [*sorted((ROOT / "aaplug" / "verbs").glob("*.py")), *sorted((ROOT / "cli").glob("*.py"))]
+FILES = [*sorted((ROOT / "aaplug" / "options").glob("*.py")), *sorted((ROOT / "cli").glob("*.py"))]
 
 
 def helps(file: Path) -> list[str]:

@@ -9,7 +9,7 @@ import pytest
 from aaplug_cli.main import VERBS, _verb, main
 
 from aaplug.core.errors import UsageError
-from aaplug.verbs.options import Options
+from aaplug.options.base import Options
 
 NO_NUMBERS = (math.nan, math.inf, -math.inf, -1, 10**30, True, "", "x" * 10_000)
 

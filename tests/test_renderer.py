@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from aaplug.core.cameras import WHITE, Camera, CameraSet
+from aaplug.core.choices import QUALITIES
 from aaplug.core.errors import FrameError, UsageError
 from aaplug.core.gaussians import CONVENTIONS, MIP, Gaussians
 from aaplug.core.imaging import average_samples, box_average
@@ -15,7 +16,7 @@ from aaplug.core.splats import Render
 from aaplug.core.training import TrainingViews
 from aaplug.methods.filters import Smoothing3D, fuse_stored
 from aaplug.methods.pixel_kernels import SURFEL
-from aaplug.methods.recipes import NEIGHBOURS, QUALITIES, RECIPES, find_recipe, suited
+from aaplug.methods.recipes import NEIGHBOURS, RECIPES, find_recipe, suited
 from aaplug.rasterizers import RASTERIZERS
 from aaplug.rendering import renderer as rendering
 from aaplug.rendering.renderer import Renderer

@@ -17,13 +17,12 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from aaplug.core.cameras import Camera
+from aaplug.core.choices import Colour
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.kernels import Kernels
 from aaplug.core.rules import RULES_3DGS, Rules
 from aaplug.core.splats import Render, Splats2D
 from aaplug.core.training import TrainingViews
-
-Colour = tuple[float, float, float]
 
 
 @runtime_checkable

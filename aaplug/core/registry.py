@@ -10,10 +10,12 @@ cannot be used is left out with a warning, so that it does not stop everything e
 """
 
 import logging
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
 
+from aaplug.core.choices import NAMES
 from aaplug.core.errors import UsageError, closest, did_you_mean, not_one_of
 
 KINDS = (  # each is a registry and, with underscores and an s, an entry point group
@@ -21,6 +23,8 @@ KINDS = (  # each is a registry and, with underscores and an s, an entry point g
     *("rasterizer", "metric", "protocol", "method", "scene format", "camera format"),
 )
 PREFIX = "aaplug."
+
+_registered: dict[str, list[str]] = {kind: [] for kind in KINDS}  # names added from Python
 
 log = logging.getLogger("aaplug")
 T = TypeVar("T")
@@ -38,6 +42,7 @@ class Registry(Mapping[str, T]):
         self.kind, self._entries = kind, dict(own)
         self._fits = (lambda value: isinstance(value, check)) if isinstance(check, type) else check
         self._loaded = False
+        assert kind not in NAMES or NAMES[kind] == tuple(own), f"choices.NAMES has other names of a {kind}"
 
     def __getitem__(self, name: str) -> T:
         return self._all()[name]
@@ -55,11 +60,9 @@ class Registry(Mapping[str, T]):
             UsageError: there is none; the error names `parameter`, or else the kind, and the closest names.
         """
         entries = self._all()
-        if name in entries:
-            return entries[name]
-        close = closest(name, entries)
-        hint = f" (did you mean '{close}'?)" if close else ""
-        raise UsageError(parameter or self.kind, not_one_of(name, entries) + hint)
+        if name not in entries:
+            raise UsageError(parameter or self.kind, unknown(name, entries))
+        return entries[name]
 
     def register(self, name: str, value: T) -> None:
         """Add an entry from Python, for this process.
@@ -69,13 +72,14 @@ class Registry(Mapping[str, T]):
         """
         self._all()
         self._add(name, value, f"{self.kind} {name}")
+        _registered[self.kind].append(name)
 
     def _all(self) -> dict[str, T]:
         if not self._loaded:
             self._loaded = True
             _warn_of_unknown_groups()
             group = group_of(self.kind)
-            for point in entry_points(group=group):
+            for point in _points().select(group=group):
                 package = f" of package {point.dist.name}" if point.dist else ""
                 where = f"plug-in {point.value}{package} ({group})"
                 try:
@@ -101,6 +105,18 @@ def named(objects: Iterable[T]) -> dict[str, T]:
     return {getattr(value, "name"): value for value in objects}  # noqa: B009
 
 
+def names_of(kind: str) -> list[str]:
+    """Names of a kind in `choices.NAMES`, and plug-ins', also of such as cannot be used: nothing is imported."""
+    points = _points().select(group=group_of(kind))
+    return list(dict.fromkeys([*NAMES[kind], *(point.name for point in points), *_registered[kind]]))
+
+
+def unknown(name: str, known: Collection[str]) -> str:
+    """Message for a name that is none of the known ones, with the closest of them."""
+    close = closest(name, known)
+    return not_one_of(name, known) + (f" (did you mean '{close}'?)" if close else "")
+
+
 def group_of(kind: str) -> str:
     """Name of the entry point group of a kind."""
     return f"{PREFIX}{kind.replace(' ', '_')}s"
@@ -108,9 +124,15 @@ def group_of(kind: str) -> str:
 
 def _warn_of_unknown_groups() -> None:
     known = set(map(group_of, KINDS))
-    for group in sorted(entry_points().groups):
+    for group in sorted(_points().groups):
         if group.startswith(PREFIX) and group not in known:
             log.warning("entry point group %s is not known%s", group, did_you_mean(group, known))
+
+
+@cache
+def _points() -> Any:
+    """Of all installed packages; reading them takes milliseconds, and no plug-in comes while a process runs."""
+    return entry_points()
 
 
 def _load(point: EntryPoint, where: str) -> Any:

@@ -15,13 +15,12 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from aaplug.core.cameras import Camera
+from aaplug.core.choices import MIN_SEEN_SHARE
 from aaplug.core.errors import FrameError, UsageError
 from aaplug.core.rules import NEAR
 
 MARGIN = 0.15  # of the image's side; equals 3DGS's clamp of the Jacobian at 1.3 tan(fov/2)
 CHUNK_PAIRS = 4_000_000  # Gaussian-camera pairs held at once: about 150 MB
-# below this share of Gaussians seen, scene and cameras are taken to be in different frames
-MIN_SEEN_SHARE = 0.5
 FRAME_CHECK_GAUSSIANS = 50_000  # size of the even sample for the frame check
 
 

@@ -17,6 +17,7 @@ from typing import Any
 from torch import Tensor
 
 from aaplug.core.cameras import Camera
+from aaplug.core.choices import Background
 from aaplug.core.errors import UsageError
 from aaplug.core.executors import Apply
 from aaplug.core.gaussians import Gaussians
@@ -34,10 +35,9 @@ from aaplug.evaluation.truth import Truth, ViewTruth, source_of
 from aaplug.io.photographs import DOWNSCALES
 from aaplug.methods.recipe import Recipe
 from aaplug.methods.recipes import suited
-from aaplug.rendering.renderer import Background, Renderer
+from aaplug.rendering.renderer import Renderer
 
 NO_PHOTOGRAPH = "no photograph is this large: metrics above the photographs' own size are undefined"
-
 CORNER = 64  # px
 
 Values = Mapping[str, float | None]

@@ -14,7 +14,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.cameras import Camera
-from aaplug.core.interfaces import Colour, CountsEvaluations
+from aaplug.core.choices import Colour
+from aaplug.core.interfaces import CountsEvaluations
 from aaplug.evaluation.protocols import Protocol
 from aaplug.rendering.renderer import Renderer
 

@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
+from aaplug.core.choices import metric_option
 from aaplug.core.errors import UsageError, not_one_of
 from aaplug.core.registry import Registry, named
 from aaplug.evaluation.lpips import LPIPS
@@ -175,8 +176,3 @@ def default_metrics(protocol: Protocol) -> tuple[str, ...]:
     """Names of what is measured where the user chooses nothing."""
     figures = (CONSISTENCY, ENERGY) if protocol.change == "size" else ()
     return tuple(metric_option(m.name) for m in (PSNR, SSIM[protocol.ssim], *figures))
-
-
-def metric_option(name: str) -> str:
-    """A metric's name as an option's value."""
-    return name.casefold().replace(" ", "-")

@@ -18,6 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.cameras import Camera
+from aaplug.core.choices import Background
 from aaplug.core.errors import UsageError, not_one_of
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.imaging import quantised, resampled
@@ -29,7 +30,7 @@ from aaplug.evaluation.upsamplers import Upsampler, bicubic
 from aaplug.io.photographs import DOWNSCALES, Photograph
 from aaplug.methods.recipe import Recipe
 from aaplug.methods.recipes import find_recipe
-from aaplug.rendering.renderer import Background, Renderer
+from aaplug.rendering.renderer import Renderer
 
 NO_PHOTOGRAPH = "has no photograph to compare with; truth 'self' compares with the scene's own render"
 MEMORY = 1e9  # bytes of images to keep; what does not fit is made again each time

@@ -10,6 +10,7 @@ from dataclasses import replace
 import torch
 
 from aaplug.core.cameras import Camera, spread
+from aaplug.core.choices import LEVEL_STEPS
 from aaplug.core.free_views import free_views
 from aaplug.core.gaussians import Fusion, Gaussians
 from aaplug.core.monitor import SILENT, Monitor
@@ -35,7 +36,6 @@ FASTER = {"means": 1.0, "quats": 1.0, "log_scales": 3.0, "logit_opacities": 1.0,
 SHARE = 0.3
 USUAL = 0.02  # root mean square error, of colours in [0, 1]
 DECAY = 0.03
-STEPS = 800  # for a level of 1/4 of the training rate and above; a smaller one takes more, of smaller images
 LARGE = 1 / 4  # of the training rate
 MOST_TIMES = 8.0  # as many at most
 GOOD = 3.5e-5  # mean square error, 44.5 dB: a level that is so close is not tuned
@@ -46,14 +46,14 @@ def refined(
     rate: float,
     look: Renderer,
     poses: Sequence[Camera],
-    steps: int = STEPS,
+    steps: int = LEVEL_STEPS,
     viewer: Viewer | None = None,
     monitor: Monitor = SILENT,
 ) -> Gaussians:
     """The level after tuning, or as it is where that does not help.
 
     rate: the lowest sampling rate relative to training's that it is meant for.
-    steps: for a rate of `LARGE` and above; see `STEPS`.
+    steps: for a rate of `LARGE` and above; see `LEVEL_STEPS`.
     look: draws the scene as training showed it.
     poses: views to tune on, at the training size.
     viewer: what will draw the result; None for aaplug.

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+from aaplug.core.choices import ANCHOR, WEIGHTS
 from aaplug.core.errors import UsageError, not_one_of
 from aaplug.core.registry import Registry
 from aaplug.finetuning.losses import LOSSES
@@ -33,8 +34,7 @@ class Settings:
     seed: int = 0
 
 
-# these scales and weights, and that all parameters move, were measured
-OURS = Settings("consistency", 1000, {0.5: 1.0, 0.25: 2.0, 0.125: 1.0}, RATES, anchor=3.0, decay=0.03)
+OURS = Settings("consistency", 1000, WEIGHTS, RATES, anchor=ANCHOR, decay=0.03)
 # 3DGS's rates worsen a scene that is nearly right, and 300 steps are too few to recover
 GENTLE = {name: 0.3 * rate for name, rate in RATES.items()}
 # for conversion, a few minutes; `balanced` divides its weights by the scene's errors

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
+from aaplug.core.choices import MOST_FPS
 from aaplug.core.errors import OutputError, UsageError
 from aaplug.core.imaging import levels
 from aaplug.io.atomic import check_output, replacing_file
@@ -30,7 +31,6 @@ PIXELS = "yuv420p"  # the pixel format that every player supports
 BT709 = 1  # its code for matrix, primaries and transfer in ITU-T H.273
 MPEG_RANGE = 1  # FFmpeg's AVCOL_RANGE_MPEG: black is 16, white is 235
 MOST_DENOMINATOR = 1001  # of frames per second, as in 30000/1001
-MOST_FPS = 1000
 SAME_BYTES = {"fflags": "+bitexact"}  # no random track number, no version: the same frames make the same file
 
 

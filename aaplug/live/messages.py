@@ -12,9 +12,9 @@ from typing import Any
 
 import torch
 
+from aaplug.core.choices import QUALITIES
 from aaplug.core.errors import SHOWN, UsageError, not_one_of
 from aaplug.live.paints import PAINTS
-from aaplug.methods.recipes import QUALITIES
 
 MOST_BYTES = 16_384  # of a message
 MOST_SIDE = 8192  # px of a picture

@@ -17,6 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.cameras import Camera
+from aaplug.core.choices import QUALITIES
 from aaplug.core.imaging import quantised, resampled
 from aaplug.evaluation.metrics import psnr
 from aaplug.io.images import encode_jpeg, encode_png
@@ -24,7 +25,6 @@ from aaplug.io.photographs import read_photo
 from aaplug.live.messages import See, Side, Still
 from aaplug.live.paints import PAINTS
 from aaplug.live.subject import Subject
-from aaplug.methods.recipes import QUALITIES
 from aaplug.rendering.renderer import Renderer
 from aaplug.rendering.strips import strips
 

@@ -8,6 +8,7 @@ import torch
 
 from aaplug.core.camera_paths import up_of
 from aaplug.core.cameras import Camera, CameraSet, spread
+from aaplug.core.choices import QUALITIES
 from aaplug.core.errors import AaplugError
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.orbits import pinhole
@@ -16,7 +17,7 @@ from aaplug.evaluation.protocols import median_depth
 from aaplug.live.messages import See, Side
 from aaplug.live.paints import PAINTS
 from aaplug.methods.recipe import Recipe
-from aaplug.methods.recipes import QUALITIES, RECIPES, find_recipe
+from aaplug.methods.recipes import RECIPES, find_recipe
 from aaplug.rendering.renderer import Renderer
 
 KEPT = 6  # renderers: a recipe with a world filter has Gaussians of its own

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+from aaplug.core.choices import QUALITIES
 from aaplug.core.errors import UsageError, not_one_of
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.interfaces import MatchesRates
@@ -10,10 +11,6 @@ from aaplug.methods.filters import SCREEN_FILTERS, LowPass, Matched, Smoothing3D
 from aaplug.methods.pixel_kernels import SURFEL
 from aaplug.methods.recipe import Promises, Recipe
 from aaplug.methods.research_recipes import RESEARCH_RECIPES
-
-# Relative rate that each quality samples a pixel at.  A small image costs per Gaussian, not per pixel: at 1/8 of the
-# training size 2x2 samples take no more splat-pixel evaluations than `classic` with one.
-QUALITIES = {"fast": 0.25, "balanced": 0.5, "best": 1.0}
 
 # Where there are levels of detail, one is picked for the samples' rate: most samples along a pixel's side, and the
 # number of Gaussians up to which more samples, of finer levels, are taken as without levels (some 20 ms on two cores).

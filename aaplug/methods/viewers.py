@@ -156,6 +156,11 @@ VIEWERS: Registry[Viewer] = Registry(
 FAST = Viewer("fast", "aaplug", "matched", None, "--recipe matched")
 
 
+def find_viewer(viewer: str | Viewer | None) -> Viewer | None:
+    """The viewer, by name or itself; raises UsageError if the name is not known."""
+    return VIEWERS.find(viewer, "viewer") if isinstance(viewer, str) else viewer
+
+
 def fuse(scene: Gaussians, training: TrainingViews | None, form: Form = MATCHED_ENERGY) -> Gaussians:
     """Convert a scene to the Mip rule: fuse its stored 3D filter, or apply `form` if it stores none.
 

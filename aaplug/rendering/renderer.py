@@ -10,22 +10,23 @@ and weighing the samples of each pixel.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from aaplug.core.cameras import BLACK, WHITE, Camera, CameraSet
+from aaplug.core.choices import MIN_SEEN_SHARE, Background, Colour
 from aaplug.core.culling import cull
 from aaplug.core.errors import UsageError
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.imaging import average_samples
-from aaplug.core.interfaces import Colour, Rasterizer, RunsKernels
+from aaplug.core.interfaces import Rasterizer, RunsKernels
 from aaplug.core.kernels import EAGER, Kernels
 from aaplug.core.projection import project, shade, with_depth_slopes
 from aaplug.core.pyramids import Cutter, Pyramid
-from aaplug.core.sampling import MIN_SEEN_SHARE, sampling_bounds
+from aaplug.core.sampling import sampling_bounds
 from aaplug.core.splats import Render, Splats2D, concatenated
 from aaplug.core.training import TrainingViews
 from aaplug.methods.filters import fuse_stored
@@ -36,7 +37,6 @@ from aaplug.rasterizers import RASTERIZERS, find_rasterizer
 CHUNK = 1 << 20  # Gaussians projected at once
 RATE_DIGITS = 2  # decimals of the rate that sets the weight of neighbours, which so moves in steps
 
-Background = Literal["auto", "white", "black"] | Colour
 Harmonics = Callable[[int, int], Float[Tensor, "c k 3"]]
 
 

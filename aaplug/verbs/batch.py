@@ -16,8 +16,8 @@ from aaplug.core.monitor import SILENT, Monitor
 from aaplug.evaluation.report.files import as_json, write_texts
 from aaplug.evaluation.results import Report, as_csv, grid, method, results
 from aaplug.io.atomic import claimed, output_folder, refuse_existing
+from aaplug.options.objects import AnyPath
 from aaplug.verbs.evaluate import EvaluateOptions, check_results
-from aaplug.verbs.inputs import AnyPath
 from aaplug.verbs.shard import Record, Shard
 from aaplug.verbs.views import file_names
 

@@ -1,25 +1,23 @@
 """How fast this machine renders, stage by stage."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import product
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from aaplug.core.cameras import Camera, CameraSet
-from aaplug.core.errors import UsageError, not_one_of
+from aaplug.core.errors import UsageError
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.kernels import EAGER, Kernels
 from aaplug.core.monitor import SILENT, Monitor
 from aaplug.io.limits import lack_of_memory
+from aaplug.options.bench import BenchOptions
+from aaplug.options.shared import size_of
 from aaplug.rasterizers.tiled.ahead_of_time import build, load
 from aaplug.rendering.benchmark import Figures, exponent, measure, synthetic_camera, synthetic_scene
 from aaplug.verbs.inputs import CamerasLike, Held, SceneLike, inputs_of, processor, whole_of
-from aaplug.verbs.options import THREADS, UNSET, Options, choice, flag, number
-from aaplug.verbs.views import size_of
 
 SIZES = ("800x800", "1600x1060")  # of images
 BYTES = 1200  # a Gaussian of degree 3 with its gradients and what autograd keeps, measured
-CHOICES = ("all", "compiled", "eager")
 
 
 class Bench(NamedTuple):
@@ -27,24 +25,6 @@ class Bench(NamedTuple):
 
     runs: list[Figures]
     exponents: dict[str, float]
-
-
-@dataclass(frozen=True, kw_only=True)
-class BenchOptions(Options):
-    """What to time."""
-
-    gaussians: Annotated[Sequence[int], number(1, 100_000_000, whole=True, several=True)] = (10_000, 100_000, 1_000_000)
-    """Sizes of the synthetic scenes."""
-    resolution: Annotated[Sequence[str] | None, flag("WxH ...")] = None
-    """Sizes of the images: all scenes at the first, the middle one at each (default: 800x800 1600x1060)."""
-    rasterizer: Annotated[str, choice(CHOICES)] = "all"
-    """Which to time; all: compiled, if `aaplug warmup` has run, and eager."""
-    repeats: Annotated[int, number(1, 1000, whole=True)] = 5
-    """Runs per median."""
-    threads: Annotated[int | None, THREADS, UNSET] = None
-    """Processor threads (default: all)."""
-    forward_only: bool = False
-    """Leave out the backward pass."""
 
 
 @BenchOptions.shown
@@ -77,8 +57,6 @@ def _first_view(scene: Held, cameras: CameraSet) -> tuple[Gaussians, Camera]:
 
 
 def _kernels(rasterizer: str, monitor: Monitor) -> list[Kernels]:
-    if rasterizer not in CHOICES:
-        raise UsageError("rasterizer", not_one_of(rasterizer, CHOICES))
     if rasterizer == "eager":
         return [EAGER]
     compiled = load()

@@ -4,11 +4,9 @@ import logging
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
-
-import tyro
+from typing import Any
 
 from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.digests import digest_of_scene
@@ -20,7 +18,7 @@ from aaplug.core.training import TrainingViews
 from aaplug.evaluation.comparison import ComparedScene, Comparison
 from aaplug.evaluation.engine import Candidate, Task, evaluate
 from aaplug.evaluation.image_store import ImageStore
-from aaplug.evaluation.metrics import METRICS, find_metrics, metric_option
+from aaplug.evaluation.metrics import find_metrics
 from aaplug.evaluation.protocols import PROTOCOLS
 from aaplug.evaluation.report.comparison_files import COMPARED, write_comparison
 from aaplug.evaluation.report.files import PAGE
@@ -32,16 +30,16 @@ from aaplug.io.atomic import claimed, output_folder
 from aaplug.io.cameras import select_views
 from aaplug.io.scenes import bytes_of, called, open_scene
 from aaplug.io.scenes.scene_file import SceneFile, usable
-from aaplug.methods.recipe import Recipe
 from aaplug.methods.recipes import RECIPES
-from aaplug.methods.viewers import VIEWERS, Viewer
+from aaplug.methods.viewers import Viewer, find_viewer
+from aaplug.options.compare import SIZES, CompareOptions
+from aaplug.options.objects import AnyPath
 from aaplug.rendering.renderer import Renderer
 from aaplug.verbs.agreement import settled
 from aaplug.verbs.announce import announce
 from aaplug.verbs.assumed import say_assumed
 from aaplug.verbs.evaluate import JOURNAL, check_journalled, environment, facts_of_cameras, seconds_of, shown_views
 from aaplug.verbs.inputs import (
-    AnyPath,
     CamerasLike,
     Held,
     SceneLike,
@@ -55,44 +53,13 @@ from aaplug.verbs.inputs import (
     shown_of,
     whole_of,
 )
-from aaplug.verbs.options import RECIPE_NAMES, SCALES, RecipeOptions, choice, flag
 from aaplug.verbs.views import file_names
 
-SIZES = (2.0, 1.0, 0.5, 0.25)
 METHOD = replace(
     PROTOCOLS["self"], name="compare", source="the first scene as its recipe draws it at each size", scales=SIZES
 )
-MEASURED = ("psnr", "ssim", "flicker")
 
 log = logging.getLogger("aaplug")
-
-
-@dataclass(frozen=True, kw_only=True)
-class CompareOptions(RecipeOptions):
-    """Sizes, metrics and how the scenes are shown."""
-
-    recipe: Annotated[str | Recipe, choice([*RECIPE_NAMES, "..."])] = "auto"
-    """How to draw every scene, each by the convention that it was trained with."""
-    viewer: Annotated[str | Viewer | None, flag("VIEWER", "--for", kind=str | None)] = None
-    """Draw the scenes as spark or another of examples/guides/viewers.md does; the truth stays the first by --recipe."""
-    scale: Annotated[Sequence[float], SCALES] = SIZES
-    """One or more sizes relative to the training size."""
-    metric: Annotated[str | Sequence[str], flag("|".join(map(metric_option, METRICS)), kind=tuple[str, ...])] = MEASURED
-    """Metrics (default: psnr ssim flicker)."""
-    show: Annotated[str, tyro.conf.arg(metavar="N|NAME,...")] = "3"
-    """Views in the report's viewer: how many, or which."""
-    any_frame: bool = False
-    """Compare scenes that lie in different frames too."""
-    resume: bool = False
-    """Continue an interrupted comparison; finished views are not measured again."""
-    overwrite: bool = False
-    """Replace existing results."""
-
-    def shown_by(self) -> Viewer | None:
-        """The viewer, by name or itself."""
-        if self.viewer is not None and self.recipe != "auto":
-            raise UsageError("viewer", "sets the recipe itself; leave out `recipe`")
-        return VIEWERS.find(self.viewer, "viewer") if isinstance(self.viewer, str) else self.viewer
 
 
 @CompareOptions.shown
@@ -122,7 +89,7 @@ def compare(
         AaplugError: as `render`; also, there are fewer than two scenes, or one is named twice.
     """
     o = CompareOptions.of(options)
-    viewer, folder = o.shown_by(), None if output is None else Path(output)
+    viewer, folder = find_viewer(o.viewer), None if output is None else Path(output)
     check_compared(folder, o)
     metrics = find_metrics([o.metric] if isinstance(o.metric, str) else o.metric, METHOD)
     named = _one_reading(_named(scenes), monitor)

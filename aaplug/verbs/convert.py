@@ -4,11 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
-
-import tyro
+from typing import Any
 
 from aaplug.core.cameras import Camera, CameraSet
+from aaplug.core.choices import SpzAxes
 from aaplug.core.errors import UsageError
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.monitor import SILENT, Monitor
@@ -19,22 +18,14 @@ from aaplug.finetuning.fitting import fit, steps_for
 from aaplug.inspection.survey import check_frame_of
 from aaplug.io.atomic import claimed
 from aaplug.io.cameras import select_views
-from aaplug.io.scenes import SpzAxes, check_scene_output, write_parts, write_scene
+from aaplug.io.scenes import check_scene_output, write_parts, write_scene
 from aaplug.io.scenes.scene_file import SceneFile
-from aaplug.methods.viewers import FORMS, MATCHED_ENERGY, MIP_VIEWER, VIEWERS, Form, Viewer, blurring, fuse
+from aaplug.methods.viewers import FORMS, MATCHED_ENERGY, MIP_VIEWER, Form, Viewer, blurring, find_viewer, fuse
+from aaplug.options.convert import ConvertOptions
+from aaplug.options.objects import AnyPath
 from aaplug.verbs.assumed import say_assumed
 from aaplug.verbs.in_parts import LARGE, convert_parts
-from aaplug.verbs.inputs import (
-    AnyPath,
-    CamerasLike,
-    SceneLike,
-    look_of,
-    opened_and_seen,
-    processor,
-    sources_of,
-    whole_of,
-)
-from aaplug.verbs.options import STEPS, UNSET, ViewOptions, flag, number
+from aaplug.verbs.inputs import CamerasLike, SceneLike, look_of, opened_and_seen, processor, sources_of, whole_of
 
 
 @dataclass(frozen=True)
@@ -49,35 +40,6 @@ class Converted:
     scene: Gaussians | None
     viewer: Viewer
     report: Report | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
-class ConvertOptions(ViewOptions):
-    """What to fuse, and how to measure it."""
-
-    views: Annotated[str, tyro.conf.arg(metavar="NAME,...|test|train|all")] = "train"
-    """Views that --for is measured on, by name or split."""
-    viewer: Annotated[str | Viewer | None, flag("VIEWER", "--for", kind=str | None)] = None
-    """Fit the scene to spark, playcanvas or another of examples/guides/viewers.md, and print the remaining error."""
-    steps: Annotated[int | None, STEPS, UNSET] = None
-    """With --for: steps of the fit, 0 for none (default: 300, or 0 if the viewer draws as training did)."""
-    form: Annotated[str | None, flag("|".join(FORMS))] = None
-    """Without --for: keep training's energy (matched-energy, the default), or smooth as Mip-Splatting does."""
-    variance: Annotated[float | None, number(0.001, 100), UNSET] = None
-    """Without --for: variance to fuse, in px² at the training rate (default: 0.2)."""
-    overwrite: bool = False
-    """Replace an existing output."""
-
-    def chosen(self) -> Form | Viewer:
-        """What to convert for: a viewer, or the Mip rule by a closed form."""
-        if self.viewer is None:
-            if self.steps is not None:
-                raise UsageError("steps", "belongs to the optimization for a `viewer`; name one")
-            found = MATCHED_ENERGY if self.form is None else FORMS.find(self.form, "form")
-            return found if self.variance is None else found.with_variance(self.variance)
-        if self.form is not None or self.variance is not None:
-            raise UsageError("viewer", "sets form and variance itself; leave out `form`, `variance`")
-        return VIEWERS.find(self.viewer, "viewer") if isinstance(self.viewer, str) else self.viewer
 
 
 @ConvertOptions.shown
@@ -109,7 +71,7 @@ def convert(
         KeyboardInterrupt: Ctrl-C stopped the optimization; nothing is written.
     """
     o = ConvertOptions.of(options)
-    chosen, path = o.chosen(), None if output is None else Path(output)
+    chosen, path = _chosen(o), None if output is None else Path(output)
     opened, known = opened_and_seen(scene, cameras, monitor)
     check = partial(check_scene_output, path, o.overwrite, sources_of(opened)) if path else lambda: None
     check()
@@ -130,6 +92,19 @@ def convert(
             assert found.scene is not None
             write_scene(path, found.scene, **writing)
     return found
+
+
+def _chosen(o: ConvertOptions) -> Form | Viewer:
+    """What to convert for: a viewer, or the Mip rule by a closed form."""
+    viewer = find_viewer(o.viewer)
+    if viewer is not None:
+        if o.form is not None or o.variance is not None:
+            raise UsageError("viewer", "sets form and variance itself; leave out `form`, `variance`")
+        return viewer
+    if o.steps is not None:
+        raise UsageError("steps", "belongs to the optimization for a `viewer`; name one")
+    found = MATCHED_ENERGY if o.form is None else FORMS.find(o.form, "form")
+    return found if o.variance is None else found.with_variance(o.variance)
 
 
 def _fitted(scene: Gaussians, cameras: CameraSet, viewer: Viewer, o: ConvertOptions, monitor: Monitor) -> Converted:

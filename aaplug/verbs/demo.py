@@ -19,10 +19,10 @@ from aaplug.io.atomic import output_folder, refuse_existing
 from aaplug.io.cameras import read_cameras
 from aaplug.io.images import read_image, write_png
 from aaplug.io.scenes import read_scene
+from aaplug.options.objects import AnyPath
 from aaplug.rendering.renderer import Renderer
 from aaplug.verbs.convert import convert
 from aaplug.verbs.evaluate import evaluate
-from aaplug.verbs.inputs import AnyPath
 
 SCALES = (1.0, 0.5, 0.25, 0.125)
 SHOWN = "r_136"  # the view on the contact sheet

@@ -4,14 +4,13 @@ import math
 import platform
 from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
-
-import tyro
+from typing import Any, get_args
 
 from aaplug.core.cameras import Camera, CameraSet
+from aaplug.core.choices import USER_RECIPES, metric_option
 from aaplug.core.digests import digest_of_cameras, digest_of_files, digest_of_scene
 from aaplug.core.errors import OutputError, UsageError, not_one_of
 from aaplug.core.gaussians import Gaussians
@@ -21,7 +20,7 @@ from aaplug.evaluation.engine import Task, candidates_of
 from aaplug.evaluation.engine import evaluate as measure
 from aaplug.evaluation.image_store import ImageStore
 from aaplug.evaluation.metric import Metric
-from aaplug.evaluation.metrics import METRICS, default_metrics, find_metrics, metric_option
+from aaplug.evaluation.metrics import default_metrics, find_metrics
 from aaplug.evaluation.protocols import PROTOCOLS, LpipsFlavour, Protocol, SsimFlavour, TruthSource
 from aaplug.evaluation.report.files import PAGE, RESULTS, write_page, write_results
 from aaplug.evaluation.results import Report
@@ -30,12 +29,13 @@ from aaplug.inspection.coverage import coverage
 from aaplug.io.atomic import claimed, output_folder, refuse_existing
 from aaplug.io.cameras import select_views
 from aaplug.methods.recipe import Recipe
-from aaplug.methods.recipes import RECIPES, USER_RECIPES, suited
+from aaplug.methods.recipes import RECIPES, suited
+from aaplug.options.evaluate import ALL, EvaluateOptions, Layout
+from aaplug.options.objects import AnyPath
 from aaplug.rendering.cost import comparing, cost_of
 from aaplug.verbs.announce import announce
 from aaplug.verbs.assumed import say_assumed
 from aaplug.verbs.inputs import (
-    AnyPath,
     CamerasLike,
     Held,
     SceneLike,
@@ -46,46 +46,10 @@ from aaplug.verbs.inputs import (
     scheduled,
     whole_of,
 )
-from aaplug.verbs.options import RECIPE_NAMES, SCALES, UNSET, RecipeOptions, choice, choices, flag
 
-ALL = "all"  # instead of recipes' names: every recipe that the scene suits
-DEFAULT_RECIPES = ("classic", "mip", "matched", "auto")
 FLAVOURS = {"ssim": get_args(SsimFlavour), "lpips": get_args(LpipsFlavour)}
 JOURNAL = "progress.jsonl"
-USER_NAMES = [recipe.name for recipe in USER_RECIPES]
 PACKAGES = ("aaplug", "torch", "numpy", "opencv-contrib-python-headless")
-
-Layout = Literal["plain", "inria"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class EvaluateOptions(RecipeOptions):
-    """Recipes, scales, truth and metrics."""
-
-    protocol: Annotated[str | Protocol, choice(PROTOCOLS)] = "default"
-    """Scales, truth, downscaling and flavours of metrics, by name."""
-    recipe: Annotated[str | Sequence[str | Recipe], choices([*RECIPE_NAMES, ALL, "..."])] = DEFAULT_RECIPES
-    """One or more recipes.  all adds the research recipes, which examples/guides/methods.md lists."""
-    scale: Annotated[Sequence[float] | None, SCALES, UNSET] = None
-    """One or more sizes relative to the training size (default: the protocol's)."""
-    truth: Literal["auto", "photographs", "self"] = "auto"
-    """Compare with photographs, or with the scene's own supersampled look; auto leaves it to the protocol."""
-    metric: Annotated[
-        str | Sequence[str] | None, flag("|".join(map(metric_option, METRICS)), kind=tuple[str, ...] | None)
-    ] = None
-    """Metrics, with flavours ssim:wang|3dgs, lpips:3dgs|vgg|alex (default: psnr ssim consistency energy-drift)."""
-    lpips: Annotated[tuple[AnyPath, AnyPath] | None, flag("TRUNK HEADS", kind=tuple[str, str] | None)] = None
-    """Weights of LPIPS, which is then measured: torchvision's VGG16 (AlexNet), and the lpips package's heads for it."""
-    report: bool = False
-    """Write report.html, one page with pictures side by side, tables and curves, and its plots."""
-    show: Annotated[str, tyro.conf.arg(metavar="N|NAME,...")] = "3"
-    """Views in the report's viewer: how many, or which."""
-    layout: Layout = "plain"
-    """inria stores every render and its truth in test/METHOD/{renders,gt}, where other metric scripts look."""
-    resume: bool = False
-    """Continue an interrupted evaluation; finished views are not measured again."""
-    overwrite: bool = False
-    """Replace existing results."""
 
 
 @EvaluateOptions.shown
@@ -226,7 +190,7 @@ def _recipes(o: EvaluateOptions, scene: Gaussians, monitor: Monitor) -> list[Rec
 
 def _recipe(recipe: str | Recipe, o: EvaluateOptions) -> Recipe:
     """A recipe with the user's choices; research recipes keep their own rate reference, which is what they compare."""
-    return recipe_of(recipe, o if recipe in USER_NAMES else replace(o, rate_reference=None))
+    return recipe_of(recipe, o if recipe in USER_RECIPES else replace(o, rate_reference=None))
 
 
 def shown_views(text: str, views: Sequence[Camera]) -> tuple[int, ...]:

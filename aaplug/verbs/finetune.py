@@ -6,15 +6,15 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from statistics import mean
-from typing import Annotated, Any
+from typing import Any
 
-import tyro
 from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.cameras import Camera, CameraSet
+from aaplug.core.choices import SpzAxes
 from aaplug.core.digests import digest_of_files
-from aaplug.core.errors import UsageError, not_one_of
+from aaplug.core.errors import UsageError
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.monitor import SILENT, Monitor
 from aaplug.core.sampling import sampling_bounds
@@ -24,23 +24,22 @@ from aaplug.evaluation.report.contact_sheet import contact_sheet
 from aaplug.evaluation.results import Report, results, scale_name
 from aaplug.evaluation.truth import MEMORY, Truth, back_projected, source_of, upsampled
 from aaplug.evaluation.upsamplers import find_upsampler
-from aaplug.finetuning.losses import LOSSES
-from aaplug.finetuning.parameters import RATES
 from aaplug.finetuning.session import recorded, tune
-from aaplug.finetuning.settings import METHODS, OURS, Settings, settings_of
+from aaplug.finetuning.settings import METHODS, Settings, settings_of
 from aaplug.finetuning.state import TuningJob
 from aaplug.io.atomic import check_output, claimed, replacing
 from aaplug.io.cameras import select_views
 from aaplug.io.images import write_png
-from aaplug.io.scenes import SpzAxes, check_scene_output, write_scene
+from aaplug.io.scenes import check_scene_output, write_scene
 from aaplug.methods.recipes import RECIPES
 from aaplug.methods.viewers import FAST, VIEWERS, Viewer, fuse_for
+from aaplug.options.finetune import FinetuneOptions
+from aaplug.options.objects import AnyPath
 from aaplug.rendering.cost import GRADIENTS, cost_of
 from aaplug.rendering.renderer import Renderer
 from aaplug.verbs.announce import announce
 from aaplug.verbs.assumed import say_assumed
-from aaplug.verbs.inputs import AnyPath, CamerasLike, SceneLike, inputs_of, look_of, processor, sources_of, whole_of
-from aaplug.verbs.options import SCALES, STEPS, UNSET, ViewOptions, choice, choices, flag, number
+from aaplug.verbs.inputs import CamerasLike, SceneLike, inputs_of, look_of, processor, sources_of, whole_of
 
 Image = Float[Tensor, "h w 3"]
 
@@ -64,44 +63,6 @@ class Tuned:
         weights = {f"{scale:g}": weight for scale, weight in self.settings.weights.items()}
         settings = asdict(self.settings) | {"weights": weights}
         return results(self.report) | {"settings": settings, "probes": list(self.probes)}
-
-
-@dataclass(frozen=True, kw_only=True)
-class FinetuneOptions(ViewOptions):
-    """The optimization."""
-
-    target: Annotated[str | Viewer | None, flag("fast|VIEWER", "--for", kind=str | None)] = None
-    """Who will show the scene: fast (aaplug's matched, the default) or a viewer of examples/guides/viewers.md."""
-    views: Annotated[str, tyro.conf.arg(metavar="NAME,...|test|train|all")] = "test"
-    """Views that the result is measured on, by name or split; training views are what it is tuned on."""
-    method: Annotated[str, choice(METHODS)] = "consistency"
-    """consistency makes one model for all scales; mipmap-gs makes one for a single --scale, as Mipmap-GS does."""
-    scale: Annotated[Sequence[float], SCALES] = tuple(OURS.weights)
-    """Sizes against the training size that must look right, beside the training size itself."""
-    steps: Annotated[int | None, STEPS, UNSET] = None
-    """Number of steps (default: 1000)."""
-    loss: Annotated[str, choice(LOSSES)] = OURS.loss
-    """l2, or 3DGS's 0.8 L1 + 0.2 D-SSIM."""
-    anchor: Annotated[float, number(0, 1_000_000)] = OURS.anchor
-    """Weight of the training size in every step, against 1 for the other scales."""
-    move: Annotated[Sequence[str], choices(RATES)] = tuple(RATES)
-    """Parameters that move."""
-    learning_rate: Annotated[float, number(1e-6, 100)] = 1.0
-    """Factor on the method's learning rates."""
-    densify_every: Annotated[int | None, STEPS, UNSET] = None
-    """Clone, split and prune every N steps; 0 for never (default: the method's own)."""
-    truth: Annotated[str, choice(("auto", "self", "photographs"))] = "auto"
-    """What the training size should look like: self is the scene's own render; auto takes photographs if all exist."""
-    upsampler: Annotated[str | None, flag("bicubic|lanczos|FILE")] = None
-    """For scales above the photographs': an interpolation or a network (.pb, .pt2); default: the scene's own render."""
-    seed: Annotated[int, number(0, 2**31 - 1, whole=True)] = 0
-    """Seed of the views and scales that the steps draw."""
-    checkpoint_every: Annotated[int, number(1, 1_000_000, whole=True)] = 100
-    """Steps between checkpoints."""
-    resume: bool = False
-    """Continue an interrupted run from its checkpoint."""
-    overwrite: bool = False
-    """Replace existing outputs."""
 
 
 @FinetuneOptions.shown
@@ -217,10 +178,7 @@ def _viewer(o: FinetuneOptions) -> Viewer:
     """What will show the scene: as asked, or the method's own."""
     if not isinstance(o.target, str):
         return o.target or METHODS[o.method].viewer
-    known = {FAST.name: FAST, **VIEWERS}
-    if o.target not in known:
-        raise UsageError("target", not_one_of(o.target, known))
-    return known[o.target]
+    return FAST if o.target == FAST.name else VIEWERS.find(o.target, "target")
 
 
 def _source(truth: str, cameras: CameraSet) -> TruthSource:

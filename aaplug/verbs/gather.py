@@ -14,9 +14,9 @@ from aaplug.core.monitor import SILENT, Monitor
 from aaplug.evaluation.journal import read_report
 from aaplug.io.atomic import claimed, refuse_existing
 from aaplug.io.values import read_json
+from aaplug.options.objects import AnyPath
 from aaplug.verbs.batch import RESULTS, SUMMARY, Batch, write_batch
 from aaplug.verbs.evaluate import JOURNAL
-from aaplug.verbs.inputs import AnyPath
 from aaplug.verbs.shard import Record, Shard
 
 RECORD = re.compile(r"shard-(\d+)-of-(\d+)\.json")

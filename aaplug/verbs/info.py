@@ -13,9 +13,10 @@ from aaplug.io.scenes import open_scene
 from aaplug.io.scenes.ply import Document
 from aaplug.io.scenes.scene_file import SceneFile
 from aaplug.methods.viewers import describe
+from aaplug.options.objects import AnyPath
+from aaplug.options.shared import FrameOptions
 from aaplug.verbs.assumed import TRAINING_RATE, Orbit, probed, rate_of
-from aaplug.verbs.inputs import AnyPath, CamerasLike, opened_and_seen
-from aaplug.verbs.options import FrameOptions
+from aaplug.verbs.inputs import CamerasLike, opened_and_seen
 
 EXPONENTIATED = 20.0  # larger log-scales are taken for scales
 FEW_STEPS = 1e4  # float32 steps across the scene's extent: with fewer, positions are coarse

@@ -4,7 +4,6 @@ import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
-from os import PathLike
 from pathlib import Path
 from typing import overload
 
@@ -25,15 +24,15 @@ from aaplug.io.scenes.scene_file import SceneFile
 from aaplug.levels.pyramids import read_pyramid
 from aaplug.methods.recipe import Recipe
 from aaplug.methods.recipes import RECIPES, find_recipe
+from aaplug.options.objects import AnyPath
+from aaplug.options.shared import RecipeOptions, ViewOptions
 from aaplug.rasterizers import find_rasterizer
 from aaplug.rendering.renderer import Harmonics, Renderer, background_colour
 from aaplug.verbs.agreement import agreement, settled
 from aaplug.verbs.assumed import Orbit
-from aaplug.verbs.options import RecipeOptions, ViewOptions
 
 log = logging.getLogger("aaplug")
 
-AnyPath = str | PathLike[str]
 SceneLike = Gaussians | Pyramid | AnyPath
 Held = Gaussians | Pyramid  # in memory
 CamerasLike = CameraSet | Orbit | AnyPath | None

@@ -5,23 +5,22 @@ from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import torch
-import tyro
 
 from aaplug.core.cameras import Camera, CameraSet
+from aaplug.core.choices import SpzAxes
 from aaplug.core.digests import digest_of_cameras, digest_of_scene, digest_of_values
 from aaplug.core.errors import OutputError, UsageError
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.monitor import SILENT, Monitor
 from aaplug.core.sampling import check_frame
 from aaplug.finetuning.fitting import fit, steps_for
-from aaplug.finetuning.refining import STEPS as STEPS_EACH
 from aaplug.finetuning.refining import refined
 from aaplug.io.atomic import claimed, output_folder, refuse_existing
 from aaplug.io.cameras import select_views
-from aaplug.io.scenes import SpzAxes, check_scene_output, write_scene, written_format
+from aaplug.io.scenes import check_scene_output, write_scene, written_format
 from aaplug.io.scenes.manifests import MANIFEST, LevelFile, Manifest, hash_of, is_pyramid, read_manifest, write_manifest
 from aaplug.io.scenes.scene_file import FLOAT, SceneFile, matrix_of
 from aaplug.levels.chunks import LARGEST, chunks_of
@@ -29,103 +28,15 @@ from aaplug.levels.merging import Goal, merged, merged_in_chunks
 from aaplug.levels.pyramids import Level, levels_in
 from aaplug.levels.rates import rates_of
 from aaplug.methods.filters import fuse_stored
-from aaplug.methods.viewers import VIEWERS, Viewer
+from aaplug.methods.viewers import find_viewer
+from aaplug.options.lod import LodOptions
+from aaplug.options.objects import AnyPath
 from aaplug.verbs.assumed import say_assumed
-from aaplug.verbs.inputs import (
-    AnyPath,
-    CamerasLike,
-    Held,
-    SceneLike,
-    look_of,
-    opened_and_seen,
-    processor,
-    sources_of,
-    whole_of,
-)
-from aaplug.verbs.options import STEPS, UNSET, ViewOptions, flag, number
+from aaplug.verbs.inputs import CamerasLike, Held, SceneLike, look_of, opened_and_seen, processor, sources_of, whole_of
 
 LEVELS = 4  # as many as usual: down to 1/16 of the training size
-TIMES_FOR_ONE = 2  # as many steps for one scene: its counts are met, so tuning has more to mend
 MEGABYTE = 1e6
 NORMALS = 3  # columns that a .ply has beside a Gaussian's parameters
-
-
-@dataclass(frozen=True, kw_only=True)
-class LodOptions(ViewOptions):
-    """How light, and how to tune."""
-
-    views: Annotated[str, tyro.conf.arg(metavar="NAME,...|test|train|all")] = "train"
-    """Views that levels are tuned on, with free ones between them."""
-
-    simplify: Annotated[float | None, number(1e-6, 1e9), UNSET] = None
-    """Write one scene with this share of the Gaussians; above 1, with so many."""
-    budget: Annotated[float | None, number(0.001, 1e6), UNSET] = None
-    """Write one scene of as many Gaussians as fit into a .ply of so many MB (10^6 bytes)."""
-    levels: Annotated[int | None, number(1, 12, whole=True), UNSET] = None
-    """Write a folder of levels, each for half the size of the one before, as light as the image allows (default: 4)."""
-    merge_below: Annotated[float, number(0, 10)] = 0.0
-    """With levels: merge Gaussians up to so many px of the level in any case; faster to draw, and less exact."""
-    scale: Annotated[float | None, number(0.001, 1), UNSET] = None
-    """With --simplify or --budget: size of the images that the scene is meant for (default: root of the share)."""
-    viewer: Annotated[str | Viewer | None, flag("VIEWER", "--for", kind=str | None)] = None
-    """Tune each file for spark, playcanvas or another of examples/guides/viewers.md, instead of for aaplug."""
-    refine: bool = True
-    """Merge alone, in seconds: do not tune the result to look like the scene, which takes minutes."""
-    steps: Annotated[int | None, STEPS, UNSET] = None
-    """Steps of tuning for each level, more for small ones (default: 800, or 1600 for one scene)."""
-    resume: bool = False
-    """Keep the levels that are there, if they were made of the same scene, cameras and options."""
-    overwrite: bool = False
-    """Replace existing outputs."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        given = [name for name in ("simplify", "budget", "levels") if getattr(self, name) is not None]
-        if len(given) > 1:
-            raise UsageError(given[1], f"cannot be combined with `{given[0]}`: each asks for other files")
-        if self.scale is not None and not self.single:
-            raise UsageError("scale", "belongs to `simplify` and `budget`")
-        if self.merge_below and self.single:
-            raise UsageError("merge_below", "belongs to levels")
-        if self.resume and (self.single or self.viewer is not None):
-            raise UsageError("resume", "belongs to levels for aaplug")
-        if self.viewer is not None and not self.tuning:
-            raise UsageError("viewer", "is what the result is tuned for: leave out `refine`, and `steps` of 0")
-
-    @property
-    def single(self) -> bool:
-        """Whether one scene is asked for, not levels."""
-        return self.simplify is not None or self.budget is not None
-
-    @property
-    def tuning(self) -> int:
-        """Steps of tuning for a rate of 1/4 and above; 0 for none."""
-        usual = TIMES_FOR_ONE * STEPS_EACH if self.single else STEPS_EACH
-        return (usual if self.steps is None else self.steps) if self.refine else 0
-
-    @property
-    def shown_by(self) -> Viewer | None:
-        """The viewer; None for aaplug."""
-        return VIEWERS.find(self.viewer, "viewer") if isinstance(self.viewer, str) else self.viewer
-
-    def goals(self, scene: Gaussians) -> list[Goal]:
-        """What to merge for, one scene after the other.
-
-        Raises:
-            UsageError: the scene has fewer Gaussians than asked for.
-        """
-        if not self.single:
-            return [Goal.of_level(level, self.merge_below) for level in range(1, (self.levels or LEVELS) + 1)]
-        if self.budget is not None:
-            each = FLOAT * (len(matrix_of(scene[:0])[0]) + NORMALS)
-            count = min(len(scene), int(self.budget * MEGABYTE / each))
-        else:
-            assert self.simplify is not None
-            count = round(self.simplify * (len(scene) if self.simplify <= 1 else 1))
-        if count > len(scene):
-            raise UsageError("simplify", f"asks for {count:,} Gaussians, and the scene has {len(scene):,}")
-        goal = Goal.of_count(max(1, count), scene)
-        return [goal if self.scale is None else replace(goal, rate=self.scale)]
 
 
 @LodOptions.shown
@@ -172,7 +83,7 @@ def lod(
     with processor(o.threads), folder, claimed(path, check):
         make = _Maker(whole, known.train, *_tuners(whole, known, o, monitor), monitor)
         if o.single:
-            found = make.finished(make(Level(whole, 1.0), o.goals(whole)[0]))
+            found = make.finished(make(Level(whole, 1.0), goals_of(o, whole)[0]))
             if path is not None:
                 write_scene(path, found.scene, overwrite=o.overwrite, spz_axes=spz_axes)
             return [found]
@@ -204,13 +115,33 @@ class _Maker:
         return self.tuned(Level(found, goal.rate, chunks))
 
 
+def goals_of(o: LodOptions, scene: Gaussians) -> list[Goal]:
+    """What to merge for, one scene after the other.
+
+    Raises:
+        UsageError: the scene has fewer Gaussians than asked for.
+    """
+    if not o.single:
+        return [Goal.of_level(level, o.merge_below) for level in range(1, (o.levels or LEVELS) + 1)]
+    if o.budget is not None:
+        each = FLOAT * (len(matrix_of(scene[:0])[0]) + NORMALS)
+        count = min(len(scene), int(o.budget * MEGABYTE / each))
+    else:
+        assert o.simplify is not None
+        count = round(o.simplify * (len(scene) if o.simplify <= 1 else 1))
+    if count > len(scene):
+        raise UsageError("simplify", f"asks for {count:,} Gaussians, and the scene has {len(scene):,}")
+    goal = Goal.of_count(max(1, count), scene)
+    return [goal if o.scale is None else replace(goal, rate=o.scale)]
+
+
 def _tuners(
     scene: Gaussians, cameras: CameraSet, o: LodOptions, monitor: Monitor
 ) -> tuple[Callable[[Level], Level], Callable[[Level], Level]]:
     """What tunes a level for aaplug, and for a viewer; one of them does nothing."""
     if not o.tuning:
         return _same, _same
-    viewer = o.shown_by
+    viewer = find_viewer(o.viewer)
     look, views = look_of(scene, cameras, o.tuning, o, monitor), select_views(cameras, o.views)
 
     def tuned(level: Level) -> Level:
@@ -239,7 +170,7 @@ def _levels(
         manifest, done = found, list(levels_in(pyramid, found))
         make.monitor.say(f"resumed: {len(done) - 1} levels are there")
     done = done or [Level(make.scene, 1.0, chunks_of(make.scene.means, LARGEST))]
-    goals = o.goals(make.scene)
+    goals = goals_of(o, make.scene)
     for place in range(len(goals) + 1):
         if place >= len(done):
             done.append(make(done[-1], goals[place - 1]))

@@ -1,10 +1,10 @@
 """Images of a scene at new resolutions."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 from aaplug.core.cameras import Camera
 from aaplug.core.errors import listing
@@ -14,12 +14,13 @@ from aaplug.io.atomic import claimed, output_folder
 from aaplug.io.cameras import select_views
 from aaplug.io.scenes.scene_file import SceneFile
 from aaplug.methods.recipes import find_recipe
+from aaplug.options.objects import AnyPath
+from aaplug.options.render import RenderOptions
 from aaplug.rendering.frames import write_frames
 from aaplug.rendering.renderer import Renderer
 from aaplug.verbs.announce import announce
 from aaplug.verbs.assumed import say_assumed
 from aaplug.verbs.inputs import (
-    AnyPath,
     CamerasLike,
     SceneLike,
     drawable,
@@ -29,7 +30,6 @@ from aaplug.verbs.inputs import (
     processor,
     scheduled,
 )
-from aaplug.verbs.options import ImageOptions, RecipeOptions
 from aaplug.verbs.views import image_paths, names_image, resized
 
 
@@ -38,14 +38,6 @@ class Written(NamedTuple):
 
     view: Camera
     file: Path
-
-
-@dataclass(frozen=True, kw_only=True)
-class RenderOptions(RecipeOptions, ImageOptions):
-    """Rendering."""
-
-    bit_depth: Literal[8, 16] = 8
-    """Bits per colour channel."""
 
 
 @RenderOptions.shown

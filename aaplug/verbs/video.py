@@ -1,10 +1,9 @@
 """A video of a scene along a camera path, one recipe or two side by side."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -21,12 +20,13 @@ from aaplug.evaluation.report.contact_sheet import labelled, magnified
 from aaplug.io.atomic import claimed
 from aaplug.io.cameras import select_views
 from aaplug.io.cameras.camera_path import read_camera_path
-from aaplug.io.video import MOST_FPS, check_video
+from aaplug.io.video import check_video
+from aaplug.options.objects import AnyPath
+from aaplug.options.video import VideoOptions
 from aaplug.rendering.videos import make_video
 from aaplug.verbs.announce import announce
 from aaplug.verbs.assumed import say_assumed
 from aaplug.verbs.inputs import (
-    AnyPath,
     CamerasLike,
     SceneLike,
     drawn_by,
@@ -37,7 +37,6 @@ from aaplug.verbs.inputs import (
     scheduled,
     whole_of,
 )
-from aaplug.verbs.options import RECIPE_NAMES, SCALE, UNSET, ImageOptions, RecipeOptions, choice, number
 from aaplug.verbs.views import resized
 
 FPS = 30.0  # frames per second, where neither the caller nor a path file says
@@ -52,26 +51,6 @@ class Clip(NamedTuple):
     file: Path
     frames: int
     fps: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class VideoOptions(RecipeOptions, ImageOptions):
-    """Rendering, and the camera path."""
-
-    scale: Annotated[float | None, SCALE, UNSET] = None
-    """Size relative to the training size, or to that of a path file (default: 1)."""
-    path: Annotated[AnyPath, choice(["zoom", "dolly", "orbit", "FILE.json"])] = "zoom"
-    """zoom (focal length), dolly (distance) or orbit from the first of --views, or nerfstudio's camera_path.json."""
-    beside: Annotated[str | None, choice(["none", *RECIPE_NAMES, "..."])] = "classic"
-    """Recipe to show on the left; none shows --recipe alone."""
-    start: Annotated[float, SCALE] = 1.0
-    """Sampling rate at the start of a zoom or dolly, relative to training."""
-    end: Annotated[float, SCALE] = 0.125
-    """Sampling rate where it turns back."""
-    seconds: Annotated[float, number(0.01, 3600)] = 6.0
-    """Length in seconds of a zoom, dolly or orbit."""
-    fps: Annotated[float | None, number(0.1, MOST_FPS), UNSET] = None
-    """Frames per second (default: the path file's, or 30)."""
 
 
 @VideoOptions.shown

@@ -4,34 +4,23 @@ import threading
 import webbrowser
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from importlib.resources import as_file, files
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 from aaplug.core.errors import UsageError
 from aaplug.core.monitor import SILENT, Monitor
 from aaplug.io.scenes import called
 from aaplug.io.scenes.scene_file import SceneFile
+from aaplug.methods.recipes import RECIPES
+from aaplug.options.shared import RECIPE_NAMES
+from aaplug.options.view import LiveOptions
 from aaplug.verbs.assumed import say_assumed
 from aaplug.verbs.inputs import CamerasLike, SceneLike, file_of, opened_and_seen, processor, shown_of, unchecked_look_of
-from aaplug.verbs.options import RECIPE_NAMES, ViewOptions, flag, number
 
 FRAMES = 100  # that are drawn at least; not so many that kernels are compiled first
 SAMPLE = "chair.ply"
-
-
-@dataclass(frozen=True, kw_only=True)
-class LiveOptions(ViewOptions):
-    """The page, and how the scene is drawn."""
-
-    host: Annotated[str, flag("ADDRESS")] = "127.0.0.1"
-    """Address to listen on; any but this machine's own asks for the token in the printed address."""
-    port: Annotated[int, number(0, 65_535, whole=True)] = 8080
-    """Port to listen on; 0 takes any free one."""
-    no_browser: bool = False
-    """Print the address, and open no browser."""
 
 
 @contextmanager
@@ -63,7 +52,8 @@ def serving(
         say_assumed(cameras, monitor)
         file = file_of(opened)
         title = "the bundled sample" if scene is None else "scene" if file is None else called(file)
-        subject = Subject(held, cameras, look, RECIPE_NAMES, title, words or (str(file or title),))
+        recipes = [name for name in RECIPE_NAMES if name in RECIPES]  # without plug-ins that cannot be used
+        subject = Subject(held, cameras, look, recipes, title, words or (str(file or title),))
         with Studio(subject) as studio, Server(studio, o.host, o.port) as server:
             yield server.address
 

@@ -5,10 +5,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from aaplug.core.cameras import Camera
-from aaplug.core.errors import SHOWN, OutputError, UsageError
+from aaplug.core.errors import OutputError, UsageError
 from aaplug.io.atomic import check_output, refuse_existing
+from aaplug.options.shared import check_side, size_of
 
-MAX_SIDE = 16384  # px
 IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".exr", ".bmp", ".gif")  # any other name is a folder
 LONGEST_NAME = 200  # bytes; file systems take 255, and a number and a suffix are added
 
@@ -30,22 +30,8 @@ def resized(
     else:
         sized = [view.scaled(1.0 if scale is None else scale) for view in views]
     for view in sized:
-        _check_side(view.name, view.width, view.height)
+        check_side(view.name, view.width, view.height)
     return sized
-
-
-def size_of(text: str, where: str = "resolution") -> tuple[int, int]:
-    """Width and height of "400x300", in px; `where` is the option that it is of.
-
-    Raises:
-        UsageError: it is no size, or a side is above `MAX_SIDE`.
-    """
-    match = re.fullmatch(r"([1-9]\d{0,8})x([1-9]\d{0,8})", text, re.ASCII)
-    if match is None:
-        raise UsageError(where, f"takes sizes such as 400x400, got {text[:SHOWN]}")
-    width, height = int(match[1]), int(match[2])
-    _check_side(where, width, height)
-    return width, height
 
 
 def names_image(output: Path) -> bool:
@@ -92,8 +78,3 @@ def _size(text: str, view: Camera) -> tuple[int, int]:
 def _cut(slug: str) -> str:
     """The name, cut to what every file system takes."""
     return slug.encode()[:LONGEST_NAME].decode(errors="ignore")
-
-
-def _check_side(where: str, width: int, height: int) -> None:
-    if max(width, height) > MAX_SIDE:
-        raise UsageError(where, f"would be {width}x{height} px; the limit is {MAX_SIDE} a side")

@@ -15,7 +15,7 @@ from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
 import aaplug
-from aaplug.verbs.options import Options
+from aaplug.options.base import Options
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]

@@ -15,6 +15,7 @@ import torch
 
 from aaplug.core.camera_paths import moved, zoomed
 from aaplug.core.cameras import BLACK, WHITE, Camera
+from aaplug.core.choices import RateReference
 from aaplug.core.imaging import quantised
 from aaplug.core.interfaces import Rasterizer
 from aaplug.core.training import TrainingViews
@@ -22,7 +23,6 @@ from aaplug.evaluation.metrics import psnr
 from aaplug.evaluation.protocols import median_depth
 from aaplug.io.cameras import read_cameras
 from aaplug.io.scenes import read_scene
-from aaplug.methods.filters import RateReference
 from aaplug.methods.recipe import Recipe
 from aaplug.methods.recipes import find_recipe
 from aaplug.rasterizers import find_rasterizer

@@ -17,6 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.cameras import Camera
+from aaplug.core.choices import QUALITIES
 from aaplug.core.imaging import over, quantised
 from aaplug.core.interfaces import Colour, Rasterizer, ScreenFilter
 from aaplug.core.splats import Render, Splats2D
@@ -29,7 +30,7 @@ from aaplug.evaluation.truth import Truth, ViewTruth, own_look
 from aaplug.io.cameras import read_cameras
 from aaplug.io.scenes import read_scene
 from aaplug.methods.recipe import Recipe
-from aaplug.methods.recipes import QUALITIES, find_recipe
+from aaplug.methods.recipes import find_recipe
 from aaplug.rendering.renderer import Renderer
 from tests.bench.away import Scene, on_each
 from tests.conftest import SHARED_DATA

@@ -14,13 +14,14 @@ from os import PathLike
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
+from aaplug.core.choices import SpzAxes
 from aaplug.core.errors import FormatError, OutputError, UsageError
 from aaplug.core.gaussians import Convention, Gaussians
 from aaplug.core.registry import Registry, named
 from aaplug.io.atomic import check_output
 from aaplug.io.scenes import compressed_ply, ksplat, ply, pt, sog, splat, spz
 from aaplug.io.scenes.manifests import is_pyramid, path_of, read_manifest
-from aaplug.io.scenes.options import Options, SpzAxes
+from aaplug.io.scenes.options import Options
 from aaplug.io.scenes.scene_file import SceneFile
 from aaplug.io.values import read_start
 

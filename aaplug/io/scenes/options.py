@@ -1,11 +1,10 @@
 """Options for reading and writing scene files; each format uses those that concern it."""
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import get_args
 
+from aaplug.core.choices import SpzAxes
 from aaplug.core.errors import UsageError
-
-SpzAxes = Literal["auto", "opengl", "opencv"]
 
 
 @dataclass(frozen=True)

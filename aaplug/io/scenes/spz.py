@@ -26,12 +26,13 @@ import zstandard
 from jaxtyping import Float
 from torch import Tensor
 
+from aaplug.core.choices import SpzAxes
 from aaplug.core.errors import FormatError, OutputError
 from aaplug.core.gaussians import CLASSIC, Gaussians
 from aaplug.core.locks import scratch
 from aaplug.io.atomic import replacing
 from aaplug.io.limits import whole_limit
-from aaplug.io.scenes.options import Options, SpzAxes
+from aaplug.io.scenes.options import Options
 from aaplug.io.scenes.packed import byte_opacities, check_growth, floats, half_turn_about_x, largest_last
 from aaplug.io.scenes.scene_file import COMPENSATED, KERNEL_LOST, SceneFile, check_count, library_errors
 

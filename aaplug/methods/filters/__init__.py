@@ -7,7 +7,7 @@ from aaplug.methods.filters.adaptive import ADAPTIVE_VARIANCE, Adaptive
 from aaplug.methods.filters.dilation import Dilation
 from aaplug.methods.filters.energy import MATCHED_VARIANCE, MatchedEnergy
 from aaplug.methods.filters.low_pass import LowPass
-from aaplug.methods.filters.matched import PIXEL_VARIANCE, Matched, RateReference
+from aaplug.methods.filters.matched import PIXEL_VARIANCE, Matched
 from aaplug.methods.filters.pixel_size import ByPixelSize
 from aaplug.methods.filters.smoothing import (
     NYQUIST_VARIANCE,

@@ -14,13 +14,14 @@ Design and measurements are aaplug's own.  Step one with one global rate is SA-G
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple, cast, get_args
+from typing import NamedTuple, cast, get_args
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from aaplug.core.cameras import Camera
+from aaplug.core.choices import RateReference
 from aaplug.core.errors import UsageError, not_one_of
 from aaplug.core.splats import Splats2D
 from aaplug.core.training import TrainingViews
@@ -31,8 +32,6 @@ PIXEL_VARIANCE = 0.07
 
 MAX_RISE = 1.2  # largest factor by which "pose" raises the reference of a coarser view (examples/guides/methods.md)
 FULL_RISE_AT = 1 / 4  # relative rate at which the factor reaches MAX_RISE, at a pose of the data set
-
-RateReference = Literal["pose", "global", "sharpest", "interval"]
 
 
 @dataclass(frozen=True)

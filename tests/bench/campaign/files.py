@@ -18,7 +18,7 @@ from aaplug.finetuning.state import begin, load, save
 from aaplug.io.batch_file import read_batch
 from aaplug.io.cameras import read_cameras
 from aaplug.io.images import read_image, read_rgba
-from aaplug.verbs.options import did_you_mean  # noqa: F401  (imports the verbs before the children are forked)
+from aaplug.verbs.inputs import inputs_of  # noqa: F401  (imports the verbs before the children are forked)
 from tests.hostile import NAMES, Target, check, mutations, scene
 from tests.test_batch import SETTINGS
 from tests.test_cameras_io import EXPORTED, FIXTURES, write_json

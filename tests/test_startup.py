@@ -1,0 +1,109 @@
+"""Help, and mistakes on the command line, are answered before torch is imported."""
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from typing import get_args
+
+import pytest
+from aaplug_cli.main import VERBS
+from aaplug_cli.options import FileOptions
+
+from aaplug.core import choices
+from aaplug.core.errors import UsageError
+from aaplug.core.gaussians import CONVENTIONS
+from aaplug.core.registry import KINDS, Registry, names_of
+from aaplug.evaluation.metrics import METRICS
+from aaplug.evaluation.protocols import PROTOCOLS
+from aaplug.finetuning.losses import LOSSES
+from aaplug.finetuning.parameters import RATES
+from aaplug.finetuning.settings import METHODS, OURS
+from aaplug.methods.recipes import RECIPES
+from aaplug.methods.viewers import FORMS, VIEWERS
+from aaplug.options.finetune import FinetuneOptions
+from aaplug.options.render import RenderOptions
+from aaplug.rasterizers import RASTERIZERS
+from aaplug.verbs.finetune import _settings
+from tests.test_options import REFUSED
+
+REGISTRIES = (RECIPES, RASTERIZERS, METRICS, PROTOCOLS, METHODS, FORMS, VIEWERS)
+SLOW = ["torch", "numpy", "cv2", "jaxtyping", "beartype", "scipy", "skimage", "matplotlib", "PIL", "av"]
+PROGRAM = """
+import json, sys
+from aaplug_cli.main import main
+words, slow = json.loads(sys.argv[1])
+found = []
+for each in words:
+    try:
+        main(each.split())
+    except SystemExit as stop:
+        found.append([each, stop.code or 0, [name for name in slow if name in sys.modules]])
+print(json.dumps(found))
+"""
+HELPS = ["--version", "--help", *(f"{verb} --help" for verb in VERBS)]
+MISTAKES = [
+    *("", "flyy", *REFUSED),
+    *("render -o out", "video -o v.webm", "convert -o c.ply", "lod -o l.ply", "finetune -o t.ply", "evaluate"),
+    *("info", "compare", "compare one.ply", "gather"),
+    *("render s.ply -o out --recipe mipp", "render s.ply -o out --quality good", "video s.ply -o v.webm --beside mipp"),
+    *("evaluate s.ply --recipe mip mipp", "evaluate s.ply --protocol blend", "evaluate s.ply --rasterizer fast"),
+    *("render s.ply -o out --rate-reference pos", "render s.ply -o out --convention clasic"),
+    *("convert s.ply -o c.ply --for web", "convert s.ply -o c.ply --form web"),
+    *("finetune s.ply -o t.ply --for web", "finetune s.ply -o t.ply --loss l3", "finetune s.ply -o t.ply --method m"),
+    *("compare a.ply b.ply --for web", "compare a.ply b.ply --for spark --recipe mip", "lod s.ply -o l --scale 0.5"),
+    *("render s.ply -o out --orbit 2 --eye 1 2 3", "bench --rasterizer fast"),
+]
+
+
+def answered(words: list[str]) -> list[tuple[str, int, list[str]]]:
+    """Each command's words and exit code, and the slow packages that were imported by its end."""
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM, json.dumps([words, SLOW])], capture_output=True, text=True, check=True
+    )
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def test_help_imports_nothing_slow():
+    assert answered(HELPS) == [[words, 0, []] for words in HELPS]
+
+
+def test_mistakes_import_nothing_slow():
+    assert answered(MISTAKES) == [[words, 2, []] for words in MISTAKES]
+
+
+@pytest.mark.parametrize("registry", REGISTRIES, ids=lambda registry: registry.kind)
+def test_names_are_known_before_what_they_name(registry):
+    assert names_of(registry.kind) == list(registry)
+
+
+def test_each_kind_that_options_choose_from_is_compared():
+    assert {registry.kind for registry in REGISTRIES} == choices.NAMES.keys() < set(KINDS)
+
+
+def test_a_registry_with_other_names_is_a_mistake_of_ours():
+    with pytest.raises(AssertionError, match="other names of a form"):
+        Registry("form", {"matched-energy": object()})
+
+
+def test_other_names_agree_with_what_they_name():
+    assert tuple(CONVENTIONS) == get_args(choices.ConventionName)
+    assert tuple(LOSSES) == get_args(choices.LossName)
+    assert tuple(RATES) == choices.PARAMETERS
+    assert _settings(FinetuneOptions()) == OURS
+
+
+def test_a_recipe_that_python_registers_can_be_named(monkeypatch):
+    with pytest.raises(UsageError, match="recipe: 'mine' is not one of auto"):
+        RenderOptions(recipe="mine")
+    monkeypatch.setattr(RECIPES, "_entries", dict(RECIPES))
+    monkeypatch.setattr("aaplug.core.registry._registered", {kind: [] for kind in KINDS})
+    RECIPES.register("mine", replace(RECIPES["mip"], name="mine"))
+    assert RenderOptions(recipe="mine").recipe == "mine"
+
+
+def test_a_misspelled_name_is_refused_with_the_nearest():
+    with pytest.raises(UsageError, match=r"recipe: 'mipp' is not one of .* \(did you mean 'mip'\?\)"):
+        RenderOptions(recipe="mipp")
+    with pytest.raises(UsageError, match="convention: 'x' is not one of classic, antialiased"):
+        FileOptions(convention="x")
