@@ -120,16 +120,25 @@ def check_frame(
     """Share of Gaussians that any camera sees, on an even sample of the scene.
 
     Raises:
+        FrameError: see `check_seen`.
+    """
+    sample = means[:: max(1, len(means) // FRAME_CHECK_GAUSSIANS)]
+    return check_seen(sampling_bounds(sample, cameras).seen, len(cameras), scene_name, min_share)
+
+
+def check_seen(seen: Bool[Tensor, " n"], cameras: int, scene_name: str, min_share: float) -> float:
+    """Share of Gaussians that any camera sees; 1 if there are none.
+
+    cameras: their number.
+
+    Raises:
         FrameError: the share is below `min_share`: scene and cameras are probably in different frames.
     """
-    if len(means) == 0:
-        return 1.0
-    sample = means[:: max(1, len(means) // FRAME_CHECK_GAUSSIANS)]
-    share = sampling_bounds(sample, cameras).seen.double().mean().item()
+    share = seen.double().mean().item() if len(seen) else 1.0
     if share < min_share:
         raise FrameError(
             scene_name,
-            f"only {share:.1%} of its Gaussians are seen by any of the {len(cameras)} cameras (expected at least "
+            f"only {share:.1%} of its Gaussians are seen by any of the {cameras} cameras (expected at least "
             f"{min_share:.0%}): scene and cameras are in different frames. nerfstudio scenes need the transform of "
             "dataparser_transforms.json, gsplat scenes were normalised unless trained with normalize_world_space "
             "off; if the cameras are right nevertheless, lower `min_seen`",

@@ -7,7 +7,7 @@ from statistics import median
 
 from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.gaussians import Convention, Gaussians
-from aaplug.core.sampling import SamplingBounds, check_frame, sampling_bounds
+from aaplug.core.sampling import SamplingBounds, check_seen, sampling_bounds
 
 
 @dataclass(frozen=True)
@@ -44,9 +44,10 @@ class TrainingViews:
             UsageError: there are no cameras.
         """
         views = cameras.train if isinstance(cameras, CameraSet) else tuple(cameras)
+        bounds = sampling_bounds(scene.means, views)
         if min_seen > 0 and not (isinstance(cameras, CameraSet) and cameras.assumed):
-            check_frame(scene.means, views, scene.name, min_seen)
-        return cls(scene.convention, views, sampling_bounds(scene.means, views), cull_margin)
+            check_seen(bounds.seen, len(views), scene.name, min_seen)
+        return cls(scene.convention, views, bounds, cull_margin)
 
     def relative_rate(self, camera: Camera) -> float:
         """A view's focal length over training's: 1 at the training size, 1/2 at half of it.  Depth plays no part.
