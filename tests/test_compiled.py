@@ -211,7 +211,7 @@ def test_one_row_is_left_to_the_eager_function():
 @pytest.mark.parametrize(("tiles", "threads"), [(4, 1), (5, 2)])
 def test_few_tiles_are_left_to_one_thread(tiles, threads):
     kernel = Kernel("few", lambda x: (x,), lambda: (torch.ones(9),), ("t",), alone=4)
-    package = Package(lambda args: [args[0].new_tensor(torch.get_num_threads())], [(torch.float32, [])])
+    package = Package(lambda args: [args[0].new_tensor(torch.get_num_threads())], [(torch.float32, torch.Size())])
     with torch_threads(2):
         (found,) = CompiledKernels({"few": package}).run(kernel, torch.ones(tiles))
         assert torch.get_num_threads() == 2

@@ -119,9 +119,9 @@ def _composite_block(
 
 
 def places(at: Int[Tensor, " t"], ahead: int, ends: Int[Tensor, " t"], bins: Bins) -> Int[Tensor, " t"]:
-    """Where each tile's splats from `ahead` on stand; without any left, padding does."""
+    """Where each tile's splats from `ahead` on stand; of the FEWEST tiles one may have none left and gets padding."""
     here = at + ahead
-    return torch.where(here < ends, here, bins.padding)
+    return here if len(at) > FEWEST else torch.where(here < ends, here, bins.padding)
 
 
 def _going(counts: Int[Tensor, " t"], at_once: int) -> list[int]:

@@ -18,18 +18,18 @@ class Package:
     """A kernel compiled for CPU arguments of these types, and of these shapes after the leading size."""
 
     run: Callable[[list[Tensor]], list[Tensor]]
-    types: list[tuple[torch.dtype, list[int]]]
+    types: list[tuple[torch.dtype, torch.Size]]
 
     @staticmethod
     def of(run: Callable[[list[Tensor]], list[Tensor]], example: tuple[Tensor, ...]) -> "Package":
         """The package that was compiled for an example."""
-        return Package(run, [(arg.dtype, list(arg.shape[1:])) for arg in example])
+        return Package(run, [(arg.dtype, arg.shape[1:]) for arg in example])
 
     def takes(self, args: tuple[Tensor, ...]) -> bool:
         """Whether it can run these arguments; a leading size of one is a separate case to the compiler."""
         for arg, (dtype, rest) in zip(args, self.types, strict=True):
-            leading, *found = arg.shape
-            if arg.dtype is not dtype or found != rest or leading < 2 or not arg.is_cpu:
+            shape = arg.shape
+            if arg.dtype is not dtype or shape[1:] != rest or shape[0] < 2 or not arg.is_cpu:
                 return False
         return True
 
