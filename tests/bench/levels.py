@@ -63,7 +63,8 @@ class Bench:
 
     def __init__(self, name: str, opened: Opened, rasterizer: Rasterizer):
         self.name = name
-        self.scene, self.cameras, self.how = opened
+        self.scene, self.cameras, how = opened
+        self.how = how
         self.training = TrainingViews.of(self.scene, self.cameras, how.cull_margin)
         self.look = own_look(self.scene, self.training, rasterizer, how.background)
         self.views = self.cameras.test[:: -(-len(self.cameras.test) // VIEWS)]
@@ -119,15 +120,15 @@ def psnr(shown: Renderer, truths: Sequence[ViewTruth], scale: float) -> float:
 
 
 @torch.no_grad()
-def milliseconds(*draws: Callable[[], object]) -> list[float]:
-    """Medians of several runs in turn, after one of each that does not count."""
+def milliseconds(*draws: Callable[[], object], clock: Callable[[], float] = time.perf_counter) -> list[float]:
+    """Medians of several runs in turn, after one of each that does not count; clock: in seconds."""
     times: list[list[float]] = []
     for _ in range(1 + REPEATS):
         times.append([])
         for draw in draws:
-            started = time.perf_counter()
+            started = clock()
             draw()
-            times[-1].append(1e3 * (time.perf_counter() - started))
+            times[-1].append(1e3 * (clock() - started))
     return [statistics.median(own) for own in zip(*times[1:], strict=True)]
 
 
@@ -178,23 +179,25 @@ def million(bench: Bench) -> None:
             "merged": bench.built(f"{bench.name}-merged", refine=False),
             "tuned": bench.built(f"{bench.name}-lod"),
         }
-    print("\n| | size | own look | ms | of the scene's | Gaussians in view | samples |\n" + "|---" * 7 + "|")
+    print(
+        "\n| | size | own look | ms of processor | of the scene's | Gaussians in view | samples along a pixel |\n"
+        + "|---" * 7
+        + "|"
+    )
     for quality in ("fast", "balanced"):
         shown = {"the scene": bench.shown(bench.scene, "auto", quality)}
         shown |= {f"levels, {how}": bench.shown(pyramid, "auto", quality) for how, pyramid in pyramids.items()}
         for scale in SCALES[1:]:
             view = bench.views[0].scaled(scale)
-            times = milliseconds(*(partial(renderer, view) for renderer in shown.values()))
+            times = milliseconds(*(partial(renderer, view) for renderer in shown.values()), clock=time.process_time)
             for (name, renderer), took in zip(shown.items(), times, strict=True):
-                seen = psnr(renderer, bench.own, scale), round(took), took / times[0]
-                side = renderer.samples(view)
-                row(
-                    f"{name}, {quality}",
-                    f"1/{1 / scale:g}",
-                    *seen,
+                cells = (
+                    psnr(renderer, bench.own, scale),
+                    round(took),
+                    took / times[0],
                     f"{bench.drawn(renderer, scale):,}",
-                    f"{side}x{side}",
                 )
+                row(f"{name}, {quality}", f"1/{1 / scale:g}", *cells, renderer.samples(view))
 
 
 @torch.no_grad()

@@ -1,13 +1,12 @@
 """Scenes of a million Gaussians, with cameras: one of noise, and one split from a trained scene."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 
 import torch
 
-from aaplug.core.camera_paths import orbit
-from aaplug.core.cameras import BLACK, Camera, CameraSet
+from aaplug.core.cameras import BLACK, Camera, CameraSet, look_at
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.projection import rotation_matrices
 from aaplug.io.cameras import read_cameras
@@ -20,8 +19,9 @@ from tests.conftest import SHARED_DATA
 
 COUNT = 1_000_000
 TRAINED = 800  # px: side of the synthetic scene's training images
-POSES, TESTS = 24, 5  # training poses on a ring around the synthetic scene, and test poses between them
-BETWEEN = 0.31  # of the step from one test pose to the next: none is a training pose
+RINGS, POSES = (8.0, 16.0, 26.0, 40.0), 25  # degrees above the horizon, and training poses at each
+TEST_RING, TESTS = 20.0, 5
+BETWEEN = 0.31  # of the step from one test pose to the next
 PARTS = 20  # Gaussians that each of a trained scene is split into
 PART = 0.25  # of a Gaussian's covariance that each part has; the spread of their means has the rest
 UP = (0.0, 0.0, 1.0)
@@ -70,18 +70,23 @@ def finely(name: str) -> Opened:
 def noise() -> Opened:
     """The synthetic scene, whose neighbours have colours at random, and cameras around it."""
     camera = synthetic_camera(TRAINED, TRAINED)
-    return (
-        synthetic_scene(COUNT),
-        CameraSet(_ring(camera, POSES), _ring(camera, TESTS, BETWEEN)),
-        Scene("", background=BLACK),
-    )
+    train = [view for ring, degrees in enumerate(RINGS) for view in _ring(camera, degrees, POSES, ring / len(RINGS))]
+    test = _ring(camera, TEST_RING, TESTS, BETWEEN)
+    return synthetic_scene(COUNT), CameraSet(tuple(train), tuple(test)), Scene("", background=BLACK)
 
 
-def _ring(camera: Camera, count: int, start: float = 0.0) -> tuple[Camera, ...]:
-    """Poses of a data set around the vertical axis through the scene's middle."""
-    depth, up = float(camera.centre.norm()), torch.tensor(UP, dtype=torch.float64)
-    turned = (orbit(camera, (start + i) / count, depth, up) for i in range(count))
-    return tuple(replace(view, name=f"{start:g} {i}").as_trained() for i, view in enumerate(turned))
+def _ring(camera: Camera, degrees: float, count: int, start: float) -> Iterator[Camera]:
+    """Poses of a data set around the scene's middle, as far from it as the camera.
+
+    degrees: above the horizon.  start: of the step from one to the next.
+    """
+    elevation, up = math.radians(degrees), torch.tensor(UP)
+    for i in range(count):
+        turn = math.tau * (start + i) / count
+        flat = math.cos(elevation) * math.cos(turn), math.cos(elevation) * math.sin(turn)
+        eye = float(camera.centre.norm()) * torch.tensor([*flat, math.sin(elevation)])
+        pose = look_at(*(place.double() for place in (eye, torch.zeros(3), up)))
+        yield replace(camera, name=f"{degrees:g} degrees {i}", cam_from_world=pose).as_trained()
 
 
 MILLIONS: Mapping[str, Callable[[], Opened]] = {
