@@ -39,6 +39,7 @@ class Recipe:
     takes_quality: `target_rate` is set by the user's choice of quality.
     levels_grid: most samples along a pixel's side where the scene has levels of detail; 0 draws the finest level alone.
     levels_budget: Gaussians up to which a view takes as many samples as without levels, of finer ones.
+    levels_share: of the scene's Gaussians, up to which it does so too.
     for_discs: name of the recipe that takes its place for scenes of 2D Gaussians.
     """
 
@@ -56,6 +57,7 @@ class Recipe:
     takes_quality: bool = False
     levels_grid: int = 0
     levels_budget: int = 0
+    levels_share: float = 0.0
     for_discs: str | None = None
     promises: Promises = Promises()
 

@@ -12,10 +12,10 @@ from aaplug.methods.pixel_kernels import SURFEL
 from aaplug.methods.recipe import Promises, Recipe
 from aaplug.methods.research_recipes import RESEARCH_RECIPES
 
-# Where there are levels of detail, one is picked for the samples' rate: most samples along a pixel's side, and the
-# number of Gaussians up to which more samples, of finer levels, are taken as without levels (some 20 ms on two cores).
-# The best quality draws the finest level alone.
-LEVELS = {"fast": (1, 0), "balanced": (2, 100_000), "best": (0, 0)}
+# Where there are levels of detail, one is picked for the samples' rate: most samples along a pixel's side; and up to
+# which number of Gaussians (some 20 ms on two cores) or share of the scene's (a third of the time without levels) more
+# samples, of finer levels, are taken as without levels.  The best quality draws the finest level alone.
+LEVELS = {"fast": (1, 0, 0.0), "balanced": (2, 100_000, 0.27), "best": (0, 0, 0.0)}
 
 # Of a sample, the weight of those beside it where samples are few: it takes the noise off what compositing could not
 # resolve.  0.02 to 0.04 are best against the scenes' own look (examples/guides/methods.md).
@@ -32,6 +32,7 @@ USER_RECIPES = (
         takes_quality=True,
         levels_grid=LEVELS["balanced"][0],
         levels_budget=LEVELS["balanced"][1],
+        levels_share=LEVELS["balanced"][2],
         for_discs="2dgs-matched",
         promises=Promises(equals_training=True),
     ),
@@ -112,8 +113,9 @@ def find_recipe(
             raise UsageError("rate_reference", f"recipe '{name}' compares no sampling rates")
         recipe = replace(recipe, screen=recipe.screen.with_reference(rate_reference))
     if recipe.takes_quality:
-        grid, budget = LEVELS[quality]
-        recipe = replace(recipe, target_rate=QUALITIES[quality], levels_grid=grid, levels_budget=budget)
+        grid, budget, share = LEVELS[quality]
+        levels = {"levels_grid": grid, "levels_budget": budget, "levels_share": share}
+        recipe = replace(recipe, target_rate=QUALITIES[quality], **levels)
     return recipe if target_rate is None else replace(recipe, target_rate=target_rate)
 
 

@@ -146,8 +146,9 @@ class Renderer:
         if self.cutter is None:
             return asked
         least = min(asked, self.recipe.levels_grid)
-        finer = range(asked, least, -1) if self.recipe.levels_budget else ()
-        cheap = (n for n in finer if self.cutter.count(_sampled(camera, n)) <= self.recipe.levels_budget)
+        most = max(self.recipe.levels_budget, self.recipe.levels_share * self.cutter.pyramid.sizes[0])
+        finer = range(asked, least, -1) if most else ()
+        cheap = (n for n in finer if self.cutter.count(_sampled(camera, n)) <= most)
         return next(cheap, least)
 
     def neighbours(self, camera: Camera) -> float:

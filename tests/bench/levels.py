@@ -1,9 +1,10 @@
-"""Levels of detail, measured: python -m tests.bench.levels [SCENE ...], of chair and snowmiku, or cost.
+"""Levels of detail, measured: python -m tests.bench.levels [SCENE ...], of those below, or cost.
 
 For a scene it prints lighter scenes beside splat-transform's `--decimate`; then a pyramid, kept in a folder of the
 working directory, at sizes from 1/2 to 1/32, with and without levels: PSNR in dB, SSIM and flicker against the scene's
 own look, PSNR against photographs, median milliseconds, Gaussians projected and evaluations of a splat in a pixel; then
-a dolly, also as a video.  For cost: time against Gaussians and pixels on synthetic scenes.
+a dolly, also as a video.  For a scene of `MILLIONS`: what levels lose by the own look and what they save of the time,
+merged alone and tuned.  For cost: time against Gaussians and pixels on synthetic scenes.
 """
 
 import statistics
@@ -11,6 +12,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from typing import Literal
 
@@ -26,8 +28,6 @@ from aaplug.evaluation.metrics import PSNR
 from aaplug.evaluation.protocols import median_depth
 from aaplug.evaluation.results import Report, mean
 from aaplug.evaluation.truth import Truth, ViewTruth, own_look
-from aaplug.io.cameras import read_cameras
-from aaplug.io.scenes import read_scene
 from aaplug.io.video import write_video
 from aaplug.levels.pyramids import pyramid_of, read_pyramid
 from aaplug.methods.recipes import find_recipe
@@ -36,8 +36,8 @@ from aaplug.rendering.benchmark import exponent, synthetic_camera, synthetic_sce
 from aaplug.rendering.renderer import Renderer
 from aaplug.verbs.evaluate import evaluate
 from aaplug.verbs.lod import lod
-from tests.bench.away import SCENES, Scene, decibels
-from tests.conftest import SHARED_DATA
+from tests.bench.away import decibels
+from tests.bench.millions import MILLIONS, TRAINED, Opened, trained
 
 VIEWS = 5
 SCALES = (1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 32)
@@ -56,16 +56,15 @@ FPS = 20.0
 COUNTS = (100_000, 1_000_000, 3_000_000)  # Gaussians of the synthetic scenes
 SIZES = ((100, 75), (400, 300), (800, 600), (1600, 1200))
 BELOW = 0.5  # px: levels of the synthetic scenes are merged to be fast
-TRAINED = 800  # px: side of the synthetic scenes' training image
 
 
 class Bench:
     """A scene, its look, and what test views should show."""
 
-    def __init__(self, name: str, how: Scene, rasterizer: Rasterizer):
-        self.name, self.how = name, how
-        self.scene = read_scene(SHARED_DATA / how.file)
-        self.cameras = read_cameras((SHARED_DATA / how.file).parent, train_scale=how.scale)
+    def __init__(self, name: str, opened: Opened, rasterizer: Rasterizer):
+        self.name = name
+        self.scene, self.cameras, how = opened
+        self.how = how
         self.training = TrainingViews.of(self.scene, self.cameras, how.cull_margin)
         self.look = own_look(self.scene, self.training, rasterizer, how.background)
         self.views = self.cameras.test[:: -(-len(self.cameras.test) // VIEWS)]
@@ -88,6 +87,21 @@ class Bench:
             **{"background": self.look.background, "cull_margin": self.how.cull_margin},
         )
 
+    def built(self, folder: str, refine: bool = True) -> Pyramid:
+        """Levels in a folder of the working directory; those that are there are kept."""
+        how = {"cull_margin": self.how.cull_margin, "background": self.look.background, "refine": refine}
+        started = time.perf_counter()
+        lod(self.scene, self.cameras, folder, levels=LEVELS, resume=True, **how)
+        print(f"\n{folder}: built or found in {time.perf_counter() - started:.0f} s")
+        pyramid = read_pyramid(folder)
+        print(f"levels: {', '.join(f'{size:,}' for size in pyramid.sizes)} Gaussians in {pyramid.count} chunks")
+        return pyramid
+
+    def drawn(self, shown: Renderer, scale: float) -> int:
+        """Gaussians that a view at a scale projects."""
+        fine = shown.sampled(self.views[0].scaled(scale))[0]
+        return len(shown.scene) if shown.cutter is None else shown.cutter.count(fine)
+
     def light(self, share: float, scale: float, refine: bool) -> Gaussians:
         """A lighter scene."""
         how = {"cull_margin": self.how.cull_margin, "background": self.look.background}
@@ -106,15 +120,16 @@ def psnr(shown: Renderer, truths: Sequence[ViewTruth], scale: float) -> float:
 
 
 @torch.no_grad()
-def milliseconds(draw: Callable[[], object]) -> float:
-    """Median of several runs after one that does not count."""
-    draw()
-    times = []
-    for _ in range(REPEATS):
-        started = time.perf_counter()
-        draw()
-        times.append(1e3 * (time.perf_counter() - started))
-    return statistics.median(times)
+def milliseconds(*draws: Callable[[], object], clock: Callable[[], float] = time.perf_counter) -> list[float]:
+    """Medians of several runs in turn, after one of each that does not count; clock: in seconds."""
+    times: list[list[float]] = []
+    for _ in range(1 + REPEATS):
+        times.append([])
+        for draw in draws:
+            started = clock()
+            draw()
+            times[-1].append(1e3 * (clock() - started))
+    return [statistics.median(own) for own in zip(*times[1:], strict=True)]
 
 
 def row(*cells: object) -> None:
@@ -137,27 +152,52 @@ def lighter(bench: Bench) -> None:
 
 def levels(bench: Bench) -> Pyramid:
     """A pyramid against the scene."""
-    folder = f"{bench.name}-lod"
-    how = {"cull_margin": bench.how.cull_margin, "background": bench.look.background}
-    started = time.perf_counter()
-    lod(bench.scene, bench.cameras, folder, levels=LEVELS, resume=True, **how)
-    print(f"\nbuilt or found in {time.perf_counter() - started:.0f} s")
-    pyramid = read_pyramid(folder)
-    print(f"levels: {', '.join(f'{size:,}' for size in pyramid.sizes)} Gaussians in {pyramid.count} chunks\n")
-    print("| | size | own look | SSIM | flicker | photographs | ms | Gaussians | evaluations, M |\n" + "|---" * 9 + "|")
+    pyramid = bench.built(f"{bench.name}-lod")
+    print(
+        "\n| | size | own look | SSIM | flicker | photographs | ms | Gaussians | evaluations, M |\n" + "|---" * 9 + "|"
+    )
     for quality in ("fast", "balanced", "best"):
         for name, scene in (("levels", pyramid), ("the scene", bench.scene)):
             shown = bench.shown(scene, "auto", quality)
             own, photographs = (bench.measured(scene, quality, truth) for truth in ("self", "photographs"))
             for scale in SCALES:
-                fine = shown.sampled(bench.views[0].scaled(scale))[0]
-                count = len(bench.scene) if shown.cutter is None else shown.cutter.count(fine)
+                count = bench.drawn(shown, scale)
                 views, real = own.select("auto", scale), mean(photographs.select("auto", scale), PSNR.name)
                 took = round(1e3 * statistics.median(view.seconds for view in views))
                 evaluations = statistics.mean(view.evaluations or 0 for view in views) / 1e6
                 seen = [metric.text(mean(views, metric.name)) for metric in own.metrics]
                 row(f"{name}, {quality}", f"1/{1 / scale:g}", *seen, real, took, f"{count:,}", evaluations)
     return pyramid
+
+
+@torch.no_grad()
+def million(bench: Bench) -> None:
+    """Levels that are merged alone and tuned ones against a scene of so many Gaussians that these decide the time."""
+    print(f"\n{bench.name}, {len(bench.scene):,} Gaussians\n")
+    with torch.enable_grad():
+        pyramids = {
+            "merged": bench.built(f"{bench.name}-merged", refine=False),
+            "tuned": bench.built(f"{bench.name}-lod"),
+        }
+    print(
+        "\n| | size | own look | ms of processor | of the scene's | Gaussians in view | samples along a pixel |\n"
+        + "|---" * 7
+        + "|"
+    )
+    for quality in ("fast", "balanced"):
+        shown = {"the scene": bench.shown(bench.scene, "auto", quality)}
+        shown |= {f"levels, {how}": bench.shown(pyramid, "auto", quality) for how, pyramid in pyramids.items()}
+        for scale in SCALES[1:]:
+            view = bench.views[0].scaled(scale)
+            times = milliseconds(*(partial(renderer, view) for renderer in shown.values()), clock=time.process_time)
+            for (name, renderer), took in zip(shown.items(), times, strict=True):
+                cells = (
+                    psnr(renderer, bench.own, scale),
+                    round(took),
+                    took / times[0],
+                    f"{bench.drawn(renderer, scale):,}",
+                )
+                row(f"{name}, {quality}", f"1/{1 / scale:g}", *cells, renderer.samples(view))
 
 
 @torch.no_grad()
@@ -203,7 +243,7 @@ def cost(rasterizer: Rasterizer) -> None:
         for width, height in SIZES:
             view = replace(camera.resized(width, width), height=height)
             view = replace(view, cy=height / 2)
-            took = [milliseconds(lambda r=renderer, v=view: r(v)) for renderer in (with_levels, without)]
+            took = milliseconds(partial(with_levels, view), partial(without, view))
             by_size.setdefault((width, height), []).append(took[0])
             assert with_levels.cutter is not None
             drawn, sizes = with_levels.cutter.count(view), ", ".join(f"{size:,}" for size in pyramid.sizes[1:])
@@ -220,10 +260,13 @@ def main(names: Sequence[str]) -> None:
         if name == "cost":
             cost(rasterizer)
             continue
-        bench = Bench(name, SCENES[name], rasterizer)
+        bench = Bench(name, MILLIONS[name]() if name in MILLIONS else trained(name), rasterizer)
+        if name in MILLIONS:
+            million(bench)
+            continue
         dolly(bench, levels(bench))
         lighter(bench)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:] or ("chair", "snowmiku", "cost"))
+    main(sys.argv[1:] or ("chair", "snowmiku", "million", "chair_million", "cost"))

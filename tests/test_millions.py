@@ -1,0 +1,51 @@
+"""Large scenes: what `balanced` draws of their levels, and how the bench splits a small scene into one."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from aaplug.core.cameras import CameraSet
+from aaplug.core.pyramids import Pyramid
+from aaplug.evaluation.metrics import psnr
+from aaplug.levels.covariances import covariances, outer
+from aaplug.rendering.renderer import Renderer
+from tests.bench.millions import PARTS, split
+from tests.conftest import make_camera, make_scene
+
+VIEWS = tuple(make_camera(eye, (64, 48)) for eye in ((0.0, -4.0, 0.0), (3.0, -2.0, 1.0)))
+CAMERAS = CameraSet(VIEWS, VIEWS)
+
+
+@pytest.mark.parametrize(
+    ("budget", "share", "expected"),
+    [(0, 0.0, 2), (50, 0.0, 4), (49, 0.0, 2), (0, 0.25, 4), (0, 0.24, 2), (50, 0.1, 4), (10, 0.25, 4)],
+)
+def test_balanced_takes_all_samples_while_its_levels_are_few_or_a_small_share(budget, share, expected):
+    """Of 200 Gaussians, level 1 has 50 and level 2 has 45; a view at 1/8 draws one of them."""
+    scenes = [make_scene(count) for count in (200, 50, 45)]
+    levels = Pyramid.of(scenes, [torch.zeros(len(scene), dtype=torch.int64) for scene in scenes])
+    renderer = Renderer.of(levels, CAMERAS, rasterizer="eager")
+    limited = replace(renderer, recipe=replace(renderer.recipe, levels_budget=budget, levels_share=share))
+    assert renderer.samples(VIEWS[0].scaled(1 / 8)) == 4
+    assert limited.samples(VIEWS[0].scaled(1 / 8)) == expected
+
+
+def test_the_parts_of_a_gaussian_have_its_moments():
+    scene = make_scene(50)
+    parts = split(scene, CAMERAS)
+    assert len(parts) == 50 * PARTS
+    means = parts.means.reshape(50, PARTS, 3)
+    torch.testing.assert_close(means.mean(dim=1), scene.means, rtol=1e-5, atol=1e-5)
+    spread = outer((means - means.mean(dim=1, keepdim=True)).flatten(0, 1)) + covariances(parts)
+    torch.testing.assert_close(spread.reshape(50, PARTS, 6).mean(dim=1), covariances(scene), rtol=1e-3, atol=1e-5)
+
+
+def test_a_split_scene_looks_nearly_as_before():
+    scene = make_scene(50)
+    images = [Renderer.of(s, VIEWS, "classic")(VIEWS[0]).rgb for s in (scene, split(scene, CAMERAS))]
+    assert (psnr(*images) or 0) > 25
+
+
+def test_a_split_scene_is_the_same_each_time():
+    assert torch.equal(split(make_scene(20), CAMERAS).means, split(make_scene(20), CAMERAS).means)
