@@ -17,6 +17,7 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn import functional
 
 from aaplug.core.interfaces import PixelKernel, Pixels
 from aaplug.core.kernels import Kernel
@@ -80,13 +81,17 @@ def _backward(
 ) -> Float[Tensor, "m c"]:
     """Gradient of the raster rows.
 
-    What a splat contributes in a tile is kept where it stands in the tile's list, and summed over tiles at the end.
+    What splats contribute in a tile is kept step by step, and summed over tiles at the end.
     """
     assert bins.pairs is not None
     local, kernel = tile_centres(rows), step_kernel(how.pixel, how.rules)
     steps = bins.splats.view(-1, STEP)
-    parts = rows.new_zeros(len(steps), STEP * rows.shape[1])
-    light = torch.zeros_like(g_alpha)
+    count = sum(len(before) for segment in segments for before in segment.before)
+    parts = rows.new_empty(count + 1, STEP * rows.shape[1])
+    parts[count] = 0
+    turns = torch.arange(count, dtype=torch.int32, device=rows.device)
+    part_of = torch.full_like(steps[:, 0], count)  # steps behind saturated pixels contribute nothing
+    light, done = torch.zeros_like(g_alpha), 0
     for segment in reversed(segments):
         behind, hidden = (plane.index_select(0, segment.tiles) for plane in (light, g_alpha))
         colours = g_colour.index_select(1, segment.tiles)
@@ -96,11 +101,15 @@ def _backward(
             at = places(segment.at[:n], step * STEP, segment.ends[:n], bins) // STEP
             drawn = rows_at(rows, steps.index_select(0, at))
             pixels = (before, behind[:n], *colours[:, :n].unbind(), hidden[:n], *local, ones[:n])
-            (sums,) = how.kernels.run(kernel, drawn, segment.origins[:n], *pixels)
-            parts.index_copy_(0, at, sums)
+            (parts[done : done + n],) = how.kernels.run(kernel, drawn, segment.origins[:n], *pixels)
+            part_of.index_copy_(0, at, turns[done : done + n])
+            done += n
         light.index_copy_(0, segment.tiles, behind)
+    stand, starts = bins.pairs.of_splats()
+    stand = part_of.index_select(0, stand // STEP) * STEP + stand % STEP
     total = torch.zeros_like(rows)
-    total.index_copy_(0, bins.pairs.nearest, bins.pairs.sums(parts.view(-1, rows.shape[1])))
+    sums = functional.embedding_bag(stand, parts.view(-1, rows.shape[1]), starts, mode="sum")
+    total.index_copy_(0, bins.pairs.nearest, sums)
     if isinstance(how.pixel, SumsGradients):
         return how.pixel.from_sums(rows, total, how.kernels)
     return total

@@ -17,7 +17,6 @@ from itertools import pairwise
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.nn import functional
 
 from aaplug.core.ellipses import squared_cutoff
 from aaplug.core.kernels import Kernel, Kernels
@@ -48,12 +47,12 @@ class Pairs:
     sorted: Int[Tensor, " p"]
     places: Int[Tensor, " p"]
 
-    def sums(self, parts: Float[Tensor, "padded_p c"]) -> Float[Tensor, "m c"]:
-        """Per splat of `nearest`, the sum of what stands at its pairs' places."""
+    def of_splats(self) -> tuple[Int[Tensor, " p"], Int[Tensor, " m"]]:
+        """Places of all pairs, in the pairs' order, and the first of each splat of `nearest`."""
         places = torch.empty_like(self.places)
         places[self.sorted] = self.places
         starts = torch.cat([self.starts, self.starts.new_full((1,), len(places))])
-        return functional.embedding_bag(places, parts, starts.index_select(0, self.spans), mode="sum")
+        return places, starts.index_select(0, self.spans)
 
 
 @dataclass(frozen=True)
