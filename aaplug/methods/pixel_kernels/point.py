@@ -1,7 +1,8 @@
 """The value at the pixel's centre: 3DGS's own pixel kernel (Kerbl et al. 2023, eq. 4).
 
-u and v are the raster row's linear forms, scaled so that u² + v² = log2(e)/2 · dᵀ C⁻¹ d.  Opacity o is stored as log2:
-alpha is 2^(log2 o - u² - v²).
+u and v are the raster row's linear forms, scaled so that u² + v² = log2(e)/2 · dᵀ C⁻¹ d.  Opacity o is stored as
+log2 o - LOG2_PADDING, at least 0 where it can be seen: alpha is 2^(LOG2_PADDING + h) with h = log2 o - LOG2_PADDING -
+u² - v².
 
 The backward pass reduces over a tile's pixels inside the compiled loop: seven sums of the gradient of log alpha and
 three of the colour gradient per splat.
@@ -25,9 +26,9 @@ from aaplug.methods.pixel_kernels.raster_rows import COLUMNS, OPACITY, TILE, for
 
 HALF_LOG2_E = 0.5 * math.log2(math.e)
 LN_2 = math.log(2)
-LOG2_PADDING = -9.0  # log2 alpha of the padding row, below every cut-off; clamped here to avoid slow subnormals
-SQUARINGS = 3  # 2^x is computed as p(x)^(2^SQUARINGS), p of degree DEGREE: relative error 1e-6 in float32
-DEGREE = 6
+LOG2_PADDING = -9.0  # log2 alpha of the padding row, below every cut-off
+SQUARINGS = 3  # 2^x is computed as p(x)^(2^SQUARINGS), p of degree DEGREE: relative error 3e-6 in float32
+DEGREE = 5
 
 
 @dataclass(frozen=True)
@@ -50,10 +51,21 @@ class Point:
         return kernels.run(POINT_ROWS, *columns)[0]
 
     def alpha(self, rows: Float[Tensor, "*n t c"], pixels: Pixels, rules: Rules) -> Float[Tensor, "*n t P"]:
-        """2^(log2 o - u² - v²), 0 below the cut-off."""
+        """2^(log2 o - u² - v²), 0 below the cut-off.
+
+        Compiled it is a polynomial, because a call in a loop stops vectorization.  Below the cut-off that may be
+        anything, and is left out.
+        """
         u, v = forms_at(rows, pixels)
-        exponent = torch.addcmul(rows[..., OPACITY, None], u, u, value=-1)
-        return _exp2_above_cutoff(torch.addcmul(exponent, v, v, value=-1), rules)
+        opacity = rows[..., OPACITY, None]
+        if torch.compiler.is_compiling():
+            h = torch.addcmul(torch.addcmul(opacity, u, u, value=-1), v, v, value=-1)
+            value = _power(_polynomial(h, ROOT_OF_EXP2), SQUARINGS)
+            return torch.where(h >= rules.log2_min_alpha - LOG2_PADDING, value, 0.0)
+        exponent = torch.addcmul(opacity + LOG2_PADDING, u, u, value=-1)
+        exponent = torch.addcmul(exponent, v, v, value=-1)
+        # clamped, because subnormal numbers are slow
+        return torch.threshold(exponent.clamp_(min=LOG2_PADDING).exp2_(), rules.below_min_alpha, 0.0)
 
     def exact(self, splats: Splats2D, offsets: Float[Tensor, "p c 2"]) -> Float[Tensor, "p c"]:
         """exp(-dᵀ C⁻¹ d / 2)."""
@@ -96,18 +108,8 @@ def _point_rows(
 ) -> tuple[Float[Tensor, "m_and_1 10"]]:
     """Raster rows and the padding row."""
     forms = [HALF_LOG2_E**0.5 * form for form in whitening_columns(covs, dets)]
-    columns = [*forms, *means.unbind(dim=1), opacities.log2(), *rgb.unbind(dim=1)]
-    ends = [LOG2_PADDING if i == OPACITY else 0.0 for i in range(COLUMNS)]
-    padded = [functional.pad(x, (0, 1), value=end) for x, end in zip(columns, ends, strict=True)]
-    return (torch.stack(padded, dim=1),)
-
-
-def _exp2_above_cutoff(exponent: Float[Tensor, "*n P L"], rules: Rules) -> Float[Tensor, "*n P L"]:
-    """2^exponent, 0 below the cut-off.  Compiled it is a polynomial, because a call in a loop stops vectorization."""
-    if torch.compiler.is_compiling():
-        root = _polynomial(torch.relu(exponent - LOG2_PADDING), ROOT_OF_EXP2)
-        return torch.where(exponent >= rules.log2_min_alpha, _power(root, SQUARINGS), 0.0)
-    return torch.threshold(exponent.clamp(min=LOG2_PADDING).exp2_(), rules.below_min_alpha, 0.0)
+    columns = [*forms, *means.unbind(dim=1), opacities.log2() - LOG2_PADDING, *rgb.unbind(dim=1)]
+    return (torch.stack([functional.pad(column, (0, 1)) for column in columns], dim=1),)
 
 
 def _polynomial(x: Tensor, coefficients: tuple[float, ...]) -> Tensor:
