@@ -1,6 +1,7 @@
 """The recipes that a user picks, each with its source; `research_recipes` has the comparisons."""
 
 from dataclasses import replace
+from typing import Any
 
 from aaplug.core.choices import QUALITIES
 from aaplug.core.errors import UsageError, not_one_of
@@ -17,6 +18,14 @@ from aaplug.methods.research_recipes import RESEARCH_RECIPES
 # samples, of finer levels, are taken as without levels.  The best quality draws the finest level alone.
 LEVELS = {"fast": (1, 0, 0.0), "balanced": (2, 100_000, 0.27), "best": (0, 0, 0.0)}
 
+
+def _set_by(quality: str) -> dict[str, Any]:
+    """What a quality sets of a recipe."""
+    grid, budget, share = LEVELS[quality]
+    rate = QUALITIES[quality]
+    return {"target_rate": rate, "levels_grid": grid, "levels_budget": budget, "levels_share": share}
+
+
 # Of a sample, the weight of those beside it where samples are few: it takes the noise off what compositing could not
 # resolve.  0.02 to 0.04 are best against the scenes' own look (examples/guides/methods.md).
 NEIGHBOURS = 0.03
@@ -27,14 +36,11 @@ USER_RECIPES = (
         Matched(),
         "aaplug: matched, with more samples per pixel the smaller the image (--quality), weighed with their neighbours",
         "the default",
-        target_rate=QUALITIES["balanced"],
         neighbours=NEIGHBOURS,
         takes_quality=True,
-        levels_grid=LEVELS["balanced"][0],
-        levels_budget=LEVELS["balanced"][1],
-        levels_share=LEVELS["balanced"][2],
         for_discs="2dgs-matched",
         promises=Promises(equals_training=True),
+        **_set_by("balanced"),
     ),
     Recipe(
         "matched",
@@ -113,9 +119,7 @@ def find_recipe(
             raise UsageError("rate_reference", f"recipe '{name}' compares no sampling rates")
         recipe = replace(recipe, screen=recipe.screen.with_reference(rate_reference))
     if recipe.takes_quality:
-        grid, budget, share = LEVELS[quality]
-        levels = {"levels_grid": grid, "levels_budget": budget, "levels_share": share}
-        recipe = replace(recipe, target_rate=QUALITIES[quality], **levels)
+        recipe = replace(recipe, **_set_by(quality))
     return recipe if target_rate is None else replace(recipe, target_rate=target_rate)
 
 
