@@ -47,11 +47,14 @@ def test_compiled_kernels_give_the_eager_results(built, kernel: Kernel):
         assert (fast.double() - slow.double()).abs().max() < 10 * ANSWER * scale
 
 
-@pytest.mark.parametrize("name", ["composite-point", "composite-point-backward", "gaussian-blending"])
+LOOPS = {"composite-point": 2, "composite-point-backward": 2, "gaussian-blending": 1}  # the first brings raster rows
+
+
+@pytest.mark.parametrize("name", LOOPS)
 def test_compositing_is_one_loop_over_tiles(built, name):
     with zipfile.ZipFile(compiled.cache_folder() / f"{name}.pt2") as package:
         sources = [package.read(n).decode() for n in package.namelist() if "kernel.cpp" in n]
-    assert sum(source.count("for(int64_t x0=") for source in sources) == 1
+    assert sum(source.count("for(int64_t x0=") for source in sources) == LOOPS[name]
 
 
 def test_packages_are_checked_by_one_thread_which_is_undone_after_that(built, tmp_path, monkeypatch):
@@ -173,15 +176,15 @@ def test_without_a_compiler_a_build_is_refused(empty_cache, monkeypatch):
 
 def test_after_a_failed_build_auto_is_eager_and_says_why(empty_cache, monkeypatch):
     def fails():
-        raise UsageError("warmup", "torch cannot compile 'places' here")
+        raise UsageError("warmup", "torch cannot compile 'slots' here")
 
     monkeypatch.setattr(choice, "has_compiler", lambda: True)
     monkeypatch.setattr(choice, "build", fails)
     said: list[str] = []
     chosen = find_rasterizer("auto", choice.FRAMES_THAT_PAY, said.append)
     assert chosen is RASTERIZERS["eager"]
-    assert "cannot compile 'places'" in said[-1]
-    with pytest.raises(UsageError, match="cannot compile 'places'"):
+    assert "cannot compile 'slots'" in said[-1]
+    with pytest.raises(UsageError, match="cannot compile 'slots'"):
         find_rasterizer("compiled", 1, said.append)
 
 
@@ -190,8 +193,8 @@ def test_a_kernel_that_does_not_compile_is_named(empty_cache, monkeypatch):
         raise KeyError("buf14")
 
     monkeypatch.setattr(torch._inductor, "aoti_compile_and_package", fails)
-    with pytest.raises(UsageError, match=r"warmup: torch .* cannot compile 'places' here"):
-        compiled._build("places")
+    with pytest.raises(UsageError, match=r"warmup: torch .* cannot compile 'slots' here"):
+        compiled._build("slots")
 
 
 def test_an_unknown_name_lists_the_known_ones():

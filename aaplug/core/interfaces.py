@@ -94,8 +94,8 @@ class PixelKernel(Protocol):
     name: unique among pixel kernels.
     columns: number of columns of a raster row.
     needs_depth_slopes: whether it draws discs, which need `Splats2D.depth_slopes`.
-    splats_per_pass: splats of a tile that one compiled pass composites: a multiple of `forward.STEP` that divides
-        `binning.LONGEST_PASS`; 8 suits all but the cheapest kernels.
+    splats_per_pass: splats of a tile that one compiled pass composites: a multiple of `forward.STEP`; 8 suits all but
+        the cheapest kernels.  More compile slowly, fewer reload the pixels' state more often.
     """
 
     @property
@@ -155,7 +155,7 @@ class Compositor(Protocol):
     ) -> Float[Tensor, "4 t P"]:
         """Premultiplied red, green, blue, and alpha; tile t composites `order[first[t] : first[t] + counts[t]]`.
 
-        order: padded by `binning.LONGEST_PASS`, so that a pass may read past the end.
+        order: has at least one entry.
         centres: x and y of the pixel centres, in px.  window: `Splats2D.window`, in px.
         """
         ...

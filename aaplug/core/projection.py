@@ -61,9 +61,11 @@ def project_covariances(
 def _beyond(near: float, columns: tuple[Tensor, ...], opacities: Float[Tensor, " n"]) -> Splats2D:
     """Splats of these means, covariances, determinants and depths, without those before the near plane."""
     means, covs, dets, depths = columns
-    splats = Splats2D(means, covs, dets, depths, opacities, torch.arange(len(means), device=means.device))
-    in_front = depths > near
-    return splats if in_front.all() else splats[in_front]
+    in_front = (depths > near).nonzero().squeeze(1)
+    if len(in_front) < len(means):
+        brought = (column.index_select(0, in_front) for column in (means, covs, dets, depths, opacities))
+        means, covs, dets, depths, opacities = brought
+    return Splats2D(means, covs, dets, depths, opacities, in_front)
 
 
 def with_depth_slopes(splats: Splats2D, scene: Gaussians, camera: Camera) -> Splats2D:

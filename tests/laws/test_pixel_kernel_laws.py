@@ -22,7 +22,6 @@ from aaplug.methods.pixel_kernels import INTEGRAL, PIXEL_KERNELS, POINT, SURFEL,
 from aaplug.methods.pixel_kernels.raster_rows import BLUE, COLUMNS, OPACITY, RED, TILE, tile_centres
 from aaplug.rasterizers import Reference, Tiled
 from aaplug.rasterizers.reference import alphas
-from aaplug.rasterizers.tiled.binning import LONGEST_PASS
 from aaplug.rasterizers.tiled.forward import STEP
 from tests.conftest import ALL_RASTERIZERS, each, make_camera, make_scene, make_splats, splats_of
 
@@ -121,9 +120,8 @@ def test_bounding_ellipses_contain_every_pixel_that_is_drawn(pixel, rules):
         assert not (drawn & ~inside).any()
 
 
-def test_a_pass_is_whole_steps_and_a_part_of_the_longest(pixel):
+def test_a_pass_is_whole_steps(pixel):
     assert pixel.splats_per_pass % STEP == 0
-    assert LONGEST_PASS % pixel.splats_per_pass == 0
 
 
 @pytest.mark.parametrize("window", [0.0, 1.0])

@@ -44,9 +44,7 @@ PLAIN = 0.1  # standard deviations: a window that spans less is taken as a point
 NARROW = 0.3  # standard deviations: half windows below which a series keeps more digits than a difference
 FARTHEST = 4.0  # standard deviations from a window's edge, beyond which the mean is below every cut-off
 SPLATS_PER_PASS = 4  # more compile slowly
-PASSES = (
-    2  # whose rows are gathered at once; together they have at most `LONGEST_PASS` splats, by which `order` is padded
-)
+PASSES = 2  # whose rows are gathered at once
 COMPACT_BELOW = 7 / 8  # tiles that are done are dropped once the share of the others is below this
 FEWEST = 2  # tiles in a pass: compiled kernels take no fewer
 EXAMPLE_TILES, EXAMPLE_SPLATS = 1024, 4096  # as large as real work: inductor chooses by them which loops use threads
@@ -175,7 +173,7 @@ class GaussianBlending:
         turns = torch.arange(PASSES * SPLATS_PER_PASS, device=x.device).view(PASSES, 1, -1)
         while len(tiles):
             places = at[:, None] + turns
-            owners = torch.where(places < ends[:, None], order[places], len(rows) - 1)
+            owners = torch.where(places < ends[:, None], order[places.clamp(max=len(order) - 1)], len(rows) - 1)
             for drawn in rows.index_select(0, owners.flatten()).view(*owners.shape, -1):
                 light = Light(*kernels.run(kernel, drawn, x, y, *light))
             at = torch.minimum(at + turns.numel(), ends)

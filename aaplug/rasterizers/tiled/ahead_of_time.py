@@ -9,6 +9,7 @@ again.
 import hashlib
 import inspect
 import os
+import platform
 import shutil
 import sys
 import warnings
@@ -27,7 +28,7 @@ from aaplug.core.monitor import Tell
 from aaplug.core.rules import RULES_3DGS
 from aaplug.methods.compositors import gaussian_blending
 from aaplug.methods.pixel_kernels import INTEGRAL, POINT, averages, integral, point, raster_rows
-from aaplug.rasterizers.tiled import backward, binning, forward
+from aaplug.rasterizers.tiled import backward, binning, forward, layout
 from aaplug.rasterizers.tiled.packages import CompiledKernels, Package
 
 KERNELS: tuple[Kernel, ...] = (  # those that take longest to compile come last
@@ -38,7 +39,8 @@ KERNELS: tuple[Kernel, ...] = (  # those that take longest to compile come last
     binning.table_kernel(),
     binning.SPANS,
     binning.PAIRS,
-    binning.PLACES,
+    layout.PLACED,
+    backward.SLOTS,
     point.FROM_SUMS,
     *projection.SHADE_BACKWARD.values(),
     backward.step_kernel(POINT, RULES_3DGS),
@@ -49,7 +51,7 @@ KERNELS: tuple[Kernel, ...] = (  # those that take longest to compile come last
 )
 SOURCES = (  # modules whose source the kernels are made of
     *(kernels, rules, splats, ellipses, culling, projection, spherical_harmonics),
-    *(raster_rows, averages, point, integral, gaussian_blending, binning, forward, backward),
+    *(raster_rows, averages, point, integral, gaussian_blending, binning, forward, backward, layout),
 )
 OPTIONS = {
     "max_fusion_size": 1_000_000,  # a pass stays one loop, however many operations it has
@@ -62,7 +64,11 @@ OPTIONS = {
 TILING_HEURISTIC = "cpp.enable_tiling_heuristics"
 # operations up to which inductor writes a value out again for each of its readers, where kernels are chained
 CHAINED = {"realize_opcount_threshold": 10}
+# g++ orders a loop's instructions before it allots registers: independent splats then overlap.  The setting of the
+# architecture is the only one whose text reaches the compiler.
+ORDERED = {"cpp.march": "native -fschedule-insns"} if (sys.platform, platform.machine()) == ("linux", "x86_64") else {}
 LARGEST_SIZE = 1 << 31
+STANDARD_COMPILER = "clang++" if sys.platform == "darwin" else "g++"
 MOST_PROCESSES = 4  # compilers side by side: each takes most of a GB
 # of the largest value: between a package's result and the eager one, on the example
 TOLERANCE = 1e-4
@@ -71,7 +77,7 @@ TOLERANCE = 1e-4
 def cache_folder() -> Path:
     """Folder of the packages for this version and this processor."""
     source = "".join(inspect.getsource(module) for module in SOURCES)
-    options = f"{OPTIONS} {TILING_HEURISTIC} {CHAINED}"
+    options = f"{OPTIONS} {TILING_HEURISTIC} {CHAINED} {ORDERED}"
     facts = [torch.__version__, torch.backends.cpu.get_cpu_capability(), source, options]
     key = hashlib.sha256("\0".join(facts).encode()).hexdigest()[:16]
     return Path(platformdirs.user_cache_dir("aaplug", appauthor=False)) / f"kernels-{key}"
@@ -79,8 +85,11 @@ def cache_folder() -> Path:
 
 def has_compiler() -> bool:
     """Whether this machine has the compiler that torch would use."""
-    standard = "clang++" if sys.platform == "darwin" else "g++"
-    return shutil.which(os.environ.get("CXX", standard)) is not None
+    return shutil.which(_compiler()) is not None
+
+
+def _compiler() -> str:
+    return os.environ.get("CXX", STANDARD_COMPILER)
 
 
 def load() -> CompiledKernels | None:
@@ -201,7 +210,10 @@ def _build(name: str) -> None:
             made = torch._inductor.aoti_compile_and_package(
                 program,
                 package_path=str(folder / "k.pt2"),
-                inductor_configs=OPTIONS | {TILING_HEURISTIC: not kernel.gathers} | (CHAINED if kernel.chained else {}),
+                inductor_configs=OPTIONS
+                | (ORDERED if _compiler() == STANDARD_COMPILER else {})
+                | {TILING_HEURISTIC: not kernel.gathers}
+                | (CHAINED if kernel.chained else {}),
             )
             os.replace(made, path)
     except OSError as error:

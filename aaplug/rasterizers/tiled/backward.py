@@ -15,7 +15,7 @@ from functools import cache, partial
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
@@ -24,7 +24,7 @@ from aaplug.core.kernels import Kernel
 from aaplug.core.rules import Rules
 from aaplug.methods.pixel_kernels.gradients import Move, SumsGradients, sums_by_autograd
 from aaplug.methods.pixel_kernels.raster_rows import BLUE, GREEN, RED, tile_centres
-from aaplug.rasterizers.tiled.binning import LONGEST_PASS, Bins
+from aaplug.rasterizers.tiled.binning import Bins
 from aaplug.rasterizers.tiled.forward import (
     ALONE,
     STEP,
@@ -33,18 +33,16 @@ from aaplug.rasterizers.tiled.forward import (
     composite_forward,
     in_turn,
     less,
-    places,
-    rows_at,
+    next_rows,
     tiles_example,
     transmitted,
     where_above,
 )
+from aaplug.rasterizers.tiled.layout import tiles_of
 
 
-def composite(
-    rows: Float[Tensor, "m c"], bins: Bins, how: Compositing
-) -> tuple[Float[Tensor, "3 t P"], Float[Tensor, "t P"]]:
-    """Premultiplied colour, and alpha, of every pixel of every tile; differentiable in the raster rows.
+def composite(rows: Float[Tensor, "m c"], bins: Bins, how: Compositing) -> Float[Tensor, "4 h w"]:
+    """Premultiplied colour, and alpha, of every pixel; differentiable in the raster rows.
 
     rows: the last one is the padding row.
     """
@@ -57,27 +55,21 @@ class _Composite(torch.autograd.Function):
     """Compositing with its own backward pass."""
 
     @staticmethod
-    def forward(ctx: Any, rows: Tensor, bins: Bins, how: Compositing) -> tuple[Tensor, Tensor]:
+    def forward(ctx: Any, rows: Tensor, bins: Bins, how: Compositing) -> Tensor:
         segments: list[Segment] = []
-        colour, alpha = composite_forward(rows, bins, how, segments)
+        image = composite_forward(rows, bins, how, segments)
         ctx.save_for_backward(rows)
         ctx.rest = (bins, segments, how)
-        return colour, alpha
+        return image
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None, None]:
         (rows,) = ctx.saved_tensors
-        colour, alpha = (grad.contiguous() for grad in grads)
-        return _backward(rows, colour, alpha, *ctx.rest), None, None
+        return _backward(rows, tiles_of(grads[0].contiguous()), *ctx.rest), None, None
 
 
 def _backward(
-    rows: Float[Tensor, "m c"],
-    g_colour: Float[Tensor, "3 all P"],
-    g_alpha: Float[Tensor, "all P"],
-    bins: Bins,
-    segments: list[Segment],
-    how: Compositing,
+    rows: Float[Tensor, "m c"], grads: Float[Tensor, "4 all P"], bins: Bins, segments: list[Segment], how: Compositing
 ) -> Float[Tensor, "m c"]:
     """Gradient of the raster rows.
 
@@ -85,40 +77,62 @@ def _backward(
     """
     assert bins.pairs is not None
     local, kernel = tile_centres(rows), step_kernel(how.pixel, how.rules)
-    steps = bins.splats.view(-1, STEP)
     count = sum(len(before) for segment in segments for before in segment.before)
     parts = rows.new_empty(count + 1, STEP * rows.shape[1])
     parts[count] = 0
     turns = torch.arange(count, dtype=torch.int32, device=rows.device)
-    part_of = torch.full_like(steps[:, 0], count)  # steps behind saturated pixels contribute nothing
-    light, done = torch.zeros_like(g_alpha), 0
+    steps = (bins.counts + (STEP - 1)) // STEP
+    first = steps.cumsum(0) - steps
+    part_of = turns.new_full((int(steps.sum()),), count)  # steps behind saturated pixels contribute nothing
+    light, done = torch.zeros_like(grads[3]), 0
     for segment in reversed(segments):
-        behind, hidden = (plane.index_select(0, segment.tiles) for plane in (light, g_alpha))
-        colours = g_colour.index_select(1, segment.tiles)
+        behind = light.index_select(0, segment.tiles)
+        colours = grads.index_select(1, segment.tiles)
         ones = torch.ones_like(segment.origins[:, 0])
+        step_of = first.index_select(0, segment.tiles) + segment.start // STEP
         for step, before in reversed([*enumerate(segment.before)]):
             n = len(before)
-            at = places(segment.at[:n], step * STEP, segment.ends[:n], bins) // STEP
-            drawn = rows_at(rows, steps.index_select(0, at))
-            pixels = (before, behind[:n], *colours[:, :n].unbind(), hidden[:n], *local, ones[:n])
-            (parts[done : done + n],) = how.kernels.run(kernel, drawn, segment.origins[:n], *pixels)
-            part_of.index_copy_(0, at, turns[done : done + n])
+            where = (bins.splats, segment.at[:n] + step * STEP, segment.ends[:n], segment.origins[:n])
+            pixels = (before, behind[:n], *colours[:, :n].unbind(), *local, ones[:n])
+            (parts[done : done + n],) = how.kernels.run(kernel, rows, *where, *pixels)
+            part_of.index_copy_(0, step_of[:n] + step, turns[done : done + n])
             done += n
         light.index_copy_(0, segment.tiles, behind)
-    stand, starts = bins.pairs.of_splats()
-    stand = part_of.index_select(0, stand // STEP) * STEP + stand % STEP
+    pairs = bins.pairs
+    shifts = (first * STEP - bins.first).int()
+    (slots,) = how.kernels.run(SLOTS, turns.new_empty(len(pairs.sorted)), pairs.tiles, shifts, part_of, pairs.sorted)
     total = torch.zeros_like(rows)
-    sums = functional.embedding_bag(stand, parts.view(-1, rows.shape[1]), starts, mode="sum")
-    total.index_copy_(0, bins.pairs.nearest, sums)
+    sums = functional.embedding_bag(slots, parts.view(-1, rows.shape[1]), pairs.starts, mode="sum")
+    total.index_copy_(0, pairs.nearest, sums)
     if isinstance(how.pixel, SumsGradients):
         return how.pixel.from_sums(rows, total, how.kernels)
     return total
 
 
+def _slots(
+    slots: Int[Tensor, " p"],
+    tiles: Int[Tensor, " p"],
+    shifts: Int[Tensor, " t"],
+    part_of: Int[Tensor, " s"],
+    pairs: Int[Tensor, " p"],
+) -> tuple[Int[Tensor, " p"]]:
+    """Where each pair's contribution stands among those of all splats of all steps.
+
+    tiles: sorted; pairs: their pairs.  shifts: how far a tile's list moves when each is padded to whole steps.
+    part_of: where each step's contributions stand among all steps.
+    """
+    stand = torch.arange(tiles.shape[0], dtype=torch.int32, device=tiles.device) + shifts[tiles.int()]
+    slots.index_put_((pairs,), part_of[stand // STEP] * STEP + stand % STEP)
+    return (slots,)
+
+
 def _step(
     pixel: PixelKernel,
     rules: Rules,
-    rows: Float[Tensor, "t K c"],
+    rows: Float[Tensor, "m c"],
+    ids: Int[Tensor, " p"],
+    at: Int[Tensor, " t"],
+    ends: Int[Tensor, " t"],
     origins: Float[Tensor, "t 2"],
     T: Float[Tensor, "t P"],
     behind: Float[Tensor, "t P"],
@@ -134,7 +148,7 @@ def _step(
     one = one[:, None]
     before, passed = T, []
     pixels = Pixels(origins, local_x, local_y)
-    for row, alpha in in_turn(pixel, rules, rows.transpose(0, 1), pixels):
+    for row, alpha in in_turn(pixel, rules, next_rows(rows, ids, at, ends, STEP), pixels):
         through = transmitted(alpha, one, rules)
         after = before * through
         hides = where_above(rules.below_min_transmittance, after, one - through)
@@ -161,9 +175,18 @@ def _step(
     return (sums,)
 
 
-def _step_example(columns: int) -> tuple[Tensor, ...]:
-    rows, ids, _, *rest = tiles_example(6, columns)
-    return rows_at(rows, ids.view(-1, LONGEST_PASS)[:-1, :STEP]), *rest
+def _slots_example() -> tuple[Tensor, ...]:
+    tiles, each = 10_000, 5 * STEP
+    pairs = torch.arange(tiles * each)
+    by_tile = (pairs // each).short()
+    steps = torch.arange(len(pairs) // STEP, dtype=torch.int32)
+    return (
+        torch.zeros_like(pairs, dtype=torch.int32),
+        by_tile,
+        torch.zeros(tiles, dtype=torch.int32),
+        steps,
+        pairs.flip(0),
+    )
 
 
 @cache
@@ -172,7 +195,10 @@ def step_kernel(pixel: PixelKernel, rules: Rules) -> Kernel:
     return Kernel(
         f"composite-{pixel.name}{rules.tag}-backward",
         partial(_step, pixel, rules),
-        partial(_step_example, pixel.columns),
-        (*8 * ("t",), None, None, "t"),
+        partial(tiles_example, 6, pixel.columns),
+        ("m", "p", *9 * ("t",), None, None, "t"),
         alone=ALONE,
     )
+
+
+SLOTS = Kernel("slots", _slots, _slots_example, ("p", "p", "t", "s", "p"))

@@ -16,10 +16,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from aaplug.core.interfaces import PixelKernel, Pixels
-from aaplug.core.kernels import Kernel, Kernels
+from aaplug.core.kernels import Kernel, Kernels, written_out
 from aaplug.core.rules import Rules
 from aaplug.methods.pixel_kernels.raster_rows import BLUE, GREEN, PIXELS, RED, tile_centres
-from aaplug.rasterizers.tiled.binning import LONGEST_PASS, Bins
+from aaplug.rasterizers.tiled.binning import Bins
+from aaplug.rasterizers.tiled.layout import placed
 
 STEP = 4  # splats per backward step; transmittance is stored before each step.  With more the compiler splits the loop
 CHECK_EVERY = 2  # passes between checks for saturated tiles
@@ -27,7 +28,11 @@ COMPACT_BELOW = 3 / 4  # saturated tiles are dropped once the share of unsaturat
 FEWEST = 2  # tiles in a pass: compiled kernels take no fewer, and a tile without splats left stays as it is
 ALONE = 64  # tiles in a call: about what one thread composites while another wakes up
 GATE = 1e9  # lifts any nonzero output of `threshold` above 1, so that min(output · GATE, value) is `value` or 0
-EXAMPLE_TILES, EXAMPLE_SPLATS = (1024, 4096)  # as large as real work: inductor chooses by them which loops use threads
+EXAMPLE_TILES, EXAMPLE_SPLATS, EXAMPLE_LIST = (
+    1024,
+    4096,
+    16,
+)  # as large as real work: inductor chooses by them which loops use threads
 
 
 @dataclass(frozen=True)
@@ -49,11 +54,13 @@ class Segment:
     """The passes between two compactions of the list of tiles; kept for the backward pass.
 
     tiles: tiles that were composited, those with the most splats first.
+    start: how many splats of each were composited before; a multiple of STEP.
     at, ends: per tile, where its splats of this segment begin and where all end in `Bins.splats`.
     before: per backward step, transmittance before it, for the first n of `tiles`: those that had splats left.
     """
 
     tiles: Int[Tensor, " t"]
+    start: int
     at: Int[Tensor, " t"]
     ends: Int[Tensor, " t"]
     origins: Float[Tensor, "t 2"]
@@ -62,43 +69,45 @@ class Segment:
 
 def composite_forward(
     rows: Float[Tensor, "m c"], bins: Bins, how: Compositing, segments: list[Segment] | None = None
-) -> tuple[Float[Tensor, "3 all P"], Float[Tensor, "all P"]]:
+) -> Float[Tensor, "4 h w"]:
     """Premultiplied colour, and alpha, of every pixel; appends what the backward pass needs to `segments`.
 
     rows: raster rows; the last one is the padding row.
     """
     local = tile_centres(rows)
-    image = rows.new_zeros(4, len(bins.counts), PIXELS)
+    planes = rows.new_zeros(4, len(bins.counts), PIXELS)
     order = torch.sort(bins.counts, descending=True, stable=True).indices
-    order = order[: max(FEWEST, int((bins.counts > 0).sum()))]
-    for tiles in order.tensor_split(-(-len(order) // how.kernels.tiles) or 1) if len(order) else ():
-        _composite_block(rows, bins, tiles, image, local, how, segments)
-    return image[:3], image[3]
+    drawn = max(FEWEST, int((bins.counts > 0).sum()))
+    tiles = order[:drawn].tensor_split(-(-drawn // how.kernels.tiles)) if len(order) else ()
+    done = 0
+    for block in tiles:
+        _composite_block(rows, bins, block, planes[:, done : done + len(block)], local, how, segments)
+        done += len(block)
+    return placed(planes, order, bins.columns, how.kernels)
 
 
 def _composite_block(
     rows: Float[Tensor, "m c"],
     bins: Bins,
     tiles: Int[Tensor, " t"],
-    image: Float[Tensor, "4 all P"],
+    image: Float[Tensor, "4 t P"],
     local: tuple[Float[Tensor, " P"], Float[Tensor, " P"]],
     how: Compositing,
     segments: list[Segment] | None,
 ) -> None:
     """Composite one block of tiles into `image`, until their splats run out or every pixel is saturated."""
     T = rows.new_ones(len(tiles), PIXELS)
-    planes = rows.new_zeros(4, len(tiles), PIXELS)
+    planes, kept = image, None
     start, splats = 0, how.pixel.splats_per_pass
     while len(tiles):
-        columns = [x.index_select(0, tiles) for x in (bins.first, bins.counts, bins.origins)]
-        first, counts, origins = columns
+        first, counts, origins = (x.index_select(0, tiles) for x in (bins.first, bins.counts, bins.origins))
         at, ends, ones = first + start, first + counts, torch.ones_like(origins[:, 0])
         going, rest = _going(counts - start, splats), tiles[:0]
         before, steps = [], [] if segments is None else _going(counts - start, STEP)
         if segments is not None:
-            segments.append(Segment(tiles, at, ends, origins, before))
+            segments.append(Segment(tiles, start, at, ends, origins, before))
         for i, n in enumerate(going):
-            where = (bins.splats, places(at[:n], i * splats, ends[:n], bins), origins[:n])
+            where = (bins.splats, at[:n] + i * splats, ends[:n], origins[:n])
             pixels = (T[:n], *planes[:, :n].unbind(), *local, ones[:n])
             *within, after = how.kernels.run(how.kernel, rows, *where, *pixels)
             here = steps[i * splats // STEP :]
@@ -113,23 +122,19 @@ def _composite_block(
                         alive[:FEWEST] = True
                     rest = alive.nonzero().squeeze(1)
                     break
-        image.index_copy_(1, tiles, planes)
+        if kept is not None:
+            image.index_copy_(1, kept, planes)
+        kept = rest if kept is None else kept.index_select(0, rest)
         tiles, T = tiles.index_select(0, rest), T.index_select(0, rest)
         planes = planes.index_select(1, rest)
 
 
-def places(at: Int[Tensor, " t"], ahead: int, ends: Int[Tensor, " t"], bins: Bins) -> Int[Tensor, " t"]:
-    """Where each tile's splats from `ahead` on stand; of the FEWEST tiles one may have none left and gets padding."""
-    here = at + ahead
-    return here if len(at) > FEWEST else torch.where(here < ends, here, bins.padding)
-
-
 def _going(counts: Int[Tensor, " t"], at_once: int) -> list[int]:
     """How many tiles take part in each pass of `at_once` splats; `counts`: splats left per tile, falling."""
-    passes = (counts + (at_once - 1)) // at_once
-    turns = torch.arange(int(passes[0]), device=counts.device)
-    going = (len(passes) - torch.searchsorted(passes.flip(0), turns, right=True)).tolist()
-    return [max(n, min(FEWEST, len(passes))) for n in going]
+    passes = ((counts + (at_once - 1)) // at_once).int()
+    turns = torch.arange(1, int(passes[0]) + 1, dtype=torch.int32, device=counts.device)
+    going = torch.searchsorted(-passes, -turns, right=True).clamp(min=min(FEWEST, len(passes)))
+    return going.tolist()
 
 
 def _pass(
@@ -138,6 +143,7 @@ def _pass(
     rows: Float[Tensor, "m c"],
     ids: Int[Tensor, " p"],
     at: Int[Tensor, " t"],
+    ends: Int[Tensor, " t"],
     origins: Float[Tensor, "t 2"],
     T: Float[Tensor, "t P"],
     red: Float[Tensor, "t P"],
@@ -156,10 +162,7 @@ def _pass(
     one = one[:, None]
     before, seen = T, []
     pixels = Pixels(origins, local_x, local_y)
-    if torch.compiler.is_compiling():  # each row is loaded where it is needed
-        drawn = (rows[ids[at + k]] for k in range(pixel.splats_per_pass))
-    else:
-        drawn = rows_at(rows, ids[at + torch.arange(pixel.splats_per_pass, device=at.device)[:, None]])
+    drawn = next_rows(rows, ids, at, ends, pixel.splats_per_pass)
     for row, alpha in in_turn(pixel, rules, drawn, pixels):
         after = before * transmitted(alpha, one, rules)
         weight = where_above(rules.below_min_transmittance, after, less(before, after, one))
@@ -174,22 +177,27 @@ def _pass(
 
 
 def in_turn(
-    pixel: PixelKernel, rules: Rules, rows: Float[Tensor, "K t c"] | Iterator[Tensor], pixels: Pixels
+    pixel: PixelKernel, rules: Rules, rows: Float[Tensor, "t K c"], pixels: Pixels
 ) -> Iterator[tuple[Float[Tensor, "t c"], Float[Tensor, "t P"]]]:
     """Raster row and alpha of each tile's k-th splat, for k = 0 … K - 1.
 
     Eager code computes all alphas at once, a compiled loop each one where it is needed.
     """
-    if isinstance(rows, Tensor) and not torch.compiler.is_compiling():
-        yield from zip(rows.unbind(), pixel.alpha(rows, pixels, rules).unbind(), strict=True)
-    else:
-        for row in rows:
+    if torch.compiler.is_compiling():
+        for row in rows.unbind(dim=1):
             yield row, pixel.alpha(row, pixels, rules)
+    else:
+        alphas = pixel.alpha(rows.transpose(0, 1), pixels, rules)
+        yield from zip(rows.unbind(dim=1), alphas.unbind(), strict=True)
 
 
-def rows_at(rows: Float[Tensor, "m c"], owners: Int[Tensor, "*n"]) -> Float[Tensor, "*n c"]:
-    """Raster rows of splats."""
-    return rows.index_select(0, owners.flatten()).view(*owners.shape, -1)
+def next_rows(
+    rows: Float[Tensor, "m c"], ids: Int[Tensor, " p"], at: Int[Tensor, " t"], ends: Int[Tensor, " t"], count: int
+) -> Float[Tensor, "t K c"]:
+    """Raster rows of each tile's next `count` splats, from `at`; the padding row where none are left."""
+    place = at[:, None] + torch.arange(count, device=at.device)
+    owners = torch.where(place < ends[:, None], ids[place.clamp(max=ids.shape[0] - 1)], rows.shape[0] - 1)
+    return written_out(rows.index_select(0, owners.flatten()).view(-1, count, rows.shape[1]))
 
 
 # Eager code costs one pass over memory per operation, and `where` costs most.  In a compiled loop, function calls and
@@ -217,13 +225,14 @@ def where_above(bound: float, test: Tensor, value: Tensor) -> Tensor:
 
 
 def tiles_example(planes: int, columns: int) -> tuple[Tensor, ...]:
-    """Raster rows, splats and where they begin, tile corners and planes of pixels to compile for."""
+    """Raster rows, splats, where they begin and end, tile corners and planes of pixels to compile for."""
     tiles = EXAMPLE_TILES
     rows = torch.linspace(0.012, 0.1, EXAMPLE_SPLATS * columns).view(EXAMPLE_SPLATS, columns)
-    ids = torch.arange((tiles + 1) * LONGEST_PASS, dtype=torch.int32) % EXAMPLE_SPLATS
-    at = torch.arange(tiles) * LONGEST_PASS
+    ids = torch.arange(tiles * EXAMPLE_LIST, dtype=torch.int32) % EXAMPLE_SPLATS
+    at = torch.arange(tiles) * EXAMPLE_LIST
+    ends = at + EXAMPLE_LIST
     pixels = [torch.full((tiles, PIXELS), 0.5) for _ in range(planes)]
-    return rows, ids, at, torch.ones(tiles, 2), *pixels, *tile_centres(rows), torch.ones(tiles)
+    return rows, ids, at, ends, torch.ones(tiles, 2), *pixels, *tile_centres(rows), torch.ones(tiles)
 
 
 @cache
@@ -233,7 +242,7 @@ def pass_kernel(pixel: PixelKernel, rules: Rules) -> Kernel:
         f"composite-{pixel.name}{rules.tag}",
         partial(_pass, pixel, rules),
         partial(tiles_example, 5, pixel.columns),
-        ("m", "p", *7 * ("t",), None, None, "t"),
+        ("m", "p", *8 * ("t",), None, None, "t"),
         evaluations=pixel.splats_per_pass,
         alone=ALONE,
     )

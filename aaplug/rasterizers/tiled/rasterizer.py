@@ -13,7 +13,6 @@ from functools import partial
 from itertools import chain
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.errors import UsageError
@@ -27,9 +26,10 @@ from aaplug.methods.pixel_kernels.raster_rows import TILE, tile_centres
 from aaplug.rasterizers.tiled.backward import composite
 from aaplug.rasterizers.tiled.binning import MEMORY, Bins, bands
 from aaplug.rasterizers.tiled.forward import Compositing
+from aaplug.rasterizers.tiled.layout import placed
 from aaplug.rasterizers.tiled.packages import CountingKernels
 
-Painter = Callable[[Bins], tuple[Tensor, Tensor]]
+Painter = Callable[[Bins], Tensor]  # premultiplied colour, and alpha, of a band: 4 planes
 BLENDED_TILES = 512  # composited together by a compositor, so that what it keeps per pixel fits the cache
 
 
@@ -82,9 +82,8 @@ class Tiled:
 
         def painted() -> Iterator[Render]:
             for bins in bands(ellipses, grid, self.kernels, self.memory, rules, gradients):
-                colours, alphas = paint(bins)
-                rgb, alpha = (_untiled(x, grid[1]) for x in (colours, alphas[None]))
-                yield over(rgb, alpha[..., 0], background)
+                image = paint(bins)
+                yield over(image[:3].permute(1, 2, 0), image[3], background)
 
         whole = _assembled(painted(), grid[0] * TILE)
         return Render(whole.rgb[: hw[0], : hw[1]], whole.alpha[: hw[0], : hw[1]])
@@ -94,23 +93,16 @@ class Tiled:
         rows = compositor.rows(splats)
         local = tile_centres(rows)
 
-        def paint(bins: Bins) -> tuple[Tensor, Tensor]:
+        def paint(bins: Bins) -> Tensor:
             order = torch.sort(bins.counts, descending=True, stable=True).indices
             parts = []
             for tiles in order.split(BLENDED_TILES):
                 x, y = (bins.origins[tiles, i, None] + local[i] for i in (0, 1))
                 lists = (bins.splats, bins.first[tiles], bins.counts[tiles])
                 parts.append(compositor.tiles(rows, splats.window, *lists, (x, y), self.kernels, rules))
-            image = torch.cat(parts, dim=1)[:, order.argsort()].to(splats.means)
-            return image[:3], image[3]
+            return placed(torch.cat(parts, dim=1).to(splats.means), order, bins.columns, self.kernels)
 
         return paint
-
-
-def _untiled(tiles: Float[Tensor, "k t P"], columns: int) -> Float[Tensor, "h w k"]:
-    """Put tiles, whole rows of them, in their places.  Each plane stays whole in memory, which copies fastest."""
-    planes = tiles.view(len(tiles), -1, columns, TILE, TILE).transpose(2, 3)
-    return planes.reshape(len(tiles), -1, columns * TILE).permute(1, 2, 0)
 
 
 def _assembled(bands: Iterator[Render], height: int) -> Render:
