@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 BACKWARD = "-backward"  # suffix of the name of a kernel's gradient kernel
+ONE_MORE = "+1"  # suffix of the name of a size
 
 
 @dataclass(frozen=True)
@@ -20,7 +21,8 @@ class Kernel:
     function: tensors in, a tuple of tensors out; what it updates in place must be contiguous.
     example: makes the arguments to compile for, as large as real work: inductor decides by them which loops use
     threads.
-    sizes: per argument the name of its leading size, None where that is fixed; sizes of one name are equal.
+    sizes: per argument the name of its leading size, None where that is fixed; sizes of one name are equal, and "n+1"
+        is one more than "n".
     gathers: the kernel gathers scattered rows.  Inductor would leave the loop scalar; set this where arithmetic
         outweighs the gathers.
     chained: each value is made of many before it, and several read it.  Inductor would write it out again for each.

@@ -8,7 +8,6 @@ nothing cancels.  The camera's centre is subtracted in float64; the rest runs in
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import cache, partial, reduce
-from typing import Any
 
 import torch
 from jaxtyping import Float, Int
@@ -19,7 +18,7 @@ from aaplug.core.gaussians import MAX_LOG_SCALE, Gaussians
 from aaplug.core.kernels import EAGER, Kernel, Kernels, backward_of
 from aaplug.core.rules import NEAR, RULES_3DGS, Rules, variant
 from aaplug.core.spherical_harmonics import sh_colour
-from aaplug.core.splats import Splats2D
+from aaplug.core.splats import Splats2D, picked
 
 JACOBIAN_MARGIN = 0.3  # of half the image: 3DGS linearises no farther out (1.3 tan(fov/2))
 MAX_SIGMA = 1e9  # px: larger splats look the same, but their determinant overflows float32
@@ -63,7 +62,7 @@ def _beyond(near: float, columns: tuple[Tensor, ...], opacities: Float[Tensor, "
     means, covs, dets, depths = columns
     in_front = (depths > near).nonzero().squeeze(1)
     if len(in_front) < len(means):
-        brought = (column.index_select(0, in_front) for column in (means, covs, dets, depths, opacities))
+        brought = (picked(column, in_front) for column in (means, covs, dets, depths, opacities))
         means, covs, dets, depths, opacities = brought
     return Splats2D(means, covs, dets, depths, opacities, in_front)
 
@@ -105,33 +104,9 @@ def _shaded_together(sources: Int[Tensor, " m"], scene: Gaussians) -> Sequence[I
 def _shade(
     sh: Float[Tensor, "n k 3"], means: Float[Tensor, "n 3"], sources: Int[Tensor, " m"], centre: Float[Tensor, " 3"]
 ) -> tuple[Tensor]:
-    offset = (_picked(means, sources).double() - centre).to(means)
+    offset = (picked(means, sources).double() - centre).to(means)
     directions = offset / offset.square().sum(dim=1, keepdim=True).sqrt()
-    return (sh_colour(_picked(sh, sources), directions).clamp(min=0.0),)
-
-
-def _picked(x: Float[Tensor, "n *c"], rows: Int[Tensor, " m"]) -> Float[Tensor, "m *c"]:
-    """Select rows, each at most once."""
-    return _Picked.apply(x, rows)  # pyright: ignore[reportReturnType]
-
-
-class _Picked(torch.autograd.Function):
-    """Copies gradients to their rows; `index_select` would add them atomically, although no row repeats."""
-
-    @staticmethod
-    def forward(x: Tensor, rows: Tensor) -> Tensor:
-        return x.index_select(0, rows)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
-        x, rows = inputs
-        ctx.save_for_backward(rows)
-        ctx.shape = x.shape
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None]:
-        (rows,) = ctx.saved_tensors
-        return grads[0].new_zeros(ctx.shape).index_copy(0, rows, grads[0]), None
+    return (sh_colour(picked(sh, sources), directions).clamp(min=0.0),)
 
 
 def _camera_rows(like: Tensor, camera: Camera) -> tuple[Float[Tensor, " 3"], Float[Tensor, "3 3"], Float[Tensor, " 8"]]:

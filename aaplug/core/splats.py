@@ -7,7 +7,7 @@ correct digit for a needle, computed from the factors of the projection it has a
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -41,11 +41,17 @@ class Splats2D:
 
     def __getitem__(self, index: Tensor | slice) -> "Splats2D":
         """The splats at `index` (a mask, indices or a slice), in that order."""
-        if isinstance(index, Tensor) and index.dtype == torch.bool:
-            index = index.nonzero().squeeze(1)
 
-        def at(column: Tensor) -> Tensor:  # index_select is several times faster than [index]
-            return column[index] if isinstance(index, slice) else column.index_select(0, index)
+        def at(column: Tensor) -> Tensor:
+            if isinstance(index, slice):
+                return column[index]
+            if rows is not None and column.requires_grad:
+                return picked(column, rows)
+            return column.index_select(0, index if rows is None else rows)  # several times faster than [index]
+
+        rows = None
+        if isinstance(index, Tensor) and index.dtype == torch.bool:
+            rows = index.nonzero().squeeze(1)
 
         return replace(self, **{name: at(column) for name, column in self._columns().items()})
 
@@ -96,6 +102,30 @@ def concatenated(parts: Sequence[Splats2D]) -> Splats2D:
         return first
     columns = {name: torch.cat([getattr(part, name) for part in parts]) for name in first._columns()}
     return replace(first, **columns)
+
+
+def picked(x: Float[Tensor, "n *c"], rows: Int[Tensor, " m"]) -> Float[Tensor, "m *c"]:
+    """Select rows, each at most once."""
+    return _Picked.apply(x, rows)  # pyright: ignore[reportReturnType]
+
+
+class _Picked(torch.autograd.Function):
+    """Copies gradients to their rows; `index_select` would add them atomically, although no row repeats."""
+
+    @staticmethod
+    def forward(x: Tensor, rows: Tensor) -> Tensor:
+        return x.index_select(0, rows)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
+        x, rows = inputs
+        ctx.save_for_backward(rows)
+        ctx.shape = x.shape
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None]:
+        (rows,) = ctx.saved_tensors
+        return grads[0].new_zeros(ctx.shape).index_copy(0, rows, grads[0]), None
 
 
 class Render(NamedTuple):

@@ -18,7 +18,7 @@ from torch.nn import functional
 
 from aaplug.core.ellipses import whitening, whitening_columns
 from aaplug.core.interfaces import Pixels
-from aaplug.core.kernels import Kernel, Kernels
+from aaplug.core.kernels import Kernel, Kernels, backward_of
 from aaplug.core.rules import Rules
 from aaplug.core.splats import Splats2D
 from aaplug.methods.pixel_kernels.gradients import Move
@@ -175,5 +175,6 @@ def _from_sums_example() -> tuple[Tensor, ...]:
 
 ROOT_OF_EXP2 = _root_of_exp2(SQUARINGS, DEGREE)
 POINT_ROWS = Kernel("point-rows", _point_rows, lambda: (*splat_example(), torch.ones(100_000, 3)), ("m",) * 5)
+POINT_ROWS_BACKWARD = backward_of(POINT_ROWS, ("m+1",))
 FROM_SUMS = Kernel("composite-sums", _from_sums, _from_sums_example, ("m", "m"))
 POINT = Point()

@@ -22,7 +22,7 @@ import torch
 from aaplug.core import culling, ellipses, kernels, projection, rules, spherical_harmonics, splats
 from aaplug.core.errors import UsageError
 from aaplug.core.executors import Processes, torch_threads
-from aaplug.core.kernels import EAGER, Kernel, Kernels
+from aaplug.core.kernels import EAGER, ONE_MORE, Kernel, Kernels
 from aaplug.core.locks import scratch
 from aaplug.core.monitor import Tell
 from aaplug.core.rules import RULES_3DGS
@@ -42,6 +42,7 @@ KERNELS: tuple[Kernel, ...] = (  # those that take longest to compile come last
     layout.PLACED,
     backward.SLOTS,
     point.FROM_SUMS,
+    point.POINT_ROWS_BACKWARD,
     *projection.SHADE_BACKWARD.values(),
     backward.step_kernel(POINT, RULES_3DGS),
     projection.PROJECT_BACKWARD,
@@ -195,9 +196,9 @@ def _build(name: str) -> None:
     """Build one kernel, by its name, so that it can run in another process."""
     kernel = next(kernel for kernel in KERNELS if kernel.name == name)
     path = _path(kernel)
-    sizes = {
-        name: torch.export.Dim(f"size_{name}", min=2, max=LARGEST_SIZE) for name in kernel.sizes if name is not None
-    }
+    names = {name.removesuffix(ONE_MORE) for name in kernel.sizes if name is not None}
+    sizes = {name: torch.export.Dim(f"size_{name}", min=2, max=LARGEST_SIZE) for name in names}
+    sizes |= {name + ONE_MORE: size + 1 for name, size in sizes.items()}
     shapes = tuple({0: sizes[name]} if name is not None else None for name in kernel.sizes)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -27,6 +27,7 @@ from aaplug.methods.pixel_kernels.raster_rows import BLUE, GREEN, RED, tile_cent
 from aaplug.rasterizers.tiled.binning import Bins
 from aaplug.rasterizers.tiled.forward import (
     ALONE,
+    EXAMPLE_TILES,
     STEP,
     Compositing,
     Segment,
@@ -94,7 +95,7 @@ def _backward(
             n = len(before)
             where = (bins.splats, segment.at[:n] + step * STEP, segment.ends[:n], segment.origins[:n])
             pixels = (before, behind[:n], *colours[:, :n].unbind(), *local, ones[:n])
-            (parts[done : done + n],) = how.kernels.run(kernel, rows, *where, *pixels)
+            how.kernels.run(kernel, rows, *where, *pixels, parts[done : done + n])
             part_of.index_copy_(0, step_of[:n] + step, turns[done : done + n])
             done += n
         light.index_copy_(0, segment.tiles, behind)
@@ -143,8 +144,12 @@ def _step(
     local_x: Float[Tensor, " P"],
     local_y: Float[Tensor, " P"],
     one: Float[Tensor, " t"],
-) -> tuple[Float[Tensor, "t c_STEP"]]:
-    """Each tile's contributions to the gradients of K splats; updates `behind`, B_k in the module's docstring."""
+    parts: Float[Tensor, "t c_STEP"],
+) -> tuple[()]:
+    """Write each tile's contributions to the gradients of K splats into `parts`.
+
+    Updates `behind`, B_k in the module's docstring.
+    """
     one = one[:, None]
     before, passed = T, []
     pixels = Pixels(origins, local_x, local_y)
@@ -172,7 +177,8 @@ def _step(
     else:
         sums = sums_by_autograd(pixel, rules, moves[::-1], colours, pixels)
     behind.copy_(light)
-    return (sums,)
+    parts.copy_(sums)
+    return ()
 
 
 def _slots_example() -> tuple[Tensor, ...]:
@@ -195,8 +201,8 @@ def step_kernel(pixel: PixelKernel, rules: Rules) -> Kernel:
     return Kernel(
         f"composite-{pixel.name}{rules.tag}-backward",
         partial(_step, pixel, rules),
-        partial(tiles_example, 6, pixel.columns),
-        ("m", "p", *9 * ("t",), None, None, "t"),
+        lambda: (*tiles_example(6, pixel.columns), torch.zeros(EXAMPLE_TILES, STEP * pixel.columns)),
+        ("m", "p", *9 * ("t",), None, None, "t", "t"),
         alone=ALONE,
     )
 
