@@ -26,6 +26,7 @@ class Kernel:
     gathers: the kernel gathers scattered rows.  Inductor would leave the loop scalar; set this where arithmetic
         outweighs the gathers.
     chained: each value is made of many before it, and several read it.  Inductor would write it out again for each.
+    overlaps: it computes many alike values in turn, and each takes long: g++ should mix their instructions.
     pulls_back: the function computes gradients itself, so it is traced before it is compiled.
     evaluations: splat-pixel evaluations of one call, per pixel of a tile; 0 for kernels that do not composite.
     alone: up to this size "t" it runs on one thread, because waking the others takes longer.
@@ -37,6 +38,7 @@ class Kernel:
     sizes: tuple[str | None, ...]
     gathers: bool = False
     chained: bool = False
+    overlaps: bool = False
     pulls_back: bool = False
     evaluations: int = 0
     alone: int = 0

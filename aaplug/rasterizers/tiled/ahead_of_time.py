@@ -39,7 +39,7 @@ KERNELS: tuple[Kernel, ...] = (  # those that take longest to compile come last
     binning.table_kernel(),
     binning.SPANS,
     binning.PAIRS,
-    layout.PLACED,
+    layout.LINES,
     backward.SLOTS,
     point.FROM_SUMS,
     point.POINT_ROWS_BACKWARD,
@@ -65,9 +65,9 @@ OPTIONS = {
 TILING_HEURISTIC = "cpp.enable_tiling_heuristics"
 # operations up to which inductor writes a value out again for each of its readers, where kernels are chained
 CHAINED = {"realize_opcount_threshold": 10}
-# g++ orders a loop's instructions before it allots registers: independent splats then overlap.  The setting of the
-# architecture is the only one whose text reaches the compiler.
-ORDERED = {"cpp.march": "native -fschedule-insns"} if (sys.platform, platform.machine()) == ("linux", "x86_64") else {}
+# where instructions overlap, g++ orders them before it allots registers; a kernel with many sums would run out of these
+# (the setting of the architecture is the only one whose text reaches the compiler)
+MIXED = {"cpp.march": "native -fschedule-insns"} if (sys.platform, platform.machine()) == ("linux", "x86_64") else {}
 LARGEST_SIZE = 1 << 31
 STANDARD_COMPILER = "clang++" if sys.platform == "darwin" else "g++"
 MOST_PROCESSES = 4  # compilers side by side: each takes most of a GB
@@ -78,7 +78,7 @@ TOLERANCE = 1e-4
 def cache_folder() -> Path:
     """Folder of the packages for this version and this processor."""
     source = "".join(inspect.getsource(module) for module in SOURCES)
-    options = f"{OPTIONS} {TILING_HEURISTIC} {CHAINED} {ORDERED}"
+    options = f"{OPTIONS} {TILING_HEURISTIC} {CHAINED} {MIXED}"
     facts = [torch.__version__, torch.backends.cpu.get_cpu_capability(), source, options]
     key = hashlib.sha256("\0".join(facts).encode()).hexdigest()[:16]
     return Path(platformdirs.user_cache_dir("aaplug", appauthor=False)) / f"kernels-{key}"
@@ -212,7 +212,7 @@ def _build(name: str) -> None:
                 program,
                 package_path=str(folder / "k.pt2"),
                 inductor_configs=OPTIONS
-                | (ORDERED if _compiler() == STANDARD_COMPILER else {})
+                | (MIXED if kernel.overlaps and _compiler() == STANDARD_COMPILER else {})
                 | {TILING_HEURISTIC: not kernel.gathers}
                 | (CHAINED if kernel.chained else {}),
             )

@@ -23,7 +23,7 @@ from aaplug.core.interfaces import PixelKernel, Pixels
 from aaplug.core.kernels import Kernel
 from aaplug.core.rules import Rules
 from aaplug.methods.pixel_kernels.gradients import Move, SumsGradients, sums_by_autograd
-from aaplug.methods.pixel_kernels.raster_rows import BLUE, GREEN, RED, tile_centres
+from aaplug.methods.pixel_kernels.raster_rows import BLUE, GREEN, PIXELS, RED, tile_centres
 from aaplug.rasterizers.tiled.binning import Bins
 from aaplug.rasterizers.tiled.forward import (
     ALONE,
@@ -66,11 +66,11 @@ class _Composite(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None, None]:
         (rows,) = ctx.saved_tensors
-        return _backward(rows, tiles_of(grads[0].contiguous()), *ctx.rest), None, None
+        return _backward(rows, grads[0].contiguous(), *ctx.rest), None, None
 
 
 def _backward(
-    rows: Float[Tensor, "m c"], grads: Float[Tensor, "4 all P"], bins: Bins, segments: list[Segment], how: Compositing
+    rows: Float[Tensor, "m c"], grads: Float[Tensor, "4 h w"], bins: Bins, segments: list[Segment], how: Compositing
 ) -> Float[Tensor, "m c"]:
     """Gradient of the raster rows.
 
@@ -79,29 +79,35 @@ def _backward(
     assert bins.pairs is not None
     local, kernel = tile_centres(rows), step_kernel(how.pixel, how.rules)
     count = sum(len(before) for segment in segments for before in segment.before)
+    if not count:
+        return torch.zeros_like(rows)
     parts = rows.new_empty(count + 1, STEP * rows.shape[1])
     parts[count] = 0
-    turns = torch.arange(count, dtype=torch.int32, device=rows.device)
     steps = (bins.counts + (STEP - 1)) // STEP
     first = steps.cumsum(0) - steps
-    part_of = turns.new_full((int(steps.sum()),), count)  # steps behind saturated pixels contribute nothing
-    light, done = torch.zeros_like(grads[3]), 0
+    light, made, done = grads.new_zeros(len(steps), PIXELS), [], 0
     for segment in reversed(segments):
         behind = light.index_select(0, segment.tiles)
-        colours = grads.index_select(1, segment.tiles)
-        ones = torch.ones_like(segment.origins[:, 0])
+        colours = tiles_of(grads, segment.tiles, bins.columns, how.kernels)
         step_of = first.index_select(0, segment.tiles) + segment.start // STEP
+        ones = torch.ones_like(segment.origins[:, 0])
+        part = whole = [step_of, segment.at, segment.ends, segment.origins, behind, *colours, ones]
         for step, before in reversed([*enumerate(segment.before)]):
             n = len(before)
-            where = (bins.splats, segment.at[:n] + step * STEP, segment.ends[:n], segment.origins[:n])
-            pixels = (before, behind[:n], *colours[:, :n].unbind(), *local, ones[:n])
-            how.kernels.run(kernel, rows, *where, *pixels, parts[done : done + n])
-            part_of.index_copy_(0, step_of[:n] + step, turns[done : done + n])
+            if n != len(part[0]):
+                part = [x[:n] for x in whole]
+            mine, at, ends, corners, *pixels, unit = part
+            where = (bins.splats, at + step * STEP, ends, corners)
+            how.kernels.run(kernel, rows, *where, before, *pixels, *local, unit, parts[done : done + n])
+            made.append(mine + step)
             done += n
         light.index_copy_(0, segment.tiles, behind)
+    # where each step's contributions stand; steps behind saturated pixels contribute nothing
+    part_of = torch.full((int(steps.sum()),), count, dtype=torch.int32, device=rows.device)
+    part_of.index_copy_(0, torch.cat(made), torch.arange(count, dtype=torch.int32, device=rows.device))
     pairs = bins.pairs
     shifts = (first * STEP - bins.first).int()
-    (slots,) = how.kernels.run(SLOTS, turns.new_empty(len(pairs.sorted)), pairs.tiles, shifts, part_of, pairs.sorted)
+    (slots,) = how.kernels.run(SLOTS, part_of.new_empty(len(pairs.sorted)), pairs.tiles, shifts, part_of, pairs.sorted)
     total = torch.zeros_like(rows)
     sums = functional.embedding_bag(slots, parts.view(-1, rows.shape[1]), pairs.starts, mode="sum")
     total.index_copy_(0, pairs.nearest, sums)

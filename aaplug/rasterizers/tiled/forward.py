@@ -106,12 +106,15 @@ def _composite_block(
         before, steps = [], [] if segments is None else _going(counts - start, STEP)
         if segments is not None:
             segments.append(Segment(tiles, start, at, ends, origins, before))
+        part = whole = [at, ends, origins, *planes.unbind(), ones]
         for i, n in enumerate(going):
-            where = (bins.splats, at[:n] + i * splats, ends[:n], origins[:n])
-            pixels = (T[:n], *planes[:, :n].unbind(), *local, ones[:n])
-            *within, after = how.kernels.run(how.kernel, rows, *where, *pixels)
-            here = steps[i * splats // STEP :]
-            before += [x[:m] for x, m in zip((T, *within), here, strict=False)]
+            if n < len(T):
+                T, part = T[:n], [x[:n] for x in whole]
+            begin, end, corners, *light, unit = part
+            where = (bins.splats, begin + i * splats, end, corners)
+            *within, after = how.kernels.run(how.kernel, rows, *where, T, *light, *local, unit)
+            drawn = steps[i * splats // STEP :]
+            before += [x[:m] for x, m in zip((T, *within), drawn, strict=False)]
             T = after
             start += splats
             if i % CHECK_EVERY == CHECK_EVERY - 1 and i + 1 < len(going):
@@ -243,6 +246,7 @@ def pass_kernel(pixel: PixelKernel, rules: Rules) -> Kernel:
         partial(_pass, pixel, rules),
         partial(tiles_example, 5, pixel.columns),
         ("m", "p", *8 * ("t",), None, None, "t"),
+        overlaps=True,
         evaluations=pixel.splats_per_pass,
         alone=ALONE,
     )

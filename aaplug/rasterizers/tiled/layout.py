@@ -1,6 +1,6 @@
 """Planes of pixels: tile by tile, or as an image.
 
-k: planes; l: lines of tiles; t: tiles of TILE × TILE px; P: pixels per tile.
+k: planes; l, a: lines of TILE pixels; t: tiles of TILE × TILE px; P: pixels per tile.
 """
 
 import torch
@@ -16,27 +16,32 @@ def placed(
 ) -> Float[Tensor, "4 h w"]:
     """Planes of an image of `columns` tiles a row.  order: which of the image's tiles each is."""
     ranks = torch.empty_like(order).index_copy_(0, order, torch.arange(len(order), device=order.device))
-    down = torch.arange(TILE, device=order.device)[:, None]
-    lines = (ranks.view(-1, 1, columns) * TILE + down).flatten()
-    (image,) = kernels.run(PLACED, lines, *(plane.reshape(-1, TILE) for plane in planes))
-    return image.view(len(planes), -1, columns * TILE)
+    lines = ranks.view(-1, 1, columns) * TILE + torch.arange(TILE, device=order.device)[:, None]
+    return _brought(planes, lines, kernels).view(len(planes), -1, columns * TILE)
 
 
-def _placed(lines: Int[Tensor, " l"], *planes: Float[Tensor, "l side"]) -> tuple[Float[Tensor, "k l side"]]:
-    """Bring the lines of all tiles, TILE pixels each, in the image's order."""
-    return (torch.stack([plane.index_select(0, lines) for plane in planes]),)
+def tiles_of(
+    image: Float[Tensor, "4 h w"], tiles: Int[Tensor, " t"], columns: int, kernels: Kernels
+) -> Float[Tensor, "4 t P"]:
+    """Planes of some tiles of an image with `columns` tiles a row."""
+    down = torch.arange(TILE, device=tiles.device) * columns
+    lines = (tiles // columns * TILE * columns + tiles % columns)[:, None] + down
+    return _brought(image, lines, kernels).view(len(image), -1, PIXELS)
 
 
-def tiles_of(image: Float[Tensor, "k h w"]) -> Float[Tensor, "k t P"]:
-    """Planes of its tiles, row by row; h and w are multiples of TILE."""
-    planes, height, width = image.shape
-    tiles = image.view(planes, height // TILE, TILE, width // TILE, TILE).transpose(2, 3)
-    return tiles.reshape(planes, -1, PIXELS)
+def _brought(planes: Float[Tensor, "4 *any"], lines: Int[Tensor, "*order"], kernels: Kernels) -> Float[Tensor, "4 l s"]:
+    """Lines of TILE pixels in another order."""
+    return kernels.run(LINES, lines.flatten(), *(plane.reshape(-1, TILE) for plane in planes))[0]
 
 
-def _placed_example() -> tuple[Tensor, ...]:
-    lines = torch.arange(10_000 * TILE).flip(0)
-    return lines, *(torch.linspace(0.0, 1.0, len(lines) * TILE).view(-1, TILE) for _ in range(4))
+def _lines(order: Int[Tensor, " l"], *planes: Float[Tensor, "a side"]) -> tuple[Float[Tensor, "k l side"]]:
+    return (torch.stack([plane.index_select(0, order) for plane in planes]),)
 
 
-PLACED = Kernel("placed", _placed, _placed_example, ("l",) * 5)
+def _lines_example() -> tuple[Tensor, ...]:
+    lines = 10_000 * TILE
+    planes = (torch.linspace(0.0, 1.0, lines * TILE).view(-1, TILE) for _ in range(4))
+    return torch.arange(lines).flip(0), *planes
+
+
+LINES = Kernel("lines", _lines, _lines_example, ("l", *4 * ("a",)))
