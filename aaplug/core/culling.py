@@ -29,7 +29,7 @@ def cull(
     size = splats.means.new_tensor([hw[1], hw[0], margin * max(hw)])
     of = splats if ellipses is None else ellipses
     (inside,) = kernels.run(cull_kernel(rules.min_alpha), of.means, of.covs, of.dets, of.opacities, size)
-    return splats[inside]
+    return splats.selected(inside.nonzero().squeeze(1), kernels)
 
 
 @cache

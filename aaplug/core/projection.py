@@ -18,7 +18,7 @@ from aaplug.core.gaussians import MAX_LOG_SCALE, Gaussians
 from aaplug.core.kernels import EAGER, Kernel, Kernels, backward_of
 from aaplug.core.rules import NEAR, RULES_3DGS, Rules, variant
 from aaplug.core.spherical_harmonics import sh_colour
-from aaplug.core.splats import Splats2D, picked
+from aaplug.core.splats import SELECT, Splats2D, picked
 
 JACOBIAN_MARGIN = 0.3  # of half the image: 3DGS linearises no farther out (1.3 tan(fov/2))
 MAX_SIGMA = 1e9  # px: larger splats look the same, but their determinant overflows float32
@@ -31,7 +31,7 @@ def project(scene: Gaussians, camera: Camera, kernels: Kernels = EAGER, rules: R
     columns = kernels.run(
         project_kernel(rules.near), *(scene.means, scene.quats, scene.log_scales), *_camera_rows(scene.means, camera)
     )
-    return _beyond(rules.near, columns, scene.opacities)
+    return _beyond(rules.near, columns, scene.opacities, kernels)
 
 
 def project_covariances(
@@ -57,13 +57,14 @@ def project_covariances(
     return _beyond(rules.near, columns, opacities)
 
 
-def _beyond(near: float, columns: tuple[Tensor, ...], opacities: Float[Tensor, " n"]) -> Splats2D:
+def _beyond(
+    near: float, columns: tuple[Tensor, ...], opacities: Float[Tensor, " n"], kernels: Kernels = EAGER
+) -> Splats2D:
     """Splats of these means, covariances, determinants and depths, without those before the near plane."""
     means, covs, dets, depths = columns
     in_front = (depths > near).nonzero().squeeze(1)
     if len(in_front) < len(means):
-        brought = (picked(column, in_front) for column in (means, covs, dets, depths, opacities))
-        means, covs, dets, depths, opacities = brought
+        means, covs, dets, depths, opacities = kernels.run(SELECT, in_front, *columns, opacities)
     return Splats2D(means, covs, dets, depths, opacities, in_front)
 
 

@@ -13,8 +13,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from aaplug.core.kernels import EAGER, Kernel, Kernels
+
 # floor of the opacity factor, so that rounding erases no splat (3DGS)
 MIN_COMPENSATION = 0.005
+SHAPE = ("means", "covs", "dets", "depths", "opacities")  # columns that every splat has
 
 
 @dataclass(frozen=True)
@@ -41,19 +44,20 @@ class Splats2D:
 
     def __getitem__(self, index: Tensor | slice) -> "Splats2D":
         """The splats at `index` (a mask, indices or a slice), in that order."""
-
-        def at(column: Tensor) -> Tensor:
-            if isinstance(index, slice):
-                return column[index]
-            if rows is not None and column.requires_grad:
-                return picked(column, rows)
-            return column.index_select(0, index if rows is None else rows)  # several times faster than [index]
-
-        rows = None
         if isinstance(index, Tensor) and index.dtype == torch.bool:
-            rows = index.nonzero().squeeze(1)
+            return self.selected(index.nonzero().squeeze(1))
+
+        def at(column: Tensor) -> Tensor:  # index_select is several times faster than [index]
+            return column[index] if isinstance(index, slice) else column.index_select(0, index)
 
         return replace(self, **{name: at(column) for name, column in self._columns().items()})
+
+    def selected(self, rows: Int[Tensor, " k"], kernels: Kernels = EAGER) -> "Splats2D":
+        """The splats at `rows`, each at most once."""
+        columns = self._columns()
+        shape = kernels.run(SELECT, rows, *(columns.pop(name) for name in SHAPE))
+        rest = {name: column.index_select(0, rows) for name, column in columns.items()}
+        return replace(self, **dict(zip(SHAPE, shape, strict=True)), **rest)
 
     def to(self, dtype: torch.dtype) -> "Splats2D":
         """The same splats in another precision."""
@@ -104,6 +108,16 @@ def concatenated(parts: Sequence[Splats2D]) -> Splats2D:
     return replace(first, **columns)
 
 
+class Render(NamedTuple):
+    """An image.
+
+    rgb: composited over its background, not clamped to 1.  alpha: the share of the background that is hidden.
+    """
+
+    rgb: Float[Tensor, "h w 3"]
+    alpha: Float[Tensor, "h w"]
+
+
 def picked(x: Float[Tensor, "n *c"], rows: Int[Tensor, " m"]) -> Float[Tensor, "m *c"]:
     """Select rows, each at most once."""
     return _Picked.apply(x, rows)  # pyright: ignore[reportReturnType]
@@ -128,11 +142,15 @@ class _Picked(torch.autograd.Function):
         return grads[0].new_zeros(ctx.shape).index_copy(0, rows, grads[0]), None
 
 
-class Render(NamedTuple):
-    """An image.
+def _selected(rows: Int[Tensor, " k"], *columns: Float[Tensor, "m ..."]) -> tuple[Float[Tensor, "k ..."], ...]:
+    return tuple(picked(column, rows) for column in columns)
 
-    rgb: composited over its background, not clamped to 1.  alpha: the share of the background that is hidden.
-    """
 
-    rgb: Float[Tensor, "h w 3"]
-    alpha: Float[Tensor, "h w"]
+def _select_example() -> tuple[Tensor, ...]:
+    m = 100_000
+    columns = (torch.linspace(0.0, 1.0, width * m) for width in (2, 3, 1, 1, 1))
+    means, covs, *scalars = columns
+    return torch.arange(0, m, 2), means.view(m, 2), covs.view(m, 3), *scalars
+
+
+SELECT = Kernel("select", _selected, _select_example, ("k", *5 * ("m",)))

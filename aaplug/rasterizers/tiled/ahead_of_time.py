@@ -34,11 +34,13 @@ from aaplug.rasterizers.tiled.packages import CompiledKernels, Package
 KERNELS: tuple[Kernel, ...] = (  # those that take longest to compile come last
     projection.project_kernel(),
     *projection.SHADE.values(),
+    splats.SELECT,
     culling.cull_kernel(),
     point.POINT_ROWS,
     binning.table_kernel(),
     binning.SPANS,
     binning.PAIRS,
+    binning.LISTS,
     layout.LINES,
     backward.SLOTS,
     point.FROM_SUMS,

@@ -161,7 +161,7 @@ def _bin(
     starts = _starts(widths)
     tiles, splats = kernels.run(PAIRS, _runs(starts, widths), starts, first, owners)
     by_tile, pairs = torch.sort(tiles, stable=True)
-    drawn = splats.index_select(0, pairs) if len(pairs) else splats.new_zeros(1)
+    drawn = kernels.run(LISTS, splats, pairs)[0] if len(pairs) else splats.new_zeros(1)
     tile = torch.arange(size, device=order.device)
     ends = torch.searchsorted(by_tile, tile.to(tiles), right=True)
     counts = torch.diff(ends, prepend=ends.new_zeros(1))
@@ -233,6 +233,11 @@ def _pairs(
     return (place + (first - starts)[spans]).to(first.dtype), owners[spans]
 
 
+def _lists(splats: Int[Tensor, " p"], pairs: Int[Tensor, " p"]) -> tuple[Int[Tensor, " p"]]:
+    """The splats of pairs, by tile."""
+    return (splats.index_select(0, pairs),)
+
+
 # --------------------------------------------------------------------------------------------------------- kernels
 
 
@@ -250,6 +255,11 @@ def _pairs_example() -> tuple[Tensor, ...]:
     return torch.arange(200_000, dtype=torch.int32) // 4, 4 * spans, (spans % 999).short(), spans
 
 
+def _lists_example() -> tuple[Tensor, ...]:
+    pairs = torch.arange(200_000)
+    return pairs.int(), pairs.flip(0)
+
+
 @cache
 def table_kernel(min_alpha: float = RULES_3DGS.min_alpha) -> Kernel:
     """The table for one cut-off."""
@@ -264,3 +274,4 @@ def table_kernel(min_alpha: float = RULES_3DGS.min_alpha) -> Kernel:
 
 SPANS = Kernel("spans", _spans, _spans_example, ("s", "m", "m", "m", None))
 PAIRS = Kernel("pairs", _pairs, _pairs_example, ("p", "s", "s", "s"))
+LISTS = Kernel("lists", _lists, _lists_example, ("p", "p"))
