@@ -9,7 +9,6 @@ import torch
 
 from aaplug import rasterizers as choice
 from aaplug.core.errors import UsageError
-from aaplug.core.executors import torch_threads
 from aaplug.core.kernels import EAGER, Kernel
 from aaplug.core.rules import RULES_GSPLAT
 from aaplug.core.training import TrainingViews
@@ -210,13 +209,3 @@ def test_one_row_is_left_to_the_eager_function():
     assert ran.run(double, torch.ones(2))[0].tolist() == [3, 3]
     assert ran.run(double, torch.ones(2).double())[0].tolist() == [2, 2]
     assert EAGER.run(double, torch.ones(2))[0].tolist() == [2, 2]
-
-
-@pytest.mark.parametrize(("tiles", "threads"), [(4, 1), (5, 2)])
-def test_few_tiles_are_left_to_one_thread(tiles, threads):
-    kernel = Kernel("few", lambda x: (x,), lambda: (torch.ones(9),), ("t",), alone=4)
-    package = Package(lambda args: [args[0].new_tensor(torch.get_num_threads())], [(torch.float32, torch.Size())])
-    with torch_threads(2):
-        (found,) = CompiledKernels({"few": package}).run(kernel, torch.ones(tiles))
-        assert torch.get_num_threads() == 2
-    assert found == threads

@@ -29,7 +29,6 @@ class Kernel:
     overlaps: it computes many alike values in turn, and each takes long: g++ should mix their instructions.
     pulls_back: the function computes gradients itself, so it is traced before it is compiled.
     evaluations: splat-pixel evaluations of one call, per pixel of a tile; 0 for kernels that do not composite.
-    alone: up to this size "t" it runs on one thread, because waking the others takes longer.
     """
 
     name: str
@@ -41,7 +40,6 @@ class Kernel:
     overlaps: bool = False
     pulls_back: bool = False
     evaluations: int = 0
-    alone: int = 0
 
     def size(self, name: str, args: tuple[Tensor, ...]) -> int:
         """A leading size of these arguments."""

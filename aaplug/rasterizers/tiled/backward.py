@@ -26,7 +26,6 @@ from aaplug.methods.pixel_kernels.gradients import Move, SumsGradients, sums_by_
 from aaplug.methods.pixel_kernels.raster_rows import BLUE, GREEN, PIXELS, RED, tile_centres
 from aaplug.rasterizers.tiled.binning import Bins
 from aaplug.rasterizers.tiled.forward import (
-    ALONE,
     EXAMPLE_TILES,
     STEP,
     Compositing,
@@ -209,7 +208,6 @@ def step_kernel(pixel: PixelKernel, rules: Rules) -> Kernel:
         partial(_step, pixel, rules),
         lambda: (*tiles_example(6, pixel.columns), torch.zeros(EXAMPLE_TILES, STEP * pixel.columns)),
         ("m", "p", *9 * ("t",), None, None, "t", "t"),
-        alone=ALONE,
     )
 
 

@@ -23,10 +23,9 @@ from aaplug.rasterizers.tiled.binning import Bins
 from aaplug.rasterizers.tiled.layout import placed
 
 STEP = 4  # splats per backward step; transmittance is stored before each step.  With more the compiler splits the loop
-CHECK_EVERY = 2  # passes between checks for saturated tiles
+CHECK_PASSES, CHECK_TILES = 2, 1000  # least passes, and tiles in them, between checks for saturated tiles
 COMPACT_BELOW = 3 / 4  # saturated tiles are dropped once the share of unsaturated ones is below this
 FEWEST = 2  # tiles in a pass: compiled kernels take no fewer, and a tile without splats left stays as it is
-ALONE = 64  # tiles in a call: about what one thread composites while another wakes up
 GATE = 1e9  # lifts any nonzero output of `threshold` above 1, so that min(output · GATE, value) is `value` or 0
 EXAMPLE_TILES, EXAMPLE_SPLATS, EXAMPLE_LIST = (
     1024,
@@ -107,6 +106,7 @@ def _composite_block(
         if segments is not None:
             segments.append(Segment(tiles, start, at, ends, origins, before))
         part = whole = [at, ends, origins, *planes.unbind(), ones]
+        passes, passed = 0, 0
         for i, n in enumerate(going):
             if n < len(T):
                 T, part = T[:n], [x[:n] for x in whole]
@@ -117,7 +117,9 @@ def _composite_block(
             before += [x[:m] for x, m in zip((T, *within), drawn, strict=False)]
             T = after
             start += splats
-            if i % CHECK_EVERY == CHECK_EVERY - 1 and i + 1 < len(going):
+            passes, passed = passes + 1, passed + n
+            if passes >= CHECK_PASSES and passed >= CHECK_TILES and i + 1 < len(going):
+                passes, passed = 0, 0
                 alive = T[: going[i + 1]].amax(dim=1) > 0
                 count = int(alive.sum())
                 if count < COMPACT_BELOW * len(alive):
@@ -248,5 +250,4 @@ def pass_kernel(pixel: PixelKernel, rules: Rules) -> Kernel:
         ("m", "p", *8 * ("t",), None, None, "t"),
         overlaps=True,
         evaluations=pixel.splats_per_pass,
-        alone=ALONE,
     )

@@ -1,14 +1,12 @@
 """Kernels that do more than run eagerly: compiled packages where they fit, and counting the work of compositing."""
 
 from collections.abc import Callable, Mapping
-from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from aaplug.core.executors import torch_threads
 from aaplug.core.kernels import BACKWARD, Kernel, Kernels
 from aaplug.methods.pixel_kernels.raster_rows import PIXELS
 
@@ -63,9 +61,7 @@ class CompiledKernels(Kernels):
         if package is None or not package.takes(args):
             return super().run(kernel, *args)
         if not (torch.is_grad_enabled() and any(arg.requires_grad for arg in args)):
-            alone = kernel.alone and kernel.size("t", args) <= kernel.alone
-            with torch_threads(1) if alone else nullcontext():
-                return tuple(package.run([arg.contiguous() for arg in args]))
+            return tuple(package.run([arg.contiguous() for arg in args]))
         backward = self._package(kernel.name + BACKWARD)
         if backward is None:
             return super().run(kernel, *args)
