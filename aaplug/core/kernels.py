@@ -4,7 +4,7 @@ A kernel is a function of tensors.  Run eagerly it is plain array code, for any 
 `rasterizers.tiled.ahead_of_time` compiles the same source into one fused loop.  A stage asks its `Kernels` to run it.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -26,7 +26,8 @@ class Kernel:
     gathers: the kernel gathers scattered rows.  Inductor would leave the loop scalar; set this where arithmetic
         outweighs the gathers.
     chained: each value is made of many before it, and several read it.  Inductor would write it out again for each.
-    overlaps: it computes many alike values in turn, and each takes long: g++ should mix their instructions.
+    overlaps: it computes many independent values in turn, so g++ should schedule instructions before it allocates
+        registers.  With many sums it would run out of registers.
     pulls_back: the function computes gradients itself, so it is traced before it is compiled.
     evaluations: splat-pixel evaluations of one call, per pixel of a tile; 0 for kernels that do not composite.
     """
@@ -46,10 +47,11 @@ class Kernel:
         return len(args[self.sizes.index(name)])
 
 
-def backward_of(kernel: Kernel, results: tuple[str, ...]) -> Kernel:
+def backward_of(kernel: Kernel, results: tuple[str, ...], chained: bool = False) -> Kernel:
     """The kernel for the gradient of each floating point argument of a kernel without side effects.
 
     It takes the arguments, then the gradients of the results, whose leading sizes are named in `results`.
+    chained: see `Kernel`.
     """
     count = len(kernel.sizes)
 
@@ -73,7 +75,10 @@ def backward_of(kernel: Kernel, results: tuple[str, ...]) -> Kernel:
 
     sizes = (*kernel.sizes, *results)
     name = kernel.name + BACKWARD
-    return Kernel(name, function, example, sizes, kernel.gathers, kernel.chained, pulls_back=True)
+    return Kernel(name, function, example, sizes, kernel.gathers, chained, pulls_back=True)
+
+
+Runner = Callable[..., Sequence[Tensor]]
 
 
 class Kernels:
@@ -87,10 +92,17 @@ class Kernels:
 
     def run(self, kernel: Kernel, *args: Tensor) -> tuple[Tensor, ...]:
         """Run one stage."""
-        return kernel.function(*args)
+        return tuple(self.runner(kernel, args)(*args))
+
+    def runner(self, kernel: Kernel, args: tuple[Tensor, ...]) -> Runner:
+        """What runs a stage for these arguments, and for others that differ in leading sizes, from 2, and values only.
+
+        Many small calls cost less so.
+        """
+        return kernel.function
 
 
-def written_out(x: Tensor) -> Tensor:
+def materialized(x: Tensor) -> Tensor:
     """x itself; a compiled kernel computes it in a loop of its own, where it would compute it again at each use."""
     return x.as_strided(x.shape, x.stride()) if torch.compiler.is_compiling() else x
 

@@ -221,7 +221,7 @@ def project_kernel(near: float = NEAR) -> Kernel:
     return Kernel(name, function, _project_example, sizes, gathers=True)
 
 
-PROJECT_BACKWARD = backward_of(project_kernel(), ("n", "n", "n", "n"))
+PROJECT_BACKWARD = backward_of(project_kernel(), ("n", "n", "n", "n"), chained=True)
 SHADE = {  # by coefficients per channel
     k: Kernel(f"shade-{k}", _shade, partial(_shade_example, k), ("n", "n", "m", None)) for k in (4, 9, 16)
 }

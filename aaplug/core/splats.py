@@ -17,7 +17,7 @@ from aaplug.core.kernels import EAGER, Kernel, Kernels
 
 # floor of the opacity factor, so that rounding erases no splat (3DGS)
 MIN_COMPENSATION = 0.005
-SHAPE = ("means", "covs", "dets", "depths", "opacities")  # columns that every splat has
+SHAPE = ("means", "covs", "dets", "depths", "opacities")  # floating point columns that every splat has
 
 
 @dataclass(frozen=True)
@@ -56,8 +56,9 @@ class Splats2D:
         """The splats at `rows`, each at most once."""
         columns = self._columns()
         shape = kernels.run(SELECT, rows, *(columns.pop(name) for name in SHAPE))
-        rest = {name: column.index_select(0, rows) for name, column in columns.items()}
-        return replace(self, **dict(zip(SHAPE, shape, strict=True)), **rest)
+        sources = columns.pop("sources").index_select(0, rows)
+        rest = {name: picked(column, rows) for name, column in columns.items()}
+        return replace(self, **dict(zip(SHAPE, shape, strict=True)), sources=sources, **rest)
 
     def to(self, dtype: torch.dtype) -> "Splats2D":
         """The same splats in another precision."""

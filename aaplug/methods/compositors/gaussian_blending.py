@@ -37,14 +37,14 @@ from aaplug.core.ellipses import principal_columns
 from aaplug.core.kernels import Kernel, Kernels
 from aaplug.core.rules import RULES_3DGS, Rules
 from aaplug.core.splats import Splats2D
-from aaplug.methods.pixel_kernels.raster_rows import COLUMNS, PIXELS, rows_of
+from aaplug.methods.pixel_kernels.raster_rows import COLUMNS, PIXELS, next_rows, rows_of
 
 LEAST_VARIANCE = 1e-3  # px²: of a window along one side
 PLAIN = 0.1  # standard deviations: a window that spans less is taken as a point
 NARROW = 0.3  # standard deviations: half windows below which a series keeps more digits than a difference
 FARTHEST = 4.0  # standard deviations from a window's edge, beyond which the mean is below every cut-off
 SPLATS_PER_PASS = 4  # more compile slowly
-PASSES = 2  # whose rows are gathered at once
+GATHERED = 2 * SPLATS_PER_PASS  # raster rows that a tile gathers at once
 COMPACT_BELOW = 7 / 8  # tiles that are done are dropped once the share of the others is below this
 FEWEST = 2  # tiles in a pass: compiled kernels take no fewer
 EXAMPLE_TILES, EXAMPLE_SPLATS = 1024, 4096  # as large as real work: inductor chooses by them which loops use threads
@@ -170,13 +170,10 @@ class GaussianBlending:
         image = x.new_zeros(4, *x.shape)
         tiles, light = torch.arange(len(counts), device=x.device), light_of(x, window)
         at, ends, kernel = first, first + counts, pass_kernel(rules)
-        turns = torch.arange(PASSES * SPLATS_PER_PASS, device=x.device).view(PASSES, 1, -1)
         while len(tiles):
-            places = at[:, None] + turns
-            owners = torch.where(places < ends[:, None], order[places.clamp(max=len(order) - 1)], len(rows) - 1)
-            for drawn in rows.index_select(0, owners.flatten()).view(*owners.shape, -1):
+            for drawn in next_rows(rows, order, at, ends, GATHERED).split(SPLATS_PER_PASS, dim=1):
                 light = Light(*kernels.run(kernel, drawn, x, y, *light))
-            at = torch.minimum(at + turns.numel(), ends)
+            at = torch.minimum(at + GATHERED, ends)
             alive = (at < ends) & (light.share.amax(dim=1) >= rules.min_transmittance)
             count = int(alive.sum())
             if count >= COMPACT_BELOW * len(tiles):

@@ -1,6 +1,7 @@
 """Raster rows: what a tile needs to know of a splat, one row of numbers each.
 
-m: splats; t: tiles of TILE × TILE px; P: pixels per tile; n: rows per tile; c: columns.
+m: splats; p: pairs of a splat and a tile; t: tiles of TILE × TILE px; P: pixels per tile; n: rows per tile; K: splats
+of a tile in turn; c: columns.
 
 The first columns are the same for every pixel kernel: two linear forms u, v of the pixel's position, which whiten the
 splat, its centre, opacity and colour.  Linear forms keep the digits that the expanded quadratic form of a needle loses.
@@ -9,10 +10,11 @@ splat, its centre, opacity and colour.  Linear forms keep the digits that the ex
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from aaplug.core.interfaces import Pixels
+from aaplug.core.kernels import materialized
 from aaplug.core.splats import Splats2D
 
 TILE = 8  # px: side of a tile
@@ -61,6 +63,15 @@ def offsets_at(row: Float[Tensor, "*n t c"], pixels: Pixels) -> tuple[Float[Tens
 
 def _from_corner(row: Float[Tensor, "*n t c"], pixels: Pixels) -> tuple[Float[Tensor, "*n t"], Float[Tensor, "*n t"]]:
     return row[..., X] - pixels.corners[:, 0], row[..., Y] - pixels.corners[:, 1]
+
+
+def next_rows(
+    rows: Float[Tensor, "m c"], ids: Int[Tensor, " p"], at: Int[Tensor, " t"], ends: Int[Tensor, " t"], count: int
+) -> Float[Tensor, "t K c"]:
+    """Raster rows of each tile's next `count` splats, from `at`; the padding row where none are left."""
+    place = at[:, None] + torch.arange(count, device=at.device)
+    owners = torch.where(place < ends[:, None], ids[place.clamp(max=ids.shape[0] - 1)], rows.shape[0] - 1)
+    return materialized(rows.index_select(0, owners.flatten()).view(-1, count, rows.shape[1]))
 
 
 def splat_example() -> tuple[Tensor, ...]:

@@ -15,6 +15,7 @@ import sys
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import platformdirs
 import torch
@@ -67,9 +68,7 @@ OPTIONS = {
 TILING_HEURISTIC = "cpp.enable_tiling_heuristics"
 # operations up to which inductor writes a value out again for each of its readers, where kernels are chained
 CHAINED = {"realize_opcount_threshold": 10}
-# where instructions overlap, g++ orders them before it allots registers; a kernel with many sums would run out of these
-# (the setting of the architecture is the only one whose text reaches the compiler)
-MIXED = {"cpp.march": "native -fschedule-insns"} if (sys.platform, platform.machine()) == ("linux", "x86_64") else {}
+SCHEDULED = "native -fschedule-insns"  # as the architecture, the only setting whose text reaches g++
 LARGEST_SIZE = 1 << 31
 STANDARD_COMPILER = "clang++" if sys.platform == "darwin" else "g++"
 MOST_PROCESSES = 4  # compilers side by side: each takes most of a GB
@@ -80,7 +79,7 @@ TOLERANCE = 1e-4
 def cache_folder() -> Path:
     """Folder of the packages for this version and this processor."""
     source = "".join(inspect.getsource(module) for module in SOURCES)
-    options = f"{OPTIONS} {TILING_HEURISTIC} {CHAINED} {MIXED}"
+    options = f"{OPTIONS} {TILING_HEURISTIC} {CHAINED} {SCHEDULED} {_compiler()}"
     facts = [torch.__version__, torch.backends.cpu.get_cpu_capability(), source, options]
     key = hashlib.sha256("\0".join(facts).encode()).hexdigest()[:16]
     return Path(platformdirs.user_cache_dir("aaplug", appauthor=False)) / f"kernels-{key}"
@@ -211,12 +210,7 @@ def _build(name: str) -> None:
             module = make_fx(kernel.function, tracing_mode="symbolic")(*args) if kernel.pulls_back else _Module(kernel)
             program = torch.export.export(module, args, dynamic_shapes=shapes if kernel.pulls_back else (shapes,))
             made = torch._inductor.aoti_compile_and_package(
-                program,
-                package_path=str(folder / "k.pt2"),
-                inductor_configs=OPTIONS
-                | (MIXED if kernel.overlaps and _compiler() == STANDARD_COMPILER else {})
-                | {TILING_HEURISTIC: not kernel.gathers}
-                | (CHAINED if kernel.chained else {}),
+                program, package_path=str(folder / "k.pt2"), inductor_configs=_configs(kernel)
             )
             os.replace(made, path)
     except OSError as error:
@@ -224,6 +218,18 @@ def _build(name: str) -> None:
     except Exception as error:  # a compiler can fail in any way
         problem = f"torch {torch.__version__} cannot compile '{kernel.name}' here: {error}"
         raise UsageError("warmup", problem) from error
+
+
+def _configs(kernel: Kernel) -> dict[str, Any]:
+    """Inductor's settings."""
+    from torch._inductor.config import cpp  # takes long
+
+    configs = OPTIONS | {TILING_HEURISTIC: not kernel.gathers} | (CHAINED if kernel.chained else {})
+    x86_linux = (sys.platform, platform.machine()) == ("linux", "x86_64")
+    free = getattr(cpp, "march", "missing") is None  # known to this torch, and not set by the user
+    if kernel.overlaps and x86_linux and free and Path(_compiler()).name == STANDARD_COMPILER:
+        configs |= {"cpp.march": SCHEDULED}
+    return configs
 
 
 class _Module(torch.nn.Module):

@@ -1,6 +1,7 @@
 """Compositing, backward: from the last splats of each tile to the first, in steps of STEP.
 
-t: tiles; K: splats per step; P: pixels per tile; m: raster rows; c: columns of a raster row.
+t: tiles; K: splats per step; P: pixels per tile; m: raster rows; c: columns of a raster row; p: pairs of a splat and
+a tile; s: steps of all tiles.
 
 g: the loss's gradient in the pixel's premultiplied colour and alpha.  c_k: colour of splat k, extended by a 1 for
 alpha.  T_k: transmittance in front of it.  B_k: g · (what the splats behind k composite to, with nothing in front).
@@ -23,17 +24,17 @@ from aaplug.core.interfaces import PixelKernel, Pixels
 from aaplug.core.kernels import Kernel
 from aaplug.core.rules import Rules
 from aaplug.methods.pixel_kernels.gradients import Move, SumsGradients, sums_by_autograd
-from aaplug.methods.pixel_kernels.raster_rows import BLUE, GREEN, PIXELS, RED, tile_centres
+from aaplug.methods.pixel_kernels.raster_rows import BLUE, GREEN, PIXELS, RED, next_rows, tile_centres
 from aaplug.rasterizers.tiled.binning import Bins
 from aaplug.rasterizers.tiled.forward import (
     EXAMPLE_TILES,
+    FEWEST,
     STEP,
     Compositing,
     Segment,
     composite_forward,
     in_turn,
     less,
-    next_rows,
     tiles_example,
     transmitted,
     where_above,
@@ -83,7 +84,7 @@ def _backward(
     parts = rows.new_empty(count + 1, STEP * rows.shape[1])
     parts[count] = 0
     steps = (bins.counts + (STEP - 1)) // STEP
-    first = steps.cumsum(0) - steps
+    first, total = steps.cumsum(0) - steps, int(steps.sum())
     light, made, done = grads.new_zeros(len(steps), PIXELS), [], 0
     for segment in reversed(segments):
         behind = light.index_select(0, segment.tiles)
@@ -91,28 +92,33 @@ def _backward(
         step_of = first.index_select(0, segment.tiles) + segment.start // STEP
         ones = torch.ones_like(segment.origins[:, 0])
         part = whole = [step_of, segment.at, segment.ends, segment.origins, behind, *colours, ones]
+        run = None
         for step, before in reversed([*enumerate(segment.before)]):
             n = len(before)
             if n != len(part[0]):
                 part = [x[:n] for x in whole]
             mine, at, ends, corners, *pixels, unit = part
             where = (bins.splats, at + step * STEP, ends, corners)
-            how.kernels.run(kernel, rows, *where, before, *pixels, *local, unit, parts[done : done + n])
-            made.append(mine + step)
+            args = (rows, *where, before, *pixels, *local, unit, parts[done : done + n])
+            run = run or how.kernels.runner(kernel, args)
+            run(*args)
+            # among the fewest tiles one may have no splats left: its step is none of the list
+            made.append(mine + step if n > FEWEST else torch.where(at + step * STEP < ends, mine + step, total))
             done += n
         light.index_copy_(0, segment.tiles, behind)
     # where each step's contributions stand; steps behind saturated pixels contribute nothing
-    part_of = torch.full((int(steps.sum()),), count, dtype=torch.int32, device=rows.device)
+    part_of = torch.full((total + 1,), count, dtype=torch.int32, device=rows.device)
     part_of.index_copy_(0, torch.cat(made), torch.arange(count, dtype=torch.int32, device=rows.device))
     pairs = bins.pairs
     shifts = (first * STEP - bins.first).int()
-    (slots,) = how.kernels.run(SLOTS, part_of.new_empty(len(pairs.sorted)), pairs.tiles, shifts, part_of, pairs.sorted)
-    total = torch.zeros_like(rows)
+    slots = part_of.new_empty(len(pairs.sorted))
+    how.kernels.run(SLOTS, slots, pairs.tiles, shifts, part_of, pairs.sorted)
+    summed = torch.zeros_like(rows)
     sums = functional.embedding_bag(slots, parts.view(-1, rows.shape[1]), pairs.starts, mode="sum")
-    total.index_copy_(0, pairs.nearest, sums)
+    summed.index_copy_(0, pairs.nearest, sums)
     if isinstance(how.pixel, SumsGradients):
-        return how.pixel.from_sums(rows, total, how.kernels)
-    return total
+        return how.pixel.from_sums(rows, summed, how.kernels)
+    return summed
 
 
 def _slots(
@@ -121,15 +127,15 @@ def _slots(
     shifts: Int[Tensor, " t"],
     part_of: Int[Tensor, " s"],
     pairs: Int[Tensor, " p"],
-) -> tuple[Int[Tensor, " p"]]:
-    """Where each pair's contribution stands among those of all splats of all steps.
+) -> tuple[()]:
+    """Write into `slots` where each pair's contribution stands among those of all splats of all steps.
 
     tiles: sorted; pairs: their pairs.  shifts: how far a tile's list moves when each is padded to whole steps.
     part_of: where each step's contributions stand among all steps.
     """
-    stand = torch.arange(tiles.shape[0], dtype=torch.int32, device=tiles.device) + shifts[tiles.int()]
-    slots.index_put_((pairs,), part_of[stand // STEP] * STEP + stand % STEP)
-    return (slots,)
+    place = torch.arange(tiles.shape[0], dtype=torch.int32, device=tiles.device) + shifts[tiles.int()]
+    slots.index_put_((pairs,), part_of[place // STEP] * STEP + place % STEP)
+    return ()
 
 
 def _step(
@@ -187,17 +193,11 @@ def _step(
 
 
 def _slots_example() -> tuple[Tensor, ...]:
-    tiles, each = 10_000, 5 * STEP
+    tiles, each = 10_000, 5 * STEP - 1
     pairs = torch.arange(tiles * each)
-    by_tile = (pairs // each).short()
-    steps = torch.arange(len(pairs) // STEP, dtype=torch.int32)
-    return (
-        torch.zeros_like(pairs, dtype=torch.int32),
-        by_tile,
-        torch.zeros(tiles, dtype=torch.int32),
-        steps,
-        pairs.flip(0),
-    )
+    shifts = torch.arange(tiles, dtype=torch.int32)  # each list moves by one more
+    steps = torch.arange(5 * tiles, dtype=torch.int32)
+    return pairs.int(), (pairs // each).short(), shifts, steps, pairs.flip(0)
 
 
 @cache

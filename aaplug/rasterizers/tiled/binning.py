@@ -19,7 +19,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from aaplug.core.ellipses import squared_cutoff
-from aaplug.core.kernels import Kernel, Kernels, written_out
+from aaplug.core.kernels import Kernel, Kernels, materialized
 from aaplug.core.rules import RULES_3DGS, Rules, variant
 from aaplug.core.splats import Splats2D
 from aaplug.methods.pixel_kernels.raster_rows import TILE, splat_example
@@ -63,8 +63,8 @@ class Bins:
 
 
 @dataclass(frozen=True)
-class Spread:
-    """How each splat spreads over tiles.
+class TileBoxes:
+    """Which tiles each splat may reach.
 
     table: what its spans are computed from; see `_table_rows`.
     top, bottom: its first row of tiles, and the one past its last.  wide: columns of tiles of its box.
@@ -86,9 +86,9 @@ def bands(
     gradients: bool = False,
 ) -> Iterator[Bins]:
     """Bins of bands of tile rows, from the top; with `pairs` if `gradients`."""
-    order, spread = _depth_order(splats.depths), _spread(splats, grid, kernels, rules)
-    for rows in _rows(spread, grid, min(MOST_PAIRS, max(1, int(memory / PAIR_BYTES)))):
-        yield _bin(spread, order, rows, grid[1], kernels, gradients)
+    order, boxes = _depth_order(splats.depths), _tile_boxes(splats, grid, kernels, rules)
+    for rows in _rows(boxes, grid, min(MOST_PAIRS, max(1, int(memory / PAIR_BYTES)))):
+        yield _bin(boxes, order, rows, grid[1], kernels, gradients)
 
 
 def _depth_order(depths: Float[Tensor, " m"]) -> Int[Tensor, " m"]:
@@ -100,10 +100,10 @@ def _depth_order(depths: Float[Tensor, " m"]) -> Int[Tensor, " m"]:
     return torch.sort(keys, stable=True).indices
 
 
-def _spread(splats: Splats2D, grid: tuple[int, int], kernels: Kernels, rules: Rules) -> Spread:
+def _tile_boxes(splats: Splats2D, grid: tuple[int, int], kernels: Kernels, rules: Rules) -> TileBoxes:
     limit = splats.means.new_tensor([grid[1], grid[0]])
     columns = (splats.means, splats.covs, splats.dets, splats.opacities)
-    return Spread(*kernels.run(table_kernel(rules.min_alpha), *columns, limit))
+    return TileBoxes(*kernels.run(table_kernel(rules.min_alpha), *columns, limit))
 
 
 def _table_rows(
@@ -114,7 +114,7 @@ def _table_rows(
     opacities: Float[Tensor, " m"],
     limit: Float[Tensor, " 2"],
 ) -> tuple[Float[Tensor, "m 8"], Int[Tensor, " m"], Int[Tensor, " m"], Int[Tensor, " m"]]:
-    """The columns of `Spread`.
+    """The columns of `TileBoxes`.
 
     The table's: x, y; slope xy/yy and variance det/yy of x given y; yy; squared cut-off; rightmost point's dy; first
     row of tiles.
@@ -135,14 +135,14 @@ def _table_rows(
     return table, top.int(), bottom.int(), (right - left).int()
 
 
-def _rows(spread: Spread, grid: tuple[int, int], budget: int) -> list[tuple[int, int]]:
+def _rows(boxes: TileBoxes, grid: tuple[int, int], budget: int) -> list[tuple[int, int]]:
     """Cut the grid into bands of whole tile rows with about `budget` candidate pairs and at most `SHORT` tiles each."""
     most = max(1, SHORT // grid[1])
     cuts = [*range(0, grid[0], most), grid[0]]
-    if int((spread.wide * (spread.bottom - spread.top)).sum()) > budget:
-        wide = spread.wide.long()
+    if int((boxes.wide * (boxes.bottom - boxes.top)).sum()) > budget:
+        wide = boxes.wide.long()
         change = wide.new_zeros(grid[0] + 1)
-        change.index_add_(0, spread.top, wide).index_add_(0, spread.bottom, -wide)
+        change.index_add_(0, boxes.top, wide).index_add_(0, boxes.bottom, -wide)
         ends = change.cumsum(0).cumsum(0)[: grid[0]]  # candidates down to each row
         marks = ends.new_tensor(range(budget, int(ends[-1]), budget))
         cuts = sorted({*cuts, *(torch.searchsorted(ends, marks) + 1).tolist()})
@@ -150,12 +150,12 @@ def _rows(spread: Spread, grid: tuple[int, int], budget: int) -> list[tuple[int,
 
 
 def _bin(
-    spread: Spread, order: Int[Tensor, " m"], rows: tuple[int, int], columns: int, kernels: Kernels, gradients: bool
+    boxes: TileBoxes, order: Int[Tensor, " m"], rows: tuple[int, int], columns: int, kernels: Kernels, gradients: bool
 ) -> Bins:
     """Pair splats, nearest first, with the tiles that they overlap in a band of rows."""
-    heights = (spread.bottom.clamp(*rows) - spread.top.clamp(*rows)).index_select(0, order)
+    heights = (boxes.bottom.clamp(*rows) - boxes.top.clamp(*rows)).index_select(0, order)
     down, band = _starts(heights), order.new_tensor([rows[0], columns])
-    first, widths, owners = kernels.run(SPANS, _runs(down, heights), order, down, spread.table, band)
+    first, widths, owners = kernels.run(SPANS, _runs(down, heights), order, down, boxes.table, band)
     size = (rows[1] - rows[0]) * columns
     first = first.short() if size <= SHORT else first  # half as many bits sort in half the time
     starts = _starts(widths)
@@ -170,7 +170,7 @@ def _bin(
     if gradients:
         ahead = torch.cat([starts, starts.new_full((1,), len(pairs))])
         kept = Pairs(order, ahead.index_select(0, down), pairs, by_tile)
-    return Bins(drawn, ends - counts, counts, origins.to(spread.table), columns, kept)
+    return Bins(drawn, ends - counts, counts, origins.to(boxes.table), columns, kept)
 
 
 def _starts(counts: Int[Tensor, " m"]) -> Int[Tensor, " m"]:
@@ -205,8 +205,8 @@ def _spans(
     the one nearest to that point's dy therefore bounds the span; the left edge is symmetric.
     """
     top_row, columns = band.unbind()
-    nearest = written_out(table.index_select(0, order))
-    x, y, slope, variance, yy, cutoff, rightmost, low_y = nearest[ranks].unbind(dim=1)
+    by_depth = materialized(table.index_select(0, order))
+    x, y, slope, variance, yy, cutoff, rightmost, low_y = by_depth[ranks].unbind(dim=1)
     down = (torch.arange(ranks.shape[0], device=ranks.device) - starts[ranks]).to(x)
     tile_y = torch.maximum(low_y, top_row) + down
     top = tile_y * TILE + 0.5 - y

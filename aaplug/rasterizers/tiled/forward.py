@@ -1,6 +1,6 @@
 """Compositing, forward: front-to-back alpha compositing of all tiles at once, as array code that compiles to one loop.
 
-t: tiles of a block; all: tiles of a band; n: the first of t; P: pixels per tile; K: splats per pass or step;
+t: tiles of a block; n: the first of t; P: pixels per tile; K: splats per pass or step;
 m: raster rows; p: entries of `Bins.splats`; c: columns of a raster row.
 
 A pass composites the next splats of every tile.  Tiles are sorted by falling splat count, so tiles with splats left
@@ -16,9 +16,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from aaplug.core.interfaces import PixelKernel, Pixels
-from aaplug.core.kernels import Kernel, Kernels, written_out
+from aaplug.core.kernels import Kernel, Kernels
 from aaplug.core.rules import Rules
-from aaplug.methods.pixel_kernels.raster_rows import BLUE, GREEN, PIXELS, RED, tile_centres
+from aaplug.methods.pixel_kernels.raster_rows import BLUE, GREEN, PIXELS, RED, next_rows, tile_centres
 from aaplug.rasterizers.tiled.binning import Bins
 from aaplug.rasterizers.tiled.layout import placed
 
@@ -106,13 +106,14 @@ def _composite_block(
         if segments is not None:
             segments.append(Segment(tiles, start, at, ends, origins, before))
         part = whole = [at, ends, origins, *planes.unbind(), ones]
-        passes, passed = 0, 0
+        passes, passed, run = 0, 0, None
         for i, n in enumerate(going):
             if n < len(T):
                 T, part = T[:n], [x[:n] for x in whole]
             begin, end, corners, *light, unit = part
-            where = (bins.splats, begin + i * splats, end, corners)
-            *within, after = how.kernels.run(how.kernel, rows, *where, T, *light, *local, unit)
+            args = (rows, bins.splats, begin + i * splats, end, corners, T, *light, *local, unit)
+            run = run or how.kernels.runner(how.kernel, args)
+            *within, after = run(*args)
             drawn = steps[i * splats // STEP :]
             before += [x[:m] for x, m in zip((T, *within), drawn, strict=False)]
             T = after
@@ -194,15 +195,6 @@ def in_turn(
     else:
         alphas = pixel.alpha(rows.transpose(0, 1), pixels, rules)
         yield from zip(rows.unbind(dim=1), alphas.unbind(), strict=True)
-
-
-def next_rows(
-    rows: Float[Tensor, "m c"], ids: Int[Tensor, " p"], at: Int[Tensor, " t"], ends: Int[Tensor, " t"], count: int
-) -> Float[Tensor, "t K c"]:
-    """Raster rows of each tile's next `count` splats, from `at`; the padding row where none are left."""
-    place = at[:, None] + torch.arange(count, device=at.device)
-    owners = torch.where(place < ends[:, None], ids[place.clamp(max=ids.shape[0] - 1)], rows.shape[0] - 1)
-    return written_out(rows.index_select(0, owners.flatten()).view(-1, count, rows.shape[1]))
 
 
 # Eager code costs one pass over memory per operation, and `where` costs most.  In a compiled loop, function calls and

@@ -1,13 +1,14 @@
 """Kernels that do more than run eagerly: compiled packages where they fit, and counting the work of compositing."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from aaplug.core.kernels import BACKWARD, Kernel, Kernels
+from aaplug.core.kernels import BACKWARD, Kernel, Kernels, Runner
 from aaplug.methods.pixel_kernels.raster_rows import PIXELS
 
 
@@ -22,6 +23,14 @@ class Package:
     def of(run: Callable[[list[Tensor]], list[Tensor]], example: tuple[Tensor, ...]) -> "Package":
         """The package that was compiled for an example."""
         return Package(run, [(arg.dtype, arg.shape[1:]) for arg in example])
+
+    def run_whole(self, *args: Tensor) -> list[Tensor]:
+        """Run contiguous arguments."""
+        return self.run([*args])
+
+    def run_any(self, *args: Tensor) -> list[Tensor]:
+        """Run arguments, copying those that are not contiguous."""
+        return self.run([arg.contiguous() for arg in args])
 
     def takes(self, args: tuple[Tensor, ...]) -> bool:
         """Whether it can run these arguments; a leading size of one is a separate case to the compiler."""
@@ -55,17 +64,16 @@ class CompiledKernels(Kernels):
     def __reduce__(self) -> tuple[Callable[[], Kernels], tuple[()]]:
         return self._reload, ()
 
-    def run(self, kernel: Kernel, *args: Tensor) -> tuple[Tensor, ...]:
-        """Run one stage."""
+    def runner(self, kernel: Kernel, args: tuple[Tensor, ...]) -> Runner:
+        """What runs one stage for such arguments."""
         package = self._package(kernel.name)
         if package is None or not package.takes(args):
-            return super().run(kernel, *args)
+            return kernel.function
         if not (torch.is_grad_enabled() and any(arg.requires_grad for arg in args)):
-            return tuple(package.run([arg.contiguous() for arg in args]))
+            whole = all(arg.is_contiguous() for arg in args)
+            return package.run_whole if whole else package.run_any
         backward = self._package(kernel.name + BACKWARD)
-        if backward is None:
-            return super().run(kernel, *args)
-        return _Tracked.apply(package, backward, *args)  # pyright: ignore[reportReturnType]
+        return kernel.function if backward is None else partial(_Tracked.apply, package, backward)
 
     def _package(self, name: str) -> Package | None:
         if name not in self._packages:
@@ -98,8 +106,12 @@ class CountingKernels(Kernels):
         self._kernels, self._add = kernels, add
         self.name, self.tiles = kernels.name, kernels.tiles
 
-    def run(self, kernel: Kernel, *args: Tensor) -> tuple[Tensor, ...]:
-        """Run a kernel."""
-        if kernel.evaluations:
+    def runner(self, kernel: Kernel, args: tuple[Tensor, ...]) -> Runner:
+        """What runs a kernel and counts."""
+        run = self._kernels.runner(kernel, args)
+
+        def counting(*args: Tensor) -> Sequence[Tensor]:
             self._add(kernel.size("t", args) * kernel.evaluations * PIXELS)
-        return self._kernels.run(kernel, *args)
+            return run(*args)
+
+        return counting if kernel.evaluations else run

@@ -1,0 +1,132 @@
+"""Tiles: their lists, the lines that they are made of, and gradients where few of them have splats."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from aaplug.core.executors import torch_threads
+from aaplug.core.kernels import EAGER, Kernels
+from aaplug.core.splats import Splats2D
+from aaplug.methods.pixel_kernels.raster_rows import PIXELS, TILE, next_rows
+from aaplug.rasterizers import Reference, Tiled
+from aaplug.rasterizers.tiled import binning, forward, layout
+from tests.conftest import make_splats
+
+F64 = torch.float64
+SKY = (0.25, 0.5, 1.0)
+
+
+class TwoTilesAtOnce(Kernels):
+    """Eager kernels that composite two tiles a call."""
+
+    tiles = 2
+
+
+def in_tiles(*counts: int) -> Splats2D:
+    """A row of tiles with so many faint splats each, all inside their tile."""
+    tile = torch.arange(len(counts)).repeat_interleave(torch.tensor(counts))
+    splats = make_splats(sum(counts), (TILE, TILE), 4, (-2.0, -1.0)).to(F64)
+    means = 2.5 + (splats.means / TILE).clamp(0, 1) * (TILE - 5)
+    means[:, 0] += TILE * tile
+    covs = torch.tensor([0.3, 0.05, 0.2], dtype=F64).repeat(len(tile), 1)
+    dets = torch.full_like(splats.dets, 0.3 * 0.2 - 0.05**2)
+    return replace(splats, means=means, covs=covs, dets=dets, opacities=0.05 + 0.1 * splats.opacities)
+
+
+def gradients(draw, splats: Splats2D, hw: tuple[int, int]) -> tuple[torch.Tensor, ...]:
+    assert splats.rgb is not None
+    leaves = [x.detach().requires_grad_() for x in (splats.means, splats.opacities, splats.rgb)]
+    means, opacities, rgb = leaves
+    image = draw(replace(splats, means=means, opacities=opacities, rgb=rgb), hw, SKY)
+    weights = torch.linspace(0.5, 1.5, image.alpha.numel(), dtype=F64).view(hw)
+    return torch.autograd.grad((image.rgb.sum(dim=2) * weights + image.alpha * weights.flip(0)).sum(), leaves)
+
+
+@pytest.mark.parametrize("kernels", [EAGER, TwoTilesAtOnce()], ids=["all tiles at once", "two at once"])
+@pytest.mark.parametrize(
+    "counts", [(7,), (7, 0), (0, 7), (0, 7, 0), (20, 3), (3, 20), (40, 1, 1), (1, 1, 40, 0), (5, 70, 2, 9, 33)], ids=str
+)
+def test_gradients_where_few_tiles_have_splats(counts, kernels):
+    splats, hw = in_tiles(*counts), (TILE, TILE * len(counts))
+    found, expected = (gradients(draw, splats, hw) for draw in (Tiled(kernels), Reference()))
+    for fast, slow in zip(found, expected, strict=True):
+        assert slow.abs().amin(dim=-1).max() > 0
+        torch.testing.assert_close(fast, slow, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("place", [(-50.0, 4.0), None], ids=["outside the image", "no splats"])
+def test_gradients_of_what_is_not_drawn_are_0(place):
+    splats = in_tiles(3)
+    splats = splats[:0] if place is None else replace(splats, means=splats.means * 0 + splats.means.new_tensor(place))
+    for grad in gradients(Tiled(), splats, (TILE, TILE)):
+        assert grad.eq(0).all()
+
+
+def test_gradients_have_the_same_bits_for_every_number_of_threads():
+    splats = make_splats(3000, (96, 96), 6, (0.0, 2.0)).to(F64)
+    found = []
+    for threads in (1, 2, 3):
+        with torch_threads(threads):
+            found.append(gradients(Tiled(), splats, (96, 96)))
+    assert found[0][0].abs().sum() > 0
+    for others in found[1:]:
+        assert all(a.equal(b) for a, b in zip(found[0], others, strict=True))
+
+
+def test_when_saturated_tiles_are_dropped_changes_no_bit(monkeypatch):
+    splats = make_splats(2000, (64, 64), 6, (1.0, 3.0))
+    splats = replace(splats, opacities=splats.opacities.clamp(min=0.5))
+
+    def drawn(passes: int, tiles: int) -> tuple[torch.Tensor, ...]:
+        monkeypatch.setattr(forward, "CHECK_PASSES", passes)
+        monkeypatch.setattr(forward, "CHECK_TILES", tiles)
+        evaluations: list[int] = []
+        image = Tiled().counting(evaluations.append)(splats, (64, 64), SKY)
+        return *image, torch.tensor(sum(evaluations))
+
+    often, never = drawn(1, 0), drawn(10_000, 0)
+    assert often[2] < 0.9 * never[2]
+    assert often[0].equal(never[0])
+    assert often[1].equal(never[1])
+
+
+@pytest.mark.parametrize("counts", [[], [0], [0, 0], [3], [0, 2, 0, 0, 1, 4, 0]], ids=str)
+def test_runs_repeat_as_often_as_they_count(counts):
+    lengths = torch.tensor(counts, dtype=torch.int32)
+    runs = binning._runs(binning._starts(lengths), lengths)
+    assert runs.dtype == torch.int32
+    assert runs.equal(torch.repeat_interleave(lengths).int())
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(1, 1), (4, 1), (1, 5), (3, 4)])
+def test_tiles_are_placed_where_they_were_taken_from(rows, columns):
+    image = torch.rand(4, rows * TILE, columns * TILE, generator=torch.Generator().manual_seed(1))
+    order = torch.randperm(rows * columns, generator=torch.Generator().manual_seed(2))
+    tiles = layout.tiles_of(image, order, columns, EAGER)
+    for tile, mine in zip(order.tolist(), tiles.unbind(dim=1), strict=True):
+        y, x = TILE * (tile // columns), TILE * (tile % columns)
+        assert mine.equal(image[:, y : y + TILE, x : x + TILE].reshape(4, PIXELS))
+    assert layout.placed(tiles, order, columns, EAGER).equal(image)
+    some = order[::2]
+    assert layout.tiles_of(image, some, columns, EAGER).equal(tiles[:, ::2])
+
+
+def test_a_tile_without_splats_left_reads_the_padding_row():
+    rows = torch.arange(5.0)[:, None].expand(-1, 2)  # the last is the padding row
+    ids = torch.tensor([3, 1, 2], dtype=torch.int32)
+    at, ends = torch.tensor([0, 2, 3, 9]), torch.tensor([2, 3, 3, 3])
+    found = next_rows(rows, ids, at, ends, 3)
+    assert found[..., 0].tolist() == [[3, 1, 4], [2, 4, 4], [4, 4, 4], [4, 4, 4]]
+
+
+@pytest.mark.parametrize("rows", [[], [4], [5, 0, 3], list(range(9))], ids=str)
+def test_selected_splats_are_those_of_the_rows_and_pass_gradients_on(rows):
+    splats = make_splats(9, (20, 20), 3, (0.0, 1.0)).to(F64)
+    splats = replace(splats, depth_slopes=torch.ones(9, 2, dtype=F64), means=splats.means.requires_grad_())
+    index = torch.tensor(rows, dtype=torch.long)
+    found = splats.selected(index)
+    for name, column in splats._columns().items():
+        assert getattr(found, name).equal(column[index])
+    (grad,) = torch.autograd.grad(found.means.sum() + 0 * splats.means.sum(), splats.means)
+    assert grad.equal(torch.zeros(9, 2, dtype=F64).index_fill(0, index, 1.0))
