@@ -46,8 +46,8 @@ def test_compiled_kernels_give_the_eager_results(built, kernel: Kernel):
         assert (fast.double() - slow.double()).abs().max() < 10 * ANSWER * scale
 
 
-# a loop before it brings raster rows, a loop after it writes the sums out
-LOOPS = {"composite-point": 2, "composite-point-backward": 3, "gaussian-blending": 1}
+# loops before it find and gather raster rows, a loop after it writes the sums out
+LOOPS = {"composite-point": 3, "composite-point-backward": 3, "gaussian-blending": 1}
 
 
 @pytest.mark.parametrize("name", LOOPS)

@@ -20,6 +20,8 @@ from aaplug.core.splats import Splats2D
 TILE = 8  # px: side of a tile
 PIXELS = TILE * TILE
 
+LONG = 8  # rows of a tile: from here on it pays that the loop over rows, which waits for memory, does nothing else
+
 UX, UY, VX, VY, X, Y, OPACITY, RED, GREEN, BLUE = range(10)
 COLUMNS = 10  # columns from here on are a kernel's own
 
@@ -71,6 +73,8 @@ def next_rows(
     """Raster rows of each tile's next `count` splats, from `at`; the padding row where none are left."""
     place = at[:, None] + torch.arange(count, device=at.device)
     owners = torch.where(place < ends[:, None], ids[place.clamp(max=ids.shape[0] - 1)], rows.shape[0] - 1)
+    if count >= LONG:
+        owners = materialized(owners)
     return materialized(rows.index_select(0, owners.flatten()).view(-1, count, rows.shape[1]))
 
 
