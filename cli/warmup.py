@@ -9,7 +9,7 @@ from .console import TERMINAL, print_json, say
 
 @dataclass(frozen=True)
 class Warmup:
-    """Compile the fast rasterizer once for this machine (about two minutes)."""
+    """Compile the fast rasterizer once for this machine (two to three minutes)."""
 
     json: bool = False
     """Print where the kernels are as one JSON object on stdout."""

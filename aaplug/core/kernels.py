@@ -1,7 +1,7 @@
 """Kernels: the elementwise stages of a frame, one source that runs in two ways.
 
 A kernel is a function of tensors.  Run eagerly it is plain array code, for any device, precision and gradient;
-`rasterizers.tiled.ahead_of_time` compiles the same source into one fused loop.  A stage asks its `Kernels` to run it.
+`rasterizers.tiled.ahead_of_time` compiles the same source into few fused loops.  A stage asks its `Kernels` to run it.
 """
 
 from collections.abc import Callable, Sequence

@@ -15,7 +15,7 @@ class Kernels(NamedTuple):
 
 
 def warmup(*, monitor: Monitor = SILENT) -> Kernels:
-    """Compile what is missing, in about two minutes.
+    """Compile what is missing, in two to three minutes.
 
     Raises:
         UsageError: there is no compiler or it fails, or the cache folder cannot be written.

@@ -1,10 +1,12 @@
-"""Compositing, forward: front-to-back alpha compositing of all tiles at once, as array code that compiles to one loop.
+"""Compositing, forward: front-to-back alpha compositing of all tiles at once, as array code that is compiled.
+
+Compiled, a pass gathers its raster rows in one loop and composites in one loop over tiles and pixels.
 
 t: tiles of a block; n: the first of t; P: pixels per tile; K: splats per pass or step;
 m: raster rows; p: entries of `Bins.splats`; c: columns of a raster row.
 
 A pass composites the next splats of every tile.  Tiles are sorted by falling splat count, so tiles with splats left
-are always a prefix.  Every few passes, tiles whose pixels are all saturated may be dropped (compaction).
+are always a prefix.  From time to time, tiles whose pixels are all saturated are dropped (compaction).
 """
 
 from collections.abc import Iterator
@@ -22,16 +24,13 @@ from aaplug.methods.pixel_kernels.raster_rows import BLUE, GREEN, PIXELS, RED, n
 from aaplug.rasterizers.tiled.binning import Bins
 from aaplug.rasterizers.tiled.layout import placed
 
-STEP = 4  # splats per backward step; transmittance is stored before each step.  With more the compiler splits the loop
+STEP = 4  # splats per backward step; transmittance is stored before each step.  With 8 the sums leave the registers
 CHECK_PASSES, CHECK_TILES = 2, 1000  # least passes, and tiles in them, between checks for saturated tiles
 COMPACT_BELOW = 3 / 4  # saturated tiles are dropped once the share of unsaturated ones is below this
 FEWEST = 2  # tiles in a pass: compiled kernels take no fewer, and a tile without splats left stays as it is
 GATE = 1e9  # lifts any nonzero output of `threshold` above 1, so that min(output · GATE, value) is `value` or 0
-EXAMPLE_TILES, EXAMPLE_SPLATS, EXAMPLE_LIST = (
-    1024,
-    4096,
-    16,
-)  # as large as real work: inductor chooses by them which loops use threads
+EXAMPLE_TILES, EXAMPLE_SPLATS = (1024, 4096)  # as large as real work: inductor chooses by them which loops use threads
+EXAMPLE_LIST = 16  # splats of each tile
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The tiled rasterizer: one depth sort, tiles, and compositing as elementwise array code that compiles to one loop.
+"""The tiled rasterizer: one depth sort, tiles, and compositing as elementwise array code that is compiled.
 
 t: tiles of TILE × TILE px; P: pixels per tile.
 
