@@ -225,4 +225,4 @@ PROJECT_BACKWARD = backward_of(project_kernel(), ("n", "n", "n", "n"), chained=T
 SHADE = {  # by coefficients per channel
     k: Kernel(f"shade-{k}", _shade, partial(_shade_example, k), ("n", "n", "m", None)) for k in (4, 9, 16)
 }
-SHADE_BACKWARD = {k: backward_of(kernel, ("m",)) for k, kernel in SHADE.items()}
+SHADE_BACKWARD = {k: backward_of(kernel, ("m",), chained=True) for k, kernel in SHADE.items()}
