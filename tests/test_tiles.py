@@ -94,7 +94,7 @@ def test_when_saturated_tiles_are_dropped_changes_no_bit(monkeypatch):
 @pytest.mark.parametrize("counts", [[], [0], [0, 0], [3], [0, 2, 0, 0, 1, 4, 0]], ids=str)
 def test_runs_repeat_as_often_as_they_count(counts):
     lengths = torch.tensor(counts, dtype=torch.int32)
-    runs = binning._runs(binning._starts(lengths), lengths)
+    runs = binning._runs(binning.starts_of(lengths), lengths)
     assert runs.dtype == torch.int32
     assert runs.equal(torch.repeat_interleave(lengths).int())
 

@@ -25,7 +25,7 @@ from aaplug.core.kernels import Kernel
 from aaplug.core.rules import Rules
 from aaplug.methods.pixel_kernels.gradients import Move, SumsGradients, sums_by_autograd
 from aaplug.methods.pixel_kernels.raster_rows import BLUE, GREEN, PIXELS, RED, next_rows, tile_centres
-from aaplug.rasterizers.tiled.binning import Bins
+from aaplug.rasterizers.tiled.binning import Bins, starts_of
 from aaplug.rasterizers.tiled.forward import (
     EXAMPLE_TILES,
     FEWEST,
@@ -84,7 +84,7 @@ def _backward(
     parts = rows.new_empty(count + 1, STEP * rows.shape[1])
     parts[count] = 0
     steps = (bins.counts + (STEP - 1)) // STEP
-    first, total = steps.cumsum(0) - steps, int(steps.sum())
+    first, total = starts_of(steps), int(steps.sum())
     light, made, done = grads.new_zeros(len(steps), PIXELS), [], 0
     for segment in reversed(segments):
         behind = light.index_select(0, segment.tiles)

@@ -154,11 +154,11 @@ def _bin(
 ) -> Bins:
     """Pair splats, nearest first, with the tiles that they overlap in a band of rows."""
     heights = (boxes.bottom.clamp(*rows) - boxes.top.clamp(*rows)).index_select(0, order)
-    down, band = _starts(heights), order.new_tensor([rows[0], columns])
+    down, band = starts_of(heights), order.new_tensor([rows[0], columns])
     first, widths, owners = kernels.run(SPANS, _runs(down, heights), order, down, boxes.table, band)
     size = (rows[1] - rows[0]) * columns
     first = first.short() if size <= SHORT else first  # half as many bits sort in half the time
-    starts = _starts(widths)
+    starts = starts_of(widths)
     tiles, splats = kernels.run(PAIRS, _runs(starts, widths), starts, first, owners)
     by_tile, pairs = torch.sort(tiles, stable=True)
     drawn = kernels.run(LISTS, splats, pairs)[0] if len(pairs) else splats.new_zeros(1)
@@ -173,7 +173,8 @@ def _bin(
     return Bins(drawn, ends - counts, counts, origins.to(boxes.table), columns, kept)
 
 
-def _starts(counts: Int[Tensor, " m"]) -> Int[Tensor, " m"]:
+def starts_of(counts: Int[Tensor, " m"]) -> Int[Tensor, " m"]:
+    """Where each of several runs begins that follow one another."""
     return counts.cumsum(0, dtype=counts.dtype) - counts
 
 
