@@ -46,6 +46,24 @@ def test_compiled_kernels_give_the_eager_results(built, kernel: Kernel):
         assert (fast.double() - slow.double()).abs().max() < 10 * ANSWER * scale
 
 
+COMPOSITING = [kernel for kernel in compiled.KERNELS if kernel.name.startswith(("composite-", "gaussian-"))]
+
+
+@pytest.mark.parametrize("kernel", COMPOSITING, ids=lambda kernel: kernel.name)
+def test_examples_show_what_compositing_computes(kernel: Kernel):
+    """A broken package is found by its results on the example, so each of them depends on the splats."""
+    given, results = kernel.example(), []
+    for factor in (1.0, 1.01):
+        args = kernel.example()
+        args[0].mul_(factor)
+        made = EAGER.run(kernel, *args)
+        written = [after for before, after in zip(given[1:], args[1:], strict=True) if not before.equal(after)]
+        results.append([*made, *written])
+    assert results[0]
+    for one, other in zip(*results, strict=True):
+        assert not one.equal(other)
+
+
 # loops before it find and gather raster rows, a loop after it writes the sums out
 LOOPS = {"composite-point": 3, "composite-point-backward": 3, "gaussian-blending": 1}
 

@@ -103,13 +103,13 @@ def test_runs_repeat_as_often_as_they_count(counts):
 def test_tiles_are_placed_where_they_were_taken_from(rows, columns):
     image = torch.rand(4, rows * TILE, columns * TILE, generator=torch.Generator().manual_seed(1))
     order = torch.randperm(rows * columns, generator=torch.Generator().manual_seed(2))
-    tiles = layout.tiles_of(image, order, columns, EAGER)
+    tiles = layout.tiles_of(image.unbind(), order, columns, EAGER)
     for tile, mine in zip(order.tolist(), tiles.unbind(dim=1), strict=True):
         y, x = TILE * (tile // columns), TILE * (tile % columns)
         assert mine.equal(image[:, y : y + TILE, x : x + TILE].reshape(4, PIXELS))
     assert layout.placed(tiles, order, columns, EAGER).equal(image)
     some = order[::2]
-    assert layout.tiles_of(image, some, columns, EAGER).equal(tiles[:, ::2])
+    assert layout.tiles_of(image.unbind(), some, columns, EAGER).equal(tiles[:, ::2])
 
 
 def test_a_tile_without_splats_left_reads_the_padding_row():

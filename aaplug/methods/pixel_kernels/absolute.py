@@ -22,26 +22,27 @@ class AbsolutePoint(Point):
     """`Point`, with absolute gradients of the centres."""
 
     name: str = "point-absolute"
+    gradient_sums: int = 2
 
     def sums(
         self, moves: list[Move], colours: tuple[Tensor, Tensor, Tensor], T: Tensor, pixels: Pixels
-    ) -> Float[Tensor, "t c_K"]:
-        """Per splat, a raster row with the sums of the absolute gradients of its centre's x and y."""
+    ) -> Float[Tensor, "t s_K"]:
+        """Per splat, the sums of the absolute gradients of its centre's x and y."""
         sums = []
         for row, _, gradient in moves:
             u, v = forms_at(row, pixels)
-            found = torch.zeros_like(row)
-            for column, (i, j) in ((X, (UX, VX)), (Y, (UY, VY))):
+            for i, j in ((UX, VX), (UY, VY)):
                 slope = 2 * LN_2 * (row[:, i, None] * u + row[:, j, None] * v)
-                found[:, column] = (gradient * slope).abs().sum(dim=1)
-            sums.append(found)
-        return torch.cat(sums, dim=1)
+                sums.append((gradient * slope).abs().sum(dim=1))
+        return torch.stack(sums, dim=1)
 
     def from_sums(
-        self, rows: Float[Tensor, "m c"], sums: Float[Tensor, "m c"], kernels: Kernels
+        self, rows: Float[Tensor, "m c"], sums: Float[Tensor, "m s"], kernels: Kernels
     ) -> Float[Tensor, "m c"]:
-        """The sums themselves."""
-        return sums
+        """The sums, as the gradient of the centre."""
+        found = torch.zeros_like(rows)
+        found[:, X], found[:, Y] = sums.unbind(dim=1)
+        return found
 
 
 ABSOLUTE_POINT = AbsolutePoint()

@@ -1,6 +1,6 @@
 """How a pixel kernel's gradient is summed over the pixels of a tile.
 
-t: tiles; K: splats of a step; P: pixels per tile; c: columns of a raster row.
+t: tiles; K: splats of a step; P: pixels per tile; c: columns of a raster row; s: sums.
 """
 
 from typing import NamedTuple, Protocol, runtime_checkable
@@ -25,22 +25,33 @@ class Move(NamedTuple):
 
 @runtime_checkable
 class SumsGradients(Protocol):
-    """A pixel kernel that sums its own gradient in closed form; without it, autograd differentiates `alpha`."""
+    """A pixel kernel that sums its own gradient in closed form; without it, autograd differentiates `alpha`.
+
+    gradient_sums: how many sums per splat.
+    """
+
+    @property
+    def gradient_sums(self) -> int: ...  # noqa: D102
 
     def sums(
         self, moves: list[Move], colours: tuple[Tensor, Tensor, Tensor], T: Tensor, pixels: Pixels
-    ) -> Float[Tensor, "t c_K"]:
-        """Sums over each tile's pixels, as many per splat as a raster row has columns.
+    ) -> Float[Tensor, "t s_K"]:
+        """Sums over each tile's pixels, `gradient_sums` of each splat.
 
         colours: gradient of the image's red, green and blue.  T: transmittance before the first of the splats.
         """
         ...
 
     def from_sums(
-        self, rows: Float[Tensor, "m c"], sums: Float[Tensor, "m c"], kernels: Kernels
+        self, rows: Float[Tensor, "m c"], sums: Float[Tensor, "m s"], kernels: Kernels
     ) -> Float[Tensor, "m c"]:
         """Gradient of the raster rows from the sums over all tiles."""
         ...
+
+
+def sums_per_splat(pixel: PixelKernel) -> int:
+    """How many sums a splat's gradient is made of."""
+    return pixel.gradient_sums if isinstance(pixel, SumsGradients) else pixel.columns
 
 
 def sums_by_autograd(

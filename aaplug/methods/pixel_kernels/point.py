@@ -4,7 +4,7 @@ u and v are the raster row's linear forms, scaled so that u² + v² = log2(e)/2 
 log2 o - LOG2_PADDING, at least 0 where it can be seen: alpha is 2^(LOG2_PADDING + h) with h = log2 o - LOG2_PADDING -
 u² - v².
 
-The backward pass reduces over a tile's pixels inside the compiled loop: seven sums of the gradient of log alpha and
+The backward pass reduces over a tile's pixels inside the compiled loop: six sums of the gradient of log alpha and
 three of the colour gradient per splat.
 """
 
@@ -22,7 +22,7 @@ from aaplug.core.kernels import Kernel, Kernels, backward_of
 from aaplug.core.rules import Rules
 from aaplug.core.splats import Splats2D
 from aaplug.methods.pixel_kernels.gradients import Move
-from aaplug.methods.pixel_kernels.raster_rows import COLUMNS, OPACITY, TILE, forms_at, offsets_at, splat_example
+from aaplug.methods.pixel_kernels.raster_rows import COLUMNS, OPACITY, TILE, forms_at, splat_example
 
 HALF_LOG2_E = 0.5 * math.log2(math.e)
 LN_2 = math.log(2)
@@ -39,6 +39,7 @@ class Point:
     columns: int = COLUMNS
     needs_depth_slopes: bool = False
     splats_per_pass: int = 16
+    gradient_sums: int = 9
 
     def bounding_ellipses(self, splats: Splats2D, rules: Rules) -> Splats2D | None:
         """The splats themselves."""
@@ -74,26 +75,25 @@ class Point:
 
     def sums(
         self, moves: list[Move], colours: tuple[Tensor, Tensor, Tensor], T: Tensor, pixels: Pixels
-    ) -> Float[Tensor, "t c_K"]:
-        """Per splat, ten sums over the tile's pixels, from which `from_sums` makes the gradient of its raster row.
+    ) -> Float[Tensor, "t s_K"]:
+        """Per splat, nine sums over the tile's pixels, from which `from_sums` makes the gradient of its raster row.
 
-        With s the gradient of log alpha and (dx, dy) the offset from the splat, in px: s·u·dx, s·u·dy, s·v·dx, s·v·dy,
-        s·u, s·v, s, and the compositing weight times the gradient of red, green and blue.
+        With s the gradient of log alpha: s·u², s·u·v, s·v², s·u, s·v, s, and the compositing weight times the gradient
+        of red, green and blue.
         """
         if not torch.compiler.is_compiling():
             return _sums_by_products(moves, colours, pixels)
         sums = []
         for row, weight, gradient in moves:
-            dx, dy = offsets_at(row, pixels)
-            su, sv = (gradient * form for form in forms_at(row, pixels))
-            red, green, blue = (weight * colour for colour in colours)
             # no-op, as both are 0 where T is 0; the test on T makes the compiler fuse all sums into one loop
-            gradient, red = (torch.where(T > 0, x, 0.0) for x in (gradient, red))
-            sums += [su * dx, su * dy, sv * dx, sv * dy, su, sv, gradient, red, green, blue]
+            gradient, weight = (torch.where(T > 0, x, 0.0) for x in (gradient, weight))
+            u, v = forms_at(row, pixels)
+            su, sv = gradient * u, gradient * v
+            sums += [su * u, su * v, sv * v, su, sv, gradient, *(weight * colour for colour in colours)]
         return torch.cat([x.sum(dim=1, keepdim=True) for x in sums], dim=1)
 
     def from_sums(
-        self, rows: Float[Tensor, "m c"], sums: Float[Tensor, "m c"], kernels: Kernels
+        self, rows: Float[Tensor, "m c"], sums: Float[Tensor, "m s"], kernels: Kernels
     ) -> Float[Tensor, "m c"]:
         """Gradient of the raster rows from the sums."""
         return kernels.run(FROM_SUMS, rows, sums)[0]
@@ -139,7 +139,7 @@ def _root_of_exp2(squarings: int, degree: int) -> tuple[float, ...]:
 
 def _sums_by_products(
     moves: list[Move], colours: tuple[Tensor, Tensor, Tensor], pixels: Pixels
-) -> Float[Tensor, "t c_K"]:
+) -> Float[Tensor, "t s_K"]:
     """The same sums, for eager mode: matrix products of moments about the tile's centre, to keep precision."""
     rows, weights, gradients = (torch.stack(x, dim=1) for x in zip(*moves, strict=True))
     x, y = pixels.x - TILE / 2, pixels.y - TILE / 2
@@ -148,33 +148,44 @@ def _sums_by_products(
     ux, uy, vx, vy, centre_x, centre_y, *_ = rows.unbind(dim=2)
     dx = pixels.corners[:, 0, None] + TILE / 2 - centre_x
     dy = pixels.corners[:, 1, None] + TILE / 2 - centre_y
-    by_offset, by_form = [], []
-    for i, j in ((ux, uy), (vx, vy)):
-        middle = i * dx + j * dy
-        along = middle * s + i * sx + j * sy
-        by_form += [along]
-        by_offset += [dx * along + middle * sx + i * sxx + j * sxy]
-        by_offset += [dy * along + middle * sy + i * sxy + j * syy]
+    u, v = ux * dx + uy * dy, vx * dx + vy * dy
+    su, sv = u * s + ux * sx + uy * sy, v * s + vx * sx + vy * sy
+    # of each form times x and y
+    ux_, uy_ = u * sx + ux * sxx + uy * sxy, u * sy + ux * sxy + uy * syy
+    vx_, vy_ = v * sx + vx * sxx + vy * sxy, v * sy + vx * sxy + vy * syy
+    squares = [u * su + ux * ux_ + uy * uy_, v * su + vx * ux_ + vy * uy_, v * sv + vx * vx_ + vy * vy_]
     by_colour = torch.bmm(weights, torch.stack(colours, dim=2)).unbind(dim=2)
-    return torch.stack([*by_offset, *by_form, s, *by_colour], dim=2).flatten(1)
+    return torch.stack([*squares, su, sv, s, *by_colour], dim=2).flatten(1)
 
 
-def _from_sums(rows: Float[Tensor, "m 10"], sums: Float[Tensor, "m 10"]) -> tuple[Float[Tensor, "m 10"]]:
-    """Chain rule for log alpha = ln 2 (log2 o - u² - v²)."""
+def _from_sums(rows: Float[Tensor, "m 10"], sums: Float[Tensor, "m 9"]) -> tuple[Float[Tensor, "m 10"]]:
+    """Chain rule for log alpha = ln 2 (log2 o - u² - v²).
+
+    The offset (dx, dy) from the splat is linear in u and v, by the inverse of the forms.
+    """
     ux, uy, vx, vy, *_ = rows.unbind(dim=1)
-    *by_offset, su, sv, s, red, green, blue = sums.unbind(dim=1)
-    forms = [-2 * LN_2 * form for form in by_offset]
+    suu, suv, svv, su, sv, s, red, green, blue = sums.unbind(dim=1)
+    det = ux * vy - uy * vx
+    scale = torch.where(det != 0, -2 * LN_2 / det, 0.0)  # the padding row has none
+    forms = []
+    for p, q in ((suu, suv), (suv, svv)):
+        forms += [scale * (vy * p - uy * q), scale * (ux * q - vx * p)]
     centre = [2 * LN_2 * (ux * su + vx * sv), 2 * LN_2 * (uy * su + vy * sv)]
     return (torch.stack([*forms, *centre, LN_2 * s, red, green, blue], dim=1),)
 
 
 def _from_sums_example() -> tuple[Tensor, ...]:
-    m = 100_000
-    return tuple(torch.linspace(0.1, 1.0, m * COLUMNS).view(m, -1) for _ in range(2))
+    rows = _point_rows(*_point_example())[0]
+    return rows, torch.linspace(0.1, 1.0, len(rows) * POINT.gradient_sums).view(len(rows), -1)
+
+
+def _point_example() -> tuple[Tensor, ...]:
+    splats = splat_example()
+    return *splats, torch.ones(len(splats[0]), 3)
 
 
 ROOT_OF_EXP2 = _root_of_exp2(SQUARINGS, DEGREE)
-POINT_ROWS = Kernel("point-rows", _point_rows, lambda: (*splat_example(), torch.ones(100_000, 3)), ("m",) * 5)
+POINT_ROWS = Kernel("point-rows", _point_rows, _point_example, ("m",) * 5)
 POINT_ROWS_BACKWARD = backward_of(POINT_ROWS, ("m+1",))
 FROM_SUMS = Kernel("composite-sums", _from_sums, _from_sums_example, ("m", "m"))
 POINT = Point()

@@ -23,7 +23,7 @@ from torch.nn import functional
 from aaplug.core.interfaces import PixelKernel, Pixels
 from aaplug.core.kernels import Kernel
 from aaplug.core.rules import Rules
-from aaplug.methods.pixel_kernels.gradients import Move, SumsGradients, sums_by_autograd
+from aaplug.methods.pixel_kernels.gradients import Move, SumsGradients, sums_by_autograd, sums_per_splat
 from aaplug.methods.pixel_kernels.raster_rows import BLUE, GREEN, PIXELS, RED, next_rows, tile_centres
 from aaplug.rasterizers.tiled.binning import Bins, starts_of
 from aaplug.rasterizers.tiled.forward import (
@@ -42,35 +42,38 @@ from aaplug.rasterizers.tiled.forward import (
 from aaplug.rasterizers.tiled.layout import tiles_of
 
 
-def composite(rows: Float[Tensor, "m c"], bins: Bins, how: Compositing) -> Float[Tensor, "4 h w"]:
+def composite(
+    rows: Float[Tensor, "m c"], bins: Bins, how: Compositing
+) -> tuple[Float[Tensor, "3 h w"], Float[Tensor, "h w"]]:
     """Premultiplied colour, and alpha, of every pixel; differentiable in the raster rows.
 
     rows: the last one is the padding row.
     """
     if rows.requires_grad and torch.is_grad_enabled():
         return _Composite.apply(rows, bins, how)  # pyright: ignore[reportReturnType]
-    return composite_forward(rows, bins, how)
+    image = composite_forward(rows, bins, how)
+    return image[:3], image[3]
 
 
 class _Composite(torch.autograd.Function):
     """Compositing with its own backward pass."""
 
     @staticmethod
-    def forward(ctx: Any, rows: Tensor, bins: Bins, how: Compositing) -> Tensor:
+    def forward(ctx: Any, rows: Tensor, bins: Bins, how: Compositing) -> tuple[Tensor, Tensor]:
         segments: list[Segment] = []
         image = composite_forward(rows, bins, how, segments)
         ctx.save_for_backward(rows)
         ctx.rest = (bins, segments, how)
-        return image
+        return image[:3], image[3]
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None, None]:
         (rows,) = ctx.saved_tensors
-        return _backward(rows, grads[0].contiguous(), *ctx.rest), None, None
+        return _backward(rows, [*grads[0], grads[1]], *ctx.rest), None, None
 
 
 def _backward(
-    rows: Float[Tensor, "m c"], grads: Float[Tensor, "4 h w"], bins: Bins, segments: list[Segment], how: Compositing
+    rows: Float[Tensor, "m c"], grads: list[Float[Tensor, "h w"]], bins: Bins, segments: list[Segment], how: Compositing
 ) -> Float[Tensor, "m c"]:
     """Gradient of the raster rows.
 
@@ -81,11 +84,12 @@ def _backward(
     count = sum(len(before) for segment in segments for before in segment.before)
     if not count:
         return torch.zeros_like(rows)
-    parts = rows.new_empty(count + 1, STEP * rows.shape[1])
+    columns = sums_per_splat(how.pixel)
+    parts = rows.new_empty(count + 1, STEP * columns)
     parts[count] = 0
     steps = (bins.counts + (STEP - 1)) // STEP
     first, total = starts_of(steps), int(steps.sum())
-    light, made, done = grads.new_zeros(len(steps), PIXELS), [], 0
+    light, made, done = rows.new_zeros(len(steps), PIXELS), [], 0
     for segment in reversed(segments):
         behind = light.index_select(0, segment.tiles)
         colours = tiles_of(grads, segment.tiles, bins.columns, how.kernels)
@@ -113,8 +117,8 @@ def _backward(
     shifts = (first * STEP - bins.first).int()
     slots = part_of.new_empty(len(pairs.sorted))
     how.kernels.run(SLOTS, slots, pairs.tiles, shifts, part_of, pairs.sorted)
-    summed = torch.zeros_like(rows)
-    sums = functional.embedding_bag(slots, parts.view(-1, rows.shape[1]), pairs.starts, mode="sum")
+    summed = rows.new_zeros(len(rows), columns)
+    sums = functional.embedding_bag(slots, parts.view(-1, columns), pairs.starts, mode="sum")
     summed.index_copy_(0, pairs.nearest, sums)
     if isinstance(how.pixel, SumsGradients):
         return how.pixel.from_sums(rows, summed, how.kernels)
@@ -155,7 +159,7 @@ def _step(
     local_x: Float[Tensor, " P"],
     local_y: Float[Tensor, " P"],
     one: Float[Tensor, " t"],
-    parts: Float[Tensor, "t c_STEP"],
+    parts: Float[Tensor, "t sums"],
 ) -> tuple[()]:
     """Write each tile's contributions to the gradients of K splats into `parts`.
 
@@ -206,7 +210,7 @@ def step_kernel(pixel: PixelKernel, rules: Rules) -> Kernel:
     return Kernel(
         f"composite-{pixel.name}{rules.tag}-backward",
         partial(_step, pixel, rules),
-        lambda: (*tiles_example(6, pixel.columns), torch.zeros(EXAMPLE_TILES, STEP * pixel.columns)),
+        lambda: (*tiles_example(6, pixel), torch.zeros(EXAMPLE_TILES, STEP * sums_per_splat(pixel))),
         ("m", "p", *9 * ("t",), None, None, "t", "t"),
     )
 

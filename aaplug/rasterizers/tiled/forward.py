@@ -18,8 +18,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from aaplug.core.interfaces import PixelKernel, Pixels
-from aaplug.core.kernels import Kernel, Kernels
+from aaplug.core.kernels import EAGER, Kernel, Kernels
 from aaplug.core.rules import Rules
+from aaplug.core.splats import Splats2D
 from aaplug.methods.pixel_kernels.raster_rows import BLUE, GREEN, PIXELS, RED, next_rows, tile_centres
 from aaplug.rasterizers.tiled.binning import Bins
 from aaplug.rasterizers.tiled.layout import placed
@@ -220,10 +221,20 @@ def where_above(bound: float, test: Tensor, value: Tensor) -> Tensor:
     return torch.minimum(torch.threshold(test, bound, 0.0).mul_(GATE), value)
 
 
-def tiles_example(planes: int, columns: int) -> tuple[Tensor, ...]:
+def rows_example(pixel: PixelKernel) -> Float[Tensor, "m c"]:
+    """Raster rows of splats that every pixel of `tiles_example` sees."""
+    ramp = torch.linspace(0.0, 1.0, EXAMPLE_SPLATS)
+    means = torch.stack([3 + 4 * ramp, 7 - 4 * ramp], dim=1)
+    covs = torch.stack([20 + ramp, ramp, 20 - ramp], dim=1)
+    dets = covs[:, 0] * covs[:, 2] - covs[:, 1].square()
+    shape = (means, covs, dets, 1 + ramp, 0.1 + 0.1 * ramp, torch.arange(EXAMPLE_SPLATS))
+    splats = Splats2D(*shape, torch.stack([ramp, 1 - ramp, ramp], dim=1), torch.zeros_like(means))
+    return pixel.raster_rows(splats, EAGER)
+
+
+def tiles_example(planes: int, pixel: PixelKernel) -> tuple[Tensor, ...]:
     """Raster rows, splats, where they begin and end, tile corners and planes of pixels to compile for."""
-    tiles = EXAMPLE_TILES
-    rows = torch.linspace(0.012, 0.1, EXAMPLE_SPLATS * columns).view(EXAMPLE_SPLATS, columns)
+    tiles, rows = EXAMPLE_TILES, rows_example(pixel)
     ids = torch.arange(tiles * EXAMPLE_LIST, dtype=torch.int32) % EXAMPLE_SPLATS
     at = torch.arange(tiles) * EXAMPLE_LIST
     ends = at + EXAMPLE_LIST
@@ -237,7 +248,7 @@ def pass_kernel(pixel: PixelKernel, rules: Rules) -> Kernel:
     return Kernel(
         f"composite-{pixel.name}{rules.tag}",
         partial(_pass, pixel, rules),
-        partial(tiles_example, 5, pixel.columns),
+        partial(tiles_example, 5, pixel),
         ("m", "p", *8 * ("t",), None, None, "t"),
         overlaps=True,
         evaluations=pixel.splats_per_pass,

@@ -3,6 +3,8 @@
 k: planes; l, a: lines of TILE pixels; t: tiles of TILE × TILE px; P: pixels per tile.
 """
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -17,20 +19,20 @@ def placed(
     """Planes of an image of `columns` tiles a row.  order: which of the image's tiles each is."""
     ranks = torch.empty_like(order).index_copy_(0, order, torch.arange(len(order), device=order.device))
     lines = ranks.view(-1, 1, columns) * TILE + torch.arange(TILE, device=order.device)[:, None]
-    return _gathered(planes, lines, kernels).view(len(planes), -1, columns * TILE)
+    return _gathered(planes.unbind(), lines, kernels).view(len(planes), -1, columns * TILE)
 
 
 def tiles_of(
-    image: Float[Tensor, "4 h w"], tiles: Int[Tensor, " t"], columns: int, kernels: Kernels
+    planes: Sequence[Float[Tensor, "h w"]], tiles: Int[Tensor, " t"], columns: int, kernels: Kernels
 ) -> Float[Tensor, "4 t P"]:
     """Planes of some tiles of an image with `columns` tiles a row."""
     down = torch.arange(TILE, device=tiles.device) * columns
     lines = (tiles // columns * TILE * columns + tiles % columns)[:, None] + down
-    return _gathered(image, lines, kernels).view(len(image), -1, PIXELS)
+    return _gathered(planes, lines, kernels).view(len(planes), -1, PIXELS)
 
 
 def _gathered(
-    planes: Float[Tensor, "4 *any"], lines: Int[Tensor, "*order"], kernels: Kernels
+    planes: Sequence[Float[Tensor, "*any"]], lines: Int[Tensor, "*order"], kernels: Kernels
 ) -> Float[Tensor, "4 l s"]:
     """Lines of TILE pixels in another order."""
     return kernels.run(LINES, lines.flatten(), *(plane.reshape(-1, TILE) for plane in planes))[0]

@@ -29,7 +29,7 @@ from aaplug.rasterizers.tiled.forward import Compositing
 from aaplug.rasterizers.tiled.layout import placed
 from aaplug.rasterizers.tiled.packages import CountingKernels
 
-Painter = Callable[[Bins], Tensor]  # premultiplied colour, and alpha, of a band: 4 planes
+Painter = Callable[[Bins], tuple[Tensor, Tensor]]  # a band's premultiplied colour, three planes, and alpha
 BLENDED_TILES = 512  # composited together by a compositor, so that what it keeps per pixel fits the cache
 
 
@@ -82,8 +82,8 @@ class Tiled:
 
         def painted() -> Iterator[Render]:
             for bins in bands(ellipses, grid, self.kernels, self.memory, rules, gradients):
-                image = paint(bins)
-                yield over(image[:3].permute(1, 2, 0), image[3], background)
+                rgb, alpha = paint(bins)
+                yield over(rgb.permute(1, 2, 0), alpha, background)
 
         whole = _assembled(painted(), grid[0] * TILE)
         return Render(whole.rgb[: hw[0], : hw[1]], whole.alpha[: hw[0], : hw[1]])
@@ -93,14 +93,15 @@ class Tiled:
         rows = compositor.rows(splats)
         local = tile_centres(rows)
 
-        def paint(bins: Bins) -> Tensor:
+        def paint(bins: Bins) -> tuple[Tensor, Tensor]:
             order = torch.sort(bins.counts, descending=True, stable=True).indices
             parts = []
             for tiles in order.split(BLENDED_TILES):
                 x, y = (bins.origins[tiles, i, None] + local[i] for i in (0, 1))
                 lists = (bins.splats, bins.first[tiles], bins.counts[tiles])
                 parts.append(compositor.tiles(rows, splats.window, *lists, (x, y), self.kernels, rules))
-            return placed(torch.cat(parts, dim=1).to(splats.means), order, bins.columns, self.kernels)
+            image = placed(torch.cat(parts, dim=1).to(splats.means), order, bins.columns, self.kernels)
+            return image[:3], image[3]
 
         return paint
 
