@@ -146,7 +146,9 @@ def _tuners(
 
     def tuned(level: Level) -> Level:
         if viewer is not None and level.scene is scene:
-            return level._replace(scene=fit(scene, viewer, look, views, steps_for(scene, viewer), monitor).scene)
+            usual = steps_for(scene, viewer)
+            steps = o.steps if usual and o.steps is not None else usual
+            return level._replace(scene=fit(scene, viewer, look, views, steps, monitor).scene)
         return level._replace(scene=refined(level.scene, level.rate, look, views, o.tuning, viewer, monitor))
 
     return (tuned, _same) if viewer is None else (_same, tuned)
