@@ -9,6 +9,7 @@ three of the colour gradient per splat.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -19,6 +20,7 @@ from torch.nn import functional
 from aaplug.core.ellipses import whitening, whitening_columns
 from aaplug.core.interfaces import Pixels
 from aaplug.core.kernels import Kernel, Kernels, backward_of
+from aaplug.core.projection import sum_of
 from aaplug.core.rules import Rules
 from aaplug.core.splats import Splats2D
 from aaplug.methods.pixel_kernels.gradients import Move
@@ -148,14 +150,16 @@ def _sums_by_products(
     ux, uy, vx, vy, centre_x, centre_y, *_ = rows.unbind(dim=2)
     dx = pixels.corners[:, 0, None] + TILE / 2 - centre_x
     dy = pixels.corners[:, 1, None] + TILE / 2 - centre_y
-    u, v = ux * dx + uy * dy, vx * dx + vy * dy
-    su, sv = u * s + ux * sx + uy * sy, v * s + vx * sx + vy * sy
-    # of each form times x and y
-    ux_, uy_ = u * sx + ux * sxx + uy * sxy, u * sy + ux * sxy + uy * syy
-    vx_, vy_ = v * sx + vx * sxx + vy * sxy, v * sy + vx * sxy + vy * syy
-    squares = [u * su + ux * ux_ + uy * uy_, v * su + vx * ux_ + vy * uy_, v * sv + vx * vx_ + vy * vy_]
+    u, v = ((i * dx + j * dy, i, j) for i, j in ((ux, uy), (vx, vy)))  # value at the tile's centre, and slopes
+    moments = ((s, sx, sy), (sx, sxx, sxy), (sy, sxy, syy))
+    by_u, by_v = ([_dot(form, moment) for moment in moments] for form in (u, v))  # s times the form, times 1, x and y
+    squares = [_dot(u, by_u), _dot(v, by_u), _dot(v, by_v)]
     by_colour = torch.bmm(weights, torch.stack(colours, dim=2)).unbind(dim=2)
-    return torch.stack([*squares, su, sv, s, *by_colour], dim=2).flatten(1)
+    return torch.stack([*squares, by_u[0], by_v[0], s, *by_colour], dim=2).flatten(1)
+
+
+def _dot(a: Sequence[Tensor], b: Sequence[Tensor]) -> Tensor:
+    return sum_of(p * q for p, q in zip(a, b, strict=True))
 
 
 def _from_sums(rows: Float[Tensor, "m 10"], sums: Float[Tensor, "m 9"]) -> tuple[Float[Tensor, "m 10"]]:

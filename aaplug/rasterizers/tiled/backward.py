@@ -51,8 +51,7 @@ def composite(
     """
     if rows.requires_grad and torch.is_grad_enabled():
         return _Composite.apply(rows, bins, how)  # pyright: ignore[reportReturnType]
-    image = composite_forward(rows, bins, how)
-    return image[:3], image[3]
+    return composite_forward(rows, bins, how)
 
 
 class _Composite(torch.autograd.Function):
@@ -64,12 +63,13 @@ class _Composite(torch.autograd.Function):
         image = composite_forward(rows, bins, how, segments)
         ctx.save_for_backward(rows)
         ctx.rest = (bins, segments, how)
-        return image[:3], image[3]
+        return image
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None, None]:
         (rows,) = ctx.saved_tensors
-        return _backward(rows, [*grads[0], grads[1]], *ctx.rest), None, None
+        rgb, alpha = (grad.contiguous() for grad in grads)  # once: they are gathered for each segment
+        return _backward(rows, [*rgb, alpha], *ctx.rest), None, None
 
 
 def _backward(

@@ -30,7 +30,7 @@ CHECK_PASSES, CHECK_TILES = 2, 1000  # least passes, and tiles in them, between 
 COMPACT_BELOW = 3 / 4  # saturated tiles are dropped once the share of unsaturated ones is below this
 FEWEST = 2  # tiles in a pass: compiled kernels take no fewer, and a tile without splats left stays as it is
 GATE = 1e9  # lifts any nonzero output of `threshold` above 1, so that min(output · GATE, value) is `value` or 0
-EXAMPLE_TILES, EXAMPLE_SPLATS = (1024, 4096)  # as large as real work: inductor chooses by them which loops use threads
+EXAMPLE_TILES, EXAMPLE_SPLATS = 1024, 4096  # as large as real work: inductor chooses by them which loops use threads
 EXAMPLE_LIST = 16  # splats of each tile
 
 
@@ -68,7 +68,7 @@ class Segment:
 
 def composite_forward(
     rows: Float[Tensor, "m c"], bins: Bins, how: Compositing, segments: list[Segment] | None = None
-) -> Float[Tensor, "4 h w"]:
+) -> tuple[Float[Tensor, "3 h w"], Float[Tensor, "h w"]]:
     """Premultiplied colour, and alpha, of every pixel; appends what the backward pass needs to `segments`.
 
     rows: raster rows; the last one is the padding row.
@@ -82,7 +82,8 @@ def composite_forward(
     for block in tiles:
         _composite_block(rows, bins, block, planes[:, done : done + len(block)], local, how, segments)
         done += len(block)
-    return placed(planes, order, bins.columns, how.kernels)
+    image = placed(planes, order, bins.columns, how.kernels)
+    return image[:3], image[3]
 
 
 def _composite_block(
