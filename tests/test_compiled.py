@@ -8,13 +8,15 @@ import pytest
 import torch
 
 from aaplug import rasterizers as choice
+from aaplug.core import shading
 from aaplug.core.errors import UsageError
-from aaplug.core.kernels import EAGER, Kernel
+from aaplug.core.kernels import EAGER, Kernel, Kernels
 from aaplug.core.rules import RULES_GSPLAT
 from aaplug.core.training import TrainingViews
 from aaplug.methods.recipes import RECIPES
 from aaplug.rasterizers import RASTERIZERS, Tiled, find_rasterizer
 from aaplug.rasterizers.tiled import ahead_of_time as compiled
+from aaplug.rasterizers.tiled import packages
 from aaplug.rasterizers.tiled.packages import CompiledKernels, Package
 from aaplug.rendering.renderer import Renderer
 from tests.conftest import COMPILED, make_camera, make_scene, sized
@@ -133,14 +135,24 @@ def test_other_rules_and_precisions_are_left_to_the_eager_functions(built):
     assert (fast - usual).abs().max() > 1e-3
 
 
-def test_compiled_kernels_have_gradients(built):
-    scene, camera = make_scene(100), make_camera()
-    means = scene.means.clone().requires_grad_()
+@pytest.mark.parametrize("at_once", [13, 1000])
+def test_compiled_gradients_are_the_eager_ones_in_parts_and_at_once(built, at_once, monkeypatch):
+    scene, camera = make_scene(100, degree=2), make_camera()
     training = TrainingViews.of(scene, [camera])
-    renderer = Renderer(replace(scene, means=means), training, RECIPES["classic"], Tiled(built))
-    renderer(camera).rgb.sum().backward()
-    assert means.grad is not None
-    assert means.grad.abs().sum() > 0
+
+    def gradients(kernels: Kernels) -> tuple[torch.Tensor, ...]:
+        leaves = {name: column.clone().requires_grad_() for name, column in scene.columns.items()}
+        pose = camera.cam_from_world.clone().requires_grad_()
+        renderer = Renderer(replace(scene, **leaves), training, RECIPES["classic"], Tiled(kernels))
+        image = renderer(replace(camera, cam_from_world=pose)).rgb
+        return torch.autograd.grad(image.square().sum(), [*leaves.values(), pose])
+
+    expected = gradients(EAGER)
+    monkeypatch.setattr(packages, "ROWS", at_once)
+    monkeypatch.setattr(shading, "CHUNK", at_once)
+    for fast, slow in zip(gradients(built), expected, strict=True):
+        assert slow.abs().max() > 0
+        torch.testing.assert_close(fast, slow, rtol=0, atol=1e-4 * float(slow.abs().max()))
 
 
 def test_a_pickled_rasterizer_loads_the_packages_of_its_machine(built, empty_cache):
@@ -221,8 +233,8 @@ def test_an_unknown_name_lists_the_known_ones():
 
 
 def test_one_row_is_left_to_the_eager_function():
-    ran = CompiledKernels({"double": Package.of(lambda args: [3 * args[0]], (torch.ones(4),))})
     double = Kernel("double", lambda x: (2 * x,), lambda: (torch.ones(4),), ("n",))
+    ran = CompiledKernels({"double": Package.of(lambda args: [3 * args[0]], double)})
     assert ran.run(double, torch.ones(1))[0].item() == 2
     assert ran.run(double, torch.ones(2))[0].tolist() == [3, 3]
     assert ran.run(double, torch.ones(2).double())[0].tolist() == [2, 2]

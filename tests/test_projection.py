@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from aaplug.core import projection
+from aaplug.core import shading
 from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import Gaussians
-from aaplug.core.projection import project, rotation_matrices, shade
+from aaplug.core.projection import project, rotation_matrices
+from aaplug.core.shading import shade
 from aaplug.core.spherical_harmonics import sh_colour
 from tests.conftest import make_camera, make_scene
 
@@ -449,11 +450,14 @@ def test_the_ratio_of_determinants_is_the_change_of_area_across_the_ray():
 
 def test_shading_in_chunks_gives_the_same_colours(monkeypatch):
     scene, camera = make_scene(50, degree=3), make_camera()
-    splats = project(scene, camera)
-    whole = shade(splats, scene, camera).rgb
-    monkeypatch.setattr(projection, "SHADED_AT_ONCE", 7)
+    splats, sh = project(scene, camera), scene.sh.clone().requires_grad_()
+    whole = shade(splats, replace(scene, sh=sh), camera).rgb
+    [gradient] = torch.autograd.grad(whole.square().sum(), [sh])
+    monkeypatch.setattr(shading, "CHUNK", 7)
     assert len(splats.sources) > 7
-    assert shade(splats, scene, camera).rgb.equal(whole)
+    parts = shade(splats, replace(scene, sh=sh), camera).rgb
+    assert parts.equal(whole)
+    assert torch.autograd.grad(parts.square().sum(), [sh])[0].equal(gradient)
 
 
 def test_gradients_of_colours_reach_only_the_gaussians_drawn():

@@ -7,7 +7,8 @@ import torch
 
 from aaplug.core.cameras import WHITE, Camera
 from aaplug.core.culling import cull
-from aaplug.core.projection import project, shade
+from aaplug.core.projection import project
+from aaplug.core.shading import shade
 from aaplug.core.training import TrainingViews
 from aaplug.evaluation.engine import Task, candidates_of, evaluate
 from aaplug.evaluation.metrics import PSNR

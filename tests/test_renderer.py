@@ -167,6 +167,19 @@ def test_scenes_are_projected_in_chunks_without_a_change(cameras, monkeypatch):
     torch.testing.assert_close(renderer(cameras[0]).rgb, whole, rtol=0, atol=1e-6)
 
 
+def test_gradients_are_made_at_once_because_each_part_would_take_a_scene(cameras, monkeypatch):
+    scene = make_scene(200)
+    scene = replace(scene, means=scene.means.requires_grad_())
+    renderer, seen = Renderer.of(scene, cameras, rasterizer="eager"), []
+    monkeypatch.setattr(rendering, "CHUNK", 33)
+    monkeypatch.setattr(rendering, "project", lambda part, *rest: seen.append(len(part)) or project(part, *rest))
+    renderer(cameras[0])
+    assert seen == [200]
+    with torch.no_grad():
+        renderer(cameras[0])
+    assert seen[1:] == [33, 33, 33, 33, 33, 33, 2]
+
+
 # neighbours -------------------------------------------------------------------------------------
 
 

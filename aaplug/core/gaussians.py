@@ -150,6 +150,14 @@ class Gaussians:
         """Every parameter that is present, by name."""
         return {name: value for name, value in vars(self).items() if isinstance(value, Tensor)}
 
+    @property
+    def tracked(self) -> bool:
+        """Whether gradients of a parameter will be asked for.
+
+        Then work is not done in chunks, because each chunk's gradient would be as large as the scene.
+        """
+        return torch.is_grad_enabled() and any(column.requires_grad for column in self.columns.values())
+
 
 def joined(parts: Sequence[Gaussians]) -> Gaussians:
     """The Gaussians of several parts of one scene, at least one part, each with the same columns."""

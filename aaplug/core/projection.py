@@ -1,29 +1,27 @@
-"""From Gaussians and a camera to splats: EWA projection and spherical-harmonics colour.
+"""From Gaussians and a camera to splats: EWA projection.
 
 n: Gaussians of the scene, m: those beyond the near plane.  A splat's covariance is M Mᵀ with the 2×3 factor M = J W R S
 (Zwicker et al., "EWA splatting", 2002; 3DGS, eq. 5).  Its determinant |a × b|² comes from the rows a and b of M, where
 nothing cancels.  The camera's centre is subtracted in float64; the rest runs in the scene's precision.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import cache, partial, reduce
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import MAX_LOG_SCALE, Gaussians
 from aaplug.core.kernels import EAGER, Kernel, Kernels, backward_of
 from aaplug.core.rules import NEAR, RULES_3DGS, Rules, variant
-from aaplug.core.spherical_harmonics import sh_colour
-from aaplug.core.splats import SELECT, Splats2D, picked
+from aaplug.core.splats import SELECT, Splats2D
 
 JACOBIAN_MARGIN = 0.3  # of half the image: 3DGS linearises no farther out (1.3 tan(fov/2))
 MAX_SIGMA = 1e9  # px: larger splats look the same, but their determinant overflows float32
 MIN_FACING = 1e-6  # of depth: a disc at a flatter angle is a line, and its slope overflows
-SHADED_AT_ONCE = 1 << 16  # Gaussians
 
 
 def project(scene: Gaussians, camera: Camera, kernels: Kernels = EAGER, rules: Rules = RULES_3DGS) -> Splats2D:
@@ -83,31 +81,6 @@ def with_depth_slopes(splats: Splats2D, scene: Gaussians, camera: Camera) -> Spl
     facing = torch.where(edge_on, MIN_FACING * splats.depths, facing)
     focal = normals.new_tensor([camera.fx, camera.fy])
     return replace(splats, depth_slopes=-(splats.depths / facing)[:, None] * normals[:, :2] / focal)
-
-
-def shade(splats: Splats2D, scene: Gaussians, camera: Camera, kernels: Kernels = EAGER) -> Splats2D:
-    """Add each splat's colour as seen from the camera: SH plus mid-grey, clamped below at black (3DGS)."""
-    centre = camera.centre.to(scene.means.device)
-    kernel = SHADE.get(scene.sh.shape[1])
-    shaded = []
-    for sources in _shaded_together(splats.sources, scene):
-        args = (scene.sh, scene.means, sources, centre)
-        shaded += _shade(*args) if kernel is None else kernels.run(kernel, *args)
-    return replace(splats, rgb=shaded[0] if len(shaded) == 1 else torch.cat(shaded))
-
-
-def _shaded_together(sources: Int[Tensor, " m"], scene: Gaussians) -> Sequence[Int[Tensor, " k"]]:
-    """Chunks that fit the cache; one chunk with gradients, because each chunk's gradient is as large as the scene."""
-    tracked = scene.sh.requires_grad or scene.means.requires_grad
-    return [sources] if tracked and torch.is_grad_enabled() else sources.split(SHADED_AT_ONCE)
-
-
-def _shade(
-    sh: Float[Tensor, "n k 3"], means: Float[Tensor, "n 3"], sources: Int[Tensor, " m"], centre: Float[Tensor, " 3"]
-) -> tuple[Tensor]:
-    offset = (picked(means, sources).double() - centre).to(means)
-    directions = offset / offset.square().sum(dim=1, keepdim=True).sqrt()
-    return (sh_colour(picked(sh, sources), directions).clamp(min=0.0),)
 
 
 def _camera_rows(like: Tensor, camera: Camera) -> tuple[Float[Tensor, " 3"], Float[Tensor, "3 3"], Float[Tensor, " 8"]]:
@@ -197,13 +170,6 @@ def rotation_matrices(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
 EXAMPLE_SIZE = 100_000  # as large as real work: inductor decides by it which loops use threads
 
 
-def _shade_example(coefficients: int) -> tuple[Tensor, ...]:
-    sh = torch.linspace(-1.0, 1.0, EXAMPLE_SIZE * coefficients * 3)
-    means = torch.linspace(1.0, 2.0, EXAMPLE_SIZE * 3).view(-1, 3)
-    sources = torch.arange(0, EXAMPLE_SIZE, 2)
-    return sh.view(-1, coefficients, 3), means, sources, torch.zeros(3, dtype=torch.float64)
-
-
 def _project_example() -> tuple[Tensor, ...]:
     draw = torch.Generator().manual_seed(0)
     means, log_scales = torch.rand(2, EXAMPLE_SIZE, 3, generator=draw).unbind()
@@ -222,7 +188,3 @@ def project_kernel(near: float = NEAR) -> Kernel:
 
 
 PROJECT_BACKWARD = backward_of(project_kernel(), ("n", "n", "n", "n"), chained=True)
-SHADE = {  # by coefficients per channel
-    k: Kernel(f"shade-{k}", _shade, partial(_shade_example, k), ("n", "n", "m", None)) for k in (4, 9, 16)
-}
-SHADE_BACKWARD = {k: backward_of(kernel, ("m",), chained=True) for k, kernel in SHADE.items()}

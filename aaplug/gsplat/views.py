@@ -12,8 +12,9 @@ from torch import Tensor
 
 from aaplug.core.ellipses import squared_cutoff
 from aaplug.core.kernels import Kernels
-from aaplug.core.projection import project, project_covariances, shade
+from aaplug.core.projection import project, project_covariances
 from aaplug.core.sampling import SamplingBounds
+from aaplug.core.shading import shade
 from aaplug.core.splats import Splats2D
 from aaplug.core.training import TrainingViews
 from aaplug.gsplat.arguments import Options, View

@@ -20,7 +20,8 @@ from aaplug.core.cameras import Camera, look_at
 from aaplug.core.culling import cull
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.kernels import Kernels
-from aaplug.core.projection import project, shade
+from aaplug.core.projection import project
+from aaplug.core.shading import shade
 from aaplug.core.spherical_harmonics import SH_C0
 from aaplug.core.training import TrainingViews
 from aaplug.methods.pixel_kernels.raster_rows import TILE
@@ -31,6 +32,7 @@ from aaplug.rasterizers.tiled.binning import bands
 from aaplug.rasterizers.tiled.forward import Compositing
 from aaplug.rendering.renderer import Renderer
 
+DRAWN_AT_ONCE = 1 << 16  # Gaussians; a multiple of 16, so that the random numbers are those of one draw
 MATRIX_SIDE = 2048
 FIELD_OF_VIEW = 50.0  # degrees, of the synthetic camera
 SEED = 0
@@ -139,7 +141,10 @@ def synthetic_scene(n: int, seed: int = SEED) -> Gaussians:
     opacities = torch.where(sides, low, 1 - 0.2 * torch.rand(n, generator=draw))
     opacities = torch.where(large, 0.5 * opacities, opacities).clamp(0.006, 0.998)
     base = 0.5 * torch.randn(n, 1, 3, generator=draw).tanh() / SH_C0
-    sh = torch.cat([base, 0.06 * torch.randn(n, 15, 3, generator=draw)], dim=1)
+    sh = base.new_empty(n, 16, 3)
+    sh[:, :1] = base
+    for part in sh[:, 1:].split(DRAWN_AT_ONCE):
+        part.copy_(0.06 * torch.randn(part.shape, generator=draw))
     quats = _turned_to(normals, torch.randn(n, generator=draw))
     return Gaussians(means, quats, log_scales, opacities.logit(), sh)
 

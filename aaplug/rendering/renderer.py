@@ -24,9 +24,10 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.core.imaging import average_samples
 from aaplug.core.interfaces import Rasterizer, RunsKernels
 from aaplug.core.kernels import EAGER, Kernels
-from aaplug.core.projection import project, shade, with_depth_slopes
+from aaplug.core.projection import project, with_depth_slopes
 from aaplug.core.pyramids import Cutter, Pyramid
 from aaplug.core.sampling import sampling_bounds
+from aaplug.core.shading import shade
 from aaplug.core.splats import Render, Splats2D, concatenated
 from aaplug.core.training import TrainingViews
 from aaplug.methods.filters import fuse_stored
@@ -34,7 +35,7 @@ from aaplug.methods.recipe import Recipe
 from aaplug.methods.recipes import find_recipe, suited
 from aaplug.rasterizers import RASTERIZERS, find_rasterizer
 
-CHUNK = 1 << 20  # Gaussians projected at once
+CHUNK = 1 << 20  # Gaussians projected at once, where no gradients are asked for
 RATE_DIGITS = 2  # decimals of the rate that sets the weight of neighbours, which so moves in steps
 
 Harmonics = Callable[[int, int], Float[Tensor, "c k 3"]]
@@ -189,12 +190,13 @@ class Renderer:
         Gaussians pass in chunks, so that memory is bounded by a chunk and by the splats that stay.
         """
         cut = None if self.cutter is None else self.cutter(camera)
-        whole, parts = len(self.scene) if cut is None else len(cut), []
-        for start in range(0, max(1, whole), CHUNK):
+        whole, parts = max(1, len(self.scene) if cut is None else len(cut)), []
+        at_once = whole if self.scene.tracked else CHUNK
+        for start in range(0, whole, at_once):
             if cut is not None:
-                chunk, places = cut[start : start + CHUNK].of(self.scene), cut.places[start:]
+                chunk, places = cut[start : start + at_once].of(self.scene), cut.places[start:]
             else:
-                chunk, places = self.scene if whole <= CHUNK else self.scene[start : start + CHUNK], start
+                chunk, places = self.scene if whole <= at_once else self.scene[start : start + at_once], start
             splats = self._projected(chunk, places, camera)
             parts.append(self._shaded(splats, chunk, start, camera))
         splats = concatenated(parts)

@@ -18,7 +18,8 @@ from torch import Tensor
 from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import ANTIALIASED, CLASSIC, CONVENTIONS, MIP, Convention, Gaussians
 from aaplug.core.interfaces import ScreenFilter
-from aaplug.core.projection import project, shade
+from aaplug.core.projection import project
+from aaplug.core.shading import shade
 from aaplug.core.splats import Splats2D
 from aaplug.core.training import TrainingViews
 from aaplug.methods.filters import (

@@ -20,7 +20,7 @@ from typing import Any
 import platformdirs
 import torch
 
-from aaplug.core import culling, ellipses, kernels, projection, rules, spherical_harmonics, splats
+from aaplug.core import culling, ellipses, kernels, projection, rules, shading, spherical_harmonics, splats
 from aaplug.core.errors import UsageError
 from aaplug.core.executors import Processes, torch_threads
 from aaplug.core.kernels import EAGER, ONE_MORE, Kernel, Kernels
@@ -34,7 +34,7 @@ from aaplug.rasterizers.tiled.packages import CompiledKernels, Package
 
 KERNELS: tuple[Kernel, ...] = (  # those that take longest to compile come last
     projection.project_kernel(),
-    *projection.SHADE.values(),
+    *map(shading.shade_kernel, shading.COMPILED),
     splats.SELECT,
     culling.cull_kernel(),
     point.POINT_ROWS,
@@ -46,7 +46,7 @@ KERNELS: tuple[Kernel, ...] = (  # those that take longest to compile come last
     backward.SLOTS,
     point.FROM_SUMS,
     point.POINT_ROWS_BACKWARD,
-    *projection.SHADE_BACKWARD.values(),
+    *map(shading.backward_kernel, shading.COMPILED),
     backward.step_kernel(POINT, RULES_3DGS),
     projection.PROJECT_BACKWARD,
     gaussian_blending.pass_kernel(),
@@ -54,7 +54,7 @@ KERNELS: tuple[Kernel, ...] = (  # those that take longest to compile come last
     forward.pass_kernel(POINT, RULES_3DGS),
 )
 SOURCES = (  # modules whose source the kernels are made of
-    *(kernels, rules, splats, ellipses, culling, projection, spherical_harmonics),
+    *(kernels, rules, splats, ellipses, culling, projection, shading, spherical_harmonics),
     *(raster_rows, averages, point, integral, gaussian_blending, binning, forward, backward, layout),
 )
 OPTIONS = {
@@ -166,7 +166,7 @@ def _is_sound(kernel: Kernel) -> bool:
 
 def _load(kernel: Kernel) -> Package | None:
     """The package, if its result equals the eager one; else None."""
-    return Package.of(_opened(kernel), kernel.example()) if _is_sound(kernel) else None
+    return Package.of(_opened(kernel), kernel) if _is_sound(kernel) else None
 
 
 def _opened(kernel: Kernel) -> Callable[[list[torch.Tensor]], list[torch.Tensor]]:

@@ -11,18 +11,24 @@ from torch import Tensor
 from aaplug.core.kernels import BACKWARD, Kernel, Kernels, Runner
 from aaplug.methods.pixel_kernels.raster_rows import PIXELS
 
+ROWS = 1 << 15  # whose gradients are computed at once, so that what lies between fits the cache
+
 
 @dataclass(frozen=True)
 class Package:
-    """A kernel compiled for CPU arguments of these types, and of these shapes after the leading size."""
+    """A kernel compiled for CPU arguments of these types, and of these shapes after the leading size.
+
+    sizes: see `Kernel`.
+    """
 
     run: Callable[[list[Tensor]], list[Tensor]]
     types: list[tuple[torch.dtype, torch.Size]]
+    sizes: tuple[str | None, ...]
 
     @staticmethod
-    def of(run: Callable[[list[Tensor]], list[Tensor]], example: tuple[Tensor, ...]) -> "Package":
-        """The package that was compiled for an example."""
-        return Package(run, [(arg.dtype, arg.shape[1:]) for arg in example])
+    def of(run: Callable[[list[Tensor]], list[Tensor]], kernel: Kernel) -> "Package":
+        """The package that a kernel was compiled to."""
+        return Package(run, [(arg.dtype, arg.shape[1:]) for arg in kernel.example()], kernel.sizes)
 
     def run_whole(self, *args: Tensor) -> list[Tensor]:
         """Run contiguous arguments."""
@@ -94,8 +100,21 @@ class _Tracked(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         args = ctx.saved_tensors
-        found = iter(ctx.package.run([*args, *(grad.contiguous() for grad in grads)]))
+        found = iter(_pulled_back(ctx.package, args, [grad.contiguous() for grad in grads]))
         return None, None, *(next(found) if arg.is_floating_point() else None for arg in args)
+
+
+def _pulled_back(package: Package, args: Sequence[Tensor], grads: list[Tensor]) -> list[Tensor]:
+    """Gradients of the floating point arguments; in parts, where all rows are independent."""
+    given = list(zip([*args, *grads], package.sizes, strict=True))
+    rows = {size: len(arg) for arg, size in given if size is not None}
+    if len(rows) > 1 or sum(rows.values()) <= ROWS:
+        return package.run([arg for arg, _ in given])
+    parts = -(-sum(rows.values()) // ROWS)
+    split = [[arg] * parts if size is None else arg.tensor_split(parts) for arg, size in given]
+    found = zip(*(package.run([*part]) for part in zip(*split, strict=True)), strict=True)
+    sizes = [size for arg, size in given[: len(args)] if arg.is_floating_point()]
+    return [torch.stack(x).sum(0) if size is None else torch.cat(x) for x, size in zip(found, sizes, strict=True)]
 
 
 class CountingKernels(Kernels):
