@@ -186,7 +186,7 @@ def test_spz_axes_can_be_left_as_they_are(tmp_path: Path):
 
 def test_a_half_turn_of_the_scene_is_a_half_turn_of_the_view():
     """Colours seen from turned directions are those seen before."""
-    from aaplug.core.projection import sh_colour
+    from aaplug.core.spherical_harmonics import sh_colour
     from aaplug.io.scenes.packed import half_turn_about_x
 
     scene = oracle()
