@@ -39,7 +39,9 @@ class SamplingBounds:
     views: Int[Tensor, " n"]
 
     def __getitem__(self, index: Tensor | slice) -> "SamplingBounds":
-        """The bounds of the Gaussians at `index`."""
+        """The bounds of the Gaussians at `index` (a mask, indices or a slice)."""
+        if isinstance(index, Tensor) and index.dtype != torch.bool:  # several times faster than [index]
+            return SamplingBounds(*(column.index_select(0, index) for column in vars(self).values()))
         return SamplingBounds(*(column[index] for column in vars(self).values()))
 
     @property

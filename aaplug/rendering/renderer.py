@@ -166,7 +166,7 @@ class Renderer:
         any training camera, it is the median over visible Gaussians of (rate now / nearest rate in the Gaussian's
         training range); without any, the ratio of focal lengths.
         """
-        if camera.trained_focal is not None or not self.training.bounds.seen.any():
+        if camera.trained_focal is not None:
             return self.training.relative_rate(camera)
         key = (*camera.intrinsics, camera.cam_from_world.detach().cpu().numpy().tobytes())
         if key not in self._rates:

@@ -28,9 +28,9 @@ class Adaptive:
 
     def __call__(self, splats: Splats2D, camera: Camera, training: TrainingViews) -> Splats2D:
         """Filter the splats of one view."""
-        seen = training.bounds.seen[splats.sources]
-        finest = training.bounds.highest[splats.sources].to(splats.depths).where(seen, 1.0)
-        magnified = torch.where(seen, camera.focal / splats.depths / finest, 1.0).clamp(min=1.0)
+        bounds = training.bounds[splats.sources]
+        finest = bounds.highest.to(splats.depths).where(bounds.seen, 1.0)
+        magnified = torch.where(bounds.seen, camera.focal / splats.depths / finest, 1.0).clamp(min=1.0)
         variance = self.variance * magnified * magnified
         return splats.convolved(variance[:, None] * _sphere(splats, camera), compensate=True)
 

@@ -17,12 +17,13 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple, cast, get_args
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.cameras import Camera
 from aaplug.core.choices import RateReference
 from aaplug.core.errors import UsageError, not_one_of
+from aaplug.core.sampling import SamplingBounds
 from aaplug.core.splats import Splats2D
 from aaplug.core.training import TrainingViews
 
@@ -85,10 +86,10 @@ class Matched:
         view = torch.full_like(splats.depths, training.relative_rate(camera))
         if self.reference == "global":
             return view
-        seen = training.bounds.seen.index_select(0, splats.sources)
+        bounds = training.bounds[splats.sources]
         now = camera.focal / splats.depths
-        compared = REFERENCES[self.reference](now, _trained(splats, camera, training, seen))
-        return torch.where(seen, now / compared, view)
+        compared = REFERENCES[self.reference](now, _trained(splats, camera, bounds))
+        return torch.where(bounds.seen, now / compared, view)
 
 
 class Trained(NamedTuple):
@@ -102,12 +103,9 @@ class Trained(NamedTuple):
     own: Float[Tensor, " m"] | None
 
 
-def _trained(splats: Splats2D, camera: Camera, training: TrainingViews, seen: Bool[Tensor, " m"]) -> Trained:
+def _trained(splats: Splats2D, camera: Camera, bounds: SamplingBounds) -> Trained:
     """Training rates of each splat; bounds of 1 for Gaussians that no camera saw, only to avoid dividing by 0."""
-    lowest, highest = (
-        bound.index_select(0, splats.sources).to(splats.depths).where(seen, 1.0)
-        for bound in (training.bounds.lowest, training.bounds.highest)
-    )
+    lowest, highest = (rate.to(splats.depths).where(bounds.seen, 1.0) for rate in (bounds.lowest, bounds.highest))
     own = None if camera.trained_focal is None else camera.trained_focal / splats.depths
     return Trained(lowest, highest, own)
 
