@@ -7,7 +7,7 @@ it fades into the next.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -102,10 +102,10 @@ class Pyramid:
         return torch.stack([torch.bincount(part, minlength=self.count) for part in parts])
 
     @cached_property
-    def firsts(self) -> Int[Tensor, "l c_and_1"]:
-        """Index of each chunk's first Gaussian in each level but the finest, and of that after the last."""
-        ends = self.counts[1:].flatten().cumsum(0).reshape(-1, self.count) + self.sizes[0]
-        return torch.cat([ends[:, :1] - self.counts[1:, :1], ends], dim=1)
+    def firsts(self) -> Int[Tensor, "l c"]:
+        """Index of each chunk's first Gaussian in each level; no meaning in the finest, which has its own order."""
+        counts = self.counts.flatten()
+        return (counts.cumsum(0) - counts).view(-1, self.count)
 
     @cached_property
     def count(self) -> int:
@@ -118,7 +118,7 @@ class Cutter:
     """Picks a view's cut from bounds of the chunks.
 
     centres, radii: of a ball around a chunk's means, in world units.
-    reach: how far beyond it one of its Gaussians can be seen.
+    reach: how far from the ball's centre one of its Gaussians can be seen.
     sizes: how far from its mean each Gaussian of the pyramid can be seen, in world units.
     lowest, highest: training's sampling rates in the chunk, px per world unit; 0 if no camera sees it.
     """
@@ -147,30 +147,32 @@ class Cutter:
 
         means = scene.means.detach().double()
         centres = (extreme(means, "amin") + extreme(means, "amax")) / 2
-        radii = extreme((means - centres[chunks]).norm(dim=1), "amax")
+        distances = (means - centres[chunks]).norm(dim=1)
+        radii = extreme(distances, "amax")
         blurs = torch.where(bounds.seen, training.convention.kernel**0.5 / bounds.lowest, 0.0)
         sizes = STRETCH * SIGMAS * (scene.scales.detach().amax(dim=1).square() + blurs.square()).sqrt()
         lowest = extreme(torch.where(bounds.seen, bounds.lowest, torch.inf), "amin")
         seen = lowest.isfinite()
         highest = extreme(bounds.highest, "amax")
-        reach = extreme(sizes, "amax").double()
+        reach = extreme(distances + sizes, "amax")
         return cls(pyramid, training, centres, radii, reach, sizes, lowest.where(seen, 0.0), highest)
 
     @torch.no_grad()
     def __call__(self, camera: Camera) -> Cut:
         """The cut of a view whose pixels are those of `camera`."""
-        visible, octaves = self.visible(camera), self.octaves(camera)
-        parts, shares = zip(*self._parts(visible, octaves), strict=True)
-        index, shares = torch.cat(parts), torch.cat(shares)
+        frustum, shares = self._frustum(camera), self.shares(self.octaves(camera))
+        shares = shares.masked_fill(~_reaches(frustum, self.centres, self.reach), 0.0)
+        index, shares = self._candidates(shares.to(self.sizes))
         means, sizes = (column.index_select(0, index) for column in (self.pyramid.scene.means, self.sizes))
-        shown = self._shown(camera, means, sizes).nonzero()[:, 0]
+        shown = _reaches(frustum, means, sizes).nonzero()[:, 0]
         index, shares = index.index_select(0, shown), shares.index_select(0, shown)
         return Cut(index, None if (shares == 1).all() else shares)
 
     @torch.no_grad()
     def count(self, camera: Camera) -> int:
         """Number of Gaussians in the cut of a view."""
-        drawn = (self.shares(self.octaves(camera)) > 0) & self.visible(camera)
+        visible = _reaches(self._frustum(camera), self.centres, self.reach)
+        drawn = (self.shares(self.octaves(camera)) > 0) & visible
         return int(self.pyramid.counts[drawn].sum())
 
     @property
@@ -203,36 +205,36 @@ class Cutter:
         coming[0] = 1
         return coming - torch.cat([coming[1:], torch.zeros_like(coming[:1])])
 
-    def visible(self, camera: Camera) -> Bool[Tensor, " c"]:
-        """Chunks that can reach into the image."""
-        return self._shown(camera, self.centres, self.radii + self.reach)
+    def _frustum(self, camera: Camera) -> tuple[Float[Tensor, "5 3"], Float[Tensor, " 5"]]:
+        """Normals and offsets of the planes around what is seen; normals · place + offset >= 0 inside."""
+        normals, offsets = _planes(camera, PAD * max(1.0, self.training.relative_rate(camera)))
+        return normals, offsets + FAR_ROUNDING * camera.cam_from_world.detach()[:3, 3].cpu().norm()
 
-    def _shown(self, camera: Camera, places: Float[Tensor, "m 3"], room: Float[Tensor, " m"]) -> Bool[Tensor, " m"]:
-        """Whether what is seen up to `room` from a place can reach into the image."""
-        pad = PAD * max(1.0, self.training.relative_rate(camera))
-        normals, offsets = _frustum(camera, pad)
-        room = room + FAR_ROUNDING * float(camera.cam_from_world.detach()[:3, 3].norm())
-        return torch.addmm(offsets.to(places)[:, None], normals.to(places), places.T).amin(dim=0) > -room
-
-    def _parts(
-        self, visible: Bool[Tensor, " c"], octaves: Float[Tensor, " c"]
-    ) -> Iterator[tuple[Int[Tensor, " m"], Float[Tensor, " m"]]]:
-        """The Gaussians of every level and their shares."""
-        shares = self.shares(octaves).masked_fill(~visible, 0.0).to(self.pyramid.scene.means)
-        finest, *coarser = shares
-        if finest.any():
-            own = finest[self.pyramid.chunks[: self.pyramid.sizes[0]]]
-            index = own.nonzero()[:, 0]
-            yield index, own[index]
-        for level, share in zip(self.pyramid.firsts, coarser, strict=True):
-            chosen = share.nonzero()[:, 0]
-            starts, counts = level[chosen], level[chosen + 1] - level[chosen]
-            skipped = torch.repeat_interleave(starts - counts.cumsum(0) + counts, counts)
-            yield skipped + torch.arange(len(skipped)), torch.repeat_interleave(share[chosen], counts)
+    def _candidates(self, shares: Float[Tensor, "l c"]) -> tuple[Int[Tensor, " m"], Float[Tensor, " m"]]:
+        """The Gaussians of the chunks that have a share, ascending, and their shares."""
+        pyramid = self.pyramid
+        finest = shares[0].index_select(0, pyramid.chunks[: pyramid.sizes[0]]) if shares[0].any() else shares[0, :0]
+        first = finest.nonzero()[:, 0]
+        shares[0] = 0
+        levels, chunks = shares.nonzero().unbind(dim=1)
+        counts = pyramid.counts[levels, chunks]
+        runs = torch.repeat_interleave(counts)
+        skipped = pyramid.firsts[levels, chunks] - counts.cumsum(0) + counts
+        index = skipped.index_select(0, runs) + torch.arange(len(runs))
+        own = shares[levels, chunks].index_select(0, runs)
+        return torch.cat([first, index]), torch.cat([finest.index_select(0, first), own])
 
 
-def _frustum(camera: Camera, pad: float) -> tuple[Float[Tensor, "5 3"], Float[Tensor, " 5"]]:
-    """Normals and offsets of the planes around what a camera sees, in the world; normals · place + offset >= 0 inside.
+def _reaches(
+    frustum: tuple[Tensor, Tensor], places: Float[Tensor, "m 3"], room: Float[Tensor, " m"]
+) -> Bool[Tensor, " m"]:
+    """Whether what is seen up to `room` from a place can reach into the image."""
+    normals, offsets = (x.to(places) for x in frustum)
+    return torch.addmm(offsets[:, None], normals, places.T).amin(dim=0) > -room
+
+
+def _planes(camera: Camera, pad: float) -> tuple[Float[Tensor, "5 3"], Float[Tensor, " 5"]]:
+    """Normals and offsets of the planes around what a camera sees, in the world.
 
     pad: px around the image.
     """

@@ -14,7 +14,7 @@ Design and measurements are aaplug's own.  Step one with one global rate is SA-G
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import NamedTuple, cast, get_args
+from typing import cast, get_args
 
 import torch
 from jaxtyping import Float
@@ -23,7 +23,6 @@ from torch import Tensor
 from aaplug.core.cameras import Camera
 from aaplug.core.choices import RateReference
 from aaplug.core.errors import UsageError, not_one_of
-from aaplug.core.sampling import SamplingBounds
 from aaplug.core.splats import Splats2D
 from aaplug.core.training import TrainingViews
 
@@ -33,6 +32,7 @@ PIXEL_VARIANCE = 0.07
 
 MAX_RISE = 1.2  # largest factor by which "pose" raises the reference of a coarser view (examples/guides/methods.md)
 FULL_RISE_AT = 1 / 4  # relative rate at which the factor reaches MAX_RISE, at a pose of the data set
+RISE_SPEED = math.log(MAX_RISE, 1 / FULL_RISE_AT)  # there, exponent of the factor in the inverse of that rate
 
 
 @dataclass(frozen=True)
@@ -83,65 +83,40 @@ class Matched:
 
     def rates(self, splats: Splats2D, camera: Camera, training: TrainingViews) -> Float[Tensor, " m"]:
         """Relative sampling rate r of each splat; the view's own r for Gaussians that no training camera saw."""
-        view = torch.full_like(splats.depths, training.relative_rate(camera))
-        if self.reference == "global":
-            return view
-        bounds = training.bounds[splats.sources]
+        view, at_pose = training.relative_rate(camera), camera.trained_focal is not None
+        if self.reference == "global" or (self.reference == "pose" and at_pose and view >= 1):
+            return torch.full_like(splats.depths, view)
         now = camera.focal / splats.depths
-        compared = REFERENCES[self.reference](now, _trained(splats, camera, bounds))
-        return torch.where(bounds.seen, now / compared, view)
+        if self.reference == "pose" and at_pose:
+            own, rise = now / view, min(view**-RISE_SPEED, MAX_RISE)
+            highest = training.bounds.highest.index_select(0, splats.sources).to(own)  # 0 for a Gaussian not seen
+            return now / torch.minimum(rise * own, torch.maximum(highest, own))
+        bounds = training.bounds[splats.sources]
+        lowest, highest = (rate.to(now).where(bounds.seen, 1.0) for rate in (bounds.lowest, bounds.highest))
+        if self.reference == "interval" and at_pose:
+            lowest, highest = torch.minimum(lowest, now / view), torch.maximum(highest, now / view)
+        return torch.where(bounds.seen, now / REFERENCES[self.reference](now, lowest, highest), view)
 
 
-class Trained(NamedTuple):
-    """Sampling rates of each splat in training, px per world unit.
-
-    own: at this pose's training size, None for a free camera.
-    """
-
-    lowest: Float[Tensor, " m"]
-    highest: Float[Tensor, " m"]
-    own: Float[Tensor, " m"] | None
+Rates = Float[Tensor, " m"]  # px per world unit
 
 
-def _trained(splats: Splats2D, camera: Camera, bounds: SamplingBounds) -> Trained:
-    """Training rates of each splat; bounds of 1 for Gaussians that no camera saw, only to avoid dividing by 0."""
-    lowest, highest = (rate.to(splats.depths).where(bounds.seen, 1.0) for rate in (bounds.lowest, bounds.highest))
-    own = None if camera.trained_focal is None else camera.trained_focal / splats.depths
-    return Trained(lowest, highest, own)
+def _sharpest(now: Rates, lowest: Rates, highest: Rates) -> Rates:
+    return highest
 
 
-def _sharpest(now: Float[Tensor, " m"], trained: Trained) -> Float[Tensor, " m"]:
-    return trained.highest
-
-
-def _interval(now: Float[Tensor, " m"], trained: Trained) -> Float[Tensor, " m"]:
-    lowest, highest = _range(trained)
+def _interval(now: Rates, lowest: Rates, highest: Rates) -> Rates:
     return torch.minimum(torch.maximum(now, lowest), highest)
 
 
-def _pose(now: Float[Tensor, " m"], trained: Trained) -> Float[Tensor, " m"]:
-    """The pose's own training rate, or for a free camera the clamped current rate; raised where `now` is lower."""
-    lowest, highest = _range(trained)
-    if trained.own is None:
-        low, high, speed = lowest, highest, 1.0
-    else:
-        low = high = trained.own
-        speed = math.log(MAX_RISE) / -math.log(FULL_RISE_AT)
-    rise = (low / now).pow(speed).clamp(max=MAX_RISE)
-    raised = torch.minimum(low * rise, highest)
-    return torch.where(now < low, raised, torch.minimum(now, high))
+def _free_pose(now: Rates, lowest: Rates, highest: Rates) -> Rates:
+    """The rate clamped to training's; raised where it is lower."""
+    raised = torch.minimum(lowest * (lowest / now).clamp(max=MAX_RISE), highest)
+    return torch.where(now < lowest, raised, torch.minimum(now, highest))
 
 
-def _range(trained: Trained) -> tuple[Float[Tensor, " m"], Float[Tensor, " m"]]:
-    """Lowest and highest rate in training, with this pose's own."""
-    lowest, highest, own = trained
-    if own is None:
-        return lowest, highest
-    return torch.minimum(lowest, own), torch.maximum(highest, own)
-
-
-REFERENCES: dict[str, Callable[[Tensor, Trained], Tensor]] = {
-    "pose": _pose,
+REFERENCES: dict[str, Callable[[Rates, Rates, Rates], Rates]] = {  # of the current rate and training's range
+    "pose": _free_pose,
     "sharpest": _sharpest,
     "interval": _interval,
 }
