@@ -11,6 +11,7 @@ from aaplug import rasterizers as choice
 from aaplug.core import shading
 from aaplug.core.errors import UsageError
 from aaplug.core.kernels import EAGER, Kernel, Kernels
+from aaplug.core.projection import project
 from aaplug.core.rules import RULES_GSPLAT
 from aaplug.core.training import TrainingViews
 from aaplug.methods.recipes import RECIPES
@@ -153,6 +154,31 @@ def test_compiled_gradients_are_the_eager_ones_in_parts_and_at_once(built, at_on
     for fast, slow in zip(gradients(built), expected, strict=True):
         assert slow.abs().max() > 0
         torch.testing.assert_close(fast, slow, rtol=0, atol=1e-4 * float(slow.abs().max()))
+
+
+def test_gradients_reach_parameters_in_any_layout(built):
+    scene, camera = make_scene(100, degree=2), make_camera()
+    splats = project(scene, camera)
+    for sh, means in ((scene.sh.mT.contiguous().mT, scene.means), (scene.sh, scene.means.T.contiguous().T)):
+        leaves = sh.requires_grad_(), means.requires_grad_()
+        rgb = shading.shade(splats, replace(scene, sh=sh, means=means), camera, built).rgb
+        found = torch.autograd.grad(rgb.square().sum(), leaves)
+        rgb = shading.shade(splats, replace(scene, sh=sh, means=means), camera).rgb
+        torch.testing.assert_close(found, torch.autograd.grad(rgb.square().sum(), leaves))
+
+
+@pytest.mark.parametrize("kernel", compiled.KERNELS, ids=lambda kernel: kernel.name)
+def test_kernels_name_the_arguments_that_they_update(kernel: Kernel):
+    args, kept = kernel.example(), kernel.example()
+    kernel.function(*args)
+    changed = [i for i, (now, before) in enumerate(zip(args, kept, strict=True)) if not torch.equal(now, before)]
+    assert changed == [*kernel.updates]
+
+
+def test_a_kernel_refuses_to_update_a_copy():
+    kernel = Kernel("fill", lambda x: (), lambda: (torch.ones(4, 2),), ("n",), updates=(0,))
+    with pytest.raises(AssertionError, match="fill would update copies"):
+        CompiledKernels({"fill": Package.of(lambda args: [], kernel)}).run(kernel, torch.ones(2, 4).T)
 
 
 def test_a_pickled_rasterizer_loads_the_packages_of_its_machine(built, empty_cache):

@@ -167,6 +167,14 @@ def test_scenes_are_projected_in_chunks_without_a_change(cameras, monkeypatch):
     torch.testing.assert_close(renderer(cameras[0]).rgb, whole, rtol=0, atol=1e-6)
 
 
+def test_a_renderer_of_a_scene_with_gradients_has_them_where_the_filter_follows_the_training_views(cameras):
+    scene = make_scene(200)
+    scene = replace(scene, means=scene.means.requires_grad_())
+    Renderer.of(scene, cameras, "matched")(replace(cameras[0], trained_focal=None).scaled(0.5)).rgb.sum().backward()
+    assert scene.means.grad.isfinite().all()
+    assert scene.means.grad.abs().sum() > 0
+
+
 def test_gradients_are_made_at_once_because_each_part_would_take_a_scene(cameras, monkeypatch):
     scene = make_scene(200)
     scene = replace(scene, means=scene.means.requires_grad_())

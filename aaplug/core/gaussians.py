@@ -154,7 +154,7 @@ class Gaussians:
     def tracked(self) -> bool:
         """Whether gradients of a parameter will be asked for.
 
-        Then work is not done in chunks, because each chunk's gradient would be as large as the scene.
+        Then they are not projected in chunks, because each chunk's gradient would be as large as the scene.
         """
         return torch.is_grad_enabled() and any(column.requires_grad for column in self.columns.values())
 

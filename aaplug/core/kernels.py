@@ -12,13 +12,14 @@ from torch import Tensor
 
 BACKWARD = "-backward"  # suffix of the name of a kernel's gradient kernel
 ONE_MORE = "+1"  # suffix of the name of a size
+EXAMPLE_SIZE = 100_000  # rows to compile for, as many as in real work: inductor chooses by them which loops use threads
 
 
 @dataclass(frozen=True)
 class Kernel:
     """One stage.
 
-    function: tensors in, a tuple of tensors out; what it updates in place must be contiguous.
+    function: tensors in, a tuple of tensors out.
     example: makes the arguments to compile for, as large as real work: inductor decides by them which loops use
     threads.
     sizes: per argument the name of its leading size, None where that is fixed; sizes of one name are equal, and "n+1"
@@ -29,6 +30,7 @@ class Kernel:
     overlaps: it computes many independent values in turn, so g++ should schedule instructions before it allocates
         registers.  With many sums it would run out of registers.
     pulls_back: the function computes gradients itself, so it is traced before it is compiled.
+    updates: positions of the arguments that it updates in place; they must be contiguous.
     evaluations: splat-pixel evaluations of one call, per pixel of a tile; 0 for kernels that do not composite.
     """
 
@@ -40,6 +42,7 @@ class Kernel:
     chained: bool = False
     overlaps: bool = False
     pulls_back: bool = False
+    updates: tuple[int, ...] = ()
     evaluations: int = 0
 
     def size(self, name: str, args: tuple[Tensor, ...]) -> int:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import MAX_LOG_SCALE, Gaussians
-from aaplug.core.kernels import EAGER, Kernel, Kernels, backward_of
+from aaplug.core.kernels import EAGER, EXAMPLE_SIZE, Kernel, Kernels, backward_of
 from aaplug.core.rules import NEAR, RULES_3DGS, Rules, variant
 from aaplug.core.splats import SELECT, Splats2D
 
@@ -165,9 +165,6 @@ def rotation_rows(quats: Float[Tensor, "n 4"]) -> list[list[Tensor]]:
 def rotation_matrices(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
     """Rotation matrices of unit quaternions wxyz."""
     return torch.stack([torch.stack(row, dim=-1) for row in rotation_rows(quats)], dim=-2)
-
-
-EXAMPLE_SIZE = 100_000  # as large as real work: inductor decides by it which loops use threads
 
 
 def _project_example() -> tuple[Tensor, ...]:

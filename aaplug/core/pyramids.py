@@ -105,7 +105,7 @@ class Pyramid:
     def firsts(self) -> Int[Tensor, "l c"]:
         """Index of each chunk's first Gaussian in each level; no meaning in the finest, which has its own order."""
         counts = self.counts.flatten()
-        return (counts.cumsum(0) - counts).view(-1, self.count)
+        return (counts.cumsum(0) - counts).view_as(self.counts)
 
     @cached_property
     def count(self) -> int:
@@ -170,7 +170,7 @@ class Cutter:
 
     @torch.no_grad()
     def count(self, camera: Camera) -> int:
-        """Number of Gaussians in the cut of a view."""
+        """Number of Gaussians in the chunks that a view draws, of which the cut leaves out those beside the image."""
         visible = _reaches(self._frustum(camera), self.centres, self.reach)
         drawn = (self.shares(self.octaves(camera)) > 0) & visible
         return int(self.pyramid.counts[drawn].sum())
@@ -215,13 +215,12 @@ class Cutter:
         pyramid = self.pyramid
         finest = shares[0].index_select(0, pyramid.chunks[: pyramid.sizes[0]]) if shares[0].any() else shares[0, :0]
         first = finest.nonzero()[:, 0]
-        shares[0] = 0
-        levels, chunks = shares.nonzero().unbind(dim=1)
-        counts = pyramid.counts[levels, chunks]
+        levels, chunks = shares[1:].nonzero().unbind(dim=1)
+        counts, firsts = (of[1:][levels, chunks] for of in (pyramid.counts, pyramid.firsts))
         runs = torch.repeat_interleave(counts)
-        skipped = pyramid.firsts[levels, chunks] - counts.cumsum(0) + counts
-        index = skipped.index_select(0, runs) + torch.arange(len(runs))
-        own = shares[levels, chunks].index_select(0, runs)
+        skipped = firsts - counts.cumsum(0) + counts
+        index = skipped.index_select(0, runs) + torch.arange(len(runs), device=runs.device)
+        own = shares[1:][levels, chunks].index_select(0, runs)
         return torch.cat([first, index]), torch.cat([finest.index_select(0, first), own])
 
 

@@ -39,7 +39,7 @@ class SamplingBounds:
     views: Int[Tensor, " n"]
 
     def __getitem__(self, index: Tensor | slice) -> "SamplingBounds":
-        """The bounds of the Gaussians at `index` (a mask, indices or a slice)."""
+        """The bounds of the Gaussians at `index` (a mask, a vector of indices from 0, or a slice)."""
         if isinstance(index, Tensor) and index.dtype != torch.bool:  # several times faster than [index]
             return SamplingBounds(*(column.index_select(0, index) for column in vars(self).values()))
         return SamplingBounds(*(column[index] for column in vars(self).values()))
@@ -64,6 +64,7 @@ class SamplingBounds:
         return torch.where(self.seen, self.highest, coarsest)
 
 
+@torch.no_grad()
 def sampling_bounds(
     means: Float[Tensor, "n 3"], cameras: Sequence[Camera], chunk_pairs: int = CHUNK_PAIRS
 ) -> SamplingBounds:

@@ -1,7 +1,7 @@
 """Colour of splats, from the spherical harmonics of their Gaussians.
 
 n: Gaussians of the scene; m: splats; k: coefficients per channel, (degree + 1)².  The camera's centre is subtracted in
-float64; the rest runs in the scene's precision.  Splats pass in chunks that fit the cache, and so do their gradients.
+float64; the rest runs in the scene's precision.  Splats pass in chunks that fit the cache, forward and backward.
 """
 
 from dataclasses import replace
@@ -14,24 +14,26 @@ from torch import Tensor
 
 from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import Gaussians
-from aaplug.core.kernels import EAGER, Kernel, Kernels
+from aaplug.core.kernels import EAGER, EXAMPLE_SIZE, Kernel, Kernels
 from aaplug.core.spherical_harmonics import sh_colour
 from aaplug.core.splats import Splats2D
 
 CHUNK = 1 << 16  # splats
 COMPILED = (4, 9, 16)  # coefficients per channel of degree 1 to 3
-EXAMPLE_SIZE = 100_000  # Gaussians; as large as real work: inductor chooses by it which loops use threads
 
 
 def shade(splats: Splats2D, scene: Gaussians, camera: Camera, kernels: Kernels = EAGER) -> Splats2D:
-    """Add each splat's colour as seen from the camera: SH plus mid-grey, clamped below at black (3DGS)."""
+    """Add each splat's colour as seen from the camera: SH plus mid-grey, clamped below at black (3DGS).
+
+    splats: at most one of each Gaussian.
+    """
     centre = camera.centre.to(scene.means.device)
-    rgb = _Shade.apply(scene.sh, scene.means, centre, splats.sources, kernels)
-    return replace(splats, rgb=rgb)
+    columns = (scene.sh.contiguous(), scene.means.contiguous())  # once, and not for each chunk
+    return replace(splats, rgb=_Shade.apply(*columns, centre, splats.sources, kernels))
 
 
 class _Shade(torch.autograd.Function):
-    """Colours in chunks, with gradients that each chunk adds to the scene's."""
+    """Colours in chunks; each writes the gradients of its own Gaussians into those of the scene."""
 
     @staticmethod
     def forward(ctx: Any, sh: Tensor, means: Tensor, centre: Tensor, sources: Tensor, kernels: Kernels) -> Tensor:
@@ -44,12 +46,16 @@ class _Shade(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         sh, means, centre, sources = ctx.saved_tensors
-        kernel = backward_kernel(sh.shape[1])
-        into = torch.zeros_like(sh), torch.zeros_like(means)
+        kernel = gradients_kernel(sh.shape[1])
+        wanted = ctx.needs_input_grad[:2]
+        # what nobody asked for is written, but not cleared: rows that are not drawn cost nothing
+        into = [
+            torch.zeros_like(x) if asked else torch.empty_like(x) for x, asked in zip((sh, means), wanted, strict=True)
+        ]
         moved = torch.zeros_like(centre)
         for part, grad in zip(sources.split(CHUNK), grads[0].split(CHUNK), strict=True):
             moved += ctx.kernels.run(kernel, sh, means, part, centre, grad, *into)[0]
-        return *into, moved, None, None
+        return *(x if asked else None for x, asked in zip(into, wanted, strict=True)), moved, None, None
 
 
 def _colours(
@@ -66,7 +72,7 @@ def _shade(
     return (_colours(sh.index_select(0, sources), means.index_select(0, sources), centre),)
 
 
-def _shade_backward(
+def _gradients(
     sh: Float[Tensor, "n k 3"],
     means: Float[Tensor, "n 3"],
     sources: Int[Tensor, " m"],
@@ -90,7 +96,7 @@ def _example(coefficients: int) -> tuple[Tensor, ...]:
     return sh.view(-1, coefficients, 3), means, sources, torch.zeros(3, dtype=torch.float64)
 
 
-def _backward_example(coefficients: int) -> tuple[Tensor, ...]:
+def _gradients_example(coefficients: int) -> tuple[Tensor, ...]:
     sh, means, sources, centre = _example(coefficients)
     grad = torch.linspace(-1.0, 1.0, 3 * len(sources)).view(-1, 3)
     return sh, means, sources, centre, grad, torch.zeros_like(sh), torch.zeros_like(means)
@@ -103,13 +109,14 @@ def shade_kernel(coefficients: int) -> Kernel:
 
 
 @cache
-def backward_kernel(coefficients: int) -> Kernel:
+def gradients_kernel(coefficients: int) -> Kernel:
     """Their gradients."""
     return Kernel(
-        f"shade-{coefficients}-backward",
-        _shade_backward,
-        partial(_backward_example, coefficients),
+        f"shade-{coefficients}-gradients",
+        _gradients,
+        partial(_gradients_example, coefficients),
         ("n", "n", "m", None, "m", "n", "n"),
         chained=True,
         pulls_back=True,
+        updates=(5, 6),
     )

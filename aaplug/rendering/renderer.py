@@ -187,7 +187,7 @@ class Renderer:
     def splats(self, camera: Camera) -> Splats2D:
         """The splats of one view: projected, selected, filtered, culled and coloured.
 
-        Gaussians pass in chunks, so that memory is bounded by a chunk and by the splats that stay.
+        Without gradients, Gaussians pass in chunks, and memory is bounded by a chunk and by the splats that stay.
         """
         cut = None if self.cutter is None else self.cutter(camera)
         whole, parts = max(1, len(self.scene) if cut is None else len(cut)), []

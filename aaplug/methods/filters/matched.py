@@ -32,7 +32,7 @@ PIXEL_VARIANCE = 0.07
 
 MAX_RISE = 1.2  # largest factor by which "pose" raises the reference of a coarser view (examples/guides/methods.md)
 FULL_RISE_AT = 1 / 4  # relative rate at which the factor reaches MAX_RISE, at a pose of the data set
-RISE_SPEED = math.log(MAX_RISE, 1 / FULL_RISE_AT)  # there, exponent of the factor in the inverse of that rate
+RISE_SPEED = math.log(MAX_RISE, 1 / FULL_RISE_AT)  # there the factor is (1 / relative rate) ** RISE_SPEED
 
 
 @dataclass(frozen=True)
@@ -84,21 +84,28 @@ class Matched:
     def rates(self, splats: Splats2D, camera: Camera, training: TrainingViews) -> Float[Tensor, " m"]:
         """Relative sampling rate r of each splat; the view's own r for Gaussians that no training camera saw."""
         view, at_pose = training.relative_rate(camera), camera.trained_focal is not None
-        if self.reference == "global" or (self.reference == "pose" and at_pose and view >= 1):
+        if self.reference == "global":
             return torch.full_like(splats.depths, view)
         now = camera.focal / splats.depths
+        own = now / view  # at this pose's training size
         if self.reference == "pose" and at_pose:
-            own, rise = now / view, min(view**-RISE_SPEED, MAX_RISE)
-            highest = training.bounds.highest.index_select(0, splats.sources).to(own)  # 0 for a Gaussian not seen
-            return now / torch.minimum(rise * own, torch.maximum(highest, own))
+            return _at_pose(view, own, training.bounds.highest.index_select(0, splats.sources).to(own))
         bounds = training.bounds[splats.sources]
         lowest, highest = (rate.to(now).where(bounds.seen, 1.0) for rate in (bounds.lowest, bounds.highest))
         if self.reference == "interval" and at_pose:
-            lowest, highest = torch.minimum(lowest, now / view), torch.maximum(highest, now / view)
+            lowest, highest = torch.minimum(lowest, own), torch.maximum(highest, own)
         return torch.where(bounds.seen, now / REFERENCES[self.reference](now, lowest, highest), view)
 
 
 Rates = Float[Tensor, " m"]  # px per world unit
+
+
+def _at_pose(view: float, own: Rates, highest: Rates) -> Rates:
+    """Relative rates at a pose of the data set; highest: in training, 0 for a Gaussian that no camera saw."""
+    if view >= 1:
+        return torch.full_like(own, view)
+    rise = min(view**-RISE_SPEED, MAX_RISE)
+    return view * own / torch.minimum(rise * own, torch.maximum(highest, own))
 
 
 def _sharpest(now: Rates, lowest: Rates, highest: Rates) -> Rates:

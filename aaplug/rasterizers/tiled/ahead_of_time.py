@@ -46,7 +46,7 @@ KERNELS: tuple[Kernel, ...] = (  # those that take longest to compile come last
     backward.SLOTS,
     point.FROM_SUMS,
     point.POINT_ROWS_BACKWARD,
-    *map(shading.backward_kernel, shading.COMPILED),
+    *map(shading.gradients_kernel, shading.COMPILED),
     backward.step_kernel(POINT, RULES_3DGS),
     projection.PROJECT_BACKWARD,
     gaussian_blending.pass_kernel(),

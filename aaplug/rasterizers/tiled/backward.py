@@ -212,7 +212,8 @@ def step_kernel(pixel: PixelKernel, rules: Rules) -> Kernel:
         partial(_step, pixel, rules),
         lambda: (*tiles_example(6, pixel), torch.zeros(EXAMPLE_TILES, STEP * sums_per_splat(pixel))),
         ("m", "p", *9 * ("t",), None, None, "t", "t"),
+        updates=(6, 14),
     )
 
 
-SLOTS = Kernel("slots", _slots, _slots_example, ("p", "p", "t", "s", "p"))
+SLOTS = Kernel("slots", _slots, _slots_example, ("p", "p", "t", "s", "p"), updates=(0,))

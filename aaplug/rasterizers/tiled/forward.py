@@ -252,5 +252,6 @@ def pass_kernel(pixel: PixelKernel, rules: Rules) -> Kernel:
         partial(tiles_example, 5, pixel),
         ("m", "p", *8 * ("t",), None, None, "t"),
         overlaps=True,
+        updates=(6, 7, 8, 9),
         evaluations=pixel.splats_per_pass,
     )

@@ -76,8 +76,10 @@ class CompiledKernels(Kernels):
         if package is None or not package.takes(args):
             return kernel.function
         if not (torch.is_grad_enabled() and any(arg.requires_grad for arg in args)):
-            whole = all(arg.is_contiguous() for arg in args)
-            return package.run_whole if whole else package.run_any
+            if all(arg.is_contiguous() for arg in args):
+                return package.run_whole
+            assert all(args[i].is_contiguous() for i in kernel.updates), f"{kernel.name} would update copies"
+            return package.run_any
         backward = self._package(kernel.name + BACKWARD)
         return kernel.function if backward is None else partial(_Tracked.apply, package, backward)
 
@@ -105,12 +107,13 @@ class _Tracked(torch.autograd.Function):
 
 
 def _pulled_back(package: Package, args: Sequence[Tensor], grads: list[Tensor]) -> list[Tensor]:
-    """Gradients of the floating point arguments; in parts, where all rows are independent."""
+    """Gradients of the floating point arguments; a part of the rows at a time, where all have one leading size."""
     given = list(zip([*args, *grads], package.sizes, strict=True))
     rows = {size: len(arg) for arg, size in given if size is not None}
-    if len(rows) > 1 or sum(rows.values()) <= ROWS:
+    longest = max(rows.values())
+    if len(rows) > 1 or longest <= ROWS:
         return package.run([arg for arg, _ in given])
-    parts = -(-sum(rows.values()) // ROWS)
+    parts = -(-longest // ROWS)
     split = [[arg] * parts if size is None else arg.tensor_split(parts) for arg, size in given]
     found = zip(*(package.run([*part]) for part in zip(*split, strict=True)), strict=True)
     sizes = [size for arg, size in given[: len(args)] if arg.is_floating_point()]
