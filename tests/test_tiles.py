@@ -7,10 +7,11 @@ import torch
 
 from aaplug.core.executors import torch_threads
 from aaplug.core.kernels import EAGER, Kernels
+from aaplug.core.runs import runs_of, starts_of
 from aaplug.core.splats import Splats2D
 from aaplug.methods.pixel_kernels.raster_rows import PIXELS, TILE, next_rows
 from aaplug.rasterizers import Reference, Tiled
-from aaplug.rasterizers.tiled import binning, forward, layout
+from aaplug.rasterizers.tiled import forward, layout
 from tests.conftest import make_splats
 
 F64 = torch.float64
@@ -94,7 +95,7 @@ def test_when_saturated_tiles_are_dropped_changes_no_bit(monkeypatch):
 @pytest.mark.parametrize("counts", [[], [0], [0, 0], [3], [0, 2, 0, 0, 1, 4, 0]], ids=str)
 def test_runs_repeat_as_often_as_they_count(counts):
     lengths = torch.tensor(counts, dtype=torch.int32)
-    runs = binning._runs(binning.starts_of(lengths), lengths)
+    runs = runs_of(starts_of(lengths), lengths)
     assert runs.dtype == torch.int32
     assert runs.equal(torch.repeat_interleave(lengths).int())
 

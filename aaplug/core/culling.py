@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.ellipses import squared_cutoff
-from aaplug.core.kernels import EAGER, Kernel, Kernels
+from aaplug.core.kernels import EAGER, EXAMPLE_SIZE, Kernel, Kernels
 from aaplug.core.rules import RULES_3DGS, Rules, variant
 from aaplug.core.splats import Splats2D
 
@@ -63,6 +63,6 @@ def _inside(
 
 
 def _example() -> tuple[Tensor, ...]:
-    m = 100_000
+    m = EXAMPLE_SIZE
     means = torch.linspace(-9.0, 9.0, 2 * m).view(m, 2)
     return means, torch.ones(m, 3), torch.ones(m), torch.ones(m), torch.tensor([4.0, 4.0, 2.0])

@@ -19,6 +19,7 @@ from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import MIN_OPACITY, Gaussians, joined
 from aaplug.core.projection import JACOBIAN_MARGIN
 from aaplug.core.rules import NEAR
+from aaplug.core.runs import runs_of, starts_of
 from aaplug.core.training import TrainingViews
 
 FADE = 0.5  # octaves of the sampling rate over which a level fades into the next
@@ -104,8 +105,7 @@ class Pyramid:
     @cached_property
     def firsts(self) -> Int[Tensor, "l c"]:
         """Index of each chunk's first Gaussian in each level; no meaning in the finest, which has its own order."""
-        counts = self.counts.flatten()
-        return (counts.cumsum(0) - counts).view_as(self.counts)
+        return starts_of(self.counts.flatten()).view_as(self.counts)
 
     @cached_property
     def count(self) -> int:
@@ -160,9 +160,8 @@ class Cutter:
     @torch.no_grad()
     def __call__(self, camera: Camera) -> Cut:
         """The cut of a view whose pixels are those of `camera`."""
-        frustum, shares = self._frustum(camera), self.shares(self.octaves(camera))
-        shares = shares.masked_fill(~_reaches(frustum, self.centres, self.reach), 0.0)
-        index, shares = self._candidates(shares.to(self.sizes))
+        frustum = self._frustum(camera)
+        index, shares = self._candidates(self._drawn(camera, frustum).to(self.sizes))
         means, sizes = (column.index_select(0, index) for column in (self.pyramid.scene.means, self.sizes))
         shown = _reaches(frustum, means, sizes).nonzero()[:, 0]
         index, shares = index.index_select(0, shown), shares.index_select(0, shown)
@@ -171,9 +170,7 @@ class Cutter:
     @torch.no_grad()
     def count(self, camera: Camera) -> int:
         """Number of Gaussians in the chunks that a view draws, of which the cut leaves out those beside the image."""
-        visible = _reaches(self._frustum(camera), self.centres, self.reach)
-        drawn = (self.shares(self.octaves(camera)) > 0) & visible
-        return int(self.pyramid.counts[drawn].sum())
+        return int(self.pyramid.counts[self._drawn(camera, self._frustum(camera)) > 0].sum())
 
     @property
     def coarsest(self) -> slice:
@@ -210,6 +207,11 @@ class Cutter:
         normals, offsets = _planes(camera, PAD * max(1.0, self.training.relative_rate(camera)))
         return normals, offsets + FAR_ROUNDING * camera.cam_from_world.detach()[:3, 3].cpu().norm()
 
+    def _drawn(self, camera: Camera, frustum: tuple[Tensor, Tensor]) -> Float[Tensor, "l c"]:
+        """Share of each level in each chunk; 0 for chunks that cannot reach into the image."""
+        visible = _reaches(frustum, self.centres, self.reach)
+        return self.shares(self.octaves(camera)).masked_fill(~visible, 0.0)
+
     def _candidates(self, shares: Float[Tensor, "l c"]) -> tuple[Int[Tensor, " m"], Float[Tensor, " m"]]:
         """The Gaussians of the chunks that have a share, ascending, and their shares."""
         pyramid = self.pyramid
@@ -217,9 +219,9 @@ class Cutter:
         first = finest.nonzero()[:, 0]
         levels, chunks = shares[1:].nonzero().unbind(dim=1)
         counts, firsts = (of[1:][levels, chunks] for of in (pyramid.counts, pyramid.firsts))
-        runs = torch.repeat_interleave(counts)
-        skipped = firsts - counts.cumsum(0) + counts
-        index = skipped.index_select(0, runs) + torch.arange(len(runs), device=runs.device)
+        starts = starts_of(counts)
+        runs = runs_of(starts, counts)
+        index = (firsts - starts).index_select(0, runs) + torch.arange(len(runs), device=runs.device)
         own = shares[1:][levels, chunks].index_select(0, runs)
         return torch.cat([first, index]), torch.cat([finest.index_select(0, first), own])
 

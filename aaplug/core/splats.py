@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from aaplug.core.kernels import EAGER, Kernel, Kernels
+from aaplug.core.kernels import EAGER, EXAMPLE_SIZE, Kernel, Kernels
 
 # floor of the opacity factor, so that rounding erases no splat (3DGS)
 MIN_COMPENSATION = 0.005
@@ -128,19 +128,15 @@ class _Picked(torch.autograd.Function):
     """Copies gradients to their rows; `index_select` would add them atomically, although no row repeats."""
 
     @staticmethod
-    def forward(x: Tensor, rows: Tensor) -> Tensor:
-        return x.index_select(0, rows)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
-        x, rows = inputs
+    def forward(ctx: Any, x: Tensor, rows: Tensor) -> Tensor:
         ctx.save_for_backward(rows)
         ctx.shape = x.shape
+        return x.index_select(0, rows)
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None]:
         (rows,) = ctx.saved_tensors
-        return grads[0].new_zeros(ctx.shape).index_copy(0, rows, grads[0]), None
+        return grads[0].new_zeros(ctx.shape).index_copy_(0, rows, grads[0]), None
 
 
 def _selected(rows: Int[Tensor, " k"], *columns: Float[Tensor, "m ..."]) -> tuple[Float[Tensor, "k ..."], ...]:
@@ -148,7 +144,7 @@ def _selected(rows: Int[Tensor, " k"], *columns: Float[Tensor, "m ..."]) -> tupl
 
 
 def _select_example() -> tuple[Tensor, ...]:
-    m = 100_000
+    m = EXAMPLE_SIZE
     columns = (torch.linspace(0.0, 1.0, width * m) for width in (2, 3, 1, 1, 1))
     means, covs, *scalars = columns
     return torch.arange(0, m, 2), means.view(m, 2), covs.view(m, 3), *scalars

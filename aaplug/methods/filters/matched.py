@@ -84,11 +84,12 @@ class Matched:
     def rates(self, splats: Splats2D, camera: Camera, training: TrainingViews) -> Float[Tensor, " m"]:
         """Relative sampling rate r of each splat; the view's own r for Gaussians that no training camera saw."""
         view, at_pose = training.relative_rate(camera), camera.trained_focal is not None
-        if self.reference == "global":
+        by_pose = self.reference == "pose" and at_pose
+        if self.reference == "global" or (by_pose and view >= 1):
             return torch.full_like(splats.depths, view)
         now = camera.focal / splats.depths
         own = now / view  # at this pose's training size
-        if self.reference == "pose" and at_pose:
+        if by_pose:
             return _at_pose(view, own, training.bounds.highest.index_select(0, splats.sources).to(own))
         bounds = training.bounds[splats.sources]
         lowest, highest = (rate.to(now).where(bounds.seen, 1.0) for rate in (bounds.lowest, bounds.highest))
@@ -101,9 +102,7 @@ Rates = Float[Tensor, " m"]  # px per world unit
 
 
 def _at_pose(view: float, own: Rates, highest: Rates) -> Rates:
-    """Relative rates at a pose of the data set; highest: in training, 0 for a Gaussian that no camera saw."""
-    if view >= 1:
-        return torch.full_like(own, view)
+    """Relative rates below 1 at a pose of the data set; highest: in training, 0 for a Gaussian that no camera saw."""
     rise = min(view**-RISE_SPEED, MAX_RISE)
     return view * own / torch.minimum(rise * own, torch.maximum(highest, own))
 

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from aaplug.core.interfaces import Pixels
-from aaplug.core.kernels import materialized
+from aaplug.core.kernels import EXAMPLE_SIZE, materialized
 from aaplug.core.splats import Splats2D
 
 TILE = 8  # px: side of a tile
@@ -80,6 +80,6 @@ def next_rows(
 
 def splat_example() -> tuple[Tensor, ...]:
     """Means, covariances, determinants and opacities to compile for."""
-    m = 100_000
+    m = EXAMPLE_SIZE
     means = torch.linspace(0.0, 99.0, 2 * m).view(m, 2)
     return means, torch.tensor([3.0, 1.0, 2.0]).repeat(m, 1), torch.full((m,), 5.0), torch.ones(m)

@@ -23,9 +23,10 @@ from torch.nn import functional
 from aaplug.core.interfaces import PixelKernel, Pixels
 from aaplug.core.kernels import Kernel
 from aaplug.core.rules import Rules
+from aaplug.core.runs import starts_of
 from aaplug.methods.pixel_kernels.gradients import Move, SumsGradients, sums_by_autograd, sums_per_splat
 from aaplug.methods.pixel_kernels.raster_rows import BLUE, GREEN, PIXELS, RED, next_rows, tile_centres
-from aaplug.rasterizers.tiled.binning import Bins, starts_of
+from aaplug.rasterizers.tiled.binning import Bins
 from aaplug.rasterizers.tiled.forward import (
     EXAMPLE_TILES,
     FEWEST,

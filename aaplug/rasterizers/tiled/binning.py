@@ -21,6 +21,7 @@ from torch import Tensor
 from aaplug.core.ellipses import squared_cutoff
 from aaplug.core.kernels import Kernel, Kernels, materialized
 from aaplug.core.rules import RULES_3DGS, Rules, variant
+from aaplug.core.runs import runs_of, starts_of
 from aaplug.core.splats import Splats2D
 from aaplug.methods.pixel_kernels.raster_rows import TILE, splat_example
 
@@ -155,11 +156,11 @@ def _bin(
     """Pair splats, nearest first, with the tiles that they overlap in a band of rows."""
     heights = (boxes.bottom.clamp(*rows) - boxes.top.clamp(*rows)).index_select(0, order)
     down, band = starts_of(heights), order.new_tensor([rows[0], columns])
-    first, widths, owners = kernels.run(SPANS, _runs(down, heights), order, down, boxes.table, band)
+    first, widths, owners = kernels.run(SPANS, runs_of(down, heights), order, down, boxes.table, band)
     size = (rows[1] - rows[0]) * columns
     first = first.short() if size <= SHORT else first  # half as many bits sort in half the time
     starts = starts_of(widths)
-    tiles, splats = kernels.run(PAIRS, _runs(starts, widths), starts, first, owners)
+    tiles, splats = kernels.run(PAIRS, runs_of(starts, widths), starts, first, owners)
     by_tile, pairs = torch.sort(tiles, stable=True)
     drawn = kernels.run(LISTS, splats, pairs)[0] if len(pairs) else splats.new_zeros(1)
     tile = torch.arange(size, device=order.device)
@@ -171,23 +172,6 @@ def _bin(
         ahead = torch.cat([starts, starts.new_full((1,), len(pairs))])
         kept = Pairs(order, ahead.index_select(0, down), pairs, by_tile)
     return Bins(drawn, ends - counts, counts, origins.to(boxes.table), columns, kept)
-
-
-def starts_of(counts: Int[Tensor, " m"]) -> Int[Tensor, " m"]:
-    """Where each of several runs begins that follow one another."""
-    return counts.cumsum(0, dtype=counts.dtype) - counts
-
-
-def _runs(starts: Int[Tensor, " m"], counts: Int[Tensor, " m"]) -> Int[Tensor, " p"]:
-    """Which run each place belongs to, where run i begins at `starts[i]` and holds `counts[i]`, perhaps none.
-
-    Several times faster than `repeat_interleave`.
-    """
-    total = int(counts.sum())
-    begun = starts.new_zeros(total + 1)  # runs that begin here; none at the end begin at `total`
-    begun.index_add_(0, starts, torch.ones_like(starts))
-    begun[0] -= 1
-    return begun[:total].cumsum(0, dtype=begun.dtype)
 
 
 def _spans(
