@@ -63,7 +63,7 @@ class Point:
         opacity = rows[..., OPACITY, None]
         if torch.compiler.is_compiling():
             h = torch.addcmul(torch.addcmul(opacity, u, u, value=-1), v, v, value=-1)
-            value = _power(_polynomial(h, ROOT_OF_EXP2), SQUARINGS)
+            value = _polynomial(h, ROOT_OF_EXP2).pow(2**SQUARINGS)  # compiled to squarings
             return torch.where(h >= rules.log2_min_alpha - LOG2_PADDING, value, 0.0)
         exponent = torch.addcmul(opacity + LOG2_PADDING, u, u, value=-1)
         exponent = torch.addcmul(exponent, v, v, value=-1)
@@ -120,12 +120,6 @@ def _polynomial(x: Tensor, coefficients: tuple[float, ...]) -> Tensor:
     for coefficient in rest[-2::-1]:
         value = value * x + coefficient
     return value
-
-
-def _power(x: Tensor, squarings: int) -> Tensor:
-    for _ in range(squarings):
-        x = x * x
-    return x
 
 
 def _root_of_exp2(squarings: int, degree: int) -> tuple[float, ...]:
