@@ -21,6 +21,7 @@ from aaplug.core.free_views import between, free_views
 from aaplug.core.gaussians import ANTIALIASED, Gaussians
 from aaplug.core.pyramids import Cut, Cutter, Pyramid
 from aaplug.core.training import TrainingViews
+from aaplug.finetuning import refining
 from aaplug.io.scenes import open_scene, read_scene
 from aaplug.io.scenes.manifests import MANIFEST, read_manifest
 from aaplug.levels.chunks import chunks_of
@@ -314,6 +315,15 @@ def test_tuning_brings_a_level_closer(sample_scene, sample_cameras):
         shown = (Renderer.of(s.scene, few, recipe)(view).rgb for s in (merged, tuned))
         before, after = ((image - truth).square().mean() for image in shown)
         assert after < share * before
+
+
+def test_no_more_views_are_prepared_than_steps_look_at(sample_cameras):
+    poses = sample_cameras.train
+    for steps, most in ((1, 1), (5, 5), (10_000, 10_000)):
+        views, probes = refining._views(poses, {0.5: 1.0}, steps)
+        assert 0 < len(views) <= most
+        assert probes
+    assert len(views) > 5
 
 
 def test_levels_for_a_viewer_are_files_by_its_rule_and_no_pyramid(cli):

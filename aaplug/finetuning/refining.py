@@ -62,7 +62,8 @@ def refined(
         UsageError: no step has a finite gradient.
     """
     scales = {rate * scale: weight for scale, weight in SCALES.items() if rate * scale < 1}
-    views, probes = _views(poses, scales)
+    steps = round(steps * min(MOST_TIMES, max(1.0, LARGE / rate)))
+    views, probes = _views(poses, scales, steps)
     truth = Truth(look, memory=MEMORY)
     known = look.training
     if viewer is not None:
@@ -73,7 +74,6 @@ def refined(
     if before < GOOD:
         return level
     _prepare(truth, views, scales, monitor)
-    steps = round(steps * min(MOST_TIMES, max(1.0, LARGE / rate)))
     share = SHARE * before**0.5 / USUAL
     rates = {name: share * FASTER[name] * (1 / rate if name == "means" else 1) * own for name, own in RATES.items()}
     settings = Settings("levels", steps, scales, rates, decay=DECAY)
@@ -94,11 +94,11 @@ def refined(
     )
 
 
-def _views(poses: Sequence[Camera], scales: dict[float, float]) -> tuple[list[Camera], list[Camera]]:
-    """Views to tune on, as many as fit into memory, and others."""
+def _views(poses: Sequence[Camera], scales: dict[float, float], steps: int) -> tuple[list[Camera], list[Camera]]:
+    """Views to tune on, one a step and as many as fit into memory, and others."""
     poses = spread(poses, POSES)
     pixels = max(camera.width * camera.height for camera in poses) * sum(scale**2 for scale in scales)
-    views = spread([*poses, *free_views(poses, FREE)], max(1, int(MEMORY / (BYTES * pixels))))
+    views = spread([*poses, *free_views(poses, FREE)], max(1, min(steps, int(MEMORY / (BYTES * pixels)))))
     return list(views), list(spread(free_views(poses, 1, seed=1), PROBES)) or list(poses[:1])
 
 
