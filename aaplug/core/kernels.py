@@ -6,6 +6,7 @@ A kernel is a function of tensors.  Run eagerly it is plain array code, for any 
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -28,7 +29,7 @@ class Kernel:
         outweighs the gathers.
     chained: each value is made of many before it, and several read it.  Inductor would write it out again for each.
     overlaps: it computes many independent values in turn, so g++ should schedule instructions before it allocates
-        registers.  With many sums it would run out of registers.
+        registers: "freely", or "within registers" where it also keeps many sums.
     pulls_back: the function computes gradients itself, so it is traced before it is compiled.
     updates: positions of the arguments that it updates in place; they must be contiguous.
     evaluations: splat-pixel evaluations of one call, per pixel of a tile; 0 for kernels that do not composite.
@@ -40,7 +41,7 @@ class Kernel:
     sizes: tuple[str | None, ...]
     gathers: bool = False
     chained: bool = False
-    overlaps: bool = False
+    overlaps: Literal["freely", "within registers"] | None = None
     pulls_back: bool = False
     updates: tuple[int, ...] = ()
     evaluations: int = 0

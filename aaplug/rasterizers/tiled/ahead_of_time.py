@@ -68,7 +68,10 @@ OPTIONS = {
 TILING_HEURISTIC = "cpp.enable_tiling_heuristics"
 # operations up to which inductor writes a value out again for each of its readers, where kernels are chained
 CHAINED = {"realize_opcount_threshold": 10}
-SCHEDULED = "native -fschedule-insns"  # as the architecture, the only setting whose text reaches g++
+OVERLAPS = {  # of `Kernel`; as the architecture, the only setting whose text reaches g++
+    "freely": "native -fschedule-insns",
+    "within registers": "native -fschedule-insns -fsched-pressure",
+}
 LARGEST_SIZE = 1 << 31
 STANDARD_COMPILER = "clang++" if sys.platform == "darwin" else "g++"
 MOST_PROCESSES = 4  # compilers side by side: each takes most of a GB
@@ -79,7 +82,7 @@ TOLERANCE = 1e-4
 def cache_folder() -> Path:
     """Folder of the packages for this version and this processor."""
     source = "".join(inspect.getsource(module) for module in SOURCES)
-    options = f"{OPTIONS} {TILING_HEURISTIC} {CHAINED} {SCHEDULED} {_compiler()}"
+    options = f"{OPTIONS} {TILING_HEURISTIC} {CHAINED} {OVERLAPS} {_compiler()}"
     facts = [torch.__version__, torch.backends.cpu.get_cpu_capability(), source, options]
     key = hashlib.sha256("\0".join(facts).encode()).hexdigest()[:16]
     return Path(platformdirs.user_cache_dir("aaplug", appauthor=False)) / f"kernels-{key}"
@@ -228,7 +231,7 @@ def _configs(kernel: Kernel) -> dict[str, Any]:
     x86_linux = (sys.platform, platform.machine()) == ("linux", "x86_64")
     free = getattr(cpp, "march", "missing") is None  # known to this torch, and not set by the user
     if kernel.overlaps and x86_linux and free and Path(_compiler()).name == STANDARD_COMPILER:
-        configs |= {"cpp.march": SCHEDULED}
+        configs |= {"cpp.march": OVERLAPS[kernel.overlaps]}
     return configs
 
 

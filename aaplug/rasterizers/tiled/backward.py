@@ -213,6 +213,7 @@ def step_kernel(pixel: PixelKernel, rules: Rules) -> Kernel:
         partial(_step, pixel, rules),
         lambda: (*tiles_example(6, pixel), torch.zeros(EXAMPLE_TILES, STEP * sums_per_splat(pixel))),
         ("m", "p", *9 * ("t",), None, None, "t", "t"),
+        overlaps="within registers",
         updates=(6, 14),
     )
 

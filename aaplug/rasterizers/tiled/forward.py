@@ -251,7 +251,7 @@ def pass_kernel(pixel: PixelKernel, rules: Rules) -> Kernel:
         partial(_pass, pixel, rules),
         partial(tiles_example, 5, pixel),
         ("m", "p", *8 * ("t",), None, None, "t"),
-        overlaps=True,
+        overlaps="freely",
         updates=(6, 7, 8, 9),
         evaluations=pixel.splats_per_pass,
     )
