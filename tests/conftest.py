@@ -26,9 +26,6 @@ from aaplug.io.scenes import read_scene
 from aaplug.rasterizers import RASTERIZERS, Tiled
 from aaplug.rasterizers.tiled.ahead_of_time import load
 
-# Test processes run side by side; threads that wait for each other would stall them all.
-torch.set_num_threads(1)
-
 COMPILED = load()
 ALL_RASTERIZERS: dict[str, Rasterizer] = {**RASTERIZERS, **({} if COMPILED is None else {"compiled": Tiled(COMPILED)})}
 
@@ -36,6 +33,11 @@ SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 SAMPLE = Path(str(files("aaplug.io.sample")))
 CLEAR_REFS = Path("/proc/self/clear_refs")
 needs_peak_memory = pytest.mark.skipif(not CLEAR_REFS.exists(), reason="peak memory of a process is read from /proc")
+
+
+def pytest_configure() -> None:
+    """Test processes run side by side; threads that wait for each other would stall them all."""
+    torch.set_num_threads(1)
 
 
 @pytest.fixture(autouse=True)

@@ -1,5 +1,6 @@
 """Frames and steps for pytest-benchmark: `pytest tests/bench/rasterizer.py -n0`."""
 
+import os
 from collections.abc import Iterator
 from typing import Any
 
@@ -12,7 +13,6 @@ from aaplug.core.training import TrainingViews
 from aaplug.methods.recipes import find_recipe
 from aaplug.rendering.benchmark import gradient_step, synthetic_camera, synthetic_scene
 from aaplug.rendering.renderer import Renderer
-from tests.bench import take_all_threads
 from tests.conftest import ALL_RASTERIZERS
 
 CAMERA = synthetic_camera(800, 800).as_trained()
@@ -23,7 +23,7 @@ RECIPE = find_recipe("classic")
 @pytest.fixture(autouse=True, scope="module")
 def all_threads() -> Iterator[None]:
     before = torch.get_num_threads()
-    take_all_threads()
+    torch.set_num_threads(os.cpu_count() or 1)  # tests have one
     yield
     torch.set_num_threads(before)
 

@@ -7,14 +7,12 @@ import time
 import torch
 
 from aaplug.core.sampling import sampling_bounds
-from tests.bench import take_all_threads
 from tests.conftest import make_camera
 
 KIB = 1024
 
 
 def main(gaussians: int = 3_000_000, cameras: int = 300) -> None:
-    take_all_threads()
     angles = torch.linspace(0, 6.28, cameras)
     views = [make_camera((4 * a.cos().item(), 4 * a.sin().item(), 1.0), (1600, 1060)) for a in angles]
     means = torch.randn(gaussians, 3)

@@ -36,7 +36,6 @@ from aaplug.io.scenes import read_scene, write_scene
 from aaplug.methods.viewers import VIEWERS, Viewer, fuse_for
 from aaplug.rendering.renderer import Renderer
 from aaplug.verbs.convert import convert
-from tests.bench import take_all_threads
 
 FOLDER = Path(__file__).parent
 SCALES = (1.0, 0.5, 0.25, 0.125)
@@ -170,7 +169,6 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=4, help="number of views")
     parser.add_argument("--only", nargs="+", choices=PAGES, default=list(PAGES), help="rows of the table")
     asked = parser.parse_args()
-    take_all_threads()
     subprocess.run(["npm", "install", "--no-audit", "--no-fund", "--silent"], cwd=FOLDER, check=True)
     asked.work.mkdir(parents=True, exist_ok=True)
     with as_file(files("aaplug.io.sample")) as sample:
