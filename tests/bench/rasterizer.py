@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 import torch
 
+from aaplug.core.executors import torch_threads
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.interfaces import Rasterizer
 from aaplug.core.training import TrainingViews
@@ -22,10 +23,8 @@ RECIPE = find_recipe("classic")
 
 @pytest.fixture(autouse=True, scope="module")
 def all_threads() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(os.cpu_count() or 1)  # tests have one
-    yield
-    torch.set_num_threads(before)
+    with torch_threads(os.cpu_count() or 1):  # tests have one
+        yield
 
 
 @pytest.fixture(params=["compiled", "eager"])
