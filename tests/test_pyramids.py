@@ -320,7 +320,7 @@ def test_tuning_brings_a_level_closer(sample_scene, sample_cameras):
 def test_no_more_views_are_prepared_than_steps_look_at(sample_cameras):
     poses = sample_cameras.train
     for steps, most in ((1, 1), (5, 5), (10_000, 10_000)):
-        views, probes = refining._views(poses, {0.5: 1.0}, steps)
+        views, probes = refining._views(poses, 0.5, steps)
         assert 0 < len(views) <= most
         assert probes
     assert len(views) > 5

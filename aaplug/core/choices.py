@@ -37,7 +37,7 @@ SpzAxes = Literal["auto", "opengl", "opencv"]
 ConventionName = Literal["classic", "antialiased", "mip", "playcanvas", "playcanvas-classic"]
 LossName = Literal["l2", "l1-dssim"]
 MOST_FPS = 1000  # frames per second of a video
-LEVEL_STEPS = 800  # for a level of 1/4 of the training rate and above; a smaller one takes more, of smaller images
+LEVEL_STEPS = 1000  # for a level of 1/4 of the training rate and above; a smaller one takes more, of smaller images
 # of fine-tuning: weight of the loss by scale, and of the training size beside them; as they are, and that all
 # parameters move, was measured
 WEIGHTS = {0.5: 1.0, 0.25: 2.0, 0.125: 1.0}

@@ -2,8 +2,8 @@
 
 c: chunks, l: levels, n: Gaussians of all levels.  A chunk is a part of space.  No Gaussian stands for others of another
 chunk, so each chunk is drawn at a level of its own, which its sampling rate decides.  Level k is meant for rates down
-to 2⁻ᵏ of training's.  With x = -log₂ of the relative rate, level k is drawn alone from k - 1/2 to k; from k to k + 1/2
-it fades into the next.
+to 2⁻ᵏ of training's.  It is drawn alone from 3/4 of the rate of the level before down to its own; from there to 3/4 of
+that, it fades into the next.
 """
 
 import math
@@ -22,7 +22,7 @@ from aaplug.core.rules import NEAR
 from aaplug.core.runs import runs_of, starts_of
 from aaplug.core.training import TrainingViews
 
-FADE = 0.5  # octaves of the sampling rate over which a level fades into the next
+FADE = math.log2(4 / 3)  # octaves of the sampling rate over which a level fades into the next: half of the way
 ROUNDING = 1e-4  # octaves: what lies nearer to a level is that level
 SIGMAS = 3.33  # standard deviations to where an opaque Gaussian's alpha falls below 1/255
 PAD = 4.0  # px around the image that the filters reach at most, at training's rate and below
@@ -198,7 +198,7 @@ class Cutter:
     def shares(self, octaves: Float[Tensor, " c"]) -> Float[Tensor, "l c"]:
         """Share of each level in each chunk; they sum to 1."""
         levels = torch.arange(len(self.pyramid)).to(octaves)[:, None]
-        coming = ((octaves - levels + 1) / FADE).clamp(0, 1)  # of level k: 0 up to k - 1, 1 from k - 1/2 on
+        coming = ((octaves - levels + 1) / FADE).clamp(0, 1)  # of level k: 0 up to k - 1
         coming[0] = 1
         return coming - torch.cat([coming[1:], torch.zeros_like(coming[:1])])
 

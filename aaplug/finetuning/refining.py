@@ -1,11 +1,14 @@
 """Refining a level of detail: its Gaussians are tuned until the level, at its own size, looks like the scene.
 
-The truth is the scene's own render at the training size, box-averaged, from training poses and from free ones between
-them.  So no photograph is needed, and views away from training hold.
+The truth is the scene's own render, box-averaged, from training poses and from others between them.  So no photograph
+is needed, and views away from training hold.  Most of the others are drawn like training poses, by the ratio of focal
+lengths, and the rest as free ones: the two rules draw a Gaussian somewhat differently, and a level should fit both.
 """
 
+import statistics
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import cycle
 
 import torch
 
@@ -14,8 +17,7 @@ from aaplug.core.choices import LEVEL_STEPS
 from aaplug.core.free_views import free_views
 from aaplug.core.gaussians import Fusion, Gaussians
 from aaplug.core.monitor import SILENT, Monitor
-from aaplug.core.training import TrainingViews
-from aaplug.evaluation.truth import Truth, ViewTruth
+from aaplug.evaluation.truth import Truth
 from aaplug.finetuning.loop import run
 from aaplug.finetuning.parameters import RATES
 from aaplug.finetuning.settings import Settings
@@ -25,12 +27,14 @@ from aaplug.methods.viewers import TUNED, Viewer
 from aaplug.rendering.renderer import Renderer
 
 POSES = 100  # training poses at most
-FREE = 3  # free poses for each
+BETWEEN = 2  # poses between them for each, drawn as training's
+FREE = 4  # one view out of so many is free
 PROBES = 6  # views that tell whether tuning helped, and are not tuned on
 MEMORY = 1e9  # bytes of images to compare with
 BYTES = 6  # a pixel
-# weight by scale, over the level's rate: it is drawn alone from 1.41 to 1 and fades out below
-SCALES = {1.41: 0.4, 1.19: 0.6, 1.0: 1.0, 0.84: 0.6}
+# of the views as trained, in turn, over the training size.  So a level learns the rates over its own at which it is
+# drawn: alone from 4/3 to 1, and below it fades out.  The truth is of that size too: whole boxes of pixels do not blur
+SIZES = (1.0, 1.41, 1.0, 1.19, 1.41, 1.0, 1.19, 0.84)
 # over 3DGS's learning rates, where the level's error is `USUAL`; they follow the error, as the noise they leave does
 FASTER = {"means": 1.0, "quats": 1.0, "log_scales": 3.0, "logit_opacities": 1.0, "dc": 2.0, "rest": 5.0}
 SHARE = 0.3
@@ -61,22 +65,20 @@ def refined(
     Raises:
         UsageError: no step has a finite gradient.
     """
-    scales = {rate * scale: weight for scale, weight in SCALES.items() if rate * scale < 1}
     steps = round(steps * min(MOST_TIMES, max(1.0, LARGE / rate)))
-    views, probes = _views(poses, scales, steps)
+    views, probes = _views(poses, rate, steps)
     truth = Truth(look, memory=MEMORY)
-    known = look.training
     if viewer is not None:
         level = replace(viewer.shown(level), convention=viewer.convention_of(level))
         look = replace(look, recipe=RECIPES[viewer.recipe])
-    shown = replace(look, scene=level, training=TrainingViews.of(level, known.cameras, known.cull_margin))
+    shown = look.showing(level)
     before = _error(shown, truth, probes, rate)
     if before < GOOD:
         return level
-    _prepare(truth, views, scales, monitor)
+    _prepare(truth, views, rate, monitor)
     share = SHARE * before**0.5 / USUAL
     rates = {name: share * FASTER[name] * (1 / rate if name == "means" else 1) * own for name, own in RATES.items()}
-    settings = Settings("levels", steps, scales, rates, decay=DECAY)
+    settings = Settings("levels", steps, {rate: 1.0}, rates, decay=DECAY)
     job = TuningJob(shown, views, truth, settings)
     state = begin(job)
     with monitor.progress("refining", "steps") as tell:
@@ -94,23 +96,27 @@ def refined(
     )
 
 
-def _views(poses: Sequence[Camera], scales: dict[float, float], steps: int) -> tuple[list[Camera], list[Camera]]:
-    """Views to tune on, one a step and as many as fit into memory, and others."""
+def _views(poses: Sequence[Camera], rate: float, steps: int) -> tuple[list[Camera], list[Camera]]:
+    """Views to tune on, one a step and as many as fit into memory, and others, of the training size."""
     poses = spread(poses, POSES)
-    pixels = max(camera.width * camera.height for camera in poses) * sum(scale**2 for scale in scales)
-    views = spread([*poses, *free_views(poses, FREE)], max(1, min(steps, int(MEMORY / (BYTES * pixels)))))
-    return list(views), list(spread(free_views(poses, 1, seed=1), PROBES)) or list(poses[:1])
+    sizes = [size for size in SIZES if size * rate <= 1] or [1.0]
+    area = statistics.mean((size * rate) ** 2 for size in sizes)
+    most = MEMORY / (BYTES * area * max(camera.width * camera.height for camera in poses))
+    count = max(1, min(steps, int(most)))
+    between = [view.as_trained() for view in free_views(poses, BETWEEN)]
+    trained = spread([*poses, *between], count - count // FREE)
+    sized = [view.scaled(size) for view, size in zip(trained, cycle(sizes), strict=False)]
+    free = spread(free_views(poses, 1, seed=1), count // FREE) if count >= FREE else ()
+    return [*sized, *free], list(spread(free_views(poses, 1, seed=2), PROBES)) or list(poses[:1])
 
 
 @torch.no_grad()
-def _prepare(truth: Truth, views: Sequence[Camera], scales: dict[float, float], monitor: Monitor) -> None:
-    """Make all images to compare with, each view's from one render."""
+def _prepare(truth: Truth, views: Sequence[Camera], rate: float, monitor: Monitor) -> None:
+    """Make all images to compare with."""
     with monitor.progress("rendering", "views") as tell:
         for number, view in enumerate(views):
             tell(number, len(views))
-            one = ViewTruth(truth, view)
-            for scale in scales:
-                one.image(scale)
+            truth(view, rate)
 
 
 @torch.no_grad()

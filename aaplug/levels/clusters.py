@@ -32,6 +32,7 @@ MAX_OPACITY = RULES_3DGS.max_alpha  # of a merged Gaussian; no renderer shows mo
 # seen alone, 0 its size.  Beside others, which overlap what it gains, the half is best (examples/guides/levels.md)
 WIDENING = 0.5
 LARGEST = 1e6  # px: what is larger looks the same, but its squared area overflows float32
+LEAST_VISIBLE = 1e-3  # what is hidden still has a place and a colour
 THINNEST = 0.02  # px: standard deviation to which the dilation is taken out at most
 
 
@@ -42,7 +43,8 @@ class Clusters:
     means: world units, in float64, so that far from the origin small distances count.
     covs: as training saw them.
     opacities: of the cluster alone, as training saw it.  Above 1, only a wider Gaussian has this energy: see `opaque`.
-    weights: summed opacity times projected area of the Gaussians, in squared world units.
+    visible: share of the cluster's light that views show, from 0 to 1.
+    weights: summed opacity times projected area times visible share of the Gaussians, in squared world units.
     colours: weighted mean, without view dependence.
     rates: training's sampling rate, px per world unit.
     chunks: the chunk of each; clusters of different ones are not merged.
@@ -52,6 +54,7 @@ class Clusters:
     means: Float[Tensor, "n 3"]
     covs: Packed
     opacities: Float[Tensor, " n"]
+    visible: Float[Tensor, " n"]
     weights: Float[Tensor, " n"]
     colours: Float[Tensor, "n 3"]
     rates: Float[Tensor, " n"]
@@ -77,10 +80,16 @@ class Clusters:
         return replace(self, covs=self.covs * excess[:, None], opacities=self.opacities / excess)
 
 
-def seen(scene: Gaussians, rates: Float[Tensor, " n"], chunks: Int[Tensor, " n"] | None = None) -> Clusters:
+def seen(
+    scene: Gaussians,
+    rates: Float[Tensor, " n"],
+    chunks: Int[Tensor, " n"] | None = None,
+    visible: Float[Tensor, " n"] | None = None,
+) -> Clusters:
     """Every Gaussian as a cluster of its own.
 
     chunks: see `Clusters`; None for one of all.
+    visible: see `visibility`; None for all of each Gaussian.
     """
     largest = (LARGEST / rates).log()[:, None].to(scene.log_scales)
     raw = covariances(replace(scene, log_scales=scene.log_scales.minimum(largest)))
@@ -88,11 +97,12 @@ def seen(scene: Gaussians, rates: Float[Tensor, " n"], chunks: Int[Tensor, " n"]
     opacities = scene.opacities
     if scene.convention.compensated:
         opacities = opacities * area(raw) / area(covs)
-    weights = opacities.clamp(min=MIN_OPACITY) * area(covs)
+    visible = torch.ones_like(opacities) if visible is None else visible.clamp(min=LEAST_VISIBLE)
+    weights = opacities.clamp(min=MIN_OPACITY) * area(covs) * visible
     colours = COLOUR_OFFSET + SH_C0 * scene.sh[:, 0]
     own = torch.arange(len(scene))
     chunks = torch.zeros_like(own) if chunks is None else chunks
-    return Clusters(scene.means.double(), covs, opacities, weights, colours, rates, chunks, own)
+    return Clusters(scene.means.double(), covs, opacities, visible, weights, colours, rates, chunks, own)
 
 
 def merged_pairs(a: Clusters, b: Clusters) -> Clusters:
@@ -100,18 +110,21 @@ def merged_pairs(a: Clusters, b: Clusters) -> Clusters:
 
     Mean, covariance and colour are the pair's moments under its weights.  Alone, the result has the pair's energy: the
     integral of the alpha of both together, a + b - a b, over a plane across the view, as a mean over three directions.
+    What views show of either counts, so that what is hidden adds nothing to what is seen.
     """
     weights, share, covs = paired(a, b)
     first, second = a.opaque, b.opaque
     offsets = (b.means - a.means).to(covs)
-    one = first.opacities[:, None] * areas(first.covs)
-    other = second.opacities[:, None] * areas(second.covs)
+    visible = b.visible.lerp(a.visible, share)
+    one = (first.opacities * a.visible / visible)[:, None] * areas(first.covs)
+    other = (second.opacities * b.visible / visible)[:, None] * areas(second.covs)
     both = one * other * overlaps(first.covs + second.covs, offsets)
     return replace(
         a,
         means=a.means + (1 - share).double()[:, None] * (b.means - a.means),
         covs=covs,
         opacities=(one + other - both).mean(dim=1) / area(covs),
+        visible=visible,
         weights=weights,
         colours=b.colours.lerp(a.colours, share[:, None]),
         rates=b.rates.lerp(a.rates, share),

@@ -24,7 +24,8 @@ from aaplug.methods.filters import PIXEL_VARIANCE, fuse_stored
 from aaplug.methods.viewers import MERGED
 
 ENOUGH = 0.02  # of the clusters: after a round that merges fewer, more is allowed to change
-TOLERANCE = 1e-4  # px² of the level: squared change of the image, from 0 to 1, by one pair
+TOLERANCE = 1e-5  # px² of the level: squared change of the image, from 0 to 1, by one pair as views show it
+USUAL = 0.1  # squared share of a Gaussian that views show, where it is not known: about the mean of two scenes
 FIRST_SHARE = 0.01  # of the tolerance in the first rounds, so that a bad pair does not go before a better one
 FIRST, LAST = 1e-7, 1e3  # px²: tolerances of the first rounds and of the last but one, where a count is asked for
 STEP = 10.0  # from one tolerance to the next
@@ -75,18 +76,23 @@ class Merged(NamedTuple):
 
 
 def merged(
-    scene: Gaussians, rates: Float[Tensor, " n"], goal: Goal, tell: Tell = lambda done, total: None
+    scene: Gaussians,
+    rates: Float[Tensor, " n"],
+    goal: Goal,
+    tell: Tell = lambda done, total: None,
+    visible: Float[Tensor, " n"] | None = None,
 ) -> Gaussians:
     """A lighter scene, with a record of it; the scene itself if nothing is to be merged.
 
     rates: training's sampling rate of each Gaussian, px per world unit; see `rates_of`.
+    visible: how much of each Gaussian views show, see `visibility`; None for all.
 
     Raises:
         UsageError: the scene holds 2D Gaussians.
     """
     if len(scene) <= (goal.count or 1) and not scene.flat:
         return scene
-    return merged_in_chunks(scene, rates, torch.zeros(len(scene), dtype=torch.int64), goal, tell).scene
+    return merged_in_chunks(scene, rates, torch.zeros(len(scene), dtype=torch.int64), goal, tell, visible).scene
 
 
 def merged_in_chunks(
@@ -95,16 +101,20 @@ def merged_in_chunks(
     chunks: Int[Tensor, " n"],
     goal: Goal,
     tell: Tell = lambda done, total: None,
+    visible: Float[Tensor, " n"] | None = None,
 ) -> Merged:
     """A lighter scene in which no Gaussian stands for those of different chunks; see `merged`."""
     if scene.flat:
         raise UsageError(scene.name, "holds 2D Gaussians, which cannot be merged")
     scene = fuse_stored(scene)
+    if visible is None:
+        goal = replace(goal, tolerance=goal.tolerance / USUAL)
     order = _order(scene, chunks)
     parts: list[Merged] = []
     for start, stop in _batches(chunks[order]):
         own, said = order[start:stop], partial(_told, tell, start, len(scene) - (goal.count or 0))
-        parts.append(_merged_batch(scene[own], rates[own], chunks[own], goal, said))
+        shown = None if visible is None else visible[own]
+        parts.append(_merged_batch(seen(scene[own], rates[own], chunks[own], shown), scene[own], goal, said))
     found = replace(joined([part.scene for part in parts]), origin=None)
     record = Fusion(MERGED, {"rate": f"{goal.rate:.4g}", "from": str(len(scene))})
     return Merged(replace(found, fused=(*scene.fused, record)), torch.cat([part.chunks for part in parts]))
@@ -124,10 +134,7 @@ def _batches(chunks: Int[Tensor, " n"]) -> Iterator[tuple[int, int]]:
         start = stop
 
 
-def _merged_batch(
-    scene: Gaussians, rates: Float[Tensor, " n"], chunks: Int[Tensor, " n"], goal: Goal, tell: Callable[[int], None]
-) -> Merged:
-    own = seen(scene, rates, chunks)
+def _merged_batch(own: Clusters, scene: Gaussians, goal: Goal, tell: Callable[[int], None]) -> Merged:
     clusters = _rounds(own, goal, tell)
     found, places = alone(clusters, scene, own.weights), clusters.chunks
     if goal.count is None:
@@ -180,11 +187,11 @@ def _joined(clusters: Clusters, pairs: Edges) -> Clusters:
 
 
 def _hidden(scene: Gaussians, clusters: Clusters, rate: float) -> Bool[Tensor, " n"]:
-    """Gaussians whose alpha no pixel of the level shows, along any of three directions: below the cut-off."""
+    """Gaussians of which no pixel of the level shows as much as the cut-off, along any of three directions."""
     px = clusters.rates * rate
     narrow = covariances(scene)
     trained = blurred(narrow, scene.convention.kernel / clusters.rates.square())
     shown = blurred(trained, PIXEL_VARIANCE / px.square())
     start = narrow if scene.convention.compensated else trained
-    peaks = scene.opacities[:, None] * areas(start) / areas(shown)
+    peaks = (scene.opacities * clusters.visible)[:, None] * areas(start) / areas(shown)
     return peaks.amax(dim=1) < scene.convention.rules.min_alpha

@@ -3,7 +3,7 @@
 n: clusters, p: pairs.  The image of a pair is compared with that of the merged cluster through the level's pixel, as
 ∫ |difference|² over the plane across the view, a mean over three directions.  For Gaussians that only add up it is a
 sum of overlaps in closed form.  It is large for clusters that lie apart by more than a pixel, differ in colour or
-cross, and so keeps what is large as it is.  Occlusion plays no part.
+cross, and so keeps what is large as it is.  Each cluster counts by how much of it views show.
 """
 
 from collections.abc import Iterator, Sequence

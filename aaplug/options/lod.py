@@ -35,7 +35,7 @@ class LodOptions(ViewOptions):
     refine: bool = True
     """Merge alone, in seconds: do not tune the result to look like the scene, which takes minutes."""
     steps: Annotated[int | None, STEPS, UNSET] = None
-    """Steps of tuning for each level, more for small ones (default: 800, or 1600 for one scene)."""
+    """Steps of tuning for each level, more for small ones (default: 1000, or 2000 for one scene)."""
     resume: bool = False
     """Keep the levels that are there, if they were made of the same scene, cameras and options."""
     overwrite: bool = False

@@ -116,6 +116,13 @@ class Renderer:
         cutter = Cutter.of(pyramid, training) if pyramid else None
         return cls(prepared(scene, training, recipe), training, recipe, rasterizer, colour, cutter=cutter)
 
+    def showing(self, scene: Gaussians) -> "Renderer":
+        """The same for another scene: its sampling bounds are computed from the same cameras."""
+        known = self.training
+        training = TrainingViews.of(scene, known.cameras, known.cull_margin)
+        filtered = prepared(scene, training, self.recipe)
+        return replace(self, scene=filtered, training=training, harmonics=None, cutter=None)
+
     def __call__(self, camera: Camera) -> Render:
         """Render one view: rgb and alpha of `camera.hw`.
 

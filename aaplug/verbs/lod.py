@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.choices import SpzAxes
@@ -31,6 +33,8 @@ from aaplug.methods.filters import fuse_stored
 from aaplug.methods.viewers import find_viewer
 from aaplug.options.lod import LodOptions
 from aaplug.options.objects import AnyPath
+from aaplug.rendering.renderer import Renderer
+from aaplug.rendering.visibility import VIEWS, visibility
 from aaplug.verbs.assumed import say_assumed
 from aaplug.verbs.inputs import CamerasLike, Held, SceneLike, look_of, opened_and_seen, processor, sources_of, whole_of
 
@@ -81,7 +85,7 @@ def lod(
     say_assumed(known, monitor)
     folder = nullcontext() if path is None or o.single else output_folder(path)
     with processor(o.threads), folder, claimed(path, check):
-        make = _Maker(whole, known.train, *_tuners(whole, known, o, monitor), monitor)
+        make = _maker(whole, known, o, monitor)
         if o.single:
             found = make.finished(make(Level(whole, 1.0), goals_of(o, whole)[0]))
             if path is not None:
@@ -94,25 +98,52 @@ def lod(
 class _Maker:
     """Makes a level of the one before it.
 
+    look: draws the scene as training showed it; None where levels are neither tuned nor merged by what views show.
+    views: to tune on, and to merge by; none to merge by where nobody knows the cameras.
     tuned: for aaplug; the next level is made of the result.
     finished: for a viewer.
     """
 
     scene: Gaussians
     train: Sequence[Camera]
+    look: Renderer | None
+    views: Sequence[Camera]
     tuned: Callable[[Level], Level]
     finished: Callable[[Level], Level]
     monitor: Monitor
 
     def __call__(self, before: Level, goal: Goal) -> Level:
-        scene, rates = before.scene, rates_of(before.scene, self.train)
+        scene, rates, visible = before.scene, rates_of(before.scene, self.train), self._visible(before.scene, goal.rate)
         with self.monitor.progress("merging", "Gaussians") as tell:
             if before.chunks is None:
-                found, chunks = merged(scene, rates, goal, tell), None
+                found, chunks = merged(scene, rates, goal, tell, visible), None
             else:
-                found, chunks = merged_in_chunks(scene, rates, before.chunks, goal, tell)
+                found, chunks = merged_in_chunks(scene, rates, before.chunks, goal, tell, visible)
         self.monitor.say(f"{len(found):,} Gaussians for {goal.rate:.3g} × the training rate")
         return self.tuned(Level(found, goal.rate, chunks))
+
+    def _visible(self, scene: Gaussians, rate: float) -> Float[Tensor, " n"] | None:
+        if self.look is None or not self.views:
+            return None
+        with self.monitor.progress("looking", "views") as tell:
+            return visibility(self.look.showing(scene), self.views, rate, tell)
+
+
+def _maker(scene: Gaussians, cameras: CameraSet, o: LodOptions, monitor: Monitor) -> _Maker:
+    if cameras.assumed and not o.tuning:
+        return _Maker(scene, cameras.train, None, (), _same, _same, monitor)
+    look, views = look_of(scene, cameras, o.tuning or VIEWS, o, monitor), select_views(cameras, o.views)
+    viewer = find_viewer(o.viewer)
+
+    def tuned(level: Level) -> Level:
+        if viewer is not None and level.scene is scene:
+            usual = steps_for(scene, viewer)
+            steps = o.steps if usual and o.steps is not None else usual
+            return level._replace(scene=fit(scene, viewer, look, views, steps, monitor).scene)
+        return level._replace(scene=refined(level.scene, level.rate, look, views, o.tuning, viewer, monitor))
+
+    both = (_same, _same) if not o.tuning else (tuned, _same) if viewer is None else (_same, tuned)
+    return _Maker(scene, cameras.train, look, () if cameras.assumed else views, *both, monitor)
 
 
 def goals_of(o: LodOptions, scene: Gaussians) -> list[Goal]:
@@ -133,25 +164,6 @@ def goals_of(o: LodOptions, scene: Gaussians) -> list[Goal]:
         raise UsageError("simplify", f"asks for {count:,} Gaussians, and the scene has {len(scene):,}")
     goal = Goal.of_count(max(1, count), scene)
     return [goal if o.scale is None else replace(goal, rate=o.scale)]
-
-
-def _tuners(
-    scene: Gaussians, cameras: CameraSet, o: LodOptions, monitor: Monitor
-) -> tuple[Callable[[Level], Level], Callable[[Level], Level]]:
-    """What tunes a level for aaplug, and for a viewer; one of them does nothing."""
-    if not o.tuning:
-        return _same, _same
-    viewer = find_viewer(o.viewer)
-    look, views = look_of(scene, cameras, o.tuning, o, monitor), select_views(cameras, o.views)
-
-    def tuned(level: Level) -> Level:
-        if viewer is not None and level.scene is scene:
-            usual = steps_for(scene, viewer)
-            steps = o.steps if usual and o.steps is not None else usual
-            return level._replace(scene=fit(scene, viewer, look, views, steps, monitor).scene)
-        return level._replace(scene=refined(level.scene, level.rate, look, views, o.tuning, viewer, monitor))
-
-    return (tuned, _same) if viewer is None else (_same, tuned)
 
 
 def _same(level: Level) -> Level:
