@@ -33,8 +33,8 @@ PROBES = 6  # views that tell whether tuning helped, and are not tuned on
 MEMORY = 1e9  # bytes of images to compare with
 BYTES = 6  # a pixel
 # of the views as trained, in turn, over the training size.  So a level learns the rates over its own at which it is
-# drawn: alone from 4/3 to 1, and below it fades out.  The truth is of that size too: whole boxes of pixels do not blur
-SIZES = (1.0, 1.41, 1.0, 1.19, 1.41, 1.0, 1.19, 0.84)
+# drawn: alone from 3/2 to 1, and below it fades out.  The truth is of that size too: whole boxes of pixels do not blur
+SIZES = (1.0, 1.5, 1.0, 1.22, 1.5, 1.0, 1.22, 0.84)
 # over 3DGS's learning rates, where the level's error is `USUAL`; they follow the error, as the noise they leave does
 FASTER = {"means": 1.0, "quats": 1.0, "log_scales": 3.0, "logit_opacities": 1.0, "dc": 2.0, "rest": 5.0}
 SHARE = 0.3

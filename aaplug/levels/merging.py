@@ -135,7 +135,7 @@ def _batches(chunks: Int[Tensor, " n"]) -> Iterator[tuple[int, int]]:
 
 
 def _merged_batch(own: Clusters, scene: Gaussians, goal: Goal, tell: Callable[[int], None]) -> Merged:
-    clusters = _rounds(own, goal, tell)
+    clusters = rounds(own, goal, tell)
     found, places = alone(clusters, scene, own.weights), clusters.chunks
     if goal.count is None:
         shown = (~_hidden(found, clusters, goal.rate)).nonzero()[:, 0]
@@ -156,7 +156,8 @@ def _order(scene: Gaussians, chunks: Int[Tensor, " n"]) -> Int[Tensor, " n"]:
     return order
 
 
-def _rounds(clusters: Clusters, goal: Goal, tell: Callable[[int], None]) -> Clusters:
+def rounds(clusters: Clusters, goal: Goal, tell: Callable[[int], None]) -> Clusters:
+    """The clusters after all pairs are merged that the goal allows; `tell` is called with how many are gone."""
     first, least = len(clusters), goal.count or 1
     for tolerance in goal.tolerances:
         enough = 0.0 if tolerance == math.inf else ENOUGH

@@ -28,6 +28,8 @@ class LodOptions(ViewOptions):
     """Write a folder of levels, each for half the size of the one before, as light as the image allows (default: 4)."""
     merge_below: Annotated[float, number(0, 10)] = 0.0
     """With levels: merge Gaussians up to so many px of the level in any case; faster to draw, and less exact."""
+    multi_scale: bool = False
+    """Write the levels, merged alone, into one .ply with the columns of Multi-Scale 3DGS, whose own rule picks them."""
     scale: Annotated[float | None, number(0.001, 1), UNSET] = None
     """With --simplify or --budget: size of the images that the scene is meant for (default: root of the share)."""
     viewer: OneViewer = None
@@ -46,6 +48,13 @@ class LodOptions(ViewOptions):
         given = [name for name in ("simplify", "budget", "levels") if getattr(self, name) is not None]
         if len(given) > 1:
             raise UsageError(given[1], f"cannot be combined with `{given[0]}`: each asks for other files")
+        others = [
+            name
+            for name in ("simplify", "budget", "scale", "merge_below", "viewer", "steps", "resume")
+            if getattr(self, name)
+        ]
+        if self.multi_scale and others:
+            raise UsageError(others[0], "cannot be combined with `multi_scale`, whose levels are merged alone")
         if self.scale is not None and not self.single:
             raise UsageError("scale", "belongs to `simplify` and `budget`")
         if self.merge_below and self.single:
@@ -57,8 +66,8 @@ class LodOptions(ViewOptions):
 
     @property
     def single(self) -> bool:
-        """Whether one scene is asked for, not levels."""
-        return self.simplify is not None or self.budget is not None
+        """Whether one file is asked for, not a folder."""
+        return self.simplify is not None or self.budget is not None or self.multi_scale
 
     @property
     def tuning(self) -> int:

@@ -27,6 +27,7 @@ from aaplug.io.scenes.manifests import MANIFEST, LevelFile, Manifest, hash_of, i
 from aaplug.io.scenes.scene_file import FLOAT, SceneFile, matrix_of
 from aaplug.levels.chunks import LARGEST, chunks_of
 from aaplug.levels.merging import Goal, merged, merged_in_chunks
+from aaplug.levels.multi_scale import in_one_scene
 from aaplug.levels.pyramids import Level, levels_in
 from aaplug.levels.rates import rates_of
 from aaplug.methods.filters import fuse_stored
@@ -85,6 +86,12 @@ def lod(
     say_assumed(known, monitor)
     folder = nullcontext() if path is None or o.single else output_folder(path)
     with processor(o.threads), folder, claimed(path, check):
+        if o.multi_scale:
+            with monitor.progress("merging", "levels") as tell:
+                one = in_one_scene(whole, known.train, o.levels or LEVELS, tell)
+            if path is not None:
+                write_scene(path, one, overwrite=o.overwrite)
+            return [Level(one, 0.5 ** (o.levels or LEVELS))]
         make = _maker(whole, known, o, monitor)
         if o.single:
             found = make.finished(make(Level(whole, 1.0), goals_of(o, whole)[0]))
@@ -214,7 +221,9 @@ def _files(output: Path | None, scene: Held | SceneFile, o: LodOptions) -> list[
         return []
     sources = sources_of(scene)
     if o.single:
-        check_scene_output(output, o.overwrite, sources)
+        format = check_scene_output(output, o.overwrite, sources)
+        if o.multi_scale and format.name != "ply":
+            raise OutputError(output, "cannot hold the columns of Multi-Scale 3DGS; write a .ply")
         return [output]
     if written_format(output):
         raise OutputError(output, "levels go to a folder; for one scene, give `simplify` or `budget`")

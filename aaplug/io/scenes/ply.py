@@ -169,6 +169,16 @@ def _pixel_sizes(rows: np.ndarray) -> PixelSizes | None:
     return PixelSizes(smallest, largest, base > 0)
 
 
+def _sizes(scene: Gaussians) -> dict[str, np.ndarray]:
+    """The columns of Multi-Scale 3DGS, if the scene has its pixel sizes."""
+    sizes = scene.pixel_sizes
+    return (
+        {}
+        if sizes is None
+        else dict(zip(SIZES, map(np.asarray, (sizes.smallest, sizes.largest, sizes.base)), strict=True))
+    )
+
+
 def _one_type(dtype: np.dtype) -> bool:
     """Whether all columns are little-endian float32, so that the rows are a matrix."""
     return all(dtype[i] == np.dtype("<f4") for i in range(len(dtype.names or ())))
@@ -182,7 +192,8 @@ def _plain_header(scene: Gaussians) -> Header:
     """The header that 3DGS writes, with its order of columns."""
     rest = [f"f_rest_{i}" for i in range(3 * (scene.sh.shape[1] - 1))]
     order = [*REQUIRED[:3], *NORMALS, *COLOURS, *rest, *REQUIRED[6:]]
-    properties = [f"property float {c}" for c in order if c in NORMALS or c in matrix_of(scene[:0])[0]]
+    known = (*NORMALS, *matrix_of(scene[:0])[0])
+    properties = [f"property float {c}" for c in (*(c for c in order if c in known), *_sizes(scene))]
     start = ["ply", f"format {LITTLE} 1.0", f"element vertex {len(scene)}"]
     return parse("scene", [*start, *properties, "end_header"], "\n")
 
@@ -216,7 +227,7 @@ def _records(header: Header, scene: Gaussians) -> np.ndarray:
     known, matrix = matrix_of(scene)
     values = matrix.detach().cpu().numpy()
     assert not np.isnan(values).any(), "a parameter is NaN"
-    names, at_once = header.vertex.names, _one_type(records.dtype)
+    names, at_once, sizes = header.vertex.names, _one_type(records.dtype), _sizes(scene)
     if at_once:
         _matrix(records)[:, [names.index(column) for column in known]] = values
     old, document = None, _document_of(scene)
@@ -231,4 +242,6 @@ def _records(header: Header, scene: Gaussians) -> np.ndarray:
             records[p.name] = new
         elif p.name not in known and was is not None:
             records[p.name] = was
+        elif p.name in sizes:
+            records[p.name] = sizes[p.name]
     return records

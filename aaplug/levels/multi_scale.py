@@ -1,0 +1,104 @@
+"""All levels in one scene, for Multi-Scale 3DGS' selection by pixel size (Yan et al., CVPR 2024, arXiv 2311.17089).
+
+Its rule never leaves out a Gaussian of 2 px or more as too small.  So a level merges only Gaussians that are smaller in
+every training view, and these are what it replaces; what is larger stays for all sizes.  Its rasterizer dilates by
+0.3 px² at any size.  So a merged Gaussian is thinner by that much, in pixels of the lowest rate that it is drawn at.
+
+A Gaussian of level k is drawn from 2^-(k - 1/2) of training's sampling rate down to 2^-(m - 1/2), where level m
+replaces it.  Its pixel size differs from view to view: the recorded one is the geometric middle of the training views',
+so there are views in which a Gaussian and what replaces it are both drawn, or neither, at rates near to these.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from aaplug.core.cameras import Camera, spread
+from aaplug.core.errors import UsageError
+from aaplug.core.gaussians import CLASSIC, Gaussians, PixelSizes, joined
+from aaplug.core.monitor import Tell
+from aaplug.core.projection import project
+from aaplug.levels.clusters import alone, seen
+from aaplug.levels.merging import Goal, rounds
+from aaplug.levels.rates import rates_of
+from aaplug.methods.filters import fuse_stored
+from aaplug.methods.filters.pixel_size import LEAST_SHARE, MOST_SHARE, SMALL, pixel_size
+
+TOLERANCE = 1e-2  # px² of the level, as in `merging`: what a level does not merge is dilated, which is worse
+VIEWS = 50  # training views that sizes are taken from
+HALF = 2**0.5  # half a level, as a ratio of sampling rates
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Gaussians, the level that each was made for, and the one that replaces it: 0 for none."""
+
+    scene: Gaussians
+    made: Int[Tensor, " n"]
+    replaced: Int[Tensor, " n"]
+
+    @classmethod
+    def of(cls, scene: Gaussians, made: int | Int[Tensor, " n"] = 0, replaced: int = 0) -> "_Part":
+        every = torch.zeros(len(scene), dtype=torch.int64)
+        return cls(replace(scene, origin=None, pixel_sizes=None), every + made, every + replaced)
+
+    def __getitem__(self, index: Tensor) -> "_Part":
+        return _Part(self.scene[index], self.made[index], self.replaced[index])
+
+
+def in_one_scene(
+    scene: Gaussians, cameras: Sequence[Camera], levels: int, tell: Tell = lambda done, total: None
+) -> Gaussians:
+    """The scene and its levels, with the pixel sizes by which Multi-Scale 3DGS draws each at its own size.
+
+    Raises:
+        UsageError: training did not dilate the scene by 3DGS's 0.3 px², or it holds 2D Gaussians.
+        FrameError: no camera sees any.
+    """
+    if scene.convention != CLASSIC or scene.flat:
+        what = "2D Gaussians" if scene.flat else f"a scene of the convention '{scene.convention.name}'"
+        raise UsageError(scene.name, f"is {what}; Multi-Scale 3DGS draws 3D Gaussians by the convention 'classic'")
+    drawn, done = _Part.of(fuse_stored(scene)), []
+    for level in range(1, levels + 1):
+        tell(level - 1, levels)
+        largest = pixel_sizes(drawn.scene, cameras)[1]
+        small = largest / 2**level < SMALL
+        drawn, gone = _merged(drawn[(~small).nonzero()[:, 0]], drawn[small.nonzero()[:, 0]], cameras, level)
+        done.append(gone)
+    parts = [drawn, *done]
+    whole = joined([part.scene for part in parts])
+    made, replaced = (torch.cat([getattr(part, name) for part in parts]) for name in ("made", "replaced"))
+    least, most = pixel_sizes(whole, cameras)
+    middle = (least * most).sqrt()
+    smallest = torch.where(replaced > 0, middle * HALF * 0.5**replaced / LEAST_SHARE, 0.0)
+    greatest = torch.where(made > 0, middle * HALF * 0.5**made / MOST_SHARE, 0.0)
+    return replace(whole, pixel_sizes=PixelSizes(smallest, greatest, (made == 0) & (replaced == 0)))
+
+
+def pixel_sizes(scene: Gaussians, cameras: Sequence[Camera]) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
+    """Smallest and largest pixel size of each Gaussian in the cameras' images; 0 for one that none sees."""
+    least, most = torch.full((len(scene),), torch.inf), torch.zeros(len(scene))
+    for camera in spread(cameras, VIEWS):
+        splats = project(scene, camera)
+        own, size = splats.sources, pixel_size(splats).float()
+        least[own], most[own] = least[own].minimum(size), most[own].maximum(size)
+    return least.where(least.isfinite(), 0.0), most
+
+
+def _merged(large: _Part, small: _Part, cameras: Sequence[Camera], level: int) -> tuple[_Part, _Part]:
+    """What is drawn after a level, and what it replaces."""
+    if not len(small.scene):
+        return large, small
+    own = seen(small.scene, rates_of(small.scene, cameras))
+    clusters = rounds(own, Goal(0.5**level, tolerance=TOLERANCE), lambda count: None)
+    counts = torch.bincount(clusters.labels, minlength=len(clusters))
+    merged = alone(replace(clusters, rates=clusters.rates * 0.5**level / HALF), small.scene, own.weights)
+    replaced = counts[clusters.labels] > 1
+    gone, stays = (small[rows.nonzero()[:, 0]] for rows in (replaced, ~replaced))
+    fresh = _Part.of(merged[(counts > 1).nonzero()[:, 0]], made=level)
+    parts = (large, stays, fresh)
+    made = torch.cat([part.made for part in parts])
+    return _Part.of(joined([part.scene for part in parts]), made), _Part.of(gone.scene, gone.made, level)

@@ -1,0 +1,100 @@
+"""All levels in one scene: what Multi-Scale 3DGS' own rule draws of them, and the file that holds them."""
+
+# ruff: noqa: F811 (fixtures come from another file)
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+import aaplug
+from aaplug.core.errors import OutputError, UsageError
+from aaplug.core.gaussians import MIP, Gaussians
+from aaplug.evaluation.metrics import psnr
+from aaplug.io.scenes import open_scene, read_scene
+from aaplug.levels.multi_scale import in_one_scene, pixel_sizes
+from aaplug.rendering.renderer import Renderer
+from tests.conftest import make_camera, make_scene
+from tests.test_cli import cli, dataset  # noqa: F401 (fixtures)
+
+LEVELS = 4
+
+
+@pytest.fixture(scope="module")
+def together(sample_scene, sample_cameras) -> Gaussians:
+    return in_one_scene(sample_scene, sample_cameras.train, LEVELS)
+
+
+def test_its_rule_draws_fewer_gaussians_that_look_more_like_the_scene(together, sample_scene, sample_cameras):
+    view = sample_cameras.test[0]
+    ceiling = Renderer.of(sample_scene, sample_cameras, quality="best")
+    by_rule = Renderer.of(together, sample_cameras, "multi-scale")
+    classic = Renderer.of(sample_scene, sample_cameras, "classic")
+    for scale, gain in ((1 / 4, 1.0), (1 / 8, 2.0), (1 / 16, 3.0)):
+        truth = ceiling(view.scaled(scale)).rgb
+        found, plain = (psnr(shown(view.scaled(scale)).rgb, truth) or 0 for shown in (by_rule, classic))
+        assert found > plain + gain, scale
+    drawn = [len(by_rule.splats(view.scaled(0.5**level))) for level in range(LEVELS + 1)]
+    assert drawn == sorted(drawn, reverse=True)
+    assert drawn[-1] < 0.3 * drawn[0]
+    full = psnr(by_rule(view).rgb, classic(view).rgb)
+    assert full is None or full > 40
+
+
+def test_nothing_is_left_out_between_levels(together, sample_cameras):
+    """The alpha of a view changes from one rate to the next, but never falls by much: no part is left out."""
+    by_rule, view = Renderer.of(together, sample_cameras, "multi-scale"), sample_cameras.test[0]
+    shares = [float(by_rule(view.scaled(2 ** (-step / 4))).alpha.mean()) for step in range(4 * LEVELS + 1)]
+    for share in shares:
+        assert share > 0.97 * shares[0]
+
+
+def test_every_gaussian_of_the_scene_is_there_to_the_bit(together, sample_scene):
+    rows = {tuple(row) for row in torch.cat([together.means, together.sh[:, 0]], dim=1).tolist()}
+    assert {tuple(row) for row in torch.cat([sample_scene.means, sample_scene.sh[:, 0]], dim=1).tolist()} <= rows
+
+
+def test_pixel_sizes_are_those_of_all_views():
+    scene, views = make_scene(30), [make_camera((0.0, -4.0, 0.0)), make_camera((0.0, -8.0, 0.0))]
+    each = [pixel_sizes(scene, [view]) for view in views]
+    least, most = pixel_sizes(scene, views)
+    seen = torch.stack([most > 0 for _, most in each]).all(dim=0)
+    assert seen.any()
+    assert torch.equal(least[seen], torch.minimum(each[0][0], each[1][0])[seen])
+    assert torch.equal(most[seen], torch.maximum(each[0][1], each[1][1])[seen])
+
+
+@pytest.mark.parametrize("change", [{"convention": MIP}, {"flat": True}])
+def test_a_scene_that_its_rasterizer_shows_otherwise_is_refused(change):
+    with pytest.raises(UsageError, match="Multi-Scale 3DGS draws 3D Gaussians by the convention 'classic'"):
+        in_one_scene(replace(make_scene(5), **change), [make_camera()], 1)
+
+
+def test_the_file_keeps_the_columns(cli):
+    code, _, err = cli("lod scene.ply --cameras . -o together.ply --multi-scale --levels 2")
+    assert code == 0, err
+    assert "pixel sizes of Multi-Scale 3DGS, for the recipe multi-scale" in open_scene("together.ply").notes
+    (found,) = aaplug.lod("scene.ply", ".", levels=2, multi_scale=True)
+    read, made = read_scene("together.ply").pixel_sizes, found.scene.pixel_sizes
+    assert read is not None
+    assert made is not None
+    for name in ("smallest", "largest", "base"):
+        assert torch.equal(getattr(read, name), getattr(made, name)), name
+    assert len(found.scene) > len(read_scene("scene.ply"))
+    assert cli("render together.ply --cameras . -o images --recipe multi-scale --scale 0.25")[0] == 0
+
+
+@pytest.mark.parametrize("more", ["--simplify 0.5", "--scale 0.5", "--merge-below 1", "--for spark", "--resume"])
+def test_what_it_cannot_do_is_refused(cli, more):
+    code, _, err = cli(f"lod scene.ply --cameras . -o together.ply --multi-scale {more}")
+    assert code == 2
+    assert "cannot be combined with --multi-scale" in err
+    assert not Path("together.ply").exists()
+
+
+def test_a_format_without_its_columns_is_refused(cli):
+    code, _, err = cli("lod scene.ply --cameras . -o together.splat --multi-scale")
+    assert (code, "write a .ply" in err) == (2, True)
+    with pytest.raises(OutputError, match="columns of Multi-Scale 3DGS"):
+        aaplug.lod("scene.ply", ".", "together.splat", multi_scale=True)
