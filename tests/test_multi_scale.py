@@ -2,6 +2,7 @@
 
 # ruff: noqa: F811 (fixtures come from another file)
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -42,12 +43,20 @@ def test_its_rule_draws_fewer_gaussians_that_look_more_like_the_scene(together, 
     assert full is None or full > 40
 
 
-def test_nothing_is_left_out_between_levels(together, sample_cameras):
-    """The alpha of a view changes from one rate to the next, but never falls by much: no part is left out."""
-    by_rule, view = Renderer.of(together, sample_cameras, "multi-scale"), sample_cameras.test[0]
-    shares = [float(by_rule(view.scaled(2 ** (-step / 4))).alpha.mean()) for step in range(4 * LEVELS + 1)]
-    for share in shares:
-        assert share > 0.97 * shares[0]
+def test_a_wall_of_small_gaussians_stays_closed_at_every_size():
+    """Every one of them is replaced, so a part that neither it nor its level covers would be a hole."""
+    side = torch.arange(64) * 0.03 - 0.96
+    means = torch.stack([side.repeat(64), torch.zeros(64**2), side.repeat_interleave(64)], dim=1)
+    wall = replace(make_scene(1)[torch.zeros(64**2, dtype=torch.int64)], means=means)
+    wall.log_scales[:], wall.logit_opacities[:] = math.log(0.02), 3.0
+    views = [make_camera((x, -4.0, 0.0), (256, 256), 0.6) for x in (-0.3, 0.0, 0.3)]
+    by_rule = Renderer.of(in_one_scene(wall, views, LEVELS), views, "multi-scale")
+    for step in range(4 * LEVELS + 1):
+        render = by_rule(views[1].scaled(2 ** (-step / 4)))
+        middle = slice(render.alpha.shape[0] * 3 // 8, render.alpha.shape[0] * 5 // 8 + 1)
+        assert render.alpha[middle, middle].mean() > 0.7, step
+    drawn = [len(by_rule.splats(views[1].scaled(0.5**level))) for level in (0, LEVELS)]
+    assert drawn[1] < 0.1 * drawn[0]
 
 
 def test_every_gaussian_of_the_scene_is_there_to_the_bit(together, sample_scene):

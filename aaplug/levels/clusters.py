@@ -32,6 +32,7 @@ MAX_OPACITY = RULES_3DGS.max_alpha  # of a merged Gaussian; no renderer shows mo
 # seen alone, 0 its size.  Beside others, which overlap what it gains, the half is best (examples/guides/levels.md)
 WIDENING = 0.5
 LARGEST = 1e6  # px: what is larger looks the same, but its squared area overflows float32
+USUAL = 0.3  # visible share where nothing is known: its square is about the mean of two scenes
 LEAST_VISIBLE = 1e-3  # what is hidden still has a place and a colour
 THINNEST = 0.02  # px: standard deviation to which the dilation is taken out at most
 
@@ -89,7 +90,7 @@ def seen(
     """Every Gaussian as a cluster of its own.
 
     chunks: see `Clusters`; None for one of all.
-    visible: see `visibility`; None for all of each Gaussian.
+    visible: see `visibility`; NaN where nothing is known, None for all of each Gaussian.
     """
     largest = (LARGEST / rates).log()[:, None].to(scene.log_scales)
     raw = covariances(replace(scene, log_scales=scene.log_scales.minimum(largest)))
@@ -97,7 +98,7 @@ def seen(
     opacities = scene.opacities
     if scene.convention.compensated:
         opacities = opacities * area(raw) / area(covs)
-    visible = torch.ones_like(opacities) if visible is None else visible.clamp(min=LEAST_VISIBLE)
+    visible = torch.ones_like(opacities) if visible is None else visible.nan_to_num(USUAL).clamp(min=LEAST_VISIBLE)
     weights = opacities.clamp(min=MIN_OPACITY) * area(covs) * visible
     colours = COLOUR_OFFSET + SH_C0 * scene.sh[:, 0]
     own = torch.arange(len(scene))

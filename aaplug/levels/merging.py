@@ -17,15 +17,14 @@ from torch import Tensor
 from aaplug.core.errors import UsageError
 from aaplug.core.gaussians import Fusion, Gaussians, joined
 from aaplug.core.monitor import Tell
-from aaplug.levels.clusters import Clusters, alone, merged_pairs, seen
+from aaplug.levels.clusters import USUAL, Clusters, alone, merged_pairs, seen
 from aaplug.levels.covariances import areas, blurred, covariances
 from aaplug.levels.pairing import Edges, curve, edges_below, matched
 from aaplug.methods.filters import PIXEL_VARIANCE, fuse_stored
 from aaplug.methods.viewers import MERGED
 
 ENOUGH = 0.02  # of the clusters: after a round that merges fewer, more is allowed to change
-TOLERANCE = 1e-5  # px² of the level: squared change of the image, from 0 to 1, by one pair as views show it
-USUAL = 0.1  # squared share of a Gaussian that views show, where it is not known: about the mean of two scenes
+TOLERANCE = 8e-6  # px² of the level: squared change of the image, from 0 to 1, by one pair as views show it
 FIRST_SHARE = 0.01  # of the tolerance in the first rounds, so that a bad pair does not go before a better one
 FIRST, LAST = 1e-7, 1e3  # px²: tolerances of the first rounds and of the last but one, where a count is asked for
 STEP = 10.0  # from one tolerance to the next
@@ -108,7 +107,7 @@ def merged_in_chunks(
         raise UsageError(scene.name, "holds 2D Gaussians, which cannot be merged")
     scene = fuse_stored(scene)
     if visible is None:
-        goal = replace(goal, tolerance=goal.tolerance / USUAL)
+        goal = replace(goal, tolerance=goal.tolerance / USUAL**2)
     order = _order(scene, chunks)
     parts: list[Merged] = []
     for start, stop in _batches(chunks[order]):
@@ -188,11 +187,15 @@ def _joined(clusters: Clusters, pairs: Edges) -> Clusters:
 
 
 def _hidden(scene: Gaussians, clusters: Clusters, rate: float) -> Bool[Tensor, " n"]:
-    """Gaussians of which no pixel of the level shows as much as the cut-off, along any of three directions."""
+    """Gaussians whose alpha no pixel of the level shows, along any of three directions: below the cut-off.
+
+    Also those of which views show a smaller share than the cut-off.
+    """
     px = clusters.rates * rate
     narrow = covariances(scene)
     trained = blurred(narrow, scene.convention.kernel / clusters.rates.square())
     shown = blurred(trained, PIXEL_VARIANCE / px.square())
     start = narrow if scene.convention.compensated else trained
-    peaks = (scene.opacities * clusters.visible)[:, None] * areas(start) / areas(shown)
-    return peaks.amax(dim=1) < scene.convention.rules.min_alpha
+    peaks = scene.opacities[:, None] * areas(start) / areas(shown)
+    least = scene.convention.rules.min_alpha
+    return (peaks.amax(dim=1) < least) | (clusters.visible < least)

@@ -1,8 +1,9 @@
 """All levels in one scene, for Multi-Scale 3DGS' selection by pixel size (Yan et al., CVPR 2024, arXiv 2311.17089).
 
 Its rule never leaves out a Gaussian of 2 px or more as too small.  So a level merges only Gaussians that are smaller in
-every training view, and these are what it replaces; what is larger stays for all sizes.  Its rasterizer dilates by
-0.3 px² at any size.  So a merged Gaussian is thinner by that much, in pixels of the lowest rate that it is drawn at.
+50 training views, and these are what it replaces; what is larger stays for all sizes.  Its rasterizer dilates by
+0.3 px² at any size.  So a merged Gaussian is thinner by that much, in pixels of the highest rate that it is drawn at:
+any thinner, and surfaces would have holes there.
 
 A Gaussian of level k is drawn from 2^-(k - 1/2) of training's sampling rate down to 2^-(m - 1/2), where level m
 replaces it.  Its pixel size differs from view to view: the recorded one is the geometric middle of the training views',
@@ -18,7 +19,7 @@ from torch import Tensor
 
 from aaplug.core.cameras import Camera, spread
 from aaplug.core.errors import UsageError
-from aaplug.core.gaussians import CLASSIC, Gaussians, PixelSizes, joined
+from aaplug.core.gaussians import CLASSIC, Fusion, Gaussians, PixelSizes, joined
 from aaplug.core.monitor import Tell
 from aaplug.core.projection import project
 from aaplug.levels.clusters import alone, seen
@@ -26,6 +27,7 @@ from aaplug.levels.merging import Goal, rounds
 from aaplug.levels.rates import rates_of
 from aaplug.methods.filters import fuse_stored
 from aaplug.methods.filters.pixel_size import LEAST_SHARE, MOST_SHARE, SMALL, pixel_size
+from aaplug.methods.viewers import MERGED
 
 TOLERANCE = 1e-2  # px² of the level, as in `merging`: what a level does not merge is dilated, which is worse
 VIEWS = 50  # training views that sizes are taken from
@@ -65,37 +67,48 @@ def in_one_scene(
     for level in range(1, levels + 1):
         tell(level - 1, levels)
         largest = pixel_sizes(drawn.scene, cameras)[1]
-        small = largest / 2**level < SMALL
-        drawn, gone = _merged(drawn[(~small).nonzero()[:, 0]], drawn[small.nonzero()[:, 0]], cameras, level)
+        small, rates = (largest > 0) & (largest / 2**level < SMALL), rates_of(drawn.scene, cameras)
+        drawn, gone = _merged(drawn[(~small).nonzero()[:, 0]], drawn[small.nonzero()[:, 0]], rates[small], level)
         done.append(gone)
     parts = [drawn, *done]
     whole = joined([part.scene for part in parts])
     made, replaced = (torch.cat([getattr(part, name) for part in parts]) for name in ("made", "replaced"))
     least, most = pixel_sizes(whole, cameras)
     middle = (least * most).sqrt()
-    smallest = torch.where(replaced > 0, middle * HALF * 0.5**replaced / LEAST_SHARE, 0.0)
-    greatest = torch.where(made > 0, middle * HALF * 0.5**made / MOST_SHARE, 0.0)
-    return replace(whole, pixel_sizes=PixelSizes(smallest, greatest, (made == 0) & (replaced == 0)))
+    smallest = torch.where(replaced > 0, middle * _first_drawn(replaced) / LEAST_SHARE, 0.0)
+    greatest = torch.where(made > 0, middle * _first_drawn(made) / MOST_SHARE, 0.0)
+    record = Fusion(MERGED, {"levels": str(levels), "from": str(len(scene))})
+    sizes = PixelSizes(smallest, greatest, (made == 0) & (replaced == 0))
+    return replace(whole, pixel_sizes=sizes, fused=(*scene.fused, record))
 
 
 def pixel_sizes(scene: Gaussians, cameras: Sequence[Camera]) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
-    """Smallest and largest pixel size of each Gaussian in the cameras' images; 0 for one that none sees."""
+    """Smallest and largest pixel size of each Gaussian in the cameras' images; 0 for one whose middle none shows."""
     least, most = torch.full((len(scene),), torch.inf), torch.zeros(len(scene))
     for camera in spread(cameras, VIEWS):
         splats = project(scene, camera)
+        sides = torch.tensor([camera.width, camera.height]).to(splats.means)
+        splats = splats[((splats.means >= 0) & (splats.means <= sides)).all(dim=1)]
         own, size = splats.sources, pixel_size(splats).float()
         least[own], most[own] = least[own].minimum(size), most[own].maximum(size)
     return least.where(least.isfinite(), 0.0), most
 
 
-def _merged(large: _Part, small: _Part, cameras: Sequence[Camera], level: int) -> tuple[_Part, _Part]:
-    """What is drawn after a level, and what it replaces."""
+def _first_drawn(made: Int[Tensor, " *n"]) -> Float[Tensor, " *n"]:
+    """Highest sampling rate, relative to training's, at which Gaussians of a level are drawn."""
+    return torch.where(made > 0, HALF * 0.5**made, 1.0)
+
+
+def _merged(large: _Part, small: _Part, rates: Float[Tensor, " s"], level: int) -> tuple[_Part, _Part]:
+    """What is drawn after a level, and what it replaces; rates: of the small ones."""
     if not len(small.scene):
         return large, small
-    own = seen(small.scene, rates_of(small.scene, cameras))
+    own = replace(seen(small.scene, rates * _first_drawn(small.made)), rates=rates)
     clusters = rounds(own, Goal(0.5**level, tolerance=TOLERANCE), lambda count: None)
     counts = torch.bincount(clusters.labels, minlength=len(clusters))
-    merged = alone(replace(clusters, rates=clusters.rates * 0.5**level / HALF), small.scene, own.weights)
+    merged = alone(
+        replace(clusters, rates=clusters.rates * _first_drawn(torch.tensor(level))), small.scene, own.weights
+    )
     replaced = counts[clusters.labels] > 1
     gone, stays = (small[rows.nonzero()[:, 0]] for rows in (replaced, ~replaced))
     fresh = _Part.of(merged[(counts > 1).nonzero()[:, 0]], made=level)

@@ -18,7 +18,7 @@ class LodOptions(ViewOptions):
     """How light, and how to tune."""
 
     views: Annotated[str, tyro.conf.arg(metavar="NAME,...|test|train|all")] = "train"
-    """Views that levels are tuned on, with free ones between them."""
+    """Views that levels are tuned on and that tell what is hidden, with free ones between them."""
 
     simplify: Annotated[float | None, number(1e-6, 1e9), UNSET] = None
     """Write one scene with this share of the Gaussians; above 1, with so many."""
@@ -35,7 +35,7 @@ class LodOptions(ViewOptions):
     viewer: OneViewer = None
     """Tune each file for spark, playcanvas or another of examples/guides/viewers.md, instead of for aaplug."""
     refine: bool = True
-    """Merge alone, in seconds: do not tune the result to look like the scene, which takes minutes."""
+    """Merge alone: do not tune the result to look like the scene, which takes minutes."""
     steps: Annotated[int | None, STEPS, UNSET] = None
     """Steps of tuning for each level, more for small ones (default: 1000, or 2000 for one scene)."""
     resume: bool = False

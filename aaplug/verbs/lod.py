@@ -41,6 +41,7 @@ from aaplug.verbs.inputs import CamerasLike, Held, SceneLike, look_of, opened_an
 
 LEVELS = 4  # as many as usual: down to 1/16 of the training size
 MEGABYTE = 1e6
+RULE = 2  # of merging and tuning; raised when it changes, so that levels of two rules are not mixed
 NORMALS = 3  # columns that a .ply has beside a Gaussian's parameters
 
 
@@ -68,7 +69,7 @@ def lod(
         options: fields of `LodOptions`.
 
     Returns:
-        The one lighter scene; or all levels, first the scene itself.
+        The one scene, lighter or with all levels in it; or all levels, first the scene itself.
 
     Raises:
         AaplugError: as `render`; also, the scene holds 2D Gaussians or none at all.
@@ -79,6 +80,8 @@ def lod(
     check = partial(_files, path, opened, o)
     files = check()
     whole = fuse_stored(whole_of(opened, drop_bad))
+    if whole.pixel_sizes is not None:
+        raise UsageError(whole.name, "holds levels already, by the columns of Multi-Scale 3DGS")
     if not len(whole):
         raise UsageError(whole.name, "has no Gaussians to merge")
     if not known.assumed:
@@ -120,7 +123,7 @@ class _Maker:
     monitor: Monitor
 
     def __call__(self, before: Level, goal: Goal) -> Level:
-        scene, rates, visible = before.scene, rates_of(before.scene, self.train), self._visible(before.scene, goal.rate)
+        scene, rates, visible = before.scene, rates_of(before.scene, self.train), self._visible(before, goal)
         with self.monitor.progress("merging", "Gaussians") as tell:
             if before.chunks is None:
                 found, chunks = merged(scene, rates, goal, tell, visible), None
@@ -129,11 +132,12 @@ class _Maker:
         self.monitor.say(f"{len(found):,} Gaussians for {goal.rate:.3g} × the training rate")
         return self.tuned(Level(found, goal.rate, chunks))
 
-    def _visible(self, scene: Gaussians, rate: float) -> Float[Tensor, " n"] | None:
+    def _visible(self, before: Level, goal: Goal) -> Float[Tensor, " n"] | None:
         if self.look is None or not self.views:
             return None
+        scale = max(goal.rate, before.rate / 2)  # below that, many of its Gaussians are too faint to be drawn
         with self.monitor.progress("looking", "views") as tell:
-            return visibility(self.look.showing(scene), self.views, rate, tell)
+            return visibility(self.look.showing(before.scene), self.views, scale, tell)
 
 
 def _maker(scene: Gaussians, cameras: CameraSet, o: LodOptions, monitor: Monitor) -> _Maker:
@@ -207,7 +211,9 @@ def _levels(
 def _source(scene: Gaussians, cameras: CameraSet, o: LodOptions) -> str:
     """Hash of all that the levels depend on."""
     facts = [digest_of_scene(scene), digest_of_cameras(cameras.train)]
-    return digest_of_values((*facts, cameras.background, o.merge_below, o.tuning, o.views, o.background, o.cull_margin))
+    return digest_of_values(
+        (RULE, *facts, cameras.background, o.merge_below, o.tuning, o.views, o.background, o.cull_margin)
+    )
 
 
 def _described(file: Path, level: Level) -> LevelFile:

@@ -1,10 +1,11 @@
 """Levels of detail, measured: python -m tests.bench.levels [SCENE ...], of those below, or cost.
 
 For a scene it prints lighter scenes beside splat-transform's `--decimate`; then a pyramid, kept in a folder of the
-working directory, at sizes from 1/2 to 1/32, with and without levels: PSNR in dB, SSIM and flicker against the scene's
-own look, PSNR against photographs, median milliseconds, Gaussians projected and evaluations of a splat in a pixel; then
-a dolly, also as a video.  For a scene of `MILLIONS`: what levels lose by the own look and what they save of the time,
-merged alone and tuned.  For cost: time against Gaussians and pixels on synthetic scenes.
+working directory, at sizes from 1/2 to 1/32, with and without levels: PSNR in dB, SSIM and flicker against the
+scene's own look, PSNR against photographs, median milliseconds, Gaussians projected and evaluations of a splat in a
+pixel; then a dolly, also as a video; and all levels in one scene by Multi-Scale 3DGS' rule.  For a scene of
+`MILLIONS`: what levels lose by the own look and what they save of the time, merged alone and tuned.  For cost: time
+against Gaussians and pixels on synthetic scenes.
 """
 
 import statistics
@@ -19,7 +20,7 @@ from typing import Literal
 import torch
 
 from aaplug.core.camera_paths import moved
-from aaplug.core.cameras import Camera, CameraSet
+from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.interfaces import Rasterizer
 from aaplug.core.pyramids import Pyramid
@@ -32,15 +33,16 @@ from aaplug.io.video import write_video
 from aaplug.levels.pyramids import pyramid_of, read_pyramid
 from aaplug.methods.recipes import find_recipe
 from aaplug.rasterizers import find_rasterizer
-from aaplug.rendering.benchmark import exponent, synthetic_camera, synthetic_scene
+from aaplug.rendering.benchmark import exponent, synthetic_camera
 from aaplug.rendering.renderer import Renderer
 from aaplug.verbs.evaluate import evaluate
 from aaplug.verbs.lod import lod
 from tests.bench.away import decibels
-from tests.bench.millions import MILLIONS, TRAINED, Opened, trained
+from tests.bench.millions import MILLIONS, TRAINED, Opened, noise, trained
 
 VIEWS = 5
 SCALES = (1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 32)
+BETWEEN = (0.24, 1 / 5, 1 / 6, 1 / 7, 0.11, 1 / 10, 0.07)  # sizes at which samples lie closer than half of training's
 LEVELS = 5
 SHARES = {1 / 4: (1 / 4, 1 / 8), 1 / 16: (1 / 8,)}  # scales that lighter scenes are tuned for
 DECIMATED = {  # at 1/2, 1/4 and 1/8, measured with @playcanvas/splat-transform 3; on the capture by other test views
@@ -150,6 +152,17 @@ def lighter(bench: Bench) -> None:
             row(what, f"{len(scene):,}", *(psnr(bench.shown(scene, "matched"), bench.own, s) for s in SCALES[:3]))
 
 
+@torch.no_grad()
+def together(bench: Bench) -> None:
+    """All levels in one scene by Multi-Scale 3DGS' rule, beside 3DGS."""
+    (one,) = lod(bench.scene, bench.cameras, multi_scale=True, levels=LEVELS)
+    print("\n| | " + " | ".join(f"1/{1 / scale:g}" for scale in (1.0, *SCALES)) + " |\n" + "|---" * 7 + "|")
+    for recipe, scene in (("multi-scale", one.scene), ("classic", bench.scene)):
+        shown = bench.shown(scene, recipe)
+        row(f"`{recipe}`, PSNR", *(psnr(shown, bench.own, scale) for scale in (1.0, *SCALES)))
+        row("splats", *(f"{len(shown.splats(bench.views[0].scaled(scale))):,}" for scale in (1.0, *SCALES)))
+
+
 def levels(bench: Bench) -> Pyramid:
     """A pyramid against the scene."""
     pyramid = bench.built(f"{bench.name}-lod")
@@ -187,7 +200,7 @@ def million(bench: Bench) -> None:
     for quality in ("fast", "balanced"):
         shown = {"the scene": bench.shown(bench.scene, "auto", quality)}
         shown |= {f"levels, {how}": bench.shown(pyramid, "auto", quality) for how, pyramid in pyramids.items()}
-        for scale in SCALES[1:]:
+        for scale in (*SCALES[1:], *BETWEEN):
             view = bench.views[0].scaled(scale)
             times = milliseconds(*(partial(renderer, view) for renderer in shown.values()), clock=time.process_time)
             for (name, renderer), took in zip(shown.items(), times, strict=True):
@@ -230,11 +243,10 @@ def dolly(bench: Bench, pyramid: Pyramid) -> None:
 def cost(rasterizer: Rasterizer) -> None:
     """Time of a frame against Gaussians and pixels, by levels that are merged alone."""
     camera: Camera = synthetic_camera(TRAINED, TRAINED).as_trained()
-    cameras = CameraSet((camera,), (camera,))
     print("\n| Gaussians | levels | s | size | levels, ms | Gaussians projected | without, ms |\n" + "|---" * 7 + "|")
     by_size: dict[tuple[int, int], list[float]] = {}
     for count in COUNTS:
-        scene = synthetic_scene(count)
+        scene, cameras, _ = noise(count)
         started = time.perf_counter()
         pyramid = pyramid_of(lod(scene, cameras, levels=LEVELS, refine=False, merge_below=BELOW))
         seconds = time.perf_counter() - started
@@ -265,6 +277,7 @@ def main(names: Sequence[str]) -> None:
             million(bench)
             continue
         dolly(bench, levels(bench))
+        together(bench)
         lighter(bench)
 
 

@@ -67,12 +67,12 @@ def finely(name: str) -> Opened:
     return split(scene, cameras), cameras, how
 
 
-def noise() -> Opened:
+def noise(count: int = COUNT) -> Opened:
     """The synthetic scene, whose neighbours have colours at random, and cameras around it."""
     camera = synthetic_camera(TRAINED, TRAINED)
     train = [view for ring, degrees in enumerate(RINGS) for view in _ring(camera, degrees, POSES, ring / len(RINGS))]
     test = _ring(camera, TEST_RING, TESTS, BETWEEN)
-    return synthetic_scene(COUNT), CameraSet(tuple(train), tuple(test)), Scene("", background=BLACK)
+    return synthetic_scene(count), CameraSet(tuple(train), tuple(test)), Scene("", background=BLACK)
 
 
 def _ring(camera: Camera, degrees: float, count: int, start: float) -> Iterator[Camera]:

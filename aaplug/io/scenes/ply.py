@@ -175,7 +175,7 @@ def _sizes(scene: Gaussians) -> dict[str, np.ndarray]:
     return (
         {}
         if sizes is None
-        else dict(zip(SIZES, map(np.asarray, (sizes.smallest, sizes.largest, sizes.base)), strict=True))
+        else dict(zip(SIZES, (column.cpu().numpy() for column in vars(sizes).values()), strict=True))
     )
 
 
@@ -204,7 +204,7 @@ def _updated(old: Header, scene: Gaussians, count: int, new: bool) -> Header:
     known = old.vertex.names
     kept = SCALES[2] if scene.flat else None
     dropped = [c for c in known if _is_parameter(c) and c not in wanted and c != kept]
-    added = [column for column in wanted if column not in known]
+    added = [column for column in (*wanted, *_sizes(scene)) if column not in known]
     header = old.little().with_vertex(count, dropped, added)
     return stating(header, None if new else old, scene.convention, scene.fused)
 
