@@ -9,7 +9,7 @@ covariance before any dilation and L = 2 ln(255 o), as in the published code.  I
 Gaussians of the coarsest level are always drawn, and an unknown size excludes nothing.
 
 Written from the method's description.  No checkpoint trained by it was available, so the columns are tested on
-synthetic scenes only.
+synthetic scenes and on those of `levels.multi_scale` only.
 """
 
 from dataclasses import dataclass
