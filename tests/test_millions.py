@@ -19,10 +19,10 @@ CAMERAS = CameraSet(VIEWS, VIEWS)
 
 @pytest.mark.parametrize(
     ("budget", "share", "expected"),
-    [(0, 0.0, 2), (50, 0.0, 4), (49, 0.0, 2), (0, 0.25, 4), (0, 0.24, 2), (50, 0.1, 4), (10, 0.25, 4)],
+    [(0, 0.0, 2), (50, 0.0, 4), (49, 0.0, 3), (44, 0.0, 2), (0, 0.25, 4), (0, 0.24, 3), (50, 0.1, 4), (10, 0.25, 4)],
 )
 def test_balanced_takes_all_samples_while_its_levels_are_few_or_a_small_share(budget, share, expected):
-    """Of 200 Gaussians, level 1 has 50 and level 2 has 45; a view at 1/8 draws one of them."""
+    """Of 200 Gaussians, level 1 has 50 and level 2 has 45; a view at 1/8 draws level 1 with 4 samples, else level 2."""
     scenes = [make_scene(count) for count in (200, 50, 45)]
     levels = Pyramid.of(scenes, [torch.zeros(len(scene), dtype=torch.int64) for scene in scenes])
     renderer = Renderer.of(levels, CAMERAS, rasterizer="eager")

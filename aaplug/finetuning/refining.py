@@ -104,8 +104,9 @@ def _views(poses: Sequence[Camera], rate: float, steps: int) -> tuple[list[Camer
     most = MEMORY / (BYTES * area * max(camera.width * camera.height for camera in poses))
     count = max(1, min(steps, int(most)))
     between = [view.as_trained() for view in free_views(poses, BETWEEN)]
-    trained = spread([*poses, *between], count - count // FREE)
-    trained = [*trained] * (-(-min(len(sizes), count) // len(trained)))  # few views at several sizes
+    known = count - count // FREE
+    trained = spread([*poses, *between], known)
+    trained = [*trained] * max(1, min(len(sizes), known) // len(trained))  # few views at several sizes
     sized = [view.scaled(size) for view, size in zip(trained, cycle(sizes), strict=False)]
     free = spread(free_views(poses, 1, seed=1), count // FREE) if count >= FREE else ()
     return [*sized, *free], list(spread(free_views(poses, 1, seed=2), PROBES)) or list(poses[:1])
