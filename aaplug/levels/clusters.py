@@ -32,9 +32,8 @@ MAX_OPACITY = RULES_3DGS.max_alpha  # of a merged Gaussian; no renderer shows mo
 # seen alone, 0 its size.  Beside others, which overlap what it gains, the half is best (examples/guides/levels.md)
 WIDENING = 0.5
 LARGEST = 1e6  # px: what is larger looks the same, but its squared area overflows float32
-USUAL = (
-    0.28  # visible share where nothing is known: its square, 0.08, lies between the means of two scenes, 0.05 and 0.19
-)
+# visible share where nothing is known: its square, 0.08, lies between the means of two scenes, 0.05 and 0.19
+USUAL = 0.28
 LEAST_VISIBLE = 1e-3  # what is hidden still has a place and a colour
 THINNEST = 0.02  # px: standard deviation to which the dilation is taken out at most
 

@@ -84,7 +84,7 @@ def merged(
     """A lighter scene, with a record of it; the scene itself if nothing is to be merged.
 
     rates: training's sampling rate of each Gaussian, px per world unit; see `rates_of`.
-    visible: how much of each Gaussian views show, see `visibility`; None for all.
+    visible: how much of each Gaussian views show, see `visibility`; None where nothing is known of any.
 
     Raises:
         UsageError: the scene holds 2D Gaussians.

@@ -61,7 +61,7 @@ def _light(look: Renderer, camera: Camera) -> tuple[Splats2D, Float[Tensor, " m"
     if not len(splats):
         return splats, splats.opacities
     with torch.enable_grad():
-        colours = torch.zeros_like(splats.means[:, :1]).expand(-1, 3).contiguous().requires_grad_()
+        colours = splats.means.new_zeros(len(splats), 3).requires_grad_()
         recipe, rules = look.recipe, look.training.convention.rules
         painted = replace(splats, rgb=colours)
         render = look.rasterizer(painted, camera.hw, BLACK, recipe.pixel, recipe.compositor, rules)

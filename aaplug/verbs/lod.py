@@ -135,9 +135,10 @@ class _Maker:
     def _visible(self, before: Level, goal: Goal) -> Float[Tensor, " n"] | None:
         if self.look is None or not self.views:
             return None
+        look = self.look if before.scene is self.scene else self.look.showing(before.scene)
         scale = max(goal.rate, before.rate / 2)  # below that, many of its Gaussians are too faint to be drawn
         with self.monitor.progress("looking", "views") as tell:
-            return visibility(self.look.showing(before.scene), self.views, scale, tell)
+            return visibility(look, self.views, scale, tell)
 
 
 def _maker(scene: Gaussians, cameras: CameraSet, o: LodOptions, monitor: Monitor) -> _Maker:

@@ -172,11 +172,9 @@ def _pixel_sizes(rows: np.ndarray) -> PixelSizes | None:
 def _sizes(scene: Gaussians) -> dict[str, np.ndarray]:
     """The columns of Multi-Scale 3DGS, if the scene has its pixel sizes."""
     sizes = scene.pixel_sizes
-    return (
-        {}
-        if sizes is None
-        else dict(zip(SIZES, (column.cpu().numpy() for column in vars(sizes).values()), strict=True))
-    )
+    if sizes is None:
+        return {}
+    return {name: column.cpu().numpy() for name, column in zip(SIZES, vars(sizes).values(), strict=True)}
 
 
 def _one_type(dtype: np.dtype) -> bool:
