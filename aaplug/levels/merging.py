@@ -17,7 +17,7 @@ from torch import Tensor
 from aaplug.core.errors import UsageError
 from aaplug.core.gaussians import Fusion, Gaussians, joined
 from aaplug.core.monitor import Tell
-from aaplug.levels.clusters import USUAL, Clusters, alone, merged_pairs, seen
+from aaplug.levels.clusters import Clusters, alone, merged_pairs, seen
 from aaplug.levels.covariances import areas, blurred, covariances
 from aaplug.levels.pairing import Edges, curve, edges_below, matched
 from aaplug.methods.filters import PIXEL_VARIANCE, fuse_stored
@@ -107,13 +107,13 @@ def merged_in_chunks(
         raise UsageError(scene.name, "holds 2D Gaussians, which cannot be merged")
     scene = fuse_stored(scene)
     if visible is None:
-        goal = replace(goal, tolerance=goal.tolerance / USUAL**2)
+        visible = torch.full((len(scene),), torch.nan)
     order = _order(scene, chunks)
     parts: list[Merged] = []
     for start, stop in _batches(chunks[order]):
         own, said = order[start:stop], partial(_told, tell, start, len(scene) - (goal.count or 0))
-        shown = None if visible is None else visible[own]
-        parts.append(_merged_batch(seen(scene[own], rates[own], chunks[own], shown), scene[own], goal, said))
+        clusters = seen(scene[own], rates[own], chunks[own], visible[own])
+        parts.append(_merged_batch(clusters, scene[own], goal, said))
     found = replace(joined([part.scene for part in parts]), origin=None)
     record = Fusion(MERGED, {"rate": f"{goal.rate:.4g}", "from": str(len(scene))})
     return Merged(replace(found, fused=(*scene.fused, record)), torch.cat([part.chunks for part in parts]))

@@ -123,6 +123,8 @@ class _Maker:
     monitor: Monitor
 
     def __call__(self, before: Level, goal: Goal) -> Level:
+        if not len(before.scene):
+            return before._replace(rate=goal.rate)
         scene, rates, visible = before.scene, rates_of(before.scene, self.train), self._visible(before, goal)
         with self.monitor.progress("merging", "Gaussians") as tell:
             if before.chunks is None:
@@ -196,7 +198,9 @@ def _levels(
         manifest, done = found, list(levels_in(pyramid, found))
         make.monitor.say(f"resumed: {len(done) - 1} levels are there")
     done = done or [Level(make.scene, 1.0, chunks_of(make.scene.means, LARGEST))]
-    goals = goals_of(o, make.scene)
+    goals, finest = goals_of(o, make.scene), done[0].chunks
+    assert finest is not None
+    count = int(finest.max()) + 1
     for place in range(len(goals) + 1):
         if place >= len(done):
             done.append(make(done[-1], goals[place - 1]))
@@ -204,7 +208,7 @@ def _levels(
         if folder is not None and place >= len(manifest.levels):
             write_scene(files[place], shown.scene, overwrite=o.overwrite or o.resume)
             if pyramid:
-                manifest = replace(manifest, levels=(*manifest.levels, _described(files[place], shown)))
+                manifest = replace(manifest, levels=(*manifest.levels, _described(files[place], shown, count)))
                 write_manifest(pyramid, manifest)
         yield shown
 
@@ -217,9 +221,10 @@ def _source(scene: Gaussians, cameras: CameraSet, o: LodOptions) -> str:
     )
 
 
-def _described(file: Path, level: Level) -> LevelFile:
+def _described(file: Path, level: Level, chunks: int) -> LevelFile:
     assert level.chunks is not None
-    return LevelFile(file.name, level.rate, hash_of(file), tuple(torch.bincount(level.chunks).tolist()))
+    counts = torch.bincount(level.chunks, minlength=chunks)
+    return LevelFile(file.name, level.rate, hash_of(file), tuple(counts.tolist()))
 
 
 def _files(output: Path | None, scene: Held | SceneFile, o: LodOptions) -> list[Path]:
