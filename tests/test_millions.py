@@ -19,16 +19,31 @@ CAMERAS = CameraSet(VIEWS, VIEWS)
 
 @pytest.mark.parametrize(
     ("budget", "share", "expected"),
-    [(0, 0.0, 2), (50, 0.0, 4), (49, 0.0, 3), (44, 0.0, 2), (0, 0.25, 4), (0, 0.24, 3), (50, 0.1, 4), (10, 0.25, 4)],
+    [(0, 0.0, 1.0), (50, 0.0, 0.0), (49, 0.0, 0.5), (44, 0.0, 1.0)]
+    + [(0, 0.25, 0.0), (0, 0.24, 0.5), (50, 0.1, 0.0), (10, 0.25, 0.0)],
 )
-def test_balanced_takes_all_samples_while_its_levels_are_few_or_a_small_share(budget, share, expected):
-    """Of 200 Gaussians, level 1 has 50 and level 2 has 45; a view at 1/8 draws level 1 with 4 samples, else level 2."""
-    scenes = [make_scene(count) for count in (200, 50, 45)]
+def test_balanced_draws_coarser_levels_where_they_are_many_and_a_large_share(budget, share, expected):
+    """Of 200 Gaussians, level 1 has 50 and level 2 has 45; a view at 1/8 has 4 samples, at the rate of level 1."""
+    scenes = [make_scene(count) for count in (200, 50, 45, 5)]
     levels = Pyramid.of(scenes, [torch.zeros(len(scene), dtype=torch.int64) for scene in scenes])
     renderer = Renderer.of(levels, CAMERAS, rasterizer="eager")
     limited = replace(renderer, recipe=replace(renderer.recipe, levels_budget=budget, levels_share=share))
-    assert renderer.samples(VIEWS[0].scaled(1 / 8)) == 4
-    assert limited.samples(VIEWS[0].scaled(1 / 8)) == expected
+    view = VIEWS[0].scaled(1 / 8)
+    fine, samples = limited.sampled(view)
+    assert samples == renderer.samples(view) == 4
+    assert limited.coarsening(fine, samples) == expected
+    assert limited.cutter is not None
+    assert len(limited.cutter(fine, expected)) <= (50 if expected == 0 else 45)
+    assert limited.draw(view).splats.sources.tolist() == limited.splats(fine, samples).sources.tolist()
+
+
+@pytest.mark.parametrize("samples", [1, 2])
+def test_levels_stay_finer_than_the_pixels(samples):
+    scenes = [make_scene(count) for count in (200, 50, 5)]
+    levels = Pyramid.of(scenes, [torch.zeros(len(scene), dtype=torch.int64) for scene in scenes])
+    cutter = Renderer.of(levels, CAMERAS, rasterizer="eager").cutter
+    assert cutter is not None
+    assert cutter.coarsening(VIEWS[0].scaled(1 / 2), samples, 0) == 0
 
 
 def test_the_parts_of_a_gaussian_have_its_moments():

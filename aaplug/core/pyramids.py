@@ -23,6 +23,8 @@ from aaplug.core.runs import runs_of, starts_of
 from aaplug.core.training import TrainingViews
 
 FADE = math.log2(4 / 3)  # octaves of the sampling rate over which a level fades into the next: half of the way
+COARSER = 1 / 4  # octaves: steps in which coarser levels are tried
+FINER = 1.0  # octaves that the levels of several samples are finer than the pixels' own
 ROUNDING = 1e-4  # octaves: what lies nearer to a level is that level
 SIGMAS = 3.33  # standard deviations to where an opaque Gaussian's alpha falls below 1/255
 PAD = 4.0  # px around the image that the filters reach at most, at training's rate and below
@@ -158,27 +160,38 @@ class Cutter:
         return cls(pyramid, training, centres, radii, reach, sizes, lowest.where(seen, 0.0), highest)
 
     @torch.no_grad()
-    def __call__(self, camera: Camera) -> Cut:
-        """The cut of a view whose pixels are those of `camera`."""
+    def __call__(self, camera: Camera, coarser: float = 0.0) -> Cut:
+        """The cut of a view whose pixels are those of `camera`; coarser: octaves to add to those of all chunks."""
         frustum = self._frustum(camera)
-        index, shares = self._candidates(self._drawn(camera, frustum).to(self.sizes))
+        index, shares = self._candidates(self._drawn(camera, frustum, coarser).to(self.sizes))
         means, sizes = (column.index_select(0, index) for column in (self.pyramid.scene.means, self.sizes))
         shown = _reaches(frustum, means, sizes).nonzero()[:, 0]
         index, shares = index.index_select(0, shown), shares.index_select(0, shown)
         return Cut(index, None if (shares == 1).all() else shares)
 
     @torch.no_grad()
-    def count(self, camera: Camera) -> int:
+    def count(self, camera: Camera, coarser: float = 0.0) -> int:
         """Number of Gaussians in the chunks that a view draws, of which the cut leaves out those beside the image."""
-        return int(self.pyramid.counts[self._drawn(camera, self._frustum(camera)) > 0].sum())
+        return int(self.pyramid.counts[self._drawn(camera, self._frustum(camera), coarser) > 0].sum())
+
+    def coarsening(self, camera: Camera, samples: int, most: int) -> float:
+        """Octaves by which a view's levels are coarser than those of its samples, in steps of `COARSER`.
+
+        As few as leave at most so many Gaussians, while levels stay `FINER` than those of the pixels.
+
+        camera: of the samples.  samples: along a pixel's side.
+        """
+        last = max(0.0, math.log2(samples) - FINER)
+        steps = (step * COARSER for step in range(math.ceil(last / COARSER)))
+        return next((octaves for octaves in steps if self.count(camera, octaves) <= most), last)
 
     @property
     def coarsest(self) -> slice:
         """Places of the coarsest level's Gaussians."""
         return slice(len(self.pyramid.chunks) - self.pyramid.sizes[-1], None)
 
-    def octaves(self, camera: Camera) -> Float[Tensor, " c"]:
-        """How far each chunk's sampling rate lies below training's, in octaves; 0 where it does not.
+    def octaves(self, camera: Camera, coarser: float = 0.0) -> Float[Tensor, " c"]:
+        """How far each chunk's sampling rate lies below training's, in octaves, and `coarser` more; 0 where it does not.
 
         At a data-set pose it is the ratio of focal lengths.  For a free camera the chunk's nearest point counts, and
         the nearest rate of training.
@@ -193,7 +206,7 @@ class Cutter:
         octaves = -own.log2()
         nearest = octaves.round()
         octaves = torch.where((octaves - nearest).abs() < ROUNDING, nearest, octaves)
-        return octaves.clamp(0, len(self.pyramid) - 1)
+        return (octaves + coarser).clamp(0, len(self.pyramid) - 1)
 
     def shares(self, octaves: Float[Tensor, " c"]) -> Float[Tensor, "l c"]:
         """Share of each level in each chunk; they sum to 1."""
@@ -207,10 +220,10 @@ class Cutter:
         normals, offsets = _planes(camera, PAD * max(1.0, self.training.relative_rate(camera)))
         return normals, offsets + FAR_ROUNDING * camera.cam_from_world.detach()[:3, 3].cpu().norm()
 
-    def _drawn(self, camera: Camera, frustum: tuple[Tensor, Tensor]) -> Float[Tensor, "l c"]:
+    def _drawn(self, camera: Camera, frustum: tuple[Tensor, Tensor], coarser: float) -> Float[Tensor, "l c"]:
         """Share of each level in each chunk; 0 for chunks that cannot reach into the image."""
         visible = _reaches(frustum, self.centres, self.reach)
-        return self.shares(self.octaves(camera)).masked_fill(~visible, 0.0)
+        return self.shares(self.octaves(camera, coarser)).masked_fill(~visible, 0.0)
 
     def _candidates(self, shares: Float[Tensor, "l c"]) -> tuple[Int[Tensor, " m"], Float[Tensor, " m"]]:
         """The Gaussians of the chunks that have a share, ascending, and their shares."""

@@ -97,7 +97,7 @@ def _samples(renderer: Renderer, camera: Camera, samples: int) -> Map:
 def _cost(renderer: Renderer, camera: Camera, samples: int) -> Map:
     """Splats that the tile of a pixel lists, for each of its samples."""
     fine = camera.resized(camera.width * samples, camera.height * samples)
-    splats, rules = renderer.splats(fine), renderer.training.convention.rules
+    splats, rules = renderer.splats(fine, samples), renderer.training.convention.rules
     kernels = renderer.rasterizer.kernels if isinstance(renderer.rasterizer, RunsKernels) else EAGER
     grid = -(-fine.height // TILE), -(-fine.width // TILE)
     ellipses = renderer.recipe.pixel.bounding_ellipses(splats, rules) or splats

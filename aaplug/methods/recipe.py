@@ -38,7 +38,7 @@ class Recipe:
     neighbours: weight of the samples on either side of each, in the limit of a sampling rate of 0; see `neighbours_at`.
     takes_quality: `target_rate` is set by the user's choice of quality.
     levels_grid: most samples along a pixel's side where the scene has levels of detail; 0 draws the finest level alone.
-    levels_budget: Gaussians up to which a view takes as many samples as without levels, of finer ones.
+    levels_budget: Gaussians up to which a view draws the levels of its samples' rate; else coarser ones.
     levels_share: of the scene's Gaussians, up to which it does so too.
     for_discs: name of the recipe that takes its place for scenes of 2D Gaussians.
     """
@@ -55,7 +55,7 @@ class Recipe:
     compositor: Compositor | None = None
     selection: Selection | None = None
     takes_quality: bool = False
-    levels_grid: int = 0
+    levels_grid: float = 0.0
     levels_budget: int = 0
     levels_share: float = 0.0
     for_discs: str | None = None

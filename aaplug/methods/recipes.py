@@ -1,5 +1,6 @@
 """The recipes that a user picks, each with its source; `research_recipes` has the comparisons."""
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -13,10 +14,10 @@ from aaplug.methods.pixel_kernels import SURFEL
 from aaplug.methods.recipe import Promises, Recipe
 from aaplug.methods.research_recipes import RESEARCH_RECIPES
 
-# Where there are levels of detail, one is picked for the samples' rate: most samples along a pixel's side; and up to
-# which number of Gaussians (some 20 ms on two cores) or share of the scene's (a third of the time without levels) more
-# samples, of finer levels, are taken as without levels.  The best quality draws the finest level alone.
-LEVELS = {"fast": (1, 0, 0.0), "balanced": (2, 100_000, 0.27), "best": (0, 0, 0.0)}
+# Where there are levels of detail: most samples along a pixel's side; and up to which number of Gaussians (some 20 ms on
+# two cores) or share of the scene's (a third of the time without levels) levels are those of the samples' rate.  The
+# best quality draws the finest level alone.
+LEVELS = {"fast": (1.0, 0, 0.0), "balanced": (math.inf, 100_000, 0.27), "best": (0.0, 0, 0.0)}
 
 
 def _set_by(quality: str) -> dict[str, Any]:

@@ -136,7 +136,7 @@ class Renderer:
     def draw(self, camera: Camera) -> Drawing:
         """Render one view and keep its splats, for example to read their gradients."""
         fine, samples = self.sampled(camera)
-        splats = self.splats(fine)
+        splats = self.splats(fine, samples)
         recipe, rules = self.recipe, self.training.convention.rules
         image = self.rasterizer(splats, fine.hw, self.background, recipe.pixel, recipe.compositor, rules)
         return Drawing(average_samples(image, samples, self.neighbours(camera)), splats, fine.hw)
@@ -151,13 +151,14 @@ class Renderer:
         if self.recipe.target_rate == 0:
             return self.recipe.grid
         asked = self.recipe.samples_at(self.relative_rate(camera))
+        return asked if self.cutter is None else int(min(asked, self.recipe.levels_grid))
+
+    def coarsening(self, camera: Camera, samples: int) -> float:
+        """Octaves by which levels of detail are coarser than those of the samples; see `Cutter.coarsening`."""
         if self.cutter is None:
-            return asked
-        least = min(asked, self.recipe.levels_grid)
-        most = max(self.recipe.levels_budget, self.recipe.levels_share * self.cutter.pyramid.sizes[0])
-        finer = range(asked, least, -1) if most else ()
-        cheap = (n for n in finer if self.cutter.count(_sampled(camera, n)) <= most)
-        return next(cheap, least)
+            return 0.0
+        most = max(self.recipe.levels_budget, int(self.recipe.levels_share * self.cutter.pyramid.sizes[0]))
+        return self.cutter.coarsening(camera, samples, most)
 
     def neighbours(self, camera: Camera) -> float:
         """Weight of the samples on either side of each sample: like their number, a constant to gradients."""
@@ -191,12 +192,14 @@ class Renderer:
         now, lowest, highest = (x[both] for x in (now, bounds.lowest, bounds.highest))
         return float((now / torch.minimum(torch.maximum(now, lowest), highest)).median())
 
-    def splats(self, camera: Camera) -> Splats2D:
+    def splats(self, camera: Camera, samples: int = 1) -> Splats2D:
         """The splats of one view: projected, selected, filtered, culled and coloured.
 
         Without gradients, Gaussians pass in chunks, and memory is bounded by a chunk and by the splats that stay.
+
+        samples: along a pixel's side, if `camera` is that of the supersampled image.
         """
-        cut = None if self.cutter is None else self.cutter(camera)
+        cut = None if self.cutter is None else self.cutter(camera, self.coarsening(camera, samples))
         whole, parts = max(1, len(self.scene) if cut is None else len(cut)), []
         at_once = whole if self.scene.tracked else CHUNK
         for start in range(0, whole, at_once):

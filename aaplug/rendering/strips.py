@@ -30,7 +30,7 @@ def strips(
     left, right = columns or (0, camera.width)
     start, end = max(0, left - HALO), min(camera.width, right + HALO)
     fine = camera.resized(camera.width * samples, camera.height * samples)
-    splats, soft = _moved(renderer.splats(fine), -start * samples, 0), renderer.neighbours(camera)
+    splats, soft = _moved(renderer.splats(fine, samples), -start * samples, 0), renderer.neighbours(camera)
     fine = replace(fine, width=(end - start) * samples)
     rows, drawn = max(1, SAMPLES // (fine.width * samples)), []
     for top in range(0, camera.height, rows):

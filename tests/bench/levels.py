@@ -101,8 +101,8 @@ class Bench:
 
     def drawn(self, shown: Renderer, scale: float) -> int:
         """Gaussians that a view at a scale projects."""
-        fine = shown.sampled(self.views[0].scaled(scale))[0]
-        return len(shown.scene) if shown.cutter is None else shown.cutter.count(fine)
+        fine, samples = shown.sampled(self.views[0].scaled(scale))
+        return len(shown.scene) if shown.cutter is None else shown.cutter.count(fine, shown.coarsening(fine, samples))
 
     def light(self, share: float, scale: float, refine: bool) -> Gaussians:
         """A lighter scene."""
