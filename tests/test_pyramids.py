@@ -120,6 +120,17 @@ def test_a_pyramid_of_one_level_is_the_scene(levels):
     assert torch.equal(drawn.rgb, alone.rgb)
 
 
+def test_pixels_larger_than_those_of_the_coarsest_level_take_several_samples(levels, renderer):
+    """As many as reach that level's rate, but no more than without levels."""
+    assert len(levels) == 4
+    samples = [renderer.samples(VIEWS[0].scaled(0.5**k)) for k in range(7)]
+    assert samples == [1, 1, 1, 1, 2, 4, 8]
+    one = Pyramid.of([levels.finest], [levels.chunks[: levels.sizes[0]]])
+    alone, same = (Renderer.of(s, VIEWS, "auto", quality="fast", rasterizer="eager") for s in (levels.finest, one))
+    for k in range(7):
+        assert same.samples(VIEWS[0].scaled(0.5**k)) == alone.samples(VIEWS[0].scaled(0.5**k))
+
+
 @pytest.mark.parametrize("eye", [(0.0, -4.0, 0.0), (0.3, -0.6, 0.2), FAR, (2.0, 0.0, 2.0)])
 @pytest.mark.parametrize("scale", [1.0, 0.3])
 def test_what_is_left_out_shows_nothing(renderer, eye, scale, monkeypatch):

@@ -94,6 +94,11 @@ class Pyramid:
         return self.scene[start : start + self.sizes[number]]
 
     @property
+    def coarsest_rate(self) -> float:
+        """The lowest sampling rate, relative to training's, that there is a level for."""
+        return 0.5 ** (len(self) - 1)
+
+    @property
     def finest(self) -> Gaussians:
         """The scene that the levels were made of."""
         return self.level(0)

@@ -31,7 +31,7 @@ from aaplug.core.shading import shade
 from aaplug.core.splats import Render, Splats2D, concatenated
 from aaplug.core.training import TrainingViews
 from aaplug.methods.filters import fuse_stored
-from aaplug.methods.recipe import Recipe
+from aaplug.methods.recipe import SLACK, Recipe
 from aaplug.methods.recipes import find_recipe, suited
 from aaplug.rasterizers import RASTERIZERS, find_rasterizer
 
@@ -150,8 +150,12 @@ class Renderer:
         """Number of samples along a pixel's side."""
         if self.recipe.target_rate == 0:
             return self.recipe.grid
-        asked = self.recipe.samples_at(self.relative_rate(camera))
-        return asked if self.cutter is None else int(min(asked, self.recipe.levels_grid))
+        rate = self.relative_rate(camera)
+        asked = self.recipe.samples_at(rate)
+        if self.cutter is None:
+            return asked
+        for_coarsest = math.ceil(self.cutter.pyramid.coarsest_rate / rate - SLACK)
+        return int(min(asked, max(self.recipe.levels_grid, for_coarsest)))
 
     def coarsening(self, camera: Camera, samples: int) -> float:
         """Octaves by which levels of detail are coarser than those of the samples; see `Cutter.coarsening`."""
