@@ -19,8 +19,10 @@ CAMERAS = CameraSet(VIEWS, VIEWS)
 
 @pytest.mark.parametrize(
     ("budget", "share", "expected"),
-    [(0, 0.0, 1.0), (50, 0.0, 0.0), (49, 0.0, 0.5), (44, 0.0, 1.0)]
-    + [(0, 0.25, 0.0), (0, 0.24, 0.5), (50, 0.1, 0.0), (10, 0.25, 0.0)],
+    [
+        *((0, 0.0, 1.0), (50, 0.0, 0.0), (49, 0.0, 0.5), (44, 0.0, 1.0)),
+        *((0, 0.25, 0.0), (0, 0.24, 0.5), (50, 0.1, 0.0), (10, 0.25, 0.0)),
+    ],
 )
 def test_balanced_draws_coarser_levels_where_they_are_many_and_a_large_share(budget, share, expected):
     """Of 200 Gaussians, level 1 has 50 and level 2 has 45; a view at 1/8 has 4 samples, at the rate of level 1."""

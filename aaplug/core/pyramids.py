@@ -196,7 +196,7 @@ class Cutter:
         return slice(len(self.pyramid.chunks) - self.pyramid.sizes[-1], None)
 
     def octaves(self, camera: Camera, coarser: float = 0.0) -> Float[Tensor, " c"]:
-        """How far each chunk's sampling rate lies below training's, in octaves, and `coarser` more; 0 where it does not.
+        """How far each chunk's sampling rate lies below training's, and `coarser` more, in octaves; at least 0.
 
         At a data-set pose it is the ratio of focal lengths.  For a free camera the chunk's nearest point counts, and
         the nearest rate of training.

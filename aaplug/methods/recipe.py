@@ -37,8 +37,8 @@ class Recipe:
     grid: smallest number of samples along a pixel's side, at any rate.
     neighbours: weight of the samples on either side of each, in the limit of a sampling rate of 0; see `neighbours_at`.
     takes_quality: `target_rate` is set by the user's choice of quality.
-    levels_grid: most samples along a pixel's side where the scene has a level for that pixel, see `Pyramid`; 0 draws the
-        finest level alone.
+    levels_grid: most samples along a pixel's side where the scene has a level of detail for it; 0 draws the finest
+        level alone.
     levels_budget: Gaussians up to which a view draws the levels of its samples' rate; else coarser ones.
     levels_share: of the scene's Gaussians, up to which it does so too.
     for_discs: name of the recipe that takes its place for scenes of 2D Gaussians.

@@ -14,9 +14,9 @@ from aaplug.methods.pixel_kernels import SURFEL
 from aaplug.methods.recipe import Promises, Recipe
 from aaplug.methods.research_recipes import RESEARCH_RECIPES
 
-# Where there are levels of detail: most samples along a pixel's side; and up to which number of Gaussians (some 20 ms on
-# two cores) or share of the scene's (a third of the time without levels) levels are those of the samples' rate.  The
-# best quality draws the finest level alone.
+# Where there are levels of detail: most samples along a pixel's side; and up to which number of Gaussians (some 20 ms
+# on two cores) or share of the scene's (a third of the time without levels) levels are those of the samples' rate.
+# The best quality draws the finest level alone.
 LEVELS = {"fast": (1.0, 0, 0.0), "balanced": (math.inf, 100_000, 0.27), "best": (0.0, 0, 0.0)}
 
 
