@@ -7,8 +7,14 @@ import torch
 
 from aaplug.core.cameras import CameraSet
 from aaplug.core.pyramids import Pyramid
+from aaplug.core.training import TrainingViews
+from aaplug.evaluation.engine import Task, candidates_of, evaluate
 from aaplug.evaluation.metrics import psnr
+from aaplug.evaluation.results import mean
+from aaplug.evaluation.truth import Truth, own_look
 from aaplug.levels.covariances import covariances, outer
+from aaplug.methods.recipe import LevelChoice, Recipe
+from aaplug.methods.recipes import find_recipe
 from aaplug.rendering.renderer import Renderer
 from tests.bench.millions import PARTS, split
 from tests.conftest import make_camera, make_scene
@@ -20,7 +26,7 @@ CAMERAS = CameraSet(VIEWS, VIEWS)
 @pytest.mark.parametrize(
     ("budget", "share", "expected"),
     [
-        *((0, 0.0, 1.0), (50, 0.0, 0.0), (49, 0.0, 0.5), (44, 0.0, 1.0)),
+        *((0, 0.0, 0.5), (50, 0.0, 0.0), (49, 0.0, 0.5), (44, 0.0, 0.5)),
         *((0, 0.25, 0.0), (0, 0.24, 0.5), (50, 0.1, 0.0), (10, 0.25, 0.0)),
     ],
 )
@@ -29,23 +35,54 @@ def test_balanced_draws_coarser_levels_where_they_are_many_and_a_large_share(bud
     scenes = [make_scene(count) for count in (200, 50, 45, 5)]
     levels = Pyramid.of(scenes, [torch.zeros(len(scene), dtype=torch.int64) for scene in scenes])
     renderer = Renderer.of(levels, CAMERAS, rasterizer="eager")
-    limited = replace(renderer, recipe=replace(renderer.recipe, levels_budget=budget, levels_share=share))
+    limited = replace(
+        renderer, recipe=replace(renderer.recipe, levels=LevelChoice(budget=budget, share=share, finer=1.0))
+    )
     view = VIEWS[0].scaled(1 / 8)
     fine, samples = limited.sampled(view)
     assert samples == renderer.samples(view) == 4
     assert limited.coarsening(fine, samples) == expected
     assert limited.cutter is not None
-    assert len(limited.cutter(fine, expected)) <= (50 if expected == 0 else 45)
+    assert limited.cutter.count(fine, expected) == (50 if expected == 0 else 45)
+    assert len(limited.cutter(fine, expected)) > 0
     assert limited.draw(view).splats.sources.tolist() == limited.splats(fine, samples).sources.tolist()
 
 
-@pytest.mark.parametrize("samples", [1, 2])
-def test_levels_stay_finer_than_the_pixels(samples):
-    scenes = [make_scene(count) for count in (200, 50, 5)]
+@pytest.mark.parametrize(("quality", "expected"), [("fast", 0.5), ("balanced", 0.0)])
+def test_levels_of_several_samples_stay_as_fine_as_the_quality_asks(quality, expected):
+    scenes = [make_scene(count) for count in (200_000, 150_000, 120_000)]
     levels = Pyramid.of(scenes, [torch.zeros(len(scene), dtype=torch.int64) for scene in scenes])
-    cutter = Renderer.of(levels, CAMERAS, rasterizer="eager").cutter
-    assert cutter is not None
-    assert cutter.coarsening(VIEWS[0].scaled(1 / 2), samples, 0) == 0
+    renderer = Renderer.of(levels, CAMERAS, quality=quality, rasterizer="eager")
+    assert renderer.coarsening(VIEWS[0].scaled(1 / 2), 2) == expected
+
+
+@pytest.mark.parametrize("scale", [1 / 4.17, 1 / 5, 1 / 9, 1 / 10, 1 / 10.5])
+def test_where_no_level_is_light_enough_the_lightest_is_drawn_alone(scale):
+    """And not two that fade."""
+    scenes = [make_scene(count) for count in (200, 150, 120)]
+    levels = Pyramid.of(scenes, [torch.zeros(len(scene), dtype=torch.int64) for scene in scenes])
+    renderer = Renderer.of(levels, CAMERAS, rasterizer="eager")
+    limited = replace(renderer, recipe=replace(renderer.recipe, levels=LevelChoice(finer=1.0)))
+    fine, samples = limited.sampled(VIEWS[0].scaled(scale))
+    assert limited.cutter is not None
+    assert limited.cutter(fine, limited.coarsening(fine, samples)).shares is None
+
+
+def test_evaluation_tells_apart_recipes_that_draw_different_levels():
+    scenes = [make_scene(count) for count in (200, 150, 20)]
+    levels = Pyramid.of(scenes, [torch.zeros(len(scene), dtype=torch.int64) for scene in scenes])
+    training = TrainingViews.of(scenes[0], VIEWS)
+    fine = find_recipe("auto")
+    coarse = replace(fine, name="coarse", levels=LevelChoice())
+    truth = Truth(own_look(scenes[0], training, "eager"))
+
+    def figures(*recipes: Recipe) -> list[float | None]:
+        candidates = candidates_of(levels, training, recipes, "eager")
+        report = evaluate(Task(candidates, (1 / 8,), VIEWS[:1], truth))
+        return [mean(report.select(recipe.name, 1 / 8), "PSNR") for recipe in recipes]
+
+    assert figures(fine, coarse) == [*figures(fine), *figures(coarse)]
+    assert figures(fine) != figures(coarse)
 
 
 def test_the_parts_of_a_gaussian_have_its_moments():

@@ -20,16 +20,18 @@ from aaplug.core.cameras import CameraSet
 from aaplug.core.errors import FormatError
 from aaplug.core.free_views import between, free_views
 from aaplug.core.gaussians import ANTIALIASED, Gaussians
-from aaplug.core.pyramids import Cut, Cutter, Pyramid
+from aaplug.core.pyramids import Cutter, Pyramid, faded
 from aaplug.core.training import TrainingViews
+from aaplug.evaluation.metrics import psnr
 from aaplug.finetuning import refining
 from aaplug.io.scenes import open_scene, read_scene
 from aaplug.io.scenes.manifests import MANIFEST, read_manifest
 from aaplug.levels.chunks import chunks_of
 from aaplug.levels.merging import Goal, merged_in_chunks
-from aaplug.levels.pyramids import read_pyramid
+from aaplug.levels.pyramids import pyramid_of, read_pyramid
 from aaplug.rendering.renderer import Renderer
-from tests.conftest import make_camera, make_scene
+from aaplug.verbs.lod import lod
+from tests.conftest import make_camera, make_scene, make_splats
 from tests.test_cli import cli, dataset  # noqa: F401 (fixtures)
 
 RATE = 20.0  # px per world unit
@@ -151,6 +153,16 @@ def test_a_view_past_the_scene_draws_nothing(renderer):
     assert (renderer(view).rgb == 0).all()
 
 
+def test_where_the_coarsest_level_shows_nothing_the_next_one_tells_a_free_cameras_rate(levels):
+    empty = levels.finest[:0]
+    chunks = levels.chunks.split(list(levels.sizes))
+    parts = [levels.level(number) for number in range(len(levels))]
+    more = Pyramid.of([*parts, empty], [*chunks, chunks[0][:0]])
+    view = replace(make_camera((0.0, -16.0, 0.0), (64, 48)), trained_focal=None)
+    rates = [Renderer.of(s, VIEWS, "auto", rasterizer="eager").relative_rate(view) for s in (levels, more)]
+    assert rates[0] == rates[1] < 0.5
+
+
 def test_a_near_part_is_fine_and_a_far_part_coarse():
     near, far = make_scene(60), make_scene(60, seed=1)
     near.means[:] *= 0.1
@@ -166,15 +178,36 @@ def test_a_near_part_is_fine_and_a_far_part_coarse():
     assert octaves[0] > octaves[1] > 0
 
 
-def test_two_levels_that_agree_keep_the_transmittance(levels):
-    """Scaled optical depths, not alphas: (1 - a)ʷ (1 - a)¹⁻ʷ = 1 - a."""
-    scene = levels.finest
-    places = torch.arange(len(scene))
-    for share in (0.1, 0.5, 0.93):
-        w = torch.full((len(scene),), share)
-        one, other = (Cut(places, s).of(scene).opacities for s in (w, 1 - w))
-        assert torch.allclose((1 - one) * (1 - other), 1 - scene.opacities, atol=1e-5)
-    assert torch.equal(Cut(places, torch.ones(len(scene))).of(scene).logit_opacities, scene.logit_opacities)
+@pytest.mark.parametrize("opacity", [0.3, 0.6, 0.98])
+@pytest.mark.parametrize("octave", [0.04, 0.2, 0.4])
+def test_two_levels_that_agree_keep_the_energy(opacity, octave):
+    """The sum of alpha, of which the cut-off takes a little."""
+    scene, camera = make_scene(1), make_camera((0.0, -4.0, 0.0), (640, 480))
+    scene.means[:], scene.log_scales[:], scene.logit_opacities[:] = 0.0, -1.2, torch.tensor(opacity).logit()
+    whole = Pyramid.of([scene] * 2, [torch.zeros(1, dtype=torch.int64)] * 2)
+    view = camera.scaled(0.5**octave)
+    both, alone = (Renderer.of(s, [camera], "auto", quality="fast", rasterizer="eager") for s in (whole, scene))
+    assert both.cutter is not None
+    assert both.cutter(view).shares is not None
+    assert both(view).alpha.sum() == pytest.approx(float(alone(view).alpha.sum()), rel=0.02)
+
+
+def test_a_whole_share_is_the_splat_to_the_bit():
+    splats = make_splats(50, (48, 64))
+    assert torch.equal(faded(splats, torch.ones(50)).opacities, splats.opacities)
+    assert (faded(splats, torch.full((50,), 0.5)).opacities < splats.opacities).all()
+
+
+def test_between_two_levels_an_image_is_about_as_close_to_the_scene_as_with_either(sample_scene, sample_cameras):
+    """Of optical depths, or of opacities in the world, fades are 4 to 10 dB farther."""
+    made = lod(sample_scene, sample_cameras, levels=2, refine=False)
+    view = sample_cameras.test[0]
+    shown, best = (
+        Renderer.of(s, sample_cameras, quality=quality)
+        for s, quality in ((pyramid_of(made), "fast"), (sample_scene, "best"))
+    )
+    found = [psnr(shown(view.scaled(rate)).rgb, best(view.scaled(rate)).rgb) or 0.0 for rate in (0.5, 0.43, 0.374)]
+    assert found[1] > min(found[0], found[2]) - 1
 
 
 def test_a_dolly_does_not_pop(renderer):

@@ -12,6 +12,7 @@ import torch
 
 from aaplug.core.cameras import CameraSet
 from aaplug.core.imaging import quantised
+from aaplug.core.pyramids import Pyramid
 from aaplug.evaluation.metrics import psnr
 from aaplug.io.images import write_png
 from aaplug.live import pictures
@@ -20,6 +21,7 @@ from aaplug.live.paints import PAINTS
 from aaplug.live.pictures import Pictures
 from aaplug.live.studio import Studio
 from aaplug.live.subject import Subject
+from aaplug.methods.recipe import LevelChoice
 from aaplug.rendering.renderer import Renderer
 from aaplug.rendering.strips import strips
 from tests.conftest import make_camera, make_scene
@@ -112,6 +114,18 @@ def test_strips_are_the_picture(seen, recipe, scale, monkeypatch):
         for found, expected in zip(drawn, whole, strict=True):
             torch.testing.assert_close(found, expected[:, slice(*(columns or (None,)))], atol=2e-5, rtol=0)
         assert taken > 1 or scale < 0.5
+
+
+def test_strips_draw_the_levels_of_the_picture():
+    scenes = [make_scene(count) for count in (200, 150, 20)]
+    levels = Pyramid.of(scenes, [torch.zeros(len(scene), dtype=torch.int64) for scene in scenes])
+    camera = make_camera((0.0, -4.0, 0.0), (160, 120))
+    renderer = Renderer.of(levels, [camera], rasterizer="eager")
+    renderer = replace(renderer, recipe=replace(renderer.recipe, levels=LevelChoice()))
+    view = camera.scaled(1 / 8)
+    assert renderer.coarsening(*renderer.sampled(view)) > 0
+    drawn, _ = finished(strips(renderer, view, renderer.samples(view)))
+    torch.testing.assert_close(drawn.rgb, renderer(view).rgb, atol=2e-5, rtol=0)
 
 
 @pytest.mark.parametrize("at", [0, None])

@@ -6,6 +6,7 @@ to 2⁻ᵏ of training's.  It is drawn alone from 3/4 of the rate of the level b
 that, it fades into the next.
 """
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,15 +17,15 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from aaplug.core.cameras import Camera
-from aaplug.core.gaussians import MIN_OPACITY, Gaussians, joined
+from aaplug.core.gaussians import Gaussians, joined
 from aaplug.core.projection import JACOBIAN_MARGIN
 from aaplug.core.rules import NEAR
 from aaplug.core.runs import runs_of, starts_of
+from aaplug.core.splats import Splats2D
 from aaplug.core.training import TrainingViews
 
 FADE = math.log2(4 / 3)  # octaves of the sampling rate over which a level fades into the next: half of the way
 COARSER = 1 / 4  # octaves: steps in which coarser levels are tried
-FINER = 1.0  # octaves that the levels of several samples are finer than the pixels' own
 ROUNDING = 1e-4  # octaves: what lies nearer to a level is that level
 SIGMAS = 3.33  # standard deviations to where an opaque Gaussian's alpha falls below 1/255
 PAD = 4.0  # px around the image that the filters reach at most, at training's rate and below
@@ -37,7 +38,7 @@ class Cut:
     """What a view draws.
 
     places: of Gaussians among those of all levels, ascending.
-    shares: of each one's optical depth that is drawn; None for all of it.
+    shares: of each one's energy that is drawn, see `faded`; None for all of it.
     """
 
     places: Int[Tensor, " m"]
@@ -51,18 +52,11 @@ class Cut:
         return Cut(self.places[part], None if self.shares is None else self.shares[part])
 
     def of(self, scene: Gaussians) -> Gaussians:
-        """The Gaussians of the cut, with their shares of opacity and without harmonics.
-
-        Scaling optical depths keeps the transmittance of two levels that agree: (1 - a)ʷ (1 - a)¹⁻ʷ = 1 - a.
-        """
-        logits = scene.logit_opacities.index_select(0, self.places)
-        if self.shares is not None:
-            depths = torch.nn.functional.softplus(logits)  # optical: -ln(1 - opacity)
-            faded = (-torch.expm1(-self.shares * depths)).clamp(MIN_OPACITY, 1 - MIN_OPACITY).logit()
-            logits = torch.where(self.shares == 1, logits, faded)
-        columns = {name: getattr(scene, name).index_select(0, self.places) for name in ("means", "quats", "log_scales")}
-        none = scene.sh[:1].expand(len(logits), -1, -1)
-        return replace(scene, **columns, logit_opacities=logits, sh=none, origin=None, pixel_sizes=None)
+        """The Gaussians of the cut, without harmonics."""
+        names = ("means", "quats", "log_scales", "logit_opacities")
+        columns = {name: getattr(scene, name).index_select(0, self.places) for name in names}
+        none = scene.sh[:1].expand(len(self), -1, -1)
+        return replace(scene, **columns, sh=none, origin=None, pixel_sizes=None)
 
 
 @dataclass(frozen=True)
@@ -97,6 +91,12 @@ class Pyramid:
     def coarsest_rate(self) -> float:
         """The lowest sampling rate, relative to training's, that there is a level for."""
         return 0.5 ** (len(self) - 1)
+
+    @property
+    def coarsest_first(self) -> list[slice]:
+        """Places of each level's Gaussians, the coarsest level first."""
+        stops = [0, *itertools.accumulate(self.sizes)]
+        return [slice(*ends) for ends in itertools.pairwise(stops)][::-1]
 
     @property
     def finest(self) -> Gaussians:
@@ -179,21 +179,20 @@ class Cutter:
         """Number of Gaussians in the chunks that a view draws, of which the cut leaves out those beside the image."""
         return int(self.pyramid.counts[self._drawn(camera, self._frustum(camera), coarser) > 0].sum())
 
-    def coarsening(self, camera: Camera, samples: int, most: int) -> float:
-        """Octaves by which a view's levels are coarser than those of its samples, in steps of `COARSER`.
+    def coarsening(self, camera: Camera, last: float, most: int) -> float:
+        """Octaves by which a view's levels are coarser than those of its samples, in steps of `COARSER` up to `last`.
 
-        As few as leave at most so many Gaussians, while levels stay `FINER` than those of the pixels.
+        As few as leave at most `most` Gaussians; where none does, those that leave the fewest.
 
-        camera: of the samples.  samples: along a pixel's side.
+        camera: of the samples.
         """
-        last = max(0.0, math.log2(samples) - FINER)
-        steps = (step * COARSER for step in range(math.ceil(last / COARSER)))
-        return next((octaves for octaves in steps if self.count(camera, octaves) <= most), last)
-
-    @property
-    def coarsest(self) -> slice:
-        """Places of the coarsest level's Gaussians."""
-        return slice(len(self.pyramid.chunks) - self.pyramid.sizes[-1], None)
+        fewest = math.inf, 0.0
+        for octaves in (*(step * COARSER for step in range(math.ceil(last / COARSER))), last):
+            count = self.count(camera, octaves)
+            if count <= most:
+                return octaves
+            fewest = min(fewest, (count, octaves))
+        return fewest[1]
 
     def octaves(self, camera: Camera, coarser: float = 0.0) -> Float[Tensor, " c"]:
         """How far each chunk's sampling rate lies below training's, and `coarser` more, in octaves; at least 0.
@@ -242,6 +241,16 @@ class Cutter:
         index = (firsts - starts).index_select(0, runs) + torch.arange(len(runs), device=runs.device)
         own = shares[1:][levels, chunks].index_select(0, runs)
         return torch.cat([first, index]), torch.cat([finest.index_select(0, first), own])
+
+
+def faded(splats: Splats2D, shares: Float[Tensor, " m"]) -> Splats2D:
+    """The splats of a level with a share w of its energy, ∫ α; the other level that a chunk draws has 1 - w.
+
+    Where both agree, two Gaussians of peaks a and b lie on each other.  Their alpha together, a + b - a b, has the
+    integral of the one of peak α if a + b - a b / 2 = α.  So (1 - a/2) (1 - b/2) = 1 - α/2, and a = 2 (1 - (1 - α/2)ʷ).
+    """
+    opacities = -2 * torch.expm1(shares * torch.log1p(-splats.opacities / 2))
+    return replace(splats, opacities=torch.where(shares == 1, splats.opacities, opacities))
 
 
 def _reaches(

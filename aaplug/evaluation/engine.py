@@ -62,7 +62,7 @@ def candidates_of(
     prepared: dict[tuple[WorldFilter | None, bool], Renderer] = {}
     found, finest = [], scene.finest if isinstance(scene, Pyramid) else scene
     for recipe in (suited(recipe, finest) for recipe in recipes):
-        key = recipe.world, recipe.levels_grid > 0
+        key = recipe.world, recipe.levels is not None
         if key not in prepared:
             prepared[key] = Renderer.of(scene, training, recipe, rasterizer=rasterizer, background=background)
         found.append(Candidate(recipe.name, replace(prepared[key], recipe=recipe)))
@@ -269,7 +269,7 @@ class _Bench:
 def _work(renderer: Renderer, camera: Camera) -> Hashable:
     """Equal for renderers that draw the same image of a view."""
     recipe = renderer.recipe
-    method = recipe.selection, recipe.screen, recipe.pixel, recipe.compositor
+    method = recipe.selection, recipe.screen, recipe.pixel, recipe.compositor, recipe.levels
     samples = renderer.samples(camera), renderer.neighbours(camera)
     how = samples, renderer.background, renderer.rasterizer.name
     return id(renderer.scene), id(renderer.training), method, how

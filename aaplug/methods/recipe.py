@@ -28,6 +28,22 @@ class Promises:
 
 
 @dataclass(frozen=True)
+class LevelChoice:
+    """How a view's samples and levels of detail are chosen.
+
+    most_samples: along a pixel's side, where a level is meant for the pixel.
+    budget: Gaussians up to which a view draws the levels of its samples' rate; else coarser ones.
+    share: of the scene's Gaussians, up to which it does so too.
+    finer: octaves that the levels of several samples are finer than the pixel's own, at least.
+    """
+
+    most_samples: float = math.inf
+    budget: int = 0
+    share: float = 0.0
+    finer: float = 0.0
+
+
+@dataclass(frozen=True)
 class Recipe:
     """How to render a scene.
 
@@ -37,10 +53,7 @@ class Recipe:
     grid: smallest number of samples along a pixel's side, at any rate.
     neighbours: weight of the samples on either side of each, in the limit of a sampling rate of 0; see `neighbours_at`.
     takes_quality: `target_rate` is set by the user's choice of quality.
-    levels_grid: most samples along a pixel's side where the scene has a level of detail for it; 0 draws the finest
-        level alone.
-    levels_budget: Gaussians up to which a view draws the levels of its samples' rate; else coarser ones.
-    levels_share: of the scene's Gaussians, up to which it does so too.
+    levels: how levels of detail are chosen; None draws the finest alone.
     for_discs: name of the recipe that takes its place for scenes of 2D Gaussians.
     """
 
@@ -56,9 +69,7 @@ class Recipe:
     compositor: Compositor | None = None
     selection: Selection | None = None
     takes_quality: bool = False
-    levels_grid: float = 0.0
-    levels_budget: int = 0
-    levels_share: float = 0.0
+    levels: LevelChoice | None = None
     for_discs: str | None = None
     promises: Promises = Promises()
 

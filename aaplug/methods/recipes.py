@@ -1,6 +1,5 @@
 """The recipes that a user picks, each with its source; `research_recipes` has the comparisons."""
 
-import math
 from dataclasses import replace
 from typing import Any
 
@@ -11,20 +10,20 @@ from aaplug.core.interfaces import MatchesRates
 from aaplug.core.registry import Registry, named
 from aaplug.methods.filters import SCREEN_FILTERS, LowPass, Matched, Smoothing3D
 from aaplug.methods.pixel_kernels import SURFEL
-from aaplug.methods.recipe import Promises, Recipe
+from aaplug.methods.recipe import LevelChoice, Promises, Recipe
 from aaplug.methods.research_recipes import RESEARCH_RECIPES
 
-# Where there are levels of detail: most samples along a pixel's side; and up to which number of Gaussians (some 20 ms
-# on two cores) or share of the scene's (a third of the time without levels) levels are those of the samples' rate.
-# The best quality draws the finest level alone.
-LEVELS = {"fast": (1.0, 0, 0.0), "balanced": (math.inf, 100_000, 0.27), "best": (0.0, 0, 0.0)}
+# 100,000 Gaussians take some 20 ms on two cores, and 27 % of a large scene's a third of the time without levels
+LEVELS = {
+    "fast": LevelChoice(most_samples=1.0),
+    "balanced": LevelChoice(budget=100_000, share=0.27, finer=1.0),
+    "best": None,
+}
 
 
 def _set_by(quality: str) -> dict[str, Any]:
     """What a quality sets of a recipe."""
-    grid, budget, share = LEVELS[quality]
-    rate = QUALITIES[quality]
-    return {"target_rate": rate, "levels_grid": grid, "levels_budget": budget, "levels_share": share}
+    return {"target_rate": QUALITIES[quality], "levels": LEVELS[quality]}
 
 
 # Of a sample, the weight of those beside it where samples are few: it takes the noise off what compositing could not

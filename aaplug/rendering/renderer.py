@@ -25,7 +25,7 @@ from aaplug.core.imaging import average_samples
 from aaplug.core.interfaces import Rasterizer, RunsKernels
 from aaplug.core.kernels import EAGER, Kernels
 from aaplug.core.projection import project, with_depth_slopes
-from aaplug.core.pyramids import Cutter, Pyramid
+from aaplug.core.pyramids import Cutter, Pyramid, faded
 from aaplug.core.sampling import sampling_bounds
 from aaplug.core.shading import shade
 from aaplug.core.splats import Render, Splats2D, concatenated
@@ -103,7 +103,7 @@ class Renderer:
             recipe = find_recipe(recipe, quality=quality)
         pyramid = None
         if isinstance(scene, Pyramid):
-            pyramid = scene if recipe.levels_grid else None
+            pyramid = scene if recipe.levels else None
             scene = scene.scene if pyramid else scene.finest
         if isinstance(cameras, TrainingViews):
             training = cameras if pyramid is None else TrainingViews.of(scene, cameras.cameras, cameras.cull_margin)
@@ -152,17 +152,18 @@ class Renderer:
             return self.recipe.grid
         rate = self.relative_rate(camera)
         asked = self.recipe.samples_at(rate)
-        if self.cutter is None:
+        if self.cutter is None or self.recipe.levels is None:
             return asked
         for_coarsest = math.ceil(self.cutter.pyramid.coarsest_rate / rate - SLACK)
-        return int(min(asked, max(self.recipe.levels_grid, for_coarsest)))
+        return int(min(asked, max(self.recipe.levels.most_samples, for_coarsest)))
 
     def coarsening(self, camera: Camera, samples: int) -> float:
         """Octaves by which levels of detail are coarser than those of the samples; see `Cutter.coarsening`."""
-        if self.cutter is None:
+        choice = self.recipe.levels
+        if self.cutter is None or choice is None:
             return 0.0
-        most = max(self.recipe.levels_budget, int(self.recipe.levels_share * self.cutter.pyramid.sizes[0]))
-        return self.cutter.coarsening(camera, samples, most)
+        most = max(choice.budget, int(choice.share * self.cutter.pyramid.sizes[0]))
+        return self.cutter.coarsening(camera, max(0.0, math.log2(samples) - choice.finer), most)
 
     def neighbours(self, camera: Camera) -> float:
         """Weight of the samples on either side of each sample: like their number, a constant to gradients."""
@@ -187,14 +188,14 @@ class Renderer:
 
     @torch.no_grad()
     def _median_rate(self, camera: Camera) -> float:
-        part = slice(None) if self.cutter is None else self.cutter.coarsest
-        bounds = self.training.bounds[part]
-        now = sampling_bounds(self.scene.means[part], [camera]).highest
-        both = (now > 0) & bounds.seen
-        if not both.any():
-            return self.training.relative_rate(camera)
-        now, lowest, highest = (x[both] for x in (now, bounds.lowest, bounds.highest))
-        return float((now / torch.minimum(torch.maximum(now, lowest), highest)).median())
+        for part in [slice(None)] if self.cutter is None else self.cutter.pyramid.coarsest_first:
+            bounds = self.training.bounds[part]
+            now = sampling_bounds(self.scene.means[part], [camera]).highest
+            both = (now > 0) & bounds.seen
+            if both.any():
+                now, lowest, highest = (x[both] for x in (now, bounds.lowest, bounds.highest))
+                return float((now / torch.minimum(torch.maximum(now, lowest), highest)).median())
+        return self.training.relative_rate(camera)
 
     def splats(self, camera: Camera, samples: int = 1) -> Splats2D:
         """The splats of one view: projected, selected, filtered, culled and coloured.
@@ -208,17 +209,24 @@ class Renderer:
         at_once = whole if self.scene.tracked else CHUNK
         for start in range(0, whole, at_once):
             if cut is not None:
-                chunk, places = cut[start : start + at_once].of(self.scene), cut.places[start:]
+                part = cut[start : start + at_once]
+                chunk, places, shares = part.of(self.scene), part.places, part.shares
             else:
                 chunk, places = self.scene if whole <= at_once else self.scene[start : start + at_once], start
-            splats = self._projected(chunk, places, camera)
+                shares = None
+            splats = self._projected(chunk, places, shares, camera)
             parts.append(self._shaded(splats, chunk, start, camera))
         splats = concatenated(parts)
         _check_colours(splats)
         return splats
 
-    def _projected(self, chunk: Gaussians, places: Int[Tensor, " m"] | int, camera: Camera) -> Splats2D:
-        """Splats of some Gaussians, without colour; places: of each in the scene, or of the first if all follow."""
+    def _projected(
+        self, chunk: Gaussians, places: Int[Tensor, " m"] | int, shares: Float[Tensor, " m"] | None, camera: Camera
+    ) -> Splats2D:
+        """Splats of some Gaussians, without colour.
+
+        places: of each in the scene, or of the first if all follow.  shares: see `Cut`.
+        """
         recipe, training, kernels = self.recipe, self.training, self._kernels
         rules = training.convention.rules
         splats = project(chunk, camera, kernels, rules)
@@ -229,6 +237,8 @@ class Renderer:
         own = splats.sources
         splats = replace(splats, sources=own + places if isinstance(places, int) else places.index_select(0, own))
         splats = recipe.screen(splats, camera, training)
+        if shares is not None:
+            splats = faded(splats, shares.index_select(0, own))
         ellipses = recipe.pixel.bounding_ellipses(splats, rules)
         return cull(splats, camera.hw, training.cull_margin, kernels, ellipses, rules)
 
