@@ -12,6 +12,7 @@ import torch
 
 import aaplug
 import aaplug.core.projection
+from aaplug.core.cameras import CameraSet
 from aaplug.core.errors import FrameError, OutputError, UsageError
 from aaplug.core.executors import torch_threads
 from aaplug.core.gaussians import ANTIALIASED, CLASSIC, MIP, Gaussians
@@ -269,6 +270,15 @@ def test_levels_are_files_that_nest(cli):
     assert [level["rate"] for level in json.loads(out)["levels"]] == [1.0, 0.5, 0.25, 0.125]
     assert [f.settings["rate"] for f in scenes[3].fused] == ["0.5", "0.25", "0.125"]
     assert "merge (rate=0.5" in cli("info levels/scene_lod1.ply")[1]
+
+
+def test_what_no_camera_sees_stays_when_all_else_is_too_faint():
+    cameras = [make_camera(eye, (640, 480)) for eye in ((0.0, -4.0, 0.0), (3.0, -2.0, 1.0))]
+    scene = replace(make_scene(4), log_scales=torch.full((4, 3), -7.0), logit_opacities=torch.full((4,), -2.0))
+    scene.means[3] = torch.tensor([0.0, -40.0, 0.0])
+    scene.log_scales[3], scene.logit_opacities[3] = -2.0, 4.0
+    sizes = [len(level.scene) for level in aaplug.lod(scene, CameraSet(tuple(cameras), ()), levels=5, refine=False)]
+    assert (sizes[0], sizes[-2:]) == (4, [1, 1])
 
 
 def test_a_level_may_have_no_gaussians(tmp_path, sample_cameras):

@@ -14,7 +14,7 @@ from torch import Tensor
 from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.choices import SpzAxes
 from aaplug.core.digests import digest_of_cameras, digest_of_scene, digest_of_values
-from aaplug.core.errors import OutputError, UsageError
+from aaplug.core.errors import FrameError, OutputError, UsageError
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.monitor import SILENT, Monitor
 from aaplug.core.sampling import check_frame
@@ -123,9 +123,16 @@ class _Maker:
     monitor: Monitor
 
     def __call__(self, before: Level, goal: Goal) -> Level:
-        if not len(before.scene):
-            return before._replace(rate=goal.rate)
-        scene, rates, visible = before.scene, rates_of(before.scene, self.train), self._visible(before, goal)
+        scene, same = before.scene, before._replace(rate=goal.rate)
+        if not len(scene):
+            return same
+        try:
+            rates = rates_of(scene, self.train)
+        except FrameError:
+            if scene is self.scene:
+                raise
+            return same  # no camera sees any of what is left
+        visible = self._visible(before, goal)
         with self.monitor.progress("merging", "Gaussians") as tell:
             if before.chunks is None:
                 found, chunks = merged(scene, rates, goal, tell, visible), None
