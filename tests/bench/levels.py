@@ -1,11 +1,11 @@
 """Levels of detail, measured: python -m tests.bench.levels [SCENE ...], of those below, or cost.
 
-For a scene it prints lighter scenes beside splat-transform's `--decimate`; then a pyramid, kept in a folder of the
-working directory, at sizes from 1/2 to 1/32, with and without levels: PSNR in dB, SSIM and flicker against the
-scene's own look, PSNR against photographs, median milliseconds, Gaussians projected and evaluations of a splat in a
-pixel; then a dolly, also as a video; and all levels in one scene by Multi-Scale 3DGS' rule.  For a scene of
-`MILLIONS`: what levels lose by the own look and what they save of the time, merged alone and tuned.  For cost: time
-against Gaussians and pixels on synthetic scenes.
+For a scene it prints a pyramid, kept in a folder of the working directory, at sizes from 1/2 to 1/32, with and without
+levels: PSNR in dB, SSIM and flicker against the scene's own look, PSNR against photographs, median milliseconds,
+Gaussians projected and evaluations of a splat in a pixel.  Then it prints fades between two levels; a dolly, also as a
+video; all levels in one scene by Multi-Scale 3DGS' rule; and lighter scenes beside splat-transform's `--decimate`.
+For a scene of `MILLIONS`: what levels lose by the own look and what they save of the time, merged alone and tuned.
+For cost: time against Gaussians and pixels on synthetic scenes.
 """
 
 import statistics
@@ -16,14 +16,16 @@ from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from typing import Literal
+from unittest.mock import patch
 
 import torch
 
 from aaplug.core.camera_paths import moved
 from aaplug.core.cameras import Camera
-from aaplug.core.gaussians import Gaussians
+from aaplug.core.gaussians import MIN_OPACITY, Gaussians
 from aaplug.core.interfaces import Rasterizer
-from aaplug.core.pyramids import Pyramid
+from aaplug.core.pyramids import Pyramid, faded
+from aaplug.core.splats import Splats2D
 from aaplug.core.training import TrainingViews
 from aaplug.evaluation.metrics import PSNR
 from aaplug.evaluation.protocols import median_depth
@@ -43,6 +45,7 @@ from tests.bench.millions import MILLIONS, TRAINED, Opened, noise, trained
 VIEWS = 5
 SCALES = (1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 32)
 BETWEEN = (0.24, 1 / 5, 1 / 6, 1 / 7, 0.11, 1 / 10, 0.07)  # sizes at which samples lie closer than half of training's
+FADING = (0.5, 0.46, 0.44, 0.42, 0.4, 0.37)  # sizes from where level 1 is drawn alone to where level 2 is
 LEVELS = 5
 SHARES = {1 / 4: (1 / 4, 1 / 8), 1 / 16: (1 / 8,)}  # scales that lighter scenes are tuned for
 RULES = ("matched", "classic")  # that lighter scenes are shown by
@@ -193,6 +196,22 @@ def levels(bench: Bench) -> Pyramid:
 
 
 @torch.no_grad()
+def fades(bench: Bench, pyramid: Pyramid) -> None:
+    """Between levels 1 and 2, one sample per pixel, as levels fade and by optical depth."""
+    print("\n| fade | " + " | ".join(f"{scale:g}" for scale in FADING) + " |\n" + "|---" * (1 + len(FADING)) + "|")
+    shown = bench.shown(pyramid, "auto", "fast")
+    for how, fade in (("energy", faded), ("optical depth", by_depth)):
+        with patch("aaplug.rendering.renderer.faded", fade):
+            row(how, *(psnr(shown, bench.own, scale) for scale in FADING))
+
+
+def by_depth(splats: Splats2D, shares: torch.Tensor) -> Splats2D:
+    """As `faded`, with a share of the optical depth at a splat's middle."""
+    opacities = splats.opacities.clamp(max=1 - MIN_OPACITY)
+    return replace(splats, opacities=-torch.expm1(shares * torch.log1p(-opacities)))
+
+
+@torch.no_grad()
 def million(bench: Bench) -> None:
     """Levels that are merged alone and tuned ones against a scene of so many Gaussians that these decide the time."""
     print(f"\n{bench.name}, {len(bench.scene):,} Gaussians\n")
@@ -285,7 +304,9 @@ def main(names: Sequence[str]) -> None:
         if name in MILLIONS:
             million(bench)
             continue
-        dolly(bench, levels(bench))
+        pyramid = levels(bench)
+        fades(bench, pyramid)
+        dolly(bench, pyramid)
         together(bench)
         lighter(bench)
 
