@@ -257,5 +257,5 @@ def test_every_option_in_the_documents_exists(capsys):
     known = set(re.findall(r"--[a-z][a-z-]+", helps))
     named = set(re.findall(r"`(--[a-z][a-z-]+)", text))
     # of 3DGS's own scripts, of splat-transform, of nerfbaselines, of Dask
-    others = {"--antialiasing", "--decimate", "--set", "--memory-limit"}
+    others = {"--antialiasing", "--decimate", "--decimate-adaptive", "--set", "--memory-limit"}
     assert named - known - others == set()

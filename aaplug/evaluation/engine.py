@@ -269,9 +269,10 @@ class _Bench:
 def _work(renderer: Renderer, camera: Camera) -> Hashable:
     """Equal for renderers that draw the same image of a view."""
     recipe = renderer.recipe
-    method = recipe.selection, recipe.screen, recipe.pixel, recipe.compositor, recipe.levels
-    samples = renderer.samples(camera), renderer.neighbours(camera)
-    how = samples, renderer.background, renderer.rasterizer.name
+    method = recipe.selection, recipe.screen, recipe.pixel, recipe.compositor
+    fine, samples = renderer.sampled(camera)
+    sampled = samples, renderer.neighbours(camera), renderer.coarsening(fine, samples)
+    how = sampled, renderer.background, renderer.rasterizer.name
     return id(renderer.scene), id(renderer.training), method, how
 
 
