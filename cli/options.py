@@ -89,7 +89,7 @@ class SceneOptions(FileOptions):
     """The scene."""
 
     scene: Annotated[Path | None, tyro.conf.Positional, flag("SCENE")] = None
-    """A scene (.ply, .compressed.ply, .spz, .sog, .splat, .ksplat) or its folder (INRIA model, SOG, levels of detail)."""
+    """A scene (.ply, .compressed.ply, .spz, .sog, .splat, .ksplat) or a folder (INRIA model, SOG, levels of detail)."""
     model_path: Annotated[Path | None, flag("FOLDER", "-m")] = None
     """An INRIA model folder, instead of SCENE."""
     iteration: Annotated[int | None, number(0, 10**9, whole=True), UNSET] = None
