@@ -72,7 +72,7 @@ def at_rest(page, **parts: str):
       const seen = document.querySelector('{SEEN}').dataset;
       return seen.stage === 'done' && seen.asked === seen.id && {shows};
     }}"""
-    page.wait_for_function(script, arg=parts, timeout=20_000)
+    page.wait_for_function(script, arg=parts, timeout=60_000)  # a busy machine
 
 
 def data(page, name: str) -> str:
