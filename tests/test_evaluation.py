@@ -9,6 +9,7 @@ import torch
 from aaplug.core.cameras import CameraSet
 from aaplug.core.errors import UsageError
 from aaplug.core.imaging import box_average, quantised
+from aaplug.core.registry import KINDS
 from aaplug.core.training import TrainingViews
 from aaplug.evaluation.engine import NO_PHOTOGRAPH, Candidate, Task, candidates_of, compare, evaluate
 from aaplug.evaluation.image_store import ImageStore
@@ -234,6 +235,7 @@ def test_images_lie_where_3dgs_scripts_look(world, tmp_path):
 
 def test_a_new_metric_that_is_undefined_is_reported_with_its_own_words(world, monkeypatch):
     monkeypatch.setattr(METRICS, "_entries", dict(METRICS))
+    monkeypatch.setattr("aaplug.core.registry._registered", {kind: [] for kind in KINDS})
     odd = Metric("odd", "", 1.0, 2, "its protocol", lambda image, truth: None, undefined="too odd")
     nan = replace(odd, name="nan", measure=lambda image, truth: float("nan"), undefined="not finite")
     METRICS.register("odd", odd)  # and `nan` is given from Python alone

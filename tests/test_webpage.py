@@ -184,6 +184,7 @@ def labels(page, selector="#stage") -> list[str]:
 def choose(page, *roles: str):
     """Show these, at a scale that has photographs."""
     page.locator("#scales input").nth(1).check(force=True)
+    page.wait_for_selector("#roles input[value=truth]:enabled", state="attached")
     for box in page.locator("#roles input").all():
         box.set_checked(box.get_attribute("value") in roles, force=True)
 
