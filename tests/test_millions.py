@@ -23,6 +23,12 @@ VIEWS = tuple(make_camera(eye, (64, 48)) for eye in ((0.0, -4.0, 0.0), (3.0, -2.
 CAMERAS = CameraSet(VIEWS, VIEWS)
 
 
+def in_one_chunk(*counts: int) -> Pyramid:
+    """Levels of so many Gaussians, of different scenes."""
+    scenes = [make_scene(count) for count in counts]
+    return Pyramid.of(scenes, [torch.zeros(len(scene), dtype=torch.int64) for scene in scenes])
+
+
 @pytest.mark.parametrize(
     ("budget", "share", "expected"),
     [
@@ -32,8 +38,7 @@ CAMERAS = CameraSet(VIEWS, VIEWS)
 )
 def test_balanced_draws_coarser_levels_where_they_are_many_and_a_large_share(budget, share, expected):
     """Of 200 Gaussians, level 1 has 50 and level 2 has 45; a view at 1/8 has 4 samples, at the rate of level 1."""
-    scenes = [make_scene(count) for count in (200, 50, 45, 5)]
-    levels = Pyramid.of(scenes, [torch.zeros(len(scene), dtype=torch.int64) for scene in scenes])
+    levels = in_one_chunk(200, 50, 45, 5)
     renderer = Renderer.of(levels, CAMERAS, rasterizer="eager")
     limited = replace(
         renderer, recipe=replace(renderer.recipe, levels=LevelChoice(budget=budget, share=share, finer=1.0))
@@ -50,8 +55,7 @@ def test_balanced_draws_coarser_levels_where_they_are_many_and_a_large_share(bud
 
 @pytest.mark.parametrize(("quality", "expected"), [("fast", 0.5), ("balanced", 0.0)])
 def test_levels_of_several_samples_stay_as_fine_as_the_quality_asks(quality, expected):
-    scenes = [make_scene(count) for count in (200_000, 150_000, 120_000)]
-    levels = Pyramid.of(scenes, [torch.zeros(len(scene), dtype=torch.int64) for scene in scenes])
+    levels = in_one_chunk(200_000, 150_000, 120_000)
     renderer = Renderer.of(levels, CAMERAS, quality=quality, rasterizer="eager")
     assert renderer.coarsening(VIEWS[0].scaled(1 / 2), 2) == expected
 
@@ -59,8 +63,7 @@ def test_levels_of_several_samples_stay_as_fine_as_the_quality_asks(quality, exp
 @pytest.mark.parametrize("scale", [1 / 4.17, 1 / 5, 1 / 9, 1 / 10, 1 / 10.5])
 def test_where_no_level_is_light_enough_the_lightest_is_drawn_alone(scale):
     """And not two that fade."""
-    scenes = [make_scene(count) for count in (200, 150, 120)]
-    levels = Pyramid.of(scenes, [torch.zeros(len(scene), dtype=torch.int64) for scene in scenes])
+    levels = in_one_chunk(200, 150, 120)
     renderer = Renderer.of(levels, CAMERAS, rasterizer="eager")
     limited = replace(renderer, recipe=replace(renderer.recipe, levels=LevelChoice(finer=1.0)))
     fine, samples = limited.sampled(VIEWS[0].scaled(scale))
@@ -69,12 +72,11 @@ def test_where_no_level_is_light_enough_the_lightest_is_drawn_alone(scale):
 
 
 def test_evaluation_tells_apart_recipes_that_draw_different_levels():
-    scenes = [make_scene(count) for count in (200, 150, 20)]
-    levels = Pyramid.of(scenes, [torch.zeros(len(scene), dtype=torch.int64) for scene in scenes])
-    training = TrainingViews.of(scenes[0], VIEWS)
+    levels = in_one_chunk(200, 150, 20)
+    training = TrainingViews.of(levels.finest, VIEWS)
     fine = find_recipe("auto")
     coarse = replace(fine, name="coarse", levels=LevelChoice())
-    truth = Truth(own_look(scenes[0], training, "eager"))
+    truth = Truth(own_look(levels.finest, training, "eager"))
 
     def figures(*recipes: Recipe) -> list[float | None]:
         candidates = candidates_of(levels, training, recipes, "eager")

@@ -84,8 +84,7 @@ class Pyramid:
 
     def level(self, number: int) -> Gaussians:
         """One level as a scene of its own."""
-        start = sum(self.sizes[:number])
-        return self.scene[start : start + self.sizes[number]]
+        return self.scene[self.places[number]]
 
     @property
     def coarsest_rate(self) -> float:
@@ -93,10 +92,9 @@ class Pyramid:
         return 0.5 ** (len(self) - 1)
 
     @property
-    def coarsest_first(self) -> list[slice]:
-        """Places of each level's Gaussians, the coarsest level first."""
-        stops = [0, *itertools.accumulate(self.sizes)]
-        return [slice(*ends) for ends in itertools.pairwise(stops)][::-1]
+    def places(self) -> list[slice]:
+        """Where each level's Gaussians are."""
+        return [slice(*ends) for ends in itertools.pairwise([0, *itertools.accumulate(self.sizes)])]
 
     @property
     def finest(self) -> Gaussians:
@@ -186,6 +184,8 @@ class Cutter:
 
         camera: of the samples.
         """
+        if not last:
+            return 0.0  # the only step: nothing to count
         fewest = math.inf, 0.0
         for octaves in (*(step * COARSER for step in range(math.ceil(last / COARSER))), last):
             count = self.count(camera, octaves)

@@ -188,7 +188,7 @@ class Renderer:
 
     @torch.no_grad()
     def _median_rate(self, camera: Camera) -> float:
-        for part in [slice(None)] if self.cutter is None else self.cutter.pyramid.coarsest_first:
+        for part in [slice(None)] if self.cutter is None else reversed(self.cutter.pyramid.places):
             bounds = self.training.bounds[part]
             now = sampling_bounds(self.scene.means[part], [camera]).highest
             both = (now > 0) & bounds.seen
