@@ -1,1 +1,1 @@
-"""The command line: one verb a file, each reading, calling the library and writing."""
+"""The command line: `verbs` is the table of verbs, `words` turns words into their options, `console` talks."""

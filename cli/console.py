@@ -14,9 +14,10 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from aaplug.core.errors import printable
-from aaplug.core.monitor import Monitor, Tell
+from aaplug.system.errors import printable
+from aaplug.system.monitor import Monitor, Tell
 
+FAILED = 1  # exit code of work that is not all done
 LINE_SECONDS = 10.0  # between progress lines where there is no terminal
 
 log = Console(stderr=True, highlight=False, soft_wrap=True)

@@ -17,19 +17,22 @@ import pytest
 import torch
 
 from aaplug.core.cameras import Camera, CameraSet, look_at
-from aaplug.core.gaussians import Gaussians, PixelSizes
+from aaplug.core.gaussians import Gaussians
 from aaplug.core.interfaces import Rasterizer
 from aaplug.core.splats import Splats2D
 from aaplug.core.training import TrainingViews
 from aaplug.io.cameras import read_cameras
 from aaplug.io.scenes import read_scene
-from aaplug.rasterizers import RASTERIZERS, Tiled
+from aaplug.lab.pixel_size import PixelSizes
+from aaplug.rasterizers import RASTERIZERS
+from aaplug.rasterizers.tiled import Tiled
 from aaplug.rasterizers.tiled.ahead_of_time import load
 
 COMPILED = load()
 ALL_RASTERIZERS: dict[str, Rasterizer] = {**RASTERIZERS, **({} if COMPILED is None else {"compiled": Tiled(COMPILED)})}
 
-SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+ROOT = Path(__file__).resolve().parents[1]
+SHARED_DATA = ROOT.parent / "shared" / "data"
 SAMPLE = Path(str(files("aaplug.io.sample")))
 CLEAR_REFS = Path("/proc/self/clear_refs")
 needs_peak_memory = pytest.mark.skipif(not CLEAR_REFS.exists(), reason="peak memory of a process is read from /proc")
@@ -97,8 +100,7 @@ print(peak() - before)
 def memory_taken(prepare: str, work: str) -> int:
     """Bytes by which statements raise the peak of a fresh process; one that ran other tests has memory to reuse."""
     command = [sys.executable, "-c", MEASURE.format(prepare=prepare, work=work)]
-    root = Path(__file__).resolve().parents[1]
-    run = subprocess.run(command, cwd=root, capture_output=True, text=True, check=True, timeout=120)
+    run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True, timeout=120)
     return int(run.stdout)
 
 
@@ -113,6 +115,15 @@ def make_camera(
     pose = look_at(torch.tensor(eye), torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
     centre = size[0] / 2, size[1] / 2
     return Camera(name, *size, focal, focal, *centre, pose).as_trained()
+
+
+def straight_camera(
+    focal: float = 100.0, size: tuple[int, int] = (80, 60), centre: tuple[float, float] | None = None, back: float = 0.0
+) -> Camera:
+    """At (0, 0, -back), looking along +z, with x and y as in the image."""
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[2, 3] = back
+    return Camera("straight", *size, focal, focal, *(centre or (size[0] / 2, size[1] / 2)), pose)
 
 
 def make_scene(n: int, seed: int = 0, dtype: torch.dtype = torch.float32, degree: int = 1) -> Gaussians:
@@ -133,7 +144,7 @@ def sized(scene: Gaussians) -> Gaussians:
     n = len(scene)
     base = torch.arange(n) % 4 == 0
     sizes = PixelSizes(torch.full((n,), 4.0), torch.full((n,), 8.0), base)
-    return replace(scene, pixel_sizes=sizes)
+    return replace(scene, extras=sizes.extras)
 
 
 def make_splats(m: int, hw: tuple[int, int], seed: int = 0, log_sigmas: tuple[float, float] = (-1.0, 2.0)) -> Splats2D:

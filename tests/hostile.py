@@ -17,13 +17,14 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 
 import torch
 
-from aaplug.core.errors import AaplugError
-from aaplug.inspection.survey import survey
-from aaplug.io.scenes import open_scene
+from aaplug.evaluation.survey import survey
+from aaplug.io.scenes import read_scene
+from aaplug.system.errors import AaplugError
 from tests.scene_files import DATA, MADE, STORED, write_file
 
 SECONDS = 1.0  # of processor time a file; other processes may make the clock's run longer
@@ -53,7 +54,7 @@ class Target:
 
 def read_as_info_does(path: Path) -> None:
     """Open a scene and look at every Gaussian."""
-    survey(open_scene(path, allow_checkpoint=True))
+    survey(read_scene(path, allow_checkpoint=True))
 
 
 def scene(name: str) -> Target:
@@ -120,14 +121,10 @@ def check(name: str, files: Iterable[bytes], target: Target | None = None) -> Co
     Raises:
         AssertionError: a file did harm.
     """
-    outcomes: Counter[str] = Counter()
-    batch: list[bytes] = []
-    for data in files:
-        batch.append(data)
-        if len(batch) == BATCH:
-            outcomes += _in_a_child(name, batch, target or scene(name))
-            batch = []
-    return outcomes + _in_a_child(name, batch, target or scene(name)) if batch else outcomes
+    outcomes, files = Counter[str](), iter(files)
+    while batch := list(islice(files, BATCH)):
+        outcomes += _in_a_child(name, batch, target or scene(name))
+    return outcomes
 
 
 def _spoil(data: bytearray, rng: random.Random) -> bytearray:
@@ -154,17 +151,17 @@ def _in_a_child(name: str, files: list[bytes], target: Target) -> Counter[str]:
     child.start()
     send.close()
     try:
-        found, slowest, growth, left = receive.recv()
+        outcomes, slowest, growth, left = receive.recv()
     except EOFError:
         child.join()
         raise AssertionError(f"{name}: the reader died with {child.exitcode}") from None
     child.join()
-    strange = {key: n for key, n in found.items() if key not in ("read", "refused")}
+    strange = {key: n for key, n in outcomes.items() if key not in ("read", "refused")}
     assert not strange, (name, strange)
     assert slowest < SECONDS, (name, slowest)
     assert growth < GROWTH, (name, growth)
     assert not left, (name, left)
-    return found
+    return outcomes
 
 
 def _work(target: Target, files: list[bytes], send) -> None:
@@ -173,20 +170,17 @@ def _work(target: Target, files: list[bytes], send) -> None:
     space = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (space + MEMORY, space + MEMORY))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    before = _resident()
-    found: Counter[str] = Counter()
-    slowest = 0.0
+    before, outcomes, slowest = _resident(), Counter[str](), 0.0
     with tempfile.TemporaryDirectory() as folder:
         path = target.make(Path(folder))
         there = sorted(p.name for p in path.parent.iterdir())
         for data in files:
             path.write_bytes(data)
             start = time.process_time()
-            result = outcome(path, target.read)
-            found[result] += 1
+            outcomes[outcome(path, target.read)] += 1
             slowest = max(slowest, time.process_time() - start)
         left = [p.name for p in path.parent.iterdir() if p.name not in (*there, path.name)]
-    send.send((found, slowest, _resident() - before, left))
+    send.send((outcomes, slowest, _resident() - before, left))
 
 
 def _resident() -> int:
@@ -200,8 +194,8 @@ def main() -> None:
     for each in NAMES if name == "all" else name.split(","):
         data = scene(each).content()
         start = time.perf_counter()
-        found = check(each, mutations(data, seed, count))
-        print(each, dict(found), f"{time.perf_counter() - start:.0f} s", flush=True)
+        outcomes = check(each, mutations(data, seed, count))
+        print(each, dict(outcomes), f"{time.perf_counter() - start:.0f} s", flush=True)
 
 
 if __name__ == "__main__":

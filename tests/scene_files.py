@@ -53,13 +53,12 @@ def spz(version: int, zipped: bool = True, flags: int = 1, degree: int = 3) -> b
 
 def splat() -> bytes:
     s = oracle()
-    rows = []
-    for i in range(len(s)):
-        rgb = 0.5 + SH_C0 * s.sh[i, 0]
-        rows.append(struct.pack("<6f", *s.means[i].tolist(), *s.scales[i].tolist()))
-        rows.append(bytes_of(torch.cat([rgb, s.opacities[i : i + 1]]), 255, 0).tobytes())
-        rows.append(bytes_of(s.unit_quats[i], 128, 128).tobytes())
-    return b"".join(rows)
+    shapes = torch.cat([s.means, s.scales], 1).numpy().astype("<f4").view(np.uint8)
+    return np.concatenate([shapes, rgba_bytes(s), bytes_of(s.unit_quats, 128, 128)], axis=1).tobytes()
+
+
+def rgba_bytes(s: Gaussians) -> np.ndarray:
+    return bytes_of(torch.cat([0.5 + SH_C0 * s.sh[:, 0], s.opacities[:, None]], 1), 255, 0)
 
 
 def ksplat(level: int, degree: int = 2, per_bucket: int = 16) -> bytes:
@@ -79,8 +78,7 @@ def ksplat(level: int, degree: int = 2, per_bucket: int = 16) -> bytes:
     means = s.means.numpy()
     rows["p"] = means if level == 0 else np.round((means - centres[0]) * steps / (block / 2) + steps)
     rows["s"], rows["q"] = s.scales.numpy(), s.unit_quats.numpy()
-    rgb = 0.5 + SH_C0 * s.sh[:, 0]
-    rows["c"] = bytes_of(torch.cat([rgb, s.opacities[:, None]], 1), 255, 0)
+    rows["c"] = rgba_bytes(s)
     rows["h"] = rest if level < 2 else np.round((rest + 1.5) / 3 * 255).clip(0, 255)
     main = bytearray(4096)
     struct.pack_into("<BBxxIIIIHxx", main, 0, 0, 1, 1, 1, n, n, level)
@@ -97,18 +95,8 @@ def ksplat(level: int, degree: int = 2, per_bucket: int = 16) -> bytes:
 def splats() -> dict[str, torch.Tensor]:
     """The scene as gsplat's trainer holds it."""
     s = oracle()
-    return {
-        "means": s.means.clone(),
-        "scales": s.log_scales.clone(),
-        "quats": s.quats.clone(),
-        "opacities": s.logit_opacities.clone(),
-        "sh0": s.sh[:, :1].clone(),
-        "shN": s.sh[:, 1:].clone(),
-    }
-
-
-def checkpoint(path: Path) -> None:
-    torch.save({"step": 1, "splats": splats()}, path)
+    columns = {"means": s.means, "scales": s.log_scales, "quats": s.quats, "opacities": s.logit_opacities}
+    return {key: value.clone() for key, value in (columns | {"sh0": s.sh[:, :1], "shN": s.sh[:, 1:]}).items()}
 
 
 MADE: Mapping[str, Callable[[], bytes]] = {
@@ -128,7 +116,7 @@ def write_file(folder: Path, name: str) -> Path:
     """The file of that name of MADE or STORED, or a checkpoint, in a folder."""
     path = folder / name
     if name.endswith(".pt"):
-        checkpoint(path)
+        torch.save({"step": 1, "splats": splats()}, path)
     elif name in MADE:
         path.write_bytes(MADE[name]())
     else:

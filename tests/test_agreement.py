@@ -8,15 +8,16 @@ import pytest
 import torch
 from aaplug_cli.options import SceneOptions
 
-from aaplug.core.cameras import WHITE, CameraSet
+from aaplug.core.cameras import CameraSet
+from aaplug.core.colours import WHITE
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.training import TrainingViews
-from aaplug.evaluation.truth import own_look
-from aaplug.io.scenes import open_scene, read_scene, write_scene
+from aaplug.io.scenes import read_scene, write_scene
 from aaplug.io.scenes.packed import half_turn_about_x
 from aaplug.io.scenes.scene_file import SceneFile
-from aaplug.verbs.agreement import Agreement, agreement, settled
-from aaplug.verbs.assumed import Orbit
+from aaplug.rendering.agreement import Agreement, agreement, settled
+from aaplug.options.shared import Orbit
+from aaplug.rendering.renderer import own_look
 from aaplug.verbs.render import render
 from tests.conftest import make_camera, make_scene
 
@@ -64,7 +65,7 @@ def test_a_spz_is_read_as_fits_the_cameras(sample_scene, sample_cameras, tmp_pat
     pytest.importorskip("gsply")
     scene = sample_scene[:: len(sample_scene) // 3000]
     write_scene(tmp_path / "a.spz", scene, spz_axes=axes)
-    chosen = settled(open_scene(tmp_path / "a.spz"), sample_cameras)
+    chosen = settled(read_scene(tmp_path / "a.spz"), sample_cameras)
     expected = read_scene(tmp_path / "a.spz", spz_axes=axes)
     assert torch.equal(chosen.whole().means, expected.means)
     assert torch.equal(chosen.whole().sh, expected.sh)
@@ -73,7 +74,7 @@ def test_a_spz_is_read_as_fits_the_cameras(sample_scene, sample_cameras, tmp_pat
 def test_assumed_cameras_decide_nothing(sample_scene, tmp_path: Path):
     pytest.importorskip("gsply")
     write_scene(tmp_path / "a.spz", sample_scene[:100], spz_axes="opencv")
-    opened = open_scene(tmp_path / "a.spz")
+    opened = read_scene(tmp_path / "a.spz")
     assert opened.other is not None
     assert settled(opened, Orbit().around(opened)) is opened
 
@@ -113,5 +114,5 @@ def test_a_reading_that_the_cameras_may_change_is_told_as_such(sample_scene, tmp
 def test_without_evidence_a_spz_follows_its_specification(sample_scene, sample_cameras, tmp_path: Path):
     pytest.importorskip("gsply")
     write_scene(tmp_path / "a.spz", sample_scene[:100], spz_axes="opencv")
-    chosen = settled(open_scene(tmp_path / "a.spz"), without_photos(sample_cameras))
+    chosen = settled(read_scene(tmp_path / "a.spz"), without_photos(sample_cameras))
     assert torch.equal(chosen.whole().means, read_scene(tmp_path / "a.spz", spz_axes="opengl").means)

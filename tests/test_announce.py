@@ -5,11 +5,11 @@ from dataclasses import replace
 import pytest
 
 from aaplug.core.cameras import CameraSet
-from aaplug.core.errors import UsageError
-from aaplug.core.monitor import Monitor
 from aaplug.finetuning.settings import Settings
 from aaplug.rendering.cost import EAGER, GRADIENTS, cost_of
 from aaplug.rendering.renderer import Renderer
+from aaplug.system.errors import UsageError
+from aaplug.system.monitor import Monitor
 from aaplug.verbs.announce import announce
 from aaplug.verbs.bench import bench
 from aaplug.verbs.evaluate import evaluate

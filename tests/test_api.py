@@ -12,7 +12,7 @@ from aaplug_cli.main import VERBS
 from aaplug_cli.options import option_types
 
 import aaplug
-from aaplug.core.errors import FrameError, UsageError
+from aaplug.system.errors import FrameError, UsageError
 from tests.conftest import SAMPLE, make_camera, make_scene
 from tests.test_cli import EYES, SIZE, cli, dataset, inria_model  # noqa: F401  (fixtures)
 

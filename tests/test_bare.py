@@ -11,21 +11,23 @@ import torch
 
 import aaplug
 from aaplug.core.camera_paths import up_of
-from aaplug.core.errors import UsageError
+from aaplug.core.chunks import chunks_of
 from aaplug.core.gaussians import Gaussians, joined
-from aaplug.core.monitor import SILENT
-from aaplug.core.orbits import DOWN_IS_Y, Frame, frame_of, likely_up, looked_from, orbit
+from aaplug.core.orbits import DOWN_IS_Y, Frame, frame_of, likely_up, orbit, training_side
 from aaplug.core.pyramids import Cutter, Pyramid
 from aaplug.core.sampling import sampling_bounds
 from aaplug.core.training import TrainingViews
 from aaplug.io.images import image_size, read_image
 from aaplug.io.scenes import read_scene, write_scene
-from aaplug.levels.chunks import chunks_of
 from aaplug.levels.merging import Goal, merged_in_chunks
 from aaplug.levels.rates import rates_of
-from aaplug.methods.filters import NYQUIST_VARIANCE
+from aaplug.methods.filters.smoothing import NYQUIST_VARIANCE
+from aaplug.rendering.orbits import CROP, FOV, rate_of
+from aaplug.options.shared import Orbit
+from aaplug.rendering.assumed import decibels_at
 from aaplug.rendering.renderer import Renderer
-from aaplug.verbs.assumed import CROP, FOV, Orbit, decibels_at, rate_of
+from aaplug.system.errors import UsageError
+from aaplug.system.monitor import SILENT
 from aaplug.verbs.inputs import inputs_of
 from tests.conftest import make_scene
 from tests.test_cli import cli, dataset  # noqa: F401 (fixtures)
@@ -84,9 +86,9 @@ def test_every_view_sees_the_bulk_of_the_scene(sample_scene, size):
             assert wide.max() > 0.4, "the scene is small in the picture"
 
 
-def test_up_is_where_training_looked_from(sample_scene):
-    assert likely_up(looked_from(sample_scene)) == UP
-    assert likely_up(looked_from(replace(sample_scene, sh=sample_scene.sh[:, :1]))) == DOWN_IS_Y
+def test_up_is_where_training_training_side(sample_scene):
+    assert likely_up(training_side(sample_scene)) == UP
+    assert likely_up(training_side(replace(sample_scene, sh=sample_scene.sh[:, :1]))) == DOWN_IS_Y
 
 
 def test_up_is_what_nerfstudio_makes_it(tmp_path):
@@ -177,8 +179,8 @@ def test_how_much_a_picture_of_a_pyramid_hangs_on_the_rate():
     scene = make_scene(300)
     chunks = chunks_of(scene.means, 100)
     cameras = Orbit(train_view="96x64").around(scene)
-    coarse = merged_in_chunks(scene, rates_of(scene, cameras.train), chunks, Goal(0.5, tolerance=1e3))
-    pyramid = Pyramid.of([scene, coarse.scene], [chunks, coarse.chunks])
+    coarse, coarse_chunks = merge_in_chunks(scene, rates_of(scene, cameras.train), chunks, Goal(0.5, tolerance=1e3))
+    pyramid = Pyramid.of([scene, coarse], [chunks, coarse_chunks])
     shown = Renderer.of(pyramid, cameras, "auto", quality="fast", rasterizer="eager")
     view = replace(cameras.test[0], trained_focal=None)
     training = shown.training.finer(2.0)

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from aaplug.core.errors import ClusterError, FormatError
 from aaplug.evaluation.journal import Journal
 from aaplug.evaluation.results import Measurement, Report
 from aaplug.io.atomic import claimed
 from aaplug.io.batch_file import read_batch
+from aaplug.system.errors import ClusterError, FormatError
 from aaplug.verbs.batch import batch as evaluate_all
 from tests.test_cli import cli, dataset  # noqa: F401  (fixtures)
 

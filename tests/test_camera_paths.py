@@ -8,8 +8,8 @@ import torch
 
 from aaplug.core import camera_paths as paths
 from aaplug.core.cameras import CameraSet
-from aaplug.core.errors import FormatError
 from aaplug.io.cameras.camera_path import read_camera_path, sniff
+from aaplug.system.errors import FormatError
 from tests.conftest import make_camera
 
 VIEW = make_camera((0.0, -4.0, 0.0))

@@ -14,25 +14,17 @@ from hypothesis import strategies as st
 from PIL import Image
 
 import aaplug
-from aaplug.core.cameras import BLACK, WHITE, CameraSet
-from aaplug.core.errors import AaplugError, FormatError, UsageError
-from aaplug.core.registry import Registry
+from aaplug.core.cameras import CameraSet
+from aaplug.core.colours import BLACK, WHITE
 from aaplug.io.cameras import OWN, read_cameras, select_views
 from aaplug.io.cameras.camera_path import read_camera_path
 from aaplug.io.cameras.cfg_args import read_cfg_args
 from aaplug.io.cameras.options import Options
+from aaplug.system.errors import AaplugError, FormatError, UsageError
+from aaplug.system.registry import Registry, named
 from tests.conftest import make_camera
 
 QUARTER_TURN = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]  # 90° about z
-HALF = math.sqrt(0.5)
-
-
-@pytest.fixture(scope="module")
-def shared_data():
-    folder = Path(__file__).resolve().parents[2] / "shared" / "data"
-    if not folder.is_dir():
-        pytest.skip("the real scenes are not here")
-    return folder
 
 
 def write_json(path, document):
@@ -48,6 +40,16 @@ def photo(path, width, height, mode="RGB"):
 
 def names(cameras):
     return [camera.name for camera in cameras]
+
+
+def refused(path, *messages):
+    with pytest.raises(FormatError) as caught:
+        read_cameras(path)
+    assert all(message in str(caught.value) for message in messages)
+
+
+def values(camera):
+    return camera.fx, camera.fy, camera.cx, camera.cy
 
 
 # INRIA ------------------------------------------------------------------------------------------
@@ -76,7 +78,7 @@ def test_inria_pose_is_the_inverse_of_camera_to_world(tmp_path):
     expected = torch.tensor([[0, 1, 0, -2], [-1, 0, 0, 1], [0, 0, 1, -3], [0, 0, 0, 1]], dtype=torch.float64)
     assert torch.equal(camera.cam_from_world, expected)
     assert camera.centre.tolist() == [1, 2, 3]
-    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (300, 310, 200, 100)
+    assert values(camera) == (300, 310, 200, 100)
     assert (camera.name, camera.hw, camera.trained_focal) == ("a", (200, 400), camera.focal)
 
 
@@ -94,8 +96,7 @@ def test_inria_pose_is_the_inverse_of_camera_to_world(tmp_path):
 def test_inria_training_size_follows_3dgs(tmp_path, cfg, size):
     cameras = read_cameras(inria(tmp_path, inria_entry(width=2402, height=1000), cfg=cfg))
     (camera,) = cameras.train
-    assert (camera.width, camera.height) == size
-    assert camera.fx == pytest.approx(300 * size[0] / 2402)
+    assert (camera.width, camera.height, camera.fx) == (*size, pytest.approx(300 * size[0] / 2402))
     assert camera.trained_focal == camera.focal
     assert any("training size" in n and str(size[0]) in n for n in cameras.notes)
     assert any("assumed" in n for n in cameras.notes) == (cfg is None)
@@ -111,35 +112,27 @@ def test_inria_photos_count_more_than_the_sizes_in_the_file(tmp_path):
 
 def test_photo_of_another_shape_is_refused(tmp_path):
     photo(tmp_path / "images" / "a.png", 100, 200)
-    with pytest.raises(FormatError, match="100×200 px, which is not the shape"):
-        read_cameras(inria(tmp_path))
+    refused(inria(tmp_path), "100×200 px, which is not the shape")
 
 
 def test_inria_split_goes_by_name(tmp_path):
     inria(tmp_path, *many(17), cfg="Namespace(eval=True, white_background=True)")
     cameras = read_cameras(tmp_path)
-    assert names(cameras.test) == ["v00", "v08", "v16"]
-    assert len(cameras.train) == 14
+    assert (names(cameras.test), len(cameras.train)) == (["v00", "v08", "v16"], 14)
     assert cameras.background == WHITE
     assert names(read_cameras(tmp_path, test_every=16).test) == ["v00", "v16"]
     undivided = read_cameras(tmp_path, test_every=0)
     assert undivided.train is undivided.test
     assert len(undivided.train) == 17
-
-
-def test_inria_without_eval_has_no_split(tmp_path):
     cameras = read_cameras(inria(tmp_path, *many(9), cfg="Namespace(white_background=False)"))
-    assert len(cameras.train) == len(cameras.test) == 9
-    assert cameras.background == BLACK
+    assert (len(cameras.train), len(cameras.test), cameras.background) == (9, 9, BLACK)
     assert read_cameras(inria(tmp_path / "bare", *many(9))).background is None
 
 
-def test_inria_copies_of_a_view_count_once(tmp_path):
+def test_inria_copies_of_a_view_count_once_and_other_views_of_a_name_are_a_second_list(tmp_path):
+    """The model of a Blender set lists its test views first; some models list a view once per split."""
     cameras = read_cameras(inria(tmp_path, inria_entry(), inria_entry(id=1), inria_entry("b")))
     assert names(cameras.train) == ["a", "b"]
-
-
-def test_inria_model_of_a_blender_set_lists_test_views_first(tmp_path):
     test = [inria_entry(f"r_{i}", position=[float(i), 0, 0]) for i in range(3)]
     train = [inria_entry(f"r_{i}", position=[0, float(i) + 1, 0]) for i in range(2)]
     cameras = read_cameras(inria(tmp_path, *test, *train, cfg="Namespace(eval=True)"))
@@ -150,9 +143,8 @@ def test_inria_model_of_a_blender_set_lists_test_views_first(tmp_path):
 
 def test_cfg_args_is_never_run(tmp_path):
     trap = tmp_path / "trap"
-    cfg = f"Namespace(resolution=1, eval=open({str(trap)!r}, 'w'))"
     with pytest.raises(FormatError, match="eval should be a literal"):
-        read_cameras(inria(tmp_path, cfg=cfg))
+        read_cameras(inria(tmp_path, cfg=f"Namespace(resolution=1, eval=open({str(trap)!r}, 'w'))"))
     assert not trap.exists()
 
 
@@ -166,8 +158,7 @@ def test_cfg_args_is_never_run(tmp_path):
     ids=range(12),
 )
 def test_odd_cfg_args_are_refused(tmp_path, cfg):
-    with pytest.raises(FormatError):
-        read_cameras(inria(tmp_path, cfg=cfg))
+    refused(inria(tmp_path, cfg=cfg))
 
 
 def test_cfg_args_of_windows_is_read_without_warnings(tmp_path):
@@ -195,14 +186,11 @@ def test_cfg_args_of_windows_is_read_without_warnings(tmp_path):
     ids=str,
 )
 def test_inria_names_what_is_wrong(tmp_path, change, message):
-    folder = inria(tmp_path, inria_entry(), inria_entry("b", **change) | change)
+    folder = inria(tmp_path, inria_entry(), inria_entry("b") | change)
     if message is None:  # odd, but allowed
         read_cameras(folder)
-        return
-    with pytest.raises(FormatError) as caught:
-        read_cameras(folder)
-    assert message in str(caught.value)
-    assert "cameras.json" in str(caught.value)
+    else:
+        refused(folder, "cameras.json", message)
 
 
 def test_rotation_is_made_orthonormal(tmp_path):
@@ -219,14 +207,12 @@ def test_rotation_is_made_orthonormal(tmp_path):
 )
 def test_odd_json_is_refused(tmp_path, text):
     (tmp_path / "cameras.json").write_text(text, encoding="latin-1")
-    with pytest.raises(FormatError):
-        read_cameras(tmp_path)
+    refused(tmp_path)
 
 
 def test_json_is_capped(tmp_path, monkeypatch):
     monkeypatch.setenv("AAPLUG_JSON", "100")
-    with pytest.raises(FormatError, match="longer than 100 bytes"):
-        read_cameras(inria(tmp_path))
+    refused(inria(tmp_path), "longer than 100 bytes")
 
 
 # COLMAP -----------------------------------------------------------------------------------------
@@ -276,8 +262,8 @@ def test_colmap_values(tmp_path, write):
     write(tmp_path / "sparse" / "0")
     first, second = read_cameras(tmp_path, test_every=0).train
     assert (first.name, second.name) == ("a.b", "cam b/with space")
-    assert (first.fx, first.fy, first.cx, first.cy) == (250, 250, 200, 100)
-    assert (second.fx, second.fy, second.cx, second.cy) == (300, 310, 199, 101)
+    assert values(first) == (250, 250, 200, 100)
+    assert values(second) == (300, 310, 199, 101)
     turned = torch.tensor([[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]], dtype=torch.float64)
     assert torch.allclose(second.cam_from_world, turned, atol=1e-15)
     assert first.cam_from_world[:3, 3].tolist() == [0, 0.5, 0.25]
@@ -299,7 +285,7 @@ def test_colmap_trains_at_the_size_of_its_photos(tmp_path):
     photo(tmp_path / "images_4" / "cam b" / "with space.jpg", 100, 50)
     first, second = read_cameras(tmp_path, images="images_4", test_every=0).train
     assert (first.width, first.fx, first.cx) == (100, 62.5, 50)
-    assert (second.fx, second.fy, second.cx, second.cy) == (75, 77.5, 49.75, 25.25)
+    assert values(second) == (75, 77.5, 49.75, 25.25)
     assert second.trained_focal == second.focal
     (scaled, _) = read_cameras(tmp_path, images="images_4", test_every=0, train_scale=0.5).train
     assert (scaled.width, scaled.fx) == (200, 125)
@@ -318,18 +304,16 @@ def test_a_colmap_lens_that_distorts_is_the_pinhole_at_its_centre(tmp_path, writ
     cameras = read_cameras(write(tmp_path / "a", *straight))
     assert cameras.train[0].fy == 310
     assert not any("distorts" in note for note in cameras.notes)
-    for model, values in ((4, (0.0, 0.0, 0.0, 1e-9)), (5, (0.0,) * 4)):
+    for model, coefficients in ((4, (0.0, 0.0, 0.0, 1e-9)), (5, (0.0,) * 4)):
         folder = tmp_path / f"m{model}"
         photo(folder / "images" / "a.png", 200, 100)
-        bent = one_camera(model, (300.0, 310.0, 200.0, 100.0, *values))
+        bent = one_camera(model, (300.0, 310.0, 200.0, 100.0, *coefficients))
         cameras = read_cameras(write(folder / "sparse", *bent).parent)
         (camera,) = cameras.train
-        # its photo's size
-        assert (camera.fx, camera.fy, camera.cx, camera.cy) == (150, 155, 100, 50)
+        assert values(camera) == (150, 155, 100, 50), "at its photo's size"
         assert camera.photo is not None
         assert camera.lens is not None
-        assert camera.lens.coefficients == values
-        assert camera.lens.window == (0, 0, 200, 100)
+        assert (camera.lens.coefficients, camera.lens.window) == (coefficients, (0, 0, 200, 100))
         assert f"1 cameras have a lens that distorts ({MODEL_NAMES[model]})" in cameras.notes[-1]
 
 
@@ -345,8 +329,7 @@ def test_photos_through_a_lens_that_opencv_has_not_are_not_used(tmp_path):
 def test_a_colmap_camera_that_sees_all_around_is_refused(tmp_path):
     colmap_txt(tmp_path, *one_camera(1, (300.0, 310.0, 200.0, 100.0)))
     (tmp_path / "cameras.txt").write_text("1 EQUIRECTANGULAR 400 200 400 200\n")
-    with pytest.raises(FormatError, match="EQUIRECTANGULAR, which has no focal length"):
-        read_cameras(tmp_path)
+    refused(tmp_path, "EQUIRECTANGULAR, which has no focal length")
 
 
 def test_colmap_models_have_their_number_of_parameters(tmp_path):
@@ -369,9 +352,7 @@ def test_colmap_models_have_their_number_of_parameters(tmp_path):
     ids=lambda value: value if isinstance(value, str) else "",
 )
 def test_colmap_names_what_is_wrong(tmp_path, image, message):
-    with pytest.raises(FormatError) as caught:
-        read_cameras(colmap_bin(tmp_path, images=(image,)))
-    assert message in str(caught.value)
+    refused(colmap_bin(tmp_path, images=(image,)), message)
 
 
 def test_colmap_cut_anywhere_is_refused(tmp_path):
@@ -392,13 +373,11 @@ def test_photo_behind_a_link_out_of_the_dataset_is_refused(tmp_path):
     colmap_bin(root / "sparse")
     (root / "images").mkdir()
     (root / "images" / "a.b.png").symlink_to(tmp_path / "elsewhere" / "a.b.png")
-    with pytest.raises(FormatError, match="lies outside"):
-        read_cameras(root)
+    refused(root, "lies outside")
     (root / "images" / "a.b.png").unlink()
     (root / "images").rmdir()
     (root / "images").symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(FormatError, match="lies outside"):
-        read_cameras(root)
+    refused(root, "lies outside")
     assert read_cameras(root, images=str(tmp_path / "elsewhere")).test[0].photo is not None
 
 
@@ -419,6 +398,10 @@ OPENGL = [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
 def transforms(frames, **shared):
     frames = [{"transform_matrix": OPENGL} | frame for frame in frames]
     return {"camera_angle_x": math.pi / 2} | shared | {"frames": frames}
+
+
+def plain_transforms(folder):
+    return write_json(folder / "transforms.json", transforms([{"file_path": "a"}], w=40, h=20))
 
 
 def blender(folder):
@@ -445,12 +428,8 @@ def test_blender_values(tmp_path):
     assert (camera.cam_from_world @ ahead).tolist() == [0, 0, 3, 1]
     assert (camera.cam_from_world @ above).tolist() == [0, -1, 0, 1]
     assert any("transforms_val.json" in note for note in cameras.notes)
-
-
-def test_blender_train_scale(tmp_path):
-    camera = read_cameras(blender(tmp_path), train_scale=0.25).test[0]
-    assert (camera.hw, camera.trained_focal) == ((5, 10), camera.focal)
-    assert camera.fx == pytest.approx(5)
+    camera = read_cameras(tmp_path, train_scale=0.25).test[0]
+    assert (camera.hw, camera.trained_focal, camera.fx) == ((5, 10), camera.focal, pytest.approx(5))
 
 
 def test_blender_split_is_not_overruled(tmp_path):
@@ -487,10 +466,9 @@ def test_transforms_intrinsics_of_a_frame_come_first(tmp_path):
     ids=str,
 )
 def test_transforms_name_what_is_wrong(tmp_path, frame, message):
+    refused(write_json(tmp_path / "transforms.json", transforms([{"file_path": "a"}])), "add w and h")
     document = transforms([{"file_path": "a"} | frame], w=40, h=20)
-    with pytest.raises(FormatError) as caught:
-        read_cameras(write_json(tmp_path / "transforms.json", document))
-    assert message in str(caught.value)
+    refused(write_json(tmp_path / "transforms.json", document), message)
 
 
 @pytest.mark.parametrize(
@@ -563,10 +541,8 @@ def test_nerfstudios_lists_are_the_split(tmp_path):
     cameras = read_cameras(path)
     assert (names(cameras.train), names(cameras.test)) == (["a", "c"], ["b"])
     assert len(read_cameras(path, test_every=0).train) == 3
-    lists["train_filenames"] = "a.png"
-    write_json(path, transforms(frames, w=40, h=20, **lists))
-    with pytest.raises(FormatError, match="train_filenames should be a list"):
-        read_cameras(path)
+    write_json(path, transforms(frames, w=40, h=20, **lists | {"train_filenames": "a.png"}))
+    refused(path, "train_filenames should be a list")
 
 
 def test_the_dataparsers_transform_takes_poses_to_the_trained_frame(tmp_path):
@@ -581,18 +557,11 @@ def test_the_dataparsers_transform_takes_poses_to_the_trained_frame(tmp_path):
     matrix = torch.tensor(turn, dtype=torch.float64)
     point = torch.tensor([0.3, -0.7, 0.2, 1.0], dtype=torch.float64)
     moved = torch.cat([0.5 * (matrix @ point), point[3:]])
-    seen, still = (c.train[0].cam_from_world @ p for c, p in ((before, point), (after, moved)))
-    torch.testing.assert_close(still[:3], 0.5 * seen[:3])  # the same picture, at half the size
+    first, second = (c.train[0].cam_from_world @ p for c, p in ((before, point), (after, moved)))
+    torch.testing.assert_close(second[:3], 0.5 * first[:3])  # the same picture, at half the size
     for wrong in ({"transform": turn, "scale": 0}, {"transform": [[1]], "scale": 1}, [], {}):
         write_json(tmp_path / "dataparser_transforms.json", wrong)
-        with pytest.raises(FormatError, match="dataparser_transforms"):
-            read_cameras(path)
-
-
-def test_transforms_without_a_size_say_what_to_do(tmp_path):
-    write_json(tmp_path / "transforms.json", transforms([{"file_path": "a"}]))
-    with pytest.raises(FormatError, match="add w and h"):
-        read_cameras(tmp_path)
+        refused(path, "dataparser_transforms")
 
 
 # Plain pinholes ---------------------------------------------------------------------------------
@@ -616,6 +585,11 @@ def test_pinhole_values(tmp_path):
 # Camera paths, LLFF, multi-scale Blender ---------------------------------------------------------
 
 
+def twin(folder):
+    """The same camera in a transforms.json."""
+    return read_cameras(plain_transforms(folder)).train[0]
+
+
 def camera_path(**changes):
     motion = [cell for row in OPENGL for cell in row]
     view = {"camera_to_world": motion, "fov": 90.0, "aspect": 2.0}
@@ -625,8 +599,7 @@ def camera_path(**changes):
 def test_a_camera_path_is_free_cameras(tmp_path):
     path = write_json(tmp_path / "camera_path.json", camera_path())
     (camera,) = read_cameras(path).train
-    same = read_cameras(write_json(tmp_path / "transforms.json", transforms([{"file_path": "a"}], w=40, h=20))).train[0]
-    assert torch.equal(camera.cam_from_world, same.cam_from_world)
+    assert torch.equal(camera.cam_from_world, twin(tmp_path).cam_from_world)
     assert (camera.fx, camera.fy, camera.hw) == (pytest.approx(10), pytest.approx(10), (20, 40))
     assert camera.trained_focal is None
 
@@ -642,8 +615,7 @@ def test_a_camera_path_is_free_cameras(tmp_path):
     ids=str,
 )
 def test_odd_camera_paths_are_refused(tmp_path, change):
-    with pytest.raises(FormatError, match=r"camera_path\.json"):
-        read_cameras(write_json(tmp_path / "camera_path.json", camera_path(**change)))
+    refused(write_json(tmp_path / "camera_path.json", camera_path(**change)), "camera_path.json")
 
 
 def llff(folder, count=9):
@@ -658,9 +630,8 @@ def llff(folder, count=9):
 
 def test_llff_axes_are_down_right_and_back(tmp_path):
     cameras = read_cameras(llff(tmp_path))
-    same = read_cameras(write_json(tmp_path / "transforms.json", transforms([{"file_path": "a"}], w=40, h=20))).train[0]
     camera = cameras.train[0]
-    assert torch.allclose(camera.cam_from_world, same.cam_from_world, atol=1e-15)
+    assert torch.allclose(camera.cam_from_world, twin(tmp_path / "other").cam_from_world, atol=1e-15)
     assert (camera.fx, camera.hw, camera.name) == (30, (20, 40), "001")
     assert names(cameras.test) == ["000", "008"]
     for i in range(9):
@@ -674,12 +645,10 @@ def test_odd_llff_files_are_refused(tmp_path):
     shapes = [np.zeros((2, 16)), np.zeros(17), np.zeros((0, 17)), np.zeros((2, 17))]
     for rows in (*shapes, np.ones((2, 17), int), np.array([{}] * 17)[None]):
         np.save(file, rows)
-        with pytest.raises(FormatError, match=r"poses_bounds\.npy"):
-            read_cameras(tmp_path)
+        refused(tmp_path, "poses_bounds.npy")
     header = llff(tmp_path / "good") / "poses_bounds.npy"
     file.write_bytes(header.read_bytes().replace(b"(9, 17)", b"(999999999, 17)"))
-    with pytest.raises(FormatError, match=r"not a \.npy file"):
-        read_cameras(tmp_path)
+    refused(tmp_path, "not a .npy file")
 
 
 def multiscale(folder):
@@ -706,8 +675,7 @@ def test_multiscale_blender_has_a_view_a_scale(tmp_path):
 def test_odd_multiscale_sets_are_refused(tmp_path, key, value):
     document = json.loads(multiscale(tmp_path).read_text())
     document["train"][key] = value
-    with pytest.raises(FormatError, match=r"metadata\.json"):
-        read_cameras(write_json(tmp_path / "metadata.json", document))
+    refused(write_json(tmp_path / "metadata.json", document), "metadata.json")
 
 
 # Choosing ---------------------------------------------------------------------------------------
@@ -717,7 +685,7 @@ def test_a_folder_is_read_as_the_most_telling_of_its_formats(tmp_path):
     def kind():
         return read_cameras(tmp_path).notes[0].split()[0]
 
-    write_json(tmp_path / "transforms.json", transforms([{"file_path": "a"}], w=4, h=2))
+    plain_transforms(tmp_path)
     assert kind() == "transforms"
     inria(tmp_path)
     assert kind() == "INRIA"
@@ -730,10 +698,8 @@ def test_a_folder_is_read_as_the_most_telling_of_its_formats(tmp_path):
 
 
 def test_a_folder_without_cameras_says_what_was_looked_for(tmp_path):
-    with pytest.raises(FormatError, match=r"cameras\.json.*COLMAP.*transforms_train\.json"):
-        read_cameras(tmp_path)
-    with pytest.raises(FormatError, match="no such file"):
-        read_cameras(tmp_path / "none")
+    refused(tmp_path, "cameras.json", "COLMAP", "transforms_train.json")
+    refused(tmp_path / "none", "no such file")
 
 
 @pytest.mark.parametrize(
@@ -769,10 +735,7 @@ FIXTURES = {  # how to make each format's files, the path to read, and the file 
     "cameras.txt": (colmap_txt, "cameras.txt"),
     "images.txt": (colmap_txt, "images.txt"),
     "blender": (blender, "transforms_train.json"),
-    "transforms": (
-        lambda folder: write_json(folder / "transforms.json", transforms([{"file_path": "a"}], w=4, h=2)).parent,
-        "transforms.json",
-    ),
+    "transforms": (lambda folder: plain_transforms(folder).parent, "transforms.json"),
     "pinhole": (lambda folder: write_json(folder / "p.json", pinhole()), ""),
     "camera_path": (lambda folder: write_json(folder / "path.json", camera_path()), ""),
     "llff": (llff, "poses_bounds.npy"),
@@ -802,10 +765,14 @@ class Dialect:
         return CameraSet((), (), notes=("by the plug-in",))
 
 
+def with_formats(monkeypatch, *formats):
+    registry = Registry("camera format", "aaplug.io.cameras:CameraFormat", named(formats))
+    monkeypatch.setattr("aaplug.io.cameras.CAMERA_FORMATS", registry)
+
+
 def test_a_plug_in_is_asked_before_the_own_formats(tmp_path, monkeypatch):
-    own = {format.name: format for format in OWN}
-    monkeypatch.setattr("aaplug.io.cameras.CAMERA_FORMATS", Registry("camera format", own | {"dialect": Dialect()}))
-    path = write_json(tmp_path / "transforms.json", transforms([{"file_path": "a"}], w=4, h=2))
+    with_formats(monkeypatch, *OWN, Dialect())
+    path = plain_transforms(tmp_path)
     assert read_cameras(path).notes == ("by the plug-in",)
     assert read_cameras(tmp_path).notes != ("by the plug-in",)
 
@@ -826,7 +793,7 @@ def test_what_a_plug_in_reads_is_checked(tmp_path, monkeypatch, change, message)
             cameras = (replace(make_camera(), **change),)
             return CameraSet(cameras, cameras)
 
-    monkeypatch.setattr("aaplug.io.cameras.CAMERA_FORMATS", Registry("camera format", {"dialect": Careless()}))
+    with_formats(monkeypatch, Careless())
     with pytest.raises(FormatError, match=message):
         read_cameras(write_json(tmp_path / "transforms.json", {}))
 

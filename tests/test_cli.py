@@ -14,7 +14,7 @@ import torch
 from aaplug_cli.main import main
 from plyfile import PlyData
 
-from aaplug.core.cameras import BLACK
+from aaplug.core.colours import BLACK
 from aaplug.io.cameras import read_cameras
 from aaplug.io.images import image_size, write_png
 from aaplug.io.scenes import read_scene, write_scene

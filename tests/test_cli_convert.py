@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from aaplug.core.gaussians import MIP, PLAYCANVAS, Fusion
+from aaplug.core.conventions import MIP, PLAYCANVAS
+from aaplug.core.gaussians import Fusion
 from aaplug.io.scenes import read_scene, write_scene
 from tests.conftest import make_scene
 from tests.test_cli import cli, dataset  # noqa: F401 (fixtures)

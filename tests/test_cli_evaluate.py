@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from aaplug.core.digests import digest_of_scene
+from aaplug.core.gaussians import digest_of_scene
 from aaplug.io.images import image_size
 from aaplug.io.scenes import read_scene
-from aaplug.methods.recipes import RECIPES
+from aaplug.methods import RECIPES
 from aaplug.verbs.evaluate import evaluate
 from tests.test_cli import assert_refused, break_frame, break_nothing, break_photo, cli, dataset  # noqa: F401  (fixtures)
 

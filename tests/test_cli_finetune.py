@@ -13,7 +13,7 @@ import cv2
 import pytest
 from aaplug_cli.main import main
 
-from aaplug.core.gaussians import MIP
+from aaplug.core.conventions import MIP
 from aaplug.finetuning import loop
 from aaplug.io.scenes import read_scene
 from tests.test_cli import cli, dataset  # noqa: F401 (fixtures)

@@ -6,7 +6,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from importlib.metadata import version
@@ -18,15 +18,15 @@ from typing import Any
 import pytest
 
 import aaplug
-from aaplug.core.errors import FormatError, UsageError
-from aaplug.core.locks import SCRATCH, remove_left
-from aaplug.core.monitor import SILENT, Monitor
 from aaplug.evaluation.journal import Journal
+from aaplug.system.errors import FormatError, UsageError
+from aaplug.system.locks import SCRATCH_PREFIX, remove_left
+from aaplug.system.monitor import SILENT, Monitor
 from tests.test_batch import timeless
 from tests.test_cli import cli, dataset  # noqa: F401  (fixtures)
 from tests.test_executors import refuse_three
 
-cluster = pytest.importorskip("aaplug.core.cluster")  # its package is an extra
+cluster = pytest.importorskip("aaplug.system.cluster")  # its package is an extra
 
 SETTINGS = "--cameras . --views all --recipe matched --scale 0.5 1 --rasterizer eager --layout inria"
 KILLED_CLIENT = """
@@ -67,20 +67,7 @@ def started(*words: str) -> Iterator[subprocess.Popen[str]]:
 
 def line_of(process: subprocess.Popen[str], said: str) -> str:
     """The line of a process's log that holds these words; waits for it."""
-    assert process.stderr is not None
-    return next(line for line in process.stderr if said in line)
-
-
-def after(number: int, act: Callable[[], object]):
-    """`Journal.add` that acts after the call of that number."""
-    calls, add = count(), Journal.add
-
-    def adding(journal, view, measurements):
-        add(journal, view, measurements)
-        if next(calls) == number:
-            act()
-
-    return adding
+    return next(line for line in process.stderr or () if said in line)
 
 
 def deadly_once(mark: Path, item: int) -> int:
@@ -94,8 +81,8 @@ def deadly_once(mark: Path, item: int) -> int:
 @pytest.fixture(scope="module")
 def local() -> Iterator[Any]:
     """A cluster of one process of this machine."""
-    with cluster.connected("local", 1, None, Counting()) as found:
-        yield found
+    with cluster.connected("local", 1, None, Counting()) as processes:
+        yield processes
 
 
 def test_whoever_is_killed_the_bytes_are_those_of_one_process(cli, monkeypatch):  # noqa: F811
@@ -113,8 +100,9 @@ def test_whoever_is_killed_the_bytes_are_those_of_one_process(cli, monkeypatch):
         def run(killed: subprocess.Popen[str]) -> tuple[int, str]:
             """Exit code and last line of a run in which a process is killed after the first view."""
             shutil.rmtree("out", ignore_errors=True)
+            add = Journal.add
             with monkeypatch.context() as patch:
-                patch.setattr(Journal, "add", after(0, killed.kill))
+                patch.setattr(Journal, "add", lambda *line: (add(*line), killed.kill()))
                 code, _, err = cli(words)
             return code, err.splitlines()[-1]
 
@@ -128,7 +116,7 @@ def test_whoever_is_killed_the_bytes_are_those_of_one_process(cli, monkeypatch):
         remove_left.cache_clear()
         assert cli(f"{words} --resume")[0] == 0
         assert timeless(Path("out")) == whole
-        assert not list(Path("out").glob(f"{SCRATCH}*"))
+        assert not list(Path("out").glob(f"{SCRATCH_PREFIX}*"))
 
         lost = "the connection is lost; start it again, and repeat the command, with --resume where it has one"
         assert run(master) == (2, f"error: scheduler {address}: {lost}")
@@ -170,10 +158,10 @@ def test_images_and_videos_are_the_same(local, cli, monkeypatch):  # noqa: F811
 
 
 def test_items_come_in_order_until_the_first_error_and_few_are_read_ahead(local):
-    found, items = [], count()
+    results, items = [], count()
     with pytest.raises(FormatError, match=r"scene\.ply: is short"):
-        found.extend(local.map(refuse_three, items))
-    assert found == [0, 1, 4]
+        results.extend(local.map(refuse_three, items))
+    assert results == [0, 1, 4]
     assert next(items) <= 6
 
 
@@ -200,7 +188,7 @@ def test_a_worker_with_another_version_is_refused_by_name(local, monkeypatch):
 def test_a_cluster_without_workers_is_lost_after_a_while(local, monkeypatch):
     monkeypatch.setattr(local.client, "scheduler_info", lambda n_workers: {"n_workers": 0, "total_threads": 0})
     assert list(local.map(refuse_three, [1])) == [1]
-    monkeypatch.setattr(cluster, "ABSENT", -1.0)
+    monkeypatch.setattr(cluster, "ABSENT_SECONDS", -1.0)
     with pytest.raises(UsageError, match="scheduler local: has had no workers for"):
         list(local.map(refuse_three, [1]))
 
@@ -211,10 +199,12 @@ def test_a_worker_that_does_not_see_the_folder_is_named(monkeypatch, tmp_path):
         cluster._work(str(tmp_path / "work.pt"))
 
 
-def test_a_cluster_that_never_had_workers_is_refused(monkeypatch):
-    monkeypatch.setattr(cluster, "ANSWER", 0.1)
-    with pytest.raises(UsageError, match="scheduler local: has no workers; start some"):
-        cluster.connected("local", 0, None, SILENT).__enter__()
+def test_a_cluster_without_workers_or_without_a_folder_is_refused(monkeypatch):
+    monkeypatch.setattr(cluster, "ANSWER_SECONDS", 0.1)
+    folder = "output: name a folder that the workers of tcp://far:1 see, too"
+    for scheduler, said in (("local", "scheduler local: has no workers; start some"), ("tcp://far:1", folder)):
+        with pytest.raises(UsageError, match=said):
+            cluster.connected(scheduler, 0, None, SILENT).__enter__()
 
 
 REFUSED = {
@@ -225,7 +215,7 @@ REFUSED = {
 
 @pytest.mark.parametrize("address", REFUSED)
 def test_a_scheduler_that_is_not_there_is_one_line(address, cli, monkeypatch):  # noqa: F811
-    monkeypatch.setattr(cluster, "ANSWER", 0.2)
+    monkeypatch.setattr(cluster, "ANSWER_SECONDS", 0.2)
     code, out, err = cli(f"render scene.ply --cameras . -o out --rasterizer eager --scheduler {address}")
     assert (code, out, err.splitlines()[-1]) == (2, "", f"error: {REFUSED[address]}")
     assert not Path("out").exists()
@@ -236,8 +226,3 @@ def test_without_the_extra_its_name_is_told(cli, monkeypatch):  # noqa: F811
     code, _, err = cli("render scene.ply --cameras . -o out --rasterizer eager --scheduler local")
     assert code == 2
     assert err.endswith("error: --scheduler: needs the extra `cluster`: pip install 'aaplug[cluster]'\n")
-
-
-def test_evaluating_on_other_machines_needs_a_folder():
-    with pytest.raises(UsageError, match="output: name a folder that the workers of tcp://far:1 see, too"):
-        cluster.connected("tcp://far:1", 1, None, SILENT).__enter__()

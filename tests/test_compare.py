@@ -11,18 +11,18 @@ import pytest
 import torch
 
 import aaplug
-from aaplug.core.errors import AaplugError, FrameError, UsageError
-from aaplug.core.executors import ProcessesIfLong
-from aaplug.core.gaussians import MIP
-from aaplug.evaluation.engine import _Measuring
+from aaplug.core.conventions import MIP
+from aaplug.evaluation.alignment import mismatch
+from aaplug.evaluation.comparison import differences
+from aaplug.evaluation.engine import ViewMeasurer
 from aaplug.evaluation.journal import Journal
 from aaplug.evaluation.report.contact_sheet import ERROR_FULL, HEAT, error_map
-from aaplug.inspection.alignment import mismatch
-from aaplug.inspection.differences import differences
 from aaplug.io.cameras import read_cameras
 from aaplug.io.images import image_size
 from aaplug.io.scenes import bytes_of, read_scene, write_scene
 from aaplug.io.scenes.packed import half_turn_about_x
+from aaplug.system.errors import AaplugError, FrameError, UsageError
+from aaplug.system.executors import ProcessesIfLong
 from tests.conftest import make_scene
 from tests.test_cli import EYES, cli, dataset  # noqa: F401  (fixtures)
 
@@ -310,12 +310,12 @@ def test_views_measured_in_processes_are_the_same(cli, monkeypatch):  # noqa: F8
 
 def test_what_goes_to_another_process_leaves_files_behind(cli, monkeypatch):  # noqa: F811
     seen = []
-    monkeypatch.setattr(_Measuring, "__call__", lambda self, index: (seen.append(self.__getstate__()["task"]), 0 / 0))
+    monkeypatch.setattr(ViewMeasurer, "__call__", lambda self, index: (seen.append(self.__getstate__()["task"]), 0 / 0))
     with pytest.raises(ZeroDivisionError):
         aaplug.compare(["scene.ply", "scene.ply"], ".", rasterizer="eager")
     (task,) = seen
     assert all(candidate.renderer.scene.origin is None for candidate in task.candidates)
-    assert task.truth.own.scene is task.candidates[0].renderer.scene
+    assert task.truth.renderer.scene is task.candidates[0].renderer.scene
 
 
 def test_bytes_of_a_folder_of_images_are_those_of_all(tmp_path):

@@ -1,26 +1,35 @@
 """Kernels compiled ahead of time: the same results as eager code, and a cache that survives damage."""
 
+import json
 import pickle
+import shutil
+import subprocess
+import sys
 import zipfile
+from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 
-from aaplug import rasterizers as choice
-from aaplug.core import shading
-from aaplug.core.errors import UsageError
+import aaplug
+from aaplug.core import projection, shading
 from aaplug.core.kernels import EAGER, Kernel, Kernels
 from aaplug.core.projection import project
 from aaplug.core.rules import RULES_GSPLAT
 from aaplug.core.training import TrainingViews
-from aaplug.methods.recipes import RECIPES
-from aaplug.rasterizers import RASTERIZERS, Tiled, find_rasterizer
+from aaplug.methods import RECIPES
+from aaplug.methods.pixel_kernels import point
+from aaplug.rasterizers import RASTERIZERS, choice
+from aaplug.rasterizers.choice import find_rasterizer
+from aaplug.rasterizers.tiled import Tiled, binning, forward, packages
 from aaplug.rasterizers.tiled import ahead_of_time as compiled
-from aaplug.rasterizers.tiled import packages
 from aaplug.rasterizers.tiled.packages import CompiledKernels, Package
 from aaplug.rendering.renderer import Renderer
-from tests.conftest import COMPILED, make_camera, make_scene, sized
+from aaplug.system.errors import UsageError
+from aaplug.system.executors import torch_threads
+from tests.conftest import COMPILED, ROOT, make_camera, make_scene, sized
 
 ANSWER = 1e-5
 
@@ -38,8 +47,14 @@ def empty_cache(tmp_path, monkeypatch):
     return tmp_path
 
 
-@pytest.mark.parametrize("kernel", compiled.KERNELS, ids=lambda kernel: kernel.name)
+ALL_KERNELS = compiled.kernels_of([*RECIPES.values()])  # also those that `warmup` compiles on request
+each_kernel = pytest.mark.parametrize("kernel", ALL_KERNELS, ids=lambda kernel: kernel.name)
+
+
+@each_kernel
 def test_compiled_kernels_give_the_eager_results(built, kernel: Kernel):
+    if not compiled.package_path(kernel).is_file():
+        pytest.skip("this kernel is not compiled here (aaplug warmup --recipe)")
     args, twins = kernel.example(), kernel.example()
     answers = zip([*built.run(kernel, *args), *args], [*EAGER.run(kernel, *twins), *twins], strict=True)
     for fast, slow in answers:  # results, and arguments updated in place
@@ -49,7 +64,7 @@ def test_compiled_kernels_give_the_eager_results(built, kernel: Kernel):
         assert (fast.double() - slow.double()).abs().max() < 10 * ANSWER * scale
 
 
-COMPOSITING = [kernel for kernel in compiled.KERNELS if kernel.name.startswith(("composite-", "gaussian-"))]
+COMPOSITING = [kernel for kernel in ALL_KERNELS if kernel.name.startswith(("composite-", "gaussian-"))]
 
 
 @pytest.mark.parametrize("kernel", COMPOSITING, ids=lambda kernel: kernel.name)
@@ -59,9 +74,9 @@ def test_examples_show_what_compositing_computes(kernel: Kernel):
     for factor in (1.0, 1.01):
         args = kernel.example()
         args[0].mul_(factor)
-        made = EAGER.run(kernel, *args)
+        returned = EAGER.run(kernel, *args)
         written = [after for before, after in zip(given[1:], args[1:], strict=True) if not before.equal(after)]
-        results.append([*made, *written])
+        results.append([*returned, *written])
     assert results[0]
     for one, other in zip(*results, strict=True):
         assert not one.equal(other)
@@ -73,38 +88,38 @@ LOOPS = {"composite-point": 3, "composite-point-backward": 3, "gaussian-blending
 
 @pytest.mark.parametrize("name", LOOPS)
 def test_compositing_is_one_loop_over_tiles(built, name):
-    with zipfile.ZipFile(compiled.cache_folder() / f"{name}.pt2") as package:
+    (kernel,) = (kernel for kernel in ALL_KERNELS if kernel.name == name)
+    path = compiled.package_path(kernel)
+    if not path.is_file():
+        pytest.skip("this kernel is not compiled here (aaplug warmup --recipe)")
+    with zipfile.ZipFile(path) as package:
         sources = [package.read(n).decode() for n in package.namelist() if "kernel.cpp" in n]
     assert sum(source.count("for(int64_t x0=") for source in sources) == LOOPS[name]
 
 
 def test_packages_are_checked_by_one_thread_which_is_undone_after_that(built, tmp_path, monkeypatch):
-    seen, close, threads = [], compiled._close, torch.get_num_threads()
-    monkeypatch.setattr(compiled, "_mark", lambda kernel: tmp_path / kernel.name)  # as if none were known
-    monkeypatch.setattr(compiled, "_close", lambda *x: seen.append(torch.get_num_threads()) or close(*x))
-    try:
-        torch.set_num_threads(2)
-        assert compiled.load() is not None
-        assert set(seen) == {1}
+    counts, close, kernel = [], compiled._close, compiled.KERNELS[0]
+    copy = shutil.copy(compiled.package_path(kernel), tmp_path)  # without the mark that it was compared
+    monkeypatch.setattr(compiled, "_close", lambda *x: counts.append(torch.get_num_threads()) or close(*x))
+    with torch_threads(2):
+        assert compiled._is_sound(kernel, Path(copy))
+        assert set(counts) == {1}
         assert torch.get_num_threads() == 2
-    finally:
-        torch.set_num_threads(threads)
 
 
-def test_a_package_that_passed_is_compared_again_only_after_a_change(built, empty_cache, monkeypatch):
+def test_a_package_that_passed_is_compared_again_only_after_a_change(empty_cache, monkeypatch):
     kernel, results = compiled.KERNELS[0], iter([True, False])
-    monkeypatch.setattr(compiled, "_passes", lambda kernel: next(results))
-    path = compiled._path(kernel)
-    assert not compiled._is_sound(kernel), "it is not there"
-    path.parent.mkdir(parents=True)
+    monkeypatch.setattr(compiled, "_passes", lambda kernel, path: next(results))
+    path = empty_cache / "kernel.pt2"
+    assert not compiled._is_sound(kernel, path), "it is not there"
     path.write_bytes(b"package")
-    assert all(compiled._is_sound(kernel) for _ in range(3))
+    assert all(compiled._is_sound(kernel, path) for _ in range(3))
     path.write_bytes(b"another")
-    assert not compiled._is_sound(kernel)
+    assert not compiled._is_sound(kernel, path)
 
 
-WAYS = {(r.pixel.name, r.compositor, r.selection): name for name, r in RECIPES.items()}
-IMAGES = [(name, 1) for name in WAYS.values()] + [("matched", degree) for degree in (0, 2, 3)]
+PIXELS_AND_SELECTIONS = {(r.pixel.name, r.compositor, r.selection): name for name, r in RECIPES.items()}
+IMAGES = [(name, 1) for name in PIXELS_AND_SELECTIONS.values()] + [("matched", degree) for degree in (0, 2, 3)]
 
 
 @pytest.mark.parametrize(("recipe", "degree"), IMAGES)
@@ -150,7 +165,7 @@ def test_compiled_gradients_are_the_eager_ones_in_parts_and_at_once(built, at_on
 
     expected = gradients(EAGER)
     monkeypatch.setattr(packages, "ROWS", at_once)
-    monkeypatch.setattr(shading, "CHUNK", at_once)
+    monkeypatch.setattr(shading, "SPLATS_PER_CALL", at_once)
     for fast, slow in zip(gradients(built), expected, strict=True):
         assert slow.abs().max() > 0
         torch.testing.assert_close(fast, slow, rtol=0, atol=1e-4 * float(slow.abs().max()))
@@ -162,23 +177,23 @@ def test_gradients_reach_parameters_in_any_layout(built):
     for sh, means in ((scene.sh.mT.contiguous().mT, scene.means), (scene.sh, scene.means.T.contiguous().T)):
         leaves = sh.requires_grad_(), means.requires_grad_()
         rgb = shading.shade(splats, replace(scene, sh=sh, means=means), camera, built).rgb
-        found = torch.autograd.grad(rgb.square().sum(), leaves)
+        gradients = torch.autograd.grad(rgb.square().sum(), leaves)
         rgb = shading.shade(splats, replace(scene, sh=sh, means=means), camera).rgb
-        torch.testing.assert_close(found, torch.autograd.grad(rgb.square().sum(), leaves))
+        torch.testing.assert_close(gradients, torch.autograd.grad(rgb.square().sum(), leaves))
 
 
-@pytest.mark.parametrize("kernel", compiled.KERNELS, ids=lambda kernel: kernel.name)
+@each_kernel
 def test_kernels_name_the_arguments_that_they_update(kernel: Kernel):
-    args, kept = kernel.example(), kernel.example()
+    args, untouched = kernel.example(), kernel.example()
     kernel.function(*args)
-    changed = [i for i, (now, before) in enumerate(zip(args, kept, strict=True)) if not torch.equal(now, before)]
+    changed = [i for i, (now, before) in enumerate(zip(args, untouched, strict=True)) if not torch.equal(now, before)]
     assert changed == [*kernel.updates]
 
 
 def test_a_kernel_refuses_to_update_a_copy():
     kernel = Kernel("fill", lambda x: (), lambda: (torch.ones(4, 2),), ("n",), updates=(0,))
     with pytest.raises(AssertionError, match="fill would update copies"):
-        CompiledKernels({"fill": Package.of(lambda args: [], kernel)}).run(kernel, torch.ones(2, 4).T)
+        CompiledKernels(lambda kernel: Package.of(lambda args: [], kernel)).run(kernel, torch.ones(2, 4).T)
 
 
 def test_a_pickled_rasterizer_loads_the_packages_of_its_machine(built, empty_cache):
@@ -192,18 +207,91 @@ def test_an_empty_cache_loads_nothing(empty_cache):
 
 
 def test_broken_packages_load_nothing(built, empty_cache):
-    folder = compiled.cache_folder()
-    folder.mkdir(parents=True)
+    compiled.cache_folder().mkdir(parents=True)
     for kernel in compiled.KERNELS:
-        (folder / f"{kernel.name}.pt2").write_bytes(b"not a package")
+        compiled.package_path(kernel).write_bytes(b"not a package")
     assert compiled.load() is None
 
 
-def test_other_options_have_another_folder(monkeypatch):
-    before = compiled.cache_folder()
-    assert compiled.cache_folder() == before
-    monkeypatch.setattr(compiled, "OPTIONS", {"max_fusion_size": 1})
-    assert compiled.cache_folder() != before
+def paths(kernels: Sequence[Kernel] = compiled.KERNELS) -> dict[str, str]:
+    return {kernel.name: compiled.package_path(kernel).name for kernel in kernels}
+
+
+def other_polynomial(x: torch.Tensor, coefficients: tuple[float, ...]) -> torch.Tensor:
+    return x
+
+
+@pytest.mark.parametrize(
+    ("module", "name", "value", "changed"),
+    [
+        (binning, "CUTOFF_SLACK", 2e-4, {"table", "spans"}),
+        (point, "_polynomial", other_polynomial, {"composite-point", "composite-point-backward"}),
+        (point, "ROOT_OF_EXP2", (1.0, 2.0), {"composite-point", "composite-point-backward"}),
+        (point.Point, "exact", lambda *_: None, set()),
+        (projection, "JACOBIAN_MARGIN", 0.5, set()),  # nothing that is traced names it
+        (projection, "MAX_SIGMA", 1e8, {"project", "project-backward"}),
+        (shading, "COMPILED", (4,), set()),
+        (forward, "EXAMPLE_TILES", 8, {"composite-point", "composite-point-backward"}),
+    ],
+)
+def test_a_change_of_a_kernels_sources_is_a_change_of_its_package_alone(monkeypatch, module, name, value, changed):
+    before = paths()
+    assert paths() == before
+    monkeypatch.setattr(module, name, value)
+    after = paths()
+    assert {kernel for kernel in before if before[kernel] != after[kernel]} == changed
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("OPTIONS", {"max_fusion_size": 1}),
+        ("_compiler_version", lambda compiler: "g++ 99"),
+        ("_processor", lambda: "another"),
+        ("_compiler", lambda: "clang++"),
+    ],
+)
+def test_other_options_compilers_and_processors_have_other_packages(monkeypatch, name, value):
+    before = paths()
+    monkeypatch.setattr(compiled, name, value)
+    assert not {*before.values()} & {*paths().values()}
+
+
+def test_a_compiler_that_does_not_run_has_no_version():
+    assert compiled._compiler_version("no-such-compiler") == ""
+    assert compiled._compiler_version(sys.executable).startswith("Python 3.")
+
+
+def test_names_of_packages_are_the_same_in_every_process():
+    """Also where annotations of arrays are not checked, as in the user's process."""
+    program = (
+        "import json; from aaplug.methods import RECIPES; from aaplug.rasterizers.tiled.ahead_of_time import *;"
+        "kernels = kernels_of([*RECIPES.values()]);"
+        "print(json.dumps({kernel.name: package_path(kernel).name for kernel in kernels}))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert json.loads(done.stdout) == paths(ALL_KERNELS)
+
+
+def test_a_recipe_says_which_kernels_it_needs():
+    def more(name: str) -> list[str]:
+        return [kernel.name for kernel in compiled.kernels_of([RECIPES[name]])[len(compiled.KERNELS) :]]
+
+    assert [more(name) for name in ("auto", "matched", "classic", "mip")] == [[]] * 4
+    assert more("2dgs") == ["composite-surfel"]
+    assert more("analytic") == ["composite-integral"]
+    assert more("gaussian-blending") == ["gaussian-blending"]
+
+
+def test_warmup_builds_what_recipes_need(empty_cache, monkeypatch):
+    asked = []
+    monkeypatch.setattr("aaplug.verbs.warmup.build", lambda tell, recipes: asked.append([r.name for r in recipes]))
+    assert aaplug.warmup().names == [kernel.name for kernel in compiled.KERNELS]
+    assert aaplug.warmup("analytic").names[-1] == "composite-integral"
+    assert aaplug.warmup(["2dgs", RECIPES["gaussian-blending"]]).names[-1] == "gaussian-blending"
+    assert asked == [[], ["analytic"], ["2dgs", "gaussian-blending"]]
+    with pytest.raises(UsageError, match="recipe: 'mipp' is not one of"):
+        aaplug.warmup("mipp")
 
 
 @pytest.mark.parametrize("compiler", [True, False])
@@ -216,12 +304,12 @@ def test_without_packages_auto_is_eager_and_says_why(empty_cache, monkeypatch, c
 
 
 def test_many_frames_build_what_is_missing(empty_cache, monkeypatch):
-    made = CompiledKernels({})
+    kernels = CompiledKernels(lambda kernel: None)
     monkeypatch.setattr(choice, "has_compiler", lambda: True)
-    monkeypatch.setattr(choice, "build", lambda: made)
+    monkeypatch.setattr(choice, "build", lambda: kernels)
     chosen = find_rasterizer("auto", choice.FRAMES_THAT_PAY, lambda text: None)
     assert isinstance(chosen, Tiled)
-    assert chosen.kernels is made
+    assert chosen.kernels is kernels
 
 
 def test_without_a_compiler_a_build_is_refused(empty_cache, monkeypatch):
@@ -250,7 +338,7 @@ def test_a_kernel_that_does_not_compile_is_named(empty_cache, monkeypatch):
 
     monkeypatch.setattr(torch._inductor, "aoti_compile_and_package", fails)
     with pytest.raises(UsageError, match=r"warmup: torch .* cannot compile 'slots' here"):
-        compiled._build("slots")
+        compiled._build((), "slots")
 
 
 def test_an_unknown_name_lists_the_known_ones():
@@ -260,7 +348,7 @@ def test_an_unknown_name_lists_the_known_ones():
 
 def test_one_row_is_left_to_the_eager_function():
     double = Kernel("double", lambda x: (2 * x,), lambda: (torch.ones(4),), ("n",))
-    ran = CompiledKernels({"double": Package.of(lambda args: [3 * args[0]], double)})
+    ran = CompiledKernels(lambda kernel: Package.of(lambda args: [3 * args[0]], kernel))
     assert ran.run(double, torch.ones(1))[0].item() == 2
     assert ran.run(double, torch.ones(2))[0].tolist() == [3, 3]
     assert ran.run(double, torch.ones(2).double())[0].tolist() == [2, 2]

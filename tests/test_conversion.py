@@ -6,16 +6,17 @@ import pytest
 import torch
 
 from aaplug.core.cameras import Camera
-from aaplug.core.errors import UsageError
-from aaplug.core.gaussians import ANTIALIASED, CLASSIC, CONVENTIONS, MIP
+from aaplug.core.conventions import ANTIALIASED, CLASSIC, CONVENTIONS, MIP
 from aaplug.core.projection import project
 from aaplug.core.sampling import median_rates
 from aaplug.core.training import TrainingViews
 from aaplug.io.scenes import read_scene, write_scene
+from aaplug.methods import FORMS, RECIPES
+from aaplug.methods.conversion import FITTED_VARIANCE, fuse, fuse_for
 from aaplug.methods.filters.dilation import Dilation
-from aaplug.methods.recipes import RECIPES
-from aaplug.methods.viewers import FITTED_VARIANCE, FORMS, VIEWERS, fuse, fuse_for
+from aaplug.methods.viewers import VIEWERS
 from aaplug.rendering.renderer import Renderer
+from aaplug.system.errors import UsageError
 from tests.conftest import make_camera, make_scene
 
 EYES = [(0.0, -4.0, 0.0), (3.0, -3.5, 1.0), (-1.0, -2.5, 1.5), (0.5, 5.0, -1.0)]

@@ -9,19 +9,16 @@ from dataclasses import replace
 import pytest
 import torch
 
-from aaplug.core.digests import digest_of_scene
-from aaplug.methods.recipes import RECIPES
+from aaplug.core.gaussians import digest_of_scene
+from aaplug.methods import RECIPES
 from tests.conftest import make_scene, sized
 
 SCENE = sized(make_scene(5))
-SIZES = SCENE.pixel_sizes
 CHANGES = {
     "a mean": lambda: replace(SCENE, means=SCENE.means + 1e-6),
-    "no pixel sizes": lambda: replace(SCENE, pixel_sizes=None),
-    "a smallest size": lambda: replace(SCENE, pixel_sizes=replace(SIZES, smallest=SIZES.smallest + 1)),
-    "a largest size": lambda: replace(SCENE, pixel_sizes=replace(SIZES, largest=SIZES.largest + 1)),
-    "a base": lambda: replace(SCENE, pixel_sizes=replace(SIZES, base=~SIZES.base)),
     "a 3D filter": lambda: replace(SCENE, filter_3d=torch.ones(5)),
+    "no extras": lambda: replace(SCENE, extras={}),
+    "an extra column": lambda: replace(SCENE, extras={**SCENE.extras, "base_mask": torch.zeros(5)}),
 }
 
 

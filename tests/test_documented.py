@@ -1,4 +1,4 @@
-"""Whatever README and the guides show runs: every fenced block as it stands, with small files of the names it uses."""
+"""Whatever README, the guides and the examples show runs as it stands, with small files of the names that it uses."""
 
 import json
 import os
@@ -6,8 +6,6 @@ import re
 import runpy
 import shlex
 import shutil
-import subprocess
-import sys
 import tomllib
 from dataclasses import replace
 from itertools import chain
@@ -25,6 +23,7 @@ from tests.conftest import SAMPLE
 
 ROOT = Path(__file__).resolve().parents[1]
 GUIDES = sorted((ROOT / "examples" / "guides").glob("*.md"))
+EXAMPLES = sorted((ROOT / "examples").glob("[0-9]*.py"))
 GAUSSIANS = 80
 SIZE = 24  # px: side of the photographs
 TRAINING = 3  # cameras
@@ -43,10 +42,13 @@ NERFBASELINES = (
     "nerfbaselines evaluate predictions --output results.json",
 )
 ELSEWHERE = {  # commands of the tests and benches themselves, and what runs them instead
-    "python -m tests.bench.method_tables every_recipe": "ten minutes; needs scenes beside the repository",
-    "python -m tests.bench.pictures": "ten seconds; test_site.py draws the figure of the tables",
-    "python -m tests.bench.viewers": "minutes; needs Node.js and Chromium",
-    "python -m tests.bench.campaign": "about an hour",
+    "python -m tests.bench method_tables": "ten minutes; needs scenes beside the repository",
+    "python -m tests.bench pictures": "ten seconds; test_site.py draws the figure of the tables",
+    "python -m tests.bench viewers": "minutes; needs Node.js and Chromium",
+    **dict.fromkeys(
+        (f"python -m tests.bench {name}" for name in ("campaign", "odd_options", "full_disks", "kills")),
+        "about an hour in all",
+    ),
     "AAPLUG_FUZZ=10000 python -m pytest tests/test_hostile_files.py": "pytest runs it with fewer mutations",
     "python -m tests.hostile all 10000": "test_hostile_files.py runs it with fewer mutations",
     **dict.fromkeys(
@@ -97,7 +99,6 @@ BLOCKS = [
     for block in blocks_of(path)
 ]
 COMMANDS = [block for block in BLOCKS if block.language == "bash"]
-SCRIPTS = [block for block in BLOCKS if block.language == "sh"]  # of a cluster's scheduler
 PROGRAMS = [block for block in BLOCKS if block.language == "python"]
 TABLES = [block for block in BLOCKS if block.language == "toml"]
 
@@ -180,11 +181,12 @@ def here(prepared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pat
     return tmp_path
 
 
-def test_there_are_blocks_of_every_kind():
+def test_there_are_blocks_of_every_kind_and_examples():
     assert len(COMMANDS) > 15
     assert PROGRAMS
     assert TABLES
-    assert {block.language for block in BLOCKS} <= {"bash", "python", "toml", "json", "sh"}
+    assert EXAMPLES
+    assert {block.language for block in BLOCKS} <= {"bash", "python", "toml", "json"}
     assert set(ELSEWHERE) <= {line for block in COMMANDS for line in lines_of(block)}
 
 
@@ -209,15 +211,6 @@ def test_documented_commands_run(block, here, capsys):
             assert printed.out, f"{line} printed nothing"
 
 
-@pytest.mark.parametrize("block", SCRIPTS, ids=str)
-def test_documented_scripts_run(block, here):
-    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    job = os.environ | {"PATH": path, "SLURM_ARRAY_TASK_ID": "1"}
-    done = subprocess.run(["sh", "-e"], input=block.text, text=True, env=job, capture_output=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert (here / "results" / "shard-1-of-8.json").is_file()
-
-
 def lines_of(block: Block) -> list[str]:
     """The commands of a block, without comments and with continued lines joined."""
     joined = block.text.replace("\\\n", " ").splitlines()
@@ -232,6 +225,12 @@ def test_documented_programs_run(block, here):
     image = variables.get("image")
     wrote = set(os.listdir(here)) - before - {"program.py"}
     assert wrote or (image is not None and image.std() > 0.01), "the program shows nothing"
+
+
+@pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
+def test_example_runs(example, tmp_path, capsys):
+    runpy.run_path(str(example))["main"](tmp_path)
+    assert capsys.readouterr().out
 
 
 @pytest.mark.parametrize("block", TABLES, ids=str)

@@ -6,23 +6,21 @@ from pathlib import Path
 import pytest
 import torch
 
-from aaplug.core.cameras import CameraSet
-from aaplug.core.errors import UsageError
 from aaplug.core.imaging import box_average, quantised
-from aaplug.core.registry import KINDS
 from aaplug.core.training import TrainingViews
+from aaplug.evaluation import METRICS, PROTOCOLS
 from aaplug.evaluation.engine import NO_PHOTOGRAPH, Candidate, Task, candidates_of, compare, evaluate
 from aaplug.evaluation.image_store import ImageStore
 from aaplug.evaluation.metric import Metric, TimedRenderer
-from aaplug.evaluation.metrics import CONSISTENCY, ENERGY, FLICKER, METRICS, PSNR, SSIM, psnr
-from aaplug.evaluation.protocols import PROTOCOLS
+from aaplug.evaluation.metrics import CONSISTENCY, ENERGY, FLICKER, PSNR, SSIM, psnr
 from aaplug.evaluation.results import CEILING, as_csv, mean, per_view, results, scale_name, tables
-from aaplug.evaluation.truth import KEPT, Truth, back_projected, own_look
+from aaplug.evaluation.truth import KEPT, Truth, back_projected
 from aaplug.io.images import read_image, write_png
-from aaplug.methods.recipes import RECIPES, find_recipe
+from aaplug.methods import RECIPES
+from aaplug.methods.recipes import find_recipe
 from aaplug.rasterizers import RASTERIZERS
-from aaplug.rendering.renderer import Renderer
-from aaplug.verbs.compare import compare as compare_scenes
+from aaplug.rendering.renderer import Renderer, own_look
+from aaplug.system.errors import UsageError
 from tests.conftest import make_camera, make_scene
 
 
@@ -39,6 +37,16 @@ def world(tmp_path_factory):
     return look, views
 
 
+@pytest.fixture
+def look(world):
+    return world[0]
+
+
+@pytest.fixture
+def views(world):
+    return world[1]
+
+
 def drawn(look, view, recipe="classic"):
     return replace(look, recipe=RECIPES[recipe])(view).rgb
 
@@ -50,23 +58,22 @@ def task(look, views, source="photographs", protocol="default", recipes=("classi
     return Task(**({"candidates": candidates, "scales": (1.0, 0.5, 2.0), "views": views, "truth": truth} | changes))
 
 
-def test_figures_are_those_of_the_images_compared_by_hand(world):
-    look, views = world
+def test_figures_are_those_of_the_images_compared_by_hand(look, views):
     report = evaluate(task(look, views))
     assert report.recipes == (CEILING, "classic", "matched")
-    for view in views:
+    for place, view in enumerate(views):
         photo = quantised(read_image(view.photo, None))
-        ceiling = next(m for m in report.select(CEILING, 0.5) if m.view == view.name).values["PSNR"]
-        resampled = quantised(box_average(drawn(look, view).clamp(0, 1), 2))
-        assert ceiling == pytest.approx(psnr(resampled, box_average(photo, 2)), abs=1e-9)
-        for scale, truth in ((1.0, photo), (0.5, box_average(photo, 2))):
-            image = drawn(look, view.scaled(scale), "classic")
-            found = next(m for m in report.select("classic", scale) if m.view == view.name)
-            assert found.values["PSNR"] == pytest.approx(psnr(quantised(image), truth), abs=1e-9)
+        half = box_average(photo, 2)
+        for recipe, scale, image, truth in (
+            (CEILING, 0.5, box_average(drawn(look, view).clamp(0, 1), 2), half),
+            ("classic", 1.0, drawn(look, view), photo),
+            ("classic", 0.5, drawn(look, view.scaled(0.5)), half),
+        ):
+            found = report.select(recipe, scale)[place].values["PSNR"]
+            assert found == pytest.approx(psnr(quantised(image), truth), abs=1e-9)
 
 
-def test_self_truth_needs_no_photographs_and_makes_the_ceiling_perfect(world):
-    look, views = world
+def test_self_truth_needs_no_photographs_and_makes_the_ceiling_perfect(look, views):
     bare = [replace(view, photo=None) for view in views]
     report = evaluate(task(look, bare, "self"))
     assert mean(report.select(CEILING, 0.5), "PSNR") is None  # equal images
@@ -76,8 +83,7 @@ def test_self_truth_needs_no_photographs_and_makes_the_ceiling_perfect(world):
     assert mean(report.select("matched", 0.5), "PSNR") > mean(report.select("classic", 0.5), "PSNR")
 
 
-def test_work_without_a_truth_empty_or_doubled_is_refused(world):
-    look, views = world
+def test_work_without_a_truth_empty_or_doubled_is_refused(look, views):
     bare = [replace(views[0], photo=None)]
     for work, words in (
         (task(look, views, scales=()), "needs at least"),
@@ -90,8 +96,7 @@ def test_work_without_a_truth_empty_or_doubled_is_refused(world):
             evaluate(work)
 
 
-def test_reports_hold_every_view_recipe_and_scale(world):
-    look, views = world
+def test_reports_hold_every_view_recipe_and_scale(look, views):
     report = evaluate(task(look, views))
     values = per_view(report)["matched@0.5"]["PSNR"]
     assert list(values) == ["a", "b"]
@@ -113,28 +118,22 @@ def test_scales_are_written_as_people_do(scale, name):
     assert scale_name(scale) == name
 
 
-def test_evaluations_are_counted_and_fewer_where_images_are_smaller(world):
-    look, views = world
-    report = evaluate(task(look, views))
-    for recipe in ("classic", "matched"):
-        small, full = (report.select(recipe, scale)[0].evaluations for scale in (0.5, 1.0))
-        assert 0 < small < full
+@pytest.mark.parametrize("name", [n for n, r in RECIPES.items() if r.selection is None])
+def test_the_evaluations_of_every_recipe_are_counted_and_fewer_where_images_are_smaller(look, views, name):
+    report = evaluate(task(look, views[:1], recipes=(name,), scales=(0.5, 1.0), ceiling=False))
+    small, full = (report.select(name, scale)[0].evaluations for scale in (0.5, 1.0))
+    assert 0 < small < full
+
+
+def test_a_rasterizer_that_does_not_count_has_no_evaluations(look, views):
     slow = replace(look, rasterizer=RASTERIZERS["reference"])
     assert evaluate(task(slow, views[:1], scales=(0.5,))).measurements[0].evaluations is None
-
-
-@pytest.mark.parametrize("name", [n for n, r in RECIPES.items() if r.selection is None])
-def test_the_evaluations_of_every_recipe_are_counted(world, name):
-    look, views = world
-    report = evaluate(task(look, views[:1], recipes=(name,), scales=(0.5,), ceiling=False))
-    assert report.measurements[0].evaluations > 0
 
 
 FIGURES = (CONSISTENCY, ENERGY, FLICKER)
 
 
-def test_figures_without_a_photograph_are_those_taken_by_hand(world):
-    look, views = world
+def test_figures_without_a_photograph_are_those_taken_by_hand(look, views):
     report = evaluate(task(look, views, metrics=FIGURES))
     full, small = drawn(look, views[0]), drawn(look, views[0].scaled(0.5))
     values = report.select("classic", 0.5)[0].values
@@ -149,8 +148,7 @@ def test_figures_without_a_photograph_are_those_taken_by_hand(world):
     assert set(without.select("classic", 0.5)[0].values.values()) == {None}
 
 
-def test_flicker_of_supersampling_is_nearer_to_motion_alone(world):
-    look, views = world
+def test_flicker_of_supersampling_is_nearer_to_motion_alone(look, views):
     recipes = [RECIPES["ewa"], find_recipe("auto", quality="best")]
     report = evaluate(task(look, views[:1], recipes=recipes, scales=(0.25,), metrics=(FLICKER,)))
     far, near = (abs(report.select(r.name, 0.25)[0].values["flicker"] - 1) for r in recipes)
@@ -159,35 +157,24 @@ def test_flicker_of_supersampling_is_nearer_to_motion_alone(world):
 
 
 @pytest.mark.parametrize("name", ["distance", "fov"])
-def test_moved_cameras_are_compared_with_the_supersampled_look(world, name):
+def test_moved_cameras_are_compared_with_the_supersampled_look(look, views, name):
     recipes = ["classic", find_recipe("matched", rate_reference="interval")]
-    report = evaluate(task(*world, "self", name, recipes, scales=(1.0, 0.25)))
+    report = evaluate(task(look, views, "self", name, recipes, scales=(1.0, 0.25)))
     assert report.recipes == ("classic", "matched")  # the truth is its own ceiling
     classic, matched = (mean(report.select(r, 0.25), "PSNR") for r in report.recipes)
     assert matched > classic + 3
     assert report.protocol["protocol"]["scale changes"] == name
 
 
-def test_a_protocol_names_its_flavours_in_every_result(world):
-    look, views = world
-    report = evaluate(task(look, views[:1], protocol="360-zoom-out", scales=(1.0, 0.5)))
+def test_a_protocol_names_its_flavours_and_views_of_one_name_are_told_apart(look, views):
+    twins = [replace(view, name="same") for view in views]
+    report = evaluate(task(look, twins, protocol="360-zoom-out", scales=(0.5,)))
     assert results(report)["_aaplug"]["metrics"]["SSIM"] == SSIM["3dgs"].protocol
     assert "Pillow" in per_view(report)["_aaplug"]["downscale"]
-
-
-def test_views_of_one_name_are_told_apart(world):
-    look, views = world
-    twins = [replace(view, name="same") for view in views]
-    report = evaluate(task(look, twins, scales=(0.5,)))
     assert list(per_view(report)["classic@0.5"]["PSNR"]) == ["00000_same", "00001_same"]
 
 
-class StoppedError(Exception):
-    pass
-
-
-def test_an_interrupted_evaluation_continues_and_redoes_nothing(world, tmp_path, monkeypatch):
-    look, views = world
+def test_an_interrupted_evaluation_continues_and_redoes_nothing(look, views, tmp_path, monkeypatch):
     told = []
     whole = evaluate(task(look, views), tell=lambda *counts: told.append(counts), journal=tmp_path / "whole.jsonl")
     assert told == [(0, 2), (1, 2), (2, 2)]
@@ -195,13 +182,13 @@ def test_an_interrupted_evaluation_continues_and_redoes_nothing(world, tmp_path,
 
     def stop(done: int, total: int) -> None:
         if done == 1:
-            raise StoppedError
+            raise KeyboardInterrupt
 
-    with pytest.raises(StoppedError):
+    with pytest.raises(KeyboardInterrupt):
         evaluate(task(look, views), tell=stop, journal=path)
     before = path.read_bytes()
-    seen, render = [], Renderer.draw
-    monkeypatch.setattr(Renderer, "draw", lambda self, view: (seen.append(view.name), render(self, view))[1])
+    seen, draw = [], Renderer.draw
+    monkeypatch.setattr(Renderer, "draw", lambda self, view: (seen.append(view.name), draw(self, view))[1])
     report = evaluate(task(look, views), journal=path, resume=True)
     assert set(seen) == {"b"}
     assert path.read_bytes().startswith(before)
@@ -215,9 +202,8 @@ def test_an_interrupted_evaluation_continues_and_redoes_nothing(world, tmp_path,
     assert not seen
 
 
-def test_images_lie_where_3dgs_scripts_look(world, tmp_path):
-    look, views = world
-    store = ImageStore(tmp_path, shown=(1,), everything=True)
+def test_images_lie_where_3dgs_scripts_look(look, views, tmp_path):
+    store = ImageStore(tmp_path, report_views=(1,), everything=True)
     evaluate(task(look, views), images=store)
     every = sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.png"))
     assert "test/classic@0.5/renders/00000.png" in every
@@ -233,13 +219,11 @@ def test_images_lie_where_3dgs_scripts_look(world, tmp_path):
 # metrics that the registry does not know beforehand
 
 
-def test_a_new_metric_that_is_undefined_is_reported_with_its_own_words(world, monkeypatch):
+def test_a_new_metric_that_is_undefined_is_reported_with_its_own_words(look, views, monkeypatch):
     monkeypatch.setattr(METRICS, "_entries", dict(METRICS))
-    monkeypatch.setattr("aaplug.core.registry._registered", {kind: [] for kind in KINDS})
     odd = Metric("odd", "", 1.0, 2, "its protocol", lambda image, truth: None, undefined="too odd")
     nan = replace(odd, name="nan", measure=lambda image, truth: float("nan"), undefined="not finite")
     METRICS.register("odd", odd)  # and `nan` is given from Python alone
-    look, views = world
     work = task(look, views[:1], scales=(0.5,), metrics=(PSNR, odd, nan))
     report = evaluate(work, journal=views[0].photo.with_name("odd.jsonl"))
     found = report.select("classic", 0.5)[0]
@@ -252,44 +236,20 @@ def test_a_new_metric_that_is_undefined_is_reported_with_its_own_words(world, mo
 # candidates side by side
 
 
-def test_candidates_compare_as_by_hand(world):
-    look, views = world
+def test_candidates_compare_as_by_hand(look, views):
     other = replace(look, background=(1.0, 1.0, 1.0))  # so it is drawn anew
-    truth = Truth(look, memory=1e9)
-    candidates = [Candidate("own", look), Candidate("other", other)]
-    report = compare(candidates, views, (1.0, 0.5), truth)
+    report = compare([Candidate("own", look), Candidate("other", other)], views, (1.0, 0.5), Truth(look, memory=1e9))
     assert report.recipes == ("own", "other")
-    small = views[1].scaled(0.5)
-    wanted = quantised(box_average(look(views[1]).rgb.clamp(0, 1), 2).to(KEPT).float())
-    assert report.select("own", 1.0)[0].values["PSNR"] > 60  # but for the float16 of the kept truth
-    found = report.select("other", 0.5)[1].values["PSNR"]
-    assert found == pytest.approx(psnr(quantised(other(small).rgb), wanted), abs=1e-9)
-
-
-def test_each_candidate_is_drawn_with_the_bounds_of_its_own_scene(world):
-    look, views = world
-    grown = make_scene(200, seed=1)
-    bare = [replace(view, photo=None) for view in views]
-    report = compare_scenes(
-        {"original": look.scene, "again": look.scene, "grown": grown},
-        CameraSet(tuple(bare), tuple(bare)),
-        recipe="matched",
-        scale=(1.0, 0.5),
-        metric=("psnr", "ssim"),
-        rasterizer="eager",
-    ).report
-    assert report.protocol["truth"] == "reference"
-    assert mean(report.select("original", 1.0), "SSIM") == pytest.approx(1.0)
-    assert report.select("again", 0.5)[0].values == report.select("original", 0.5)[0].values
-    assert mean(report.select("original", 0.5), "PSNR") is None
-    assert mean(report.select("grown", 0.5), "PSNR") < 60
+    assert report.select("own", 1.0)[0].values["PSNR"] > 60  # but for the float16 of the cached truth
+    wanted = quantised(box_average(look(views[1]).rgb.clamp(0, 1), 2).to(CACHE_DTYPE).float())
+    expected = psnr(quantised(other(views[1].scaled(0.5)).rgb), wanted)
+    assert report.select("other", 0.5)[1].values["PSNR"] == pytest.approx(expected, abs=1e-9)
 
 
 # the truth
 
 
-def test_the_truth_without_photographs_draws_its_look_once(world, monkeypatch):
-    look, views = world
+def test_the_truth_without_photographs_draws_its_look_once(look, views, monkeypatch):
     drawings = []
     call = TimedRenderer.__call__
     monkeypatch.setattr(TimedRenderer, "__call__", lambda self, view: (drawings.append(view), call(self, view))[1])
@@ -299,43 +259,38 @@ def test_the_truth_without_photographs_draws_its_look_once(world, monkeypatch):
     assert [view.hw for view in drawings] == [(48, 64), (24, 32), (24, 32)]
 
 
-def test_a_kept_truth_is_made_once_and_a_full_memory_keeps_nothing(world):
-    look, views = world
-    kept, forgetful = Truth(look, memory=1e9), Truth(look, memory=0.0)
-    image = kept(views[0], 0.25)
-    assert kept(views[0], 0.25).equal(image)
-    assert len(kept._kept) == 1
-    assert forgetful(views[0], 0.25).equal(image)
-    assert not forgetful._kept
-    assert image.equal(Truth(look)(views[0], 0.25).to(KEPT).float())
-    namesake = replace(views[1], name=views[0].name)  # as in Blender's splits
-    assert not kept(namesake, 0.25).equal(image)
-
-
-def test_cached_images_lie_together_in_memory():
+def test_a_cached_truth_is_made_once_and_lies_with_others_in_memory(look, views):
     """Each in a block of its own kept gigabytes of freed renders from the system."""
-    cameras = [make_camera((x, -4.0, 0.5)) for x in (0.0, 1.0, 2.0)]
-    truth = Truth(own_look(make_scene(50), TrainingViews.of(make_scene(50), cameras), "eager"), memory=1e6)
-    images = [truth(camera, scale) for camera in cameras for scale in (0.5, 0.25)]
-    kept = list(truth._kept.values())
-    assert len({image.untyped_storage().data_ptr() for image in kept}) == 1
-    for image, cached in zip(images, kept, strict=True):
-        torch.testing.assert_close(image, cached.float(), rtol=0, atol=0)
-    full = Truth(truth.own, memory=float(kept[0].nbytes))
-    for camera in cameras:
-        full(camera, 0.5)
-    assert len(full._kept) == 1
+    views = [*views, replace(views[1], name=views[0].name)]  # a namesake, as in Blender's splits
+    truth = Truth(look, memory=1e9)
+    images = [truth(view, scale) for view in views[:2] for scale in (0.5, 0.25)]
+    cached = list(truth._cache.values())
+    for image, stored in zip(images, cached, strict=True):
+        torch.testing.assert_close(image, stored.float(), rtol=0, atol=0)
+    assert len({image.untyped_storage().data_ptr() for image in cached}) == 1
+    assert truth(views[2], 0.25).equal(images[3])
+    assert len(truth._cache) == 4
+    assert images[1].equal(Truth(look)(views[0], 0.25).to(CACHE_DTYPE).float())
 
 
-def test_larger_truth_has_the_averages_of_the_training_size(world):
-    look, views = world
+@pytest.mark.parametrize("room", [0, 1])
+def test_a_full_memory_caches_nothing_more(look, views, room):
+    bytes_of_one = look(views[0].scaled(0.5)).rgb.to(CACHE_DTYPE).nbytes
+    truth = Truth(look, memory=float(room * bytes_of_one))
+    first, second = (truth(view, 0.5) for view in views)
+    assert len(truth._cache) == room
+    assert truth(views[0], 0.5).equal(first)
+    assert not truth(views[1], 0.5).equal(first)
+    assert truth(views[1], 0.5).equal(second)
+
+
+def test_larger_truth_has_the_averages_of_the_training_size(look, views):
     full, larger = look(views[0]).rgb, Truth(look, enlarge=back_projected)(views[0], 2.0)
     off = [(box_average(image, 2) - full).square().mean() for image in (larger, look(views[0].scaled(2.0)).rgb)]
     assert off[0] < 0.2 * off[1]
 
 
-def test_what_a_recipe_draws_by_is_part_of_the_request(world, tmp_path):
-    look, views = world
+def test_what_a_recipe_draws_by_is_part_of_the_request(look, views, tmp_path):
     first, changed = (task(look, views[:1], recipes=[replace(RECIPES["mip"], grid=grid)]) for grid in (1, 2))
     evaluate(first, journal=tmp_path / "journal")
     with pytest.raises(UsageError, match=r"another request \(recipes_sha256 changed"):

@@ -6,17 +6,17 @@ from dataclasses import replace
 import pytest
 import torch
 
-from aaplug.core.errors import UsageError
-from aaplug.core.gaussians import PixelSizes
 from aaplug.core.projection import project, rotation_matrices
 from aaplug.core.splats import Splats2D
 from aaplug.core.training import TrainingViews
-from aaplug.methods.filters import Adaptive, AnisotropicSmoothing, ByPixelSize, Smoothing3D
-from aaplug.methods.filters.adaptive import ADAPTIVE_VARIANCE
-from aaplug.methods.filters.pixel_size import pixel_size
-from aaplug.methods.filters.smoothing import BALANCE_FLOOR, LEAST_SHARE
-from aaplug.methods.recipes import RECIPES, suited
+from aaplug.lab.adaptive import ADAPTIVE_VARIANCE, Adaptive
+from aaplug.lab.pixel_size import ByPixelSize, PixelSizes, pixel_size
+from aaplug.lab.smoothing import LEAST_SHARE, AnisotropicSmoothing
+from aaplug.methods import RECIPES
+from aaplug.methods.filters.smoothing import BALANCE_FLOOR, Smoothing3D
+from aaplug.methods.recipes import suited
 from aaplug.rendering.renderer import Renderer
+from aaplug.system.errors import UsageError
 from tests.conftest import make_camera, make_scene, make_splats, sized
 
 F64 = torch.float64

@@ -7,24 +7,33 @@ import pytest
 import torch
 from skimage.metrics import structural_similarity as ssim_of_skimage
 
-from aaplug.core.cameras import WHITE, CameraSet
-from aaplug.core.digests import digest_of_scene
-from aaplug.core.errors import FormatError, UsageError
-from aaplug.core.gaussians import Gaussians
+from aaplug.core.cameras import CameraSet
+from aaplug.core.colours import WHITE
+from aaplug.core.gaussians import Gaussians, digest_of_scene
 from aaplug.core.projection import rotation_matrices
 from aaplug.core.sampling import sampling_bounds
 from aaplug.core.training import TrainingViews
-from aaplug.evaluation.truth import MEMORY, Truth, back_projected, own_look
+from aaplug.evaluation.truth import MEMORY, Truth, back_projected
 from aaplug.finetuning import loop
-from aaplug.finetuning.densification import MIN_OPACITY, SHRINK, THRESHOLD, carried, densify
 from aaplug.finetuning.loop import advance, loss_at, run
 from aaplug.finetuning.losses import LOSSES, l1_dssim, l2, structural_similarity
 from aaplug.finetuning.parameters import RATES, between, extent, least_log_scales, leaves_of, scene_of
-from aaplug.finetuning.settings import QUICK, Settings, balanced
+from aaplug.finetuning.settings import CONSISTENCY, QUICK_SETTINGS, Settings, balance, settings_of
 from aaplug.finetuning.state import State, TuningJob, begin, load, save
 from aaplug.io.images import write_png
-from aaplug.methods.recipes import RECIPES
+from aaplug.lab.densification import (
+    MIN_GRADIENT,
+    MIN_OPACITY,
+    SPLIT_SHRINKAGE,
+    densify,
+    densify_after_step,
+    moments_after,
+)
+from aaplug.methods import RECIPES
+from aaplug.options.finetune import FinetuneOptions
 from aaplug.rasterizers import RASTERIZERS
+from aaplug.rendering.renderer import own_look
+from aaplug.system.errors import FormatError, UsageError
 from aaplug.verbs.finetune import finetune
 from tests.conftest import make_camera, make_scene
 
@@ -42,7 +51,7 @@ def make_job(
     scene = make_scene(n, seed=4, dtype=dtype)
     look = own_look(scene, TrainingViews.of(scene, VIEWS), RASTERIZERS["eager"], GREY)
     truth = Truth(look, enlarge=back_projected, memory=MEMORY)
-    return TuningJob(replace(look, recipe=RECIPES[recipe]), VIEWS, truth, settings)
+    return TuningJob(replace(look, recipe=RECIPES[recipe]), VIEWS, truth, settings, densify=densify_after_step)
 
 
 def after(job: TuningJob, steps: int | None = None) -> State:
@@ -87,7 +96,7 @@ def test_losses_are_the_papers():
 @pytest.mark.parametrize(("loss", "recipe"), [("l1-dssim", "matched"), ("l2", "mip"), ("l1-dssim", "classic")])
 def test_gradients_of_the_whole_loss_are_finite_differences(loss, recipe):
     job = make_job(25, replace(SETTINGS, loss=loss), F64, recipe)
-    white = replace(job.truth, own=replace(job.truth.own, background=WHITE))
+    white = replace(job.truth, renderer=replace(job.truth.renderer, background=WHITE))
     job = replace(job, truth=white)  # far from the kinks of L1
     generator = torch.Generator().manual_seed(2)
     leaves = {
@@ -155,13 +164,13 @@ def test_densify_clones_the_small_splits_the_large_and_prunes_the_faint():
         log_scales=torch.tensor([-6.0, -6.0, 0.0, 0.0])[:, None].repeat(1, 3),
         logit_opacities=torch.tensor([1.0, -9.0, 1.0, 1.0]),
     )
-    pull = torch.tensor([2 * THRESHOLD, 0.0, 2 * THRESHOLD, 0.0])
+    pull = torch.tensor([2 * MIN_GRADIENT, 0.0, 2 * MIN_GRADIENT, 0.0])
     change = densify(scene, pull, 1.0, torch.Generator().manual_seed(0))
     assert change.sources.tolist() == [0, 3, 0, 2, 2]
     assert change.new.tolist() == [False, False, True, True, True]
     clone, halves = change.scene[2:3], change.scene[3:]
     assert torch.equal(clone.means[0], scene.means[0])
-    torch.testing.assert_close(halves.log_scales, scene.log_scales[2:] - math.log(SHRINK))
+    torch.testing.assert_close(halves.log_scales, scene.log_scales[2:] - math.log(SPLIT_SHRINKAGE))
     assert not torch.equal(halves.means[0], halves.means[1])
     assert (change.scene.opacities >= MIN_OPACITY).all()
 
@@ -179,15 +188,14 @@ def test_halves_lie_where_the_gaussian_lies():
 def test_the_optimizer_forgets_what_is_new_alone():
     change = densify(make_scene(3), torch.tensor([1.0, 0.0, 0.0]), 1e9, torch.Generator().manual_seed(0))
     moments = {"step": torch.tensor(5.0), "exp_avg": torch.arange(1.0, 4.0)[:, None]}
-    found = carried(moments, change)
+    found = moments_after(moments, change)
     assert found["exp_avg"][:, 0].tolist() == [1.0, 2.0, 3.0, 0.0]
     assert found["step"] == 5
 
 
 def test_a_densified_scene_is_reported_with_its_own_bounds():
     """The scene before has fewer Gaussians, and `matched` reads a bound of each."""
-    job = make_job(settings=replace(SETTINGS, steps=4, densify_every=2))
-    state = after(job)
+    state = after(job := make_job(settings=replace(SETTINGS, steps=4, densify_every=2)))
     here = sampling_bounds(state.leaves["means"].detach(), job.start.training.cameras)
     assert len(state.bounds.highest) == len(state.leaves["means"]) > 60
     torch.testing.assert_close(state.bounds.highest, here.highest, rtol=0.1, atol=0.0)
@@ -195,9 +203,9 @@ def test_a_densified_scene_is_reported_with_its_own_bounds():
     found = finetune(
         make_scene(60, seed=4),
         cameras,
+        method="mipmap-gs",
         scale=(0.25,),
         steps=3,
-        anchor=30.0,
         densify_every=2,
         truth="self",
         views="view0",
@@ -206,6 +214,11 @@ def test_a_densified_scene_is_reported_with_its_own_bounds():
     assert len(found.scene) > 60
     assert [m.recipe for m in found.report.measurements] == ["before"] * 2 + ["after"] * 2
     assert all(m.values["PSNR"] for m in found.report.measurements if m.recipe == "after")
+
+
+def test_a_method_that_keeps_the_number_of_gaussians_says_so():
+    with pytest.raises(UsageError, match="densify_every: the method consistency keeps the number of Gaussians"):
+        settings_of(CONSISTENCY, FinetuneOptions(densify_every=2))
 
 
 # runs
@@ -358,6 +371,6 @@ def test_between_two_scenes_are_both_and_what_is_half_way():
 
 def test_balanced_weights_are_against_the_roots_of_errors():
     errors = {1.0: 1e-4, 0.5: 4e-4, 0.25: 1e-2, 0.125: 1.0}
-    found = balanced(QUICK, errors)
+    found = balance(QUICK_SETTINGS, errors)
     assert found.weights == pytest.approx({0.5: 50.0, 0.25: 10.0, 0.125: 1.0})
-    assert found.anchor == pytest.approx(QUICK.anchor * 100)
+    assert found.anchor == pytest.approx(QUICK_SETTINGS.anchor * 100)

@@ -2,10 +2,10 @@
 
 import pytest
 
-from aaplug.core.errors import OutputError
-from aaplug.core.executors import ProcessesIfLong, torch_threads
 from aaplug.rendering.frames import write_frames
 from aaplug.rendering.renderer import Renderer
+from aaplug.system.errors import OutputError
+from aaplug.system.executors import ProcessesIfLong, torch_threads
 from tests.conftest import ALL_RASTERIZERS, make_camera, make_scene
 
 VIEWS = [make_camera((x / 2, -4.0, 0.3), (40, 30), name=f"v{x}") for x in range(4)]
@@ -23,22 +23,14 @@ def paths(tmp_path):
 
 
 def test_files_are_the_same_whatever_the_number_of_processes(renderer, paths):
-    files, told = {}, {}
+    files, progress = [], []
     for threads in (1, 2):
-        told[threads] = []
-        tell = told[threads]
-        write_frames(
-            renderer,
-            VIEWS,
-            paths,
-            ProcessesIfLong(threads, pays_after=0.0).map,
-            overwrite=threads == 2,
-            tell=lambda *now, tell=tell: tell.append(now),
-        )
-        files[threads] = [path.read_bytes() for path in paths]
-    assert files[1] == files[2]
-    assert len(set(files[1])) == len(VIEWS)
-    assert told[1] == told[2] == [(done, 4) for done in range(5)]
+        apply = ProcessesIfLong(threads, pays_after=0.0).map
+        write_frames(renderer, VIEWS, paths, apply, overwrite=threads == 2, tell=lambda *now: progress.append(now))
+        files.append([path.read_bytes() for path in paths])
+    assert files[0] == files[1]
+    assert len(set(files[0])) == len(VIEWS)
+    assert progress == 2 * [(done, 4) for done in range(5)]
 
 
 def test_an_existing_file_is_refused_by_name(renderer, paths):
@@ -49,7 +41,7 @@ def test_an_existing_file_is_refused_by_name(renderer, paths):
 
 
 def test_little_work_starts_no_process(renderer, paths, monkeypatch):
-    monkeypatch.setattr("aaplug.core.executors.Processes", None)
+    monkeypatch.setattr("aaplug.system.executors.Processes", None)
     write_frames(renderer, VIEWS, paths, ProcessesIfLong(8).map)
     assert all(path.is_file() for path in paths)
 

@@ -7,13 +7,15 @@ import pytest
 import torch
 from torch import Tensor
 
-from aaplug.core.executors import torch_threads
 from aaplug.core.rules import RULES_3DGS, Rules
 from aaplug.core.splats import Splats2D
-from aaplug.methods.compositors import GaussianBlending
-from aaplug.methods.compositors.gaussian_blending import LEAST_VARIANCE, PLAIN, Light, behind, light_of, moments
-from aaplug.methods.pixel_kernels import INTEGRAL, POINT
-from aaplug.rasterizers import RASTERIZERS, Reference, Tiled
+from aaplug.lab.gaussian_blending import LEAST_VARIANCE, PLAIN, GaussianBlending, Light, behind, light_of, moments
+from aaplug.lab.integral import INTEGRAL
+from aaplug.methods.pixel_kernels.point import POINT
+from aaplug.rasterizers import RASTERIZERS
+from aaplug.rasterizers.reference import Reference
+from aaplug.rasterizers.tiled import Tiled
+from aaplug.system.executors import torch_threads
 from tests.conftest import ALL_RASTERIZERS, make_splats, splats_of
 
 F64 = torch.float64

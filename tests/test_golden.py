@@ -17,10 +17,12 @@ import pytest
 import torch
 
 from aaplug.core.cameras import Camera
-from aaplug.core.gaussians import ANTIALIASED, CLASSIC, Gaussians
+from aaplug.core.conventions import ANTIALIASED, CLASSIC
+from aaplug.core.gaussians import Gaussians
 from aaplug.core.rules import RULES_GSPLAT
 from aaplug.core.training import TrainingViews
-from aaplug.rasterizers import Reference, Tiled
+from aaplug.rasterizers.reference import Reference
+from aaplug.rasterizers.tiled import Tiled
 from aaplug.rendering.renderer import Renderer
 from tests.conftest import ALL_RASTERIZERS, make_camera, make_scene
 

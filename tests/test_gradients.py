@@ -11,12 +11,14 @@ from torch import Tensor
 
 from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import Gaussians
+from aaplug.core.interfaces import Rasterizer
+from aaplug.core.splats import Splats2D
 from aaplug.core.training import TrainingViews
-from aaplug.methods.filters import SCREEN_FILTERS, WORLD_FILTERS
-from aaplug.methods.pixel_kernels import POINT
+from aaplug.methods import RECIPES, SCREEN_FILTERS, WORLD_FILTERS
+from aaplug.methods.pixel_kernels.point import POINT
 from aaplug.methods.recipe import Recipe
-from aaplug.methods.recipes import RECIPES
-from aaplug.rasterizers import Reference, Tiled
+from aaplug.rasterizers.reference import Reference
+from aaplug.rasterizers.tiled import Tiled
 from aaplug.rendering.renderer import Renderer
 from tests.conftest import COMPILED, make_camera, make_scene, make_splats, sized
 
@@ -37,7 +39,7 @@ WORLDS = {
 SAMPLED = {"samples": replace(RECIPES["sa-gs"], target_rate=1.0)}
 
 
-def way(recipe: Recipe) -> tuple[object, ...]:
+def arguments(recipe: Recipe) -> tuple[object, ...]:
     """Everything that makes an image."""
     return (
         *(recipe.world, recipe.screen, recipe.pixel, recipe.compositor, recipe.selection),
@@ -46,8 +48,8 @@ def way(recipe: Recipe) -> tuple[object, ...]:
 
 
 NAMED = {f"recipe {name}": recipe for name, recipe in RECIPES.items()} | SCREENS | WORLDS | SAMPLED
-NAMES_BY_WAY = {way(recipe): name for name, recipe in NAMED.items()}  # one name where several are alike
-DIFFERENT = {name: NAMED[name] for name in NAMES_BY_WAY.values()}
+NAMES_BY_ARGUMENTS = {arguments(recipe): name for name, recipe in NAMED.items()}  # one name where several are alike
+DIFFERENT = {name: NAMED[name] for name in NAMES_BY_ARGUMENTS.values()}
 
 
 def leaves() -> dict[str, Tensor]:
@@ -82,51 +84,41 @@ def test_gradients_are_finite_differences(recipe):
     chosen, values = DIFFERENT[recipe], leaves()
     grads = torch.autograd.grad(loss(chosen, values), list(values.values()))
     fixed = {name: value.detach() for name, value in values.items()}
-    ways = {name: direction(name, value) for name, value in fixed.items()}
-    slopes = {name: (grad * ways[name]).sum().item() for name, grad in zip(NAMES, grads, strict=True)}
+    directions = {name: direction(name, value) for name, value in fixed.items()}
+    slopes = {name: (grad * directions[name]).sum().item() for name, grad in zip(NAMES, grads, strict=True)}
     least = min(abs(slope) for slope in slopes.values())
     assert least > 1e-3, f"something does not matter here: {slopes}"
-    steps = {name: STEP * least / slopes[name] * ways[name] for name in NAMES}
+    steps = {name: STEP * least / slopes[name] * directions[name] for name in NAMES}
     ends = [loss(chosen, {n: fixed[n] + sign * steps[n] for n in NAMES}).item() for sign in (1, -1)]
     slope = (ends[0] - ends[1]) / (2 * STEP)
     assert slope == pytest.approx(len(NAMES) * least, rel=RELATIVE / len(NAMES)), slopes
+
+
+def splat_gradients(rasterizer: Rasterizer, splats: Splats2D, hw: tuple[int, int]) -> tuple[Tensor, ...]:
+    names = ("means", "covs", "dets", "opacities", "rgb")
+    values = {name: getattr(splats, name).clone().requires_grad_() for name in names}
+    image = rasterizer(replace(splats, **values), hw, BLACK, POINT)
+    return torch.autograd.grad(image.rgb.square().sum() + image.alpha.sum(), list(values.values()))
 
 
 def test_gradients_of_stacked_capped_and_faint_splats_are_those_of_the_reference():
     hw = (17, 26)
     splats = make_splats(400, hw, seed=2).to(F64)
     splats = replace(splats, opacities=splats.opacities.sqrt())
-    names = ("means", "covs", "dets", "opacities", "rgb")
-    found = []
-    for rasterizer in (Tiled(), Reference()):
-        values = {name: getattr(splats, name).clone().requires_grad_() for name in names}
-        image = rasterizer(replace(splats, **values), hw, BLACK, POINT)
-        found.append(torch.autograd.grad(image.rgb.square().sum() + image.alpha.sum(), list(values.values())))
-    for a, b in zip(*found, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-9)
+    gradients = (splat_gradients(rasterizer, splats, hw) for rasterizer in (TILED, Reference()))
+    torch.testing.assert_close(*gradients, rtol=1e-9, atol=1e-9)
 
 
 def test_bands_give_the_gradients_of_one():
     splats = make_splats(400, (40, 26), seed=2).to(F64)
-
-    def of_means(memory: float) -> Tensor:
-        means = splats.means.clone().requires_grad_()
-        image = Tiled(memory=memory)(replace(splats, means=means), (40, 26), BLACK, POINT)
-        return torch.autograd.grad(image.rgb.square().sum(), means)[0]
-
-    torch.testing.assert_close(of_means(1.0), of_means(1e9), rtol=1e-12, atol=1e-12)
+    bands, one = (splat_gradients(Tiled(memory=memory), splats, (40, 26)) for memory in (1.0, 1e9))
+    torch.testing.assert_close(bands, one, rtol=1e-12, atol=1e-12)
 
 
 def test_compiled_gradients_are_the_eager_ones():
     if COMPILED is None:
         pytest.skip("the kernels are not compiled here (aaplug warmup)")
-    hw = (90, 120)
-    splats = make_splats(3000, hw, seed=5)
-    names = ("means", "covs", "dets", "opacities", "rgb")
-    found = []
-    for rasterizer in (Tiled(COMPILED), Tiled()):
-        values = {name: getattr(splats, name).clone().requires_grad_() for name in names}
-        image = rasterizer(replace(splats, **values), hw, BLACK, POINT)
-        found.append(torch.autograd.grad(image.rgb.square().sum(), list(values.values())))
-    for fast, eager in zip(*found, strict=True):
+    splats = make_splats(3000, (90, 120), seed=5)
+    gradients = (splat_gradients(rasterizer, splats, (90, 120)) for rasterizer in (Tiled(COMPILED), TILED))
+    for fast, eager in zip(*gradients, strict=True):
         assert (fast - eager).norm() < 1e-4 * eager.norm()

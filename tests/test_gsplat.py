@@ -13,17 +13,18 @@ from torch import Tensor
 
 import aaplug.gsplat
 from aaplug.core.cameras import Camera
-from aaplug.core.errors import UsageError
-from aaplug.core.gaussians import CLASSIC, Gaussians
+from aaplug.core.conventions import CLASSIC
+from aaplug.core.gaussians import Gaussians
 from aaplug.core.projection import rotation_matrices
 from aaplug.core.rules import RULES_GSPLAT
 from aaplug.core.splats import Render
 from aaplug.core.training import TrainingViews
 from aaplug.gsplat import rasterization
 from aaplug.gsplat.arguments import FIXED
-from aaplug.methods.filters import Matched
-from aaplug.methods.recipes import RECIPES
+from aaplug.methods import RECIPES
+from aaplug.methods.filters.matched import Matched
 from aaplug.rendering.renderer import Renderer
+from aaplug.system.errors import UsageError
 from tests.conftest import make_camera, make_scene
 
 F64 = torch.float64
@@ -141,26 +142,6 @@ def test_gradients_of_projection_equal_gsplats(reference, given):
         b = (b + b.mT).triu() - torch.diag_embed(b.diagonal(dim1=1, dim2=2)) if name == "covars" else b
         assert (a - b).abs().max() < 1e-4 * b.abs().max(), name
         torch.testing.assert_close(a, b, rtol=1e-7, atol=1e-7 * float(b.abs().max()))
-
-
-@pytest.mark.parametrize("packed", [True, False])
-def test_the_table_of_tiles_equals_gsplats(reference, packed):
-    _, _, meta = rasterization(**gaussians(), **two_views(), packed=False, tile_size=8, rasterizer=Nothing())
-    grid = meta["tile_width"], meta["tile_height"]
-    assert grid == (5, 4)
-    counts, ids, flatten = reference._isect_tiles(
-        *(meta[name].float() if name != "radii" else meta[name] for name in ("means2d", "radii", "depths")), 8, *grid
-    )
-    if packed:
-        shown = (meta["radii"] > 0).all(dim=2)
-        counts = counts[shown]
-        flatten = (shown.flatten().cumsum(0) - 1)[flatten.long()].int()
-        _, _, meta = rasterization(**gaussians(), **two_views(), tile_size=8, rasterizer=Nothing())
-    torch.testing.assert_close(meta["tiles_per_gauss"], counts.int())
-    torch.testing.assert_close(meta["isect_ids"], ids)
-    torch.testing.assert_close(meta["flatten_ids"], flatten.int())
-    offsets = reference._isect_offset_encode(ids, 2, *grid)
-    torch.testing.assert_close(meta["isect_offsets"], offsets.int())
 
 
 def test_arguments_have_gsplats_names_and_defaults():
@@ -288,7 +269,7 @@ def test_packed_and_unpacked_tables_hold_the_same():
     torch.testing.assert_close((image, alpha), others[:2])
     meta, at = others[2], (packed["camera_ids"], packed["gaussian_ids"])
     assert meta.keys() == packed.keys()
-    for name in ("radii", "means2d", "depths", "conics", "opacities", "tiles_per_gauss"):
+    for name in ("radii", "means2d", "depths", "conics", "opacities"):
         torch.testing.assert_close(packed[name], meta[name][at])
     assert meta["means2d"].shape == (2, 40, 2)
     assert (meta["radii"][:, 0] == 0).all()
@@ -313,7 +294,6 @@ def test_batches_of_scenes_are_drawn_one_by_one(packed):
     poses = {name: views[name].expand(2, *views[name].shape) for name in ("viewmats", "Ks")}
     image, alpha, meta = rasterization(**together, **views | poses, packed=packed)
     assert alpha.shape == (2, 2, SIZE[1], SIZE[0], 1)
-    assert meta["isect_offsets"].shape == (2, 2, 2, 3)
     assert meta["n_batches"] == 2
     for i, scene in enumerate(scenes):
         alone, _, own = rasterization(**scene, **views, packed=packed)
@@ -392,21 +372,6 @@ def test_absolute_gradients_are_summed_over_pixels(packed):
     means2d.absgrad.zero_()
     parts.sum().backward()
     torch.testing.assert_close(means2d.absgrad, expected)
-
-
-def test_sparse_gradients_hold_the_same_values():
-    found = []
-    for sparse in (False, True):
-        values = gaussians()
-        values["means"][0] += 100
-        names = ("means", "quats", "scales")
-        leaves = [values[name].requires_grad_() for name in names]
-        image, _, meta = rasterization(**values, **two_views(), sparse_grad=sparse)
-        found.append(torch.autograd.grad(image.square().sum(), leaves))
-    for dense, sparse in zip(*found, strict=True):
-        assert sparse.is_sparse
-        torch.testing.assert_close(sparse.to_dense(), dense)
-        torch.testing.assert_close(sparse.indices()[0], meta["gaussian_ids"].unique())
 
 
 # ----------------------------------------------------------------------------------------------------------- training
@@ -528,6 +493,7 @@ WRONG = {
     "relative_rate: expected numbers above 0, got -1.0": {"rasterize_mode": "matched", "relative_rate": -1.0},
     "camera_model: only pinhole is supported on the CPU (pinhole cameras), got fisheye": {"camera_model": "fisheye"},
     "distributed: only False is supported": {"distributed": True},
+    "sparse_grad: only False is supported": {"sparse_grad": True},
     "with_ut: only False is supported": {"with_ut": True},
     "radial_coeffs: only None is supported": {"radial_coeffs": torch.zeros(2, 6)},
     "heliocentric: is not an argument of gsplat's rasterization": {"heliocentric": 1},

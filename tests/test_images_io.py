@@ -5,6 +5,7 @@ import os
 import struct
 import time
 import zlib
+from contextlib import suppress
 from pathlib import Path
 
 import cv2
@@ -16,14 +17,12 @@ from hypothesis import strategies as st
 from PIL import Image
 
 import aaplug
-from aaplug.core.errors import FormatError
 from aaplug.core.imaging import quantised
 from aaplug.io.images import image_size, read_image, read_rgba, write_png
 from aaplug.io.photographs import read_photo
+from aaplug.system.errors import FormatError
 from tests.conftest import memory_taken, needs_peak_memory
 
-DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
-needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the real scenes are not here")
 WHITE, BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
 
 
@@ -47,14 +46,10 @@ def test_reading_a_written_png_gives_the_quantised_image(tmp_path: Path, bit_dep
     write_png(tmp_path / "a.png", rgb, bit_depth)
     assert torch.equal(read_image(tmp_path / "a.png", None), quantised(rgb, bit_depth))
     assert image_size(tmp_path / "a.png") == (7, 5)
-
-
-@pytest.mark.parametrize("bit_depth", [8, 16])
-def test_every_code_survives(tmp_path: Path, bit_depth: int):
     codes = torch.arange(2**bit_depth).reshape(-1, 256, 1).expand(-1, -1, 3)
     rgb = codes.float() / (2**bit_depth - 1)
-    write_png(tmp_path / "a.png", rgb, bit_depth)
-    assert torch.equal(read_image(tmp_path / "a.png", None), rgb)
+    write_png(tmp_path / "codes.png", rgb, bit_depth)
+    assert torch.equal(read_image(tmp_path / "codes.png", None), rgb), "every code survives"
 
 
 def test_colours_are_rgb_and_rows_run_down(tmp_path: Path):
@@ -69,10 +64,6 @@ def test_alpha_is_composited_in_float(tmp_path: Path):
     got = read_image(path, (0.5, 0.25, 1.0))[0, 0]
     expected = [(10 / 255) * 0.2 + 0.4, (20 / 255) * 0.2 + 0.2, (30 / 255) * 0.2 + 0.8]
     assert got.tolist() == pytest.approx(expected, abs=1e-7)
-
-
-def test_a_transparent_image_needs_a_background(tmp_path: Path):
-    path = save(tmp_path / "a.png", np.full((2, 2, 4), 255, np.uint8))
     with pytest.raises(FormatError, match=r"a\.png: is transparent.*pass `background`"):
         read_image(path, None)
 
@@ -98,33 +89,24 @@ def test_an_orientation_tag_moves_no_pixel(tmp_path: Path):
     assert (got[:, :12] > 0.9).all()
 
 
-@pytest.mark.parametrize(("mode", "suffix"), [("CMYK", "tiff"), ("LA", "tiff"), ("F", "tiff")])
-def test_samples_that_would_be_misread_are_refused(tmp_path: Path, mode: str, suffix: str):
-    Image.new(mode, (4, 4)).save(tmp_path / f"a.{suffix}")
+@pytest.mark.parametrize("mode", ["CMYK", "LA", "F"])
+def test_samples_that_would_be_misread_are_refused(tmp_path: Path, mode: str):
+    Image.new(mode, (4, 4)).save(tmp_path / "a.tiff")
     with pytest.raises(FormatError, match="save it"):
-        read_image(tmp_path / f"a.{suffix}", WHITE)
+        read_image(tmp_path / "a.tiff", WHITE)
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".webp", ".tiff", ".bmp"])
 def test_a_damaged_image_is_one_silent_error(tmp_path: Path, suffix: str, capfd: pytest.CaptureFixture[str]):
     whole = save(tmp_path / f"a{suffix}", (random_image(64, 64).numpy() * 255).astype(np.uint8))
     content = whole.read_bytes()
-    for cut in [*range(0, 40, 3), len(content) // 2, len(content) - 30]:
-        whole.write_bytes(content[:cut])
-        with pytest.raises(FormatError, match=f"a{suffix}"):
-            read_image(whole, None)
-    assert capfd.readouterr() == ("", "")
-
-
-def test_a_jpeg_with_lost_pixels_is_refused(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
-    pixels = (random_image(64, 64).numpy() * 255).astype(np.uint8)
-    path = save(tmp_path / "a.jpg", pixels)
-    content = bytearray(path.read_bytes())
     middle = len(content) // 2
-    content[middle : middle + 2] = b"\xff\xd9"  # an end marker amid the scan
-    path.write_bytes(content)
-    with pytest.raises(FormatError, match=r"a\.jpg: is damaged or cut short"):
-        read_image(path, None)
+    lost = content[:middle] + b"\xff\xd9" + content[middle + 2 :]  # an end marker amid the scan of a JPEG
+    spoiled = [lost] if suffix == ".jpg" else []
+    for data in [*spoiled, *(content[:cut] for cut in [*range(0, 40, 3), middle, len(content) - 30])]:
+        whole.write_bytes(data)
+        with pytest.raises(FormatError, match=rf"a\{suffix}: is (damaged|not an image)"):
+            read_image(whole, None)
     assert capfd.readouterr() == ("", "")
 
 
@@ -154,10 +136,7 @@ def test_junk_and_missing_files_are_named(tmp_path: Path):
 
 
 def test_a_huge_image_is_refused_by_its_header(tmp_path: Path):
-    header = struct.pack(">IIBBBBB", 16385, 16384, 8, 2, 0, 0, 0)
-    bomb = b"\x89PNG\r\n\x1a\n" + png_chunk(b"IHDR", header)
-    bomb += png_chunk(b"IDAT", zlib.compress(bytes(100))) + png_chunk(b"IEND", b"")
-    (tmp_path / "bomb.png").write_bytes(bomb)
+    (tmp_path / "bomb.png").write_bytes(animated((16385, 16384), (7, 5), SHORT))
     with pytest.raises(FormatError, match="16385x16384"):
         read_image(tmp_path / "bomb.png", None)
 
@@ -203,8 +182,7 @@ def test_a_file_far_larger_than_its_pixels_is_not_read(tmp_path: Path):
 
 def test_pixels_of_another_size_than_the_headers_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     path = save(tmp_path / "a.png", np.zeros((5, 7, 3), np.uint8))
-    decoder = "aaplug.io.images.cv2.imdecode"
-    monkeypatch.setattr(decoder, lambda data, flags: np.zeros((7, 5, 3), np.uint8))
+    monkeypatch.setattr("aaplug.io.images.cv2.imdecode", lambda data, flags: np.zeros((7, 5, 3), np.uint8))
     with pytest.raises(FormatError, match=r"a\.png: has 5x7 px where its header says 7x5"):
         read_image(path)
 
@@ -212,11 +190,11 @@ def test_pixels_of_another_size_than_the_headers_are_refused(tmp_path: Path, mon
 SIDE = 3000  # px
 SLACK = 48 * 2**20  # bytes: bands of rows at work, the file
 RESULT = 3 * 4  # bytes a pixel
-BYTES = [("RGB", "PNG", 3 + RESULT), ("RGBA", "PNG", 4 + RESULT), ("RGB", "WEBP", 3 + RESULT)]
+BYTES = [("RGB", "PNG", 3 + RESULT), ("RGBA", "PNG", 4 + RESULT), ("RGB", "WEBP", 3 + RESULT), ("", "animation", 0)]
 BOMB = """
 from pathlib import Path
 from PIL import Image
-from aaplug.core.errors import FormatError
+from aaplug.system.errors import FormatError
 from aaplug.io.images import read_image, read_rgba
 from tests.test_images_io import SHORT, SIDE, animated
 def attempt(path):
@@ -235,15 +213,11 @@ if not path.exists():
 @needs_peak_memory
 @pytest.mark.parametrize(("mode", "kind", "bytes_a_pixel"), BYTES)
 def test_memory_is_the_samples_and_the_result(tmp_path: Path, mode: str, kind: str, bytes_a_pixel: int):
-    """Converting the whole image at once took three times the result."""
-    Image.new(mode, (SIDE, SIDE)).save(tmp_path / "a", kind)
+    """Converting the whole image at once took three times the result; an animation that claims much takes little."""
+    if kind != "animation":
+        Image.new(mode, (SIDE, SIDE)).save(tmp_path / "a", kind)
     prepare = BOMB.format(folder=str(tmp_path), name="a")
     assert memory_taken(prepare, "attempt(path)") < SLACK + bytes_a_pixel * SIDE**2
-
-
-@needs_peak_memory
-def test_an_animation_that_claims_much_takes_little(tmp_path: Path):
-    assert memory_taken(BOMB.format(folder=str(tmp_path), name="a"), "attempt(path)") < SLACK
 
 
 def test_between_pillows_limit_and_ours_a_size_is_just_a_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -262,10 +236,8 @@ def test_noise_in_an_image_never_escapes(tmp_path_factory, noise: bytes, kind: s
     content.write(noise)
     path = tmp_path_factory.getbasetemp() / "noise"
     path.write_bytes(content.getvalue())
-    try:
+    with suppress(FormatError):  # and nothing else
         assert read_image(path, WHITE).shape[2] == 3
-    except FormatError:
-        return  # and nothing else
 
 
 def test_paths_are_text_too(tmp_path: Path):
@@ -277,13 +249,12 @@ def test_paths_are_text_too(tmp_path: Path):
     assert torch.equal(read_rgba(path)[..., :3], rgb)
 
 
-@needs_data
 @pytest.mark.data
-def test_real_photographs_are_read():
-    chair = read_image(DATA / "chair" / "test" / "r_0.png", WHITE)
+def test_real_photographs_are_read(shared_data: Path):
+    chair = read_image(shared_data / "chair" / "test" / "r_0.png", WHITE)
     assert chair.shape == (800, 800, 3)
     assert chair[0, 0].tolist() == [1, 1, 1]
-    photograph = next((DATA / "snowmiku" / "images").iterdir())
+    photograph = next((shared_data / "snowmiku" / "images").iterdir())
     assert image_size(photograph) == (984, 740)
     assert read_image(photograph, None).shape == (740, 984, 3)
 

@@ -8,13 +8,14 @@ import pytest
 import torch
 
 from aaplug.core.cameras import Camera
-from aaplug.core.errors import FormatError, FrameError, UsageError
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.training import TrainingViews
-from aaplug.inspection.survey import Histogram, check_frame_of, survey
-from aaplug.io.scenes import open_scene, read_scene, write_parts, write_scene
-from aaplug.methods.filters import NYQUIST_VARIANCE
-from aaplug.methods.viewers import FORMS, fuse
+from aaplug.evaluation.survey import Histogram, check_frame_of, survey
+from aaplug.io.scenes import read_scene, write_parts, write_scene
+from aaplug.methods import FORMS
+from aaplug.methods.conversion import fuse
+from aaplug.methods.filters.smoothing import NYQUIST_VARIANCE
+from aaplug.system.errors import FormatError, FrameError, UsageError
 from aaplug.verbs.in_parts import convert_parts
 from tests.conftest import make_camera, make_scene
 
@@ -45,7 +46,7 @@ def test_parts_are_converted_as_the_whole_is(tmp_path: Path, wide_scene, cameras
     training = TrainingViews.of(scene, cameras)
     assert 0 < training.bounds.seen.sum() < len(scene)
     write_scene(tmp_path / "whole.ply", fuse(scene, training, FORMS[form]))
-    opened, told = open_scene(path), []
+    opened, told = read_scene(path), []
     parts = convert_parts(opened, cameras, FORMS[form], tell=lambda *x: told.append(x), size=SIZE, threads=2)
     write_parts(tmp_path / "parts.ply", parts, opened.count)
     heads = [(tmp_path / n).read_bytes().split(b"end_header")[0] for n in ("parts.ply", "whole.ply")]
@@ -59,7 +60,7 @@ def test_parts_are_converted_as_the_whole_is(tmp_path: Path, wide_scene, cameras
 def test_a_stored_filter_is_fused_in_parts_without_cameras(tmp_path: Path):
     path = saved(tmp_path, replace(make_scene(100), filter_3d=torch.rand(100) * 0.1))
     whole = fuse(read_scene(path), None, FORMS["mip-splatting"])
-    parts = list(convert_parts(open_scene(path), (), FORMS["mip-splatting"], size=SIZE))
+    parts = list(convert_parts(read_scene(path), (), FORMS["mip-splatting"], size=SIZE))
     for field in ("log_scales", "logit_opacities"):
         together = torch.cat([getattr(part, field) for part in parts])
         torch.testing.assert_close(together, getattr(whole, field))
@@ -78,7 +79,7 @@ def test_a_failure_in_a_late_part_leaves_no_file(tmp_path: Path, cameras):
     at = len(data) - 10 * stride
     data[at : at + 4] = b"\xff\xff\xff\x7f"
     path.write_bytes(data)
-    opened = open_scene(path)
+    opened = read_scene(path)
     with pytest.raises(FormatError, match="row 90 has NaN in x"):
         write_parts(tmp_path / "out.ply", convert_parts(opened, cameras, FORMS["matched-energy"], size=SIZE), 100)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["in.ply"]
@@ -87,20 +88,20 @@ def test_a_failure_in_a_late_part_leaves_no_file(tmp_path: Path, cameras):
 def test_discs_are_not_converted(tmp_path: Path, cameras):
     path = saved(tmp_path, replace(make_scene(5), flat=True))
     with pytest.raises(UsageError, match="2D Gaussians"):
-        list(convert_parts(open_scene(path), cameras, FORMS["matched-energy"]))
+        list(convert_parts(read_scene(path), cameras, FORMS["matched-energy"]))
 
 
 def test_strangers_are_noticed_on_a_sample(tmp_path: Path, cameras):
     path = saved(tmp_path, replace(make_scene(500), means=make_scene(500).means + 100))
     with pytest.raises(FrameError, match="different frames"):
-        check_frame_of(open_scene(path), cameras, 0.5)
+        check_frame_of(read_scene(path), cameras, 0.5)
     near = tmp_path / "near.ply"
     write_scene(near, make_scene(500))
-    assert check_frame_of(open_scene(near), cameras, 0.5) > 0.9
+    assert check_frame_of(read_scene(near), cameras, 0.5) > 0.9
 
 
 def test_a_survey_finds_what_the_whole_shows(tmp_path: Path, wide_scene, cameras):
-    opened = open_scene(saved(tmp_path, wide_scene))
+    opened = read_scene(saved(tmp_path, wide_scene))
     found, scene = survey(opened, cameras), read_scene(opened.path)
     bounds = TrainingViews.of(scene, cameras).bounds
     middle = scene.scales.median(dim=1).values
@@ -118,7 +119,7 @@ def test_a_survey_counts_what_cannot_be_used(tmp_path: Path):
     data = bytearray(path.read_bytes())
     data[-4:] = b"\xff\xff\xff\x7f"  # the last row's last number
     path.write_bytes(data)
-    found = survey(open_scene(path))
+    found = survey(read_scene(path))
     assert (found.count, found.faults) == (19, {"NaN in rot_3": 1})
 
 

@@ -8,10 +8,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from aaplug.core.gaussians import ANTIALIASED, CLASSIC, CONVENTIONS, MIP
+from aaplug.core.conventions import ANTIALIASED, CLASSIC, CONVENTIONS, MIP
 from aaplug.io.cameras import read_cameras
-from aaplug.io.scenes import open_scene, read_scene, write_scene
-from aaplug.methods.viewers import FORMS, fuse
+from aaplug.io.scenes import read_scene, write_scene
+from aaplug.methods import FORMS
+from aaplug.methods.conversion import fuse
 from tests.scene_files import ORACLE
 
 OLDEST = 3  # major version: before, it wrote .spz in other axes and without a flag
@@ -71,7 +72,7 @@ def test_what_survives_splat_transform_is_whether_training_compensated(suffix, c
         words = [SPLAT_TRANSFORM, "-q", "-w", "-g", "cpu", str(a), str(b)]
         subprocess.run(words, check=True, capture_output=True, timeout=120)
     for path in (packed, unpacked):
-        found = open_scene(path)
+        found = read_scene(path)
         assert found.convention == (MIP if convention.compensated else CLASSIC)
         assert ("its kernel is not recorded" in found.evidence) == convention.compensated
 

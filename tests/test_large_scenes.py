@@ -6,13 +6,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from aaplug.core.errors import FormatError
 from aaplug.core.gaussians import Gaussians
 from aaplug.io.images import read_image
-from aaplug.io.scenes import open_scene, write_scene
+from aaplug.io.scenes import read_scene, write_scene
 from aaplug.io.scenes.harmonics import without_harmonics
 from aaplug.rendering import renderer as rendering
 from aaplug.rendering.renderer import Renderer
+from aaplug.system.errors import FormatError
 from aaplug.verbs import inputs
 from aaplug.verbs.render import render
 from tests.conftest import make_camera, make_scene, memory_taken, needs_peak_memory
@@ -38,7 +38,7 @@ def in_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("in_chunks")
 @pytest.mark.parametrize("recipe", ["classic", "auto", "mip-splatting"])
 def test_images_are_the_same_to_the_bit(tmp_path: Path, recipe: str):
-    opened = open_scene(written(tmp_path)[0])
+    opened = read_scene(written(tmp_path)[0])
     held = Renderer.of(opened.whole(), VIEWS, recipe)
     scene, harmonics = without_harmonics(opened)
     read = replace(Renderer.of(scene, VIEWS, recipe), harmonics=harmonics)
@@ -54,7 +54,7 @@ def test_rows_that_are_left_out_shift_no_colours(tmp_path: Path):
     spoiled = scene.sh.clone()
     spoiled[[0, 5, 1999], 7, 1] = torch.inf
     write_scene(path, replace(scene, sh=spoiled), overwrite=True)
-    opened = open_scene(path)
+    opened = read_scene(path)
     with pytest.raises(FormatError, match=r"scene\.ply: row 0 \(and 2 more\) has Inf in f_rest_21"):
         without_harmonics(opened)
     held = Renderer.of(opened.whole(drop_bad=True), VIEWS, "classic")
@@ -66,7 +66,7 @@ def test_rows_that_are_left_out_shift_no_colours(tmp_path: Path):
 
 def test_a_file_that_changes_is_noticed(tmp_path: Path):
     path, scene = written(tmp_path)
-    kept, harmonics = without_harmonics(open_scene(path))
+    kept, harmonics = without_harmonics(read_scene(path))
     write_scene(path, scene[:2000], overwrite=True)
     with pytest.raises(FormatError, match="changed while it was being read"):
         replace(Renderer.of(kept, VIEWS, "classic"), harmonics=harmonics)(VIEWS[0])
@@ -92,11 +92,11 @@ def test_the_command_draws_a_large_scene_so(tmp_path: Path, monkeypatch: pytest.
 
 MADE = """
 from pathlib import Path
-from aaplug.io.scenes import open_scene, write_scene
+from aaplug.io.scenes import read_scene, write_scene
 from aaplug.io.scenes.harmonics import without_harmonics
 from tests.conftest import make_scene
 path = Path({path!r})
-without_harmonics(open_scene(path))
+without_harmonics(read_scene(path))
 path = path.with_name("large.ply")
 write_scene(path, make_scene({count}, degree=3))
 """
@@ -105,5 +105,5 @@ write_scene(path, make_scene({count}, degree=3))
 @needs_peak_memory
 def test_memory_holds_no_harmonics(tmp_path: Path):
     prepare = MADE.format(path=str(written(tmp_path)[0]), count=COUNT)
-    taken = memory_taken(prepare, "scene = without_harmonics(open_scene(path))")
+    taken = memory_taken(prepare, "scene = without_harmonics(read_scene(path))")
     assert taken < SLACK + A_GAUSSIAN * COUNT

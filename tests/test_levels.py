@@ -13,19 +13,19 @@ import torch
 import aaplug
 import aaplug.core.projection
 from aaplug.core.cameras import CameraSet
-from aaplug.core.errors import FrameError, OutputError, UsageError
-from aaplug.core.executors import torch_threads
-from aaplug.core.gaussians import ANTIALIASED, CLASSIC, MIP, Gaussians
+from aaplug.core.conventions import ANTIALIASED, CLASSIC, MIP
+from aaplug.core.gaussians import Gaussians
 from aaplug.core.projection import project
 from aaplug.evaluation.metrics import psnr
 from aaplug.io.scenes import read_scene
-from aaplug.levels.clusters import MAX_OPACITY, merged_pairs, seen
-from aaplug.levels.covariances import area, areas, covariances, packed, quats_of, unpacked
-from aaplug.levels.merging import Goal, merged, merged_in_chunks
-from aaplug.levels.pairing import MOST_COST, costs, edges_below, matched
-from aaplug.levels.rates import rates_of
-from aaplug.methods.viewers import MERGED, blurring
+from aaplug.levels.clusters import MAX_OPACITY, clusters_of, merge_pairs, rates_of
+from aaplug.levels.covariances import area, areas, covariances, pack, quats_of, unpack
+from aaplug.levels.merging import Goal, merge, merge_in_chunks
+from aaplug.levels.pairing import MAX_COST, costs, edges_below, matching
+from aaplug.methods.conversion import MERGED, blurring
 from aaplug.rendering.renderer import Renderer
+from aaplug.system.errors import FrameError, OutputError, UsageError
+from aaplug.system.executors import torch_threads
 from tests.conftest import make_camera, make_scene
 from tests.test_cli import cli, dataset  # noqa: F401 (fixtures)
 
@@ -42,7 +42,7 @@ def pair(opacity: float, apart: float, size: float = 0.2) -> Gaussians:
 
 
 def merged_to(count: int, scene: Gaussians, rate: float = RATE) -> Gaussians:
-    return merged(scene, torch.full((len(scene),), rate), Goal.of_count(count, scene))
+    return merge(scene, torch.full((len(scene),), rate), Goal.of_count(count, scene))
 
 
 def energies(scene: Gaussians) -> torch.Tensor:
@@ -66,8 +66,8 @@ def test_a_merged_pair_alone_keeps_the_integral_of_its_alpha():
     """Against a fine grid: the closed form a + b - a b, without a renderer's cut-off."""
     scene = pair(0.7, 0.25)
     rates = torch.full((2,), 1e4)  # training's dilation vanishes
-    clusters = seen(scene, rates)
-    both = merged_pairs(clusters[:1], clusters[1:])
+    clusters = clusters_of(scene, rates)
+    both = merge_pairs(clusters[:1], clusters[1:])
     x = torch.linspace(-2, 2, 401, dtype=torch.float64)
     found = []
     for plane in ((0, 1), (1, 2), (2, 0)):
@@ -85,8 +85,8 @@ def test_opaque_pairs_never_exceed_the_cap_and_grow_instead():
     scene = pair(0.99, 0.6)
     one = merged_to(1, scene)
     assert one.opacities.item() == pytest.approx(MAX_OPACITY, abs=1e-6)
-    plain = seen(scene, torch.full((2,), RATE))
-    moments = merged_pairs(plain[:1], plain[1:])
+    plain = clusters_of(scene, torch.full((2,), RATE))
+    moments = merge_pairs(plain[:1], plain[1:])
     assert moments.opacities.item() > 1
     assert area(covariances(one)).item() > area(moments.covs).item() * 1.02
 
@@ -126,8 +126,8 @@ def test_counts_are_met_exactly(count):
 def test_equal_gaussians_are_merged_too():
     """Equal costs must not leave every cluster preferring its neighbour."""
     scene = make_scene(1)[torch.zeros(200, dtype=torch.long)]
-    clusters = seen(scene, torch.full((200,), RATE))
-    pairs = matched(edges_below(clusters, 1.0, math.inf), 200)
+    clusters = clusters_of(scene, torch.full((200,), RATE))
+    pairs = matching(edges_below(clusters, 1.0, math.inf), 200)
     assert len(pairs) > 60
     assert len(set(pairs.one.tolist()) | set(pairs.other.tolist())) == 2 * len(pairs)
     assert len(merged_to(3, scene)) == 3
@@ -158,7 +158,7 @@ def test_what_is_large_stays_and_what_is_small_is_merged():
     small.means[:] = 0.02 * small.means + 3
     small.log_scales[:] = math.log(0.002)
     scene = Gaussians(*(torch.cat([getattr(s, n) for s in (large, small)]) for n in large.columns))
-    found = merged(scene, torch.full((450,), RATE), Goal.of_level(1))
+    found = merge(scene, torch.full((450,), RATE), Goal.of_level(1))
     near = found.means.min(dim=1).values > 2
     assert int((~near).sum()) > 45
     assert int(near.sum()) < 40
@@ -169,7 +169,7 @@ def test_what_falls_below_a_size_is_merged_whatever_it_changes():
     scene = replace(make_scene(4), means=near, log_scales=torch.full((4, 3), math.log(0.01)))
     goals = [Goal(0.5, tolerance=1e-12, smallest=px) for px in (0.0, 0.5, 100.0)]
     everywhere, one = torch.full((4,), RATE), torch.zeros(4, dtype=torch.int64)
-    counts = [len(merged_in_chunks(scene, everywhere, one, goal).scene) for goal in goals]
+    counts = [len(merge_in_chunks(scene, everywhere, one, goal)[0]) for goal in goals]
     assert counts == [4, 3, 1]
 
 
@@ -177,7 +177,7 @@ def test_a_lighter_scene_looks_like_the_scene(sample_scene, sample_cameras):
     rates = rates_of(sample_scene, sample_cameras.train)
     view = sample_cameras.test[0]
     truth = Renderer.of(sample_scene, sample_cameras, quality="best", background="white")(view.scaled(1 / 8)).rgb
-    level = merged(sample_scene, rates, Goal.of_level(3))
+    level = merge(sample_scene, rates, Goal.of_level(3))
     assert len(level) < 0.5 * len(sample_scene)
     image = Renderer.of(level, sample_cameras, background="white")(view.scaled(1 / 8)).rgb
     assert (psnr(image, truth) or 0) > 38
@@ -215,8 +215,8 @@ def test_extreme_sizes_and_transparent_gaussians_are_merged():
     found = merged_to(9, scene)
     assert len(found) == 9
     assert all(column.isfinite().all() for column in found.columns.values())
-    clusters = seen(scene, torch.full((60,), RATE))
-    assert (costs(clusters[:-1], clusters[1:], 1.0) <= MOST_COST).all()
+    clusters = clusters_of(scene, torch.full((60,), RATE))
+    assert (costs(clusters[:-1], clusters[1:], 1.0) <= MAX_COST).all()
 
 
 def test_rotations_become_quaternions_again():
@@ -225,7 +225,7 @@ def test_rotations_become_quaternions_again():
     again = quats_of(rotations)
     signs = (again * scene.unit_quats).sum(dim=1)
     torch.testing.assert_close(signs.abs(), torch.ones_like(signs))
-    torch.testing.assert_close(unpacked(packed(rotations @ rotations.mT)), torch.eye(3).double().expand(50, 3, 3))
+    torch.testing.assert_close(unpack(pack(rotations @ rotations.mT)), torch.eye(3).double().expand(50, 3, 3))
 
 
 def test_a_projection_along_an_axis_has_the_packed_minors():

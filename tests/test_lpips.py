@@ -1,13 +1,14 @@
 """LPIPS from weights that the user gives: the published formula, and files that are not what they should be."""
 
+import pickle
 from pathlib import Path
 
 import pytest
 import torch
 from torch.nn.functional import conv2d, max_pool2d, relu
 
-from aaplug.core.errors import FormatError
 from aaplug.evaluation.lpips import NETS, lpips_metric
+from aaplug.system.errors import FormatError
 
 CHANNELS = (4, 5, 6, 7, 8)
 
@@ -35,40 +36,28 @@ def lpips_weights(folder: Path) -> dict[str, tuple[Path, Path]]:
     return files
 
 
-def by_hand(image, truth, trunk, heads, low):
-    """VGG16's five stages written out; low is what black is mapped to."""
-    mean, std = torch.tensor([-0.030, -0.088, -0.188]), torch.tensor([0.458, 0.448, 0.450])
-    maps = []
-    for x in (image, truth):
-        x = (((x if low == 0 else 2 * x - 1) - mean) / std).permute(2, 0, 1)[None]
-        found = []
-        for numbers in ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28)):
-            x = max_pool2d(x, 2) if found else x
-            for number in numbers:
-                x = relu(conv2d(x, trunk[f"features.{number}.weight"], trunk[f"features.{number}.bias"], padding=1))
-            found.append(x / (x.norm(dim=1, keepdim=True) + 1e-10))
-        maps.append(found)
-    pairs = enumerate(zip(*maps, strict=True))
-    return sum(((a - b) ** 2 * heads[f"lin{i}.model.1.weight"]).sum(dim=1).mean().item() for i, (a, b) in pairs)
-
-
 @pytest.mark.parametrize(("flavour", "low"), [("vgg", -1), ("3dgs", 0)])
 def test_lpips_is_the_published_formula(weights, flavour, low):
-    g = torch.Generator().manual_seed(0)
-    image, truth = torch.rand(40, 48, 3, generator=g), torch.rand(40, 48, 3, generator=g)
+    """VGG16's five stages written out, for both images at once; the net is fed [low, 1]."""
+    both, trunk = torch.rand(2, 40, 48, 3, generator=torch.Generator().manual_seed(0)), torch.load(weights["vgg"][0])
+    heads, expected = torch.load(weights["vgg"][1]), 0.0
+    mean, std = torch.tensor([-0.030, -0.088, -0.188]), torch.tensor([0.458, 0.448, 0.450])
+    x = ((low + (1 - low) * both - mean) / std).permute(0, 3, 1, 2)
+    for stage, numbers in enumerate(((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28))):
+        x = max_pool2d(x, 2) if stage else x
+        for number in numbers:
+            x = relu(conv2d(x, trunk[f"features.{number}.weight"], trunk[f"features.{number}.bias"], padding=1))
+        a, b = x / (x.norm(dim=1, keepdim=True) + 1e-10)
+        expected += ((a - b) ** 2 * heads[f"lin{stage}.model.1.weight"][0]).sum(dim=0).mean().item()
     metric = lpips_metric(flavour, *weights["vgg"])
-    trunk, heads = (torch.load(path, weights_only=True) for path in weights["vgg"])
-    expected = by_hand(image, truth, trunk, heads, low)
-    assert metric.measure(image, truth) == pytest.approx(expected, rel=1e-5)
+    assert metric.measure(*both) == pytest.approx(expected, rel=1e-5)
+    assert pickle.loads(pickle.dumps(metric)).measure(*both) == metric.measure(*both)  # for other processes
     assert metric.protocol.startswith(f"{flavour}:")
 
 
-def test_lpips_of_equal_images_is_zero_and_of_tiny_ones_undefined(weights):
-    metric = lpips_metric("alex", *weights["alex"])
-    image = torch.rand(64, 64, 3)
-    assert metric.measure(image, image) == 0
-    assert metric.measure(image, 1 - image) > 0
-    assert metric.measure(image[:20], image[:20]) is None
+def test_lpips_of_alexnet_is_zero_for_equal_images(weights):
+    metric, image = lpips_metric("alex", *weights["alex"]), torch.rand(64, 64, 3)
+    assert metric.measure(image, image) == 0 < metric.measure(image, 1 - image)
     assert "32 px" in metric.undefined
 
 

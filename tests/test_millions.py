@@ -11,11 +11,11 @@ from aaplug.core.training import TrainingViews
 from aaplug.evaluation.engine import Task, candidates_of, evaluate
 from aaplug.evaluation.metrics import psnr
 from aaplug.evaluation.results import mean
-from aaplug.evaluation.truth import Truth, own_look
+from aaplug.evaluation.truth import Truth
 from aaplug.levels.covariances import covariances, outer
 from aaplug.methods.recipe import LevelChoice, Recipe
 from aaplug.methods.recipes import find_recipe
-from aaplug.rendering.renderer import Renderer
+from aaplug.rendering.renderer import Renderer, own_look
 from tests.bench.millions import PARTS, split
 from tests.conftest import make_camera, make_scene
 

@@ -12,9 +12,9 @@ import pytest
 import torch
 from aaplug_cli.main import main
 
-from aaplug.core.errors import FormatError
 from aaplug.io.cameras import read_cameras
-from aaplug.io.scenes import open_scene, read_scene, write_scene
+from aaplug.io.scenes import read_scene, write_scene
+from aaplug.system.errors import FormatError
 from tests.conftest import make_scene
 from tests.test_cli import cli, dataset  # noqa: F401  (fixtures)
 
@@ -140,7 +140,7 @@ def test_a_checkpoint_whose_tensors_hold_no_rows_is_refused(tmp_path):
             path = tmp_path / f"{name}-{number}.pt"
             torch.save({"splats": {**columns, name: tensor}}, path)
             with pytest.raises(FormatError, match=f"{name} should be a tensor with a row for each Gaussian"):
-                open_scene(path, allow_checkpoint=True)
+                read_scene(path, allow_checkpoint=True)
 
 
 def test_a_principal_point_far_away_is_refused(tmp_path):

@@ -10,12 +10,13 @@ import pytest
 import torch
 
 import aaplug
-from aaplug.core.errors import OutputError, UsageError
-from aaplug.core.gaussians import MIP, Gaussians
+from aaplug.core.conventions import MIP
+from aaplug.core.gaussians import Gaussians
 from aaplug.evaluation.metrics import psnr
-from aaplug.io.scenes import open_scene, read_scene
-from aaplug.levels.multi_scale import in_one_scene, pixel_sizes
+from aaplug.io.scenes import read_scene
+from aaplug.lab.multi_scale import in_one_scene, pixel_sizes
 from aaplug.rendering.renderer import Renderer
+from aaplug.system.errors import OutputError, UsageError
 from tests.conftest import make_camera, make_scene
 from tests.test_cli import cli, dataset  # noqa: F401 (fixtures)
 
@@ -83,7 +84,7 @@ def test_a_scene_that_its_rasterizer_shows_otherwise_is_refused(change):
 def test_the_file_keeps_the_columns(cli):
     code, _, err = cli("lod scene.ply --cameras . -o together.ply --multi-scale --levels 2")
     assert code == 0, err
-    assert "pixel sizes of Multi-Scale 3DGS, for the recipe multi-scale" in open_scene("together.ply").notes
+    assert "pixel sizes of Multi-Scale 3DGS, for the recipe multi-scale" in read_scene("together.ply").notes
     (found,) = aaplug.lod("scene.ply", ".", levels=2, multi_scale=True)
     read, made = read_scene("together.ply").pixel_sizes, found.scene.pixel_sizes
     assert read is not None

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from aaplug.core.cameras import WHITE, Camera
-from aaplug.core.errors import UsageError
+from aaplug.core.cameras import Camera
+from aaplug.core.colours import WHITE
 from aaplug.io.scenes import read_scene, write_scene
 from aaplug.rendering.renderer import Renderer
+from aaplug.system.errors import UsageError
 from tests.conftest import make_camera, make_scene
 
 EYES = [(0.3, -3.0, 0.4), (2.5, -1.0, -0.5), (-2.0, -2.0, 0.3)]
@@ -23,23 +24,20 @@ def method(monkeypatch):
     specs = []
     monkeypatch.setitem(sys.modules, "nerfbaselines", ModuleType("nerfbaselines"))
     monkeypatch.setattr(sys.modules["nerfbaselines"], "register", specs.append, raising=False)
-    monkeypatch.delitem(sys.modules, "aaplug.nerfbaselines", raising=False)
-    import aaplug.nerfbaselines as module
+    monkeypatch.delitem(sys.modules, "aaplug.evaluation.nerfbaselines", raising=False)
+    import aaplug.evaluation.nerfbaselines as module
 
     assert specs[0]["id"] == "aaplug"
     assert specs[0]["method_class"] == f"{module.__name__}:{module.Aaplug.__name__}"
     yield module
-    sys.modules.pop("aaplug.nerfbaselines", None)
+    sys.modules.pop("aaplug.evaluation.nerfbaselines", None)
 
 
 def theirs(view: Camera) -> SimpleNamespace:
     """A camera as nerfbaselines gives it."""
     pose = torch.linalg.inv(view.cam_from_world)[:3].numpy().astype(np.float32)
-    camera = SimpleNamespace(
-        poses=pose,
-        intrinsics=np.array([view.fx, view.fy, view.cx, view.cy], np.float32),
-        image_sizes=np.array([view.width, view.height], np.int32),
-    )
+    intrinsics, sizes = np.array([view.fx, view.fy, view.cx, view.cy], np.float32), np.array([view.width, view.height])
+    camera = SimpleNamespace(poses=pose, intrinsics=intrinsics, image_sizes=sizes)
     camera.item = lambda: camera
     return camera
 

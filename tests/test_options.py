@@ -8,8 +8,8 @@ from typing import Any, get_args, get_type_hints
 import pytest
 from aaplug_cli.main import VERBS, _verb, main
 
-from aaplug.core.errors import UsageError
 from aaplug.options.base import Options
+from aaplug.system.errors import UsageError
 
 NO_NUMBERS = (math.nan, math.inf, -math.inf, -1, 10**30, True, "", "x" * 10_000)
 

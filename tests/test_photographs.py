@@ -1,15 +1,18 @@
 """Photographs made smaller, in each of the field's ways."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
-from aaplug.core.errors import UsageError
 from aaplug.core.imaging import box_average, quantised
 from aaplug.io.images import read_image
-from aaplug.io.photographs import DOWNSCALES
+from aaplug.io.photographs import DOWNSCALES, photo_at
+from aaplug.system.errors import UsageError
+from tests.conftest import make_camera
 
 WHITE = (1.0, 1.0, 1.0)
 
@@ -59,3 +62,11 @@ def test_pil_bicubic_is_pillows(rgba):
     found = DOWNSCALES["pil-bicubic"].read(rgba, WHITE).at((4, 6), 0.25)
     assert torch.allclose(found, torch.from_numpy(small).float() / 255)
     assert not torch.allclose(found, DOWNSCALES["box"].read(rgba, WHITE).at((4, 6), 0.25))
+
+
+@pytest.mark.parametrize("width", [12, 24, 48])
+def test_a_photograph_shows_the_whole_view_whatever_size_the_view_was_trained_at(rgba, width):
+    """A photograph of another width than its view's is resampled, not cropped."""
+    view = replace(make_camera(size=(width, width * 2 // 3)), photo=rgba)
+    expected = box_average(quantised(read_image(rgba, WHITE)), 4)
+    assert photo_at(view, view.scaled(6 / width), WHITE).equal(expected)

@@ -5,10 +5,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from aaplug.core.errors import UsageError
+from aaplug.evaluation import PROTOCOLS
 from aaplug.evaluation.metrics import SSIM
-from aaplug.evaluation.protocols import PROTOCOLS, median_depth
+from aaplug.evaluation.protocols import median_depth
 from aaplug.io.photographs import DOWNSCALES
+from aaplug.system.errors import UsageError
 from tests.conftest import make_camera, make_scene
 
 
@@ -16,11 +17,9 @@ from tests.conftest import make_camera, make_scene
 def test_scale_one_is_the_view_itself_and_names_exist(protocol):
     view = make_camera()
     camera = protocol.camera(view, 1.0, 4.0)
-    assert (camera.hw, camera.fx, camera.cx) == (view.hw, view.fx, view.cx)
+    assert (camera.hw, camera.intrinsics) == (view.hw, view.intrinsics)
     assert camera.cam_from_world.equal(view.cam_from_world)
-    assert protocol.downscale in DOWNSCALES
-    assert protocol.ssim in SSIM
-    assert protocol.source
+    assert (protocol.downscale in DOWNSCALES, protocol.ssim in SSIM, bool(protocol.source)) == (True, True, True)
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS.values(), ids=lambda p: p.name)
@@ -41,8 +40,7 @@ def test_cameras_of_moved_and_of_whole_sized_protocols():
 
 
 def test_median_depth_is_of_what_the_view_shows():
-    scene = make_scene(500)
-    view = make_camera((0.0, -4.0, 0.0))
+    scene, view = make_scene(500), make_camera((0.0, -4.0, 0.0))
     depths = scene.means @ view.cam_from_world[2, :3].float() + view.cam_from_world[2, 3].float()
     assert depths.min() < median_depth(scene.means, view) < depths.max()
     backwards = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0])).double()

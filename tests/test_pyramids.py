@@ -16,20 +16,20 @@ from hypothesis import strategies as st
 
 import aaplug
 from aaplug.core import pyramids
+from aaplug.core.camera_paths import between, free_views, moved
 from aaplug.core.cameras import CameraSet
-from aaplug.core.errors import FormatError
-from aaplug.core.free_views import between, free_views
-from aaplug.core.gaussians import ANTIALIASED, Gaussians
+from aaplug.core.chunks import chunks_of
+from aaplug.core.conventions import ANTIALIASED
+from aaplug.core.gaussians import Gaussians
 from aaplug.core.pyramids import Cutter, Pyramid, faded
 from aaplug.core.training import TrainingViews
 from aaplug.evaluation.metrics import psnr
 from aaplug.finetuning import refining
-from aaplug.io.scenes import open_scene, read_scene
-from aaplug.io.scenes.manifests import MANIFEST, read_manifest
-from aaplug.levels.chunks import chunks_of
+from aaplug.io.scenes import read_scene
+from aaplug.io.scenes.pyramid_folder import MANIFEST, pyramid_of, read_manifest, read_pyramid
 from aaplug.levels.merging import Goal, merged_in_chunks
-from aaplug.levels.pyramids import pyramid_of, read_pyramid
 from aaplug.rendering.renderer import Renderer
+from aaplug.system.errors import FormatError
 from aaplug.verbs.lod import lod
 from tests.conftest import make_camera, make_scene, make_splats
 from tests.test_cli import cli, dataset  # noqa: F401 (fixtures)
@@ -47,9 +47,9 @@ def pyramid(n: int = 300, levels: int = 3, largest: int = 40) -> Pyramid:
     """Merged without tuning."""
     scenes, chunks = [make_scene(n)], [chunks_of(make_scene(n).means, largest)]
     for level in range(1, levels + 1):
-        made = merged_in_chunks(scenes[-1], rates(scenes[-1]), chunks[-1], Goal(0.5**level, tolerance=1e-2))
-        scenes.append(made.scene)
-        chunks.append(made.chunks)
+        scene, places = merge_in_chunks(scenes[-1], rates(scenes[-1]), chunks[-1], Goal(0.5**level, tolerance=1e-2))
+        scenes.append(scene)
+        chunks.append(places)
     return Pyramid.of(scenes, chunks)
 
 
@@ -68,15 +68,11 @@ def renderer(levels) -> Renderer:
 def test_the_shares_of_a_chunk_sum_to_one(octaves):
     scene = make_scene(5)
     whole = Pyramid.of([scene] * 6, [torch.zeros(5, dtype=torch.int64)] * 6)
-    shares = Cutter.of(whole, TrainingViews.of(scene_of(whole), VIEWS)).shares(torch.tensor([octaves]))[:, 0]
+    shares = Cutter.of(whole, TrainingViews.of(whole.scene, VIEWS)).shares(torch.tensor([octaves]))[:, 0]
     assert shares.sum() == pytest.approx(1, abs=1e-6)
     assert (shares > 0).sum() <= 2
     assert shares.min() >= 0
     assert shares[math.ceil(octaves)] > 0 or octaves < 1e-6  # the level that is meant for this rate
-
-
-def scene_of(whole: Pyramid) -> Gaussians:
-    return whole.scene
 
 
 def test_levels_become_lighter_and_stand_for_their_own_chunk_alone(levels):
@@ -86,9 +82,9 @@ def test_levels_become_lighter_and_stand_for_their_own_chunk_alone(levels):
     finest = levels.finest
     chunks = levels.chunks[: levels.sizes[0]]
     painted = replace(finest, sh=chunks.float()[:, None, None].expand_as(finest.sh).clone())
-    made = merged_in_chunks(painted, rates(painted), chunks, Goal(0.25, tolerance=1e3))
-    assert len(made.scene) < len(finest) / 3
-    assert torch.allclose(made.scene.sh[:, 0, 0], made.chunks.float(), atol=1e-3)
+    coarse, places = merge_in_chunks(painted, rates(painted), chunks, Goal(0.25, tolerance=1e3))
+    assert len(coarse) < len(finest) / 3
+    assert torch.allclose(coarse.sh[:, 0, 0], places.float(), atol=1e-3)
 
 
 def test_chunks_are_boxes_of_bounded_size_whatever_the_order():
@@ -116,10 +112,10 @@ def test_from_the_training_rate_on_the_image_is_the_scenes_own_to_the_bit(levels
 def test_a_pyramid_of_one_level_is_the_scene(levels):
     one = Pyramid.of([levels.finest], [levels.chunks[: levels.sizes[0]]])
     view = VIEWS[0].scaled(0.25)
-    drawn, alone = (Renderer.of(s, VIEWS, "matched", rasterizer="eager")(view) for s in (one, levels.finest))
-    assert torch.equal(drawn.rgb, alone.rgb)
-    drawn = Renderer.of(one, VIEWS, "auto", quality="fast", rasterizer="eager")(view)
-    assert torch.equal(drawn.rgb, alone.rgb)
+    images = [Renderer.of(s, VIEWS, "matched", rasterizer="eager")(view).rgb for s in (one, levels.finest)]
+    images.append(Renderer.of(one, VIEWS, "auto", quality="fast", rasterizer="eager")(view).rgb)
+    assert torch.equal(images[0], images[1])
+    assert torch.equal(images[2], images[1])
 
 
 def test_pixels_larger_than_those_of_the_coarsest_level_take_several_samples(levels, renderer):
@@ -158,7 +154,7 @@ def test_where_the_coarsest_level_shows_nothing_the_next_one_tells_a_free_camera
     chunks = levels.chunks.split(list(levels.sizes))
     parts = [levels.level(number) for number in range(len(levels))]
     more = Pyramid.of([*parts, empty], [*chunks, chunks[0][:0]])
-    view = replace(make_camera((0.0, -16.0, 0.0), (64, 48)), trained_focal=None)
+    view = moved(VIEWS[0], 4 / 16, 4.0)
     rates = [Renderer.of(s, VIEWS, "auto", rasterizer="eager").relative_rate(view) for s in (levels, more)]
     assert rates[0] == rates[1] < 0.5
 
@@ -171,10 +167,11 @@ def test_a_near_part_is_fine_and_a_far_part_coarse():
     chunks = torch.arange(2).repeat_interleave(60)
     coarse = merged_in_chunks(both, rates(both), chunks, Goal(0.25, tolerance=1e3))
     whole = Pyramid.of([both, coarse.scene, coarse.scene], [chunks, coarse.chunks, coarse.chunks])
-    cutter = Cutter.of(whole, TrainingViews.of(whole.scene, [make_camera((0.0, -4.0, 0.0), (640, 480))]))
-    octaves = cutter.octaves(replace(make_camera((0.0, -4.0, 0.0), (640, 480)), trained_focal=None))
+    view = make_camera((0.0, -4.0, 0.0), (640, 480))
+    cutter = Cutter.of(whole, TrainingViews.of(whole.scene, [view]))
+    octaves = cutter.octaves(replace(view, trained_focal=None))
     assert octaves[0] == octaves[1] == 0  # each as training saw it
-    octaves = cutter.octaves(replace(make_camera((0.0, -6.0, 0.0), (640, 480)), trained_focal=None))
+    octaves = cutter.octaves(moved(view, 4 / 6, 4.0))
     assert octaves[0] > octaves[1] > 0
 
 
@@ -202,22 +199,15 @@ def test_between_two_levels_an_image_is_about_as_close_to_the_scene_as_with_eith
     """Of optical depths, or of opacities in the world, fades are 4 to 10 dB farther."""
     made = lod(sample_scene, sample_cameras, levels=2, refine=False)
     view = sample_cameras.test[0]
-    shown, best = (
-        Renderer.of(s, sample_cameras, quality=quality)
-        for s, quality in ((pyramid_of(made), "fast"), (sample_scene, "best"))
-    )
-    found = [psnr(shown(view.scaled(rate)).rgb, best(view.scaled(rate)).rgb) or 0.0 for rate in (0.5, 0.43, 0.374)]
-    assert found[1] > min(found[0], found[2]) - 1
+    fast = Renderer.of(pyramid_of(made), sample_cameras, quality="fast")
+    best = Renderer.of(sample_scene, sample_cameras, quality="best")
+    psnrs = [psnr(fast(view.scaled(rate)).rgb, best(view.scaled(rate)).rgb) or 0.0 for rate in (0.5, 0.43, 0.374)]
+    assert psnrs[1] > min(psnrs[0], psnrs[2]) - 1
 
 
 def test_a_dolly_does_not_pop(renderer):
     """Steps of 1/20 octave away from the scene: no step changes the image much more than its neighbours do."""
-    view = replace(VIEWS[0], trained_focal=None)
-    images = []
-    for step in range(61):
-        pose = view.cam_from_world.clone()
-        pose[2, 3] += 4.0 * (2 ** (step / 20) - 1)
-        images.append(renderer(replace(view, cam_from_world=pose)).rgb)
+    images = [renderer(moved(VIEWS[0], 2 ** (-step / 20), 4.0)).rgb for step in range(61)]
     changes = torch.stack([(b - a).abs().max() for a, b in itertools.pairwise(images)])
     assert changes.max() < 3 * changes.median()
 
@@ -238,11 +228,8 @@ def test_gradients_reach_the_levels_of_a_cut(renderer, levels):
     assert cut.shares is not None
     assert 0 < cut.shares.min() < 1
     for place in found.abs().topk(3).indices.tolist():
-        ends = []
-        for step in (1e-5, -1e-5):
-            moved = logits.detach().clone()
-            moved[place] += step
-            ends.append(loss(moved))
+        step = torch.zeros_like(logits).index_fill_(0, torch.tensor([place]), 1e-5)
+        ends = [loss(logits.detach() + change) for change in (step, -step)]
         assert (ends[0] - ends[1]) / 2e-5 == pytest.approx(float(found[place]), rel=1e-4)
 
 
@@ -273,15 +260,13 @@ def folder(cli) -> Path:
 def test_a_folder_of_levels_is_a_scene(cli, folder):
     whole = read_pyramid(folder)
     assert len(whole) == 3
-    assert torch.equal(whole.finest.means, open_scene("scene.ply").whole().means)
+    assert torch.equal(whole.finest.means, read_scene("scene.ply").whole().means)
     for words in ("--scale 0.25", "--scale 0.25 --quality fast", "--scale 0.25 --quality best"):
         code, _, err = cli(f"render levels --cameras . -o images {words} --overwrite")
         assert code == 0, err
     code, _, err = cli("evaluate levels --cameras . -o results --scale 0.5 --recipe auto matched --truth self")
     assert code == 0, err
-    facts = cli("info levels")
-    assert facts[0] == 0
-    assert "3 levels of detail" in facts[1]
+    assert "3 levels of detail" in cli("info levels")[1]
     assert cli("convert levels --cameras . -o converted.ply")[0] == 0
     assert cli("lod levels --cameras . -o light.ply --simplify 0.5 --no-refine")[0] == 0
 
@@ -296,57 +281,42 @@ def test_building_goes_on_where_it_stopped(cli, folder):
     assert code == 0, err
     assert "resumed: 1 level" in err
     assert {file.name: file.read_bytes() for file in folder.iterdir()} == first
-    code, _, err = cli("lod scene.ply --cameras . -o levels --levels 2 --steps 4 --resume")
-    assert code == 2
-    assert "other options" in err
+    refusal = cli("lod scene.ply --cameras . -o levels --levels 2 --steps 4 --resume")
+    assert refusal[0] == 2
+    assert "other options" in refusal[2]
 
 
-def broken(folder: Path, how: str) -> None:
-    level, manifest = folder / "scene_lod1.ply", folder / MANIFEST
-    document = json.loads(manifest.read_text())
-    if how == "missing":
-        level.unlink()
-    elif how == "truncated":
-        level.write_bytes(level.read_bytes()[:-7])
-    elif how == "foreign":
-        level.write_bytes((folder / "scene_lod2.ply").read_bytes())
-    elif how == "newer":
-        manifest.write_text(json.dumps(document | {"aaplug_levels": 2}))
-    elif how == "outside":
-        document["levels"][1]["file"] = "../scene.ply"
+def in_manifest(**changes):
+    """Change the second level in the manifest."""
+
+    def change(_: Path, manifest: Path) -> None:
+        document = json.loads(manifest.read_text())
+        document["levels"][1] |= changes
         manifest.write_text(json.dumps(document))
-    elif how == "chunks":
-        document["levels"][1]["chunks"] = [10**9]
-        manifest.write_text(json.dumps(document))
-    else:
-        manifest.write_text("{}")
+
+    return change
 
 
 BROKEN = {
-    "missing": "scene_lod1.ply: is missing",
-    "truncated": "scene_lod1.ply: is not the level",
-    "foreign": "scene_lod1.ply: is not the level",
-    "newer": "should be version 1, not 'version 2",
-    "outside": "file should be a name without folders",
-    "chunks": "does not have the chunks",
-    "empty": "lod.json",
+    "missing": (lambda level, _: level.unlink(), "scene_lod1.ply: is missing"),
+    "truncated": (lambda level, _: level.write_bytes(level.read_bytes()[:-7]), "scene_lod1.ply: is not the level"),
+    "foreign": (lambda level, _: Path("levels/scene_lod2.ply").replace(level), "scene_lod1.ply: is not the level"),
+    "newer": (lambda _, manifest: manifest.write_text('{"aaplug_levels": 2}'), "should be version 1, not 'version 2"),
+    "outside": (in_manifest(file="../scene.ply"), "file should be a name without folders"),
+    "chunks": (in_manifest(chunks=[10**9]), "does not have the chunks"),
+    "empty": (lambda _, manifest: manifest.write_text("{}"), "lod.json"),
 }
 
 
-@pytest.mark.parametrize(("how", "said"), BROKEN.items(), ids=BROKEN)
-def test_a_broken_pyramid_is_refused_in_one_line(cli, folder, how, said):
-    broken(folder, how)
+@pytest.mark.parametrize("case", BROKEN)
+def test_a_broken_pyramid_is_refused_in_one_line(cli, folder, case):
+    breaking, said = BROKEN[case]
+    breaking(folder / "scene_lod1.ply", folder / MANIFEST)
     code, out, err = cli("render levels --cameras . -o images")
     assert (code, out) == (2, "")
     assert said in err.splitlines()[-1]
     with pytest.raises(FormatError):
         read_pyramid(folder)
-
-
-def test_the_manifest_names_every_level(folder):
-    manifest = read_manifest(folder)
-    assert [level.rate for level in manifest.levels] == [1.0, 0.5, 0.25]
-    assert [sum(level.chunks) for level in manifest.levels] == list(read_pyramid(folder).sizes)
 
 
 def test_tuning_brings_a_level_closer(sample_scene, sample_cameras):

@@ -16,10 +16,11 @@ import torch
 from aaplug.core.ellipses import squared_cutoff
 from aaplug.core.kernels import EAGER
 from aaplug.core.splats import Render, Splats2D
-from aaplug.methods.pixel_kernels import POINT
+from aaplug.methods.pixel_kernels.point import POINT
 from aaplug.methods.pixel_kernels.raster_rows import TILE
-from aaplug.rasterizers import Reference, Tiled, reference
-from aaplug.rasterizers.tiled import binning
+from aaplug.rasterizers import reference
+from aaplug.rasterizers.reference import Reference
+from aaplug.rasterizers.tiled import Tiled, binning
 from tests.conftest import ALL_RASTERIZERS, make_splats, memory_taken, needs_peak_memory, splats_of
 
 F64 = torch.float64
@@ -366,7 +367,7 @@ def test_a_smaller_memory_budget_changes_nothing():
 
 FRAME_MEMORY = 100e6  # bytes; measured: 50e6, in one band 130e6; the image is 67e6
 FRAME = """
-from aaplug.rasterizers import Tiled
+from aaplug.rasterizers.tiled import Tiled
 from tests.conftest import make_splats
 splats, draw = make_splats(3000, (2048, 2048), 7, (0.0, 5.0)), Tiled(memory=1e6)
 draw(splats, (64, 64), (0.0, 0.0, 0.0))

@@ -5,7 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from aaplug.core.cameras import WHITE, Camera
+from aaplug.core.cameras import Camera
+from aaplug.core.colours import WHITE
 from aaplug.core.culling import cull
 from aaplug.core.projection import project
 from aaplug.core.shading import shade
@@ -13,12 +14,13 @@ from aaplug.core.training import TrainingViews
 from aaplug.evaluation.engine import Task, candidates_of, evaluate
 from aaplug.evaluation.metrics import PSNR
 from aaplug.evaluation.results import CEILING, mean
-from aaplug.evaluation.truth import Truth, own_look
+from aaplug.evaluation.truth import Truth
 from aaplug.io.cameras import read_cameras
 from aaplug.io.scenes import read_scene, write_scene
-from aaplug.methods.recipes import RECIPES, find_recipe
+from aaplug.methods import RECIPES
+from aaplug.methods.recipes import find_recipe
 from aaplug.rasterizers import RASTERIZERS
-from aaplug.rendering.renderer import Renderer
+from aaplug.rendering.renderer import Renderer, own_look
 from tests.conftest import SAMPLE
 
 SCENES = {"chair": ("chair.ply", 25), "snowmiku": ("snowmiku.ply", 13)}  # file, number of test views

@@ -6,20 +6,22 @@ from dataclasses import replace
 import pytest
 import torch
 
-from aaplug.core.cameras import WHITE, Camera, CameraSet
-from aaplug.core.choices import QUALITIES
-from aaplug.core.errors import FrameError, UsageError
-from aaplug.core.gaussians import CONVENTIONS, MIP, Gaussians
+from aaplug.core.cameras import Camera, CameraSet
+from aaplug.core.colours import WHITE
+from aaplug.core.conventions import CONVENTIONS, MIP
+from aaplug.core.gaussians import Gaussians
 from aaplug.core.imaging import average_samples, box_average
 from aaplug.core.projection import project
 from aaplug.core.splats import Render
 from aaplug.core.training import TrainingViews
-from aaplug.methods.filters import Smoothing3D, fuse_stored
-from aaplug.methods.pixel_kernels import SURFEL
-from aaplug.methods.recipes import NEIGHBOURS, RECIPES, find_recipe, suited
+from aaplug.methods import QUALITIES, RECIPES
+from aaplug.methods.filters.smoothing import Smoothing3D, fuse_stored
+from aaplug.methods.pixel_kernels.surfel import SURFEL
+from aaplug.methods.recipes import NEIGHBOURS, find_recipe, suited
 from aaplug.rasterizers import RASTERIZERS
 from aaplug.rendering import renderer as rendering
 from aaplug.rendering.renderer import Renderer
+from aaplug.system.errors import FrameError, UsageError
 from tests.conftest import make_camera, make_scene
 
 REFERENCE = RASTERIZERS["reference"]
@@ -224,9 +226,10 @@ def test_auto_weighs_neighbours_only_where_its_samples_are_coarser_than_training
     renderer = Renderer.of(make_scene(30), cameras, quality=quality)
     for scale in (0.125, 0.25, 0.5, 1.0, 2.0):
         view = cameras[0].scaled(scale)
-        sampled = min(1.0, scale * renderer.samples(view))
-        assert renderer.neighbours(view) == pytest.approx(NEIGHBOURS * (1 - sampled**2))
-        assert Renderer.of(make_scene(30), cameras, "matched").neighbours(view) == 0
+        samples = renderer.samples(view)
+        sampled = min(1.0, scale * samples)
+        assert renderer.neighbours(view, samples) == pytest.approx(NEIGHBOURS * (1 - sampled**2))
+        assert Renderer.of(make_scene(30), cameras, "matched").neighbours(view, samples) == 0
 
 
 def test_auto_is_nearer_to_the_look_of_training_than_one_plain_sample(sample_scene, sample_training, sample_cameras):

@@ -7,21 +7,22 @@ from functools import cache
 import pytest
 import torch
 
+from aaplug.core.conventions import CLASSIC
 from aaplug.core.culling import cull, cull_kernel
-from aaplug.core.errors import UsageError
-from aaplug.core.gaussians import CLASSIC
 from aaplug.core.interfaces import PixelKernel
 from aaplug.core.projection import project, project_kernel
 from aaplug.core.rules import RULES_3DGS, RULES_GSPLAT, Rules
 from aaplug.core.splats import Render
-from aaplug.methods.compositors import COMPOSITORS
-from aaplug.methods.pixel_kernels import INTEGRAL, PIXEL_KERNELS, POINT
-from aaplug.methods.recipes import RECIPES
-from aaplug.rasterizers import Reference, Tiled
+from aaplug.lab.integral import INTEGRAL
+from aaplug.methods import COMPOSITORS, PIXEL_KERNELS, RECIPES
+from aaplug.methods.pixel_kernels.point import POINT
+from aaplug.rasterizers.reference import Reference
+from aaplug.rasterizers.tiled import Tiled
 from aaplug.rasterizers.tiled.backward import step_kernel
 from aaplug.rasterizers.tiled.binning import table_kernel
 from aaplug.rasterizers.tiled.forward import pass_kernel
 from aaplug.rendering.renderer import Renderer
+from aaplug.system.errors import UsageError
 from tests.conftest import ALL_RASTERIZERS, each, make_camera, make_scene, make_splats, splats_of
 
 F64 = torch.float64

@@ -11,9 +11,9 @@ import pytest
 
 import aaplug
 from aaplug.evaluation.results import CEILING
-from aaplug.methods.recipes import RECIPES
+from aaplug.methods import RECIPES
 from tests.bench.method_tables import COLUMNS, SCALES, lines, short_table, table
-from tests.bench.pictures import FOLDER
+from tests.bench.pictures import CURVES, FOLDER, scales
 from tests.test_webpage import browser  # noqa: F401  (fixture)
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -70,14 +70,12 @@ def test_lines_of_a_csv_are_means_and_a_median_of_seconds():
 
 
 def test_the_figure_of_the_tables_is_the_committed_one():
-    from tests.bench.pictures.scales import SHOWN, scales
-
     def curves(svg: str) -> list[str]:
         return re.findall(r'<path d="(M [^"]*)" clip-path', svg)
 
     drawn, committed = curves(scales().svg()), curves((FOLDER / "scales.svg").read_text())
     assert drawn == committed
-    assert len(drawn) >= 4 * len(SHOWN)
+    assert len(drawn) >= 4 * len(CURVES)
 
 
 def test_pictures_are_small_and_each_is_shown():

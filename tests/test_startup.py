@@ -1,6 +1,7 @@
 """Help, and mistakes on the command line, are answered before torch is imported."""
 
 import json
+import resource
 import subprocess
 import sys
 from dataclasses import replace
@@ -10,25 +11,23 @@ import pytest
 from aaplug_cli.main import VERBS
 from aaplug_cli.options import FileOptions
 
-from aaplug.core import choices
-from aaplug.core.errors import UsageError
-from aaplug.core.gaussians import CONVENTIONS
-from aaplug.core.registry import KINDS, Registry, names_of
-from aaplug.evaluation.metrics import METRICS
-from aaplug.evaluation.protocols import PROTOCOLS
 from aaplug.finetuning.losses import LOSSES
 from aaplug.finetuning.parameters import RATES
-from aaplug.finetuning.settings import METHODS, OURS
-from aaplug.methods.recipes import RECIPES
-from aaplug.methods.viewers import FORMS, VIEWERS
-from aaplug.options.finetune import FinetuneOptions
-from aaplug.options.render import RenderOptions
+from aaplug.finetuning.settings import CONSISTENCY, CONSISTENCY_SETTINGS, settings_of
+from aaplug.methods import FORMS, RECIPES
+from aaplug.methods.viewers import VIEWERS
+from aaplug.options.verbs import FinetuneOptions
+from aaplug.options.verbs import RenderOptions
 from aaplug.rasterizers import RASTERIZERS
-from aaplug.verbs.finetune import _settings
+from aaplug.system.errors import UsageError
+from aaplug.system.registry import KINDS, Registry, names_of
 from tests.test_options import REFUSED
 
-REGISTRIES = (RECIPES, RASTERIZERS, METRICS, PROTOCOLS, METHODS, FORMS, VIEWERS)
 SLOW = ["torch", "numpy", "cv2", "jaxtyping", "beartype", "scipy", "skimage", "matplotlib", "PIL", "av"]
+SLOW += ["distributed", "dask", "viser", "aaplug.lab"]
+START = "from aaplug_cli.main import program; program()"
+STARTS = {"import": ("-c", "import aaplug"), "version": ("-c", START, "--version"), "help": ("-c", START, "--help")}
+MAX_RATIOS = {"import": 3, "version": 5, "help": 20}  # to a bare start of Python, about 20 ms
 PROGRAM = """
 import json, sys
 from aaplug_cli.main import main
@@ -45,7 +44,7 @@ HELPS = ["--version", "--help", *(f"{verb} --help" for verb in VERBS)]
 MISTAKES = [
     *("", "flyy", *REFUSED),
     *("render -o out", "video -o v.webm", "convert -o c.ply", "lod -o l.ply", "finetune -o t.ply", "evaluate"),
-    *("info", "compare", "compare one.ply", "gather"),
+    *("info", "compare", "compare one.ply"),
     *("render s.ply -o out --recipe mipp", "render s.ply -o out --quality good", "video s.ply -o v.webm --beside mipp"),
     *("evaluate s.ply --recipe mip mipp", "evaluate s.ply --protocol blend", "evaluate s.ply --rasterizer fast"),
     *("render s.ply -o out --rate-reference pos", "render s.ply -o out --convention clasic"),
@@ -72,38 +71,52 @@ def test_mistakes_import_nothing_slow():
     assert answered(MISTAKES) == [[words, 2, []] for words in MISTAKES]
 
 
-@pytest.mark.parametrize("registry", REGISTRIES, ids=lambda registry: registry.kind)
-def test_names_are_known_before_what_they_name(registry):
-    assert names_of(registry.kind) == list(registry)
+def test_importing_the_library_imports_nothing_slow():
+    program = f"import sys, aaplug; print([name for name in {SLOW} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"
 
 
-def test_each_kind_that_options_choose_from_is_compared():
-    assert {registry.kind for registry in REGISTRIES} == choices.NAMES.keys() < set(KINDS)
+def processor_time(*words: str) -> float:
+    """Seconds of the quickest of several starts of Python; other processes would lengthen the clock's."""
+    seconds = []
+    for _ in range(5):
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        subprocess.run([sys.executable, *words], stdout=subprocess.DEVNULL, check=True)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        seconds.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
+    return min(seconds)
 
 
-def test_a_registry_with_other_names_is_a_mistake_of_ours():
-    with pytest.raises(AssertionError, match="other names of a form"):
-        Registry("form", {"matched-energy": object()})
+def test_the_program_starts_quickly():
+    bare = processor_time("-c", "pass")
+    ratios = {name: processor_time(*words) / bare for name, words in STARTS.items()}
+    print(bare, ratios)
+    assert all(ratios[name] < most for name, most in MAX_RATIOS.items()), ratios
+
+
+@pytest.mark.parametrize("kind", REGISTRIES)
+def test_names_are_known_before_what_they_name(kind):
+    assert names_of(kind) == list(_at(REGISTRIES[kind]))
 
 
 def test_other_names_agree_with_what_they_name():
     assert tuple(CONVENTIONS) == get_args(choices.ConventionName)
     assert tuple(LOSSES) == get_args(choices.LossName)
     assert tuple(RATES) == choices.PARAMETERS
-    assert _settings(FinetuneOptions()) == OURS
+    assert settings_of(CONSISTENCY, FinetuneOptions()) == CONSISTENCY_SETTINGS
 
 
 def test_a_recipe_that_python_registers_can_be_named(monkeypatch):
     with pytest.raises(UsageError, match="recipe: 'mine' is not one of auto"):
         RenderOptions(recipe="mine")
     monkeypatch.setattr(RECIPES, "_entries", dict(RECIPES))
-    monkeypatch.setattr("aaplug.core.registry._registered", {kind: [] for kind in KINDS})
     RECIPES.register("mine", replace(RECIPES["mip"], name="mine"))
     assert RenderOptions(recipe="mine").recipe == "mine"
 
 
 def test_a_misspelled_name_is_refused_with_the_nearest():
-    with pytest.raises(UsageError, match=r"recipe: 'mipp' is not one of .* \(did you mean 'mip'\?\)"):
+    with pytest.raises(UsageError, match=r"recipe: 'mipp' is not one of .*; did you mean mip\?"):
         RenderOptions(recipe="mipp")
     with pytest.raises(UsageError, match="convention: 'x' is not one of classic, antialiased"):
         FileOptions(convention="x")

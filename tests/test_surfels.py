@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from aaplug.methods.recipes import RECIPES
+from aaplug.methods import RECIPES
 from aaplug.rendering.renderer import Renderer
 from tests.conftest import make_camera, make_scene
 

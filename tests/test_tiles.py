@@ -5,13 +5,13 @@ from dataclasses import replace
 import pytest
 import torch
 
-from aaplug.core.executors import torch_threads
 from aaplug.core.kernels import EAGER, Kernels
 from aaplug.core.runs import runs_of, starts_of
 from aaplug.core.splats import Splats2D
 from aaplug.methods.pixel_kernels.raster_rows import PIXELS, TILE, next_rows
-from aaplug.rasterizers import Reference, Tiled
-from aaplug.rasterizers.tiled import forward, layout
+from aaplug.rasterizers.reference import Reference
+from aaplug.rasterizers.tiled import Tiled, forward, layout
+from aaplug.system.executors import torch_threads
 from tests.conftest import make_splats
 
 F64 = torch.float64

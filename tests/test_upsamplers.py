@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from aaplug.core.errors import FormatError, UsageError
 from aaplug.core.imaging import box_average
 from aaplug.evaluation.upsamplers import UPSAMPLERS, find_upsampler
+from aaplug.system.errors import FormatError, UsageError
 
 
 @pytest.mark.parametrize("name", UPSAMPLERS)

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from aaplug.core.errors import OutputError, UsageError
 from aaplug.io.video import write_video
+from aaplug.system.errors import OutputError, UsageError
 from aaplug.verbs.video import side_by_side
 from tests.test_camera_paths import document
 from tests.test_cli import cli, dataset  # noqa: F401  (fixtures)

@@ -2,8 +2,8 @@
 
 import json
 import struct
-import threading
 from dataclasses import replace
+from queue import SimpleQueue
 
 import cv2
 import numpy as np
@@ -11,13 +11,13 @@ import pytest
 import torch
 
 from aaplug.core.cameras import CameraSet
-from aaplug.core.imaging import quantised
+from aaplug.core.imaging import average_samples, box_average, quantised
 from aaplug.core.pyramids import Pyramid
 from aaplug.evaluation.metrics import psnr
-from aaplug.io.images import write_png
+from aaplug.io.images import read_image, write_png
 from aaplug.live import pictures
-from aaplug.live.messages import See, Side
-from aaplug.live.paints import PAINTS
+from aaplug.live.messages import PictureRequest, Side, StillRequest
+from aaplug.live.overlays import OVERLAYS
 from aaplug.live.pictures import Pictures
 from aaplug.live.studio import Studio
 from aaplug.live.subject import Subject
@@ -31,16 +31,19 @@ SIDES = (Side("classic", "best"), Side("auto", "best"))
 RECIPES = ("classic", "auto", "mip")
 
 
+def with_photograph(scene, views, folder) -> CameraSet:
+    """The views as trained; the first has a photograph, somewhat darker than the scene."""
+    views = [view.as_trained() for view in views]
+    write_png(folder / "0.png", Renderer.of(scene, views, "classic", rasterizer="eager")(views[0]).rgb * 0.9)
+    views[0] = replace(views[0], photo=folder / "0.png")
+    return CameraSet(tuple(views), tuple(views))
+
+
 @pytest.fixture(scope="module")
 def seen(tmp_path_factory):
-    """A scene and its cameras; the first has a photograph."""
-    scene = make_scene(200)
-    views = [make_camera((0.0, -4.0, 0.0), name="a"), make_camera((2.0, -4.0, 1.0), name="b")]
-    views = [camera.as_trained() for camera in views]
-    photo = tmp_path_factory.mktemp("photos") / "a.png"
-    write_png(photo, Renderer.of(scene, views, "classic", rasterizer="eager")(views[0]).rgb * 0.9)
-    views[0] = replace(views[0], photo=photo)
-    return scene, CameraSet(tuple(views), tuple(views))
+    """A scene and its cameras."""
+    scene, views = make_scene(200), [make_camera((0.0, -4.0, 0.0), name="a"), make_camera((2.0, -4.0, 1.0), name="b")]
+    return scene, with_photograph(scene, views, tmp_path_factory.mktemp("photos"))
 
 
 @pytest.fixture
@@ -49,19 +52,19 @@ def subject(seen):
     return Subject(scene, cameras, Renderer.of(scene, cameras, "matched", rasterizer="eager"), RECIPES, "a scene", ())
 
 
-def a_wish(subject: Subject, scale=0.5, **other) -> See:
+def a_request(subject: Subject, scale=0.5, **other) -> PictureRequest:
     camera = subject.views[0].scaled(scale)
     pose = tuple(camera.cam_from_world.flatten().tolist())
-    return replace(See(1, pose, camera.focal, camera.width, camera.height, 0.5, SIDES, at=0), **other)
+    return replace(PictureRequest(1, pose, camera.focal, camera.width, camera.height, 0.5, SIDES, at=0), **other)
 
 
-def unpacked(found: bytes) -> tuple[dict, list[bytes]]:
-    (length,) = struct.unpack_from("<I", found)
-    header, at, files = json.loads(found[4 : 4 + length]), 4 + length, []
+def unpacked(message: bytes) -> tuple[dict, list[bytes]]:
+    (length,) = struct.unpack_from("<I", message)
+    header, at, files = json.loads(message[4 : 4 + length]), 4 + length, []
     for part in header.get("parts", ()):
-        files.append(found[at : at + part["bytes"]])
+        files.append(message[at : at + part["bytes"]])
         at += part["bytes"]
-    return header, files if "parts" in header else [found[at:]]
+    return header, files if "parts" in header else [message[at:]]
 
 
 def decoded(file: bytes) -> torch.Tensor:
@@ -69,21 +72,23 @@ def decoded(file: bytes) -> torch.Tensor:
     return torch.from_numpy(np.ascontiguousarray(bgr[..., ::-1])).float() / 255
 
 
-def shown(messages) -> tuple[dict, list[torch.Tensor]]:
+def headers(messages) -> list[dict]:
+    return [unpacked(message)[0] for message in filter(None, messages)]
+
+
+def assembled(messages) -> tuple[dict, list[torch.Tensor]]:
     """The last header, and both sides as a page has assembled them."""
-    sheets, header = [torch.empty(0), torch.empty(0)], {}
-    for message in filter(None, messages):
-        header, files = unpacked(message)
-        width, height = header["size"]
-        for part, file in zip(header["parts"], files, strict=True):
+    messages = list(filter(None, messages))
+    header = headers(messages)[-1]
+    width, height = header["size"]
+    sheets = [torch.zeros(height, width, 3) for _ in SIDES]
+    for message in messages:
+        moment, files = unpacked(message)
+        for part, file in zip(moment["parts"], files, strict=True):
             if part["of"] in "01":
-                sheet = sheets[int(part["of"])]
-                sheet = sheet if sheet.shape[:2] == (height, width) else torch.zeros(height, width, 3)
                 left, right = part["span"]
-                image = decoded(file)
-                scaled = cv2.resize(image.numpy(), (right - left, height))
-                sheet[:, left:right] = torch.from_numpy(scaled)
-                sheets[int(part["of"])] = sheet
+                image = cv2.resize(decoded(file).numpy(), (right - left, height))
+                sheets[int(part["of"])][:, left:right] = torch.from_numpy(image)
     return header, sheets
 
 
@@ -103,17 +108,30 @@ def finished(steps):
 
 @pytest.mark.parametrize(("recipe", "scale"), [("classic", 1.0), ("auto", 0.5), ("auto", 0.125)])
 def test_strips_are_the_picture(seen, recipe, scale, monkeypatch):
-    monkeypatch.setattr("aaplug.rendering.strips.SAMPLES", 1000)
+    monkeypatch.setattr("aaplug.rendering.strips.SAMPLES_PER_STRIP", 1000)
     renderer = Renderer.of(*seen, recipe, quality="best", rasterizer="eager")
     camera = seen[1].train[0].scaled(scale)
     whole = renderer(camera)
     middle = camera.width // 3
     for columns in (None, (0, middle), (middle, camera.width)):
-        steps = strips(renderer, camera, renderer.samples(camera), columns)
-        drawn, taken = finished(steps)
-        for found, expected in zip(drawn, whole, strict=True):
-            torch.testing.assert_close(found, expected[:, slice(*(columns or (None,)))], atol=2e-5, rtol=0)
+        render, taken = finished(strips(renderer, camera, renderer.samples(camera), columns))
+        for image, expected in zip(render, whole, strict=True):
+            torch.testing.assert_close(image, expected[:, slice(*(columns or (None,)))], atol=2e-5, rtol=0)
         assert taken > 1 or scale < 0.5
+
+
+@pytest.mark.parametrize("samples", [1, 3])
+def test_strips_of_another_count_weigh_neighbours_as_that_count_does(seen, samples):
+    renderer = Renderer.of(*seen, "auto", quality="best", rasterizer="eager")
+    colours = torch.rand(len(seen[0]), 1, 3, generator=torch.Generator().manual_seed(0))
+    renderer = replace(renderer, scene=replace(renderer.scene, sh=4 * colours))
+    camera = seen[1].train[0].scaled(1 / 4)
+    assert samples != renderer.samples(camera)
+    fine = camera.resized(camera.width * samples, camera.height * samples)
+    weight = renderer.recipe.neighbours_at(samples / 4)
+    expected = average_samples(renderer.paint(renderer.splats(fine, samples), fine.hw), samples, weight)
+    render, _ = finished(strips(renderer, camera, samples))
+    torch.testing.assert_close(render.rgb, expected.rgb, atol=2e-5, rtol=0)
 
 
 def test_strips_draw_the_levels_of_the_picture():
@@ -124,166 +142,149 @@ def test_strips_draw_the_levels_of_the_picture():
     renderer = replace(renderer, recipe=replace(renderer.recipe, levels=LevelChoice()))
     view = camera.scaled(1 / 8)
     assert renderer.coarsening(*renderer.sampled(view)) > 0
-    drawn, _ = finished(strips(renderer, view, renderer.samples(view)))
-    torch.testing.assert_close(drawn.rgb, renderer(view).rgb, atol=2e-5, rtol=0)
+    render, _ = finished(strips(renderer, view, renderer.samples(view)))
+    torch.testing.assert_close(render.rgb, renderer(view).rgb, atol=2e-5, rtol=0)
 
 
-@pytest.mark.parametrize("at", [0, None])
-def test_at_rest_a_page_has_the_library_s_own_pictures(subject, at):
-    wish = a_wish(subject, at=at)
-    header, sheets = shown(Pictures(subject).steps(wish))
+@pytest.mark.parametrize(("at", "is_lossless"), [(0, True), (None, True), (0, False)])
+def test_at_rest_a_page_has_the_library_s_own_pictures(subject, at, is_lossless, monkeypatch):
+    if not is_lossless:
+        monkeypatch.setattr(pictures, "MAX_LOSSLESS_PIXELS", 0)
+    request = a_request(subject, scale=0.5 if is_lossless else 1.0, at=at)
+    header, sheets = assembled(Pictures(subject).steps(request))
     assert header["stage"] == "done"
-    camera = subject.camera(wish)
     for side, sheet in zip(SIDES, sheets, strict=True):
         how = {"quality": side.quality, "rasterizer": "eager"}
-        expected = Renderer.of(subject.scene, subject.cameras, side.recipe, **how)(camera).rgb
-        assert float((sheet - quantised(expected)).abs().max()) < 1.1 / 255
-
-
-def test_a_large_picture_is_sent_as_jpeg_above_40_db(subject, monkeypatch):
-    monkeypatch.setattr(pictures, "LOSSLESS", 0)
-    wish = a_wish(subject, scale=1.0)
-    messages = list(Pictures(subject).steps(wish))
-    assert unpacked(messages[-1])[0]["stage"] == "done"
-    _, sheets = shown(messages)
-    for side, sheet in zip(SIDES, sheets, strict=True):
-        expected = subject.renderer(side)(subject.camera(wish)).rgb
-        assert 40 < psnr(sheet, quantised(expected)) < 80
+        expected = quantised(
+            Renderer.of(subject.scene, subject.cameras, side.recipe, **how)(subject.camera(request)).rgb
+        )
+        assert (float((sheet - expected).abs().max()) < 1.1 / 255) == is_lossless
+        assert is_lossless or 40 < psnr(sheet, expected) < 80
 
 
 def test_a_moving_camera_gets_one_quick_picture_of_what_is_visible(subject, monkeypatch):
-    monkeypatch.setattr(pictures, "UNIT", (2000, 400_000))
+    monkeypatch.setattr(pictures, "UNIT_SAMPLES", 2000)
     moving = Pictures(subject)
-    wish = a_wish(subject, scale=2.0, split=0.25, moving=True)
-    [message] = moving.steps(wish)
+    request = a_request(subject, scale=2.0, split=0.25, moving=True)
+    [message] = moving.steps(request)
     header, files = unpacked(message)
     assert header["stage"] == "moving"
-    assert [part["span"] for part in header["parts"]] == [[0, wish.width // 4], [wish.width // 4, wish.width]]
+    assert [part["span"] for part in header["parts"]] == [[0, request.width // 4], [request.width // 4, request.width]]
     assert header["scale"] < 1
-    assert decoded(files[1]).shape[1] < wish.width * 0.75
-    resting = list(moving.steps(replace(wish, moving=False)))
-    assert "moving" not in {unpacked(m)[0]["stage"] for m in resting if m}  # it has that one
+    assert decoded(files[1]).shape[1] < request.width * 0.75
+    resting = headers(moving.steps(replace(request, moving=False)))
+    assert "moving" not in {header["stage"] for header in resting}  # it has that one
 
 
 def test_the_effort_falls_with_slow_frames_and_grows_where_it_was_short():
-    assert pictures._adapted(1.0, 2 * pictures.FRAME, limited=True) == pytest.approx(0.6)
-    assert pictures._adapted(1.0, pictures.FRAME / 2, limited=True) > 1
-    assert pictures._adapted(1.0, pictures.FRAME / 2, limited=False) == 1
-    assert pictures._adapted(1 / 16, 9.0, limited=True) == 1 / 16
+    assert pictures._adapted(1.0, 2 * pictures.FRAME_SECONDS, is_limited=True) == pytest.approx(0.6)
+    assert pictures._adapted(1.0, pictures.FRAME_SECONDS / 2, is_limited=True) > 1
+    assert pictures._adapted(1.0, pictures.FRAME_SECONDS / 2, is_limited=False) == 1
+    assert pictures._adapted(1 / 16, 9.0, is_limited=True) == 1 / 16
 
 
 def test_what_is_done_is_not_drawn_again(subject):
     drawing = Pictures(subject)
-    list(drawing.steps(a_wish(subject)))
-    messages = [unpacked(m)[0] for m in drawing.steps(a_wish(subject, id=2, paint="alpha")) if m]
-    assert [header["stage"] for header in messages] == ["done"]
-    assert [part["of"] for part in messages[0]["parts"]] == ["paint"]
+    list(drawing.steps(a_request(subject)))
+    [header] = headers(drawing.steps(a_request(subject, id=2, overlay="alpha")))
+    assert (header["stage"], [part["of"] for part in header["parts"]]) == ("done", ["paint"])
 
 
-def test_the_photograph_has_the_figures_of_an_evaluation(subject):
-    header, _ = shown(Pictures(subject).steps(a_wish(subject, scale=0.5, photo=True)))
-    [own] = [part for part in header["parts"] if part["of"] == "photo"]
-    view = subject.views[0]
-    expected = []
-    for side in SIDES:
-        image = quantised(subject.renderer(side)(view.scaled(0.5)).rgb)
-        photo = decoded(view.photo.read_bytes())
-        small = torch.nn.functional.avg_pool2d(photo.permute(2, 0, 1), 2).permute(1, 2, 0)
-        expected.append(psnr(image, small))
-    assert header["psnr"] == pytest.approx(expected, abs=0.02)
+@pytest.mark.parametrize("shrink", [1, 2])
+def test_a_photograph_of_any_size_has_the_figures_of_an_evaluation(seen, subject, shrink, tmp_path):
+    photo = box_average(read_image(subject.views[0].photo), shrink)
+    write_png(tmp_path / "photo.png", photo)
+    views = replace(seen[1].train[0], photo=tmp_path / "photo.png"), seen[1].train[1]
+    subject = replace(subject, cameras=CameraSet(views, views))
+    request = a_request(subject, scale=0.5, photo=True)
+    *_, message = filter(None, Pictures(subject).steps(request))
+    header, [file] = unpacked(message)
+    expected = box_average(photo, 2 // shrink)
+    torch.testing.assert_close(decoded(file), expected, atol=0.6 / 255, rtol=0)
+    images = [quantised(subject.renderer(side)(views[0].scaled(0.5)).rgb) for side in SIDES]
+    assert header["psnr"] == pytest.approx([psnr(image, expected) for image in images], abs=0.02)
     assert header["whole"]
-    assert own["span"] == [0, view.width // 2]
+    assert header["parts"][0]["span"] == [0, request.width]
 
 
 def test_a_view_in_a_larger_window_keeps_its_pixels(subject):
-    wish = a_wish(subject, scale=0.5)
-    wide = replace(wish, width=wish.width + 31, height=wish.height + 8)
-    left, top, width, height = subject.frame(wide)
-    assert (left, top, width, height) == (15, 4, wish.width, wish.height)
+    request = a_request(subject, scale=0.5)
+    wide = replace(request, width=request.width + 31, height=request.height + 8)
+    view, left, top = subject.placed_view(wide)
+    assert (left, top, view.width, view.height) == (15, 4, request.width, request.height)
     renderer = subject.renderer(SIDES[0])
-    inner = renderer(subject.camera(wide)).rgb[top : top + height, left : left + width]
+    inner = renderer(subject.camera(wide)).rgb[top : top + view.height, left : left + view.width]
     torch.testing.assert_close(inner, renderer(subject.views[0].scaled(0.5)).rgb, atol=0.01, rtol=0)  # but for its edge
 
 
-@pytest.mark.parametrize("name", PAINTS)
-def test_paints_tell_what_they_say(subject, name):
-    renderer, wish = subject.renderer(SIDES[1]), a_wish(subject, scale=0.5)
-    camera = subject.camera(wish)
-    values = PAINTS[name].draw(renderer, camera, 2)
+LAWS = {
+    "alpha": lambda values: 0 <= values.min() < values.max() <= 1,
+    "samples": lambda values: set(values.tolist()) == {4.0},
+    "views": lambda values: 1 <= values.min() <= values.max() <= 2.001,
+    "rate": lambda values: 0.2 < values.median() <= 0.51,  # half of the training size at a training pose
+    "cost": lambda values: values.max() >= 4,
+}
+
+
+@pytest.mark.parametrize("name", OVERLAYS)
+def test_overlays_tell_what_they_say(subject, name):
+    renderer, camera = subject.renderer(SIDES[1]), subject.camera(a_request(subject, scale=0.5))
+    values = OVERLAYS[name].values(renderer, camera, 2)
     assert values.shape == camera.hw
-    known = values[values.isfinite()]
+    assert LAWS[name](values[values.isfinite()])
     if name == "alpha":
-        torch.testing.assert_close(
-            values, renderer.rasterizer(renderer.splats(camera), camera.hw, (0.0, 0.0, 0.0)).alpha
-        )
-    elif name == "samples":
-        assert set(known.tolist()) == {4.0}
-    elif name == "views":
-        assert float(known.min()) >= 1
-        assert float(known.max()) <= 2.001
-    elif name == "rate":  # half of the training size at a training pose
-        assert 0.2 < float(known.median()) <= 0.51
-    else:
-        assert float(known.max()) >= 4
-    levels, legend = PAINTS[name](renderer, camera, 2)
+        one_sample = replace(renderer.recipe, grid=1, target_rate=0.0, neighbours=0.0)
+        torch.testing.assert_close(values, replace(renderer, recipe=one_sample)(camera).alpha)
+    levels, legend = OVERLAYS[name](renderer, camera, 2)
     assert 0 <= float(levels.min()) <= float(levels.max()) <= 1
     assert legend["low"] < legend["high"]
 
 
 def test_a_still_has_the_size_that_was_asked_for(subject):
-    wish = a_wish(subject)
-    found = [m for m in Pictures(subject).still(wish, pictures.Still(60, 40, 1)) if m]
-    header, [file] = unpacked(found[-1])
+    request = a_request(subject)
+    *_, message = filter(None, Pictures(subject).still(request, StillRequest(60, 40, 1)))
+    header, [file] = unpacked(message)
     assert header["still"] == "auto-60x40.png"
-    expected = subject.renderer(SIDES[1])(subject.camera(wish).framed(60, 40)).rgb
+    expected = subject.renderer(SIDES[1])(subject.camera(request).framed(60, 40)).rgb
     assert float((decoded(file) - quantised(expected)).abs().max()) < 1.1 / 255
 
 
 # --------------------------------------------------------------------------------------------------------- the studio
 
 
-def test_a_newer_wish_ends_the_older_one_between_strips(subject, monkeypatch):
-    monkeypatch.setattr("aaplug.rendering.strips.SAMPLES", 200)
-    studio, sent = Studio(subject), []
-    page = studio.enter(sent.append)
-    studio.tell(page, a_wish(subject, id=1))
-    for _ in range(3):
-        page.step()
-    assert page.steps is not None
-    studio.tell(page, a_wish(subject, id=2, scale=0.25))
-    messages = [message for _ in range(200) if (message := page.step() if page.busy else None)]
+def test_a_newer_request_ends_the_older_one_between_strips(subject, monkeypatch):
+    monkeypatch.setattr("aaplug.rendering.strips.SAMPLES_PER_STRIP", 200)
+    studio = Studio(subject)
+    with studio.page(print) as page:
+        studio.receive(page, a_request(subject, id=1))
+        for _ in range(3):
+            page.step()
+        assert page.steps is not None
+        studio.receive(page, a_request(subject, id=2, scale=0.25))
+        messages = [message for _ in range(200) if (message := page.step() if page.busy else None)]
     assert {unpacked(message)[0]["id"] for message in messages} == {2}
 
 
 def test_two_pages_take_turns_and_a_slow_one_waits(subject, monkeypatch):
-    monkeypatch.setattr("aaplug.rendering.strips.SAMPLES", 200)
+    monkeypatch.setattr("aaplug.rendering.strips.SAMPLES_PER_STRIP", 200)
     studio = Studio(subject)
-    pages = [studio.enter(lambda message: None) for _ in range(2)]
-    for page in pages:
-        studio.tell(page, a_wish(subject))
-    assert [studio._next() for _ in range(4)] == pages * 2
-    pages[0].sent = pages[0].shown + 2
-    assert [studio._next() for _ in range(2)] == [pages[1]] * 2
-    studio.leave(pages[1])
-    pages[0].shown += 1
-    assert studio._next() is pages[0]
+    with studio.page(print) as slow:
+        with studio.page(print) as other:
+            for page in (slow, other):
+                studio.receive(page, a_request(subject))
+            assert [studio._next() for _ in range(4)] == [slow, other] * 2
+            slow.sent = slow.received + 2
+            assert [studio._next() for _ in range(2)] == [other] * 2
+        slow.received += 1
+        assert studio._next() is slow
 
 
 def test_a_picture_that_fails_says_so_and_the_next_one_comes(subject, monkeypatch):
-    sent, there = [], threading.Event()
-
-    def keep(message):
-        sent.append(unpacked(message)[0])
-        there.set()
-
-    with Studio(subject) as studio:
-        page = studio.enter(keep)
+    sent = SimpleQueue()
+    with Studio(subject) as studio, studio.page(sent.put) as page:
         with monkeypatch.context() as broken:
             broken.setattr(Pictures, "_preview", lambda *_: (_ for _ in ()).throw(MemoryError()))
-            studio.tell(page, a_wish(subject))
-            assert there.wait(10)
-        assert sent[0] == {"problem": "out of memory"}
-        there.clear()
-        studio.tell(page, a_wish(subject, id=2))
-        assert there.wait(10)
-        assert sent[1]["id"] == 2
+            studio.receive(page, a_request(subject))
+            assert unpacked(sent.get(timeout=10))[0] == {"problem": "out of memory"}
+        studio.receive(page, a_request(subject, id=2))
+        assert unpacked(sent.get(timeout=10))[0]["id"] == 2

@@ -1,25 +1,24 @@
 """The live page, driven as a person would in a real browser."""
 
 import json
+import math
 from base64 import b64decode
 from contextlib import ExitStack
-from dataclasses import replace
 from urllib.parse import unquote, urlsplit
 
-import cv2
-import numpy as np
 import pytest
 import torch
 
-from aaplug.core.cameras import CameraSet
+from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.imaging import quantised
 from aaplug.core.orbits import pinhole
 from aaplug.evaluation.metrics import psnr
 from aaplug.io.cameras.camera_path import read_camera_path
-from aaplug.io.images import read_image, write_png
+from aaplug.io.images import read_image
 from aaplug.rendering.renderer import Renderer
 from aaplug.verbs.view import serving
 from tests.conftest import make_camera, make_scene
+from tests.test_view import decoded, with_photograph
 from tests.test_webpage import browser  # noqa: F401  (fixture)
 
 SEEN = "#picture"
@@ -28,13 +27,9 @@ SEEN = "#picture"
 @pytest.fixture(scope="module")
 def seen(tmp_path_factory):
     """A scene and its cameras, of which the first has a photograph."""
-    scene, folder = make_scene(200), tmp_path_factory.mktemp("photos")
-    eyes = [(0.0, -4.0, 0.0), (2.0, -4.0, 1.0), (-2.0, -4.0, 1.0)]
-    views = [make_camera(eye, name=f"<i>{i}") for i, eye in enumerate(eyes)]
-    views = [view.scaled(4.0).as_trained() for view in views]
-    write_png(folder / "0.png", Renderer.of(scene, views, "classic", rasterizer="eager")(views[0]).rgb * 0.9)
-    views[0] = replace(views[0], photo=folder / "0.png")
-    return scene, CameraSet(tuple(views), tuple(views))
+    scene, eyes = make_scene(200), [(0.0, -4.0, 0.0), (2.0, -4.0, 1.0), (-2.0, -4.0, 1.0)]
+    views = [make_camera(eye, name=f"<i>{i}").scaled(4.0) for i, eye in enumerate(eyes)]
+    return scene, with_photograph(scene, views, tmp_path_factory.mktemp("photos"))
 
 
 @pytest.fixture(scope="module")
@@ -89,20 +84,35 @@ def state(page) -> dict:
     return json.loads(unquote(urlsplit(before).fragment))
 
 
+def camera_of(page, cameras: CameraSet) -> Camera:
+    """The camera of the picture, from what the page says of itself."""
+    fields = state(page)
+    size, focal = tuple(map(int, data(page, "size").split("x"))), fields["scale"] * cameras.train[0].focal
+    return pinhole("seen", size, focal, torch.tensor(fields["pose"], dtype=torch.float64).view(4, 4))
+
+
 def image(page, selector=SEEN) -> torch.Tensor:
     """The pixels of a canvas themselves."""
     url = page.evaluate("(s) => document.querySelector(s).toDataURL()", selector)
-    pixels = cv2.imdecode(np.frombuffer(b64decode(url.partition(",")[2]), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
-    return torch.from_numpy(pixels.astype(np.float32) / 255)
+    return decoded(b64decode(url.partition(",")[2]))
 
 
 def drag(page, start, end, button="left"):
-    box = page.locator(SEEN).bounding_box()
-    places = [(box["x"] + x * box["width"], box["y"] + y * box["height"]) for x, y in (start, end)]
-    page.mouse.move(*places[0])
+    page.mouse.move(*place(page, *start))
     page.mouse.down(button=button)
-    page.mouse.move(*places[1], steps=4)
+    page.mouse.move(*place(page, *end), steps=4)
     page.mouse.up(button=button)
+
+
+def place(page, x, y) -> tuple[float, float]:
+    """A place on the screen, from shares of the picture."""
+    box = page.locator(SEEN).bounding_box()
+    return box["x"] + x * box["width"], box["y"] + y * box["height"]
+
+
+def says(page, script: str):
+    """Until what the page says of itself is so."""
+    page.wait_for_function(f"(({{dataset}}) => {script})(document.querySelector('{SEEN}'))")
 
 
 def test_a_streamed_picture_is_the_library_s_own(opened, seen):
@@ -111,16 +121,12 @@ def test_a_streamed_picture_is_the_library_s_own(opened, seen):
     page.keyboard.press("2")  # 1/4
     page.keyboard.press("f")
     at_rest(page, at="", split="1.000")
-    width, height = map(int, data(page, "size").split("x"))
-    found = state(page)
-    scene, cameras = seen
-    pose = torch.tensor(found["pose"], dtype=torch.float64).view(4, 4)
-    camera = pinhole("seen", (width, height), found["scale"] * cameras.train[0].focal, pose)
+    camera = camera_of(page, seen[1])
     for recipe, flipped in (("classic", "0.000"), ("auto", "1.000")):
-        expected = Renderer.of(scene, cameras, recipe, quality="best", rasterizer="eager")(camera).rgb
-        shown = image(page).permute(2, 0, 1)[None]
-        small = torch.nn.functional.interpolate(shown, (height, width), mode="nearest-exact")[0].permute(1, 2, 0)
-        inside = slice(4, width - 4)  # the divider stands at an edge
+        expected = Renderer.of(*seen, recipe, quality="best", rasterizer="eager")(camera).rgb
+        enlarged = image(page).permute(2, 0, 1)[None]
+        small = torch.nn.functional.interpolate(enlarged, camera.hw, mode="nearest-exact")[0].permute(1, 2, 0)
+        inside = slice(4, camera.width - 4)  # the divider stands at an edge
         decibels = psnr(small[:, inside].contiguous(), quantised(expected)[:, inside].contiguous())
         assert decibels is None or decibels > 40  # None: equal
         page.keyboard.press("f")
@@ -171,20 +177,18 @@ def test_the_camera_turns_moves_and_comes_nearer(opened):
     assert state(page)["pose"] == poses[0]
 
 
-def test_the_scale_sets_the_size_in_pixels(opened):
+def test_the_scale_sets_the_size_in_pixels(opened, seen):
     page = opened()
     page.locator("#scales input").nth(2).check(force=True)  # 1/2
     at_rest(page, scale="0.5")
-    width, height = map(int, data(page, "size").split("x"))
-    found = state(page)
-    focal, half = 0.5 * 4 * make_camera((0.0, -4.0, 0.0)).focal, np.tan(np.radians(found["fov"] / 2))
-    assert height == pytest.approx(2 * focal * half, abs=1)
-    box = page.locator(SEEN).bounding_box()
-    assert box["height"] == pytest.approx(500, abs=2)
+    camera = camera_of(page, seen[1])
+    assert camera.focal == 0.5 * seen[1].train[0].focal
+    assert camera.height == pytest.approx(2 * camera.focal * math.tan(math.radians(state(page)["fov"] / 2)), abs=1)
+    assert page.locator(SEEN).bounding_box()["height"] == pytest.approx(500, abs=2)
     page.locator("input[name=enlarge]").nth(1).check(force=True)
-    page.wait_for_function(f"document.querySelector('#picture').width === {width}")
+    page.wait_for_function(f"document.querySelector('{SEEN}').width === {camera.width}")
     page.set_viewport_size({"width": 1000, "height": 420})
-    page.wait_for_function(f"document.querySelector('{SEEN}').dataset.size !== '{width}x{height}'")
+    says(page, f"dataset.size !== '{camera.width}x{camera.height}'")
 
 
 def test_the_lens_shows_single_pixels_of_both_sides(opened):
@@ -192,27 +196,26 @@ def test_the_lens_shows_single_pixels_of_both_sides(opened):
     page.keyboard.press("1")
     page.keyboard.press("l")
     at_rest(page, scale="0.125")
-    box = page.locator(SEEN).bounding_box()
-    page.mouse.move(box["x"] + box["width"] * 0.4, box["y"] + box["height"] * 0.5)
-    page.wait_for_function("document.querySelector('#picture').dataset.lens.startsWith('0.4')")
+    page.mouse.move(*place(page, 0.4, 0.5))
+    says(page, "dataset.lens.startsWith('0.4')")
     crops = [image(page, f"#crops figure:nth-child({i}) canvas") for i in (1, 2)]
     assert all(len(torch.unique(crop.flatten(0, 1), dim=0)) < 150 for crop in crops)  # a few large pixels
     page.keyboard.press("+")
-    page.wait_for_function("document.querySelector('#picture').dataset.lens.endsWith(',16')")
+    says(page, "dataset.lens.endsWith(',16')")
     page.keyboard.press("Escape")
     page.wait_for_selector(f'{SEEN}[data-lens="off"]')
 
 
-def test_one_stands_in_cameras_and_sees_their_photographs(opened):
+def test_one_stands_in_cameras_and_sees_their_photographs(opened, seen):
     page = opened()
     assert page.input_value("#view") == "0"
     page.fill("#fade", "1")
     values = data(page, "psnr").split(",")
     assert len(values) == 2
     assert f"{float(values[0]):.2f} dB" in page.inner_text("#psnr")
-    shown = image(page)
+    faded = image(page)
     page.fill("#fade", "0")
-    assert not torch.equal(image(page), shown)
+    assert not torch.equal(image(page), faded)
     page.keyboard.press(".")
     at_rest(page, at="1")
     assert page.inner_text("#psnr") == ""
@@ -222,23 +225,10 @@ def test_one_stands_in_cameras_and_sees_their_photographs(opened):
         page.mouse.move(200, 100)
         page.mouse.wheel(0, 300)
     at_rest(page, at="")
-    box = page.locator(SEEN).bounding_box()
-    x, y = projected(make_camera((-2.0, -4.0, 1.0)).centre, state(page), page)
-    page.mouse.click(box["x"] + x * box["width"], box["y"] + y * box["height"])
+    camera = camera_of(page, seen[1])
+    [[x, y]], _ = camera.project(seen[1].train[2].centre[None])
+    page.mouse.click(*place(page, float(x) / camera.width, float(y) / camera.height))
     at_rest(page, at="2")
-
-
-def seen_pose(found: dict) -> list[list[float]]:
-    return [found["pose"][i : i + 4] for i in range(0, 16, 4)]
-
-
-def projected(point: torch.Tensor, found: dict, page) -> tuple[float, float]:
-    """Where a point is, in shares of the picture."""
-    width, height = map(int, data(page, "size").split("x"))
-    focal = found["scale"] * 4 * make_camera((0.0, -4.0, 0.0)).focal
-    pose = torch.tensor(seen_pose(found), dtype=torch.float64)
-    [[x, y]], _ = pinhole("p", (width, height), focal, pose).project(point[None].double())
-    return float(x) / width, float(y) / height
 
 
 def test_paints_have_a_legend_and_tell_the_value_under_the_pointer(opened):
@@ -247,8 +237,7 @@ def test_paints_have_a_legend_and_tell_the_value_under_the_pointer(opened):
         page.select_option("#paint", name)
         at_rest(page, paint=name)
         assert page.locator("#legend").is_visible()
-        box = page.locator(SEEN).bounding_box()
-        page.mouse.move(box["x"] + box["width"] * 0.45, box["y"] + box["height"] * 0.5)
+        page.mouse.move(*place(page, 0.45, 0.5))
         page.wait_for_function("document.querySelector('#legend output').textContent.startsWith('here: ')")
         assert float(page.inner_text("#legend output").removeprefix("here: ")) >= 0
     page.select_option("#paint", "")
@@ -256,17 +245,7 @@ def test_paints_have_a_legend_and_tell_the_value_under_the_pointer(opened):
     assert not page.locator("#legend").is_visible()
 
 
-def test_shaking_moves_the_picture_and_stops(opened):
-    page = opened()
-    page.keyboard.press("x")
-    page.wait_for_selector(f"{SEEN}[data-stage=moving]")
-    first = int(data(page, "id"))
-    page.wait_for_function(f"document.querySelector('#picture').dataset.id > {first + 3}")
-    page.keyboard.press("x")
-    at_rest(page, at="0")
-
-
-def test_a_path_a_still_and_a_command_are_kept(opened, tmp_path):
+def test_a_path_a_still_and_a_command_are_kept(opened, seen, tmp_path):
     page = opened(permissions=["clipboard-read", "clipboard-write"])
     page.keyboard.press("r")
     drag(page, (0.2, 0.5), (0.4, 0.5))
@@ -279,7 +258,7 @@ def test_a_path_a_still_and_a_command_are_kept(opened, tmp_path):
     download.value.save_as(tmp_path / "camera_path.json")
     path = read_camera_path(tmp_path / "camera_path.json")
     assert path.fps == 24
-    end = torch.tensor(seen_pose(state(page)), dtype=torch.float64)
+    end = camera_of(page, seen[1]).cam_from_world
     torch.testing.assert_close(path.cameras[-1].cam_from_world, end, atol=1e-6, rtol=0)
     page.fill("#width", "64")
     page.fill("#height", "48")
@@ -288,35 +267,36 @@ def test_a_path_a_still_and_a_command_are_kept(opened, tmp_path):
     download.value.save_as(tmp_path / "still.png")
     assert read_image(tmp_path / "still.png").shape == (48, 64, 3)
     page.click("#command")
-    page.wait_for_function("document.querySelector('#said').textContent.startsWith('copied')")
+    page.locator("#said", has_text="copied").wait_for()
     words = page.evaluate("navigator.clipboard.readText()")
     assert "aaplug video scene.ply --cameras 'a b' --path camera_path.json" in words
     page.keyboard.press("Home")
     at_rest(page, at="0")
     page.click("#command")
-    page.wait_for_function("document.querySelector('#said').textContent.includes('--views')")
+    page.locator("#said", has_text="--views").wait_for()
     words = page.inner_text("#said")
     assert "aaplug render scene.ply --cameras 'a b' --views '<i>0' --scale" in words
     assert "--recipe auto --quality best" in words
     page.keyboard.press("f")
     at_rest(page, split="1.000")
     page.click("#command")  # of the side that is seen
-    page.wait_for_function("document.querySelector('#said').textContent.includes('--recipe classic -o')")
+    page.locator("#said", has_text="--recipe classic -o").wait_for()
     page.fill("#width", "100000")
     page.click("#still")
-    page.wait_for_function("document.querySelector('#said').textContent.startsWith('size: is 100000x48 px')")
+    page.locator("#said", has_text="size: is 100000x48 px").wait_for()
 
 
-def test_two_pages_move_at_once_and_one_may_close(opened):
+def test_two_pages_shake_at_once_and_one_may_close(opened):
     one, two = opened(), opened(width=600)
     for page in (one, two):
         page.keyboard.press("x")
+        page.wait_for_selector(f"{SEEN}[data-stage=moving]")
     marks = [int(data(page, "id")) for page in (one, two)]
     for page, mark in zip((one, two), marks, strict=True):
-        page.wait_for_function(f"document.querySelector('#picture').dataset.id > {mark + 3}")
+        says(page, f"dataset.id > {mark + 3}")
     one.close()
     two.keyboard.press("x")
-    at_rest(two)
+    at_rest(two, at="0")
 
 
 def test_a_lost_page_finds_its_server_again(opened, seen):
@@ -347,9 +327,7 @@ def test_it_fits_a_phone_and_a_tablet(opened, size, scheme):
         " && parseFloat(getComputedStyle(e).fontSize) < 10).length"
     )
     assert small == 0
-    box = page.locator(SEEN).bounding_box()
-    assert box["height"] > 200
+    assert page.locator(SEEN).bounding_box()["height"] > 200
     page.keyboard.press("h")
     page.wait_for_function(f"document.querySelector('#stage').clientHeight === {size[1]}")
-    shot = cv2.imdecode(np.frombuffer(page.screenshot(), np.uint8), cv2.IMREAD_COLOR)
-    assert shot.std() > 1
+    assert decoded(page.screenshot()).std() > 1 / 255

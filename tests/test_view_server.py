@@ -5,13 +5,14 @@ import math
 import socket
 import webbrowser
 from contextlib import contextmanager
+from types import SimpleNamespace
 
 import pytest
 import torch
 
-from aaplug.core.errors import UsageError
-from aaplug.core.monitor import SILENT
-from aaplug.live.messages import See, Side, parsed
+from aaplug.live.messages import PictureRequest, Side, parse
+from aaplug.system.errors import UsageError
+from aaplug.system.monitor import SILENT
 from aaplug.verbs.view import attend, serving, view
 from tests.test_cli import cli, dataset  # noqa: F401  (fixtures)
 from tests.test_view import RECIPES, seen, unpacked  # noqa: F401  (a fixture)
@@ -52,16 +53,16 @@ GARBAGE = [
 
 
 def test_a_good_message_is_taken():
-    found = parsed(json.dumps({"see": GOOD | {"at": 1, "paint": "rate", "moving": True}}), RECIPES, 2)
-    assert isinstance(found, See)
-    assert (found.at, found.paint, found.moving, found.sides[1]) == (1, "rate", True, Side("auto", "fast"))
+    request = parse(json.dumps({"see": GOOD | {"at": 1, "paint": "rate", "moving": True}}), RECIPES, 2)
+    assert isinstance(request, PictureRequest)
+    assert (request.at, request.overlay, request.moving, request.sides[1]) == (1, "rate", True, Side("auto", "fast"))
 
 
 @pytest.mark.parametrize("name", REFUSED)
 def test_a_message_out_of_bounds_is_refused_in_clear_words(name):
     other, words = REFUSED[name]
     with pytest.raises(UsageError) as error:
-        parsed(json.dumps({"see": GOOD | other}), RECIPES, 2)
+        parse(json.dumps({"see": GOOD | other}), RECIPES, 2)
     assert words in str(error.value)
     assert len(str(error.value)) < 200
 
@@ -69,7 +70,7 @@ def test_a_message_out_of_bounds_is_refused_in_clear_words(name):
 @pytest.mark.parametrize("text", GARBAGE, ids=lambda text: str(text)[:20])
 def test_garbage_is_refused(text):
     with pytest.raises(UsageError):
-        parsed(text, RECIPES, 2)
+        parse(text, RECIPES, 2)
 
 
 # --------------------------------------------------------------------------------------------------------- the server
@@ -149,26 +150,14 @@ def test_garbage_harms_nobody(address, capfd):
             bad.send(text)
             assert "problem" in unpacked(bad.recv(timeout=10))[0]
         assert "problem" in ask(bad, width=100_000)
-        assert ask(bad)["stage"] == "done"
+        assert ask(bad, pose=[*POSE[:11], 1e8, *POSE[12:]])["stage"] == "done"  # it sees nothing
         bad.send("x" * 100_000)
         with pytest.raises(exceptions.ConnectionClosedError, match="1009"):
             bad.recv(timeout=10)
-        for request in (
-            "\n",
-            "POST / HTTP/1.1\nHost: HERE\n\n",
-            "\x16\x03\x01\x02\n\n",
-            "GET " + 20_000 * "a" + "\n\n",
-        ):
+        for request in ("\n", "POST / HTTP/1.1\nHost: HERE\n\n", "\x16\x03\x01\x02\n\n", f"GET {20_000 * 'a'}\n\n"):
             raw(address, request)
         assert ask(good)["stage"] == "done"
     assert capfd.readouterr().err == ""
-
-
-def test_a_pose_that_sees_nothing_has_a_picture(address):
-    with connected(address) as connection:
-        connection.recv()
-        away = [*POSE[:11], 1e8, *POSE[12:]]
-        assert ask(connection, pose=away)["stage"] == "done"
 
 
 # -------------------------------------------------------------------------------------------------------- the command
@@ -181,6 +170,11 @@ def test_a_busy_port_is_one_clear_line(address, cli):  # noqa: F811
     assert f"--port: {port} of 127.0.0.1 cannot be used: address already in use" in err.splitlines()[-1]
 
 
+def test_a_host_that_cannot_be_a_name_is_refused(seen):  # noqa: F811
+    with pytest.raises(UsageError, match="cannot be used"), serving(*seen, host=70 * "x", rasterizer="eager"):
+        pass
+
+
 def test_a_scene_that_fails_to_load_opens_no_page(cli):  # noqa: F811
     code, _, err = cli("view missing.ply --no-browser --port 0")
     assert (code, len(err.splitlines())) == (2, 1)
@@ -188,12 +182,10 @@ def test_a_scene_that_fails_to_load_opens_no_page(cli):  # noqa: F811
 
 
 def test_the_command_says_where_and_ends_quietly(cli, monkeypatch):  # noqa: F811
-    def interrupted(self, timeout=None):
+    def interrupted():
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(
-        "aaplug.verbs.view.threading", type("Fake", (), {"Event": type("E", (), {"wait": interrupted})})
-    )
+    monkeypatch.setattr("aaplug.verbs.view.threading", SimpleNamespace(Event=lambda: SimpleNamespace(wait=interrupted)))
     code, _, err = cli("view scene.ply --cameras . --rasterizer eager --no-browser --port 0")
     assert code == 0
     assert "open http://127.0.0.1:" in err
@@ -209,10 +201,10 @@ def test_without_a_scene_the_sample_opens(monkeypatch):
 
 def test_a_browser_in_the_terminal_is_not_opened(monkeypatch):
     opened = []
-    windowed = type("Windowed", (), {"open": lambda self, address: opened.append(address)})()
-    event = type("Event", (), {"wait": lambda self: None})
-    monkeypatch.setattr("aaplug.verbs.view.threading", type("Threading", (), {"Event": event}))
-    for browser in (webbrowser.GenericBrowser("lynx"), windowed):
+    monkeypatch.setattr(
+        "aaplug.verbs.view.threading", SimpleNamespace(Event=lambda: SimpleNamespace(wait=lambda: None))
+    )
+    for browser in (webbrowser.GenericBrowser("lynx"), SimpleNamespace(open=opened.append)):
         monkeypatch.setattr(webbrowser, "get", lambda chosen=browser: chosen)
         attend("http://there/", SILENT, no_browser=False)
     attend("http://there/", SILENT, no_browser=True)
@@ -231,10 +223,6 @@ def test_words_of_the_command_line_name_what_is_seen(tmp_path):
 
     scene = SceneOptions(scene=tmp_path / "s.ply", convention="mip", drop_bad=True)
     assert _words(scene) == [str(tmp_path / "s.ply"), "--convention", "mip", "--drop-bad"]
-    assert _words(CameraOptions(cameras=tmp_path, train_scale=0.5)) == [
-        "--cameras",
-        str(tmp_path),
-        "--train-scale",
-        "0.5",
-    ]
+    words = _words(CameraOptions(cameras=tmp_path, train_scale=0.5))
+    assert words == ["--cameras", str(tmp_path), "--train-scale", "0.5"]
     assert _words(CameraOptions().orbit) == []

@@ -8,13 +8,13 @@ import torch
 
 import aaplug
 from aaplug.core.cameras import CameraSet
-from aaplug.core.executors import torch_threads
 from aaplug.core.gaussians import Gaussians, joined
 from aaplug.core.training import TrainingViews
-from aaplug.evaluation.truth import own_look
 from aaplug.levels.clusters import merged_pairs, seen
 from aaplug.levels.merging import Goal, merged
+from aaplug.rendering.renderer import own_look
 from aaplug.rendering.visibility import visibility
+from aaplug.system.executors import torch_threads
 from tests.conftest import make_camera, make_scene
 
 RATE = 40.0  # px per world unit
@@ -106,15 +106,15 @@ def test_a_level_leaves_out_what_is_hidden_and_keeps_it_where_nothing_is_known()
     scene, rates = make_scene(40), torch.full((40,), RATE)
     hidden = torch.arange(40) % 2 == 0
     goal = Goal(1.0, tolerance=0.0)
-    assert len(merged(scene, rates, goal)) == 40
-    left = merged(scene, rates, goal, visible=(~hidden).float())
+    assert len(merge(scene, rates, goal)) == 40
+    left = merge(scene, rates, goal, visible=(~hidden).float())
     assert torch.equal(left.means.sort(dim=0).values, scene.means[~hidden].sort(dim=0).values)
 
 
 def test_equally_visible_gaussians_merge_alike_for_a_tolerance_of_their_squared_share():
     scene, rates, share = make_scene(60), torch.full((60,), RATE), 0.4
     found = [
-        merged(scene, rates, Goal(0.1, tolerance=0.3 * own**2), visible=torch.full((60,), own)) for own in (1.0, share)
+        merge(scene, rates, Goal(0.1, tolerance=0.3 * own**2), visible=torch.full((60,), own)) for own in (1.0, share)
     ]
     assert len(found[0]) < 50
     for name, column in found[0].columns.items():
@@ -124,7 +124,7 @@ def test_equally_visible_gaussians_merge_alike_for_a_tolerance_of_their_squared_
 def test_a_hidden_gaussian_adds_nothing_to_the_seen_one_that_it_is_merged_with():
     scene = joined([one((0.0, 0.0, 0.0), 0.1, 0.5), one((0.0, 0.1, 0.0), 0.1, 0.5)])
     scene.sh[:, 0] = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    clusters = seen(scene, torch.full((2,), RATE), visible=torch.tensor([1.0, 0.0]))
-    both = merged_pairs(clusters[:1], clusters[1:])
+    clusters = clusters_of(scene, torch.full((2,), RATE), visible=torch.tensor([1.0, 0.0]))
+    both = merge_pairs(clusters[:1], clusters[1:])
     for name in ("means", "covs", "opacities", "colours", "visible"):
         torch.testing.assert_close(getattr(both, name), getattr(clusters[:1], name), rtol=5e-3, atol=5e-3)

@@ -1,11 +1,11 @@
-"""Camera paths that show aliasing: zoom, dolly and orbit from one view of the data set.
+"""Cameras made of other cameras: paths that show aliasing, and free views between those of a data set.
 
 t runs over [0, 1).  Zoom and dolly go from `start` to `end` and back; both are factors on the sampling rate.  Speed is
 even in octaves and eases at both ends.  An orbit goes once around.  All three are loops.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
@@ -14,9 +14,12 @@ from torch import Tensor
 
 from aaplug.core.cameras import Camera, CameraSet
 
+NEIGHBOURS = 6  # cameras nearest to each, between which and itself its free views lie
+LEAST_SHARE, LARGEST_SHARE = 0.2, 0.8  # of the way to the neighbour
+
 
 def zoomed(view: Camera, by: float) -> Camera:
-    """The view with its focal length multiplied."""
+    """The view with its focal length multiplied; pose and size stay."""
     return replace(view, fx=view.fx * by, fy=view.fy * by)
 
 
@@ -28,19 +31,19 @@ def moved(view: Camera, by: float, depth: float) -> Camera:
 
 
 def zoom(view: Camera, t: float, start: float, end: float) -> Camera:
-    """The view with its focal length multiplied; pose and size stay."""
+    """The view with its focal length multiplied by `factor`."""
     return zoomed(view, factor(t, start, end))
 
 
 def dolly(view: Camera, t: float, start: float, end: float, depth: float) -> Camera:
-    """The view from farther away or nearer, as a free camera: see `moved`."""
+    """A free camera, moved by `factor`: see `moved`."""
     return moved(view, factor(t, start, end), depth)
 
 
 def factor(t: float, start: float, end: float) -> float:
     """The factor on the sampling rate that a zoom or dolly has at t."""
-    way = 0.5 - 0.5 * math.cos(2 * math.pi * t)
-    return start * (end / start) ** way
+    progress = 0.5 - 0.5 * math.cos(2 * math.pi * t)
+    return start * (end / start) ** progress
 
 
 def orbit(view: Camera, t: float, depth: float, up: Float[Tensor, " 3"]) -> Camera:
@@ -50,6 +53,14 @@ def orbit(view: Camera, t: float, depth: float, up: Float[Tensor, " 3"]) -> Came
     turn[:3, :3] = _rotation(up, 2 * math.pi * t)
     turn[:3, 3] = pivot - turn[:3, :3] @ pivot
     return replace(view, cam_from_world=view.cam_from_world @ turn, trained_focal=None)
+
+
+def _rotation(axis: Float[Tensor, " 3"], angle: float) -> Float[Tensor, "3 3"]:
+    """Rodrigues' formula, for a unit axis."""
+    x, y, z = axis.double().tolist()
+    cross = torch.tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]], dtype=torch.float64)
+    identity = torch.eye(3, dtype=torch.float64)
+    return identity + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
 
 
 def up_of(cameras: CameraSet) -> Float[Tensor, " 3"]:
@@ -64,9 +75,37 @@ def frames(path: Callable[[float], Camera], count: int) -> list[Camera]:
     return [replace(path(i / count), name=f"{i:0{digits}}") for i in range(count)]
 
 
-def _rotation(axis: Float[Tensor, " 3"], angle: float) -> Float[Tensor, "3 3"]:
-    """Rodrigues' formula, for a unit axis."""
-    x, y, z = axis.double().tolist()
-    cross = torch.tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]], dtype=torch.float64)
-    identity = torch.eye(3, dtype=torch.float64)
-    return identity + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
+def free_views(cameras: Sequence[Camera], each: int, seed: int = 0) -> list[Camera]:
+    """Views between each camera and `each` of its neighbours, at random; none for a single camera.
+
+    They keep the first camera's lens and are no poses of the data set.
+    """
+    centres = torch.stack([camera.centre for camera in cameras])
+    nearest = torch.cdist(centres, centres).argsort(dim=1, stable=True)[:, 1 : NEIGHBOURS + 1]
+    generator = torch.Generator().manual_seed(seed)
+    views = []
+    for camera, others in zip(cameras, nearest, strict=True):
+        for number in range(each if len(others) else 0):
+            other = cameras[int(others[torch.randint(len(others), (), generator=generator)])]
+            share = LEAST_SHARE + (LARGEST_SHARE - LEAST_SHARE) * float(torch.rand((), generator=generator))
+            views.append(replace(between(camera, other, share), name=f"{camera.name} free {number + 1}"))
+    return views
+
+
+def between(first: Camera, last: Camera, share: float) -> Camera:
+    """A free camera on the way from one camera to another: the centre on a line, the rotation about one axis."""
+    turn = first.cam_from_world[:3, :3] @ last.cam_from_world[:3, :3].T  # from the last camera's frame to the first's
+    rotation = _part(turn.T, share) @ first.cam_from_world[:3, :3]
+    pose = torch.eye(4, dtype=first.cam_from_world.dtype)
+    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ first.centre.lerp(last.centre, share)
+    return replace(first, cam_from_world=pose, trained_focal=None, photo=None)
+
+
+def _part(rotation: Float[Tensor, "3 3"], share: float) -> Float[Tensor, "3 3"]:
+    """A share of a rotation: exp(share · ln R) (Rodrigues)."""
+    skew = (rotation - rotation.T) / 2
+    sine = float(torch.stack([skew[2, 1], skew[0, 2], skew[1, 0]]).norm())
+    angle = math.atan2(sine, (float(rotation.trace()) - 1) / 2)
+    if sine == 0:
+        return torch.eye(3, dtype=rotation.dtype)
+    return torch.linalg.matrix_exp(skew * (share * angle / sine))

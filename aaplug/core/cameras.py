@@ -5,18 +5,18 @@ Camera frame: x right, y down, z forward (OpenCV).  Pixel (0, 0) covers [0, 1) �
 Sizes and focal lengths may differ from view to view.
 """
 
+import hashlib
+import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-WHITE = (1.0, 1.0, 1.0)
-BLACK = (0.0, 0.0, 0.0)
-WHOLE_PIXEL = 1e-6  # px: slack before a scaled size is rounded down
+WHOLE_SLACK = 1e-6  # a size (px) or a factor this close to a whole number is one
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Camera:
     fx, fy, cx, cy: in px of this size.
     trained_focal: px.  For a pose of the data set, the focal length at which training rendered it (or would have, for
         a held-out view); scaling the view keeps it.  None for a free camera.
-    photo: the photograph taken from here, if any.  lens: its distortion, if any.
+    photo: the photograph taken from here, if any.  lens: its distortion, if any.  Neither counts for equality.
     """
 
     name: str
@@ -54,8 +54,20 @@ class Camera:
     cy: float
     cam_from_world: Float[Tensor, "4 4"]
     trained_focal: float | None = None
-    photo: Path | None = field(default=None, compare=False)
-    lens: Lens | None = field(default=None, compare=False)
+    photo: Path | None = None
+    lens: Lens | None = None
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Camera):
+            return NotImplemented
+        return self._scalars == other._scalars and torch.equal(self.cam_from_world, other.cam_from_world)
+
+    def __hash__(self) -> int:
+        return hash(self._scalars)
+
+    @property
+    def _scalars(self) -> tuple[object, ...]:
+        return self.name, *self.intrinsics, self.trained_focal
 
     @property
     def intrinsics(self) -> tuple[float, float, float, float, int, int]:
@@ -90,9 +102,7 @@ class Camera:
         A partial row at the bottom or column at the right is dropped, so that scaled(1/n) sees exactly what n×n box
         averages of the full image see.
         """
-        width = max(1, math.floor(self.width * factor + WHOLE_PIXEL))
-        height = max(1, math.floor(self.height * factor + WHOLE_PIXEL))
-        return self._stretched(width, height, factor, factor)
+        return self._stretched(whole_side(self.width * factor), whole_side(self.height * factor), factor, factor)
 
     def resized(self, width: int, height: int) -> "Camera":
         """The same field of view in `width` × `height` px; pixels stop being square if the aspect changes."""
@@ -119,7 +129,7 @@ class CameraSet:
     train: the cameras that sampling bounds come from.  test: held-out views; the same as `train` without a split.
     background: the colour that training put behind the scene; None if the files do not say.
     notes: facts worth printing, one line each (format, split, training scale and its source).
-    assumed: whether nobody knows the cameras, and these stand in for them.
+    assumed: true where nobody knows the cameras, and these stand in for them.
     """
 
     train: tuple[Camera, ...]
@@ -131,8 +141,13 @@ class CameraSet:
     @property
     def all(self) -> tuple[Camera, ...]:
         """Every camera once, training views first."""
-        known = {id(camera) for camera in self.train}
-        return self.train + tuple(camera for camera in self.test if id(camera) not in known)
+        training = {id(camera) for camera in self.train}
+        return self.train + tuple(camera for camera in self.test if id(camera) not in training)
+
+
+def whole_side(length: float) -> int:
+    """Whole pixels in a side of this length (px), at least one."""
+    return max(1, math.floor(length + WHOLE_SLACK))
 
 
 def spread(views: Sequence[Camera], most: int) -> Sequence[Camera]:
@@ -149,3 +164,11 @@ def look_at(eye: Float[Tensor, " 3"], target: Float[Tensor, " 3"], up: Float[Ten
     pose[:3, :3] = torch.stack([right, down, forward])
     pose[:3, 3] = -pose[:3, :3] @ eye.double()
     return pose
+
+
+def digest_of_cameras(views: Sequence[Camera]) -> str:
+    """Hash of the views as they were understood: names, sizes, intrinsics, poses, training focal lengths and lenses."""
+    values = [
+        [v.name, *v.intrinsics, v.cam_from_world.tolist(), v.trained_focal, v.lens and asdict(v.lens)] for v in views
+    ]
+    return hashlib.sha256(json.dumps(values).encode()).hexdigest()

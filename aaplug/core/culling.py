@@ -1,4 +1,4 @@
-"""Culling: which splats can change an image."""
+"""Culling of the splats that cannot change an image."""
 
 import math
 from functools import cache, partial
@@ -27,21 +27,17 @@ def cull(
     ellipses: the same splats' bounding ellipses, where a pixel kernel shows more than the splats' own.
     """
     size = splats.means.new_tensor([hw[1], hw[0], margin * max(hw)])
-    of = splats if ellipses is None else ellipses
-    (inside,) = kernels.run(cull_kernel(rules.min_alpha), of.means, of.covs, of.dets, of.opacities, size)
+    bounds = splats if ellipses is None else ellipses
+    columns = bounds.means, bounds.covs, bounds.dets, bounds.opacities
+    (inside,) = kernels.run(cull_kernel(rules.min_alpha), *columns, size)
     return splats.selected(inside.nonzero().squeeze(1), kernels)
 
 
 @cache
 def cull_kernel(min_alpha: float = RULES_3DGS.min_alpha) -> Kernel:
     """The test for one cut-off."""
-    return Kernel(
-        "cull" + variant((min_alpha,), (RULES_3DGS.min_alpha,)),
-        partial(_inside, min_alpha),
-        _example,
-        ("m", "m", "m", "m", None),
-        gathers=True,
-    )
+    name = "cull" + variant((min_alpha,), (RULES_3DGS.min_alpha,))
+    return Kernel(name, partial(_inside, min_alpha), _example, ("m", "m", "m", "m", None), gathers=True)
 
 
 def _inside(

@@ -1,4 +1,4 @@
-"""Ellipses of screen-space Gaussians: whitening, principal axes, the cut-off, and growing by a radius.
+"""Ellipses of screen-space Gaussians: whitening, the cut-off, and growing by a radius.
 
 m: splats.  d: offset (dx, dy) from a splat's centre, in px.  C: its covariance, packed (xx, xy, yy), in px².
 """
@@ -37,20 +37,6 @@ def whitening_columns(covs: Float[Tensor, "m 3"], dets: Float[Tensor, " m"]) -> 
         torch.where(wide, along, zero),
         torch.where(wide, zero, along),
     )
-
-
-def principal_columns(covs: Float[Tensor, "m 3"], dets: Float[Tensor, " m"]) -> Columns:
-    """ux, uy, vx, vy of a whitening whose rows are the principal axes over their standard deviations, longer first."""
-    xx, xy, yy = covs.unbind(dim=1)
-    across, along = 2 * xy, xx - yy
-    round_ = (across == 0) & (along == 0)  # a circle: any axes do, but the angle has no gradient
-    angle = 0.5 * torch.atan2(across.where(~round_, 0.0), along.where(~round_, 1.0))
-    half = 0.5 * (xx + yy)
-    root = torch.hypot(0.5 * along.where(~round_, 1.0), xy)
-    longer = half + torch.where(round_, 0.0, root)
-    wide, thin = longer.rsqrt(), (longer / dets).sqrt()
-    cos, sin = angle.cos(), angle.sin()
-    return cos * wide, sin * wide, -sin * thin, cos * thin
 
 
 def squared_cutoff(opacities: Float[Tensor, " m"], min_alpha: float = RULES_3DGS.min_alpha) -> Float[Tensor, " m"]:

@@ -1,62 +1,39 @@
 """The scene: 3D Gaussians exactly as their file stores them.
 
 n: Gaussians; k: spherical-harmonics coefficients per channel, (degree + 1)².  Lengths are in world units.  Stored
-values (log-scales, opacity logits, quaternions of any length) are kept, so that reading and writing loses nothing.
+values (log-scales, opacity logits, quaternions of any length) stay, so that reading and writing loses nothing.
 Activated values (scales, opacities, unit quaternions) are properties.
 """
 
+import hashlib
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
-from aaplug.core.rules import RULES_3DGS, Rules
+from aaplug.core.conventions import CLASSIC, Convention
 
 MAX_LOG_SCALE = 30.0  # larger |ln s| overflow float32 once squared; values are clamped on use
 MIN_OPACITY = 1e-7  # keeps the logit finite in float32
 
 
 @dataclass(frozen=True)
-class Convention:
-    """How training turned a projected covariance into pixels.
-
-    kernel: variance added to the covariance's diagonal, in px² of the training image.
-    compensated: whether opacity was then multiplied by √(det C / det(C + kernel·I)).
-    rules: of compositing.
-    """
-
-    name: str
-    kernel: float
-    compensated: bool
-    rules: Rules = RULES_3DGS
-
-
-CLASSIC = Convention("classic", 0.3, compensated=False)  # 3DGS (Kerbl et al. 2023)
-ANTIALIASED = Convention("antialiased", 0.3, compensated=True)  # 3DGS --antialiasing, gsplat "antialiased"
-MIP = Convention("mip", 0.1, compensated=True)  # Mip-Splatting (Yu et al. 2024), arXiv 2311.16493
-# PlayCanvas (engine 2.23.3) adds 0.3 in half pixels; what is fitted to it records that as its training
-PLAYCANVAS = Convention("playcanvas", 0.3 / 4, compensated=True)
-PLAYCANVAS_CLASSIC = Convention("playcanvas-classic", 0.3 / 4, compensated=False)  # its anti-aliasing is off
-CONVENTIONS = {c.name: c for c in (CLASSIC, ANTIALIASED, MIP, PLAYCANVAS, PLAYCANVAS_CLASSIC)}
-
-
-@dataclass(frozen=True)
 class Fusion:
-    """Something that was fused into the stored scales and opacities; it is recorded in the file."""
+    """A change that was fused into the stored scales and opacities; the file records it."""
 
     method: str
     settings: dict[str, str] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Origin:
     """The file that a scene came from, with everything in it that is not a parameter of a Gaussian.
 
-    document: what the format's writer needs to restore the file (column order, unknown columns, comments).
+    document: everything that the format's writer restores (column order, unknown columns, comments).
     rows: index of each Gaussian in the document.
     """
 
@@ -67,30 +44,14 @@ class Origin:
     rows: Int[Tensor, " n"]
 
 
-@dataclass(frozen=True)
-class PixelSizes:
-    """The sizes at which training drew each Gaussian, as Multi-Scale 3DGS (Yan et al. 2024) stores them.
-
-    smallest, largest: px, in images of the Gaussian's level; not above 0 where unknown.
-    base: whether it belongs to the coarsest level.
-    """
-
-    smallest: Float[Tensor, " n"]
-    largest: Float[Tensor, " n"]
-    base: Bool[Tensor, " n"]
-
-    def __getitem__(self, index: Tensor | slice) -> "PixelSizes":
-        """The sizes at `index`, in that order."""
-        return PixelSizes(self.smallest[index], self.largest[index], self.base[index])
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Gaussians:
     """n Gaussians and how they were trained.
 
     flat: 2D Gaussians (2DGS, Huang et al. 2024), discs across the third axis.  Their file has two scales; the third
         log-scale here is -MAX_LOG_SCALE, no thickness, so that renderers need no special case.
     filter_3d: standard deviation of Mip-Splatting's 3D filter, stored beside the scales and not yet fused.
+    extras: further columns of the file by name, for methods that know them.
     """
 
     means: Float[Tensor, "n 3"]
@@ -103,7 +64,7 @@ class Gaussians:
     fused: tuple[Fusion, ...] = ()
     origin: Origin | None = None
     flat: bool = False
-    pixel_sizes: PixelSizes | None = None
+    extras: Mapping[str, Shaped[Tensor, " n"]] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return self.means.shape[0]
@@ -135,14 +96,14 @@ class Gaussians:
 
     def __getitem__(self, index: Tensor | slice) -> "Gaussians":
         """The Gaussians at `index` (a mask, indices or a slice), in that order."""
-        kept = index.cpu() if isinstance(index, Tensor) else index  # the file's rows stay on the CPU
-        origin = self.origin and replace(self.origin, rows=self.origin.rows[kept])
+        rows = index.cpu() if isinstance(index, Tensor) else index  # the file's rows stay on the CPU
+        origin = self.origin and replace(self.origin, rows=self.origin.rows[rows])
         columns = {name: column[index] for name, column in self.columns.items()}
-        sizes = None if self.pixel_sizes is None else self.pixel_sizes[index]
-        return replace(self, **columns, pixel_sizes=sizes, origin=origin)
+        extras = {name: column[index] for name, column in self.extras.items()}
+        return replace(self, **columns, extras=extras, origin=origin)
 
     def to(self, dtype: torch.dtype) -> "Gaussians":
-        """The same Gaussians in another precision; recorded pixel sizes keep theirs."""
+        """The same Gaussians in another precision; extras keep theirs."""
         return replace(self, **{name: column.to(dtype) for name, column in self.columns.items()})
 
     @property
@@ -152,10 +113,7 @@ class Gaussians:
 
     @property
     def tracked(self) -> bool:
-        """Whether gradients of a parameter will be asked for.
-
-        Then they are not projected in chunks, because each chunk's gradient would be as large as the scene.
-        """
+        """True if a parameter takes gradients.  Projection in chunks would make each one as large as the scene."""
         return torch.is_grad_enabled() and any(column.requires_grad for column in self.columns.values())
 
 
@@ -163,14 +121,9 @@ def joined(parts: Sequence[Gaussians]) -> Gaussians:
     """The Gaussians of several parts of one scene, at least one part, each with the same columns."""
     first = parts[0]
     columns = {name: torch.cat([getattr(part, name) for part in parts]) for name in first.columns}
-    sizes = [vars(part.pixel_sizes).values() for part in parts if part.pixel_sizes is not None]
+    extras = {name: torch.cat([part.extras[name] for part in parts]) for name in first.extras}
     rows = [part.origin.rows for part in parts if part.origin is not None]
-    return replace(
-        first,
-        **columns,
-        pixel_sizes=PixelSizes(*map(torch.cat, zip(*sizes, strict=True))) if sizes else None,
-        origin=first.origin and replace(first.origin, rows=torch.cat(rows)),
-    )
+    return replace(first, **columns, extras=extras, origin=first.origin and replace(first.origin, rows=torch.cat(rows)))
 
 
 def scale_opacities(
@@ -185,3 +138,12 @@ def scale_opacities(
     log_opacity = log_opacity.clamp(math.log(MIN_OPACITY), math.log(max_opacity))
     logits = log_opacity - torch.log(-torch.expm1(log_opacity))
     return torch.where(log_factor == 0, logit_opacities, logits)
+
+
+def digest_of_scene(scene: Gaussians) -> str:
+    """Hash (SHA-256, in hex) of the Gaussians and of everything that changes their images."""
+    digest = hashlib.sha256(repr((scene.convention, scene.fused, scene.flat)).encode())
+    for name, column in {**scene.columns, **scene.extras}.items():
+        digest.update(f"{name} {tuple(column.shape)} {column.dtype}".encode())
+        digest.update(column.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()

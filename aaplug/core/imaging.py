@@ -11,10 +11,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.errors import UsageError
+from aaplug.core.cameras import WHOLE_SLACK, whole_side
 from aaplug.core.splats import Render
-
-WHOLE = 1e-6  # slack before a size or a factor counts as fractional
+from aaplug.system.errors import UsageError
 
 
 def over(rgb: Float[Tensor, "h w 3"], alpha: Float[Tensor, "h w"], background: tuple[float, float, float]) -> Render:
@@ -54,16 +53,16 @@ def resampled(
         UsageError: no box fits into the image.
     """
     height, width, _ = rgb.shape
-    hw = hw or (_whole(height * factor), _whole(width * factor))
+    hw = hw or (whole_side(height * factor), whole_side(width * factor))
     if factor == 1:
         return rgb[: hw[0], : hw[1]]
-    if factor < 1 and abs(1 / factor - round(1 / factor)) < WHOLE:
+    if factor < 1 and abs(1 / factor - round(1 / factor)) < WHOLE_SLACK:
         box = round(1 / factor)
         if box > min(height, width):
             raise UsageError("scale", f"{factor:g} leaves no pixel of a {width}x{height} image")
         return box_average(rgb, box)[: hw[0], : hw[1]]
-    used = rgb[: math.ceil(hw[0] / factor - WHOLE), : math.ceil(hw[1] / factor - WHOLE)]
-    return _resized(used, hw, cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC)
+    source = rgb[: math.ceil(hw[0] / factor - WHOLE_SLACK), : math.ceil(hw[1] / factor - WHOLE_SLACK)]
+    return _resized(source, hw, cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC)
 
 
 def stretched(rgb: Float[Tensor, "h w 3"], hw: tuple[int, int]) -> Float[Tensor, "h2 w2 3"]:
@@ -72,7 +71,7 @@ def stretched(rgb: Float[Tensor, "h w 3"], hw: tuple[int, int]) -> Float[Tensor,
 
 
 def quantised(rgb: Float[Tensor, "h w 3"], bit_depth: int = 8) -> Float[Tensor, "h w 3"]:
-    """What reading back a PNG of these colours gives."""
+    """The colours of a PNG of this image that is read back."""
     return levels(rgb, bit_depth) / (2**bit_depth - 1)
 
 
@@ -83,7 +82,7 @@ def levels(rgb: Float[Tensor, "h w c"], bit_depth: int) -> Float[Tensor, "h w c"
 
 
 def _pooled(image: Float[Tensor, "h w c"], n: int, neighbours: float = 0.0) -> Float[Tensor, "H W c"]:
-    """See `average_samples`.  What neighbours exchange inside a box stays in it, so only its border samples count."""
+    """Means of boxes: see `average_samples`.  Exchanges inside a box leave its sum; only those at its border count."""
     for dim in (0, 1):
         along = image.movedim(dim, 0)
         boxes = reduce(torch.add, (along[i::n] for i in range(n)))
@@ -98,7 +97,3 @@ def _pooled(image: Float[Tensor, "h w c"], n: int, neighbours: float = 0.0) -> F
 
 def _resized(rgb: Tensor, hw: tuple[int, int], kernel: int) -> Tensor:
     return torch.from_numpy(cv2.resize(rgb.cpu().numpy(), (hw[1], hw[0]), interpolation=kernel))
-
-
-def _whole(side: float) -> int:
-    return max(1, math.floor(side + WHOLE))

@@ -1,4 +1,4 @@
-"""The rendering interfaces: what a plug-in receives, what it returns, and what it must guarantee.
+"""The rendering interfaces of plug-ins: arguments, results and guarantees.
 
 A world filter acts once per scene.  Per view, a selection picks the splats to draw and a screen filter changes their
 covariances and opacities.  A pixel kernel gives a splat's alpha at a pixel, a compositor turns alphas into colour, and
@@ -6,7 +6,7 @@ a rasterizer does both for a whole image.  Recipes, metrics and file formats hav
 `evaluation.metric`, `io.scenes` and `io.cameras`.
 
 Plug-ins are frozen dataclasses or functions.  They are deterministic, have no side effects and never change their
-input.  Each kind has a `core.registry.Registry`; `tests/laws` checks every registered filter, pixel kernel,
+input.  Each kind has a `system.registry.Registry`; `tests/laws` checks every registered filter, pixel kernel,
 compositor, rasterizer and recipe.
 """
 
@@ -17,9 +17,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from aaplug.core.cameras import Camera
-from aaplug.core.choices import Colour
+from aaplug.core.colours import Colour
 from aaplug.core.gaussians import Gaussians
-from aaplug.core.kernels import Kernels
+from aaplug.core.kernels import Kernel, Kernels
 from aaplug.core.rules import RULES_3DGS, Rules
 from aaplug.core.splats import Render, Splats2D
 from aaplug.core.training import TrainingViews
@@ -47,7 +47,7 @@ class Selection(Protocol):
         ...
 
     def lacks(self, scene: Gaussians) -> str | None:
-        """What this selection needs and the scene lacks, in words; None if nothing."""
+        """The facts that this selection needs and the scene lacks, in words; None if it lacks nothing."""
         ...
 
 
@@ -93,7 +93,7 @@ class PixelKernel(Protocol):
 
     name: unique among pixel kernels.
     columns: number of columns of a raster row.
-    needs_depth_slopes: whether it draws discs, which need `Splats2D.depth_slopes`.
+    needs_depth_slopes: true if it draws discs, which need `Splats2D.depth_slopes`.
     splats_per_pass: splats of a tile that one compiled pass composites: a multiple of `forward.STEP`; 8 suits all but
         the cheapest kernels.  More compile slowly, fewer reload the pixels' state more often.
     """
@@ -115,7 +115,7 @@ class PixelKernel(Protocol):
         ...
 
     def raster_rows(self, splats: Splats2D, kernels: Kernels) -> Float[Tensor, "m_and_1 c"]:
-        """One row per splat, with all that `alpha` needs and the colour, then one padding row.
+        """One row per splat, with the colour and everything that `alpha` reads, then one padding row.
 
         The padding row's alpha is 0 everywhere: tiles that have run out of splats read it.  `raster_rows.rows_of`
         appends it.
@@ -168,12 +168,21 @@ class Compositor(Protocol):
 
 
 @runtime_checkable
+class RunsOwnKernels(Protocol):
+    """A pixel kernel or compositor that runs kernels by itself, which `aaplug warmup` then compiles."""
+
+    def kernels(self, rules: Rules) -> tuple[Kernel, ...]:
+        """These kernels, for scenes composited by the given rules."""
+        ...
+
+
+@runtime_checkable
 class Rasterizer(Protocol):
     """Composites splats front to back over a background; splats of equal depth keep the given order."""
 
     @property
     def name(self) -> str:
-        """As shown to the user."""
+        """Name that users read."""
         ...
 
     def __call__(

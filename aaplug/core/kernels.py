@@ -13,16 +13,15 @@ from torch import Tensor
 
 BACKWARD = "-backward"  # suffix of the name of a kernel's gradient kernel
 ONE_MORE = "+1"  # suffix of the name of a size
-EXAMPLE_SIZE = 100_000  # rows to compile for, as many as in real work: inductor chooses by them which loops use threads
+EXAMPLE_SIZE = 100_000  # rows, as many as in real work: inductor chooses by them which loops use threads
 
 
 @dataclass(frozen=True)
 class Kernel:
-    """One stage.
+    """One stage of a frame.
 
     function: tensors in, a tuple of tensors out.
-    example: makes the arguments to compile for, as large as real work: inductor decides by them which loops use
-    threads.
+    example: makes the arguments to compile for, `EXAMPLE_SIZE` rows of them.
     sizes: per argument the name of its leading size, None where that is fixed; sizes of one name are equal, and "n+1"
         is one more than "n".
     gathers: the kernel gathers scattered rows.  Inductor would leave the loop scalar; set this where arithmetic
@@ -61,25 +60,23 @@ def backward_of(kernel: Kernel, results: tuple[str, ...], chained: bool = False)
 
     def function(*args: Tensor) -> tuple[Tensor, ...]:
         inputs, grads = args[:count], args[count:]
-        moving = [i for i, arg in enumerate(inputs) if arg.is_floating_point()]
+        places = [i for i, arg in enumerate(inputs) if arg.is_floating_point()]
 
-        def of(*values: Tensor) -> tuple[Tensor, ...]:
-            filled = list(inputs)
-            for i, value in zip(moving, values, strict=True):
-                filled[i] = value
-            return kernel.function(*filled)
+        def of_floats(*values: Tensor) -> tuple[Tensor, ...]:
+            arguments = list(inputs)
+            for i, value in zip(places, values, strict=True):
+                arguments[i] = value
+            return kernel.function(*arguments)
 
-        pull = torch.func.vjp(of, *(inputs[i] for i in moving))[1]
+        pull = torch.func.vjp(of_floats, *(inputs[i] for i in places))[1]
         return tuple(pull(grads))
 
     def example() -> tuple[Tensor, ...]:
         args = kernel.example()
-        found = kernel.function(*args)
-        return *args, *(torch.linspace(-1.0, 1.0, x.numel()).to(x).view_as(x) for x in found)
+        return *args, *(torch.linspace(-1.0, 1.0, x.numel()).to(x).view_as(x) for x in kernel.function(*args))
 
     sizes = (*kernel.sizes, *results)
-    name = kernel.name + BACKWARD
-    return Kernel(name, function, example, sizes, kernel.gathers, chained, pulls_back=True)
+    return Kernel(kernel.name + BACKWARD, function, example, sizes, kernel.gathers, chained, pulls_back=True)
 
 
 Runner = Callable[..., Sequence[Tensor]]
@@ -99,15 +96,15 @@ class Kernels:
         return tuple(self.runner(kernel, args)(*args))
 
     def runner(self, kernel: Kernel, args: tuple[Tensor, ...]) -> Runner:
-        """What runs a stage for these arguments, and for others that differ in leading sizes, from 2, and values only.
+        """The function of a stage, for many small calls.
 
-        Many small calls cost less so.
+        It takes these arguments, and others that differ in their values and in leading sizes of at least 2.
         """
         return kernel.function
 
 
 def materialized(x: Tensor) -> Tensor:
-    """x itself; a compiled kernel computes it in a loop of its own, where it would compute it again at each use."""
+    """x itself.  A compiled kernel then computes it once, in a loop of its own, and not again at each use."""
     return x.as_strided(x.shape, x.stride()) if torch.compiler.is_compiling() else x
 
 

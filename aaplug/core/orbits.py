@@ -1,4 +1,4 @@
-"""Views of a scene of which nothing but its Gaussians is known: an orbit around what matters in it.
+"""Views of a scene without cameras: an orbit around the part that matters.
 
 Floaters and far surroundings are many and large, so they must not decide the frame: a Gaussian counts by its opacity,
 and less the larger it is.  Training makes small Gaussians where its cameras looked from close by.
@@ -13,32 +13,32 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.cameras import Camera, look_at
-from aaplug.core.errors import UsageError
 from aaplug.core.gaussians import MIN_OPACITY, Gaussians
 from aaplug.core.rules import NEAR
 from aaplug.core.spherical_harmonics import COLOUR_OFFSET, sh_colour
+from aaplug.system.errors import UsageError
 
-CORE = 2.0  # median distances from the centre: what lies farther is taken for surroundings
-BULK = 0.99  # share of the core that the frame's ball encloses
-MARGIN = 1.05  # of the ball's radius: room for the Gaussians' own width
-OWN_SIZE = 3.0  # standard deviations of the median Gaussian: the least radius of the ball
-LEAST_RADIUS = 1e-3 * NEAR  # world units: smaller scenes have no picture
-STEPS = 100  # of an iteration
-STILL = 1e-4  # of the points' median distance: a step of Weiszfeld's that is the last
-SHAPE_STEPS = 20
-ROUND = 0.02  # of a covariance's trace, added to each axis: a plane keeps some thickness
-SOFT = 1e-6  # of the points' median distance: what keeps a step finite where the median meets a point
+CORE_DISTANCES = 2.0  # median distances from the centre; Gaussians farther out count as surroundings
+CORE_SHARE = 0.99  # of the core, inside the frame's ball
+RADIUS_MARGIN = 1.05  # of the ball's radius: room for the width of Gaussians
+MIN_RADIUS_SIGMAS = 3.0  # least radius of the ball, in standard deviations of the median Gaussian
+MIN_RADIUS = 1e-3 * NEAR  # world units: smaller scenes have no picture
+MAX_STEPS = 100  # of an iteration
+MIN_STEP = 1e-4  # of the points' median distance: Weiszfeld's iteration ends at a step this short
+SHAPE_STEPS = 20  # of Tyler's iteration
+THICKNESS = 0.02  # of a covariance's trace, added to each axis: a plane keeps some thickness
+SOFTENING = 1e-6  # of the points' median distance: a step stays finite where the median meets a point
 
 DOWN_IS_Y = (0.0, -1.0, 0.0)  # up where y points down, as in COLMAP's and 3DGS's cameras: the usual convention
-UPS = {(0.0, 0.0, 1.0): (0.0, -1.0, 0.0), (0.0, 1.0, 0.0): (0.0, 0.0, 1.0), DOWN_IS_Y: (0.0, 0.0, -1.0)}  # up: front
-SURE = 0.2  # lead in `looked_from` at which another axis than the usual one is taken for up
-BROAD = 1.5  # ratio of a scene's horizontal variances from which it has a broad side
-DIRECTIONS = 256  # in which colours are compared
+FRONT_OF_UP = {(0.0, 0.0, 1.0): (0.0, -1.0, 0.0), (0.0, 1.0, 0.0): (0.0, 0.0, 1.0), DOWN_IS_Y: (0.0, 0.0, -1.0)}
+MIN_LEAD = 0.2  # length along an axis or the horizon from which `training_side` decides
+BROAD_RATIO = 1.5  # of a scene's horizontal variances; from here on it has a broad side
+COLOUR_DIRECTIONS = 256  # over the sphere, in which colours are compared
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Frame:
-    """What a picture of the scene should show: a ball, in world units.
+    """The ball that a picture of the scene should show, in world units.
 
     up, front: unit vectors at right angles; an orbit begins at `front`.
     outside: share of the Gaussians outside of the ball, such as surroundings and floaters.
@@ -51,7 +51,7 @@ class Frame:
     outside: float
 
     def distance(self, fov: float) -> float:
-        """From where the ball fills a field of view of this angle, in radians; beyond the near plane in any case."""
+        """Distance at which the ball fills a field of view (radians); the ball stays beyond the near plane."""
         return max(self.radius / math.sin(fov / 2), self.radius + 2 * NEAR)
 
     def focal(self, distance: float) -> float:
@@ -75,14 +75,18 @@ def frame_of(scene: Gaussians, up: Sequence[float] | None = None) -> Frame:
     centre = _geometric_median(points, weights)
     shape = _shape(points - centre, weights)
     distances = _lengths(points - centre, shape)
-    core = distances <= CORE * _quantile(distances, weights, 0.5)
-    core &= distances <= _quantile(distances[core], weights[core], BULK)
+    core = distances <= CORE_DISTANCES * _quantile(distances, weights, 0.5)
+    core &= distances <= _quantile(distances[core], weights[core], CORE_SHARE)
     centre, reach = _enclosing_ball(points[core])
-    radius = max(MARGIN * reach, OWN_SIZE * size, LEAST_RADIUS)
-    seen = looked_from(scene)
-    axis = _unit(likely_up(seen) if up is None else up, "up")
+    radius = max(RADIUS_MARGIN * reach, MIN_RADIUS_SIGMAS * size, MIN_RADIUS)
+    side = training_side(scene)
+    axis = torch.tensor([float(x) for x in (likely_up(side) if up is None else up)], dtype=torch.float64)
+    length = float(axis.norm())
+    if not 0 < length < math.inf:
+        raise UsageError("up", f"takes a direction, got {', '.join(f'{x:g}' for x in axis.tolist())}")
+    axis = axis / length
     outside = float(((points - centre).norm(dim=1) > radius).double().mean())
-    return Frame(centre, radius, axis, _front(axis, seen, shape), outside)
+    return Frame(centre, radius, axis, _front(axis, side, shape), outside)
 
 
 def orbit(
@@ -109,15 +113,15 @@ def pinhole(name: str, size: tuple[int, int], focal: float, pose: Float[Tensor, 
     return Camera(name, *size, focal, focal, size[0] / 2, size[1] / 2, pose)
 
 
-def likely_up(seen: Float[Tensor, " 3"]) -> tuple[float, float, float]:
-    """The axis that points up: -y as usual, or z or y if training clearly looked from there; seen: `looked_from`."""
-    lead = {axis: float(seen @ seen.new_tensor(axis)) for axis in UPS}
-    best = max(UPS, key=lambda axis: lead[axis])
-    return best if lead[best] > max(lead[DOWN_IS_Y], 0.0) + SURE else DOWN_IS_Y
+def likely_up(side: Float[Tensor, " 3"]) -> tuple[float, float, float]:
+    """The axis that points up: -y as usual, or z or y if training clearly looked from there; side: `training_side`."""
+    lead = {axis: float(side @ side.new_tensor(axis)) for axis in FRONT_OF_UP}
+    best = max(FRONT_OF_UP, key=lambda axis: lead[axis])
+    return best if lead[best] > max(lead[DOWN_IS_Y], 0.0) + MIN_LEAD else DOWN_IS_Y
 
 
-def looked_from(scene: Gaussians) -> Float[Tensor, " 3"]:
-    """Where training looked from, as a direction of a length between 0 (anywhere, or unknown) and about 1.
+def training_side(scene: Gaussians) -> Float[Tensor, " 3"]:
+    """The direction that training looked from, of a length between 0 (anywhere, or unknown) and about 1.
 
     Harmonics are fitted where cameras looked, so colours vary most in those directions.  This is the first moment of
     their standard deviation over the sphere, aaplug's own measure.
@@ -125,7 +129,7 @@ def looked_from(scene: Gaussians) -> Float[Tensor, " 3"]:
     k = scene.sh.shape[1]
     if k == 1:
         return torch.zeros(3, dtype=torch.float64)
-    directions = _even_directions(DIRECTIONS)
+    directions = _even_directions(COLOUR_DIRECTIONS)
     ones = torch.eye(k).repeat(len(directions), 1)[:, :, None].expand(-1, -1, 3)
     basis = sh_colour(ones, directions.repeat_interleave(k, dim=0))[:, 0].view(-1, k) - COLOUR_OFFSET
     varied = scene.sh[:, 1:].float() * scene.opacities[:, None, None].float().sqrt()
@@ -137,37 +141,30 @@ def looked_from(scene: Gaussians) -> Float[Tensor, " 3"]:
     return -3 * (spread[:, None] * directions).mean(dim=0).double() / total  # directions run from the camera
 
 
-def _front(up: Float[Tensor, " 3"], seen: Float[Tensor, " 3"], shape: Float[Tensor, "3 3"]) -> Float[Tensor, " 3"]:
+def _front(up: Float[Tensor, " 3"], side: Float[Tensor, " 3"], shape: Float[Tensor, "3 3"]) -> Float[Tensor, " 3"]:
     """The horizontal direction that training looked from, else that of a broad side, else the usual one."""
-    level = seen - (seen @ up) * up
-    if float(level.norm()) < SURE:
+    level = side - (side @ up) * up
+    if float(level.norm()) < MIN_LEAD:
         plane = torch.linalg.svd(up[None]).Vh[1:]  # two horizontal directions
-        usual = plane.T @ (plane @ level.new_tensor(UPS[max(UPS, key=lambda axis: float(up @ up.new_tensor(axis)))]))
+        nearest = max(FRONT_OF_UP, key=lambda axis: float(up @ up.new_tensor(axis)))
+        usual = plane.T @ (plane @ level.new_tensor(FRONT_OF_UP[nearest]))
         (narrow, broad), sides = torch.linalg.eigh(plane @ shape @ plane.T)
-        clear = float(broad) > BROAD * float(narrow) or not float(usual.norm()) > 0
+        clear = float(broad) > BROAD_RATIO * float(narrow) or not float(usual.norm()) > 0
         level = sides[:, 0] @ plane if clear else usual
         level = -level if float(level @ usual) < 0 else level
     return torch.nn.functional.normalize(level, dim=0)
 
 
-def _unit(direction: Sequence[float], where: str) -> Float[Tensor, " 3"]:
-    given = torch.tensor([float(x) for x in direction], dtype=torch.float64)
-    length = float(given.norm())
-    if not 0 < length < math.inf:
-        raise UsageError(where, f"takes a direction, got {', '.join(f'{x:g}' for x in given.tolist())}")
-    return given / length
-
-
 def _geometric_median(points: Float[Tensor, "n 3"], weights: Float[Tensor, " n"]) -> Float[Tensor, " 3"]:
     """The place with the least weighted sum of distances to the points (Weiszfeld 1937)."""
     centre = points.median(dim=0).values
-    for _ in range(STEPS):
+    for _ in range(MAX_STEPS):
         distances = (points - centre).norm(dim=1)
         typical = float(distances.median())
-        pull = weights / (distances + SOFT * typical).clamp(min=torch.finfo(torch.float64).tiny)
+        pull = weights / (distances + SOFTENING * typical).clamp(min=torch.finfo(torch.float64).tiny)
         step = (points - centre).T @ pull / pull.sum()
         centre = centre + step
-        if float(step.norm()) <= STILL * typical:
+        if float(step.norm()) <= MIN_STEP * typical:
             break
     return centre
 
@@ -178,10 +175,9 @@ def _shape(offsets: Float[Tensor, "n 3"], weights: Float[Tensor, " n"]) -> Float
     shape = identity
     for _ in range(SHAPE_STEPS):
         pull = weights / _lengths(offsets, shape).square().clamp(min=torch.finfo(offsets.dtype).tiny)
-        found = (offsets * pull[:, None]).T @ offsets
-        found = found / found.trace().clamp(min=torch.finfo(offsets.dtype).tiny)
-        found = found + ROUND * identity
-        shape = found / torch.linalg.det(found) ** (1 / 3)
+        moments = (offsets * pull[:, None]).T @ offsets
+        moments = moments / moments.trace().clamp(min=torch.finfo(offsets.dtype).tiny) + THICKNESS * identity
+        shape = moments / torch.linalg.det(moments) ** (1 / 3)
     return shape
 
 
@@ -193,14 +189,14 @@ def _lengths(offsets: Float[Tensor, "n 3"], shape: Float[Tensor, "3 3"]) -> Floa
 def _enclosing_ball(points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, " 3"], float]:
     """Centre and radius of nearly the smallest ball around the points (Bădoiu and Clarkson 2003)."""
     centre = points.mean(dim=0)
-    for step in range(1, STEPS):
+    for step in range(1, MAX_STEPS):
         away = points - centre
         centre = centre + away[away.square().sum(dim=1).argmax()] / (step + 1)
     return centre, float((points - centre).norm(dim=1).max())
 
 
 def _quantile(values: Float[Tensor, " n"], weights: Float[Tensor, " n"], share: float) -> float:
-    """The value below which this share of the weight lies."""
+    """The value with this share of the weight below it."""
     order = values.argsort()
     running = weights[order].cumsum(dim=0)
     place = int(torch.searchsorted(running, share * running[-1]))

@@ -26,9 +26,8 @@ MIN_FACING = 1e-6  # of depth: a disc at a flatter angle is a line, and its slop
 
 def project(scene: Gaussians, camera: Camera, kernels: Kernels = EAGER, rules: Rules = RULES_3DGS) -> Splats2D:
     """Splats of every Gaussian beyond the near plane, without colour and before any screen filter."""
-    columns = kernels.run(
-        project_kernel(rules.near), *(scene.means, scene.quats, scene.log_scales), *_camera_rows(scene.means, camera)
-    )
+    shape = scene.means, scene.quats, scene.log_scales
+    columns = kernels.run(project_kernel(rules.near), *shape, *_camera_rows(scene.means, camera))
     return _beyond(rules.near, columns, scene.opacities, kernels)
 
 
@@ -137,13 +136,13 @@ def _linearised(
     fx, fy, cx, cy, left, right, top, bottom = lens.unbind()
     world = [row.unbind() for row in rotation.unbind()]
     x, y, z = (sum_of(r * p for r, p in zip(row, local, strict=True)) for row in world)
-    ahead = z.clamp(min=near)  # nearer ones are dropped later; here they must not overflow into gradients
+    ahead = z.clamp(min=near)  # nearer Gaussians are dropped later; here they must not overflow into gradients
     slope_x, slope_y = x / ahead, y / ahead
-    # rows of the projection's derivative along the world's axes, its direction clamped to the widened image
-    held_x = torch.minimum(torch.maximum(slope_x, left), right)
-    held_y = torch.minimum(torch.maximum(slope_y, top), bottom)
-    across = [fx / ahead * (i - held_x * k) for i, k in zip(world[0], world[2], strict=True)]
-    down = [fy / ahead * (j - held_y * k) for j, k in zip(world[1], world[2], strict=True)]
+    # The rows of the projection's derivative lie along the world's axes; its direction is clamped to the widened image.
+    clamped_x = torch.minimum(torch.maximum(slope_x, left), right)
+    clamped_y = torch.minimum(torch.maximum(slope_y, top), bottom)
+    across = [fx / ahead * (i - clamped_x * k) for i, k in zip(world[0], world[2], strict=True)]
+    down = [fy / ahead * (j - clamped_y * k) for j, k in zip(world[1], world[2], strict=True)]
     return [fx * slope_x + cx, fy * slope_y + cy], across, down, z
 
 
@@ -168,9 +167,9 @@ def rotation_matrices(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
 
 
 def _project_example() -> tuple[Tensor, ...]:
-    draw = torch.Generator().manual_seed(0)
-    means, log_scales = torch.rand(2, EXAMPLE_SIZE, 3, generator=draw).unbind()
-    quats = torch.randn(EXAMPLE_SIZE, 4, generator=draw)
+    generator = torch.Generator().manual_seed(0)
+    means, log_scales = torch.rand(2, EXAMPLE_SIZE, 3, generator=generator).unbind()
+    quats = torch.randn(EXAMPLE_SIZE, 4, generator=generator)
     centre = torch.tensor([0.5, 0.5, -2.0], dtype=torch.float64)
     lens = torch.tensor([90.0, 90.0, 40.0, 40.0, -0.5, 0.5, -0.5, 0.5])
     return means, quats, log_scales - 4, centre, torch.eye(3), lens
@@ -179,9 +178,8 @@ def _project_example() -> tuple[Tensor, ...]:
 @cache
 def project_kernel(near: float = NEAR) -> Kernel:
     """Projection for one near plane."""
-    sizes = ("n", "n", "n", None, None, None)
-    name, function = "project" + variant((near,), (NEAR,)), partial(_project, near)
-    return Kernel(name, function, _project_example, sizes, gathers=True)
+    name, sizes = "project" + variant((near,), (NEAR,)), ("n", "n", "n", None, None, None)
+    return Kernel(name, partial(_project, near), _project_example, sizes, gathers=True)
 
 
 PROJECT_BACKWARD = backward_of(project_kernel(), ("n", "n", "n", "n"), chained=True)

@@ -1,4 +1,4 @@
-"""Pyramids: a scene with coarser levels of itself, and the cut that a view draws.
+"""Pyramids: a scene with coarser levels of itself, and the cut of it that a view draws.
 
 c: chunks, l: levels, n: Gaussians of all levels.  A chunk is a part of space.  No Gaussian stands for others of another
 chunk, so each chunk is drawn at a level of its own, which its sampling rate decides.  Level k is meant for rates down
@@ -24,21 +24,21 @@ from aaplug.core.runs import runs_of, starts_of
 from aaplug.core.splats import Splats2D
 from aaplug.core.training import TrainingViews
 
-FADE = math.log2(4 / 3)  # octaves of the sampling rate over which a level fades into the next: half of the way
-COARSER = 1 / 4  # octaves: steps in which coarser levels are tried
-ROUNDING = 1e-4  # octaves: what lies nearer to a level is that level
-SIGMAS = 3.33  # standard deviations to where an opaque Gaussian's alpha falls below 1/255
-PAD = 4.0  # px around the image that the filters reach at most, at training's rate and below
-FAR_ROUNDING = 1e-6  # of the camera's distance from the origin: what float32 may lose in the camera's frame
-STRETCH = 1 + JACOBIAN_MARGIN  # how much longer than it is a Gaussian outside of the image is projected at most
+FADE_OCTAVES = math.log2(4 / 3)  # of the sampling rate, over which a level fades into the next
+COARSENING_STEP = 1 / 4  # octaves between the coarser levels that are tried
+OCTAVE_SLACK = 1e-4  # octaves: a rate this near to a level's is that level's
+CUTOFF_SIGMAS = 3.33  # standard deviations at which an opaque Gaussian's alpha falls below 1/255
+FILTER_REACH = 4.0  # px around the image that filters reach at most, at training's rate and below
+FLOAT32_SLACK = 1e-6  # of the camera's distance from the origin: float32 may lose this in the camera's frame
+MAX_STRETCH = 1 + JACOBIAN_MARGIN  # largest ratio of a projected Gaussian's length outside of the image to its own
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Cut:
-    """What a view draws.
+    """The Gaussians that a view draws.
 
-    places: of Gaussians among those of all levels, ascending.
-    shares: of each one's energy that is drawn, see `faded`; None for all of it.
+    places: indices among the Gaussians of all levels, ascending.
+    shares: share of each one's energy that is drawn, see `faded`; None for all of it.
     """
 
     places: Int[Tensor, " m"]
@@ -48,24 +48,23 @@ class Cut:
         return len(self.places)
 
     def __getitem__(self, part: slice) -> "Cut":
-        """A part of it."""
+        """A part of the cut."""
         return Cut(self.places[part], None if self.shares is None else self.shares[part])
 
     def of(self, scene: Gaussians) -> Gaussians:
         """The Gaussians of the cut, without harmonics."""
         names = ("means", "quats", "log_scales", "logit_opacities")
         columns = {name: getattr(scene, name).index_select(0, self.places) for name in names}
-        none = scene.sh[:1].expand(len(self), -1, -1)
-        return replace(scene, **columns, sh=none, origin=None, pixel_sizes=None)
+        return replace(scene, **columns, sh=scene.sh[:1].expand(len(self), -1, -1), origin=None, extras={})
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Pyramid:
     """All levels of a scene as one, the finest first.
 
-    scene: its origin is not known.
-    sizes: Gaussians of each level.
-    chunks: of each Gaussian; those of every level but the finest lie in the order of their chunks.
+    scene: the Gaussians of all levels, without origin and extras.
+    sizes: number of Gaussians of each level.
+    chunks: chunk of each Gaussian.  Gaussians of every level but the finest are in the order of their chunks.
     """
 
     scene: Gaussians
@@ -75,8 +74,8 @@ class Pyramid:
     @classmethod
     def of(cls, levels: Sequence[Gaussians], chunks: Sequence[Int[Tensor, " _"]]) -> "Pyramid":
         """A pyramid of its levels, the finest first, at least one, and the chunk of each of their Gaussians."""
-        like = [replace(level, origin=None, pixel_sizes=None) for level in levels]
-        return cls(joined(like), tuple(map(len, levels)), torch.cat(list(chunks)))
+        scene = joined([replace(level, origin=None, extras={}) for level in levels])
+        return cls(scene, tuple(map(len, levels)), torch.cat(list(chunks)))
 
     def __len__(self) -> int:
         """Number of levels."""
@@ -88,12 +87,12 @@ class Pyramid:
 
     @property
     def coarsest_rate(self) -> float:
-        """The lowest sampling rate, relative to training's, that there is a level for."""
+        """The lowest sampling rate that there is a level for, relative to training's."""
         return 0.5 ** (len(self) - 1)
 
     @property
     def places(self) -> list[slice]:
-        """Where each level's Gaussians are."""
+        """The slice of each level's Gaussians."""
         return [slice(*ends) for ends in itertools.pairwise([0, *itertools.accumulate(self.sizes)])]
 
     @property
@@ -118,13 +117,13 @@ class Pyramid:
         return int(self.chunks.max()) + 1 if len(self.chunks) else 0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Cutter:
     """Picks a view's cut from bounds of the chunks.
 
-    centres, radii: of a ball around a chunk's means, in world units.
-    reach: how far from the ball's centre one of its Gaussians can be seen.
-    sizes: how far from its mean each Gaussian of the pyramid can be seen, in world units.
+    centres, radii: balls around the chunks' means.
+    reach: distance from a ball's centre within which its Gaussians are visible.
+    sizes: distance from its mean within which each Gaussian of the pyramid is visible.  All lengths: world units.
     lowest, highest: training's sampling rates in the chunk, px per world unit; 0 if no camera sees it.
     """
 
@@ -139,10 +138,7 @@ class Cutter:
 
     @classmethod
     def of(cls, pyramid: Pyramid, training: TrainingViews) -> "Cutter":
-        """Compute the bounds of every chunk.
-
-        training: views of all levels.
-        """
+        """Compute the bounds of every chunk; training: of the Gaussians of all levels."""
         scene, chunks, bounds = pyramid.scene, pyramid.chunks, training.bounds
 
         def extreme(values: Tensor, how: str) -> Tensor:
@@ -155,39 +151,48 @@ class Cutter:
         distances = (means - centres[chunks]).norm(dim=1)
         radii = extreme(distances, "amax")
         blurs = torch.where(bounds.seen, training.convention.kernel**0.5 / bounds.lowest, 0.0)
-        sizes = STRETCH * SIGMAS * (scene.scales.detach().amax(dim=1).square() + blurs.square()).sqrt()
+        sizes = MAX_STRETCH * CUTOFF_SIGMAS * (scene.scales.detach().amax(dim=1).square() + blurs.square()).sqrt()
         lowest = extreme(torch.where(bounds.seen, bounds.lowest, torch.inf), "amin")
-        seen = lowest.isfinite()
+        lowest = lowest.where(lowest.isfinite(), 0.0)
         highest = extreme(bounds.highest, "amax")
         reach = extreme(distances + sizes, "amax")
-        return cls(pyramid, training, centres, radii, reach, sizes, lowest.where(seen, 0.0), highest)
+        return cls(pyramid, training, centres, radii, reach, sizes, lowest, highest)
 
     @torch.no_grad()
     def __call__(self, camera: Camera, coarser: float = 0.0) -> Cut:
         """The cut of a view whose pixels are those of `camera`; coarser: octaves to add to those of all chunks."""
-        frustum = self._frustum(camera)
-        index, shares = self._candidates(self._drawn(camera, frustum, coarser).to(self.sizes))
-        means, sizes = (column.index_select(0, index) for column in (self.pyramid.scene.means, self.sizes))
-        shown = _reaches(frustum, means, sizes).nonzero()[:, 0]
-        index, shares = index.index_select(0, shown), shares.index_select(0, shown)
-        return Cut(index, None if (shares == 1).all() else shares)
+        frustum, pyramid = self._frustum(camera), self.pyramid
+        shares = self._visible_shares(camera, frustum, coarser).to(self.sizes)
+        finest = shares[0].index_select(0, pyramid.chunks[: pyramid.sizes[0]]) if shares[0].any() else shares[0, :0]
+        finest_places = finest.nonzero()[:, 0]
+        levels, chunks = shares[1:].nonzero().unbind(dim=1)
+        counts, firsts = (table[1:][levels, chunks] for table in (pyramid.counts, pyramid.firsts))
+        starts = starts_of(counts)
+        runs = runs_of(starts, counts)
+        places = (firsts - starts).index_select(0, runs) + torch.arange(len(runs), device=runs.device)
+        places = torch.cat([finest_places, places])  # of all chunks with a share
+        coarse_shares = shares[1:][levels, chunks].index_select(0, runs)
+        shares = torch.cat([finest.index_select(0, finest_places), coarse_shares])
+        means, sizes = (column.index_select(0, places) for column in (pyramid.scene.means, self.sizes))
+        visible = _reaches(frustum, means, sizes).nonzero()[:, 0]
+        places, shares = places.index_select(0, visible), shares.index_select(0, visible)
+        return Cut(places, None if (shares == 1).all() else shares)
 
     @torch.no_grad()
     def count(self, camera: Camera, coarser: float = 0.0) -> int:
-        """Number of Gaussians in the chunks that a view draws, of which the cut leaves out those beside the image."""
-        return int(self.pyramid.counts[self._drawn(camera, self._frustum(camera), coarser) > 0].sum())
+        """Number of Gaussians in the chunks that a view draws; the cut also leaves out those beside the image."""
+        return int(self.pyramid.counts[self._visible_shares(camera, self._frustum(camera), coarser) > 0].sum())
 
     def coarsening(self, camera: Camera, last: float, most: int) -> float:
-        """Octaves by which a view's levels are coarser than those of its samples, in steps of `COARSER` up to `last`.
+        """Octaves by which a view's levels are coarser than its samples need, in steps of `COARSENING_STEP`.
 
-        As few as leave at most `most` Gaussians; where none does, those that leave the fewest.
-
-        camera: of the samples.
+        They are the fewest up to `last` that leave at most `most` Gaussians, else those that leave the fewest
+        Gaussians.  camera: of the samples.
         """
         if not last:
             return 0.0  # the only step: nothing to count
         fewest = math.inf, 0.0
-        for octaves in (*(step * COARSER for step in range(math.ceil(last / COARSER))), last):
+        for octaves in (*(step * COARSENING_STEP for step in range(math.ceil(last / COARSENING_STEP))), last):
             count = self.count(camera, octaves)
             if count <= most:
                 return octaves
@@ -195,52 +200,50 @@ class Cutter:
         return fewest[1]
 
     def octaves(self, camera: Camera, coarser: float = 0.0) -> Float[Tensor, " c"]:
-        """How far each chunk's sampling rate lies below training's, and `coarser` more, in octaves; at least 0.
+        """Octaves of each chunk's sampling rate below training's, and `coarser` more; from 0 to the last level.
 
-        At a data-set pose it is the ratio of focal lengths.  For a free camera the chunk's nearest point counts, and
-        the nearest rate of training.
+        At a data-set pose the rate is the ratio of focal lengths.  For a free camera the chunk's nearest point counts,
+        and the nearest rate of training.
         """
-        own = torch.full_like(self.radii, self.training.relative_rate(camera))
+        rates = torch.full_like(self.radii, self.training.relative_rate(camera))
         if camera.trained_focal is None:
             pose = camera.cam_from_world.detach().double()
             depths = self.centres @ pose[2, :3] + pose[2, 3]
             now = camera.focal / (depths - self.radii).clamp(min=NEAR)
             trained = torch.minimum(torch.maximum(now, self.lowest.double()), self.highest.double())
-            own = torch.where(self.highest > 0, now / trained, own)
-        octaves = -own.log2()
+            rates = torch.where(self.highest > 0, now / trained, rates)
+        octaves = -rates.log2()
         nearest = octaves.round()
-        octaves = torch.where((octaves - nearest).abs() < ROUNDING, nearest, octaves)
+        octaves = torch.where((octaves - nearest).abs() < OCTAVE_SLACK, nearest, octaves)
         return (octaves + coarser).clamp(0, len(self.pyramid) - 1)
 
     def shares(self, octaves: Float[Tensor, " c"]) -> Float[Tensor, "l c"]:
         """Share of each level in each chunk; they sum to 1."""
         levels = torch.arange(len(self.pyramid)).to(octaves)[:, None]
-        coming = ((octaves - levels + 1) / FADE).clamp(0, 1)  # of level k: 0 up to k - 1
+        coming = ((octaves - levels + 1) / FADE_OCTAVES).clamp(0, 1)  # of level k: 0 up to k - 1
         coming[0] = 1
         return coming - torch.cat([coming[1:], torch.zeros_like(coming[:1])])
 
     def _frustum(self, camera: Camera) -> tuple[Float[Tensor, "5 3"], Float[Tensor, " 5"]]:
-        """Normals and offsets of the planes around what is seen; normals · place + offset >= 0 inside."""
-        normals, offsets = _planes(camera, PAD * max(1.0, self.training.relative_rate(camera)))
-        return normals, offsets + FAR_ROUNDING * camera.cam_from_world.detach()[:3, 3].cpu().norm()
+        """Normals and offsets, in the world, of the planes around the view; normals · place + offset >= 0 inside."""
+        margin = FILTER_REACH * max(1.0, self.training.relative_rate(camera))  # px
+        rows = [[0.0, 0.0, 1.0, -NEAR]]
+        sides = (camera.fx, camera.cx, camera.width), (camera.fy, camera.cy, camera.height)
+        for axis, (focal, centre, side) in enumerate(sides):
+            for sign, edge in ((1.0, -margin - centre), (-1.0, side + margin - centre)):
+                slope = edge / focal  # the plane along = slope z
+                row = [0.0, 0.0, -sign * slope, 0.0]
+                row[axis] = sign
+                rows.append([x / math.hypot(1, slope) for x in row])
+        planes = torch.tensor(rows, dtype=torch.float64)
+        pose = camera.cam_from_world.detach().cpu().double()
+        offsets = planes[:, :3] @ pose[:3, 3] + planes[:, 3]
+        return planes[:, :3] @ pose[:3, :3], offsets + FLOAT32_SLACK * pose[:3, 3].norm()
 
-    def _drawn(self, camera: Camera, frustum: tuple[Tensor, Tensor], coarser: float) -> Float[Tensor, "l c"]:
+    def _visible_shares(self, camera: Camera, frustum: tuple[Tensor, Tensor], coarser: float) -> Float[Tensor, "l c"]:
         """Share of each level in each chunk; 0 for chunks that cannot reach into the image."""
         visible = _reaches(frustum, self.centres, self.reach)
         return self.shares(self.octaves(camera, coarser)).masked_fill(~visible, 0.0)
-
-    def _candidates(self, shares: Float[Tensor, "l c"]) -> tuple[Int[Tensor, " m"], Float[Tensor, " m"]]:
-        """The Gaussians of the chunks that have a share, ascending, and their shares."""
-        pyramid = self.pyramid
-        finest = shares[0].index_select(0, pyramid.chunks[: pyramid.sizes[0]]) if shares[0].any() else shares[0, :0]
-        first = finest.nonzero()[:, 0]
-        levels, chunks = shares[1:].nonzero().unbind(dim=1)
-        counts, firsts = (of[1:][levels, chunks] for of in (pyramid.counts, pyramid.firsts))
-        starts = starts_of(counts)
-        runs = runs_of(starts, counts)
-        index = (firsts - starts).index_select(0, runs) + torch.arange(len(runs), device=runs.device)
-        own = shares[1:][levels, chunks].index_select(0, runs)
-        return torch.cat([first, index]), torch.cat([finest.index_select(0, first), own])
 
 
 def faded(splats: Splats2D, shares: Float[Tensor, " m"]) -> Splats2D:
@@ -256,26 +259,6 @@ def faded(splats: Splats2D, shares: Float[Tensor, " m"]) -> Splats2D:
 def _reaches(
     frustum: tuple[Tensor, Tensor], places: Float[Tensor, "m 3"], room: Float[Tensor, " m"]
 ) -> Bool[Tensor, " m"]:
-    """Whether what is seen up to `room` from a place can reach into the image."""
+    """True where a thing that is visible up to `room` from its place can reach into the image."""
     normals, offsets = (x.to(places) for x in frustum)
     return torch.addmm(offsets[:, None], normals, places.T).amin(dim=0) > -room
-
-
-def _planes(camera: Camera, pad: float) -> tuple[Float[Tensor, "5 3"], Float[Tensor, " 5"]]:
-    """Normals and offsets of the planes around what a camera sees, in the world.
-
-    pad: px around the image.
-    """
-    planes = [[0.0, 0.0, 1.0, -NEAR]]
-    for axis, focal, centre, side in (
-        (0, camera.fx, camera.cx, camera.width),
-        (1, camera.fy, camera.cy, camera.height),
-    ):
-        for sign, edge in ((1.0, -pad - centre), (-1.0, side + pad - centre)):
-            slope = edge / focal  # the plane along = slope z
-            plane = [0.0, 0.0, -sign * slope, 0.0]
-            plane[axis] = sign
-            planes.append([x / math.hypot(1, slope) for x in plane])
-    found = torch.tensor(planes, dtype=torch.float64)
-    pose = camera.cam_from_world.detach().cpu().double()
-    return found[:, :3] @ pose[:3, :3], found[:, :3] @ pose[:3, 3] + found[:, 3]

@@ -3,19 +3,19 @@
 They belong to training: a scene looks right when it is composited as it was trained.
 """
 
+import math
+import struct
 from dataclasses import dataclass, field
 
-import torch
-
-from aaplug.core.errors import UsageError
+from aaplug.system.errors import UsageError
 
 NEAR = 0.2  # world units of depth: nearer Gaussians are neither drawn nor counted as seen (3DGS)
-SMALLEST_CUTOFF = 1 / 500  # the compiled exp2 is a polynomial that ends at 2^-9
+MIN_CUTOFF = 1 / 500  # the compiled exp2 is a polynomial that ends at 2^-9
 
 
 @dataclass(frozen=True)
 class Rules:
-    """How splats become pixels.  Values are rounded to float32, as renderers hold them.
+    """The constants of compositing.  Values are rounded to float32, as renderers hold them.
 
     max_alpha: cap of one splat's alpha at a pixel.
     min_alpha: a smaller alpha is skipped.
@@ -31,24 +31,20 @@ class Rules:
     min_alpha: float = 1 / 255
     min_transmittance: float = 1e-4
     near: float = NEAR
-    # derived once, because kernels are traced and must not create tensors
+    # These are computed once, because kernels are traced and must not create tensors.
     below_min_alpha: float = field(init=False, repr=False, compare=False)
     log2_min_alpha: float = field(init=False, repr=False, compare=False)
     below_min_transmittance: float = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        if not (
-            SMALLEST_CUTOFF <= self.min_alpha < self.max_alpha < 1 and 0 < self.min_transmittance < 1 and self.near > 0
-        ):
-            raise UsageError(
-                "rules",
-                f"expected {SMALLEST_CUTOFF:g} <= min_alpha < max_alpha < 1, 0 < min_transmittance < 1 and near > 0, "
-                f"got {self}",
-            )
+        alphas = MIN_CUTOFF <= self.min_alpha < self.max_alpha < 1
+        if not (alphas and 0 < self.min_transmittance < 1 and self.near > 0):
+            ranges = f"{MIN_CUTOFF:g} <= min_alpha < max_alpha < 1, 0 < min_transmittance < 1 and near > 0"
+            raise UsageError("rules", f"expected {ranges}, got {self}")
         for name in ("max_alpha", "min_transmittance"):
-            object.__setattr__(self, name, torch.tensor(getattr(self, name)).item())
+            object.__setattr__(self, name, float32(getattr(self, name)))
         object.__setattr__(self, "below_min_alpha", just_below(self.min_alpha))
-        object.__setattr__(self, "log2_min_alpha", torch.tensor(self.min_alpha).log2().item())
+        object.__setattr__(self, "log2_min_alpha", float32(math.log2(float32(self.min_alpha))))
         object.__setattr__(self, "below_min_transmittance", just_below(self.min_transmittance))
 
     @property
@@ -65,7 +61,14 @@ def variant(values: tuple[float, ...], defaults: tuple[float, ...]) -> str:
 
 def just_below(value: float) -> float:
     """The float32 below a positive value: `torch.threshold` keeps what is above its bound, so also `value` itself."""
-    return torch.nextafter(torch.tensor(value), torch.tensor(0.0)).item()
+    [bits] = struct.unpack("I", struct.pack("f", value))
+    [below] = struct.unpack("f", struct.pack("I", bits - 1))
+    return below
+
+
+def float32(value: float) -> float:
+    """The float32 nearest to a value."""
+    return struct.unpack("f", struct.pack("f", value))[0]
 
 
 RULES_3DGS = Rules()

@@ -1,4 +1,4 @@
-"""Runs that follow one another, each of so many places.
+"""Runs of places, one after another.
 
 m: runs; p: places.
 """
@@ -9,17 +9,17 @@ from torch import Tensor
 
 
 def starts_of(counts: Int[Tensor, " m"]) -> Int[Tensor, " m"]:
-    """Where each of several runs begins that follow one another."""
+    """The first place of each run, of these lengths."""
     return counts.cumsum(0, dtype=counts.dtype) - counts
 
 
 def runs_of(starts: Int[Tensor, " m"], counts: Int[Tensor, " m"]) -> Int[Tensor, " p"]:
-    """Which run each place belongs to, where run i begins at `starts[i]` and holds `counts[i]`, perhaps none.
+    """The run of each place, where run i begins at `starts[i]` and has `counts[i]` places, perhaps none.
 
-    Several times faster than `repeat_interleave`.
+    It is several times faster than `repeat_interleave`.
     """
     total = int(counts.sum())
-    begun = starts.new_zeros(total + 1)  # runs that begin here; none at the end begin at `total`
-    begun.index_add_(0, starts, torch.ones_like(starts))
-    begun[0] -= 1
-    return begun[:total].cumsum(0, dtype=begun.dtype)
+    beginnings = starts.new_zeros(total + 1)  # runs that begin at each place; empty runs at the end begin at `total`
+    beginnings.index_add_(0, starts, torch.ones_like(starts))
+    beginnings[0] -= 1
+    return beginnings[:total].cumsum(0, dtype=beginnings.dtype)

@@ -1,8 +1,8 @@
-"""How finely a set of cameras samples each Gaussian: the sampling rates that rate-aware filters start from.
+"""Sampling rates: how finely cameras sample each Gaussian, from which rate-aware filters start.
 
 n: Gaussians, v: cameras, c: Gaussians of a chunk.  A camera of focal length f px samples a Gaussian at depth z (along
 the optical axis) with f / z pixels per world unit.  It sees the Gaussian when the depth is above `NEAR` and the
-projected centre lies in the image widened by `MARGIN` of its size on every side (Mip-Splatting, arXiv 2311.16493,
+projected centre lies in the image widened by `IMAGE_MARGIN` of its size on every side (Mip-Splatting, arXiv 2311.16493,
 section 5.1 and its published constants).  Each rate pairs a camera's own focal length with its own depth, as in the
 paper's equation 7.  Functions that take cameras raise UsageError if there are none.
 """
@@ -15,18 +15,18 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from aaplug.core.cameras import Camera
-from aaplug.core.choices import MIN_SEEN_SHARE
-from aaplug.core.errors import FrameError, UsageError
+from aaplug.core.conventions import MIN_SEEN_SHARE
 from aaplug.core.rules import NEAR
+from aaplug.system.errors import FrameError, UsageError
 
-MARGIN = 0.15  # of the image's side; equals 3DGS's clamp of the Jacobian at 1.3 tan(fov/2)
+IMAGE_MARGIN = 0.15  # of the image's side; equals 3DGS's clamp of the Jacobian at 1.3 tan(fov/2)
 CHUNK_PAIRS = 4_000_000  # Gaussian-camera pairs held at once: about 150 MB
 FRAME_CHECK_GAUSSIANS = 50_000  # size of the even sample for the frame check
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SamplingBounds:
-    """What filters know about a camera set.  Everything is zero for a Gaussian that no camera sees.
+    """The facts about a camera set that filters use; all are zero for a Gaussian that no camera sees.
 
     highest, lowest: sampling rate over the cameras that see the Gaussian, in px per world unit.
     nearest: smallest depth in these cameras, in world units.
@@ -46,7 +46,7 @@ class SamplingBounds:
 
     @property
     def seen(self) -> Bool[Tensor, " n"]:
-        """Whether any camera sees the Gaussian."""
+        """True where any camera sees the Gaussian."""
         return self.views > 0
 
     @property
@@ -60,8 +60,7 @@ class SamplingBounds:
             return self.highest
         if not self.seen.any():
             raise FrameError("sampling bounds", "no camera sees any Gaussian: there is no rate to filter by")
-        coarsest = self.highest[self.seen].min()
-        return torch.where(self.seen, self.highest, coarsest)
+        return torch.where(self.seen, self.highest, self.highest[self.seen].min())
 
 
 @torch.no_grad()
@@ -72,18 +71,17 @@ def sampling_bounds(
 
     Memory beyond the result and one float64 copy of the means is bounded by `chunk_pairs`.
     """
-    n = len(means)
-    highest, lowest, nearest = (means.new_zeros(n) for _ in range(3))
+    highest, lowest, nearest = (means.new_zeros(len(means)) for _ in range(3))
     focals = means.new_tensor([camera.focal for camera in cameras])
-    views = torch.zeros(n, dtype=torch.int32, device=means.device)
-    for part, rates in _rates_in_chunks(means, cameras, chunk_pairs):
-        seen = rates > 0
-        views[part] = seen.sum(dim=1, dtype=torch.int32)
+    views = torch.zeros(len(means), dtype=torch.int32, device=means.device)
+    for part, rates in rates_in_chunks(means, cameras, chunk_pairs):
+        visible = rates > 0
+        views[part] = visible.sum(dim=1, dtype=torch.int32)
         highest[part] = rates.amax(dim=1)
         nearest[part] = focals[0] / highest[part]
         if (focals != focals[0]).any():
             nearest[part] = (focals / rates).amin(dim=1)
-        lowest[part] = rates.masked_fill_(~seen, torch.inf).amin(dim=1)
+        lowest[part] = rates.masked_fill_(~visible, torch.inf).amin(dim=1)
     lowest[views == 0] = nearest[views == 0] = 0
     return SamplingBounds(highest, lowest, nearest, views)
 
@@ -93,28 +91,9 @@ def median_rates(
 ) -> Float[Tensor, " n"]:
     """Median sampling rate of each Gaussian over the cameras that see it, in px per world unit; 0 if none does."""
     median = means.new_zeros(len(means))
-    for part, rates in _rates_in_chunks(means, cameras, chunk_pairs):
-        middle = rates.masked_fill_(rates == 0, torch.nan).nanmedian(dim=1).values
-        median[part] = middle.nan_to_num(0.0)
+    for part, rates in rates_in_chunks(means, cameras, chunk_pairs):
+        median[part] = rates.masked_fill_(rates == 0, torch.nan).nanmedian(dim=1).values.nan_to_num(0.0)
     return median
-
-
-def view_information(
-    means: Float[Tensor, "n 3"], cameras: Sequence[Camera], chunk_pairs: int = CHUNK_PAIRS
-) -> Float[Tensor, "n 3 3"]:
-    """Directional sampling density of each Gaussian: Σ ν² (I - d dᵀ) over the cameras that see it, in px² per unit².
-
-    Along u, uᵀ M u is the summed squared rate; a camera adds nothing along its own ray d.  0 if no camera sees it.
-    """
-    origin = _middle(cameras)
-    eyes = torch.stack([camera.centre - origin for camera in cameras]).to(means)
-    information = means.new_zeros(len(means), 3, 3)
-    for part, rates in _rates_in_chunks(means, cameras, chunk_pairs):
-        local = (means[part].double() - origin).to(means)
-        rays = torch.nn.functional.normalize(local[:, None] - eyes, dim=2) * rates[:, :, None]
-        total = rates.square().sum(dim=1)[:, None, None] * torch.eye(3).to(means)
-        information[part] = total - rays.mT @ rays
-    return information
 
 
 def check_frame(
@@ -125,14 +104,12 @@ def check_frame(
     Raises:
         FrameError: see `check_seen`.
     """
-    sample = means[:: max(1, len(means) // FRAME_CHECK_GAUSSIANS)]
+    sample = means[:: max(1, len(means) // FRAME_SAMPLE_SIZE)]
     return check_seen(sampling_bounds(sample, cameras).seen, len(cameras), scene_name, min_share)
 
 
 def check_seen(seen: Bool[Tensor, " n"], cameras: int, scene_name: str, min_share: float) -> float:
-    """Share of Gaussians that any camera sees; 1 if there are none.
-
-    cameras: their number.
+    """Share of Gaussians that any camera sees; 1 if there are none.  cameras: their number.
 
     Raises:
         FrameError: the share is below `min_share`: scene and cameras are probably in different frames.
@@ -149,14 +126,14 @@ def check_seen(seen: Bool[Tensor, " n"], cameras: int, scene_name: str, min_shar
     return share
 
 
-def _rates_in_chunks(
+def rates_in_chunks(
     means: Float[Tensor, "n 3"], cameras: Sequence[Camera], chunk_pairs: int
 ) -> Iterator[tuple[slice, Float[Tensor, "c v"]]]:
     """Yield (chunk of the Gaussians, its rate in every camera); a rate of 0 means "not seen".
 
     The cameras' mean position is subtracted in float64 first, so that scenes far from the origin keep their digits.
     """
-    origin = _middle(cameras)
+    origin = mean_position(cameras)
     poses = torch.stack([camera.cam_from_world for camera in cameras])
     offset = poses[:, :3, 3] + poses[:, :3, :3] @ origin
     rotation, offset = poses[:, :3, :3].to(means), offset.to(means)
@@ -167,12 +144,12 @@ def _rates_in_chunks(
         part = slice(start, min(start + step, len(means)))
         local = (means[part].double() - origin).to(means)
         x, y, z = (torch.addmm(offset[:, i], local, rotation[:, i].T) for i in range(3))
-        seen = (z > NEAR) & _inside(x.div_(z).mul_(fx).add_(cx), width)
-        seen &= _inside(y.div_(z).mul_(fy).add_(cy), height)
-        yield part, torch.where(seen, focal / z, 0.0)
+        visible = (z > NEAR) & _inside(x.div_(z).mul_(fx).add_(cx), width)
+        visible &= _inside(y.div_(z).mul_(fy).add_(cy), height)
+        yield part, torch.where(visible, focal / z, 0.0)
 
 
-def _middle(cameras: Sequence[Camera]) -> Float[Tensor, " 3"]:
+def mean_position(cameras: Sequence[Camera]) -> Float[Tensor, " 3"]:
     """The cameras' mean position."""
     if not cameras:
         raise UsageError("cameras", "there are none, and sampling bounds need at least one")
@@ -180,4 +157,4 @@ def _middle(cameras: Sequence[Camera]) -> Float[Tensor, " 3"]:
 
 
 def _inside(position: Float[Tensor, "c v"], side: Float[Tensor, " v"]) -> Bool[Tensor, "c v"]:
-    return (position >= -MARGIN * side) & (position <= side + MARGIN * side)
+    return (position >= -IMAGE_MARGIN * side) & (position <= side + IMAGE_MARGIN * side)

@@ -18,8 +18,8 @@ from aaplug.core.kernels import EAGER, EXAMPLE_SIZE, Kernel, Kernels
 from aaplug.core.spherical_harmonics import sh_colour
 from aaplug.core.splats import Splats2D
 
-CHUNK = 1 << 16  # splats
-COMPILED = (4, 9, 16)  # coefficients per channel of degree 1 to 3
+SPLATS_PER_CALL = 1 << 16
+COMPILED_COEFFICIENTS = (4, 9, 16)  # coefficients per channel of degree 1 to 3
 
 
 def shade(splats: Splats2D, scene: Gaussians, camera: Camera, kernels: Kernels = EAGER) -> Splats2D:
@@ -40,22 +40,22 @@ class _Shade(torch.autograd.Function):
         ctx.save_for_backward(sh, means, centre, sources)
         ctx.kernels = kernels
         kernel = shade_kernel(sh.shape[1])
-        parts = [kernels.run(kernel, sh, means, part, centre)[0] for part in sources.split(CHUNK)]
+        parts = [kernels.run(kernel, sh, means, part, centre)[0] for part in sources.split(SPLATS_PER_CALL)]
         return parts[0] if len(parts) == 1 else torch.cat(parts)
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         sh, means, centre, sources = ctx.saved_tensors
         kernel = gradients_kernel(sh.shape[1])
-        wanted = ctx.needs_input_grad[:2]
-        # what nobody asked for is written, but not cleared: rows that are not drawn cost nothing
-        into = [
-            torch.zeros_like(x) if asked else torch.empty_like(x) for x, asked in zip((sh, means), wanted, strict=True)
+        needs = ctx.needs_input_grad[:2]
+        # A gradient that nobody needs is written, but not cleared: rows that are not drawn cost nothing.
+        results = [
+            torch.zeros_like(x) if need else torch.empty_like(x) for x, need in zip((sh, means), needs, strict=True)
         ]
-        moved = torch.zeros_like(centre)
-        for part, grad in zip(sources.split(CHUNK), grads[0].split(CHUNK), strict=True):
-            moved += ctx.kernels.run(kernel, sh, means, part, centre, grad, *into)[0]
-        return *(x if asked else None for x, asked in zip(into, wanted, strict=True)), moved, None, None
+        d_centre = torch.zeros_like(centre)
+        for part, grad in zip(sources.split(SPLATS_PER_CALL), grads[0].split(SPLATS_PER_CALL), strict=True):
+            d_centre += ctx.kernels.run(kernel, sh, means, part, centre, grad, *results)[0]
+        return *(x if need else None for x, need in zip(results, needs, strict=True)), d_centre, None, None
 
 
 def _colours(
@@ -110,13 +110,7 @@ def shade_kernel(coefficients: int) -> Kernel:
 
 @cache
 def gradients_kernel(coefficients: int) -> Kernel:
-    """Their gradients."""
-    return Kernel(
-        f"shade-{coefficients}-gradients",
-        _gradients,
-        partial(_gradients_example, coefficients),
-        ("n", "n", "m", None, "m", "n", "n"),
-        chained=True,
-        pulls_back=True,
-        updates=(5, 6),
-    )
+    """Gradients of these colours."""
+    name, example = f"shade-{coefficients}-gradients", partial(_gradients_example, coefficients)
+    sizes = ("n", "n", "m", None, "m", "n", "n")
+    return Kernel(name, _gradients, example, sizes, chained=True, pulls_back=True, updates=(5, 6))

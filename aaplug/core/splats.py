@@ -15,12 +15,11 @@ from torch import Tensor
 
 from aaplug.core.kernels import EAGER, EXAMPLE_SIZE, Kernel, Kernels
 
-# floor of the opacity factor, so that rounding erases no splat (3DGS)
-MIN_COMPENSATION = 0.005
-SHAPE = ("means", "covs", "dets", "depths", "opacities")  # floating point columns that every splat has
+MIN_COMPENSATION = 0.005  # floor of the opacity factor, so that rounding erases no splat (3DGS)
+SHAPE_COLUMNS = ("means", "covs", "dets", "depths", "opacities")  # floating point, and of every splat
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Splats2D:
     """Splats of one view, in no particular order.
 
@@ -55,10 +54,10 @@ class Splats2D:
     def selected(self, rows: Int[Tensor, " k"], kernels: Kernels = EAGER) -> "Splats2D":
         """The splats at `rows`, each at most once."""
         columns = self._columns()
-        shape = kernels.run(SELECT, rows, *(columns.pop(name) for name in SHAPE))
+        shape = kernels.run(SELECT, rows, *(columns.pop(name) for name in SHAPE_COLUMNS))
         sources = columns.pop("sources").index_select(0, rows)
-        rest = {name: picked(column, rows) for name, column in columns.items()}
-        return replace(self, **dict(zip(SHAPE, shape, strict=True)), sources=sources, **rest)
+        others = {name: picked(column, rows) for name, column in columns.items()}
+        return replace(self, **dict(zip(SHAPE_COLUMNS, shape, strict=True)), sources=sources, **others)
 
     def to(self, dtype: torch.dtype) -> "Splats2D":
         """The same splats in another precision."""
@@ -102,11 +101,10 @@ class Splats2D:
 
 def concatenated(parts: Sequence[Splats2D]) -> Splats2D:
     """The splats of several parts as one; every part has the same columns."""
-    first, *rest = parts
-    if not rest:
-        return first
-    columns = {name: torch.cat([getattr(part, name) for part in parts]) for name in first._columns()}
-    return replace(first, **columns)
+    if len(parts) == 1:
+        return parts[0]
+    columns = {name: torch.cat([getattr(part, name) for part in parts]) for name in parts[0]._columns()}
+    return replace(parts[0], **columns)
 
 
 class Render(NamedTuple):

@@ -1,4 +1,4 @@
-"""What is known about training: its rasterization convention, and how finely its cameras sampled the scene."""
+"""Facts about training: its rasterization convention, and how finely its cameras sampled the scene."""
 
 import math
 from collections.abc import Sequence
@@ -6,13 +6,14 @@ from dataclasses import dataclass, replace
 from statistics import median
 
 from aaplug.core.cameras import Camera, CameraSet
-from aaplug.core.gaussians import Convention, Gaussians
+from aaplug.core.conventions import Convention
+from aaplug.core.gaussians import Gaussians
 from aaplug.core.sampling import SamplingBounds, check_seen, sampling_bounds
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TrainingViews:
-    """The training cameras of one scene and what they tell about each Gaussian.
+    """The training cameras of one scene, and their sampling rates of each Gaussian.
 
     convention: how training turned covariances into pixels.
     cameras: at the training size.
@@ -54,8 +55,7 @@ class TrainingViews:
 
         A free camera is compared with the training cameras' median focal length.
         """
-        trained = camera.trained_focal or median(c.focal for c in self.cameras)
-        return camera.focal / trained
+        return camera.focal / (camera.trained_focal or median(c.focal for c in self.cameras))
 
     def finer(self, factor: float) -> "TrainingViews":
         """The same views with pixels `factor` times as dense, so that every rate is `factor` times as high."""

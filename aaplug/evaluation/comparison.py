@@ -1,24 +1,36 @@
-"""The results of a comparison of scenes as data and in print: what each scene is, how it differs, how near it looks.
+"""Scenes held to the first of them: how their Gaussians differ, and their results as data and in print.
 
 Every scene is a row of a `Report` whose truth is the first of them, the reference.
+
+Gaussians are compared one by one where two scenes have the same number.  Some programs sort the Gaussians.  Where rows
+are not the same Gaussians, those are paired that are each other's nearest neighbours (positions that a format rounded
+to the same place lose their partners).
+
+n: Gaussians, m: pairs.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from statistics import median, stdev
+from itertools import product
+from statistics import median
 from typing import Any, NamedTuple
 
+import torch
+from jaxtyping import Float, Int
 from rich.box import SIMPLE_HEAD
 from rich.markup import escape
 from rich.table import Table
+from scipy.spatial import KDTree
+from torch import Tensor
 
-from aaplug.core.errors import printable
+from aaplug.core.gaussians import MAX_LOG_SCALE, Gaussians
 from aaplug.evaluation.metric import Metric
 from aaplug.evaluation.metrics import EQUAL, PSNR
-from aaplug.evaluation.results import Facts, Measurement, Report, mean, tables
-from aaplug.inspection.differences import Differences
+from aaplug.evaluation.results import Facts, Measurement, Report, mean, spread_of, tables
+from aaplug.system.errors import printable
 
+SAME_ROWS_DISTANCE = 0.01  # of the scene's size: the median distance within which rows are the same Gaussians
 GUARDED = (
     "the lowest, over scenes and scales, of the mean PSNR of the views whose images differ, in dB; null if none do"
 )
@@ -26,11 +38,86 @@ UNKNOWN = "–"
 
 
 @dataclass(frozen=True)
+class Change:
+    """Absolute differences of one quantity over the pairs: root mean square, median and largest."""
+
+    rms: float
+    median: float
+    largest: float
+
+    @classmethod
+    def of(cls, values: Float[Tensor, "*m"]) -> "Change":
+        """Of differences, or of their lengths; 0 of none."""
+        if not values.numel():
+            return cls(0.0, 0.0, 0.0)
+        sizes = values.double().abs().flatten()
+        return cls(float(sizes.square().mean().sqrt()), float(sizes.median()), float(sizes.max()))
+
+
+@dataclass(frozen=True)
+class Differences:
+    """The changes from one scene to another.
+
+    paired: share of the Gaussians that have a partner.  sorted: true if the order changed.
+    positions: world units.  scales: of ln σ, axis by axis from the thinnest.  opacities: of values in [0, 1].
+    harmonics: of the coefficients, by degree; those that one scene lacks count as 0.
+    """
+
+    paired: float
+    sorted: bool
+    positions: Change
+    scales: Change
+    opacities: Change
+    harmonics: tuple[Change, ...]
+
+    @property
+    def changes(self) -> dict[str, Change]:
+        """The changes by the quantity's name."""
+        degrees = {f"SH {degree}": change for degree, change in enumerate(self.harmonics)}
+        return {"positions": self.positions, "scales": self.scales, "opacities": self.opacities, **degrees}
+
+    def as_json(self) -> dict[str, Any]:
+        """JSON-ready."""
+        return {"paired": self.paired, "sorted": self.sorted} | {k: vars(v) for k, v in self.changes.items()}
+
+
+def differences(reference: Gaussians, other: Gaussians) -> Differences | None:
+    """The changes from the reference to the other; None where their counts differ or there is no Gaussian."""
+    if len(reference) != len(other) or not len(reference):
+        return None
+    first, second = reference, other
+    distances = (reference.means.double() - reference.means.double().median(dim=0).values).norm(dim=1)
+    moves = (reference.means.double() - other.means.double()).norm(dim=1)
+    same_rows = float(moves.median()) <= SAME_ROWS_DISTANCE * float(distances.median())
+    if not same_rows:
+        there, back = _nearest(reference, other), _nearest(other, reference)
+        mutual = (back[there] == torch.arange(len(reference))).nonzero()[:, 0]
+        first, second = reference[mutual], other[there[mutual]]
+    a, b = (scene.log_scales.clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE).sort(dim=1).values for scene in (first, second))
+    most = max(first.sh.shape[1], second.sh.shape[1])
+    one, two = (torch.nn.functional.pad(s.sh, (0, 0, 0, most - s.sh.shape[1])) for s in (first, second))
+    return Differences(
+        paired=len(first) / len(reference),
+        sorted=not same_rows,
+        positions=Change.of((first.means.double() - second.means.double()).norm(dim=1)),
+        scales=Change.of(a.double() - b.double()),
+        opacities=Change.of(first.opacities.double() - second.opacities.double()),
+        harmonics=tuple(Change.of((one - two)[:, d * d : (d + 1) ** 2]) for d in range(round(most**0.5))),
+    )
+
+
+def _nearest(scene: Gaussians, among: Gaussians) -> Int[Tensor, " n"]:
+    """Row of the nearest of the others, for each Gaussian."""
+    tree = KDTree(among.means.detach().double().numpy())
+    return torch.from_numpy(tree.query(scene.means.detach().double().numpy())[1]).long()
+
+
+@dataclass(frozen=True)
 class ComparedScene:
-    """What a scene is.
+    """A scene of a comparison.
 
     file, bytes: None of a scene that came from no file.
-    frame: what its frame is against the reference's, in words; None if the same.
+    frame: its frame against the reference's, in words; None if the same.
     differences: from the reference, Gaussian by Gaussian; None where the counts differ.
     """
 
@@ -50,7 +137,7 @@ class ComparedScene:
 
 
 class Lowest(NamedTuple):
-    """A mean PSNR in dB, infinite where all images are equal, and where it was found."""
+    """A mean PSNR in dB, infinite where all images are equal, with its scene and scale."""
 
     value: float
     scene: str
@@ -71,91 +158,71 @@ class Comparison:
 
     @property
     def lowest(self) -> Lowest:
-        """The worst scene at its worst scale, by mean PSNR: what `aaplug compare --fail-under` guards."""
-        found = [Lowest(_psnr(self.report, s.name, r), s.name, r) for s in self.scenes[1:] for r in self.report.scales]
-        return min(found)
+        """The worst scene at its worst scale, by mean PSNR: the figure that `aaplug compare --fail-under` guards."""
+        cases = []
+        for scene, scale in product(self.scenes[1:], self.report.scales):
+            value = mean(self.report.select(scene.name, scale), PSNR.name)
+            cases.append(Lowest(math.inf if value is None else value, scene.name, scale))
+        return min(cases)
 
     def summary(self) -> dict[str, Any]:
         """Everything, JSON-ready."""
-        value, scene, scale = self.lowest
-        guard = {"figure": GUARDED, "value": None if value == math.inf else value, "scene": scene, "scale": scale}
-        scenes = {scene.name: scene.as_json() | {"scales": self._figures(scene.name)} for scene in self.scenes}
-        protocol = {**self.report.protocol, "notes": self.report.notes}
+        value, worst, scale = self.lowest
+        guard = {"figure": GUARDED, "value": None if value == math.inf else value, "scene": worst, "scale": scale}
+        report, scenes = self.report, dict[str, Any]()
+        for scene in self.scenes:
+            figures = {f"{s:g}": _statistics(report.metrics, report.select(scene.name, s)) for s in report.scales}
+            scenes[scene.name] = scene.as_json() | {"scales": figures}
+        protocol = {**report.protocol, "notes": report.notes}
         return {"reference": self.reference.name, "guard": guard, "scenes": scenes, "protocol": protocol}
 
-    def _figures(self, name: str) -> dict[str, Any]:
-        """By scale: every metric and the time of a frame over the views, and view by view."""
-        return {f"{s:g}": _statistics(self.report.metrics, self.report.select(name, s)) for s in self.report.scales}
-
     def tables(self) -> list[Table]:
-        """What the scenes are, how their Gaussians differ, and every metric over scales."""
-        return [*self.facts(), *tables(self.report)]
+        """The scenes, how their Gaussians differ, and every metric over scales."""
+        facts = []
+        for title, headings, rows in self.facts():
+            table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+            for place, heading in enumerate(headings):
+                table.add_column(heading, justify="right" if place else "left", overflow="fold")
+            for row in rows:
+                table.add_row(*(escape(printable(cell)) for cell in row))
+            facts.append(table)
+        return [*facts, *tables(self.report)]
 
-    def facts(self) -> list[Table]:
-        """What the scenes are, and how their Gaussians differ."""
-        return [_table(title, headings, rows) for title, headings, rows in self.cells()]
-
-    def cells(self) -> list[Facts]:
-        """Tables as title, headings and rows of text."""
-        found = [("scenes", ["scene", "format", "bytes", "Gaussians", "SH degree", "convention"], self._scene_rows())]
-        if changed := [scene for scene in self.scenes if scene.differences is not None]:
-            names = max((list(s.differences.named) for s in changed if s.differences), key=len)
-            title = "differences of the Gaussians, root mean square"
-            found.append((title, ["scene", *names, "paired"], [_difference_row(scene, names) for scene in changed]))
-        return found
-
-    def _scene_rows(self) -> list[list[str]]:
-        whole, rows = self.reference.bytes, []
+    def facts(self) -> list[Facts]:
+        """The scenes, and how their Gaussians differ, as tables of title, headings and rows of text."""
+        reference, rows = self.reference, []
         for scene in self.scenes:
             size = UNKNOWN if scene.bytes is None else f"{scene.bytes:,}"
-            if scene is not self.reference and whole and scene.bytes is not None:
-                size += f" ({scene.bytes / whole:.1%})"
+            if scene is not reference and reference.bytes and scene.bytes is not None:
+                size += f" ({scene.bytes / reference.bytes:.1%})"
             facts = f"{scene.gaussians:,}", str(scene.sh_degree), scene.convention
             rows.append([scene.name, scene.format or "in memory", size, *facts])
-        return rows
-
-
-def _psnr(report: Report, name: str, scale: float) -> float:
-    found = mean(report.select(name, scale), PSNR.name)
-    return math.inf if found is None else found
+        headings = ["scene", "format", "bytes", "Gaussians", "SH degree", "convention"]
+        changed = [(scene.name, scene.differences) for scene in self.scenes if scene.differences is not None]
+        if not changed:
+            return [("scenes", headings, rows)]
+        names, lines = max((list(each.changes) for _, each in changed), key=len), []
+        for scene, each in changed:
+            cells = [f"{each.changes[name].rms:.2g}" if name in each.changes else UNKNOWN for name in names]
+            lines.append([scene, *cells, f"{each.paired:.1%}{', sorted' * each.sorted}"])
+        title = "differences of the Gaussians, root mean square"
+        return [("scenes", headings, rows), (title, ["scene", *names, "paired"], lines)]
 
 
 def _statistics(metrics: Sequence[Metric], views: Sequence[Measurement]) -> dict[str, Any]:
-    found = {metric.name: _spread(metric, {v.view: v.values.get(metric.name) for v in views}) for metric in metrics}
+    """The metrics and the time of a frame over the views, and view by view."""
+    figures = dict[str, Any]()
+    for metric in metrics:
+        spread = spread_of(metric, views)
+        figures[metric.name] = spread and {
+            "mean": spread.mean,
+            "median": spread.median,
+            "worst": {"view": spread.worst[0], "value": spread.worst[1]},
+            "spread": spread.deviation,
+        }
     return {
-        **found,
+        **figures,
         "equal_views": sum(EQUAL in view.note for view in views),
         "seconds": median(view.seconds for view in views),
         "per_view": {v.view: {**v.values, "seconds": round(v.seconds, 4)} for v in views},
     }
-
-
-def _spread(metric: Metric, values: Mapping[str, float | None]) -> dict[str, Any] | None:
-    """Mean, median, worst and standard deviation over the views where the metric is defined; None if nowhere."""
-    known = {view: value for view, value in values.items() if value is not None}
-    if not known:
-        return None
-    worst = max(known, key=lambda view: metric.loss(known[view]))
-    return {
-        "mean": sum(known.values()) / len(known),
-        "median": median(known.values()),
-        "worst": {"view": worst, "value": known[worst]},
-        "spread": stdev(known.values()) if len(known) > 1 else None,
-    }
-
-
-def _difference_row(scene: ComparedScene, names: Sequence[str]) -> list[str]:
-    assert scene.differences is not None
-    changes = scene.differences.named
-    cells = [f"{changes[name].rms:.2g}" if name in changes else UNKNOWN for name in names]
-    order = ", sorted" if scene.differences.sorted else ""
-    return [scene.name, *cells, f"{scene.differences.paired:.1%}{order}"]
-
-
-def _table(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
-    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
-    for place, heading in enumerate(headings):
-        table.add_column(heading, justify="right" if place else "left", overflow="fold")
-    for row in rows:
-        table.add_row(*(escape(printable(cell)) for cell in row))
-    return table

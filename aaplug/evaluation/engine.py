@@ -7,43 +7,41 @@ before they are compared.  Views stream: only the numbers of finished views are 
 
 import math
 from collections.abc import Hashable, Iterator, Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from os import PathLike
-from pathlib import Path
 from typing import Any
 
 from torch import Tensor
 
 from aaplug.core.cameras import Camera
-from aaplug.core.choices import Background
-from aaplug.core.errors import UsageError
-from aaplug.core.executors import Apply
+from aaplug.core.colours import Background
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.imaging import quantised
 from aaplug.core.interfaces import Rasterizer, WorldFilter
-from aaplug.core.monitor import Tell
-from aaplug.core.pyramids import Pyramid
 from aaplug.core.training import TrainingViews
 from aaplug.evaluation.image_store import ImageStore
 from aaplug.evaluation.journal import Journal
-from aaplug.evaluation.metric import Drawn, Image, Metric, Series, TimedRenderer
+from aaplug.evaluation.metric import Image, Metric, Series, TimedImage, TimedRenderer
 from aaplug.evaluation.metrics import PSNR, SSIM
 from aaplug.evaluation.results import CEILING, Measurement, Report
 from aaplug.evaluation.truth import Truth, ViewTruth, source_of
 from aaplug.io.photographs import DOWNSCALES
+from aaplug.io.scenes import SceneLike, scene_of
 from aaplug.methods.recipe import Recipe
 from aaplug.methods.recipes import suited
 from aaplug.rendering.renderer import Renderer
+from aaplug.system.errors import UsageError
+from aaplug.system.executors import Apply
+from aaplug.system.monitor import Tell
 
 NO_PHOTOGRAPH = "no photograph is this large: metrics above the photographs' own size are undefined"
-CORNER = 64  # px
+EQUAL_IMAGES_SIDE = 64  # px: of images that equal their truth, metrics look at this corner
 
 Values = Mapping[str, float | None]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Candidate:
     """A scene as one recipe shows it, under a name of its own."""
 
@@ -52,7 +50,7 @@ class Candidate:
 
 
 def candidates_of(
-    scene: Gaussians | Pyramid,
+    scene: SceneLike,
     training: TrainingViews,
     recipes: Sequence[Recipe],
     rasterizer: str | Rasterizer = "auto",
@@ -60,18 +58,18 @@ def candidates_of(
 ) -> list[Candidate]:
     """One scene by several recipes; those with the same world filter share the filtered scene."""
     prepared: dict[tuple[WorldFilter | None, bool], Renderer] = {}
-    found, finest = [], scene.finest if isinstance(scene, Pyramid) else scene
-    for recipe in (suited(recipe, finest) for recipe in recipes):
+    scene, found = scene_of(scene), []
+    for recipe in (suited(recipe, scene.gaussians()) for recipe in recipes):
         key = recipe.world, recipe.levels is not None
-        if key not in prepared:
-            prepared[key] = Renderer.of(scene, training, recipe, rasterizer=rasterizer, background=background)
-        found.append(Candidate(recipe.name, replace(prepared[key], recipe=recipe)))
-    return found
+        if key not in renderers:
+            renderers[key] = Renderer.of(scene, training, recipe, rasterizer=rasterizer, background=background)
+        candidates.append(Candidate(recipe.name, replace(renderers[key], recipe=recipe)))
+    return candidates
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Task:
-    """What to evaluate and against which truth.
+    """Candidates, scales and views to evaluate, and the truth to evaluate them against.
 
     views: at the training size.
     metrics: None takes PSNR and the protocol's SSIM.
@@ -87,7 +85,7 @@ class Task:
 
     @property
     def measured(self) -> tuple[Metric, ...]:
-        """Every metric, first those that compare with the truth."""
+        """The metrics, first those that compare with the truth."""
         if self.metrics is None:
             return (PSNR, SSIM[self.truth.protocol.ssim])
         return tuple(sorted(self.metrics, key=lambda metric: metric.measure is None))
@@ -96,6 +94,11 @@ class Task:
     def names(self) -> list[str]:
         """Rows of the report."""
         return [CEILING, *(candidate.name for candidate in self.candidates)]
+
+    @property
+    def resizes(self) -> bool:
+        """True where a scale changes the image's size, so that images of one view can be averaged down."""
+        return self.truth.protocol.change == "size"
 
 
 def evaluate(
@@ -118,21 +121,16 @@ def evaluate(
     Raises:
         UsageError: nothing to measure, a view lacks the photograph it needs, or the journal is of another request.
     """
-    task = replace(task, views=_distinct(task.views))
-    _check(task)
+    task = _checked(task)
     request = _request(task) | dict(facts or {})
-    written = None if journal is None else Journal(Path(journal), request, resume)
-    known = {} if written is None else written.known
-    found, left = dict(known), [index for index in range(len(task.views)) if index not in known]
-    with written or nullcontext():
-        tell(len(found), len(task.views))
-        for index, measured in apply(_Measuring(task, images), left) if left else ():
-            found[index] = measured
-            if written is not None:
-                written.add(index, measured)
-            tell(len(found), len(task.views))
-    order, measurements = task.names, [m for index in sorted(found) for m in found[index]]
-    measurements.sort(key=lambda m: (order.index(m.recipe), task.scales.index(m.scale)))
+    with Journal(journal, request, resume) as finished:
+        remaining = [index for index in range(len(task.views)) if index not in finished.views]
+        tell(len(finished.views), len(task.views))
+        for index, measurements in apply(ViewMeasurer(task, images), remaining) if remaining else ():
+            finished.add(index, measurements)
+            tell(len(finished.views), len(task.views))
+    rows, measurements = task.names, [m for index in sorted(finished.views) for m in finished.views[index]]
+    measurements.sort(key=lambda m: (rows.index(m.recipe), task.scales.index(m.scale)))
     return Report(tuple(measurements), request, task.measured)
 
 
@@ -147,35 +145,33 @@ def compare(
     return evaluate(Task(candidates, scales, views, truth, ceiling=False), tell=tell)
 
 
-def _distinct(views: Sequence[Camera]) -> Sequence[Camera]:
-    """Number the views where two have the same name, as views of two splits may."""
-    if len({view.name for view in views}) == len(views):
-        return views
-    return [replace(view, name=f"{i:05d}_{view.name}") for i, view in enumerate(views)]
-
-
-def _check(task: Task) -> None:
+def _checked(task: Task) -> Task:
+    """The task, its views numbered where two have the same name, as views of two splits may."""
     if not (task.candidates and task.scales and task.views):
         raise UsageError("evaluate", "needs at least one recipe, one scale and one view")
     if any(not (scale > 0 and math.isfinite(scale)) for scale in task.scales):
         raise UsageError("scale", f"sizes must be above 0, got {min(task.scales):g}")
     if len(set(task.names)) != len(task.names) or len(set(task.scales)) != len(task.scales):
         raise UsageError("evaluate", "a recipe or a scale is named twice")
-    if task.truth.source == "photographs" and task.truth.protocol.change != "size":
-        raise UsageError("truth", f"protocol {task.truth.protocol.name} moves the camera: no photograph shows that")
+    views = task.views
+    if len({view.name for view in views}) < len(views):
+        views = [replace(view, name=f"{i:05d}_{view.name}") for i, view in enumerate(views)]
     if task.truth.source == "photographs":
-        source_of(task.views, task.truth.source)
+        if not task.resizes:
+            raise UsageError("truth", f"protocol {task.truth.protocol.name} moves the camera: no photograph shows that")
+        source_of(views, "photographs")
+    return replace(task, views=views)
 
 
 def _request(task: Task) -> dict[str, Any]:
-    """What the numbers mean; a journal is of the same request if these are equal."""
+    """The meaning of the numbers; a journal is of the same request if these are equal."""
     photographs = task.truth.source == "photographs"
     return {
         "protocol": task.truth.protocol.facts,
         "truth": task.truth.source,
         "downscale": DOWNSCALES[task.truth.protocol.downscale if photographs else "box"].protocol,
         "rounding": "renders clamped to [0, 1] and rounded to 8 bits",
-        "background": list(task.truth.own.background),
+        "background": list(task.truth.renderer.background),
         "metrics": {metric.name: metric.protocol for metric in task.measured},
         "views": len(task.views),
         "view_names": [view.name for view in task.views],
@@ -186,84 +182,75 @@ def _request(task: Task) -> dict[str, Any]:
     }
 
 
-@dataclass(frozen=True)
-class _Measuring:
-    """Measures the view of an index."""
+@dataclass(frozen=True, eq=False)
+class ViewMeasurer:
+    """Measures the view of an index; can be sent to another process."""
 
     task: Task
     images: ImageStore | None
 
     def __call__(self, index: int) -> tuple[int, tuple[Measurement, ...]]:
-        return index, tuple(self._bench.measure(index, self.task.views[index]))
+        """Measure every candidate at every scale."""
+        view, measurements = self.task.views[index], list[Measurement]()
+        truth = ViewTruth(self.task.truth, view)
+        training_size: dict[str, TimedImage] = {}  # by candidate
+        for scale in sorted(self.task.scales, key=lambda scale: scale != 1):  # figures need scale 1
+            compared = _Comparison(self.task.measured, truth.compared(scale))
+            for name, image in self._images(truth, scale):
+                if scale == 1 and self.task.resizes:
+                    training_size[name] = image
+                series = None if name == CEILING else self._series(truth, name, scale, image, training_size.get(name))
+                values, note = compared(image, series)
+                if self.images is not None:
+                    self.images.keep(index, name, scale, image.rgb, compared.truth)
+                cost = image.samples, image.seconds
+                measurements.append(Measurement(name, scale, view.name, values, *cost, note, image.evaluations))
+        return index, tuple(measurements)
+
+    def _images(self, truth: ViewTruth, scale: float) -> Iterator[tuple[str, TimedImage]]:
+        """The rows' images at a scale; candidates that draw alike, as several do at the training size, draw once."""
+        camera = truth.camera(scale)
+        images: dict[Hashable, TimedImage] = {}
+        if truth.truth.source == "reference":
+            images[_work(truth.truth.renderer, camera)] = truth.reference(scale)
+        elif self.task.ceiling and self.task.resizes:
+            yield CEILING, truth.look.resampled_to(truth.resized_look(scale))
+            if scale == 1:
+                images[_work(truth.truth.renderer, camera)] = truth.look
+        for name, renderer in self._renderers.items():
+            work = _work(renderer.renderer, camera)
+            if work not in images:
+                images[work] = renderer(camera)
+            yield name, images[work]
 
     @cached_property
-    def _bench(self) -> "_Bench":
-        return _Bench(self.task, self.images)
+    def _renderers(self) -> dict[str, TimedRenderer]:
+        return {c.name: TimedRenderer(c.renderer) for c in self.task.candidates}
+
+    def _series(self, truth: ViewTruth, name: str, scale: float, image: TimedImage, full: TimedImage | None) -> Series:
+        def frames() -> tuple[list[Image], list[Image]]:
+            expected = truth.motion(scale)
+            if truth.truth.source == "reference" and image is truth.reference(scale):  # it moves as the truth does
+                return expected, expected
+            return self._renderers[name].motion(truth.camera(scale), image), expected
+
+        smaller = partial(self.task.truth.protocol.resized, camera=truth.camera(scale), scale=scale)
+        return Series(scale, image, full, smaller, frames if self.task.resizes else None)
 
     def __getstate__(self) -> dict[str, Any]:
-        """For another process, wherever it runs: without the scenes' files, which may be open."""
-        bare: dict[int, Gaussians] = {}  # what is shared stays so
+        """The work without the scenes' files, which may be open, and with absolute paths."""
+        scenes: dict[int, Gaussians] = {}  # renderers that share a scene go on to share it
 
         def portable(renderer: Renderer) -> Renderer:
-            return replace(renderer, scene=bare.setdefault(id(renderer.scene), replace(renderer.scene, origin=None)))
+            return replace(
+                renderer, scene=bare.setdefault(id(renderer.scene), replace(renderer.scene, origin=None)), source=None
+            )
 
         candidates = [Candidate(c.name, portable(c.renderer)) for c in self.task.candidates]
-        truth = replace(self.task.truth, own=portable(self.task.truth.own))
+        truth = replace(self.task.truth, renderer=portable(self.task.truth.renderer))
         views = [view if view.photo is None else replace(view, photo=view.photo.absolute()) for view in self.task.views]
         images = self.images and replace(self.images, folder=self.images.folder.absolute())
         return {"task": replace(self.task, candidates=candidates, truth=truth, views=views), "images": images}
-
-
-class _Bench:
-    """Measures one view after another."""
-
-    def __init__(self, task: Task, images: ImageStore | None):
-        self.task, self.images = task, images
-        self.timed = {c.name: TimedRenderer(c.renderer) for c in task.candidates}
-        self.sized = task.truth.protocol.change == "size"
-
-    def measure(self, index: int, view: Camera) -> Iterator[Measurement]:
-        """Measure every candidate at every scale."""
-        truth = ViewTruth(self.task.truth, view)
-        fulls: dict[str, Drawn] = {}
-        for scale in sorted(self.task.scales, key=lambda scale: scale != 1):  # figures need scale 1
-            comparison = _Comparison(self.task.measured, truth.compared(scale))
-            for name, drawn in self._drawn(truth, scale):
-                if scale == 1 and self.sized:
-                    fulls[name] = drawn
-                series = None if name == CEILING else self._series(truth, name, scale, drawn, fulls.get(name))
-                values, note = comparison.values(drawn, series)
-                if self.images is not None:
-                    self.images.keep(index, name, scale, drawn.rgb, comparison.truth)
-                cost = drawn.samples, drawn.seconds
-                yield Measurement(name, scale, view.name, values, *cost, note, drawn.evaluations)
-
-    def _drawn(self, truth: ViewTruth, scale: float) -> Iterator[tuple[str, Drawn]]:
-        """The rows' images at a scale; candidates that draw alike, as several do at the training size, draw once."""
-        camera = truth.camera(scale)
-        drawings: dict[Hashable, Drawn] = {}
-        if truth.truth.source == "reference":
-            drawings[_work(truth.truth.own, camera)] = truth.drawn(scale)
-        elif self.task.ceiling and self.sized:
-            yield CEILING, truth.look.resampled_to(truth.resized_look(scale))
-            if scale == 1:
-                drawings[_work(truth.truth.own, camera)] = truth.look
-        for name, timed in self.timed.items():
-            work = _work(timed.renderer, camera)
-            if work not in drawings:
-                drawings[work] = timed(camera)
-            yield name, drawings[work]
-
-    def _series(self, truth: ViewTruth, name: str, scale: float, drawn: Drawn, full: Drawn | None) -> Series:
-        camera, timed = truth.camera(scale), self.timed[name]
-        still = truth.truth.source == "reference" and drawn is truth.drawn(scale)  # it moves as the truth does
-
-        def frames() -> tuple[list[Image], list[Image]]:
-            expected = truth.motion(scale)
-            return (expected if still else timed.motion(camera, first=drawn)), expected
-
-        smaller = partial(self.task.truth.protocol.resized, camera=camera, scale=scale)
-        return Series(scale, drawn, full, smaller, frames if self.sized else None)
 
 
 def _work(renderer: Renderer, camera: Camera) -> Hashable:
@@ -271,37 +258,35 @@ def _work(renderer: Renderer, camera: Camera) -> Hashable:
     recipe = renderer.recipe
     method = recipe.selection, recipe.screen, recipe.pixel, recipe.compositor
     fine, samples = renderer.sampled(camera)
-    sampled = samples, renderer.neighbours(camera), renderer.coarsening(fine, samples)
+    sampled = samples, renderer.neighbours(camera, samples), renderer.coarsening(fine, samples)
     how = sampled, renderer.background, renderer.rasterizer.name
     return id(renderer.scene), id(renderer.training), method, how
 
 
 class _Comparison:
-    """Compares images with one truth; equal images are compared once."""
+    """Compares images with one truth, None where there is none; equal images are compared once."""
 
     def __init__(self, metrics: Sequence[Metric], truth: Image | None):
         self.metrics, self.truth = metrics, truth
-        self._known: list[tuple[Tensor, Values]] = []
+        self._results: list[tuple[Tensor, Values]] = []
 
-    def values(self, drawn: Drawn, series: Series | None) -> tuple[Values, str]:
-        """Every metric's value, and why values are undefined; the ceiling has no series, and so no figures."""
-        compared = self._compared(drawn.rgb)
+    def __call__(self, image: TimedImage, series: Series | None) -> tuple[Values, str]:
+        """Values by metric, and the reasons why some are undefined; the ceiling has no series, and so no figures."""
+        compared = self._compared(quantised(image.rgb))
         values = {m.name: compared[m.name] if m.measure else (series and m.of(series)) for m in self.metrics}
         if self.truth is None:
             return values, NO_PHOTOGRAPH
         undefined = [m.undefined for m in self.metrics if m.measure and values[m.name] is None]
         return values, "; ".join(dict.fromkeys(undefined))
 
-    def _compared(self, rgb: Image) -> Values:
+    def _compared(self, image: Image) -> Values:
         metrics = [metric for metric in self.metrics if metric.measure]
         if self.truth is None:
             return dict.fromkeys(metric.name for metric in metrics)
-        image = quantised(rgb)
-        for known, values in self._known:
-            if image.equal(known):
+        for earlier, values in self._results:
+            if image.equal(earlier):
                 return values
-        assert self.truth is not None
-        part = slice(CORNER if image.equal(self.truth) else None)  # of equal images, a corner says as much
+        part = slice(EQUAL_IMAGES_SIDE if image.equal(self.truth) else None)
         values = {m.name: m.compare(image[part, part], self.truth[part, part]) for m in metrics}
-        self._known.append((image, values))
+        self._results.append((image, values))
         return values

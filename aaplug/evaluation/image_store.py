@@ -1,4 +1,4 @@
-"""Where an evaluation stores images: test/<recipe>@<scale>/renders/00003.png, and the truth in gt/ beside it.
+"""Images of an evaluation on disk: test/<recipe>@<scale>/renders/00003.png, and the truth in gt/ beside it.
 
 This is the layout of 3DGS's own scripts in a model folder, so other metric scripts can read it.  The few images that a
 report shows have the same layout in images/.  The number is the view's place in the request.  An existing image is
@@ -14,26 +14,26 @@ from aaplug.io.atomic import make_folder
 from aaplug.io.images import write_png
 
 RENDERS, TRUTHS = "renders", "gt"
-SHOWN, EVERYTHING = "images", "test"  # folders
+REPORT_FOLDER, TEST_FOLDER = "images", "test"
 
 
 @dataclass(frozen=True)
 class ImageStore:
     """A store of rendered and true images.
 
-    shown: places of the views that go to images/, with the ceiling.
+    report_views: places of the views that go to images/, with the ceiling.
     everything: store all views that have a truth in test/, as 3DGS's scripts do.
     """
 
     folder: Path
-    shown: tuple[int, ...]
+    report_views: tuple[int, ...]
     everything: bool = False
 
     def keep(self, view: int, recipe: str, scale: float, image: Image, truth: Image | None) -> None:
         """Store one image and its truth, wherever they belong."""
-        folders = [SHOWN] if view in self.shown else []
+        folders = [REPORT_FOLDER] if view in self.report_views else []
         if self.everything and truth is not None and recipe != CEILING:
-            folders.append(EVERYTHING)
+            folders.append(TEST_FOLDER)
         for folder in folders:
             for kind, pixels in ((RENDERS, image), (TRUTHS, truth)):
                 if pixels is not None:
@@ -41,7 +41,7 @@ class ImageStore:
                     make_folder(path.parent)
                     write_png(path, pixels, overwrite=True)
 
-    def path(self, view: int, recipe: str, scale: float, kind: str = RENDERS, folder: str = SHOWN) -> Path:
-        """Path of a render, or by kind of its truth; of those shown unless the other folder is named."""
+    def path(self, view: int, recipe: str, scale: float, kind: str = RENDERS, folder: str = REPORT_FOLDER) -> Path:
+        """Path of a render, or by `kind` of its truth; in the report's folder unless the other one is named."""
         name = "ceiling" if recipe == CEILING else recipe
         return self.folder / folder / method(name, scale) / kind / f"{view:05d}.png"

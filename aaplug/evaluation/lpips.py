@@ -6,7 +6,6 @@ are the `lpips` package's (weights/v0.1/vgg.pth, alex.pth).  Neither is shipped 
 """
 
 import pickle
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -15,13 +14,13 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d, max_pool2d, relu
 
-from aaplug.core.errors import FormatError, UsageError
 from aaplug.evaluation.metric import Image, LpipsFiles, Metric
 from aaplug.evaluation.protocols import LpipsFlavour, Protocol
+from aaplug.system.errors import FormatError, UsageError
 
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)  # of ImageNet in [−1, 1] (LPIPS)
 EPSILON = 1e-10  # added to a feature's length before dividing by it (LPIPS)
-LEAST_SIDE = 32  # px: smaller images leave nothing after five stages
+MIN_SIDE = 32  # px: smaller images leave nothing after five stages
 
 
 @dataclass(frozen=True)
@@ -42,7 +41,7 @@ NETS = {
         for stage, convolution in enumerate(((0, 4, 2), (3, 1, 2), (6, 1, 1), (8, 1, 1), (10, 1, 1)))
     ),
 }
-WORDS: dict[LpipsFlavour, str] = {
+VARIANTS: dict[LpipsFlavour, str] = {
     "3dgs": "3dgs: version 0.1, VGG16 fed [0, 1] as 3DGS's scripts do",
     "vgg": "vgg: version 0.1, VGG16 fed [−1, 1]",
     "alex": "alex: version 0.1, AlexNet fed [−1, 1]",
@@ -57,46 +56,35 @@ def lpips_metric(flavour: LpipsFlavour, trunk: str | PathLike[str], heads: str |
     net = NETS["alex" if flavour == "alex" else "vgg"]
     weights = _trunk(Path(trunk), net)
     linear = _heads(Path(heads), [weights[stage.convolutions[-1][0]][0].shape[0] for stage in net])
-    distance = _distance(net, weights, linear, from_unit=flavour == "3dgs")
-    return replace(LPIPS, protocol=WORDS[flavour], measure=distance)
+    return replace(LPIPS, protocol=VARIANTS[flavour], measure=_Distance(net, weights, linear, flavour == "3dgs"))
 
 
-def _prepared(protocol: Protocol, files: LpipsFiles | None) -> Metric:
-    if files is None:
-        raise UsageError("LPIPS", "needs weights: --lpips TRUNK HEADS")
-    return lpips_metric(protocol.lpips, *files)
+@dataclass(frozen=True, eq=False)
+class _Distance:
+    """The distance of two images; from_unit: the net is fed [0, 1].  It can be sent to other processes."""
 
-
-def _without_weights(image: Image, truth: Image) -> None:
-    raise UsageError("LPIPS", "needs weights: see `lpips_metric`")
-
-
-SMALL = f"image smaller than the {LEAST_SIDE} px that LPIPS needs"
-LPIPS = Metric("LPIPS", "", 0.0, 4, "version 0.1", _without_weights, undefined=SMALL, prepare=_prepared)
-
-
-def _distance(
-    net: tuple[Stage, ...], weights: dict[int, tuple[Tensor, Tensor]], heads: list[Tensor], from_unit: bool
-) -> Callable[[Image, Image], float | None]:
-    def features(image: Image) -> list[Tensor]:
-        x = image.float() if from_unit else 2 * image.float() - 1
-        x = ((x - x.new_tensor(SHIFT)) / x.new_tensor(SCALE)).permute(2, 0, 1)[None]
-        found = []
-        for stage in net:
-            x = max_pool2d(x, *stage.pool) if stage.pool else x
-            for number, stride, padding in stage.convolutions:
-                x = relu(conv2d(x, *weights[number], stride=stride, padding=padding))
-            found.append(x / (x.square().sum(dim=1, keepdim=True).sqrt() + EPSILON))
-        return found
+    net: tuple[Stage, ...]
+    weights: dict[int, tuple[Tensor, Tensor]]
+    heads: list[Tensor]
+    from_unit: bool
 
     @torch.no_grad()
-    def measure(image: Image, truth: Image) -> float | None:
-        if min(image.shape[:2]) < LEAST_SIDE:
+    def __call__(self, image: Image, truth: Image) -> float | None:
+        if min(image.shape[:2]) < MIN_SIDE:
             return None
-        pairs = zip(features(image), features(truth), heads, strict=True)
+        pairs = zip(self._features(image), self._features(truth), self.heads, strict=True)
         return float(sum(conv2d((a - b).square(), head).mean() for a, b, head in pairs))
 
-    return measure
+    def _features(self, image: Image) -> list[Tensor]:
+        x = image.float() if self.from_unit else 2 * image.float() - 1
+        x = ((x - x.new_tensor(SHIFT)) / x.new_tensor(SCALE)).permute(2, 0, 1)[None]
+        maps = []
+        for stage in self.net:
+            x = max_pool2d(x, *stage.pool) if stage.pool else x
+            for number, stride, padding in stage.convolutions:
+                x = relu(conv2d(x, *self.weights[number], stride=stride, padding=padding))
+            maps.append(x / (x.square().sum(dim=1, keepdim=True).sqrt() + EPSILON))
+        return maps
 
 
 def _trunk(path: Path, net: tuple[Stage, ...]) -> dict[int, tuple[Tensor, Tensor]]:
@@ -130,3 +118,17 @@ def _state(path: Path) -> dict[str, Tensor]:
     if not isinstance(state, dict):
         raise FormatError(path, "should hold a state dict")
     return {key: value for key, value in state.items() if isinstance(value, Tensor)}
+
+
+def _with_weights(protocol: Protocol, files: LpipsFiles | None) -> Metric:
+    if files is None:
+        raise UsageError("LPIPS", "needs weights: --lpips TRUNK HEADS")
+    return lpips_metric(protocol.lpips, *files)
+
+
+def _without_weights(image: Image, truth: Image) -> None:
+    raise UsageError("LPIPS", "needs weights: see `lpips_metric`")
+
+
+TOO_SMALL = f"image smaller than the {MIN_SIDE} px that LPIPS needs"
+LPIPS = Metric("LPIPS", "", 0.0, 4, "version 0.1", _without_weights, undefined=TOO_SMALL, prepare=_with_weights)

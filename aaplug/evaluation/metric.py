@@ -14,24 +14,25 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.cameras import Camera
-from aaplug.core.choices import Colour
+from aaplug.core.colours import Colour
 from aaplug.core.interfaces import CountsEvaluations
 from aaplug.evaluation.protocols import Protocol
 from aaplug.rendering.renderer import Renderer
+from aaplug.system.errors import UsageError
 
 Image = Float[Tensor, "h w 3"]
 LpipsFiles = tuple[Path, Path]  # of the trunk and of the heads
 SHIFT_STEPS = 4  # frames of a motion; between two of them the image moves 1/4 px right and down
 
 
-@dataclass(frozen=True)
-class Drawn:
+@dataclass(frozen=True, eq=False)
+class TimedImage:
     """A timed render.
 
     samples: along a pixel's side.  seconds: wall clock.  evaluations: of a splat at a pixel; None if not counted.
     """
 
-    rgb: Float[Tensor, "h w 3"]
+    rgb: Image
     alpha: Float[Tensor, "h w"]
     background: Colour
     samples: int
@@ -39,11 +40,11 @@ class Drawn:
     evaluations: int | None
 
     @property
-    def light(self) -> Float[Tensor, "h w 3"]:
+    def light(self) -> Image:
         """The colours without the background."""
         return self.rgb - (1 - self.alpha[..., None]) * self.rgb.new_tensor(self.background)
 
-    def resampled_to(self, rgb: Float[Tensor, "h2 w2 3"]) -> "Drawn":
+    def resampled_to(self, rgb: Float[Tensor, "h2 w2 3"]) -> "TimedImage":
         """An opaque image made from this render, at the cost of this render."""
         return replace(self, rgb=rgb, alpha=rgb.new_ones(rgb.shape[:2]), samples=1)
 
@@ -58,7 +59,7 @@ class TimedRenderer:
             renderer = replace(renderer, rasterizer=renderer.rasterizer.counting(self._evaluations.append))
         self.renderer = renderer
 
-    def __call__(self, camera: Camera) -> Drawn:
+    def __call__(self, camera: Camera) -> TimedImage:
         """Render one view, without gradients."""
         if self._evaluations is not None:
             self._evaluations.clear()
@@ -68,23 +69,23 @@ class TimedRenderer:
         seconds = time.perf_counter() - started
         evaluations = None if self._evaluations is None else sum(self._evaluations)
         samples, background = self.renderer.samples(camera), self.renderer.background
-        return Drawn(rgb.float(), alpha.float(), background, samples, seconds, evaluations)
+        return TimedImage(rgb.float(), alpha.float(), background, samples, seconds, evaluations)
 
-    def motion(self, camera: Camera, scale: float = 1.0, first: Drawn | None = None) -> list[Float[Tensor, "h w 3"]]:
+    def motion(self, camera: Camera, first: TimedImage, scale: float = 1.0) -> list[Image]:
         """Frames, clamped to [0, 1], whose content moves by 1/4 px of the image that is `scale` times as large.
 
-        first: the render of `camera` itself, if there is one.
+        first: the render of `camera` itself.
         """
         steps = [step / scale / SHIFT_STEPS for step in range(1, SHIFT_STEPS)]
         views = (replace(camera, cx=camera.cx + step, cy=camera.cy + step) for step in steps)
-        return [drawn.rgb.clamp(0, 1) for drawn in (first or self(camera), *map(self, views))]
+        return [image.rgb.clamp(0, 1) for image in (first, *map(self, views))]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Series:
     """Images of one candidate in one view at one scale.
 
-    drawn: at that scale.
+    image: at that scale.
     full: by the same candidate at the training size; None if scale 1 is not measured or a scale moves the camera.
     smaller: averages a training-size image down to that scale.
     frames: draws the candidate's frames of a small motion, and those of the truth: of the scene's own look, averaged
@@ -92,10 +93,10 @@ class Series:
     """
 
     scale: float
-    drawn: Drawn
-    full: Drawn | None
-    smaller: Callable[[Float[Tensor, "H W 3"]], Float[Tensor, "h w 3"]]
-    frames: Callable[[], tuple[Sequence[Tensor], Sequence[Tensor]]] | None
+    image: TimedImage
+    full: TimedImage | None
+    smaller: Callable[[Float[Tensor, "H W 3"]], Image]
+    frames: Callable[[], tuple[Sequence[Image], Sequence[Image]]] | None
 
 
 @dataclass(frozen=True)
@@ -105,10 +106,10 @@ class Metric:
     unit: "" for none.
     ideal: value of a perfect image; infinite where higher is always better.
     digits: decimals in tables.
-    protocol: which of the field's variants it is, in words.
+    protocol: the field's variant that it is, in words.
     measure: the value for an image and the truth, both of 8 bits; None where it is undefined.
     figure: the value for images of one candidate, without a truth; None where it is undefined.
-    undefined: why a value can be None, in words; reports print it as a note.
+    undefined: the reason why a value can be None; reports print it as a note.
     prepare: makes the metric as a protocol asks for it, with LPIPS's files; None if neither concerns it.
     """
 
@@ -121,6 +122,10 @@ class Metric:
     figure: Callable[[Series], float | None] | None = None
     undefined: str = "undefined for this image"
     prepare: Callable[[Protocol, LpipsFiles | None], "Metric"] | None = None
+
+    def __post_init__(self) -> None:
+        if (self.measure is None) == (self.figure is None):
+            raise UsageError(f"metric {self.name}", "needs either `measure` or `figure`")
 
     def compare(self, image: Image, truth: Image) -> float | None:
         """The value of `measure`; None where that is undefined, NaN or infinite."""

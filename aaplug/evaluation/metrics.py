@@ -1,4 +1,4 @@
-"""Metrics by name: those that compare an image with a truth, and figures of one candidate, which need no truth.
+"""Metrics: those that compare an image with a truth, and figures of one candidate, which need no truth.
 
 Images are [h, w, 3] in [0, 1].  A value that is not defined (images too small) or infinite (equal images) is None.
 A package adds a metric by an entry point in the group "aaplug.metrics": a `Metric` with a `measure` of image and truth.
@@ -20,16 +20,15 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.choices import metric_option
-from aaplug.core.errors import UsageError, not_one_of
-from aaplug.core.registry import Registry, named
-from aaplug.evaluation.lpips import LPIPS
+from aaplug.evaluation import METRICS
 from aaplug.evaluation.metric import Image, LpipsFiles, Metric, Series
 from aaplug.evaluation.protocols import Protocol, SsimFlavour
+from aaplug.options.shared import metric_option
+from aaplug.system.errors import UsageError, not_one_of
 
 SSIM_WINDOW = 11  # px: the Gaussian of SSIM_SIGMA, cut at 3.5 sigma (Wang et al. 2004)
 SSIM_SIGMA = 1.5  # px
-FLIP_DEGREE = 67  # px per degree: FLIP's default, a 0.7 m wide 4K screen seen from 0.7 m
+FLIP_PX_PER_DEGREE = 67  # FLIP's default, a 0.7 m wide 4K screen seen from 0.7 m
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709, on the values as stored
 
 
@@ -66,42 +65,42 @@ def flip(image: Image, truth: Image) -> float | None:
     import flip_evaluator  # pyright: ignore[reportMissingImports]
 
     a, b = (np.ascontiguousarray(x.float().cpu().numpy()) for x in (truth, image))
-    _, value, _ = flip_evaluator.evaluate(a, b, "LDR", True, False, True, {"ppd": FLIP_DEGREE})
+    _, value, _ = flip_evaluator.evaluate(a, b, "LDR", True, False, True, {"ppd": FLIP_PX_PER_DEGREE})
     return float(value)
 
 
-def energy(rgb: Float[Tensor, "h w 3"]) -> float:
+def energy(rgb: Image) -> float:
     """Mean luminance (Rec. 709)."""
     means = cv2.mean(rgb.cpu().numpy())  # summed in float64
     return sum(weight * mean for weight, mean in zip(LUMINANCE, means, strict=False))
 
 
-def energy_drift(drawn: Float[Tensor, "h w 3"], expected: Float[Tensor, "H W 3"]) -> float | None:
+def energy_drift(image: Image, expected: Float[Tensor, "H W 3"]) -> float | None:
     """Relative excess of an image's light over the expected light; None where none is expected."""
-    before = energy(expected)
-    return None if before == 0 else energy(drawn) / before - 1
+    light = energy(expected)
+    return None if light == 0 else energy(image) / light - 1
 
 
-def flicker(frames: Sequence[Float[Tensor, "h w 3"]], motion: Sequence[Float[Tensor, "h w 3"]]) -> float | None:
+def flicker(frames: Sequence[Image], motion: Sequence[Image]) -> float | None:
     """RMS change from frame to frame, over that of `motion` alone; None where nothing moves.
 
     Above 1 the image shimmers, below 1 it is blurred.
     """
-    own, expected = (sum(float((b - a).double().square().mean()) for a, b in pairwise(x)) for x in (frames, motion))
-    return None if expected == 0 else math.sqrt(own / expected)
+    actual, expected = (sum(float((b - a).double().square().mean()) for a, b in pairwise(x)) for x in (frames, motion))
+    return None if expected == 0 else math.sqrt(actual / expected)
 
 
 def _consistency(series: Series) -> float | None:
     if series.full is None or series.scale >= 1:
         return None
-    return psnr(series.drawn.rgb.clamp(0, 1), series.smaller(series.full.rgb.clamp(0, 1)))
+    return psnr(series.image.rgb.clamp(0, 1), series.smaller(series.full.rgb.clamp(0, 1)))
 
 
 def _energy_drift(series: Series) -> float | None:
     if series.full is None:
         return None
-    rows, columns = (math.ceil(side / series.scale) for side in series.drawn.rgb.shape[:2])
-    return energy_drift(series.drawn.light, series.full.light[:rows, :columns])
+    rows, columns = (math.ceil(side / series.scale) for side in series.image.rgb.shape[:2])
+    return energy_drift(series.image.light, series.full.light[:rows, :columns])
 
 
 def _flicker(series: Series) -> float | None:
@@ -128,27 +127,34 @@ SSIM: dict[SsimFlavour, Metric] = {
     "wang": _ssim("wang", "border cropped"),
     "3dgs": _ssim("3dgs", "zero-padded, border kept"),
 }
-FLIP = Metric("FLIP", "", 0.0, 4, f"LDR-FLIP, mean, {FLIP_DEGREE} px a degree", flip)
-_OWN_DOWNSCALED = (
-    "PSNR of the image against the recipe's own training-size image, box-averaged; null at and above that size, where "
-    "the two are equal, and where scale 1 is not measured"
+SSIM_WANG = SSIM["wang"]
+FLIP = Metric("FLIP", "", 0.0, 4, f"LDR-FLIP, mean, {FLIP_PX_PER_DEGREE} px a degree", flip)
+CONSISTENCY = Metric(
+    "consistency",
+    unit="dB",
+    ideal=math.inf,
+    digits=2,
+    protocol="PSNR of the image against the recipe's own training-size image, box-averaged; null at and above that "
+    "size, where the two are equal, and where scale 1 is not measured",
+    figure=_consistency,
 )
-CONSISTENCY = Metric("consistency", "dB", math.inf, 2, _OWN_DOWNSCALED, figure=_consistency)
-_OWN_LIGHT = (
-    "luminance of what is drawn, without the background, over the recipe's own at the training size, minus 1; "
-    "null where scale 1 is not measured"
+ENERGY = Metric(
+    "energy drift",
+    unit="",
+    ideal=0.0,
+    digits=4,
+    protocol="luminance of what is drawn, without the background, over the recipe's own at the training size, minus 1; "
+    "null where scale 1 is not measured",
+    figure=_energy_drift,
 )
-ENERGY = Metric("energy drift", "", 0.0, 4, _OWN_LIGHT, figure=_energy_drift)
-_OWN_MOTION = (
-    "frame-to-frame change over three steps of 1/4 px, over that of the training-size image, averaged down: 1 is "
-    "motion alone; null at and above the training size"
-)
-FLICKER = Metric("flicker", "", 1.0, 3, _OWN_MOTION, figure=_flicker)
-
-METRICS: Registry[Metric] = Registry(
-    "metric",
-    named((PSNR, SSIM["wang"], LPIPS, FLIP, CONSISTENCY, ENERGY, FLICKER)),
-    check=lambda value: isinstance(value, Metric) and (value.measure is None) != (value.figure is None),
+FLICKER = Metric(
+    "flicker",
+    unit="",
+    ideal=1.0,
+    digits=3,
+    protocol="frame-to-frame change over three steps of 1/4 px, over that of the training-size image, averaged down: "
+    "1 is motion alone; null at and above the training size",
+    figure=_flicker,
 )
 
 
@@ -162,14 +168,14 @@ def find_metrics(names: Sequence[str], protocol: Protocol, lpips_weights: LpipsF
         UsageError: a name is not known or given twice, or a metric lacks what it needs.
         FormatError: a file of weights cannot be read.
     """
-    known = {metric_option(name): metric for name, metric in METRICS.items()}
+    options = {metric_option(name): metric for name, metric in METRICS.items()}
     wanted = [metric_option(name) for name in names]
-    if unknown := [name for name in wanted if name not in known]:
-        raise UsageError("metric", not_one_of(unknown[0], known))
+    if unknown := [name for name in wanted if name not in options]:
+        raise UsageError("metric", not_one_of(unknown[0], options))
     if len(set(wanted)) != len(wanted):
         raise UsageError("metric", "a metric is named twice")
-    found = [known[name] for name in wanted]
-    return [metric.prepare(protocol, lpips_weights) if metric.prepare else metric for metric in found]
+    metrics = [options[name] for name in wanted]
+    return [metric.prepare(protocol, lpips_weights) if metric.prepare else metric for metric in metrics]
 
 
 def default_metrics(protocol: Protocol) -> tuple[str, ...]:

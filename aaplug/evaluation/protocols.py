@@ -1,9 +1,9 @@
-"""Evaluation protocols by name: what a scale changes, the truth and how it is made smaller, which SSIM and LPIPS.
+"""Evaluation protocols: the change that a scale makes, the truth and its downscaling, the flavours of SSIM and LPIPS.
 
 A scale is a sampling rate relative to training.  A protocol changes one of these to reach it:
 "size": the image has that many times the pixels per side; pose and field of view stay.
-"distance": the camera moves along its axis until what lies at the view's median depth is 1/scale as far; focal length
-and image size stay.
+"distance": the camera moves along its axis until the view's median depth is 1/scale of what it was; focal length and
+image size stay.
 "fov": the focal length is multiplied by it; pose and size stay.
 """
 
@@ -15,11 +15,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.camera_paths import moved, zoomed
-from aaplug.core.cameras import WHITE, Camera
-from aaplug.core.errors import UsageError
+from aaplug.core.cameras import Camera
+from aaplug.core.colours import WHITE
 from aaplug.core.imaging import resampled, stretched
-from aaplug.core.registry import Registry
 from aaplug.core.rules import NEAR
+from aaplug.system.errors import UsageError
 
 SsimFlavour = Literal["wang", "3dgs"]
 LpipsFlavour = Literal["3dgs", "vgg", "alex"]
@@ -34,7 +34,7 @@ ZOOM_IN = (1.0, 2.0, 4.0, 8.0)
 class Protocol:
     """One way to evaluate.
 
-    source: where it comes from.
+    source: its publication, or its use.
     truth: None takes photographs where every view has one.
     downscale: a name of `DOWNSCALES`.
     whole_sizes: round side·scale to whole pixels and stretch the image by less than one pixel, instead of cropping it.
@@ -68,7 +68,7 @@ class Protocol:
 
     @property
     def facts(self) -> dict[str, Any]:
-        """What a report says about the protocol."""
+        """The protocol in a report."""
         cropped, rounded = "what does not fill a pixel is cropped", "rounded, pixels stretched by less than one"
         sizes = rounded if self.whole_sizes else cropped
         return {"name": self.name, "source": self.source, "scale changes": self.change, "sizes": sizes}
@@ -84,30 +84,53 @@ def median_depth(means: Float[Tensor, "n 3"], view: Camera) -> float:
     return float(torch.median(depth[inside]))
 
 
-_SOURCES = {
-    "default": "aaplug: photographs where every view has one, else self",
-    "blender": "NeRF-synthetic, single-train multi-test (Mip-Splatting, section 6.2): trained at full size, tested "
-    "down to 1/8, on white",
-    "360-zoom-out": "Mip-NeRF 360 trained at full size, rendered at 1, 1/2, 1/4 and 1/8 of it (3DGS's -r 1, 2, 4, 8)",
-    "360-zoom-in": "Mip-NeRF 360, single-train multi-test (Mip-Splatting, section 6.3): trained at -r 8, rendered at "
-    "-r 8, 4, 2 and 1",
-    "distance": "the camera moves away and nearer, the focal length stays (the argument of LOD-GS, arXiv 2507.00554); "
-    "against the scene's own supersampled look",
-    "fov": "the focal length changes, pose and image size stay; against the scene's own supersampled look",
-    "self": "no photographs: against the scene's own training-size look, averaged down, and `matched` above that size",
-}
-_SELF = Protocol("self", "", ZOOM_OUT, "self")
-_3DGS = Protocol("", "", ZOOM_OUT, "photographs", ssim="3dgs", lpips="3dgs")
-_360 = replace(_3DGS, name="360-zoom-out", downscale="pil-bicubic", whole_sizes=True)
-_OWN = (
-    Protocol("default", "", ZOOM_OUT),
-    replace(_3DGS, name="blender", downscale="rgba-box", background=WHITE),
-    _360,
-    replace(_360, name="360-zoom-in", scales=ZOOM_IN),
-    replace(_SELF, name="distance", change="distance"),
-    replace(_SELF, name="fov", change="fov"),
-    _SELF,
+DEFAULT = Protocol("default", "aaplug: photographs where every view has one, else self", ZOOM_OUT)
+BLENDER = Protocol(
+    "blender",
+    "NeRF-synthetic, single-train multi-test (Mip-Splatting, section 6.2): trained at full size, tested down to 1/8, "
+    "on white",
+    ZOOM_OUT,
+    "photographs",
+    downscale="rgba-box",
+    ssim="3dgs",
+    lpips="3dgs",
+    background=WHITE,
 )
-PROTOCOLS: Registry[Protocol] = Registry(
-    "protocol", {p.name: replace(p, source=_SOURCES[p.name]) for p in _OWN}, lambda value: isinstance(value, Protocol)
+ZOOM_OUT_360 = Protocol(
+    "360-zoom-out",
+    "Mip-NeRF 360 trained at full size, rendered at 1, 1/2, 1/4 and 1/8 of it (3DGS's -r 1, 2, 4, 8)",
+    ZOOM_OUT,
+    "photographs",
+    downscale="pil-bicubic",
+    whole_sizes=True,
+    ssim="3dgs",
+    lpips="3dgs",
+)
+ZOOM_IN_360 = replace(
+    ZOOM_OUT_360,
+    name="360-zoom-in",
+    source="Mip-NeRF 360, single-train multi-test (Mip-Splatting, section 6.3): trained at -r 8, rendered at "
+    "-r 8, 4, 2 and 1",
+    scales=ZOOM_IN,
+)
+DISTANCE = Protocol(
+    "distance",
+    "the camera moves away and nearer, the focal length stays (the argument of LOD-GS, arXiv 2507.00554); "
+    "against the scene's own supersampled look",
+    ZOOM_OUT,
+    "self",
+    change="distance",
+)
+FIELD_OF_VIEW = Protocol(
+    "fov",
+    "the focal length changes, pose and image size stay; against the scene's own supersampled look",
+    ZOOM_OUT,
+    "self",
+    change="fov",
+)
+SELF = Protocol(
+    "self",
+    "no photographs: against the scene's own training-size look, averaged down, and `matched` above that size",
+    ZOOM_OUT,
+    "self",
 )

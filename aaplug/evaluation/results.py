@@ -6,20 +6,20 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from statistics import quantiles, stdev
+from statistics import median, quantiles, stdev
 from typing import Any
 
 from rich.markup import escape
 from rich.table import Table
 
-from aaplug.core.registry import named
+from aaplug.evaluation import METRICS
 from aaplug.evaluation.metric import Metric, number
-from aaplug.evaluation.metrics import EQUAL, METRICS, PSNR, SSIM
+from aaplug.evaluation.metrics import EQUAL, PSNR, SSIM
+from aaplug.system.registry import named
 
 CEILING = "training size, resampled"  # a row of every table: the own training-size look
 TIME_DIGITS, COUNT_DIGITS = 3, 2  # decimals of seconds, and of million evaluations
 MILLION = 1e6
-
 
 Facts = tuple[str, list[str], list[list[str]]]  # a table of text: title, headings, rows
 
@@ -29,7 +29,7 @@ class Measurement:
     """One candidate at one scale on one view.
 
     recipe: the candidate's name.
-    values: by metric; None where undefined, and `note` says why.
+    values: by metric; None where undefined, for the reason in `note`.
     samples: along a pixel's side.
     evaluations: splat-pixel evaluations of compositing; None where not counted.
     """
@@ -58,13 +58,12 @@ class Report:
     @property
     def metrics(self) -> tuple[Metric, ...]:
         """The metrics measured, in order."""
-        names = dict.fromkeys(name for m in self.measurements for name in m.values)
-        given = named(self.measured)
-        return tuple(given.get(name) or METRICS[name] for name in names) or (PSNR, SSIM["wang"])
+        names, measured = dict.fromkeys(name for m in self.measurements for name in m.values), named(self.measured)
+        return tuple(measured.get(name) or METRICS[name] for name in names) or (PSNR, SSIM["wang"])
 
     @property
     def compared(self) -> tuple[Metric, ...]:
-        """Those that compare with the truth; reports show the first of them most."""
+        """The metrics that compare with the truth; reports show the first of them most."""
         return tuple(metric for metric in self.metrics if metric.measure is not None)
 
     @property
@@ -73,8 +72,8 @@ class Report:
         return tuple(dict.fromkeys(m.recipe for m in self.measurements))
 
     @property
-    def rows(self) -> str:
-        """What a row of its tables is."""
+    def row_title(self) -> str:
+        """The heading of its tables' rows: "recipe", or "compared scene"."""
         return self.protocol.get("rows", "recipe")
 
     @property
@@ -103,7 +102,7 @@ class Cell:
     """A figure of a table, as text.
 
     text: the mean over the views, or the median.
-    best: whether it is the best of its column; the ceiling never is.
+    best: true if it is the best of its column; the ceiling never is.
     spread: standard deviation or quartiles over the views; "" where there are fewer than two.
     worst: value and name of the worst view; None where all are equal.
     """
@@ -119,6 +118,39 @@ def mean(measurements: Iterable[Measurement], metric: str) -> float | None:
     return _mean(m.values.get(metric) for m in measurements)
 
 
+def million_evaluations(report: Report, recipe: str, scale: float) -> float | None:
+    """Mean splat-pixel evaluations of a view, in millions; None if not counted."""
+    return _mean(m.evaluations and m.evaluations / MILLION for m in report.select(recipe, scale))
+
+
+def _mean(values: Iterable[float | None]) -> float | None:
+    defined = [value for value in values if value is not None]
+    return sum(defined) / len(defined) if defined else None
+
+
+@dataclass(frozen=True)
+class Spread:
+    """A metric over the views where it is defined.
+
+    worst: (view, value).  deviation: of the sample; None of one view.
+    """
+
+    mean: float
+    median: float
+    worst: tuple[str, float]
+    deviation: float | None
+
+
+def spread_of(metric: Metric, measurements: Iterable[Measurement]) -> Spread | None:
+    """The spread over the views; None where the metric is nowhere defined."""
+    values = {m.view: value for m in measurements if (value := m.values.get(metric.name)) is not None}
+    if not values:
+        return None
+    worst = max(values, key=lambda view: metric.loss(values[view]))
+    deviation = stdev(values.values()) if len(values) > 1 else None
+    return Spread(sum(values.values()) / len(values), median(values.values()), (worst, values[worst]), deviation)
+
+
 def scale_name(scale: float) -> str:
     """A scale in words: 1/4, 1, 2×, 0.3."""
     if scale > 1:
@@ -128,37 +160,63 @@ def scale_name(scale: float) -> str:
     return str(fraction) if exact else f"{scale:g}"
 
 
+def method(recipe: str, scale: float) -> str:
+    """The name of a recipe at a scale, where INRIA's files name a method."""
+    return f"{recipe}@{scale:g}"
+
+
 def tables(report: Report) -> list[Table]:
     """A table per metric, then seconds and evaluations per view; recipes down, scales across, the best value bold."""
-    what = f"{report.protocol['truth']}, {report.protocol['views']} views"
+    subject = f"{report.protocol['truth']}, {report.protocol['views']} views"
     grids = []
     for metric in report.metrics:
-        variant = report.protocol.get("metrics", {}).get(metric.name, "").partition(":")
-        flavour = f" {variant[0]}" if variant[1] and " " not in variant[0] else ""
-        unit = f" [{metric.unit}]" if metric.unit else ""
-        lines = [[f"[bold]{cell.text}[/]" if cell.best else cell.text for cell in row] for row in rows(report, metric)]
-        grids.append(grid(f"{metric.name}{flavour}{unit}, {what}", report, lines, "italic"))
-    return grids + [
-        grid(title, report, [[cell.text for cell in row] for row in cells]) for title, cells in work(report)
-    ]
+        variant, colon, _ = report.protocol.get("metrics", {}).get(metric.name, "").partition(":")
+        flavour = f" {variant}" if colon and " " not in variant else ""
+        title = f"{metric.name}{flavour}{metric.title.removeprefix(metric.name)}, {subject}"
+        rows = metric_cells(report, metric)
+        lines = [[f"[bold]{cell.text}[/]" if cell.best else cell.text for cell in row] for row in rows]
+        grids.append(grid(title, report, lines, "italic"))
+    for title, rows in cost_cells(report):
+        grids.append(grid(title, report, [[cell.text for cell in row] for row in rows]))
+    return grids
 
 
-def rows(report: Report, metric: Metric) -> list[list[Cell]]:
-    """A metric's table of means, recipes down and scales across."""
-    means = {r: [_shown(metric, report.select(r, s)) for s in report.scales] for r in report.recipes}
-    judged = [line for recipe, line in means.items() if recipe != CEILING]
-    columns = ([v for line in judged if (v := line[place]) is not None] for place in range(len(report.scales)))
-    best = [min(column, key=metric.loss, default=None) for column in columns]
-    return [
-        [
-            _metric_cell(metric, report.select(recipe, scale), v, v is not None and v == top and recipe != CEILING)
-            for scale, v, top in zip(report.scales, line, best, strict=True)
-        ]
-        for recipe, line in means.items()
-    ]
+def grid(title: str, report: Report, lines: list[list[str]], ceiling: str | None = None) -> Table:
+    """A table of one line per recipe; ceiling: style of that row."""
+    grid = Table(title=escape(title), title_justify="left")
+    grid.add_column(report.row_title, no_wrap=True)
+    for scale in report.scales:
+        grid.add_column(scale_name(scale), justify="right", no_wrap=True)
+    for recipe, cells in zip(report.recipes, lines, strict=True):
+        grid.add_row(escape(recipe), *cells, style=ceiling if recipe == CEILING else None)
+    return grid
 
 
-def work(report: Report) -> list[tuple[str, list[list[Cell]]]]:
+def metric_cells(report: Report, metric: Metric) -> list[list[Cell]]:
+    """A metric's table of means, recipes down and scales across; infinity where every image equals its truth."""
+    columns = []
+    for scale in report.scales:
+        views, means = {recipe: report.select(recipe, scale) for recipe in report.recipes}, dict[str, float | None]()
+        for recipe, measurements in views.items():
+            equal = metric.undefined == EQUAL and measurements and all(EQUAL in m.note for m in measurements)
+            average = mean(measurements, metric.name)
+            means[recipe] = math.inf if average is None and equal else average
+        contenders = [value for recipe, value in means.items() if recipe != CEILING and value is not None]
+        best = min(contenders, key=metric.loss, default=math.nan)
+        columns.append([_cell(metric, views[r], value, r != CEILING and value == best) for r, value in means.items()])
+    return [list(row) for row in zip(*columns, strict=True)]
+
+
+def _cell(metric: Metric, views: Sequence[Measurement], average: float | None, best: bool) -> Cell:
+    spread = spread_of(metric, views)
+    if spread is None or spread.deviation is None:
+        return Cell(metric.text(average), best)
+    view, value = spread.worst
+    worst = (metric.text(value), view) if spread.deviation else None
+    return Cell(metric.text(average), best, f"± {metric.text(spread.deviation)}", worst)
+
+
+def cost_cells(report: Report) -> list[tuple[str, list[list[Cell]]]]:
     """Tables of a view's cost, recipes down and scales across, as (title, rows)."""
     columns = [("seconds per view, median", _time_cell)]
     if any(m.evaluations is not None for m in report.measurements):
@@ -168,21 +226,7 @@ def work(report: Report) -> list[tuple[str, list[list[Cell]]]]:
     ]
 
 
-def _shown(metric: Metric, views: Sequence[Measurement]) -> float | None:
-    """The mean, or infinity where every image equals its truth."""
-    found = mean(views, metric.name)
-    equal = bool(views) and metric.undefined == EQUAL and all(EQUAL in m.note for m in views)
-    return math.inf if found is None and equal else found
-
-
-def _metric_cell(metric: Metric, views: Iterable[Measurement], average: float | None, best: bool) -> Cell:
-    known = {m.view: value for m in views if (value := m.values.get(metric.name)) is not None}
-    worst = max(known, key=lambda view: metric.loss(known[view]), default="")
-    named = (metric.text(known[worst]), worst) if len(set(known.values())) > 1 else None
-    return Cell(metric.text(average), best, _deviation(known.values(), metric.digits), named)
-
-
-def _time_cell(views: Iterable[Measurement]) -> Cell:
+def _time_cell(views: Sequence[Measurement]) -> Cell:
     times = [m.seconds for m in views]
     if len(times) < 2:
         return Cell(number(_mean(times), TIME_DIGITS))
@@ -190,15 +234,10 @@ def _time_cell(views: Iterable[Measurement]) -> Cell:
     return Cell(middle, spread=f"{low} to {high}")
 
 
-def _evaluations_cell(views: Iterable[Measurement]) -> Cell:
-    known = [m.evaluations / MILLION for m in views if m.evaluations is not None]
-    return Cell(number(_mean(known), COUNT_DIGITS), spread=_deviation(known, COUNT_DIGITS))
-
-
-def _deviation(values: Iterable[float], digits: int) -> str:
-    """Sample standard deviation as text; "" of fewer than two values."""
-    known = list(values)
-    return f"± {number(stdev(known), digits)}" if len(known) > 1 else ""
+def _evaluations_cell(views: Sequence[Measurement]) -> Cell:
+    millions = [m.evaluations / MILLION for m in views if m.evaluations is not None]
+    spread = f"± {number(stdev(millions), COUNT_DIGITS)}" if len(millions) > 1 else ""
+    return Cell(number(_mean(millions), COUNT_DIGITS), spread=spread)
 
 
 def results(report: Report) -> dict[str, Any]:
@@ -209,16 +248,15 @@ def results(report: Report) -> dict[str, Any]:
 def per_view(report: Report) -> dict[str, Any]:
     """INRIA's per_view.json, {method: {metric: {view: value}}}, and samples per pixel side, seconds, evaluations."""
 
-    def content(views: tuple[Measurement, ...]) -> dict[str, Any]:
+    def content(views: Sequence[Measurement]) -> dict[str, Any]:
         values = {m.name: {v.view: v.values.get(m.name) for v in views} for m in report.metrics}
-        samples, evaluations = ({v.view: getattr(v, name) for v in views} for name in ("samples", "evaluations"))
-        times = {v.view: round(v.seconds, 4) for v in views}
-        return values | {"samples": samples, "seconds": times, "evaluations": evaluations}
+        samples, times = {v.view: v.samples for v in views}, {v.view: round(v.seconds, 4) for v in views}
+        return {**values, "samples": samples, "seconds": times, "evaluations": {v.view: v.evaluations for v in views}}
 
     return _by_method(report, content)
 
 
-def _by_method(report: Report, content: Callable[[tuple[Measurement, ...]], dict[str, Any]]) -> dict[str, Any]:
+def _by_method(report: Report, content: Callable[[Sequence[Measurement]], dict[str, Any]]) -> dict[str, Any]:
     methods = {method(r, s): content(report.select(r, s)) for r in report.recipes for s in report.scales}
     return methods | {"_aaplug": dict(report.protocol) | {"notes": report.notes}}
 
@@ -229,8 +267,8 @@ def as_csv(reports: Mapping[str, Report]) -> str:
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     fixed = ("samples", "evaluations", "seconds", "note")
-    rows = next((report.rows for report in reports.values()), "recipe")
-    table.writerow(["scene", "protocol", rows, "scale", "view", *metrics, *fixed])
+    row_title = next((report.row_title for report in reports.values()), "recipe")
+    table.writerow(["scene", "protocol", row_title, "scale", "view", *metrics, *fixed])
     for scene, report in reports.items():
         name = report.protocol.get("protocol", {}).get("name", "")
         for m in report.measurements:
@@ -238,29 +276,3 @@ def as_csv(reports: Mapping[str, Report]) -> str:
             extra = (m.samples, m.evaluations, round(m.seconds, 4), m.note)
             table.writerow([scene, name, m.recipe, f"{m.scale:g}", m.view, *values, *extra])
     return text.getvalue()
-
-
-def method(recipe: str, scale: float) -> str:
-    """The name of a recipe at a scale, where INRIA's files name a method."""
-    return f"{recipe}@{scale:g}"
-
-
-def million_evaluations(report: Report, recipe: str, scale: float) -> float | None:
-    """Mean splat-pixel evaluations of a view, in millions; None if not counted."""
-    return _mean(m.evaluations and m.evaluations / MILLION for m in report.select(recipe, scale))
-
-
-def _mean(values: Iterable[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return sum(known) / len(known) if known else None
-
-
-def grid(title: str, report: Report, lines: list[list[str]], ceiling: str | None = None) -> Table:
-    """A table of one line per recipe; ceiling: style of that row."""
-    grid = Table(title=escape(title), title_justify="left")
-    grid.add_column(report.rows, no_wrap=True)
-    for scale in report.scales:
-        grid.add_column(scale_name(scale), justify="right", no_wrap=True)
-    for recipe, cells in zip(report.recipes, lines, strict=True):
-        grid.add_row(escape(recipe), *cells, style=ceiling if recipe == CEILING else None)
-    return grid

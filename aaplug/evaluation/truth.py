@@ -18,34 +18,24 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.cameras import Camera
-from aaplug.core.choices import Background
-from aaplug.core.errors import UsageError, not_one_of
-from aaplug.core.gaussians import Gaussians
 from aaplug.core.imaging import quantised, resampled
-from aaplug.core.interfaces import Rasterizer
-from aaplug.core.training import TrainingViews
-from aaplug.evaluation.metric import Drawn, Image, TimedRenderer
-from aaplug.evaluation.protocols import PROTOCOLS, Protocol, TruthSource, median_depth
+from aaplug.evaluation import PROTOCOLS
+from aaplug.evaluation.metric import Image, TimedImage, TimedRenderer
+from aaplug.evaluation.protocols import Protocol, TruthSource, median_depth
 from aaplug.evaluation.upsamplers import Upsampler, bicubic
 from aaplug.io.photographs import DOWNSCALES, Photograph
 from aaplug.methods.recipe import Recipe
 from aaplug.methods.recipes import find_recipe
 from aaplug.rendering.renderer import Renderer
+from aaplug.system.errors import UsageError, not_one_of
 
 NO_PHOTOGRAPH = "has no photograph to compare with; truth 'self' compares with the scene's own render"
-MEMORY = 1e9  # bytes of images to keep; what does not fit is made again each time
-KEPT = torch.float16  # 11 significant bits, against the 8 that are compared
-SLAB = 1 << 25  # numbers of the cache allocated at once: 64 MB
+MEMORY = 1e9  # bytes of images to cache; what does not fit is made again each time
+CACHE_DTYPE = torch.float16  # 11 significant bits, against the 8 that are compared
+SLAB_SIZE = 1 << 25  # numbers of the cache allocated at once: 64 MB
 
 Larger = Float[Tensor, "H W 3"]
 Enlarge = Callable[[Renderer, Image, Camera], Larger]  # (the scene's own renderer, source image, target camera)
-
-
-def own_look(
-    scene: Gaussians, training: TrainingViews, rasterizer: str | Rasterizer = "auto", background: Background = "auto"
-) -> Renderer:
-    """A renderer of the scene by training's own rule, at any size (recipe `matched`)."""
-    return Renderer.of(scene, training, find_recipe("matched"), rasterizer=rasterizer, background=background)
 
 
 def back_projected(own: Renderer, full: Image, camera: Camera) -> Larger:
@@ -70,32 +60,48 @@ def source_of(views: Sequence[Camera], asked: str = "auto") -> TruthSource:
     Raises UsageError if there is no source of that name, or a view has no photograph.
     """
     missing = [view.name for view in views if view.photo is None]
-    if asked == "self" or (asked == "auto" and missing):
+    if name == "self" or (name == "auto" and missing):
         return "self"
-    if asked not in ("auto", "photographs"):
-        raise UsageError("truth", not_one_of(asked, ("auto", "photographs", "self")))
+    if name not in ("auto", "photographs"):
+        raise UsageError("truth", not_one_of(name, ("auto", "photographs", "self")))
     if missing:
         raise UsageError(missing[0], NO_PHOTOGRAPH)
     return "photographs"
 
 
-@dataclass(frozen=True)
+def upsampled(upsampler: Upsampler) -> Enlarge:
+    """Estimate ground truth by enlarging the source image with an upsampler."""
+    return lambda renderer, full, camera: upsampler(full, camera.hw)
+
+
+def back_projected(renderer: Renderer, full: Image, camera: Camera) -> Larger:
+    """The scene's own render after one step of iterative back-projection towards the source image.
+
+    (Irani and Peleg 1991.)  The bicubically enlarged residual is added, so box averages match only approximately.
+    """
+    with torch.no_grad():
+        image = renderer(camera).rgb.clamp(0.0, 1.0)
+    averages = resampled(image, full.shape[1] / camera.width, (full.shape[0], full.shape[1]))
+    return image + bicubic(full - averages, camera.hw)
+
+
+@dataclass(frozen=True, eq=False)
 class Truth:
     """The images to compare with.
 
-    own: renders the scene by training's rule (see `own_look`), or the reference by its recipe.
+    renderer: renders the scene by training's rule (see `own_look`), or the reference by its recipe.
     enlarge: estimates ground truth above the source's size.  None: the scene's own render at that size; with
         photographs, undefined.
     memory: bytes of float16 images to cache between calls; None caches none.
     """
 
-    own: Renderer
+    renderer: Renderer
     source: TruthSource = "self"
     protocol: Protocol = PROTOCOLS["default"]
     enlarge: Enlarge | None = None
     memory: float | None = None
-    _kept: dict[tuple[object, ...], Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
-    _room: list[Tensor] = field(default_factory=list, init=False, repr=False, compare=False)
+    _cache: dict[tuple[object, ...], Tensor] = field(default_factory=dict, init=False, repr=False)
+    _slab: list[Tensor] = field(default_factory=list, init=False, repr=False)  # the unused end of the last one
 
     def __call__(self, view: Camera, scale: float) -> Image:
         """Ground truth of `view` (given at the training size) at `scale`; it must be defined there."""
@@ -105,8 +111,8 @@ class Truth:
 
     @cached_property
     def timed(self) -> TimedRenderer:
-        """A TimedRenderer of `own`; made once."""
-        return TimedRenderer(self.own)
+        """The renderer with a clock; one for all views."""
+        return TimedRenderer(self.renderer)
 
     def cached(self, view: Camera, scale: float, make: Callable[[], Image | None]) -> Image | None:
         """The cached image, or a new one, cached while there is room."""
@@ -114,22 +120,22 @@ class Truth:
             return make()
         pose = view.cam_from_world.detach().cpu().numpy().tobytes()  # names recur in other splits
         key = *view.intrinsics, pose, scale
-        if key in self._kept:
-            return self._kept[key].float()
-        made = make()
-        if made is None:
+        if key in self._cache:
+            return self._cache[key].float()
+        new = make()
+        if new is None:
             return None
-        image = made.to(KEPT)
-        if sum(kept.nbytes for kept in self._kept.values()) + image.nbytes <= self.memory:
-            self._kept[key] = self._stored(image)
+        image = new.to(CACHE_DTYPE)
+        if sum(cached.nbytes for cached in self._cache.values()) + image.nbytes <= self.memory:
+            self._cache[key] = self._in_slab(image)
         return image.float()
 
-    def _stored(self, image: Image) -> Image:
+    def _in_slab(self, image: Image) -> Image:
         """A copy in a slab: small blocks that stay, between large ones that go, would keep those from the system."""
         size = image.numel()
-        if not self._room or len(self._room[0]) < size:
-            self._room[:] = [torch.empty(max(size, SLAB), dtype=KEPT)]
-        place, self._room[0] = self._room[0].split([size, len(self._room[0]) - size])
+        if not self._slab or len(self._slab[0]) < size:
+            self._slab[:] = [torch.empty(max(size, SLAB_SIZE), dtype=CACHE_DTYPE)]
+        place, self._slab[0] = self._slab[0].split([size, len(self._slab[0]) - size])
         return place.view(image.shape).copy_(image)
 
 
@@ -138,83 +144,80 @@ class ViewTruth:
 
     def __init__(self, truth: Truth, view: Camera):
         self.truth, self.view = truth, view
-        self._motions: dict[float, list[Tensor]] = {}
-        self._drawn: dict[float, Drawn] = {}
+        self._references: dict[float, TimedImage] = {}
+        self._motions: dict[float, list[Image]] = {}
 
     def camera(self, scale: float) -> Camera:
         """The view at a scale."""
         return self.truth.protocol.camera(self.view, scale, self._depth)
 
-    @cached_property
-    def look(self) -> Drawn:
-        """The scene's own render at the training size."""
-        return self.truth.timed(self.view)
-
-    def drawn(self, scale: float) -> Drawn:
-        """The reference at a scale."""
-        if scale not in self._drawn:
-            self._drawn[scale] = self.truth.timed(self.camera(scale))
-        return self._drawn[scale]
-
-    def resized_look(self, scale: float) -> Image:
-        """The training-size render resampled to this scale: downsampled below 1, bicubic above."""
-        return self.truth.protocol.resized(self.look.rgb.clamp(0, 1), self.camera(scale), scale)
-
     def compared(self, scale: float) -> Image | None:
-        """What renders are compared with, None if undefined; the scene's own renders are rounded to 8 bits."""
+        """The image that renders are compared with, None if undefined; the scene's own are rounded to 8 bits."""
         image = self.image(scale)
         rounds = self.truth.source != "photographs" or self.truth.memory is not None
         return quantised(image) if image is not None and rounds else image
 
     def image(self, scale: float) -> Image | None:
         """The truth at a scale, before rounding; None where there is none."""
-        return self.truth.cached(self.view, scale, lambda: self._made(scale))
+        return self.truth.cached(self.view, scale, lambda: self._image(scale))
 
-    def motion(self, scale: float) -> list[Image]:
-        """Frames that move by 1/4 px of this scale: of the reference, or of training-size renders, then resampled."""
-        if scale not in self._motions:
-            self._motions[scale] = self._moving(scale)
-        return self._motions[scale]
-
-    def _moving(self, scale: float) -> list[Image]:
-        camera, timed = self.camera(scale), self.truth.timed
-        if self.truth.source == "reference":
-            return timed.motion(camera, first=self.drawn(scale))
-        frames = timed.motion(self.view, scale, self.look)
-        return [self.truth.protocol.resized(frame, camera, scale) for frame in frames]
-
-    def _made(self, scale: float) -> Image | None:
+    def _image(self, scale: float) -> Image | None:
         truth, camera = self.truth, self.camera(scale)
         if truth.source == "reference":
-            return self.drawn(scale).rgb
+            return self.reference(scale).rgb
         if truth.protocol.change != "size":
             samples = max(1, math.ceil(1 / scale))  # as dense as training's pixels
-            return self._shown(camera, replace(truth.own.recipe, grid=samples))
+            return self._render(camera, replace(truth.renderer.recipe, grid=samples))
         if truth.source == "photographs":
             factor = scale * self.view.width / self._photograph.hw[1]
             if factor <= 1:
                 return self._photograph.at(camera.hw, factor)
-        elif truth.own.training.relative_rate(camera) <= 1:
+        elif truth.renderer.training.relative_rate(camera) <= 1:
             return self.resized_look(scale)
         if truth.enlarge is not None:
-            photographed = truth.source == "photographs"
-            full = self._photograph.at(self._photograph.hw, 1.0) if photographed else self.look.rgb.clamp(0.0, 1.0)
-            return truth.enlarge(truth.own, full, camera).clamp(0.0, 1.0)
-        return None if truth.source == "photographs" else self._shown(camera, find_recipe("auto", quality="best"))
+            photographs = truth.source == "photographs"
+            full = self._photograph.at(self._photograph.hw, 1.0) if photographs else self.look.rgb.clamp(0.0, 1.0)
+            return truth.enlarge(truth.renderer, full, camera).clamp(0.0, 1.0)
+        return None if truth.source == "photographs" else self._render(camera, find_recipe("auto", quality="best"))
+
+    @cached_property
+    def look(self) -> TimedImage:
+        """The scene's own render at the training size."""
+        return self.truth.timed(self.view)
+
+    def resized_look(self, scale: float) -> Image:
+        """The training-size render resampled to this scale: downsampled below 1, bicubic above."""
+        return self.truth.protocol.resized(self.look.rgb.clamp(0, 1), self.camera(scale), scale)
+
+    def reference(self, scale: float) -> TimedImage:
+        """The reference at a scale."""
+        if scale not in self._references:
+            self._references[scale] = self.truth.timed(self.camera(scale))
+        return self._references[scale]
+
+    def motion(self, scale: float) -> list[Image]:
+        """Frames that move by 1/4 px of this scale: of the reference, or of training-size renders, then resampled."""
+        if scale not in self._motions:
+            camera, timed, resized = self.camera(scale), self.truth.timed, self.truth.protocol.resized
+            if self.truth.source == "reference":
+                self._motions[scale] = timed.motion(camera, self.reference(scale))
+            else:
+                frames = timed.motion(self.view, self.look, scale)
+                self._motions[scale] = [resized(frame, camera, scale) for frame in frames]
+        return self._motions[scale]
 
     @cached_property
     def _photograph(self) -> Photograph:
         assert self.view.photo is not None
         downscale = DOWNSCALES[self.truth.protocol.downscale]
-        return downscale.read(self.view.photo, self.truth.own.background, self.view.lens)
+        return downscale.read(self.view.photo, self.truth.renderer.background, self.view.lens)
 
     @cached_property
     def _depth(self) -> float:
         """Median depth of the scene in the view, in world units; needed only where the distance changes."""
         if self.truth.protocol.change != "distance":
             return 1.0
-        return median_depth(self.truth.own.scene.means, self.view)
+        return median_depth(self.truth.renderer.scene.means, self.view)
 
-    def _shown(self, camera: Camera, recipe: Recipe) -> Image:
-        """The scene by a recipe."""
-        return TimedRenderer(replace(self.truth.own, recipe=recipe))(camera).rgb
+    def _render(self, camera: Camera, recipe: Recipe) -> Image:
+        return TimedRenderer(replace(self.truth.renderer, recipe=recipe))(camera).rgb

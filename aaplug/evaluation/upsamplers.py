@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.errors import FormatError, UsageError
+from aaplug.system.errors import FormatError, UsageError
 
 Upsampler = Callable[[Float[Tensor, "h w 3"], tuple[int, int]], Float[Tensor, "H W 3"]]
 OPENCV_NAME = re.compile(r"(edsr|espcn|fsrcnn|lapsrn).*_x(\d)\.pb", re.IGNORECASE)
@@ -22,10 +22,7 @@ BYTE = 255.0
 
 
 def _resized(kernel: int) -> Upsampler:
-    def upsample(image: Tensor, hw: tuple[int, int]) -> Tensor:
-        return torch.from_numpy(cv2.resize(image.numpy(), hw[::-1], interpolation=kernel))
-
-    return upsample
+    return lambda image, hw: torch.from_numpy(cv2.resize(image.numpy(), hw[::-1], interpolation=kernel))
 
 
 bicubic, lanczos = _resized(cv2.INTER_CUBIC), _resized(cv2.INTER_LANCZOS4)
@@ -47,7 +44,14 @@ def find_upsampler(name: str) -> Upsampler:
     if not path.is_file():
         raise FormatError(path, "does not exist")
     network = _opencv(path) if path.suffix == ".pb" else _torch(path)
-    return lambda image, hw: _at_size(network(image), hw)
+
+    def upsample(image: Tensor, hw: tuple[int, int]) -> Tensor:
+        larger = network(image)
+        if tuple(larger.shape[:2]) == hw:
+            return larger
+        return _resized(cv2.INTER_AREA if larger.shape[0] > hw[0] else cv2.INTER_CUBIC)(larger, hw)
+
+    return upsample
 
 
 def _opencv(path: Path) -> Callable[[Tensor], Tensor]:
@@ -87,10 +91,3 @@ def _torch(path: Path) -> Callable[[Tensor], Tensor]:
                 raise FormatError(path, f"does not take an image of {image.shape[1]}x{image.shape[0]} px") from error
 
     return enlarge
-
-
-def _at_size(image: Tensor, hw: tuple[int, int]) -> Tensor:
-    if tuple(image.shape[:2]) == hw:
-        return image
-    kernel = cv2.INTER_AREA if image.shape[0] > hw[0] else cv2.INTER_CUBIC
-    return _resized(kernel)(image, hw)

@@ -1,1 +1,12 @@
 """Fine-tuning at test time: move the Gaussians until every scale looks like the training size."""
+
+from typing import TYPE_CHECKING
+
+from aaplug.system.registry import Registry
+
+if TYPE_CHECKING:
+    from aaplug.finetuning.settings import Method
+
+METHODS: Registry["Method"] = Registry(
+    "method", "aaplug.finetuning.settings:Method", {"consistency": "aaplug.finetuning.settings:CONSISTENCY"}
+)

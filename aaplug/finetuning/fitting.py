@@ -5,26 +5,27 @@ from dataclasses import dataclass, replace
 
 from aaplug.core.cameras import Camera, spread
 from aaplug.core.gaussians import Fusion, Gaussians
-from aaplug.core.monitor import SILENT, Monitor
 from aaplug.evaluation.engine import Candidate, compare
 from aaplug.evaluation.metrics import PSNR
 from aaplug.evaluation.results import Report, mean
 from aaplug.evaluation.truth import MEMORY, Truth, back_projected
 from aaplug.finetuning.parameters import between
-from aaplug.finetuning.session import recorded, tune
-from aaplug.finetuning.settings import QUICK, balanced
+from aaplug.finetuning.session import tune, tuned_scene
+from aaplug.finetuning.settings import QUICK_SETTINGS, balance
 from aaplug.finetuning.state import TuningJob
-from aaplug.methods.recipes import RECIPES
-from aaplug.methods.viewers import Viewer, fuse_for
+from aaplug.methods import RECIPES
+from aaplug.methods.conversion import fuse_for
+from aaplug.methods.viewers import Viewer
 from aaplug.rendering.renderer import Renderer
+from aaplug.system.monitor import SILENT, Monitor
 
-SHARES = (0.5, 0.25, 0.125)  # of the way to the tuned scene, tried while a scale is worse than the original
-ROUNDING = (1 / 255) ** 2 / 12  # mean square error of rounding to 8 bits
-MEASURED = 8  # views, evenly spaced, that scenes are compared on
+PARTS_OF_CHANGE = (0.5, 0.25, 0.125)  # towards the tuned scene, tried while a scale is worse than the original
+ROUNDING_ERROR = (1 / 255) ** 2 / 12  # mean square error of rounding to 8 bits
+MAX_VIEWS = 8  # evenly spaced, that scenes are compared on
 ORIGINAL, CLOSED_FORM, CONVERTED = "original", "closed form", "converted"  # rows of the report
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Fitted:
     """A scene for a viewer.  report: original, closed form and result as the viewer shows them."""
 
@@ -34,7 +35,7 @@ class Fitted:
 
 def steps_for(scene: Gaussians, viewer: Viewer) -> int:
     """The usual number of steps: none for a viewer that draws as training did."""
-    return 0 if scene.convention == viewer.convention_of(scene) else QUICK.steps
+    return 0 if scene.convention == viewer.convention_of(scene) else QUICK_SETTINGS.steps
 
 
 def fit(
@@ -49,44 +50,39 @@ def fit(
     truth = Truth(look, enlarge=back_projected, memory=MEMORY)
     original = replace(look, scene=viewer.shown(look.scene), recipe=RECIPES[viewer.recipe])
 
-    def measured(*candidates: Candidate) -> Report:
+    def measure(*candidates: Candidate) -> Report:
         with monitor.progress("measuring", "views") as tell:
-            return compare(candidates, spread(views, MEASURED), (1.0, *QUICK.weights), truth, tell)
+            return compare(candidates, spread(views, MAX_VIEWS), (1.0, *QUICK_SETTINGS.weights), truth, tell)
 
-    def with_result(found: Gaussians) -> Report:
-        return before.with_more(measured(Candidate(CONVERTED, replace(original, scene=found))))
+    def report_of(result: Gaussians) -> Report:
+        return before.with_more(measure(Candidate(CONVERTED, replace(original, scene=result))))
 
     start = replace(original, scene=fuse_for(scene, original.training, viewer))
-    before = measured(Candidate(ORIGINAL, original), Candidate(CLOSED_FORM, start))
+    before = measure(Candidate(ORIGINAL, original), Candidate(CLOSED_FORM, start))
     if steps and _is_worse(before, CLOSED_FORM):
         monitor.say("the closed form is worse than the original at some scale: starting from the original")
         start = original
-    settings = balanced(replace(QUICK, steps=steps), _errors(before))
-    job = TuningJob(start, original.training.cameras, truth, settings)
+    psnr = {s: mean(before.select(ORIGINAL, s), PSNR.name) for s in before.scales}
+    errors = {s: max(ROUNDING_ERROR, 0.0 if dB is None else 10 ** (-dB / 10)) for s, dB in psnr.items()}
+    job = TuningJob(start, original.training.cameras, truth, balance(replace(QUICK_SETTINGS, steps=steps), errors))
     state = tune(job, monitor=monitor)
-    tuned = found = recorded(state, job, viewer.convention_of(scene), {"for": viewer.name})
-    report = with_result(found)
-    for share in SHARES if state.step else ():
+    tuned = result = tuned_scene(state, job, viewer.convention_of(scene), {"for": viewer.name})
+    report = report_of(result)
+    for part in PARTS_OF_CHANGE if state.step else ():
         if not _is_worse(report, CONVERTED):
             break
-        monitor.say(f"worse than the original at some scale: taking {share:g} of the change")
+        monitor.say(f"worse than the original at some scale: taking {part:g} of the change")
         *earlier, tuning = tuned.fused
-        partly = Fusion(tuning.method, tuning.settings | {"share": f"{share:g}"})
-        found = replace(between(original.scene, tuned, share), fused=(*earlier, partly))
-        report = with_result(found)
+        record = Fusion(tuning.method, tuning.settings | {"share": f"{part:g}"})
+        result = replace(between(original.scene, tuned, part), fused=(*earlier, record))
+        report = report_of(result)
     if state.step and _is_worse(report, CONVERTED):
         monitor.say("still worse than the original at some scale: read the table before you use it")
-    return Fitted(found, report)
-
-
-def _errors(report: Report) -> dict[float, float]:
-    """The original's mean square error by scale, at least that of rounding."""
-    psnr = {s: mean(report.select(ORIGINAL, s), PSNR.name) for s in report.scales}
-    return {s: max(ROUNDING, 0.0 if d is None else 10 ** (-d / 10)) for s, d in psnr.items()}
+    return Fitted(result, report)
 
 
 def _is_worse(report: Report, name: str) -> bool:
-    """Whether a row has a lower PSNR than the original at any scale; None means equal to the truth."""
+    """True if a row has a lower PSNR than the original at any scale; None means equal to the truth."""
     for scale in report.scales:
         before, after = (mean(report.select(n, scale), PSNR.name) for n in (ORIGINAL, name))
         if after is not None and (before is None or after < before):

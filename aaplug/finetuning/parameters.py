@@ -15,7 +15,7 @@ from torch import Tensor
 from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.sampling import SamplingBounds
-from aaplug.methods.filters import NYQUIST_VARIANCE
+from aaplug.methods.filters.smoothing import NYQUIST_VARIANCE
 
 Leaves = dict[str, Tensor]
 WHOLE = ("means", "quats", "log_scales", "logit_opacities")  # leaves that are columns of the scene
@@ -44,7 +44,7 @@ def scene_of(leaves: Mapping[str, Tensor], like: Gaussians) -> Gaussians:
     """
     values = {name: leaves[name] for name in WHOLE}
     sh = torch.cat([leaves["dc"], leaves["rest"]], dim=1)
-    dropped = {} if len(sh) == len(like) else {"origin": None, "pixel_sizes": None}
+    dropped = {} if len(sh) == len(like) else {"origin": None, "extras": {}}
     return replace(like, **values, **dropped, sh=sh)
 
 

@@ -11,17 +11,18 @@ from pathlib import Path
 from typing import Any
 
 from aaplug.core.cameras import spread
-from aaplug.core.gaussians import Convention, Fusion, Gaussians
-from aaplug.core.monitor import SILENT, Monitor
+from aaplug.core.conventions import Convention
+from aaplug.core.gaussians import Fusion, Gaussians
 from aaplug.evaluation.engine import Candidate, compare
 from aaplug.evaluation.metrics import PSNR
 from aaplug.evaluation.results import mean, scale_name
 from aaplug.finetuning.loop import run
 from aaplug.finetuning.state import State, TuningJob, begin, load, save
-from aaplug.methods.viewers import TUNED
+from aaplug.methods.conversion import TUNED
+from aaplug.system.monitor import SILENT, Monitor
 
-PROBES = 3  # training views, evenly spaced, that progress is measured on
-RECENT = 20  # steps over which the reported loss is averaged
+PROBE_VIEWS = 3  # training views, evenly spaced, that progress is measured on
+LOSS_STEPS = 20  # over which the reported loss is averaged
 
 
 def tune(
@@ -32,54 +33,57 @@ def tune(
     Ctrl-C stops it after the current step, once the checkpoint is written; a second Ctrl-C stops it at once.  Both
     raise KeyboardInterrupt.
     """
-    found = resume and checkpoint is not None and checkpoint.exists()
-    state, good = load(checkpoint, job) if found and checkpoint else (begin(job), None)
-    if resume:
-        monitor.say(f"resumed at step {state.step}" if found else "there is no checkpoint yet: starting at step 0")
+    if resume and checkpoint is not None and checkpoint.exists():
+        state, fallback = load(checkpoint, job)
+        monitor.say(f"resumed at step {state.step}")
+    else:
+        state, fallback = begin(job), None
+        if resume:
+            monitor.say("there is no checkpoint yet: starting at step 0")
     steps, first, started = job.settings.steps, state.step, time.monotonic()
 
-    def keep(state: State, good: Mapping[str, Any]) -> None:
+    def keep(state: State, fallback: Mapping[str, Any]) -> None:
         """Measure a few training views, write the checkpoint, and report both."""
-        told = _probed(job, state)
+        summary = _probe(job, state)
         if checkpoint is not None:
-            save(checkpoint, job, state, good)
+            save(checkpoint, job, state, fallback)
         pace = (time.monotonic() - started) / max(1, state.step - first)
-        monitor.say(f"step {state.step} of {steps}{told}; {pace:.2f} s per step")
+        monitor.say(f"step {state.step} of {steps}{summary}; {pace:.2f} s per step")
 
-    with monitor.progress("tuning", "steps") as tell, _interruptible(monitor.say) as stopped:
+    with monitor.progress("tuning", "steps") as tell, _interruptible(monitor.say) as interrupted:
 
         def stop() -> bool:
             tell(state.step, steps)
-            return stopped()
+            return interrupted()
 
-        done = run(job, state, good, every=every, keep=keep, stop=stop, say=monitor.say)
+        done = run(job, state, fallback, every=every, keep=keep, stop=stop, say=monitor.say)
         if done:
             tell(steps, steps)
     if not done:
-        kept = "nothing is written" if checkpoint is None else "the checkpoint is written; resume it"
-        monitor.say(f"stopped at step {state.step}; {kept}")
+        outcome = "nothing is written" if checkpoint is None else "the checkpoint is written; resume it"
+        monitor.say(f"stopped at step {state.step}; {outcome}")
         raise KeyboardInterrupt
     return state
 
 
-def _probed(job: TuningJob, state: State) -> str:
-    """Measure a few training views at the training size and the scale farthest from it; the result in words."""
-    scales = list(dict.fromkeys([1.0, max(job.settings.weights, key=lambda s: abs(math.log(s)))]))
-    report = compare([Candidate("now", state.renderer(job))], spread(job.views, PROBES), scales, job.truth)
-    psnr = {scale: mean(report.select("now", scale), PSNR.name) for scale in scales}
-    state.probes.append({"step": state.step, "psnr": {f"{s:g}": v for s, v in psnr.items()}})
-    losses = [loss for step in state.curve[-RECENT:] for loss in step["loss"].values()]
-    loss = f", loss {sum(losses) / len(losses):.2e}" if losses else ""
-    values = {s: "infinite" if v is None else f"{v:.2f}" for s, v in psnr.items()}
-    return f"{loss}: " + ", ".join(f"{value} dB at {scale_name(s)}" for s, value in values.items())
-
-
-def recorded(state: State, job: TuningJob, convention: Convention, settings: Mapping[str, str]) -> Gaussians:
+def tuned_scene(state: State, job: TuningJob, convention: Convention, settings: Mapping[str, str]) -> Gaussians:
     """The tuned scene with a record of its tuning; after no steps the start itself."""
     if state.step == 0:
         return replace(job.start.scene, convention=convention)
     scene, fusion = state.scene(job), Fusion(TUNED, {"steps": str(state.step), **settings})
     return replace(scene, convention=convention, fused=(*scene.fused, fusion))
+
+
+def _probe(job: TuningJob, state: State) -> str:
+    """Measure a few training views at the training size and the scale farthest from it; the result in words."""
+    scales = list(dict.fromkeys([1.0, max(job.settings.weights, key=lambda s: abs(math.log(s)))]))
+    report = compare([Candidate("now", state.renderer(job))], spread(job.views, PROBE_VIEWS), scales, job.truth)
+    psnr = {scale: mean(report.select("now", scale), PSNR.name) for scale in scales}
+    state.probes.append({"step": state.step, "psnr": {f"{s:g}": v for s, v in psnr.items()}})
+    losses = [loss for step in state.curve[-LOSS_STEPS:] for loss in step["loss"].values()]
+    loss = f", loss {sum(losses) / len(losses):.2e}" if losses else ""
+    values = {s: "infinite" if v is None else f"{v:.2f}" for s, v in psnr.items()}
+    return f"{loss}: " + ", ".join(f"{value} dB at {scale_name(s)}" for s, value in values.items())
 
 
 @contextmanager
@@ -88,19 +92,19 @@ def _interruptible(say: Callable[[str], None]) -> Iterator[Callable[[], bool]]:
 
     Python lets only the main thread handle signals; in others nothing changes.
     """
-    pressed: list[int] = []
+    presses: list[int] = []
 
     def note(number: int, frame: Any) -> None:
-        if pressed:
+        if presses:
             raise KeyboardInterrupt
-        pressed.append(number)
+        presses.append(number)
         say("stopping after this step; press again to stop at once")
 
     if threading.current_thread() is not threading.main_thread():
-        yield lambda: bool(pressed)
+        yield lambda: False
         return
     before = signal.signal(signal.SIGINT, note)
     try:
-        yield lambda: bool(pressed)
+        yield lambda: bool(presses)
     finally:
         signal.signal(signal.SIGINT, before)

@@ -1,14 +1,13 @@
-"""How to fine-tune: aaplug's method and Mipmap-GS's."""
+"""How to fine-tune: the settings of a run, and aaplug's method of choosing them."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from aaplug.core.choices import ANCHOR, WEIGHTS
-from aaplug.core.errors import UsageError, not_one_of
-from aaplug.core.registry import Registry
 from aaplug.finetuning.losses import LOSSES
 from aaplug.finetuning.parameters import RATES
-from aaplug.methods.viewers import CLASSIC_VIEWER, FAST, Viewer
+from aaplug.methods.viewers import FAST, Viewer
+from aaplug.options.verbs import ANCHOR_WEIGHT, LOSS_WEIGHTS
+from aaplug.system.errors import UsageError, not_one_of
 
 
 @dataclass(frozen=True)
@@ -34,14 +33,14 @@ class Settings:
     seed: int = 0
 
 
-OURS = Settings("consistency", 1000, WEIGHTS, RATES, anchor=ANCHOR, decay=0.03)
+OURS = Settings("consistency", 1000, LOSS_WEIGHTS, RATES, anchor=ANCHOR_WEIGHT, decay=0.03)
 # 3DGS's rates worsen a scene that is nearly right, and 300 steps are too few to recover
-GENTLE = {name: 0.3 * rate for name, rate in RATES.items()}
-# for conversion, a few minutes; `balanced` divides its weights by the scene's errors
-QUICK = replace(OURS, name="quick", steps=300, weights=dict.fromkeys(OURS.weights, 1.0), anchor=4.0, rates=GENTLE)
+GENTLE_RATES = {name: 0.3 * rate for name, rate in RATES.items()}
+# Conversion takes a few minutes by these; `balance` divides the weights by the scene's errors
+QUICK_SETTINGS = Settings("quick", 300, dict.fromkeys(WEIGHTS, 1.0), GENTLE_RATES, anchor=4.0, decay=0.03)
 
 
-def balanced(settings: Settings, errors: Mapping[float, float]) -> Settings:
+def balance(settings: Settings, errors: Mapping[float, float]) -> Settings:
     """Divide the weight of every scale by the root of the mean square error found there; errors[1.0] is the anchor's.
 
     Undivided losses would sacrifice scales with small errors to those with large ones; losses as shares of the errors
@@ -53,57 +52,45 @@ def balanced(settings: Settings, errors: Mapping[float, float]) -> Settings:
 
 def consistency(scales: Sequence[float], move: Sequence[str], anchor: float) -> Settings:
     """One model for all scales and the training size."""
-    weights = {scale: OURS.weights.get(scale, 1.0) for scale in scales}
-    return replace(OURS, weights=weights, rates={name: RATES[name] for name in move}, anchor=anchor)
-
-
-def mipmap_gs(scales: Sequence[float], move: Sequence[str] = (), anchor: float = 0.0) -> Settings:
-    """Mipmap-GS (Li et al. 2024), one model for one scale: all parameters at 3DGS's rates, 1000 steps of L2.
-
-    Its truth is a bilinear resize at the test poses; here it is the box average at the training poses.  It moves every
-    parameter and has no anchor.  More than one scale raises UsageError.
-    """
-    if len(scales) != 1:
-        raise UsageError("scale", "mipmap-gs makes one model for one scale; give one")
-    return Settings("mipmap-gs", 1000, {scales[0]: 1.0}, RATES, densify_every=100)
+    weights = {scale: WEIGHTS.get(scale, 1.0) for scale in scales}
+    return replace(CONSISTENCY_SETTINGS, weights=weights, rates={name: RATES[name] for name in move}, anchor=anchor)
 
 
 @dataclass(frozen=True)
 class Method:
-    """A way to fine-tune: settings, from the scales, the parameters that move and the anchor; and the usual viewer."""
+    """A way to fine-tune.
+
+    settings: of a run, from its scales, the parameters that move and the anchor.
+    viewer: the usual one.
+    densify: called after each step with the `TuningJob`, the `State`, which it may change, and the step's drawings,
+        whose screen-space means retain their gradients; None for a method that keeps the number of Gaussians.
+    """
 
     settings: Callable[[Sequence[float], Sequence[str], float], Settings]
     viewer: Viewer
+    densify: Callable[..., None] | None = None
 
 
-METHODS: Registry[Method] = Registry(
-    "method",
-    {"consistency": Method(consistency, FAST), "mipmap-gs": Method(mipmap_gs, CLASSIC_VIEWER)},
-    check=lambda value: isinstance(value, Method),
-)
+CONSISTENCY = Method(consistency, FAST)
 
 
-def settings_of(
-    method: Method,
-    *,
-    scale: Sequence[float],
-    steps: int | None,
-    loss: str,
-    anchor: float,
-    move: Sequence[str],
-    learning_rate: float,
-    densify_every: int | None,
-    seed: int,
-) -> Settings:
+def settings_of(method: Method, options: FinetuneOptions) -> Settings:
     """A method's settings with the user's choices; None takes the method's own.
 
     Raises UsageError if a name is not known, or a choice does not fit the method.
     """
-    if not move or any(name not in RATES for name in move):
+    if not options.move or any(name not in RATES for name in options.move):
         raise UsageError("move", f"needs parameters out of {', '.join(RATES)}")
-    if loss not in LOSSES:
-        raise UsageError("loss", not_one_of(loss, LOSSES))
-    own, counts = method.settings(scale, move, anchor), {"steps": steps, "densify_every": densify_every}
-    given = {name: value for name, value in counts.items() if value is not None}
-    rates = {name: rate * learning_rate for name, rate in own.rates.items()}
-    return replace(own, rates=rates, loss=loss, seed=seed, **given)
+    if options.loss not in LOSSES:
+        raise UsageError("loss", not_one_of(options.loss, LOSSES))
+    settings = method.settings(options.scale, options.move, options.anchor)
+    if options.densify_every and method.densify is None:
+        raise UsageError("densify_every", f"the method {settings.name} keeps the number of Gaussians")
+    return replace(
+        settings,
+        steps=settings.steps if options.steps is None else options.steps,
+        rates={name: rate * options.learning_rate for name, rate in settings.rates.items()},
+        loss=options.loss,
+        densify_every=settings.densify_every if options.densify_every is None else options.densify_every,
+        seed=options.seed,
+    )

@@ -4,7 +4,7 @@ A checkpoint is one file of everything that the next step depends on, written wh
 tensors, numbers and strings only, and is read as such: nothing in it is executed.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
@@ -15,23 +15,22 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.cameras import Camera
-from aaplug.core.digests import digest_of_cameras, digest_of_files, digest_of_scene
-from aaplug.core.errors import AaplugError, FormatError, UsageError, printable
-from aaplug.core.gaussians import Gaussians
+from aaplug.core.cameras import Camera, digest_of_cameras
+from aaplug.core.gaussians import Gaussians, digest_of_scene
 from aaplug.core.sampling import SamplingBounds
 from aaplug.evaluation.truth import Truth
-from aaplug.finetuning.densification import ScreenGradients
 from aaplug.finetuning.parameters import Leaves, leaves_of, scene_of
 from aaplug.finetuning.settings import Settings
 from aaplug.io.atomic import replacing
 from aaplug.rendering.renderer import Renderer
+from aaplug.system.digests import digest_of_files
+from aaplug.system.errors import AaplugError, FormatError, UsageError, printable
 
 EPSILON = 1e-15  # of Adam (3DGS)
 FORMAT, VERSION = "aaplug finetune", 5  # of a checkpoint
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TuningJob:
     """What to tune, how it will be viewed, and what it should look like.
 
@@ -39,6 +38,7 @@ class TuningJob:
     views: training views, at the training size.
     truth: the images that renders are compared with.
     upsampler: what makes its larger images, as text that changes if it does.
+    densify: that of the `Method`.
     """
 
     start: Renderer
@@ -46,6 +46,7 @@ class TuningJob:
     truth: Truth
     settings: Settings
     upsampler: str = ""
+    densify: Callable[..., None] | None = None
 
     @cached_property
     def facts(self) -> dict[str, str]:
@@ -55,7 +56,7 @@ class TuningJob:
         photos = [view.photo for view in self.views if view.photo]
         return settings | {
             "scene": digest_of_scene(start.scene),
-            "truth": f"{digest_of_scene(truth.own.scene)} {truth.source} {self.upsampler}",
+            "truth": f"{digest_of_scene(truth.renderer.scene)} {truth.source} {self.upsampler}",
             "recipe": f"{start.recipe.name} {start.recipe.digest}",
             "views": digest_of_cameras(self.views),
             "training cameras": digest_of_cameras(start.training.cameras),
@@ -67,16 +68,16 @@ class TuningJob:
         }
 
 
-@dataclass
+@dataclass(eq=False)
 class State:
     """How far a run has come; changed in place, step by step.
 
     first_log_scales: of each Gaussian when the run or densification made it.
     bounds: sampling bounds; they are computed anew every `loop.BOUNDS_EVERY` steps and after each densification.
-    bad_steps: steps in a row without a finite gradient.
+    gradients: sums over steps that the job's `densify` needs, by name.
+    bad_steps: consecutive steps without finite gradients.
     rollbacks: how often the run returned to an earlier state.
-    curve: number, view and loss by scale of each step.
-    probes: PSNR measured on the way.
+    curve: number, view and loss by scale of each step.  probes: PSNR measured on the way.
     """
 
     step: int
@@ -84,7 +85,7 @@ class State:
     adam: torch.optim.Adam
     first_log_scales: Float[Tensor, "n 3"]
     bounds: SamplingBounds
-    gradients: ScreenGradients
+    gradients: dict[str, Tensor] = field(default_factory=dict)
     bad_steps: int = 0
     rollbacks: int = 0
     curve: list[dict[str, Any]] = field(default_factory=list)
@@ -106,8 +107,7 @@ def begin(job: TuningJob) -> State:
     if not len(scene):
         raise UsageError(scene.name, "has no Gaussians to tune")
     leaves = leaves_of(scene)
-    gradients = ScreenGradients.none_of(len(scene))
-    return State(0, leaves, optimizer(leaves, job.settings), scene.log_scales, job.start.training.bounds, gradients)
+    return State(0, leaves, optimizer(leaves, job.settings), scene.log_scales, job.start.training.bounds)
 
 
 def optimizer(leaves: Leaves, settings: Settings) -> torch.optim.Adam:
@@ -117,31 +117,29 @@ def optimizer(leaves: Leaves, settings: Settings) -> torch.optim.Adam:
     return torch.optim.Adam(groups, eps=EPSILON)
 
 
-def packed(state: State) -> dict[str, Any]:
+def snapshot(state: State) -> dict[str, Any]:
     """A copy of the state, which later steps do not change, in types that a file can hold."""
     leaves = {name: leaf.detach() for name, leaf in state.leaves.items()}
-    held = {"adam": state.adam.state_dict(), "bounds": vars(state.bounds), "gradients": vars(state.gradients)}
-    return deepcopy({**vars(state), "leaves": leaves, **held})
+    return deepcopy({**vars(state), "leaves": leaves, "adam": state.adam.state_dict(), "bounds": vars(state.bounds)})
 
 
-def unpacked(data: Mapping[str, Any], job: TuningJob) -> State:
-    """The state again; it shares no tensor with `data`."""
+def state_of(data: Mapping[str, Any], job: TuningJob) -> State:
+    """The state of a snapshot; they share no tensor."""
     values = deepcopy(dict(data))
     adam = optimizer(values["leaves"], job.settings)
     adam.load_state_dict(values["adam"])
-    bounds, gradients = SamplingBounds(**values["bounds"]), ScreenGradients(**values["gradients"])
-    return State(**values | {"adam": adam, "bounds": bounds, "gradients": gradients})
+    return State(**values | {"adam": adam, "bounds": SamplingBounds(**values["bounds"])})
 
 
-def save(path: Path, job: TuningJob, state: State, good: Mapping[str, Any]) -> None:
-    """Write the state and the last good one; if that fails, an older checkpoint is still whole."""
-    content = {"format": FORMAT, "version": VERSION, "job": job.facts, "state": packed(state), "good": dict(good)}
+def save(path: Path, job: TuningJob, state: State, fallback: Mapping[str, Any]) -> None:
+    """Write the state and the snapshot to fall back to; if that fails, an older checkpoint is still whole."""
+    facts = {"format": FORMAT, "version": VERSION, "job": job.facts}
     with replacing(path, overwrite=True) as stream:
-        torch.save(content, stream)
+        torch.save(facts | {"state": snapshot(state), "good": dict(fallback)}, stream)
 
 
 def load(path: Path, job: TuningJob) -> tuple[State, dict[str, Any]]:
-    """The state of a run of this job, and the last good one, packed.
+    """The state of a run of this job, and the snapshot to fall back to.
 
     Raises:
         FormatError: the file is damaged, of another version or something else.
@@ -149,20 +147,16 @@ def load(path: Path, job: TuningJob) -> tuple[State, dict[str, Any]]:
     """
     try:
         content = torch.load(path, weights_only=True)
-        _check_version(path, content)
+        version, expected = f"{content['format']} {content.get('version', '')}".strip(), f"{FORMAT} {VERSION}"
+        if version != expected:
+            problem = f"is a checkpoint of another version: expected {expected}, got {printable(version)}"
+            raise FormatError(path, problem)
         for key, value in job.facts.items():
-            if (found := content["job"].get(key)) != value:
-                raise UsageError(
-                    str(path), f"is of another run: its {key} was {printable(str(found))}, now it is {value}"
-                )
-        return unpacked(content["state"], job), content["good"]
+            if (before := content["job"].get(key)) != value:
+                problem = f"is of another run: its {key} was {printable(str(before))}, now it is {value}"
+                raise UsageError(str(path), problem)
+        return state_of(content["state"], job), content["good"]
     except AaplugError:
         raise
     except Exception as error:  # torch raises all kinds over a damaged file
         raise FormatError(path, "is damaged, or no checkpoint") from error
-
-
-def _check_version(path: Path, content: Mapping[str, Any]) -> None:
-    found = f"{content['format']} {content.get('version', '')}".strip()
-    if found != (expected := f"{FORMAT} {VERSION}"):
-        raise FormatError(path, f"is a checkpoint of another version: expected {expected}, got {printable(found)}")

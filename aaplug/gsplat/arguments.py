@@ -14,9 +14,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.cameras import Camera
-from aaplug.core.errors import UsageError, not_one_of
-from aaplug.core.gaussians import MAX_LOG_SCALE, Convention, Gaussians
+from aaplug.core.conventions import Convention
+from aaplug.core.gaussians import MAX_LOG_SCALE, Gaussians
 from aaplug.core.rules import Rules
+from aaplug.system.errors import UsageError, not_one_of
 
 MODES = {
     "render_mode": ("RGB", "D", "ED", "RGB+D", "RGB+ED"),
@@ -24,8 +25,8 @@ MODES = {
     "trained_mode": ("classic", "antialiased"),
 }
 
-# gsplat's arguments of which one value is supported, its default
-FIXED: dict[str, object] = {
+FIXED: dict[str, object] = {  # arguments of gsplat of which only the default is supported
+    "sparse_grad": False,
     "distributed": False,
     "camera_model": "pinhole",
     "with_ut": False,
@@ -39,7 +40,7 @@ FIXED: dict[str, object] = {
 }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)  # `==` is that of `Camera`
 class AnyPose(Camera):
     """A camera whose `cam_from_world` may be any affine map, which also makes its gradient that of any matrix."""
 
@@ -72,9 +73,9 @@ class Options:
     max_alpha: float
 
     def __post_init__(self) -> None:
-        for name, known in MODES.items():
-            if getattr(self, name) not in known:
-                raise UsageError(name, not_one_of(getattr(self, name), known))
+        for name, modes in MODES.items():
+            if getattr(self, name) not in modes:
+                raise UsageError(name, not_one_of(getattr(self, name), modes))
         for name in ("width", "height", "near_plane", "tile_size"):
             if not getattr(self, name) > 0:
                 raise UsageError(name, f"expected a number above 0, got {getattr(self, name)}")
@@ -88,7 +89,7 @@ class Options:
 
     @property
     def coloured(self) -> bool:
-        """Whether colours are drawn."""
+        """True where colours are drawn."""
         return self.render_mode.startswith("RGB")
 
     @property
@@ -99,12 +100,12 @@ class Options:
         return Convention(f"gsplat {mode}", self.eps2d, mode == "antialiased", rules)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class View:
     """One image: its Gaussians and its camera.
 
-    scene: without opacities, which gsplat has activated, so that they may be 0 or 1; with harmonics if there are any.
-    features: plain colours; None with harmonics.
+    scene: the Gaussians without opacities, which gsplat has activated, so that they may be 0 or 1.
+    features: plain colours; None for harmonics, which `scene` has.
     """
 
     scene: Gaussians
@@ -116,11 +117,7 @@ class View:
 
 
 def refuse(others: Mapping[str, object]) -> None:
-    """Refuse what is not supported.
-
-    Raises:
-        UsageError: an argument is not known, or differs from gsplat's default.
-    """
+    """Raise UsageError for an argument that is not known, or differs from gsplat's default."""
     for name, value in others.items():
         if name not in FIXED:
             raise UsageError(name, "is not an argument of gsplat's rasterization that aaplug knows")
@@ -146,67 +143,62 @@ def views_of(
     Raises:
         UsageError: shapes do not fit each other, or a camera is no pinhole camera.
     """
-    *batch, n, _ = _shaped("means", means, (*means.shape[:-1], 3), least=2)
-    *_, c, _, _ = _shaped("viewmats", viewmats, (*batch, *viewmats.shape[-3:-2], 4, 4), least=3)
-    _shaped("Ks", Ks, (*batch, c, 3, 3))
-    _shaped("opacities", opacities, (*batch, n))
+    *batch, n, _ = _check_shape("means", means, (*means.shape[:-1], 3), least=2)
+    *_, c, _, _ = _check_shape("viewmats", viewmats, (*batch, *viewmats.shape[-3:-2], 4, 4), least=3)
+    _check_shape("Ks", Ks, (*batch, c, 3, 3))
+    _check_shape("opacities", opacities, (*batch, n))
     if covars is None:
         if quats is None or scales is None:
             raise UsageError("covars", "expected quats and scales, or covars")
-        _shaped("quats", quats, (*batch, n, 4))
-        _shaped("scales", scales, (*batch, n, 3))
+        _check_shape("quats", quats, (*batch, n, 4))
+        _check_shape("scales", scales, (*batch, n, 3))
     else:
-        _shaped("covars", covars, (*batch, n, 3, 3))
+        _check_shape("covars", covars, (*batch, n, 3, 3))
         quats, scales = means.new_zeros(*batch, n, 4), torch.ones_like(means)
-    own = _colours_per_camera(colors, (*batch,), c, n, options.sh_degree)
+    degree = options.sh_degree
+    channels = colors.shape[-1:] if degree is None else (*colors.shape[-2:-1], 3)
+    per_camera = colors.dim() == len(batch) + 2 + len(channels)
+    _check_shape("colors", colors, (*batch, *((c,) if per_camera else ()), n, *channels))
+    if degree is not None and not 0 <= degree < colors.shape[-2] ** 0.5:
+        raise UsageError("sh_degree", f"{degree} needs {(degree + 1) ** 2} coefficients, colors has {colors.shape[-2]}")
     if backgrounds is not None:
-        _shaped("backgrounds", backgrounds, (*batch, c, 3 if options.sh_degree is not None else colors.shape[-1]))
-    shared = [_per_image(x, (*batch,), c) for x in (means, quats, scales, opacities, covars)]
-    each = [_per_image(x, (*batch,), c, per_camera=True) for x in (backgrounds, viewmats, Ks)]
-    colours = _per_image(colors, (*batch,), c, per_camera=own)
-    rates = _rates(relative_rate, (*batch, c), options)
-    parts = zip(*shared, colours, *each, rates, strict=True)
-    return [_view(*own, options) for own in parts]  # pyright: ignore[reportCallIssue]
+        _check_shape("backgrounds", backgrounds, (*batch, c, 3 if degree is not None else colors.shape[-1]))
+    columns = [
+        *(_per_image(x, batch, c) for x in (means, quats, scales, opacities, covars)),
+        _per_image(colors, batch, c, per_camera),
+        *(_per_image(x, batch, c, per_camera=True) for x in (backgrounds, viewmats, Ks)),
+        _rates(relative_rate, (*batch, c), options),
+    ]
+    return [_view(*row, options) for row in zip(*columns, strict=True)]  # pyright: ignore[reportCallIssue]
 
 
-def _shaped(name: str, x: Tensor, shape: Sequence[int], least: int = 0) -> Sequence[int]:
-    """The shape, if it is the expected one."""
+def _check_shape(name: str, x: Tensor, shape: Sequence[int], least: int = 0) -> Sequence[int]:
+    """Return the shape, of at least `least` dimensions, or raise UsageError."""
     if tuple(x.shape) != tuple(shape) or x.dim() < least:
         raise UsageError(name, f"expected shape [{', '.join(map(str, shape))}], got {list(x.shape)}")
     return x.shape
 
 
-def _colours_per_camera(colors: Tensor, batch: tuple[int, ...], c: int, n: int, degree: int | None) -> bool:
-    """Whether each camera has colours of its own."""
-    inner = colors.shape[-1:] if degree is None else (*colors.shape[-2:-1], 3)
-    own = colors.dim() == len(batch) + 2 + len(inner)
-    _shaped("colors", colors, (*batch, *((c,) if own else ()), n, *inner))
-    if degree is not None and not 0 <= degree < colors.shape[-2] ** 0.5:
-        raise UsageError("sh_degree", f"{degree} needs {(degree + 1) ** 2} coefficients, colors has {colors.shape[-2]}")
-    return own
-
-
-def _per_image(x: Tensor | None, batch: tuple[int, ...], c: int, per_camera: bool = False) -> list[Any]:
-    """A tensor's part for each image, None for no tensor; per_camera: whether it has a dimension of cameras."""
-    whole = math.prod(batch)
+def _per_image(x: Tensor | None, batch: Sequence[int], c: int, per_camera: bool = False) -> list[Any]:
+    """A tensor's part for each image, None for no tensor; with `per_camera` it has a dimension of cameras."""
     if x is None:
-        return whole * c * [None]
-    parts = x.reshape(whole, *x.shape[len(batch) :]).unbind()
-    return [own for part in parts for own in (part.unbind() if per_camera else c * [part])]
+        return math.prod(batch) * c * [None]
+    parts = x.reshape(math.prod(batch), *x.shape[len(batch) :])
+    return [part for scene in parts.unbind() for part in (scene.unbind() if per_camera else c * [scene])]
 
 
-def _rates(relative_rate: float | Tensor | None, shape: tuple[int, ...], options: Options) -> list[float | None]:
-    """Each image's sampling rate relative to training; None unless it is asked for."""
+def _rates(relative_rate: float | Tensor | None, shape: Sequence[int], options: Options) -> list[float | None]:
+    """Each image's sampling rate relative to training; None for every mode but "matched"."""
     if (relative_rate is not None) != (options.rasterize_mode == "matched"):
         raise UsageError("relative_rate", 'belongs to rasterize_mode="matched", which needs it')
     if relative_rate is None:
         return [None for _ in range(math.prod(shape))]
     rates = torch.as_tensor(relative_rate, dtype=torch.float64)
     if rates.dim() > 0:
-        _shaped("relative_rate", rates, shape)
+        _check_shape("relative_rate", rates, shape)
     if not (rates > 0).all():
         raise UsageError("relative_rate", f"expected numbers above 0, got {relative_rate}")
-    return rates.expand(shape).flatten().tolist()
+    return rates.expand(*shape).flatten().tolist()
 
 
 def _view(
@@ -223,24 +215,14 @@ def _view(
     options: Options,
 ) -> View:
     """One image's part of the arguments."""
-    degree, unused = options.sh_degree, means.new_zeros(len(means), 1, 3)
-    lengths = scales.abs().clamp(min=math.exp(-MAX_LOG_SCALE)).log()
-    scene = Gaussians(
-        means,
-        quats,
-        lengths,
-        torch.zeros_like(opacities),
-        unused if degree is None else colors[:, : (degree + 1) ** 2],
-        options.convention,
-    )
-    features = colors if degree is None else None
-    return View(scene, opacities, covars, features, background, _camera(viewmat, K, rate, options))
-
-
-def _camera(viewmat: Tensor, K: Tensor, rate: float | None, options: Options) -> Camera:
-    """The pinhole camera of a pose and a matrix of intrinsics."""
     (fx, skew, cx), (below, fy, cy), last = K.tolist()
     if skew != 0 or below != 0 or last != [0, 0, 1] or not (fx > 0 and fy > 0):
         raise UsageError("Ks", f"expected fx, 0, cx; 0, fy, cy; 0, 0, 1 with fx and fy above 0, got {K.tolist()}")
     camera = AnyPose("", options.width, options.height, fx, fy, cx, cy, viewmat.double())
-    return camera if rate is None else replace(camera, trained_focal=camera.focal / rate)
+    if rate is not None:
+        camera = replace(camera, trained_focal=camera.focal / rate)
+    log_scales = scales.abs().clamp(min=math.exp(-MAX_LOG_SCALE)).log()
+    degree, no_opacities = options.sh_degree, torch.zeros_like(opacities)
+    sh = means.new_zeros(len(means), 1, 3) if degree is None else colors[:, : (degree + 1) ** 2]
+    scene = Gaussians(means, quats, log_scales, no_opacities, sh, options.convention)
+    return View(scene, opacities, covars, colors if degree is None else None, background, camera)

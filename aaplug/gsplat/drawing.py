@@ -1,73 +1,129 @@
-"""Images of any number of channels, drawn three at a time, and the absolute gradients of splats' centres.
+"""One image by gsplat's rules: which splats it keeps, their channels, drawn three at a time, and absolute gradients.
 
-m: splats of one image; d: channels, of which the first are colours; h, w: px.
+m: splats of the image; d: channels, of which the first are colours; h, w: px.
 """
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
-from aaplug.core.cameras import BLACK
+from aaplug.core.colours import BLACK
+from aaplug.core.ellipses import squared_cutoff
 from aaplug.core.interfaces import PixelKernel, Rasterizer
+from aaplug.core.kernels import Kernels
+from aaplug.core.projection import project, project_covariances
+from aaplug.core.sampling import SamplingBounds
+from aaplug.core.shading import shade
 from aaplug.core.splats import Splats2D
-from aaplug.gsplat.arguments import Options
-from aaplug.methods.pixel_kernels import POINT
+from aaplug.core.training import TrainingViews
+from aaplug.gsplat.arguments import Options, View
+from aaplug.methods.filters.matched import Matched
 from aaplug.methods.pixel_kernels.absolute import ABSOLUTE_POINT
+from aaplug.methods.pixel_kernels.point import POINT
 
-AT_ONCE = 3  # channels, what a rasterizer draws
-LEAST_ALPHA = 1e-10  # what expected depth is divided by where nothing is drawn
+MIN_COMPENSATION = 1e-9  # gsplat has none; this one keeps the gradient of the root finite where the factor is 0
+MAX_RADIUS = 2.0**30  # px; fits 32 bits
+CHANNELS_PER_CALL = 3  # of a rasterizer
+MIN_ALPHA_OF_DEPTH = 1e-10  # expected depth is divided by no less
+
+_EMPTY = torch.zeros(0)
+NO_BOUNDS = SamplingBounds(_EMPTY, _EMPTY, _EMPTY, _EMPTY.int())
 
 Image = tuple[Float[Tensor, "h w d"], Float[Tensor, "h w 1"]]
-Told = Callable[[Float[Tensor, "m 2"]], object]
+AddGradient = Callable[[Float[Tensor, "m 2"]], object]
 
 
-def drawn(
+@dataclass(frozen=True, eq=False)
+class ViewSplats:
+    """The splats of one image without colour.  radii: half the sides of their bounding boxes along x and y, in px."""
+
+    splats: Splats2D
+    radii: Int[Tensor, "m 2"]
+
+    @classmethod
+    def of(cls, view: View, options: Options, kernels: Kernels) -> "ViewSplats":
+        """The splats that gsplat keeps, after the screen filter of `rasterize_mode`.
+
+        It drops what lies beyond a plane, has an opacity below 1/255, a radius of at most `radius_clip` along both
+        axes, or a box outside of the image.
+        """
+        rules, camera = options.convention.rules, view.camera
+        if view.covars is None:
+            splats = project(view.scene, camera, kernels, rules)
+            splats = replace(splats, opacities=view.opacities.index_select(0, splats.sources))
+        else:
+            splats = project_covariances(view.scene.means, view.covars, view.opacities, camera, rules)
+        if options.rasterize_mode == "matched":
+            splats = Matched("global")(splats, camera, TrainingViews(options.convention, [camera], NO_BOUNDS))
+        else:
+            splats = splats.blurred(options.eps2d, options.convention.compensated, MIN_COMPENSATION)
+        with torch.no_grad():
+            reach = squared_cutoff(splats.opacities, rules.min_alpha).clamp(min=0.0).sqrt()
+            radii = (reach[:, None] * splats.covs[:, ::2].sqrt()).ceil().clamp(max=MAX_RADIUS)
+        low, high = splats.means - radii, splats.means + radii
+        keep = (splats.depths <= options.far_plane) & (splats.opacities >= rules.min_alpha) & (splats.dets > 0)
+        keep = keep & (radii > options.radius_clip).any(dim=1)
+        keep = keep & (high > 0).all(dim=1) & (low < low.new_tensor([options.width, options.height])).all(dim=1)
+        return cls(splats[keep], radii[keep].int())
+
+
+def draw(
     splats: Splats2D,
-    features: Float[Tensor, "m d"],
-    background: Float[Tensor, " colours"] | None,
+    view: View,
     options: Options,
     rasterizer: Rasterizer,
-    tell: Told | None,
+    kernels: Kernels,
+    add_gradient: AddGradient | None,
 ) -> Image:
-    """Features and alpha; depth, the last channel, has no background and may be divided by alpha.
+    """Colours and depth, as far as `render_mode` draws them, and alpha.
 
-    tell: called in the backward pass with the absolute gradients of the centres, if they are wanted.
+    Depth, the last channel, has no background and may be divided by alpha.
+
+    add_gradient: called in the backward pass with the absolute gradients of the centres, unless it is None.
     """
+    channels = []
+    if options.coloured and view.features is not None:
+        channels.append(view.features.index_select(0, splats.sources))
+    elif options.coloured:
+        channels.append(shade(splats, view.scene, view.camera, kernels).rgb)
+    if options.render_mode != "RGB":
+        channels.append(splats.depths[:, None])
+    features = torch.cat(channels, dim=1)
     width = features.shape[1]
-    padded = functional.pad(features, (0, -width % AT_ONCE))
-    parts = [_three(replace(splats, rgb=rgb), options, rasterizer, tell) for rgb in padded.split(AT_ONCE, dim=1)]
-    alpha = parts[0][..., AT_ONCE:]
-    image = torch.cat([part[..., :AT_ONCE] for part in parts], dim=2)[..., :width]
-    if background is not None and options.coloured:
-        behind = functional.pad(background, (0, width - len(background)))
-        image = image + (1 - alpha) * behind
+    padded = functional.pad(features, (0, -width % CHANNELS_PER_CALL)).split(CHANNELS_PER_CALL, dim=1)
+    parts = [_draw_three(replace(splats, rgb=rgb), options, rasterizer, add_gradient) for rgb in padded]
+    alpha = parts[0][..., CHANNELS_PER_CALL:]
+    image = torch.cat([part[..., :CHANNELS_PER_CALL] for part in parts], dim=2)[..., :width]
+    if view.background is not None and options.coloured:
+        image = image + (1 - alpha) * functional.pad(view.background, (0, width - len(view.background)))
     if options.render_mode.endswith("ED"):
-        image = torch.cat([image[..., :-1], image[..., -1:] / alpha.clamp(min=LEAST_ALPHA)], dim=2)
+        image = torch.cat([image[..., :-1], image[..., -1:] / alpha.clamp(min=MIN_ALPHA_OF_DEPTH)], dim=2)
     return image, alpha
 
 
-def _three(splats: Splats2D, options: Options, rasterizer: Rasterizer, tell: Told | None) -> Float[Tensor, "h w 4"]:
+def _draw_three(
+    splats: Splats2D, options: Options, rasterizer: Rasterizer, add_gradient: AddGradient | None
+) -> Float[Tensor, "h w 4"]:
     """Three premultiplied channels, and alpha."""
-    rules = options.convention.rules
 
     def paint(splats: Splats2D, kernel: PixelKernel) -> Tensor:
-        image = rasterizer(splats, options.hw, BLACK, kernel, None, rules)
+        image = rasterizer(splats, options.hw, BLACK, kernel, None, options.convention.rules)
         return torch.cat([image.rgb, image.alpha[..., None]], dim=2)
 
     image = paint(splats, POINT)
 
     def backward(gradient: Tensor) -> None:
-        assert tell is not None
+        assert add_gradient is not None
         with torch.enable_grad():
             constants = {name: x.detach() for name, x in vars(splats).items() if isinstance(x, Tensor)}
             means = constants["means"].requires_grad_()
             again = paint(replace(splats, **constants), ABSOLUTE_POINT)
-        tell(torch.autograd.grad(again, means, gradient)[0])
+        add_gradient(torch.autograd.grad(again, means, gradient)[0])
 
-    if tell is not None and image.requires_grad:
+    if add_gradient is not None and image.requires_grad:
         image.register_hook(backward)
     return image

@@ -6,16 +6,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from aaplug.core.gaussians import CLASSIC
+from aaplug.core.conventions import CLASSIC
 from aaplug.core.interfaces import Rasterizer, RunsKernels
 from aaplug.core.kernels import EAGER
 from aaplug.core.rules import RULES_GSPLAT
 from aaplug.gsplat.arguments import Options, refuse, views_of
-from aaplug.gsplat.drawing import drawn
-from aaplug.gsplat.sparse import with_sparse_gradient
-from aaplug.gsplat.table import Layout, tabulated
-from aaplug.gsplat.views import features_of, seen
-from aaplug.rasterizers import find_rasterizer
+from aaplug.gsplat.drawing import ViewSplats, draw
+from aaplug.gsplat.table import Layout, table_of
+from aaplug.rasterizers.choice import find_rasterizer
 
 
 def rasterization(
@@ -73,16 +71,14 @@ def rasterization(
         eps2d: px²; variance added to every projected covariance.
         sh_degree: degree of the harmonics to use; None for plain channels.
         packed: lay `meta` out by splat, not by camera and Gaussian.
-        tile_size: px; of the tiles in `meta`.  It does not change the image.
         backgrounds: [..., c, d]; black if None.  Depth has none.
         render_mode: "RGB", colours; "D" or "ED", depth summed by weight or expected; "RGB+D" or "RGB+ED", both, with
             depth as the last channel.
-        sparse_grad: with `packed`, gradients of means, quats and scales are sparse.
         absgrad: the backward pass sets `meta["means2d"].absgrad` (arXiv 2404.10484).
         rasterize_mode: "classic"; "antialiased", which also scales opacity by √(det C / det(C + eps2d·I)), without a
             floor; or aaplug's "matched", which draws at any rate what training drew at its own (`Matched`).
-        channel_chunk, segmented: without effect here.
-        distributed, camera_model: only gsplat's defaults are supported.
+        tile_size, channel_chunk, segmented: without effect here.
+        sparse_grad, distributed, camera_model: only gsplat's defaults are supported.
         covars: [..., n, 3, 3], in squared world units, instead of quats and scales; the upper triangle is read.
         relative_rate: for "matched": each image's focal length over training's, one number or [..., c].
         trained_mode: for "matched": "classic" or "antialiased", the mode of training.
@@ -91,7 +87,8 @@ def rasterization(
         others: further arguments of gsplat's, of which only the defaults are supported.
 
     Returns:
-        Images [..., c, height, width, channels], alpha [..., c, height, width, 1], and `meta` with gsplat's keys.
+        Images [..., c, height, width, channels], alpha [..., c, height, width, 1], and `meta` with gsplat's keys,
+        except those of its tiles.
 
     Raises:
         UsageError: something is not supported or out of range, or shapes do not fit each other.
@@ -100,29 +97,23 @@ def rasterization(
         *(width, height, near_plane, far_plane, radius_clip, eps2d, sh_degree, packed, tile_size, render_mode),
         *(rasterize_mode, trained_mode, max_alpha),
     )
-    refuse({"distributed": distributed, "camera_model": camera_model, **others})
-    rows: list[Tensor] = []
-    if sparse_grad and packed:
-        means = with_sparse_gradient(means, rows)
-        quats, scales = (x if x is None else with_sparse_gradient(x, rows) for x in (quats, scales))
+    refuse({"sparse_grad": sparse_grad, "distributed": distributed, "camera_model": camera_model, **others})
     tensors = (means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars)
     views = views_of(*tensors, relative_rate, options)
-    chosen = _named(rasterizer) if isinstance(rasterizer, str) else rasterizer
-    kernels = chosen.kernels if isinstance(chosen, RunsKernels) else EAGER
-    found = [seen(view, options, kernels) for view in views]
-    layout = Layout.of([part.splats for part in found], viewmats.shape[:-2], means.shape[-2], packed)
-    rows.append(layout.sources.unique())
-    meta, splats = tabulated(found, layout, options)
-    told = layout.told(meta["means2d"]) if absgrad else len(views) * [None]
+    painter = _rasterizer_of(rasterizer) if isinstance(rasterizer, str) else rasterizer
+    kernels = painter.kernels if isinstance(painter, RunsKernels) else EAGER
+    parts = [ViewSplats.of(view, options, kernels) for view in views]
+    layout = Layout.of(parts, viewmats.shape[:-2], means.shape[-2], packed)
+    meta, splats = table_of(parts, layout, options)
+    adders = layout.gradient_adders(meta["means2d"]) if absgrad else len(views) * [None]
     images = [
-        drawn(part, features_of(part, view, options, kernels), view.background, options, chosen, tell)
-        for part, view, tell in zip(splats, views, told, strict=True)
+        draw(part, view, options, painter, kernels, add) for part, view, add in zip(splats, views, adders, strict=True)
     ]
-    colours, alphas = (torch.stack(parts).unflatten(0, layout.shape) for parts in zip(*images, strict=True))
+    colours, alphas = (torch.stack(column).unflatten(0, layout.shape) for column in zip(*images, strict=True))
     return colours, alphas, meta
 
 
 @cache
-def _named(name: str) -> Rasterizer:
+def _rasterizer_of(name: str) -> Rasterizer:
     """A rasterizer by name; compiled kernels are loaded and checked once, not for every image."""
     return find_rasterizer(name)

@@ -15,11 +15,11 @@ from os import PathLike
 from pathlib import Path
 from typing import BinaryIO
 
-from aaplug.core.errors import OutputError, listing, of_system, reason
-from aaplug.core.locks import OURS, new_file, remove_left
+from aaplug.system.errors import OutputError, listing, of_system, reason
+from aaplug.system.locks import OUR_PREFIX, new_file, remove_left
 
 TOKEN_BYTES = 8  # random bytes in a temporary file's name: 2^64 names
-DIGITS = 16  # of the hash that names a claim
+HASH_DIGITS = 16  # in the name of a claim
 
 
 @contextmanager
@@ -38,7 +38,7 @@ def replacing_file(path: str | PathLike[str], overwrite: bool, suffix: str = ".t
     path = Path(path)
     _check_target(path, overwrite)
     target = Path(os.path.realpath(path))  # a link stays a link; its target is replaced
-    temporary = target.with_name(f"{OURS}{secrets.token_hex(TOKEN_BYTES)}{suffix}")
+    temporary = target.with_name(f"{OUR_PREFIX}{secrets.token_hex(TOKEN_BYTES)}{suffix}")
     remove_left(target.parent)
     try:
         with new_file(temporary):
@@ -68,7 +68,7 @@ def claimed(path: str | PathLike[str] | None, check: Callable[[], object] = lamb
         yield
         return
     path = Path(os.path.realpath(path))
-    name = OURS + hashlib.sha256(os.fsencode(path.name)).hexdigest()[:DIGITS]
+    name = OUR_PREFIX + hashlib.sha256(os.fsencode(path.name)).hexdigest()[:DIGITS]
     mark = path / name if path.is_dir() else path.with_name(name)
     with ExitStack() as stack:
         try:
@@ -79,6 +79,19 @@ def claimed(path: str | PathLike[str] | None, check: Callable[[], object] = lamb
             raise OutputError(path, f"cannot be written: {reason(error)}") from error
         stack.callback(mark.unlink, missing_ok=True)
         check()
+        yield
+
+
+@contextmanager
+def writing(path: str | PathLike[str] | None, check: Callable[[], object], folder: bool = False) -> Iterator[None]:
+    """Claim an output while the block writes it; None claims nothing.  Raises as `claimed` and `make_folder`.
+
+    check: refuses what must not be written.  folder: the output is one; it is made, and removed if it stays empty.
+    """
+    with ExitStack() as stack:
+        if path is not None and folder:
+            stack.enter_context(output_folder(path))
+        stack.enter_context(claimed(path, check))
         yield
 
 
@@ -104,13 +117,13 @@ def make_folder(path: str | PathLike[str]) -> Path:
 def output_folder(path: str | PathLike[str]) -> Iterator[Path]:
     """Make a folder for the outputs of the block; if it fails, remove what was made and is still empty."""
     path = Path(path)
-    made = [folder for folder in (path, *path.parents) if not folder.exists()]
+    missing = [folder for folder in (path, *path.parents) if not folder.exists()]
     make_folder(path)
     try:
         yield path
     except BaseException:
         with suppress(OSError):  # one that is not empty stays, and so do those that hold it
-            for folder in made:
+            for folder in missing:
                 folder.rmdir()
         raise
 

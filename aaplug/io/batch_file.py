@@ -11,12 +11,12 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from aaplug.core.errors import FormatError
 from aaplug.io.values import read_bounded
+from aaplug.system.errors import FormatError
 
-LIMIT = 2**20  # bytes: thousands of scenes
-SCENES = "scene"
-PATHS = ("scene", "model_path", "cameras", "output", "lpips")  # keys whose values are paths
+MAX_SIZE = 2**20  # bytes: thousands of scenes
+SCENES_KEY = "scene"
+PATH_KEYS = ("scene", "model_path", "cameras", "output", "lpips")
 
 
 @dataclass(frozen=True)
@@ -34,19 +34,20 @@ def read_batch(path: str | PathLike[str]) -> BatchFile:
     """
     path = Path(path)
     try:
-        document = tomllib.loads(read_bounded(path, LIMIT).decode("utf-8-sig"))
+        document = tomllib.loads(read_bounded(path, MAX_SIZE).decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:
         raise FormatError(path, f"should be TOML: {error}") from error
-    tables = document.pop(SCENES, None)
+    tables = document.pop(SCENES_KEY, None)
     if not isinstance(tables, list) or not tables or not all(isinstance(t, dict) for t in tables):
         raise FormatError(path, "names no scene; it needs a [[scene]] table for each")
     scenes: dict[str, Mapping[str, Any]] = {}
     for number, table in enumerate(tables, start=1):
         settings = _settings(table, path.parent)
         file = settings.get("scene") or settings.get("model_path")
-        if not (named := settings.pop("name", None)) and not isinstance(file, str):
+        name = settings.pop("name", None)
+        if not name and not isinstance(file, str):
             raise FormatError(path, f"[[scene]] {number}: names no scene; add scene = ... as text")
-        name = named or Path(str(file)).stem or file
+        name = name or Path(str(file)).stem or file
         if not isinstance(name, str) or name.casefold() in map(str.casefold, scenes):
             raise FormatError(path, f"[[scene]] {number}: needs a name of its own, not {name!r}; add name = ...")
         scenes[name] = settings
@@ -56,7 +57,7 @@ def read_batch(path: str | PathLike[str]) -> BatchFile:
 def _settings(table: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """The table with underscores in its keys, and relative paths resolved against `folder`."""
     settings = {key.replace("-", "_"): value for key, value in table.items()}
-    return {k: _resolved(v, folder) if k in PATHS else v for k, v in settings.items()}
+    return {k: _resolved(v, folder) if k in PATH_KEYS else v for k, v in settings.items()}
 
 
 def _resolved(value: Any, folder: Path) -> Any:

@@ -27,30 +27,30 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from aaplug.core.errors import FormatError, listing
 from aaplug.core.imaging import levels
 from aaplug.io.atomic import replacing
 from aaplug.io.limits import whole_limit
+from aaplug.system.errors import FormatError, listing
 
 LOSSLESS_WEBP = 101  # OpenCV's quality for it
 SAMPLE_TYPES = {8: np.uint8, 16: np.uint16}  # by bit depth
-ROWS = 64  # of an image converted to samples at once
+ROWS_PER_BAND = 64  # of an image converted to samples at once
 ALPHA_CHANNELS = 4  # RGB and alpha
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")  # of Pillow; OpenCV tells them by the same first bytes
-BYTES_A_PIXEL = 8  # four channels of 16 bits: no image takes more
+MAX_PIXEL_SIZE = 8  # bytes: four channels of 16 bits
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_CHUNK = struct.Struct(">I4s")  # length of the data and kind, before them
 PNG_CHECKSUM = 4  # bytes, after them
 PNG_PIXELS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")  # chunks that make a still picture
-LOST = ("Corrupt JPEG data: premature end", "Premature end of JPEG file")  # libjpeg's messages for lost pixels
-DAMAGE = "Corrupt JPEG data"  # and for what may be harmless: bytes between the markers
+LOSS_MESSAGES = ("Corrupt JPEG data: premature end", "Premature end of JPEG file")  # libjpeg's messages for lost pixels
+DAMAGE_MESSAGE = "Corrupt JPEG data"  # libjpeg's for what may be harmless too: bytes between the markers
 STDERR = 2  # file descriptor, which the codecs write to directly
 
 log = logging.getLogger("aaplug")
 
 
 class _Header(NamedTuple):
-    """What a file says before its pixels: width and height in px, and whether it declares transparency."""
+    """Width and height in px, and transparency, as a file declares them before its pixels."""
 
     size: tuple[int, int]
     transparent: bool
@@ -90,66 +90,55 @@ def write_png(
     path: str | PathLike[str], rgb: Float[Tensor, "h w 3"], bit_depth: int = 8, overwrite: bool = False
 ) -> None:
     """Write colours, clamped to [0, 1], as a PNG; see `replacing`."""
-    png = _encoded(".png", _stored(rgb, bit_depth))
+    png = _encoded(".png", rgb, bit_depth=bit_depth)
     with replacing(path, overwrite) as stream:
         stream.write(png)
 
 
 def encode_webp(rgb: Float[Tensor, "h w 3"], quality: int | None) -> bytes:
     """A WebP file of colours clamped to [0, 1], in 8 bits.  quality: 1 to 100; None is lossless."""
-    setting = LOSSLESS_WEBP if quality is None else quality
-    return _encoded(".webp", _stored(rgb, 8), cv2.IMWRITE_WEBP_QUALITY, setting)
+    return _encoded(".webp", rgb, cv2.IMWRITE_WEBP_QUALITY, LOSSLESS_WEBP if quality is None else quality)
 
 
 def encode_jpeg(rgb: Float[Tensor, "h w 3"], quality: int) -> bytes:
     """A JPEG file of colours clamped to [0, 1], with colour at full resolution.  quality: 1 to 100."""
     settings = cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444
-    return _encoded(".jpg", _stored(rgb, 8), *settings)
+    return _encoded(".jpg", rgb, *settings)
 
 
 def encode_png(rgb: Float[Tensor, "h w c"]) -> bytes:
     """A PNG file of 8 bits, of colours or of one channel, clamped to [0, 1]; quick rather than small."""
-    return _encoded(".png", _stored(rgb, 8), cv2.IMWRITE_PNG_COMPRESSION, 1)
+    return _encoded(".png", rgb, cv2.IMWRITE_PNG_COMPRESSION, 1)
 
 
-def _encoded(suffix: str, samples: np.ndarray, *settings: int) -> bytes:
-    done, file = cv2.imencode(suffix, samples, settings)
-    assert done
+def _encoded(suffix: str, rgb: Float[Tensor, "h w c"], *settings: int, bit_depth: int = 8) -> bytes:
+    """Samples in OpenCV's BGR order, converted in bands of rows to keep the float copies small, as a file."""
+    bands = (levels(rows, bit_depth).flip(2).cpu().numpy() for rows in rgb.split(ROWS_PER_BAND))
+    samples = np.concatenate([band.astype(SAMPLE_TYPES[bit_depth]) for band in bands])
+    success, file = cv2.imencode(suffix, samples, settings)
+    assert success
     return file.tobytes()
-
-
-def _stored(rgb: Float[Tensor, "h w c"], bit_depth: int) -> np.ndarray:
-    """Samples in OpenCV's BGR order, converted in bands of rows to keep the float copies small."""
-    parts = (levels(rows, bit_depth).flip(2).cpu().numpy() for rows in rgb.split(ROWS))
-    return np.concatenate([part.astype(SAMPLE_TYPES[bit_depth]) for part in parts])
 
 
 def _look(path: Path) -> _Header:
     """The header, within the limits."""
+    pillow_limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None  # it is lower than ours and only warns
     try:
-        with _no_pillow_limit(), warnings.catch_warnings(action="ignore"), Image.open(path, formats=FORMATS) as header:
+        with warnings.catch_warnings(action="ignore"), Image.open(path, formats=FORMATS) as header:
             size, transparent = header.size, header.has_transparency_data
             stored = path.stat().st_size
     except FileNotFoundError as error:
         raise FormatError(path, "does not exist") from error
     except Exception as error:  # Pillow's parsers raise all kinds
         raise FormatError(path, f"is not an image that can be read ({listing(FORMATS)})") from error
+    finally:
+        Image.MAX_IMAGE_PIXELS = pillow_limit
     pixels, most = size[0] * size[1], whole_limit("IMAGE")  # an image above it counts as a decompression bomb
     if pixels > most:
         raise FormatError(path, f"has {size[0]}x{size[1]} px, more than the {most:,} allowed")
-    if stored > BYTES_A_PIXEL * pixels + whole_limit("IMAGE_EXTRA"):
+    if stored > MAX_PIXEL_SIZE * pixels + whole_limit("IMAGE_EXTRA"):
         raise FormatError(path, f"has {stored:,} bytes, which {size[0]}x{size[1]} px do not need")
     return _Header(size, transparent)
-
-
-@contextmanager
-def _no_pillow_limit() -> Iterator[None]:
-    """Disable Pillow's own limit, which is lower than ours and only warns."""
-    limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
-    try:
-        yield
-    finally:
-        Image.MAX_IMAGE_PIXELS = limit
 
 
 def _read(path: Path, channels: int, finished: Callable[[Tensor], Tensor]) -> Float[Tensor, "h w c"]:
@@ -165,9 +154,9 @@ def _read(path: Path, channels: int, finished: Callable[[Tensor], Tensor]) -> Fl
         raise FormatError(path, "has colours or transparency that OpenCV cannot read; save it as RGB(A) PNG")
     order = [0, 0, 0] if stored == 1 else [2, 1, 0, 3][:stored]
     highest, image = np.iinfo(samples.dtype).max, torch.empty(height, width, channels)
-    for start in range(0, height, ROWS):
-        rows = samples[start : start + ROWS, :, order].astype(np.float32) / highest
-        image[start : start + ROWS] = finished(torch.from_numpy(rows))
+    for start in range(0, height, ROWS_PER_BAND):
+        rows = samples[start : start + ROWS_PER_BAND, :, order].astype(np.float32) / highest
+        image[start : start + ROWS_PER_BAND] = finished(torch.from_numpy(rows))
     return image
 
 
@@ -182,9 +171,9 @@ def _decode(path: Path) -> np.ndarray:
             lines = words.read().decode("ascii", "replace").splitlines()
     except (OSError, MemoryError, cv2.error) as error:
         raise FormatError(path, "cannot be read or is damaged") from error
-    if pixels is None or any(line.startswith(LOST) for line in lines):
+    if pixels is None or any(line.startswith(LOSS_MESSAGES) for line in lines):
         raise FormatError(path, "is damaged or cut short")
-    if damage := next((line for line in lines if line.startswith(DAMAGE)), ""):
+    if damage := next((line for line in lines if line.startswith(DAMAGE_MESSAGE)), ""):
         log.warning("%s: is damaged (%s)", path, damage)
     return pixels[..., None] if pixels.ndim == 2 else pixels
 
@@ -193,18 +182,18 @@ def _still(path: Path, data: bytes) -> bytes:
     """A PNG without the chunks of an animation, with which OpenCV also takes pixels that are missing for black."""
     if not data.startswith(PNG_SIGNATURE):
         return data
-    kept, at = [PNG_SIGNATURE], len(PNG_SIGNATURE)
+    parts, at = [PNG_SIGNATURE], len(PNG_SIGNATURE)
     while at + PNG_CHUNK.size <= len(data):
         length, kind = PNG_CHUNK.unpack_from(data, at)
         end = at + PNG_CHUNK.size + length + PNG_CHECKSUM
         if end > len(data):  # OpenCV would make room for what is not there
             raise FormatError(path, "is damaged or cut short")
         if kind in PNG_PIXELS:
-            kept.append(data[at:end])
+            parts.append(data[at:end])
         if kind == PNG_PIXELS[-1]:
             break
         at = end
-    return b"".join(kept)
+    return b"".join(parts)
 
 
 @contextmanager

@@ -16,9 +16,9 @@ from torch import Tensor
 
 from aaplug.core.cameras import Camera, Lens
 
-HALF = 0.5  # px: the centre of OpenCV's first pixel is 0
-LEAST_SHARE = 0.5  # of a side: a photograph that covers less of its pinhole's view is not used
-MAPS = 8  # of lenses kept, since most photographs share one
+HALF_PIXEL = 0.5  # px: the centre of OpenCV's first pixel is 0
+MIN_SHARE = 0.5  # of a side: a photograph that covers less of its pinhole's view is not used
+CACHED_LENSES = 8  # since most photographs share one
 
 
 @dataclass(frozen=True)
@@ -57,12 +57,11 @@ def lens_notes(distortions: Sequence[Distortion | None], cameras: Sequence[Camer
     if not pairs:
         return []
     models = ", ".join(sorted({lens.name for lens, _ in pairs}))
-    photographed = [camera for _, camera in pairs if camera.photo]
+    straight = sum(camera.photo is not None for _, camera in pairs)
     what = "their photos are undistorted (OpenCV) and cropped to what they cover"
-    if len(photographed) < len(pairs):
-        what = "photos whose distortion OpenCV lacks are not used; colmap image_undistorter converts them"
-        if photographed:
-            what = f"{len(photographed)} photos are undistorted; other {what}"
+    if straight < len(pairs):
+        lost = "photos whose distortion OpenCV lacks are not used; colmap image_undistorter converts them"
+        what = f"{straight} photos are undistorted; other {lost}" if straight else lost
     distort = f"{len(pairs)} cameras have a lens that distorts ({models})"
     return [f"{distort}: renders are of the pinhole at its centre; {what}"]
 
@@ -80,16 +79,16 @@ def _undistorted(camera: Camera, lens: Distortion) -> Camera:
     return replace(camera, width=width, height=height, cx=cx, cy=cy, lens=replace(whole, window=window))
 
 
-@lru_cache(MAPS)
+@lru_cache(CACHED_LENSES)
 def _window(whole: Lens) -> tuple[int, int, int, int] | None:
-    """Left, top, width and height of the pinhole's view that the photograph covers; None if less than LEAST_SHARE."""
+    """Left, top, width and height of the pinhole's view that the photograph covers; None if less than MIN_SHARE."""
     width, height = whole.size
     x, y = _maps(whole, width, height)
-    outside = ~((x >= -HALF) & (x <= width - HALF) & (y >= -HALF) & (y <= height - HALF))
+    outside = ~((x >= -HALF_PIXEL) & (x <= width - HALF_PIXEL) & (y >= -HALF_PIXEL) & (y <= height - HALF_PIXEL))
     x0, y0, x1, y1 = 0, 0, width, height
-    while x1 - x0 >= LEAST_SHARE * width and y1 - y0 >= LEAST_SHARE * height:
-        seen = outside[y0:y1, x0:x1]
-        sides = [side.mean() for side in (seen[:, 0], seen[0], seen[:, -1], seen[-1])]
+    while x1 - x0 >= MIN_SHARE * width and y1 - y0 >= MIN_SHARE * height:
+        inner = outside[y0:y1, x0:x1]
+        sides = [side.mean() for side in (inner[:, 0], inner[0], inner[:, -1], inner[-1])]
         worst = int(np.argmax(sides))
         if sides[worst] == 0:
             return x0, y0, x1 - x0, y1 - y0
@@ -98,23 +97,23 @@ def _window(whole: Lens) -> tuple[int, int, int, int] | None:
     return None
 
 
-@lru_cache(MAPS)
+@lru_cache(CACHED_LENSES)
 def _maps(lens: Lens, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
     """For each pixel of the pinhole's window, x and y in a photograph of width × height px, in OpenCV's pixels."""
     scale = width / lens.size[0], height / lens.size[1]
     left, top, *window = lens.window
     size = tuple(max(1, round(side * s)) for side, s in zip(window, scale, strict=True))
-    own = _matrix(lens.pinhole, (0, 0), scale)
-    seen = _matrix(lens.pinhole, (left, top), tuple(a / b for a, b in zip(size, window, strict=True)))
-    coefficients = np.array(lens.coefficients)
-    find = cv2.fisheye.initUndistortRectifyMap if lens.fisheye else cv2.initUndistortRectifyMap
-    x, y = find(own, coefficients, np.eye(3), seen, size, cv2.CV_32FC1)
+    zoom = tuple(a / b for a, b in zip(size, window, strict=True))
+    photo, pinhole = (_matrix(lens.pinhole, *each) for each in (((0, 0), scale), ((left, top), zoom)))
+    maps = cv2.fisheye.initUndistortRectifyMap if lens.fisheye else cv2.initUndistortRectifyMap
+    x, y = maps(photo, np.array(lens.coefficients), np.eye(3), pinhole, size, cv2.CV_32FC1)
     return x, y
 
 
 def _matrix(
     pinhole: tuple[float, float, float, float], corner: tuple[int, int], scale: tuple[float, ...]
 ) -> np.ndarray:
+    """Intrinsics in OpenCV's pixels of an image that begins at `corner` and is `scale` times as dense."""
     fx, fy, cx, cy = pinhole
-    x, y = (cx - corner[0]) * scale[0] - HALF, (cy - corner[1]) * scale[1] - HALF
+    x, y = (cx - corner[0]) * scale[0] - HALF_PIXEL, (cy - corner[1]) * scale[1] - HALF_PIXEL
     return np.array([[fx * scale[0], 0, x], [0, fy * scale[1], y], [0, 0, 1]])

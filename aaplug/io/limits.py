@@ -9,7 +9,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from aaplug.core.errors import UsageError
+from aaplug.system.errors import UsageError
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ def whole_limit(name: str) -> int:
 
 
 def lack_of_memory(needed: int | float) -> str | None:
-    """Why this machine cannot hold so many bytes, in words; None if it can, or does not say what it has."""
+    """The reason that this machine cannot hold so many bytes, in words; None if it can, or its memory is unknown."""
     memory, share = memory_of_machine(), limit("MEMORY_SHARE")
     if memory is None or needed <= share * memory:
         return None

@@ -15,15 +15,15 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from aaplug.core.cameras import Lens
-from aaplug.core.errors import UsageError
-from aaplug.core.imaging import WHOLE, box_average, levels, quantised, resampled
+from aaplug.core.cameras import WHOLE_SLACK, Lens
+from aaplug.core.imaging import box_average, levels, quantised, resampled
 from aaplug.io.images import read_image, read_rgba
 from aaplug.io.lenses import undistorted
+from aaplug.system.errors import UsageError
 
 At = Callable[[tuple[int, int], float], Float[Tensor, "h w 3"]]
 Background = tuple[float, float, float]
-LEVELS = 255  # highest level of 8 bits
+MAX_LEVEL = 255  # of 8 bits
 
 
 @dataclass(frozen=True)
@@ -36,6 +36,13 @@ class Photograph:
 
     hw: tuple[int, int]
     at: At
+
+    def factor(self, view: Camera, scale: float) -> float:
+        """The density, relative to the photograph's own, of pixels `scale` times as dense as those of its view.
+
+        A photograph may be larger or smaller than the size at which its view was trained.
+        """
+        return scale * view.width / self.hw[1]
 
 
 @dataclass(frozen=True)
@@ -52,6 +59,16 @@ def read_photo(path: str | PathLike[str], background: Background, lens: Lens | N
     return quantised(undistorted(read_image(path, background), lens))
 
 
+def photo_at(view: Camera, resized: Camera, background: Background) -> Float[Tensor, "h w 3"]:
+    """Read the photograph of a view at the size of `resized`, the same view with pixels denser or sparser.
+
+    Below the photograph's own size its pixels are averaged; above it they are interpolated (bicubic, which overshoots).
+    """
+    assert view.photo is not None
+    photograph = _box(view.photo, background, view.lens)
+    return photograph.at(resized.hw, photograph.factor(view, resized.fx / view.fx))
+
+
 def _box(path: Path, background: Background, lens: Lens | None = None) -> Photograph:
     photo = read_photo(path, background, lens)
     return Photograph((photo.shape[0], photo.shape[1]), lambda hw, factor: resampled(photo, factor, hw))
@@ -64,20 +81,19 @@ def _rgba_box(path: Path, background: Background, lens: Lens | None = None) -> P
 
     def at(hw: tuple[int, int], factor: float) -> Float[Tensor, "h w 3"]:
         depth = round(math.log2(1 / factor))
-        if abs(factor * 2**depth - 1) > WHOLE:
+        if abs(factor * 2**depth - 1) > WHOLE_SLACK:
             raise UsageError("scale", f"{factor:g} is not a power of 1/2, as multi-scale Blender data needs")
         while len(halves) <= depth:
             halves.append(box_average(halves[-1], 2))
-        saved = _truncated(halves[depth])[: hw[0], : hw[1]]
-        return _truncated(saved[..., :3] * saved[..., 3:] + behind * (1 - saved[..., 3:]))
+        saved = truncated(halves[depth])[: hw[0], : hw[1]]
+        return truncated(saved[..., :3] * saved[..., 3:] + behind * (1 - saved[..., 3:]))
+
+    def truncated(values: Tensor) -> Tensor:
+        """Truncate to 8 bits; the slack keeps a whole level that float32 rounded down."""
+        return (values * MAX_LEVEL + 1e-3).floor() / MAX_LEVEL
 
     height, width, _ = halves[0].shape
     return Photograph((height, width), at)
-
-
-def _truncated(values: Tensor) -> Tensor:
-    """Truncate to 8 bits; the slack keeps a whole level that float32 rounded down."""
-    return (values * LEVELS + 1e-3).floor() / LEVELS
 
 
 def _pil_bicubic(path: Path, background: Background, lens: Lens | None = None) -> Photograph:
@@ -87,7 +103,7 @@ def _pil_bicubic(path: Path, background: Background, lens: Lens | None = None) -
 
     def at(hw: tuple[int, int], factor: float) -> Float[Tensor, "h w 3"]:
         small = picture.resize((hw[1], hw[0]), Image.Resampling.BICUBIC)
-        return torch.from_numpy(np.array(small, dtype=np.float32) / LEVELS)
+        return torch.from_numpy(np.array(small, dtype=np.float32) / MAX_LEVEL)
 
     return Photograph((photo.shape[0], photo.shape[1]), at)
 
@@ -95,8 +111,9 @@ def _pil_bicubic(path: Path, background: Background, lens: Lens | None = None) -
 BOX = "box average (area-weighted where the factor is not whole), after compositing and 8-bit rounding"
 RGBA_BOX = "RGBA halved by 2×2 box means in float, cut to 8 bits, composited, cut again (multi-scale Blender data)"
 PIL_BICUBIC = "Pillow's antialiased bicubic on the 8-bit photograph, in 8 bits (3DGS's -r)"
-DOWNSCALES = {
-    "box": Downscale("box", BOX, _box),
-    "rgba-box": Downscale("rgba-box", RGBA_BOX, _rgba_box),
-    "pil-bicubic": Downscale("pil-bicubic", PIL_BICUBIC, _pil_bicubic),
-}
+METHODS = [
+    Downscale("box", BOX, _box),
+    Downscale("rgba-box", RGBA_BOX, _rgba_box),
+    Downscale("pil-bicubic", PIL_BICUBIC, _pil_bicubic),
+]
+DOWNSCALES = {method.name: method for method in METHODS}

@@ -16,8 +16,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.errors import FormatError, reason
 from aaplug.io.limits import whole_limit
+from aaplug.system.errors import FormatError, reason
 
 Value = TypeVar("Value")
 
@@ -149,8 +149,12 @@ def read_json(path: Path) -> Any:
 
 def parse_json(data: bytes, path: Path) -> Any:
     """The JSON in these bytes of the file `path`."""
+
+    def refuse(constant: str) -> NoReturn:
+        raise ValueError(f"{constant} is not a finite number")
+
     try:
-        return json.loads(data.decode("utf-8-sig"), parse_constant=_refuse)
+        return json.loads(data.decode("utf-8-sig"), parse_constant=refuse)
     except (RecursionError, MemoryError) as error:
         raise FormatError(path, "its JSON is nested too deeply") from error
     except ValueError as error:
@@ -175,13 +179,9 @@ def entries(path: Path, what: str, items: object, shared: dict[str, Any] | None 
 
 
 def mentions(path: Path, keys: Sequence[str]) -> bool:
-    """Whether one of these JSON keys stands in the first bytes of the file; False if it cannot be read."""
+    """True if one of these JSON keys stands in the first bytes of the file; False if it cannot be read."""
     try:
         start = read_start(path, HEAD_LIMIT)
     except FormatError:
         return False
     return any(f'"{key}"'.encode() in start for key in keys)
-
-
-def _refuse(constant: str) -> NoReturn:
-    raise ValueError(f"{constant} is not a finite number")

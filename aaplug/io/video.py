@@ -14,10 +14,10 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.choices import MOST_FPS
-from aaplug.core.errors import OutputError, UsageError
 from aaplug.core.imaging import levels
+from aaplug.io import MOST_FPS
 from aaplug.io.atomic import check_output, replacing_file
+from aaplug.system.errors import OutputError, UsageError
 
 if TYPE_CHECKING:
     from av import VideoStream
@@ -27,11 +27,11 @@ CODECS = {  # by suffix: FFmpeg's name and settings; `crf` is a constant quality
     ".webm": ("libvpx-vp9", {"crf": "24", "b": "0", "row-mt": "1", "cpu-used": "4"}),
     ".mp4": ("libx264", {"crf": "18"}),
 }
-PIXELS = "yuv420p"  # the pixel format that every player supports
+PIXEL_FORMAT = "yuv420p"  # that every player supports
 BT709 = 1  # its code for matrix, primaries and transfer in ITU-T H.273
 MPEG_RANGE = 1  # FFmpeg's AVCOL_RANGE_MPEG: black is 16, white is 235
-MOST_DENOMINATOR = 1001  # of frames per second, as in 30000/1001
-SAME_BYTES = {"fflags": "+bitexact"}  # no random track number, no version: the same frames make the same file
+MAX_DENOMINATOR = 1001  # of frames per second, as in 30000/1001
+BIT_EXACT = {"fflags": "+bitexact"}  # no random track number, no version: the same frames make the same file
 
 
 def check_video(path: str | PathLike[str], fps: float, overwrite: bool) -> None:
@@ -54,17 +54,10 @@ def write_video(
     """Write a video of at least one frame; errors as in `check_video`, and OutputError if it cannot be written."""
     check_video(path, fps, overwrite)
     with replacing_file(path, overwrite, Path(path).suffix.lower()) as temporary:
-        _encode(temporary, (_even(frame) for frame in frames), fps)
+        _encode(temporary, frames, fps)
 
 
-def _even(frame: Float[Tensor, "h w 3"]) -> np.ndarray:
-    """8-bit RGB with even sides."""
-    pixels = levels(frame, 8).byte().cpu().numpy()
-    height, width, _ = pixels.shape
-    return np.pad(pixels, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
-
-
-def _encode(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
+def _encode(path: Path, frames: Iterable[Float[Tensor, "h w 3"]], fps: float) -> None:
     """Convert to BT.709 with rounding, and say so in the file: players then show white as white."""
     import av  # it loads FFmpeg
     from av.error import FFmpegError
@@ -72,12 +65,15 @@ def _encode(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
 
     range_and_matrix = {"dst_color_range": ColorRange.MPEG, "dst_colorspace": Colorspace.ITU709}
     try:
-        with av.open(str(path), "w", options=SAME_BYTES) as container:
+        with av.open(str(path), "w", options=BIT_EXACT) as container:
             stream = None
             for frame in frames:
-                stream = stream or _added_stream(container, path.suffix, frame.shape[1], frame.shape[0], fps)
-                picture = av.VideoFrame.from_ndarray(frame, format="rgb24")
-                container.mux(stream.encode(picture.reformat(format=PIXELS, **range_and_matrix)))
+                pixels = levels(frame, 8).byte().cpu().numpy()
+                height, width, _ = pixels.shape
+                pixels = np.pad(pixels, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+                stream = stream or _added_stream(container, path.suffix, pixels.shape[1], pixels.shape[0], fps)
+                picture = av.VideoFrame.from_ndarray(pixels, format="rgb24")
+                container.mux(stream.encode(picture.reformat(format=PIXEL_FORMAT, **range_and_matrix)))
             if stream is not None:
                 container.mux(stream.encode())
     except FFmpegError as error:
@@ -86,9 +82,9 @@ def _encode(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
 
 def _added_stream(container: "OutputContainer", suffix: str, width: int, height: int, fps: float) -> "VideoStream":
     name, settings = CODECS[suffix]
-    rate = Fraction(fps).limit_denominator(MOST_DENOMINATOR)
+    rate = Fraction(fps).limit_denominator(MAX_DENOMINATOR)
     stream = cast("VideoStream", container.add_stream(name, rate, options=settings))
-    stream.width, stream.height, stream.pix_fmt = width, height, PIXELS
+    stream.width, stream.height, stream.pix_fmt = width, height, PIXEL_FORMAT
     colours = stream.codec_context
     colours.color_range, colours.colorspace = MPEG_RANGE, BT709
     colours.color_primaries = colours.color_trc = BT709

@@ -1,9 +1,10 @@
 """Clusters: groups of Gaussians, each as the one Gaussian that has the group's moments.
 
-n: clusters.  A cluster is kept as training saw it, with training's dilation in its covariance (`seen`), because many
-Gaussians are thinner than the pixel that they were trained with.  `alone` takes the dilation out again.
+n: clusters.  A cluster is kept as training saw it, with training's dilation in its covariance, because many Gaussians
+are thinner than the pixel that they were trained with.  `gaussians_of` takes the dilation out again.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -11,34 +12,28 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import MIN_OPACITY, Gaussians
 from aaplug.core.rules import RULES_3DGS
+from aaplug.core.sampling import median_rates
 from aaplug.core.spherical_harmonics import COLOUR_OFFSET, SH_C0
-from aaplug.levels.covariances import (
-    Packed,
-    area,
-    areas,
-    blurred,
-    covariances,
-    outer,
-    overlaps,
-    packed,
-    quats_of,
-    unpacked,
-)
+from aaplug.levels.covariances import Packed, area, areas, blur, covariances, outer, overlaps, pack, quats_of, unpack
+from aaplug.system.errors import FrameError
 
 MAX_OPACITY = RULES_3DGS.max_alpha  # of a merged Gaussian; no renderer shows more
-# power of what an opacity exceeds its cap by, of which the area of the Gaussian grows.  1 keeps its energy when it is
-# seen alone, 0 its size.  Beside others, which overlap what it gains, the half is best (examples/guides/levels.md)
-WIDENING = 0.5
-LARGEST = 1e6  # px: what is larger looks the same, but its squared area overflows float32
-# visible share where nothing is known: its square, 0.08, lies between the means of two scenes, 0.05 and 0.19
-USUAL = 0.28
-LEAST_VISIBLE = 1e-3  # what is hidden still has a place and a colour
-THINNEST = 0.02  # px: standard deviation to which the dilation is taken out at most
+# An opacity above MAX_OPACITY is divided by its excess, and the Gaussian's area grows by this power of the excess.  The
+# power 1 keeps the energy of a Gaussian alone, 0 keeps its size.  Others overlap what it gains, so that one half is
+# best beside them (examples/guides/levels.md)
+WIDENING_POWER = 0.5
+MAX_SIGMA = 1e6  # px: what is larger looks the same, but its squared area overflows float32
+# The visible share of a Gaussian of which nothing is known.  Its square, 0.08, lies between the means of two scenes,
+# 0.05 and 0.19
+USUAL_VISIBLE = 0.28
+MIN_VISIBLE = 1e-3  # a hidden Gaussian still has a place and a colour
+MIN_SIGMA = 0.02  # px: no standard deviation is less once the dilation is taken out
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Clusters:
     """Clusters in one order, which their labels refer to.
 
@@ -46,7 +41,7 @@ class Clusters:
     covs: as training saw them.
     opacities: of the cluster alone, as training saw it.  Above 1, only a wider Gaussian has this energy: see `opaque`.
     visible: share of the cluster's light that views show, from 0 to 1.
-    weights: summed opacity times projected area times visible share of the Gaussians, in squared world units.
+    weights: sums of the Gaussians' opacity times projected area times visible share, in squared world units.
     colours: weighted mean, without view dependence.
     rates: training's sampling rate, px per world unit.
     chunks: the chunk of each; clusters of different ones are not merged.
@@ -77,12 +72,25 @@ class Clusters:
 
     @cached_property
     def opaque(self) -> "Clusters":
-        """The same energies with opacities of at most `MAX_OPACITY`: what exceeds it goes into the area."""
+        """The same energies with opacities of at most `MAX_OPACITY`; the excess goes into the area."""
         excess = (self.opacities / MAX_OPACITY).clamp(min=1)
         return replace(self, covs=self.covs * excess[:, None], opacities=self.opacities / excess)
 
 
-def seen(
+def rates_of(scene: Gaussians, cameras: Sequence[Camera]) -> Float[Tensor, " n"]:
+    """Median rate over the cameras that see a Gaussian, px per world unit; the lowest of these for one that none sees.
+
+    Raises:
+        FrameError: no camera sees any.
+    """
+    rates = median_rates(scene.means, cameras)
+    positive = rates[rates > 0]
+    if not len(positive):
+        raise FrameError(scene.name, f"none of its Gaussians is seen by any of the {len(cameras)} cameras")
+    return torch.where(rates > 0, rates, positive.min())
+
+
+def clusters_of(
     scene: Gaussians,
     rates: Float[Tensor, " n"],
     chunks: Int[Tensor, " n"] | None = None,
@@ -93,28 +101,30 @@ def seen(
     chunks: see `Clusters`; None for one of all.
     visible: see `visibility`; NaN where nothing is known, None for all of each Gaussian.
     """
-    largest = (LARGEST / rates).log()[:, None].to(scene.log_scales)
-    raw = covariances(replace(scene, log_scales=scene.log_scales.minimum(largest)))
-    covs = blurred(raw, scene.convention.kernel / rates.square())
+    max_log_scales = (MAX_SIGMA / rates).log()[:, None].to(scene.log_scales)
+    raw = covariances(replace(scene, log_scales=scene.log_scales.minimum(max_log_scales)))
+    covs = blur(raw, scene.convention.kernel / rates.square())
     opacities = scene.opacities
     if scene.convention.compensated:
         opacities = opacities * area(raw) / area(covs)
-    visible = torch.ones_like(opacities) if visible is None else visible.nan_to_num(USUAL).clamp(min=LEAST_VISIBLE)
+    visible = (
+        torch.ones_like(opacities) if visible is None else visible.nan_to_num(USUAL_VISIBLE).clamp(min=MIN_VISIBLE)
+    )
     weights = opacities.clamp(min=MIN_OPACITY) * area(covs) * visible
     colours = COLOUR_OFFSET + SH_C0 * scene.sh[:, 0]
-    own = torch.arange(len(scene))
-    chunks = torch.zeros_like(own) if chunks is None else chunks
-    return Clusters(scene.means.double(), covs, opacities, visible, weights, colours, rates, chunks, own)
+    labels = torch.arange(len(scene))
+    chunks = torch.zeros_like(labels) if chunks is None else chunks
+    return Clusters(scene.means.double(), covs, opacities, visible, weights, colours, rates, chunks, labels)
 
 
-def merged_pairs(a: Clusters, b: Clusters) -> Clusters:
+def merge_pairs(a: Clusters, b: Clusters) -> Clusters:
     """Merge each cluster of `a` with the one of `b` at its place; the labels are those of `a`.
 
     Mean, covariance and colour are the pair's moments under its weights.  Alone, the result has the pair's energy: the
     integral of the alpha of both together, a + b - a b, over a plane across the view, as a mean over three directions.
-    What views show of either counts, so that what is hidden adds nothing to what is seen.
+    Each cluster counts by its visible share, so that a hidden one adds nothing to a visible one.
     """
-    weights, share, covs = paired(a, b)
+    weights, share, covs = pair_moments(a, b)
     first, second = a.opaque, b.opaque
     offsets = (b.means - a.means).to(covs)
     visible = b.visible.lerp(a.visible, share)
@@ -133,7 +143,7 @@ def merged_pairs(a: Clusters, b: Clusters) -> Clusters:
     )
 
 
-def paired(a: Clusters, b: Clusters) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"], Packed]:
+def pair_moments(a: Clusters, b: Clusters) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"], Packed]:
     """Weight of each pair, the share that `a` has in it, and the covariance with the spread of both means."""
     weights = a.weights + b.weights
     share = torch.where(weights > 0, a.weights / weights, 0.5)
@@ -141,54 +151,48 @@ def paired(a: Clusters, b: Clusters) -> tuple[Float[Tensor, " n"], Float[Tensor,
     return weights, share, one * a.covs + other * b.covs + one * other * outer((b.means - a.means).to(a.covs))
 
 
-def alone(clusters: Clusters, scene: Gaussians, weights: Float[Tensor, " m"]) -> Gaussians:
+def gaussians_of(clusters: Clusters, scene: Gaussians, weights: Float[Tensor, " m"]) -> Gaussians:
     """The scene of these clusters; one of a single Gaussian is that Gaussian, to the bit.
 
-    weights: of the scene's Gaussians, as `seen` gives them.
+    weights: of the scene's Gaussians, as `clusters_of` gives them.
     """
     counts = torch.bincount(clusters.labels, minlength=len(clusters))
     order = torch.argsort(clusters.labels, stable=True)
     first = order[counts.cumsum(0) - counts]
     many = (counts > 1).nonzero()[:, 0]
-    whole = replace(scene, origin=None, pixel_sizes=None)[first]
-    columns = {name: column.clone() for name, column in whole.columns.items()}
+    columns = {name: column[first] for name, column in scene.columns.items()}
     for name, values in _shapes(clusters[many], scene).items():
         columns[name][many] = values.to(columns[name])
     columns["sh"][many] = _mean_harmonics(scene, clusters, weights)[many]
-    return replace(whole, **columns)
+    return replace(scene, **columns, origin=None, extras={})
 
 
 def _shapes(clusters: Clusters, scene: Gaussians) -> dict[str, Tensor]:
     """Columns of the Gaussians that training would have seen as these clusters."""
     excess = (clusters.opacities / MAX_OPACITY).clamp(min=1).double()
-    shown = clusters.covs.double() * excess.pow(WIDENING)[:, None]
+    covs = clusters.covs.double() * excess.pow(WIDENING_POWER)[:, None]
     px2 = clusters.rates.double().square()
-    variances, axes = torch.linalg.eigh(unpacked(blurred(shown, -scene.convention.kernel / px2)))
-    variances = variances.maximum((THINNEST**2 / px2)[:, None])
+    variances, axes = torch.linalg.eigh(unpack(blur(covs, -scene.convention.kernel / px2)))
+    variances = variances.maximum((MIN_SIGMA**2 / px2)[:, None])
     axes = axes * torch.linalg.det(axes)[:, None, None]  # a reflection becomes a rotation
     opacities = clusters.opacities / excess
     if scene.convention.compensated:
-        opacities = opacities * area(shown) / area(packed((axes * variances[:, None]) @ axes.mT))
+        opacities = opacities * area(covs) / area(pack((axes * variances[:, None]) @ axes.mT))
     logits = opacities.clamp(MIN_OPACITY, MAX_OPACITY).logit()
-    return {
-        "means": clusters.means,
-        "quats": quats_of(axes),
-        "log_scales": 0.5 * variances.log(),
-        "logit_opacities": logits,
-    }
+    log_scales = 0.5 * variances.log()
+    return {"means": clusters.means, "quats": quats_of(axes), "log_scales": log_scales, "logit_opacities": logits}
 
 
 def _mean_harmonics(scene: Gaussians, clusters: Clusters, weights: Float[Tensor, " m"]) -> Float[Tensor, "n k 3"]:
     """Weighted mean of the harmonics, one coefficient after the other, so that little memory is taken at once."""
+
+    def sums(values: Float[Tensor, " m"]) -> Float[Tensor, " n"]:
+        return values.new_zeros(len(clusters)).index_add_(0, clusters.labels, values)
+
     weights = weights.double()
-    total = _summed(weights, clusters)
-    found = scene.sh.new_empty(len(clusters), *scene.sh.shape[1:])
+    total = sums(weights)
+    means = scene.sh.new_empty(len(clusters), *scene.sh.shape[1:])
     for k in range(scene.sh.shape[1]):
         for channel in range(3):
-            found[:, k, channel] = _summed(scene.sh[:, k, channel] * weights, clusters) / total
-    return found
-
-
-def _summed(values: Float[Tensor, " m"], clusters: Clusters) -> Float[Tensor, " n"]:
-    """Sum over the Gaussians of each cluster."""
-    return values.new_zeros(len(clusters)).index_add_(0, clusters.labels, values)
+            means[:, k, channel] = sums(scene.sh[:, k, channel] * weights) / total
+    return means

@@ -1,7 +1,7 @@
-"""Covariances in the world and their shadows: what a Gaussian covers, seen along each of the world's axes.
+"""Covariances in the world, and their projections along each of its axes.
 
-n: Gaussians.  A covariance is packed as (xx, xy, xz, yy, yz, zz), in squared world units.  Seen from far along an axis,
-a Gaussian is a 2D one whose covariance is a minor of the packed one, so every integral below has a closed form.
+n: Gaussians.  A covariance is packed as (xx, xy, xz, yy, yz, zz), in squared world units.  From far along an axis, a
+Gaussian is a 2D one whose covariance is a minor of the packed one, so every integral below has a closed form.
 """
 
 import math
@@ -16,7 +16,7 @@ from aaplug.core.projection import rotation_matrices
 
 PLACES = ((0, 1, 2), (1, 3, 4), (2, 4, 5))  # of a matrix's elements in the packed form
 DIAGONAL = tuple(PLACES[i][i] for i in range(3))
-AXES = ((0, 1), (1, 2), (2, 0))  # of the planes seen along z, x and y
+PLANES = ((0, 1), (1, 2), (2, 0))  # axes of the planes across z, x and y
 
 Packed = Float[Tensor, "n 6"]
 
@@ -24,15 +24,15 @@ Packed = Float[Tensor, "n 6"]
 def covariances(scene: Gaussians) -> Packed:
     """Covariance of each Gaussian as its file stores it."""
     factors = rotation_matrices(scene.unit_quats) * scene.scales[:, None, :]
-    return packed(factors @ factors.mT)
+    return pack(factors @ factors.mT)
 
 
-def packed(matrices: Float[Tensor, "n 3 3"]) -> Packed:
+def pack(matrices: Float[Tensor, "n 3 3"]) -> Packed:
     """The upper triangle of symmetric matrices."""
     return torch.stack([matrices[:, i, j] for i in range(3) for j in range(i, 3)], dim=1)
 
 
-def unpacked(covs: Packed) -> Float[Tensor, "n 3 3"]:
+def unpack(covs: Packed) -> Float[Tensor, "n 3 3"]:
     """The symmetric matrices again."""
     return covs[:, torch.tensor(PLACES)]
 
@@ -42,8 +42,8 @@ def outer(offsets: Float[Tensor, "n 3"]) -> Packed:
     return torch.stack([offsets[:, i] * offsets[:, j] for i in range(3) for j in range(i, 3)], dim=1)
 
 
-def blurred(covs: Packed, variance: Float[Tensor, " n"]) -> Packed:
-    """Covariances after an isotropic blur, or with a negative variance before one."""
+def blur(covs: Packed, variance: Float[Tensor, " n"]) -> Packed:
+    """Covariances after an isotropic blur; a negative variance takes one out."""
     wider = covs.clone()
     for place in DIAGONAL:
         wider[:, place] += variance
@@ -51,7 +51,7 @@ def blurred(covs: Packed, variance: Float[Tensor, " n"]) -> Packed:
 
 
 def _minors(covs: Packed) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    for i, j in AXES:
+    for i, j in PLANES:
         yield covs[:, PLACES[i][i]], covs[:, PLACES[i][j]], covs[:, PLACES[j][j]]
 
 
@@ -71,15 +71,15 @@ def overlaps(total: Packed, offsets: Float[Tensor, "n 3"] | None = None) -> Floa
 
     total: the sum of their covariances.  offsets: between their means; None for none.
     """
-    found = []
-    for (i, j), (a, b, c) in zip(AXES, _minors(total), strict=True):
+    integrals = []
+    for (i, j), (a, b, c) in zip(PLANES, _minors(total), strict=True):
         det = (a * c - b * b).clamp(min=torch.finfo(a.dtype).tiny)
         peak = 1 / (2 * math.pi * det.sqrt())
         if offsets is not None:
             x, y = offsets[:, i], offsets[:, j]
             peak = peak * torch.exp(-0.5 * (c * x * x - 2 * b * x * y + a * y * y) / det)
-        found.append(peak)
-    return torch.stack(found, dim=1)
+        integrals.append(peak)
+    return torch.stack(integrals, dim=1)
 
 
 def quats_of(rotations: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 4"]:

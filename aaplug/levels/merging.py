@@ -7,28 +7,28 @@ the scene's order nor on the number of threads.
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from aaplug.core.errors import UsageError
+from aaplug.core.chunks import curve
 from aaplug.core.gaussians import Fusion, Gaussians, joined
-from aaplug.core.monitor import Tell
 from aaplug.levels.clusters import Clusters, alone, merged_pairs, seen
 from aaplug.levels.covariances import areas, blurred, covariances
-from aaplug.levels.pairing import Edges, curve, edges_below, matched
-from aaplug.methods.filters import PIXEL_VARIANCE, fuse_stored
-from aaplug.methods.viewers import MERGED
+from aaplug.levels.pairing import Edges, edges_below, matched
+from aaplug.methods.conversion import MERGED
+from aaplug.methods.filters.matched import PIXEL_VARIANCE
+from aaplug.methods.filters.smoothing import fuse_stored
+from aaplug.system.errors import UsageError
+from aaplug.system.monitor import Tell
 
-ENOUGH = 0.02  # of the clusters: after a round that merges fewer, more is allowed to change
+MIN_MERGED_SHARE = 0.02  # of the clusters: after a round that merges fewer, more is allowed to change
 TOLERANCE = 8e-6  # px² of the level: squared change of the image, from 0 to 1, by one pair as views show it
 FIRST_SHARE = 0.01  # of the tolerance in the first rounds, so that a bad pair does not go before a better one
-FIRST, LAST = 1e-7, 1e3  # px²: tolerances of the first rounds and of the last but one, where a count is asked for
-STEP = 10.0  # from one tolerance to the next
-BATCH = 1 << 17  # Gaussians merged at once where chunks are kept apart: some 300 MB
+FIRST_OF_COUNT, LAST_OF_COUNT = 1e-7, 1e3  # px²: first and last but one tolerance, where a count is asked for
+TOLERANCE_STEP = 10.0  # from one tolerance to the next
+GAUSSIANS_PER_BATCH = 1 << 17  # of whole chunks, merged at once: some 300 MB
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,7 @@ class Goal:
     rate: sampling rate relative to training's at which the result is shown.
     count: how many Gaussians to leave; None for as many as `tolerance` asks.
     tolerance: ∫ of the squared change of the image that merging a pair may make, in px² at that rate.
-    smallest: px at that rate; pairs whose merged Gaussian has no larger standard deviation are merged whatever they
-        change.
+    smallest: px at that rate; a pair is merged at any cost if the result has no larger standard deviation.
     """
 
     rate: float
@@ -49,16 +48,18 @@ class Goal:
 
     @classmethod
     def of_count(cls, count: int, scene: Gaussians) -> "Goal":
-        """So many Gaussians: a quarter of them is meant for half the size, as on a surface."""
+        """The goal of so many Gaussians: a quarter of them is meant for half the size, as on a surface."""
         return cls(min(1.0, math.sqrt(count / max(1, len(scene)))), count)
 
     @property
     def tolerances(self) -> Iterator[float]:
-        """What a pair may change in the rounds, one after another."""
-        now, last = (FIRST_SHARE * self.tolerance, self.tolerance) if self.count is None else (FIRST, LAST)
-        while now < last:
-            yield now
-            now *= STEP
+        """The tolerance of each round, in px²."""
+        tolerance, last = FIRST_SHARE * self.tolerance, self.tolerance
+        if self.count is not None:
+            tolerance, last = FIRST_OF_COUNT, LAST_OF_COUNT
+        while tolerance < last:
+            yield tolerance
+            tolerance *= TOLERANCE_STEP
         yield self.tolerance
 
     @classmethod
@@ -67,14 +68,7 @@ class Goal:
         return cls(0.5**level, tolerance=TOLERANCE, smallest=smallest)
 
 
-class Merged(NamedTuple):
-    """A lighter scene, and the chunk of each of its Gaussians, ascending."""
-
-    scene: Gaussians
-    chunks: Int[Tensor, " n"]
-
-
-def merged(
+def merge(
     scene: Gaussians,
     rates: Float[Tensor, " n"],
     goal: Goal,
@@ -84,67 +78,85 @@ def merged(
     """A lighter scene, with a record of it; the scene itself if nothing is to be merged.
 
     rates: training's sampling rate of each Gaussian, px per world unit; see `rates_of`.
-    visible: how much of each Gaussian views show, see `visibility`; None where nothing is known of any.
+    visible: share of each Gaussian that views show, see `visibility`; None where nothing is known of any.
 
     Raises:
         UsageError: the scene holds 2D Gaussians.
     """
     if len(scene) <= (goal.count or 1) and not scene.flat:
         return scene
-    return merged_in_chunks(scene, rates, torch.zeros(len(scene), dtype=torch.int64), goal, tell, visible).scene
+    return merge_in_chunks(scene, rates, torch.zeros(len(scene), dtype=torch.int64), goal, tell, visible)[0]
 
 
-def merged_in_chunks(
+def merge_in_chunks(
     scene: Gaussians,
     rates: Float[Tensor, " n"],
     chunks: Int[Tensor, " n"],
     goal: Goal,
     tell: Tell = lambda done, total: None,
     visible: Float[Tensor, " n"] | None = None,
-) -> Merged:
-    """A lighter scene in which no Gaussian stands for those of different chunks; see `merged`."""
+) -> tuple[Gaussians, Int[Tensor, " m"]]:
+    """A lighter scene and the chunk of each of its Gaussians, ascending; see `merge`.
+
+    No Gaussian of it stands for those of different chunks.
+    """
     if scene.flat:
         raise UsageError(scene.name, "holds 2D Gaussians, which cannot be merged")
     scene = fuse_stored(scene)
     if visible is None:
         visible = torch.full((len(scene),), torch.nan)
     order = _order(scene, chunks)
-    parts: list[Merged] = []
-    for start, stop in _batches(chunks[order]):
-        own, said = order[start:stop], partial(_told, tell, start, len(scene) - (goal.count or 0))
-        clusters = seen(scene[own], rates[own], chunks[own], visible[own])
-        parts.append(_merged_batch(clusters, scene[own], goal, said))
-    found = replace(joined([part.scene for part in parts]), origin=None)
-    record = Fusion(MERGED, {"rate": f"{goal.rate:.4g}", "from": str(len(scene))})
-    return Merged(replace(found, fused=(*scene.fused, record)), torch.cat([part.chunks for part in parts]))
+    along, total = chunks[order], len(scene) - (goal.count or 0)
+    parts, start = [], 0
+    while start < len(scene):
+        last = along[min(start + GAUSSIANS_PER_BATCH, len(scene)) - 1]
+        stop = int(torch.searchsorted(along, last, right=True))
+        batch = order[start:stop]
 
+        def tell_batch(done: int, start: int = start) -> None:
+            tell(min(start + done, total), total)
 
-def _told(tell: Tell, start: int, total: int, done: int) -> None:
-    tell(min(start + done, total), total)
-
-
-def _batches(chunks: Int[Tensor, " n"]) -> Iterator[tuple[int, int]]:
-    """Start and end of runs of whole chunks, of about `BATCH` Gaussians."""
-    start = 0
-    while start < len(chunks):
-        last = chunks[min(start + BATCH, len(chunks)) - 1]
-        stop = int(torch.searchsorted(chunks, last, right=True))
-        yield start, stop
+        clusters = clusters_of(scene[batch], rates[batch], chunks[batch], visible[batch])
+        parts.append(_merge_batch(clusters, scene[batch], goal, tell_batch))
         start = stop
+    lighter = replace(joined([part for part, _ in parts]), origin=None)
+    record = Fusion(MERGED, {"rate": f"{goal.rate:.4g}", "from": str(len(scene))})
+    return replace(lighter, fused=(*scene.fused, record)), torch.cat([part for _, part in parts])
 
 
-def _merged_batch(own: Clusters, scene: Gaussians, goal: Goal, tell: Callable[[int], None]) -> Merged:
-    clusters = rounds(own, goal, tell)
-    found, places = alone(clusters, scene, own.weights), clusters.chunks
+def rounds(clusters: Clusters, goal: Goal, tell: Callable[[int], None]) -> Clusters:
+    """The clusters after all pairs are merged that the goal allows; `tell` is called with how many are gone."""
+    first, least = len(clusters), goal.count or 1
+    for tolerance in goal.tolerances:
+        min_share = 0.0 if tolerance == math.inf else MIN_MERGED_SHARE
+        while len(clusters) > least:
+            smallest = goal.smallest if tolerance == goal.tolerance else 0.0
+            pairs = matching(edges_below(clusters, goal.rate, tolerance, smallest), len(clusters))
+            pairs = pairs[torch.argsort(pairs.cost, stable=True)[: len(clusters) - least]]
+            is_last = len(pairs) <= min_share * len(clusters)
+            if len(pairs):
+                clusters = _merge_matching(clusters, pairs)
+                tell(first - len(clusters))
+            if is_last:
+                break
+    return clusters
+
+
+def _merge_batch(
+    clusters: Clusters, scene: Gaussians, goal: Goal, tell: Callable[[int], None]
+) -> tuple[Gaussians, Int[Tensor, " m"]]:
+    """The lighter scene of one batch and its chunks, without hidden Gaussians unless their count is the goal."""
+    result = rounds(clusters, goal, tell)
+    lighter, chunks = gaussians_of(result, scene, clusters.weights), result.chunks
     if goal.count is None:
-        shown = (~_hidden(found, clusters, goal.rate)).nonzero()[:, 0]
-        found, places = found[shown], places[shown]
+        visible = (~_hidden(lighter, result, goal.rate)).nonzero()[:, 0]
+        lighter, chunks = lighter[visible], chunks[visible]
     tell(len(scene))
-    return Merged(found, places)
+    return lighter, chunks
 
 
 def _order(scene: Gaussians, chunks: Int[Tensor, " n"]) -> Int[Tensor, " n"]:
-    """By chunk, in each along a curve; Gaussians at one place by their other parameters.
+    """Order by chunk, in each along a curve, and at one place by the other parameters.
 
     So the scene's own order plays no part.
     """
@@ -155,47 +167,29 @@ def _order(scene: Gaussians, chunks: Int[Tensor, " n"]) -> Int[Tensor, " n"]:
     return order
 
 
-def rounds(clusters: Clusters, goal: Goal, tell: Callable[[int], None]) -> Clusters:
-    """The clusters after all pairs are merged that the goal allows; `tell` is called with how many are gone."""
-    first, least = len(clusters), goal.count or 1
-    for tolerance in goal.tolerances:
-        enough = 0.0 if tolerance == math.inf else ENOUGH
-        while len(clusters) > least:
-            smallest = goal.smallest if tolerance == goal.tolerance else 0.0
-            pairs = matched(edges_below(clusters, goal.rate, tolerance, smallest), len(clusters))
-            pairs = pairs[torch.argsort(pairs.cost, stable=True)[: len(clusters) - least]]
-            few = len(pairs) <= enough * len(clusters)
-            if len(pairs):
-                clusters = _joined(clusters, pairs)
-                tell(first - len(clusters))
-            if few:
-                break
-    return clusters
-
-
-def _joined(clusters: Clusters, pairs: Edges) -> Clusters:
+def _merge_matching(clusters: Clusters, pairs: Edges) -> Clusters:
     """The clusters after these pairs are merged, in the order of their first ones."""
     one, other = pairs.one, pairs.other
-    changed = {name: column.clone() for name, column in clusters.columns.items()}
-    for name, values in merged_pairs(clusters[one], clusters[other]).columns.items():
-        changed[name][one] = values
+    columns = {name: column.clone() for name, column in clusters.columns.items()}
+    for name, values in merge_pairs(clusters[one], clusters[other]).columns.items():
+        columns[name][one] = values
     stays = torch.ones(len(clusters), dtype=torch.bool)
     stays[other] = False
     places = stays.cumsum(0) - 1
     places[other] = places[one]
-    return replace(clusters, **changed, labels=places[clusters.labels])[stays.nonzero()[:, 0]]
+    return replace(clusters, **columns, labels=places[clusters.labels])[stays.nonzero()[:, 0]]
 
 
 def _hidden(scene: Gaussians, clusters: Clusters, rate: float) -> Bool[Tensor, " n"]:
-    """Gaussians whose alpha no pixel of the level shows, along any of three directions: below the cut-off.
+    """True where alpha lies below the cut-off in every pixel of the level, along each of three directions.
 
-    Also those of which views show a smaller share than the cut-off.
+    Also where views show a smaller share than the cut-off.
     """
     px = clusters.rates * rate
-    narrow = covariances(scene)
-    trained = blurred(narrow, scene.convention.kernel / clusters.rates.square())
-    shown = blurred(trained, PIXEL_VARIANCE / px.square())
-    start = narrow if scene.convention.compensated else trained
-    peaks = scene.opacities[:, None] * areas(start) / areas(shown)
+    raw = covariances(scene)
+    trained = blur(raw, scene.convention.kernel / clusters.rates.square())
+    at_level = blur(trained, PIXEL_VARIANCE / px.square())
+    unblurred = raw if scene.convention.compensated else trained
+    peaks = scene.opacities[:, None] * areas(unblurred) / areas(at_level)
     least = scene.convention.rules.min_alpha
     return (peaks.amax(dim=1) < least) | (clusters.visible < least)

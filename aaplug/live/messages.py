@@ -1,4 +1,4 @@
-"""What a page may ask for: every message is bounded, checked and refused in clear words.
+"""Messages of a page: each is bounded, and checked or refused in clear words.
 
 A message is one JSON object.  {"see": ...} asks for a picture, {"shown": id} says that one has arrived, {"still": ...}
 asks for a picture as a file.  No message names a file.
@@ -12,34 +12,36 @@ from typing import Any
 
 import torch
 
-from aaplug.core.choices import QUALITIES
-from aaplug.core.errors import SHOWN, UsageError, not_one_of
-from aaplug.live.paints import PAINTS
+from aaplug.live.overlays import OVERLAYS
+from aaplug.methods import QUALITIES
+from aaplug.system.errors import MAX_VALUE_CHARACTERS, UsageError, not_one_of
 
-MOST_BYTES = 16_384  # of a message
-MOST_SIDE = 8192  # px of a picture
-MOST_PIXELS = 1 << 25  # of a picture
-FARTHEST = 1e9  # world units, and px of a focal length
-ROUNDED = 1e-3  # by how much a pose's rotation may miss orthonormality: a page's own arithmetic misses 1e-12
-POSE = 16  # numbers, row by row
+MAX_MESSAGE_BYTES = 16_384
+MAX_SIDE = 8192  # px of a picture
+MAX_PIXELS = 1 << 25  # of a picture
+MAX_DISTANCE = 1e9  # world units, and px of a focal length
+MAX_ROTATION_ERROR = 1e-3  # from orthonormality: a page's own arithmetic misses it by 1e-12
+MAX_ID = 2**53  # a page counts in float64
+POSE_NUMBERS = 16  # row by row
 
 
 @dataclass(frozen=True)
 class Side:
-    """How one side of the picture is drawn."""
+    """Recipe and quality of one side of the picture."""
 
     recipe: str
     quality: str
 
 
 @dataclass(frozen=True)
-class See:
+class PictureRequest:
     """A picture that a page wants to see.
 
     pose: `cam_from_world`, row by row.  focal, width, height: in px.
     split: share of the width that the left side fills.
     at: index of the training camera whose pose it is; else None.
-    moving: whether the next one follows at once.  paint: what is painted over; photo: whether the photograph is.
+    moving: True if the next request follows at once.
+    overlay: name of the overlay to send along.  photo: True to send the photograph along.
     """
 
     id: int
@@ -51,12 +53,12 @@ class See:
     sides: tuple[Side, Side]
     at: int | None = None
     moving: bool = False
-    paint: str | None = None
+    overlay: str | None = None
     photo: bool = False
 
 
 @dataclass(frozen=True)
-class Still:
+class StillRequest:
     """A picture wanted as a file, of the pose that is seen.  side: 0 or 1.  width, height: in px."""
 
     width: int
@@ -65,14 +67,14 @@ class Still:
 
 
 @dataclass(frozen=True)
-class Shown:
+class Receipt:
     """The page has the picture of this number."""
 
     id: int
 
 
-def parsed(text: str | bytes, recipes: Sequence[str], cameras: int) -> See | Still | Shown:
-    """A message.
+def parse(text: str | bytes, recipes: Sequence[str], cameras: int) -> PictureRequest | StillRequest | Receipt:
+    """Read a message.
 
     recipes: names that may be asked for.  cameras: how many there are to stand in.
 
@@ -82,60 +84,51 @@ def parsed(text: str | bytes, recipes: Sequence[str], cameras: int) -> See | Sti
     if not isinstance(text, str):
         raise UsageError("message", "takes text, got bytes")
     try:
-        found = json.loads(text)
+        message = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise UsageError("message", "is not JSON") from error
-    if not isinstance(found, dict) or len(found) != 1 or next(iter(found)) not in ("see", "still", "shown"):
+    if not isinstance(message, dict) or len(message) != 1 or next(iter(message)) not in ("see", "still", "shown"):
         raise UsageError("message", "takes one of see, still and shown")
-    [(kind, body)] = found.items()
+    [(kind, body)] = message.items()
     if kind == "shown":
-        return Shown(_whole({"shown": body}, "shown", 0, 2**53))
+        return Receipt(_whole(message, "shown", 0, MAX_ID))
     if not isinstance(body, dict):
         raise UsageError(kind, f"takes an object, got {_short(body)}")
+    width, height = (_whole(body, side, 1, 10**9) for side in ("width", "height"))
+    if max(width, height) > MAX_SIDE or width * height > MAX_PIXELS:
+        raise UsageError("size", f"is {width}x{height} px; the limit is {MAX_SIDE} a side and {MAX_PIXELS:,} in all")
     if kind == "still":
-        return Still(*_size(body), _whole(body, "side", 0, 1))
-    return _see(body, recipes, cameras)
-
-
-def _see(body: Mapping[str, Any], recipes: Sequence[str], cameras: int) -> See:
+        return StillRequest(width, height, _whole(body, "side", 0, 1))
     sides = body.get("sides")
     if not isinstance(sides, list) or len(sides) != 2 or not all(isinstance(side, dict) for side in sides):
         raise UsageError("sides", f"takes two objects, got {_short(sides)}")
-    left, right = (Side(_name(s, "recipe", recipes), _name(s, "quality", QUALITIES)) for s in sides)
-    width, height = _size(body)
-    return See(
-        id=_whole(body, "id", 0, 2**53),
+    left, right = (Side(_name(side, "recipe", recipes), _name(side, "quality", QUALITIES)) for side in sides)
+    return PictureRequest(
+        id=_whole(body, "id", 0, MAX_ID),
         pose=_pose(body),
-        focal=_number(body, "focal", 1e-3, FARTHEST),
+        focal=_number(body, "focal", 1e-3, MAX_DISTANCE),
         width=width,
         height=height,
         split=_number(body, "split", 0.0, 1.0),
         sides=(left, right),
         at=None if body.get("at") is None else _whole(body, "at", 0, cameras - 1),
         moving=body.get("moving") is True,
-        paint=None if body.get("paint") is None else _name(body, "paint", PAINTS),
+        overlay=None if body.get("paint") is None else _name(body, "paint", OVERLAYS),
         photo=body.get("photo") is True,
     )
 
 
 def _pose(body: Mapping[str, Any]) -> tuple[float, ...]:
-    found = body.get("pose")
-    if not isinstance(found, list) or len(found) != POSE:
-        raise UsageError("pose", f"takes {POSE} numbers, got {_short(found)}")
-    numbers = tuple(_number({"pose": x}, "pose", -FARTHEST, FARTHEST) for x in found)
-    matrix = torch.tensor(numbers, dtype=torch.float64).view(4, 4)
-    rotation = matrix[:3, :3]
-    apart = (rotation @ rotation.T - torch.eye(3, dtype=torch.float64)).abs().max()
-    if float(apart) > ROUNDED or float(torch.linalg.det(rotation)) < 0 or numbers[12:] != (0, 0, 0, 1):
+    """The numbers of a rigid motion, row by row."""
+    pose = body.get("pose")
+    if not isinstance(pose, list) or len(pose) != POSE_NUMBERS:
+        raise UsageError("pose", f"takes {POSE_NUMBERS} numbers, got {_short(pose)}")
+    numbers = tuple(_number({"pose": x}, "pose", -MAX_DISTANCE, MAX_DISTANCE) for x in pose)
+    rotation = torch.tensor(numbers, dtype=torch.float64).view(4, 4)[:3, :3]
+    error = (rotation @ rotation.T - torch.eye(3, dtype=torch.float64)).abs().max()
+    if float(error) > MAX_ROTATION_ERROR or float(torch.linalg.det(rotation)) < 0 or numbers[12:] != (0, 0, 0, 1):
         raise UsageError("pose", "takes a rotation and a translation, row by row")
     return numbers
-
-
-def _size(body: Mapping[str, Any]) -> tuple[int, int]:
-    width, height = (_whole(body, side, 1, 10**9) for side in ("width", "height"))
-    if max(width, height) > MOST_SIDE or width * height > MOST_PIXELS:
-        raise UsageError("size", f"is {width}x{height} px; the limit is {MOST_SIDE} a side and {MOST_PIXELS:,} in all")
-    return width, height
 
 
 def _number(body: Mapping[str, Any], name: str, least: float, most: float) -> float:
@@ -152,12 +145,12 @@ def _whole(body: Mapping[str, Any], name: str, least: int, most: int) -> int:
     return int(value)
 
 
-def _name(body: Mapping[str, Any], name: str, known: Sequence[str] | Mapping[str, Any]) -> str:
+def _name(body: Mapping[str, Any], name: str, choices: Sequence[str] | Mapping[str, Any]) -> str:
     value = body.get(name)
-    if not isinstance(value, str) or value not in known:
-        raise UsageError(name, not_one_of(_short(value), known))
+    if not isinstance(value, str) or value not in choices:
+        raise UsageError(name, not_one_of(_short(value), choices))
     return value
 
 
 def _short(value: object) -> str:
-    return str(value)[:SHOWN]
+    return str(value)[:MAX_VALUE_CHARACTERS]

@@ -1,15 +1,15 @@
 """The pictures of one page, drawn step by step: quick ones while the camera moves, ever finer ones at rest.
 
 Each step is one `next` of a generator, some 30 ms long; whoever takes the steps may drop the rest of them for a newer
-wish.  A picture goes to the page as one binary message: the length of a header (4 bytes, little endian), the header as
-JSON, and the files of its parts, one after another.
+request.  A picture goes to the page as one binary message: the length of a header (4 bytes, little endian), the header
+as JSON, and the files of its parts, one after another.
 """
 
 import json
 import struct
 import time
-from collections.abc import Generator, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Generator
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
@@ -17,49 +17,38 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.cameras import Camera
-from aaplug.core.choices import QUALITIES
 from aaplug.core.imaging import quantised, resampled
 from aaplug.evaluation.metrics import psnr
 from aaplug.io.images import encode_jpeg, encode_png
 from aaplug.io.photographs import read_photo
-from aaplug.live.messages import See, Side, Still
-from aaplug.live.paints import PAINTS
+from aaplug.live.messages import PictureRequest, Side, StillRequest
+from aaplug.live.overlays import OVERLAYS
 from aaplug.live.subject import Subject
+from aaplug.methods import QUALITIES
 from aaplug.rendering.renderer import Renderer
 from aaplug.rendering.strips import strips
 
-MOVING_QUALITY, RESTING_QUALITY = 85, 95  # of JPEG
-LOSSLESS = 400_000  # px up to which a picture at rest is sent as PNG, so that single pixels are true
-FRAME = 0.040  # seconds that a frame may take while the camera moves, in all
-LEAST_SCALE = 0.25  # of a side's resolution while the camera moves
-UNIT = 1 << 18, 400_000  # samples, and Gaussians, that an effort of 1 draws
-LEAST_GAUSSIANS = 40_000
-EFFORTS = 1 / 16, 16.0
-STEP = 0.6, 1.4  # by which the effort changes from frame to frame, at most
-MOST_SAMPLES = 1 << 24  # of one side: about a second
-PROBED = 20_000  # Gaussians by which a moving picture's sampling rate is estimated
+PREVIEW_QUALITY, RESTING_QUALITY = 85, 95  # of JPEG
+MAX_LOSSLESS_PIXELS = 400_000  # of a picture at rest that is sent as PNG, so that single pixels are true
+FRAME_SECONDS = 0.040  # that a frame may take while the camera moves, in all
+MIN_PREVIEW_SCALE = 0.25  # of a side's resolution while the camera moves
+MIN_PREVIEW_GAUSSIANS = 40_000
+UNIT_SAMPLES, UNIT_GAUSSIANS = 1 << 18, 400_000  # that an effort of 1 draws
+EFFORT_RANGE = 1 / 16, 16.0
+EFFORT_STEP_RANGE = 0.6, 1.4  # factors from frame to frame
+MAX_SAMPLES = 1 << 24  # of one side: about a second
+PROBE_GAUSSIANS = 20_000  # by which a moving picture's sampling rate is estimated
 
 Span = tuple[int, int]  # columns of the picture: the first, and one past the last
 Steps = Generator[bytes | None, None, None]
 
 
 class Part(NamedTuple):
-    """A part of a picture: what it is of ("0" and "1" are the sides), its columns, and its file."""
+    """A part of a picture: its subject ("0" and "1" are the sides), its columns, and its file."""
 
     of: str
     span: Span
     file: bytes
-
-
-@dataclass(frozen=True)
-class _Wish:
-    """What decides the pixels of both sides: a `See` without the words around it."""
-
-    see: See
-
-    @classmethod
-    def of(cls, see: See) -> "_Wish":
-        return cls(replace(see, id=0, split=0.0, moving=False, paint=None, photo=False))
 
 
 class Pictures:
@@ -68,156 +57,123 @@ class Pictures:
     def __init__(self, subject: Subject):
         self._subject = subject
         self._effort = 0.5
-        self._previewed: _Wish | None = None
-        self._images: tuple[_Wish, list[Tensor], list[int]] | None = None  # both sides, whole
+        self._previewed: PictureRequest | None = None
+        self._complete: tuple[PictureRequest, list[Tensor], list[int]] | None = None  # both sides, whole; their samples
 
     @torch.no_grad()
-    def steps(self, see: See) -> Steps:
-        """Draw a wish; yields pictures to send, and None between the strips of one."""
-        wish, started = _Wish.of(see), time.perf_counter()
-        camera = self._subject.camera(see)
-        if self._images is None or self._images[0] != wish:
-            if self._previewed != wish:
-                yield self._preview(see, camera)
-                self._previewed = wish
-            if see.moving:
-                return
-            yield from self._refined(see, camera, started)
-        elif see.moving:
+    def steps(self, request: PictureRequest) -> Steps:
+        """Draw what is wanted; yields pictures to send, and None between the strips of one."""
+        started, camera = time.perf_counter(), self._subject.camera(request)
+        pixels = replace(request, id=0, split=0.0, moving=False, overlay=None, photo=False)  # what decides both sides
+        is_complete = self._complete is not None and self._complete[0] == pixels
+        if not is_complete and self._previewed != pixels:
+            yield self._preview(request, camera)
+            self._previewed = pixels
+        if request.moving:
             return
-        yield from self._extras(see, camera, started)
+        if not is_complete:
+            images, counts = yield from self._refined(request, camera, started)
+            self._complete = pixels, images, counts
+        assert self._complete is not None
+        _, images, counts = self._complete
+        facts: dict[str, Any] = {}
+        parts: list[Part] = []
+        if request.at is not None and request.photo and self._subject.views[request.at].photo is not None:
+            yield None
+            part, facts = self._photograph(request, images)
+            parts.append(part)
+        if request.overlay is not None:
+            yield None
+            levels, legend = OVERLAYS[request.overlay](self._subject.renderer(request.sides[1]), camera, counts[1])
+            parts.append(Part("paint", (0, camera.width), encode_png(levels[..., None])))
+            facts = facts | {"legend": legend}
+        yield _picture(request, parts, started, stage="done", samples=counts, **facts)
 
     @torch.no_grad()
-    def still(self, see: See, still: Still) -> Steps:
+    def still(self, request: PictureRequest, still: StillRequest) -> Steps:
         """The picture as a file of its own, of any size: the shorter side keeps its field of view."""
-        camera = self._subject.camera(see).framed(still.width, still.height)
-        renderer = self._subject.renderer(see.sides[still.side])
-        samples, _ = _bounded(renderer.samples(camera), camera)
-        drawn = yield from strips(renderer, camera, samples)
-        name = f"{see.sides[still.side].recipe}-{still.width}x{still.height}.png"
-        yield message({"still": name}, [encode_png(drawn.rgb)])
+        camera = self._subject.camera(request).framed(still.width, still.height)
+        renderer = self._subject.renderer(request.sides[still.side])
+        render = yield from strips(renderer, camera, _bounded_samples(renderer, camera))
+        name = f"{request.sides[still.side].recipe}-{still.width}x{still.height}.png"
+        yield message({"still": name}, [encode_png(render.rgb)])
 
-    # ------------------------------------------------------------------------------------------------------ moving
-
-    def _preview(self, see: See, camera: Camera) -> bytes:
+    def _preview(self, request: PictureRequest, camera: Camera) -> bytes:
         """Both visible parts, in the time of a frame: coarser, with fewer Gaussians, or as they are if they fit."""
-        started = time.perf_counter()
-        room, gaussians = (self._effort * unit for unit in UNIT)
-        gaussians = max(LEAST_GAUSSIANS, round(gaussians))
-        spans = _visible(see, camera.width)
-        renderers = [self._subject.boldest(side, gaussians) for side in see.sides]
-        samples = [self._probed(side, camera) for side in see.sides]
-        wanted = sum((b - a) * camera.height * samples[i] ** 2 for i, (a, b) in spans.items())
-        scale = 1.0
-        if wanted > room:
-            samples = [1, 1]
-            scale = min(1.0, max(LEAST_SCALE, (room / (camera.width * camera.height)) ** 0.5))
+        started, scale, gaussians = time.perf_counter(), 1.0, 0
+        max_samples = self._effort * UNIT_SAMPLES
+        max_gaussians = max(MIN_PREVIEW_GAUSSIANS, round(self._effort * UNIT_GAUSSIANS))
+        probes = [self._subject.preview_renderer(side, PROBE_GAUSSIANS) for side in request.sides]
+        counts = [_bounded_samples(probe, camera) for probe in probes]
+        spans = [(i, span) for i, span in enumerate(_spans(request)) if span[0] < span[1]]
+        too_many = sum((b - a) * camera.height * counts[i] ** 2 for i, (a, b) in spans) > max_samples
+        if too_many:
+            counts = [1, 1]
+            scale = min(1.0, max(MIN_PREVIEW_SCALE, (max_samples / (camera.width * camera.height)) ** 0.5))
         parts = []
-        for i, span in spans.items():
-            part = _part(camera, span, scale)
-            recipe = replace(renderers[i].recipe, target_rate=0.0, grid=samples[i], neighbours=0.0)
-            drawn = replace(renderers[i], recipe=recipe)(part)
-            parts.append(Part(str(i), span, encode_jpeg(drawn.rgb, MOVING_QUALITY)))
-        seconds = time.perf_counter() - started
-        limited = wanted > room or gaussians < len(self._subject.look.scene)
-        self._effort = _adapted(self._effort, seconds, limited)
-        about = {"stage": "moving", "ms": 1000 * seconds, "samples": samples, "scale": scale}
-        drawn_of = max((len(renderers[i].scene) for i in spans), default=0)
-        return picture(see, camera, parts, about | {"gaussians": drawn_of})
+        for i, (left, right) in spans:
+            renderer = self._subject.preview_renderer(request.sides[i], max_gaussians)
+            recipe = replace(renderer.recipe, target_rate=0.0, grid=counts[i], neighbours=0.0)
+            view = replace(camera, width=right - left, cx=camera.cx - left)
+            view = view.resized(max(1, round(view.width * scale)), max(1, round(view.height * scale)))
+            rgb = replace(renderer, recipe=recipe)(view).rgb
+            parts.append(Part(str(i), (left, right), encode_jpeg(rgb, PREVIEW_QUALITY)))
+            gaussians = max(gaussians, len(renderer.scene))
+        is_limited = too_many or max_gaussians < len(self._subject.look.scene)
+        self._effort = _adapted(self._effort, time.perf_counter() - started, is_limited)
+        facts = {"stage": "moving", "samples": counts, "scale": scale, "gaussians": gaussians}
+        return _picture(request, parts, started, **facts)
 
-    def _probed(self, side: Side, camera: Camera) -> int:
-        """Samples along a pixel's side as a few Gaussians tell."""
-        return _bounded(self._subject.boldest(side, PROBED).samples(camera), camera)[0]
-
-    # ------------------------------------------------------------------------------------------------------ at rest
-
-    def _refined(self, see: See, camera: Camera, started: float) -> Steps:
-        """The visible parts in rising quality, then the hidden ones."""
-        ladders = [self._ladder(side, camera) for side in see.sides]
-        visible, images = _visible(see, camera.width), [torch.empty(*camera.hw, 3) for _ in see.sides]
-        last = [ladder[-1][1] for ladder in ladders]
-        for step in range(max(map(len, ladders))):
+    def _refined(
+        self, request: PictureRequest, camera: Camera, started: float
+    ) -> Generator[bytes | None, None, tuple[list[Tensor], list[int]]]:
+        """Draw the visible parts in rising quality, then the hidden ones; returns both sides, and their samples."""
+        ladders, spans = [self._ladder(side, camera) for side in request.sides], _spans(request)
+        images, counts = [torch.empty(*camera.hw, 3) for _ in ladders], [0, 0]
+        height = max(map(len, ladders))
+        rungs = [[(i, spans[i], *x[step]) for i, x in enumerate(ladders) if step < len(x)] for step in range(height)]
+        rungs.append([(i, spans[1 - i], *x[-1]) for i, x in enumerate(ladders)])
+        for step, rung in enumerate(rungs):
             parts = []
-            for i, span in visible.items():
-                if step < len(ladders[i]):
-                    yield from self._drawn(images[i], camera, span, *ladders[i][step])
-                    parts.append(_resting(str(i), span, images[i]))
+            for i, span, renderer, samples in rung:
+                counts[i] = samples
+                if span[0] < span[1]:
+                    render = yield from strips(renderer, camera, samples, span)
+                    images[i][:, slice(*span)] = render.rgb
+                    parts.append(_part_at_rest(str(i), span, render.rgb))
             if parts:
-                counts = [ladder[min(step, len(ladder) - 1)][1] for ladder in ladders]
-                done = step + 1 == max(map(len, ladders))
-                yield picture(see, camera, parts, _about(counts, "complete" if done else "refining", started))
-        parts = []
-        for i, ladder in enumerate(ladders):
-            for span in _others(visible.get(i), camera.width):
-                yield from self._drawn(images[i], camera, span, *ladder[-1])
-                parts.append(_resting(str(i), span, images[i]))
-        if parts:
-            yield picture(see, camera, parts, _about(last, "complete", started))
-        self._images = _Wish.of(see), images, last
+                stage = "refining" if step + 1 < height else "complete"
+                yield _picture(request, parts, started, stage=stage, samples=counts)
+        return images, counts
 
     def _ladder(self, side: Side, camera: Camera) -> list[tuple[Renderer, int]]:
         """Renderers in rising quality up to the chosen one, each with more samples than the one before."""
         names = list(QUALITIES)
-        found: list[tuple[Renderer, int]] = []
+        ladder: list[tuple[Renderer, int]] = []
         for quality in names[: names.index(side.quality) + 1]:
             renderer = self._subject.renderer(replace(side, quality=quality))
-            samples, cut = _bounded(renderer.samples(camera), camera)
-            if not found or samples > found[-1][1] or renderer.cutter is not None:
-                found.append((renderer, samples))
-            else:
-                found[-1] = renderer, samples
-            if cut or not renderer.recipe.takes_quality:
+            samples = _bounded_samples(renderer, camera)
+            if ladder and samples <= ladder[-1][1] and renderer.cutter is None:
+                ladder.pop()
+            ladder.append((renderer, samples))
+            if samples < renderer.samples(camera) or not renderer.recipe.takes_quality:
                 break
-        return found
+        return ladder
 
-    def _drawn(
-        self, image: Float[Tensor, "h w 3"], camera: Camera, span: Span, renderer: Renderer, samples: int
-    ) -> Generator[None, None, None]:
-        """Draw some columns of the image."""
-        drawn = yield from strips(renderer, camera, samples, span)
-        image[:, slice(*span)] = drawn.rgb
-
-    # ------------------------------------------------------------------------------------------------------- extras
-
-    def _extras(self, see: See, camera: Camera, started: float) -> Steps:
-        """The photograph with figures, and what is painted over; at the end, word that all is done."""
-        assert self._images is not None
-        _, images, counts = self._images
-        about: dict[str, Any] = {}
-        parts: list[Part] = []
-        if see.at is not None and see.photo and self._subject.views[see.at].photo is not None:
-            yield None
-            found, values = self._photographed(see, camera, images)
-            about, parts = values, [found]
-        if see.paint is not None:
-            yield None
-            samples = counts[1]
-            levels, legend = PAINTS[see.paint](self._subject.renderer(see.sides[1]), camera, samples)
-            parts.append(Part("paint", (0, camera.width), encode_png(levels[..., None])))
-            about |= {"legend": legend}
-        yield picture(see, camera, parts, _about(counts, "done", started) | about)
-
-    def _photographed(self, see: See, camera: Camera, images: list[Tensor]) -> tuple[Part, dict[str, Any]]:
-        """The photograph at the picture's size, and the PSNR of both sides against what is seen of it."""
-        assert see.at is not None
-        view = self._subject.views[see.at]
+    def _photograph(self, request: PictureRequest, images: list[Tensor]) -> tuple[Part, dict[str, Any]]:
+        """The photograph at the picture's size, and the PSNR of both sides against the part of it in the picture."""
+        assert request.at is not None
+        view, (placed, left, top) = self._subject.views[request.at], self._subject.placed_view(request)
         assert view.photo is not None
-        left, top, width, height = self._subject.frame(see)
         photo = read_photo(view.photo, self._subject.look.background, view.lens)
-        photo = resampled(photo, see.focal / view.focal, (height, width)).clamp(0, 1)
-        box = max(0, left), max(0, top), min(camera.width, left + width), min(camera.height, top + height)
-        seen = photo[box[1] - top : box[3] - top, box[0] - left : box[2] - left]
-        values = [psnr(quantised(image[box[1] : box[3], box[0] : box[2]]), seen) for image in images]
-        part = Part("photo", (box[0], box[2]), _still_file(seen))
-        whole = (width, height) == (box[2] - box[0], box[3] - box[1])
-        return part, {"psnr": values, "rows": [box[1], box[3]], "whole": whole}
-
-
-def picture(see: See, camera: Camera, parts: list[Part], about: dict[str, Any]) -> bytes:
-    """A picture, or some parts of it, as a message."""
-    header = {"id": see.id, "size": [camera.width, camera.height]} | about
-    header["parts"] = [{"of": part.of, "span": part.span, "bytes": len(part.file)} for part in parts]
-    return message(header, [part.file for part in parts])
+        factor = request.focal / view.focal * (view.width / photo.shape[1])  # a photograph may be of another size
+        photo = resampled(photo, factor, placed.hw).clamp(0, 1)
+        rows = max(0, top), min(request.height, top + placed.height)
+        columns = max(0, left), min(request.width, left + placed.width)
+        photo = photo[rows[0] - top : rows[1] - top, columns[0] - left : columns[1] - left]
+        values = [psnr(quantised(image[slice(*rows), slice(*columns)]), photo) for image in images]
+        whole = placed.hw == (rows[1] - rows[0], columns[1] - columns[0])
+        return _part_at_rest("photo", columns, photo), {"psnr": values, "rows": rows, "whole": whole}
 
 
 def message(header: dict[str, Any], files: list[bytes]) -> bytes:
@@ -226,45 +182,33 @@ def message(header: dict[str, Any], files: list[bytes]) -> bytes:
     return b"".join([struct.pack("<I", len(text)), text, *files])
 
 
-def _about(samples: list[int], stage: str, started: float) -> dict[str, Any]:
-    return {"stage": stage, "ms": 1000 * (time.perf_counter() - started), "samples": samples}
+def _picture(request: PictureRequest, parts: list[Part], started: float, **facts: Any) -> bytes:
+    """A picture, or some parts of it, as a message; started: when its drawing began."""
+    header: dict[str, Any] = {"id": request.id, "size": [request.width, request.height]} | facts
+    header["ms"] = 1000 * (time.perf_counter() - started)
+    header["parts"] = [{"of": part.of, "span": part.span, "bytes": len(part.file)} for part in parts]
+    return message(header, [part.file for part in parts])
 
 
-def _resting(of: str, span: Span, image: Float[Tensor, "h w 3"]) -> Part:
-    return Part(of, span, _still_file(image[:, slice(*span)]))
+def _part_at_rest(of: str, span: Span, rgb: Float[Tensor, "h w 3"]) -> Part:
+    lossless = rgb.shape[0] * rgb.shape[1] <= MAX_LOSSLESS_PIXELS
+    return Part(of, span, encode_png(rgb) if lossless else encode_jpeg(rgb, RESTING_QUALITY))
 
 
-def _still_file(rgb: Float[Tensor, "h w 3"]) -> bytes:
-    return encode_png(rgb) if rgb.shape[0] * rgb.shape[1] <= LOSSLESS else encode_jpeg(rgb, RESTING_QUALITY)
+def _spans(request: PictureRequest) -> tuple[Span, Span]:
+    """The columns of each side that can be seen; those of the other side are hidden."""
+    cut = round(request.split * request.width)
+    return (0, cut), (cut, request.width)
 
 
-def _visible(see: See, width: int) -> dict[int, Span]:
-    """The columns of each side that can be seen."""
-    cut = round(see.split * width)
-    return {i: span for i, span in enumerate([(0, cut), (cut, width)]) if span[0] < span[1]}
-
-
-def _others(span: Span | None, width: int) -> Iterator[Span]:
-    """The columns beside a span."""
-    left, right = span or (0, 0)
-    return iter([(a, b) for a, b in ((0, left), (right, width)) if a < b])
-
-
-def _part(camera: Camera, span: Span, scale: float) -> Camera:
-    """Some columns of a view, in fewer pixels."""
-    left, right = span
-    part = replace(camera, width=right - left, cx=camera.cx - left)
-    return part.resized(max(1, round(part.width * scale)), max(1, round(part.height * scale)))
-
-
-def _adapted(effort: float, seconds: float, limited: bool) -> float:
+def _adapted(effort: float, seconds: float, is_limited: bool) -> float:
     """The effort for the next frame; it grows only where it was what limited this one."""
-    low, high = STEP
-    by = min(max(FRAME / seconds, low), high if limited else 1.0)
-    return min(max(effort * by, EFFORTS[0]), EFFORTS[1])
+    smallest, largest = EFFORT_STEP_RANGE
+    step = min(max(FRAME_SECONDS / seconds, smallest), largest if is_limited else 1.0)
+    return min(max(effort * step, EFFORT_RANGE[0]), EFFORT_RANGE[1])
 
 
-def _bounded(samples: int, camera: Camera) -> tuple[int, bool]:
-    """Samples along a pixel's side, no more than can be waited for, and whether they were more."""
-    most = max(1, int((MOST_SAMPLES / (camera.width * camera.height)) ** 0.5))
-    return min(samples, most), samples > most
+def _bounded_samples(renderer: Renderer, camera: Camera) -> int:
+    """Samples along a pixel's side, no more than can be waited for."""
+    most = max(1, int((MAX_SAMPLES / (camera.width * camera.height)) ** 0.5))
+    return min(renderer.samples(camera), most)

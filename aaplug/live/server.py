@@ -11,6 +11,7 @@ import json
 import logging
 import secrets
 import threading
+from concurrent.futures import Future
 from contextlib import suppress
 from functools import partial
 from http import HTTPStatus
@@ -18,24 +19,23 @@ from ipaddress import ip_address
 from os import strerror
 from urllib.parse import parse_qs, urlsplit
 
-from websockets.asyncio.server import Server as Listener
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
-from aaplug.core.errors import UsageError, reason
-from aaplug.live.messages import MOST_BYTES, parsed
+from aaplug.live.messages import MAX_MESSAGE_BYTES, parse
 from aaplug.live.pictures import message
-from aaplug.live.studio import Page, Studio
+from aaplug.live.studio import Studio
 from aaplug.live.webpage import page
+from aaplug.system.errors import UsageError, reason
 
-LIVE = "/live"  # the path of the websocket
-MOST_PAGES = 32  # open at once
-LOCAL = ("localhost", "127.0.0.1", "::1")
-SILENT = logging.getLogger("aaplug.live")  # websockets would print a traceback for each bad request
-SILENT.addHandler(logging.NullHandler())
-SILENT.propagate = False
+WEBSOCKET_PATH = "/live"
+MAX_OPEN_PAGES = 32
+LOCAL_NAMES = ("localhost", "127.0.0.1", "::1")
+log = logging.getLogger("aaplug.live")
+log.addHandler(logging.NullHandler())
+log.propagate = False  # websockets would print a traceback for each bad request
 
 
 class Server:
@@ -48,111 +48,95 @@ class Server:
     def __init__(self, studio: Studio, host: str = "127.0.0.1", port: int = 8080):
         self._studio, self._host, self._port = studio, host, port
         self._token = None if _is_local(host) else secrets.token_urlsafe(16)
-        self._loop = asyncio.new_event_loop()
-        self._started: threading.Event = threading.Event()
-        self._trouble: OSError | None = None
-        self._listener: Listener | None = None
-        self._ends: asyncio.Event = asyncio.Event()
-        self._open = 0
-        self._thread = threading.Thread(target=self._run, name="server", daemon=True)
+        self._open_pages = 0
+        self._started: Future[tuple[asyncio.AbstractEventLoop, int]] = Future()  # with its loop and port
+        self._end = asyncio.Event()
+        self._thread = threading.Thread(target=lambda: asyncio.run(self._serve()), name="server", daemon=True)
 
     @property
     def address(self) -> str:
-        """What to open in a browser."""
-        shown = f"[{self._host}]" if ":" in self._host else self._host
+        """The address to open in a browser."""
+        host = f"[{self._host}]" if ":" in self._host else self._host
         token = "" if self._token is None else f"?token={self._token}"
-        return f"http://{shown}:{self._port}/{token}"
+        return f"http://{host}:{self._port}/{token}"
 
     def __enter__(self) -> "Server":
         self._thread.start()
-        self._started.wait()
-        if self._trouble is not None:
+        try:
+            self._loop, self._port = self._started.result()
+        except (OSError, UnicodeError) as error:
             self._thread.join()
-            raise UsageError("port", f"{self._port} of {self._host} cannot be used: {_why(self._trouble)}")
+            code = error.errno if isinstance(error, OSError) else None  # asyncio's own words name the address once more
+            why = strerror(code).lower() if code and code > 0 else reason(error)
+            raise UsageError("port", f"{self._port} of {self._host} cannot be used: {why}") from error
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._loop.call_soon_threadsafe(self._ends.set)
+        self._loop.call_soon_threadsafe(self._end.set)
         self._thread.join()
 
-    def _run(self) -> None:
-        with asyncio.Runner(loop_factory=lambda: self._loop) as runner:
-            runner.run(self._serve())
-
     async def _serve(self) -> None:
-        how = {"max_size": MOST_BYTES, "max_queue": 16, "compression": None, "logger": SILENT, "server_header": None}
+        limits = {"max_size": MAX_MESSAGE_BYTES, "max_queue": 16, "compression": None}
+        options = limits | {"process_request": self._answer, "logger": log, "server_header": None}
         try:
-            listening = await serve(self._talk, self._host, self._port, process_request=self._answer, **how)
-        except OSError as error:
-            self._trouble = error
-            self._started.set()
+            listener = await serve(self._talk, self._host, self._port, **options)
+        except (OSError, UnicodeError) as error:  # the latter: no host can have this name
+            self._started.set_exception(error)
             return
-        async with listening as listener:
-            self._port = listener.sockets[0].getsockname()[1]
-            self._started.set()
-            await self._ends.wait()
+        async with listener:
+            self._started.set_result((asyncio.get_running_loop(), listener.sockets[0].getsockname()[1]))
+            await self._end.wait()
 
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         """The page, a refusal, or None to go on to a websocket."""
-        parts = urlsplit(request.path)
+        address = urlsplit(request.path)
         hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
         host = hosts[0] if len(hosts) == 1 else ""
-        if self._token is None and _name_of(host) not in (*LOCAL, self._host):
-            return _said(HTTPStatus.FORBIDDEN, "This server answers to its own name alone.")
-        token = parse_qs(parts.query).get("token", [""])[0]
+        name = host[1:].partition("]")[0] if host.startswith("[") else host.partition(":")[0]  # without its port
+        if self._token is None and name not in (*LOCAL_NAMES, self._host):
+            return _response(HTTPStatus.FORBIDDEN, "This server answers to its own name alone.")
+        token = parse_qs(address.query).get("token", [""])[0]
         if self._token is not None and not hmac.compare_digest(token.encode(), self._token.encode()):
-            return _said(HTTPStatus.FORBIDDEN, "Open the address that the terminal shows: it ends in a token.")
-        if parts.path == "/":
-            return _response(HTTPStatus.OK, "text/html", page().encode())
-        if parts.path != LIVE:
-            return _said(HTTPStatus.NOT_FOUND, "There is one page here: /")
+            return _response(HTTPStatus.FORBIDDEN, "Open the address that the terminal shows: it ends in a token.")
+        if address.path == "/":
+            return _response(HTTPStatus.OK, page(), "text/html")
+        if address.path != WEBSOCKET_PATH:
+            return _response(HTTPStatus.NOT_FOUND, "There is one page here: /")
         if len(origins) != 1 or origins[0] not in (f"http://{host}", f"https://{host}"):
-            return _said(HTTPStatus.FORBIDDEN, "A websocket must come from this server's own page.")
-        if self._open >= MOST_PAGES:
-            return _said(HTTPStatus.SERVICE_UNAVAILABLE, f"{MOST_PAGES} pages are open; close one.")
+            return _response(HTTPStatus.FORBIDDEN, "A websocket must come from this server's own page.")
+        if self._open_pages >= MAX_OPEN_PAGES:
+            return _response(HTTPStatus.SERVICE_UNAVAILABLE, f"{MAX_OPEN_PAGES} pages are open; close one.")
         return None
 
     async def _talk(self, connection: ServerConnection) -> None:
-        """One page, from its first word to its last."""
-        waiting: asyncio.Queue[bytes] = asyncio.Queue()  # the studio puts no more than a few
-        guest = self._studio.enter(partial(self._hand, waiting))
-        self._open += 1
-        sending = None
+        """Serve one page, from its first word to its last."""
+        subject, sending = self._studio.subject, None
+        outbox: asyncio.Queue[bytes] = asyncio.Queue()  # the studio puts no more than a few
+        self._open_pages += 1
         try:
-            await connection.send(json.dumps(self._studio.subject.about(), allow_nan=False))
-            sending = asyncio.create_task(_send_all(connection, waiting))
-            await self._listen(connection, guest)
-        except ConnectionClosed:
-            pass  # a closed tab
+            with self._studio.page(partial(self._post, outbox)) as client, suppress(ConnectionClosed):
+                await connection.send(json.dumps(subject.about(), allow_nan=False))
+                sending = asyncio.create_task(_send_all(connection, outbox))
+                async for text in connection:
+                    try:
+                        self._studio.receive(client, parse(text, subject.recipes, len(subject.views)))
+                    except UsageError as error:
+                        await connection.send(message({"problem": str(error)}, []))
         finally:
-            self._open -= 1
-            self._studio.leave(guest)
+            self._open_pages -= 1
             if sending is not None:
                 sending.cancel()
 
-    def _hand(self, waiting: "asyncio.Queue[bytes]", said: bytes) -> None:
-        """From the studio's thread to the page."""
+    def _post(self, outbox: "asyncio.Queue[bytes]", picture: bytes) -> None:
+        """Put a picture into a page's outbox, from the studio's thread."""
         with suppress(RuntimeError):  # the server has closed meanwhile
-            self._loop.call_soon_threadsafe(waiting.put_nowait, said)
-
-    async def _listen(self, connection: ServerConnection, guest: Page) -> None:
-        subject = self._studio.subject
-        async for text in connection:
-            try:
-                self._studio.tell(guest, parsed(text, subject.recipes, len(subject.views)))
-            except UsageError as error:
-                await connection.send(message({"problem": str(error)}, []))
+            self._loop.call_soon_threadsafe(outbox.put_nowait, picture)
 
 
-async def _send_all(connection: ServerConnection, waiting: "asyncio.Queue[bytes]") -> None:
-    with suppress(ConnectionClosed):
+async def _send_all(connection: ServerConnection, outbox: "asyncio.Queue[bytes]") -> None:
+    with suppress(ConnectionClosed):  # a closed tab
         while True:
-            await connection.send(await waiting.get())
-
-
-def _why(error: OSError) -> str:
-    """The system's own words; asyncio's name the address once more."""
-    return (strerror(error.errno) if error.errno and error.errno > 0 else reason(error)).lower()
+            await connection.send(await outbox.get())
 
 
 def _is_local(host: str) -> bool:
@@ -162,22 +146,15 @@ def _is_local(host: str) -> bool:
         return False
 
 
-def _name_of(host: str) -> str:
-    """The name in a Host header, without its port."""
-    return host[1:].partition("]")[0] if host.startswith("[") else host.partition(":")[0]
-
-
-def _said(status: HTTPStatus, text: str) -> Response:
-    return _response(status, "text/plain", f"{text}\n".encode())
-
-
-def _response(status: HTTPStatus, kind: str, body: bytes) -> Response:
-    headers = Headers()
-    headers["Content-Type"] = f"{kind}; charset=utf-8"
-    headers["Content-Length"] = str(len(body))
-    headers["Content-Security-Policy"] = "frame-ancestors 'none'"
-    for name, value in (("Cache-Control", "no-store"), ("X-Content-Type-Options", "nosniff")):
-        headers[name] = value
-    headers["Referrer-Policy"] = "no-referrer"
-    headers["Connection"] = "close"
-    return Response(status.value, status.phrase, headers, body)
+def _response(status: HTTPStatus, text: str, kind: str = "text/plain") -> Response:
+    body = f"{text}\n".encode()
+    headers = {
+        "Content-Type": f"{kind}; charset=utf-8",
+        "Content-Length": str(len(body)),
+        "Content-Security-Policy": "frame-ancestors 'none'",
+        "Cache-Control": "no-store",
+        "X-Content-Type-Options": "nosniff",
+        "Referrer-Policy": "no-referrer",
+        "Connection": "close",
+    }
+    return Response(status.value, status.phrase, Headers(headers), body)

@@ -3,16 +3,17 @@
 import logging
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
-from aaplug.core.errors import AaplugError, UsageError, printable
-from aaplug.live.messages import See, Shown, Still
+from aaplug.live.messages import PictureRequest, Receipt, StillRequest
 from aaplug.live.pictures import Pictures, Steps, message
 from aaplug.live.subject import Subject
+from aaplug.system.errors import AaplugError, UsageError, printable
 
-IN_FLIGHT = 2  # pictures that are sent and not yet shown, so that a slow line delays no newer one
-MOST_STILLS = 4  # that wait; more are refused
+MAX_IN_FLIGHT = 2  # pictures that are sent and have not arrived, so that a slow line delays no newer one
+MAX_WAITING_STILLS = 4  # more are refused
 
 log = logging.getLogger("aaplug")
 
@@ -21,33 +22,32 @@ log = logging.getLogger("aaplug")
 class Page:
     """One client: what it wants, and the steps that lead there.
 
-    send: called from the studio's thread with a message.
+    send: called from the studio's thread with a message.  newer: True if no step for the request is taken yet.
+    sent, received: counts of pictures.
     """
 
     pictures: Pictures
     send: Callable[[bytes], object]
-    see: See | None = None
+    request: PictureRequest | None = None
     newer: bool = False
     steps: Steps | None = None
-    stills: deque[Still] = field(default_factory=deque)
+    stills: deque[StillRequest] = field(default_factory=deque)
     sent: int = 0
-    shown: int = 0
+    received: int = 0
 
     @property
     def busy(self) -> bool:
-        """Whether there is a step to take now."""
-        return self.sent - self.shown < IN_FLIGHT and bool(self.newer or self.steps or self.stills)
+        """True if there is a step to take now."""
+        return self.sent - self.received < MAX_IN_FLIGHT and bool(self.newer or self.steps or self.stills)
 
     def step(self) -> bytes | None:
-        """Take one step; newer wishes replace what is being drawn."""
-        assert self.see is not None
-        if self.newer or self.steps is None:
-            if self.steps is not None:
-                self.steps.close()
-            if self.newer:
-                self.newer, self.steps = False, self.pictures.steps(self.see)
-            else:
-                self.steps = self.pictures.still(self.see, self.stills.popleft())
+        """Take one step; a newer request replaces what is being drawn."""
+        assert self.request is not None
+        if self.newer:
+            self.newer = False  # before the request is read: the next one may come at any time
+            self.steps = self.pictures.steps(self.request)
+        elif self.steps is None:
+            self.steps = self.pictures.still(self.request, self.stills.popleft())
         try:
             return next(self.steps)
         except StopIteration:
@@ -75,58 +75,56 @@ class Studio:
             self._changed.notify()
         self._thread.join()
 
-    def enter(self, send: Callable[[bytes], object]) -> Page:
-        """Begin to draw for a page."""
+    @contextmanager
+    def page(self, send: Callable[[bytes], object]) -> Iterator[Page]:
+        """A block in which the studio draws for a page; `send`: see `Page`."""
         page = Page(Pictures(self.subject), send)
         with self._changed:
             self._pages.append(page)
-        return page
+        try:
+            yield page
+        finally:
+            with self._changed:
+                self._pages.remove(page)
 
-    def leave(self, page: Page) -> None:
-        """Stop drawing for a page."""
-        with self._changed:
-            self._pages.remove(page)
-
-    def tell(self, page: Page, said: See | Still | Shown) -> None:
-        """Receive what a page wants.
+    def receive(self, page: Page, said: PictureRequest | StillRequest | Receipt) -> None:
+        """Take a message of a page.
 
         Raises:
             UsageError: it wants more than it may.
         """
         with self._changed:
             match said:
-                case See():
-                    page.see, page.newer = said, True
-                case Still() if page.see is None or len(page.stills) >= MOST_STILLS:
+                case PictureRequest():
+                    page.request, page.newer = said, True
+                case StillRequest() if page.request is None or len(page.stills) >= MAX_WAITING_STILLS:
                     raise UsageError("still", "wait until the ones before are done")
-                case Still():
+                case StillRequest():
                     page.stills.append(said)
-                case Shown():
-                    page.shown = min(page.sent, page.shown + 1)
+                case Receipt():
+                    page.received = min(page.sent, page.received + 1)
             self._changed.notify()
 
     def _run(self) -> None:
         while (page := self._next()) is not None:
             try:
-                found = page.step()
+                picture = page.step()
             except Exception as error:  # one picture fails, the studio goes on
                 page.steps = None
-                known = isinstance(error, AaplugError | MemoryError)
-                if not known:
+                if not isinstance(error, AaplugError | MemoryError):
                     log.warning("a picture failed: %r", error)
-                found = message({"problem": printable(str(error) or "out of memory")}, [])
-            if found is not None:
+                picture = message({"problem": printable(str(error) or "out of memory")}, [])
+            if picture is not None:
                 page.sent += 1
-                page.send(found)
+                page.send(picture)
 
     def _next(self) -> Page | None:
         """The page whose turn it is, once there is one; None at the end."""
         with self._changed:
+            self._changed.wait_for(lambda: not self._open or any(page.busy for page in self._pages))
             while self._open:
-                for _ in range(len(self._pages)):
-                    page = self._pages[0]
-                    self._pages.rotate(-1)
-                    if page.busy:
-                        return page
-                self._changed.wait()
+                page = self._pages[0]
+                self._pages.rotate(-1)
+                if page.busy:
+                    return page
         return None

@@ -1,19 +1,38 @@
-"""What options are made of: how values are read from words, checked, and shown by `--help`."""
+"""The parts that options are made of: how values are read from words, checked, and shown by `--help`."""
 
+import ast
 import inspect
-from collections.abc import Callable, Iterable, Mapping
+import textwrap
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from functools import cache
+from itertools import pairwise
 from numbers import Integral, Real
-from typing import Any, TypeVar, cast, get_type_hints
+from typing import Annotated, Any, Self, cast, get_type_hints
 
 import tyro
 
-from aaplug.core.errors import SHOWN, UsageError, did_you_mean, not_one_of
-from aaplug.core.registry import names_of, unknown
+from aaplug.system.errors import SHOWN, UsageError, did_you_mean, not_one_of
+from aaplug.system.monitor import SILENT, Monitor
+from aaplug.system.registry import names_of, unknown
 
-Chosen = TypeVar("Chosen", bound="Options")
-Verb = TypeVar("Verb", bound=Callable[..., Any])
+
+@dataclass(frozen=True)
+class Group:
+    """A heading of `--help`, under which an option stands; options without one stand first.
+
+    title: `--help` adds "options".
+    """
+
+    title: str
+    about: str
+
+
+CAMERAS = Group("camera", "How the camera files are read, and which of the scene's Gaussians they must see.")
+ORBIT = Group("orbit", "Without cameras: views on an orbit around the scene, and the training that is assumed.")
+DRAWING = Group("drawing", "How images are drawn: programs, memory and machines.")
+REPORT = Group("report", "Files beside the figures.")
+TUNING = Group("tuning", "The optimization, of which the defaults were measured.")
 
 
 def flag(metavar: str, *aliases: str, kind: Any = None) -> Any:
@@ -35,18 +54,27 @@ def choices(names: Iterable[str]) -> Any:
     )
 
 
-def number(least: int | float, most: int | float, *, whole: bool = False, several: bool = False, unit: str = "") -> Any:
+def number(
+    least: int | float,
+    most: int | float,
+    *,
+    whole: bool = False,
+    several: bool = False,
+    unit: str = "",
+    metavar: str | None = None,
+) -> Any:
     """An option that takes a number from `least` to `most`, an integer if `whole`, or one or more if `several`.
 
-    `--help` shows the range, and `Options` refuses what is outside of it.  unit: may follow the number as a word's end.
+    `Options` refuses what is outside of the range.  unit: may follow the number as a word's end.
+    metavar: shown by `--help` instead of the range.
     """
-    kind, shown = int if whole else float, f"{least:.10g}..{most:.10g}" + " ..." * several
+    kind, range_text = int if whole else float, f"{least:.10g}..{most:.10g}" + " ..." * several
 
     def read(words: list[str]) -> Any:
         try:
             values = tuple(kind(word.removesuffix(unit)) for word in words)
         except ValueError as error:
-            raise ValueError(f"takes {shown}, got {' '.join(words)[:SHOWN]}") from error
+            raise ValueError(f"takes {range_text}, got {' '.join(words)[:SHOWN]}") from error
         return values if several else values[0]
 
     def holds(value: Any) -> bool:
@@ -57,13 +85,17 @@ def number(least: int | float, most: int | float, *, whole: bool = False, severa
         values = value if several else [value]
         return isinstance(values, (list, tuple)) and len(values) > 0 and all(map(holds, values))
 
-    return tyro.constructors.PrimitiveConstructorSpec(
-        "*" if several else 1,
-        shown,
-        read,
-        fits,
-        lambda value: [str(v) for v in (value if several and value else [value])],
-    )
+    def words(value: Any) -> list[str]:
+        return [str(v) for v in (value if several and value else [value])]
+
+    return Numbers("*" if several else 1, metavar or range_text, read, fits, words, range_text=range_text)
+
+
+@dataclass(frozen=True)
+class Numbers(tyro.constructors.PrimitiveConstructorSpec[Any]):
+    """How an option reads and checks numbers; range_text: for messages."""
+
+    range_text: str = ""
 
 
 UNSET: Any = tyro.conf.arg(help_behavior_hint="")  # an option that is absent unless given: its help shows no default
@@ -78,10 +110,10 @@ class OneOf:
 
     def check(self, option: str, value: Any) -> None:
         """Refuse other names; raises UsageError."""
-        known = [*self.others, *(names_of(self.kind) if self.kind else ())]
+        names = [*self.others, *(names_of(self.kind) if self.kind else ())]
         for name in value if isinstance(value, (list, tuple)) else [value]:
-            if isinstance(name, str) and name not in known:
-                raise UsageError(option, unknown(name, known) if self.kind else not_one_of(name, known))
+            if isinstance(name, str) and name not in names:
+                raise UsageError(option, unknown(name, names) if self.kind else not_one_of(name, names))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,6 +124,9 @@ class Options:
         UsageError: a number is outside of its option's range, or a name is not known.
     """
 
+    monitor: Annotated[Monitor, tyro.conf.Suppress] = SILENT
+    """Receiver of messages and progress."""
+
     def __post_init__(self) -> None:
         for name, check in _checks(type(self)):
             value = getattr(self, name)
@@ -99,29 +134,40 @@ class Options:
                 check.check(name, value)
             elif value is not None and not check.is_instance(value):
                 got = ", ".join(map(str, value)) if isinstance(value, (list, tuple)) else str(value)
-                raise UsageError(name, f"takes {check.metavar}, got {got[:SHOWN] or 'nothing'}")
+                takes = check.range_text if isinstance(check, Numbers) else check.metavar
+                raise UsageError(name, f"takes {takes}, got {got[:SHOWN] or 'nothing'}")
 
     @classmethod
-    def of(cls: type[Chosen], given: Mapping[str, Any]) -> Chosen:
+    def of(cls, given: Mapping[str, Any]) -> Self:
         """The options that a caller gave, checked by name, and the defaults."""
-        known = [field.name for field in fields(cls)]
-        for name in given.keys() - known:
-            raise UsageError(name, f"is no option here{did_you_mean(name, known)}")
+        names = [field.name for field in fields(cls)]
+        for name in given.keys() - names:
+            raise UsageError(name, f"is no option here{did_you_mean(name, names)}")
         return cls(**given)
 
-    @classmethod
-    def shown(cls, verb: Verb) -> Verb:
-        """Decorate a verb: its signature shows these options instead of `**options`."""
-        signature = inspect.signature(verb)
-        own = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
-        options = inspect.signature(cls).parameters.values()
-        vars(verb)["__signature__"] = signature.replace(parameters=[*own, *options])
-        return verb
+
+@cache
+def docs_of(options: type) -> dict[str, str]:
+    """The docstring of each field of a dataclass, its bases' included, by the field's name."""
+    found: dict[str, str] = {}
+    for base in reversed(options.__mro__[:-1]):
+        [tree] = ast.parse(textwrap.dedent(inspect.getsource(base))).body
+        body = cast(ast.ClassDef, tree).body
+        for statement, after in pairwise(body):
+            if isinstance(statement, ast.AnnAssign) and isinstance(after, ast.Expr):
+                found[ast.unparse(statement.target)] = ast.literal_eval(after.value)
+    return found
 
 
 @cache
 def _checks(options: type[Options]) -> list[tuple[str, Any]]:
-    """How values of options are checked, by the option's name."""
+    """The checks of values, each with its option's name."""
     hints = get_type_hints(options, include_extras=True).items()
-    found = [(name, check) for name, hint in hints for check in getattr(hint, "__metadata__", ())]
-    return [(name, c) for name, c in found if isinstance(c, OneOf | tyro.constructors.PrimitiveConstructorSpec)]
+    pairs = [(name, check) for name, hint in hints for check in getattr(hint, "__metadata__", ())]
+    return [(name, c) for name, c in pairs if isinstance(c, OneOf | tyro.constructors.PrimitiveConstructorSpec)]
+
+
+def documented(text: str | None, options: type[Options]) -> str:
+    """A verb's docstring with its options, a line each."""
+    lines = [f"    {name}: {doc}" for name, doc in docs_of(options).items()]
+    return "\n".join([inspect.cleandoc(text or ""), "", "Options:", *lines])

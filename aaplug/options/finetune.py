@@ -2,16 +2,19 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, get_args
+from typing import Annotated, Literal, get_args
 
 import tyro
 
-from aaplug.core.choices import ANCHOR, PARAMETERS, WEIGHTS, LossName
-from aaplug.core.registry import names_of
 from aaplug.options.base import UNSET, OneOf, choice, choices, flag, number
 from aaplug.options.objects import Viewer
 from aaplug.options.shared import SCALES, STEPS, ViewOptions
+from aaplug.system.registry import names_of
 
+LossName = Literal["l2", "l1-dssim"]
+WEIGHTS = {0.5: 1.0, 0.25: 2.0, 0.125: 1.0}  # weight of the loss by scale
+ANCHOR = 3.0  # weight of the loss at the training size, beside those of the scales
+PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "dc", "rest")
 TRUTHS = ("auto", "self", "photographs")
 
 
@@ -40,7 +43,7 @@ class FinetuneOptions(ViewOptions):
     learning_rate: Annotated[float, number(1e-6, 100)] = 1.0
     """Factor on the method's learning rates."""
     densify_every: Annotated[int | None, STEPS, UNSET] = None
-    """Clone, split and prune every N steps; 0 for never (default: the method's own)."""
+    """Clone, split and prune every N steps, with mipmap-gs; 0 for never (default: the method's own)."""
     truth: Annotated[str, choice(TRUTHS), OneOf(TRUTHS)] = "auto"
     """What the training size should look like: self is the scene's own render; auto takes photographs if all exist."""
     upsampler: Annotated[str | None, flag("bicubic|lanczos|FILE")] = None

@@ -3,38 +3,55 @@
 import math
 import os
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, get_args
+from os import PathLike
+from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import tyro
 
-from aaplug.core.choices import MIN_SEEN_SHARE, NAMES, QUALITIES, USER_RECIPES, Background, RateReference
-from aaplug.core.errors import SHOWN, UsageError
-from aaplug.core.registry import names_of
-from aaplug.options.base import UNSET, OneOf, Options, choice, flag, number
-from aaplug.options.objects import Executor, Rasterizer, Recipe, Viewer
+from aaplug.core.colours import Background
+from aaplug.core.conventions import MIN_SEEN_SHARE
+from aaplug.methods import QUALITIES, RateReference
+from aaplug.options.base import CAMERAS, DRAWING, ORBIT, UNSET, OneOf, Options, choice, flag, number
+from aaplug.system.errors import SHOWN, UsageError
+from aaplug.system.registry import names_of
+
+if TYPE_CHECKING:  # the modules of these types import torch
+    from aaplug.core.interfaces import Rasterizer
+    from aaplug.evaluation.protocols import Protocol
+    from aaplug.methods.recipe import Recipe
+    from aaplug.methods.viewers import Viewer
+    from aaplug.system.executors import Executor
+else:
+    Executor = Rasterizer = Protocol = Recipe = Viewer = Any
+
+AnyPath = str | PathLike[str]
 
 SCALE = number(0.001, 64)  # sizes of images against the training size
 SCALES = number(0.001, 64, several=True)
-STEPS = number(0, 1_000_000, whole=True)
-_SHARE = number(0, 1)
+STEPS = number(0, 1_000_000, whole=True, metavar="N")
 THREADS = number(1, max(8, os.cpu_count() or 1), whole=True)  # more gain nothing, and can exhaust the machine
-_GIGABYTES = number(0.01, 1024)
-_MARGIN = number(0, math.inf)
-RECIPE_NAMES = [name for name in names_of("recipe") if name in USER_RECIPES or name not in NAMES["recipe"]]
-_DRAWN_BY = ("auto", "compiled")  # beside those of the registry
-_REFERENCES = get_args(RateReference)
+VIEWS = tyro.conf.arg(metavar="NAME,...|test|train|all")
+RECIPE_NAMES = names_of("recipe", comparisons=False)
+RASTERIZER_NAMES = ("auto", "compiled")  # beside those of the registry
+RATE_REFERENCES = get_args(RateReference)
 MAX_SIDE = 16384  # px
+MAX_COORDINATE = 1e7  # world units
+DEFAULT_FOV = 50.0  # degrees
+
+_PLACE = number(-MAX_COORDINATE, MAX_COORDINATE, several=True, metavar="X Y Z")
 
 OneRecipe = Annotated[str | Recipe, choice([*RECIPE_NAMES, "..."]), OneOf(kind="recipe")]
 OneViewer = Annotated[str | Viewer | None, flag("VIEWER", "--for", kind=str | None), OneOf(kind="viewer")]
+OneProtocol = Annotated[str | Protocol, choice(names_of("protocol")), OneOf(kind="protocol")]
 
 
 @dataclass(frozen=True, kw_only=True)
 class FrameOptions(Options):
     """Whether scene and cameras belong together."""
 
-    min_seen: Annotated[float, _SHARE] = MIN_SEEN_SHARE
+    min_seen: Annotated[float, number(0, 1), CAMERAS] = MIN_SEEN_SHARE
     """Stop if the cameras see a smaller share of the Gaussians than this."""
 
 
@@ -42,19 +59,22 @@ class FrameOptions(Options):
 class ViewOptions(FrameOptions):
     """Views, background and rasterizer."""
 
-    views: Annotated[str, tyro.conf.arg(metavar="NAME,...|test|train|all")] = "test"
+    views: Annotated[str, VIEWS] = "test"
     """Views, by name or split."""
     background: Annotated[Background, choice(("auto", "white", "black"))] = "auto"
     """Colour behind the scene; auto is what training had."""
-    rasterizer: Annotated[
-        str | Rasterizer, choice([*_DRAWN_BY, *names_of("rasterizer")]), OneOf(_DRAWN_BY, "rasterizer")
-    ] = "auto"
-    """auto: compiled if `aaplug warmup` has run, else eager.  reference: slow, exact, float64."""
     threads: Annotated[int | None, THREADS, UNSET] = None
     """Processor threads (default: all)."""
-    memory: Annotated[float | None, _GIGABYTES, UNSET] = None
+    rasterizer: Annotated[
+        str | Rasterizer,
+        choice([*RASTERIZER_NAMES, *names_of("rasterizer")]),
+        OneOf(RASTERIZER_NAMES, "rasterizer"),
+        DRAWING,
+    ] = "auto"
+    """auto: compiled if `aaplug warmup` has run, else eager.  reference: slow, exact, float64."""
+    memory: Annotated[float | None, number(0.01, 1024, metavar="GB"), UNSET, DRAWING] = None
     """GB that drawing a frame may take, beside the scene and the image themselves (default: 1)."""
-    cull_margin: Annotated[float, _MARGIN, UNSET] = math.inf
+    cull_margin: Annotated[float, number(0, math.inf, metavar="SHARE"), UNSET, CAMERAS] = math.inf
     """For scenes trained so: leave out Gaussians centred off the image by more than this share of its longer side."""
 
 
@@ -64,9 +84,9 @@ class RecipeOptions(ViewOptions):
 
     quality: Annotated[str, choice(QUALITIES), OneOf(tuple(QUALITIES))] = "balanced"
     """How finely recipe auto samples: fast reaches a quarter of the training rate, balanced half, best all of it."""
-    rate_reference: Annotated[str | None, flag("|".join(_REFERENCES)), OneOf(_REFERENCES)] = None
+    rate_reference: Annotated[str | None, flag("|".join(RATE_REFERENCES)), OneOf(RATE_REFERENCES), DRAWING] = None
     """Sampling rate that matched and auto compare with (default: pose: global, but interval for free cameras)."""
-    scheduler: Annotated[str | Executor | None, flag("local|tcp://HOST:PORT", kind=str | None)] = None
+    scheduler: Annotated[str | Executor | None, flag("local|tcp://HOST:PORT", kind=str | None), DRAWING] = None
     """Draw views on a Dask cluster: of --threads processes on this machine, or of the machines at an address."""
 
 
@@ -75,13 +95,49 @@ class ImageOptions(Options):
     """Images by one recipe at one size."""
 
     recipe: OneRecipe = "auto"
-    """How to render; examples/guides/methods.md lists further recipes, for research."""
+    """How to render; `aaplug evaluate --recipe all` lists further recipes, for comparison."""
     scale: Annotated[float | None, SCALE, UNSET] = None
     """Size relative to the training size (default: 1)."""
     resolution: Annotated[str | None, flag("WxH")] = None
     """Size in px, such as 400x400; -1 on one side keeps the aspect (-1x720)."""
     overwrite: bool = False
     """Replace existing outputs."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Orbit(Options):
+    """Without cameras: views on an orbit around the scene, and the training that is assumed."""
+
+    orbit: Annotated[int | None, number(1, 10_000, whole=True), UNSET, ORBIT] = None
+    """Number of views around the scene (default: 8, or 1 for a single picture)."""
+    elevation: Annotated[float | None, number(-89, 89), UNSET, ORBIT] = None
+    """Degrees of the orbit above the horizon (default: 20)."""
+    fov: Annotated[float, number(1, 170), ORBIT] = DEFAULT_FOV
+    """Field of view in degrees, along the image's shorter side."""
+    look_at: Annotated[Sequence[float] | None, _PLACE, UNSET, ORBIT] = None
+    """Place to look at, X Y Z (default: the middle of the scene)."""
+    eye: Annotated[Sequence[float] | None, _PLACE, UNSET, ORBIT] = None
+    """Place to look from, X Y Z, instead of an orbit."""
+    up: Annotated[Sequence[float] | None, _PLACE, UNSET, ORBIT] = None
+    """Direction that points up, X Y Z (default: 0 -1 0, or what file and colours say)."""
+    train_view: Annotated[str | None, flag("WxH"), ORBIT] = None
+    """Size in px of the training images, which are taken to show what the orbit shows (default: 1600x1066)."""
+    train_rate: Annotated[float | None, number(1e-6, 1e9, metavar="RATE"), UNSET, ORBIT] = None
+    """Instead, px per world unit in the middle of the scene in training."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("look_at", "eye", "up"):
+            value = getattr(self, name)
+            if value is not None and len(value) != 3:
+                raise UsageError(name, f"takes three numbers X Y Z, got {len(value)}")
+        if self.train_view is not None:
+            size_of(self.train_view, "train_view")
+        if self.train_view is not None and self.train_rate is not None:
+            raise UsageError("train_view", "and `train_rate` both set the training rate; give one")
+        for name in ("orbit", "elevation"):
+            if self.eye is not None and getattr(self, name) is not None:
+                raise UsageError("eye", f"is a single place, which `{name}` would change; give one")
 
 
 def size_of(text: str, where: str = "resolution") -> tuple[int, int]:
@@ -92,7 +148,7 @@ def size_of(text: str, where: str = "resolution") -> tuple[int, int]:
     """
     match = re.fullmatch(r"([1-9]\d{0,8})x([1-9]\d{0,8})", text, re.ASCII)
     if match is None:
-        raise UsageError(where, f"takes sizes such as 400x400, got {text[:SHOWN]}")
+        raise UsageError(where, f"takes sizes such as 400x400, got {text[:MAX_VALUE_CHARACTERS]}")
     width, height = int(match[1]), int(match[2])
     check_side(where, width, height)
     return width, height
@@ -102,3 +158,8 @@ def check_side(where: str, width: int, height: int) -> None:
     """Refuse an image with a side above `MAX_SIDE`; raises UsageError."""
     if max(width, height) > MAX_SIDE:
         raise UsageError(where, f"would be {width}x{height} px; the limit is {MAX_SIDE} a side")
+
+
+def metric_option(name: str) -> str:
+    """A metric's name as an option's value."""
+    return name.casefold().replace(" ", "-")

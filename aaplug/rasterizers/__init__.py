@@ -1,44 +1,14 @@
 """Rasterizers by name: `tiled`, eager or compiled, and the slow float64 `reference` that checks it."""
 
-from collections.abc import Callable
+from typing import TYPE_CHECKING
 
-from aaplug.core.errors import UsageError, not_one_of
-from aaplug.core.interfaces import Rasterizer
-from aaplug.core.registry import Registry, named
-from aaplug.rasterizers.reference import Reference
-from aaplug.rasterizers.tiled import Tiled
-from aaplug.rasterizers.tiled.ahead_of_time import build, has_compiler, load
+from aaplug.system.registry import Registry
 
-FRAMES_THAT_PAY = 500  # compiling takes about 150 s and saves about 0.3 s per 800 x 800 frame
+if TYPE_CHECKING:
+    from aaplug.core.interfaces import Rasterizer
 
-RASTERIZERS: Registry[Rasterizer] = Registry("rasterizer", named((Tiled(), Reference())), Rasterizer)
-
-
-def find_rasterizer(name: str = "auto", frames: int = 1, say: Callable[[str], None] = lambda text: None) -> Rasterizer:
-    """A rasterizer by name; "auto" is compiled where kernels are built, and builds them where `frames` repay it.
-
-    say: called with the choice, in words.
-
-    Raises:
-        UsageError: the name is not known, or "compiled" was asked for and cannot be built.
-    """
-    if name in RASTERIZERS:
-        return RASTERIZERS[name]
-    if name not in ("auto", "compiled"):
-        raise UsageError("rasterizer", not_one_of(name, ["auto", "compiled", *RASTERIZERS]))
-    kernels = load()
-    if kernels is None and (name == "compiled" or (frames >= FRAMES_THAT_PAY and has_compiler())):
-        say("rasterizer: compiling the kernels, once for this machine (two to three minutes)")
-        try:
-            kernels = build()
-        except UsageError as error:
-            if name == "compiled":
-                raise
-            say(f"rasterizer: eager ({error})")
-            return RASTERIZERS["eager"]
-    if kernels is not None:
-        say("rasterizer: compiled")
-        return Tiled(kernels)
-    hint = "`aaplug warmup` compiles it, several times as fast"
-    say(f"rasterizer: eager ({hint if has_compiler() else 'no C++ compiler found to compile it'})")
-    return RASTERIZERS["eager"]
+RASTERIZERS: Registry["Rasterizer"] = Registry(
+    "rasterizer",
+    "aaplug.core.interfaces:Rasterizer",
+    {"eager": "aaplug.rasterizers.tiled.rasterizer:EAGER_TILED", "reference": "aaplug.rasterizers.reference:REFERENCE"},
+)

@@ -10,11 +10,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from aaplug.core.colours import Colour
 from aaplug.core.imaging import over
-from aaplug.core.interfaces import Colour, Compositor, PixelKernel
+from aaplug.core.interfaces import Compositor, PixelKernel
 from aaplug.core.rules import RULES_3DGS, Rules
 from aaplug.core.splats import Render, Splats2D
-from aaplug.methods.pixel_kernels import POINT
+from aaplug.methods.pixel_kernels.point import POINT
 
 STRIP_PIXELS = 4096
 CHUNK_SPLATS = 512
@@ -38,19 +39,14 @@ class Reference:
         """Draw the splats in float64."""
         splats = splats.to(torch.float64)
         splats = splats[torch.sort(splats.depths, stable=True).indices]
-        centres = _pixel_centres(hw).to(splats.means.device)
+        y, x = (torch.arange(side, dtype=torch.float64, device=splats.means.device) + 0.5 for side in hw)
         strips = [
             _strip(splats, strip, pixel, rules) if compositor is None else compositor.exact(splats, strip, rules)
-            for strip in centres.split(STRIP_PIXELS)
+            for strip in torch.cartesian_prod(y, x).flip(1).split(STRIP_PIXELS)
         ]
         rgb = torch.cat([rgb for rgb, _ in strips]).reshape(*hw, 3)
         transmittance = torch.cat([t for _, t in strips]).reshape(hw)
         return over(rgb, 1 - transmittance, background)
-
-
-def _pixel_centres(hw: tuple[int, int]) -> Float[Tensor, "p 2"]:
-    y, x = (torch.arange(side, dtype=torch.float64) + 0.5 for side in hw)
-    return torch.cartesian_prod(y, x).flip(1)
 
 
 def _strip(
@@ -66,11 +62,11 @@ def _strip(
         after = transmittance[:, None] * (1 - alpha).cumprod(dim=1)
         before = torch.cat([transmittance[:, None], after[:, :-1]], dim=1)
         # `after` only falls, so the first splat that misses the bound ends the pixel
-        kept = (after >= rules.min_transmittance) & going[:, None]
+        counts = (after >= rules.min_transmittance) & going[:, None]
         assert chunk.rgb is not None
-        rgb = rgb + (torch.where(kept, alpha * before, 0.0)) @ chunk.rgb
-        transmittance = torch.minimum(transmittance, torch.where(kept, after, 1.0).amin(dim=1))
-        going = going & kept[:, -1]
+        rgb = rgb + (torch.where(counts, alpha * before, 0.0)) @ chunk.rgb
+        transmittance = torch.minimum(transmittance, torch.where(counts, after, 1.0).amin(dim=1))
+        going = going & counts[:, -1]
     return rgb, transmittance
 
 
@@ -81,3 +77,6 @@ def alphas(
     values = pixel.exact(splats, centres[:, None] - splats.means)
     alpha = (splats.opacities * values).clamp(max=rules.max_alpha)
     return torch.where(alpha >= rules.min_alpha, alpha, 0.0)
+
+
+REFERENCE = Reference()

@@ -26,7 +26,7 @@ from aaplug.core.spherical_harmonics import SH_C0
 from aaplug.core.training import TrainingViews
 from aaplug.methods.pixel_kernels.raster_rows import TILE
 from aaplug.methods.recipes import find_recipe
-from aaplug.rasterizers import Tiled
+from aaplug.rasterizers.tiled import Tiled
 from aaplug.rasterizers.tiled.backward import composite
 from aaplug.rasterizers.tiled.binning import bands
 from aaplug.rasterizers.tiled.forward import Compositing

@@ -5,7 +5,7 @@ wait for each other; Python threads gained nothing.  An image does not depend on
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -13,11 +13,11 @@ from typing import Any
 import torch
 
 from aaplug.core.cameras import Camera
-from aaplug.core.executors import Apply
-from aaplug.core.monitor import Tell
 from aaplug.io.atomic import check_output
 from aaplug.io.images import write_png
 from aaplug.rendering.renderer import Renderer
+from aaplug.system.executors import Apply
+from aaplug.system.monitor import Tell
 
 
 def write_frames(
@@ -64,7 +64,6 @@ class _Writer:
         write_png(self.paths[index], image, self.bit_depth, overwrite=True)
 
     def __getstate__(self) -> dict[str, Any]:
-        """For another process, wherever it runs: without the scene's file, which may be open."""
-        scene = replace(self.renderer.scene, origin=None)
+        """For another process, wherever it runs."""
         paths = [path.absolute() for path in self.paths]
-        return self.__dict__ | {"renderer": replace(self.renderer, scene=scene), "paths": paths}
+        return self.__dict__ | {"renderer": self.renderer.portable(), "paths": paths}

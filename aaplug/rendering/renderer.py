@@ -10,32 +10,39 @@ and weighing the samples of each pixel.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from os import PathLike
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from aaplug.core.cameras import BLACK, WHITE, Camera, CameraSet
-from aaplug.core.choices import MIN_SEEN_SHARE, Background, Colour
+from aaplug.core.cameras import Camera, CameraSet
+from aaplug.core.colours import BLACK, WHITE, Background, Colour
+from aaplug.core.conventions import MIN_SEEN_SHARE
 from aaplug.core.culling import cull
-from aaplug.core.errors import UsageError
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.imaging import average_samples
 from aaplug.core.interfaces import Rasterizer, RunsKernels
 from aaplug.core.kernels import EAGER, Kernels
 from aaplug.core.projection import project, with_depth_slopes
-from aaplug.core.pyramids import Cutter, Pyramid, faded
+from aaplug.core.pyramids import Cutter, faded
 from aaplug.core.sampling import sampling_bounds
 from aaplug.core.shading import shade
 from aaplug.core.splats import Render, Splats2D, concatenated
 from aaplug.core.training import TrainingViews
-from aaplug.methods.filters import fuse_stored
-from aaplug.methods.recipe import SLACK, Recipe
+from aaplug.io.cameras import read_cameras
+from aaplug.io.scenes import SceneLike, scene_of
+from aaplug.io.scenes.harmonics import without_harmonics
+from aaplug.io.scenes.scene_file import Scene
+from aaplug.methods.filters.smoothing import fuse_stored
+from aaplug.methods.recipe import RATE_TOLERANCE, Recipe
 from aaplug.methods.recipes import find_recipe, suited
-from aaplug.rasterizers import RASTERIZERS, find_rasterizer
+from aaplug.rasterizers import RASTERIZERS
+from aaplug.rasterizers.choice import find_rasterizer
+from aaplug.system.errors import UsageError
 
-CHUNK = 1 << 20  # Gaussians projected at once, where no gradients are asked for
+GAUSSIANS_AT_ONCE = 1 << 20  # Gaussians projected at once, where no gradients are asked for
 RATE_DIGITS = 2  # decimals of the rate that sets the weight of neighbours, which so moves in steps
 
 Harmonics = Callable[[int, int], Float[Tensor, "c k 3"]]
@@ -49,14 +56,15 @@ class Drawing(NamedTuple):
     hw: tuple[int, int]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Renderer:
     """A prepared scene; call it with a camera.
 
-    scene: the scene after the world filter.  training: the training views of the unfiltered scene.
+    scene: the Gaussians after the world filter.  training: the training views of the unfiltered ones.
     background: red, green, blue in [0, 1].
     harmonics: reads those of the Gaussians from start up to stop, where `scene.sh` does not hold them; else None.
     cutter: picks what a view draws where `scene` has several levels of detail; else None.
+    source: the scene as it is stored, from which `by` and `trained_at` prepare it anew; None in other processes.
     """
 
     scene: Gaussians
@@ -66,13 +74,14 @@ class Renderer:
     background: Colour = BLACK
     harmonics: Harmonics | None = None
     cutter: Cutter | None = None
-    _rates: dict[tuple[object, ...], float] = field(default_factory=dict, init=False, repr=False, compare=False)
+    source: Scene | None = field(default=None, repr=False)
+    _rates: dict[tuple[object, ...], float] = field(default_factory=dict, init=False, repr=False)
 
     @classmethod
     def of(
         cls,
-        scene: Gaussians | Pyramid,
-        cameras: CameraSet | Sequence[Camera] | TrainingViews,
+        scene: SceneLike,
+        cameras: CameraSet | Sequence[Camera] | TrainingViews | str | PathLike[str],
         recipe: str | Recipe = "auto",
         *,
         quality: str = "balanced",
@@ -84,10 +93,10 @@ class Renderer:
         """Prepare a scene: check its frame, compute its sampling bounds and apply the world filter.
 
         Args:
-            scene: the scene as its file stores it, before any world filter; or a pyramid, whose levels are drawn if
-                the recipe takes them.
-            cameras: the training cameras.  With a `TrainingViews` nothing is checked or computed, and `cull_margin`
-                and `min_seen` are ignored.
+            scene: a scene, its Gaussians or its path, before any world filter; its levels of detail are drawn if the
+                recipe takes them.
+            cameras: the training cameras, or their path.  With a `TrainingViews` nothing is checked or computed, and
+                `cull_margin` and `min_seen` are ignored.
             recipe: a recipe, or its name in `RECIPES`.
             quality: "fast", "balanced" or "best": how finely recipe "auto" supersamples.
             background: a colour, "white", "black", or "auto": the colour that a `CameraSet` records, else black.
@@ -96,32 +105,56 @@ class Renderer:
             min_seen: share of the Gaussians that the cameras must see.
 
         Raises:
+            FormatError: a file cannot be read.
             FrameError: the cameras see little of the scene.
             UsageError: a name is not known, there are no cameras, or the scene lacks what the recipe needs.
         """
+        if isinstance(cameras, str | PathLike):
+            cameras = read_cameras(cameras)
         if isinstance(recipe, str):
             recipe = find_recipe(recipe, quality=quality)
-        pyramid = None
-        if isinstance(scene, Pyramid):
-            pyramid = scene if recipe.levels else None
-            scene = scene.scene if pyramid else scene.finest
-        if isinstance(cameras, TrainingViews):
-            training = cameras if pyramid is None else TrainingViews.of(scene, cameras.cameras, cameras.cull_margin)
-        else:
-            training = TrainingViews.of(scene, cameras, cull_margin, min_seen)
+        source = scene_of(scene)
+        pyramid = source.levels if recipe.levels else None
+        gaussians, harmonics = (pyramid.scene, None) if pyramid else without_harmonics(source)
+        if not isinstance(cameras, TrainingViews):
+            training = TrainingViews.of(gaussians, cameras, cull_margin, min_seen)
+        elif len(cameras.bounds.views) == len(gaussians):
+            training = cameras
+        else:  # of other levels of detail
+            training = TrainingViews.of(gaussians, cameras.cameras, cameras.cull_margin)
         if isinstance(rasterizer, str):
             rasterizer = find_rasterizer(rasterizer)
-        recipe = suited(recipe, scene)
+        recipe = suited(recipe, gaussians)
         colour = background_colour(background, cameras)
         cutter = Cutter.of(pyramid, training) if pyramid else None
-        return cls(prepared(scene, training, recipe), training, recipe, rasterizer, colour, cutter=cutter)
+        filtered = _filtered(gaussians, training, recipe)
+        return cls(filtered, training, recipe, rasterizer, colour, harmonics, cutter, source)
+
+    def by(self, recipe: Recipe) -> "Renderer":
+        """The same scene by another recipe."""
+        assert self.source is not None
+        same = {"background": self.background, "rasterizer": self.rasterizer}
+        return Renderer.of(self.source, self.training, recipe, **same)
+
+    def trained_at(self, factor: float) -> "Renderer":
+        """The same scene as if training had sampled it `factor` times as finely; its world filter is applied anew."""
+        training = self.training.finer(factor)
+        cutter = None if self.cutter is None else Cutter.of(self.cutter.pyramid, training)
+        if self.recipe.world is None:
+            return replace(self, training=training, cutter=cutter)
+        assert self.source is not None
+        raw = self.source.gaussians() if self.cutter is None else self.cutter.pyramid.scene
+        return replace(self, scene=_filtered(raw, training, self.recipe), training=training, cutter=cutter)
 
     def showing(self, scene: Gaussians) -> "Renderer":
         """The same for another scene: its sampling bounds are computed from the same cameras."""
-        known = self.training
-        training = TrainingViews.of(scene, known.cameras, known.cull_margin)
-        filtered = prepared(scene, training, self.recipe)
-        return replace(self, scene=filtered, training=training, harmonics=None, cutter=None)
+        training = TrainingViews.of(scene, self.training.cameras, self.training.cull_margin)
+        same = {"background": self.background, "rasterizer": self.rasterizer}
+        return Renderer.of(scene, training, self.recipe, **same)
+
+    def portable(self) -> "Renderer":
+        """The same for another process, without the scene's file, which may be open."""
+        return replace(self, scene=replace(self.scene, origin=None), source=None)
 
     def __call__(self, camera: Camera) -> Render:
         """Render one view: rgb and alpha of `camera.hw`.
@@ -137,14 +170,22 @@ class Renderer:
         """Render one view and keep its splats, for example to read their gradients."""
         fine, samples = self.sampled(camera)
         splats = self.splats(fine, samples)
+        image = self.paint(splats, fine.hw)
+        return Drawing(average_samples(image, samples, self.neighbours(camera, samples)), splats, fine.hw)
+
+    def paint(self, splats: Splats2D, hw: tuple[int, int], background: Colour | None = None) -> Render:
+        """Composite coloured splats into an image of height and width `hw` px.
+
+        background: None for the renderer's own.
+        """
+        colour = self.background if background is None else background
         recipe, rules = self.recipe, self.training.convention.rules
-        image = self.rasterizer(splats, fine.hw, self.background, recipe.pixel, recipe.compositor, rules)
-        return Drawing(average_samples(image, samples, self.neighbours(camera)), splats, fine.hw)
+        return self.rasterizer(splats, hw, colour, recipe.pixel, recipe.compositor, rules)
 
     def sampled(self, camera: Camera) -> tuple[Camera, int]:
         """Camera of the supersampled image, and the samples along a pixel's side."""
         samples = self.samples(camera)
-        return _sampled(camera, samples), samples
+        return camera.resized(camera.width * samples, camera.height * samples), samples
 
     def samples(self, camera: Camera) -> int:
         """Number of samples along a pixel's side."""
@@ -154,7 +195,7 @@ class Renderer:
         asked = self.recipe.samples_at(rate)
         if self.cutter is None or self.recipe.levels is None:
             return asked
-        for_coarsest = math.ceil(self.cutter.pyramid.coarsest_rate / rate - SLACK)
+        for_coarsest = math.ceil(self.cutter.pyramid.coarsest_rate / rate - RATE_TOLERANCE)
         return int(min(asked, max(self.recipe.levels.most_samples, for_coarsest)))
 
     def coarsening(self, camera: Camera, samples: int) -> float:
@@ -165,11 +206,14 @@ class Renderer:
         most = max(choice.budget, int(choice.share * self.cutter.pyramid.sizes[0]))
         return self.cutter.coarsening(camera, max(0.0, math.log2(samples) - choice.finer), most)
 
-    def neighbours(self, camera: Camera) -> float:
-        """Weight of the samples on either side of each sample: like their number, a constant to gradients."""
+    def neighbours(self, camera: Camera, samples: int) -> float:
+        """Weight of the samples on either side of each sample: like their number, a constant to gradients.
+
+        samples: along a pixel's side.
+        """
         if self.recipe.neighbours == 0 or self.cutter is not None:
             return 0.0
-        sampled_rate = self.samples(camera) * self.relative_rate(camera)
+        sampled_rate = samples * self.relative_rate(camera)
         return self.recipe.neighbours_at(round(sampled_rate, RATE_DIGITS))
 
     def relative_rate(self, camera: Camera) -> float:
@@ -206,7 +250,7 @@ class Renderer:
         """
         cut = None if self.cutter is None else self.cutter(camera, self.coarsening(camera, samples))
         whole, parts = max(1, len(self.scene) if cut is None else len(cut)), []
-        at_once = whole if self.scene.tracked else CHUNK
+        at_once = whole if self.scene.tracked else GAUSSIANS_AT_ONCE
         for start in range(0, whole, at_once):
             if cut is not None:
                 part = cut[start : start + at_once]
@@ -227,7 +271,7 @@ class Renderer:
 
         places: of each in the scene, or of the first if all follow.  shares: see `Cut`.
         """
-        recipe, training, kernels = self.recipe, self.training, self._kernels
+        recipe, training, kernels = self.recipe, self.training, self.kernels
         rules = training.convention.rules
         splats = project(chunk, camera, kernels, rules)
         if recipe.selection is not None:
@@ -245,28 +289,31 @@ class Renderer:
     def _shaded(self, splats: Splats2D, chunk: Gaussians, start: int, camera: Camera) -> Splats2D:
         """The same splats with colour; harmonics that the scene does not hold are read for the chunk from `start`."""
         if self.harmonics is None or not len(splats):
-            return shade(splats, self.scene, camera, self._kernels)
+            return shade(splats, self.scene, camera, self.kernels)
         chunk = replace(chunk, sh=self.harmonics(start, start + len(chunk)))
         local = replace(splats, sources=splats.sources - start)
-        return replace(shade(local, chunk, camera, self._kernels), sources=splats.sources)
+        return replace(shade(local, chunk, camera, self.kernels), sources=splats.sources)
 
     @property
-    def _kernels(self) -> Kernels:
+    def kernels(self) -> Kernels:
+        """The kernels that run the stages before the rasterizer, as it runs its own."""
         return self.rasterizer.kernels if isinstance(self.rasterizer, RunsKernels) else EAGER
 
 
-def _sampled(camera: Camera, samples: int) -> Camera:
-    """Camera of the image with so many samples along a pixel's side."""
-    return camera.resized(camera.width * samples, camera.height * samples)
-
-
-def prepared(scene: Gaussians, training: TrainingViews, recipe: Recipe) -> Gaussians:
+def _filtered(scene: Gaussians, training: TrainingViews, recipe: Recipe) -> Gaussians:
     """Apply what acts once per scene: its stored 3D filter, which is part of it, then the recipe's world filter.
 
     A world filter is applied even if the scene already contains one: use `mip` if it stores `filter_3D`.
     """
     scene = fuse_stored(scene)
     return scene if recipe.world is None else recipe.world(scene, training)
+
+
+def own_look(
+    scene: SceneLike, training: TrainingViews, rasterizer: str | Rasterizer = "auto", background: Background = "auto"
+) -> Renderer:
+    """A renderer of the scene by training's own rule, at any size (recipe `matched`); its finest level alone."""
+    return Renderer.of(scene, training, find_recipe("matched"), rasterizer=rasterizer, background=background)
 
 
 def background_colour(background: Background, cameras: object = None) -> Colour:

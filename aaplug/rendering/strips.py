@@ -8,13 +8,11 @@ import torch
 from aaplug.core.cameras import Camera
 from aaplug.core.culling import cull
 from aaplug.core.imaging import average_samples
-from aaplug.core.interfaces import RunsKernels
-from aaplug.core.kernels import EAGER
 from aaplug.core.splats import Render, Splats2D
 from aaplug.rendering.renderer import Renderer
 
-SAMPLES = 1 << 19  # of a strip: some 30 ms on two cores
-HALO = 1  # pixels beyond a strip, whose samples neighbours weigh in
+SAMPLES_PER_STRIP = 1 << 19  # some 30 ms on two cores
+HALO = 1  # px beyond a strip's sides: neighbours of its samples lie there
 
 
 @torch.no_grad()
@@ -30,7 +28,7 @@ def strips(
     left, right = columns or (0, camera.width)
     start, end = max(0, left - HALO), min(camera.width, right + HALO)
     fine = camera.resized(camera.width * samples, camera.height * samples)
-    splats, soft = _moved(renderer.splats(fine, samples), -start * samples, 0), renderer.neighbours(camera)
+    splats, soft = _moved(renderer.splats(fine, samples), -start * samples, 0), renderer.neighbours(camera, samples)
     fine = replace(fine, width=(end - start) * samples)
     rows, drawn = max(1, SAMPLES // (fine.width * samples)), []
     for top in range(0, camera.height, rows):
@@ -46,11 +44,10 @@ def _strip(
 ) -> Render:
     """Some rows of pixels; whole: height and width of all samples."""
     top, bottom = max(0, rows[0] - HALO), min(whole[0] // samples, rows[1] + HALO)
-    recipe, rules, rasterizer = renderer.recipe, renderer.training.convention.rules, renderer.rasterizer
-    kernels = rasterizer.kernels if isinstance(rasterizer, RunsKernels) else EAGER
+    pixel, rules = renderer.recipe.pixel, renderer.training.convention.rules
     moved, hw = _moved(splats, 0, -top * samples), ((bottom - top) * samples, whole[1])
-    here = cull(moved, hw, kernels=kernels, ellipses=recipe.pixel.bounding_ellipses(moved, rules), rules=rules)
-    image = rasterizer(here, hw, renderer.background, recipe.pixel, recipe.compositor, rules)
+    here = cull(moved, hw, kernels=renderer.kernels, ellipses=pixel.bounding_ellipses(moved, rules), rules=rules)
+    image = renderer.paint(here, hw)
     pixels = average_samples(image, samples, soft)
     inner = slice(rows[0] - top, rows[1] - top)
     return Render(pixels.rgb[inner], pixels.alpha[inner])

@@ -8,13 +8,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.cameras import Camera
-from aaplug.core.executors import Apply
-from aaplug.core.locks import scratch
-from aaplug.core.monitor import Tell
 from aaplug.io.images import read_image
 from aaplug.io.video import check_video, write_video
 from aaplug.rendering.frames import write_frames
 from aaplug.rendering.renderer import Renderer
+from aaplug.system.executors import Apply
+from aaplug.system.locks import scratch
+from aaplug.system.monitor import Tell
 
 Image = Float[Tensor, "h w 3"]
 

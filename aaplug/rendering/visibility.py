@@ -1,9 +1,9 @@
-"""How much of each Gaussian a scene's views show, past those in front of it.
+"""The visible share of each Gaussian in a scene's views, past those in front of it.
 
-Merging may change what is hidden at no cost, and a level leaves out what no view shows.  The light that a splat adds
-to an image, Σ T α with the transmittance T before it, is the gradient of the sum of all pixels with respect to its
-colour.  Over the light that it would add alone, this is its mean transmittance.  Alone it would add the part of
-2π √det (o - c) that lies in the image, as alphas below the cut-off c are not drawn.
+Merging may change hidden Gaussians at no cost, and a level leaves out those that no view shows.  A splat adds the light
+Σ T α to an image, with the transmittance T before it.  This is the gradient of the sum of all pixels with respect to
+its colour.  Divided by the light that the splat would add alone, it is the splat's mean transmittance.  Alone it would
+add the part of 2π √det (o - c) that lies in the image, because alphas below the cut-off c are not drawn.
 """
 
 import math
@@ -14,13 +14,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.cameras import BLACK, Camera, spread
-from aaplug.core.free_views import free_views
-from aaplug.core.monitor import Tell
+from aaplug.core.camera_paths import free_views
+from aaplug.core.cameras import Camera, spread
+from aaplug.core.colours import BLACK
 from aaplug.core.splats import Splats2D
 from aaplug.rendering.renderer import Renderer
+from aaplug.system.monitor import Tell
 
-VIEWS = 100  # half of them training poses, half free ones between these, as far as there are so many
+MAX_VIEWS = 100  # half of them training poses, half free ones between these
 
 
 def visibility(
@@ -28,25 +29,25 @@ def visibility(
 ) -> Float[Tensor, " n"]:
     """Mean transmittance in front of each Gaussian of `look`'s scene, in the view that shows most of it.
 
-    It is NaN for a Gaussian that lies in no image, and where it is too faint to be drawn: nothing is known of it.
+    NaN for a Gaussian of which nothing is known: it lies in no image, or is too faint to be drawn.
 
     poses: training poses; free ones between them count too.
     scale: of the images, against the poses' size.
     """
-    found = torch.full((len(look.scene),), -1.0)
-    views = [*spread(poses, VIEWS // 2), *spread(free_views(poses, 1), VIEWS // 2)]
+    shares = torch.full((len(look.scene),), -1.0)
+    views = [*spread(poses, MAX_VIEWS // 2), *spread(free_views(poses, 1), MAX_VIEWS // 2)]
     for number, view in enumerate(views):
         tell(number, len(views))
         camera = view.scaled(scale)
         splats, light = _light(look, camera)
         share = light / _alone(splats, camera.hw, look.training.convention.rules.min_alpha)
         share = share.clamp(max=1).where(share.isfinite(), -1.0)
-        found[splats.sources] = torch.maximum(found[splats.sources], share.to(found))
-    return found.where(found >= 0, torch.nan)
+        shares[splats.sources] = torch.maximum(shares[splats.sources], share.to(shares))
+    return shares.where(shares >= 0, torch.nan)
 
 
 def _alone(splats: Splats2D, hw: tuple[int, int], min_alpha: float) -> Float[Tensor, " m"]:
-    """What each splat would add to an empty image: 0 if its middle lies outside."""
+    """The light that each splat would add to an empty image, in px²: 0 if its middle lies outside."""
     sides, means = torch.tensor([hw[1], hw[0]]).to(splats.means), splats.means
     sigmas = splats.covs[:, [0, 2]].sqrt()
     inside = torch.special.ndtr((sides - means) / sigmas) - torch.special.ndtr(-means / sigmas)
@@ -55,15 +56,13 @@ def _alone(splats: Splats2D, hw: tuple[int, int], min_alpha: float) -> Float[Ten
 
 
 def _light(look: Renderer, camera: Camera) -> tuple[Splats2D, Float[Tensor, " m"]]:
-    """The splats of a view, and the light that each adds to its image: px² where it covers them fully."""
+    """The splats of a view, and the light that each adds to its image, in px² at full alpha."""
     with torch.no_grad():
         splats = look.splats(camera)
     if not len(splats):
         return splats, splats.opacities
     with torch.enable_grad():
         colours = splats.means.new_zeros(len(splats), 3).requires_grad_()
-        recipe, rules = look.recipe, look.training.convention.rules
-        painted = replace(splats, rgb=colours)
-        render = look.rasterizer(painted, camera.hw, BLACK, recipe.pixel, recipe.compositor, rules)
+        render = look.paint(replace(splats, rgb=colours), camera.hw, BLACK)
         (light,) = torch.autograd.grad(render.rgb[..., 0].sum(), colours)
     return splats, light[:, 0]

@@ -3,12 +3,12 @@
 from collections.abc import Sequence
 
 from aaplug.core.cameras import Camera
-from aaplug.core.errors import UsageError, listing
-from aaplug.core.executors import PAYS_AFTER
-from aaplug.core.monitor import Monitor
 from aaplug.io.limits import lack_of_memory
 from aaplug.rendering.cost import cost_of
 from aaplug.rendering.renderer import Renderer
+from aaplug.system.errors import UsageError, listing
+from aaplug.system.executors import PAYS_AFTER_SECONDS
+from aaplug.system.monitor import Monitor
 
 LONG = 60.0  # seconds of work from which a job is announced
 LARGE = 4e9  # bytes from which it is
@@ -34,7 +34,7 @@ def announce(
     """
     cost = cost_of(renderers, views)
     seconds = cost.seconds if seconds is None else seconds
-    needed = cost.scene + cost.image * (processes if seconds > PAYS_AFTER else 1)
+    needed = cost.scene + cost.image * (processes if seconds > PAYS_AFTER_SECONDS else 1)
     sizes = listing(sorted({f"{view.width}x{view.height}" for view in views}), most=3)
     images = len(views) * len(renderers)
     what = f"{work or f'{images} image' + 's' * (images != 1)} at {sizes}"

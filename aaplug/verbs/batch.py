@@ -4,21 +4,20 @@ import traceback
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeVar
 
 from rich.markup import escape
 from rich.table import Table
 
-from aaplug.core.errors import AaplugError, ClusterError, printable
-from aaplug.core.monitor import SILENT, Monitor
 from aaplug.evaluation.report.files import as_json, write_texts
 from aaplug.evaluation.results import Report, as_csv, grid, method, results
 from aaplug.io.atomic import claimed, output_folder, refuse_existing
-from aaplug.options.objects import AnyPath
-from aaplug.verbs.evaluate import EvaluateOptions, check_results
-from aaplug.verbs.shard import Record, Shard
+from aaplug.options.shared import AnyPath
+from aaplug.options.verbs import EvaluateOptions
+from aaplug.system.errors import AaplugError, ClusterError, printable
+from aaplug.system.monitor import SILENT, Monitor
+from aaplug.verbs.evaluate import check_results
 from aaplug.verbs.views import file_names
 
 SUMMARY, RESULTS = "batch.json", "results.csv"
@@ -86,8 +85,6 @@ def batch(
     *,
     resume: bool = False,
     overwrite: bool = False,
-    shard: str | None = None,
-    request: str = "",
     monitor: Monitor = SILENT,
 ) -> Batch:
     """Evaluate scenes into folders of their own, and write batch.json and results.csv beside these.
@@ -96,44 +93,24 @@ def batch(
         runs: scenes by name, each as `functools.partial(evaluate, scene, cameras, ...)`; called with `name`,
             `output`, `resume`, `overwrite` and `monitor`.
         output: folder of the scenes' folders.
-        shard: "3/8" for the third of eight parts of the scenes; writes its record instead, for `gather`.
-        request: hash of what all shards must agree on.
 
     Raises:
         AaplugError: there are results already, an option does not fit, or the summary cannot be written.
     """
     folders = [Path(output) / slug for slug in file_names([name for name, _ in runs], "scene", 3)]
-    part = None if shard is None else Shard.read(shard)
-    mine = [place for place in range(len(runs)) if part is None or part.holds(place)]
-    names = {folder.name: name for folder, (name, _) in zip(folders, runs, strict=True)}
-    check = partial(_check, Path(output), part, [folders[place] for place in mine], resume, overwrite)
+
+    def check() -> None:
+        refuse_existing([Path(output) / name for name in (SUMMARY, RESULTS)], overwrite or resume)
+        for folder in folders:
+            check_results(folder, EvaluateOptions(resume=resume, overwrite=overwrite))
+
     check()
-    with output_folder(output) as made, claimed(made if part is None else made / part.record, check):
-        todo = {folders[place]: runs[place] for place in mine}
-        found = _batch(todo, resume, overwrite, monitor)
-        if part is None:
-            write_batch(found, made, monitor)
-        else:
-            outcomes = {scene: found.failures.get(scene) for scene in found.names}
-            record = Record(version("aaplug"), request, names, outcomes)
-            for path in write_texts(made, {part.record: as_json(vars(record))}, overwrite=True):
-                monitor.say(f"wrote {path}: shard {part}, {len(mine)} of {len(runs)} scenes")
+    with output_folder(output) as made, claimed(made, check):
+        found = _batch(dict(zip(folders, runs, strict=True)), resume, overwrite, monitor)
+        texts = {SUMMARY: as_json(found.summary()), RESULTS: as_csv(found.reports)}
+        for path in write_texts(made, texts, overwrite=True):  # checked at the start
+            monitor.say(f"wrote {path}")
     return found
-
-
-def write_batch(found: Batch, folder: Path, monitor: Monitor) -> None:
-    """Write batch.json and results.csv; whether they may be replaced was checked at the start."""
-    texts = {SUMMARY: as_json(found.summary()), RESULTS: as_csv(found.reports)}
-    for path in write_texts(folder, texts, overwrite=True):
-        monitor.say(f"wrote {path}")
-
-
-def _check(output: Path, shard: Shard | None, folders: Sequence[Path], resume: bool, overwrite: bool) -> None:
-    """Refuse what would replace results."""
-    own = (SUMMARY, RESULTS, *([] if shard is None else [shard.record]))
-    refuse_existing([output / name for name in own], overwrite or resume)
-    for folder in folders:
-        check_results(folder, EvaluateOptions(resume=resume, overwrite=overwrite))
 
 
 def _batch(

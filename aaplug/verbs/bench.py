@@ -2,22 +2,24 @@
 
 from collections.abc import Sequence
 from itertools import product
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from aaplug.core.cameras import Camera, CameraSet
-from aaplug.core.errors import UsageError
+from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.kernels import EAGER, Kernels
-from aaplug.core.monitor import SILENT, Monitor
 from aaplug.io.limits import lack_of_memory
-from aaplug.options.bench import BenchOptions
+from aaplug.io.scenes import SceneLike
 from aaplug.options.shared import size_of
+from aaplug.options.verbs import BenchOptions
 from aaplug.rasterizers.tiled.ahead_of_time import build, load
 from aaplug.rendering.benchmark import Figures, exponent, measure, synthetic_camera, synthetic_scene
-from aaplug.verbs.inputs import CamerasLike, Held, SceneLike, inputs_of, processor, whole_of
+from aaplug.rendering.job import CamerasLike, Job, running
+from aaplug.system.errors import UsageError
+from aaplug.system.monitor import Monitor
+from aaplug.verbs.verb import looks
 
-SIZES = ("800x800", "1600x1060")  # of images
-BYTES = 1200  # a Gaussian of degree 3 with its gradients and what autograd keeps, measured
+DEFAULT_RESOLUTIONS = ("800x800", "1600x1060")
+GAUSSIAN_BYTES = 1200  # one of degree 3 with its gradients and what autograd keeps, measured
 
 
 class Bench(NamedTuple):
@@ -27,33 +29,28 @@ class Bench(NamedTuple):
     exponents: dict[str, float]
 
 
-@BenchOptions.shown
-def bench(
-    scene: SceneLike | None = None, cameras: CamerasLike = None, *, monitor: Monitor = SILENT, **options: Any
-) -> Bench:
+@looks(BenchOptions)
+def bench(scene: SceneLike | None, cameras: CamerasLike, options: BenchOptions) -> Bench:
     """Time the rasterizer on synthetic scenes, or on the first training view of a scene.
 
     Args:
         scene: see `render`; without one, synthetic ones.
         cameras: see `render`.
-        monitor: see `render`.
-        options: fields of `BenchOptions`.
     """
-    o = BenchOptions.of(options)
     runs: list[Figures] = []
-    with processor(o.threads):
-        work = _synthetic(o) if scene is None else [_first_view(*inputs_of(scene, cameras, monitor))]
-        kernels = _kernels(o.rasterizer, monitor)
-        for (shown, camera), each in product(work, kernels):
-            run = measure(shown, camera, each, o.repeats, not o.forward_only)
+    with running(options, None, lambda: None):
+        if scene is None:
+            work = _synthetic(options)
+        else:
+            job = Job.of(scene, cameras, options)
+            work = [(job.scene.gaussians(), job.cameras.train[0])]
+        kernels = _kernels(options.rasterizer, options.monitor)
+        for (gaussians, camera), each in product(work, kernels):
+            run = measure(gaussians, camera, each, options.repeats, not options.forward_only)
             shape = f"{run.gaussians:,} Gaussians, {run.width}x{run.height}"
-            monitor.say(f"{shape}, {run.rasterizer}: {run.forward_ms:.0f} ms")
+            options.monitor.say(f"{shape}, {run.rasterizer}: {run.forward_ms:.0f} ms")
             runs.append(run)
     return Bench(runs, _exponents(runs))
-
-
-def _first_view(scene: Held, cameras: CameraSet) -> tuple[Gaussians, Camera]:
-    return whole_of(scene), cameras.train[0]
 
 
 def _kernels(rasterizer: str, monitor: Monitor) -> list[Kernels]:
@@ -69,14 +66,14 @@ def _kernels(rasterizer: str, monitor: Monitor) -> list[Kernels]:
     return [compiled, EAGER]
 
 
-def _synthetic(o: BenchOptions) -> list[tuple[Gaussians, Camera]]:
+def _synthetic(options: BenchOptions) -> list[tuple[Gaussians, Camera]]:
     """Every scene at the first size, and the middle one at the others."""
-    given = o.resolution or (SIZES if len(o.gaussians) > 1 else SIZES[:1])
+    given = options.resolution or (DEFAULT_RESOLUTIONS if len(options.gaussians) > 1 else DEFAULT_RESOLUTIONS[:1])
     first, *others = [synthetic_camera(*size_of(text)) for text in given]
-    most = max(o.gaussians)
-    if lacking := lack_of_memory(BYTES * most):
+    most = max(options.gaussians)
+    if lacking := lack_of_memory(GAUSSIAN_BYTES * most):
         raise UsageError("gaussians", f"{most:,} with gradients take {lacking}")
-    scenes = [synthetic_scene(n) for n in o.gaussians]
+    scenes = [synthetic_scene(n) for n in options.gaussians]
     middle = scenes[len(scenes) // 2]
     return [*((scene, first) for scene in scenes), *((middle, c) for c in others)]
 

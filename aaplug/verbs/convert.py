@@ -1,134 +1,127 @@
-"""Conversion: a plain scene file with anti-aliasing fused in."""
+"""Conversion: a plain scene file that anti-aliased viewers show right."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from aaplug.core.cameras import Camera, CameraSet
-from aaplug.core.choices import SpzAxes
-from aaplug.core.errors import UsageError
 from aaplug.core.gaussians import Gaussians
-from aaplug.core.monitor import SILENT, Monitor
 from aaplug.core.training import TrainingViews
-from aaplug.evaluation.results import Report
-from aaplug.evaluation.truth import own_look
+from aaplug.evaluation.results import Report, results
+from aaplug.evaluation.survey import check_frame_of
 from aaplug.finetuning.fitting import fit, steps_for
-from aaplug.inspection.survey import check_frame_of
-from aaplug.io.atomic import claimed
-from aaplug.io.cameras import select_views
-from aaplug.io.scenes import check_scene_output, write_parts, write_scene
-from aaplug.io.scenes.scene_file import SceneFile
-from aaplug.methods.viewers import FORMS, MATCHED_ENERGY, MIP_VIEWER, Form, Viewer, blurring, find_viewer, fuse
-from aaplug.options.convert import ConvertOptions
-from aaplug.options.objects import AnyPath
-from aaplug.verbs.assumed import say_assumed
-from aaplug.verbs.in_parts import LARGE, convert_parts
-from aaplug.verbs.inputs import CamerasLike, SceneLike, look_of, opened_and_seen, processor, sources_of, whole_of
+from aaplug.io.scenes import SceneLike, check_scene_output, write_parts, write_scene
+from aaplug.methods import FORMS
+from aaplug.methods.conversion import MATCHED_ENERGY, Form, blurring, fuse
+from aaplug.methods.viewers import MIP_VIEWER, Viewer, find_viewer
+from aaplug.options.shared import AnyPath
+from aaplug.options.verbs import ConvertOptions
+from aaplug.rendering.job import CamerasLike, Job, running
+from aaplug.rendering.renderer import own_look
+from aaplug.system.errors import UsageError
+from aaplug.verbs.in_parts import LARGE_SCENE, convert_parts
+from aaplug.verbs.verb import writes
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Converted:
     """A converted scene.
 
+    gaussians: their number.
     scene: None if it was large and went to the output in parts.
     viewer: whose rule draws it.
     report: the original, the closed form and the result as the viewer shows them; None unless a viewer was named.
     """
 
+    gaussians: int
     scene: Gaussians | None
     viewer: Viewer
     report: Report | None = None
 
+    def as_json(self) -> dict[str, Any]:
+        """The number of Gaussians, what is fused, and for a named viewer its settings and the remaining error."""
+        facts: dict[str, Any] = {"gaussians": self.gaussians}
+        if self.scene is not None:
+            facts["fused"] = [{"method": f.method, **f.settings} for f in self.scene.fused]
+        if self.report is not None:
+            viewer = {"for": self.viewer.name, "settings": self.viewer.settings}
+            facts |= {**viewer, "residual": results(self.report)}
+        return facts
 
-@ConvertOptions.shown
-def convert(
-    scene: SceneLike | SceneFile,
-    cameras: CamerasLike = None,
-    output: AnyPath | None = None,
-    *,
-    drop_bad: bool = False,
-    spz_axes: SpzAxes = "auto",
-    monitor: Monitor = SILENT,
-    **options: Any,
-) -> Converted:
+
+@writes(ConvertOptions)
+def convert(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, options: ConvertOptions) -> Converted:
     """Fuse anti-aliasing into a plain scene, in closed form for the Mip rule or fitted to a named viewer.
 
     Files of more than a million Gaussians are converted to `output` in parts, unless a viewer is named.
 
     Args:
-        scene: Gaussians, a scene's file, opened or not, or a model folder.
+        scene: see `render`.
         cameras: see `render`; not needed where the scene stores a 3D filter.
         output: file to write, .ply, .spz or .splat; None writes none.
-        drop_bad: leave out Gaussians of a file that cannot be used.
-        spz_axes: of a .spz to write; see `open_scene`.
-        monitor: see `render`.
-        options: fields of `ConvertOptions`.
 
     Raises:
         AaplugError: as `render`; also, something is fused already.
         KeyboardInterrupt: Ctrl-C stopped the optimization; nothing is written.
     """
-    o = ConvertOptions.of(options)
-    chosen, path = _chosen(o), None if output is None else Path(output)
-    opened, known = opened_and_seen(scene, cameras, monitor)
-    check = partial(check_scene_output, path, o.overwrite, sources_of(opened)) if path else lambda: None
+    rule, path = _rule(options), None if output is None else Path(output)
+    job = Job.of(scene, cameras, options)
+    files = {"overwrite": options.overwrite, "spz_axes": options.spz_axes}
+    check = partial(check_scene_output, path, options.overwrite, job.scene.files) if path else lambda: None
     check()
-    writing = {"overwrite": o.overwrite, "spz_axes": spz_axes}
-    with processor(o.threads) as workers, claimed(path, check):
-        if path and isinstance(opened, SceneFile) and opened.count > LARGE and isinstance(chosen, Form):
-            train = _train_of(opened, known, o.min_seen, monitor)
-            with monitor.progress("converting", "Gaussians") as tell:
-                parts = convert_parts(opened, train, chosen, drop_bad, tell, threads=workers)
-                write_parts(path, parts, opened.count, **writing)
-            return Converted(None, MIP_VIEWER)
-        whole = whole_of(opened, drop_bad)
-        if isinstance(chosen, Form):
-            found = Converted(_fused(whole, known, chosen, o.min_seen, monitor), MIP_VIEWER)
-        else:
-            found = _fitted(whole, known, chosen, o, monitor)
+    with running(options, path, check) as workers:
+        if path and job.scene.path and job.scene.count > LARGE_SCENE and isinstance(rule, Form):
+            return _converted_in_parts(job, rule, path, workers.threads, files)
+        result = _closed_form(job, rule) if isinstance(rule, Form) else _fitted(job, rule)
         if path is not None:
-            assert found.scene is not None
-            write_scene(path, found.scene, **writing)
-    return found
+            assert result.scene is not None
+            write_scene(path, result.scene, **files)
+    return result
 
 
-def _chosen(o: ConvertOptions) -> Form | Viewer:
-    """What to convert for: a viewer, or the Mip rule by a closed form."""
-    viewer = find_viewer(o.viewer)
+def _rule(options: ConvertOptions) -> Form | Viewer:
+    """The rule to convert for: a viewer's, or the Mip rule by a closed form."""
+    viewer = find_viewer(options.viewer)
     if viewer is not None:
-        if o.form is not None or o.variance is not None:
+        if options.form is not None or options.variance is not None:
             raise UsageError("viewer", "sets form and variance itself; leave out `form`, `variance`")
         return viewer
-    if o.steps is not None:
+    if options.steps is not None:
         raise UsageError("steps", "belongs to the optimization for a `viewer`; name one")
-    found = MATCHED_ENERGY if o.form is None else FORMS.find(o.form, "form")
-    return found if o.variance is None else found.with_variance(o.variance)
+    form = MATCHED_ENERGY if options.form is None else FORMS.find(options.form, "form")
+    return form if options.variance is None else form.with_variance(options.variance)
 
 
-def _fitted(scene: Gaussians, cameras: CameraSet, viewer: Viewer, o: ConvertOptions, monitor: Monitor) -> Converted:
-    steps = steps_for(scene, viewer) if o.steps is None else o.steps
-    look = look_of(scene, cameras, steps, o, monitor)
-    say_assumed(cameras, monitor, look)
-    fitted = fit(scene, viewer, look, select_views(cameras, o.views), steps, monitor)
-    return Converted(fitted.scene, viewer, fitted.report)
-
-
-def _train_of(opened: SceneFile, cameras: CameraSet, min_seen: float, monitor: Monitor) -> Sequence[Camera]:
-    """The training cameras; none where the scene needs none, or is refused anyway."""
-    if blurring(opened.fused) or opened.raw(0, min(1, opened.count)).filter_3d is not None:
-        return ()
-    say_assumed(cameras, monitor)
-    if not cameras.assumed:
-        check_frame_of(opened, cameras.train, min_seen)
-    return cameras.train
-
-
-def _fused(scene: Gaussians, cameras: CameraSet, form: Form, min_seen: float, monitor: Monitor) -> Gaussians:
+def _closed_form(job: Job[ConvertOptions], form: Form) -> Converted:
     """The closed form for the Mip rule."""
-    if blurring(scene.fused) or scene.filter_3d is not None:  # needs none, or is refused anyway
-        return fuse(scene, None, form)
-    training = TrainingViews.of(scene, cameras, min_seen=min_seen)
-    say_assumed(cameras, monitor, own_look(scene, training))
-    return fuse(scene, training, form)
+    gaussians = job.scene.gaussians()
+    training = None
+    if not blurring(gaussians.fused) and gaussians.filter_3d is None:  # else it needs no cameras, or is refused
+        training = TrainingViews.of(gaussians, job.cameras, min_seen=job.options.min_seen)
+        job.say_assumed(own_look(gaussians, training))
+    fused = fuse(gaussians, training, form)
+    return Converted(len(fused), fused, MIP_VIEWER)
+
+
+def _converted_in_parts(job: Job[ConvertOptions], form: Form, path: Path, threads: int, files: Any) -> Converted:
+    """The closed form of a large file, written part by part."""
+    scene, train = job.scene, job.cameras.train
+    if blurring(scene.fused) or scene.raw(0, min(1, scene.count)).filter_3d is not None:
+        train = ()  # it needs no cameras, or is refused anyway
+    else:
+        job.say_assumed()
+        if not job.cameras.assumed:
+            check_frame_of(scene, train, job.options.min_seen)
+    with job.monitor.progress("converting", "Gaussians") as tell:
+        write_parts(path, convert_parts(scene, train, form, tell, threads=threads), scene.count, **files)
+    return Converted(scene.count, None, MIP_VIEWER)
+
+
+def _fitted(job: Job[ConvertOptions], viewer: Viewer) -> Converted:
+    """The scene optimized for a viewer."""
+    gaussians = job.scene.gaussians()
+    steps = steps_for(gaussians, viewer) if job.options.steps is None else job.options.steps
+    look = job.look(steps)
+    job.say_assumed(look)
+    fitted = fit(gaussians, viewer, look, job.views, steps, job.monitor)
+    return Converted(len(fitted.scene), fitted.scene, viewer, fitted.report)

@@ -7,10 +7,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.cameras import WHITE, Camera
+from aaplug.core.cameras import Camera
+from aaplug.core.colours import WHITE
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.imaging import quantised, resampled
-from aaplug.core.monitor import SILENT, Monitor
 from aaplug.core.training import TrainingViews
 from aaplug.evaluation.report.contact_sheet import contact_sheet
 from aaplug.evaluation.report.files import RESULTS
@@ -19,13 +19,14 @@ from aaplug.io.atomic import output_folder, refuse_existing
 from aaplug.io.cameras import read_cameras
 from aaplug.io.images import read_image, write_png
 from aaplug.io.scenes import read_scene
-from aaplug.options.objects import AnyPath
+from aaplug.options.shared import AnyPath
 from aaplug.rendering.renderer import Renderer
+from aaplug.system.monitor import SILENT, Monitor
 from aaplug.verbs.convert import convert
 from aaplug.verbs.evaluate import evaluate
 
 SCALES = (1.0, 0.5, 0.25, 0.125)
-SHOWN = "r_136"  # the view on the contact sheet
+SHEET_VIEW = "r_136"
 COLUMNS = ("photograph", "classic 3DGS", "aaplug", "converted .ply, Mip viewer")
 CONVERTED, SHEET = "chair-converted.ply", "contact-sheet.png"
 
@@ -39,12 +40,12 @@ def demo(output: AnyPath = "demo-out", *, overwrite: bool = False, monitor: Moni
     folder = Path(output)
     refuse_existing([folder / name for name in (CONVERTED, SHEET, *RESULTS)], overwrite)
     with output_folder(folder), as_file(files("aaplug.io.sample")) as sample:
-        scene, cameras = read_scene(sample / "chair.ply"), read_cameras(sample)
+        scene, cameras = read_scene(sample / "chair.ply").gaussians(), read_cameras(sample)
         counts = f"{len(scene):,} Gaussians, {len(cameras.train)} training cameras"
         monitor.say(f"sample: {counts}, {len(cameras.test)} photographs")
         convert(scene, cameras, folder / CONVERTED, overwrite=overwrite, monitor=monitor)
-        [view] = [camera for camera in cameras.test if camera.name == SHOWN]
-        sheet = _sheet(scene, read_scene(folder / CONVERTED), TrainingViews.of(scene, cameras), view)
+        [view] = [camera for camera in cameras.test if camera.name == SHEET_VIEW]
+        sheet = _sheet(scene, read_scene(folder / CONVERTED).gaussians(), TrainingViews.of(scene, cameras), view)
         write_png(folder / SHEET, sheet, overwrite=overwrite)
         monitor.say(f"wrote {folder / SHEET}")
         how = {"scale": SCALES, "metric": ("psnr", "ssim"), "name": "chair"}
@@ -71,7 +72,7 @@ def _sheet(scene: Gaussians, converted: Gaussians, training: TrainingViews, view
 
 
 def _box(alpha: Float[Tensor, "h w"]) -> tuple[int, int, int, int]:
-    """Left, top, right and bottom of what is opaque, on whole pixels of the smallest scale."""
+    """Left, top, right and bottom of the opaque pixels, on whole pixels of the smallest scale."""
     rows, columns = (alpha > 0.5).any(dim=1).nonzero(), (alpha > 0.5).any(dim=0).nonzero()
     step = round(1 / min(SCALES))
     low = [int(side.min()) // step * step for side in (columns, rows)]

@@ -12,33 +12,32 @@ from dataclasses import replace
 import torch
 
 from aaplug.core.cameras import Camera
-from aaplug.core.executors import Threads
 from aaplug.core.gaussians import Gaussians
-from aaplug.core.monitor import Tell
 from aaplug.core.sampling import SamplingBounds, sampling_bounds
 from aaplug.core.training import TrainingViews
-from aaplug.io.scenes.scene_file import PART, SceneFile
-from aaplug.methods.viewers import Form, fuse
+from aaplug.io.scenes.scene_file import PART, Scene
+from aaplug.methods.conversion import Form, fuse
+from aaplug.system.executors import Threads
+from aaplug.system.monitor import Tell
 
-LARGE = 1_000_000  # Gaussians: larger scenes are converted in parts; a million take 0.3 GB, and more at work
+LARGE_SCENE = 1_000_000  # Gaussians: larger files are converted in parts; a million take 0.3 GB, and more at work
 
 
 def convert_parts(
-    opened: SceneFile,
+    scene: Scene,
     cameras: Sequence[Camera],
     form: Form,
-    drop_bad: bool = False,
     tell: Tell = lambda done, total: None,
     size: int = PART,
     threads: int = 1,
 ) -> Iterator[Gaussians]:
-    """Yield the parts of the scene, each converted as `viewers.fuse` would convert the whole.
+    """Yield the parts of the scene, each converted as `conversion.fuse` would convert the whole.
 
     cameras: training cameras; none where the scene stores its 3D filter.
     tell: called with (Gaussians done, Gaussians in all).
     size: Gaussians per part.  threads: parts converted at once.
     """
-    coarsest = _coarsest(opened, cameras, drop_bad, size) if cameras and form.uses_bounds else None
+    coarsest = _coarsest(scene, cameras, size) if cameras and form.uses_bounds else None
 
     def converted(part: Gaussians) -> Gaussians:
         if not cameras:
@@ -47,10 +46,10 @@ def convert_parts(
         return fuse(part, TrainingViews(part.convention, cameras, bounds), form)
 
     done = 0
-    for part in Threads(threads).map(converted, opened.parts(drop_bad, size)):
+    for part in Threads(threads).map(converted, scene.parts(size)):
         yield part
         done += len(part)
-        tell(min(done, opened.count), opened.count)
+        tell(min(done, scene.count), scene.count)
 
 
 def _bounds(part: Gaussians, cameras: Sequence[Camera], coarsest: float | None) -> SamplingBounds:
@@ -63,6 +62,6 @@ def _bounds(part: Gaussians, cameras: Sequence[Camera], coarsest: float | None) 
     return replace(bounds, highest=highest, views=bounds.views.clamp(min=1))
 
 
-def _coarsest(opened: SceneFile, cameras: Sequence[Camera], drop_bad: bool, size: int) -> float:
-    found = (sampling_bounds(part.means, cameras) for part in opened.parts(drop_bad, size))
+def _coarsest(scene: Scene, cameras: Sequence[Camera], size: int) -> float:
+    found = (sampling_bounds(part.means, cameras) for part in scene.parts(size))
     return min((part.highest[part.seen].min().item() for part in found if part.seen.any()), default=math.inf)

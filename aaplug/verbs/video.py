@@ -3,46 +3,32 @@
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core import camera_paths
-from aaplug.core.cameras import Camera, CameraSet
-from aaplug.core.errors import UsageError
-from aaplug.core.executors import ProcessesIfLong
-from aaplug.core.gaussians import Gaussians
-from aaplug.core.monitor import SILENT, Monitor
+from aaplug.core.cameras import Camera
 from aaplug.evaluation.protocols import median_depth
 from aaplug.evaluation.report.contact_sheet import labelled, magnified
-from aaplug.io.atomic import claimed
-from aaplug.io.cameras import select_views
 from aaplug.io.cameras.camera_path import read_camera_path
+from aaplug.io.scenes import SceneLike
 from aaplug.io.video import check_video
-from aaplug.options.objects import AnyPath
-from aaplug.options.video import VideoOptions
+from aaplug.options.shared import AnyPath
+from aaplug.options.verbs import VideoOptions
+from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.rendering.videos import make_video
-from aaplug.verbs.announce import announce
-from aaplug.verbs.assumed import say_assumed
-from aaplug.verbs.inputs import (
-    CamerasLike,
-    SceneLike,
-    drawn_by,
-    inputs_of,
-    look_of,
-    processor,
-    recipe_of,
-    scheduled,
-    whole_of,
-)
+from aaplug.system.errors import UsageError
+from aaplug.system.executors import ProcessesIfLong
+from aaplug.verbs.verb import writes
 from aaplug.verbs.views import resized
 
-FPS = 30.0  # frames per second, where neither the caller nor a path file says
-GAP = 4  # px between two panes
-MOST_FRAMES = 100_000
-RECEDING = ("zoom", "dolly")  # paths on which things become small
+DEFAULT_FPS = 30.0  # frames per second, where neither the caller nor a path file says
+PANE_GAP = 4  # px
+MAX_FRAMES = 100_000
+RECEDING_PATHS = ("zoom", "dolly")  # on which things become small
 
 
 class Clip(NamedTuple):
@@ -53,56 +39,80 @@ class Clip(NamedTuple):
     fps: float
 
 
-@VideoOptions.shown
-def video(
-    scene: SceneLike,
-    cameras: CamerasLike = None,
-    output: AnyPath = "video.webm",
-    *,
-    monitor: Monitor = SILENT,
-    **options: Any,
-) -> Clip:
+@writes(VideoOptions)
+def video(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, options: VideoOptions) -> Clip:
     """Render a camera path to a video.
 
     Args:
         scene: see `render`.
         cameras: see `render`.
-        monitor: see `render`.
-        output: a .webm file (VP9), or .mp4 (H.264).
-        options: fields of `VideoOptions`; `beside` may be None.
+        output: a .webm file (VP9), or .mp4 (H.264); None: "video.webm".
 
     Raises:
         AaplugError: as `render`.
     """
-    o = VideoOptions.of(options)
-    left = "none" if o.beside is None else o.beside
-    recipes = [recipe_of(recipe, o) for recipe in (left, o.recipe) if recipe != "none"]
-    free = None if str(o.path) in MOVES else read_camera_path(Path(o.path))
-    fps = o.fps or (FPS if free is None else free.fps)
-    check = partial(check_video, Path(output), fps, o.overwrite)
+    target = Path("video.webm" if output is None else output)
+    file = None if str(options.path) in PATHS else read_camera_path(Path(options.path))
+    fps = options.fps or (DEFAULT_FPS if file is None else file.fps)
+    check = partial(check_video, target, fps, options.overwrite)
     check()
-    scene, cameras = inputs_of(scene, cameras, monitor)
-    path = free.cameras if free else _along(whole_of(scene), cameras, o, fps, monitor)
-    shown = resized(path, o.scale, o.resolution, cameras.assumed and free is None)
+    job = Job.of(scene, cameras, options)
+    recipes = [job.recipe(name) for name in (options.beside or "none", options.recipe) if name != "none"]
+    path = file.cameras if file else _built_in_path(job, fps)
+    views = resized(path, options.scale, options.resolution, job.cameras.assumed and file is None)
     labels = [{"auto": "aaplug auto"}.get(recipe.name, recipe.name) for recipe in recipes]
 
     def compose(index: int, images: Sequence[Float[Tensor, "h _ 3"]]) -> Float[Tensor, "h w 3"]:
-        rate = camera_paths.factor(index / len(shown), o.start, o.end) if str(o.path) in RECEDING else 1.0
-        return side_by_side(images, labels, rate, shown[index].width / path[index].width)
+        share = index / len(views)
+        receding = str(options.path) in RECEDING_PATHS
+        rate = camera_paths.factor(share, options.start, options.end) if receding else 1.0
+        return side_by_side(images, labels, rate, views[index].width / path[index].width)
 
-    with processor(o.threads) as workers, claimed(output, check):
-        look = look_of(scene, cameras, len(shown) * len(recipes), o, monitor)
-        renderers = [drawn_by(recipe, scene, look) for recipe in recipes]
-        size = f"{shown[0].width}x{shown[0].height}"
-        monitor.say(f"{len(shown)} frames of {size} px per pane, {fps:g} per second")
-        say_assumed(cameras, monitor, renderers[-1], shown[0])
-        announce(renderers, shown, monitor, processes=workers, fewer="seconds or frames per second")
-        folder = Path(output).parent
-        with scheduled(o, folder, monitor) as cluster, monitor.progress("rendering", "images") as tell:
-            pool = cluster or ProcessesIfLong(workers)
-            how = {"overwrite": o.overwrite, "tell": tell, "folder": cluster and folder}
-            make_video(output, renderers, shown, fps, compose, pool.map, **how)
-    return Clip(Path(output), len(shown), fps)
+    with running(options, target, check) as workers:
+        look = job.look(len(views) * len(recipes))
+        renderers = [look.by(recipe) for recipe in recipes]
+        size = f"{views[0].width}x{views[0].height}"
+        job.monitor.say(f"{len(views)} frames of {size} px per pane, {fps:g} per second")
+        job.say_assumed(renderers[-1], views[0])
+        job.announce(renderers, views, processes=workers.threads, fewer="seconds or frames per second")
+        with job.monitor.progress("rendering", "images") as tell:
+            pool = workers.cluster or ProcessesIfLong(workers.threads)
+            how = {"overwrite": options.overwrite, "tell": tell, "folder": workers.cluster and target.parent}
+            make_video(target, renderers, views, fps, compose, pool.map, **how)
+    return Clip(target, len(views), fps)
+
+
+def _built_in_path(job: Job[VideoOptions], fps: float) -> list[Camera]:
+    """The cameras of a zoom, a dolly or an orbit.
+
+    Raises:
+        UsageError: it has more than `MAX_FRAMES`, or the view is not known.
+    """
+    options = job.options
+    count = max(1, round(options.seconds * fps))
+    if count > MAX_FRAMES:
+        raise UsageError("seconds", f"makes {count:,} frames; the limit is {MAX_FRAMES:,}")
+    view = job.views[0]
+    job.monitor.say(f"path: {options.path} from view {view.name}")
+    return camera_paths.frames(PATHS[str(options.path)](job, view), count)
+
+
+PATHS: dict[str, Callable[[Job[VideoOptions], Camera], Callable[[float], Camera]]] = {  # cameras of t in [0, 1)
+    "zoom": lambda job, view: partial(camera_paths.zoom, view, start=job.options.start, end=job.options.end),
+    "dolly": lambda job, view: partial(
+        camera_paths.dolly,
+        view,
+        start=job.options.start,
+        end=job.options.end,
+        depth=median_depth(job.scene.gaussians().means, view),
+    ),
+    "orbit": lambda job, view: partial(
+        camera_paths.orbit,
+        view,
+        depth=median_depth(job.scene.gaussians().means, view),
+        up=camera_paths.up_of(job.cameras),
+    ),
+}
 
 
 def side_by_side(
@@ -116,29 +126,7 @@ def side_by_side(
     if len(images) == 1:
         return images[0]
     caption = f"{rate * size:.2f} of training's sampling, {{times}}x"
-    inset = [magnified(image, min(1.0, rate), caption) for image in images]
-    shown = [labelled(image, label) for image, label in zip(inset, labels, strict=True)]
-    gap = torch.zeros(shown[0].shape[0], GAP, 3)
-    return torch.cat([part for image in shown for part in (gap, image)][1:], dim=1)
-
-
-def _along(scene: Gaussians, cameras: CameraSet, o: VideoOptions, fps: float, monitor: Monitor) -> list[Camera]:
-    """The cameras of a built-in path."""
-    count = max(1, round(o.seconds * fps))
-    if count > MOST_FRAMES:
-        raise UsageError("seconds", f"makes {count:,} frames; the limit is {MOST_FRAMES:,}")
-    view = select_views(cameras, o.views)[0]
-    monitor.say(f"path: {o.path} from view {view.name}")
-    return camera_paths.frames(MOVES[str(o.path)](scene, cameras, view, o), count)
-
-
-Along = Callable[[float], Camera]  # of t in [0, 1)
-MOVES: dict[str, Callable[[Gaussians, CameraSet, Camera, VideoOptions], Along]] = {
-    "zoom": lambda scene, cameras, view, o: partial(camera_paths.zoom, view, start=o.start, end=o.end),
-    "dolly": lambda scene, cameras, view, o: partial(
-        camera_paths.dolly, view, start=o.start, end=o.end, depth=median_depth(scene.means, view)
-    ),
-    "orbit": lambda scene, cameras, view, o: partial(
-        camera_paths.orbit, view, depth=median_depth(scene.means, view), up=camera_paths.up_of(cameras)
-    ),
-}
+    insets = [magnified(image, min(1.0, rate), caption) for image in images]
+    panes = [labelled(image, label) for image, label in zip(insets, labels, strict=True)]
+    gap = torch.zeros(panes[0].shape[0], PANE_GAP, 3)
+    return torch.cat([part for pane in panes for part in (gap, pane)][1:], dim=1)

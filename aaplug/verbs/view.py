@@ -1,86 +1,69 @@
-"""A scene live in the browser, classic 3DGS beside aaplug."""
+"""A scene live in the browser."""
 
 import threading
 import webbrowser
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from importlib.resources import as_file, files
 from importlib.util import find_spec
-from pathlib import Path
-from typing import Any
 
-from aaplug.core.errors import UsageError
-from aaplug.core.monitor import SILENT, Monitor
-from aaplug.io.scenes import called
-from aaplug.io.scenes.scene_file import SceneFile
-from aaplug.methods.recipes import RECIPES
+from aaplug.io.scenes import SceneLike
+from aaplug.methods import RECIPES
 from aaplug.options.shared import RECIPE_NAMES
-from aaplug.options.view import LiveOptions
-from aaplug.verbs.assumed import say_assumed
-from aaplug.verbs.inputs import CamerasLike, SceneLike, file_of, opened_and_seen, processor, shown_of, unchecked_look_of
+from aaplug.options.verbs import LiveOptions
+from aaplug.rendering.job import CamerasLike, Job, running
+from aaplug.system.errors import UsageError
+from aaplug.system.monitor import Monitor
+from aaplug.verbs.verb import looks
 
-FRAMES = 100  # that are drawn at least; not so many that kernels are compiled first
+MIN_FRAMES = 100  # that are drawn at least; not so many that kernels are compiled first
 SAMPLE = "chair.ply"
 
 
 @contextmanager
 def serving(
-    scene: SceneLike | SceneFile | None = None,
-    cameras: CamerasLike = None,
-    *,
-    words: Sequence[str] = (),
-    monitor: Monitor = SILENT,
-    drop_bad: bool = False,
-    **options: Any,
+    scene: SceneLike | None, cameras: CamerasLike, options: LiveOptions, words: Sequence[str] = ()
 ) -> Iterator[str]:
     """A block in which a scene can be seen live in the browser; yields the page's address.
 
     words: of a command line that name the scene and its cameras, for the page to show.
     Other arguments and errors: see `view`.
     """
-    o = LiveOptions.of(options)
     if find_spec("websockets") is None:
         raise UsageError("view", "needs the extra `view`: pip install 'aaplug[view]'")
     from aaplug.live.server import Server  # its package is an extra
     from aaplug.live.studio import Studio
     from aaplug.live.subject import Subject
 
-    with _sample_or(scene) as (shown, where), processor(o.threads):
-        opened, cameras = opened_and_seen(shown, where if cameras is None else cameras, monitor)
-        held = shown_of(opened, drop_bad)
-        look = unchecked_look_of(held, cameras, FRAMES, o, monitor)
-        say_assumed(cameras, monitor)
-        file = file_of(opened)
-        title = "the bundled sample" if scene is None else "scene" if file is None else called(file)
+    with ExitStack() as stack:
+        title = "the bundled sample" if scene is None else None
+        if scene is None:
+            folder = stack.enter_context(as_file(files("aaplug.io.sample")))
+            scene, cameras = folder / SAMPLE, folder if cameras is None else cameras
+        stack.enter_context(running(options, None, lambda: None))
+        job = Job.of(scene, cameras, options)
+        look = job.look(MIN_FRAMES, check=False)
+        job.say_assumed()
+        title = title or job.scene.title
         recipes = [name for name in RECIPE_NAMES if name in RECIPES]  # without plug-ins that cannot be used
-        subject = Subject(held, cameras, look, recipes, title, words or (str(file or title),))
-        with Studio(subject) as studio, Server(studio, o.host, o.port) as server:
-            yield server.address
+        subject = Subject(job.scene, job.cameras, look, recipes, title, words or (str(job.scene.file or title),))
+        studio = stack.enter_context(Studio(subject))
+        yield stack.enter_context(Server(studio, options.host, options.port)).address
 
 
-@LiveOptions.shown
-def view(
-    scene: SceneLike | SceneFile | None = None,
-    cameras: CamerasLike = None,
-    *,
-    drop_bad: bool = False,
-    monitor: Monitor = SILENT,
-    **options: Any,
-) -> None:
+@looks(LiveOptions)
+def view(scene: SceneLike | None, cameras: CamerasLike, options: LiveOptions) -> None:
     """Show a scene live in the browser, until interrupted.
 
     Args:
         scene: see `render`; None for the bundled sample.
         cameras: see `render`.
-        drop_bad: leave out Gaussians of a file that cannot be used.
-        monitor: receives messages.
-        options: fields of `LiveOptions`.
 
     Raises:
         AaplugError: an input cannot be read, an option does not fit, or nothing can listen at the address.
     """
-    with serving(scene, cameras, drop_bad=drop_bad, monitor=monitor, **options) as address:
-        attend(address, monitor, LiveOptions.of(options).no_browser)
+    with serving(scene, cameras, options) as address:
+        attend(address, options.monitor, options.no_browser)
 
 
 def attend(address: str, monitor: Monitor, no_browser: bool) -> None:
@@ -92,13 +75,3 @@ def attend(address: str, monitor: Monitor, no_browser: bool) -> None:
             if type(browser) is not webbrowser.GenericBrowser:
                 browser.open(address)
     threading.Event().wait()
-
-
-@contextmanager
-def _sample_or(scene: SceneLike | SceneFile | None) -> Iterator[tuple[SceneLike | SceneFile, Path | None]]:
-    """The scene, or without one the bundled sample and its cameras."""
-    if scene is not None:
-        yield scene, None
-        return
-    with as_file(files("aaplug.io.sample")) as folder:
-        yield folder / SAMPLE, folder

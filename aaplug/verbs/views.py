@@ -5,9 +5,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from aaplug.core.cameras import Camera
-from aaplug.core.errors import OutputError, UsageError
 from aaplug.io.atomic import check_output, refuse_existing
 from aaplug.options.shared import check_side, size_of
+from aaplug.system.errors import OutputError, UsageError
 
 IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".exr", ".bmp", ".gif")  # any other name is a folder
 LONGEST_NAME = 200  # bytes; file systems take 255, and a number and a suffix are added

@@ -1,10 +1,13 @@
 """Compiling the rasterizer's kernels once for a machine."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from aaplug.core.monitor import SILENT, Monitor
-from aaplug.rasterizers.tiled.ahead_of_time import KERNELS, build, cache_folder
+from aaplug.methods import RECIPES
+from aaplug.methods.recipe import Recipe
+from aaplug.rasterizers.tiled.ahead_of_time import build, cache_folder, kernels_of
+from aaplug.system.monitor import SILENT, Monitor
 
 
 class Kernels(NamedTuple):
@@ -14,12 +17,16 @@ class Kernels(NamedTuple):
     names: list[str]
 
 
-def warmup(*, monitor: Monitor = SILENT) -> Kernels:
+def warmup(recipe: str | Recipe | Sequence[str | Recipe] = (), *, monitor: Monitor = SILENT) -> Kernels:
     """Compile what is missing, in two to three minutes.
 
+    recipe: one or several whose kernels are compiled beside those that the default recipes need.
+
     Raises:
-        UsageError: there is no compiler or it fails, or the cache folder cannot be written.
+        UsageError: a recipe is not known, there is no compiler or it fails, or the cache folder cannot be written.
     """
+    named = [recipe] if isinstance(recipe, str | Recipe) else recipe
+    recipes = [RECIPES.find(each, "recipe") if isinstance(each, str) else each for each in named]
     with monitor.progress("compiling", "kernels") as tell:
-        build(tell)
-    return Kernels(cache_folder(), [kernel.name for kernel in KERNELS])
+        build(tell, recipes)
+    return Kernels(cache_folder(), [kernel.name for kernel in kernels_of(recipes)])

@@ -7,12 +7,13 @@ from dataclasses import replace
 from importlib.resources import as_file, files
 
 from aaplug.core.training import TrainingViews
-from aaplug.evaluation.truth import MEMORY, Truth, own_look
+from aaplug.evaluation.truth import MEMORY, Truth
 from aaplug.finetuning.loop import advance
-from aaplug.finetuning.settings import OURS
+from aaplug.finetuning.settings import CONSISTENCY_SETTINGS
 from aaplug.finetuning.state import TuningJob, begin
 from aaplug.io.cameras import read_cameras
 from aaplug.io.scenes import read_scene
+from aaplug.rendering.renderer import own_look
 
 
 def main(steps: int = 9) -> None:
@@ -23,7 +24,7 @@ def main(steps: int = 9) -> None:
     print(f"rasterizer: {look.rasterizer.name}")
     views = cameras.train[:1]  # its truth is made in the first step, which is not counted
     for scale in (1.0, 0.5, 0.25, 0.125):
-        settings = replace(OURS, weights={scale: 1.0}, anchor=0.0, steps=steps)
+        settings = replace(CONSISTENCY_SETTINGS, weights={scale: 1.0}, anchor=0.0, steps=steps)
         job = TuningJob(look, views, Truth(look, memory=MEMORY), settings)
         state, seconds = begin(job), []
         for _ in range(steps):

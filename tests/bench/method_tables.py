@@ -1,4 +1,4 @@
-"""The tables of examples/guides/methods.md: python -m tests.bench.method_tables FOLDER.
+"""The tables of examples/guides/methods.md, from every recipe on every scene.
 
 Evaluates what `every_recipe.toml` names into the folder, except what is there already.  Each scene has a CSV file in
 examples/guides/tables, with a line per recipe and scale: means over the views, and the median of their seconds.  The
@@ -8,7 +8,6 @@ short table of the page is printed.
 import csv
 import json
 import subprocess
-import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from statistics import mean, median
@@ -34,10 +33,9 @@ SCALES = {
 Table = dict[tuple[str, float], dict[str, str]]  # a line of the CSV by recipe and scale
 
 
-def main(folder: Path) -> None:
+def main(folder: Path = Path("every_recipe")) -> None:
     """Measure, write a CSV for every scene, and print the short table."""
-    evaluate = ["aaplug", "evaluate", "--batch", str(BATCH), "-o", str(folder), "--resume"]
-    subprocess.run(evaluate, check=True)
+    subprocess.run(["aaplug", "evaluate", "--batch", str(BATCH), "-o", str(folder), "--resume"], check=True)
     for path in sorted(folder.glob("*/per_view.json")):
         with open(TABLES / f"{path.parent.name}.csv", "w", newline="", encoding="utf-8") as file:
             csv.writer(file, lineterminator="\n").writerows([COLUMNS, *lines(json.loads(path.read_text()))])
@@ -67,15 +65,11 @@ def table(scene: str) -> Table:
 
 def short_table() -> str:
     """PSNR of some recipes at some scales of every scene, as Markdown."""
-    shown = {scene: table(scene) for scene in SCALES}
+    tables = {scene: table(scene) for scene in SCALES}
     columns = [(scene, scale) for scene, scales in SCALES.items() for scale in scales]
     names = [f"{scene} {scale_name(scale)}" for scene, scale in columns]
     rows = [["recipe", *names], ["---"] * (len(names) + 1)]
     for recipe in SHORT:
         name = recipe if " " in recipe else f"`{recipe}`"
-        rows.append([name, *(shown[scene][recipe, scale][PSNR_COLUMN] for scene, scale in columns)])
+        rows.append([name, *(tables[scene][recipe, scale][PSNR_COLUMN] for scene, scale in columns)])
     return "\n".join(f"| {' | '.join(row)} |" for row in rows).replace(" --- ", "---")
-
-
-if __name__ == "__main__":
-    main(Path(sys.argv[1]))

@@ -6,13 +6,14 @@ from dataclasses import replace
 
 import torch
 
-from aaplug.core.cameras import BLACK, Camera, CameraSet, look_at
+from aaplug.core.cameras import Camera, CameraSet, look_at
+from aaplug.core.colours import BLACK
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.projection import rotation_matrices
 from aaplug.io.cameras import read_cameras
 from aaplug.io.scenes import read_scene
-from aaplug.levels.covariances import area, blurred, covariances
-from aaplug.levels.rates import rates_of
+from aaplug.levels.clusters import rates_of
+from aaplug.levels.covariances import area, blur, covariances
 from aaplug.rendering.benchmark import SEED, synthetic_camera, synthetic_scene
 from tests.bench.away import SCENES, Scene
 from tests.conftest import SHARED_DATA
@@ -44,13 +45,13 @@ def split(scene: Gaussians, cameras: CameraSet, parts: int = PARTS, seed: int = 
     factors = rotation_matrices(scene.unit_quats) * scene.scales[:, None, :]
     means = scene.means[:, None] + math.sqrt(1 - PART) * places @ factors.mT
     dilation = scene.convention.kernel / rates_of(scene, cameras.train).square()
-    whole, part = (area(blurred(share * covariances(scene), dilation)) for share in (1.0, PART))
+    whole, part = (area(blur(share * covariances(scene), dilation)) for share in (1.0, PART))
     each = replace(
         scene,
         log_scales=scene.log_scales + 0.5 * math.log(PART),
         logit_opacities=(scene.opacities * whole / part / parts).logit(eps=1e-4),
         origin=None,
-        pixel_sizes=None,
+        extras={},
     )
     return replace(each[torch.arange(len(scene)).repeat_interleave(parts)], means=means.flatten(0, 1))
 

@@ -1,15 +1,11 @@
-"""The live view, measured: python -m tests.bench.view [GAUSSIANS ...] [--seconds N | --minutes N].
+"""Frames a second, delay and memory of the live view, by scripted flights around synthetic scenes.
 
-A scripted flight around a synthetic scene in a window of 1280x720 px, alone and by two clients at once.  Prints frames
-a second while the camera moves, milliseconds from pose to picture (median, 95th percentile), seconds from rest to the
-first picture of full quality, megabytes a second, and the process's peak memory.  The clients are threads of the same
-process; they do not decode the pictures.
-
-With --minutes, clients come and go for so long, each with a flight of its own size, recipe and paint; after each of
-them it prints the memory that the process holds.
+A flight is in a window of 1280x720 px, alone and by two clients at once.  The columns have frames a second while the
+camera moves, milliseconds from pose to picture (median, 95th percentile), seconds from rest to the first picture of
+full quality, megabytes a second, and the process's peak memory.  The clients are threads of the same process; they do
+not decode the pictures.
 """
 
-import argparse
 import itertools
 import json
 import math
@@ -18,6 +14,8 @@ import statistics
 import struct
 import threading
 import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -29,134 +27,129 @@ from aaplug.core import camera_paths
 from aaplug.core.cameras import Camera, CameraSet
 from aaplug.rendering.benchmark import synthetic_camera, synthetic_scene
 from aaplug.verbs.view import serving
+from tests.bench import heading, row
 
-SIZES = (100_000, 550_000, 1_000_000)
 WINDOW = (1280, 720)  # px
-ASKED = 60  # poses a second, as a browser's screen asks
-TURNS = 30.0  # seconds around the scene
+POSES_PER_SECOND = 60  # as a browser's screen asks
+TURN_SECONDS = 30.0  # once around the scene
 DEPTH = 5.0  # world units to what the flight turns about
+HELD_FLIGHT_SECONDS = 20.0
 PAINTS: tuple[dict[str, Any], ...] = ({}, {"paint": "rate"}, {"paint": "cost"})
 SIDES = [{"recipe": "classic", "quality": "best"}, {"recipe": "auto", "quality": "best"}]
 
 
-@dataclass
-class Flight:
-    """What one client saw."""
+def main(
+    gaussians: Sequence[int] = (100_000, 550_000, 1_000_000), seconds: float = 30.0, minutes: float | None = None
+) -> None:
+    """Print the table.
 
-    sent: dict[int, float] = field(default_factory=dict)
-    delays: list[float] = field(default_factory=list)
-    moving: int = 0
-    bytes: int = 0
-    rest: float = math.nan
-    done: threading.Event = field(default_factory=threading.Event)
-
-    def listen(self, connection: ClientConnection) -> None:
-        """Receive pictures until all is done."""
-        while not self.done.is_set():
-            found = connection.recv()
-            now = time.perf_counter()
-            assert isinstance(found, bytes)
-            (length,) = struct.unpack_from("<I", found)
-            header = json.loads(found[4 : 4 + length])
-            connection.send('{"shown": 1}')
-            self.bytes += len(found)
-            if header["stage"] == "moving":
-                self.moving += 1
-                self.delays.append(now - self.sent[header["id"]])
-            elif header["stage"] == "complete" and math.isnan(self.rest):
-                self.rest = now - self.sent[header["id"]]
-            elif header["stage"] == "done":
-                self.done.set()
-
-
-def fly(address: str, view: Camera, seconds: float, flight: Flight, other: dict[str, Any] | None = None) -> None:
-    """Turn about the scene, then rest.
-
-    other: further fields of what is asked for.
+    Args:
+        gaussians: of the scenes.
+        seconds: of a flight.
+        minutes: let clients come and go for so long on the first scene, each with a flight of its own size, recipe
+            and paint, and print the memory that the process holds after each.
     """
-    up = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
-    where = address.replace("http", "ws", 1) + "live"
-    with connect(where, origin=address.rstrip("/"), proxy=None, max_size=None) as connection:  # pyright: ignore[reportArgumentType]
-        connection.recv()
-        listener = threading.Thread(target=flight.listen, args=(connection,))
-        listener.start()
-        began = time.perf_counter()
-        for number in range(1, round(seconds * ASKED) + 1):
-            time.sleep(max(0.0, began + number / ASKED - time.perf_counter()))
-            pose = camera_paths.orbit(view, number / ASKED / TURNS, DEPTH, up).cam_from_world
-            see = {"id": number, "pose": pose.flatten().tolist(), "focal": view.focal, "split": 0.5, "sides": SIDES}
-            see |= {"width": view.width, "height": view.height, "moving": number < round(seconds * ASKED)} | (
-                other or {}
-            )
-            flight.sent[number] = time.perf_counter()
-            connection.send(json.dumps({"see": see}))
-        flight.done.wait(60)
-        listener.join()
+    if minutes is not None:
+        return held(minutes, gaussians[0])
+    delays = ("pose to picture, ms", "95 %", "rest to full quality, s")
+    heading("the live view", "Gaussians", "clients", "frames/s", *delays, "MB/s", "GB")
+    for count, clients in itertools.product(gaussians, (1, 2)):
+        fly_together(count, clients, seconds)
+    return None
 
 
-def measured(gaussians: int, clients: int, seconds: float) -> str:
-    """One line of the table."""
-    view = synthetic_camera(*WINDOW).as_trained()
-    free, cameras = replace(view, trained_focal=None), CameraSet((view,), (view,))
-    with serving(synthetic_scene(gaussians), cameras, port=0, no_browser=True) as address:
-        warm = Flight()
-        fly(address, free, 2.0, warm)
+def fly_together(gaussians: int, clients: int, seconds: float) -> None:
+    """Print one line of the table."""
+    with _served(gaussians) as (address, view):
+        Flight().fly(address, view, 2.0)  # warms up
         flights = [Flight() for _ in range(clients)]
-        threads = [threading.Thread(target=fly, args=(address, free, seconds, flight)) for flight in flights]
+        threads = [threading.Thread(target=flight.fly, args=(address, view, seconds)) for flight in flights]
         for thread in threads:
             thread.start()
         for thread in threads:
             thread.join()
     delays = sorted(1000 * delay for flight in flights for delay in flight.delays)
-    cells = [
-        f"{gaussians:,}", str(clients),
-        " ".join(f"{flight.moving / seconds:.1f}" for flight in flights),
-        f"{statistics.median(delays):.0f}", f"{delays[int(0.95 * len(delays))]:.0f}",
+    row(
+        f"{gaussians:,}",
+        clients,
+        " ".join(f"{len(flight.delays) / seconds:.1f}" for flight in flights),
+        *(f"{statistics.median(delays):.0f}", f"{delays[int(0.95 * len(delays))]:.0f}"),
         " ".join(f"{flight.rest:.2f}" for flight in flights),
         f"{sum(flight.bytes for flight in flights) / seconds / 1e6:.1f}",
-        f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6:.2f}",
-    ]  # fmt: skip
-    return f"| {' | '.join(cells)} |"
+        resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6,
+    )
 
 
 def held(minutes: float, gaussians: int) -> None:
     """Print the memory that is held after each of many flights."""
-    view = synthetic_camera(*WINDOW).as_trained()
-    free, cameras = replace(view, trained_focal=None), CameraSet((view,), (view,))
-    print("| minutes | pictures | GB held |\n|---|---|---|")
-    with serving(synthetic_scene(gaussians), cameras, port=0, no_browser=True) as address:
+    heading("memory", "minutes", "pictures", "GB held")
+    with _served(gaussians) as (address, view):
         began, pictures = time.perf_counter(), 0
         for scale, recipe, paint in itertools.cycle(itertools.product((1, 0.5, 0.75), ("auto", "mip"), PAINTS)):
-            flight = Flight()
-            fly(
-                address,
-                free.scaled(scale),
-                20.0,
-                flight,
-                {"sides": [SIDES[0], {"recipe": recipe, "quality": "best"}]} | paint,
-            )
-            pictures += flight.moving
+            flight, sides = Flight(), [SIDES[0], {"recipe": recipe, "quality": "best"}]
+            flight.fly(address, view.scaled(scale), HELD_FLIGHT_SECONDS, sides=sides, **paint)
+            pictures += len(flight.delays)
             passed = (time.perf_counter() - began) / 60
-            print(f"| {passed:.1f} | {pictures} | {psutil.Process().memory_info().rss / 1e9:.2f} |", flush=True)
+            row(f"{passed:.1f}", pictures, psutil.Process().memory_info().rss / 1e9)
             if passed > minutes:
                 return
 
 
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("gaussians", nargs="*", type=int, default=SIZES)
-    parser.add_argument("--seconds", type=float, default=30.0)
-    parser.add_argument("--minutes", type=float)
-    asked = parser.parse_args()
-    if asked.minutes is not None:
-        return held(asked.minutes, asked.gaussians[0])
-    print("| Gaussians | clients | frames/s | pose to picture, ms | 95 % | rest to full quality, s | MB/s | GB |")
-    print("|---|---|---|---|---|---|---|---|")
-    for gaussians in asked.gaussians:
-        for clients in (1, 2):
-            print(measured(gaussians, clients, asked.seconds), flush=True)
+@contextmanager
+def _served(gaussians: int) -> Iterator[tuple[str, Camera]]:
+    """The address of a page with a synthetic scene, and a free camera of it."""
+    view = synthetic_camera(*WINDOW).as_trained()
+    with serving(synthetic_scene(gaussians), CameraSet((view,), (view,)), port=0, no_browser=True) as address:
+        yield address, replace(view, trained_focal=None)
 
 
-if __name__ == "__main__":
-    main()
+@dataclass
+class Flight:
+    """One client's flight.
+
+    requests: times at which pictures were asked for, by number.  delays: of pictures while the camera moves, in s.
+    rest: seconds from rest to full quality.
+    """
+
+    requests: dict[int, float] = field(default_factory=dict)
+    delays: list[float] = field(default_factory=list)
+    bytes: int = 0
+    rest: float = math.nan
+    done: threading.Event = field(default_factory=threading.Event)
+
+    def fly(self, address: str, view: Camera, seconds: float, **fields: Any) -> None:
+        """Turn about the scene, then rest.  fields: of the requests."""
+        up = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
+        where = address.replace("http", "ws", 1) + "live"
+        with connect(where, origin=address.rstrip("/"), proxy=None, max_size=None) as connection:  # pyright: ignore[reportArgumentType]
+            connection.recv()
+            listener = threading.Thread(target=self.listen, args=(connection,))
+            listener.start()
+            began, count = time.perf_counter(), round(seconds * POSES_PER_SECOND)
+            for number in range(1, count + 1):
+                time.sleep(max(0.0, began + number / POSES_PER_SECOND - time.perf_counter()))
+                pose = camera_paths.orbit(view, number / POSES_PER_SECOND / TURN_SECONDS, DEPTH, up).cam_from_world
+                see = {"id": number, "pose": pose.flatten().tolist(), "focal": view.focal, "split": 0.5, "sides": SIDES}
+                see |= {"width": view.width, "height": view.height, "moving": number < count, **fields}
+                self.requests[number] = time.perf_counter()
+                connection.send(json.dumps({"see": see}))
+            self.done.wait(60)
+            listener.join()
+
+    def listen(self, connection: ClientConnection) -> None:
+        """Receive pictures until all is done."""
+        while not self.done.is_set():
+            message = connection.recv()
+            now = time.perf_counter()
+            assert isinstance(message, bytes)
+            (length,) = struct.unpack_from("<I", message)
+            header = json.loads(message[4 : 4 + length])
+            connection.send('{"shown": 1}')
+            self.bytes += len(message)
+            delay = now - self.requests[header["id"]]
+            if header["stage"] == "moving":
+                self.delays.append(delay)
+            elif header["stage"] == "complete" and math.isnan(self.rest):
+                self.rest = delay
+            elif header["stage"] == "done":
+                self.done.set()

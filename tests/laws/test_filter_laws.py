@@ -16,26 +16,19 @@ import torch
 from torch import Tensor
 
 from aaplug.core.cameras import Camera
-from aaplug.core.gaussians import ANTIALIASED, CLASSIC, CONVENTIONS, MIP, Convention, Gaussians
+from aaplug.core.conventions import ANTIALIASED, CLASSIC, CONVENTIONS, MIP, Convention
+from aaplug.core.gaussians import Gaussians
 from aaplug.core.interfaces import ScreenFilter
 from aaplug.core.projection import project
 from aaplug.core.shading import shade
 from aaplug.core.splats import Splats2D
 from aaplug.core.training import TrainingViews
-from aaplug.methods.filters import (
-    PIXEL_VARIANCE,
-    SCREEN_FILTERS,
-    WORLD_FILTERS,
-    AnisotropicSmoothing,
-    Dilation,
-    FlatSmoothing,
-    Matched,
-    MatchedEnergy,
-    Smoothing3D,
-    fuse_stored,
-)
-from aaplug.methods.filters.matched import FULL_RISE_AT, MAX_RISE
-from aaplug.methods.recipes import RECIPES
+from aaplug.lab.smoothing import AnisotropicSmoothing, FlatSmoothing
+from aaplug.methods import RECIPES, SCREEN_FILTERS, WORLD_FILTERS
+from aaplug.methods.filters.dilation import Dilation
+from aaplug.methods.filters.energy import MatchedEnergy
+from aaplug.methods.filters.matched import FULL_RISE_AT, MAX_RISE, PIXEL_VARIANCE, Matched
+from aaplug.methods.filters.smoothing import Smoothing3D, fuse_stored
 from tests.conftest import each, make_camera, make_scene, make_splats
 
 F64 = torch.float64

@@ -17,11 +17,15 @@ from aaplug.core.kernels import EAGER
 from aaplug.core.projection import project, rotation_matrices, with_depth_slopes
 from aaplug.core.rules import RULES_3DGS, Rules
 from aaplug.core.splats import Splats2D
-from aaplug.methods.compositors import COMPOSITORS
-from aaplug.methods.pixel_kernels import INTEGRAL, PIXEL_KERNELS, POINT, SURFEL, SURFEL_MIP, point
+from aaplug.lab.integral import INTEGRAL
+from aaplug.lab.surfel_mip import SURFEL_MIP
+from aaplug.methods import COMPOSITORS, PIXEL_KERNELS
+from aaplug.methods.pixel_kernels import point
+from aaplug.methods.pixel_kernels.point import POINT
 from aaplug.methods.pixel_kernels.raster_rows import BLUE, COLUMNS, OPACITY, RED, TILE, tile_centres
-from aaplug.rasterizers import Reference, Tiled
-from aaplug.rasterizers.reference import alphas
+from aaplug.methods.pixel_kernels.surfel import SURFEL
+from aaplug.rasterizers.reference import Reference, alphas
+from aaplug.rasterizers.tiled import Tiled
 from aaplug.rasterizers.tiled.forward import STEP
 from tests.conftest import ALL_RASTERIZERS, each, make_camera, make_scene, make_splats, splats_of
 

@@ -6,11 +6,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from aaplug.core.errors import UsageError
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.training import TrainingViews
-from aaplug.methods.recipes import RECIPES
+from aaplug.methods import RECIPES
 from aaplug.rendering.renderer import Renderer
+from aaplug.system.errors import UsageError
 from tests.conftest import ALL_RASTERIZERS, make_camera, make_scene
 
 CAMERA = make_camera(size=(40, 30))

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from aaplug.core.splats import Render, Splats2D
-from aaplug.methods.pixel_kernels import POINT
+from aaplug.methods.pixel_kernels.point import POINT
 from tests.conftest import ALL_RASTERIZERS, make_splats
 
 HW = (29, 43)

@@ -11,8 +11,8 @@ import torch
 from aaplug.core.camera_paths import zoomed
 from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import Gaussians
+from aaplug.methods import RECIPES
 from aaplug.methods.recipe import Recipe
-from aaplug.methods.recipes import RECIPES
 from aaplug.rendering.renderer import Renderer
 from tests.conftest import each, make_camera, make_scene, sized
 

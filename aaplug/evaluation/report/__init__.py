@@ -1,1 +1,1 @@
-"""What a reader sees of an evaluation: its files, plots, contact sheets and the web page."""
+"""The reports of an evaluation: its files, plots, contact sheets and the web page."""

@@ -14,13 +14,13 @@ from torch import Tensor
 
 from aaplug.core.imaging import levels
 
-CELL = 320  # px: height of an image on the sheet
+CELL_HEIGHT = 320  # px
 GAP = 12  # px
 HEADING = 36  # px: height of a line of text
 INK = (40, 40, 40)
 LIGHT_INK = (245, 245, 245)
 FRAME, FRAME_INK = 2, (128, 128, 128)  # px: edge of an inset
-LEAST_INSET = 64  # px
+MIN_INSET = 64  # px
 ERROR_FULL = 32  # levels of 255 at the end of the error scale, as on the report's page
 HEAT = ((0, 0, 4), (86, 16, 110), (187, 55, 84), (249, 140, 10), (252, 255, 164))  # colours of the error scale
 BYTE = 255
@@ -34,16 +34,16 @@ def contact_sheet(
     widths = [cell.shape[1] for cell in cells[0]]
     margin = max(_text_width(label) for label, _ in rows) + 2 * GAP
     *lefts, width = accumulate((w + GAP for w in widths), initial=margin)
-    sheet = np.full((HEADING + len(rows) * (CELL + GAP), width, 3), 255, dtype=np.uint8)
+    sheet = np.full((HEADING + len(rows) * (CELL_HEIGHT + GAP), width, 3), 255, dtype=np.uint8)
     for left, heading in zip(lefts, columns, strict=True):
         _write(sheet, heading, left, HEADING - GAP)
     for r, ((label, _), images) in enumerate(zip(rows, cells, strict=True)):
-        top = HEADING + r * (CELL + GAP)
-        _write(sheet, label, GAP, top + CELL // 2)
+        top = HEADING + r * (CELL_HEIGHT + GAP)
+        _write(sheet, label, GAP, top + CELL_HEIGHT // 2)
         for left, room, image in zip(lefts, widths, images, strict=True):
-            shown = image[:, :room]
-            sheet[top : top + CELL, left : left + shown.shape[1]] = shown
-    return torch.from_numpy(sheet).float() / 255
+            part = image[:, :room]
+            sheet[top : top + CELL_HEIGHT, left : left + part.shape[1]] = part
+    return torch.from_numpy(sheet).float() / BYTE
 
 
 def error_map(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
@@ -57,21 +57,21 @@ def labelled(image: Float[Tensor, "h w 3"], label: str) -> Float[Tensor, "h w 3"
     """A copy of the image with a label on a dark strip in its top left corner."""
     pixels = _bytes(image)
     _write_on_strip(pixels, label, 0, 0)
-    return torch.from_numpy(pixels).float() / 255
+    return torch.from_numpy(pixels).float() / BYTE
 
 
 def magnified(image: Float[Tensor, "h w 3"], part: float, label: str) -> Float[Tensor, "h w 3"]:
     """A copy of the image with its middle enlarged in the bottom right corner, each pixel to a sharp square.
 
     part: share of the image that is of interest, in the middle, along each side.  The inset stays outside of it and
-        shows half of it along each side, or a little more; without room for `LEAST_INSET` px there is none.
+        shows half of it along each side, or a little more; without room for `MIN_INSET` px there is none.
     label: stands above the inset; {times} in it becomes the enlargement.
     """
     pixels = _bytes(image)
     height, width, _ = pixels.shape
     room = int((1 - part) / 2 * min(height, width)) - FRAME
     times = int((1 - part) / part)
-    if times > 1 and room >= LEAST_INSET:
+    if times > 1 and room >= MIN_INSET:
         side = room // times
         top, left = (height - side) // 2, (width - side) // 2
         inset = pixels[top : top + side, left : left + side].repeat(times, axis=0).repeat(times, axis=1)
@@ -80,7 +80,7 @@ def magnified(image: Float[Tensor, "h w 3"], part: float, label: str) -> Float[T
         pixels[y:, x:] = inset
         words = label.format(times=times)
         _write_on_strip(pixels, words, max(0, width - _text_width(words) - 2 * GAP), y - FRAME - HEADING)
-    return torch.from_numpy(pixels).float() / 255
+    return torch.from_numpy(pixels).float() / BYTE
 
 
 def _write_on_strip(pixels: np.ndarray, text: str, left: int, top: int) -> None:
@@ -90,11 +90,11 @@ def _write_on_strip(pixels: np.ndarray, text: str, left: int, top: int) -> None:
 
 
 def _enlarged(image: Float[Tensor, "h w 3"]) -> np.ndarray:
-    """8 bits, CELL px high; pixels of small images stay sharp squares, those of large ones are averaged."""
+    """8 bits, CELL_HEIGHT px high; pixels of small images stay sharp squares, those of large ones are averaged."""
     pixels = _bytes(image)
-    width = max(1, round(pixels.shape[1] * CELL / pixels.shape[0]))
-    kernel = cv2.INTER_NEAREST if pixels.shape[0] < CELL else cv2.INTER_AREA
-    return cv2.resize(pixels, (width, CELL), interpolation=kernel)
+    width = max(1, round(pixels.shape[1] * CELL_HEIGHT / pixels.shape[0]))
+    kernel = cv2.INTER_NEAREST if pixels.shape[0] < CELL_HEIGHT else cv2.INTER_AREA
+    return cv2.resize(pixels, (width, CELL_HEIGHT), interpolation=kernel)
 
 
 def _bytes(image: Float[Tensor, "h w 3"]) -> np.ndarray:

@@ -1,4 +1,8 @@
-"""The files of an evaluation: results.json, per_view.json, results.csv, report.html and its plots."""
+"""The files of an evaluation and of a comparison of scenes.
+
+An evaluation: results.json, per_view.json, results.csv.  A comparison: compare.json, compare.csv and contact-sheet.png.
+Of both: report.html and its plots.
+"""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -6,18 +10,67 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
+from jaxtyping import Float
+from torch import Tensor
+
+from aaplug.evaluation.comparison import Comparison
+from aaplug.evaluation.coverage import Coverage
+from aaplug.evaluation.engine import Task
 from aaplug.evaluation.image_store import ImageStore
-from aaplug.evaluation.results import Facts, Report, as_csv, per_view, results
-from aaplug.inspection.coverage import Coverage
+from aaplug.evaluation.metric import Image, TimedRenderer
+from aaplug.evaluation.metrics import PSNR
+from aaplug.evaluation.report.contact_sheet import contact_sheet, error_map
+from aaplug.evaluation.results import Facts, Report, as_csv, per_view, results, scale_name
+from aaplug.evaluation.truth import ViewTruth
 from aaplug.io.atomic import make_folder, replacing
+from aaplug.io.images import write_png
 
 RESULTS = ("results.json", "per_view.json", "results.csv")
+COMPARED = ("compare.json", "compare.csv", "contact-sheet.png")
 PAGE, PLOTS = "report.html", "plots"
 
 
-def as_json(data: Any) -> str:
-    """Strict JSON, as files hold it."""
-    return json.dumps(data, indent=1, allow_nan=False) + "\n"
+def write_results(report: Report, folder: str | PathLike[str], overwrite: bool, name: str = "scene") -> list[Path]:
+    """Write results.json, per_view.json and results.csv; return their paths."""
+    texts = (as_json(results(report)), as_json(per_view(report)), as_csv({name: report}))
+    return write_texts(folder, dict(zip(RESULTS, texts, strict=True)), overwrite)
+
+
+def write_comparison(
+    comparison: Comparison, task: Task, folder: Path, bounds: Coverage, images: ImageStore, overwrite: bool
+) -> list[Path]:
+    """Write the files and return their paths.  bounds: of the reference.  images: those that the page shows."""
+    data, table, sheet = COMPARED
+    texts = {data: as_json(comparison.summary()), table: as_csv({"compare": comparison.report})}
+    paths = write_texts(folder, texts, overwrite)
+    title = f"{comparison.reference.name} and {', '.join(scene.name for scene in comparison.scenes[1:])}"
+    paths += write_page(folder, title, comparison.report, bounds, images, overwrite, comparison.facts())
+    write_png(folder / sheet, _sheet(comparison, task), overwrite=overwrite)
+    return [*paths, folder / sheet]
+
+
+def write_page(
+    folder: str | PathLike[str],
+    name: str,
+    report: Report,
+    bounds: Coverage,
+    images: ImageStore,
+    overwrite: bool,
+    facts: Sequence[Facts] = (),
+) -> list[Path]:
+    """Write report.html, and its plots as PNG and SVG into plots/; return both paths.  facts: further tables."""
+    # matplotlib takes most of a second to import
+    from aaplug.evaluation.report.plots import plots
+    from aaplug.evaluation.report.webpage import page
+
+    figures = plots(report, bounds)
+    paths = write_texts(folder, {PAGE: page(name, report, bounds, figures, images, facts)}, overwrite)
+    beside = make_folder(Path(folder) / PLOTS)
+    for plot in figures:
+        for suffix, data in ((".png", plot.png()), (".svg", plot.svg().encode())):
+            with replacing(beside / (plot.name + suffix), overwrite=True) as stream:
+                stream.write(data)
+    return [*paths, beside]
 
 
 def write_texts(folder: str | PathLike[str], texts: Mapping[str, str], overwrite: bool) -> list[Path]:
@@ -29,34 +82,32 @@ def write_texts(folder: str | PathLike[str], texts: Mapping[str, str], overwrite
     return paths
 
 
-def write_results(report: Report, folder: str | PathLike[str], overwrite: bool, name: str = "scene") -> list[Path]:
-    """Write results.json, per_view.json and results.csv; return their paths."""
-    texts = (as_json(results(report)), as_json(per_view(report)), as_csv({name: report}))
-    return write_texts(folder, dict(zip(RESULTS, texts, strict=True)), overwrite)
+def as_json(data: Any) -> str:
+    """Strict JSON, as files hold it."""
+    return json.dumps(data, indent=1, allow_nan=False) + "\n"
 
 
-def write_page(
-    folder: str | PathLike[str],
-    name: str,
-    report: Report,
-    found: Coverage,
-    images: ImageStore,
-    overwrite: bool,
-    facts: Sequence[Facts] = (),
-) -> list[Path]:
-    """Write report.html, and its plots as PNG and SVG into plots/; return both paths.
+def _sheet(comparison: Comparison, task: Task) -> Float[Tensor, "H W 3"]:
+    """The view with the lowest PSNR at every scale: the truth, then every other scene and the map of its errors."""
+    reference, report = comparison.reference.name, comparison.report
+    values = [(m.values.get(PSNR.name), m.view) for m in report.measurements if m.recipe != reference]
+    defined = [(value, view) for value, view in values if value is not None]
+    worst = report.protocol["view_names"].index(min(defined)[1]) if defined else 0
+    truth = ViewTruth(task.truth, task.views[worst])
+    others = {c.name: TimedRenderer(c.renderer) for c in task.candidates if c.name != reference}
+    columns, rows = [reference], []
+    for name in others:
+        columns += [name, "error"]
+    for scale in sorted(task.scales, reverse=True):
+        expected = truth.image(scale)
+        assert expected is not None
+        cells: list[Image] = [expected]
+        for renderer in others.values():
+            image = renderer(truth.camera(scale)).rgb
+            cells += [image, error_map(image, expected)]
+        rows.append((_ascii(scale_name(scale)), cells))
+    return contact_sheet([_ascii(name) for name in columns], rows)
 
-    facts: further tables of text, as title, headings and rows.
-    """
-    # matplotlib takes most of a second to import
-    from aaplug.evaluation.report.plots import plots
-    from aaplug.evaluation.report.webpage import page
 
-    drawn = plots(report, found)
-    written = write_texts(folder, {PAGE: page(name, report, found, drawn, images, facts)}, overwrite)
-    beside = make_folder(Path(folder) / PLOTS)
-    for plot in drawn:
-        for suffix, data in ((".png", plot.png()), (".svg", plot.svg().encode())):
-            with replacing(beside / (plot.name + suffix), overwrite=True) as stream:
-                stream.write(data)
-    return [*written, beside]
+def _ascii(text: str) -> str:
+    return text.replace("×", "x").encode("ascii", "replace").decode()

@@ -6,29 +6,29 @@ Text is drawn literally (no TeX), so that names may hold any character.  Output 
 import io
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from itertools import cycle
 from typing import Any
 
 import matplotlib as mpl
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
+from aaplug.evaluation.coverage import Coverage
 from aaplug.evaluation.metric import Metric
 from aaplug.evaluation.results import CEILING, Report, mean, million_evaluations, scale_name
-from aaplug.inspection.coverage import Coverage
 
 # Distinct on white and on near-black; the markers help readers who do not see all colours.
 COLOURS = ("#3b82f6", "#d97706", "#16a34a", "#db2777", "#8b5cf6", "#0d9aa8", "#a3713d", "#7b8794")
 MARKERS = "osD^vPX*"
 INK = "#010203"  # placeholder for the colour of the page's text, which is light or dark
 PAPER_INK = "#1c2733"
-SIZE = (5.2, 3.3)  # inches
+FIGURE_INCHES = (5.2, 3.3)
 DPI = 160  # of a PNG
 BOUNDS = "sampling-bounds"
-INKED = ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color")
+INK_SETTINGS = ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color")
 STYLE: dict[Any, Any] = {
     "text.parse_math": False,
     "svg.fonttype": "none",
@@ -46,7 +46,7 @@ Value = Callable[[Report, str, float], float | None]  # by recipe and scale
 
 @dataclass(frozen=True)
 class Plot:
-    """A figure, drawn on demand in a given ink.  name: for its file.  says: what it shows, for a screen reader."""
+    """A figure, drawn on demand in a given ink.  name: for its file.  says: its content, for a screen reader."""
 
     name: str
     says: str
@@ -69,39 +69,47 @@ class Plot:
         return re.sub(r'<svg ([^>]*?)width="[^"]*" height="[^"]*"', r"<svg \1", text, count=1)
 
     def _saved(self, kind: str, ink: str, **settings: Any) -> bytes:
-        stream, parts = io.BytesIO(), dict.fromkeys(INKED, ink)
+        stream, parts = io.BytesIO(), dict.fromkeys(INK_SETTINGS, ink)
         with mpl.rc_context({**STYLE, **parts}):
             self.draw(ink).savefig(stream, format=kind, bbox_inches="tight", **settings)
         return stream.getvalue()
 
 
-def plots(report: Report, found: Coverage) -> list[Plot]:
-    """Everything that a report draws: metrics against the truth and work over scale, and the sampling bounds."""
-    curves = [_metric_curves(metric, report) for metric in report.compared]
+def plots(report: Report, bounds: Coverage) -> list[Plot]:
+    """The plots of a report: metrics against the truth and work over scale, and the sampling bounds."""
+    curves = []
+    for metric in report.compared:
+        name = re.sub(r"\W+", "-", metric.name.lower())
+        curves.append(_curves(name, metric.title, partial(_mean, metric), report))
     title = "million splat-pixel evaluations per view"
     curves.append(_curves("evaluations", title, million_evaluations, report, from_zero=True))
-    drawn = [plot for plot in curves if plot is not None]
-    share = "" if found.under is None else f": {found.under:.0%} are under it"
+    share = "" if bounds.under is None else f": {bounds.under:.0%} are under it"
     words = f"Histogram of the Gaussians' extent over their sampling bound{share}"
-    return [*drawn, Plot(BOUNDS, words, lambda ink: _bounds(found, ink))]
+    return [*(plot for plot in curves if plot is not None), Plot(BOUNDS, words, partial(_histogram, bounds))]
 
 
-def _metric_curves(metric: Metric, report: Report) -> Plot | None:
-    name = re.sub(r"\W+", "-", metric.name.lower())
-    return _curves(name, metric.title, lambda _, r, s: mean(report.select(r, s), metric.name), report)
+def _mean(metric: Metric, report: Report, recipe: str, scale: float) -> float | None:
+    return mean(report.select(recipe, scale), metric.name)
 
 
 def _curves(name: str, title: str, value: Value, report: Report, from_zero: bool = False) -> Plot | None:
-    """One line per recipe over scale, from 0 if `from_zero`; None if there is nothing to draw."""
+    """One line per recipe over scale, from 0 if `from_zero`; None if there is nothing to draw.
+
+    Lines have gaps where a value is undefined; the ceiling's is dashed and lies behind the others.
+    """
     scales = sorted(report.scales)
     values = {recipe: [value(report, recipe, scale) for scale in scales] for recipe in report.recipes}
     if all(v is None for line in values.values() for v in line):
         return None
 
     def draw(ink: str) -> Figure:
-        figure = Figure(SIZE)
+        lines = {recipe: [math.nan if v is None else v for v in line] for recipe, line in values.items()}
+        figure, ceiling = Figure(FIGURE_INCHES), lines.pop(CEILING, None)
         axes = figure.add_subplot(title=title)
-        _lines(axes, ink, scales, values)
+        for (recipe, line), colour, marker in zip(lines.items(), cycle(COLOURS), cycle(MARKERS), strict=False):
+            axes.plot(scales, line, marker=marker, ms=5, color=colour, label=recipe)
+        if ceiling is not None:
+            axes.plot(scales, ceiling, color=ink, ls=(0, (4, 3)), lw=1, label=CEILING, zorder=1)
         axes.set_xscale("log", base=2)
         axes.set_xticks(scales, [scale_name(scale) for scale in scales])
         axes.minorticks_off()
@@ -115,24 +123,14 @@ def _curves(name: str, title: str, value: Value, report: Report, from_zero: bool
     return Plot(name, f"{title} over scale, one line per recipe", draw)
 
 
-def _lines(axes: Axes, ink: str, scales: list[float], values: Mapping[str, list[float | None]]) -> None:
-    """Lines by recipe, with gaps where a value is undefined; the ceiling's is dashed and lies behind the others."""
-    known = {name: [math.nan if v is None else v for v in line] for name, line in values.items()}
-    ceiling = known.pop(CEILING, None)
-    for (recipe, line), colour, marker in zip(known.items(), cycle(COLOURS), cycle(MARKERS), strict=False):
-        axes.plot(scales, line, marker=marker, ms=5, color=colour, label=recipe)
-    if ceiling is not None:
-        axes.plot(scales, ceiling, color=ink, ls=(0, (4, 3)), lw=1, label=CEILING, zorder=1)
-
-
-def _bounds(found: Coverage, ink: str) -> Figure:
-    figure = Figure(SIZE)
+def _histogram(bounds: Coverage, ink: str) -> Figure:
+    figure = Figure(FIGURE_INCHES)
     axes = figure.add_subplot(title="Gaussians against their sampling bound")
-    lefts, width = found.edges[:-1], found.edges[1] - found.edges[0]
+    lefts, width = bounds.edges[:-1], bounds.edges[1] - bounds.edges[0]
     colours = [COLOURS[1] if left < 0 else COLOURS[0] for left in lefts]
-    axes.bar(lefts, found.counts, width=width, align="edge", color=colours, linewidth=0)
+    axes.bar(lefts, bounds.counts, width=width, align="edge", color=colours, linewidth=0)
     axes.axvline(0, color=ink, lw=1)
-    top = max(*found.counts, 1)
+    top = max(*bounds.counts, 1)
     axes.text(-0.15, top * 1.04, "aliases  ", ha="right", va="bottom", color=COLOURS[1])
     axes.text(0.15, top * 1.04, "  sampled well", ha="left", va="bottom", color=COLOURS[0])
     axes.set_ylim(top=top * 1.15)

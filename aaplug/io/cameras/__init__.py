@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from aaplug.core.cameras import Camera, CameraSet
-from aaplug.core.errors import FormatError, UsageError, listing
-from aaplug.core.registry import Registry, named
 from aaplug.io.cameras import blender, camera_path, colmap, inria, inria_model, llff, multiscale, pinhole, transforms
 from aaplug.io.cameras.options import Options
 from aaplug.io.cameras.poses import pose
 from aaplug.io.values import MAX_FOCAL, Place, focal, number, numbers, pixels
+from aaplug.system.errors import FormatError, UsageError, listing
+from aaplug.system.registry import Registry, named
 
 CLOSE_NAMES = 3  # names suggested for an unknown one
 
@@ -53,7 +53,7 @@ class CameraFormat(Protocol):
 # the first that accepts a path is used
 OWN: tuple[CameraFormat, ...]
 OWN = (pinhole, camera_path, inria_model, colmap, blender, inria, multiscale, transforms, llff)
-CAMERA_FORMATS = Registry[CameraFormat]("camera format", named(OWN), lambda f: isinstance(f, CameraFormat))
+CAMERA_FORMATS = Registry[CameraFormat]("camera format", "aaplug.io.cameras:CameraFormat", named(OWN))
 
 
 def read_cameras(

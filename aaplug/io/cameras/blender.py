@@ -5,10 +5,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from aaplug.core.cameras import CameraSet
-from aaplug.core.errors import UsageError
 from aaplug.io.cameras import transforms
 from aaplug.io.cameras.options import Options, explicit
 from aaplug.io.cameras.transforms import Source, read_source, set_of, trained
+from aaplug.system.errors import UsageError
 
 TRAIN, TEST, VAL = (f"transforms_{split}.json" for split in ("train", "test", "val"))
 
@@ -17,24 +17,20 @@ sign = "transforms_train.json (Blender)"
 
 
 def sniff(path: Path) -> bool:
-    """Whether it is a folder with training views."""
+    """True for a folder with training views."""
     return os.path.isfile(path / TRAIN)
 
 
 def read(path: Path, options: Options) -> CameraSet:
     """The cameras, with the split that the files give."""
-    cameras = _cameras(path, options)
+    if not os.path.isfile(path / TEST):
+        cameras = transforms.read(path / TRAIN, options)
+    elif options.test_every is not None:
+        raise UsageError("test_every", f"{path / TEST} gives the split; leave it out")
+    else:
+        train, test = (read_source(path / file, options) for file in (TRAIN, TEST))
+        split = explicit(trained(train, options), trained(test, options), f"{TRAIN} and {TEST}")
+        notes = tuple(dict.fromkeys(train.notes + test.notes))
+        cameras = set_of(Source((*train.cameras, *test.cameras), notes=notes), split, options)
     more = (f"{VAL} is not read",) if os.path.isfile(path / VAL) else ()
     return replace(cameras, notes=cameras.notes + more)
-
-
-def _cameras(path: Path, options: Options) -> CameraSet:
-    if not os.path.isfile(path / TEST):
-        return transforms.read(path / TRAIN, options)
-    if options.test_every is not None:
-        raise UsageError("test_every", f"{path / TEST} gives the split; leave it out")
-    train, test = (read_source(path / file, options) for file in (TRAIN, TEST))
-    split = explicit(trained(train, options), trained(test, options), f"{TRAIN} and {TEST}")
-    notes = tuple(dict.fromkeys(train.notes + test.notes))
-    both = Source((*train.cameras, *test.cameras), notes=notes)
-    return set_of(both, split, options)

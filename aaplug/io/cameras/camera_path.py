@@ -11,16 +11,15 @@ from os import PathLike
 from pathlib import Path
 
 from aaplug.core.cameras import Camera, CameraSet
-from aaplug.io.cameras.options import Options, undivided
+from aaplug.io.cameras.options import Options, described_sizes, file_sizes, undivided
 from aaplug.io.cameras.photos import refuse_folder
 from aaplug.io.cameras.poses import centred, inverse, pose_of_opengl
-from aaplug.io.cameras.sizes import described_sizes, file_sizes
 from aaplug.io.values import Entry, entries, focal, mentions, number, object_of, pixels, read_json
 
 KEY = "camera_path"
 PERSPECTIVE = "perspective"
-USUAL_FPS = 24.0  # if the file does not say
-HALF_TURN = 180.0  # degrees: the angle of view of a pinhole is less
+DEFAULT_FPS = 24.0  # frames per second, if the file does not say
+MAX_ANGLE = 180.0  # degrees: the angle of view of a pinhole is less
 
 name = "camera_path"
 sign = "a JSON file with camera_path (nerfstudio)"
@@ -35,7 +34,7 @@ class CameraPath:
 
 
 def sniff(path: Path) -> bool:
-    """Whether a file has the keys of a camera path."""
+    """True for a file with the keys of a camera path."""
     return not os.path.isdir(path) and mentions(path, [KEY, "camera_to_world"])
 
 
@@ -58,19 +57,18 @@ def read_camera_path(path: str | PathLike[str]) -> CameraPath:
     kind = about.fields.get("camera_type", PERSPECTIVE)
     about.place.expect(kind == PERSPECTIVE, "camera_type", PERSPECTIVE, kind)
     size = about.get("render_width", pixels), about.get("render_height", pixels)
-    fps = about.get("fps", number, USUAL_FPS)
+    fps = about.get("fps", number, DEFAULT_FPS)
     about.place.expect(fps > 0, "fps", "above 0", fps)
     frames = entries(path, "frame", about.fields[KEY])
     digits = len(str(len(frames) - 1))
-    cameras = (_camera(entry, f"{i:0{digits}}", *size) for i, entry in enumerate(frames))
-    return CameraPath(tuple(cameras), fps)
+    return CameraPath(tuple(_camera(entry, f"{i:0{digits}}", size) for i, entry in enumerate(frames)), fps)
 
 
-def _camera(entry: Entry, name: str, width: int, height: int) -> Camera:
+def _camera(entry: Entry, name: str, size: tuple[int, int]) -> Camera:
     angle = entry.get("fov", number)
-    entry.place.expect(0 < angle < HALF_TURN, "fov", f"above 0 and below {HALF_TURN:g} degrees", angle)
-    f = focal(height / 2 / math.tan(math.radians(angle) / 2), entry.place, "fov's focal length")
+    entry.place.expect(0 < angle < MAX_ANGLE, "fov", f"above 0 and below {MAX_ANGLE:g} degrees", angle)
+    f = focal(size[1] / 2 / math.tan(math.radians(angle) / 2), entry.place, "fov's focal length")
     motion = entry.vector("camera_to_world", 16).reshape(4, 4)
     world_from_cam = pose_of_opengl(motion, entry.place, "camera_to_world")
     cam_from_world = inverse(world_from_cam, entry.place, "camera_to_world")
-    return centred(name, (width, height), (f, f), cam_from_world)
+    return centred(name, size, (f, f), cam_from_world)

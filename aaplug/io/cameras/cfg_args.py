@@ -7,16 +7,14 @@ Functions raise FormatError for a file that breaks its format.
 """
 
 import ast
-import math
 import re
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from aaplug.core.errors import FormatError
 from aaplug.io.limits import whole_limit
 from aaplug.io.values import Entry, Place, number, read_bounded, text
+from aaplug.system.errors import FormatError
 
 NAME = "cfg_args"
 CAPPED = -1.0  # 3DGS's default resolution: the width capped at WIDTH_CAP
@@ -26,12 +24,12 @@ DIVISORS = (1, 2, 4, 8)  # resolutions that divide the size; others are a width 
 
 @dataclass(frozen=True)
 class CfgArgs:
-    """What a run says about its images.
+    """A run's settings that concern its images.
 
     resolution: a divisor in DIVISORS, CAPPED, or a width in px.
     images: the folder of the photos.
     white_background: None if the file does not say.
-    held_out: whether every 8th view was kept from training (eval).
+    held_out: true if every 8th view was kept from training (eval).
     """
 
     resolution: float = CAPPED
@@ -55,14 +53,7 @@ class CfgArgs:
 
 def read_cfg_args(path: Path) -> CfgArgs:
     """Read the settings that concern cameras; those that the file does not mention have their defaults."""
-    entry = Entry(Place(path, "Namespace"), _literals(path, _parsed(path)))
-    resolution, images = entry.get("resolution", _resolution, CAPPED), entry.get("images", text, CfgArgs.images)
-    white, held_out = (_flag(entry, name) for name in ("white_background", "eval"))
-    return CfgArgs(resolution, images, white, bool(held_out))
-
-
-def _parsed(path: Path) -> ast.Call:
-    source = read_bounded(path, whole_limit("CFG_ARGS"))
+    source, settings = read_bounded(path, whole_limit("CFG_ARGS")), {}
     try:
         with warnings.catch_warnings(action="ignore"):  # Python's, about backslashes in Windows paths
             call = ast.parse(source.decode().strip(), mode="eval").body
@@ -72,19 +63,16 @@ def _parsed(path: Path) -> ast.Call:
         raise FormatError(path, "should be a Python Namespace(...)")
     if call.func.id != "Namespace" or call.args or not all(keyword.arg for keyword in call.keywords):
         raise FormatError(path, f"should be Namespace(name=value, ...), not {call.func.id}(...)")
-    return call
-
-
-def _literals(path: Path, call: ast.Call) -> dict[str, Any]:
-    found = {}
     for keyword in call.keywords:
-        name = str(keyword.arg)
         try:
-            found[name] = ast.literal_eval(keyword.value)
+            settings[str(keyword.arg)] = ast.literal_eval(keyword.value)
         except (ValueError, TypeError, SyntaxError, RecursionError, MemoryError) as error:
-            problem = f"{name} should be a literal (number, text, True, list); code is never run"
+            problem = f"{keyword.arg} should be a literal (number, text, True, list); code is never run"
             raise FormatError(path, problem) from error
-    return found
+    entry = Entry(Place(path, "Namespace"), settings)
+    resolution, images = entry.get("resolution", _resolution, CAPPED), entry.get("images", text, CfgArgs.images)
+    white, held_out = (_flag(entry, name) for name in ("white_background", "eval"))
+    return CfgArgs(resolution, images, white, bool(held_out))
 
 
 def _resolution(value: object, place: Place, field: str) -> float:
@@ -98,8 +86,3 @@ def _flag(entry: Entry, field: str) -> bool | None:
     value = entry.fields.get(field)
     entry.place.expect(value is None or isinstance(value, bool), field, "True or False", value)
     return value
-
-
-def half_up(value: float) -> int:
-    """Round halves up, as the tools that make images_N folders do; Python rounds them to even."""
-    return max(1, math.floor(value + 0.5))

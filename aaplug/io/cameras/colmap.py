@@ -17,18 +17,26 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.cameras import Camera, CameraSet
-from aaplug.core.errors import FormatError, listing
 from aaplug.io.cameras.cfg_args import WIDTH_CAP
 from aaplug.io.cameras.colmap_files import KINDS, Image, Intrinsics, read_cameras, read_images
-from aaplug.io.cameras.options import LLFF_HOLD, Options, every_nth
+from aaplug.io.cameras.options import (
+    LLFF_HOLD,
+    Options,
+    Size,
+    camera_set,
+    every_nth,
+    file_sizes,
+    photo_sizes,
+    trained_at,
+)
 from aaplug.io.cameras.photos import distinct, photo_folder, with_photos, without_suffix
 from aaplug.io.cameras.poses import inverse, pose
-from aaplug.io.cameras.sizes import Size, camera_set, file_sizes, photo_sizes, trained_at
 from aaplug.io.lenses import Distortion, lens_notes, undistorted_cameras
 from aaplug.io.values import Place, focal, number, pixels
+from aaplug.system.errors import FormatError, listing
 
-LEAST_QUATERNION = 1e-6  # shortest quaternion that counts as a rotation
-OPENCV = {  # for each of OpenCV's coefficients, the index of the model's distortion parameter; -1 for 0
+MIN_QUATERNION_LENGTH = 1e-6  # a shorter one counts as no rotation
+OPENCV_ORDER = {  # for each of OpenCV's coefficients, the index of the model's distortion parameter; -1 for 0
     "SIMPLE_RADIAL": (0, -1, -1, -1),
     "RADIAL": (0, 1, -1, -1),
     "OPENCV": (0, 1, 2, 3),
@@ -43,7 +51,7 @@ sign = "sparse/0 or sparse (COLMAP)"
 
 
 def sniff(path: Path) -> bool:
-    """Whether it is a dataset's root, a model's folder, or one of a model's files."""
+    """True for a dataset's root, a model's folder, and one of a model's files."""
     return _model_folder(path) is not None
 
 
@@ -53,7 +61,11 @@ def read(path: Path, options: Options) -> CameraSet:
     cameras_file, images_file = _files(folder)
     intrinsics = read_cameras(cameras_file)
     images = sorted(read_images(images_file), key=lambda image: image.name)
-    photos = photo_folder(_root(folder), options, "images", Place(folder, "images"))
+    root = folder.absolute()
+    if root.name.isdigit() and "sparse" in root.parent.name:
+        root = root.parent
+    root = root.parent if "sparse" in root.name else root
+    photos = photo_folder(root, options, "images", Place(folder, "images"))
     source = [_camera(image, intrinsics) for image in images]
     source = with_photos(source, [image.place for image in images], photos)
     names = distinct(images_file, [image.name for image in images], (without_suffix, str))
@@ -68,8 +80,8 @@ def read(path: Path, options: Options) -> CameraSet:
 
 def _model_folder(path: Path) -> Path | None:
     if not os.path.isdir(path):
-        known = path.stem in ("cameras", "images", "points3D") and path.suffix in KINDS
-        return path.parent if known else None
+        in_model = path.stem in ("cameras", "images", "points3D") and path.suffix in KINDS
+        return path.parent if in_model else None
     tries = (path / "sparse" / "0", path / "sparse", path / "0", path)
     return next((t for t in tries if any(os.path.isfile(t / f"cameras{k}") for k in KINDS)), None)
 
@@ -77,19 +89,11 @@ def _model_folder(path: Path) -> Path | None:
 def _files(folder: Path) -> tuple[Path, Path]:
     pairs = [(folder / f"cameras{kind}", folder / f"images{kind}") for kind in KINDS]
     for pair in pairs:
-        if all(os.path.isfile(file) for file in pair):
+        if all(map(os.path.isfile, pair)):
             return pair
-    there = [file.name for pair in pairs for file in pair if os.path.isfile(file)]
+    there = listing([file.name for pair in pairs for file in pair if os.path.isfile(file)])
     needs = "a COLMAP model needs cameras.bin and images.bin, or cameras.txt and images.txt"
-    raise FormatError(folder, f"{needs}; found {listing(there) or 'neither'}")
-
-
-def _root(folder: Path) -> Path:
-    """The dataset's root, above sparse/0 or sparse."""
-    folder = folder.absolute()
-    if folder.name.isdigit() and "sparse" in folder.parent.name:
-        folder = folder.parent
-    return folder.parent if "sparse" in folder.name else folder
+    raise FormatError(folder, f"{needs}; found {there or 'neither'}")
 
 
 def _training_sizes(cameras: Sequence[Camera], options: Options) -> tuple[list[Size], str]:
@@ -107,23 +111,15 @@ def _camera(image: Image, intrinsics: dict[int, Intrinsics]) -> Camera:
     if image.camera_id not in intrinsics:
         raise image.place.error(f"uses camera {image.camera_id}, which cameras does not hold")
     lens = intrinsics[image.camera_id]
-    fx, fy, cx, cy = _pinhole(lens)
-    width = pixels(lens.width, lens.place, "width")
-    height = pixels(lens.height, lens.place, "height")
-    translation = [number(value, image.place, "translation") for value in image.translation]
-    cam_from_world = pose(_rotation(image), torch.tensor(translation, dtype=torch.float64), image.place, "quaternion")
-    inverse(cam_from_world, image.place, "translation")  # refuses a centre that overflows
-    return Camera(image.name, width, height, fx, fy, cx, cy, cam_from_world)
-
-
-def _pinhole(lens: Intrinsics) -> tuple[float, float, float, float]:
-    """fx, fy, cx, cy, without the distortion."""
-    values = [number(value, lens.place, "parameter") for value in lens.parameters]
-    n = lens.model.focals
+    values, n = [number(value, lens.place, "parameter") for value in lens.parameters], lens.model.focals
     if not n:
         raise lens.place.error(f"its model is {lens.model.name}, which has no focal length")
     fx, fy = (focal(f, lens.place, "focal length") for f in (values[0], values[n - 1]))
-    return fx, fy, values[n], values[n + 1]
+    width, height = pixels(lens.width, lens.place, "width"), pixels(lens.height, lens.place, "height")
+    translation = [number(value, image.place, "translation") for value in image.translation]
+    cam_from_world = pose(_rotation(image), torch.tensor(translation, dtype=torch.float64), image.place, "quaternion")
+    inverse(cam_from_world, image.place, "translation")  # refuses a centre that overflows
+    return Camera(image.name, width, height, fx, fy, values[n], values[n + 1], cam_from_world)
 
 
 def _distortion(lens: Intrinsics) -> Distortion | None:
@@ -131,17 +127,17 @@ def _distortion(lens: Intrinsics) -> Distortion | None:
     rest = lens.parameters[lens.model.focals + 2 :]
     if lens.model.straight and not any(rest):
         return None
-    order = OPENCV.get(lens.model.name)
-    found = [number(value, lens.place, "parameter") for value in rest]
-    coefficients = None if order is None else tuple((*found, 0.0)[i] for i in order)
+    order = OPENCV_ORDER.get(lens.model.name)
+    values = [number(value, lens.place, "parameter") for value in rest]
+    coefficients = None if order is None else tuple((*values, 0.0)[i] for i in order)
     return Distortion(lens.model.name, coefficients, lens.model.name.endswith("FISHEYE"))
 
 
 def _rotation(image: Image) -> Float[Tensor, "3 3"]:
     """The rotation of a quaternion wxyz: I + 2w[v]ₓ + 2[v]ₓ² after normalization."""
     length = math.hypot(*image.quaternion)
-    right = LEAST_QUATERNION <= length < math.inf
-    image.place.expect(right, "quaternion", "finite and not zero", image.quaternion)
+    usable = MIN_QUATERNION_LENGTH <= length < math.inf
+    image.place.expect(usable, "quaternion", "finite and not zero", image.quaternion)
     w, x, y, z = (value / length for value in image.quaternion)
     cross = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
     return torch.eye(3, dtype=torch.float64) + 2 * w * cross + 2 * cross @ cross

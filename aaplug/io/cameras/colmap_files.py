@@ -13,22 +13,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
 
-from aaplug.core.errors import FormatError, reason
 from aaplug.io.limits import whole_limit
 from aaplug.io.values import Place, text
+from aaplug.system.errors import FormatError, reason
 
 Record = TypeVar("Record")
 Number = TypeVar("Number", int, float)
 Parser = Callable[[Path, BinaryIO], Iterator[Record]]
 
 KINDS = (".bin", ".txt")
-LINE_LIMIT = 64 * 2**20  # bytes: a line lists the points of one image
+MAX_LINE_SIZE = 64 * 2**20  # bytes: a line lists the points of one image
 POINT_SIZE = 24  # bytes: x, y (float64) and the 3D point's id
-COUNT = struct.Struct("<Q")
-CAMERA = struct.Struct("<IiQQ")  # id, model, width, height; the parameters follow
-IMAGE = struct.Struct("<I7dI")  # id, quaternion, translation, camera id; name and points follow
-LEAST_CAMERA = CAMERA.size + 2 * 8  # bytes: every model has 2 parameters or more
-LEAST_IMAGE = IMAGE.size + 1 + COUNT.size  # bytes: an empty name has its NUL
+COUNT_RECORD = struct.Struct("<Q")
+CAMERA_RECORD = struct.Struct("<IiQQ")  # id, model, width, height; the parameters follow
+IMAGE_RECORD = struct.Struct("<I7dI")  # id, quaternion, translation, camera id; name and points follow
+MIN_CAMERA_SIZE = CAMERA_RECORD.size + 2 * 8  # bytes: every model has 2 parameters or more
+MIN_IMAGE_SIZE = IMAGE_RECORD.size + 1 + COUNT_RECORD.size  # bytes: an empty name has its NUL
 CAMERA_FIELDS = 4  # id, model, width, height
 IMAGE_FIELDS = 10  # id, 4 of the quaternion, 3 of the translation, camera id, name
 
@@ -39,7 +39,7 @@ class Model:
 
     parameters: how many.
     focals: how many of them are focal lengths, which come first; cx and cy follow, then distortion.
-    straight: whether it is a pinhole if all distortion is zero.
+    straight: true if it is a pinhole when all distortion is zero.
     """
 
     name: str
@@ -96,20 +96,20 @@ class Image:
 
 def read_cameras(file: Path) -> dict[int, Intrinsics]:
     """Read the intrinsics, by camera id."""
-    found: dict[int, Intrinsics] = {}
+    by_id: dict[int, Intrinsics] = {}
     for intrinsics in _records(file, _binary_cameras, _text_cameras):
-        if intrinsics.key in found:
+        if intrinsics.key in by_id:
             raise intrinsics.place.error("ids should be unique, but this one is there twice")
-        found[intrinsics.key] = intrinsics
-    return found
+        by_id[intrinsics.key] = intrinsics
+    return by_id
 
 
 def read_images(file: Path) -> list[Image]:
     """Read the images, in the order of the file."""
-    found = list(_records(file, _binary_images, _text_images))
-    if not found:
+    images = list(_records(file, _binary_images, _text_images))
+    if not images:
         raise FormatError(file, "holds no image: the reconstruction placed no camera")
-    return found
+    return images
 
 
 class _Reader:
@@ -132,21 +132,11 @@ class _Reader:
 
     def count(self, least: int, what: str) -> int:
         """A number of records, checked against the bytes that are left, `least` or more for each."""
-        (n,) = self.unpack(COUNT, f"number of {what}")
+        (n,) = self.unpack(COUNT_RECORD, f"number of {what}")
         if n * least > self.left:
             need = f"{n} {what} need {n * least} bytes at least, and {self.left} are left"
             raise FormatError(self.path, f"{need}; the file is cut short or is not COLMAP's")
         return n
-
-    def name(self, what: str) -> bytes:
-        """Bytes up to a NUL."""
-        start, most = self.file.tell(), whole_limit("NAME")
-        chunk = self.file.read(min(most + 1, self.left))
-        name, end, _ = chunk.partition(b"\0")
-        if not end:
-            raise FormatError(self.path, f"{what}: its name should end within {most} bytes, not after {len(chunk)}")
-        self.file.seek(start + len(name) + 1)
-        return name
 
 
 def _records(file: Path, binary: Parser[Record], lines: Parser[Record]) -> Iterator[Record]:
@@ -159,8 +149,8 @@ def _records(file: Path, binary: Parser[Record], lines: Parser[Record]) -> Itera
 
 def _binary_cameras(file: Path, stream: BinaryIO) -> Iterator[Intrinsics]:
     reader = _Reader(file, stream)
-    for index in range(reader.count(LEAST_CAMERA, "cameras")):
-        key, model_id, width, height = reader.unpack(CAMERA, f"camera record {index}")
+    for index in range(reader.count(MIN_CAMERA_SIZE, "cameras")):
+        key, model_id, width, height = reader.unpack(CAMERA_RECORD, f"camera record {index}")
         place = Place(reader.path, f"camera {key}")
         if not 0 <= model_id < len(MODELS):
             raise place.wrong("model", f"COLMAP's, 0 to {len(MODELS) - 1}", model_id)
@@ -171,13 +161,18 @@ def _binary_cameras(file: Path, stream: BinaryIO) -> Iterator[Intrinsics]:
 
 def _binary_images(file: Path, stream: BinaryIO) -> Iterator[Image]:
     reader = _Reader(file, stream)
-    for index in range(reader.count(LEAST_IMAGE, "images")):
+    for index in range(reader.count(MIN_IMAGE_SIZE, "images")):
         what = f"image record {index}"
-        key, *motion, camera_id = reader.unpack(IMAGE, what)
+        key, *motion, camera_id = reader.unpack(IMAGE_RECORD, what)
         place = Place(reader.path, f"image {key}")
-        name = text(_decoded(reader.name(what), place), place, "name")
+        start, most = stream.tell(), whole_limit("NAME")
+        chunk = stream.read(min(most + 1, reader.left))
+        name, end, _ = chunk.partition(b"\0")
+        if not end:
+            raise FormatError(file, f"{what}: its name should end within {most} bytes, not after {len(chunk)}")
+        stream.seek(start + len(name) + 1)
         stream.seek(reader.count(POINT_SIZE, f"points of {what}") * POINT_SIZE, os.SEEK_CUR)
-        yield Image(place, name, camera_id, tuple(motion[:4]), tuple(motion[4:]))
+        yield Image(place, text(_decoded(name, place), place, "name"), camera_id, tuple(motion[:4]), tuple(motion[4:]))
 
 
 def _text_cameras(file: Path, stream: BinaryIO) -> Iterator[Intrinsics]:
@@ -214,9 +209,9 @@ def _text_images(file: Path, stream: BinaryIO) -> Iterator[Image]:
 
 def _lines(file: Path, stream: BinaryIO) -> Iterator[tuple[int, bytes]]:
     """Numbered lines of bounded length."""
-    for row, line in enumerate(iter(lambda: stream.readline(LINE_LIMIT + 1), b""), start=1):
-        if len(line) > LINE_LIMIT:
-            raise FormatError(file, f"line {row} is longer than {LINE_LIMIT} bytes")
+    for row, line in enumerate(iter(lambda: stream.readline(MAX_LINE_SIZE + 1), b""), start=1):
+        if len(line) > MAX_LINE_SIZE:
+            raise FormatError(file, f"line {row} is longer than {MAX_LINE_SIZE} bytes")
         yield row, line
 
 

@@ -5,20 +5,31 @@ rotation: camera-to-world, OpenCV axes; fx, fy: in px.  The principal point is t
 the photos before training scaled them, so the training size is computed by 3DGS's rule.
 """
 
+import math
 import os
-from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
-from itertools import count
 from pathlib import Path
 
-from aaplug.core.cameras import BLACK, WHITE, Camera, CameraSet
+from aaplug.core.cameras import Camera, CameraSet
+from aaplug.core.colours import BLACK, WHITE
 from aaplug.io.cameras import cfg_args
-from aaplug.io.cameras.cfg_args import WIDTH_CAP, CfgArgs, half_up, read_cfg_args
-from aaplug.io.cameras.options import LLFF_HOLD, Options, Split, every_nth, explicit
+from aaplug.io.cameras.cfg_args import WIDTH_CAP, CfgArgs, read_cfg_args
+from aaplug.io.cameras.options import (
+    LLFF_HOLD,
+    Options,
+    Size,
+    Split,
+    camera_set,
+    every_nth,
+    explicit,
+    file_sizes,
+    photo_sizes,
+    trained_at,
+)
 from aaplug.io.cameras.photos import photo_folder, with_photos
 from aaplug.io.cameras.poses import centred, inverse, pose
-from aaplug.io.cameras.sizes import Size, camera_set, file_sizes, photo_sizes, trained_at
 from aaplug.io.values import Entry, Place, entries, focal, mentions, pixels, read_json, text
 
 FILE = "cameras.json"
@@ -28,7 +39,7 @@ sign = "cameras.json (INRIA)"
 
 
 def sniff(path: Path) -> bool:
-    """Whether a folder holds cameras.json, or a file is one by its name or keys."""
+    """True for a folder that holds cameras.json, and for a file that is one by its name or keys."""
     if os.path.isdir(path):
         return os.path.isfile(path / FILE)
     return path.name == FILE or mentions(path, ["img_name"])
@@ -38,15 +49,17 @@ def read(path: Path, options: Options) -> CameraSet:
     """The cameras at the size at which 3DGS trained."""
     folder = path if os.path.isdir(path) else path.parent
     file = folder / FILE if path == folder or path.name == cfg_args.NAME else path
-    found = entries(file, "camera", read_json(file))
+    items = entries(file, "camera", read_json(file))
     run = folder / cfg_args.NAME
     settings = read_cfg_args(run) if os.path.isfile(run) else None
     photos = photo_folder(folder, options, (settings or CfgArgs()).images, Place(run, "images"))
-    source = with_photos([_camera(e) for e in found], [e.place for e in found], photos)
-    source = _without_copies(source)
+    source = with_photos([_camera(item) for item in items], [item.place for item in items], photos)
+    views = dict[tuple[object, ...], Camera]()
+    for camera in source:  # some runs list a view once per split
+        views.setdefault((camera.name, *camera.cam_from_world.flatten().tolist()), camera)
+    source = list(views.values())
     sizes, why = _training_sizes(source, settings, options)
-    trained = trained_at(source, sizes)
-    split = _split(trained, settings, options)
+    split = _split(trained_at(source, sizes), settings, options)
     background = {None: None, True: WHITE, False: BLACK}[settings.white_background if settings else None]
     return camera_set("INRIA cameras.json", source, split, why, background)
 
@@ -59,61 +72,37 @@ def _camera(entry: Entry) -> Camera:
     return centred(entry.get("img_name", text), size, focals, cam_from_world)
 
 
-def _without_copies(cameras: Sequence[Camera]) -> list[Camera]:
-    """Drop repeated views: some runs list a view once per split."""
-    first: dict[tuple[object, ...], Camera] = {}
-    for camera in cameras:
-        first.setdefault((camera.name, *camera.cam_from_world.flatten().tolist()), camera)
-    return list(first.values())
-
-
 def _training_sizes(cameras: Sequence[Camera], settings: CfgArgs | None, options: Options) -> tuple[list[Size], str]:
+    """3DGS's rule, applied to the sizes of the photos that training loaded; and the reason, for a note."""
     if options.train_scale is not None:
         return file_sizes(cameras, options)
     run = settings or CfgArgs()
-    base, base_why = _base_sizes(cameras, run)
+    n = run.divisor
+    if any(camera.photo for camera in cameras):
+        loaded, why = photo_sizes(cameras), "size of the photos"
+    else:  # tools that make images_N folders round halves up; Python rounds them to even
+        loaded = [tuple(max(1, math.floor(side / n + 0.5)) for side in (c.width, c.height)) for c in cameras]
+        why = "size in the file" + (f" / {n} for {run.images}" if n > 1 else "")
     rule = f"resolution {run.resolution:g} in cfg_args"
     if settings is None:
         rule = f"3DGS's cap at {WIDTH_CAP} px, assumed without cfg_args: `train_scale` sets it"
-    return [run.size(*size) for size in base], f"{base_why}, {rule}"
-
-
-def _base_sizes(cameras: Sequence[Camera], run: CfgArgs) -> tuple[list[Size], str]:
-    """The sizes of the photos that training loaded, before its resolution rule."""
-    if any(camera.photo for camera in cameras):
-        return photo_sizes(cameras), "size of the photos"
-    n = run.divisor
-    sizes = [(half_up(camera.width / n), half_up(camera.height / n)) for camera in cameras]
-    return sizes, "size in the file" + (f" / {n} for {run.images}" if n > 1 else "")
+    return [run.size(*size) for size in loaded], f"{why}, {rule}"
 
 
 def _split(cameras: Sequence[Camera], settings: CfgArgs | None, options: Options) -> Split:
+    """The split by name, or by order where the names begin again: Blender's test views r_0, ..., then training's."""
     held_out = settings is not None and settings.held_out
-    names = [camera.name for camera in cameras]
-    second = _second_run(names)
-    if held_out and options.test_every is None and second:
+    counts, occurrences = Counter[str](), list[int]()
+    for camera in cameras:
+        counts[camera.name] += 1
+        occurrences.append(counts[camera.name])
+    second = next((index for index, times in enumerate(occurrences) if times > 1), len(cameras))
+    again = [camera.name for camera in cameras[second:]]
+    if held_out and options.test_every is None and again and len(set(again)) == len(again):
         return explicit(cameras[second:], cameras[:second], "names repeat: test views come first")
-    ordered = sorted(_renamed(cameras), key=lambda camera: camera.name)
+    pairs = zip(cameras, occurrences, strict=True)
+    renamed = [camera if times == 1 else replace(camera, name=f"{camera.name}~{times}") for camera, times in pairs]
+    ordered = sorted(renamed, key=lambda camera: camera.name)
     if settings is None:
         return every_nth(ordered, options, 0, "no cfg_args; `test_every` 8 is 3DGS's rule")
-    hold = LLFF_HOLD if held_out else 0
-    return every_nth(ordered, options, hold, f"eval={held_out} in cfg_args")
-
-
-def _second_run(names: Sequence[str]) -> int | None:
-    """Index at which the names begin again, if they do once: Blender's test views r_0, ..., then training r_0, ..."""
-    if not (start := next((i for i, n in enumerate(_times_met(names)) if n > 1), None)):
-        return None
-    return start if len(set(names[start:])) == len(names[start:]) else None
-
-
-def _renamed(cameras: Sequence[Camera]) -> list[Camera]:
-    """Append a number to repeated names."""
-    times = _times_met([camera.name for camera in cameras])
-    return [c if n == 1 else replace(c, name=f"{c.name}~{n}") for c, n in zip(cameras, times, strict=True)]
-
-
-def _times_met(names: Sequence[str]) -> list[int]:
-    """How often each name has occurred up to its place in the list, itself included."""
-    met = defaultdict[str, Iterator[int]](lambda: count(1))
-    return [next(met[name]) for name in names]
+    return every_nth(ordered, options, LLFF_HOLD if held_out else 0, f"eval={held_out} in cfg_args")

@@ -15,6 +15,6 @@ sign = "cameras.json with cfg_args (INRIA)"
 
 
 def sniff(path: Path) -> bool:
-    """Whether it is a folder that holds both files, or its cfg_args."""
+    """True for a folder that holds both files, or its cfg_args."""
     folder = path.parent if path.name == cfg_args.NAME else path
     return all(os.path.isfile(folder / file) for file in (FILE, cfg_args.NAME))

@@ -13,13 +13,12 @@ import numpy as np
 import torch
 
 from aaplug.core.cameras import Camera, CameraSet
-from aaplug.core.errors import FormatError
-from aaplug.io.cameras.options import LLFF_HOLD, Options, every_nth
+from aaplug.io.cameras.options import LLFF_HOLD, Options, camera_set, every_nth, file_sizes, photo_sizes, trained_at
 from aaplug.io.cameras.photos import SUFFIXES, last_part, photo_folder, with_photos
 from aaplug.io.cameras.poses import centred, inverse, pose
-from aaplug.io.cameras.sizes import camera_set, file_sizes, photo_sizes, trained_at
 from aaplug.io.limits import whole_limit
 from aaplug.io.values import Place, focal, number, pixels, read_bounded
+from aaplug.system.errors import FormatError
 
 FILE = "poses_bounds.npy"
 COLUMNS = 17
@@ -29,7 +28,7 @@ sign = "poses_bounds.npy (LLFF)"
 
 
 def sniff(path: Path) -> bool:
-    """Whether it is the file, or a folder that holds it."""
+    """True for the file, and for a folder that holds it."""
     return path.name == FILE or os.path.isfile(path / FILE)
 
 
@@ -38,13 +37,18 @@ def read(path: Path, options: Options) -> CameraSet:
     file = path / FILE if os.path.isdir(path) else path
     rows = _rows(file)
     folder = photo_folder(file.parent, options, "images", Place(file, "images"))
-    names = _names(folder.folder, len(rows))
+    try:
+        names = sorted(p.name for p in folder.folder.iterdir() if p.suffix.lower() in SUFFIXES)
+    except OSError:
+        names = []
+    if len(names) != len(rows):
+        names = [f"{i:03}" for i in range(len(rows))]
     places = [Place(file, f"row {i}") for i in range(len(rows))]
     source = [_camera(*each) for each in zip(rows, names, places, strict=True)]
     source = with_photos(source, places, folder)
     source = [replace(camera, name=last_part(camera.name)) for camera in source]
-    photographed = photo_sizes(source), "size of the photos, or in the file"
-    sizes, why = photographed if options.train_scale is None else file_sizes(source, options)
+    photo_rule = photo_sizes(source), "size of the photos, or in the file"
+    sizes, why = photo_rule if options.train_scale is None else file_sizes(source, options)
     split = every_nth(trained_at(source, sizes), options, LLFF_HOLD, "LLFF's rule; `test_every` 0 for no split")
     return camera_set(f"LLFF {FILE}", source, split, why)
 
@@ -63,22 +67,11 @@ def _rows(file: Path) -> np.ndarray:
     return np.array(rows, np.float64)
 
 
-def _names(folder: Path, count: int) -> list[str]:
-    """The photos' names in order; numbers if there are not as many photos as rows."""
-    try:
-        found = sorted(p.name for p in folder.iterdir() if p.suffix.lower() in SUFFIXES)
-    except OSError:
-        found = []
-    return found if len(found) == count else [f"{i:03}" for i in range(count)]
-
-
 def _camera(row: np.ndarray, name: str, place: Place) -> Camera:
     values = [number(float(value), place, "it") for value in row]
     matrix = torch.tensor(values[:15], dtype=torch.float64).reshape(3, 5)
-    height = pixels(matrix[0, 4].item(), place, "height")
-    width = pixels(matrix[1, 4].item(), place, "width")
+    height, width = (pixels(matrix[i, 4].item(), place, field) for i, field in enumerate(("height", "width")))
     f = focal(matrix[2, 4].item(), place, "focal length")
     down, right, back = matrix[:, :3].unbind(dim=1)
     world_from_cam = pose(torch.stack([right, down, -back], dim=1), matrix[:, 3], place, "rotation")
-    cam_from_world = inverse(world_from_cam, place, "position")
-    return centred(name, (width, height), (f, f), cam_from_world)
+    return centred(name, (width, height), (f, f), inverse(world_from_cam, place, "position"))

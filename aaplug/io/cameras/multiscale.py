@@ -8,13 +8,13 @@ its own size.
 import os
 from pathlib import Path
 
-from aaplug.core.cameras import WHITE, Camera, CameraSet
-from aaplug.core.errors import UsageError
-from aaplug.io.cameras.options import Options, explicit, undivided
+from aaplug.core.cameras import Camera, CameraSet
+from aaplug.core.colours import WHITE
+from aaplug.io.cameras.options import Options, described_sizes, explicit, file_sizes, trained_at, undivided
 from aaplug.io.cameras.photos import PhotoFolder, distinct, last_part, refuse_folder, without_suffix
 from aaplug.io.cameras.poses import centred, inverse, pose_of_opengl, rigid
-from aaplug.io.cameras.sizes import described_sizes, file_sizes, trained_at
 from aaplug.io.values import Entry, Place, focal, mentions, object_of, pixels, read_json, text
+from aaplug.system.errors import UsageError
 
 FILE = "metadata.json"
 COLUMNS = ("file_path", "cam2world", "width", "height", "focal")
@@ -24,7 +24,7 @@ sign = "metadata.json (multi-scale Blender)"
 
 
 def sniff(path: Path) -> bool:
-    """Whether a folder's metadata.json, or the file, has these keys."""
+    """True for a folder whose metadata.json, and for a file that, has these keys."""
     file = path / FILE if os.path.isdir(path) else path
     return mentions(file, ["cam2world"]) and mentions(file, ["file_path"])
 
@@ -37,8 +37,8 @@ def read(path: Path, options: Options) -> CameraSet:
     file = path / FILE if os.path.isdir(path) else path
     document = object_of(read_json(file), file, "it", "'train', as multi-scale Blender datasets have", "train")
     train, test = (_cameras(document, split) if split in document else [] for split in ("train", "test"))
-    trained, held = (trained_at(v, file_sizes(v, options)[0]) for v in (train, test))
-    split = explicit(trained, held, FILE) if held else undivided(trained, f"no test in {FILE}")
+    trained, held_out = (trained_at(views, file_sizes(views, options)[0]) for views in (train, test))
+    split = explicit(trained, held_out, FILE) if held_out else undivided(trained, f"no test in {FILE}")
     what = f"multi-scale Blender: {len(train) + len(test)} cameras, {described_sizes(train)}"
     size = "training size: each photo's own, as all scales were trained on"
     return CameraSet(split.train, split.test, WHITE, (what, split.note, size, "background: white, Blender's custom"))
@@ -51,16 +51,13 @@ def _cameras(document: Entry, split: str) -> list[Camera]:
     if len(lists) != len(COLUMNS) or len(lengths) != 1 or 0 in lengths:
         raise columns.place.error(f"{', '.join(COLUMNS)} should be lists of one length")
     rows = zip(*lists, strict=True)
-    found = [Entry(Place(file, f"{split} {i}"), dict(zip(COLUMNS, row, strict=True))) for i, row in enumerate(rows)]
-    paths = [entry.get("file_path", text) for entry in found]
+    items = [Entry(Place(file, f"{split} {i}"), dict(zip(COLUMNS, row, strict=True))) for i, row in enumerate(rows)]
+    paths = [item.get("file_path", text) for item in items]
     names = distinct(file, paths, (last_part, without_suffix, str))
-    folder = PhotoFolder(file.parent, file.parent)
-    return [_camera(entry, name, folder) for entry, name in zip(found, names, strict=True)]
-
-
-def _camera(entry: Entry, name: str, folder: PhotoFolder) -> Camera:
-    motion = rigid(entry, "cam2world")
-    world_from_cam = pose_of_opengl(motion, entry.place, "cam2world")
-    size, f = (entry.get("width", pixels), entry.get("height", pixels)), entry.get("focal", focal)
-    cam_from_world = inverse(world_from_cam, entry.place, "cam2world")
-    return centred(name, size, (f, f), cam_from_world, folder.find(entry.get("file_path", text), entry.place))
+    folder, cameras = PhotoFolder(file.parent, file.parent), list[Camera]()
+    for item, name, photo in zip(items, names, paths, strict=True):
+        world_from_cam = pose_of_opengl(rigid(item, "cam2world"), item.place, "cam2world")
+        size, f = (item.get("width", pixels), item.get("height", pixels)), item.get("focal", focal)
+        cam_from_world = inverse(world_from_cam, item.place, "cam2world")
+        cameras.append(centred(name, size, (f, f), cam_from_world, folder.find(photo, item.place)))
+    return cameras

@@ -1,13 +1,22 @@
-"""Options for reading cameras, and the split into training and test views."""
+"""Options for reading cameras, and what follows from them: training sizes, the split, the set that a reader returns.
+
+Sizes are (width, height), in px.  Functions raise UsageError for a side above the limit CAMERA_SIDE, and FormatError
+for a photo that cannot be read or whose aspect differs from its camera's.
+"""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from aaplug.core.cameras import Camera
-from aaplug.core.errors import UsageError
+from aaplug.core.cameras import Camera, CameraSet
+from aaplug.io.images import image_size
+from aaplug.io.limits import whole_limit
+from aaplug.system.errors import FormatError, UsageError
 
 LLFF_HOLD = 8  # every 8th view by name is a test view: LLFF, 3DGS --eval
+MAX_ASPECT_ERROR = 0.01  # relative difference between a photo's aspect and its camera's that rounding explains
+
+Size = tuple[int, int]
 
 
 @dataclass(frozen=True)
@@ -65,3 +74,61 @@ def every_nth(cameras: Sequence[Camera], options: Options, custom: int, source: 
         return undivided(cameras, "one camera cannot be divided")
     train = [camera for index, camera in enumerate(cameras) if index % n]
     return explicit(train, cameras[::n], f"1 in {n} by name: {source}")
+
+
+def file_sizes(cameras: Sequence[Camera], options: Options) -> tuple[list[Size], str]:
+    """Each camera's size in the file, times `train_scale` if the user chose one; and the reason, for a note."""
+    scale = options.train_scale
+    sizes = [_scaled(camera, 1.0 if scale is None else scale) for camera in cameras]
+    most = whole_limit("CAMERA_SIDE")
+    if max(map(max, sizes), default=0) > most:
+        raise UsageError("train_scale", f"makes an image of more than {most} px a side")
+    return sizes, "size in the file" + ("" if scale is None else f" × {scale:g}: `train_scale`")
+
+
+def photo_sizes(cameras: Sequence[Camera]) -> list[Size]:
+    """The size of each camera's photo; a camera without one is scaled like the first that has one."""
+    sizes: list[Size | None] = []
+    for camera in cameras:
+        size = camera.photo and image_size(camera.photo)
+        if size and abs(size[1] - (height := camera.height * size[0] / camera.width)) > 1 + MAX_ASPECT_ERROR * height:
+            what = (
+                f"is {size[0]}×{size[1]} px, which is not the shape of its camera ({camera.width}×{camera.height} px)"
+            )
+            raise FormatError(camera.photo or "", f"{what}; is it the wrong folder, or is the photo turned?")
+        sizes.append(size)
+    rate = next((size[0] / camera.width for size, camera in zip(sizes, cameras, strict=True) if size), 1.0)
+    return [size or _scaled(camera, rate) for size, camera in zip(sizes, cameras, strict=True)]
+
+
+def trained_at(cameras: Sequence[Camera], sizes: Sequence[Size]) -> list[Camera]:
+    """The cameras at their training sizes, with the same fields of view."""
+    return [camera.resized(*size).as_trained() for camera, size in zip(cameras, sizes, strict=True)]
+
+
+def described_sizes(cameras: Sequence[Camera]) -> str:
+    """The cameras' sizes, for a note."""
+    sizes = sorted({(c.width, c.height) for c in cameras}, key=lambda s: (s[0] * s[1], s))
+    words = [f"{width}×{height}" for width, height in sizes]
+    return f"{words[0]} px" if len(words) == 1 else f"{words[0]} to {words[-1]} px"
+
+
+def camera_set(
+    kind: str,
+    source: Sequence[Camera],
+    split: Split,
+    why: str,
+    background: tuple[float, float, float] | None = None,
+    more: Sequence[str] = (),
+) -> CameraSet:
+    """The set of a split of cameras, with notes on format, split and training size.
+
+    source: the cameras as the file has them.  why: where the training size came from.  more: notes to add.
+    """
+    format = f"{kind}: {len(source)} cameras, {described_sizes(source)} in the file"
+    size = f"training size: {described_sizes([*split.train, *split.test])} ({why})"
+    return CameraSet(split.train, split.test, background, (format, split.note, size, *more))
+
+
+def _scaled(camera: Camera, scale: float) -> Size:
+    return max(1, round(camera.width * scale)), max(1, round(camera.height * scale))

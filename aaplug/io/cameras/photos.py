@@ -11,12 +11,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from aaplug.core.cameras import Camera
-from aaplug.core.errors import FormatError, UsageError, listing
 from aaplug.io.cameras.options import Options
 from aaplug.io.values import Place
+from aaplug.system.errors import FormatError, UsageError, listing
 
-COMMON = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")  # tried for names without a suffix
-SUFFIXES = (*COMMON, ".webp", ".tif", ".tiff", ".bmp", ".exr")  # of image files
+COMMON_SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")  # tried for names without a suffix
+SUFFIXES = (*COMMON_SUFFIXES, ".webp", ".tif", ".tiff", ".bmp", ".exr")  # of image files
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class PhotoFolder:
     """A folder of photos.
 
     home: the folder that no path may leave, even by a link.
-    chosen: whether the user named the folder.
+    chosen: true if the user named the folder.
     """
 
     folder: Path
@@ -34,12 +34,17 @@ class PhotoFolder:
     def find(self, name: str, place: Place) -> Path | None:
         """The photo of that name, or of that name with another suffix, if there is one."""
         _refuse_escape(name, place)
-        bare = without_suffix(name)
-        tries = (name, *(bare + suffix for suffix in COMMON))
-        found = next((p for p in (self.folder / t for t in tries) if os.path.isfile(p)), None)
-        if found is not None and not _within(found, self.home):
+        tries = (name, *(without_suffix(name) + suffix for suffix in COMMON_SUFFIXES))
+        photo = next((path for path in (self.folder / t for t in tries) if os.path.isfile(path)), None)
+        if photo is None:
+            return None
+        try:
+            inside = photo.resolve().is_relative_to(self.home.resolve())
+        except (OSError, RuntimeError):  # a loop of links
+            inside = False
+        if not inside:
             raise place.error(f"photo {name!r} lies outside {self.home}; pass `images` to allow another folder")
-        return found
+        return photo
 
 
 def photo_folder(root: Path, options: Options, custom: str, place: Place) -> PhotoFolder:
@@ -62,11 +67,11 @@ def refuse_folder(options: Options) -> None:
 def with_photos(cameras: Sequence[Camera], places: Sequence[Place], folder: PhotoFolder) -> list[Camera]:
     """The cameras with their photos, found by the cameras' names."""
     pairs = zip(cameras, places, strict=True)
-    found = [replace(camera, photo=folder.find(camera.name, place)) for camera, place in pairs]
-    if folder.chosen and not any(camera.photo for camera in found):
+    photographed = [replace(camera, photo=folder.find(camera.name, place)) for camera, place in pairs]
+    if folder.chosen and not any(camera.photo for camera in photographed):
         names = listing([camera.name for camera in cameras], most=3)
         raise UsageError("images", f"{folder.folder} holds no photo of these cameras ({names})")
-    return found
+    return photographed
 
 
 def without_suffix(name: str) -> str:
@@ -95,10 +100,3 @@ def _refuse_escape(name: str, place: Place) -> None:
     kinds = PurePosixPath(name), PureWindowsPath(name)
     if not name.isprintable() or any(kind.anchor or ".." in kind.parts for kind in kinds):
         raise place.error(f"path {name!r} should stay within the dataset: no '..', not absolute")
-
-
-def _within(path: Path, home: Path) -> bool:
-    try:
-        return path.resolve().is_relative_to(home.resolve())
-    except (OSError, RuntimeError):  # a loop of links
-        return False

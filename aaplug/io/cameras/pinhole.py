@@ -7,10 +7,9 @@ world_to_camera is 4×4, row by row, OpenCV axes.
 from pathlib import Path
 
 from aaplug.core.cameras import Camera, CameraSet
-from aaplug.io.cameras.options import Options, every_nth
+from aaplug.io.cameras.options import Options, camera_set, every_nth, file_sizes, trained_at
 from aaplug.io.cameras.photos import refuse_folder
 from aaplug.io.cameras.poses import inverse, pose, rigid
-from aaplug.io.cameras.sizes import camera_set, file_sizes, trained_at
 from aaplug.io.values import Entry, entries, focal, mentions, number, pixels, read_json
 
 name = "pinhole"
@@ -18,7 +17,7 @@ sign = "a JSON file with world_to_camera"
 
 
 def sniff(path: Path) -> bool:
-    """Whether a file has the key world_to_camera."""
+    """True for a file with the key world_to_camera."""
     return mentions(path, ["world_to_camera"])
 
 
@@ -27,10 +26,10 @@ def read(path: Path, options: Options) -> CameraSet:
     refuse_folder(options)
     document = read_json(path)
     alone = isinstance(document, dict)
-    found = entries(path, "camera", [document] if alone else document)
-    digits = len(str(len(found) - 1))
-    names = [path.stem] if alone else [f"camera_{i:0{digits}}" for i in range(len(found))]
-    source = [_camera(entry, name) for entry, name in zip(found, names, strict=True)]
+    items = entries(path, "camera", [document] if alone else document)
+    digits = len(str(len(items) - 1))
+    names = [path.stem] if alone else [f"camera_{i:0{digits}}" for i in range(len(items))]
+    source = [_camera(item, name) for item, name in zip(items, names, strict=True)]
     sizes, why = file_sizes(source, options)
     split = every_nth(trained_at(source, sizes), options, 0, "the format has no split")
     return camera_set("pinhole JSON", source, split, why)

@@ -12,7 +12,7 @@ from torch import Tensor
 from aaplug.core.cameras import Camera
 from aaplug.io.values import Entry, Place
 
-ORTHONORMAL = 1e-3  # largest error of an entry of R·Rᵀ that counts as rounding
+MAX_ROTATION_ERROR = 1e-3  # largest error of an entry of R·Rᵀ that counts as rounding
 OPENCV_FROM_OPENGL = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)  # y and z change sign
 
 
@@ -26,8 +26,8 @@ def pose(
 ) -> Float[Tensor, "4 4"]:
     """The rigid motion with this translation and the rotation nearest to `rotation`."""
     error = (rotation @ rotation.T - torch.eye(3, dtype=torch.float64)).abs().max().item()
-    if not error <= ORTHONORMAL:
-        off = f"R·Rᵀ is {error:.2g} off the identity, {ORTHONORMAL:g} allowed"
+    if not error <= MAX_ROTATION_ERROR:
+        off = f"R·Rᵀ is {error:.2g} off the identity, {MAX_ROTATION_ERROR:g} allowed"
         raise place.error(f"{field} should be a rotation: {off}")
     if torch.linalg.det(rotation) <= 0:
         raise place.error(f"{field} should be a rotation, but it mirrors (its determinant is -1)")

@@ -19,13 +19,12 @@ from typing import Any
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.cameras import WHITE, Camera, CameraSet
-from aaplug.core.errors import FormatError
-from aaplug.io.cameras.options import Options, Split, every_nth, explicit
+from aaplug.core.cameras import Camera, CameraSet
+from aaplug.core.colours import WHITE
+from aaplug.io.cameras.options import Options, Size, Split, camera_set, every_nth, explicit, file_sizes, trained_at
 from aaplug.io.cameras.photos import PhotoFolder, distinct, last_part, refuse_folder, without_suffix
 from aaplug.io.cameras.poses import inverse, pose, pose_of_opengl, rigid
-from aaplug.io.cameras.sizes import Size, camera_set, file_sizes, trained_at
-from aaplug.io.images import image_size
+from aaplug.io.images import PNG_SIGNATURE, image_size
 from aaplug.io.lenses import Distortion, lens_notes, undistorted_cameras
 from aaplug.io.values import (
     Entry,
@@ -40,20 +39,19 @@ from aaplug.io.values import (
     read_start,
     text,
 )
+from aaplug.system.errors import FormatError
 
 FILE = "transforms.json"
-AROUND = ("EQUIRECTANGULAR", "OMNIDIRECTIONALSTEREO_L", "OMNIDIRECTIONALSTEREO_R", "VR180_L", "VR180_R")
+PANORAMAS = ("EQUIRECTANGULAR", "OMNIDIRECTIONALSTEREO_L", "OMNIDIRECTIONALSTEREO_R", "VR180_L", "VR180_R")
 PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV")  # OPENCV is one if its coefficients are 0
 EXPORTED = "transform"  # key of a frame's 3×4 pose in `ns-export cameras`
 LAST_ROW = [0.0, 0.0, 0.0, 1.0]
 FISHEYE = "OPENCV_FISHEYE"
-DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
-LEAST_ANGLE = 1e-9  # rad: the smallest angle of view
-SPLITS = ("train_filenames", "val_filenames", "test_filenames")  # nerfstudio's lists
-Frame = tuple[Entry, Path | None]  # with its photo, if there is one
-PNG = b"\x89PNG\r\n\x1a\n"
+COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+MIN_ANGLE = 1e-9  # rad: the smallest angle of view
+FILE_LISTS = ("train_filenames", "val_filenames", "test_filenames")  # nerfstudio's split
 PNG_COLOUR_TYPE = 25  # byte of the header
-PNG_ALPHA = (4, 6)  # colour types with alpha: gray and RGB
+PNG_ALPHA = (b"\4", b"\6")  # colour types with alpha: gray and RGB
 DATAPARSER = "dataparser_transforms.json"
 
 name = "transforms"
@@ -62,29 +60,23 @@ sign = "transforms.json (nerfstudio, instant-ngp)"
 
 @dataclass(frozen=True)
 class Source:
-    """The cameras of a file.  held_out: whether each is a test view, None if the file does not say."""
+    """The cameras of a file.  held_out: true for each that is a test view, None if the file does not say."""
 
     cameras: tuple[Camera, ...]
     held_out: tuple[bool, ...] | None = None
     notes: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Dataparser:
     """A rigid motion, followed by a scale."""
 
     motion: Float[Tensor, "4 4"]
     scale: float
 
-    def moved(self, world_from_cam: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
-        """A camera's pose in the trained frame."""
-        moved = self.motion @ world_from_cam
-        moved[:3, 3] *= self.scale
-        return moved
-
 
 def sniff(path: Path) -> bool:
-    """Whether a folder holds transforms.json, or a file is one by its name or keys."""
+    """True for a folder that holds transforms.json, and for a file that is one by its name or keys."""
     if os.path.isdir(path):
         return os.path.isfile(path / FILE)
     named = path.name.startswith("transforms") and path.suffix == ".json"
@@ -98,7 +90,7 @@ def read(path: Path, options: Options) -> CameraSet:
     cameras = trained(source, options)
     if source.held_out is not None and options.test_every is None:
         pairs = list(zip(cameras, source.held_out, strict=True))
-        train, test = ([c for c, out in pairs if out == held] for held in (False, True))
+        train, test = ([camera for camera, out in pairs if out == held] for held in (False, True))
         return set_of(source, explicit(train, test, "lists of file names"), options)
     if options.test_every:
         cameras = sorted(cameras, key=lambda camera: camera.name)
@@ -107,7 +99,8 @@ def read(path: Path, options: Options) -> CameraSet:
 
 def set_of(source: Source, split: Split, options: Options) -> CameraSet:
     """The set of a split of the source's cameras; photos with alpha mean a white background, Blender's custom."""
-    alpha = any(camera.photo and _has_alpha(camera.photo) for camera in source.cameras)
+    headers = (read_start(camera.photo, PNG_COLOUR_TYPE + 1) for camera in source.cameras if camera.photo)
+    alpha = any(h.startswith(PNG_SIGNATURE) and h[PNG_COLOUR_TYPE:] in PNG_ALPHA for h in headers)
     more = ["background: white, Blender's custom, as photos have alpha"] if alpha else []
     why, background = file_sizes(source.cameras, options)[1], WHITE if alpha else None
     return camera_set("transforms JSON", source.cameras, split, why, background, [*more, *source.notes])
@@ -122,18 +115,46 @@ def read_source(file: Path, options: Options) -> Source:
     """The cameras at the size that the file or the photos give, in the frame of the trained scene."""
     refuse_folder(options)
     document = _document(file)
-    frames = _frames(file, document)
-    paths = [entry.get("file_path", text) for entry, _ in frames]
+    shared = {key: value for key, value in document.items() if key != "frames"}
+    frames = entries(file, "frame", document["frames"], shared)
+    exported = any(EXPORTED in frame for frame in frames)
+    folder = PhotoFolder(file.parent, file.parent)
+    photos = [None if EXPORTED in f else folder.find(f.get("file_path", text), f.place) for f in frames]
+    paths = [frame.get("file_path", text) for frame in frames]
     names = distinct(file, paths, (last_part, without_suffix, str))
-    photo = next((photo for _, photo in frames if photo), None)
+    photo = next(filter(None, photos), None)
     spare = image_size(photo) if photo else None  # for frames without w, h and photo
-    exported = any(EXPORTED in entry for entry, _ in frames)
     parser = None if exported else _dataparser(file.parent / DATAPARSER)
-    cameras = [_camera(frame, name, spare, parser) for frame, name in zip(frames, names, strict=True)]
-    lenses = [_distortion(entry) for entry, _ in frames]
+    cameras = [_camera(*each, spare, parser) for each in zip(frames, photos, names, strict=True)]
+    lenses = [_distortion(frame) for frame in frames]
     cameras = undistorted_cameras(cameras, lenses)
-    notes = (*lens_notes(lenses, cameras), *_frame_notes(document, exported, parser))
-    return Source(tuple(cameras), _held_out(file, document, paths), notes)
+    notes = lens_notes(lenses, cameras)
+    if exported:
+        notes.append("frame: that in which nerfstudio trained (ns-export cameras); photos unknown")
+    elif parser:
+        notes.append(f"frame: that of {DATAPARSER} (scale {parser.scale:g}), in which nerfstudio trains")
+    elif "applied_transform" in document:
+        notes.append(f"frame: as in the file; a scene that nerfstudio trained needs its {DATAPARSER} beside it")
+    return Source(tuple(cameras), _held_out(file, document, paths), tuple(notes))
+
+
+def _document(file: Path) -> dict[str, Any]:
+    """The object with `frames`; those of `ns-export cameras`, whose pose has three rows, get the fourth."""
+    document = read_json(file)
+    if not isinstance(document, list):
+        return object_of(document, file, "it", "'frames', as Blender and nerfstudio write", "frames").fields
+    frames = []
+    for index, row in enumerate(document):
+        if not isinstance(row, dict) or EXPORTED not in row:
+            what = "an object with file_path and transform, as ns-export cameras writes"
+            raise FormatError(file, f"item {index} should be {what}")
+        if not {"fl_x", "w", "h"} <= row.keys():
+            lacks = f"item {index} has no fl_x, w and h, so its lens is unknown"
+            hint = f"give nerfstudio's transforms.json, with the run's {DATAPARSER} beside it"
+            raise FormatError(file, f"{lacks}; {hint}")
+        rows = row[EXPORTED]
+        frames.append({**row, "transform_matrix": [*rows, LAST_ROW] if isinstance(rows, list) else rows})
+    return {"frames": frames}
 
 
 def _dataparser(path: Path) -> Dataparser | None:
@@ -146,93 +167,47 @@ def _dataparser(path: Path) -> Dataparser | None:
     return Dataparser(pose(matrix[:, :3], matrix[:, 3], entry.place, "transform"), scale)
 
 
-def _frame_notes(document: dict[str, Any], exported: bool, parser: Dataparser | None) -> list[str]:
-    if exported:
-        return ["frame: that in which nerfstudio trained (ns-export cameras); photos unknown"]
-    if parser:
-        return [f"frame: that of {DATAPARSER} (scale {parser.scale:g}), in which nerfstudio trains"]
-    if "applied_transform" in document:
-        return [f"frame: as in the file; a scene that nerfstudio trained needs its {DATAPARSER} beside it"]
-    return []
-
-
 def _held_out(file: Path, document: dict[str, Any], paths: Sequence[str]) -> tuple[bool, ...] | None:
-    """Whether nerfstudio's lists of file names keep each frame from training; None without lists."""
-    lists = {key: document[key] for key in SPLITS if key in document}
-    if SPLITS[0] not in lists:
+    """True for each frame that nerfstudio's lists of file names keep from training; None without lists."""
+    lists = {key: document[key] for key in FILE_LISTS if key in document}
+    if FILE_LISTS[0] not in lists:
         return None
     for key, listed in lists.items():
-        right = isinstance(listed, list) and all(isinstance(p, str) for p in listed)
+        right = isinstance(listed, list) and all(isinstance(path, str) for path in listed)
         Place(file, "lists of file names").expect(right, key, "a list of paths", listed)
-    train = set(lists[SPLITS[0]])
+    train = set(lists[FILE_LISTS[0]])
     return tuple(path not in train for path in paths)
 
 
-def _document(file: Path) -> dict[str, Any]:
-    document = read_json(file)
-    if isinstance(document, list):
-        return {"frames": [_exported(file, index, row) for index, row in enumerate(document)]}
-    return object_of(document, file, "it", "'frames', as Blender and nerfstudio write", "frames").fields
-
-
-def _exported(file: Path, index: int, row: object) -> dict[str, Any]:
-    """A frame of `ns-export cameras`, whose pose has three rows, with the fourth added."""
-    if not isinstance(row, dict) or EXPORTED not in row:
-        what = "an object with file_path and transform, as ns-export cameras writes"
-        raise FormatError(file, f"item {index} should be {what}")
-    if not {"fl_x", "w", "h"} <= row.keys():
-        lacks = f"item {index} has no fl_x, w and h, so its lens is unknown"
-        raise FormatError(file, f"{lacks}; give nerfstudio's transforms.json, with the run's {DATAPARSER} beside it")
-    rows = row[EXPORTED]
-    return {**row, "transform_matrix": [*rows, LAST_ROW] if isinstance(rows, list) else rows}
-
-
-def _frames(file: Path, document: dict[str, Any]) -> list[Frame]:
-    shared = {key: value for key, value in document.items() if key != "frames"}
-    folder = PhotoFolder(file.parent, file.parent)
-    found = entries(file, "frame", document["frames"], shared)
-    photos = [None if EXPORTED in e else folder.find(e.get("file_path", text), e.place) for e in found]
-    return list(zip(found, photos, strict=True))
-
-
-def _camera(frame: Frame, name: str, spare: Size | None, parser: Dataparser | None) -> Camera:
-    entry, photo = frame
-    width, height = _size(entry, photo, spare)
-    fx = _focal(entry, width)
-    fy, cx, cy = entry.get("fl_y", focal, fx), entry.get("cx", number, width / 2), entry.get("cy", number, height / 2)
-    motion = rigid(entry, "transform_matrix")
-    world_from_cam = pose_of_opengl(motion, entry.place, "transform_matrix")
-    world_from_cam = world_from_cam if parser is None else parser.moved(world_from_cam)
-    cam_from_world = inverse(world_from_cam, entry.place, "transform_matrix")
-    return Camera(name, width, height, fx, fy, cx, cy, cam_from_world, photo=photo)
-
-
-def _size(entry: Entry, photo: Path | None, spare: Size | None) -> Size:
+def _camera(entry: Entry, photo: Path | None, name: str, spare: Size | None, parser: Dataparser | None) -> Camera:
     if "w" in entry and "h" in entry:
-        return entry.get("w", pixels), entry.get("h", pixels)
-    if photo:
-        return image_size(photo)
-    if spare is None:
+        width, height = entry.get("w", pixels), entry.get("h", pixels)
+    elif size := image_size(photo) if photo else spare:
+        width, height = size
+    else:
         unknown = "its size is unknown: the file has no w and h, and there are no photos"
         raise entry.place.error(f"{unknown}; put the photos where file_path says, or add w and h (px) beside frames")
-    return spare
-
-
-def _focal(entry: Entry, width: int) -> float:
     if "fl_x" in entry or "camera_angle_x" not in entry:
-        return entry.get("fl_x", focal)
-    angle = entry.get("camera_angle_x", number)
-    right = LEAST_ANGLE <= angle < math.pi
-    entry.place.expect(right, "camera_angle_x", "above 0 and below π, in radians", angle)
-    return focal(width / 2 / math.tan(angle / 2), entry.place, "camera_angle_x's focal length")
+        fx = entry.get("fl_x", focal)
+    else:
+        angle = entry.get("camera_angle_x", number)
+        entry.place.expect(MIN_ANGLE <= angle < math.pi, "camera_angle_x", "above 0 and below π, in radians", angle)
+        fx = focal(width / 2 / math.tan(angle / 2), entry.place, "camera_angle_x's focal length")
+    fy, cx, cy = entry.get("fl_y", focal, fx), entry.get("cx", number, width / 2), entry.get("cy", number, height / 2)
+    world_from_cam = pose_of_opengl(rigid(entry, "transform_matrix"), entry.place, "transform_matrix")
+    if parser is not None:
+        world_from_cam = parser.motion @ world_from_cam
+        world_from_cam[:3, 3] *= parser.scale
+    cam_from_world = inverse(world_from_cam, entry.place, "transform_matrix")
+    return Camera(name, width, height, fx, fy, cx, cy, cam_from_world, photo=photo)
 
 
 def _distortion(entry: Entry) -> Distortion | None:
     """The distortion, None for a pinhole."""
     model = entry.get("camera_model", text, PINHOLES[0])
-    if model in AROUND:
+    if model in PANORAMAS:
         raise entry.place.error(f"its camera_model is {model}, which has no focal length")
-    k = {key: entry.get(key, number, 0.0) for key in DISTORTION}
+    k = {key: entry.get(key, number, 0.0) for key in COEFFICIENTS}
     listed = entry.fields.get("distortion_params") or []
     entry.place.expect(isinstance(listed, list), "distortion_params", "a list of numbers", listed)
     others = [number(value, entry.place, "distortion_params") for value in listed]
@@ -242,11 +217,6 @@ def _distortion(entry: Entry) -> Distortion | None:
         return Distortion(model if model == FISHEYE else "fisheye", None if any(others) else angular, fisheye=True)
     if model in PINHOLES and not any(others) and not any(k.values()):
         return None
-    known = model in PINHOLES and not any(others) and not k["k4"]
+    supported = model in PINHOLES and not any(others) and not k["k4"]
     radial = tuple(k[key] for key in ("k1", "k2", "p1", "p2", "k3"))  # in OpenCV's order
-    return Distortion(model, radial if known else None)
-
-
-def _has_alpha(photo: Path) -> bool:
-    header = read_start(photo, PNG_COLOUR_TYPE + 1)
-    return header.startswith(PNG) and header[PNG_COLOUR_TYPE:] in [bytes([t]) for t in PNG_ALPHA]
+    return Distortion(model, radial if supported else None)

@@ -14,20 +14,20 @@ from os import PathLike
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-from aaplug.core.choices import SpzAxes
-from aaplug.core.errors import FormatError, OutputError, UsageError
-from aaplug.core.gaussians import Convention, Gaussians
-from aaplug.core.registry import Registry, named
+from aaplug.core.conventions import Convention
+from aaplug.core.gaussians import Gaussians
+from aaplug.core.pyramids import Pyramid
+from aaplug.io import SpzAxes
 from aaplug.io.atomic import check_output
 from aaplug.io.scenes import compressed_ply, ksplat, ply, pt, sog, splat, spz
-from aaplug.io.scenes.manifests import is_pyramid, path_of, read_manifest
 from aaplug.io.scenes.options import Options
-from aaplug.io.scenes.scene_file import SceneFile
+from aaplug.io.scenes.pyramid_folder import is_pyramid, path_of, read_manifest, read_pyramid
+from aaplug.io.scenes.scene_file import MODEL_SCENE, SOG_FOLDER, Scene
 from aaplug.io.values import read_start
+from aaplug.system.errors import FormatError, OutputError, UsageError
+from aaplug.system.registry import Registry, named
 
 HEAD_BYTES = 64  # of a file, passed to each format's `sniff`
-MODEL_SCENE = "point_cloud/iteration_*/point_cloud.ply"  # in an INRIA model folder
-SOG_FOLDER = "meta.json"  # marks a folder of SOG images
 
 
 @runtime_checkable
@@ -41,8 +41,8 @@ class SceneFormat(Protocol):
         """Whether a file that begins with `head` is of this format.  Never raises."""
         ...
 
-    def open_scene(self, path: Path, options: Options) -> SceneFile:
-        """Read what the file says about the scene; Gaussians are loaded when `SceneFile.load` is called.
+    def open_scene(self, path: Path, options: Options) -> Scene:
+        """Read what the file says about the scene; rows are read when `Scene.load` is called.
 
         Raises FormatError if the file breaks its format.
         """
@@ -66,26 +66,39 @@ class WritableFormat(SceneFormat, Protocol):
 
 # the first that accepts a file is used
 OWN: tuple[SceneFormat, ...] = (compressed_ply, ply, spz, sog, pt, splat, ksplat)
-SCENE_FORMATS = Registry[SceneFormat]("scene format", named(OWN), lambda f: isinstance(f, SceneFormat))
+SCENE_FORMATS = Registry[SceneFormat]("scene format", "aaplug.io.scenes:SceneFormat", named(OWN))
+SceneLike = Scene | Gaussians | Pyramid | str | PathLike[str]
 
 
-def open_scene(
+def scene_of(scene: SceneLike) -> Scene:
+    """The scene itself, that of Gaussians in memory, or that of a path as `read_scene` opens it."""
+    if isinstance(scene, Scene):
+        return scene
+    return Scene.in_memory(scene) if isinstance(scene, Gaussians | Pyramid) else read_scene(scene)
+
+
+def read_scene(
     path: str | PathLike[str],
     *,
     iteration: int | None = None,
     convention: Convention | None = None,
+    drop_bad: bool = False,
     allow_checkpoint: bool = False,
     spz_axes: SpzAxes = "auto",
-) -> SceneFile:
-    """Open a scene without reading its Gaussians.
+) -> Scene:
+    """Open a scene: a file, or a folder of an INRIA model, of SOG images or of levels of detail.
+
+    Its Gaussians are read when they are first asked for: `read_scene("scene.ply").gaussians()`.
 
     Args:
-        path: a scene file, an INRIA model folder, a folder of SOG images or of levels of detail; see `find_scene`.
+        path: see `find_scene`.
         iteration: which iteration of a model folder; None for the last.
         convention: how the scene was trained, if the file does not say or is wrong.
+        drop_bad: leave out Gaussians with NaN, infinite or unusable values and log a warning with their number;
+            without it they are an error when they are read.
         allow_checkpoint: open a .pt too, a pickle, of which only tensors are read.
         spz_axes: of a .spz: "opengl" by its specification, "opencv" as splat-transform and gsply write them; "auto" is
-            the first, with the second as `SceneFile.other`.
+            the first, with the second as `Scene.other`.
 
     Raises:
         FormatError: the file is missing, of no known format, or breaks its format.
@@ -97,41 +110,18 @@ def open_scene(
     if not head:
         raise FormatError(path, "is empty")
     formats = sorted(SCENE_FORMATS.values(), key=OWN.__contains__)  # plug-ins first
-    for format in formats:
-        if format.sniff(path, head):
-            file = format.open_scene(path, options)
-            if folder is not None:
-                file = replace(file, pyramid=folder, notes=(*file.notes, read_manifest(folder).described))
-            return file if convention is None else _stated(file, convention)
-    known = ", ".join("." + format.name for format in formats)
-    raise FormatError(path, f"is of no known scene format; aaplug reads {known}")
-
-
-def _stated(file: SceneFile, convention: Convention) -> SceneFile:
-    """The file with the convention that the user states."""
-    other = file.other and _stated(file.other, convention)
-    return replace(file, convention=convention, evidence="stated by the user", other=other)
-
-
-def read_scene(
-    path: str | PathLike[str],
-    *,
-    iteration: int | None = None,
-    convention: Convention | None = None,
-    drop_bad: bool = False,
-    allow_checkpoint: bool = False,
-    spz_axes: SpzAxes = "auto",
-) -> Gaussians:
-    """Read a scene.
-
-    drop_bad: leave out Gaussians with NaN, infinite or unusable values and log a warning with their number; without it
-    they are an error.  Other arguments: see `open_scene`.
-
-    Raises:
-        FormatError: the file is missing, of no known format, breaks its format, or is too large for this machine.
-    """
-    how = {"allow_checkpoint": allow_checkpoint, "spz_axes": spz_axes}
-    return open_scene(path, iteration=iteration, convention=convention, **how).whole(drop_bad)
+    format = next((format for format in formats if format.sniff(path, head)), None)
+    if format is None:
+        known = ", ".join("." + format.name for format in formats)
+        raise FormatError(path, f"is of no known scene format; aaplug reads {known}")
+    scene = replace(format.open_scene(path, options), drop_bad=drop_bad)
+    if folder is not None:
+        notes = (*scene.notes, read_manifest(folder).described)
+        scene = replace(scene, folder=folder, read_levels=read_pyramid, notes=notes)
+    if convention is None:
+        return replace(scene, other=scene.other and replace(scene.other, drop_bad=drop_bad))
+    stated = {"convention": convention, "evidence": "stated by the user"}
+    return replace(scene, **stated, other=scene.other and replace(scene.other, **stated, drop_bad=drop_bad))
 
 
 def write_scene(
@@ -192,17 +182,6 @@ def check_scene_output(
     return writer
 
 
-def bytes_of(path: str | PathLike[str]) -> int | None:
-    """Size of a scene's file; of levels of detail or SOG images, of their folder's files.  None if it is gone."""
-    path = Path(path)
-    folder = path.parent if path.name == SOG_FOLDER else path
-    files = [file for file in folder.iterdir() if file.is_file()] if folder.is_dir() else [path]
-    try:
-        return sum(file.stat().st_size for file in files)
-    except OSError:
-        return None
-
-
 def find_scene(path: str | PathLike[str], iteration: int | None = None) -> Path:
     """The scene file that a path means.
 
@@ -225,11 +204,3 @@ def find_scene(path: str | PathLike[str], iteration: int | None = None) -> Path:
     if chosen not in scenes:
         raise FormatError(path, f"has no iteration {chosen}; it has {', '.join(map(str, sorted(scenes)))}")
     return scenes[chosen]
-
-
-def called(path: Path) -> str:
-    """What people call the scene of a file or pyramid: its name, or that of its folder if its format names the file."""
-    whole = path.resolve()
-    if whole.match(MODEL_SCENE):
-        return whole.parents[2].name
-    return whole.parent.name if whole.name == SOG_FOLDER else whole.name

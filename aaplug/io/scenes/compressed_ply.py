@@ -6,6 +6,7 @@ largest component, 3 × 10 for the others), packed_color (4 bytes).  Element "sh
 The header's comments say how the scene was trained, as in a plain .ply.
 """
 
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -14,7 +15,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.errors import FormatError
 from aaplug.core.gaussians import Gaussians
 from aaplug.io.scenes.options import Options
 from aaplug.io.scenes.packed import byte_opacities, floats, largest_last
@@ -22,20 +22,21 @@ from aaplug.io.scenes.ply_document import Table, stamp_of
 from aaplug.io.scenes.ply_header import LITTLE, Element, Header, check_size, is_packed, read_header
 from aaplug.io.scenes.ply_tags import meaning
 from aaplug.io.scenes.scene_file import DEGREES, SceneFile, check_count, library_errors, sh_of_colour
+from aaplug.system.errors import FormatError
 
 WORDS = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 BOUNDS = [f"{end}_{axis}" for end in ("min", "max") for axis in ("x", "y", "z")]
 SCALE_BOUNDS = [f"{end}_scale_{axis}" for end in ("min", "max") for axis in ("x", "y", "z")]
 COLOUR_BOUNDS = [f"{end}_{c}" for end in ("min", "max") for c in ("r", "g", "b")]
 ELEVEN_TEN_ELEVEN = ((21, 11), (11, 10), (0, 11))
-PER_CHUNK = 256  # Gaussians
+CHUNK_LENGTH = 256  # Gaussians
 SH_SPAN = 8.0  # harmonics lie between -4 and 4
 
 name = "compressed.ply"
 
 
 def sniff(path: Path, head: bytes) -> bool:
-    """Whether this is a .ply with packed words."""
+    """True for a .ply with packed words."""
     return head.startswith((b"ply\n", b"ply\r")) and is_packed(path)
 
 
@@ -44,8 +45,11 @@ def open_scene(path: Path, options: Options) -> SceneFile:
     with library_errors(path):
         header = read_header(path)
         check_size(header, path.stat().st_size)
-        tables = _tables(path, header)
-        _check(header, tables)
+        _check(path, header)
+        stamp, tables = stamp_of(path), {}
+        for element in header.elements:
+            dtype = np.dtype([(p.name, "<" + p.code) for p in element.properties])
+            tables[element.name] = Table(path, header.start_of(element), element.count, dtype, stamp)
         said = meaning(header, compressed=True)
         bounds = tables["chunk"].read(0, tables["chunk"].count)
     sh = tables.get("sh")
@@ -54,44 +58,35 @@ def open_scene(path: Path, options: Options) -> SceneFile:
     return SceneFile(path, name, count, degree, load, said.evidence, said.convention, said.fused)
 
 
-def _tables(path: Path, header: Header) -> dict[str, Table]:
+def _check(path: Path, header: Header) -> None:
     if header.coding != LITTLE or any(e.lists for e in header.elements):
         raise FormatError(path, f"is a packed .ply, which should be {LITTLE} without lists")
-    tables, stamp = {}, stamp_of(path)
-    for element in header.elements:
-        dtype = np.dtype([(p.name, "<" + p.code) for p in element.properties])
-        tables[element.name] = Table(path, header.start_of(element), element.count, dtype, stamp)
-    return tables
-
-
-def _check(header: Header, tables: dict[str, Table]) -> None:
     elements = {e.name: e for e in header.elements}
-    count = header.vertex.count
-    check_count(Path(header.path), count)
-    _need(header, header.vertex, WORDS, "u4")
-    chunk = elements.get("chunk")
-    if chunk is None or chunk.count * PER_CHUNK < count:
-        raise FormatError(header.path, f"has {chunk.count if chunk else 0:,} chunks, too few for {count:,} Gaussians")
+    count, chunk = header.vertex.count, elements.get("chunk")
+    check_count(path, count)
+    _need(path, header.vertex, WORDS, "u4")
+    if chunk is None or chunk.count * CHUNK_LENGTH < count:
+        raise FormatError(path, f"has {chunk.count if chunk else 0:,} chunks, too few for {count:,} Gaussians")
     coloured = COLOUR_BOUNDS if COLOUR_BOUNDS[0] in chunk.names else []
-    _need(header, chunk, [*BOUNDS, *SCALE_BOUNDS, *coloured], "f4")
+    _need(path, chunk, [*BOUNDS, *SCALE_BOUNDS, *coloured], "f4")
     if sh := elements.get("sh"):
         rest = len(sh.properties)
         if sh.count != count or rest not in DEGREES:
-            raise FormatError(header.path, f"has {sh.count:,} rows of {rest} harmonics for {count:,} Gaussians")
-        _need(header, sh, [f"f_rest_{i}" for i in range(rest)], "u1")
+            raise FormatError(path, f"has {sh.count:,} rows of {rest} harmonics for {count:,} Gaussians")
+        _need(path, sh, [f"f_rest_{i}" for i in range(rest)], "u1")
 
 
-def _need(header: Header, element: Element, columns: list[str] | tuple[str, ...], code: str) -> None:
-    known = {p.name: p.code for p in element.properties}
-    missing = [c for c in columns if known.get(c) != code]
+def _need(path: Path, element: Element, columns: Sequence[str], code: str) -> None:
+    codes = {p.name: p.code for p in element.properties}
+    missing = [c for c in columns if codes.get(c) != code]
     if missing:
-        raise FormatError(header.path, f"element {element.name!r} needs {missing[0]} as {code}")
+        raise FormatError(path, f"element {element.name!r} needs {missing[0]} as {code}")
 
 
 def _rows(tables: dict[str, Table], bounds: np.ndarray, degree: int, start: int, stop: int) -> Gaussians:
     words = tables["vertex"].read(start, stop)
     rest = tables["sh"].read(start, stop) if degree else None
-    of_row = np.arange(start, stop) // PER_CHUNK
+    of_row = np.arange(start, stop) // CHUNK_LENGTH
     colour = words["packed_color"]
     rgb = _fractions(colour, (24, 8), (16, 8), (8, 8))
     if COLOUR_BOUNDS[0] in (bounds.dtype.names or ()):
@@ -118,8 +113,8 @@ def _between(
 
 def _fractions(words: np.ndarray, *fields: tuple[int, int]) -> Float[Tensor, "n c"]:
     """Fields of the words, each a place and a number of bits, as fractions of the largest value."""
-    most = [(shift, (1 << bits) - 1) for shift, bits in fields]
-    return torch.stack([floats(words >> shift & largest) / largest for shift, largest in most], dim=1)
+    masks = [(shift, (1 << bits) - 1) for shift, bits in fields]
+    return torch.stack([floats(words >> shift & mask) / mask for shift, mask in masks], dim=1)
 
 
 def _harmonic(values: np.ndarray) -> Float[Tensor, " n"]:

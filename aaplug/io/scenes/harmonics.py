@@ -10,7 +10,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from aaplug.core.gaussians import Gaussians, joined
-from aaplug.io.scenes.scene_file import FLOAT, SHAPE_NUMBERS, SceneFile
+from aaplug.io.scenes.scene_file import Scene
+
+MAX_HARMONICS_BYTES = 2 * 10**9  # reading more for each view costs less than holding them; 10 M Gaussians of degree 3
 
 
 @dataclass(frozen=True)
@@ -20,7 +22,7 @@ class FileHarmonics:
     rows: the file's row of each Gaussian, increasing.
     """
 
-    file: SceneFile
+    file: Scene
     rows: Int[Tensor, " n"]
 
     def __call__(self, start: int, stop: int) -> Float[Tensor, "c k 3"]:
@@ -31,13 +33,16 @@ class FileHarmonics:
         return harmonics if end - first == len(rows) else harmonics[rows - first]
 
 
-def without_harmonics(opened: SceneFile, drop_bad: bool = False) -> tuple[Gaussians, FileHarmonics]:
-    """The scene but for its harmonics, and what reads them.  `sh` has its shape but is NaN and takes no memory.
+def without_harmonics(scene: Scene) -> tuple[Gaussians, FileHarmonics | None]:
+    """The scene's Gaussians, and what reads their harmonics where these are large and stay in the file; else None.
 
-    All values are checked, the harmonics too, part by part; raises FormatError as `SceneFile.parts` and `whole`.
+    `sh` then has its shape but is NaN and takes no memory.  All values are checked, the harmonics too, part by part.
+    Only a .ply is read by rows.  Raises FormatError as `Scene.gaussians`.
     """
-    opened.check_memory(opened.count * FLOAT * SHAPE_NUMBERS)
-    scene = joined([replace(part, sh=torch.empty(len(part), 0, 3)) for part in opened.parts(drop_bad)])
-    assert scene.origin is not None
-    nothing = torch.full((1, (opened.sh_degree + 1) ** 2, 3), torch.nan)
-    return replace(scene, sh=nothing.expand(len(scene), -1, -1)), FileHarmonics(opened, scene.origin.rows)
+    if scene.path is None or scene.format != "ply" or scene.harmonics_bytes <= MAX_HARMONICS_BYTES:
+        return scene.gaussians(), None
+    scene.check_memory(harmonics=False)
+    bare = joined([replace(part, sh=torch.empty(len(part), 0, 3)) for part in scene.parts()])
+    assert bare.origin is not None
+    nothing = torch.full((1, (scene.sh_degree + 1) ** 2, 3), torch.nan)
+    return replace(bare, sh=nothing.expand(len(bare), -1, -1)), FileHarmonics(scene, bare.origin.rows)

@@ -13,22 +13,22 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from aaplug.core.errors import FormatError
-from aaplug.core.gaussians import Gaussians
+from aaplug.core.gaussians import Gaussians, joined
 from aaplug.io.scenes.options import Options
 from aaplug.io.scenes.packed import byte_opacities, floats
 from aaplug.io.scenes.scene_file import SceneFile, check_count, library_errors, sh_of_colour
 from aaplug.io.scenes.splat import EVIDENCE
+from aaplug.system.errors import FormatError
 
 # version, sections, Gaussians, level, smallest and largest harmonic
 MAIN = struct.Struct("<BBxxI8xIH14xff")
 MAIN_SIZE, SECTION_SIZE = 4096, 1024
 SECTION = struct.Struct("<IIIIfH2xI4xIIH")  # see Section
-FLOATS = ("<f4", "<f2", "<f2")  # of scales and quaternions, by level
-POSITIONS = ("<f4", "<u2", "<u2")
-HARMONICS = ("<f4", "<f2", "u1")
-RANGES = (1, 32767, 32767)  # of positions, if the section does not say
-SH_RANGE = (-1.5, 1.5)  # of harmonics in bytes, if the file does not say
+SHAPE_TYPES = ("<f4", "<f2", "<f2")  # of scales and quaternions, by level
+POSITION_TYPES = ("<f4", "<u2", "<u2")
+HARMONIC_TYPES = ("<f4", "<f2", "u1")
+POSITION_RANGES = (1, 32767, 32767)  # if the section does not say
+HARMONIC_RANGE = (-1.5, 1.5)  # of harmonics in bytes, if the file does not say
 MAX_DEGREE = 3
 
 name = "ksplat"
@@ -58,7 +58,7 @@ Records = tuple[Section, np.ndarray, np.ndarray]  # a section, its records, and 
 
 
 def sniff(path: Path, head: bytes) -> bool:
-    """Whether the suffix is .ksplat; the format has no magic number."""
+    """True for the suffix .ksplat; the format has no magic number."""
     return path.suffix.lower() == ".ksplat"
 
 
@@ -69,7 +69,9 @@ def open_scene(path: Path, options: Options) -> SceneFile:
         level, sh_range, sections = _sections(path, data)
         count = sum(section.count for section, *_ in sections)
         degree = max((section.degree for section, *_ in sections), default=0)
-        scene = _joined([_decoded(s, level, sh_range, degree) for s in sections], degree)
+        none = torch.zeros(0, 3)
+        empty = Gaussians(none, torch.zeros(0, 4), none, torch.zeros(0), torch.zeros(0, (degree + 1) ** 2, 3))
+        scene = joined([empty, *(_decoded(records, level, sh_range, degree) for records in sections)])
     notes = (f"compression level {level}",)
     return SceneFile(path, name, count, degree, lambda start, stop: scene[start:stop], EVIDENCE, notes=notes)
 
@@ -84,19 +86,22 @@ def _sections(path: Path, data: bytes) -> tuple[int, tuple[float, float], list[R
     at = MAIN_SIZE + number * SECTION_SIZE
     if at > len(data):
         raise FormatError(path, f"promises {number:,} sections, more than it can hold")
-    found = []
+    sections = []
     for index in range(number):
         section = Section(*SECTION.unpack_from(data, MAIN_SIZE + index * SECTION_SIZE))
         records, at = _records(path, data, at, section, level)
         if section.count:
-            found.append(records)
-    if sum(section.count for section, *_ in found) != count:
+            sections.append(records)
+    if sum(section.count for section, *_ in sections) != count:
         raise FormatError(path, f"promises {count:,} Gaussians, and its sections hold another number")
-    return level, (least or SH_RANGE[0], most or SH_RANGE[1]), found
+    return level, (least or HARMONIC_RANGE[0], most or HARMONIC_RANGE[1]), sections
 
 
 def _records(path: Path, data: bytes, at: int, section: Section, level: int) -> tuple[Records, int]:
-    record = _record(section.degree, level) if section.degree <= MAX_DEGREE else None
+    rest = 3 * ((section.degree + 1) ** 2 - 1)
+    shape, position, harmonic = SHAPE_TYPES[level], POSITION_TYPES[level], HARMONIC_TYPES[level]
+    fields = [("means", position, 3), ("scales", shape, 3), ("quats", shape, 4), ("rgba", "u1", 4)]
+    record = np.dtype([*fields, ("sh", harmonic, rest)]) if section.degree <= MAX_DEGREE else None
     sizes = 4 * section.partial
     start = at + sizes + section.bucket_size * section.buckets
     end = start + (record.itemsize * section.room if record else 0)
@@ -119,33 +124,19 @@ def _records(path: Path, data: bytes, at: int, section: Section, level: int) -> 
     return (section, rows, centres[bucket]), end
 
 
-def _record(degree: int, level: int) -> np.dtype:
-    rest = 3 * ((degree + 1) ** 2 - 1)
-    floating, position = FLOATS[level], POSITIONS[level]
-    shapes = [("means", position, 3), ("scales", floating, 3), ("quats", floating, 4), ("rgba", "u1", 4)]
-    return np.dtype([*shapes, ("sh", HARMONICS[level], rest)])
-
-
 def _decoded(records: Records, level: int, sh_range: tuple[float, float], degree: int) -> Gaussians:
     section, rows, centres = records
     means = rows["means"].astype(np.float64)
     if level:
-        steps = section.range or RANGES[level]
+        steps = section.range or POSITION_RANGES[level]
         means = (means - steps) * (section.block / 2 / steps) + centres
     sh = torch.zeros(len(rows), (degree + 1) ** 2, 3)
     sh[:, 0] = sh_of_colour(floats(rows["rgba"][:, :3]) / 255)
     rest = floats(rows["sh"])
-    if level == len(HARMONICS) - 1:
+    if level == len(HARMONIC_TYPES) - 1:
         rest = sh_range[0] + rest / 255 * (sh_range[1] - sh_range[0])
     for d in range(1, section.degree + 1):
         band = rest[:, 3 * (d * d - 1) : 3 * ((d + 1) ** 2 - 1)]
         sh[:, d * d : (d + 1) ** 2] = band.reshape(len(rows), 3, 2 * d + 1).transpose(1, 2)
     opacities = byte_opacities(rows["rgba"][:, 3])
     return Gaussians(floats(means), floats(rows["quats"]), floats(rows["scales"]).log(), opacities, sh)
-
-
-def _joined(scenes: list[Gaussians], degree: int) -> Gaussians:
-    none = [torch.zeros(0, *shape) for shape in ((3,), (4,), (3,), (), ((degree + 1) ** 2, 3))]
-    parts = [(s.means, s.quats, s.log_scales, s.logit_opacities, s.sh) for s in scenes]
-    means, quats, log_scales, logits, sh = (torch.cat(columns) for columns in zip(none, *parts, strict=True))
-    return Gaussians(means, quats, log_scales, logits, sh)

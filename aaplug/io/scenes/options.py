@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 from typing import get_args
 
-from aaplug.core.choices import SpzAxes
-from aaplug.core.errors import UsageError
+from aaplug.io import SpzAxes
+from aaplug.system.errors import UsageError
 
 
 @dataclass(frozen=True)
@@ -20,6 +20,6 @@ class Options:
     spz_axes: SpzAxes = "auto"
 
     def __post_init__(self) -> None:
-        known = get_args(SpzAxes)
-        if self.spz_axes not in known:
-            raise UsageError("spz_axes", f"should be {' or '.join(known)}, not {self.spz_axes!r}")
+        choices = get_args(SpzAxes)
+        if self.spz_axes not in choices:
+            raise UsageError("spz_axes", f"should be {' or '.join(choices)}, not {self.spz_axes!r}")

@@ -13,12 +13,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.errors import FormatError
 from aaplug.core.gaussians import Gaussians
 from aaplug.io.limits import limit
 from aaplug.io.scenes.scene_file import logit_of
+from aaplug.system.errors import FormatError
 
-BYTE = 255
+MAX_BYTE = 255
 
 
 def check_growth(path: Path, inflated: int, compressed: int) -> None:
@@ -38,7 +38,7 @@ def largest_last(rest: Float[Tensor, "n 3"], largest: Tensor) -> Float[Tensor, "
 
 def byte_opacities(alpha: np.ndarray) -> Float[Tensor, " n"]:
     """Logits of opacities stored as bytes."""
-    return logit_of(floats(alpha) / BYTE)
+    return logit_of(floats(alpha) / MAX_BYTE)
 
 
 def floats(values: np.ndarray) -> Tensor:

@@ -13,13 +13,11 @@ from dataclasses import replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 import torch
 
-from aaplug.core.errors import FormatError, OutputError, listing
-from aaplug.core.gaussians import Gaussians, PixelSizes
+from aaplug.core.gaussians import Gaussians
 from aaplug.io.atomic import replacing
 from aaplug.io.scenes.options import Options
 from aaplug.io.scenes.ply_document import Document, document_of, stamp_of
@@ -35,6 +33,7 @@ from aaplug.io.scenes.scene_file import (
     scene_of,
     sh_of_colour,
 )
+from aaplug.system.errors import FormatError, OutputError, listing
 
 REST = re.compile(r"f_rest_\d+")
 COLOURS = ("f_dc_0", "f_dc_1", "f_dc_2")
@@ -42,17 +41,17 @@ BYTE_COLOURS = ("red", "green", "blue")  # uchar
 SCALES = ("scale_0", "scale_1", "scale_2")
 REQUIRED = (*("x", "y", "z", *COLOURS, "opacity", *SCALES), *("rot_0", "rot_1", "rot_2", "rot_3"))
 NORMALS = ("nx", "ny", "nz")  # unused; 3DGS writes them, and some readers expect them
-SIZES = ("min_pixel_sizes", "max_pixel_sizes", "base_mask")  # of Multi-Scale 3DGS, of any type
-FLOATS = ("f4", "f8")
-CHUNK = 1 << 12  # rows converted at once: 1 MB, so that a column's stride stays within the cache
-BATCH = 1 << 16  # rows written at once: 16 MB
+EXTRAS = ("min_pixel_sizes", "max_pixel_sizes", "base_mask")  # of Multi-Scale 3DGS, of any type
+FLOAT_CODES = ("f4", "f8")
+ROWS_PER_CONVERSION = 1 << 12  # 1 MB, so that a column's stride stays within the cache
+ROWS_PER_WRITE = 1 << 16  # 16 MB
 
 name = "ply"
 needs = None
 
 
 def sniff(path: Path, head: bytes) -> bool:
-    """Whether this is a .ply file that is not packed, whether it holds a scene or not."""
+    """True for a .ply file that is not packed, even if it holds no scene."""
     return head.startswith((b"ply\n", b"ply\r")) and not is_packed(path)
 
 
@@ -67,10 +66,8 @@ def open_scene(path: Path, options: Options) -> SceneFile:
         said, note = meaning_in_run(header)
         document = document_of(path, header, stamp)
     degree = DEGREES[len(_rest(header))]
-    load, count = partial(_rows, document, degree, said.flat), header.vertex.count
-    return SceneFile(
-        path, name, count, degree, load, **vars(said), document=document, notes=(*notes, *([note] if note else ()))
-    )
+    load, notes = partial(_rows, document, degree, said.flat), (*notes, *([note] if note else ()))
+    return SceneFile(path, name, header.vertex.count, degree, load, **vars(said), document=document, notes=notes)
 
 
 def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: Options) -> None:
@@ -78,13 +75,14 @@ def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, o
     parts = iter(parts)
     first = next(parts)
     document = _document_of(first) or Document(_plain_header(first))
-    header = _updated(document.header, first, count, new=document.table is None)
+    header = _header(document, first, count)
     with replacing(path, overwrite) as stream:
         stream.write(header.content)
         document.copy(document.before, stream)
         start, written = stream.tell(), 0
         for part in chain([first], parts):
-            _write_rows(stream, header, part)
+            for at in range(0, len(part), ROWS_PER_WRITE):
+                stream.write(_records(header, part[at : at + ROWS_PER_WRITE]).tobytes())
             written += len(part)
         size = start + written * header.vertex.stride
         if stream.tell() != size:
@@ -103,36 +101,33 @@ def _rest(header: Header) -> list[str]:
 def _check_columns(header: Header) -> list[str]:
     """Check the columns; notes on unusual ones that are understood."""
     vertex = header.vertex
-    known = {p.name: p for p in vertex.properties}
+    columns = {p.name: p for p in vertex.properties}
     if vertex.lists:
         raise FormatError(header.path, f"vertex property {listing(vertex.lists)} is a list; a scene has numbers only")
-    coloured = all(c in known and known[c].code == "u1" for c in BYTE_COLOURS) and not known.keys() & {*COLOURS}
+    coloured = all(c in columns and columns[c].code == "u1" for c in BYTE_COLOURS) and not columns.keys() & {*COLOURS}
     optional = {*(COLOURS if coloured else ()), SCALES[2]}
-    missing = [c for c in REQUIRED if c not in known and c not in optional]
+    missing = [c for c in REQUIRED if c not in columns and c not in optional]
     if missing:
         lacks = f"vertex lacks {', '.join(missing)}, which a 3DGS .ply has"
         raise FormatError(header.path, f"{lacks}; is it a point cloud or a mesh?")
-    used = [p for p in known.values() if _is_parameter(p.name)]
-    wrong = [p.name for p in used if p.code not in FLOATS]
+    used = [p for p in vertex.properties if _is_parameter(p.name)]
+    wrong = [p.name for p in used if p.code not in FLOAT_CODES]
     if wrong:
         raise FormatError(header.path, f"{listing(wrong)} must be float; convert the file to float32")
-    _check_rest(header.path, _rest(header))
+    rest = _rest(header)
+    if len(rest) not in DEGREES:
+        raise FormatError(header.path, f"has {len(rest)} f_rest columns; degrees 0 to 4 have 0, 9, 24, 45 or 72")
+    gaps = [f"f_rest_{i}" for i in range(len(rest)) if f"f_rest_{i}" not in rest]
+    if gaps:
+        raise FormatError(header.path, f"has {len(rest)} f_rest columns, but not {listing(gaps)}")
     double = [p.name for p in used if p.code == "f8"]
     notes = {
         f"coding: {header.coding}": header.coding != LITTLE,
         f"{len(double)} columns of float64, used as float32": double,
-        "pixel sizes of Multi-Scale 3DGS, for the recipe multi-scale": all(c in known for c in SIZES),
+        "pixel sizes of Multi-Scale 3DGS, for the recipe multi-scale": all(c in columns for c in EXTRAS),
         "colours from the columns red, green, blue; no harmonics": coloured,
     }
     return [note for note, applies in notes.items() if applies]
-
-
-def _check_rest(path: str, rest: list[str]) -> None:
-    if len(rest) not in DEGREES:
-        raise FormatError(path, f"has {len(rest)} f_rest columns; degrees 0 to 4 have 0, 9, 24, 45 or 72")
-    gaps = [f"f_rest_{i}" for i in range(len(rest)) if f"f_rest_{i}" not in rest]
-    if gaps:
-        raise FormatError(path, f"has {len(rest)} f_rest columns, but not {listing(gaps)}")
 
 
 def _is_parameter(column: str) -> bool:
@@ -150,35 +145,20 @@ def _rows(document: Document, degree: int, flat: bool, start: int, stop: int) ->
     else:
         names = tuple(name for name in names if _is_parameter(name))
         values = torch.empty(len(rows), len(names))
-        for begin in range(0, len(rows), CHUNK):
-            part = slice(begin, begin + CHUNK)
+        for begin in range(0, len(rows), ROWS_PER_CONVERSION):
+            part = slice(begin, begin + ROWS_PER_CONVERSION)
             for i, column in enumerate(names):
                 values[part, i] = torch.from_numpy(rows[column][part].astype(np.float32))
     if COLOURS[0] not in names:
         colours = np.stack([rows[c].astype(np.float32) for c in BYTE_COLOURS], axis=1)
         harmonics = sh_of_colour(torch.from_numpy(colours) / np.iinfo(np.uint8).max)
         names, values = (*names, *COLOURS), torch.cat([values, harmonics], dim=1)
-    return replace(scene_of(names, values, degree, flat), pixel_sizes=_pixel_sizes(rows))
-
-
-def _pixel_sizes(rows: np.ndarray) -> PixelSizes | None:
-    """The columns of Multi-Scale 3DGS; writing keeps them like all columns that are not parameters."""
-    if not all(column in (rows.dtype.names or ()) for column in SIZES):
-        return None
-    smallest, largest, base = (torch.from_numpy(rows[c].astype(np.float32)) for c in SIZES)
-    return PixelSizes(smallest, largest, base > 0)
-
-
-def _sizes(scene: Gaussians) -> dict[str, np.ndarray]:
-    """The columns of Multi-Scale 3DGS, if the scene has its pixel sizes."""
-    sizes = scene.pixel_sizes
-    if sizes is None:
-        return {}
-    return {name: column.cpu().numpy() for name, column in zip(SIZES, vars(sizes).values(), strict=True)}
+    extras = {c: torch.from_numpy(rows[c].astype(np.float32)) for c in EXTRAS if c in (rows.dtype.names or ())}
+    return replace(scene_of(names, values, degree, flat), extras=extras)
 
 
 def _one_type(dtype: np.dtype) -> bool:
-    """Whether all columns are little-endian float32, so that the rows are a matrix."""
+    """True if all columns are little-endian float32, so that the rows are a matrix."""
     return all(dtype[i] == np.dtype("<f4") for i in range(len(dtype.names or ())))
 
 
@@ -190,30 +170,24 @@ def _plain_header(scene: Gaussians) -> Header:
     """The header that 3DGS writes, with its order of columns."""
     rest = [f"f_rest_{i}" for i in range(3 * (scene.sh.shape[1] - 1))]
     order = [*REQUIRED[:3], *NORMALS, *COLOURS, *rest, *REQUIRED[6:]]
-    known = (*NORMALS, *matrix_of(scene[:0])[0])
-    properties = [f"property float {c}" for c in (*(c for c in order if c in known), *_sizes(scene))]
+    columns = (*NORMALS, *matrix_of(scene[:0])[0])
+    properties = [f"property float {c}" for c in (*(c for c in order if c in columns), *scene.extras)]
     start = ["ply", f"format {LITTLE} 1.0", f"element vertex {len(scene)}"]
     return parse("scene", [*start, *properties, "end_header"], "\n")
 
 
-def _updated(old: Header, scene: Gaussians, count: int, new: bool) -> Header:
-    """The header for this scene: count, columns, convention and fusions."""
-    wanted, _ = matrix_of(scene[:0])
-    known = old.vertex.names
-    kept = SCALES[2] if scene.flat else None
-    dropped = [c for c in known if _is_parameter(c) and c not in wanted and c != kept]
-    added = [column for column in (*wanted, *_sizes(scene)) if column not in known]
-    header = old.little().with_vertex(count, dropped, added)
-    return stating(header, None if new else old, scene.convention, scene.fused)
+def _header(document: Document, scene: Gaussians, count: int) -> Header:
+    """The document's header for this scene: count, columns, convention and fusions."""
+    old, (wanted, _) = document.header, matrix_of(scene[:0])
+    spare = SCALES[2] if scene.flat else None
+    dropped = [c for c in old.vertex.names if _is_parameter(c) and c not in wanted and c != spare]
+    added = [column for column in (*wanted, *scene.extras) if column not in old.vertex.names]
+    read = None if document.table is None else old
+    return stating(old.rewritten(count, dropped, added), read, scene.convention, scene.fused)
 
 
 def _document_of(scene: Gaussians) -> Document | None:
     return scene.origin.document if scene.origin and scene.origin.format == name else None
-
-
-def _write_rows(stream: BinaryIO, header: Header, scene: Gaussians) -> None:
-    for start in range(0, len(scene), BATCH):
-        stream.write(_records(header, scene[start : start + BATCH]).tobytes())
 
 
 def _records(header: Header, scene: Gaussians) -> np.ndarray:
@@ -222,24 +196,24 @@ def _records(header: Header, scene: Gaussians) -> np.ndarray:
     In a column that is not float32, a value that is still what was read keeps the file's digits.
     """
     records = np.zeros(len(scene), np.dtype([(p.name, "<" + p.code) for p in header.vertex.properties]))
-    known, matrix = matrix_of(scene)
+    parameters, matrix = matrix_of(scene)
     values = matrix.detach().cpu().numpy()
     assert not np.isnan(values).any(), "a parameter is NaN"
-    names, at_once, sizes = header.vertex.names, _one_type(records.dtype), _sizes(scene)
+    names, at_once = header.vertex.names, _one_type(records.dtype)
     if at_once:
-        _matrix(records)[:, [names.index(column) for column in known]] = values
+        _matrix(records)[:, [names.index(column) for column in parameters]] = values
     old, document = None, _document_of(scene)
-    if document and document.table and scene.origin and not (at_once and set(names) == set(known)):
+    if document and document.table and scene.origin and not (at_once and set(names) == set(parameters)):
         old = document.table.take(scene.origin.rows.cpu())
     for p in header.vertex.properties:
         was = old[p.name] if old is not None and p.name in (old.dtype.names or ()) else None
-        if p.name in known and not at_once:
-            new = values[:, known.index(p.name)]
+        if p.name in parameters and not at_once:
+            new = values[:, parameters.index(p.name)]
             if was is not None and p.code != "f4":
                 new = np.where(was.astype(np.float32) == new, was, new)
             records[p.name] = new
-        elif p.name not in known and was is not None:
+        elif p.name not in parameters and was is not None:
             records[p.name] = was
-        elif p.name in sizes:
-            records[p.name] = sizes[p.name]
+        elif p.name in scene.extras:
+            records[p.name] = scene.extras[p.name].cpu().numpy()
     return records

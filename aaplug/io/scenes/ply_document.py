@@ -16,15 +16,15 @@ import numpy as np
 from plyfile import PlyData, PlyElement
 from torch import Tensor
 
-from aaplug.core.errors import FormatError
 from aaplug.io.scenes.ply_header import BIG, LITTLE, TEXT, Header
 from aaplug.io.scenes.scene_file import read_rows
+from aaplug.system.errors import FormatError
 
-SPARSE = 16  # rows spread over more than this many times their number are read one by one
-BLOCK = 1 << 20  # bytes copied at once
+MAX_SPREAD = 16  # rows spread over more than this many times their number are read one by one
+BLOCK_SIZE = 1 << 20  # bytes copied at once
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Table:
     """The Gaussians' rows in a file, or in memory if they had to be parsed.
 
@@ -36,12 +36,12 @@ class Table:
     count: int
     dtype: np.dtype
     stamp: tuple[int, int]
-    held: np.ndarray | None = None
+    parsed: np.ndarray | None = None
 
     def read(self, start: int, stop: int) -> np.ndarray:
         """The rows from start up to stop."""
-        if self.held is not None:
-            return self.held[start:stop]
+        if self.parsed is not None:
+            return self.parsed[start:stop]
         self._check_unchanged()
         return read_rows(self.path, self.dtype, start, stop, self.offset)
 
@@ -50,7 +50,7 @@ class Table:
         if len(rows) == 0:
             return np.empty(0, self.dtype)
         first, last = int(rows.min()), int(rows.max())
-        if self.held is None and last - first > SPARSE * len(rows):
+        if self.parsed is None and last - first > MAX_SPREAD * len(rows):
             self._check_unchanged()
             table = np.memmap(self.path, self.dtype, "r", self.offset, (self.count,))
             return np.array(table[rows.numpy()])
@@ -84,7 +84,7 @@ class Document:
         assert self.table is not None
         with self.table.path.open("rb") as source:
             source.seek(start)
-            while start < stop and (data := source.read(min(BLOCK, stop - start))):
+            while start < stop and (data := source.read(min(BLOCK_SIZE, stop - start))):
                 stream.write(data)
                 start += len(data)
 
@@ -113,8 +113,7 @@ def document_of(path: Path, header: Header, stamp: tuple[int, int]) -> Document:
         offset = int(getattr(data, "offset", offset))
         return _located(header, Table(path, offset, table.count, dtype, stamp))
     before, after = (_little(part) for part in (elements[:at], elements[at + 1 :]))
-    held = Table(path, 0, len(data), data.dtype, stamp, np.asarray(data))
-    return Document(header, held, before, after)
+    return Document(header, Table(path, 0, len(data), data.dtype, stamp, np.asarray(data)), before, after)
 
 
 def _located(header: Header, table: Table) -> Document:

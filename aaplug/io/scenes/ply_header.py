@@ -14,14 +14,14 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from aaplug.core.errors import SHOWN, FormatError
 from aaplug.io.limits import whole_limit
 from aaplug.io.values import read_start
+from aaplug.system.errors import MAX_VALUE_CHARACTERS, FormatError
 
 MAX_COUNT_DIGITS = 18  # still an int64
-BYTES = "latin-1"  # one character per byte
+ENCODING = "latin-1"  # one character per byte
 LITTLE, BIG, TEXT = "binary_little_endian", "binary_big_endian", "ascii"
-LEAST_TEXT = 2  # bytes of a value in text: a digit and a separator
+MIN_TEXT_SIZE = 2  # bytes of a value in text: a digit and a separator
 PACKED = re.compile(rb"property\s+uint\w*\s+packed_position")  # in a .compressed.ply
 CODES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
@@ -88,11 +88,11 @@ class Header:
     @cached_property
     def content(self) -> bytes:
         """The lines with their ends."""
-        return _content(self.lines, self.newline)
+        return "".join(line + self.newline for line in self.lines).encode(ENCODING)
 
     @property
     def plain(self) -> bool:
-        """Whether plyfile can read it: all ASCII, no empty lines."""
+        """True if plyfile can read it: all ASCII, no empty lines."""
         return self.content.isascii() and len(self.content) == self.size
 
     @property
@@ -103,10 +103,10 @@ class Header:
     @property
     def vertex(self) -> Element:
         """The table of Gaussians."""
-        found = [element for element in self.elements if element.name == "vertex"]
-        if not found:
-            raise FormatError(self.path, "has no element 'vertex'; is it a Gaussian splatting scene?")
-        return found[0]
+        for element in self.elements:
+            if element.name == "vertex":
+                return element
+        raise FormatError(self.path, "has no element 'vertex'; is it a Gaussian splatting scene?")
 
     def start_of(self, element: Element) -> int:
         """Where a table begins in the file, if the tables before it have no lists."""
@@ -114,8 +114,8 @@ class Header:
 
     def without_comments(self, unwanted: Callable[[str], object]) -> "Header":
         """The header without the comments for which `unwanted` is true."""
-        kept = (x for x in self.lines if _keyword(x) != "comment" or not unwanted(_comment(x)))
-        return parse(self.path, kept, self.newline)
+        lines = (x for x in self.lines if _keyword(x) != "comment" or not unwanted(_comment(x)))
+        return parse(self.path, lines, self.newline)
 
     def with_comments(self, comments: Iterable[str]) -> "Header":
         """The header with comments added before the first element."""
@@ -123,20 +123,14 @@ class Header:
         added = [f"comment {comment}" for comment in comments]
         return parse(self.path, [*self.lines[:first], *added, *self.lines[first:]], self.newline)
 
-    def little(self) -> "Header":
-        """The header of the same tables in little-endian binary."""
-        words = f"format {LITTLE} 1.0"
-        lines = (words if _keyword(line) == "format" else line for line in self.lines)
-        return parse(self.path, lines, self.newline)
-
     def with_padded_count(self, count: int) -> "Header":
         """The header with fewer vertices and the same size: spaces replace lost digits."""
         old = str(self.vertex.count)
         lines = (re.sub(rf"^(\s*element\s+vertex\s+){old}", rf"\g<1>{count:>{len(old)}}", x) for x in self.lines)
         return parse(self.path, lines, self.newline)
 
-    def with_vertex(self, count: int, dropped: Collection[str], added: Iterable[str]) -> "Header":
-        """The header with `count` vertices, without the columns `dropped`, with float columns `added` at the end."""
+    def rewritten(self, count: int, dropped: Collection[str], added: Iterable[str]) -> "Header":
+        """The header of a little-endian file with `count` vertices, without some columns, with others (float) added."""
         lines: list[str] = []
         inside = False
         for line in self.lines:
@@ -146,6 +140,8 @@ class Header:
             if words[:1] == ["element"]:
                 inside = words[1] == "vertex"
                 line = re.sub(r"(vertex\s+)\d+", rf"\g<1>{count}", line) if inside else line
+            if words[:1] == ["format"]:
+                line = f"format {LITTLE} 1.0"
             if not (inside and words[:1] == ["property"] and words[-1] in dropped):
                 lines.append(line)
         return parse(self.path, lines, self.newline)
@@ -167,12 +163,12 @@ def read_header(path: Path) -> Header:
     lines = (head[:end] + last).split(newline)
     if len(lines) > most_lines:
         raise FormatError(path, f"the header has {len(lines)} lines, more than the {most_lines} allowed")
-    decoded = (line.decode(BYTES) for line in lines if line)
+    decoded = (line.decode(ENCODING) for line in lines if line)
     return parse(str(path), decoded, newline.decode(), end + len(last + newline))
 
 
 def is_packed(path: Path) -> bool:
-    """Whether a .ply's header declares the packed words of a .compressed.ply.  Never raises."""
+    """True if a .ply's header declares the packed words of a .compressed.ply.  Never raises."""
     try:
         start = read_start(path, whole_limit("HEADER"))
     except FormatError:
@@ -183,23 +179,26 @@ def is_packed(path: Path) -> bool:
 def parse(path: str, lines: Iterable[str], newline: str, size: int | None = None) -> Header:
     """Parse a header's lines; `size` is that of the header in its file."""
     lines = tuple(lines)
-    elements: list[Element] = []
+    tables: list[tuple[str, int, list[Property]]] = []
     formats: list[list[str]] = []
     for number, line in enumerate(lines[1:-1], start=2):
         match line.split():
             case ["comment" | "obj_info", *_] | []:
                 pass
             case _ if not line.isascii():
-                raise FormatError(path, f"line {number} of the header is not ASCII: {line[:SHOWN]!r}")
+                raise FormatError(path, f"line {number} of the header is not ASCII: {line[:MAX_VALUE_CHARACTERS]!r}")
             case ["format", *words]:
                 formats.append(words)
             case ["element", name, count]:
-                elements.append(Element(name, _count(path, name, count)))
-            case ["property", *words] if elements and (column := _property(words)):
-                grown = (*elements[-1].properties, column)
-                elements[-1] = Element(elements[-1].name, elements[-1].count, grown)
+                if not re.fullmatch(r"\d+", count, re.ASCII) or len(count) > MAX_COUNT_DIGITS:
+                    raise FormatError(path, f"element {name!r} has the impossible count {count[:SHOWN]!r}")
+                tables.append((name, int(count), []))
+            case ["property", kind, name] if tables and kind in CODES:
+                tables[-1][2].append(Property(name, CODES[kind]))
+            case ["property", "list", length, kind, name] if tables and length in CODES and kind in CODES:
+                tables[-1][2].append(Property(name, CODES[kind], CODES[length]))
             case _:
-                raise FormatError(path, f"line {number} of the header is not PLY: {line[:SHOWN]!r}")
+                raise FormatError(path, f"line {number} of the header is not PLY: {line[:MAX_VALUE_CHARACTERS]!r}")
     coding = _coding(path, formats)
     _check_unique(path, elements)
     size = len(_content(lines, newline)) if size is None else size
@@ -209,7 +208,7 @@ def parse(path: str, lines: Iterable[str], newline: str, size: int | None = None
 def check_size(header: Header, actual: int) -> None:
     """Compare the file's size with what the header promises, before anything is allocated."""
     if header.coding == TEXT:
-        least = header.size + sum(e.count * len(e.properties) * LEAST_TEXT for e in header.elements)
+        least = header.size + sum(e.count * len(e.properties) * MIN_TEXT_SIZE for e in header.elements)
         if actual < least - 1:  # the last line may lack its line end
             need = f"the values that its header promises need {least:,} bytes at least"
             raise FormatError(header.path, f"is cut short: {need}, and it has {actual:,}")
@@ -240,7 +239,7 @@ def _content(lines: Iterable[str], newline: str) -> bytes:
 
 def _count(path: str, name: str, count: str) -> int:
     if not re.fullmatch(r"\d+", count, re.ASCII) or len(count) > MAX_COUNT_DIGITS:
-        raise FormatError(path, f"element {name!r} has the impossible count {count[:SHOWN]!r}")
+        raise FormatError(path, f"element {name!r} has the impossible count {count[:MAX_VALUE_CHARACTERS]!r}")
     return int(count)
 
 
@@ -256,7 +255,7 @@ def _coding(path: str, formats: list[list[str]]) -> str:
     for coding in (LITTLE, BIG, TEXT):
         if formats == [[coding, "1.0"]]:
             return coding
-    found = " and ".join(" ".join(words)[:SHOWN] for words in formats) or "none"
+    found = " and ".join(" ".join(words)[:MAX_VALUE_CHARACTERS] for words in formats) or "none"
     raise FormatError(path, f"its format is {found}; known are {LITTLE}, {BIG} and {TEXT}, each 1.0")
 
 

@@ -16,16 +16,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from aaplug.core.errors import FormatError
-from aaplug.core.gaussians import CLASSIC, Gaussians
+from aaplug.core.conventions import CLASSIC
+from aaplug.core.gaussians import Gaussians
 from aaplug.io.limits import whole_limit
 from aaplug.io.scenes.options import Options
 from aaplug.io.scenes.scene_file import DEGREES, SceneFile, check_count, library_errors
 from aaplug.io.scenes.training_config import gsplat_config
+from aaplug.system.errors import FormatError
 
 SAFE_TORCH = (2, 10)  # the first release without CVE-2026-24747
 SUFFIXES = (".pt", ".pth", ".ckpt")
-ZIP = b"PK\x03\x04"
 SHAPES = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (), "sh0": (1, 3)}
 UNKNOWN = CLASSIC, "neither the format nor a cfg.yml in the folder above says: assumed classic"
 
@@ -33,7 +33,7 @@ name = "pt"
 
 
 def sniff(path: Path, head: bytes) -> bool:
-    """Whether the suffix is a checkpoint's."""
+    """True for the suffix of a checkpoint."""
     return path.suffix.lower() in SUFFIXES
 
 
@@ -42,13 +42,18 @@ def open_scene(path: Path, options: Options) -> SceneFile:
     if not options.allow_checkpoint:
         what = "is a training checkpoint (a pickle)"
         raise FormatError(path, f"{what}; pass `allow_checkpoint` to read it, or export it as .ply")
-    found = re.match(r"(\d+)\.(\d+)", torch.__version__)
-    if found is None or (int(found[1]), int(found[2])) < SAFE_TORCH:
+    version = re.match(r"(\d+)\.(\d+)", torch.__version__)
+    if version is None or (int(version[1]), int(version[2])) < SAFE_TORCH:
         raise FormatError(path, f"needs torch 2.10 or newer to be read safely; this is {torch.__version__}")
     with library_errors(path):
         size = path.stat().st_size
         _check_archive(path, size)
-        splats = _splats(path, _load(path))
+        try:
+            with warnings.catch_warnings(action="ignore"):  # torch's, about a damaged pickle
+                document = torch.load(path, "cpu", weights_only=True, mmap=True)
+        except pickle.UnpicklingError as error:  # torch's own words advise loading everything else too
+            raise FormatError(path, "is damaged, or holds more than tensors; nothing of it was run") from error
+        splats = _splats(path, document)
     count = len(splats["means"])
     check_count(path, count)
     for key, tensor in splats.items():
@@ -68,39 +73,26 @@ def _check_archive(path: Path, size: int) -> None:
         raise FormatError(path, "has compressed members, which torch does not write")
 
 
-def _load(path: Path) -> Any:
-    """Tensors and plain containers of them.  torch's own error would advise loading everything else too."""
-    try:
-        with warnings.catch_warnings(action="ignore"):  # torch's, about a damaged pickle
-            return torch.load(path, "cpu", weights_only=True, mmap=True)
-    except pickle.UnpicklingError as error:
-        raise FormatError(path, "is damaged, or holds more than tensors; nothing of it was run") from error
-
-
 def _splats(path: Path, document: Any) -> dict[str, Tensor]:
+    """The tensors by gsplat's names.  A tensor can be a mere description, sparse, nested, quantized or a scalar."""
     splats = document.get("splats", document) if isinstance(document, dict) else None
     if not isinstance(splats, dict) or not all(isinstance(splats.get(k), Tensor) for k in SHAPES):
         raise FormatError(path, f"holds no splats with {', '.join(SHAPES)}, as gsplat writes them")
     rest = splats.get("shN")
-    found = {**{key: splats[key] for key in SHAPES}, **({} if rest is None else {"shN": rest})}
-    for key, tensor in found.items():
-        if not (isinstance(tensor, Tensor) and _holds_numbers(tensor)):
+    tensors = {**{key: splats[key] for key in SHAPES}, **({} if rest is None else {"shN": rest})}
+    for key, value in tensors.items():
+        dense = isinstance(value, Tensor) and value.layout == torch.strided
+        plain = dense and not value.is_nested and not value.is_quantized and value.device.type == "cpu"
+        if not plain or value.ndim == 0:
             raise FormatError(path, f"{key} should be a tensor with a row for each Gaussian, on the CPU")
-    return {"shN": torch.zeros(len(found["means"]), 0, 3), **found}
-
-
-def _holds_numbers(tensor: Tensor) -> bool:
-    """Whether it has rows of numbers: a tensor can be a mere description, sparse, nested, quantized or a scalar."""
-    plain = tensor.layout == torch.strided and not tensor.is_nested and not tensor.is_quantized
-    return plain and tensor.device.type == "cpu" and tensor.ndim > 0
+    return {"shN": torch.zeros(len(tensors["means"]), 0, 3), **tensors}
 
 
 def _check(path: Path, key: str, tensor: Tensor, count: int, size: int) -> None:
-    if key in SHAPES:
-        fits = tensor.shape[1:] == SHAPES[key]
-    else:
-        fits = tensor.ndim == 3 and tensor.shape[2] == 3 and 3 * tensor.shape[1] in DEGREES
-    if not (fits and tensor.is_floating_point() and len(tensor) == count):
+    right = tensor.shape[1:] == SHAPES.get(key)
+    if key == "shN":
+        right = tensor.ndim == 3 and tensor.shape[2] == 3 and 3 * tensor.shape[1] in DEGREES
+    if not (right and tensor.is_floating_point() and len(tensor) == count):
         raise FormatError(path, f"{key} is {tensor.dtype} of shape {list(tensor.shape)}, for {count:,} Gaussians")
     if tensor.numel() * tensor.element_size() > size:
         raise FormatError(path, f"{key} has {tensor.numel():,} values, more than the file holds")

@@ -7,7 +7,7 @@ A format decodes rows; this module checks their values, reports unusable ones, a
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +16,19 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from aaplug.core.errors import AaplugError, FormatError, listing, reason
-from aaplug.core.gaussians import CLASSIC, MAX_LOG_SCALE, MIN_OPACITY, MIP, Convention, Fusion, Gaussians, Origin
+from aaplug.core.cameras import CameraSet
+from aaplug.core.conventions import CLASSIC, MIP, Convention
+from aaplug.core.gaussians import MAX_LOG_SCALE, MIN_OPACITY, Fusion, Gaussians, Origin, digest_of_scene, joined
+from aaplug.core.pyramids import Pyramid
 from aaplug.core.spherical_harmonics import COLOUR_OFFSET, SH_C0
+from aaplug.io.cameras import holds_cameras, read_cameras
 from aaplug.io.limits import lack_of_memory, whole_limit
+from aaplug.system.errors import AaplugError, FormatError, listing, reason
 
+MODEL_SCENE = "point_cloud/iteration_*/point_cloud.ply"  # in an INRIA model folder
+SOG_FOLDER = "meta.json"  # marks a folder of SOG images
 SHORTEST_QUATERNION = 1e-12  # torch's `normalize` does not normalize a shorter one
+PROBES = 512  # evenly spaced places in the file, from which the frame check samples
 PART = 1 << 16  # Gaussians per part: 15 MB at degree 3
 FLOAT = 4  # bytes
 HUGE_LOG_SCALE = 20.0  # half a billion units
@@ -38,20 +45,22 @@ DEGREES = {3 * ((d + 1) ** 2 - 1): d for d in range(5)}  # SH degree by number o
 log = logging.getLogger("aaplug")
 
 
-@dataclass(frozen=True)
-class SceneFile:
-    """An opened scene file.
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A scene: an opened file or folder, or Gaussians in memory.  It compares by identity.
 
-    load: decodes the rows from start up to stop exactly as stored, without convention and origin.
+    path: its file; None in memory.
+    load: returns the rows from start up to stop exactly as stored; a file's without convention and origin.
     evidence: the convention's source in the file.
-    document: what the format's writer needs to give everything back.
+    document: the file's other contents, which its format's writer needs to give everything back.
     flat: see `Gaussians`.
     notes: facts worth printing about how the file was understood, a line each.
     other: the same file read in another way, where it does not say which is right; its last note says how.
-    pyramid: the folder of levels of detail whose finest level this is; else None.
+    folder: of the levels of detail whose finest this is; else None.  read_levels: reads all of them.
+    drop_bad: rows that cannot be used are left out, instead of raising FormatError.
     """
 
-    path: Path
+    path: Path | None
     format: str
     count: int
     sh_degree: int
@@ -62,64 +71,191 @@ class SceneFile:
     flat: bool = False
     document: Any = None
     notes: tuple[str, ...] = ()
-    other: "SceneFile | None" = None
-    pyramid: Path | None = None
+    other: "Scene | None" = None
+    folder: Path | None = None
+    read_levels: Callable[[Path], Pyramid] | None = None
+    drop_bad: bool = False
+    _memory: dict[str, Any] = field(default_factory=dict, init=False, repr=False)  # Gaussians and levels, once read
+
+    @classmethod
+    def in_memory(cls, held: Gaussians | Pyramid) -> "Scene":
+        """The scene of Gaussians, or of all levels of detail."""
+        finest, levels = (held.finest, held) if isinstance(held, Pyramid) else (held, None)
+        origin = finest.origin
+        scene = cls(
+            path=None,
+            format="levels" if levels is not None else "" if origin is None else origin.format,
+            count=len(finest),
+            sh_degree=finest.sh_degree,
+            load=lambda start, stop: finest[start:stop],
+            evidence="" if origin is None else origin.evidence,
+            convention=finest.convention,
+            fused=finest.fused,
+            flat=finest.flat,
+            document=None if origin is None else origin.document,
+        )
+        scene._memory.update(gaussians=finest, levels=levels)
+        return scene
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Copies hold the rows: what reads a file does not leave its process."""
+        rows = self.raw(0, self.count)
+        return {**vars(self), "load": _Rows(rows), "other": None}
+
+    @property
+    def name(self) -> str:
+        """For messages: the file, or "scene"."""
+        return str(self.path) if self.path is not None else self._memory["gaussians"].name
+
+    @property
+    def title(self) -> str:
+        """The name that people use: the file's, or its folder's where its format names the file; or "scene"."""
+        if self.file is None:
+            return "scene"
+        if self.file.match(MODEL_SCENE):
+            return self.file.parents[2].name
+        return self.file.parent.name if self.file.name == SOG_FOLDER else self.file.name
+
+    @property
+    def file(self) -> Path | None:
+        """The file that it was read from, or its folder of levels of detail; None if it has none."""
+        path = self.folder or self._source
+        return None if path is None else path.resolve()
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """Files that outputs must not replace."""
+        return () if self._source is None else (self._source,)
+
+    @property
+    def _source(self) -> Path | None:
+        origin = None if self.path is not None else self._memory["gaussians"].origin
+        return self.path if origin is None else Path(origin.path)
+
+    @property
+    def bytes(self) -> int | None:
+        """Size of the file; of levels of detail or SOG images, of their folder's files.  None if there is none."""
+        if self.file is None:
+            return None
+        folder = self.file.parent if self.file.name == SOG_FOLDER else self.file
+        try:
+            files = [file for file in folder.iterdir() if file.is_file()] if folder.is_dir() else [self.file]
+            return sum(file.stat().st_size for file in files)
+        except OSError:
+            return None
+
+    @property
+    def camera_folder(self) -> Path | None:
+        """The scene's folder, or the model folder that its file is in, if that holds cameras."""
+        path = self.folder or self._source
+        if path is None:
+            return None
+        folder = path.parents[2] if path.match(MODEL_SCENE) else path
+        return folder if folder.is_dir() and holds_cameras(folder) else None
+
+    @property
+    def cameras(self) -> CameraSet | None:
+        """The cameras of `camera_folder`; None if there are none.  Raises as `read_cameras`."""
+        return None if self.camera_folder is None else read_cameras(self.camera_folder)
+
+    @property
+    def levels(self) -> Pyramid | None:
+        """All levels of detail, read once; None if there is but one.  Raises FormatError if a level is broken."""
+        if "levels" not in self._memory:
+            self._memory["levels"] = self.folder and self.read_levels and self.read_levels(self.folder)
+        return self._memory["levels"]
+
+    def gaussians(self) -> Gaussians:
+        """All Gaussians, read once; of levels of detail the finest.
+
+        Raises:
+            FormatError: a row cannot be used and `drop_bad` is false, the file breaks its format, or it takes more
+                than the limit MEMORY_SHARE of the machine's memory.
+        """
+        if "gaussians" not in self._memory:
+            self.check_memory()
+            [self._memory["gaussians"]] = self.parts(max(1, self.count))
+        return self._memory["gaussians"]
+
+    @property
+    def digest(self) -> str:
+        """Hash of the Gaussians of all levels, with everything that they are drawn by."""
+        return digest_of_scene(self.gaussians() if self.levels is None else self.levels.scene)
 
     def raw(self, start: int, stop: int) -> Gaussians:
         """The rows from start up to stop, with convention and origin; their values are not checked."""
+        if self.path is None:
+            return self.load(start, stop)
         origin = Origin(str(self.path), self.format, self.evidence, self.document, torch.arange(start, stop))
         with library_errors(self.path):
             rows = self.load(start, stop)
-        said = {"convention": self.convention, "fused": self.fused, "flat": self.flat}
-        return replace(rows, **said, origin=origin)
+        facts = {"convention": self.convention, "fused": self.fused, "flat": self.flat}
+        return replace(rows, **facts, origin=origin)
 
-    def parts(
-        self, drop_bad: bool = False, size: int = PART, found: dict[str, int] | None = None
-    ) -> Iterator[Gaussians]:
+    def parts(self, size: int = PART, faults: dict[str, int] | None = None) -> Iterator[Gaussians]:
         """The scene part by part, at least one, checked.
 
         size: Gaussians per part.
-        found: receives the faults of rows that are left out and their numbers; None logs them.
-        A row that cannot be used raises FormatError if `drop_bad` is false.
+        faults: receives the faults of rows that are left out and their numbers, and leaves out such rows; None logs
+            the number of rows that `drop_bad` leaves out.
+
+        Raises:
+            FormatError: a row cannot be used, and neither `drop_bad` nor `faults` asks to leave it out.
         """
-        dropped: dict[str, int] = {} if found is None else found
+        dropped: dict[str, int] = {} if faults is None else faults
         left_out, doubts = 0, dict[str, int]()
         for start in range(0, max(self.count, 1), size):
             part = self.raw(start, min(start + size, self.count))
-            bad = _check(part, self.path, drop_bad, dropped)
+            if self.path is None:
+                yield part
+                continue
+            bad = _check(part, self.path, self.drop_bad or faults is not None, dropped)
             left_out += 0 if bad is None else int(bad.sum())
             part = part if bad is None else part[~bad]
             for text, number in doubts_of(part).items():
                 doubts[text] = doubts.get(text, 0) + number
             yield part
         for text, number in doubts.items():
-            log.warning("%s: %d of %d Gaussians have %s", self.path, number, self.count, text)
-        if left_out and found is None:
+            log.warning("%s: %d of %d Gaussians have %s", self.name, number, self.count, text)
+        if left_out and faults is None:
             counts = listing([f"{text}: {number:,}" for text, number in dropped.items()])
-            log.warning("%s: left out %d of %d Gaussians (%s)", self.path, left_out, self.count, counts)
+            log.warning("%s: left out %d of %d Gaussians (%s)", self.name, left_out, self.count, counts)
 
-    def whole(self, drop_bad: bool = False) -> Gaussians:
-        """The whole scene; raises FormatError as `parts`, and above the limit MEMORY_SHARE of the machine's memory."""
-        self.check_memory(self.count * FLOAT * SHAPE_NUMBERS + self.harmonics_bytes)
-        (scene,) = self.parts(drop_bad, max(1, self.count))
-        return scene
+    def decoded(self) -> "Scene":
+        """This reading alone, its rows decoded once and kept; raises FormatError as `gaussians`."""
+        self.check_memory()
+        return replace(self, load=_Rows(self.raw(0, self.count)), other=None)
 
-    def held(self) -> "SceneFile":
-        """The same file, its rows decoded once and kept, and this reading alone; raises FormatError as `whole`."""
-        self.check_memory(self.count * FLOAT * SHAPE_NUMBERS + self.harmonics_bytes)
-        rows = self.raw(0, self.count)
-        return replace(self, load=lambda start, stop: rows[start:stop], other=None)
+    def sample(self, each: int) -> Gaussians:
+        """Usable Gaussians from evenly spaced places, `each` at a place: enough to know where the scene is."""
+        some = joined([self.raw(rows.start, rows.stop) for rows in probes(self.count, each)] or [self.raw(0, 0)])
+        finite = [column.flatten(1 if column.ndim > 1 else 0).isfinite() for column in some.columns.values()]
+        return some[torch.stack([f if f.ndim == 1 else f.all(dim=1) for f in finite]).all(dim=0)]
 
     @property
     def harmonics_bytes(self) -> int:
-        """What the harmonics take in memory."""
+        """Bytes that the harmonics take in memory."""
         return self.count * FLOAT * 3 * (self.sh_degree + 1) ** 2
 
-    def check_memory(self, needed: int) -> None:
-        """Refuse a scene that takes more bytes than the limit MEMORY_SHARE of the machine's memory."""
+    def check_memory(self, harmonics: bool = True) -> None:
+        """Refuse a scene above the limit MEMORY_SHARE of the machine's memory, with or without harmonics."""
+        needed = self.count * FLOAT * SHAPE_NUMBERS + self.harmonics_bytes * harmonics
         if lacking := lack_of_memory(needed):
             hint = "info and convert read it in parts, AAPLUG_MEMORY_SHARE=1 allows all"
-            raise FormatError(self.path, f"its {self.count:,} Gaussians take {lacking}; {hint}")
+            raise FormatError(self.name, f"its {self.count:,} Gaussians take {lacking}; {hint}")
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """Reads rows of Gaussians in memory."""
+
+    rows: Gaussians
+
+    def __call__(self, start: int, stop: int) -> Gaussians:
+        return self.rows[start:stop]
+
+
+SceneFile = Scene
 
 
 @contextmanager
@@ -267,3 +403,9 @@ def _check(part: Gaussians, path: Path, drop_bad: bool, dropped: dict[str, int])
     for text, rows in faults.items():
         dropped[text] = dropped.get(text, 0) + int(rows.sum())
     return torch.stack(list(faults.values())).any(dim=0)
+
+
+def probes(count: int, each: int) -> list[range]:
+    """Rows at evenly spaced places of a file of so many, `each` at a place: few enough to read before the work."""
+    step = max(each, count // PROBES)
+    return [range(start, min(start + each, count)) for start in range(0, count, step)]

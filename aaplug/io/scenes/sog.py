@@ -23,20 +23,22 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from aaplug.core.errors import FormatError
-from aaplug.core.gaussians import CLASSIC, MAX_LOG_SCALE, Convention, Gaussians
+from aaplug.core.conventions import CLASSIC, Convention
+from aaplug.core.gaussians import MAX_LOG_SCALE, Gaussians
 from aaplug.io.limits import whole_limit
 from aaplug.io.scenes.options import Options
 from aaplug.io.scenes.packed import byte_opacities, check_growth, floats, largest_last
 from aaplug.io.scenes.scene_file import COMPENSATED, KERNEL_LOST, SceneFile, check_count, library_errors
 from aaplug.io.values import Entry, number, object_of, parse_json, read_bounded
+from aaplug.system.errors import FormatError
 
 META = "meta.json"
-FILE = re.compile(r"[\w\-][\w\-.]{0,99}", re.ASCII)
-ZIP = b"PK\x03\x04"
+FILE_NAME = re.compile(r"[\w\-][\w\-.]{0,99}", re.ASCII)
+ZIP_SIGNATURE = b"PK\x03\x04"
 PALETTE_ROW = 64  # entries
-LARGEST = 252  # alpha of a quaternion whose w is largest; 253 to 255 stand for x, y, z
-IMAGE_MEMORY = 4  # bytes per pixel
+MAX_PALETTE_PIXELS = PALETTE_ROW * 15 * (1 << 10)  # 64 entries of 15 coefficients in each of 1024 rows
+W_LARGEST = 252  # alpha of a quaternion whose w is largest; 253 to 255 stand for x, y, z
+BYTES_PER_PIXEL = 4
 SPARE_PIXELS = 1 << 16  # pixels allowed beyond twice the number of Gaussians
 
 name = "sog"
@@ -44,7 +46,7 @@ name = "sog"
 Fetch = Callable[[str, int], bytes]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Part:
     """An entry of meta.json, with its images as RGBA, a row per pixel, and the width of the first."""
 
@@ -57,19 +59,14 @@ class Part:
         low, high = (self.entry.vector(key, channels).float() for key in ("mins", "maxs"))
         return torch.lerp(low, high, floats(self.pixels[0][rows, :channels]) / 255)
 
-    def coded(self, rows: slice) -> Float[Tensor, "n 3"]:
+    def coded(self, pixels: np.ndarray) -> Float[Tensor, "*n 3"]:
         """Version 2: bytes as indices into the codebook."""
-        return self.codebook[torch.from_numpy(self.pixels[0][rows, :3].astype(np.int64))]
-
-    @property
-    def codebook(self) -> Float[Tensor, " 256"]:
-        """The values of the 256 bytes."""
-        return self.entry.vector("codebook", 256).float()
+        return self.entry.vector("codebook", 256).float()[torch.from_numpy(pixels.astype(np.int64))]
 
 
 def sniff(path: Path, head: bytes) -> bool:
-    """Whether it is a meta.json, or a zip with the suffix .sog or .zip."""
-    zipped = head.startswith(ZIP) and path.suffix.lower() in (".sog", ".zip")
+    """True for a meta.json, and for a zip with the suffix .sog or .zip."""
+    zipped = head.startswith(ZIP_SIGNATURE) and path.suffix.lower() in (".sog", ".zip")
     return zipped or (path.name == META and head.lstrip().startswith(b"{"))
 
 
@@ -78,10 +75,10 @@ def open_scene(path: Path, options: Options) -> SceneFile:
     with library_errors(path):
         if path.name == META:
             meta = parse_json(read_bounded(path, whole_limit("JSON")), path)
-            return _scene(path, meta, lambda file, most: _from_folder(path, file, most))
+            return _scene(path, meta, partial(_from_folder, path))
         with zipfile.ZipFile(path) as archive:
             meta = parse_json(_from_zip(path, archive, META, whole_limit("JSON")), path)
-            return _scene(path, meta, lambda file, most: _from_zip(path, archive, file, most))
+            return _scene(path, meta, partial(_from_zip, path, archive))
 
 
 def _from_folder(path: Path, file: str, most: int) -> bytes:
@@ -105,9 +102,12 @@ def _from_zip(path: Path, archive: zipfile.ZipFile, file: str, most: int) -> byt
 def _scene(path: Path, meta: Any, fetch: Fetch) -> SceneFile:
     root = object_of(meta, path, META, "means, scales, quats and sh0")
     version = root.fields.get("version", 1)
-    right = version in (1, 2) and (version == 2) == ("version" in meta)
-    root.place.expect(right, "version", "2, or left out", version)
-    count = _count(root, version)
+    root.place.expect(version in (1, 2) and (version == 2) == ("version" in meta), "version", "2, or left out", version)
+    value = root.get("count", number) if version > 1 else root.entry("means").fields.get("shape", [0])
+    value = value[0] if isinstance(value, list) and value else value
+    if not isinstance(value, int | float) or value < 0 or value != int(value):
+        raise root.place.wrong("count", "a whole number", value)
+    count = int(value)
     check_count(path, count)
     used = [key for key in ("means", "quats", "scales", "sh0", "shN") if meta.get(key)]
     parts = {key: _part(path, root, key, count, fetch) for key in used}
@@ -121,14 +121,6 @@ def _scene(path: Path, meta: Any, fetch: Fetch) -> SceneFile:
     return SceneFile(path, name, count, degree, load, evidence, convention, flat=flat, notes=notes)
 
 
-def _count(root: Entry, version: int) -> int:
-    value = root.get("count", number) if version > 1 else root.entry("means").fields.get("shape", [0])
-    count = value[0] if isinstance(value, list) and value else value
-    if not isinstance(count, int | float) or count < 0 or count != int(count):
-        raise root.place.wrong("count", "a whole number", count)
-    return int(count)
-
-
 def _part(path: Path, root: Entry, key: str, count: int, fetch: Fetch) -> Part:
     entry = root.entry(key)
     files = entry.value("files")
@@ -136,8 +128,8 @@ def _part(path: Path, root: Entry, key: str, count: int, fetch: Fetch) -> Part:
     entry.place.expect(isinstance(files, list) and len(files) == wanted, "files", f"{wanted} names", files)
     images = []
     for index, file in enumerate(files):
-        right = isinstance(file, str) and bool(FILE.fullmatch(file))
-        entry.place.expect(right, "files", "names of plain files beside meta.json", file)
+        plain = isinstance(file, str) and bool(FILE_NAME.fullmatch(file))
+        entry.place.expect(plain, "files", "names of plain files beside meta.json", file)
         palette = key == "shN" and index == 0
         noisy = key == "means" and index == 0  # low bytes do not compress: the size tells the count
         images.append(_image(path, file, fetch, None if palette else count, noisy))
@@ -146,10 +138,10 @@ def _part(path: Path, root: Entry, key: str, count: int, fetch: Fetch) -> Part:
 
 def _image(path: Path, file: str, fetch: Fetch, count: int | None, noisy: bool) -> tuple[np.ndarray, int]:
     """RGBA of a lossless WebP, a row per pixel, and its width; refuses more pixels than `count` Gaussians need."""
-    most = 2 * count + SPARE_PIXELS if count is not None else PALETTE_ROW * 15 * (1 << 10)
-    data = fetch(file, IMAGE_MEMORY * most + whole_limit("SLACK"))
+    most = 2 * count + SPARE_PIXELS if count is not None else MAX_PALETTE_PIXELS
+    data = fetch(file, BYTES_PER_PIXEL * most + whole_limit("SLACK"))
     if noisy:
-        check_growth(path, IMAGE_MEMORY * (count or 0), len(data))
+        check_growth(path, BYTES_PER_PIXEL * (count or 0), len(data))
     # Pillow warns about large images; the check below is stricter
     with warnings.catch_warnings(action="ignore"), Image.open(io.BytesIO(data), formats=["WEBP"]) as image:
         width, height = image.size
@@ -177,7 +169,7 @@ def _palette(part: Part, version: int) -> Float[Tensor, "p c 3"]:
         raise part.entry.place.error(f"the palette's image is {part.width} px wide; 192, 512 or 960 expected")
     pixels = part.pixels[0][:, :3].reshape(-1, coefficients, 3)
     if version > 1:
-        return part.codebook[torch.from_numpy(pixels.astype(np.int64))]
+        return part.coded(pixels)
     low, high = (part.entry.get(key, number) for key in ("mins", "maxs"))
     return floats(pixels) / 255 * (high - low) + low
 
@@ -189,14 +181,20 @@ def _rows(
     means, quats, scales, sh0 = (parts[key] for key in ("means", "quats", "scales", "sh0"))
     alpha = sh0.pixels[0][rows, 3]
     if version > 1:
-        log_scales, colours, logits = scales.coded(rows), sh0.coded(rows), byte_opacities(alpha)
+        log_scales, colours, logits = (
+            scales.coded(scales.pixels[0][rows, :3]),
+            sh0.coded(sh0.pixels[0][rows, :3]),
+            byte_opacities(alpha),
+        )
     else:
         log_scales, both = scales.between(3, rows), sh0.between(4, rows)
         colours, logits = both[:, :3], both[:, 3]
     sh = torch.zeros(len(alpha), 1 + palette.shape[1], 3)
     sh[:, 0] = colours
     if "shN" in parts:
-        sh[:, 1:] = _chosen(parts["shN"], palette, rows)
+        labels = parts["shN"].pixels[1][rows].astype(np.int64)
+        index = torch.from_numpy(labels[:, 0] + 256 * labels[:, 1])
+        sh[:, 1:] = palette[index.clamp(max=len(palette) - 1)] * (index < len(palette))[:, None, None]
     if flat:
         log_scales[:, 2] = -MAX_LOG_SCALE
     return Gaussians(_means(means, rows), _quats(quats.pixels[0][rows]), log_scales, logits, sh)
@@ -212,14 +210,7 @@ def _means(part: Part, rows: slice) -> Float[Tensor, "n 3"]:
 
 def _quats(pixels: np.ndarray) -> Float[Tensor, "n 4"]:
     rest = (floats(pixels[:, :3]) / 255 - 0.5) * 2**0.5
-    known = torch.from_numpy(pixels[:, 3] >= LARGEST)
-    largest = torch.from_numpy(pixels[:, 3].astype(np.int64)) - LARGEST
+    valid = torch.from_numpy(pixels[:, 3] >= W_LARGEST)
+    largest = torch.from_numpy(pixels[:, 3].astype(np.int64)) - W_LARGEST
     quats = largest_last(rest, largest.clamp(min=0))
-    return torch.where(known[:, None], quats, torch.tensor([1.0, 0.0, 0.0, 0.0]))
-
-
-def _chosen(part: Part, palette: Float[Tensor, "p c 3"], rows: slice) -> Float[Tensor, "n c 3"]:
-    labels = part.pixels[1][rows].astype(np.int64)
-    index = torch.from_numpy(labels[:, 0] + 256 * labels[:, 1])
-    chosen = palette[index.clamp(max=len(palette) - 1)]
-    return chosen * (index < len(palette))[:, None, None]
+    return torch.where(valid[:, None], quats, torch.tensor([1.0, 0.0, 0.0, 0.0]))

@@ -10,16 +10,16 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from aaplug.core.errors import FormatError
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.spherical_harmonics import COLOUR_OFFSET, SH_C0
 from aaplug.io.atomic import replacing
 from aaplug.io.scenes.options import Options
 from aaplug.io.scenes.packed import byte_opacities, floats
 from aaplug.io.scenes.scene_file import SceneFile, check_count, library_errors, read_rows, sh_of_colour
+from aaplug.system.errors import FormatError
 
 RECORD = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
-ZERO = 128  # the byte that stands for a quaternion component of 0
+ZERO_BYTE = 128  # the byte that stands for a quaternion component of 0
 EVIDENCE = "the format does not say: assumed classic (3DGS default)"
 
 name = "splat"
@@ -27,7 +27,7 @@ needs = None
 
 
 def sniff(path: Path, head: bytes) -> bool:
-    """Whether the suffix is .splat."""
+    """True for the suffix .splat."""
     return path.suffix.lower() == ".splat"
 
 
@@ -52,7 +52,7 @@ def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, o
 def _rows(path: Path, start: int, stop: int) -> Gaussians:
     records = read_rows(path, RECORD, start, stop)
     rgba = records["rgba"]
-    means, quats = floats(records["means"]), (floats(records["quats"]) - ZERO) / ZERO
+    means, quats = floats(records["means"]), (floats(records["quats"]) - ZERO_BYTE) / ZERO_BYTE
     sh = sh_of_colour(floats(rgba[:, :3]) / 255)[:, None]
     return Gaussians(means, quats, floats(records["scales"]).log(), byte_opacities(rgba[:, 3]), sh)
 
@@ -64,5 +64,5 @@ def _records(scene: Gaussians) -> np.ndarray:
     records["means"] = scene.means.numpy()
     records["scales"] = scene.scales.numpy()
     records["rgba"] = (rgba.clamp(0, 1) * 255).round().numpy()
-    records["quats"] = (scene.unit_quats * ZERO + ZERO).round().clamp(0, 255).numpy()
+    records["quats"] = (scene.unit_quats * ZERO_BYTE + ZERO_BYTE).round().clamp(0, 255).numpy()
     return records

@@ -26,38 +26,41 @@ import zstandard
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.choices import SpzAxes
-from aaplug.core.errors import FormatError, OutputError
-from aaplug.core.gaussians import CLASSIC, Gaussians
-from aaplug.core.locks import scratch
+from aaplug.core.conventions import CLASSIC
+from aaplug.core.gaussians import Gaussians
+from aaplug.io import SpzAxes
 from aaplug.io.atomic import replacing
 from aaplug.io.limits import whole_limit
 from aaplug.io.scenes.options import Options
 from aaplug.io.scenes.packed import byte_opacities, check_growth, floats, half_turn_about_x, largest_last
 from aaplug.io.scenes.scene_file import COMPENSATED, KERNEL_LOST, SceneFile, check_count, library_errors
+from aaplug.system.errors import FormatError, OutputError
+from aaplug.system.locks import scratch
 
 MAGIC = b"NGSP"
-GZIP = b"\x1f\x8b"
+GZIP_SIGNATURE = b"\x1f\x8b"
 GZIP_WINDOW = 31  # zlib's code for a gzip stream with the largest window
 MAX_WINDOW = 1 << 27  # bytes: zstd's own maximum
 HEADER = struct.Struct("<4sIIBBBB")  # magic, version, count, degree, fraction bits, flags, reserved
 HEADER_4 = struct.Struct("<4sIIBBBBI12x")  # the reserved byte counts streams; then the table's place
 STREAM = struct.Struct("<QQ")  # compressed and decompressed size
-HALVES, FIXED, THREES, STREAMS = 1, 2, 3, 4  # versions, by what each introduced
+FIRST_VERSION = 1  # positions are float16
+WORD_QUATERNIONS_VERSION = 3  # quaternions are words: the smallest three components, 10 bits each
+STREAMS_VERSION = 4  # a zstd stream per section; the last version
 MAX_DEGREE = 4
 MAX_FRACTION = 24  # bits of a position
 COLOUR_GAIN = 0.15  # stored colour over the harmonic of degree 0
-SCALE_STEPS, SCALE_LEAST = 16.0, -10.0  # log-scales: steps per unit, and the smallest
-MAGNITUDE = 511  # 9 bits of a quaternion's component; the tenth is its sign
-WRITTEN = 3  # version
-MOST_GAUSSIANS = 10_000_000  # accepted by readers of versions before 4 (nianticlabs/spz)
-MOST_DEGREE = 3  # of harmonics that gsply writes
+SCALE_STEPS, MIN_LOG_SCALE = 16.0, -10.0  # log-scales: steps per unit, and the smallest
+MAGNITUDE_MASK = 511  # 9 bits of a quaternion's component; the tenth is its sign
+WRITTEN_VERSION = 3
+MAX_WRITTEN_GAUSSIANS = 10_000_000  # accepted by readers of versions before 4 (nianticlabs/spz)
+MAX_WRITTEN_DEGREE = 3  # of harmonics that gsply writes
+MAX_WRITTEN_FRACTION = 20  # bits: a millionth of a unit
 POSITION_BITS = 23  # of a position's fixed-point number, beside its sign
-MOST_FRACTION = 20  # bits: a millionth of a unit
-FLAGS = 14  # byte of the header
+FLAGS_BYTE = 14  # place in the header
 ANTIALIASED_FLAG = 1
 MAX_LOGIT = 30.0  # in float32 its opacity is 1
-# between the axes of the file and OpenCV's, in both directions
+# TURNS lead from the axes of the file to OpenCV's, and back.
 TURNS: Mapping[str, Callable[[Gaussians], Gaussians]] = {"opengl": half_turn_about_x, "opencv": lambda scene: scene}
 AXES_NOTES = {
     "opengl": "axes turned from OpenGL's to OpenCV's, by the specification "
@@ -82,14 +85,14 @@ class Header:
     @property
     def widths(self) -> tuple[int, ...]:
         """Bytes per Gaussian in each section: positions, opacities, colours, scales, quaternions, harmonics."""
-        position = 6 if self.version == HALVES else 9
-        quaternion = 4 if self.version >= THREES else 3
+        position = 6 if self.version == FIRST_VERSION else 9
+        quaternion = 4 if self.version >= WORD_QUATERNIONS_VERSION else 3
         return position, 1, 3, 3, quaternion, 3 * ((self.degree + 1) ** 2 - 1)
 
 
 def sniff(path: Path, head: bytes) -> bool:
-    """Whether the file begins with the magic, or is a gzip stream with the suffix .spz."""
-    return head.startswith(MAGIC) or (head.startswith(GZIP) and path.suffix.lower() == ".spz")
+    """True for a file that begins with the magic, and for a gzip stream with the suffix .spz."""
+    return head.startswith(MAGIC) or (head.startswith(GZIP_SIGNATURE) and path.suffix.lower() == ".spz")
 
 
 def open_scene(path: Path, options: Options) -> SceneFile:
@@ -111,10 +114,12 @@ def open_scene(path: Path, options: Options) -> SceneFile:
 
 def _sections(path: Path) -> tuple[Header, list[np.ndarray]]:
     data = path.read_bytes()
-    zipped = data.startswith(GZIP)
-    header = _header(path, _gunzip(data, HEADER.size) if zipped else data[: HEADER.size])
+    zipped = data.startswith(GZIP_SIGNATURE)
+    header = _header(
+        path, zlib.decompressobj(GZIP_WINDOW).decompress(data, HEADER.size) if zipped else data[: HEADER.size]
+    )
     sizes = [width * header.count for width in header.widths]
-    if header.version >= STREAMS:
+    if header.version >= STREAMS_VERSION:
         if zipped:
             raise FormatError(path, f"version {header.version} should not be one gzip stream")
         parts: Iterable[bytes] = _streams(path, data, sizes)
@@ -129,8 +134,8 @@ def _header(path: Path, data: bytes) -> Header:
     if len(data) < HEADER.size or not data.startswith(MAGIC):
         raise FormatError(path, "is not an .spz: its header is missing")
     _, version, count, degree, fraction, flags, _ = HEADER.unpack(data)
-    if not HALVES <= version <= STREAMS:
-        raise FormatError(path, f"is .spz of version {version}; known are 1 to {STREAMS}")
+    if not FIRST_VERSION <= version <= STREAMS_VERSION:
+        raise FormatError(path, f"is .spz of version {version}; known are 1 to {STREAMS_VERSION}")
     if degree > MAX_DEGREE or fraction > MAX_FRACTION:
         raise FormatError(path, f"has the impossible SH degree {degree} or {fraction} bits of fraction")
     check_count(path, count)
@@ -141,7 +146,8 @@ def _payload(path: Path, data: bytes, size: int, zipped: bool) -> bytes:
     whole = HEADER.size + size
     if zipped:
         check_growth(path, whole, len(data))
-        inflated = _gunzip(data, whole + (slack := whole_limit("SLACK")) + 1)
+        slack = whole_limit("SLACK")
+        inflated = zlib.decompressobj(GZIP_WINDOW).decompress(data, whole + slack + 1)
         if not whole <= len(inflated) <= whole + slack:  # a few bytes more are accepted
             many = "more than " * (len(inflated) > whole + slack)
             raise FormatError(path, f"inflates to {many}{len(inflated):,} bytes where its header promises {whole:,}")
@@ -171,21 +177,13 @@ def _streams(path: Path, data: bytes, sizes: list[int]) -> Iterable[bytes]:
         if inflated != size or at + compressed > len(data):
             what = f"lists a stream of {compressed:,} bytes for {inflated:,}"
             raise FormatError(path, f"{what}; {size:,} expected, and {len(data) - at:,} bytes are left")
-        yield _unzstd(data[at : at + compressed], size, path)
+        decompressor = zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW)
+        with decompressor.stream_reader(io.BytesIO(data[at : at + compressed])) as stream:
+            section = stream.read(size + 1)
+        if len(section) != size:
+            raise FormatError(path, f"a stream inflates to {len(section):,} bytes where {size:,} are promised")
+        yield section
         at += compressed
-
-
-def _gunzip(data: bytes, size: int) -> bytes:
-    """The first bytes of a gzip stream, or all if it has fewer."""
-    return zlib.decompressobj(GZIP_WINDOW).decompress(data, size)
-
-
-def _unzstd(data: bytes, size: int, path: Path) -> bytes:
-    with zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW).stream_reader(io.BytesIO(data)) as stream:
-        inflated = stream.read(size + 1)
-    if len(inflated) != size:
-        raise FormatError(path, f"a stream inflates to {len(inflated):,} bytes where {size:,} are promised")
-    return inflated
 
 
 def _rows(
@@ -196,14 +194,16 @@ def _rows(
     sh = torch.zeros(n, k, 3)
     sh[:, 0] = (floats(colours) / 255 - 0.5) / COLOUR_GAIN
     sh[:, 1:] = (floats(harmonics.reshape(n, k - 1, 3)) - 128) / 128
-    # before version 3: x, y, z; w follows and is not negative
-    unit = _threes(quats) if header.version >= THREES else largest_last(floats(quats) / 127.5 - 1, torch.zeros(n))
-    log_scales = floats(scales) / SCALE_STEPS + SCALE_LEAST
+    if header.version >= WORD_QUATERNIONS_VERSION:
+        unit = _threes(quats)
+    else:  # x, y, z; w follows and is not negative
+        unit = largest_last(floats(quats) / 127.5 - 1, torch.zeros(n))
+    log_scales = floats(scales) / SCALE_STEPS + MIN_LOG_SCALE
     return turn(Gaussians(_positions(header, positions), unit, log_scales, byte_opacities(alphas[:, 0]), sh))
 
 
 def _positions(header: Header, data: np.ndarray) -> Float[Tensor, "n 3"]:
-    if header.version == HALVES:
+    if header.version == FIRST_VERSION:
         return floats(np.ascontiguousarray(data).view("<f2"))
     low, middle, high = (data[:, i::3].astype(np.int32) for i in range(3))
     fixed = low | middle << 8 | high.astype(np.uint8).view(np.int8).astype(np.int32) << 16
@@ -214,8 +214,8 @@ def _threes(data: np.ndarray) -> Float[Tensor, "n 4"]:
     """2 bits for the index of the largest component (xyzw), then 10 bits for each of the others."""
     words = np.ascontiguousarray(data).view("<u4")[:, 0].astype(np.int64)
     fields = [(words >> shift) & 1023 for shift in (20, 10, 0)]
-    parts = [(f & MAGNITUDE) * np.where(f > MAGNITUDE, -1, 1) for f in fields]
-    rest = floats(np.stack(parts, axis=1)) / MAGNITUDE / 2**0.5
+    parts = [(f & MAGNITUDE_MASK) * np.where(f > MAGNITUDE_MASK, -1, 1) for f in fields]
+    rest = floats(np.stack(parts, axis=1)) / MAGNITUDE_MASK / 2**0.5
     xyzw = largest_last(rest, torch.from_numpy(words >> 30))
     return xyzw[:, [3, 0, 1, 2]]
 
@@ -223,8 +223,7 @@ def _threes(data: np.ndarray) -> Float[Tensor, "n 4"]:
 def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: Options) -> None:
     """Write a scene, with values rounded to the format's steps."""
     turn = TURNS["opengl" if options.spz_axes == "auto" else options.spz_axes]
-    scenes = [turn(_checked(path, part)) for part in parts]
-    content = _packed(path, scenes)
+    content = _packed(path, [turn(_checked(path, part)) for part in parts])
     with replacing(path, overwrite) as stream:
         stream.write(content)
 
@@ -235,16 +234,16 @@ def _checked(path: Path, part: Gaussians) -> Gaussians:
         raise OutputError(path, "cannot hold 2D Gaussians; write a .ply")
     if part.filter_3d is not None:
         raise OutputError(path, "cannot hold a filter_3D; aaplug convert fuses it")
-    if part.sh_degree > MOST_DEGREE:
-        degrees = f"up to degree {MOST_DEGREE}, not {part.sh_degree}"
+    if part.sh_degree > MAX_WRITTEN_DEGREE:
+        degrees = f"up to degree {MAX_WRITTEN_DEGREE}, not {part.sh_degree}"
         raise OutputError(path, f"gsply writes harmonics {degrees}; write a .ply")
     return part
 
 
 def _packed(path: Path, scenes: list[Gaussians]) -> bytes:
     count = sum(map(len, scenes))
-    if count > MOST_GAUSSIANS:
-        raise OutputError(path, f"readers take {MOST_GAUSSIANS:,} Gaussians, not {count:,}; write a .ply")
+    if count > MAX_WRITTEN_GAUSSIANS:
+        raise OutputError(path, f"readers take {MAX_WRITTEN_GAUSSIANS:,} Gaussians, not {count:,}; write a .ply")
     from gsply.gsdata import GSData  # an optional package, and slow to import
     from gsply.spz import write_spz
 
@@ -252,6 +251,10 @@ def _packed(path: Path, scenes: list[Gaussians]) -> bytes:
         return torch.cat([values(scene) for scene in scenes]).contiguous().numpy()
 
     means = column(lambda s: s.means)
+    farthest = float(np.abs(means).max(initial=0.0))
+    fraction = POSITION_BITS - math.frexp(farthest)[1] if farthest else MAX_WRITTEN_FRACTION  # the farthest still fits
+    if fraction < 1:
+        raise OutputError(path, f"cannot hold positions as far as {farthest:g} from the origin; write a .ply")
     with library_errors(path), scratch() as folder:
         file = folder / "scene.spz"
         data = GSData.from_arrays(
@@ -263,16 +266,7 @@ def _packed(path: Path, scenes: list[Gaussians]) -> bytes:
             shN=column(lambda s: s.sh[:, 1:]),
             format="ply",
         )
-        write_spz(file, data, version=WRITTEN, fractional_bits=_fraction(path, means))
+        write_spz(file, data, version=WRITTEN_VERSION, fractional_bits=min(fraction, MAX_WRITTEN_FRACTION))
         content = bytearray(gzip.decompress(file.read_bytes()))
-    content[FLAGS] = ANTIALIASED_FLAG * scenes[0].convention.compensated
+    content[FLAGS_BYTE] = ANTIALIASED_FLAG * scenes[0].convention.compensated
     return gzip.compress(content, mtime=0)
-
-
-def _fraction(path: Path, means: np.ndarray) -> int:
-    """Bits of the fraction with which the farthest position still fits."""
-    farthest = float(np.abs(means).max(initial=0.0))
-    room = POSITION_BITS - math.frexp(farthest)[1] if farthest else MOST_FRACTION
-    if room < 1:
-        raise OutputError(path, f"cannot hold positions as far as {farthest:g} from the origin; write a .ply")
-    return min(room, MOST_FRACTION)

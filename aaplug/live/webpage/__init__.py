@@ -2,7 +2,7 @@
 
 from functools import cache
 
-from aaplug.pages import assembled
+from aaplug.evaluation.report.pages import assembled
 
 SCRIPTS = ("poses.js", "link.js", "painting.js", "live.js", "controls.js")
 

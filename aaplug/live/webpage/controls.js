@@ -31,23 +31,23 @@ const stepCamera = (by) => standIn(((state.at ?? (by > 0 ? -1 : 0)) + by + about
 
 // ----------------------------------------------------------------------------------------------------- from the server
 
-function hello(told) {
+function hello(facts) {
   const first = about === null;
-  about = told;
+  about = facts;
   at("lost").hidden = true;
   asked = "";
   if (!first) return wake();
-  document.title = `${told.title} · aaplug`;
-  at("title").textContent = told.title;
-  const kernels = told.rasterizer === "compiled" ? "" : `, rasterizer ${told.rasterizer}: \`aaplug warmup\` makes it faster`;
-  at("facts").textContent = `${told.gaussians.toLocaleString("en")} Gaussians${told.assumed ? ", training rate assumed" : ""}${kernels}`;
+  document.title = `${facts.title} · aaplug`;
+  at("title").textContent = facts.title;
+  const kernels = facts.rasterizer === "compiled" ? "" : `, rasterizer ${facts.rasterizer}: \`aaplug warmup\` makes it faster`;
+  at("facts").textContent = `${facts.gaussians.toLocaleString("en")} Gaussians${facts.assumed ? ", training rate assumed" : ""}${kernels}`;
   for (const i of [0, 1]) {
-    listed(`recipe-${i}`, told.recipes.map(({name}) => name));
-    listed(`quality-${i}`, told.qualities);
+    listed(`recipe-${i}`, facts.recipes.map(({name}) => name));
+    listed(`quality-${i}`, facts.qualities);
   }
-  listed("paint", ["", ...Object.keys(told.paints)], ["nothing", ...Object.values(told.paints)]);
-  listed("view", ["", ...told.views.keys()], ["–", ...told.views.map(({name}) => name)]);
-  at("cameras").textContent = told.assumed ? "Views" : "Cameras";
+  listed("paint", ["", ...Object.keys(facts.paints)], ["nothing", ...Object.values(facts.paints)]);
+  listed("view", ["", ...facts.views.keys()], ["–", ...facts.views.map(({name}) => name)]);
+  at("cameras").textContent = facts.assumed ? "Views" : "Cameras";
   for (const scale of EIGHTHS) {
     const label = document.createElement("label"), input = document.createElement("input"), text = document.createElement("span");
     Object.assign(input, {type: "radio", name: "size", value: scale});
@@ -55,8 +55,8 @@ function hello(told) {
     label.append(input, text);
     at("scales").append(label);
   }
-  const known = told.recipes.map(({name}) => name), best = told.qualities.at(-1);
-  state.sides = ["classic", "auto"].map((name, i) => ({recipe: known.includes(name) ? name : known.at(-i), quality: best}));
+  const names = facts.recipes.map(({name}) => name), best = facts.qualities.at(-1);
+  state.sides = ["classic", "auto"].map((name, i) => ({recipe: names.includes(name) ? name : names.at(-i), quality: best}));
   standIn(0);
   fromAddress();
 }
@@ -144,18 +144,18 @@ async function copyCommand() {
 
 // --------------------------------------------------------------------------------------------------------------- keys
 
-const HELD = { // what a held key does in each step
+const KEY_STEPS = { // what a held key does in each step
   ArrowLeft: () => turned(state, 0.04, 0, about.up), ArrowRight: () => turned(state, -0.04, 0, about.up),
   ArrowUp: () => turned(state, 0, 0.04, about.up), ArrowDown: () => turned(state, 0, -0.04, about.up),
   w: () => dollied(state, 0.95), s: () => dollied(state, 1 / 0.95),
   a: () => panned(state, -0.03, 0), e: () => panned(state, 0.03, 0), q: () => panned(state, 0, -0.03), z: () => panned(state, 0, 0.03),
 };
-const PRESSED = {
+const KEY_ACTIONS = {
   f: flip, d: () => change({split: 0.5}), x: () => change({shake: !state.shake}), c: () => change({frustums: !state.frustums}),
   r: () => at("record").click(), p: () => change({fade: state.fade > 0 ? 0 : 1}), h: fold, Home: () => { state.pose = null; standIn(0); },
   ",": () => stepCamera(-1), ".": () => stepCamera(1),
 };
-EIGHTHS.forEach((scale, i) => { PRESSED[i + 1] = () => change({scale}); });
+EIGHTHS.forEach((scale, i) => { KEY_ACTIONS[i + 1] = () => change({scale}); });
 
 window.addEventListener("keydown", (event) => {
   const key = event.key.length === 1 ? event.key.toLowerCase() : event.key, {target} = event;
@@ -163,8 +163,8 @@ window.addEventListener("keydown", (event) => {
   if (key.length > 1 && target.matches("input[type=range], input[type=radio]")) return; // arrows are theirs
   const changes = {...(state.lens ? lensMoves(event, state) : {}), ...shortcuts(state)};
   if (key in changes) change(changes[key]);
-  else if (key in HELD) change(HELD[key]());
-  else if (key in PRESSED) PRESSED[key]();
+  else if (key in KEY_STEPS) change(KEY_STEPS[key]());
+  else if (key in KEY_ACTIONS) KEY_ACTIONS[key]();
   else return;
   event.preventDefault();
 });
@@ -196,17 +196,17 @@ stage.addEventListener("pointermove", (event) => {
   travelled += Math.hypot(dx, dy);
   if (pointers.size === 2) pinch(before, event);
   else if (grabbed === "split") change({split: pointer.x});
-  else if (grabbed === "turn") change(turned(state, -dx * TURN, -dy * TURN, about.up));
+  else if (grabbed === "turn") change(turned(state, -dx * TURN_PER_PX, -dy * TURN_PER_PX, about.up));
   else shift(dx, dy);
   pointers.set(event.pointerId, event);
 });
 
 function hover(event) {
   canvas.style.cursor = nearDivider(event) ? "ew-resize" : "";
-  const box = canvas.getBoundingClientRect(), found = state.frustums ? cameraNear(cameras, pointer.x, pointer.y, box) : null;
-  if (found !== null) canvas.style.cursor = "pointer";
-  const redraws = found !== hovered || shown.painted;
-  hovered = found;
+  const box = canvas.getBoundingClientRect(), index = state.frustums ? cameraNear(cameras, pointer.x, pointer.y, box) : null;
+  if (index !== null) canvas.style.cursor = "pointer";
+  const redraws = index !== hovered || livePicture.overlay;
+  hovered = index;
   if (state.lens && pointer.x >= 0 && pointer.x <= 1) change({x: pointer.x, y: pointer.y});
   else if (redraws) draw();
 }
@@ -228,8 +228,8 @@ function released(event) {
   canvas.classList.remove("turning");
   if (!tapped || grabbed === "split") return;
   const {x, y} = over(event);
-  const found = state.frustums ? cameraNear(cameras, x, y, canvas.getBoundingClientRect()) : null;
-  if (found !== null) standIn(found);
+  const index = state.frustums ? cameraNear(cameras, x, y, canvas.getBoundingClientRect()) : null;
+  if (index !== null) standIn(index);
   else if (state.lens) change({x, y});
 }
 stage.addEventListener("pointerup", released);
@@ -239,28 +239,28 @@ stage.addEventListener("dblclick", () => change({split: 0.5}));
 stage.addEventListener("contextmenu", (event) => event.preventDefault());
 stage.addEventListener("wheel", (event) => {
   event.preventDefault();
-  if (about) change(dollied(state, Math.exp(clamp(event.deltaY * (event.deltaMode ? 30 : 1), -400, 400) * NEARER)));
+  if (about) change(dollied(state, Math.exp(clamp(event.deltaY * (event.deltaMode ? 30 : 1), -400, 400) * NEARER_PER_PX)));
 }, {passive: false});
 new ResizeObserver(() => { if (about) { controls(); draw(); wake(); } }).observe(stage);
 
 // -------------------------------------------------------------------------------------------------------- the address
 
-const KEPT = ["pose", "depth", "at", "base", "scale", "enlarge", "fov", "sides", "split", "lens", "x", "y", "zoom", "frustums", "fade", "paint"];
+const ADDRESS_FIELDS = ["pose", "depth", "at", "base", "scale", "enlarge", "fov", "sides", "split", "lens", "x", "y", "zoom", "frustums", "fade", "paint"];
 
 function address() {
-  return `#${encodeURIComponent(JSON.stringify(Object.fromEntries(KEPT.map((name) => [name, state[name]]))))}`;
+  return `#${encodeURIComponent(JSON.stringify(Object.fromEntries(ADDRESS_FIELDS.map((name) => [name, state[name]]))))}`;
 }
 
 function fromAddress() { // the state that the address names, where it can be one
   try {
-    const found = JSON.parse(decodeURIComponent(location.hash.slice(1)));
-    const known = (index) => Number.isInteger(index) && index >= 0 && index < about.views.length;
-    const numbers = ["depth", "scale", "fov", "split", "x", "y", "zoom", "fade"].every((name) => Number.isFinite(found[name]));
-    const sides = found.sides.every(({recipe, quality}) => about.recipes.some(({name}) => name === recipe) && about.qualities.includes(quality));
-    if (!numbers || !sides || found.sides.length !== 2 || !known(found.base) || (found.at !== null && !known(found.at))) return;
-    if (found.pose.length !== 16 || !found.pose.every(Number.isFinite) || !(found.scale > 0 && found.depth > 0)) return;
-    if (found.paint !== null && !(found.paint in about.paints)) return;
-    change({...Object.fromEntries(KEPT.map((name) => [name, found[name]])), scale: clamp(found.scale, 1 / 8, 8)});
+    const fields = JSON.parse(decodeURIComponent(location.hash.slice(1)));
+    const isView = (index) => Number.isInteger(index) && index >= 0 && index < about.views.length;
+    const numbers = ["depth", "scale", "fov", "split", "x", "y", "zoom", "fade"].every((name) => Number.isFinite(fields[name]));
+    const sides = fields.sides.every(({recipe, quality}) => about.recipes.some(({name}) => name === recipe) && about.qualities.includes(quality));
+    if (!numbers || !sides || fields.sides.length !== 2 || !isView(fields.base) || (fields.at !== null && !isView(fields.at))) return;
+    if (fields.pose.length !== 16 || !fields.pose.every(Number.isFinite) || !(fields.scale > 0 && fields.depth > 0)) return;
+    if (fields.paint !== null && !(fields.paint in about.paints)) return;
+    change({...Object.fromEntries(ADDRESS_FIELDS.map((name) => [name, fields[name]])), scale: clamp(fields.scale, 1 / 8, 8)});
   } catch { /* nothing, or nothing of ours */ }
 }
 

@@ -1,6 +1,6 @@
 // The link to the server: one websocket, opened again when it is lost.
 
-const AGAIN = [500, 1000, 2000, 5000]; // ms before the next attempts
+const RETRY_MS = [500, 1000, 2000, 5000]; // ms before the next attempts
 
 function linked(on) { // on.hello(about), on.message(header, files), on.lost()
   let socket = null, attempts = 0, chain = Promise.resolve();
@@ -36,13 +36,13 @@ function linked(on) { // on.hello(about), on.message(header, files), on.lost()
     };
     socket.onclose = () => {
       on.lost();
-      setTimeout(open, AGAIN[Math.min(attempts++, AGAIN.length - 1)]);
+      setTimeout(open, RETRY_MS[Math.min(attempts++, RETRY_MS.length - 1)]);
     };
   }
 
-  function send(said) {
+  function send(message) {
     if (socket.readyState !== WebSocket.OPEN) return false;
-    socket.send(JSON.stringify(said));
+    socket.send(JSON.stringify(message));
     return true;
   }
 

@@ -2,19 +2,19 @@
 
 const at = (id) => document.getElementById(id);
 const stage = at("stage"), canvas = at("picture");
-const RESTS = 80; // ms without a change after which the camera is at rest
+const REST_MS = 80; // ms without a change after which the camera is at rest
 const FPS = 24; // of a recorded path
-const SHAKE = 0.7, SHAKES = [1.1, 0.7]; // px to either side, and turns per second along both axes
-const MOST = {side: 8192, pixels: 1 << 25}; // of a picture, as the server bounds it
-const TURN = 0.008, MOVE = 1.2, NEARER = 0.0015; // of a drag: radians per CSS px; of the wheel: per px
-const QUIET = 200; // ms without a change before the address follows
+const SHAKE_PX = 0.7, SHAKE_TURNS = [1.1, 0.7]; // px to either side, and turns per second along both axes
+const MAX_PICTURE = {side: 8192, pixels: 1 << 25}; // of a picture, as the server bounds it
+const TURN_PER_PX = 0.008, NEARER_PER_PX = 0.0015; // of a drag: radians per CSS px; of the wheel: per px
+const ADDRESS_DELAY_MS = 200; // ms without a change before the address follows
 
-let about = null; // what the server told about the scene
+let about = null; // the facts about the scene, from the server
 const state = {
   pose: null, depth: 1, at: null, base: 0, scale: 1, enlarge: true, fov: 50, sides: [], split: 0.5, lens: false, x: 0.5, y: 0.5,
   zoom: 8, frustums: false, fade: 0, paint: null, shake: false, record: false,
 };
-const shown = {id: 0, stage: "connecting", size: [1, 1], sheets: [sheetOf(1, 1)[0], sheetOf(1, 1)[0]], photo: null, painted: null};
+const livePicture = {id: 0, stage: "connecting", size: [1, 1], sheets: [sheetOf(1, 1)[0], sheetOf(1, 1)[0]], photo: null, overlay: null};
 const path = [];
 
 const view = () => about.views[state.at ?? state.base];
@@ -25,8 +25,8 @@ function extent() { // size and focal length of the picture that fits the state,
   const density = window.devicePixelRatio || 1, focal = state.scale * (state.at === null ? trained() : view().focal);
   const [width, height] = [stage.clientWidth, stage.clientHeight].map((side) => Math.max(1, Math.floor(side * density)));
   const high = 2 * focal * tangent(), wide = high * width / height;
-  let size = [clamp(Math.round(wide), 1, Math.min(width, MOST.side)), clamp(Math.round(high), 1, Math.min(height, MOST.side))];
-  const over = Math.sqrt(size[0] * size[1] / MOST.pixels);
+  let size = [clamp(Math.round(wide), 1, Math.min(width, MAX_PICTURE.side)), clamp(Math.round(high), 1, Math.min(height, MAX_PICTURE.side))];
+  const over = Math.sqrt(size[0] * size[1] / MAX_PICTURE.pixels);
   if (over > 1) size = size.map((side) => Math.floor(side / over));
   const times = state.enlarge ? Math.max(1, Math.min(width / size[0], height / size[1])) : 1;
   return {size, focal, times, density};
@@ -44,7 +44,7 @@ let link = null, asked = "", moving = false, changed = 0, number = 0, waiting = 
 
 function shaken(now) { // the pose, moved by fractions of a pixel
   if (!state.shake) return state.pose;
-  const [x, y] = SHAKES.map((turns) => SHAKE * Math.sin(now / 1000 * turns * 2 * Math.PI) / extent().focal);
+  const [x, y] = SHAKE_TURNS.map((turns) => SHAKE_PX * Math.sin(now / 1000 * turns * 2 * Math.PI) / extent().focal);
   return looked(state.pose, x, y);
 }
 
@@ -59,7 +59,7 @@ function frame(now) { // asks for what has changed, and says when the camera res
   if (!about || !state.sides.length) return;
   const wanted = wish(now), key = JSON.stringify(wanted), fresh = key !== asked;
   if (fresh) changed = now;
-  const rests = now - changed > RESTS && !state.shake;
+  const rests = now - changed > REST_MS && !state.shake;
   if (fresh || (rests && moving)) {
     const id = ++number;
     if (link.send({see: {...wanted, id, split: state.split, moving: !rests}})) {
@@ -85,7 +85,7 @@ function change(parts) {
   draw();
   wake();
   clearTimeout(change.waiting);
-  change.waiting = setTimeout(() => history.replaceState(null, "", address()), QUIET);
+  change.waiting = setTimeout(() => history.replaceState(null, "", address()), ADDRESS_DELAY_MS);
 }
 
 function standIn(index) { // at a camera of the data set, all of its picture in sight
@@ -110,19 +110,19 @@ function receive(header, bitmaps) {
     return say(header.problem);
   }
   if (header.still) return download(bitmaps[0], header.still);
-  if (String(header.size) !== String(shown.size)) {
-    shown.sheets = shown.sheets.map(() => sheetOf(...header.size)[0]);
-    shown.size = header.size;
+  if (String(header.size) !== String(livePicture.size)) {
+    livePicture.sheets = livePicture.sheets.map(() => sheetOf(...header.size)[0]);
+    livePicture.size = header.size;
   }
   const settled = header.stage === "done";
-  if (!settled) shown.photo = shown.painted = null;
-  else if (!header.parts.some(({of}) => of === "paint")) shown.painted = null;
+  if (!settled) livePicture.photo = livePicture.overlay = null;
+  else if (!header.parts.some(({of}) => of === "paint")) livePicture.overlay = null;
   header.parts.forEach(({of, span: [left, right]}, i) => {
-    if (of === "photo") shown.photo = {bitmap: bitmaps[i], box: [left, header.rows[0], right - left, header.rows[1] - header.rows[0]]};
-    else if (of === "paint") shown.painted = paintSheet(bitmaps[i], header.legend);
-    else shown.sheets[of].getContext("2d").drawImage(bitmaps[i], left, 0, right - left, header.size[1]);
+    if (of === "photo") livePicture.photo = {bitmap: bitmaps[i], box: [left, header.rows[0], right - left, header.rows[1] - header.rows[0]]};
+    else if (of === "paint") livePicture.overlay = paintSheet(bitmaps[i], header.legend);
+    else livePicture.sheets[of].getContext("2d").drawImage(bitmaps[i], left, 0, right - left, header.size[1]);
   });
-  Object.assign(shown, {id: header.id, stage: header.stage, psnr: header.psnr, whole: header.whole});
+  Object.assign(livePicture, {id: header.id, stage: header.stage, psnr: header.psnr, whole: header.whole});
   status(header);
   draw();
 }
@@ -141,20 +141,20 @@ let cameras = [], hovered = null, pointer = null;
 
 function draw() {
   if (!about) return;
-  const [width, height] = shown.size, {times, density} = extent(), box = lensBox(state, height / width);
+  const [width, height] = livePicture.size, {times, density} = extent(), box = lensBox(state, height / width);
   canvas.width = Math.round(width * times); canvas.height = Math.round(height * times);
   canvas.style.width = `${canvas.width / density}px`; canvas.style.height = `${canvas.height / density}px`;
-  drawWhole(canvas, shown.sheets, state.split);
+  drawWhole(canvas, livePicture.sheets, state.split);
   const ink = canvas.getContext("2d");
   ink.imageSmoothingEnabled = false;
-  if (shown.photo && state.fade > 0) {
+  if (livePicture.photo && state.fade > 0) {
     ink.globalAlpha = state.fade;
-    ink.drawImage(shown.photo.bitmap, ...shown.photo.box.map((x) => x * times));
+    ink.drawImage(livePicture.photo.bitmap, ...livePicture.photo.box.map((x) => x * times));
     ink.globalAlpha = 1;
   }
-  if (shown.painted) ink.drawImage(shown.painted.sheet, 0, 0, canvas.width, canvas.height);
+  if (livePicture.overlay) ink.drawImage(livePicture.overlay.sheet, 0, 0, canvas.width, canvas.height);
   if (state.frustums) {
-    cameras = camerasIn(about.views, state.pose, extent().focal, shown.size, state.depth);
+    cameras = camerasIn(about.views, state.pose, extent().focal, livePicture.size, state.depth);
     drawCameras(canvas, cameras, hovered);
   }
   if (state.lens) {
@@ -169,7 +169,7 @@ function drawCrops(box) {
   [...at("crops").children].forEach((figure, i) => {
     const [crop, caption] = figure.children, side = Math.round(crop.clientWidth * (window.devicePixelRatio || 1));
     crop.width = crop.height = side;
-    drawCrop(crop, shown.sheets[i], box);
+    drawCrop(crop, livePicture.sheets[i], box);
     caption.textContent = nameOf(i);
   });
 }
@@ -184,20 +184,20 @@ function labels() {
   at("name-0").textContent = state.split > 0 ? nameOf(0) : "";
   at("name-1").textContent = state.split < 1 ? nameOf(1) : "";
   at("crops").hidden = !state.lens;
-  at("legend").hidden = !shown.painted;
-  if (!shown.painted) return;
-  drawLegend(at("legend"), shown.painted.legend);
-  const found = pointer && paintedValue(shown.painted, pointer.x, pointer.y);
-  at("legend").querySelector("output").textContent = found ? `here: ${found}` : "";
+  at("legend").hidden = !livePicture.overlay;
+  if (!livePicture.overlay) return;
+  drawLegend(at("legend"), livePicture.overlay.legend);
+  const value = pointer && valueUnder(livePicture.overlay, pointer.x, pointer.y);
+  at("legend").querySelector("output").textContent = value ? `here: ${value}` : "";
 }
 
 function figures() { // for whoever reads the page by machine, and the photograph's figures
-  const {psnr, whole} = shown.stage === "done" ? shown : {};
+  const {psnr, whole} = livePicture.stage === "done" ? livePicture : {};
   const values = psnr && psnr.map((value, i) => `${nameOf(i)}: ${value === null ? "equal" : `${value.toFixed(2)} dB`}`);
   at("psnr").textContent = values ? `${values.join("\n")}${whole ? "" : "\n(of what is seen)"}` : "";
   Object.assign(canvas.dataset, {
-    id: shown.id, stage: shown.stage, size: shown.size.join("x"), split: state.split.toFixed(3), lens: state.lens ? lensText(state) : "off",
-    at: state.at ?? "", scale: state.scale, paint: shown.painted ? state.paint : "", psnr: psnr ? psnr.join() : "",
+    id: livePicture.id, stage: livePicture.stage, size: livePicture.size.join("x"), split: state.split.toFixed(3), lens: state.lens ? lensText(state) : "off",
+    at: state.at ?? "", scale: state.scale, paint: livePicture.overlay ? state.paint : "", psnr: psnr ? psnr.join() : "",
   });
   canvas.setAttribute("aria-label", `${nameOf(0)} left of ${(100 * state.split).toFixed(0)} % of the width, ${nameOf(1)} right`);
 }

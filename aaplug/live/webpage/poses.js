@@ -4,7 +4,7 @@
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const plus = (a, b, by = 1) => a.map((x, i) => x + by * b[i]);
 const axesOf = (pose) => [pose.slice(0, 3), pose.slice(4, 7), pose.slice(8, 11)];
-const POLE = 0.995; // of the cosine between sight and up: beyond it a turn would roll over
+const MAX_POLE_COSINE = 0.995; // of the cosine between sight and up: beyond it a turn would roll over
 
 function eyeOf(pose) {
   const shift = [pose[3], pose[7], pose[11]], axes = axesOf(pose);
@@ -23,7 +23,7 @@ function turned({pose, depth}, yaw, pitch, up) { // about the point in front, in
   const axes = axesOf(pose), eye = eyeOf(pose), pivot = plus(eye, axes[2], depth);
   const upright = Math.sign(-dot(axes[1], up)) || 1; // a camera that hangs upside down turns the other way
   const apart = Math.abs(dot(rotated(axes[2], axes[0], pitch), up));
-  const tilt = apart > POLE && apart > Math.abs(dot(axes[2], up)) ? 0 : pitch;
+  const tilt = apart > MAX_POLE_COSINE && apart > Math.abs(dot(axes[2], up)) ? 0 : pitch;
   const all = (v) => rotated(rotated(v, axes[0], tilt), up, yaw * upright);
   const [right, down, forward] = axes.map(all);
   return {pose: poseOf([right, down, forward], plus(pivot, forward, -depth)), depth};

@@ -19,16 +19,17 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.cameras import Camera
+from aaplug.core.conventions import MIP, Convention
 from aaplug.core.convolution import smoothed_by
-from aaplug.core.gaussians import MIP, Convention, Fusion, Gaussians, scale_opacities
+from aaplug.core.gaussians import Fusion, Gaussians, scale_opacities
 from aaplug.core.projection import project
 from aaplug.core.sampling import median_rates, sampling_bounds
 from aaplug.core.training import TrainingViews
 
 MATCHED_VARIANCE = 0.2  # px² at the median training rate: 3DGS's 0.3 minus the Mip viewer's 0.1
 MAX_FUSED_OPACITY = 0.9999  # cap: matching energy can demand an opacity above 1
-# px² at the median training rate: thinning stops here; below it no image changes visibly
-THINNEST = 0.01
+# px² at the median training rate: thinning stops here.  Below it no image changes visibly.
+MIN_THINNED_VARIANCE = 0.01
 FIT_VIEWS = 25  # evenly spread training views over which the opacity factor is averaged
 
 
@@ -55,12 +56,12 @@ class MatchedEnergy:
 
 
 def _widened(scene: Gaussians, rates: Float[Tensor, " n"], variance: float) -> Gaussians:
-    """Add `variance` px² to every axis; a negative one thins it to at least `THINNEST`, and leaves thinner axes."""
+    """Add `variance` px² to every axis; a negative one thins axes down to `MIN_THINNED_VARIANCE`, never below."""
     if variance >= 0:
         log_sigma = 0.5 * torch.tensor(variance).log() - rates.log()
         return smoothed_by(scene, log_sigma.where(rates > 0, -torch.inf)[:, None], volume=False)
     px2 = (2 * (scene.log_scales + rates.log()[:, None])).exp()
-    least = px2.clamp(max=THINNEST)
+    least = px2.clamp(max=MIN_THINNED_VARIANCE)
     share = torch.maximum(px2 + variance, least) / px2
     change = (0.5 * share.log()).where(rates[:, None] > 0, 0.0)
     return replace(scene, log_scales=scene.log_scales + change)
@@ -78,7 +79,10 @@ def _mean_log_factor(
         trained = raw.blurred(training.convention.kernel, training.convention.compensated)
         wide = wide.blurred(blur, compensate=False)
         factor = 0.5 * (trained.dets / wide.dets).log() + (trained.opacities / raw.opacities).log()
-        seen = sampling_bounds(scene.means[raw.sources], [camera]).seen & factor.isfinite()
-        total.index_add_(0, raw.sources[seen], factor[seen].double())
-        count.index_add_(0, raw.sources[seen], torch.ones_like(factor[seen], dtype=torch.float64))
+        fitted = sampling_bounds(scene.means[raw.sources], [camera]).seen & factor.isfinite()
+        total.index_add_(0, raw.sources[fitted], factor[fitted].double())
+        count.index_add_(0, raw.sources[fitted], torch.ones_like(factor[fitted], dtype=torch.float64))
     return (total / count.clamp(min=1)).to(scene.logit_opacities)
+
+
+MATCHED_ENERGY = MatchedEnergy()

@@ -12,7 +12,6 @@ Design and measurements are aaplug's own.  Step one with one global rate is SA-G
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import cast, get_args
 
@@ -21,10 +20,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.cameras import Camera
-from aaplug.core.choices import RateReference
-from aaplug.core.errors import UsageError, not_one_of
 from aaplug.core.splats import Splats2D
 from aaplug.core.training import TrainingViews
+from aaplug.methods import RateReference
+from aaplug.system.errors import UsageError, not_one_of
 
 # px²: variance of a pixel's own filter, as a Gaussian.  A box has 1/12, Mip-Splatting takes 0.1.  Opaque splats side by
 # side hide less than their energies add up to, and a narrower filter offsets some of that (examples/guides/methods.md).
@@ -76,53 +75,35 @@ class Matched:
         Raises:
             UsageError: there is no reference of that name.
         """
-        known = get_args(RateReference)
-        if reference not in known:
-            raise UsageError("rate_reference", not_one_of(reference, known))
+        references = get_args(RateReference)
+        if reference not in references:
+            raise UsageError("rate_reference", not_one_of(reference, references))
         return replace(self, reference=cast(RateReference, reference))
 
     def rates(self, splats: Splats2D, camera: Camera, training: TrainingViews) -> Float[Tensor, " m"]:
         """Relative sampling rate r of each splat; the view's own r for Gaussians that no training camera saw."""
         view, at_pose = training.relative_rate(camera), camera.trained_focal is not None
-        by_pose = self.reference == "pose" and at_pose
-        if self.reference == "global" or (by_pose and view >= 1):
+        if self.reference == "global" or (self.reference == "pose" and at_pose and view >= 1):
             return torch.full_like(splats.depths, view)
         now = camera.focal / splats.depths
-        own = now / view  # at this pose's training size
-        if by_pose:
-            return _at_pose(view, own, training.bounds.highest.index_select(0, splats.sources).to(own))
+        in_training = now / view  # at this pose's training size
+        if self.reference == "pose" and at_pose:
+            highest = training.bounds.highest.index_select(0, splats.sources).to(now)  # 0 if no training camera saw it
+            rise = min(view**-RISE_SPEED, MAX_RISE)
+            return view * in_training / torch.minimum(rise * in_training, torch.maximum(highest, in_training))
         bounds = training.bounds[splats.sources]
         lowest, highest = (rate.to(now).where(bounds.seen, 1.0) for rate in (bounds.lowest, bounds.highest))
-        if self.reference == "interval" and at_pose:
-            lowest, highest = torch.minimum(lowest, own), torch.maximum(highest, own)
-        return torch.where(bounds.seen, now / REFERENCES[self.reference](now, lowest, highest), view)
+        if self.reference == "sharpest":
+            against = highest
+        elif self.reference == "interval":
+            if at_pose:
+                lowest, highest = torch.minimum(lowest, in_training), torch.maximum(highest, in_training)
+            against = torch.minimum(torch.maximum(now, lowest), highest)
+        else:  # "pose" for a free camera: clamped to training's rates, and raised where it is lower
+            raised = torch.minimum(lowest * (lowest / now).clamp(max=MAX_RISE), highest)
+            against = torch.where(now < lowest, raised, torch.minimum(now, highest))
+        return torch.where(bounds.seen, now / against, view)
 
 
-Rates = Float[Tensor, " m"]  # px per world unit
-
-
-def _at_pose(view: float, own: Rates, highest: Rates) -> Rates:
-    """Relative rates below 1 at a pose of the data set; highest: in training, 0 for a Gaussian that no camera saw."""
-    rise = min(view**-RISE_SPEED, MAX_RISE)
-    return view * own / torch.minimum(rise * own, torch.maximum(highest, own))
-
-
-def _sharpest(now: Rates, lowest: Rates, highest: Rates) -> Rates:
-    return highest
-
-
-def _interval(now: Rates, lowest: Rates, highest: Rates) -> Rates:
-    return torch.minimum(torch.maximum(now, lowest), highest)
-
-
-def _free_pose(now: Rates, lowest: Rates, highest: Rates) -> Rates:
-    """The rate clamped to training's; raised where it is lower."""
-    raised = torch.minimum(lowest * (lowest / now).clamp(max=MAX_RISE), highest)
-    return torch.where(now < lowest, raised, torch.minimum(now, highest))
-
-
-REFERENCES: dict[str, Callable[[Rates, Rates, Rates], Rates]] = {  # of the current rate and training's range
-    "pose": _free_pose,
-    "sharpest": _sharpest,
-    "interval": _interval,
-}
+BY_POSE, BY_GLOBAL_RATE = Matched(), Matched("global")
+BY_SHARPEST_RATE, BY_INTERVAL = Matched("sharpest"), Matched("interval")

@@ -40,9 +40,9 @@ class AbsolutePoint(Point):
         self, rows: Float[Tensor, "m c"], sums: Float[Tensor, "m s"], kernels: Kernels
     ) -> Float[Tensor, "m c"]:
         """The sums, as the gradient of the centre."""
-        found = torch.zeros_like(rows)
-        found[:, X], found[:, Y] = sums.unbind(dim=1)
-        return found
+        gradient = torch.zeros_like(rows)
+        gradient[:, X], gradient[:, Y] = sums.unbind(dim=1)
+        return gradient
 
 
 ABSOLUTE_POINT = AbsolutePoint()

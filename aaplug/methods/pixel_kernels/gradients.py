@@ -1,4 +1,4 @@
-"""How a pixel kernel's gradient is summed over the pixels of a tile.
+"""Sums of a pixel kernel's gradient over the pixels of a tile.
 
 t: tiles; K: splats of a step; P: pixels per tile; c: columns of a raster row; s: sums.
 """
@@ -27,7 +27,7 @@ class Move(NamedTuple):
 class SumsGradients(Protocol):
     """A pixel kernel that sums its own gradient in closed form; without it, autograd differentiates `alpha`.
 
-    gradient_sums: how many sums per splat.
+    gradient_sums: number of sums per splat.
     """
 
     @property
@@ -50,7 +50,7 @@ class SumsGradients(Protocol):
 
 
 def sums_per_splat(pixel: PixelKernel) -> int:
-    """How many sums a splat's gradient is made of."""
+    """The number of sums that a splat's gradient is made of."""
     return pixel.gradient_sums if isinstance(pixel, SumsGradients) else pixel.columns
 
 

@@ -53,6 +53,10 @@ class Point:
         columns = (splats.means, splats.covs, splats.dets, splats.opacities, splats.rgb)
         return kernels.run(POINT_ROWS, *columns)[0]
 
+    def kernels(self, rules: Rules) -> tuple[Kernel, ...]:
+        """Those of raster rows and of the sums of gradients."""
+        return POINT_ROWS, FROM_SUMS, POINT_ROWS_BACKWARD
+
     def alpha(self, rows: Float[Tensor, "*n t c"], pixels: Pixels, rules: Rules) -> Float[Tensor, "*n t P"]:
         """2^(log2 o - u² - v²), 0 below the cut-off.
 
@@ -67,7 +71,7 @@ class Point:
             return torch.where(h >= rules.log2_min_alpha - LOG2_PADDING, value, 0.0)
         exponent = torch.addcmul(opacity + LOG2_PADDING, u, u, value=-1)
         exponent = torch.addcmul(exponent, v, v, value=-1)
-        # clamped, because subnormal numbers are slow
+        # The exponent is clamped, because subnormal numbers are slow.
         return torch.threshold(exponent.clamp_(min=LOG2_PADDING).exp2_(), rules.below_min_alpha, 0.0)
 
     def exact(self, splats: Splats2D, offsets: Float[Tensor, "p c 2"]) -> Float[Tensor, "p c"]:
@@ -87,7 +91,7 @@ class Point:
             return _sums_by_products(moves, colours, pixels)
         sums = []
         for row, weight, gradient in moves:
-            # no-op, as both are 0 where T is 0; the test on T makes the compiler fuse all sums into one loop
+            # Both are 0 where T is 0, but the test on T makes the compiler fuse all sums into one loop.
             gradient, weight = (torch.where(T > 0, x, 0.0) for x in (gradient, weight))
             u, v = forms_at(row, pixels)
             su, sv = gradient * u, gradient * v

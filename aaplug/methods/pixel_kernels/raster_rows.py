@@ -20,20 +20,20 @@ from aaplug.core.splats import Splats2D
 TILE = 8  # px: side of a tile
 PIXELS = TILE * TILE
 
-LONG = 8  # rows of a tile: from here on it pays that the loop over rows, which waits for memory, does nothing else
+MIN_LONG_LIST = 8  # rows of a tile, from which on the loop over rows, which waits for memory, should do nothing else
 
 UX, UY, VX, VY, X, Y, OPACITY, RED, GREEN, BLUE = range(10)
 COLUMNS = 10  # columns from here on are a kernel's own
 
 
-def rows_of(splats: Splats2D, forms: Sequence[Tensor], own: Sequence[Tensor]) -> Float[Tensor, "m c"]:
+def rows_of(splats: Splats2D, forms: Sequence[Tensor], more: Sequence[Tensor]) -> Float[Tensor, "m c"]:
     """Assemble raster rows from the two forms and a kernel's own columns, and the padding row, whose alpha is 0.
 
     A tile reads it when its splats have run out.
     """
     assert splats.rgb is not None
     centre, colour = splats.means.unbind(dim=1), splats.rgb.unbind(dim=1)
-    rows = torch.stack([*forms, *centre, splats.opacities, *colour, *own], dim=1)
+    rows = torch.stack([*forms, *centre, splats.opacities, *colour, *more], dim=1)
     return torch.cat([rows, rows.new_zeros(1, rows.shape[1])])
 
 
@@ -73,7 +73,7 @@ def next_rows(
     """Raster rows of each tile's next `count` splats, from `at`; the padding row where none are left."""
     place = at[:, None] + torch.arange(count, device=at.device)
     owners = torch.where(place < ends[:, None], ids[place.clamp(max=ids.shape[0] - 1)], rows.shape[0] - 1)
-    if count >= LONG:
+    if count >= MIN_LONG_LIST:
         owners = materialized(owners)
     return materialized(rows.index_select(0, owners.flatten()).view(-1, count, rows.shape[1]))
 

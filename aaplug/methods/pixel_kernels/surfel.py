@@ -1,4 +1,4 @@
-"""Discs where rays meet them: 2DGS (Huang et al. 2024) and AA-2DGS (Younes et al., NeurIPS 2025).
+"""Discs where rays meet them: 2DGS (Huang et al. 2024).
 
 d: offset of a pixel from the disc's projected centre, in px.  C: covariance of the disc's linearised projection, in
 px².  B: a whitening of C, Bᵀ B = C⁻¹.  n: depth slopes, in 1/px.  Inverse depth on the disc's plane is linear in the
@@ -7,8 +7,6 @@ disc: 2DGS's intersection (eq. 10), by the Sherman-Morrison formula.  Beyond a 2
 
 "surfel" is 2DGS: exp(-ρ/2) with ρ = min(|s|², 2 |d|²/r²).  The second term is a screen-space low-pass filter with a
 standard deviation of √½ r px, where r = `Splats2D.window`: 1 in `2dgs`, training's pixel in `2dgs-matched`.
-"surfel-mip" is AA-2DGS's object-space Mip filter: with J = ds/dd = (B + s nᵀ)/w and V = I + 0.1 J Jᵀ it is
-det V^-½ exp(-sᵀ V⁻¹ s / 2).
 """
 
 from dataclasses import dataclass, replace
@@ -22,26 +20,20 @@ from aaplug.core.interfaces import Pixels
 from aaplug.core.kernels import Kernels
 from aaplug.core.rules import Rules
 from aaplug.core.splats import Splats2D
-from aaplug.methods.pixel_kernels.raster_rows import COLUMNS, OPACITY, UX, UY, VX, VY, forms_at, offsets_at, rows_of
+from aaplug.methods.pixel_kernels.raster_rows import COLUMNS, OPACITY, forms_at, offsets_at, rows_of
 
 SLOPE_X, SLOPE_Y, LOW_PASS_WIDTH = COLUMNS, COLUMNS + 1, COLUMNS + 2
 LOW_PASS = 2.0  # 1/px²: inverse variance of 2DGS's low-pass filter, whose σ is √½ px
-DISC_VARIANCE = 0.1  # px²: variance of AA-2DGS's object-space Mip filter
-LEAST_FACTOR = 1e-8  # AA-2DGS adds this to 1/det V before the square root, as published
-NARROWEST = 1e-3  # px: lower bound of the low-pass filter's width, which is a divisor
+MIN_FILTER_WIDTH = 1e-3  # px: lower bound of the low-pass filter's width, which is a divisor
 IN_FRONT = 1e-3  # lower bound of w, and of 1 - R q for a disc near the camera plane
 HORIZON = 1e-12  # lower bound of w in `exact`
 
 
 @dataclass(frozen=True)
 class Surfel:
-    """Alpha is opacity times the disc's Gaussian where the pixel's ray meets its plane.
+    """Alpha is opacity times the disc's Gaussian where the pixel's ray meets its plane."""
 
-    smoothed: AA-2DGS's Mip filter instead of 2DGS's low-pass filter.
-    """
-
-    name: str
-    smoothed: bool
+    name: str = "surfel"
     columns: int = COLUMNS + 3
     needs_depth_slopes: bool = True
     splats_per_pass: int = 8
@@ -71,14 +63,16 @@ class Surfel:
             dets=splats.dets / left**3,
             opacities=torch.where(near, splats.opacities, 0.0),
         )
-        width = max(splats.window, NARROWEST)
-        variance = DISC_VARIANCE if self.smoothed else width**2 / LOW_PASS
-        return grown(ellipses, (variance * cutoff).sqrt(), rules.min_alpha)
+        return grown(ellipses, (self.filter_variance(splats.window) * cutoff).sqrt(), rules.min_alpha)
+
+    def filter_variance(self, window: float) -> float:
+        """Variance of the filter beside the disc, in px², by which its bounding ellipse grows."""
+        return max(window, MIN_FILTER_WIDTH) ** 2 / LOW_PASS
 
     def raster_rows(self, splats: Splats2D, kernels: Kernels) -> Float[Tensor, "m c"]:
         """Whitening forms, depth slopes, and the width of the low-pass filter."""
         assert splats.depth_slopes is not None
-        width = torch.full_like(splats.opacities, max(splats.window, NARROWEST))
+        width = torch.full_like(splats.opacities, max(splats.window, MIN_FILTER_WIDTH))
         forms = whitening_columns(splats.covs, splats.dets)
         return rows_of(splats, forms, [*splats.depth_slopes.unbind(dim=1), width])
 
@@ -88,58 +82,38 @@ class Surfel:
         dx, dy = offsets_at(rows, pixels)
         slopes = rows[..., SLOPE_X, None], rows[..., SLOPE_Y, None]
         ahead = (1 - slopes[0] * dx - slopes[1] * dy).clamp(min=IN_FRONT)
-        if self.smoothed:
-            whitening = tuple(rows[..., i, None] for i in (UX, UY, VX, VY))
-            value = _mip_filtered(e, ahead, whitening, slopes)
-        else:
-            value = _low_passed(e, ahead, dx * dx + dy * dy, rows[..., LOW_PASS_WIDTH, None])
+        value = self.value(rows, e, ahead, slopes, dx * dx + dy * dy)
         return torch.threshold(rows[..., OPACITY, None] * value, rules.below_min_alpha, 0.0)
 
+    def value(
+        self, rows: Tensor, e: tuple[Tensor, Tensor], ahead: Tensor, slopes: tuple[Tensor, Tensor], squared: Tensor
+    ) -> Tensor:
+        """The filtered disc.  e: whitened offset B d.  ahead: w.  slopes: n.  squared: |d|², in px²."""
+        on_disc = (e[0] * e[0] + e[1] * e[1]) / (ahead * ahead)
+        width = rows[..., LOW_PASS_WIDTH, None]
+        return (-0.5 * torch.minimum(on_disc, LOW_PASS * squared / (width * width))).exp()
+
     def exact(self, splats: Splats2D, offsets: Float[Tensor, "p c 2"]) -> Float[Tensor, "p c"]:
-        """2DGS's intersection of homogeneous planes (its eqs. 8 to 10), and AA-2DGS's filter as its paper expands it.
-
-        T_u, T_v, T_w map the disc's coordinates to the screen, from any root of its covariance and its depth slopes.
-        """
-        t_u, t_v, t_w = _planes(splats)
-        x, y = offsets[..., :1], offsets[..., 1:]
-        by_row, by_column = x * t_w - t_u, y * t_w - t_v
-        p = torch.linalg.cross(by_row, by_column)
-        in_front = p[..., 2] > HORIZON
-        depth = torch.where(in_front, p[..., 2], 1.0)
-        s, t = p[..., 0] / depth, p[..., 1] / depth
-        if not self.smoothed:
-            squared = offsets.square().sum(dim=2)
-            low_pass = LOW_PASS * squared / max(splats.window, NARROWEST) ** 2
-            values = torch.exp(-0.5 * torch.minimum(s * s + t * t, low_pass))
-            return torch.where(in_front, values, torch.exp(-0.5 * low_pass))
-        by_x = torch.linalg.cross(t_w.expand_as(by_column), by_column)
-        by_y = torch.linalg.cross(by_row, t_w.expand_as(by_row))
-        jacobian = [
-            (change[..., i] * depth - p[..., i] * change[..., 2]) / depth**2 for change in (by_x, by_y) for i in (0, 1)
-        ]
-        return torch.where(in_front, _exact_mip_filter(s, t, jacobian), 0.0)
+        """2DGS's intersection of homogeneous planes (its eqs. 8 to 10), beside its low-pass filter."""
+        _, in_front, s, t = intersection(splats, offsets)[:4]
+        squared = offsets.square().sum(dim=2)
+        low_pass = LOW_PASS * squared / max(splats.window, MIN_FILTER_WIDTH) ** 2
+        values = torch.exp(-0.5 * torch.minimum(s * s + t * t, low_pass))
+        return torch.where(in_front, values, torch.exp(-0.5 * low_pass))
 
 
-def _low_passed(e: tuple[Tensor, Tensor], ahead: Tensor, squared: Tensor, width: Tensor) -> Tensor:
-    """2DGS.  e: whitened offset.  ahead: w.  squared: |d|², in px²."""
-    on_disc = (e[0] * e[0] + e[1] * e[1]) / (ahead * ahead)
-    return (-0.5 * torch.minimum(on_disc, LOW_PASS * squared / (width * width))).exp()
+def intersection(splats: Splats2D, offsets: Float[Tensor, "p c 2"]) -> tuple[Tensor, ...]:
+    """p = by_row × by_column, where it lies in front, the disc's coordinates s and t, by_row, by_column and T_w.
 
-
-def _mip_filtered(
-    e: tuple[Tensor, Tensor], ahead: Tensor, whitening: tuple[Tensor, ...], slopes: tuple[Tensor, Tensor]
-) -> Tensor:
-    """AA-2DGS.  whitening: ux, uy, vx, vy."""
-    s, t = e[0] / ahead, e[1] / ahead
-    ux, uy, vx, vy = whitening
-    j00, j01 = (ux + s * slopes[0]) / ahead, (uy + s * slopes[1]) / ahead
-    j10, j11 = (vx + t * slopes[0]) / ahead, (vy + t * slopes[1]) / ahead
-    k = DISC_VARIANCE
-    area = j00 * j11 - j01 * j10
-    size = j00 * j00 + j01 * j01 + j10 * j10 + j11 * j11
-    det = 1 + k * size + k * k * area * area
-    across = (j10 * s - j00 * t) ** 2 + (j11 * s - j01 * t) ** 2
-    return (1 / det + LEAST_FACTOR).sqrt() * (-0.5 * (s * s + t * t + k * across) / det).exp()
+    T_u, T_v, T_w map the disc's coordinates to the screen, from any root of its covariance and its depth slopes.
+    """
+    t_u, t_v, t_w = _planes(splats)
+    x, y = offsets[..., :1], offsets[..., 1:]
+    by_row, by_column = x * t_w - t_u, y * t_w - t_v
+    p = torch.linalg.cross(by_row, by_column)
+    in_front = p[..., 2] > HORIZON
+    depth = torch.where(in_front, p[..., 2], 1.0)
+    return p, in_front, p[..., 0] / depth, p[..., 1] / depth, by_row, by_column, t_w
 
 
 def _planes(splats: Splats2D) -> tuple[Tensor, Tensor, Tensor]:
@@ -154,14 +128,4 @@ def _planes(splats: Splats2D) -> tuple[Tensor, Tensor, Tensor]:
     return t_u, t_v, torch.cat([tilt, one[:, None]], dim=1)
 
 
-def _exact_mip_filter(s: Tensor, t: Tensor, jacobian: list[Tensor]) -> Tensor:
-    a, b, c, d = jacobian
-    kappa = DISC_VARIANCE
-    area, size = a * d - b * c, a * a + b * b + c * c + d * d
-    det = kappa**2 * area**2 + kappa * size + 1
-    rho = (s * s + t * t + kappa * ((d * s - c * t) ** 2 + (a * t - b * s) ** 2)) / det
-    return (1 / det + LEAST_FACTOR).sqrt() * torch.exp(-0.5 * rho)
-
-
-SURFEL = Surfel("surfel", smoothed=False)
-SURFEL_MIP = Surfel("surfel-mip", smoothed=True)
+SURFEL = Surfel()

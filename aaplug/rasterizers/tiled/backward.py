@@ -29,7 +29,7 @@ from aaplug.methods.pixel_kernels.raster_rows import BLUE, GREEN, PIXELS, RED, n
 from aaplug.rasterizers.tiled.binning import Bins
 from aaplug.rasterizers.tiled.forward import (
     EXAMPLE_TILES,
-    FEWEST,
+    MIN_TILES,
     STEP,
     Compositing,
     Segment,
@@ -90,7 +90,7 @@ def _backward(
     parts[count] = 0
     steps = (bins.counts + (STEP - 1)) // STEP
     first, total = starts_of(steps), int(steps.sum())
-    light, made, done = rows.new_zeros(len(steps), PIXELS), [], 0
+    light, steps_done, done = rows.new_zeros(len(steps), PIXELS), [], 0
     for segment in reversed(segments):
         behind = light.index_select(0, segment.tiles)
         colours = tiles_of(grads, segment.tiles, bins.columns, how.kernels)
@@ -107,13 +107,14 @@ def _backward(
             args = (rows, *where, before, *pixels, *local, unit, parts[done : done + n])
             run = run or how.kernels.runner(kernel, args)
             run(*args)
-            # among the fewest tiles one may have no splats left: its step is none of the list
-            made.append(mine + step if n > FEWEST else torch.where(at + step * STEP < ends, mine + step, total))
+            # Among the fewest tiles one may have no splats left: its step is none of the list.
+            these = mine + step
+            steps_done.append(these if n > MIN_TILES else torch.where(at + step * STEP < ends, these, total))
             done += n
         light.index_copy_(0, segment.tiles, behind)
-    # where each step's contributions stand; steps behind saturated pixels contribute nothing
+    # `part_of` tells where each step's contributions stand.  Steps behind saturated pixels contribute nothing.
     part_of = torch.full((total + 1,), count, dtype=torch.int32, device=rows.device)
-    part_of.index_copy_(0, torch.cat(made), torch.arange(count, dtype=torch.int32, device=rows.device))
+    part_of.index_copy_(0, torch.cat(steps_done), torch.arange(count, dtype=torch.int32, device=rows.device))
     pairs = bins.pairs
     shifts = (first * STEP - bins.first).int()
     slots = part_of.new_empty(len(pairs.sorted))
@@ -182,7 +183,7 @@ def _step(
         colour = torch.addcmul(colour, row[:, GREEN, None], g_green)
         colour = torch.addcmul(colour, row[:, BLUE, None], g_blue)
         ahead = less(colour, light, one)
-        # weight is 0 below the cut-off and after the stop; at the cap alpha has no gradient
+        # The weight is 0 below the cut-off and after the stop.  At the cap alpha has no gradient.
         move = where_above(0.0, rules.max_alpha * one - alpha, weight) * ahead
         moves.append(Move(row, weight, move))
         light = light + hides * ahead

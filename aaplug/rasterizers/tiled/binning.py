@@ -25,14 +25,14 @@ from aaplug.core.runs import runs_of, starts_of
 from aaplug.core.splats import Splats2D
 from aaplug.methods.pixel_kernels.raster_rows import TILE, splat_example
 
-MEMORY = 1e9  # bytes
+MEMORY_BYTES = 1e9
 PAIR_BYTES = 64  # bytes per candidate pair while a band is binned, measured
-MOST_PAIRS = 1 << 30  # in a band, so that they are counted by 32 bit integers
-SHORT = torch.iinfo(torch.int16).max  # tiles in a band, so that they are sorted by few bits
+MAX_PAIRS = 1 << 30  # in a band, so that they are counted by 32 bit integers
+MAX_SHORT_TILES = torch.iinfo(torch.int16).max  # tiles in a band, so that they are sorted by few bits
 CUTOFF_SLACK = 1e-4  # relative margin of the squared cut-off, so that float32 rounding never drops a pixel above it
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Pairs:
     """The pairs of a band, those of one splat together and nearest splats first: the order of sums over tiles.
 
@@ -46,7 +46,7 @@ class Pairs:
     tiles: Int[Tensor, " p"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Bins:
     """Tile t of a band draws the splats `splats[first[t] : first[t] + counts[t]]`, nearest first.
 
@@ -63,11 +63,11 @@ class Bins:
     pairs: Pairs | None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TileBoxes:
-    """Which tiles each splat may reach.
+    """The tiles that each splat may reach.
 
-    table: what its spans are computed from; see `_table_rows`.
+    table: the columns that its spans are computed from; see `_table_rows`.
     top, bottom: its first row of tiles, and the one past its last.  wide: columns of tiles of its box.
     """
 
@@ -82,29 +82,20 @@ def bands(
     splats: Splats2D,
     grid: tuple[int, int],
     kernels: Kernels,
-    memory: float = MEMORY,
+    memory: float = MEMORY_BYTES,
     rules: Rules = RULES_3DGS,
     gradients: bool = False,
 ) -> Iterator[Bins]:
-    """Bins of bands of tile rows, from the top; with `pairs` if `gradients`."""
-    order, boxes = _depth_order(splats.depths), _tile_boxes(splats, grid, kernels, rules)
-    for rows in _rows(boxes, grid, min(MOST_PAIRS, max(1, int(memory / PAIR_BYTES)))):
-        yield _bin(boxes, order, rows, grid[1], kernels, gradients)
-
-
-def _depth_order(depths: Float[Tensor, " m"]) -> Int[Tensor, " m"]:
-    """Indices, nearest first; equal depths keep the given order.
-
-    The bits of positive floats sort like the floats, and integers sort faster.
-    """
+    """Bins of bands of tile rows, from the top; with `pairs` if `gradients`.  Equal depths keep the given order."""
+    depths = splats.depths
+    # The bits of positive floats sort like the floats, and integers sort faster.
     keys = depths.contiguous().view(torch.int32) if depths.dtype == torch.float32 else depths
-    return torch.sort(keys, stable=True).indices
-
-
-def _tile_boxes(splats: Splats2D, grid: tuple[int, int], kernels: Kernels, rules: Rules) -> TileBoxes:
-    limit = splats.means.new_tensor([grid[1], grid[0]])
+    order = torch.sort(keys, stable=True).indices
     columns = (splats.means, splats.covs, splats.dets, splats.opacities)
-    return TileBoxes(*kernels.run(table_kernel(rules.min_alpha), *columns, limit))
+    limit = splats.means.new_tensor([grid[1], grid[0]])
+    boxes = TileBoxes(*kernels.run(table_kernel(rules.min_alpha), *columns, limit))
+    for rows in _rows(boxes, grid, min(MAX_PAIRS, max(1, int(memory / PAIR_BYTES)))):
+        yield _bin(boxes, order, rows, grid[1], kernels, gradients)
 
 
 def _table_rows(
@@ -137,8 +128,8 @@ def _table_rows(
 
 
 def _rows(boxes: TileBoxes, grid: tuple[int, int], budget: int) -> list[tuple[int, int]]:
-    """Cut the grid into bands of whole tile rows with about `budget` candidate pairs and at most `SHORT` tiles each."""
-    most = max(1, SHORT // grid[1])
+    """Bands of whole tile rows, each of about `budget` candidate pairs and at most `MAX_SHORT_TILES` tiles."""
+    most = max(1, MAX_SHORT_TILES // grid[1])
     cuts = [*range(0, grid[0], most), grid[0]]
     if int((boxes.wide * (boxes.bottom - boxes.top)).sum()) > budget:
         wide = boxes.wide.long()
@@ -158,20 +149,20 @@ def _bin(
     down, band = starts_of(heights), order.new_tensor([rows[0], columns])
     first, widths, owners = kernels.run(SPANS, runs_of(down, heights), order, down, boxes.table, band)
     size = (rows[1] - rows[0]) * columns
-    first = first.short() if size <= SHORT else first  # half as many bits sort in half the time
+    first = first.short() if size <= MAX_SHORT_TILES else first  # half as many bits sort in half the time
     starts = starts_of(widths)
     tiles, splats = kernels.run(PAIRS, runs_of(starts, widths), starts, first, owners)
     by_tile, pairs = torch.sort(tiles, stable=True)
-    drawn = kernels.run(LISTS, splats, pairs)[0] if len(pairs) else splats.new_zeros(1)
+    lists = kernels.run(LISTS, splats, pairs)[0] if len(pairs) else splats.new_zeros(1)
     tile = torch.arange(size, device=order.device)
     ends = torch.searchsorted(by_tile, tile.to(tiles), right=True)
     counts = torch.diff(ends, prepend=ends.new_zeros(1))
     origins = torch.stack([tile % columns, tile // columns + rows[0]], dim=1) * TILE
-    kept = None
+    by_splat = None
     if gradients:
         ahead = torch.cat([starts, starts.new_full((1,), len(pairs))])
-        kept = Pairs(order, ahead.index_select(0, down), pairs, by_tile)
-    return Bins(drawn, ends - counts, counts, origins.to(boxes.table), columns, kept)
+        by_splat = Pairs(order, ahead.index_select(0, down), pairs, by_tile)
+    return Bins(lists, ends - counts, counts, origins.to(boxes.table), columns, by_splat)
 
 
 def _spans(

@@ -28,8 +28,8 @@ from aaplug.rasterizers.tiled.layout import placed
 STEP = 4  # splats per backward step; transmittance is stored before each step.  With 8 the sums leave the registers
 CHECK_PASSES, CHECK_TILES = 2, 1000  # least passes, and tiles in them, between checks for saturated tiles
 COMPACT_BELOW = 3 / 4  # saturated tiles are dropped once the share of unsaturated ones is below this
-FEWEST = 2  # tiles in a pass: compiled kernels take no fewer, and a tile without splats left stays as it is
-GATE = 1e9  # lifts any nonzero output of `threshold` above 1, so that min(output · GATE, value) is `value` or 0
+MIN_TILES = 2  # tiles in a pass: compiled kernels take no fewer, and a tile without splats left stays as it is
+MASK_GAIN = 1e9  # lifts any nonzero output of `threshold` above 1: the smaller of that and a value is 0 or the value
 EXAMPLE_TILES, EXAMPLE_SPLATS = 1024, 4096  # as large as real work: inductor chooses by them which loops use threads
 EXAMPLE_LIST = 16  # splats of each tile
 
@@ -42,13 +42,8 @@ class Compositing:
     rules: Rules
     kernels: Kernels
 
-    @property
-    def kernel(self) -> Kernel:
-        """One pass."""
-        return pass_kernel(self.pixel, self.rules)
 
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Segment:
     """The passes between two compactions of the list of tiles; kept for the backward pass.
 
@@ -76,8 +71,8 @@ def composite_forward(
     local = tile_centres(rows)
     planes = rows.new_zeros(4, len(bins.counts), PIXELS)
     order = torch.sort(bins.counts, descending=True, stable=True).indices
-    drawn = max(FEWEST, int((bins.counts > 0).sum()))
-    tiles = order[:drawn].tensor_split(-(-drawn // how.kernels.tiles)) if len(order) else ()
+    filled = max(MIN_TILES, int((bins.counts > 0).sum()))
+    tiles = order[:filled].tensor_split(-(-filled // how.kernels.tiles)) if len(order) else ()
     done = 0
     for block in tiles:
         _composite_block(rows, bins, block, planes[:, done : done + len(block)], local, how, segments)
@@ -96,8 +91,8 @@ def _composite_block(
     segments: list[Segment] | None,
 ) -> None:
     """Composite one block of tiles into `image`, until their splats run out or every pixel is saturated."""
-    T = rows.new_ones(len(tiles), PIXELS)
-    planes, kept = image, None
+    T, kernel = rows.new_ones(len(tiles), PIXELS), pass_kernel(how.pixel, how.rules)
+    planes, places = image, None  # of the tiles that are left, and where they lie in the image
     start, splats = 0, how.pixel.splats_per_pass
     while len(tiles):
         first, counts, origins = (x.index_select(0, tiles) for x in (bins.first, bins.counts, bins.origins))
@@ -113,10 +108,10 @@ def _composite_block(
                 T, part = T[:n], [x[:n] for x in whole]
             begin, end, corners, *light, unit = part
             args = (rows, bins.splats, begin + i * splats, end, corners, T, *light, *local, unit)
-            run = run or how.kernels.runner(how.kernel, args)
+            run = run or how.kernels.runner(kernel, args)
             *within, after = run(*args)
-            drawn = steps[i * splats // STEP :]
-            before += [x[:m] for x, m in zip((T, *within), drawn, strict=False)]
+            tiles_of_steps = steps[i * splats // STEP :]
+            before += [x[:m] for x, m in zip((T, *within), tiles_of_steps, strict=False)]
             T = after
             start += splats
             passes, passed = passes + 1, passed + n
@@ -125,22 +120,22 @@ def _composite_block(
                 alive = T[: going[i + 1]].amax(dim=1) > 0
                 count = int(alive.sum())
                 if count < COMPACT_BELOW * len(alive):
-                    if 0 < count < FEWEST:
-                        alive[:FEWEST] = True
+                    if 0 < count < MIN_TILES:
+                        alive[:MIN_TILES] = True
                     rest = alive.nonzero().squeeze(1)
                     break
-        if kept is not None:
-            image.index_copy_(1, kept, planes)
-        kept = rest if kept is None else kept.index_select(0, rest)
+        if places is not None:
+            image.index_copy_(1, places, planes)
+        places = rest if places is None else places.index_select(0, rest)
         tiles, T = tiles.index_select(0, rest), T.index_select(0, rest)
         planes = planes.index_select(1, rest)
 
 
 def _going(counts: Int[Tensor, " t"], at_once: int) -> list[int]:
-    """How many tiles take part in each pass of `at_once` splats; `counts`: splats left per tile, falling."""
+    """The number of tiles in each pass of `at_once` splats.  counts: splats left per tile, falling."""
     passes = ((counts + (at_once - 1)) // at_once).int()
     turns = torch.arange(1, int(passes[0]) + 1, dtype=torch.int32, device=counts.device)
-    going = torch.searchsorted(-passes, -turns, right=True).clamp(min=min(FEWEST, len(passes)))
+    going = torch.searchsorted(-passes, -turns, right=True).clamp(min=min(MIN_TILES, len(passes)))
     return going.tolist()
 
 
@@ -167,10 +162,10 @@ def _pass(
     one: 1 per tile; multiplying by it makes the compiler keep one loop over tiles.
     """
     one = one[:, None]
-    before, seen = T, []
+    before, left = T, []
     pixels = Pixels(origins, local_x, local_y)
-    drawn = next_rows(rows, ids, at, ends, pixel.splats_per_pass)
-    for row, alpha in in_turn(pixel, rules, drawn, pixels):
+    nearest = next_rows(rows, ids, at, ends, pixel.splats_per_pass)
+    for row, alpha in in_turn(pixel, rules, nearest, pixels):
         after = before * transmitted(alpha, one, rules)
         weight = where_above(rules.below_min_transmittance, after, less(before, after, one))
         before = after
@@ -178,9 +173,9 @@ def _pass(
         green.addcmul_(weight, row[:, GREEN, None])
         blue.addcmul_(weight, row[:, BLUE, None])
         hidden.add_(weight)
-        seen.append(before)
+        left.append(before)
     bound = rules.below_min_transmittance
-    return tuple(torch.threshold(one * x, bound, 0.0) for x in seen[STEP - 1 :: STEP])
+    return tuple(torch.threshold(one * x, bound, 0.0) for x in left[STEP - 1 :: STEP])
 
 
 def in_turn(
@@ -219,7 +214,7 @@ def where_above(bound: float, test: Tensor, value: Tensor) -> Tensor:
     """`value` where `test` > `bound`, else 0; needs bound >= 0 and 0 <= value <= 1."""
     if torch.compiler.is_compiling():
         return torch.where(test > bound, value, 0.0)
-    return torch.minimum(torch.threshold(test, bound, 0.0).mul_(GATE), value)
+    return torch.minimum(torch.threshold(test, bound, 0.0).mul_(MASK_GAIN), value)
 
 
 def rows_example(pixel: PixelKernel) -> Float[Tensor, "m c"]:

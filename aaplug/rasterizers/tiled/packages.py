@@ -1,6 +1,6 @@
 """Kernels that do more than run eagerly: compiled packages where they fit, and counting the work of compositing."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -11,7 +11,7 @@ from torch import Tensor
 from aaplug.core.kernels import BACKWARD, Kernel, Kernels, Runner
 from aaplug.methods.pixel_kernels.raster_rows import PIXELS
 
-ROWS = 1 << 15  # whose gradients are computed at once, so that what lies between fits the cache
+MAX_GRADIENT_ROWS = 1 << 15  # whose gradients are computed at once, so that what lies between fits the cache
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Package:
         return self.run([arg.contiguous() for arg in args])
 
     def takes(self, args: tuple[Tensor, ...]) -> bool:
-        """Whether it can run these arguments; a leading size of one is a separate case to the compiler."""
+        """True if it can run these arguments; a leading size of one is a separate case to the compiler."""
         for arg, (dtype, rest) in zip(args, self.types, strict=True):
             shape = arg.shape
             if arg.dtype is not dtype or shape[1:] != rest or shape[0] < 2 or not arg.is_cpu:
@@ -58,21 +58,24 @@ class CompiledKernels(Kernels):
 
     def __init__(
         self,
-        packages: Mapping[str, Package],
-        later: Callable[[str], Package | None] = lambda name: None,
+        package_of: Callable[[Kernel], Package | None],
+        gradients: Sequence[Kernel] = (),
         reload: Callable[[], Kernels] = Kernels,
     ):
-        """packages: by their kernels' names.  later: loads another when it is first needed.  reload: for unpickling."""
-        self._reload = reload
-        self._packages: dict[str, Package | None] = dict(packages)
-        self._later = later
+        """package_of: loads a kernel's package when it is first needed.  gradients: kernels that differentiate others.
+
+        reload: for unpickling.
+        """
+        self._package_of, self._reload = package_of, reload
+        self._gradients = {kernel.name: kernel for kernel in gradients}
+        self._packages: dict[str, Package | None] = {}  # by their kernels' names
 
     def __reduce__(self) -> tuple[Callable[[], Kernels], tuple[()]]:
         return self._reload, ()
 
     def runner(self, kernel: Kernel, args: tuple[Tensor, ...]) -> Runner:
-        """What runs one stage for such arguments."""
-        package = self._package(kernel.name)
+        """The function that runs one stage for such arguments."""
+        package = self._package(kernel)
         if package is None or not package.takes(args):
             return kernel.function
         if not (torch.is_grad_enabled() and any(arg.requires_grad for arg in args)):
@@ -80,13 +83,14 @@ class CompiledKernels(Kernels):
                 return package.run_whole
             assert all(args[i].is_contiguous() for i in kernel.updates), f"{kernel.name} would update copies"
             return package.run_any
-        backward = self._package(kernel.name + BACKWARD)
+        gradient = self._gradients.get(kernel.name + BACKWARD)
+        backward = None if gradient is None else self._package(gradient)
         return kernel.function if backward is None else partial(_Tracked.apply, package, backward)
 
-    def _package(self, name: str) -> Package | None:
-        if name not in self._packages:
-            self._packages[name] = self._later(name)
-        return self._packages[name]
+    def _package(self, kernel: Kernel) -> Package | None:
+        if kernel.name not in self._packages:
+            self._packages[kernel.name] = self._package_of(kernel)
+        return self._packages[kernel.name]
 
 
 class _Tracked(torch.autograd.Function):
@@ -102,22 +106,22 @@ class _Tracked(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         args = ctx.saved_tensors
-        found = iter(_pulled_back(ctx.package, args, [grad.contiguous() for grad in grads]))
-        return None, None, *(next(found) if arg.is_floating_point() else None for arg in args)
+        results = iter(_pulled_back(ctx.package, args, [grad.contiguous() for grad in grads]))
+        return None, None, *(next(results) if arg.is_floating_point() else None for arg in args)
 
 
 def _pulled_back(package: Package, args: Sequence[Tensor], grads: list[Tensor]) -> list[Tensor]:
     """Gradients of the floating point arguments; a part of the rows at a time, where all have one leading size."""
-    given = list(zip([*args, *grads], package.sizes, strict=True))
-    rows = {size: len(arg) for arg, size in given if size is not None}
+    sized = list(zip([*args, *grads], package.sizes, strict=True))
+    rows = {size: len(arg) for arg, size in sized if size is not None}
     longest = max(rows.values())
-    if len(rows) > 1 or longest <= ROWS:
-        return package.run([arg for arg, _ in given])
-    parts = -(-longest // ROWS)
-    split = [[arg] * parts if size is None else arg.tensor_split(parts) for arg, size in given]
-    found = zip(*(package.run([*part]) for part in zip(*split, strict=True)), strict=True)
-    sizes = [size for arg, size in given[: len(args)] if arg.is_floating_point()]
-    return [torch.stack(x).sum(0) if size is None else torch.cat(x) for x, size in zip(found, sizes, strict=True)]
+    if len(rows) > 1 or longest <= MAX_GRADIENT_ROWS:
+        return package.run([arg for arg, _ in sized])
+    parts = -(-longest // MAX_GRADIENT_ROWS)
+    split = [[arg] * parts if size is None else arg.tensor_split(parts) for arg, size in sized]
+    results = zip(*(package.run([*part]) for part in zip(*split, strict=True)), strict=True)
+    sizes = [size for arg, size in sized[: len(args)] if arg.is_floating_point()]
+    return [torch.stack(x).sum(0) if size is None else torch.cat(x) for x, size in zip(results, sizes, strict=True)]
 
 
 class CountingKernels(Kernels):
@@ -129,7 +133,7 @@ class CountingKernels(Kernels):
         self.name, self.tiles = kernels.name, kernels.tiles
 
     def runner(self, kernel: Kernel, args: tuple[Tensor, ...]) -> Runner:
-        """What runs a kernel and counts."""
+        """The function that runs a kernel, and counts."""
         run = self._kernels.runner(kernel, args)
 
         def counting(*args: Tensor) -> Sequence[Tensor]:

@@ -15,22 +15,23 @@ from itertools import chain
 import torch
 from torch import Tensor
 
-from aaplug.core.errors import UsageError
+from aaplug.core.colours import Colour
 from aaplug.core.imaging import over
-from aaplug.core.interfaces import Colour, Compositor, PixelKernel
+from aaplug.core.interfaces import Compositor, PixelKernel
 from aaplug.core.kernels import EAGER, Kernels
 from aaplug.core.rules import RULES_3DGS, Rules
 from aaplug.core.splats import Render, Splats2D
-from aaplug.methods.pixel_kernels import POINT
+from aaplug.methods.pixel_kernels.point import POINT
 from aaplug.methods.pixel_kernels.raster_rows import TILE, tile_centres
 from aaplug.rasterizers.tiled.backward import composite
-from aaplug.rasterizers.tiled.binning import MEMORY, Bins, bands
+from aaplug.rasterizers.tiled.binning import MEMORY_BYTES, Bins, bands
 from aaplug.rasterizers.tiled.forward import Compositing
 from aaplug.rasterizers.tiled.layout import placed
 from aaplug.rasterizers.tiled.packages import CountingKernels
+from aaplug.system.errors import UsageError
 
 Painter = Callable[[Bins], tuple[Tensor, Tensor]]  # a band's premultiplied colour, three planes, and alpha
-BLENDED_TILES = 512  # composited together by a compositor, so that what it keeps per pixel fits the cache
+MAX_BLENDED_TILES = 512  # composited together by a compositor, so that what it keeps per pixel fits the cache
 
 
 @dataclass(frozen=True)
@@ -41,11 +42,11 @@ class Tiled:
     """
 
     kernels: Kernels = EAGER
-    memory: float = MEMORY
+    memory: float = MEMORY_BYTES
 
     @property
     def name(self) -> str:
-        """How its kernels run."""
+        """The name of its kernels: eager or compiled."""
         return self.kernels.name
 
     def within(self, memory: float) -> "Tiled":
@@ -96,7 +97,7 @@ class Tiled:
         def paint(bins: Bins) -> tuple[Tensor, Tensor]:
             order = torch.sort(bins.counts, descending=True, stable=True).indices
             parts = []
-            for tiles in order.split(BLENDED_TILES):
+            for tiles in order.split(MAX_BLENDED_TILES):
                 x, y = (bins.origins[tiles, i, None] + local[i] for i in (0, 1))
                 lists = (bins.splats, bins.first[tiles], bins.counts[tiles])
                 parts.append(compositor.tiles(rows, splats.window, *lists, (x, y), self.kernels, rules))
@@ -118,3 +119,6 @@ def _assembled(bands: Iterator[Render], height: int) -> Render:
         whole.rgb[top:bottom], whole.alpha[top:bottom] = band
         top = bottom
     return whole
+
+
+EAGER_TILED = Tiled()

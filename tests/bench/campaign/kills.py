@@ -10,9 +10,9 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-from aaplug.core.locks import OURS, SCRATCH
 from aaplug.io.images import read_image
 from aaplug.io.scenes import read_scene
+from aaplug.system.locks import OUR_PREFIX, SCRATCH_PREFIX
 from tests.conftest import SAMPLE
 from tests.test_batch import timeless
 
@@ -52,7 +52,7 @@ def torn(folder: Path) -> list[str]:
     """Outputs that cannot be read."""
     bad = []
     for path in folder.rglob("*"):
-        if path.name.startswith(OURS):
+        if path.name.startswith(OUR_PREFIX):
             continue
         try:
             if path.suffix == ".ply":
@@ -101,7 +101,7 @@ def _one(folder: Path, words: str, resumes: bool, whole: dict[str, object], mome
     if code and resumes and start(folder, f"{words} --overwrite").wait() == 0:
         code = 0  # it had ended before it was killed, so that there was nothing to resume
     time.sleep(0.2)  # workers notice the death of their parent
-    left = [p.name for p in folder.rglob("*") if p.name.startswith((OURS, SCRATCH))]
+    left = [p.name for p in folder.rglob("*") if p.name.startswith((OUR_PREFIX, SCRATCH_PREFIX))]
     if code or left or content(folder / "out") != whole:
         return f"killed at {moment:.2f} s: exit code {code}, left {left}, same {content(folder / 'out') == whole}"
     return ""

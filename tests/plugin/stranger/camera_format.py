@@ -10,8 +10,8 @@ from pathlib import Path
 import torch
 
 from aaplug.core.cameras import Camera, CameraSet, look_at
-from aaplug.core.errors import FormatError, UsageError
 from aaplug.io.cameras.options import Options
+from aaplug.system.errors import FormatError, UsageError
 
 NUMBERS = 10
 UP = torch.tensor([0.0, 0.0, 1.0])

@@ -6,11 +6,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from aaplug.core.colours import Colour
 from aaplug.core.imaging import over
-from aaplug.core.interfaces import Colour, Compositor, PixelKernel
+from aaplug.core.interfaces import Compositor, PixelKernel
 from aaplug.core.rules import RULES_3DGS, Rules
 from aaplug.core.splats import Render, Splats2D
-from aaplug.methods.pixel_kernels import POINT
+from aaplug.methods.pixel_kernels.point import POINT
 
 
 @dataclass(frozen=True)

@@ -9,12 +9,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.errors import FormatError
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.spherical_harmonics import COLOUR_OFFSET, SH_C0
 from aaplug.io.atomic import replacing
 from aaplug.io.scenes.options import Options
 from aaplug.io.scenes.scene_file import SceneFile, check_count, library_errors, logit_of, sh_of_colour
+from aaplug.system.errors import FormatError
 
 COLUMNS = 8
 EVIDENCE = "the format does not say: assumed classic (3DGS default)"

@@ -13,29 +13,27 @@ from typing import Any
 
 from markupsafe import Markup
 
+from aaplug.evaluation.coverage import Coverage
 from aaplug.evaluation.image_store import TRUTHS, ImageStore
 from aaplug.evaluation.metric import Metric
+from aaplug.evaluation.report.pages import assembled
 from aaplug.evaluation.report.plots import BOUNDS, Plot
-from aaplug.evaluation.results import CEILING, Facts, Report, as_csv, mean, rows, scale_name, work
-from aaplug.inspection.coverage import Coverage
+from aaplug.evaluation.results import CEILING, Facts, Report, as_csv, cost_cells, mean, metric_cells, scale_name
 from aaplug.io.images import encode_webp, image_size, read_image
-from aaplug.pages import assembled
 
-COSTS = (  # what the tables of `work` mean
+COSTS = (  # the meaning of the tables of `cost_cells`
     "rendering alone, on the machine that the protocol names; below, the quartiles over the views",
     "splat-pixel evaluations of compositing; below, the standard deviation over the views",
 )
-BUDGET = 12_000_000  # bytes of lossless images; a larger page opens slowly and gets lossy ones
-LOSSY = 90  # WebP quality above the budget
+LOSSLESS_BYTES = 12_000_000  # of all images; a larger page opens slowly and gets lossy ones
+LOSSY_QUALITY = 90  # of WebP
 TRUTH = "truth"  # the role of the true image, beside the recipes
 AGAINST = {"photographs": "photographs", "self": "the scene's own supersampled look", "reference": "the first scene"}
-HIDDEN = ("metrics", "view_names")  # parts of the protocol that the page shows elsewhere
-
-Key = tuple[int, float, str]  # view, scale, and a recipe or TRUTH
+SHOWN_ELSEWHERE = ("metrics", "view_names")  # parts of the protocol
 
 
 def page(
-    name: str, report: Report, found: Coverage, drawn: list[Plot], images: ImageStore, facts: Sequence[Facts] = ()
+    name: str, report: Report, bounds: Coverage, plots: list[Plot], images: ImageStore, facts: Sequence[Facts] = ()
 ) -> str:
     """The page's text; raises FormatError where an image that it shows is missing.  facts: further tables."""
     return assembled(
@@ -53,45 +51,41 @@ def page(
         fact_tables=facts,
         against=AGAINST[report.protocol["truth"]],
         notes=report.notes,
-        coverage=found,
+        coverage=bounds,
         scale_name=scale_name,
-        plots=[(plot, Markup(plot.inline_svg())) for plot in drawn],
+        plots=[(plot, Markup(plot.inline_svg())) for plot in plots],
         bounds=BOUNDS,
         gallery=_gallery(report, images),
-        facts=[(k.replace("_", " "), _text(v)) for k, v in report.protocol.items() if k not in HIDDEN],
+        facts=[(k.replace("_", " "), _text(v)) for k, v in report.protocol.items() if k not in SHOWN_ELSEWHERE],
         csv=as_csv({name: report}),
     )
 
 
 def _headline(report: Report) -> dict[str, str] | None:
     """Best and worst recipe at the scale farthest below the training size; None where nothing was compared."""
-    metric = next(iter(report.compared), None)
-    if metric is None:
-        return None
-    for scale in sorted(report.scales, key=lambda s: min(s, 1 / s)):
-        means = {r: mean(report.select(r, scale), metric.name) for r in report.recipes}
-        ceiling = means.pop(CEILING, None)
-        losses = {r: metric.loss(value) for r, value in means.items() if value is not None}
-        if len(losses) > 1:
-            best, worst = min(losses, key=losses.__getitem__), max(losses, key=losses.__getitem__)
-            return {
-                "scale": scale_name(scale),
-                "best": best,
-                "best_value": _with_unit(metric, means[best]),
-                "worst": worst,
-                "worst_value": _with_unit(metric, means[worst]),
-                "ceiling_value": "" if ceiling is None else _with_unit(metric, ceiling),
-            }
+    for metric in report.compared[:1]:
+        for scale in sorted(report.scales, key=lambda s: min(s, 1 / s)):
+            means = {r: mean(report.select(r, scale), metric.name) for r in report.recipes}
+            ceiling = means.pop(CEILING, None)
+            losses = {r: metric.loss(value) for r, value in means.items() if value is not None}
+            if len(losses) > 1:
+                best, worst = min(losses, key=losses.__getitem__), max(losses, key=losses.__getitem__)
+                return {
+                    "scale": scale_name(scale),
+                    "best": best,
+                    "best_value": _with_unit(metric, means[best]),
+                    "worst": worst,
+                    "worst_value": _with_unit(metric, means[worst]),
+                    "ceiling_value": "" if ceiling is None else _with_unit(metric, ceiling),
+                }
     return None
 
 
 def _tables(report: Report) -> list[dict[str, Any]]:
-    """Title, what it means, and rows of (recipe, cells)."""
+    """Title, meaning, and rows of (recipe, cells)."""
     variants = report.protocol.get("metrics", {})
-    tables = [
-        (metric.title, variants.get(metric.name, metric.protocol), rows(report, metric)) for metric in report.metrics
-    ]
-    tables += [(title, about, cells) for about, (title, cells) in zip(COSTS, work(report), strict=False)]
+    tables = [(m.title, variants.get(m.name, m.protocol), metric_cells(report, m)) for m in report.metrics]
+    tables += [(title, about, cells) for about, (title, cells) in zip(COSTS, cost_cells(report), strict=False)]
     return [
         {"title": title, "about": about, "rows": list(zip(report.recipes, cells, strict=True))}
         for title, about, cells in tables
@@ -110,69 +104,50 @@ def _text(value: Any) -> str:
 
 
 def _gallery(report: Report, images: ImageStore) -> dict[str, Any]:
-    """JSON-ready data for page.js: what the before/after viewer shows."""
-    names = report.protocol["view_names"]
+    """JSON-ready data for page.js: views, scales and roles of the viewer, and its images with their scores."""
+    names, files = report.protocol["view_names"], dict[tuple[int, float], dict[str, Path]]()
+    for view, scale in product(images.report_views, report.scales):
+        files[view, scale] = {recipe: images.path(view, recipe, scale) for recipe in report.recipes}
+        truth = images.path(view, report.recipes[-1], scale, TRUTHS)
+        if truth.is_file():
+            files[view, scale][TRUTH] = truth
+    uris, scores, shots = _uris([path for roles in files.values() for path in roles.values()]), _scores(report), []
+    for (view, scale), roles in files.items():
+        width, height = image_size(roles[report.recipes[-1]])
+        pictures = {
+            r: {"uri": uris[path], "score": scores.get((names[view], scale, r), "")} for r, path in roles.items()
+        }
+        size = {"width": width, "height": height}
+        shots.append({"view": names[view], "scale": scale_name(scale), **size, "images": pictures})
     return {
-        "views": [names[view] for view in images.shown],
+        "views": [names[view] for view in images.report_views],
         "scales": [scale_name(scale) for scale in report.scales],
         "truth": TRUTH,
         "truthName": "photograph" if report.protocol["truth"] == "photographs" else "truth",
         "ceiling": CEILING,
         "recipes": list(report.recipes),
-        "shots": _shots(report, images),
+        "shots": shots,
+    }
+
+
+def _uris(paths: Sequence[Path]) -> dict[Path, str]:
+    """Lossless images, or lossy ones where those would be too large."""
+    encoded = {path: encode_webp(read_image(path, None), None) for path in paths}
+    if sum(map(len, encoded.values())) > LOSSLESS_BYTES:
+        encoded = {path: encode_webp(read_image(path, None), LOSSY_QUALITY) for path in paths}
+    return {path: "data:image/webp;base64," + base64.b64encode(webp).decode() for path, webp in encoded.items()}
+
+
+def _scores(report: Report) -> dict[tuple[str, float, str], str]:
+    """By view, scale and recipe: the value of the report's first metric against the truth, as text."""
+    return {
+        (m.view, m.scale, m.recipe): _with_unit(metric, value)
+        for metric in report.compared[:1]
+        for m in report.measurements
+        if (value := m.values.get(metric.name)) is not None
     }
 
 
 def _with_unit(metric: Metric, value: float | None) -> str:
     """A value in words: 31.20 dB."""
     return f"{metric.text(value)} {metric.unit}".rstrip()
-
-
-def _shots(report: Report, images: ImageStore) -> list[dict[str, Any]]:
-    """The images of every view at every scale, with their scores."""
-    files, scores, shots = _files(report, images), _scores(report), []
-    uris = _uris(files)
-    for view, scale in product(images.shown, report.scales):
-        name = report.protocol["view_names"][view]
-        width, height = image_size(files[view, scale, report.recipes[-1]])
-        shown = {
-            role: {"uri": uri, "score": scores.get((name, scale, role), "")}
-            for (of, at, role), uri in uris.items()
-            if (of, at) == (view, scale)
-        }
-        size = {"width": width, "height": height}
-        shots.append({"view": name, "scale": scale_name(scale), **size, "images": shown})
-    return shots
-
-
-def _files(report: Report, images: ImageStore) -> dict[Key, Path]:
-    files: dict[Key, Path] = {}
-    for view, scale in product(images.shown, report.scales):
-        files |= {(view, scale, recipe): images.path(view, recipe, scale) for recipe in report.recipes}
-        truth = images.path(view, report.recipes[-1], scale, TRUTHS)
-        if truth.is_file():
-            files[view, scale, TRUTH] = truth
-    return files
-
-
-def _uris(files: dict[Key, Path]) -> dict[Key, str]:
-    """Lossless images, or lossy ones where those would exceed the budget."""
-
-    def encoded_at(quality: int | None) -> dict[Key, bytes]:
-        return {key: encode_webp(read_image(path, None), quality) for key, path in files.items()}
-
-    encoded = encoded_at(None)
-    if sum(map(len, encoded.values())) > BUDGET:
-        encoded = encoded_at(LOSSY)
-    prefix = "data:image/webp;base64,"
-    return {key: prefix + base64.b64encode(webp).decode() for key, webp in encoded.items()}
-
-
-def _scores(report: Report) -> dict[tuple[str, float, str], str]:
-    """By view, scale and recipe: the value of the report's first metric against the truth, as text."""
-    metric = next(iter(report.compared), None)
-    return {
-        (m.view, m.scale, m.recipe): _with_unit(metric, value)
-        for m in report.measurements
-        if metric is not None and (value := m.values.get(metric.name)) is not None
-    }

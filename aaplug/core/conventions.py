@@ -1,0 +1,34 @@
+"""Conventions: how training turned a projected covariance into pixels, and when scene and cameras fit together.
+
+They are plain data and import no torch, so that the command line knows their names at once.
+"""
+
+from dataclasses import dataclass
+
+from aaplug.core.rules import RULES_3DGS, Rules
+
+MIN_SEEN_SHARE = 0.5  # cameras that see a smaller share of the Gaussians are taken to be in another frame
+
+
+@dataclass(frozen=True)
+class Convention:
+    """The steps by which training turned a projected covariance into pixels.
+
+    kernel: variance added to the covariance's diagonal, in px² of the training image.
+    compensated: true where opacity was then multiplied by √(det C / det(C + kernel·I)).
+    rules: of compositing.
+    """
+
+    name: str
+    kernel: float
+    compensated: bool
+    rules: Rules = RULES_3DGS
+
+
+CLASSIC = Convention("classic", 0.3, compensated=False)  # 3DGS (Kerbl et al. 2023)
+ANTIALIASED = Convention("antialiased", 0.3, compensated=True)  # 3DGS --antialiasing, gsplat "antialiased"
+MIP = Convention("mip", 0.1, compensated=True)  # Mip-Splatting (Yu et al. 2024), arXiv 2311.16493
+# PlayCanvas (engine 2.23.3) adds 0.3 in half pixels; what is fitted to it records that as its training
+PLAYCANVAS = Convention("playcanvas", 0.3 / 4, compensated=True)
+PLAYCANVAS_CLASSIC = Convention("playcanvas-classic", 0.3 / 4, compensated=False)  # its anti-aliasing is off
+CONVENTIONS = {c.name: c for c in (CLASSIC, ANTIALIASED, MIP, PLAYCANVAS, PLAYCANVAS_CLASSIC)}

@@ -1,0 +1,117 @@
+"""Statistics of a whole scene, gathered part by part in bounded memory."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from aaplug.core.cameras import Camera
+from aaplug.core.gaussians import Gaussians
+from aaplug.core.sampling import check_frame, sampling_bounds
+from aaplug.evaluation.coverage import log_multiples, middle_log_scales
+from aaplug.io.scenes.scene_file import Scene, probes
+from aaplug.system.monitor import Tell
+
+PROBE_ROWS = 64  # Gaussians read at each place of the file
+BINS = 4096  # of a histogram
+NEEDLE_RATIO = 10.0  # longest axis over the middle one, from which a Gaussian is a needle
+
+
+class Histogram:
+    """Counts of values between two ends; the first and the last bin also count what lies outside."""
+
+    def __init__(self, low: float, high: float) -> None:
+        self.low, self.high = low, high
+        self.counts = torch.zeros(BINS, dtype=torch.int64)
+
+    def add(self, values: Float[Tensor, " n"]) -> None:
+        """Count values."""
+        share = (values.double() - self.low) / (self.high - self.low)
+        bins = (share * BINS).clamp(0, BINS - 1).long()
+        self.counts += torch.bincount(bins, minlength=BINS)
+
+    def quantile(self, share: float) -> float | None:
+        """Middle of the bin that holds this quantile; None without values."""
+        if not (total := int(self.counts.sum())):
+            return None
+        place = int(torch.searchsorted(self.counts.cumsum(0), max(1, math.ceil(share * total))))
+        return self.low + (place + 0.5) * (self.high - self.low) / BINS
+
+    def share_below(self, value: float) -> float | None:
+        """Share of the values in bins below that of a value; None without values."""
+        place = min(BINS, max(0, round((value - self.low) / (self.high - self.low) * BINS)))
+        return int(self.counts[:place].sum()) / total if (total := int(self.counts.sum())) else None
+
+
+@dataclass(eq=False)
+class Survey:
+    """Counts over a scene.  Opacities lie in [0, 1]; scales, rates and multiples are natural logarithms.
+
+    seen, under: Gaussians that a camera sees, and those of them below their sampling bound.
+    needles: Gaussians more than `NEEDLE_RATIO` times as long as broad.
+    above_zero: Gaussians with three log-scales above 0.  activated: with an opacity logit in [0, 1].
+    rates: highest sampling rate in training.  multiples: extent over the sampling bound.
+    largest: log-scale.  filtered: true if a 3D filter is stored.  faults: unusable rows by their fault.
+    """
+
+    cameras: Sequence[Camera] = ()
+    count: int = 0
+    seen: int = 0
+    under: int = 0
+    needles: int = 0
+    above_zero: int = 0
+    activated: int = 0
+    low: Float[Tensor, "3"] = field(default_factory=lambda: torch.full((3,), torch.inf))
+    high: Float[Tensor, "3"] = field(default_factory=lambda: torch.full((3,), -torch.inf))
+    opacities: Histogram = field(default_factory=lambda: Histogram(0.0, 1.0))
+    scales: Histogram = field(default_factory=lambda: Histogram(-35.0, 35.0))
+    rates: Histogram = field(default_factory=lambda: Histogram(-35.0, 35.0))
+    multiples: Histogram = field(default_factory=lambda: Histogram(-20.0, 20.0))
+    largest: float = -math.inf
+    filtered: bool = False
+    faults: dict[str, int] = field(default_factory=dict)
+
+    def add(self, part: Gaussians) -> None:
+        """Count a part of the scene."""
+        self.filtered |= part.filter_3d is not None
+        if not len(part):
+            return
+        self.count += len(part)
+        low, high = part.means.aminmax(dim=0)
+        self.low, self.high = torch.minimum(self.low, low), torch.maximum(self.high, high)
+        self.opacities.add(part.opacities)
+        self.scales.add(middle_log_scales(part))
+        self.largest = max(self.largest, part.log_scales.max().item())
+        _, broad, long = part.log_scales.sort(dim=1).values.unbind(dim=1)
+        self.needles += int((long - broad > math.log(NEEDLE_RATIO)).sum())
+        self.above_zero += int((part.log_scales > 0).all(dim=1).sum())
+        logits = part.logit_opacities
+        self.activated += int(((logits >= 0) & (logits <= 1)).sum())
+        if not self.cameras:
+            return
+        bounds = sampling_bounds(part.means, self.cameras)
+        self.seen += int(bounds.seen.sum())
+        self.rates.add(bounds.highest[bounds.seen].log())
+        multiples = log_multiples(part, bounds)
+        self.multiples.add(multiples)
+        self.under += int((multiples < 0).sum())
+
+
+def survey(opened: Scene, cameras: Sequence[Camera] = (), tell: Tell = lambda done, total: None) -> Survey:
+    """Survey a scene; unusable rows are counted and left out.  `tell` is called with Gaussians done and in all."""
+    found = Survey(cameras)
+    for part in opened.parts(faults=found.faults):
+        found.add(part)
+        tell(found.count, max(1, opened.count))
+    return found
+
+
+def check_frame_of(opened: Scene, cameras: Sequence[Camera], min_seen: float) -> float:
+    """`sampling.check_frame` on Gaussians from evenly spaced places of the file."""
+    means = [opened.load(rows.start, rows.stop).means for rows in probes(opened.count, PROBE_ROWS)]
+    sample = torch.cat(means) if means else torch.zeros(0, 3)
+    sample = sample[sample.isfinite().all(dim=1)]
+    return check_frame(sample, cameras, opened.name, min_seen)

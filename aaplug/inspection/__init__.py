@@ -1,1 +1,0 @@
-"""What a scene is and how finely training sampled it."""

@@ -1,0 +1,178 @@
+"""Pyramids on disk: a folder of plain .ply files, NAME_lod0.ply to NAME_lodN.ply, and lod.json, which describes them.
+
+lod.json: {"aaplug_levels": 1, "source": hash, "largest": n, "levels": [{"file", "rate", "hash", "chunks"}]}.  source:
+of the scene, the cameras and the options that the levels were made of.  largest: see `core.chunks`.  rate: the lowest
+sampling rate relative to training's that a level is meant for.  chunks: how many Gaussians each chunk has; all levels
+but the finest, which keeps the scene's order, lie chunk by chunk.
+"""
+
+import hashlib
+import json
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from os import PathLike
+from pathlib import Path
+from typing import NamedTuple, cast
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from aaplug.core.chunks import chunks_of
+from aaplug.core.gaussians import Gaussians
+from aaplug.core.pyramids import Pyramid
+from aaplug.io.atomic import replacing
+from aaplug.io.scenes import ply
+from aaplug.io.scenes.options import Options
+from aaplug.io.values import Entry, Place, entries, number, object_of, read_json, text
+from aaplug.system.errors import FormatError
+
+MANIFEST = "lod.json"
+KEY = "aaplug_levels"
+VERSION = 1
+MOST = 1 << 40  # Gaussians of a chunk: more is nonsense
+ENDS = 1 << 16  # bytes at either end of a level's file that its hash covers, with its size
+
+
+@dataclass(frozen=True)
+class LevelFile:
+    """A level and what its file should be; see the module."""
+
+    file: str
+    rate: float
+    hash: str
+    chunks: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """What lod.json says; see the module."""
+
+    source: str
+    largest: int
+    levels: tuple[LevelFile, ...]
+
+    @property
+    def described(self) -> str:
+        """In words."""
+        counts = " > ".join(f"{sum(level.chunks):,}" for level in self.levels)
+        return f"{len(self.levels)} levels of detail: {counts} Gaussians, down to {self.levels[-1].rate:.3g} × training"
+
+
+class Level(NamedTuple):
+    """A lighter scene.
+
+    rate: the lowest sampling rate relative to training's that it is meant for.
+    chunks: of each Gaussian; None if it belongs to no pyramid.
+    """
+
+    scene: Gaussians
+    rate: float
+    chunks: Int[Tensor, " n"] | None = None
+
+
+def pyramid_of(levels: Sequence[Level]) -> Pyramid:
+    """The pyramid of these levels, the finest first."""
+    chunks = [level.chunks for level in levels if level.chunks is not None]
+    return Pyramid.of([level.scene for level in levels], chunks)
+
+
+def is_pyramid(folder: str | PathLike[str]) -> bool:
+    """Whether a folder holds a pyramid."""
+    return (Path(folder) / MANIFEST).is_file()
+
+
+def read_manifest(folder: str | PathLike[str]) -> Manifest:
+    """Read lod.json.
+
+    Raises:
+        FormatError: it breaks its format or is of a newer version.
+    """
+    path = Path(folder) / MANIFEST
+    about = object_of(read_json(path), path, "the pyramid", f"'{KEY}'", KEY)
+    version = about.get(KEY, number)
+    about.place.expect(version == VERSION, KEY, f"version {VERSION}", f"version {version:g}, of another aaplug")
+    items = [_level(entry) for entry in entries(path, "levels", about.fields.get("levels"))]
+    largest = int(about.get("largest", number))
+    return Manifest(about.get("source", text), largest, tuple(items))
+
+
+def read_pyramid(folder: str | PathLike[str]) -> Pyramid:
+    """Read a folder that `aaplug.lod` wrote.
+
+    Raises:
+        FormatError: lod.json or a level is missing, broken, or not what it should be.
+    """
+    return pyramid_of(list(levels_in(folder, read_manifest(folder))))
+
+
+def levels_in(folder: str | PathLike[str], manifest: Manifest) -> Iterator[Level]:
+    """The levels of a folder; see `read_pyramid`."""
+    for place, entry in enumerate(manifest.levels):
+        path = path_of(Path(folder), entry)
+        scene, sizes = ply.open_scene(path, Options()).gaussians(), torch.tensor(entry.chunks)
+        problem = FormatError(path, f"does not have the chunks that {MANIFEST} lists")
+        if sizes.sum() != len(scene):  # before memory is taken for as many as it says
+            raise problem
+        chunks = (
+            torch.arange(len(sizes)).repeat_interleave(sizes) if place else chunks_of(scene.means, manifest.largest)
+        )
+        if not torch.equal(torch.bincount(chunks, minlength=len(sizes)), sizes):
+            raise problem
+        yield Level(scene, entry.rate, chunks)
+
+
+def write_manifest(folder: str | PathLike[str], manifest: Manifest) -> None:
+    """Write lod.json, replacing it.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    content = {KEY: VERSION, **asdict(manifest)}
+    with replacing(Path(folder) / MANIFEST, overwrite=True) as stream:
+        stream.write(json.dumps(content).encode())
+
+
+def hash_of(path: Path) -> str:
+    """Hash of a file's size and ends, in a time that does not depend on its size.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    size = path.stat().st_size
+    digest = hashlib.sha256(str(size).encode())
+    with path.open("rb") as stream:
+        digest.update(stream.read(ENDS))
+        stream.seek(max(0, size - ENDS), os.SEEK_SET)
+        digest.update(stream.read(ENDS))
+    return digest.hexdigest()
+
+
+def path_of(folder: Path, level: LevelFile) -> Path:
+    """The file of a level.
+
+    Raises:
+        FormatError: it is missing or not the one that lod.json names.
+    """
+    path = folder / level.file
+    if not path.is_file():
+        raise FormatError(path, f"is missing: {MANIFEST} names it as a level; `aaplug lod --overwrite` makes it again")
+    if hash_of(path) != level.hash:
+        raise FormatError(path, f"is not the level that {MANIFEST} names: it was changed, cut short or exchanged")
+    return path
+
+
+def _level(entry: Entry) -> LevelFile:
+    file = entry.get("file", text)
+    entry.place.expect(file == Path(file).name, "file", "a name without folders", file)
+    chunks, rate = entry.get("chunks", _counts), entry.get("rate", number)
+    entry.place.expect(0 < rate <= 1, "rate", "above 0 and at most 1", rate)
+    return LevelFile(file, rate, entry.get("hash", text), chunks)
+
+
+def _counts(value: object, place: Place, field: str) -> tuple[int, ...]:
+    """`value` as counts."""
+    right = isinstance(value, list) and all(type(item) is int and 0 <= item < MOST for item in value)
+    place.expect(right and bool(value), field, "a list of counts", value)
+    return tuple(cast(list[int], value))

@@ -1,0 +1,123 @@
+"""Recipes for comparison: other methods of the field, and variants that were measured to be no better.
+
+`aaplug evaluate --recipe all` measures them with the others; examples/guides/methods.md has their figures.
+"""
+
+from aaplug.lab.filters import ADAPTIVE, ANISOTROPIC, BALANCED, FLAT, LARGEST_FOCAL, SCALE_ADAPTIVE
+from aaplug.lab.gaussian_blending import GAUSSIAN_BLENDING as WINDOWED_LIGHT
+from aaplug.lab.integral import INTEGRAL
+from aaplug.lab.pixel_size import BY_PIXEL_SIZE
+from aaplug.lab.surfel_mip import SURFEL_MIP
+from aaplug.methods.filters.dilation import NONE, OF_CLASSIC, OF_MIP, LowPass
+from aaplug.methods.filters.matched import Matched
+from aaplug.methods.recipe import Promises, Recipe
+
+MIP_SPLATTING_CODE = Recipe(
+    "mip-splatting-code",
+    OF_MIP,
+    "Mip-Splatting as in its published code: the largest focal length for every camera",
+    "parity with its published code; differs if focal lengths differ",
+    world=LARGEST_FOCAL,
+    promises=Promises(opaque_when_near=False),
+)
+MIP_SPLATTING_BALANCED = Recipe(
+    "mip-splatting-balanced",
+    OF_MIP,
+    "aaplug: Mip-Splatting with opacities balanced by the broadest face's area, not by volume, and bounded",
+    "comparison: avoids most of mip-splatting's dimming",
+    world=BALANCED,
+    promises=Promises(opaque_when_near=False),
+)
+MIP_SPLATTING_ANISOTROPIC = Recipe(
+    "mip-splatting-anisotropic",
+    OF_MIP,
+    "aaplug: Mip-Splatting with directional bounds: smooths each axis by the information of all views along it",
+    "comparison: measured to be no better than mip-splatting",
+    world=ANISOTROPIC,
+    promises=Promises(opaque_when_near=False),
+)
+AAA = Recipe(
+    "aaa",
+    ADAPTIVE,
+    "AAA-Gaussians' adaptive 3D filter (ICCV 2025, arXiv 2504.12811), with its projected-area factor",
+    "scenes trained with it",
+    promises=Promises(opaque_when_near=False),
+)
+MULTI_SCALE = Recipe(
+    "multi-scale",
+    OF_CLASSIC,
+    "Multi-Scale 3DGS (Yan et al. 2024): draws a Gaussian only at the pixel sizes it was trained for, +0.3 px²",
+    "scenes trained with it, whose files have its columns",
+    selection=BY_PIXEL_SIZE,
+    promises=Promises(keeps_energy=False),
+)
+ANALYTIC = Recipe(
+    "analytic",
+    NONE,
+    "Analytic-Splatting (Liang et al. 2024): no dilation, alpha integrated over the pixel by the exact normal "
+    "distribution",
+    "scenes trained with it",
+    pixel=INTEGRAL,
+)
+SA_GS = Recipe(
+    "sa-gs",
+    SCALE_ADAPTIVE,
+    "SA-GS's 2D scale-adaptive filter (Song et al., arXiv 2403.19615): 0.3 r² px², one rate per view",
+    "comparison: matched without its second step",
+    promises=Promises(equals_training=True, fades_when_small=False),
+)
+SA_GS_INTEGRAL = Recipe(
+    "sa-gs-integral",
+    SCALE_ADAPTIVE,
+    "SA-GS's filter and integration; divides by the standard deviation (its code by the variance)",
+    "comparison: it repeats blur that training applied already",
+    pixel=INTEGRAL,
+)
+SA_GS_SAMPLES = Recipe(
+    "sa-gs-samples",
+    SCALE_ADAPTIVE,
+    "SA-GS's filter and supersampling; composites the background with the true transmittance",
+    "comparison: nine samples per pixel at every rate",
+    grid=3,
+    promises=Promises(fades_when_small=False),
+)
+MATCHED_SAMPLES = Recipe(
+    "matched-samples",
+    Matched(),
+    "aaplug: matched, with 3×3 samples per pixel at every rate",
+    "comparison: nine samples per pixel at every rate",
+    grid=3,
+)
+MATCHED_INTEGRAL = Recipe(
+    "matched-integral",
+    Matched(windowed=True),
+    "aaplug: matched, with Analytic-Splatting's integral over the rest of the pixel",
+    "comparison: slower than matched and no better",
+    pixel=INTEGRAL,
+    promises=Promises(equals_training=True),
+)
+AA_2DGS = Recipe(
+    "aa-2dgs",
+    LowPass(),
+    "AA-2DGS (Younes et al., NeurIPS 2025): the world-space flat kernel, then the object-space Mip filter",
+    "scenes of 2D Gaussians trained with it",
+    world=FLAT,
+    pixel=SURFEL_MIP,
+    promises=Promises(opaque_when_near=False),
+)
+GAUSSIAN_BLENDING = Recipe(
+    "gaussian-blending",
+    NONE,
+    "Gaussian Blending (arXiv 2511.15102): no dilation, light passes through a window in the pixel",
+    "scenes trained with it or with Analytic-Splatting",
+    pixel=INTEGRAL,
+    compositor=WINDOWED_LIGHT,
+)
+MATCHED_BLENDING = Recipe(
+    "matched-blending",
+    Matched(windowed=True),
+    "aaplug: matched, with Gaussian Blending's window over the rest of the pixel",
+    "comparison: the best with one sample per pixel, but slower than several samples",
+    pixel=INTEGRAL,
+    compositor=WINDOWED_LIGHT,
+)

@@ -1,0 +1,106 @@
+"""Conversion: fusing anti-aliasing into a plain scene, for viewers that have only a fixed 2D filter.
+
+`fuse` targets the Mip rule (0.1 px², compensated), `fuse_for` a named viewer.  Each Gaussian is converted
+independently; `aaplug.finetuning` can then optimize all of them together.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from aaplug.core.conventions import MIP, Convention
+from aaplug.core.gaussians import Fusion, Gaussians
+from aaplug.core.training import TrainingViews
+from aaplug.methods.filters.energy import MatchedEnergy
+from aaplug.methods.filters.smoothing import Smoothing3D, fuse_stored
+from aaplug.methods.viewers import Viewer
+from aaplug.system.errors import UsageError
+
+FITTED_VARIANCE = 0.1  # px² at the median training rate, best measured; from uncompensated training to compensation
+TUNED = "finetune"  # method that fine-tuning records in `Gaussians.fused`; it adds no blur
+MERGED = "merge"  # method that levels of detail record; it keeps what blur there is
+
+
+@dataclass(frozen=True)
+class Form:
+    """A closed-form conversion to the Mip rule.
+
+    uses_bounds: the filter reads `TrainingViews.bounds`; if not, only the cameras.
+    skips: convention of the scenes that need no conversion; None if all need one.
+    """
+
+    filter: MatchedEnergy | Smoothing3D
+    uses_bounds: bool
+    skips: Convention | None = None
+
+    def with_variance(self, variance: float) -> "Form":
+        """The same form with another fused variance, in px² at the training rate."""
+        filter_: Any = replace(self.filter, variance=variance)
+        return replace(self, filter=filter_)
+
+
+MATCHED_ENERGY = Form(MatchedEnergy(), uses_bounds=False, skips=MIP)
+MIP_SPLATTING = Form(Smoothing3D(), uses_bounds=True)
+
+
+def fuse(scene: Gaussians, training: TrainingViews | None, form: Form = MATCHED_ENERGY) -> Gaussians:
+    """Convert a scene to the Mip rule: fuse its stored 3D filter, or apply `form` if it stores none.
+
+    training: may be None if the scene stores a 3D filter.
+
+    Raises:
+        UsageError: something is fused already, the scene needs nothing, or cameras are missing.
+    """
+    _check_convertible(scene)
+    if form.skips == scene.convention and scene.filter_3d is None:
+        raise UsageError(scene.name, "was trained by the Mip rule and stores no 3D filter: there is nothing to fuse")
+    if scene.filter_3d is not None:
+        converted = fuse_stored(scene)
+    elif training is None:
+        raise UsageError(scene.name, "has no stored 3D filter: its conversion needs the training cameras")
+    else:
+        converted = form.filter(scene, training)
+    return replace(converted, convention=MIP)
+
+
+def fuse_for(scene: Gaussians, training: TrainingViews, viewer: Viewer) -> Gaussians:
+    """Convert a scene for a viewer, which sees only the harmonics that it draws.
+
+    If the viewer draws as training did, only a stored 3D filter is fused.
+
+    Raises:
+        UsageError: the viewer has a rule of its own, and the scene holds 2D Gaussians or blur is already fused.
+    """
+    if viewer.convention is None:
+        return fuse_stored(scene)
+    _check_convertible(scene)
+    scene = fuse_stored(viewer.shown(scene))
+    trained, shown = scene.convention, viewer.convention
+    if trained == shown:
+        return scene
+    fitted = shown.compensated and not trained.compensated
+    return MatchedEnergy(FITTED_VARIANCE if fitted else trained.kernel - shown.kernel, shown)(scene, training)
+
+
+def blurring(fused: Sequence[Fusion]) -> list[Fusion]:
+    """The fusions that added blur: all but merging and fine-tuning."""
+    return [fusion for fusion in fused if fusion.method not in (MERGED, TUNED)]
+
+
+def describe(fusion: Fusion) -> str:
+    """One printable phrase, such as "matched-energy (variance=0.2, views=25)"."""
+    settings = ", ".join(f"{key}={value}" for key, value in fusion.settings.items())
+    return f"{fusion.method} ({settings})" if settings else fusion.method
+
+
+def fused_in(scene: Gaussians) -> str:
+    """Everything that is fused in a scene, in words."""
+    return "; ".join(describe(fusion) for fusion in scene.fused) or "nothing"
+
+
+def _check_convertible(scene: Gaussians) -> None:
+    if scene.flat:
+        raise UsageError(scene.name, "holds 2D Gaussians, which closed-form conversion does not support")
+    if blurs := blurring(scene.fused):
+        done = "; ".join(map(describe, blurs))
+        raise UsageError(scene.name, f"already has {done} fused; converting it again would blur it twice")

@@ -1,0 +1,293 @@
+"""Options of each verb, stated once: a field is a verb's keyword, its docstring the command line's help.
+
+Importing them takes no torch, so that help and mistakes on the command line are answered at once.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Literal, get_args
+
+import tyro
+
+from aaplug.io import MOST_FPS, SpzAxes
+from aaplug.options.base import DRAWING, REPORT, TUNING, UNSET, OneOf, Options, choice, choices, flag, number
+from aaplug.options.shared import (
+    RECIPE_NAMES,
+    SCALE,
+    SCALES,
+    STEPS,
+    THREADS,
+    VIEWS,
+    AnyPath,
+    ImageOptions,
+    OneProtocol,
+    OneRecipe,
+    OneViewer,
+    Recipe,
+    RecipeOptions,
+    Viewer,
+    ViewOptions,
+    metric_option,
+    size_of,
+)
+from aaplug.system.errors import UsageError
+from aaplug.system.registry import names_of
+
+ALL = "all"  # instead of recipes' names: every recipe that the scene suits
+DEFAULT_RECIPES = ("classic", "mip", "matched", "auto")
+COMPARED_SCALES = (2.0, 1.0, 0.5, 0.25)
+COMPARED_METRICS = ("psnr", "ssim", "flicker")
+METRIC_NAMES = "|".join(map(metric_option, names_of("metric")))
+TIMED_RASTERIZERS = ("all", "compiled", "eager")
+LEVEL_STEPS = 1000  # for a level of 1/4 of the training rate and above; a smaller one takes more, of smaller images
+SINGLE_SCENE_FACTOR = 2  # times as many steps for one scene: its counts are met, so tuning has more to mend
+LossName = Literal["l2", "l1-dssim"]
+LOSS_WEIGHTS = {0.5: 1.0, 0.25: 2.0, 0.125: 1.0}  # by scale; measured, as are the two below
+ANCHOR_WEIGHT = 3.0  # of the loss at the training size, beside those of the scales
+TUNED_PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "dc", "rest")
+TRUTHS = ("auto", "self", "photographs")
+Layout = Literal["plain", "inria"]
+
+SHOWN_VIEWS = tyro.conf.arg(metavar="N|NAME,...")
+
+
+@dataclass(frozen=True, kw_only=True)
+class WritingOptions(Options):
+    """A scene file to write."""
+
+    spz_axes: Annotated[SpzAxes, tyro.conf.Suppress] = "auto"
+    """Axes of a .spz to write; see `read_scene`."""
+    overwrite: bool = False
+    """Replace existing outputs."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderOptions(RecipeOptions, ImageOptions):
+    """Rendering."""
+
+    bit_depth: Literal[8, 16] = 8
+    """Bits per colour channel."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class VideoOptions(RecipeOptions, ImageOptions):
+    """Rendering, and the camera path."""
+
+    scale: Annotated[float | None, SCALE, UNSET] = None
+    """Size relative to the training size, or to that of a path file (default: 1)."""
+    path: Annotated[AnyPath, choice(["zoom", "dolly", "orbit", "FILE.json"])] = "zoom"
+    """zoom (focal length), dolly (distance) or orbit from the first of --views, or nerfstudio's camera_path.json."""
+    beside: Annotated[str | None, choice(["none", *RECIPE_NAMES, "..."]), OneOf(("none",), "recipe")] = "classic"
+    """Recipe to show on the left; none shows --recipe alone."""
+    start: Annotated[float, SCALE] = 1.0
+    """Sampling rate at the start of a zoom or dolly, relative to training."""
+    end: Annotated[float, SCALE] = 0.125
+    """Sampling rate where it turns back."""
+    seconds: Annotated[float, number(0.01, 3600)] = 6.0
+    """Length in seconds of a zoom, dolly or orbit."""
+    fps: Annotated[float | None, number(0.1, MOST_FPS), UNSET] = None
+    """Frames per second (default: the path file's, or 30)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateOptions(RecipeOptions):
+    """Recipes, scales, truth and metrics."""
+
+    name: Annotated[str | None, tyro.conf.Suppress] = None
+    """The scene's name in the results; None for its file's."""
+    protocol: OneProtocol = "default"
+    """Scales, truth, downscaling and flavours of metrics, by name."""
+    recipe: Annotated[str | Sequence[str | Recipe], choices([*RECIPE_NAMES, ALL, "..."]), OneOf((ALL,), "recipe")] = (
+        DEFAULT_RECIPES
+    )
+    """One or more recipes.  all adds those for comparison, which examples/guides/methods.md lists."""
+    scale: Annotated[Sequence[float] | None, SCALES, UNSET] = None
+    """One or more sizes relative to the training size (default: the protocol's)."""
+    truth: Literal["auto", "photographs", "self"] = "auto"
+    """Compare with photographs, or with the scene's own supersampled look; auto leaves it to the protocol."""
+    metric: Annotated[str | Sequence[str] | None, flag(METRIC_NAMES, kind=tuple[str, ...] | None)] = None
+    """Metrics, with flavours ssim:wang|3dgs, lpips:3dgs|vgg|alex (default: psnr ssim consistency energy-drift)."""
+    lpips: Annotated[tuple[AnyPath, AnyPath] | None, flag("TRUNK HEADS", kind=tuple[str, str] | None), REPORT] = None
+    """Weights of LPIPS, which is then measured: torchvision's VGG16 (AlexNet), and the lpips package's heads for it."""
+    report: bool = False
+    """Write report.html, one page with pictures side by side, tables and curves, and its plots."""
+    show: Annotated[str, SHOWN_VIEWS, REPORT] = "3"
+    """Views in the report's viewer: how many, or which."""
+    layout: Annotated[Layout, REPORT] = "plain"
+    """inria stores every render and its truth in test/METHOD/{renders,gt}, where other metric scripts look."""
+    resume: bool = False
+    """Continue an interrupted evaluation; finished views are not measured again."""
+    overwrite: bool = False
+    """Replace existing results."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompareOptions(RecipeOptions):
+    """Sizes, metrics and how the scenes are shown."""
+
+    recipe: OneRecipe = "auto"
+    """How to draw every scene, each by the convention that it was trained with."""
+    viewer: OneViewer = None
+    """Draw the scenes as spark or another of examples/guides/viewers.md does; the truth stays the first by --recipe."""
+    scale: Annotated[Sequence[float], SCALES] = COMPARED_SCALES
+    """One or more sizes relative to the training size."""
+    metric: Annotated[str | Sequence[str], flag(METRIC_NAMES, kind=tuple[str, ...])] = COMPARED_METRICS
+    """Metrics (default: psnr ssim flicker)."""
+    show: Annotated[str, SHOWN_VIEWS, REPORT] = "3"
+    """Views in the report's viewer: how many, or which."""
+    any_frame: Annotated[bool, DRAWING] = False
+    """Compare scenes that lie in different frames too."""
+    resume: bool = False
+    """Continue an interrupted comparison; finished views are not measured again."""
+    overwrite: bool = False
+    """Replace existing results."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.viewer is not None and self.recipe != "auto":
+            raise UsageError("viewer", "sets the recipe itself; leave out `recipe`")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConvertOptions(WritingOptions, ViewOptions):
+    """What to fuse, and how to measure it."""
+
+    views: Annotated[str, VIEWS] = "train"
+    """Views that --for is measured on, by name or split."""
+    viewer: OneViewer = None
+    """Fit the scene to spark, playcanvas or another of examples/guides/viewers.md, and print the remaining error."""
+    steps: Annotated[int | None, STEPS, UNSET] = None
+    """With --for: steps of the fit, 0 for none (default: 300, or 0 if the viewer draws as training did)."""
+    form: Annotated[str | None, flag("|".join(names_of("form"))), OneOf(kind="form")] = None
+    """Without --for: keep training's energy (matched-energy, the default), or smooth as Mip-Splatting does."""
+    variance: Annotated[float | None, number(0.001, 100), UNSET] = None
+    """Without --for: variance to fuse, in px² at the training rate (default: 0.2)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LodOptions(WritingOptions, ViewOptions):
+    """How light, and how to tune."""
+
+    views: Annotated[str, VIEWS] = "train"
+    """Views that levels are tuned on and that tell what is hidden, with free ones between them."""
+
+    simplify: Annotated[float | None, number(1e-6, 1e9, metavar="SHARE|COUNT"), UNSET] = None
+    """Write one scene with this share of the Gaussians; above 1, with so many."""
+    budget: Annotated[float | None, number(0.001, 1e6, metavar="MB"), UNSET] = None
+    """Write one scene of as many Gaussians as fit into a .ply of so many MB (10^6 bytes)."""
+    levels: Annotated[int | None, number(1, 12, whole=True), UNSET] = None
+    """Write a folder of levels, each for half the size of the one before, as light as the image allows (default: 4)."""
+    merge_below: Annotated[float, number(0, 10)] = 0.0
+    """With levels: merge Gaussians up to so many px of the level in any case; faster to draw, and less exact."""
+    scale: Annotated[float | None, number(0.001, 1), UNSET] = None
+    """With --simplify or --budget: size of the images that the scene is meant for (default: root of the share)."""
+    viewer: OneViewer = None
+    """Tune each file for spark, playcanvas or another of examples/guides/viewers.md, instead of for aaplug."""
+    refine: bool = True
+    """Merge alone: do not tune the result to look like the scene, which takes minutes."""
+    steps: Annotated[int | None, STEPS, UNSET] = None
+    """Steps of tuning for each level, more for small ones (default: 1000, or 2000 for one scene)."""
+    resume: bool = False
+    """Keep the levels that are there, if they were made of the same scene, cameras and options."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        given = [name for name in ("simplify", "budget", "levels") if getattr(self, name) is not None]
+        if len(given) > 1:
+            raise UsageError(given[1], f"cannot be combined with `{given[0]}`: each asks for other files")
+        if self.scale is not None and not self.single:
+            raise UsageError("scale", "belongs to `simplify` and `budget`")
+        if self.merge_below and self.single:
+            raise UsageError("merge_below", "belongs to levels")
+        if self.resume and (self.single or self.viewer is not None):
+            raise UsageError("resume", "belongs to levels for aaplug")
+        if self.viewer is not None and not self.tuning:
+            raise UsageError("viewer", "is what the result is tuned for: leave out `refine`, and `steps` of 0")
+
+    @property
+    def single(self) -> bool:
+        """Whether one file is asked for, not a folder."""
+        return self.simplify is not None or self.budget is not None
+
+    @property
+    def tuning(self) -> int:
+        """Steps of tuning for a rate of 1/4 and above; 0 for none."""
+        usual = SINGLE_SCENE_FACTOR * LEVEL_STEPS if self.single else LEVEL_STEPS
+        return (usual if self.steps is None else self.steps) if self.refine else 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class FinetuneOptions(WritingOptions, ViewOptions):
+    """The optimization."""
+
+    viewer: Annotated[
+        str | Viewer | None, flag("fast|VIEWER", "--for", kind=str | None), OneOf(("fast",), "viewer")
+    ] = None
+    """Who will show the scene: fast (aaplug's matched, the default) or a viewer of examples/guides/viewers.md."""
+    views: Annotated[str, VIEWS] = "test"
+    """Views that the result is measured on, by name or split; training views are what it is tuned on."""
+    method: Annotated[str, choice(names_of("method")), OneOf(kind="method")] = "consistency"
+    """consistency makes one model for all scales; mipmap-gs makes one for a single --scale, as Mipmap-GS does."""
+    scale: Annotated[Sequence[float], SCALES] = tuple(LOSS_WEIGHTS)
+    """Sizes against the training size that must look right, beside the training size itself."""
+    steps: Annotated[int | None, STEPS, UNSET] = None
+    """Number of steps (default: 1000)."""
+    loss: Annotated[str, choice(get_args(LossName)), OneOf(get_args(LossName)), TUNING] = "l2"
+    """l2, or 3DGS's 0.8 L1 + 0.2 D-SSIM."""
+    anchor: Annotated[float, number(0, 1_000_000, metavar="WEIGHT"), TUNING] = ANCHOR_WEIGHT
+    """Weight of the training size in every step, against 1 for the other scales."""
+    move: Annotated[Sequence[str], choices(TUNED_PARAMETERS), TUNING] = TUNED_PARAMETERS
+    """Parameters that move."""
+    learning_rate: Annotated[float, number(1e-6, 100), TUNING] = 1.0
+    """Factor on the method's learning rates."""
+    densify_every: Annotated[int | None, STEPS, UNSET, TUNING] = None
+    """Clone, split and prune every N steps; 0 for never (default: the method's own)."""
+    truth: Annotated[str, choice(TRUTHS), OneOf(TRUTHS)] = "auto"
+    """What the training size should look like: self is the scene's own render; auto takes photographs if all exist."""
+    upsampler: Annotated[str | None, flag("bicubic|lanczos|FILE"), TUNING] = None
+    """For scales above the photographs': an interpolation or a network (.pb, .pt2); default: the scene's own render."""
+    seed: Annotated[int, number(0, 2**31 - 1, whole=True, metavar="N"), TUNING] = 0
+    """Seed of the views and scales that the steps draw."""
+    checkpoint_every: Annotated[int, number(1, 1_000_000, whole=True, metavar="N"), TUNING] = 100
+    """Steps between checkpoints."""
+    resume: bool = False
+    """Continue an interrupted run from its checkpoint."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LiveOptions(ViewOptions):
+    """The page, and how the scene is drawn."""
+
+    host: Annotated[str, flag("ADDRESS")] = "127.0.0.1"
+    """Address to listen on; any but this machine's own asks for the token in the printed address."""
+    port: Annotated[int, number(0, 65_535, whole=True)] = 8080
+    """Port to listen on; 0 takes any free one."""
+    no_browser: bool = False
+    """Print the address, and open no browser."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchOptions(Options):
+    """What to time."""
+
+    gaussians: Annotated[Sequence[int], number(1, 100_000_000, whole=True, several=True, metavar="N ...")] = (
+        10_000,
+        100_000,
+        1_000_000,
+    )
+    """Sizes of the synthetic scenes."""
+    resolution: Annotated[Sequence[str] | None, flag("WxH ...")] = None
+    """Sizes of the images: all scenes at the first, the middle one at each (default: 800x800 1600x1060)."""
+    rasterizer: Annotated[str, choice(TIMED_RASTERIZERS), OneOf(TIMED_RASTERIZERS)] = "all"
+    """Which to time; all: compiled, if `aaplug warmup` has run, and eager."""
+    repeats: Annotated[int, number(1, 1000, whole=True)] = 5
+    """Runs per median."""
+    threads: Annotated[int | None, THREADS, UNSET] = None
+    """Processor threads (default: all)."""
+    forward_only: bool = False
+    """Leave out the backward pass."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for size in self.resolution or ():
+            size_of(size)

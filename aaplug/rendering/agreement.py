@@ -1,0 +1,131 @@
+"""How well a scene and its cameras fit.
+
+Cameras of another capture may see a scene too, and a scene may be turned over.  Photographs tell at once; without them,
+cameras are expected to look at the scene's middle.
+"""
+
+from dataclasses import dataclass
+from statistics import median
+
+import torch
+
+from aaplug.core.cameras import Camera, CameraSet, spread
+from aaplug.core.imaging import resampled
+from aaplug.core.rules import NEAR
+from aaplug.core.training import TrainingViews
+from aaplug.io.photographs import read_photo
+from aaplug.io.scenes.scene_file import Scene, usable
+from aaplug.rendering.renderer import Renderer, background_colour, own_look
+from aaplug.system.errors import AaplugError
+from aaplug.system.monitor import SILENT, Monitor
+
+SAMPLE = 50_000  # Gaussians whose places are looked at
+VIEWS = 20  # cameras that look at them
+PHOTOGRAPHS = 3  # that are compared
+SIDE = 100  # px: longer side of the images that are compared
+LARGEST = 3_000_000  # Gaussians: a larger scene is not rendered for this
+HALF_A_SIDE = 0.5  # distance from the image's centre beyond which the scene's middle is outside of it
+MIN_SHARE_LEAD = 0.1  # of Gaussians seen, by which a reading fits better
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How well a scene and its cameras fit.
+
+    seen: share of the Gaussians that any camera sees.
+    size: median standard deviation along a Gaussian's middle axis at its highest training rate, in px; None if unseen.
+    offset: distance of the scene's middle from the image's centre in the median view, as a share of the side.
+    gain: how much closer renders come to the photographs than one flat colour does, in dB; None without photographs.
+    """
+
+    seen: float
+    size: float | None
+    offset: float
+    gain: float | None
+
+    @property
+    def doubt(self) -> str | None:
+        """Why the cameras seem to be of another capture, in words; None if they do not."""
+        if self.gain is not None:
+            if self.gain > 0:
+                return None
+            return f"renders are {-self.gain:.1f} dB farther from the photographs than one flat colour is"
+        if self.offset > HALF_A_SIDE:
+            return "in half of the views the middle of the scene lies outside of the image"
+        return None
+
+    def __str__(self) -> str:
+        size = "" if self.size is None else f", their median size is {self.size:.2g} px"
+        gain = "" if self.gain is None else f", renders are {self.gain:.1f} dB closer to photographs than a flat colour"
+        return f"the cameras see {self.seen:.0%} of the Gaussians{size}{gain}"
+
+
+def agreement(look: Renderer, cameras: CameraSet) -> Agreement:
+    """How well a scene, drawn as training did, fits its cameras."""
+    scene, bounds = look.scene, look.training.bounds
+    seen = bounds.seen
+    middle = scene.scales.median(dim=1).values
+    size = float((middle * bounds.highest)[seen].median()) if seen.any() else None
+    some = spread(look.training.cameras, VIEWS)
+    offsets = [_offset(scene.means[:: max(1, len(scene) // SAMPLE)], camera) for camera in some]
+    return Agreement(float(seen.float().mean()), size, median(offsets), _gain(look, cameras))
+
+
+def settled(scene: Scene, cameras: CameraSet, monitor: Monitor = SILENT) -> Scene:
+    """The reading of a file that fits the cameras, where the file does not say which of two is meant.
+
+    Each reading is decoded once, and what is odd in it is left to whoever uses it.  Assumed cameras decide nothing.
+    """
+    if scene.other is None or cameras.assumed:
+        return scene
+    readings, background = (scene.decoded(), scene.other.decoded()), background_colour("auto", cameras)
+    fits = []
+    for reading in readings:
+        gaussians = usable(reading.raw(0, reading.count))
+        look = own_look(gaussians, TrainingViews.of(gaussians, cameras), background=background)
+        fits.append(agreement(look, cameras))
+    first, second = fits
+    if first.gain is not None and second.gain is not None:
+        better = second.gain > first.gain
+    else:
+        better = second.seen > first.seen + MIN_SHARE_LEAD or (first.doubt is not None and second.doubt is None)
+    reading = readings[better]
+    how, _, _ = reading.notes[-1].partition(" (")
+    monitor.say(f"{scene.title}: {how}, as fits the cameras: {fits[better]}")
+    return reading
+
+
+def _offset(means: torch.Tensor, camera: Camera) -> float:
+    """Distance of the median place from the image's centre, as a share of the side; of what is before the camera."""
+    places, depths = camera.project(means)
+    ahead = places[depths > NEAR]
+    if not len(ahead):
+        return float("inf")
+    sides = places.new_tensor([camera.width, camera.height])
+    return float((ahead.median(dim=0).values / sides - 0.5).abs().max())
+
+
+@torch.no_grad()
+def _gain(look: Renderer, cameras: CameraSet) -> float | None:
+    """Median gain over a few photographs; those that cannot be read do not count."""
+    views = [view for view in cameras.all if view.photo is not None]
+    if not views or not 0 < len(look.scene) <= LARGEST:
+        return None
+    gains = []
+    for view in spread(views, PHOTOGRAPHS):
+        try:
+            gains.append(_gain_at(look, view))
+        except AaplugError:
+            continue
+    return median(gains) if gains else None
+
+
+def _gain_at(look: Renderer, view: Camera) -> float:
+    """PSNR of the small render over that of the small photograph's mean colour, in dB."""
+    assert view.photo is not None
+    small = view.scaled(min(1.0, SIDE / max(view.hw)))
+    photo = read_photo(view.photo, look.background, view.lens)
+    truth = resampled(photo, small.width / photo.shape[1], small.hw)
+    error = (look(small).rgb.clamp(0, 1) - truth).square().mean()
+    flat = (truth - truth.mean(dim=(0, 1))).square().mean()
+    return float(10 * (flat / error.clamp(min=torch.finfo().tiny)).log10())

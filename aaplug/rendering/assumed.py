@@ -1,0 +1,181 @@
+"""What stands in for cameras where there are none: views on an orbit, and an assumption about the training rate.
+
+A scene's file does not say how finely training sampled it.  The assumption: by images of `TRAIN_VIEW` px taken from the
+default orbit.  A 3D filter that the file stores tells the rate itself; `cfg_args` beside the file may tell the width.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from aaplug.core.cameras import Camera, CameraSet, look_at
+from aaplug.core.gaussians import Gaussians
+from aaplug.core.orbits import Frame, frame_of, pinhole
+from aaplug.core.orbits import orbit as orbit_views
+from aaplug.core.sampling import sampling_bounds
+from aaplug.io.cameras import holds_cameras
+from aaplug.io.cameras.cfg_args import CAPPED, DIVISORS, NAME, WIDTH_CAP, read_cfg_args
+from aaplug.io.scenes.ply import Document
+from aaplug.io.scenes.ply_tags import NERFSTUDIO
+from aaplug.io.scenes.scene_file import Scene
+from aaplug.methods.filters.smoothing import NYQUIST_VARIANCE
+from aaplug.options.shared import DEFAULT_FOV, Orbit, size_of
+from aaplug.rendering.renderer import Renderer
+from aaplug.system.errors import AaplugError, UsageError
+from aaplug.system.monitor import Monitor
+
+TRAIN_VIEW = (WIDTH_CAP, WIDTH_CAP * 2 // 3)  # px: the width that 3DGS trains at by default, in a camera's usual shape
+ORBIT_VIEWS = 8
+ELEVATION = 20.0  # degrees
+RINGS = (0.0, 20.0, 40.0)  # degrees of elevation: the assumed training views
+PROBE_ROWS = 16  # Gaussians at each place that is looked at
+CROP_SIDE = 128  # px: side of the part of a picture that is compared at other training rates
+Z_UP = (0.0, 0.0, 1.0)  # nerfstudio turns its scenes so
+
+TRAINING_RATE = "training rate: "  # how the note begins
+
+
+def cameras_around(scene: Scene, orbit: Orbit, single: bool = False) -> CameraSet:
+    """Cameras for a scene without any: the assumed training views, and as test views those that an orbit shows.
+
+    single: show one view, unless the orbit says how many.
+
+    Raises:
+        UsageError: the scene is empty, or a direction is none.
+    """
+    if single and orbit.orbit is None and orbit.eye is None:
+        orbit = replace(orbit, orbit=1)
+    sample = scene.sample(PROBE_ROWS)
+    frame = frame_around(scene, orbit, sample)
+    train, reason = _assumed_training(orbit, frame, sample, scene.path)
+    cameras = CameraSet(train, _orbit_views(orbit, frame, train[0]), assumed=True)
+    size, rate = f"{train[0].width}x{train[0].height}", rate_of(cameras, frame)
+    note = f"{TRAINING_RATE}assumed as of {size} px from the orbit, {rate:.4g} px per unit in its middle ({reason})"
+    if scene.path is not None and holds_cameras(scene.path.parent):
+        return replace(cameras, notes=(note, f"there are cameras: --cameras {scene.path.parent}"))
+    return replace(cameras, notes=(note,))
+
+
+def frame_around(scene: Scene, orbit: Orbit, sample: Gaussians | None = None) -> Frame:
+    """The frame of an orbit; raises UsageError as `cameras_around`.  sample: the scene's, if it is known."""
+    if orbit.up is not None:
+        up = orbit.up
+    else:  # what nerfstudio writes points up along z
+        comments = scene.document.header.comments if isinstance(scene.document, Document) else []
+        up = Z_UP if any(NERFSTUDIO.match(comment) for comment in comments) else None
+    return frame_of(scene.sample(PROBE_ROWS) if sample is None else sample, up)
+
+
+def _assumed_training(
+    orbit: Orbit, frame: Frame, sample: Gaussians, path: Path | None
+) -> tuple[tuple[Camera, ...], str]:
+    """The assumed training views, and what the assumption rests on."""
+    size, reason = TRAIN_VIEW, "as nothing says; --train-view or --train-rate do"
+    if orbit.train_view is not None:
+        size, reason = size_of(orbit.train_view, "train_view"), "--train-view"
+    elif width := _width_in_run(path):
+        size, reason = (width, round(width * TRAIN_VIEW[1] / TRAIN_VIEW[0])), f"width from {NAME}"
+    fov = math.radians(DEFAULT_FOV)
+    rings = [orbit_views(frame, ORBIT_VIEWS, size, math.radians(e), fov, f"training_{e:.0f}") for e in RINGS]
+    views = tuple(view.as_trained() for ring in rings for view in ring)
+    factor: float | None = None
+    if orbit.train_rate is not None:
+        factor, reason = orbit.train_rate * frame.distance(fov) / views[0].focal, "--train-rate"
+    elif orbit.train_view is None and (factor := _filtered_rate(sample, views)):
+        reason = "from the file's 3D filter"
+    if not factor:
+        return views, reason
+    width, height = (max(1, round(side * factor)) for side in (views[0].width, views[0].height))
+    focal = views[0].focal * factor  # the views at `factor` times their sampling rate, in whole pixels
+    return tuple(pinhole(v.name, (width, height), focal, v.cam_from_world).as_trained() for v in views), reason
+
+
+def _orbit_views(orbit: Orbit, frame: Frame, trained: Camera) -> tuple[Camera, ...]:
+    """The views to show, as poses of the data set where they are like the training views."""
+    size = trained.width, trained.height
+    fov = math.radians(orbit.fov)
+    centre = frame.centre if orbit.look_at is None else frame.centre.new_tensor(orbit.look_at)
+    if orbit.eye is not None:
+        pose = _pose(frame.centre.new_tensor(orbit.eye), centre, frame)
+        return (pinhole("eye", size, min(size) / 2 / math.tan(fov / 2), pose),)
+    elevation = math.radians(ELEVATION if orbit.elevation is None else orbit.elevation)
+    views = orbit_views(replace(frame, centre=centre), orbit.orbit or ORBIT_VIEWS, size, elevation, fov)
+    if orbit.look_at is not None or orbit.fov != DEFAULT_FOV:
+        return views
+    return tuple(replace(view, fx=trained.fx, fy=trained.fy).as_trained() for view in views)
+
+
+def rate_of(cameras: CameraSet, frame: Frame) -> float:
+    """The assumed training rate in the middle of the frame, px per world unit."""
+    return cameras.train[0].focal / frame.distance(math.radians(DEFAULT_FOV))
+
+
+def say_assumed(
+    cameras: CameraSet, monitor: Monitor, renderer: Renderer | None = None, view: Camera | None = None
+) -> None:
+    """Say what is assumed, and how much a picture hangs on it; nothing where the cameras are known.
+
+    view: the picture; None for the first test view at the training size.
+    """
+    if not cameras.assumed:
+        return
+    for note in cameras.notes:
+        monitor.say(note)
+    if renderer is not None:
+        half, twice = decibels_at(renderer, view or cameras.test[0], (0.5, 2.0))
+        monitor.say(f"with half that rate the image would be {_apart(half)}, with twice {_apart(twice)}")
+
+
+@torch.no_grad()
+def decibels_at(renderer: Renderer, view: Camera, factors: Sequence[float]) -> list[float]:
+    """PSNR between the middle of a view, and what it would be if training had been `factors` times as fine; in dB."""
+    width, height = min(view.width, CROP_SIDE), min(view.height, CROP_SIDE)
+    left, top = (view.width - width) // 2, (view.height - height) // 2
+    crop = replace(view, width=width, height=height, cx=view.cx - left, cy=view.cy - top)
+    image, decibels = renderer(crop).rgb.clamp(0, 1), []
+    for factor in factors:
+        trained = None if view.trained_focal is None else view.trained_focal * factor
+        other = renderer.trained_at(factor)(replace(crop, trained_focal=trained)).rgb.clamp(0, 1)
+        error = float((image - other).square().mean())
+        decibels.append(math.inf if error == 0 else -10 * math.log10(error))
+    return decibels
+
+
+def _apart(decibels: float) -> str:
+    return "the same" if decibels == math.inf else f"{decibels:.0f} dB from this one"
+
+
+def _filtered_rate(some: Gaussians, views: Sequence[Camera]) -> float | None:
+    """How much finer training was than the views, by the 3D filter: its variance is 0.2 px² at the highest rate."""
+    if some.filter_3d is None:
+        return None
+    bounds = sampling_bounds(some.means, views)
+    known = bounds.seen & (some.filter_3d > 0)
+    if not known.any():
+        return None
+    return float((math.sqrt(NYQUIST_VARIANCE) / some.filter_3d[known] / bounds.highest[known]).median())
+
+
+def _width_in_run(path: Path | None) -> int | None:
+    """The width in px that a training run's `cfg_args` beside the file, or in its model folder, states."""
+    if path is None:
+        return None
+    for folder in (path.parent, *path.absolute().parents[2:3]):
+        try:
+            resolution = read_cfg_args(folder / NAME).resolution
+        except AaplugError:  # there is none, or it is of another program
+            continue
+        return None if resolution in (CAPPED, *DIVISORS) else int(resolution)
+    return None
+
+
+def _pose(eye: torch.Tensor, target: torch.Tensor, frame: Frame) -> torch.Tensor:
+    """`look_at` with the frame's up; where that is the direction of sight, its front points up in the image."""
+    sight = target - eye
+    if not float(sight.norm()) > 0:
+        raise UsageError("eye", "and the place to look at are the same; move one")
+    beside = torch.linalg.cross(sight / sight.norm(), frame.up).norm()
+    return look_at(eye, target, frame.up if float(beside) > 1e-6 else frame.front)

@@ -1,0 +1,205 @@
+"""Job: a scene and its cameras, opened and fitted to each other, and the options of the verb that works on them.
+
+Every verb begins with `Job.of`.  It then checks its output, and draws inside `running`, which limits torch's threads,
+claims the output and connects the workers.
+"""
+
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from importlib.util import find_spec
+from os import PathLike
+from pathlib import Path
+from typing import Generic, TypeVar
+
+import torch
+
+from aaplug.core.cameras import Camera, CameraSet
+from aaplug.core.colours import BLACK, WHITE
+from aaplug.core.interfaces import MatchesRates, TakesMemory
+from aaplug.core.training import TrainingViews
+from aaplug.io.atomic import writing
+from aaplug.io.cameras import read_cameras, select_views
+from aaplug.io.limits import lack_of_memory
+from aaplug.io.scenes import SceneLike, scene_of
+from aaplug.io.scenes.scene_file import Scene
+from aaplug.methods import RECIPES
+from aaplug.methods.recipe import Recipe
+from aaplug.methods.recipes import find_recipe
+from aaplug.options.base import Options
+from aaplug.options.shared import Orbit, RecipeOptions, ViewOptions
+from aaplug.rasterizers.choice import find_rasterizer
+from aaplug.rendering.agreement import agreement, settled
+from aaplug.rendering.assumed import cameras_around, say_assumed
+from aaplug.rendering.cost import Cost, cost_of
+from aaplug.rendering.renderer import Renderer, background_colour, own_look
+from aaplug.system.errors import UsageError, listing
+from aaplug.system.executors import PAYS_AFTER, Executor, torch_threads
+from aaplug.system.monitor import Monitor
+
+LONG_JOB = 60.0  # seconds of work from which a job is announced
+LARGE_JOB = 4e9  # bytes from which it is
+
+log = logging.getLogger("aaplug")
+O = TypeVar("O", bound=Options)  # noqa: E741
+O_co = TypeVar("O_co", bound=Options, covariant=True)
+CamerasLike = CameraSet | Orbit | str | PathLike[str] | None
+
+
+@dataclass(frozen=True, eq=False)
+class Job(Generic[O_co]):
+    """A scene by the reading that fits its cameras, these cameras, and a verb's options."""
+
+    scene: Scene
+    cameras: CameraSet
+    options: O_co
+
+    @classmethod
+    def of(cls, scene: SceneLike, cameras: CamerasLike, options: O, single: bool = False) -> "Job[O]":
+        """Open the scene and its cameras.
+
+        Args:
+            scene: a scene, its Gaussians or its path.
+            cameras: themselves, or their path; None for those of the scene's model folder, else an `Orbit`.
+            options: of the verb.
+            single: an orbit is asked for one picture.
+
+        Raises:
+            AaplugError: a file cannot be read, or there is nothing to look at.
+        """
+        opened = scene_of(scene)
+        if cameras is None:
+            cameras = opened.cameras or Orbit()
+        if isinstance(cameras, Orbit):
+            cameras = cameras_around(opened, cameras, single)
+        elif not isinstance(cameras, CameraSet):
+            cameras = read_cameras(cameras)
+        return Job(settled(opened, cameras, options.monitor), cameras, options)
+
+    @property
+    def monitor(self) -> Monitor:
+        """Receiver of messages and progress."""
+        return self.options.monitor
+
+    @cached_property
+    def views(self: "Job[ViewOptions]") -> tuple[Camera, ...]:
+        """The views that the options name."""
+        return select_views(self.cameras, self.options.views)
+
+    def look(self: "Job[ViewOptions]", frames: int, check: bool = True) -> Renderer:
+        """The scene as training showed it, with the background and rasterizer that the options ask for.
+
+        Args:
+            frames: number of images that will be rendered in all.
+            check: say how well scene and cameras fit, which takes seconds.
+        """
+        options, say = self.options, self.monitor.say
+        colour = background_colour(options.background, self.cameras)
+        if options.background == "auto":
+            name = {WHITE: "white", BLACK: "black"}.get(colour, str(colour))
+            unstated = "nothing says" if self.cameras.assumed else "the camera files do not say"
+            say(f"background: {name} ({'from the camera files' if self.cameras.background else unstated})")
+        rasterizer = options.rasterizer
+        if isinstance(rasterizer, str):
+            rasterizer = find_rasterizer(rasterizer, frames, say)
+        if options.memory is not None and isinstance(rasterizer, TakesMemory):
+            rasterizer = rasterizer.within(options.memory * 1e9)
+        training = self.training(self.scene)
+        look = own_look(self.scene, training, rasterizer, colour)
+        if check and not self.cameras.assumed:
+            fit = agreement(look, self.cameras)
+            say(f"fit: {fit}")
+            if fit.doubt:
+                log.warning("%s: scene and cameras seem to be of different captures: %s", look.scene.name, fit.doubt)
+        return look
+
+    def training(self: "Job[ViewOptions]", scene: Scene) -> TrainingViews:
+        """The training views of a scene; raises FrameError as `TrainingViews.of`."""
+        options = self.options
+        return TrainingViews.of(scene.gaussians(), self.cameras, options.cull_margin, options.min_seen)
+
+    def recipe(self: "Job[RecipeOptions]", recipe: str | Recipe) -> Recipe:
+        """A recipe as it is, or by name as the options say; the rate reference goes to those that compare rates."""
+        if isinstance(recipe, Recipe):
+            return recipe
+        options = self.options
+        matches = isinstance(RECIPES.find(recipe, "recipe").screen, MatchesRates)
+        reference = options.rate_reference if matches else None
+        return find_recipe(recipe, quality=options.quality, rate_reference=reference)
+
+    def say_assumed(self, renderer: Renderer | None = None, view: Camera | None = None) -> None:
+        """Say which training is assumed, and how much a picture hangs on it; see `assumed.say_assumed`."""
+        say_assumed(self.cameras, self.monitor, renderer, view)
+
+    def announce(
+        self,
+        renderers: Sequence[Renderer],
+        views: Sequence[Camera],
+        *,
+        cost: Cost | None = None,
+        work: str | None = None,
+        processes: int = 1,
+        fewer: str = "views",
+    ) -> None:
+        """Say how long rendering every view with every renderer will take, and how much memory, where that is much.
+
+        cost: where it is not that of these images.  work: in words, if it is more than these images.
+        processes: number that share it.  fewer: what takes less time, in words.
+
+        Raises:
+            UsageError: it would take more memory than the limit MEMORY_SHARE of the machine's allows.
+        """
+        cost = cost or cost_of(renderers, views)
+        needed = cost.scene + cost.image * (processes if cost.seconds > PAYS_AFTER else 1)
+        sizes = listing(sorted({f"{view.width}x{view.height}" for view in views}), most=3)
+        images = len(views) * len(renderers)
+        what = f"{work or f'{images} image' + 's' * (images != 1)} at {sizes}"
+        if lacking := lack_of_memory(needed):
+            raise UsageError(what, f"would take {lacking}; a smaller `scale` or fewer `threads` need less")
+        if cost.seconds >= LONG_JOB or needed >= LARGE_JOB:
+            minutes = f"about {cost.seconds / 60:.0f} minutes" if cost.seconds >= LONG_JOB else "under a minute"
+            memory = f", {needed / 1e9:.1f} GB" if needed >= LARGE_JOB else ""
+            self.monitor.say(f"{what}: {minutes}{memory}; fewer {fewer} take less")
+
+
+@dataclass(frozen=True)
+class Workers:
+    """Those who draw: torch's threads of this process, and the cluster if one is named."""
+
+    threads: int
+    cluster: Executor | None
+
+
+@contextmanager
+def running(
+    options: Options,
+    output: Path | None,
+    check: Callable[[], object],
+    folder: bool = False,
+    shared: Path | None = None,
+) -> Iterator[Workers]:
+    """Limit torch's threads, claim the output and connect the workers that the options name, inside the block.
+
+    check: refuses what must not be written; see `io.atomic.writing`.  folder: the output is one.
+    shared: folder that all workers see; None for the output's.
+
+    Raises:
+        OutputError: the output cannot be written.
+        UsageError: the extra `cluster` is missing, nothing answers there, or the workers are unfit.
+    """
+    threads = getattr(options, "threads", None) or torch.get_num_threads()
+    scheduler = options.scheduler if isinstance(options, RecipeOptions) else None
+    with torch_threads(threads), writing(output, check, folder):
+        if not isinstance(scheduler, str):
+            yield Workers(threads, scheduler)
+            return
+        if find_spec("distributed") is None:
+            raise UsageError("scheduler", "needs the extra `cluster`: pip install 'aaplug[cluster]'")
+        from aaplug.system.cluster import connected  # its package is an extra
+
+        if output is not None:
+            shared = output if folder else output.parent
+        with connected(scheduler, threads, shared, options.monitor) as cluster:
+            yield Workers(threads, cluster)

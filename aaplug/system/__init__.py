@@ -1,0 +1,1 @@
+"""Floor below the scene: errors, registries, workers, locks, hashes, messages."""

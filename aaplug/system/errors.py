@@ -1,0 +1,79 @@
+"""Errors of users; each says where it is, what was expected, what is there and what to do.
+
+Everything here reaches the terminal as one line and ends the program with exit code 2.  Our own mistakes are
+`assert`s and are not caught.
+"""
+
+import difflib
+from collections.abc import Iterable, Sequence
+from os import PathLike
+
+MAX_VALUE_CHARACTERS = 60  # characters of a refused value in a message
+
+
+class AaplugError(Exception):
+    """Any mistake in the user's input, worded for the user."""
+
+    def __init__(self, where: str | PathLike[str], problem: str) -> None:
+        self.where = str(where)
+        self.problem = problem
+        super().__init__(f"{self.where}: {problem}")
+
+    def __reduce__(self) -> tuple[type["AaplugError"], tuple[str, str]]:
+        """Return the parts that it is made of, so that it can come back from another process."""
+        return type(self), (self.where, self.problem)
+
+
+class FormatError(AaplugError):
+    """A file is not what its format promises."""
+
+
+class FrameError(AaplugError):
+    """Scene and cameras do not belong together."""
+
+
+class OutputError(AaplugError):
+    """Nothing may or can be written there."""
+
+
+class UsageError(AaplugError):
+    """Options that contradict each other or name nothing."""
+
+
+class ClusterError(UsageError):
+    """A cluster that has gone or is unfit, and so ends a whole batch."""
+
+
+def listing(names: Sequence[str], most: int = 6) -> str:
+    """Join names for a message, cut short where there are many."""
+    first = ", ".join(names[:most])
+    return first if len(names) <= most else f"{first} and {len(names) - most} more"
+
+
+def not_one_of(name: object, names: Iterable[str]) -> str:
+    """Message for a name that is none of these."""
+    return f"'{name}' is not one of {', '.join(names)}"
+
+
+def did_you_mean(name: str, names: Iterable[str]) -> str:
+    """The end of a message about a misspelled name; empty if none of the names is like it."""
+    matches = difflib.get_close_matches(name, list(names), 1)
+    return f"; did you mean {matches[0]}?" if matches else ""
+
+
+def printable(text: str) -> str:
+    """The text with control characters, which command a terminal, in escaped form."""
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+
+
+def reason(error: Exception) -> str:
+    """The reason of a failure of a library or the system, in lower case: an OSError's without its number and path."""
+    strerror = error.strerror if isinstance(error, OSError) else None
+    return (strerror or str(error)).lower()
+
+
+def of_system(error: BaseException | None) -> OSError | None:
+    """The system's error, also behind torch's own about a full disk."""
+    if isinstance(error, RuntimeError):
+        error = error.__context__
+    return error if isinstance(error, OSError) else None

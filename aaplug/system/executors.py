@@ -1,0 +1,212 @@
+"""Worker pools: apply one function to many items, in threads or in processes.
+
+Results come in the order of the items, and a pool reads only a few items ahead of its workers, so memory does not grow
+with the number of items.  Leaving the loop early, also by an exception, ends the workers.
+"""
+
+import multiprocessing
+import os
+import shutil
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, ThreadPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from dataclasses import dataclass
+from multiprocessing import resource_tracker
+from pathlib import Path
+from typing import Any, Protocol, TypeVar, runtime_checkable
+
+import torch
+
+from aaplug.system.allocator import keep_freed_memory
+from aaplug.system.errors import OutputError, UsageError, of_system, reason
+from aaplug.system.locks import scratch
+
+# Python's resource tracker removes what killed processes left; with this option it does not say so
+QUIET_TRACKER = "ignore::UserWarning:multiprocessing.resource_tracker"
+
+WORK_FILE_NAME = "work.pt"  # file with the function of the workers, in a folder of temporary files
+PAYS_AFTER_SECONDS = 20.0  # two processes take five seconds to start, and save two fifths
+ITEMS_PER_WORKER = 2  # waiting or at work, so that no worker is idle
+
+T = TypeVar("T")
+R = TypeVar("R")
+Result = TypeVar("Result", covariant=True)
+Apply = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]  # like `map`, and each executor's
+
+
+@runtime_checkable
+class Executor(Protocol):
+    """A pool of workers: threads, processes of this machine, or a cluster's (`system.cluster`)."""
+
+    def map(self, work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+        """Yield `work(item)` of every item."""
+        ...
+
+
+class Pending(Protocol[Result]):
+    """A result to come."""
+
+    def result(self) -> Result:
+        """Wait for it."""
+        ...
+
+
+@dataclass(frozen=True)
+class Threads:
+    """Threads of this process, each with one torch thread.  At most one item per thread waits."""
+
+    workers: int
+
+    def map(self, work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+        """Yield `work(item)` of every item, in order."""
+        pool = ThreadPoolExecutor(self.workers, initializer=torch.set_num_threads, initargs=(1,))
+        with torch_threads(1), pool:
+            try:
+                yield from results(lambda item: pool.submit(work, item), items, lambda: self.workers + 1)
+            finally:
+                pool.shutdown(cancel_futures=True)
+
+
+@dataclass(frozen=True)
+class Processes:
+    """Fresh (spawned) processes.
+
+    `work` is pickled once, to a file that all of them map, so it can hold a large scene; items and results travel
+    through pipes.  A script that uses processes needs `if __name__ == "__main__":` around its calls.
+
+    torch_threads: of each process; None leaves torch's default.
+    ordered: true for results in the order of the items, false for results as they finish.
+    """
+
+    workers: int
+    torch_threads: int | None = 1
+    ordered: bool = True
+
+    def map(self, work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+        """Yield `work(item)` of every item.
+
+        Raises:
+            UsageError: a process died, for example for lack of memory.
+            OutputError: there is no room for the file of `work`.
+        """
+        with scratch() as folder:
+            save(work, folder / WORK_FILE_NAME)
+            track_quietly()
+            spawn = multiprocessing.get_context("spawn")
+            pool = ProcessPoolExecutor(self.workers, spawn, _start, (str(folder), self.torch_threads))
+            try:
+                most = ITEMS_PER_WORKER * self.workers
+                yield from results(lambda item: pool.submit(_call, item), items, lambda: most, self.ordered)
+            except BrokenProcessPool as error:
+                raise UsageError(
+                    "worker process",
+                    "died: out of memory (fewer threads need less), or started by a script "
+                    'without `if __name__ == "__main__":`',
+                ) from error
+            finally:
+                pool.shutdown(cancel_futures=True)
+
+
+@dataclass(frozen=True)
+class ProcessesIfLong:
+    """Processes, if the first item says that more than `pays_after` seconds of work are left; else this one."""
+
+    workers: int
+    pays_after: float = PAYS_AFTER_SECONDS
+
+    def map(self, work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+        """Yield `work(item)` of every item, in order; errors as those of `Processes`."""
+        first, *others = items
+        started = time.perf_counter()
+        yield work(first)
+        left = (time.perf_counter() - started) * len(others)
+        workers = min(self.workers, len(others)) if left > self.pays_after else 1
+        yield from (map if workers < 2 else Processes(workers).map)(work, others)
+
+
+@contextmanager
+def torch_threads(count: int) -> Iterator[None]:
+    """Let torch use `count` threads inside the block."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def results(
+    submit: Callable[[T], Pending[R]], items: Iterable[T], most: Callable[[], int], ordered: bool = True
+) -> Iterator[R]:
+    """Yield the results, with at most `most()` items submitted and not yet yielded."""
+    waiting: deque[Any] = deque()
+    for item in items:
+        waiting.append(submit(item))
+        if len(waiting) >= most():
+            yield _next(waiting, ordered)
+    while waiting:
+        yield _next(waiting, ordered)
+
+
+def _next(waiting: deque[Any], ordered: bool) -> Any:
+    future = waiting[0] if ordered else next(iter(wait(waiting, return_when=FIRST_COMPLETED).done))
+    waiting.remove(future)
+    return future.result()
+
+
+def save(work: object, path: Path) -> None:
+    """Write the function of the workers; raises OutputError if there is no room for it."""
+    try:
+        with path.open("wb") as stream:
+            torch.save(work, stream)
+    except (OSError, RuntimeError) as error:
+        if cause := of_system(error):
+            raise OutputError(path, f"cannot be written: {reason(cause)}") from error
+        raise
+
+
+def load(path: str | Path) -> Callable[[Any], Any]:
+    """Return what `save` wrote; its tensors stay in the file until they are read."""
+    return torch.load(path, mmap=True, weights_only=False)  # our own file
+
+
+def track_quietly() -> None:
+    """Start Python's resource tracker, which inherits the options of warnings, before the first worker does."""
+    if os.name != "posix":  # there is none
+        return
+    sys.warnoptions.append(QUIET_TRACKER)
+    try:
+        resource_tracker.ensure_running()
+    finally:
+        sys.warnoptions.remove(QUIET_TRACKER)
+
+
+_work: Callable[[Any], Any] | None = None  # function of this worker process
+
+
+def _start(folder: str, threads: int | None) -> None:
+    """Begin a worker process: load the work, and end with the parent if that dies without shutting the pool down."""
+    global _work
+
+    def end_with_parent() -> None:
+        parent = multiprocessing.parent_process()
+        assert parent is not None
+        parent.join()
+        shutil.rmtree(folder, ignore_errors=True)
+        os._exit(1)
+
+    threading.Thread(target=end_with_parent, daemon=True).start()
+    keep_freed_memory()
+    if threads is not None:
+        torch.set_num_threads(threads)
+    _work = load(Path(folder) / WORK_FILE_NAME)
+
+
+def _call(item: Any) -> Any:
+    assert _work is not None
+    return _work(item)

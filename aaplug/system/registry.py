@@ -1,0 +1,170 @@
+"""Registries of everything that is chosen by name, from aaplug and from installed plug-ins.
+
+A package adds an entry by an entry point in the group "aaplug.<kind>s", for example in its pyproject.toml:
+
+    [project.entry-points."aaplug.screen_filters"]
+    sharp = "their_package.sharp:SHARP"
+
+The entry's name is the name in the registry.  An object with a `name` of its own must agree with it.  A plug-in that
+cannot be used is left out with a warning, so that it does not stop everything else.  An entry is imported when it is
+first used, so that names can be listed without importing anything.
+"""
+
+import logging
+from collections.abc import Iterable, Iterator, Mapping
+from functools import cache
+from importlib import import_module
+from importlib.metadata import entry_points
+from typing import Any, TypeVar
+
+from aaplug.system.errors import UsageError, did_you_mean, not_one_of
+
+PREFIX = "aaplug."
+REGISTRIES = {  # place of each kind's registry; a kind, with underscores and an s, is an entry point group
+    "world filter": "aaplug.methods:WORLD_FILTERS",
+    "screen filter": "aaplug.methods:SCREEN_FILTERS",
+    "selection": "aaplug.methods:SELECTIONS",
+    "pixel kernel": "aaplug.methods:PIXEL_KERNELS",
+    "compositor": "aaplug.methods:COMPOSITORS",
+    "recipe": "aaplug.methods:RECIPES",
+    "viewer": "aaplug.methods.viewers:VIEWERS",
+    "form": "aaplug.methods:FORMS",
+    "rasterizer": "aaplug.rasterizers:RASTERIZERS",
+    "metric": "aaplug.evaluation:METRICS",
+    "protocol": "aaplug.evaluation:PROTOCOLS",
+    "method": "aaplug.finetuning:METHODS",
+    "scene format": "aaplug.io.scenes:SCENE_FORMATS",
+    "camera format": "aaplug.io.cameras:CAMERA_FORMATS",
+}
+
+log = logging.getLogger("aaplug")
+T = TypeVar("T")
+
+
+class Registry(Mapping[str, T]):
+    """Named objects of one kind.
+
+    kind: one of `REGISTRIES`.
+    """
+
+    def __init__(self, kind: str, type_at: str, own: Mapping[str, T | str]):
+        """type_at: place of the entries' type, as "module:name".  own: aaplug's entries, or their places."""
+        assert kind in REGISTRIES, kind
+        self.kind, self._type_at = kind, type_at
+        self._built_in: dict[str, T | str] = dict(own)
+        self._entries: dict[str, T] = {}  # loaded
+        self._plug_ins_loaded = False
+
+    @property
+    def names(self) -> list[str]:
+        """All names, also of plug-ins that cannot be used; nothing is imported."""
+        points = _points().select(group=group_of(self.kind))
+        return list(dict.fromkeys([*self._built_in, *(point.name for point in points), *self._entries]))
+
+    def __getitem__(self, name: str) -> T:
+        if name not in self._entries:
+            if name not in self._built_in:
+                self._load_plug_ins()
+            else:
+                value: Any = self._built_in[name]
+                self._add(name, _at(value) if isinstance(value, str) else value, f"{self.kind} {name}")
+        return self._entries[name]
+
+    def __iter__(self) -> Iterator[str]:
+        self._load_plug_ins()
+        return iter(dict.fromkeys([*self._built_in, *self._entries]))
+
+    def __len__(self) -> int:
+        return len(list(iter(self)))
+
+    def __reduce__(self) -> tuple[Any, tuple[str]]:
+        """A registry is its process's own; a copy is that of the process that makes it."""
+        return _at, (REGISTRIES[self.kind],)
+
+    def find(self, name: str, parameter: str | None = None) -> T:
+        """An entry by name.
+
+        Raises:
+            UsageError: there is none; the error names `parameter`, or else the kind, and the closest names.
+        """
+        if name not in self._built_in and name not in list(self):
+            raise UsageError(parameter or self.kind, not_one_of(name, self) + did_you_mean(name, self))
+        return self[name]
+
+    def register(self, name: str, value: T) -> None:
+        """Add an entry from Python, for this process.
+
+        Raises:
+            UsageError: the name is taken, or the object is not of this kind.
+        """
+        self._load_plug_ins()
+        where = f"{self.kind} {name}"
+        if name in self._built_in:
+            raise UsageError(where, f"a {self.kind} named '{name}' exists already")
+        self._add(name, value, where)
+
+    def _load_plug_ins(self) -> None:
+        if self._plug_ins_loaded:
+            return
+        self._plug_ins_loaded = True
+        groups = set(map(group_of, REGISTRIES))
+        for group in sorted(_points().groups):
+            if group.startswith(PREFIX) and group not in groups:
+                log.warning("entry point group %s is not known%s", group, did_you_mean(group, groups))
+        group = group_of(self.kind)
+        for point in _points().select(group=group):
+            package = f" of package {point.dist.name}" if point.dist else ""
+            where = f"plug-in {point.value}{package} ({group})"
+            try:
+                if point.name in self._built_in:
+                    raise UsageError(where, f"a {self.kind} named '{point.name}' exists already")
+                try:
+                    value = point.load()
+                except Exception as error:  # a plug-in can fail in any way
+                    raise UsageError(where, f"cannot be imported: {error}") from error
+                self._add(point.name, value, where)
+            except UsageError as error:
+                log.warning("%s; it is left out", error)
+
+    def _add(self, name: str, value: T, where: str) -> None:
+        if name in self._entries:
+            raise UsageError(where, f"a {self.kind} named '{name}' exists already")
+        if isinstance(value, type) or not isinstance(value, _at(self._type_at)):
+            noun = f"the class {value.__name__}" if isinstance(value, type) else f"a {type(value).__name__}"
+            raise UsageError(where, f"is {noun}, which is not a {self.kind}; see examples/guides/contributing.md")
+        name_inside = getattr(value, "name", name)
+        if name_inside != name:
+            raise UsageError(where, f"is registered as '{name}' but calls itself '{name_inside}'")
+        self._entries[name] = value
+
+
+def named(objects: Iterable[T]) -> dict[str, T]:
+    """Objects by their `name`."""
+    return {getattr(value, "name"): value for value in objects}  # noqa: B009
+
+
+def names_of(kind: str, comparisons: bool = True) -> list[str]:
+    """Names in the registry of a kind; nothing that takes long is imported.
+
+    comparisons: also those that aaplug adds by entry points, which are there for comparison.
+    """
+    names = _at(REGISTRIES[kind]).names
+    ours = {p.name for p in _points().select(group=group_of(kind)) if p.dist is not None and p.dist.name == "aaplug"}
+    return names if comparisons else [name for name in names if name not in ours]
+
+
+def group_of(kind: str) -> str:
+    """Name of the entry point group of a kind."""
+    return f"{PREFIX}{kind.replace(' ', '_')}s"
+
+
+def _at(place: str) -> Any:
+    """The object at "module:name"."""
+    module, _, name = place.partition(":")
+    return getattr(import_module(module), name)
+
+
+@cache
+def _points() -> Any:
+    """Entry points of all installed packages; reading them takes milliseconds, and none comes while a process runs."""
+    return entry_points()

@@ -1,0 +1,96 @@
+"""The decorator of verbs: a function that takes its options as one object is called with them as keywords.
+
+A verb's options are a dataclass of `aaplug.options`, which states each keyword once.  Type checkers see them as
+keywords of the verb, and so do `help` and the API's pages.
+"""
+
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from functools import wraps
+from typing import Any, ParamSpec, Protocol, TypeVar
+
+from aaplug.io.scenes import SceneLike
+from aaplug.options.base import Options, documented
+from aaplug.options.shared import AnyPath
+from aaplug.rendering.job import CamerasLike
+
+P = ParamSpec("P")
+O_contra = TypeVar("O_contra", bound=Options, contravariant=True)
+R_co = TypeVar("R_co", covariant=True)
+ScenesLike = Mapping[str, SceneLike] | Sequence[SceneLike]
+
+
+class Writing(Protocol[P, R_co]):
+    """A verb that works on a scene and can write an output."""
+
+    def __call__(  # noqa: D102
+        self,
+        scene: SceneLike,
+        cameras: CamerasLike = None,
+        output: AnyPath | None = None,
+        *_: P.args,
+        **options: P.kwargs,
+    ) -> R_co: ...
+
+
+class Looking(Protocol[P, R_co]):
+    """A verb that looks at a scene."""
+
+    def __call__(  # noqa: D102
+        self, scene: SceneLike | None = None, cameras: CamerasLike = None, *_: P.args, **options: P.kwargs
+    ) -> R_co: ...
+
+
+class Comparing(Protocol[P, R_co]):
+    """A verb that works on several scenes."""
+
+    def __call__(  # noqa: D102
+        self,
+        scenes: ScenesLike,
+        cameras: CamerasLike = None,
+        output: AnyPath | None = None,
+        *_: P.args,
+        **options: P.kwargs,
+    ) -> R_co: ...
+
+
+def writes(
+    options: Callable[P, O_contra],
+) -> Callable[[Callable[[SceneLike, CamerasLike, AnyPath | None, O_contra], R_co]], Writing[P, R_co]]:
+    """Decorate a verb that works on a scene and can write an output."""
+    return _with(options, ("cameras", "output"))
+
+
+def looks(
+    options: Callable[P, O_contra],
+) -> Callable[[Callable[[SceneLike | None, CamerasLike, O_contra], R_co]], Looking[P, R_co]]:
+    """Decorate a verb that looks at a scene."""
+    return _with(options, ("scene", "cameras"))
+
+
+def compares(
+    options: Callable[P, O_contra],
+) -> Callable[[Callable[[ScenesLike, CamerasLike, AnyPath | None, O_contra], R_co]], Comparing[P, R_co]]:
+    """Decorate a verb that works on several scenes."""
+    return _with(options, ("cameras", "output"))
+
+
+def _with(options: Any, optional: tuple[str, ...]) -> Any:
+    def decorate(body: Callable[..., Any]) -> Callable[..., Any]:
+        *given, last = inspect.signature(body).parameters.values()
+        assert last.name == "options"
+        inputs = inspect.Signature([p.replace(default=None) if p.name in optional else p for p in given])
+
+        @wraps(body)
+        def verb(*args: Any, **keywords: Any) -> Any:
+            own = {name: keywords.pop(name) for name in inputs.parameters if name in keywords}
+            bound = inputs.bind(*args, **own)
+            bound.apply_defaults()
+            return body(*bound.args, options.of(keywords))
+
+        fields = inspect.signature(options).parameters.values()
+        signature = inspect.signature(body).replace(parameters=[*inputs.parameters.values(), *fields])
+        vars(verb).update(__signature__=signature, __doc__=documented(body.__doc__, options))
+        return verb
+
+    return decorate

@@ -1,0 +1,126 @@
+"""Scenes and cameras as the command line names them: options, reading, and saying what was read."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+import aaplug
+from aaplug.core.conventions import CONVENTIONS
+from aaplug.io import SpzAxes
+from aaplug.options.base import CAMERAS, UNSET, Group, OneOf, Options, flag, number
+from aaplug.options.shared import SCALE, Orbit
+from aaplug.system.errors import UsageError
+
+from .console import TERMINAL, say
+from .words import Words, worded
+
+if TYPE_CHECKING:
+    from aaplug.io.scenes.scene_file import Scene
+
+SCENE_FILE = Group("scene file", "How scene files are read.")
+CONVENTION_NAMES = tuple(CONVENTIONS)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FileOptions(Options):
+    """How scene files are read."""
+
+    convention: Annotated[str | None, flag("|".join(CONVENTION_NAMES)), OneOf(CONVENTION_NAMES), SCENE_FILE] = None
+    """How the scene was trained or, for playcanvas and playcanvas-classic, converted, if its file does not say."""
+    drop_bad: Annotated[bool, SCENE_FILE] = False
+    """Leave out Gaussians with NaN, infinite or unusable values instead of stopping."""
+    allow_checkpoint: Annotated[bool, SCENE_FILE] = False
+    """Also read gsplat's .pt, a pickle; only its tensors are loaded."""
+    spz_axes: Annotated[SpzAxes, SCENE_FILE] = "auto"
+    """Axes of a .spz: opengl (its specification), opencv (splat-transform, gsply), or auto: as the cameras tell."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneOptions(FileOptions):
+    """The scene."""
+
+    scene: Annotated[Path | None, tyro.conf.Positional, flag("SCENE")] = None
+    """A scene (.ply, .compressed.ply, .spz, .sog, .splat, .ksplat) or a folder (INRIA model, SOG, levels of detail)."""
+    model_path: Annotated[Path | None, flag("FOLDER", "-m"), SCENE_FILE] = None
+    """An INRIA model folder, instead of SCENE."""
+    iteration: Annotated[int | None, number(0, 10**9, whole=True, metavar="N"), UNSET, SCENE_FILE] = None
+    """Iteration of a model folder (default: the last)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraOptions(Options):
+    """The cameras."""
+
+    cameras: Annotated[Path | None, flag("PATH")] = None
+    """cameras.json, COLMAP model, Blender transforms_*.json, or their folder (default: SCENE's model folder)."""
+    train_scale: Annotated[float | None, SCALE, UNSET, CAMERAS] = None
+    """Training size relative to the cameras' source size, where the files do not say."""
+    images: Annotated[str | None, flag("FOLDER"), CAMERAS] = None
+    """Folder of photographs inside the data set (default: the format's own)."""
+    test_every: Annotated[int | None, number(0, 1_000_000, whole=True, metavar="N"), UNSET, CAMERAS] = None
+    """Hold out every N-th view by name; 0 for no split (default: as usual for the format)."""
+
+
+SCENE_AND_CAMERAS: Sequence[type[Options]] = (SceneOptions, CameraOptions, Orbit)
+
+
+def path_of(words: Words) -> Path:
+    """The one scene that the words name; raises UsageError if they name none or two."""
+    if (words.scene is None) == (words.model_path is None):
+        raise UsageError("scene", "name one scene, before the options: a .ply, a model folder, or -m FOLDER")
+    return words.scene or words.model_path
+
+
+def open_scene(words: Words, path: Path | None = None) -> "Scene":
+    """Open the scene that the words name, or one at a path, and say what it is."""
+    from aaplug.methods.conversion import describe
+
+    files = words.of(FileOptions if path else SceneOptions)
+    scene = aaplug.read_scene(
+        path or path_of(words),
+        iteration=files.iteration if isinstance(files, SceneOptions) else None,
+        convention=None if files.convention is None else CONVENTIONS[files.convention],
+        drop_bad=files.drop_bad,
+        allow_checkpoint=files.allow_checkpoint,
+        spz_axes=files.spz_axes,
+    )
+    facts = f"{scene.count:,} Gaussians, SH degree {scene.sh_degree}, {scene.convention.name} ({scene.evidence})"
+    say(f"scene: {scene.path}: {facts}")
+    for note in scene.notes:
+        undecided = scene.other is not None and note == scene.notes[-1]
+        text = f"unless the cameras tell otherwise, {note}" if undecided else note
+        say(worded(f"scene: {text}", FileOptions.__dataclass_fields__))
+    for fusion in scene.fused:
+        say(f"fused: {describe(fusion)}")
+    return scene
+
+
+def read_cameras(words: Words, scene: "Scene") -> "aaplug.CameraSet | Orbit":
+    """Read the cameras and say where sizes and split come from; without any, the orbit that stands in for them."""
+    options, orbit = words.of(CameraOptions), words.of(Orbit)
+    path = options.cameras or scene.camera_folder
+    if path is None:
+        return orbit
+    for name, usual in vars(Orbit()).items():
+        if name != "monitor" and getattr(orbit, name) != usual:
+            raise UsageError(name, f"is for scenes without cameras, and there are some: {path}")
+    cameras = aaplug.read_cameras(
+        path, train_scale=options.train_scale, images=options.images, test_every=options.test_every
+    )
+    for note in cameras.notes:
+        say(worded(f"cameras: {note}", CameraOptions.__dataclass_fields__))
+    return cameras
+
+
+def read_inputs(words: Words) -> "tuple[Scene, aaplug.CameraSet | Orbit]":
+    """Open the scene and read its cameras, and say what they are."""
+    scene = open_scene(words)
+    return scene, read_cameras(words, scene)
+
+
+def told(words: Words, options: type[Options]) -> dict[str, Any]:
+    """Keywords of the library's verb: its options, and the terminal to tell."""
+    return words.keywords(options) | {"monitor": TERMINAL}

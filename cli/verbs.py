@@ -1,0 +1,451 @@
+"""The table of verbs: the options of each, and how it reads, calls the library and tells what came of it."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+from rich.box import SIMPLE_HEAD
+from rich.markup import escape
+from rich.table import Table
+
+import aaplug
+from aaplug.options import verbs
+from aaplug.options.base import REPORT, UNSET, Options, flag, number
+from aaplug.options.shared import MAX_SIDE, FrameOptions, Orbit
+from aaplug.system.errors import UsageError, printable
+
+from .batch import SEVERAL, batch_of_evaluations, for_each_scene
+from .console import FAILED, TERMINAL, out, print_json, say
+from .inputs import (
+    SCENE_AND_CAMERAS,
+    CameraOptions,
+    FileOptions,
+    SceneOptions,
+    open_scene,
+    path_of,
+    read_cameras,
+    read_inputs,
+    told,
+)
+from .words import Command, Option, Words, json_of, options_of, output
+
+if TYPE_CHECKING:
+    from aaplug.rendering.benchmark import Figures
+
+VERBS: dict[str, Command] = {}
+PROGRAM_KEYS = ("fused", "comments")  # of `info`, for programs; the table has words for the first
+
+
+def verb(*options: type[Options] | Option) -> Callable[[Callable[[Words], int]], Callable[[Words], int]]:
+    """Enter a function into the table; its docstring is the verb's help.
+
+    options: single ones, and dataclasses of them; of two with one name the first counts.
+    """
+    stated: dict[str, Option] = {}
+    for each in options:
+        for option in [each] if isinstance(each, Option) else options_of(each):
+            stated.setdefault(option.name, option)
+
+    def enter(run: Callable[[Words], int]) -> Callable[[Words], int]:
+        name = run.__name__.replace("_", "-")
+        VERBS[name] = Command(name, run.__doc__ or "", list(stated.values()), run)
+        return run
+
+    return enter
+
+
+@verb(
+    *SCENE_AND_CAMERAS,
+    output("PATH", "A folder for the images, or one .png for one view."),
+    verbs.RenderOptions,
+    json_of("the files as one JSON object"),
+)
+def render(words: Words) -> int:
+    """Render views of a scene at any size to PNG.
+
+    To measure how close images come to the truth, use evaluate; for a moving camera, video.
+    """
+    inputs = read_inputs(words)
+    written = aaplug.render(*inputs, words.output, **told(words, verbs.RenderOptions))
+    if words.json:
+        images = [{"view": v.name, "file": str(p), "width": v.width, "height": v.height} for v, p in written]
+        print_json({"recipe": words.recipe, "images": images})
+    else:
+        say(f"wrote {len(written)} image{'s' * (len(written) != 1)} to {words.output}")
+    return 0
+
+
+@verb(
+    *SCENE_AND_CAMERAS,
+    output("FILE", "File to write: .ply, or .spz or .splat, which round values and keep less; with --batch, a folder."),
+    verbs.ConvertOptions,
+    *SEVERAL,
+    json_of("what was done as one JSON object"),
+)
+def convert(words: Words) -> int:
+    """Fuse anti-aliasing into a plain scene file of as many Gaussians, for viewers with a fixed 2D filter.
+
+    In seconds for the 2D Mip filter (0.1 px², compensated), in minutes for a viewer named by --for.  For fewer
+    Gaussians, use lod; to move the Gaussians until all sizes look right, finetune.
+    """
+    if words.batch is not None:
+        return for_each_scene(words, lambda own: ".ply", lambda own: _converted(own)[0])
+    facts, result = _converted(words)
+    from aaplug.evaluation.results import tables
+    from aaplug.methods.conversion import fused_in
+
+    if words.json:
+        print_json(facts)
+    elif result.report is not None:
+        out.print("As the viewer draws it, against the scene's own training-size render:")
+        out.print(tables(result.report)[0])
+    how = "in parts" if result.scene is None else f"fused {fused_in(result.scene)}"
+    say(f"wrote {words.output}: {how}; show it with {result.viewer.rule} ({result.viewer.name})")
+    say(result.viewer.advice)
+    return 0
+
+
+def _converted(words: Words) -> tuple[dict[str, Any], Any]:
+    """Convert one scene; facts for JSON, and the result."""
+    result = aaplug.convert(*read_inputs(words), words.output, **told(words, verbs.ConvertOptions))
+    return {"output": str(words.output)} | result.as_json(), result
+
+
+@verb(
+    *SCENE_AND_CAMERAS,
+    output("PATH", "The one scene's file (.ply, .spz or .splat), or a folder for levels (.ply) or, with --batch, all."),
+    verbs.LodOptions,
+    *SEVERAL,
+    json_of("what was made as one JSON object"),
+)
+def lod(words: Words) -> int:
+    """Merge Gaussians: into levels of detail, or into one lighter scene (--simplify, --budget).
+
+    Levels make small images faster and cleaner.  To keep every Gaussian, use convert or finetune.
+    """
+    if words.batch is not None:
+        return for_each_scene(
+            words, lambda own: ".ply" if own.of(verbs.LodOptions).single else "", lambda own: _lod(own)
+        )
+    facts = _lod(words)
+    if words.json:
+        print_json(facts)
+    counts = [f"{level['gaussians']:,}" for level in facts["levels"]]
+    say(f"wrote {words.output}: {' > '.join(counts)} Gaussians")
+    return 0
+
+
+def _lod(words: Words) -> dict[str, Any]:
+    scene, cameras = read_inputs(words)
+    levels = aaplug.lod(scene, cameras, words.output, **told(words, verbs.LodOptions))
+    made = [{"rate": level.rate, "gaussians": len(level.scene)} for level in levels]
+    return {"output": str(words.output), "gaussians": scene.count, "levels": made}
+
+
+@verb(
+    *SCENE_AND_CAMERAS,
+    output("FILE.ply", "File to write the scene to."),
+    verbs.FinetuneOptions,
+    json_of("the report as JSON instead of the table"),
+)
+def finetune(words: Words) -> int:
+    """Optimize the Gaussians until every scale looks like the training size, averaged down; write a plain scene file.
+
+    It takes minutes to hours and gives the closest images at one sample per pixel; convert takes seconds.  A report
+    (.finetune.json), pictures (.finetune.png) and a checkpoint go beside it.  Ctrl-C stops after the current step;
+    --resume continues.
+    """
+    tuned = aaplug.finetune(*read_inputs(words), words.output, **told(words, verbs.FinetuneOptions))
+    if words.json:
+        print_json(tuned.as_json())
+    else:
+        from aaplug.evaluation.results import tables
+
+        out.print(*tables(tuned.report))
+    stem = words.output.stem
+    say(f"wrote {words.output}, {stem}.finetune.json and {stem}.finetune.png")
+    return 0
+
+
+MORE_SCENES = Option(
+    "more",
+    Annotated[tuple[Path, ...], tyro.conf.Positional, flag("[SCENE ...]")],
+    "More scenes, with the same --cameras or each a model folder.  Each gets its own folder of results.",
+    (),
+)
+BATCH = Option(
+    "batch",
+    Annotated[Path | None, flag("FILE.toml")],
+    "Scenes and their settings from a file; what it does not say is as on the command line.",
+    None,
+)
+
+
+@verb(
+    SceneOptions,
+    MORE_SCENES,
+    BATCH,
+    CameraOptions,
+    Orbit,
+    output("FOLDER", "Folder for results.json, per_view.json and results.csv.", None),
+    verbs.EvaluateOptions,
+    json_of("results.json instead of the table"),
+)
+def evaluate(words: Words) -> int:
+    """Measure recipes over scales, against photographs or against the scene's own look; of one scene or many.
+
+    To measure scene files against each other, use compare; for images only, render.
+    """
+    if words.batch is not None or words.more:
+        return batch_of_evaluations(words)
+    _ = path_of(words)  # refuses where none is named
+    from aaplug.evaluation.results import results, tables
+    from aaplug.verbs.evaluate import check_results
+
+    check_results(words.output, words.of(verbs.EvaluateOptions))  # before the scene is read
+    report = aaplug.evaluate(*read_inputs(words), words.output, **told(words, verbs.EvaluateOptions))
+    if words.json:
+        print_json(results(report))
+    else:
+        out.print(*tables(report))
+    return 0
+
+
+@verb(
+    *SCENE_AND_CAMERAS,
+    output("FILE.webm", "The video: VP9 .webm, or H.264 .mp4."),
+    verbs.VideoOptions,
+    json_of("what was written as one JSON object"),
+)
+def video(words: Words) -> int:
+    """Render a camera path to a video, classic 3DGS and aaplug side by side.
+
+    For single images, use render; to move the camera by hand, view.
+    """
+    clip = aaplug.video(*read_inputs(words), words.output, **told(words, verbs.VideoOptions))
+    if words.json:
+        print_json(clip._asdict() | {"file": str(clip.file)})
+    else:
+        say(f"wrote {clip.file}")
+    return 0
+
+
+@verb(
+    Option(
+        "scenes",
+        Annotated[tuple[Path, ...], tyro.conf.Positional, flag("SCENE SCENE [SCENE ...]")],
+        "Two or more scenes of any format, or their folders; the first is what the others are held to.",
+        (),
+    ),
+    Option(
+        "reference",
+        Annotated[Path | None, flag("SCENE")],
+        "The scene that the others are held to, instead of the first.",
+        None,
+    ),
+    CameraOptions,
+    output("FOLDER", "Folder for compare.json, compare.csv, report.html and contact-sheet.png.", None),
+    verbs.CompareOptions,
+    Option(
+        "fail_under",
+        Annotated[float | None, number(0, 200, unit="dB"), UNSET, REPORT],
+        "Exit with 1 if the mean PSNR of a scene at any scale is below so many dB: --fail-under 40dB.",
+        None,
+    ),
+    FileOptions,
+    Orbit,
+    json_of("compare.json instead of the tables"),
+)
+def compare(words: Words) -> int:
+    """Measure what compression, conversion, pruning or training again cost: scenes against the first, at every size.
+
+    To measure recipes on one scene, use evaluate.
+    """
+    first, others = words.reference, [path for path in words.scenes if path != words.reference]
+    paths = others if first is None else [first, *others]
+    if words.reference is None:
+        paths = list(words.scenes)
+    if len(paths) < 2:
+        raise UsageError("compare", f"needs two scenes or more, got {len(paths)}: aaplug compare A.ply B.spz")
+    from aaplug.verbs.compare import check_compared
+
+    check_compared(words.output, words.of(verbs.CompareOptions))  # before anything is read
+    scenes = [open_scene(words, path) for path in paths]
+    cameras = read_cameras(words, scenes[0])
+    comparison = aaplug.compare(scenes, cameras, words.output, **told(words, verbs.CompareOptions))
+    if words.json:
+        print_json(comparison.summary())
+    else:
+        out.print(*comparison.tables())
+    least, lowest = words.fail_under, comparison.lowest
+    if least is not None and lowest.value < least:
+        say(f"{lowest.scene} at {lowest.scale:g}: mean PSNR {lowest.value:.2f} dB is below {least:g} dB")
+        return FAILED
+    return 0
+
+
+@verb(
+    *SCENE_AND_CAMERAS,
+    FrameOptions,
+    Option("limits", bool, "Show every limit on files instead, and the environment variable that changes it.", False),
+    json_of("one JSON object instead of a table"),
+)
+def info(words: Words) -> int:
+    """Tell about a scene: its convention and why, what is fused, what is odd.
+
+    With cameras it tells how finely they sample the scene.
+    """
+    if words.limits:
+        return _show_limits(words.json)
+    scene = open_scene(words)
+    cameras = words.of(Orbit) if words.cameras is None else read_cameras(words, scene)
+    facts = aaplug.info(scene, cameras, **told(words, FrameOptions))
+    if words.json:
+        print_json(facts)
+        return 0
+    table = Table(show_header=False, box=None, pad_edge=False)
+    for key, value in facts.items():
+        if key not in PROGRAM_KEYS and value != []:
+            name = key.removesuffix("_text").replace("_px2", " (px²)").replace("_", " ")
+            table.add_row(f"[dim]{name}[/]", escape(_text(value)))
+    out.print(table)
+    return 0
+
+
+def _text(value: Any) -> str:
+    """A fact of `info` in words."""
+    if value is None or isinstance(value, bool):
+        return {None: "unknown", True: "yes", False: "no"}[value]
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, list):
+        lines = any(isinstance(item, str) for item in value)
+        return ("\n" if lines else "  ").join(_text(item) for item in value)
+    if isinstance(value, dict):
+        return "  ".join(f"{name} px: {_text(share)}" for name, share in value.items())
+    return f"{value:,}" if isinstance(value, int) else printable(str(value))
+
+
+def _show_limits(as_json: bool) -> int:
+    from aaplug.core.gaussians import MAX_LOG_SCALE
+    from aaplug.io.limits import LIMITS, limit, memory_of_machine
+
+    values = {name: limit(name) for name in LIMITS}
+    fixed = {
+        "LOG_SCALE": (MAX_LOG_SCALE, "", "a log-scale's absolute value, clamped on use"),
+        "RENDER_SIDE": (MAX_SIDE, "px", "a side of a rendered image"),
+    }
+    if as_json:
+        print_json(values | {name: value for name, (value, *_) in fixed.items()})
+        return 0
+    table = Table("limit", "value", "unit", "of", "set by", box=None, pad_edge=False)
+    for name, value in values.items():
+        row = LIMITS[name]
+        table.add_row(name, f"{value:,}", row.unit, row.what, f"AAPLUG_{name}")
+    for name, (value, unit, what) in fixed.items():
+        table.add_row(name, f"{value:,}", unit, what, "fixed")
+    out.print(table)
+    if (memory := memory_of_machine()) is not None:
+        out.print(f"This machine has {memory / 1e9:.1f} GB of memory.")
+    return 0
+
+
+@verb(
+    output("FOLDER", "Folder for the converted scene, the contact sheet and the results.", Path("demo-out")),
+    Option("overwrite", bool, "Replace the files of an earlier demo.", False),
+)
+def demo(words: Words) -> int:
+    """Convert, render and measure the bundled scene: a pretrained chair and four photographs."""
+    from aaplug.evaluation.results import tables
+    from aaplug.verbs.demo import SHEET
+
+    out.print(*tables(aaplug.demo(words.output, overwrite=words.overwrite, monitor=TERMINAL)))
+    say(f"look at {words.output / SHEET}")
+    return 0
+
+
+@verb(*SCENE_AND_CAMERAS, verbs.LiveOptions)
+def view(words: Words) -> int:
+    """Look at a scene live in the browser, classic 3DGS beside aaplug; without SCENE at the bundled sample."""
+    scene = cameras = None
+    if words.scene is not None or words.model_path is not None:
+        scene, cameras = read_inputs(words)
+    command = [word for options in (SceneOptions, CameraOptions, Orbit) for word in words.given(options)]
+    from aaplug.verbs.view import attend, serving
+
+    options = words.where().of(verbs.LiveOptions)
+    with serving(scene, cameras, dataclasses.replace(options, monitor=TERMINAL), command) as address:
+        try:
+            attend(address, TERMINAL, options.no_browser)
+        except KeyboardInterrupt:  # the usual end
+            say("closed")
+    return 0
+
+
+@verb(json_of("where the kernels are as one JSON object"))
+def warmup(words: Words) -> int:
+    """Compile the fast rasterizer once for this machine (two to three minutes)."""
+    kernels = aaplug.warmup(monitor=TERMINAL)
+    say(f"{len(kernels.names)} kernels in {kernels.folder}")
+    if words.json:
+        print_json({"folder": str(kernels.folder), "kernels": kernels.names})
+    return 0
+
+
+@verb(*SCENE_AND_CAMERAS, verbs.BenchOptions, json_of('one JSON object: the figures, or {"runs": [...]} of several'))
+def bench(words: Words) -> int:
+    """Time the rasterizer on synthetic scenes, or on SCENE with --cameras (its first training view)."""
+    scene = cameras = None
+    if words.scene is not None or words.model_path is not None:
+        scene, cameras = read_inputs(words)
+    runs, exponents = aaplug.bench(scene, cameras, **told(words, verbs.BenchOptions))
+    if words.json:
+        several = {"runs": [run.as_json() for run in runs], "exponents": exponents}
+        print_json(runs[0].as_json() if len(runs) == 1 else several)
+        return 0
+    import torch
+
+    threads = words.threads or torch.get_num_threads()
+    figures = _table(f"medians, ms; matmul is a 2048³ float32 product, {threads} threads", FIGURES, runs)
+    stages = {name: partial(_stage, name) for name in runs[0].stages_ms}
+    out.print(figures, _table("stages, ms", stages, runs))
+    for name, value in exponents.items():
+        out.print(f"time grows as {name}^{value:.2f}")
+    return 0
+
+
+def _stage(name: str, run: "Figures") -> str:
+    return f"{run.stages_ms[name]:.0f}"
+
+
+FIGURES: dict[str, Callable[["Figures"], str]] = {
+    "forward": lambda run: f"{run.forward_ms:.0f}",
+    "+ back": lambda run: "" if run.forward_backward_ms is None else f"{run.forward_backward_ms:.0f}",
+    "matmul": lambda run: f"{run.matmul_ms:.0f}",
+    "share": lambda run: f"{run.share:.2f}",
+    "Mevals": lambda run: f"{run.evaluations / 1e6:.0f}",
+    "ns/eval": lambda run: f"{run.ns_per_evaluation:.2f}",
+    "GB": lambda run: f"{run.peak_bytes / 1e9:.1f}",
+}
+
+
+def _table(title: str, columns: dict[str, Callable[["Figures"], str]], runs: Sequence["Figures"]) -> Table:
+    """A row a run: the sizes of its scene and image, its rasterizer, and the columns."""
+    table = Table(title=title, box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    for name in ("scene", "", *columns):
+        table.add_column(name, justify="right" if name else "left", no_wrap=True)
+    for run in runs:
+        count = next(
+            (
+                f"{run.gaussians / unit:.0f}{mark}"
+                for unit, mark in ((1e6, "M"), (1e3, "k"))
+                if run.gaussians >= 10 * unit or run.gaussians % unit == 0
+            ),
+            str(run.gaussians),
+        )
+        row = f"{count} {run.width}x{run.height}"
+        table.add_row(row, run.rasterizer, *(text(run) for text in columns.values()))
+    return table

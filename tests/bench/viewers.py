@@ -1,0 +1,180 @@
+"""What web viewers draw of the bundled chair: PSNR against photographs and against aaplug's prediction.
+
+It needs Node.js, npm and Chromium.  Each row of `VIEWERS` that a page here can show draws the original and the scene
+converted for it, at four sizes.  A cell has PSNR in dB against the photographs and, in brackets, against aaplug's own
+render by the row's rule, which is the prediction.  Where anti-aliasing must be turned on, a third row has the converted
+scene with it off.
+"""
+
+import json
+import os
+import shutil
+import statistics
+import subprocess
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.resources import as_file, files
+from math import atan, degrees
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from aaplug.core.cameras import Camera, CameraSet
+from aaplug.core.colours import WHITE
+from aaplug.core.gaussians import Gaussians
+from aaplug.core.imaging import quantised, resampled
+from aaplug.core.training import TrainingViews
+from aaplug.io.cameras import read_cameras
+from aaplug.io.images import read_image
+from aaplug.io.photographs import read_photo
+from aaplug.io.scenes import read_scene, write_scene
+from aaplug.methods.conversion import fuse_for
+from aaplug.methods.viewers import VIEWERS, Viewer
+from aaplug.rendering.renderer import Renderer
+from aaplug.verbs.convert import convert
+from tests.bench import heading, row
+from tests.bench.scenes import decibels
+
+FOLDER = Path(__file__).with_name("viewer_pages")
+SCALES = (1.0, 0.5, 0.25, 0.125)
+PAGE_SECONDS = 300.0  # that a page may take for one thing
+OPENGL = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))  # from OpenCV's axes
+
+
+@dataclass(frozen=True)
+class Page:
+    """How a page shows a viewer's row; `off`: the options with anti-aliasing off, where it is off by default."""
+
+    name: str
+    options: Mapping[str, Any]
+    off: Mapping[str, Any] | None = None
+
+
+def _mkkellogg(**options: Any) -> Page:
+    usual = {"sphericalHarmonicsDegree": 2}
+    return Page("mkkellogg", usual | options, usual if options else None)
+
+
+PAGES = {
+    "spark": Page("spark", {}),
+    "spark-mip": Page("spark", {"blurAmount": 0.1}),
+    "spark-classic": Page("spark", {"preBlurAmount": 0.3, "blurAmount": 0}),
+    "playcanvas": Page("playcanvas", {"antiAlias": True}, {"antiAlias": False}),
+    "playcanvas-classic": Page("playcanvas", {"antiAlias": False}),
+    "mkkellogg": _mkkellogg(antialiased=True),
+    "mkkellogg-mip": _mkkellogg(antialiased=True, kernel2DSize=0.1),
+    "mkkellogg-classic": _mkkellogg(),
+}
+
+
+def main(
+    work: Path = Path("out/viewers"), steps: int | None = None, views: int = 4, rows: Sequence[str] = tuple(PAGES)
+) -> None:
+    """Print the table.
+
+    Args:
+        work: folder of converted scenes and pictures.
+        steps: of the conversions; 0 takes the closed forms, which are quick.
+        views: their number.
+        rows: of the table.
+    """
+    subprocess.run(["npm", "install", "--no-audit", "--no-fund", "--silent"], cwd=FOLDER, check=True)
+    work.mkdir(parents=True, exist_ok=True)
+    with as_file(files("aaplug.io.sample")) as sample:
+        scene, cameras = read_scene(sample / "chair.ply"), read_cameras(sample)
+        bench = Bench(work.resolve(), scene, cameras, cameras.test[:views], steps)
+        heading("viewers", "`--for`", "scene", *(round(bench.views[0].width * scale) for scale in SCALES))
+        for name in rows:
+            for label, cells in bench.rows(VIEWERS[name]):
+                row(f"`{name}`", label, *cells)
+
+
+@dataclass(frozen=True)
+class Bench:
+    """What every picture needs.  views: the test views that are shown, all square."""
+
+    work: Path
+    scene: Gaussians
+    cameras: CameraSet
+    views: Sequence[Camera]
+    steps: int | None
+
+    def converted(self, viewer: Viewer) -> Gaussians:
+        """The scene for a viewer; made once for each rule and degree."""
+        path = self.work / f"{viewer.recipe}-{viewer.sh_degree}.ply"
+        if not path.exists():
+            if self.steps == 0:  # `convert` would measure it too
+                scene = fuse_for(self.scene, TrainingViews.of(self.scene, self.cameras), viewer)
+            else:
+                scene = convert(self.scene, self.cameras, viewer=viewer, steps=self.steps).scene
+                assert scene is not None
+            write_scene(path, scene)
+        return read_scene(path)
+
+    def rows(self, viewer: Viewer) -> Iterator[tuple[str, list[str]]]:
+        """The rows of a viewer: what is shown, and a cell per scale."""
+        page, converted = PAGES[viewer.name], self.converted(viewer)
+        yield "original", self.cells(viewer, self.scene, page.name, page.options)
+        if converted.fused:
+            yield "converted", self.cells(viewer, converted, page.name, page.options)
+        if page.off is not None:
+            yield "converted, anti-aliasing off", self.cells(None, converted, page.name, page.off)
+
+    def cells(self, viewer: Viewer | None, scene: Gaussians, page: str, options: Mapping[str, Any]) -> list[str]:
+        """PSNR against photographs at each scale and, for a viewer, against its prediction."""
+        pictures = self.pictures(scene, page, options)
+        cells = []
+        for scale in SCALES:
+            drawn = [pictures[view.name, scale] for view in self.views]
+            photos = [_photograph(view, scale) for view in self.views]
+            cell = f"{_mean(drawn, photos):.2f}"
+            if viewer is not None:
+                own = Renderer.of(viewer.shown(scene), self.cameras, viewer.recipe, background=WHITE)
+                predicted = [quantised(own(view.scaled(scale)).rgb) for view in self.views]
+                cell += f" ({_mean(drawn, predicted):.1f})"
+            cells.append(cell)
+        return cells
+
+    def pictures(
+        self, scene: Gaussians, page: str, options: Mapping[str, Any]
+    ) -> dict[tuple[str, float], Float[Tensor, "h w 3"]]:
+        """What a page draws, by view and scale."""
+        path, job = self.work / "shown.ply", self.work / "job.json"
+        write_scene(path, scene, overwrite=True)
+        files = {(v.name, s): self.work / f"{v.name}@{s:g}.png" for v in self.views for s in SCALES}
+        shots = [
+            _shot(view.scaled(scale)) | {"file": str(files[view.name, scale])}
+            for view in self.views
+            for scale in SCALES
+        ]
+        facts = {"page": page, "scene": str(path), "options": options, "shots": shots, "seconds": PAGE_SECONDS}
+        job.write_text(json.dumps(facts | {"chromium": _chromium()}))
+        subprocess.run(["node", str(FOLDER / "run.mjs"), str(job)], check=True)
+        return {key: read_image(file, WHITE) for key, file in files.items()}
+
+
+def _shot(camera: Camera) -> dict[str, Any]:
+    """A camera as the pages take it: field of view in degrees, pose from the world's axes in OpenGL's."""
+    assert camera.width == camera.height, "the pages show squares"
+    pose = torch.linalg.inv(camera.cam_from_world.double()) @ OPENGL
+    fov = degrees(2 * atan(camera.height / 2 / camera.fy))
+    return {"size": camera.width, "fov": fov, "pose": pose.tolist()}
+
+
+def _photograph(view: Camera, scale: float) -> Float[Tensor, "h w 3"]:
+    assert view.photo is not None
+    return quantised(resampled(read_photo(view.photo, WHITE), scale))
+
+
+def _mean(images: Sequence[Float[Tensor, "h w 3"]], truths: Sequence[Float[Tensor, "h w 3"]]) -> float:
+    return statistics.fmean(map(decibels, images, truths))
+
+
+def _chromium() -> str:
+    program = os.environ.get("CHROMIUM") or shutil.which("chromium") or shutil.which("google-chrome")
+    if program is None:
+        raise SystemExit("no Chromium; install it, or set CHROMIUM to its path")
+    return program

@@ -1,1 +1,0 @@
-"""What web viewers draw, against photographs and against what aaplug predicts."""
