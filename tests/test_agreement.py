@@ -15,8 +15,8 @@ from aaplug.core.training import TrainingViews
 from aaplug.io.scenes import read_scene, write_scene
 from aaplug.io.scenes.packed import half_turn_about_x
 from aaplug.io.scenes.scene_file import SceneFile
-from aaplug.rendering.agreement import Agreement, agreement, settled
 from aaplug.options.shared import Orbit
+from aaplug.rendering.agreement import Agreement, agreement, settled
 from aaplug.rendering.renderer import own_look
 from aaplug.verbs.render import render
 from tests.conftest import make_camera, make_scene

@@ -8,6 +8,9 @@ from pathlib import Path
 
 import pytest
 import torch
+from aaplug.levels.rates import rates_of
+from aaplug.rendering.orbits import CROP, FOV, rate_of
+from aaplug.verbs.inputs import inputs_of
 
 import aaplug
 from aaplug.core.camera_paths import up_of
@@ -19,16 +22,13 @@ from aaplug.core.sampling import sampling_bounds
 from aaplug.core.training import TrainingViews
 from aaplug.io.images import image_size, read_image
 from aaplug.io.scenes import read_scene, write_scene
-from aaplug.levels.merging import Goal, merged_in_chunks
-from aaplug.levels.rates import rates_of
+from aaplug.levels.merging import Goal
 from aaplug.methods.filters.smoothing import NYQUIST_VARIANCE
-from aaplug.rendering.orbits import CROP, FOV, rate_of
 from aaplug.options.shared import Orbit
 from aaplug.rendering.assumed import decibels_at
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import UsageError
 from aaplug.system.monitor import SILENT
-from aaplug.verbs.inputs import inputs_of
 from tests.conftest import make_scene
 from tests.test_cli import cli, dataset  # noqa: F401 (fixtures)
 

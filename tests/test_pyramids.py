@@ -26,7 +26,7 @@ from aaplug.core.training import TrainingViews
 from aaplug.evaluation.metrics import psnr
 from aaplug.finetuning import refining
 from aaplug.io.scenes import read_scene
-from aaplug.io.scenes.pyramid_folder import MANIFEST, pyramid_of, read_manifest, read_pyramid
+from aaplug.io.scenes.pyramid_folder import MANIFEST, pyramid_of, read_pyramid
 from aaplug.levels.merging import Goal, merged_in_chunks
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import FormatError

@@ -14,13 +14,10 @@ from aaplug_cli.options import FileOptions
 from aaplug.finetuning.losses import LOSSES
 from aaplug.finetuning.parameters import RATES
 from aaplug.finetuning.settings import CONSISTENCY, CONSISTENCY_SETTINGS, settings_of
-from aaplug.methods import FORMS, RECIPES
-from aaplug.methods.viewers import VIEWERS
-from aaplug.options.verbs import FinetuneOptions
-from aaplug.options.verbs import RenderOptions
-from aaplug.rasterizers import RASTERIZERS
+from aaplug.methods import RECIPES
+from aaplug.options.verbs import FinetuneOptions, RenderOptions
 from aaplug.system.errors import UsageError
-from aaplug.system.registry import KINDS, Registry, names_of
+from aaplug.system.registry import names_of
 from tests.test_options import REFUSED
 
 SLOW = ["torch", "numpy", "cv2", "jaxtyping", "beartype", "scipy", "skimage", "matplotlib", "PIL", "av"]

@@ -10,8 +10,7 @@ import aaplug
 from aaplug.core.cameras import CameraSet
 from aaplug.core.gaussians import Gaussians, joined
 from aaplug.core.training import TrainingViews
-from aaplug.levels.clusters import merged_pairs, seen
-from aaplug.levels.merging import Goal, merged
+from aaplug.levels.merging import Goal
 from aaplug.rendering.renderer import own_look
 from aaplug.rendering.visibility import visibility
 from aaplug.system.executors import torch_threads

@@ -9,7 +9,6 @@ the data set's cameras, and saves both, with the recipe, as a checkpoint:
 """
 
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

@@ -21,7 +21,7 @@ from aaplug.core.cameras import Camera, spread
 from aaplug.core.conventions import CLASSIC
 from aaplug.core.gaussians import Fusion, Gaussians, joined
 from aaplug.core.projection import project
-from aaplug.lab.pixel_size import LEAST_SHARE, MOST_SHARE, SMALL, PixelSizes, pixel_size
+from aaplug.lab.pixel_size import LEAST_SHARE, MOST_SHARE, PixelSizes, pixel_size
 from aaplug.levels.clusters import clusters_of, gaussians_of, rates_of
 from aaplug.levels.merging import Goal, rounds
 from aaplug.methods.conversion import MERGED

@@ -14,9 +14,9 @@ from torch import Tensor
 
 from aaplug.core.chunks import curve
 from aaplug.core.gaussians import Fusion, Gaussians, joined
-from aaplug.levels.clusters import Clusters, alone, merged_pairs, seen
-from aaplug.levels.covariances import areas, blurred, covariances
-from aaplug.levels.pairing import Edges, edges_below, matched
+from aaplug.levels.clusters import Clusters
+from aaplug.levels.covariances import areas, covariances
+from aaplug.levels.pairing import Edges, edges_below
 from aaplug.methods.conversion import MERGED
 from aaplug.methods.filters.matched import PIXEL_VARIANCE
 from aaplug.methods.filters.smoothing import fuse_stored

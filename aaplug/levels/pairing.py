@@ -14,8 +14,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from aaplug.core.chunks import curve
-from aaplug.levels.clusters import Clusters, paired
-from aaplug.levels.covariances import DIAGONAL, Packed, blurred, overlaps
+from aaplug.levels.clusters import Clusters
+from aaplug.levels.covariances import DIAGONAL, Packed, overlaps
 
 PIXEL_BLUR = 0.3  # px²: variance of the level's pixel in comparisons; 0.1 to 1 give levels as good
 ALPHA_WEIGHT = 0.5  # of squared differences of alpha, beside those of red, green and blue

@@ -13,8 +13,7 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.core.orbits import pinhole
 from aaplug.evaluation.protocols import median_depth
 from aaplug.io.scenes.scene_file import Scene
-from aaplug.live.messages import See, Side
-from aaplug.live.paints import PAINTS
+from aaplug.live.messages import Side
 from aaplug.methods import QUALITIES, RECIPES
 from aaplug.methods.recipes import find_recipe
 from aaplug.rendering.renderer import Renderer

@@ -174,11 +174,7 @@ class Workers:
 
 @contextmanager
 def running(
-    options: Options,
-    output: Path | None,
-    check: Callable[[], object],
-    folder: bool = False,
-    shared: Path | None = None,
+    options: Options, output: Path | None, check: Callable[[], object], folder: bool = False, shared: Path | None = None
 ) -> Iterator[Workers]:
     """Limit torch's threads, claim the output and connect the workers that the options name, inside the block.
 

@@ -21,7 +21,7 @@ from aaplug.evaluation.results import Report, results, scale_name
 from aaplug.evaluation.truth import MEMORY, Truth, back_projected, source_of, upsampled
 from aaplug.evaluation.upsamplers import find_upsampler
 from aaplug.finetuning import METHODS
-from aaplug.finetuning.session import tune, tuned_scene
+from aaplug.finetuning.session import tune
 from aaplug.finetuning.settings import Settings, settings_of
 from aaplug.finetuning.state import TuningJob
 from aaplug.io.atomic import check_output, replacing

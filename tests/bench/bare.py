@@ -19,7 +19,6 @@ from aaplug.core.imaging import quantised, resampled
 from aaplug.core.sampling import median_rates
 from aaplug.io.photographs import read_photo
 from aaplug.methods.recipes import find_recipe
-from aaplug.rasterizers.choice import find_rasterizer
 from aaplug.options.shared import Orbit
 from aaplug.rendering.assumed import decibels_at
 from aaplug.rendering.renderer import Renderer

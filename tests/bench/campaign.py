@@ -16,6 +16,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
+from aaplug.verbs.inputs import inputs_of  # noqa: F401  (imports the verbs before the children are forked)
 
 from aaplug.evaluation.journal import Journal
 from aaplug.finetuning.state import begin, load, save
@@ -23,7 +24,6 @@ from aaplug.io.batch_file import read_batch
 from aaplug.io.cameras import CAMERA_FORMATS, read_cameras
 from aaplug.io.images import read_image, read_rgba
 from aaplug.io.scenes import SCENE_FORMATS, WritableFormat, write_scene
-from aaplug.verbs.inputs import inputs_of  # noqa: F401  (imports the verbs before the children are forked)
 from tests.bench import heading, row
 from tests.conftest import make_scene
 from tests.hostile import NAMES, Target, check, mutations, read_as_info_does, scene

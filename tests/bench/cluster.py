@@ -12,8 +12,6 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
-import torch
-
 import aaplug
 from aaplug.evaluation.engine import Task, ViewMeasurer, candidates_of
 from aaplug.evaluation.journal import Journal

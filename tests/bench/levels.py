@@ -30,10 +30,8 @@ from aaplug.evaluation.results import Report, mean
 from aaplug.evaluation.truth import Truth, ViewTruth
 from aaplug.io.scenes.pyramid_folder import pyramid_of, read_pyramid
 from aaplug.io.video import write_video
-from aaplug.methods.recipes import find_recipe
-from aaplug.rasterizers.choice import find_rasterizer
 from aaplug.rendering.benchmark import exponent, synthetic_camera
-from aaplug.rendering.renderer import Renderer, own_look
+from aaplug.rendering.renderer import Renderer
 from aaplug.verbs.evaluate import evaluate
 from aaplug.verbs.lod import lod
 from tests.bench import heading, row

@@ -8,12 +8,8 @@ import torch
 
 from aaplug.evaluation.results import scale_name
 from aaplug.evaluation.truth import Truth, ViewTruth
-from aaplug.io.cameras import read_cameras
-from aaplug.io.scenes import read_scene
 from aaplug.methods.recipes import find_recipe
-from aaplug.rendering.renderer import own_look
-from tests.bench.away import VIEWS, Scene, decibels, on_each
-from tests.conftest import SHARED_DATA
+from tests.bench.away import decibels
 
 FIRST_VIEW = 2  # other tables have the views from the first
 WEIGHTS = (0.0, 0.02, 0.03, 0.04, 0.06)

@@ -7,6 +7,7 @@ from functools import cached_property
 from typing import Any
 
 import torch
+from aaplug.levels.rates import rates_of
 from jaxtyping import Float
 from torch import Tensor
 
@@ -20,7 +21,6 @@ from aaplug.evaluation.metrics import psnr
 from aaplug.io.cameras import read_cameras
 from aaplug.io.scenes import read_scene
 from aaplug.levels.covariances import area, blurred, covariances
-from aaplug.levels.rates import rates_of
 from aaplug.methods.recipe import Recipe
 from aaplug.rendering.benchmark import SEED, synthetic_camera, synthetic_scene
 from aaplug.rendering.renderer import Renderer
