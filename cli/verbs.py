@@ -13,8 +13,8 @@ from rich.table import Table
 
 import aaplug
 from aaplug.options import verbs
-from aaplug.options.base import REPORT, UNSET, Options, flag, number
-from aaplug.options.shared import MAX_SIDE, FrameOptions, Orbit
+from aaplug.options.base import REPORT, UNSET, OneOf, Options, choices, flag, number
+from aaplug.options.shared import MAX_SIDE, RECIPE_NAMES, FrameOptions, Orbit
 from aaplug.system.errors import UsageError, printable
 
 from .batch import SEVERAL, batch_of_evaluations, for_each_scene
@@ -385,10 +385,18 @@ def view(words: Words) -> int:
     return 0
 
 
-@verb(json_of("where the kernels are as one JSON object"))
+@verb(
+    Option(
+        "recipe",
+        Annotated[tuple[str, ...], choices([*RECIPE_NAMES, "..."]), OneOf(kind="recipe"), UNSET],
+        "Compile what these recipes need, too; by default what auto, matched, classic and mip need.",
+        (),
+    ),
+    json_of("where the kernels are as one JSON object"),
+)
 def warmup(words: Words) -> int:
     """Compile the fast rasterizer once for this machine (two to three minutes)."""
-    kernels = aaplug.warmup(monitor=TERMINAL)
+    kernels = aaplug.warmup(words.recipe, monitor=TERMINAL)
     say(f"{len(kernels.names)} kernels in {kernels.folder}")
     if words.json:
         print_json({"folder": str(kernels.folder), "kernels": kernels.names})

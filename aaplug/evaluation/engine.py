@@ -57,8 +57,8 @@ def candidates_of(
     background: Background = "auto",
 ) -> list[Candidate]:
     """One scene by several recipes; those with the same world filter share the filtered scene."""
-    prepared: dict[tuple[WorldFilter | None, bool], Renderer] = {}
-    scene, found = scene_of(scene), []
+    renderers: dict[tuple[WorldFilter | None, bool], Renderer] = {}
+    candidates, scene = [], scene_of(scene)
     for recipe in (suited(recipe, scene.gaussians()) for recipe in recipes):
         key = recipe.world, recipe.levels is not None
         if key not in renderers:
@@ -242,9 +242,8 @@ class ViewMeasurer:
         scenes: dict[int, Gaussians] = {}  # renderers that share a scene go on to share it
 
         def portable(renderer: Renderer) -> Renderer:
-            return replace(
-                renderer, scene=bare.setdefault(id(renderer.scene), replace(renderer.scene, origin=None)), source=None
-            )
+            scene = scenes.setdefault(id(renderer.scene), replace(renderer.scene, origin=None))
+            return replace(renderer, scene=scene, source=None)
 
         candidates = [Candidate(c.name, portable(c.renderer)) for c in self.task.candidates]
         truth = replace(self.task.truth, renderer=portable(self.task.truth.renderer))
@@ -258,9 +257,8 @@ def _work(renderer: Renderer, camera: Camera) -> Hashable:
     recipe = renderer.recipe
     method = recipe.selection, recipe.screen, recipe.pixel, recipe.compositor
     fine, samples = renderer.sampled(camera)
-    sampled = samples, renderer.neighbours(camera, samples), renderer.coarsening(fine, samples)
-    how = sampled, renderer.background, renderer.rasterizer.name
-    return id(renderer.scene), id(renderer.training), method, how
+    sampling = samples, renderer.neighbours(camera, samples), renderer.coarsening(fine, samples)
+    return id(renderer.scene), id(renderer.training), method, sampling, renderer.background, renderer.rasterizer.name
 
 
 class _Comparison:

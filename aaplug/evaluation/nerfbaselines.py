@@ -9,6 +9,7 @@ the data set's cameras, and saves both, with the recipe, as a checkpoint:
 """
 
 import json
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -67,15 +68,21 @@ class Aaplug:
         self.checkpoint = checkpoint
         if checkpoint is not None:
             folder = Path(checkpoint)
-            self.settings = json.loads((folder / SETTINGS).read_text()) | chosen
+            self.settings = json.loads((folder / SETTINGS).read_text()) | overrides
             self.scene, self.cameras = read_scene(folder / SCENE).gaussians(), read_cameras(folder / CAMERAS).all
         elif path is None or train_dataset is None:
             raise UsageError("--set scene", "name the file of the scene that was trained on this data set")
         else:
             colour = train_dataset["metadata"].get("background_color")
             background = BLACK if colour is None else [float(level) / LARGEST_LEVEL for level in colour]
-            self.settings = DEFAULTS | chosen | {"background": background}
-            self.scene, self.cameras = read_scene(path).gaussians(), _training_cameras(train_dataset)
+            self.settings = DEFAULTS | overrides | {"background": background}
+            root, paths = (
+                train_dataset["image_paths_root"],
+                train_dataset["image_paths"],
+            )  # photographs name the cameras
+            pairs = zip(paths, train_dataset["cameras"], strict=True)
+            cameras = [_camera(camera, os.path.relpath(path, root)).as_trained() for path, camera in pairs]
+            self.scene, self.cameras = read_scene(path).gaussians(), cameras
         settings: dict[str, Any] = self.settings
         red, green, blue = settings["background"]
         recipe, quality = settings["recipe"], settings["quality"]

@@ -9,7 +9,7 @@ Where scenes are compared, ground truth is one of them, the reference, as its ow
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -22,12 +22,11 @@ from aaplug.core.imaging import quantised, resampled
 from aaplug.evaluation import PROTOCOLS
 from aaplug.evaluation.metric import Image, TimedImage, TimedRenderer
 from aaplug.evaluation.protocols import Protocol, TruthSource, median_depth
-from aaplug.evaluation.upsamplers import Upsampler, bicubic
+from aaplug.evaluation.upsamplers import bicubic
 from aaplug.io.photographs import DOWNSCALES, Photograph
 from aaplug.methods.recipe import Recipe
 from aaplug.methods.recipes import find_recipe
 from aaplug.rendering.renderer import Renderer
-from aaplug.system.errors import UsageError, not_one_of
 
 NO_PHOTOGRAPH = "has no photograph to compare with; truth 'self' compares with the scene's own render"
 MEMORY = 1e9  # bytes of images to cache; what does not fit is made again each time
@@ -36,42 +35,6 @@ SLAB_SIZE = 1 << 25  # numbers of the cache allocated at once: 64 MB
 
 Larger = Float[Tensor, "H W 3"]
 Enlarge = Callable[[Renderer, Image, Camera], Larger]  # (the scene's own renderer, source image, target camera)
-
-
-def back_projected(own: Renderer, full: Image, camera: Camera) -> Larger:
-    """The scene's own render after one step of iterative back-projection towards the source image.
-
-    (Irani and Peleg 1991.)  The bicubically enlarged residual is added, so box averages match only approximately.
-    """
-    with torch.no_grad():
-        image = own(camera).rgb.clamp(0.0, 1.0)
-    averages = resampled(image, full.shape[1] / camera.width, (full.shape[0], full.shape[1]))
-    return image + bicubic(full - averages, camera.hw)
-
-
-def upsampled(upsampler: Upsampler) -> Enlarge:
-    """Estimate ground truth by enlarging the source image with an upsampler."""
-    return lambda own, full, camera: upsampler(full, camera.hw)
-
-
-def source_of(views: Sequence[Camera], asked: str = "auto") -> TruthSource:
-    """The requested source; for "auto", photographs if every view has one, else the scene's own render ("self").
-
-    Raises UsageError if there is no source of that name, or a view has no photograph.
-    """
-    missing = [view.name for view in views if view.photo is None]
-    if name == "self" or (name == "auto" and missing):
-        return "self"
-    if name not in ("auto", "photographs"):
-        raise UsageError("truth", not_one_of(name, ("auto", "photographs", "self")))
-    if missing:
-        raise UsageError(missing[0], NO_PHOTOGRAPH)
-    return "photographs"
-
-
-def upsampled(upsampler: Upsampler) -> Enlarge:
-    """Estimate ground truth by enlarging the source image with an upsampler."""
-    return lambda renderer, full, camera: upsampler(full, camera.hw)
 
 
 def back_projected(renderer: Renderer, full: Image, camera: Camera) -> Larger:
