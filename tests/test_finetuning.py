@@ -30,7 +30,7 @@ from aaplug.lab.densification import (
     moments_after,
 )
 from aaplug.methods import RECIPES
-from aaplug.options.finetune import FinetuneOptions
+from aaplug.options.verbs import FinetuneOptions
 from aaplug.rasterizers import RASTERIZERS
 from aaplug.rendering.renderer import own_look
 from aaplug.system.errors import FormatError, UsageError

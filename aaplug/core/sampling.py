@@ -21,7 +21,7 @@ from aaplug.system.errors import FrameError, UsageError
 
 IMAGE_MARGIN = 0.15  # of the image's side; equals 3DGS's clamp of the Jacobian at 1.3 tan(fov/2)
 CHUNK_PAIRS = 4_000_000  # Gaussian-camera pairs held at once: about 150 MB
-FRAME_CHECK_GAUSSIANS = 50_000  # size of the even sample for the frame check
+FRAME_SAMPLE_SIZE = 50_000  # Gaussians of the even sample for the frame check
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from aaplug.finetuning.losses import LOSSES
 from aaplug.finetuning.parameters import RATES
 from aaplug.methods.viewers import FAST, Viewer
-from aaplug.options.verbs import ANCHOR_WEIGHT, LOSS_WEIGHTS
+from aaplug.options.verbs import ANCHOR_WEIGHT, LOSS_WEIGHTS, FinetuneOptions
 from aaplug.system.errors import UsageError, not_one_of
 
 
@@ -33,11 +33,11 @@ class Settings:
     seed: int = 0
 
 
-OURS = Settings("consistency", 1000, LOSS_WEIGHTS, RATES, anchor=ANCHOR_WEIGHT, decay=0.03)
+CONSISTENCY_SETTINGS = Settings("consistency", 1000, LOSS_WEIGHTS, RATES, anchor=ANCHOR_WEIGHT, decay=0.03)
 # 3DGS's rates worsen a scene that is nearly right, and 300 steps are too few to recover
 GENTLE_RATES = {name: 0.3 * rate for name, rate in RATES.items()}
 # Conversion takes a few minutes by these; `balance` divides the weights by the scene's errors
-QUICK_SETTINGS = Settings("quick", 300, dict.fromkeys(WEIGHTS, 1.0), GENTLE_RATES, anchor=4.0, decay=0.03)
+QUICK_SETTINGS = Settings("quick", 300, dict.fromkeys(LOSS_WEIGHTS, 1.0), GENTLE_RATES, anchor=4.0, decay=0.03)
 
 
 def balance(settings: Settings, errors: Mapping[float, float]) -> Settings:
@@ -52,7 +52,7 @@ def balance(settings: Settings, errors: Mapping[float, float]) -> Settings:
 
 def consistency(scales: Sequence[float], move: Sequence[str], anchor: float) -> Settings:
     """One model for all scales and the training size."""
-    weights = {scale: WEIGHTS.get(scale, 1.0) for scale in scales}
+    weights = {scale: LOSS_WEIGHTS.get(scale, 1.0) for scale in scales}
     return replace(CONSISTENCY_SETTINGS, weights=weights, rates={name: RATES[name] for name in move}, anchor=anchor)
 
 

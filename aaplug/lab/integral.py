@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.special import ndtr
 
-from aaplug.core.ellipses import Columns, grown
+from aaplug.core.ellipses import grown, principal_columns
 from aaplug.core.interfaces import Pixels
 from aaplug.core.kernels import Kernels
 from aaplug.core.rules import Rules
@@ -68,24 +68,18 @@ class Integral:
         return values
 
 
-def principal_columns(covs: Float[Tensor, "m 3"], dets: Float[Tensor, " m"]) -> Columns:
-    """ux, uy, vx, vy of a whitening whose rows are the principal axes over their standard deviations, longer first."""
-    xx, xy, yy = covs.unbind(dim=1)
-    across, along = 2 * xy, xx - yy
-    circle = (across == 0) & (along == 0)  # any axes do, but the angle has no gradient
-    angle = 0.5 * torch.atan2(across.where(~circle, 0.0), along.where(~circle, 1.0))
-    half = 0.5 * (xx + yy)
-    root = torch.hypot(0.5 * along.where(~circle, 1.0), xy)
-    longer = half + torch.where(circle, 0.0, root)
-    wide, thin = longer.rsqrt(), (longer / dets).sqrt()
-    cos, sin = angle.cos(), angle.sin()
-    return cos * wide, sin * wide, -sin * thin, cos * thin
+def mean_gaussian(u: Tensor, h: Tensor) -> Tensor:
+    """Mean of exp(-x²/2) over u ± h, all in standard deviations.
 
-
-def pixel_margin(splats: Splats2D, rules: Rules) -> Splats2D:
-    """The splats, grown by half the diagonal of the window."""
-    radius = HALF_DIAGONAL * max(splats.window, THINNEST)
-    return grown(splats, torch.full_like(splats.dets, radius), rules.min_alpha)
+    For small h its series is e^(-u²/2) (1 + h²(u² - 1)/6 + h⁴(u⁴ - 6u² + 3)/120).
+    """
+    small = MAX_SERIES_HALF[u.dtype]
+    wide = h.clamp(min=small)
+    ends = [((u + side * wide) * math.sqrt(0.5)).erf() for side in (1, -1)]
+    mean = (ends[0] - ends[1]) * math.sqrt(math.pi / 8) / wide
+    uu, hh = u * u, h * h
+    series = 1 + hh * (uu - 1) / 6 + hh * hh * (uu * uu - 6 * uu + 3) / 120
+    return torch.where(h < small, series * (-0.5 * uu).exp(), mean)
 
 
 INTEGRAL = Integral()

@@ -21,9 +21,10 @@ from aaplug.core.cameras import Camera, spread
 from aaplug.core.conventions import CLASSIC
 from aaplug.core.gaussians import Fusion, Gaussians, joined
 from aaplug.core.projection import project
-from aaplug.lab.pixel_size import LEAST_SHARE, MOST_SHARE, PixelSizes, pixel_size
-from aaplug.levels.clusters import clusters_of, gaussians_of, rates_of
+from aaplug.lab.pixel_size import LEAST_SHARE, MAX_SMALL_SIZE, MOST_SHARE, PixelSizes, pixel_size
+from aaplug.levels.clusters import alone, seen
 from aaplug.levels.merging import Goal, rounds
+from aaplug.levels.rates import rates_of
 from aaplug.methods.conversion import MERGED
 from aaplug.methods.filters.smoothing import fuse_stored
 from aaplug.system.errors import UsageError
@@ -105,11 +106,11 @@ def _merged(large: _Part, small: _Part, rates: Float[Tensor, " s"], level: int) 
     """The Gaussians that are drawn after a level, and those that it replaces; rates: of the small ones."""
     if not len(small.scene):
         return large, small
-    own = replace(clusters_of(small.scene, rates * _first_drawn(small.made)), rates=rates)
-    clusters = rounds(own, Goal(0.5**level, tolerance=TOLERANCE), lambda count: None)
+    covered = replace(seen(small.scene, rates * _highest_rate(small.level)), rates=rates)
+    clusters = rounds(covered, Goal(0.5**level, tolerance=TOLERANCE), lambda count: None)
     counts = torch.bincount(clusters.labels, minlength=len(clusters))
-    merged = gaussians_of(
-        replace(clusters, rates=clusters.rates * _first_drawn(torch.tensor(level))), small.scene, own.weights
+    merged = alone(
+        replace(clusters, rates=clusters.rates * _highest_rate(torch.tensor(level))), small.scene, covered.weights
     )
     replaced = counts[clusters.labels] > 1
     gone, stays = (small[rows.nonzero()[:, 0]] for rows in (replaced, ~replaced))

@@ -14,9 +14,9 @@ from torch import Tensor
 
 from aaplug.core.chunks import curve
 from aaplug.core.gaussians import Fusion, Gaussians, joined
-from aaplug.levels.clusters import Clusters
-from aaplug.levels.covariances import areas, covariances
-from aaplug.levels.pairing import Edges, edges_below
+from aaplug.levels.clusters import Clusters, clusters_of, gaussians_of, merge_pairs
+from aaplug.levels.covariances import areas, blur, covariances
+from aaplug.levels.pairing import Edges, edges_below, matching
 from aaplug.methods.conversion import MERGED
 from aaplug.methods.filters.matched import PIXEL_VARIANCE
 from aaplug.methods.filters.smoothing import fuse_stored

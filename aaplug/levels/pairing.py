@@ -14,20 +14,20 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from aaplug.core.chunks import curve
-from aaplug.levels.clusters import Clusters
-from aaplug.levels.covariances import DIAGONAL, Packed, overlaps
+from aaplug.levels.clusters import Clusters, pair_moments
+from aaplug.levels.covariances import DIAGONAL, Packed, blur, overlaps
 
 PIXEL_BLUR = 0.3  # px²: variance of the level's pixel in comparisons; 0.1 to 1 give levels as good
 ALPHA_WEIGHT = 0.5  # of squared differences of alpha, beside those of red, green and blue
-WINDOW = 10  # neighbours along a curve that a cluster is compared with, on either side
-SHIFTS = (0.0, 0.23, 0.41)  # of the curves: what one separates lies together on another
-CHUNK = 1 << 16  # pairs compared at once: 10 MB
-ROUNDING = 1e-6  # share of a pair's own energy below which float32 does not tell how much the image changes
-JITTER = 0.01  # largest share by which a cost is raised, so that among equal costs many pairs choose each other
-MOST_COST = 1e30  # of a pair whose cost overflows
+NEIGHBOURS = 10  # along a curve that a cluster is compared with, on either side
+CURVE_SHIFTS = (0.0, 0.23, 0.41)  # neighbours that one curve separates lie together on another
+PAIRS_PER_BATCH = 1 << 16  # compared at once: 10 MB
+MIN_COST_SHARE = 1e-6  # of a pair's own energy; float32 does not tell smaller changes of the image
+MAX_JITTER = 0.01  # share by which a cost is raised, so that among equal costs many pairs choose each other
+MAX_COST = 1e30  # of a pair whose cost overflows
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Edges:
     """Pairs of clusters and what merging each costs, in px² of the level.  e: pairs."""
 

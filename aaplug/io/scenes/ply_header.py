@@ -16,7 +16,7 @@ from pathlib import Path
 
 from aaplug.io.limits import whole_limit
 from aaplug.io.values import read_start
-from aaplug.system.errors import MAX_VALUE_CHARACTERS, FormatError
+from aaplug.system.errors import SHOWN, FormatError
 
 MAX_COUNT_DIGITS = 18  # still an int64
 ENCODING = "latin-1"  # one character per byte
@@ -186,7 +186,7 @@ def parse(path: str, lines: Iterable[str], newline: str, size: int | None = None
             case ["comment" | "obj_info", *_] | []:
                 pass
             case _ if not line.isascii():
-                raise FormatError(path, f"line {number} of the header is not ASCII: {line[:MAX_VALUE_CHARACTERS]!r}")
+                raise FormatError(path, f"line {number} of the header is not ASCII: {line[:SHOWN]!r}")
             case ["format", *words]:
                 formats.append(words)
             case ["element", name, count]:
@@ -198,11 +198,19 @@ def parse(path: str, lines: Iterable[str], newline: str, size: int | None = None
             case ["property", "list", length, kind, name] if tables and length in CODES and kind in CODES:
                 tables[-1][2].append(Property(name, CODES[kind], CODES[length]))
             case _:
-                raise FormatError(path, f"line {number} of the header is not PLY: {line[:MAX_VALUE_CHARACTERS]!r}")
-    coding = _coding(path, formats)
-    _check_unique(path, elements)
-    size = len(_content(lines, newline)) if size is None else size
-    return Header(path, lines, newline, tuple(elements), coding, size)
+                raise FormatError(path, f"line {number} of the header is not PLY: {line[:SHOWN]!r}")
+    coding = next((coding for coding in (LITTLE, BIG, TEXT) if formats == [[coding, "1.0"]]), None)
+    if coding is None:
+        words = " and ".join(" ".join(words)[:SHOWN] for words in formats) or "none"
+        raise FormatError(path, f"its format is {words}; known are {LITTLE}, {BIG} and {TEXT}, each 1.0")
+    names = [f"element {name!r}" for name, _, _ in tables]
+    names += [f"property of {name} {column.name!r}" for name, _, columns in tables for column in columns]
+    for name, times in Counter(names).items():
+        if times > 1:
+            raise FormatError(path, f"{name} is declared twice")
+    elements = tuple(Element(name, count, tuple(columns)) for name, count, columns in tables)
+    size = sum(len(line + newline) for line in lines) if size is None else size
+    return Header(path, lines, newline, elements, coding, size)
 
 
 def check_size(header: Header, actual: int) -> None:
@@ -231,37 +239,3 @@ def _keyword(line: str) -> str:
 
 def _comment(line: str) -> str:
     return line.strip()[len("comment") :].strip()
-
-
-def _content(lines: Iterable[str], newline: str) -> bytes:
-    return "".join(line + newline for line in lines).encode(BYTES)
-
-
-def _count(path: str, name: str, count: str) -> int:
-    if not re.fullmatch(r"\d+", count, re.ASCII) or len(count) > MAX_COUNT_DIGITS:
-        raise FormatError(path, f"element {name!r} has the impossible count {count[:MAX_VALUE_CHARACTERS]!r}")
-    return int(count)
-
-
-def _property(words: list[str]) -> Property | None:
-    match words:
-        case ["list", length, kind, name] if length in CODES and kind in CODES:
-            return Property(name, CODES[kind], CODES[length])
-        case [kind, name] if kind in CODES:
-            return Property(name, CODES[kind])
-
-
-def _coding(path: str, formats: list[list[str]]) -> str:
-    for coding in (LITTLE, BIG, TEXT):
-        if formats == [[coding, "1.0"]]:
-            return coding
-    found = " and ".join(" ".join(words)[:MAX_VALUE_CHARACTERS] for words in formats) or "none"
-    raise FormatError(path, f"its format is {found}; known are {LITTLE}, {BIG} and {TEXT}, each 1.0")
-
-
-def _check_unique(path: str, elements: list[Element]) -> None:
-    names = [f"element {e.name!r}" for e in elements]
-    names += [f"property of {e.name} {name!r}" for e in elements for name in e.names]
-    for name, times in Counter(names).items():
-        if times > 1:
-            raise FormatError(path, f"{name} is declared twice")

@@ -39,7 +39,7 @@ from aaplug.system.monitor import Tell
 
 KERNELS: tuple[Kernel, ...] = (  # of every recipe with the pixel kernel `POINT`; the slowest to compile come last
     projection.project_kernel(),
-    *map(shading.shade_kernel, shading.COMPILED_COEFFICIENTS),
+    *map(shading.shade_kernel, shading.COMPILED),
     splats.SELECT,
     culling.cull_kernel(),
     binning.table_kernel(),
@@ -48,9 +48,8 @@ KERNELS: tuple[Kernel, ...] = (  # of every recipe with the pixel kernel `POINT`
     binning.LISTS,
     layout.LINES,
     backward.SLOTS,
-    point.FROM_SUMS,
-    point.POINT_ROWS_BACKWARD,
-    *map(shading.gradients_kernel, shading.COMPILED_COEFFICIENTS),
+    *POINT.kernels(RULES_3DGS),
+    *map(shading.gradients_kernel, shading.COMPILED),
     backward.step_kernel(POINT, RULES_3DGS),
     projection.PROJECT_BACKWARD,
     forward.pass_kernel(POINT, RULES_3DGS),
