@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from aaplug.system.errors import OutputError, listing, of_system, reason
-from aaplug.system.locks import OURS, new_file, remove_left
+from aaplug.system.locks import OUR_PREFIX, new_file, remove_left
 
 TOKEN_BYTES = 8  # random bytes in a temporary file's name: 2^64 names
 HASH_DIGITS = 16  # in the name of a claim
@@ -38,7 +38,7 @@ def replacing_file(path: str | PathLike[str], overwrite: bool, suffix: str = ".t
     path = Path(path)
     _check_target(path, overwrite)
     target = Path(os.path.realpath(path))  # a link stays a link; its target is replaced
-    temporary = target.with_name(f"{OURS}{secrets.token_hex(TOKEN_BYTES)}{suffix}")
+    temporary = target.with_name(f"{OUR_PREFIX}{secrets.token_hex(TOKEN_BYTES)}{suffix}")
     remove_left(target.parent)
     try:
         with new_file(temporary):
@@ -68,7 +68,7 @@ def claimed(path: str | PathLike[str] | None, check: Callable[[], object] = lamb
         yield
         return
     path = Path(os.path.realpath(path))
-    name = OURS + hashlib.sha256(os.fsencode(path.name)).hexdigest()[:HASH_DIGITS]
+    name = OUR_PREFIX + hashlib.sha256(os.fsencode(path.name)).hexdigest()[:HASH_DIGITS]
     mark = path / name if path.is_dir() else path.with_name(name)
     with ExitStack() as stack:
         try:

@@ -16,7 +16,8 @@ from PIL import Image
 from torch import Tensor
 
 from aaplug.core.cameras import Camera, Lens
-from aaplug.core.imaging import WHOLE, box_average, levels, quantised, resampled
+from aaplug.core.cameras import WHOLE_SLACK
+from aaplug.core.imaging import box_average, levels, quantised, resampled
 from aaplug.io.images import read_image, read_rgba
 from aaplug.io.lenses import undistorted
 from aaplug.system.errors import UsageError
@@ -81,7 +82,7 @@ def _rgba_box(path: Path, background: Background, lens: Lens | None = None) -> P
 
     def at(hw: tuple[int, int], factor: float) -> Float[Tensor, "h w 3"]:
         depth = round(math.log2(1 / factor))
-        if abs(factor * 2**depth - 1) > WHOLE:
+        if abs(factor * 2**depth - 1) > WHOLE_SLACK:
             raise UsageError("scale", f"{factor:g} is not a power of 1/2, as multi-scale Blender data needs")
         while len(halves) <= depth:
             halves.append(box_average(halves[-1], 2))

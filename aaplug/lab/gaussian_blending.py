@@ -33,7 +33,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.special import ndtr
 
-from aaplug.core.ellipses import principal_columns
+from aaplug.lab.integral import principal_columns
 from aaplug.core.kernels import Kernel, Kernels
 from aaplug.core.rules import RULES_3DGS, Rules
 from aaplug.core.splats import Splats2D

@@ -14,7 +14,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.special import ndtr
 
-from aaplug.core.ellipses import grown, principal_columns
+from aaplug.core.ellipses import grown
+from aaplug.lab.integral import principal_columns
 from aaplug.core.interfaces import Pixels
 from aaplug.core.kernels import Kernels
 from aaplug.core.rules import Rules

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Self, cast, get_type_hints
 
 import tyro
 
-from aaplug.system.errors import SHOWN, UsageError, did_you_mean, not_one_of
+from aaplug.system.errors import MAX_VALUE_CHARACTERS, UsageError, did_you_mean, not_one_of
 from aaplug.system.monitor import SILENT, Monitor
 from aaplug.system.registry import names_of, unknown
 
@@ -74,7 +74,7 @@ def number(
         try:
             values = tuple(kind(word.removesuffix(unit)) for word in words)
         except ValueError as error:
-            raise ValueError(f"takes {range_text}, got {' '.join(words)[:SHOWN]}") from error
+            raise ValueError(f"takes {range_text}, got {' '.join(words)[:MAX_VALUE_CHARACTERS]}") from error
         return values if several else values[0]
 
     def holds(value: Any) -> bool:
@@ -135,7 +135,7 @@ class Options:
             elif value is not None and not check.is_instance(value):
                 got = ", ".join(map(str, value)) if isinstance(value, (list, tuple)) else str(value)
                 takes = check.range_text if isinstance(check, Numbers) else check.metavar
-                raise UsageError(name, f"takes {takes}, got {got[:SHOWN] or 'nothing'}")
+                raise UsageError(name, f"takes {takes}, got {got[:MAX_VALUE_CHARACTERS] or 'nothing'}")
 
     @classmethod
     def of(cls, given: Mapping[str, Any]) -> Self:

@@ -36,7 +36,7 @@ from aaplug.rendering.assumed import cameras_around, say_assumed
 from aaplug.rendering.cost import Cost, cost_of
 from aaplug.rendering.renderer import Renderer, background_colour, own_look
 from aaplug.system.errors import UsageError, listing
-from aaplug.system.executors import PAYS_AFTER, Executor, torch_threads
+from aaplug.system.executors import PAYS_AFTER_SECONDS, Executor, torch_threads
 from aaplug.system.monitor import Monitor
 
 LONG_JOB = 60.0  # seconds of work from which a job is announced
@@ -152,7 +152,7 @@ class Job(Generic[O_co]):
             UsageError: it would take more memory than the limit MEMORY_SHARE of the machine's allows.
         """
         cost = cost or cost_of(renderers, views)
-        needed = cost.scene + cost.image * (processes if cost.seconds > PAYS_AFTER else 1)
+        needed = cost.scene + cost.image * (processes if cost.seconds > PAYS_AFTER_SECONDS else 1)
         sizes = listing(sorted({f"{view.width}x{view.height}" for view in views}), most=3)
         images = len(views) * len(renderers)
         what = f"{work or f'{images} image' + 's' * (images != 1)} at {sizes}"

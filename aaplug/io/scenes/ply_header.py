@@ -16,7 +16,7 @@ from pathlib import Path
 
 from aaplug.io.limits import whole_limit
 from aaplug.io.values import read_start
-from aaplug.system.errors import SHOWN, FormatError
+from aaplug.system.errors import MAX_VALUE_CHARACTERS, FormatError
 
 MAX_COUNT_DIGITS = 18  # still an int64
 ENCODING = "latin-1"  # one character per byte
@@ -186,22 +186,22 @@ def parse(path: str, lines: Iterable[str], newline: str, size: int | None = None
             case ["comment" | "obj_info", *_] | []:
                 pass
             case _ if not line.isascii():
-                raise FormatError(path, f"line {number} of the header is not ASCII: {line[:SHOWN]!r}")
+                raise FormatError(path, f"line {number} of the header is not ASCII: {line[:MAX_VALUE_CHARACTERS]!r}")
             case ["format", *words]:
                 formats.append(words)
             case ["element", name, count]:
                 if not re.fullmatch(r"\d+", count, re.ASCII) or len(count) > MAX_COUNT_DIGITS:
-                    raise FormatError(path, f"element {name!r} has the impossible count {count[:SHOWN]!r}")
+                    raise FormatError(path, f"element {name!r} has the impossible count {count[:MAX_VALUE_CHARACTERS]!r}")
                 tables.append((name, int(count), []))
             case ["property", kind, name] if tables and kind in CODES:
                 tables[-1][2].append(Property(name, CODES[kind]))
             case ["property", "list", length, kind, name] if tables and length in CODES and kind in CODES:
                 tables[-1][2].append(Property(name, CODES[kind], CODES[length]))
             case _:
-                raise FormatError(path, f"line {number} of the header is not PLY: {line[:SHOWN]!r}")
+                raise FormatError(path, f"line {number} of the header is not PLY: {line[:MAX_VALUE_CHARACTERS]!r}")
     coding = next((coding for coding in (LITTLE, BIG, TEXT) if formats == [[coding, "1.0"]]), None)
     if coding is None:
-        words = " and ".join(" ".join(words)[:SHOWN] for words in formats) or "none"
+        words = " and ".join(" ".join(words)[:MAX_VALUE_CHARACTERS] for words in formats) or "none"
         raise FormatError(path, f"its format is {words}; known are {LITTLE}, {BIG} and {TEXT}, each 1.0")
     names = [f"element {name!r}" for name, _, _ in tables]
     names += [f"property of {name} {column.name!r}" for name, _, columns in tables for column in columns]

@@ -39,7 +39,7 @@ from aaplug.system.monitor import Tell
 
 KERNELS: tuple[Kernel, ...] = (  # of every recipe with the pixel kernel `POINT`; the slowest to compile come last
     projection.project_kernel(),
-    *map(shading.shade_kernel, shading.COMPILED),
+    *map(shading.shade_kernel, shading.COMPILED_COEFFICIENTS),
     splats.SELECT,
     culling.cull_kernel(),
     binning.table_kernel(),
@@ -49,7 +49,7 @@ KERNELS: tuple[Kernel, ...] = (  # of every recipe with the pixel kernel `POINT`
     layout.LINES,
     backward.SLOTS,
     *POINT.kernels(RULES_3DGS),
-    *map(shading.gradients_kernel, shading.COMPILED),
+    *map(shading.gradients_kernel, shading.COMPILED_COEFFICIENTS),
     backward.step_kernel(POINT, RULES_3DGS),
     projection.PROJECT_BACKWARD,
     forward.pass_kernel(POINT, RULES_3DGS),
