@@ -19,7 +19,7 @@ from torch import Tensor
 from aaplug.core.cameras import Camera
 from aaplug.core.colours import Colour
 from aaplug.core.gaussians import Gaussians
-from aaplug.core.kernels import Kernels
+from aaplug.core.kernels import Kernel, Kernels
 from aaplug.core.rules import RULES_3DGS, Rules
 from aaplug.core.splats import Render, Splats2D
 from aaplug.core.training import TrainingViews
@@ -186,6 +186,15 @@ class Rasterizer(Protocol):
         rules: Rules = RULES_3DGS,
     ) -> Render:
         """Draw coloured splats into an image of height and width `hw`."""
+        ...
+
+
+@runtime_checkable
+class RunsOwnKernels(Protocol):
+    """A pixel kernel or compositor that runs kernels by itself, which `aaplug warmup` then compiles."""
+
+    def kernels(self, rules: Rules) -> tuple[Kernel, ...]:
+        """These kernels, for scenes composited by the given rules."""
         ...
 
 

@@ -12,8 +12,8 @@ from itertools import cycle
 
 import torch
 
-from aaplug.core.cameras import Camera, spread
 from aaplug.core.camera_paths import free_views
+from aaplug.core.cameras import Camera, spread
 from aaplug.core.gaussians import Fusion, Gaussians
 from aaplug.evaluation.truth import Truth
 from aaplug.finetuning.loop import run

@@ -56,7 +56,7 @@ class TuningJob:
         photos = [view.photo for view in self.views if view.photo]
         return settings | {
             "scene": digest_of_scene(start.scene),
-            "truth": f"{digest_of_scene(truth.own.scene)} {truth.source} {self.upsampler}",
+            "truth": f"{digest_of_scene(truth.renderer.scene)} {truth.source} {self.upsampler}",
             "recipe": f"{start.recipe.name} {start.recipe.digest}",
             "views": digest_of_cameras(self.views),
             "training cameras": digest_of_cameras(start.training.cameras),

@@ -15,8 +15,7 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from aaplug.core.cameras import Camera, Lens
-from aaplug.core.cameras import WHOLE_SLACK
+from aaplug.core.cameras import WHOLE_SLACK, Camera, Lens
 from aaplug.core.imaging import box_average, levels, quantised, resampled
 from aaplug.io.images import read_image, read_rgba
 from aaplug.io.lenses import undistorted

@@ -33,10 +33,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.special import ndtr
 
-from aaplug.lab.integral import principal_columns
 from aaplug.core.kernels import Kernel, Kernels
 from aaplug.core.rules import RULES_3DGS, Rules
 from aaplug.core.splats import Splats2D
+from aaplug.lab.integral import principal_columns
 from aaplug.methods.pixel_kernels.raster_rows import COLUMNS, PIXELS, next_rows, rows_of
 
 MIN_WINDOW_VARIANCE = 1e-3  # px²: of a window along one side

@@ -14,8 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.special import ndtr
 
-from aaplug.core.ellipses import grown
-from aaplug.lab.integral import principal_columns
+from aaplug.core.ellipses import Columns, grown
 from aaplug.core.interfaces import Pixels
 from aaplug.core.kernels import Kernels
 from aaplug.core.rules import Rules
@@ -67,6 +66,20 @@ class Integral:
             probability = ndtr(u + width / 2) - ndtr(u - width / 2)
             values = values * probability * math.sqrt(2 * math.pi) / width
         return values
+
+
+def principal_columns(covs: Float[Tensor, "m 3"], dets: Float[Tensor, " m"]) -> Columns:
+    """ux, uy, vx, vy of a whitening whose rows are the principal axes over their standard deviations, longer first."""
+    xx, xy, yy = covs.unbind(dim=1)
+    across, along = 2 * xy, xx - yy
+    circle = (across == 0) & (along == 0)  # any axes do, but the angle has no gradient
+    angle = 0.5 * torch.atan2(across.where(~circle, 0.0), along.where(~circle, 1.0))
+    half = 0.5 * (xx + yy)
+    root = torch.hypot(0.5 * along.where(~circle, 1.0), xy)
+    longer = half + torch.where(circle, 0.0, root)
+    wide, thin = longer.rsqrt(), (longer / dets).sqrt()
+    cos, sin = angle.cos(), angle.sin()
+    return cos * wide, sin * wide, -sin * thin, cos * thin
 
 
 def mean_gaussian(u: Tensor, h: Tensor) -> Tensor:

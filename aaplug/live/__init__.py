@@ -1,6 +1,6 @@
 """A scene shown live: a page in the browser, drawn by the rasterizer of this machine and streamed.
 
-`subject` is the scene with its renderers, `messages` checks the messages of a page.  `pictures` draws what a page asks
-for, step by step, with `overlays`; `studio` is the one thread that takes these steps, for all pages in turn; `server`
-speaks with the pages.
+`subject` is the scene with its renderers, `messages` checks the messages of a page.  `pictures` draws what one page
+asks for, step by step, with `overlays`; `studio` is the one thread that takes these steps, for all pages in turn;
+`server` speaks with the pages.
 """

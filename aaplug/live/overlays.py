@@ -13,7 +13,6 @@ from torch import Tensor
 
 from aaplug.core.cameras import Camera
 from aaplug.core.colours import BLACK
-from aaplug.core.splats import Render
 from aaplug.methods.pixel_kernels.raster_rows import TILE
 from aaplug.rasterizers.tiled.binning import bands
 from aaplug.rendering.renderer import Renderer
@@ -55,26 +54,6 @@ class Overlay:
         return levels, legend | {"title": self.title, "about": self.about}
 
 
-def _blended(renderer: Renderer, camera: Camera, of_training: Callable[[Tensor, Tensor], Tensor]) -> Map:
-    """Mean over what a pixel shows of a value of each Gaussian that training saw.
-
-    of_training: called with depths of splats, in world units, and their places in the scene.
-    """
-    splats, bounds = renderer.splats(camera), renderer.training.bounds
-    seen = bounds.seen[splats.sources].to(splats.depths)
-    values = torch.where(seen > 0, of_training(splats.depths, splats.sources).to(seen), 0.0)
-    rgb = torch.stack([values, seen, torch.ones_like(seen)], dim=1)
-    total, known, _ = _drawn(renderer, camera, rgb).rgb.unbind(dim=2)
-    return torch.where(known > SHOWS, total / known, torch.nan)
-
-
-def _drawn(renderer: Renderer, camera: Camera, rgb: Float[Tensor, "m 3"] | None = None) -> Render:
-    """The picture with one sample per pixel, before black; rgb: of each splat, instead of its own."""
-    splats = renderer.splats(camera)
-    splats = splats if rgb is None else replace(splats, rgb=rgb)
-    return renderer.paint(splats, camera.hw, BLACK)
-
-
 def _rate(renderer: Renderer, camera: Camera, samples: int) -> Map:
     highest = renderer.training.bounds.highest
     return _blended(renderer, camera, lambda depths, places: (camera.focal / depths / highest[places]).log2()).exp2()
@@ -98,7 +77,7 @@ def _cost(renderer: Renderer, camera: Camera, samples: int) -> Map:
     splats, rules = renderer.splats(fine, samples), renderer.training.convention.rules
     grid = -(-fine.height // TILE), -(-fine.width // TILE)
     ellipses = renderer.recipe.pixel.bounding_ellipses(splats, rules) or splats
-    counts = torch.cat([found.counts for found in bands(ellipses, grid, renderer.kernels, rules=rules)]).view(grid)
+    counts = torch.cat([bins.counts for bins in bands(ellipses, grid, renderer.kernels, rules=rules)]).view(grid)
     rows, columns = (((torch.arange(side) + 0.5) * samples / TILE).long() for side in camera.hw)
     return counts[rows][:, columns].float() * samples**2
 

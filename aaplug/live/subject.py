@@ -13,7 +13,8 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.core.orbits import pinhole
 from aaplug.evaluation.protocols import median_depth
 from aaplug.io.scenes.scene_file import Scene
-from aaplug.live.messages import Side
+from aaplug.live.messages import PictureRequest, Side
+from aaplug.live.overlays import OVERLAYS
 from aaplug.methods import QUALITIES, RECIPES
 from aaplug.methods.recipes import find_recipe
 from aaplug.rendering.renderer import Renderer

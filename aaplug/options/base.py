@@ -14,7 +14,7 @@ import tyro
 
 from aaplug.system.errors import MAX_VALUE_CHARACTERS, UsageError, did_you_mean, not_one_of
 from aaplug.system.monitor import SILENT, Monitor
-from aaplug.system.registry import names_of, unknown
+from aaplug.system.registry import names_of
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,8 @@ class OneOf:
         names = [*self.others, *(names_of(self.kind) if self.kind else ())]
         for name in value if isinstance(value, (list, tuple)) else [value]:
             if isinstance(name, str) and name not in names:
-                raise UsageError(option, unknown(name, names) if self.kind else not_one_of(name, names))
+                closest = did_you_mean(name, names) if self.kind else ""
+                raise UsageError(option, not_one_of(name, names) + closest)
 
 
 @dataclass(frozen=True, kw_only=True)

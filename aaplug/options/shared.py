@@ -14,7 +14,7 @@ from aaplug.core.colours import Background
 from aaplug.core.conventions import MIN_SEEN_SHARE
 from aaplug.methods import QUALITIES, RateReference
 from aaplug.options.base import CAMERAS, DRAWING, ORBIT, UNSET, OneOf, Options, choice, flag, number
-from aaplug.system.errors import UsageError
+from aaplug.system.errors import MAX_VALUE_CHARACTERS, UsageError
 from aaplug.system.registry import names_of
 
 if TYPE_CHECKING:  # the modules of these types import torch

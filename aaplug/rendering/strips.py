@@ -28,29 +28,23 @@ def strips(
     left, right = columns or (0, camera.width)
     start, end = max(0, left - HALO), min(camera.width, right + HALO)
     fine = camera.resized(camera.width * samples, camera.height * samples)
-    splats, soft = _moved(renderer.splats(fine, samples), -start * samples, 0), renderer.neighbours(camera, samples)
-    fine = replace(fine, width=(end - start) * samples)
-    rows, drawn = max(1, SAMPLES // (fine.width * samples)), []
+    splats = _moved(renderer.splats(fine, samples), -start * samples, 0)
+    pixel, rules, weight = (
+        renderer.recipe.pixel,
+        renderer.training.convention.rules,
+        renderer.neighbours(camera, samples),
+    )
+    rows, parts = max(1, SAMPLES_PER_STRIP // ((end - start) * samples**2)), []
     for top in range(0, camera.height, rows):
         yield
-        bottom = min(top + rows, camera.height)
-        drawn.append(_strip(renderer, splats, fine.hw, (top, bottom), samples, soft))
-    whole = Render(*(torch.cat(parts) for parts in zip(*drawn, strict=True)))
-    return Render(*(image[:, left - start : right - start] for image in whole))
-
-
-def _strip(
-    renderer: Renderer, splats: Splats2D, whole: tuple[int, int], rows: tuple[int, int], samples: int, soft: float
-) -> Render:
-    """Some rows of pixels; whole: height and width of all samples."""
-    top, bottom = max(0, rows[0] - HALO), min(whole[0] // samples, rows[1] + HALO)
-    pixel, rules = renderer.recipe.pixel, renderer.training.convention.rules
-    moved, hw = _moved(splats, 0, -top * samples), ((bottom - top) * samples, whole[1])
-    here = cull(moved, hw, kernels=renderer.kernels, ellipses=pixel.bounding_ellipses(moved, rules), rules=rules)
-    image = renderer.paint(here, hw)
-    pixels = average_samples(image, samples, soft)
-    inner = slice(rows[0] - top, rows[1] - top)
-    return Render(pixels.rgb[inner], pixels.alpha[inner])
+        above, below = max(0, top - HALO), min(camera.height, top + rows + HALO)
+        moved, hw = _moved(splats, 0, -above * samples), ((below - above) * samples, (end - start) * samples)
+        ellipses = pixel.bounding_ellipses(moved, rules)
+        visible = cull(moved, hw, kernels=renderer.kernels, ellipses=ellipses, rules=rules)
+        strip = average_samples(renderer.paint(visible, hw), samples, weight)
+        inner = slice(top - above, top - above + rows), slice(left - start, right - start)
+        parts.append((strip.rgb[inner], strip.alpha[inner]))
+    return Render(*(torch.cat(images) for images in zip(*parts, strict=True)))
 
 
 def _moved(splats: Splats2D, right: int, down: int) -> Splats2D:

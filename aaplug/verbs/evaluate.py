@@ -86,7 +86,7 @@ def evaluate(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
 def cost_of_task(task: Task, sized: Sequence[Camera]) -> Cost:
     """An estimate: every candidate's images, the truths, which are as fine as training, and their comparison."""
     truths = [*task.views] * (1 if task.truth.protocol.change == "size" else len(task.scales))
-    images, truth = cost_of([c.renderer for c in task.candidates], sized), cost_of([task.truth.own], truths)
+    images, truth = cost_of([c.renderer for c in task.candidates], sized), cost_of([task.truth.renderer], truths)
     seconds = images.seconds + truth.seconds + comparing(sized, len(task.names))
     return images._replace(seconds=seconds)
 
