@@ -9,7 +9,7 @@ Where scenes are compared, ground truth is one of them, the reference, as its ow
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -22,11 +22,12 @@ from aaplug.core.imaging import quantised, resampled
 from aaplug.evaluation import PROTOCOLS
 from aaplug.evaluation.metric import Image, TimedImage, TimedRenderer
 from aaplug.evaluation.protocols import Protocol, TruthSource, median_depth
-from aaplug.evaluation.upsamplers import bicubic
+from aaplug.evaluation.upsamplers import Upsampler, bicubic
 from aaplug.io.photographs import DOWNSCALES, Photograph
 from aaplug.methods.recipe import Recipe
 from aaplug.methods.recipes import find_recipe
 from aaplug.rendering.renderer import Renderer
+from aaplug.system.errors import UsageError, not_one_of
 
 NO_PHOTOGRAPH = "has no photograph to compare with; truth 'self' compares with the scene's own render"
 MEMORY = 1e9  # bytes of images to cache; what does not fit is made again each time
@@ -35,6 +36,26 @@ SLAB_SIZE = 1 << 25  # numbers of the cache allocated at once: 64 MB
 
 Larger = Float[Tensor, "H W 3"]
 Enlarge = Callable[[Renderer, Image, Camera], Larger]  # (the scene's own renderer, source image, target camera)
+
+
+def source_of(views: Sequence[Camera], name: str = "auto") -> TruthSource:
+    """The source of this name; for "auto", photographs if every view has one, else the scene's own render ("self").
+
+    Raises UsageError if there is no source of that name, or a view has no photograph.
+    """
+    missing = [view.name for view in views if view.photo is None]
+    if name == "self" or (name == "auto" and missing):
+        return "self"
+    if name not in ("auto", "photographs"):
+        raise UsageError("truth", not_one_of(name, ("auto", "photographs", "self")))
+    if missing:
+        raise UsageError(missing[0], NO_PHOTOGRAPH)
+    return "photographs"
+
+
+def upsampled(upsampler: Upsampler) -> Enlarge:
+    """Estimate ground truth by enlarging the source image with an upsampler."""
+    return lambda renderer, full, camera: upsampler(full, camera.hw)
 
 
 def back_projected(renderer: Renderer, full: Image, camera: Camera) -> Larger:

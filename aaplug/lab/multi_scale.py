@@ -22,9 +22,8 @@ from aaplug.core.conventions import CLASSIC
 from aaplug.core.gaussians import Fusion, Gaussians, joined
 from aaplug.core.projection import project
 from aaplug.lab.pixel_size import LEAST_SHARE, MAX_SMALL_SIZE, MOST_SHARE, PixelSizes, pixel_size
-from aaplug.levels.clusters import alone, seen
+from aaplug.levels.clusters import clusters_of, gaussians_of, rates_of
 from aaplug.levels.merging import Goal, rounds
-from aaplug.levels.rates import rates_of
 from aaplug.methods.conversion import MERGED
 from aaplug.methods.filters.smoothing import fuse_stored
 from aaplug.system.errors import UsageError
@@ -106,10 +105,10 @@ def _merged(large: _Part, small: _Part, rates: Float[Tensor, " s"], level: int) 
     """The Gaussians that are drawn after a level, and those that it replaces; rates: of the small ones."""
     if not len(small.scene):
         return large, small
-    covered = replace(seen(small.scene, rates * _highest_rate(small.level)), rates=rates)
+    covered = replace(clusters_of(small.scene, rates * _highest_rate(small.level)), rates=rates)
     clusters = rounds(covered, Goal(0.5**level, tolerance=TOLERANCE), lambda count: None)
     counts = torch.bincount(clusters.labels, minlength=len(clusters))
-    merged = alone(
+    merged = gaussians_of(
         replace(clusters, rates=clusters.rates * _highest_rate(torch.tensor(level))), small.scene, covered.weights
     )
     replaced = counts[clusters.labels] > 1

@@ -99,7 +99,7 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
         checkpoint = path and _beside(path, "pt")
         state = tune(tuning, checkpoint, options.checkpoint_every, options.resume, job.monitor)
         record = {"for": viewer.name, "method": settings.name}
-        scene = recorded(state, tuning, viewer.convention_of(raw), record)
+        scene = tuned_scene(state, tuning, viewer.convention_of(raw), record)
         if path is not None:
             write_scene(path, scene, overwrite=options.overwrite, spz_axes=options.spz_axes)
         closed = [Candidate("closed form", start)] * (len(start.scene.fused) > len(raw.fused))

@@ -14,7 +14,7 @@ from aaplug.core.chunks import MAX_CHUNK_GAUSSIANS, chunks_of
 from aaplug.core.gaussians import Gaussians, digest_of_scene
 from aaplug.core.sampling import check_frame
 from aaplug.finetuning.fitting import fit, steps_for
-from aaplug.finetuning.refining import refined
+from aaplug.finetuning.refining import refine
 from aaplug.io.atomic import refuse_existing
 from aaplug.io.scenes import SceneLike, check_scene_output, write_scene, written_format
 from aaplug.io.scenes.pyramid_folder import (
@@ -29,8 +29,8 @@ from aaplug.io.scenes.pyramid_folder import (
     write_manifest,
 )
 from aaplug.io.scenes.scene_file import FLOAT, Scene, matrix_of
-from aaplug.levels.merging import Goal, merged, merged_in_chunks
-from aaplug.levels.rates import rates_of
+from aaplug.levels.clusters import rates_of
+from aaplug.levels.merging import Goal, merge, merge_in_chunks
 from aaplug.methods.filters.smoothing import fuse_stored
 from aaplug.methods.viewers import Viewer, find_viewer
 from aaplug.options.shared import AnyPath
@@ -104,7 +104,7 @@ class _Maker:
         """The maker that the options ask for."""
         if job.cameras.assumed and not job.options.tuning:
             return cls(scene, job, None, (), None)
-        return cls(scene, job, job.look(job.options.tuning or VIEWS), job.views, find_viewer(job.options.viewer))
+        return cls(scene, job, job.look(job.options.tuning or MAX_VIEWS), job.views, find_viewer(job.options.viewer))
 
     def __call__(self, before: Level, goal: Goal) -> Level:
         """The level for a goal."""
@@ -120,9 +120,9 @@ class _Maker:
         visible = self._visible(before, goal)
         with monitor.progress("merging", "Gaussians") as tell:
             if before.chunks is None:
-                lighter, chunks = merged(scene, rates, goal, tell, visible), None
+                lighter, chunks = merge(scene, rates, goal, tell, visible), None
             else:
-                lighter, chunks = merged_in_chunks(scene, rates, before.chunks, goal, tell, visible)
+                lighter, chunks = merge_in_chunks(scene, rates, before.chunks, goal, tell, visible)
         monitor.say(f"{len(lighter):,} Gaussians for {goal.rate:.3g} × the training rate")
         level = Level(lighter, goal.rate, chunks)
         return self._tuned(level) if self.viewer is None else level
@@ -140,7 +140,7 @@ class _Maker:
             steps = options.steps if usual and options.steps is not None else usual
             fitted = fit(self.scene, self.viewer, look, self.views, steps, self.job.monitor)
             return level._replace(scene=fitted.scene)
-        scene = refined(level.scene, level.rate, look, self.views, options.tuning, self.viewer, self.job.monitor)
+        scene = refine(level.scene, level.rate, look, self.views, options.tuning, self.viewer, self.job.monitor)
         return level._replace(scene=scene)
 
     def _visible(self, before: Level, goal: Goal) -> Float[Tensor, " n"] | None:
