@@ -141,7 +141,8 @@ class Command:
         for group, members in groups.items():
             nested = make_dataclass(group.title.title(), [member.spec for member in members], frozen=True)
             nested.__doc__ = group.about
-            specs.append((group.title, nested, field(default_factory=nested)))
+            name = group.title.replace(" ", "_") + "_options"
+            specs.append((name, Annotated[nested, tyro.conf.arg(name=group.title)], field(default_factory=nested)))
         parser = make_dataclass(self.name.title(), specs, frozen=True)
         parser.__doc__ = self.help
         return parser

@@ -21,7 +21,7 @@ from aaplug.evaluation.results import Report, results, scale_name
 from aaplug.evaluation.truth import MEMORY, Truth, back_projected, source_of, upsampled
 from aaplug.evaluation.upsamplers import find_upsampler
 from aaplug.finetuning import METHODS
-from aaplug.finetuning.session import tune
+from aaplug.finetuning.session import tune, tuned_scene
 from aaplug.finetuning.settings import Settings, settings_of
 from aaplug.finetuning.state import TuningJob
 from aaplug.io.atomic import check_output, replacing
@@ -99,18 +99,18 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
         checkpoint = path and _beside(path, "pt")
         state = tune(tuning, checkpoint, options.checkpoint_every, options.resume, job.monitor)
         record = {"for": viewer.name, "method": settings.name}
-        scene = tuned_scene(state, tuning, viewer.convention_of(raw), record)
+        result = tuned_scene(state, tuning, viewer.convention_of(raw), record)
         if path is not None:
-            write_scene(path, scene, overwrite=options.overwrite, spz_axes=options.spz_axes)
+            write_scene(path, result, overwrite=options.overwrite, spz_axes=options.spz_axes)
         closed = [Candidate("closed form", start)] * (len(start.scene.fused) > len(raw.fused))
-        bounds = sampling_bounds(scene.means, train)  # densification may have changed the number of Gaussians
-        after = replace(start, scene=scene, training=replace(start.training, bounds=bounds))
+        bounds = sampling_bounds(result.means, train)  # densification may have changed the number of Gaussians
+        after = replace(start, scene=result, training=replace(start.training, bounds=bounds))
         candidates = [Candidate("before", before), *closed, Candidate("after", after)]
         scales = sorted({1.0, *settings.weights}, reverse=True)
         truth = replace(truth, source=source_of(job.views))
         with job.monitor.progress("measuring", "views") as tell:
             report = compare(candidates, job.views, scales, truth, tell)
-        tuned = Tuned(scene, report, settings, state.curve, state.probes)
+        tuned = Tuned(result, report, settings, state.curve, state.probes)
         if path is not None:
             sheet = _sheet(candidates, job.views[0], scales, truth)
             _write(path, tuned, sheet, options.overwrite)

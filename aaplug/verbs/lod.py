@@ -37,7 +37,7 @@ from aaplug.options.shared import AnyPath
 from aaplug.options.verbs import LodOptions
 from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.rendering.renderer import Renderer
-from aaplug.rendering.visibility import visibility
+from aaplug.rendering.visibility import MAX_VIEWS, visibility
 from aaplug.system.digests import digest_of_values
 from aaplug.system.errors import FrameError, OutputError, UsageError
 from aaplug.verbs.verb import writes
