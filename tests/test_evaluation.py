@@ -14,7 +14,7 @@ from aaplug.evaluation.image_store import ImageStore
 from aaplug.evaluation.metric import Metric, TimedRenderer
 from aaplug.evaluation.metrics import CONSISTENCY, ENERGY, FLICKER, PSNR, SSIM, psnr
 from aaplug.evaluation.results import CEILING, as_csv, mean, per_view, results, scale_name, tables
-from aaplug.evaluation.truth import Truth, back_projected
+from aaplug.evaluation.truth import CACHE_DTYPE, Truth, back_projected
 from aaplug.io.images import read_image, write_png
 from aaplug.methods import RECIPES
 from aaplug.methods.recipes import find_recipe

@@ -3,7 +3,6 @@
 import re
 import shutil
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 from statistics import mean, stdev
 from urllib.parse import parse_qs, urlsplit
@@ -57,24 +56,10 @@ def written(tmp_path_factory):
     return folder, report, coverage(scene, training, report.scales)
 
 
-class Tags(HTMLParser):
-    """Every tag with its attributes."""
-
-    def __init__(self, text: str):
-        super().__init__()
-        self.tags: list[tuple[str, dict[str, str | None]]] = []
-        self.feed(text)
-
-    def handle_starttag(self, tag, attrs):
-        self.tags.append((tag, dict(attrs)))
-
-
 def test_the_page_refers_to_nothing_outside_itself(written):
     text = (written[0] / "report.html").read_text()
-    for tag, attributes in Tags(text).tags:
-        for name in ("src", "href", "xlink:href", "action", "data"):
-            value = attributes.get(name) or "#"
-            assert value.startswith(("#", "data:")), (tag, name, value)
+    targets = re.findall(r"\s(?:src|href|xlink:href|action|data)=[\"']?([^\"'\s>]*)", text)
+    assert {target.partition(":")[0] for target in targets if not target.startswith("#")} == {"data"}
     assert not re.search(r"@import|url\((?!#)", text)
     assert "default-src 'none'" in text
 
@@ -83,7 +68,7 @@ def test_every_name_is_escaped_and_the_best_is_bold(written):
     text = (written[0] / "report.html").read_text()
     assert "<script>alert" not in text
     assert "&lt;/script&gt;&lt;script&gt;alert(&#39;x&#39;)" in text
-    assert [tag for tag, _ in Tags(text).tags].count("script") == 2  # its data and its own
+    assert len(re.findall(r"<script\b", text)) == 2  # its data and its own
     rows = re.findall(r"<tr( class=\"ceiling\")?><th scope=\"row\">(.*?)</th>(.*?)</tr>", text)
     assert {bool(ceiling) for ceiling, _, cells in rows if '<span class="best">' in cells} == {False}
     assert any(ceiling for ceiling, _, _ in rows)
@@ -134,12 +119,11 @@ def browser():
 @pytest.fixture
 def opened(browser, written):
     """A function that opens the page in a window of some size and scheme; nothing may have gone wrong in it."""
-    troubles, contexts, asked = [], [], []
+    troubles, pages, asked = [], [], []
 
     def open_page(width=1280, height=900, scheme="light", address=""):
-        context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=scheme)
-        contexts.append(context)
-        page = context.new_page()
+        page = browser.new_page(viewport={"width": width, "height": height}, color_scheme=scheme)
+        pages.append(page)
         page.on("console", lambda message: troubles.append(message.text))
         page.on("pageerror", lambda error: troubles.append(str(error)))
         page.on("request", lambda request: asked.append(request.url))
@@ -148,8 +132,8 @@ def opened(browser, written):
         return page
 
     yield open_page
-    for context in contexts:
-        context.close()
+    for page in pages:
+        page.close()
     assert troubles == []
     assert all(url.startswith(("file:", "data:")) for url in asked)
 

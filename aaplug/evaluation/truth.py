@@ -73,7 +73,7 @@ def back_projected(renderer: Renderer, full: Image, camera: Camera) -> Larger:
 class Truth:
     """The images to compare with.
 
-    renderer: renders the scene by training's rule (see `own_look`), or the reference by its recipe.
+    renderer: renders the scene by training's rule (see `rendering.renderer.own_look`), or the reference by its recipe.
     enlarge: estimates ground truth above the source's size.  None: the scene's own render at that size; with
         photographs, undefined.
     memory: bytes of float16 images to cache between calls; None caches none.
