@@ -39,24 +39,17 @@ def test_a_converted_scene_renders_the_same_from_its_file(form, tmp_path, camera
     assert torch.equal(*images)
 
 
-def test_converting_twice_is_refused(cameras):
+def test_what_cannot_be_fused_is_refused(cameras):
     scene = make_scene(50)
     training = TrainingViews.of(scene, cameras)
+    with pytest.raises(UsageError, match="needs the training cameras"):
+        fuse(scene, None, FORMS["matched-energy"])
+    with pytest.raises(UsageError, match="nothing to fuse"):
+        fuse(replace(scene, convention=MIP), training, FORMS["matched-energy"])  # without a stored filter
     converted = fuse(scene, training, FORMS["matched-energy"])
     for form in FORMS.values():
         with pytest.raises(UsageError, match="already has matched-energy"):
             fuse(converted, training, form)
-
-
-def test_converting_a_classic_scene_needs_cameras():
-    with pytest.raises(UsageError, match="needs the training cameras"):
-        fuse(make_scene(3), None, FORMS["matched-energy"])
-
-
-def test_a_mip_scene_without_stored_filter_has_nothing_to_fuse(cameras):
-    scene = replace(make_scene(3), convention=MIP)
-    with pytest.raises(UsageError, match="nothing to fuse"):
-        fuse(scene, TrainingViews.of(scene, cameras), FORMS["matched-energy"])
 
 
 @pytest.mark.parametrize("convention", [CLASSIC, ANTIALIASED], ids=lambda c: c.name)
@@ -133,7 +126,7 @@ def test_a_scene_thinner_than_a_viewers_blur_keeps_some_area(cameras):
     converted = fuse_for(scene, TrainingViews.of(scene, cameras), VIEWERS["antialiased"])
     assert (converted.log_scales <= scene.log_scales).all()
     assert converted.log_scales.isfinite().all()
-    px = converted.scales * median_rates(scene.means, cameras)[:, None]
-    least = (scene.scales * median_rates(scene.means, cameras)[:, None]).clamp(max=0.1)
-    assert (px >= 0.999 * least).all()
-    assert (px < 0.999 * scene.scales * median_rates(scene.means, cameras)[:, None]).any()
+    rates = median_rates(scene.means, cameras)[:, None]
+    px, before = converted.scales * rates, scene.scales * rates
+    assert (px >= 0.999 * before.clamp(max=0.1)).all()
+    assert (px < 0.999 * before).any()

@@ -108,19 +108,15 @@ def test_a_single_gaussian_is_itself_to_the_bit():
     rows = {tuple(row) for row in torch.cat([scene.means, scene.quats, scene.log_scales], dim=1).tolist()}
     again = [tuple(row) in rows for row in torch.cat([found.means, found.quats, found.log_scales], dim=1).tolist()]
     assert 10 <= sum(again) < 20
-    alone = scene[:1]
-    assert merged_to(1, alone) is alone
+    assert merged_to(1, alone := scene[:1]) is alone
 
 
-def test_merging_nothing_returns_the_scene():
-    scene = make_scene(40)
-    assert merged_to(40, scene) is scene
-
-
-@pytest.mark.parametrize("count", [1, 30, 119])
+@pytest.mark.parametrize("count", [1, 30, 119, 120])
 def test_counts_are_met_exactly(count):
     scene = make_scene(120)
-    assert len(merged_to(count, scene)) == count
+    found = merged_to(count, scene)
+    assert len(found) == count
+    assert (found is scene) == (count == 120)
 
 
 def test_equal_gaussians_are_merged_too():
@@ -133,22 +129,23 @@ def test_equal_gaussians_are_merged_too():
     assert len(merged_to(3, scene)) == 3
 
 
+def assert_equal(a: Gaussians, b: Gaussians) -> None:
+    for name, column in a.columns.items():
+        assert torch.equal(column, b.columns[name]), name
+
+
 def test_the_order_of_the_scene_plays_no_part():
     scene = make_scene(300)
     shuffled = scene[torch.randperm(300, generator=torch.Generator().manual_seed(1))]
-    first, second = (merged_to(60, s) for s in (scene, shuffled))
-    for name, column in first.columns.items():
-        assert torch.equal(column, second.columns[name]), name
+    assert_equal(*(merged_to(60, s) for s in (scene, shuffled)))
 
 
 def test_the_number_of_threads_plays_no_part(sample_scene):
-    scene = sample_scene[::3]
-    found = []
+    scene, found = sample_scene[::3], []
     for threads in (1, 2):
         with torch_threads(threads):
             found.append(merged_to(len(scene) // 4, scene, rate=200.0))
-    for name, column in found[0].columns.items():
-        assert torch.equal(column, found[1].columns[name]), name
+    assert_equal(*found)
 
 
 def test_what_is_large_stays_and_what_is_small_is_merged():
@@ -194,17 +191,13 @@ def test_without_cameras_levels_are_for_the_orbits_views():
     assert not torch.equal(found.scene.means, coarser.scene.means)
 
 
-def test_cameras_that_see_nothing_have_no_rate():
-    away = replace(make_scene(9), means=make_scene(9).means + 1000)
-    with pytest.raises(FrameError, match="none of its Gaussians is seen by any of the 1 cameras"):
-        rates_of(away, [make_camera()])
-
-
 def test_gaussians_that_no_camera_sees_have_the_lowest_rate():
     scene = make_scene(20)
     scene.means[3] = torch.tensor([0.0, -9.0, 0.0])
     rates = rates_of(scene, [make_camera()])
     assert rates[3] == rates[torch.arange(20) != 3].min() > 0
+    with pytest.raises(FrameError, match="none of its Gaussians is seen by any of the 1 cameras"):
+        rates_of(replace(scene, means=scene.means + 1000), [make_camera()])
 
 
 def test_extreme_sizes_and_transparent_gaussians_are_merged():

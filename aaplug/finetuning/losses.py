@@ -31,7 +31,14 @@ def l1_dssim(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> Fl
 def structural_similarity(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
     """Mean SSIM over the windows that lie inside the image; the window shrinks to fit a smaller image."""
     a, b = (x.permute(2, 0, 1)[:, None] for x in (image, truth))
-    rows, columns = (_window(min(SSIM_WINDOW, side)).to(image) for side in a.shape[2:])
+
+    def window(side: int) -> Tensor:
+        size = min(SSIM_WINDOW, side)
+        x = torch.arange(size, dtype=torch.float64) - (size - 1) / 2
+        weights = torch.exp(-0.5 * (x / SSIM_SIGMA) ** 2)
+        return (weights / weights.sum()).to(image)
+
+    rows, columns = map(window, a.shape[2:])
 
     def blurred(x: Tensor) -> Tensor:
         down = torch.nn.functional.conv2d(x, rows[None, None, :, None])
@@ -43,12 +50,6 @@ def structural_similarity(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h
     c1, c2 = (k * k for k in SSIM_K)
     alike = (2 * mean_a * mean_b + c1) * (2 * cov + c2)
     return (alike / ((mean_a**2 + mean_b**2 + c1) * (var_a + var_b + c2))).mean()
-
-
-def _window(size: int) -> Float[Tensor, " w"]:
-    x = torch.arange(size, dtype=torch.float64) - (size - 1) / 2
-    weights = torch.exp(-0.5 * (x / SSIM_SIGMA) ** 2)
-    return weights / weights.sum()
 
 
 LOSSES: dict[str, Loss] = {"l2": l2, "l1-dssim": l1_dssim}
