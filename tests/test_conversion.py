@@ -33,7 +33,7 @@ def test_a_converted_scene_renders_the_same_from_its_file(form, tmp_path, camera
     training = TrainingViews.of(scene, cameras)
     converted = fuse(scene, training, form)
     write_scene(tmp_path / "converted.ply", converted)
-    again = read_scene(tmp_path / "converted.ply")
+    again = read_scene(tmp_path / "converted.ply").gaussians()
     assert (again.convention, again.fused) == (MIP, converted.fused)
     images = [Renderer(s, training, RECIPES["mip"])(cameras[0]).rgb for s in (converted, again)]
     assert torch.equal(*images)
@@ -96,11 +96,11 @@ def test_converted_for_a_viewer_shows_the_energy_that_training_showed(viewer, tr
 def test_harmonics_that_a_viewer_does_not_draw_are_not_written(tmp_path, cameras):
     scene = replace(make_scene(50), sh=torch.randn(50, 16, 3, generator=torch.Generator().manual_seed(0)))
     write_scene(tmp_path / "scene.ply", scene)
-    scene = read_scene(tmp_path / "scene.ply")
+    scene = read_scene(tmp_path / "scene.ply").gaussians()
     training = TrainingViews.of(scene, cameras)
     for name, degree in (("mkkellogg", 2), ("mkkellogg-classic", 2), ("spark", 3), ("classic", 3)):
         write_scene(tmp_path / f"{name}.ply", fuse_for(scene, training, VIEWERS[name]))
-        again = read_scene(tmp_path / f"{name}.ply")
+        again = read_scene(tmp_path / f"{name}.ply").gaussians()
         assert again.sh_degree == degree
         assert torch.equal(again.sh, scene.sh[:, : (degree + 1) ** 2])
 
