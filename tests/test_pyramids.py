@@ -26,8 +26,8 @@ from aaplug.core.training import TrainingViews
 from aaplug.evaluation.metrics import psnr
 from aaplug.finetuning import refining
 from aaplug.io.scenes import read_scene
-from aaplug.io.scenes.pyramid_folder import MANIFEST, pyramid_of, read_pyramid
-from aaplug.levels.merging import Goal, merged_in_chunks
+from aaplug.io.scenes.pyramid_folder import MANIFEST, pyramid_of, read_manifest, read_pyramid
+from aaplug.levels.merging import Goal, merge_in_chunks
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import FormatError
 from aaplug.verbs.lod import lod
@@ -165,8 +165,8 @@ def test_a_near_part_is_fine_and_a_far_part_coarse():
     far.means[:] = 0.1 * far.means + torch.tensor([0.0, 40.0, 0.0])
     both = Gaussians(**{name: torch.cat([getattr(near, name), getattr(far, name)]) for name in near.columns})
     chunks = torch.arange(2).repeat_interleave(60)
-    coarse = merged_in_chunks(both, rates(both), chunks, Goal(0.25, tolerance=1e3))
-    whole = Pyramid.of([both, coarse.scene, coarse.scene], [chunks, coarse.chunks, coarse.chunks])
+    coarse, places = merge_in_chunks(both, rates(both), chunks, Goal(0.25, tolerance=1e3))
+    whole = Pyramid.of([both, coarse, coarse], [chunks, places, places])
     view = make_camera((0.0, -4.0, 0.0), (640, 480))
     cutter = Cutter.of(whole, TrainingViews.of(whole.scene, [view]))
     octaves = cutter.octaves(replace(view, trained_focal=None))
@@ -258,8 +258,9 @@ def folder(cli) -> Path:
 
 
 def test_a_folder_of_levels_is_a_scene(cli, folder):
-    whole = read_pyramid(folder)
-    assert len(whole) == 3
+    whole, manifest = read_pyramid(folder), read_manifest(folder)
+    assert [level.rate for level in manifest.levels] == [1.0, 0.5, 0.25]
+    assert [sum(level.chunks) for level in manifest.levels] == list(whole.sizes)
     assert torch.equal(whole.finest.means, read_scene("scene.ply").whole().means)
     for words in ("--scale 0.25", "--scale 0.25 --quality fast", "--scale 0.25 --quality best"):
         code, _, err = cli(f"render levels --cameras . -o images {words} --overwrite")
