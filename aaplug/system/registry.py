@@ -11,7 +11,7 @@ first used, so that names can be listed without importing anything.
 """
 
 import logging
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -88,7 +88,7 @@ class Registry(Mapping[str, T]):
             UsageError: there is none; the error names `parameter`, or else the kind, and the closest names.
         """
         if name not in self._built_in and name not in list(self):
-            raise UsageError(parameter or self.kind, not_one_of(name, self) + did_you_mean(name, self))
+            raise UsageError(parameter or self.kind, unknown(name, list(self)))
         return self[name]
 
     def register(self, name: str, value: T) -> None:
@@ -151,6 +151,12 @@ def names_of(kind: str, comparisons: bool = True) -> list[str]:
     names = _at(REGISTRIES[kind]).names
     ours = {p.name for p in _points().select(group=group_of(kind)) if p.dist is not None and p.dist.name == "aaplug"}
     return names if comparisons else [name for name in names if name not in ours]
+
+
+def unknown(name: str, names: Collection[str]) -> str:
+    """Message for a name that is in no registry: the closest one, or the question for the package that adds it."""
+    hint = did_you_mean(name, names) or "; if a package adds it, is that installed?"
+    return not_one_of(name, names) + hint
 
 
 def group_of(kind: str) -> str:
