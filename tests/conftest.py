@@ -70,7 +70,7 @@ def sample_folder() -> Path:
 
 @pytest.fixture(scope="session")
 def sample_scene() -> Gaussians:
-    return read_scene(SAMPLE / "chair.ply")
+    return read_scene(SAMPLE / "chair.ply").gaussians()
 
 
 @pytest.fixture(scope="session")

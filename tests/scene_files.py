@@ -17,7 +17,7 @@ ORACLE = DATA / "oracle.ply"  # random, 40 Gaussians of degree 3, tagged mip; th
 
 
 def oracle() -> Gaussians:
-    return read_scene(ORACLE)
+    return read_scene(ORACLE).gaussians()
 
 
 def bytes_of(values: torch.Tensor, gain: float, offset: float) -> np.ndarray:

@@ -37,7 +37,7 @@ def test_python_in_the_readme_gives_the_command_lines_image(cli):  # noqa: F811
 
 @pytest.mark.parametrize("recipe", ["mip-splatting", "matched"])
 def test_a_renderer_applies_the_recipes_world_filter(cli, recipe):  # noqa: F811
-    scene, cameras = aaplug.read_scene("scene.ply"), aaplug.read_cameras(".")
+    scene, cameras = aaplug.read_scene("scene.ply").gaussians(), aaplug.read_cameras(".")
     image = aaplug.Renderer.of(scene, cameras, recipe)(cameras.test[0].scaled(0.5)).rgb
     words = f"render scene.ply --cameras . -o one.png --scale 0.5 --recipe {recipe}"
     assert cli(f"{words} --bit-depth 16")[0] == 0
@@ -72,7 +72,7 @@ def test_render_takes_paths_as_strings(cli):  # noqa: F811
 def test_a_model_folder_brings_its_own_cameras(cli):  # noqa: F811
     model = inria_model(Path("model"), "Namespace(white_background=True, resolution=2, images='images', eval=False)")
     by_folder = aaplug.render(str(model), output="one", views="a")
-    scene = aaplug.read_scene(model / "point_cloud/iteration_30/point_cloud.ply")
+    scene = aaplug.read_scene(model / "point_cloud/iteration_30/point_cloud.ply").gaussians()
     by_scene = aaplug.render(scene, output="two", views="a")
     assert by_folder[0].file.read_bytes() == by_scene[0].file.read_bytes()
 

@@ -39,7 +39,7 @@ def make_dataset(folder: Path) -> Path:
     (folder / "test").mkdir()
     write_png(folder / "test" / "r_0.png", torch.zeros(SIZE[1], SIZE[0], 3))
     cameras = read_cameras(folder)
-    scene = read_scene(folder / "scene.ply")
+    scene = read_scene(folder / "scene.ply").gaussians()
     image = Renderer.of(scene, cameras, "classic", rasterizer="eager")(cameras.test[0]).rgb
     write_png(folder / "test" / "r_0.png", image, overwrite=True)
     return folder
@@ -265,7 +265,7 @@ def test_demo_does_the_whole_job(cli, monkeypatch):
     assert "auto" in out
     results = json.loads(Path("shown/results.json").read_text())
     assert results["auto@0.125"]["PSNR"] > results["classic@0.125"]["PSNR"] + 15
-    assert read_scene(Path("shown/chair-converted.ply")).fused
+    assert read_scene(Path("shown/chair-converted.ply")).gaussians().fused
     width, height = image_size(Path("shown/contact-sheet.png"))
     assert min(width, height) > 300
     assert cli("demo -o shown")[0] == 2

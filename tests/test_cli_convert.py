@@ -18,7 +18,7 @@ CONVERT = "convert scene.ply --cameras . -o c.ply"
 
 
 def fused(name: str = "c.ply") -> list[str]:
-    return [fusion.method for fusion in read_scene(Path(name)).fused]
+    return [fusion.method for fusion in read_scene(Path(name)).gaussians().fused]
 
 
 def test_convert_writes_what_was_fused(cli):
@@ -27,7 +27,7 @@ def test_convert_writes_what_was_fused(cli):
     expected = {"method": "matched-energy", "variance": "0.2", "views": "3", "from": "classic"}
     assert json.loads(out) == {"output": "c.ply", "gaussians": 150, "fused": [expected]}
     assert "show it with 0.1 px², compensated (mip)" in err
-    again = read_scene(Path("c.ply"))
+    again = read_scene(Path("c.ply")).gaussians()
     assert (again.convention, fused()) == (MIP, ["matched-energy"])
     assert "matched-energy (variance=0.2" in cli("info c.ply")[1]
 
@@ -35,7 +35,7 @@ def test_convert_writes_what_was_fused(cli):
 def test_convert_fuses_plain_mip_splatting_and_another_variance(cli):
     assert cli(f"{CONVERT} --form mip-splatting --variance 0.1")[0] == 0
     expected = Fusion("smoothing3d", {"variance": "0.1", "opacity": "volume"})
-    assert read_scene(Path("c.ply")).fused == (expected,)
+    assert read_scene(Path("c.ply")).gaussians().fused == (expected,)
 
 
 @pytest.mark.parametrize("large", [False, True])
@@ -45,7 +45,7 @@ def test_convert_fuses_a_stored_filter_without_cameras(cli, monkeypatch, large):
     write_scene(Path("unfused.ply"), scene)
     code, _, err = cli("convert unfused.ply -o c.ply")
     assert (code, "in parts" in err) == (0, large)
-    found = read_scene(Path("c.ply"))
+    found = read_scene(Path("c.ply")).gaussians()
     assert (fused(), found.filter_3d) == (["filter_3D"], None)
     expected = 0.5 * (scene.scales.square() + 0.01**2).log()
     torch.testing.assert_close(found.log_scales, expected)
@@ -57,7 +57,7 @@ def test_convert_for_a_viewer_tags_its_rule_and_prints_what_is_left(cli, viewer)
     code, out, err = cli(f"{CONVERT} --for {viewer} --steps 1 --threads 1")
     assert code == 0, err
     assert [line for line in out.splitlines() if "converted" in line]
-    found, compensated = read_scene(Path("c.ply")), viewer == "gsplat"
+    found, compensated = read_scene(Path("c.ply")).gaussians(), viewer == "gsplat"
     assert (found.convention.kernel, found.convention.compensated) == (0.3, compensated)
     assert (b"SplatRenderMode: mip" in Path("c.ply").read_bytes()) == compensated
     settings = dict(found.fused[-1].settings)
@@ -84,7 +84,7 @@ def test_convert_for_a_program_says_what_to_choose_there(cli, viewer, convention
     code, _, err = cli(f"{CONVERT} --for {viewer} --steps 0 --threads 1")
     assert code == 0, err
     assert advice in " ".join(err.split())
-    assert read_scene(Path("c.ply")).convention == convention
+    assert read_scene(Path("c.ply")).gaussians().convention == convention
 
 
 def test_convert_for_a_viewer_prints_the_residual_as_json(cli):
@@ -110,7 +110,7 @@ def test_convert_starts_from_the_original_where_the_closed_form_is_worse(cli, mo
     monkeypatch.setattr("aaplug.finetuning.fitting.fuse_for", dim)
     code, _, err = cli(f"{CONVERT} --for mip --steps 1")
     assert (code, "starting from the original" in err) == (0, True)
-    original, found = (read_scene(Path(name)).logit_opacities for name in ("scene.ply", "c.ply"))
+    original, found = (read_scene(Path(name)).gaussians().logit_opacities for name in ("scene.ply", "c.ply"))
     assert (found - original).abs().max() < 1
 
 
@@ -132,7 +132,7 @@ def test_convert_refuses_options_that_do_not_fit(cli, options, words):
 
 
 def test_what_was_tuned_converts_and_what_was_converted_does_not_again(cli):
-    tuned = replace(read_scene(Path("scene.ply")), fused=(Fusion("finetune"),))
+    tuned = replace(read_scene(Path("scene.ply")).gaussians(), fused=(Fusion("finetune"),))
     write_scene(Path("tuned.ply"), tuned)
     assert cli("convert tuned.ply --cameras . -o c.ply")[0] == 0
     assert fused() == ["finetune", "matched-energy"]

@@ -24,7 +24,7 @@ def test_it_writes_results_and_prints_a_table(cli):  # noqa: F811
     about = results["_aaplug"]
     assert about["truth"] == "photographs"
     assert about["scene"]["sha256"] == hashlib.sha256(Path("scene.ply").read_bytes()).hexdigest()
-    assert about["scene"]["gaussians_sha256"] == digest_of_scene(read_scene("scene.ply"))
+    assert about["scene"]["gaussians_sha256"] == digest_of_scene(read_scene("scene.ply").gaussians())
     assert {"aaplug", "torch"} <= set(about["versions"])
     assert list(json.loads(Path("out/per_view.json").read_text())["classic@0.5"]["SSIM"]) == ["r_0"]
 

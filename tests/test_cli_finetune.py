@@ -42,7 +42,7 @@ def test_finetune_without_steps_changes_no_byte(cli):
 
 
 def test_finetune_writes_scene_report_and_pictures(whole):
-    found = read_scene(whole / "tuned.ply")
+    found = read_scene(whole / "tuned.ply").gaussians()
     assert found.convention == MIP
     assert [fusion.method for fusion in found.fused] == ["matched-energy", "finetune"]
     settings = {"steps": "3", "for": "mip", "method": "consistency"}

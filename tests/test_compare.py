@@ -74,7 +74,7 @@ def test_a_scene_equals_itself_at_every_scale(cli):  # noqa: F811
 
 
 def test_what_a_change_costs_is_measured_and_guarded(cli):  # noqa: F811
-    scene = read_scene("scene.ply")
+    scene = read_scene("scene.ply").gaussians()
     write_scene("dim.ply", replace(scene, logit_opacities=scene.logit_opacities - 0.3))
     write_scene("grey.splat", scene)
     code, out, err = cli(f"compare scene.ply dim.ply grey.splat {WORDS} --json --fail-under 60dB")
@@ -101,7 +101,7 @@ def test_what_a_change_costs_is_measured_and_guarded(cli):  # noqa: F811
 
 
 def test_the_truth_is_the_reference_at_that_size(cli):  # noqa: F811
-    scene, cameras = read_scene("scene.ply"), read_cameras(".")
+    scene, cameras = read_scene("scene.ply").gaussians(), read_cameras(".")
     dim = replace(scene, logit_opacities=scene.logit_opacities - 0.3)
     found = aaplug.compare({"a": scene, "b": dim}, cameras, scale=(0.5,), metric="psnr", rasterizer="eager")
     a, b = (
@@ -192,7 +192,7 @@ def test_scenes_in_one_frame_are_not_taken_for_turned(lopsided):
 
 
 def test_other_frames_are_refused_by_name(cli):  # noqa: F811
-    write_scene("turned.ply", half_turn_about_x(read_scene("scene.ply")))
+    write_scene("turned.ply", half_turn_about_x(read_scene("scene.ply").gaussians()))
     code, out, err = cli(f"compare scene.ply turned.ply {WORDS}")
     named = "turned.ply: is scene.ply turned by 180 degrees about x"
     assert (code, out) == (2, "")
@@ -205,7 +205,7 @@ def test_other_frames_are_refused_by_name(cli):  # noqa: F811
 @pytest.mark.parametrize("axes", ["opengl", "opencv"])
 def test_a_spz_is_read_in_the_frame_of_the_other(cli, axes):  # noqa: F811
     pytest.importorskip("gsply")
-    scene = read_scene("scene.ply")
+    scene = read_scene("scene.ply").gaussians()
     write_scene("c.spz", scene, spz_axes=axes)
     for words in ("scene.ply c.spz", "c.spz scene.ply"):
         code, _, err = cli(f"compare {words} {WORDS} --metric psnr")
@@ -213,8 +213,8 @@ def test_a_spz_is_read_in_the_frame_of_the_other(cli, axes):  # noqa: F811
 
 
 def test_harmonics_that_are_gone_are_said(cli):  # noqa: F811
-    write_scene("grey.splat", read_scene("scene.ply"))
-    degree = read_scene("scene.ply").sh_degree
+    write_scene("grey.splat", read_scene("scene.ply").gaussians())
+    degree = read_scene("scene.ply").gaussians().sh_degree
     _, _, err = cli(f"compare scene.ply grey.splat {WORDS} --metric psnr")
     assert f"grey.splat: has SH degree 0, scene.ply {degree}: what one lacks counts as a difference from 0" in err
 
@@ -236,7 +236,7 @@ REFUSED = {
 
 @pytest.mark.parametrize("words", REFUSED)
 def test_bad_input_is_one_line(cli, words):  # noqa: F811
-    write_scene("other.ply", read_scene("scene.ply"))
+    write_scene("other.ply", read_scene("scene.ply").gaussians())
     Path("broken.ply").write_bytes(Path("scene.ply").read_bytes()[:-100])
     code, out, err = cli(f"{words} --cameras . --rasterizer eager --scale 0.5")
     assert (code, out) == (2, "")
@@ -259,7 +259,7 @@ def test_the_library_refuses_the_same():
 
 def test_files_and_a_continued_run(cli, monkeypatch):  # noqa: F811
     write_scene(
-        "dim.ply", replace(read_scene("scene.ply"), logit_opacities=read_scene("scene.ply").logit_opacities - 1)
+        "dim.ply", replace(read_scene("scene.ply").gaussians(), logit_opacities=read_scene("scene.ply").gaussians().logit_opacities - 1)
     )
     words = f"compare scene.ply dim.ply {WORDS} -o out --show 1"
     real, added = Journal.add, []
@@ -299,7 +299,7 @@ def test_an_error_map_runs_from_black_to_the_end_of_the_scale():
 
 
 def test_views_measured_in_processes_are_the_same(cli, monkeypatch):  # noqa: F811
-    scene, cameras = read_scene("scene.ply"), read_cameras(".")
+    scene, cameras = read_scene("scene.ply").gaussians(), read_cameras(".")
     given = {"a": scene, "b": replace(scene, convention=MIP)}
     how = {"scale": (0.5,), "rasterizer": "eager", "threads": 2, "views": "train", "metric": "psnr"}
     expected = aaplug.compare(given, cameras, **how).report

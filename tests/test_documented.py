@@ -112,7 +112,7 @@ def few(scene: Gaussians) -> Gaussians:
 def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder that holds every file that the documents name."""
     folder = tmp_path_factory.mktemp("documented")
-    scene = replace(few(read_scene(SAMPLE / "chair.ply")), origin=None)
+    scene = replace(few(read_scene(SAMPLE / "chair.ply").gaussians()), origin=None)
     for name in ("scene.ply", "a.ply", "b.ply", "chair.ply", "toy/point_cloud.ply"):
         (folder / name).parent.mkdir(exist_ok=True)
         write_scene(folder / name, scene)

@@ -42,7 +42,7 @@ def wide_scene() -> Gaussians:
 @pytest.mark.parametrize("form", FORMS)
 def test_parts_are_converted_as_the_whole_is(tmp_path: Path, wide_scene, cameras, form: str):
     path = saved(tmp_path, wide_scene)
-    scene = read_scene(path)
+    scene = read_scene(path).gaussians()
     training = TrainingViews.of(scene, cameras)
     assert 0 < training.bounds.seen.sum() < len(scene)
     write_scene(tmp_path / "whole.ply", fuse(scene, training, FORMS[form]))
@@ -51,7 +51,7 @@ def test_parts_are_converted_as_the_whole_is(tmp_path: Path, wide_scene, cameras
     write_parts(tmp_path / "parts.ply", parts, opened.count)
     heads = [(tmp_path / n).read_bytes().split(b"end_header")[0] for n in ("parts.ply", "whole.ply")]
     assert heads[0] == heads[1]
-    together, whole = (read_scene(tmp_path / name) for name in ("parts.ply", "whole.ply"))
+    together, whole = (read_scene(tmp_path / name).gaussians() for name in ("parts.ply", "whole.ply"))
     for field in ("means", "log_scales", "logit_opacities", "sh"):  # products of matrices round by their size
         torch.testing.assert_close(getattr(together, field), getattr(whole, field), rtol=1e-5, atol=1e-6)
     assert told[-1] == (150, 150)
@@ -59,7 +59,7 @@ def test_parts_are_converted_as_the_whole_is(tmp_path: Path, wide_scene, cameras
 
 def test_a_stored_filter_is_fused_in_parts_without_cameras(tmp_path: Path):
     path = saved(tmp_path, replace(make_scene(100), filter_3d=torch.rand(100) * 0.1))
-    whole = fuse(read_scene(path), None, FORMS["mip-splatting"])
+    whole = fuse(read_scene(path).gaussians(), None, FORMS["mip-splatting"])
     parts = list(convert_parts(read_scene(path), (), FORMS["mip-splatting"], size=SIZE))
     for field in ("log_scales", "logit_opacities"):
         together = torch.cat([getattr(part, field) for part in parts])
@@ -102,7 +102,7 @@ def test_strangers_are_noticed_on_a_sample(tmp_path: Path, cameras):
 
 def test_a_survey_finds_what_the_whole_shows(tmp_path: Path, wide_scene, cameras):
     opened = read_scene(saved(tmp_path, wide_scene))
-    found, scene = survey(opened, cameras), read_scene(opened.path)
+    found, scene = survey(opened, cameras), read_scene(opened.path).gaussians()
     bounds = TrainingViews.of(scene, cameras).bounds
     middle = scene.scales.median(dim=1).values
     under = middle[bounds.seen] < NYQUIST_VARIANCE**0.5 / bounds.highest[bounds.seen]

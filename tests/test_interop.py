@@ -38,7 +38,7 @@ def test_splat_transform_reads_a_converted_scene(form, sample_scene, sample_trai
     write_scene(tmp_path / "converted.ply", fuse(sample_scene, sample_training, FORMS[form]))
     words = [SPLAT_TRANSFORM, "-w", str(tmp_path / "converted.ply"), str(tmp_path / "theirs.ply")]
     subprocess.run(words, check=True, capture_output=True, timeout=120)
-    ours, theirs = (read_scene(tmp_path / name) for name in ("converted.ply", "theirs.ply"))
+    ours, theirs = (read_scene(tmp_path / name).gaussians() for name in ("converted.ply", "theirs.ply"))
     assert len(theirs) == len(ours)
     order = [scene.means[:, 0].argsort(stable=True) for scene in (ours, theirs)]  # it may sort
     for field in ("log_scales", "logit_opacities"):
@@ -53,7 +53,7 @@ def test_what_splat_transform_packs_is_read_as_it_unpacks_it(suffix, tmp_path):
     for source, target in ((ORACLE, packed), (packed, unpacked)):
         words = [SPLAT_TRANSFORM, "-q", "-w", "-g", "cpu", str(source), str(target)]
         subprocess.run(words, check=True, capture_output=True, timeout=120)
-    ours, theirs = read_scene(packed, spz_axes="opencv"), read_scene(unpacked)
+    ours, theirs = read_scene(packed, spz_axes="opencv").gaussians(), read_scene(unpacked).gaussians()
     for field in ("means", "log_scales", "logit_opacities", "sh"):
         torch.testing.assert_close(getattr(ours, field), getattr(theirs, field), rtol=0, atol=1e-5)
     assert (ours.unit_quats * theirs.unit_quats).sum(dim=1).abs().min() > 0.9999
@@ -67,7 +67,7 @@ def test_what_splat_transform_packs_is_read_as_it_unpacks_it(suffix, tmp_path):
 def test_what_survives_splat_transform_is_whether_training_compensated(suffix, convention, tmp_path):
     """Its one bit is read as the Mip rule, for which `convert` makes scenes; another kernel is lost, which is said."""
     source, packed, unpacked = (tmp_path / name for name in ("source.ply", f"packed{suffix}", "unpacked.ply"))
-    write_scene(source, replace(read_scene(ORACLE), convention=convention))
+    write_scene(source, replace(read_scene(ORACLE).gaussians(), convention=convention))
     for a, b in ((source, packed), (packed, unpacked)):
         words = [SPLAT_TRANSFORM, "-q", "-w", "-g", "cpu", str(a), str(b)]
         subprocess.run(words, check=True, capture_output=True, timeout=120)
@@ -81,11 +81,11 @@ def test_what_survives_splat_transform_is_whether_training_compensated(suffix, c
 @pytest.mark.parametrize("convention", [CLASSIC, ANTIALIASED])
 def test_splat_transform_reads_our_spz(convention, tmp_path):
     pytest.importorskip("gsply")
-    ours, path = replace(read_scene(ORACLE), convention=convention), tmp_path / "ours.spz"
+    ours, path = replace(read_scene(ORACLE).gaussians(), convention=convention), tmp_path / "ours.spz"
     write_scene(path, ours, spz_axes="opencv")
     words = [SPLAT_TRANSFORM, "-q", "-w", str(path), str(tmp_path / "theirs.ply")]
     subprocess.run(words, check=True, capture_output=True, timeout=120)
-    theirs, again = read_scene(tmp_path / "theirs.ply"), read_scene(path, spz_axes="opencv")
+    theirs, again = read_scene(tmp_path / "theirs.ply").gaussians(), read_scene(path, spz_axes="opencv").gaussians()
     torch.testing.assert_close(theirs.means, ours.means, rtol=0, atol=2e-6)
     torch.testing.assert_close(theirs.log_scales, ours.log_scales, rtol=0, atol=1 / 32 + 1e-5)
     for field in ("means", "log_scales", "logit_opacities", "sh"):

@@ -126,7 +126,7 @@ def test_values_that_no_one_meant_are_told(tmp_path, change, caplog):
     column = getattr(scene, change).clone()
     column[3] = 30.0 if change == "log_scales" else 1e28
     write_scene(tmp_path / "odd.ply", replace(scene, **{change: column}))
-    read_scene(tmp_path / "odd.ply")
+    read_scene(tmp_path / "odd.ply").gaussians()
     assert "1 of 40 Gaussians have a " in caplog.text
 
 

@@ -86,12 +86,12 @@ def test_the_file_keeps_the_columns(cli):
     assert code == 0, err
     assert "pixel sizes of Multi-Scale 3DGS, for the recipe multi-scale" in read_scene("together.ply").notes
     (found,) = aaplug.lod("scene.ply", ".", levels=2, multi_scale=True)
-    read, made = read_scene("together.ply").pixel_sizes, found.scene.pixel_sizes
+    read, made = read_scene("together.ply").gaussians().pixel_sizes, found.scene.pixel_sizes
     assert read is not None
     assert made is not None
     for name in ("smallest", "largest", "base"):
         assert torch.equal(getattr(read, name), getattr(made, name)), name
-    assert len(found.scene) > len(read_scene("scene.ply"))
+    assert len(found.scene) > len(read_scene("scene.ply").gaussians())
     assert cli("render together.ply --cameras . -o images --recipe multi-scale --scale 0.25")[0] == 0
 
 

@@ -67,7 +67,7 @@ def test_images_are_the_renderers_also_from_a_checkpoint(method, scene_file, tmp
     assert (made.get_info()["loaded_step"], loaded.get_info()["loaded_step"]) == (None, 0)
     assert len(loaded.cameras) == 3
     views = [make_camera(eye) for eye in EYES]
-    renderer = Renderer.of(read_scene(scene_file), views, recipe, background=WHITE)
+    renderer = Renderer.of(read_scene(scene_file).gaussians(), views, recipe, background=WHITE)
     for view in (views[1], replace(views[1].scaled(0.5), trained_focal=None)):
         expected = renderer(view)
         for each in (made, loaded):

@@ -60,7 +60,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
 def finished(installed: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder in which one process with the plug-in has run the guide's commands, `evaluate --help` and the laws."""
     folder = tmp_path_factory.mktemp("theirs")
-    write_scene(folder / "scene.ply", few(read_scene(SAMPLE / "chair.ply")))
+    write_scene(folder / "scene.ply", few(read_scene(SAMPLE / "chair.ply").gaussians()))
     write_cameras(folder / "path" / "to" / "colmap")
     views = [("left", -1, 0), ("right", 1, 0), ("held", 0, 1)]
     lines = (LOOK.format(name=name, x=x, held_out=held) for name, x, held in views)

@@ -362,7 +362,7 @@ def test_levels_for_a_viewer_are_files_by_its_rule_and_no_pyramid(cli):
     assert code == 0, err
     assert all(b"fused=finetune steps=2 for=spark" in file.read_bytes() for file in Path("levels").iterdir())
     assert sorted(file.name for file in Path("levels").iterdir()) == ["scene_lod0.ply", "scene_lod1.ply"]
-    assert [read_scene(file).convention for file in Path("levels").iterdir()] == [ANTIALIASED] * 2
+    assert [read_scene(file).gaussians().convention for file in Path("levels").iterdir()] == [ANTIALIASED] * 2
     for more, said in (("--resume", "levels for aaplug"), ("--no-refine", "is what the result is tuned for")):
         code, _, err = cli(f"{words} --for spark {more}")
         assert code == 2

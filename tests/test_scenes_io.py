@@ -160,7 +160,7 @@ def same_values(a: Gaussians, b: Gaussians) -> bool:
 
 @pytest.mark.parametrize("file", ROUND_TRIPS.values(), ids=ROUND_TRIPS.keys())
 def test_an_unchanged_scene_is_written_back_to_the_byte(tmp_path: Path, file: File):
-    assert through(read_scene(file.save(tmp_path)), tmp_path) == file.content
+    assert through(read_scene(file.save(tmp_path)).gaussians(), tmp_path) == file.content
 
 
 @given(st.integers(0, 3), st.integers(0, 20), st.sampled_from([*CONVENTIONS.values()]), st.data())
@@ -175,7 +175,7 @@ def test_what_was_written_is_read(tmp_path_factory, degree, n, convention, data)
     filter_3d = torch.rand(n) if data.draw(st.booleans()) else None
     scene = replace(scene, convention=convention, fused=fused, filter_3d=filter_3d)
     content = through(scene, folder)
-    again = read_scene(folder / "out.ply")
+    again = read_scene(folder / "out.ply").gaussians()
     assert same_values(again, scene)
     assert (again.convention, again.fused) == (convention, fused)
     assert (again.filter_3d is None) == (filter_3d is None)
@@ -186,7 +186,7 @@ def test_what_was_written_is_read(tmp_path_factory, degree, n, convention, data)
 
 def test_columns_go_where_inria_puts_them(tmp_path: Path):
     file = plain(degree=2)
-    scene, rows = read_scene(file.save(tmp_path)), values(file.content, file)
+    scene, rows = read_scene(file.save(tmp_path)).gaussians(), values(file.content, file)
     sh = {"f_dc_2": (0, 2), "f_rest_0": (1, 0), "f_rest_7": (8, 0), "f_rest_8": (1, 1), "f_rest_18": (3, 2)}
     columns = {"z": scene.means[:, 2], "rot_0": scene.quats[:, 0], "scale_1": scene.log_scales[:, 1]}
     columns |= {"opacity": scene.logit_opacities} | {name: scene.sh[:, k, c] for name, (k, c) in sh.items()}
@@ -204,7 +204,7 @@ def test_a_scene_without_origin_has_inrias_columns(tmp_path: Path):
 
 def test_only_changed_columns_differ(tmp_path: Path):
     file = File(columns=shuffled)
-    scene = read_scene(file.save(tmp_path))
+    scene = read_scene(file.save(tmp_path)).gaussians()
     scene = replace(scene, log_scales=scene.log_scales + torch.tensor([0.0, 1.0, 0.0]))
     content = through(scene, tmp_path)
     assert content.startswith(file.header)
@@ -215,22 +215,22 @@ def test_only_changed_columns_differ(tmp_path: Path):
 @pytest.mark.parametrize("index", [[], [4, 4, 0]])
 def test_chosen_rows_keep_their_unknown_columns(tmp_path: Path, index: list[int]):
     file = File(columns=shuffled, after=(box, bytes(range(10))))
-    scene = read_scene(file.save(tmp_path))[torch.tensor(index, dtype=torch.int64)]
+    scene = read_scene(file.save(tmp_path)).gaussians()[torch.tensor(index, dtype=torch.int64)]
     expected = replace(file, count=str(len(index))).header + file.rows[index].tobytes()
     assert through(scene, tmp_path) == expected + file.after[1]
 
 
 def test_fewer_harmonics_drop_their_columns(tmp_path: Path):
-    scene = read_scene(plain(degree=2).save(tmp_path))
+    scene = read_scene(plain(degree=2).save(tmp_path)).gaussians()
     content = through(replace(scene, sh=scene.sh[:, :4]), tmp_path)
     assert content.count(b"property float f_rest_") == 9
-    assert torch.equal(read_scene(tmp_path / "out.ply").sh, scene.sh[:, :4])
+    assert torch.equal(read_scene(tmp_path / "out.ply").gaussians().sh, scene.sh[:, :4])
 
 
 def test_large_scenes_are_copied_in_whole(tmp_path: Path):
     scene = random_scene(70_000, 0)
     write_scene(tmp_path / "large.ply", scene)
-    assert same_values(read_scene(tmp_path / "large.ply"), scene)
+    assert same_values(read_scene(tmp_path / "large.ply").gaussians(), scene)
 
 
 @pytest.mark.data
@@ -244,7 +244,7 @@ def test_large_scenes_are_copied_in_whole(tmp_path: Path):
 )
 def test_real_scenes_are_written_back_to_the_byte(tmp_path: Path, shared_data: Path, name, n, degree):
     path = next(p for p in (shared_data / name, shared_data / "formats" / name) if p.exists())
-    scene = read_scene(path)
+    scene = read_scene(path).gaussians()
     assert (len(scene), scene.sh_degree, scene.convention) == (n, degree, CLASSIC)
     assert through(scene, tmp_path) == path.read_bytes()
 
@@ -273,12 +273,12 @@ def test_real_scenes_are_written_back_to_the_byte(tmp_path: Path, shared_data: P
     ],
 )
 def test_the_strongest_evidence_decides_and_is_kept_and_the_user_knows_best(tmp_path, file, convention, evidence):
-    scene = read_scene(file.save(tmp_path))
+    scene = read_scene(file.save(tmp_path)).gaussians()
     assert scene.origin
     assert scene.convention == convention
     assert evidence in scene.origin.evidence
     assert through(scene, tmp_path) == file.content
-    stated = read_scene(tmp_path / "in.ply", convention=ANTIALIASED)
+    stated = read_scene(tmp_path / "in.ply", convention=ANTIALIASED).gaussians()
     assert stated.origin
     assert (stated.convention, stated.origin.evidence) == (ANTIALIASED, "stated by the user")
 
@@ -294,12 +294,12 @@ def test_pixel_sizes_are_read_and_kept(tmp_path: Path):
     part = values(through(scene[torch.tensor([3, 1])], tmp_path), file)
     assert part["base_mask"].tolist() == stored["base_mask"][[3, 1]].tolist()
     lacking = replace(file, columns=file.columns[:-1])
-    assert set(read_scene(lacking.save(tmp_path)).extras) == {*EXTRAS} - {"base_mask"}
+    assert set(read_scene(lacking.save(tmp_path)).gaussians().extras) == {*EXTRAS} - {"base_mask"}
 
 
 def test_the_filter_column_is_read_dropped_and_written(tmp_path: Path):
     file = filtered()
-    scene = read_scene(file.save(tmp_path))
+    scene = read_scene(file.save(tmp_path)).gaussians()
     assert scene.filter_3d is not None
     assert scene.filter_3d.tolist() == values(file.content, file)["filter_3D"].tolist()
     content = through(replace(scene, filter_3d=scene.filter_3d + 1), tmp_path)
@@ -324,19 +324,19 @@ def test_the_filter_column_is_read_dropped_and_written(tmp_path: Path):
     ],
 )
 def test_tags_follow_the_convention(tmp_path, before, convention: Convention, after):
-    scene = read_scene(plain(*before).save(tmp_path))
+    scene = read_scene(plain(*before).save(tmp_path)).gaussians()
     content = through(replace(scene, convention=convention), tmp_path)
     assert comments(content) == (before if after is None else after)
-    assert read_scene(tmp_path / "out.ply").convention == convention
+    assert read_scene(tmp_path / "out.ply").gaussians().convention == convention
 
 
 def test_a_fusion_is_recorded_and_read_back(tmp_path: Path):
-    scene = read_scene(plain("hello", "SplatRenderMode: default").save(tmp_path))
+    scene = read_scene(plain("hello", "SplatRenderMode: default").save(tmp_path)).gaussians()
     fusion = Fusion("mip", {"kernel": "0.1", "compensated": "1"})
     content = through(replace(scene, fused=(fusion,)), tmp_path)
     record = "aaplug fused=mip kernel=0.1 compensated=1 convention=classic"
     assert comments(content) == ["hello", "SplatRenderMode: default", record]
-    again = read_scene(tmp_path / "out.ply")
+    again = read_scene(tmp_path / "out.ply").gaussians()
     assert again.fused == (fusion,)
     (tmp_path / "twice").mkdir()
     again = replace(again, fused=(fusion, Fusion("b")), convention=MIP)
@@ -370,7 +370,7 @@ def coded(folder: Path, file: File, order: str) -> Path:
 )  # fmt: skip
 def test_every_coding_gives_the_same_scene(tmp_path: Path, file: File, order: str):
     path = coded(tmp_path, file, order)
-    scene, twin = read_scene(path), read_scene(file.save(tmp_path))
+    scene, twin = read_scene(path).gaussians(), read_scene(file.save(tmp_path)).gaussians()
     assert same_values(scene, twin)
     written = through(scene, tmp_path).split(b"end_header\n", 1)[1]
     assert written == through(twin, tmp_path).split(b"end_header\n", 1)[1]
@@ -381,7 +381,7 @@ def test_every_coding_gives_the_same_scene(tmp_path: Path, file: File, order: st
 @pytest.mark.parametrize("column", ["f_rest_3", "scale_1"])
 def test_double_columns_are_read_as_float_and_kept_where_unchanged(tmp_path: Path, column: str):
     file = with_type("double", column)
-    scene = read_scene(file.save(tmp_path))
+    scene = read_scene(file.save(tmp_path)).gaussians()
     assert through(scene, tmp_path) == file.content
     moved = through(replace(scene, means=scene.means + 1, sh=scene.sh + 1), tmp_path)
     old, new = values(file.content, file), values(moved, file)
@@ -392,19 +392,19 @@ def test_double_columns_are_read_as_float_and_kept_where_unchanged(tmp_path: Pat
 
 def test_colours_in_bytes_become_harmonics_of_degree_0(tmp_path: Path):
     file = coloured()
-    scene = read_scene(file.save(tmp_path))
+    scene = read_scene(file.save(tmp_path)).gaussians()
     rows = values(file.content, file)
     expected = np.stack([rows[c] for c in ("red", "green", "blue")], 1) / 255
     shown = 0.5 + 0.28209479177387814 * scene.sh[:, 0]  # 3DGS's colour of degree 0
     np.testing.assert_allclose(shown.numpy(), expected, atol=1e-6)
     content = through(scene, tmp_path)
     assert b"property uchar red" in content
-    assert torch.equal(read_scene(tmp_path / "out.ply").sh, scene.sh)
+    assert torch.equal(read_scene(tmp_path / "out.ply").gaussians().sh, scene.sh)
 
 
 @pytest.mark.parametrize("file", [without("scale_2"), plain("SplatRenderMode: 2DGS")], ids=["two scales", "tag"])
 def test_2d_gaussians_are_discs(tmp_path: Path, file: File):
-    scene = read_scene(file.save(tmp_path))
+    scene = read_scene(file.save(tmp_path)).gaussians()
     assert (scene.flat, scene.convention) == (True, CLASSIC)
     assert (scene.log_scales[:, 2] == -MAX_LOG_SCALE).all()
     assert "2D Gaussians" in read_scene(tmp_path / "in.ply").evidence
@@ -413,19 +413,19 @@ def test_2d_gaussians_are_discs(tmp_path: Path, file: File):
         file.header.count(b"scale_2")
     )
     assert b"scale_2" not in through(replace(random_scene(3, 0), flat=True), tmp_path), "without an origin"
-    assert read_scene(tmp_path / "out.ply").flat
+    assert read_scene(tmp_path / "out.ply").gaussians().flat
 
 
 def test_comments_of_any_alphabet_are_kept(tmp_path: Path):
     for text in ("\x85 \xa0", "日本"):
-        scene = read_scene(plain(text).save(tmp_path))
+        scene = read_scene(plain(text).save(tmp_path)).gaussians()
         assert through(scene, tmp_path) == plain(text).content
         assert text.encode() in through(replace(scene, convention=MIP), tmp_path)
 
 
 def test_empty_lines_in_a_header_are_left_out(tmp_path: Path):
     file = File(top=[*File().top, "", "comment x"])
-    scene = read_scene(file.save(tmp_path))
+    scene = read_scene(file.save(tmp_path)).gaussians()
     assert through(scene, tmp_path) == File(top=[*File().top, "comment x"]).content
 
 
@@ -449,7 +449,7 @@ def test_a_nerfstudio_export_is_what_its_config_says_or_asks(tmp_path: Path, con
     path = plain(*NERFSTUDIO).save(tmp_path)
     if config is not None:
         (tmp_path / "config.yml").write_text(config)
-    opened = read_scene(path)
+    opened = read_scene(path).gaussians()
     assert opened.convention == convention
     assert evidence in opened.evidence
     assert any("state `convention`" in note for note in opened.notes) == ("may be" in evidence)
@@ -484,8 +484,8 @@ def test_every_kind_of_ply_keeps_the_convention(tmp_path: Path, kind: str):
         "disc": without("scale_2"),
     }.get(kind, plain("hello"))
     path = coded(tmp_path, file, kind) if kind in (">", "text") else file.save(tmp_path)
-    through(replace(read_scene(path), convention=ANTIALIASED), tmp_path)
-    again = read_scene(tmp_path / "out.ply")
+    through(replace(read_scene(path).gaussians(), convention=ANTIALIASED), tmp_path)
+    again = read_scene(tmp_path / "out.ply").gaussians()
     assert again.convention == ANTIALIASED
     write_scene(tmp_path / "twice.ply", again)
     assert (tmp_path / "twice.ply").read_bytes() == (tmp_path / "out.ply").read_bytes()
@@ -516,7 +516,7 @@ def test_parts_with_rows_left_out_say_their_number(tmp_path: Path, caplog):
     assert content.endswith(b"end_header\n" + np.delete(rows, [3, 9]).tobytes())
     path = damaged(tmp_path, file, **{c: (r, np.nan) for c, r in zip("xyz", range(3), strict=True)})
     write_parts(tmp_path / "fewer.ply", read_scene(path).parts(drop_bad=True, size=3), 12)
-    assert len(read_scene(tmp_path / "fewer.ply")) == 9
+    assert len(read_scene(tmp_path / "fewer.ply").gaussians()) == 9
     assert len(PlyData.read(str(tmp_path / "fewer.ply"))["vertex"].data) == 9
 
 
@@ -563,7 +563,7 @@ def test_bad_headers_are_one_quick_line(tmp_path: Path, file: File, problem: str
     path = file.save(tmp_path)
     start = time.perf_counter()
     with pytest.raises(FormatError, match=problem) as caught:
-        read_scene(path)
+        read_scene(path).gaussians()
     assert time.perf_counter() - start < QUICK
     assert "\n" not in str(caught.value)
     assert str(caught.value).startswith(str(path))
@@ -576,7 +576,7 @@ def test_a_list_among_the_gaussians_and_a_file_without_any_are_named(tmp_path: P
     for content, problem in ((listed, "vertex property x is a list"), (empty, "no element 'vertex'")):
         path.write_bytes(content)
         with pytest.raises(FormatError, match=problem):
-            read_scene(path)
+            read_scene(path).gaussians()
 
 
 @pytest.mark.parametrize(("kept", "whole"), [(0, 0), (91, 0), (459, 4)])
@@ -585,7 +585,7 @@ def test_a_cut_body_says_how_much_is_whole(tmp_path: Path, kept: int, whole: int
     path.write_bytes(file.header + file.before[1] + file.rows.tobytes()[:kept])
     sizes = f"{len(file.content)} bytes and it has {len(file.header) + 10 + kept}"
     with pytest.raises(FormatError) as caught:
-        read_scene(path)
+        read_scene(path).gaussians()
     assert sizes in str(caught.value).replace(",", "")
     assert f"{whole} of 5 Gaussians are whole" in str(caught.value)
 
@@ -593,20 +593,20 @@ def test_a_cut_body_says_how_much_is_whole(tmp_path: Path, kept: int, whole: int
 def test_more_gaussians_than_allowed_are_refused(tmp_path: Path, monkeypatch):
     path = File().save(tmp_path)
     monkeypatch.setenv("AAPLUG_GAUSSIANS", "5")
-    assert len(read_scene(path)) == 5
+    assert len(read_scene(path).gaussians()) == 5
     monkeypatch.setenv("AAPLUG_GAUSSIANS", "4")
     with pytest.raises(FormatError, match="holds 5 Gaussians and the limit is 4; AAPLUG_GAUSSIANS"):
-        read_scene(path)
+        read_scene(path).gaussians()
     monkeypatch.setenv("AAPLUG_GAUSSIANS", "many")
     with pytest.raises(UsageError, match="AAPLUG_GAUSSIANS: should be a number above 0"):
-        read_scene(path)
+        read_scene(path).gaussians()
 
 
 def test_a_scene_larger_than_memory_is_refused_whole_and_read_in_parts(tmp_path, monkeypatch):
     path = File().save(tmp_path)
     monkeypatch.setenv("AAPLUG_MEMORY_SHARE", "1e-9")
     with pytest.raises(FormatError, match="info and convert read it in parts"):
-        read_scene(path)
+        read_scene(path).gaussians()
     assert [len(part) for part in read_scene(path).parts(size=2)] == [2, 2, 1]
 
 
@@ -627,7 +627,7 @@ def damaged(folder: Path, file: File, **cells: tuple[int | list[int], float]) ->
 def test_a_bad_number_is_found_in_every_kind_of_column(tmp_path: Path, column: str, value: float):
     path = damaged(tmp_path, filtered(), **{column: (3, value)})
     if (column, value) in {("scale_2", -np.inf), ("opacity", np.inf)}:  # no thickness; opaque
-        scene = read_scene(path)
+        scene = read_scene(path).gaussians()
         assert scene.scales.isfinite().all()
         assert scene.opacities.max() <= 1
         assert through(scene, tmp_path) == path.read_bytes()
@@ -635,12 +635,12 @@ def test_a_bad_number_is_found_in_every_kind_of_column(tmp_path: Path, column: s
     what = "NaN" if np.isnan(value) else "Inf"
     problem = f"in.ply: row 3 has {what} in {column}[;,].*pass `drop_bad`"
     with pytest.raises(FormatError, match=problem):
-        read_scene(path)
-    origin = read_scene(path, drop_bad=True).origin
+        read_scene(path).gaussians()
+    origin = read_scene(path, drop_bad=True).gaussians().origin
     assert origin is not None
     assert origin.rows.tolist() == [0, 1, 2, 4]
     path = damaged(tmp_path, filtered(), nx=(3, value))
-    assert through(read_scene(path), tmp_path) == path.read_bytes(), "a column that aaplug does not use"
+    assert through(read_scene(path).gaussians(), tmp_path) == path.read_bytes(), "a column that aaplug does not use"
 
 
 @pytest.mark.parametrize(("length", "problem"), [(1e-20, "length zero"), (3e38, "too long")])
@@ -648,8 +648,8 @@ def test_a_quaternion_without_direction_is_refused(tmp_path: Path, length: float
     cells = {f"rot_{i}": (1, length) for i in range(4)}
     path = damaged(tmp_path, File(), **cells)
     with pytest.raises(FormatError, match=f"row 1 has a quaternion.*{problem}"):
-        read_scene(path)
-    assert len(read_scene(path, drop_bad=True)) == 4
+        read_scene(path).gaussians()
+    assert len(read_scene(path, drop_bad=True).gaussians()) == 4
 
 
 def test_dropped_rows_are_counted_aloud_and_stay_dropped(tmp_path: Path, caplog: pytest.LogCaptureFixture):
@@ -657,9 +657,9 @@ def test_dropped_rows_are_counted_aloud_and_stay_dropped(tmp_path: Path, caplog:
     path = damaged(tmp_path, file, x=([1, 2], np.nan), opacity=(2, np.nan))
     rows = values(path.read_bytes(), file)
     with pytest.raises(FormatError, match=r"row 1 \(and 1 more\) has NaN in x, row 2 has NaN in op"):
-        read_scene(path)
+        read_scene(path).gaussians()
     with caplog.at_level(logging.WARNING, logger="aaplug"):
-        scene = read_scene(path, drop_bad=True)
+        scene = read_scene(path, drop_bad=True).gaussians()
     assert "left out 2 of 5 Gaussians (NaN in x: 2, NaN in opacity: 1)" in caplog.text
     expected = replace(file, count="3").header + rows[[0, 3, 4]].tobytes()
     assert through(scene, tmp_path) == expected
@@ -682,14 +682,14 @@ def test_what_is_no_scene_file_is_refused(tmp_path: Path, name: str, problem: st
     (tmp_path / "empty.ply").touch()
     (tmp_path / "junk.ply").write_bytes(b"junk")
     with pytest.raises(FormatError, match=problem):
-        read_scene(tmp_path / name)
-    assert len(read_scene(File().save(tmp_path).rename(tmp_path / "scene.dat"))) == 5, "told by content"
+        read_scene(tmp_path / name).gaussians()
+    assert len(read_scene(File().save(tmp_path).rename(tmp_path / "scene.dat")).gaussians()) == 5, "told by content"
 
 
 def test_a_scene_is_never_written_over_its_own_file(tmp_path: Path):
     path = File().save(tmp_path)
     (tmp_path / "link.ply").symlink_to(path)
-    scene = read_scene(path)
+    scene = read_scene(path).gaussians()
     for output in (path, tmp_path / "link.ply"):
         with pytest.raises(OutputError, match="is also the input"):
             write_scene(output, scene, overwrite=True)
@@ -723,16 +723,16 @@ def test_a_model_folder_means_its_last_iteration(tmp_path: Path):
     assert find_scene(model).parent.name == "iteration_30000"
     assert find_scene(model, 7000).parent.name == "iteration_7000"
     assert called(find_scene(model)) == model.name
-    assert len(read_scene(str(model))) == open_scene(str(model), iteration=7000).count == 5
+    assert len(read_scene(str(model)).gaussians()) == open_scene(str(model), iteration=7000).gaussians().count == 5
     with pytest.raises(FormatError, match="no iteration 5; it has 7000, 30000"):
         find_scene(model, 5)
 
 
 def test_paths_are_text_too_and_a_folder_is_a_scene(tmp_path: Path):
     model = str(inria_model(tmp_path / "model", "7000", "30000"))
-    assert len(read_scene(model)) == read_scene(model, iteration=7000).count == 5
+    assert len(read_scene(model).gaussians()) == read_scene(model, iteration=7000).count == 5
     assert find_scene(model, 7000).parent.name == "iteration_7000"
-    scene = aaplug.read_scene(str(File().save(tmp_path)))
+    scene = aaplug.read_scene(str(File().save(tmp_path))).gaussians()
     write_scene(str(tmp_path / "text.ply"), scene)
     write_parts(str(tmp_path / "parts.ply"), [scene], 5, [str(tmp_path / "in.ply")])
     assert (tmp_path / "text.ply").read_bytes() == (tmp_path / "parts.ply").read_bytes()

@@ -16,7 +16,7 @@ import aaplug
 from pathlib import Path
 sample = Path(aaplug.__file__).parent / "io" / "sample"
 assert sample.is_relative_to({folder!r}), sample
-print(len(aaplug.read_scene(sample / "chair.ply")), len(aaplug.read_cameras(sample).test))
+print(len(aaplug.read_scene(sample / "chair.ply").gaussians()), len(aaplug.read_cameras(sample).test))
 """
 
 

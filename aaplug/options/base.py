@@ -8,13 +8,15 @@ from dataclasses import dataclass, fields
 from functools import cache
 from itertools import pairwise
 from numbers import Integral, Real
-from typing import Annotated, Any, Self, cast, get_type_hints
+from typing import Annotated, Any, TypeVar, cast, get_type_hints
 
 import tyro
 
 from aaplug.system.errors import MAX_VALUE_CHARACTERS, UsageError, did_you_mean, not_one_of
 from aaplug.system.monitor import SILENT, Monitor
 from aaplug.system.registry import names_of
+
+Chosen = TypeVar("Chosen", bound="Options")
 
 
 @dataclass(frozen=True)
@@ -139,7 +141,7 @@ class Options:
                 raise UsageError(name, f"takes {takes}, got {got[:MAX_VALUE_CHARACTERS] or 'nothing'}")
 
     @classmethod
-    def of(cls, given: Mapping[str, Any]) -> Self:
+    def of(cls: type[Chosen], given: Mapping[str, Any]) -> Chosen:
         """The options that a caller gave, checked by name, and the defaults."""
         names = [field.name for field in fields(cls)]
         for name in given.keys() - names:

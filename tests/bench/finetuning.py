@@ -19,7 +19,7 @@ from aaplug.rendering.renderer import own_look
 def main(steps: int = 9) -> None:
     """Time a number of steps at every scale."""
     with as_file(files("aaplug.io.sample")) as sample:
-        scene, cameras = read_scene(sample / "chair.ply"), read_cameras(sample)
+        scene, cameras = read_scene(sample / "chair.ply").gaussians(), read_cameras(sample)
     look = own_look(scene, TrainingViews.of(scene, cameras), background="white")
     print(f"rasterizer: {look.rasterizer.name}")
     views = cameras.train[:1]  # its truth is made in the first step, which is not counted

@@ -59,7 +59,7 @@ def split(scene: Gaussians, cameras: CameraSet, parts: int = PARTS, seed: int = 
 def trained(name: str) -> Opened:
     """A trained scene, its cameras, and how it was trained."""
     path = SHARED_DATA / SCENES[name].file
-    return read_scene(path), read_cameras(path.parent, train_scale=SCENES[name].scale), SCENES[name]
+    return read_scene(path).gaussians(), read_cameras(path.parent, train_scale=SCENES[name].scale), SCENES[name]
 
 
 def finely(name: str) -> Opened:

@@ -56,7 +56,7 @@ def torn(folder: Path) -> list[str]:
             continue
         try:
             if path.suffix == ".ply":
-                read_scene(path)
+                read_scene(path).gaussians()
             elif path.suffix == ".png":
                 read_image(path)
         except Exception as error:
