@@ -259,7 +259,10 @@ def test_the_library_refuses_the_same():
 
 def test_files_and_a_continued_run(cli, monkeypatch):  # noqa: F811
     write_scene(
-        "dim.ply", replace(read_scene("scene.ply").gaussians(), logit_opacities=read_scene("scene.ply").gaussians().logit_opacities - 1)
+        "dim.ply",
+        replace(
+            read_scene("scene.ply").gaussians(), logit_opacities=read_scene("scene.ply").gaussians().logit_opacities - 1
+        ),
     )
     words = f"compare scene.ply dim.ply {WORDS} -o out --show 1"
     real, added = Journal.add, []

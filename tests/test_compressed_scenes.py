@@ -14,17 +14,7 @@ import torch
 from aaplug.core.conventions import ANTIALIASED, CLASSIC, MIP
 from aaplug.core.gaussians import MAX_LOG_SCALE, Gaussians
 from aaplug.core.spherical_harmonics import sh_colour
-from aaplug.io.scenes import (
-    HEAD_BYTES,
-    OWN,
-    SCENE_FORMATS,
-    WritableFormat,
-    called,
-    find_scene,
-    ply,
-    read_scene,
-    write_scene,
-)
+from aaplug.io.scenes import HEAD_BYTES, OWN, SCENE_FORMATS, WritableFormat, find_scene, ply, read_scene, write_scene
 from aaplug.io.scenes.options import Options
 from aaplug.io.scenes.packed import half_turn_about_x
 from aaplug.io.scenes.scene_file import SceneFile
@@ -102,7 +92,7 @@ def test_each_format_is_recognized_and_read_in_parts_and_written_as_ply(tmp_path
     assert [format.name for format in OWN if format.sniff(path, head)] == [kind]
     opened = read_scene(path, allow_checkpoint=True)
     assert opened.format == kind
-    whole, parts = opened.whole(), list(opened.parts(size=16))
+    whole, parts = opened.gaussians(), list(opened.parts(size=16))
     assert [len(part) for part in parts] == [16, 16, 8]
     write_scene(tmp_path / "out.ply", whole)
     again = read_scene(tmp_path / "out.ply")
@@ -210,7 +200,7 @@ def test_spz_is_written_in_the_axes_asked_for(tmp_path: Path, expected):
     torch.testing.assert_close(same.means, expected.means, rtol=0, atol=2e-6)
     turned = read_scene(tmp_path / "a.spz")
     assert torch.equal(turned.means, same.means * torch.tensor([1.0, -1.0, -1.0]))
-    assert "axes as stored" in open_scene(tmp_path / "a.spz", spz_axes="opencv").notes[1]
+    assert "axes as stored" in read_scene(tmp_path / "a.spz", spz_axes="opencv").notes[1]
 
 
 def test_spz_holds_the_ends_of_its_ranges(tmp_path: Path, expected):
@@ -255,8 +245,8 @@ def test_spz_without_its_writer_names_the_extra(tmp_path: Path, expected, monkey
 
 def test_a_sog_folder_is_a_scene(expected):
     assert find_scene(DATA / "oracle_sog").name == "meta.json"
-    assert called(find_scene(DATA / "oracle_sog")) == "oracle_sog"
-    assert called(DATA / "a.ply") == "a.ply"
+    assert read_scene(DATA / "oracle_sog").title == "oracle_sog"
+    assert read_scene(DATA / "a.ply").title == "a.ply"
     assert read_scene(find_scene(DATA / "oracle_sog")).count == len(expected)
 
 

@@ -278,7 +278,7 @@ def test_a_level_may_have_no_gaussians(tmp_path, sample_cameras):
     """What is too faint to be drawn at a size is in no level from there on."""
     faint = replace(make_scene(3), log_scales=torch.full((3, 3), -7.0), logit_opacities=torch.full((3,), -4.0))
     levels = aaplug.lod(faint, sample_cameras, tmp_path / "levels", levels=4, refine=False)
-    pyramid = aaplug.read_pyramid(tmp_path / "levels")
+    pyramid = aaplug.read_scene(tmp_path / "levels")
     assert pyramid.sizes == tuple(len(level.scene) for level in levels)
     assert (pyramid.sizes[0], pyramid.sizes[-1]) == (3, 0)
     renderer = aaplug.Renderer.of(pyramid, sample_cameras, quality="fast")

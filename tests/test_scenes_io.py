@@ -18,7 +18,7 @@ from plyfile import PlyData
 import aaplug
 from aaplug.core.conventions import ANTIALIASED, CLASSIC, CONVENTIONS, MIP, Convention
 from aaplug.core.gaussians import MAX_LOG_SCALE, Fusion, Gaussians
-from aaplug.io.scenes import called, find_scene, read_scene, write_parts, write_scene
+from aaplug.io.scenes import find_scene, read_scene, write_parts, write_scene
 from aaplug.io.values import HEAD_LIMIT
 from aaplug.system.errors import FormatError, OutputError, UsageError
 
@@ -288,7 +288,7 @@ def test_pixel_sizes_are_read_and_kept(tmp_path: Path):
     file = plain(columns=[*File().columns, *sizes])
     opened = read_scene(file.save(tmp_path))
     assert "pixel sizes of Multi-Scale 3DGS, for the recipe multi-scale" in opened.notes
-    scene, stored = opened.whole(), values(file.content, file)
+    scene, stored = opened.gaussians(), values(file.content, file)
     assert {name: column.tolist() for name, column in scene.extras.items()} == {n: stored[n].tolist() for n in EXTRAS}
     assert through(scene, tmp_path) == file.content
     part = values(through(scene[torch.tensor([3, 1])], tmp_path), file)
@@ -449,14 +449,14 @@ def test_a_nerfstudio_export_is_what_its_config_says_or_asks(tmp_path: Path, con
     path = plain(*NERFSTUDIO).save(tmp_path)
     if config is not None:
         (tmp_path / "config.yml").write_text(config)
-    opened = read_scene(path).gaussians()
+    opened = read_scene(path)
     assert opened.convention == convention
     assert evidence in opened.evidence
     assert any("state `convention`" in note for note in opened.notes) == ("may be" in evidence)
     for comment in ("SplatRenderMode: default", "aaplug convention=classic"):  # a tag is stronger
-        assert open_scene(plain(*NERFSTUDIO, comment).save(tmp_path)).convention == CLASSIC
+        assert read_scene(plain(*NERFSTUDIO, comment).save(tmp_path)).convention == CLASSIC
     (tmp_path / "elsewhere").mkdir()
-    write_scene(tmp_path / "elsewhere" / "out.ply", opened.whole())
+    write_scene(tmp_path / "elsewhere" / "out.ply", opened.gaussians())
     assert read_scene(tmp_path / "elsewhere" / "out.ply").convention == convention
 
 
@@ -499,7 +499,7 @@ def test_parts_make_the_whole(tmp_path: Path, file: File):
     opened = read_scene(file.save(tmp_path))
     parts = list(opened.parts(size=2))
     assert [len(part) for part in parts] == [2, 2, 1]
-    assert same_values(parts[1], opened.whole()[2:4])
+    assert same_values(parts[1], opened.gaussians()[2:4])
     write_parts(tmp_path / "out.ply", iter(parts), 5)
     assert (tmp_path / "out.ply").read_bytes() == file.content
 
@@ -509,13 +509,13 @@ def test_parts_with_rows_left_out_say_their_number(tmp_path: Path, caplog):
     path = damaged(tmp_path, file, x=(3, np.nan), y=(9, np.inf))
     rows = values(path.read_bytes(), file)
     with caplog.at_level(logging.WARNING, logger="aaplug"):
-        write_parts(tmp_path / "out.ply", read_scene(path).parts(drop_bad=True, size=3), 12)
+        write_parts(tmp_path / "out.ply", read_scene(path, drop_bad=True).parts(size=3), 12)
     assert "left out 2 of 12 Gaussians (NaN in x: 1, Inf in y: 1)" in caplog.text
     content = (tmp_path / "out.ply").read_bytes()
     assert b"element vertex 10\n" in content
     assert content.endswith(b"end_header\n" + np.delete(rows, [3, 9]).tobytes())
     path = damaged(tmp_path, file, **{c: (r, np.nan) for c, r in zip("xyz", range(3), strict=True)})
-    write_parts(tmp_path / "fewer.ply", read_scene(path).parts(drop_bad=True, size=3), 12)
+    write_parts(tmp_path / "fewer.ply", read_scene(path, drop_bad=True).parts(size=3), 12)
     assert len(read_scene(tmp_path / "fewer.ply").gaussians()) == 9
     assert len(PlyData.read(str(tmp_path / "fewer.ply"))["vertex"].data) == 9
 
@@ -525,7 +525,7 @@ def test_a_file_that_changes_while_it_is_read_is_noticed(tmp_path: Path):
     opened = read_scene(path)
     path.write_bytes(File().content[:-92] + bytes(91))
     with pytest.raises(FormatError, match="changed while"):
-        opened.whole()
+        opened.gaussians()
 
 
 # Damaged files
@@ -722,8 +722,8 @@ def test_a_model_folder_means_its_last_iteration(tmp_path: Path):
     model = inria_model(tmp_path, "7000", "30000", "best")
     assert find_scene(model).parent.name == "iteration_30000"
     assert find_scene(model, 7000).parent.name == "iteration_7000"
-    assert called(find_scene(model)) == model.name
-    assert len(read_scene(str(model)).gaussians()) == open_scene(str(model), iteration=7000).gaussians().count == 5
+    assert read_scene(model).title == model.name
+    assert len(read_scene(str(model)).gaussians()) == read_scene(str(model), iteration=7000).count == 5
     with pytest.raises(FormatError, match="no iteration 5; it has 7000, 30000"):
         find_scene(model, 5)
 
