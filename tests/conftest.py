@@ -139,10 +139,13 @@ def make_scene(n: int, seed: int = 0, dtype: torch.dtype = torch.float32, degree
     ).to(dtype)
 
 
-def sized(scene: Gaussians) -> Gaussians:
-    """The scene with the pixel sizes of Multi-Scale 3DGS; in most views some Gaussians are too small or too large."""
+def sized(scene: Gaussians, always: bool = False) -> Gaussians:
+    """The scene with the pixel sizes of Multi-Scale 3DGS; in most views some Gaussians are too small or too large.
+
+    always: every Gaussian is drawn at every size.
+    """
     n = len(scene)
-    base = torch.arange(n) % 4 == 0
+    base = (torch.arange(n) % 4 == 0) | always
     sizes = PixelSizes(torch.full((n,), 4.0), torch.full((n,), 8.0), base)
     return replace(scene, extras=sizes.extras)
 

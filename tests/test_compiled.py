@@ -164,7 +164,7 @@ def test_compiled_gradients_are_the_eager_ones_in_parts_and_at_once(built, at_on
         return torch.autograd.grad(image.square().sum(), [*leaves.values(), pose])
 
     expected = gradients(EAGER)
-    monkeypatch.setattr(packages, "ROWS", at_once)
+    monkeypatch.setattr(packages, "MAX_GRADIENT_ROWS", at_once)
     monkeypatch.setattr(shading, "SPLATS_PER_CALL", at_once)
     for fast, slow in zip(gradients(built), expected, strict=True):
         assert slow.abs().max() > 0
@@ -230,7 +230,7 @@ def other_polynomial(x: torch.Tensor, coefficients: tuple[float, ...]) -> torch.
         (point.Point, "exact", lambda *_: None, set()),
         (projection, "JACOBIAN_MARGIN", 0.5, set()),  # nothing that is traced names it
         (projection, "MAX_SIGMA", 1e8, {"project", "project-backward"}),
-        (shading, "COMPILED", (4,), set()),
+        (shading, "COMPILED_COEFFICIENTS", (4,), set()),
         (forward, "EXAMPLE_TILES", 8, {"composite-point", "composite-point-backward"}),
     ],
 )

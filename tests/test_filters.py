@@ -176,7 +176,7 @@ def test_multi_scale_draws_gaussians_at_the_sizes_of_training(size, smallest, la
     variance = (size / CUTOFF) ** 2
     splats = row_of_splats([(variance, 0.0, variance)] * 2)
     always = PixelSizes(torch.ones(2) * smallest, torch.ones(2) * largest, torch.tensor([base, True]))
-    chosen = ByPixelSize()(splats, replace(make_scene(2), pixel_sizes=always))
+    chosen = ByPixelSize()(splats, replace(make_scene(2), extras=always.extras))
     assert chosen.sources.tolist() == [0, 1][not drawn :]
 
 
@@ -192,7 +192,7 @@ def test_multi_scale_selects_by_the_size_in_the_view_before_dilation():
     camera = make_camera(size=(200, 200))
     sizes = pixel_size(project(scene, camera))
     level = PixelSizes(sizes / 2, torch.tensor([99.0, 0.25 * sizes[1]]), torch.tensor([False, False]))
-    scene = replace(scene, pixel_sizes=level)
+    scene = replace(scene, extras=level.extras)
     drawn = {scale: ByPixelSize()(project(scene, camera.scaled(scale)), scene).sources.tolist() for scale in (1.0, 0.1)}
     assert drawn == {1.0: [0], 0.1: [1]}
     training = TrainingViews.of(scene, [camera])
@@ -216,8 +216,26 @@ def test_a_scene_without_pixel_sizes_is_refused():
 
 def test_pixel_sizes_follow_their_gaussians():
     scene = sized(make_scene(8)).to(F64)
-    assert scene.pixel_sizes is not None
-    part = scene[torch.tensor([4, 1])].pixel_sizes
+    part = PixelSizes.of(scene[torch.tensor([4, 1])])
     assert part is not None
     assert part.base.tolist() == [True, False]
     assert len(part.largest) == 2
+
+
+@pytest.mark.parametrize(("name", "factor"), [("2dgs", 1.0), ("2dgs-matched", 0.5)])
+def test_the_low_pass_filter_follows_the_rate_where_it_is_matched(name, factor):
+    """A disc of no size looks like its filter: √½ px wide, or √½ / 2 px at half the size."""
+    scene = replace(
+        make_scene(1, dtype=F64),
+        means=torch.zeros(1, 3, dtype=F64),
+        quats=torch.tensor([[0.7, 0.7, 0.0, 0.0]], dtype=F64),
+        log_scales=torch.tensor([[-12.0, -12.0, -30.0]], dtype=F64),
+        logit_opacities=torch.tensor([4.0], dtype=F64),
+        flat=True,
+    )
+    camera = make_camera((0.0, -4.0, 0.0), size=(16, 16))
+    recipe = replace(RECIPES[name], target_rate=0.0)
+    alpha = Renderer.of(scene, [camera], recipe, rasterizer="eager")(camera.scaled(0.5)).alpha
+    squared = 2 * 0.5 / factor**2  # the nearest pixel centres are half a px away in x and y
+    expected = scene.opacities.item() * math.exp(-squared / 2)
+    assert alpha.max().item() == pytest.approx(expected, rel=1e-3)

@@ -9,7 +9,15 @@ from torch import Tensor
 
 from aaplug.core.rules import RULES_3DGS, Rules
 from aaplug.core.splats import Splats2D
-from aaplug.lab.gaussian_blending import LEAST_VARIANCE, PLAIN, GaussianBlending, Light, behind, light_of, moments
+from aaplug.lab.gaussian_blending import (
+    MAX_POINT_SPAN,
+    MIN_WINDOW_VARIANCE,
+    GaussianBlending,
+    Light,
+    behind,
+    light_of,
+    moments,
+)
 from aaplug.lab.integral import INTEGRAL
 from aaplug.methods.pixel_kernels.point import POINT
 from aaplug.rasterizers import RASTERIZERS
@@ -73,11 +81,11 @@ def test_the_window_has_the_moments_of_the_light_that_is_left(cov):
 
 def test_a_window_is_no_narrower_than_its_least_variance():
     light, _ = after(((0.0, 0.0), (0.25, 0.0, 0.25), 1.0, 0.5, WHITE), window=0.08)
-    assert light.width.item() == pytest.approx((12 * LEAST_VARIANCE) ** 0.5)
+    assert light.width.item() == pytest.approx((12 * MIN_WINDOW_VARIANCE) ** 0.5)
 
 
 def test_a_window_that_spans_little_of_a_splat_is_a_point_and_stays():
-    sigma = 1 / (0.99 * PLAIN)
+    sigma = 1 / (0.99 * MAX_POINT_SPAN)
     light, _ = after(((3.0, 0.0), (sigma**2, 0.0, 0.01), 1.0, 0.5, WHITE))
     assert light.share.item() == pytest.approx(1 - 0.5 * math.exp(-0.5 * (3 / sigma) ** 2))
     assert [x.item() for x in light[1:5]] == [0, 0, 1, 1]

@@ -1,24 +1,20 @@
 """All levels in one scene: what Multi-Scale 3DGS' own rule draws of them, and the file that holds them."""
 
-# ruff: noqa: F811 (fixtures come from another file)
-
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
 
-import aaplug
 from aaplug.core.conventions import MIP
 from aaplug.core.gaussians import Gaussians
 from aaplug.evaluation.metrics import psnr
-from aaplug.io.scenes import read_scene
+from aaplug.io.scenes import read_scene, write_scene
 from aaplug.lab.multi_scale import in_one_scene, pixel_sizes
+from aaplug.lab.pixel_size import PixelSizes
 from aaplug.rendering.renderer import Renderer
-from aaplug.system.errors import OutputError, UsageError
+from aaplug.system.errors import UsageError
 from tests.conftest import make_camera, make_scene
-from tests.test_cli import cli, dataset  # noqa: F401 (fixtures)
 
 LEVELS = 4
 
@@ -35,8 +31,8 @@ def test_its_rule_draws_fewer_gaussians_that_look_more_like_the_scene(together, 
     classic = Renderer.of(sample_scene, sample_cameras, "classic")
     for scale, gain in ((1 / 4, 0.5), (1 / 8, 1.0), (1 / 16, 2.0)):
         truth = ceiling(view.scaled(scale)).rgb
-        found, plain = (psnr(shown(view.scaled(scale)).rgb, truth) or 0 for shown in (by_rule, classic))
-        assert found > plain + gain, scale
+        ours, plain = (psnr(renderer(view.scaled(scale)).rgb, truth) or 0 for renderer in (by_rule, classic))
+        assert ours > plain + gain, scale
     drawn = [len(by_rule.splats(view.scaled(0.5**level))) for level in range(LEVELS + 1)]
     assert drawn == sorted(drawn, reverse=True)
     assert drawn[-1] < 0.3 * drawn[0]
@@ -69,10 +65,10 @@ def test_pixel_sizes_are_those_of_all_views():
     scene, views = make_scene(30), [make_camera((0.0, -4.0, 0.0)), make_camera((0.0, -8.0, 0.0))]
     each = [pixel_sizes(scene, [view]) for view in views]
     least, most = pixel_sizes(scene, views)
-    seen = torch.stack([most > 0 for _, most in each]).all(dim=0)
-    assert seen.any()
-    assert torch.equal(least[seen], torch.minimum(each[0][0], each[1][0])[seen])
-    assert torch.equal(most[seen], torch.maximum(each[0][1], each[1][1])[seen])
+    shared = torch.stack([most > 0 for _, most in each]).all(dim=0)
+    assert shared.any()
+    assert torch.equal(least[shared], torch.minimum(each[0][0], each[1][0])[shared])
+    assert torch.equal(most[shared], torch.maximum(each[0][1], each[1][1])[shared])
 
 
 @pytest.mark.parametrize("change", [{"convention": MIP}, {"flat": True}])
@@ -81,30 +77,12 @@ def test_a_scene_that_its_rasterizer_shows_otherwise_is_refused(change):
         in_one_scene(replace(make_scene(5), **change), [make_camera()], 1)
 
 
-def test_the_file_keeps_the_columns(cli):
-    code, _, err = cli("lod scene.ply --cameras . -o together.ply --multi-scale --levels 2")
-    assert code == 0, err
-    assert "pixel sizes of Multi-Scale 3DGS, for the recipe multi-scale" in read_scene("together.ply").notes
-    (found,) = aaplug.lod("scene.ply", ".", levels=2, multi_scale=True)
-    read, made = read_scene("together.ply").gaussians().pixel_sizes, found.scene.pixel_sizes
-    assert read is not None
-    assert made is not None
-    for name in ("smallest", "largest", "base"):
-        assert torch.equal(getattr(read, name), getattr(made, name)), name
-    assert len(found.scene) > len(read_scene("scene.ply").gaussians())
-    assert cli("render together.ply --cameras . -o images --recipe multi-scale --scale 0.25")[0] == 0
-
-
-@pytest.mark.parametrize("more", ["--simplify 0.5", "--scale 0.5", "--merge-below 1", "--for spark", "--resume"])
-def test_what_it_cannot_do_is_refused(cli, more):
-    code, _, err = cli(f"lod scene.ply --cameras . -o together.ply --multi-scale {more}")
-    assert code == 2
-    assert "cannot be combined with --multi-scale" in err
-    assert not Path("together.ply").exists()
-
-
-def test_a_format_without_its_columns_is_refused(cli):
-    code, _, err = cli("lod scene.ply --cameras . -o together.splat --multi-scale")
-    assert (code, "write a .ply" in err) == (2, True)
-    with pytest.raises(OutputError, match="columns of Multi-Scale 3DGS"):
-        aaplug.lod("scene.ply", ".", "together.splat", multi_scale=True)
+def test_the_file_keeps_the_columns(together, tmp_path):
+    write_scene(tmp_path / "together.ply", together)
+    scene = read_scene(tmp_path / "together.ply")
+    assert "pixel sizes of Multi-Scale 3DGS, for the recipe multi-scale" in scene.notes
+    before, after = PixelSizes.of(together), PixelSizes.of(scene.gaussians())
+    assert before is not None
+    assert after is not None
+    for name, column in vars(before).items():
+        assert getattr(after, name).equal(column), name

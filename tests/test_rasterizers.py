@@ -421,16 +421,3 @@ def test_splats_are_paired_with_exactly_the_tiles_that_their_ellipses_reach():
         assert listed[least <= reached, tile].all()
         surely_missed = least > reached * 1.001 + 0.01
         assert not listed[surely_missed, tile].any()
-
-
-@pytest.mark.parametrize("which", ["none at all", "none in the image", "none opaque enough"])
-def test_without_splats_the_image_is_the_background(rasterize, which):
-    splats = stack((0.5, RED))
-    splats = {
-        "none at all": splats[:0],
-        "none in the image": replace(splats, means=splats.means + 1000),
-        "none opaque enough": replace(splats, opacities=splats.opacities * 0.001),
-    }[which]
-    image = rasterize(splats, (9, 11), SKY)
-    close(image.rgb, torch.tensor(SKY, dtype=F64).expand(9, 11, 3), atol=0)
-    close(image.alpha, torch.zeros(9, 11), atol=0)

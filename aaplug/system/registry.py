@@ -15,6 +15,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
+from importlib.util import find_spec
 from typing import Any, TypeVar
 
 from aaplug.system.errors import UsageError, did_you_mean, not_one_of
@@ -116,6 +117,8 @@ class Registry(Mapping[str, T]):
             package = f" of package {point.dist.name}" if point.dist else ""
             where = f"plug-in {point.value}{package} ({group})"
             try:
+                if point.dist and point.dist.name == "aaplug" and find_spec(point.module.rpartition(".")[0]) is None:
+                    continue  # the folder for comparisons may be deleted
                 if point.name in self._built_in:
                     raise UsageError(where, f"a {self.kind} named '{point.name}' exists already")
                 try:

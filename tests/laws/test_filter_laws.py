@@ -314,18 +314,31 @@ def test_a_world_filter_treats_each_gaussian_by_itself(world):
         torch.testing.assert_close(getattr(part, name), getattr(whole, name))
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, F64])
-def test_world_scales_never_shrink_and_opacities_stay_inside_0_and_1(world, dtype):
+EXTREMES: dict[str, Callable[[Gaussians], Gaussians]] = {
+    "points": lambda scene: replace(scene, log_scales=torch.full((40, 3), -80.0)),
+    "needles": lambda scene: replace(scene, log_scales=torch.tensor([[0.0, -30.0, -30.0]] * 40)),
+    "sheets": lambda scene: replace(scene, log_scales=torch.tensor([[0.0, 0.0, -80.0]] * 40)),
+    "giants": lambda scene: replace(scene, log_scales=torch.full((40, 3), 12.0)),
+}
+
+
+@pytest.mark.parametrize("shape", ["usual", "usual, in float64", *EXTREMES])
+def test_world_scales_never_shrink_and_opacities_stay_inside_0_and_1(world, shape):
+    dtype = F64 if "float64" in shape else torch.float32
     for convention in CONVENTIONS.values():
         scene = world_scene(dtype, convention)
-        scene.logit_opacities[:2] = torch.tensor([-30.0, 100.0])
+        if shape in EXTREMES:
+            scene = EXTREMES[shape](scene)
+        else:
+            scene.logit_opacities[:2] = torch.tensor([-30.0, 100.0])
         filtered = world(scene, TrainingViews.of(scene, CAMERAS))
         assert filtered.log_scales.dtype == filtered.logit_opacities.dtype == dtype
         assert (filtered.log_scales >= scene.log_scales).all()
         assert filtered.log_scales.isfinite().all()
         assert filtered.logit_opacities.isfinite().all()
-        assert filtered.opacities.min() > 0
-        assert filtered.opacities.max() < 1
+        if shape not in EXTREMES:
+            assert filtered.opacities.min() > 0
+            assert filtered.opacities.max() < 1
 
 
 VARIED = {name: world for name, world in WORLD_FILTERS.items() if hasattr(world, "variance")}
@@ -361,13 +374,9 @@ def test_a_world_filter_records_what_it_did(world):
     twice = world(replace(once, filter_3d=scene.filter_3d), TrainingViews.of(scene, CAMERAS))
     assert twice.fused[0] == once.fused[0]
     assert len(twice.fused) == 2
-
-
-@pytest.mark.parametrize("world", VARIED.values(), ids=VARIED)
-def test_a_world_filter_records_its_variance(world):
-    scene = world_scene()
-    changed = replace(world, variance=0.125)(scene, TrainingViews.of(scene, CAMERAS))
-    assert changed.fused[0].settings["variance"] == "0.125"
+    if hasattr(world, "variance"):
+        stronger = replace(world, variance=0.125)(scene, TrainingViews.of(scene, CAMERAS))
+        assert stronger.fused[0].settings["variance"] == "0.125"
 
 
 @pytest.mark.parametrize("world", [Smoothing3D(), FlatSmoothing(), MatchedEnergy()])
@@ -401,11 +410,6 @@ def test_a_gaussian_whose_stored_filter_is_0_does_not_change_a_bit():
         moved = getattr(fused, name) != getattr(scene, name)
         assert not moved[still].any()
         assert moved[~still].any()
-
-
-def test_a_scene_without_a_stored_filter_stays_itself():
-    scene = make_scene(3)
-    assert fuse_stored(scene) is scene
 
 
 def test_a_stored_filter_is_fused_and_removed():
@@ -508,24 +512,6 @@ def test_the_gradient_of_a_world_filter_is_that_of_its_formula(world):
     assert scene.filter_3d is not None
     inputs = scene.log_scales, scene.logit_opacities - 2, scene.filter_3d
     assert torch.autograd.gradcheck(filtered, [x.clone().requires_grad_() for x in inputs])
-
-
-EXTREMES: dict[str, Callable[[Gaussians], Gaussians]] = {
-    "points": lambda scene: replace(scene, log_scales=torch.full((40, 3), -80.0)),
-    "needles": lambda scene: replace(scene, log_scales=torch.tensor([[0.0, -30.0, -30.0]] * 40)),
-    "sheets": lambda scene: replace(scene, log_scales=torch.tensor([[0.0, 0.0, -80.0]] * 40)),
-    "giants": lambda scene: replace(scene, log_scales=torch.full((40, 3), 12.0)),
-}
-
-
-@pytest.mark.parametrize("shape", EXTREMES)
-def test_world_filters_give_finite_values_for_extreme_scales(world, shape):
-    for convention in CONVENTIONS.values():
-        scene = EXTREMES[shape](world_scene(torch.float32, convention))
-        filtered = world(scene, TrainingViews.of(scene, CAMERAS))
-        assert filtered.log_scales.isfinite().all()
-        assert filtered.logit_opacities.isfinite().all()
-        assert (filtered.log_scales >= scene.log_scales).all()
 
 
 def test_screen_filters_give_finite_values_for_extreme_scales(screen, situation):
