@@ -18,11 +18,13 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.core.projection import project
 from aaplug.evaluation.metrics import psnr
 from aaplug.io.scenes import read_scene
+from aaplug.io.scenes.scene_file import Scene
 from aaplug.levels.clusters import MAX_OPACITY, clusters_of, merge_pairs, rates_of
 from aaplug.levels.covariances import area, areas, covariances, pack, quats_of, unpack
 from aaplug.levels.merging import Goal, merge, merge_in_chunks
 from aaplug.levels.pairing import MAX_COST, costs, edges_below, matching
 from aaplug.methods.conversion import MERGED, blurring
+from aaplug.rendering.assumed import cameras_around
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import FrameError, OutputError, UsageError
 from aaplug.system.executors import torch_threads
@@ -185,7 +187,7 @@ def test_a_lighter_scene_looks_like_the_scene(sample_scene, sample_cameras):
 def test_without_cameras_levels_are_for_the_orbits_views():
     scene = make_scene(101)
     (found,) = aaplug.lod(scene, simplify=0.2, refine=False)
-    (expected,) = aaplug.lod(scene, aaplug.Orbit().around(scene), simplify=0.2, refine=False)
+    (expected,) = aaplug.lod(scene, cameras_around(Scene.in_memory(scene), aaplug.Orbit()), simplify=0.2, refine=False)
     assert torch.equal(found.scene.means, expected.scene.means)
     (coarser,) = aaplug.lod(scene, aaplug.Orbit(train_view="160x106"), simplify=0.2, refine=False)
     assert not torch.equal(found.scene.means, coarser.scene.means)
@@ -278,7 +280,7 @@ def test_a_level_may_have_no_gaussians(tmp_path, sample_cameras):
     """What is too faint to be drawn at a size is in no level from there on."""
     faint = replace(make_scene(3), log_scales=torch.full((3, 3), -7.0), logit_opacities=torch.full((3,), -4.0))
     levels = aaplug.lod(faint, sample_cameras, tmp_path / "levels", levels=4, refine=False)
-    pyramid = aaplug.read_scene(tmp_path / "levels")
+    pyramid = aaplug.read_scene(tmp_path / "levels").levels
     assert pyramid.sizes == tuple(len(level.scene) for level in levels)
     assert (pyramid.sizes[0], pyramid.sizes[-1]) == (3, 0)
     renderer = aaplug.Renderer.of(pyramid, sample_cameras, quality="fast")

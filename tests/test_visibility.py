@@ -10,7 +10,8 @@ import aaplug
 from aaplug.core.cameras import CameraSet
 from aaplug.core.gaussians import Gaussians, joined
 from aaplug.core.training import TrainingViews
-from aaplug.levels.merging import Goal
+from aaplug.levels.clusters import clusters_of, merge_pairs
+from aaplug.levels.merging import Goal, merge
 from aaplug.rendering.renderer import own_look
 from aaplug.rendering.visibility import visibility
 from aaplug.system.executors import torch_threads

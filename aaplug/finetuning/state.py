@@ -48,6 +48,9 @@ class TuningJob:
     upsampler: str = ""
     densify: Callable[..., None] | None = None
 
+    def __post_init__(self) -> None:
+        assert self.densify or not self.settings.densify_every
+
     @cached_property
     def facts(self) -> dict[str, str]:
         """Everything that a run depends on, as text that can be compared; files are read once."""

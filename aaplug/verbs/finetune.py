@@ -77,7 +77,8 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
         AaplugError: as `render`; also, the checkpoint is of another run, or no gradient is finite.
         KeyboardInterrupt: Ctrl-C stopped the run; its checkpoint is written.
     """
-    settings, viewer, path = _settings(options), _viewer(options), None if output is None else Path(output)
+    method, viewer = METHODS.find(options.method, "method"), _viewer(options)
+    settings, path = settings_of(method, options), None if output is None else Path(output)
     job = Job.of(scene, cameras, options)
     check = partial(_check, path, job.scene.files, options)
     check()
@@ -91,7 +92,7 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
         before = replace(look, scene=viewer.shown(look.scene), recipe=RECIPES[viewer.recipe])
         start = replace(before, scene=fuse_for(raw, look.training, viewer))
         truth = Truth(look, truth_source, enlarge=enlarge, memory=MEMORY)
-        tuning = TuningJob(start, train, truth, settings, upsampler)
+        tuning = TuningJob(start, train, truth, settings, upsampler, method.densify)
         steps = f"{settings.name}, {settings.steps} steps, truth: {truth_source}"
         job.monitor.say(f"tuning for {start.recipe.name} ({start.recipe.source}): {steps}")
         cost = _cost(start, train, settings)
@@ -120,11 +121,6 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
 def _beside(scene: Path, kind: str) -> Path:
     """A file beside the scene, by its suffix; .pt is the checkpoint."""
     return scene.with_suffix(f".finetune.{kind}")
-
-
-def _settings(options: FinetuneOptions) -> Settings:
-    names = ("scale", "steps", "loss", "anchor", "move", "learning_rate", "densify_every", "seed")
-    return settings_of(METHODS.find(options.method, "method"), **{name: getattr(options, name) for name in names})
 
 
 def _check(path: Path | None, inputs: Sequence[Path], options: FinetuneOptions) -> None:
