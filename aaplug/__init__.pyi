@@ -25,6 +25,7 @@ from .rendering.renderer import Renderer as Renderer
 from .options.shared import Orbit as Orbit
 from .verbs.batch import batch as batch
 from .verbs.bench import bench as bench
+from .verbs.check_plugin import check_plugin as check_plugin
 from .verbs.compare import compare as compare
 from .verbs.convert import convert as convert
 from .verbs.demo import demo as demo

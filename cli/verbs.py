@@ -403,6 +403,22 @@ def warmup(words: Words) -> int:
     return 0
 
 
+@verb(
+    Option("module", Annotated[str, tyro.conf.Positional, flag("MODULE")], "The package, or one of its modules."),
+    json_of("a list of objects, laws and problems"),
+)
+def check_plugin(words: Words) -> int:
+    """Check what a package adds: filters, kernels, rasterizers, recipes, metrics and formats by their laws."""
+    verdicts = aaplug.check_plugin(words.module, monitor=TERMINAL)
+    if words.json:
+        print_json([verdict._asdict() for verdict in verdicts])
+    else:
+        for each in verdicts:
+            outcome = f"FAILED: {each.problem}" if each.problem else "passed"
+            out.print(escape(printable(f"{each.kind} {each.name}: {each.law} {outcome}")), soft_wrap=True)
+    return FAILED if any(each.problem for each in verdicts) else 0
+
+
 @verb(*SCENE_AND_CAMERAS, verbs.BenchOptions, json_of('one JSON object: the figures, or {"runs": [...]} of several'))
 def bench(words: Words) -> int:
     """Time the rasterizer on synthetic scenes, or on SCENE with --cameras (its first training view)."""

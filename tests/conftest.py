@@ -21,6 +21,9 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.core.interfaces import Rasterizer
 from aaplug.core.splats import Splats2D
 from aaplug.core.training import TrainingViews
+from aaplug.evaluation.laws.base import make_camera as make_camera
+from aaplug.evaluation.laws.base import make_scene as make_scene
+from aaplug.evaluation.laws.base import make_splats as make_splats
 from aaplug.io.cameras import read_cameras
 from aaplug.io.scenes import read_scene
 from aaplug.lab.pixel_size import PixelSizes
@@ -104,19 +107,6 @@ def memory_taken(prepare: str, work: str) -> int:
     return int(run.stdout)
 
 
-def make_camera(
-    eye: tuple[float, float, float] = (0.0, -4.0, 0.0),
-    size: tuple[int, int] = (64, 48),
-    fov: float = 0.7,
-    name: str = "view",
-) -> Camera:
-    """A pose of the data set that looks at the origin; size is width and height in px."""
-    focal = 0.5 * size[0] / math.tan(fov / 2)
-    pose = look_at(torch.tensor(eye), torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
-    centre = size[0] / 2, size[1] / 2
-    return Camera(name, *size, focal, focal, *centre, pose).as_trained()
-
-
 def straight_camera(
     focal: float = 100.0, size: tuple[int, int] = (80, 60), centre: tuple[float, float] | None = None, back: float = 0.0
 ) -> Camera:
@@ -124,19 +114,6 @@ def straight_camera(
     pose = torch.eye(4, dtype=torch.float64)
     pose[2, 3] = back
     return Camera("straight", *size, focal, focal, *(centre or (size[0] / 2, size[1] / 2)), pose)
-
-
-def make_scene(n: int, seed: int = 0, dtype: torch.dtype = torch.float32, degree: int = 1) -> Gaussians:
-    """Random Gaussians around the origin with scales near 0.1 world units."""
-    g = torch.Generator().manual_seed(seed)
-    rand = {"generator": g, "dtype": torch.float64}
-    return Gaussians(
-        means=torch.randn(n, 3, **rand) * 0.7,
-        quats=torch.randn(n, 4, **rand),
-        log_scales=torch.randn(n, 3, **rand) * 0.7 - 2.5,
-        logit_opacities=torch.randn(n, **rand) * 2,
-        sh=torch.randn(n, (degree + 1) ** 2, 3, **rand) * 0.5,
-    ).to(dtype)
 
 
 def sized(scene: Gaussians, always: bool = False) -> Gaussians:
@@ -148,26 +125,6 @@ def sized(scene: Gaussians, always: bool = False) -> Gaussians:
     base = (torch.arange(n) % 4 == 0) | always
     sizes = PixelSizes(torch.full((n,), 4.0), torch.full((n,), 8.0), base)
     return replace(scene, extras=sizes.extras)
-
-
-def make_splats(m: int, hw: tuple[int, int], seed: int = 0, log_sigmas: tuple[float, float] = (-1.0, 2.0)) -> Splats2D:
-    """Random coloured splats in and around an image; log_sigmas: range of ln standard deviations, in px."""
-    g = torch.Generator().manual_seed(seed)
-    low, high = log_sigmas
-    sigmas = torch.exp(low + (high - low) * torch.rand(m, 2, generator=g))
-    angle = torch.rand(m, generator=g) * math.pi
-    cos, sin = angle.cos(), angle.sin()
-    a = torch.stack([cos * sigmas[:, 0], -sin * sigmas[:, 1]], dim=1)
-    b = torch.stack([sin * sigmas[:, 0], cos * sigmas[:, 1]], dim=1)
-    return Splats2D(
-        means=torch.rand(m, 2, generator=g) * 1.2 * torch.tensor([hw[1], hw[0]]) - 0.1 * max(hw),
-        covs=torch.stack([(a * a).sum(1), (a * b).sum(1), (b * b).sum(1)], dim=1),
-        dets=sigmas.prod(dim=1).square(),
-        depths=torch.rand(m, generator=g) * 5 + 1,
-        opacities=torch.rand(m, generator=g),
-        sources=torch.arange(m),
-        rgb=torch.rand(m, 3, generator=g),
-    )
 
 
 def splats_of(*rows: tuple) -> Splats2D:

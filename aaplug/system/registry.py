@@ -62,6 +62,11 @@ class Registry(Mapping[str, T]):
         points = _points().select(group=group_of(self.kind))
         return list(dict.fromkeys([*self._built_in, *(point.name for point in points), *self._entries]))
 
+    @property
+    def type(self) -> Any:
+        """The type of the entries."""
+        return _at(self._type_at)
+
     def __getitem__(self, name: str) -> T:
         if name not in self._entries:
             if name not in self._built_in:
@@ -132,7 +137,7 @@ class Registry(Mapping[str, T]):
     def _add(self, name: str, value: T, where: str) -> None:
         if name in self._entries:
             raise UsageError(where, f"a {self.kind} named '{name}' exists already")
-        if isinstance(value, type) or not isinstance(value, _at(self._type_at)):
+        if isinstance(value, type) or not isinstance(value, self.type):
             noun = f"the class {value.__name__}" if isinstance(value, type) else f"a {type(value).__name__}"
             raise UsageError(where, f"is {noun}, which is not a {self.kind}; see examples/guides/contributing.md")
         name_inside = getattr(value, "name", name)
@@ -151,7 +156,7 @@ def names_of(kind: str, comparisons: bool = True) -> list[str]:
 
     comparisons: also those that aaplug adds by entry points, which are there for comparison.
     """
-    names = _at(REGISTRIES[kind]).names
+    names = registry_of(kind).names
     ours = {p.name for p in _points().select(group=group_of(kind)) if p.dist is not None and p.dist.name == "aaplug"}
     return names if comparisons else [name for name in names if name not in ours]
 
@@ -160,6 +165,11 @@ def unknown(name: str, names: Collection[str]) -> str:
     """Message for a name that is in no registry: the closest one, or the question for the package that adds it."""
     hint = did_you_mean(name, names) or "; if a package adds it, is that installed?"
     return not_one_of(name, names) + hint
+
+
+def registry_of(kind: str) -> Registry[Any]:
+    """The registry of a kind."""
+    return _at(REGISTRIES[kind])
 
 
 def group_of(kind: str) -> str:

@@ -1,0 +1,93 @@
+"""What laws are made of: their table, and scenes, cameras and splats at random to try them on."""
+
+import math
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+from aaplug.core.cameras import Camera, look_at
+from aaplug.core.gaussians import Gaussians
+from aaplug.core.splats import Splats2D
+
+F64 = torch.float64
+LAWS: dict[str, list[Callable[[Any], None]]] = {}  # by kind
+L = TypeVar("L", bound=Callable[[Any], None])
+
+
+class LawError(AssertionError):
+    """An object breaks a law of its kind."""
+
+
+def law_of(kind: str) -> Callable[[L], L]:
+    """Enter a function into the table; the first line of its docstring is the law."""
+
+    def enter(law: L) -> L:
+        LAWS.setdefault(kind, []).append(law)
+        return law
+
+    return enter
+
+
+def require(holds: object, problem: str) -> None:
+    """Raise LawError with the problem unless the condition holds."""
+    if not holds:
+        raise LawError(problem)
+
+
+def copies_of(thing: Splats2D | Gaussians) -> dict[str, Tensor]:
+    """Copies of all tensors, by name."""
+    return {name: value.clone() for name, value in vars(thing).items() if isinstance(value, Tensor)}
+
+
+def require_same(thing: Splats2D | Gaussians, before: dict[str, Tensor]) -> None:
+    """Raise LawError unless these tensors are as they were, to the bit."""
+    for name, value in before.items():
+        require(getattr(thing, name).equal(value), f"changes {name}")
+
+
+def make_camera(
+    eye: tuple[float, float, float] = (0.0, -4.0, 0.0),
+    size: tuple[int, int] = (64, 48),
+    fov: float = 0.7,
+    name: str = "view",
+) -> Camera:
+    """A pose of the data set that looks at the origin; size is width and height in px."""
+    focal = 0.5 * size[0] / math.tan(fov / 2)
+    pose = look_at(torch.tensor(eye), torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
+    centre = size[0] / 2, size[1] / 2
+    return Camera(name, *size, focal, focal, *centre, pose).as_trained()
+
+
+def make_scene(n: int, seed: int = 0, dtype: torch.dtype = torch.float32, degree: int = 1) -> Gaussians:
+    """Random Gaussians around the origin with scales near 0.1 world units."""
+    g = torch.Generator().manual_seed(seed)
+    rand = {"generator": g, "dtype": F64}
+    return Gaussians(
+        means=torch.randn(n, 3, **rand) * 0.7,
+        quats=torch.randn(n, 4, **rand),
+        log_scales=torch.randn(n, 3, **rand) * 0.7 - 2.5,
+        logit_opacities=torch.randn(n, **rand) * 2,
+        sh=torch.randn(n, (degree + 1) ** 2, 3, **rand) * 0.5,
+    ).to(dtype)
+
+
+def make_splats(m: int, hw: tuple[int, int], seed: int = 0, log_sigmas: tuple[float, float] = (-1.0, 2.0)) -> Splats2D:
+    """Random coloured splats in and around an image; log_sigmas: range of ln standard deviations, in px."""
+    g = torch.Generator().manual_seed(seed)
+    low, high = log_sigmas
+    sigmas = torch.exp(low + (high - low) * torch.rand(m, 2, generator=g))
+    angle = torch.rand(m, generator=g) * math.pi
+    cos, sin = angle.cos(), angle.sin()
+    a = torch.stack([cos * sigmas[:, 0], -sin * sigmas[:, 1]], dim=1)
+    b = torch.stack([sin * sigmas[:, 0], cos * sigmas[:, 1]], dim=1)
+    return Splats2D(
+        means=torch.rand(m, 2, generator=g) * 1.2 * torch.tensor([hw[1], hw[0]]) - 0.1 * max(hw),
+        covs=torch.stack([(a * a).sum(1), (a * b).sum(1), (b * b).sum(1)], dim=1),
+        dets=sigmas.prod(dim=1).square(),
+        depths=torch.rand(m, generator=g) * 5 + 1,
+        opacities=torch.rand(m, generator=g),
+        sources=torch.arange(m),
+        rgb=torch.rand(m, 3, generator=g),
+    )

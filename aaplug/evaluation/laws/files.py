@@ -1,0 +1,81 @@
+"""Laws of metrics, and of formats of scenes and cameras."""
+
+import math
+import tempfile
+from pathlib import Path
+
+import torch
+
+from aaplug.core.imaging import quantised
+from aaplug.evaluation.metric import Metric
+from aaplug.io.cameras import CameraFormat
+from aaplug.io.scenes import SceneFormat, WritableFormat
+from aaplug.io.scenes.options import Options
+from aaplug.system.errors import FormatError, UsageError
+
+from .base import law_of, make_scene, require
+
+COUNT = 20  # Gaussians
+HEADS = (b"", b"\0" * 64, b"\xff" * 64, b"ply\n" + b"comment " * 8, b"PK\3\4" + bytes(60), b"{" * 64)
+
+
+@law_of("metric")
+def is_ideal_for_the_truth(metric: Metric) -> None:
+    """`measure` gives `ideal` or None for the truth itself, a worse value for noise, and the same value again."""
+    if metric.measure is None:
+        return
+    truth = quantised(torch.rand(64, 64, 3, generator=torch.Generator().manual_seed(0)))
+    noise = quantised(torch.rand(64, 64, 3, generator=torch.Generator().manual_seed(1)))
+    try:
+        ideal, value, again = (metric.compare(image, truth) for image in (truth, noise, noise))
+    except UsageError:  # it needs files that are not here
+        return
+    require(value == again, f"gives {value}, then {again}")
+    close = ideal is None or math.isclose(ideal, metric.ideal, abs_tol=1e-4)
+    require(close, f"the truth has {ideal} instead of {metric.ideal}")
+    worse = value is None or ideal is None or metric.loss(value) > metric.loss(ideal)
+    require(worse, f"noise has {value}, which is no worse than {ideal}")
+
+
+@law_of("scene format")
+def tells_scenes_apart(format: SceneFormat) -> None:
+    """`sniff` never raises, and `open_scene` refuses an empty or foreign file with FormatError, if `sniff` takes it."""
+    with tempfile.TemporaryDirectory() as folder:
+        for head in HEADS:
+            path = Path(folder) / f"scene.{format.name}"
+            path.write_bytes(head)
+            if not format.sniff(path, head):
+                continue
+            try:
+                scene = format.open_scene(path, Options())
+                require(len(scene.load(0, scene.count)) == scene.count, f"{head[:8]!r}: not as many rows as it says")
+            except FormatError:
+                pass
+
+
+@law_of("scene format")
+def reads_what_it_writes(format: SceneFormat) -> None:
+    """What it writes it takes, with as many Gaussians, at their places to 1 %."""
+    if not isinstance(format, WritableFormat):
+        return
+    scene = make_scene(COUNT)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"scene.{format.name}"
+        format.write(path, [scene[:12], scene[12:]], COUNT, False, Options())
+        require(format.sniff(path, path.read_bytes()[:64]), "does not take its own file")
+        opened = format.open_scene(path, Options())
+        require(opened.count == COUNT, f"wrote {COUNT} Gaussians and reads {opened.count}")
+        torch.testing.assert_close(opened.load(0, COUNT).means.float(), scene.means, rtol=0.01, atol=0.01)
+        require(len(opened.load(5, 9)) == 4, "`load` does not return the rows from start up to stop")
+
+
+@law_of("camera format")
+def tells_cameras_apart(format: CameraFormat) -> None:
+    """`sniff` never raises: for a missing path, an empty folder, or a file of bytes."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "cameras"
+        format.sniff(path)
+        format.sniff(Path(folder))
+        for head in HEADS:
+            path.write_bytes(head)
+            format.sniff(path)

@@ -1,0 +1,81 @@
+"""Laws run on what a package adds."""
+
+import inspect
+from collections.abc import Iterator
+from importlib import import_module
+from importlib.metadata import entry_points
+from types import ModuleType
+from typing import Any, NamedTuple
+
+from aaplug.evaluation.laws import LAWS
+from aaplug.system.errors import UsageError
+from aaplug.system.monitor import SILENT, Monitor
+from aaplug.system.registry import group_of, registry_of
+
+
+class Verdict(NamedTuple):
+    """An object and a law of its kind.  problem: how the law is broken; "" if it holds."""
+
+    kind: str
+    name: str
+    law: str
+    problem: str
+
+
+def check_plugin(module: str, *, monitor: Monitor = SILENT) -> list[Verdict]:
+    """Run the laws of its kind on each object of a module, and on each that its package's entry points name.
+
+    Raises:
+        UsageError: the module cannot be imported, or there is nothing with laws in it.
+    """
+    objects = list(_objects(module))
+    if not objects:
+        raise UsageError(module, f"holds no object that has laws; these are for each {', '.join(LAWS)}")
+    tries = [(kind, name, value, law) for kind, name, value in objects for law in LAWS[kind]]
+    verdicts = []
+    with monitor.progress("checking", "laws") as tell:
+        for done, (kind, name, value, law) in enumerate(tries, 1):
+            problem = ""
+            try:
+                law(value)
+            except Exception as error:  # a plug-in can fail in any way
+                problem = " ".join(str(error).split()) or type(error).__name__
+            verdicts.append(Verdict(kind, name, (law.__doc__ or "").splitlines()[0], problem))
+            tell(done, len(tries))
+    return verdicts
+
+
+def _objects(module: str) -> Iterator[tuple[str, str, Any]]:
+    """Kind, name and value of all that has laws: what entry points of the package name, then the rest of the module."""
+    package = module.partition(".")[0]
+    names: set[tuple[str, int]] = set()
+    for kind in LAWS:
+        for point in entry_points(group=group_of(kind)):
+            if point.module.partition(".")[0] == package:
+                value = vars(_imported(point.module)).get(point.attr)
+                if value is None:
+                    raise UsageError(module, f"has no {point.value}, which an entry point names")
+                names.add((kind, id(value)))
+                yield kind, point.name, value
+    for name, value in vars(_imported(module)).items():
+        for kind in LAWS:
+            if not name.startswith("_") and _is_new(kind, value) and (kind, id(value)) not in names:
+                names.add((kind, id(value)))
+                yield kind, getattr(value, "name", name), value
+
+
+def _imported(module: str) -> ModuleType:
+    try:
+        return import_module(module)
+    except Exception as error:  # a plug-in can fail in any way
+        raise UsageError(module, f"cannot be imported: {error}") from error
+
+
+def _is_new(kind: str, value: Any) -> bool:
+    """True for an object of a kind that is not registered; callables are told apart by the names of their arguments."""
+    registry = registry_of(kind)
+    if isinstance(value, type) or not isinstance(value, registry.type) or any(v is value for v in registry.values()):
+        return False
+    call = vars(registry.type).get("__call__")
+    wanted = [] if call is None else list(inspect.signature(call).parameters)[1:]
+    return not wanted or list(inspect.signature(value).parameters)[: len(wanted)] == wanted
