@@ -8,7 +8,7 @@ from .io.scenes.scene_file import Scene as Scene
 
 # nouns
 from .core.cameras import Camera as Camera, CameraSet as CameraSet, look_at as look_at
-from .system.errors import AaplugError as AaplugError
+from .system.errors import AaplugError as AaplugError, FormatError as FormatError, UsageError as UsageError
 from .core.conventions import Convention as Convention
 from .core.gaussians import Gaussians as Gaussians
 from .system.monitor import Monitor as Monitor
@@ -46,3 +46,28 @@ from .methods import PIXEL_KERNELS as PIXEL_KERNELS
 from .methods import RECIPES as RECIPES
 from .methods.viewers import VIEWERS as VIEWERS
 from .rasterizers import RASTERIZERS as RASTERIZERS
+
+# what a plug-in implements
+from .core.interfaces import Compositor as Compositor, PixelKernel as PixelKernel, Rasterizer as Rasterizer
+from .core.interfaces import ScreenFilter as ScreenFilter, WorldFilter as WorldFilter
+from .evaluation.metric import Metric as Metric
+from .io.cameras import CameraFormat as CameraFormat
+from .io.scenes import SceneFormat as SceneFormat, WritableFormat as WritableFormat
+
+# what a plug-in works with
+from .core.colours import Colour as Colour
+from .core.convolution import smoothed_by as smoothed_by
+from .core.ellipses import grown as grown, whitening as whitening, whitening_columns as whitening_columns
+from .core.gaussians import Fusion as Fusion
+from .core.imaging import over as over
+from .core.interfaces import Pixels as Pixels
+from .core.kernels import Kernels as Kernels
+from .core.rules import RULES_3DGS as RULES_3DGS, Rules as Rules
+from .core.spherical_harmonics import COLOUR_OFFSET as COLOUR_OFFSET, SH_C0 as SH_C0
+from .core.splats import Splats2D as Splats2D
+from .io.atomic import replacing as replacing
+from .io.cameras.options import CameraFileOptions as CameraFileOptions
+from .io.scenes.options import SceneFileOptions as SceneFileOptions
+from .io.scenes.scene_file import check_count as check_count, library_errors as library_errors
+from .io.scenes.scene_file import logit_of as logit_of, sh_of_colour as sh_of_colour
+from .methods.pixel_kernels import raster_rows as raster_rows

@@ -4,7 +4,6 @@
 """
 
 import logging
-import math
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -16,7 +15,7 @@ from typing import Any
 import pytest
 import torch
 
-from aaplug.core.cameras import Camera, CameraSet, look_at
+from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.interfaces import Rasterizer
 from aaplug.core.splats import Splats2D

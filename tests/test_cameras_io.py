@@ -19,7 +19,7 @@ from aaplug.core.colours import BLACK, WHITE
 from aaplug.io.cameras import OWN, read_cameras, select_views
 from aaplug.io.cameras.camera_path import read_camera_path
 from aaplug.io.cameras.cfg_args import read_cfg_args
-from aaplug.io.cameras.options import Options
+from aaplug.io.cameras.options import CameraFileOptions
 from aaplug.system.errors import AaplugError, FormatError, UsageError
 from aaplug.system.registry import Registry, named
 from tests.conftest import make_camera
@@ -761,7 +761,7 @@ class Dialect:
     def sniff(self, path: Path) -> bool:
         return path.name == "transforms.json"
 
-    def read(self, path: Path, options: Options) -> CameraSet:
+    def read(self, path: Path, options: CameraFileOptions) -> CameraSet:
         return CameraSet((), (), notes=("by the plug-in",))
 
 
@@ -789,7 +789,7 @@ def test_a_plug_in_is_asked_before_the_own_formats(tmp_path, monkeypatch):
 )
 def test_what_a_plug_in_reads_is_checked(tmp_path, monkeypatch, change, message):
     class Careless(Dialect):
-        def read(self, path: Path, options: Options) -> CameraSet:
+        def read(self, path: Path, options: CameraFileOptions) -> CameraSet:
             cameras = (replace(make_camera(), **change),)
             return CameraSet(cameras, cameras)
 

@@ -15,7 +15,7 @@ from aaplug.core.conventions import ANTIALIASED, CLASSIC, MIP
 from aaplug.core.gaussians import MAX_LOG_SCALE, Gaussians
 from aaplug.core.spherical_harmonics import sh_colour
 from aaplug.io.scenes import HEAD_BYTES, OWN, SCENE_FORMATS, WritableFormat, find_scene, ply, read_scene, write_scene
-from aaplug.io.scenes.options import Options
+from aaplug.io.scenes.options import SceneFileOptions
 from aaplug.io.scenes.packed import half_turn_about_x
 from aaplug.io.scenes.scene_file import SceneFile
 from aaplug.system.errors import FormatError, OutputError, UsageError
@@ -144,7 +144,7 @@ class Toy:
     def sniff(self, path: Path, head: bytes) -> bool:
         return path.name.startswith("toy")
 
-    def read_scene(self, path: Path, options: Options) -> SceneFile:
+    def read_scene(self, path: Path, options: SceneFileOptions) -> SceneFile:
         return replace(ply.open_scene(path, options), format=self.name)
 
     def write(self, path, parts, count, overwrite, options) -> None:

@@ -10,7 +10,7 @@ from aaplug.core.imaging import quantised
 from aaplug.evaluation.metric import Metric
 from aaplug.io.cameras import CameraFormat
 from aaplug.io.scenes import SceneFormat, WritableFormat
-from aaplug.io.scenes.options import Options
+from aaplug.io.scenes.options import SceneFileOptions
 from aaplug.system.errors import FormatError, UsageError
 
 from .base import law_of, make_scene, require
@@ -47,7 +47,7 @@ def tells_scenes_apart(format: SceneFormat) -> None:
             if not format.sniff(path, head):
                 continue
             try:
-                scene = format.open_scene(path, Options())
+                scene = format.open_scene(path, SceneFileOptions())
                 require(len(scene.load(0, scene.count)) == scene.count, f"{head[:8]!r}: not as many rows as it says")
             except FormatError:
                 pass
@@ -61,9 +61,9 @@ def reads_what_it_writes(format: SceneFormat) -> None:
     scene = make_scene(COUNT)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"scene.{format.name}"
-        format.write(path, [scene[:12], scene[12:]], COUNT, False, Options())
+        format.write(path, [scene[:12], scene[12:]], COUNT, False, SceneFileOptions())
         require(format.sniff(path, path.read_bytes()[:64]), "does not take its own file")
-        opened = format.open_scene(path, Options())
+        opened = format.open_scene(path, SceneFileOptions())
         require(opened.count == COUNT, f"wrote {COUNT} Gaussians and reads {opened.count}")
         torch.testing.assert_close(opened.load(0, COUNT).means.float(), scene.means, rtol=0.01, atol=0.01)
         require(len(opened.load(5, 9)) == 4, "`load` does not return the rows from start up to stop")

@@ -13,7 +13,7 @@ from typing import Protocol, runtime_checkable
 
 from aaplug.core.cameras import Camera, CameraSet
 from aaplug.io.cameras import blender, camera_path, colmap, inria, inria_model, llff, multiscale, pinhole, transforms
-from aaplug.io.cameras.options import Options
+from aaplug.io.cameras.options import CameraFileOptions
 from aaplug.io.cameras.poses import pose
 from aaplug.io.values import MAX_FOCAL, Place, focal, number, numbers, pixels
 from aaplug.system.errors import FormatError, UsageError, listing
@@ -40,7 +40,7 @@ class CameraFormat(Protocol):
         """Whether a file or folder is of this format.  Never raises."""
         ...
 
-    def read(self, path: Path, options: Options) -> CameraSet:
+    def read(self, path: Path, options: CameraFileOptions) -> CameraSet:
         """The cameras at their training size, with the axes and pixel centres of `aaplug.core.cameras`.
 
         Raises:
@@ -75,7 +75,7 @@ def read_cameras(
         FormatError: there are no cameras, or a file breaks its format.
         UsageError: an option does not fit.
     """
-    options = Options(train_scale, images, test_every)
+    options = CameraFileOptions(train_scale, images, test_every)
     if not os.path.exists(path):
         raise FormatError(path, "there is no such file or folder")
     path = Path(path)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from aaplug.core.cameras import CameraSet
 from aaplug.io.cameras import transforms
-from aaplug.io.cameras.options import Options, explicit
+from aaplug.io.cameras.options import CameraFileOptions, explicit
 from aaplug.io.cameras.transforms import Source, read_source, set_of, trained
 from aaplug.system.errors import UsageError
 
@@ -21,7 +21,7 @@ def sniff(path: Path) -> bool:
     return os.path.isfile(path / TRAIN)
 
 
-def read(path: Path, options: Options) -> CameraSet:
+def read(path: Path, options: CameraFileOptions) -> CameraSet:
     """The cameras, with the split that the files give."""
     if not os.path.isfile(path / TEST):
         cameras = transforms.read(path / TRAIN, options)

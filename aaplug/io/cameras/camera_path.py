@@ -11,7 +11,7 @@ from os import PathLike
 from pathlib import Path
 
 from aaplug.core.cameras import Camera, CameraSet
-from aaplug.io.cameras.options import Options, described_sizes, file_sizes, undivided
+from aaplug.io.cameras.options import CameraFileOptions, described_sizes, file_sizes, undivided
 from aaplug.io.cameras.photos import refuse_folder
 from aaplug.io.cameras.poses import centred, inverse, pose_of_opengl
 from aaplug.io.values import Entry, entries, focal, mentions, number, object_of, pixels, read_json
@@ -38,7 +38,7 @@ def sniff(path: Path) -> bool:
     return not os.path.isdir(path) and mentions(path, [KEY, "camera_to_world"])
 
 
-def read(path: Path, options: Options) -> CameraSet:
+def read(path: Path, options: CameraFileOptions) -> CameraSet:
     """The cameras.  They are free: not poses of a dataset, so they say nothing about the sampling of training."""
     refuse_folder(options)
     cameras = read_camera_path(path).cameras

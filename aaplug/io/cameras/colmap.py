@@ -21,7 +21,7 @@ from aaplug.io.cameras.cfg_args import WIDTH_CAP
 from aaplug.io.cameras.colmap_files import KINDS, Image, Intrinsics, read_cameras, read_images
 from aaplug.io.cameras.options import (
     LLFF_HOLD,
-    Options,
+    CameraFileOptions,
     Size,
     camera_set,
     every_nth,
@@ -55,7 +55,7 @@ def sniff(path: Path) -> bool:
     return _model_folder(path) is not None
 
 
-def read(path: Path, options: Options) -> CameraSet:
+def read(path: Path, options: CameraFileOptions) -> CameraSet:
     """The cameras at the size of their photos."""
     folder = _model_folder(path) or path
     cameras_file, images_file = _files(folder)
@@ -96,7 +96,7 @@ def _files(folder: Path) -> tuple[Path, Path]:
     raise FormatError(folder, f"{needs}; found {there or 'neither'}")
 
 
-def _training_sizes(cameras: Sequence[Camera], options: Options) -> tuple[list[Size], str]:
+def _training_sizes(cameras: Sequence[Camera], options: CameraFileOptions) -> tuple[list[Size], str]:
     if options.train_scale is not None:
         return file_sizes(cameras, options)
     there = sum(camera.photo is not None for camera in cameras)

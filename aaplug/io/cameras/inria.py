@@ -18,7 +18,7 @@ from aaplug.io.cameras import cfg_args
 from aaplug.io.cameras.cfg_args import WIDTH_CAP, CfgArgs, read_cfg_args
 from aaplug.io.cameras.options import (
     LLFF_HOLD,
-    Options,
+    CameraFileOptions,
     Size,
     Split,
     camera_set,
@@ -45,7 +45,7 @@ def sniff(path: Path) -> bool:
     return path.name == FILE or mentions(path, ["img_name"])
 
 
-def read(path: Path, options: Options) -> CameraSet:
+def read(path: Path, options: CameraFileOptions) -> CameraSet:
     """The cameras at the size at which 3DGS trained."""
     folder = path if os.path.isdir(path) else path.parent
     file = folder / FILE if path == folder or path.name == cfg_args.NAME else path
@@ -72,7 +72,9 @@ def _camera(entry: Entry) -> Camera:
     return centred(entry.get("img_name", text), size, focals, cam_from_world)
 
 
-def _training_sizes(cameras: Sequence[Camera], settings: CfgArgs | None, options: Options) -> tuple[list[Size], str]:
+def _training_sizes(
+    cameras: Sequence[Camera], settings: CfgArgs | None, options: CameraFileOptions
+) -> tuple[list[Size], str]:
     """3DGS's rule, applied to the sizes of the photos that training loaded; and the reason, for a note."""
     if options.train_scale is not None:
         return file_sizes(cameras, options)
@@ -89,7 +91,7 @@ def _training_sizes(cameras: Sequence[Camera], settings: CfgArgs | None, options
     return [run.size(*size) for size in loaded], f"{why}, {rule}"
 
 
-def _split(cameras: Sequence[Camera], settings: CfgArgs | None, options: Options) -> Split:
+def _split(cameras: Sequence[Camera], settings: CfgArgs | None, options: CameraFileOptions) -> Split:
     """The split by name, or by order where the names begin again: Blender's test views r_0, ..., then training's."""
     held_out = settings is not None and settings.held_out
     counts, occurrences = Counter[str](), list[int]()

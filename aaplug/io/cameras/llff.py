@@ -13,7 +13,15 @@ import numpy as np
 import torch
 
 from aaplug.core.cameras import Camera, CameraSet
-from aaplug.io.cameras.options import LLFF_HOLD, Options, camera_set, every_nth, file_sizes, photo_sizes, trained_at
+from aaplug.io.cameras.options import (
+    LLFF_HOLD,
+    CameraFileOptions,
+    camera_set,
+    every_nth,
+    file_sizes,
+    photo_sizes,
+    trained_at,
+)
 from aaplug.io.cameras.photos import SUFFIXES, last_part, photo_folder, with_photos
 from aaplug.io.cameras.poses import centred, inverse, pose
 from aaplug.io.limits import whole_limit
@@ -32,7 +40,7 @@ def sniff(path: Path) -> bool:
     return path.name == FILE or os.path.isfile(path / FILE)
 
 
-def read(path: Path, options: Options) -> CameraSet:
+def read(path: Path, options: CameraFileOptions) -> CameraSet:
     """The cameras at the size of their photos, every 8th a test view."""
     file = path / FILE if os.path.isdir(path) else path
     rows = _rows(file)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.colours import WHITE
-from aaplug.io.cameras.options import Options, described_sizes, explicit, file_sizes, trained_at, undivided
+from aaplug.io.cameras.options import CameraFileOptions, described_sizes, explicit, file_sizes, trained_at, undivided
 from aaplug.io.cameras.photos import PhotoFolder, distinct, last_part, refuse_folder, without_suffix
 from aaplug.io.cameras.poses import centred, inverse, pose_of_opengl, rigid
 from aaplug.io.values import Entry, Place, focal, mentions, object_of, pixels, read_json, text
@@ -29,7 +29,7 @@ def sniff(path: Path) -> bool:
     return mentions(file, ["cam2world"]) and mentions(file, ["file_path"])
 
 
-def read(path: Path, options: Options) -> CameraSet:
+def read(path: Path, options: CameraFileOptions) -> CameraSet:
     """The cameras of all scales, with the split that the file gives."""
     refuse_folder(options)
     if options.test_every is not None:

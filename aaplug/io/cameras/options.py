@@ -20,7 +20,7 @@ Size = tuple[int, int]
 
 
 @dataclass(frozen=True)
-class Options:
+class CameraFileOptions:
     """The user's choices; None means what the files say, or else the format's custom.
 
     train_scale: training size over the size in the files.
@@ -60,7 +60,7 @@ def undivided(cameras: Sequence[Camera], source: str) -> Split:
     return Split(views, views, f"split: none, all {len(views)} cameras are train and test ({source})")
 
 
-def every_nth(cameras: Sequence[Camera], options: Options, custom: int, source: str) -> Split:
+def every_nth(cameras: Sequence[Camera], options: CameraFileOptions, custom: int, source: str) -> Split:
     """Every n-th camera, beginning with the first, is a test view.
 
     custom: n if `options` do not give it, for the reason `source`; 0 for no split.
@@ -76,7 +76,7 @@ def every_nth(cameras: Sequence[Camera], options: Options, custom: int, source: 
     return explicit(train, cameras[::n], f"1 in {n} by name: {source}")
 
 
-def file_sizes(cameras: Sequence[Camera], options: Options) -> tuple[list[Size], str]:
+def file_sizes(cameras: Sequence[Camera], options: CameraFileOptions) -> tuple[list[Size], str]:
     """Each camera's size in the file, times `train_scale` if the user chose one; and the reason, for a note."""
     scale = options.train_scale
     sizes = [_scaled(camera, 1.0 if scale is None else scale) for camera in cameras]

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from aaplug.core.cameras import Camera
-from aaplug.io.cameras.options import Options
+from aaplug.io.cameras.options import CameraFileOptions
 from aaplug.io.values import Place
 from aaplug.system.errors import FormatError, UsageError, listing
 
@@ -47,7 +47,7 @@ class PhotoFolder:
         return photo
 
 
-def photo_folder(root: Path, options: Options, custom: str, place: Place) -> PhotoFolder:
+def photo_folder(root: Path, options: CameraFileOptions, custom: str, place: Place) -> PhotoFolder:
     """The folder that the user chose, or else `custom`: what the files name, or the format's usual one."""
     if options.images is None:
         _refuse_escape(custom, place)
@@ -58,7 +58,7 @@ def photo_folder(root: Path, options: Options, custom: str, place: Place) -> Pho
     return PhotoFolder(folder, folder, chosen=True)
 
 
-def refuse_folder(options: Options) -> None:
+def refuse_folder(options: CameraFileOptions) -> None:
     """Refuse a folder of photos, for formats that give each photo's path."""
     if options.images is not None:
         raise UsageError("images", "this format gives each photo's path itself; leave it out")

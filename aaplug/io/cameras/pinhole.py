@@ -7,7 +7,7 @@ world_to_camera is 4×4, row by row, OpenCV axes.
 from pathlib import Path
 
 from aaplug.core.cameras import Camera, CameraSet
-from aaplug.io.cameras.options import Options, camera_set, every_nth, file_sizes, trained_at
+from aaplug.io.cameras.options import CameraFileOptions, camera_set, every_nth, file_sizes, trained_at
 from aaplug.io.cameras.photos import refuse_folder
 from aaplug.io.cameras.poses import inverse, pose, rigid
 from aaplug.io.values import Entry, entries, focal, mentions, number, pixels, read_json
@@ -21,7 +21,7 @@ def sniff(path: Path) -> bool:
     return mentions(path, ["world_to_camera"])
 
 
-def read(path: Path, options: Options) -> CameraSet:
+def read(path: Path, options: CameraFileOptions) -> CameraSet:
     """The cameras; a single one is named after its file, those of a list by their numbers."""
     refuse_folder(options)
     document = read_json(path)

@@ -21,7 +21,16 @@ from torch import Tensor
 
 from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.colours import WHITE
-from aaplug.io.cameras.options import Options, Size, Split, camera_set, every_nth, explicit, file_sizes, trained_at
+from aaplug.io.cameras.options import (
+    CameraFileOptions,
+    Size,
+    Split,
+    camera_set,
+    every_nth,
+    explicit,
+    file_sizes,
+    trained_at,
+)
 from aaplug.io.cameras.photos import PhotoFolder, distinct, last_part, refuse_folder, without_suffix
 from aaplug.io.cameras.poses import inverse, pose, pose_of_opengl, rigid
 from aaplug.io.images import PNG_SIGNATURE, image_size
@@ -83,7 +92,7 @@ def sniff(path: Path) -> bool:
     return named or mentions(path, ["transform_matrix", "frames"])
 
 
-def read(path: Path, options: Options) -> CameraSet:
+def read(path: Path, options: CameraFileOptions) -> CameraSet:
     """The cameras of one file."""
     file = path / FILE if os.path.isdir(path) else path
     source = read_source(file, options)
@@ -97,7 +106,7 @@ def read(path: Path, options: Options) -> CameraSet:
     return set_of(source, every_nth(cameras, options, 0, f"only {file.name} read"), options)
 
 
-def set_of(source: Source, split: Split, options: Options) -> CameraSet:
+def set_of(source: Source, split: Split, options: CameraFileOptions) -> CameraSet:
     """The set of a split of the source's cameras; photos with alpha mean a white background, Blender's custom."""
     headers = (read_start(camera.photo, PNG_COLOUR_TYPE + 1) for camera in source.cameras if camera.photo)
     alpha = any(h.startswith(PNG_SIGNATURE) and h[PNG_COLOUR_TYPE:] in PNG_ALPHA for h in headers)
@@ -106,12 +115,12 @@ def set_of(source: Source, split: Split, options: Options) -> CameraSet:
     return camera_set("transforms JSON", source.cameras, split, why, background, [*more, *source.notes])
 
 
-def trained(source: Source, options: Options) -> list[Camera]:
+def trained(source: Source, options: CameraFileOptions) -> list[Camera]:
     """The source's cameras at their training size."""
     return trained_at(source.cameras, file_sizes(source.cameras, options)[0])
 
 
-def read_source(file: Path, options: Options) -> Source:
+def read_source(file: Path, options: CameraFileOptions) -> Source:
     """The cameras at the size that the file or the photos give, in the frame of the trained scene."""
     refuse_folder(options)
     document = _document(file)

@@ -20,7 +20,7 @@ from aaplug.core.pyramids import Pyramid
 from aaplug.io import SpzAxes
 from aaplug.io.atomic import check_output
 from aaplug.io.scenes import compressed_ply, ksplat, ply, pt, sog, splat, spz
-from aaplug.io.scenes.options import Options
+from aaplug.io.scenes.options import SceneFileOptions
 from aaplug.io.scenes.pyramid_folder import is_pyramid, path_of, read_manifest, read_pyramid
 from aaplug.io.scenes.scene_file import MODEL_SCENE, SOG_FOLDER, Scene
 from aaplug.io.values import read_start
@@ -41,7 +41,7 @@ class SceneFormat(Protocol):
         """Whether a file that begins with `head` is of this format.  Never raises."""
         ...
 
-    def open_scene(self, path: Path, options: Options) -> Scene:
+    def open_scene(self, path: Path, options: SceneFileOptions) -> Scene:
         """Read what the file says about the scene; rows are read when `Scene.load` is called.
 
         Raises FormatError if the file breaks its format.
@@ -56,7 +56,9 @@ class WritableFormat(SceneFormat, Protocol):
     @property
     def needs(self) -> str | None: ...  # noqa: D102
 
-    def write(self, path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: Options) -> None:
+    def write(
+        self, path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: SceneFileOptions
+    ) -> None:
         """Write a scene of at least one part and at most `count` Gaussians, whole or not at all.
 
         Raises OutputError if the format cannot hold the scene, the file exists and `overwrite` is false, or it fails.
@@ -103,7 +105,7 @@ def read_scene(
     Raises:
         FormatError: the file is missing, of no known format, or breaks its format.
     """
-    options = Options(allow_checkpoint, spz_axes)
+    options = SceneFileOptions(allow_checkpoint, spz_axes)
     folder = Path(path) if is_pyramid(path) else None
     path = find_scene(path, iteration)
     head = read_start(path, HEAD_BYTES)
@@ -154,7 +156,7 @@ def write_parts(
     inputs: files that are being read and may not be replaced.  Errors: see `write_scene`.
     """
     writer = check_scene_output(path, overwrite, inputs)
-    writer.write(Path(path), parts, count, overwrite, Options(spz_axes=spz_axes))
+    writer.write(Path(path), parts, count, overwrite, SceneFileOptions(spz_axes=spz_axes))
 
 
 def written_format(path: str | PathLike[str]) -> WritableFormat | None:

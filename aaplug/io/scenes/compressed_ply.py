@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.gaussians import Gaussians
-from aaplug.io.scenes.options import Options
+from aaplug.io.scenes.options import SceneFileOptions
 from aaplug.io.scenes.packed import byte_opacities, floats, largest_last
 from aaplug.io.scenes.ply_document import Table, stamp_of
 from aaplug.io.scenes.ply_header import LITTLE, Element, Header, check_size, is_packed, read_header
@@ -40,7 +40,7 @@ def sniff(path: Path, head: bytes) -> bool:
     return head.startswith((b"ply\n", b"ply\r")) and is_packed(path)
 
 
-def open_scene(path: Path, options: Options) -> SceneFile:
+def open_scene(path: Path, options: SceneFileOptions) -> SceneFile:
     """See `SceneFormat`."""
     with library_errors(path):
         header = read_header(path)

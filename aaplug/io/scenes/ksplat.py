@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from aaplug.core.gaussians import Gaussians, joined
-from aaplug.io.scenes.options import Options
+from aaplug.io.scenes.options import SceneFileOptions
 from aaplug.io.scenes.packed import byte_opacities, floats
 from aaplug.io.scenes.scene_file import SceneFile, check_count, library_errors, sh_of_colour
 from aaplug.io.scenes.splat import EVIDENCE
@@ -62,7 +62,7 @@ def sniff(path: Path, head: bytes) -> bool:
     return path.suffix.lower() == ".ksplat"
 
 
-def open_scene(path: Path, options: Options) -> SceneFile:
+def open_scene(path: Path, options: SceneFileOptions) -> SceneFile:
     """See `SceneFormat`."""
     with library_errors(path):
         data = path.read_bytes()

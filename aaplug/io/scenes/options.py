@@ -8,7 +8,7 @@ from aaplug.system.errors import UsageError
 
 
 @dataclass(frozen=True)
-class Options:
+class SceneFileOptions:
     """The user's choices; raises UsageError for unknown axes.
 
     allow_checkpoint: open a .pt, a pickle, of which only tensors are read.

@@ -19,7 +19,7 @@ import torch
 
 from aaplug.core.gaussians import Gaussians
 from aaplug.io.atomic import replacing
-from aaplug.io.scenes.options import Options
+from aaplug.io.scenes.options import SceneFileOptions
 from aaplug.io.scenes.ply_document import Document, document_of, stamp_of
 from aaplug.io.scenes.ply_header import LITTLE, Header, check_size, is_packed, parse, read_header
 from aaplug.io.scenes.ply_tags import meaning_in_run, stating
@@ -55,7 +55,7 @@ def sniff(path: Path, head: bytes) -> bool:
     return head.startswith((b"ply\n", b"ply\r")) and not is_packed(path)
 
 
-def open_scene(path: Path, options: Options) -> SceneFile:
+def open_scene(path: Path, options: SceneFileOptions) -> SceneFile:
     """See `SceneFormat`."""
     with library_errors(path):
         header = read_header(path)
@@ -70,7 +70,7 @@ def open_scene(path: Path, options: Options) -> SceneFile:
     return SceneFile(path, name, header.vertex.count, degree, load, **vars(said), document=document, notes=notes)
 
 
-def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: Options) -> None:
+def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: SceneFileOptions) -> None:
     """Write a scene part by part, with the columns, tables and comments of its source file."""
     parts = iter(parts)
     first = next(parts)

@@ -19,7 +19,7 @@ from torch import Tensor
 from aaplug.core.conventions import CLASSIC
 from aaplug.core.gaussians import Gaussians
 from aaplug.io.limits import whole_limit
-from aaplug.io.scenes.options import Options
+from aaplug.io.scenes.options import SceneFileOptions
 from aaplug.io.scenes.scene_file import DEGREES, SceneFile, check_count, library_errors
 from aaplug.io.scenes.training_config import gsplat_config
 from aaplug.system.errors import FormatError
@@ -37,7 +37,7 @@ def sniff(path: Path, head: bytes) -> bool:
     return path.suffix.lower() in SUFFIXES
 
 
-def open_scene(path: Path, options: Options) -> SceneFile:
+def open_scene(path: Path, options: SceneFileOptions) -> SceneFile:
     """See `SceneFormat`."""
     if not options.allow_checkpoint:
         what = "is a training checkpoint (a pickle)"

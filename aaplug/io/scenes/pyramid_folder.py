@@ -24,7 +24,7 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.core.pyramids import Pyramid
 from aaplug.io.atomic import replacing
 from aaplug.io.scenes import ply
-from aaplug.io.scenes.options import Options
+from aaplug.io.scenes.options import SceneFileOptions
 from aaplug.io.values import Entry, Place, entries, number, object_of, read_json, text
 from aaplug.system.errors import FormatError
 
@@ -111,7 +111,7 @@ def levels_in(folder: str | PathLike[str], manifest: Manifest) -> Iterator[Level
     """The levels of a folder; see `read_pyramid`."""
     for place, entry in enumerate(manifest.levels):
         path = path_of(Path(folder), entry)
-        scene, sizes = ply.open_scene(path, Options()).gaussians(), torch.tensor(entry.chunks)
+        scene, sizes = ply.open_scene(path, SceneFileOptions()).gaussians(), torch.tensor(entry.chunks)
         problem = FormatError(path, f"does not have the chunks that {MANIFEST} lists")
         if sizes.sum() != len(scene):  # before memory is taken for as many as it says
             raise problem

@@ -26,7 +26,7 @@ from torch import Tensor
 from aaplug.core.conventions import CLASSIC, Convention
 from aaplug.core.gaussians import MAX_LOG_SCALE, Gaussians
 from aaplug.io.limits import whole_limit
-from aaplug.io.scenes.options import Options
+from aaplug.io.scenes.options import SceneFileOptions
 from aaplug.io.scenes.packed import byte_opacities, check_growth, floats, largest_last
 from aaplug.io.scenes.scene_file import COMPENSATED, KERNEL_LOST, SceneFile, check_count, library_errors
 from aaplug.io.values import Entry, number, object_of, parse_json, read_bounded
@@ -70,7 +70,7 @@ def sniff(path: Path, head: bytes) -> bool:
     return zipped or (path.name == META and head.lstrip().startswith(b"{"))
 
 
-def open_scene(path: Path, options: Options) -> SceneFile:
+def open_scene(path: Path, options: SceneFileOptions) -> SceneFile:
     """See `SceneFormat`."""
     with library_errors(path):
         if path.name == META:

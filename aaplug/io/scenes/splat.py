@@ -13,7 +13,7 @@ import torch
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.spherical_harmonics import COLOUR_OFFSET, SH_C0
 from aaplug.io.atomic import replacing
-from aaplug.io.scenes.options import Options
+from aaplug.io.scenes.options import SceneFileOptions
 from aaplug.io.scenes.packed import byte_opacities, floats
 from aaplug.io.scenes.scene_file import SceneFile, check_count, library_errors, read_rows, sh_of_colour
 from aaplug.system.errors import FormatError
@@ -31,7 +31,7 @@ def sniff(path: Path, head: bytes) -> bool:
     return path.suffix.lower() == ".splat"
 
 
-def open_scene(path: Path, options: Options) -> SceneFile:
+def open_scene(path: Path, options: SceneFileOptions) -> SceneFile:
     """See `SceneFormat`."""
     with library_errors(path):
         size = path.stat().st_size
@@ -43,7 +43,7 @@ def open_scene(path: Path, options: Options) -> SceneFile:
     return SceneFile(path, name, count, 0, lambda a, b: _rows(path, a, b), EVIDENCE)
 
 
-def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: Options) -> None:
+def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: SceneFileOptions) -> None:
     """Write a scene part by part; harmonics above degree 0 and the convention are lost."""
     with replacing(path, overwrite) as stream:
         stream.writelines(_records(part).tobytes() for part in parts)

@@ -31,7 +31,7 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.io import SpzAxes
 from aaplug.io.atomic import replacing
 from aaplug.io.limits import whole_limit
-from aaplug.io.scenes.options import Options
+from aaplug.io.scenes.options import SceneFileOptions
 from aaplug.io.scenes.packed import byte_opacities, check_growth, floats, half_turn_about_x, largest_last
 from aaplug.io.scenes.scene_file import COMPENSATED, KERNEL_LOST, SceneFile, check_count, library_errors
 from aaplug.system.errors import FormatError, OutputError
@@ -95,7 +95,7 @@ def sniff(path: Path, head: bytes) -> bool:
     return head.startswith(MAGIC) or (head.startswith(GZIP_SIGNATURE) and path.suffix.lower() == ".spz")
 
 
-def open_scene(path: Path, options: Options) -> SceneFile:
+def open_scene(path: Path, options: SceneFileOptions) -> SceneFile:
     """Decompress a scene; see `SceneFormat`."""
     with library_errors(path):
         header, sections = _sections(path)
@@ -220,7 +220,7 @@ def _threes(data: np.ndarray) -> Float[Tensor, "n 4"]:
     return xyzw[:, [3, 0, 1, 2]]
 
 
-def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: Options) -> None:
+def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: SceneFileOptions) -> None:
     """Write a scene, with values rounded to the format's steps."""
     turn = TURNS["opengl" if options.spz_axes == "auto" else options.spz_axes]
     content = _packed(path, [turn(_checked(path, part)) for part in parts])

@@ -9,9 +9,7 @@ from pathlib import Path
 
 import torch
 
-from aaplug.core.cameras import Camera, CameraSet, look_at
-from aaplug.io.cameras.options import Options
-from aaplug.system.errors import FormatError, UsageError
+from aaplug import Camera, CameraFileOptions, CameraSet, FormatError, UsageError, look_at
 
 NUMBERS = 10
 UP = torch.tensor([0.0, 0.0, 1.0])
@@ -25,17 +23,17 @@ class Look:
     sign: str = "a file called .look"
 
     def sniff(self, path: Path) -> bool:
-        """Whether a file is of this format.  Never raises."""
+        """True for a file of this format.  Never raises."""
         return path.suffix.lower() == ".look"
 
-    def read(self, path: Path, options: Options) -> CameraSet:
+    def read(self, path: Path, options: CameraFileOptions) -> CameraSet:
         """The cameras at their training size.
 
         Raises:
             FormatError: a line is not what it should be.
             UsageError: an option does not fit.
         """
-        if options != Options():
+        if options != CameraFileOptions():
             raise UsageError("cameras", "a .look file holds sizes and split; it takes no options")
         views = [_view(path, line) for line in path.read_text().splitlines() if line.strip()]
         train = tuple(camera for camera, held_out in views if not held_out)

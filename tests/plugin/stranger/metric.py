@@ -1,13 +1,12 @@
 """A metric: mean absolute error."""
 
-from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.evaluation.metric import Metric
+from aaplug import Metric
 
 
-def mean_absolute_error(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> float | None:
-    """Mean over pixels and channels; undefined for an empty image."""
+def mean_absolute_error(image: Tensor, truth: Tensor) -> float | None:
+    """Mean over pixels and channels of images [h, w, 3] in [0, 1]; undefined for an empty image."""
     return None if image.numel() == 0 else float((image - truth).abs().mean())
 
 

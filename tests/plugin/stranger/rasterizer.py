@@ -3,15 +3,9 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.colours import Colour
-from aaplug.core.imaging import over
-from aaplug.core.interfaces import Compositor, PixelKernel
-from aaplug.core.rules import RULES_3DGS, Rules
-from aaplug.core.splats import Render, Splats2D
-from aaplug.methods.pixel_kernels.point import POINT
+from aaplug import RULES_3DGS, Colour, Compositor, PixelKernel, Render, Rules, Splats2D, over
 
 
 @dataclass(frozen=True)
@@ -25,7 +19,7 @@ class RowByRow:
         splats: Splats2D,
         hw: tuple[int, int],
         background: Colour,
-        pixel: PixelKernel = POINT,
+        pixel: PixelKernel,
         compositor: Compositor | None = None,
         rules: Rules = RULES_3DGS,
     ) -> Render:
@@ -42,10 +36,8 @@ class RowByRow:
         return over(rgb, 1 - transmittance, background)
 
 
-def _row(
-    splats: Splats2D, centres: Float[Tensor, "w 2"], pixel: PixelKernel, rules: Rules
-) -> tuple[Float[Tensor, "w 3"], Float[Tensor, " w"]]:
-    """Premultiplied colour, and the share of the background that stays visible."""
+def _row(splats: Splats2D, centres: Tensor, pixel: PixelKernel, rules: Rules) -> tuple[Tensor, Tensor]:
+    """Premultiplied colour [w, 3] and the visible share [w] of the background, at pixel centres [w, 2]."""
     values = pixel.exact(splats, centres[:, None] - splats.means)
     alpha = (splats.opacities * values).clamp(max=rules.max_alpha)
     alpha = torch.where(alpha >= rules.min_alpha, alpha, 0.0)

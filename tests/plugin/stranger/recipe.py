@@ -1,6 +1,6 @@
 """A recipe: our screen filter with our pixel kernel."""
 
-from aaplug.methods.recipe import Recipe
+from aaplug import Recipe
 
 from .pixel_kernel import FOUR_POINTS
 from .screen_filter import SOFT

@@ -6,15 +6,21 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.gaussians import Gaussians
-from aaplug.core.spherical_harmonics import COLOUR_OFFSET, SH_C0
-from aaplug.io.atomic import replacing
-from aaplug.io.scenes.options import Options
-from aaplug.io.scenes.scene_file import SceneFile, check_count, library_errors, logit_of, sh_of_colour
-from aaplug.system.errors import FormatError
+from aaplug import (
+    COLOUR_OFFSET,
+    SH_C0,
+    FormatError,
+    Gaussians,
+    Scene,
+    SceneFileOptions,
+    check_count,
+    library_errors,
+    logit_of,
+    replacing,
+    sh_of_colour,
+)
 
 COLUMNS = 8
 EVIDENCE = "the format does not say: assumed classic (3DGS default)"
@@ -28,10 +34,10 @@ class Balls:
     needs: str | None = None  # a package that writing imports
 
     def sniff(self, path: Path, head: bytes) -> bool:
-        """Whether the suffix is .balls; a text file has no signature."""
+        """True if the suffix is .balls; a text file has no signature."""
         return path.suffix.lower() == ".balls"
 
-    def open_scene(self, path: Path, options: Options) -> SceneFile:
+    def open_scene(self, path: Path, options: SceneFileOptions) -> Scene:
         """Read what the file says about the scene.
 
         Raises:
@@ -46,9 +52,11 @@ class Balls:
         def load(start: int, stop: int) -> Gaussians:
             return _gaussians(rows[start:stop])
 
-        return SceneFile(path, self.name, len(rows), 0, load, EVIDENCE)
+        return Scene(path, self.name, len(rows), 0, load, EVIDENCE)
 
-    def write(self, path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: Options) -> None:
+    def write(
+        self, path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: SceneFileOptions
+    ) -> None:
         """Write a scene; the widest axis becomes the radius.
 
         Raises:
@@ -62,7 +70,7 @@ class Balls:
                 np.savetxt(stream, torch.cat(columns, dim=1).numpy(), fmt="%.9g")
 
 
-def _gaussians(rows: Float[Tensor, "n 8"]) -> Gaussians:
+def _gaussians(rows: Tensor) -> Gaussians:
     return Gaussians(
         means=rows[:, :3],
         quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(rows), 1),

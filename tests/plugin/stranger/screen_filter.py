@@ -2,9 +2,7 @@
 
 from dataclasses import dataclass
 
-from aaplug.core.cameras import Camera
-from aaplug.core.splats import Splats2D
-from aaplug.core.training import TrainingViews
+from aaplug import Camera, Splats2D, TrainingViews
 
 
 @dataclass(frozen=True)

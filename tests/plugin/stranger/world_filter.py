@@ -2,9 +2,7 @@
 
 from dataclasses import dataclass, replace
 
-from aaplug.core.convolution import smoothed_by
-from aaplug.core.gaussians import Fusion, Gaussians
-from aaplug.core.training import TrainingViews
+from aaplug import Fusion, Gaussians, TrainingViews, smoothed_by
 
 
 @dataclass(frozen=True)
