@@ -12,8 +12,10 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
+import torch
+
 import aaplug
-from aaplug.evaluation.engine import Task, ViewMeasurer, candidates_of
+from aaplug.evaluation.engine import Task, _Measuring, candidates_of
 from aaplug.evaluation.journal import Journal
 from aaplug.evaluation.results import Measurement
 from aaplug.evaluation.truth import Truth
@@ -22,7 +24,7 @@ from aaplug.io.scenes import read_scene
 from aaplug.rendering.benchmark import synthetic_scene
 from aaplug.rendering.renderer import own_look
 from aaplug.system.cluster import connected
-from aaplug.system.executors import WORK_FILE_NAME, Executor, Processes, load, save
+from aaplug.system.executors import WORK, Executor, Processes, loaded, save
 from aaplug.system.monitor import SILENT
 from tests.bench import heading, row
 from tests.bench.large import cameras, write
@@ -79,19 +81,6 @@ def _processes(workers: int) -> Iterator[Executor]:
     yield Processes(workers)
 
 
-def _local(workers: int) -> AbstractContextManager[Executor]:
-    return connected("local", workers, None, SILENT)
-
-
-def _measuring(views: int) -> Callable[[int], object]:
-    """The sample's evaluation at five scales."""
-    scene, known = read_scene(SAMPLE / "chair.ply"), read_cameras(SAMPLE)
-    shown = known.train[:views]
-    renderer = aaplug.Renderer.of(scene, known, "auto", rasterizer="eager")
-    candidates = candidates_of(scene, renderer.training, [renderer.recipe], "eager")
-    return ViewMeasurer(Task(candidates, SCALES, shown, Truth(own_look(scene, renderer.training))), None)
-
-
 def costs() -> None:
     """What a batch pays besides its views, and what a view costs."""
     heading("costs", "what", "measured")
@@ -111,24 +100,28 @@ def _sending(folder: Path) -> None:
     """A scene's way to a worker: the file, written once, and its first reading."""
     scene = synthetic_scene(MILLION)
     began = time.monotonic()
-    save(partial(_touched, scene), folder / WORK_FILE_NAME)
+    save(partial(_touched, scene), folder / WORK)
     written = time.monotonic()
-    load(folder / WORK_FILE_NAME)(0)
-    read, size = time.monotonic() - written, (folder / WORK_FILE_NAME).stat().st_size / 1e6
-    print(f"{LARGE:,} Gaussians, {size:.0f} MB: {written - began:.2f} s to write, {read:.2f} s to read")
+    loaded(folder / WORK)(0)
+    seconds, size = time.monotonic() - written, (folder / WORK).stat().st_size / 1e6
+    row(f"{MILLION:,} Gaussians, {size:.0f} MB", f"{written - began:.2f} s to write, {seconds:.2f} s to read")
+
+
+def _touched(scene: aaplug.Gaussians, _: int) -> float:
+    """Read all of a scene."""
+    return float(sum(value.double().sum() for value in vars(scene).values() if isinstance(value, torch.Tensor)))
 
 
 def _journal(folder: Path) -> None:
     """A line of the journal, with five recipes at five scales."""
     times, line = [], [Measurement("auto", s, "v", {"PSNR": 30.0, "SSIM": 0.9}, 4, 0.1, "", 1) for s in SCALES * 5]
-    path = folder / "j" / "progress.jsonl"
-    with Journal(path, {}, resume=False) as journal:
+    with Journal(folder / "j" / "progress.jsonl", {}, resume=False) as journal:
         for view in range(200):
             began = time.monotonic()
             journal.add(view, line)
             times.append(time.monotonic() - began)
-        size = path.stat().st_size / len(times)
-    print(f"journal: {1000 * statistics.median(times):.2f} ms a view, {size:.0f} bytes")
+        size = journal.path.stat().st_size / len(times)
+    row("journal", f"{1000 * statistics.median(times):.2f} ms a view, {size:.0f} bytes")
 
 
 def _scene_and_view(folder: Path) -> None:

@@ -9,7 +9,8 @@ import torch
 from aaplug.evaluation.results import scale_name
 from aaplug.evaluation.truth import Truth, ViewTruth
 from aaplug.methods.recipes import find_recipe
-from tests.bench.away import decibels
+from tests.bench import heading, row
+from tests.bench.scenes import decibels, trained
 
 FIRST_VIEW = 2  # other tables have the views from the first
 WEIGHTS = (0.0, 0.02, 0.03, 0.04, 0.06)
