@@ -1,6 +1,5 @@
 """The table of verbs: the options of each, and how it reads, calls the library and tells what came of it."""
 
-import dataclasses
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -376,10 +375,9 @@ def view(words: Words) -> int:
     command = [word for options in (SceneOptions, CameraOptions, Orbit) for word in words.given(options)]
     from aaplug.verbs.view import attend, serving
 
-    options = words.where().of(verbs.LiveOptions)
-    with serving(scene, cameras, dataclasses.replace(options, monitor=TERMINAL), command) as address:
+    with serving(scene, cameras, words=command, **told(words, verbs.LiveOptions)) as address:
         try:
-            attend(address, TERMINAL, options.no_browser)
+            attend(address, TERMINAL, words.no_browser)
         except KeyboardInterrupt:  # the usual end
             say("closed")
     return 0

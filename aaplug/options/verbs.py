@@ -264,6 +264,8 @@ class LiveOptions(ViewOptions):
     """Port to listen on; 0 takes any free one."""
     no_browser: bool = False
     """Print the address, and open no browser."""
+    words: Annotated[Sequence[str], tyro.conf.Suppress] = ()
+    """Words of a command line that name the scene and its cameras, for the page to show."""
 
 
 @dataclass(frozen=True, kw_only=True)

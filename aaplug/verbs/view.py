@@ -2,7 +2,7 @@
 
 import threading
 import webbrowser
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from importlib.resources import as_file, files
 from importlib.util import find_spec
@@ -20,14 +20,12 @@ MIN_FRAMES = 100  # that are drawn at least; not so many that kernels are compil
 SAMPLE = "chair.ply"
 
 
+@looks(LiveOptions)
 @contextmanager
-def serving(
-    scene: SceneLike | None, cameras: CamerasLike, options: LiveOptions, words: Sequence[str] = ()
-) -> Iterator[str]:
+def serving(scene: SceneLike | None, cameras: CamerasLike, options: LiveOptions) -> Iterator[str]:
     """A block in which a scene can be seen live in the browser; yields the page's address.
 
-    words: of a command line that name the scene and its cameras, for the page to show.
-    Other arguments and errors: see `view`.
+    Arguments and errors: see `view`.
     """
     if find_spec("websockets") is None:
         raise UsageError("view", "needs the extra `view`: pip install 'aaplug[view]'")
@@ -46,7 +44,9 @@ def serving(
         job.say_assumed()
         title = title or job.scene.title
         recipes = [name for name in RECIPE_NAMES if name in RECIPES]  # without plug-ins that cannot be used
-        subject = Subject(job.scene, job.cameras, look, recipes, title, words or (str(job.scene.file or title),))
+        subject = Subject(
+            job.scene, job.cameras, look, recipes, title, options.words or (str(job.scene.file or title),)
+        )
         studio = stack.enter_context(Studio(subject))
         yield stack.enter_context(Server(studio, options.host, options.port)).address
 
@@ -62,7 +62,7 @@ def view(scene: SceneLike | None, cameras: CamerasLike, options: LiveOptions) ->
     Raises:
         AaplugError: an input cannot be read, an option does not fit, or nothing can listen at the address.
     """
-    with serving(scene, cameras, options) as address:
+    with serving(scene, cameras, **vars(options)) as address:
         attend(address, options.monitor, options.no_browser)
 
 

@@ -18,9 +18,10 @@ from aaplug.core.cameras import Camera
 from aaplug.core.imaging import quantised, resampled
 from aaplug.core.sampling import median_rates
 from aaplug.io.photographs import read_photo
+from aaplug.io.scenes import scene_of
 from aaplug.methods.recipes import find_recipe
 from aaplug.options.shared import Orbit
-from aaplug.rendering.assumed import decibels_at
+from aaplug.rendering.assumed import cameras_around, decibels_at
 from aaplug.rendering.renderer import Renderer
 from aaplug.verbs.convert import convert
 from tests.bench import heading, row
@@ -133,7 +134,7 @@ def _case(name: str) -> Case:
     """Read a checkpoint."""
     plain, _, stated = name.partition(", ")
     known = trained(plain)
-    bare = replace(known, cameras=(STATED[plain] if stated else Orbit()).around(known.scene))
+    bare = replace(known, cameras=cameras_around(scene_of(known.scene), STATED[plain] if stated else Orbit()))
     true, assumed = (median_rates(known.scene.means, each.cameras.train) for each in (known, bare))
     both = (true > 0) & (assumed > 0)
     views = known.views()

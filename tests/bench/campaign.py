@@ -16,8 +16,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from aaplug.verbs.inputs import inputs_of  # noqa: F401  (imports the verbs before the children are forked)
 
+import aaplug.verbs.evaluate  # noqa: F401  (imports the verbs before the children are forked)
 from aaplug.evaluation.journal import Journal
 from aaplug.finetuning.state import begin, load, save
 from aaplug.io.batch_file import read_batch

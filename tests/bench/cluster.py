@@ -15,7 +15,7 @@ from typing import Literal
 import torch
 
 import aaplug
-from aaplug.evaluation.engine import Task, _Measuring, candidates_of
+from aaplug.evaluation.engine import Task, ViewMeasurer, candidates_of
 from aaplug.evaluation.journal import Journal
 from aaplug.evaluation.results import Measurement
 from aaplug.evaluation.truth import Truth
@@ -24,7 +24,7 @@ from aaplug.io.scenes import read_scene
 from aaplug.rendering.benchmark import synthetic_scene
 from aaplug.rendering.renderer import own_look
 from aaplug.system.cluster import connected
-from aaplug.system.executors import WORK, Executor, Processes, loaded, save
+from aaplug.system.executors import WORK_FILE_NAME, Executor, Processes, load, save
 from aaplug.system.monitor import SILENT
 from tests.bench import heading, row
 from tests.bench.large import cameras, write
@@ -52,7 +52,7 @@ def speed(workers: int, views: int, runs: int) -> None:
     scene, data = read_scene(SAMPLE / "chair.ply"), read_cameras(SAMPLE)
     renderer = aaplug.Renderer.of(scene, data, "auto", rasterizer="eager")
     candidates = candidates_of(scene, renderer.training, [renderer.recipe], "eager")
-    work = _Measuring(Task(candidates, SCALES, data.train[:views], Truth(own_look(scene, renderer.training))), None)
+    work = ViewMeasurer(Task(candidates, SCALES, data.train[:views], Truth(own_look(scene, renderer.training))), None)
     pools = {"processes": _processes, "--scheduler local": lambda count: connected("local", count, None, SILENT)}
     rates: dict[str, list[tuple[float, ...]]] = {name: [] for name in pools}
     heading("views a second", "", "with start and end", "without", "of processor time")
@@ -100,10 +100,10 @@ def _sending(folder: Path) -> None:
     """A scene's way to a worker: the file, written once, and its first reading."""
     scene = synthetic_scene(MILLION)
     began = time.monotonic()
-    save(partial(_touched, scene), folder / WORK)
+    save(partial(_touched, scene), folder / WORK_FILE_NAME)
     written = time.monotonic()
-    loaded(folder / WORK)(0)
-    seconds, size = time.monotonic() - written, (folder / WORK).stat().st_size / 1e6
+    load(folder / WORK_FILE_NAME)(0)
+    seconds, size = time.monotonic() - written, (folder / WORK_FILE_NAME).stat().st_size / 1e6
     row(f"{MILLION:,} Gaussians, {size:.0f} MB", f"{written - began:.2f} s to write, {seconds:.2f} s to read")
 
 
@@ -120,6 +120,7 @@ def _journal(folder: Path) -> None:
             began = time.monotonic()
             journal.add(view, line)
             times.append(time.monotonic() - began)
+        assert journal.path is not None
         size = journal.path.stat().st_size / len(times)
     row("journal", f"{1000 * statistics.median(times):.2f} ms a view, {size:.0f} bytes")
 

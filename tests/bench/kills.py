@@ -19,7 +19,7 @@ import psutil
 
 from aaplug.io.images import read_image
 from aaplug.io.scenes import read_scene
-from aaplug.system.locks import OUR_PREFIX, SCRATCH
+from aaplug.system.locks import OUR_PREFIX, SCRATCH_PREFIX
 from tests.bench import heading, row
 from tests.conftest import SAMPLE
 from tests.test_batch import timeless
@@ -129,7 +129,7 @@ def _problem(folder: Path, job: Job, whole: dict[str, object], moment: float) ->
     if code and job.again == "--resume" and start(folder, f"{words} --overwrite").wait() == 0:
         code = 0  # it had ended before it was killed, so that there was nothing to resume
     time.sleep(0.2)  # workers notice the death of their parent
-    left = [p.name for p in folder.rglob("*") if p.name.startswith((OUR_PREFIX, SCRATCH))]
+    left = [p.name for p in folder.rglob("*") if p.name.startswith((OUR_PREFIX, SCRATCH_PREFIX))]
     same = _content(folder / "out") == whole
     return f"killed at {moment:.2f} s: exit code {code}, left {left}, same {same}" if code or left or not same else ""
 

@@ -30,6 +30,7 @@ from aaplug.evaluation.results import Report, mean
 from aaplug.evaluation.truth import Truth, ViewTruth
 from aaplug.io.scenes.pyramid_folder import pyramid_of, read_pyramid
 from aaplug.io.video import write_video
+from aaplug.lab.multi_scale import in_one_scene
 from aaplug.rendering.benchmark import exponent, synthetic_camera
 from aaplug.rendering.renderer import Renderer
 from aaplug.verbs.evaluate import evaluate
@@ -72,7 +73,7 @@ def main(scenes: Sequence[str] = ("chair", "snowmiku", *MILLIONS, "cost")) -> No
             pyramid = levels(bench)
             fades(bench, pyramid)
             dolly(bench, pyramid)
-            together(bench)
+            in_one(bench)
             lighter(bench)
 
 
@@ -157,12 +158,12 @@ def lighter(bench: Bench) -> None:
 
 
 @torch.no_grad()
-def together(bench: Bench) -> None:
+def in_one(bench: Bench) -> None:
     """All levels in one scene by Multi-Scale 3DGS' rule, beside 3DGS."""
-    (one,) = lod(bench.scene, bench.cameras, multi_scale=True, levels=LEVELS)
+    together = in_one_scene(bench.scene, bench.cameras.train, LEVELS)
     scales = (1.0, *SCALES)
     heading("all levels in one scene", "", *(f"1/{1 / scale:g}" for scale in scales))
-    for recipe, scene in (("multi-scale", one.scene), ("classic", bench.scene)):
+    for recipe, scene in (("multi-scale", together), ("classic", bench.scene)):
         renderer = bench.renderer(scene, recipe)
         row(f"`{recipe}`, PSNR", *(bench.psnr(renderer, scale) for scale in scales))
         row("splats", *(f"{len(renderer.splats(bench.views[0].scaled(scale))):,}" for scale in scales))

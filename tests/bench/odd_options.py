@@ -12,9 +12,8 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from aaplug_cli.main import VERBS, _verb
 from aaplug_cli.main import main as program  # pyright: ignore[reportMissingImports]
-from aaplug_cli.options import option_types  # pyright: ignore[reportMissingImports]
+from aaplug_cli.verbs import VERBS  # pyright: ignore[reportMissingImports]
 
 from tests.bench import heading, row
 from tests.test_cli import make_dataset
@@ -56,7 +55,7 @@ def cases() -> Iterator[tuple[str, list[str]]]:
     for verb in VERBS:
         if verb in SKIPPED:
             continue
-        for option in option_types(_verb(verb)):
+        for option in VERBS[verb].types:
             for value in ODD:
                 words = [verb, *BASE.get(verb, "").split()]
                 if option in ("scene", "more"):

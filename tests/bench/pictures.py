@@ -47,7 +47,7 @@ ENLARGED_QUALITY = 80  # WebP: an enlarged view is smooth
 def main() -> None:
     """Write all pictures."""
     with as_file(files("aaplug.io.sample")) as sample:
-        scene, cameras = read_scene(sample / "chair.ply"), read_cameras(sample)
+        scene, cameras = read_scene(sample / "chair.ply").gaussians(), read_cameras(sample)
         pictures = {f"{plot.name}.svg": plot.svg().encode() for plot in (*concepts(scene, cameras), scales())}
         pictures |= gallery(scene, cameras)
     for name, content in pictures.items():

@@ -7,7 +7,6 @@ from functools import cached_property
 from typing import Any
 
 import torch
-from aaplug.levels.rates import rates_of
 from jaxtyping import Float
 from torch import Tensor
 
@@ -20,7 +19,8 @@ from aaplug.core.training import TrainingViews
 from aaplug.evaluation.metrics import psnr
 from aaplug.io.cameras import read_cameras
 from aaplug.io.scenes import read_scene
-from aaplug.levels.covariances import area, blurred, covariances
+from aaplug.levels.clusters import rates_of
+from aaplug.levels.covariances import area, blur, covariances
 from aaplug.methods.recipe import Recipe
 from aaplug.rendering.benchmark import SEED, synthetic_camera, synthetic_scene
 from aaplug.rendering.renderer import Renderer
@@ -92,7 +92,7 @@ def trained(name: str) -> Trained:
     checkpoint = CHECKPOINTS[name]
     path = SHARED_DATA / checkpoint.file
     cameras = path.parent if checkpoint.cameras is None else SHARED_DATA / checkpoint.cameras
-    return Trained(read_scene(path), read_cameras(cameras, train_scale=checkpoint.scale), checkpoint)
+    return Trained(read_scene(path).gaussians(), read_cameras(cameras, train_scale=checkpoint.scale), checkpoint)
 
 
 def decibels(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> float:
@@ -116,7 +116,7 @@ def split(scene: Gaussians, cameras: CameraSet, parts: int = PARTS, seed: int = 
     factors = rotation_matrices(scene.unit_quats) * scene.scales[:, None, :]
     means = scene.means[:, None] + math.sqrt(1 - PART_COVARIANCE) * places @ factors.mT
     dilation = scene.convention.kernel / rates_of(scene, cameras.train).square()
-    whole, part = (area(blurred(share * covariances(scene), dilation)) for share in (1.0, PART_COVARIANCE))
+    whole, part = (area(blur(share * covariances(scene), dilation)) for share in (1.0, PART_COVARIANCE))
     each = replace(
         scene,
         log_scales=scene.log_scales + 0.5 * math.log(PART_COVARIANCE),

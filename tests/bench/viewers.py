@@ -84,7 +84,7 @@ def main(
     subprocess.run(["npm", "install", "--no-audit", "--no-fund", "--silent"], cwd=FOLDER, check=True)
     work.mkdir(parents=True, exist_ok=True)
     with as_file(files("aaplug.io.sample")) as sample:
-        scene, cameras = read_scene(sample / "chair.ply"), read_cameras(sample)
+        scene, cameras = read_scene(sample / "chair.ply").gaussians(), read_cameras(sample)
         bench = Bench(work.resolve(), scene, cameras, cameras.test[:views], steps)
         heading("viewers", "`--for`", "scene", *(round(bench.views[0].width * scale) for scale in SCALES))
         for name in rows:
@@ -112,7 +112,7 @@ class Bench:
                 scene = convert(self.scene, self.cameras, viewer=viewer, steps=self.steps).scene
                 assert scene is not None
             write_scene(path, scene)
-        return read_scene(path)
+        return read_scene(path).gaussians()
 
     def rows(self, viewer: Viewer) -> Iterator[tuple[str, list[str]]]:
         """The rows of a viewer: what is shown, and a cell per scale."""
