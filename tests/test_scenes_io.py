@@ -19,6 +19,7 @@ import aaplug
 from aaplug.core.conventions import ANTIALIASED, CLASSIC, CONVENTIONS, MIP, Convention
 from aaplug.core.gaussians import MAX_LOG_SCALE, Fusion, Gaussians
 from aaplug.io.scenes import find_scene, read_scene, write_parts, write_scene
+from aaplug.io.scenes.ply import EXTRAS
 from aaplug.io.values import HEAD_LIMIT
 from aaplug.system.errors import FormatError, OutputError, UsageError
 
