@@ -90,7 +90,7 @@ def _with(options: Any, optional: tuple[str, ...]) -> Any:
 
         fields = inspect.signature(options).parameters.values()
         signature = inspect.signature(body).replace(parameters=[*inputs.parameters.values(), *fields])
-        vars(verb).update(__signature__=signature, __doc__=documented(body.__doc__, options))
+        vars(verb).update(__signature__=signature, __doc__=documented(body.__doc__, options), options=options)
         return verb
 
     return decorate

@@ -1,12 +1,10 @@
 """What the site has beyond the guides: the API's pages, the tour, and the scripts that aaplug's own pages share."""
 
-import ast
 import inspect
 import json
 import re
 from collections.abc import Mapping
 from dataclasses import MISSING, Field, fields
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +13,14 @@ from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
 import aaplug
-from aaplug.options.base import Options
+from aaplug.options.base import Options, docs_of
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
+PAGES = ROOT / "aaplug" / "evaluation" / "report" / "pages"
 STUB = ROOT / "aaplug" / "__init__.pyi"
-SHARED = [ROOT / "aaplug" / "pages" / name for name in ("pictures.js", "comparing.js")]
-THEME = ROOT / "aaplug" / "pages" / "theme.css"
+SHARED = [PAGES / name for name in ("pictures.js", "comparing.js")]
+THEME = PAGES / "theme.css"
 TOUR = ROOT / "examples" / "tour.ipynb"
 TABLED = "    options: { members: false, show_signature: false, show_bases: false, merge_init_into_class: false }\n"
 TO_IMPLEMENT = {  # topic, and what a package of one's own implements (contributing.md)
@@ -30,7 +29,7 @@ TO_IMPLEMENT = {  # topic, and what a package of one's own implements (contribut
             f"core.interfaces.{name}"
             for name in ("ScreenFilter", "WorldFilter", "PixelKernel", "Compositor", "Rasterizer")
         ),
-        *("core.splats.Splats2D", "core.registry.Registry", "evaluation.metric.Metric"),
+        *("core.splats.Splats2D", "system.registry.Registry", "evaluation.metric.Metric"),
         *("io.scenes.SceneFormat", "io.scenes.WritableFormat", "io.cameras.CameraFormat"),
     ]
 }
@@ -61,19 +60,14 @@ def entry_of(name: str) -> str:
     shown = f"::: aaplug.{name}\n"
     if isinstance(found, Mapping):
         return shown + "\n| name | what it is |\n|---|---|\n" + "".join(map(row_of, found.items())) + "\n"
-    module = inspect.getmodule(found)
-    options = getattr(module, f"{name.capitalize()}Options", getattr(module, "LiveOptions", None))
+    options = getattr(found, "options", None)
     return shown if options is None or not inspect.isfunction(found) else f"{shown}{options_of(options)}"
 
 
 def options_of(options: type[Options]) -> str:
     """A table of options with their defaults, from the docstrings that are also the command line's help."""
-    said = {}
-    for kind in options.__mro__[-2::-1]:  # from the most general, after `object`
-        for field, text in pairwise(ast.parse(inspect.getsource(kind)).body[0].body):
-            if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
-                said[field.target.id] = " ".join(text.value.value.split()).replace("|", "\\|")
-    rows = (f"| `{one.name}` | `{default_of(one)}` | {said.get(one.name, '')} |\n" for one in fields(options))
+    docs = {name: " ".join(text.split()).replace("|", "\\|") for name, text in docs_of(options).items()}
+    rows = (f"| `{one.name}` | `{default_of(one)}` | {docs.get(one.name, '')} |\n" for one in fields(options))
     return f"\n**Options:**\n\n| option | default | what it does |\n|---|---|---|\n{''.join(rows)}\n"
 
 
