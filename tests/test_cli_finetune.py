@@ -115,7 +115,7 @@ def test_a_run_killed_before_its_first_checkpoint_starts_anew(cli, whole):
         ("--learning-rate 0", "--learning-rate: takes 1e-06..100, got 0.0"),
         ("--move size", "--move: needs parameters out of means"),
         ("--loss l3", "--loss: 'l3' is not one of l2"),
-        ("--for web", "--target: 'web' is not one of fast"),
+        ("--for web", "--for: 'web' is not one of fast"),
         ("--overwrite -o scene.ply", "is also the input"),
     ],
 )

@@ -87,7 +87,7 @@ def _rule(options: ConvertOptions) -> Form | Viewer:
             raise UsageError("viewer", "sets form and variance itself; leave out `form`, `variance`")
         return viewer
     if options.steps is not None:
-        raise UsageError("steps", "belongs to the optimization for a `viewer`; name one")
+        raise UsageError("steps", "belongs to the fit to a viewer; name one with `viewer`")
     form = MATCHED_ENERGY if options.form is None else FORMS.find(options.form, "form")
     return form if options.variance is None else form.with_variance(options.variance)
 
