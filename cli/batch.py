@@ -78,17 +78,17 @@ def _scenes_to_evaluate(words: Words) -> list[tuple[str, Words]]:
 def for_each_scene(words: Words, suffix: Callable[[Words], str], work: Callable[[Words], dict[str, Any]]) -> int:
     """Do a verb for every scene of its batch file, and write batch.json.  One scene that fails stops no other.
 
-    suffix: of a scene's output.  work: does the verb for one scene, and returns facts for JSON.
+    suffix: of a scene's output.
+    work: does the verb for one scene, and returns facts for JSON; a `status` among them replaces "done".
     """
     from aaplug.evaluation.report.files import as_json, write_texts
     from aaplug.io.atomic import refuse_existing
-    from aaplug.io.scenes.pyramid_folder import is_pyramid
     from aaplug.options.shared import RecipeOptions
     from aaplug.rendering.job import running
     from aaplug.verbs.batch import SUMMARY, status_table
     from aaplug.verbs.views import file_names
 
-    named = dict(scenes_of(words.batch, words.where(batch=None, scheduler=None)))
+    named = dict(scenes_of(words.batch, words.where(batch=None, resume=False, scheduler=None)))
     folder = next(iter(named.values())).output
     slugs = file_names(list(named), "scene", 3)
     todo = {
@@ -97,8 +97,8 @@ def for_each_scene(words: Words, suffix: Callable[[Words], str], work: Callable[
     }
     outcomes: dict[str, Any] = {}
     for name, own in list(todo.items()):
-        if words.resume and (own.output.is_file() or is_pyramid(own.output)):
-            outcomes[name] = {"status": "kept", "output": str(todo.pop(name).output)}
+        if words.resume and own.output.is_file():
+            outcomes[name] = made_before(todo.pop(name))
     check = partial(refuse_existing, [folder / SUMMARY], words.overwrite or words.resume)
     check()
     options = RecipeOptions(scheduler=words.scheduler, threads=words.threads, monitor=TERMINAL)
@@ -117,6 +117,11 @@ def for_each_scene(words: Words, suffix: Callable[[Words], str], work: Callable[
         rows = [(name, facts["status"], facts.get("error") or facts["output"]) for name, facts in outcomes.items()]
         out.print(status_table("output or why there is none", rows))
     return FAILED if any(facts["status"] == "failed" for facts in outcomes.values()) else 0
+
+
+def made_before(own: Words) -> dict[str, Any]:
+    """Facts of a scene whose output an earlier run made."""
+    return {"status": "kept", "output": str(own.output)}
 
 
 @dataclass(frozen=True)
@@ -154,11 +159,14 @@ def _set(path: Path, where: str, words: Words, settings: Mapping[str, Any], refu
     for name, value in settings.items():
         if name not in names:
             raise FormatError(path, f"{where}: {name} is no setting here{did_you_mean(name, names)}")
-        if value is False and isinstance(words.values[name], bool):
-            words = words.where(**{name: False})
+        if isinstance(value, bool) and isinstance(words.values[name], bool):
+            words = words.where(**{name: value})
             continue
         try:
             words = words.command.parse(setting_words(name, value), words)
         except UsageError as error:
             raise FormatError(path, f"{where}: {error}") from error
-    return words
+    try:
+        return words.checked()
+    except UsageError as error:
+        raise FormatError(path, f"{where}: {error}") from error

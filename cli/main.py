@@ -9,6 +9,7 @@ import os
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import make_dataclass
 from importlib.metadata import version
 from typing import Any
 
@@ -86,12 +87,14 @@ def run(words: Sequence[str]) -> int:
 
     if words and words[0] in VERBS:
         command = VERBS[words[0]]
-        return command.run(command.parse(words[1:]))
+        given = command.parse(words[1:])
+        several = given.values.get("batch") is not None  # then each scene has options of its own, checked with its file
+        return command.run(given if several else given.checked())
     if words and not words[0].startswith("-"):
         raise UsageError("aaplug", f"there is no verb '{words[0]}'{did_you_mean(words[0], VERBS)}; see `aaplug --help`")
     parsers: dict[str, type[Any]] = {}
     for name, command in VERBS.items():
-        parsers[name] = type(name, (), {"__doc__": command.help.partition("\n")[0]})
+        parsers[name] = make_dataclass(name, (), namespace={"__doc__": command.help.partition("\n")[0]})
     with one_line("aaplug"):
         tyro.extras.subcommand_cli_from_dict(parsers, prog="aaplug", description=DESCRIPTION, args=words, config=CONFIG)
     return 0

@@ -1,6 +1,7 @@
 """The table of verbs: the options of each, and how it reads, calls the library and tells what came of it."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -16,7 +17,7 @@ from aaplug.options.base import REPORT, UNSET, OneOf, Options, choices, flag, nu
 from aaplug.options.shared import MAX_SIDE, RECIPE_NAMES, FrameOptions, Orbit
 from aaplug.system.errors import UsageError, printable
 
-from .batch import SEVERAL, batch_of_evaluations, for_each_scene
+from .batch import SEVERAL, batch_of_evaluations, for_each_scene, made_before
 from .console import FAILED, TERMINAL, out, print_json, say
 from .inputs import (
     SCENE_AND_CAMERAS,
@@ -44,13 +45,14 @@ def verb(*options: type[Options] | Option) -> Callable[[Callable[[Words], int]],
     options: single ones, and dataclasses of them; of two with one name the first counts.
     """
     stated: dict[str, Option] = {}
+    classes = [each for each in options if not isinstance(each, Option)]
     for each in options:
         for option in [each] if isinstance(each, Option) else options_of(each):
             stated.setdefault(option.name, option)
 
     def enter(run: Callable[[Words], int]) -> Callable[[Words], int]:
         name = run.__name__.replace("_", "-")
-        VERBS[name] = Command(name, run.__doc__ or "", list(stated.values()), run)
+        VERBS[name] = Command(name, run.__doc__ or "", list(stated.values()), classes, run)
         return run
 
     return enter
@@ -126,9 +128,8 @@ def lod(words: Words) -> int:
     Levels make small images faster and cleaner.  To keep every Gaussian, use convert or finetune.
     """
     if words.batch is not None:
-        return for_each_scene(
-            words, lambda own: ".ply" if own.of(verbs.LodOptions).single else "", lambda own: _lod(own)
-        )
+        suffix, resume = (lambda own: ".ply" if own.of(verbs.LodOptions).single else ""), words.resume
+        return for_each_scene(words, suffix, lambda own: _lod_of_batch(own, resume))
     facts = _lod(words)
     if words.json:
         print_json(facts)
@@ -142,6 +143,17 @@ def _lod(words: Words) -> dict[str, Any]:
     levels = aaplug.lod(scene, cameras, words.output, **told(words, verbs.LodOptions))
     made = [{"rate": level.rate, "gaussians": len(level.scene)} for level in levels]
     return {"output": str(words.output), "gaussians": scene.count, "levels": made}
+
+
+def _lod_of_batch(own: Words, resume: bool) -> dict[str, Any]:
+    """One scene of a batch; `resume` leaves out levels that are there."""
+    from aaplug.io.scenes.pyramid_folder import is_pyramid, read_manifest
+    from aaplug.verbs.lod import DEFAULT_LEVELS
+
+    resume = resume and is_pyramid(own.output)
+    if resume and len(read_manifest(own.output).levels) > (own.levels or DEFAULT_LEVELS):
+        return made_before(own)
+    return _lod(own.where(resume=resume))
 
 
 @verb(
@@ -232,6 +244,14 @@ def video(words: Words) -> int:
     return 0
 
 
+@dataclass(frozen=True, kw_only=True)
+class GuardOptions(Options):
+    """A guard for pipelines."""
+
+    fail_under: Annotated[float | None, number(0, 200, unit="dB"), UNSET, REPORT] = None
+    """Exit with 1 if the mean PSNR of a scene at any scale is below so many dB: --fail-under 40dB."""
+
+
 @verb(
     Option(
         "scenes",
@@ -248,12 +268,7 @@ def video(words: Words) -> int:
     CameraOptions,
     output("FOLDER", "Folder for compare.json, compare.csv, report.html and contact-sheet.png.", None),
     verbs.CompareOptions,
-    Option(
-        "fail_under",
-        Annotated[float | None, number(0, 200, unit="dB"), UNSET, REPORT],
-        "Exit with 1 if the mean PSNR of a scene at any scale is below so many dB: --fail-under 40dB.",
-        None,
-    ),
+    GuardOptions,
     FileOptions,
     Orbit,
     json_of("compare.json instead of the tables"),
@@ -295,7 +310,8 @@ def compare(words: Words) -> int:
 def info(words: Words) -> int:
     """Tell about a scene: its convention and why, what is fused, what is odd.
 
-    With cameras it tells how finely they sample the scene.
+    With cameras it tells how finely they sample the scene.  To see the scene, use view; to measure images of it,
+    evaluate.
     """
     if words.limits:
         return _show_limits(words.json)
@@ -357,7 +373,10 @@ def _show_limits(as_json: bool) -> int:
     Option("overwrite", bool, "Replace the files of an earlier demo.", False),
 )
 def demo(words: Words) -> int:
-    """Convert, render and measure the bundled scene: a pretrained chair and four photographs."""
+    """Convert, render and measure the bundled scene: a pretrained chair and four photographs.
+
+    To try the installation.  For a scene of your own, use render, convert or evaluate.
+    """
     from aaplug.evaluation.results import tables
     from aaplug.verbs.demo import SHEET
 
@@ -368,7 +387,10 @@ def demo(words: Words) -> int:
 
 @verb(*SCENE_AND_CAMERAS, verbs.LiveOptions)
 def view(words: Words) -> int:
-    """Look at a scene live in the browser, classic 3DGS beside aaplug; without SCENE at the bundled sample."""
+    """Look at a scene live in the browser, classic 3DGS beside aaplug; without SCENE at the bundled sample.
+
+    To write images, use render; for a moving camera, video.
+    """
     scene = cameras = None
     if words.scene is not None or words.model_path is not None:
         scene, cameras = read_inputs(words)
@@ -393,7 +415,10 @@ def view(words: Words) -> int:
     json_of("where the kernels are as one JSON object"),
 )
 def warmup(words: Words) -> int:
-    """Compile the fast rasterizer once for this machine (two to three minutes)."""
+    """Compile the fast rasterizer once for this machine (two to three minutes).
+
+    The other verbs work without it, only slower.  To measure how fast it is, use bench.
+    """
     kernels = aaplug.warmup(words.recipe, monitor=TERMINAL)
     say(f"{len(kernels.names)} kernels in {kernels.folder}")
     if words.json:
@@ -406,7 +431,10 @@ def warmup(words: Words) -> int:
     json_of("a list of objects, laws and problems"),
 )
 def check_plugin(words: Words) -> int:
-    """Check what a package adds: filters, kernels, rasterizers, recipes, metrics and formats by their laws."""
+    """Check what a package adds: filters, kernels, rasterizers, recipes, metrics and formats by their laws.
+
+    While writing a plug-in.  To measure how good the recipes that it adds are, use evaluate.
+    """
     verdicts = aaplug.check_plugin(words.module, monitor=TERMINAL)
     if words.json:
         print_json([verdict._asdict() for verdict in verdicts])
@@ -419,7 +447,10 @@ def check_plugin(words: Words) -> int:
 
 @verb(*SCENE_AND_CAMERAS, verbs.BenchOptions, json_of('one JSON object: the figures, or {"runs": [...]} of several'))
 def bench(words: Words) -> int:
-    """Time the rasterizer on synthetic scenes, or on SCENE with --cameras (its first training view)."""
+    """Time the rasterizer on synthetic scenes, or on SCENE with --cameras (its first training view).
+
+    To measure how close images come to the truth, use evaluate; to compile the fast rasterizer, warmup.
+    """
     scene = cameras = None
     if words.scene is not None or words.model_path is not None:
         scene, cameras = read_inputs(words)

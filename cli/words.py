@@ -96,6 +96,12 @@ class Words:
         """The options of one dataclass; raises UsageError if one does not fit."""
         return options(**self.keywords(options))
 
+    def checked(self) -> "Words":
+        """These words, if each option and what is between them fits; raises UsageError."""
+        for options in self.command.classes:
+            self.of(options)
+        return self
+
     def where(self, **values: Any) -> "Words":
         """The same with other values."""
         parsed = self.parsed
@@ -118,11 +124,12 @@ class Words:
 
 @dataclass(frozen=True)
 class Command:
-    """A verb of the command line: its help, its options and what runs it."""
+    """A verb of the command line: its help, its options, the dataclasses that state most of them, and what runs it."""
 
     name: str
     help: str
     options: Sequence[Option]
+    classes: Sequence[type[Options]]
     run: Callable[[Words], int]
 
     @cached_property
@@ -216,8 +223,6 @@ def setting_words(name: str, value: Any) -> list[str]:
     """A setting of a batch file as words of the command line."""
     if name == "scene":
         return [str(value)]
-    if value is True:
-        return [_flag_of(name)]
     return [_flag_of(name), *map(str, value if isinstance(value, list) else [value])]
 
 

@@ -150,6 +150,7 @@ REFUSED = {
     "one name": ("[[scene]]\nscene = 'a.ply'\n[[scene]]\nscene = 'b/A.ply'", "name of its own"),
     "unknown": (SETTINGS.replace("scale", "scales"), "scales is no setting here; did you mean scale?"),
     "misfit": (SETTINGS.replace("[0.5]", "['big']"), "--scale: takes 0.001..64 ..., got big"),
+    "out of range": ("min-seen = 2" + SETTINGS, "at the top: --min-seen: takes 0..1, got 2"),
     "not here": (SETTINGS + "output = 'elsewhere'", "scene 'broken': output is no setting here"),
     "a choice": (SETTINGS + "truth = 'other'", "invalid choice 'other' for argument '--truth'"),
 }  # fmt: skip
@@ -260,7 +261,10 @@ cameras = "."
 
 @pytest.mark.parametrize(
     ("verb", "own", "outputs"),
-    [("convert", "variance = 0.1", ("scene.ply", "wide.ply")), ("lod --no-refine", "levels = 1", ("scene", "wide"))],
+    [
+        ("convert", "variance = 0.1", ("scene.ply", "wide.ply")),
+        ("lod --no-refine", "levels = 1\nrefine = true\nsteps = 0", ("scene", "wide")),
+    ],
 )
 def test_many_scenes_are_made_and_a_broken_one_is_named(batch, verb, own, outputs):
     Path("many.toml").write_text(MANY.format(own=own))
@@ -274,5 +278,20 @@ def test_many_scenes_are_made_and_a_broken_one_is_named(batch, verb, own, output
     assert json.loads(Path("out/batch.json").read_text())["scenes"] == found
     assert sorted(path.name for path in Path("out").iterdir()) == sorted(["batch.json", *outputs])
     assert batch(f"{verb} --batch many.toml -o out")[0] == 2  # nothing is replaced unasked
-    code, out, _ = batch(f"{verb} --batch many.toml -o out --keep --json")
+    code, out, _ = batch(f"{verb} --batch many.toml -o out --resume --json")
     assert [facts["status"] for facts in json.loads(out)["scenes"].values()] == ["kept", "kept", "failed"]
+
+
+def test_resuming_makes_the_levels_that_are_missing_and_single_scenes(batch):
+    Path("many.toml").write_text('[[scene]]\nscene = "scene.ply"\ncameras = "."\nrefine = false')
+    assert batch("lod --batch many.toml -o out --levels 2")[0] == 0
+    whole = {path.name: path.read_bytes() for path in Path("out/scene").iterdir()}
+    manifest = json.loads(whole["lod.json"])
+    manifest["levels"].pop()
+    Path("out/scene/lod.json").write_text(json.dumps(manifest))  # as a kill before the last level leaves it
+    code, out, err = batch("lod --batch many.toml -o out --levels 2 --resume --json")
+    assert (code, json.loads(out)["scenes"]["scene"]["status"]) == (0, "done")
+    assert "resumed: 1 levels are there" in err
+    assert {path.name: path.read_bytes() for path in Path("out/scene").iterdir()} == whole
+    assert batch("lod --batch many.toml -o light --simplify 0.5 --resume")[0] == 0
+    assert Path("light/scene.ply").is_file()

@@ -222,7 +222,7 @@ def test_a_scheduler_that_is_not_there_is_one_line(address, cli, monkeypatch):  
 
 
 def test_without_the_extra_its_name_is_told(cli, monkeypatch):  # noqa: F811
-    monkeypatch.setattr("aaplug.verbs.inputs.find_spec", lambda name: None)
+    monkeypatch.setattr("aaplug.rendering.job.find_spec", lambda name: None)
     code, _, err = cli("render scene.ply --cameras . -o out --rasterizer eager --scheduler local")
     assert code == 2
     assert err.endswith("error: --scheduler: needs the extra `cluster`: pip install 'aaplug[cluster]'\n")

@@ -5,11 +5,15 @@ import re
 from pathlib import Path
 
 import pytest
+from aaplug_cli.verbs import VERBS
 
 from tests.test_cli import cli, dataset  # noqa: F401  (fixtures)
 
 ROOT = Path(__file__).resolve().parents[1]
 FILES = [*sorted((ROOT / "aaplug" / "options").glob("*.py")), *sorted((ROOT / "cli").glob("*.py"))]
+
+
+HEADING = re.compile(r"^ ([a-z ]+?) +\n [-─]+ *$", re.MULTILINE)  # of a part of --help, where there is no terminal
 
 
 def helps(file: Path) -> list[str]:
@@ -37,6 +41,39 @@ def test_help_begins_with_examples(cli):  # noqa: F811
     _, out, _ = cli("--help")
     lines = [line.strip() for line in out.splitlines()]
     assert "aaplug convert scene.ply --cameras path/to/colmap -o converted.ply" in lines
+
+
+def test_help_lists_each_verb_with_its_first_line_only(cli):  # noqa: F811
+    listed = " ".join(cli("--help")[1].split())
+    for name, command in VERBS.items():
+        first, *rest = command.help.split("\n\n")
+        assert f"• {name} {first}" in listed
+        assert not any(" ".join(text.split()) in listed for text in rest)
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_help_of_a_verb_opens_with_when_to_use_it_and_when_another(cli, verb):  # noqa: F811
+    usage, about = HEADING.split(cli(f"{verb} --help")[1])[0].strip().split("\n", 1)
+    assert usage.startswith(f"usage: aaplug {verb} ")
+    first, when = about.strip().split("\n\n")
+    assert first == VERBS[verb].help.splitlines()[0]
+    assert any(re.search(rf"\b{other}\b", when) for other in VERBS if other != verb), when
+
+
+def test_render_shows_few_options_before_those_with_a_heading(cli):  # noqa: F811
+    text = HEADING.split(cli("render --help")[1])
+    headings, options = text[1::2], re.findall(r"^ {1,2}(-\w|--[a-z-]+|[A-Z]+)\b", "".join(text[2:6:2]), re.MULTILINE)
+    assert headings[:3] == ["positional arguments", "options", "scene file options"]
+    assert {"SCENE", "-h", "-o", "--cameras", "--scale"} <= set(options)
+    assert len(options) <= 15
+
+
+def test_a_mistyped_verb_is_answered_with_the_one_that_was_meant(cli):  # noqa: F811
+    code, _, err = cli("evaluat scene.ply")
+    assert (code, err) == (
+        2,
+        "error: aaplug: there is no verb 'evaluat'; did you mean evaluate?; see `aaplug --help`\n",
+    )
 
 
 def test_only_a_video_has_a_path_file(cli):  # noqa: F811

@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 import pytest
-from aaplug_cli.main import VERBS, _verb, main
+from aaplug_cli.main import main
+from aaplug_cli.verbs import VERBS
 
 from aaplug.options.base import Options
 from aaplug.system.errors import UsageError
@@ -14,29 +15,23 @@ from aaplug.system.errors import UsageError
 NO_NUMBERS = (math.nan, math.inf, -math.inf, -1, 10**30, True, "", "x" * 10_000)
 
 
-def groups(noun: type) -> set[type[Options]]:
-    """The option classes inside a verb's."""
-    found = {noun} if issubclass(noun, Options) else set()
-    for hint in get_type_hints(noun).values():
-        if dataclasses.is_dataclass(hint) and isinstance(hint, type):
-            found |= groups(hint)
-    return found
+def range_of(hint: Any) -> list[Any]:
+    """The ranges that an annotation states: one for a number, none for others."""
+    return [part for part in getattr(hint, "__metadata__", ()) if hasattr(part, "is_instance")]
 
 
-ALL = sorted({group for verb in VERBS for group in groups(_verb(verb))}, key=lambda c: c.__name__)
+def numeric(hint: Any) -> bool:
+    return hint in (int, float) or any(numeric(arg) for arg in get_args(hint) if not isinstance(arg, (int, str)))
 
 
-def numbers(group: type[Options]) -> dict[str, Any]:
-    """The options of a class that take numbers, with their annotations' metadata."""
-    hints, plain = get_type_hints(group, include_extras=True), get_type_hints(group)
-
-    def numeric(hint: Any) -> bool:
-        return hint in (int, float) or any(numeric(arg) for arg in get_args(hint) if not isinstance(arg, (int, str)))
-
+def numbers(options: type[Options]) -> dict[str, list[Any]]:
+    """The options of a class that take numbers, with their ranges."""
+    hints, plain = get_type_hints(options, include_extras=True), get_type_hints(options)
     named = [n for n, hint in plain.items() if numeric(hint) and n != "background"]  # a colour or a name
-    return {name: [m for m in getattr(hints[name], "__metadata__", ()) if hasattr(m, "is_instance")] for name in named}
+    return {name: range_of(hints[name]) for name in named}
 
 
+ALL = sorted({group for verb in VERBS.values() for group in verb.classes}, key=lambda c: c.__name__)
 NUMERIC = [(group, name, specs) for group in ALL for name, specs in numbers(group).items()]
 IDS = [f"{group.__name__}.{name}" for group, name, _ in NUMERIC]
 
@@ -49,7 +44,7 @@ def test_the_options_are_found():
 def test_every_number_has_a_range(group, name, specs):
     assert len(specs) == 1, f"{group.__name__}.{name} has no range"
     (spec,) = specs
-    least, most = map(float, spec.metavar.removesuffix(" ...").split(".."))
+    least, most = map(float, spec.range_text.removesuffix(" ...").split(".."))
     several = spec.nargs == "*"
     for value in NO_NUMBERS:
         inside = isinstance(value, (int, float)) and value is not True and least <= value <= most
@@ -75,10 +70,13 @@ REFUSED = {
     "render s.ply -o out --threads 99999": "--threads: takes 1..",
     "finetune s.ply -o t.ply --scale 1,nan": "--scale: takes 0.001..64 ..., got 1.0, nan",
     "evaluate s.ply --scale": "--scale: takes 0.001..64 ..., got nothing",
+    "compare a.ply b.ply --fail-under 500": "--fail-under: takes 0..200, got 500",
     "bench --gaussians 1e5": "takes 1..100000000 ..., got 1e5",
     "bench --gaussians 10 --resolution 0x0": "--resolution: takes sizes such as 400x400, got 0x0",
     "bench --gaussians 10 --resolution 1000000x1000000": "the limit is 16384 a side",
-    "fly s.ply": "Unrecognized options: fly",
+    "fly s.ply": "there is no verb 'fly'; see `aaplug --help`",
+    "rendr s.ply": "there is no verb 'rendr'; did you mean render?",
+    "--colour": "Unrecognized options: --colour",
 }
 
 
@@ -99,6 +97,7 @@ def test_help_shows_every_range(verb, capsys):
     with pytest.raises(SystemExit):
         main([verb, "--help"])
     shown = "".join(capsys.readouterr().out.split())
-    for group in groups(_verb(verb)):
-        for name, (spec,) in numbers(group).items():
-            assert f"--{name.replace('_', '-')}{spec.metavar}".replace(" ", "") in shown
+    for option in VERBS[verb].options:
+        if numeric(get_args(option.annotation)[:1] and get_args(option.annotation)[0]):
+            (spec,) = range_of(option.annotation)
+            assert f"--{option.name.replace('_', '-')}{spec.metavar}".replace(" ", "") in shown
