@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from aaplug_cli.options import SceneOptions
+from aaplug_cli.main import main
 
 from aaplug.core.cameras import CameraSet
 from aaplug.core.colours import WHITE
@@ -14,9 +14,10 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.core.training import TrainingViews
 from aaplug.io.scenes import read_scene, write_scene
 from aaplug.io.scenes.packed import half_turn_about_x
-from aaplug.io.scenes.scene_file import SceneFile
+from aaplug.io.scenes.scene_file import Scene
 from aaplug.options.shared import Orbit
 from aaplug.rendering.agreement import Agreement, agreement, settled
+from aaplug.rendering.assumed import cameras_around
 from aaplug.rendering.renderer import own_look
 from aaplug.verbs.render import render
 from tests.conftest import make_camera, make_scene
@@ -67,8 +68,8 @@ def test_a_spz_is_read_as_fits_the_cameras(sample_scene, sample_cameras, tmp_pat
     write_scene(tmp_path / "a.spz", scene, spz_axes=axes)
     chosen = settled(read_scene(tmp_path / "a.spz"), sample_cameras)
     expected = read_scene(tmp_path / "a.spz", spz_axes=axes).gaussians()
-    assert torch.equal(chosen.whole().means, expected.means)
-    assert torch.equal(chosen.whole().sh, expected.sh)
+    assert torch.equal(chosen.gaussians().means, expected.means)
+    assert torch.equal(chosen.gaussians().sh, expected.sh)
 
 
 def test_assumed_cameras_decide_nothing(sample_scene, tmp_path: Path):
@@ -76,7 +77,7 @@ def test_assumed_cameras_decide_nothing(sample_scene, tmp_path: Path):
     write_scene(tmp_path / "a.spz", sample_scene[:100], spz_axes="opencv")
     opened = read_scene(tmp_path / "a.spz")
     assert opened.other is not None
-    assert settled(opened, Orbit().around(opened)) is opened
+    assert settled(opened, cameras_around(opened, Orbit())) is opened
 
 
 def test_of_two_readings_each_is_decoded_once_and_what_is_odd_is_said_once(sample_scene, sample_cameras, caplog):
@@ -84,19 +85,18 @@ def test_of_two_readings_each_is_decoded_once_and_what_is_odd_is_said_once(sampl
     scene.means[0], scene.sh[1] = torch.nan, 1e5
     decoded = []
 
-    def reading(turned: bool, **other) -> SceneFile:
+    def reading(turned: bool, **other) -> Scene:
         def load(start: int, stop: int) -> Gaussians:
             decoded.append(turned)
             return (half_turn_about_x(scene) if turned else scene)[start:stop]
 
-        return SceneFile(
-            Path("a.spz"), "spz", len(scene), 3, load, "", notes=("turned" if turned else "stored",), **other
-        )
+        notes = ("turned" if turned else "stored",)
+        return Scene(Path("a.spz"), "spz", len(scene), 3, load, "", notes=notes, drop_bad=True, **other)
 
     with caplog.at_level(logging.WARNING, "aaplug"):
         chosen = settled(reading(True, other=reading(False)), sample_cameras)
         assert caplog.messages == []
-        assert torch.equal(chosen.whole(drop_bad=True).means, scene.means[1:])
+        assert torch.equal(chosen.gaussians().means, scene.means[1:])
     assert sorted(decoded) == [False, True]
     assert [("left out" in said, "a harmonic beyond" in said) for said in caplog.messages] == [(0, 1), (1, 0)]
     assert chosen.other is None
@@ -106,8 +106,9 @@ def test_a_reading_that_the_cameras_may_change_is_told_as_such(sample_scene, tmp
     pytest.importorskip("gsply")
     write_scene(tmp_path / "a.spz", sample_scene[:100], spz_axes="opencv")
     for axes, provisional in (("auto", True), ("opencv", False)):
-        SceneOptions(scene=tmp_path / "a.spz", spz_axes=axes).open()
-        told = [line for line in capsys.readouterr().err.splitlines() if "axes" in line]
+        with pytest.raises(SystemExit):
+            main(["info", str(tmp_path / "a.spz"), "--spz-axes", axes])
+        told = [line for line in capsys.readouterr().err.splitlines() if line.startswith("scene: ") and "axes" in line]
         assert [line.startswith("scene: unless the cameras tell otherwise, ") for line in told] == [provisional]
 
 
@@ -115,4 +116,4 @@ def test_without_evidence_a_spz_follows_its_specification(sample_scene, sample_c
     pytest.importorskip("gsply")
     write_scene(tmp_path / "a.spz", sample_scene[:100], spz_axes="opencv")
     chosen = settled(read_scene(tmp_path / "a.spz"), without_photos(sample_cameras))
-    assert torch.equal(chosen.whole().means, read_scene(tmp_path / "a.spz", spz_axes="opengl").gaussians().means)
+    assert torch.equal(chosen.gaussians().means, read_scene(tmp_path / "a.spz", spz_axes="opengl").gaussians().means)

@@ -12,6 +12,7 @@ from aaplug.core.gaussians import Origin
 from aaplug.core.orbits import frame_of
 from aaplug.core.pyramids import Cutter, Pyramid
 from aaplug.core.training import TrainingViews
+from aaplug.io.scenes import read_scene, scene_of, write_scene
 from tests.conftest import make_camera, make_scene, make_splats, sized
 
 VIEWS = make_camera(), make_camera((3.0, -2.0, 1.0), name="other")
@@ -44,3 +45,27 @@ def test_cameras_are_equal_by_value(field):
     assert CameraSet((view,), ()) != CameraSet((changed,), ())
     assert view == replace(view, cam_from_world=view.cam_from_world.clone())
     assert view != "view"
+
+
+@pytest.mark.parametrize("copied", COPIES.values(), ids=COPIES)
+@pytest.mark.parametrize("held", [SCENE, PYRAMID, "file"], ids=["Gaussians", "levels", "file"])
+def test_a_copy_of_a_scene_holds_its_rows_and_equals_itself_alone(held, copied, tmp_path):
+    path = tmp_path / "scene.ply"
+    if held == "file":
+        write_scene(path, make_scene(6))
+        held = path
+    digest, scene = scene_of(held).digest, scene_of(held)
+    other = copied(scene)
+    path.unlink(missing_ok=True)  # a copy does not read it
+    assert (other.title, other.count, other.digest) == (scene.title, 6, digest)
+    assert (other.levels is None) == (held is not PYRAMID)
+    assert scene == scene != other
+    assert len({scene, other}) == 2
+
+
+def test_two_openings_of_a_file_are_two_scenes(tmp_path):
+    write_scene(tmp_path / "scene.ply", make_scene(6))
+    first, second = (read_scene(tmp_path / "scene.ply") for _ in range(2))
+    assert first != second
+    assert first.digest == second.digest
+    assert first.gaussians() is first.gaussians(), "rows are read once"

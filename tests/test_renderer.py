@@ -1,5 +1,8 @@
 """The renderer: how it is prepared, and what recipes promise about the training size, energy and samples."""
 
+import ast
+import copy
+import itertools
 import pickle
 from dataclasses import replace
 
@@ -14,15 +17,18 @@ from aaplug.core.imaging import average_samples, box_average
 from aaplug.core.projection import project
 from aaplug.core.splats import Render
 from aaplug.core.training import TrainingViews
+from aaplug.io.cameras import read_cameras
+from aaplug.io.scenes import read_scene
 from aaplug.methods import QUALITIES, RECIPES
 from aaplug.methods.filters.smoothing import Smoothing3D, fuse_stored
 from aaplug.methods.pixel_kernels.surfel import SURFEL
-from aaplug.methods.recipes import NEIGHBOURS, find_recipe, suited
+from aaplug.methods.presets import NEIGHBOURS
+from aaplug.methods.recipes import find_recipe, suited
 from aaplug.rasterizers import RASTERIZERS
 from aaplug.rendering import renderer as rendering
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import FrameError, UsageError
-from tests.conftest import make_camera, make_scene
+from tests.conftest import ROOT, make_camera, make_scene
 
 REFERENCE = RASTERIZERS["reference"]
 OWN_RECIPE = dict(
@@ -150,6 +156,59 @@ def test_a_renderer_can_be_sent_to_another_process(cameras):
     assert again(cameras[0]).rgb.equal(renderer(cameras[0]).rgb)
 
 
+def test_paths_are_read(sample_folder, sample_cameras):
+    scene, view = sample_folder / "chair.ply", sample_cameras.test[0].scaled(0.125)
+    by_path, by_hand = (
+        Renderer.of(*pair, rasterizer="eager")
+        for pair in ((scene, str(sample_folder)), (read_scene(scene), read_cameras(sample_folder)))
+    )
+    assert by_path.recipe == by_hand.recipe
+    assert by_path.background == by_hand.background
+    assert all(a.equal(b) for a, b in zip(by_path.scene.columns.values(), by_hand.scene.columns.values(), strict=True))
+    assert by_path.training.bounds.highest.equal(by_hand.training.bounds.highest)
+    assert by_path(view).rgb.equal(by_hand(view).rgb)
+
+
+def test_a_world_filter_follows_the_training_rate(cameras):
+    scene, view = make_scene(200), cameras[0].scaled(0.5)
+    renderer = Renderer.of(scene, cameras, "mip-splatting", rasterizer="eager")
+    finer = renderer.trained_at(2.0)
+    anew = Renderer.of(scene, TrainingViews.of(scene, cameras).finer(2.0), "mip-splatting", rasterizer="eager")
+    assert finer.scene.log_scales.equal(anew.scene.log_scales)
+    assert finer(view).rgb.equal(anew(view).rgb)
+    rates_alone = replace(renderer, training=renderer.training.finer(2.0))
+    assert (finer(view).rgb - rates_alone(view).rgb).abs().max() > 0.01
+    assert renderer.trained_at(1.0)(view).rgb.equal(renderer(view).rgb)
+
+
+def test_by_another_recipe_the_scene_is_prepared_anew(cameras):
+    scene = make_scene(200)
+    filtered = Renderer.of(scene, cameras, "mip-splatting", rasterizer="eager", background="white")
+    plain = filtered.by(RECIPES["classic"])
+    assert plain.scene.log_scales.equal(scene.log_scales)
+    assert plain.background == WHITE
+    assert plain.by(filtered.recipe).scene.log_scales.equal(filtered.scene.log_scales)
+
+
+def test_recipes_are_compared_without_an_error():
+    for name, other in itertools.product(RECIPES, repeat=2):
+        assert (RECIPES[name] == RECIPES[other]) == (name == other)
+    for name in RECIPES:
+        assert copy.deepcopy(RECIPES[name]).digest == RECIPES[name].digest
+
+
+def test_one_place_calls_the_rasterizer():
+    """A rasterizer takes a recipe's pixel kernel and its compositor."""
+    calls = [
+        f"{path.stem}: {ast.unparse(call.func)}"
+        for path in sorted((ROOT / "aaplug").rglob("*.py"))
+        for call in ast.walk(ast.parse(path.read_text()))
+        if isinstance(call, ast.Call)
+        and {"pixel", "compositor"} <= {argument.attr for argument in call.args if isinstance(argument, ast.Attribute)}
+    ]
+    assert calls == ["renderer: self.rasterizer"]
+
+
 def test_a_drawing_holds_the_splats_of_the_image_that_has_the_samples(cameras):
     renderer = Renderer.of(make_scene(50), cameras, quality="best", rasterizer="eager")
     view = cameras[0].scaled(0.5)
@@ -165,7 +224,7 @@ def test_a_drawing_holds_the_splats_of_the_image_that_has_the_samples(cameras):
 def test_scenes_are_projected_in_chunks_without_a_change(cameras, monkeypatch):
     renderer = Renderer.of(make_scene(200), cameras, rasterizer="eager")
     whole = renderer(cameras[0]).rgb
-    monkeypatch.setattr(rendering, "CHUNK", 33)
+    monkeypatch.setattr(rendering, "GAUSSIANS_AT_ONCE", 33)
     torch.testing.assert_close(renderer(cameras[0]).rgb, whole, rtol=0, atol=1e-6)
 
 
@@ -181,7 +240,7 @@ def test_gradients_are_made_at_once_because_each_part_would_take_a_scene(cameras
     scene = make_scene(200)
     scene = replace(scene, means=scene.means.requires_grad_())
     renderer, seen = Renderer.of(scene, cameras, rasterizer="eager"), []
-    monkeypatch.setattr(rendering, "CHUNK", 33)
+    monkeypatch.setattr(rendering, "GAUSSIANS_AT_ONCE", 33)
     monkeypatch.setattr(rendering, "project", lambda part, *rest: seen.append(len(part)) or project(part, *rest))
     renderer(cameras[0])
     assert seen == [200]
