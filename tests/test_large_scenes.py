@@ -1,5 +1,6 @@
 """Scenes whose harmonics stay in their file are drawn as those held in memory."""
 
+import pickle
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,12 +9,12 @@ import torch
 
 from aaplug.core.gaussians import Gaussians
 from aaplug.io.images import read_image
-from aaplug.io.scenes import read_scene, write_scene
+from aaplug.io.scenes import harmonics, read_scene, write_scene
 from aaplug.io.scenes.harmonics import without_harmonics
+from aaplug.io.scenes.scene_file import Scene
 from aaplug.rendering import renderer as rendering
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import FormatError
-from aaplug.verbs import inputs
 from aaplug.verbs.render import render
 from tests.conftest import make_camera, make_scene, memory_taken, needs_peak_memory
 
@@ -32,20 +33,26 @@ def written(folder: Path, count: int = 3000) -> tuple[Path, Gaussians]:
 
 @pytest.fixture
 def in_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rendering, "CHUNK", 700)
+    """Harmonics of any size stay in the file, and Gaussians are projected in chunks."""
+    monkeypatch.setattr(harmonics, "MAX_HARMONICS_BYTES", 0)
+    monkeypatch.setattr(rendering, "GAUSSIANS_AT_ONCE", 700)
+
+
+def both(path: Path, recipe: str, drop_bad: bool = False) -> tuple[Renderer, Renderer]:
+    """A renderer whose harmonics stay in the file, and one that holds them."""
+    read, held = (read_scene(path, drop_bad=drop_bad) for _ in range(2))
+    return Renderer.of(read, VIEWS, recipe), Renderer.of(held.gaussians(), VIEWS, recipe)
 
 
 @pytest.mark.usefixtures("in_chunks")
 @pytest.mark.parametrize("recipe", ["classic", "auto", "mip-splatting"])
 def test_images_are_the_same_to_the_bit(tmp_path: Path, recipe: str):
-    opened = read_scene(written(tmp_path)[0])
-    held = Renderer.of(opened.whole(), VIEWS, recipe)
-    scene, harmonics = without_harmonics(opened)
-    read = replace(Renderer.of(scene, VIEWS, recipe), harmonics=harmonics)
-    assert scene.sh.shape == held.scene.sh.shape
-    assert scene.sh.isnan().all()
+    read, held = both(written(tmp_path)[0], recipe)
+    assert read.scene.sh.shape == held.scene.sh.shape
+    assert read.scene.sh.isnan().all()
     for view in VIEWS:
         assert torch.equal(read(view).rgb, held(view).rgb)
+        assert torch.equal(read.trained_at(2.0)(view).rgb, held.trained_at(2.0)(view).rgb)
 
 
 @pytest.mark.usefixtures("in_chunks")
@@ -54,22 +61,36 @@ def test_rows_that_are_left_out_shift_no_colours(tmp_path: Path):
     spoiled = scene.sh.clone()
     spoiled[[0, 5, 1999], 7, 1] = torch.inf
     write_scene(path, replace(scene, sh=spoiled), overwrite=True)
-    opened = read_scene(path)
     with pytest.raises(FormatError, match=r"scene\.ply: row 0 \(and 2 more\) has Inf in f_rest_21"):
-        without_harmonics(opened)
-    held = Renderer.of(opened.whole(drop_bad=True), VIEWS, "classic")
-    kept, harmonics = without_harmonics(opened, drop_bad=True)
-    assert torch.equal(torch.cat([harmonics(0, 1500), harmonics(1500, len(kept))]), held.scene.sh)
-    read = replace(Renderer.of(kept, VIEWS, "classic"), harmonics=harmonics)
+        without_harmonics(read_scene(path))
+    read, held = both(path, "classic", drop_bad=True)
+    assert torch.equal(torch.cat([read.harmonics(0, 1500), read.harmonics(1500, len(read.scene))]), held.scene.sh)
     assert torch.equal(read(VIEWS[0]).rgb, held(VIEWS[0]).rgb)
 
 
+@pytest.mark.usefixtures("in_chunks")
 def test_a_file_that_changes_is_noticed(tmp_path: Path):
     path, scene = written(tmp_path)
-    kept, harmonics = without_harmonics(read_scene(path))
+    renderer = Renderer.of(path, VIEWS, "classic")
     write_scene(path, scene[:2000], overwrite=True)
     with pytest.raises(FormatError, match="changed while it was being read"):
-        replace(Renderer.of(kept, VIEWS, "classic"), harmonics=harmonics)(VIEWS[0])
+        renderer(VIEWS[0])
+
+
+@pytest.mark.usefixtures("in_chunks")
+def test_another_process_reads_the_file_itself(tmp_path: Path):
+    renderer = Renderer.of(written(tmp_path)[0], VIEWS, "classic").portable()
+    sent = pickle.dumps(renderer)
+    assert len(sent) < A_GAUSSIAN * len(renderer.scene)
+    assert torch.equal(pickle.loads(sent)(VIEWS[0]).rgb, renderer(VIEWS[0]).rgb)
+
+
+def test_gaussians_that_were_read_anyway_are_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(harmonics, "MAX_HARMONICS_BYTES", 0)
+    scene = read_scene(written(tmp_path)[0])
+    assert without_harmonics(scene) is without_harmonics(scene), "it is read once"
+    scene.gaussians()
+    assert without_harmonics(scene) == (scene.gaussians(), None)
 
 
 def test_the_command_draws_a_large_scene_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sample_folder: Path):
@@ -77,24 +98,19 @@ def test_the_command_draws_a_large_scene_so(tmp_path: Path, monkeypatch: pytest.
         chair, one = sample_folder / "chair.ply", {"views": "test", "scale": 1 / 8, "threads": 1}
         return [read_image(file) for _, file in render(chair, sample_folder, tmp_path / folder, **one)]
 
-    held = images("held")
-    asked: list[object] = []
-
-    def asking(*args: object) -> tuple[Gaussians, object]:
-        asked.append(args)
-        return without_harmonics(*args)
-
-    monkeypatch.setattr(inputs, "without_harmonics", asking)
-    monkeypatch.setattr(inputs, "HELD_HARMONICS", 0)
-    assert all(torch.equal(a, b) for a, b in zip(images("read"), held, strict=True))
-    assert asked
+    expected = images("held")
+    monkeypatch.setattr(harmonics, "MAX_HARMONICS_BYTES", 0)
+    monkeypatch.setattr(Scene, "gaussians", lambda scene: pytest.fail("all of the scene is read"))
+    assert all(torch.equal(a, b) for a, b in zip(images("read"), expected, strict=True))
 
 
 MADE = """
 from pathlib import Path
-from aaplug.io.scenes import read_scene, write_scene
+from aaplug.io.scenes import harmonics, read_scene, write_scene
+from aaplug.io.scenes import harmonics
 from aaplug.io.scenes.harmonics import without_harmonics
 from tests.conftest import make_scene
+harmonics.MAX_HARMONICS_BYTES = 0
 path = Path({path!r})
 without_harmonics(read_scene(path))
 path = path.with_name("large.ply")

@@ -50,12 +50,13 @@ def cameras_around(scene: Scene, orbit: Orbit, single: bool = False) -> CameraSe
         orbit = replace(orbit, orbit=1)
     sample = scene.sample(PROBE_ROWS)
     frame = frame_around(scene, orbit, sample)
-    train, reason = _assumed_training(orbit, frame, sample, scene.path)
+    path = next(iter(scene.files), None)
+    train, reason = _assumed_training(orbit, frame, sample, path)
     cameras = CameraSet(train, _orbit_views(orbit, frame, train[0]), assumed=True)
     size, rate = f"{train[0].width}x{train[0].height}", rate_of(cameras, frame)
     note = f"{TRAINING_RATE}assumed as of {size} px from the orbit, {rate:.4g} px per unit in its middle ({reason})"
-    if scene.path is not None and holds_cameras(scene.path.parent):
-        return replace(cameras, notes=(note, f"there are cameras: --cameras {scene.path.parent}"))
+    if path is not None and holds_cameras(path.parent):
+        return replace(cameras, notes=(note, f"there are cameras: --cameras {path.parent}"))
     return replace(cameras, notes=(note,))
 
 

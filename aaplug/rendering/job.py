@@ -24,6 +24,7 @@ from aaplug.io.atomic import writing
 from aaplug.io.cameras import read_cameras, select_views
 from aaplug.io.limits import lack_of_memory
 from aaplug.io.scenes import SceneLike, scene_of
+from aaplug.io.scenes.harmonics import without_harmonics
 from aaplug.io.scenes.scene_file import Scene
 from aaplug.methods import RECIPES
 from aaplug.methods.recipe import Recipe
@@ -118,7 +119,8 @@ class Job(Generic[O_co]):
     def training(self: "Job[ViewOptions]", scene: Scene) -> TrainingViews:
         """The training views of a scene; raises FrameError as `TrainingViews.of`."""
         options = self.options
-        return TrainingViews.of(scene.gaussians(), self.cameras, options.cull_margin, options.min_seen)
+        gaussians, _ = without_harmonics(scene)
+        return TrainingViews.of(gaussians, self.cameras, options.cull_margin, options.min_seen)
 
     def recipe(self: "Job[RecipeOptions]", recipe: str | Recipe) -> Recipe:
         """A recipe as it is, or by name as the options say; the rate reference goes to those that compare rates."""

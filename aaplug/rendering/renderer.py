@@ -143,7 +143,7 @@ class Renderer:
         if self.recipe.world is None:
             return replace(self, training=training, cutter=cutter)
         assert self.source is not None
-        raw = self.source.gaussians() if self.cutter is None else self.cutter.pyramid.scene
+        raw = without_harmonics(self.source)[0] if self.cutter is None else self.cutter.pyramid.scene
         return replace(self, scene=_filtered(raw, training, self.recipe), training=training, cutter=cutter)
 
     def showing(self, scene: Gaussians) -> "Renderer":

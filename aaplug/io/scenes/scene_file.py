@@ -58,6 +58,7 @@ class Scene:
     other: the same file read in another way, where it does not say which is right; its last note says how.
     folder: of the levels of detail whose finest this is; else None.  read_levels: reads all of them.
     drop_bad: rows that cannot be used are left out, instead of raising FormatError.
+    memory: what was read of it, by name: each part is read once.
     """
 
     path: Path | None
@@ -75,7 +76,7 @@ class Scene:
     folder: Path | None = None
     read_levels: Callable[[Path], Pyramid] | None = None
     drop_bad: bool = False
-    _memory: dict[str, Any] = field(default_factory=dict, init=False, repr=False)  # Gaussians and levels, once read
+    memory: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
 
     @classmethod
     def in_memory(cls, held: Gaussians | Pyramid) -> "Scene":
@@ -94,7 +95,7 @@ class Scene:
             flat=finest.flat,
             document=None if origin is None else origin.document,
         )
-        scene._memory.update(gaussians=finest, levels=levels)
+        scene.memory.update(gaussians=finest, levels=levels)
         return scene
 
     def __getstate__(self) -> dict[str, Any]:
@@ -105,7 +106,7 @@ class Scene:
     @property
     def name(self) -> str:
         """For messages: the file, or "scene"."""
-        return str(self.path) if self.path is not None else self._memory["gaussians"].name
+        return str(self.path) if self.path is not None else self.memory["gaussians"].name
 
     @property
     def title(self) -> str:
@@ -129,7 +130,7 @@ class Scene:
 
     @property
     def _source(self) -> Path | None:
-        origin = None if self.path is not None else self._memory["gaussians"].origin
+        origin = None if self.path is not None else self.memory["gaussians"].origin
         return self.path if origin is None else Path(origin.path)
 
     @property
@@ -161,9 +162,9 @@ class Scene:
     @property
     def levels(self) -> Pyramid | None:
         """All levels of detail, read once; None if there is but one.  Raises FormatError if a level is broken."""
-        if "levels" not in self._memory:
-            self._memory["levels"] = self.folder and self.read_levels and self.read_levels(self.folder)
-        return self._memory["levels"]
+        if "levels" not in self.memory:
+            self.memory["levels"] = self.folder and self.read_levels and self.read_levels(self.folder)
+        return self.memory["levels"]
 
     def gaussians(self) -> Gaussians:
         """All Gaussians, read once; of levels of detail the finest.
@@ -172,10 +173,10 @@ class Scene:
             FormatError: a row cannot be used and `drop_bad` is false, the file breaks its format, or it takes more
                 than the limit MEMORY_SHARE of the machine's memory.
         """
-        if "gaussians" not in self._memory:
+        if "gaussians" not in self.memory:
             self.check_memory()
-            [self._memory["gaussians"]] = self.parts(max(1, self.count))
-        return self._memory["gaussians"]
+            [self.memory["gaussians"]] = self.parts(max(1, self.count))
+        return self.memory["gaussians"]
 
     @property
     def digest(self) -> str:
