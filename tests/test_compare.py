@@ -19,8 +19,9 @@ from aaplug.evaluation.journal import Journal
 from aaplug.evaluation.report.contact_sheet import ERROR_FULL, HEAT, error_map
 from aaplug.io.cameras import read_cameras
 from aaplug.io.images import image_size
-from aaplug.io.scenes import bytes_of, read_scene, write_scene
+from aaplug.io.scenes import read_scene, write_scene
 from aaplug.io.scenes.packed import half_turn_about_x
+from aaplug.io.scenes.scene_file import Scene
 from aaplug.system.errors import AaplugError, FrameError, UsageError
 from aaplug.system.executors import ProcessesIfLong
 from tests.conftest import make_scene
@@ -258,12 +259,8 @@ def test_the_library_refuses_the_same():
 
 
 def test_files_and_a_continued_run(cli, monkeypatch):  # noqa: F811
-    write_scene(
-        "dim.ply",
-        replace(
-            read_scene("scene.ply").gaussians(), logit_opacities=read_scene("scene.ply").gaussians().logit_opacities - 1
-        ),
-    )
+    scene = read_scene("scene.ply").gaussians()
+    write_scene("dim.ply", replace(scene, logit_opacities=scene.logit_opacities - 1))
     words = f"compare scene.ply dim.ply {WORDS} -o out --show 1"
     real, added = Journal.add, []
 
@@ -322,7 +319,9 @@ def test_what_goes_to_another_process_leaves_files_behind(cli, monkeypatch):  # 
 
 
 def test_bytes_of_a_folder_of_images_are_those_of_all(tmp_path):
+    scene = Scene(tmp_path / "meta.json", "sog", 0, 0, lambda start, stop: make_scene(0), "")
     for name, size in (("meta.json", 3), ("means.webp", 5)):
         (tmp_path / name).write_bytes(b"x" * size)
-    assert bytes_of(tmp_path / "meta.json") == bytes_of(tmp_path) == 8
-    assert bytes_of(tmp_path / "gone.ply") is None
+    assert scene.bytes == 8
+    assert replace(scene, path=tmp_path / "means.webp").bytes == 5
+    assert replace(scene, path=tmp_path / "gone.ply").bytes is None
