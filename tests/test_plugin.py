@@ -54,7 +54,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
 
 @pytest.fixture(scope="module")
 def finished(installed: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder in which one process with the plug-in has run the guide's commands, the laws among them, and `evaluate --help`."""
+    """The folder in which one process with the plug-in has run the guide's commands and `evaluate --help`."""
     folder = tmp_path_factory.mktemp("theirs")
     write_scene(folder / "scene.ply", few(read_scene(SAMPLE / "chair.ply").gaussians()))
     write_cameras(folder / "path" / "to" / "colmap")
