@@ -47,7 +47,7 @@ def batch_of_evaluations(words: Words) -> int:
         raise UsageError("output", "name a folder for the results of several scenes: -o FOLDER")
     from aaplug.rendering.job import running
 
-    options = first.of(EvaluateOptions)
+    options = EvaluateOptions(**told(first, EvaluateOptions))
 
     def run(own: Words, scheduler: Any, name: str, output: Path, **given: Any) -> Any:
         keywords = told(own, EvaluateOptions) | {"scheduler": scheduler, "name": name}

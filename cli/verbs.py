@@ -93,7 +93,7 @@ def convert(words: Words) -> int:
     Gaussians, use lod; to move the Gaussians until all sizes look right, finetune.
     """
     if words.batch is not None:
-        return for_each_scene(words, lambda own: ".ply", lambda own: _converted(own)[0])
+        return for_each_scene(words, lambda own: ".ply", _converted_facts)
     facts, result = _converted(words)
     from aaplug.evaluation.results import tables
     from aaplug.methods.conversion import fused_in
@@ -115,6 +115,10 @@ def _converted(words: Words) -> tuple[dict[str, Any], Any]:
     return {"output": str(words.output)} | result.as_json(), result
 
 
+def _converted_facts(words: Words) -> dict[str, Any]:
+    return _converted(words)[0]
+
+
 @verb(
     *SCENE_AND_CAMERAS,
     output("PATH", "The one scene's file (.ply, .spz or .splat), or a folder for levels (.ply) or, with --batch, all."),
@@ -128,8 +132,8 @@ def lod(words: Words) -> int:
     Levels make small images faster and cleaner.  To keep every Gaussian, use convert or finetune.
     """
     if words.batch is not None:
-        suffix, resume = (lambda own: ".ply" if own.of(verbs.LodOptions).single else ""), words.resume
-        return for_each_scene(words, suffix, lambda own: _lod_of_batch(own, resume))
+        work = partial(_lod_of_batch, resume=words.resume)
+        return for_each_scene(words, lambda own: ".ply" if own.of(verbs.LodOptions).single else "", work)
     facts = _lod(words)
     if words.json:
         print_json(facts)

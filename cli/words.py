@@ -76,12 +76,11 @@ def options_of(options: type[Options]) -> list[Option]:
 class Words:
     """The options that a command line, or a batch file, gives to a verb; each is an attribute."""
 
-    def __init__(self, command: "Command", parsed: Any):
-        self.command, self.parsed = command, parsed
-        self.values: dict[str, Any] = {}
-        for each in fields(parsed):
-            value = getattr(parsed, each.name)
-            self.values |= vars(value) if dataclasses.is_dataclass(value) else {each.name: value}
+    def __init__(self, command: "Command", values: Mapping[str, Any]):
+        self.command, self.values = command, dict(values)
+
+    def __reduce__(self) -> tuple[Any, tuple[str, dict[str, Any]]]:
+        return _words_of, (self.command.name, self.values)  # a worker of a cluster has a table of its own
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__") or name == "values":
@@ -104,10 +103,7 @@ class Words:
 
     def where(self, **values: Any) -> "Words":
         """The same with other values."""
-        parsed = self.parsed
-        for name, value in values.items():
-            parsed = _replaced(parsed, name, value)
-        return Words(self.command, parsed)
+        return Words(self.command, self.values | values)
 
     def given(self, options: type[Options]) -> list[str]:
         """The command line's words that give the options of one dataclass which are not as usual."""
@@ -156,10 +152,23 @@ class Command:
 
     def parse(self, words: Sequence[str], default: Words | None = None) -> Words:
         """Read words; raises UsageError if they do not fit.  default: has what they do not say."""
-        how = {} if default is None else {"default": default.parsed}
+        how = {} if default is None else {"default": self.filled(default.values)}
         program = f"aaplug {self.name}"
         with one_line(program):
-            return Words(self, tyro.cli(self.parser, prog=program, args=self.parted(words), config=CONFIG, **how))
+            parsed = tyro.cli(self.parser, prog=program, args=self.parted(words), config=CONFIG, **how)
+        values: dict[str, Any] = {}
+        for name, value in vars(parsed).items():
+            values |= vars(value) if dataclasses.is_dataclass(value) else {name: value}
+        return Words(self, values)
+
+    def filled(self, values: Mapping[str, Any]) -> Any:
+        """The parser's dataclass with these values."""
+
+        def fill(kind: Any) -> Any:
+            names = {each.name: each.default_factory for each in fields(kind)}  # of groups, their dataclasses
+            return kind(**{n: values[n] if n in values else fill(group) for n, group in names.items()})
+
+        return fill(self.parser)
 
     def parted(self, words: Sequence[str]) -> list[str]:
         """The words as the parser wants them.
@@ -239,9 +248,8 @@ def _default(each: dataclasses.Field[Any]) -> Any:
     return each.default_factory() if each.default_factory is not MISSING else each.default
 
 
-def _replaced(parsed: Any, name: str, value: Any) -> Any:
-    if name in {each.name for each in fields(parsed)}:
-        return dataclasses.replace(parsed, **{name: value})
-    groups: Mapping[str, Any] = {n: g for n, g in vars(parsed).items() if dataclasses.is_dataclass(g)}
-    [(title, group)] = [(n, g) for n, g in groups.items() if hasattr(g, name)]
-    return dataclasses.replace(parsed, **{title: dataclasses.replace(group, **{name: value})})
+def _words_of(verb: str, values: Mapping[str, Any]) -> Words:
+    """The words of a verb in the table, with these values."""
+    from .verbs import VERBS  # its modules import this one
+
+    return Words(VERBS[verb], values)
