@@ -4,12 +4,10 @@ import inspect
 import re
 import runpy
 import tomllib
-from importlib import import_module
 from pathlib import Path
 
 import pytest
-from aaplug_cli.main import VERBS
-from aaplug_cli.options import option_types
+from aaplug_cli.verbs import VERBS
 
 import aaplug
 from aaplug.system.errors import FrameError, UsageError
@@ -84,9 +82,8 @@ def test_an_option_that_is_none_is_refused_with_the_nearest_name():
 
 @pytest.mark.parametrize("verb", VERBS)
 def test_verbs_have_the_options_of_the_command_line(verb):
-    parameters = inspect.signature(getattr(aaplug, verb)).parameters
-    options = option_types(getattr(import_module(f"aaplug_cli.{verb}"), verb.capitalize()))
-    missing = parameters.keys() - options.keys() - {"monitor", "name"}
+    parameters = inspect.signature(getattr(aaplug, verb.replace("-", "_"))).parameters
+    missing = parameters.keys() - VERBS[verb].types.keys() - {"monitor", "name", "words"}
     assert not missing
     for name, parameter in parameters.items():
         keyword = parameter.kind is inspect.Parameter.KEYWORD_ONLY

@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
-from aaplug_cli.main import VERBS, main
+from aaplug_cli.main import main
+from aaplug_cli.verbs import VERBS
 from PIL import Image
 
 from aaplug.core.gaussians import Gaussians

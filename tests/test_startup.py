@@ -8,8 +8,8 @@ from dataclasses import replace
 from typing import get_args
 
 import pytest
-from aaplug_cli.main import VERBS
-from aaplug_cli.options import FileOptions
+from aaplug_cli.verbs import VERBS
+from aaplug_cli.inputs import FileOptions
 
 from aaplug.finetuning.losses import LOSSES
 from aaplug.finetuning.parameters import RATES

@@ -15,6 +15,7 @@ from aaplug.core.imaging import average_samples, box_average, quantised
 from aaplug.core.pyramids import Pyramid
 from aaplug.evaluation.metrics import psnr
 from aaplug.io.images import read_image, write_png
+from aaplug.io.scenes import scene_of
 from aaplug.live import pictures
 from aaplug.live.messages import PictureRequest, Side, StillRequest
 from aaplug.live.overlays import OVERLAYS
@@ -49,7 +50,8 @@ def seen(tmp_path_factory):
 @pytest.fixture
 def subject(seen):
     scene, cameras = seen
-    return Subject(scene, cameras, Renderer.of(scene, cameras, "matched", rasterizer="eager"), RECIPES, "a scene", ())
+    look = Renderer.of(scene, cameras, "matched", rasterizer="eager")
+    return Subject(scene_of(scene), cameras, look, RECIPES, "a scene", ())
 
 
 def a_request(subject: Subject, scale=0.5, **other) -> PictureRequest:
