@@ -23,6 +23,7 @@ from .rendering.renderer import Renderer as Renderer
 
 # the command line's verbs, each as one call
 from .options.shared import Orbit as Orbit
+from .rendering.assumed import cameras_around as cameras_around
 from .verbs.batch import batch as batch
 from .verbs.bench import bench as bench
 from .verbs.check_plugin import check_plugin as check_plugin

@@ -16,7 +16,7 @@ from aaplug.levels.covariances import covariances, outer
 from aaplug.methods.recipe import LevelChoice, Recipe
 from aaplug.methods.recipes import find_recipe
 from aaplug.rendering.renderer import Renderer, own_look
-from tests.bench.millions import PARTS, split
+from tests.bench.scenes import PARTS, split
 from tests.conftest import make_camera, make_scene
 
 VIEWS = tuple(make_camera(eye, (64, 48)) for eye in ((0.0, -4.0, 0.0), (3.0, -2.0, 1.0)))

@@ -8,16 +8,16 @@ from dataclasses import replace
 from typing import get_args
 
 import pytest
-from aaplug_cli.verbs import VERBS
 from aaplug_cli.inputs import FileOptions
+from aaplug_cli.verbs import VERBS
 
 from aaplug.finetuning.losses import LOSSES
 from aaplug.finetuning.parameters import RATES
 from aaplug.finetuning.settings import CONSISTENCY, CONSISTENCY_SETTINGS, settings_of
 from aaplug.methods import RECIPES
-from aaplug.options.verbs import FinetuneOptions, RenderOptions
+from aaplug.options.verbs import TUNED_PARAMETERS, FinetuneOptions, LossName, RenderOptions
 from aaplug.system.errors import UsageError
-from aaplug.system.registry import names_of
+from aaplug.system.registry import REGISTRIES, _at, names_of
 from tests.test_options import REFUSED
 
 SLOW = ["torch", "numpy", "cv2", "jaxtyping", "beartype", "scipy", "skimage", "matplotlib", "PIL", "av"]
@@ -98,9 +98,8 @@ def test_names_are_known_before_what_they_name(kind):
 
 
 def test_other_names_agree_with_what_they_name():
-    assert tuple(CONVENTIONS) == get_args(choices.ConventionName)
-    assert tuple(LOSSES) == get_args(choices.LossName)
-    assert tuple(RATES) == choices.PARAMETERS
+    assert tuple(LOSSES) == get_args(LossName)
+    assert tuple(RATES) == TUNED_PARAMETERS
     assert settings_of(CONSISTENCY, FinetuneOptions()) == CONSISTENCY_SETTINGS
 
 

@@ -18,6 +18,7 @@ from aaplug.core.orbits import orbit as orbit_views
 from aaplug.core.sampling import sampling_bounds
 from aaplug.io.cameras import holds_cameras
 from aaplug.io.cameras.cfg_args import CAPPED, DIVISORS, NAME, WIDTH_CAP, read_cfg_args
+from aaplug.io.scenes import SceneLike, scene_of
 from aaplug.io.scenes.ply import Document
 from aaplug.io.scenes.ply_tags import NERFSTUDIO
 from aaplug.io.scenes.scene_file import Scene
@@ -38,7 +39,7 @@ Z_UP = (0.0, 0.0, 1.0)  # nerfstudio turns its scenes so
 TRAINING_RATE = "training rate: "  # how the note begins
 
 
-def cameras_around(scene: Scene, orbit: Orbit, single: bool = False) -> CameraSet:
+def cameras_around(scene: SceneLike, orbit: Orbit, single: bool = False) -> CameraSet:
     """Cameras for a scene without any: the assumed training views, and as test views those that an orbit shows.
 
     single: show one view, unless the orbit says how many.
@@ -48,6 +49,7 @@ def cameras_around(scene: Scene, orbit: Orbit, single: bool = False) -> CameraSe
     """
     if single and orbit.orbit is None and orbit.eye is None:
         orbit = replace(orbit, orbit=1)
+    scene = scene_of(scene)
     sample = scene.sample(PROBE_ROWS)
     frame = frame_around(scene, orbit, sample)
     path = next(iter(scene.files), None)

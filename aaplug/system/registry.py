@@ -167,7 +167,7 @@ def unknown(name: str, names: Collection[str]) -> str:
     return not_one_of(name, names) + hint
 
 
-def registry_of(kind: str) -> Registry[Any]:
+def registry_of(kind: str) -> Any:  # a run-time check of a registry would load its entries
     """The registry of a kind."""
     return _at(REGISTRIES[kind])
 
