@@ -51,7 +51,8 @@ def batch_of_evaluations(words: Words) -> int:
 
     def run(own: Words, scheduler: Any, name: str, output: Path, **given: Any) -> Any:
         keywords = told(own, EvaluateOptions) | {"scheduler": scheduler, "name": name}
-        return aaplug.evaluate(*read_inputs(own), output, **keywords | given)
+        inputs = read_inputs(own)
+        return aaplug.evaluate(*inputs, output, **keywords | given)
 
     with running(options, None, lambda: None, shared=first.output) as workers:
         runs = [(name, partial(run, own, workers.cluster)) for name, own in scenes]

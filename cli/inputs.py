@@ -76,11 +76,12 @@ def path_of(words: Words) -> Path:
 
 def open_scene(words: Words, path: Path | None = None) -> "Scene":
     """Open the scene that the words name, or one at a path, and say what it is."""
+    path = path or path_of(words)
     from aaplug.methods.conversion import describe
 
-    files = words.of(FileOptions if path else SceneOptions)
+    files = words.of(SceneOptions if "scene" in words.values else FileOptions)
     scene = aaplug.read_scene(
-        path or path_of(words),
+        path,
         iteration=files.iteration if isinstance(files, SceneOptions) else None,
         convention=None if files.convention is None else CONVENTIONS[files.convention],
         drop_bad=files.drop_bad,

@@ -9,9 +9,7 @@ import os
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import make_dataclass
 from importlib.metadata import version
-from typing import Any
 
 from aaplug.system.allocator import keep_freed_memory
 from aaplug.system.errors import AaplugError, UsageError, did_you_mean, printable, reason
@@ -80,24 +78,37 @@ def _guarded(words: Sequence[str]) -> int:
 
 def run(words: Sequence[str]) -> int:
     """Run one verb with its options; its result is the exit code."""
-    import tyro
-
     from .verbs import VERBS
-    from .words import CONFIG, one_line
 
     if words and words[0] in VERBS:
         command = VERBS[words[0]]
         given = command.parse(words[1:])
         several = given.values.get("batch") is not None  # then each scene has options of its own, checked with its file
         return command.run(given if several else given.checked())
-    if words and not words[0].startswith("-"):
-        raise UsageError("aaplug", f"there is no verb '{words[0]}'{did_you_mean(words[0], VERBS)}; see `aaplug --help`")
-    parsers: dict[str, type[Any]] = {}
+    if words and words[0] in ("-h", "--help"):
+        show_verbs()
+        return 0
+    if not words:
+        problem = f"name a verb: {', '.join(VERBS)}"
+    elif words[0].startswith("-"):
+        problem = f"Unrecognized options: {words[0]}"
+    else:
+        problem = f"there is no verb '{words[0]}'{did_you_mean(words[0], VERBS)}"
+    raise UsageError("aaplug", f"{problem}; see `aaplug --help`")
+
+
+def show_verbs() -> None:
+    """Print what the program does, and each verb with the first line of its help."""
+    from rich.table import Table
+
+    from .console import out
+    from .verbs import VERBS
+
+    table = Table(show_header=False, box=None, padding=(0, 2, 0, 2))
     for name, command in VERBS.items():
-        parsers[name] = make_dataclass(name, (), namespace={"__doc__": command.help.partition("\n")[0]})
-    with one_line("aaplug"):
-        tyro.extras.subcommand_cli_from_dict(parsers, prog="aaplug", description=DESCRIPTION, args=words, config=CONFIG)
-    return 0
+        table.add_row(name, command.help.partition("\n\n")[0])
+    out.print(f"usage: aaplug [-h] VERB ...\n\n{DESCRIPTION}\n", markup=False)
+    out.print(table)
 
 
 def _worded(error: AaplugError, words: Sequence[str]) -> str:

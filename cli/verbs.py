@@ -30,7 +30,7 @@ from .inputs import (
     read_inputs,
     told,
 )
-from .words import Command, Option, Words, json_of, options_of, output
+from .words import Command, Option, Words, json_of, output
 
 if TYPE_CHECKING:
     from aaplug.rendering.benchmark import Figures
@@ -40,19 +40,11 @@ PROGRAM_KEYS = ("fused", "comments")  # of `info`, for programs; the table has w
 
 
 def verb(*options: type[Options] | Option) -> Callable[[Callable[[Words], int]], Callable[[Words], int]]:
-    """Enter a function into the table; its docstring is the verb's help.
-
-    options: single ones, and dataclasses of them; of two with one name the first counts.
-    """
-    stated: dict[str, Option] = {}
-    classes = [each for each in options if not isinstance(each, Option)]
-    for each in options:
-        for option in [each] if isinstance(each, Option) else options_of(each):
-            stated.setdefault(option.name, option)
+    """Enter a function into the table with its options; its docstring is the verb's help."""
 
     def enter(run: Callable[[Words], int]) -> Callable[[Words], int]:
         name = run.__name__.replace("_", "-")
-        VERBS[name] = Command(name, run.__doc__ or "", list(stated.values()), classes, run)
+        VERBS[name] = Command(name, run.__doc__ or "", options, run)
         return run
 
     return enter
@@ -111,7 +103,8 @@ def convert(words: Words) -> int:
 
 def _converted(words: Words) -> tuple[dict[str, Any], Any]:
     """Convert one scene; facts for JSON, and the result."""
-    result = aaplug.convert(*read_inputs(words), words.output, **told(words, verbs.ConvertOptions))
+    inputs = read_inputs(words)
+    result = aaplug.convert(*inputs, words.output, **told(words, verbs.ConvertOptions))
     return {"output": str(words.output)} | result.as_json(), result
 
 
@@ -173,7 +166,8 @@ def finetune(words: Words) -> int:
     (.finetune.json), pictures (.finetune.png) and a checkpoint go beside it.  Ctrl-C stops after the current step;
     --resume continues.
     """
-    tuned = aaplug.finetune(*read_inputs(words), words.output, **told(words, verbs.FinetuneOptions))
+    inputs = read_inputs(words)
+    tuned = aaplug.finetune(*inputs, words.output, **told(words, verbs.FinetuneOptions))
     if words.json:
         print_json(tuned.as_json())
     else:
@@ -221,7 +215,8 @@ def evaluate(words: Words) -> int:
     from aaplug.verbs.evaluate import check_results
 
     check_results(words.output, words.of(verbs.EvaluateOptions))  # before the scene is read
-    report = aaplug.evaluate(*read_inputs(words), words.output, **told(words, verbs.EvaluateOptions))
+    inputs = read_inputs(words)
+    report = aaplug.evaluate(*inputs, words.output, **told(words, verbs.EvaluateOptions))
     if words.json:
         print_json(results(report))
     else:
@@ -240,7 +235,8 @@ def video(words: Words) -> int:
 
     For single images, use render; to move the camera by hand, view.
     """
-    clip = aaplug.video(*read_inputs(words), words.output, **told(words, verbs.VideoOptions))
+    inputs = read_inputs(words)
+    clip = aaplug.video(*inputs, words.output, **told(words, verbs.VideoOptions))
     if words.json:
         print_json(clip._asdict() | {"file": str(clip.file)})
     else:

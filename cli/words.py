@@ -120,13 +120,29 @@ class Words:
 
 @dataclass(frozen=True)
 class Command:
-    """A verb of the command line: its help, its options, the dataclasses that state most of them, and what runs it."""
+    """A verb of the command line: its help, its options and what runs it.
+
+    stated: single options, and dataclasses of them; of two with one name the first counts.
+    """
 
     name: str
     help: str
-    options: Sequence[Option]
-    classes: Sequence[type[Options]]
+    stated: Sequence[type[Options] | Option]
     run: Callable[[Words], int]
+
+    @cached_property
+    def options(self) -> list[Option]:
+        """All options; they are read from the dataclasses when the verb is used."""
+        options: dict[str, Option] = {}
+        for each in self.stated:
+            for option in [each] if isinstance(each, Option) else options_of(each):
+                options.setdefault(option.name, option)
+        return list(options.values())
+
+    @property
+    def classes(self) -> list[type[Options]]:
+        """The dataclasses that state most of the options."""
+        return [each for each in self.stated if not isinstance(each, Option)]
 
     @cached_property
     def types(self) -> dict[str, Any]:
