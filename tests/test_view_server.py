@@ -218,11 +218,14 @@ def test_without_the_extra_it_says_how_to_get_it(monkeypatch, seen):  # noqa: F8
 
 
 def test_words_of_the_command_line_name_what_is_seen(tmp_path):
-    from aaplug_cli.options import CameraOptions, SceneOptions
-    from aaplug_cli.view import _words
+    from aaplug_cli.inputs import CameraOptions, SceneOptions
+    from aaplug_cli.verbs import VERBS
 
-    scene = SceneOptions(scene=tmp_path / "s.ply", convention="mip", drop_bad=True)
-    assert _words(scene) == [str(tmp_path / "s.ply"), "--convention", "mip", "--drop-bad"]
-    words = _words(CameraOptions(cameras=tmp_path, train_scale=0.5))
-    assert words == ["--cameras", str(tmp_path), "--train-scale", "0.5"]
-    assert _words(CameraOptions().orbit) == []
+    from aaplug.options.shared import Orbit
+
+    scene = [str(tmp_path / "s.ply"), "--convention", "mip", "--drop-bad"]
+    cameras = ["--cameras", str(tmp_path), "--train-scale", "0.5"]
+    words = VERBS["view"].parse([*scene, *cameras])
+    assert words.given(SceneOptions) == scene
+    assert words.given(CameraOptions) == cameras
+    assert words.given(Orbit) == []

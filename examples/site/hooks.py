@@ -23,23 +23,13 @@ SHARED = [PAGES / name for name in ("pictures.js", "comparing.js")]
 THEME = PAGES / "theme.css"
 TOUR = ROOT / "examples" / "tour.ipynb"
 TABLED = "    options: { members: false, show_signature: false, show_bases: false, merge_init_into_class: false }\n"
-TO_IMPLEMENT = {  # topic, and what a package of one's own implements (contributing.md)
-    "what a plug-in implements": [
-        *(
-            f"core.interfaces.{name}"
-            for name in ("ScreenFilter", "WorldFilter", "PixelKernel", "Compositor", "Rasterizer")
-        ),
-        *("core.splats.Splats2D", "system.registry.Registry", "evaluation.metric.Metric"),
-        *("io.scenes.SceneFormat", "io.scenes.WritableFormat", "io.cameras.CameraFormat"),
-    ]
-}
 WORDS = ("source", "protocol", "program")  # attributes that say what an entry of a registry is
 
 
 def topics() -> dict[str, list[str]]:
     """Public names of each topic, from the comments of the stub."""
     blocks = re.findall(r"^# (.+)\n((?:from .+\n)+)", STUB.read_text(), re.M)
-    return {title: re.findall(r"\w+ as (\w+)", lines) for title, lines in blocks} | TO_IMPLEMENT
+    return {title: re.findall(r"\w+ as (\w+)", lines) for title, lines in blocks}
 
 
 def path_of(title: str) -> str:
