@@ -112,9 +112,11 @@ class Words:
         for name, value in self.keywords(options).items():
             if value in (None, False) or value == defaults.get(name):
                 continue
-            option = [] if name == "scene" else [_flag_of(name)]
             values = value if isinstance(value, list | tuple) else [] if value is True else [value]
-            words += [*option, *map(str, values)]
+            if name == "scene":  # the positional one comes first
+                words = [*map(str, values), *words]
+            else:
+                words += [_flag_of(name), *map(str, values)]
         return words
 
 

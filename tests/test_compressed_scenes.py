@@ -14,23 +14,14 @@ import torch
 from aaplug.core.conventions import ANTIALIASED, CLASSIC, MIP
 from aaplug.core.gaussians import MAX_LOG_SCALE, Gaussians
 from aaplug.core.spherical_harmonics import sh_colour
-from aaplug.io.scenes import (
-    HEAD_BYTES,
-    OWN,
-    SCENE_FORMATS,
-    WritableFormat,
-    find_scene,
-    ply,
-    read_scene,
-    spz,
-    write_scene,
-)
+from aaplug.io.scenes import HEAD_BYTES, OWN, SCENE_FORMATS, WritableFormat, find_scene, ply, read_scene, write_scene
 from aaplug.io.scenes.options import SceneFileOptions
 from aaplug.io.scenes.packed import half_turn_about_x
-from aaplug.io.scenes.scene_file import SceneFile
+from aaplug.io.scenes.scene_file import Scene
 from aaplug.system.errors import FormatError, OutputError, UsageError
 from aaplug.system.registry import Registry, named
-from tests.scene_files import DATA, MADE, ksplat, oracle, splat, splats, write_file
+from tests.conftest import SAMPLE
+from tests.scene_files import DATA, MADE, ksplat, oracle, splat, splats, spz, write_file
 
 MADE_SPZ = ("v1.spz", "v2.spz", "raw.spz", "degree4.spz")
 CARRY_A_TAG = dict.fromkeys(
@@ -154,7 +145,7 @@ class Toy:
     def sniff(self, path: Path, head: bytes) -> bool:
         return path.name.startswith("toy")
 
-    def open_scene(self, path: Path, options: SceneFileOptions) -> SceneFile:
+    def open_scene(self, path: Path, options: SceneFileOptions) -> Scene:
         return replace(ply.open_scene(path, options), format=self.name)
 
     def write(self, path, parts, count, overwrite, options) -> None:

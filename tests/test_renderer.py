@@ -287,8 +287,8 @@ def test_auto_weighs_neighbours_only_where_its_samples_are_coarser_than_training
         view = cameras[0].scaled(scale)
         samples = renderer.samples(view)
         sampled = min(1.0, scale * samples)
-        assert renderer.neighbours(view, samples) == pytest.approx(NEIGHBOURS * (1 - sampled**2))
-        assert Renderer.of(make_scene(30), cameras, "matched").neighbours(view, samples) == 0
+        assert renderer.sampling(view, samples)[1] == pytest.approx(NEIGHBOURS * (1 - sampled**2))
+        assert Renderer.of(make_scene(30), cameras, "matched").sampling(view, samples)[1] == 0
 
 
 def test_auto_is_nearer_to_the_look_of_training_than_one_plain_sample(sample_scene, sample_training, sample_cameras):

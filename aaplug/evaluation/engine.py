@@ -257,7 +257,7 @@ def _work(renderer: Renderer, camera: Camera) -> Hashable:
     recipe = renderer.recipe
     method = recipe.selection, recipe.screen, recipe.pixel, recipe.compositor
     fine, samples = renderer.sampled(camera)
-    sampling = samples, renderer.neighbours(camera, samples), renderer.coarsening(fine, samples)
+    sampling = *renderer.sampling(camera), renderer.coarsening(fine, samples)
     return id(renderer.scene), id(renderer.training), method, sampling, renderer.background, renderer.rasterizer.name
 
 

@@ -17,10 +17,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.cameras import Camera
-from aaplug.core.imaging import quantised, resampled
+from aaplug.core.imaging import quantised
 from aaplug.evaluation.metrics import psnr
 from aaplug.io.images import encode_jpeg, encode_png
-from aaplug.io.photographs import read_photo
+from aaplug.io.photographs import photo_at
 from aaplug.live.messages import PictureRequest, Side, StillRequest
 from aaplug.live.overlays import OVERLAYS
 from aaplug.live.subject import Subject
@@ -165,9 +165,7 @@ class Pictures:
         assert request.at is not None
         view, (placed, left, top) = self._subject.views[request.at], self._subject.placed_view(request)
         assert view.photo is not None
-        photo = read_photo(view.photo, self._subject.look.background, view.lens)
-        factor = request.focal / view.focal * (view.width / photo.shape[1])  # a photograph may be of another size
-        photo = resampled(photo, factor, placed.hw).clamp(0, 1)
+        photo = photo_at(view, placed, self._subject.look.background).clamp(0, 1)
         rows = max(0, top), min(request.height, top + placed.height)
         columns = max(0, left), min(request.width, left + placed.width)
         photo = photo[rows[0] - top : rows[1] - top, columns[0] - left : columns[1] - left]

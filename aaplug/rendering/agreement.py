@@ -10,10 +10,9 @@ from statistics import median
 import torch
 
 from aaplug.core.cameras import Camera, CameraSet, spread
-from aaplug.core.imaging import resampled
 from aaplug.core.rules import NEAR
 from aaplug.core.training import TrainingViews
-from aaplug.io.photographs import read_photo
+from aaplug.io.photographs import photo_at
 from aaplug.io.scenes.scene_file import Scene, usable
 from aaplug.rendering.renderer import Renderer, background_colour, own_look
 from aaplug.system.errors import AaplugError
@@ -124,8 +123,7 @@ def _gain_at(look: Renderer, view: Camera) -> float:
     """PSNR of the small render over that of the small photograph's mean colour, in dB."""
     assert view.photo is not None
     small = view.scaled(min(1.0, SIDE / max(view.hw)))
-    photo = read_photo(view.photo, look.background, view.lens)
-    truth = resampled(photo, small.width / photo.shape[1], small.hw)
+    truth = photo_at(view, small, look.background)
     error = (look(small).rgb.clamp(0, 1) - truth).square().mean()
     flat = (truth - truth.mean(dim=(0, 1))).square().mean()
     return float(10 * (flat / error.clamp(min=torch.finfo().tiny)).log10())

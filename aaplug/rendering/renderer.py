@@ -168,10 +168,11 @@ class Renderer:
 
     def draw(self, camera: Camera) -> Drawing:
         """Render one view and keep its splats, for example to read their gradients."""
-        fine, samples = self.sampled(camera)
+        samples, weight = self.sampling(camera)
+        fine = camera.resized(camera.width * samples, camera.height * samples)
         splats = self.splats(fine, samples)
         image = self.paint(splats, fine.hw)
-        return Drawing(average_samples(image, samples, self.neighbours(camera, samples)), splats, fine.hw)
+        return Drawing(average_samples(image, samples, weight), splats, fine.hw)
 
     def paint(self, splats: Splats2D, hw: tuple[int, int], background: Colour | None = None) -> Render:
         """Composite coloured splats into an image of height and width `hw` px.
@@ -189,14 +190,21 @@ class Renderer:
 
     def samples(self, camera: Camera) -> int:
         """Number of samples along a pixel's side."""
-        if self.recipe.target_rate == 0:
-            return self.recipe.grid
-        rate = self.relative_rate(camera)
-        asked = self.recipe.samples_at(rate)
-        if self.cutter is None or self.recipe.levels is None:
-            return asked
-        for_coarsest = math.ceil(self.cutter.pyramid.coarsest_rate / rate - RATE_TOLERANCE)
-        return int(min(asked, max(self.recipe.levels.most_samples, for_coarsest)))
+        return self.sampling(camera)[0]
+
+    def sampling(self, camera: Camera, samples: int | None = None) -> tuple[int, float]:
+        """Samples along a pixel's side, and the weight of those on either side of each; constants to gradients.
+
+        samples: instead of the recipe's number.
+        """
+        recipe, weighs = self.recipe, self.recipe.neighbours > 0 and self.cutter is None
+        rate = self.relative_rate(camera) if weighs or (samples is None and recipe.target_rate) else 1.0
+        if samples is None:
+            samples = recipe.samples_at(rate) if recipe.target_rate else recipe.grid
+            if recipe.target_rate and self.cutter is not None and recipe.levels is not None:
+                for_coarsest = math.ceil(self.cutter.pyramid.coarsest_rate / rate - RATE_TOLERANCE)
+                samples = int(min(samples, max(recipe.levels.most_samples, for_coarsest)))
+        return samples, recipe.neighbours_at(round(samples * rate, RATE_DIGITS)) if weighs else 0.0
 
     def coarsening(self, camera: Camera, samples: int) -> float:
         """Octaves by which levels of detail are coarser than those of the samples; see `Cutter.coarsening`."""
@@ -205,16 +213,6 @@ class Renderer:
             return 0.0
         most = max(choice.budget, int(choice.share * self.cutter.pyramid.sizes[0]))
         return self.cutter.coarsening(camera, max(0.0, math.log2(samples) - choice.finer), most)
-
-    def neighbours(self, camera: Camera, samples: int) -> float:
-        """Weight of the samples on either side of each sample: like their number, a constant to gradients.
-
-        samples: along a pixel's side.
-        """
-        if self.recipe.neighbours == 0 or self.cutter is not None:
-            return 0.0
-        sampled_rate = samples * self.relative_rate(camera)
-        return self.recipe.neighbours_at(round(sampled_rate, RATE_DIGITS))
 
     def relative_rate(self, camera: Camera) -> float:
         """A view's sampling rate relative to training, which sets the samples per pixel.
@@ -259,7 +257,12 @@ class Renderer:
                 chunk, places = self.scene if whole <= at_once else self.scene[start : start + at_once], start
                 shares = None
             splats = self._projected(chunk, places, shares, camera)
-            parts.append(self._shaded(splats, chunk, start, camera))
+            if self.harmonics is None or not len(splats):
+                parts.append(shade(splats, self.scene, camera, self.kernels))
+                continue
+            chunk = replace(chunk, sh=self.harmonics(start, start + len(chunk)))
+            local = replace(splats, sources=splats.sources - start)
+            parts.append(replace(shade(local, chunk, camera, self.kernels), sources=splats.sources))
         splats = concatenated(parts)
         _check_colours(splats)
         return splats
@@ -285,14 +288,6 @@ class Renderer:
             splats = faded(splats, shares.index_select(0, own))
         ellipses = recipe.pixel.bounding_ellipses(splats, rules)
         return cull(splats, camera.hw, training.cull_margin, kernels, ellipses, rules)
-
-    def _shaded(self, splats: Splats2D, chunk: Gaussians, start: int, camera: Camera) -> Splats2D:
-        """The same splats with colour; harmonics that the scene does not hold are read for the chunk from `start`."""
-        if self.harmonics is None or not len(splats):
-            return shade(splats, self.scene, camera, self.kernels)
-        chunk = replace(chunk, sh=self.harmonics(start, start + len(chunk)))
-        local = replace(splats, sources=splats.sources - start)
-        return replace(shade(local, chunk, camera, self.kernels), sources=splats.sources)
 
     @property
     def kernels(self) -> Kernels:

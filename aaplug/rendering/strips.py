@@ -32,7 +32,7 @@ def strips(
     pixel, rules, weight = (
         renderer.recipe.pixel,
         renderer.training.convention.rules,
-        renderer.neighbours(camera, samples),
+        renderer.sampling(camera, samples)[1],
     )
     rows, parts = max(1, SAMPLES_PER_STRIP // ((end - start) * samples**2)), []
     for top in range(0, camera.height, rows):

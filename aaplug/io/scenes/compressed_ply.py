@@ -21,7 +21,7 @@ from aaplug.io.scenes.packed import byte_opacities, floats, largest_last
 from aaplug.io.scenes.ply_document import Table, stamp_of
 from aaplug.io.scenes.ply_header import LITTLE, Element, Header, check_size, is_packed, read_header
 from aaplug.io.scenes.ply_tags import meaning
-from aaplug.io.scenes.scene_file import DEGREES, SceneFile, check_count, library_errors, sh_of_colour
+from aaplug.io.scenes.scene_file import DEGREES, Scene, check_count, library_errors, sh_of_colour
 from aaplug.system.errors import FormatError
 
 WORDS = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
@@ -40,7 +40,7 @@ def sniff(path: Path, head: bytes) -> bool:
     return head.startswith((b"ply\n", b"ply\r")) and is_packed(path)
 
 
-def open_scene(path: Path, options: SceneFileOptions) -> SceneFile:
+def open_scene(path: Path, options: SceneFileOptions) -> Scene:
     """See `SceneFormat`."""
     with library_errors(path):
         header = read_header(path)
@@ -55,7 +55,7 @@ def open_scene(path: Path, options: SceneFileOptions) -> SceneFile:
     sh = tables.get("sh")
     degree = DEGREES[len(sh.dtype.names or ())] if sh else 0
     load, count = partial(_rows, tables, bounds, degree), header.vertex.count
-    return SceneFile(path, name, count, degree, load, said.evidence, said.convention, said.fused)
+    return Scene(path, name, count, degree, load, said.evidence, said.convention, said.fused)
 
 
 def _check(path: Path, header: Header) -> None:

@@ -16,7 +16,7 @@ import torch
 from aaplug.core.gaussians import Gaussians, joined
 from aaplug.io.scenes.options import SceneFileOptions
 from aaplug.io.scenes.packed import byte_opacities, floats
-from aaplug.io.scenes.scene_file import SceneFile, check_count, library_errors, sh_of_colour
+from aaplug.io.scenes.scene_file import Scene, check_count, library_errors, sh_of_colour
 from aaplug.io.scenes.splat import EVIDENCE
 from aaplug.system.errors import FormatError
 
@@ -62,7 +62,7 @@ def sniff(path: Path, head: bytes) -> bool:
     return path.suffix.lower() == ".ksplat"
 
 
-def open_scene(path: Path, options: SceneFileOptions) -> SceneFile:
+def open_scene(path: Path, options: SceneFileOptions) -> Scene:
     """See `SceneFormat`."""
     with library_errors(path):
         data = path.read_bytes()
@@ -73,7 +73,7 @@ def open_scene(path: Path, options: SceneFileOptions) -> SceneFile:
         empty = Gaussians(none, torch.zeros(0, 4), none, torch.zeros(0), torch.zeros(0, (degree + 1) ** 2, 3))
         scene = joined([empty, *(_decoded(records, level, sh_range, degree) for records in sections)])
     notes = (f"compression level {level}",)
-    return SceneFile(path, name, count, degree, lambda start, stop: scene[start:stop], EVIDENCE, notes=notes)
+    return Scene(path, name, count, degree, lambda start, stop: scene[start:stop], EVIDENCE, notes=notes)
 
 
 def _sections(path: Path, data: bytes) -> tuple[int, tuple[float, float], list[Records]]:

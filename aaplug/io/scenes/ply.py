@@ -26,7 +26,7 @@ from aaplug.io.scenes.ply_tags import meaning_in_run, stating
 from aaplug.io.scenes.scene_file import (
     DEGREES,
     FILTER_COLUMN,
-    SceneFile,
+    Scene,
     check_count,
     library_errors,
     matrix_of,
@@ -55,7 +55,7 @@ def sniff(path: Path, head: bytes) -> bool:
     return head.startswith((b"ply\n", b"ply\r")) and not is_packed(path)
 
 
-def open_scene(path: Path, options: SceneFileOptions) -> SceneFile:
+def open_scene(path: Path, options: SceneFileOptions) -> Scene:
     """See `SceneFormat`."""
     with library_errors(path):
         header = read_header(path)
@@ -67,7 +67,7 @@ def open_scene(path: Path, options: SceneFileOptions) -> SceneFile:
         document = document_of(path, header, stamp)
     degree = DEGREES[len(_rest(header))]
     load, notes = partial(_rows, document, degree, said.flat), (*notes, *([note] if note else ()))
-    return SceneFile(path, name, header.vertex.count, degree, load, **vars(said), document=document, notes=notes)
+    return Scene(path, name, header.vertex.count, degree, load, **vars(said), document=document, notes=notes)
 
 
 def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: SceneFileOptions) -> None:

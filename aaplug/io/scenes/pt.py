@@ -20,7 +20,7 @@ from aaplug.core.conventions import CLASSIC
 from aaplug.core.gaussians import Gaussians
 from aaplug.io.limits import whole_limit
 from aaplug.io.scenes.options import SceneFileOptions
-from aaplug.io.scenes.scene_file import DEGREES, SceneFile, check_count, library_errors
+from aaplug.io.scenes.scene_file import DEGREES, Scene, check_count, library_errors
 from aaplug.io.scenes.training_config import gsplat_config
 from aaplug.system.errors import FormatError
 
@@ -37,7 +37,7 @@ def sniff(path: Path, head: bytes) -> bool:
     return path.suffix.lower() in SUFFIXES
 
 
-def open_scene(path: Path, options: SceneFileOptions) -> SceneFile:
+def open_scene(path: Path, options: SceneFileOptions) -> Scene:
     """See `SceneFormat`."""
     if not options.allow_checkpoint:
         what = "is a training checkpoint (a pickle)"
@@ -60,7 +60,7 @@ def open_scene(path: Path, options: SceneFileOptions) -> SceneFile:
         _check(path, key, tensor, count, size)
     degree = DEGREES[3 * splats["shN"].shape[1]]
     convention, evidence = gsplat_config(path) or UNKNOWN
-    return SceneFile(path, name, count, degree, partial(_rows, splats), evidence, convention)
+    return Scene(path, name, count, degree, partial(_rows, splats), evidence, convention)
 
 
 def _check_archive(path: Path, size: int) -> None:

@@ -256,9 +256,6 @@ class _Rows:
         return self.rows[start:stop]
 
 
-SceneFile = Scene
-
-
 @contextmanager
 def library_errors(path: Path) -> Iterator[None]:
     """Report whatever a library raises about a damaged file as one FormatError."""

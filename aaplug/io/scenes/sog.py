@@ -28,7 +28,7 @@ from aaplug.core.gaussians import MAX_LOG_SCALE, Gaussians
 from aaplug.io.limits import whole_limit
 from aaplug.io.scenes.options import SceneFileOptions
 from aaplug.io.scenes.packed import byte_opacities, check_growth, floats, largest_last
-from aaplug.io.scenes.scene_file import COMPENSATED, KERNEL_LOST, SceneFile, check_count, library_errors
+from aaplug.io.scenes.scene_file import COMPENSATED, KERNEL_LOST, Scene, check_count, library_errors
 from aaplug.io.values import Entry, number, object_of, parse_json, read_bounded
 from aaplug.system.errors import FormatError
 
@@ -70,7 +70,7 @@ def sniff(path: Path, head: bytes) -> bool:
     return zipped or (path.name == META and head.lstrip().startswith(b"{"))
 
 
-def open_scene(path: Path, options: SceneFileOptions) -> SceneFile:
+def open_scene(path: Path, options: SceneFileOptions) -> Scene:
     """See `SceneFormat`."""
     with library_errors(path):
         if path.name == META:
@@ -99,7 +99,7 @@ def _from_zip(path: Path, archive: zipfile.ZipFile, file: str, most: int) -> byt
         return stream.read(most + 1)
 
 
-def _scene(path: Path, meta: Any, fetch: Fetch) -> SceneFile:
+def _scene(path: Path, meta: Any, fetch: Fetch) -> Scene:
     root = object_of(meta, path, META, "means, scales, quats and sh0")
     version = root.fields.get("version", 1)
     root.place.expect(version in (1, 2) and (version == 2) == ("version" in meta), "version", "2, or left out", version)
@@ -118,7 +118,7 @@ def _scene(path: Path, meta: Any, fetch: Fetch) -> SceneFile:
     degree = round((palette.shape[1] + 1) ** 0.5) - 1
     convention, evidence, flat = _meaning(meta)
     load, notes = partial(_rows, parts, palette, version, flat), (f"version {version}",)
-    return SceneFile(path, name, count, degree, load, evidence, convention, flat=flat, notes=notes)
+    return Scene(path, name, count, degree, load, evidence, convention, flat=flat, notes=notes)
 
 
 def _part(path: Path, root: Entry, key: str, count: int, fetch: Fetch) -> Part:

@@ -15,7 +15,7 @@ from aaplug.core.spherical_harmonics import COLOUR_OFFSET, SH_C0
 from aaplug.io.atomic import replacing
 from aaplug.io.scenes.options import SceneFileOptions
 from aaplug.io.scenes.packed import byte_opacities, floats
-from aaplug.io.scenes.scene_file import SceneFile, check_count, library_errors, read_rows, sh_of_colour
+from aaplug.io.scenes.scene_file import Scene, check_count, library_errors, read_rows, sh_of_colour
 from aaplug.system.errors import FormatError
 
 RECORD = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
@@ -31,7 +31,7 @@ def sniff(path: Path, head: bytes) -> bool:
     return path.suffix.lower() == ".splat"
 
 
-def open_scene(path: Path, options: SceneFileOptions) -> SceneFile:
+def open_scene(path: Path, options: SceneFileOptions) -> Scene:
     """See `SceneFormat`."""
     with library_errors(path):
         size = path.stat().st_size
@@ -40,7 +40,7 @@ def open_scene(path: Path, options: SceneFileOptions) -> SceneFile:
         raise FormatError(path, f"{what}; it is cut short or not a .splat")
     count = size // RECORD.itemsize
     check_count(path, count)
-    return SceneFile(path, name, count, 0, lambda a, b: _rows(path, a, b), EVIDENCE)
+    return Scene(path, name, count, 0, lambda a, b: _rows(path, a, b), EVIDENCE)
 
 
 def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: SceneFileOptions) -> None:

@@ -33,7 +33,7 @@ from aaplug.io.atomic import replacing
 from aaplug.io.limits import whole_limit
 from aaplug.io.scenes.options import SceneFileOptions
 from aaplug.io.scenes.packed import byte_opacities, check_growth, floats, half_turn_about_x, largest_last
-from aaplug.io.scenes.scene_file import COMPENSATED, KERNEL_LOST, SceneFile, check_count, library_errors
+from aaplug.io.scenes.scene_file import COMPENSATED, KERNEL_LOST, Scene, check_count, library_errors
 from aaplug.system.errors import FormatError, OutputError
 from aaplug.system.locks import scratch
 
@@ -95,7 +95,7 @@ def sniff(path: Path, head: bytes) -> bool:
     return head.startswith(MAGIC) or (head.startswith(GZIP_SIGNATURE) and path.suffix.lower() == ".spz")
 
 
-def open_scene(path: Path, options: SceneFileOptions) -> SceneFile:
+def open_scene(path: Path, options: SceneFileOptions) -> Scene:
     """Decompress a scene; see `SceneFormat`."""
     with library_errors(path):
         header, sections = _sections(path)
@@ -103,9 +103,9 @@ def open_scene(path: Path, options: SceneFileOptions) -> SceneFile:
     if header.flags & ANTIALIASED_FLAG:
         convention, evidence = COMPENSATED, f"the flag antialiased is set; {KERNEL_LOST}"
 
-    def reading(axes: SpzAxes, other: SceneFile | None = None) -> SceneFile:
+    def reading(axes: SpzAxes, other: Scene | None = None) -> Scene:
         load, notes = partial(_rows, header, sections, TURNS[axes]), (f"version {header.version}", AXES_NOTES[axes])
-        return SceneFile(path, name, header.count, header.degree, load, evidence, convention, notes=notes, other=other)
+        return Scene(path, name, header.count, header.degree, load, evidence, convention, notes=notes, other=other)
 
     if options.spz_axes == "auto":  # the header does not name its writer
         return reading("opengl", reading("opencv"))
