@@ -30,12 +30,11 @@ from .inputs import (
     read_inputs,
     told,
 )
-from .words import Command, Option, Words, json_of, output
+from .words import VERBS, Command, Option, Words, json_of, output
 
 if TYPE_CHECKING:
     from aaplug.rendering.benchmark import Figures
 
-VERBS: dict[str, Command] = {}
 PROGRAM_KEYS = ("fused", "comments")  # of `info`, for programs; the table has words for the first
 
 

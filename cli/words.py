@@ -214,6 +214,9 @@ class Command:
         return [*files, *parted]
 
 
+VERBS: dict[str, Command] = {}  # by name; `verbs` fills it
+
+
 @contextmanager
 def one_line(program: str) -> Iterator[None]:
     """Turn tyro's box about words that it cannot read into an error of one line.
@@ -268,6 +271,4 @@ def _default(each: dataclasses.Field[Any]) -> Any:
 
 def _words_of(verb: str, values: Mapping[str, Any]) -> Words:
     """The words of a verb in the table, with these values."""
-    from .verbs import VERBS  # its modules import this one
-
     return Words(VERBS[verb], values)
