@@ -10,6 +10,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr
 from dataclasses import MISSING, dataclass, field, fields, make_dataclass
 from functools import cached_property
+from importlib import import_module
 from io import StringIO
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
@@ -271,4 +272,5 @@ def _default(each: dataclasses.Field[Any]) -> Any:
 
 def _words_of(verb: str, values: Mapping[str, Any]) -> Words:
     """The words of a verb in the table, with these values."""
+    import_module(".verbs", __package__)  # fills the table, in a process that unpickles words before all else
     return Words(VERBS[verb], values)
