@@ -1,7 +1,10 @@
 """Kernels compiled ahead of time: the same results as eager code, and a cache that survives damage."""
 
+import errno
 import json
+import os
 import pickle
+import re
 import shutil
 import subprocess
 import sys
@@ -32,6 +35,7 @@ from aaplug.system.executors import torch_threads
 from tests.conftest import COMPILED, ROOT, make_camera, make_scene, sized
 
 ANSWER = 1e-5
+CACHE = compiled.cache_folder()
 
 
 @pytest.fixture
@@ -97,25 +101,111 @@ def test_compositing_is_one_loop_over_tiles(built, name):
     assert sum(source.count("for(int64_t x0=") for source in sources) == LOOPS[name]
 
 
-def test_packages_are_checked_by_one_thread_which_is_undone_after_that(built, tmp_path, monkeypatch):
-    counts, close, kernel = [], compiled._close, compiled.KERNELS[0]
-    copy = shutil.copy(compiled.package_path(kernel), tmp_path)  # without the mark that it was compared
+@pytest.fixture
+def copied_cache(built, empty_cache):
+    """The packages of this machine alone, without what was unpacked from them."""
+    packages = [compiled.package_path(kernel) for kernel in compiled.KERNELS]
+    (empty_cache / "kernels").mkdir()
+    for package in packages:
+        shutil.copy(CACHE / package.name, package)
+    return empty_cache / "kernels"
+
+
+def test_packages_are_compared_by_one_thread_which_is_undone_after_that(copied_cache, monkeypatch):
+    counts, close = [], compiled._close
     monkeypatch.setattr(compiled, "_close", lambda *x: counts.append(torch.get_num_threads()) or close(*x))
     with torch_threads(2):
-        assert compiled._is_sound(kernel, Path(copy))
+        assert compiled._is_sound(compiled.KERNELS[0])
         assert set(counts) == {1}
         assert torch.get_num_threads() == 2
 
 
-def test_a_package_that_passed_is_compared_again_only_after_a_change(empty_cache, monkeypatch):
-    kernel, results = compiled.KERNELS[0], iter([True, False])
-    monkeypatch.setattr(compiled, "_passes", lambda kernel, path: next(results))
-    path = empty_cache / "kernel.pt2"
-    assert not compiled._is_sound(kernel, path), "it is not there"
-    path.write_bytes(b"package")
-    assert all(compiled._is_sound(kernel, path) for _ in range(3))
-    path.write_bytes(b"another")
-    assert not compiled._is_sound(kernel, path)
+def test_a_library_is_unpacked_and_compared_once_until_it_changes(copied_cache, monkeypatch):
+    kernel, compared = binning.LISTS, []
+    monkeypatch.setattr(compiled, "_close", lambda *x: compared.append(x) or True)
+    library = compiled.package_path(kernel).with_suffix(".so")
+    for change in (None, library.unlink, lambda: library.write_bytes(b"damaged")):
+        if change is not None:
+            change()
+        compared.clear()
+        assert compiled._is_sound(kernel)
+        assert compared
+        compared.clear()
+        assert compiled._is_sound(kernel)
+        assert not compared
+
+
+DRAWS = """if True:
+    import os, resource, signal, sys
+    from tests.conftest import make_camera, make_scene
+    from aaplug.rendering.renderer import Renderer
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
+    renderer = Renderer.of(make_scene(100), [make_camera()], "classic")
+    renderer(make_camera())
+    print(renderer.rasterizer.name, flush=True)
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_drawing_writes_nothing_and_a_killed_process_leaves_nothing(built, tmp_path):
+    """The folder of temporary files may be full, missing, or not allow programs to run."""
+    done = subprocess.run(
+        [sys.executable, "-c", DRAWS],
+        cwd=ROOT,
+        env=os.environ | {"TMPDIR": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.stdout, done.returncode) == ("compiled\n", -9), done.stderr
+    assert not [*tmp_path.iterdir()]
+
+
+def not_a_package(package: Path) -> None:
+    package.write_bytes(b"not a package")
+
+
+def of_another_kernel(package: Path) -> None:
+    shutil.copy(CACHE / compiled.package_path(binning.LISTS).name, package)
+
+
+def of_another_machine(package: Path) -> None:
+    with zipfile.ZipFile(package) as members:
+        [name] = [name for name in members.namelist() if name.endswith(".so")]
+        library = bytearray(members.read(name))
+    library[18:20] = b"\xb7\x00"  # ELF's number of aarch64
+    with zipfile.ZipFile(package, "w") as members:
+        members.writestr(name, bytes(library))
+
+
+def cut(package: Path) -> None:
+    package.write_bytes(package.read_bytes()[:100_000])
+
+
+@pytest.mark.parametrize("damage", [not_a_package, of_another_kernel, of_another_machine, cut])
+def test_a_damaged_or_foreign_package_is_left_aside_with_one_line(copied_cache, damage, caplog):
+    package = compiled.package_path(compiled.KERNELS[0])
+    damage(package)
+    for _ in range(2):
+        assert find_rasterizer("auto") is RASTERIZERS["eager"]
+    assert len(caplog.messages) == 1
+    assert re.fullmatch(rf"{package}: cannot be used: .+; images are drawn eagerly, .+", caplog.messages[0])
+
+
+@pytest.mark.parametrize(
+    ("name", "error"),
+    [("scratch", OSError(errno.EROFS, "read-only file system")), ("_opened", OSError("failed to map segment"))],
+)
+def test_a_cache_that_cannot_be_used_means_eager_images_and_one_line(copied_cache, monkeypatch, caplog, name, error):
+    """A read-only folder, and one that does not allow programs to run."""
+
+    def fails(*args):
+        raise error
+
+    monkeypatch.setattr(compiled, name, fails)
+    assert find_rasterizer("auto") is RASTERIZERS["eager"]
+    [line] = caplog.messages
+    assert str(error.strerror or error) in line
 
 
 PIXELS_AND_SELECTIONS = {(r.pixel.name, r.compositor, r.selection): name for name, r in RECIPES.items()}
@@ -203,13 +293,6 @@ def test_a_pickled_rasterizer_loads_the_packages_of_its_machine(built, empty_cac
 
 
 def test_an_empty_cache_loads_nothing(empty_cache):
-    assert compiled.load() is None
-
-
-def test_broken_packages_load_nothing(built, empty_cache):
-    compiled.cache_folder().mkdir(parents=True)
-    for kernel in compiled.KERNELS:
-        compiled.package_path(kernel).write_bytes(b"not a package")
     assert compiled.load() is None
 
 

@@ -2,17 +2,22 @@
 
 Each kernel becomes one package of `torch._inductor`.  Its file's name holds a hash of all that it was compiled from and
 by: the kernel's own sources (`tiled.sources`), torch, its options, the compiler and the processor.  So a stale package
-is never loaded, and a change of one kernel rebuilds that one.  A package that does not load, or whose result differs
-from the eager one, is built again.  A package that passed is remembered by its hash and is not compared again.
+is never loaded, and a change of one kernel rebuilds that one.
+
+Beside the package lies the library that was unpacked from it, once for all processes, and the hash of that library if
+its results equalled the eager ones.  A library with another hash is unpacked and compared again.  A kernel that cannot
+be used is left aside with a warning: images, or their gradients, are then computed eagerly.
 """
 
 import hashlib
+import logging
 import os
 import platform
 import shutil
 import subprocess
 import sys
 import warnings
+import zipfile
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import cache, partial
@@ -32,7 +37,8 @@ from aaplug.methods.recipe import Recipe
 from aaplug.rasterizers.tiled import backward, binning, forward, layout
 from aaplug.rasterizers.tiled.packages import CompiledKernels, Package
 from aaplug.rasterizers.tiled.sources import sources_of
-from aaplug.system.errors import UsageError
+from aaplug.system.digests import digest_of_files
+from aaplug.system.errors import UsageError, reason
 from aaplug.system.executors import Processes, torch_threads
 from aaplug.system.locks import scratch
 from aaplug.system.monitor import Tell
@@ -70,10 +76,14 @@ OVERLAPS = {  # of `Kernel`; as the architecture, the only setting whose text re
     "within registers": "native -fschedule-insns -fsched-pressure",
 }
 MAX_SIZE = 1 << 31
+LIBRARY_SUFFIXES = (".so", ".pyd", ".dll", ".dylib")  # of the library in a package, by system
 STANDARD_COMPILER = "clang++" if sys.platform == "darwin" else "g++"
 MAX_PROCESSES = 4  # compilers side by side: each takes most of a GB
 # Share of the largest value by which a package's result may differ from the eager one, on the example.
 RESULT_TOLERANCE = 1e-4
+
+log = logging.getLogger("aaplug")
+Run = Callable[[list[torch.Tensor]], list[torch.Tensor]]
 
 
 def kernels_of(recipes: Sequence[Recipe]) -> list[Kernel]:
@@ -138,12 +148,15 @@ def load() -> CompiledKernels | None:
     Others are used where they are built.  Each loads when it is first needed; a broken one is replaced by its eager
     function.
     """
-    paths = [(kernel, package_path(kernel)) for kernel in KERNELS]
-    if not all(path.is_file() for _, path in paths):
+    if not all(package_path(kernel).is_file() for kernel in KERNELS):
         return None
-    if not all(_is_sound(kernel, path) for kernel, path in paths if not kernel.pulls_back):
-        return None
-    return CompiledKernels(_package, KERNELS, load_or_eager)
+    packages = {}
+    for kernel in KERNELS:
+        if not kernel.pulls_back:
+            packages[kernel.name] = _package(kernel)
+            if packages[kernel.name] is None:
+                return None
+    return CompiledKernels(lambda kernel: packages.get(kernel.name) or _package(kernel), KERNELS, load_or_eager)
 
 
 def load_or_eager() -> Kernels:
@@ -160,15 +173,15 @@ def build(progress: Tell = lambda done, total: None, recipes: Sequence[Recipe] =
         UsageError: there is no compiler or it fails, the cache folder cannot be written, or a process died.
     """
     kernels = kernels_of(recipes)
-    missing = [kernel.name for kernel in kernels if not _is_sound(kernel, package_path(kernel))]
+    missing = [kernel.name for kernel in kernels if not _is_sound(kernel)]
     ready, total = len(kernels) - len(missing), len(kernels)
     progress(ready, total)
     if missing:
         if not has_compiler():
             raise UsageError("warmup", "needs a C++ compiler (g++ or clang++) for torch to compile with")
         processes = min(torch.get_num_threads(), MAX_PROCESSES, len(missing))
-        # The longest come first, so that none is left over at the end.  Kernels are made for torch's default threads.
-        pool = Processes(processes, torch_threads=None, ordered=False)
+        # The longest come first, so that none is left over at the end.
+        pool = Processes(processes, torch_threads=os.cpu_count() or 1, ordered=False)
         for done, _ in enumerate(pool.map(partial(_build, tuple(recipes)), missing[::-1]), start=ready + 1):
             progress(done, total)
     loaded = load()
@@ -177,48 +190,61 @@ def build(progress: Tell = lambda done, total: None, recipes: Sequence[Recipe] =
     return loaded
 
 
-def _is_sound(kernel: Kernel, path: Path) -> bool:
-    """True if the package gives the eager result.  A file beside it holds the hash of the package that did."""
-    mark = path.with_suffix(".sound")
-    try:
-        digest = hashlib.sha256(path.read_bytes()).hexdigest()
-        if mark.is_file() and mark.read_text() == digest:
-            return True
-        sound = _passes(kernel, path)
-        if sound:
-            with scratch(str(mark.parent)) as folder:
-                (folder / mark.name).write_text(digest)
-                os.replace(folder / mark.name, mark)
-        return sound
-    except FileNotFoundError:
-        return False
-    except OSError:  # the cache cannot be written: the next process compares again
-        return _passes(kernel, path)
+@cache
+def _warn(path: Path, problem: str) -> None:
+    log.warning("%s: %s; images are drawn eagerly, and slower; `aaplug warmup` builds it again", path, problem)
 
 
 def _package(kernel: Kernel) -> Package | None:
-    """The package of a kernel, if there is one and its result equals the eager one; else None."""
+    """The package of a kernel; None if it is not built or, with a warning, if it cannot be used."""
     path = package_path(kernel)
-    return Package.of(_opened(path), kernel) if _is_sound(kernel, path) else None
-
-
-def _opened(path: Path) -> Callable[[list[torch.Tensor]], list[torch.Tensor]]:
-    # This is the loader inside `aoti_load_package`, whose import takes 2 s and whose calls take four times as long.
-    loader = torch._C._aoti.AOTIModelPackageLoader  # pyright: ignore[reportAttributeAccessIssue]
-    return loader(str(path), "model", True, 1, -1).run
-
-
-def _passes(kernel: Kernel, path: Path) -> bool:
-    """True if the package's result on the example equals the eager one."""
     try:
-        package = _opened(path)
-        with torch.no_grad(), torch_threads(1):  # several threads would wait for each other
-            args, twins = kernel.example(), kernel.example()
-            results = [*package(list(args)), *args]  # with the arguments that are updated in place
-            expected = [*kernel.function(*twins), *twins]
-            return all(_close(a, b) for a, b in zip(results, expected, strict=True))
-    except Exception:  # a broken package can fail in any way; it is built again
-        return False
+        return Package.of(_compared(kernel, path), kernel)
+    except UsageError as error:
+        if path.exists():
+            _warn(path, error.problem)
+        return None
+
+
+def _is_sound(kernel: Kernel) -> bool:
+    with suppress(UsageError):
+        return bool(_compared(kernel, package_path(kernel)))
+    return False
+
+
+def _compared(kernel: Kernel, package: Path) -> Run:
+    """The function in a kernel's library, whose results were compared with the eager ones once.
+
+    Raises:
+        UsageError: it is not built, cannot be unpacked or loaded, or has other results.
+    """
+    library, mark = package.with_suffix(".so"), package.with_suffix(".so.sha256")
+    try:
+        if mark.is_file() and library.is_file() and mark.read_text() == digest_of_files([library]):
+            return _opened(library)
+        with zipfile.ZipFile(package) as members, scratch(str(package.parent)) as folder:
+            [name] = [name for name in members.namelist() if name.endswith(LIBRARY_SUFFIXES)]
+            (folder / library.name).write_bytes(members.read(name))
+            (folder / mark.name).write_text(digest_of_files([folder / library.name]))
+            mark.unlink(missing_ok=True)
+            os.replace(folder / library.name, library)
+            run = _opened(library)
+            with torch.no_grad(), torch_threads(1):  # several threads would wait for each other
+                args, twins = kernel.example(), kernel.example()
+                results = [*run(list(args)), *args]  # with the arguments that are updated in place
+                expected = [*kernel.function(*twins), *twins]
+                if not all(_close(a, b) for a, b in zip(results, expected, strict=True)):
+                    raise ValueError("its results differ from those of eager code")
+            os.replace(folder / mark.name, mark)
+            return run
+    except Exception as error:  # a broken library can fail in any way
+        [problem, *_] = reason(error).splitlines() or [type(error).__name__]
+        raise UsageError(f"kernel {kernel.name}", f"cannot be used: {problem}") from error
+
+
+def _opened(library: Path) -> Run:
+    # This is the runner inside `aoti_load_package`, whose import takes 2 s and whose calls take four times as long.
+    return torch._C._aoti.AOTIModelContainerRunnerCpu(str(library), 1).run  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def _close(result: torch.Tensor, expected: torch.Tensor) -> bool:
@@ -245,9 +271,13 @@ def _build(recipes: Sequence[Recipe], name: str) -> None:
             package = torch._inductor.aoti_compile_and_package(
                 program, package_path=str(folder / "k.pt2"), inductor_configs=_configs(kernel)
             )
+            path.with_suffix(".so").unlink(missing_ok=True)  # of the package that is replaced
             os.replace(package, path)
+        _compared(kernel, path)
+    except UsageError:
+        raise
     except OSError as error:
-        raise UsageError("warmup", f"cannot write {path.parent}: {error}") from error
+        raise UsageError("warmup", f"cannot write {path.parent}: {reason(error)}") from error
     except Exception as error:  # a compiler can fail in any way
         problem = f"torch {torch.__version__} cannot compile '{kernel.name}' here: {error}"
         raise UsageError("warmup", problem) from error
