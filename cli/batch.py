@@ -54,7 +54,7 @@ def batch_of_evaluations(words: Words) -> int:
         inputs = read_inputs(own)
         return aaplug.evaluate(*inputs, output, **keywords | given)
 
-    with running(options, None, lambda: None, shared=first.output) as workers:
+    with running(options, None, lambda: None, (), shared=first.output) as workers:
         runs = [(name, partial(run, own, workers.cluster)) for name, own in scenes]
         how = {"resume": options.resume, "overwrite": options.overwrite, "monitor": TERMINAL}
         batch = aaplug.batch(runs, first.output, **how)
@@ -103,7 +103,7 @@ def for_each_scene(words: Words, suffix: Callable[[Words], str], work: Callable[
     check = partial(refuse_existing, [folder / SUMMARY], words.overwrite or words.resume)
     check()
     options = RecipeOptions(scheduler=words.scheduler, threads=words.threads, monitor=TERMINAL)
-    with running(options, folder, check, folder=True) as workers:
+    with running(options, folder, check, [words.batch], folder=True) as workers:
         apply = map if workers.cluster is None else workers.cluster.map
         results = apply(_OneScene(work, None if workers.cluster is None else Path.cwd()), todo.values())
         for name, facts in zip(todo, results, strict=True):

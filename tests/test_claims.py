@@ -1,6 +1,9 @@
 """An output is written by one process; what another wrote meanwhile is not replaced."""
 
+import os
+import shutil
 from contextlib import contextmanager
+from itertools import cycle
 from pathlib import Path
 
 import pytest
@@ -65,3 +68,34 @@ def test_what_another_process_wrote_meanwhile_is_not_replaced(name, job, monkeyp
     assert (code, written.read_bytes()) == (2, b"rival's")
     assert "exists" in err or "already holds" in err
     assert not any(word in err for word in ("tuning for", "rendering:", "---"))
+
+
+@pytest.mark.parametrize("name", [*OUTPUTS, "report"])
+def test_no_input_is_replaced_whatever_overwrite_says(name, job):
+    """Each file that a verb writes becomes, one after the other, a link to a photograph, cameras or the scene."""
+    words, output, _ = OUTPUTS.get(name, (f"{OUTPUTS['evaluate'][0]} --report --layout inria", "out", ""))
+    assert job(words)[0] == 0
+    sources = cycle([Path("test/r_0.png"), Path("transforms_train.json"), Path("scene.ply")])
+    links = cycle([os.link, lambda source, path: path.symlink_to(source.absolute())])
+    written = [path for path in (Path(output), *Path(output).rglob("*"), *Path().glob("t.finetune*")) if path.is_file()]
+    each_kind = {(path.parent, path.suffix): path for path in written}.values()
+    assert each_kind
+    for path, source, link in zip(each_kind, sources, links, strict=False):
+        before, old = source.read_bytes(), path.read_bytes()
+        path.unlink()
+        link(source, path)
+        code, err = job(f"{words} --overwrite")
+        assert (code > 0, source.read_bytes() == before, path.samefile(source)) == (True, True, True), path
+        assert f"is also the input {source}" in " ".join(err.split()), path
+        path.unlink()
+        path.write_bytes(old)
+
+
+def test_photographs_that_the_chosen_cameras_do_not_name_are_inputs_too(job):
+    shutil.copytree("test", "val")
+    shutil.copytree("test", "images_4")
+    for folder in ("test", "val", "images_4"):
+        before = Path(folder, "r_0.png").read_bytes()
+        code, err = job(f"render scene.ply --cameras transforms_test.json -o {folder} --overwrite")
+        assert (code, Path(folder, "r_0.png").read_bytes()) == (2, before)
+        assert "is also the input" in err

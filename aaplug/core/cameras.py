@@ -8,7 +8,7 @@ Sizes and focal lengths may differ from view to view.
 import hashlib
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -130,6 +130,7 @@ class CameraSet:
     background: the colour that training put behind the scene; None if the files do not say.
     notes: facts worth printing, one line each (format, split, training scale and its source).
     assumed: true where nobody knows the cameras, and these stand in for them.
+    files: what they were read from, with the data set's photographs; no output replaces one.
     """
 
     train: tuple[Camera, ...]
@@ -137,12 +138,18 @@ class CameraSet:
     background: tuple[float, float, float] | None = None
     notes: tuple[str, ...] = ()
     assumed: bool = False
+    files: tuple[Path, ...] = ()
 
     @property
     def all(self) -> tuple[Camera, ...]:
         """Every camera once, training views first."""
         training = {id(camera) for camera in self.train}
         return self.train + tuple(camera for camera in self.test if id(camera) not in training)
+
+
+def photographs(views: Iterable[Camera]) -> list[Path]:
+    """Files of the views' photographs, of those that have one."""
+    return [view.photo for view in views if view.photo is not None]
 
 
 def whole_side(length: float) -> int:

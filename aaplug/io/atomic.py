@@ -1,9 +1,11 @@
-"""Files that appear whole or not at all.
+"""Files that appear whole or not at all, and never in place of an input.
 
 A temporary file beside the output takes the output's name once all of its bytes are on the disk.  If writing fails or
 is interrupted, the old file is unchanged and the temporary file is removed.
 
 Functions raise OutputError for an output that exists while `overwrite` is false, has no folder or cannot be written.
+Inside `writing` they raise it, whatever `overwrite` says, for an output that is an input, also through symbolic or hard
+links.
 """
 
 import hashlib
@@ -21,9 +23,14 @@ from aaplug.system.locks import OUR_PREFIX, new_file, remove_left
 TOKEN_BYTES = 8  # random bytes in a temporary file's name: 2^64 names
 HASH_DIGITS = 16  # in the name of a claim
 
+FileId = tuple[int, int]  # device and number on it: the same for every name of a file
+AnyPath = str | PathLike[str]
+_open_outputs = list[AnyPath]()  # of the blocks of `writing` in this process
+_inputs = dict[FileId, AnyPath]()  # of these blocks and of those that ended inside them
+
 
 @contextmanager
-def replacing(path: str | PathLike[str], overwrite: bool) -> Iterator[BinaryIO]:
+def replacing(path: AnyPath, overwrite: bool) -> Iterator[BinaryIO]:
     """Yield a binary stream whose content becomes `path` when the block ends without an exception.
 
     The block should only write: any OSError in it is reported as a failure to write `path`.
@@ -33,7 +40,7 @@ def replacing(path: str | PathLike[str], overwrite: bool) -> Iterator[BinaryIO]:
 
 
 @contextmanager
-def replacing_file(path: str | PathLike[str], overwrite: bool, suffix: str = ".tmp") -> Iterator[Path]:
+def replacing_file(path: AnyPath, overwrite: bool, suffix: str = ".tmp") -> Iterator[Path]:
     """Like `replacing`, for libraries that open their file themselves: yields an empty file that ends in `suffix`."""
     path = Path(path)
     _check_target(path, overwrite)
@@ -56,17 +63,14 @@ def replacing_file(path: str | PathLike[str], overwrite: bool, suffix: str = ".t
 
 
 @contextmanager
-def claimed(path: str | PathLike[str] | None, check: Callable[[], object] = lambda: None) -> Iterator[None]:
-    """Keep other processes from writing an output, a file or a folder, while the block runs; None claims nothing.
+def claimed(path: AnyPath, check: Callable[[], object] = lambda: None) -> Iterator[None]:
+    """Keep other processes from writing an output, a file or a folder, while the block runs.
 
     check: refuses what must not be written.  It is called again here, as another process may have written meanwhile.
 
     Raises:
         OutputError: another process is writing it, or nothing can be written beside it.
     """
-    if path is None:
-        yield
-        return
     path = Path(os.path.realpath(path))
     name = OUR_PREFIX + hashlib.sha256(os.fsencode(path.name)).hexdigest()[:HASH_DIGITS]
     mark = path / name if path.is_dir() else path.with_name(name)
@@ -83,28 +87,40 @@ def claimed(path: str | PathLike[str] | None, check: Callable[[], object] = lamb
 
 
 @contextmanager
-def writing(path: str | PathLike[str] | None, check: Callable[[], object], folder: bool = False) -> Iterator[None]:
+def writing(
+    path: AnyPath | None, check: Callable[[], object], inputs: Iterable[AnyPath], folder: bool = False
+) -> Iterator[None]:
     """Claim an output while the block writes it; None claims nothing.  Raises as `claimed` and `make_folder`.
 
-    check: refuses what must not be written.  folder: the output is one; it is made, and removed if it stays empty.
+    check: refuses what must not be written.
+    inputs: files that nothing in this process replaces before the outermost block ends.
+    folder: the output is one; it is made, and removed if it stays empty.
     """
+    if path is None:
+        yield
+        return
     with ExitStack() as stack:
-        if path is not None and folder:
+        _open_outputs.append(path)
+        stack.callback(_close, path)
+        _inputs.update(_ids_of(inputs))
+        if folder:
             stack.enter_context(output_folder(path))
         stack.enter_context(claimed(path, check))
         yield
 
 
-def check_output(path: str | PathLike[str], overwrite: bool, inputs: Iterable[str | PathLike[str]] = ()) -> None:
-    """Refuse an output that must not be written, before any work: one of the inputs too, whatever `overwrite` says."""
-    for source in inputs:
-        with suppress(OSError, ValueError):  # a file that does not exist is the same as no other
-            if os.path.samefile(path, source):
-                raise OutputError(path, f"is also the input {source}; give the output another name")
-    _check_target(Path(path), overwrite)
+def _close(path: AnyPath) -> None:
+    _open_outputs.remove(path)
+    if not _open_outputs:
+        _inputs.clear()
 
 
-def make_folder(path: str | PathLike[str]) -> Path:
+def check_output(path: AnyPath, overwrite: bool, inputs: Iterable[AnyPath] = ()) -> None:
+    """Refuse an output that must not be written, before any work; one of these inputs too."""
+    _check_target(Path(path), overwrite, inputs)
+
+
+def make_folder(path: AnyPath) -> Path:
     """Make a folder and its parents where they do not exist, and return it."""
     try:
         Path(path).mkdir(parents=True, exist_ok=True)
@@ -114,7 +130,7 @@ def make_folder(path: str | PathLike[str]) -> Path:
 
 
 @contextmanager
-def output_folder(path: str | PathLike[str]) -> Iterator[Path]:
+def output_folder(path: AnyPath) -> Iterator[Path]:
     """Make a folder for the outputs of the block; if it fails, remove what was made and is still empty."""
     path = Path(path)
     missing = [folder for folder in (path, *path.parents) if not folder.exists()]
@@ -133,12 +149,33 @@ def refuse_existing(paths: Sequence[Path], overwrite: bool) -> None:
     folder = paths[0].parent
     if folder.exists() and not folder.is_dir():
         raise OutputError(folder, "is a file; name a folder")
+    refuse_inputs(paths)
     existing = [path.name for path in paths if path.exists()]
     if existing and not overwrite:
         raise OutputError(folder, f"already holds {listing(existing, most=3)}; pass `overwrite` to replace files")
 
 
-def _check_target(path: Path, overwrite: bool) -> None:
+def refuse_inputs(paths: Iterable[AnyPath], inputs: Iterable[AnyPath] = ()) -> None:
+    """Refuse outputs that are one of these inputs, or one inside `writing`."""
+    sources = _inputs | _ids_of(inputs)
+    for file_id, path in _ids_of(paths).items():
+        if file_id in sources:
+            raise OutputError(path, f"is also the input {sources[file_id]}; give the output another name")
+
+
+def _ids_of(paths: Iterable[AnyPath]) -> dict[FileId, AnyPath]:
+    """The files that exist, without folders."""
+    ids = dict[FileId, AnyPath]()
+    for path in paths:
+        with suppress(OSError, ValueError):
+            if os.path.isfile(path):
+                status = os.stat(path)
+                ids[status.st_dev, status.st_ino] = path
+    return ids
+
+
+def _check_target(path: Path, overwrite: bool, inputs: Iterable[AnyPath] = ()) -> None:
+    refuse_inputs([path], inputs)
     try:
         if path.is_dir():
             raise OutputError(path, "is a folder; name a file in it")

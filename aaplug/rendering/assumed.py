@@ -52,7 +52,7 @@ def cameras_around(scene: SceneLike, orbit: Orbit, single: bool = False) -> Came
     scene = scene_of(scene)
     sample = scene.sample(PROBE_ROWS)
     frame = frame_around(scene, orbit, sample)
-    path = next(iter(scene.files), None)
+    path = scene.source
     train, reason = _assumed_training(orbit, frame, sample, path)
     cameras = CameraSet(train, _orbit_views(orbit, frame, train[0]), assumed=True)
     size, rate = f"{train[0].width}x{train[0].height}", rate_of(cameras, frame)

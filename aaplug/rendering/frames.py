@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from aaplug.core.cameras import Camera
+from aaplug.core.cameras import Camera, photographs
 from aaplug.io.atomic import check_output
 from aaplug.io.images import write_png
 from aaplug.rendering.renderer import Renderer
@@ -41,8 +41,9 @@ def write_frames(
     """
     total = len(views)
     files = tuple(Path(path) for path in paths)
+    photos = photographs(views)
     for path in files:
-        check_output(path, overwrite)
+        check_output(path, overwrite, photos)
     write = _Writer(renderer, tuple(views), files, bit_depth)
     tell(0, total)
     for done, _ in enumerate(apply(write, range(total)), start=1):

@@ -5,7 +5,7 @@ claims the output and connects the workers.
 """
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,11 +16,11 @@ from typing import Generic, TypeVar
 
 import torch
 
-from aaplug.core.cameras import Camera, CameraSet
+from aaplug.core.cameras import Camera, CameraSet, photographs
 from aaplug.core.colours import BLACK, WHITE
 from aaplug.core.interfaces import MatchesRates, TakesMemory
 from aaplug.core.training import TrainingViews
-from aaplug.io.atomic import writing
+from aaplug.io.atomic import AnyPath, writing
 from aaplug.io.cameras import read_cameras, select_views
 from aaplug.io.limits import lack_of_memory
 from aaplug.io.scenes import SceneLike, scene_of
@@ -83,6 +83,11 @@ class Job(Generic[O_co]):
     def monitor(self) -> Monitor:
         """Receiver of messages and progress."""
         return self.options.monitor
+
+    @property
+    def inputs(self) -> tuple[Path, ...]:
+        """Files that no output replaces: those of the scene and of the cameras, and the photographs."""
+        return *self.scene.files, *self.cameras.files, *photographs(self.cameras.all)
 
     @cached_property
     def views(self: "Job[ViewOptions]") -> tuple[Camera, ...]:
@@ -176,11 +181,17 @@ class Workers:
 
 @contextmanager
 def running(
-    options: Options, output: Path | None, check: Callable[[], object], folder: bool = False, shared: Path | None = None
+    options: Options,
+    output: Path | None,
+    check: Callable[[], object],
+    inputs: Iterable[AnyPath],
+    folder: bool = False,
+    shared: Path | None = None,
 ) -> Iterator[Workers]:
     """Limit torch's threads, claim the output and connect the workers that the options name, inside the block.
 
-    check: refuses what must not be written; see `io.atomic.writing`.  folder: the output is one.
+    check: refuses what must not be written.  inputs: files that no output replaces; both see `io.atomic.writing`.
+    folder: the output is one.
     shared: folder that all workers see; None for the output's.
 
     Raises:
@@ -189,7 +200,7 @@ def running(
     """
     threads = getattr(options, "threads", None) or torch.get_num_threads()
     scheduler = options.scheduler if isinstance(options, RecipeOptions) else None
-    with torch_threads(threads), writing(output, check, folder):
+    with torch_threads(threads), writing(output, check, inputs, folder):
         if not isinstance(scheduler, str):
             yield Workers(threads, scheduler)
             return

@@ -12,7 +12,7 @@ from rich.table import Table
 
 from aaplug.evaluation.report.files import as_json, write_texts
 from aaplug.evaluation.results import Report, as_csv, grid, method, results
-from aaplug.io.atomic import claimed, output_folder, refuse_existing
+from aaplug.io.atomic import refuse_existing, writing
 from aaplug.options.shared import AnyPath
 from aaplug.options.verbs import EvaluateOptions
 from aaplug.system.errors import AaplugError, ClusterError, printable
@@ -105,10 +105,10 @@ def batch(
             check_results(folder, EvaluateOptions(resume=resume, overwrite=overwrite))
 
     check()
-    with output_folder(output) as made, claimed(made, check):
+    with writing(output, check, (), folder=True):
         found = _batch(dict(zip(folders, runs, strict=True)), resume, overwrite, monitor)
         texts = {SUMMARY: as_json(found.summary()), RESULTS: as_csv(found.reports)}
-        for path in write_texts(made, texts, overwrite=True):  # checked at the start
+        for path in write_texts(output, texts, overwrite=True):  # checked at the start
             monitor.say(f"wrote {path}")
     return found
 

@@ -38,7 +38,7 @@ def bench(scene: SceneLike | None, cameras: CamerasLike, options: BenchOptions) 
         cameras: see `render`.
     """
     runs: list[Figures] = []
-    with running(options, None, lambda: None):
+    with running(options, None, lambda: None, ()):
         if scene is None:
             work = _synthetic(options)
         else:

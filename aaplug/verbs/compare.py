@@ -74,7 +74,8 @@ def compare(scenes: ScenesLike, cameras: CamerasLike, output: AnyPath | None, op
     job = Job.of(next(iter(named.values())), cameras, options)
     views, scales = job.views, options.scale
     images = folder and ImageStore(folder, views_in_report(options.show, views))
-    with running(options, folder, check, folder=True) as workers:
+    inputs = [*job.inputs, *(file for scene in named.values() for file in scene.files)]
+    with running(options, folder, check, inputs, folder=True) as workers:
         named = {name: settled(scene, job.cameras, options.monitor) for name, scene in named.items()}
         rows = _rows(named, options)
         look = job.look(len(views) * len(scales) * len(rows))

@@ -69,7 +69,7 @@ def convert(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opti
     files = {"overwrite": options.overwrite, "spz_axes": options.spz_axes}
     check = partial(check_scene_output, path, options.overwrite, job.scene.files) if path else lambda: None
     check()
-    with running(options, path, check) as workers:
+    with running(options, path, check, job.inputs) as workers:
         if path and job.scene.path and job.scene.count > LARGE_SCENE and isinstance(rule, Form):
             return _converted_in_parts(job, rule, path, workers.threads, files)
         result = _closed_form(job, rule) if isinstance(rule, Form) else _fitted(job, rule)

@@ -62,7 +62,7 @@ def evaluate(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
     source = _truth_source(job, protocol)
     facts = _facts(job, source)
     images = folder and ImageStore(folder, report_views, everything=options.layout == "inria")
-    with running(options, folder, lambda: check_results(folder, options), folder=True) as workers:
+    with running(options, folder, lambda: check_results(folder, options), job.inputs, folder=True) as workers:
         look = job.look(len(views) * len(recipes) * len(scales))
         job.say_assumed(look)
         candidates = candidates_of(job.scene, look.training, recipes, look.rasterizer, look.background)
@@ -124,11 +124,11 @@ def check_journalled(folder: Path | None, files: Sequence[str], what: str, resum
         raise UsageError("resume", "needs a folder; give `output`")
     if resume and overwrite:
         raise UsageError("resume", "and `overwrite` contradict each other; give one")
-    if folder is None or overwrite or resume:
+    if folder is None:
         return
-    if (folder / JOURNAL).exists():
+    if (folder / JOURNAL).exists() and not (overwrite or resume):
         raise OutputError(folder, f"holds {what}; `resume` continues it, `overwrite` starts anew")
-    refuse_existing([folder / name for name in files], overwrite=False)
+    refuse_existing([folder / name for name in (JOURNAL, *files)], overwrite or resume)
 
 
 def _metrics(options: EvaluateOptions) -> tuple[list[Metric], Protocol]:

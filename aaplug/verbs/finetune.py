@@ -86,7 +86,7 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
     enlarge = back_projected if options.upsampler is None else upsampled(find_upsampler(options.upsampler))
     upsampler = str(options.upsampler)
     upsampler = digest_of_files([upsampler]) if Path(upsampler).is_file() else upsampler
-    with running(options, path, check):
+    with running(options, path, check, job.inputs):
         raw, look, train = job.scene.gaussians(), job.look(settings.steps), job.cameras.train
         job.say_assumed(look)
         before = replace(look, scene=viewer.shown(look.scene), recipe=RECIPES[viewer.recipe])

@@ -74,7 +74,7 @@ def lod(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, options:
     if not job.cameras.assumed:
         check_frame(whole.means, job.cameras.train, whole.name, options.min_seen)
     job.say_assumed()
-    with running(options, path, check, folder=not options.single):
+    with running(options, path, check, job.inputs, folder=not options.single):
         maker = _Maker.of(whole, job)
         if not options.single:
             return list(_levels(maker, path, files))
@@ -222,7 +222,7 @@ def _files(output: Path | None, scene: Scene, options: LodOptions) -> list[Path]
         return [output]
     if written_format(output):
         raise OutputError(output, "levels go to a folder; for one scene, give `simplify` or `budget`")
-    stem = scene.files[0].stem if scene.files else "scene"
+    stem = scene.source.stem if scene.source else "scene"
     files = [output / f"{stem}_lod{level}.ply" for level in range((options.levels or DEFAULT_LEVELS) + 1)]
     others = [output / MANIFEST] if options.viewer is None else []
     refuse_existing([*files, *others], options.overwrite or options.resume)

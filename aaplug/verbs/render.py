@@ -43,7 +43,7 @@ def render(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, optio
     views = resized(job.views, options.scale, options.resolution, job.cameras.assumed)
     check = partial(image_paths, target, views, options.overwrite)
     paths = check()
-    with running(options, target, check, folder=not names_image(target)) as workers:
+    with running(options, target, check, job.inputs, folder=not names_image(target)) as workers:
         renderer = job.look(len(views)).by(job.recipe(options.recipe))
         job.monitor.say(description(renderer, views))
         job.say_assumed(renderer, views[0])

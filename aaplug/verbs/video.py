@@ -68,7 +68,8 @@ def video(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, option
         rate = camera_paths.factor(share, options.start, options.end) if receding else 1.0
         return side_by_side(images, labels, rate, views[index].width / path[index].width)
 
-    with running(options, target, check) as workers:
+    path_file = [] if file is None else [str(options.path)]
+    with running(options, target, check, [*job.inputs, *path_file]) as workers:
         look = job.look(len(views) * len(recipes))
         renderers = [look.by(recipe) for recipe in recipes]
         size = f"{views[0].width}x{views[0].height}"

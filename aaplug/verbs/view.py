@@ -38,7 +38,7 @@ def serving(scene: SceneLike | None, cameras: CamerasLike, options: LiveOptions)
         if scene is None:
             folder = stack.enter_context(as_file(files("aaplug.io.sample")))
             scene, cameras = folder / SAMPLE, folder if cameras is None else cameras
-        stack.enter_context(running(options, None, lambda: None))
+        stack.enter_context(running(options, None, lambda: None, ()))
         job = Job.of(scene, cameras, options)
         look = job.look(MIN_FRAMES, check=False)
         job.say_assumed()

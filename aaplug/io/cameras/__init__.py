@@ -7,6 +7,7 @@ an entry point in the group "aaplug.camera_formats" (see `core.registry`).  `rea
 
 import difflib
 import os
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -14,6 +15,7 @@ from typing import Protocol, runtime_checkable
 from aaplug.core.cameras import Camera, CameraSet
 from aaplug.io.cameras import blender, camera_path, colmap, inria, inria_model, llff, multiscale, pinhole, transforms
 from aaplug.io.cameras.options import CameraFileOptions
+from aaplug.io.cameras.photos import files_of
 from aaplug.io.cameras.poses import pose
 from aaplug.io.values import MAX_FOCAL, Place, focal, number, numbers, pixels
 from aaplug.system.errors import FormatError, UsageError, listing
@@ -82,7 +84,8 @@ def read_cameras(
     formats = sorted(CAMERA_FORMATS.values(), key=OWN.__contains__)  # plug-ins first
     for format in formats:
         if format.sniff(path):
-            return _checked(format.read(path, options), path)
+            cameras = _checked(format.read(path, options), path)
+            return replace(cameras, files=files_of(path, cameras))
     signs = "; ".join(format.sign for format in formats)
     raise FormatError(path, f"holds no cameras of a known format; looked for: {signs}")
 

@@ -5,16 +5,21 @@ the user chose in vain.
 """
 
 import os
+import re
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
-from aaplug.core.cameras import Camera
+from aaplug.core.cameras import Camera, CameraSet, photographs
 from aaplug.io.cameras.options import CameraFileOptions
 from aaplug.io.values import Place
 from aaplug.system.errors import FormatError, UsageError, listing
 
+CAMERA_FILE = re.compile(  # of any format
+    r"(dataparser_)?transforms.*\.json|(cameras|metadata)\.json|cfg_args|poses_bounds\.npy|(cameras|images|points3D)\..*"
+)
+PHOTO_FOLDER = re.compile(r"train|test|val|images(_\d+)?")  # by the customs of data sets
 COMMON_SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")  # tried for names without a suffix
 SUFFIXES = (*COMMON_SUFFIXES, ".webp", ".tif", ".tiff", ".bmp", ".exr")  # of image files
 
@@ -72,6 +77,27 @@ def with_photos(cameras: Sequence[Camera], places: Sequence[Place], folder: Phot
         names = listing([camera.name for camera in cameras], most=3)
         raise UsageError("images", f"{folder.folder} holds no photo of these cameras ({names})")
     return photographed
+
+
+def files_of(path: Path, cameras: CameraSet) -> tuple[Path, ...]:
+    """The files that these cameras may have been read from, and all photographs of their data set."""
+    home = path if path.is_dir() else path.parent
+    files = [path, *photographs(cameras.all)]
+    for folder in (home, home / "sparse", home / "sparse" / "0", home / "0"):
+        files += [file for file in _listed(folder) if CAMERA_FILE.fullmatch(file.name)]
+    photo_folders = {photo.parent for photo in photographs(cameras.all)}
+    for root in {folder.parent for folder in photo_folders if PHOTO_FOLDER.fullmatch(folder.name)}:
+        for folder in _listed(root):
+            if PHOTO_FOLDER.fullmatch(folder.name):
+                files += [file for file in _listed(folder) if file.suffix.lower() in SUFFIXES]
+    return tuple(dict.fromkeys(files))
+
+
+def _listed(folder: Path) -> list[Path]:
+    try:
+        return sorted(folder.iterdir())
+    except OSError:
+        return []
 
 
 def without_suffix(name: str) -> str:

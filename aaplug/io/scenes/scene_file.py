@@ -120,35 +120,36 @@ class Scene:
     @property
     def file(self) -> Path | None:
         """The file that it was read from, or its folder of levels of detail; None if it has none."""
-        path = self.folder or self._source
+        path = self.folder or self.source
         return None if path is None else path.resolve()
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """Files that outputs must not replace."""
-        return () if self._source is None else (self._source,)
+        """Files that hold it, which no output replaces: of levels of detail or SOG images all in their folder."""
+        path = self.folder or self.source
+        if path is None:
+            return ()
+        folder = path.parent if path.name == SOG_FOLDER else path
+        return tuple(file for file in folder.iterdir() if file.is_file()) if folder.is_dir() else (path,)
 
     @property
-    def _source(self) -> Path | None:
+    def source(self) -> Path | None:
+        """The file that its rows come from; of levels of detail the finest's."""
         origin = None if self.path is not None else self.memory["gaussians"].origin
         return self.path if origin is None else Path(origin.path)
 
     @property
     def bytes(self) -> int | None:
         """Size of the file; of levels of detail or SOG images, of their folder's files.  None if there is none."""
-        if self.file is None:
-            return None
-        folder = self.file.parent if self.file.name == SOG_FOLDER else self.file
         try:
-            files = [file for file in folder.iterdir() if file.is_file()] if folder.is_dir() else [self.file]
-            return sum(file.stat().st_size for file in files)
+            return sum(file.stat().st_size for file in self.files) if self.files else None
         except OSError:
             return None
 
     @property
     def camera_folder(self) -> Path | None:
         """The scene's folder, or the model folder that its file is in, if that holds cameras."""
-        path = self.folder or self._source
+        path = self.folder or self.source
         if path is None:
             return None
         folder = path.parents[2] if path.match(MODEL_SCENE) else path
