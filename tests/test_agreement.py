@@ -15,11 +15,12 @@ from aaplug.core.training import TrainingViews
 from aaplug.io.scenes import read_scene, write_scene
 from aaplug.io.scenes.packed import half_turn_about_x
 from aaplug.io.scenes.scene_file import Scene
-from aaplug.options.shared import Orbit
+from aaplug.options.shared import Orbit, ViewOptions
 from aaplug.rendering.agreement import Agreement, agreement, settled
 from aaplug.rendering.assumed import cameras_around
+from aaplug.rendering.job import Job
 from aaplug.rendering.renderer import own_look
-from aaplug.verbs.render import render
+from aaplug.system.errors import FrameError
 from tests.conftest import make_camera, make_scene
 
 
@@ -51,13 +52,21 @@ def test_without_photographs_cameras_should_look_at_the_scenes_middle():
     assert "the middle of the scene lies outside of the image" in found.doubt
 
 
-def test_doubt_is_a_warning(sample_scene, sample_cameras, tmp_path, caplog):
-    with caplog.at_level(logging.WARNING, "aaplug"):
-        render(half_turn_about_x(sample_scene), sample_cameras, tmp_path / "a", views="r_8", scale=0.05)
+@pytest.mark.parametrize("photographs", [True, False])
+def test_cameras_of_another_capture_are_refused_unless_min_seen_is_0(sample_scene, sample_cameras, photographs, caplog):
+    scene, cameras = half_turn_about_x(sample_scene), sample_cameras
+    if not photographs:
+        aside = tuple(replace(view, cx=view.cx + 0.6 * view.width, photo=None) for view in cameras.train)
+        scene, cameras = sample_scene, replace(cameras, train=aside, test=aside)
+    job = Job.of(scene, cameras, ViewOptions())
+    with pytest.raises(FrameError, match=r"seem to be of different captures.*if they are right, pass `min_seen` 0"):
+        job.look(1)
+    replace(job, options=ViewOptions(min_seen=0.0)).look(1)
     assert "seem to be of different captures" in caplog.text
-    caplog.clear()
-    with caplog.at_level(logging.WARNING, "aaplug"):
-        render(sample_scene, sample_cameras, tmp_path / "b", views="r_8", scale=0.05)
+
+
+def test_cameras_of_the_same_capture_are_not_doubted(sample_scene, sample_cameras, caplog):
+    Job.of(sample_scene, sample_cameras, ViewOptions()).look(1)
     assert caplog.text == ""
 
 

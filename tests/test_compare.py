@@ -16,7 +16,7 @@ from aaplug.evaluation.alignment import mismatch
 from aaplug.evaluation.comparison import differences
 from aaplug.evaluation.engine import ViewMeasurer
 from aaplug.evaluation.journal import Journal
-from aaplug.evaluation.report.contact_sheet import ERROR_FULL, HEAT, error_map
+from aaplug.evaluation.report.contact_sheet import ERROR_FULL, HEAT, contact_sheet, error_map, labelled, magnified
 from aaplug.io.cameras import read_cameras
 from aaplug.io.images import image_size
 from aaplug.io.scenes import read_scene, write_scene
@@ -262,7 +262,8 @@ def test_files_and_a_continued_run(cli, monkeypatch):  # noqa: F811
     scene = read_scene("scene.ply").gaussians()
     write_scene("dim.ply", replace(scene, logit_opacities=scene.logit_opacities - 1))
     words = f"compare scene.ply dim.ply {WORDS} -o out --show 1"
-    real, added = Journal.add, []
+    real, added, texts = Journal.add, [], list[str]()
+    monkeypatch.setattr("cv2.putText", lambda sheet, text, *rest: texts.append(text))
 
     def stopping(self, view, measurements):
         if len(added) == 2:
@@ -276,6 +277,10 @@ def test_files_and_a_continued_run(cli, monkeypatch):  # noqa: F811
     assert "resume" in cli(words)[2]
     assert cli(f"{words} --resume")[0] == 0
     data = json.loads(Path("out/compare.json").read_text())
+    per_view = [scale["per_view"] for scale in data["scenes"]["dim.ply"]["scales"].values()]
+    _, worst = min((views[name]["PSNR"], name) for views in per_view for name in views)
+    captions = [f"{views[worst]['PSNR']:.2f} dB" for views in reversed(per_view)]
+    assert [text for text in texts if "dB" in text] == captions
     assert json.loads(cli(f"{words} --overwrite --json")[1])["guard"] == data["guard"]
     with Path("out/compare.csv").open() as stream:
         rows = list(csv.DictReader(stream))
@@ -287,6 +292,29 @@ def test_files_and_a_continued_run(cli, monkeypatch):  # noqa: F811
     assert "compared scene" in page
     width, height = image_size(Path("out/contact-sheet.png"))
     assert width > height > 3 * 320
+
+
+@pytest.fixture
+def texts(monkeypatch):
+    """What is written into pictures, in order."""
+    texts = []
+    monkeypatch.setattr("cv2.putText", lambda sheet, text, *rest: texts.append(text))
+    return texts
+
+
+def test_pictures_hold_no_sign_that_the_font_lacks(texts):
+    image = torch.zeros(400, 400, 3)
+    labelled(image, "4× – é ∞ 日")
+    magnified(image, 0.1, "½ of {times}×")
+    contact_sheet(("a×", "b×"), [(2.0, (image, image))])
+    assert texts == ["4x - e inf ?", "1?2 of 9x", "ax", "bx", "2x: 400x400", "equal"]
+
+
+def test_under_each_picture_stands_its_psnr_against_the_first_of_its_row(texts):
+    images = [torch.full((5, 6, 3), level / 255) for level in (100, 100, 110)]
+    contact_sheet(("truth", "same", "other"), [(0.5, images), (0.25, images)], errors=True)
+    assert texts[:5] == ["truth", "same", "error", "other", "error"]
+    assert texts[5:] == ["1/2: 6x5", "equal", "28.13 dB", "1/4: 6x5", "equal", "28.13 dB"]
 
 
 def test_an_error_map_runs_from_black_to_the_end_of_the_scale():

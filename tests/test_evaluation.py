@@ -1,11 +1,14 @@
 """Evaluation: what is compared with what, and what the report holds."""
 
-from dataclasses import replace
+import json
+import math
+from dataclasses import fields, replace
 from pathlib import Path
 
 import pytest
 import torch
 
+from aaplug.core.cameras import Camera, Lens
 from aaplug.core.imaging import box_average, quantised
 from aaplug.core.training import TrainingViews
 from aaplug.evaluation import METRICS, PROTOCOLS
@@ -20,7 +23,7 @@ from aaplug.methods import RECIPES
 from aaplug.methods.recipes import find_recipe
 from aaplug.rasterizers import RASTERIZERS
 from aaplug.rendering.renderer import Renderer, own_look
-from aaplug.system.errors import UsageError
+from aaplug.system.errors import FormatError, UsageError
 from tests.conftest import make_camera, make_scene
 
 
@@ -202,6 +205,41 @@ def test_an_interrupted_evaluation_continues_and_redoes_nothing(look, views, tmp
     assert not seen
 
 
+EDITS = {
+    "a view that is there": ("view", 0),
+    "a view that is not": ("view", 2),
+    "a negative view": ("view", -1),
+    "no view": ("view", True),
+    "a part of a view": ("view", 1.5),
+    "another recipe": ("recipe", "mip"),
+    "another scale": ("scale", 0.75),
+    "another name": ("name", "a"),
+    "another metric": ("values", {"PSNR": 30.0, "FLIP": 0.1}),
+    "a metric less": ("values", {"PSNR": 30.0}),
+    "no number": ("values", {"PSNR": math.nan, "SSIM": 1.0}),
+    "no finite time": ("seconds", math.inf),
+    "no samples": ("samples", None),
+    "a measurement less": ("measurements", []),
+}
+
+
+@pytest.mark.parametrize("edit", EDITS)
+def test_a_journal_that_was_edited_by_hand_is_refused(look, views, tmp_path, edit):
+    path = tmp_path / "progress.jsonl"
+    work = task(look, views, scales=(1.0, 0.5), recipes=("classic",), ceiling=False)
+    evaluate(work, journal=path)
+    *kept, last = path.read_text().splitlines()
+    key, value = EDITS[edit]
+    line = json.loads(last)
+    if key in line:
+        line[key] = value
+    else:
+        line["measurements"][1]["view" if key == "name" else key] = value
+    path.write_text("\n".join([*kept, json.dumps(line), ""]))
+    with pytest.raises(FormatError, match="its line 3 is damaged"):
+        evaluate(work, journal=path, resume=True)
+
+
 def test_images_lie_where_3dgs_scripts_look(look, views, tmp_path):
     store = ImageStore(tmp_path, report_views=(1,), everything=True)
     evaluate(task(look, views), images=store)
@@ -271,6 +309,20 @@ def test_a_cached_truth_is_made_once_and_lies_with_others_in_memory(look, views)
     assert truth(views[2], 0.25).equal(images[3])
     assert len(truth._cache) == 4
     assert images[1].equal(Truth(look)(views[0], 0.25).to(CACHE_DTYPE).float())
+
+
+def test_the_cache_tells_views_apart_by_all_that_their_images_depend_on(look, views):
+    view, truth = views[0], Truth(look, memory=1e9)
+    pose = view.cam_from_world.clone()
+    pose[0, 3] += 1
+    lens = Lens((0.1,), False, view.hw, (1.0,) * 4, (0, 0, *view.hw))
+    others = {"photo": views[1].photo, "lens": lens, "cam_from_world": pose, "trained_focal": 7.0, "name": "other"}
+    for field in fields(Camera):
+        value = getattr(view, field.name)
+        other = replace(view, **{field.name: others[field.name] if field.name in others else type(value)(value + 1)})
+        truth.cached(view, 1.0, lambda: torch.zeros(1, 1, 3))
+        image = truth.cached(other, 1.0, lambda: torch.ones(1, 1, 3))
+        assert bool(image.any()) == (field.name != "name"), field.name
 
 
 @pytest.mark.parametrize("room", [0, 1])

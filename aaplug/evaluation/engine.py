@@ -9,6 +9,7 @@ import math
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from itertools import product
 from os import PathLike
 from typing import Any
 
@@ -96,6 +97,12 @@ class Task:
         return [CEILING, *(candidate.name for candidate in self.candidates)]
 
     @property
+    def rows(self) -> list[str]:
+        """Rows that every view has a measurement of, at every scale."""
+        with_ceiling = self.ceiling and self.resizes and self.truth.source != "reference"
+        return self.names if with_ceiling else self.names[1:]
+
+    @property
     def resizes(self) -> bool:
         """True where a scale changes the image's size, so that images of one view can be averaged down."""
         return self.truth.protocol.change == "size"
@@ -123,7 +130,7 @@ def evaluate(
     """
     task = _checked(task)
     request = _request(task) | dict(facts or {})
-    with Journal(journal, request, resume) as finished:
+    with Journal(journal, request, resume, partial(_answers, task)) as finished:
         remaining = [index for index in range(len(task.views)) if index not in finished.views]
         tell(len(finished.views), len(task.views))
         for index, measurements in apply(ViewMeasurer(task, images), remaining) if remaining else ():
@@ -132,6 +139,17 @@ def evaluate(
     rows, measurements = task.names, [m for index in sorted(finished.views) for m in finished.views[index]]
     measurements.sort(key=lambda m: (rows.index(m.recipe), task.scales.index(m.scale)))
     return Report(tuple(measurements), request, task.measured)
+
+
+def _answers(task: Task, view: int, measurements: Sequence[Measurement]) -> bool:
+    """True if these are the measurements that the task asks for of the view in this place."""
+    cases = sorted(product(task.rows, task.scales))
+    metrics = {metric.name for metric in task.measured}
+    return (
+        0 <= view < len(task.views)
+        and sorted((m.recipe, m.scale) for m in measurements) == cases
+        and all(m.view == task.views[view].name and set(m.values) == metrics for m in measurements)
+    )
 
 
 def compare(
@@ -213,7 +231,7 @@ class ViewMeasurer:
         images: dict[Hashable, TimedImage] = {}
         if truth.truth.source == "reference":
             images[_work(truth.truth.renderer, camera)] = truth.reference(scale)
-        elif self.task.ceiling and self.task.resizes:
+        elif CEILING in self.task.rows:
             yield CEILING, truth.look.resampled_to(truth.resized_look(scale))
             if scale == 1:
                 images[_work(truth.truth.renderer, camera)] = truth.look

@@ -6,8 +6,9 @@ an uninterrupted one does.
 """
 
 import json
+import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
 from os import PathLike
@@ -18,14 +19,23 @@ from aaplug.evaluation.results import Measurement
 from aaplug.system.errors import FormatError, OutputError, UsageError, listing, reason
 from aaplug.system.locks import lock
 
+Fits = Callable[[int, Sequence[Measurement]], bool]
+
 
 class Journal:
     """An open journal; a context manager.  views: measurements of the finished views, by their place in the request."""
 
-    def __init__(self, path: str | PathLike[str] | None, request: Mapping[str, Any], resume: bool):
+    def __init__(
+        self,
+        path: str | PathLike[str] | None,
+        request: Mapping[str, Any],
+        resume: bool,
+        fits: Fits = lambda view, measurements: True,
+    ):
         """Continue the journal at `path` if `resume` is set and there is one; else start it with the first `add`.
 
         path: None keeps the views in memory alone.
+        fits: True for the place and the measurements of a view that the request asks for.
 
         Raises:
             UsageError: the journal is of another request, or another process is writing it.
@@ -38,7 +48,7 @@ class Journal:
         if self.path is not None:
             self._request = json.loads(json.dumps(request, allow_nan=False))
             if resume and self.path.exists():
-                self._continue(self.path)
+                self._continue(self.path, fits)
 
     def __enter__(self) -> "Journal":
         return self
@@ -66,12 +76,20 @@ class Journal:
                 self._stream.flush()
                 os.fsync(self._stream.fileno())
 
-    def _continue(self, path: Path) -> None:
+    def _continue(self, path: Path, fits: Fits) -> None:
         """Read the finished views, and keep the file open where it is of this request."""
         with _named_errors(path), ExitStack() as stack:
             stream = stack.enter_context(path.open("r+b"))
             _lock(stream, path)
-            lines = _whole_lines(stream)
+            lines, end = list[Any](), 0
+            for text in stream:
+                try:
+                    lines.append(json.loads(text.removesuffix(b"\n") if text.endswith(b"\n") else b""))
+                except ValueError:  # cut short, or the zeros that a power loss can leave
+                    break
+                end += len(text)
+            stream.seek(end)
+            stream.truncate()
             if not lines:
                 return
             first, now = lines[0], self._request
@@ -83,35 +101,22 @@ class Journal:
                 raise UsageError(str(path), f"{problem}; repeat that request, or start again with `overwrite`")
             for number, line in enumerate(lines[1:], start=2):
                 try:
-                    self.views[int(line["view"])] = tuple(map(_measurement, line["measurements"]))
-                except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+                    view, measurements = line["view"], tuple(map(_measurement, line["measurements"]))
+                    if type(view) is not int or view in self.views or not fits(view, measurements):
+                        raise ValueError(line)
+                except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
                     raise FormatError(path, f"its line {number} is damaged; start again with `overwrite`") from error
+                self.views[view] = measurements
             stack.pop_all()  # the stream stays open
             self._stream = stream
 
 
-def _whole_lines(stream: BinaryIO) -> list[Any]:
-    """The complete lines; cuts the file after them."""
-    stream.seek(0)
-    lines, end = list[Any](), 0
-    for line in stream:
-        if not line.endswith(b"\n"):
-            break
-        try:
-            lines.append(json.loads(line))
-        except ValueError:  # a power loss can leave zeros
-            break
-        end += len(line)
-    stream.seek(end)
-    stream.truncate()
-    return lines
-
-
 def _measurement(line: Any) -> Measurement:
     """A measurement as it was written; raises TypeError or KeyError if it is none."""
-    texts, values = (line["recipe"], line["view"], line["note"]), line["values"]
-    numbers = (line["scale"], line["samples"], line["seconds"], *(v for v in values.values() if v is not None))
-    if not all(isinstance(text, str) for text in texts) or not all(isinstance(n, int | float) for n in numbers):
+    texts, numbers = (line["recipe"], line["view"], line["note"]), (line["scale"], line["samples"], line["seconds"])
+    defined = [n for n in (line["evaluations"], *line["values"].values()) if n is not None]
+    finite = all(type(n) in (int, float) and math.isfinite(n) for n in (*numbers, *defined))
+    if not finite or not all(isinstance(text, str) for text in texts):
         raise TypeError(line)
     return Measurement(**line)
 

@@ -102,8 +102,8 @@ class Truth:
         """The cached image, or a new one, cached while there is room."""
         if self.memory is None:
             return make()
-        pose = view.cam_from_world.detach().cpu().numpy().tobytes()  # names recur in other splits
-        key = *view.intrinsics, pose, scale
+        pose = view.cam_from_world.detach().cpu().numpy().tobytes()
+        key = scale, *(vars(view) | {"cam_from_world": pose, "name": None}).values()  # names recur in other splits
         if key in self._cache:
             return self._cache[key].float()
         new = make()
@@ -153,7 +153,7 @@ class ViewTruth:
             samples = max(1, math.ceil(1 / scale))  # as dense as training's pixels
             return self._render(camera, replace(truth.renderer.recipe, grid=samples))
         if truth.source == "photographs":
-            factor = scale * self.view.width / self._photograph.hw[1]
+            factor = self._photograph.factor(self.view, scale)
             if factor <= 1:
                 return self._photograph.at(camera.hw, factor)
         elif truth.renderer.training.relative_rate(camera) <= 1:

@@ -52,7 +52,7 @@ class FrameOptions(Options):
     """Whether scene and cameras belong together."""
 
     min_seen: Annotated[float, number(0, 1), CAMERAS] = MIN_SEEN_SHARE
-    """Stop if the cameras see a smaller share of the Gaussians than this."""
+    """Stop if the cameras see a smaller share of the Gaussians than this, or seem of another capture; 0 goes on."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -36,7 +36,7 @@ from aaplug.rendering.agreement import agreement, settled
 from aaplug.rendering.assumed import cameras_around, say_assumed
 from aaplug.rendering.cost import Cost, cost_of
 from aaplug.rendering.renderer import Renderer, background_colour, own_look
-from aaplug.system.errors import UsageError, listing
+from aaplug.system.errors import FrameError, UsageError, listing
 from aaplug.system.executors import PAYS_AFTER_SECONDS, Executor, torch_threads
 from aaplug.system.monitor import Monitor
 
@@ -100,6 +100,9 @@ class Job(Generic[O_co]):
         Args:
             frames: number of images that will be rendered in all.
             check: say how well scene and cameras fit, which takes seconds.
+
+        Raises:
+            FrameError: scene and cameras seem to be of different captures, and `min_seen` is not 0.
         """
         options, say = self.options, self.monitor.say
         colour = background_colour(options.background, self.cameras)
@@ -118,7 +121,10 @@ class Job(Generic[O_co]):
             fit = agreement(look, self.cameras)
             say(f"fit: {fit}")
             if fit.doubt:
-                log.warning("%s: scene and cameras seem to be of different captures: %s", look.scene.name, fit.doubt)
+                problem = f"scene and cameras seem to be of different captures: {fit.doubt}"
+                if options.min_seen > 0:
+                    raise FrameError(look.scene.name, f"{problem}; if they are right, pass `min_seen` 0")
+                log.warning("%s: %s", look.scene.name, problem)
         return look
 
     def training(self: "Job[ViewOptions]", scene: Scene) -> TrainingViews:

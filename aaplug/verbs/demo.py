@@ -14,7 +14,7 @@ from aaplug.core.imaging import quantised, resampled
 from aaplug.core.training import TrainingViews
 from aaplug.evaluation.report.contact_sheet import contact_sheet
 from aaplug.evaluation.report.files import RESULTS
-from aaplug.evaluation.results import Report, scale_name
+from aaplug.evaluation.results import Report
 from aaplug.io.atomic import output_folder, refuse_existing
 from aaplug.io.cameras import read_cameras
 from aaplug.io.images import read_image, write_png
@@ -67,7 +67,7 @@ def _sheet(scene: Gaussians, converted: Gaussians, training: TrainingViews, view
         images = [resampled(photo, scale), *(renderer(camera).rgb for renderer in renderers)]
         y = slice(round(top * scale), round(bottom * scale))
         x = slice(round(left * scale), round(right * scale))
-        rows.append((f"{scale_name(scale)}: {camera.width}x{camera.height}", [image[y, x] for image in images]))
+        rows.append((scale, [image[y, x] for image in images]))
     return contact_sheet(COLUMNS, rows)
 
 

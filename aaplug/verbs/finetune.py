@@ -17,7 +17,7 @@ from aaplug.core.sampling import sampling_bounds
 from aaplug.evaluation.engine import Candidate, compare
 from aaplug.evaluation.protocols import TruthSource
 from aaplug.evaluation.report.contact_sheet import contact_sheet
-from aaplug.evaluation.results import Report, results, scale_name
+from aaplug.evaluation.results import Report, results
 from aaplug.evaluation.truth import MEMORY, Truth, back_projected, source_of, upsampled
 from aaplug.evaluation.upsamplers import find_upsampler
 from aaplug.finetuning import METHODS
@@ -150,11 +150,7 @@ def _cost(start: Renderer, views: Sequence[Camera], settings: Settings) -> Cost:
 
 def _sheet(candidates: Sequence[Candidate], view: Camera, scales: Iterable[float], truth: Truth) -> Image:
     """A view at every scale: the truth, and each candidate."""
-    rows = []
-    for scale in scales:
-        camera = view.scaled(scale)
-        drawn = [candidate.renderer(camera).rgb for candidate in candidates]
-        rows.append((f"{scale_name(scale)}: {camera.width}x{camera.height}", [truth(view, scale), *drawn]))
+    rows = [(s, [truth(view, s), *(c.renderer(view.scaled(s)).rgb for c in candidates)]) for s in scales]
     return contact_sheet(("truth", *(c.name for c in candidates)), rows)
 
 

@@ -1,10 +1,11 @@
 """A grid of images of different sizes, all shown at one height, so that the pixels of small ones are visible.
 
-Images are [h, w, 3] in [0, 1].  Labels must be ASCII, the only characters of OpenCV's built-in font.
+Images are [h, w, 3] in [0, 1].  OpenCV's built-in font has ASCII alone: other signs are spelled by it.
 """
 
+import unicodedata
 from collections.abc import Sequence
-from itertools import accumulate
+from itertools import accumulate, count
 
 import cv2
 import numpy as np
@@ -12,7 +13,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.imaging import levels
+from aaplug.core.imaging import levels, quantised
+from aaplug.evaluation.metrics import PSNR, psnr
+from aaplug.evaluation.results import scale_name
 
 CELL_HEIGHT = 320  # px
 GAP = 12  # px
@@ -24,25 +27,43 @@ MIN_INSET = 64  # px
 ERROR_FULL = 32  # levels of 255 at the end of the error scale, as on the report's page
 HEAT = ((0, 0, 4), (86, 16, 110), (187, 55, 84), (249, 140, 10), (252, 255, 164))  # colours of the error scale
 BYTE = 255
+SPELLING = str.maketrans({"×": "x", "–": "-", "−": "-", "∞": "inf", "…": "..."})
 
 
 def contact_sheet(
-    columns: Sequence[str], rows: Sequence[tuple[str, Sequence[Float[Tensor, "_ _ 3"]]]]
+    columns: Sequence[str], rows: Sequence[tuple[float, Sequence[Float[Tensor, "_ _ 3"]]]], errors: bool = False
 ) -> Float[Tensor, "H W 3"]:
-    """Images with a heading over every column and a label left of every row; widths are those of the first row."""
-    cells = [[_enlarged(image) for image in images] for _, images in rows]
-    widths = [cell.shape[1] for cell in cells[0]]
-    margin = max(_text_width(label) for label, _ in rows) + 2 * GAP
-    *lefts, width = accumulate((w + GAP for w in widths), initial=margin)
-    sheet = np.full((HEADING + len(rows) * (CELL_HEIGHT + GAP), width, 3), 255, dtype=np.uint8)
-    for left, heading in zip(lefts, columns, strict=True):
+    """A grid of images: a row a scale, which begins with the truth; below each other image stands its PSNR.
+
+    columns: headings.  rows: the scale and its images; widths are those of the first row.
+    errors: show a map of its errors beside each image that is not the truth.
+    """
+    headings, sheet_rows = [columns[0]], []
+    for heading in columns[1:]:
+        headings += [heading, "error"] if errors else [heading]
+    for scale, (truth, *images) in rows:
+        cells = [(truth, "")]
+        for image in images:
+            decibels = psnr(quantised(image), quantised(truth))
+            cells.append((image, "equal" if decibels is None else f"{PSNR.text(decibels)} {PSNR.unit}"))
+            cells += [(error_map(image, truth), "")] if errors else []
+        height, width, _ = truth.shape
+        label = f"{scale_name(scale)}: {width}x{height}"
+        sheet_rows.append((label, [(_enlarged(image), caption) for image, caption in cells]))
+    widths = [image.shape[1] for image, _ in sheet_rows[0][1]]
+    margin = max(_text_width(label) for label, _ in sheet_rows) + 2 * GAP
+    *lefts, total = accumulate((w + GAP for w in widths), initial=margin)
+    row_height = CELL_HEIGHT + HEADING
+    sheet = np.full((HEADING + len(rows) * row_height, total, 3), 255, dtype=np.uint8)
+    for left, heading in zip(lefts, headings, strict=True):
         _write(sheet, heading, left, HEADING - GAP)
-    for r, ((label, _), images) in enumerate(zip(rows, cells, strict=True)):
-        top = HEADING + r * (CELL_HEIGHT + GAP)
+    for top, (label, cells) in zip(count(HEADING, row_height), sheet_rows, strict=False):
         _write(sheet, label, GAP, top + CELL_HEIGHT // 2)
-        for left, room, image in zip(lefts, widths, images, strict=True):
+        for left, room, (image, caption) in zip(lefts, widths, cells, strict=True):
             part = image[:, :room]
             sheet[top : top + CELL_HEIGHT, left : left + part.shape[1]] = part
+            if caption:
+                _write(sheet, caption, left, top + row_height - GAP)
     return torch.from_numpy(sheet).float() / BYTE
 
 
@@ -101,9 +122,15 @@ def _bytes(image: Float[Tensor, "h w 3"]) -> np.ndarray:
     return levels(image, 8).byte().cpu().numpy()
 
 
+def _in_font(text: str) -> str:
+    """The text in ASCII: signs spelled, letters without accents, "?" for others."""
+    letters = unicodedata.normalize("NFKD", text.translate(SPELLING))
+    return "".join(c for c in letters if not unicodedata.combining(c)).encode("ascii", "replace").decode()
+
+
 def _text_width(text: str) -> int:
-    return cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.6, 1)[0][0]
+    return cv2.getTextSize(_in_font(text), cv2.FONT_HERSHEY_SIMPLEX, 0.6, 1)[0][0]
 
 
 def _write(sheet: np.ndarray, text: str, left: int, bottom: int, ink: tuple[int, int, int] = INK) -> None:
-    cv2.putText(sheet, text, (left, bottom), cv2.FONT_HERSHEY_SIMPLEX, 0.6, ink, 1, cv2.LINE_AA)
+    cv2.putText(sheet, _in_font(text), (left, bottom), cv2.FONT_HERSHEY_SIMPLEX, 0.6, ink, 1, cv2.LINE_AA)

@@ -17,10 +17,10 @@ from aaplug.evaluation.comparison import Comparison
 from aaplug.evaluation.coverage import Coverage
 from aaplug.evaluation.engine import Task
 from aaplug.evaluation.image_store import ImageStore
-from aaplug.evaluation.metric import Image, TimedRenderer
+from aaplug.evaluation.metric import TimedRenderer
 from aaplug.evaluation.metrics import PSNR
-from aaplug.evaluation.report.contact_sheet import contact_sheet, error_map
-from aaplug.evaluation.results import Facts, Report, as_csv, per_view, results, scale_name
+from aaplug.evaluation.report.contact_sheet import contact_sheet
+from aaplug.evaluation.results import Facts, Report, as_csv, per_view, results
 from aaplug.evaluation.truth import ViewTruth
 from aaplug.io.atomic import make_folder, replacing
 from aaplug.io.images import write_png
@@ -95,19 +95,9 @@ def _sheet(comparison: Comparison, task: Task) -> Float[Tensor, "H W 3"]:
     worst = report.protocol["view_names"].index(min(defined)[1]) if defined else 0
     truth = ViewTruth(task.truth, task.views[worst])
     others = {c.name: TimedRenderer(c.renderer) for c in task.candidates if c.name != reference}
-    columns, rows = [reference], []
-    for name in others:
-        columns += [name, "error"]
+    rows = []
     for scale in sorted(task.scales, reverse=True):
         expected = truth.image(scale)
         assert expected is not None
-        cells: list[Image] = [expected]
-        for renderer in others.values():
-            image = renderer(truth.camera(scale)).rgb
-            cells += [image, error_map(image, expected)]
-        rows.append((_ascii(scale_name(scale)), cells))
-    return contact_sheet([_ascii(name) for name in columns], rows)
-
-
-def _ascii(text: str) -> str:
-    return text.replace("×", "x").encode("ascii", "replace").decode()
+        rows.append((scale, [expected, *(renderer(truth.camera(scale)).rgb for renderer in others.values())]))
+    return contact_sheet((reference, *others), rows, errors=True)
