@@ -12,6 +12,8 @@ from aaplug.core.cameras import CameraSet
 from aaplug.core.colours import WHITE
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.training import TrainingViews
+from aaplug.io.images import write_png
+from aaplug.io.photographs import read_photo
 from aaplug.io.scenes import read_scene, write_scene
 from aaplug.io.scenes.packed import half_turn_about_x
 from aaplug.io.scenes.scene_file import Scene
@@ -65,8 +67,15 @@ def test_cameras_of_another_capture_are_refused_unless_min_seen_is_0(sample_scen
     assert "seem to be of different captures" in caplog.text
 
 
-def test_cameras_of_the_same_capture_are_not_doubted(sample_scene, sample_cameras, caplog):
-    Job.of(sample_scene, sample_cameras, ViewOptions()).look(1)
+@pytest.mark.parametrize("background", ["auto", "black", (0.0, 0.5, 0.0)])
+def test_cameras_of_the_same_capture_are_not_doubted_whatever_the_background(
+    sample_scene, sample_cameras, background, tmp_path, caplog
+):
+    views = [replace(view, photo=tmp_path / f"{view.name}.png") for view in sample_cameras.test]
+    for opaque, view in zip(views, sample_cameras.test, strict=True):
+        write_png(opaque.photo, read_photo(view.photo, WHITE))
+    job = Job.of(sample_scene, replace(sample_cameras, test=tuple(views)), ViewOptions(background=background))
+    job.look(1)
     assert caplog.text == ""
 
 

@@ -10,6 +10,7 @@ from statistics import median
 import torch
 
 from aaplug.core.cameras import Camera, CameraSet, spread
+from aaplug.core.colours import BLACK, WHITE
 from aaplug.core.rules import NEAR
 from aaplug.core.training import TrainingViews
 from aaplug.io.photographs import photo_at
@@ -120,10 +121,12 @@ def _gain(look: Renderer, cameras: CameraSet) -> float | None:
 
 
 def _gain_at(look: Renderer, view: Camera) -> float:
-    """PSNR of the small render over that of the small photograph's mean colour, in dB."""
+    """PSNR of the small render over that of the small photograph's mean colour, in dB, on the background that fits."""
     assert view.photo is not None
     small = view.scaled(min(1.0, SIDE / max(view.hw)))
-    truth = photo_at(view, small, look.background)
-    error = (look(small).rgb.clamp(0, 1) - truth).square().mean()
+    truth, (rgb, alpha) = photo_at(view, small, look.background), look(small)
+    behind = (1 - alpha)[..., None] * truth.new_tensor([[[colour]] for colour in (BLACK, WHITE, look.background)])
+    images = (rgb - behind[2] + behind).clamp(0, 1)
+    error = (images - truth).square().mean(dim=(1, 2, 3)).min()
     flat = (truth - truth.mean(dim=(0, 1))).square().mean()
     return float(10 * (flat / error.clamp(min=torch.finfo().tiny)).log10())
