@@ -1,7 +1,5 @@
 """Reads hostile files in child processes with limits on memory and time.
 
-    python -m tests.hostile all|NAME,... N [SEED]      N random mutations of each small scene, figures on stdout
-
 A child process is forked once a batch, after everything is imported, and may take `MEMORY` more address space than it
 has.  Each file must end as a scene or in one of our errors, within `SECONDS` and `GROWTH` of resident memory.
 """
@@ -11,7 +9,6 @@ import os
 import random
 import resource
 import shutil
-import sys
 import tempfile
 import time
 from collections import Counter
@@ -93,28 +90,6 @@ def mutations(data: bytes, seed: int, count: int) -> Iterator[bytes]:
         yield bytes(spoiled)
 
 
-def cuts(data: bytes, header: int, body: int = 200) -> Iterator[bytes]:
-    """Cut at every byte of the header and at places spread over the body."""
-    step = max(1, (len(data) - header) // body)
-    for size in [*range(header), *range(header, len(data), step)]:
-        yield data[:size]
-
-
-def flipped_digits(data: bytes, header: int) -> Iterator[bytes]:
-    """Every digit of the header replaced by some others."""
-    for at in range(header):
-        if 48 <= data[at] < 58:
-            for digit in b"0189-":
-                yield data[:at] + bytes([digit]) + data[at + 1 :]
-
-
-def header_size(name: str, data: bytes) -> int:
-    """How many bytes tell about the rest."""
-    if name.endswith(".ply"):
-        return data.index(b"end_header\n") + 11
-    return len(data) if len(data) < 512 else 256
-
-
 def check(name: str, files: Iterable[bytes], target: Target | None = None) -> Counter[str]:
     """Read each of these as the target, or as a scene of that name, in children; counts of outcomes.
 
@@ -187,16 +162,3 @@ def _resident() -> int:
     """Most resident memory so far of this process, a fork's own."""
     words = Path("/proc/self/status").read_text().split()
     return int(words[words.index("VmHWM:") + 1]) * 1024
-
-
-def main() -> None:
-    name, count, seed = sys.argv[1], int(sys.argv[2]), int([*sys.argv, "0"][3])
-    for each in NAMES if name == "all" else name.split(","):
-        data = scene(each).content()
-        start = time.perf_counter()
-        outcomes = check(each, mutations(data, seed, count))
-        print(each, dict(outcomes), f"{time.perf_counter() - start:.0f} s", flush=True)
-
-
-if __name__ == "__main__":
-    main()

@@ -9,8 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from PIL import Image
 
 import aaplug
@@ -20,7 +18,7 @@ from aaplug.io.cameras import OWN, read_cameras, select_views
 from aaplug.io.cameras.camera_path import read_camera_path
 from aaplug.io.cameras.cfg_args import read_cfg_args
 from aaplug.io.cameras.options import CameraFileOptions
-from aaplug.system.errors import AaplugError, FormatError, UsageError
+from aaplug.system.errors import FormatError, UsageError
 from aaplug.system.registry import Registry, named
 from tests.conftest import make_camera
 
@@ -801,26 +799,6 @@ def test_what_a_plug_in_reads_is_checked(tmp_path, monkeypatch, change, message)
 def test_a_path_is_text_too(tmp_path):
     assert len(aaplug.read_cameras(str(inria(tmp_path))).all) == 1
     assert len(read_camera_path(str(write_json(tmp_path / "path.json", camera_path()))).cameras) == 1
-
-
-@pytest.mark.parametrize("name", FIXTURES)
-@settings(max_examples=4, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(data=st.data())
-def test_spoiled_files_read_or_raise_our_errors(tmp_path, name, data):
-    make, spoil = FIXTURES[name]
-    path = make(tmp_path)
-    file = path / spoil if spoil else path
-    whole = file.read_bytes()
-    spoiled = bytearray(whole)
-    for _ in range(data.draw(st.integers(1, 4))):
-        at = data.draw(st.integers(0, max(0, len(spoiled) - 1)))
-        spoiled[at : at + data.draw(st.integers(0, 4))] = data.draw(st.binary(max_size=8))
-    file.write_bytes(spoiled)
-    try:
-        assert isinstance(read_cameras(path), CameraSet)
-    except AaplugError as error:
-        str(error).encode()
-    file.write_bytes(whole)
 
 
 # Real scenes ------------------------------------------------------------------------------------

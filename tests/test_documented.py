@@ -50,8 +50,6 @@ ELSEWHERE = {  # commands of the tests and benches themselves, and what runs the
         (f"python -m tests.bench {name}" for name in ("campaign", "odd_options", "full_disks", "kills")),
         "about an hour in all",
     ),
-    "AAPLUG_FUZZ=10000 python -m pytest tests/test_hostile_files.py": "pytest runs it with fewer mutations",
-    "python -m tests.hostile all 10000": "test_hostile_files.py runs it with fewer mutations",
     **dict.fromkeys(
         ("pip install 'aaplug[view]'", "pip install 'aaplug[cluster]'"), "the gate installs it from constraints.txt"
     ),

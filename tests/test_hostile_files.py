@@ -1,10 +1,9 @@
-"""Damaged and hostile scene files end as a scene or in one of our errors, quickly, in little memory.
+"""Damaged and hostile files end as what they hold or in one of our errors, quickly, in little memory.
 
-A few hundred files a format run here; AAPLUG_FUZZ=10000 runs that many mutations of each (or python -m tests.hostile).
+Some files of each reader run here; `python -m tests.bench campaign` runs as many as one asks for.
 """
 
 import io
-import os
 import sys
 import zipfile
 import zlib
@@ -12,19 +11,17 @@ from collections.abc import Callable
 
 import pytest
 
-from tests.hostile import NAMES, check, cuts, flipped_digits, header_size, mutations, scene
+from tests.bench.campaign import cameras, damaged, others, scenes
+from tests.hostile import check
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="limits are Linux's")
-MUTATIONS = int(os.environ.get("AAPLUG_FUZZ", "25"))
-EVERY = 1 if MUTATIONS >= 1000 else 61  # of cuts and flips, where the campaign is not asked for
+TARGETS = {**scenes(), **cameras(), **others()}
+FILES = 50  # of each reader
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", TARGETS)
 def test_damage_does_no_harm(name: str):
-    data = scene(name).content()
-    header = header_size(name, data)
-    files = [*cuts(data, header)][::EVERY] + [*flipped_digits(data, header)][::EVERY]
-    assert check(name, [*files, *mutations(data, 0, MUTATIONS)])["refused"] > 0
+    assert damaged(name, TARGETS[name], FILES, seed=0)["refused"] > 0
 
 
 def gzip_of(start: bytes, zeros: int) -> bytes:

@@ -153,51 +153,6 @@ def test_pixels_stop_independently(rasterize):
 # the reference and a plain loop -----------------------------------------------------------------
 
 
-def draw_by_loop(
-    splats: Splats2D, hw: tuple[int, int], background: tuple[float, float, float]
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """3DGS's rules, one pixel and one splat at a time, in Python floats."""
-    rgb, alphas = torch.zeros(*hw, 3, dtype=F64), torch.zeros(hw, dtype=F64)
-    assert splats.rgb is not None
-    order = sorted(range(len(splats)), key=lambda i: splats.depths[i].item())
-    for row in range(hw[0]):
-        for column in range(hw[1]):
-            left, colour = 1.0, [0.0, 0.0, 0.0]
-            for i in order:
-                dx = column + 0.5 - splats.means[i, 0].item()
-                dy = row + 0.5 - splats.means[i, 1].item()
-                xx, xy, yy = splats.covs[i].tolist()
-                power = -0.5 * (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy)
-                alpha = splats.opacities[i].item() * math.exp(power / (xx * yy - xy * xy))
-                alpha = min(0.99, alpha)
-                if alpha < 1 / 255:
-                    continue
-                if left * (1 - alpha) < 1e-4:
-                    break
-                weight = alpha * left
-                colour = [c + weight * s for c, s in zip(colour, splats.rgb[i].tolist(), strict=True)]
-                left *= 1 - alpha
-            over = [c + left * b for c, b in zip(colour, background, strict=True)]
-            rgb[row, column], alphas[row, column] = torch.tensor(over, dtype=F64), 1 - left
-    return rgb, alphas
-
-
-@pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("opaque", [False, True])
-def test_the_reference_equals_a_plain_loop(seed, opaque):
-    hw = (7, 9)
-    splats = make_splats(25, hw, seed, (-1.0, 1.5)).to(F64)
-    if opaque:
-        splats = replace(splats, opacities=0.8 + 0.18 * splats.opacities, covs=splats.covs * 9)
-    xx, xy, yy = splats.covs.unbind(dim=1)
-    splats = replace(splats, dets=xx * yy - xy * xy)
-    rgb, alpha = draw_by_loop(splats, hw, SKY)
-    assert (alpha.max() > 0.999) == opaque, "only the opaque ones should stop pixels"
-    image = REFERENCE(splats, hw, SKY)
-    close(image.rgb, rgb, atol=1e-12)
-    close(image.alpha, alpha, atol=1e-12)
-
-
 def test_strips_and_chunks_of_the_reference_change_nothing(monkeypatch):
     hw = (12, 17)
     splats = make_splats(120, hw, 5, (0.0, 2.5)).to(F64)

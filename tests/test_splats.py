@@ -193,16 +193,6 @@ def test_the_volume_factor_and_its_gradient_stay_finite_for_points(scale):
     torch.testing.assert_close(gradient, torch.ones(1, 3))
 
 
-@pytest.mark.parametrize("volume", [False, True])
-@pytest.mark.parametrize("dtype", [torch.float32, F64])
-def test_smoothing_by_zero_changes_no_bit(volume, dtype):
-    scene = replace(make_scene(200, dtype=dtype), log_scales=torch.linspace(-60, 40, 600, dtype=dtype).view(200, 3))
-    scene.logit_opacities[:4] = torch.tensor([-100.0, -20.0, 20.0, 100.0])
-    same = smoothed_by(scene, torch.full((200, 1), -math.inf, dtype=dtype), volume)
-    assert same.log_scales.equal(scene.log_scales)
-    assert same.logit_opacities.equal(scene.logit_opacities)
-
-
 @pytest.mark.parametrize("axes", [[1.0], [1.0, 0.5, 2.0]], ids=["alike", "each its own"])
 def test_smoothing_adds_variances(axes):
     scene = make_scene(50, dtype=F64)

@@ -1,144 +1,30 @@
-"""Laws of every filter: those of the registries, plug-ins among them, and those that recipes use.
-
-The sampling rate of the view and the convention of training matter to some filters only.  Screen filters are tried in
-`SITUATIONS`, in which each view and each convention occurs, rather than in all combinations.
-"""
+"""What single filters are, beyond the laws that every one keeps (test_registered.py)."""
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
 from itertools import pairwise, product
-from typing import NamedTuple
 
 import pytest
 import torch
 from torch import Tensor
 
-from aaplug.core.cameras import Camera
-from aaplug.core.conventions import ANTIALIASED, CLASSIC, CONVENTIONS, MIP, Convention
-from aaplug.core.gaussians import Gaussians
-from aaplug.core.interfaces import ScreenFilter
+from aaplug.core.conventions import CLASSIC, CONVENTIONS, MIP
 from aaplug.core.projection import project
-from aaplug.core.shading import shade
-from aaplug.core.splats import Splats2D
 from aaplug.core.training import TrainingViews
+from aaplug.evaluation.laws.filters import CAMERAS, F64, SCENE, SITUATIONS, spheres, trained_with, world_scene
 from aaplug.lab.smoothing import AnisotropicSmoothing, FlatSmoothing
-from aaplug.methods import RECIPES, SCREEN_FILTERS, WORLD_FILTERS
+from aaplug.methods import SCREEN_FILTERS, WORLD_FILTERS
 from aaplug.methods.filters.dilation import Dilation
 from aaplug.methods.filters.energy import MatchedEnergy
 from aaplug.methods.filters.matched import FULL_RISE_AT, MAX_RISE, PIXEL_VARIANCE, Matched
 from aaplug.methods.filters.smoothing import Smoothing3D, fuse_stored
 from tests.conftest import each, make_camera, make_scene, make_splats
 
-F64 = torch.float64
-EYES = [(0.0, -4.0, 0.0), (3.0, -4.0, 1.0), (-2.0, -6.0, 0.5)]
-CAMERAS = [make_camera(eye) for eye in EYES]
-FREE = replace(make_camera((0.3, -2.0, 0.2)), trained_focal=None)
-SCENE = make_scene(40, dtype=F64)
-SCREENS: dict[str, ScreenFilter] = {
-    **SCREEN_FILTERS,
-    **{
-        f"recipe {recipe.name}": recipe.screen
-        for recipe in RECIPES.values()
-        if recipe.screen not in SCREEN_FILTERS.values()
-    },
-}
-
-
-class Situation(NamedTuple):
-    """A view, and the convention that the scene was trained in."""
-
-    view: Camera
-    convention: Convention
-
-    @property
-    def training(self) -> TrainingViews:
-        return trained_with(self.convention)
-
-
-SITUATIONS = {
-    "training size, classic": Situation(CAMERAS[0], CLASSIC),
-    "half, antialiased": Situation(CAMERAS[0].scaled(0.5), ANTIALIASED),
-    "threefold, mip": Situation(CAMERAS[0].scaled(3.0), MIP),
-    "free, near and small, classic": Situation(FREE.scaled(0.3), CLASSIC),
-}
-
-
-@cache
-def trained_with(convention: Convention) -> TrainingViews:
-    """The training views of `SCENE`, had it been trained in that convention."""
-    return TrainingViews.of(replace(SCENE, convention=convention), CAMERAS)
-
-
-screen = each(SCREENS)
-world = each(WORLD_FILTERS)
 situation = each(SITUATIONS)
 convention = each(CONVENTIONS)
 
 
-def tensors_of(thing: Splats2D | Gaussians) -> dict[str, Tensor]:
-    return {name: value for name, value in vars(thing).items() if isinstance(value, Tensor)}
-
-
-def copies_of(thing: Splats2D | Gaussians) -> dict[str, Tensor]:
-    return {name: value.clone() for name, value in tensors_of(thing).items()}
-
-
-def spheres(sigma: float, opacities: tuple[float, ...] = (0.0, 0.1, 0.5, 0.9, 1.0)) -> Splats2D:
-    """Round splats of `sigma` px."""
-    m = len(opacities)
-    splats = make_splats(m, (48, 64)).to(F64)
-    return replace(
-        splats,
-        covs=torch.tensor([[sigma**2, 0.0, sigma**2]], dtype=F64).expand(m, 3),
-        dets=torch.full((m,), sigma**4, dtype=F64),
-        opacities=torch.tensor(opacities, dtype=F64),
-        depths=torch.linspace(2, 6, m, dtype=F64),
-    )
-
-
 # screen filters ---------------------------------------------------------------------------------
-
-
-def test_a_screen_filter_keeps_its_input_and_changes_only_covariances_and_opacities(screen, situation):
-    splats = shade(project(SCENE, situation.view), SCENE, situation.view)
-    before = copies_of(splats)
-    filtered = screen(splats, situation.view, situation.training)
-    assert all(getattr(splats, name).equal(kept) for name, kept in before.items())
-    assert len(filtered) == len(splats) > 0
-    for name in ("means", "depths", "sources", "rgb"):
-        assert getattr(filtered, name).equal(before[name]), name
-
-
-def test_covariances_never_shrink_and_match_their_determinants(screen, situation):
-    splats = project(SCENE, situation.view)
-    filtered = screen(splats, situation.view, situation.training)
-    xx, xy, yy = (filtered.covs - splats.covs).unbind(dim=1)
-    assert xx.min() >= 0
-    assert yy.min() >= 0
-    assert (xx * yy - xy * xy).min() >= -1e-12
-    assert (filtered.dets >= splats.dets).all()
-    xx, xy, yy = filtered.covs.unbind(dim=1)
-    torch.testing.assert_close(filtered.dets, xx * yy - xy * xy, rtol=1e-7, atol=1e-12)
-
-
-def test_opacities_stay_between_0_and_1(screen, situation):
-    for sigma, dtype in product((1e-6, 1e-3, 0.1, 1.0, 30.0, 1e6), (torch.float32, F64)):
-        splats = spheres(sigma).to(dtype)
-        opacities = screen(splats, situation.view, situation.training).opacities
-        assert opacities.isfinite().all()
-        assert opacities.min() >= 0
-        assert opacities.max() <= 1
-        assert opacities[0] == 0
-
-
-def test_a_huge_splat_keeps_its_opacity_and_shape(screen, situation):
-    splats = spheres(1e4)
-    filtered = screen(splats, situation.view, situation.training)
-    torch.testing.assert_close(filtered.opacities, splats.opacities, rtol=1e-6, atol=0)
-    scale = splats.covs[:, :1]
-    torch.testing.assert_close(filtered.covs / scale, splats.covs / scale, rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -265,80 +151,7 @@ def test_the_gradient_of_a_blur_is_that_of_its_formula(compensate, floor):
     assert torch.autograd.gradcheck(blur, [x.clone().requires_grad_() for x in inputs])
 
 
-@pytest.mark.parametrize("name", [name for name in SITUATIONS if "training size" not in name])
-def test_the_gradient_of_a_screen_filter_is_that_of_its_formula(screen, name):
-    """Not at the training size, where the range of rates ends at the view itself: that is a kink."""
-    view, training = SITUATIONS[name].view, SITUATIONS[name].training
-    splats = make_splats(3, (48, 64), log_sigmas=(-1.0, 1.0)).to(F64)
-
-    def filtered(covs: Tensor, dets: Tensor, depths: Tensor, opacities: Tensor):
-        given = replace(splats, covs=covs, dets=dets, depths=depths, opacities=opacities)
-        out = screen(given, view, training)
-        return out.covs, out.dets, out.opacities
-
-    inputs = splats.covs, splats.dets, splats.depths, splats.opacities
-    assert torch.autograd.gradcheck(filtered, [x.clone().requires_grad_() for x in inputs])
-
-
 # world filters ----------------------------------------------------------------------------------
-
-
-def world_scene(dtype: torch.dtype = F64, convention: Convention = ANTIALIASED) -> Gaussians:
-    """A scene that every world filter changes."""
-    scene = make_scene(40, dtype=dtype)
-    stored = torch.linspace(0.01, 0.2, 40, dtype=dtype)
-    return replace(scene, filter_3d=stored, convention=convention)
-
-
-def test_a_world_filter_keeps_its_input_and_changes_only_scales_and_opacities(world):
-    scene = world_scene()
-    before, training = copies_of(scene), TrainingViews.of(scene, CAMERAS)
-    filtered = world(scene, training)
-    assert all(getattr(scene, name).equal(kept) for name, kept in before.items())
-    assert scene.fused == ()
-    assert len(filtered) == len(scene)
-    for name in ("means", "quats", "sh"):
-        assert getattr(filtered, name).equal(before[name]), name
-    assert filtered.log_scales.shape == scene.log_scales.shape
-    assert not filtered.log_scales.equal(scene.log_scales)
-
-
-def test_a_world_filter_treats_each_gaussian_by_itself(world):
-    scene = world_scene()
-    training = TrainingViews.of(scene, CAMERAS)
-    assert training.bounds.seen.all()
-    order = torch.randperm(40, generator=torch.Generator().manual_seed(0))[:25]
-    part = world(scene[order], TrainingViews.of(scene[order], CAMERAS))
-    whole = world(scene, training)[order]
-    for name in ("log_scales", "logit_opacities"):
-        torch.testing.assert_close(getattr(part, name), getattr(whole, name))
-
-
-EXTREMES: dict[str, Callable[[Gaussians], Gaussians]] = {
-    "points": lambda scene: replace(scene, log_scales=torch.full((40, 3), -80.0)),
-    "needles": lambda scene: replace(scene, log_scales=torch.tensor([[0.0, -30.0, -30.0]] * 40)),
-    "sheets": lambda scene: replace(scene, log_scales=torch.tensor([[0.0, 0.0, -80.0]] * 40)),
-    "giants": lambda scene: replace(scene, log_scales=torch.full((40, 3), 12.0)),
-}
-
-
-@pytest.mark.parametrize("shape", ["usual", "usual, in float64", *EXTREMES])
-def test_world_scales_never_shrink_and_opacities_stay_inside_0_and_1(world, shape):
-    dtype = F64 if "float64" in shape else torch.float32
-    for convention in CONVENTIONS.values():
-        scene = world_scene(dtype, convention)
-        if shape in EXTREMES:
-            scene = EXTREMES[shape](scene)
-        else:
-            scene.logit_opacities[:2] = torch.tensor([-30.0, 100.0])
-        filtered = world(scene, TrainingViews.of(scene, CAMERAS))
-        assert filtered.log_scales.dtype == filtered.logit_opacities.dtype == dtype
-        assert (filtered.log_scales >= scene.log_scales).all()
-        assert filtered.log_scales.isfinite().all()
-        assert filtered.logit_opacities.isfinite().all()
-        if shape not in EXTREMES:
-            assert filtered.opacities.min() > 0
-            assert filtered.opacities.max() < 1
 
 
 VARIED = {name: world for name, world in WORLD_FILTERS.items() if hasattr(world, "variance")}
@@ -353,6 +166,7 @@ def test_a_stronger_world_filter_widens_more_and_is_fainter(name):
         if name in VARIED:
             world = replace(VARIED[name], variance=VARIED[name].variance * factor)
             results.append(world(scene, training))
+            assert float(results[-1].fused[0].settings["variance"]) == pytest.approx(world.variance)
         else:
             given = replace(scene, filter_3d=scene.filter_3d * factor**0.5)
             results.append(fuse_stored(given))
@@ -364,19 +178,6 @@ def test_a_stronger_world_filter_widens_more_and_is_fainter(name):
         fainter = strong.logit_opacities < weak.logit_opacities
         assert (fainter | (weak.opacities >= 0.9999 - 1e-9)).all()
         assert fainter.double().mean() > 0.5
-
-
-def test_a_world_filter_records_what_it_did(world):
-    scene = world_scene()
-    once = world(scene, TrainingViews.of(scene, CAMERAS))
-    assert len(once.fused) == 1
-    assert once.fused[0].method
-    twice = world(replace(once, filter_3d=scene.filter_3d), TrainingViews.of(scene, CAMERAS))
-    assert twice.fused[0] == once.fused[0]
-    assert len(twice.fused) == 2
-    if hasattr(world, "variance"):
-        stronger = replace(world, variance=0.125)(scene, TrainingViews.of(scene, CAMERAS))
-        assert stronger.fused[0].settings["variance"] == "0.125"
 
 
 @pytest.mark.parametrize("world", [Smoothing3D(), FlatSmoothing(), MatchedEnergy()])
@@ -498,26 +299,3 @@ def test_matched_energy_gives_a_mip_viewer_the_classic_look_of_a_sphere():
     trained = project(scene, CAMERAS[0]).blurred(0.3, compensate=False)
     torch.testing.assert_close(shown.covs, trained.covs, rtol=1e-7, atol=1e-9)
     torch.testing.assert_close(shown.opacities, trained.opacities, rtol=1e-7, atol=0)
-
-
-def test_the_gradient_of_a_world_filter_is_that_of_its_formula(world):
-    scene = world_scene()[torch.arange(2)]
-    training = TrainingViews.of(scene, CAMERAS)
-
-    def filtered(log_scales: Tensor, logit_opacities: Tensor, filter_3d: Tensor):
-        given = replace(scene, log_scales=log_scales, logit_opacities=logit_opacities, filter_3d=filter_3d)
-        out = world(given, training)
-        return out.log_scales, out.logit_opacities
-
-    assert scene.filter_3d is not None
-    inputs = scene.log_scales, scene.logit_opacities - 2, scene.filter_3d
-    assert torch.autograd.gradcheck(filtered, [x.clone().requires_grad_() for x in inputs])
-
-
-def test_screen_filters_give_finite_values_for_extreme_scales(screen, situation):
-    for shape in EXTREMES.values():
-        splats = project(shape(SCENE.to(torch.float32)), situation.view)
-        assert len(splats) == len(SCENE)
-        filtered = screen(splats, situation.view, situation.training)
-        for name, value in tensors_of(filtered).items():
-            assert value.isfinite().all(), name

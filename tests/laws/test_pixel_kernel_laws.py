@@ -1,4 +1,4 @@
-"""Laws of every pixel kernel and every compositor, and aaplug's own kernels against quadratures in float64."""
+"""Pixel kernels against quadratures in float64 and published values; test_registered.py has the laws of every one."""
 
 import math
 from collections.abc import Callable
@@ -10,48 +10,28 @@ import torch
 from torch import Tensor
 
 from aaplug.core.cameras import Camera
-from aaplug.core.ellipses import squared_cutoff, whitening
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.interfaces import Pixels
-from aaplug.core.kernels import EAGER
 from aaplug.core.projection import project, rotation_matrices, with_depth_slopes
-from aaplug.core.rules import RULES_3DGS, Rules
+from aaplug.core.rules import RULES_3DGS
 from aaplug.core.splats import Splats2D
+from aaplug.evaluation.laws.drawing import COARSE, require_bounds, some_splats
 from aaplug.lab.integral import INTEGRAL
 from aaplug.lab.surfel_mip import SURFEL_MIP
-from aaplug.methods import COMPOSITORS, PIXEL_KERNELS
+from aaplug.methods import PIXEL_KERNELS
 from aaplug.methods.pixel_kernels import point
 from aaplug.methods.pixel_kernels.point import POINT
-from aaplug.methods.pixel_kernels.raster_rows import BLUE, COLUMNS, OPACITY, RED, TILE, tile_centres
+from aaplug.methods.pixel_kernels.raster_rows import COLUMNS, OPACITY
 from aaplug.methods.pixel_kernels.surfel import SURFEL
-from aaplug.rasterizers.reference import Reference, alphas
 from aaplug.rasterizers.tiled import Tiled
-from aaplug.rasterizers.tiled.forward import STEP
-from tests.conftest import ALL_RASTERIZERS, each, make_camera, make_scene, make_splats, splats_of
+from tests.conftest import ALL_RASTERIZERS, each, make_camera, make_scene, splats_of
 
 F64 = torch.float64
 BLACK, WHITE, SKY = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (0.25, 0.5, 1.0)
 CAMERA = make_camera((1.0, -3.0, 0.5))
-COARSE = Rules(max_alpha=0.9, min_alpha=0.02, min_transmittance=1e-2)
 
 
 pixel = each(PIXEL_KERNELS)
-compositor = each(COMPOSITORS)
-
-
-def some_splats(
-    m: int, hw: tuple[int, int], log_sigmas: tuple[float, float] = (-1.5, 2.5), window: float = 1.0
-) -> Splats2D:
-    """Random splats that every kernel can draw, with depth slopes.
-
-    Their horizons lie outside the image: at a disc's horizon AA-2DGS's filter is not small, and the tiled rasterizer
-    does not draw it there.
-    """
-    splats = make_splats(m, hw, 8, log_sigmas).to(F64)
-    xx, xy, yy = splats.covs.unbind(dim=1)
-    slopes = 0.07 * torch.randn(m, 2, generator=torch.Generator().manual_seed(3), dtype=F64)
-    slopes = (slopes / splats.covs[:, [0, 2]].sqrt()).clamp(-0.012, 0.012)
-    return replace(splats, dets=xx * yy - xy * xy, depth_slopes=slopes, window=window)
 
 
 def discs(n: int) -> Gaussians:
@@ -66,108 +46,9 @@ def disc_splats(scene: Gaussians) -> Splats2D:
     return with_depth_slopes(project(scene, CAMERA), scene, CAMERA)
 
 
-def away_from_cutoff(alpha: Tensor, rules: Rules, band: float = 1e-3) -> Tensor:
-    return (alpha / rules.min_alpha - 1).abs() > band
-
-
-# laws of every kernel ---------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("compiling", [False, True], ids=["eager code", "code for the compiler"])
-@pytest.mark.parametrize("dtype", [torch.float32, F64])
-@pytest.mark.parametrize("window", [0.0, 0.6, 1.0])
 @pytest.mark.parametrize("rules", [RULES_3DGS, COARSE], ids=["3dgs", "coarse"])
-def test_alpha_from_raster_rows_is_the_exact_one(pixel, rules, window, dtype, compiling, monkeypatch):
-    splats = some_splats(60, (3 * TILE, 4 * TILE), window=window)
-    given = splats.to(dtype)
-    corners = torch.cartesian_prod(torch.arange(4), torch.arange(3)).to(dtype) * TILE
-    centres = torch.stack(tile_centres(corners), dim=1)
-    rows = pixel.raster_rows(given, EAGER)[:-1, None].expand(-1, len(corners), -1)
-    if compiling:
-        monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)
-    alpha = pixel.alpha(rows, Pixels(corners, *centres.unbind(dim=1)), rules)
-    points = (corners[:, None] + centres).flatten(0, 1).double()
-    exact = pixel.exact(splats, points[:, None] - splats.means) * splats.opacities
-    exact = exact.T.unflatten(1, alpha.shape[1:])
-    expected = torch.where(exact >= rules.min_alpha, exact, 0.0)
-    compared = away_from_cutoff(exact, rules)
-    difference = (alpha.double() - expected).abs()[compared].max()
-    assert (expected > 0).sum() > 1000
-    # the compiler's exp2 is a polynomial with a relative error of 1e-6
-    assert difference < (2e-5 if dtype == torch.float32 else 2e-6 if compiling else 1e-9)
-
-
-def test_the_padding_row_draws_nothing_and_rows_hold_the_colours(pixel):
-    splats = some_splats(9, (TILE, TILE))
-    assert splats.rgb is not None
-    rows = pixel.raster_rows(splats, EAGER)
-    assert rows.shape == (10, pixel.columns)
-    torch.testing.assert_close(rows[:-1, RED : BLUE + 1], splats.rgb)
-    pixels = Pixels(torch.tensor([[0.0, 0.0], [8.0, 800.0]], dtype=F64), *tile_centres(rows))
-    assert (pixel.alpha(rows[:-1, None].expand(-1, 2, -1), pixels, RULES_3DGS) > 0).any()
-    assert pixel.alpha(rows[-1:].expand(2, -1), pixels, RULES_3DGS).eq(0).all()
-
-
-@pytest.mark.parametrize("rules", [RULES_3DGS, COARSE], ids=["3dgs", "coarse"])
-def test_bounding_ellipses_contain_every_pixel_that_is_drawn(pixel, rules):
-    for splats in (some_splats(100, (48, 64)), disc_splats(discs(100))):
-        ellipses = pixel.bounding_ellipses(splats, rules) or splats
-        ticks = [torch.arange(-20, side + 20, 2.3, dtype=F64) for side in (64, 48)]
-        points = torch.cartesian_prod(*ticks)
-        meets_horizon = ellipses.opacities == 0  # such discs are not drawn
-        drawn = (alphas(splats, points, pixel, rules) >= rules.min_alpha) & ~meets_horizon
-        offsets = points[:, None] - ellipses.means
-        white = torch.einsum("cij,pcj->pci", whitening(ellipses), offsets)
-        cutoff = squared_cutoff(ellipses.opacities, rules.min_alpha)
-        inside = white.square().sum(dim=2) <= cutoff * (1 + 1e-9)
-        assert drawn.sum() > 1000
-        assert not (drawn & ~inside).any()
-
-
-def test_a_pass_is_whole_steps(pixel):
-    assert pixel.splats_per_pass % STEP == 0
-
-
-@pytest.mark.parametrize("window", [0.0, 1.0])
-def test_tiled_equals_the_reference_with_every_kernel(pixel, window):
-    hw = (33, 44)
-    splats = some_splats(250, hw, (-3.0, 3.0), window)
-    tiled, exact = (draw(splats, hw, SKY, pixel) for draw in (Tiled(), Reference()))
-    torch.testing.assert_close(tiled.rgb, exact.rgb, rtol=0, atol=1e-9)
-    single = Tiled()(splats.to(torch.float32), hw, SKY, pixel)
-    difference = (single.rgb - exact.rgb).abs().amax(dim=2)
-    assert (difference > 2e-5).double().mean() < 1e-3, "more than flips at a cut-off"
-    assert difference.max() < 0.01
-
-
-def test_gradients_with_every_kernel_are_those_of_the_reference(pixel):
-    """With determinants made of the covariances: kernels may read either."""
-    hw = (17, 26)
-    splats = some_splats(120, hw)
-    names = ["means", "covs", "opacities", "rgb"]
-    names += ["depth_slopes"] if pixel.needs_depth_slopes else []
-    found = []
-    for rasterizer in (Tiled(), Reference()):
-        values = {name: getattr(splats, name).clone().requires_grad_() for name in names}
-        xx, xy, yy = values["covs"].unbind(dim=1)
-        given = replace(splats, **values, dets=xx * yy - xy * xy)
-        image = rasterizer(given, hw, BLACK, pixel)
-        loss = image.rgb.square().sum() + image.alpha.sum()
-        found.append(torch.autograd.grad(loss, list(values.values())))
-    for tiled, exact in zip(*found, strict=True):
-        assert exact.abs().max() > 0
-        torch.testing.assert_close(tiled, exact, rtol=1e-8, atol=1e-8)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, F64])
-@pytest.mark.parametrize("window", [0.0, 0.6, 1.0])
-def test_tiled_equals_the_reference_with_every_compositor(compositor, dtype, window):
-    hw = (33, 44)
-    splats = some_splats(250, hw, (-3.0, 3.0), window).to(dtype)
-    tiled, exact = (draw(splats, hw, SKY, INTEGRAL, compositor) for draw in (Tiled(), Reference()))
-    difference = (tiled.rgb - exact.rgb).abs().amax(dim=2)
-    assert (difference > 2e-5).double().mean() < 1e-3, "more than flips at a cut-off"
-    assert difference.max() < 0.01
+def test_bounding_ellipses_contain_every_pixel_that_is_drawn_of_discs_at_their_horizons(pixel, rules):
+    require_bounds(pixel, disc_splats(discs(100)), rules)
 
 
 # the kernels of aaplug against independent integrals --------------------------------------------
