@@ -10,8 +10,8 @@ import pytest
 from aaplug_cli.verbs import VERBS
 
 import aaplug
-from aaplug.system.errors import FrameError, UsageError
-from tests.conftest import SAMPLE, make_camera, make_scene
+from aaplug.system.errors import UsageError
+from tests.conftest import SAMPLE
 from tests.test_cli import EYES, SIZE, cli, dataset, inria_model  # noqa: F401  (fixtures)
 
 README = Path(__file__).parents[1] / "README.md"
@@ -41,23 +41,6 @@ def test_a_renderer_applies_the_recipes_world_filter(cli, recipe):  # noqa: F811
     assert cli(f"{words} --bit-depth 16")[0] == 0
     aaplug.write_png("two.png", image, bit_depth=16)
     assert Path("two.png").read_bytes() == Path("one.png").read_bytes()
-
-
-def test_the_world_filter_changes_the_chair(sample_scene, sample_cameras):
-    view = sample_cameras.test[0].scaled(1 / 8)
-    image = aaplug.Renderer.of(sample_scene, sample_cameras, "mip-splatting")(view).rgb
-    mip = aaplug.Renderer.of(sample_scene, sample_cameras, "mip")(view).rgb
-    assert (image - mip).abs().max() > 0.1
-
-
-def test_a_renderer_refuses_cameras_of_another_frame():
-    views = [make_camera(eye) for eye in EYES["train"]]
-    scene = make_scene(50)
-    scene.means[:] += 1000
-    with pytest.raises(FrameError, match="different frames"):
-        aaplug.Renderer.of(scene, views)
-    with pytest.raises(FrameError, match=r"0\.0%"):
-        aaplug.Renderer.of(scene, views, min_seen=1e-6)
 
 
 def test_render_takes_paths_as_strings(cli):  # noqa: F811

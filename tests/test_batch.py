@@ -280,18 +280,3 @@ def test_many_scenes_are_made_and_a_broken_one_is_named(batch, verb, own, output
     assert batch(f"{verb} --batch many.toml -o out")[0] == 2  # nothing is replaced unasked
     code, out, _ = batch(f"{verb} --batch many.toml -o out --resume --json")
     assert [facts["status"] for facts in json.loads(out)["scenes"].values()] == ["kept", "kept", "failed"]
-
-
-def test_resuming_makes_the_levels_that_are_missing_and_single_scenes(batch):
-    Path("many.toml").write_text('[[scene]]\nscene = "scene.ply"\ncameras = "."\nrefine = false')
-    assert batch("lod --batch many.toml -o out --levels 2")[0] == 0
-    whole = {path.name: path.read_bytes() for path in Path("out/scene").iterdir()}
-    manifest = json.loads(whole["lod.json"])
-    manifest["levels"].pop()
-    Path("out/scene/lod.json").write_text(json.dumps(manifest))  # as a kill before the last level leaves it
-    code, out, err = batch("lod --batch many.toml -o out --levels 2 --resume --json")
-    assert (code, json.loads(out)["scenes"]["scene"]["status"]) == (0, "done")
-    assert "resumed: 1 levels are there" in err
-    assert {path.name: path.read_bytes() for path in Path("out/scene").iterdir()} == whole
-    assert batch("lod --batch many.toml -o light --simplify 0.5 --resume")[0] == 0
-    assert Path("light/scene.ply").is_file()

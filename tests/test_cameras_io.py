@@ -21,6 +21,7 @@ from aaplug.io.cameras.options import CameraFileOptions
 from aaplug.system.errors import FormatError, UsageError
 from aaplug.system.registry import Registry, named
 from tests.conftest import make_camera
+from tests.test_camera_paths import document
 
 QUARTER_TURN = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]  # 90° about z
 
@@ -588,34 +589,6 @@ def twin(folder):
     return read_cameras(plain_transforms(folder)).train[0]
 
 
-def camera_path(**changes):
-    motion = [cell for row in OPENGL for cell in row]
-    view = {"camera_to_world": motion, "fov": 90.0, "aspect": 2.0}
-    return {"render_width": 40, "render_height": 20, "camera_type": "perspective", "camera_path": [view]} | changes
-
-
-def test_a_camera_path_is_free_cameras(tmp_path):
-    path = write_json(tmp_path / "camera_path.json", camera_path())
-    (camera,) = read_cameras(path).train
-    assert torch.equal(camera.cam_from_world, twin(tmp_path).cam_from_world)
-    assert (camera.fx, camera.fy, camera.hw) == (pytest.approx(10), pytest.approx(10), (20, 40))
-    assert camera.trained_focal is None
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"camera_type": "equirectangular"},
-        {"camera_path": []},
-        {"camera_path": [{"fov": 180, "camera_to_world": [0] * 16}]},
-        {"camera_path": [{"fov": 50, "camera_to_world": [0] * 16}]},
-    ],
-    ids=str,
-)
-def test_odd_camera_paths_are_refused(tmp_path, change):
-    refused(write_json(tmp_path / "camera_path.json", camera_path(**change)), "camera_path.json")
-
-
 def llff(folder, count=9):
     """The camera of the transforms above, in LLFF's axes: down, right, back."""
     opengl = np.array(OPENGL)[:3]
@@ -735,7 +708,7 @@ FIXTURES = {  # how to make each format's files, the path to read, and the file 
     "blender": (blender, "transforms_train.json"),
     "transforms": (lambda folder: plain_transforms(folder).parent, "transforms.json"),
     "pinhole": (lambda folder: write_json(folder / "p.json", pinhole()), ""),
-    "camera_path": (lambda folder: write_json(folder / "path.json", camera_path()), ""),
+    "camera_path": (lambda folder: write_json(folder / "path.json", document()), ""),
     "llff": (llff, "poses_bounds.npy"),
     "multiscale": (lambda folder: multiscale(folder).parent, "metadata.json"),
 }
@@ -798,7 +771,7 @@ def test_what_a_plug_in_reads_is_checked(tmp_path, monkeypatch, change, message)
 
 def test_a_path_is_text_too(tmp_path):
     assert len(aaplug.read_cameras(str(inria(tmp_path))).all) == 1
-    assert len(read_camera_path(str(write_json(tmp_path / "path.json", camera_path()))).cameras) == 1
+    assert len(read_camera_path(str(write_json(tmp_path / "path.json", document()))).cameras) == 1
 
 
 # Real scenes ------------------------------------------------------------------------------------

@@ -9,7 +9,6 @@ from aaplug.core.cameras import CameraSet
 from aaplug.core.pyramids import Pyramid
 from aaplug.core.training import TrainingViews
 from aaplug.evaluation.engine import Task, candidates_of, evaluate
-from aaplug.evaluation.metrics import psnr
 from aaplug.evaluation.results import mean
 from aaplug.evaluation.truth import Truth
 from aaplug.levels.covariances import covariances, outer
@@ -95,13 +94,3 @@ def test_the_parts_of_a_gaussian_have_its_moments():
     torch.testing.assert_close(means.mean(dim=1), scene.means, rtol=1e-5, atol=1e-5)
     spread = outer((means - means.mean(dim=1, keepdim=True)).flatten(0, 1)) + covariances(parts)
     torch.testing.assert_close(spread.reshape(50, PARTS, 6).mean(dim=1), covariances(scene), rtol=1e-3, atol=1e-5)
-
-
-def test_a_split_scene_looks_nearly_as_before():
-    scene = make_scene(50)
-    images = [Renderer.of(s, VIEWS, "classic")(VIEWS[0]).rgb for s in (scene, split(scene, CAMERAS))]
-    assert (psnr(*images) or 0) > 25
-
-
-def test_a_split_scene_is_the_same_each_time():
-    assert torch.equal(split(make_scene(20), CAMERAS).means, split(make_scene(20), CAMERAS).means)

@@ -67,24 +67,6 @@ def test_the_near_plane_itself_is_not_seen(dtype):
     assert seen.tolist() == [False, False, False, False, True]
 
 
-def test_each_camera_pairs_its_own_focal_length_with_its_own_depth():
-    # the paper's equation 7; the published code's max f / min z would be 128 / 2 = 64
-    near, far = straight_camera(64.0, back=2.0), straight_camera(128.0, back=8.0)
-    point = torch.zeros(1, 3)
-    bounds = sampling_bounds(point, [near, far])
-    assert bounds.highest.tolist() == [32.0]
-    assert bounds.lowest.tolist() == [16.0]
-    assert bounds.views.tolist() == [2]
-
-
-def test_with_one_focal_length_the_nearest_camera_has_the_highest_rate():
-    cameras = [straight_camera(64.0, back=back) for back in (4.0, 2.0, 8.0)]
-    bounds = sampling_bounds(torch.zeros(1, 3), cameras)
-    assert bounds.highest.item() == pytest.approx(32.0)
-    assert bounds.lowest.item() == pytest.approx(8.0)
-    assert median_rates(torch.zeros(1, 3), cameras).item() == pytest.approx(16.0)
-
-
 def test_unseen_gaussians_have_rate_zero_or_by_choice_the_coarsest():
     points = torch.tensor([[0.0, 0.0, 2.0], [0.0, 0.0, 8.0], [0.0, 0.0, -1.0], [99.0, 0.0, 1.0]])
     bounds = sampling_bounds(points, [straight_camera(64.0)])
