@@ -323,9 +323,6 @@ def test_python_takes_an_orbit_for_cameras(dataset, tmp_path):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ("--orbit 0", "--orbit: takes 1..10000"),
-        ("--elevation 90", "--elevation: takes -89..89"),
-        ("--fov 0", "--fov: takes 1..170"),
         ("--up 0 0 0", "--up: takes a direction"),
         ("--up nan 0 1", "--up: takes"),
         ("--up 0 1", "--up: takes three numbers"),
@@ -335,7 +332,6 @@ def test_python_takes_an_orbit_for_cameras(dataset, tmp_path):
         ("--train-view 48", "--train-view: takes sizes"),
         ("--train-view 99999x9", "--train-view: would be"),
         ("--train-view 40x40 --train-rate 5", "--train-view: and --train-rate"),
-        ("--train-rate 0", "--train-rate: takes"),
         ("--train-rate 1e8", "the limit is 16384 a side"),
         ("--resolution 99999x10", "the limit is 16384 a side"),
         ("--cameras . --orbit 4", "--orbit: is for scenes without cameras"),

@@ -97,10 +97,3 @@ def test_the_middle_scene_is_drawn_at_every_size(capsys):
     sizes = [(run["gaussians"], run["width"]) for run in found["runs"]]
     assert sizes == [(300, 40), (400, 40), (500, 40), (400, 48)]
     assert set(found["exponents"]) == {"eager: Gaussians", "eager: pixels"}
-
-
-@pytest.mark.parametrize("words", [("--gaussians", "0"), ("--resolution", "big"), ("--repeats", "0")])
-def test_bad_sizes_are_refused(capsys, words):
-    code, said = run_bench(capsys, *words)
-    assert code == 2
-    assert "error" in said.err

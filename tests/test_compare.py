@@ -22,7 +22,6 @@ from aaplug.io.images import image_size
 from aaplug.io.scenes import read_scene, write_scene
 from aaplug.io.scenes.packed import half_turn_about_x
 from aaplug.io.scenes.scene_file import Scene
-from aaplug.system.errors import AaplugError, FrameError, UsageError
 from aaplug.system.executors import ProcessesIfLong
 from tests.conftest import make_scene
 from tests.test_cli import EYES, cli, dataset  # noqa: F401  (fixtures)
@@ -226,10 +225,7 @@ REFUSED = {
     "compare scene.ply nothing.ply": "nothing.ply: cannot be read: no such file",
     "compare scene.ply broken.ply": "broken.ply: ",
     "compare scene.ply other.ply other.ply": "other.ply: is named twice",
-    "compare scene.ply other.ply --for nothing": "'nothing' is not one of",
-    "compare scene.ply other.ply --metric nothing": "'nothing' is not one of",
     "compare scene.ply other.ply --fail-under 40db": "--fail-under: takes 0..200",
-    "compare scene.ply other.ply --fail-under 900dB": "--fail-under: takes 0..200",
     "compare scene.ply other.ply --resume": "--resume: needs a folder",
     "compare scene.ply other.ply --views nothing": "there is no view 'nothing'",
 }
@@ -243,16 +239,6 @@ def test_bad_input_is_one_line(cli, words):  # noqa: F811
     assert (code, out) == (2, "")
     assert err.splitlines()[-1].startswith("error: ")
     assert REFUSED[words] in err.splitlines()[-1]
-
-
-def test_the_library_refuses_the_same():
-    scene = make_scene(20)
-    with pytest.raises(UsageError, match="needs two scenes or more, got 1"):
-        aaplug.compare([scene])
-    with pytest.raises(FrameError, match="turned by 180 degrees about x"):
-        aaplug.compare({"a": scene, "b": half_turn_about_x(scene)})
-    with pytest.raises(AaplugError, match="fail_under: is no option here"):
-        aaplug.compare([scene, scene], fail_under=40)
 
 
 # what is written

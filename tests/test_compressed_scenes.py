@@ -376,6 +376,8 @@ def test_a_checkpoint_of_wrong_shapes_is_refused(tmp_path: Path):
     good = splats()
     for key, value in (
         ("means", torch.zeros(())),
+        ("means", good["means"].to("meta")),
+        ("opacities", good["opacities"].to_sparse()),
         ("quats", torch.zeros(40, 3)),
         ("scales", torch.zeros(40, 3, dtype=torch.int32)),
         ("shN", torch.zeros(40, 5, 3)),

@@ -129,20 +129,6 @@ def row_of_splats(covs: list[tuple[float, float, float]]) -> Splats2D:
 CUTOFF = math.sqrt(2 * math.log(255))
 
 
-@pytest.mark.parametrize(
-    ("cov", "cross_section"),
-    [
-        ((1.0, 0.0, 1.0), 1.0),
-        ((4.0, 0.0, 1.0), 1.0),
-        ((1.0, 0.0, 9.0), 1.0),
-        ((2.5, 1.5, 2.5), math.sqrt(1.6)),  # 4 and 1 px², turned by 45°
-    ],
-)
-def test_a_pixel_size_is_a_half_width_where_alpha_ends(cov, cross_section):
-    size = pixel_size(row_of_splats([cov])).item()
-    assert size == pytest.approx(CUTOFF * cross_section, rel=1e-12)
-
-
 def test_pixel_sizes_are_those_of_the_published_form():
     """min(√(L/A), √(L/C)) with the diagonal of the inverse, by a matrix's own inverse."""
     splats = make_splats(200, (40, 60)).to(F64)

@@ -220,15 +220,3 @@ def test_images_are_those_of_3dgs(seed, degree):
     assert 20 < len(drawn) < 70
     golden = composited(drawn, camera, 0.99, lambda after: after < 1e-4)
     agree(scene, camera, "classic", golden)
-
-
-def test_the_two_caps_give_different_images():
-    """So that the tests above would notice the wrong rules."""
-    camera = make_camera((0.4, -1.1, 0.2), size=(36, 27), fov=1.0)
-    scene = scene_of(4, 0)
-    images = []
-    for convention in (CLASSIC, GSPLAT):
-        trained = replace(scene, convention=convention)
-        training = TrainingViews.of(trained, [camera])
-        images.append(Renderer.of(trained, training, "classic", rasterizer="eager")(camera))
-    assert (images[0].rgb - images[1].rgb).abs().max() > 1e-3

@@ -68,14 +68,6 @@ def test_render_shows_few_options_before_those_with_a_heading(cli):  # noqa: F81
     assert len(options) <= 15
 
 
-def test_a_mistyped_verb_is_answered_with_the_one_that_was_meant(cli):  # noqa: F811
-    code, _, err = cli("evaluat scene.ply")
-    assert (code, err) == (
-        2,
-        "error: aaplug: there is no verb 'evaluat'; did you mean evaluate?; see `aaplug --help`\n",
-    )
-
-
 def test_only_a_video_has_a_path_file(cli):  # noqa: F811
     assert "path file" not in cli("render --help")[1]
     assert "path file" in cli("video --help")[1]

@@ -57,16 +57,6 @@ def test_parts_are_converted_as_the_whole_is(tmp_path: Path, wide_scene, cameras
     assert told[-1] == (150, 150)
 
 
-def test_a_stored_filter_is_fused_in_parts_without_cameras(tmp_path: Path):
-    path = saved(tmp_path, replace(make_scene(100), filter_3d=torch.rand(100) * 0.1))
-    whole = fuse(read_scene(path).gaussians(), None, FORMS["mip-splatting"])
-    parts = list(convert_parts(read_scene(path), (), FORMS["mip-splatting"], size=SIZE))
-    for field in ("log_scales", "logit_opacities"):
-        together = torch.cat([getattr(part, field) for part in parts])
-        torch.testing.assert_close(together, getattr(whole, field))
-    assert parts[0].fused == whole.fused
-
-
 def test_a_failure_in_a_late_part_leaves_no_file(tmp_path: Path, cameras):
     scene = make_scene(100)
     scene.means[90, 1] = math.nan

@@ -4,6 +4,8 @@ import re
 import shutil
 import subprocess
 from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
 
 import pytest
 import torch
@@ -30,14 +32,21 @@ def splat_transform() -> str | None:
 
 
 SPLAT_TRANSFORM = splat_transform()
+needs_it = pytest.mark.skipif(SPLAT_TRANSFORM is None, reason="splat-transform 3 is not installed")
 
 
-@pytest.mark.skipif(SPLAT_TRANSFORM is None, reason="splat-transform 3 is not installed")
+def transformed(*paths: Path) -> None:
+    """Let the program write each file from the one before."""
+    for source, target in pairwise(paths):
+        words = [SPLAT_TRANSFORM, "-q", "-w", "-g", "cpu", str(source), str(target)]
+        subprocess.run(words, check=True, capture_output=True, timeout=120)
+
+
+@needs_it
 @pytest.mark.parametrize("form", FORMS)
 def test_splat_transform_reads_a_converted_scene(form, sample_scene, sample_training, tmp_path):
     write_scene(tmp_path / "converted.ply", fuse(sample_scene, sample_training, FORMS[form]))
-    words = [SPLAT_TRANSFORM, "-w", str(tmp_path / "converted.ply"), str(tmp_path / "theirs.ply")]
-    subprocess.run(words, check=True, capture_output=True, timeout=120)
+    transformed(tmp_path / "converted.ply", tmp_path / "theirs.ply")
     ours, theirs = (read_scene(tmp_path / name).gaussians() for name in ("converted.ply", "theirs.ply"))
     assert len(theirs) == len(ours)
     order = [scene.means[:, 0].argsort(stable=True) for scene in (ours, theirs)]  # it may sort
@@ -46,13 +55,11 @@ def test_splat_transform_reads_a_converted_scene(form, sample_scene, sample_trai
         torch.testing.assert_close(a, b)
 
 
-@pytest.mark.skipif(SPLAT_TRANSFORM is None, reason="splat-transform 3 is not installed")
+@needs_it
 @pytest.mark.parametrize("suffix", [".compressed.ply", ".sog", ".spz", ".ply"])
 def test_what_splat_transform_packs_is_read_as_it_unpacks_it(suffix, tmp_path):
     packed, unpacked = tmp_path / f"packed{suffix}", tmp_path / "unpacked.ply"
-    for source, target in ((ORACLE, packed), (packed, unpacked)):
-        words = [SPLAT_TRANSFORM, "-q", "-w", "-g", "cpu", str(source), str(target)]
-        subprocess.run(words, check=True, capture_output=True, timeout=120)
+    transformed(ORACLE, packed, unpacked)
     ours, theirs = read_scene(packed, spz_axes="opencv").gaussians(), read_scene(unpacked).gaussians()
     for field in ("means", "log_scales", "logit_opacities", "sh"):
         torch.testing.assert_close(getattr(ours, field), getattr(theirs, field), rtol=0, atol=1e-5)
@@ -61,30 +68,27 @@ def test_what_splat_transform_packs_is_read_as_it_unpacks_it(suffix, tmp_path):
     assert theirs.convention.compensated
 
 
-@pytest.mark.skipif(SPLAT_TRANSFORM is None, reason="splat-transform 3 is not installed")
+@needs_it
 @pytest.mark.parametrize("suffix", [".compressed.ply", ".sog", ".spz", ".ply"])
 @pytest.mark.parametrize("convention", CONVENTIONS.values(), ids=CONVENTIONS)
 def test_what_survives_splat_transform_is_whether_training_compensated(suffix, convention, tmp_path):
     """Its one bit is read as the Mip rule, for which `convert` makes scenes; another kernel is lost, which is said."""
     source, packed, unpacked = (tmp_path / name for name in ("source.ply", f"packed{suffix}", "unpacked.ply"))
     write_scene(source, replace(read_scene(ORACLE).gaussians(), convention=convention))
-    for a, b in ((source, packed), (packed, unpacked)):
-        words = [SPLAT_TRANSFORM, "-q", "-w", "-g", "cpu", str(a), str(b)]
-        subprocess.run(words, check=True, capture_output=True, timeout=120)
+    transformed(source, packed, unpacked)
     for path in (packed, unpacked):
         found = read_scene(path)
         assert found.convention == (MIP if convention.compensated else CLASSIC)
         assert ("its kernel is not recorded" in found.evidence) == convention.compensated
 
 
-@pytest.mark.skipif(SPLAT_TRANSFORM is None, reason="splat-transform 3 is not installed")
+@needs_it
 @pytest.mark.parametrize("convention", [CLASSIC, ANTIALIASED])
 def test_splat_transform_reads_our_spz(convention, tmp_path):
     pytest.importorskip("gsply")
     ours, path = replace(read_scene(ORACLE).gaussians(), convention=convention), tmp_path / "ours.spz"
     write_scene(path, ours, spz_axes="opencv")
-    words = [SPLAT_TRANSFORM, "-q", "-w", str(path), str(tmp_path / "theirs.ply")]
-    subprocess.run(words, check=True, capture_output=True, timeout=120)
+    transformed(path, tmp_path / "theirs.ply")
     theirs, again = read_scene(tmp_path / "theirs.ply").gaussians(), read_scene(path, spz_axes="opencv").gaussians()
     torch.testing.assert_close(theirs.means, ours.means, rtol=0, atol=2e-6)
     torch.testing.assert_close(theirs.log_scales, ours.log_scales, rtol=0, atol=1 / 32 + 1e-5)

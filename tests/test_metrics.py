@@ -3,14 +3,10 @@
 import importlib.util
 import math
 
-import numpy as np
 import pytest
 import torch
-from scipy.ndimage import gaussian_filter
-from skimage.data import astronaut
 from torch.nn.functional import pad
 
-from aaplug.core.imaging import box_average
 from aaplug.evaluation import METRICS, PROTOCOLS
 from aaplug.evaluation.metric import Metric
 from aaplug.evaluation.metrics import (
@@ -47,20 +43,6 @@ def test_ssim_is_the_one_of_wang_with_the_border_cropped_or_padded(hw, flavour, 
     vx, vy, cov, c1, c2 = xx - mx**2, yy - my**2, xy - mx * my, 0.01**2, 0.03**2
     expected = ((2 * mx * my + c1) * (2 * cov + c2)) / ((mx**2 + my**2 + c1) * (vx + vy + c2))
     assert ssim(a, b, flavour) == pytest.approx(expected.mean().item(), abs=1e-9)
-
-
-# image side in px, SSIM zero-padded and cropped: published with the 3DGS family's border effect
-BORDER = [(512, 0.7997, 0.7965), (256, 0.8336, 0.8291), (128, 0.8611, 0.8547), (64, 0.8877, 0.8792)]
-
-
-def test_the_border_reads_higher_the_smaller_the_image():
-    photo, noise = torch.from_numpy(astronaut() / 255), np.random.default_rng(0)
-    for side, padded, cropped in BORDER:
-        truth = box_average(photo, 512 // side)
-        blurred = gaussian_filter(truth.numpy(), (0.7, 0.7, 0))
-        image = torch.from_numpy(np.clip(blurred + noise.normal(0, 0.02, truth.shape), 0, 1))
-        assert ssim(image, truth, "3dgs") == pytest.approx(padded, abs=6e-5)
-        assert ssim(image, truth, "wang") == pytest.approx(cropped, abs=6e-5)
 
 
 def test_energy_drift_is_the_share_of_light_gained():

@@ -9,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-import torch
 from aaplug_cli.main import main
 
 from aaplug.io.cameras import read_cameras
@@ -128,19 +127,6 @@ def test_values_that_no_one_meant_are_told(tmp_path, change, caplog):
     write_scene(tmp_path / "odd.ply", replace(scene, **{change: column}))
     read_scene(tmp_path / "odd.ply").gaussians()
     assert "1 of 40 Gaussians have a " in caplog.text
-
-
-def test_a_checkpoint_whose_tensors_hold_no_rows_is_refused(tmp_path):
-    scene = make_scene(10)
-    columns = {"means": scene.means, "quats": scene.quats, "scales": scene.log_scales}
-    columns |= {"opacities": scene.logit_opacities, "sh0": scene.sh[:, :1]}
-    for name in columns:
-        odd = (torch.tensor(1.0), columns[name].to("meta"), columns[name].to_sparse())
-        for number, tensor in enumerate(odd):
-            path = tmp_path / f"{name}-{number}.pt"
-            torch.save({"splats": {**columns, name: tensor}}, path)
-            with pytest.raises(FormatError, match=f"{name} should be a tensor with a row for each Gaussian"):
-                read_scene(path, allow_checkpoint=True)
 
 
 def test_a_principal_point_far_away_is_refused(tmp_path):

@@ -9,9 +9,7 @@ import torch
 from aaplug.core.conventions import MIP
 from aaplug.core.gaussians import Gaussians
 from aaplug.evaluation.metrics import psnr
-from aaplug.io.scenes import read_scene, write_scene
 from aaplug.lab.multi_scale import in_one_scene, pixel_sizes
-from aaplug.lab.pixel_size import PixelSizes
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import UsageError
 from tests.conftest import make_camera, make_scene
@@ -75,14 +73,3 @@ def test_pixel_sizes_are_those_of_all_views():
 def test_a_scene_that_its_rasterizer_shows_otherwise_is_refused(change):
     with pytest.raises(UsageError, match="Multi-Scale 3DGS draws 3D Gaussians by the convention 'classic'"):
         in_one_scene(replace(make_scene(5), **change), [make_camera()], 1)
-
-
-def test_the_file_keeps_the_columns(together, tmp_path):
-    write_scene(tmp_path / "together.ply", together)
-    scene = read_scene(tmp_path / "together.ply")
-    assert "pixel sizes of Multi-Scale 3DGS, for the recipe multi-scale" in scene.notes
-    before, after = PixelSizes.of(together), PixelSizes.of(scene.gaussians())
-    assert before is not None
-    assert after is not None
-    for name, column in vars(before).items():
-        assert getattr(after, name).equal(column), name

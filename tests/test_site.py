@@ -129,7 +129,7 @@ def gallery(browser, hooks, tmp_path):  # noqa: F811
     assert troubles == []
 
 
-def test_a_divider_of_the_gallery_moves_by_mouse_keys_and_slider(gallery):
+def test_a_slider_of_the_gallery_moves_by_mouse_and_keys_and_its_lens_shows_both_pictures(gallery):
     box = gallery.locator(".stage canvas").bounding_box()
     gallery.mouse.move(box["x"] + box["width"] / 2, box["y"] + 50)
     gallery.mouse.down()
@@ -140,9 +140,6 @@ def test_a_divider_of_the_gallery_moves_by_mouse_keys_and_slider(gallery):
     gallery.wait_for_selector(".compare[data-split='0.270']")
     gallery.locator("input[type=range]").fill("80")
     gallery.wait_for_selector(".compare[data-split='0.800']")
-
-
-def test_the_lens_of_the_gallery_shows_both_pictures(gallery):
     assert gallery.locator(".crops canvas").count() == 0
     gallery.locator("input[type=checkbox]").check()
     assert gallery.locator(".crops canvas").count() == 2

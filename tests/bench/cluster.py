@@ -1,88 +1,31 @@
-"""What a cluster of this machine's workers costs: rates, and the time of a scene, an item and a line of the journal."""
+"""What a cluster of this machine's workers costs: the time of a scene, an item and a line of the journal."""
 
 import json
 import os
-import resource
 import statistics
 import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Literal
 
 import torch
 
 import aaplug
-from aaplug.evaluation.engine import Task, ViewMeasurer, candidates_of
 from aaplug.evaluation.journal import Journal
 from aaplug.evaluation.results import Measurement
-from aaplug.evaluation.truth import Truth
-from aaplug.io.cameras import read_cameras
-from aaplug.io.scenes import read_scene
 from aaplug.rendering.benchmark import synthetic_scene
-from aaplug.rendering.renderer import own_look
 from aaplug.system.cluster import connected
-from aaplug.system.executors import WORK_FILE_NAME, Executor, Processes, load, save
+from aaplug.system.executors import WORK_FILE_NAME, load, save
 from aaplug.system.monitor import SILENT
 from tests.bench import heading, row
 from tests.bench.large import cameras, write
-from tests.conftest import SAMPLE
 
 MILLION = 1_000_000  # Gaussians
 SCALES = (1.0, 0.5, 0.25, 0.125, 0.0625)
 
 
-def main(what: Literal["speed", "costs"], workers: int = 2, views: int = 24, runs: int = 3) -> None:
-    """Print a table.
-
-    Args:
-        what: speed: views a second of `--scheduler local` against plain processes.  costs: what a batch pays besides
-            its views, and what a view costs.
-        workers: of speed.
-        views: of speed.
-        runs: of speed, of which medians are printed.
-    """
-    speed(workers, views, runs) if what == "speed" else costs()
-
-
-def speed(workers: int, views: int, runs: int) -> None:
-    """Views a second of both pools, by turns: with start and end, without, and by processor time with both."""
-    scene, data = read_scene(SAMPLE / "chair.ply"), read_cameras(SAMPLE)
-    renderer = aaplug.Renderer.of(scene, data, "auto", rasterizer="eager")
-    candidates = candidates_of(scene, renderer.training, [renderer.recipe], "eager")
-    work = ViewMeasurer(Task(candidates, SCALES, data.train[:views], Truth(own_look(scene, renderer.training))), None)
-    pools = {"processes": _processes, "--scheduler local": lambda count: connected("local", count, None, SILENT)}
-    rates: dict[str, list[tuple[float, ...]]] = {name: [] for name in pools}
-    heading("views a second", "", "with start and end", "without", "of processor time")
-    for _ in range(runs):
-        for name, pool in pools.items():
-            began, used = time.monotonic(), _processor_time()
-            with pool(workers) as executor:
-                ends = [time.monotonic() for _ in executor.map(work, range(views))]
-            total = time.monotonic() - began
-            rates[name].append((views / total, (views - 1) / (ends[-1] - ends[0]), views / (_processor_time() - used)))
-            row(name, *rates[name][-1])
-    medians = [[statistics.median(column) for column in zip(*each, strict=True)] for each in rates.values()]
-    for name, values in zip(rates, medians, strict=True):
-        row(f"{name}, medians", *values)
-    row("ratio", *(local / plain for plain, local in zip(*medians, strict=True)))
-
-
-def _processor_time() -> float:
-    """Seconds of this process and those that it has seen end."""
-    spent = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    return sum(each.ru_utime + each.ru_stime for each in spent)
-
-
-@contextmanager
-def _processes(workers: int) -> Iterator[Executor]:
-    yield Processes(workers)
-
-
-def costs() -> None:
-    """What a batch pays besides its views, and what a view costs."""
+def main() -> None:
+    """Print what a batch pays besides its views, and what a view costs."""
     heading("costs", "what", "measured")
     with tempfile.TemporaryDirectory() as name:
         _sending(Path(name))

@@ -1,11 +1,11 @@
-"""Levels of detail against the scene they were made of: quality, milliseconds, fades, a dolly, lighter scenes.
+"""Levels of detail against the scene they were made of: quality, milliseconds, lighter scenes.
 
 For a trained scene it makes a pyramid, kept in a folder of the working directory, and draws sizes from 1/2 to 1/32 with
 and without levels: PSNR in dB, SSIM and flicker against the scene's own look, PSNR against photographs, median
-milliseconds, Gaussians projected and evaluations of a splat in a pixel.  Then come fades between two levels; a dolly,
-also as a video; all levels in one scene by Multi-Scale 3DGS' rule; and lighter scenes beside splat-transform's
-`--decimate`.  For a scene of a million it has what levels lose by the own look and what they save of the time, merged
-alone and tuned.  For `cost` it has time against Gaussians and pixels on synthetic scenes.
+milliseconds, Gaussians projected and evaluations of a splat in a pixel.  Then come all levels in one scene by
+Multi-Scale 3DGS' rule, and lighter scenes beside splat-transform's `--decimate`.  For a scene of a million it has what
+levels lose by the own look and what they save of the time, merged alone and tuned.  For `cost` it has time against
+Gaussians and pixels on synthetic scenes.
 """
 
 import statistics
@@ -13,23 +13,17 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import pairwise
 from typing import Any, Literal
-from unittest.mock import patch
 
 import torch
 
-from aaplug.core.camera_paths import moved
 from aaplug.core.cameras import Camera
-from aaplug.core.gaussians import MIN_OPACITY, Gaussians
-from aaplug.core.pyramids import Pyramid, faded
-from aaplug.core.splats import Splats2D
+from aaplug.core.gaussians import Gaussians
+from aaplug.core.pyramids import Pyramid
 from aaplug.evaluation.metrics import PSNR
-from aaplug.evaluation.protocols import median_depth
 from aaplug.evaluation.results import Report, mean
 from aaplug.evaluation.truth import Truth, ViewTruth
 from aaplug.io.scenes.pyramid_folder import pyramid_of, read_pyramid
-from aaplug.io.video import write_video
 from aaplug.lab.multi_scale import in_one_scene
 from aaplug.rendering.benchmark import exponent, synthetic_camera
 from aaplug.rendering.renderer import Renderer
@@ -41,7 +35,6 @@ from tests.bench.scenes import MILLIONS, SYNTHETIC_SIDE, Trained, decibels, nois
 TEST_VIEWS = 5
 SCALES = (1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 32)
 BETWEEN_SCALES = (0.24, 1 / 5, 1 / 6, 1 / 7, 0.11, 1 / 10, 0.07)  # where samples lie closer than half of training's
-FADE_SCALES = (0.5, 0.46, 0.44, 0.42, 0.4, 0.37)  # from where level 1 is drawn alone to where level 2 is
 LEVELS = 5
 SHARES = {1 / 4: (1 / 4, 1 / 8), 1 / 16: (1 / 8,)}  # of the Gaussians, and the scales that lighter scenes are tuned for
 RULES = ("matched", "classic")  # that lighter scenes are shown by
@@ -54,8 +47,6 @@ DECIMATED = {  # at 1/2, 1/4 and 1/8 by each of these, with @playcanvas/splat-tr
 }
 METRICS = ("psnr", "ssim", "flicker")
 REPEATS = 5
-OCTAVES, FRAMES_PER_OCTAVE = 3, 20  # of the dolly
-FPS = 20.0
 COST_GAUSSIANS = (100_000, 1_000_000, 3_000_000)
 COST_SIZES = ((100, 75), (400, 300), (800, 600), (1600, 1200))
 MERGE_BELOW = 0.5  # px: levels of the synthetic scenes are merged to be fast
@@ -70,9 +61,7 @@ def main(scenes: Sequence[str] = ("chair", "snowmiku", *MILLIONS, "cost")) -> No
             million(Bench(name, MILLIONS[name]()))
         else:
             bench = Bench(name, trained(name))
-            pyramid = levels(bench)
-            fades(bench, pyramid)
-            dolly(bench, pyramid)
+            levels(bench)
             in_one(bench)
             lighter(bench)
 
@@ -169,7 +158,7 @@ def in_one(bench: Bench) -> None:
         row("splats", *(f"{len(renderer.splats(bench.views[0].scaled(scale))):,}" for scale in scales))
 
 
-def levels(bench: Bench) -> Pyramid:
+def levels(bench: Bench) -> None:
     """A pyramid against the scene."""
     pyramid = bench.pyramid(f"{bench.name}-lod")
     columns = ("", "size", "own look", "SSIM", "flicker", "photographs", "ms", "Gaussians", "evaluations, M")
@@ -185,23 +174,6 @@ def levels(bench: Bench) -> Pyramid:
                 figures = [metric.text(mean(views, metric.name)) for metric in own.metrics]
                 count = f"{bench.projected(renderer, scale):,}"
                 row(f"{name}, {quality}", f"1/{1 / scale:g}", *figures, real, ms, count, evaluations)
-    return pyramid
-
-
-@torch.no_grad()
-def fades(bench: Bench, pyramid: Pyramid) -> None:
-    """Between levels 1 and 2, one sample per pixel, as levels fade and by optical depth."""
-    heading("fades", "fade", *(f"{scale:g}" for scale in FADE_SCALES))
-    renderer = bench.renderer(pyramid, "auto", "fast")
-    for name, fade in (("energy", faded), ("optical depth", by_depth)):
-        with patch("aaplug.rendering.renderer.faded", fade):
-            row(name, *(bench.psnr(renderer, scale) for scale in FADE_SCALES))
-
-
-def by_depth(splats: Splats2D, shares: torch.Tensor) -> Splats2D:
-    """As `faded`, with a share of the optical depth at a splat's middle."""
-    opacities = splats.opacities.clamp(max=1 - MIN_OPACITY)
-    return replace(splats, opacities=-torch.expm1(shares * torch.log1p(-opacities)))
 
 
 def million(bench: Bench) -> None:
@@ -220,32 +192,6 @@ def million(bench: Bench) -> None:
                 figures = bench.psnr(renderer, scale), round(took), took / times[0]
                 count = f"{bench.projected(renderer, scale):,}"
                 row(f"{name}, {quality}", f"1/{1 / scale:g}", *figures, count, renderer.samples(view))
-
-
-@torch.no_grad()
-def dolly(bench: Bench, pyramid: Pyramid) -> None:
-    """Frame-to-frame changes of a view that moves away over three octaves, against those of the ceiling."""
-    view = bench.views[0]
-    depth = median_depth(bench.scene.means, view)
-    frames = [moved(view, 2 ** (-step / FRAMES_PER_OCTAVE), depth) for step in range(OCTAVES * FRAMES_PER_OCTAVE + 1)]
-    heading("dolly", "", "change of a frame, median (RMS)", "against the ceiling's at that frame, at most")
-    renderers = {
-        "`best`, the ceiling": bench.renderer(bench.scene, "auto", "best"),
-        "levels, `balanced`": bench.renderer(pyramid, "auto"),
-        "levels, `fast`": bench.renderer(pyramid, "auto", "fast"),
-        "`matched`": bench.renderer(bench.scene, "matched"),
-    }
-    ceiling: list[float] = []
-    sides: list[list[torch.Tensor]] = []
-    for name, renderer in renderers.items():
-        images = [renderer(frame).rgb.clamp(0, 1) for frame in frames]
-        changes = [float((b - a).square().mean().sqrt()) for a, b in pairwise(images)]
-        ceiling = ceiling or changes
-        worst = max(change / best for change, best in zip(changes, ceiling, strict=True))
-        row(name, f"{statistics.median(changes):.4f}", worst)
-        sides = [*sides, [image.half() for image in images]][:2]
-    beside = (torch.cat(pair, dim=1).float() for pair in zip(*sides, strict=True))
-    write_video(f"{bench.name}-dolly.webm", beside, FPS, overwrite=True)
 
 
 def cost() -> None:

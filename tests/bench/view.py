@@ -17,9 +17,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from typing import Any
 
-import psutil
 import torch
 from websockets.sync.client import ClientConnection, connect
 
@@ -33,29 +31,15 @@ WINDOW = (1280, 720)  # px
 POSES_PER_SECOND = 60  # as a browser's screen asks
 TURN_SECONDS = 30.0  # once around the scene
 DEPTH = 5.0  # world units to what the flight turns about
-HELD_FLIGHT_SECONDS = 20.0
-PAINTS: tuple[dict[str, Any], ...] = ({}, {"paint": "rate"}, {"paint": "cost"})
 SIDES = [{"recipe": "classic", "quality": "best"}, {"recipe": "auto", "quality": "best"}]
 
 
-def main(
-    gaussians: Sequence[int] = (100_000, 550_000, 1_000_000), seconds: float = 30.0, minutes: float | None = None
-) -> None:
-    """Print the table.
-
-    Args:
-        gaussians: of the scenes.
-        seconds: of a flight.
-        minutes: let clients come and go for so long on the first scene, each with a flight of its own size, recipe
-            and paint, and print the memory that the process holds after each.
-    """
-    if minutes is not None:
-        return held(minutes, gaussians[0])
+def main(gaussians: Sequence[int] = (100_000, 550_000, 1_000_000), seconds: float = 30.0) -> None:
+    """Print the table; seconds: of a flight."""
     delays = ("pose to picture, ms", "95 %", "rest to full quality, s")
     heading("the live view", "Gaussians", "clients", "frames/s", *delays, "MB/s", "GB")
     for count, clients in itertools.product(gaussians, (1, 2)):
         fly_together(count, clients, seconds)
-    return None
 
 
 def fly_together(gaussians: int, clients: int, seconds: float) -> None:
@@ -80,21 +64,6 @@ def fly_together(gaussians: int, clients: int, seconds: float) -> None:
     )
 
 
-def held(minutes: float, gaussians: int) -> None:
-    """Print the memory that is held after each of many flights."""
-    heading("memory", "minutes", "pictures", "GB held")
-    with _served(gaussians) as (address, view):
-        began, pictures = time.perf_counter(), 0
-        for scale, recipe, paint in itertools.cycle(itertools.product((1, 0.5, 0.75), ("auto", "mip"), PAINTS)):
-            flight, sides = Flight(), [SIDES[0], {"recipe": recipe, "quality": "best"}]
-            flight.fly(address, view.scaled(scale), HELD_FLIGHT_SECONDS, sides=sides, **paint)
-            pictures += len(flight.delays)
-            passed = (time.perf_counter() - began) / 60
-            row(f"{passed:.1f}", pictures, psutil.Process().memory_info().rss / 1e9)
-            if passed > minutes:
-                return
-
-
 @contextmanager
 def _served(gaussians: int) -> Iterator[tuple[str, Camera]]:
     """The address of a page with a synthetic scene, and a free camera of it."""
@@ -117,8 +86,8 @@ class Flight:
     rest: float = math.nan
     done: threading.Event = field(default_factory=threading.Event)
 
-    def fly(self, address: str, view: Camera, seconds: float, **fields: Any) -> None:
-        """Turn about the scene, then rest.  fields: of the requests."""
+    def fly(self, address: str, view: Camera, seconds: float) -> None:
+        """Turn about the scene, then rest."""
         up = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
         where = address.replace("http", "ws", 1) + "live"
         with connect(where, origin=address.rstrip("/"), proxy=None, max_size=None) as connection:  # pyright: ignore[reportArgumentType]
@@ -130,7 +99,7 @@ class Flight:
                 time.sleep(max(0.0, began + number / POSES_PER_SECOND - time.perf_counter()))
                 pose = camera_paths.orbit(view, number / POSES_PER_SECOND / TURN_SECONDS, DEPTH, up).cam_from_world
                 see = {"id": number, "pose": pose.flatten().tolist(), "focal": view.focal, "split": 0.5, "sides": SIDES}
-                see |= {"width": view.width, "height": view.height, "moving": number < count, **fields}
+                see |= {"width": view.width, "height": view.height, "moving": number < count}
                 self.requests[number] = time.perf_counter()
                 connection.send(json.dumps({"see": see}))
             self.done.wait(60)

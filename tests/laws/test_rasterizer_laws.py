@@ -62,12 +62,6 @@ def assert_same(image: Render, other: Render, atol: float = SAME) -> None:
     torch.testing.assert_close(image.alpha, other.alpha, rtol=0, atol=atol)
 
 
-def background_share(image: Render) -> torch.Tensor:
-    """Largest difference between an image and its background."""
-    away = (image.rgb - torch.tensor(SKY, dtype=image.rgb.dtype)).abs().max()
-    return torch.maximum(away, image.alpha.abs().max())
-
-
 def test_splats_behind_an_opaque_wall_change_nothing(rasterize, splats):
     wall = joined(*[one(covariance=(1e8, 0.0, 1e8), opacity=1.0)] * 3)
     before = rasterize(joined(wall, splats), HW, SKY)
@@ -108,43 +102,6 @@ def test_transparent_splats_change_nothing(rasterize, splats, opacity):
 def test_only_the_order_of_depths_matters(rasterize, splats):
     before = rasterize(splats, HW, SKY)
     assert_same(rasterize(replace(splats, depths=splats.depths.exp() * 1e3), HW, SKY), before)
-
-
-@pytest.mark.parametrize("opacity", [0.0, 0.003])
-def test_an_image_of_invisible_splats_is_the_background(rasterize, opacity):
-    assert background_share(rasterize(one(opacity=opacity), HW, SKY)) == 0
-    assert background_share(rasterize(one(mean=(-500.0, 12.5)), HW, SKY)) == 0
-
-
-@pytest.mark.parametrize("log_sigmas", [(-2.0, 0.0), (0.0, 2.0), (3.0, 6.0)])
-def test_alpha_is_between_0_and_1(rasterize, log_sigmas):
-    splats = make_splats(400, HW, seed=4, log_sigmas=log_sigmas)
-    alpha = rasterize(replace(splats, opacities=splats.opacities.sqrt()), HW, SKY).alpha
-    assert alpha.min() >= 0
-    assert 0.5 < alpha.max() <= 1
-
-
-def test_the_background_is_added_by_one_minus_alpha(rasterize, splats):
-    on_black, on_sky = rasterize(splats, HW, (0.0, 0.0, 0.0)), rasterize(splats, HW, SKY)
-    assert on_black.alpha.equal(on_sky.alpha)
-    sky = (1 - on_black.alpha)[..., None] * torch.tensor(SKY)
-    torch.testing.assert_close(on_sky.rgb, on_black.rgb + sky.to(on_sky.rgb), rtol=0, atol=SAME)
-
-
-def test_moving_everything_by_a_pixel_moves_the_image(rasterize, splats):
-    before = rasterize(splats, HW, SKY)
-    moved = rasterize(replace(splats, means=splats.means + torch.tensor([1.0, 2.0])), HW, SKY)
-    torch.testing.assert_close(moved.rgb[2:, 1:], before.rgb[:-2, :-1], rtol=0, atol=2e-5)
-
-
-def test_mirroring_everything_mirrors_the_image(rasterize, splats):
-    mirrored = replace(
-        splats,
-        means=torch.tensor([float(HW[1]), 0.0]) + splats.means * torch.tensor([-1.0, 1.0]),
-        covs=splats.covs * torch.tensor([1.0, -1.0, 1.0]),
-    )
-    before, after = rasterize(splats, HW, SKY), rasterize(mirrored, HW, SKY)
-    torch.testing.assert_close(after.rgb.flip(1), before.rgb, rtol=0, atol=2e-5)
 
 
 POISON = {
