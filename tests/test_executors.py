@@ -1,5 +1,6 @@
 """Worker pools: results in order, few items read ahead, errors that come back whole, no worker outlives its parent."""
 
+import math
 import os
 import platform
 import subprocess
@@ -10,6 +11,7 @@ import psutil
 import pytest
 import torch
 
+from aaplug.system.cores import FREE_CORES, FreeCores, Reading, on_free_cores
 from aaplug.system.errors import FormatError, UsageError
 from aaplug.system.executors import Processes, Threads, torch_threads
 
@@ -116,3 +118,36 @@ def test_kept_memory_is_not_fetched_again():
         for how in ("kept", "usual")
     )
     assert kept < usual / 10
+
+
+def test_threads_leave_a_core_to_another_program(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Two cores and one second: this process worked 0.5 s of each, another program the rest of one core.
+    readings = iter([Reading(0.0, 0.0, 0.0), Reading(1.0, 1.0, 2.0), Reading(2.0, 2.0, 3.0), Reading(3.0, 2.5, 3.7)])
+    monkeypatch.setattr(Reading, "now", lambda: next(readings))
+    monkeypatch.setattr("os.sched_getaffinity", lambda process: {0, 1}, raising=False)
+    monkeypatch.setattr("aaplug.system.cores.WINDOW_SECONDS", -math.inf)
+    cores = FreeCores()
+    assert [cores.count() for _ in range(3)] == [1, 2, 2]
+
+
+@pytest.mark.skipif(Reading.now() is None, reason="the system does not tell how busy its cores are")
+def test_work_of_other_programs_is_counted_and_own_work_is_not() -> None:
+    seconds = 0.3
+    work = f"import time; end = time.process_time() + {seconds}\nwhile time.process_time() < end: pass"
+    readings = [Reading.now()]
+    subprocess.run([sys.executable, "-c", work], check=True)
+    readings.append(Reading.now())
+    exec(work)
+    readings.append(Reading.now())
+    own = [reading.own for reading in readings if reading]
+    cores = [reading.cores for reading in readings if reading]
+    assert cores[1] - cores[0] - (own[1] - own[0]) > seconds / 2
+    assert own[2] - own[1] >= seconds
+
+
+def test_torch_has_as_many_threads_as_cores_are_free_and_then_its_own_number(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(FREE_CORES, "count", lambda: 1)
+    with torch_threads(2):
+        with on_free_cores():
+            assert torch.get_num_threads() == 1
+        assert torch.get_num_threads() == 2

@@ -24,6 +24,7 @@ from aaplug.gsplat.arguments import Options, View
 from aaplug.methods.filters.matched import Matched
 from aaplug.methods.pixel_kernels.absolute import ABSOLUTE_POINT
 from aaplug.methods.pixel_kernels.point import POINT
+from aaplug.system.cores import on_free_cores
 
 MIN_COMPENSATION = 1e-9  # gsplat has none; this one keeps the gradient of the root finite where the factor is 0
 MAX_RADIUS = 2.0**30  # px; fits 32 bits
@@ -71,6 +72,7 @@ class ViewSplats:
         return cls(splats[keep], radii[keep].int())
 
 
+@on_free_cores()
 def draw(
     splats: Splats2D,
     view: View,

@@ -40,6 +40,7 @@ from aaplug.methods.recipe import RATE_TOLERANCE, Recipe
 from aaplug.methods.recipes import find_recipe, suited
 from aaplug.rasterizers import RASTERIZERS
 from aaplug.rasterizers.choice import find_rasterizer
+from aaplug.system.cores import on_free_cores
 from aaplug.system.errors import UsageError
 
 GAUSSIANS_AT_ONCE = 1 << 20  # Gaussians projected at once, where no gradients are asked for
@@ -166,6 +167,7 @@ class Renderer:
         """
         return self.draw(camera).render
 
+    @on_free_cores()
     def draw(self, camera: Camera) -> Drawing:
         """Render one view and keep its splats, for example to read their gradients."""
         samples, weight = self.sampling(camera)
@@ -174,6 +176,7 @@ class Renderer:
         image = self.paint(splats, fine.hw)
         return Drawing(average_samples(image, samples, weight), splats, fine.hw)
 
+    @on_free_cores()
     def paint(self, splats: Splats2D, hw: tuple[int, int], background: Colour | None = None) -> Render:
         """Composite coloured splats into an image of height and width `hw` px.
 
@@ -239,6 +242,7 @@ class Renderer:
                 return float((now / torch.minimum(torch.maximum(now, lowest), highest)).median())
         return self.training.relative_rate(camera)
 
+    @on_free_cores()
     def splats(self, camera: Camera, samples: int = 1) -> Splats2D:
         """The splats of one view: projected, selected, filtered, culled and coloured.
 

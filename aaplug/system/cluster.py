@@ -234,7 +234,7 @@ def _call(path: str, versions: dict[str, str], item: Any) -> Any:
     for package, expected in versions.items():
         _refuse_other(get_worker().address, package, VERSIONS[package], expected)
     with _one_item:
-        torch.set_num_threads(1)  # of this thread, and for good: torch takes time to change it
+        torch.set_num_threads(1)  # of this thread, and for good
         return _work(path)(item)
 
 

@@ -41,6 +41,7 @@ from aaplug.rasterizers.tiled.forward import (
     where_above,
 )
 from aaplug.rasterizers.tiled.layout import tiles_of
+from aaplug.system.cores import on_free_cores
 
 
 def composite(
@@ -73,6 +74,7 @@ class _Composite(torch.autograd.Function):
         return _backward(rows, [*rgb, alpha], *ctx.rest), None, None
 
 
+@on_free_cores()
 def _backward(
     rows: Float[Tensor, "m c"], grads: list[Float[Tensor, "h w"]], bins: Bins, segments: list[Segment], how: Compositing
 ) -> Float[Tensor, "m c"]:
