@@ -96,7 +96,7 @@ def convert(words: Words) -> int:
         out.print(tables(result.report)[0])
     how = "in parts" if result.scene is None else f"fused {fused_in(result.scene)}"
     say(f"wrote {words.output}: {how}; show it with {result.viewer.rule} ({result.viewer.name})")
-    say(result.viewer.advice)
+    say(result.viewer.advice(words.output.suffix[1:].lower()))
     return 0
 
 
@@ -147,7 +147,7 @@ def _lod_of_batch(own: Words, resume: bool) -> dict[str, Any]:
     from aaplug.verbs.lod import DEFAULT_LEVELS
 
     resume = resume and is_pyramid(own.output)
-    if resume and len(read_manifest(own.output).levels) > (own.levels or DEFAULT_LEVELS):
+    if resume and len(read_manifest(own.output, unfinished=True).levels) > (own.levels or DEFAULT_LEVELS):
         return made_before(own)
     return _lod(own.where(resume=resume))
 

@@ -92,10 +92,13 @@ def test_no_input_is_replaced_whatever_overwrite_says(name, job):
 
 
 def test_photographs_that_the_chosen_cameras_do_not_name_are_inputs_too(job):
-    shutil.copytree("test", "val")
-    shutil.copytree("test", "images_4")
-    for folder in ("test", "val", "images_4"):
+    cameras = Path("transforms_test.json")
+    Path("images.json").write_text(cameras.read_text().replace("./test/r_0", "./images_8/r_0"))
+    for folder in ("test", "val", "images_8", "images_4"):
+        if folder != "test":
+            shutil.copytree("test", folder)
         before = Path(folder, "r_0.png").read_bytes()
-        code, err = job(f"render scene.ply --cameras transforms_test.json -o {folder} --overwrite")
+        file = "images.json" if "images" in folder else cameras
+        code, err = job(f"render scene.ply --cameras {file} -o {folder} --overwrite")
         assert (code, Path(folder, "r_0.png").read_bytes()) == (2, before)
         assert "is also the input" in err

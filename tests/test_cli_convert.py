@@ -135,3 +135,16 @@ def test_what_was_tuned_converts_and_what_was_converted_does_not_again(cli):
     assert fused() == ["finetune", "matched-energy"]
     code, _, err = cli("convert c.ply --cameras . -o d.ply --for mip --steps 0")
     assert (code, "already has matched-energy" in err) == (2, True)
+
+
+def test_a_file_fits_the_viewer_or_names_one_that_opens_it(cli):
+    pytest.importorskip("gsply")
+    means = read_scene("scene.ply").gaussians().means
+    for viewer, axes in (("spark", "opencv"), ("spark --spz-axes opengl", "opengl"), ("mip", "opengl")):
+        code, _, err = cli(f"convert scene.ply --cameras . -o c.spz --for {viewer} --steps 0 --overwrite")
+        assert code == 0, err
+        assert torch.allclose(read_scene("c.spz", spz_axes=axes).gaussians().means, means, atol=1e-5)
+    code, _, err = cli("convert scene.ply --cameras . -o c.splat")
+    assert code == 0
+    assert "open the .splat in Spark 2.2.0 (blurAmount: 0.1) or GaussianSplats3D 0.4.7 (antialiased: true" in err
+    assert " ".join(err.split()).count("a .splat cannot hold") == 1

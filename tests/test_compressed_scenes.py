@@ -185,6 +185,36 @@ def test_a_half_turn_of_the_scene_is_a_half_turn_of_the_view():
     torch.testing.assert_close(sh_colour(half_turn_about_x(scene).sh, turned), sh_colour(scene.sh, directions))
 
 
+@pytest.mark.parametrize("name", WRITABLE)
+def test_no_format_is_written_with_what_it_cannot_hold(tmp_path: Path, expected, name):
+    if name == "spz":
+        pytest.importorskip("gsply")
+    path = tmp_path / f"a.{name}"
+    for column in expected.columns:
+        values = getattr(expected, column).clone()
+        values[2] = torch.nan
+        with pytest.raises(OutputError, match=r"the scene to write cannot be used: row 2 has NaN in"):
+            write_scene(path, replace(expected, **{column: values}))
+    if name == "splat":
+        with pytest.raises(OutputError, match="cannot hold a scene without Gaussians"):
+            write_scene(path, expected[:0])
+        assert not path.exists()
+    else:
+        write_scene(path, expected[:0])
+        assert len(read_scene(path).gaussians()) == 0
+    tracked = {name: column.double().requires_grad_() for name, column in expected.columns.items()}
+    write_scene(path, replace(expected, **tracked), overwrite=True)
+    assert len(read_scene(path).gaussians()) == len(expected)
+
+
+def test_a_splat_says_what_it_loses(tmp_path: Path, expected, caplog):
+    write_scene(tmp_path / "plain.splat", replace(expected, sh=expected.sh[:, :1], convention=CLASSIC))
+    assert not caplog.text
+    write_scene(tmp_path / "rich.splat", replace(expected, convention=MIP))
+    [record] = caplog.records
+    assert "cannot hold harmonics of degrees 1 to 3 and the record of its training (mip); a .ply can" in record.message
+
+
 def test_spz_is_written_in_the_axes_asked_for(tmp_path: Path, expected):
     pytest.importorskip("gsply")
     write_scene(tmp_path / "a.spz", expected, spz_axes="opencv")

@@ -1,9 +1,11 @@
 """Images come in as stored and go out rounded to the nearest code."""
 
 import os
+import re
 import struct
 import time
 import zlib
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -14,9 +16,9 @@ from PIL import Image
 
 import aaplug
 from aaplug.core.imaging import quantised
-from aaplug.io.images import image_size, read_image, read_rgba, write_png
+from aaplug.io.images import checked_image, image_size, read_image, read_rgba, write_png
 from aaplug.io.photographs import read_photo
-from aaplug.system.errors import FormatError
+from aaplug.system.errors import FormatError, UsageError
 from tests.conftest import memory_taken, needs_peak_memory
 
 WHITE, BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
@@ -24,6 +26,35 @@ WHITE, BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
 
 def random_image(height: int = 5, width: int = 7) -> torch.Tensor:
     return torch.rand(height, width, 3, generator=torch.Generator().manual_seed(0))
+
+
+NOT_IMAGES = {
+    "bytes": (torch.zeros(4, 4, 3, dtype=torch.uint8), {}, "torch.uint8 [4, 4, 3]"),
+    "numpy": (np.zeros((4, 4, 3), np.float32), {}, "not ndarray"),
+    "channels first": (torch.zeros(3, 4, 4), {}, "[3, 4, 4]"),
+    "flat": (torch.zeros(4, 4), {}, "[4, 4]"),
+    "empty": (torch.zeros(0, 4, 3), {}, "[0, 4, 3]"),
+    "NaN": (torch.full((4, 4, 3), torch.nan), {}, "NaN or infinite"),
+    "bit depth": (torch.zeros(4, 4, 3), {"bit_depth": 7}, "'7' is not one of 8, 16"),
+}
+
+
+@pytest.mark.parametrize("case", NOT_IMAGES)
+def test_what_is_no_image_is_not_written(tmp_path, case):
+    image, options, said = NOT_IMAGES[case]
+    write = (
+        partial(write_png, tmp_path / "image.png") if options else checked_image
+    )  # tests type-check `write_png` itself
+    with pytest.raises(UsageError, match=re.escape(said)):
+        write(image, **options)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("kind", [torch.float16, torch.float64])
+def test_any_floats_are_written_also_with_gradients(tmp_path, kind):
+    image = torch.full((2, 2, 3), 0.2, dtype=kind, requires_grad=True)
+    write_png(tmp_path / "image.png", image)
+    assert torch.equal(read_image(tmp_path / "image.png"), torch.full((2, 2, 3), 51 / 255))
 
 
 def save(path: Path, pixels: np.ndarray) -> Path:
@@ -190,7 +221,7 @@ BYTES = [("RGB", "PNG", 3 + RESULT), ("RGBA", "PNG", 4 + RESULT), ("RGB", "WEBP"
 BOMB = """
 from pathlib import Path
 from PIL import Image
-from aaplug.system.errors import FormatError
+from aaplug.system.errors import FormatError, UsageError
 from aaplug.io.images import read_image, read_rgba
 from tests.test_images_io import SHORT, SIDE, animated
 def attempt(path):

@@ -12,7 +12,7 @@ from aaplug.core.cameras import Camera
 from aaplug.core.colours import WHITE
 from aaplug.io.scenes import read_scene, write_scene
 from aaplug.rendering.renderer import Renderer
-from aaplug.system.errors import UsageError
+from aaplug.system.errors import FormatError, UsageError
 from tests.conftest import make_camera, make_scene
 
 EYES = [(0.3, -3.0, 0.4), (2.5, -1.0, -0.5), (-2.0, -2.0, 0.3)]
@@ -51,7 +51,7 @@ def scene_file(tmp_path):
 def dataset() -> dict[str, object]:
     return {
         "cameras": [theirs(make_camera(eye)) for eye in EYES],
-        "image_paths": [f"/data/train/r_{i}.png" for i in range(3)],
+        "image_paths": ["/data/r_0.png", "/elsewhere/r_0.png", "/elsewhere/r_0.png"],  # outside the root, and twice
         "image_paths_root": "/data",
         "metadata": {"background_color": np.array([255, 255, 255], np.uint8)},
     }
@@ -78,6 +78,14 @@ def test_images_are_the_renderers_also_from_a_checkpoint(method, scene_file, tmp
         stored = made.render(theirs(view))["color"]
         assert stored.dtype == np.uint8
         assert np.abs(stored / 255 - found["color"]).max() < 0.6 / 255
+
+
+@pytest.mark.parametrize("settings", ["{", "[]", "{}", '{"recipe": 3}', '{"recipe": "auto", "background": [0, 2, 0]}'])
+def test_settings_of_a_checkpoint_are_checked(method, scene_file, tmp_path, settings):
+    method.Aaplug(train_dataset=dataset(), config_overrides={"scene": str(scene_file)}).save(str(tmp_path / "made"))
+    (tmp_path / "made" / "aaplug.json").write_text(settings)
+    with pytest.raises(FormatError, match=r"aaplug\.json: "):
+        method.Aaplug(checkpoint=str(tmp_path / "made"))
 
 
 def test_what_is_missing_or_not_known_is_said(method, scene_file):

@@ -55,6 +55,14 @@ def test_the_same_frames_make_the_same_file(tmp_path, suffix):
     assert first == second
 
 
+@pytest.mark.parametrize("values", [[], [np.nan], [0, 1]])
+def test_what_is_no_film_is_refused(tmp_path, values):
+    frames = [torch.full((8, 8 + 4 * place, 3), float(value)) for place, value in enumerate(values)]
+    with pytest.raises(UsageError, match=r"^(frames|image): "):
+        write_video(tmp_path / "v.webm", frames, 25.0)
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_video_that_fails_leaves_nothing(tmp_path):
     def frames():
         yield torch.zeros(8, 8, 3)

@@ -23,6 +23,7 @@ from aaplug.core.rules import NEAR
 from aaplug.core.runs import runs_of, starts_of
 from aaplug.core.splats import Splats2D
 from aaplug.core.training import TrainingViews
+from aaplug.system.errors import UsageError
 
 FADE_OCTAVES = math.log2(4 / 3)  # of the sampling rate, over which a level fades into the next
 COARSENING_STEP = 1 / 4  # octaves between the coarser levels that are tried
@@ -74,6 +75,9 @@ class Pyramid:
     @classmethod
     def of(cls, levels: Sequence[Gaussians], chunks: Sequence[Int[Tensor, " _"]]) -> "Pyramid":
         """A pyramid of its levels, the finest first, at least one, and the chunk of each of their Gaussians."""
+        if not levels or [len(level) for level in levels] != [len(part) for part in chunks]:
+            counts = f"{len(levels)} levels and {len(chunks)} lists of chunks"
+            raise UsageError("levels", f"should be one or more, each with a chunk for each Gaussian; got {counts}")
         scene = joined([replace(level, origin=None, extras={}) for level in levels])
         return cls(scene, tuple(map(len, levels)), torch.cat(list(chunks)))
 

@@ -8,8 +8,6 @@ the data set's cameras, and saves both, with the recipe, as a checkpoint:
     aaplug.json       recipe, quality and background
 """
 
-import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -20,8 +18,11 @@ import torch
 from aaplug.core.cameras import Camera
 from aaplug.core.colours import BLACK
 from aaplug.core.imaging import levels
+from aaplug.evaluation.report.files import as_json, write_texts
+from aaplug.io.atomic import make_folder
 from aaplug.io.cameras import read_cameras
 from aaplug.io.scenes import read_scene, write_scene
+from aaplug.io.values import object_of, read_json, text
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import UsageError, not_one_of
 
@@ -60,6 +61,7 @@ class Aaplug:
 
         Raises:
             UsageError: something is missing, or not known.
+            FormatError: a file of the checkpoint is not what `save` writes.
         """
         overrides = dict(config_overrides or {})
         path = overrides.pop("scene", None)
@@ -68,7 +70,7 @@ class Aaplug:
         self.checkpoint = checkpoint
         if checkpoint is not None:
             folder = Path(checkpoint)
-            self.settings = json.loads((folder / SETTINGS).read_text()) | overrides
+            self.settings = _read_settings(folder / SETTINGS) | overrides
             self.scene, self.cameras = read_scene(folder / SCENE).gaussians(), read_cameras(folder / CAMERAS).all
         elif path is None or train_dataset is None:
             raise UsageError("--set scene", "name the file of the scene that was trained on this data set")
@@ -76,13 +78,9 @@ class Aaplug:
             colour = train_dataset["metadata"].get("background_color")
             background = BLACK if colour is None else [float(level) / LARGEST_LEVEL for level in colour]
             self.settings = DEFAULTS | overrides | {"background": background}
-            root, paths = (
-                train_dataset["image_paths_root"],
-                train_dataset["image_paths"],
-            )  # photographs name the cameras
-            pairs = zip(paths, train_dataset["cameras"], strict=True)
-            cameras = [_camera(camera, os.path.relpath(path, root)).as_trained() for path, camera in pairs]
-            self.scene, self.cameras = read_scene(path).gaussians(), cameras
+            cameras = enumerate(train_dataset["cameras"])  # photographs may lie anywhere, so numbers name them
+            self.cameras = [_camera(camera, f"view_{index:05}").as_trained() for index, camera in cameras]
+            self.scene = read_scene(path).gaussians()
         settings: dict[str, Any] = self.settings
         red, green, blue = settings["background"]
         recipe, quality = settings["recipe"], settings["quality"]
@@ -128,16 +126,23 @@ class Aaplug:
 
     def save(self, path: str) -> None:
         """Write the scene, its training cameras and the recipe into a folder."""
-        folder = Path(path)
-        folder.mkdir(parents=True, exist_ok=True)
+        folder = make_folder(path)
         write_scene(folder / SCENE, self.scene, overwrite=True)
         frames = []
         for c in self.cameras:
             pose = torch.linalg.inv(c.cam_from_world).numpy() @ OPENGL
             sizes = {"w": c.width, "h": c.height, "cx": c.cx, "cy": c.cy, "fl_x": c.fx, "fl_y": c.fy}
             frames.append({"file_path": c.name, **sizes, "transform_matrix": pose.tolist()})
-        (folder / CAMERAS).write_text(json.dumps({"frames": frames}))
-        (folder / SETTINGS).write_text(json.dumps(self.settings))
+        write_texts(folder, {CAMERAS: as_json({"frames": frames}), SETTINGS: as_json(self.settings)}, overwrite=True)
+
+
+def _read_settings(file: Path) -> dict[str, Any]:
+    """The settings of a checkpoint; raises FormatError if they are not what `save` writes."""
+    entry = object_of(read_json(file), file, "the settings", "recipe, quality and background", "background")
+    background = entry.vector("background", 3)
+    right = bool(((background >= 0) & (background <= 1)).all())
+    entry.place.expect(right, "background", "three numbers from 0 to 1", background.tolist())
+    return {name: entry.get(name, text) for name in DEFAULTS} | {"background": background.tolist()}
 
 
 def _camera(camera: Any, name: str) -> Camera:

@@ -14,11 +14,11 @@ import os
 import struct
 import tempfile
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
-from typing import IO, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -30,7 +30,7 @@ from torch import Tensor
 from aaplug.core.imaging import levels
 from aaplug.io.atomic import replacing
 from aaplug.io.limits import whole_limit
-from aaplug.system.errors import FormatError, listing
+from aaplug.system.errors import FormatError, UsageError, listing, not_one_of
 
 LOSSLESS_WEBP = 101  # OpenCV's quality for it
 SAMPLE_TYPES = {8: np.uint8, 16: np.uint16}  # by bit depth
@@ -89,7 +89,12 @@ def read_rgba(path: str | PathLike[str]) -> Float[Tensor, "h w 4"]:
 def write_png(
     path: str | PathLike[str], rgb: Float[Tensor, "h w 3"], bit_depth: int = 8, overwrite: bool = False
 ) -> None:
-    """Write colours, clamped to [0, 1], as a PNG; see `replacing`."""
+    """Write colours, clamped to [0, 1], as a PNG of 8 or 16 bits.
+
+    Raises:
+        OutputError: see `replacing`.
+        UsageError: it is no image of finite floats [height, width, 3], or there is no such bit depth.
+    """
     png = _encoded(".png", rgb, bit_depth=bit_depth)
     with replacing(path, overwrite) as stream:
         stream.write(png)
@@ -111,8 +116,22 @@ def encode_png(rgb: Float[Tensor, "h w c"]) -> bytes:
     return _encoded(".png", rgb, cv2.IMWRITE_PNG_COMPRESSION, 1)
 
 
+def checked_image(image: Any, channels: Sequence[int] = (3,)) -> Float[Tensor, "h w c"]:
+    """An image that can be stored, without gradients; raises UsageError for anything but finite floats [h, w, c]."""
+    got = f"{image.dtype} {list(image.shape)}" if isinstance(image, Tensor) else type(image).__name__
+    right = isinstance(image, Tensor) and image.is_floating_point() and image.ndim == 3 and image.numel() > 0
+    if not right or image.shape[2] not in channels:
+        raise UsageError("image", f"should be a tensor of floats from 0 to 1, [height, width, 3], not {got}")
+    if not image.isfinite().all():
+        raise UsageError("image", "has colours that are NaN or infinite")
+    return image.detach()
+
+
 def _encoded(suffix: str, rgb: Float[Tensor, "h w c"], *settings: int, bit_depth: int = 8) -> bytes:
     """Samples in OpenCV's BGR order, converted in bands of rows to keep the float copies small, as a file."""
+    if bit_depth not in SAMPLE_TYPES:
+        raise UsageError("bit_depth", not_one_of(bit_depth, map(str, SAMPLE_TYPES)))
+    rgb = checked_image(rgb, (1, 3))
     bands = (levels(rows, bit_depth).flip(2).cpu().numpy() for rows in rgb.split(ROWS_PER_BAND))
     samples = np.concatenate([band.astype(SAMPLE_TYPES[bit_depth]) for band in bands])
     success, file = cv2.imencode(suffix, samples, settings)

@@ -22,7 +22,7 @@ from aaplug.system.errors import FormatError, reason
 Value = TypeVar("Value")
 
 HEAD_LIMIT = 64 * 2**10  # bytes searched for keys when a format is guessed
-MAX_FOCAL = 1e9  # px: far above any real lens; what is computed from it stays finite
+MIN_FOCAL, MAX_FOCAL = 1e-6, 1e9  # px: far beyond any real lens; what is computed from them stays finite
 
 
 @dataclass(frozen=True)
@@ -105,15 +105,20 @@ def numbers(value: object, length: int, place: Place, field: str) -> list[float]
 def focal(value: object, place: Place, field: str) -> float:
     """`value` as a focal length, in px."""
     real = number(value, place, field)
-    place.expect(0 < real <= MAX_FOCAL, field, f"above 0 and at most {MAX_FOCAL:g} px", value)
+    place.expect(MIN_FOCAL <= real <= MAX_FOCAL, field, f"from {MIN_FOCAL:g} to {MAX_FOCAL:g} px", value)
     return real
+
+
+def whole(value: object, place: Place, field: str, most: int, unit: str = "") -> int:
+    """`value` as a whole number from 1 to `most`, in a unit."""
+    real = number(value, place, field)
+    place.expect(1 <= real <= most and real.is_integer(), field, f"a whole number{unit} from 1 to {most}", value)
+    return int(real)
 
 
 def pixels(value: object, place: Place, field: str) -> int:
     """`value` as the side of an image, in px."""
-    real, most = number(value, place, field), whole_limit("CAMERA_SIDE")
-    place.expect(1 <= real <= most and real.is_integer(), field, f"a whole number of px from 1 to {most}", value)
-    return int(real)
+    return whole(value, place, field, whole_limit("CAMERA_SIDE"), " of px")
 
 
 def text(value: object, place: Place, field: str) -> str:

@@ -17,6 +17,7 @@ from torch import Tensor
 from aaplug.core.imaging import levels
 from aaplug.io import MOST_FPS
 from aaplug.io.atomic import check_output, replacing_file
+from aaplug.io.images import checked_image
 from aaplug.system.errors import OutputError, UsageError
 
 if TYPE_CHECKING:
@@ -68,14 +69,19 @@ def _encode(path: Path, frames: Iterable[Float[Tensor, "h w 3"]], fps: float) ->
         with av.open(str(path), "w", options=BIT_EXACT) as container:
             stream = None
             for frame in frames:
-                pixels = levels(frame, 8).byte().cpu().numpy()
+                pixels = levels(checked_image(frame), 8).byte().cpu().numpy()
                 height, width, _ = pixels.shape
                 pixels = np.pad(pixels, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
-                stream = stream or _added_stream(container, path.suffix, pixels.shape[1], pixels.shape[0], fps)
+                height, width, _ = pixels.shape
+                stream = stream or _added_stream(container, path.suffix, width, height, fps)
+                if (stream.width, stream.height) != (width, height):
+                    size = f"{width}x{height} px after one of {stream.width}x{stream.height} px"
+                    raise UsageError("frames", f"should all have one size; one has {size}")
                 picture = av.VideoFrame.from_ndarray(pixels, format="rgb24")
                 container.mux(stream.encode(picture.reformat(format=PIXEL_FORMAT, **range_and_matrix)))
-            if stream is not None:
-                container.mux(stream.encode())
+            if stream is None:
+                raise UsageError("frames", "has none; a video needs one at least")
+            container.mux(stream.encode())
     except FFmpegError as error:
         raise OSError(error.errno, error.strerror) from error
 

@@ -4,7 +4,7 @@ A viewer adds a constant variance to every projected covariance, with or without
 """
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from aaplug.core.conventions import ANTIALIASED, CLASSIC, MIP, PLAYCANVAS, PLAYCANVAS_CLASSIC, Convention
 from aaplug.system.registry import Registry, named
@@ -12,6 +12,7 @@ from aaplug.system.registry import Registry, named
 if TYPE_CHECKING:
     from aaplug.core.gaussians import Gaussians
 
+SpzAxes = Literal["auto", "opengl", "opencv"]
 MOST_DEGREE = 4  # of spherical harmonics in any file
 
 
@@ -26,6 +27,8 @@ class Viewer:
     switched: anti-aliasing is off there until these settings turn it on.
     sh_degree: highest degree of the harmonics that it draws.
     cut: the end of a splat, in words.
+    formats: suffixes of the scene files that the program is known to open, of those that aaplug writes.
+    spz_axes: in which it takes the numbers of a .spz; "auto": those of the specification.
     """
 
     name: str
@@ -36,6 +39,8 @@ class Viewer:
     switched: bool = False
     sh_degree: int = MOST_DEGREE
     cut: str = "alpha < 1/255"
+    formats: tuple[str, ...] = ("ply",)
+    spz_axes: SpzAxes = "auto"
 
     def convention_of(self, scene: "Gaussians") -> Convention:
         """The convention that the file of a scene for this viewer declares."""
@@ -48,13 +53,20 @@ class Viewer:
             return f"recipe {self.recipe}"
         return f"{self.convention.kernel:g} px², {'' if self.convention.compensated else 'not '}compensated"
 
-    @property
-    def advice(self) -> str:
-        """One line on the settings to choose in the program for a scene that was converted for it."""
+    def advice(self, suffix: str = "ply") -> str:
+        """One line on the settings to choose in the program for a file that was converted for it."""
+        if suffix not in self.formats:
+            others = (v for v in VIEWERS.values() if suffix in v.formats and v.convention == self.convention)
+            known = " or ".join(f"{viewer.program} ({viewer.settings})" for viewer in others)
+            return f"open the .{suffix} in {known}" if known else f"no viewer of this rule is known to open a .{suffix}"
         if not self.switched:
             return f"in {self.program}, choose {self.settings}"
         without = "with it off, a converted scene can look worse than the original"
         return f"in {self.program}, turn anti-aliasing on: {self.settings} ({without})"
+
+    def axes(self, asked: SpzAxes) -> SpzAxes:
+        """Axes for a .spz: those asked for, or the program's own."""
+        return self.spz_axes if asked == "auto" else asked
 
     def shown(self, scene: "Gaussians") -> "Gaussians":
         """The scene with the harmonics that the program draws."""
@@ -67,7 +79,8 @@ MIP_VIEWER = Viewer("mip", "Mip-Splatting's viewers", "mip", MIP, "a kernel of 0
 
 
 def _spark(name: str, recipe: str, convention: Convention, settings: str) -> Viewer:
-    return Viewer(name, "Spark 2.2.0", recipe, convention, settings, sh_degree=3, cut="√8 σ")
+    how = {"sh_degree": 3, "cut": "√8 σ", "formats": ("ply", "spz", "splat"), "spz_axes": "opencv"}
+    return Viewer(name, "Spark 2.2.0", recipe, convention, settings, **how)
 
 
 def _playcanvas(name: str, program: str, switch: str, compensated: bool) -> Viewer:
@@ -78,9 +91,8 @@ def _playcanvas(name: str, program: str, switch: str, compensated: bool) -> View
 def _mkkellogg(name: str, recipe: str, convention: Convention, settings: str) -> Viewer:
     chosen = f"{settings}sphericalHarmonicsDegree: 2"
     cut = "√8 σ; widths bent by √max(0.1, ·)"
-    return Viewer(
-        name, "GaussianSplats3D 0.4.7", recipe, convention, chosen, convention.compensated, sh_degree=2, cut=cut
-    )
+    how = {"sh_degree": 2, "cut": cut, "formats": ("ply", "splat")}
+    return Viewer(name, "GaussianSplats3D 0.4.7", recipe, convention, chosen, convention.compensated, **how)
 
 
 def _gsplat(name: str, recipe: str, convention: Convention, settings: str) -> Viewer:

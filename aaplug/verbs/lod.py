@@ -1,8 +1,10 @@
 """Levels of detail: lighter scene files for lower sampling rates."""
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import count, takewhile
 from pathlib import Path
 
 import torch
@@ -15,7 +17,7 @@ from aaplug.core.gaussians import Gaussians, digest_of_scene
 from aaplug.core.sampling import check_frame
 from aaplug.finetuning.fitting import fit, steps_for
 from aaplug.finetuning.refining import refine
-from aaplug.io.atomic import refuse_existing
+from aaplug.io.atomic import refuse_existing, refuse_inputs
 from aaplug.io.scenes import SceneLike, check_scene_output, write_scene, written_format
 from aaplug.io.scenes.pyramid_folder import (
     MANIFEST,
@@ -39,7 +41,7 @@ from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.rendering.renderer import Renderer
 from aaplug.rendering.visibility import MAX_VIEWS, visibility
 from aaplug.system.digests import digest_of_values
-from aaplug.system.errors import FrameError, OutputError, UsageError
+from aaplug.system.errors import FormatError, FrameError, OutputError, UsageError
 from aaplug.verbs.verb import writes
 
 DEFAULT_LEVELS = 4  # down to 1/16 of the training size
@@ -66,8 +68,8 @@ def lod(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, options:
     """
     job = Job.of(scene, cameras, options)
     path = None if output is None else Path(output)
-    check = partial(_files, path, job.scene, options)
-    files = check()
+    check = partial(_outputs, path, job.scene, options)
+    files, stale = check()
     whole = fuse_stored(job.scene.gaussians())
     if not len(whole):
         raise UsageError(whole.name, "has no Gaussians to merge")
@@ -77,10 +79,14 @@ def lod(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, options:
     with running(options, path, check, job.inputs, folder=not options.single):
         maker = _Maker.of(whole, job)
         if not options.single:
-            return list(_levels(maker, path, files))
+            levels = list(_levels(maker, path, files))
+            for file in stale:
+                file.unlink(missing_ok=True)
+            return levels
         lighter = maker.finished(maker(Level(whole, 1.0), goals_of(options, whole)[0]))
         if path is not None:
-            write_scene(path, lighter.scene, overwrite=options.overwrite, spz_axes=options.spz_axes)
+            axes = maker.viewer.axes(options.spz_axes) if maker.viewer else options.spz_axes
+            write_scene(path, lighter.scene, overwrite=options.overwrite, spz_axes=axes)
         return [lighter]
 
 
@@ -179,15 +185,17 @@ def _levels(maker: _Maker, folder: Path | None, files: Sequence[Path]) -> Iterat
     options = maker.job.options
     levels: list[Level] = []
     pyramid = folder if options.viewer is None else None
-    manifest = Manifest(_source(maker) if pyramid else "", MAX_CHUNK_GAUSSIANS, ())
+    goals = goals_of(options, maker.scene)
+    manifest = Manifest(_source(maker) if pyramid else "", MAX_CHUNK_GAUSSIANS, len(goals) + 1, ())
     if pyramid and options.resume and is_pyramid(pyramid):
-        earlier = read_manifest(pyramid)
+        earlier = read_manifest(pyramid, unfinished=True)
         if earlier.source != manifest.source:
             raise UsageError("resume", f"{folder} holds levels of another scene, other cameras or other options")
-        manifest, levels = earlier, list(levels_in(pyramid, earlier))
+        levels = list(levels_in(pyramid, earlier))
+        manifest = replace(manifest, count=max(len(goals) + 1, len(levels)), levels=earlier.levels)
         maker.job.monitor.say(f"resumed: {len(levels) - 1} levels are there")
     levels = levels or [Level(maker.scene, 1.0, chunks_of(maker.scene.means, MAX_CHUNK_GAUSSIANS))]
-    goals, finest = goals_of(options, maker.scene), levels[0].chunks
+    finest = levels[0].chunks
     assert finest is not None
     chunk_count = int(finest.max()) + 1
     for place in range(len(goals) + 1):
@@ -213,17 +221,26 @@ def _source(maker: _Maker) -> str:
     return digest_of_values((MERGING_RULE, *facts, *choices))
 
 
-def _files(output: Path | None, scene: Scene, options: LodOptions) -> list[Path]:
-    """The files to write, checked before any work."""
+def _outputs(output: Path | None, scene: Scene, options: LodOptions) -> tuple[list[Path], list[Path]]:
+    """The files to write and an earlier run's to remove, checked before any work."""
     if output is None:
-        return []
+        return [], []
     if options.single:
         check_scene_output(output, options.overwrite, scene.files)
-        return [output]
+        return [output], []
     if written_format(output):
         raise OutputError(output, "levels go to a folder; for one scene, give `simplify` or `budget`")
     stem = scene.source.stem if scene.source else "scene"
     files = [output / f"{stem}_lod{level}.ply" for level in range((options.levels or DEFAULT_LEVELS) + 1)]
     others = [output / MANIFEST] if options.viewer is None else []
     refuse_existing([*files, *others], options.overwrite or options.resume)
-    return files
+    if not options.overwrite:
+        return files, []
+    stale = list(takewhile(Path.is_file, (output / f"{stem}_lod{level}.ply" for level in count(len(files)))))
+    if is_pyramid(output):
+        with suppress(FormatError):
+            stale += [output / level.file for level in read_manifest(output, unfinished=True).levels]
+        stale.append(output / MANIFEST)
+    stale = [file for file in stale if file not in (*files, *others)]
+    refuse_inputs(stale, scene.files)
+    return files, stale

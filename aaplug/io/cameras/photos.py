@@ -9,6 +9,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from aaplug.core.cameras import Camera, CameraSet, photographs
@@ -19,7 +20,7 @@ from aaplug.system.errors import FormatError, UsageError, listing
 CAMERA_FILE = re.compile(  # of any format
     r"(dataparser_)?transforms.*\.json|(cameras|metadata)\.json|cfg_args|poses_bounds\.npy|(cameras|images|points3D)\..*"
 )
-PHOTO_FOLDER = re.compile(r"train|test|val|images(_\d+)?")  # by the customs of data sets
+PHOTO_FOLDERS = (re.compile("train|test|val"), re.compile(r"images(_\d+)?"))  # that data sets have beside each other
 COMMON_SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")  # tried for names without a suffix
 SUFFIXES = (*COMMON_SUFFIXES, ".webp", ".tif", ".tiff", ".bmp", ".exr")  # of image files
 
@@ -86,10 +87,10 @@ def files_of(path: Path, cameras: CameraSet) -> tuple[Path, ...]:
     for folder in (home, home / "sparse", home / "sparse" / "0", home / "0"):
         files += [file for file in _listed(folder) if CAMERA_FILE.fullmatch(file.name)]
     photo_folders = {photo.parent for photo in photographs(cameras.all)}
-    for root in {folder.parent for folder in photo_folders if PHOTO_FOLDER.fullmatch(folder.name)}:
-        for folder in _listed(root):
-            if PHOTO_FOLDER.fullmatch(folder.name):
-                files += [file for file in _listed(folder) if file.suffix.lower() in SUFFIXES]
+    for folder, names in product(photo_folders, PHOTO_FOLDERS):
+        beside = _listed(folder.parent) if names.fullmatch(folder.name) else []
+        for each in filter(lambda path: names.fullmatch(path.name), beside):
+            files += [file for file in _listed(each) if file.suffix.lower() in SUFFIXES]
     return tuple(dict.fromkeys(files))
 
 

@@ -21,8 +21,8 @@ from aaplug.io import SpzAxes
 from aaplug.io.atomic import check_output
 from aaplug.io.scenes import compressed_ply, ksplat, ply, pt, sog, splat, spz
 from aaplug.io.scenes.options import SceneFileOptions
-from aaplug.io.scenes.pyramid_folder import is_pyramid, path_of, read_manifest, read_pyramid
-from aaplug.io.scenes.scene_file import MODEL_SCENE, SOG_FOLDER, Scene
+from aaplug.io.scenes.pyramid_folder import MANIFEST, is_pyramid, path_of, read_manifest, read_pyramid
+from aaplug.io.scenes.scene_file import MODEL_SCENE, SOG_FOLDER, Scene, described_faults, faults_of
 from aaplug.io.values import read_start
 from aaplug.system.errors import FormatError, OutputError, UsageError
 from aaplug.system.registry import Registry, named
@@ -106,7 +106,7 @@ def read_scene(
         FormatError: the file is missing, of no known format, or breaks its format.
     """
     options = SceneFileOptions(allow_checkpoint, spz_axes)
-    folder = Path(path) if is_pyramid(path) else None
+    folder, manifest = (Path(path), read_manifest(path)) if is_pyramid(path) else (None, None)
     path = find_scene(path, iteration)
     head = read_start(path, HEAD_BYTES)
     if not head:
@@ -117,9 +117,10 @@ def read_scene(
         known = ", ".join("." + format.name for format in formats)
         raise FormatError(path, f"is of no known scene format; aaplug reads {known}")
     scene = replace(format.open_scene(path, options), drop_bad=drop_bad)
-    if folder is not None:
-        notes = (*scene.notes, read_manifest(folder).described)
-        scene = replace(scene, folder=folder, read_levels=read_pyramid, notes=notes)
+    if folder is not None and manifest is not None:
+        others = (folder / MANIFEST, *(folder / level.file for level in manifest.levels[1:]))
+        notes = (*scene.notes, manifest.described)
+        scene = replace(scene, folder=folder, read_levels=read_pyramid, others=others, notes=notes)
     if convention is None:
         return replace(scene, other=scene.other and replace(scene.other, drop_bad=drop_bad))
     stated = {"convention": convention, "evidence": "stated by the user"}
@@ -156,7 +157,16 @@ def write_parts(
     inputs: files that are being read and may not be replaced.  Errors: see `write_scene`.
     """
     writer = check_scene_output(path, overwrite, inputs)
-    writer.write(Path(path), parts, count, overwrite, SceneFileOptions(spz_axes=spz_axes))
+    storable = (_storable(path, part) for part in parts)
+    writer.write(Path(path), storable, count, overwrite, SceneFileOptions(spz_axes=spz_axes))
+
+
+def _storable(path: str | PathLike[str], part: Gaussians) -> Gaussians:
+    """The part as float32 on the CPU; raises OutputError for values that no renderer can use."""
+    part = replace(part, **{name: column.detach().cpu().float() for name, column in part.columns.items()})
+    if faults := faults_of(part):
+        raise OutputError(path, f"the scene to write cannot be used: {described_faults(faults)}")
+    return part
 
 
 def written_format(path: str | PathLike[str]) -> WritableFormat | None:

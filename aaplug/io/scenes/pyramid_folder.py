@@ -1,19 +1,19 @@
 """Pyramids on disk: a folder of plain .ply files, NAME_lod0.ply to NAME_lodN.ply, and lod.json, which describes them.
 
-lod.json: {"aaplug_levels": 1, "source": hash, "largest": n, "levels": [{"file", "rate", "hash", "chunks"}]}.  source:
-of the scene, the cameras and the options that the levels were made of.  largest: see `core.chunks`.  rate: the lowest
-sampling rate relative to training's that a level is meant for.  chunks: how many Gaussians each chunk has; all levels
+lod.json: {"aaplug_levels": 2, "source": hash, "largest": n, "count": n, "levels": [{"file", "rate", "hash", "chunks"}]}
+source: of the scene, the cameras and the options that the levels were made of.  largest: see `core.chunks`.  count: of
+levels, once all are made; a pyramid that lists fewer is unfinished.  rate: the lowest sampling rate relative to
+training's that a level is meant for.  hash: SHA-256 of the file.  chunks: how many Gaussians each chunk has; all levels
 but the finest, which keeps the scene's order, lie chunk by chunk.
 """
 
 import hashlib
 import json
-import os
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from os import PathLike
 from pathlib import Path
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Int
@@ -25,14 +25,13 @@ from aaplug.core.pyramids import Pyramid
 from aaplug.io.atomic import replacing
 from aaplug.io.scenes import ply
 from aaplug.io.scenes.options import SceneFileOptions
-from aaplug.io.values import Entry, Place, entries, number, object_of, read_json, text
+from aaplug.io.values import entries, number, object_of, read_json, text, whole
 from aaplug.system.errors import FormatError
 
 MANIFEST = "lod.json"
 KEY = "aaplug_levels"
-VERSION = 1
-MOST = 1 << 40  # Gaussians of a chunk: more is nonsense
-ENDS = 1 << 16  # bytes at either end of a level's file that its hash covers, with its size
+VERSION = 2
+MAX_GAUSSIANS = 1 << 40  # of a chunk: more is nonsense
 
 
 @dataclass(frozen=True)
@@ -51,6 +50,7 @@ class Manifest:
 
     source: str
     largest: int
+    count: int
     levels: tuple[LevelFile, ...]
 
     @property
@@ -79,23 +79,33 @@ def pyramid_of(levels: Sequence[Level]) -> Pyramid:
 
 
 def is_pyramid(folder: str | PathLike[str]) -> bool:
-    """Whether a folder holds a pyramid."""
+    """True for a folder that holds a pyramid, finished or not."""
     return (Path(folder) / MANIFEST).is_file()
 
 
-def read_manifest(folder: str | PathLike[str]) -> Manifest:
-    """Read lod.json.
+def read_manifest(folder: str | PathLike[str], unfinished: bool = False) -> Manifest:
+    """Read lod.json; one that lists fewer levels than were asked for is refused unless `unfinished` allows it.
 
     Raises:
-        FormatError: it breaks its format or is of a newer version.
+        FormatError: it is unfinished, breaks its format or is of another version.
     """
     path = Path(folder) / MANIFEST
     about = object_of(read_json(path), path, "the pyramid", f"'{KEY}'", KEY)
     version = about.get(KEY, number)
     about.place.expect(version == VERSION, KEY, f"version {VERSION}", f"version {version:g}, of another aaplug")
-    items = [_level(entry) for entry in entries(path, "levels", about.fields.get("levels"))]
-    largest = int(about.get("largest", number))
-    return Manifest(about.get("source", text), largest, tuple(items))
+    levels = []
+    for entry in entries(path, "levels", about.fields.get("levels")):
+        file, rate, chunks = entry.get("file", text), entry.get("rate", number), entry.value("chunks")
+        entry.place.expect(file == Path(file).name, "file", "a name without folders", file)
+        entry.place.expect(0 < rate <= 1, "rate", "above 0 and at most 1", rate)
+        counts = isinstance(chunks, list) and all(type(n) is int and 0 <= n <= MAX_GAUSSIANS for n in chunks)
+        entry.place.expect(counts and bool(chunks), "chunks", "a list of counts", chunks)
+        levels.append(LevelFile(file, rate, entry.get("hash", text), tuple(chunks)))
+    largest, count = (whole(about.value(key), about.place, key, MAX_GAUSSIANS) for key in ("largest", "count"))
+    if len(levels) < count and not unfinished:
+        remedy = "`aaplug lod --resume` makes the others, `--overwrite` all of them again"
+        raise FormatError(path, f"lists {len(levels)} of {count} levels, as making them was interrupted; {remedy}")
+    return Manifest(about.get("source", text), largest, count, tuple(levels))
 
 
 def read_pyramid(folder: str | PathLike[str]) -> Pyramid:
@@ -113,40 +123,26 @@ def levels_in(folder: str | PathLike[str], manifest: Manifest) -> Iterator[Level
         path = path_of(Path(folder), entry)
         scene, sizes = ply.open_scene(path, SceneFileOptions()).gaussians(), torch.tensor(entry.chunks)
         problem = FormatError(path, f"does not have the chunks that {MANIFEST} lists")
-        if sizes.sum() != len(scene):  # before memory is taken for as many as it says
+        if sum(entry.chunks) != len(scene):  # before memory is taken for as many as it says
             raise problem
-        chunks = (
-            torch.arange(len(sizes)).repeat_interleave(sizes) if place else chunks_of(scene.means, manifest.largest)
-        )
+        chunks = torch.arange(len(sizes)).repeat_interleave(sizes)
+        if not place:
+            chunks = chunks_of(scene.means, manifest.largest)
         if not torch.equal(torch.bincount(chunks, minlength=len(sizes)), sizes):
             raise problem
         yield Level(scene, entry.rate, chunks)
 
 
 def write_manifest(folder: str | PathLike[str], manifest: Manifest) -> None:
-    """Write lod.json, replacing it.
-
-    Raises:
-        OutputError: it cannot be written.
-    """
-    content = {KEY: VERSION, **asdict(manifest)}
+    """Write lod.json, replacing it; raises OutputError if it cannot be written."""
     with replacing(Path(folder) / MANIFEST, overwrite=True) as stream:
-        stream.write(json.dumps(content).encode())
+        stream.write(json.dumps({KEY: VERSION, **asdict(manifest)}).encode())
 
 
 def hash_of(path: Path) -> str:
-    """Hash of a file's size and ends, in a time that does not depend on its size.
-
-    Raises:
-        OSError: it cannot be read.
-    """
-    size = path.stat().st_size
-    digest = hashlib.sha256(str(size).encode())
+    """SHA-256 of a file, in hex; raises OSError if it cannot be read."""
     with path.open("rb") as stream:
-        digest.update(stream.read(ENDS))
-        stream.seek(max(0, size - ENDS), os.SEEK_SET)
-        digest.update(stream.read(ENDS))
-    return digest.hexdigest()
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def path_of(folder: Path, level: LevelFile) -> Path:
@@ -161,18 +157,3 @@ def path_of(folder: Path, level: LevelFile) -> Path:
     if hash_of(path) != level.hash:
         raise FormatError(path, f"is not the level that {MANIFEST} names: it was changed, cut short or exchanged")
     return path
-
-
-def _level(entry: Entry) -> LevelFile:
-    file = entry.get("file", text)
-    entry.place.expect(file == Path(file).name, "file", "a name without folders", file)
-    chunks, rate = entry.get("chunks", _counts), entry.get("rate", number)
-    entry.place.expect(0 < rate <= 1, "rate", "above 0 and at most 1", rate)
-    return LevelFile(file, rate, entry.get("hash", text), chunks)
-
-
-def _counts(value: object, place: Place, field: str) -> tuple[int, ...]:
-    """`value` as counts."""
-    right = isinstance(value, list) and all(type(item) is int and 0 <= item < MOST for item in value)
-    place.expect(right and bool(value), field, "a list of counts", value)
-    return tuple(cast(list[int], value))

@@ -5,7 +5,7 @@ A format decodes rows; this module checks their values, reports unusable ones, a
 """
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -57,6 +57,7 @@ class Scene:
     notes: facts worth printing about how the file was understood, a line each.
     other: the same file read in another way, where it does not say which is right; its last note says how.
     folder: of the levels of detail whose finest this is; else None.  read_levels: reads all of them.
+    others: further files that hold it: other levels of detail, images of SOG.
     drop_bad: rows that cannot be used are left out, instead of raising FormatError.
     memory: what was read of it, by name: each part is read once.
     """
@@ -75,6 +76,7 @@ class Scene:
     other: "Scene | None" = None
     folder: Path | None = None
     read_levels: Callable[[Path], Pyramid] | None = None
+    others: tuple[Path, ...] = ()
     drop_bad: bool = False
     memory: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
 
@@ -125,12 +127,8 @@ class Scene:
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """Files that hold it, which no output replaces: of levels of detail or SOG images all in their folder."""
-        path = self.folder or self.source
-        if path is None:
-            return ()
-        folder = path.parent if path.name == SOG_FOLDER else path
-        return tuple(file for file in folder.iterdir() if file.is_file()) if folder.is_dir() else (path,)
+        """Files that hold it, which no output replaces."""
+        return () if self.source is None else (self.source, *self.others)
 
     @property
     def source(self) -> Path | None:
@@ -140,7 +138,7 @@ class Scene:
 
     @property
     def bytes(self) -> int | None:
-        """Size of the file; of levels of detail or SOG images, of their folder's files.  None if there is none."""
+        """Size of `files`; None if there is none."""
         try:
             return sum(file.stat().st_size for file in self.files) if self.files else None
         except OSError:
@@ -361,6 +359,15 @@ def faults_of(scene: Gaussians) -> dict[str, Bool[Tensor, " n"]]:
     return {text: rows for text, rows in faults.items() if rows.any()}
 
 
+def described_faults(faults: Mapping[str, Bool[Tensor, " n"]], start: int = 0) -> str:
+    """Faults in words, each with its first row, counted from `start`."""
+    words = []
+    for text, rows in faults.items():
+        first, *others = rows.nonzero()[:, 0].tolist()
+        words.append(f"row {start + first}{f' (and {len(others)} more)' if others else ''} has {text}")
+    return listing(words)
+
+
 def usable(scene: Gaussians) -> Gaussians:
     """The Gaussians that renderers can use."""
     faults = faults_of(scene)
@@ -395,9 +402,7 @@ def _check(part: Gaussians, path: Path, drop_bad: bool, dropped: dict[str, int])
         return None
     assert part.origin is not None
     if not drop_bad:
-        bad = {text: part.origin.rows[rows] for text, rows in faults.items()}
-        more = {text: f" (and {len(rows) - 1} more)" if len(rows) > 1 else "" for text, rows in bad.items()}
-        what = listing([f"row {int(rows[0])}{more[text]} has {text}" for text, rows in bad.items()])
+        what = described_faults(faults, int(part.origin.rows[0]))
         raise FormatError(path, f"{what}; pass `drop_bad` to leave such rows out")
     for text, rows in faults.items():
         dropped[text] = dropped.get(text, 0) + int(rows.sum())

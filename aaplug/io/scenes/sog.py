@@ -118,7 +118,9 @@ def _scene(path: Path, meta: Any, fetch: Fetch) -> Scene:
     degree = round((palette.shape[1] + 1) ** 0.5) - 1
     convention, evidence, flat = _meaning(meta)
     load, notes = partial(_rows, parts, palette, version, flat), (f"version {version}",)
-    return Scene(path, name, count, degree, load, evidence, convention, flat=flat, notes=notes)
+    files = [file for part in parts.values() for file in part.entry.value("files")] if path.name == META else []
+    others = tuple(path.parent / file for file in files)
+    return Scene(path, name, count, degree, load, evidence, convention, flat=flat, notes=notes, others=others)
 
 
 def _part(path: Path, root: Entry, key: str, count: int, fetch: Fetch) -> Part:

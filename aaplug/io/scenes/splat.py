@@ -4,6 +4,7 @@ Position and scales (float32, linear), colour and opacity (bytes), quaternion wx
 header, no harmonics above degree 0, and does not say how the scene was trained, so it is recognized by its suffix.
 """
 
+import logging
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -16,11 +17,13 @@ from aaplug.io.atomic import replacing
 from aaplug.io.scenes.options import SceneFileOptions
 from aaplug.io.scenes.packed import byte_opacities, floats
 from aaplug.io.scenes.scene_file import Scene, check_count, library_errors, read_rows, sh_of_colour
-from aaplug.system.errors import FormatError
+from aaplug.system.errors import FormatError, OutputError
 
 RECORD = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
 ZERO_BYTE = 128  # the byte that stands for a quaternion component of 0
 EVIDENCE = "the format does not say: assumed classic (3DGS default)"
+
+log = logging.getLogger("aaplug")
 
 name = "splat"
 needs = None
@@ -44,9 +47,17 @@ def open_scene(path: Path, options: SceneFileOptions) -> Scene:
 
 
 def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: SceneFileOptions) -> None:
-    """Write a scene part by part; harmonics above degree 0 and the convention are lost."""
+    """Write a scene part by part; harmonics above degree 0 and the convention are lost, as a warning says."""
     with replacing(path, overwrite) as stream:
-        stream.writelines(_records(part).tobytes() for part in parts)
+        for number, part in enumerate(parts):
+            lost = [f"harmonics of degrees 1 to {part.sh_degree}"] if part.sh_degree else []
+            if part.convention.compensated or part.fused:
+                lost.append(f"the record of its training ({part.convention.name})")
+            if lost and not number:
+                log.warning("%s: a .splat cannot hold %s; a .ply can", path, " and ".join(lost))
+            stream.write(_records(part).tobytes())
+        if not stream.tell():
+            raise OutputError(path, "cannot hold a scene without Gaussians; write a .ply")
 
 
 def _rows(path: Path, start: int, stop: int) -> Gaussians:
