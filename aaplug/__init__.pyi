@@ -4,7 +4,7 @@
 from .io.cameras import read_cameras as read_cameras
 from .io.images import read_image as read_image, write_png as write_png
 from .io.scenes import read_scene as read_scene, write_scene as write_scene
-from .io.scenes.scene_file import Scene as Scene
+from .io.scenes.scene import Scene as Scene
 
 # nouns
 from .core.cameras import Camera as Camera, CameraSet as CameraSet, look_at as look_at
@@ -69,6 +69,6 @@ from .core.splats import Splats2D as Splats2D
 from .io.atomic import replacing as replacing
 from .io.cameras.options import CameraFileOptions as CameraFileOptions
 from .io.scenes.options import SceneFileOptions as SceneFileOptions
-from .io.scenes.scene_file import check_count as check_count, library_errors as library_errors
-from .io.scenes.scene_file import logit_of as logit_of, sh_of_colour as sh_of_colour
+from .io.scenes.scene import check_count as check_count, library_errors as library_errors
+from .io.scenes.scene import logit_of as logit_of, sh_of_colour as sh_of_colour
 from .methods.pixel_kernels import raster_rows as raster_rows

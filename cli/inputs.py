@@ -18,7 +18,7 @@ from .console import TERMINAL, say
 from .words import Words, worded
 
 if TYPE_CHECKING:
-    from aaplug.io.scenes.scene_file import Scene
+    from aaplug.io.scenes.scene import Scene
 
 SCENE_FILE = Group("scene file", "How scene files are read.")
 CONVENTION_NAMES = tuple(CONVENTIONS)

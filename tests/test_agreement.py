@@ -16,7 +16,7 @@ from aaplug.io.images import write_png
 from aaplug.io.photographs import read_photo
 from aaplug.io.scenes import read_scene, write_scene
 from aaplug.io.scenes.packed import half_turn_about_x
-from aaplug.io.scenes.scene_file import Scene
+from aaplug.io.scenes.scene import Scene
 from aaplug.options.shared import Orbit, ViewOptions
 from aaplug.rendering.agreement import Agreement, agreement, settled
 from aaplug.rendering.assumed import cameras_around

@@ -21,7 +21,7 @@ from aaplug.io.cameras import read_cameras
 from aaplug.io.images import image_size
 from aaplug.io.scenes import read_scene, write_scene
 from aaplug.io.scenes.packed import half_turn_about_x
-from aaplug.io.scenes.scene_file import Scene
+from aaplug.io.scenes.scene import Scene
 from aaplug.system.executors import ProcessesIfLong
 from tests.conftest import make_scene
 from tests.test_cli import EYES, cli, dataset  # noqa: F401  (fixtures)

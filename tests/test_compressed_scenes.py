@@ -16,7 +16,7 @@ from aaplug.core.spherical_harmonics import sh_colour
 from aaplug.io.scenes import HEAD_BYTES, OWN, SCENE_FORMATS, WritableFormat, find_scene, ply, read_scene, write_scene
 from aaplug.io.scenes.options import SceneFileOptions
 from aaplug.io.scenes.packed import half_turn_about_x
-from aaplug.io.scenes.scene_file import Scene
+from aaplug.io.scenes.scene import Scene
 from aaplug.system.errors import FormatError, OutputError, UsageError
 from aaplug.system.registry import Registry, named
 from tests.conftest import SAMPLE

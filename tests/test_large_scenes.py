@@ -11,7 +11,7 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.io.images import read_image
 from aaplug.io.scenes import harmonics, read_scene, write_scene
 from aaplug.io.scenes.harmonics import without_harmonics
-from aaplug.io.scenes.scene_file import Scene
+from aaplug.io.scenes.scene import Scene
 from aaplug.rendering import renderer as rendering
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import FormatError

@@ -18,7 +18,7 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.core.projection import project
 from aaplug.evaluation.metrics import psnr
 from aaplug.io.scenes import read_scene
-from aaplug.io.scenes.scene_file import Scene
+from aaplug.io.scenes.scene import Scene
 from aaplug.levels.clusters import MAX_OPACITY, clusters_of, merge_pairs, rates_of
 from aaplug.levels.covariances import area, areas, covariances, pack, quats_of, unpack
 from aaplug.levels.merging import Goal, merge, merge_in_chunks

@@ -12,7 +12,7 @@ from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.sampling import check_frame, sampling_bounds
 from aaplug.evaluation.coverage import log_multiples, middle_log_scales
-from aaplug.io.scenes.scene_file import Scene, probes
+from aaplug.io.scenes.scene import Scene, probes
 from aaplug.system.monitor import Tell
 
 PROBE_ROWS = 64  # Gaussians read at each place of the file

@@ -12,7 +12,7 @@ from aaplug.core.cameras import Camera, CameraSet, spread
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.orbits import pinhole
 from aaplug.evaluation.protocols import median_depth
-from aaplug.io.scenes.scene_file import Scene
+from aaplug.io.scenes.scene import Scene
 from aaplug.live.messages import PictureRequest, Side
 from aaplug.live.overlays import OVERLAYS
 from aaplug.methods import QUALITIES, RECIPES

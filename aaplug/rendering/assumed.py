@@ -21,7 +21,7 @@ from aaplug.io.cameras.cfg_args import CAPPED, DIVISORS, NAME, WIDTH_CAP, read_c
 from aaplug.io.scenes import SceneLike, scene_of
 from aaplug.io.scenes.ply import Document
 from aaplug.io.scenes.ply_tags import NERFSTUDIO
-from aaplug.io.scenes.scene_file import Scene
+from aaplug.io.scenes.scene import Scene
 from aaplug.methods.filters.smoothing import NYQUIST_VARIANCE
 from aaplug.options.shared import DEFAULT_FOV, Orbit, size_of
 from aaplug.rendering.renderer import Renderer

@@ -34,7 +34,7 @@ from aaplug.core.training import TrainingViews
 from aaplug.io.cameras import read_cameras
 from aaplug.io.scenes import SceneLike, scene_of
 from aaplug.io.scenes.harmonics import without_harmonics
-from aaplug.io.scenes.scene_file import Scene
+from aaplug.io.scenes.scene import Scene
 from aaplug.methods.filters.smoothing import fuse_stored
 from aaplug.methods.recipe import RATE_TOLERANCE, Recipe
 from aaplug.methods.recipes import find_recipe, suited

@@ -19,7 +19,7 @@ from aaplug.evaluation.metrics import find_metrics
 from aaplug.evaluation.report.files import COMPARED, PAGE, write_comparison
 from aaplug.evaluation.truth import Truth
 from aaplug.io.scenes import scene_of
-from aaplug.io.scenes.scene_file import Scene, usable
+from aaplug.io.scenes.scene import Scene, usable
 from aaplug.methods import RECIPES
 from aaplug.methods.viewers import Viewer, find_viewer
 from aaplug.options.shared import AnyPath

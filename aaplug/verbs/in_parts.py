@@ -15,7 +15,7 @@ from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.sampling import SamplingBounds, sampling_bounds
 from aaplug.core.training import TrainingViews
-from aaplug.io.scenes.scene_file import PART, Scene
+from aaplug.io.scenes.scene import PART, Scene
 from aaplug.methods.conversion import Form, fuse
 from aaplug.system.executors import Threads
 from aaplug.system.monitor import Tell

@@ -10,7 +10,7 @@ from aaplug.evaluation.coverage import aliasing_begins
 from aaplug.evaluation.survey import Survey, check_frame_of, survey
 from aaplug.io.scenes import SceneLike, scene_of
 from aaplug.io.scenes.ply import Document
-from aaplug.io.scenes.scene_file import Scene
+from aaplug.io.scenes.scene import Scene
 from aaplug.methods.conversion import describe
 from aaplug.options.shared import FrameOptions, Orbit
 from aaplug.rendering.assumed import PROBE_ROWS, TRAINING_RATE, frame_around, rate_of

@@ -30,7 +30,7 @@ from aaplug.io.scenes.pyramid_folder import (
     read_manifest,
     write_manifest,
 )
-from aaplug.io.scenes.scene_file import FLOAT, Scene, matrix_of
+from aaplug.io.scenes.scene import FLOAT, Scene, matrix_of
 from aaplug.levels.clusters import rates_of
 from aaplug.levels.merging import Goal, merge, merge_in_chunks
 from aaplug.methods.filters.smoothing import fuse_stored

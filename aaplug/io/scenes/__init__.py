@@ -22,7 +22,7 @@ from aaplug.io.atomic import check_output
 from aaplug.io.scenes import compressed_ply, ksplat, ply, pt, sog, splat, spz
 from aaplug.io.scenes.options import SceneFileOptions
 from aaplug.io.scenes.pyramid_folder import MANIFEST, is_pyramid, path_of, read_manifest, read_pyramid
-from aaplug.io.scenes.scene_file import MODEL_SCENE, SOG_FOLDER, Scene, described_faults, faults_of
+from aaplug.io.scenes.scene import MODEL_SCENE, SOG_FOLDER, Scene, described_faults, faults_of
 from aaplug.io.values import read_start
 from aaplug.system.errors import FormatError, OutputError, UsageError
 from aaplug.system.registry import Registry, named

@@ -21,7 +21,7 @@ from aaplug.io.scenes.packed import byte_opacities, floats, largest_last
 from aaplug.io.scenes.ply_document import Table, stamp_of
 from aaplug.io.scenes.ply_header import LITTLE, Element, Header, check_size, is_packed, read_header
 from aaplug.io.scenes.ply_tags import meaning
-from aaplug.io.scenes.scene_file import DEGREES, Scene, check_count, library_errors, sh_of_colour
+from aaplug.io.scenes.scene import DEGREES, Scene, check_count, library_errors, sh_of_colour
 from aaplug.system.errors import FormatError
 
 WORDS = ("packed_position", "packed_rotation", "packed_scale", "packed_color")

@@ -16,7 +16,7 @@ import torch
 from aaplug.core.gaussians import Gaussians, joined
 from aaplug.io.scenes.options import SceneFileOptions
 from aaplug.io.scenes.packed import byte_opacities, floats
-from aaplug.io.scenes.scene_file import Scene, check_count, library_errors, sh_of_colour
+from aaplug.io.scenes.scene import Scene, check_count, library_errors, sh_of_colour
 from aaplug.io.scenes.splat import EVIDENCE
 from aaplug.system.errors import FormatError
 

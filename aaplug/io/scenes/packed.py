@@ -15,7 +15,7 @@ from torch import Tensor
 
 from aaplug.core.gaussians import Gaussians
 from aaplug.io.limits import limit
-from aaplug.io.scenes.scene_file import logit_of
+from aaplug.io.scenes.scene import logit_of
 from aaplug.system.errors import FormatError
 
 MAX_BYTE = 255

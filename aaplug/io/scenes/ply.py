@@ -23,7 +23,7 @@ from aaplug.io.scenes.options import SceneFileOptions
 from aaplug.io.scenes.ply_document import Document, document_of, stamp_of
 from aaplug.io.scenes.ply_header import LITTLE, Header, check_size, is_packed, parse, read_header
 from aaplug.io.scenes.ply_tags import meaning_in_run, stating
-from aaplug.io.scenes.scene_file import (
+from aaplug.io.scenes.scene import (
     DEGREES,
     FILTER_COLUMN,
     Scene,

@@ -20,7 +20,7 @@ from aaplug.core.conventions import CLASSIC
 from aaplug.core.gaussians import Gaussians
 from aaplug.io.limits import whole_limit
 from aaplug.io.scenes.options import SceneFileOptions
-from aaplug.io.scenes.scene_file import DEGREES, Scene, check_count, library_errors
+from aaplug.io.scenes.scene import DEGREES, Scene, check_count, library_errors
 from aaplug.io.scenes.training_config import gsplat_config
 from aaplug.system.errors import FormatError
 

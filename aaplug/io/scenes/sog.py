@@ -28,7 +28,7 @@ from aaplug.core.gaussians import MAX_LOG_SCALE, Gaussians
 from aaplug.io.limits import whole_limit
 from aaplug.io.scenes.options import SceneFileOptions
 from aaplug.io.scenes.packed import byte_opacities, check_growth, floats, largest_last
-from aaplug.io.scenes.scene_file import COMPENSATED, KERNEL_LOST, Scene, check_count, library_errors
+from aaplug.io.scenes.scene import COMPENSATED, KERNEL_LOST, Scene, check_count, library_errors
 from aaplug.io.values import Entry, number, object_of, parse_json, read_bounded
 from aaplug.system.errors import FormatError
 

@@ -16,7 +16,7 @@ from aaplug.core.spherical_harmonics import COLOUR_OFFSET, SH_C0
 from aaplug.io.atomic import replacing
 from aaplug.io.scenes.options import SceneFileOptions
 from aaplug.io.scenes.packed import byte_opacities, floats
-from aaplug.io.scenes.scene_file import Scene, check_count, library_errors, read_rows, sh_of_colour
+from aaplug.io.scenes.scene import Scene, check_count, library_errors, read_rows, sh_of_colour
 from aaplug.system.errors import FormatError, OutputError
 
 RECORD = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])

@@ -33,7 +33,7 @@ from aaplug.io.atomic import replacing
 from aaplug.io.limits import whole_limit
 from aaplug.io.scenes.options import SceneFileOptions
 from aaplug.io.scenes.packed import byte_opacities, check_growth, floats, half_turn_about_x, largest_last
-from aaplug.io.scenes.scene_file import COMPENSATED, KERNEL_LOST, Scene, check_count, library_errors
+from aaplug.io.scenes.scene import COMPENSATED, KERNEL_LOST, Scene, check_count, library_errors
 from aaplug.system.errors import FormatError, OutputError
 from aaplug.system.locks import scratch
 
