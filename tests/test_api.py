@@ -43,21 +43,6 @@ def test_a_renderer_applies_the_recipes_world_filter(cli, recipe):  # noqa: F811
     assert Path("two.png").read_bytes() == Path("one.png").read_bytes()
 
 
-def test_render_takes_paths_as_strings(cli):  # noqa: F811
-    (written,) = aaplug.render("scene.ply", ".", "out", scale=0.5)
-    assert (written.view.width, written.view.height) == (SIZE[0] / 2, SIZE[1] / 2)
-    assert cli("render scene.ply --cameras . -o again --scale 0.5")[0] == 0
-    assert written.file.read_bytes() == Path("again/r_0.png").read_bytes()
-
-
-def test_a_model_folder_brings_its_own_cameras(cli):  # noqa: F811
-    model = inria_model(Path("model"), "Namespace(white_background=True, resolution=2, images='images', eval=False)")
-    by_folder = aaplug.render(str(model), output="one", views="a")
-    scene = aaplug.read_scene(model / "point_cloud/iteration_30/point_cloud.ply").gaussians()
-    by_scene = aaplug.render(scene, output="two", views="a")
-    assert by_folder[0].file.read_bytes() == by_scene[0].file.read_bytes()
-
-
 def test_an_option_that_is_none_is_refused_with_the_nearest_name():
     with pytest.raises(UsageError, match="scal: is no option here; did you mean scale"):
         aaplug.render("scene.ply", scal=0.5)

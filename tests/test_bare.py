@@ -320,30 +320,6 @@ def test_python_takes_an_orbit_for_cameras(dataset, tmp_path):
 # mistakes
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        ("--up 0 0 0", "--up: takes a direction"),
-        ("--up nan 0 1", "--up: takes"),
-        ("--up 0 1", "--up: takes three numbers"),
-        ("--eye 1 2 inf", "--eye: takes"),
-        ("--eye 1 2 3 --look-at 1 2 3", "--eye: and the place to look at are the same"),
-        ("--eye 1 2 3 --orbit 4", "--eye: is a single place"),
-        ("--train-view 48", "--train-view: takes sizes"),
-        ("--train-view 99999x9", "--train-view: would be"),
-        ("--train-view 40x40 --train-rate 5", "--train-view: and --train-rate"),
-        ("--train-rate 1e8", "the limit is 16384 a side"),
-        ("--resolution 99999x10", "the limit is 16384 a side"),
-        ("--cameras . --orbit 4", "--orbit: is for scenes without cameras"),
-    ],
-)
-def test_mistakes_are_one_line(cli, words, said):
-    code, out, err = cli(f"render scene.ply -o new {words}")
-    assert (code, out) == (2, "")
-    assert said in err.splitlines()[-1]
-    assert not Path("new").exists()
-
-
 def test_a_scene_of_nothing_is_refused(cli):
     write_scene("empty.ply", make_scene(0))
     code, _, err = cli("render empty.ply -o new")

@@ -114,20 +114,6 @@ def test_convert_starts_from_the_original_where_the_closed_form_is_worse(cli, mo
     assert (found - original).abs().max() < 1
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ("--steps 3", "--steps: belongs to the fit to a viewer; name one with --for"),
-        ("--for gsplat --variance 0.1", "leave out --form, --variance"),
-    ],
-)
-def test_convert_refuses_options_that_do_not_fit(cli, options, words):
-    code, _, err = cli(f"{CONVERT} {options}")
-    assert code == 2
-    assert words in err
-    assert not Path("c.ply").exists()
-
-
 def test_what_was_tuned_converts_and_what_was_converted_does_not_again(cli):
     tuned = replace(read_scene(Path("scene.ply")).gaussians(), fused=(Fusion("finetune"),))
     write_scene(Path("tuned.ply"), tuned)

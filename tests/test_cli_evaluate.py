@@ -94,30 +94,7 @@ def test_help_shows_the_recipes_for_users_and_says_that_there_are_more(cli):  # 
     assert "matched-integral" not in text
 
 
-EVALUATE = "evaluate scene.ply --cameras . -o new"
-REFUSED = {
-    f"{EVALUATE} --recipe multi-scale": ["base_mask"],
-    f"{EVALUATE} --metric psnrr": ["--metric", "psnrr", "flip"],
-    f"{EVALUATE} --metric ssim:alex": ["--metric", "ssim:3dgs"],
-    "evaluate scene.ply --cameras . --report": ["--report", "--output"],
-    f"{EVALUATE} --resume --overwrite": ["contradict"],
-    f"{EVALUATE} --protocol blendr": ["--protocol", "blendr", "blender"],
-    f"{EVALUATE} --report --show r_9": ["--show", "r_9"],
-    "evaluate scene.ply --batch b.toml -o new": ["--batch", "scene.ply"],
-    "evaluate scene.ply scene.ply --cameras .": ["-o FOLDER", "several"],
-    f"{EVALUATE} --protocol fov --truth photographs": ["fov"],
-    f"{EVALUATE} --protocol blender --scale 0.3": ["1/2"],
-    f"{EVALUATE} --lpips a.pth b.pth": ["a.pth"],
-    f"{EVALUATE} --metric lpips:alex": ["--lpips"],
-}
-
-
-@pytest.mark.parametrize("words", REFUSED)
-def test_refusals_name_file_and_cause_and_write_nothing(cli, words):  # noqa: F811
-    assert_refused(cli, words, REFUSED[words])
-
-
 def test_an_unreadable_photograph_is_named(cli):  # noqa: F811
     photograph = Path("test/r_0.png")
     photograph.write_bytes(photograph.read_bytes()[: photograph.stat().st_size // 2])
-    assert_refused(cli, EVALUATE, ["r_0.png"])
+    assert_refused(cli, "evaluate scene.ply --cameras . -o new", ["r_0.png"])

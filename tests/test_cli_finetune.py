@@ -101,20 +101,3 @@ def test_a_run_killed_before_its_first_checkpoint_starts_anew(cli, whole):
     code, _, err = cli(f"{RUN} --resume")
     assert (code, "there is no checkpoint yet: starting at step 0" in err) == (0, True)
     assert Path("tuned.ply").read_bytes() == (whole / "tuned.ply").read_bytes()
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ("--method mipmap-gs --scale 0.5 0.25", "one model for one scale"),
-        ("--upsampler nearest", "expected bicubic, lanczos"),
-        ("--truth photographs", "has no photograph; --truth self"),
-        ("--move size", "--move: needs parameters out of means"),
-        ("--overwrite -o scene.ply", "is also the input"),
-    ],
-)
-def test_finetune_refuses_what_cannot_be(cli, options, words):
-    code, out, err = cli(f"finetune scene.ply --cameras . -o tuned.ply --rasterizer eager {options}")
-    assert (code, out) == (2, "")
-    assert words in err
-    assert not list(Path().glob("tuned*"))

@@ -253,20 +253,6 @@ def test_a_budget_is_kept(cli):
     assert 3800 < len(rows) <= 4000
 
 
-def test_levels_are_files_that_nest(cli):
-    code, out, err = cli("lod scene.ply --cameras . -o levels --levels 3 --no-refine --json")
-    assert code == 0, err
-    files = sorted(Path("levels").glob("*.ply"))
-    assert [file.name for file in files] == [f"scene_lod{k}.ply" for k in range(4)]
-    assert files[0].read_bytes() == Path("scene.ply").read_bytes()
-    scenes = [read_scene(file).gaussians() for file in files]
-    counts = [len(scene) for scene in scenes]
-    assert counts == sorted(counts, reverse=True)
-    assert [level["rate"] for level in json.loads(out)["levels"]] == [1.0, 0.5, 0.25, 0.125]
-    assert [f.settings["rate"] for f in scenes[3].fused] == ["0.5", "0.25", "0.125"]
-    assert "merge (rate=0.5" in cli("info levels/scene_lod1.ply")[1]
-
-
 def test_what_no_camera_sees_stays_when_all_else_is_too_faint():
     cameras = [make_camera(eye, (640, 480)) for eye in ((0.0, -4.0, 0.0), (3.0, -2.0, 1.0))]
     scene = replace(make_scene(4), log_scales=torch.full((4, 3), -7.0), logit_opacities=torch.full((4,), -2.0))
@@ -285,24 +271,6 @@ def test_a_level_may_have_no_gaussians(tmp_path, sample_cameras):
     assert (pyramid.sizes[0], pyramid.sizes[-1]) == (3, 0)
     renderer = aaplug.Renderer.of(pyramid, sample_cameras, quality="fast")
     assert renderer(sample_cameras.test[0].scaled(1 / 16)).alpha.max() == 0
-
-
-REFUSED = {
-    "-o x.ply --simplify 1000": "--simplify: asks for 1,000 Gaussians, and the scene has 150",
-    "-o x.ply --simplify 0.5 --levels 2": "--levels: cannot be combined with --simplify",
-    "-o x.ply": "x.ply: levels go to a folder; for one scene, give --simplify or --budget",
-    "-o x.obj --simplify 0.5": "has no suffix of a format that can be written",
-    "-o scene.ply --simplify 0.5 --overwrite": "is also the input",
-}
-
-
-@pytest.mark.parametrize(("words", "said"), REFUSED.items(), ids=REFUSED)
-def test_mistakes_are_one_line(cli, words, said):
-    before = sorted(Path().iterdir())
-    code, out, err = cli(f"lod scene.ply {words}")
-    assert (code, out) == (2, "")
-    assert said in err.splitlines()[-1]
-    assert sorted(Path().iterdir()) == before
 
 
 def test_what_cannot_be_merged_is_refused(tmp_path):

@@ -1,4 +1,4 @@
-"""Large scenes: what `balanced` draws of their levels, and how the bench splits a small scene into one."""
+"""Large scenes: what `balanced` draws of their levels."""
 
 from dataclasses import replace
 
@@ -11,11 +11,9 @@ from aaplug.core.training import TrainingViews
 from aaplug.evaluation.engine import Task, candidates_of, evaluate
 from aaplug.evaluation.results import mean
 from aaplug.evaluation.truth import Truth
-from aaplug.levels.covariances import covariances, outer
 from aaplug.methods.recipe import LevelChoice, Recipe
 from aaplug.methods.recipes import find_recipe
 from aaplug.rendering.renderer import Renderer, own_look
-from tests.bench.scenes import PARTS, split
 from tests.conftest import make_camera, make_scene
 
 VIEWS = tuple(make_camera(eye, (64, 48)) for eye in ((0.0, -4.0, 0.0), (3.0, -2.0, 1.0)))
@@ -84,13 +82,3 @@ def test_evaluation_tells_apart_recipes_that_draw_different_levels():
 
     assert figures(fine, coarse) == [*figures(fine), *figures(coarse)]
     assert figures(fine) != figures(coarse)
-
-
-def test_the_parts_of_a_gaussian_have_its_moments():
-    scene = make_scene(50)
-    parts = split(scene, CAMERAS)
-    assert len(parts) == 50 * PARTS
-    means = parts.means.reshape(50, PARTS, 3)
-    torch.testing.assert_close(means.mean(dim=1), scene.means, rtol=1e-5, atol=1e-5)
-    spread = outer((means - means.mean(dim=1, keepdim=True)).flatten(0, 1)) + covariances(parts)
-    torch.testing.assert_close(spread.reshape(50, PARTS, 6).mean(dim=1), covariances(scene), rtol=1e-3, atol=1e-5)

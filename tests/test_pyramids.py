@@ -261,7 +261,8 @@ def test_a_folder_of_levels_is_a_scene(cli, folder):
     whole, manifest = read_pyramid(folder), read_manifest(folder)
     assert [level.rate for level in manifest.levels] == [1.0, 0.5, 0.25]
     assert [sum(level.chunks) for level in manifest.levels] == list(whole.sizes)
-    assert torch.equal(whole.finest.means, read_scene("scene.ply").gaussians().means)
+    assert (folder / "scene_lod0.ply").read_bytes() == Path("scene.ply").read_bytes()
+    assert [f.settings["rate"] for f in read_scene(folder / "scene_lod2.ply").gaussians().fused[::2]] == ["0.5", "0.25"]
     for words in ("--scale 0.25", "--scale 0.25 --quality fast", "--scale 0.25 --quality best"):
         code, _, err = cli(f"render levels --cameras . -o images {words} --overwrite")
         assert code == 0, err

@@ -3,38 +3,31 @@
 For a trained scene it makes a pyramid, kept in a folder of the working directory, and draws sizes from 1/2 to 1/32 with
 and without levels: PSNR in dB, SSIM and flicker against the scene's own look, PSNR against photographs, median
 milliseconds, Gaussians projected and evaluations of a splat in a pixel.  Then come all levels in one scene by
-Multi-Scale 3DGS' rule, and lighter scenes beside splat-transform's `--decimate`.  For a scene of a million it has what
-levels lose by the own look and what they save of the time, merged alone and tuned.  For `cost` it has time against
-Gaussians and pixels on synthetic scenes.
+Multi-Scale 3DGS' rule, and lighter scenes beside splat-transform's `--decimate`.
 """
 
 import statistics
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import replace
-from functools import partial
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import torch
 
-from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.pyramids import Pyramid
 from aaplug.evaluation.metrics import PSNR
 from aaplug.evaluation.results import Report, mean
 from aaplug.evaluation.truth import Truth, ViewTruth
-from aaplug.io.scenes.pyramid_folder import pyramid_of, read_pyramid
+from aaplug.io.scenes.pyramid_folder import read_pyramid
 from aaplug.lab.multi_scale import in_one_scene
-from aaplug.rendering.benchmark import exponent, synthetic_camera
 from aaplug.rendering.renderer import Renderer
 from aaplug.verbs.evaluate import evaluate
 from aaplug.verbs.lod import lod
 from tests.bench import heading, row
-from tests.bench.scenes import MILLIONS, SYNTHETIC_SIDE, Trained, decibels, noise, trained
+from tests.bench.scenes import Trained, decibels, trained
 
 TEST_VIEWS = 5
 SCALES = (1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 32)
-BETWEEN_SCALES = (0.24, 1 / 5, 1 / 6, 1 / 7, 0.11, 1 / 10, 0.07)  # where samples lie closer than half of training's
 LEVELS = 5
 SHARES = {1 / 4: (1 / 4, 1 / 8), 1 / 16: (1 / 8,)}  # of the Gaussians, and the scales that lighter scenes are tuned for
 RULES = ("matched", "classic")  # that lighter scenes are shown by
@@ -46,24 +39,15 @@ DECIMATED = {  # at 1/2, 1/4 and 1/8 by each of these, with @playcanvas/splat-tr
     ("snowmiku", 1 / 16): (25.93, 26.17, 26.68, 25.96, 26.24, 26.31),
 }
 METRICS = ("psnr", "ssim", "flicker")
-REPEATS = 5
-COST_GAUSSIANS = (100_000, 1_000_000, 3_000_000)
-COST_SIZES = ((100, 75), (400, 300), (800, 600), (1600, 1200))
-MERGE_BELOW = 0.5  # px: levels of the synthetic scenes are merged to be fast
 
 
-def main(scenes: Sequence[str] = ("chair", "snowmiku", *MILLIONS, "cost")) -> None:
+def main(scenes: Sequence[str] = ("chair", "snowmiku")) -> None:
     """Print the tables of these scenes."""
     for name in scenes:
-        if name == "cost":
-            cost()
-        elif name in MILLIONS:
-            million(Bench(name, MILLIONS[name]()))
-        else:
-            bench = Bench(name, trained(name))
-            levels(bench)
-            in_one(bench)
-            lighter(bench)
+        bench = Bench(name, trained(name))
+        levels(bench)
+        in_one(bench)
+        lighter(bench)
 
 
 class Bench:
@@ -109,19 +93,6 @@ class Bench:
         """PSNR by the own look at a scale, mean of the views."""
         truths = [(truth.view.scaled(scale), truth.compared(scale)) for truth in self.own_looks]
         return statistics.mean(decibels(renderer(view).rgb, wanted) for view, wanted in truths if wanted is not None)
-
-
-@torch.no_grad()
-def milliseconds(*draws: Callable[[], object], clock: Callable[[], float] = time.perf_counter) -> list[float]:
-    """Medians of several runs in turn, after one of each that does not count; clock: in seconds."""
-    times: list[list[float]] = []
-    for _ in range(1 + REPEATS):
-        times.append([])
-        for draw in draws:
-            started = clock()
-            draw()
-            times[-1].append(1e3 * (clock() - started))
-    return [statistics.median(column) for column in zip(*times[1:], strict=True)]
 
 
 def lighter(bench: Bench) -> None:
@@ -174,44 +145,3 @@ def levels(bench: Bench) -> None:
                 figures = [metric.text(mean(views, metric.name)) for metric in own.metrics]
                 count = f"{bench.projected(renderer, scale):,}"
                 row(f"{name}, {quality}", f"1/{1 / scale:g}", *figures, real, ms, count, evaluations)
-
-
-def million(bench: Bench) -> None:
-    """Levels that are merged alone and tuned ones against a scene of so many Gaussians that these decide the time."""
-    folders = {"merged": f"{bench.name}-merged", "tuned": f"{bench.name}-lod"}
-    pyramids = {kind: bench.pyramid(folder, refine=kind == "tuned") for kind, folder in folders.items()}
-    columns = ("own look", "ms of processor", "of the scene's", "Gaussians in view", "samples along a pixel")
-    heading(f"{bench.name}, {len(bench.scene):,} Gaussians", "", "size", *columns)
-    for quality in ("fast", "balanced"):
-        renderers = {"the scene": bench.renderer(bench.scene, "auto", quality)}
-        renderers |= {f"levels, {kind}": bench.renderer(each, "auto", quality) for kind, each in pyramids.items()}
-        for scale in (*SCALES[1:], *BETWEEN_SCALES):
-            view = bench.views[0].scaled(scale)
-            times = milliseconds(*(partial(draw, view) for draw in renderers.values()), clock=time.process_time)
-            for (name, renderer), took in zip(renderers.items(), times, strict=True):
-                figures = bench.psnr(renderer, scale), round(took), took / times[0]
-                count = f"{bench.projected(renderer, scale):,}"
-                row(f"{name}, {quality}", f"1/{1 / scale:g}", *figures, count, renderer.samples(view))
-
-
-def cost() -> None:
-    """Time of a frame against Gaussians and pixels, by levels that are merged alone."""
-    camera: Camera = synthetic_camera(SYNTHETIC_SIDE, SYNTHETIC_SIDE).as_trained()
-    heading("cost", "Gaussians", "levels", "s", "size", "levels, ms", "Gaussians projected", "without, ms")
-    times: dict[tuple[int, int], list[float]] = {size: [] for size in COST_SIZES}
-    for count in COST_GAUSSIANS:
-        scene = noise(count)
-        started = time.perf_counter()
-        pyramid = pyramid_of(lod(scene.scene, scene.cameras, levels=LEVELS, refine=False, merge_below=MERGE_BELOW))
-        seconds = time.perf_counter() - started
-        with_levels = Renderer.of(pyramid, scene.cameras, "auto", quality="fast")
-        without = Renderer.of(scene.scene, scene.cameras, "matched")
-        for width, height in COST_SIZES:
-            view = replace(camera.resized(width, width), height=height, cy=height / 2)
-            took = milliseconds(partial(with_levels, view), partial(without, view))
-            times[width, height].append(took[0])
-            assert with_levels.cutter is not None
-            projected, sizes = with_levels.cutter.count(view), ", ".join(f"{size:,}" for size in pyramid.sizes[1:])
-            row(f"{count:,}", sizes, round(seconds), f"{width}x{height}", took[0], f"{projected:,}", took[1])
-    for (width, height), own in times.items():
-        print(f"exponent of the Gaussians at {width}x{height}: {exponent(list(map(float, COST_GAUSSIANS)), own):.2f}")
