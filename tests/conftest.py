@@ -3,7 +3,10 @@
 `shared_data` is a folder of real scenes that may lie beside the repository; tests that use it skip where it is absent.
 """
 
+import json
 import logging
+import math
+import shutil
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -12,8 +15,10 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from aaplug_cli.main import main
 
 from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.gaussians import Gaussians
@@ -24,11 +29,13 @@ from aaplug.evaluation.laws.base import make_camera as make_camera
 from aaplug.evaluation.laws.base import make_scene as make_scene
 from aaplug.evaluation.laws.base import make_splats as make_splats
 from aaplug.io.cameras import read_cameras
-from aaplug.io.scenes import read_scene
+from aaplug.io.images import write_png
+from aaplug.io.scenes import read_scene, write_scene
 from aaplug.lab.pixel_size import PixelSizes
 from aaplug.rasterizers import RASTERIZERS
 from aaplug.rasterizers.tiled import Tiled
 from aaplug.rasterizers.tiled.ahead_of_time import load
+from aaplug.rendering.renderer import Renderer
 
 COMPILED = load()
 ALL_RASTERIZERS: dict[str, Rasterizer] = {**RASTERIZERS, **({} if COMPILED is None else {"compiled": Tiled(COMPILED)})}
@@ -37,6 +44,8 @@ ROOT = Path(__file__).resolve().parents[1]
 SHARED_DATA = ROOT.parent / "shared" / "data"
 SAMPLE = Path(str(files("aaplug.io.sample")))
 CLEAR_REFS = Path("/proc/self/clear_refs")
+EYES = {"train": [(0.0, -4.0, 0.0), (2.0, -3.5, 1.0), (-3.0, -3.0, 0.5)], "test": [(1.0, -4.0, 0.0)]}
+SIZE = (64, 48)  # px
 needs_peak_memory = pytest.mark.skipif(not CLEAR_REFS.exists(), reason="peak memory of a process is read from /proc")
 
 
@@ -83,6 +92,71 @@ def sample_cameras() -> CameraSet:
 @pytest.fixture(scope="session")
 def sample_training(sample_scene: Gaussians, sample_cameras: CameraSet) -> TrainingViews:
     return TrainingViews.of(sample_scene, sample_cameras)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory) -> Path:
+    """A folder with scene.ply, three training cameras and a test camera with its photograph."""
+    return make_dataset(tmp_path_factory.mktemp("dataset"))
+
+
+def make_dataset(folder: Path) -> Path:
+    """A scene, training cameras, and a test camera with its photograph."""
+    write_scene(folder / "scene.ply", make_scene(150))
+    for split, eyes in EYES.items():
+        write_transforms(folder, split, eyes)
+    (folder / "test").mkdir()
+    write_png(folder / "test" / "r_0.png", torch.zeros(SIZE[1], SIZE[0], 3))
+    cameras = read_cameras(folder)
+    scene = read_scene(folder / "scene.ply").gaussians()
+    image = Renderer.of(scene, cameras, "classic", rasterizer="eager")(cameras.test[0]).rgb
+    write_png(folder / "test" / "r_0.png", image, overwrite=True)
+    return folder
+
+
+@pytest.fixture
+def cli(dataset, tmp_path, monkeypatch, capsys):
+    """Run the program in a fresh folder holding a copy of the data set; gives (exit code, stdout, stderr)."""
+    shutil.copytree(dataset, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+
+    def run(words: str) -> tuple[int, str, str]:
+        with pytest.raises(SystemExit) as stop:
+            main(words.split())
+        printed = capsys.readouterr()
+        return int(stop.value.code or 0), printed.out, printed.err
+
+    return run
+
+
+def write_transforms(folder: Path, split: str, eyes: list[tuple[float, float, float]]) -> None:
+    cameras = [make_camera(eye, SIZE) for eye in eyes]
+    flip = np.diag([1.0, -1.0, -1.0, 1.0])  # Blender looks along −z with y up
+    frames = [
+        {"file_path": f"./{split}/r_{i}", "transform_matrix": (np.linalg.inv(c.cam_from_world.numpy()) @ flip).tolist()}
+        for i, c in enumerate(cameras)
+    ]  # fmt: skip
+    angle = 2 * math.atan(0.5 * SIZE[0] / cameras[0].fx)
+    data = {"camera_angle_x": angle, "w": SIZE[0], "h": SIZE[1], "frames": frames}
+    (folder / f"transforms_{split}.json").write_text(json.dumps(data))
+
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+FLAGS = [
+    "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
+    "--disable-component-update", "--disable-sync",
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def browser():
+    api = pytest.importorskip("playwright.sync_api")
+    if CHROMIUM is None:
+        pytest.skip("there is no Chromium")
+    with api.sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        yield chromium
+        chromium.close()
 
 
 MEASURE = """

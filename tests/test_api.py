@@ -12,12 +12,11 @@ from aaplug_cli.verbs import VERBS
 import aaplug
 from aaplug.system.errors import UsageError
 from tests.conftest import SAMPLE
-from tests.test_cli import EYES, SIZE, cli, dataset, inria_model  # noqa: F401  (fixtures)
 
 README = Path(__file__).parents[1] / "README.md"
 
 
-def test_python_in_the_readme_gives_the_command_lines_image(cli):  # noqa: F811
+def test_python_in_the_readme_gives_the_command_lines_image(cli):
     Path("scene.ply").unlink()
     Path("scene.ply").symlink_to(SAMPLE / "chair.ply")
     Path("path/to").mkdir(parents=True)
@@ -34,7 +33,7 @@ def test_python_in_the_readme_gives_the_command_lines_image(cli):  # noqa: F811
 
 
 @pytest.mark.parametrize("recipe", ["mip-splatting", "matched"])
-def test_a_renderer_applies_the_recipes_world_filter(cli, recipe):  # noqa: F811
+def test_a_renderer_applies_the_recipes_world_filter(cli, recipe):
     scene, cameras = aaplug.read_scene("scene.ply").gaussians(), aaplug.read_cameras(".")
     image = aaplug.Renderer.of(scene, cameras, recipe)(cameras.test[0].scaled(0.5)).rgb
     words = f"render scene.ply --cameras . -o one.png --scale 0.5 --recipe {recipe}"

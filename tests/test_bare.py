@@ -1,4 +1,3 @@
-# ruff: noqa: F811 (fixtures come from another file)
 """A scene without cameras: where it is looked at from, what is assumed about its training, and every verb."""
 
 import json
@@ -30,7 +29,6 @@ from aaplug.rendering.job import Job
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import UsageError
 from tests.conftest import make_scene
-from tests.test_cli import cli, dataset  # noqa: F401 (fixtures)
 
 UP = (0.0, 0.0, 1.0)
 SMALL = "--train-view 48x36"

@@ -13,7 +13,6 @@ from aaplug.io.atomic import claimed
 from aaplug.io.batch_file import read_batch
 from aaplug.system.errors import ClusterError, FormatError
 from aaplug.verbs.batch import batch as evaluate_all
-from tests.test_cli import cli, dataset  # noqa: F401  (fixtures)
 
 SETTINGS = """
 output = "out"
@@ -35,7 +34,7 @@ recipe = ["classic"]
 
 
 @pytest.fixture
-def batch(cli):  # noqa: F811
+def batch(cli):
     """The program, in a folder that holds batch.toml, a whole scene and a broken one."""
     data = Path("scene.ply").read_bytes()
     Path("broken.ply").write_bytes(data[:-100])

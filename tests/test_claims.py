@@ -10,7 +10,6 @@ import pytest
 
 from aaplug.io import atomic
 from aaplug.io.atomic import claimed
-from tests.test_cli import cli, dataset  # noqa: F401  (fixtures)
 
 SCENE = "scene.ply --cameras . --rasterizer eager"
 OUTPUTS = {  # verb, words, what is claimed, what a rival writes there
@@ -28,7 +27,7 @@ OUTPUTS = {  # verb, words, what is claimed, what a rival writes there
 
 
 @pytest.fixture
-def job(cli):  # noqa: F811
+def job(cli):
     """Run a verb; gives exit code and error."""
     Path("scenes.toml").write_text('[[scene]]\nscene = "scene.ply"\n')
 

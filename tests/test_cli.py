@@ -1,8 +1,6 @@
 """The command line as its users meet it: words, files, exit codes, one-line errors that leave nothing behind."""
 
 import json
-import math
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -11,65 +9,11 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from aaplug_cli.main import main
 from plyfile import PlyData
 
-from aaplug.io.cameras import read_cameras
-from aaplug.io.images import image_size, write_png
+from aaplug.io.images import image_size
 from aaplug.io.scenes import read_scene, write_scene
-from aaplug.rendering.renderer import Renderer
-from tests.conftest import make_camera, make_scene
-
-EYES = {"train": [(0.0, -4.0, 0.0), (2.0, -3.5, 1.0), (-3.0, -3.0, 0.5)], "test": [(1.0, -4.0, 0.0)]}
-SIZE = (64, 48)
-
-
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory) -> Path:
-    """A folder with scene.ply, three training cameras and a test camera with its photograph."""
-    return make_dataset(tmp_path_factory.mktemp("dataset"))
-
-
-def make_dataset(folder: Path) -> Path:
-    """A scene, training cameras, and a test camera with its photograph."""
-    write_scene(folder / "scene.ply", make_scene(150))
-    for split, eyes in EYES.items():
-        write_transforms(folder, split, eyes)
-    (folder / "test").mkdir()
-    write_png(folder / "test" / "r_0.png", torch.zeros(SIZE[1], SIZE[0], 3))
-    cameras = read_cameras(folder)
-    scene = read_scene(folder / "scene.ply").gaussians()
-    image = Renderer.of(scene, cameras, "classic", rasterizer="eager")(cameras.test[0]).rgb
-    write_png(folder / "test" / "r_0.png", image, overwrite=True)
-    return folder
-
-
-@pytest.fixture
-def cli(dataset, tmp_path, monkeypatch, capsys):
-    """Run the program in a fresh folder holding a copy of the data set; gives (exit code, stdout, stderr)."""
-    shutil.copytree(dataset, tmp_path, dirs_exist_ok=True)
-    monkeypatch.chdir(tmp_path)
-
-    def run(words: str) -> tuple[int, str, str]:
-        with pytest.raises(SystemExit) as stop:
-            main(words.split())
-        printed = capsys.readouterr()
-        return int(stop.value.code or 0), printed.out, printed.err
-
-    return run
-
-
-def write_transforms(folder: Path, split: str, eyes: list[tuple[float, float, float]]) -> None:
-    cameras = [make_camera(eye, SIZE) for eye in eyes]
-    flip = np.diag([1.0, -1.0, -1.0, 1.0])  # Blender looks along −z with y up
-    frames = [
-        {"file_path": f"./{split}/r_{i}", "transform_matrix": (np.linalg.inv(c.cam_from_world.numpy()) @ flip).tolist()}
-        for i, c in enumerate(cameras)
-    ]  # fmt: skip
-    angle = 2 * math.atan(0.5 * SIZE[0] / cameras[0].fx)
-    data = {"camera_angle_x": angle, "w": SIZE[0], "h": SIZE[1], "frames": frames}
-    (folder / f"transforms_{split}.json").write_text(json.dumps(data))
-
+from tests.conftest import EYES, SIZE, make_camera, make_scene
 
 # what works
 

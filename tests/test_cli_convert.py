@@ -1,4 +1,3 @@
-# ruff: noqa: F811 (fixtures come from another file)
 """Converting from the command line: files, tags, what is left for a viewer."""
 
 import json
@@ -12,7 +11,6 @@ from aaplug.core.conventions import MIP, PLAYCANVAS
 from aaplug.core.gaussians import Fusion
 from aaplug.io.scenes import read_scene, write_scene
 from tests.conftest import make_scene
-from tests.test_cli import cli, dataset  # noqa: F401 (fixtures)
 
 CONVERT = "convert scene.ply --cameras . -o c.ply"
 

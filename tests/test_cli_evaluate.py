@@ -11,10 +11,10 @@ from aaplug.io.images import image_size
 from aaplug.io.scenes import read_scene
 from aaplug.methods import RECIPES
 from aaplug.verbs.evaluate import evaluate
-from tests.test_cli import assert_refused, cli, dataset  # noqa: F401  (fixtures)
+from tests.test_cli import assert_refused
 
 
-def test_it_writes_results_and_prints_a_table(cli):  # noqa: F811
+def test_it_writes_results_and_prints_a_table(cli):
     words = "evaluate scene.ply --cameras . -o out --recipe classic auto --scale 1 0.5"
     code, out, _ = cli(words)
     assert code == 0
@@ -29,7 +29,7 @@ def test_it_writes_results_and_prints_a_table(cli):  # noqa: F811
     assert list(json.loads(Path("out/per_view.json").read_text())["classic@0.5"]["SSIM"]) == ["r_0"]
 
 
-def test_the_library_gives_what_the_command_line_gives(cli):  # noqa: F811
+def test_the_library_gives_what_the_command_line_gives(cli):
     own = evaluate("scene.ply", ".", recipe=["mip"], scale=[0.5], rasterizer="eager")
     words = "evaluate scene.ply --cameras . --recipe mip --scale 0.5 --rasterizer eager -o out"
     assert cli(words)[0] == 0
@@ -39,7 +39,7 @@ def test_the_library_gives_what_the_command_line_gives(cli):  # noqa: F811
 
 
 @pytest.mark.parametrize("several", ["--recipe mip,auto --scale 1,0.5", "--scale=1,0.5 --recipe=mip,auto,"])
-def test_commas_part_values_as_spaces_do(cli, several):  # noqa: F811
+def test_commas_part_values_as_spaces_do(cli, several):
     code, out, _ = cli(f"evaluate scene.ply --cameras . {several} -o a,b --json")
     assert code == 0
     methods = {name for name in json.loads(out) if "@" in name and " " not in name}
@@ -47,7 +47,7 @@ def test_commas_part_values_as_spaces_do(cli, several):  # noqa: F811
     assert Path("a,b/results.json").is_file()
 
 
-def test_without_photographs_it_takes_the_scenes_own_look(cli):  # noqa: F811
+def test_without_photographs_it_takes_the_scenes_own_look(cli):
     words = "evaluate scene.ply --cameras . --views train --scale 0.5 --recipe mip --json"
     code, out, err = cli(words)
     assert code == 0
@@ -55,14 +55,14 @@ def test_without_photographs_it_takes_the_scenes_own_look(cli):  # noqa: F811
     assert json.loads(out)["_aaplug"]["truth"] == "self"
 
 
-def test_all_leaves_out_what_does_not_suit_the_scene(cli):  # noqa: F811
+def test_all_leaves_out_what_does_not_suit_the_scene(cli):
     code, out, err = cli("evaluate scene.ply --cameras . --recipe all --scale 0.25 --json")
     assert code == 0
     assert "recipe multi-scale left out: the scene lacks" in err
     assert set(json.loads(out)["_aaplug"]["recipes"]) == set(RECIPES) - {"multi-scale"}
 
 
-def test_a_protocol_names_itself_and_its_flavours(cli):  # noqa: F811
+def test_a_protocol_names_itself_and_its_flavours(cli):
     words = "evaluate scene.ply --cameras . --protocol blender --scale 0.5 --recipe matched --json"
     about = json.loads(cli(words)[1])["_aaplug"]
     assert about["protocol"]["name"] == "blender"
@@ -74,7 +74,7 @@ def test_a_protocol_names_itself_and_its_flavours(cli):  # noqa: F811
     assert overridden["metrics"]["SSIM"].startswith("wang")
 
 
-def test_it_writes_a_report_and_inrias_folders(cli):  # noqa: F811
+def test_it_writes_a_report_and_inrias_folders(cli):
     pytest.importorskip("flip_evaluator")
     words = "evaluate scene.ply --cameras . -o out --recipe classic auto --scale 0.5"
     options = "--metric psnr,flip,flicker --report --layout inria --show r_0"
@@ -88,13 +88,13 @@ def test_it_writes_a_report_and_inrias_folders(cli):  # noqa: F811
     assert Path("out/results.csv").read_text().count("\n") == 4
 
 
-def test_help_shows_the_recipes_for_users_and_says_that_there_are_more(cli):  # noqa: F811
+def test_help_shows_the_recipes_for_users_and_says_that_there_are_more(cli):
     text = cli("evaluate --help")[1]
     assert "playcanvas-classic|all|..." in text.replace("\n", "").replace(" ", "")
     assert "matched-integral" not in text
 
 
-def test_an_unreadable_photograph_is_named(cli):  # noqa: F811
+def test_an_unreadable_photograph_is_named(cli):
     photograph = Path("test/r_0.png")
     photograph.write_bytes(photograph.read_bytes()[: photograph.stat().st_size // 2])
     assert_refused(cli, "evaluate scene.ply --cameras . -o new", ["r_0.png"])

@@ -1,4 +1,3 @@
-# ruff: noqa: F811 (fixtures come from another file)
 """Fine-tuning from the command line: files, tags, interruptions."""
 
 import json
@@ -16,7 +15,6 @@ from aaplug_cli.main import main
 from aaplug.core.conventions import MIP
 from aaplug.finetuning import loop
 from aaplug.io.scenes import read_scene
-from tests.test_cli import cli, dataset  # noqa: F401 (fixtures)
 
 TUNE = "finetune scene.ply --cameras . -o tuned.ply --scale 0.5 --threads 1 --for mip --rasterizer eager"
 RUN = f"{TUNE} --steps 3 --checkpoint-every 2"

@@ -1,4 +1,3 @@
-# ruff: noqa: F811 (fixtures come from another file)
 """What a scene is, from the library and the command line."""
 
 import json
@@ -11,7 +10,7 @@ import torch
 from aaplug.io.scenes import write_scene
 from aaplug.verbs.info import info
 from tests.conftest import make_scene
-from tests.test_cli import break_nan, cli, dataset  # noqa: F401 (fixtures)
+from tests.test_cli import break_nan
 
 BOTH_MODES = b"comment SplatRenderMode: mip\ncomment SplatRenderMode: default\nelement vertex"
 

@@ -23,7 +23,6 @@ from aaplug.system.errors import FormatError, UsageError
 from aaplug.system.locks import SCRATCH_PREFIX, remove_left
 from aaplug.system.monitor import SILENT, Monitor
 from tests.test_batch import timeless
-from tests.test_cli import cli, dataset  # noqa: F401  (fixtures)
 from tests.test_executors import refuse_three
 
 cluster = pytest.importorskip("aaplug.system.cluster")  # its package is an extra
@@ -85,7 +84,7 @@ def local() -> Iterator[Any]:
         yield processes
 
 
-def test_whoever_is_killed_the_bytes_are_those_of_one_process(cli, monkeypatch):  # noqa: F811
+def test_whoever_is_killed_the_bytes_are_those_of_one_process(cli, monkeypatch):
     assert cli(f"evaluate scene.ply {SETTINGS} -o one")[0] == 0
     whole = timeless(Path("one"))
     with ExitStack() as stack:
@@ -125,7 +124,7 @@ def test_whoever_is_killed_the_bytes_are_those_of_one_process(cli, monkeypatch):
         assert timeless(Path("out")) == whole
 
 
-def test_a_batch_on_this_machine_has_the_bytes_of_one_process(cli):  # noqa: F811
+def test_a_batch_on_this_machine_has_the_bytes_of_one_process(cli):
     shutil.copy("scene.ply", "b.ply")
     words = f"evaluate scene.ply b.ply {SETTINGS} -o"
     assert cli(f"{words} one")[0] == 0
@@ -134,7 +133,7 @@ def test_a_batch_on_this_machine_has_the_bytes_of_one_process(cli):  # noqa: F81
     assert re.search(r"evaluating b: 4 of 4 views, \S+ a second, 1 worker\n", err)
 
 
-def test_scenes_are_converted_to_the_same_bytes(cli):  # noqa: F811
+def test_scenes_are_converted_to_the_same_bytes(cli):
     Path("many.toml").write_text(
         "[[scene]]\nscene = 'scene.ply'\ncameras = '.'\n[[scene]]\nname = 'b'\nscene = 'scene.ply'\n"
         "cameras = '.'\nvariance = 0.1\n"
@@ -145,7 +144,7 @@ def test_scenes_are_converted_to_the_same_bytes(cli):  # noqa: F811
         assert Path("here", name).read_bytes() == Path("there", name).read_bytes()
 
 
-def test_images_and_videos_are_the_same(local, cli, monkeypatch):  # noqa: F811
+def test_images_and_videos_are_the_same(local, cli, monkeypatch):
     def made(folder: str, **given: Any) -> list[bytes]:
         Path(folder).mkdir()
         how = {"rasterizer": "eager", "scale": 0.5, **given}
@@ -214,14 +213,14 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("address", REFUSED)
-def test_a_scheduler_that_is_not_there_is_one_line(address, cli, monkeypatch):  # noqa: F811
+def test_a_scheduler_that_is_not_there_is_one_line(address, cli, monkeypatch):
     monkeypatch.setattr(cluster, "ANSWER_SECONDS", 0.2)
     code, out, err = cli(f"render scene.ply --cameras . -o out --rasterizer eager --scheduler {address}")
     assert (code, out, err.splitlines()[-1]) == (2, "", f"error: {REFUSED[address]}")
     assert not Path("out").exists()
 
 
-def test_without_the_extra_its_name_is_told(cli, monkeypatch):  # noqa: F811
+def test_without_the_extra_its_name_is_told(cli, monkeypatch):
     monkeypatch.setattr("aaplug.rendering.job.find_spec", lambda name: None)
     code, _, err = cli("render scene.ply --cameras . -o out --rasterizer eager --scheduler local")
     assert code == 2

@@ -23,8 +23,7 @@ from aaplug.io.scenes import read_scene, write_scene
 from aaplug.io.scenes.packed import half_turn_about_x
 from aaplug.io.scenes.scene import Scene
 from aaplug.system.executors import ProcessesIfLong
-from tests.conftest import make_scene
-from tests.test_cli import EYES, cli, dataset  # noqa: F401  (fixtures)
+from tests.conftest import EYES, make_scene
 
 WORDS = "--cameras . --rasterizer eager --views train --scale 0.5 1 2"
 TURNS = {
@@ -55,7 +54,7 @@ def shuffled(scene, seed=0):
 # what is compared
 
 
-def test_a_scene_equals_itself_at_every_scale(cli):  # noqa: F811
+def test_a_scene_equals_itself_at_every_scale(cli):
     code, out, _ = cli(f"compare scene.ply scene.ply {WORDS} --json --fail-under 200dB")
     found = json.loads(out)
     assert (code, found["guard"]["value"]) == (0, None)
@@ -73,7 +72,7 @@ def test_a_scene_equals_itself_at_every_scale(cli):  # noqa: F811
     assert out.count("∞") == 6
 
 
-def test_what_a_change_costs_is_measured_and_guarded(cli):  # noqa: F811
+def test_what_a_change_costs_is_measured_and_guarded(cli):
     scene = read_scene("scene.ply").gaussians()
     write_scene("dim.ply", replace(scene, logit_opacities=scene.logit_opacities - 0.3))
     write_scene("grey.splat", scene)
@@ -100,7 +99,7 @@ def test_what_a_change_costs_is_measured_and_guarded(cli):  # noqa: F811
     assert cli(f"compare scene.ply dim.ply grey.splat {WORDS} --fail-under {min(means.values()) - 0.01}")[0] == 0
 
 
-def test_the_truth_is_the_reference_at_that_size(cli):  # noqa: F811
+def test_the_truth_is_the_reference_at_that_size(cli):
     scene, cameras = read_scene("scene.ply").gaussians(), read_cameras(".")
     dim = replace(scene, logit_opacities=scene.logit_opacities - 0.3)
     found = aaplug.compare({"a": scene, "b": dim}, cameras, scale=(0.5,), metric="psnr", rasterizer="eager")
@@ -112,7 +111,7 @@ def test_the_truth_is_the_reference_at_that_size(cli):  # noqa: F811
     assert found.lowest == (pytest.approx(expected, abs=1e-4), "b", 0.5)
 
 
-def test_a_viewer_draws_all_and_the_truth_stays(cli):  # noqa: F811
+def test_a_viewer_draws_all_and_the_truth_stays(cli):
     words = f"compare scene.ply scene.ply {WORDS} --metric psnr --json"
     shown = json.loads(cli(f"{words} --for classic")[1])["scenes"]["scene.ply"]
     first, second = json.loads(cli(f"{words} --for mip")[1])["scenes"].values()
@@ -123,7 +122,7 @@ def test_a_viewer_draws_all_and_the_truth_stays(cli):  # noqa: F811
     assert (code, "--for" in err or "--viewer" in err) == (2, True)
 
 
-def test_another_reference_and_levels_of_detail(cli):  # noqa: F811
+def test_another_reference_and_levels_of_detail(cli):
     assert cli("lod scene.ply --cameras . -o levels --levels 1 --no-refine --rasterizer eager")[0] == 0
     code, out, _ = cli(f"compare levels scene.ply --reference scene.ply {WORDS} --metric psnr --json")
     found = json.loads(out)
@@ -133,7 +132,7 @@ def test_another_reference_and_levels_of_detail(cli):  # noqa: F811
     assert found["scenes"]["levels"]["bytes"] == sum(file.stat().st_size for file in Path("levels").iterdir())
 
 
-def test_bare_files_are_seen_from_an_orbit(cli):  # noqa: F811
+def test_bare_files_are_seen_from_an_orbit(cli):
     for name in ("transforms_train.json", "transforms_test.json"):
         Path(name).unlink()
     words = "--rasterizer eager --orbit 2 --train-view 48x32 --scale 0.5 --metric psnr --json"
@@ -191,7 +190,7 @@ def test_scenes_in_one_frame_are_not_taken_for_turned(lopsided):
 # what is refused
 
 
-def test_other_frames_are_refused_by_name(cli):  # noqa: F811
+def test_other_frames_are_refused_by_name(cli):
     write_scene("turned.ply", half_turn_about_x(read_scene("scene.ply").gaussians()))
     code, out, err = cli(f"compare scene.ply turned.ply {WORDS}")
     named = "turned.ply: is scene.ply turned by 180 degrees about x"
@@ -203,7 +202,7 @@ def test_other_frames_are_refused_by_name(cli):  # noqa: F811
 
 
 @pytest.mark.parametrize("axes", ["opengl", "opencv"])
-def test_a_spz_is_read_in_the_frame_of_the_other(cli, axes):  # noqa: F811
+def test_a_spz_is_read_in_the_frame_of_the_other(cli, axes):
     pytest.importorskip("gsply")
     scene = read_scene("scene.ply").gaussians()
     write_scene("c.spz", scene, spz_axes=axes)
@@ -212,7 +211,7 @@ def test_a_spz_is_read_in_the_frame_of_the_other(cli, axes):  # noqa: F811
         assert (code, "as fits scene.ply" in err) == (0, True)
 
 
-def test_harmonics_that_are_gone_are_said(cli):  # noqa: F811
+def test_harmonics_that_are_gone_are_said(cli):
     write_scene("grey.splat", read_scene("scene.ply").gaussians())
     degree = read_scene("scene.ply").gaussians().sh_degree
     _, _, err = cli(f"compare scene.ply grey.splat {WORDS} --metric psnr")
@@ -232,7 +231,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("words", REFUSED)
-def test_bad_input_is_one_line(cli, words):  # noqa: F811
+def test_bad_input_is_one_line(cli, words):
     write_scene("other.ply", read_scene("scene.ply").gaussians())
     Path("broken.ply").write_bytes(Path("scene.ply").read_bytes()[:-100])
     code, out, err = cli(f"{words} --cameras . --rasterizer eager --scale 0.5")
@@ -244,7 +243,7 @@ def test_bad_input_is_one_line(cli, words):  # noqa: F811
 # what is written
 
 
-def test_files_and_a_continued_run(cli, monkeypatch):  # noqa: F811
+def test_files_and_a_continued_run(cli, monkeypatch):
     scene = read_scene("scene.ply").gaussians()
     write_scene("dim.ply", replace(scene, logit_opacities=scene.logit_opacities - 1))
     words = f"compare scene.ply dim.ply {WORDS} -o out --show 1"
@@ -312,7 +311,7 @@ def test_an_error_map_runs_from_black_to_the_end_of_the_scale():
         torch.testing.assert_close(pixel, torch.tensor(colour, dtype=torch.float32))
 
 
-def test_views_measured_in_processes_are_the_same(cli, monkeypatch):  # noqa: F811
+def test_views_measured_in_processes_are_the_same(cli, monkeypatch):
     scene, cameras = read_scene("scene.ply").gaussians(), read_cameras(".")
     given = {"a": scene, "b": replace(scene, convention=MIP)}
     how = {"scale": (0.5,), "rasterizer": "eager", "threads": 2, "views": "train", "metric": "psnr"}
@@ -322,7 +321,7 @@ def test_views_measured_in_processes_are_the_same(cli, monkeypatch):  # noqa: F8
     assert [m.values for m in found.measurements] == [m.values for m in expected.measurements]
 
 
-def test_what_goes_to_another_process_leaves_files_behind(cli, monkeypatch):  # noqa: F811
+def test_what_goes_to_another_process_leaves_files_behind(cli, monkeypatch):
     seen = []
     monkeypatch.setattr(ViewMeasurer, "__call__", lambda self, index: (seen.append(self.__getstate__()["task"]), 0 / 0))
     with pytest.raises(ZeroDivisionError):

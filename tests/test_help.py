@@ -7,8 +7,6 @@ from pathlib import Path
 import pytest
 from aaplug_cli.verbs import VERBS
 
-from tests.test_cli import cli, dataset  # noqa: F401  (fixtures)
-
 ROOT = Path(__file__).resolve().parents[1]
 FILES = [*sorted((ROOT / "aaplug" / "options").glob("*.py")), *sorted((ROOT / "cli").glob("*.py"))]
 
@@ -37,13 +35,13 @@ def test_an_option_is_told_in_one_line(file):
     assert [text for text in helps(file) if "\n" in text] == []
 
 
-def test_help_begins_with_examples(cli):  # noqa: F811
+def test_help_begins_with_examples(cli):
     _, out, _ = cli("--help")
     lines = [line.strip() for line in out.splitlines()]
     assert "aaplug convert scene.ply --cameras path/to/colmap -o converted.ply" in lines
 
 
-def test_help_lists_each_verb_with_its_first_line_only(cli):  # noqa: F811
+def test_help_lists_each_verb_with_its_first_line_only(cli):
     listed = " ".join(cli("--help")[1].split())
     for name, command in VERBS.items():
         first, *rest = command.help.split("\n\n")
@@ -52,7 +50,7 @@ def test_help_lists_each_verb_with_its_first_line_only(cli):  # noqa: F811
 
 
 @pytest.mark.parametrize("verb", VERBS)
-def test_help_of_a_verb_opens_with_when_to_use_it_and_when_another(cli, verb):  # noqa: F811
+def test_help_of_a_verb_opens_with_when_to_use_it_and_when_another(cli, verb):
     usage, about = HEADING.split(cli(f"{verb} --help")[1])[0].strip().split("\n", 1)
     assert usage.startswith(f"usage: aaplug {verb} ")
     first, when = about.strip().split("\n\n")
@@ -60,7 +58,7 @@ def test_help_of_a_verb_opens_with_when_to_use_it_and_when_another(cli, verb):  
     assert any(re.search(rf"\b{other}\b", when) for other in VERBS if other != verb), when
 
 
-def test_render_shows_few_options_before_those_with_a_heading(cli):  # noqa: F811
+def test_render_shows_few_options_before_those_with_a_heading(cli):
     text = HEADING.split(cli("render --help")[1])
     headings, options = text[1::2], re.findall(r"^ {1,2}(-\w|--[a-z-]+|[A-Z]+)\b", "".join(text[2:6:2]), re.MULTILINE)
     assert headings[:3] == ["positional arguments", "options", "scene file options"]
@@ -68,12 +66,12 @@ def test_render_shows_few_options_before_those_with_a_heading(cli):  # noqa: F81
     assert len(options) <= 15
 
 
-def test_only_a_video_has_a_path_file(cli):  # noqa: F811
+def test_only_a_video_has_a_path_file(cli):
     assert "path file" not in cli("render --help")[1]
     assert "path file" in cli("video --help")[1]
 
 
-def test_a_refused_word_ends_in_one_stop(cli):  # noqa: F811
+def test_a_refused_word_ends_in_one_stop(cli):
     for words in ("", "evaluat", "bench --gaussians 10 --scale 1"):
         _, _, err = cli(words)
         assert "; see `aaplug" in err

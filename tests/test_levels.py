@@ -1,7 +1,5 @@
 """Levels of detail: what merging keeps, what it does not depend on, and the files and errors of `aaplug lod`."""
 
-# ruff: noqa: F811 (fixtures come from another file)
-
 import json
 import math
 from dataclasses import replace
@@ -29,7 +27,6 @@ from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import FrameError, OutputError, UsageError
 from aaplug.system.executors import torch_threads
 from tests.conftest import make_camera, make_scene
-from tests.test_cli import cli, dataset  # noqa: F401 (fixtures)
 
 RATE = 20.0  # px per world unit
 EYES = ((0.0, -4.0, 0.0), (4.0, 0.0, 0.0), (0.5, 0.0, 4.0))

@@ -15,7 +15,6 @@ from aaplug.io.cameras import read_cameras
 from aaplug.io.scenes import read_scene, write_scene
 from aaplug.system.errors import FormatError
 from tests.conftest import make_scene
-from tests.test_cli import cli, dataset  # noqa: F401  (fixtures)
 
 LONG = "n" * 300
 FULL = Path("/dev/full")
@@ -27,7 +26,7 @@ def with_comment(path: Path, comment: bytes) -> None:
     path.write_bytes(data[:after] + b"comment " + comment + b"\n" + data[after:])
 
 
-def test_escapes_of_a_file_do_not_reach_the_terminal(cli):  # noqa: F811
+def test_escapes_of_a_file_do_not_reach_the_terminal(cli):
     with_comment(Path("scene.ply"), b"SplatRenderMode: \x1b[31mred")
     code, out, err = cli("info scene.ply")
     assert code == 0
@@ -40,7 +39,7 @@ def test_escapes_of_a_file_do_not_reach_the_terminal(cli):  # noqa: F811
 
 @pytest.mark.skipif(not FULL.exists(), reason="there is no device that is always full")
 @pytest.mark.parametrize("words", ["info scene.ply --json", "info scene.ply", "--help", "--version"])
-def test_a_full_disk_behind_stdout_is_one_line(cli, tmp_path, words):  # noqa: F811
+def test_a_full_disk_behind_stdout_is_one_line(cli, tmp_path, words):
     program = [sys.executable, "-c", "from aaplug_cli.main import main; main()", *words.split()]
     with FULL.open("w") as full:
         done = subprocess.run(program, cwd=tmp_path, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
@@ -58,7 +57,7 @@ def test_a_full_disk_behind_stdout_is_one_line(cli, tmp_path, words):  # noqa: F
         f"convert scene.ply --cameras . -o {LONG}.ply",
     ],
 )
-def test_names_longer_than_the_file_system_takes(cli, words):  # noqa: F811
+def test_names_longer_than_the_file_system_takes(cli, words):
     before = sorted(Path().iterdir())
     code, out, err = cli(words)
     assert (code, out) == (2, "")
@@ -67,14 +66,14 @@ def test_names_longer_than_the_file_system_takes(cli, words):  # noqa: F811
     assert sorted(Path().iterdir()) == before
 
 
-def test_views_with_long_names_are_written(cli):  # noqa: F811
+def test_views_with_long_names_are_written(cli):
     cameras = Path("transforms_test.json")
     cameras.write_text(cameras.read_text().replace("r_0", LONG))
     assert cli("render scene.ply --cameras transforms_test.json -o new --scale 0.5")[0] == 0
     assert [len(path.stem) for path in Path("new").iterdir()] == [200]
 
 
-def test_names_that_are_not_utf_8(cli):  # noqa: F811
+def test_names_that_are_not_utf_8(cli):
     odd = os.fsdecode(b"\xff\xfe")
     Path("scene.ply").rename(f"{odd}.ply")
     assert cli(f"info {odd}.ply")[0] == 0
@@ -83,14 +82,14 @@ def test_names_that_are_not_utf_8(cli):  # noqa: F811
     assert Path(f"r{odd}/report.html").exists()
 
 
-def test_a_folder_may_have_a_dot(cli):  # noqa: F811
+def test_a_folder_may_have_a_dot(cli):
     assert cli("render scene.ply --cameras . -o results_v1.0 --scale 0.5")[0] == 0
     assert [path.name for path in Path("results_v1.0").iterdir()] == ["r_0.png"]
     assert "name a folder" in cli("render scene.ply --cameras . -o new.jpg --scale 0.5")[2]
 
 
 @pytest.mark.parametrize("before", ["--scale 0.5 0.25", "--scale=0.5,0.25", "--scale 0.5 0.25 --recipe mip"])
-def test_a_scene_may_follow_an_option_of_several_values(cli, before):  # noqa: F811
+def test_a_scene_may_follow_an_option_of_several_values(cli, before):
     words = "--cameras . --metric psnr --json --rasterizer eager"
     code, out, _ = cli(f"evaluate {words} --recipe mip {before} ./scene.ply")
     assert code == 0
@@ -107,11 +106,11 @@ def test_an_error_of_the_system_is_told_by_what_it_is(monkeypatch, capsys):
     assert capsys.readouterr().err == "error: unexpected OSError: cannot allocate memory\n"
 
 
-def test_a_comma_at_the_end_names_no_view(cli):  # noqa: F811
+def test_a_comma_at_the_end_names_no_view(cli):
     assert cli("render scene.ply --cameras . -o new --views r_0, --scale 0.5")[0] == 0
 
 
-def test_an_empty_scene_is_not_tuned(cli):  # noqa: F811
+def test_an_empty_scene_is_not_tuned(cli):
     write_scene("scene.ply", make_scene(0), overwrite=True)
     for words in ("finetune scene.ply --cameras . -o t.ply", "convert scene.ply --cameras . -o t.ply --for gsplat"):
         code, _, err = cli(f"{words} --steps 1 --rasterizer eager")

@@ -1,7 +1,5 @@
 """Pyramids: what a view draws of them, the laws that its cut keeps, and the files that hold them."""
 
-# ruff: noqa: F811 (fixtures come from another file)
-
 import itertools
 import json
 import math
@@ -32,7 +30,6 @@ from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import FormatError
 from aaplug.verbs.lod import lod
 from tests.conftest import make_camera, make_scene, make_splats
-from tests.test_cli import cli, dataset  # noqa: F401 (fixtures)
 
 RATE = 20.0  # px per world unit
 VIEWS = tuple(make_camera(eye, (64, 48)) for eye in ((0.0, -4.0, 0.0), (3.0, -2.0, 1.0), (-3.0, -2.0, 0.5)))

@@ -14,7 +14,6 @@ from aaplug.evaluation.results import CEILING
 from aaplug.methods import RECIPES
 from tests.bench.method_tables import COLUMNS, SCALES, lines, short_table, table
 from tests.bench.pictures import CURVES, FOLDER, scales
-from tests.test_webpage import browser  # noqa: F401  (fixture)
 
 ROOT = Path(__file__).resolve().parents[1]
 GUIDES = ROOT / "examples" / "guides"
@@ -112,7 +111,7 @@ def test_fields_of_a_docstring_become_a_list():
 
 
 @pytest.fixture
-def gallery(browser, hooks, tmp_path):  # noqa: F811
+def gallery(browser, hooks, tmp_path):
     """One slider of the gallery, as the site shows it."""
     names = ("chair-r_136-100-classic.webp", "chair-r_136-100-auto.webp")
     images = "".join(f'<img alt="{name[16:-5]}" src="{(FOLDER / name).as_uri()}">' for name in names)

@@ -14,7 +14,6 @@ from aaplug.io.video import write_video
 from aaplug.system.errors import OutputError, UsageError
 from aaplug.verbs.video import side_by_side
 from tests.test_camera_paths import document
-from tests.test_cli import cli, dataset  # noqa: F401  (fixtures)
 
 
 def read(path: Path) -> tuple[np.ndarray, float]:
@@ -137,7 +136,7 @@ def test_what_becomes_small_is_also_shown_enlarged():
     assert torch.allclose(near[40:, :600], image[40:], atol=0.5 / 255)
 
 
-def test_the_programs_video_of_a_zoom_holds_the_enlarged_middle(cli):  # noqa: F811
+def test_the_programs_video_of_a_zoom_holds_the_enlarged_middle(cli):
     code, _, err = cli("video scene.ply --cameras . -o v.webm --resolution 320x240 --seconds 0.2 --fps 20")
     assert code == 0, err
     found, _ = read(Path("v.webm"))
@@ -147,7 +146,7 @@ def test_the_programs_video_of_a_zoom_holds_the_enlarged_middle(cli):  # noqa: F
 
 
 @pytest.mark.parametrize("path", ["zoom", "dolly", "orbit"])
-def test_the_program_makes_a_video_side_by_side(cli, path):  # noqa: F811
+def test_the_program_makes_a_video_side_by_side(cli, path):
     words = f"video scene.ply --cameras . -o v.webm --path {path} --rasterizer eager --seconds 0.2 --fps 20 --json"
     code, out, err = cli(words)
     assert (code, json.loads(out)["frames"]) == (0, 4)
@@ -159,7 +158,7 @@ def test_the_program_makes_a_video_side_by_side(cli, path):  # noqa: F811
     assert changes.min() > 0.1  # the camera moves
 
 
-def test_the_program_follows_a_camera_path(cli):  # noqa: F811
+def test_the_program_follows_a_camera_path(cli):
     Path("path.json").write_text(json.dumps(document()))
     code, _, err = cli("video scene.ply --cameras . -o v.webm --path path.json --beside none")
     assert code == 0, err

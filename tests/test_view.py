@@ -26,7 +26,6 @@ from aaplug.methods.recipe import LevelChoice
 from aaplug.rendering.renderer import Renderer
 from aaplug.rendering.strips import strips
 from tests.conftest import make_camera, make_scene
-from tests.test_cli import cli, dataset  # noqa: F401  (fixtures)
 
 SIDES = (Side("classic", "best"), Side("auto", "best"))
 RECIPES = ("classic", "auto", "mip")

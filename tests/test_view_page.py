@@ -19,7 +19,6 @@ from aaplug.rendering.renderer import Renderer
 from aaplug.verbs.view import serving
 from tests.conftest import make_camera, make_scene
 from tests.test_view import decoded, with_photograph
-from tests.test_webpage import browser  # noqa: F401  (fixture)
 
 SEEN = "#picture"
 
@@ -39,7 +38,7 @@ def address(seen):
 
 
 @pytest.fixture
-def opened(browser, address):  # noqa: F811
+def opened(browser, address):
     """A function that opens the page in a window of some size; nothing may have gone wrong in it."""
     troubles = []
     with ExitStack() as contexts:

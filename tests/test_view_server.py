@@ -14,7 +14,6 @@ from aaplug.live.messages import PictureRequest, Side, parse
 from aaplug.system.errors import UsageError
 from aaplug.system.monitor import SILENT
 from aaplug.verbs.view import attend, serving, view
-from tests.test_cli import cli, dataset  # noqa: F401  (fixtures)
 from tests.test_view import RECIPES, seen, unpacked  # noqa: F401  (a fixture)
 
 # ------------------------------------------------------------------------------------------------------- the messages
@@ -163,7 +162,7 @@ def test_garbage_harms_nobody(address, capfd):
 # -------------------------------------------------------------------------------------------------------- the command
 
 
-def test_a_busy_port_is_one_clear_line(address, cli):  # noqa: F811
+def test_a_busy_port_is_one_clear_line(address, cli):
     port = address.split(":")[2].rstrip("/")
     code, _, err = cli(f"view scene.ply --cameras . --rasterizer eager --no-browser --port {port}")
     assert code == 2
@@ -175,13 +174,13 @@ def test_a_host_that_cannot_be_a_name_is_refused(seen):  # noqa: F811
         pass
 
 
-def test_a_scene_that_fails_to_load_opens_no_page(cli):  # noqa: F811
+def test_a_scene_that_fails_to_load_opens_no_page(cli):
     code, _, err = cli("view missing.ply --no-browser --port 0")
     assert (code, len(err.splitlines())) == (2, 1)
     assert "missing.ply" in err
 
 
-def test_the_command_says_where_and_ends_quietly(cli, monkeypatch):  # noqa: F811
+def test_the_command_says_where_and_ends_quietly(cli, monkeypatch):
     def interrupted():
         raise KeyboardInterrupt
 

@@ -1,7 +1,6 @@
 """The report: one page that holds everything, escapes every name, and works by mouse and by keyboard in a browser."""
 
 import re
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from statistics import mean, stdev
@@ -22,11 +21,6 @@ from aaplug.verbs.evaluate import evaluate
 from tests.conftest import make_camera, make_scene
 
 NASTY = "</script><script>alert('x')</script>&amp;$\\frac$ “r_0”"
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")  # fmt: skip
-FLAGS = [
-    "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
-    "--disable-component-update", "--disable-sync",
-]  # fmt: skip
 PICTURE = "#stage canvas"
 ESCAPED = NASTY.replace("\\", "\\\\")  # in a selector
 
@@ -103,17 +97,6 @@ def test_tables_show_the_spread_and_the_worst_view_and_times_their_quartiles(wri
 
 
 # ------------------------------------------------------------------------------------------------------- in a browser
-
-
-@pytest.fixture(scope="module")
-def browser():
-    api = pytest.importorskip("playwright.sync_api")
-    if CHROMIUM is None:
-        pytest.skip("there is no Chromium")
-    with api.sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        yield chromium
-        chromium.close()
 
 
 @pytest.fixture

@@ -16,7 +16,7 @@ from aaplug_cli.main import main as program  # pyright: ignore[reportMissingImpo
 from aaplug_cli.verbs import VERBS  # pyright: ignore[reportMissingImports]
 
 from tests.bench import heading, row
-from tests.test_cli import make_dataset
+from tests.conftest import make_dataset
 
 ODD = ("nan", "inf", "-inf", "-1", "0", str(10**30), "", "x" * 10_000, os.fsdecode(b"\xff\xfe\x80"))
 EXIT_CODES = ("0", "1", "2", "130")

@@ -62,9 +62,9 @@ class Trained:
         """The training views, computed once."""
         return TrainingViews.of(self.scene, self.cameras, self.checkpoint.cull_margin)
 
-    def views(self, count: int = TEST_VIEWS, first: int = 0) -> Sequence[Camera]:
+    def views(self, count: int = TEST_VIEWS) -> Sequence[Camera]:
         """Test views, spread over all."""
-        return self.cameras.test[first :: -(-len(self.cameras.test) // count)]
+        return self.cameras.test[:: -(-len(self.cameras.test) // count)]
 
     def renderer(self, recipe: str | Recipe = "auto", **options: Any) -> Renderer:
         """A renderer of the scene over its training's background."""
