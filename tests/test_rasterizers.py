@@ -49,44 +49,6 @@ def close(image: torch.Tensor, expected, atol: float = 1e-6) -> None:
 # by hand ----------------------------------------------------------------------------------------
 
 
-def test_alpha_falls_with_the_mahalanobis_distance(rasterize):
-    # C = (5 2; 2 3), det 11, 11·C⁻¹ = (3 −2; −2 5): for d = (1, 2) dᵀC⁻¹d = 15/11, for (1, −2) it is 31/11
-    image = rasterize(splats_of(((4.5, 4.5), (5.0, 2.0, 3.0), 1.0, 0.9, RED)), (9, 9), BLACK)
-    close(image.alpha[6, 5], 0.9 * math.exp(-15 / 22))
-    close(image.alpha[2, 5], 0.9 * math.exp(-31 / 22))
-    close(image.alpha[2, 3], 0.9 * math.exp(-15 / 22))
-
-
-def test_a_pixel_is_sampled_at_its_centre_x_along_columns_and_y_along_rows(rasterize):
-    splats = splats_of(((10.5, 3.5), (0.2, 0.0, 0.2), 1.0, 0.9, RED))
-    image = rasterize(splats, (6, 13), BLACK)
-    assert image.rgb.shape == (6, 13, 3)
-    assert image.alpha.shape == (6, 13)
-    close(image.alpha[3, 10], 0.9)
-    between = rasterize(replace(splats, means=splats.means + 0.5), (6, 13), BLACK).alpha
-    close(between[3:5, 10:12], torch.full((2, 2), 0.9 * math.exp(-0.5 * (0.25 + 0.25) / 0.2)))
-
-
-def test_the_background_has_the_remaining_transmittance(rasterize):
-    image = rasterize(stack((0.75, RED)), (9, 9), SKY)
-    close(image.rgb[4, 4], [0.75 + 0.25 * 0.25, 0.25 * 0.5, 0.25 * 1.0])
-    close(image.alpha[4, 4], 0.75)
-    corner = 0.75 * math.exp(-0.5 * (16 + 16) / 4)
-    close(image.rgb[0, 0], [corner + (1 - corner) * 0.25, (1 - corner) * 0.5, 1 - corner])
-
-
-@pytest.mark.parametrize("near_first", [True, False])
-def test_nearer_splats_are_composited_first_in_any_order_of_input(rasterize, near_first):
-    both = stack((0.6, RED), (0.5, GREEN))
-    both = both if near_first else both[torch.tensor([1, 0])]
-    image = rasterize(both, (9, 9), SKY)
-    rest = 0.4 * 0.5
-    close(image.rgb[4, 4], [0.6 + rest * 0.25, 0.4 * 0.5 + rest * 0.5, rest])
-    close(image.alpha[4, 4], 1 - rest)
-    swapped = replace(both, depths=3 - both.depths)
-    close(rasterize(swapped, (9, 9), BLACK).rgb[4, 4], [0.5 * 0.6, 0.5, 0.0])
-
-
 @pytest.mark.parametrize("order", [[0, 1, 2], [2, 1, 0], [1, 2, 0]])
 def test_splats_of_equal_depth_are_drawn_in_scene_order(rasterize, order):
     splats = stack((0.5, RED), (0.5, GREEN), (0.5, BLUE))[torch.tensor(order)]
