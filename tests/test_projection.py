@@ -1,4 +1,4 @@
-"""Projection against finite differences, and its precision; harmonics are orthonormal.  test_golden.py has the formulas."""
+"""Projection against finite differences, and its precision; orthonormal harmonics.  test_golden.py has the formulas."""
 
 import math
 from dataclasses import replace
