@@ -1,9 +1,6 @@
 """The benchmark: figures that are measured, scenes that are what they say."""
 
 import json
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 import torch
@@ -15,13 +12,7 @@ from aaplug.core.rules import RULES_3DGS
 from aaplug.rendering.benchmark import exponent, measure, synthetic_camera, synthetic_scene
 from aaplug.rendering.renderer import Renderer
 
-ROOT = Path(__file__).resolve().parents[1]
 STAGES = ["project", "filter", "cull", "shade", "bin", "forms", "composite"]
-
-
-def test_benches_measure_with_the_threads_of_the_machine():
-    code = "import torch; own = torch.get_num_threads(); import tests.conftest; assert torch.get_num_threads() == own"
-    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
 
 
 def test_figures_of_a_small_scene():

@@ -1,7 +1,7 @@
 """Fine-tuning from the command line: files, tags, interruptions."""
 
+import contextlib
 import json
-import os
 import shutil
 import signal
 import subprocess
@@ -25,11 +25,8 @@ def whole(dataset, tmp_path_factory) -> Path:
     """A folder with the outputs of an uninterrupted run."""
     folder = tmp_path_factory.mktemp("whole")
     shutil.copytree(dataset, folder, dirs_exist_ok=True)
-    here = Path.cwd()
-    os.chdir(folder)
-    with pytest.raises(SystemExit, match="0"):
+    with contextlib.chdir(folder), pytest.raises(SystemExit, match="0"):
         main(RUN.split())
-    os.chdir(here)
     return folder
 
 

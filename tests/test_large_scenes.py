@@ -106,10 +106,9 @@ def test_the_command_draws_a_large_scene_so(tmp_path: Path, monkeypatch: pytest.
 
 MADE = """
 from pathlib import Path
+from aaplug.evaluation.laws.base import make_scene
 from aaplug.io.scenes import harmonics, read_scene, write_scene
-from aaplug.io.scenes import harmonics
 from aaplug.io.scenes.harmonics import without_harmonics
-from tests.conftest import make_scene
 harmonics.MAX_HARMONICS_BYTES = 0
 path = Path({path!r})
 without_harmonics(read_scene(path))

@@ -253,7 +253,7 @@ def test_a_smaller_memory_budget_changes_nothing():
 FRAME_MEMORY = 100e6  # bytes; measured: 50e6, in one band 130e6; the image is 67e6
 FRAME = """
 from aaplug.rasterizers.tiled import Tiled
-from tests.conftest import make_splats
+from aaplug.evaluation.laws.base import make_splats
 splats, draw = make_splats(3000, (2048, 2048), 7, (0.0, 5.0)), Tiled(memory=1e6)
 draw(splats, (64, 64), (0.0, 0.0, 0.0))
 """

@@ -184,8 +184,8 @@ def test_the_frame_check_samples_a_large_scene_evenly():
 
 BOUNDS = """
 from aaplug.core.sampling import CHUNK_PAIRS, sampling_bounds
-from tests.conftest import straight_camera
-means, cameras = torch.randn(100_000, 3), [straight_camera(back=4.0 + i / 50) for i in range(60)]
+from aaplug.evaluation.laws.base import make_camera
+means, cameras = torch.randn(100_000, 3), [make_camera((0.0, -4.0 - i / 50, 0.0)) for i in range(60)]
 sampling_bounds(means[:100], cameras)
 """
 
