@@ -117,9 +117,6 @@ def test_another_aspect_keeps_pixels_square_and_the_scene_in_view():
     assert (framed.cx, framed.cy, framed.trained_focal) == (150, 450, view.trained_focal)
 
 
-# the training rate
-
-
 def test_the_assumed_rate_is_as_stated():
     scene = make_scene(300)
     frame = frame_around(scene_of(scene), Orbit())
@@ -198,9 +195,6 @@ def test_how_much_a_picture_of_a_pyramid_hangs_on_the_rate():
     other = finer(view).rgb.clamp(0, 1)
     error = (shown(view).rgb.clamp(0, 1) - other).square().mean()
     assert decibels_at(shown, view, (2.0,)) == pytest.approx([-10 * float(error.log10())], rel=1e-4)
-
-
-# the verbs
 
 
 def test_the_orbit_of_levels_of_detail_is_that_of_the_finest():
@@ -313,9 +307,6 @@ def test_python_takes_an_orbit_for_cameras(dataset, tmp_path):
     images = [[image.file.read_bytes() for image in written] for written in (by_file, by_scene, by_cameras)]
     assert images[0] == images[1] == images[2]
     assert len(images[0]) == 2
-
-
-# mistakes
 
 
 def test_a_scene_of_nothing_is_refused(cli):

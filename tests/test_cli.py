@@ -71,9 +71,6 @@ def test_cull_margin_leaves_out_what_is_centred_far_outside(cli):
     assert Path("all.png").read_bytes() == Path("wide.png").read_bytes()
 
 
-# what is refused: one line, exit code 2, nothing written
-
-
 def break_nan(folder: Path) -> None:
     vertices = PlyData.read(folder / "scene.ply", mmap=False)
     vertices["vertex"]["x"][3:5] = np.nan

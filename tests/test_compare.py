@@ -51,9 +51,6 @@ def shuffled(scene, seed=0):
     return scene[torch.randperm(len(scene), generator=torch.Generator().manual_seed(seed))]
 
 
-# what is compared
-
-
 def test_a_scene_equals_itself_at_every_scale(cli):
     code, out, _ = cli(f"compare scene.ply scene.ply {WORDS} --json --fail-under 200dB")
     found = json.loads(out)
@@ -141,9 +138,6 @@ def test_bare_files_are_seen_from_an_orbit(cli):
     assert "training rate: assumed" in err
 
 
-# Gaussians
-
-
 def test_differences_are_found_in_any_order(lopsided):
     moved = replace(lopsided, means=lopsided.means + torch.tensor([1e-4, 0.0, 0.0]), sh=lopsided.sh * 1.0)
     moved.sh[:, 1:4] += 0.01
@@ -185,9 +179,6 @@ def test_scenes_in_one_frame_are_not_taken_for_turned(lopsided):
         assert mismatch(lopsided, other) is None
     line = replace(lopsided[:50], means=torch.linspace(-1, 1, 50)[:, None] * torch.ones(3) + 900)
     assert mismatch(lopsided, line).startswith("elsewhere: half of its Gaussians lie 1")
-
-
-# what is refused
 
 
 def test_other_frames_are_refused_by_name(cli):
@@ -238,9 +229,6 @@ def test_bad_input_is_one_line(cli, words):
     assert (code, out) == (2, "")
     assert err.splitlines()[-1].startswith("error: ")
     assert REFUSED[words] in err.splitlines()[-1]
-
-
-# what is written
 
 
 def test_files_and_a_continued_run(cli, monkeypatch):

@@ -254,9 +254,6 @@ def test_images_lie_where_3dgs_scripts_look(look, views, tmp_path):
     assert stored.equal(quantised(image))
 
 
-# metrics that the registry does not know beforehand
-
-
 def test_a_new_metric_that_is_undefined_is_reported_with_its_own_words(look, views, monkeypatch):
     monkeypatch.setattr(METRICS, "_entries", dict(METRICS))
     odd = Metric("odd", "", 1.0, 2, "its protocol", lambda image, truth: None, undefined="too odd")
@@ -271,9 +268,6 @@ def test_a_new_metric_that_is_undefined_is_reported_with_its_own_words(look, vie
     assert len(tables(report)) == 5
 
 
-# candidates side by side
-
-
 def test_candidates_compare_as_by_hand(look, views):
     other = replace(look, background=(1.0, 1.0, 1.0))  # so it is drawn anew
     report = compare([Candidate("own", look), Candidate("other", other)], views, (1.0, 0.5), Truth(look, memory=1e9))
@@ -282,9 +276,6 @@ def test_candidates_compare_as_by_hand(look, views):
     wanted = quantised(box_average(look(views[1]).rgb.clamp(0, 1), 2).to(CACHE_DTYPE).float())
     expected = psnr(quantised(other(views[1].scaled(0.5)).rgb), wanted)
     assert report.select("other", 0.5)[1].values["PSNR"] == pytest.approx(expected, abs=1e-9)
-
-
-# the truth
 
 
 def test_the_truth_without_photographs_draws_its_look_once(look, views, monkeypatch):

@@ -230,9 +230,6 @@ def test_a_projection_along_an_axis_has_the_packed_minors():
     torch.testing.assert_close(areas(covariances(scene))[:, 2], expected.double(), rtol=1e-3, atol=0)
 
 
-# The command
-
-
 def test_one_lighter_scene(cli):
     code, out, err = cli("lod scene.ply --cameras . -o light.ply --simplify 0.2 --steps 3 --json")
     assert code == 0, err

@@ -58,9 +58,6 @@ def test_flicker_of_motion_alone_is_one_and_of_twice_the_change_two():
     assert flicker(frames, [frames[0]] * 3) is None
 
 
-# laws of every metric
-
-
 @pytest.mark.parametrize("metric", METRICS.values(), ids=lambda metric: metric.name)
 def test_a_metrics_loss_is_least_at_its_ideal(metric):
     ideal = 1e9 if math.isinf(metric.ideal) else metric.ideal
@@ -101,9 +98,6 @@ def test_a_metric_is_worse_the_farther_images_are(comparing, name):
 def test_a_metric_of_neither_kind_is_refused():
     with pytest.raises(UsageError, match="needs either `measure` or `figure`"):
         Metric("nothing", "", 1.0, 2, "neither")
-
-
-# metrics by name
 
 
 def test_metrics_are_found_by_name_in_the_flavour_of_the_protocol():

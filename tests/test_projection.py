@@ -30,9 +30,6 @@ def world_covariance(scene: Gaussians) -> torch.Tensor:
     return rotation @ scene.log_scales[0].exp().square().diag() @ rotation.T
 
 
-# where a splat lands ----------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
 def test_the_near_plane_itself_is_not_drawn(dtype):
     scene = make_scene(5, dtype=dtype)
@@ -47,9 +44,6 @@ def test_the_near_plane_itself_is_not_drawn(dtype):
 def test_a_scene_behind_the_camera_has_no_splats():
     scene, camera = replace(make_scene(1), means=torch.tensor([[0.0, 0.0, -1.0]])), straight_camera()
     assert shade(project(scene, camera), scene, camera).rgb.shape == (0, 3)
-
-
-# the linearised projection ----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -74,9 +68,6 @@ def test_off_axis_covariances_follow_the_derivative_of_the_pinhole(seed):
     torch.testing.assert_close(splats.means[0], pixel(mean))
     torch.testing.assert_close(splats.covs[0], packed(expected), rtol=1e-8, atol=1e-8)
     torch.testing.assert_close(splats.dets[0], torch.linalg.det(expected), rtol=1e-7, atol=0)
-
-
-# precision --------------------------------------------------------------------------------------
 
 
 def needles(n: int, long: float, thin: float) -> Gaussians:

@@ -1,4 +1,4 @@
-"""Compositing worked by hand, the reference against a plain loop, and the tiled rasterizer against the reference.
+"""Cut-offs worked by hand, and the tiled rasterizer against the reference, which test_golden.py holds to plain loops.
 
 At a cut-off (alpha at 1/255, transmittance at 1e-4) float32 and float64 may decide differently.  `near_a_cutoff` finds
 the pixels where that can happen: all others must agree tightly, and those that differ are counted.
@@ -44,9 +44,6 @@ def stack(*layers: tuple[float, tuple[float, float, float]]) -> Splats2D:
 
 def close(image: torch.Tensor, expected, atol: float = 1e-6) -> None:
     torch.testing.assert_close(image.double(), torch.as_tensor(expected, dtype=F64), rtol=0, atol=atol)
-
-
-# by hand ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("order", [[0, 1, 2], [2, 1, 0], [1, 2, 0]])
@@ -97,9 +94,6 @@ def test_pixels_stop_independently(rasterize):
     close(green[8], 0.5, atol=1e-4)
 
 
-# the reference and a plain loop -----------------------------------------------------------------
-
-
 def test_strips_and_chunks_of_the_reference_change_nothing(monkeypatch):
     hw = (12, 17)
     splats = make_splats(120, hw, 5, (0.0, 2.5)).to(F64)
@@ -111,9 +105,6 @@ def test_strips_and_chunks_of_the_reference_change_nothing(monkeypatch):
     parts = REFERENCE(splats, hw, SKY)
     close(parts.rgb, whole.rgb, atol=1e-12)
     close(parts.alpha, whole.alpha, atol=1e-12)
-
-
-# the tiled rasterizer and the reference ---------------------------------------------------------
 
 
 def needles(m: int, hw: tuple[int, int], seed: int, long: float, thin: float) -> Splats2D:

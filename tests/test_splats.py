@@ -107,9 +107,6 @@ def test_a_splat_of_no_area_has_finite_gradients_when_blurred(factor):
     assert all(g.isfinite().all() for g in gradients if g is not None)
 
 
-# ellipses ---------------------------------------------------------------------------------------
-
-
 def test_alpha_is_1_255_at_the_cutoff():
     splats = splat(4.0, 0.0, 9.0, opacity=0.8)
     distance = squared_cutoff(splats.opacities).item()
@@ -151,9 +148,6 @@ def test_indexing_keeps_every_column_and_the_order():
         part = splats[index]
         for name in ("means", "covs", "dets", "depths", "opacities", "sources", "rgb"):
             assert getattr(part, name).equal(getattr(splats, name)[index]), name
-
-
-# smoothing in the world -------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -206,9 +200,6 @@ def test_the_smoothed_scale_is_finite_and_the_larger_of_both_where_they_differ(l
     expected = max(log_scale, log_sigma) + (0.5 * math.log(2) if log_scale == log_sigma else 0)
     assert smoothed.log_scales[0].tolist() == pytest.approx([expected] * 3, rel=1e-4, abs=1e-4)
     assert smoothed.logit_opacities.isfinite().all()
-
-
-# opacities --------------------------------------------------------------------------------------
 
 
 def scaled_logit(logit: float, factor: float, most: float) -> float:

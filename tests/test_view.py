@@ -93,9 +93,6 @@ def assembled(messages) -> tuple[dict, list[torch.Tensor]]:
     return header, sheets
 
 
-# ----------------------------------------------------------------------------------------------------------- drawing
-
-
 def finished(steps):
     """What a generator returns, and how often it yielded."""
     taken = 0
@@ -248,9 +245,6 @@ def test_a_still_has_the_size_that_was_asked_for(subject):
     assert header["still"] == "auto-60x40.png"
     expected = subject.renderer(SIDES[1])(subject.camera(request).framed(60, 40)).rgb
     assert float((decoded(file) - quantised(expected)).abs().max()) < 1.1 / 255
-
-
-# --------------------------------------------------------------------------------------------------------- the studio
 
 
 def test_a_newer_request_ends_the_older_one_between_strips(subject, monkeypatch):

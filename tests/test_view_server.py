@@ -72,9 +72,6 @@ def test_garbage_is_refused(text):
         parse(text, RECIPES, 2)
 
 
-# --------------------------------------------------------------------------------------------------------- the server
-
-
 @pytest.fixture(scope="module")
 def address(seen):  # noqa: F811
     with serving(*seen, port=0, rasterizer="eager") as address:
@@ -157,9 +154,6 @@ def test_garbage_harms_nobody(address, capfd):
             raw(address, request)
         assert ask(good)["stage"] == "done"
     assert capfd.readouterr().err == ""
-
-
-# -------------------------------------------------------------------------------------------------------- the command
 
 
 def test_a_busy_port_is_one_clear_line(address, cli):

@@ -96,9 +96,6 @@ def test_tables_show_the_spread_and_the_worst_view_and_times_their_quartiles(wri
     assert cell("seconds per view, median", "auto", 1.0)[1] == [f"{time:.3f}" for time in times]
 
 
-# ------------------------------------------------------------------------------------------------------- in a browser
-
-
 @pytest.fixture
 def opened(browser, written):
     """A function that opens the page in a window of some size and scheme; nothing may have gone wrong in it."""

@@ -24,9 +24,6 @@ situation = each(SITUATIONS)
 convention = each(CONVENTIONS)
 
 
-# screen filters ---------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("name", "variance", "compensated"), [("classic", 0.3, False), ("ewa", 0.3, True), ("mip", 0.1, True)]
 )
@@ -138,9 +135,6 @@ def test_the_gradient_of_a_blur_is_that_of_its_formula(compensate, floor):
 
     inputs = splats.covs, splats.dets, splats.opacities, variances
     assert torch.autograd.gradcheck(blur, [x.clone().requires_grad_() for x in inputs])
-
-
-# world filters ----------------------------------------------------------------------------------
 
 
 VARIED = {name: world for name, world in WORLD_FILTERS.items() if hasattr(world, "variance")}

@@ -51,9 +51,6 @@ def test_bounding_ellipses_contain_every_pixel_that_is_drawn_of_discs_at_their_h
     require_bounds(pixel, disc_splats(discs(100)), rules)
 
 
-# the kernels of aaplug against independent integrals --------------------------------------------
-
-
 def gaussians_at(offsets: Tensor, splats: Splats2D) -> Tensor:
     """exp(-dᵀ C⁻¹ d / 2) at offsets (..., c, 2), by the inverse of the matrix."""
     xx, xy, yy = splats.covs.unbind(dim=1)
