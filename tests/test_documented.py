@@ -66,7 +66,7 @@ ELSEWHERE = {  # commands of the tests and benches themselves, and what runs the
         "test_view.py: it ends when it is interrupted",
     ),
     **dict.fromkeys(NERFBASELINES, "test_nerfbaselines.py, where the package is"),
-    "python -m tests.guided -max_total_time=60": ".ci/run, twice for half as long",
+    "python -m tests.guided -max_total_time=60": ".ci/run, twice for a third as long",
 }
 
 
