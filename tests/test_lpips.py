@@ -55,12 +55,6 @@ def test_lpips_is_the_published_formula(weights, flavour, low):
     assert metric.protocol.startswith(f"{flavour}:")
 
 
-def test_lpips_of_alexnet_is_zero_for_equal_images(weights):
-    metric, image = lpips_metric("alex", *weights["alex"]), torch.rand(64, 64, 3)
-    assert metric.measure(image, image) == 0 < metric.measure(image, 1 - image)
-    assert "32 px" in metric.undefined
-
-
 def test_other_files_are_refused(weights, tmp_path):
     (trunk, heads), other = weights["vgg"], weights["alex"]
     (tmp_path / "text").write_text("not weights")

@@ -346,21 +346,6 @@ def test_matched_is_training_itself_at_every_view_of_the_training_size(conventio
         assert all((r(camera).rgb - expected).abs().max() <= 1e-5 for r in ours)
 
 
-@pytest.mark.parametrize(("is_free", "like"), [(True, "interval"), (False, "global")])
-def test_matched_takes_the_interval_for_free_cameras_only(is_free, like):
-    """From near; from afar both rise to a sharper rate."""
-    scene, cameras = make_scene(50), [make_camera((0.0, -4.0, 0.0)), make_camera((2.0, -3.0, 1.0))]
-    training = TrainingViews.of(scene, cameras)
-    view = make_camera((0.0, -8.0, 0.0)).scaled(2.5)
-    view = free(view) if is_free else view
-    found, expected, other = (
-        find_recipe("matched", rate_reference=r).screen(project(scene, view), view, training)
-        for r in ("pose", like, "sharpest")
-    )
-    torch.testing.assert_close(found.covs, expected.covs)
-    assert (found.covs - other.covs).abs().max() > 0.01
-
-
 def test_best_is_the_average_of_the_image_of_the_training_size():
     scene, camera = make_scene(200), make_camera(size=(64, 64))
     full = Renderer.of(scene, [camera], "classic", rasterizer="eager")(camera).rgb
