@@ -6,17 +6,23 @@ import pytest
 import torch
 from aaplug_cli.main import main
 
+from aaplug.core.cameras import CameraSet
 from aaplug.core.kernels import EAGER
 from aaplug.core.projection import rotation_matrices
 from aaplug.core.rules import RULES_3DGS
+from aaplug.io.scenes import read_scene, write_scene
 from aaplug.rendering.benchmark import exponent, measure, synthetic_camera, synthetic_scene
 from aaplug.rendering.renderer import Renderer
+from aaplug.verbs.bench import bench
+from aaplug.verbs.lod import lod
+from tests.conftest import make_camera, make_scene
 
 STAGES = ["project", "filter", "cull", "shade", "bin", "forms", "composite"]
 
 
 def test_figures_of_a_small_scene():
-    run = measure(synthetic_scene(500), synthetic_camera(40, 24), EAGER, repeats=1)
+    camera = synthetic_camera(40, 24).as_trained()
+    run = measure(Renderer.of(synthetic_scene(500), [camera], "classic"), camera, EAGER, repeats=1)
     assert run.rasterizer == "eager"
     assert (run.gaussians, run.width, run.height) == (500, 40, 24)
     assert list(run.stages_ms) == STAGES
@@ -88,3 +94,31 @@ def test_the_middle_scene_is_drawn_at_every_size(capsys):
     sizes = [(run["gaussians"], run["width"]) for run in found["runs"]]
     assert sizes == [(300, 40), (400, 40), (500, 40), (400, 48)]
     assert set(found["exponents"]) == {"eager: Gaussians", "eager: pixels"}
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory) -> Path:
+    """A folder of two levels, and cameras of 64x48 px."""
+    folder = tmp_path_factory.mktemp("model")
+    views, scene = [make_camera(name=name) for name in "ab"], make_scene(400)
+    cameras = CameraSet(tuple(views), tuple(views))
+    how = {"levels": 2, "refine": False, "rasterizer": "eager"}
+    lod(scene, cameras, folder / "levels", **how)
+    write_scene(folder / "whole.ply", scene)
+    return folder
+
+
+@pytest.mark.parametrize("scene", ["levels", "whole.ply"])
+def test_a_scene_is_timed_as_it_is_drawn_at_the_sizes_that_are_asked_for(model, scene):
+    cameras = CameraSet(*[(make_camera(),)] * 2)
+    how = {"rasterizer": "eager", "repeats": 1}
+    runs = [
+        *bench(model / scene, cameras, **how).runs,
+        *bench(model / scene, cameras, resolution=("64x48", "16x12"), **how).runs,
+    ]
+    assert [(run.width, run.height) for run in runs] == [(64, 48), (64, 48), (16, 12)]
+    first, second, small = (run.gaussians for run in runs)
+    coarsest = read_scene(model / "levels").levels.sizes[1]
+    assert first == second > coarsest
+    assert small == 400 if scene == "whole.ply" else 0 < small <= coarsest
+    assert runs[2].evaluations < runs[0].evaluations

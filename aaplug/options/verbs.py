@@ -279,7 +279,7 @@ class BenchOptions(Options):
     )
     """Sizes of the synthetic scenes."""
     resolution: Annotated[Sequence[str] | None, flag("WxH ...")] = None
-    """Sizes of the images: all scenes at the first, the middle one at each (default: 800x800 1600x1060)."""
+    """Sizes of the images: all scenes at the first, the middle one at each (default: a view's or 800x800 1600x1060)."""
     rasterizer: Annotated[str, choice(TIMED_RASTERIZERS), OneOf(TIMED_RASTERIZERS)] = "all"
     """Which to time; all: compiled, if `aaplug warmup` has run, and eager."""
     repeats: Annotated[int, number(1, 1000, whole=True)] = 5

@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from statistics import linear_regression, median
 from typing import Any
 
@@ -21,11 +22,10 @@ from aaplug.core.culling import cull
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.kernels import Kernels
 from aaplug.core.projection import project
+from aaplug.core.pyramids import faded
 from aaplug.core.shading import shade
 from aaplug.core.spherical_harmonics import SH_C0
-from aaplug.core.training import TrainingViews
 from aaplug.methods.pixel_kernels.raster_rows import TILE
-from aaplug.methods.recipes import find_recipe
 from aaplug.rasterizers.tiled import Tiled
 from aaplug.rasterizers.tiled.backward import composite
 from aaplug.rasterizers.tiled.binning import bands
@@ -42,6 +42,7 @@ SEED = 0
 class Figures:
     """Measurements of one scene at one size.
 
+    gaussians: those of the scene, or of the levels of detail that the view draws.
     evaluations: splat-pixel evaluations of compositing.  tile_evaluations: those of whole tiles that ellipses touch.
     peak_bytes: the most memory that the process has used so far.
     """
@@ -69,24 +70,23 @@ class Figures:
         return {**self.__dict__, "forward_share_of_matmul": self.share}
 
 
-def measure(scene: Gaussians, camera: Camera, kernels: Kernels, repeats: int = 5, backward: bool = True) -> Figures:
-    """Time one view of a scene by recipe "classic".
+def measure(renderer: Renderer, camera: Camera, kernels: Kernels, repeats: int = 5, backward: bool = True) -> Figures:
+    """Time one view, of the levels of detail that the renderer picks for it if it has any.
 
     kernels: run the stages, eagerly or compiled.  backward: also time the gradients of all parameters.
     """
-    camera, rasterizer = camera.as_trained(), Tiled(kernels)
-    training = TrainingViews.of(scene, [camera])
-    renderer = Renderer(scene, training, find_recipe("classic"), rasterizer)
+    rasterizer = Tiled(kernels)
+    renderer = replace(renderer, rasterizer=rasterizer)
     counts: list[int] = []
     with torch.no_grad():
-        stages, tile_evaluations = _stages(renderer, camera, kernels, repeats)
+        stages, gaussians, tile_evaluations = _stages(renderer, camera, kernels, repeats)
         replace(renderer, rasterizer=rasterizer.counting(counts.append))(camera)
         a = torch.ones(MATRIX_SIDE, MATRIX_SIDE)
         frame, product = _timed(repeats, lambda: renderer(camera), lambda: a @ a)
     both = _timed(repeats, lambda: gradient_step(renderer, camera))[0] if backward else None
     return Figures(
         rasterizer=kernels.name,
-        gaussians=len(scene),
+        gaussians=gaussians,
         width=camera.width,
         height=camera.height,
         forward_ms=frame,
@@ -176,8 +176,8 @@ def _turned_to(normals: Float[Tensor, "n 3"], roll: Float[Tensor, " n"]) -> Floa
     return torch.stack([w * cos, i * cos + j * sin, j * cos - i * sin, w * sin], dim=1)
 
 
-def _stages(renderer: Renderer, camera: Camera, kernels: Kernels, repeats: int) -> tuple[dict[str, float], int]:
-    """Milliseconds of each stage of the renderer, and the evaluations in all tiles that ellipses touch."""
+def _stages(renderer: Renderer, camera: Camera, kernels: Kernels, repeats: int) -> tuple[dict[str, float], int, int]:
+    """Times of a frame's stages, as `Renderer.draw` and `Tiled` run them; its Gaussians; evaluations of whole tiles."""
     times: dict[str, float] = {}
 
     def stage(name: str, work: Callable[[], Any]) -> Any:
@@ -187,14 +187,22 @@ def _stages(renderer: Renderer, camera: Camera, kernels: Kernels, repeats: int) 
     scene, recipe, training = renderer.scene, renderer.recipe, renderer.training
     hw, grid = camera.hw, (-(-camera.height // TILE), -(-camera.width // TILE))
     how = Compositing(recipe.pixel, training.convention.rules, kernels)
-    splats = stage("project", lambda: project(scene, camera, kernels))
+    chunk, cut = scene, None
+    if renderer.cutter is not None:
+        cut = stage("cut", partial(renderer.cutter, camera, renderer.coarsening(camera, 1)))
+        chunk = cut.of(scene)
+    splats = stage("project", lambda: project(chunk, camera, kernels))
+    if cut is not None:
+        own = splats.sources
+        splats = replace(splats, sources=cut.places.index_select(0, own))
+        splats = splats if cut.shares is None else faded(splats, cut.shares.index_select(0, own))
     splats = stage("filter", lambda: recipe.screen(splats, camera, training))
     splats = stage("cull", lambda: cull(splats, hw, kernels=kernels))
     splats = stage("shade", lambda: shade(splats, scene, camera, kernels))
     bins = stage("bin", lambda: list(bands(splats, grid, kernels)))
     rows = stage("forms", lambda: recipe.pixel.raster_rows(splats, kernels))
     stage("composite", lambda: [composite(rows, band, how) for band in bins])
-    return times, sum(int(band.counts.sum()) for band in bins) * TILE**2
+    return times, len(chunk), sum(int(band.counts.sum()) for band in bins) * TILE**2
 
 
 def _timed(repeats: int, *works: Callable[[], Any]) -> list[float]:

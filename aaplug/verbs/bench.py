@@ -1,23 +1,27 @@
 """How fast this machine renders, stage by stage."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import product
 from typing import NamedTuple
 
 from aaplug.core.cameras import Camera
-from aaplug.core.gaussians import Gaussians
 from aaplug.core.kernels import EAGER, Kernels
 from aaplug.io.limits import lack_of_memory
 from aaplug.io.scenes import SceneLike
+from aaplug.methods.recipe import LevelChoice
+from aaplug.methods.recipes import find_recipe
 from aaplug.options.shared import size_of
 from aaplug.options.verbs import BenchOptions
 from aaplug.rasterizers.tiled.ahead_of_time import build, load
 from aaplug.rendering.benchmark import Figures, exponent, measure, synthetic_camera, synthetic_scene
 from aaplug.rendering.job import CamerasLike, Job, running
+from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import UsageError
 from aaplug.system.monitor import Monitor
 from aaplug.verbs.verb import looks
 
+TIMED = replace(find_recipe("classic"), levels=LevelChoice())
 DEFAULT_RESOLUTIONS = ("800x800", "1600x1060")
 GAUSSIAN_BYTES = 1200  # one of degree 3 with its gradients and what autograd keeps, measured
 
@@ -31,7 +35,7 @@ class Bench(NamedTuple):
 
 @looks(BenchOptions)
 def bench(scene: SceneLike | None, cameras: CamerasLike, options: BenchOptions) -> Bench:
-    """Time the rasterizer on synthetic scenes, or on the first training view of a scene.
+    """Time the rasterizer on synthetic scenes, or on the first training view of a scene, at one or several sizes.
 
     Args:
         scene: see `render`; without one, synthetic ones.
@@ -43,10 +47,13 @@ def bench(scene: SceneLike | None, cameras: CamerasLike, options: BenchOptions) 
             work = _synthetic(options)
         else:
             job = Job.of(scene, cameras, options)
-            work = [(job.scene.gaussians(), job.cameras.train[0])]
+            job.scene.gaussians()  # with harmonics, which the renderer else leaves in a large file
+            renderer = Renderer.of(job.scene, job.cameras, TIMED, rasterizer="eager", min_seen=0.0)
+            view = job.cameras.train[0]
+            work = [(renderer, view.resized(*size_of(text))) for text in options.resolution or ()] or [(renderer, view)]
         kernels = _kernels(options.rasterizer, options.monitor)
-        for (gaussians, camera), each in product(work, kernels):
-            run = measure(gaussians, camera, each, options.repeats, not options.forward_only)
+        for (renderer, camera), each in product(work, kernels):
+            run = measure(renderer, camera, each, options.repeats, not options.forward_only)
             shape = f"{run.gaussians:,} Gaussians, {run.width}x{run.height}"
             options.monitor.say(f"{shape}, {run.rasterizer}: {run.forward_ms:.0f} ms")
             runs.append(run)
@@ -66,16 +73,16 @@ def _kernels(rasterizer: str, monitor: Monitor) -> list[Kernels]:
     return [compiled, EAGER]
 
 
-def _synthetic(options: BenchOptions) -> list[tuple[Gaussians, Camera]]:
+def _synthetic(options: BenchOptions) -> list[tuple[Renderer, Camera]]:
     """Every scene at the first size, and the middle one at the others."""
     given = options.resolution or (DEFAULT_RESOLUTIONS if len(options.gaussians) > 1 else DEFAULT_RESOLUTIONS[:1])
-    first, *others = [synthetic_camera(*size_of(text)) for text in given]
+    first, *others = [synthetic_camera(*size_of(text)).as_trained() for text in given]
     most = max(options.gaussians)
     if lacking := lack_of_memory(GAUSSIAN_BYTES * most):
         raise UsageError("gaussians", f"{most:,} with gradients take {lacking}")
-    scenes = [synthetic_scene(n) for n in options.gaussians]
+    scenes = [Renderer.of(synthetic_scene(n), [first], TIMED, rasterizer="eager") for n in options.gaussians]
     middle = scenes[len(scenes) // 2]
-    return [*((scene, first) for scene in scenes), *((middle, c) for c in others)]
+    return [*((scene, first) for scene in scenes), *((middle, camera) for camera in others)]
 
 
 def _exponents(runs: Sequence[Figures]) -> dict[str, float]:
