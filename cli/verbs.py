@@ -213,7 +213,8 @@ def evaluate(words: Words) -> int:
     from aaplug.evaluation.results import results, tables
     from aaplug.verbs.evaluate import check_results
 
-    check_results(words.output, words.of(verbs.EvaluateOptions))  # before the scene is read
+    # before the scene is read
+    check_results(words.output, words.resume, words.overwrite, words.report, words.layout)
     inputs = read_inputs(words)
     report = aaplug.evaluate(*inputs, words.output, **told(words, verbs.EvaluateOptions))
     if words.json:
@@ -285,7 +286,7 @@ def compare(words: Words) -> int:
         raise UsageError("compare", f"needs two scenes or more, got {len(paths)}: aaplug compare A.ply B.spz")
     from aaplug.verbs.compare import check_compared
 
-    check_compared(words.output, words.of(verbs.CompareOptions))  # before anything is read
+    check_compared(words.output, words.resume, words.overwrite)  # before anything is read
     scenes = [open_scene(words, path) for path in paths]
     cameras = read_cameras(words, scenes[0])
     comparison = aaplug.compare(scenes, cameras, words.output, **told(words, verbs.CompareOptions))

@@ -9,8 +9,9 @@ to the same place lose their partners).
 n: Gaussians, m: pairs.
 """
 
+import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from statistics import median
@@ -24,17 +25,22 @@ from rich.table import Table
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from aaplug.core.gaussians import MAX_LOG_SCALE, Gaussians
+from aaplug.core.gaussians import MAX_LOG_SCALE, Gaussians, digest_of_scene
+from aaplug.evaluation.alignment import mismatch
 from aaplug.evaluation.metric import Metric
 from aaplug.evaluation.metrics import EQUAL, PSNR
 from aaplug.evaluation.results import Facts, Measurement, Report, mean, spread_of, tables
-from aaplug.system.errors import printable
+from aaplug.io.scenes.scene import Scene, usable
+from aaplug.system.errors import FrameError, printable
 
 SAME_ROWS_DISTANCE = 0.01  # of the scene's size: the median distance within which rows are the same Gaussians
 GUARDED = (
     "the lowest, over scenes and scales, of the mean PSNR of the views whose images differ, in dB; null if none do"
 )
 UNKNOWN = "–"
+
+Say = Callable[[str], None]
+log = logging.getLogger("aaplug")
 
 
 @dataclass(frozen=True)
@@ -128,12 +134,70 @@ class ComparedScene:
     gaussians: int
     sh_degree: int
     convention: str
+    digest: str
     frame: str | None = None
     differences: Differences | None = None
 
     def as_json(self) -> dict[str, Any]:
         """JSON-ready."""
-        return vars(self) | {"differences": self.differences and self.differences.as_json()}
+        facts = vars(self) | {"differences": self.differences and self.differences.as_json()}
+        del facts["digest"]  # the protocol has it
+        return facts
+
+
+def in_one_frame(scenes: Mapping[str, Scene], say: Say = lambda text: None) -> dict[str, Scene]:
+    """The scenes; where a file can be read in two ways and another scene's in one, the reading in that one's frame."""
+    certain = next((name for name, scene in scenes.items() if scene.other is None), None)
+    if certain is None or all(scene.other is None for scene in scenes.values()):
+        return dict(scenes)
+    reference, settled = usable(scenes[certain].raw(0, scenes[certain].count)), dict[str, Scene]()
+    for name, scene in scenes.items():
+        settled[name] = scene
+        if scene.other is None:
+            continue
+        readings = scene.decoded(), scene.other.decoded()
+        fits = [mismatch(reference, usable(reading.raw(0, reading.count))) is None for reading in readings]
+        if fits[0] != fits[1]:
+            settled[name] = reading = readings[fits[1]]
+            say(f"{scene.title}: {reading.notes[-1].partition(' (')[0]}, as fits {certain}")
+    return settled
+
+
+def compared_scenes(
+    scenes: Mapping[str, Scene], any_frame: bool = False, say: Say = lambda text: None
+) -> tuple[ComparedScene, ...]:
+    """Facts of the scenes, the reference first; says what they lack.
+
+    any_frame: warn of a scene in another frame than the reference's, instead of raising FrameError.
+    """
+    reference, first = next((name, scene.gaussians()) for name, scene in scenes.items())
+    rows: list[ComparedScene] = []
+    for name, scene in scenes.items():
+        gaussians = scene.gaussians()
+        frame = mismatch(first, gaussians) if rows else None
+        if frame is not None:
+            problem = f"is {reference} {frame}"
+            if not any_frame:
+                raise FrameError(name, f"{problem}; bring both into one frame, or pass `any_frame`")
+            log.warning("%s: %s", name, problem)
+        if gaussians.sh_degree != first.sh_degree:
+            degrees = f"{name}: has SH degree {gaussians.sh_degree}, {reference} {first.sh_degree}"
+            say(f"{degrees}: what one lacks counts as a difference from 0")
+        rows.append(
+            ComparedScene(
+                name=name,
+                file=scene.file and scene.file.name,
+                format="levels" if scene.levels is not None else scene.format or None,
+                bytes=scene.bytes,
+                gaussians=len(gaussians),
+                sh_degree=gaussians.sh_degree,
+                convention=gaussians.convention.name,
+                digest=digest_of_scene(gaussians),
+                frame=frame,
+                differences=differences(first, gaussians) if rows else None,
+            )
+        )
+    return tuple(rows)
 
 
 class Lowest(NamedTuple):

@@ -6,16 +6,18 @@ before they are compared.  Views stream: only the numbers of finished views are 
 """
 
 import math
+import platform
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from importlib.metadata import version
 from itertools import product
 from os import PathLike
 from typing import Any
 
 from torch import Tensor
 
-from aaplug.core.cameras import Camera
+from aaplug.core.cameras import Camera, digest_of_cameras
 from aaplug.core.colours import Background
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.imaging import quantised
@@ -31,11 +33,14 @@ from aaplug.io.photographs import DOWNSCALES
 from aaplug.io.scenes import SceneLike, scene_of
 from aaplug.methods.recipe import Recipe
 from aaplug.methods.recipes import suited
+from aaplug.rendering.cost import Cost, comparing, cost_of
 from aaplug.rendering.renderer import Renderer
+from aaplug.system.digests import digest_of_files
 from aaplug.system.errors import UsageError
 from aaplug.system.executors import Apply
 from aaplug.system.monitor import Tell
 
+PACKAGES = ("aaplug", "torch", "numpy", "opencv-contrib-python-headless")
 NO_PHOTOGRAPH = "no photograph is this large: metrics above the photographs' own size are undefined"
 EQUAL_IMAGES_SIDE = 64  # px: of images that equal their truth, metrics look at this corner
 
@@ -101,6 +106,23 @@ class Task:
         """Rows that every view has a measurement of, at every scale."""
         with_ceiling = self.ceiling and self.resizes and self.truth.source != "reference"
         return self.names if with_ceiling else self.names[1:]
+
+    @property
+    def sized_views(self) -> list[Camera]:
+        """Every view at every scale, as large as its image is."""
+        return [view.scaled(scale) if self.resizes else view for view in self.views for scale in self.scales]
+
+    @property
+    def cost(self) -> Cost:
+        """An estimate: every candidate's images, the truths, which are as fine as training, and their comparison."""
+        truths = [*self.views] * (1 if self.resizes else len(self.scales))
+        images, truth = cost_of(self.renderers, self.sized_views), cost_of([self.truth.renderer], truths)
+        return images._replace(seconds=images.seconds + truth.seconds + comparing(self.sized_views, len(self.names)))
+
+    @property
+    def renderers(self) -> list[Renderer]:
+        """Those of the candidates."""
+        return [candidate.renderer for candidate in self.candidates]
 
     @property
     def resizes(self) -> bool:
@@ -198,6 +220,25 @@ def _request(task: Task) -> dict[str, Any]:
         "recipes_sha256": {c.name: c.renderer.recipe.digest for c in task.candidates},
         "rasterizer": task.candidates[0].renderer.rasterizer.name,
     }
+
+
+def facts_of(task: Task, notes: Sequence[str]) -> dict[str, Any]:
+    """Versions, platform, and hashes of the cameras and photographs that a task reads; notes: of the cameras."""
+    training, source = task.truth.renderer.training, task.truth.source
+    facts = {
+        "versions": {name: version(name) for name in PACKAGES} | {"python": platform.python_version()},
+        "platform": f"{platform.system()} {platform.machine()}",
+        "cameras": {
+            "notes": list(notes),
+            "sha256": digest_of_cameras(task.views),
+            "training_sha256": digest_of_cameras(training.cameras),
+        },
+        "cull_margin": training.cull_margin if math.isfinite(training.cull_margin) else None,
+    }
+    if source == "reference":
+        return facts
+    photos = [view.photo for view in task.views if view.photo] if source == "photographs" else []
+    return facts | {"photographs": {"count": len(photos), "sha256": digest_of_files(photos) if photos else None}}
 
 
 @dataclass(frozen=True, eq=False)

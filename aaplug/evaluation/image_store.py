@@ -5,13 +5,16 @@ report shows have the same layout in images/.  The number is the view's place in
 replaced: a continued evaluation writes the same one again.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from aaplug.core.cameras import Camera
 from aaplug.evaluation.metric import Image
 from aaplug.evaluation.results import CEILING, method
 from aaplug.io.atomic import make_folder
 from aaplug.io.images import write_png
+from aaplug.system.errors import UsageError
 
 RENDERS, TRUTHS = "renders", "gt"
 REPORT_FOLDER, TEST_FOLDER = "images", "test"
@@ -28,6 +31,18 @@ class ImageStore:
     folder: Path
     report_views: tuple[int, ...]
     everything: bool = False
+
+    @classmethod
+    def of(cls, folder: Path, show: str, views: Sequence[Camera], everything: bool = False) -> "ImageStore":
+        """A store whose report shows these views: so many, evenly spread, or those named, with commas between."""
+        if show.isdecimal():
+            count = min(int(show), len(views))
+            return cls(folder, tuple(i * len(views) // count for i in range(count)), everything)
+        places = {view.name: place for place, view in enumerate(views)}
+        for name in show.split(","):
+            if name not in places:
+                raise UsageError("show", f"there is no view '{name}' among those evaluated")
+        return cls(folder, tuple(places[name] for name in show.split(",")), everything)
 
     def keep(self, view: int, recipe: str, scale: float, image: Image, truth: Image | None) -> None:
         """Store one image and its truth, wherever they belong."""

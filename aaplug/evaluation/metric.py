@@ -7,7 +7,6 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import torch
 from jaxtyping import Float
@@ -17,11 +16,12 @@ from aaplug.core.cameras import Camera
 from aaplug.core.colours import Colour
 from aaplug.core.interfaces import CountsEvaluations
 from aaplug.evaluation.protocols import Protocol
+from aaplug.options.shared import AnyPath
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import UsageError
 
 Image = Float[Tensor, "h w 3"]
-LpipsFiles = tuple[Path, Path]  # of the trunk and of the heads
+LpipsFiles = tuple[AnyPath, AnyPath]  # of the trunk and of the heads
 SHIFT_STEPS = 4  # frames of a motion; between two of them the image moves 1/4 px right and down
 
 

@@ -11,9 +11,10 @@ script does, and so reads higher the smaller the image (by 0.003 at 512 px, 0.00
 import importlib.util
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise
-from typing import Any
+from typing import Any, get_args
 
 import cv2
 import numpy as np
@@ -22,13 +23,14 @@ from torch import Tensor
 
 from aaplug.evaluation import METRICS
 from aaplug.evaluation.metric import Image, LpipsFiles, Metric, Series
-from aaplug.evaluation.protocols import Protocol, SsimFlavour
+from aaplug.evaluation.protocols import LpipsFlavour, Protocol, SsimFlavour
 from aaplug.options.shared import metric_option
 from aaplug.system.errors import UsageError, not_one_of
 
 SSIM_WINDOW = 11  # px: the Gaussian of SSIM_SIGMA, cut at 3.5 sigma (Wang et al. 2004)
 SSIM_SIGMA = 1.5  # px
 FLIP_PX_PER_DEGREE = 67  # FLIP's default, a 0.7 m wide 4K screen seen from 0.7 m
+FLAVOURS = {"ssim": get_args(SsimFlavour), "lpips": get_args(LpipsFlavour)}
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709, on the values as stored
 
 
@@ -158,23 +160,33 @@ FLICKER = Metric(
 )
 
 
-def find_metrics(names: Sequence[str], protocol: Protocol, lpips_weights: LpipsFiles | None = None) -> list[Metric]:
-    """Metrics by name, in the flavours of a protocol.
+def find_metrics(
+    names: str | Sequence[str] | None, protocol: Protocol, lpips_weights: LpipsFiles | None = None
+) -> list[Metric]:
+    """Metrics by name, in the flavours of a protocol where the names state none.
 
-    names: of `METRICS`, in any case, "-" for a space: "psnr", "energy-drift".
-    lpips_weights: files of LPIPS's trunk and heads; only LPIPS needs them.
+    names: of `METRICS`, in any case, "-" for a space: "psnr", "energy-drift", "ssim:wang"; None for the usual ones.
+    lpips_weights: files of LPIPS's trunk and heads, which is then among the metrics; only LPIPS needs them.
 
     Raises:
         UsageError: a name is not known or given twice, or a metric lacks what it needs.
         FormatError: a file of weights cannot be read.
     """
+    names = default_metrics(protocol) if names is None else (names,) if isinstance(names, str) else names
+    parts = [metric_option(name).partition(":") for name in names]
+    if lpips_weights is not None and not any(name == "lpips" for name, _, _ in parts):
+        parts.append(("lpips", "", ""))
+    for name, colon, flavour in parts:
+        if colon and flavour not in FLAVOURS.get(name, ()):
+            flavours = [f"{metric}:{f}" for metric in FLAVOURS for f in FLAVOURS[metric]]
+            raise UsageError("metric", not_one_of(f"{name}:{flavour}", flavours))
     options = {metric_option(name): metric for name, metric in METRICS.items()}
-    wanted = [metric_option(name) for name in names]
-    if unknown := [name for name in wanted if name not in options]:
+    if unknown := [name for name, _, _ in parts if name not in options]:
         raise UsageError("metric", not_one_of(unknown[0], options))
-    if len(set(wanted)) != len(wanted):
+    metrics = [options[name] for name, _, _ in parts]
+    if len(set(metrics)) != len(metrics):
         raise UsageError("metric", "a metric is named twice")
-    metrics = [options[name] for name in wanted]
+    protocol = replace(protocol, **{name: flavour for name, _, flavour in parts if flavour})
     return [metric.prepare(protocol, lpips_weights) if metric.prepare else metric for metric in metrics]
 
 

@@ -4,9 +4,9 @@ import math
 import os
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
-from typing import TYPE_CHECKING, Annotated, Any, get_args
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args
 
 import tyro
 
@@ -40,6 +40,7 @@ MAX_SIDE = 16384  # px
 MAX_COORDINATE = 1e7  # world units
 DEFAULT_FOV = 50.0  # degrees
 
+V = TypeVar("V", bound="ViewOptions")
 _PLACE = number(-MAX_COORDINATE, MAX_COORDINATE, several=True, metavar="X Y Z")
 
 OneRecipe = Annotated[str | Recipe, choice([*RECIPE_NAMES, "..."]), OneOf(kind="recipe")]
@@ -76,6 +77,10 @@ class ViewOptions(FrameOptions):
     """GB that drawing a frame may take, beside the scene and the image themselves (default: 1)."""
     cull_margin: Annotated[float, number(0, math.inf, metavar="SHARE"), UNSET, CAMERAS] = math.inf
     """For scenes trained so: leave out Gaussians centred off the image by more than this share of its longer side."""
+
+    def on(self: V, background: Background | None) -> V:
+        """These options, with a background where they leave it open."""
+        return self if background is None or self.background != "auto" else replace(self, background=background)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -28,9 +28,10 @@ from aaplug.io.scenes.harmonics import without_harmonics
 from aaplug.io.scenes.scene import Scene
 from aaplug.methods import RECIPES
 from aaplug.methods.recipe import Recipe
-from aaplug.methods.recipes import find_recipe
+from aaplug.methods.recipes import find_recipe, suited
 from aaplug.options.base import Options
 from aaplug.options.shared import Orbit, RecipeOptions, ViewOptions
+from aaplug.options.verbs import ALL
 from aaplug.rasterizers.choice import find_rasterizer
 from aaplug.rendering.agreement import agreement, settled
 from aaplug.rendering.assumed import cameras_around, say_assumed
@@ -141,6 +142,18 @@ class Job(Generic[O_co]):
         matches = isinstance(RECIPES.find(recipe, "recipe").screen, MatchesRates)
         reference = options.rate_reference if matches else None
         return find_recipe(recipe, quality=options.quality, rate_reference=reference)
+
+    def recipes(self: "Job[RecipeOptions]", names: str | Recipe | Sequence[str | Recipe]) -> list[Recipe]:
+        """Recipes as `recipe`, fitted to the scene; of "all", those that it has everything for."""
+        gaussians, names = self.scene.gaussians(), [names] if isinstance(names, str | Recipe) else names
+        if ALL not in names:
+            return [suited(self.recipe(name), gaussians) for name in names]
+        recipes = [self.recipe(name) for name in RECIPES]
+        lacks = {recipe.name: recipe.lacks(gaussians) for recipe in recipes}
+        for name, lack in lacks.items():
+            if lack is not None:
+                self.monitor.say(f"recipe {name} left out: {lack}")
+        return [suited(recipe, gaussians) for recipe in recipes if lacks[recipe.name] is None]
 
     def say_assumed(self, renderer: Renderer | None = None, view: Camera | None = None) -> None:
         """Say which training is assumed, and how much a picture hangs on it; see `assumed.say_assumed`."""

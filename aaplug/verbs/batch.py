@@ -14,7 +14,6 @@ from aaplug.evaluation.report.files import as_json, write_texts
 from aaplug.evaluation.results import Report, as_csv, grid, method, results
 from aaplug.io.atomic import refuse_existing, writing
 from aaplug.options.shared import AnyPath
-from aaplug.options.verbs import EvaluateOptions
 from aaplug.system.errors import AaplugError, ClusterError, printable
 from aaplug.system.monitor import SILENT, Monitor
 from aaplug.verbs.evaluate import check_results
@@ -102,7 +101,7 @@ def batch(
     def check() -> None:
         refuse_existing([Path(output) / name for name in (SUMMARY, RESULTS)], overwrite or resume)
         for folder in folders:
-            check_results(folder, EvaluateOptions(resume=resume, overwrite=overwrite))
+            check_results(folder, resume, overwrite)
 
     check()
     with writing(output, check, (), folder=True):

@@ -30,10 +30,13 @@ COMPARED = ("compare.json", "compare.csv", "contact-sheet.png")
 PAGE, PLOTS = "report.html", "plots"
 
 
-def write_results(report: Report, folder: str | PathLike[str], overwrite: bool, name: str = "scene") -> list[Path]:
-    """Write results.json, per_view.json and results.csv; return their paths."""
+def write_evaluation(
+    report: Report, name: str, folder: Path, bounds: Coverage | None, images: ImageStore, overwrite: bool
+) -> list[Path]:
+    """Write the files and return their paths.  bounds: of the scene, for a page; None for none."""
     texts = (as_json(results(report)), as_json(per_view(report)), as_csv({name: report}))
-    return write_texts(folder, dict(zip(RESULTS, texts, strict=True)), overwrite)
+    paths = write_texts(folder, dict(zip(RESULTS, texts, strict=True)), overwrite)
+    return paths if bounds is None else paths + write_page(folder, name, report, bounds, images, overwrite)
 
 
 def write_comparison(
