@@ -11,7 +11,7 @@ n: Gaussians, m: pairs.
 
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import product
 from statistics import median
@@ -27,9 +27,8 @@ from torch import Tensor
 
 from aaplug.core.gaussians import MAX_LOG_SCALE, Gaussians, digest_of_scene
 from aaplug.evaluation.alignment import mismatch
-from aaplug.evaluation.metric import Metric
 from aaplug.evaluation.metrics import EQUAL, PSNR
-from aaplug.evaluation.results import Facts, Measurement, Report, mean, spread_of, tables
+from aaplug.evaluation.results import Facts, Report, mean, spread_of, tables
 from aaplug.io.scenes.scene import Scene, usable
 from aaplug.system.errors import FrameError, printable
 
@@ -235,8 +234,24 @@ class Comparison:
         guard = {"figure": GUARDED, "value": None if value == math.inf else value, "scene": worst, "scale": scale}
         report, scenes = self.report, dict[str, Any]()
         for scene in self.scenes:
-            figures = {f"{s:g}": _statistics(report.metrics, report.select(scene.name, s)) for s in report.scales}
-            scenes[scene.name] = scene.as_json() | {"scales": figures}
+            scales = dict[str, Any]()
+            for scale in report.scales:
+                views, figures = report.select(scene.name, scale), dict[str, Any]()
+                for metric in report.metrics:
+                    spread = spread_of(metric, views)
+                    figures[metric.name] = spread and {
+                        "mean": spread.mean,
+                        "median": spread.median,
+                        "worst": {"view": spread.worst[0], "value": spread.worst[1]},
+                        "spread": spread.deviation,
+                    }
+                scales[f"{scale:g}"] = {
+                    **figures,
+                    "equal_views": sum(EQUAL in view.note for view in views),
+                    "seconds": median(view.seconds for view in views),
+                    "per_view": {v.view: {**v.values, "seconds": round(v.seconds, 4)} for v in views},
+                }
+            scenes[scene.name] = scene.as_json() | {"scales": scales}
         protocol = {**report.protocol, "notes": report.notes}
         return {"reference": self.reference.name, "guard": guard, "scenes": scenes, "protocol": protocol}
 
@@ -271,22 +286,3 @@ class Comparison:
             lines.append([scene, *cells, f"{each.paired:.1%}{', sorted' * each.sorted}"])
         title = "differences of the Gaussians, root mean square"
         return [("scenes", headings, rows), (title, ["scene", *names, "paired"], lines)]
-
-
-def _statistics(metrics: Sequence[Metric], views: Sequence[Measurement]) -> dict[str, Any]:
-    """The metrics and the time of a frame over the views, and view by view."""
-    figures = dict[str, Any]()
-    for metric in metrics:
-        spread = spread_of(metric, views)
-        figures[metric.name] = spread and {
-            "mean": spread.mean,
-            "median": spread.median,
-            "worst": {"view": spread.worst[0], "value": spread.worst[1]},
-            "spread": spread.deviation,
-        }
-    return {
-        **figures,
-        "equal_views": sum(EQUAL in view.note for view in views),
-        "seconds": median(view.seconds for view in views),
-        "per_view": {v.view: {**v.values, "seconds": round(v.seconds, 4)} for v in views},
-    }

@@ -54,8 +54,20 @@ def lpips_metric(flavour: LpipsFlavour, trunk: str | PathLike[str], heads: str |
     Raises FormatError if a file is not the weights of this net.
     """
     net = NETS["alex" if flavour == "alex" else "vgg"]
-    weights = _trunk(Path(trunk), net)
-    linear = _heads(Path(heads), [weights[stage.convolutions[-1][0]][0].shape[0] for stage in net])
+    state, weights, channels = _state(Path(trunk)), dict[int, tuple[Tensor, Tensor]](), 3
+    for number in (number for stage in net for number, _, _ in stage.convolutions):
+        weight, bias = (state.get(f"features.{number}.{part}") for part in ("weight", "bias"))
+        if weight is None or bias is None or weight.dim() != 4 or weight.shape[1] != channels:
+            problem = f"holds no features.{number} for {channels} channels; give torchvision's weights"
+            raise FormatError(Path(trunk), problem)
+        weights[number], channels = (weight.float(), bias.float()), weight.shape[0]
+    state, linear = _state(Path(heads)), []
+    for number, stage in enumerate(net):
+        head, count = state.get(f"lin{number}.model.1.weight"), weights[stage.convolutions[-1][0]][0].shape[0]
+        if head is None or head.shape != (1, count, 1, 1):
+            problem = f"holds no lin{number} of {count} channels; give the lpips package's weights"
+            raise FormatError(Path(heads), problem)
+        linear.append(head.float())
     return replace(LPIPS, protocol=VARIANTS[flavour], measure=_Distance(net, weights, linear, flavour == "3dgs"))
 
 
@@ -85,26 +97,6 @@ class _Distance:
                 x = relu(conv2d(x, *self.weights[number], stride=stride, padding=padding))
             maps.append(x / (x.square().sum(dim=1, keepdim=True).sqrt() + EPSILON))
         return maps
-
-
-def _trunk(path: Path, net: tuple[Stage, ...]) -> dict[int, tuple[Tensor, Tensor]]:
-    state, weights, channels = _state(path), {}, 3
-    for number in (number for stage in net for number, _, _ in stage.convolutions):
-        weight, bias = (state.get(f"features.{number}.{part}") for part in ("weight", "bias"))
-        if weight is None or bias is None or weight.dim() != 4 or weight.shape[1] != channels:
-            raise FormatError(path, f"holds no features.{number} for {channels} channels; give torchvision's weights")
-        weights[number], channels = (weight.float(), bias.float()), weight.shape[0]
-    return weights
-
-
-def _heads(path: Path, channels: list[int]) -> list[Tensor]:
-    state, heads = _state(path), []
-    for number, count in enumerate(channels):
-        head = state.get(f"lin{number}.model.1.weight")
-        if head is None or head.shape != (1, count, 1, 1):
-            raise FormatError(path, f"holds no lin{number} of {count} channels; give the lpips package's weights")
-        heads.append(head.float())
-    return heads
 
 
 def _state(path: Path) -> dict[str, Tensor]:

@@ -3,9 +3,10 @@
 import csv
 import io
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from itertools import product
 from statistics import median, quantiles, stdev
 from typing import Any
 
@@ -196,69 +197,67 @@ def metric_cells(report: Report, metric: Metric) -> list[list[Cell]]:
     """A metric's table of means, recipes down and scales across; infinity where every image equals its truth."""
     columns = []
     for scale in report.scales:
-        views, means = {recipe: report.select(recipe, scale) for recipe in report.recipes}, dict[str, float | None]()
+        views = {recipe: report.select(recipe, scale) for recipe in report.recipes}
+        spreads = {recipe: spread_of(metric, measurements) for recipe, measurements in views.items()}
+        means = {recipe: None if spread is None else spread.mean for recipe, spread in spreads.items()}
         for recipe, measurements in views.items():
-            equal = metric.undefined == EQUAL and measurements and all(EQUAL in m.note for m in measurements)
-            average = mean(measurements, metric.name)
-            means[recipe] = math.inf if average is None and equal else average
+            equal = measurements and all(EQUAL in m.note for m in measurements)
+            if equal and spreads[recipe] is None and metric.undefined == EQUAL:
+                means[recipe] = math.inf
         contenders = [value for recipe, value in means.items() if recipe != CEILING and value is not None]
-        best = min(contenders, key=metric.loss, default=math.nan)
-        columns.append([_cell(metric, views[r], value, r != CEILING and value == best) for r, value in means.items()])
+        best, cells = min(contenders, key=metric.loss, default=math.nan), list[Cell]()
+        for recipe, spread in spreads.items():
+            value, deviation, worst = means[recipe], "", None
+            if spread is not None and spread.deviation is not None:
+                deviation = f"± {metric.text(spread.deviation)}"
+                worst = (metric.text(spread.worst[1]), spread.worst[0]) if spread.deviation else None
+            cells.append(Cell(metric.text(value), recipe != CEILING and value == best, deviation, worst))
+        columns.append(cells)
     return [list(row) for row in zip(*columns, strict=True)]
-
-
-def _cell(metric: Metric, views: Sequence[Measurement], average: float | None, best: bool) -> Cell:
-    spread = spread_of(metric, views)
-    if spread is None or spread.deviation is None:
-        return Cell(metric.text(average), best)
-    view, value = spread.worst
-    worst = (metric.text(value), view) if spread.deviation else None
-    return Cell(metric.text(average), best, f"± {metric.text(spread.deviation)}", worst)
 
 
 def cost_cells(report: Report) -> list[tuple[str, list[list[Cell]]]]:
     """Tables of a view's cost, recipes down and scales across, as (title, rows)."""
-    columns = [("seconds per view, median", _time_cell)]
+
+    def time(views: Sequence[Measurement]) -> Cell:
+        times = [m.seconds for m in views]
+        if len(times) < 2:
+            return Cell(number(_mean(times), TIME_DIGITS))
+        low, middle, high = (number(time, TIME_DIGITS) for time in quantiles(times, n=4, method="inclusive"))
+        return Cell(middle, spread=f"{low} to {high}")
+
+    def evaluations(views: Sequence[Measurement]) -> Cell:
+        millions = [m.evaluations / MILLION for m in views if m.evaluations is not None]
+        spread = f"± {number(stdev(millions), COUNT_DIGITS)}" if len(millions) > 1 else ""
+        return Cell(number(_mean(millions), COUNT_DIGITS), spread=spread)
+
+    columns = [("seconds per view, median", time)]
     if any(m.evaluations is not None for m in report.measurements):
-        columns.append(("million evaluations per view", _evaluations_cell))
+        columns.append(("million evaluations per view", evaluations))
     return [
         (title, [[cell(report.select(r, s)) for s in report.scales] for r in report.recipes]) for title, cell in columns
     ]
 
 
-def _time_cell(views: Sequence[Measurement]) -> Cell:
-    times = [m.seconds for m in views]
-    if len(times) < 2:
-        return Cell(number(_mean(times), TIME_DIGITS))
-    low, middle, high = (number(time, TIME_DIGITS) for time in quantiles(times, n=4, method="inclusive"))
-    return Cell(middle, spread=f"{low} to {high}")
-
-
-def _evaluations_cell(views: Sequence[Measurement]) -> Cell:
-    millions = [m.evaluations / MILLION for m in views if m.evaluations is not None]
-    spread = f"± {number(stdev(millions), COUNT_DIGITS)}" if len(millions) > 1 else ""
-    return Cell(number(_mean(millions), COUNT_DIGITS), spread=spread)
-
-
 def results(report: Report) -> dict[str, Any]:
     """INRIA's results.json, {method: {metric: mean}}, methods named recipe@scale; the protocol is "_aaplug"."""
-    return _by_method(report, lambda views: {m.name: mean(views, m.name) for m in report.metrics})
+    cases = {method(r, s): report.select(r, s) for r in report.recipes for s in report.scales}
+    means = {name: {m.name: mean(views, m.name) for m in report.metrics} for name, views in cases.items()}
+    return means | {"_aaplug": dict(report.protocol) | {"notes": report.notes}}
 
 
 def per_view(report: Report) -> dict[str, Any]:
     """INRIA's per_view.json, {method: {metric: {view: value}}}, and samples per pixel side, seconds, evaluations."""
-
-    def content(views: Sequence[Measurement]) -> dict[str, Any]:
-        values = {m.name: {v.view: v.values.get(m.name) for v in views} for m in report.metrics}
-        samples, times = {v.view: v.samples for v in views}, {v.view: round(v.seconds, 4) for v in views}
-        return {**values, "samples": samples, "seconds": times, "evaluations": {v.view: v.evaluations for v in views}}
-
-    return _by_method(report, content)
-
-
-def _by_method(report: Report, content: Callable[[Sequence[Measurement]], dict[str, Any]]) -> dict[str, Any]:
-    methods = {method(r, s): content(report.select(r, s)) for r in report.recipes for s in report.scales}
-    return methods | {"_aaplug": dict(report.protocol) | {"notes": report.notes}}
+    content = dict[str, Any]()
+    for recipe, scale in product(report.recipes, report.scales):
+        views = report.select(recipe, scale)
+        content[method(recipe, scale)] = {
+            **{m.name: {v.view: v.values.get(m.name) for v in views} for m in report.metrics},
+            "samples": {v.view: v.samples for v in views},
+            "seconds": {v.view: round(v.seconds, 4) for v in views},
+            "evaluations": {v.view: v.evaluations for v in views},
+        }
+    return content | {"_aaplug": dict(report.protocol) | {"notes": report.notes}}
 
 
 def as_csv(reports: Mapping[str, Report]) -> str:

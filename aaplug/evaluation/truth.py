@@ -111,16 +111,13 @@ class Truth:
             return None
         image = new.to(CACHE_DTYPE)
         if sum(cached.nbytes for cached in self._cache.values()) + image.nbytes <= self.memory:
-            self._cache[key] = self._in_slab(image)
+            # in a slab: small blocks that stay, between large ones that go, would keep those from the system
+            size = image.numel()
+            if not self._slab or len(self._slab[0]) < size:
+                self._slab[:] = [torch.empty(max(size, SLAB_SIZE), dtype=CACHE_DTYPE)]
+            place, self._slab[0] = self._slab[0].split([size, len(self._slab[0]) - size])
+            self._cache[key] = place.view(image.shape).copy_(image)
         return image.float()
-
-    def _in_slab(self, image: Image) -> Image:
-        """A copy in a slab: small blocks that stay, between large ones that go, would keep those from the system."""
-        size = image.numel()
-        if not self._slab or len(self._slab[0]) < size:
-            self._slab[:] = [torch.empty(max(size, SLAB_SIZE), dtype=CACHE_DTYPE)]
-        place, self._slab[0] = self._slab[0].split([size, len(self._slab[0]) - size])
-        return place.view(image.shape).copy_(image)
 
 
 class ViewTruth:

@@ -53,8 +53,15 @@ def run(
     fallback = fallback or snapshot(state)
     while state.step < job.settings.steps and not stop():
         advance(job, state)
-        if state.bad_steps >= MAX_BAD_STEPS:
-            _roll_back(job, state, fallback, say)
+        if state.bad_steps >= MAX_BAD_STEPS:  # the step count continues, so other views follow
+            step, rollbacks = state.step, state.rollbacks + 1
+            if rollbacks > MAX_ROLLBACKS:
+                problem = f"has no finite gradient at step {step}, after {MAX_ROLLBACKS} rollbacks"
+                raise UsageError("finetune", problem)
+            vars(state).update(vars(state_of(fallback, job)))
+            state.step, state.bad_steps, state.rollbacks = step, 0, rollbacks
+            back = f"back to step {fallback['step']}, at half the learning rates"
+            say(f"step {step}: {MAX_BAD_STEPS} steps without a finite gradient; {back}")
         if state.step % every == 0 and not state.bad_steps:
             fallback = snapshot(state)
             keep(state, fallback)
@@ -108,17 +115,6 @@ def update_bounds(job: TuningJob, state: State) -> None:
     """Compute the sampling bounds where the Gaussians are now, and clamp the parameters by them."""
     state.bounds = sampling_bounds(state.leaves["means"].detach(), job.start.training.cameras)
     _clamp_parameters(state)
-
-
-def _roll_back(job: TuningJob, state: State, fallback: Mapping[str, Any], say: Callable[[str], None]) -> None:
-    """Restore the snapshot and halve the learning rates; the step count continues, so other views follow."""
-    step, rollbacks = state.step, state.rollbacks + 1
-    if rollbacks > MAX_ROLLBACKS:
-        raise UsageError("finetune", f"has no finite gradient at step {step}, after {MAX_ROLLBACKS} rollbacks")
-    vars(state).update(vars(state_of(fallback, job)))
-    state.step, state.bad_steps, state.rollbacks = step, 0, rollbacks
-    back = f"back to step {fallback['step']}, at half the learning rates"
-    say(f"step {step}: {MAX_BAD_STEPS} steps without a finite gradient; {back}")
 
 
 def _view_and_weights(settings: Settings, views: Sequence[Camera], step: int) -> tuple[Camera, dict[float, float]]:

@@ -43,12 +43,19 @@ def tune(
     steps, first, started = job.settings.steps, state.step, time.monotonic()
 
     def keep(state: State, fallback: Mapping[str, Any]) -> None:
-        """Measure a few training views, write the checkpoint, and report both."""
-        summary = _probe(job, state)
+        """Measure a few training views at the training size and the farthest scale; write the checkpoint; say both."""
+        scales = list(dict.fromkeys([1.0, max(job.settings.weights, key=lambda s: abs(math.log(s)))]))
+        report = compare([Candidate("now", state.renderer(job))], spread(job.views, PROBE_VIEWS), scales, job.truth)
+        psnr = {scale: mean(report.select("now", scale), PSNR.name) for scale in scales}
+        state.probes.append({"step": state.step, "psnr": {f"{s:g}": v for s, v in psnr.items()}})
+        losses = [loss for step in state.curve[-LOSS_STEPS:] for loss in step["loss"].values()]
+        loss = f", loss {sum(losses) / len(losses):.2e}" if losses else ""
+        values = {s: "infinite" if v is None else f"{v:.2f}" for s, v in psnr.items()}
+        decibels = ", ".join(f"{value} dB at {scale_name(s)}" for s, value in values.items())
         if checkpoint is not None:
             save(checkpoint, job, state, fallback)
         pace = (time.monotonic() - started) / max(1, state.step - first)
-        monitor.say(f"step {state.step} of {steps}{summary}; {pace:.2f} s per step")
+        monitor.say(f"step {state.step} of {steps}{loss}: {decibels}; {pace:.2f} s per step")
 
     with monitor.progress("tuning", "steps") as tell, _interruptible(monitor.say) as interrupted:
 
@@ -72,18 +79,6 @@ def tuned_scene(state: State, job: TuningJob, convention: Convention, settings: 
         return replace(job.start.scene, convention=convention)
     scene, fusion = state.scene(job), Fusion(TUNED, {"steps": str(state.step), **settings})
     return replace(scene, convention=convention, fused=(*scene.fused, fusion))
-
-
-def _probe(job: TuningJob, state: State) -> str:
-    """Measure a few training views at the training size and the scale farthest from it; the result in words."""
-    scales = list(dict.fromkeys([1.0, max(job.settings.weights, key=lambda s: abs(math.log(s)))]))
-    report = compare([Candidate("now", state.renderer(job))], spread(job.views, PROBE_VIEWS), scales, job.truth)
-    psnr = {scale: mean(report.select("now", scale), PSNR.name) for scale in scales}
-    state.probes.append({"step": state.step, "psnr": {f"{s:g}": v for s, v in psnr.items()}})
-    losses = [loss for step in state.curve[-LOSS_STEPS:] for loss in step["loss"].values()]
-    loss = f", loss {sum(losses) / len(losses):.2e}" if losses else ""
-    values = {s: "infinite" if v is None else f"{v:.2f}" for s, v in psnr.items()}
-    return f"{loss}: " + ", ".join(f"{value} dB at {scale_name(s)}" for s, value in values.items())
 
 
 @contextmanager

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from statistics import fmean
 from typing import Any, TypeVar
 
 from rich.markup import escape
@@ -41,28 +42,24 @@ class Batch:
 
     def _means(self) -> dict[str, dict[str, float | None]]:
         """By method and metric; None where a scene has no value, as means over different scenes do not compare."""
-        found = [results(report) for report in self.reports.values()]
-        shared = [name for name in (found[0] if found else ()) if all(name in one for one in found)]
-        return {
-            name: {key: _mean([one[name].get(key) for one in found]) for key in found[0][name]}
-            for name in shared
-            if name != "_aaplug"
-        }
+        figures, means = [results(report) for report in self.reports.values()], dict[str, dict[str, float | None]]()
+        for name in figures[0] if figures else ():
+            if name != "_aaplug" and all(name in each for each in figures):
+                values = {key: [each[name].get(key) for each in figures] for key in figures[0][name]}
+                means[name] = {key: None if None in each else fmean(each) for key, each in values.items()}
+        return means
 
     def tables(self) -> list[Table]:
         """The means, one table per metric, and the status of every scene."""
-        why = {folder: self.failures.get(folder) for folder in self.names}
-        scenes = status_table(
-            "why",
-            [(name, "failed" if why[folder] else "done", why[folder] or "") for folder, name in self.names.items()],
-        )
+        whys = [(name, self.failures.get(folder, "")) for folder, name in self.names.items()]
+        scenes = status_table("why", [(name, "failed" if why else "done", why) for name, why in whys])
         if not self.reports:
             return [scenes]
         first, means, grids = next(iter(self.reports.values())), self._means(), []
         over = f"mean of {len(self.reports)} scene{'s' * (len(self.reports) != 1)}"
         for metric in first.metrics:
-            found = [[means.get(method(r, s), {}).get(metric.name) for s in first.scales] for r in first.recipes]
-            lines = [[metric.text(value) for value in line] for line in found]
+            values = [[means.get(method(r, s), {}).get(metric.name) for s in first.scales] for r in first.recipes]
+            lines = [[metric.text(value) for value in line] for line in values]
             grids.append(grid(f"{metric.title}, {over}", first, lines))
         return [*grids, scenes]
 
@@ -73,8 +70,8 @@ def status_table(told: str, rows: Iterable[tuple[str, str, str]]) -> Table:
     for heading in ("scene", "status", told):
         table.add_column(heading, overflow="fold")
     for name, status, text in rows:
-        shown = "[red]failed[/]" if status == "failed" else status
-        table.add_row(escape(printable(name)), shown, escape(printable(text)))
+        status = "[red]failed[/]" if status == "failed" else status
+        table.add_row(escape(printable(name)), status, escape(printable(text)))
     return table
 
 
@@ -104,30 +101,23 @@ def batch(
             check_results(folder, resume, overwrite)
 
     check()
+    reports, failures = dict[str, Report](), dict[str, str]()
     with writing(output, check, (), folder=True):
-        found = _batch(dict(zip(folders, runs, strict=True)), resume, overwrite, monitor)
-        texts = {SUMMARY: as_json(found.summary()), RESULTS: as_csv(found.reports)}
+        for folder, (name, run) in zip(folders, runs, strict=True):
+            monitor.say(f"--- {name}")
+            options = {"name": name, "output": folder, "resume": resume, "overwrite": overwrite, "monitor": monitor}
+            report = outcome(partial(run, **options), monitor)
+            if isinstance(report, Report):
+                reports[folder.name] = report
+            else:
+                failures[folder.name] = report
+                monitor.say(f"failed: {name}: {report}")
+        names = {folder.name: name for folder, (name, _) in zip(folders, runs, strict=True)}
+        done = Batch(names, reports, failures)
+        texts = {SUMMARY: as_json(done.summary()), RESULTS: as_csv(reports)}
         for path in write_texts(output, texts, overwrite=True):  # checked at the start
             monitor.say(f"wrote {path}")
-    return found
-
-
-def _batch(
-    runs: Mapping[Path, tuple[str, Callable[..., Report]]], resume: bool, overwrite: bool, monitor: Monitor
-) -> Batch:
-    """Evaluate scenes, by their folders."""
-    reports: dict[str, Report] = {}
-    failures: dict[str, str] = {}
-    for folder, (name, run) in runs.items():
-        monitor.say(f"--- {name}")
-        given = {"name": name, "output": folder, "resume": resume, "overwrite": overwrite}
-        found = outcome(partial(run, **given, monitor=monitor), monitor)
-        if isinstance(found, Report):
-            reports[folder.name] = found
-        else:
-            failures[folder.name] = found
-            monitor.say(f"failed: {name}: {found}")
-    return Batch({folder.name: name for folder, (name, _) in runs.items()}, reports, failures)
+    return done
 
 
 def outcome(run: Callable[[], T], monitor: Monitor) -> T | str:
@@ -143,8 +133,3 @@ def outcome(run: Callable[[], T], monitor: Monitor) -> T | str:
     except Exception as error:  # a mistake in aaplug must not cost the other scenes
         monitor.say(traceback.format_exc())
         return f"unexpected {type(error).__name__}: {error}"
-
-
-def _mean(values: Sequence[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return sum(known) / len(known) if len(known) == len(values) else None

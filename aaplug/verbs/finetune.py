@@ -11,11 +11,10 @@ from typing import Any
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.cameras import Camera, CameraSet
+from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.sampling import sampling_bounds
 from aaplug.evaluation.engine import Candidate, compare
-from aaplug.evaluation.protocols import TruthSource
 from aaplug.evaluation.report.contact_sheet import contact_sheet
 from aaplug.evaluation.results import Report, results
 from aaplug.evaluation.truth import MEMORY, Truth, back_projected, source_of, upsampled
@@ -29,7 +28,7 @@ from aaplug.io.images import write_png
 from aaplug.io.scenes import SceneLike, check_scene_output, write_scene
 from aaplug.methods import RECIPES
 from aaplug.methods.conversion import fuse_for
-from aaplug.methods.viewers import FAST, VIEWERS, Viewer
+from aaplug.methods.viewers import FAST, VIEWERS
 from aaplug.options.shared import AnyPath
 from aaplug.options.verbs import FinetuneOptions
 from aaplug.rendering.cost import GRADIENTS, Cost, cost_of
@@ -77,12 +76,14 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
         AaplugError: as `render`; also, the checkpoint is of another run, or no gradient is finite.
         KeyboardInterrupt: Ctrl-C stopped the run; its checkpoint is written.
     """
-    method, viewer = METHODS.find(options.method, "method"), _viewer(options)
-    settings, path = settings_of(method, options), None if output is None else Path(output)
+    method, path = METHODS.find(options.method, "method"), None if output is None else Path(output)
+    settings, viewer = settings_of(method, options), options.viewer or method.viewer
+    if isinstance(viewer, str):
+        viewer = FAST if viewer == FAST.name else VIEWERS.find(viewer, "viewer")
     job = Job.of(scene, cameras, options)
-    check = partial(_check, path, job.scene.files, options)
+    check = partial(_check, path, job.scene.files, options.resume, options.overwrite)
     check()
-    truth_source = _truth_source(options.truth, job.cameras)
+    truth_source = source_of(job.cameras.train, options.truth)
     enlarge = back_projected if options.upsampler is None else upsampled(find_upsampler(options.upsampler))
     upsampler = str(options.upsampler)
     upsampler = digest_of_files([upsampler]) if Path(upsampler).is_file() else upsampler
@@ -113,8 +114,11 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
             report = compare(candidates, job.views, scales, truth, tell)
         tuned = Tuned(result, report, settings, state.curve, state.probes)
         if path is not None:
+            with replacing(_beside(path, "json"), options.overwrite) as stream:
+                stream.write(json.dumps(tuned.as_json() | {"curve": list(tuned.curve)}, indent=1).encode())
             sheet = _sheet(candidates, job.views[0], scales, truth)
-            _write(path, tuned, sheet, options.overwrite)
+            write_png(_beside(path, "png"), sheet, overwrite=options.overwrite)
+            _beside(path, "pt").unlink(missing_ok=True)
     return tuned
 
 
@@ -123,18 +127,14 @@ def _beside(scene: Path, kind: str) -> Path:
     return scene.with_suffix(f".finetune.{kind}")
 
 
-def _check(path: Path | None, inputs: Sequence[Path], options: FinetuneOptions) -> None:
+def _check(path: Path | None, inputs: Sequence[Path], resume: bool, overwrite: bool) -> None:
     """Check, before any work, the checkpoints, and that the scene and the files beside it may be written."""
     if path is None:
-        if options.resume:
+        if resume:
             raise UsageError("resume", "needs the `output` of the interrupted run")
         return
-    check_scene_output(path, options.overwrite, inputs)
-    for kind, replaces in (
-        ("json", options.overwrite),
-        ("png", options.overwrite),
-        ("pt", options.resume or options.overwrite),
-    ):
+    check_scene_output(path, overwrite, inputs)
+    for kind, replaces in (("json", overwrite), ("png", overwrite), ("pt", resume or overwrite)):
         check_output(_beside(path, kind), replaces, inputs)
 
 
@@ -152,26 +152,3 @@ def _sheet(candidates: Sequence[Candidate], view: Camera, scales: Iterable[float
     """A view at every scale: the truth, and each candidate."""
     rows = [(s, [truth(view, s), *(c.renderer(view.scaled(s)).rgb for c in candidates)]) for s in scales]
     return contact_sheet(("truth", *(c.name for c in candidates)), rows)
-
-
-def _write(path: Path, tuned: Tuned, sheet: Image, overwrite: bool) -> None:
-    """Write the report and the pictures, and remove the checkpoint."""
-    with replacing(_beside(path, "json"), overwrite) as stream:
-        stream.write(json.dumps(tuned.as_json() | {"curve": list(tuned.curve)}, indent=1).encode())
-    write_png(_beside(path, "png"), sheet, overwrite=overwrite)
-    _beside(path, "pt").unlink(missing_ok=True)
-
-
-def _viewer(options: FinetuneOptions) -> Viewer:
-    """The viewer that will show the scene: as asked, or the method's own."""
-    if not isinstance(options.viewer, str):
-        return options.viewer or METHODS[options.method].viewer
-    return FAST if options.viewer == FAST.name else VIEWERS.find(options.viewer, "viewer")
-
-
-def _truth_source(truth: str, cameras: CameraSet) -> TruthSource:
-    """The source of the images that renders are compared with."""
-    missing = [view.name for view in cameras.train if view.photo is None]
-    if truth == "photographs" and missing:
-        raise UsageError(missing[0], "has no photograph; `truth` self needs none")
-    return source_of(cameras.train, truth)

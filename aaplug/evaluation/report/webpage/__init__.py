@@ -111,7 +111,17 @@ def _gallery(report: Report, images: ImageStore) -> dict[str, Any]:
         truth = images.path(view, report.recipes[-1], scale, TRUTHS)
         if truth.is_file():
             files[view, scale][TRUTH] = truth
-    uris, scores, shots = _uris([path for roles in files.values() for path in roles.values()]), _scores(report), []
+    paths, shots = [path for roles in files.values() for path in roles.values()], []
+    encoded = {path: encode_webp(read_image(path, None), None) for path in paths}
+    if sum(map(len, encoded.values())) > LOSSLESS_BYTES:
+        encoded = {path: encode_webp(read_image(path, None), LOSSY_QUALITY) for path in paths}
+    uris = {path: "data:image/webp;base64," + base64.b64encode(webp).decode() for path, webp in encoded.items()}
+    scores = {  # of the report's first metric against the truth
+        (m.view, m.scale, m.recipe): _with_unit(metric, value)
+        for metric in report.compared[:1]
+        for m in report.measurements
+        if (value := m.values.get(metric.name)) is not None
+    }
     for (view, scale), roles in files.items():
         width, height = image_size(roles[report.recipes[-1]])
         pictures = {
@@ -127,24 +137,6 @@ def _gallery(report: Report, images: ImageStore) -> dict[str, Any]:
         "ceiling": CEILING,
         "recipes": list(report.recipes),
         "shots": shots,
-    }
-
-
-def _uris(paths: Sequence[Path]) -> dict[Path, str]:
-    """Lossless images, or lossy ones where those would be too large."""
-    encoded = {path: encode_webp(read_image(path, None), None) for path in paths}
-    if sum(map(len, encoded.values())) > LOSSLESS_BYTES:
-        encoded = {path: encode_webp(read_image(path, None), LOSSY_QUALITY) for path in paths}
-    return {path: "data:image/webp;base64," + base64.b64encode(webp).decode() for path, webp in encoded.items()}
-
-
-def _scores(report: Report) -> dict[tuple[str, float, str], str]:
-    """By view, scale and recipe: the value of the report's first metric against the truth, as text."""
-    return {
-        (m.view, m.scale, m.recipe): _with_unit(metric, value)
-        for metric in report.compared[:1]
-        for m in report.measurements
-        if (value := m.values.get(metric.name)) is not None
     }
 
 
