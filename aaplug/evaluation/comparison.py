@@ -52,7 +52,7 @@ class Change:
 
     @classmethod
     def of(cls, values: Float[Tensor, "*m"]) -> "Change":
-        """Of differences, or of their lengths; 0 of none."""
+        """The change by differences or their lengths; 0 if there are none."""
         if not values.numel():
             return cls(0.0, 0.0, 0.0)
         sizes = values.double().abs().flatten()

@@ -97,15 +97,10 @@ class Task:
         return tuple(sorted(self.metrics, key=lambda metric: metric.measure is None))
 
     @property
-    def names(self) -> list[str]:
-        """Rows of the report."""
-        return [CEILING, *(candidate.name for candidate in self.candidates)]
-
-    @property
     def rows(self) -> list[str]:
-        """Rows that every view has a measurement of, at every scale."""
-        with_ceiling = self.ceiling and self.resizes and self.truth.source != "reference"
-        return self.names if with_ceiling else self.names[1:]
+        """Rows of the report; every view has a measurement of each at every scale."""
+        ceiling = [CEILING] if self.ceiling and self.resizes and self.truth.source != "reference" else []
+        return ceiling + [candidate.name for candidate in self.candidates]
 
     @property
     def sized_views(self) -> list[Camera]:
@@ -117,11 +112,11 @@ class Task:
         """An estimate: every candidate's images, the truths, which are as fine as training, and their comparison."""
         truths = [*self.views] * (1 if self.resizes else len(self.scales))
         images, truth = cost_of(self.renderers, self.sized_views), cost_of([self.truth.renderer], truths)
-        return images._replace(seconds=images.seconds + truth.seconds + comparing(self.sized_views, len(self.names)))
+        return images._replace(seconds=images.seconds + truth.seconds + comparing(self.sized_views, len(self.rows)))
 
     @property
     def renderers(self) -> list[Renderer]:
-        """Those of the candidates."""
+        """Renderers of the candidates."""
         return [candidate.renderer for candidate in self.candidates]
 
     @property
@@ -158,7 +153,7 @@ def evaluate(
         for index, measurements in apply(ViewMeasurer(task, images), remaining) if remaining else ():
             finished.add(index, measurements)
             tell(len(finished.views), len(task.views))
-    rows, measurements = task.names, [m for index in sorted(finished.views) for m in finished.views[index]]
+    rows, measurements = task.rows, [m for index in sorted(finished.views) for m in finished.views[index]]
     measurements.sort(key=lambda m: (rows.index(m.recipe), task.scales.index(m.scale)))
     return Report(tuple(measurements), request, task.measured)
 
@@ -191,7 +186,8 @@ def _checked(task: Task) -> Task:
         raise UsageError("evaluate", "needs at least one recipe, one scale and one view")
     if any(not (scale > 0 and math.isfinite(scale)) for scale in task.scales):
         raise UsageError("scale", f"sizes must be above 0, got {min(task.scales):g}")
-    if len(set(task.names)) != len(task.names) or len(set(task.scales)) != len(task.scales):
+    names = {CEILING, *(candidate.name for candidate in task.candidates)}
+    if len(names) != len(task.candidates) + 1 or len(set(task.scales)) != len(task.scales):
         raise UsageError("evaluate", "a recipe or a scale is named twice")
     views = task.views
     if len({view.name for view in views}) < len(views):
@@ -329,21 +325,14 @@ class _Comparison:
 
     def __call__(self, image: TimedImage, series: Series | None) -> tuple[Values, str]:
         """Values by metric, and the reasons why some are undefined; the ceiling has no series, and so no figures."""
-        compared = self._compared(quantised(image.rgb))
-        values = {m.name: compared[m.name] if m.measure else (series and m.of(series)) for m in self.metrics}
-        if self.truth is None:
-            return values, NO_PHOTOGRAPH
-        undefined = [m.undefined for m in self.metrics if m.measure and values[m.name] is None]
-        return values, "; ".join(dict.fromkeys(undefined))
-
-    def _compared(self, image: Image) -> Values:
-        metrics = [metric for metric in self.metrics if metric.measure]
-        if self.truth is None:
-            return dict.fromkeys(metric.name for metric in metrics)
-        for earlier, values in self._results:
-            if image.equal(earlier):
-                return values
-        part = slice(EQUAL_IMAGES_SIDE if image.equal(self.truth) else None)
-        values = {m.name: m.compare(image[part, part], self.truth[part, part]) for m in metrics}
-        self._results.append((image, values))
-        return values
+        rgb, truth, measures = quantised(image.rgb), self.truth, [metric for metric in self.metrics if metric.measure]
+        values = next((earlier for other, earlier in self._results if rgb.equal(other)), None)
+        if truth is None:
+            values = dict.fromkeys(metric.name for metric in measures)
+        elif values is None:
+            part = slice(EQUAL_IMAGES_SIDE if rgb.equal(truth) else None)
+            values = {m.name: m.compare(rgb[part, part], truth[part, part]) for m in measures}
+            self._results.append((rgb, values))
+        values = {m.name: values[m.name] if m.measure else (series and m.of(series)) for m in self.metrics}
+        undefined = [metric.undefined for metric in measures if values[metric.name] is None]
+        return values, NO_PHOTOGRAPH if truth is None else "; ".join(dict.fromkeys(undefined))

@@ -102,11 +102,11 @@ class Survey:
 
 def survey(opened: Scene, cameras: Sequence[Camera] = (), tell: Tell = lambda done, total: None) -> Survey:
     """Survey a scene; unusable rows are counted and left out.  `tell` is called with Gaussians done and in all."""
-    found = Survey(cameras)
-    for part in opened.parts(faults=found.faults):
-        found.add(part)
-        tell(found.count, max(1, opened.count))
-    return found
+    statistics = Survey(cameras)
+    for part in opened.parts(faults=statistics.faults):
+        statistics.add(part)
+        tell(statistics.count, max(1, opened.count))
+    return statistics
 
 
 def check_frame_of(opened: Scene, cameras: Sequence[Camera], min_seen: float) -> float:

@@ -1,4 +1,4 @@
-"""What a run works on, how far it has come, and its checkpoints.
+"""The work of a run, its state, and its checkpoints.
 
 A checkpoint is one file of everything that the next step depends on, written whole or not at all.  It is torch's, of
 tensors, numbers and strings only, and is read as such: nothing in it is executed.
@@ -32,7 +32,7 @@ FORMAT, VERSION = "aaplug finetune", 5  # of a checkpoint
 
 @dataclass(frozen=True, eq=False)
 class TuningJob:
-    """What to tune, how it will be viewed, and what it should look like.
+    """A scene to tune, the way it will be drawn, and the images that it should give.
 
     start: draws the scene that the run starts from as the viewer will; its recipe has no world filter.
     views: training views, at the training size.

@@ -83,14 +83,14 @@ def measure(renderer: Renderer, camera: Camera, kernels: Kernels, repeats: int =
         replace(renderer, rasterizer=rasterizer.counting(counts.append))(camera)
         a = torch.ones(MATRIX_SIDE, MATRIX_SIDE)
         frame, product = _timed(repeats, lambda: renderer(camera), lambda: a @ a)
-    both = _timed(repeats, lambda: gradient_step(renderer, camera))[0] if backward else None
+    gradients = _timed(repeats, lambda: gradient_step(renderer, camera))[0] if backward else None
     return Figures(
         rasterizer=kernels.name,
         gaussians=gaussians,
         width=camera.width,
         height=camera.height,
         forward_ms=frame,
-        forward_backward_ms=both,
+        forward_backward_ms=gradients,
         evaluations=sum(counts),
         tile_evaluations=tile_evaluations,
         ns_per_evaluation=stages["composite"] * 1e6 / max(1, sum(counts)),
@@ -193,9 +193,9 @@ def _stages(renderer: Renderer, camera: Camera, kernels: Kernels, repeats: int) 
         chunk = cut.of(scene)
     splats = stage("project", lambda: project(chunk, camera, kernels))
     if cut is not None:
-        own = splats.sources
-        splats = replace(splats, sources=cut.places.index_select(0, own))
-        splats = splats if cut.shares is None else faded(splats, cut.shares.index_select(0, own))
+        rows = splats.sources  # of the cut
+        splats = replace(splats, sources=cut.places.index_select(0, rows))
+        splats = splats if cut.shares is None else faded(splats, cut.shares.index_select(0, rows))
     splats = stage("filter", lambda: recipe.screen(splats, camera, training))
     splats = stage("cull", lambda: cull(splats, hw, kernels=kernels))
     splats = stage("shade", lambda: shade(splats, scene, camera, kernels))

@@ -27,7 +27,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Batch:
-    """What became of the scenes, by the names of their folders: a report, or in words why there is none."""
+    """Outcomes of the scenes, by the names of their folders: a report, or in words why there is none."""
 
     names: Mapping[str, str]
     reports: Mapping[str, Report]
@@ -64,11 +64,11 @@ class Batch:
         return [*grids, scenes]
 
 
-def status_table(told: str, rows: Iterable[tuple[str, str, str]]) -> Table:
-    """What became of each scene: its name, its status, and what is told of it."""
+def status_table(heading: str, rows: Iterable[tuple[str, str, str]]) -> Table:
+    """A table of the scenes: name, status, and a text under the heading."""
     table = Table(title="scenes", title_justify="left")
-    for heading in ("scene", "status", told):
-        table.add_column(heading, overflow="fold")
+    for column in ("scene", "status", heading):
+        table.add_column(column, overflow="fold")
     for name, status, text in rows:
         status = "[red]failed[/]" if status == "failed" else status
         table.add_row(escape(printable(name)), status, escape(printable(text)))
@@ -121,7 +121,7 @@ def batch(
 
 
 def outcome(run: Callable[[], T], monitor: Monitor) -> T | str:
-    """What one scene of many came to, or in words why there is nothing."""
+    """The result of one scene of many, or in words why there is none."""
     try:
         return run()
     except ClusterError:  # the next scene would end alike

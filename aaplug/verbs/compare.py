@@ -65,23 +65,25 @@ def compare(scenes: ScenesLike, cameras: CamerasLike, output: AnyPath | None, op
     with running(options, folder, check, inputs, folder=True) as workers:
         look = job.look(len(views) * len(scales) * len(rows))
         job.say_assumed(look)
-        recipe, own = job.recipe(options.recipe), {"rasterizer": look.rasterizer, "background": look.background}
-        renderers = [Renderer.of(scene, job.training(scene), recipe, **own) for scene in named.values()]
+        recipe, same = job.recipe(options.recipe), {"rasterizer": look.rasterizer, "background": look.background}
+        renderers = [Renderer.of(scene, job.training(scene), recipe, **same) for scene in named.values()]
         truth = Truth(renderers[0], "reference", PROTOCOL)
         if viewer is not None:
-            drawn = [viewer.shown(scene.gaussians()) for scene in named.values()]
-            trained, recipe = [renderer.training for renderer in renderers], RECIPES[viewer.recipe]
-            renderers = [Renderer.of(s, t, recipe, **own) for s, t in zip(drawn, trained, strict=True)]
+            recipe, pairs = RECIPES[viewer.recipe], zip(named.values(), renderers, strict=True)
+            renderers = [Renderer.of(viewer.shown(s.gaussians()), r.training, recipe, **same) for s, r in pairs]
         candidates = [Candidate(name, renderer) for name, renderer in zip(named, renderers, strict=True)]
         task = Task(candidates, scales, views, truth, metrics, ceiling=False)
         job.announce(renderers, task.sized_views, cost=task.cost, processes=workers.threads)
-        asked = {"quality": options.quality, "rate_reference": options.rate_reference or "pose", "shown": options.show}
         facts = facts_of(task, job.cameras.notes) | {
             "rows": "compared scene",
             "reference": rows[0].name,
             "viewer": viewer and viewer.name,
             "scenes_sha256": {row.name: row.digest for row in rows},
-            "options": asked,
+            "options": {
+                "quality": options.quality,
+                "rate_reference": options.rate_reference or "pose",
+                "shown": options.show,
+            },
         }
         pool = workers.cluster or ProcessesIfLong(workers.threads)
         with job.monitor.progress("comparing", "views") as tell:

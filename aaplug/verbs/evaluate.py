@@ -60,9 +60,9 @@ def evaluate(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
         candidates = candidates_of(job.scene, look.training, recipes, look.rasterizer, look.background)
         task = Task(candidates, scales, views, Truth(look, source, protocol), metrics)
         job.announce(task.renderers, task.sized_views, cost=task.cost)
-        asked = {"quality": options.quality, "rate_reference": options.rate_reference or "pose"}
-        asked |= {"shown": options.show if options.report else None, "layout": options.layout}
-        facts = {**facts_of(task, job.cameras.notes), "scene": facts_of_scene(job.scene), "options": asked}
+        choices = {"quality": options.quality, "rate_reference": options.rate_reference or "pose"}
+        choices |= {"shown": options.show if options.report else None, "layout": options.layout}
+        facts = {**facts_of(task, job.cameras.notes), "scene": facts_of_scene(job.scene), "options": choices}
         apply = workers.cluster.map if workers.cluster else map
         with job.monitor.progress(f"evaluating {name}", "views") as tell:
             report = measure(task, facts, tell, folder and folder / JOURNAL, options.resume, images, apply)
@@ -99,7 +99,7 @@ def check_journalled(folder: Path | None, files: Sequence[str], what: str, resum
 
 
 def facts_of_scene(scene: Scene) -> dict[str, Any]:
-    """What is known of a scene's Gaussians, and hashes of them and of their file."""
+    """File, number and convention of a scene's Gaussians, and hashes of them and of the file."""
     gaussians = scene.gaussians() if scene.levels is None else scene.levels.scene
     origin = gaussians.origin
     return {

@@ -142,9 +142,9 @@ def _cost(start: Renderer, views: Sequence[Camera], settings: Settings) -> Cost:
     """An estimate: a step draws one scale and the anchor; each view's truth is rendered once for each scale."""
     frame = {s: cost_of([start], [v.scaled(s) for v in views]).seconds / len(views) for s in (1.0, *settings.weights)}
     anchors = 1 if settings.anchor else 0
-    drawn = mean(frame[scale] for scale in settings.weights) + anchors * frame[1.0]
+    step = mean(frame[scale] for scale in settings.weights) + anchors * frame[1.0]
     truths = min(settings.steps * (1 + anchors), len(views) * len(frame))
-    seconds = GRADIENTS * settings.steps * drawn + truths * frame[1.0]
+    seconds = GRADIENTS * settings.steps * step + truths * frame[1.0]
     return cost_of([start], views)._replace(seconds=seconds)
 
 

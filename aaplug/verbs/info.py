@@ -1,7 +1,7 @@
-"""What a scene is."""
+"""Facts of a scene: its convention and why, what is fused, what is odd."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from aaplug.core.cameras import CameraSet
@@ -56,10 +56,12 @@ def info(scene: SceneLike | None, cameras: CamerasLike, options: FrameOptions) -
         sampling = _assumed_facts(statistics, job.cameras, frame_around(opened, orbit))
     else:
         sampling = _sampling_facts(statistics, job.cameras, opened.convention.kernel) if train else {}
-    return _scene_facts(opened, statistics) | sampling | {"problems": list(_problems(opened, statistics))}
+    comments = opened.document.header.comments if isinstance(opened.document, Document) else []
+    problems = list(_problems(opened, statistics, comments))
+    return _scene_facts(opened, statistics, comments) | sampling | {"problems": problems}
 
 
-def _scene_facts(scene: Scene, statistics: Survey) -> dict[str, Any]:
+def _scene_facts(scene: Scene, statistics: Survey, comments: Sequence[str]) -> dict[str, Any]:
     scale = statistics.scales.quantile(0.5)
     return {
         "file": scene.name,
@@ -77,17 +79,13 @@ def _scene_facts(scene: Scene, statistics: Survey) -> dict[str, Any]:
         "fused": [{"method": f.method, **f.settings} for f in scene.fused],
         "fused_text": "; ".join(describe(f) for f in scene.fused) or "nothing",
         "notes": list(scene.notes),
-        "comments": _comments(scene),
+        "comments": comments,
         "low_corner": statistics.low.tolist() if statistics.count else None,
         "high_corner": statistics.high.tolist() if statistics.count else None,
         "needle_share": statistics.needles / max(1, statistics.count),
         "median_opacity": statistics.opacities.quantile(0.5),
         "median_scale": None if scale is None else math.exp(scale),
     }
-
-
-def _comments(scene: Scene) -> list[str]:
-    return scene.document.header.comments if isinstance(scene.document, Document) else []
 
 
 def _sampling_facts(statistics: Survey, cameras: CameraSet, kernel: float) -> dict[str, Any]:
@@ -103,7 +101,6 @@ def _sampling_facts(statistics: Survey, cameras: CameraSet, kernel: float) -> di
 
 
 def _assumed_facts(statistics: Survey, cameras: CameraSet, frame: Frame) -> dict[str, Any]:
-    """What can be told without cameras."""
     side = max(cameras.train[0].hw)
     shares = {size: statistics.multiples.share_below(math.log(side / size)) for size in PICTURE_SIDES}
     return {
@@ -117,8 +114,8 @@ def _assumed_facts(statistics: Survey, cameras: CameraSet, frame: Frame) -> dict
     }
 
 
-def _problems(scene: Scene, statistics: Survey) -> Iterator[str]:
-    """What is odd about the scene, each with what to do."""
+def _problems(scene: Scene, statistics: Survey, comments: Sequence[str]) -> Iterator[str]:
+    """Yield what is odd about the scene, each with what to do."""
     for text, number in statistics.faults.items():
         yield f"{number:,} Gaussians have {text}: --drop-bad leaves them out"
     if not scene.count:
@@ -137,6 +134,6 @@ def _problems(scene: Scene, statistics: Survey) -> Iterator[str]:
     extent = (statistics.high - statistics.low).max().item()
     if 0 < extent < MIN_STEPS * ULP * farthest:
         yield f"lies {farthest:.3g} from the origin, where float32 is coarse: centre it before training"
-    modes = [c for c in _comments(scene) if c.lower().startswith("splatrendermode")]
+    modes = [c for c in comments if c.lower().startswith("splatrendermode")]
     if len({mode.lower() for mode in modes}) > 1:
         yield f"its comments contradict each other ({'; '.join(modes)}): the last one counts; --convention overrides it"

@@ -1,4 +1,4 @@
-"""What laws are made of: their table, and scenes, cameras and splats at random to try them on."""
+"""The table of laws, and scenes, cameras and splats at random to try them on."""
 
 import math
 from collections.abc import Callable

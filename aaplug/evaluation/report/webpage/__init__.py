@@ -36,6 +36,9 @@ def page(
     name: str, report: Report, bounds: Coverage, plots: list[Plot], images: ImageStore, facts: Sequence[Facts] = ()
 ) -> str:
     """The page's text; raises FormatError where an image that it shows is missing.  facts: further tables."""
+    variants = report.protocol.get("metrics", {})
+    tables = [(m.title, variants.get(m.name, m.protocol), metric_cells(report, m)) for m in report.metrics]
+    tables += [(title, about, cells) for about, (title, cells) in zip(COSTS, cost_cells(report), strict=False)]
     return assembled(
         __name__,
         "page.html.j2",
@@ -47,7 +50,10 @@ def page(
         scales=[scale_name(scale) for scale in report.scales],
         ceiling=CEILING,
         headline=_headline(report),
-        tables=_tables(report),
+        tables=[
+            {"title": title, "about": about, "rows": list(zip(report.recipes, cells, strict=True))}
+            for title, about, cells in tables
+        ],
         fact_tables=facts,
         against=AGAINST[report.protocol["truth"]],
         notes=report.notes,
@@ -79,17 +85,6 @@ def _headline(report: Report) -> dict[str, str] | None:
                     "ceiling_value": "" if ceiling is None else _with_unit(metric, ceiling),
                 }
     return None
-
-
-def _tables(report: Report) -> list[dict[str, Any]]:
-    """Title, meaning, and rows of (recipe, cells)."""
-    variants = report.protocol.get("metrics", {})
-    tables = [(m.title, variants.get(m.name, m.protocol), metric_cells(report, m)) for m in report.metrics]
-    tables += [(title, about, cells) for about, (title, cells) in zip(COSTS, cost_cells(report), strict=False)]
-    return [
-        {"title": title, "about": about, "rows": list(zip(report.recipes, cells, strict=True))}
-        for title, about, cells in tables
-    ]
 
 
 def _text(value: Any) -> str:
