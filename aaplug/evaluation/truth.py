@@ -29,7 +29,7 @@ from aaplug.methods.recipes import find_recipe
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import UsageError, not_one_of
 
-NO_PHOTOGRAPH = "has no photograph to compare with; truth 'self' compares with the scene's own render"
+NO_PHOTOGRAPH = "has no photograph; `truth` self compares with the scene's own render"
 MEMORY = 1e9  # bytes of images to cache; what does not fit is made again each time
 CACHE_DTYPE = torch.float16  # 11 significant bits, against the 8 that are compared
 SLAB_SIZE = 1 << 25  # numbers of the cache allocated at once: 64 MB
