@@ -298,17 +298,6 @@ def test_needles_are_counted(tmp_path):
     assert aaplug.info(tmp_path / "a.ply")["needle_share"] == 0.25
 
 
-def test_python_takes_an_orbit_for_cameras(dataset, tmp_path):
-    scene = aaplug.read_scene(dataset / "scene.ply").gaussians()
-    chosen = aaplug.Orbit(orbit=2, train_view="48x36")
-    by_file = aaplug.render(dataset / "scene.ply", chosen, tmp_path / "a")
-    by_scene = aaplug.render(scene, chosen, tmp_path / "b")
-    by_cameras = aaplug.render(scene, around(scene, chosen), tmp_path / "c")
-    images = [[image.file.read_bytes() for image in written] for written in (by_file, by_scene, by_cameras)]
-    assert images[0] == images[1] == images[2]
-    assert len(images[0]) == 2
-
-
 def test_a_scene_of_nothing_is_refused(cli):
     write_scene("empty.ply", make_scene(0))
     code, _, err = cli("render empty.ply -o new")

@@ -90,7 +90,7 @@ def test_whoever_is_killed_the_bytes_are_those_of_one_process(cli, monkeypatch):
         master = stack.enter_context(started("scheduler", "--port", "0", "--host", "127.0.0.1"))
         address = line_of(master, "Scheduler at:").split()[-1]
         how = ("--nthreads", "1", "--memory-limit", "0", "--no-nanny")
-        workers = [stack.enter_context(started("worker", address, *how)) for _ in range(3)]
+        workers = [stack.enter_context(started("worker", address, *how)) for _ in range(2)]
         for worker in workers:
             line_of(worker, "Registered to")
         words = f"evaluate scene.ply {SETTINGS} -o out --scheduler {address}"

@@ -200,14 +200,6 @@ def test_a_scene_without_pixel_sizes_is_refused():
     assert suited(recipe, sized(scene)) is recipe
 
 
-def test_pixel_sizes_follow_their_gaussians():
-    scene = sized(make_scene(8)).to(F64)
-    part = PixelSizes.of(scene[torch.tensor([4, 1])])
-    assert part is not None
-    assert part.base.tolist() == [True, False]
-    assert len(part.largest) == 2
-
-
 @pytest.mark.parametrize(("name", "factor"), [("2dgs", 1.0), ("2dgs-matched", 0.5)])
 def test_the_low_pass_filter_follows_the_rate_where_it_is_matched(name, factor):
     """A disc of no size looks like its filter: √½ px wide, or √½ / 2 px at half the size."""

@@ -165,17 +165,6 @@ def test_images_equal_the_formula(mode, channels):
         assert mode == "antialiased" or (expected[0] - capped).abs().max() > 1e-4, "the cap should matter here"
 
 
-@pytest.mark.parametrize("mode", ["RGB", "D", "ED", "RGB+D", "RGB+ED"])
-def test_images_in_float32_equal_the_reference_rasterizers(mode):
-    values, views = gaussians(300, torch.float32, degree=1), two_views(torch.float32)
-    more = {"sh_degree": 1, "render_mode": mode, "backgrounds": torch.tensor([[1.0, 0.5, 0.2], [0.0, 0.3, 0.9]])}
-    found, exact = (rasterization(**values, **views, **more, rasterizer=name) for name in ("eager", "reference"))
-    assert found[0].shape[-1] == {"RGB": 3, "D": 1, "ED": 1}.get(mode, 4)
-    for a, b in zip(found[:2], exact[:2], strict=True):
-        assert b.dtype == F64
-        assert (a - b).abs().max() < 5e-5
-
-
 def test_depth_is_summed_by_weight_and_may_be_divided_by_alpha():
     values, views = gaussians(), two_views()
     backgrounds = torch.ones(2, 3, dtype=F64)

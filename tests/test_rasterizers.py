@@ -201,17 +201,6 @@ def test_a_splat_reaches_the_first_pixel_of_the_next_tile(way, alpha):
     close(image.alpha, REFERENCE(splats, (24, 24), BLACK).alpha)
 
 
-@pytest.mark.parametrize("opacity", [0.005, 0.02, 0.3])
-def test_thousands_of_splats_on_one_tile(opacity):
-    splats = make_splats(2000, (8, 8), 3, (2.0, 3.0)).to(F64)
-    splats = replace(splats, opacities=torch.full((2000,), opacity, dtype=F64))
-    tiled, exact = TILED(splats, (8, 8), SKY), REFERENCE(splats, (8, 8), SKY)
-    difference = (tiled.rgb - exact.rgb).abs().amax(dim=2)
-    assert difference.max() < 1e-3, "a flip is worth no more than what it leaves out"
-    assert difference.median() < TOLERANCE
-    assert difference[~near_a_cutoff(splats, (8, 8), band=1e-5)].max() < TOLERANCE
-
-
 def test_no_pass_has_a_single_tile():
     """Compiled kernels take no fewer than two, and eager ones are many times as slow."""
     deep = make_splats(600, (8, 8), 3, (-1.0, 0.0)).to(F64)  # in one corner of the image

@@ -237,6 +237,8 @@ def test_large_scenes_are_copied_in_whole(tmp_path: Path):
 @pytest.mark.parametrize(
     ("name", "n", "degree"),
     [
+        ("chair/chair.ply", 49_295, 3),
+        ("snowmiku/snowmiku.ply", 59_953, 3),
         ("splats/train-1000.ply", 1000, 3),
         ("splats/flowers_lod3_sh2.ply", 26_895, 2),
         ("small_splats/metalsplatter/SplatIO/TestData/test-splat.3-points-from-train.ply", 3, 3),

@@ -8,7 +8,6 @@ from dataclasses import replace
 from typing import get_args
 
 import pytest
-from aaplug_cli.inputs import FileOptions
 from aaplug_cli.verbs import VERBS
 
 from aaplug.finetuning.losses import LOSSES
@@ -109,10 +108,3 @@ def test_a_recipe_that_python_registers_can_be_named(monkeypatch):
     monkeypatch.setattr(RECIPES, "_entries", dict(RECIPES))
     RECIPES.register("mine", replace(RECIPES["mip"], name="mine"))
     assert RenderOptions(recipe="mine").recipe == "mine"
-
-
-def test_a_misspelled_name_is_refused_with_the_nearest():
-    with pytest.raises(UsageError, match=r"recipe: 'mipp' is not one of .*; did you mean mip\?"):
-        RenderOptions(recipe="mipp")
-    with pytest.raises(UsageError, match="convention: 'x' is not one of classic, antialiased"):
-        FileOptions(convention="x")

@@ -1,6 +1,6 @@
 """Kills at random moments: nothing is half written, nothing stays behind, and what can be resumed ends the same.
 
-`batch` is killed and resumed as one command.  Of `cluster` a worker is killed too; its bytes are those of one process.
+`batch` is killed and resumed as one command.
 """
 
 import os
@@ -14,8 +14,6 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
-
-import psutil
 
 from aaplug.io.images import read_image
 from aaplug.io.scenes import read_scene
@@ -44,15 +42,10 @@ quality = "fast"
 
 
 class Job(NamedTuple):
-    """A command to kill.
-
-    workers: further words of the runs that are killed and that follow, whose journal tells that workers are at work.
-    again: the word of the run that follows.
-    """
+    """A command to kill.  again: the word of the run that follows."""
 
     words: str
     again: str = "--overwrite"
-    workers: str = ""
 
 
 JOBS = {
@@ -65,7 +58,6 @@ JOBS = {
     ),
     "video": Job(f"video {SCENE} -o out/v.webm --scale 0.125 --seconds 0.3 --beside none"),
     "batch": Job("evaluate --batch batch.toml -o out/many", "--resume"),
-    "cluster": Job(f"{EVALUATION} auto --layout inria --views test", "--resume", "--scheduler local --threads 3"),
 }
 
 
@@ -114,10 +106,7 @@ def _killed(folder: Path, job: Job, count: int, dice: random.Random) -> tuple[li
 def _problem(folder: Path, job: Job, whole: dict[str, object], moment: float) -> str | None:
     """What went wrong after a kill at that moment, "" for nothing; None if the job had ended before."""
     shutil.rmtree(folder / "out")
-    words = f"{job.words} {job.workers}"
-    process = start(folder, words)
-    if job.workers:
-        _kill_a_worker(process, folder / "out" / "results" / "progress.jsonl")
+    process = start(folder, job.words)
     with suppress(subprocess.TimeoutExpired):
         process.wait(moment)
         return None
@@ -125,22 +114,13 @@ def _problem(folder: Path, job: Job, whole: dict[str, object], moment: float) ->
     process.wait()
     if torn := _torn(folder / "out"):
         return f"killed at {moment:.2f} s: {torn}"
-    code = start(folder, f"{words} {job.again}").wait()
-    if code and job.again == "--resume" and start(folder, f"{words} --overwrite").wait() == 0:
+    code = start(folder, f"{job.words} {job.again}").wait()
+    if code and job.again == "--resume" and start(folder, f"{job.words} --overwrite").wait() == 0:
         code = 0  # it had ended before it was killed, so that there was nothing to resume
     time.sleep(0.2)  # workers notice the death of their parent
     left = [p.name for p in folder.rglob("*") if p.name.startswith((OUR_PREFIX, SCRATCH_PREFIX))]
     same = _content(folder / "out") == whole
     return f"killed at {moment:.2f} s: exit code {code}, left {left}, same {same}" if code or left or not same else ""
-
-
-def _kill_a_worker(process: subprocess.Popen[bytes], journal: Path) -> None:
-    """Kill one of a command's workers as soon as a view is done."""
-    while not journal.exists() and process.poll() is None:
-        time.sleep(0.01)
-    with suppress(psutil.Error):
-        children = psutil.Process(process.pid).children(recursive=True)
-        next(child for child in children if "spawn_main" in " ".join(child.cmdline())).kill()
 
 
 def _content(folder: Path) -> dict[str, object]:
