@@ -1,6 +1,7 @@
 """The benchmark: figures that are measured, scenes that are what they say."""
 
 import json
+from pathlib import Path
 
 import pytest
 import torch

@@ -21,9 +21,9 @@ from aaplug.io.cameras import read_cameras
 from aaplug.io.images import image_size
 from aaplug.io.scenes import read_scene, write_scene
 from aaplug.io.scenes.packed import half_turn_about_x
-from aaplug.io.scenes.scene import Scene
 from aaplug.system.executors import ProcessesIfLong
 from tests.conftest import EYES, make_scene
+from tests.scene_files import DATA
 
 WORDS = "--cameras . --rasterizer eager --views train --scale 0.5 1 2"
 TURNS = {
@@ -319,10 +319,9 @@ def test_what_goes_to_another_process_leaves_files_behind(cli, monkeypatch):
     assert task.truth.renderer.scene is task.candidates[0].renderer.scene
 
 
-def test_bytes_of_a_folder_of_images_are_those_of_all(tmp_path):
-    scene = Scene(tmp_path / "meta.json", "sog", 0, 0, lambda start, stop: make_scene(0), "")
-    for name, size in (("meta.json", 3), ("means.webp", 5)):
-        (tmp_path / name).write_bytes(b"x" * size)
-    assert scene.bytes == 8
-    assert replace(scene, path=tmp_path / "means.webp").bytes == 5
-    assert replace(scene, path=tmp_path / "gone.ply").bytes is None
+def test_bytes_of_a_folder_of_images_are_those_of_all():
+    folder = DATA / "oracle_sog"
+    scene = read_scene(folder / "meta.json")
+    assert scene.bytes == sum(file.stat().st_size for file in folder.iterdir())
+    assert replace(scene, others=()).bytes == (folder / "meta.json").stat().st_size
+    assert replace(scene, path=folder / "gone.ply").bytes is None

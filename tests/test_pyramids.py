@@ -365,7 +365,7 @@ def test_tuning_brings_a_level_closer(sample_scene, sample_cameras):
     truth = Renderer.of(scene, few, "auto", quality="best")(view).rgb
     (merged,) = aaplug.lod(scene, few, simplify=0.1, scale=0.25, refine=False)
     for viewer, recipe, share in ((None, "matched", 0.8), ("spark-classic", "classic", 0.6)):
-        (tuned,) = aaplug.lod(scene, few, simplify=0.1, scale=0.25, steps=40, viewer=viewer)
+        (tuned,) = aaplug.lod(scene, few, simplify=0.1, scale=0.25, steps=60, viewer=viewer)
         assert len(merged.scene) == len(tuned.scene)
         shown = (Renderer.of(s.scene, few, recipe)(view).rgb for s in (merged, tuned))
         before, after = ((image - truth).square().mean() for image in shown)
