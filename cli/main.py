@@ -12,7 +12,8 @@ from contextlib import suppress
 from importlib.metadata import version
 
 from aaplug.system.allocator import keep_freed_memory
-from aaplug.system.errors import AaplugError, UsageError, did_you_mean, printable, reason
+from aaplug.system.errors import AaplugError, UsageError, did_you_mean, printable, reason, within_memory
+from aaplug.system.signals import end_as_by_interrupt
 
 FAILED, REFUSED, INTERRUPTED = 1, 2, 130  # exit codes
 GARBAGE = 100_000  # new objects between searches for cycles; Python's 700 take a tenth of the time to start
@@ -31,7 +32,8 @@ def main(words: Sequence[str] | None = None) -> None:
         sys.stdout.flush()
         sys.exit(code)
     except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
+        with suppress(OSError):  # its terminal has closed
+            print("interrupted", file=sys.stderr)
         sys.exit(INTERRUPTED)
     except OSError as error:
         of_output = error.filename is None and error.errno in UNWRITABLE
@@ -47,6 +49,7 @@ def main(words: Sequence[str] | None = None) -> None:
 def program() -> None:
     """Run the program and end its process at once: what Python does at exit takes torch half a second."""
     keep_freed_memory()
+    end_as_by_interrupt()
     gc.set_threshold(GARBAGE)
     try:
         main()
@@ -66,11 +69,10 @@ def _guarded(words: Sequence[str]) -> int:
 
     console.set_up()
     try:
-        return run(words)
+        with within_memory("aaplug"):
+            return run(words)
     except AaplugError as error:
         console.refuse(_worded(error, words))
-    except MemoryError:
-        console.refuse("out of memory; a smaller --scale or fewer Gaussians need less")
     except RecursionError:
         console.refuse("an input is nested too deeply")
     return REFUSED

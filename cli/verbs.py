@@ -346,7 +346,7 @@ def _text(value: Any) -> str:
 
 def _show_limits(as_json: bool) -> int:
     from aaplug.core.gaussians import MAX_LOG_SCALE
-    from aaplug.io.limits import LIMITS, limit, memory_of_machine
+    from aaplug.io.limits import LIMITS, limit, usable_memory
 
     values = {name: limit(name) for name in LIMITS}
     fixed = {
@@ -363,8 +363,8 @@ def _show_limits(as_json: bool) -> int:
     for name, (value, unit, what) in fixed.items():
         table.add_row(name, f"{value:,}", unit, what, "fixed")
     out.print(table)
-    if (memory := memory_of_machine()) is not None:
-        out.print(f"This machine has {memory / 1e9:.1f} GB of memory.")
+    if (memory := usable_memory()) is not None:
+        out.print(f"Memory: {memory}.")
     return 0
 
 

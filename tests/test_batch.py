@@ -225,7 +225,8 @@ def test_no_failure_of_a_scene_costs_another(tmp_path):
     found = evaluate_all(runs, tmp_path / "out")
     assert list(found.names.values()) == ["x", "y", "x", "z"]
     assert len(set(found.names)) == 4  # folders of their own
-    assert list(found.failures.values()) == ["unexpected ValueError: oh", "out of memory"]
+    memory = "scene: out of memory; a smaller `scale`, fewer `threads` or fewer Gaussians need less"
+    assert list(found.failures.values()) == ["unexpected ValueError: oh", memory]
     assert [report.recipes for report in found.reports.values()] == [("auto",), ("auto",)]
     # a mean over fewer scenes would not compare
     assert found.summary()["mean"] == {"auto@1": {"PSNR": None}}

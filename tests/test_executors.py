@@ -3,8 +3,10 @@
 import math
 import os
 import platform
+import signal
 import subprocess
 import sys
+import time
 from itertools import count
 
 import psutil
@@ -12,8 +14,10 @@ import pytest
 import torch
 
 from aaplug.system.cores import FREE_CORES, FreeCores, Reading, on_free_cores
-from aaplug.system.errors import FormatError, UsageError
+from aaplug.system.errors import FormatError, UsageError, within_memory
 from aaplug.system.executors import Processes, Threads, torch_threads
+from aaplug.system.locks import scratch
+from tests.conftest import ROOT
 
 PARENT = """
 import time
@@ -151,3 +155,131 @@ def test_torch_has_as_many_threads_as_cores_are_free_and_then_its_own_number(mon
         with on_free_cores():
             assert torch.get_num_threads() == 1
         assert torch.get_num_threads() == 2
+
+
+def hold(item: int) -> None:
+    with scratch():
+        time.sleep(item)
+
+
+HOLDS = """if __name__ == "__main__":
+    from aaplug.system.executors import Processes
+    from aaplug.system.locks import scratch
+    from aaplug.system.signals import end_as_by_interrupt
+    from tests.test_executors import hold
+    end_as_by_interrupt()
+    with scratch():
+        print("working", flush=True)
+        list(Processes(2).map(hold, [1000] * 9))
+"""
+
+
+@pytest.mark.parametrize(("name", "send"), [("SIGTERM", os.kill), ("SIGHUP", os.killpg)], ids=["parent", "group"])
+def test_signals_that_end_a_program_leave_no_worker_and_no_temporary_file(tmp_path, name, send):
+    script, temporary = tmp_path / "parent.py", tmp_path / "temporary"
+    script.write_text(HOLDS)
+    temporary.mkdir()
+    environment = os.environ | {"TMPDIR": str(temporary), "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, str(script)], env=environment, start_new_session=True, **streams) as parent:
+        while (
+            parent.poll() is None and len([*temporary.glob("aaplug-scratch-*")]) < 4
+        ):  # its own, the pool's, two items'
+            time.sleep(0.01)
+        workers = psutil.Process(parent.pid).children()
+        send(parent.pid, getattr(signal, name))
+        _, err = parent.communicate(timeout=60)
+    assert err.splitlines()[-1] == "KeyboardInterrupt", err
+    assert not psutil.wait_procs(workers, timeout=10)[1]
+    assert not [*temporary.iterdir()]
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError(),
+        RuntimeError("[enforce fail at alloc_cpu.cpp:127] DefaultCPUAllocator: can't allocate memory: you tried ..."),
+        RuntimeError("DefaultCPUAllocator: not enough memory: you tried to allocate 8 bytes."),
+        torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 8 bytes."),
+    ],
+)
+def test_lack_of_memory_is_one_clear_error(error):
+    with pytest.raises(UsageError, match="view r_0: out of memory; a smaller `scale`"), within_memory("view r_0"):
+        raise error
+
+
+def test_other_errors_are_not_taken_for_lack_of_memory():
+    with pytest.raises(RuntimeError, match="shape"), within_memory("view r_0"):
+        raise RuntimeError("shape '[2]' is invalid for input of size 3")
+
+
+LIMITED = """if True:
+    import resource
+    from pathlib import Path
+    import torch
+    from aaplug.rendering.renderer import Renderer
+    from aaplug.system.errors import UsageError
+    from tests.conftest import make_camera, make_scene
+    torch.set_num_threads(1)
+    renderer = Renderer.of(make_scene(200), [make_camera()], "classic")
+    renderer(make_camera())
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (used + 1_000_000, resource.RLIM_INFINITY))
+    try:
+        renderer(make_camera(size=(6000, 4000)))
+    except UsageError as error:
+        print(error)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_rendering_without_enough_memory_is_one_clear_error():
+    done = subprocess.run([sys.executable, "-c", LIMITED], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("view view at 6000x4000: out of memory;"), done
+
+
+SAME_BITS = """
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+import torch
+from aaplug.rendering.benchmark import synthetic_camera, synthetic_scene
+from aaplug.rendering.renderer import Renderer
+from aaplug.system.executors import Processes, Threads
+
+@dataclass
+class Draw:
+    renderers: list
+    views: list
+    def __call__(self, item):
+        return self.renderers[item % 2](self.views[item // 2]).rgb.numpy().tobytes()
+
+if __name__ == "__main__":
+    torch.set_num_threads(2)
+    scene, camera = synthetic_scene(2000), synthetic_camera(300, 200)
+    renderers = [Renderer.of(scene, [camera], "classic", rasterizer=name).portable() for name in ("eager", "auto")]
+    draw = Draw(renderers, [camera, camera.scaled(0.5), camera.scaled(0.25)])
+    items = range(6)
+    expected = [*map(draw, items)]
+    children = []
+    for _ in range(2):
+        child = os.fork()
+        if child == 0:
+            os._exit([*map(draw, items)] != expected)
+        children.append(child)
+    print("forked", [os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) for child in children])
+    with ThreadPoolExecutor(2) as pool:
+        print("threads", [*pool.map(draw, items)] == expected)
+    print("pool", [*Threads(2).map(draw, items)] == expected)
+    print("processes", [*Processes(2).map(draw, items)] == expected)
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")
+def test_threads_forked_processes_and_pools_draw_the_same_bits_as_one(tmp_path):
+    script = tmp_path / "draw.py"
+    script.write_text(SAME_BITS)
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}
+    words = [sys.executable, str(script)]
+    done = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=300, check=False)
+    assert done.stdout.splitlines() == ["forked [0, 0]", "threads True", "pool True", "processes True"], done.stderr

@@ -102,17 +102,23 @@ class Task:
         ceiling = [CEILING] if self.ceiling and self.resizes and self.truth.source != "reference" else []
         return ceiling + [candidate.name for candidate in self.candidates]
 
-    @property
+    @cached_property
     def sized_views(self) -> list[Camera]:
-        """Every view at every scale, as large as its image is."""
-        return [view.scaled(scale) if self.resizes else view for view in self.views for scale in self.scales]
+        """Every view at every scale, as the protocol draws it."""
+        truths = [ViewTruth(self.truth, view) for view in self.views]
+        return [truth.camera(scale) for truth in truths for scale in self.scales]
 
     @property
     def cost(self) -> Cost:
         """An estimate: every candidate's images, the truths, which are as fine as training, and their comparison."""
-        truths = [*self.views] * (1 if self.resizes else len(self.scales))
-        images, truth = cost_of(self.renderers, self.sized_views), cost_of([self.truth.renderer], truths)
-        return images._replace(seconds=images.seconds + truth.seconds + comparing(self.sized_views, len(self.rows)))
+        images, sized, count = cost_of(self.renderers, self.sized_views), self.sized_views, len(self.scales)
+        if self.resizes:
+            truths = [cost_of([self.truth.renderer], self.views)]
+        else:
+            looks = map(self.truth.supersampled, self.scales)
+            truths = [cost_of([look], sized[i::count]) for i, look in enumerate(looks)]
+        seconds = images.seconds + sum(cost.seconds for cost in truths) + comparing(sized, len(self.rows))
+        return images._replace(seconds=seconds, image=max(images.image, *(cost.image for cost in truths)))
 
     @property
     def renderers(self) -> list[Renderer]:

@@ -24,7 +24,6 @@ from aaplug.evaluation.metric import Image, TimedImage, TimedRenderer
 from aaplug.evaluation.protocols import Protocol, TruthSource, median_depth
 from aaplug.evaluation.upsamplers import Upsampler, bicubic
 from aaplug.io.photographs import DOWNSCALES, Photograph
-from aaplug.methods.recipe import Recipe
 from aaplug.methods.recipes import find_recipe
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import UsageError, not_one_of
@@ -98,6 +97,11 @@ class Truth:
         """The renderer with a clock; one for all views."""
         return TimedRenderer(self.renderer)
 
+    def supersampled(self, scale: float) -> Renderer:
+        """The renderer of a view that a protocol moves, with samples as dense as training's pixels."""
+        samples = max(1, math.ceil(1 / scale))
+        return replace(self.renderer, recipe=replace(self.renderer.recipe, grid=samples))
+
     def cached(self, view: Camera, scale: float, make: Callable[[], Image | None]) -> Image | None:
         """The cached image, or a new one, cached while there is room."""
         if self.memory is None:
@@ -147,8 +151,7 @@ class ViewTruth:
         if truth.source == "reference":
             return self.reference(scale).rgb
         if truth.protocol.change != "size":
-            samples = max(1, math.ceil(1 / scale))  # as dense as training's pixels
-            return self._render(camera, replace(truth.renderer.recipe, grid=samples))
+            return TimedRenderer(truth.supersampled(scale))(camera).rgb
         if truth.source == "photographs":
             factor = self._photograph.factor(self.view, scale)
             if factor <= 1:
@@ -159,7 +162,9 @@ class ViewTruth:
             photographs = truth.source == "photographs"
             full = self._photograph.at(self._photograph.hw, 1.0) if photographs else self.look.rgb.clamp(0.0, 1.0)
             return truth.enlarge(truth.renderer, full, camera).clamp(0.0, 1.0)
-        return None if truth.source == "photographs" else self._render(camera, find_recipe("auto", quality="best"))
+        if truth.source == "photographs":
+            return None
+        return TimedRenderer(replace(truth.renderer, recipe=find_recipe("auto", quality="best")))(camera).rgb
 
     @cached_property
     def look(self) -> TimedImage:
@@ -199,6 +204,3 @@ class ViewTruth:
         if self.truth.protocol.change != "distance":
             return 1.0
         return median_depth(self.truth.renderer.scene.means, self.view)
-
-    def _render(self, camera: Camera, recipe: Recipe) -> Image:
-        return TimedRenderer(replace(self.truth.renderer, recipe=recipe))(camera).rgb

@@ -6,10 +6,17 @@ readers: counts that allocate terabytes, decompression bombs, endless headers.
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
 
 from aaplug.system.errors import UsageError
+
+CGROUP = Path("/sys/fs/cgroup")
+CONTROL_GROUPS = Path("/proc/self/cgroup")  # those of this process
+STATM = Path("/proc/self/statm")  # pages of memory that it uses
 
 
 @dataclass(frozen=True)
@@ -60,16 +67,49 @@ def whole_limit(name: str) -> int:
 
 
 def lack_of_memory(needed: int | float) -> str | None:
-    """The reason that this machine cannot hold so many bytes, in words; None if it can, or its memory is unknown."""
-    memory, share = memory_of_machine(), limit("MEMORY_SHARE")
-    if memory is None or needed <= share * memory:
+    """The reason that this process cannot hold so many bytes, in words; None if it can, or its memory is unknown."""
+    memory, share = usable_memory(), limit("MEMORY_SHARE")
+    if memory is None or needed <= share * memory.bytes:
         return None
-    return f"{needed / 1e9:.1f} GB, more than {share:.0%} of this machine's {memory / 1e9:.0f} GB"
+    return f"{needed / 1e9:.1f} GB, more than {share:.0%} of {memory}"
 
 
-def memory_of_machine() -> float | None:
-    """Bytes of RAM, None where the system does not say."""
-    try:
-        return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
-    except (AttributeError, ValueError, OSError):
-        return None
+class Memory(NamedTuple):
+    """Bytes that this process may take, and who says so, in words with a place for the number."""
+
+    bytes: float
+    words: str
+
+    def __str__(self) -> str:
+        return self.words.format(f"{self.bytes / 1e9:.1f} GB")
+
+
+def usable_memory() -> Memory | None:
+    """The least that machine, container and `ulimit -v` leave to this process; None where the system does not say."""
+    candidates = []
+    with suppress(AttributeError, ValueError, OSError):
+        machine = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+        candidates.append(Memory(machine, "this machine's {}"))
+    for path in _files_of_control_groups():
+        with suppress(OSError, ValueError):  # "max", or it is not there
+            candidates.append(Memory(float(path.read_text()), "this container's {}"))
+    with suppress(ImportError, OSError):
+        import resource
+
+        most, _ = resource.getrlimit(resource.RLIMIT_AS)
+        if most != resource.RLIM_INFINITY:
+            pages = int(STATM.read_text().split()[0]) if STATM.exists() else 0
+            left = max(0.0, float(most - pages * os.sysconf("SC_PAGE_SIZE")))
+            candidates.append(Memory(left, "the {} that `ulimit -v` leaves"))
+    return min(candidates, default=None)
+
+
+def _files_of_control_groups() -> Iterator[Path]:
+    """Files that may limit this process's memory, by version 1 or 2 of Linux's control groups, and those above it."""
+    lines = CONTROL_GROUPS.read_text().splitlines() if CONTROL_GROUPS.exists() else []
+    for line in lines:
+        _, controllers, place = line.split(":", 2)
+        if controllers == "" or "memory" in controllers.split(","):
+            root, name = (CGROUP / "memory", "memory.limit_in_bytes") if controllers else (CGROUP, "memory.max")
+            inner = root / place.lstrip("/")
+            yield from (folder / name for folder in (inner, *inner.parents) if folder.is_relative_to(root))

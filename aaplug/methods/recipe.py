@@ -10,6 +10,7 @@ from aaplug.methods import QUALITIES
 from aaplug.methods.pixel_kernels.point import POINT
 from aaplug.system.digests import digest_of_values
 
+MAX_SAMPLES = 64  # along a pixel's side that a rate asks for; a mean of 4096 tells less than an 8-bit step from more
 RATE_TOLERANCE = 1e-6  # samples: excess over a whole number of them that takes no further sample
 
 
@@ -83,8 +84,8 @@ class Recipe:
         return digest_of_values(replace(self, source="", when="", promises=Promises()))
 
     def samples_at(self, relative_rate: float) -> int:
-        """Samples along a pixel's side, for a view at `relative_rate` against training."""
-        return max(self.grid, math.ceil(min(self.target_rate, 1.0) / relative_rate - RATE_TOLERANCE))
+        """Samples along a pixel's side, for a view at `relative_rate` against training; see `MAX_SAMPLES`."""
+        return max(self.grid, math.ceil(min(MAX_SAMPLES, min(self.target_rate, 1.0) / relative_rate - RATE_TOLERANCE)))
 
     def neighbours_at(self, sampled_rate: float) -> float:
         """Weight of the samples on either side of each, where the samples lie at `sampled_rate` against training.

@@ -34,6 +34,7 @@ ELEVATION = 20.0  # degrees
 RINGS = (0.0, 20.0, 40.0)  # degrees of elevation: the assumed training views
 PROBE_ROWS = 16  # Gaussians at each place that is looked at
 CROP_SIDE = 128  # px: side of the part of a picture that is compared at other training rates
+CROP_SAMPLES = 1024  # along its side, at most
 Z_UP = (0.0, 0.0, 1.0)  # nerfstudio turns its scenes so
 
 TRAINING_RATE = "training rate: "  # how the note begins
@@ -135,7 +136,8 @@ def say_assumed(
 @torch.no_grad()
 def decibels_at(renderer: Renderer, view: Camera, factors: Sequence[float]) -> list[float]:
     """PSNR between the middle of a view, and what it would be if training had been `factors` times as fine; in dB."""
-    width, height = min(view.width, CROP_SIDE), min(view.height, CROP_SIDE)
+    side = max(1, min(CROP_SIDE, CROP_SAMPLES // renderer.samples(view)))
+    width, height = min(view.width, side), min(view.height, side)
     left, top = (view.width - width) // 2, (view.height - height) // 2
     crop = replace(view, width=width, height=height, cx=view.cx - left, cy=view.cy - top)
     image, decibels = renderer(crop).rgb.clamp(0, 1), []

@@ -7,13 +7,12 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 from aaplug.core.cameras import Camera
-from aaplug.rendering.renderer import Renderer
+from aaplug.rendering.renderer import SAMPLE_BYTES, Renderer
 
 COMPILED = 0.19e-6, 0.047e-6  # seconds per Gaussian of the scene, and per sample of the image
 EAGER = 0.64e-6, 0.29e-6
 GRADIENTS = 4.0  # a frame with gradients, its loss and the optimizer's step against one without, on the chair
 COMPARED = 0.3e-6  # seconds per pixel: an image compared with its truth by PSNR and SSIM, on the chair
-SAMPLE_BYTES = 32.0  # per sample: red, green, blue and alpha in float32, and a copy
 
 
 class Cost(NamedTuple):

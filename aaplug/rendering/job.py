@@ -37,7 +37,7 @@ from aaplug.rendering.agreement import agreement, settled
 from aaplug.rendering.assumed import cameras_around, say_assumed
 from aaplug.rendering.cost import Cost, cost_of
 from aaplug.rendering.renderer import Renderer, background_colour, own_look
-from aaplug.system.errors import FrameError, UsageError, listing
+from aaplug.system.errors import FrameError, UsageError, listing, within_memory
 from aaplug.system.executors import PAYS_AFTER_SECONDS, Executor, torch_threads
 from aaplug.system.monitor import Monitor
 
@@ -219,7 +219,7 @@ def running(
     """
     threads = getattr(options, "threads", None) or torch.get_num_threads()
     scheduler = options.scheduler if isinstance(options, RecipeOptions) else None
-    with torch_threads(threads), writing(output, check, inputs, folder):
+    with torch_threads(threads), writing(output, check, inputs, folder), within_memory("memory"):
         if not isinstance(scheduler, str):
             yield Workers(threads, scheduler)
             return

@@ -32,6 +32,7 @@ from aaplug.core.shading import shade
 from aaplug.core.splats import Render, Splats2D, concatenated
 from aaplug.core.training import TrainingViews
 from aaplug.io.cameras import read_cameras
+from aaplug.io.limits import lack_of_memory
 from aaplug.io.scenes import SceneLike, scene_of
 from aaplug.io.scenes.harmonics import without_harmonics
 from aaplug.io.scenes.scene import Scene
@@ -41,9 +42,11 @@ from aaplug.methods.recipes import find_recipe, suited
 from aaplug.rasterizers import RASTERIZERS
 from aaplug.rasterizers.choice import find_rasterizer
 from aaplug.system.cores import on_free_cores
-from aaplug.system.errors import UsageError
+from aaplug.system.errors import UsageError, within_memory
 
 GAUSSIANS_AT_ONCE = 1 << 20  # Gaussians projected at once, where no gradients are asked for
+SAMPLE_BYTES = 32.0  # per sample of an image: red, green, blue and alpha in float32, and a copy
+UNCHECKED_SAMPLES = 1 << 26  # of an image, up to which memory is not checked
 RATE_DIGITS = 2  # decimals of the rate that sets the weight of neighbours, which so moves in steps
 
 Harmonics = Callable[[int, int], Float[Tensor, "c k 3"]]
@@ -163,15 +166,20 @@ class Renderer:
         Differentiable in every parameter of the scene and in `camera.cam_from_world`.
 
         Raises:
-            UsageError: a Gaussian in view has a colour that is NaN or infinite.
+            UsageError: a Gaussian in view has a colour that is NaN or infinite, or memory does not suffice.
         """
-        return self.draw(camera).render
+        with within_memory(f"view {camera.name} at {camera.width}x{camera.height}"):
+            return self.draw(camera).render
 
     @on_free_cores()
     def draw(self, camera: Camera) -> Drawing:
         """Render one view and keep its splats, for example to read their gradients."""
         samples, weight = self.sampling(camera)
         fine = camera.resized(camera.width * samples, camera.height * samples)
+        pixels = fine.width * fine.height
+        if pixels > UNCHECKED_SAMPLES and (lacking := lack_of_memory(SAMPLE_BYTES * pixels)):
+            problem = f"with {samples}×{samples} samples per pixel would take {lacking}; a smaller image needs less"
+            raise UsageError(f"view {camera.name} at {camera.width}x{camera.height}", problem)
         splats = self.splats(fine, samples)
         image = self.paint(splats, fine.hw)
         return Drawing(average_samples(image, samples, weight), splats, fine.hw)

@@ -5,10 +5,13 @@ Everything here reaches the terminal as one line and ends the program with exit 
 """
 
 import difflib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from os import PathLike
 
 MAX_VALUE_CHARACTERS = 60  # characters of a refused value in a message
+# In a RuntimeError for lack of memory: torch's words, on Linux and elsewhere, and the last of a compiled kernel's.
+MEMORY_WORDS = ("can't allocate memory", "not enough memory", "out of memory", "API call failed")
 
 
 class AaplugError(Exception):
@@ -77,3 +80,19 @@ def of_system(error: BaseException | None) -> OSError | None:
     if isinstance(error, RuntimeError):
         error = error.__context__
     return error if isinstance(error, OSError) else None
+
+
+@contextmanager
+def within_memory(what: str) -> Iterator[None]:
+    """Turn an error for lack of memory inside the block, Python's or torch's, into one of ours.
+
+    Raises:
+        UsageError: `what` needs more memory than the system gave.
+    """
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        if not isinstance(error, MemoryError) and not any(words in str(error) for words in MEMORY_WORDS):
+            raise
+        problem = "out of memory; a smaller `scale`, fewer `threads` or fewer Gaussians need less"
+        raise UsageError(what, problem) from error

@@ -7,6 +7,7 @@ with the number of items.  Leaving the loop early, also by an exception, ends th
 import multiprocessing
 import os
 import shutil
+import signal
 import sys
 import threading
 import time
@@ -14,7 +15,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing import resource_tracker
 from pathlib import Path
@@ -25,6 +26,7 @@ import torch
 from aaplug.system.allocator import keep_freed_memory
 from aaplug.system.errors import OutputError, UsageError, of_system, reason
 from aaplug.system.locks import scratch
+from aaplug.system.signals import end_as_worker
 
 # Python's resource tracker removes what killed processes left; with this option it does not say so
 QUIET_TRACKER = "ignore::UserWarning:multiprocessing.resource_tracker"
@@ -102,6 +104,11 @@ class Processes:
             try:
                 most = ITEMS_PER_WORKER * self.workers
                 yield from results(lambda item: pool.submit(_call, item), items, lambda: most, self.ordered)
+            except (KeyboardInterrupt, GeneratorExit):  # the items at work need not be finished
+                for process in getattr(pool, "_processes", None) or {}:
+                    with suppress(OSError):
+                        os.kill(process, signal.SIGTERM)
+                raise
             except BrokenProcessPool as error:
                 raise UsageError(
                     "worker process",
@@ -129,15 +136,29 @@ class ProcessesIfLong:
         yield from (map if workers < 2 else Processes(workers).map)(work, others)
 
 
+_is_forked = False  # true in a process that began as a copy of another
+
+
+def _begin_forked() -> None:
+    """Draw with one thread in the copy of a process: it has no others of OpenMP's, and would wait for them."""
+    global _is_forked
+    _is_forked = True
+    torch.set_num_threads(1)
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_begin_forked)
+
+
 @contextmanager
 def torch_threads(count: int) -> Iterator[None]:
-    """Let torch use `count` threads inside the block."""
+    """Let torch use `count` threads inside the block; one in a forked process."""
     before = torch.get_num_threads()
-    torch.set_num_threads(count)
+    torch.set_num_threads(1 if _is_forked else count)
     try:
         yield
     finally:
-        torch.set_num_threads(before)
+        torch.set_num_threads(1 if _is_forked else before)  # it may have begun inside
 
 
 def results(
@@ -176,13 +197,18 @@ def load(path: str | Path) -> Callable[[Any], Any]:
 
 
 def track_quietly() -> None:
-    """Start Python's resource tracker, which inherits the options of warnings, before the first worker does."""
+    """Start Python's resource tracker before the first worker does.
+
+    It inherits the options of warnings, and that a closing terminal (HUP) does not end it before the workers.
+    """
     if os.name != "posix":  # there is none
         return
     sys.warnoptions.append(QUIET_TRACKER)
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGHUP])
     try:
         resource_tracker.ensure_running()
     finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
         sys.warnoptions.remove(QUIET_TRACKER)
 
 
@@ -201,6 +227,7 @@ def _start(folder: str, threads: int | None) -> None:
         os._exit(1)
 
     threading.Thread(target=end_with_parent, daemon=True).start()
+    end_as_worker()
     keep_freed_memory()
     if threads is not None:
         torch.set_num_threads(threads)
@@ -209,4 +236,7 @@ def _start(folder: str, threads: int | None) -> None:
 
 def _call(item: Any) -> Any:
     assert _work is not None
-    return _work(item)
+    try:
+        return _work(item)
+    except SystemExit as end:  # the pool would go on with the next item
+        os._exit(end.code if isinstance(end.code, int) else 1)

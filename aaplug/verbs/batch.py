@@ -15,7 +15,7 @@ from aaplug.evaluation.report.files import as_json, write_texts
 from aaplug.evaluation.results import Report, as_csv, grid, method, results
 from aaplug.io.atomic import refuse_existing, writing
 from aaplug.options.shared import AnyPath
-from aaplug.system.errors import AaplugError, ClusterError, printable
+from aaplug.system.errors import AaplugError, ClusterError, printable, within_memory
 from aaplug.system.monitor import SILENT, Monitor
 from aaplug.verbs.evaluate import check_results
 from aaplug.verbs.views import file_names
@@ -123,13 +123,12 @@ def batch(
 def outcome(run: Callable[[], T], monitor: Monitor) -> T | str:
     """The result of one scene of many, or in words why there is none."""
     try:
-        return run()
+        with within_memory("scene"):
+            return run()
     except ClusterError:  # the next scene would end alike
         raise
     except AaplugError as error:
         return str(error)
-    except MemoryError:
-        return "out of memory"
     except Exception as error:  # a mistake in aaplug must not cost the other scenes
         monitor.say(traceback.format_exc())
         return f"unexpected {type(error).__name__}: {error}"

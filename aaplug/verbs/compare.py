@@ -64,7 +64,6 @@ def compare(scenes: ScenesLike, cameras: CamerasLike, output: AnyPath | None, op
     inputs = [*job.inputs, *(file for scene in named.values() for file in scene.files)]
     with running(options, folder, check, inputs, folder=True) as workers:
         look = job.look(len(views) * len(scales) * len(rows))
-        job.say_assumed(look)
         recipe, same = job.recipe(options.recipe), {"rasterizer": look.rasterizer, "background": look.background}
         renderers = [Renderer.of(scene, job.training(scene), recipe, **same) for scene in named.values()]
         truth = Truth(renderers[0], "reference", PROTOCOL)
@@ -74,6 +73,7 @@ def compare(scenes: ScenesLike, cameras: CamerasLike, output: AnyPath | None, op
         candidates = [Candidate(name, renderer) for name, renderer in zip(named, renderers, strict=True)]
         task = Task(candidates, scales, views, truth, metrics, ceiling=False)
         job.announce(renderers, task.sized_views, cost=task.cost, processes=workers.threads)
+        job.say_assumed(look)
         facts = facts_of(task, job.cameras.notes) | {
             "rows": "compared scene",
             "reference": rows[0].name,

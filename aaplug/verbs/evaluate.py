@@ -56,10 +56,10 @@ def evaluate(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
     images = None if folder is None else ImageStore.of(folder, show, views, everything)
     with running(options, folder, check, job.inputs, folder=True) as workers:
         look = job.look(len(views) * len(recipes) * len(scales))
-        job.say_assumed(look)
         candidates = candidates_of(job.scene, look.training, recipes, look.rasterizer, look.background)
         task = Task(candidates, scales, views, Truth(look, source, protocol), metrics)
         job.announce(task.renderers, task.sized_views, cost=task.cost)
+        job.say_assumed(look)
         choices = {"quality": options.quality, "rate_reference": options.rate_reference or "pose"}
         choices |= {"shown": options.show if options.report else None, "layout": options.layout}
         facts = {**facts_of(task, job.cameras.notes), "scene": facts_of_scene(job.scene), "options": choices}

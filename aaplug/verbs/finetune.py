@@ -89,7 +89,6 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
     upsampler = digest_of_files([upsampler]) if Path(upsampler).is_file() else upsampler
     with running(options, path, check, job.inputs):
         raw, look, train = job.scene.gaussians(), job.look(settings.steps), job.cameras.train
-        job.say_assumed(look)
         before = replace(look, scene=viewer.shown(look.scene), recipe=RECIPES[viewer.recipe])
         start = replace(before, scene=fuse_for(raw, look.training, viewer))
         truth = Truth(look, truth_source, enlarge=enlarge, memory=MEMORY)
@@ -98,6 +97,7 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
         job.monitor.say(f"tuning for {start.recipe.name} ({start.recipe.source}): {steps}")
         cost = _cost(start, train, settings)
         job.announce([start], train, cost=cost, work=f"{settings.steps} steps", fewer="steps")
+        job.say_assumed(look)
         checkpoint = path and _beside(path, "pt")
         state = tune(tuning, checkpoint, options.checkpoint_every, options.resume, job.monitor)
         record = {"for": viewer.name, "method": settings.name}

@@ -46,8 +46,8 @@ def render(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, optio
     with running(options, target, check, job.inputs, folder=not names_image(target)) as workers:
         renderer = job.look(len(views)).by(job.recipe(options.recipe))
         job.monitor.say(description(renderer, views))
-        job.say_assumed(renderer, views[0])
         job.announce([renderer], views, processes=workers.threads)
+        job.say_assumed(renderer, views[0])
         with job.monitor.progress("rendering", "views") as tell:
             pool = workers.cluster or ProcessesIfLong(workers.threads)
             how = {"bit_depth": options.bit_depth, "overwrite": options.overwrite, "tell": tell}

@@ -74,8 +74,8 @@ def video(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, option
         renderers = [look.by(recipe) for recipe in recipes]
         size = f"{views[0].width}x{views[0].height}"
         job.monitor.say(f"{len(views)} frames of {size} px per pane, {fps:g} per second")
-        job.say_assumed(renderers[-1], views[0])
         job.announce(renderers, views, processes=workers.threads, fewer="seconds or frames per second")
+        job.say_assumed(renderers[-1], views[0])
         with job.monitor.progress("rendering", "images") as tell:
             pool = workers.cluster or ProcessesIfLong(workers.threads)
             how = {"overwrite": options.overwrite, "tell": tell, "folder": workers.cluster and target.parent}
