@@ -1,11 +1,14 @@
 """Kills at random moments: nothing is half written, nothing stays behind, and what can be resumed ends the same.
 
-`batch` is killed and resumed as one command.
+Every second kill is -9; the others are TERM and HUP in turn, after which nothing may stay behind even before the next
+run.  `batch` is killed and resumed as one command.  Of `cluster` a worker is killed too; its bytes are those of one
+process.
 """
 
 import os
 import random
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -15,6 +18,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
+import psutil
+
 from aaplug.io.images import read_image
 from aaplug.io.scenes import read_scene
 from aaplug.system.locks import OUR_PREFIX, SCRATCH_PREFIX
@@ -23,7 +28,8 @@ from tests.conftest import SAMPLE
 from tests.test_batch import timeless
 
 SOONER = 0.9  # factor on the time within which a job is killed, where it ended before
-PROGRAM = "from aaplug_cli.main import main; main()"
+SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGKILL, signal.SIGHUP)
+PROGRAM = "from aaplug_cli.main import program; program()"
 SCENE = f"{SAMPLE / 'chair.ply'} --cameras {SAMPLE}"
 EVALUATION = f"evaluate {SCENE} -o out/results --scale 0.25 0.125 --recipe classic"
 BATCH = f"""
@@ -42,10 +48,15 @@ quality = "fast"
 
 
 class Job(NamedTuple):
-    """A command to kill.  again: the word of the run that follows."""
+    """A command to kill.
+
+    workers: further words of the runs that are killed and that follow, whose journal tells that workers are at work.
+    again: the word of the run that follows.
+    """
 
     words: str
     again: str = "--overwrite"
+    workers: str = ""
 
 
 JOBS = {
@@ -56,24 +67,36 @@ JOBS = {
         f"finetune {SCENE} -o out/t.ply --steps 6 --checkpoint-every 2 --truth self --scale 0.125 --anchor 0",
         "--resume",
     ),
+    "lod": Job(f"lod {SCENE} -o out/levels --levels 2 --no-refine"),
     "video": Job(f"video {SCENE} -o out/v.webm --scale 0.125 --seconds 0.3 --beside none"),
     "batch": Job("evaluate --batch batch.toml -o out/many", "--resume"),
+    "cluster": Job(f"{EVALUATION} auto --layout inria --views test", "--resume", "--scheduler local --threads 3"),
 }
 
 
-def main(kills: int = 40, jobs: Sequence[str] = tuple(JOBS), seed: int = 0) -> None:
+class Outcome(NamedTuple):
+    """What went wrong after a kill: outputs half written, files left behind, results that differ; in words."""
+
+    torn: str = ""
+    left: str = ""
+    other: str = ""
+
+
+def main(kills: int = 20, jobs: Sequence[str] = tuple(JOBS), seed: int = 0) -> None:
     """Kill each job so often; print a row for it, and end with 1 if anything went wrong.
 
     seed: of the moments.
     """
-    dice, wrong = random.Random(seed), 0
-    heading("kills", "job", "kills", "within, s", "wrong")
+    dice, wrong = random.Random(seed), list[str]()
+    heading("kills", "job", "kills", "by TERM or HUP", "within, s", "torn", "left behind", "other results")
     for name in jobs:
         with tempfile.TemporaryDirectory() as folder:
-            problems, seconds = _killed(Path(folder), JOBS[name], kills, dice)
-        wrong += len(problems)
-        row(name, kills, f"{seconds:.1f}", "; ".join(problems) or 0)
-    sys.exit(wrong > 0)
+            outcomes, seconds = _killed(Path(folder), JOBS[name], kills, dice)
+        counts = [sum(map(bool, column)) for column in zip(*outcomes, strict=True)]
+        row(name, kills, sum(SIGNALS[i % 4] != signal.SIGKILL for i in range(kills)), f"{seconds:.1f}", *counts)
+        wrong += [f"{name}: {problem}" for outcome in outcomes for problem in outcome if problem]
+    print("\n".join(["", *wrong]))
+    sys.exit(bool(wrong))
 
 
 def start(folder: Path, words: str) -> subprocess.Popen[bytes]:
@@ -87,40 +110,59 @@ def start(folder: Path, words: str) -> subprocess.Popen[bytes]:
     return subprocess.Popen(command, cwd=folder, stdout=quiet, stderr=quiet, env=environment)
 
 
-def _killed(folder: Path, job: Job, count: int, dice: random.Random) -> tuple[list[str], float]:
-    """What went wrong in so many kills, and the time within which the last one was, in s."""
+def _killed(folder: Path, job: Job, count: int, dice: random.Random) -> tuple[list[Outcome], float]:
+    """The outcomes of so many kills, and the time within which the last one was, in s."""
     began = time.monotonic()
     assert start(folder, job.words).wait() == 0
-    whole, seconds, problems = _content(folder / "out"), time.monotonic() - began, list[str]()
-    done = 0
-    while done < count:
-        problem = _problem(folder, job, whole, dice.uniform(0, seconds))
-        if problem is None:  # the job is faster than it was
+    whole, seconds, outcomes = _content(folder / "out"), time.monotonic() - began, list[Outcome]()
+    while len(outcomes) < count:
+        outcome = _outcome(folder, job, whole, dice.uniform(0, seconds), SIGNALS[len(outcomes) % 4])
+        if outcome is None:  # the job is faster than it was
             seconds *= SOONER
-            continue
-        done += 1
-        problems += [problem] if problem else []
-    return problems, seconds
+        else:
+            outcomes.append(outcome)
+    return outcomes, seconds
 
 
-def _problem(folder: Path, job: Job, whole: dict[str, object], moment: float) -> str | None:
-    """What went wrong after a kill at that moment, "" for nothing; None if the job had ended before."""
+def _outcome(folder: Path, job: Job, whole: dict[str, object], moment: float, kill: signal.Signals) -> Outcome | None:
+    """The outcome of a kill at that moment; None if the job had ended before."""
     shutil.rmtree(folder / "out")
-    process = start(folder, job.words)
+    words, where = f"{job.words} {job.workers}", f"{kill.name} at {moment:.2f} s: "
+    process = start(folder, words)
+    if job.workers:
+        _kill_a_worker(process, folder / "out" / "results" / "progress.jsonl")
     with suppress(subprocess.TimeoutExpired):
         process.wait(moment)
         return None
-    process.kill()
+    process.send_signal(kill)
     process.wait()
-    if torn := _torn(folder / "out"):
-        return f"killed at {moment:.2f} s: {torn}"
-    code = start(folder, f"{job.words} {job.again}").wait()
-    if code and job.again == "--resume" and start(folder, f"{job.words} --overwrite").wait() == 0:
+    torn, left = _torn(folder / "out"), [] if kill == signal.SIGKILL else _left(folder)
+    code = start(folder, f"{words} {job.again}").wait()
+    if code and job.again == "--resume" and start(folder, f"{words} --overwrite").wait() == 0:
         code = 0  # it had ended before it was killed, so that there was nothing to resume
     time.sleep(0.2)  # workers notice the death of their parent
-    left = [p.name for p in folder.rglob("*") if p.name.startswith((OUR_PREFIX, SCRATCH_PREFIX))]
+    left += _left(folder)
     same = _content(folder / "out") == whole
-    return f"killed at {moment:.2f} s: exit code {code}, left {left}, same {same}" if code or left or not same else ""
+    return Outcome(
+        f"{where}{torn}" if torn else "",
+        f"{where}{left}" if left else "",
+        f"{where}exit code {code}, same {same}" if code or not same else "",
+    )
+
+
+def _left(folder: Path) -> list[str]:
+    """Temporary files, in their folder and beside the outputs."""
+    beside = [path for path in (folder / "out").rglob("*") if path.name.startswith((OUR_PREFIX, SCRATCH_PREFIX))]
+    return [str(path.relative_to(folder)) for path in [*(folder / "tmp").iterdir(), *beside]]
+
+
+def _kill_a_worker(process: subprocess.Popen[bytes], journal: Path) -> None:
+    """Kill one of a command's workers as soon as a view is done."""
+    while not journal.exists() and process.poll() is None:
+        time.sleep(0.01)
+    with suppress(psutil.Error):
+        children = psutil.Process(process.pid).children(recursive=True)
+        next(child for child in children if "spawn_main" in " ".join(child.cmdline())).kill()
 
 
 def _content(folder: Path) -> dict[str, object]:
