@@ -158,7 +158,7 @@ def test_kernels_of_other_rules_have_other_names(rules):
     ids=str,
 )
 def test_wrong_rules_are_refused(wrong):
-    with pytest.raises(UsageError, match="rules: expected"):
+    with pytest.raises(UsageError, match=": expected"):
         Rules(**wrong)
 
 

@@ -8,15 +8,31 @@ Sizes and focal lengths may differ from view to view.
 import hashlib
 import json
 import math
+import operator
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from aaplug.core.colours import Colour
+from aaplug.system.contracts import Range, check_fields, contract
+from aaplug.system.errors import UsageError
+
 WHOLE_SLACK = 1e-6  # a size (px) or a factor this close to a whole number is one
+MAX_SIDE = 2**24  # px: up to here float32 tells pixels apart
+MAX_FOCAL = 1e9  # px: far above any real lens; what is computed from it stays finite
+MAX_DISTANCE = 1e18  # world units from the origin; its square fits into float32
+MIN_SINE = 1e-12  # between the direction of sight and up
+MAX_ROTATION_ERROR = 1e-3  # largest error of an entry of R·Rᵀ that counts as rounding
+
+Side = Annotated[int, Range(1, MAX_SIDE)]  # px
+Focal = Annotated[float, Range(above=0, most=MAX_FOCAL)]  # px
+Place = Annotated[float, Range(-MAX_FOCAL, MAX_FOCAL)]  # px
+Factor = Annotated[float, Range(above=0, most=MAX_FOCAL)]
 
 
 @dataclass(frozen=True)
@@ -43,19 +59,41 @@ class Camera:
     trained_focal: px.  For a pose of the data set, the focal length at which training rendered it (or would have, for
         a held-out view); scaling the view keeps it.  None for a free camera.
     photo: the photograph taken from here, if any.  lens: its distortion, if any.  Neither counts for equality.
+
+    Raises:
+        UsageError: a number is out of range, or the pose is no rigid motion.
     """
 
     name: str
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
+    width: Side
+    height: Side
+    fx: Focal
+    fy: Focal
+    cx: Place
+    cy: Place
     cam_from_world: Float[Tensor, "4 4"]
-    trained_focal: float | None = None
+    trained_focal: Focal | None = None
     photo: Path | None = None
     lens: Lens | None = None
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        object.__setattr__(self, "cam_from_world", self.cam_from_world.double())
+        self._check_pose()
+
+    def _check_pose(self) -> None:
+        """Refuse a pose that is no rigid motion."""
+        right, down, forward, last = self.cam_from_world.tolist()
+        axes, place = [row[:3] for row in (right, down, forward)], [row[3] for row in (right, down, forward)]
+        products = [sum(map(operator.mul, a, b)) - (a is b) for a in axes for b in axes]
+        if not all(abs(product) <= MAX_ROTATION_ERROR for product in products):
+            raise UsageError("cam_from_world", f"expected a rotation, got {axes}")
+        (a, b, c), (d, e, f), (g, h, i) = axes
+        if a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) < 0:
+            raise UsageError("cam_from_world", f"expected a rotation, got one that mirrors: {axes}")
+        if last != [0, 0, 0, 1] or not all(abs(x) <= MAX_DISTANCE for x in place):
+            expected = f"a translation of at most {MAX_DISTANCE:g}, and 0 0 0 1 below"
+            raise UsageError("cam_from_world", f"expected {expected}, got {place} and {last}")
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Camera):
@@ -89,6 +127,7 @@ class Camera:
         """Position in the world."""
         return -self.cam_from_world[:3, :3].T @ self.cam_from_world[:3, 3]
 
+    @contract
     def project(self, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 2"], Float[Tensor, " n"]]:
         """Positions in px and depths in world units of world points, in float64."""
         pose = self.cam_from_world
@@ -96,7 +135,8 @@ class Camera:
         x, y, z = local.unbind(dim=1)
         return torch.stack([x / z * self.fx + self.cx, y / z * self.fy + self.cy], dim=1), z
 
-    def scaled(self, factor: float) -> "Camera":
+    @contract
+    def scaled(self, factor: Factor) -> "Camera":
         """The same view with pixels `factor` times as dense.
 
         A partial row at the bottom or column at the right is dropped, so that scaled(1/n) sees exactly what n×n box
@@ -104,11 +144,13 @@ class Camera:
         """
         return self._stretched(whole_side(self.width * factor), whole_side(self.height * factor), factor, factor)
 
-    def resized(self, width: int, height: int) -> "Camera":
+    @contract
+    def resized(self, width: Side, height: Side) -> "Camera":
         """The same field of view in `width` × `height` px; pixels stop being square if the aspect changes."""
         return self._stretched(width, height, width / self.width, height / self.height)
 
-    def framed(self, width: int, height: int) -> "Camera":
+    @contract
+    def framed(self, width: Side, height: Side) -> "Camera":
         """The same pose in `width` × `height` px, square as before: the shorter side keeps its field of view."""
         factor = min(width, height) / min(self.hw)
         middle = {"cx": width / 2, "cy": height / 2}
@@ -135,10 +177,15 @@ class CameraSet:
 
     train: tuple[Camera, ...]
     test: tuple[Camera, ...]
-    background: tuple[float, float, float] | None = None
+    background: Colour | None = None
     notes: tuple[str, ...] = ()
     assumed: bool = False
     files: tuple[Path, ...] = ()
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        for name in ("train", "test", "notes"):
+            object.__setattr__(self, name, tuple(getattr(self, name)))
 
     @property
     def all(self) -> tuple[Camera, ...]:
@@ -162,14 +209,26 @@ def spread(views: Sequence[Camera], most: int) -> Sequence[Camera]:
     return views[:: max(1, -(-len(views) // most))]
 
 
+@contract
 def look_at(eye: Float[Tensor, " 3"], target: Float[Tensor, " 3"], up: Float[Tensor, " 3"]) -> Float[Tensor, "4 4"]:
-    """`cam_from_world` of a camera at `eye` that looks at `target`, with `up` pointing up in the image."""
-    forward = torch.nn.functional.normalize((target - eye).double(), dim=0)
-    right = torch.nn.functional.normalize(torch.linalg.cross(forward, up.double()), dim=0)
+    """`cam_from_world` of a camera at `eye` that looks at `target`, with `up` pointing up in the image.
+
+    Raises:
+        UsageError: there is no direction of sight, or it is that of `up`.
+    """
+    eye, target, up = (x.double() for x in (eye, target, up))
+    sight = target - eye
+    if not 0 < float(sight.norm()) < math.inf:
+        raise UsageError("target", f"expected a place other than `eye`, got {target.tolist()}")
+    forward = torch.nn.functional.normalize(sight, dim=0)
+    right = torch.linalg.cross(forward, torch.nn.functional.normalize(up, dim=0))
+    if not float(right.norm()) > MIN_SINE:
+        raise UsageError("up", f"expected a direction other than that of sight, got {up.tolist()}")
+    right = torch.nn.functional.normalize(right, dim=0)
     down = torch.linalg.cross(forward, right)
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3, :3] = torch.stack([right, down, forward])
-    pose[:3, 3] = -pose[:3, :3] @ eye.double()
+    pose[:3, 3] = -pose[:3, :3] @ eye
     return pose
 
 

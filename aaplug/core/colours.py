@@ -1,8 +1,11 @@
 """Colours behind a scene: red, green, blue in [0, 1]."""
 
-from typing import Literal
+from typing import Annotated, Literal
 
-Colour = tuple[float, float, float]
+from aaplug.system.contracts import Range
+
+Share = Annotated[float, Range(0, 1)]
+Colour = tuple[Share, Share, Share]
 Background = Literal["auto", "white", "black"] | Colour
 
 WHITE: Colour = (1.0, 1.0, 1.0)

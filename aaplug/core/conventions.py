@@ -4,9 +4,12 @@ They are plain data and import no torch, so that the command line knows their na
 """
 
 from dataclasses import dataclass
+from typing import Annotated
 
 from aaplug.core.rules import RULES_3DGS, Rules
+from aaplug.system.contracts import Range, check_fields
 
+MAX_KERNEL = 1e6  # px²: what is computed from it stays finite
 MIN_SEEN_SHARE = 0.5  # cameras that see a smaller share of the Gaussians are taken to be in another frame
 
 
@@ -20,9 +23,12 @@ class Convention:
     """
 
     name: str
-    kernel: float
+    kernel: Annotated[float, Range(0, MAX_KERNEL)]
     compensated: bool
     rules: Rules = RULES_3DGS
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
 
 CLASSIC = Convention("classic", 0.3, compensated=False)  # 3DGS (Kerbl et al. 2023)

@@ -10,13 +10,18 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.gaussians import Gaussians, scale_opacities
+from aaplug.system.contracts import contract
+from aaplug.system.errors import UsageError
 
 
+@contract
 def smoothed_by(scene: Gaussians, log_sigma: Float[Tensor, "n k"], volume: bool) -> Gaussians:
     """Convolve each Gaussian with one of standard deviation e^log_sigma; -inf changes nothing.
 
     log_sigma: one for all axes of a Gaussian, or one per axis.  volume: scale opacities by the volume factor.
     """
+    if log_sigma.shape not in ((len(scene), 1), (len(scene), 3)):
+        raise UsageError("log_sigma", f"expected [{len(scene)}, 1] or [{len(scene)}, 3], got {[*log_sigma.shape]}")
     log_scales = 0.5 * torch.logaddexp(2 * scene.log_scales, 2 * log_sigma)
     smoothed = replace(scene, log_scales=log_scales)
     if not volume:

@@ -4,6 +4,7 @@ m: splats.  d: offset (dx, dy) from a splat's centre, in px.  C: its covariance,
 """
 
 from dataclasses import replace
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
@@ -11,10 +12,13 @@ from torch import Tensor
 
 from aaplug.core.rules import RULES_3DGS
 from aaplug.core.splats import Splats2D
+from aaplug.system.contracts import Range, contract
+from aaplug.system.errors import UsageError
 
 Columns = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
+@contract
 def whitening(splats: Splats2D) -> Float[Tensor, "m 2 2"]:
     """W of each splat with |W d|² = dᵀ C⁻¹ d."""
     return torch.stack(whitening_columns(splats.covs, splats.dets), dim=1).unflatten(1, (2, 2))
@@ -44,12 +48,15 @@ def squared_cutoff(opacities: Float[Tensor, " m"], min_alpha: float = RULES_3DGS
     return 2 * torch.log(opacities / min_alpha)
 
 
-def grown(splats: Splats2D, radius: Float[Tensor, " m"], min_alpha: float) -> Splats2D:
+@contract
+def grown(splats: Splats2D, radius: Float[Tensor, " m"], min_alpha: Annotated[float, Range(above=0)]) -> Splats2D:
     """Splats whose cut-off ellipses contain every point within `radius` px of the given ones; for bounding only.
 
     For any e > 0, the covariance (1 + e) C + (1 + 1/e) (r²/R) I bounds the Minkowski sum of an ellipse (C, squared
     cut-off R) and a disc of radius r.  e = r / √(R tr C / 2) makes the bound's trace smallest.
     """
+    if radius.shape != splats.dets.shape:
+        raise UsageError("radius", f"expected [{len(splats)}] numbers, got {[*radius.shape]}")
     cutoff = squared_cutoff(splats.opacities, min_alpha)
     cutoff = cutoff.clamp(min=torch.finfo(splats.means.dtype).tiny)
     radius = radius.clamp(min=torch.finfo(splats.means.dtype).eps)  # it is divided by

@@ -16,8 +16,11 @@ from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from aaplug.core.conventions import CLASSIC, Convention
+from aaplug.system.contracts import check_fields, contract, described
+from aaplug.system.errors import UsageError
 
 MAX_LOG_SCALE = 30.0  # larger |ln s| overflow float32 once squared; values are clamped on use
+COEFFICIENTS = (1, 4, 9, 16, 25)  # per channel, of degree 0 to 4
 MIN_OPACITY = 1e-7  # keeps the logit finite in float32
 
 
@@ -27,6 +30,9 @@ class Fusion:
 
     method: str
     settings: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +58,9 @@ class Gaussians:
         log-scale here is -MAX_LOG_SCALE, no thickness, so that renderers need no special case.
     filter_3d: standard deviation of Mip-Splatting's 3D filter, stored beside the scales and not yet fused.
     extras: further columns of the file by name, for methods that know them.
+
+    Raises:
+        UsageError: columns differ in length, precision or device, or are no tensors of these shapes.
     """
 
     means: Float[Tensor, "n 3"]
@@ -65,6 +74,15 @@ class Gaussians:
     origin: Origin | None = None
     flat: bool = False
     extras: Mapping[str, Shaped[Tensor, " n"]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        if self.sh.shape[1] not in COEFFICIENTS:
+            raise UsageError("sh", f"expected {COEFFICIENTS} coefficients per channel, got {self.sh.shape[1]}")
+        for name, column in self.columns.items():
+            if column.dtype != self.means.dtype or column.device != self.means.device:
+                means = f"{self.means.dtype} on {self.means.device}, as the means are"
+                raise UsageError(name, f"expected {means}, got {column.dtype} on {column.device}")
 
     def __len__(self) -> int:
         return self.means.shape[0]
@@ -94,14 +112,19 @@ class Gaussians:
         """Degree of the spherical harmonics, 0 to 4."""
         return round(self.sh.shape[1] ** 0.5) - 1
 
+    @contract
     def __getitem__(self, index: Tensor | slice) -> "Gaussians":
         """The Gaussians at `index` (a mask, indices or a slice), in that order."""
         rows = index.cpu() if isinstance(index, Tensor) else index  # the file's rows stay on the CPU
-        origin = self.origin and replace(self.origin, rows=self.origin.rows[rows])
-        columns = {name: column[index] for name, column in self.columns.items()}
-        extras = {name: column[index] for name, column in self.extras.items()}
+        try:
+            origin = self.origin and replace(self.origin, rows=self.origin.rows[rows])
+            columns = {name: column[index] for name, column in self.columns.items()}
+            extras = {name: column[index] for name, column in self.extras.items()}
+        except (IndexError, RuntimeError, TypeError) as error:
+            raise UsageError("index", f"expected places of {len(self)} Gaussians, got {described(index)}") from error
         return replace(self, **columns, extras=extras, origin=origin)
 
+    @contract
     def to(self, dtype: torch.dtype) -> "Gaussians":
         """The same Gaussians in another precision; extras keep theirs."""
         return replace(self, **{name: column.to(dtype) for name, column in self.columns.items()})
@@ -120,6 +143,10 @@ class Gaussians:
 def joined(parts: Sequence[Gaussians]) -> Gaussians:
     """The Gaussians of several parts of one scene, at least one part, each with the same columns."""
     first = parts[0]
+    for part in parts:
+        kinds = [(*p.columns, *p.extras, p.means.dtype, p.sh.shape[1]) for p in (first, part)]
+        if kinds[0] != kinds[1]:
+            raise UsageError("scenes", f"expected the same columns in each, got {kinds[0]} and {kinds[1]}")
     columns = {name: torch.cat([getattr(part, name) for part in parts]) for name in first.columns}
     extras = {name: torch.cat([part.extras[name] for part in parts]) for name in first.extras}
     rows = [part.origin.rows for part in parts if part.origin is not None]

@@ -13,9 +13,11 @@ from torch import Tensor
 
 from aaplug.core.cameras import WHOLE_SLACK, whole_side
 from aaplug.core.splats import Render
+from aaplug.system.contracts import contract
 from aaplug.system.errors import UsageError
 
 
+@contract
 def over(rgb: Float[Tensor, "h w 3"], alpha: Float[Tensor, "h w"], background: tuple[float, float, float]) -> Render:
     """Composite premultiplied colours over a background."""
     if not any(background):  # black adds nothing

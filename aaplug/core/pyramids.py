@@ -23,6 +23,7 @@ from aaplug.core.rules import NEAR
 from aaplug.core.runs import runs_of, starts_of
 from aaplug.core.splats import Splats2D
 from aaplug.core.training import TrainingViews
+from aaplug.system.contracts import check_fields, contract
 from aaplug.system.errors import UsageError
 
 FADE_OCTAVES = math.log2(4 / 3)  # of the sampling rate, over which a level fades into the next
@@ -72,12 +73,20 @@ class Pyramid:
     sizes: tuple[int, ...]
     chunks: Int[Tensor, " n"]
 
+    def __post_init__(self) -> None:
+        check_fields(self)
+        counts = len(self.scene), sum(self.sizes), len(self.chunks)
+        if not self.sizes or len({*counts}) > 1 or (counts[0] and int(self.chunks.min()) < 0):
+            facts = "{} Gaussians, levels of {} in all, and chunks of {}".format(*counts)
+            raise UsageError("levels", f"expected levels, and a chunk from 0 for each Gaussian, got {facts}")
+
     @classmethod
+    @contract
     def of(cls, levels: Sequence[Gaussians], chunks: Sequence[Int[Tensor, " _"]]) -> "Pyramid":
         """A pyramid of its levels, the finest first, at least one, and the chunk of each of their Gaussians."""
-        if not levels or [len(level) for level in levels] != [len(part) for part in chunks]:
-            counts = f"{len(levels)} levels and {len(chunks)} lists of chunks"
-            raise UsageError("levels", f"should be one or more, each with a chunk for each Gaussian; got {counts}")
+        if not levels or [*map(len, levels)] != [*map(len, chunks)]:
+            got = f"levels of {[*map(len, levels)]} and chunks of {[*map(len, chunks)]}"
+            raise UsageError("levels", f"expected levels, and a chunk for each Gaussian of each, got {got}")
         scene = joined([replace(level, origin=None, extras={}) for level in levels])
         return cls(scene, tuple(map(len, levels)), torch.cat(list(chunks)))
 
@@ -85,8 +94,11 @@ class Pyramid:
         """Number of levels."""
         return len(self.sizes)
 
+    @contract
     def level(self, number: int) -> Gaussians:
         """One level as a scene of its own."""
+        if not -len(self) <= number < len(self):
+            raise UsageError("number", f"expected a level from 0 to {len(self) - 1}, got {number}")
         return self.scene[self.places[number]]
 
     @property

@@ -7,6 +7,7 @@ import math
 import struct
 from dataclasses import dataclass, field
 
+from aaplug.system.contracts import check_fields
 from aaplug.system.errors import UsageError
 
 NEAR = 0.2  # world units of depth: nearer Gaussians are neither drawn nor counted as seen (3DGS)
@@ -37,6 +38,7 @@ class Rules:
     below_min_transmittance: float = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
+        check_fields(self)
         alphas = MIN_CUTOFF <= self.min_alpha < self.max_alpha < 1
         if not (alphas and 0 < self.min_transmittance < 1 and self.near > 0):
             ranges = f"{MIN_CUTOFF:g} <= min_alpha < max_alpha < 1, 0 < min_transmittance < 1 and near > 0"

@@ -4,7 +4,6 @@ n: Gaussians of the scene; m: splats; k: coefficients per channel, (degree + 1)Â
 float64; the rest runs in the scene's precision.  Splats pass in chunks that fit the cache, forward and backward.
 """
 
-from dataclasses import replace
 from functools import cache, partial
 from typing import Any
 
@@ -29,7 +28,7 @@ def shade(splats: Splats2D, scene: Gaussians, camera: Camera, kernels: Kernels =
     """
     centre = camera.centre.to(scene.means.device)
     columns = (scene.sh.contiguous(), scene.means.contiguous())  # once, and not for each chunk
-    return replace(splats, rgb=_Shade.apply(*columns, centre, splats.sources, kernels))
+    return splats.with_columns({"rgb": _Shade.apply(*columns, centre, splats.sources, kernels)})
 
 
 class _Shade(torch.autograd.Function):

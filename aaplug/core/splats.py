@@ -7,15 +7,18 @@ correct digit for a needle, computed from the factors of the projection it has a
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from aaplug.core.kernels import EAGER, EXAMPLE_SIZE, Kernel, Kernels
+from aaplug.system.contracts import Range, check_fields, contract, described
+from aaplug.system.errors import UsageError
 
 MIN_COMPENSATION = 0.005  # floor of the opacity factor, so that rounding erases no splat (3DGS)
+Floor = Annotated[float, Range(0, 1)]
 SHAPE_COLUMNS = ("means", "covs", "dets", "depths", "opacities")  # floating point, and of every splat
 
 
@@ -38,18 +41,24 @@ class Splats2D:
     depth_slopes: Float[Tensor, "m 2"] | None = None
     window: float = 1.0
 
+    def __post_init__(self) -> None:
+        check_fields(self)
+
     def __len__(self) -> int:
         return self.means.shape[0]
 
+    @contract
     def __getitem__(self, index: Tensor | slice) -> "Splats2D":
         """The splats at `index` (a mask, indices or a slice), in that order."""
-        if isinstance(index, Tensor) and index.dtype == torch.bool:
-            return self.selected(index.nonzero().squeeze(1))
-
-        def at(column: Tensor) -> Tensor:  # index_select is several times faster than [index]
-            return column[index] if isinstance(index, slice) else column.index_select(0, index)
-
-        return replace(self, **{name: at(column) for name, column in self._columns().items()})
+        try:
+            if isinstance(index, slice):
+                return self.with_columns({name: column[index] for name, column in self._columns().items()})
+            if index.dtype == torch.bool and index.shape == self.dets.shape:
+                return self.selected(index.nonzero().squeeze(1))
+            # index_select is several times faster than [index]
+            return self.with_columns({name: x.index_select(0, index) for name, x in self._columns().items()})
+        except (IndexError, RuntimeError, TypeError) as error:
+            raise UsageError("index", f"expected places of {len(self)} splats, got {described(index)}") from error
 
     def selected(self, rows: Int[Tensor, " k"], kernels: Kernels = EAGER) -> "Splats2D":
         """The splats at `rows`, each at most once."""
@@ -57,15 +66,17 @@ class Splats2D:
         shape = kernels.run(SELECT, rows, *(columns.pop(name) for name in SHAPE_COLUMNS))
         sources = columns.pop("sources").index_select(0, rows)
         others = {name: picked(column, rows) for name, column in columns.items()}
-        return replace(self, **dict(zip(SHAPE_COLUMNS, shape, strict=True)), sources=sources, **others)
+        return self.with_columns({**dict(zip(SHAPE_COLUMNS, shape, strict=True)), "sources": sources, **others})
 
+    @contract
     def to(self, dtype: torch.dtype) -> "Splats2D":
         """The same splats in another precision."""
         columns = self._columns().items()
         return replace(self, **{n: c.to(dtype) for n, c in columns if c.is_floating_point()})
 
+    @contract
     def blurred(
-        self, variance: float | Float[Tensor, " m"], compensate: bool, floor: float = MIN_COMPENSATION
+        self, variance: float | Float[Tensor, " m"], compensate: bool, floor: Floor = MIN_COMPENSATION
     ) -> "Splats2D":
         """Convolve with an isotropic Gaussian of `variance` px².
 
@@ -73,14 +84,19 @@ class Splats2D:
         √(det C / det(C + vI)), at least `floor`, which preserves the splat's energy (EWA splatting, Zwicker et al.
         2002; Mip-Splatting, eq. 10).
         """
+        if isinstance(variance, Tensor) and variance.shape != self.dets.shape:
+            raise UsageError("variance", f"expected [{len(self)}] numbers, got {[*variance.shape]}")
         trace = self.covs[:, 0] + self.covs[:, 2]
         dets = self.dets + variance * trace + variance * variance
         diagonal = self.covs.new_tensor([1.0, 0.0, 1.0])
         added = variance[:, None] if isinstance(variance, Tensor) else variance
         return self._widened(self.covs + added * diagonal, dets, compensate, floor)
 
-    def convolved(self, added: Float[Tensor, "m 3"], compensate: bool, floor: float = MIN_COMPENSATION) -> "Splats2D":
+    @contract
+    def convolved(self, added: Float[Tensor, "m 3"], compensate: bool, floor: Floor = MIN_COMPENSATION) -> "Splats2D":
         """Convolve with a Gaussian of any covariance, packed, in px²."""
+        if added.shape != self.covs.shape:
+            raise UsageError("added", f"expected {[*self.covs.shape]} numbers, got {[*added.shape]}")
         a, b, c = added.unbind(dim=1)
         xx, xy, yy = self.covs.unbind(dim=1)
         dets = self.dets + (a * c - b * b) + (xx * c + yy * a - 2 * xy * b).clamp(min=0.0)
@@ -92,7 +108,13 @@ class Splats2D:
         opacities = self.opacities
         if compensate:
             opacities = opacities * (self.dets / dets).clamp(min=floor * floor).sqrt()
-        return replace(self, covs=covs, dets=dets, opacities=opacities)
+        return self.with_columns({"covs": covs, "dets": dets, "opacities": opacities})
+
+    def with_columns(self, columns: dict[str, Tensor]) -> "Splats2D":
+        """The same with other columns, which come from columns that were checked and so are not checked again."""
+        other = object.__new__(type(self))
+        vars(other).update(vars(self), **columns)
+        return other
 
     def _columns(self) -> dict[str, Tensor]:
         """Every per-splat tensor that is present."""

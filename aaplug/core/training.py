@@ -4,11 +4,17 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from statistics import median
+from typing import Annotated
 
-from aaplug.core.cameras import Camera, CameraSet
+from aaplug.core.cameras import Camera, CameraSet, Factor
+from aaplug.core.colours import Share
 from aaplug.core.conventions import Convention
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.sampling import SamplingBounds, check_seen, sampling_bounds
+from aaplug.system.contracts import Range, check_fields, contract
+from aaplug.system.errors import UsageError
+
+Margin = Annotated[float, Range(0)]  # share of an image's longer side
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,15 +31,21 @@ class TrainingViews:
     convention: Convention
     cameras: Sequence[Camera]
     bounds: SamplingBounds
-    cull_margin: float = math.inf
+    cull_margin: Margin = math.inf
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        if not self.cameras:
+            raise UsageError("cameras", "there are none, and sampling bounds need at least one")
 
     @classmethod
+    @contract
     def of(
         cls,
         scene: Gaussians,
         cameras: CameraSet | Sequence[Camera],
-        cull_margin: float = math.inf,
-        min_seen: float = 0.0,
+        cull_margin: Margin = math.inf,
+        min_seen: Share = 0.0,
     ) -> "TrainingViews":
         """Compute the sampling bounds of a scene.
 
@@ -50,6 +62,7 @@ class TrainingViews:
             check_seen(bounds.seen, len(views), scene.name, min_seen)
         return cls(scene.convention, views, bounds, cull_margin)
 
+    @contract
     def relative_rate(self, camera: Camera) -> float:
         """A view's focal length over training's: 1 at the training size, 1/2 at half of it.  Depth plays no part.
 
@@ -57,7 +70,8 @@ class TrainingViews:
         """
         return camera.focal / (camera.trained_focal or median(c.focal for c in self.cameras))
 
-    def finer(self, factor: float) -> "TrainingViews":
+    @contract
+    def finer(self, factor: Factor) -> "TrainingViews":
         """The same views with pixels `factor` times as dense, so that every rate is `factor` times as high."""
         bounds = replace(self.bounds, highest=self.bounds.highest * factor, lowest=self.bounds.lowest * factor)
         cameras = [replace(c, fx=c.fx * factor, fy=c.fy * factor) for c in self.cameras]

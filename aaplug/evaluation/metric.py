@@ -18,6 +18,7 @@ from aaplug.core.interfaces import CountsEvaluations
 from aaplug.evaluation.protocols import Protocol
 from aaplug.options.shared import AnyPath
 from aaplug.rendering.renderer import Renderer
+from aaplug.system.contracts import check_fields
 from aaplug.system.errors import UsageError
 
 Image = Float[Tensor, "h w 3"]
@@ -124,6 +125,7 @@ class Metric:
     prepare: Callable[[Protocol, LpipsFiles | None], "Metric"] | None = None
 
     def __post_init__(self) -> None:
+        check_fields(self)
         if (self.measure is None) == (self.figure is None):
             raise UsageError(f"metric {self.name}", "needs either `measure` or `figure`")
 

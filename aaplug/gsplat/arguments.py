@@ -44,6 +44,10 @@ FIXED: dict[str, object] = {  # arguments of gsplat of which only the default is
 class AnyPose(Camera):
     """A camera whose `cam_from_world` may be any affine map, which also makes its gradient that of any matrix."""
 
+    def _check_pose(self) -> None:
+        if not torch.linalg.det(self.cam_from_world[:3, :3]).abs() > 0:
+            raise UsageError("viewmats", f"expected matrices that can be inverted, got {self.cam_from_world.tolist()}")
+
     @property
     def centre(self) -> Float[Tensor, " 3"]:
         """Position in the world."""
@@ -55,7 +59,7 @@ class Options:
     """What a call says beside its tensors; names and units as in `rasterization`.
 
     Raises:
-        UsageError: a value is outside of its range.
+        UsageError: a mode is not known.
     """
 
     width: int
@@ -76,11 +80,6 @@ class Options:
         for name, modes in MODES.items():
             if getattr(self, name) not in modes:
                 raise UsageError(name, not_one_of(getattr(self, name), modes))
-        for name in ("width", "height", "near_plane", "tile_size"):
-            if not getattr(self, name) > 0:
-                raise UsageError(name, f"expected a number above 0, got {getattr(self, name)}")
-        if not self.eps2d >= 0:
-            raise UsageError("eps2d", f"expected a variance of 0 px² or more, got {self.eps2d}")
 
     @property
     def hw(self) -> tuple[int, int]:
@@ -143,19 +142,20 @@ def views_of(
     Raises:
         UsageError: shapes do not fit each other, or a camera is no pinhole camera.
     """
-    *batch, n, _ = _check_shape("means", means, (*means.shape[:-1], 3), least=2)
-    *_, c, _, _ = _check_shape("viewmats", viewmats, (*batch, *viewmats.shape[-3:-2], 4, 4), least=3)
-    _check_shape("Ks", Ks, (*batch, c, 3, 3))
-    _check_shape("opacities", opacities, (*batch, n))
-    if covars is None:
-        if quats is None or scales is None:
-            raise UsageError("covars", "expected quats and scales, or covars")
-        _check_shape("quats", quats, (*batch, n, 4))
-        _check_shape("scales", scales, (*batch, n, 3))
-    else:
-        _check_shape("covars", covars, (*batch, n, 3, 3))
+    *batch, n, _ = means.shape
+    c = viewmats.shape[-3]
+    if not math.prod((*batch, c)):
+        raise UsageError("viewmats", f"expected cameras, got a tensor of {list(viewmats.shape)}")
+    for name, x in {"viewmats": viewmats, "Ks": Ks}.items():
+        if not x.isfinite().all():
+            raise UsageError(name, "expected finite numbers, got NaN or infinity")
+    if covars is not None:
         quats, scales = means.new_zeros(*batch, n, 4), torch.ones_like(means)
+    elif quats is None or scales is None:
+        raise UsageError("covars", "expected quats and scales, or covars")
     degree = options.sh_degree
+    if colors.dim() < len(batch) + (2 if degree is None else 3):
+        raise UsageError("colors", f"expected a row of channels for each Gaussian, got {list(colors.shape)}")
     channels = colors.shape[-1:] if degree is None else (*colors.shape[-2:-1], 3)
     per_camera = colors.dim() == len(batch) + 2 + len(channels)
     _check_shape("colors", colors, (*batch, *((c,) if per_camera else ()), n, *channels))
@@ -172,11 +172,9 @@ def views_of(
     return [_view(*row, options) for row in zip(*columns, strict=True)]  # pyright: ignore[reportCallIssue]
 
 
-def _check_shape(name: str, x: Tensor, shape: Sequence[int], least: int = 0) -> Sequence[int]:
-    """Return the shape, of at least `least` dimensions, or raise UsageError."""
-    if tuple(x.shape) != tuple(shape) or x.dim() < least:
+def _check_shape(name: str, x: Tensor, shape: Sequence[int]) -> None:
+    if tuple(x.shape) != tuple(shape):
         raise UsageError(name, f"expected shape [{', '.join(map(str, shape))}], got {list(x.shape)}")
-    return x.shape
 
 
 def _per_image(x: Tensor | None, batch: Sequence[int], c: int, per_camera: bool = False) -> list[Any]:

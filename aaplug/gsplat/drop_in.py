@@ -1,11 +1,13 @@
 """The function itself; see the package's docstring."""
 
 from functools import cache
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
+from aaplug.core.cameras import Side
 from aaplug.core.conventions import CLASSIC
 from aaplug.core.interfaces import Rasterizer, RunsKernels
 from aaplug.core.kernels import EAGER
@@ -14,26 +16,31 @@ from aaplug.gsplat.arguments import Options, refuse, views_of
 from aaplug.gsplat.drawing import ViewSplats, draw
 from aaplug.gsplat.table import Layout, table_of
 from aaplug.rasterizers.choice import find_rasterizer
+from aaplug.system.contracts import Range, contract
+
+Above0 = Annotated[float, Range(above=0)]
+From0 = Annotated[float, Range(0)]
 
 
+@contract
 def rasterization(
-    means: Tensor,
-    quats: Tensor | None,
-    scales: Tensor | None,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    width: int,
-    height: int,
-    near_plane: float = RULES_GSPLAT.near,
-    far_plane: float = 1e10,
-    radius_clip: float = 0.0,
-    eps2d: float = CLASSIC.kernel,
-    sh_degree: int | None = None,
+    means: Float[Tensor, "*b n 3"],
+    quats: Float[Tensor, "*b n 4"] | None,
+    scales: Float[Tensor, "*b n 3"] | None,
+    opacities: Float[Tensor, "*b n"],
+    colors: Float[Tensor, "..."],
+    viewmats: Float[Tensor, "*b c 4 4"],
+    Ks: Float[Tensor, "*b c 3 3"],
+    width: Side,
+    height: Side,
+    near_plane: Above0 = RULES_GSPLAT.near,
+    far_plane: Above0 = 1e10,
+    radius_clip: From0 = 0.0,
+    eps2d: From0 = CLASSIC.kernel,
+    sh_degree: Annotated[int, Range(0, 4)] | None = None,
     packed: bool = True,
-    tile_size: int = 16,
-    backgrounds: Tensor | None = None,
+    tile_size: Annotated[int, Range(1)] = 16,
+    backgrounds: Float[Tensor, "*b c d"] | None = None,
     render_mode: str = "RGB",
     sparse_grad: bool = False,
     absgrad: bool = False,
@@ -42,9 +49,9 @@ def rasterization(
     distributed: bool = False,
     camera_model: str = "pinhole",
     segmented: bool = False,
-    covars: Tensor | None = None,
+    covars: Float[Tensor, "*b n 3 3"] | None = None,
     *,
-    relative_rate: float | Tensor | None = None,
+    relative_rate: float | Float[Tensor, "..."] | None = None,
     trained_mode: str = "classic",
     max_alpha: float = RULES_GSPLAT.max_alpha,
     rasterizer: str | Rasterizer = "auto",

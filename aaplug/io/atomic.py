@@ -17,6 +17,7 @@ from os import PathLike
 from pathlib import Path
 from typing import BinaryIO
 
+from aaplug.system.contracts import contract
 from aaplug.system.errors import OutputError, listing, of_system, reason
 from aaplug.system.locks import OUR_PREFIX, new_file, remove_left
 
@@ -29,6 +30,7 @@ _open_outputs = list[AnyPath]()  # of the blocks of `writing` in this process
 _inputs = dict[FileId, AnyPath]()  # of these blocks and of those that ended inside them
 
 
+@contract
 @contextmanager
 def replacing(path: AnyPath, overwrite: bool) -> Iterator[BinaryIO]:
     """Yield a binary stream whose content becomes `path` when the block ends without an exception.

@@ -30,6 +30,7 @@ from torch import Tensor
 from aaplug.core.imaging import levels
 from aaplug.io.atomic import replacing
 from aaplug.io.limits import whole_limit
+from aaplug.system.contracts import contract
 from aaplug.system.errors import FormatError, UsageError, listing, not_one_of
 
 LOSSLESS_WEBP = 101  # OpenCV's quality for it
@@ -61,6 +62,7 @@ def image_size(path: str | PathLike[str]) -> tuple[int, int]:
     return _look(Path(path)).size
 
 
+@contract
 def read_image(
     path: str | PathLike[str], background: tuple[float, float, float] | None = None
 ) -> Float[Tensor, "h w 3"]:

@@ -2,15 +2,17 @@
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.interfaces import Compositor, PixelKernel, ScreenFilter, Selection, WorldFilter
 from aaplug.methods import QUALITIES
 from aaplug.methods.pixel_kernels.point import POINT
+from aaplug.system.contracts import Range, check_fields, contract
 from aaplug.system.digests import digest_of_values
 
 MAX_SAMPLES = 64  # along a pixel's side that a rate asks for; a mean of 4096 tells less than an 8-bit step from more
+Rate = Annotated[float, Range(above=0)]  # relative to training
 RATE_TOLERANCE = 1e-6  # samples: excess over a whole number of them that takes no further sample
 
 
@@ -67,9 +69,9 @@ class Recipe:
     source: str
     when: str
     world: WorldFilter | None = None
-    target_rate: float = 0.0
-    grid: int = 1
-    neighbours: float = 0.0
+    target_rate: Annotated[float, Range(0)] = 0.0
+    grid: Annotated[int, Range(1, MAX_SAMPLES)] = 1
+    neighbours: Annotated[float, Range(0, 0.5)] = 0.0
     pixel: PixelKernel = POINT
     compositor: Compositor | None = None
     selection: Selection | None = None
@@ -78,16 +80,21 @@ class Recipe:
     for_discs: str | None = None
     promises: Promises = Promises()
 
+    def __post_init__(self) -> None:
+        check_fields(self)
+
     @property
     def digest(self) -> str:
         """Hash of all fields but the words about it."""
         return digest_of_values(replace(self, source="", when="", promises=Promises()))
 
-    def samples_at(self, relative_rate: float) -> int:
+    @contract
+    def samples_at(self, relative_rate: Rate) -> int:
         """Samples along a pixel's side, for a view at `relative_rate` against training; see `MAX_SAMPLES`."""
         return max(self.grid, math.ceil(min(MAX_SAMPLES, min(self.target_rate, 1.0) / relative_rate - RATE_TOLERANCE)))
 
-    def neighbours_at(self, sampled_rate: float) -> float:
+    @contract
+    def neighbours_at(self, sampled_rate: Rate) -> float:
         """Weight of the samples on either side of each, where the samples lie at `sampled_rate` against training.
 
         It is 0 from training's own rate on, where samples are training's pixels, and grows as `Matched`'s pixel filter
@@ -95,6 +102,7 @@ class Recipe:
         """
         return self.neighbours * max(0.0, 1 - sampled_rate**2)
 
+    @contract
     def lacks(self, scene: Gaussians) -> str | None:
         """The columns that a scene lacks for this recipe, in words; None if nothing."""
         return None if self.selection is None else self.selection.lacks(scene)

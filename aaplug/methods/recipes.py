@@ -1,16 +1,23 @@
 """Finding the recipe that a user means, and fitting it to a scene."""
 
 from dataclasses import replace
+from typing import Annotated
 
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.interfaces import MatchesRates
 from aaplug.methods import QUALITIES, RECIPES
 from aaplug.methods.recipe import Recipe, set_by
+from aaplug.system.contracts import Range, contract
 from aaplug.system.errors import UsageError, not_one_of
 
 
+@contract
 def find_recipe(
-    name: str, *, quality: str = "balanced", rate_reference: str | None = None, target_rate: float | None = None
+    name: str,
+    *,
+    quality: str = "balanced",
+    rate_reference: str | None = None,
+    target_rate: Annotated[float, Range(0)] | None = None,
 ) -> Recipe:
     """A recipe by name, with the user's choices.
 

@@ -12,6 +12,7 @@ from typing import Annotated, Any, TypeVar, cast, get_type_hints
 
 import tyro
 
+from aaplug.system.contracts import check_fields
 from aaplug.system.errors import MAX_VALUE_CHARACTERS, UsageError, did_you_mean, not_one_of
 from aaplug.system.monitor import SILENT, Monitor
 from aaplug.system.registry import names_of
@@ -139,6 +140,7 @@ class Options:
                 got = ", ".join(map(str, value)) if isinstance(value, (list, tuple)) else str(value)
                 takes = check.range_text if isinstance(check, Numbers) else check.metavar
                 raise UsageError(name, f"takes {takes}, got {got[:MAX_VALUE_CHARACTERS] or 'nothing'}")
+        check_fields(self)
 
     @classmethod
     def of(cls: type[Chosen], given: Mapping[str, Any]) -> Chosen:

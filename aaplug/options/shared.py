@@ -14,6 +14,7 @@ from aaplug.core.colours import Background
 from aaplug.core.conventions import MIN_SEEN_SHARE
 from aaplug.methods import QUALITIES, RateReference
 from aaplug.options.base import CAMERAS, DRAWING, ORBIT, UNSET, OneOf, Options, choice, flag, number
+from aaplug.system.contracts import LazyType
 from aaplug.system.errors import MAX_VALUE_CHARACTERS, UsageError
 from aaplug.system.registry import names_of
 
@@ -24,7 +25,11 @@ if TYPE_CHECKING:  # the modules of these types import torch
     from aaplug.methods.viewers import Viewer
     from aaplug.system.executors import Executor
 else:
-    Executor = Rasterizer = Protocol = Recipe = Viewer = Any
+    Rasterizer = Annotated[Any, LazyType("aaplug.core.interfaces:Rasterizer")]
+    Protocol = Annotated[Any, LazyType("aaplug.evaluation.protocols:Protocol")]
+    Recipe = Annotated[Any, LazyType("aaplug.methods.recipe:Recipe")]
+    Viewer = Annotated[Any, LazyType("aaplug.methods.viewers:Viewer")]
+    Executor = Annotated[Any, LazyType("aaplug.system.executors:Executor")]
 
 AnyPath = str | PathLike[str]
 

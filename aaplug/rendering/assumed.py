@@ -25,6 +25,7 @@ from aaplug.io.scenes.scene import Scene
 from aaplug.methods.filters.smoothing import NYQUIST_VARIANCE
 from aaplug.options.shared import DEFAULT_FOV, Orbit, size_of
 from aaplug.rendering.renderer import Renderer
+from aaplug.system.contracts import contract
 from aaplug.system.errors import AaplugError, UsageError
 from aaplug.system.monitor import Monitor
 
@@ -40,6 +41,7 @@ Z_UP = (0.0, 0.0, 1.0)  # nerfstudio turns its scenes so
 TRAINING_RATE = "training rate: "  # how the note begins
 
 
+@contract
 def cameras_around(scene: SceneLike, orbit: Orbit, single: bool = False) -> CameraSet:
     """Cameras for a scene without any: the assumed training views, and as test views those that an orbit shows.
 

@@ -17,8 +17,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from aaplug.core.cameras import Camera, CameraSet
-from aaplug.core.colours import BLACK, WHITE, Background, Colour
+from aaplug.core.cameras import Camera, CameraSet, Factor
+from aaplug.core.colours import BLACK, WHITE, Background, Colour, Share
 from aaplug.core.conventions import MIN_SEEN_SHARE
 from aaplug.core.culling import cull
 from aaplug.core.gaussians import Gaussians
@@ -30,7 +30,7 @@ from aaplug.core.pyramids import Cutter, faded
 from aaplug.core.sampling import sampling_bounds
 from aaplug.core.shading import shade
 from aaplug.core.splats import Render, Splats2D, concatenated
-from aaplug.core.training import TrainingViews
+from aaplug.core.training import Margin, TrainingViews
 from aaplug.io.cameras import read_cameras
 from aaplug.io.limits import lack_of_memory
 from aaplug.io.scenes import SceneLike, scene_of
@@ -41,6 +41,7 @@ from aaplug.methods.recipe import RATE_TOLERANCE, Recipe
 from aaplug.methods.recipes import find_recipe, suited
 from aaplug.rasterizers import RASTERIZERS
 from aaplug.rasterizers.choice import find_rasterizer
+from aaplug.system.contracts import check_fields, contract
 from aaplug.system.cores import on_free_cores
 from aaplug.system.errors import UsageError, within_memory
 
@@ -81,7 +82,11 @@ class Renderer:
     source: Scene | None = field(default=None, repr=False)
     _rates: dict[tuple[object, ...], float] = field(default_factory=dict, init=False, repr=False)
 
+    def __post_init__(self) -> None:
+        check_fields(self)
+
     @classmethod
+    @contract
     def of(
         cls,
         scene: SceneLike,
@@ -91,8 +96,8 @@ class Renderer:
         quality: str = "balanced",
         background: Background = "auto",
         rasterizer: str | Rasterizer = "auto",
-        cull_margin: float = math.inf,
-        min_seen: float = MIN_SEEN_SHARE,
+        cull_margin: Margin = math.inf,
+        min_seen: Share = MIN_SEEN_SHARE,
     ) -> "Renderer":
         """Prepare a scene: check its frame, compute its sampling bounds and apply the world filter.
 
@@ -134,13 +139,15 @@ class Renderer:
         filtered = _filtered(gaussians, training, recipe)
         return cls(filtered, training, recipe, rasterizer, colour, harmonics, cutter, source)
 
+    @contract
     def by(self, recipe: Recipe) -> "Renderer":
         """The same scene by another recipe."""
         assert self.source is not None
         same = {"background": self.background, "rasterizer": self.rasterizer}
         return Renderer.of(self.source, self.training, recipe, **same)
 
-    def trained_at(self, factor: float) -> "Renderer":
+    @contract
+    def trained_at(self, factor: Factor) -> "Renderer":
         """The same scene as if training had sampled it `factor` times as finely; its world filter is applied anew."""
         training = self.training.finer(factor)
         cutter = None if self.cutter is None else Cutter.of(self.cutter.pyramid, training)
@@ -150,6 +157,7 @@ class Renderer:
         raw = without_harmonics(self.source)[0] if self.cutter is None else self.cutter.pyramid.scene
         return replace(self, scene=_filtered(raw, training, self.recipe), training=training, cutter=cutter)
 
+    @contract
     def showing(self, scene: Gaussians) -> "Renderer":
         """The same for another scene: its sampling bounds are computed from the same cameras."""
         training = TrainingViews.of(scene, self.training.cameras, self.training.cull_margin)
@@ -171,11 +179,12 @@ class Renderer:
         with within_memory(f"view {camera.name} at {camera.width}x{camera.height}"):
             return self.draw(camera).render
 
+    @contract
     @on_free_cores()
     def draw(self, camera: Camera) -> Drawing:
         """Render one view and keep its splats, for example to read their gradients."""
         samples, weight = self.sampling(camera)
-        fine = camera.resized(camera.width * samples, camera.height * samples)
+        fine = camera if samples == 1 else camera.resized(camera.width * samples, camera.height * samples)
         pixels = fine.width * fine.height
         if pixels > UNCHECKED_SAMPLES and (lacking := lack_of_memory(SAMPLE_BYTES * pixels)):
             problem = f"with {samples}×{samples} samples per pixel would take {lacking}; a smaller image needs less"
@@ -184,6 +193,7 @@ class Renderer:
         image = self.paint(splats, fine.hw)
         return Drawing(average_samples(image, samples, weight), splats, fine.hw)
 
+    @contract
     @on_free_cores()
     def paint(self, splats: Splats2D, hw: tuple[int, int], background: Colour | None = None) -> Render:
         """Composite coloured splats into an image of height and width `hw` px.
@@ -194,6 +204,7 @@ class Renderer:
         recipe, rules = self.recipe, self.training.convention.rules
         return self.rasterizer(splats, hw, colour, recipe.pixel, recipe.compositor, rules)
 
+    @contract
     def sampled(self, camera: Camera) -> tuple[Camera, int]:
         """Camera of the supersampled image, and the samples along a pixel's side."""
         samples = self.samples(camera)
@@ -203,6 +214,7 @@ class Renderer:
         """Number of samples along a pixel's side."""
         return self.sampling(camera)[0]
 
+    @contract
     def sampling(self, camera: Camera, samples: int | None = None) -> tuple[int, float]:
         """Samples along a pixel's side, and the weight of those on either side of each; constants to gradients.
 
@@ -217,6 +229,7 @@ class Renderer:
                 samples = int(min(samples, max(recipe.levels.most_samples, for_coarsest)))
         return samples, recipe.neighbours_at(round(samples * rate, RATE_DIGITS)) if weighs else 0.0
 
+    @contract
     def coarsening(self, camera: Camera, samples: int) -> float:
         """Octaves by which levels of detail are coarser than those of the samples; see `Cutter.coarsening`."""
         choice = self.recipe.levels
@@ -225,6 +238,7 @@ class Renderer:
         most = max(choice.budget, int(choice.share * self.cutter.pyramid.sizes[0]))
         return self.cutter.coarsening(camera, max(0.0, math.log2(samples) - choice.finer), most)
 
+    @contract
     def relative_rate(self, camera: Camera) -> float:
         """A view's sampling rate relative to training, which sets the samples per pixel.
 
@@ -250,6 +264,7 @@ class Renderer:
                 return float((now / torch.minimum(torch.maximum(now, lowest), highest)).median())
         return self.training.relative_rate(camera)
 
+    @contract
     @on_free_cores()
     def splats(self, camera: Camera, samples: int = 1) -> Splats2D:
         """The splats of one view: projected, selected, filtered, culled and coloured.
@@ -294,7 +309,10 @@ class Renderer:
         if recipe.pixel.needs_depth_slopes:
             splats = with_depth_slopes(splats, chunk, camera)
         own = splats.sources
-        splats = replace(splats, sources=own + places if isinstance(places, int) else places.index_select(0, own))
+        if not isinstance(places, int):
+            splats = replace(splats, sources=places.index_select(0, own))
+        elif places:
+            splats = replace(splats, sources=own + places)
         splats = recipe.screen(splats, camera, training)
         if shares is not None:
             splats = faded(splats, shares.index_select(0, own))
@@ -323,6 +341,7 @@ def own_look(
     return Renderer.of(scene, training, find_recipe("matched"), rasterizer=rasterizer, background=background)
 
 
+@contract
 def background_colour(background: Background, cameras: object = None) -> Colour:
     """The colour behind the scene.
 
@@ -330,7 +349,8 @@ def background_colour(background: Background, cameras: object = None) -> Colour:
         UsageError: the name is not known.
     """
     if not isinstance(background, str):
-        return background
+        red, green, blue = background
+        return red, green, blue
     named: dict[str, Colour] = {"white": WHITE, "black": BLACK}
     if background == "auto":
         found = cameras.background if isinstance(cameras, CameraSet) else None

@@ -18,6 +18,7 @@ from importlib.metadata import entry_points
 from importlib.util import find_spec
 from typing import Any, TypeVar
 
+from aaplug.system.contracts import contract, described
 from aaplug.system.errors import UsageError, did_you_mean, not_one_of
 
 PREFIX = "aaplug."
@@ -40,6 +41,12 @@ REGISTRIES = {  # place of each kind's registry; a kind, with underscores and an
 
 log = logging.getLogger("aaplug")
 T = TypeVar("T")
+
+
+class NoEntryError(UsageError, KeyError):
+    """A name that a registry does not have: an error of a user, and of a mapping."""
+
+    __str__ = Exception.__str__
 
 
 class Registry(Mapping[str, T]):
@@ -68,12 +75,16 @@ class Registry(Mapping[str, T]):
         return _at(self._type_at)
 
     def __getitem__(self, name: str) -> T:
+        if not isinstance(name, str):
+            raise NoEntryError(self.kind, f"expected a name, got {described(name)}")
         if name not in self._entries:
             if name not in self._built_in:
                 self._load_plug_ins()
             else:
                 value: Any = self._built_in[name]
                 self._add(name, _at(value) if isinstance(value, str) else value, f"{self.kind} {name}")
+        if name not in self._entries:
+            raise NoEntryError(self.kind, unknown(str(name), list(self)))
         return self._entries[name]
 
     def __iter__(self) -> Iterator[str]:
@@ -87,6 +98,7 @@ class Registry(Mapping[str, T]):
         """A registry is its process's own; a copy is that of the process that makes it."""
         return _at, (REGISTRIES[self.kind],)
 
+    @contract
     def find(self, name: str, parameter: str | None = None) -> T:
         """An entry by name.
 
@@ -97,6 +109,7 @@ class Registry(Mapping[str, T]):
             raise UsageError(parameter or self.kind, unknown(name, list(self)))
         return self[name]
 
+    @contract
     def register(self, name: str, value: T) -> None:
         """Add an entry from Python, for this process.
 

@@ -15,9 +15,11 @@ from aaplug.evaluation.report.files import as_json, write_texts
 from aaplug.evaluation.results import Report, as_csv, grid, method, results
 from aaplug.io.atomic import refuse_existing, writing
 from aaplug.options.shared import AnyPath
+from aaplug.system.contracts import contract
 from aaplug.system.errors import AaplugError, ClusterError, printable, within_memory
 from aaplug.system.monitor import SILENT, Monitor
 from aaplug.verbs.evaluate import check_results
+from aaplug.verbs.verb import check_name
 from aaplug.verbs.views import file_names
 
 SUMMARY, RESULTS = "batch.json", "results.csv"
@@ -75,6 +77,7 @@ def status_table(heading: str, rows: Iterable[tuple[str, str, str]]) -> Table:
     return table
 
 
+@contract
 def batch(
     runs: Sequence[tuple[str, Callable[..., Report]]],
     output: AnyPath,
@@ -93,6 +96,7 @@ def batch(
     Raises:
         AaplugError: there are results already, an option does not fit, or the summary cannot be written.
     """
+    check_name(output)
     folders = [Path(output) / slug for slug in file_names([name for name, _ in runs], "scene", 3)]
 
     def check() -> None:

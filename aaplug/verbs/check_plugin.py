@@ -8,6 +8,7 @@ from types import ModuleType
 from typing import Any, NamedTuple
 
 from aaplug.evaluation.laws import LAWS
+from aaplug.system.contracts import contract
 from aaplug.system.errors import UsageError
 from aaplug.system.monitor import SILENT, Monitor
 from aaplug.system.registry import group_of, registry_of
@@ -22,6 +23,7 @@ class Verdict(NamedTuple):
     problem: str
 
 
+@contract
 def check_plugin(module: str, *, monitor: Monitor = SILENT) -> list[Verdict]:
     """Run the laws of its kind on each object of a module, and on each that its package's entry points name.
 

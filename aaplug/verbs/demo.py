@@ -21,9 +21,11 @@ from aaplug.io.images import read_image, write_png
 from aaplug.io.scenes import read_scene
 from aaplug.options.shared import AnyPath
 from aaplug.rendering.renderer import Renderer
+from aaplug.system.contracts import contract
 from aaplug.system.monitor import SILENT, Monitor
 from aaplug.verbs.convert import convert
 from aaplug.verbs.evaluate import evaluate
+from aaplug.verbs.verb import check_name
 
 SCALES = (1.0, 0.5, 0.25, 0.125)
 SHEET_VIEW = "r_136"
@@ -31,12 +33,14 @@ COLUMNS = ("photograph", "classic 3DGS", "aaplug", "converted .ply, Mip viewer")
 CONVERTED, SHEET = "chair-converted.ply", "contact-sheet.png"
 
 
+@contract
 def demo(output: AnyPath = "demo-out", *, overwrite: bool = False, monitor: Monitor = SILENT) -> Report:
     """Convert, render and measure the bundled scene; write the converted scene, a contact sheet and the results.
 
     Raises:
         OutputError: in the folder `output` a file exists and `overwrite` is false, or cannot be written.
     """
+    check_name(output)
     folder = Path(output)
     refuse_existing([folder / name for name in (CONVERTED, SHEET, *RESULTS)], overwrite)
     with output_folder(folder), as_file(files("aaplug.io.sample")) as sample:

@@ -7,12 +7,16 @@ keywords of the verb, and so do `help` and the API's pages.
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from functools import wraps
+from os import PathLike
+from pathlib import Path
 from typing import Any, ParamSpec, Protocol, TypeVar
 
 from aaplug.io.scenes import SceneLike
 from aaplug.options.base import Options, documented
 from aaplug.options.shared import AnyPath
 from aaplug.rendering.job import CamerasLike
+from aaplug.system.contracts import contract
+from aaplug.system.errors import OutputError, reason
 
 P = ParamSpec("P")
 O_contra = TypeVar("O_contra", bound=Options, contravariant=True)
@@ -75,18 +79,32 @@ def compares(
     return _with(options, ("cameras", "output"))
 
 
+def check_name(output: Any) -> None:
+    """Refuse an output whose name the file system does not take."""
+    try:
+        if isinstance(output, str | PathLike):
+            Path(output).lstat()
+    except (FileNotFoundError, NotADirectoryError):
+        return
+    except (OSError, ValueError) as error:
+        raise OutputError(output, f"cannot be written: {reason(error)}") from error
+
+
 def _with(options: Any, optional: tuple[str, ...]) -> Any:
     def decorate(body: Callable[..., Any]) -> Callable[..., Any]:
         *given, last = inspect.signature(body).parameters.values()
         assert last.name == "options"
         inputs = inspect.Signature([p.replace(default=None) if p.name in optional else p for p in given])
 
+        body_checked = contract(body)
+
         @wraps(body)
         def verb(*args: Any, **keywords: Any) -> Any:
             own = {name: keywords.pop(name) for name in inputs.parameters if name in keywords}
             bound = inputs.bind(*args, **own)
             bound.apply_defaults()
-            return body(*bound.args, options.of(keywords))
+            check_name(bound.arguments.get("output"))
+            return body_checked(*bound.args, options.of(keywords))
 
         fields = inspect.signature(options).parameters.values()
         signature = inspect.signature(body).replace(parameters=[*inputs.parameters.values(), *fields])

@@ -7,6 +7,7 @@ from typing import NamedTuple
 from aaplug.methods import RECIPES
 from aaplug.methods.recipe import Recipe
 from aaplug.rasterizers.tiled.ahead_of_time import build, cache_folder, kernels_of
+from aaplug.system.contracts import contract
 from aaplug.system.monitor import SILENT, Monitor
 
 
@@ -17,6 +18,7 @@ class Kernels(NamedTuple):
     names: list[str]
 
 
+@contract
 def warmup(recipe: str | Recipe | Sequence[str | Recipe] = (), *, monitor: Monitor = SILENT) -> Kernels:
     """Compile what is missing, in two to three minutes.
 

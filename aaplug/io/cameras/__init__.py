@@ -18,6 +18,7 @@ from aaplug.io.cameras.options import CameraFileOptions
 from aaplug.io.cameras.photos import files_of
 from aaplug.io.cameras.poses import pose
 from aaplug.io.values import MAX_FOCAL, Place, focal, number, numbers, pixels
+from aaplug.system.contracts import contract
 from aaplug.system.errors import FormatError, UsageError, listing
 from aaplug.system.registry import Registry, named
 
@@ -58,6 +59,7 @@ OWN = (pinhole, camera_path, inria_model, colmap, blender, inria, multiscale, tr
 CAMERA_FORMATS = Registry[CameraFormat]("camera format", "aaplug.io.cameras:CameraFormat", named(OWN))
 
 
+@contract
 def read_cameras(
     path: str | PathLike[str],
     *,

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from aaplug.core.cameras import Camera, CameraSet
 from aaplug.io.images import image_size
 from aaplug.io.limits import whole_limit
+from aaplug.system.contracts import check_fields
 from aaplug.system.errors import FormatError, UsageError
 
 LLFF_HOLD = 8  # every 8th view by name is a test view: LLFF, 3DGS --eval
@@ -33,6 +34,7 @@ class CameraFileOptions:
     test_every: int | None = None
 
     def __post_init__(self) -> None:
+        check_fields(self)
         scale, every = self.train_scale, self.test_every
         if scale is not None and not (math.isfinite(scale) and scale > 0):
             raise UsageError("train_scale", f"should be above 0 (1/4 is 0.25), not {scale}")

@@ -22,8 +22,9 @@ from aaplug.io.atomic import check_output
 from aaplug.io.scenes import compressed_ply, ksplat, ply, pt, sog, splat, spz
 from aaplug.io.scenes.options import SceneFileOptions
 from aaplug.io.scenes.pyramid_folder import MANIFEST, is_pyramid, path_of, read_manifest, read_pyramid
-from aaplug.io.scenes.scene import MODEL_SCENE, SOG_FOLDER, Scene, described_faults, faults_of
+from aaplug.io.scenes.scene import MODEL_SCENE, SOG_FOLDER, Scene, described_faults, faults_of, library_errors
 from aaplug.io.values import read_start
+from aaplug.system.contracts import contract
 from aaplug.system.errors import FormatError, OutputError, UsageError
 from aaplug.system.registry import Registry, named
 
@@ -79,6 +80,7 @@ def scene_of(scene: SceneLike) -> Scene:
     return Scene.in_memory(scene) if isinstance(scene, Gaussians | Pyramid) else read_scene(scene)
 
 
+@contract
 def read_scene(
     path: str | PathLike[str],
     *,
@@ -106,8 +108,9 @@ def read_scene(
         FormatError: the file is missing, of no known format, or breaks its format.
     """
     options = SceneFileOptions(allow_checkpoint, spz_axes)
-    folder, manifest = (Path(path), read_manifest(path)) if is_pyramid(path) else (None, None)
-    path = find_scene(path, iteration)
+    with library_errors(Path(path)):
+        folder, manifest = (Path(path), read_manifest(path)) if is_pyramid(path) else (None, None)
+        path = find_scene(path, iteration)
     head = read_start(path, HEAD_BYTES)
     if not head:
         raise FormatError(path, "is empty")

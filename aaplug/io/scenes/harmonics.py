@@ -49,8 +49,9 @@ def without_harmonics(scene: Scene) -> tuple[Gaussians, FileHarmonics | None]:
         return scene.gaussians(), None
     if "without harmonics" not in scene.memory:
         scene.check_memory(harmonics=False)
-        bare = joined([replace(part, sh=torch.empty(len(part), 0, 3)) for part in scene.parts()])
+        nothing = torch.full((1, 1, 3), torch.nan)
+        bare = joined([replace(part, sh=nothing.expand(len(part), 1, 3)) for part in scene.parts()])
         assert bare.origin is not None
-        nothing = torch.full((1, (scene.sh_degree + 1) ** 2, 3), torch.nan).expand(len(bare), -1, -1)
+        nothing = nothing.expand(len(bare), (scene.sh_degree + 1) ** 2, 3)
         scene.memory["without harmonics"] = replace(bare, sh=nothing), FileHarmonics(path, scene.load, bare.origin.rows)
     return scene.memory["without harmonics"]

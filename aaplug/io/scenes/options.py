@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import get_args
 
 from aaplug.io import SpzAxes
+from aaplug.system.contracts import check_fields
 from aaplug.system.errors import UsageError
 
 
@@ -20,6 +21,7 @@ class SceneFileOptions:
     spz_axes: SpzAxes = "auto"
 
     def __post_init__(self) -> None:
+        check_fields(self)
         choices = get_args(SpzAxes)
         if self.spz_axes not in choices:
             raise UsageError("spz_axes", f"should be {' or '.join(choices)}, not {self.spz_axes!r}")

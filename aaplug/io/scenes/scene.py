@@ -23,7 +23,8 @@ from aaplug.core.pyramids import Pyramid
 from aaplug.core.spherical_harmonics import COLOUR_OFFSET, SH_C0
 from aaplug.io.cameras import holds_cameras, read_cameras
 from aaplug.io.limits import lack_of_memory, whole_limit
-from aaplug.system.errors import AaplugError, FormatError, listing, reason
+from aaplug.system.contracts import contract
+from aaplug.system.errors import AaplugError, FormatError, UsageError, listing, reason
 
 MODEL_SCENE = "point_cloud/iteration_*/point_cloud.ply"  # in an INRIA model folder
 SOG_FOLDER = "meta.json"  # marks a folder of SOG images
@@ -81,8 +82,14 @@ class Scene:
     memory: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
 
     @classmethod
+    @contract
     def in_memory(cls, held: Gaussians | Pyramid) -> "Scene":
-        """The scene of Gaussians, or of all levels of detail."""
+        """The scene of Gaussians, or of all levels of detail.
+
+        Raises:
+            UsageError: some have NaN, infinite or unusable values.
+        """
+        check_values(held.scene if isinstance(held, Pyramid) else held)
         finest, levels = (held.finest, held) if isinstance(held, Pyramid) else (held, None)
         origin = finest.origin
         scene = cls(
@@ -255,6 +262,7 @@ class _Rows:
         return self.rows[start:stop]
 
 
+@contract
 @contextmanager
 def library_errors(path: Path) -> Iterator[None]:
     """Report whatever a library raises about a damaged file as one FormatError."""
@@ -281,6 +289,7 @@ def read_rows(path: Path, dtype: np.dtype, start: int, stop: int, offset: int = 
     return rows
 
 
+@contract
 def check_count(path: Path, count: int) -> None:
     """Refuse a scene of more Gaussians than the limit GAUSSIANS."""
     most = whole_limit("GAUSSIANS")
@@ -329,11 +338,13 @@ def scene_of(names: Sequence[str], values: Float[Tensor, "n c"], degree: int, fl
     )
 
 
+@contract
 def logit_of(opacity: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
     """Logits of opacities; finite at 0 and 1."""
     return opacity.clamp(MIN_OPACITY, 1 - MIN_OPACITY).logit()
 
 
+@contract
 def sh_of_colour(rgb: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
     """Harmonics of degree 0 of colours in [0, 1]."""
     return (rgb - COLOUR_OFFSET) / SH_C0
@@ -372,6 +383,15 @@ def usable(scene: Gaussians) -> Gaussians:
     """The Gaussians that renderers can use."""
     faults = faults_of(scene)
     return scene[~torch.stack(list(faults.values())).any(dim=0)] if faults else scene
+
+
+def check_values(scene: Gaussians) -> None:
+    """Refuse Gaussians in memory that no renderer can use."""
+    if faults := faults_of(scene):
+        found = [
+            f"Gaussian {int(rows.nonzero()[0])} (of {int(rows.sum())}) has {text}" for text, rows in faults.items()
+        ]
+        raise UsageError(scene.name, f"{listing(found)}; leave such Gaussians out")
 
 
 def doubts_of(scene: Gaussians) -> dict[str, int]:
