@@ -8,12 +8,14 @@ import torch
 from aaplug.core.cameras import Camera
 from aaplug.core.conventions import CONVENTIONS, MIP
 from aaplug.core.projection import project
+from aaplug.core.rules import Rules
 from aaplug.core.sampling import median_rates
 from aaplug.core.training import TrainingViews
 from aaplug.io.scenes import read_scene, write_scene
 from aaplug.methods import FORMS, RECIPES
 from aaplug.methods.conversion import FITTED_VARIANCE, fuse, fuse_for
 from aaplug.methods.filters.dilation import Dilation
+from aaplug.methods.filters.energy import MatchedEnergy
 from aaplug.methods.viewers import VIEWERS
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import UsageError
@@ -115,3 +117,12 @@ def test_a_scene_thinner_than_a_viewers_blur_keeps_some_area(cameras):
     px, before = converted.scales * rates, scene.scales * rates
     assert (px >= 0.999 * before.clamp(max=0.1)).all()
     assert (px < 0.999 * before).any()
+
+
+def test_a_view_in_which_training_drew_a_gaussian_not_does_not_count():
+    """Its rules have the near plane between the two cameras' depths; the median of two rates is the lower one."""
+    scene = make_scene(1)
+    near, far = (make_camera((0.0, -distance, 0.0)) for distance in (3.0, 9.0))
+    scene = replace(scene, means=torch.zeros(1, 3), convention=replace(CONVENTIONS["classic"], rules=Rules(near=5.0)))
+    both, alone = (MatchedEnergy()(scene, TrainingViews.of(scene, views)) for views in ([near, far], [far]))
+    torch.testing.assert_close(both.logit_opacities, alone.logit_opacities)

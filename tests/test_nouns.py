@@ -1,18 +1,22 @@
 """Nouns are values: they can be compared, hashed, copied and sent to another process."""
 
 import copy
+import math
 import pickle
 from dataclasses import replace
 
 import pytest
 import torch
 
-from aaplug.core.cameras import CameraSet
+from aaplug.core.cameras import CameraSet, look_at
 from aaplug.core.gaussians import Origin
 from aaplug.core.orbits import frame_of
 from aaplug.core.pyramids import Cutter, Pyramid
 from aaplug.core.training import TrainingViews
 from aaplug.io.scenes import read_scene, scene_of, write_scene
+from aaplug.methods import RECIPES
+from aaplug.rendering.renderer import Renderer
+from aaplug.system.errors import UsageError
 from tests.conftest import make_camera, make_scene, make_splats, sized
 
 VIEWS = make_camera(), make_camera((3.0, -2.0, 1.0), name="other")
@@ -69,3 +73,59 @@ def test_two_openings_of_a_file_are_two_scenes(tmp_path):
     assert first != second
     assert first.digest == second.digest
     assert first.gaussians() is first.gaussians(), "rows are read once"
+
+
+POSE = VIEWS[0].cam_from_world
+ODD_CAMERAS = [
+    *({"fx": x} for x in (0.0, -1.0, math.inf, math.nan, 1e30)),
+    *({"cy": x} for x in (math.inf, math.nan)),
+    *({"width": x} for x in (0, -1, 10**9)),
+    *({"trained_focal": x} for x in (0.0, -1.0, math.nan)),
+    *({"cam_from_world": x} for x in (POSE * math.nan, 0 * POSE, 2 * POSE, POSE.half())),
+    {"cam_from_world": POSE * torch.tensor([[-1.0], [1.0], [1.0], [1.0]], dtype=torch.float64)},
+    {"cam_from_world": POSE + torch.eye(4, dtype=torch.float64)[:, [3, 0, 1, 2]]},
+]
+
+
+@pytest.mark.parametrize("odd", ODD_CAMERAS, ids=lambda odd: "-".join(map(str, odd)))
+def test_a_camera_is_a_pinhole_at_a_rigid_pose(odd):
+    with pytest.raises(UsageError, match="expected"):
+        replace(VIEWS[0], **odd)
+
+
+@pytest.mark.parametrize(
+    "odd", [{"cull_margin": math.nan}, {"cull_margin": -1.0}, {"min_seen": math.nan}, {"min_seen": -0.1}]
+)
+def test_training_views_take_shares(odd):
+    with pytest.raises(UsageError, match="expected a number"):
+        TrainingViews.of(SCENE, VIEWS, **odd)
+
+
+@pytest.mark.parametrize("column", ["means", "quats", "log_scales", "logit_opacities", "sh"])
+def test_gaussians_with_nan_are_refused_in_memory_as_from_a_file(column):
+    poisoned = getattr(SCENE, column).clone()
+    poisoned[3] = math.nan
+    with pytest.raises(UsageError, match=r"Gaussian 3 \(of 1\) has NaN"):
+        scene_of(replace(SCENE, **{column: poisoned}))
+
+
+@pytest.mark.parametrize("background", [(1.0, 1.0), (1.0, 1.0, math.nan), (255.0, 0.0, 0.0), "blue", 3])
+def test_a_background_is_a_colour(background):
+    with pytest.raises(UsageError, match="background: expected"):
+        Renderer.of(make_scene(6), VIEWS, background=background)
+
+
+def test_sight_has_a_direction_that_is_not_up():
+    eye, up = torch.tensor([0.0, 0.0, -4.0]), torch.tensor([0.0, -1.0, 0.0])
+    with pytest.raises(UsageError, match="target: expected a place other than"):
+        look_at(eye, eye, up)
+    with pytest.raises(UsageError, match="up: expected a direction other than"):
+        look_at(eye, 2 * up + eye, up)
+
+
+def test_a_name_that_a_registry_lacks_is_a_key_error_and_ours():
+    for error in (KeyError, UsageError):
+        with pytest.raises(error, match="did you mean mip"):
+            RECIPES["mipp"]
+    assert RECIPES.get("mipp") is None
+    assert pickle.loads(pickle.dumps(RECIPES)) is RECIPES

@@ -74,7 +74,7 @@ class Registry(Mapping[str, T]):
         """The type of the entries."""
         return _at(self._type_at)
 
-    def __getitem__(self, name: str) -> T:
+    def __getitem__(self, name: Any) -> T:
         if not isinstance(name, str):
             raise NoEntryError(self.kind, f"expected a name, got {described(name)}")
         if name not in self._entries:

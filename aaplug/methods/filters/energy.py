@@ -71,11 +71,11 @@ def _mean_log_factor(
     scene: Gaussians, widened: Gaussians, views: Sequence[Camera], training: TrainingViews, shown: Convention
 ) -> Float[Tensor, " n"]:
     """ln of (energy in training / energy in the viewer at unchanged opacity), averaged over the views that see it."""
-    blur = 0.0 if shown.compensated else shown.kernel
+    blur, rules = 0.0 if shown.compensated else shown.kernel, training.convention.rules
     total = torch.zeros_like(scene.logit_opacities, dtype=torch.float64)
     count = torch.zeros_like(total)
     for camera in views:
-        raw, wide = project(scene, camera), project(widened, camera)
+        raw, wide = (project(gaussians, camera, rules=rules) for gaussians in (scene, widened))
         trained = raw.blurred(training.convention.kernel, training.convention.compensated)
         wide = wide.blurred(blur, compensate=False)
         factor = 0.5 * (trained.dets / wide.dets).log() + (trained.opacities / raw.opacities).log()
