@@ -32,7 +32,7 @@ ODD_VALUES = (
     "\0", "n" * 5000, b"bytes", (), [], {}, (1, 2), [1.0, 2.0, math.nan], (5, 5), ["r_8"], {"a": 3}, int, aaplug.Camera,
     Path("nowhere"), np.float16(2), np.zeros((4, 3)), torch.zeros(()), torch.zeros(4, 3), torch.zeros(3),
 )  # fmt: skip
-MANY = 12  # parameters, from which on each option takes a third of the odd values
+MANY, THIN = 12, 5  # from so many parameters on, each option takes one in so many of the odd values
 TABLES = ("Gaussians", "Splats2D")  # their columns go to compiled kernels
 TAKES_NONE = ("view", "serving", "bench")  # and works on a scene of its own
 NOT_CALLED = {  # and why
@@ -173,7 +173,7 @@ def wrong_calls(folder: Path) -> Iterator[tuple[str, str, Any, bool, Callable[[]
                 continue
             thin = spec.kind is spec.KEYWORD_ONLY and len(inspect.signature(function).parameters) > MANY
             thin = spec.kind is spec.KEYWORD_ONLY and len(inspect.signature(function).parameters) > MANY
-            values = list(ODD_VALUES[number % 3 :: 3] if thin else ODD_VALUES)
+            values = list(ODD_VALUES[number % THIN :: THIN] if thin else ODD_VALUES)
             unfit = list(STRANGERS)
             if isinstance(right.get(parameter), Tensor):
                 values += odd_tensors(right[parameter].detach())

@@ -88,6 +88,7 @@ def read_rgba(path: str | PathLike[str]) -> Float[Tensor, "h w 4"]:
     return _read(Path(path), ALPHA_CHANNELS, with_alpha)
 
 
+@contract
 def write_png(
     path: str | PathLike[str], rgb: Float[Tensor, "h w 3"], bit_depth: int = 8, overwrite: bool = False
 ) -> None:

@@ -130,6 +130,7 @@ def read_scene(
     return replace(scene, **stated, other=scene.other and replace(scene.other, **stated, drop_bad=drop_bad))
 
 
+@contract
 def write_scene(
     path: str | PathLike[str], scene: Gaussians, *, overwrite: bool = False, spz_axes: SpzAxes = "auto"
 ) -> None:

@@ -388,10 +388,7 @@ def usable(scene: Gaussians) -> Gaussians:
 def check_values(scene: Gaussians) -> None:
     """Refuse Gaussians in memory that no renderer can use."""
     if faults := faults_of(scene):
-        found = [
-            f"Gaussian {int(rows.nonzero()[0])} (of {int(rows.sum())}) has {text}" for text, rows in faults.items()
-        ]
-        raise UsageError(scene.name, f"{listing(found)}; leave such Gaussians out")
+        raise UsageError(scene.name, f"{described_faults(faults)}; leave such Gaussians out")
 
 
 def doubts_of(scene: Gaussians) -> dict[str, int]:
