@@ -168,7 +168,8 @@ def test_cfg_args_of_windows_is_read_without_warnings(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"fx": 0}, "camera 1: fx should be above 0 and at most 1e+09 px, not 0"),
+        ({"fx": 0}, "camera 1: fx should be from 1e-06 to 1e+09 px, not 0"),
+        ({"fx": 1e-300}, "camera 1: fx should be from 1e-06 to 1e+09 px, not 1e-300"),
         ({"fx": True}, "camera 1: fx should be a number, not True"),
         ({"fx": 10**400}, "camera 1: fx should be a finite number"),
         ({"width": 0}, "camera 1: width should be a whole number of px from 1 to 65536, not 0"),
