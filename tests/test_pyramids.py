@@ -27,7 +27,7 @@ from aaplug.core.training import TrainingViews
 from aaplug.evaluation.metrics import psnr
 from aaplug.finetuning import refining
 from aaplug.io.scenes import read_scene
-from aaplug.io.scenes.pyramid_folder import MANIFEST, pyramid_of, read_manifest, read_pyramid
+from aaplug.io.scenes.pyramid_folder import MANIFEST, hash_of, pyramid_of, read_manifest, read_pyramid
 from aaplug.levels.merging import Goal, merge_in_chunks
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import FormatError
@@ -290,6 +290,9 @@ def test_building_goes_on_where_it_stopped(cli, folder):
     manifest = json.loads((folder / MANIFEST).read_text())
     manifest["levels"].pop()
     (folder / MANIFEST).write_text(json.dumps(manifest))
+    unfinished = cli("info levels")
+    assert unfinished[0] == 2
+    assert "lists 2 of 3 levels, as making them was interrupted; `aaplug lod --resume`" in unfinished[2]
     code, _, err = cli("lod scene.ply --cameras . -o levels --levels 2 --steps 3 --resume")
     assert code == 0, err
     assert "resumed: 1 level" in err
@@ -297,6 +300,18 @@ def test_building_goes_on_where_it_stopped(cli, folder):
     refusal = cli("lod scene.ply --cameras . -o levels --levels 2 --steps 4 --resume")
     assert refusal[0] == 2
     assert "other options" in refusal[2]
+
+
+def test_fewer_levels_leave_nothing_of_more(cli, folder):
+    for words in ("--levels 1 --no-refine", "--levels 1 --steps 1 --for spark"):
+        code, _, err = cli(f"lod scene.ply --cameras . -o levels --overwrite {words}")
+        assert code == 0, err
+        assert [file.name for file in sorted(folder.glob("*.ply"))] == ["scene_lod0.ply", "scene_lod1.ply"]
+        if "--for" not in words:
+            (folder / "notes.txt").write_text("not a level")
+            files = [folder / MANIFEST, *folder.glob("*.ply")]
+            assert read_scene(folder).bytes == sum(file.stat().st_size for file in files)
+    assert not (folder / MANIFEST).exists()
 
 
 def in_manifest(**changes):
@@ -310,11 +325,23 @@ def in_manifest(**changes):
     return change
 
 
+def test_a_levels_hash_covers_all_of_its_bytes(tmp_path):
+    data = bytearray(1 << 20)
+    hashes = set[str]()
+    for place in (0, 1 << 17, 1 << 19, len(data) - 1):
+        data[place] = 1
+        (tmp_path / "level.ply").write_bytes(data)
+        hashes.add(hash_of(tmp_path / "level.ply"))
+    assert len(hashes) == 4
+
+
 BROKEN = {
     "missing": (lambda level, _: level.unlink(), "scene_lod1.ply: is missing"),
     "truncated": (lambda level, _: level.write_bytes(level.read_bytes()[:-7]), "scene_lod1.ply: is not the level"),
     "foreign": (lambda level, _: Path("levels/scene_lod2.ply").replace(level), "scene_lod1.ply: is not the level"),
-    "newer": (lambda _, manifest: manifest.write_text('{"aaplug_levels": 2}'), "should be version 1, not 'version 2"),
+    "newer": (lambda _, manifest: manifest.write_text('{"aaplug_levels": 3}'), "should be version 2, not 'version 3"),
+    "too large": (in_manifest(chunks=[2**64]), "chunks should be a list of counts"),
+    "largest": (lambda _, manifest: manifest.write_text(manifest.read_text().replace("1024", str(2**64))), "largest"),
     "outside": (in_manifest(file="../scene.ply"), "file should be a name without folders"),
     "chunks": (in_manifest(chunks=[10**9]), "does not have the chunks"),
     "empty": (lambda _, manifest: manifest.write_text("{}"), "lod.json"),
