@@ -29,8 +29,6 @@ from aaplug.system.executors import torch_threads
 from tests.conftest import make_camera, make_scene
 
 RATE = 20.0  # px per world unit
-VIEWS = tuple(make_camera(eye, (640, 480)) for eye in ((0.0, -4.0, 0.0), (3.0, -2.0, 1.0)))
-CAMERAS = CameraSet(VIEWS, ())
 
 
 def pair(opacity: float, apart: float, size: float = 0.2) -> Gaussians:
@@ -232,22 +230,23 @@ def test_a_budget_is_kept(cli):
 
 
 def test_what_no_camera_sees_stays_when_all_else_is_too_faint():
+    cameras = [make_camera(eye, (640, 480)) for eye in ((0.0, -4.0, 0.0), (3.0, -2.0, 1.0))]
     scene = replace(make_scene(4), log_scales=torch.full((4, 3), -7.0), logit_opacities=torch.full((4,), -2.0))
     scene.means[3] = torch.tensor([0.0, -40.0, 0.0])
     scene.log_scales[3], scene.logit_opacities[3] = -2.0, 4.0
-    sizes = [len(level.scene) for level in aaplug.lod(scene, CAMERAS, levels=5, refine=False)]
+    sizes = [len(level.scene) for level in aaplug.lod(scene, CameraSet(tuple(cameras), ()), levels=5, refine=False)]
     assert (sizes[0], sizes[-2:]) == (4, [1, 1])
 
 
-def test_a_level_may_have_no_gaussians(tmp_path):
+def test_a_level_may_have_no_gaussians(tmp_path, sample_cameras):
     """What is too faint to be drawn at a size is in no level from there on."""
     faint = replace(make_scene(3), log_scales=torch.full((3, 3), -7.0), logit_opacities=torch.full((3,), -4.0))
-    levels = aaplug.lod(faint, CAMERAS, tmp_path / "levels", levels=4, refine=False)
+    levels = aaplug.lod(faint, sample_cameras, tmp_path / "levels", levels=4, refine=False)
     pyramid = aaplug.read_scene(tmp_path / "levels").levels
     assert pyramid.sizes == tuple(len(level.scene) for level in levels)
     assert (pyramid.sizes[0], pyramid.sizes[-1]) == (3, 0)
-    renderer = aaplug.Renderer.of(pyramid, CAMERAS, quality="fast")
-    assert renderer(VIEWS[0].scaled(1 / 16)).alpha.max() == 0
+    renderer = aaplug.Renderer.of(pyramid, sample_cameras, quality="fast")
+    assert renderer(sample_cameras.test[0].scaled(1 / 16)).alpha.max() == 0
 
 
 def test_what_cannot_be_merged_is_refused(tmp_path):
