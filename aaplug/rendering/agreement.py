@@ -4,6 +4,7 @@ Cameras of another capture may see a scene too, and a scene may be turned over. 
 cameras are expected to look at the scene's middle.
 """
 
+import math
 from dataclasses import dataclass
 from statistics import median
 
@@ -66,8 +67,11 @@ def agreement(look: Renderer, cameras: CameraSet) -> Agreement:
     seen = bounds.seen
     middle = scene.scales.median(dim=1).values
     size = float((middle * bounds.highest)[seen].median()) if seen.any() else None
-    some = spread(look.training.cameras, VIEWS)
-    offsets = [_offset(scene.means[:: max(1, len(scene) // SAMPLE)], camera) for camera in some]
+    offsets = []
+    for camera in spread(look.training.cameras, VIEWS):
+        places, depths = camera.project(scene.means[:: max(1, len(scene) // SAMPLE)])
+        ahead = places[depths > NEAR] / places.new_tensor([camera.width, camera.height])
+        offsets.append(float((ahead.median(dim=0).values - 0.5).abs().max()) if len(ahead) else math.inf)
     return Agreement(float(seen.float().mean()), size, median(offsets), _gain(look, cameras))
 
 
@@ -93,16 +97,6 @@ def settled(scene: Scene, cameras: CameraSet, monitor: Monitor = SILENT) -> Scen
     how, _, _ = reading.notes[-1].partition(" (")
     monitor.say(f"{scene.title}: {how}, as fits the cameras: {fits[better]}")
     return reading
-
-
-def _offset(means: torch.Tensor, camera: Camera) -> float:
-    """Distance of the median place from the image's centre, as a share of the side; of what is before the camera."""
-    places, depths = camera.project(means)
-    ahead = places[depths > NEAR]
-    if not len(ahead):
-        return float("inf")
-    sides = places.new_tensor([camera.width, camera.height])
-    return float((ahead.median(dim=0).values / sides - 0.5).abs().max())
 
 
 @torch.no_grad()

@@ -87,12 +87,17 @@ def _assumed_training(
     fov = math.radians(DEFAULT_FOV)
     rings = [orbit_views(frame, ORBIT_VIEWS, size, math.radians(e), fov, f"training_{e:.0f}") for e in RINGS]
     views = tuple(view.as_trained() for ring in rings for view in ring)
-    factor: float | None = None
     if orbit.train_rate is not None:
         factor, reason = orbit.train_rate * frame.distance(fov) / views[0].focal, "--train-rate"
-    elif orbit.train_view is None and (factor := _filtered_rate(sample, views)):
-        reason = "from the file's 3D filter"
-    if not factor:
+    elif orbit.train_view is None and sample.filter_3d is not None:
+        bounds = sampling_bounds(sample.means, views)
+        filtered = bounds.seen & (sample.filter_3d > 0)
+        if not filtered.any():
+            return views, reason
+        # the filter's variance is 0.2 px² at the highest rate
+        rates = math.sqrt(NYQUIST_VARIANCE) / sample.filter_3d[filtered] / bounds.highest[filtered]
+        factor, reason = float(rates.median()), "from the file's 3D filter"
+    else:
         return views, reason
     width, height = (max(1, round(side * factor)) for side in (views[0].width, views[0].height))
     focal = views[0].focal * factor  # the views at `factor` times their sampling rate, in whole pixels
@@ -153,17 +158,6 @@ def decibels_at(renderer: Renderer, view: Camera, factors: Sequence[float]) -> l
 
 def _apart(decibels: float) -> str:
     return "the same" if decibels == math.inf else f"{decibels:.0f} dB from this one"
-
-
-def _filtered_rate(some: Gaussians, views: Sequence[Camera]) -> float | None:
-    """How much finer training was than the views, by the 3D filter: its variance is 0.2 px² at the highest rate."""
-    if some.filter_3d is None:
-        return None
-    bounds = sampling_bounds(some.means, views)
-    known = bounds.seen & (some.filter_3d > 0)
-    if not known.any():
-        return None
-    return float((math.sqrt(NYQUIST_VARIANCE) / some.filter_3d[known] / bounds.highest[known]).median())
 
 
 def _width_in_run(path: Path | None) -> int | None:

@@ -39,8 +39,15 @@ def visibility(
     for number, view in enumerate(views):
         tell(number, len(views))
         camera = view.scaled(scale)
-        splats, light = _light(look, camera)
-        share = light / _alone(splats, camera.hw, look.training.convention.rules.min_alpha)
+        with torch.no_grad():
+            splats = look.splats(camera)
+        if not len(splats):
+            continue
+        with torch.enable_grad():
+            colours = splats.means.new_zeros(len(splats), 3).requires_grad_()
+            render = look.paint(replace(splats, rgb=colours), camera.hw, BLACK)
+            (light,) = torch.autograd.grad(render.rgb[..., 0].sum(), colours)
+        share = light[:, 0] / _alone(splats, camera.hw, look.training.convention.rules.min_alpha)
         share = share.clamp(max=1).where(share.isfinite(), -1.0)
         shares[splats.sources] = torch.maximum(shares[splats.sources], share.to(shares))
     return shares.where(shares >= 0, torch.nan)
@@ -53,16 +60,3 @@ def _alone(splats: Splats2D, hw: tuple[int, int], min_alpha: float) -> Float[Ten
     inside = torch.special.ndtr((sides - means) / sigmas) - torch.special.ndtr(-means / sigmas)
     part = inside.prod(dim=1) * ((means >= 0) & (means <= sides)).all(dim=1)
     return 2 * math.pi * splats.dets.sqrt() * (splats.opacities - min_alpha).clamp(min=0) * part
-
-
-def _light(look: Renderer, camera: Camera) -> tuple[Splats2D, Float[Tensor, " m"]]:
-    """The splats of a view, and the light that each adds to its image, in px² at full alpha."""
-    with torch.no_grad():
-        splats = look.splats(camera)
-    if not len(splats):
-        return splats, splats.opacities
-    with torch.enable_grad():
-        colours = splats.means.new_zeros(len(splats), 3).requires_grad_()
-        render = look.paint(replace(splats, rgb=colours), camera.hw, BLACK)
-        (light,) = torch.autograd.grad(render.rgb[..., 0].sum(), colours)
-    return splats, light[:, 0]
