@@ -45,7 +45,7 @@ def replacing(path: AnyPath, overwrite: bool) -> Iterator[BinaryIO]:
 def replacing_file(path: AnyPath, overwrite: bool, suffix: str = ".tmp") -> Iterator[Path]:
     """Like `replacing`, for libraries that open their file themselves: yields an empty file that ends in `suffix`."""
     path = Path(path)
-    _check_target(path, overwrite)
+    check_output(path, overwrite)
     target = Path(os.path.realpath(path))  # a link stays a link; its target is replaced
     temporary = target.with_name(f"{OUR_PREFIX}{secrets.token_hex(TOKEN_BYTES)}{suffix}")
     remove_left(target.parent)
@@ -103,23 +103,33 @@ def writing(
         return
     with ExitStack() as stack:
         _open_outputs.append(path)
-        stack.callback(_close, path)
-        _inputs.update(_ids_of(inputs))
-        if folder:
-            stack.enter_context(output_folder(path))
-        stack.enter_context(claimed(path, check))
-        yield
-
-
-def _close(path: AnyPath) -> None:
-    _open_outputs.remove(path)
-    if not _open_outputs:
-        _inputs.clear()
+        try:
+            _inputs.update(_ids_of(inputs))
+            if folder:
+                stack.enter_context(output_folder(path))
+            stack.enter_context(claimed(path, check))
+            yield
+        finally:
+            _open_outputs.remove(path)
+            if not _open_outputs:
+                _inputs.clear()
 
 
 def check_output(path: AnyPath, overwrite: bool, inputs: Iterable[AnyPath] = ()) -> None:
     """Refuse an output that must not be written, before any work; one of these inputs too."""
-    _check_target(Path(path), overwrite, inputs)
+    path = Path(path)
+    refuse_inputs([path], inputs)
+    try:
+        if path.is_dir():
+            raise OutputError(path, "is a folder; name a file in it")
+        if path.exists() and not path.is_file():
+            raise OutputError(path, "is not an ordinary file")
+        if path.exists() and not overwrite:
+            raise OutputError(path, "exists; pass `overwrite` to replace it")
+        if not Path(os.path.realpath(path)).parent.is_dir():
+            raise OutputError(path, "cannot be written: its folder does not exist; make it first")
+    except (OSError, ValueError) as error:  # no access, a name too long, or a NUL in it
+        raise OutputError(path, f"cannot be written: {reason(error)}") from error
 
 
 def make_folder(path: AnyPath) -> Path:
@@ -174,21 +184,6 @@ def _ids_of(paths: Iterable[AnyPath]) -> dict[FileId, AnyPath]:
                 status = os.stat(path)
                 ids[status.st_dev, status.st_ino] = path
     return ids
-
-
-def _check_target(path: Path, overwrite: bool, inputs: Iterable[AnyPath] = ()) -> None:
-    refuse_inputs([path], inputs)
-    try:
-        if path.is_dir():
-            raise OutputError(path, "is a folder; name a file in it")
-        if path.exists() and not path.is_file():
-            raise OutputError(path, "is not an ordinary file")
-        if path.exists() and not overwrite:
-            raise OutputError(path, "exists; pass `overwrite` to replace it")
-        if not Path(os.path.realpath(path)).parent.is_dir():
-            raise OutputError(path, "cannot be written: its folder does not exist; make it first")
-    except (OSError, ValueError) as error:  # no access, a name too long, or a NUL in it
-        raise OutputError(path, f"cannot be written: {reason(error)}") from error
 
 
 def _sync(path: Path, mode: int) -> None:

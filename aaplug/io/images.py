@@ -166,38 +166,33 @@ def _look(path: Path) -> _Header:
 def _read(path: Path, channels: int, finished: Callable[[Tensor], Tensor]) -> Float[Tensor, "h w c"]:
     """Values in [0, 1], RGB or RGBA, `finished` in bands of rows so that memory holds the samples and the result."""
     header = _look(path)
-    samples = _decode(path)
-    height, width, stored = samples.shape
-    if (width, height) != header.size:
-        raise FormatError(path, f"has {width}x{height} px where its header says {header.size[0]}x{header.size[1]}")
-    if samples.dtype not in SAMPLE_TYPES.values():
-        raise FormatError(path, f"holds {samples.dtype} samples; save it with 8 or 16 bits")
-    if header.transparent != (stored == ALPHA_CHANNELS):
-        raise FormatError(path, "has colours or transparency that OpenCV cannot read; save it as RGB(A) PNG")
-    order = [0, 0, 0] if stored == 1 else [2, 1, 0, 3][:stored]
-    highest, image = np.iinfo(samples.dtype).max, torch.empty(height, width, channels)
-    for start in range(0, height, ROWS_PER_BAND):
-        rows = samples[start : start + ROWS_PER_BAND, :, order].astype(np.float32) / highest
-        image[start : start + ROWS_PER_BAND] = finished(torch.from_numpy(rows))
-    return image
-
-
-def _decode(path: Path) -> np.ndarray:
-    """Samples as stored, [h, w, channels], BGR(A) or gray."""
     try:
         data = _still(path, path.read_bytes())
         with captured_stderr() as words:
             # UNCHANGED keeps 16 bits and alpha, and ignores the orientation tag
-            pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+            samples = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
             words.seek(0)
             lines = words.read().decode("ascii", "replace").splitlines()
     except (OSError, MemoryError, cv2.error) as error:
         raise FormatError(path, "cannot be read or is damaged") from error
-    if pixels is None or any(line.startswith(LOSS_MESSAGES) for line in lines):
+    if samples is None or any(line.startswith(LOSS_MESSAGES) for line in lines):
         raise FormatError(path, "is damaged or cut short")
     if damage := next((line for line in lines if line.startswith(DAMAGE_MESSAGE)), ""):
         log.warning("%s: is damaged (%s)", path, damage)
-    return pixels[..., None] if pixels.ndim == 2 else pixels
+    height, width, *stored = samples.shape
+    if (width, height) != header.size:
+        raise FormatError(path, f"has {width}x{height} px where its header says {header.size[0]}x{header.size[1]}")
+    if samples.dtype not in SAMPLE_TYPES.values():
+        raise FormatError(path, f"holds {samples.dtype} samples; save it with 8 or 16 bits")
+    if header.transparent != (stored == [ALPHA_CHANNELS]):
+        raise FormatError(path, "has colours or transparency that OpenCV cannot read; save it as RGB(A) PNG")
+    samples = samples.reshape(height, width, -1)
+    order = [0, 0, 0] if samples.shape[2] == 1 else [2, 1, 0, 3][: samples.shape[2]]  # from BGR(A) or gray
+    highest, image = np.iinfo(str(samples.dtype)).max, torch.empty(height, width, channels)
+    for start in range(0, height, ROWS_PER_BAND):
+        rows = samples[start : start + ROWS_PER_BAND, :, order].astype(np.float32) / highest
+        image[start : start + ROWS_PER_BAND] = finished(torch.from_numpy(rows))
+    return image
 
 
 def _still(path: Path, data: bytes) -> bytes:

@@ -35,8 +35,23 @@ class Distortion:
 
 def undistorted_cameras(cameras: Sequence[Camera], distortions: Sequence[Distortion | None]) -> list[Camera]:
     """The cameras as pinholes, cropped to what their photographs cover; without photographs that cannot be used."""
-    pairs = zip(cameras, distortions, strict=True)
-    return [camera if lens is None else _undistorted(camera, lens) for camera, lens in pairs]
+    pinholes = []
+    for camera, lens in zip(cameras, distortions, strict=True):
+        if lens is None:
+            pinholes.append(camera)
+            continue
+        whole = window = None
+        if camera.photo is not None and lens.coefficients is not None:
+            size, pinhole = (camera.width, camera.height), (camera.fx, camera.fy, camera.cx, camera.cy)
+            whole = Lens(lens.coefficients, lens.fisheye, size, pinhole, (0, 0, *size))
+            window = _window(whole)
+        if whole is None or window is None:
+            pinholes.append(replace(camera, photo=None))
+            continue
+        left, top, width, height = window
+        centre = {"cx": camera.cx - left, "cy": camera.cy - top}
+        pinholes.append(replace(camera, width=width, height=height, **centre, lens=replace(whole, window=window)))
+    return pinholes
 
 
 def undistorted(image: Float[Tensor, "h w c"], lens: Lens | None) -> Float[Tensor, "H W c"]:
@@ -64,19 +79,6 @@ def lens_notes(distortions: Sequence[Distortion | None], cameras: Sequence[Camer
         what = f"{straight} photos are undistorted; other {lost}" if straight else lost
     distort = f"{len(pairs)} cameras have a lens that distorts ({models})"
     return [f"{distort}: renders are of the pinhole at its centre; {what}"]
-
-
-def _undistorted(camera: Camera, lens: Distortion) -> Camera:
-    if camera.photo is None or lens.coefficients is None:
-        return replace(camera, photo=None)
-    size, pinhole = (camera.width, camera.height), (camera.fx, camera.fy, camera.cx, camera.cy)
-    whole = Lens(lens.coefficients, lens.fisheye, size, pinhole, (0, 0, *size))
-    window = _window(whole)
-    if window is None:
-        return replace(camera, photo=None)
-    left, top, width, height = window
-    cx, cy = camera.cx - left, camera.cy - top
-    return replace(camera, width=width, height=height, cx=cx, cy=cy, lens=replace(whole, window=window))
 
 
 @lru_cache(CACHED_LENSES)

@@ -54,36 +54,32 @@ def write_video(
 ) -> None:
     """Write a video of at least one frame; errors as in `check_video`, and OutputError if it cannot be written."""
     check_video(path, fps, overwrite)
-    with replacing_file(path, overwrite, Path(path).suffix.lower()) as temporary:
-        _encode(temporary, frames, fps)
-
-
-def _encode(path: Path, frames: Iterable[Float[Tensor, "h w 3"]], fps: float) -> None:
-    """Convert to BT.709 with rounding, and say so in the file: players then show white as white."""
     import av  # it loads FFmpeg
     from av.error import FFmpegError
     from av.video.reformatter import ColorRange, Colorspace
 
+    # converted to BT.709 with rounding, as the file declares: players then show white as white
     range_and_matrix = {"dst_color_range": ColorRange.MPEG, "dst_colorspace": Colorspace.ITU709}
-    try:
-        with av.open(str(path), "w", options=BIT_EXACT) as container:
-            stream = None
-            for frame in frames:
-                pixels = levels(checked_image(frame), 8).byte().cpu().numpy()
-                height, width, _ = pixels.shape
-                pixels = np.pad(pixels, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
-                height, width, _ = pixels.shape
-                stream = stream or _added_stream(container, path.suffix, width, height, fps)
-                if (stream.width, stream.height) != (width, height):
-                    size = f"{width}x{height} px after one of {stream.width}x{stream.height} px"
-                    raise UsageError("frames", f"should all have one size; one has {size}")
-                picture = av.VideoFrame.from_ndarray(pixels, format="rgb24")
-                container.mux(stream.encode(picture.reformat(format=PIXEL_FORMAT, **range_and_matrix)))
-            if stream is None:
-                raise UsageError("frames", "has none; a video needs one at least")
-            container.mux(stream.encode())
-    except FFmpegError as error:
-        raise OSError(error.errno, error.strerror) from error
+    suffix, stream = Path(path).suffix.lower(), None
+    with replacing_file(path, overwrite, suffix) as temporary:
+        try:
+            with av.open(str(temporary), "w", options=BIT_EXACT) as container:
+                for frame in frames:
+                    pixels = levels(checked_image(frame), 8).byte().cpu().numpy()
+                    height, width, _ = pixels.shape
+                    pixels = np.pad(pixels, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+                    height, width, _ = pixels.shape
+                    stream = stream or _added_stream(container, suffix, width, height, fps)
+                    if (stream.width, stream.height) != (width, height):
+                        size = f"{width}x{height} px after one of {stream.width}x{stream.height} px"
+                        raise UsageError("frames", f"should all have one size; one has {size}")
+                    picture = av.VideoFrame.from_ndarray(pixels, format="rgb24")
+                    container.mux(stream.encode(picture.reformat(format=PIXEL_FORMAT, **range_and_matrix)))
+                if stream is None:
+                    raise UsageError("frames", "has none; a video needs one at least")
+                container.mux(stream.encode())
+        except FFmpegError as error:
+            raise OSError(error.errno, error.strerror) from error
 
 
 def _added_stream(container: "OutputContainer", suffix: str, width: int, height: int, fps: float) -> "VideoStream":

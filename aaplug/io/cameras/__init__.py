@@ -123,9 +123,7 @@ def select_views(cameras: CameraSet, spec: str) -> tuple[Camera, ...]:
     if spec in known:  # a name may itself hold a comma
         return (known[spec],)
     names = dict.fromkeys(filter(None, map(str.strip, spec.split(",")))) or {spec: None}
-    return tuple(known[name] if name in known else _unknown(name, list(known)) for name in names)
-
-
-def _unknown(name: str, known: list[str]) -> Camera:
-    close = difflib.get_close_matches(name, known, CLOSE_NAMES, cutoff=0) if name else known
-    raise UsageError("views", f"there is no view {name!r}; train, test, all or names such as {listing(close, 3)}")
+    for name in (name for name in names if name not in known):
+        close = difflib.get_close_matches(name, known, CLOSE_NAMES, cutoff=0) if name else list(known)
+        raise UsageError("views", f"there is no view {name!r}; train, test, all or names such as {listing(close, 3)}")
+    return tuple(known[name] for name in names)

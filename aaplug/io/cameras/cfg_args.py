@@ -69,20 +69,11 @@ def read_cfg_args(path: Path) -> CfgArgs:
         except (ValueError, TypeError, SyntaxError, RecursionError, MemoryError) as error:
             problem = f"{keyword.arg} should be a literal (number, text, True, list); code is never run"
             raise FormatError(path, problem) from error
-    entry = Entry(Place(path, "Namespace"), settings)
-    resolution, images = entry.get("resolution", _resolution, CAPPED), entry.get("images", text, CfgArgs.images)
-    white, held_out = (_flag(entry, name) for name in ("white_background", "eval"))
-    return CfgArgs(resolution, images, white, bool(held_out))
-
-
-def _resolution(value: object, place: Place, field: str) -> float:
-    real, most = number(value, place, field), whole_limit("CAMERA_SIDE")
-    right = real == CAPPED or 1 <= real <= most
-    place.expect(right, field, f"-1, 1, 2, 4, 8 or a width up to {most} px", value)
-    return real
-
-
-def _flag(entry: Entry, field: str) -> bool | None:
-    value = entry.fields.get(field)
-    entry.place.expect(value is None or isinstance(value, bool), field, "True or False", value)
-    return value
+    entry, most = Entry(Place(path, "Namespace"), settings), whole_limit("CAMERA_SIDE")
+    resolution = entry.get("resolution", number, CAPPED)
+    right = resolution == CAPPED or 1 <= resolution <= most
+    entry.place.expect(right, "resolution", f"-1, 1, 2, 4, 8 or a width up to {most} px", resolution)
+    white, held_out = (settings.get(field) for field in ("white_background", "eval"))
+    for field, value in (("white_background", white), ("eval", held_out)):
+        entry.place.expect(value is None or isinstance(value, bool), field, "True or False", value)
+    return CfgArgs(resolution, entry.get("images", text, CfgArgs.images), white, bool(held_out))

@@ -21,7 +21,7 @@ from aaplug.core.conventions import ANTIALIASED, CLASSIC, CONVENTIONS, MIP, Conv
 from aaplug.core.gaussians import Fusion
 from aaplug.io.scenes.ply_header import Header
 from aaplug.io.scenes.scene import COMPENSATED, FILTER_COLUMN, KERNEL_LOST
-from aaplug.io.scenes.training_config import gsplat_config, nerfstudio_config
+from aaplug.io.scenes.training_config import run_config
 from aaplug.system.errors import FormatError
 
 RECORD = re.compile(r"aaplug\s+(?=fused=|convention=)(.*)")
@@ -53,7 +53,13 @@ class Meaning:
 
 def meaning(header: Header, compressed: bool = False) -> Meaning:
     """Read the header's tags; `compressed`: the columns are packed and say nothing about scales."""
-    records = [_record(header.path, words) for words in _matches(header, RECORD)]
+    records = list[dict[str, str]]()
+    for words in _matches(header, RECORD):
+        pairs = [word.partition("=") for word in words.split()]
+        for key, _, value in pairs:
+            if not (KEY.fullmatch(key) and WORD.fullmatch(value)):
+                raise FormatError(header.path, f"comment {'aaplug ' + words!r} is damaged: expected key=value pairs")
+        records.append({key: value for key, _, value in pairs})
     settings = [{k: v for k, v in record.items() if k != "convention"} for record in records if "fused" in record]
     fused = tuple(Fusion(each.pop("fused"), each) for each in settings)
     mode = _last(header, RENDER_MODE)
@@ -73,8 +79,8 @@ def meaning_in_run(header: Header) -> tuple[Meaning, str | None]:
     said = meaning(header)
     if not said.evidence.startswith(UNTAGGED):
         return said, None
-    is_nerfstudio, scene = bool(_matches(header, NERFSTUDIO)), Path(header.path)
-    statement = nerfstudio_config(scene) if is_nerfstudio else gsplat_config(scene)
+    is_nerfstudio = bool(_matches(header, NERFSTUDIO))
+    statement = run_config(Path(header.path), is_nerfstudio)
     if statement is not None:
         return replace(said, convention=statement[0], evidence=statement[1]), None
     return said, NERFSTUDIO_NOTE if is_nerfstudio else None
@@ -127,14 +133,6 @@ def _matches(header: Header, pattern: re.Pattern[str]) -> list[str]:
 
 def _last(header: Header, pattern: re.Pattern[str]) -> str | None:
     return (_matches(header, pattern) or [None])[-1]
-
-
-def _record(path: str, words: str) -> dict[str, str]:
-    pairs = [word.partition("=") for word in words.split()]
-    for key, _, value in pairs:
-        if not (KEY.fullmatch(key) and WORD.fullmatch(value)):
-            raise FormatError(path, f"comment {'aaplug ' + words!r} is damaged: expected key=value pairs")
-    return {key: value for key, _, value in pairs}
 
 
 def _fused_line(fusion: Fusion, convention: Convention) -> str:

@@ -21,7 +21,7 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.io.limits import whole_limit
 from aaplug.io.scenes.options import SceneFileOptions
 from aaplug.io.scenes.scene import DEGREES, Scene, check_count, library_errors
-from aaplug.io.scenes.training_config import gsplat_config
+from aaplug.io.scenes.training_config import run_config
 from aaplug.system.errors import FormatError
 
 SAFE_TORCH = (2, 10)  # the first release without CVE-2026-24747
@@ -47,7 +47,13 @@ def open_scene(path: Path, options: SceneFileOptions) -> Scene:
         raise FormatError(path, f"needs torch 2.10 or newer to be read safely; this is {torch.__version__}")
     with library_errors(path):
         size = path.stat().st_size
-        _check_archive(path, size)
+        if size > whole_limit("CHECKPOINT"):
+            raise FormatError(path, f"has {size:,} bytes; AAPLUG_CHECKPOINT raises the limit")
+        with zipfile.ZipFile(path) as archive:
+            members = archive.infolist()
+        # torch stores members uncompressed, and would inflate others without a limit
+        if any(m.compress_type != zipfile.ZIP_STORED or m.file_size > size for m in members):
+            raise FormatError(path, "has compressed members, which torch does not write")
         try:
             with warnings.catch_warnings(action="ignore"):  # torch's, about a damaged pickle
                 document = torch.load(path, "cpu", weights_only=True, mmap=True)
@@ -59,18 +65,8 @@ def open_scene(path: Path, options: SceneFileOptions) -> Scene:
     for key, tensor in splats.items():
         _check(path, key, tensor, count, size)
     degree = DEGREES[3 * splats["shN"].shape[1]]
-    convention, evidence = gsplat_config(path) or UNKNOWN
+    convention, evidence = run_config(path) or UNKNOWN
     return Scene(path, name, count, degree, partial(_rows, splats), evidence, convention)
-
-
-def _check_archive(path: Path, size: int) -> None:
-    """Refuse compressed members, which torch would inflate without a limit; torch itself stores them uncompressed."""
-    if size > whole_limit("CHECKPOINT"):
-        raise FormatError(path, f"has {size:,} bytes; AAPLUG_CHECKPOINT raises the limit")
-    with zipfile.ZipFile(path) as archive:
-        members = archive.infolist()
-    if any(m.compress_type != zipfile.ZIP_STORED or m.file_size > size for m in members):
-        raise FormatError(path, "has compressed members, which torch does not write")
 
 
 def _splats(path: Path, document: Any) -> dict[str, Tensor]:

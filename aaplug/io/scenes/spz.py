@@ -198,16 +198,14 @@ def _rows(
         unit = _threes(quats)
     else:  # x, y, z; w follows and is not negative
         unit = largest_last(floats(quats) / 127.5 - 1, torch.zeros(n))
-    log_scales = floats(scales) / SCALE_STEPS + MIN_LOG_SCALE
-    return turn(Gaussians(_positions(header, positions), unit, log_scales, byte_opacities(alphas[:, 0]), sh))
-
-
-def _positions(header: Header, data: np.ndarray) -> Float[Tensor, "n 3"]:
     if header.version == FIRST_VERSION:
-        return floats(np.ascontiguousarray(data).view("<f2"))
-    low, middle, high = (data[:, i::3].astype(np.int32) for i in range(3))
-    fixed = low | middle << 8 | high.astype(np.uint8).view(np.int8).astype(np.int32) << 16
-    return torch.from_numpy(fixed.astype(np.float64) / 2**header.fraction).float()
+        means = floats(np.ascontiguousarray(positions).view("<f2"))
+    else:  # fixed point in three bytes, the last with the sign
+        low, middle, high = (positions[:, i::3].astype(np.int32) for i in range(3))
+        fixed = low | middle << 8 | high.astype(np.uint8).view(np.int8).astype(np.int32) << 16
+        means = torch.from_numpy(fixed.astype(np.float64) / 2**header.fraction).float()
+    log_scales = floats(scales) / SCALE_STEPS + MIN_LOG_SCALE
+    return turn(Gaussians(means, unit, log_scales, byte_opacities(alphas[:, 0]), sh))
 
 
 def _threes(data: np.ndarray) -> Float[Tensor, "n 4"]:

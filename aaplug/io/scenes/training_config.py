@@ -19,22 +19,17 @@ GSPLAT_FOLDERS = ("ply", "ckpts")  # of a run, with what its trainer exports
 MODES = {b"antialiased": ANTIALIASED, b"true": ANTIALIASED, b"classic": CLASSIC, b"false": CLASSIC}
 
 
-def nerfstudio_config(scene: Path) -> tuple[Convention, str] | None:
-    """The convention in a nerfstudio run's configuration beside the scene, and the evidence; None if it has none."""
-    return _stated(scene.with_name(NERFSTUDIO_CONFIG), NERFSTUDIO_LINE)
-
-
-def gsplat_config(scene: Path) -> tuple[Convention, str] | None:
-    """The convention in the configuration of the gsplat run that holds the scene, and the evidence; or None."""
+def run_config(scene: Path, nerfstudio: bool = False) -> tuple[Convention, str] | None:
+    """The convention in the configuration of the run that holds the scene, and the evidence; None if it has none."""
     folder = scene.absolute().parent
-    return _stated(folder.parent / GSPLAT_CONFIG, GSPLAT_LINE) if folder.name in GSPLAT_FOLDERS else None
-
-
-def _stated(config: Path, line: re.Pattern[bytes]) -> tuple[Convention, str] | None:
-    """The one value that all such lines have."""
+    config, line = folder / NERFSTUDIO_CONFIG, NERFSTUDIO_LINE
+    if not nerfstudio:
+        config, line = folder.parent / GSPLAT_CONFIG, GSPLAT_LINE
+        if folder.name not in GSPLAT_FOLDERS:
+            return None
     try:
         values = {value.lower() for value in line.findall(read_start(config, HEAD_LIMIT))}
     except FormatError:  # it is not there, or cannot be read
         return None
-    convention = MODES.get(values.pop()) if len(values) == 1 else None
+    convention = MODES.get(values.pop()) if len(values) == 1 else None  # the one value that all such lines have
     return None if convention is None else (convention, f"{config.name} of its run says {convention.name}")
