@@ -8,16 +8,16 @@ from contextlib import chdir
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import aaplug
 from aaplug.options.base import DRAWING, flag
 from aaplug.options.verbs import EvaluateOptions
 from aaplug.system.errors import FormatError, UsageError, did_you_mean
 
-from .console import FAILED, TERMINAL, out, print_json, quiet
+from .console import FAILED, TERMINAL, print_json, quiet, show
 from .inputs import path_of, read_inputs, told
-from .words import Option, Words, setting_words
+from .words import Option, Words
 
 NOT_IN_A_FILE = ("batch", "more", "json", "resume", "overwrite")
 ONCE = ("output", "threads", "memory", "rasterizer", "scheduler")  # for the whole batch, not for one scene
@@ -25,16 +25,17 @@ ONCE = ("output", "threads", "memory", "rasterizer", "scheduler")  # for the who
 SEVERAL = (  # options of a verb that `for_each_scene` repeats
     Option(
         "batch",
-        Annotated[Path | None, flag("FILE.toml")],
+        flag("FILE.toml", read=Path),
         "Scenes and their settings from a file; --output is then a folder for all of them.",
         None,
     ),
-    Option("resume", bool, "With --batch: leave out scenes whose output is there.", False),
+    Option("resume", None, "With --batch: leave out scenes whose output is there.", False),
     Option(
         "scheduler",
-        Annotated[str | None, flag("local|tcp://HOST:PORT"), DRAWING],
+        flag("local|tcp://HOST:PORT"),
         "With --batch: a scene at a time on each worker of a Dask cluster; see examples/guides/cluster.md.",
         None,
+        DRAWING,
     ),
 )
 
@@ -61,7 +62,7 @@ def batch_of_evaluations(words: Words) -> int:
     if words.json:
         print_json(batch.summary())
     else:
-        out.print(*batch.tables())
+        show(*batch.tables())
     return FAILED if batch.failures else 0
 
 
@@ -116,7 +117,7 @@ def for_each_scene(words: Words, suffix: Callable[[Words], str], work: Callable[
         print_json({"scenes": outcomes})
     else:
         rows = [(name, facts["status"], facts.get("error") or facts["output"]) for name, facts in outcomes.items()]
-        out.print(status_table("output or why there is none", rows))
+        show(status_table("output or why there is none", rows))
     return FAILED if any(facts["status"] == "failed" for facts in outcomes.values()) else 0
 
 
@@ -156,18 +157,16 @@ def scenes_of(path: Path, base: Words) -> list[tuple[str, Words]]:
 
 def _set(path: Path, where: str, words: Words, settings: Mapping[str, Any], refused: Sequence[str]) -> Words:
     """The options with a table's settings."""
-    names = [name for name in words.command.types if name not in refused]
-    for name, value in settings.items():
-        if name not in names:
-            raise FormatError(path, f"{where}: {name} is no setting here{did_you_mean(name, names)}")
-        if isinstance(value, bool) and isinstance(words.values[name], bool):
-            words = words.where(**{name: value})
-            continue
-        try:
-            words = words.command.parse(setting_words(name, value), words)
-        except UsageError as error:
-            raise FormatError(path, f"{where}: {error}") from error
+    options = words.command.options
+    names = [name for name in options if name not in refused]
+    values = {}
     try:
-        return words.checked()
+        for name, value in settings.items():
+            if name not in names:
+                raise FormatError(path, f"{where}: {name} is no setting here{did_you_mean(name, names)}")
+            is_switch = options[name].argument is None and isinstance(value, bool)
+            texts = [*map(str, value if isinstance(value, list) else [value])]
+            values[name] = value if is_switch else options[name].value(texts)
+        return words.where(**values).checked()
     except UsageError as error:
         raise FormatError(path, f"{where}: {error}") from error

@@ -5,14 +5,11 @@ import logging
 import math
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import cache
 from io import TextIOWrapper
-from typing import Any
-
-from rich.console import Console
-from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from typing import TYPE_CHECKING, Any
 
 from aaplug.system.errors import printable
 from aaplug.system.monitor import Monitor, Tell
@@ -20,28 +17,56 @@ from aaplug.system.monitor import Monitor, Tell
 FAILED = 1  # exit code of work that is not all done
 LINE_SECONDS = 10.0  # between progress lines where there is no terminal
 
-log = Console(stderr=True, highlight=False, soft_wrap=True)
-out = Console(highlight=False)
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+@cache
+def log() -> "Console":
+    """The log on stderr.  Importing rich takes a tenth of a second, which help does without."""
+    from rich.console import Console
+
+    return Console(stderr=True, highlight=False, soft_wrap=True)
+
+
+def show(*things: Any) -> None:
+    """Print tables and texts on stdout."""
+    from rich.console import Console
+
+    Console(highlight=False).print(*things)
+
+
+def show_rows(rows: Iterable[Sequence[str]], headings: Sequence[str] = ()) -> None:
+    """Print texts in columns on stdout."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(*headings, show_header=bool(headings), box=None, pad_edge=False)
+    for row in rows:
+        table.add_row(*map(escape, row))
+    show(table)
 
 
 @contextmanager
 def quiet() -> Iterator[None]:
     """A block that tells nothing on stderr."""
-    before, log.quiet = log.quiet, True
+    before, log().quiet = log().quiet, True
     try:
         yield
     finally:
-        log.quiet = before
+        log().quiet = before
 
 
-def plain(text: str) -> str:
-    """The text for the log: on one line, without control characters and markup."""
-    return escape(printable(text))
+def _print(text: str, heading: str = "") -> None:
+    """One line of log, without control characters; heading: its first word, with markup."""
+    from rich.markup import escape
+
+    log().print(f"{heading}{escape(printable(text))}")
 
 
 class _Warnings(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
-        log.print(f"[yellow]warning:[/] {plain(record.getMessage())}")
+        _print(record.getMessage(), "[yellow]warning:[/] ")
 
 
 def set_up() -> None:
@@ -55,7 +80,7 @@ def set_up() -> None:
 
 def refuse(problem: str) -> None:
     """One line of error."""
-    log.print(f"[red]error:[/] {plain(problem)}")
+    _print(problem, "[red]error:[/] ")
 
 
 class Terminal(Monitor):
@@ -70,16 +95,18 @@ class Terminal(Monitor):
 
     def say(self, text: str) -> None:
         """One line of log."""
-        log.print(plain(text))
+        _print(text)
 
     @contextmanager
     def progress(self, what: str, unit: str) -> Iterator[Tell]:
         """Show progress, rate, workers and the time left."""
-        if not log.is_terminal:
+        if not log().is_terminal:
             yield self._lines(what, unit)
             return
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
         columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"))
-        with Progress(*columns, TimeRemainingColumn(), console=log, transient=True) as bar:
+        with Progress(*columns, TimeRemainingColumn(), console=log(), transient=True) as bar:
             task, rate = bar.add_task(unit, total=None), _Rate()
 
             def tell(done: int, total: int) -> None:

@@ -5,30 +5,27 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import tyro
-
 import aaplug
 from aaplug.core.conventions import CONVENTIONS
 from aaplug.io import SpzAxes
-from aaplug.options.base import CAMERAS, UNSET, Group, OneOf, Options, flag, number
+from aaplug.options.base import CAMERAS, Group, Options, flag, names, number
 from aaplug.options.shared import SCALE, Orbit
 from aaplug.system.errors import UsageError
 
 from .console import TERMINAL, say
-from .words import Words, worded
+from .words import Words, options_of, worded
 
 if TYPE_CHECKING:
     from aaplug.io.scenes.scene import Scene
 
-SCENE_FILE = Group("scene file", "How scene files are read.")
-CONVENTION_NAMES = tuple(CONVENTIONS)
+SCENE_FILE = Group("scene file options", "How scene files are read.")
 
 
 @dataclass(frozen=True, kw_only=True)
 class FileOptions(Options):
     """How scene files are read."""
 
-    convention: Annotated[str | None, flag("|".join(CONVENTION_NAMES)), OneOf(CONVENTION_NAMES), SCENE_FILE] = None
+    convention: Annotated[str | None, names(*CONVENTIONS), SCENE_FILE] = None
     """How the scene was trained or, for playcanvas and playcanvas-classic, converted, if its file does not say."""
     drop_bad: Annotated[bool, SCENE_FILE] = False
     """Leave out Gaussians with NaN, infinite or unusable values instead of stopping."""
@@ -42,11 +39,11 @@ class FileOptions(Options):
 class SceneOptions(FileOptions):
     """The scene."""
 
-    scene: Annotated[Path | None, tyro.conf.Positional, flag("SCENE")] = None
+    scene: Annotated[Path | None, flag("SCENE", read=Path, by_place=True)] = None
     """A scene (.ply, .compressed.ply, .spz, .sog, .splat, .ksplat) or a folder (INRIA model, SOG, levels of detail)."""
-    model_path: Annotated[Path | None, flag("FOLDER", "-m"), SCENE_FILE] = None
+    model_path: Annotated[Path | None, flag("FOLDER", "-m", read=Path), SCENE_FILE] = None
     """An INRIA model folder, instead of SCENE."""
-    iteration: Annotated[int | None, number(0, 10**9, whole=True, metavar="N"), UNSET, SCENE_FILE] = None
+    iteration: Annotated[int | None, number(0, 10**9, whole=True, metavar="N"), SCENE_FILE] = None
     """Iteration of a model folder (default: the last)."""
 
 
@@ -54,13 +51,13 @@ class SceneOptions(FileOptions):
 class CameraOptions(Options):
     """The cameras."""
 
-    cameras: Annotated[Path | None, flag("PATH")] = None
+    cameras: Annotated[Path | None, flag("PATH", read=Path)] = None
     """cameras.json, COLMAP model, Blender transforms_*.json, or their folder (default: SCENE's model folder)."""
-    train_scale: Annotated[float | None, SCALE, UNSET, CAMERAS] = None
+    train_scale: Annotated[float | None, SCALE, CAMERAS] = None
     """Training size relative to the cameras' source size, where the files do not say."""
     images: Annotated[str | None, flag("FOLDER"), CAMERAS] = None
     """Folder of photographs inside the data set (default: the format's own)."""
-    test_every: Annotated[int | None, number(0, 1_000_000, whole=True, metavar="N"), UNSET, CAMERAS] = None
+    test_every: Annotated[int | None, number(0, 1_000_000, whole=True, metavar="N"), CAMERAS] = None
     """Hold out every N-th view by name; 0 for no split (default: as usual for the format)."""
 
 
@@ -93,7 +90,7 @@ def open_scene(words: Words, path: Path | None = None) -> "Scene":
     for note in scene.notes:
         undecided = scene.other is not None and note == scene.notes[-1]
         text = f"unless the cameras tell otherwise, {note}" if undecided else note
-        say(worded(f"scene: {text}", FileOptions.__dataclass_fields__))
+        say(worded(f"scene: {text}", options_of(FileOptions)))
     for fusion in scene.fused:
         say(f"fused: {describe(fusion)}")
     return scene
@@ -112,7 +109,7 @@ def read_cameras(words: Words, scene: "Scene") -> "aaplug.CameraSet | Orbit":
         path, train_scale=options.train_scale, images=options.images, test_every=options.test_every
     )
     for note in cameras.notes:
-        say(worded(f"cameras: {note}", CameraOptions.__dataclass_fields__))
+        say(worded(f"cameras: {note}", options_of(CameraOptions)))
     return cameras
 
 

@@ -10,6 +10,8 @@ import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from importlib.metadata import version
+from shutil import get_terminal_size
+from textwrap import fill
 
 from aaplug.system.allocator import keep_freed_memory
 from aaplug.system.errors import AaplugError, UsageError, did_you_mean, printable, reason, within_memory
@@ -84,6 +86,9 @@ def run(words: Sequence[str]) -> int:
 
     if words and words[0] in VERBS:
         command = VERBS[words[0]]
+        if {"-h", "--help"} & {*words}:
+            print(command.explained(), end="")
+            return 0
         given = command.parse(words[1:])
         several = given.values.get("batch") is not None  # then each scene has options of its own, checked with its file
         return command.run(given if several else given.checked())
@@ -101,16 +106,13 @@ def run(words: Sequence[str]) -> int:
 
 def show_verbs() -> None:
     """Print what the program does, and each verb with the first line of its help."""
-    from rich.table import Table
-
-    from .console import out
     from .verbs import VERBS
 
-    table = Table(show_header=False, box=None, padding=(0, 2, 0, 2))
+    print(f"usage: aaplug [-h] VERB ...\n\n{DESCRIPTION}\n")
+    columns, longest = get_terminal_size().columns, max(map(len, VERBS))
     for name, command in VERBS.items():
-        table.add_row(name, command.help.partition("\n\n")[0])
-    out.print(f"usage: aaplug [-h] VERB ...\n\n{DESCRIPTION}\n", markup=False)
-    out.print(table)
+        first = command.help.partition("\n\n")[0]
+        print(fill(f"  {name:{longest}}  {first}", columns, subsequent_indent=" " * (longest + 4)))
 
 
 def _worded(error: AaplugError, words: Sequence[str]) -> str:
@@ -118,6 +120,6 @@ def _worded(error: AaplugError, words: Sequence[str]) -> str:
     from .verbs import VERBS
     from .words import worded
 
-    names = VERBS[words[0]].types if words and words[0] in VERBS else {}
-    where = worded(f"`{error.where}`", names).strip("`") if isinstance(error, UsageError) else error.where
-    return f"{where}: {worded(error.problem, names)}"
+    options = VERBS[words[0]].options.values() if words and words[0] in VERBS else []
+    where = worded(f"`{error.where}`", options).strip("`") if isinstance(error, UsageError) else error.where
+    return f"{where}: {worded(error.problem, options)}"

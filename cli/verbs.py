@@ -3,22 +3,18 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from inspect import cleandoc
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import tyro
-from rich.box import SIMPLE_HEAD
-from rich.markup import escape
-from rich.table import Table
-
 import aaplug
 from aaplug.options import verbs
-from aaplug.options.base import REPORT, UNSET, OneOf, Options, choices, flag, number
-from aaplug.options.shared import MAX_SIDE, RECIPE_NAMES, FrameOptions, Orbit
+from aaplug.options.base import REPORT, Options, flag, names, number
+from aaplug.options.shared import MAX_SIDE, RECIPE_METAVAR, FrameOptions, Orbit
 from aaplug.system.errors import UsageError, printable
 
 from .batch import SEVERAL, batch_of_evaluations, for_each_scene, made_before
-from .console import FAILED, TERMINAL, out, print_json, say
+from .console import FAILED, TERMINAL, print_json, say, show, show_rows
 from .inputs import (
     SCENE_AND_CAMERAS,
     CameraOptions,
@@ -43,7 +39,7 @@ def verb(*options: type[Options] | Option) -> Callable[[Callable[[Words], int]],
 
     def enter(run: Callable[[Words], int]) -> Callable[[Words], int]:
         name = run.__name__.replace("_", "-")
-        VERBS[name] = Command(name, run.__doc__ or "", options, run)
+        VERBS[name] = Command(name, cleandoc(run.__doc__ or ""), options, run)
         return run
 
     return enter
@@ -92,8 +88,8 @@ def convert(words: Words) -> int:
     if words.json:
         print_json(facts)
     elif result.report is not None:
-        out.print("As the viewer draws it, against the scene's own training-size render:")
-        out.print(tables(result.report)[0])
+        show("As the viewer draws it, against the scene's own training-size render:")
+        show(tables(result.report)[0])
     how = "in parts" if result.scene is None else f"fused {fused_in(result.scene)}"
     say(f"wrote {words.output}: {how}; show it with {result.viewer.rule} ({result.viewer.name})")
     say(result.viewer.advice(words.output.suffix[1:].lower()))
@@ -172,7 +168,7 @@ def finetune(words: Words) -> int:
     else:
         from aaplug.evaluation.results import tables
 
-        out.print(*tables(tuned.report))
+        show(*tables(tuned.report))
     stem = words.output.stem
     say(f"wrote {words.output}, {stem}.finetune.json and {stem}.finetune.png")
     return 0
@@ -180,13 +176,13 @@ def finetune(words: Words) -> int:
 
 MORE_SCENES = Option(
     "more",
-    Annotated[tuple[Path, ...], tyro.conf.Positional, flag("[SCENE ...]")],
+    flag("[SCENE ...]", read=Path, by_place=True, count=None),
     "More scenes, with the same --cameras or each a model folder.  Each gets its own folder of results.",
     (),
 )
 BATCH = Option(
     "batch",
-    Annotated[Path | None, flag("FILE.toml")],
+    flag("FILE.toml", read=Path),
     "Scenes and their settings from a file; what it does not say is as on the command line.",
     None,
 )
@@ -220,7 +216,7 @@ def evaluate(words: Words) -> int:
     if words.json:
         print_json(results(report))
     else:
-        out.print(*tables(report))
+        show(*tables(report))
     return 0
 
 
@@ -248,23 +244,18 @@ def video(words: Words) -> int:
 class GuardOptions(Options):
     """A guard for pipelines."""
 
-    fail_under: Annotated[float | None, number(0, 200, unit="dB"), UNSET, REPORT] = None
+    fail_under: Annotated[float | None, number(0, 200, unit="dB"), REPORT] = None
     """Exit with 1 if the mean PSNR of a scene at any scale is below so many dB: --fail-under 40dB."""
 
 
 @verb(
     Option(
         "scenes",
-        Annotated[tuple[Path, ...], tyro.conf.Positional, flag("SCENE SCENE [SCENE ...]")],
+        flag("SCENE SCENE [SCENE ...]", read=Path, by_place=True, count=None),
         "Two or more scenes of any format, or their folders; the first is what the others are held to.",
         (),
     ),
-    Option(
-        "reference",
-        Annotated[Path | None, flag("SCENE")],
-        "The scene that the others are held to, instead of the first.",
-        None,
-    ),
+    Option("reference", flag("SCENE", read=Path), "The scene that the others are held to, instead of the first.", None),
     CameraOptions,
     output("FOLDER", "Folder for compare.json, compare.csv, report.html and contact-sheet.png.", None),
     verbs.CompareOptions,
@@ -293,7 +284,7 @@ def compare(words: Words) -> int:
     if words.json:
         print_json(comparison.summary())
     else:
-        out.print(*comparison.tables())
+        show(*comparison.tables())
     least, lowest = words.fail_under, comparison.lowest
     if least is not None and lowest.value < least:
         say(f"{lowest.scene} at {lowest.scale:g}: mean PSNR {lowest.value:.2f} dB is below {least:g} dB")
@@ -304,7 +295,7 @@ def compare(words: Words) -> int:
 @verb(
     *SCENE_AND_CAMERAS,
     FrameOptions,
-    Option("limits", bool, "Show every limit on files instead, and the environment variable that changes it.", False),
+    Option("limits", None, "Show every limit on files instead, and the environment variable that changes it.", False),
     json_of("one JSON object instead of a table"),
 )
 def info(words: Words) -> int:
@@ -321,12 +312,9 @@ def info(words: Words) -> int:
     if words.json:
         print_json(facts)
         return 0
-    table = Table(show_header=False, box=None, pad_edge=False)
-    for key, value in facts.items():
-        if key not in PROGRAM_KEYS and value != []:
-            name = key.removesuffix("_text").replace("_px2", " (px²)").replace("_", " ")
-            table.add_row(f"[dim]{name}[/]", escape(_text(value)))
-    out.print(table)
+    facts = {key: value for key, value in facts.items() if key not in PROGRAM_KEYS and value != []}
+    names = [key.removesuffix("_text").replace("_px2", " (px²)").replace("_", " ") for key in facts]
+    show_rows(zip(names, map(_text, facts.values()), strict=True))
     return 0
 
 
@@ -356,21 +344,17 @@ def _show_limits(as_json: bool) -> int:
     if as_json:
         print_json(values | {name: value for name, (value, *_) in fixed.items()})
         return 0
-    table = Table("limit", "value", "unit", "of", "set by", box=None, pad_edge=False)
-    for name, value in values.items():
-        row = LIMITS[name]
-        table.add_row(name, f"{value:,}", row.unit, row.what, f"AAPLUG_{name}")
-    for name, (value, unit, what) in fixed.items():
-        table.add_row(name, f"{value:,}", unit, what, "fixed")
-    out.print(table)
+    rows = [(n, f"{value:,}", LIMITS[n].unit, LIMITS[n].what, f"AAPLUG_{n}") for n, value in values.items()]
+    rows += [(name, f"{value:,}", unit, what, "fixed") for name, (value, unit, what) in fixed.items()]
+    show_rows(rows, ("limit", "value", "unit", "of", "set by"))
     if (memory := usable_memory()) is not None:
-        out.print(f"Memory: {memory}.")
+        show(f"Memory: {memory}.")
     return 0
 
 
 @verb(
     output("FOLDER", "Folder for the converted scene, the contact sheet and the results.", Path("demo-out")),
-    Option("overwrite", bool, "Replace the files of an earlier demo.", False),
+    Option("overwrite", None, "Replace the files of an earlier demo.", False),
 )
 def demo(words: Words) -> int:
     """Convert, render and measure the bundled scene: a pretrained chair and four photographs.
@@ -380,7 +364,7 @@ def demo(words: Words) -> int:
     from aaplug.evaluation.results import tables
     from aaplug.verbs.demo import SHEET
 
-    out.print(*tables(aaplug.demo(words.output, overwrite=words.overwrite, monitor=TERMINAL)))
+    show(*tables(aaplug.demo(words.output, overwrite=words.overwrite, monitor=TERMINAL)))
     say(f"look at {words.output / SHEET}")
     return 0
 
@@ -395,6 +379,7 @@ def view(words: Words) -> int:
     if words.scene is not None or words.model_path is not None:
         scene, cameras = read_inputs(words)
     command = [word for options in (SceneOptions, CameraOptions, Orbit) for word in words.given(options)]
+    command += [] if words.background == "auto" else ["--background", words.background]
     from aaplug.verbs.view import attend, serving
 
     with serving(scene, cameras, words=command, **told(words, verbs.LiveOptions)) as address:
@@ -408,7 +393,7 @@ def view(words: Words) -> int:
 @verb(
     Option(
         "recipe",
-        Annotated[tuple[str, ...], choices([*RECIPE_NAMES, "..."]), OneOf(kind="recipe"), UNSET],
+        names(kind="recipe", metavar=RECIPE_METAVAR, count=None),
         "Compile what these recipes need, too; by default what auto, matched, classic and mip need.",
         (),
     ),
@@ -427,7 +412,7 @@ def warmup(words: Words) -> int:
 
 
 @verb(
-    Option("module", Annotated[str, tyro.conf.Positional, flag("MODULE")], "The package, or one of its modules."),
+    Option("module", flag("MODULE", by_place=True), "The package, or one of its modules."),
     json_of("a list of objects, laws and problems"),
 )
 def check_plugin(words: Words) -> int:
@@ -441,7 +426,7 @@ def check_plugin(words: Words) -> int:
     else:
         for each in verdicts:
             outcome = f"FAILED: {each.problem}" if each.problem else "passed"
-            out.print(escape(printable(f"{each.kind} {each.name}: {each.law} {outcome}")), soft_wrap=True)
+            print(printable(f"{each.kind} {each.name}: {each.law} {outcome}"))
     return FAILED if any(each.problem for each in verdicts) else 0
 
 
@@ -462,16 +447,13 @@ def bench(words: Words) -> int:
     import torch
 
     threads = words.threads or torch.get_num_threads()
-    figures = _table(f"medians, ms; matmul is a 2048³ float32 product, {threads} threads", FIGURES, runs)
-    stages = {name: partial(_stage, name) for name in runs[0].stages_ms}
-    out.print(figures, _table("stages, ms", stages, runs))
+    _show_times(f"medians, ms; matmul is a 2048³ float32 product, {threads} threads", runs, FIGURES)
+    _show_times(
+        "stages, ms", runs, {name: lambda run, name=name: f"{run.stages_ms[name]:.0f}" for name in runs[0].stages_ms}
+    )
     for name, value in exponents.items():
-        out.print(f"time grows as {name}^{value:.2f}")
+        show(f"time grows as {name}^{value:.2f}")
     return 0
-
-
-def _stage(name: str, run: "Figures") -> str:
-    return f"{run.stages_ms[name]:.0f}"
 
 
 FIGURES: dict[str, Callable[["Figures"], str]] = {
@@ -485,20 +467,15 @@ FIGURES: dict[str, Callable[["Figures"], str]] = {
 }
 
 
-def _table(title: str, columns: dict[str, Callable[["Figures"], str]], runs: Sequence["Figures"]) -> Table:
-    """A row a run: the sizes of its scene and image, its rasterizer, and the columns."""
+def _show_times(title: str, runs: Sequence["Figures"], columns: dict[str, Callable[["Figures"], str]]) -> None:
+    """Print a row a run: the sizes of its scene and image, its rasterizer, and the columns."""
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
     table = Table(title=title, box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for name in ("scene", "", *columns):
         table.add_column(name, justify="right" if name else "left", no_wrap=True)
     for run in runs:
-        count = next(
-            (
-                f"{run.gaussians / unit:.0f}{mark}"
-                for unit, mark in ((1e6, "M"), (1e3, "k"))
-                if run.gaussians >= 10 * unit or run.gaussians % unit == 0
-            ),
-            str(run.gaussians),
-        )
-        row = f"{count} {run.width}x{run.height}"
-        table.add_row(row, run.rasterizer, *(text(run) for text in columns.values()))
-    return table
+        size = f"{run.gaussians:,} {run.width}x{run.height}"
+        table.add_row(size, run.rasterizer, *(text(run) for text in columns.values()))
+    show(table)

@@ -1,77 +1,101 @@
-"""From a verb's options to the words of a command line, and back.
+"""From the words of a command line to a verb's options, and back.
 
-The fields of the options' dataclasses are stated in `aaplug.options`.  Here they become one parser a verb: a field's
-docstring is its help, and its `Group` the heading under which it stands.
+The fields of the options' dataclasses are stated in `aaplug.options`: a field's docstring is its help, and its `Group`
+the heading under which it stands.
 """
 
-import dataclasses
+import math
 import re
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager, redirect_stderr
-from dataclasses import MISSING, dataclass, field, fields, make_dataclass
+from argparse import ArgumentParser, RawDescriptionHelpFormatter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import MISSING, astuple, dataclass, fields
 from functools import cached_property
 from importlib import import_module
-from io import StringIO
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
+from textwrap import wrap
+from typing import Any, NamedTuple, TypeVar, get_type_hints
 
-import tyro
+from aaplug.options.base import PYTHON_ONLY, Argument, Group, Options, argument_of, docs_of, flag
+from aaplug.system.errors import MAX_VALUE_CHARACTERS, UsageError, did_you_mean
 
-from aaplug.options.base import Group, Options, docs_of, flag
-from aaplug.system.errors import UsageError
-
-CONFIG = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)  # how classes become options
 FILE = re.compile(r".*/.*|.*\.[A-Za-z]\w*", re.DOTALL)  # a word that names a file, unlike names and numbers
 OPTION = re.compile(r"-(?![\d.])")  # the beginning of a word that is no negative number
-SIZE = re.compile(r"-?\d+x-?\d+")  # a value of --resolution, which the parser may take for an option
+MAX_METAVAR = 30  # characters; longer lists of names stand in an option's help
+SILENT_DEFAULTS = (None, False, True, MISSING, (), math.inf)  # that help does not show
 
 T = TypeVar("T", bound=Options)
 
 
 class Option(NamedTuple):
-    """One option of a verb; its annotation holds how it is read."""
+    """One option of a verb.  argument: how its value is read; None for a switch."""
 
     name: str
-    annotation: Any
+    argument: Argument | None
     help: str
     default: Any = MISSING
+    group: Group | None = None
 
     @property
-    def group(self) -> Group | None:
-        """The heading that it stands under; None for the first."""
-        return next((part for part in getattr(self.annotation, "__metadata__", ()) if isinstance(part, Group)), None)
+    def flags(self) -> list[str]:
+        """The words that name it, the one for messages first; none for an option without a name."""
+        if self.argument is not None and self.argument.by_place:
+            return []
+        name = ("--no-" if self.default is True else "--") + self.name.replace("_", "-")
+        return sorted(
+            [name, *(self.argument.flags if self.argument else ())], key=lambda one: (one[1] != "-", one == name)
+        )
 
     @property
-    def spec(self) -> tuple[str, Any, Any]:
-        """The option as a field of the parser's dataclass."""
-        base, *metadata = get_args(self.annotation) if get_origin(self.annotation) is Annotated else [self.annotation]
-        told = [part for part in metadata if not isinstance(part, Group)]
-        configs = [part for part in told if dataclasses.is_dataclass(part) and hasattr(part, "help")]
-        told = [part for part in told if part not in configs]
-        config: Any = configs[0] if configs else tyro.conf.arg()
-        annotation = Annotated[(base, *told, dataclasses.replace(config, help=self.help))]  # pyright: ignore
-        return self.name, annotation, field(default=self.default) if self.default is not MISSING else field()
+    def shown(self) -> str:
+        """The option as messages name it."""
+        return self.flags[0] if self.flags else str(self.argument and self.argument.metavar)
+
+    def takes(self, words: Sequence[str], word: str) -> bool:
+        """True if a word belongs to its value after these."""
+        if self.argument is None:
+            return False
+        return not FILE.fullmatch(word) if self.argument.count is None else len(words) < self.argument.count
+
+    def value(self, words: Sequence[str]) -> Any:
+        """The value that words give; raises UsageError."""
+        if self.argument is None and not words:
+            return not self.default
+        takes, got = "no value", " ".join(words)[:MAX_VALUE_CHARACTERS] or "nothing"
+        if self.argument is not None:
+            with suppress(ValueError):
+                value = self.argument.value(words)
+                self.argument.check(self.shown, value)
+                return value
+            takes = self.argument.takes or self.argument.metavar
+        raise UsageError(self.shown, f"takes {takes}, got {got}")
 
 
 def output(metavar: str, text: str, default: Any = MISSING) -> Option:
     """The option that names what to write."""
-    kind = Path if default is MISSING or default is not None else Path | None
-    return Option("output", Annotated[kind, flag(metavar, "-o")], text, default)
+    return Option("output", flag(metavar, "-o", read=Path), text, default)
 
 
 def json_of(what: str) -> Option:
     """The option that prints a result as JSON."""
-    return Option("json", bool, f"Print {what} on stdout.", False)
+    return Option("json", None, f"Print {what} on stdout.", False)
 
 
 def options_of(options: type[Options]) -> list[Option]:
     """The options that a dataclass states; what the command line does not offer is left out."""
     hints, docs = get_type_hints(options, include_extras=True), docs_of(options)
-    return [
-        Option(each.name, hints[each.name], docs[each.name], _default(each))
-        for each in fields(options)
-        if tyro.conf.Suppress not in get_args(hints[each.name]) and each.name != "monitor"
-    ]
+    stated = []
+    for each in fields(options):
+        parts = getattr(hints[each.name], "__metadata__", ())
+        if PYTHON_ONLY not in parts:
+            group = next((part for part in parts if isinstance(part, Group)), None)
+            stated.append(Option(each.name, argument_of(hints[each.name]), docs[each.name], each.default, group))
+    return stated
+
+
+class _Help(RawDescriptionHelpFormatter):
+    def _split_lines(self, text: str, width: int) -> list[str]:
+        return wrap(" ".join(text.split()), width, break_on_hyphens=False)  # names stay whole
 
 
 class Words:
@@ -109,15 +133,12 @@ class Words:
     def given(self, options: type[Options]) -> list[str]:
         """The command line's words that give the options of one dataclass which are not as usual."""
         words: list[str] = []
-        defaults = {option.name: option.default for option in options_of(options)}
-        for name, value in self.keywords(options).items():
-            if value in (None, False) or value == defaults.get(name):
+        for option in options_of(options):
+            value = self.values.get(option.name)
+            if value in (None, False) or value == option.default:
                 continue
             values = value if isinstance(value, list | tuple) else [] if value is True else [value]
-            if name == "scene":  # the positional one comes first
-                words = [*map(str, values), *words]
-            else:
-                words += [_flag_of(name), *map(str, values)]
+            words = [*words, *option.flags[:1], *map(str, values)] if option.flags else [*map(str, values), *words]
         return words
 
 
@@ -134,140 +155,97 @@ class Command:
     run: Callable[[Words], int]
 
     @cached_property
-    def options(self) -> list[Option]:
-        """All options; they are read from the dataclasses when the verb is used."""
+    def options(self) -> dict[str, Option]:
+        """All options by name; they are read from the dataclasses when the verb is used."""
         options: dict[str, Option] = {}
         for each in self.stated:
             for option in [each] if isinstance(each, Option) else options_of(each):
                 options.setdefault(option.name, option)
-        return list(options.values())
+        return options
 
     @property
     def classes(self) -> list[type[Options]]:
         """The dataclasses that state most of the options."""
         return [each for each in self.stated if not isinstance(each, Option)]
 
-    @cached_property
-    def types(self) -> dict[str, Any]:
-        """Types of the options, by name."""
-        return {option.name: option.annotation for option in self.options}
+    def parse(self, words: Sequence[str]) -> Words:
+        """Read words; raises UsageError if they do not fit.
 
-    @cached_property
-    def parser(self) -> type[Any]:
-        """A dataclass of the options: first those without a heading, then one nested dataclass for each heading."""
-        groups: dict[Group, list[Option]] = {}
-        first = []
-        for option in self.options:
-            (first if option.group is None else groups.setdefault(option.group, [])).append(option)
-        specs = [option.spec for option in sorted(first, key=lambda option: option.default is not MISSING)]
-        for group, members in groups.items():
-            nested = make_dataclass(group.title.title(), [member.spec for member in members], frozen=True)
-            nested.__doc__ = group.about
-            name = group.title.replace(" ", "_") + "_options"
-            specs.append((name, Annotated[nested, tyro.conf.arg(name=group.title)], field(default_factory=nested)))
-        parser = make_dataclass(self.name.title(), specs, frozen=True)
-        parser.__doc__ = self.help
-        return parser
-
-    def parse(self, words: Sequence[str], default: Words | None = None) -> Words:
-        """Read words; raises UsageError if they do not fit.  default: has what they do not say."""
-        how = {} if default is None else {"default": self.filled(default.values)}
-        program = f"aaplug {self.name}"
-        with one_line(program):
-            parsed = tyro.cli(self.parser, prog=program, args=self.parted(words), config=CONFIG, **how)
-        values: dict[str, Any] = {}
-        for name, value in vars(parsed).items():
-            values |= vars(value) if dataclasses.is_dataclass(value) else {name: value}
+        An option of several values takes them apart or between commas, and ends before a word that names a file.
+        """
+        flags = {flag: option for option in self.options.values() for flag in option.flags}
+        given: dict[str, list[str]] = {}
+        option, places = None, list[str]()
+        for word in words:
+            name, equals, value = word.partition("=")
+            name = name.replace("_", "-")
+            if name in flags:
+                option = flags[name]
+                given[option.name] = [value] if equals else []
+            elif OPTION.match(word):
+                raise self.refusal(f"Unrecognized options: {name}{did_you_mean(name, flags)}")
+            elif option is not None and option.takes(given[option.name], word):
+                given[option.name].append(word)
+            else:
+                places.append(word)
+        for option in self.options.values():
+            if not option.flags and places:
+                most = 1 if option.argument and option.argument.count == 1 else len(places)
+                given[option.name], places = places[:most], places[most:]
+        if places:
+            raise self.refusal(f"Unrecognized words: {' '.join(places)}")
+        values = {name: option.default for name, option in self.options.items()}
+        values |= {name: self.options[name].value(words) for name, words in given.items()}
+        for name in [name for name, value in values.items() if value is MISSING]:
+            missing = self.options[name]
+            raise self.refusal(
+                f"{'/'.join(missing.flags[::-1]) or missing.shown} is missing: {missing.help.rstrip('.')}"
+            )
         return Words(self, values)
 
-    def filled(self, values: Mapping[str, Any]) -> Any:
-        """The parser's dataclass with these values."""
+    def refusal(self, problem: str) -> UsageError:
+        """The error of words that are no command line of this verb."""
+        return UsageError(f"aaplug {self.name}", f"{problem}; see `aaplug {self.name} --help`")
 
-        def fill(kind: Any) -> Any:
-            names = {each.name: each.default_factory for each in fields(kind)}  # of groups, their dataclasses
-            return kind(**{n: values[n] if n in values else fill(group) for n, group in names.items()})
-
-        return fill(self.parser)
-
-    def parted(self, words: Sequence[str]) -> list[str]:
-        """The words as the parser wants them.
-
-        `--scale 1,0.25` becomes `--scale 1 0.25`; `--views`, whose names hold commas, stays.  A file after such values
-        goes to the front, where the parser does not take it for one of them.  `--resolution -1x720` becomes one word,
-        because the parser would take the value for an option.
-        """
-        several = {_flag_of(name) for name, kind in self.types.items() if _takes_several(kind)}
-        option, parted, files = "", list[str](), list[str]()
-        for word in words:
-            if parted and parted[-1] == "--resolution" and SIZE.fullmatch(word):
-                parted[-1] += "=" + word
-                continue
-            name, _, value = word.partition("=")
-            option = name if OPTION.match(word) else option
-            if option not in several:
-                parted.append(word)
-            elif name != option and FILE.fullmatch(word):
-                files.append(word)
-            elif name == option:
-                parted += [option, *filter(None, value.split(","))]
-            else:
-                parted += filter(None, word.split(","))
-        return [*files, *parted]
+    def explained(self) -> str:
+        """The text of --help: first the options without a heading, then each heading with its own."""
+        options = sorted(self.options.values(), key=lambda option: (bool(option.flags), option.default is not MISSING))
+        places = " ".join(option.shown for option in options if not option.flags)
+        parser = ArgumentParser(
+            usage=f"aaplug {self.name} [-h] [OPTIONS] {places}".rstrip(), description=self.help, formatter_class=_Help
+        )
+        groups = dict.fromkeys(option.group for option in options)
+        headings = {group: parser.add_argument_group(*astuple(group)) if group else parser for group in groups}
+        for option in options:
+            _explain(headings[option.group], option)
+        return parser.format_help()
 
 
 VERBS: dict[str, Command] = {}  # by name; `verbs` fills it
 
 
-@contextmanager
-def one_line(program: str) -> Iterator[None]:
-    """Turn tyro's box about words that it cannot read into an error of one line.
-
-    Raises:
-        UsageError: the words inside the block do not fit the program.
-    """
-    box = StringIO()
-    try:
-        with redirect_stderr(box):
-            yield
-    except SystemExit as end:
-        if not end.code:  # --help
-            raise
-        lines = [line.strip("│╭╮╰╯─|+ ") for line in box.getvalue().splitlines()]  # drawn in ASCII on some terminals
-        text = " ".join(filter(re.compile(r"\w").search, lines[1:]))  # without the box's title and rules
-        text = re.split(" For full helptext| Argument helptext", text)[0].removeprefix("Error parsing ")
-        raise UsageError(program, f"{text.rstrip('. ')}; see `{program} --help`") from end
+def _explain(group: Any, option: Option) -> None:
+    """Add an option to a heading of the help, with its default and, where there are many, its names."""
+    argument, text = option.argument, option.help
+    how: dict[str, Any] = {"action": "store_true"}
+    if argument is not None:
+        metavar = argument.metavar
+        if len(metavar) > MAX_METAVAR:
+            listed = metavar.replace(" ...", "").replace("|...", " and others").replace("|", ", ")
+            metavar, text = option.name.upper().replace("_", "-"), f"{text}  Names: {listed}."
+        how = {"metavar": metavar}
+    if "(default" not in text and option.default not in SILENT_DEFAULTS:
+        values = option.default if isinstance(option.default, list | tuple) else [option.default]
+        text = f"{text} (default: {' '.join(f'{v:g}' if isinstance(v, float) else str(v) for v in values)})"
+    long = [name for name in option.flags if name.startswith("--")][:1]
+    names = [*(name for name in option.flags if not name.startswith("--")), *long] or [option.name]
+    group.add_argument(*names, **how, help=text.replace("%", "%%"))
 
 
-def worded(text: str, names: Collection[str]) -> str:
+def worded(text: str, options: Iterable[Option]) -> str:
     """The library's text with parameters as options: min_seen or `min_seen` becomes --min-seen."""
-
-    def option(match: re.Match[str]) -> str:
-        name = match[1] or match[2]
-        if name not in names:
-            return match[0]
-        return "SCENE" if name == "scene" else "--for" if name == "viewer" else _flag_of(name)
-
-    return re.sub(r"`(\w+)`|\b([a-z]+(?:_[a-z]+)+)\b", option, text)
-
-
-def setting_words(name: str, value: Any) -> list[str]:
-    """A setting of a batch file as words of the command line."""
-    if name == "scene":
-        return [str(value)]
-    return [_flag_of(name), *map(str, value if isinstance(value, list) else [value])]
-
-
-def _flag_of(name: str) -> str:
-    return "--" + name.replace("_", "-")
-
-
-def _takes_several(annotation: Any) -> bool:
-    base = get_args(annotation)[0] if get_origin(annotation) is Annotated else annotation
-    return Sequence in [get_origin(kind) for kind in (base, *get_args(base))]
-
-
-def _default(each: dataclasses.Field[Any]) -> Any:
-    return each.default_factory() if each.default_factory is not MISSING else each.default
+    shown = {option.name: option.shown for option in options}
+    return re.sub(r"`(\w+)`|\b([a-z]+(?:_[a-z]+)+)\b", lambda match: shown.get(match[1] or match[2], match[0]), text)
 
 
 def _words_of(verb: str, values: Mapping[str, Any]) -> Words:

@@ -50,7 +50,7 @@ def test_an_option_that_is_none_is_refused_with_the_nearest_name():
 @pytest.mark.parametrize("verb", VERBS)
 def test_verbs_have_the_options_of_the_command_line(verb):
     parameters = inspect.signature(getattr(aaplug, verb.replace("-", "_"))).parameters
-    missing = parameters.keys() - VERBS[verb].types.keys() - {"monitor", "name", "words"}
+    missing = parameters.keys() - VERBS[verb].options.keys() - {"monitor", "name", "words"}
     assert not missing
     for name, parameter in parameters.items():
         keyword = parameter.kind is inspect.Parameter.KEYWORD_ONLY

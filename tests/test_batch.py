@@ -151,7 +151,7 @@ REFUSED = {
     "misfit": (SETTINGS.replace("[0.5]", "['big']"), "--scale: takes 0.001..64 ..., got big"),
     "out of range": ("min-seen = 2" + SETTINGS, "at the top: --min-seen: takes 0..1, got 2"),
     "not here": (SETTINGS + "output = 'elsewhere'", "scene 'broken': output is no setting here"),
-    "a choice": (SETTINGS + "truth = 'other'", "invalid choice 'other' for argument '--truth'"),
+    "a choice": (SETTINGS + "truth = 'other'", "--truth: 'other' is not one of auto"),
 }  # fmt: skip
 
 

@@ -90,7 +90,7 @@ def test_it_writes_a_report_and_inrias_folders(cli):
 
 def test_help_shows_the_recipes_for_users_and_says_that_there_are_more(cli):
     text = cli("evaluate --help")[1]
-    assert "playcanvas-classic|all|..." in text.replace("\n", "").replace(" ", "")
+    assert "playcanvas-classic and others" in " ".join(text.split())
     assert "matched-integral" not in text
 
 

@@ -2,6 +2,10 @@
 
 import dataclasses
 import math
+import re
+import subprocess
+import sys
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
@@ -9,15 +13,24 @@ import pytest
 from aaplug_cli.main import main
 from aaplug_cli.verbs import VERBS
 
-from aaplug.options.base import Options
+from aaplug.options.base import Number, Options
 from aaplug.system.errors import UsageError
 
 NO_NUMBERS = (math.nan, math.inf, -math.inf, -1, 10**30, True, "", "x" * 10_000)
 
 
-def range_of(hint: Any) -> list[Any]:
+def range_of(hint: Any) -> list[Number]:
     """The ranges that an annotation states: one for a number, none for others."""
-    return [part for part in getattr(hint, "__metadata__", ()) if hasattr(part, "is_instance")]
+    return [part for part in getattr(hint, "__metadata__", ()) if isinstance(part, Number)]
+
+
+def fits(spec: Number, value: Any) -> bool:
+    """True if a value is not refused."""
+    try:
+        spec.check("option", value)
+    except UsageError:
+        return False
+    return True
 
 
 def numeric(hint: Any) -> bool:
@@ -44,13 +57,13 @@ def test_the_options_are_found():
 def test_every_number_has_a_range(group, name, specs):
     assert len(specs) == 1, f"{group.__name__}.{name} has no range"
     (spec,) = specs
-    least, most = map(float, spec.range_text.removesuffix(" ...").split(".."))
-    several = spec.nargs == "*"
+    least, most = map(float, spec.takes.removesuffix(" ...").split(".."))
+    several = spec.count is None
     for value in NO_NUMBERS:
         inside = isinstance(value, (int, float)) and value is not True and least <= value <= most
-        assert spec.is_instance([value] if several else value) == inside, value
+        assert fits(spec, [value] if several else value) == inside, value
     default = next(field.default for field in dataclasses.fields(group) if field.name == name)
-    assert default is None or spec.is_instance(default)
+    assert default is None or fits(spec, default)
 
 
 @pytest.mark.parametrize(("group", "name", "specs"), NUMERIC, ids=IDS)
@@ -58,15 +71,20 @@ def test_a_number_outside_of_its_range_is_refused(group, name, specs):
     spec, plain = specs[0], get_type_hints(group)[name]
     value = 10**30 if int in (plain, *get_args(plain)) else math.nan
     with pytest.raises(UsageError, match=rf"takes .*\.\..*, got {value}"):
-        group(**{name: [value] if spec.nargs == "*" else value})
+        group(**{name: [value] if spec.count is None else value})
 
 
 REFUSED = {
-    "render --nope": "Missing from aaplug render: -o PATH",
-    "render s.ply -o out --scal 2": "Unrecognized options: --scal",
-    "render s.ply -o": "Missing value for argument '-o/--output'",
+    "render s.ply": "-o/--output is missing: A folder for the images, or one .png for one view; see",
+    "render --nope": "Unrecognized options: --nope",
+    "render s.ply -o out --scal 2": "Unrecognized options: --scal; did you mean --scale?; see",
+    "render s.ply -o": "--output: takes PATH, got nothing",
+    "render s.ply t.ply -o x": "Unrecognized words: t.ply",
+    "render s.ply -o x --json=3": "--json: takes no value, got 3",
+    "convert s.ply -o c.ply --for supersplatt": "--for: 'supersplatt' is not one of classic",
+    "lod s.ply -o l.ply --for spark --no-refine": "--for: is what the result is tuned for: leave out --no-refine",
     "render s.ply -o out --scale x": "--scale: takes 0.001..64, got x",
-    "render s.ply -o out --bit-depth 9": "invalid choice '9'",
+    "render s.ply -o out --bit-depth 9": "--bit-depth: '9' is not one of 8, 16",
     "render s.ply -o out --threads 99999": "--threads: takes 1..",
     "finetune s.ply -o t.ply --scale 1,nan": "--scale: takes 0.001..64 ..., got 1.0, nan",
     "evaluate s.ply --scale": "--scale: takes 0.001..64 ..., got nothing",
@@ -97,7 +115,56 @@ def test_help_shows_every_range(verb, capsys):
     with pytest.raises(SystemExit):
         main([verb, "--help"])
     shown = "".join(capsys.readouterr().out.split())
-    for option in VERBS[verb].options:
-        if numeric(get_args(option.annotation)[:1] and get_args(option.annotation)[0]):
-            (spec,) = range_of(option.annotation)
-            assert f"--{option.name.replace('_', '-')}{spec.metavar}".replace(" ", "") in shown
+    for option in VERBS[verb].options.values():
+        if isinstance(option.argument, Number):
+            assert f"{option.flags[0]}{option.argument.metavar}".replace(" ", "") in shown
+
+
+SHARES = {
+    "1/4": 0.25,
+    "25%": 0.25,
+    "0.25": 0.25,
+    "12.5%": 0.125,
+    "2/1": 2.0,
+    "1/0": None,
+    "1/": None,
+    "%": None,
+    "1/2/4": None,
+}
+
+
+@pytest.mark.parametrize("word", SHARES)
+def test_a_share_is_written_as_people_write_it(word):
+    refused = pytest.raises(UsageError, match=f"--scale: takes 0.001..64, got {word}")
+    with nullcontext() if SHARES[word] else refused:
+        assert VERBS["render"].parse(["s.ply", "-o", "out", "--scale", word]).scale == SHARES[word]
+
+
+def test_help_shows_no_default_of_a_switch(capsys):
+    for verb in VERBS:
+        with pytest.raises(SystemExit):
+            main([verb, "--help"])
+        assert not re.search(r"default:\s+(True|False|None|inf)\)", capsys.readouterr().out)
+
+
+WRONG = """
+from aaplug.options.verbs import *
+from aaplug.system.errors import UsageError
+for options, name, value in (
+    (RenderOptions, "views", ["r_8"]), (RenderOptions, "resolution", (5, 5)), (RenderOptions, "overwrite", 1),
+    (RenderOptions, "bit_depth", 7), (RenderOptions, "monitor", 3), (ConvertOptions, "form", 3),
+    (EvaluateOptions, "layout", "tree"), (FinetuneOptions, "move", ["colour"]), (VideoOptions, "fps", "24"),
+):
+    try:
+        options(**{name: value})
+        print(name, "is taken")
+    except UsageError as error:
+        if not str(error).startswith(f"{name}: ") or str(value).strip("[]'") not in str(error):
+            print(error)
+"""
+
+
+def test_a_value_of_another_type_is_refused_from_python_too():
+    """In a process of its own, in which nothing else checks types."""
+    done = subprocess.run([sys.executable, "-c", WRONG], capture_output=True, text=True, check=False)
+    assert (done.stdout, done.stderr) == ("", "")

@@ -23,7 +23,7 @@ SLOW = ["torch", "numpy", "cv2", "jaxtyping", "beartype", "scipy", "skimage", "m
 SLOW += ["distributed", "dask", "viser", "aaplug.lab"]
 START = "from aaplug_cli.main import program; program()"
 STARTS = {"import": ("-c", "import aaplug"), "version": ("-c", START, "--version"), "help": ("-c", START, "--help")}
-MAX_RATIOS = {"import": 3, "version": 5, "help": 20}  # to a bare start of Python, about 20 ms
+MAX_RATIOS = {"import": 3, "version": 5, "help": 9}  # to a bare start of Python, about 20 ms
 PROGRAM = """
 import json, sys
 from aaplug_cli.main import main
@@ -84,7 +84,8 @@ def processor_time(*words: str) -> float:
     return min(seconds)
 
 
-def test_the_program_starts_quickly():
+def test_the_program_starts_quickly(monkeypatch):
+    monkeypatch.delenv("PYTHONDONTWRITEBYTECODE", raising=False)
     bare = processor_time("-c", "pass")
     ratios = {name: processor_time(*words) / bare for name, words in STARTS.items()}
     print(bare, ratios)

@@ -17,7 +17,7 @@ from aaplug.evaluation.metrics import psnr
 from aaplug.io.images import read_image, write_png
 from aaplug.io.scenes import scene_of
 from aaplug.live import pictures
-from aaplug.live.messages import PictureRequest, Side, StillRequest
+from aaplug.live.messages import PickRequest, PictureRequest, Side, StillRequest
 from aaplug.live.overlays import OVERLAYS
 from aaplug.live.pictures import Pictures
 from aaplug.live.studio import Studio
@@ -240,11 +240,24 @@ def test_overlays_tell_what_they_say(subject, name):
 
 def test_a_still_has_the_size_that_was_asked_for(subject):
     request = a_request(subject)
-    *_, message = filter(None, Pictures(subject).still(request, StillRequest(60, 40, 1)))
+    *_, message = filter(None, Pictures(subject).ordered(request, StillRequest(60, 40, 1)))
     header, [file] = unpacked(message)
     assert header["still"] == "auto-60x40.png"
     expected = subject.renderer(SIDES[1])(subject.camera(request).framed(60, 40)).rgb
     assert float((decoded(file) - quantised(expected)).abs().max()) < 1.1 / 255
+
+
+@pytest.mark.parametrize("background", [None, (1.0, 0.5, 0.0)])
+def test_the_depth_of_a_place_is_told(subject, background):
+    request = a_request(subject, background=background)
+    depths = []
+    for x, y in ((0.5, 0.5), (0.0, 0.0)):
+        [message] = Pictures(subject).ordered(request, PickRequest(x, y))
+        header, _ = unpacked(message)
+        assert header["picked"] == [x, y]
+        depths.append(header["depth"])
+    assert 3 < depths[0] < 5.5  # the camera is 4 from the middle of the scene
+    assert depths[1] is None
 
 
 def test_a_newer_request_ends_the_older_one_between_strips(subject, monkeypatch):

@@ -18,6 +18,7 @@ from aaplug.io.images import read_image
 from aaplug.rendering.renderer import Renderer
 from aaplug.verbs.view import serving
 from tests.conftest import make_camera, make_scene
+from tests.test_cli import cli, dataset  # noqa: F401  (fixtures)
 from tests.test_view import decoded, with_photograph
 
 SEEN = "#picture"
@@ -43,7 +44,7 @@ def opened(browser, address):
     troubles = []
     with ExitStack() as contexts:
 
-        def open_page(width=900, height=500, scheme="light", where=address, **other):
+        def open_page(width=900, height=500, scheme="light", where=address, as_opened=False, **other):
             how = {"color_scheme": scheme, "bypass_csp": True} | other  # playwright's waiting evaluates strings
             context = browser.new_context(viewport={"width": width, "height": height}, **how)
             contexts.callback(context.close)
@@ -52,6 +53,10 @@ def opened(browser, address):
             page.on("pageerror", lambda error: troubles.append(str(error)))
             page.goto(where)
             at_rest(page)
+            if not as_opened:  # the first camera at the training size
+                page.select_option("#view", "0")
+                page.keyboard.press("4")
+                at_rest(page, at="0", scale="1")
             return page
 
         yield open_page
@@ -148,7 +153,7 @@ def test_the_divider_works_by_mouse_and_by_keyboard(opened):
     page.keyboard.press("]")
     at_rest(page, split="0.220")
     assert data(page, "asked") == before  # both sides are there; nothing is drawn anew
-    page.keyboard.press("d")
+    page.keyboard.press("m")
     at_rest(page, split="0.500")
     assert page.inner_text("#name-0") == "classic"
     assert page.inner_text("#name-1") == "auto · best"
@@ -166,14 +171,108 @@ def test_the_camera_turns_moves_and_comes_nearer(opened):
         lambda: page.mouse.wheel(0, -200),
         lambda: page.keyboard.press("ArrowUp"),
         lambda: page.keyboard.press("s"),
+        lambda: page.keyboard.press("d"),
     ):
         act()
-        at_rest(page, at="")
+        at_rest(page, at="", split="0.500")
         poses.append(state(page)["pose"])
     assert len({tuple(pose) for pose in poses}) == len(poses)
+
+
+def test_it_opens_where_both_sides_differ_most_and_says_what_to_look_at(opened, seen):
+    page = opened(as_opened=True)
+    opening = data(page, "at"), data(page, "scale")
+    apart = {}
+    for index, view in enumerate(seen[1].train):
+        for scale in (0.125, 0.25, 0.5):
+            images = [
+                quantised(Renderer.of(*seen, recipe, quality="best", rasterizer="eager")(view.scaled(scale)).rgb)
+                for recipe in ("classic", "auto")
+            ]
+            apart[str(index), str(scale)] = psnr(*images) or math.inf
+    of_first = min((place for place in apart if place[0] == "0"), key=apart.__getitem__)
+    assert opening == min((place for place in apart if place[1] == of_first[1]), key=apart.__getitem__)
+    assert f"{apart[opening]:.1f} dB" in page.inner_text("#hint")
+    page.keyboard.press("4")
+    at_rest(page, scale="1")
+    assert not page.locator("#hint").is_visible()
     page.keyboard.press("Home")
+    at_rest(page, at=opening[0], scale=opening[1])
+    assert page.locator("#hint").is_visible()
+
+
+def test_cameras_are_in_sight_as_soon_as_they_are_shown(opened, seen):
+    page = opened()
+    page.keyboard.press("c")
+    at_rest(page, at="")
+    camera = camera_of(page, seen[1])
+    eyes, depths = camera.project(torch.stack([view.centre for view in seen[1].train]))
+    inside = (depths > 0) & (eyes > 0).all(dim=1) & (eyes < torch.tensor([camera.width, camera.height])).all(dim=1)
+    assert inside.sum() >= 2
+
+
+def test_a_double_click_sets_the_point_to_turn_about(opened, seen):
+    page = opened()
+    before = camera_of(page, seen[1])
+    x, y = 0.4, 0.55
+    page.mouse.dblclick(*place(page, x, y))
+    at_rest(page, at="", split="0.500")
+    after = camera_of(page, seen[1])
+    depth = state(page)["depth"]
+    assert 1 < depth < 8
+    point = (
+        before.cam_from_world.inverse()
+        @ torch.tensor(
+            [(x - 0.5) * before.width / before.fx * depth, (y - 0.5) * before.height / before.fy * depth, depth, 1.0]
+        ).double()
+    )
+    [middle], _ = after.project(point[None, :3])
+    torch.testing.assert_close(middle, torch.tensor([after.width, after.height]).double() / 2, atol=2.0, rtol=0)
+    drag(page, (0.2, 0.5), (0.4, 0.6))
+    at_rest(page, at="")
+    [middle], _ = camera_of(page, seen[1]).project(point[None, :3])
+    torch.testing.assert_close(middle, torch.tensor([after.width, after.height]).double() / 2, atol=2.0, rtol=0)
+
+
+def test_the_background_is_chosen_and_forgotten(opened):
+    page = opened()
+    before = image(page)[2, 2]
+    page.fill("#background", "#ff8000")
     at_rest(page, at="0")
-    assert state(page)["pose"] == poses[0]
+    corner = image(page)[2, 2]
+    torch.testing.assert_close(corner, torch.tensor([1.0, 128 / 255, 0.0]), atol=2 / 255, rtol=0)
+    page.click("#asTrained")
+    at_rest(page, at="0")
+    assert torch.equal(image(page)[2, 2], before)
+
+
+def test_full_screen_goes_on_and_off(opened):
+    page = opened()
+    page.click("#full")
+    page.wait_for_function("document.fullscreenElement !== null")
+    page.keyboard.press("g")
+    page.wait_for_function("document.fullscreenElement === null")
+
+
+def test_a_refusal_is_not_acknowledged(opened):
+    """The server counts pictures alone, so that a page that acknowledges more would be sent more than it can take."""
+    page = opened()
+    page.evaluate("""() => {
+      window.told = 0;
+      const send = WebSocket.prototype.send;
+      WebSocket.prototype.send = function (text) {
+        window.told += text.includes('"shown"');
+        send.call(this, text);
+      };
+    }""")
+    page.fill("#width", "100000")
+    for _ in range(3):
+        page.click("#still")
+        page.wait_for_timeout(200)
+    assert page.evaluate("window.told") == 0
+    page.keyboard.press("1")
+    at_rest(page, scale="0.125")
+    assert page.evaluate("window.told") > 0
 
 
 def test_the_scale_sets_the_size_in_pixels(opened, seen):
@@ -265,24 +364,38 @@ def test_a_path_a_still_and_a_command_are_kept(opened, seen, tmp_path):
         page.click("#still")
     download.value.save_as(tmp_path / "still.png")
     assert read_image(tmp_path / "still.png").shape == (48, 64, 3)
-    page.click("#command")
-    page.locator("#said", has_text="copied").wait_for()
-    words = page.evaluate("navigator.clipboard.readText()")
-    assert "aaplug video scene.ply --cameras 'a b' --path camera_path.json" in words
-    page.keyboard.press("Home")
-    at_rest(page, at="0")
-    page.click("#command")
-    page.locator("#said", has_text="--views").wait_for()
-    words = page.inner_text("#said")
-    assert "aaplug render scene.ply --cameras 'a b' --views '<i>0' --scale" in words
-    assert "--recipe auto --quality best" in words
-    page.keyboard.press("f")
-    at_rest(page, split="1.000")
-    page.click("#command")  # of the side that is seen
-    page.locator("#said", has_text="--recipe classic -o").wait_for()
     page.fill("#width", "100000")
     page.click("#still")
     page.locator("#said", has_text="size: is 100000x48 px").wait_for()
+
+
+@pytest.mark.parametrize("at", ["0", ""])
+def test_the_copied_command_draws_what_was_seen(opened, cli, at):  # noqa: F811
+    words = ("scene.ply", "--cameras", ".")
+    with serving("scene.ply", ".", port=0, rasterizer="eager", words=words) as where:
+        page = opened(width=1003, where=where, permissions=["clipboard-read", "clipboard-write"])
+        page.keyboard.press("3")  # 1/2
+        page.fill("#background", "#204060")
+        if not at:
+            drag(page, (0.2, 0.5), (0.4, 0.6))
+        page.keyboard.press("f")
+        page.keyboard.press("f")
+        at_rest(page, at=at, scale="0.5", split="0.000")
+        with page.expect_download() as download:
+            page.click("#command")
+        download.value.save_as("view.json")
+        page.locator("#said", has_text="copied").wait_for()
+        command = page.evaluate("navigator.clipboard.readText()")
+        size, shown = tuple(map(int, data(page, "size").split("x"))), image(page)
+    assert len(command) < 150
+    program, *rest = command.replace('"', "").split(" ")  # which cmd, PowerShell and sh read alike
+    assert program == "aaplug"
+    assert cli(" ".join([*rest, "--rasterizer", "eager"]))[0] == 0
+    drawn = read_image("view.png")
+    assert (drawn.shape[1], drawn.shape[0]) == size
+    small = torch.nn.functional.interpolate(shown.permute(2, 0, 1)[None], drawn.shape[:2], mode="nearest-exact")[0]
+    inside = slice(4, None)  # the divider stands at an edge
+    torch.testing.assert_close(small.permute(1, 2, 0)[:, inside], drawn[:, inside], atol=1.1 / 255, rtol=0)
 
 
 def test_two_pages_shake_at_once_and_one_may_close(opened):

@@ -1,8 +1,10 @@
 """The live view's server: what a page may ask for, who is let in, and the command."""
 
+import asyncio
 import json
 import math
 import socket
+import time
 import webbrowser
 from contextlib import contextmanager
 from types import SimpleNamespace
@@ -42,12 +44,14 @@ REFUSED = {
     "recipe": ({"sides": [{"recipe": "evil", "quality": "best"}] * 2}, "recipe: 'evil' is not one of classic, auto"),
     "quality": ({"sides": [{"recipe": "auto", "quality": "x" * 999}] * 2}, "is not one of fast, balanced, best"),
     "paint": ({"paint": "../secret"}, "paint: '../secret' is not one of rate"),
+    "background": ({"background": "red"}, "background: takes #rrggbb, got red"),
     "no id": ({"id": None}, "id: takes a number"),
 }
 GARBAGE = [
     b"\x00" * 9, "", "{", "[" * 9000, "null", "[1]", "{}",
     '{"see": 3}', '{"see": [], "shown": 1}', '{"open": "/etc/passwd"}',
-    '{"still": {"width": 9, "height": 9, "side": 3}}', '{"shown": "x"}', '{"shown": 1e999}',
+    '{"still": {"width": 9, "height": 9, "side": 3}}', '{"pick": {"x": 2, "y": 0}}', '{"pick": 1}',
+    '{"shown": "x"}', '{"shown": 1e999}',
 ]  # fmt: skip
 
 
@@ -93,7 +97,7 @@ def ask(connection, **other) -> dict:
     while True:
         header, _ = unpacked(connection.recv(timeout=20))
         connection.send('{"shown": 1}')
-        if "problem" in header or header["stage"] == "done":
+        if "refused" in header or header["stage"] == "done":
             return header
 
 
@@ -110,9 +114,16 @@ def test_the_page_is_served_to_its_own_name_alone(address):
     assert page.startswith("HTTP/1.1 200")
     assert "frame-ancestors 'none'" in page
     assert "default-src 'none'" in page
-    for host in ("evil.example:8080", "", "127.0.0.1.evil.example"):
+    for host in ("evil.example:8080", "", "127.0.0.1.evil.example", "["):
         assert " 403 " in raw(address, f"GET / HTTP/1.1\nHost: {host}\n\n").splitlines()[0]
-    assert " 404 " in raw(address, "GET /../../etc/passwd HTTP/1.1\nHost: HERE\n\n").splitlines()[0]
+    for host in ("LOCALHOST", "LocalHost:8080", "[::1]:8080"):
+        assert " 200 " in raw(address, f"GET / HTTP/1.1\nHost: {host}\n\n").splitlines()[0]
+
+
+@pytest.mark.parametrize("target", ["/../../etc/passwd", "//[", "//[x]:y/", "*", "http://[", "/live?[", "/?a=%ff&[=1"])
+def test_no_target_is_a_fault_of_the_server(address, target):
+    answer = raw(address, f"GET {target} HTTP/1.1\nHost: HERE\n\n").splitlines()[0]
+    assert any(f" {code} " in answer for code in (200, 403, 404)), answer
 
 
 @pytest.mark.parametrize("origin", ["http://evil.example", "null", None])
@@ -137,6 +148,29 @@ def test_a_network_address_asks_for_its_token(seen):  # noqa: F811
             assert json.loads(connection.recv())["views"]
 
 
+def test_a_page_that_asks_without_reading_is_cut_off(seen, monkeypatch):  # noqa: F811
+    """Nothing of what it wants is kept for it without end, whatever it says that it has got."""
+    exceptions, queues = pytest.importorskip("websockets.exceptions"), []
+
+    async def never_sends(connection, outbox):
+        queues.append(outbox)
+        await asyncio.Event().wait()
+
+    monkeypatch.setattr("aaplug.live.server._send_all", never_sends)
+    with serving(*seen, port=0, rasterizer="eager") as address, connected(address) as bad:
+        bad.recv()
+
+        def ask_on():
+            for step in range(2000):
+                bad.send(json.dumps({"see": GOOD | {"id": step, "focal": 50 + step / 100, "moving": True}}))
+                bad.send('{"shown": 1}')
+                time.sleep(0.01)
+
+        with pytest.raises(exceptions.ConnectionClosed):
+            ask_on()
+    assert queues[0].qsize() <= 16
+
+
 def test_garbage_harms_nobody(address, capfd):
     exceptions = pytest.importorskip("websockets.exceptions")
     with connected(address) as good, connected(address) as bad:
@@ -144,8 +178,8 @@ def test_garbage_harms_nobody(address, capfd):
         bad.recv()
         for text in GARBAGE:
             bad.send(text)
-            assert "problem" in unpacked(bad.recv(timeout=10))[0]
-        assert "problem" in ask(bad, width=100_000)
+            assert "refused" in unpacked(bad.recv(timeout=10))[0]
+        assert "refused" in ask(bad, width=100_000)
         assert ask(bad, pose=[*POSE[:11], 1e8, *POSE[12:]])["stage"] == "done"  # it sees nothing
         bad.send("x" * 100_000)
         with pytest.raises(exceptions.ConnectionClosedError, match="1009"):

@@ -24,14 +24,15 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
-from PIL import Image
+from PIL import Image, ImageColor
 from torch import Tensor
 
+from aaplug.core.colours import Colour
 from aaplug.core.imaging import levels
 from aaplug.io.atomic import replacing
 from aaplug.io.limits import whole_limit
 from aaplug.system.contracts import contract
-from aaplug.system.errors import FormatError, UsageError, listing, not_one_of
+from aaplug.system.errors import MAX_VALUE_CHARACTERS, FormatError, UsageError, listing, not_one_of
 
 LOSSLESS_WEBP = 101  # OpenCV's quality for it
 SAMPLE_TYPES = {8: np.uint8, 16: np.uint16}  # by bit depth
@@ -224,3 +225,17 @@ def captured_stderr() -> Iterator[IO[bytes]]:
         finally:
             os.dup2(saved, STDERR)
             os.close(saved)
+
+
+def colour_of(text: str, where: str = "background") -> Colour:
+    """The opaque colour that CSS writes so, by name, as #rrggbb, rgb(...) or hsl(...).
+
+    Raises:
+        UsageError: CSS knows no such colour; the error is at `where`.
+    """
+    try:
+        red, green, blue = ImageColor.getrgb(text)  # pyright: ignore[reportAssignmentType]
+    except ValueError as error:
+        takes = "auto or an opaque colour as CSS writes it, such as white, '#ff8000' or 'rgb(255, 128, 0)'"
+        raise UsageError(where, f"takes {takes}; got '{text[:MAX_VALUE_CHARACTERS]}'") from error
+    return red / 255, green / 255, blue / 255

@@ -1,21 +1,25 @@
 """Messages of a page: each is bounded, and checked or refused in clear words.
 
 A message is one JSON object.  {"see": ...} asks for a picture, {"shown": id} says that one has arrived, {"still": ...}
-asks for a picture as a file.  No message names a file.
+asks for a picture as a file, {"pick": ...} for the depth of what a place of the picture shows.  None names a file.
 """
 
 import json
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 
+from aaplug.core.colours import Colour
+from aaplug.io.images import colour_of
 from aaplug.live.overlays import OVERLAYS
 from aaplug.methods import QUALITIES
 from aaplug.system.errors import MAX_VALUE_CHARACTERS, UsageError, not_one_of
 
+KINDS = ("see", "still", "pick", "shown")
 MAX_MESSAGE_BYTES = 16_384
 MAX_SIDE = 8192  # px of a picture
 MAX_PIXELS = 1 << 25  # of a picture
@@ -39,7 +43,7 @@ class PictureRequest:
 
     pose: `cam_from_world`, row by row.  focal, width, height: in px.
     split: share of the width that the left side fills.
-    at: index of the training camera whose pose it is; else None.
+    at: index of the training camera whose pose it is; else None.  background: None for that of the scene.
     moving: True if the next request follows at once.
     overlay: name of the overlay to send along.  photo: True to send the photograph along.
     """
@@ -55,6 +59,7 @@ class PictureRequest:
     moving: bool = False
     overlay: str | None = None
     photo: bool = False
+    background: Colour | None = None
 
 
 @dataclass(frozen=True)
@@ -67,13 +72,24 @@ class StillRequest:
 
 
 @dataclass(frozen=True)
+class PickRequest:
+    """A place of the picture whose depth is wanted, in shares of width and height."""
+
+    x: float
+    y: float
+
+
+@dataclass(frozen=True)
 class Receipt:
     """The page has the picture of this number."""
 
     id: int
 
 
-def parse(text: str | bytes, recipes: Sequence[str], cameras: int) -> PictureRequest | StillRequest | Receipt:
+Order = StillRequest | PickRequest  # beside the picture that is wanted last, all are served
+
+
+def parse(text: str | bytes, recipes: Sequence[str], cameras: int) -> PictureRequest | Order | Receipt:
     """Read a message.
 
     recipes: names that may be asked for.  cameras: how many there are to stand in.
@@ -87,13 +103,15 @@ def parse(text: str | bytes, recipes: Sequence[str], cameras: int) -> PictureReq
         message = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise UsageError("message", "is not JSON") from error
-    if not isinstance(message, dict) or len(message) != 1 or next(iter(message)) not in ("see", "still", "shown"):
-        raise UsageError("message", "takes one of see, still and shown")
+    if not isinstance(message, dict) or len(message) != 1 or next(iter(message)) not in KINDS:
+        raise UsageError("message", f"takes one of {', '.join(KINDS)}")
     [(kind, body)] = message.items()
     if kind == "shown":
         return Receipt(_whole(message, "shown", 0, MAX_ID))
     if not isinstance(body, dict):
         raise UsageError(kind, f"takes an object, got {_short(body)}")
+    if kind == "pick":
+        return PickRequest(_number(body, "x", 0.0, 1.0), _number(body, "y", 0.0, 1.0))
     width, height = (_whole(body, side, 1, 10**9) for side in ("width", "height"))
     if max(width, height) > MAX_SIDE or width * height > MAX_PIXELS:
         raise UsageError("size", f"is {width}x{height} px; the limit is {MAX_SIDE} a side and {MAX_PIXELS:,} in all")
@@ -115,6 +133,7 @@ def parse(text: str | bytes, recipes: Sequence[str], cameras: int) -> PictureReq
         moving=body.get("moving") is True,
         overlay=None if body.get("paint") is None else _name(body, "paint", OVERLAYS),
         photo=body.get("photo") is True,
+        background=None if body.get("background") is None else _colour(body["background"]),
     )
 
 
@@ -129,6 +148,12 @@ def _pose(body: Mapping[str, Any]) -> tuple[float, ...]:
     if float(error) > MAX_ROTATION_ERROR or float(torch.linalg.det(rotation)) < 0 or numbers[12:] != (0, 0, 0, 1):
         raise UsageError("pose", "takes a rotation and a translation, row by row")
     return numbers
+
+
+def _colour(value: object) -> Colour:
+    if not isinstance(value, str) or not re.fullmatch("#[0-9a-f]{6}", value):
+        raise UsageError("background", f"takes #rrggbb, got {_short(value)}")
+    return colour_of(value)
 
 
 def _number(body: Mapping[str, Any], name: str, least: float, most: float) -> float:

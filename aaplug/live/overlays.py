@@ -95,6 +95,11 @@ def _blended(renderer: Renderer, camera: Camera, of_training: Callable[[Tensor, 
     return torch.where(seen_alpha > MIN_SEEN_ALPHA, total / seen_alpha, torch.nan)
 
 
+def depth_map(renderer: Renderer, camera: Camera) -> Map:
+    """Mean depth of what a pixel shows and training saw, in world units."""
+    return _blended(renderer, camera, lambda depths, _: depths)
+
+
 OVERLAYS = {
     "rate": Overlay(
         "sampling rate / training's", "blue: finer than training saw it; red: coarser", _rate, 1 / 8, 8.0, True, 1.0

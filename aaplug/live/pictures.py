@@ -6,6 +6,7 @@ as JSON, and the files of its parts, one after another.
 """
 
 import json
+import math
 import struct
 import time
 from collections.abc import Generator
@@ -17,12 +18,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.cameras import Camera
+from aaplug.core.colours import Colour
 from aaplug.core.imaging import quantised
 from aaplug.evaluation.metrics import psnr
+from aaplug.io.cameras.camera_path import EXACT
 from aaplug.io.images import encode_jpeg, encode_png
 from aaplug.io.photographs import photo_at
-from aaplug.live.messages import PictureRequest, Side, StillRequest
-from aaplug.live.overlays import OVERLAYS
+from aaplug.live.messages import Order, PickRequest, PictureRequest, Side
+from aaplug.live.overlays import OVERLAYS, depth_map
 from aaplug.live.subject import Subject
 from aaplug.methods import QUALITIES
 from aaplug.rendering.renderer import Renderer
@@ -76,26 +79,35 @@ class Pictures:
             self._complete = pixels, images, counts
         assert self._complete is not None
         _, images, counts = self._complete
-        facts: dict[str, Any] = {}
+        exact = {name: getattr(camera, field) for name, field in EXACT.items()}
+        facts: dict[str, Any] = {"camera": exact}
         parts: list[Part] = []
         if request.at is not None and request.photo and self._subject.views[request.at].photo is not None:
             yield None
-            part, facts = self._photograph(request, images)
+            part, figures = self._photograph(request, images)
             parts.append(part)
+            facts |= figures
         if request.overlay is not None:
             yield None
             levels, legend = OVERLAYS[request.overlay](self._subject.renderer(request.sides[1]), camera, counts[1])
             parts.append(Part("paint", (0, camera.width), encode_png(levels[..., None])))
-            facts = facts | {"legend": legend}
+            facts |= {"legend": legend}
         yield _picture(request, parts, started, stage="done", samples=counts, **facts)
 
     @torch.no_grad()
-    def still(self, request: PictureRequest, still: StillRequest) -> Steps:
-        """The picture as a file of its own, of any size: the shorter side keeps its field of view."""
-        camera = self._subject.camera(request).framed(still.width, still.height)
-        renderer = self._subject.renderer(request.sides[still.side])
+    def ordered(self, request: PictureRequest, order: Order) -> Steps:
+        """Serve an order: a picture as a file of its own, or the depth of what a place shows, null for nothing."""
+        camera = self._subject.camera(request)
+        if isinstance(order, PickRequest):
+            left, top = int(order.x * camera.width), int(order.y * camera.height)
+            around = replace(camera, width=3, height=3, cx=camera.cx - left + 1, cy=camera.cy - top + 1)
+            depth = float(depth_map(self._subject.renderer(request.sides[0]), around)[1, 1])
+            yield message({"picked": [order.x, order.y], "depth": depth if math.isfinite(depth) else None}, [])
+            return
+        camera = camera.framed(order.width, order.height)  # the shorter side keeps its field of view
+        renderer = self._subject.renderer(request.sides[order.side], request.background)
         render = yield from strips(renderer, camera, _bounded_samples(renderer, camera))
-        name = f"{request.sides[still.side].recipe}-{still.width}x{still.height}.png"
+        name = f"{request.sides[order.side].recipe}-{order.width}x{order.height}.png"
         yield message({"still": name}, [encode_png(render.rgb)])
 
     def _preview(self, request: PictureRequest, camera: Camera) -> bytes:
@@ -103,7 +115,7 @@ class Pictures:
         started, scale, gaussians = time.perf_counter(), 1.0, 0
         max_samples = self._effort * UNIT_SAMPLES
         max_gaussians = max(MIN_PREVIEW_GAUSSIANS, round(self._effort * UNIT_GAUSSIANS))
-        probes = [self._subject.preview_renderer(side, PROBE_GAUSSIANS) for side in request.sides]
+        probes = [self._subject.preview_renderer(side, None, PROBE_GAUSSIANS) for side in request.sides]
         counts = [_bounded_samples(probe, camera) for probe in probes]
         spans = [(i, span) for i, span in enumerate(_spans(request)) if span[0] < span[1]]
         too_many = sum((b - a) * camera.height * counts[i] ** 2 for i, (a, b) in spans) > max_samples
@@ -112,7 +124,7 @@ class Pictures:
             scale = min(1.0, max(MIN_PREVIEW_SCALE, (max_samples / (camera.width * camera.height)) ** 0.5))
         parts = []
         for i, (left, right) in spans:
-            renderer = self._subject.preview_renderer(request.sides[i], max_gaussians)
+            renderer = self._subject.preview_renderer(request.sides[i], request.background, max_gaussians)
             recipe = replace(renderer.recipe, target_rate=0.0, grid=counts[i], neighbours=0.0)
             view = replace(camera, width=right - left, cx=camera.cx - left)
             view = view.resized(max(1, round(view.width * scale)), max(1, round(view.height * scale)))
@@ -128,7 +140,8 @@ class Pictures:
         self, request: PictureRequest, camera: Camera, started: float
     ) -> Generator[bytes | None, None, tuple[list[Tensor], list[int]]]:
         """Draw the visible parts in rising quality, then the hidden ones; returns both sides, and their samples."""
-        ladders, spans = [self._ladder(side, camera) for side in request.sides], _spans(request)
+        spans = _spans(request)
+        ladders = [self._ladder(side, request.background, camera) for side in request.sides]
         images, counts = [torch.empty(*camera.hw, 3) for _ in ladders], [0, 0]
         height = max(map(len, ladders))
         rungs = [[(i, spans[i], *x[step]) for i, x in enumerate(ladders) if step < len(x)] for step in range(height)]
@@ -146,12 +159,12 @@ class Pictures:
                 yield _picture(request, parts, started, stage=stage, samples=counts)
         return images, counts
 
-    def _ladder(self, side: Side, camera: Camera) -> list[tuple[Renderer, int]]:
+    def _ladder(self, side: Side, background: Colour | None, camera: Camera) -> list[tuple[Renderer, int]]:
         """Renderers in rising quality up to the chosen one, each with more samples than the one before."""
         names = list(QUALITIES)
         ladder: list[tuple[Renderer, int]] = []
         for quality in names[: names.index(side.quality) + 1]:
-            renderer = self._subject.renderer(replace(side, quality=quality))
+            renderer = self._subject.renderer(replace(side, quality=quality), background)
             samples = _bounded_samples(renderer, camera)
             if ladder and samples <= ladder[-1][1] and renderer.cutter is None:
                 ladder.pop()
@@ -165,7 +178,7 @@ class Pictures:
         assert request.at is not None
         view, (placed, left, top) = self._subject.views[request.at], self._subject.placed_view(request)
         assert view.photo is not None
-        photo = photo_at(view, placed, self._subject.look.background).clamp(0, 1)
+        photo = photo_at(view, placed, request.background or self._subject.look.background).clamp(0, 1)
         rows = max(0, top), min(request.height, top + placed.height)
         columns = max(0, left), min(request.width, left + placed.width)
         photo = photo[rows[0] - top : rows[1] - top, columns[0] - left : columns[1] - left]

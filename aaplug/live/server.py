@@ -17,7 +17,7 @@ from functools import partial
 from http import HTTPStatus
 from ipaddress import ip_address
 from os import strerror
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qs
 
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.datastructures import Headers
@@ -32,6 +32,7 @@ from aaplug.system.errors import UsageError, reason
 
 WEBSOCKET_PATH = "/live"
 MAX_OPEN_PAGES = 32
+MAX_WAITING_MESSAGES = 16  # to a page; one that reads leaves no more than two
 LOCAL_NAMES = ("localhost", "127.0.0.1", "::1")
 log = logging.getLogger("aaplug.live")
 log.addHandler(logging.NullHandler())
@@ -61,6 +62,7 @@ class Server:
         return f"http://{host}:{self._port}/{token}"
 
     def __enter__(self) -> "Server":
+        self._about = json.dumps(self._studio.subject.about(), allow_nan=False)
         self._thread.start()
         try:
             self._loop, self._port = self._started.result()
@@ -89,20 +91,20 @@ class Server:
 
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         """The page, a refusal, or None to go on to a websocket."""
-        address = urlsplit(request.path)
+        path, _, query = request.path.partition("?")
         hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
-        host = hosts[0] if len(hosts) == 1 else ""
+        host = hosts[0].casefold() if len(hosts) == 1 else ""
         name = host[1:].partition("]")[0] if host.startswith("[") else host.partition(":")[0]  # without its port
-        if self._token is None and name not in (*LOCAL_NAMES, self._host):
+        if self._token is None and name not in (*LOCAL_NAMES, self._host.casefold()):
             return _response(HTTPStatus.FORBIDDEN, "This server answers to its own name alone.")
-        token = parse_qs(address.query).get("token", [""])[0]
+        token = parse_qs(query).get("token", [""])[0]
         if self._token is not None and not hmac.compare_digest(token.encode(), self._token.encode()):
             return _response(HTTPStatus.FORBIDDEN, "Open the address that the terminal shows: it ends in a token.")
-        if address.path == "/":
+        if path == "/":
             return _response(HTTPStatus.OK, page(), "text/html")
-        if address.path != WEBSOCKET_PATH:
+        if path != WEBSOCKET_PATH:
             return _response(HTTPStatus.NOT_FOUND, "There is one page here: /")
-        if len(origins) != 1 or origins[0] not in (f"http://{host}", f"https://{host}"):
+        if len(origins) != 1 or origins[0].casefold() not in (f"http://{host}", f"https://{host}"):
             return _response(HTTPStatus.FORBIDDEN, "A websocket must come from this server's own page.")
         if self._open_pages >= MAX_OPEN_PAGES:
             return _response(HTTPStatus.SERVICE_UNAVAILABLE, f"{MAX_OPEN_PAGES} pages are open; close one.")
@@ -111,26 +113,33 @@ class Server:
     async def _talk(self, connection: ServerConnection) -> None:
         """Serve one page, from its first word to its last."""
         subject, sending = self._studio.subject, None
-        outbox: asyncio.Queue[bytes] = asyncio.Queue()  # the studio puts no more than a few
+        outbox: asyncio.Queue[bytes] = asyncio.Queue(MAX_WAITING_MESSAGES)
         self._open_pages += 1
         try:
-            with self._studio.page(partial(self._post, outbox)) as client, suppress(ConnectionClosed):
-                await connection.send(json.dumps(subject.about(), allow_nan=False))
+            with self._studio.page(partial(self._post, connection, outbox)) as client, suppress(ConnectionClosed):
+                await connection.send(self._about)
                 sending = asyncio.create_task(_send_all(connection, outbox))
                 async for text in connection:
                     try:
                         self._studio.receive(client, parse(text, subject.recipes, len(subject.views)))
                     except UsageError as error:
-                        await connection.send(message({"problem": str(error)}, []))
+                        await connection.send(message({"refused": str(error)}, []))
         finally:
             self._open_pages -= 1
             if sending is not None:
                 sending.cancel()
 
-    def _post(self, outbox: "asyncio.Queue[bytes]", picture: bytes) -> None:
-        """Put a picture into a page's outbox, from the studio's thread."""
+    def _post(self, connection: ServerConnection, outbox: "asyncio.Queue[bytes]", picture: bytes) -> None:
+        """Put a picture into a page's outbox, from the studio's thread; a page that reads none is cut off."""
+
+        def put() -> None:
+            if outbox.full():
+                connection.transport.abort()
+            else:
+                outbox.put_nowait(picture)
+
         with suppress(RuntimeError):  # the server has closed meanwhile
-            self._loop.call_soon_threadsafe(outbox.put_nowait, picture)
+            self._loop.call_soon_threadsafe(put)
 
 
 async def _send_all(connection: ServerConnection, outbox: "asyncio.Queue[bytes]") -> None:

@@ -7,13 +7,13 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
-from aaplug.live.messages import PictureRequest, Receipt, StillRequest
+from aaplug.live.messages import Order, PictureRequest, Receipt
 from aaplug.live.pictures import Pictures, Steps, message
 from aaplug.live.subject import Subject
 from aaplug.system.errors import AaplugError, UsageError, printable
 
 MAX_IN_FLIGHT = 2  # pictures that are sent and have not arrived, so that a slow line delays no newer one
-MAX_WAITING_STILLS = 4  # more are refused
+MAX_WAITING_ORDERS = 4  # more are refused
 
 log = logging.getLogger("aaplug")
 
@@ -31,14 +31,14 @@ class Page:
     request: PictureRequest | None = None
     newer: bool = False
     steps: Steps | None = None
-    stills: deque[StillRequest] = field(default_factory=deque)
+    orders: deque[Order] = field(default_factory=deque)
     sent: int = 0
     received: int = 0
 
     @property
     def busy(self) -> bool:
         """True if there is a step to take now."""
-        return self.sent - self.received < MAX_IN_FLIGHT and bool(self.newer or self.steps or self.stills)
+        return self.sent - self.received < MAX_IN_FLIGHT and bool(self.newer or self.steps or self.orders)
 
     def step(self) -> bytes | None:
         """Take one step; a newer request replaces what is being drawn."""
@@ -47,7 +47,7 @@ class Page:
             self.newer = False  # before the request is read: the next one may come at any time
             self.steps = self.pictures.steps(self.request)
         elif self.steps is None:
-            self.steps = self.pictures.still(self.request, self.stills.popleft())
+            self.steps = self.pictures.ordered(self.request, self.orders.popleft())
         try:
             return next(self.steps)
         except StopIteration:
@@ -87,7 +87,7 @@ class Studio:
             with self._changed:
                 self._pages.remove(page)
 
-    def receive(self, page: Page, said: PictureRequest | StillRequest | Receipt) -> None:
+    def receive(self, page: Page, said: PictureRequest | Order | Receipt) -> None:
         """Take a message of a page.
 
         Raises:
@@ -97,12 +97,12 @@ class Studio:
             match said:
                 case PictureRequest():
                     page.request, page.newer = said, True
-                case StillRequest() if page.request is None or len(page.stills) >= MAX_WAITING_STILLS:
-                    raise UsageError("still", "wait until the ones before are done")
-                case StillRequest():
-                    page.stills.append(said)
                 case Receipt():
                     page.received = min(page.sent, page.received + 1)
+                case _ if page.request is None or len(page.orders) >= MAX_WAITING_ORDERS:
+                    raise UsageError("still", "wait until the ones before are done")
+                case _:
+                    page.orders.append(said)
             self._changed.notify()
 
     def _run(self) -> None:

@@ -1,7 +1,9 @@
 """The subject: a scene, the views to stand in, and its renderers by recipe and quality."""
 
+import math
+import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -9,8 +11,11 @@ import torch
 
 from aaplug.core.camera_paths import up_of
 from aaplug.core.cameras import Camera, CameraSet, spread
+from aaplug.core.colours import Colour
 from aaplug.core.gaussians import Gaussians
+from aaplug.core.imaging import quantised
 from aaplug.core.orbits import pinhole
+from aaplug.evaluation.metrics import psnr
 from aaplug.evaluation.protocols import median_depth
 from aaplug.io.scenes.scene import Scene
 from aaplug.live.messages import PictureRequest, Side
@@ -23,6 +28,8 @@ from aaplug.system.errors import AaplugError
 MAX_RENDERERS = 6  # in memory: a recipe with a world filter has Gaussians of its own
 MAX_PREVIEW_GAUSSIANS = 400_000  # that are drawn while the camera moves
 MAX_VIEWS = 1000  # that a page offers
+START_SECONDS = 2.0  # to find the view and the scale that a page opens with
+START_VIEWS, START_SCALES, MIN_START_SIDE = 5, (0.125, 0.25, 0.5), 16  # compared; px
 
 
 @dataclass(eq=False)
@@ -51,6 +58,12 @@ class Subject:
         self.views = spread(test_first, MAX_VIEWS)
         self._prepared = lru_cache(MAX_RENDERERS)(self._prepare)
 
+    @property
+    def opening(self) -> tuple[Side, Side]:
+        """The sides that a page opens with."""
+        left, right = (name if name in self.recipes else self.recipes[0] for name in ("classic", "auto"))
+        return Side(left, next(reversed(QUALITIES))), Side(right, next(reversed(QUALITIES)))
+
     def camera(self, request: PictureRequest) -> Camera:
         """The camera of a picture; at a view of the data set its pixels are those of the view, scaled."""
         if request.at is None:
@@ -66,15 +79,18 @@ class Subject:
         view = view.scaled(request.focal / view.focal)
         return view, (request.width - view.width) // 2, (request.height - view.height) // 2
 
-    def renderer(self, side: Side) -> Renderer:
-        """The renderer of a recipe by a quality; its memory of rates is empty, so that it stays small."""
-        return replace(self._prepared(side))
+    def renderer(self, side: Side, background: Colour | None = None) -> Renderer:
+        """The renderer of a recipe by a quality; its memory of rates is empty, so that it stays small.
 
-    def preview_renderer(self, side: Side, count: int) -> Renderer:
+        background: None for that of the scene.
+        """
+        return replace(self._prepared(side), background=background or self.look.background)
+
+    def preview_renderer(self, side: Side, background: Colour | None, count: int) -> Renderer:
         """The same with the `count` Gaussians that pictures hang on most, or with coarser levels."""
-        renderer = self.renderer(side)
+        renderer = self.renderer(side, background)
         if renderer.cutter is not None:
-            return self.renderer(replace(side, quality=next(iter(QUALITIES))))
+            return self.renderer(replace(side, quality=next(iter(QUALITIES))), background)
         scene = renderer.scene
         if id(scene) not in self._prominent:
             while len(self._prominent) >= MAX_RENDERERS:
@@ -96,9 +112,11 @@ class Subject:
             "gaussians": len(self.look.scene),
             "rasterizer": self.look.rasterizer.name,
             "assumed": self.cameras.assumed,
-            "background": [round(255 * x) for x in self.look.background],
+            "background": "#" + bytes(round(255 * x) for x in self.look.background).hex(),
             "recipes": [{"name": name, "when": RECIPES[name].when} for name in self.recipes],
             "qualities": list(QUALITIES),
+            "sides": [asdict(side) for side in self.opening],
+            "start": self.start(),
             "paints": {name: overlay.title for name, overlay in OVERLAYS.items()},
             "up": up_of(self.cameras).tolist(),
             "depth": depth,
@@ -114,6 +132,21 @@ class Subject:
                 for view in self.views
             ],
         }
+
+    def start(self) -> dict[str, Any] | None:
+        """View and scale at which the two sides that a page opens with differ most, and by how many dB.
+
+        A few views and scales are compared, for `START_SECONDS`; None if nothing differs.
+        """
+        end, best = time.monotonic() + START_SECONDS, (math.inf, 0, 1.0)
+        renderers = [self.renderer(side) for side in self.opening]
+        for index in range(0, len(self.views), -(-len(self.views) // START_VIEWS)):
+            for scale in START_SCALES if best[0] == math.inf else (best[2],):
+                camera = self.views[index].scaled(scale)
+                if time.monotonic() < end and min(camera.hw) >= MIN_START_SIDE:
+                    left, right = (quantised(renderer(camera).rgb) for renderer in renderers)
+                    best = min(best, (psnr(left, right) or math.inf, index, scale))
+        return None if best[0] == math.inf else {"decibels": best[0], "view": best[1], "scale": best[2]}
 
     def _prepare(self, side: Side) -> Renderer:
         recipe, look = find_recipe(side.recipe, quality=side.quality), self.look

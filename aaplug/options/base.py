@@ -3,14 +3,12 @@
 import ast
 import inspect
 import textwrap
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cache
 from itertools import pairwise
 from numbers import Integral, Real
-from typing import Annotated, Any, TypeVar, cast, get_type_hints
-
-import tyro
+from typing import Annotated, Any, Literal, TypeVar, cast, get_args, get_origin, get_type_hints
 
 from aaplug.system.contracts import check_fields
 from aaplug.system.errors import MAX_VALUE_CHARACTERS, UsageError, did_you_mean, not_one_of
@@ -18,43 +16,102 @@ from aaplug.system.monitor import SILENT, Monitor
 from aaplug.system.registry import names_of
 
 Chosen = TypeVar("Chosen", bound="Options")
+Bound = int | float
+PYTHON_ONLY = "python only"  # marks an option that the command line does not offer
 
 
 @dataclass(frozen=True)
 class Group:
-    """A heading of `--help`, under which an option stands; options without one stand first.
-
-    title: `--help` adds "options".
-    """
+    """A heading of `--help`, under which an option stands; options without one stand first."""
 
     title: str
     about: str
 
 
-CAMERAS = Group("camera", "How the camera files are read, and which of the scene's Gaussians they must see.")
-ORBIT = Group("orbit", "Without cameras: views on an orbit around the scene, and the training that is assumed.")
-DRAWING = Group("drawing", "How images are drawn: programs, memory and machines.")
-REPORT = Group("report", "Files beside the figures.")
-TUNING = Group("tuning", "The optimization, of which the defaults were measured.")
+CAMERAS = Group("camera options", "How the camera files are read, and which of the scene's Gaussians they must see.")
+ORBIT = Group("orbit options", "Without cameras: views on an orbit around the scene, and the training that is assumed.")
+DRAWING = Group("drawing options", "How images are drawn: programs, memory and machines.")
+REPORT = Group("report options", "Files beside the figures.")
+TUNING = Group("tuning options", "The optimization, of which the defaults were measured.")
 
 
-def flag(metavar: str, *aliases: str, kind: Any = None) -> Any:
-    """An option whose help shows `metavar` and no default, for what is absent unless given."""
-    return tyro.conf.arg(metavar=metavar, aliases=aliases, help_behavior_hint="", constructor=kind)
+@dataclass(frozen=True, kw_only=True)
+class Argument:
+    """How an option is read from words, checked and shown by `--help`.
+
+    metavar: stands for the value.  takes: the values that fit, for messages; the metavar if empty.
+    read: makes a value of one word, or raises ValueError.  count: number of words; None for one or more.
+    flags: other names than the field's, such as -m.  by_place: True if it is given without a name.
+    """
+
+    metavar: str
+    takes: str = ""
+    read: Callable[[str], Any] = str
+    count: int | None = 1
+    flags: tuple[str, ...] = ()
+    by_place: bool = False
+
+    def value(self, words: Sequence[str]) -> Any:
+        """The value that words give, several of them also between commas; raises ValueError."""
+        if self.count is None:
+            words = [part for word in words for part in word.split(",") if part]
+        if not words or len(words) != (self.count or len(words)):
+            raise ValueError(words)
+        values = tuple(map(self.read, words))
+        return values[0] if self.count == 1 else values
+
+    def check(self, option: str, value: Any) -> None:
+        """Refuse a value that does not fit; raises UsageError."""
 
 
-def choice(names: Iterable[str]) -> Any:
-    """An option that takes one of these names, or in Python an object; the library refuses other names."""
-    return tyro.constructors.PrimitiveConstructorSpec(
-        1, "|".join(names), "".join, lambda _: True, lambda one: [str(one)]
-    )
+@dataclass(frozen=True, kw_only=True)
+class Number(Argument):
+    """Takes a number from `least` to `most`, an integer if `whole`; or one or more of them."""
+
+    least: Bound
+    most: Bound
+    whole: bool
+
+    def check(self, option: str, value: Any) -> None:
+        """Refuse what is no number, or outside of the range."""
+        values = [value] if self.count else value
+        if value is None or (isinstance(values, (list, tuple)) and values and all(map(self._holds, values))):
+            return
+        got = ", ".join(map(str, values)) if isinstance(values, (list, tuple)) else str(value)
+        raise UsageError(option, f"takes {self.takes}, got {got[:MAX_VALUE_CHARACTERS] or 'nothing'}")
+
+    def _holds(self, value: Any) -> bool:
+        kind = Integral if self.whole else Real  # NumPy's too
+        return not isinstance(value, bool) and isinstance(value, kind) and self.least <= cast(float, value) <= self.most
 
 
-def choices(names: Iterable[str]) -> Any:
-    """An option that takes some of these names, or in Python objects."""
-    return tyro.constructors.PrimitiveConstructorSpec(
-        "*", "|".join(names), tuple, lambda _: True, lambda some: [*map(str, some)]
-    )
+@dataclass(frozen=True, kw_only=True)
+class Names(Argument):
+    """Takes a name: one of `others`, or of those in the registry of a kind, of which it takes the objects too."""
+
+    others: tuple[Any, ...] = ()
+    kind: str | None = None
+
+    def check(self, option: str, value: Any) -> None:
+        """Refuse other names."""
+        names = [*map(str, self.others), *(names_of(self.kind) if self.kind else ())]
+        for each in value if isinstance(value, (list, tuple)) else [value]:
+            name = str(each)[:MAX_VALUE_CHARACTERS]
+            if each is not None and name not in names and (self.kind is None or isinstance(each, str)):
+                raise UsageError(option, not_one_of(name, names) + did_you_mean(name, names))
+
+
+def flag(metavar: str, *flags: str, read: Callable[[str], Any] = str, **how: Any) -> Argument:
+    """An option that takes any word."""
+    return Argument(metavar=metavar, flags=flags, read=read, **how)
+
+
+def names(*others: Any, kind: str | None = None, metavar: str = "", **how: Any) -> Names:
+    """An option that takes one of these names, or an entry of a registry."""
+    listed = [*map(str, others), *(names_of(kind) if kind else ())]
+    values = {str(name): name for name in others}
+    how = {"read": lambda word: values.get(word, word), "metavar": metavar or "|".join(listed)} | how
+    return Names(others=others, kind=kind, **how)
 
 
 def number(
@@ -64,60 +121,24 @@ def number(
     whole: bool = False,
     several: bool = False,
     unit: str = "",
-    metavar: str | None = None,
-) -> Any:
-    """An option that takes a number from `least` to `most`, an integer if `whole`, or one or more if `several`.
+    metavar: str = "",
+) -> Number:
+    """An option that takes a number, or one or more.
 
-    `Options` refuses what is outside of the range.  unit: may follow the number as a word's end.
-    metavar: shown by `--help` instead of the range.
+    A number that need not be whole may be written as 1/4 or 25%.  unit: may follow it as the word's end.
+    metavar: stands for the value in `--help` instead of the range.
     """
-    kind, range_text = int if whole else float, f"{least:.10g}..{most:.10g}" + " ..." * several
 
-    def read(words: list[str]) -> Any:
-        try:
-            values = tuple(kind(word.removesuffix(unit)) for word in words)
-        except ValueError as error:
-            raise ValueError(f"takes {range_text}, got {' '.join(words)[:MAX_VALUE_CHARACTERS]}") from error
-        return values if several else values[0]
+    def real(word: str) -> float:
+        word = word.removesuffix(unit)
+        above, slash, below = word.removesuffix("%").partition("/")
+        if slash and not float(below):
+            raise ValueError(word)
+        return float(above) / (float(below) if slash else 1.0) / (100.0 if word.endswith("%") else 1.0)
 
-    def holds(value: Any) -> bool:
-        kinds = Integral if whole else Real  # NumPy's too
-        return not isinstance(value, bool) and isinstance(value, kinds) and least <= cast(float, value) <= most
-
-    def fits(value: Any) -> bool:
-        values = value if several else [value]
-        return isinstance(values, (list, tuple)) and len(values) > 0 and all(map(holds, values))
-
-    def words(value: Any) -> list[str]:
-        return [str(v) for v in (value if several and value else [value])]
-
-    return Numbers("*" if several else 1, metavar or range_text, read, fits, words, range_text=range_text)
-
-
-@dataclass(frozen=True)
-class Numbers(tyro.constructors.PrimitiveConstructorSpec[Any]):
-    """How an option reads and checks numbers; range_text: for messages."""
-
-    range_text: str = ""
-
-
-UNSET: Any = tyro.conf.arg(help_behavior_hint="")  # an option that is absent unless given: its help shows no default
-
-
-@dataclass(frozen=True)
-class OneOf:
-    """The names that an option takes: `others`, and those in the registry of a kind.  Beside them it takes objects."""
-
-    others: tuple[str, ...] = ()
-    kind: str | None = None
-
-    def check(self, option: str, value: Any) -> None:
-        """Refuse other names; raises UsageError."""
-        names = [*self.others, *(names_of(self.kind) if self.kind else ())]
-        for name in value if isinstance(value, (list, tuple)) else [value]:
-            if isinstance(name, str) and name not in names:
-                closest = did_you_mean(name, names) if self.kind else ""
-                raise UsageError(option, not_one_of(name, names) + closest)
+    takes = f"{least:.10g}..{most:.10g}" + " ..." * several
+    how = {"read": int if whole else real, "count": None if several else 1, "takes": takes, "whole": whole}
+    return Number(metavar=metavar or takes, least=least, most=most, **how)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,21 +146,17 @@ class Options:
     """The options of a verb.
 
     Raises:
-        UsageError: a number is outside of its option's range, or a name is not known.
+        UsageError: a value is not of its option's type, a number is outside of its range, or a name is not known.
     """
 
-    monitor: Annotated[Monitor, tyro.conf.Suppress] = SILENT
+    monitor: Annotated[Monitor, PYTHON_ONLY] = SILENT
     """Receiver of messages and progress."""
 
     def __post_init__(self) -> None:
-        for name, check in _checks(type(self)):
+        for name, argument in _checks(type(self)):
             value = getattr(self, name)
-            if isinstance(check, OneOf):
-                check.check(name, value)
-            elif value is not None and not check.is_instance(value):
-                got = ", ".join(map(str, value)) if isinstance(value, (list, tuple)) else str(value)
-                takes = check.range_text if isinstance(check, Numbers) else check.metavar
-                raise UsageError(name, f"takes {takes}, got {got[:MAX_VALUE_CHARACTERS] or 'nothing'}")
+            if argument is not None:
+                argument.check(name, value)
         check_fields(self)
 
     @classmethod
@@ -151,25 +168,34 @@ class Options:
         return cls(**given)
 
 
+def argument_of(annotation: Any) -> Argument | None:
+    """The argument that a field's annotation states, or that of a Literal; None for a switch."""
+    stated = [part for part in getattr(annotation, "__metadata__", ()) if isinstance(part, Argument)]
+    kind = plain(annotation)
+    return stated[0] if stated else names(*get_args(kind)) if get_origin(kind) is Literal else None
+
+
+def plain(annotation: Any) -> Any:
+    """An annotation without its metadata."""
+    return get_args(annotation)[0] if get_origin(annotation) is Annotated else annotation
+
+
 @cache
 def docs_of(options: type) -> dict[str, str]:
     """The docstring of each field of a dataclass, its bases' included, by the field's name."""
-    found: dict[str, str] = {}
+    docs: dict[str, str] = {}
     for base in reversed(options.__mro__[:-1]):
         [tree] = ast.parse(textwrap.dedent(inspect.getsource(base))).body
-        body = cast(ast.ClassDef, tree).body
-        for statement, after in pairwise(body):
+        for statement, after in pairwise(cast(ast.ClassDef, tree).body):
             if isinstance(statement, ast.AnnAssign) and isinstance(after, ast.Expr):
-                found[ast.unparse(statement.target)] = ast.literal_eval(after.value)
-    return found
+                docs[ast.unparse(statement.target)] = ast.literal_eval(after.value)
+    return docs
 
 
 @cache
-def _checks(options: type[Options]) -> list[tuple[str, Any]]:
-    """The checks of values, each with its option's name."""
-    hints = get_type_hints(options, include_extras=True).items()
-    pairs = [(name, check) for name, hint in hints for check in getattr(hint, "__metadata__", ())]
-    return [(name, c) for name, c in pairs if isinstance(c, OneOf | tyro.constructors.PrimitiveConstructorSpec)]
+def _checks(options: type[Options]) -> Sequence[tuple[str, Argument | None]]:
+    """Name and argument of each option."""
+    return [(name, argument_of(hint)) for name, hint in get_type_hints(options, include_extras=True).items()]
 
 
 def documented(text: str | None, options: type[Options]) -> str:

@@ -8,12 +8,10 @@ from dataclasses import dataclass, replace
 from os import PathLike
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args
 
-import tyro
-
 from aaplug.core.colours import Background
 from aaplug.core.conventions import MIN_SEEN_SHARE
 from aaplug.methods import QUALITIES, RateReference
-from aaplug.options.base import CAMERAS, DRAWING, ORBIT, UNSET, OneOf, Options, choice, flag, number
+from aaplug.options.base import CAMERAS, DRAWING, ORBIT, Options, flag, names, number
 from aaplug.system.contracts import LazyType
 from aaplug.system.errors import MAX_VALUE_CHARACTERS, UsageError
 from aaplug.system.registry import names_of
@@ -37,8 +35,9 @@ SCALE = number(0.001, 64)  # sizes of images against the training size
 SCALES = number(0.001, 64, several=True)
 STEPS = number(0, 1_000_000, whole=True, metavar="N")
 THREADS = number(1, max(8, os.cpu_count() or 1), whole=True)  # more gain nothing, and can exhaust the machine
-VIEWS = tyro.conf.arg(metavar="NAME,...|test|train|all")
+VIEWS = flag("NAME,...|test|train|all")
 RECIPE_NAMES = names_of("recipe", comparisons=False)
+RECIPE_METAVAR = "|".join([*RECIPE_NAMES, "..."])  # in `--help`
 RASTERIZER_NAMES = ("auto", "compiled")  # beside those of the registry
 RATE_REFERENCES = get_args(RateReference)
 MAX_SIDE = 16384  # px
@@ -48,9 +47,9 @@ DEFAULT_FOV = 50.0  # degrees
 V = TypeVar("V", bound="ViewOptions")
 _PLACE = number(-MAX_COORDINATE, MAX_COORDINATE, several=True, metavar="X Y Z")
 
-OneRecipe = Annotated[str | Recipe, choice([*RECIPE_NAMES, "..."]), OneOf(kind="recipe")]
-OneViewer = Annotated[str | Viewer | None, flag("VIEWER", "--for", kind=str | None), OneOf(kind="viewer")]
-OneProtocol = Annotated[str | Protocol, choice(names_of("protocol")), OneOf(kind="protocol")]
+OneRecipe = Annotated[str | Recipe, names(kind="recipe", metavar=RECIPE_METAVAR)]
+OneViewer = Annotated[str | Viewer | None, names(kind="viewer", metavar="VIEWER", flags=("--for",))]
+OneProtocol = Annotated[str | Protocol, names(kind="protocol")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,20 +66,15 @@ class ViewOptions(FrameOptions):
 
     views: Annotated[str, VIEWS] = "test"
     """Views, by name or split."""
-    background: Annotated[Background, choice(("auto", "white", "black"))] = "auto"
-    """Colour behind the scene; auto is what training had."""
-    threads: Annotated[int | None, THREADS, UNSET] = None
+    background: Annotated[Background, flag("auto|COLOUR")] = "auto"
+    """Colour behind the scene as CSS writes it, such as white or '#ff8000'; auto is what training had."""
+    threads: Annotated[int | None, THREADS] = None
     """Processor threads (default: all)."""
-    rasterizer: Annotated[
-        str | Rasterizer,
-        choice([*RASTERIZER_NAMES, *names_of("rasterizer")]),
-        OneOf(RASTERIZER_NAMES, "rasterizer"),
-        DRAWING,
-    ] = "auto"
+    rasterizer: Annotated[str | Rasterizer, names(*RASTERIZER_NAMES, kind="rasterizer"), DRAWING] = "auto"
     """auto: compiled if `aaplug warmup` has run, else eager.  reference: slow, exact, float64."""
-    memory: Annotated[float | None, number(0.01, 1024, metavar="GB"), UNSET, DRAWING] = None
+    memory: Annotated[float | None, number(0.01, 1024, metavar="GB"), DRAWING] = None
     """GB that drawing a frame may take, beside the scene and the image themselves (default: 1)."""
-    cull_margin: Annotated[float, number(0, math.inf, metavar="SHARE"), UNSET, CAMERAS] = math.inf
+    cull_margin: Annotated[float, number(0, math.inf, metavar="SHARE"), CAMERAS] = math.inf
     """For scenes trained so: leave out Gaussians centred off the image by more than this share of its longer side."""
 
     def on(self: V, background: Background | None) -> V:
@@ -92,11 +86,11 @@ class ViewOptions(FrameOptions):
 class RecipeOptions(ViewOptions):
     """What a recipe samples and compares with, and who draws it."""
 
-    quality: Annotated[str, choice(QUALITIES), OneOf(tuple(QUALITIES))] = "balanced"
+    quality: Annotated[str, names(*QUALITIES)] = "balanced"
     """How finely recipe auto samples: fast reaches a quarter of the training rate, balanced half, best all of it."""
-    rate_reference: Annotated[str | None, flag("|".join(RATE_REFERENCES)), OneOf(RATE_REFERENCES), DRAWING] = None
+    rate_reference: Annotated[str | None, names(*RATE_REFERENCES), DRAWING] = None
     """Sampling rate that matched and auto compare with (default: pose: global, but interval for free cameras)."""
-    scheduler: Annotated[str | Executor | None, flag("local|tcp://HOST:PORT", kind=str | None), DRAWING] = None
+    scheduler: Annotated[str | Executor | None, flag("local|tcp://HOST:PORT"), DRAWING] = None
     """Draw views on a Dask cluster: of --threads processes on this machine, or of the machines at an address."""
 
 
@@ -106,7 +100,7 @@ class ImageOptions(Options):
 
     recipe: OneRecipe = "auto"
     """How to render; `aaplug evaluate --recipe all` lists further recipes, for comparison."""
-    scale: Annotated[float | None, SCALE, UNSET] = None
+    scale: Annotated[float | None, SCALE] = None
     """Size relative to the training size (default: 1)."""
     resolution: Annotated[str | None, flag("WxH")] = None
     """Size in px, such as 400x400; -1 on one side keeps the aspect (-1x720)."""
@@ -118,21 +112,21 @@ class ImageOptions(Options):
 class Orbit(Options):
     """Without cameras: views on an orbit around the scene, and the training that is assumed."""
 
-    orbit: Annotated[int | None, number(1, 10_000, whole=True), UNSET, ORBIT] = None
+    orbit: Annotated[int | None, number(1, 10_000, whole=True), ORBIT] = None
     """Number of views around the scene (default: 8, or 1 for a single picture)."""
-    elevation: Annotated[float | None, number(-89, 89), UNSET, ORBIT] = None
+    elevation: Annotated[float | None, number(-89, 89), ORBIT] = None
     """Degrees of the orbit above the horizon (default: 20)."""
     fov: Annotated[float, number(1, 170), ORBIT] = DEFAULT_FOV
     """Field of view in degrees, along the image's shorter side."""
-    look_at: Annotated[Sequence[float] | None, _PLACE, UNSET, ORBIT] = None
+    look_at: Annotated[Sequence[float] | None, _PLACE, ORBIT] = None
     """Place to look at, X Y Z (default: the middle of the scene)."""
-    eye: Annotated[Sequence[float] | None, _PLACE, UNSET, ORBIT] = None
+    eye: Annotated[Sequence[float] | None, _PLACE, ORBIT] = None
     """Place to look from, X Y Z, instead of an orbit."""
-    up: Annotated[Sequence[float] | None, _PLACE, UNSET, ORBIT] = None
+    up: Annotated[Sequence[float] | None, _PLACE, ORBIT] = None
     """Direction that points up, X Y Z (default: 0 -1 0, or what file and colours say)."""
     train_view: Annotated[str | None, flag("WxH"), ORBIT] = None
     """Size in px of the training images, which are taken to show what the orbit shows (default: 1600x1066)."""
-    train_rate: Annotated[float | None, number(1e-6, 1e9, metavar="RATE"), UNSET, ORBIT] = None
+    train_rate: Annotated[float | None, number(1e-6, 1e9, metavar="RATE"), ORBIT] = None
     """Instead, px per world unit in the middle of the scene in training."""
 
     def __post_init__(self) -> None:

@@ -7,12 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Literal, get_args
 
-import tyro
-
 from aaplug.io import MOST_FPS, SpzAxes
-from aaplug.options.base import DRAWING, REPORT, TUNING, UNSET, OneOf, Options, choice, choices, flag, number
+from aaplug.options.base import DRAWING, PYTHON_ONLY, REPORT, TUNING, Options, flag, names, number
 from aaplug.options.shared import (
-    RECIPE_NAMES,
+    RECIPE_METAVAR,
     SCALE,
     SCALES,
     STEPS,
@@ -37,7 +35,7 @@ ALL = "all"  # instead of recipes' names: every recipe that the scene suits
 DEFAULT_RECIPES = ("classic", "mip", "matched", "auto")
 COMPARED_SCALES = (2.0, 1.0, 0.5, 0.25)
 COMPARED_METRICS = ("psnr", "ssim", "flicker")
-METRIC_NAMES = "|".join(map(metric_option, names_of("metric")))
+METRICS = flag("|".join(map(metric_option, names_of("metric"))) + " ...", count=None)
 TIMED_RASTERIZERS = ("all", "compiled", "eager")
 LEVEL_STEPS = 1000  # for a level of 1/4 of the training rate and above; a smaller one takes more, of smaller images
 SINGLE_SCENE_FACTOR = 2  # times as many steps for one scene: its counts are met, so tuning has more to mend
@@ -48,14 +46,14 @@ TUNED_PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "dc", "re
 TRUTHS = ("auto", "self", "photographs")
 Layout = Literal["plain", "inria"]
 
-SHOWN_VIEWS = tyro.conf.arg(metavar="N|NAME,...")
+SHOWN_VIEWS = flag("N|NAME,...")
 
 
 @dataclass(frozen=True, kw_only=True)
 class WritingOptions(Options):
     """A scene file to write."""
 
-    spz_axes: Annotated[SpzAxes, tyro.conf.Suppress] = "auto"
+    spz_axes: Annotated[SpzAxes, PYTHON_ONLY] = "auto"
     """Axes of a .spz to write; see `read_scene`."""
     overwrite: bool = False
     """Replace existing outputs."""
@@ -65,6 +63,8 @@ class WritingOptions(Options):
 class RenderOptions(RecipeOptions, ImageOptions):
     """Rendering."""
 
+    path: Annotated[AnyPath | None, flag("FILE.json")] = None
+    """Instead of --views: cameras of a path file, nerfstudio's camera_path.json or what the page of `view` saves."""
     bit_depth: Literal[8, 16] = 8
     """Bits per colour channel."""
 
@@ -73,11 +73,11 @@ class RenderOptions(RecipeOptions, ImageOptions):
 class VideoOptions(RecipeOptions, ImageOptions):
     """Rendering, and the camera path."""
 
-    scale: Annotated[float | None, SCALE, UNSET] = None
+    scale: Annotated[float | None, SCALE] = None
     """Size relative to the training size, or to that of a path file (default: 1)."""
-    path: Annotated[AnyPath, choice(["zoom", "dolly", "orbit", "FILE.json"])] = "zoom"
+    path: Annotated[AnyPath, flag("zoom|dolly|orbit|FILE.json")] = "zoom"
     """zoom (focal length), dolly (distance) or orbit from the first of --views, or nerfstudio's camera_path.json."""
-    beside: Annotated[str | None, choice(["none", *RECIPE_NAMES, "..."]), OneOf(("none",), "recipe")] = "classic"
+    beside: Annotated[str | Recipe | None, names("none", kind="recipe", metavar=f"none|{RECIPE_METAVAR}")] = "classic"
     """Recipe to show on the left; none shows --recipe alone."""
     start: Annotated[float, SCALE] = 1.0
     """Sampling rate at the start of a zoom or dolly, relative to training."""
@@ -85,7 +85,7 @@ class VideoOptions(RecipeOptions, ImageOptions):
     """Sampling rate where it turns back."""
     seconds: Annotated[float, number(0.01, 3600)] = 6.0
     """Length in seconds of a zoom, dolly or orbit."""
-    fps: Annotated[float | None, number(0.1, MOST_FPS), UNSET] = None
+    fps: Annotated[float | None, number(0.1, MOST_FPS)] = None
     """Frames per second (default: the path file's, or 30)."""
 
 
@@ -93,21 +93,21 @@ class VideoOptions(RecipeOptions, ImageOptions):
 class EvaluateOptions(RecipeOptions):
     """Recipes, scales, truth and metrics."""
 
-    name: Annotated[str | None, tyro.conf.Suppress] = None
+    name: Annotated[str | None, PYTHON_ONLY] = None
     """The scene's name in the results; None for its file's."""
     protocol: OneProtocol = "default"
     """Scales, truth, downscaling and flavours of metrics, by name."""
-    recipe: Annotated[str | Sequence[str | Recipe], choices([*RECIPE_NAMES, ALL, "..."]), OneOf((ALL,), "recipe")] = (
-        DEFAULT_RECIPES
-    )
+    recipe: Annotated[
+        str | Sequence[str | Recipe], names(ALL, kind="recipe", metavar=f"{ALL}|{RECIPE_METAVAR} ...", count=None)
+    ] = DEFAULT_RECIPES
     """One or more recipes.  all adds those for comparison, which examples/guides/methods.md lists."""
-    scale: Annotated[Sequence[float] | None, SCALES, UNSET] = None
+    scale: Annotated[Sequence[float] | None, SCALES] = None
     """One or more sizes relative to the training size (default: the protocol's)."""
     truth: Literal["auto", "photographs", "self"] = "auto"
     """Compare with photographs, or with the scene's own supersampled look; auto leaves it to the protocol."""
-    metric: Annotated[str | Sequence[str] | None, flag(METRIC_NAMES, kind=tuple[str, ...] | None)] = None
+    metric: Annotated[str | Sequence[str] | None, METRICS] = None
     """Metrics, with flavours ssim:wang|3dgs, lpips:3dgs|vgg|alex (default: psnr ssim consistency energy-drift)."""
-    lpips: Annotated[tuple[AnyPath, AnyPath] | None, flag("TRUNK HEADS", kind=tuple[str, str] | None), REPORT] = None
+    lpips: Annotated[tuple[AnyPath, AnyPath] | None, flag("TRUNK HEADS", count=2), REPORT] = None
     """Weights of LPIPS, which is then measured: torchvision's VGG16 (AlexNet), and the lpips package's heads for it."""
     report: bool = False
     """Write report.html, one page with pictures side by side, tables and curves, and its plots."""
@@ -131,7 +131,7 @@ class CompareOptions(RecipeOptions):
     """Draw the scenes as spark or another of examples/guides/viewers.md does; the truth stays the first by --recipe."""
     scale: Annotated[Sequence[float], SCALES] = COMPARED_SCALES
     """One or more sizes relative to the training size."""
-    metric: Annotated[str | Sequence[str], flag(METRIC_NAMES, kind=tuple[str, ...])] = COMPARED_METRICS
+    metric: Annotated[str | Sequence[str], METRICS] = COMPARED_METRICS
     """Metrics (default: psnr ssim flicker)."""
     show: Annotated[str, SHOWN_VIEWS, REPORT] = "3"
     """Views in the report's viewer: how many, or which."""
@@ -156,11 +156,11 @@ class ConvertOptions(WritingOptions, ViewOptions):
     """Views that --for is measured on, by name or split."""
     viewer: OneViewer = None
     """Fit the scene to spark, playcanvas or another of examples/guides/viewers.md, and print the remaining error."""
-    steps: Annotated[int | None, STEPS, UNSET] = None
+    steps: Annotated[int | None, STEPS] = None
     """With --for: steps of the fit, 0 for none (default: 300, or 0 if the viewer draws as training did)."""
-    form: Annotated[str | None, flag("|".join(names_of("form"))), OneOf(kind="form")] = None
+    form: Annotated[str | None, names(kind="form")] = None
     """Without --for: keep training's energy (matched-energy, the default), or smooth as Mip-Splatting does."""
-    variance: Annotated[float | None, number(0.001, 100), UNSET] = None
+    variance: Annotated[float | None, number(0.001, 100)] = None
     """Without --for: variance to fuse, in px² at the training rate (default: 0.2)."""
 
 
@@ -171,21 +171,21 @@ class LodOptions(WritingOptions, ViewOptions):
     views: Annotated[str, VIEWS] = "train"
     """Views that levels are tuned on and that tell what is hidden, with free ones between them."""
 
-    simplify: Annotated[float | None, number(1e-6, 1e9, metavar="SHARE|COUNT"), UNSET] = None
+    simplify: Annotated[float | None, number(1e-6, 1e9, metavar="SHARE|COUNT")] = None
     """Write one scene with this share of the Gaussians; above 1, with so many."""
-    budget: Annotated[float | None, number(0.001, 1e6, metavar="MB"), UNSET] = None
+    budget: Annotated[float | None, number(0.001, 1e6, metavar="MB")] = None
     """Write one scene of as many Gaussians as fit into a .ply of so many MB (10^6 bytes)."""
-    levels: Annotated[int | None, number(1, 12, whole=True), UNSET] = None
+    levels: Annotated[int | None, number(1, 12, whole=True)] = None
     """Write a folder of levels, each for half the size of the one before, as light as the image allows (default: 4)."""
     merge_below: Annotated[float, number(0, 10)] = 0.0
     """With levels: merge Gaussians up to so many px of the level in any case; faster to draw, and less exact."""
-    scale: Annotated[float | None, number(0.001, 1), UNSET] = None
+    scale: Annotated[float | None, number(0.001, 1)] = None
     """With --simplify or --budget: size of the images that the scene is meant for (default: root of the share)."""
     viewer: OneViewer = None
     """Tune each file for spark, playcanvas or another of examples/guides/viewers.md, instead of for aaplug."""
     refine: bool = True
     """Merge alone: do not tune the result to look like the scene, which takes minutes."""
-    steps: Annotated[int | None, STEPS, UNSET] = None
+    steps: Annotated[int | None, STEPS] = None
     """Steps of tuning for each level, more for small ones (default: 1000, or 2000 for one scene)."""
     resume: bool = False
     """Keep the levels that are there, if they were made of the same scene, cameras and options."""
@@ -220,29 +220,27 @@ class LodOptions(WritingOptions, ViewOptions):
 class FinetuneOptions(WritingOptions, ViewOptions):
     """The optimization."""
 
-    viewer: Annotated[
-        str | Viewer | None, flag("fast|VIEWER", "--for", kind=str | None), OneOf(("fast",), "viewer")
-    ] = None
+    viewer: Annotated[str | Viewer | None, names("fast", kind="viewer", metavar="fast|VIEWER", flags=("--for",))] = None
     """Who will show the scene: fast (aaplug's matched, the default) or a viewer of examples/guides/viewers.md."""
     views: Annotated[str, VIEWS] = "test"
     """Views that the result is measured on, by name or split; training views are what it is tuned on."""
-    method: Annotated[str, choice(names_of("method")), OneOf(kind="method")] = "consistency"
+    method: Annotated[str, names(kind="method")] = "consistency"
     """consistency makes one model for all scales; mipmap-gs makes one for a single --scale, as Mipmap-GS does."""
     scale: Annotated[Sequence[float], SCALES] = tuple(LOSS_WEIGHTS)
     """Sizes against the training size that must look right, beside the training size itself."""
-    steps: Annotated[int | None, STEPS, UNSET] = None
+    steps: Annotated[int | None, STEPS] = None
     """Number of steps (default: 1000)."""
-    loss: Annotated[str, choice(get_args(LossName)), OneOf(get_args(LossName)), TUNING] = "l2"
+    loss: Annotated[str, names(*get_args(LossName)), TUNING] = "l2"
     """l2, or 3DGS's 0.8 L1 + 0.2 D-SSIM."""
     anchor: Annotated[float, number(0, 1_000_000, metavar="WEIGHT"), TUNING] = ANCHOR_WEIGHT
     """Weight of the training size in every step, against 1 for the other scales."""
-    move: Annotated[Sequence[str], choices(TUNED_PARAMETERS), TUNING] = TUNED_PARAMETERS
+    move: Annotated[Sequence[str], names(*TUNED_PARAMETERS, count=None), TUNING] = TUNED_PARAMETERS
     """Parameters that move."""
     learning_rate: Annotated[float, number(1e-6, 100), TUNING] = 1.0
     """Factor on the method's learning rates."""
-    densify_every: Annotated[int | None, STEPS, UNSET, TUNING] = None
+    densify_every: Annotated[int | None, STEPS, TUNING] = None
     """Clone, split and prune every N steps; 0 for never (default: the method's own)."""
-    truth: Annotated[str, choice(TRUTHS), OneOf(TRUTHS)] = "auto"
+    truth: Annotated[str, names(*TRUTHS)] = "auto"
     """What the training size should look like: self is the scene's own render; auto takes photographs if all exist."""
     upsampler: Annotated[str | None, flag("bicubic|lanczos|FILE"), TUNING] = None
     """For scales above the photographs': an interpolation or a network (.pb, .pt2); default: the scene's own render."""
@@ -264,7 +262,7 @@ class LiveOptions(ViewOptions):
     """Port to listen on; 0 takes any free one."""
     no_browser: bool = False
     """Print the address, and open no browser."""
-    words: Annotated[Sequence[str], tyro.conf.Suppress] = ()
+    words: Annotated[Sequence[str], PYTHON_ONLY] = ()
     """Words of a command line that name the scene and its cameras, for the page to show."""
 
 
@@ -278,13 +276,13 @@ class BenchOptions(Options):
         1_000_000,
     )
     """Sizes of the synthetic scenes."""
-    resolution: Annotated[Sequence[str] | None, flag("WxH ...")] = None
+    resolution: Annotated[Sequence[str] | None, flag("WxH ...", count=None)] = None
     """Sizes of the images: all scenes at the first, the middle one at each (default: a view's or 800x800 1600x1060)."""
-    rasterizer: Annotated[str, choice(TIMED_RASTERIZERS), OneOf(TIMED_RASTERIZERS)] = "all"
+    rasterizer: Annotated[str, names(*TIMED_RASTERIZERS)] = "all"
     """Which to time; all: compiled, if `aaplug warmup` has run, and eager."""
     repeats: Annotated[int, number(1, 1000, whole=True)] = 5
     """Runs per median."""
-    threads: Annotated[int | None, THREADS, UNSET] = None
+    threads: Annotated[int | None, THREADS] = None
     """Processor threads (default: all)."""
     forward_only: bool = False
     """Leave out the backward pass."""

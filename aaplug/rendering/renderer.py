@@ -18,7 +18,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from aaplug.core.cameras import Camera, CameraSet, Factor
-from aaplug.core.colours import BLACK, WHITE, Background, Colour, Share
+from aaplug.core.colours import BLACK, Background, Colour, Share
 from aaplug.core.conventions import MIN_SEEN_SHARE
 from aaplug.core.culling import cull
 from aaplug.core.gaussians import Gaussians
@@ -32,6 +32,7 @@ from aaplug.core.shading import shade
 from aaplug.core.splats import Render, Splats2D, concatenated
 from aaplug.core.training import Margin, TrainingViews
 from aaplug.io.cameras import read_cameras
+from aaplug.io.images import colour_of
 from aaplug.io.limits import lack_of_memory
 from aaplug.io.scenes import SceneLike, scene_of
 from aaplug.io.scenes.harmonics import without_harmonics
@@ -346,18 +347,12 @@ def background_colour(background: Background, cameras: object = None) -> Colour:
     """The colour behind the scene.
 
     Raises:
-        UsageError: the name is not known.
+        UsageError: CSS knows no such colour.
     """
-    if not isinstance(background, str):
-        red, green, blue = background
-        return red, green, blue
-    named: dict[str, Colour] = {"white": WHITE, "black": BLACK}
     if background == "auto":
-        found = cameras.background if isinstance(cameras, CameraSet) else None
-        return found or BLACK
-    if background not in named:
-        raise UsageError("background", f"expected auto, white, black or a colour, got '{background}'")
-    return named[background]
+        return (cameras.background if isinstance(cameras, CameraSet) else None) or BLACK
+    red, green, blue = colour_of(background) if isinstance(background, str) else background
+    return red, green, blue
 
 
 def _check_colours(splats: Splats2D) -> None:

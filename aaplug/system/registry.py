@@ -170,8 +170,10 @@ def names_of(kind: str, comparisons: bool = True) -> list[str]:
     comparisons: also those that aaplug adds by entry points, which are there for comparison.
     """
     names = registry_of(kind).names
-    ours = {p.name for p in _points().select(group=group_of(kind)) if p.dist is not None and p.dist.name == "aaplug"}
-    return names if comparisons else [name for name in names if name not in ours]
+    if comparisons:
+        return names
+    ours = {p.name for p in _points().select(group=group_of(kind)) if p.module.startswith("aaplug.")}
+    return [name for name in names if name not in ours]
 
 
 def unknown(name: str, names: Collection[str]) -> str:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from aaplug.core.cameras import Camera
+from aaplug.io.cameras.camera_path import read_camera_path
 from aaplug.io.scenes import SceneLike
 from aaplug.options.shared import AnyPath
 from aaplug.options.verbs import RenderOptions
@@ -40,7 +41,8 @@ def render(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, optio
     """
     target = Path("images" if output is None else output)
     job = Job.of(scene, cameras, options, single=names_image(target))
-    views = resized(job.views, options.scale, options.resolution, job.cameras.assumed)
+    path = None if options.path is None else read_camera_path(options.path).cameras
+    views = resized(path or job.views, options.scale, options.resolution, job.cameras.assumed and path is None)
     check = partial(image_paths, target, views, options.overwrite)
     paths = check()
     with running(options, target, check, job.inputs, folder=not names_image(target)) as workers:

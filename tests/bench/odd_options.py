@@ -55,7 +55,7 @@ def cases() -> Iterator[tuple[str, list[str]]]:
     for verb in VERBS:
         if verb in SKIPPED:
             continue
-        for option in VERBS[verb].types:
+        for option in VERBS[verb].options:
             for value in ODD:
                 words = [verb, *BASE.get(verb, "").split()]
                 if option in ("scene", "more"):

@@ -1,12 +1,13 @@
 """nerfstudio's `camera_path.json`: free cameras along a path, the frames of a video.
 
 {render_width, render_height, fps, camera_type, camera_path: [{camera_to_world, fov}]}.  camera_to_world: 16 numbers,
-row by row, OpenGL axes, in the frame of the trained scene; fov: the vertical angle in degrees; sizes in px.
+row by row, OpenGL axes, in the frame of the trained scene; fov: the vertical angle in degrees; sizes in px.  The live
+page adds what makes a camera exact, in px: fl_x, fl_y, cx, cy and, at a pose of the data set, trained_focal.
 """
 
 import math
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from aaplug.io.values import Entry, entries, focal, mentions, number, object_of,
 KEY = "camera_path"
 PERSPECTIVE = "perspective"
 DEFAULT_FPS = 24.0  # frames per second, if the file does not say
+EXACT = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy", "trained_focal": "trained_focal"}  # fields by key
 MAX_ANGLE = 180.0  # degrees: the angle of view of a pinhole is less
 
 name = "camera_path"
@@ -71,4 +73,9 @@ def _camera(entry: Entry, name: str, size: tuple[int, int]) -> Camera:
     motion = entry.vector("camera_to_world", 16).reshape(4, 4)
     world_from_cam = pose_of_opengl(motion, entry.place, "camera_to_world")
     cam_from_world = inverse(world_from_cam, entry.place, "camera_to_world")
-    return centred(name, size, (f, f), cam_from_world)
+    exact = {
+        field: entry.get(key, number if key in ("cx", "cy") else focal)
+        for key, field in EXACT.items()
+        if entry.fields.get(key) is not None
+    }
+    return replace(centred(name, size, (f, f), cam_from_world), **exact)

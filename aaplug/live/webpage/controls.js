@@ -1,5 +1,6 @@
 // Controls: what buttons, lists, keys, pointers and the address do to the state.
 
+const VIEW_FILE = "view.json"; // the camera of the copied command
 const EIGHTHS = [1 / 8, 1 / 4, 1 / 2, 1, 2, 4, 8];
 const scaleName = (scale) => scale < 1 && Number.isInteger(1 / scale) ? `1/${1 / scale}` : `${+scale.toFixed(2)}`;
 const say = (text) => { at("said").textContent = text; };
@@ -20,6 +21,8 @@ function controls() { // show the state
   for (const name of ["lens", "shake", "frustums", "record"]) at(name).checked = state[name];
   at("zoom").textContent = `${state.zoom}×`;
   at("paint").value = state.paint || "";
+  at("background").value = state.background || about.background;
+  at("asTrained").disabled = state.background === null;
   at("view").value = state.at === null ? "" : String(state.at);
   at("fade").value = state.fade;
   at("fading").hidden = state.at === null || !view().photo;
@@ -55,10 +58,18 @@ function hello(facts) {
     label.append(input, text);
     at("scales").append(label);
   }
-  const names = facts.recipes.map(({name}) => name), best = facts.qualities.at(-1);
-  state.sides = ["classic", "auto"].map((name, i) => ({recipe: names.includes(name) ? name : names.at(-i), quality: best}));
-  standIn(0);
+  state.sides = facts.sides;
+  home();
   fromAddress();
+}
+
+function home() { // where both sides differ most, or the first view as large as it fits
+  const {start} = about;
+  state.pose = null;
+  standIn(start ? start.view : 0);
+  if (!start) return;
+  change({scale: start.scale});
+  at("hint").textContent = `Left and right differ most here, at ${scaleName(start.scale)}: ${start.decibels.toFixed(1)} dB. Drag the divider across thin parts and edges.`;
 }
 
 // ------------------------------------------------------------------------------------------------------- the controls
@@ -74,6 +85,8 @@ at("panel").addEventListener("input", ({target: {id, name, value, checked}}) => 
   else if (id === "distance") change(dollied(state, about.depth * 2 ** value / state.depth));
   else if (id === "fade") change({fade: Number(value)});
   else if (id === "paint") change({paint: value || null});
+  else if (id === "background") change({background: value});
+  else if (id === "frustums" && checked) stepBack();
   else if (id === "view" && value) standIn(Number(value));
   else if (id === "record") { if (checked) path.length = 0; change({record: checked}); }
   else if (["lens", "shake", "frustums"].includes(id)) change({[id]: checked});
@@ -81,13 +94,18 @@ at("panel").addEventListener("input", ({target: {id, name, value, checked}}) => 
 const clicks = {
   flip, half: () => change({split: 0.5}), weaker: () => change({lens: true, zoom: state.zoom / 2}),
   stronger: () => change({lens: true, zoom: state.zoom * 2}), previous: () => stepCamera(-1), next: () => stepCamera(1),
-  path: savePath, still: saveStill, command: copyCommand, fold,
+  path: savePath, still: saveStill, command: copyCommand, fold, full: fullScreen, asTrained: () => change({background: null}),
 };
 for (const [id, act] of Object.entries(clicks)) at(id).addEventListener("click", act);
 
 function fold() {
   const folded = document.body.classList.toggle("folded");
   at("fold").setAttribute("aria-expanded", String(!folded));
+}
+
+function fullScreen() {
+  if (document.fullscreenElement) document.exitFullscreen();
+  else document.documentElement.requestFullscreen().catch((error) => say(error.message));
 }
 
 // ------------------------------------------------------------------------------------------------------------ keeping
@@ -102,7 +120,7 @@ function download(file, name) {
 
 function pathOf(frames) {
   const [width, height] = extent().size;
-  const cameras = frames.map(({camera_to_world, fov}) => ({camera_to_world, fov, aspect: width / height}));
+  const cameras = frames.map(({time, ...frame}) => ({...frame, aspect: width / height}));
   return JSON.stringify({camera_type: "perspective", render_width: width, render_height: height, fps: FPS, seconds: frames.length / FPS, camera_path: cameras});
 }
 
@@ -117,29 +135,22 @@ function saveStill() {
   if (link.send({still: {width, height, side: sideSeen()}})) say("rendering the picture");
 }
 
-const quoted = (word) => /^[\w@%+=:,./-]+$/.test(word) ? word : `'${word.replaceAll("'", "'\\''")}'`;
+const quoted = (word) => /^[\w@%+=:,./-]+$/.test(word) ? word : /["$`]/.test(word) ? `'${word.replaceAll("'", "'\\''")}'` : `"${word}"`;
 
-function commandLine() { // what renders a side as it is seen
-  const {size: [width, height], focal} = extent(), {recipe, quality} = state.sides[sideSeen()];
-  const numbers = (values) => values.map((x) => String(+x.toFixed(6)));
-  const how = ["--recipe", recipe, ...(takesQuality(recipe) ? ["--quality", quality] : [])], output = ["-o", "view.png"];
-  if (about.assumed) {
-    const eye = eyeOf(state.pose), [, down, forward] = axesOf(state.pose);
-    const look = ["--eye", ...numbers(eye), "--look-at", ...numbers(plus(eye, forward, state.depth)), "--up", ...numbers(down.map((x) => -x))];
-    const fov = Math.atan(Math.min(width, height) / 2 / focal) * 360 / Math.PI;
-    return ["aaplug", "render", ...about.words, ...look, "--fov", ...numbers([fov]), "--resolution", `${width}x${height}`, ...how, ...output].map(quoted).join(" ");
-  }
-  if (state.at !== null) {
-    return ["aaplug", "render", ...about.words, "--views", view().name, "--scale", ...numbers([state.scale]), ...how, ...output].map(quoted).join(" ");
-  }
-  const frames = [{camera_to_world: worldFromCamera(state.pose), fov: Math.atan(height / 2 / focal) * 360 / Math.PI}];
-  const video = ["aaplug", "video", ...about.words, "--path", "camera_path.json", "--beside", state.sides[0].recipe, ...how, "-o", "view.webm"];
-  return `printf '%s' ${quoted(pathOf(frames))} > camera_path.json && ${video.map(quoted).join(" ")}`;
+function commandLine() { // what renders a side as it is seen, by the camera in VIEW_FILE
+  const {recipe, quality} = state.sides[sideSeen()];
+  const how = ["--recipe", recipe, ...(takesQuality(recipe) ? ["--quality", quality] : [])];
+  const colour = state.background ? ["--background", state.background] : [];
+  return ["aaplug", "render", ...about.words, ...colour, "--path", VIEW_FILE, ...how, "-o", "view.png"].map(quoted).join(" ");
 }
 
-async function copyCommand() {
-  const words = commandLine();
-  await navigator.clipboard.writeText(words).then(() => say(`copied: ${words}`), () => say(words));
+async function copyCommand() { // and save the camera that it names
+  const {id, stage: now, camera, size: [, height]} = livePicture;
+  if (now !== "done" || id !== number) return say("wait until the picture is at rest");
+  const fov = Math.atan(height / 2 / camera.fl_y) * 360 / Math.PI, words = commandLine();
+  download(new Blob([pathOf([{camera_to_world: worldFromCamera(state.pose), fov, ...camera}])], {type: "application/json"}), VIEW_FILE);
+  const what = `where ${VIEW_FILE} is saved, run: ${words}`;
+  await navigator.clipboard.writeText(words).then(() => say(`copied; ${what}`), () => say(what));
 }
 
 // --------------------------------------------------------------------------------------------------------------- keys
@@ -148,11 +159,11 @@ const KEY_STEPS = { // what a held key does in each step
   ArrowLeft: () => turned(state, 0.04, 0, about.up), ArrowRight: () => turned(state, -0.04, 0, about.up),
   ArrowUp: () => turned(state, 0, 0.04, about.up), ArrowDown: () => turned(state, 0, -0.04, about.up),
   w: () => dollied(state, 0.95), s: () => dollied(state, 1 / 0.95),
-  a: () => panned(state, -0.03, 0), e: () => panned(state, 0.03, 0), q: () => panned(state, 0, -0.03), z: () => panned(state, 0, 0.03),
+  a: () => panned(state, -0.03, 0), d: () => panned(state, 0.03, 0), q: () => panned(state, 0, 0.03), e: () => panned(state, 0, -0.03),
 };
 const KEY_ACTIONS = {
-  f: flip, d: () => change({split: 0.5}), x: () => change({shake: !state.shake}), c: () => change({frustums: !state.frustums}),
-  r: () => at("record").click(), p: () => change({fade: state.fade > 0 ? 0 : 1}), h: fold, Home: () => { state.pose = null; standIn(0); },
+  f: flip, m: () => change({split: 0.5}), g: fullScreen, x: () => change({shake: !state.shake}), c: () => state.frustums ? change({frustums: false}) : stepBack(),
+  r: () => at("record").click(), p: () => change({fade: state.fade > 0 ? 0 : 1}), h: fold, Home: home,
   ",": () => stepCamera(-1), ".": () => stepCamera(1),
 };
 EIGHTHS.forEach((scale, i) => { KEY_ACTIONS[i + 1] = () => change({scale}); });
@@ -235,7 +246,12 @@ function released(event) {
 stage.addEventListener("pointerup", released);
 stage.addEventListener("pointercancel", released);
 stage.addEventListener("pointerleave", () => { pointer = null; });
-stage.addEventListener("dblclick", () => change({split: 0.5}));
+stage.addEventListener("dblclick", (event) => {
+  if (!about || event.target.closest("button")) return;
+  if (nearDivider(event)) return change({split: 0.5});
+  const {x, y} = over(event);
+  if (Math.min(x, y, 1 - x, 1 - y) >= 0) link.send({pick: {x, y}});
+});
 stage.addEventListener("contextmenu", (event) => event.preventDefault());
 stage.addEventListener("wheel", (event) => {
   event.preventDefault();
@@ -245,7 +261,7 @@ new ResizeObserver(() => { if (about) { controls(); draw(); wake(); } }).observe
 
 // -------------------------------------------------------------------------------------------------------- the address
 
-const ADDRESS_FIELDS = ["pose", "depth", "at", "base", "scale", "enlarge", "fov", "sides", "split", "lens", "x", "y", "zoom", "frustums", "fade", "paint"];
+const ADDRESS_FIELDS = ["pose", "depth", "at", "base", "scale", "enlarge", "fov", "sides", "split", "lens", "x", "y", "zoom", "frustums", "fade", "paint", "background"];
 
 function address() {
   return `#${encodeURIComponent(JSON.stringify(Object.fromEntries(ADDRESS_FIELDS.map((name) => [name, state[name]]))))}`;
@@ -260,6 +276,7 @@ function fromAddress() { // the state that the address names, where it can be on
     if (!numbers || !sides || fields.sides.length !== 2 || !isView(fields.base) || (fields.at !== null && !isView(fields.at))) return;
     if (fields.pose.length !== 16 || !fields.pose.every(Number.isFinite) || !(fields.scale > 0 && fields.depth > 0)) return;
     if (fields.paint !== null && !(fields.paint in about.paints)) return;
+    fields.background = /^#[0-9a-f]{6}$/.test(fields.background) ? fields.background : null;
     change({...Object.fromEntries(ADDRESS_FIELDS.map((name) => [name, fields[name]])), scale: clamp(fields.scale, 1 / 8, 8)});
   } catch { /* nothing, or nothing of ours */ }
 }

@@ -11,8 +11,8 @@ function linked(on) { // on.hello(about), on.message(header, files), on.lost()
     const header = JSON.parse(words.decode(new Uint8Array(data, 4, length)));
     try {
       await handed(header, data, length);
-    } finally { // or the server would wait for this page
-      send({shown: header.id || 0});
+    } finally { // or the server would wait for this page; it counts no refusal
+      if (!header.refused) send({shown: header.id || 0});
     }
   }
 

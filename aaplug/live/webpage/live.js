@@ -7,14 +7,15 @@ const FPS = 24; // of a recorded path
 const SHAKE_PX = 0.7, SHAKE_TURNS = [1.1, 0.7]; // px to either side, and turns per second along both axes
 const MAX_PICTURE = {side: 8192, pixels: 1 << 25}; // of a picture, as the server bounds it
 const TURN_PER_PX = 0.008, NEARER_PER_PX = 0.0015; // of a drag: radians per CSS px; of the wheel: per px
+const STEP_BACK = 1.25, MAX_STEPS_BACK = 14; // times the distance with each step, until the cameras are in sight
 const ADDRESS_DELAY_MS = 200; // ms without a change before the address follows
 
 let about = null; // the facts about the scene, from the server
 const state = {
   pose: null, depth: 1, at: null, base: 0, scale: 1, enlarge: true, fov: 50, sides: [], split: 0.5, lens: false, x: 0.5, y: 0.5,
-  zoom: 8, frustums: false, fade: 0, paint: null, shake: false, record: false,
+  zoom: 8, frustums: false, fade: 0, paint: null, background: null, shake: false, record: false,
 };
-const livePicture = {id: 0, stage: "connecting", size: [1, 1], sheets: [sheetOf(1, 1)[0], sheetOf(1, 1)[0]], photo: null, overlay: null};
+const livePicture = {id: 0, stage: "connecting", size: [1, 1], sheets: [sheetOf(1, 1)[0], sheetOf(1, 1)[0]], photo: null, overlay: null, camera: null};
 const path = [];
 
 const view = () => about.views[state.at ?? state.base];
@@ -51,7 +52,7 @@ function shaken(now) { // the pose, moved by fractions of a pixel
 function wish(now) {
   const {size: [width, height], focal} = extent();
   return {pose: shaken(now), focal, width, height, sides: state.sides, at: state.shake ? null : state.at,
-    paint: state.paint, photo: state.at !== null && view().photo};
+    paint: state.paint, photo: state.at !== null && view().photo, background: state.background};
 }
 
 function frame(now) { // asks for what has changed, and says when the camera rests
@@ -94,6 +95,22 @@ function standIn(index) { // at a camera of the data set, all of its picture in 
   change({pose: one.pose, at: index, base: index, depth: state.pose ? state.depth : about.depth, fov, scale: fits});
 }
 
+function stepBack() { // so far that most of the cameras are in sight: at a pose of its own a camera cannot be seen
+  const inSight = (pose) => camerasIn(about.views, pose, extent().focal, extent().size, state.depth)
+    .filter(({points: [eye]}) => eye.every((x) => x > 0 && x < 1)).length;
+  const wanted = Math.min(about.views.length - 1, Math.ceil(about.views.length / 2));
+  const steps = Array.from({length: MAX_STEPS_BACK}, (_, i) => dollied(state, STEP_BACK ** i));
+  const next = steps.find(({pose}) => inSight(pose) >= wanted) || steps.at(-1);
+  change({frustums: true, ...(next.pose === state.pose || inSight(state.pose) >= wanted ? {} : next)});
+}
+
+function turnAbout({picked: [x, y], depth}) { // moves the camera so that what was picked is in the middle, and turns about it
+  if (depth === null) return say("nothing is there to turn about");
+  const {size: [width, height], focal} = extent();
+  const beside = panned({pose: state.pose, depth}, (x - 0.5) * width / focal, (y - 0.5) * height / focal);
+  change({pose: beside.pose, depth});
+}
+
 function keepFrame(now, {pose, focal, height}) {
   if (path.length && now - path.at(-1).time < 1000 / FPS - 4) return;
   path.push({time: now, camera_to_world: worldFromCamera(pose), fov: Math.atan(height / 2 / focal) * 360 / Math.PI});
@@ -105,11 +122,13 @@ function keepFrame(now, {pose, focal, height}) {
 const STAGES = {connecting: "connecting", moving: "moving", refining: "refining", complete: "refining", done: "at rest"};
 
 function receive(header, bitmaps) {
-  if (header.problem) {
-    at("status").lastElementChild.textContent = header.problem;
-    return say(header.problem);
+  const problem = header.problem || header.refused;
+  if (problem) {
+    at("status").lastElementChild.textContent = problem;
+    return say(problem);
   }
   if (header.still) return download(bitmaps[0], header.still);
+  if (header.picked) return turnAbout(header);
   if (String(header.size) !== String(livePicture.size)) {
     livePicture.sheets = livePicture.sheets.map(() => sheetOf(...header.size)[0]);
     livePicture.size = header.size;
@@ -122,7 +141,7 @@ function receive(header, bitmaps) {
     else if (of === "paint") livePicture.overlay = paintSheet(bitmaps[i], header.legend);
     else livePicture.sheets[of].getContext("2d").drawImage(bitmaps[i], left, 0, right - left, header.size[1]);
   });
-  Object.assign(livePicture, {id: header.id, stage: header.stage, psnr: header.psnr, whole: header.whole});
+  Object.assign(livePicture, {id: header.id, stage: header.stage, psnr: header.psnr, whole: header.whole, camera: header.camera || null});
   status(header);
   draw();
 }
@@ -184,6 +203,8 @@ function labels() {
   at("name-0").textContent = state.split > 0 ? nameOf(0) : "";
   at("name-1").textContent = state.split < 1 ? nameOf(1) : "";
   at("crops").hidden = !state.lens;
+  const {start} = about;
+  at("hint").hidden = !start || state.at !== start.view || state.scale !== start.scale;
   at("legend").hidden = !livePicture.overlay;
   if (!livePicture.overlay) return;
   drawLegend(at("legend"), livePicture.overlay.legend);
