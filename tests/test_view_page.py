@@ -2,7 +2,7 @@
 
 import json
 import math
-from base64 import b64decode
+from base64 import b64decode, b64encode
 from contextlib import ExitStack
 from urllib.parse import unquote, urlsplit
 
@@ -15,6 +15,7 @@ from aaplug.core.orbits import pinhole
 from aaplug.evaluation.metrics import psnr
 from aaplug.io.cameras.camera_path import read_camera_path
 from aaplug.io.images import read_image
+from aaplug.io.scenes import write_scene
 from aaplug.rendering.renderer import Renderer
 from aaplug.verbs.view import serving
 from tests.conftest import make_camera, make_scene
@@ -244,6 +245,23 @@ def test_the_background_is_chosen_and_forgotten(opened):
     page.click("#asTrained")
     at_rest(page, at="0")
     assert torch.equal(image(page)[2, 2], before)
+
+
+def test_a_dropped_scene_is_opened_for_this_page_alone(opened, tmp_path):
+    one, two = opened(as_opened=True), opened(as_opened=True)
+    drop = """([name, text]) => {
+      const data = new DataTransfer();
+      data.items.add(new File([Uint8Array.from(atob(text), (c) => c.charCodeAt(0))], name));
+      document.querySelector('#stage').dispatchEvent(new DragEvent('drop', {dataTransfer: data, bubbles: true}));
+    }"""
+    one.evaluate(drop, ["bad.ply", b64encode(b"no scene").decode()])
+    one.locator("#said", has_text="bad.ply").wait_for()
+    write_scene(tmp_path / "other.ply", make_scene(700))
+    one.evaluate(drop, ["other.ply", b64encode((tmp_path / "other.ply").read_bytes()).decode()])
+    one.locator("#said", has_text="opened other.ply").wait_for()
+    at_rest(one)
+    assert one.inner_text("#facts").startswith("700 Gaussians")
+    assert two.inner_text("#facts").startswith("200 Gaussians")
 
 
 def test_full_screen_goes_on_and_off(opened):

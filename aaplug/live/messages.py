@@ -1,7 +1,8 @@
 """Messages of a page: each is bounded, and checked or refused in clear words.
 
 A message is one JSON object.  {"see": ...} asks for a picture, {"shown": id} says that one has arrived, {"still": ...}
-asks for a picture as a file, {"pick": ...} for the depth of what a place of the picture shows.  None names a file.
+asks for a picture as a file, {"pick": ...} for the depth of what a place of the picture shows, and {"open": ...}
+announces a scene file, whose bytes follow in binary messages.  None names a file of this machine.
 """
 
 import json
@@ -19,13 +20,14 @@ from aaplug.live.overlays import OVERLAYS
 from aaplug.methods import QUALITIES
 from aaplug.system.errors import MAX_VALUE_CHARACTERS, UsageError, not_one_of
 
-KINDS = ("see", "still", "pick", "shown")
-MAX_MESSAGE_BYTES = 16_384
+KINDS = ("see", "still", "pick", "open", "shown")
+MAX_MESSAGE_BYTES = 65_536
 MAX_SIDE = 8192  # px of a picture
 MAX_PIXELS = 1 << 25  # of a picture
 MAX_DISTANCE = 1e9  # world units, and px of a focal length
 MAX_ROTATION_ERROR = 1e-3  # from orthonormality: a page's own arithmetic misses it by 1e-12
 MAX_ID = 2**53  # a page counts in float64
+FILE_NAME = r"\w[\w .()+-]{0,99}\.\w{1,9}"
 POSE_NUMBERS = 16  # row by row
 
 
@@ -80,6 +82,14 @@ class PickRequest:
 
 
 @dataclass(frozen=True)
+class OpenRequest:
+    """A scene file that follows.  name: the file's own, without a folder.  size: in bytes."""
+
+    name: str
+    size: int
+
+
+@dataclass(frozen=True)
 class Receipt:
     """The page has the picture of this number."""
 
@@ -89,7 +99,7 @@ class Receipt:
 Order = StillRequest | PickRequest  # beside the picture that is wanted last, all are served
 
 
-def parse(text: str | bytes, recipes: Sequence[str], cameras: int) -> PictureRequest | Order | Receipt:
+def parse(text: str | bytes, recipes: Sequence[str], cameras: int) -> PictureRequest | Order | OpenRequest | Receipt:
     """Read a message.
 
     recipes: names that may be asked for.  cameras: how many there are to stand in.
@@ -110,6 +120,11 @@ def parse(text: str | bytes, recipes: Sequence[str], cameras: int) -> PictureReq
         return Receipt(_whole(message, "shown", 0, MAX_ID))
     if not isinstance(body, dict):
         raise UsageError(kind, f"takes an object, got {_short(body)}")
+    if kind == "open":
+        name = body.get("name")
+        if not isinstance(name, str) or not re.fullmatch(FILE_NAME, name):
+            raise UsageError("name", f"takes the name of a scene file, got {_short(name)}")
+        return OpenRequest(name, _whole(body, "size", 1, MAX_ID))
     if kind == "pick":
         return PickRequest(_number(body, "x", 0.0, 1.0), _number(body, "y", 0.0, 1.0))
     width, height = (_whole(body, side, 1, 10**9) for side in ("width", "height"))

@@ -2,7 +2,7 @@
 
 Bound to this machine alone it asks for no secret, but refuses other names of the host, under which another page could
 reach it (DNS rebinding).  Bound to a network it asks for the token that is in its address.  A websocket must come from
-the server's own page.
+the server's own page.  A scene file that is dropped onto a page of this machine is opened for that page alone.
 """
 
 import asyncio
@@ -11,12 +11,16 @@ import json
 import logging
 import secrets
 import threading
+from collections.abc import Callable
 from concurrent.futures import Future
 from contextlib import suppress
 from functools import partial
 from http import HTTPStatus
 from ipaddress import ip_address
-from os import strerror
+from os import sep, strerror
+from pathlib import Path
+from shutil import disk_usage
+from tempfile import TemporaryDirectory
 from urllib.parse import parse_qs
 
 from websockets.asyncio.server import ServerConnection, serve
@@ -24,11 +28,12 @@ from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
-from aaplug.live.messages import MAX_MESSAGE_BYTES, parse
+from aaplug.live.messages import MAX_MESSAGE_BYTES, OpenRequest, parse
 from aaplug.live.pictures import message
 from aaplug.live.studio import Studio
+from aaplug.live.subject import Subject
 from aaplug.live.webpage import page
-from aaplug.system.errors import UsageError, reason
+from aaplug.system.errors import AaplugError, UsageError, reason
 
 WEBSOCKET_PATH = "/live"
 MAX_OPEN_PAGES = 32
@@ -40,14 +45,18 @@ log.propagate = False  # websockets would print a traceback for each bad request
 
 
 class Server:
-    """Serves a studio's pages; a context, in which it listens.  port 0 takes any free one.
+    """Serves a studio's pages; a context, in which it listens.
+
+    open_scene: makes a subject of a scene file.  port 0 takes any free one.
 
     Raises:
         UsageError: nothing can listen there.
     """
 
-    def __init__(self, studio: Studio, host: str = "127.0.0.1", port: int = 8080):
-        self._studio, self._host, self._port = studio, host, port
+    def __init__(
+        self, studio: Studio, open_scene: Callable[[Path], Subject], host: str = "127.0.0.1", port: int = 8080
+    ):
+        self._studio, self._open_scene, self._host, self._port = studio, open_scene, host, port
         self._token = None if _is_local(host) else secrets.token_urlsafe(16)
         self._open_pages = 0
         self._started: Future[tuple[asyncio.AbstractEventLoop, int]] = Future()  # with its loop and port
@@ -112,18 +121,34 @@ class Server:
 
     async def _talk(self, connection: ServerConnection) -> None:
         """Serve one page, from its first word to its last."""
-        subject, sending = self._studio.subject, None
+        subject, sending, file = self._studio.subject, None, None
         outbox: asyncio.Queue[bytes] = asyncio.Queue(MAX_WAITING_MESSAGES)
         self._open_pages += 1
         try:
-            with self._studio.page(partial(self._post, connection, outbox)) as client, suppress(ConnectionClosed):
+            with (
+                TemporaryDirectory() as folder,
+                self._studio.page(partial(self._post, connection, outbox)) as client,
+                suppress(ConnectionClosed),
+            ):
                 await connection.send(self._about)
                 sending = asyncio.create_task(_send_all(connection, outbox))
-                async for text in connection:
+                async for said in connection:
                     try:
-                        self._studio.receive(client, parse(text, subject.recipes, len(subject.views)))
-                    except UsageError as error:
-                        await connection.send(message({"refused": str(error)}, []))
+                        if isinstance(said, bytes) and file is not None:
+                            if file.add(said):
+                                subject, file = await asyncio.to_thread(self._open_scene, file.path), None
+                                self._studio.show(client, subject)
+                                await connection.send(json.dumps(subject.about(), allow_nan=False))
+                            continue
+                        request = parse(said, subject.recipes, len(subject.views))
+                        if isinstance(request, OpenRequest):
+                            file = IncomingFile(Path(folder), request, allowed=self._token is None)
+                            await connection.send(message({"take": request.name}, []))
+                        else:
+                            self._studio.receive(client, request)
+                    except (AaplugError, MemoryError, OSError) as error:
+                        file, why = None, str(error).replace(folder + sep, "") or "out of memory"
+                        await connection.send(message({"refused": why}, []))
         finally:
             self._open_pages -= 1
             if sending is not None:
@@ -140,6 +165,27 @@ class Server:
 
         with suppress(RuntimeError):  # the server has closed meanwhile
             self._loop.call_soon_threadsafe(put)
+
+
+class IncomingFile:
+    """A scene file that a page sends in parts."""
+
+    def __init__(self, folder: Path, request: OpenRequest, allowed: bool):
+        if not allowed:
+            raise UsageError(request.name, "is opened by a server that listens on this machine alone")
+        if request.size > disk_usage(folder).free / 2:
+            raise UsageError(request.name, f"has {request.size:,} bytes, more than the temporary folder takes")
+        self.path, self._missing = folder / request.name, request.size
+        self.path.write_bytes(b"")
+
+    def add(self, part: bytes) -> bool:
+        """Append a part; True at the end."""
+        if len(part) > self._missing:
+            raise UsageError(self.path.name, "is longer than it was announced")
+        with self.path.open("ab") as stream:
+            stream.write(part)
+        self._missing -= len(part)
+        return self._missing == 0
 
 
 async def _send_all(connection: ServerConnection, outbox: "asyncio.Queue[bytes]") -> None:

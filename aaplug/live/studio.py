@@ -87,6 +87,12 @@ class Studio:
             with self._changed:
                 self._pages.remove(page)
 
+    def show(self, page: Page, subject: Subject) -> None:
+        """Draw another subject for a page from now on."""
+        with self._changed:
+            page.pictures, page.request, page.newer, page.steps = Pictures(subject), None, False, None
+            page.orders.clear()
+
     def receive(self, page: Page, said: PictureRequest | Order | Receipt) -> None:
         """Take a message of a page.
 

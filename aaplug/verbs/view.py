@@ -2,10 +2,11 @@
 
 import threading
 import webbrowser
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from importlib.resources import as_file, files
 from importlib.util import find_spec
+from pathlib import Path
 
 from aaplug.io.scenes import SceneLike
 from aaplug.methods import RECIPES
@@ -33,22 +34,27 @@ def serving(scene: SceneLike | None, cameras: CamerasLike, options: LiveOptions)
     from aaplug.live.studio import Studio
     from aaplug.live.subject import Subject
 
-    with ExitStack() as stack:
-        title = "the bundled sample" if scene is None else None
-        if scene is None:
-            folder = stack.enter_context(as_file(files("aaplug.io.sample")))
-            scene, cameras = folder / SAMPLE, folder if cameras is None else cameras
-        stack.enter_context(running(options, None, lambda: None, ()))
+    def subject_of(scene: SceneLike, cameras: CamerasLike, title: str | None, words: Sequence[str]) -> Subject:
         job = Job.of(scene, cameras, options)
         look = job.look(MIN_FRAMES, check=False)
         job.say_assumed()
-        title = title or job.scene.title
         recipes = [name for name in RECIPE_NAMES if name in RECIPES]  # without plug-ins that cannot be used
-        subject = Subject(
-            job.scene, job.cameras, look, recipes, title, options.words or (str(job.scene.file or title),)
-        )
+        title = title or job.scene.title
+        return Subject(job.scene, job.cameras, look, recipes, title, words or (str(job.scene.file or title),))
+
+    def dropped(path: Path) -> Subject:
+        return subject_of(path, None, path.name, (path.name,))
+
+    with ExitStack() as stack:
+        stack.enter_context(running(options, None, lambda: None, ()))
+        if scene is None:
+            folder = stack.enter_context(as_file(files("aaplug.io.sample")))
+            scene, cameras = folder / SAMPLE, folder if cameras is None else cameras
+            subject = subject_of(scene, cameras, "the bundled sample", options.words)
+        else:
+            subject = subject_of(scene, cameras, None, options.words)
         studio = stack.enter_context(Studio(subject))
-        yield stack.enter_context(Server(studio, options.host, options.port)).address
+        yield stack.enter_context(Server(studio, dropped, options.host, options.port)).address
 
 
 @looks(LiveOptions)

@@ -35,11 +35,13 @@ const stepCamera = (by) => standIn(((state.at ?? (by > 0 ? -1 : 0)) + by + about
 // ----------------------------------------------------------------------------------------------------- from the server
 
 function hello(facts) {
-  const first = about === null;
+  const first = about === null, same = about !== null && about.title === facts.title && about.gaussians === facts.gaussians;
   about = facts;
   at("lost").hidden = true;
   asked = "";
-  if (!first) return wake();
+  if (same) return wake();
+  Object.assign(state, {background: null, paint: null});
+  at("scales").replaceChildren();
   document.title = `${facts.title} · aaplug`;
   at("title").textContent = facts.title;
   const kernels = facts.rasterizer === "compiled" ? "" : `, rasterizer ${facts.rasterizer}: \`aaplug warmup\` makes it faster`;
@@ -60,7 +62,8 @@ function hello(facts) {
   }
   state.sides = facts.sides;
   home();
-  fromAddress();
+  if (first) fromAddress();
+  else say(`opened ${facts.title}`);
 }
 
 function home() { // where both sides differ most, or the first view as large as it fits
@@ -253,6 +256,12 @@ stage.addEventListener("dblclick", (event) => {
   if (Math.min(x, y, 1 - x, 1 - y) >= 0) link.send({pick: {x, y}});
 });
 stage.addEventListener("contextmenu", (event) => event.preventDefault());
+document.addEventListener("dragover", (event) => event.preventDefault());
+document.addEventListener("drop", (event) => { // a scene file is opened
+  event.preventDefault();
+  [dropped] = event.dataTransfer.files;
+  if (dropped && link.send({open: {name: dropped.name, size: dropped.size}})) say(`sending ${dropped.name}`);
+});
 stage.addEventListener("wheel", (event) => {
   event.preventDefault();
   if (about) change(dollied(state, Math.exp(clamp(event.deltaY * (event.deltaMode ? 30 : 1), -400, 400) * NEARER_PER_PX)));

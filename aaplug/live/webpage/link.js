@@ -1,5 +1,6 @@
 // The link to the server: one websocket, opened again when it is lost.
 
+const PART_BYTES = 65_536, MAX_WAITING_BYTES = 1 << 22; // of a file that is sent
 const RETRY_MS = [500, 1000, 2000, 5000]; // ms before the next attempts
 
 function linked(on) { // on.hello(about), on.message(header, files), on.lost()
@@ -12,7 +13,7 @@ function linked(on) { // on.hello(about), on.message(header, files), on.lost()
     try {
       await handed(header, data, length);
     } finally { // or the server would wait for this page; it counts no refusal
-      if (!header.refused) send({shown: header.id || 0});
+      if (!header.refused && !header.take) send({shown: header.id || 0});
     }
   }
 
@@ -46,6 +47,13 @@ function linked(on) { // on.hello(about), on.message(header, files), on.lost()
     return true;
   }
 
+  async function sendFile(file) { // in parts, no faster than the server takes them
+    for (let at = 0; at < file.size; at += PART_BYTES) {
+      socket.send(await file.slice(at, at + PART_BYTES).arrayBuffer());
+      while (socket.bufferedAmount > MAX_WAITING_BYTES) await new Promise((resume) => setTimeout(resume, 20));
+    }
+  }
+
   open();
-  return {send, drop: () => socket.close()};
+  return {send, sendFile, drop: () => socket.close()};
 }

@@ -41,7 +41,7 @@ function fitted(one) { // the field of view in degrees that shows all of a view,
 
 // ---------------------------------------------------------------------------------------------------------- asking
 
-let link = null, asked = "", moving = false, changed = 0, number = 0, waiting = 0;
+let link = null, dropped = null, asked = "", moving = false, changed = 0, number = 0, waiting = 0;
 
 function shaken(now) { // the pose, moved by fractions of a pixel
   if (!state.shake) return state.pose;
@@ -128,6 +128,7 @@ function receive(header, bitmaps) {
     return say(problem);
   }
   if (header.still) return download(bitmaps[0], header.still);
+  if (header.take) return link.sendFile(dropped);
   if (header.picked) return turnAbout(header);
   if (String(header.size) !== String(livePicture.size)) {
     livePicture.sheets = livePicture.sheets.map(() => sheetOf(...header.size)[0]);
