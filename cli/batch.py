@@ -15,9 +15,9 @@ from aaplug.options.base import DRAWING, flag
 from aaplug.options.verbs import EvaluateOptions
 from aaplug.system.errors import FormatError, UsageError, did_you_mean
 
-from .console import FAILED, TERMINAL, print_json, quiet, show
+from .console import TERMINAL, quiet
 from .inputs import path_of, read_inputs, told
-from .words import Option, Words
+from .words import Answer, Option, Words
 
 NOT_IN_A_FILE = ("batch", "more", "json", "resume", "overwrite")
 ONCE = ("output", "threads", "memory", "rasterizer", "scheduler")  # for the whole batch, not for one scene
@@ -40,9 +40,16 @@ SEVERAL = (  # options of a verb that `for_each_scene` repeats
 )
 
 
-def batch_of_evaluations(words: Words) -> int:
+def batch_of_evaluations(words: Words) -> Answer:
     """Evaluate every scene that a batch file or the command line names."""
-    scenes = _scenes_to_evaluate(words)
+    if words.batch is not None:
+        if others := words.more or words.scene or words.model_path:
+            raise UsageError("batch", f"names the scenes; leave {others} out")
+        scenes = scenes_of(words.batch, words.where(batch=None))
+    else:
+        paths = [path_of(words), *words.more]
+        names = [path.stem if path.is_file() else path.name for path in paths]
+        scenes = [(n, words.where(more=(), scene=p, model_path=None)) for n, p in zip(names, paths, strict=True)]
     _, first = scenes[0]
     if first.output is None:
         raise UsageError("output", "name a folder for the results of several scenes: -o FOLDER")
@@ -50,100 +57,74 @@ def batch_of_evaluations(words: Words) -> int:
 
     options = EvaluateOptions(**told(first, EvaluateOptions))
 
-    def run(own: Words, scheduler: Any, name: str, output: Path, **given: Any) -> Any:
-        keywords = told(own, EvaluateOptions) | {"scheduler": scheduler, "name": name}
-        inputs = read_inputs(own)
+    def run(scene: Words, scheduler: Any, name: str, output: Path, **given: Any) -> Any:
+        keywords = told(scene, EvaluateOptions) | {"scheduler": scheduler, "name": name}
+        inputs = read_inputs(scene)
         return aaplug.evaluate(*inputs, output, **keywords | given)
 
     with running(options, None, lambda: None, (), shared=first.output) as workers:
-        runs = [(name, partial(run, own, workers.cluster)) for name, own in scenes]
+        runs = [(name, partial(run, scene, workers.cluster)) for name, scene in scenes]
         how = {"resume": options.resume, "overwrite": options.overwrite, "monitor": TERMINAL}
         batch = aaplug.batch(runs, first.output, **how)
-    if words.json:
-        print_json(batch.summary())
-    else:
-        show(*batch.tables())
-    return FAILED if batch.failures else 0
+    return Answer(batch.summary(), batch.tables(), bool(batch.failures))
 
 
-def _scenes_to_evaluate(words: Words) -> list[tuple[str, Words]]:
-    """The scenes by name, with their options."""
-    if words.batch is not None:
-        if named := words.more or words.scene or words.model_path:
-            raise UsageError("batch", f"names the scenes; leave {named} out")
-        return scenes_of(words.batch, words.where(batch=None))
-    paths = [path_of(words), *words.more]
-    named = [path.stem if path.is_file() else path.name for path in paths]
-    return [(n, words.where(more=(), scene=p, model_path=None)) for n, p in zip(named, paths, strict=True)]
-
-
-def for_each_scene(words: Words, suffix: Callable[[Words], str], work: Callable[[Words], dict[str, Any]]) -> int:
+def for_each_scene(words: Words, suffix: Callable[[Words], str]) -> Answer:
     """Do a verb for every scene of its batch file, and write batch.json.  One scene that fails stops no other.
 
     suffix: of a scene's output.
-    work: does the verb for one scene, and returns facts for JSON; a `status` among them replaces "done".
     """
     from aaplug.evaluation.report.files import as_json, write_texts
     from aaplug.io.atomic import refuse_existing
+    from aaplug.io.scenes.pyramid_folder import is_pyramid, read_manifest
     from aaplug.options.shared import RecipeOptions
     from aaplug.rendering.job import running
     from aaplug.verbs.batch import SUMMARY, status_table
+    from aaplug.verbs.lod import DEFAULT_LEVELS
     from aaplug.verbs.views import file_names
 
-    named = dict(scenes_of(words.batch, words.where(batch=None, resume=False, scheduler=None)))
-    folder = next(iter(named.values())).output
-    slugs = file_names(list(named), "scene", 3)
-    todo = {
-        name: own.where(output=folder / (slug + suffix(own)))
-        for slug, (name, own) in zip(slugs, named.items(), strict=True)
-    }
-    outcomes: dict[str, Any] = {}
-    for name, own in list(todo.items()):
-        if words.resume and own.output.is_file():
-            outcomes[name] = made_before(todo.pop(name))
+    scenes = dict(scenes_of(words.batch, words.where(batch=None, resume=False, scheduler=None)))
+    folder = next(iter(scenes.values())).output
+    done, todo = dict[str, dict[str, Any]](), dict[str, Words]()
+    for slug, (name, scene) in zip(file_names(list(scenes), "scene", 3), scenes.items(), strict=True):
+        output = folder / (slug + suffix(scene))
+        levels = len(read_manifest(output, unfinished=True).levels) if words.resume and is_pyramid(output) else 0
+        if words.resume and (output.is_file() or levels > (scene.values.get("levels") or DEFAULT_LEVELS)):
+            done[name] = {"status": "kept", "output": str(output)}
+        else:
+            todo[name] = scene.where(output=output, resume=levels > 0)
     check = partial(refuse_existing, [folder / SUMMARY], words.overwrite or words.resume)
     check()
     options = RecipeOptions(scheduler=words.scheduler, threads=words.threads, monitor=TERMINAL)
     with running(options, folder, check, [words.batch], folder=True) as workers:
         apply = map if workers.cluster is None else workers.cluster.map
-        results = apply(_OneScene(work, None if workers.cluster is None else Path.cwd()), todo.values())
+        results = apply(_OneScene(None if workers.cluster is None else Path.cwd()), todo.values())
         for name, facts in zip(todo, results, strict=True):
-            failed = isinstance(facts, str)
-            outcomes[name] = {"status": "failed", "error": facts} if failed else {"status": "done", **facts}
-            TERMINAL.say(f"{name}: {outcomes[name]['status']}{f': {facts}' if failed else ''}")
-        summary = as_json({"scenes": {name: outcomes[name] for name in named}})
-        write_texts(folder, {SUMMARY: summary}, overwrite=True)
-    if words.json:
-        print_json({"scenes": outcomes})
-    else:
-        rows = [(name, facts["status"], facts.get("error") or facts["output"]) for name, facts in outcomes.items()]
-        show(status_table("output or why there is none", rows))
-    return FAILED if any(facts["status"] == "failed" for facts in outcomes.values()) else 0
-
-
-def made_before(own: Words) -> dict[str, Any]:
-    """Facts of a scene whose output an earlier run made."""
-    return {"status": "kept", "output": str(own.output)}
+            done[name] = {"status": "failed", "error": facts} if isinstance(facts, str) else {"status": "done", **facts}
+            TERMINAL.say(": ".join([name, done[name]["status"], *([facts] if isinstance(facts, str) else [])]))
+        outcomes = {name: done[name] for name in scenes}
+        write_texts(folder, {SUMMARY: as_json({"scenes": outcomes})}, overwrite=True)
+    rows = [(name, facts["status"], facts.get("error") or facts["output"]) for name, facts in outcomes.items()]
+    failed = any(facts["status"] == "failed" for facts in outcomes.values())
+    return Answer({"scenes": outcomes}, [status_table("output or why there is none", rows)], failed)
 
 
 @dataclass(frozen=True)
 class _OneScene:
-    """Does the work for one scene.
+    """Does the verb for one scene: facts of what was made, or why there is nothing.
 
     elsewhere: on a worker, with one thread, whose terminal nobody reads: the folder that relative paths start from.
     """
 
-    work: Callable[[Words], dict[str, Any]]
     elsewhere: Path | None
 
-    def __call__(self, own: Words) -> dict[str, Any] | str:
-        """Facts of what was made, or why there is nothing."""
+    def __call__(self, scene: Words) -> dict[str, Any] | str:
         from aaplug.verbs.batch import outcome
 
         if self.elsewhere is None:
-            return outcome(lambda: self.work(own), TERMINAL)
+            return outcome(lambda: scene.command.run(scene).facts, TERMINAL)
         with quiet(), chdir(self.elsewhere):
-            return outcome(lambda: self.work(own.where(threads=1)), TERMINAL)
+            return outcome(lambda: scene.command.run(scene.where(threads=1)).facts, TERMINAL)
 
 
 def scenes_of(path: Path, base: Words) -> list[tuple[str, Words]]:

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 from aaplug.system.errors import printable
 from aaplug.system.monitor import Monitor, Tell
 
-FAILED = 1  # exit code of work that is not all done
 LINE_SECONDS = 10.0  # between progress lines where there is no terminal
 
 if TYPE_CHECKING:
@@ -29,22 +28,23 @@ def log() -> "Console":
     return Console(stderr=True, highlight=False, soft_wrap=True)
 
 
-def show(*things: Any) -> None:
-    """Print tables and texts on stdout."""
+def show(things: Iterable[Any]) -> None:
+    """Print tables and lines of text on stdout."""
     from rich.console import Console
 
-    Console(highlight=False).print(*things)
+    for each in things:
+        print(printable(each)) if isinstance(each, str) else Console(highlight=False).print(each)
 
 
-def show_rows(rows: Iterable[Sequence[str]], headings: Sequence[str] = ()) -> None:
-    """Print texts in columns on stdout."""
+def table(rows: Iterable[Sequence[str]], headings: Sequence[str] = ()) -> Any:
+    """Texts in columns."""
     from rich.markup import escape
     from rich.table import Table
 
-    table = Table(*headings, show_header=bool(headings), box=None, pad_edge=False)
+    grid = Table(*headings, show_header=bool(headings), box=None, pad_edge=False)
     for row in rows:
-        table.add_row(*map(escape, row))
-    show(table)
+        grid.add_row(*map(escape, row))
+    return grid
 
 
 @contextmanager

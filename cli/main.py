@@ -81,7 +81,8 @@ def _guarded(words: Sequence[str]) -> int:
 
 
 def run(words: Sequence[str]) -> int:
-    """Run one verb with its options; its result is the exit code."""
+    """Run one verb with its options; returns the exit code."""
+    from . import console
     from .verbs import VERBS
 
     if words and words[0] in VERBS:
@@ -91,7 +92,12 @@ def run(words: Sequence[str]) -> int:
             return 0
         given = command.parse(words[1:])
         several = given.values.get("batch") is not None  # then each scene has options of its own, checked with its file
-        return command.run(given if several else given.checked())
+        answer = command.run(given if several else given.checked())
+        if given.values.get("json"):
+            console.print_json(answer.facts)
+        elif answer.shown:
+            console.show(answer.shown)
+        return FAILED if answer.failed else 0
     if words and words[0] in ("-h", "--help"):
         show_verbs()
         return 0

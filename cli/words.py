@@ -142,6 +142,14 @@ class Words:
         return words
 
 
+class Answer(NamedTuple):
+    """What a verb came to: facts for --json, tables and texts for people, and whether some of the work failed."""
+
+    facts: Any
+    shown: Sequence[Any] = ()
+    failed: bool = False
+
+
 @dataclass(frozen=True)
 class Command:
     """A verb of the command line: its help, its options and what runs it.
@@ -152,7 +160,7 @@ class Command:
     name: str
     help: str
     stated: Sequence[type[Options] | Option]
-    run: Callable[[Words], int]
+    run: Callable[[Words], Answer]
 
     @cached_property
     def options(self) -> dict[str, Option]:

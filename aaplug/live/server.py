@@ -53,9 +53,7 @@ class Server:
         UsageError: nothing can listen there.
     """
 
-    def __init__(
-        self, studio: Studio, open_scene: Callable[[Path], Subject], host: str = "127.0.0.1", port: int = 8080
-    ):
+    def __init__(self, studio: Studio, open_scene: Callable[[Path], Subject], host: str, port: int):
         self._studio, self._open_scene, self._host, self._port = studio, open_scene, host, port
         self._token = None if _is_local(host) else secrets.token_urlsafe(16)
         self._open_pages = 0
