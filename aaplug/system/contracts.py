@@ -59,8 +59,10 @@ class LazyType:
     place: str
 
     def __contains__(self, value: Any) -> bool:
+        if value is None or isinstance(value, type | str):  # no reason to import anything
+            return False
         module, _, name = self.place.partition(":")
-        return not isinstance(value, type) and isinstance(value, getattr(import_module(module), name))
+        return isinstance(value, getattr(import_module(module), name))
 
     def __str__(self) -> str:
         return self.place.partition(":")[2]
