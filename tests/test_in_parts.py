@@ -15,7 +15,7 @@ from aaplug.io.scenes import read_scene, write_parts, write_scene
 from aaplug.methods import FORMS
 from aaplug.methods.conversion import fuse
 from aaplug.methods.filters.smoothing import NYQUIST_VARIANCE
-from aaplug.system.errors import FormatError, FrameError, UsageError
+from aaplug.system.errors import FormatError, FrameError, OutputError, UsageError
 from aaplug.verbs.in_parts import convert_parts
 from tests.conftest import make_camera, make_scene
 
@@ -61,8 +61,9 @@ def test_a_failure_in_a_late_part_leaves_no_file(tmp_path: Path, cameras):
     scene = make_scene(100)
     scene.means[90, 1] = math.nan
     path = tmp_path / "in.ply"
-    with pytest.raises(AssertionError, match="NaN"):
+    with pytest.raises(OutputError, match="row 90 has NaN in y"):
         write_scene(path, scene)
+    assert not path.exists()
     write_scene(path, make_scene(100))
     data = bytearray(path.read_bytes())
     stride = (len(data) - data.index(b"end_header\n") - 11) // 100

@@ -234,14 +234,17 @@ def test_what_no_camera_sees_stays_when_all_else_is_too_faint():
     scene = replace(make_scene(4), log_scales=torch.full((4, 3), -7.0), logit_opacities=torch.full((4,), -2.0))
     scene.means[3] = torch.tensor([0.0, -40.0, 0.0])
     scene.log_scales[3], scene.logit_opacities[3] = -2.0, 4.0
-    sizes = [len(level.scene) for level in aaplug.lod(scene, CameraSet(tuple(cameras), ()), levels=5, refine=False)]
+    sizes = [
+        len(level.scene)
+        for level in aaplug.lod(scene, CameraSet(tuple(cameras), ()), levels=5, refine=False, min_seen=0.0)
+    ]
     assert (sizes[0], sizes[-2:]) == (4, [1, 1])
 
 
 def test_a_level_may_have_no_gaussians(tmp_path, sample_cameras):
     """What is too faint to be drawn at a size is in no level from there on."""
     faint = replace(make_scene(3), log_scales=torch.full((3, 3), -7.0), logit_opacities=torch.full((3,), -4.0))
-    levels = aaplug.lod(faint, sample_cameras, tmp_path / "levels", levels=4, refine=False)
+    levels = aaplug.lod(faint, sample_cameras, tmp_path / "levels", levels=4, refine=False, min_seen=0.0)
     pyramid = aaplug.read_scene(tmp_path / "levels").levels
     assert pyramid.sizes == tuple(len(level.scene) for level in levels)
     assert (pyramid.sizes[0], pyramid.sizes[-1]) == (3, 0)

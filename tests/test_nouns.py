@@ -79,7 +79,7 @@ POSE = VIEWS[0].cam_from_world
 ODD_CAMERAS = [
     *({"fx": x} for x in (0.0, -1.0, math.inf, math.nan, 1e30)),
     *({"cy": x} for x in (math.inf, math.nan)),
-    *({"width": x} for x in (0, -1, 10**9)),
+    *({"width": x} for x in (0, -1, 10**10)),
     *({"trained_focal": x} for x in (0.0, -1.0, math.nan)),
     *({"cam_from_world": x} for x in (POSE * math.nan, 0 * POSE, 2 * POSE, POSE.half())),
     {"cam_from_world": POSE * torch.tensor([[-1.0], [1.0], [1.0], [1.0]], dtype=torch.float64)},
@@ -109,9 +109,9 @@ def test_gaussians_with_nan_are_refused_in_memory_as_from_a_file(column):
         scene_of(replace(SCENE, **{column: poisoned}))
 
 
-@pytest.mark.parametrize("background", [(1.0, 1.0), (1.0, 1.0, math.nan), (255.0, 0.0, 0.0), "blue", 3])
+@pytest.mark.parametrize("background", [(1.0, 1.0), (1.0, 1.0, math.nan), (255.0, 0.0, 0.0), "bluish", 3])
 def test_a_background_is_a_colour(background):
-    with pytest.raises(UsageError, match="background: expected"):
+    with pytest.raises(UsageError, match="background: (expected|takes)"):
         Renderer.of(make_scene(6), VIEWS, background=background)
 
 

@@ -23,7 +23,7 @@ from aaplug.system.contracts import Range, check_fields, contract
 from aaplug.system.errors import UsageError
 
 WHOLE_SLACK = 1e-6  # a size (px) or a factor this close to a whole number is one
-MAX_SIDE = 2**24  # px: up to here float32 tells pixels apart
+MAX_SIDE = 2**31 - 1  # px: files store sides in 32 bits
 MAX_FOCAL = 1e9  # px: far above any real lens; what is computed from it stays finite
 MAX_DISTANCE = 1e18  # world units from the origin; its square fits into float32
 MIN_SINE = 1e-12  # between the direction of sight and up
@@ -77,9 +77,14 @@ class Camera:
     lens: Lens | None = None
 
     def __post_init__(self) -> None:
-        check_fields(self)
-        object.__setattr__(self, "cam_from_world", self.cam_from_world.double())
-        self._check_pose()
+        try:
+            check_fields(self)
+            object.__setattr__(self, "cam_from_world", self.cam_from_world.double())
+            self._check_pose()
+        except UsageError as error:
+            if error.where == "name" or not self.name:
+                raise
+            raise UsageError(f"camera {self.name}", str(error)) from None
 
     def _check_pose(self) -> None:
         """Refuse a pose that is no rigid motion."""

@@ -118,7 +118,7 @@ class Job(Generic[O_co]):
             rasterizer = rasterizer.within(options.memory * 1e9)
         training = self.training(self.scene)
         look = own_look(self.scene, training, rasterizer, colour)
-        if check and not self.cameras.assumed:
+        if check and len(look.scene) and not self.cameras.assumed:
             fit = agreement(look, self.cameras)
             say(f"fit: {fit}")
             if fit.doubt:

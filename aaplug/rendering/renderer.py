@@ -169,6 +169,7 @@ class Renderer:
         """The same for another process, without the scene's file, which may be open."""
         return replace(self, scene=replace(self.scene, origin=None), source=None)
 
+    @contract
     def __call__(self, camera: Camera) -> Render:
         """Render one view: rgb and alpha of `camera.hw`.
 
@@ -228,7 +229,9 @@ class Renderer:
             if recipe.target_rate and self.cutter is not None and recipe.levels is not None:
                 for_coarsest = math.ceil(self.cutter.pyramid.coarsest_rate / rate - RATE_TOLERANCE)
                 samples = int(min(samples, max(recipe.levels.most_samples, for_coarsest)))
-        return samples, recipe.neighbours_at(round(samples * rate, RATE_DIGITS)) if weighs else 0.0
+        return samples, recipe.neighbours_at(
+            max(10**-RATE_DIGITS, round(samples * rate, RATE_DIGITS))
+        ) if weighs else 0.0
 
     @contract
     def coarsening(self, camera: Camera, samples: int) -> float:

@@ -29,11 +29,15 @@ CAMERAS = [make_camera(eye) for eye in EYES]
 FREE = replace(make_camera((0.3, -2.0, 0.2)), trained_focal=None)
 SCENE = make_scene(N, dtype=F64)
 EXTREMES: dict[str, Callable[[Gaussians], Gaussians]] = {
-    "points": lambda scene: replace(scene, log_scales=torch.full((N, 3), -80.0)),
-    "needles": lambda scene: replace(scene, log_scales=torch.tensor([[0.0, -30.0, -30.0]] * N)),
-    "sheets": lambda scene: replace(scene, log_scales=torch.tensor([[0.0, 0.0, -80.0]] * N)),
-    "giants": lambda scene: replace(scene, log_scales=torch.full((N, 3), 12.0)),
+    "points": lambda scene: _with_scales(scene, -80.0, -80.0, -80.0),
+    "needles": lambda scene: _with_scales(scene, 0.0, -30.0, -30.0),
+    "sheets": lambda scene: _with_scales(scene, 0.0, 0.0, -80.0),
+    "giants": lambda scene: _with_scales(scene, 12.0, 12.0, 12.0),
 }
+
+
+def _with_scales(scene: Gaussians, *log_scales: float) -> Gaussians:
+    return replace(scene, log_scales=scene.log_scales.new_tensor(log_scales).repeat(N, 1))
 
 
 class Situation(NamedTuple):

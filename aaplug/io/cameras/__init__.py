@@ -86,7 +86,12 @@ def read_cameras(
     formats = sorted(CAMERA_FORMATS.values(), key=OWN.__contains__)  # plug-ins first
     for format in formats:
         if format.sniff(path):
-            cameras = _checked(format.read(path, options), path)
+            try:
+                cameras = format.read(path, options)
+            except UsageError as error:
+                if not error.where.startswith("camera "):  # but an option
+                    raise
+                raise FormatError(path, str(error)) from error
             return replace(cameras, files=files_of(path, cameras))
     signs = "; ".join(format.sign for format in formats)
     raise FormatError(path, f"holds no cameras of a known format; looked for: {signs}")
@@ -95,20 +100,6 @@ def read_cameras(
 def holds_cameras(path: str | PathLike[str]) -> bool:
     """Whether any format recognizes cameras at this path."""
     return any(format.sniff(Path(path)) for format in CAMERA_FORMATS.values())
-
-
-def _checked(found: CameraSet, path: Path) -> CameraSet:
-    """The cameras, after a check of what a format may have let through: sizes, focal lengths and rigid poses."""
-    for camera in found.all:
-        place, motion = Place(path, f"camera {camera.name}"), camera.cam_from_world
-        for field, check in (("width", pixels), ("height", pixels), ("fx", focal), ("fy", focal)):
-            check(getattr(camera, field), place, field)
-        for field in ("cx", "cy"):
-            value = number(getattr(camera, field), place, field)
-            place.expect(abs(value) <= MAX_FOCAL, field, f"at most {MAX_FOCAL:g} px from 0", value)
-        numbers(motion[:3, 3].tolist(), 3, place, "translation")
-        pose(motion[:3, :3], motion[:3, 3], place, "cam_from_world")
-    return found
 
 
 def select_views(cameras: CameraSet, spec: str) -> tuple[Camera, ...]:
