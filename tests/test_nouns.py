@@ -111,7 +111,7 @@ def test_gaussians_with_nan_are_refused_in_memory_as_from_a_file(column):
 
 @pytest.mark.parametrize("background", [(1.0, 1.0), (1.0, 1.0, math.nan), (255.0, 0.0, 0.0), "bluish", 3])
 def test_a_background_is_a_colour(background):
-    with pytest.raises(UsageError, match="background: (expected|takes)"):
+    with pytest.raises(UsageError, match=r"background: (expected|takes)"):
         Renderer.of(make_scene(6), VIEWS, background=background)
 
 
