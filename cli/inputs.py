@@ -18,7 +18,7 @@ from .words import Words, options_of, worded
 if TYPE_CHECKING:
     from aaplug.io.scenes.scene import Scene
 
-SCENE_FILE = Group("scene file options", "How scene files are read.")
+SCENE_FILE = Group("scene file", "How scene files are read.")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -87,9 +87,6 @@ def run(words: Sequence[str]) -> int:
 
     if words and words[0] in VERBS:
         command = VERBS[words[0]]
-        if {"-h", "--help"} & {*words}:
-            print(command.explained(), end="")
-            return 0
         given = command.parse(words[1:])
         several = given.values.get("batch") is not None  # then each scene has options of its own, checked with its file
         answer = command.run(given if several else given.checked())

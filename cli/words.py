@@ -6,15 +6,14 @@ the heading under which it stands.
 
 import math
 import re
-from argparse import ArgumentParser, RawDescriptionHelpFormatter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import MISSING, astuple, dataclass, fields
+from contextlib import redirect_stderr, suppress
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass, make_dataclass
 from functools import cached_property
 from importlib import import_module
+from io import StringIO
 from pathlib import Path
-from textwrap import wrap
-from typing import Any, NamedTuple, TypeVar, get_type_hints
+from typing import Annotated, Any, NamedTuple, TypeVar, get_type_hints
 
 from aaplug.options.base import PYTHON_ONLY, Argument, Group, Options, argument_of, docs_of, flag
 from aaplug.system.errors import MAX_VALUE_CHARACTERS, UsageError, did_you_mean
@@ -22,7 +21,7 @@ from aaplug.system.errors import MAX_VALUE_CHARACTERS, UsageError, did_you_mean
 FILE = re.compile(r".*/.*|.*\.[A-Za-z]\w*", re.DOTALL)  # a word that names a file, unlike names and numbers
 OPTION = re.compile(r"-(?![\d.])")  # the beginning of a word that is no negative number
 MAX_METAVAR = 30  # characters; longer lists of names stand in an option's help
-SILENT_DEFAULTS = (None, False, True, MISSING, (), math.inf)  # that help does not show
+SILENT_DEFAULTS = (None, False, True, (), math.inf)  # that help does not show
 
 T = TypeVar("T", bound=Options)
 
@@ -51,12 +50,6 @@ class Option(NamedTuple):
         """The option as messages name it."""
         return self.flags[0] if self.flags else str(self.argument and self.argument.metavar)
 
-    def takes(self, words: Sequence[str], word: str) -> bool:
-        """True if a word belongs to its value after these."""
-        if self.argument is None:
-            return False
-        return not FILE.fullmatch(word) if self.argument.count is None else len(words) < self.argument.count
-
     def value(self, words: Sequence[str]) -> Any:
         """The value that words give; raises UsageError."""
         if self.argument is None and not words:
@@ -69,6 +62,31 @@ class Option(NamedTuple):
                 return value
             takes = self.argument.takes or self.argument.metavar
         raise UsageError(self.shown, f"takes {takes}, got {got}")
+
+    @property
+    def spec(self) -> tuple[str, Any, Any]:
+        """The option as a field of the parser's dataclass."""
+        import tyro
+
+        argument, text, default = self.argument, self.help, field(default=self.default)
+        hint = "" if self.default in SILENT_DEFAULTS or "(default" in text else None
+        if argument is None:
+            about = tyro.conf.arg(help=text, help_behavior_hint=hint)
+            return self.name, Annotated[bool, about], default
+        metavar = argument.metavar
+        if len(metavar) > MAX_METAVAR:
+            listed = metavar.replace(" ...", "").replace("|...", " and others").replace("|", ", ")
+            metavar, text = self.name.upper().replace("_", "-"), f"{text}  Names: {listed}."
+
+        def words_of(value: Any) -> list[str]:
+            values = value if isinstance(value, list | tuple) else [value]
+            return [f"{each:g}" if isinstance(each, float) else str(each) for each in values]
+
+        how = argument.count or "*", metavar, self.value, lambda _: True, words_of
+        about = tyro.conf.arg(metavar=metavar, aliases=argument.flags, help=text, help_behavior_hint=hint)
+        place = (tyro.conf.Positional,) * argument.by_place
+        annotation = Annotated[(Any, tyro.constructors.PrimitiveConstructorSpec(*how), about, *place)]
+        return self.name, annotation, default
 
 
 def output(metavar: str, text: str, default: Any = MISSING) -> Option:
@@ -91,11 +109,6 @@ def options_of(options: type[Options]) -> list[Option]:
             group = next((part for part in parts if isinstance(part, Group)), None)
             stated.append(Option(each.name, argument_of(hints[each.name]), docs[each.name], each.default, group))
     return stated
-
-
-class _Help(RawDescriptionHelpFormatter):
-    def _split_lines(self, text: str, width: int) -> list[str]:
-        return wrap(" ".join(text.split()), width, break_on_hyphens=False)  # names stay whole
 
 
 class Words:
@@ -176,78 +189,67 @@ class Command:
         """The dataclasses that state most of the options."""
         return [each for each in self.stated if not isinstance(each, Option)]
 
+    @cached_property
+    def parser(self) -> type[Any]:
+        """A dataclass of the options: first those without a heading, then one nested dataclass for each heading."""
+        import tyro
+
+        specs, groups = list[Any](), dict[Group, list[Any]]()
+        for each in sorted(self.options.values(), key=lambda each: each.default is not MISSING):
+            (groups.setdefault(each.group, []) if each.group else specs).append(each.spec)
+        for group, members in groups.items():
+            nested = make_dataclass(group.title, members)
+            nested.__doc__ = group.about
+            name = group.title.replace(" ", "_") + "_options"
+            specs.append((name, Annotated[nested, tyro.conf.arg(name=group.title)], field(default_factory=nested)))
+        parser = make_dataclass(self.name, specs)
+        parser.__doc__ = self.help
+        return parser
+
     def parse(self, words: Sequence[str]) -> Words:
-        """Read words; raises UsageError if they do not fit.
+        """Read words, or print --help and exit; raises UsageError if they do not fit.
 
         An option of several values takes them apart or between commas, and ends before a word that names a file.
         """
+        import tyro
+
         flags = {flag: option for option in self.options.values() for flag in option.flags}
-        given: dict[str, list[str]] = {}
-        option, places = None, list[str]()
+        files, others, option = list[str](), list[str](), None
         for word in words:
-            name, equals, value = word.partition("=")
-            name = name.replace("_", "-")
-            if name in flags:
-                option = flags[name]
-                given[option.name] = [value] if equals else []
-            elif OPTION.match(word):
-                raise self.refusal(f"Unrecognized options: {name}{did_you_mean(name, flags)}")
-            elif option is not None and option.takes(given[option.name], word):
-                given[option.name].append(word)
+            name = word.partition("=")[0].replace("_", "-")
+            if OPTION.match(word):
+                if name not in (*flags, "-h", "--help"):
+                    raise self.refusal(f"Unrecognized options: {name}{did_you_mean(name, flags)}")
+                option = flags.get(name)
+                others.append(word)
             else:
-                places.append(word)
-        for option in self.options.values():
-            if not option.flags and places:
-                most = 1 if option.argument and option.argument.count == 1 else len(places)
-                given[option.name], places = places[:most], places[most:]
-        if places:
-            raise self.refusal(f"Unrecognized words: {' '.join(places)}")
-        values = {name: option.default for name, option in self.options.items()}
-        values |= {name: self.options[name].value(words) for name, words in given.items()}
-        for name in [name for name, value in values.items() if value is MISSING]:
-            missing = self.options[name]
-            raise self.refusal(
-                f"{'/'.join(missing.flags[::-1]) or missing.shown} is missing: {missing.help.rstrip('.')}"
-            )
+                several = option and option.argument and option.argument.count is None
+                (files if several and FILE.fullmatch(word) else others).append(word)
+        box, config = StringIO(), (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
+        how = {"prog": f"aaplug {self.name}", "args": [*files, *others], "config": config}
+        try:
+            with redirect_stderr(box):
+                parsed, rest = tyro.cli(self.parser, **how, return_unknown_args=True)
+        except SystemExit as end:
+            if not end.code:  # --help
+                raise
+            text = box.getvalue().partition("\n")[2]  # without the title; the box is drawn in ASCII on some terminals
+            text = " ".join(re.findall(r"[^\s│╭╮╰╯─|+]+", text))
+            text = re.split(r" \(required\)| For full helptext| Argument helptext", text)[0]
+            raise self.refusal(text.replace(f" from aaplug {self.name}", "").rstrip(". ")) from end
+        if rest:
+            raise self.refusal(f"Unrecognized words: {' '.join(rest)}")
+        values = dict[str, Any]()
+        for name, value in vars(parsed).items():
+            values |= vars(value) if is_dataclass(value) else {name: value}
         return Words(self, values)
 
     def refusal(self, problem: str) -> UsageError:
         """The error of words that are no command line of this verb."""
         return UsageError(f"aaplug {self.name}", f"{problem}; see `aaplug {self.name} --help`")
 
-    def explained(self) -> str:
-        """The text of --help: first the options without a heading, then each heading with its own."""
-        options = sorted(self.options.values(), key=lambda option: (bool(option.flags), option.default is not MISSING))
-        places = " ".join(option.shown for option in options if not option.flags)
-        parser = ArgumentParser(
-            usage=f"aaplug {self.name} [-h] [OPTIONS] {places}".rstrip(), description=self.help, formatter_class=_Help
-        )
-        groups = dict.fromkeys(option.group for option in options)
-        headings = {group: parser.add_argument_group(*astuple(group)) if group else parser for group in groups}
-        for option in options:
-            _explain(headings[option.group], option)
-        return parser.format_help()
-
 
 VERBS: dict[str, Command] = {}  # by name; `verbs` fills it
-
-
-def _explain(group: Any, option: Option) -> None:
-    """Add an option to a heading of the help, with its default and, where there are many, its names."""
-    argument, text = option.argument, option.help
-    how: dict[str, Any] = {"action": "store_true"}
-    if argument is not None:
-        metavar = argument.metavar
-        if len(metavar) > MAX_METAVAR:
-            listed = metavar.replace(" ...", "").replace("|...", " and others").replace("|", ", ")
-            metavar, text = option.name.upper().replace("_", "-"), f"{text}  Names: {listed}."
-        how = {"metavar": metavar}
-    if "(default" not in text and option.default not in SILENT_DEFAULTS:
-        values = option.default if isinstance(option.default, list | tuple) else [option.default]
-        text = f"{text} (default: {' '.join(f'{v:g}' if isinstance(v, float) else str(v) for v in values)})"
-    long = [name for name in option.flags if name.startswith("--")][:1]
-    names = [*(name for name in option.flags if not name.startswith("--")), *long] or [option.name]
-    group.add_argument(*names, **how, help=text.replace("%", "%%"))
 
 
 def worded(text: str, options: Iterable[Option]) -> str:

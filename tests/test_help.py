@@ -11,7 +11,7 @@ ROOT = Path(__file__).resolve().parents[1]
 FILES = [*sorted((ROOT / "aaplug" / "options").glob("*.py")), *sorted((ROOT / "cli").glob("*.py"))]
 
 
-HEADING = re.compile(r"^([a-z ]+):$", re.MULTILINE)  # of a part of --help
+HEADING = re.compile(r"^ ([a-z ]+?) +\n [-─]+ *$", re.MULTILINE)  # of a part of --help, where there is no terminal
 
 
 def helps(file: Path) -> list[str]:
@@ -60,7 +60,7 @@ def test_help_of_a_verb_opens_with_when_to_use_it_and_when_another(cli, verb):
 
 def test_render_shows_few_options_before_those_with_a_heading(cli):
     text = HEADING.split(cli("render --help")[1])
-    headings, options = text[1::2], re.findall(r"^ {2}(-\w|--[a-z-]+|[A-Z]+)\b", "".join(text[2:6:2]), re.MULTILINE)
+    headings, options = text[1::2], re.findall(r"^ {1,2}(-\w|--[a-z-]+|[A-Z]+)\b", "".join(text[2:6:2]), re.MULTILINE)
     assert headings[:3] == ["positional arguments", "options", "scene file options"]
     assert {"SCENE", "-h", "-o", "--cameras", "--scale"} <= set(options)
     assert len(options) <= 15

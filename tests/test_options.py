@@ -75,12 +75,12 @@ def test_a_number_outside_of_its_range_is_refused(group, name, specs):
 
 
 REFUSED = {
-    "render s.ply": "-o/--output is missing: A folder for the images, or one .png for one view; see",
+    "render s.ply": "Missing: -o PATH, --output PATH A folder for the images, or one .png for one view; see",
     "render --nope": "Unrecognized options: --nope",
     "render s.ply -o out --scal 2": "Unrecognized options: --scal; did you mean --scale?; see",
-    "render s.ply -o": "--output: takes PATH, got nothing",
+    "render s.ply -o": "Missing value for argument '-o/--output'",
     "render s.ply t.ply -o x": "Unrecognized words: t.ply",
-    "render s.ply -o x --json=3": "--json: takes no value, got 3",
+    "render s.ply -o x --json=3": "Unrecognized words: 3; see",
     "convert s.ply -o c.ply --for supersplatt": "--for: 'supersplatt' is not one of classic",
     "lod s.ply -o l.ply --for spark --no-refine": "--for: is what the result is tuned for: leave out --no-refine",
     "render s.ply -o out --scale x": "--scale: takes 0.001..64, got x",

@@ -22,17 +22,17 @@ PYTHON_ONLY = "python only"  # marks an option that the command line does not of
 
 @dataclass(frozen=True)
 class Group:
-    """A heading of `--help`, under which an option stands; options without one stand first."""
+    """A heading of `--help`, which adds "options" to the title; options without one stand first."""
 
     title: str
     about: str
 
 
-CAMERAS = Group("camera options", "How the camera files are read, and which of the scene's Gaussians they must see.")
-ORBIT = Group("orbit options", "Without cameras: views on an orbit around the scene, and the training that is assumed.")
-DRAWING = Group("drawing options", "How images are drawn: programs, memory and machines.")
-REPORT = Group("report options", "Files beside the figures.")
-TUNING = Group("tuning options", "The optimization, of which the defaults were measured.")
+CAMERAS = Group("camera", "How the camera files are read, and which of the scene's Gaussians they must see.")
+ORBIT = Group("orbit", "Without cameras: views on an orbit around the scene, and the training that is assumed.")
+DRAWING = Group("drawing", "How images are drawn: programs, memory and machines.")
+REPORT = Group("report", "Files beside the figures.")
+TUNING = Group("tuning", "The optimization, of which the defaults were measured.")
 
 
 @dataclass(frozen=True, kw_only=True)
