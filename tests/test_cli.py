@@ -145,7 +145,7 @@ REFUSED = {
     f"{TUNE} --method mipmap-gs --scale 0.5 0.25": ["one model for one scale"],
     f"{TUNE} --upsampler nearest": ["expected bicubic, lanczos"],
     f"{TUNE} --truth photographs": ["has no photograph; --truth self"],
-    f"{TUNE} --move size": ["--move: needs parameters out of means"],
+    f"{TUNE} --move size": ["--move: 'size' is not one of means"],
     f"{TUNE} --overwrite -o scene.ply": ["is also the input"],
 }
 

@@ -19,7 +19,6 @@ from aaplug.io.scenes import write_scene
 from aaplug.rendering.renderer import Renderer
 from aaplug.verbs.view import serving
 from tests.conftest import make_camera, make_scene
-from tests.test_cli import cli, dataset  # noqa: F401  (fixtures)
 from tests.test_view import decoded, with_photograph
 
 SEEN = "#picture"
@@ -388,7 +387,7 @@ def test_a_path_a_still_and_a_command_are_kept(opened, seen, tmp_path):
 
 
 @pytest.mark.parametrize("at", ["0", ""])
-def test_the_copied_command_draws_what_was_seen(opened, cli, at):  # noqa: F811
+def test_the_copied_command_draws_what_was_seen(opened, cli, at):
     words = ("scene.ply", "--cameras", ".")
     with serving("scene.ply", ".", port=0, rasterizer="eager", words=words) as where:
         page = opened(width=1003, where=where, permissions=["clipboard-read", "clipboard-write"])
