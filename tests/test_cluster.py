@@ -19,6 +19,7 @@ import pytest
 import aaplug
 from aaplug.evaluation.journal import Journal
 from aaplug.system.errors import FormatError, UsageError
+from aaplug.system.extras import install_command
 from aaplug.system.locks import SCRATCH_PREFIX, remove_left
 from aaplug.system.monitor import SILENT, Monitor
 from tests.test_batch import timeless
@@ -214,4 +215,4 @@ def test_without_the_extra_its_name_is_told(cli, monkeypatch):
     monkeypatch.setattr("aaplug.rendering.job.find_spec", lambda name: None)
     code, _, err = cli("render scene.ply --cameras . -o out --rasterizer eager --scheduler local")
     assert code == 2
-    assert err.endswith("error: --scheduler: needs the extra `cluster`: pip install 'aaplug[cluster]'\n")
+    assert err.endswith(f"error: --scheduler: needs the extra `cluster`: {install_command('cluster')}\n")

@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 import struct
 import zipfile
 from dataclasses import dataclass, replace
@@ -18,6 +19,7 @@ from aaplug.io.scenes.options import SceneFileOptions
 from aaplug.io.scenes.packed import half_turn_about_x
 from aaplug.io.scenes.scene import Scene
 from aaplug.system.errors import FormatError, OutputError, UsageError
+from aaplug.system.extras import install_command
 from aaplug.system.registry import Registry, named
 from tests.conftest import SAMPLE
 from tests.scene_files import DATA, MADE, ksplat, oracle, splat, splats, spz, write_file
@@ -260,7 +262,7 @@ def test_spz_says_what_it_cannot_hold(tmp_path: Path, expected, changes, problem
 
 def test_spz_without_its_writer_names_the_extra(tmp_path: Path, expected, monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(UsageError, match=r"needs gsply: pip install 'aaplug\[spz\]'"):
+    with pytest.raises(UsageError, match=re.escape(f"needs gsply: {install_command('spz')}")):
         write_scene(tmp_path / "a.spz", expected)
     assert not list(tmp_path.iterdir())
 

@@ -51,7 +51,7 @@ ELSEWHERE = {  # commands of the tests and benches themselves, and what runs the
         "about an hour in all",
     ),
     **dict.fromkeys(
-        ("pip install 'aaplug[view]'", "pip install 'aaplug[cluster]'"), "the gate installs it from constraints.txt"
+        ("pip install -e '.[view]'", "pip install -e '.[cluster]'"), "the gate installs it from constraints.txt"
     ),
     **dict.fromkeys(
         (

@@ -3,6 +3,7 @@
 import asyncio
 import json
 import math
+import re
 import socket
 import time
 import webbrowser
@@ -14,6 +15,7 @@ import torch
 
 from aaplug.live.messages import PictureRequest, Side, parse
 from aaplug.system.errors import UsageError
+from aaplug.system.extras import install_command
 from aaplug.system.monitor import SILENT
 from aaplug.verbs.view import attend, serving, view
 from tests.test_view import RECIPES, seen, unpacked  # noqa: F401  (a fixture)
@@ -263,7 +265,7 @@ def test_a_browser_in_the_terminal_is_not_opened(monkeypatch):
 
 def test_without_the_extra_it_says_how_to_get_it(monkeypatch, seen):  # noqa: F811
     monkeypatch.setattr("aaplug.verbs.view.find_spec", lambda name: None)
-    with pytest.raises(UsageError, match="pip install 'aaplug\\[view\\]'"):
+    with pytest.raises(UsageError, match=re.escape(install_command("view"))):
         view(*seen, port=0)
 
 

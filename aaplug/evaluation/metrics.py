@@ -26,6 +26,7 @@ from aaplug.evaluation.metric import Image, LpipsFiles, Metric, Series
 from aaplug.evaluation.protocols import LpipsFlavour, Protocol, SsimFlavour
 from aaplug.options.shared import metric_option
 from aaplug.system.errors import UsageError, not_one_of
+from aaplug.system.extras import install_command
 
 SSIM_WINDOW = 11  # px: the Gaussian of SSIM_SIGMA, cut at 3.5 sigma (Wang et al. 2004)
 SSIM_SIGMA = 1.5  # px
@@ -63,7 +64,7 @@ def flip(image: Image, truth: Image) -> float | None:
     Raises UsageError if the package that computes it is not installed.
     """
     if importlib.util.find_spec("flip_evaluator") is None:
-        raise UsageError("FLIP", "needs the package flip-evaluator: pip install 'aaplug[flip]'")
+        raise UsageError("FLIP", f"needs the package flip-evaluator: {install_command('flip')}")
     import flip_evaluator  # pyright: ignore[reportMissingImports]
 
     a, b = (np.ascontiguousarray(x.float().cpu().numpy()) for x in (truth, image))

@@ -25,7 +25,7 @@ def find_rasterizer(name: str = "auto", frames: int = 1, say: Callable[[str], No
         raise UsageError("rasterizer", not_one_of(name, ["auto", "compiled", *RASTERIZERS]))
     kernels = load()
     if kernels is None and (name == "compiled" or (frames >= FRAMES_THAT_PAY and has_compiler())):
-        say("rasterizer: compiling the kernels, once for this machine (two to three minutes)")
+        say("rasterizer: compiling the kernels, once for this machine (about a minute on two cores)")
         try:
             kernels = build()
         except UsageError as error:

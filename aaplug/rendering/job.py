@@ -39,6 +39,7 @@ from aaplug.rendering.cost import Cost, cost_of
 from aaplug.rendering.renderer import Renderer, background_colour, own_look
 from aaplug.system.errors import FrameError, UsageError, listing, within_memory
 from aaplug.system.executors import PAYS_AFTER_SECONDS, Executor, torch_threads
+from aaplug.system.extras import install_command
 from aaplug.system.monitor import Monitor
 
 LONG_JOB = 60.0  # seconds of work from which a job is announced
@@ -224,7 +225,7 @@ def running(
             yield Workers(threads, scheduler)
             return
         if find_spec("distributed") is None:
-            raise UsageError("scheduler", "needs the extra `cluster`: pip install 'aaplug[cluster]'")
+            raise UsageError("scheduler", f"needs the extra `cluster`: {install_command('cluster')}")
         from aaplug.system.cluster import connected  # its package is an extra
 
         if output is not None:

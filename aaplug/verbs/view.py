@@ -14,6 +14,7 @@ from aaplug.options.shared import RECIPE_NAMES
 from aaplug.options.verbs import LiveOptions
 from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.system.errors import UsageError
+from aaplug.system.extras import install_command
 from aaplug.system.monitor import Monitor
 from aaplug.verbs.verb import looks
 
@@ -29,7 +30,7 @@ def serving(scene: SceneLike | None, cameras: CamerasLike, options: LiveOptions)
     Arguments and errors: see `view`.
     """
     if find_spec("websockets") is None:
-        raise UsageError("view", "needs the extra `view`: pip install 'aaplug[view]'")
+        raise UsageError("view", f"needs the extra `view`: {install_command('view')}")
     from aaplug.live.server import Server  # its package is an extra
     from aaplug.live.studio import Studio
     from aaplug.live.subject import Subject

@@ -20,7 +20,7 @@ class Kernels(NamedTuple):
 
 @contract
 def warmup(recipe: str | Recipe | Sequence[str | Recipe] = (), *, monitor: Monitor = SILENT) -> Kernels:
-    """Compile what is missing, in two to three minutes.
+    """Compile what is missing, in about a minute on two cores.
 
     recipe: one or several whose kernels are compiled beside those that the default recipes need.
 

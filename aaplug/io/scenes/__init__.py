@@ -26,6 +26,7 @@ from aaplug.io.scenes.scene import MODEL_SCENE, SOG_FOLDER, Scene, described_fau
 from aaplug.io.values import read_start
 from aaplug.system.contracts import contract
 from aaplug.system.errors import FormatError, OutputError, UsageError
+from aaplug.system.extras import install_command
 from aaplug.system.registry import Registry, named
 
 HEAD_BYTES = 64  # of a file, passed to each format's `sniff`
@@ -193,7 +194,7 @@ def check_scene_output(
         known = [f".{format.name}" for format in SCENE_FORMATS.values() if isinstance(format, WritableFormat)]
         raise OutputError(path, f"has no suffix of a format that can be written: {', '.join(known)}")
     if writer.needs is not None and importlib.util.find_spec(writer.needs) is None:
-        raise UsageError(str(path), f"writing .{writer.name} needs {writer.needs}: pip install 'aaplug[{writer.name}]'")
+        raise UsageError(str(path), f"writing .{writer.name} needs {writer.needs}: {install_command(writer.name)}")
     check_output(path, overwrite, inputs)
     return writer
 

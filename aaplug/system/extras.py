@@ -1,0 +1,24 @@
+"""The packages that only some parts of aaplug need: its extras."""
+
+import json
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, distribution
+from urllib.parse import urlsplit
+from urllib.request import url2pathname
+
+
+def install_command(extra: str) -> str:
+    """The command that adds an extra to aaplug as it is installed here: from a folder, an address or the index.
+
+    Where a package came from stands in its `direct_url.json` (PEP 610); one from the index has none.
+    """
+    origin: dict[str, object] = {}
+    with suppress(PackageNotFoundError, ValueError):
+        origin = json.loads(distribution("aaplug").read_text("direct_url.json") or "{}")
+    match origin:
+        case {"url": str(url), "dir_info": {"editable": True}}:
+            return f"pip install -e '{url2pathname(urlsplit(url).path)}[{extra}]'"
+        case {"url": str(url)}:
+            return f"pip install 'aaplug[{extra}] @ {url}'"
+        case _:
+            return f"pip install 'aaplug[{extra}]'"
