@@ -136,7 +136,8 @@ class Server:
                             if file.add(said):
                                 subject, file = await asyncio.to_thread(self._open_scene, file.path), None
                                 self._studio.show(client, subject)
-                                await connection.send(json.dumps(subject.about(), allow_nan=False))
+                                about = await asyncio.to_thread(subject.about)  # it draws
+                                await connection.send(json.dumps(about, allow_nan=False))
                             continue
                         request = parse(said, subject.recipes, len(subject.views))
                         if isinstance(request, OpenRequest):
