@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import aaplug
-from aaplug.core.conventions import CONVENTIONS
-from aaplug.io import SpzAxes
+from aaplug.core.conventions import CONVENTIONS, SpzAxes
 from aaplug.options.base import CAMERAS, Group, Options, flag, names, number
 from aaplug.options.shared import SCALE, Orbit
 from aaplug.system.errors import UsageError

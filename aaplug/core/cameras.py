@@ -87,18 +87,7 @@ class Camera:
             raise UsageError(f"camera {self.name}", str(error)) from None
 
     def _check_pose(self) -> None:
-        """Refuse a pose that is no rigid motion."""
-        right, down, forward, last = self.cam_from_world.tolist()
-        axes, place = [row[:3] for row in (right, down, forward)], [row[3] for row in (right, down, forward)]
-        products = [sum(map(operator.mul, a, b)) - (a is b) for a in axes for b in axes]
-        if not all(abs(product) <= MAX_ROTATION_ERROR for product in products):
-            raise UsageError("cam_from_world", f"expected a rotation, got {axes}")
-        (a, b, c), (d, e, f), (g, h, i) = axes
-        if a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) < 0:
-            raise UsageError("cam_from_world", f"expected a rotation, got one that mirrors: {axes}")
-        if last != [0, 0, 0, 1] or not all(abs(x) <= MAX_DISTANCE for x in place):
-            expected = f"a translation of at most {MAX_DISTANCE:g}, and 0 0 0 1 below"
-            raise UsageError("cam_from_world", f"expected {expected}, got {place} and {last}")
+        check_rigid(self.cam_from_world.tolist())
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Camera):
@@ -197,6 +186,21 @@ class CameraSet:
         """Every camera once, training views first."""
         training = {id(camera) for camera in self.train}
         return self.train + tuple(camera for camera in self.test if id(camera) not in training)
+
+
+def check_rigid(pose: Sequence[Sequence[float]]) -> None:
+    """Refuse a pose, row by row, that is no rigid motion; raises UsageError."""
+    right, down, forward, last = pose
+    axes, place = [row[:3] for row in (right, down, forward)], [row[3] for row in (right, down, forward)]
+    products = [sum(map(operator.mul, a, b)) - (a is b) for a in axes for b in axes]
+    if not all(abs(product) <= MAX_ROTATION_ERROR for product in products):
+        raise UsageError("cam_from_world", f"expected a rotation, got {axes}")
+    (a, b, c), (d, e, f), (g, h, i) = axes
+    if a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) < 0:
+        raise UsageError("cam_from_world", f"expected a rotation, got one that mirrors: {axes}")
+    if [*last] != [0, 0, 0, 1] or not all(abs(x) <= MAX_DISTANCE for x in place):
+        expected = f"a translation of at most {MAX_DISTANCE:g}, and 0 0 0 1 below"
+        raise UsageError("cam_from_world", f"expected {expected}, got {place} and {last}")
 
 
 def photographs(views: Iterable[Camera]) -> list[Path]:

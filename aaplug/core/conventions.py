@@ -4,11 +4,12 @@ They are plain data and import no torch, so that the command line knows their na
 """
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Literal
 
 from aaplug.core.rules import RULES_3DGS, Rules
 from aaplug.system.contracts import Range, check_fields
 
+SpzAxes = Literal["auto", "opengl", "opencv"]  # of a .spz: as the cameras tell, its specification, splat-transform
 MAX_KERNEL = 1e6  # px²: what is computed from it stays finite
 MIN_SEEN_SHARE = 0.5  # cameras that see a smaller share of the Gaussians are taken to be in another frame
 

@@ -16,7 +16,7 @@ from aaplug.core.cameras import Camera
 from aaplug.core.colours import Colour
 from aaplug.core.interfaces import CountsEvaluations
 from aaplug.evaluation.protocols import Protocol
-from aaplug.options.shared import AnyPath
+from aaplug.io.atomic import AnyPath
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.contracts import check_fields
 from aaplug.system.errors import UsageError

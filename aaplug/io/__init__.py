@@ -4,7 +4,4 @@ Every public function takes paths as `str | os.PathLike[str]`.  No file makes a 
 folder, or allocate more than `limits` allows.
 """
 
-from typing import Literal
-
-SpzAxes = Literal["auto", "opengl", "opencv"]  # of a .spz: as the cameras tell, its specification, splat-transform
 MOST_FPS = 1000  # frames per second of a video

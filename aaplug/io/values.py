@@ -16,13 +16,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from aaplug.core.cameras import MAX_FOCAL
 from aaplug.io.limits import whole_limit
 from aaplug.system.errors import FormatError, reason
 
 Value = TypeVar("Value")
 
 HEAD_LIMIT = 64 * 2**10  # bytes searched for keys when a format is guessed
-MIN_FOCAL, MAX_FOCAL = 1e-6, 1e9  # px: far beyond any real lens; what is computed from them stays finite
+MIN_FOCAL = 1e-6  # px: far below any real lens; what is computed from it stays finite
 
 
 @dataclass(frozen=True)

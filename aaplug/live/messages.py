@@ -12,8 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import torch
-
+from aaplug.core.cameras import check_rigid
 from aaplug.core.colours import Colour
 from aaplug.io.images import colour_of
 from aaplug.live.overlays import OVERLAYS
@@ -25,7 +24,6 @@ MAX_MESSAGE_BYTES = 65_536
 MAX_SIDE = 8192  # px of a picture
 MAX_PIXELS = 1 << 25  # of a picture
 MAX_DISTANCE = 1e9  # world units, and px of a focal length
-MAX_ROTATION_ERROR = 1e-3  # from orthonormality: a page's own arithmetic misses it by 1e-12
 MAX_ID = 2**53  # a page counts in float64
 FILE_NAME = r"\w[\w .()+-]{0,99}\.\w{1,9}"
 POSE_NUMBERS = 16  # row by row
@@ -158,10 +156,10 @@ def _pose(body: Mapping[str, Any]) -> tuple[float, ...]:
     if not isinstance(pose, list) or len(pose) != POSE_NUMBERS:
         raise UsageError("pose", f"takes {POSE_NUMBERS} numbers, got {_short(pose)}")
     numbers = tuple(_number({"pose": x}, "pose", -MAX_DISTANCE, MAX_DISTANCE) for x in pose)
-    rotation = torch.tensor(numbers, dtype=torch.float64).view(4, 4)[:3, :3]
-    error = (rotation @ rotation.T - torch.eye(3, dtype=torch.float64)).abs().max()
-    if float(error) > MAX_ROTATION_ERROR or float(torch.linalg.det(rotation)) < 0 or numbers[12:] != (0, 0, 0, 1):
-        raise UsageError("pose", "takes a rotation and a translation, row by row")
+    try:
+        check_rigid([numbers[row : row + 4] for row in range(0, POSE_NUMBERS, 4)])
+    except UsageError as error:
+        raise UsageError("pose", "takes a rotation and a translation, row by row") from error
     return numbers
 
 

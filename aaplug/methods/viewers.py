@@ -4,15 +4,14 @@ A viewer adds a constant variance to every projected covariance, with or without
 """
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
-from aaplug.core.conventions import ANTIALIASED, CLASSIC, MIP, PLAYCANVAS, PLAYCANVAS_CLASSIC, Convention
+from aaplug.core.conventions import ANTIALIASED, CLASSIC, MIP, PLAYCANVAS, PLAYCANVAS_CLASSIC, Convention, SpzAxes
 from aaplug.system.registry import Registry, named
 
 if TYPE_CHECKING:
     from aaplug.core.gaussians import Gaussians
 
-SpzAxes = Literal["auto", "opengl", "opencv"]
 MOST_DEGREE = 4  # of spherical harmonics in any file
 
 

@@ -5,7 +5,6 @@ import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from os import PathLike
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args
 
 from aaplug.core.colours import Background
@@ -28,8 +27,6 @@ else:
     Recipe = Annotated[Any, LazyType("aaplug.methods.recipe:Recipe")]
     Viewer = Annotated[Any, LazyType("aaplug.methods.viewers:Viewer")]
     Executor = Annotated[Any, LazyType("aaplug.system.executors:Executor")]
-
-AnyPath = str | PathLike[str]
 
 SCALE = number(0.001, 64)  # sizes of images against the training size
 SCALES = number(0.001, 64, several=True)

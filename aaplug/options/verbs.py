@@ -7,7 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Literal, get_args
 
-from aaplug.io import MOST_FPS, SpzAxes
+from aaplug.core.conventions import SpzAxes
+from aaplug.io import MOST_FPS
+from aaplug.io.atomic import AnyPath
 from aaplug.options.base import DRAWING, PYTHON_ONLY, REPORT, TUNING, Options, flag, names, number
 from aaplug.options.shared import (
     RECIPE_METAVAR,
@@ -16,7 +18,6 @@ from aaplug.options.shared import (
     STEPS,
     THREADS,
     VIEWS,
-    AnyPath,
     ImageOptions,
     OneProtocol,
     OneRecipe,

@@ -229,9 +229,8 @@ class Renderer:
             if recipe.target_rate and self.cutter is not None and recipe.levels is not None:
                 for_coarsest = math.ceil(self.cutter.pyramid.coarsest_rate / rate - RATE_TOLERANCE)
                 samples = int(min(samples, max(recipe.levels.most_samples, for_coarsest)))
-        return samples, recipe.neighbours_at(
-            max(10**-RATE_DIGITS, round(samples * rate, RATE_DIGITS))
-        ) if weighs else 0.0
+        sampled_rate = max(10**-RATE_DIGITS, round(samples * rate, RATE_DIGITS))
+        return samples, recipe.neighbours_at(sampled_rate) if weighs else 0.0
 
     @contract
     def coarsening(self, camera: Camera, samples: int) -> float:

@@ -13,8 +13,7 @@ from rich.table import Table
 
 from aaplug.evaluation.report.files import as_json, write_texts
 from aaplug.evaluation.results import Report, as_csv, grid, method, results
-from aaplug.io.atomic import refuse_existing, writing
-from aaplug.options.shared import AnyPath
+from aaplug.io.atomic import AnyPath, refuse_existing, writing
 from aaplug.system.contracts import contract
 from aaplug.system.errors import AaplugError, ClusterError, printable, within_memory
 from aaplug.system.monitor import SILENT, Monitor

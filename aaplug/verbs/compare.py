@@ -13,11 +13,11 @@ from aaplug.evaluation.image_store import ImageStore
 from aaplug.evaluation.metrics import find_metrics
 from aaplug.evaluation.report.files import COMPARED, PAGE, write_comparison
 from aaplug.evaluation.truth import Truth
+from aaplug.io.atomic import AnyPath
 from aaplug.io.scenes import scene_of
 from aaplug.io.scenes.scene import Scene
 from aaplug.methods import RECIPES
 from aaplug.methods.viewers import find_viewer
-from aaplug.options.shared import AnyPath
 from aaplug.options.verbs import COMPARED_SCALES, CompareOptions
 from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.rendering.renderer import Renderer

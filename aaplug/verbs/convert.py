@@ -10,11 +10,11 @@ from aaplug.core.training import TrainingViews
 from aaplug.evaluation.results import Report, results
 from aaplug.evaluation.survey import check_frame_of
 from aaplug.finetuning.fitting import fit, steps_for
+from aaplug.io.atomic import AnyPath
 from aaplug.io.scenes import SceneLike, check_scene_output, write_parts, write_scene
 from aaplug.methods import FORMS
 from aaplug.methods.conversion import MATCHED_ENERGY, Form, blurring, fuse
 from aaplug.methods.viewers import MIP_VIEWER, Viewer, find_viewer
-from aaplug.options.shared import AnyPath
 from aaplug.options.verbs import ConvertOptions
 from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.rendering.renderer import own_look

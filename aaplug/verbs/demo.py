@@ -15,11 +15,10 @@ from aaplug.core.training import TrainingViews
 from aaplug.evaluation.report.contact_sheet import contact_sheet
 from aaplug.evaluation.report.files import RESULTS
 from aaplug.evaluation.results import Report
-from aaplug.io.atomic import output_folder, refuse_existing
+from aaplug.io.atomic import AnyPath, output_folder, refuse_existing
 from aaplug.io.cameras import read_cameras
 from aaplug.io.images import read_image, write_png
 from aaplug.io.scenes import read_scene
-from aaplug.options.shared import AnyPath
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.contracts import contract
 from aaplug.system.monitor import SILENT, Monitor

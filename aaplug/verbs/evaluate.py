@@ -14,10 +14,9 @@ from aaplug.evaluation.metrics import find_metrics
 from aaplug.evaluation.report.files import PAGE, RESULTS, write_evaluation
 from aaplug.evaluation.results import Report
 from aaplug.evaluation.truth import Truth, source_of
-from aaplug.io.atomic import refuse_existing
+from aaplug.io.atomic import AnyPath, refuse_existing
 from aaplug.io.scenes import SceneLike
 from aaplug.io.scenes.scene import Scene
-from aaplug.options.shared import AnyPath
 from aaplug.options.verbs import EvaluateOptions, Layout
 from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.system.digests import digest_of_files

@@ -23,13 +23,12 @@ from aaplug.finetuning import METHODS
 from aaplug.finetuning.session import tune, tuned_scene
 from aaplug.finetuning.settings import Settings, settings_of
 from aaplug.finetuning.state import TuningJob
-from aaplug.io.atomic import check_output, replacing
+from aaplug.io.atomic import AnyPath, check_output, replacing
 from aaplug.io.images import write_png
 from aaplug.io.scenes import SceneLike, check_scene_output, write_scene
 from aaplug.methods import RECIPES
 from aaplug.methods.conversion import fuse_for
 from aaplug.methods.viewers import FAST, VIEWERS
-from aaplug.options.shared import AnyPath
 from aaplug.options.verbs import FinetuneOptions
 from aaplug.rendering.cost import GRADIENTS, Cost, cost_of
 from aaplug.rendering.job import CamerasLike, Job, running

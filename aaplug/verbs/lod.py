@@ -17,7 +17,7 @@ from aaplug.core.gaussians import Gaussians, digest_of_scene
 from aaplug.core.sampling import check_frame
 from aaplug.finetuning.fitting import fit, steps_for
 from aaplug.finetuning.refining import refine
-from aaplug.io.atomic import refuse_existing, refuse_inputs
+from aaplug.io.atomic import AnyPath, refuse_existing, refuse_inputs
 from aaplug.io.scenes import SceneLike, check_scene_output, write_scene, written_format
 from aaplug.io.scenes.pyramid_folder import (
     MANIFEST,
@@ -35,7 +35,6 @@ from aaplug.levels.clusters import rates_of
 from aaplug.levels.merging import Goal, merge, merge_in_chunks
 from aaplug.methods.filters.smoothing import fuse_stored
 from aaplug.methods.viewers import Viewer, find_viewer
-from aaplug.options.shared import AnyPath
 from aaplug.options.verbs import LodOptions
 from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.rendering.renderer import Renderer

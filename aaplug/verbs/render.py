@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from aaplug.core.cameras import Camera
+from aaplug.io.atomic import AnyPath
 from aaplug.io.cameras.camera_path import read_camera_path
 from aaplug.io.scenes import SceneLike
-from aaplug.options.shared import AnyPath
 from aaplug.options.verbs import RenderOptions
 from aaplug.rendering.frames import write_frames
 from aaplug.rendering.job import CamerasLike, Job, running

@@ -11,9 +11,9 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, ParamSpec, Protocol, TypeVar
 
+from aaplug.io.atomic import AnyPath
 from aaplug.io.scenes import SceneLike
 from aaplug.options.base import Options, documented
-from aaplug.options.shared import AnyPath
 from aaplug.rendering.job import CamerasLike
 from aaplug.system.contracts import contract
 from aaplug.system.errors import OutputError, reason

@@ -13,10 +13,10 @@ from aaplug.core import camera_paths
 from aaplug.core.cameras import Camera
 from aaplug.evaluation.protocols import median_depth
 from aaplug.evaluation.report.contact_sheet import labelled, magnified
+from aaplug.io.atomic import AnyPath
 from aaplug.io.cameras.camera_path import read_camera_path
 from aaplug.io.scenes import SceneLike
 from aaplug.io.video import check_video
-from aaplug.options.shared import AnyPath
 from aaplug.options.verbs import VideoOptions
 from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.rendering.videos import make_video

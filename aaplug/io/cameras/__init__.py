@@ -16,8 +16,6 @@ from aaplug.core.cameras import Camera, CameraSet
 from aaplug.io.cameras import blender, camera_path, colmap, inria, inria_model, llff, multiscale, pinhole, transforms
 from aaplug.io.cameras.options import CameraFileOptions
 from aaplug.io.cameras.photos import files_of
-from aaplug.io.cameras.poses import pose
-from aaplug.io.values import MAX_FOCAL, Place, focal, number, numbers, pixels
 from aaplug.system.contracts import contract
 from aaplug.system.errors import FormatError, UsageError, listing
 from aaplug.system.registry import Registry, named

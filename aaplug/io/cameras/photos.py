@@ -83,10 +83,11 @@ def with_photos(cameras: Sequence[Camera], places: Sequence[Place], folder: Phot
 def files_of(path: Path, cameras: CameraSet) -> tuple[Path, ...]:
     """The files that these cameras may have been read from, and all photographs of their data set."""
     home = path if path.is_dir() else path.parent
-    files = [path, *photographs(cameras.all)]
+    photos = photographs(cameras.all)
+    files = [path, *photos]
     for folder in (home, home / "sparse", home / "sparse" / "0", home / "0"):
         files += [file for file in _listed(folder) if CAMERA_FILE.fullmatch(file.name)]
-    photo_folders = {photo.parent for photo in photographs(cameras.all)}
+    photo_folders = {photo.parent for photo in photos}
     for folder, names in product(photo_folders, PHOTO_FOLDERS):
         beside = _listed(folder.parent) if names.fullmatch(folder.name) else []
         for each in filter(lambda path: names.fullmatch(path.name), beside):

@@ -14,10 +14,9 @@ from os import PathLike
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-from aaplug.core.conventions import Convention
+from aaplug.core.conventions import Convention, SpzAxes
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.pyramids import Pyramid
-from aaplug.io import SpzAxes
 from aaplug.io.atomic import check_output
 from aaplug.io.scenes import compressed_ply, ksplat, ply, pt, sog, splat, spz
 from aaplug.io.scenes.options import SceneFileOptions

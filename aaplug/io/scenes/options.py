@@ -1,11 +1,9 @@
 """Options for reading and writing scene files; each format uses those that concern it."""
 
 from dataclasses import dataclass
-from typing import get_args
 
-from aaplug.io import SpzAxes
+from aaplug.core.conventions import SpzAxes
 from aaplug.system.contracts import check_fields
-from aaplug.system.errors import UsageError
 
 
 @dataclass(frozen=True)
@@ -22,6 +20,3 @@ class SceneFileOptions:
 
     def __post_init__(self) -> None:
         check_fields(self)
-        choices = get_args(SpzAxes)
-        if self.spz_axes not in choices:
-            raise UsageError("spz_axes", f"should be {' or '.join(choices)}, not {self.spz_axes!r}")

@@ -26,9 +26,8 @@ import zstandard
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.conventions import CLASSIC
+from aaplug.core.conventions import CLASSIC, SpzAxes
 from aaplug.core.gaussians import Gaussians
-from aaplug.io import SpzAxes
 from aaplug.io.atomic import replacing
 from aaplug.io.limits import whole_limit
 from aaplug.io.scenes.options import SceneFileOptions
