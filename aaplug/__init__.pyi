@@ -61,7 +61,7 @@ from .core.convolution import smoothed_by as smoothed_by
 from .core.ellipses import grown as grown, whitening as whitening, whitening_columns as whitening_columns
 from .core.gaussians import Fusion as Fusion
 from .core.imaging import over as over
-from .core.interfaces import Pixels as Pixels
+from .core.interfaces import Limits as Limits, Pixels as Pixels
 from .core.kernels import Kernels as Kernels
 from .core.rules import RULES_3DGS as RULES_3DGS, Rules as Rules
 from .core.spherical_harmonics import COLOUR_OFFSET as COLOUR_OFFSET, SH_C0 as SH_C0

@@ -20,13 +20,12 @@ import aaplug
 from aaplug.core import projection, shading
 from aaplug.core.kernels import EAGER, Kernel, Kernels
 from aaplug.core.projection import project
-from aaplug.core.rules import RULES_GSPLAT
 from aaplug.core.training import TrainingViews
 from aaplug.methods import RECIPES
 from aaplug.methods.pixel_kernels import point
 from aaplug.rasterizers import RASTERIZERS, choice
 from aaplug.rasterizers.choice import find_rasterizer
-from aaplug.rasterizers.tiled import Tiled, binning, forward, packages
+from aaplug.rasterizers.tiled import Tiled, binning, forward, on_demand, packages
 from aaplug.rasterizers.tiled import ahead_of_time as compiled
 from aaplug.rasterizers.tiled.packages import CompiledKernels, Package
 from aaplug.rendering.renderer import Renderer
@@ -51,7 +50,8 @@ def empty_cache(tmp_path, monkeypatch):
     return tmp_path
 
 
-ALL_KERNELS = compiled.kernels_of([*RECIPES.values()])  # also those that `warmup` compiles on request
+# also those that `warmup` compiles on request, and those of trainers
+ALL_KERNELS = [*compiled.kernels_of([*RECIPES.values()]), *compiled.TRAINER_KERNELS]
 each_kernel = pytest.mark.parametrize("kernel", ALL_KERNELS, ids=lambda kernel: kernel.name)
 
 
@@ -87,7 +87,7 @@ def test_examples_show_what_compositing_computes(kernel: Kernel):
 
 
 # loops before it find and gather raster rows, a loop after it writes the sums out
-LOOPS = {"composite-point": 3, "composite-point-backward": 3, "gaussian-blending": 1}
+LOOPS = {"composite-point": 3, "composite-point-kept": 3, "composite-point-backward": 3, "gaussian-blending": 1}
 
 
 @pytest.mark.parametrize("name", LOOPS)
@@ -225,20 +225,12 @@ def test_compiled_images_are_the_eager_ones(built, recipe, degree):
     assert difference.max() < 0.02
 
 
-def test_other_rules_and_precisions_are_left_to_the_eager_functions(built):
-    scene, camera = make_scene(100), make_camera()
-    scene = replace(scene, logit_opacities=scene.logit_opacities + 6)
-    gsplat = replace(scene, convention=replace(scene.convention, rules=RULES_GSPLAT))
-    for given in (scene.to(torch.float64), gsplat):
-        training = TrainingViews.of(given, [camera])
-        fast, eager = (
-            Renderer(given, training, RECIPES["classic"], rasterizer)(camera).rgb
-            for rasterizer in (Tiled(built), Tiled())
-        )
-        assert fast.dtype == given.means.dtype
-        torch.testing.assert_close(fast, eager, rtol=0, atol=ANSWER)
-    usual = Renderer(scene, TrainingViews.of(scene, [camera]), RECIPES["classic"])(camera).rgb
-    assert (fast - usual).abs().max() > 1e-3
+def test_other_precisions_are_left_to_the_eager_functions(built):
+    scene, camera = make_scene(100).to(torch.float64), make_camera()
+    training = TrainingViews.of(scene, [camera])
+    fast, eager = (Renderer(scene, training, RECIPES["classic"], Tiled(k))(camera).rgb for k in (built, EAGER))
+    assert fast.dtype == torch.float64
+    assert fast.equal(eager)
 
 
 @pytest.mark.parametrize("at_once", [13, 1000])
@@ -300,6 +292,9 @@ def paths(kernels: Sequence[Kernel] = compiled.KERNELS) -> dict[str, str]:
     return {kernel.name: compiled.package_path(kernel).name for kernel in kernels}
 
 
+PASSES = {"composite-point", "composite-point-kept", "composite-point-backward"}
+
+
 def other_polynomial(x: torch.Tensor, coefficients: tuple[float, ...]) -> torch.Tensor:
     return x
 
@@ -308,13 +303,13 @@ def other_polynomial(x: torch.Tensor, coefficients: tuple[float, ...]) -> torch.
     ("module", "name", "value", "changed"),
     [
         (binning, "CUTOFF_SLACK", 2e-4, {"table", "spans"}),
-        (point, "_polynomial", other_polynomial, {"composite-point", "composite-point-backward"}),
-        (point, "ROOT_OF_EXP2", (1.0, 2.0), {"composite-point", "composite-point-backward"}),
+        (point, "_polynomial", other_polynomial, PASSES),
+        (point, "ROOT_OF_EXP2", (1.0, 2.0), PASSES),
         (point.Point, "exact", lambda *_: None, set()),
         (projection, "JACOBIAN_MARGIN", 0.5, set()),  # nothing that is traced names it
         (projection, "MAX_SIGMA", 1e8, {"project", "project-backward"}),
         (shading, "COMPILED_COEFFICIENTS", (4,), set()),
-        (forward, "EXAMPLE_TILES", 8, {"composite-point", "composite-point-backward"}),
+        (forward, "EXAMPLE_TILES", 8, PASSES),
     ],
 )
 def test_a_change_of_a_kernels_sources_is_a_change_of_its_package_alone(monkeypatch, module, name, value, changed):
@@ -349,7 +344,7 @@ def test_names_of_packages_are_the_same_in_every_process():
     """Also where annotations of arrays are not checked, as in the user's process."""
     program = (
         "import json; from aaplug.methods import RECIPES; from aaplug.rasterizers.tiled.ahead_of_time import *;"
-        "kernels = kernels_of([*RECIPES.values()]);"
+        "kernels = [*kernels_of([*RECIPES.values()]), *TRAINER_KERNELS];"
         "print(json.dumps({kernel.name: package_path(kernel).name for kernel in kernels}))"
     )
     done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
@@ -389,10 +384,33 @@ def test_without_packages_auto_is_eager_and_says_why(empty_cache, monkeypatch, c
 def test_many_frames_build_what_is_missing(empty_cache, monkeypatch):
     kernels = CompiledKernels(lambda kernel: None)
     monkeypatch.setattr(choice, "has_compiler", lambda: True)
-    monkeypatch.setattr(choice, "build", lambda: kernels)
-    chosen = find_rasterizer("auto", choice.FRAMES_THAT_PAY, lambda text: None)
-    assert isinstance(chosen, Tiled)
-    assert chosen.kernels is kernels
+    monkeypatch.setattr(choice, "build", lambda **_: kernels)
+    for frames, gradients in ((choice.FRAMES_THAT_PAY, False), (choice.STEPS_THAT_PAY, True)):
+        chosen = find_rasterizer("auto", frames, gradients=gradients)
+        assert isinstance(chosen, Tiled)
+        assert chosen.kernels is kernels
+        assert find_rasterizer("auto", frames - 1, gradients=gradients) is RASTERIZERS["eager"]
+
+
+def test_missing_kernels_are_built_beside_the_work_and_taken_up_once(empty_cache, monkeypatch, caplog):
+    for name, value in {"PATIENCE_SECONDS": 0.0, "LOOK_SECONDS": 0.0, "has_compiler": lambda: True}.items():
+        monkeypatch.setattr(on_demand, name, value)
+    program = "import sys; open('asked', 'a').write(' '.join(sys.argv[1:])); sys.exit('the disk is full')"
+    monkeypatch.setattr(on_demand, "COMPILER", program)
+    monkeypatch.chdir(empty_cache)
+    kernels, looked_up = on_demand.OnDemandKernels(), []
+    monkeypatch.setattr(kernels, "_package_of", lambda kernel: looked_up.append(kernel.name))
+    for _ in range(2):
+        project(make_scene(50), make_camera(), kernels)
+    assert kernels._compiler is not None
+    kernels._compiler.wait()
+    for _ in range(3):
+        project(make_scene(50), make_camera(), kernels)
+    assert (empty_cache / "asked").read_text() == "project"
+    assert looked_up == ["project", "project"]
+    assert caplog.messages[0].startswith("kernels run eagerly")
+    assert "the disk is full" in caplog.messages[1]
+    assert len(caplog.messages) == 2
 
 
 def test_without_a_compiler_a_build_is_refused(empty_cache, monkeypatch):
@@ -402,7 +420,7 @@ def test_without_a_compiler_a_build_is_refused(empty_cache, monkeypatch):
 
 
 def test_after_a_failed_build_auto_is_eager_and_says_why(empty_cache, monkeypatch):
-    def fails():
+    def fails(**_):
         raise UsageError("warmup", "torch cannot compile 'slots' here")
 
     monkeypatch.setattr(choice, "has_compiler", lambda: True)

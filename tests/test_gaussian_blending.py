@@ -7,6 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from aaplug.core.interfaces import Limits
 from aaplug.core.rules import RULES_3DGS, Rules
 from aaplug.core.splats import Splats2D
 from aaplug.lab.gaussian_blending import (
@@ -56,7 +57,7 @@ def after(*splats: tuple, window: float = 1.0, dtype: torch.dtype = F64) -> tupl
     origin = torch.zeros(1, 1, dtype=dtype)
     light = light_of(origin, window)
     for row in rows[:-1]:
-        light = behind(light, row[None], origin, origin, RULES_3DGS)
+        light = behind(light, row[None], origin, origin, Limits.by(RULES_3DGS))
     return light, rows
 
 

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from aaplug.core.conventions import CLASSIC
-from aaplug.core.culling import cull, cull_kernel
+from aaplug.core.culling import cull
 from aaplug.core.interfaces import PixelKernel
-from aaplug.core.projection import project, project_kernel
+from aaplug.core.projection import project
 from aaplug.core.rules import RULES_3DGS, RULES_GSPLAT, Rules
 from aaplug.core.splats import Render
 from aaplug.lab.integral import INTEGRAL
@@ -18,12 +18,10 @@ from aaplug.methods import COMPOSITORS, PIXEL_KERNELS, RECIPES
 from aaplug.methods.pixel_kernels.point import POINT
 from aaplug.rasterizers.reference import Reference
 from aaplug.rasterizers.tiled import Tiled
-from aaplug.rasterizers.tiled.backward import step_kernel
-from aaplug.rasterizers.tiled.binning import table_kernel
-from aaplug.rasterizers.tiled.forward import pass_kernel
+from aaplug.rasterizers.tiled.packages import CompiledKernels
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import UsageError
-from tests.conftest import ALL_RASTERIZERS, each, make_camera, make_scene, make_splats, splats_of
+from tests.conftest import ALL_RASTERIZERS, COMPILED, each, make_camera, make_scene, make_splats, splats_of
 
 F64 = torch.float64
 BLACK, SKY = (0.0, 0.0, 0.0), (0.25, 0.5, 1.0)
@@ -80,6 +78,19 @@ def test_gradients_follow_the_rules(rules):
     torch.testing.assert_close(*found, rtol=1e-9, atol=1e-9)
 
 
+def test_any_number_of_channels_is_composited_as_three_are():
+    splats, images = opaque_splats(), []
+    more = torch.stack([*splats.rgb.unbind(1), splats.depths, splats.opacities], dim=1)
+    for rasterizer in (Tiled(), Reference()):
+        features = more.clone().requires_grad_()
+        image = rasterizer(replace(splats, rgb=features), HW, SKY, POINT)
+        images.append((image.rgb, image.alpha, *torch.autograd.grad(image.rgb.square().sum(), features)))
+    for tiled, exact in zip(*images, strict=True):
+        torch.testing.assert_close(tiled, exact, rtol=1e-9, atol=1e-9)
+    assert images[0][0].shape == (*HW, 5)
+    torch.testing.assert_close(images[1][0][..., :3], usual(POINT).rgb)
+
+
 @pytest.mark.parametrize("rasterizer", ALL_RASTERIZERS.values(), ids=ALL_RASTERIZERS)
 def test_rules_worked_by_hand(rasterizer):
     def centre(*opacities: float, rules: Rules) -> float:
@@ -129,17 +140,24 @@ def test_the_renderer_follows_the_rules_of_training():
     assert (images[0].rgb - images[1].rgb).abs().max() > 1e-3
 
 
-def test_kernels_of_other_rules_have_other_names(rules):
-    """Compiled kernels are found by name, and the values are built into them."""
-    for kernel in (pass_kernel, step_kernel):
-        assert kernel(POINT, rules).name != kernel(POINT, RULES_3DGS).name
-        assert kernel(POINT, rules).name != kernel(INTEGRAL, rules).name
-        assert kernel(POINT, RULES_3DGS).name == kernel(POINT, Rules()).name
-    assert len({pass_kernel(POINT, r).name for r in OTHERS.values()}) == len(OTHERS)
-    for kernel in (table_kernel, cull_kernel):
-        same_cutoff = rules.min_alpha == RULES_3DGS.min_alpha
-        assert (kernel(rules.min_alpha).name == kernel().name) == same_cutoff
-    assert project_kernel(0.01).name != project_kernel().name
+@pytest.mark.skipif(COMPILED is None, reason="the kernels are not compiled here (aaplug warmup)")
+def test_compiled_kernels_follow_the_rules_without_being_built_anew(rules, monkeypatch):
+    """One kernel serves all rules: nothing falls back to eager code, and the image is the reference's."""
+    splats, eager = opaque_splats().to(torch.float32), []
+    run = CompiledKernels.runner
+
+    def watched(kernels, kernel, args):
+        runner = run(kernels, kernel, args)
+        eager.extend([kernel.name] if runner is kernel.function else [])
+        return runner
+
+    monkeypatch.setattr(CompiledKernels, "runner", watched)
+    fast, exact = (draw(splats, HW, SKY, POINT, None, rules) for draw in (Tiled(COMPILED), Reference()))
+    assert not eager
+    torch.testing.assert_close(fast.rgb.double(), exact.rgb, rtol=0, atol=2e-5)
+    seen = cull(project(make_scene(200), make_camera(), COMPILED, rules), (64, 64), kernels=COMPILED, rules=rules)
+    assert seen.sources.equal(cull(project(make_scene(200), make_camera(), rules=rules), (64, 64), rules=rules).sources)
+    assert not eager
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,6 @@
 """Culling of the splats that cannot change an image."""
 
 import math
-from functools import cache, partial
 
 import torch
 from jaxtyping import Float
@@ -9,7 +8,7 @@ from torch import Tensor
 
 from aaplug.core.ellipses import squared_cutoff
 from aaplug.core.kernels import EAGER, EXAMPLE_SIZE, Kernel, Kernels
-from aaplug.core.rules import RULES_3DGS, Rules, variant
+from aaplug.core.rules import RULES_3DGS, Rules
 from aaplug.core.splats import Splats2D
 
 
@@ -26,29 +25,22 @@ def cull(
     margin: cull splats whose centre lies farther outside the image than this share of its longer side.
     ellipses: the same splats' bounding ellipses, where a pixel kernel shows more than the splats' own.
     """
-    size = splats.means.new_tensor([hw[1], hw[0], margin * max(hw)])
+    size = splats.means.new_tensor([hw[1], hw[0], margin * max(hw), rules.min_alpha])
     bounds = splats if ellipses is None else ellipses
     columns = bounds.means, bounds.covs, bounds.dets, bounds.opacities
-    (inside,) = kernels.run(cull_kernel(rules.min_alpha), *columns, size)
+    (inside,) = kernels.run(CULL, *columns, size)
     return splats.selected(inside.nonzero().squeeze(1), kernels)
 
 
-@cache
-def cull_kernel(min_alpha: float = RULES_3DGS.min_alpha) -> Kernel:
-    """The test for one cut-off."""
-    name = "cull" + variant((min_alpha,), (RULES_3DGS.min_alpha,))
-    return Kernel(name, partial(_inside, min_alpha), _example, ("m", "m", "m", "m", None), gathers=True)
-
-
 def _inside(
-    min_alpha: float,
     means: Float[Tensor, "m 2"],
     covs: Float[Tensor, "m 3"],
     dets: Float[Tensor, " m"],
     opacities: Float[Tensor, " m"],
-    size: Float[Tensor, " 3"],
+    size: Float[Tensor, " 4"],
 ) -> tuple[Tensor]:
-    *sides, band = size.unbind()
+    """Return which splats can be seen.  size: the image's width and height, `margin` in px, and the least alpha."""
+    *sides, band, min_alpha = size.unbind()
     inside = (opacities >= min_alpha) & (dets > 0)
     cutoff = squared_cutoff(opacities, min_alpha).clamp(min=0.0)
     for mean, variance, side in zip(means.unbind(dim=1), (covs[:, 0], covs[:, 2]), sides, strict=True):
@@ -61,4 +53,7 @@ def _inside(
 def _example() -> tuple[Tensor, ...]:
     m = EXAMPLE_SIZE
     means = torch.linspace(-9.0, 9.0, 2 * m).view(m, 2)
-    return means, torch.ones(m, 3), torch.ones(m), torch.ones(m), torch.tensor([4.0, 4.0, 2.0])
+    return means, torch.ones(m, 3), torch.ones(m), torch.ones(m), torch.tensor([4.0, 4.0, 2.0, RULES_3DGS.min_alpha])
+
+
+CULL = Kernel("cull", _inside, _example, ("m", "m", "m", "m", None), gathers=True)

@@ -43,7 +43,9 @@ def whitening_columns(covs: Float[Tensor, "m 3"], dets: Float[Tensor, " m"]) -> 
     )
 
 
-def squared_cutoff(opacities: Float[Tensor, " m"], min_alpha: float = RULES_3DGS.min_alpha) -> Float[Tensor, " m"]:
+def squared_cutoff(
+    opacities: Float[Tensor, " m"], min_alpha: float | Tensor = RULES_3DGS.min_alpha
+) -> Float[Tensor, " m"]:
     """Squared Mahalanobis distance at which alpha falls to `min_alpha`; negative where it never reaches it."""
     return 2 * torch.log(opacities / min_alpha)
 

@@ -10,6 +10,7 @@ import cv2
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn import functional
 
 from aaplug.core.cameras import WHOLE_SLACK, whole_side
 from aaplug.core.splats import Render
@@ -18,11 +19,12 @@ from aaplug.system.errors import UsageError
 
 
 @contract
-def over(rgb: Float[Tensor, "h w 3"], alpha: Float[Tensor, "h w"], background: tuple[float, float, float]) -> Render:
-    """Composite premultiplied colours over a background."""
+def over(rgb: Float[Tensor, "h w d"], alpha: Float[Tensor, "h w"], background: tuple[float, float, float]) -> Render:
+    """Composite premultiplied colours over a background; channels after the third have none."""
     if not any(background):  # black adds nothing
         return Render(rgb, alpha)
-    return Render(torch.addcmul(rgb, (1 - alpha)[..., None], rgb.new_tensor(background)), alpha)
+    behind = functional.pad(rgb.new_tensor(background), (0, rgb.shape[2] - 3))
+    return Render(torch.addcmul(rgb, (1 - alpha)[..., None], behind), alpha)
 
 
 def average_samples(render: Render, n: int, neighbours: float = 0.0) -> Render:

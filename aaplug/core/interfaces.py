@@ -10,9 +10,11 @@ input.  Each kind has a `system.registry.Registry`; `tests/laws` checks every re
 compositor, rasterizer and recipe.
 """
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple, Protocol, runtime_checkable
 
+import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -20,7 +22,7 @@ from aaplug.core.cameras import Camera
 from aaplug.core.colours import Colour
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.kernels import Kernel, Kernels
-from aaplug.core.rules import RULES_3DGS, Rules
+from aaplug.core.rules import RULES_3DGS, Rules, float32, just_below
 from aaplug.core.splats import Render, Splats2D
 from aaplug.core.training import TrainingViews
 
@@ -84,6 +86,37 @@ class Pixels(NamedTuple):
     y: Float[Tensor, " P"]
 
 
+class Limits(NamedTuple):
+    """The rules as a kernel computes with them.
+
+    Eager code takes numbers.  A compiled kernel takes tensors without dimensions, so that it serves all rules.
+
+    below_min_alpha, below_min_transmittance: the float32 below each.
+    """
+
+    max_alpha: float | Tensor
+    below_min_alpha: float | Tensor
+    log2_min_alpha: float | Tensor
+    below_min_transmittance: float | Tensor
+
+    @classmethod
+    def by(cls, rules: Rules) -> "Limits":
+        """The limits of some rules, as numbers."""
+        cutoff, least = rules.min_alpha, rules.min_transmittance
+        return cls(rules.max_alpha, just_below(cutoff), float32(math.log2(float32(cutoff))), just_below(least))
+
+    @classmethod
+    def of(cls, values: Float[Tensor, " 4"]) -> "Limits":
+        """The limits that a kernel is given in one tensor."""
+        return cls(*(values.unbind() if torch.compiler.is_compiling() else values.tolist()))
+
+    def cut(self, alpha: Float[Tensor, "*any"]) -> Float[Tensor, "*any"]:
+        """Return `alpha` where it is at least the cut-off, else 0."""
+        if isinstance(self.below_min_alpha, Tensor):
+            return torch.where(alpha > self.below_min_alpha, alpha, 0.0)
+        return torch.threshold(alpha, self.below_min_alpha, 0.0)
+
+
 @runtime_checkable
 class PixelKernel(Protocol):
     """Gives a splat's alpha at a pixel.
@@ -122,8 +155,8 @@ class PixelKernel(Protocol):
         """
         ...
 
-    def alpha(self, rows: Float[Tensor, "*n t c"], pixels: Pixels, rules: Rules) -> Float[Tensor, "*n t P"]:
-        """Alpha at each tile's pixels before the cap; 0 below the cut-off."""
+    def alpha(self, rows: Float[Tensor, "*n t c"], pixels: Pixels, limits: Limits) -> Float[Tensor, "*n t P"]:
+        """Alpha at each tile's pixels before the cap; 0 below the cut-off (`limits.cut`)."""
         ...
 
     def exact(self, splats: Splats2D, offsets: Float[Tensor, "p m 2"]) -> Float[Tensor, "p m"]:
@@ -193,8 +226,8 @@ class Rasterizer(Protocol):
 class RunsOwnKernels(Protocol):
     """A pixel kernel or compositor that runs kernels by itself, which `aaplug warmup` then compiles."""
 
-    def kernels(self, rules: Rules) -> tuple[Kernel, ...]:
-        """These kernels, for scenes composited by the given rules."""
+    def kernels(self) -> tuple[Kernel, ...]:
+        """These kernels."""
         ...
 
 

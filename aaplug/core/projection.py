@@ -7,7 +7,7 @@ nothing cancels.  The camera's centre is subtracted in float64; the rest runs in
 
 from collections.abc import Iterable
 from dataclasses import replace
-from functools import cache, partial, reduce
+from functools import reduce
 
 import torch
 from jaxtyping import Float
@@ -16,7 +16,7 @@ from torch import Tensor
 from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import MAX_LOG_SCALE, Gaussians
 from aaplug.core.kernels import EAGER, EXAMPLE_SIZE, Kernel, Kernels, backward_of
-from aaplug.core.rules import NEAR, RULES_3DGS, Rules, variant
+from aaplug.core.rules import NEAR, RULES_3DGS, Rules
 from aaplug.core.splats import SELECT, Splats2D
 
 JACOBIAN_MARGIN = 0.3  # of half the image: 3DGS linearises no farther out (1.3 tan(fov/2))
@@ -27,7 +27,7 @@ MIN_FACING = 1e-6  # of depth: a disc at a flatter angle is a line, and its slop
 def project(scene: Gaussians, camera: Camera, kernels: Kernels = EAGER, rules: Rules = RULES_3DGS) -> Splats2D:
     """Splats of every Gaussian beyond the near plane, without colour and before any screen filter."""
     shape = scene.means, scene.quats, scene.log_scales
-    columns = kernels.run(project_kernel(rules.near), *shape, *_camera_rows(scene.means, camera))
+    columns = kernels.run(PROJECT, *shape, *_camera_rows(scene.means, camera, rules))
     return _beyond(rules.near, columns, scene.opacities, kernels)
 
 
@@ -42,7 +42,7 @@ def project_covariances(
 
     With T = J W, whose rows have the cross product n, det(T Σ Tᵀ) = nᵀ cof(Σ) n (Cauchy-Binet), in float64.
     """
-    centres, across, down, depths = _linearised(rules.near, means, *_camera_rows(means, camera))
+    centres, across, down, depths = _linearised(means, *_camera_rows(means, camera, rules))
     (xx, xy, xz), (_, yy, yz), (_, _, zz) = (row.unbind(dim=1) for row in covariances.double().unbind(dim=1))
     sigma = torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], dim=1).unflatten(1, (3, 3))
     a, b = (torch.stack(row, dim=1).double() for row in (across, down))
@@ -82,10 +82,15 @@ def with_depth_slopes(splats: Splats2D, scene: Gaussians, camera: Camera) -> Spl
     return replace(splats, depth_slopes=-(splats.depths / facing)[:, None] * normals[:, :2] / focal)
 
 
-def _camera_rows(like: Tensor, camera: Camera) -> tuple[Float[Tensor, " 3"], Float[Tensor, "3 3"], Float[Tensor, " 8"]]:
-    """Centre (float64), rotation, and fx, fy, cx, cy with the slopes between which projection is linearised."""
+def _camera_rows(
+    like: Tensor, camera: Camera, rules: Rules
+) -> tuple[Float[Tensor, " 3"], Float[Tensor, "3 3"], Float[Tensor, " 9"]]:
+    """Centre (float64), rotation, and the lens.
+
+    The lens: fx, fy, cx, cy, the slopes between which projection is linearised, and the near plane's depth.
+    """
     x, y = slope_limits(camera)
-    lens = like.new_tensor([camera.fx, camera.fy, camera.cx, camera.cy, *x, *y])
+    lens = like.new_tensor([camera.fx, camera.fy, camera.cx, camera.cy, *x, *y, rules.near])
     rotation = camera.cam_from_world[:3, :3].to(like)
     return camera.centre.to(like.device), rotation, lens
 
@@ -100,16 +105,15 @@ def slope_limits(camera: Camera) -> tuple[tuple[float, float], tuple[float, floa
 
 
 def _project(
-    near: float,
     means: Float[Tensor, "n 3"],
     quats: Float[Tensor, "n 4"],
     log_scales: Float[Tensor, "n 3"],
     centre: Float[Tensor, " 3"],
     rotation: Float[Tensor, "3 3"],
-    lens: Float[Tensor, " 8"],
+    lens: Float[Tensor, " 9"],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Mean, packed covariance, determinant and depth of each Gaussian, written in columns so that the loop fuses."""
-    centres, across, down, z = _linearised(near, means, centre, rotation, lens)
+    centres, across, down, z = _linearised(means, centre, rotation, lens)
     lengths = log_scales.clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE).exp().unbind(dim=1)
     quats = quats / quats.square().sum(dim=1, keepdim=True).sqrt()
     axes = zip(*rotation_rows(quats), strict=True)
@@ -125,18 +129,14 @@ def _project(
 
 
 def _linearised(
-    near: float,
-    means: Float[Tensor, "n 3"],
-    centre: Float[Tensor, " 3"],
-    rotation: Float[Tensor, "3 3"],
-    lens: Float[Tensor, " 8"],
+    means: Float[Tensor, "n 3"], centre: Float[Tensor, " 3"], rotation: Float[Tensor, "3 3"], lens: Float[Tensor, " 9"]
 ) -> tuple[list[Tensor], list[Tensor], list[Tensor], Tensor]:
     """x and y of the mean in px; the two rows of J W, in px per world unit along the world's axes; depth."""
     local = (means.double() - centre).to(means).unbind(dim=1)
-    fx, fy, cx, cy, left, right, top, bottom = lens.unbind()
+    fx, fy, cx, cy, left, right, top, bottom, near = lens.unbind()
     world = [row.unbind() for row in rotation.unbind()]
     x, y, z = (sum_of(r * p for r, p in zip(row, local, strict=True)) for row in world)
-    ahead = z.clamp(min=near)  # nearer Gaussians are dropped later; here they must not overflow into gradients
+    ahead = torch.maximum(z, near)  # nearer Gaussians are dropped later; here they must not overflow into gradients
     slope_x, slope_y = x / ahead, y / ahead
     # The rows of the projection's derivative lie along the world's axes; its direction is clamped to the widened image.
     clamped_x = torch.minimum(torch.maximum(slope_x, left), right)
@@ -171,15 +171,9 @@ def _project_example() -> tuple[Tensor, ...]:
     means, log_scales = torch.rand(2, EXAMPLE_SIZE, 3, generator=generator).unbind()
     quats = torch.randn(EXAMPLE_SIZE, 4, generator=generator)
     centre = torch.tensor([0.5, 0.5, -2.0], dtype=torch.float64)
-    lens = torch.tensor([90.0, 90.0, 40.0, 40.0, -0.5, 0.5, -0.5, 0.5])
+    lens = torch.tensor([90.0, 90.0, 40.0, 40.0, -0.5, 0.5, -0.5, 0.5, NEAR])
     return means, quats, log_scales - 4, centre, torch.eye(3), lens
 
 
-@cache
-def project_kernel(near: float = NEAR) -> Kernel:
-    """Projection for one near plane."""
-    name, sizes = "project" + variant((near,), (NEAR,)), ("n", "n", "n", None, None, None)
-    return Kernel(name, partial(_project, near), _project_example, sizes, gathers=True)
-
-
-PROJECT_BACKWARD = backward_of(project_kernel(), ("n", "n", "n", "n"), chained=True)
+PROJECT = Kernel("project", _project, _project_example, ("n", "n", "n", None, None, None), gathers=True)
+PROJECT_BACKWARD = backward_of(PROJECT, ("n", "n", "n", "n"), chained=True)

@@ -3,9 +3,8 @@
 They belong to training: a scene looks right when it is composited as it was trained.
 """
 
-import math
 import struct
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from aaplug.system.contracts import check_fields
 from aaplug.system.errors import UsageError
@@ -32,10 +31,6 @@ class Rules:
     min_alpha: float = 1 / 255
     min_transmittance: float = 1e-4
     near: float = NEAR
-    # These are computed once, because kernels are traced and must not create tensors.
-    below_min_alpha: float = field(init=False, repr=False, compare=False)
-    log2_min_alpha: float = field(init=False, repr=False, compare=False)
-    below_min_transmittance: float = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -45,24 +40,10 @@ class Rules:
             raise UsageError("rules", f"expected {ranges}, got {self}")
         for name in ("max_alpha", "min_transmittance"):
             object.__setattr__(self, name, float32(getattr(self, name)))
-        object.__setattr__(self, "below_min_alpha", just_below(self.min_alpha))
-        object.__setattr__(self, "log2_min_alpha", float32(math.log2(float32(self.min_alpha))))
-        object.__setattr__(self, "below_min_transmittance", just_below(self.min_transmittance))
-
-    @property
-    def tag(self) -> str:
-        """Suffix of a compositing kernel's name, empty for 3DGS's rules: a kernel is compiled for one set of rules."""
-        values, usual = ((r.max_alpha, r.min_alpha, r.min_transmittance) for r in (self, RULES_3DGS))
-        return variant(values, usual)
-
-
-def variant(values: tuple[float, ...], defaults: tuple[float, ...]) -> str:
-    """Suffix of a kernel's name for the constants built into it; empty for the defaults."""
-    return "" if values == defaults else "".join(f"-{value:.7g}" for value in values)
 
 
 def just_below(value: float) -> float:
-    """The float32 below a positive value: `torch.threshold` keeps what is above its bound, so also `value` itself."""
+    """The float32 below a positive value: `cut` keeps what is above its bound, so also `value` itself."""
     [bits] = struct.unpack("I", struct.pack("f", value))
     [below] = struct.unpack("f", struct.pack("I", bits - 1))
     return below

@@ -37,7 +37,7 @@ class Splats2D:
     depths: Float[Tensor, " m"]  # world units
     opacities: Float[Tensor, " m"]
     sources: Int[Tensor, " m"]  # index in the scene
-    rgb: Float[Tensor, "m 3"] | None = None
+    rgb: Float[Tensor, "m channels"] | None = None
     depth_slopes: Float[Tensor, "m 2"] | None = None
     window: float = 1.0
 
@@ -135,7 +135,7 @@ class Render(NamedTuple):
     rgb: composited over its background, not clamped to 1.  alpha: the share of the background that is hidden.
     """
 
-    rgb: Float[Tensor, "h w 3"]
+    rgb: Float[Tensor, "h w channels"]
     alpha: Float[Tensor, "h w"]
 
 

@@ -1,4 +1,4 @@
-"""One image by gsplat's rules: which splats it keeps, their channels, drawn three at a time, and absolute gradients.
+"""One image by gsplat's rules: which splats it keeps, their channels, and absolute gradients.
 
 m: splats of the image; d: channels, of which the first are colours; h, w: px.
 """
@@ -13,7 +13,7 @@ from torch.nn import functional
 
 from aaplug.core.colours import BLACK
 from aaplug.core.ellipses import squared_cutoff
-from aaplug.core.interfaces import PixelKernel, Rasterizer
+from aaplug.core.interfaces import Rasterizer
 from aaplug.core.kernels import Kernels
 from aaplug.core.projection import project, project_covariances
 from aaplug.core.sampling import SamplingBounds
@@ -22,13 +22,13 @@ from aaplug.core.splats import Splats2D
 from aaplug.core.training import TrainingViews
 from aaplug.gsplat.arguments import Options, View
 from aaplug.methods.filters.matched import Matched
-from aaplug.methods.pixel_kernels.absolute import ABSOLUTE_POINT
+from aaplug.methods.pixel_kernels.absolute import AbsolutePoint
 from aaplug.methods.pixel_kernels.point import POINT
 from aaplug.system.cores import on_free_cores
 
 MIN_COMPENSATION = 1e-9  # gsplat has none; this one keeps the gradient of the root finite where the factor is 0
 MAX_RADIUS = 2.0**30  # px; fits 32 bits
-CHANNELS_PER_CALL = 3  # of a rasterizer
+CHANNELS_PER_CALL = (3, 4)  # of a rasterizer: colour, or colour and depth
 MIN_ALPHA_OF_DEPTH = 1e-10  # expected depth is divided by no less
 
 _EMPTY = torch.zeros(0)
@@ -96,36 +96,15 @@ def draw(
         channels.append(splats.depths[:, None])
     features = torch.cat(channels, dim=1)
     width = features.shape[1]
-    padded = functional.pad(features, (0, -width % CHANNELS_PER_CALL)).split(CHANNELS_PER_CALL, dim=1)
-    parts = [_draw_three(replace(splats, rgb=rgb), options, rasterizer, add_gradient) for rgb in padded]
-    alpha = parts[0][..., CHANNELS_PER_CALL:]
-    image = torch.cat([part[..., :CHANNELS_PER_CALL] for part in parts], dim=2)[..., :width]
+    pixel = POINT if add_gradient is None else AbsolutePoint(absolute_gradients_to=add_gradient)
+    at_once = min(CHANNELS_PER_CALL, key=lambda count: -(-width // count))
+    images = []
+    for rgb in functional.pad(features, (0, -width % at_once)).split(at_once, dim=1):
+        part = replace(splats, rgb=rgb)
+        images.append(rasterizer(part, options.hw, BLACK, pixel, None, options.convention.rules))
+    image, alpha = torch.cat([image.rgb for image in images], dim=2)[..., :width], images[0].alpha[..., None]
     if view.background is not None and options.coloured:
         image = image + (1 - alpha) * functional.pad(view.background, (0, width - len(view.background)))
     if options.render_mode.endswith("ED"):
         image = torch.cat([image[..., :-1], image[..., -1:] / alpha.clamp(min=MIN_ALPHA_OF_DEPTH)], dim=2)
     return image, alpha
-
-
-def _draw_three(
-    splats: Splats2D, options: Options, rasterizer: Rasterizer, add_gradient: AddGradient | None
-) -> Float[Tensor, "h w 4"]:
-    """Three premultiplied channels, and alpha."""
-
-    def paint(splats: Splats2D, kernel: PixelKernel) -> Tensor:
-        image = rasterizer(splats, options.hw, BLACK, kernel, None, options.convention.rules)
-        return torch.cat([image.rgb, image.alpha[..., None]], dim=2)
-
-    image = paint(splats, POINT)
-
-    def backward(gradient: Tensor) -> None:
-        assert add_gradient is not None
-        with torch.enable_grad():
-            constants = {name: x.detach() for name, x in vars(splats).items() if isinstance(x, Tensor)}
-            means = constants["means"].requires_grad_()
-            again = paint(replace(splats, **constants), ABSOLUTE_POINT)
-        add_gradient(torch.autograd.grad(again, means, gradient)[0])
-
-    if add_gradient is not None and image.requires_grad:
-        image.register_hook(backward)
-    return image

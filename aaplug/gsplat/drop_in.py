@@ -123,4 +123,4 @@ def rasterization(
 @cache
 def _rasterizer_of(name: str) -> Rasterizer:
     """A rasterizer by name; compiled kernels are loaded and checked once, not for every image."""
-    return find_rasterizer(name)
+    return find_rasterizer(name, None)

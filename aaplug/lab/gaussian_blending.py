@@ -25,7 +25,6 @@ h: half a window, in the splat's standard deviations.
 
 import math
 from dataclasses import dataclass
-from functools import cache, partial
 from typing import NamedTuple
 
 import torch
@@ -33,6 +32,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.special import ndtr
 
+from aaplug.core.interfaces import Limits
 from aaplug.core.kernels import Kernel, Kernels
 from aaplug.core.rules import RULES_3DGS, Rules
 from aaplug.core.splats import Splats2D
@@ -101,7 +101,7 @@ def moments(u: Tensor, h: Tensor) -> Moments:
     )
 
 
-def behind(light: Light, row: Float[Tensor, "t 14"], x: Tensor, y: Tensor, rules: Rules) -> Light:
+def behind(light: Light, row: Float[Tensor, "t 14"], x: Tensor, y: Tensor, limits: Limits) -> Light:
     """The light behind one splat of each tile.  x, y: of the pixels' centres, in px."""
     ux, uy, vx, vy, mean_x, mean_y, opacity, red, green, blue, *more = (c[:, None] for c in row.unbind(1))
     dx, dy = x - mean_x + light.x, y - mean_y + light.y
@@ -109,8 +109,9 @@ def behind(light: Light, row: Float[Tensor, "t 14"], x: Tensor, y: Tensor, rules
     along_u, along_v = moments(ux * dx + uy * dy, half_u), moments(vx * dx + vy * dy, half_v)
     plain = (half_u < 0.5 * MAX_POINT_SPAN) | (half_v < 0.5 * MAX_POINT_SPAN)
     value = torch.where(plain, along_u.centre * along_v.centre, along_u.value * along_v.value)
-    alpha = (opacity * value).clamp(max=rules.max_alpha)
-    hides = (alpha >= rules.min_alpha) & (light.share >= rules.min_transmittance)
+    capped = opacity * value
+    alpha = torch.where(capped < limits.max_alpha, capped, limits.max_alpha)
+    hides = (alpha > limits.below_min_alpha) & (light.share > limits.below_min_transmittance)
     weight = torch.where(hides, alpha * light.share, 0.0)
     moves = hides & ~plain
     by_u, width = _rest(along_u, half_u, more[2], alpha)
@@ -145,9 +146,9 @@ class GaussianBlending:
 
     name: str = "gaussian-blending"
 
-    def kernels(self, rules: Rules) -> tuple[Kernel, ...]:
+    def kernels(self) -> tuple[Kernel, ...]:
         """A pass."""
-        return (pass_kernel(rules),)
+        return (PASS,)
 
     def rows(self, splats: Splats2D) -> Float[Tensor, "m_and_1 14"]:
         """Principal axes, that which runs nearer to x first; half a pixel along them; their variances in px²."""
@@ -173,10 +174,10 @@ class GaussianBlending:
         x, y = centres
         image = x.new_zeros(4, *x.shape)
         tiles, light = torch.arange(len(counts), device=x.device), light_of(x, window)
-        at, ends, kernel = first, first + counts, pass_kernel(rules)
+        at, ends, limits = first, first + counts, x.new_tensor(Limits.by(rules))
         while len(tiles):
             for nearest in next_rows(rows, order, at, ends, GATHERED).split(SPLATS_PER_PASS, dim=1):
-                light = Light(*kernels.run(kernel, nearest, x, y, *light))
+                light = Light(*kernels.run(PASS, nearest, x, y, *light, limits))
             at = torch.minimum(at + GATHERED, ends)
             alive = (at < ends) & (light.share.amax(dim=1) >= rules.min_transmittance)
             count = int(alive.sum())
@@ -233,30 +234,23 @@ def _exact_moments(
 
 
 def _pass(
-    rules: Rules,
-    nearest: Float[Tensor, "t K 14"],
-    x: Float[Tensor, "t P"],
-    y: Float[Tensor, "t P"],
-    *light: Float[Tensor, "t P"],
+    nearest: Float[Tensor, "t K 14"], x: Float[Tensor, "t P"], y: Float[Tensor, "t P"], *light_and_limits: Tensor
 ) -> tuple[Float[Tensor, "t P"], ...]:
     """The light behind the next splats of each tile."""
-    here = Light(*light)
+    *light, values = light_and_limits
+    here, limits = Light(*light), Limits.of(values)
     for row in nearest.unbind(1):
-        here = behind(here, row, x, y, rules)
+        here = behind(here, row, x, y, limits)
     return tuple(here)
 
 
 def _pass_example() -> tuple[Tensor, ...]:
     rows = torch.linspace(0.1, 1.0, EXAMPLE_TILES * SPLATS_PER_PASS * (COLUMNS + 4))
     x = torch.linspace(0.0, 1.0, EXAMPLE_TILES * PIXELS).view(EXAMPLE_TILES, PIXELS)
-    return rows.view(EXAMPLE_TILES, SPLATS_PER_PASS, -1), x, x.flip(0), *(c.clone() for c in light_of(x, 1.0))
+    light = [c.clone() for c in light_of(x, 1.0)]
+    return rows.view(EXAMPLE_TILES, SPLATS_PER_PASS, -1), x, x.flip(0), *light, torch.tensor(Limits.by(RULES_3DGS))
 
 
-@cache
-def pass_kernel(rules: Rules = RULES_3DGS) -> Kernel:
-    """A pass by the given rules."""
-    name, sizes = f"gaussian-blending{rules.tag}", 11 * ("t",)
-    return Kernel(name, partial(_pass, rules), _pass_example, sizes, chained=True, evaluations=SPLATS_PER_PASS)
-
-
+SIZES = (*11 * ("t",), None)
+PASS = Kernel("gaussian-blending", _pass, _pass_example, SIZES, chained=True, evaluations=SPLATS_PER_PASS)
 GAUSSIAN_BLENDING = GaussianBlending()

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.special import ndtr
 
 from aaplug.core.ellipses import Columns, grown
-from aaplug.core.interfaces import Pixels
+from aaplug.core.interfaces import Limits, Pixels
 from aaplug.core.kernels import Kernels
 from aaplug.core.rules import Rules
 from aaplug.core.splats import Splats2D
@@ -49,12 +49,12 @@ class Integral:
         halves = [0.5 * splats.window * torch.hypot(x, y) for x, y in ((ux, uy), (vx, vy))]
         return rows_of(splats, [ux, uy, vx, vy], [*halves, torch.zeros_like(ux)])
 
-    def alpha(self, rows: Float[Tensor, "*n t c"], pixels: Pixels, rules: Rules) -> Float[Tensor, "*n t P"]:
+    def alpha(self, rows: Float[Tensor, "*n t c"], pixels: Pixels, limits: Limits) -> Float[Tensor, "*n t P"]:
         """Opacity times the means over the window along both axes."""
         alpha = rows[..., OPACITY, None]
         for form, half in zip(forms_at(rows, pixels), (HALF_U, HALF_V), strict=True):
             alpha = alpha * mean_gaussian(form, rows[..., half, None])
-        return torch.threshold(alpha, rules.below_min_alpha, 0.0)
+        return limits.cut(alpha)
 
     def exact(self, splats: Splats2D, offsets: Float[Tensor, "p c 2"]) -> Float[Tensor, "p c"]:
         """2π σ₁ σ₂ P₁ P₂ / window²: Pᵢ is the normal distribution's probability of the window along axis i."""

@@ -44,16 +44,17 @@ class Reference:
             _strip(splats, strip, pixel, rules) if compositor is None else compositor.exact(splats, strip, rules)
             for strip in torch.cartesian_prod(y, x).flip(1).split(STRIP_PIXELS)
         ]
-        rgb = torch.cat([rgb for rgb, _ in strips]).reshape(*hw, 3)
+        rgb = torch.cat([rgb for rgb, _ in strips]).reshape(*hw, -1)
         transmittance = torch.cat([t for _, t in strips]).reshape(hw)
         return over(rgb, 1 - transmittance, background)
 
 
 def _strip(
     splats: Splats2D, centres: Float[Tensor, "p 2"], pixel: PixelKernel, rules: Rules
-) -> tuple[Float[Tensor, "p 3"], Float[Tensor, " p"]]:
+) -> tuple[Float[Tensor, "p d"], Float[Tensor, " p"]]:
     """Premultiplied colour and transmittance."""
-    rgb = centres.new_zeros(len(centres), 3)
+    assert splats.rgb is not None
+    rgb = centres.new_zeros(len(centres), splats.rgb.shape[1])
     transmittance = centres.new_ones(len(centres))
     going = torch.ones_like(transmittance, dtype=torch.bool)
     for start in range(0, len(splats), CHUNK_SPLATS):
@@ -63,8 +64,7 @@ def _strip(
         before = torch.cat([transmittance[:, None], after[:, :-1]], dim=1)
         # `after` only falls, so the first splat that misses the bound ends the pixel
         counts = (after >= rules.min_transmittance) & going[:, None]
-        assert chunk.rgb is not None
-        rgb = rgb + (torch.where(counts, alpha * before, 0.0)) @ chunk.rgb
+        rgb = rgb + torch.where(counts, alpha * before, 0.0) @ splats.rgb[start : start + CHUNK_SPLATS]
         transmittance = torch.minimum(transmittance, torch.where(counts, after, 1.0).amin(dim=1))
         going = going & counts[:, -1]
     return rgb, transmittance

@@ -96,11 +96,12 @@ class Job(Generic[O_co]):
         """The views that the options name."""
         return select_views(self.cameras, self.options.views)
 
-    def look(self: "Job[ViewOptions]", frames: int, check: bool = True) -> Renderer:
+    def look(self: "Job[ViewOptions]", frames: int | None, *, gradients: bool = False, check: bool = True) -> Renderer:
         """The scene as training showed it, with the background and rasterizer that the options ask for.
 
         Args:
-            frames: number of images that will be rendered in all.
+            frames: number of images that will be rendered in all; None if nobody knows.
+            gradients: each of them is a step of an optimization.
             check: say how well scene and cameras fit, which takes seconds.
 
         Raises:
@@ -114,7 +115,7 @@ class Job(Generic[O_co]):
             say(f"background: {name} ({'from the camera files' if self.cameras.background else unstated})")
         rasterizer = options.rasterizer
         if isinstance(rasterizer, str):
-            rasterizer = find_rasterizer(rasterizer, frames, say)
+            rasterizer = find_rasterizer(rasterizer, frames, say, gradients=gradients)
         if options.memory is not None and isinstance(rasterizer, TakesMemory):
             rasterizer = rasterizer.within(options.memory * 1e9)
         training = self.training(self.scene)

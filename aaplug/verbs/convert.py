@@ -122,7 +122,7 @@ def _fitted(job: Job[ConvertOptions], viewer: Viewer) -> Converted:
     """The scene optimized for a viewer."""
     gaussians = job.scene.gaussians()
     steps = steps_for(gaussians, viewer) if job.options.steps is None else job.options.steps
-    look = job.look(steps)
+    look = job.look(steps, gradients=True)
     job.say_assumed(look)
     fitted = fit(gaussians, viewer, look, job.views, steps, job.monitor)
     return Converted(len(fitted.scene), fitted.scene, viewer, fitted.report)

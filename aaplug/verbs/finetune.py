@@ -87,7 +87,7 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
     upsampler = str(options.upsampler)
     upsampler = digest_of_files([upsampler]) if Path(upsampler).is_file() else upsampler
     with running(options, path, check, job.inputs):
-        raw, look, train = job.scene.gaussians(), job.look(settings.steps), job.cameras.train
+        raw, look, train = job.scene.gaussians(), job.look(settings.steps, gradients=True), job.cameras.train
         before = replace(look, scene=viewer.shown(look.scene), recipe=RECIPES[viewer.recipe])
         start = replace(before, scene=fuse_for(raw, look.training, viewer))
         truth = Truth(look, truth_source, enlarge=enlarge, memory=MEMORY)

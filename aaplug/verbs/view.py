@@ -18,7 +18,6 @@ from aaplug.system.extras import install_command
 from aaplug.system.monitor import Monitor
 from aaplug.verbs.verb import looks
 
-MIN_FRAMES = 100  # that are drawn at least; not so many that kernels are compiled first
 SAMPLE = "chair.ply"
 
 
@@ -37,7 +36,7 @@ def serving(scene: SceneLike | None, cameras: CamerasLike, options: LiveOptions)
 
     def subject_of(scene: SceneLike, cameras: CamerasLike, title: str | None, words: Sequence[str]) -> Subject:
         job = Job.of(scene, cameras, options)
-        look = job.look(MIN_FRAMES, check=False)
+        look = job.look(None, check=False)
         job.say_assumed()
         recipes = [name for name in RECIPE_NAMES if name in RECIPES]  # without plug-ins that cannot be used
         title = title or job.scene.title

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import Gaussians
-from aaplug.core.interfaces import Pixels
+from aaplug.core.interfaces import Limits, Pixels
 from aaplug.core.projection import project, rotation_matrices, with_depth_slopes
 from aaplug.core.rules import RULES_3DGS
 from aaplug.core.splats import Splats2D
@@ -175,9 +175,9 @@ def test_the_polynomial_of_compiled_loops_is_exp2(monkeypatch):
     rows[:, OPACITY] = exponents[:, 0] - point.LOG2_PADDING
     pixels = Pixels(torch.zeros(len(rows), 2), torch.zeros(1), torch.zeros(1))
     monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)
-    compiled = POINT.alpha(rows, pixels, RULES_3DGS)
+    compiled = POINT.alpha(rows, pixels, Limits.by(RULES_3DGS))
     exact = torch.exp2(exponents.double())
-    above = exponents >= RULES_3DGS.log2_min_alpha
+    above = exponents >= Limits.by(RULES_3DGS).log2_min_alpha
     assert compiled[~above].eq(0).all()
     relative = compiled[above].double() / exact[above] - 1
     assert relative.abs().max() < 4e-6

@@ -7,7 +7,7 @@ from unittest.mock import patch
 import torch
 
 from aaplug.core.ellipses import squared_cutoff, whitening
-from aaplug.core.interfaces import Compositor, PixelKernel, Pixels, Rasterizer
+from aaplug.core.interfaces import Compositor, Limits, PixelKernel, Pixels, Rasterizer
 from aaplug.core.kernels import EAGER
 from aaplug.core.rules import RULES_3DGS, Rules
 from aaplug.core.splats import Render, Splats2D
@@ -51,7 +51,8 @@ def alpha_is_exact(pixel: PixelKernel) -> None:
         centres = torch.stack(tile_centres(corners), dim=1)
         rows = pixel.raster_rows(splats.to(dtype), EAGER)[:-1, None].expand(-1, len(corners), -1)
         with patch("torch.compiler.is_compiling", lambda: compiling):  # noqa: B023 (called in the same turn)
-            alpha = pixel.alpha(rows, Pixels(corners, *centres.unbind(dim=1)), rules)
+            limits = Limits(*torch.tensor(Limits.by(rules)).unbind()) if compiling else Limits.by(rules)
+            alpha = pixel.alpha(rows, Pixels(corners, *centres.unbind(dim=1)), limits)
         points = (corners[:, None] + centres).flatten(0, 1).double()
         exact = pixel.exact(splats, points[:, None] - splats.means) * splats.opacities
         exact = exact.T.unflatten(1, alpha.shape[1:])
@@ -74,8 +75,8 @@ def rows_hold_colours(pixel: PixelKernel) -> None:
     torch.testing.assert_close(rows[:-1, RED : BLUE + 1], splats.rgb)
     pixels = Pixels(torch.tensor([[0.0, 0.0], [8.0, 800.0]], dtype=F64), *tile_centres(rows))
     drawn, padding = (rows[:-1, None].expand(-1, 2, -1), rows[-1:].expand(2, -1))
-    require((pixel.alpha(drawn, pixels, RULES_3DGS) > 0).any(), "draws nothing")
-    require(pixel.alpha(padding, pixels, RULES_3DGS).eq(0).all(), "the padding row draws")
+    require((pixel.alpha(drawn, pixels, Limits.by(RULES_3DGS)) > 0).any(), "draws nothing")
+    require(pixel.alpha(padding, pixels, Limits.by(RULES_3DGS)).eq(0).all(), "the padding row draws")
     require(pixel.splats_per_pass % STEP == 0, f"splats_per_pass is no multiple of {STEP}")
 
 

@@ -1,48 +1,46 @@
-"""The value at the pixel's centre, with another gradient: of a splat's centre, the sum of absolute values over pixels.
+"""The value at the pixel's centre, with one more gradient: of a splat's centre, the sum of absolute values over pixels.
 
 AbsGS (Ye et al., arXiv 2404.10484, eq. 6) splits splats by it: gradients of a splat that blurs much detail cancel in
-the sum.  Everything but the centre has gradient 0.
+the sum.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.interfaces import Pixels
 from aaplug.core.kernels import Kernels
-from aaplug.methods.pixel_kernels.gradients import Move
 from aaplug.methods.pixel_kernels.point import LN_2, Point
-from aaplug.methods.pixel_kernels.raster_rows import UX, UY, VX, VY, X, Y, forms_at
+from aaplug.methods.pixel_kernels.raster_rows import UX, UY, VX, VY
 
 
 @dataclass(frozen=True)
 class AbsolutePoint(Point):
-    """`Point`, with absolute gradients of the centres."""
+    """`Point`, whose backward pass also tells the absolute gradients of the centres.
+
+    absolute_gradients_to: takes them, [m, 2] for all m splats; several times where an image is drawn in bands.
+    """
 
     name: str = "point-absolute"
-    gradient_sums: int = 2
+    gradient_sums: int = 8
+    absolute_gradients_to: Callable[[Tensor], object] | None = field(default=None, compare=False, repr=False)
 
-    def sums(
-        self, moves: list[Move], colours: tuple[Tensor, Tensor, Tensor], T: Tensor, pixels: Pixels
-    ) -> Float[Tensor, "t s_K"]:
-        """Per splat, the sums of the absolute gradients of its centre's x and y."""
-        sums = []
-        for row, _, gradient in moves:
-            u, v = forms_at(row, pixels)
-            for i, j in ((UX, VX), (UY, VY)):
-                slope = 2 * LN_2 * (row[:, i, None] * u + row[:, j, None] * v)
-                sums.append((gradient * slope).abs().sum(dim=1))
-        return torch.stack(sums, dim=1)
+    def further_terms(
+        self, row: Float[Tensor, "t c"], gradient: Float[Tensor, "t P"], forms: tuple[Tensor, Tensor]
+    ) -> list[Float[Tensor, "t P"]]:
+        """Absolute gradients of the centre's x and y at each pixel."""
+        u, v = forms
+        slopes = (2 * LN_2 * (row[:, i, None] * u + row[:, j, None] * v) for i, j in ((UX, VX), (UY, VY)))
+        return [(gradient * slope).abs() for slope in slopes]
 
     def from_sums(
         self, rows: Float[Tensor, "m c"], sums: Float[Tensor, "m s"], kernels: Kernels
     ) -> Float[Tensor, "m c"]:
-        """The sums, as the gradient of the centre."""
-        gradient = torch.zeros_like(rows)
-        gradient[:, X], gradient[:, Y] = sums.unbind(dim=1)
-        return gradient
+        """Gradient of the raster rows, as of `Point`; the last two sums are those of absolute gradients."""
+        if self.absolute_gradients_to is not None:
+            self.absolute_gradients_to(sums[:-1, -2:])
+        return super().from_sums(rows, sums[:, :-2], kernels)
 
 
 ABSOLUTE_POINT = AbsolutePoint()

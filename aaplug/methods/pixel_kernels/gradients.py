@@ -3,15 +3,15 @@
 t: tiles; K: splats of a step; P: pixels per tile; c: columns of a raster row; s: sums.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.interfaces import PixelKernel, Pixels
+from aaplug.core.interfaces import Limits, PixelKernel, Pixels
 from aaplug.core.kernels import Kernels
-from aaplug.core.rules import Rules
 from aaplug.methods.pixel_kernels.raster_rows import BLUE, RED
 
 
@@ -27,18 +27,18 @@ class Move(NamedTuple):
 class SumsGradients(Protocol):
     """A pixel kernel that sums its own gradient in closed form; without it, autograd differentiates `alpha`.
 
-    gradient_sums: number of sums per splat.
+    gradient_sums: number of sums per splat, beside one of each channel.
     """
 
     @property
     def gradient_sums(self) -> int: ...  # noqa: D102
 
     def sums(
-        self, moves: list[Move], colours: tuple[Tensor, Tensor, Tensor], T: Tensor, pixels: Pixels
+        self, moves: list[Move], colours: Sequence[Float[Tensor, "t P"]], T: Tensor, pixels: Pixels
     ) -> Float[Tensor, "t s_K"]:
-        """Sums over each tile's pixels, `gradient_sums` of each splat.
+        """Sums over each tile's pixels of each splat.
 
-        colours: gradient of the image's red, green and blue.  T: transmittance before the first of the splats.
+        colours: gradient of each channel of the image.  T: transmittance before the first of the splats.
         """
         ...
 
@@ -49,20 +49,20 @@ class SumsGradients(Protocol):
         ...
 
 
-def sums_per_splat(pixel: PixelKernel) -> int:
+def sums_per_splat(pixel: PixelKernel, channels: int) -> int:
     """The number of sums that a splat's gradient is made of."""
-    return pixel.gradient_sums if isinstance(pixel, SumsGradients) else pixel.columns
+    return pixel.gradient_sums + channels if isinstance(pixel, SumsGradients) else pixel.columns
 
 
 def sums_by_autograd(
-    pixel: PixelKernel, rules: Rules, moves: list[Move], colours: tuple[Tensor, Tensor, Tensor], pixels: Pixels
+    pixel: PixelKernel, limits: Limits, moves: list[Move], colours: Sequence[Float[Tensor, "t P"]], pixels: Pixels
 ) -> Float[Tensor, "t c_K"]:
     """Gradient of the raster rows for any pixel kernel: autograd of alpha, from the gradient of log alpha."""
     rows, weights, gradients = (torch.stack(x, dim=1) for x in zip(*moves, strict=True))
     with torch.enable_grad():
         rows = rows.detach().requires_grad_()
-        alpha = pixel.alpha(rows.transpose(0, 1), pixels, rules).transpose(0, 1)
+        alpha = pixel.alpha(rows.transpose(0, 1), pixels, limits).transpose(0, 1)
         grads = torch.where(alpha > 0, gradients / alpha, 0.0).detach()
         (added,) = torch.autograd.grad(alpha, rows, grads)
-    added[..., RED : BLUE + 1] = torch.bmm(weights, torch.stack(colours, dim=2))
+    added[..., RED : BLUE + 1] = torch.bmm(weights, torch.stack([*colours], dim=2))
     return added.flatten(1)

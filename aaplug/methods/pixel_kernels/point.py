@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from aaplug.core.ellipses import whitening, whitening_columns
-from aaplug.core.interfaces import Pixels
+from aaplug.core.interfaces import Limits, Pixels
 from aaplug.core.kernels import Kernel, Kernels, backward_of
 from aaplug.core.projection import sum_of
 from aaplug.core.rules import Rules
@@ -31,6 +31,7 @@ LN_2 = math.log(2)
 LOG2_PADDING = -9.0  # log2 alpha of the padding row, below every cut-off
 SQUARINGS = 3  # 2^x is computed as p(x)^(2^SQUARINGS), p of degree DEGREE: relative error 3e-6 in float32
 DEGREE = 5
+COMMON_SUMS = 9  # six of alpha and those of three channels; those of further channels follow
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,7 @@ class Point:
     columns: int = COLUMNS
     needs_depth_slopes: bool = False
     splats_per_pass: int = 16
-    gradient_sums: int = 9
+    gradient_sums: int = 6
 
     def bounding_ellipses(self, splats: Splats2D, rules: Rules) -> Splats2D | None:
         """The splats themselves."""
@@ -50,14 +51,11 @@ class Point:
     def raster_rows(self, splats: Splats2D, kernels: Kernels) -> Float[Tensor, "m c"]:
         """Scaled forms, and opacity as its log2."""
         assert splats.rgb is not None
-        columns = (splats.means, splats.covs, splats.dets, splats.opacities, splats.rgb)
-        return kernels.run(POINT_ROWS, *columns)[0]
+        columns = (splats.means, splats.covs, splats.dets, splats.opacities, splats.rgb[:, :3])
+        rows, more = kernels.run(POINT_ROWS, *columns)[0], splats.rgb[:, 3:]
+        return torch.cat([rows, functional.pad(more, (0, 0, 0, 1))], dim=1) if more.shape[1] else rows
 
-    def kernels(self, rules: Rules) -> tuple[Kernel, ...]:
-        """Those of raster rows and of the sums of gradients."""
-        return POINT_ROWS, FROM_SUMS, POINT_ROWS_BACKWARD
-
-    def alpha(self, rows: Float[Tensor, "*n t c"], pixels: Pixels, rules: Rules) -> Float[Tensor, "*n t P"]:
+    def alpha(self, rows: Float[Tensor, "*n t c"], pixels: Pixels, limits: Limits) -> Float[Tensor, "*n t P"]:
         """2^(log2 o - u² - v²), 0 below the cut-off.
 
         Compiled it is a polynomial, because a call in a loop stops vectorization.  Below the cut-off that may be
@@ -68,11 +66,11 @@ class Point:
         if torch.compiler.is_compiling():
             h = torch.addcmul(torch.addcmul(opacity, u, u, value=-1), v, v, value=-1)
             value = _polynomial(h, ROOT_OF_EXP2).pow(2**SQUARINGS)  # compiled to squarings
-            return torch.where(h >= rules.log2_min_alpha - LOG2_PADDING, value, 0.0)
+            return torch.where(h >= limits.log2_min_alpha - LOG2_PADDING, value, 0.0)
         exponent = torch.addcmul(opacity + LOG2_PADDING, u, u, value=-1)
         exponent = torch.addcmul(exponent, v, v, value=-1)
         # The exponent is clamped, because subnormal numbers are slow.
-        return torch.threshold(exponent.clamp_(min=LOG2_PADDING).exp2_(), rules.below_min_alpha, 0.0)
+        return limits.cut(exponent.clamp_(min=LOG2_PADDING).exp2_())
 
     def exact(self, splats: Splats2D, offsets: Float[Tensor, "p c 2"]) -> Float[Tensor, "p c"]:
         """exp(-dᵀ C⁻¹ d / 2)."""
@@ -80,15 +78,18 @@ class Point:
         return torch.exp(-0.5 * white.square().sum(dim=2))
 
     def sums(
-        self, moves: list[Move], colours: tuple[Tensor, Tensor, Tensor], T: Tensor, pixels: Pixels
+        self, moves: list[Move], colours: Sequence[Float[Tensor, "t P"]], T: Tensor, pixels: Pixels
     ) -> Float[Tensor, "t s_K"]:
-        """Per splat, nine sums over the tile's pixels, from which `from_sums` makes the gradient of its raster row.
+        """Per splat, sums over the tile's pixels, from which `from_sums` makes the gradient of its raster row.
 
         With s the gradient of log alpha: s·u², s·u·v, s·v², s·u, s·v, s, and the compositing weight times the gradient
-        of red, green and blue.
+        of each channel.
         """
         if not torch.compiler.is_compiling():
-            return _sums_by_products(moves, colours, pixels)
+            sums = _sums_by_products(moves, colours, pixels)
+            more = [self.further_terms(row, gradient, forms_at(row, pixels)) for row, _, gradient in moves]
+            further = [torch.stack([x.sum(dim=1) for x in terms], dim=1) for terms in more if terms]
+            return torch.cat([sums, torch.stack(further, dim=1)] if further else [sums], dim=2).flatten(1)
         sums = []
         for row, weight, gradient in moves:
             # Both are 0 where T is 0, but the test on T makes the compiler fuse all sums into one loop.
@@ -96,13 +97,21 @@ class Point:
             u, v = forms_at(row, pixels)
             su, sv = gradient * u, gradient * v
             sums += [su * u, su * v, sv * v, su, sv, gradient, *(weight * colour for colour in colours)]
+            sums += self.further_terms(row, gradient, (u, v))
         return torch.cat([x.sum(dim=1, keepdim=True) for x in sums], dim=1)
+
+    def further_terms(
+        self, row: Float[Tensor, "t c"], gradient: Float[Tensor, "t P"], forms: tuple[Tensor, Tensor]
+    ) -> list[Float[Tensor, "t P"]]:
+        """Terms of further sums: none.  gradient: of log alpha."""
+        return []
 
     def from_sums(
         self, rows: Float[Tensor, "m c"], sums: Float[Tensor, "m s"], kernels: Kernels
     ) -> Float[Tensor, "m c"]:
         """Gradient of the raster rows from the sums."""
-        return kernels.run(FROM_SUMS, rows, sums)[0]
+        gradient, more = kernels.run(FROM_SUMS, rows[:, :COLUMNS], sums[:, :COMMON_SUMS])[0], sums[:, COMMON_SUMS:]
+        return torch.cat([gradient, more], dim=1) if more.shape[1] else gradient
 
 
 def _point_rows(
@@ -138,8 +147,8 @@ def _root_of_exp2(squarings: int, degree: int) -> tuple[float, ...]:
 
 
 def _sums_by_products(
-    moves: list[Move], colours: tuple[Tensor, Tensor, Tensor], pixels: Pixels
-) -> Float[Tensor, "t s_K"]:
+    moves: list[Move], colours: Sequence[Float[Tensor, "t P"]], pixels: Pixels
+) -> Float[Tensor, "t K s"]:
     """The same sums, for eager mode: matrix products of moments about the tile's centre, to keep precision."""
     rows, weights, gradients = (torch.stack(x, dim=1) for x in zip(*moves, strict=True))
     x, y = pixels.x - TILE / 2, pixels.y - TILE / 2
@@ -152,8 +161,8 @@ def _sums_by_products(
     moments = ((s, sx, sy), (sx, sxx, sxy), (sy, sxy, syy))
     by_u, by_v = ([_dot(form, moment) for moment in moments] for form in (u, v))  # s times the form, times 1, x and y
     squares = [_dot(u, by_u), _dot(v, by_u), _dot(v, by_v)]
-    by_colour = torch.bmm(weights, torch.stack(colours, dim=2)).unbind(dim=2)
-    return torch.stack([*squares, by_u[0], by_v[0], s, *by_colour], dim=2).flatten(1)
+    by_colour = torch.bmm(weights, torch.stack([*colours], dim=2)).unbind(dim=2)
+    return torch.stack([*squares, by_u[0], by_v[0], s, *by_colour], dim=2)
 
 
 def _dot(a: Sequence[Tensor], b: Sequence[Tensor]) -> Tensor:
@@ -178,7 +187,7 @@ def _from_sums(rows: Float[Tensor, "m 10"], sums: Float[Tensor, "m 9"]) -> tuple
 
 def _from_sums_example() -> tuple[Tensor, ...]:
     rows = _point_rows(*_point_example())[0]
-    return rows, torch.linspace(0.1, 1.0, len(rows) * POINT.gradient_sums).view(len(rows), -1)
+    return rows, torch.linspace(0.1, 1.0, len(rows) * COMMON_SUMS).view(len(rows), -1)
 
 
 def _point_example() -> tuple[Tensor, ...]:

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.ellipses import grown, squared_cutoff, whitening_columns
-from aaplug.core.interfaces import Pixels
+from aaplug.core.interfaces import Limits, Pixels
 from aaplug.core.kernels import Kernels
 from aaplug.core.rules import Rules
 from aaplug.core.splats import Splats2D
@@ -76,14 +76,14 @@ class Surfel:
         forms = whitening_columns(splats.covs, splats.dets)
         return rows_of(splats, forms, [*splats.depth_slopes.unbind(dim=1), width])
 
-    def alpha(self, rows: Float[Tensor, "*n t c"], pixels: Pixels, rules: Rules) -> Float[Tensor, "*n t P"]:
+    def alpha(self, rows: Float[Tensor, "*n t c"], pixels: Pixels, limits: Limits) -> Float[Tensor, "*n t P"]:
         """Opacity times the disc's value."""
         e = forms_at(rows, pixels)
         dx, dy = offsets_at(rows, pixels)
         slopes = rows[..., SLOPE_X, None], rows[..., SLOPE_Y, None]
         ahead = (1 - slopes[0] * dx - slopes[1] * dy).clamp(min=IN_FRONT)
         value = self.value(rows, e, ahead, slopes, dx * dx + dy * dy)
-        return torch.threshold(rows[..., OPACITY, None] * value, rules.below_min_alpha, 0.0)
+        return limits.cut(rows[..., OPACITY, None] * value)
 
     def value(
         self, rows: Tensor, e: tuple[Tensor, Tensor], ahead: Tensor, slopes: tuple[Tensor, Tensor], squared: Tensor

@@ -18,7 +18,7 @@ import subprocess
 import sys
 import warnings
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from functools import cache, partial
 from pathlib import Path
@@ -30,9 +30,9 @@ import torch
 from aaplug.core import culling, projection, shading, splats
 from aaplug.core.interfaces import RunsOwnKernels
 from aaplug.core.kernels import EAGER, ONE_MORE, Kernel, Kernels
-from aaplug.core.rules import RULES_3DGS
+from aaplug.methods.pixel_kernels.absolute import ABSOLUTE_POINT
 from aaplug.methods.pixel_kernels.gradients import SumsGradients
-from aaplug.methods.pixel_kernels.point import POINT
+from aaplug.methods.pixel_kernels.point import FROM_SUMS, POINT, POINT_ROWS, POINT_ROWS_BACKWARD
 from aaplug.methods.recipe import Recipe
 from aaplug.rasterizers.tiled import backward, binning, forward, layout
 from aaplug.rasterizers.tiled.packages import CompiledKernels, Package
@@ -43,23 +43,40 @@ from aaplug.system.executors import Processes, torch_threads
 from aaplug.system.locks import scratch
 from aaplug.system.monitor import Tell
 
-KERNELS: tuple[Kernel, ...] = (  # of every recipe with the pixel kernel `POINT`; the slowest to compile come last
-    projection.project_kernel(),
+IMAGE_KERNELS: tuple[Kernel, ...] = (  # of every recipe with the pixel kernel `POINT`
+    projection.PROJECT,
     *map(shading.shade_kernel, shading.COMPILED_COEFFICIENTS),
     splats.SELECT,
-    culling.cull_kernel(),
-    binning.table_kernel(),
+    culling.CULL,
+    binning.TABLE,
     binning.SPANS,
     binning.PAIRS,
     binning.LISTS,
-    layout.LINES,
-    backward.SLOTS,
-    *POINT.kernels(RULES_3DGS),
-    *map(shading.gradients_kernel, shading.COMPILED_COEFFICIENTS),
-    backward.step_kernel(POINT, RULES_3DGS),
-    projection.PROJECT_BACKWARD,
-    forward.pass_kernel(POINT, RULES_3DGS),
+    layout.lines_kernel(),
+    POINT_ROWS,
+    forward.pass_kernel(POINT),
 )
+KERNELS: tuple[Kernel, ...] = (  # with those of gradients
+    *IMAGE_KERNELS,
+    backward.SLOTS,
+    POINT_ROWS_BACKWARD,
+    FROM_SUMS,
+    *map(shading.gradients_kernel, shading.COMPILED_COEFFICIENTS),
+    projection.PROJECT_BACKWARD,
+    forward.pass_kernel(POINT, keeps=True),
+    backward.step_kernel(POINT),
+)
+# What a trainer asks of `aaplug.gsplat` beside these: depth as a fourth channel, and absolute gradients.
+TRAINER_KERNELS: tuple[Kernel, ...] = (
+    layout.lines_kernel(5),
+    forward.pass_kernel(POINT, 4),
+    *(
+        kernel
+        for pixel, channels in ((POINT, 4), (ABSOLUTE_POINT, 3), (ABSOLUTE_POINT, 4))
+        for kernel in (forward.pass_kernel(pixel, channels, keeps=True), backward.step_kernel(pixel, channels))
+    ),
+)
+SLOW_TO_COMPILE = ("composite-", "gaussian-", projection.PROJECT_BACKWARD.name)  # beginnings of names
 OPTIONS = {
     "max_fusion_size": 1_000_000,  # a pass stays one loop, however many operations it has
     "cpp.max_horizontal_fusion_size": 1_000_000,  # and however many sums it has
@@ -86,20 +103,21 @@ log = logging.getLogger("aaplug")
 Run = Callable[[list[torch.Tensor]], list[torch.Tensor]]
 
 
-def kernels_of(recipes: Sequence[Recipe]) -> list[Kernel]:
-    """`KERNELS` and those that drawing by these recipes needs, each once.
+def kernels_of(recipes: Sequence[Recipe], gradients: bool = True) -> list[Kernel]:
+    """`KERNELS`, or only `IMAGE_KERNELS`, and those that drawing by these recipes needs, each once.
 
     A recipe needs the passes of its pixel kernel or compositor, and the kernels that either runs by itself.  A gradient
     that autograd makes, where a pixel kernel does not sum its own, is never compiled.
     """
-    kernels = list(KERNELS)
+    kernels = [*(KERNELS if gradients else IMAGE_KERNELS)]
     for recipe in recipes:
         drawn_by = recipe.compositor or recipe.pixel
         if isinstance(drawn_by, RunsOwnKernels):
-            kernels += drawn_by.kernels(RULES_3DGS)
+            kernels += drawn_by.kernels()
         if recipe.compositor is None:
-            passes = (backward.step_kernel, forward.pass_kernel)[not isinstance(recipe.pixel, SumsGradients) :]
-            kernels += [make(recipe.pixel, RULES_3DGS) for make in passes]
+            if gradients and isinstance(recipe.pixel, SumsGradients):
+                kernels += [backward.step_kernel(recipe.pixel), forward.pass_kernel(recipe.pixel, keeps=True)]
+            kernels.append(forward.pass_kernel(recipe.pixel))
     return list({kernel.name: kernel for kernel in kernels}.values())
 
 
@@ -114,6 +132,11 @@ def package_path(kernel: Kernel) -> Path:
     facts = (torch.__version__, options, _compiler(), _compiler_version(_compiler()), _processor(), sources_of(kernel))
     key = hashlib.sha256("\0".join(map(str, facts)).encode()).hexdigest()[:16]
     return cache_folder() / f"{kernel.name}-{key}.pt2"
+
+
+def is_built(kernel: Kernel) -> bool:
+    """True if a package of this kernel, sound or not, is in the cache."""
+    return package_path(kernel).is_file()
 
 
 def has_compiler() -> bool:
@@ -143,20 +166,19 @@ def _processor() -> str:
 
 
 def load() -> CompiledKernels | None:
-    """The compiled kernels, if all of `KERNELS` are built and those for images are sound.
+    """The compiled kernels, if all of `IMAGE_KERNELS` are built and sound.
 
     Others are used where they are built.  Each loads when it is first needed; a broken one is replaced by its eager
     function.
     """
-    if not all(package_path(kernel).is_file() for kernel in KERNELS):
+    if not all(map(is_built, IMAGE_KERNELS)):
         return None
     packages = {}
-    for kernel in KERNELS:
-        if not kernel.pulls_back:
-            packages[kernel.name] = _package(kernel)
-            if packages[kernel.name] is None:
-                return None
-    return CompiledKernels(lambda kernel: packages.get(kernel.name) or _package(kernel), KERNELS, load_or_eager)
+    for kernel in IMAGE_KERNELS:
+        packages[kernel.name] = package_of(kernel)
+        if packages[kernel.name] is None:
+            return None
+    return CompiledKernels(lambda kernel: packages.get(kernel.name) or package_of(kernel), KERNELS, load_or_eager)
 
 
 def load_or_eager() -> Kernels:
@@ -164,15 +186,22 @@ def load_or_eager() -> Kernels:
     return load() or EAGER
 
 
-def build(progress: Tell = lambda done, total: None, recipes: Sequence[Recipe] = ()) -> CompiledKernels:
+def build(
+    progress: Tell = lambda done, total: None,
+    recipes: Sequence[Recipe] = (),
+    gradients: bool = True,
+    names: Collection[str] | None = None,
+) -> CompiledKernels:
     """Build what is missing or broken, in one process per thread of torch, and load everything.
 
-    recipes: whose kernels are built beside `KERNELS`.
+    recipes, gradients: see `kernels_of`.  names: of the kernels to build, instead.
 
     Raises:
         UsageError: there is no compiler or it fails, the cache folder cannot be written, or a process died.
     """
-    kernels = kernels_of(recipes)
+    kernels = kernels_of(recipes, gradients)
+    if names is not None:
+        kernels = [kernel for kernel in (*kernels, *TRAINER_KERNELS) if kernel.name in names]
     missing = [kernel.name for kernel in kernels if not _is_sound(kernel)]
     ready, total = len(kernels) - len(missing), len(kernels)
     progress(ready, total)
@@ -181,13 +210,14 @@ def build(progress: Tell = lambda done, total: None, recipes: Sequence[Recipe] =
             raise UsageError("warmup", "needs a C++ compiler (g++ or clang++) for torch to compile with")
         processes = min(torch.get_num_threads(), MAX_PROCESSES, len(missing))
         # The longest come first, so that none is left over at the end.
+        missing.sort(key=lambda name: not name.startswith(SLOW_TO_COMPILE))
         pool = Processes(processes, torch_threads=os.cpu_count() or 1, ordered=False)
-        for done, _ in enumerate(pool.map(partial(_build, tuple(recipes)), missing[::-1]), start=ready + 1):
+        for done, _ in enumerate(pool.map(partial(_build, tuple(recipes)), missing), start=ready + 1):
             progress(done, total)
     loaded = load()
-    if loaded is None:
+    if loaded is None and names is None:
         raise UsageError("warmup", f"the packages in {cache_folder()} do not load")
-    return loaded
+    return loaded or CompiledKernels(package_of, KERNELS, load_or_eager)
 
 
 @cache
@@ -195,7 +225,7 @@ def _warn(path: Path, problem: str) -> None:
     log.warning("%s: %s; images are drawn eagerly, and slower; `aaplug warmup` builds it again", path, problem)
 
 
-def _package(kernel: Kernel) -> Package | None:
+def package_of(kernel: Kernel) -> Package | None:
     """The package of a kernel; None if it is not built or, with a warning, if it cannot be used."""
     path = package_path(kernel)
     try:
@@ -254,7 +284,7 @@ def _close(result: torch.Tensor, expected: torch.Tensor) -> bool:
 
 def _build(recipes: Sequence[Recipe], name: str) -> None:
     """Build one kernel, by its name, so that it can run in another process."""
-    kernel = next(kernel for kernel in kernels_of(recipes) if kernel.name == name)
+    kernel = next(kernel for kernel in (*kernels_of(recipes), *TRAINER_KERNELS) if kernel.name == name)
     path = package_path(kernel)
     names = {name.removesuffix(ONE_MORE) for name in kernel.sizes if name is not None}
     sizes = {name: torch.export.Dim(f"size_{name}", min=2, max=MAX_SIZE) for name in names}

@@ -20,12 +20,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
-from aaplug.core.interfaces import PixelKernel, Pixels
+from aaplug.core.interfaces import Limits, PixelKernel, Pixels
 from aaplug.core.kernels import Kernel
-from aaplug.core.rules import Rules
 from aaplug.core.runs import starts_of
 from aaplug.methods.pixel_kernels.gradients import Move, SumsGradients, sums_by_autograd, sums_per_splat
-from aaplug.methods.pixel_kernels.raster_rows import BLUE, GREEN, PIXELS, RED, next_rows, tile_centres
+from aaplug.methods.pixel_kernels.raster_rows import PIXELS, RED, next_rows, tile_centres
 from aaplug.rasterizers.tiled.binning import Bins
 from aaplug.rasterizers.tiled.forward import (
     EXAMPLE_TILES,
@@ -36,6 +35,8 @@ from aaplug.rasterizers.tiled.forward import (
     composite_forward,
     in_turn,
     less,
+    name_of,
+    shifts_of,
     tiles_example,
     transmitted,
     where_above,
@@ -46,7 +47,7 @@ from aaplug.system.cores import on_free_cores
 
 def composite(
     rows: Float[Tensor, "m c"], bins: Bins, how: Compositing
-) -> tuple[Float[Tensor, "3 h w"], Float[Tensor, "h w"]]:
+) -> tuple[Float[Tensor, "d h w"], Float[Tensor, "h w"]]:
     """Premultiplied colour, and alpha, of every pixel; differentiable in the raster rows.
 
     rows: the last one is the padding row.
@@ -83,11 +84,11 @@ def _backward(
     What splats contribute in a tile is kept step by step, and summed over tiles at the end.
     """
     assert bins.pairs is not None
-    local, kernel = tile_centres(rows), step_kernel(how.pixel, how.rules)
+    local, kernel = tile_centres(rows), step_kernel(how.pixel, how.channels)
     count = sum(len(before) for segment in segments for before in segment.before)
     if not count:
         return torch.zeros_like(rows)
-    columns = sums_per_splat(how.pixel)
+    columns, limits = sums_per_splat(how.pixel, how.channels), rows.new_tensor(Limits.by(how.rules))
     parts = rows.new_empty(count + 1, STEP * columns)
     parts[count] = 0
     steps = (bins.counts + (STEP - 1)) // STEP
@@ -97,21 +98,21 @@ def _backward(
         behind = light.index_select(0, segment.tiles)
         colours = tiles_of(grads, segment.tiles, bins.columns, how.kernels)
         step_of = first.index_select(0, segment.tiles) + segment.start // STEP
-        ones = torch.ones_like(segment.origins[:, 0])
-        part = whole = [step_of, segment.at, segment.ends, segment.origins, behind, *colours, ones]
-        run = None
+        part = whole = [step_of, segment.lists, segment.corners, behind, *colours]
+        run, shifts = None, shifts_of(len(segment.before), STEP, rows)
         for step, before in reversed([*enumerate(segment.before)]):
             n = len(before)
             if n != len(part[0]):
-                part = [x[:n] for x in whole]
-            mine, at, ends, corners, *pixels, unit = part
-            where = (bins.splats, at + step * STEP, ends, corners)
-            args = (rows, *where, before, *pixels, *local, unit, parts[done : done + n])
+                part = [x.narrow(0, 0, n) for x in whole]
+            mine, lists, corners, *pixels = part
+            args = (rows, bins.splats, lists, corners, before, *pixels, *local, limits, shifts[step])
+            args = (*args, parts.narrow(0, done, n))
             run = run or how.kernels.runner(kernel, args)
             run(*args)
             # Among the fewest tiles one may have no splats left: its step is none of the list.
             these = mine + step
-            steps_done.append(these if n > MIN_TILES else torch.where(at + step * STEP < ends, these, total))
+            ends = lists[:, 1] - step * STEP
+            steps_done.append(these if n > MIN_TILES else torch.where(lists[:, 0] < ends, these, total))
             done += n
         light.index_copy_(0, segment.tiles, behind)
     # `part_of` tells where each step's contributions stand.  Steps behind saturated pixels contribute nothing.
@@ -148,53 +149,46 @@ def _slots(
 
 def _step(
     pixel: PixelKernel,
-    rules: Rules,
     rows: Float[Tensor, "m c"],
     ids: Int[Tensor, " p"],
-    at: Int[Tensor, " t"],
-    ends: Int[Tensor, " t"],
-    origins: Float[Tensor, "t 2"],
+    lists: Int[Tensor, "t 2"],
+    corners: Float[Tensor, "t 3"],
     T: Float[Tensor, "t P"],
     behind: Float[Tensor, "t P"],
-    g_red: Float[Tensor, "t P"],
-    g_green: Float[Tensor, "t P"],
-    g_blue: Float[Tensor, "t P"],
-    g_hidden: Float[Tensor, "t P"],
-    local_x: Float[Tensor, " P"],
-    local_y: Float[Tensor, " P"],
-    one: Float[Tensor, " t"],
-    parts: Float[Tensor, "t sums"],
+    *gradients_and_rest: Tensor,
 ) -> tuple[()]:
-    """Write each tile's contributions to the gradients of K splats into `parts`.
+    """Write each tile's contributions to the gradients of K splats into `parts`, the last argument: [t, sums].
 
     Updates `behind`, B_k in the module's docstring.
+    gradients_and_rest: of d colours and alpha, [t, P]; then as in `forward._pass`.
     """
-    one = one[:, None]
+    *colours, g_hidden, local_x, local_y, values, ahead_of_list, parts = gradients_and_rest
+    limits, one = Limits.of(values), corners[:, 2:]
     before, passed = T, []
-    pixels = Pixels(origins, local_x, local_y)
-    for row, alpha in in_turn(pixel, rules, next_rows(rows, ids, at, ends, STEP), pixels):
-        through = transmitted(alpha, one, rules)
+    pixels = Pixels(corners, local_x, local_y)
+    nearest = next_rows(rows, ids, lists[:, 0] + ahead_of_list, lists[:, 1], STEP)
+    for row, alpha in in_turn(pixel, limits, nearest, pixels):
+        through = transmitted(alpha, one, limits)
         after = before * through
-        hides = where_above(rules.below_min_transmittance, after, one - through)
+        hides = where_above(limits.below_min_transmittance, after, one - through)
         passed.append((row, alpha, hides, before))
         before = after
     moves, light = [], behind
     for row, alpha, hides, reaching in reversed(passed):
         weight = reaching * hides
-        colour = torch.addcmul(g_hidden, row[:, RED, None], g_red)
-        colour = torch.addcmul(colour, row[:, GREEN, None], g_green)
-        colour = torch.addcmul(colour, row[:, BLUE, None], g_blue)
+        colour = g_hidden
+        for i, gradient in enumerate(colours, start=RED):
+            colour = torch.addcmul(colour, row[:, i, None], gradient)
         ahead = less(colour, light, one)
         # The weight is 0 below the cut-off and after the stop.  At the cap alpha has no gradient.
-        move = where_above(0.0, rules.max_alpha * one - alpha, weight) * ahead
+        move = where_above(0.0, limits.max_alpha * one - alpha, weight) * ahead
         moves.append(Move(row, weight, move))
         light = light + hides * ahead
     light = one * light
-    colours = (g_red, g_green, g_blue)
     if isinstance(pixel, SumsGradients):
         sums = pixel.sums(moves[::-1], colours, T, pixels)
     else:
-        sums = sums_by_autograd(pixel, rules, moves[::-1], colours, pixels)
+        sums = sums_by_autograd(pixel, limits, moves[::-1], colours, pixels)
     behind.copy_(light)
     parts.copy_(sums)
     return ()
@@ -209,15 +203,17 @@ def _slots_example() -> tuple[Tensor, ...]:
 
 
 @cache
-def step_kernel(pixel: PixelKernel, rules: Rules) -> Kernel:
-    """A backward step of one pixel kernel by the given rules."""
+def step_kernel(pixel: PixelKernel, channels: int = 3) -> Kernel:
+    """A backward step of one pixel kernel."""
+    planes = range(4, 7 + channels)  # transmittance, B_k, and the gradients of colours and alpha
+    sums = STEP * sums_per_splat(pixel, channels)
     return Kernel(
-        f"composite-{pixel.name}{rules.tag}-backward",
-        partial(_step, pixel, rules),
-        lambda: (*tiles_example(6, pixel), torch.zeros(EXAMPLE_TILES, STEP * sums_per_splat(pixel))),
-        ("m", "p", *9 * ("t",), None, None, "t", "t"),
+        name_of(pixel, channels) + "-backward",
+        partial(_step, pixel),
+        lambda: (*tiles_example(pixel, channels, len(planes)), torch.zeros(EXAMPLE_TILES, sums)),
+        ("m", "p", "t", "t", *("t" for _ in planes), None, None, None, None, "t"),
         overlaps="within registers",
-        updates=(6, 14),
+        updates=(planes[1], planes[-1] + 5),
     )
 
 

@@ -11,7 +11,6 @@ Bands of whole tile rows bound the memory: each exceeds the budget of candidate 
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cache, partial
 from itertools import pairwise
 
 import torch
@@ -20,7 +19,7 @@ from torch import Tensor
 
 from aaplug.core.ellipses import squared_cutoff
 from aaplug.core.kernels import Kernel, Kernels, materialized
-from aaplug.core.rules import RULES_3DGS, Rules, variant
+from aaplug.core.rules import RULES_3DGS, Rules
 from aaplug.core.runs import runs_of, starts_of
 from aaplug.core.splats import Splats2D
 from aaplug.methods.pixel_kernels.raster_rows import TILE, splat_example
@@ -92,30 +91,31 @@ def bands(
     keys = depths.contiguous().view(torch.int32) if depths.dtype == torch.float32 else depths
     order = torch.sort(keys, stable=True).indices
     columns = (splats.means, splats.covs, splats.dets, splats.opacities)
-    limit = splats.means.new_tensor([grid[1], grid[0]])
-    boxes = TileBoxes(*kernels.run(table_kernel(rules.min_alpha), *columns, limit))
+    limits = splats.means.new_tensor([grid[1], grid[0], rules.min_alpha])
+    boxes = TileBoxes(*kernels.run(TABLE, *columns, limits))
     for rows in _rows(boxes, grid, min(MAX_PAIRS, max(1, int(memory / PAIR_BYTES)))):
         yield _bin(boxes, order, rows, grid[1], kernels, gradients)
 
 
 def _table_rows(
-    min_alpha: float,
     means: Float[Tensor, "m 2"],
     covs: Float[Tensor, "m 3"],
     dets: Float[Tensor, " m"],
     opacities: Float[Tensor, " m"],
-    limit: Float[Tensor, " 2"],
+    limits: Float[Tensor, " 3"],
 ) -> tuple[Float[Tensor, "m 8"], Int[Tensor, " m"], Int[Tensor, " m"], Int[Tensor, " m"]]:
     """The columns of `TileBoxes`.
 
     The table's: x, y; slope xy/yy and variance det/yy of x given y; yy; squared cut-off; rightmost point's dy; first
     row of tiles.
+    limits: columns and rows of tiles, and the least alpha.
     """
+    *sides, min_alpha = limits.unbind()
     xx, xy, yy = covs.unbind(dim=1)
     cutoff = squared_cutoff(opacities, min_alpha) * (1 + CUTOFF_SLACK)
     cutoff = torch.where(((xx + yy) / dets).isfinite(), cutoff, -1.0)  # no width: never drawn
     lows, highs = [], []
-    for mean, variance, end in zip(means.unbind(dim=1), (xx, yy), limit.unbind(), strict=True):
+    for mean, variance, end in zip(means.unbind(dim=1), (xx, yy), sides, strict=True):
         half = (cutoff.clamp(min=0.0) * variance).sqrt()
         low = torch.minimum(((mean - half) / TILE).floor().clamp(min=0.0), end)
         high = torch.minimum(((mean + half) / TILE).floor().add(1).clamp(min=0.0), end)
@@ -236,18 +236,11 @@ def _lists_example() -> tuple[Tensor, ...]:
     return pairs.int(), pairs.flip(0)
 
 
-@cache
-def table_kernel(min_alpha: float = RULES_3DGS.min_alpha) -> Kernel:
-    """The table for one cut-off."""
-    return Kernel(
-        "table" + variant((min_alpha,), (RULES_3DGS.min_alpha,)),
-        partial(_table_rows, min_alpha),
-        lambda: (*splat_example(), torch.full((2,), 9.0)),
-        ("m",) * 4 + (None,),
-        gathers=True,
-    )
+def _table_example() -> tuple[Tensor, ...]:
+    return *splat_example(), torch.tensor([9.0, 9.0, RULES_3DGS.min_alpha])
 
 
+TABLE = Kernel("table", _table_rows, _table_example, ("m",) * 4 + (None,), gathers=True)
 SPANS = Kernel("spans", _spans, _spans_example, ("s", "m", "m", "m", None))
 PAIRS = Kernel("pairs", _pairs, _pairs_example, ("p", "s", "s", "s"))
 LISTS = Kernel("lists", _lists, _lists_example, ("p", "p"))

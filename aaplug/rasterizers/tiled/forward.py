@@ -2,26 +2,27 @@
 
 Compiled, a pass gathers its raster rows in one loop and composites in one loop over tiles and pixels.
 
-t: tiles of a block; n: the first of t; P: pixels per tile; K: splats per pass or step;
+t: tiles of a block; n: the first of t; P: pixels per tile; K: splats per pass or step; d: channels;
 m: raster rows; p: entries of `Bins.splats`; c: columns of a raster row.
 
 A pass composites the next splats of every tile.  Tiles are sorted by falling splat count, so tiles with splats left
 are always a prefix.  From time to time, tiles whose pixels are all saturated are dropped (compaction).
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn import functional
 
-from aaplug.core.interfaces import PixelKernel, Pixels
+from aaplug.core.interfaces import Limits, PixelKernel, Pixels
 from aaplug.core.kernels import EAGER, Kernel, Kernels
-from aaplug.core.rules import Rules
+from aaplug.core.rules import RULES_3DGS, Rules
 from aaplug.core.splats import Splats2D
-from aaplug.methods.pixel_kernels.raster_rows import BLUE, GREEN, PIXELS, RED, next_rows, tile_centres
+from aaplug.methods.pixel_kernels.raster_rows import PIXELS, RED, next_rows, tile_centres
 from aaplug.rasterizers.tiled.binning import Bins
 from aaplug.rasterizers.tiled.layout import placed
 
@@ -36,11 +37,12 @@ EXAMPLE_LIST = 16  # splats of each tile
 
 @dataclass(frozen=True)
 class Compositing:
-    """Settings of one frame's compositing.  kernels: runs its stages."""
+    """Settings of one frame's compositing.  channels: of a splat's colour.  kernels: runs its stages."""
 
     pixel: PixelKernel
     rules: Rules
     kernels: Kernels
+    channels: int = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,27 +51,27 @@ class Segment:
 
     tiles: tiles that were composited, those with the most splats first.
     start: how many splats of each were composited before; a multiple of STEP.
-    at, ends: per tile, where its splats of this segment begin and where all end in `Bins.splats`.
+    lists: per tile, where its splats of this segment begin and where all end in `Bins.splats`.
+    corners: per tile, x and y of its top left corner in px, and 1.
     before: per backward step, transmittance before it, for the first n of `tiles`: those that had splats left.
     """
 
     tiles: Int[Tensor, " t"]
     start: int
-    at: Int[Tensor, " t"]
-    ends: Int[Tensor, " t"]
-    origins: Float[Tensor, "t 2"]
+    lists: Int[Tensor, "t 2"]
+    corners: Float[Tensor, "t 3"]
     before: list[Float[Tensor, "n P"]]
 
 
 def composite_forward(
     rows: Float[Tensor, "m c"], bins: Bins, how: Compositing, segments: list[Segment] | None = None
-) -> tuple[Float[Tensor, "3 h w"], Float[Tensor, "h w"]]:
+) -> tuple[Float[Tensor, "d h w"], Float[Tensor, "h w"]]:
     """Premultiplied colour, and alpha, of every pixel; appends what the backward pass needs to `segments`.
 
     rows: raster rows; the last one is the padding row.
     """
     local = tile_centres(rows)
-    planes = rows.new_zeros(4, len(bins.counts), PIXELS)
+    planes = rows.new_zeros(how.channels + 1, len(bins.counts), PIXELS)
     order = torch.sort(bins.counts, descending=True, stable=True).indices
     filled = max(MIN_TILES, int((bins.counts > 0).sum()))
     tiles = order[:filled].tensor_split(-(-filled // how.kernels.tiles)) if len(order) else ()
@@ -78,41 +80,42 @@ def composite_forward(
         _composite_block(rows, bins, block, planes[:, done : done + len(block)], local, how, segments)
         done += len(block)
     image = placed(planes, order, bins.columns, how.kernels)
-    return image[:3], image[3]
+    return image[:-1], image[-1]
 
 
 def _composite_block(
     rows: Float[Tensor, "m c"],
     bins: Bins,
     tiles: Int[Tensor, " t"],
-    image: Float[Tensor, "4 t P"],
+    image: Float[Tensor, "d_and_1 t P"],
     local: tuple[Float[Tensor, " P"], Float[Tensor, " P"]],
     how: Compositing,
     segments: list[Segment] | None,
 ) -> None:
     """Composite one block of tiles into `image`, until their splats run out or every pixel is saturated."""
-    T, kernel = rows.new_ones(len(tiles), PIXELS), pass_kernel(how.pixel, how.rules)
+    T, kernel = rows.new_ones(len(tiles), PIXELS), pass_kernel(how.pixel, how.channels, segments is not None)
     planes, places = image, None  # of the tiles that are left, and where they lie in the image
-    start, splats = 0, how.pixel.splats_per_pass
+    start, splats, limits = 0, how.pixel.splats_per_pass, rows.new_tensor(Limits.by(how.rules))
     while len(tiles):
         first, counts, origins = (x.index_select(0, tiles) for x in (bins.first, bins.counts, bins.origins))
-        at, ends, ones = first + start, first + counts, torch.ones_like(origins[:, 0])
+        lists = torch.stack([first + start, first + counts], dim=1)
+        corners = functional.pad(origins, (0, 1), value=1.0)
         going, rest = _going(counts - start, splats), tiles[:0]
         before, steps = [], [] if segments is None else _going(counts - start, STEP)
         if segments is not None:
-            segments.append(Segment(tiles, start, at, ends, origins, before))
-        part = whole = [at, ends, origins, *planes.unbind(), ones]
+            segments.append(Segment(tiles, start, lists, corners, before))
+        part = whole = [lists, corners, T, *planes.unbind()]
         passes, passed, run = 0, 0, None
-        for i, n in enumerate(going):
+        for i, (n, ahead) in enumerate(zip(going, shifts_of(len(going), splats, rows), strict=True)):
             if n < len(T):
-                T, part = T[:n], [x[:n] for x in whole]
-            begin, end, corners, *light, unit = part
-            args = (rows, bins.splats, begin + i * splats, end, corners, T, *light, *local, unit)
+                part = [x.narrow(0, 0, n) for x in (*whole[:2], T, *whole[3:])]
+                T = part[2]
+            args = (rows, bins.splats, *part, *local, limits, ahead)
             run = run or how.kernels.runner(kernel, args)
-            *within, after = run(*args)
-            tiles_of_steps = steps[i * splats // STEP :]
-            before += [x[:m] for x, m in zip((T, *within), tiles_of_steps, strict=False)]
-            T = after
+            states = run(*args)
+            if segments is not None:
+                before += [x[:m] for x, m in zip((T, *states[:-1]), steps[i * splats // STEP :], strict=False)]
+                T = part[2] = states[-1]
             start += splats
             passes, passed = passes + 1, passed + n
             if passes >= CHECK_PASSES and passed >= CHECK_TILES and i + 1 < len(going):
@@ -139,47 +142,49 @@ def _going(counts: Int[Tensor, " t"], at_once: int) -> list[int]:
     return going.tolist()
 
 
+def shifts_of(passes: int, splats: int, like: Tensor) -> Sequence[Int[Tensor, ""]]:
+    """How far each pass is from the first, in splats."""
+    return torch.arange(0, passes * splats, splats, device=like.device).unbind()
+
+
 def _pass(
     pixel: PixelKernel,
-    rules: Rules,
+    keeps: bool,
     rows: Float[Tensor, "m c"],
     ids: Int[Tensor, " p"],
-    at: Int[Tensor, " t"],
-    ends: Int[Tensor, " t"],
-    origins: Float[Tensor, "t 2"],
+    lists: Int[Tensor, "t 2"],
+    corners: Float[Tensor, "t 3"],
     T: Float[Tensor, "t P"],
-    red: Float[Tensor, "t P"],
-    green: Float[Tensor, "t P"],
-    blue: Float[Tensor, "t P"],
-    hidden: Float[Tensor, "t P"],
-    local_x: Float[Tensor, " P"],
-    local_y: Float[Tensor, " P"],
-    one: Float[Tensor, " t"],
+    *planes_and_rest: Tensor,
 ) -> tuple[Float[Tensor, "t P"], ...]:
-    """Composite the next `splats_per_pass` splats of each tile, from `at`, into red, green, blue and alpha, in place.
+    """Composite the next `splats_per_pass` splats of each tile into d colours and alpha, in place.
 
-    Returns the transmittance after every STEP of them, 0 where a pixel has stopped.
-    one: 1 per tile; multiplying by it makes the compiler keep one loop over tiles.
+    keeps: return the transmittance after every STEP of them, 0 where a pixel has stopped; else update T in place.
+    corners: the last column is 1; multiplying by it makes the compiler keep one loop over tiles.
+    planes_and_rest: d colours and alpha, [t, P]; x and y of a tile's pixel centres, [P]; `Limits`; the first splat's
+        place after the beginning of the list.
     """
-    one = one[:, None]
+    *colours, hidden, local_x, local_y, values, ahead = planes_and_rest
+    limits, one = Limits.of(values), corners[:, 2:]
     before, left = T, []
-    pixels = Pixels(origins, local_x, local_y)
-    nearest = next_rows(rows, ids, at, ends, pixel.splats_per_pass)
-    for row, alpha in in_turn(pixel, rules, nearest, pixels):
-        after = before * transmitted(alpha, one, rules)
-        weight = where_above(rules.below_min_transmittance, after, less(before, after, one))
+    pixels = Pixels(corners, local_x, local_y)
+    nearest = next_rows(rows, ids, lists[:, 0] + ahead, lists[:, 1], pixel.splats_per_pass)
+    for row, alpha in in_turn(pixel, limits, nearest, pixels):
+        after = before * transmitted(alpha, one, limits)
+        weight = where_above(limits.below_min_transmittance, after, less(before, after, one))
         before = after
-        red.addcmul_(weight, row[:, RED, None])
-        green.addcmul_(weight, row[:, GREEN, None])
-        blue.addcmul_(weight, row[:, BLUE, None])
+        for i, colour in enumerate(colours, start=RED):
+            colour.addcmul_(weight, row[:, i, None])
         hidden.add_(weight)
         left.append(before)
-    bound = rules.below_min_transmittance
-    return tuple(torch.threshold(one * x, bound, 0.0) for x in left[STEP - 1 :: STEP])
+    if keeps:
+        return tuple(where_above(limits.below_min_transmittance, one * x, x) for x in left[STEP - 1 :: STEP])
+    T.copy_(where_above(limits.below_min_transmittance, one * before, before))
+    return ()
 
 
 def in_turn(
-    pixel: PixelKernel, rules: Rules, rows: Float[Tensor, "t K c"], pixels: Pixels
+    pixel: PixelKernel, limits: Limits, rows: Float[Tensor, "t K c"], pixels: Pixels
 ) -> Iterator[tuple[Float[Tensor, "t c"], Float[Tensor, "t P"]]]:
     """Raster row and alpha of each tile's k-th splat, for k = 0 … K - 1.
 
@@ -187,9 +192,9 @@ def in_turn(
     """
     if torch.compiler.is_compiling():
         for row in rows.unbind(dim=1):
-            yield row, pixel.alpha(row, pixels, rules)
+            yield row, pixel.alpha(row, pixels, limits)
     else:
-        alphas = pixel.alpha(rows.transpose(0, 1), pixels, rules)
+        alphas = pixel.alpha(rows.transpose(0, 1), pixels, limits)
         yield from zip(rows.unbind(dim=1), alphas.unbind(), strict=True)
 
 
@@ -197,11 +202,11 @@ def in_turn(
 # min/max are slow, because min/max propagate NaN.  So the next three functions have one form for each.
 
 
-def transmitted(alpha: Float[Tensor, "t P"], one: Float[Tensor, "t 1"], rules: Rules) -> Float[Tensor, "t P"]:
+def transmitted(alpha: Float[Tensor, "t P"], one: Float[Tensor, "t 1"], limits: Limits) -> Float[Tensor, "t P"]:
     """1 - alpha, with alpha capped."""
-    least = 1 - rules.max_alpha
+    least = 1 - limits.max_alpha
     if torch.compiler.is_compiling():
-        return torch.relu(rules.max_alpha * one - alpha) + least
+        return torch.relu(limits.max_alpha * one - alpha) + least
     return (one - alpha).clamp_(min=least)
 
 
@@ -210,43 +215,50 @@ def less(x: Float[Tensor, "t P"], y: Float[Tensor, "t P"], one: Float[Tensor, "t
     return one * x - y if torch.compiler.is_compiling() else x - y
 
 
-def where_above(bound: float, test: Tensor, value: Tensor) -> Tensor:
+def where_above(bound: float | Tensor, test: Tensor, value: Tensor) -> Tensor:
     """`value` where `test` > `bound`, else 0; needs bound >= 0 and 0 <= value <= 1."""
-    if torch.compiler.is_compiling():
+    if isinstance(bound, Tensor) or torch.compiler.is_compiling():
         return torch.where(test > bound, value, 0.0)
     return torch.minimum(torch.threshold(test, bound, 0.0).mul_(MASK_GAIN), value)
 
 
-def rows_example(pixel: PixelKernel) -> Float[Tensor, "m c"]:
+def rows_example(pixel: PixelKernel, channels: int) -> Float[Tensor, "m c"]:
     """Raster rows of splats that every pixel of `tiles_example` sees."""
     ramp = torch.linspace(0.0, 1.0, EXAMPLE_SPLATS)
     means = torch.stack([3 + 4 * ramp, 7 - 4 * ramp], dim=1)
     covs = torch.stack([20 + ramp, ramp, 20 - ramp], dim=1)
     dets = covs[:, 0] * covs[:, 2] - covs[:, 1].square()
     shape = (means, covs, dets, 1 + ramp, 0.1 + 0.1 * ramp, torch.arange(EXAMPLE_SPLATS))
-    splats = Splats2D(*shape, torch.stack([ramp, 1 - ramp, ramp], dim=1), torch.zeros_like(means))
+    splats = Splats2D(*shape, torch.stack([ramp, 1 - ramp, ramp, ramp][:channels], dim=1), torch.zeros_like(means))
     return pixel.raster_rows(splats, EAGER)
 
 
-def tiles_example(planes: int, pixel: PixelKernel) -> tuple[Tensor, ...]:
-    """Raster rows, splats, where they begin and end, tile corners and planes of pixels to compile for."""
-    tiles, rows = EXAMPLE_TILES, rows_example(pixel)
+def tiles_example(pixel: PixelKernel, channels: int, planes: int) -> tuple[Tensor, ...]:
+    """The arguments of `_pass`, with as many planes of pixels, to compile for."""
+    tiles, rows = EXAMPLE_TILES, rows_example(pixel, channels)
     ids = torch.arange(tiles * EXAMPLE_LIST, dtype=torch.int32) % EXAMPLE_SPLATS
     at = torch.arange(tiles) * EXAMPLE_LIST
-    ends = at + EXAMPLE_LIST
+    lists = torch.stack([at, at + EXAMPLE_LIST], dim=1)
     pixels = [torch.full((tiles, PIXELS), 0.5) for _ in range(planes)]
-    return rows, ids, at, ends, torch.ones(tiles, 2), *pixels, *tile_centres(rows), torch.ones(tiles)
+    limits = torch.tensor(Limits.by(RULES_3DGS))
+    return rows, ids, lists, torch.ones(tiles, 3), *pixels, *tile_centres(rows), limits, torch.tensor(0)
+
+
+def name_of(pixel: PixelKernel, channels: int) -> str:
+    """The name of a pixel kernel's passes."""
+    return f"composite-{pixel.name}" if channels == 3 else f"composite-{pixel.name}-{channels}"
 
 
 @cache
-def pass_kernel(pixel: PixelKernel, rules: Rules) -> Kernel:
-    """A pass of one pixel kernel by the given rules."""
+def pass_kernel(pixel: PixelKernel, channels: int = 3, keeps: bool = False) -> Kernel:
+    """A pass of one pixel kernel.  keeps: what gradients need, see `_pass`."""
+    planes = range(4, 6 + channels)  # transmittance, colours and alpha
     return Kernel(
-        f"composite-{pixel.name}{rules.tag}",
-        partial(_pass, pixel, rules),
-        partial(tiles_example, 5, pixel),
-        ("m", "p", *8 * ("t",), None, None, "t"),
+        name_of(pixel, channels) + ("-kept" if keeps else ""),
+        partial(_pass, pixel, keeps),
+        partial(tiles_example, pixel, channels, len(planes)),
+        ("m", "p", "t", "t", *("t" for _ in planes), None, None, None, None),
         overlaps="freely",
-        updates=(6, 7, 8, 9),
+        updates=tuple(planes)[keeps:],
         evaluations=pixel.splats_per_pass,
     )

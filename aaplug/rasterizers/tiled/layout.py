@@ -4,6 +4,7 @@ k: planes; l, a: lines of TILE pixels; t: tiles of TILE × TILE px; P: pixels pe
 """
 
 from collections.abc import Sequence
+from functools import cache, partial
 
 import torch
 from jaxtyping import Float, Int
@@ -14,8 +15,8 @@ from aaplug.methods.pixel_kernels.raster_rows import PIXELS, TILE
 
 
 def placed(
-    planes: Float[Tensor, "4 t P"], order: Int[Tensor, " t"], columns: int, kernels: Kernels
-) -> Float[Tensor, "4 h w"]:
+    planes: Float[Tensor, "k t P"], order: Int[Tensor, " t"], columns: int, kernels: Kernels
+) -> Float[Tensor, "k h w"]:
     """Planes of an image of `columns` tiles a row.  order: which of the image's tiles each is."""
     ranks = torch.empty_like(order).index_copy_(0, order, torch.arange(len(order), device=order.device))
     lines = ranks.view(-1, 1, columns) * TILE + torch.arange(TILE, device=order.device)[:, None]
@@ -24,7 +25,7 @@ def placed(
 
 def tiles_of(
     planes: Sequence[Float[Tensor, "h w"]], tiles: Int[Tensor, " t"], columns: int, kernels: Kernels
-) -> Float[Tensor, "4 t P"]:
+) -> Float[Tensor, "k t P"]:
     """Planes of some tiles of an image with `columns` tiles a row."""
     down = torch.arange(TILE, device=tiles.device) * columns
     lines = (tiles // columns * TILE * columns + tiles % columns)[:, None] + down
@@ -33,19 +34,23 @@ def tiles_of(
 
 def _gathered(
     planes: Sequence[Float[Tensor, "*any"]], lines: Int[Tensor, "*order"], kernels: Kernels
-) -> Float[Tensor, "4 l s"]:
+) -> Float[Tensor, "k l s"]:
     """Lines of TILE pixels in another order."""
-    return kernels.run(LINES, lines.flatten(), *(plane.reshape(-1, TILE) for plane in planes))[0]
+    return kernels.run(lines_kernel(len(planes)), lines.flatten(), *(plane.reshape(-1, TILE) for plane in planes))[0]
 
 
 def _lines(order: Int[Tensor, " l"], *planes: Float[Tensor, "a side"]) -> tuple[Float[Tensor, "k l side"]]:
     return (torch.stack([plane.index_select(0, order) for plane in planes]),)
 
 
-def _lines_example() -> tuple[Tensor, ...]:
+def _lines_example(planes: int) -> tuple[Tensor, ...]:
     lines = 10_000 * TILE
-    planes = (torch.linspace(0.0, 1.0, lines * TILE).view(-1, TILE) for _ in range(4))
-    return torch.arange(lines).flip(0), *planes
+    plane = torch.linspace(0.0, 1.0, lines * TILE).view(-1, TILE)
+    return torch.arange(lines).flip(0), *(plane.clone() for _ in range(planes))
 
 
-LINES = Kernel("lines", _lines, _lines_example, ("l", *4 * ("a",)))
+@cache
+def lines_kernel(planes: int = 4) -> Kernel:
+    """The gathering of lines of colour and alpha."""
+    name = "lines" if planes == 4 else f"lines-{planes}"
+    return Kernel(name, _lines, partial(_lines_example, planes), ("l", *planes * ("a",)))

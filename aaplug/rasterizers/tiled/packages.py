@@ -16,19 +16,22 @@ MAX_GRADIENT_ROWS = 1 << 15  # whose gradients are computed at once, so that wha
 
 @dataclass(frozen=True)
 class Package:
-    """A kernel compiled for CPU arguments of these types, and of these shapes after the leading size.
+    """A kernel compiled for CPU arguments of these types and shapes; sizes: see `Kernel`.
 
-    sizes: see `Kernel`.
+    shapes: of an argument with a leading size only what follows that.
     """
 
     run: Callable[[list[Tensor]], list[Tensor]]
-    types: list[tuple[torch.dtype, torch.Size]]
+    types: list[torch.dtype]
+    shapes: list[torch.Size]
     sizes: tuple[str | None, ...]
 
     @staticmethod
     def of(run: Callable[[list[Tensor]], list[Tensor]], kernel: Kernel) -> "Package":
         """The package that a kernel was compiled to."""
-        return Package(run, [(arg.dtype, arg.shape[1:]) for arg in kernel.example()], kernel.sizes)
+        example = list(zip(kernel.example(), kernel.sizes, strict=True))
+        shapes = [arg.shape if size is None else arg.shape[1:] for arg, size in example]
+        return Package(run, [arg.dtype for arg, _ in example], shapes, kernel.sizes)
 
     def run_whole(self, *args: Tensor) -> list[Tensor]:
         """Run contiguous arguments."""
@@ -40,9 +43,9 @@ class Package:
 
     def takes(self, args: tuple[Tensor, ...]) -> bool:
         """True if it can run these arguments; a leading size of one is a separate case to the compiler."""
-        for arg, (dtype, rest) in zip(args, self.types, strict=True):
-            shape = arg.shape
-            if arg.dtype is not dtype or shape[1:] != rest or shape[0] < 2 or not arg.is_cpu:
+        for arg, dtype, expected, size in zip(args, self.types, self.shapes, self.sizes, strict=True):
+            shape = arg.shape if size is None else arg.shape[1:]
+            if arg.dtype is not dtype or shape != expected or not arg.is_cpu or (size is not None and len(arg) < 2):
                 return False
         return True
 

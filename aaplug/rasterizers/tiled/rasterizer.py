@@ -71,12 +71,15 @@ class Tiled:
         ellipses = pixel.bounding_ellipses(splats, rules) or splats
         if compositor is None:
             rows = pixel.raster_rows(splats, self.kernels)
-            if rows.shape != (len(splats) + 1, pixel.columns):
-                expected = f"{len(splats) + 1} rows (one per splat and a padding row) of {pixel.columns} columns"
+            assert splats.rgb is not None
+            channels = splats.rgb.shape[1]
+            columns = pixel.columns + channels - 3
+            if rows.shape != (len(splats) + 1, columns):
+                expected = f"{len(splats) + 1} rows (one per splat and a padding row) of {columns} columns"
                 raise UsageError(
                     f"pixel kernel {pixel.name}", f"raster_rows should return {expected}, got {tuple(rows.shape)}"
                 )
-            paint = partial(composite, rows, how=Compositing(pixel, rules, self.kernels))
+            paint = partial(composite, rows, how=Compositing(pixel, rules, self.kernels, channels))
             gradients = rows.requires_grad and torch.is_grad_enabled()
         else:
             paint, gradients = self._blender(splats, compositor, rules), False

@@ -7,7 +7,7 @@ from itertools import product
 import torch
 from torch import Tensor
 
-from aaplug import Kernels, Pixels, Rules, Splats2D, grown, raster_rows, whitening, whitening_columns
+from aaplug import Kernels, Limits, Pixels, Rules, Splats2D, grown, raster_rows, whitening, whitening_columns
 
 QUARTER = raster_rows.COLUMNS  # our own column: a quarter of the pixel's side, in px
 COLUMNS = (raster_rows.UX, raster_rows.UY, raster_rows.VX, raster_rows.VY, raster_rows.OPACITY, QUARTER)
@@ -36,7 +36,7 @@ class FourPoints:
         quarter = torch.full_like(splats.dets, splats.window / 4)
         return raster_rows.rows_of(splats, whitening_columns(splats.covs, splats.dets), [quarter])
 
-    def alpha(self, rows: Tensor, pixels: Pixels, rules: Rules) -> Tensor:
+    def alpha(self, rows: Tensor, pixels: Pixels, limits: Limits) -> Tensor:
         """Opacity times the mean, 0 below the cut-off: [..., t, P] of rows [..., t, columns] at P pixels of t tiles."""
         u, v = raster_rows.forms_at(rows, pixels)
         ux, uy, vx, vy, opacity, quarter = (rows[..., i, None] for i in COLUMNS)
@@ -44,7 +44,7 @@ class FourPoints:
         for right, down in POINTS:
             du, dv = quarter * (right * ux + down * uy), quarter * (right * vx + down * vy)
             total = total + torch.exp(-0.5 * ((u + du).square() + (v + dv).square()))
-        return torch.threshold(opacity * total / len(POINTS), rules.below_min_alpha, 0.0)
+        return limits.cut(opacity * total / len(POINTS))
 
     def exact(self, splats: Splats2D, offsets: Tensor) -> Tensor:
         """The same mean in float64, from the definition; at offsets [p, c, 2] of p pixels from c splats, [p, c]."""
