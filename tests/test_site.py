@@ -145,6 +145,53 @@ def test_a_slider_of_the_gallery_moves_by_mouse_and_keys_and_its_lens_shows_both
     assert gallery.locator(".crops").inner_text().split() == ["classic", "auto"]
 
 
+PAGE = (
+    """# Page
+
+```bash
+aaplug evaluate some/folder/scene.ply --cameras path/to/colmap --recipe classic mip auto matched
+```
+
+| a name of one word | zebras |
+|---|---|
+| `supersplat-classic` | """
+    + "many more words " * 40
+    + "|\n"
+)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """A page with our theme, styles and hooks, but without the texts of the API."""
+    pytest.importorskip("material")
+    from mkdocs.commands.build import build
+    from mkdocs.config import load_config
+
+    folder = tmp_path_factory.mktemp("a &lt b")
+    (folder / "guides").mkdir()
+    (folder / "guides" / "page.md").write_text(PAGE)
+    places = {"docs_dir": str(folder / "guides"), "site_dir": str(folder / "out")}
+    build(load_config(str(SITE / "mkdocs.yml"), **places, plugins=["search"], nav=[{"Page": "page.md"}]))
+    return folder / "out"
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+def test_a_page_that_is_opened_from_its_folder_is_whole_and_can_be_searched(browser, site, width):
+    page, troubles = browser.new_page(viewport={"width": width, "height": 844}), []
+    page.on("pageerror", lambda error: troubles.append(str(error)))
+    page.on("console", lambda line: troubles.append(line.text) if line.type in ("error", "warning") else None)
+    page.on("request", lambda sent: None if sent.url.startswith("file:") else troubles.append(sent.url))
+    page.goto(f"file://{site}/page.html")
+    assert page.evaluate("document.querySelector('td code').getClientRects().length") == 1
+    code, button = (page.locator(f"pre > {part}").bounding_box() for part in ("code", ".md-code__nav"))
+    assert code["x"] + code["width"] <= button["x"]
+    page.locator(".md-header [for=__search]:visible, .md-search__input:visible").first.click()
+    page.keyboard.type("zebra")
+    assert "page.html?h=" in page.locator(".md-search-result__link").first.get_attribute("href")
+    page.close()
+    assert troubles == []
+
+
 def test_the_tour_runs(tmp_path, monkeypatch):
     for package in ("nbclient", "ipykernel"):
         if importlib.util.find_spec(package) is None:

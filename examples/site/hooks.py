@@ -120,6 +120,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     made = {path_of(title): page_of(title, names) for title, names in topics().items()}
     made["tour.md"] = tour()
     made["assets/sliders.js"], made["assets/site.css"] = script(), style()
+    made["assets/offline.js"] = (HERE / "offline.js").read_text()
     for path, content in made.items():
         files.append(File.generated(config, path, content=content))
     return files
@@ -128,3 +129,9 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Lead to the tour's page where a guide leads to the notebook."""
     return markdown.replace("](../tour.ipynb", "](tour.md")
+
+
+def on_post_build(config: MkDocsConfig) -> None:
+    """Write the search's index as a script, too, which pages that are opened from a folder may read."""
+    index = Path(config.site_dir, "search", "search_index.json")
+    index.with_suffix(".js").write_text(f"var __index = {index.read_text()}")
