@@ -33,7 +33,7 @@ SEVERAL = (  # options of a verb that `for_each_scene` repeats
     Option(
         "scheduler",
         flag("local|tcp://HOST:PORT"),
-        "With --batch: a scene at a time on each worker of a Dask cluster; see examples/guides/cluster.md.",
+        "With --batch: a scene at a time on each worker of a Dask cluster; see `aaplug guide cluster`.",
         None,
         DRAWING,
     ),

@@ -1,5 +1,6 @@
 """The table of verbs: the options of each, and how it reads, calls the library and tells what came of it."""
 
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from inspect import cleandoc
@@ -30,6 +31,8 @@ from .words import VERBS, Answer, Command, Option, Words, json_of, output
 if TYPE_CHECKING:
     from aaplug.rendering.benchmark import Figures
 
+HERE = Path(__file__).resolve().parent
+GUIDES = {each.stem: each for each in sorted(HERE.glob("guides/*.md")) or sorted(HERE.glob("../examples/guides/*.md"))}
 PROGRAM_KEYS = ("fused", "comments")  # of `info`, for programs; the table has words for the first
 
 
@@ -400,3 +403,25 @@ FIGURES: dict[str, Callable[["Figures"], str]] = {
     "ns/eval": lambda run: f"{run.ns_per_evaluation:.2f}",
     "GB": lambda run: f"{run.peak_bytes / 1e9:.1f}",
 }
+
+
+@verb(Option("name", names(*GUIDES, metavar="[NAME]", by_place=True), "The guide to print.", None))
+def guide(words: Words) -> Answer:
+    """List the guides, or print one.
+
+    For a verb's own options, use --help; to see aaplug at work, demo.
+    """
+    texts = {name: file.read_text("utf-8") for name, file in GUIDES.items() if words.name in (None, name)}
+    if words.name is None:
+        return Answer(None, [table((name, text.partition("\n")[0].removeprefix("# ")) for name, text in texts.items())])
+    if not sys.stdout.isatty():
+        return Answer(None, texts[words.name].splitlines())
+    from rich.markdown import Markdown, TableDataElement
+
+    class Cell(TableDataElement):
+        def __init__(self, justify: Any) -> None:
+            super().__init__(justify)
+            self.content.overflow = "fold"  # a long word keeps its end
+
+    Markdown.elements.update(th_open=Cell, td_open=Cell)
+    return Answer(None, [Markdown(texts[words.name])])

@@ -2,12 +2,14 @@
 
 import ast
 import re
+import sys
 from pathlib import Path
 
 import pytest
 from aaplug_cli.verbs import VERBS
 
 ROOT = Path(__file__).resolve().parents[1]
+GUIDES = sorted((ROOT / "examples" / "guides").glob("*.md"))
 FILES = [*sorted((ROOT / "aaplug" / "options").glob("*.py")), *sorted((ROOT / "cli").glob("*.py"))]
 
 
@@ -76,3 +78,26 @@ def test_a_refused_word_ends_in_one_stop(cli):
         _, _, err = cli(words)
         assert "; see `aaplug" in err
         assert not re.search(r"\.;|---", err), err
+
+
+def test_each_guide_is_listed_by_its_heading_and_printed_as_it_is(cli):
+    listed = [line.split(maxsplit=1) for line in cli("guide")[1].splitlines()]
+    headings = [[path.stem, path.read_text().splitlines()[0].removeprefix("# ")] for path in GUIDES]
+    assert [[name, heading.strip()] for name, heading in listed] == headings
+    for path in GUIDES:
+        assert cli(f"guide {path.stem}") == (0, path.read_text(), "")
+
+
+def test_a_guide_is_drawn_on_a_terminal_and_long_words_keep_their_ends(cli, monkeypatch):
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    monkeypatch.setenv("COLUMNS", "60")
+    _, out, _ = cli("guide viewers")
+    assert "`" not in out
+    assert "…" not in out
+
+
+def test_texts_name_guides_that_are_there_and_not_their_files(cli):
+    sources = [*(ROOT / "aaplug").rglob("*.py"), *(ROOT / "cli").glob("*.py"), ROOT / "README.md", *GUIDES]
+    named = re.findall(r"`aaplug guide (\w+)`", "".join(path.read_text() for path in sources))
+    assert {"cluster", "methods", "viewers"} <= set(named) <= {path.stem for path in GUIDES}
+    assert not any("guides/" in cli(f"{verb} --help")[1] for verb in VERBS)

@@ -94,6 +94,8 @@ REFUSED = {
     "bench --gaussians 10 --resolution 1000000x1000000": "the limit is 16384 a side",
     "fly s.ply": "there is no verb 'fly'; see `aaplug --help`",
     "rendr s.ply": "there is no verb 'rendr'; did you mean render?",
+    "guide stat": "'stat' is not one of architecture, bare",
+    "guide strat": "view, viewers; did you mean start?",
     "--colour": "Unrecognized options: --colour",
 }
 

@@ -4,6 +4,7 @@ It holds every file of the package and no other, and runs from a folder of its o
 """
 
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -28,23 +29,24 @@ def packed(wheel: Path) -> set[str]:
 
 def tracked() -> set[str]:
     """The package's files in the repository, as a wheel names them."""
-    words = ["git", "ls-files", "aaplug", "cli"]
+    words = ["git", "ls-files", "aaplug", "cli", "examples/guides/*.md"]
     listed = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True).stdout.split("\n")
-    return {name.replace("cli/", "aaplug_cli/", 1) if name.startswith("cli/") else name for name in listed if name}
+    return {re.sub(r"^(cli|examples)/", "aaplug_cli/", name) for name in listed if name}
 
 
 def run_elsewhere(wheel: Path) -> str:
-    """What the installed wheel prints, in a folder of its own: its version, and the sizes of its sample."""
+    """What the wheel prints, installed in a folder of its own: version, a guide's heading, and the sample's sizes."""
     with tempfile.TemporaryDirectory() as folder:
         there = {"cwd": folder, "env": os.environ | {"PYTHONPATH": folder}}
         pip = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--target", folder, str(wheel.resolve())]
-        version = [sys.executable, f"{folder}/bin/aaplug", "--version"]
+        program = [sys.executable, f"{folder}/bin/aaplug"]
         sample = [sys.executable, "-c", SHOWS.format(folder=folder)]
         subprocess.run(pip, check=True)
         said = (
-            subprocess.run(words, check=True, stdout=subprocess.PIPE, text=True, **there) for words in (version, sample)
+            subprocess.run(words, check=True, stdout=subprocess.PIPE, text=True, **there).stdout.splitlines()[0]
+            for words in ([*program, "--version"], [*program, "guide", "start"], sample)
         )
-        return ", ".join(done.stdout.strip() for done in said)
+        return ", ".join(said)
 
 
 def main(wheel: Path) -> None:

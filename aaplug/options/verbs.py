@@ -101,7 +101,7 @@ class EvaluateOptions(RecipeOptions):
     recipe: Annotated[
         str | Sequence[str | Recipe], names(ALL, kind="recipe", metavar=f"{ALL}|{RECIPE_METAVAR} ...", count=None)
     ] = DEFAULT_RECIPES
-    """One or more recipes.  all adds those for comparison, which examples/guides/methods.md lists."""
+    """One or more recipes.  all adds those for comparison, which `aaplug guide methods` lists."""
     scale: Annotated[Sequence[float] | None, SCALES] = None
     """One or more sizes relative to the training size (default: the protocol's)."""
     truth: Literal["auto", "photographs", "self"] = "auto"
@@ -129,7 +129,7 @@ class CompareOptions(RecipeOptions):
     recipe: OneRecipe = "auto"
     """How to draw every scene, each by the convention that it was trained with."""
     viewer: OneViewer = None
-    """Draw the scenes as spark or another of examples/guides/viewers.md does; the truth stays the first by --recipe."""
+    """Draw the scenes as spark or another of `aaplug guide viewers` does; the truth stays the first by --recipe."""
     scale: Annotated[Sequence[float], SCALES] = COMPARED_SCALES
     """One or more sizes relative to the training size."""
     metric: Annotated[str | Sequence[str], METRICS] = COMPARED_METRICS
@@ -156,7 +156,7 @@ class ConvertOptions(WritingOptions, ViewOptions):
     views: Annotated[str, VIEWS] = "train"
     """Views that --for is measured on, by name or split."""
     viewer: OneViewer = None
-    """Fit the scene to spark, playcanvas or another of examples/guides/viewers.md, and print the remaining error."""
+    """Fit the scene to spark, playcanvas or another of `aaplug guide viewers`, and print the remaining error."""
     steps: Annotated[int | None, STEPS] = None
     """With --for: steps of the fit, 0 for none (default: 300, or 0 if the viewer draws as training did)."""
     form: Annotated[str | None, names(kind="form")] = None
@@ -183,7 +183,7 @@ class LodOptions(WritingOptions, ViewOptions):
     scale: Annotated[float | None, number(0.001, 1)] = None
     """With --simplify or --budget: size of the images that the scene is meant for (default: root of the share)."""
     viewer: OneViewer = None
-    """Tune each file for spark, playcanvas or another of examples/guides/viewers.md, instead of for aaplug."""
+    """Tune each file for spark, playcanvas or another of `aaplug guide viewers`, instead of for aaplug."""
     refine: bool = True
     """Merge alone: do not tune the result to look like the scene, which takes minutes."""
     steps: Annotated[int | None, STEPS] = None
@@ -222,7 +222,7 @@ class FinetuneOptions(WritingOptions, ViewOptions):
     """The optimization."""
 
     viewer: Annotated[str | Viewer | None, names("fast", kind="viewer", metavar="fast|VIEWER", flags=("--for",))] = None
-    """Who will show the scene: fast (aaplug's matched, the default) or a viewer of examples/guides/viewers.md."""
+    """Who will show the scene: fast (aaplug's matched, the default) or a viewer of `aaplug guide viewers`."""
     views: Annotated[str, VIEWS] = "test"
     """Views that the result is measured on, by name or split; training views are what it is tuned on."""
     method: Annotated[str, names(kind="method")] = "consistency"

@@ -152,7 +152,7 @@ class Registry(Mapping[str, T]):
             raise UsageError(where, f"a {self.kind} named '{name}' exists already")
         if isinstance(value, type) or not isinstance(value, self.type):
             noun = f"the class {value.__name__}" if isinstance(value, type) else f"a {type(value).__name__}"
-            raise UsageError(where, f"is {noun}, which is not a {self.kind}; see examples/guides/contributing.md")
+            raise UsageError(where, f"is {noun}, which is not a {self.kind}; see `aaplug guide contributing`")
         name_inside = getattr(value, "name", name)
         if name_inside != name:
             raise UsageError(where, f"is registered as '{name}' but calls itself '{name_inside}'")
