@@ -2,7 +2,10 @@
 
 import inspect
 import math
+import sys
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from types import ModuleType
 
 import pytest
 import torch
@@ -13,8 +16,9 @@ from aaplug.core.conventions import CLASSIC
 from aaplug.core.projection import rotation_matrices
 from aaplug.core.rules import RULES_GSPLAT
 from aaplug.core.splats import Render
-from aaplug.gsplat import rasterization
+from aaplug.gsplat import patch, rasterization
 from aaplug.gsplat.arguments import FIXED
+from aaplug.gsplat.patching import REPLACED
 from aaplug.methods import RECIPES
 from aaplug.methods.filters.matched import Matched
 from aaplug.rendering.renderer import Renderer
@@ -378,6 +382,55 @@ def test_gsplats_own_densification_reads_meta(packed, absgrad):
         losses.append(loss.item())
     assert losses[-1] < losses[0]
     assert len(params["means"]) > 60
+
+
+# ------------------------------------------------------------------------------------------------ programs of gsplat's
+
+
+@pytest.fixture
+def stand_in(monkeypatch) -> Callable[..., ModuleType]:
+    """Makes modules by a name and what they hold."""
+
+    def module(name: str, **held: object) -> ModuleType:
+        made = ModuleType(name)
+        vars(made).update(held)
+        monkeypatch.setitem(sys.modules, name, made)
+        return made
+
+    return module
+
+
+@pytest.fixture
+def homes(stand_in) -> dict[str, ModuleType]:
+    """Modules of gsplat's names, as if it were installed, whose functions do nothing."""
+    stand_in("gsplat", __path__=[])
+    return {
+        home: stand_in(home, **{ours.__name__: lambda: None for ours in functions})
+        for home, functions in REPLACED.items()
+    }
+
+
+def test_patch_replaces_functions_wherever_they_are_held_until_it_is_closed(stand_in, homes):
+    theirs = homes["gsplat.rendering"].rasterization
+    trainer = stand_in("trainer", draw=theirs, rasterization=rasterization)
+    with patch():
+        patch().close()  # which changed nothing, and so puts nothing back
+        for home, functions in REPLACED.items():
+            for ours in functions:
+                assert getattr(homes[home], ours.__name__) is ours
+        assert trainer.draw is rasterization
+    assert homes["gsplat.rendering"].rasterization is trainer.draw is theirs
+    assert trainer.rasterization is rasterization
+
+
+@pytest.mark.parametrize("missing", ["module", "function"])
+def test_patch_says_what_it_needs(monkeypatch, homes, missing):
+    if missing == "module":
+        monkeypatch.setitem(sys.modules, "gsplat.rendering", None)
+    else:
+        del homes["gsplat.rendering"].rasterization
+    with pytest.raises(UsageError, match=r"^patch: expected gsplat 1.5 or newer \(`pip install gsplat`"):
+        patch()
 
 
 # ----------------------------------------------------------------------------------------------------------- mistakes

@@ -2,8 +2,11 @@
 
     from aaplug.gsplat import rasterization  # was: from gsplat import rasterization
 
+`aaplug.gsplat.patch()` does so for a whole program.
+
 gsplat (Ye et al., arXiv 2409.06765) has no CPU path.  This one is aaplug's own projection and rasterizers under
 gsplat's rules, written from gsplat's documentation.
 """
 
 from aaplug.gsplat.drop_in import rasterization
+from aaplug.gsplat.patching import patch

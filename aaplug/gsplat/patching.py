@@ -1,0 +1,42 @@
+"""aaplug in the place of gsplat, for programs that import gsplat themselves."""
+
+import importlib
+import sys
+from collections.abc import Callable
+from contextlib import ExitStack
+from typing import Any
+
+from aaplug.gsplat.rendering import rasterization
+from aaplug.system.errors import UsageError
+
+REPLACED: dict[str, list[Callable[..., Any]]] = {"gsplat.rendering": [rasterization]}  # by the module that defines them
+
+
+def patch() -> ExitStack:
+    """Put aaplug's functions in the place of gsplat's, in every module of this process that holds them.
+
+    Modules that import gsplat later find aaplug's too.  gsplat needs to be installed, as its strategies stay its own;
+    importing it needs no GPU.  Called again, it changes nothing.
+
+    Returns:
+        What undoes it, by `close()` or at the end of a `with` block.
+
+    Raises:
+        UsageError: gsplat is not installed, or has no such functions.
+    """
+    pairs = []
+    for home, functions in REPLACED.items():
+        try:
+            module = importlib.import_module(home)
+            pairs += [(getattr(module, ours.__name__), ours) for ours in functions]
+        except (ImportError, AttributeError) as error:
+            problem = f"expected gsplat 1.5 or newer (`pip install gsplat`, no GPU needed): {error}"
+            raise UsageError("patch", f"{problem}; without it, import from aaplug.gsplat") from error
+    undo = ExitStack()
+    for module in list(sys.modules.values()):
+        for name, held in list(getattr(module, "__dict__", {}).items()):
+            for theirs, ours in pairs:
+                if held is theirs and theirs is not ours:
+                    setattr(module, name, ours)
+                    undo.callback(setattr, module, name, theirs)
+    return undo
