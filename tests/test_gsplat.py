@@ -5,11 +5,14 @@ import math
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from fractions import Fraction
 from types import ModuleType
 
 import pytest
 import torch
 from torch import Tensor
+from torch.nn import Parameter
+from torch.optim import Optimizer
 
 from aaplug.core.cameras import Camera
 from aaplug.core.conventions import CLASSIC
@@ -18,6 +21,7 @@ from aaplug.core.rules import RULES_GSPLAT
 from aaplug.core.splats import Render
 from aaplug.gsplat import patch, rasterization
 from aaplug.gsplat.arguments import FIXED
+from aaplug.gsplat.densification import compute_relocation, quat_scale_to_covar_preci
 from aaplug.gsplat.patching import REPLACED
 from aaplug.methods import RECIPES
 from aaplug.methods.filters.matched import Matched
@@ -353,35 +357,94 @@ def photographs_and_start() -> tuple[Tensor, dict[str, Tensor]]:
     return photographs, splats | {"opacities": start.logit_opacities, "sh0": start.sh[:, :1], "shN": start.sh[:, 1:]}
 
 
+def training() -> tuple[dict[str, Parameter], dict[str, Optimizer], Callable[..., tuple[Tensor, dict[str, object]]]]:
+    """Parameters as gsplat's trainer holds them, their optimizers, and what gives one view's loss and `meta`."""
+    torch.manual_seed(0)  # gsplat's densification draws numbers
+    photographs, splats = photographs_and_start()
+    params = {name: Parameter(value.float()) for name, value in splats.items()}
+    view, photograph = cameras(VIEWS[:1], torch.float32), photographs[0].float()
+
+    def draw(**words: object) -> tuple[Tensor, dict[str, object]]:
+        activated = params["means"], params["quats"], params["scales"].exp(), params["opacities"].sigmoid()
+        colours = torch.cat([params["sh0"], params["shN"]], dim=1)
+        image, _, info = rasterization(*activated, colours, **view, sh_degree=1, **words)
+        return (image[0] - photograph).abs().mean(), info
+
+    return params, {name: torch.optim.Adam([value], lr=1e-2) for name, value in params.items()}, draw
+
+
+def descend(loss: Tensor, optimizers: dict[str, Optimizer]) -> float:
+    """One step of every optimizer; returns the loss."""
+    for optimizer in optimizers.values():
+        optimizer.step()
+        optimizer.zero_grad()
+    return loss.item()
+
+
 @pytest.mark.parametrize(("packed", "absgrad"), [(True, False), (False, True)])
 def test_gsplats_own_densification_reads_meta(packed, absgrad):
     strategies = pytest.importorskip("gsplat.strategy", reason="the package gsplat is not installed")
-    torch.manual_seed(0)  # its densification draws numbers
-    photographs, splats = photographs_and_start()
-    params = {name: torch.nn.Parameter(value.float()) for name, value in splats.items()}
-    optimizers = {name: torch.optim.Adam([value], lr=1e-2) for name, value in params.items()}
+    params, optimizers, draw = training()
     strategy = strategies.DefaultStrategy(
         refine_start_iter=2, refine_every=2, grow_grad2d=1e-6, absgrad=absgrad, refine_scale2d_stop_iter=9
     )
     strategy.check_sanity(params, optimizers)
     state = strategy.initialize_state()
-    view, photograph = cameras(VIEWS[:1], torch.float32), photographs[0].float()
     losses = []
     for step in range(8):
-        activated = params["means"], params["quats"], params["scales"].exp(), params["opacities"].sigmoid()
-        words = {"sh_degree": 1, "packed": packed, "absgrad": absgrad}
-        colours = torch.cat([params["sh0"], params["shN"]], dim=1)
-        image, _, info = rasterization(*activated, colours, **view, **words)
+        loss, info = draw(packed=packed, absgrad=absgrad)
         strategy.step_pre_backward(params, optimizers, state, step, info)
-        loss = (image[0] - photograph).abs().mean()
         loss.backward()
         strategy.step_post_backward(params, optimizers, state, step, info, packed=packed)
-        for optimizer in optimizers.values():
-            optimizer.step()
-            optimizer.zero_grad()
-        losses.append(loss.item())
+        losses.append(descend(loss, optimizers))
     assert losses[-1] < losses[0]
     assert len(params["means"]) > 60
+
+
+def test_gsplats_own_markov_chain_runs():
+    strategies = pytest.importorskip("gsplat.strategy", reason="the package gsplat is not installed")
+    params, optimizers, draw = training()
+    strategy = strategies.MCMCStrategy(cap_max=80, refine_start_iter=2, refine_every=2, min_opacity=0.2)
+    strategy.check_sanity(params, optimizers)
+    with torch.no_grad():
+        params["opacities"][:5] = -5.0  # dead, and so relocated
+    state, losses = strategy.initialize_state(), []
+    with patch():
+        for step in range(20):
+            loss, info = draw()
+            loss.backward()
+            losses.append(descend(loss, optimizers))
+            strategy.step_post_backward(params, optimizers, state, step, info, lr=1e-6)
+    assert losses[-1] < losses[0]
+    assert len(params["means"]) == 80
+    assert (params["opacities"].sigmoid() > 0.19).all()
+
+
+@pytest.mark.parametrize("copies", [1, 2, 7, 51])
+def test_relocated_copies_look_like_one(copies):
+    opacities, scales = torch.tensor([0.01, 0.5, 0.99, 1.0]), torch.rand(4, 3)
+    counts = torch.tensor([copies, copies, copies, copies + 100 * (copies == 51)])
+    new, wide = compute_relocation(opacities, scales, counts, torch.zeros(51, 51))
+    for old, o, factor in zip(opacities.tolist(), new.tolist(), (wide / scales).mean(dim=1).tolist(), strict=True):
+        assert 1 - (1 - o) ** copies == pytest.approx(old, rel=1e-5)
+        o = 1 - (1 - min(old, 1 - 2**-23)) ** (1 / copies)
+        double_sum = sum(  # eq. 9
+            Fraction(math.comb(i - 1, k) * (-1) ** k) * Fraction(o) ** (k + 1) / Fraction(math.sqrt(k + 1))
+            for i in range(1, copies + 1)
+            for k in range(i)
+        )
+        assert factor == pytest.approx(old / float(double_sum), rel=1e-5)
+
+
+def test_covariances_and_their_inverses():
+    quats, scales = torch.randn(5, 2, 4, dtype=F64), 0.5 + torch.rand(5, 2, 3, dtype=F64)
+    sigma, inverse = quat_scale_to_covar_preci(quats, scales)
+    torch.testing.assert_close(sigma[:, 1], covariances(quats[:, 1], scales[:, 1]))
+    torch.testing.assert_close(inverse, torch.linalg.inv(sigma))
+    triangle, nothing = quat_scale_to_covar_preci(quats, scales, compute_preci=False, triu=True)
+    xx, xy, xz, yy, yz, zz = triangle.unbind(dim=-1)
+    torch.testing.assert_close(torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], dim=-1).unflatten(-1, (3, 3)), sigma)
+    assert nothing is None
 
 
 # ------------------------------------------------------------------------------------------------ programs of gsplat's

@@ -6,10 +6,15 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Any
 
+from aaplug.gsplat.densification import compute_relocation, quat_scale_to_covar_preci
 from aaplug.gsplat.rendering import rasterization
 from aaplug.system.errors import UsageError
 
-REPLACED: dict[str, list[Callable[..., Any]]] = {"gsplat.rendering": [rasterization]}  # by the module that defines them
+REPLACED: dict[str, list[Callable[..., Any]]] = {  # by the modules that define them
+    "gsplat.rendering": [rasterization],
+    "gsplat.relocation": [compute_relocation],
+    "gsplat.cuda._wrapper": [quat_scale_to_covar_preci],
+}
 
 
 def patch() -> ExitStack:

@@ -1,0 +1,62 @@
+"""What gsplat's densification strategies compute on CUDA alone: relocation, and covariances for its noise.
+
+n: Gaussians; b: leading dimensions.  3DGS-MCMC is Kheradmand et al. 2024, arXiv 2404.09591.
+"""
+
+import math
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn import functional
+
+from aaplug.core.projection import rotation_matrices
+from aaplug.system.contracts import contract
+
+MAX_OPACITY = 1 - torch.finfo(torch.float32).eps  # nearer to 1 the sum of `compute_relocation` loses digits
+
+
+@contract
+def compute_relocation(
+    opacities: Float[Tensor, " n"],
+    scales: Float[Tensor, "n 3"],
+    ratios: Int[Tensor, " n"],
+    binoms: Float[Tensor, "most most"],
+) -> tuple[Float[Tensor, " n"], Float[Tensor, "n 3"]]:
+    """Opacities and scales with which N copies of a Gaussian look like one of it (3DGS-MCMC, eq. 9).
+
+    With o' = 1 - (1 - o)^(1/N), scales are multiplied by o / Σ_j C(N, j) (-1)^(j-1) o'^j / √j, j = 1 … N.  This is the
+    paper's double sum, by Σ_i C(i-1, j-1) = C(N, j).
+
+    ratios: N, taken as 1 … `most`.  binoms: gsplat's table; only its side is read.
+    """
+    counts, orders = ratios.clamp(1, len(binoms)), range(1, len(binoms) + 1)
+    choices = torch.tensor([[math.comb(n, k) for k in orders] for n in orders], dtype=torch.float64)
+    j = torch.tensor(orders, dtype=torch.float64)
+    old = opacities.double().clamp(max=MAX_OPACITY)
+    new = 1 - (1 - old) ** (1 / counts.double())
+    factors = old / -((choices / j.sqrt())[counts - 1] * (-new[:, None]) ** j).sum(dim=1)
+    return new.to(opacities), scales * factors[:, None].to(scales)
+
+
+@contract
+def quat_scale_to_covar_preci(
+    quats: Float[Tensor, "*b 4"],
+    scales: Float[Tensor, "*b 3"],
+    compute_covar: bool = True,
+    compute_preci: bool = True,
+    triu: bool = False,
+) -> tuple[Float[Tensor, "..."] | None, Float[Tensor, "..."] | None]:
+    """Covariances of Gaussians and their inverses, [*b, 3, 3], each None if not asked for.
+
+    quats: wxyz, of any length but zero.  triu: the upper triangles xx, xy, xz, yy, yz, zz, [*b, 6], instead.
+    """
+    axes = rotation_matrices(functional.normalize(quats, dim=-1).reshape(-1, 4)).view(*scales.shape, 3)
+    rows, columns = torch.triu_indices(3, 3)
+
+    def of(scales: Tensor) -> Tensor:
+        factor = axes * scales[..., None, :]
+        matrices = factor @ factor.mT
+        return matrices[..., rows, columns] if triu else matrices
+
+    return of(scales) if compute_covar else None, of(1 / scales) if compute_preci else None
