@@ -5,6 +5,7 @@ import math
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from enum import Enum
 from fractions import Fraction
 from types import ModuleType
 
@@ -16,15 +17,18 @@ from torch.optim import Optimizer
 
 from aaplug.core.cameras import Camera
 from aaplug.core.conventions import CLASSIC
+from aaplug.core.kernels import EAGER
 from aaplug.core.projection import rotation_matrices
 from aaplug.core.rules import RULES_GSPLAT
 from aaplug.core.splats import Render
 from aaplug.gsplat import patch, rasterization
 from aaplug.gsplat.arguments import FIXED
 from aaplug.gsplat.densification import compute_relocation, quat_scale_to_covar_preci
+from aaplug.gsplat.drop_in import _rasterizer_of
 from aaplug.gsplat.patching import REPLACED
 from aaplug.methods import RECIPES
 from aaplug.methods.filters.matched import Matched
+from aaplug.rasterizers.tiled import Tiled
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import UsageError
 from tests.conftest import make_camera, make_scene
@@ -292,6 +296,50 @@ def test_planes_and_radii_leave_splats_out():
         assert 0 < kept.sum() < kept.numel()
 
 
+def test_order_and_depth_may_be_by_distance():
+    values, views = gaussians(), two_views()
+    by_z, by_distance = (rasterization(**values, **views, global_z_order=z, render_mode="RGB+D") for z in (True, False))
+    meta = by_distance[2]
+    offsets = values["means"][meta["gaussian_ids"]] - torch.tensor(EYES, dtype=F64)[meta["camera_ids"]]
+    torch.testing.assert_close(meta["depths"], offsets.norm(dim=1))
+    assert (by_z[2]["depths"] < meta["depths"]).all()
+    assert (by_z[0][..., 3] <= by_distance[0][..., 3]).all()
+    assert (by_z[0][..., :3] != by_distance[0][..., :3]).any(), "the order should matter here"
+
+
+@pytest.mark.parametrize("mode", ["D", "RGB+D"])
+def test_masked_pixels_are_black(mode):
+    values, views, masks = gaussians(), two_views(), torch.rand(2, *SIZE[::-1]) < 0.5
+    values["means"].requires_grad_()
+    words = {"render_mode": mode, "backgrounds": torch.ones(2, 3, dtype=F64)}
+    image, alpha, _ = rasterization(**values, **views, **words, masks=masks)
+    expected, expected_alpha, _ = rasterization(**values, **views, **words)
+    expected[~masks] = 0  # as gsplat's trainer does
+    assert image.equal(expected)
+    assert alpha.equal(expected_alpha)
+    by_ours, by_trainer = (torch.autograd.grad(x.sum(), values["means"])[0] for x in (image, expected))
+    torch.testing.assert_close(by_ours, by_trainer)
+
+
+LIKE_DEFAULTS = {  # values that ask for what gsplat does by default
+    "distributed": None, "sparse_grad": None, "tile_size": None, "with_ut": 0, "with_eval3d": False, "macro_tile": True,
+    "radial_coeffs": torch.zeros(2, 6), "tangential_coeffs": torch.zeros(2, 2), "thin_prism_coeffs": torch.zeros(2, 4),
+    "rolling_shutter": Enum("RollingShutterType", ["GLOBAL"]).GLOBAL, "extra_signals": None, "renderer_config": None,
+}  # fmt: skip
+
+
+def test_arguments_that_ask_for_the_default_are_taken():
+    values, views = gaussians(), two_views()
+    expected, _, _ = rasterization(**values, **views)
+    assert rasterization(**values, **views, **LIKE_DEFAULTS)[0].equal(expected)
+
+
+def test_depth_needs_no_colours():
+    values, views = gaussians(degree=1), two_views()
+    expected, _, _ = rasterization(**values, **views, sh_degree=1, render_mode="ED")
+    assert rasterization(**values | {"colors": None}, **views, sh_degree=1, render_mode="ED")[0].equal(expected)
+
+
 # ---------------------------------------------------------------------------------------------------------- gradients
 
 
@@ -531,11 +579,16 @@ WRONG = {
     'relative_rate: belongs to rasterize_mode="matched", which needs it': {"rasterize_mode": "matched"},
     "relative_rate: expected shape [2], got [3]": {"rasterize_mode": "matched", "relative_rate": torch.ones(3)},
     "relative_rate: expected numbers above 0, got -1.0": {"rasterize_mode": "matched", "relative_rate": -1.0},
-    "camera_model: only pinhole is supported on the CPU (pinhole cameras), got fisheye": {"camera_model": "fisheye"},
+    "camera_model: only pinhole is supported on the CPU (pinhole cameras), got 'fisheye'": {"camera_model": "fisheye"},
     "distributed: only False is supported": {"distributed": True},
     "sparse_grad: only False is supported": {"sparse_grad": True},
     "with_ut: only False is supported": {"with_ut": True},
-    "radial_coeffs: only None is supported": {"radial_coeffs": torch.zeros(2, 6)},
+    "radial_coeffs: only None is supported on the CPU (pinhole cameras), got float32 [2, 6]": {
+        "radial_coeffs": torch.full((2, 6), 0.1)
+    },
+    "viewmats_rs: only None is supported": {"viewmats_rs": torch.zeros(2, 4, 4)},
+    "colors: expected colours for render_mode RGB, got None": {"colors": None},
+    "masks: expected shape [2, 28, 40], got [2, 4, 5]": {"masks": torch.ones(2, 4, 5, dtype=torch.bool)},
     "heliocentric: is not an argument of gsplat's rasterization": {"heliocentric": 1},
     "rasterizer: 'cuda' is not one of": {"rasterizer": "cuda"},
 }
@@ -546,3 +599,11 @@ def test_what_is_wrong_or_not_supported_is_said(message):
     with pytest.raises(UsageError) as error:
         rasterization(**gaussians() | two_views() | WRONG[message])
     assert str(error.value).startswith(message)
+
+
+def test_compiled_is_never_eager_without_a_word(monkeypatch):
+    monkeypatch.setattr("aaplug.gsplat.drop_in.find_rasterizer", lambda name: Tiled(EAGER))
+    monkeypatch.setattr("aaplug.gsplat.drop_in._rasterizer_of", _rasterizer_of.__wrapped__)
+    with pytest.raises(UsageError, match=r"^rasterizer: no kernel 'composite-point.*' is compiled for float64 \["):
+        rasterization(**gaussians(), **two_views(), rasterizer="compiled")
+    rasterization(**gaussians(), **two_views(), rasterizer="auto")

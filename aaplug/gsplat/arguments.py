@@ -17,6 +17,7 @@ from aaplug.core.cameras import Camera
 from aaplug.core.conventions import Convention
 from aaplug.core.gaussians import MAX_LOG_SCALE, Gaussians
 from aaplug.core.rules import Rules
+from aaplug.system.contracts import described
 from aaplug.system.errors import UsageError, not_one_of
 
 MODES = {
@@ -25,7 +26,7 @@ MODES = {
     "trained_mode": ("classic", "antialiased"),
 }
 
-FIXED: dict[str, object] = {  # arguments of gsplat of which only the default is supported
+FIXED: dict[str, object] = {  # arguments of gsplat 1.5 and 1.6 of which only the default, or its like, is supported
     "sparse_grad": False,
     "distributed": False,
     "camera_model": "pinhole",
@@ -37,7 +38,15 @@ FIXED: dict[str, object] = {  # arguments of gsplat of which only the default is
     "ftheta_coeffs": None,
     "rolling_shutter": "GLOBAL",
     "viewmats_rs": None,
+    "rays": None,
+    "return_normals": False,
+    "lidar_coeffs": None,
+    "external_distortion_coeffs": None,
+    "extra_signals": None,
+    "extra_signals_sh_degree": None,
+    "renderer_config": None,
 }
+WITHOUT_EFFECT = ("macro_tile", "ut_params")  # on classic projection
 
 
 @dataclass(frozen=True, eq=False)  # `==` is that of `Camera`
@@ -75,6 +84,7 @@ class Options:
     rasterize_mode: str
     trained_mode: str
     max_alpha: float
+    global_z_order: bool = True
 
     def __post_init__(self) -> None:
         for name, modes in MODES.items():
@@ -116,12 +126,25 @@ class View:
 
 
 def refuse(others: Mapping[str, object]) -> None:
-    """Raise UsageError for an argument that is not known, or differs from gsplat's default."""
+    """Raise UsageError for an argument that is not known, or asks for something else than gsplat's default.
+
+    None, False and 0 ask for the same, and coefficients of 0 for no distortion.
+    """
     for name, value in others.items():
+        if name in WITHOUT_EFFECT:
+            continue
         if name not in FIXED:
             raise UsageError(name, "is not an argument of gsplat's rasterization that aaplug knows")
-        if (value.name if isinstance(value, Enum) else value) != FIXED[name]:  # gsplat has an enumeration of shutters
-            raise UsageError(name, f"only {FIXED[name]} is supported on the CPU (pinhole cameras), got {value}")
+        default = FIXED[name]
+        if isinstance(value, Tensor):
+            same = name.endswith("_coeffs") and not value.any()
+        elif isinstance(value, Enum):  # gsplat has one of shutters
+            same = value.name == default
+        else:
+            same = value == default or not (value or default)
+        if not same:
+            words = f"only {default} is supported on the CPU (pinhole cameras), got {described(value)}"
+            raise UsageError(name, words)
 
 
 def views_of(
@@ -129,7 +152,7 @@ def views_of(
     quats: Tensor | None,
     scales: Tensor | None,
     opacities: Tensor,
-    colors: Tensor,
+    colors: Tensor | None,
     viewmats: Tensor,
     Ks: Tensor,
     backgrounds: Tensor | None,
@@ -154,15 +177,19 @@ def views_of(
     elif quats is None or scales is None:
         raise UsageError("covars", "expected quats and scales, or covars")
     degree = options.sh_degree
+    if colors is None:
+        if options.coloured:
+            raise UsageError("colors", f"expected colours for render_mode {options.render_mode}, got None")
+        colors, backgrounds = opacities[..., None], None
     if colors.dim() < len(batch) + (2 if degree is None else 3):
         raise UsageError("colors", f"expected a row of channels for each Gaussian, got {list(colors.shape)}")
     channels = colors.shape[-1:] if degree is None else (*colors.shape[-2:-1], 3)
     per_camera = colors.dim() == len(batch) + 2 + len(channels)
-    _check_shape("colors", colors, (*batch, *((c,) if per_camera else ()), n, *channels))
+    check_shape("colors", colors, (*batch, *((c,) if per_camera else ()), n, *channels))
     if degree is not None and not 0 <= degree < colors.shape[-2] ** 0.5:
         raise UsageError("sh_degree", f"{degree} needs {(degree + 1) ** 2} coefficients, colors has {colors.shape[-2]}")
     if backgrounds is not None:
-        _check_shape("backgrounds", backgrounds, (*batch, c, 3 if degree is not None else colors.shape[-1]))
+        check_shape("backgrounds", backgrounds, (*batch, c, 3 if degree is not None else colors.shape[-1]))
     columns = [
         *(_per_image(x, batch, c) for x in (means, quats, scales, opacities, covars)),
         _per_image(colors, batch, c, per_camera),
@@ -172,7 +199,8 @@ def views_of(
     return [_view(*row, options) for row in zip(*columns, strict=True)]  # pyright: ignore[reportCallIssue]
 
 
-def _check_shape(name: str, x: Tensor, shape: Sequence[int]) -> None:
+def check_shape(name: str, x: Tensor, shape: Sequence[int]) -> None:
+    """Raise UsageError for another shape."""
     if tuple(x.shape) != tuple(shape):
         raise UsageError(name, f"expected shape [{', '.join(map(str, shape))}], got {list(x.shape)}")
 
@@ -193,7 +221,7 @@ def _rates(relative_rate: float | Tensor | None, shape: Sequence[int], options: 
         return [None for _ in range(math.prod(shape))]
     rates = torch.as_tensor(relative_rate, dtype=torch.float64)
     if rates.dim() > 0:
-        _check_shape("relative_rate", rates, shape)
+        check_shape("relative_rate", rates, shape)
     if not (rates > 0).all():
         raise UsageError("relative_rate", f"expected numbers above 0, got {relative_rate}")
     return rates.expand(*shape).flatten().tolist()

@@ -69,7 +69,11 @@ class ViewSplats:
         keep = (splats.depths <= options.far_plane) & (splats.opacities >= rules.min_alpha) & (splats.dets > 0)
         keep = keep & (radii > options.radius_clip).any(dim=1)
         keep = keep & (high > 0).all(dim=1) & (low < low.new_tensor([options.width, options.height])).all(dim=1)
-        return cls(splats[keep], radii[keep].int())
+        splats = splats[keep]
+        if not options.global_z_order:
+            offsets = view.scene.means.index_select(0, splats.sources).double() - camera.centre
+            splats = replace(splats, depths=torch.linalg.vector_norm(offsets, dim=1).to(splats.depths))
+        return cls(splats, radii[keep].int())
 
 
 @on_free_cores()

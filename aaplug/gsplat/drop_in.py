@@ -1,22 +1,25 @@
 """The function itself; see the package's docstring."""
 
+from dataclasses import replace
 from functools import cache
 from typing import Annotated, Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from aaplug.core.cameras import Side
 from aaplug.core.conventions import CLASSIC
 from aaplug.core.interfaces import Rasterizer, RunsKernels
-from aaplug.core.kernels import EAGER
+from aaplug.core.kernels import EAGER, Kernel, Kernels, Runner
 from aaplug.core.rules import RULES_GSPLAT
-from aaplug.gsplat.arguments import Options, refuse, views_of
+from aaplug.gsplat.arguments import Options, check_shape, refuse, views_of
 from aaplug.gsplat.drawing import ViewSplats, draw
 from aaplug.gsplat.table import Layout, table_of
 from aaplug.rasterizers.choice import find_rasterizer
-from aaplug.system.contracts import Range, contract
+from aaplug.rasterizers.tiled import Tiled
+from aaplug.system.contracts import Range, contract, described
+from aaplug.system.errors import UsageError
 
 Above0 = Annotated[float, Range(above=0)]
 From0 = Annotated[float, Range(0)]
@@ -28,7 +31,7 @@ def rasterization(
     quats: Float[Tensor, "*b n 4"] | None,
     scales: Float[Tensor, "*b n 3"] | None,
     opacities: Float[Tensor, "*b n"],
-    colors: Float[Tensor, "..."],
+    colors: Float[Tensor, "..."] | None,
     viewmats: Float[Tensor, "*b c 4 4"],
     Ks: Float[Tensor, "*b c 3 3"],
     width: Side,
@@ -39,18 +42,20 @@ def rasterization(
     eps2d: From0 = CLASSIC.kernel,
     sh_degree: Annotated[int, Range(0, 4)] | None = None,
     packed: bool = True,
-    tile_size: Annotated[int, Range(1)] = 16,
+    tile_size: Annotated[int, Range(1)] | None = 16,
     backgrounds: Float[Tensor, "*b c d"] | None = None,
     render_mode: str = "RGB",
-    sparse_grad: bool = False,
+    sparse_grad: bool | None = False,
     absgrad: bool = False,
     rasterize_mode: str = "classic",
     channel_chunk: int = 32,
-    distributed: bool = False,
+    distributed: bool | None = False,
     camera_model: str = "pinhole",
     segmented: bool = False,
     covars: Float[Tensor, "*b n 3 3"] | None = None,
     *,
+    global_z_order: bool = True,
+    masks: Bool[Tensor, "*b c h w"] | None = None,
     relative_rate: float | Float[Tensor, "..."] | None = None,
     trained_mode: str = "classic",
     max_alpha: float = RULES_GSPLAT.max_alpha,
@@ -69,7 +74,7 @@ def rasterization(
         scales: standard deviations, [..., n, 3], in world units.
         opacities: in [0, 1], [..., n].
         colors: channels, [..., n, d] or [..., c, n, d]; with `sh_degree` coefficients, [..., n, k, 3] or
-            [..., c, n, k, 3].
+            [..., c, n, k, 3].  None where only depth is drawn.
         viewmats: from world to camera (x right, y down, z forward), [..., c, 4, 4].
         Ks: intrinsics in px, [..., c, 3, 3].
         width, height: px.
@@ -86,11 +91,13 @@ def rasterization(
             floor; or aaplug's "matched", which draws at any rate what training drew at its own (`Matched`).
         tile_size, channel_chunk, segmented: without effect here.
         sparse_grad, distributed, camera_model: only gsplat's defaults are supported.
+        global_z_order: depth is that along the optical axis; if False, the distance from the camera.
+        masks: False for pixels of an image that are left black, as gsplat's trainer does, [..., c, height, width].
         covars: [..., n, 3, 3], in squared world units, instead of quats and scales; the upper triangle is read.
         relative_rate: for "matched": each image's focal length over training's, one number or [..., c].
         trained_mode: for "matched": "classic" or "antialiased", the mode of training.
         max_alpha: cap of one splat's alpha at a pixel; 0.999 in gsplat 1.5, 0.99 in 1.6.
-        rasterizer: a rasterizer of aaplug, or its name.
+        rasterizer: a rasterizer of aaplug, or its name.  "compiled" composites by compiled kernels or not at all.
         others: further arguments of gsplat's, of which only the defaults are supported.
 
     Returns:
@@ -98,11 +105,12 @@ def rasterization(
         except those of its tiles.
 
     Raises:
-        UsageError: something is not supported or out of range, or shapes do not fit each other.
+        UsageError: something is not supported or out of range, shapes do not fit each other, or no compiled kernel
+            takes what "compiled" was asked for.
     """
     options = Options(
-        *(width, height, near_plane, far_plane, radius_clip, eps2d, sh_degree, packed, tile_size, render_mode),
-        *(rasterize_mode, trained_mode, max_alpha),
+        *(width, height, near_plane, far_plane, radius_clip, eps2d, None if colors is None else sh_degree, packed),
+        *(tile_size or 16, render_mode, rasterize_mode, trained_mode, max_alpha, global_z_order),
     )
     refuse({"sparse_grad": sparse_grad, "distributed": distributed, "camera_model": camera_model, **others})
     tensors = (means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars)
@@ -117,10 +125,32 @@ def rasterization(
         draw(part, view, options, painter, kernels, add) for part, view, add in zip(splats, views, adders, strict=True)
     ]
     colours, alphas = (torch.stack(column).unflatten(0, layout.shape) for column in zip(*images, strict=True))
+    if masks is not None:
+        check_shape("masks", masks, colours.shape[:-1])
+        colours = colours * masks[..., None]
     return colours, alphas, meta
 
 
 @cache
 def _rasterizer_of(name: str) -> Rasterizer:
     """A rasterizer by name; compiled kernels are loaded and checked once, not for every image."""
-    return find_rasterizer(name, None)
+    found = find_rasterizer(name, None)
+    if name != "compiled":
+        return found
+    assert isinstance(found, Tiled)
+    return replace(found, kernels=OnlyCompiled(found.kernels))
+
+
+class OnlyCompiled(Kernels):
+    """Runs kernels as the given ones do, and refuses to composite eagerly."""
+
+    def __init__(self, kernels: Kernels):
+        self.kernels, self.name, self.tiles = kernels, kernels.name, kernels.tiles
+
+    def runner(self, kernel: Kernel, args: tuple[Tensor, ...]) -> Runner:
+        """The function of a stage; a leading size of 1 is always run eagerly."""
+        run = self.kernels.runner(kernel, args)
+        if run is kernel.function and kernel.name.startswith("composite-") and all(len(arg) > 1 for arg in args if arg.dim()):
+            problem = f"no kernel '{kernel.name}' is compiled for {described(args[0])}"
+            raise UsageError("rasterizer", f'{problem}; "auto" draws it eagerly where "compiled" cannot')
+        return run
