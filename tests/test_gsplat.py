@@ -21,10 +21,11 @@ from aaplug.core.kernels import EAGER
 from aaplug.core.projection import rotation_matrices
 from aaplug.core.rules import RULES_GSPLAT
 from aaplug.core.splats import Render
-from aaplug.gsplat import patch, rasterization
+from aaplug.gsplat import patch, rasterization, rasterization_2dgs
 from aaplug.gsplat.arguments import FIXED
+from aaplug.gsplat.choice import rasterizer_of
 from aaplug.gsplat.densification import compute_relocation, quat_scale_to_covar_preci
-from aaplug.gsplat.drop_in import _rasterizer_of
+from aaplug.gsplat.discs import normals_of_depth
 from aaplug.gsplat.patching import REPLACED
 from aaplug.methods import RECIPES
 from aaplug.methods.filters.matched import Matched
@@ -131,13 +132,14 @@ def test_projection_equals_gsplats_on_a_thousand_cases(reference, dtype, px, rel
         assert error.max() < relative, name
 
 
-def test_arguments_have_gsplats_names_and_defaults():
-    theirs = inspect.signature(pytest.importorskip("gsplat", reason="the package is not installed").rasterization)
-    ours = inspect.signature(rasterization).parameters
+@pytest.mark.parametrize("function", [rasterization, rasterization_2dgs])
+def test_arguments_have_gsplats_names_and_defaults(function):
+    gsplat = pytest.importorskip("gsplat", reason="the package gsplat is not installed")
+    theirs, ours = inspect.signature(getattr(gsplat, function.__name__)), inspect.signature(function).parameters
     order = [name for name in theirs.parameters if name in ours]
     assert order == [name for name in ours if name in theirs.parameters] == list(theirs.parameters)[: len(order)]
     for name, parameter in theirs.parameters.items():
-        default = FIXED[name] if name in FIXED else ours[name].default
+        default = ours[name].default if name in ours else FIXED[name]
         expected = getattr(parameter.default, "name", parameter.default)
         assert default == (pytest.approx(expected) if isinstance(expected, float) else expected), name
 
@@ -237,6 +239,153 @@ def test_matched_draws_as_the_recipe_at_the_given_rate(trained_mode, rate):
     if rate == 1:
         trained, _, _ = rasterization(**values, **cameras([view]), sh_degree=1, rasterize_mode=trained_mode)
         torch.testing.assert_close(image, trained, rtol=0, atol=1e-6)
+
+
+# -------------------------------------------------------------------------------------------------------------- discs
+
+
+def discs(n: int = 30) -> dict[str, Tensor]:
+    """Arguments of random discs, some of them opaque, some smaller than a pixel, and many faint."""
+    values = gaussians(n)
+    values["opacities"][10:] *= 0.15
+    values["opacities"][:3], values["scales"][:3], values["scales"][3:6] = 1.0, 0.3, 0.01
+    return values
+
+
+def drawn_by_rays(values: dict[str, Tensor], views: dict[str, object], camera: int) -> tuple[Tensor, ...]:
+    """Colour, alpha, normal, distortion, depth and median depth of each pixel by the geometry of rays and planes."""
+    pose, lens = views["viewmats"][camera], views["Ks"][camera]
+    y, x = torch.meshgrid(*(torch.arange(side, dtype=F64) + 0.5 for side in SIZE[::-1]), indexing="ij")
+    rays = torch.stack([x, y, torch.ones_like(x)], dim=2) @ torch.linalg.inv(lens).T
+    centres = values["means"] @ pose[:3, :3].T + pose[:3, 3]
+    axes = pose[:3, :3] @ rotation_matrices(torch.nn.functional.normalize(values["quats"], dim=1))
+    left, distort, median, depth = torch.ones_like(x), torch.zeros_like(x), torch.zeros_like(x), torch.zeros_like(x)
+    colour, normals, going = torch.zeros(*x.shape, 3, dtype=F64), torch.zeros(*x.shape, 3, dtype=F64), left > 0
+    for i in centres[:, 2].argsort().tolist():
+        centre, (right, up, normal) = centres[i], axes[i].T
+        if centre[2] <= 0.01:
+            continue
+        at = (normal @ centre) / (rays @ normal)  # depth of the plane
+        offset = at[..., None] * rays - centre
+        s, t = (offset @ axis / scale for axis, scale in zip((right, up), values["scales"][i], strict=False))
+        px = lens[:2] @ centre / centre[2]
+        squared = (x - px[0]) ** 2 + (y - px[1]) ** 2
+        alpha = values["opacities"][i] * torch.exp(-0.5 * torch.minimum(s * s + t * t, 2 * squared))
+        alpha = torch.where(alpha < 1 / 255, 0.0, alpha.clamp(max=RULES_GSPLAT.max_alpha))
+        going = going & (left * (1 - alpha) > 1e-4)
+        alpha = torch.where(going, alpha, 0.0)
+        weight = left * alpha
+        distort = distort + 2 * weight * (centre[2] * (1 - left) - depth)
+        median = torch.where((alpha > 0) & (left > 0.5), centre[2], median)
+        depth, left = depth + weight * centre[2], left * (1 - alpha)
+        colour = colour + weight[..., None] * values["colors"][i]
+        normals = normals + weight[..., None] * (-normal if normal @ centre > 0 else normal)
+    return colour, 1 - left, normals @ pose[:3, :3], distort, depth, median
+
+
+@pytest.mark.parametrize(("packed", "rasterizer"), [(False, "eager"), (True, "reference")])
+def test_discs_are_where_rays_meet_them(packed, rasterizer):
+    values, views = discs(70), two_views()
+    words = {"packed": packed, "rasterizer": rasterizer, "render_mode": "RGB+D", "distloss": True}
+    image, alpha, normals, surface, distort, median, meta = rasterization_2dgs(**values, **views, **words)
+    of_median = rasterization_2dgs(**values, **views, **words, depth_mode="median")[3]
+    for camera, eye in enumerate(EYES):
+        assert surface[camera].equal(normals_of_depth(image[camera, ..., 3:], make_camera(eye, SIZE)))
+        assert of_median[camera].equal(normals_of_depth(median[camera], make_camera(eye, SIZE)))
+        results = image[camera, ..., :3], alpha[camera], normals[camera], distort[camera], image[camera, ..., 3:]
+        for ours, twin in zip((*results, median[camera]), drawn_by_rays(values, views, camera), strict=True):
+            torch.testing.assert_close(ours, twin.view(ours.shape), rtol=0, atol=1e-9)
+    assert meta["render_distort"] is distort
+    assert (distort.amax(dim=(1, 2)) > 0.03).all()
+    plain = rasterization_2dgs(**values, **views, packed=packed, rasterizer=rasterizer)
+    assert plain[3] is None
+    assert (plain[4] == 0).all()
+    assert plain[0].equal(image[..., :3])
+
+
+def test_the_median_may_lie_behind_many_faint_discs():
+    values, view = gaussians(40), cameras([make_camera((0.0, -3.0, 0.0), (7, 7))])
+    values |= {"opacities": torch.full((40,), 0.03, dtype=F64), "scales": torch.ones(40, 3, dtype=F64)}
+    values["means"] = torch.stack([torch.zeros(40), torch.linspace(-1, 1, 40), torch.zeros(40)], dim=1).to(F64)
+    values["quats"][:] = torch.tensor([1.0, 1.0, 0.0, 0.0])  # across the line of sight
+    median = rasterization_2dgs(**values, **view, rasterizer="eager")[5]
+    behind_half = next(n for n in range(40) if 0.97**n <= 0.5)
+    torch.testing.assert_close(median[0, 3, 3, 0], values["means"][behind_half - 1, 1] + 3)
+
+
+def test_ray_transforms_and_normals_equal_gsplats():
+    theirs = pytest.importorskip("gsplat.cuda._torch_impl_2dgs", reason="the package gsplat is not installed")
+    values, views = discs(200), unusual_views(5)
+    meta = rasterization_2dgs(**values, **views, rasterizer=Nothing())[-1]
+    tensors = [values[name] for name in INPUTS[:3]]
+    projected = theirs._fully_fused_projection_2dgs(*tensors, views["viewmats"], views["Ks"], *WIDE)
+    shown = (meta["radii"] > 0).all(dim=2)
+    assert shown.sum() > 200
+    names = ("radii", "depths", "ray_transforms", "normals")
+    for name, expected in zip(names, (projected[0], *projected[2:]), strict=True):
+        if name == "normals":
+            expected = torch.nn.functional.normalize(expected, dim=-1)
+        torch.testing.assert_close(meta[name][shown].to(expected.dtype), expected[shown], msg=name)
+    in_front = (projected[3][..., 2, :2].norm(dim=2) < projected[2]) & (projected[0] > 0).all(dim=2)
+    assert (shown == in_front).all()
+
+
+def test_normals_of_a_depth_image_are_those_of_its_plane():
+    view = replace(make_camera(EYES[1], SIZE), fy=70.0)
+    normal = torch.tensor([0.2, -0.3, -0.9], dtype=F64)
+    normal = normal / normal.norm()
+    y, x = torch.meshgrid(*(torch.arange(side, dtype=F64) + 0.5 for side in SIZE[::-1]), indexing="ij")
+    slopes = (x - view.cx) / view.fx * normal[0] + (y - view.cy) / view.fy * normal[1] + normal[2]
+    normals = normals_of_depth((-3 / slopes)[..., None], view)
+    expected = (normal @ view.cam_from_world[:3, :3].to(F64)).expand(SIZE[1] - 2, SIZE[0] - 2, 3)
+    torch.testing.assert_close(normals[1:-1, 1:-1], expected)
+    assert (normals[0] == 0).all()
+
+
+@pytest.mark.parametrize("depth_mode", ["expected", "median"])
+def test_gradients_of_discs_equal_finite_differences(depth_mode):
+    values, views = discs(8) | {"backgrounds": torch.rand(1, 3, dtype=F64)}, cameras([make_camera(EYES[0], SIZE)])
+    views |= {"width": 8, "height": 6}
+    views["Ks"] = views["Ks"] * torch.tensor([8 / SIZE[0], 6 / SIZE[1], 1], dtype=F64)[:, None]
+    leaves = values | {"viewmats": views.pop("viewmats")}
+
+    def draw(*args: Tensor) -> Tensor:
+        words = {"render_mode": "RGB+ED", "distloss": True, "depth_mode": depth_mode}
+        *results, _ = rasterization_2dgs(**dict(zip(leaves, args, strict=True)), **views, **words)
+        assert results[3].shape == (6, 8, 3), "gsplat leaves out the dimension of one camera"
+        return torch.cat([x.view(6, 8, -1) for x in results], dim=2)
+
+    inputs = [x.clone().requires_grad_() for x in leaves.values()]
+    assert torch.autograd.gradcheck(draw, inputs, eps=1e-7, rtol=1e-4, atol=1e-4, fast_mode=True)
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_gradient_of_a_disc_is_that_of_its_move_across_the_image(packed):
+    values, views = discs(), two_views()
+    values["means"].requires_grad_()
+    image, *_, meta = rasterization_2dgs(**values, **views, packed=packed)
+    loss = (image * torch.rand_like(image)).sum()
+    moves, transforms = torch.autograd.grad(loss, [meta["gradient_2dgs"], meta["ray_transforms"]], retain_graph=True)
+    torch.testing.assert_close(moves, transforms[..., :2, 2] * meta["depths"][..., None])
+    assert moves.abs().max() > 0
+    assert torch.autograd.grad(loss, meta["means2d"])[0].abs().max() > 0
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_odd_discs_have_finite_images_and_gradients(dtype):
+    values, view = discs(), cameras([make_camera((0.0, -3.0, 0.0), SIZE)])
+    values["means"][:4] = torch.tensor([[0.0, 0.0, 0.0], [0.4, 0.0, 0.0], [0.0, -2.9, 0.0], [0.0, 9.0, 0.0]])
+    values["quats"][:4], values["opacities"][4] = torch.tensor([1.0, 0.0, 0.0, 0.0]), 0.0  # flat before the camera
+    values["scales"][5:8], values["scales"][8, 0], values["scales"][9, 0] = 0.0, 0.0, 1e4
+    values, view = ({n: x.to(dtype) if isinstance(x, Tensor) else x for n, x in d.items()} for d in (values, view))
+    leaves = [x.requires_grad_() for x in values.values()]
+    *results, meta = rasterization_2dgs(**values, **view, render_mode="RGB+ED", distloss=True)
+    assert meta["radii"][0, 0].min() == 1, "this disc should be seen from its edge"
+    for gradient in torch.autograd.grad(sum(x.square().sum() for x in results), leaves):
+        assert gradient.isfinite().all()
+    values["means"] = values["means"] - 100  # out of sight
+    *results, meta = rasterization_2dgs(**values, **view, render_mode="RGB+ED", distloss=True)
+    assert all((x == 0).all() for x in results)
 
 
 # ------------------------------------------------------------------------------------------------ layouts and batches
@@ -602,8 +751,24 @@ def test_what_is_wrong_or_not_supported_is_said(message):
 
 
 def test_compiled_is_never_eager_without_a_word(monkeypatch):
-    monkeypatch.setattr("aaplug.gsplat.drop_in.find_rasterizer", lambda name: Tiled(EAGER))
-    monkeypatch.setattr("aaplug.gsplat.drop_in._rasterizer_of", _rasterizer_of.__wrapped__)
+    monkeypatch.setattr("aaplug.gsplat.choice.find_rasterizer", lambda name, frames: Tiled(EAGER))
+    monkeypatch.setattr("aaplug.gsplat.drop_in.rasterizer_of", rasterizer_of.__wrapped__)
     with pytest.raises(UsageError, match=r"^rasterizer: no kernel 'composite-point.*' is compiled for float64 \["):
         rasterization(**gaussians(), **two_views(), rasterizer="compiled")
     rasterization(**gaussians(), **two_views(), rasterizer="auto")
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"depth_mode": "mean"}, "depth_mode: 'mean' is not one of expected, median"),
+        ({"absgrad": True}, "absgrad: only False is supported"),
+        ({"quats": None}, "quats: expected a tensor"),
+        ({"covars": torch.zeros(40, 3, 3)}, "covars: is not an argument"),
+        ({"rasterizer": "cuda"}, "rasterizer: 'cuda' is not one of"),
+    ],
+)
+def test_what_is_wrong_with_discs_is_said(wrong, message):
+    with pytest.raises(UsageError) as error:
+        rasterization_2dgs(**gaussians() | two_views() | wrong)
+    assert str(error.value).startswith(message)

@@ -23,7 +23,7 @@ from torch import Tensor
 
 import aaplug
 from aaplug.evaluation.laws.base import make_camera, make_scene, make_splats
-from aaplug.gsplat import rasterization
+from aaplug.gsplat import rasterization, rasterization_2dgs
 from aaplug.system.errors import AaplugError
 
 STRANGERS = (object(), 2j)  # which no parameter takes
@@ -69,6 +69,7 @@ def right_calls(folder: Path) -> dict[str, tuple[Callable[..., Any], dict[str, A
     }
     gsplat = {"means": gaussians.means, "quats": gaussians.quats, "scales": gaussians.scales, "width": 16, "height": 12}
     gsplat |= {
+        "Ks": torch.tensor([[[20.0, 0, 8], [0, 20, 6], [0, 0, 1]]]),
         "opacities": gaussians.opacities,
         "colors": gaussians.sh[:, 0],
         "viewmats": view.cam_from_world[None].float(),
@@ -113,7 +114,8 @@ def right_calls(folder: Path) -> dict[str, tuple[Callable[..., Any], dict[str, A
         "TrainingViews.of": (aaplug.TrainingViews.of, {"scene": gaussians, "cameras": views}),
         "Pyramid.of": (aaplug.Pyramid.of, {"levels": [gaussians], "chunks": [pyramid.chunks]}),
         "Scene.in_memory": (aaplug.Scene.in_memory, {"held": gaussians}),
-        "rasterization": (rasterization, gsplat | {"Ks": torch.tensor([[[20.0, 0, 8], [0, 20, 6], [0, 0, 1]]])}),
+        "rasterization": (rasterization, gsplat),
+        "rasterization_2dgs": (rasterization_2dgs, gsplat),
     }
     methods: dict[str, tuple[Any, dict[str, Any]]] = {
         "scaled": (view, {"factor": 0.5}),

@@ -10,3 +10,4 @@ gsplat's rules, written from gsplat's documentation.
 
 from aaplug.gsplat.drop_in import rasterization
 from aaplug.gsplat.patching import patch
+from aaplug.gsplat.surfels import rasterization_2dgs

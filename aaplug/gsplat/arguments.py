@@ -28,6 +28,7 @@ MODES = {
 
 FIXED: dict[str, object] = {  # arguments of gsplat 1.5 and 1.6 of which only the default, or its like, is supported
     "sparse_grad": False,
+    "absgrad": False,  # of discs
     "distributed": False,
     "camera_model": "pinhole",
     "with_ut": False,

@@ -1,10 +1,11 @@
-"""One image by gsplat's rules: which splats it keeps, their channels, and absolute gradients.
+"""One image by gsplat's rules: which splats it keeps, their channels, drawn three at a time, and absolute gradients.
 
 m: splats of the image; d: channels, of which the first are colours; h, w: px.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from jaxtyping import Float, Int
@@ -13,9 +14,10 @@ from torch.nn import functional
 
 from aaplug.core.colours import BLACK
 from aaplug.core.ellipses import squared_cutoff
-from aaplug.core.interfaces import Rasterizer
+from aaplug.core.interfaces import Compositor, PixelKernel, Rasterizer
 from aaplug.core.kernels import Kernels
 from aaplug.core.projection import project, project_covariances
+from aaplug.core.rules import Rules
 from aaplug.core.sampling import SamplingBounds
 from aaplug.core.shading import shade
 from aaplug.core.splats import Splats2D
@@ -28,7 +30,6 @@ from aaplug.system.cores import on_free_cores
 
 MIN_COMPENSATION = 1e-9  # gsplat has none; this one keeps the gradient of the root finite where the factor is 0
 MAX_RADIUS = 2.0**30  # px; fits 32 bits
-CHANNELS_PER_CALL = (3, 4)  # of a rasterizer: colour, or colour and depth
 MIN_ALPHA_OF_DEPTH = 1e-10  # expected depth is divided by no less
 
 _EMPTY = torch.zeros(0)
@@ -91,6 +92,15 @@ def draw(
 
     add_gradient: called in the backward pass with the absolute gradients of the centres, unless it is None.
     """
+    features = features_of(splats, view, options, kernels)
+    pixel = POINT if add_gradient is None else AbsolutePoint(absolute_gradients_to=add_gradient)
+    three_or_four = partial(paint, options=options, rasterizer=rasterizer, kernel=pixel)
+    image, alpha = in_parts(splats, features, three_or_four, (3, 4))
+    return finished(image, alpha, view, options), alpha
+
+
+def features_of(splats: Splats2D, view: View, options: Options, kernels: Kernels) -> Float[Tensor, "m d"]:
+    """Colours and depth of each splat, as far as `render_mode` draws them."""
     channels = []
     if options.coloured and view.features is not None:
         channels.append(view.features.index_select(0, splats.sources))
@@ -98,17 +108,37 @@ def draw(
         channels.append(shade(splats, view.scene, view.camera, kernels).rgb)
     if options.render_mode != "RGB":
         channels.append(splats.depths[:, None])
-    features = torch.cat(channels, dim=1)
+    return torch.cat(channels, dim=1)
+
+
+def in_parts(
+    splats: Splats2D, features: Float[Tensor, "m d"], paint: Callable[[Splats2D], Tensor], sizes: Sequence[int] = (3,)
+) -> Image:
+    """Premultiplied channels of any number, and alpha.  paint: draws as many channels at once as `sizes` say."""
     width = features.shape[1]
-    pixel = POINT if add_gradient is None else AbsolutePoint(absolute_gradients_to=add_gradient)
-    at_once = min(CHANNELS_PER_CALL, key=lambda count: -(-width // count))
-    images = []
-    for rgb in functional.pad(features, (0, -width % at_once)).split(at_once, dim=1):
-        part = replace(splats, rgb=rgb)
-        images.append(rasterizer(part, options.hw, BLACK, pixel, None, options.convention.rules))
-    image, alpha = torch.cat([image.rgb for image in images], dim=2)[..., :width], images[0].alpha[..., None]
+    size = min(sizes, key=lambda count: -(-width // count))
+    padded = functional.pad(features, (0, -width % size)).split(size, dim=1)
+    parts = [paint(replace(splats, rgb=rgb)) for rgb in padded]
+    return torch.cat([part[..., :size] for part in parts], dim=2)[..., :width], parts[0][..., size:]
+
+
+def finished(image: Float[Tensor, "h w d"], alpha: Float[Tensor, "h w 1"], view: View, options: Options) -> Tensor:
+    """The channels of `features_of` over the background, and depth divided by alpha where it is to be expected."""
     if view.background is not None and options.coloured:
-        image = image + (1 - alpha) * functional.pad(view.background, (0, width - len(view.background)))
+        image = image + (1 - alpha) * functional.pad(view.background, (0, image.shape[2] - len(view.background)))
     if options.render_mode.endswith("ED"):
         image = torch.cat([image[..., :-1], image[..., -1:] / alpha.clamp(min=MIN_ALPHA_OF_DEPTH)], dim=2)
-    return image, alpha
+    return image
+
+
+def paint(
+    splats: Splats2D,
+    options: Options,
+    rasterizer: Rasterizer,
+    kernel: PixelKernel,
+    compositor: Compositor | None = None,
+    rules: Rules | None = None,
+) -> Float[Tensor, "h w d_and_1"]:
+    """Premultiplied channels, and alpha; by other than the options' rules if `rules` are given."""
+    image = rasterizer(splats, options.hw, BLACK, kernel, compositor, rules or options.convention.rules)
+    return torch.cat([image.rgb, image.alpha[..., None]], dim=2)

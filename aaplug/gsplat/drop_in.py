@@ -1,7 +1,5 @@
 """The function itself; see the package's docstring."""
 
-from dataclasses import replace
-from functools import cache
 from typing import Annotated, Any
 
 import torch
@@ -10,16 +8,13 @@ from torch import Tensor
 
 from aaplug.core.cameras import Side
 from aaplug.core.conventions import CLASSIC
-from aaplug.core.interfaces import Rasterizer, RunsKernels
-from aaplug.core.kernels import EAGER, Kernel, Kernels, Runner
+from aaplug.core.interfaces import Rasterizer
 from aaplug.core.rules import RULES_GSPLAT
 from aaplug.gsplat.arguments import Options, check_shape, refuse, views_of
+from aaplug.gsplat.choice import kernels_of, rasterizer_of
 from aaplug.gsplat.drawing import ViewSplats, draw
 from aaplug.gsplat.table import Layout, table_of
-from aaplug.rasterizers.choice import find_rasterizer
-from aaplug.rasterizers.tiled import Tiled
-from aaplug.system.contracts import Range, contract, described
-from aaplug.system.errors import UsageError
+from aaplug.system.contracts import Range, contract
 
 Above0 = Annotated[float, Range(above=0)]
 From0 = Annotated[float, Range(0)]
@@ -115,10 +110,11 @@ def rasterization(
     refuse({"sparse_grad": sparse_grad, "distributed": distributed, "camera_model": camera_model, **others})
     tensors = (means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars)
     views = views_of(*tensors, relative_rate, options)
-    painter = _rasterizer_of(rasterizer) if isinstance(rasterizer, str) else rasterizer
-    kernels = painter.kernels if isinstance(painter, RunsKernels) else EAGER
+    painter = rasterizer_of(rasterizer) if isinstance(rasterizer, str) else rasterizer
+    kernels = kernels_of(painter)
     parts = [ViewSplats.of(view, options, kernels) for view in views]
-    layout = Layout.of(parts, viewmats.shape[:-2], means.shape[-2], packed)
+    sources = [part.splats.sources for part in parts]
+    layout = Layout.of(sources, viewmats.shape[:-2], means.shape[-2], packed)
     meta, splats = table_of(parts, layout, options)
     adders = layout.gradient_adders(meta["means2d"]) if absgrad else len(views) * [None]
     images = [
@@ -129,28 +125,3 @@ def rasterization(
         check_shape("masks", masks, colours.shape[:-1])
         colours = colours * masks[..., None]
     return colours, alphas, meta
-
-
-@cache
-def _rasterizer_of(name: str) -> Rasterizer:
-    """A rasterizer by name; compiled kernels are loaded and checked once, not for every image."""
-    found = find_rasterizer(name, None)
-    if name != "compiled":
-        return found
-    assert isinstance(found, Tiled)
-    return replace(found, kernels=OnlyCompiled(found.kernels))
-
-
-class OnlyCompiled(Kernels):
-    """Runs kernels as the given ones do, and refuses to composite eagerly."""
-
-    def __init__(self, kernels: Kernels):
-        self.kernels, self.name, self.tiles = kernels, kernels.name, kernels.tiles
-
-    def runner(self, kernel: Kernel, args: tuple[Tensor, ...]) -> Runner:
-        """The function of a stage; a leading size of 1 is always run eagerly."""
-        run = self.kernels.runner(kernel, args)
-        if run is kernel.function and kernel.name.startswith("composite-") and all(len(arg) > 1 for arg in args if arg.dim()):
-            problem = f"no kernel '{kernel.name}' is compiled for {described(args[0])}"
-            raise UsageError("rasterizer", f'{problem}; "auto" draws it eagerly where "compiled" cannot')
-        return run

@@ -7,11 +7,11 @@ from contextlib import ExitStack
 from typing import Any
 
 from aaplug.gsplat.densification import compute_relocation, quat_scale_to_covar_preci
-from aaplug.gsplat.rendering import rasterization
+from aaplug.gsplat.rendering import rasterization, rasterization_2dgs
 from aaplug.system.errors import UsageError
 
 REPLACED: dict[str, list[Callable[..., Any]]] = {  # by the modules that define them
-    "gsplat.rendering": [rasterization],
+    "gsplat.rendering": [rasterization, rasterization_2dgs],
     "gsplat.relocation": [compute_relocation],
     "gsplat.cuda._wrapper": [quat_scale_to_covar_preci],
 }

@@ -1,5 +1,6 @@
-"""The names of `gsplat.rendering` that aaplug draws: its `rasterization`."""
+"""The names of `gsplat.rendering` that aaplug draws."""
 
 from aaplug.gsplat.drop_in import rasterization
+from aaplug.gsplat.surfels import rasterization_2dgs
 
-__all__ = ["rasterization"]
+__all__ = ["rasterization", "rasterization_2dgs"]

@@ -35,11 +35,11 @@ class Layout:
     sources: Int[Tensor, " s"]
 
     @classmethod
-    def of(cls, parts: Sequence[ViewSplats], shape: torch.Size, gaussians: int, packed: bool) -> "Layout":
-        """The layout of the splats of all images."""
-        counts = [len(part.splats) for part in parts]
+    def of(cls, sources: Sequence[Tensor], shape: torch.Size, gaussians: int, packed: bool) -> "Layout":
+        """The layout of the splats of all images, from each image's `sources`."""
+        counts = [len(part) for part in sources]
         images = torch.repeat_interleave(torch.tensor(counts))
-        return cls(shape, gaussians, packed, counts, images, torch.cat([part.splats.sources for part in parts]))
+        return cls(shape, gaussians, packed, counts, images, torch.cat(list(sources)))
 
     @property
     def rows(self) -> Int[Tensor, " s"]:
@@ -61,6 +61,19 @@ class Layout:
             column = column.flatten(0, len(self.shape)).index_select(0, self.rows)
         return column.split(self.counts)
 
+    def facts(self, options: Options) -> dict[str, Any]:
+        """What the table says beside its columns of numbers."""
+        cameras = self.shape[-1]
+        ids = (self.images // cameras, self.images % cameras, self.sources) if self.packed else (None, None, None)
+        return {
+            **dict(zip(("batch_ids", "camera_ids", "gaussian_ids"), ids, strict=True)),
+            "width": options.width,
+            "height": options.height,
+            "tile_size": options.tile_size,
+            "n_batches": self.shape[:-1].numel(),
+            "n_cameras": cameras,
+        }
+
     def gradient_adders(self, means2d: Tensor) -> list[Callable[[Tensor], object]]:
         """Functions that add each image's absolute gradients to `means2d.absgrad`, which gsplat's users read."""
         total = torch.zeros_like(means2d)
@@ -73,23 +86,15 @@ class Layout:
 
 def table_of(parts: Sequence[ViewSplats], layout: Layout, options: Options) -> tuple[dict[str, Any], list[Splats2D]]:
     """The table, and the splats of each image read from it, so that gradients of images pass through it."""
-    splats, cameras = [part.splats for part in parts], layout.shape[-1]
-    meta: dict[str, Any] = dict.fromkeys(("batch_ids", "camera_ids", "gaussian_ids"))
-    if options.packed:
-        ids = (layout.images // cameras, layout.images % cameras, layout.sources)
-        meta = dict(zip(meta, ids, strict=True))
-    meta |= {
-        "radii": layout.column([part.radii for part in parts]),
-        "means2d": layout.column([part.means for part in splats]),
-        "depths": layout.column([part.depths for part in splats]),
-        "conics": layout.column([_conics(part) for part in splats]),
-        "opacities": layout.column([part.opacities for part in splats]),
-        "width": options.width,
-        "height": options.height,
-        "tile_size": options.tile_size,
-        "n_batches": layout.shape[:-1].numel(),
-        "n_cameras": cameras,
+    splats = [part.splats for part in parts]
+    columns = {
+        "radii": [part.radii for part in parts],
+        "means2d": [part.means for part in splats],
+        "depths": [part.depths for part in splats],
+        "conics": [_conics(part) for part in splats],
+        "opacities": [part.opacities for part in splats],
     }
+    meta = layout.facts(options) | {name: layout.column(values) for name, values in columns.items()}
     rows = zip(splats, *(layout.split(meta[name]) for name in ("means2d", "depths", "opacities")), strict=True)
     return meta, [replace(part, means=means, depths=z, opacities=opacities) for part, means, z, opacities in rows]
 

@@ -1,0 +1,44 @@
+"""The rasterizer that a call asks for."""
+
+from dataclasses import replace
+from functools import cache
+
+from torch import Tensor
+
+from aaplug.core.interfaces import Rasterizer, RunsKernels
+from aaplug.core.kernels import EAGER, Kernel, Kernels, Runner
+from aaplug.rasterizers.choice import find_rasterizer
+from aaplug.rasterizers.tiled import Tiled
+from aaplug.system.contracts import described
+from aaplug.system.errors import UsageError
+
+
+def kernels_of(rasterizer: Rasterizer) -> Kernels:
+    """What runs the stages before it."""
+    return rasterizer.kernels if isinstance(rasterizer, RunsKernels) else EAGER
+
+
+@cache
+def rasterizer_of(name: str) -> Rasterizer:
+    """A rasterizer by name; compiled kernels are loaded and checked once, not for every image."""
+    found = find_rasterizer(name, None)
+    if name != "compiled":
+        return found
+    assert isinstance(found, Tiled)
+    return replace(found, kernels=OnlyCompiled(found.kernels))
+
+
+class OnlyCompiled(Kernels):
+    """Runs kernels as the given ones do, and refuses to composite eagerly."""
+
+    def __init__(self, kernels: Kernels):
+        self.kernels, self.name, self.tiles = kernels, kernels.name, kernels.tiles
+
+    def runner(self, kernel: Kernel, args: tuple[Tensor, ...]) -> Runner:
+        """The function of a stage; a leading size of 1 is always run eagerly."""
+        run = self.kernels.runner(kernel, args)
+        whole = all(len(arg) > 1 for arg in args if arg.dim())
+        if run is kernel.function and kernel.name.startswith("composite-") and whole:
+            problem = f"no kernel '{kernel.name}' is compiled for {described(args[0])}"
+            raise UsageError("rasterizer", f'{problem}; "auto" draws it eagerly where "compiled" cannot')
+        return run
