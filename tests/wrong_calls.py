@@ -38,7 +38,7 @@ TAKES_NONE = ("view", "serving", "bench")  # and works on a scene of its own
 NOT_CALLED = {  # and why
     **dict.fromkeys(("AaplugError", "FormatError", "UsageError"), "an exception"),
     **dict.fromkeys(("Monitor", "Kernels"), "passed to plug-ins, which do not make one"),
-    **dict.fromkeys(("Render", "Pixels"), "a tuple: it holds what it is given"),
+    **dict.fromkeys(("Render", "Pixels", "Limits"), "a tuple: it holds what it is given"),
     **dict.fromkeys(("raster_rows", "whitening_columns"), "compiled into kernels, which call it alone"),
     "Scene": "made by `read_scene` and `in_memory`",
     "Colour": "a name of a type",

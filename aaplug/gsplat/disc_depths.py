@@ -11,12 +11,12 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
+from aaplug.core.colours import BLACK
 from aaplug.core.interfaces import Limits, Pixels, Rasterizer
 from aaplug.core.kernels import EAGER, Kernels
 from aaplug.core.rules import RULES_GSPLAT, Rules
 from aaplug.core.splats import Splats2D
 from aaplug.gsplat.arguments import Options
-from aaplug.gsplat.drawing import paint
 from aaplug.methods.pixel_kernels.raster_rows import BLUE, RED, next_rows, tile_centres
 from aaplug.methods.pixel_kernels.surfel import SURFEL, Surfel
 from aaplug.rasterizers.reference import alphas
@@ -37,10 +37,10 @@ def distortion(splats: Splats2D, options: Options, rasterizer: Rasterizer) -> Fl
     exact = splats.to(torch.float64)
     exact = replace(exact, rgb=exact.depths[:, None].expand(-1, 3))
     rules = options.convention.rules
-    once = paint(exact, options, rasterizer, SURFEL)
+    once = rasterizer(exact, options.hw, BLACK, SURFEL, None, rules)
     squared = replace(rules, max_alpha=BELOW_1, min_transmittance=rules.min_transmittance**2)
-    twice = paint(exact, options, rasterizer, Twice(once=rules), rules=squared)
-    return (2 * (once[..., :1] * (2 - once[..., 3:]) - twice[..., :1])).to(splats.means)
+    twice = rasterizer(exact, options.hw, BLACK, Twice(once=rules), None, squared)
+    return (2 * (once.rgb[..., :1] * (2 - once.alpha[..., None]) - twice.rgb[..., :1])).to(splats.means)
 
 
 @dataclass(frozen=True)
@@ -67,9 +67,10 @@ def median_depth(splats: Splats2D, options: Options, rasterizer: Rasterizer) -> 
     number = torch.arange(len(splats))
     digits = torch.stack([number // DIGIT, number % DIGIT, 0 * number], dim=1).to(splats.means)
     with torch.no_grad():
-        found = paint(replace(splats, rgb=digits), options, rasterizer, SURFEL, MEDIAN).double()
-        high, low, _, hit = found.unbind(dim=2)
-        number = torch.where(hit > 0, DIGIT * high + low, len(splats)).long()
+        numbered, rules = replace(splats, rgb=digits), options.convention.rules
+        found = rasterizer(numbered, options.hw, BLACK, SURFEL, MEDIAN, rules)
+        high, low, _ = found.rgb.double().unbind(dim=2)
+        number = torch.where(found.alpha > 0, DIGIT * high + low, len(splats)).long()
     depths = torch.cat([splats.depths, splats.depths.new_zeros(1)])
     return depths.index_select(0, number.flatten()).view(*number.shape, 1)
 

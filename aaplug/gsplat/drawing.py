@@ -1,11 +1,10 @@
-"""One image by gsplat's rules: which splats it keeps, their channels, drawn three at a time, and absolute gradients.
+"""One image by gsplat's rules: which splats it keeps, their channels, and absolute gradients.
 
 m: splats of the image; d: channels, of which the first are colours; h, w: px.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import torch
 from jaxtyping import Float, Int
@@ -14,10 +13,9 @@ from torch.nn import functional
 
 from aaplug.core.colours import BLACK
 from aaplug.core.ellipses import squared_cutoff
-from aaplug.core.interfaces import Compositor, PixelKernel, Rasterizer
+from aaplug.core.interfaces import PixelKernel, Rasterizer
 from aaplug.core.kernels import Kernels
 from aaplug.core.projection import project, project_covariances
-from aaplug.core.rules import Rules
 from aaplug.core.sampling import SamplingBounds
 from aaplug.core.shading import shade
 from aaplug.core.splats import Splats2D
@@ -30,6 +28,9 @@ from aaplug.system.cores import on_free_cores
 
 MIN_COMPENSATION = 1e-9  # gsplat has none; this one keeps the gradient of the root finite where the factor is 0
 MAX_RADIUS = 2.0**30  # px; fits 32 bits
+CHANNELS_PER_CALL = (3, 4)  # of a rasterizer: colour, or colour and depth
+# With gradients, torch's compiler fails on four channels; a part without a gradient, as of unused depth, costs nothing.
+CHANNELS_PER_CALL_WITH_GRADIENTS = (3,)
 MIN_ALPHA_OF_DEPTH = 1e-10  # expected depth is divided by no less
 
 _EMPTY = torch.zeros(0)
@@ -94,8 +95,9 @@ def draw(
     """
     features = features_of(splats, view, options, kernels)
     pixel = POINT if add_gradient is None else AbsolutePoint(absolute_gradients_to=add_gradient)
-    three_or_four = partial(paint, options=options, rasterizer=rasterizer, kernel=pixel)
-    image, alpha = in_parts(splats, features, three_or_four, (3, 4))
+    tracked = torch.is_grad_enabled() and (splats.means.requires_grad or features.requires_grad)
+    per_call = CHANNELS_PER_CALL_WITH_GRADIENTS if tracked else CHANNELS_PER_CALL
+    image, alpha = composited(splats, features, options, rasterizer, pixel, per_call)
     return finished(image, alpha, view, options), alpha
 
 
@@ -111,15 +113,22 @@ def features_of(splats: Splats2D, view: View, options: Options, kernels: Kernels
     return torch.cat(channels, dim=1)
 
 
-def in_parts(
-    splats: Splats2D, features: Float[Tensor, "m d"], paint: Callable[[Splats2D], Tensor], sizes: Sequence[int] = (3,)
+def composited(
+    splats: Splats2D,
+    features: Float[Tensor, "m d"],
+    options: Options,
+    rasterizer: Rasterizer,
+    pixel: PixelKernel,
+    per_call: Sequence[int],
 ) -> Image:
-    """Premultiplied channels of any number, and alpha.  paint: draws as many channels at once as `sizes` say."""
+    """Premultiplied channels, and alpha.  per_call: the numbers of channels of which one is drawn at a time."""
     width = features.shape[1]
-    size = min(sizes, key=lambda count: -(-width // count))
-    padded = functional.pad(features, (0, -width % size)).split(size, dim=1)
-    parts = [paint(replace(splats, rgb=rgb)) for rgb in padded]
-    return torch.cat([part[..., :size] for part in parts], dim=2)[..., :width], parts[0][..., size:]
+    at_once = min(per_call, key=lambda count: -(-width // count))
+    images = []
+    for rgb in functional.pad(features, (0, -width % at_once)).split(at_once, dim=1):
+        part = replace(splats, rgb=rgb)
+        images.append(rasterizer(part, options.hw, BLACK, pixel, None, options.convention.rules))
+    return torch.cat([image.rgb for image in images], dim=2)[..., :width], images[0].alpha[..., None]
 
 
 def finished(image: Float[Tensor, "h w d"], alpha: Float[Tensor, "h w 1"], view: View, options: Options) -> Tensor:
@@ -129,16 +138,3 @@ def finished(image: Float[Tensor, "h w d"], alpha: Float[Tensor, "h w 1"], view:
     if options.render_mode.endswith("ED"):
         image = torch.cat([image[..., :-1], image[..., -1:] / alpha.clamp(min=MIN_ALPHA_OF_DEPTH)], dim=2)
     return image
-
-
-def paint(
-    splats: Splats2D,
-    options: Options,
-    rasterizer: Rasterizer,
-    kernel: PixelKernel,
-    compositor: Compositor | None = None,
-    rules: Rules | None = None,
-) -> Float[Tensor, "h w d_and_1"]:
-    """Premultiplied channels, and alpha; by other than the options' rules if `rules` are given."""
-    image = rasterizer(splats, options.hw, BLACK, kernel, compositor, rules or options.convention.rules)
-    return torch.cat([image.rgb, image.alpha[..., None]], dim=2)

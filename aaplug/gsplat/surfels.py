@@ -1,7 +1,6 @@
 """gsplat's `rasterization_2dgs`; see the package's docstring."""
 
 from dataclasses import replace
-from functools import partial
 from typing import Annotated, Any
 
 import torch
@@ -18,7 +17,7 @@ from aaplug.gsplat.arguments import Options, View, refuse, views_of
 from aaplug.gsplat.choice import kernels_of, rasterizer_of
 from aaplug.gsplat.disc_depths import distortion, median_depth
 from aaplug.gsplat.discs import Discs, normals_of_depth, splats_of
-from aaplug.gsplat.drawing import features_of, finished, in_parts, paint
+from aaplug.gsplat.drawing import composited, features_of, finished
 from aaplug.gsplat.drop_in import Above0, From0
 from aaplug.gsplat.table import Layout
 from aaplug.methods.pixel_kernels.surfel import SURFEL
@@ -134,7 +133,7 @@ def _draw(
     """One image's part of what is returned, normals of depth last."""
     features = features_of(splats, view, options, kernels_of(rasterizer))
     channels = torch.cat([features, normals], dim=1)
-    image, alpha = in_parts(splats, channels, partial(paint, options=options, rasterizer=rasterizer, kernel=SURFEL))
+    image, alpha = composited(splats, channels, options, rasterizer, SURFEL, (3,))
     image, normals = image.split([features.shape[1], 3], dim=2)
     image = finished(image, alpha, view, options)
     median = median_depth(splats, options, rasterizer)

@@ -66,15 +66,12 @@ KERNELS: tuple[Kernel, ...] = (  # with those of gradients
     forward.pass_kernel(POINT, keeps=True),
     backward.step_kernel(POINT),
 )
-# What a trainer asks of `aaplug.gsplat` beside these: depth as a fourth channel, and absolute gradients.
+# What a trainer asks of `aaplug.gsplat` beside these: absolute gradients, and depth as a fourth channel of images.
 TRAINER_KERNELS: tuple[Kernel, ...] = (
     layout.lines_kernel(5),
     forward.pass_kernel(POINT, 4),
-    *(
-        kernel
-        for pixel, channels in ((POINT, 4), (ABSOLUTE_POINT, 3), (ABSOLUTE_POINT, 4))
-        for kernel in (forward.pass_kernel(pixel, channels, keeps=True), backward.step_kernel(pixel, channels))
-    ),
+    forward.pass_kernel(ABSOLUTE_POINT, keeps=True),
+    backward.step_kernel(ABSOLUTE_POINT),
 )
 SLOW_TO_COMPILE = ("composite-", "gaussian-", projection.PROJECT_BACKWARD.name)  # beginnings of names
 OPTIONS = {
