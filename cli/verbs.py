@@ -346,7 +346,7 @@ def view(words: Words) -> Answer:
     json_of("where the kernels are as one JSON object"),
 )
 def warmup(words: Words) -> Answer:
-    """Compile the fast rasterizer once for this machine (about a minute on two cores).
+    """Compile the fast rasterizer once for this machine (one to three minutes on two cores).
 
     The other verbs work without it, only slower.  To measure how fast it is, use bench.
     """

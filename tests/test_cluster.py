@@ -1,6 +1,7 @@
 """Dask clusters of real processes: the bytes of one process, whoever is killed; and what is refused."""
 
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -44,10 +45,13 @@ main(sys.argv[1:])
 
 
 class Counting(Monitor):
-    """Remembers how many workers there were."""
+    """Remembers how many workers there were, and what was said."""
 
     def __init__(self) -> None:
-        self.workers = set[int]()
+        self.workers, self.said = set[int](), list[str]()
+
+    def say(self, text: str) -> None:
+        self.said.append(text)
 
     def working(self, workers: int) -> None:
         self.workers.add(workers)
@@ -157,6 +161,8 @@ def test_items_come_in_order_until_the_first_error_and_few_are_read_ahead(local)
 
 def test_an_item_whose_worker_dies_is_done_again_unless_it_kills_all(local, tmp_path, monkeypatch):
     assert list(local.map(partial(deadly_once, tmp_path / "died"), range(4))) == [0, 1, 4, 9]
+    [said] = local.monitor.said
+    assert re.fullmatch(r"lost 1 of 1 workers \(tcp://127.0.0.1:\d+\); others do again what was begun there", said)
     monkeypatch.setattr(local.client.cluster.scheduler, "allowed_failures", 0)
     with pytest.raises(UsageError, match=r"worker tcp://\S+: died 1 times at one item: out of memory"):
         list(local.map(os._exit, [3]))
@@ -176,7 +182,7 @@ def test_a_worker_with_another_version_is_refused_by_name(local, monkeypatch):
 
 
 def test_a_cluster_without_workers_is_lost_after_a_while(local, monkeypatch):
-    monkeypatch.setattr(local.client, "scheduler_info", lambda n_workers: {"n_workers": 0, "total_threads": 0})
+    monkeypatch.setattr(local.client, "nthreads", dict)
     assert list(local.map(refuse_three, [1])) == [1]
     monkeypatch.setattr(cluster, "ABSENT_SECONDS", -1.0)
     with pytest.raises(UsageError, match="scheduler local: has had no workers for"):

@@ -1,6 +1,7 @@
 """Kernels compiled ahead of time: the same results as eager code, and a cache that survives damage."""
 
 import errno
+import heapq
 import json
 import os
 import pickle
@@ -9,7 +10,7 @@ import shutil
 import subprocess
 import sys
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -370,6 +371,43 @@ def test_warmup_builds_what_recipes_need(empty_cache, monkeypatch):
     assert asked == [[], ["analytic"], ["2dgs", "gaussian-blending"]]
     with pytest.raises(UsageError, match="recipe: 'mipp' is not one of"):
         aaplug.warmup("mipp")
+
+
+SECONDS = {  # to compile, measured; the others take 7 to 15
+    "composite-point": 63,
+    "composite-point-kept": 63,
+    "project-backward": 38,
+    "composite-point-backward": 27,
+    **{f"shade-{n}-gradients": t for n, t in ((4, 11), (9, 21), (16, 23))},
+}
+
+
+@pytest.mark.parametrize("processes", [1, 2, 4])
+def test_the_time_left_of_a_warmup_is_honest_from_the_first_kernel_on(empty_cache, monkeypatch, processes):
+    taken, told = {kernel.name: SECONDS.get(kernel.name, 10) for kernel in compiled.KERNELS}, [(0.0, 0, 100)]
+
+    def in_turn(pool: object, work: object, names: Sequence[str]) -> Iterator[str]:
+        """Each name when it is done, as a pool would yield it."""
+        ends, free = [], [0.0] * processes
+        for name in names:
+            ends.append((heapq.heappop(free) + taken[name], name))
+            heapq.heappush(free, ends[-1][0])
+        for now, name in sorted(ends):
+            told.append((now, 0, 0))
+            yield name
+
+    def tell(done: int, total: int) -> None:
+        told[-1] = (told[-1][0], done, total)
+
+    monkeypatch.setattr(compiled.Processes, "map", in_turn)
+    monkeypatch.setattr(compiled, "has_compiler", lambda: True)
+    monkeypatch.setattr(compiled, "load", lambda: CompiledKernels(lambda kernel: None))
+    monkeypatch.setattr(torch, "get_num_threads", lambda: processes)
+    compiled.build(tell)
+    (*estimated, (end, *last)) = told[1:]
+    assert last == [100, 100]
+    for now, done, total in estimated:
+        assert end / 1.5 < now * total / done < end * 1.5, now
 
 
 @pytest.mark.parametrize("compiler", [True, False])

@@ -28,7 +28,7 @@ from distributed.client import ClosedClientError
 from distributed.comm.core import CommClosedError
 
 from aaplug.system.allocator import keep_freed_memory
-from aaplug.system.errors import MAX_VALUE_CHARACTERS, ClusterError, UsageError, reason
+from aaplug.system.errors import MAX_VALUE_CHARACTERS, ClusterError, UsageError, listing, reason
 from aaplug.system.executors import ITEMS_PER_WORKER, WORK_FILE_NAME, load, results, save, track_quietly
 from aaplug.system.locks import scratch
 from aaplug.system.monitor import Monitor
@@ -56,7 +56,7 @@ class Cluster:
     """A connected cluster.
 
     name: its address, for messages.  folder: where all machines see files; None for this machine's temporary files.
-    monitor: told how many workers there are.
+    monitor: told how many workers there are, and which are lost.
     """
 
     client: Client
@@ -64,6 +64,7 @@ class Cluster:
     folder: Path | None
     monitor: Monitor
     threads: int = field(default=0, init=False)
+    _workers: frozenset[str] = field(default=frozenset(), init=False)  # addresses at the last count
     _last_look: float = field(default=-math.inf, init=False)  # time of the last count of the workers
     _last_worker: float = field(default=math.inf, init=False)  # time of the last count above 0
 
@@ -87,14 +88,21 @@ class Cluster:
             yield from results(submit, items, lambda: ITEMS_PER_WORKER * max(1, self.threads))
 
     def look(self) -> None:
-        """Count the workers now and then; raises ClusterError if the scheduler has gone, or all workers for long."""
+        """Count the workers now and then, and tell of lost ones.
+
+        Raises:
+            ClusterError: the scheduler has gone, or all workers for long.
+        """
         if self.client.status != "running":
             raise self._lost()
         if time.monotonic() - self._last_look < LOOK_SECONDS:
             return
-        facts = self.client.scheduler_info(n_workers=0)
-        self.threads = facts["total_threads"]
-        self.monitor.working(facts["n_workers"])
+        present: dict[str, int] = self.client.nthreads()  # pyright: ignore[reportAssignmentType] (by address)
+        if lost := self._workers - present.keys():
+            these = f"{len(lost)} of {len(self._workers)} workers ({listing(sorted(lost))})"
+            self.monitor.say(f"lost {these}; others do again what was begun there")
+        self._workers, self.threads = frozenset(present), sum(present.values())
+        self.monitor.working(len(present))
         self._last_look = time.monotonic()
         if self.threads:
             self._last_worker = self._last_look

@@ -20,7 +20,7 @@ class Kernels(NamedTuple):
 
 @contract
 def warmup(recipe: str | Recipe | Sequence[str | Recipe] = (), *, monitor: Monitor = SILENT) -> Kernels:
-    """Compile what is missing, in about a minute on two cores.
+    """Compile what is missing, in one to three minutes on two cores.
 
     recipe: one or several whose kernels are compiled beside those that the default recipes need.
 
@@ -29,6 +29,6 @@ def warmup(recipe: str | Recipe | Sequence[str | Recipe] = (), *, monitor: Monit
     """
     named = [recipe] if isinstance(recipe, str | Recipe) else recipe
     recipes = [RECIPES.find(each, "recipe") if isinstance(each, str) else each for each in named]
-    with monitor.progress("compiling", "kernels") as tell:
+    with monitor.progress("compiling", "%") as tell:
         build(tell, recipes)
     return Kernels(cache_folder(), [kernel.name for kernel in kernels_of(recipes)])

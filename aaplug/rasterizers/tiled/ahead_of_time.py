@@ -73,7 +73,12 @@ TRAINER_KERNELS: tuple[Kernel, ...] = (
     forward.pass_kernel(ABSOLUTE_POINT, keeps=True),
     backward.step_kernel(ABSOLUTE_POINT),
 )
-SLOW_TO_COMPILE = ("composite-", "gaussian-", projection.PROJECT_BACKWARD.name)  # beginnings of names
+SLOW = {  # to compile: how many times as long as most, which take about 10 s of a processor
+    **dict.fromkeys((forward.pass_kernel(POINT, keeps=keeps).name for keeps in (False, True)), 6),
+    projection.PROJECT_BACKWARD.name: 4,
+    backward.step_kernel(POINT).name: 3,
+    **{shading.gradients_kernel(n).name: 2 for n in shading.COMPILED_COEFFICIENTS[1:]},
+}
 OPTIONS = {
     "max_fusion_size": 1_000_000,  # a pass stays one loop, however many operations it has
     "cpp.max_horizontal_fusion_size": 1_000_000,  # and however many sums it has
@@ -191,6 +196,7 @@ def build(
 ) -> CompiledKernels:
     """Build what is missing or broken, in one process per thread of torch, and load everything.
 
+    progress: told the percentage of the time for all that has been spent.
     recipes, gradients: see `kernels_of`.  names: of the kernels to build, instead.
 
     Raises:
@@ -199,18 +205,23 @@ def build(
     kernels = kernels_of(recipes, gradients)
     if names is not None:
         kernels = [kernel for kernel in (*kernels, *TRAINER_KERNELS) if kernel.name in names]
-    missing = [kernel.name for kernel in kernels if not _is_sound(kernel)]
-    ready, total = len(kernels) - len(missing), len(kernels)
-    progress(ready, total)
-    if missing:
+    costs = {kernel.name: SLOW.get(kernel.name, 1) for kernel in kernels}
+    left = [kernel.name for kernel in kernels if not _is_sound(kernel)]
+    left.sort(key=lambda name: -costs[name])  # the longest come first, so that none is left over at the end
+
+    def tell(at_work: int) -> None:
+        rest = sum(costs[name] for name in left) - sum(costs[name] for name in left[:at_work]) / 2  # they are half done
+        progress(round(100 - 100 * rest / sum(costs.values())), 100)
+
+    tell(0)
+    if left:
         if not has_compiler():
             raise UsageError("warmup", "needs a C++ compiler (g++ or clang++) for torch to compile with")
-        processes = min(torch.get_num_threads(), MAX_PROCESSES, len(missing))
-        # The longest come first, so that none is left over at the end.
-        missing.sort(key=lambda name: not name.startswith(SLOW_TO_COMPILE))
+        processes = min(torch.get_num_threads(), MAX_PROCESSES, len(left))
         pool = Processes(processes, torch_threads=os.cpu_count() or 1, ordered=False)
-        for done, _ in enumerate(pool.map(partial(_build, tuple(recipes)), missing), start=ready + 1):
-            progress(done, total)
+        for name in pool.map(partial(_build, tuple(recipes)), tuple(left)):
+            left.remove(name)
+            tell(processes)
     loaded = load()
     if loaded is None and names is None:
         raise UsageError("warmup", f"the packages in {cache_folder()} do not load")
@@ -279,8 +290,8 @@ def _close(result: torch.Tensor, expected: torch.Tensor) -> bool:
     return bool((result - expected).abs().max() <= RESULT_TOLERANCE * (1 + expected.abs().max()))
 
 
-def _build(recipes: Sequence[Recipe], name: str) -> None:
-    """Build one kernel, by its name, so that it can run in another process."""
+def _build(recipes: Sequence[Recipe], name: str) -> str:
+    """Build one kernel, by its name, so that it can run in another process; returns the name."""
     kernel = next(kernel for kernel in (*kernels_of(recipes), *TRAINER_KERNELS) if kernel.name == name)
     path = package_path(kernel)
     names = {name.removesuffix(ONE_MORE) for name in kernel.sizes if name is not None}
@@ -301,6 +312,7 @@ def _build(recipes: Sequence[Recipe], name: str) -> None:
             path.with_suffix(".so").unlink(missing_ok=True)  # of the package that is replaced
             os.replace(package, path)
         _compared(kernel, path)
+        return name
     except UsageError:
         raise
     except OSError as error:
