@@ -1,4 +1,7 @@
-"""Every claim of the tables in formats.md names the tests that prove it; viewers.md has a row for each viewer."""
+"""Every claim of the tables in formats.md names the tests that prove it; viewers.md has a row for each viewer.
+
+Tests that guides name are there.
+"""
 
 import re
 from pathlib import Path
@@ -44,6 +47,17 @@ def test_each_row_of_scenes_proves_reading_writing_and_the_tag(row: str):
         assert any("write_scene" in body or "through(" in body for body in bodies), proofs
     if tag.strip() != "the format has none":
         assert any("convention" in body for body in bodies), proofs
+
+
+def test_each_test_that_a_guide_names_is_there():
+    named = {
+        (text.name, *proof) for text in TEXTS for proof in re.findall(r"`(test_\w+\.py)::(test_\w+)`", text.read_text())
+    }
+    assert len(named) > 60
+    sources = {file: (ROOT / "tests" / file).read_text() for _, file, _ in named}
+    assert not [
+        proof for proof in sorted(named) if not re.search(rf"^def {proof[2]}\(", sources[proof[1]], re.MULTILINE)
+    ]
 
 
 def test_every_format_has_a_row():
