@@ -38,7 +38,7 @@ from aaplug.rasterizers.tiled.ahead_of_time import load
 from aaplug.rendering.renderer import Renderer
 
 COMPILED = load()
-on_demand.PATIENCE_SECONDS = math.inf  # tests compile nothing beside their work
+on_demand.PATIENCE_SECONDS = 1e9  # tests compile nothing beside their work
 ALL_RASTERIZERS: dict[str, Rasterizer] = {**RASTERIZERS, **({} if COMPILED is None else {"compiled": Tiled(COMPILED)})}
 
 ROOT = Path(__file__).resolve().parents[1]
