@@ -206,17 +206,18 @@ def main() -> None:
         functions = set(right_calls(Path(folder)))
         for name, parameter, value, refused, do in wrong_calls(Path(folder)):
             what = f"{name}({parameter}={str(value)[:40]!r} {type(value).__name__})"
-            start = time.thread_time()
+            start, valid = time.thread_time(), False
             try:
                 do()
                 ends["let pass"] += 1
+                valid = not refused
                 if refused:
                     said["passed"].append(what)
             except AaplugError:
                 ends["refused"] += 1
             except Exception as error:
                 said["raw"].append(f"{what}: {type(error).__name__}: {str(error)[:80]}")
-            if time.thread_time() - start > 1:
+            if time.thread_time() - start > 1 and not valid:  # a valid call may draw
                 said["slow"].append(what)
     callables = {
         n
