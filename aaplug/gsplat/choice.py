@@ -5,17 +5,12 @@ from functools import cache
 
 from torch import Tensor
 
-from aaplug.core.interfaces import Rasterizer, RunsKernels
-from aaplug.core.kernels import EAGER, Kernel, Kernels, Runner
+from aaplug.core.interfaces import Rasterizer
+from aaplug.core.kernels import Kernel, Kernels, Runner
 from aaplug.rasterizers.choice import find_rasterizer
 from aaplug.rasterizers.tiled import Tiled
 from aaplug.system.contracts import described
 from aaplug.system.errors import UsageError
-
-
-def kernels_of(rasterizer: Rasterizer) -> Kernels:
-    """What runs the stages before it."""
-    return rasterizer.kernels if isinstance(rasterizer, RunsKernels) else EAGER
 
 
 @cache

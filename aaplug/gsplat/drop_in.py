@@ -11,9 +11,10 @@ from aaplug.core.conventions import CLASSIC
 from aaplug.core.interfaces import Rasterizer
 from aaplug.core.rules import RULES_GSPLAT
 from aaplug.gsplat.arguments import Options, check_shape, refuse, views_of
-from aaplug.gsplat.choice import kernels_of, rasterizer_of
+from aaplug.gsplat.choice import rasterizer_of
 from aaplug.gsplat.drawing import ViewSplats, draw
 from aaplug.gsplat.table import Layout, table_of
+from aaplug.rasterizers.choice import kernels_of
 from aaplug.system.contracts import Range, contract
 
 Above0 = Annotated[float, Range(above=0)]

@@ -14,13 +14,14 @@ from aaplug.core.interfaces import Rasterizer
 from aaplug.core.rules import RULES_GSPLAT
 from aaplug.core.splats import Splats2D
 from aaplug.gsplat.arguments import Options, View, refuse, views_of
-from aaplug.gsplat.choice import kernels_of, rasterizer_of
+from aaplug.gsplat.choice import rasterizer_of
 from aaplug.gsplat.disc_depths import distortion, median_depth
 from aaplug.gsplat.discs import Discs, normals_of_depth, splats_of
 from aaplug.gsplat.drawing import composited, features_of, finished
 from aaplug.gsplat.drop_in import Above0, From0
 from aaplug.gsplat.table import Layout
 from aaplug.methods.pixel_kernels.surfel import SURFEL
+from aaplug.rasterizers.choice import kernels_of
 from aaplug.system.contracts import Range, contract
 from aaplug.system.cores import on_free_cores
 from aaplug.system.errors import UsageError, not_one_of

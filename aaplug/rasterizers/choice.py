@@ -2,7 +2,8 @@
 
 from collections.abc import Callable
 
-from aaplug.core.interfaces import Rasterizer
+from aaplug.core.interfaces import Rasterizer, RunsKernels
+from aaplug.core.kernels import EAGER, Kernels
 from aaplug.rasterizers import RASTERIZERS
 from aaplug.rasterizers.tiled import Tiled
 from aaplug.rasterizers.tiled.ahead_of_time import KERNELS, build, has_compiler, is_built, load
@@ -11,6 +12,11 @@ from aaplug.system.errors import UsageError, not_one_of
 
 # Compiled, an 800 x 800 frame is 0.3 s faster and a step with gradients 1.5 s; compiling takes about two minutes.
 FRAMES_THAT_PAY, STEPS_THAT_PAY = 400, 100
+
+
+def kernels_of(rasterizer: Rasterizer) -> Kernels:
+    """The kernels that run the stages before a rasterizer, as it runs its own."""
+    return rasterizer.kernels if isinstance(rasterizer, RunsKernels) else EAGER
 
 
 def find_rasterizer(

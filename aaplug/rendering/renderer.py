@@ -23,8 +23,8 @@ from aaplug.core.conventions import MIN_SEEN_SHARE
 from aaplug.core.culling import cull
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.imaging import average_samples
-from aaplug.core.interfaces import Rasterizer, RunsKernels
-from aaplug.core.kernels import EAGER, Kernels
+from aaplug.core.interfaces import Rasterizer
+from aaplug.core.kernels import Kernels
 from aaplug.core.projection import project, with_depth_slopes
 from aaplug.core.pyramids import Cutter, faded
 from aaplug.core.sampling import sampling_bounds
@@ -41,7 +41,7 @@ from aaplug.methods.filters.smoothing import fuse_stored
 from aaplug.methods.recipe import RATE_TOLERANCE, Recipe
 from aaplug.methods.recipes import find_recipe, suited
 from aaplug.rasterizers import RASTERIZERS
-from aaplug.rasterizers.choice import find_rasterizer
+from aaplug.rasterizers.choice import find_rasterizer, kernels_of
 from aaplug.system.contracts import check_fields, contract
 from aaplug.system.cores import on_free_cores
 from aaplug.system.errors import UsageError, within_memory
@@ -325,7 +325,7 @@ class Renderer:
     @property
     def kernels(self) -> Kernels:
         """The kernels that run the stages before the rasterizer, as it runs its own."""
-        return self.rasterizer.kernels if isinstance(self.rasterizer, RunsKernels) else EAGER
+        return kernels_of(self.rasterizer)
 
 
 def _filtered(scene: Gaussians, training: TrainingViews, recipe: Recipe) -> Gaussians:

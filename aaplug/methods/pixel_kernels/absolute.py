@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.kernels import Kernels
-from aaplug.methods.pixel_kernels.point import LN_2, Point
+from aaplug.methods.pixel_kernels.point import ALPHA_SUMS, LN_2, Point
 from aaplug.methods.pixel_kernels.raster_rows import UX, UY, VX, VY
 
 
@@ -23,7 +23,7 @@ class AbsolutePoint(Point):
     """
 
     name: str = "point-absolute"
-    gradient_sums: int = 8
+    gradient_sums: int = ALPHA_SUMS + 2
     absolute_gradients_to: Callable[[Tensor], object] | None = field(default=None, compare=False, repr=False)
 
     def further_terms(

@@ -31,7 +31,8 @@ LN_2 = math.log(2)
 LOG2_PADDING = -9.0  # log2 alpha of the padding row, below every cut-off
 SQUARINGS = 3  # 2^x is computed as p(x)^(2^SQUARINGS), p of degree DEGREE: relative error 3e-6 in float32
 DEGREE = 5
-COMMON_SUMS = 9  # six of alpha and those of three channels; those of further channels follow
+ALPHA_SUMS = 6  # of the gradient of log alpha
+COMMON_SUMS = ALPHA_SUMS + 3  # with those of three channels; those of further channels follow
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ class Point:
     columns: int = COLUMNS
     needs_depth_slopes: bool = False
     splats_per_pass: int = 16
-    gradient_sums: int = 6
+    gradient_sums: int = ALPHA_SUMS
 
     def bounding_ellipses(self, splats: Splats2D, rules: Rules) -> Splats2D | None:
         """The splats themselves."""
@@ -87,9 +88,11 @@ class Point:
         """
         if not torch.compiler.is_compiling():
             sums = _sums_by_products(moves, colours, pixels)
-            more = [self.further_terms(row, gradient, forms_at(row, pixels)) for row, _, gradient in moves]
-            further = [torch.stack([x.sum(dim=1) for x in terms], dim=1) for terms in more if terms]
-            return torch.cat([sums, torch.stack(further, dim=1)] if further else [sums], dim=2).flatten(1)
+            if self.gradient_sums > ALPHA_SUMS:
+                terms = [self.further_terms(row, gradient, forms_at(row, pixels)) for row, _, gradient in moves]
+                further = [torch.stack([x.sum(dim=1) for x in of_splat], dim=1) for of_splat in terms]
+                sums = torch.cat([sums, torch.stack(further, dim=1)], dim=2)
+            return sums.flatten(1)
         sums = []
         for row, weight, gradient in moves:
             # Both are 0 where T is 0, but the test on T makes the compiler fuse all sums into one loop.
