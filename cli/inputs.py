@@ -58,6 +58,8 @@ class CameraOptions(Options):
     """Folder of photographs inside the data set (default: the format's own)."""
     test_every: Annotated[int | None, number(0, 1_000_000, whole=True, metavar="N"), CAMERAS] = None
     """Hold out every N-th view by name; 0 for no split (default: as usual for the format)."""
+    undistort: Annotated[bool, CAMERAS] = False
+    """Straighten photographs whose lens distorts, and draw pinhole views instead of bent ones."""
 
 
 SCENE_AND_CAMERAS: Sequence[type[Options]] = (SceneOptions, CameraOptions, Orbit)
@@ -104,9 +106,8 @@ def read_cameras(words: Words, scene: "Scene") -> "aaplug.CameraSet | Orbit":
     for name, usual in vars(Orbit()).items():
         if name != "monitor" and getattr(orbit, name) != usual:
             raise UsageError(name, f"is for scenes without cameras, and there are some: {path}")
-    cameras = aaplug.read_cameras(
-        path, train_scale=options.train_scale, images=options.images, test_every=options.test_every
-    )
+    how = {name: value for name, value in vars(options).items() if name not in ("cameras", "monitor")}
+    cameras = aaplug.read_cameras(path, **how)
     for note in cameras.notes:
         say(worded(f"cameras: {note}", options_of(CameraOptions)))
     return cameras

@@ -14,6 +14,7 @@ from PIL import Image
 import aaplug
 from aaplug.core.cameras import CameraSet
 from aaplug.core.colours import BLACK, WHITE
+from aaplug.core.lenses import PINHOLE, opencv_lens
 from aaplug.io.cameras import OWN, read_cameras, select_views
 from aaplug.io.cameras.camera_path import read_camera_path
 from aaplug.io.cameras.cfg_args import read_cfg_args
@@ -307,22 +308,27 @@ def test_a_colmap_lens_that_distorts_is_the_pinhole_at_its_centre(tmp_path, writ
         folder = tmp_path / f"m{model}"
         photo(folder / "images" / "a.png", 200, 100)
         bent = one_camera(model, (300.0, 310.0, 200.0, 100.0, *coefficients))
-        cameras = read_cameras(write(folder / "sparse", *bent).parent)
+        path = write(folder / "sparse", *bent).parent
+        cameras = read_cameras(path, undistort=True)
         (camera,) = cameras.train
         assert values(camera) == (150, 155, 100, 50), "at its photo's size"
         assert camera.photo is not None
-        assert camera.lens is not None
-        assert (camera.lens.coefficients, camera.lens.window) == (coefficients, (0, 0, 200, 100))
+        assert camera.lens == PINHOLE
+        assert camera.undistortion is not None
+        lens = opencv_lens(coefficients, fisheye=model == 5)
+        assert (camera.undistortion.lens, camera.undistortion.window) == (lens, (0, 0, 200, 100))
+        (bent_camera,) = read_cameras(path).train
+        assert (bent_camera.lens, bent_camera.undistortion, bent_camera.photo) == (lens, None, camera.photo)
         assert f"1 cameras have a lens that distorts ({MODEL_NAMES[model]})" in cameras.notes[-1]
 
 
-def test_photos_through_a_lens_that_opencv_has_not_are_not_used(tmp_path):
+def test_photos_through_a_lens_that_is_not_known_are_not_used(tmp_path):
     photo(tmp_path / "images" / "a.png", 200, 100)
     bent = one_camera(7, (300.0, 310.0, 200.0, 100.0, 0.9))
     cameras = read_cameras(colmap_bin(tmp_path / "sparse", *bent).parent)
     assert cameras.train[0].photo is None
     assert "distorts (FOV)" in cameras.notes[-1]
-    assert "are not used" in cameras.notes[-1]
+    assert "without photos" in cameras.notes[-1]
 
 
 def test_a_colmap_camera_that_sees_all_around_is_refused(tmp_path):
@@ -486,17 +492,22 @@ def test_a_lens_that_distorts_is_the_pinhole_at_its_centre(tmp_path, lens, name,
     photo(tmp_path / "a.png", 40, 20)
     frames = [{"file_path": "a.png"} | lens, {"file_path": "b.png"}]
     document = transforms(frames, w=40, h=20, fl_x=30, cx=19, cy=9)
-    cameras = read_cameras(write_json(tmp_path / "transforms.json", document))
+    file = write_json(tmp_path / "transforms.json", document)
+    cameras = read_cameras(file, undistort=True)
     first, straight = cameras.train
     assert f"1 cameras have a lens that distorts ({name})" in cameras.notes[-1]
-    assert straight.lens is None
+    assert (straight.lens, straight.undistortion) == (PINHOLE, None)
+    bent = read_cameras(file).train[0]
     if coefficients is None:
-        assert (first.fx, first.cx, first.photo, first.lens) == (30, 19, None, None)
+        assert (first.fx, first.cx, first.photo, first.undistortion) == (30, 19, None, None)
+        assert (bent.photo, bent.lens) == (None, PINHOLE)
     else:
-        assert first.lens is not None
-        left = first.lens.window[0]
+        assert first.undistortion is not None
+        left = first.undistortion.window[0]
         assert (first.fx, first.cx + left, first.photo) == (30, 19, tmp_path / "a.png")
-        assert first.lens.coefficients == coefficients
+        lens = opencv_lens(tuple(map(float, coefficients)), "fisheye" in name.lower())
+        assert first.undistortion.lens == bent.lens == lens
+        assert (bent.fx, bent.cx, bent.photo) == (30, 19, tmp_path / "a.png")
 
 
 EXPORTED = {"file_path": "/elsewhere/a.png", "fl_x": 30.0, "fl_y": 31.0, "w": 40, "h": 20}

@@ -293,7 +293,7 @@ def paths(kernels: Sequence[Kernel] = compiled.KERNELS) -> dict[str, str]:
     return {kernel.name: compiled.package_path(kernel).name for kernel in kernels}
 
 
-PASSES = {"composite-point", "composite-point-kept", "composite-point-backward"}
+PASSES = {"composite-point", "composite-point-kept", "composite-point-backward", "composite-ray"}
 
 
 def other_polynomial(x: torch.Tensor, coefficients: tuple[float, ...]) -> torch.Tensor:

@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from aaplug.core.cameras import Camera, Lens
+from aaplug.core.cameras import Camera, Undistortion
 from aaplug.core.imaging import box_average, quantised
+from aaplug.core.lenses import EQUIDISTANT
 from aaplug.core.training import TrainingViews
 from aaplug.evaluation import METRICS, PROTOCOLS
 from aaplug.evaluation.engine import NO_PHOTOGRAPH, Candidate, Task, candidates_of, compare, evaluate
@@ -306,8 +307,9 @@ def test_the_cache_tells_views_apart_by_all_that_their_images_depend_on(look, vi
     view, truth = views[0], Truth(look, memory=1e9)
     pose = view.cam_from_world.clone()
     pose[0, 3] += 1
-    lens = Lens((0.1,), False, view.hw, (1.0,) * 4, (0, 0, *view.hw))
-    others = {"photo": views[1].photo, "lens": lens, "cam_from_world": pose, "trained_focal": 7.0, "name": "other"}
+    bent = Undistortion(EQUIDISTANT, view.hw, (1.0,) * 4, (0, 0, *view.hw))
+    others = {"photo": views[1].photo, "lens": EQUIDISTANT, "undistortion": bent, "cam_from_world": pose}
+    others |= {"trained_focal": 7.0, "name": "other"}
     for field in fields(Camera):
         value = getattr(view, field.name)
         other = replace(view, **{field.name: others[field.name] if field.name in others else type(value)(value + 1)})

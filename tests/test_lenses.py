@@ -1,5 +1,6 @@
-"""Photographs undistorted, against images of a known plane through lens models written out here."""
+"""Lenses: their maps, splats through them, and photographs undistorted, against models written out here."""
 
+import math
 from dataclasses import replace
 
 import cv2
@@ -8,29 +9,43 @@ import pytest
 import torch
 
 from aaplug.core.cameras import Camera
-from aaplug.io.lenses import Distortion, undistorted, undistorted_cameras
+from aaplug.core.gaussians import Gaussians
+from aaplug.core.lenses import EQUIDISTANT, EQUIRECT, EQUISOLID, ORTHO, Lens, opencv_lens
+from aaplug.core.projection import project, rotation_matrices
+from aaplug.core.rules import RULES_3DGS
+from aaplug.core.training import TrainingViews
+from aaplug.io.lenses import Distortion, cameras_of_photographs, undistorted
 from aaplug.io.photographs import read_photo
+from aaplug.methods.pixel_kernels.ray import RAY
+from aaplug.rendering.renderer import Renderer
+from aaplug.system.errors import UsageError
+from tests.conftest import ALL_RASTERIZERS, each, make_camera, make_scene
 
 SIZE = 160, 120
 PINHOLE = 130.0, 125.0, 83.0, 57.0  # fx, fy, cx, cy
-LENSES = {
-    "barrel": Distortion("OPENCV", (-0.2, 0.05, 0.0, 0.0)),
-    "pincushion": Distortion("OPENCV", (0.15, 0.0, 0.002, -0.004)),
-    "full": Distortion("FULL_OPENCV", (-0.2, 0.03, 0.001, 0.002, 0.01, 0.02, 0.01, 0.0)),
-    "fisheye": Distortion("OPENCV_FISHEYE", (0.03, -0.01, 0.002, 0.0), fisheye=True),
+MODELS = {  # COLMAP's name and OpenCV's coefficients
+    "barrel": ("OPENCV", (-0.2, 0.05, 0.0, 0.0)),
+    "pincushion": ("OPENCV", (0.15, 0.0, 0.002, -0.004)),
+    "full": ("FULL_OPENCV", (-0.2, 0.03, 0.001, 0.002, 0.01, 0.02, 0.01, 0.0)),
+    "fisheye": ("OPENCV_FISHEYE", (0.03, -0.01, 0.002, 0.0)),
 }
 
 
-def bend(xy: np.ndarray, lens: Distortion) -> np.ndarray:
+def distortion(model: tuple[str, tuple[float, ...]]) -> Distortion:
+    name, coefficients = model
+    return Distortion(name, opencv_lens(coefficients, name.endswith("FISHEYE")))
+
+
+def bend(xy: np.ndarray, model: tuple[str, tuple[float, ...]]) -> np.ndarray:
     """Where a ray (x, y, 1) meets the sensor at focal length 1 (docs.opencv.org, calib3d)."""
-    assert lens.coefficients is not None
+    name, coefficients = model
     x, y = xy.T
     r2 = x * x + y * y
-    if lens.fisheye:
+    if name.endswith("FISHEYE"):
         r, angle = np.sqrt(r2), np.arctan(np.sqrt(r2))
-        bent = angle * (1 + sum(k * angle ** (2 * i + 2) for i, k in enumerate(lens.coefficients)))
+        bent = angle * (1 + sum(k * angle ** (2 * i + 2) for i, k in enumerate(coefficients)))
         return xy * np.where(r > 1e-12, bent / np.maximum(r, 1e-12), 1.0)[:, None]
-    k1, k2, p1, p2, k3, k4, k5, k6 = (*lens.coefficients, 0, 0, 0, 0)[:8]
+    k1, k2, p1, p2, k3, k4, k5, k6 = (*coefficients, 0, 0, 0, 0)[:8]
     radial = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + k4 * r2 + k5 * r2**2 + k6 * r2**3)
     return np.stack(
         [x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y],
@@ -50,7 +65,7 @@ def centres(width: int, height: int) -> np.ndarray:
     return np.stack([columns.ravel(), rows.ravel()], axis=1)
 
 
-def taken_through(lens: Distortion, times: int = 1) -> np.ndarray:
+def taken_through(lens: tuple[str, tuple[float, ...]], times: int = 1) -> np.ndarray:
     """The plane's photograph, `times` as fine as the camera: each pixel's ray by fixed-point iteration."""
     width, height = (times * side for side in SIZE)
     fx, fy, cx, cy = (times * value for value in PINHOLE)
@@ -62,13 +77,13 @@ def taken_through(lens: Distortion, times: int = 1) -> np.ndarray:
     return plane(rays).reshape(height, width, 3)
 
 
-def camera_of(tmp_path, lens: Distortion, times: int = 1) -> Camera:
+def camera_of(tmp_path, lens: tuple[str, tuple[float, ...]], times: int = 1) -> Camera:
     pixels = (taken_through(lens, times) * 65535).round().astype(np.uint16)
     cv2.imwrite(str(tmp_path / "a.png"), pixels[..., ::-1])
     fx, fy, cx, cy = PINHOLE
     pose = torch.eye(4, dtype=torch.float64)
     camera = Camera("a", *SIZE, fx, fy, cx, cy, pose, photo=tmp_path / "a.png")
-    return undistorted_cameras([camera], [lens])[0]
+    return cameras_of_photographs([camera], [distortion(lens)], undistort=True)[0]
 
 
 def seen_by(camera: Camera, times: int = 1) -> np.ndarray:
@@ -81,44 +96,255 @@ def seen_by(camera: Camera, times: int = 1) -> np.ndarray:
 
 @pytest.mark.parametrize(("name", "times"), [("barrel", 1), ("pincushion", 2), ("full", 1), ("fisheye", 1)])
 def test_a_straightened_photograph_is_what_the_pinhole_sees(tmp_path, name, times):
-    camera = camera_of(tmp_path, LENSES[name], times)
+    camera = camera_of(tmp_path, MODELS[name], times)
     view = seen_by(camera, times)
-    photo, as_taken = (read_photo(camera.photo, (0.0, 0.0, 0.0), lens) for lens in (camera.lens, None))
+    photo, as_taken = (read_photo(camera.photo, (0.0, 0.0, 0.0), how) for how in (camera.undistortion, None))
     assert photo.shape == view.shape
     error = np.abs(photo.double().numpy() - view)
     assert error.max() < 0.012  # at the edges, where half a pixel is repeated
     assert error.mean() < 0.0015  # bilinear interpolation of these waves, and 8 bits
-    left, top, width, height = (times * side for side in camera.lens.window)
+    left, top, width, height = (times * side for side in camera.undistortion.window)
     assert np.abs(as_taken.numpy()[top : top + height, left : left + width] - view).max() > 0.1
 
 
 def test_a_barrel_shows_all_of_its_pinhole_and_a_pincushion_most(tmp_path):
-    assert camera_of(tmp_path, LENSES["barrel"]).lens.window == (0, 0, *SIZE)
-    camera = camera_of(tmp_path, LENSES["pincushion"])
-    left, top, width, height = camera.lens.window
+    assert camera_of(tmp_path, MODELS["barrel"]).undistortion.window == (0, 0, *SIZE)
+    camera = camera_of(tmp_path, MODELS["pincushion"])
+    left, top, width, height = camera.undistortion.window
     assert (camera.width, camera.height) == (width, height)
     assert (camera.fx, camera.fy, camera.cx + left, camera.cy + top) == PINHOLE
     corners = np.array([[0, 0], [width, 0], [0, height], [width, height]], float)
-    bent = bend((corners - (camera.cx, camera.cy)) / PINHOLE[:2], LENSES["pincushion"])
+    bent = bend((corners - (camera.cx, camera.cy)) / PINHOLE[:2], MODELS["pincushion"])
     sides = bent * PINHOLE[:2] + PINHOLE[2:]
     assert ((sides > -1) & (sides < np.array(SIZE) + 1)).all()
     assert width * height > 0.7 * SIZE[0] * SIZE[1]
 
 
 def test_a_lens_that_shows_little_of_its_pinhole_has_no_photograph(tmp_path):
-    camera = replace(camera_of(tmp_path, LENSES["barrel"]), lens=None)
-    strong = Distortion("OPENCV", (30.0, 0.0, 0.0, 0.0))
-    (bare,) = undistorted_cameras([camera], [strong])
-    assert (bare.photo, bare.lens, bare.width) == (None, None, SIZE[0])
+    camera = replace(camera_of(tmp_path, MODELS["barrel"]), undistortion=None)
+    strong = distortion(("OPENCV", (30.0, 0.0, 0.0, 0.0)))
+    (bare,) = cameras_of_photographs([camera], [strong], undistort=True)
+    assert (bare.photo, bare.undistortion, bare.width) == (None, None, SIZE[0])
     image = torch.rand(4, 5, 3)
     assert undistorted(image, None) is image
 
 
-@pytest.mark.parametrize("name", LENSES)
+@pytest.mark.parametrize("name", MODELS)
 def test_the_lenses_are_colmaps(name):
     pycolmap = pytest.importorskip("pycolmap")
-    lens = LENSES[name]
-    theirs = pycolmap.Camera(model=lens.name, width=SIZE[0], height=SIZE[1], params=[*PINHOLE, *lens.coefficients])
+    lens = MODELS[name]
+    theirs = pycolmap.Camera(model=lens[0], width=SIZE[0], height=SIZE[1], params=[*PINHOLE, *lens[1]])
     rays = np.random.default_rng(0).uniform(-0.4, 0.4, (50, 2))
     points = theirs.img_from_cam(np.concatenate([rays, np.ones((50, 1))], axis=1))
     np.testing.assert_allclose(points, bend(rays, lens) * PINHOLE[:2] + PINHOLE[2:], atol=1e-9)
+
+
+THIN_PRISM = Lens("equidistant", (-0.05, 0.01), tangential=(0.01, -0.01), prism=(0.01, 0.0, 0.02, 0.0))
+ALL_LENSES = {
+    "equidistant": EQUIDISTANT,
+    "equisolid": EQUISOLID,
+    "equirect": EQUIRECT,
+    "ortho": ORTHO,
+    "thin-prism": THIN_PRISM,
+} | {name: distortion(model).lens for name, model in MODELS.items()}
+lens = each(ALL_LENSES)
+
+
+def view_through(lens: Lens, eye: tuple[float, float, float] = (0.5, -0.3, 0.2), side: int = 64) -> Camera:
+    """A view from inside the scene; a panorama shows all around."""
+    width, height = (2 * side, side) if lens == EQUIRECT else (side, side)
+    focal = width / (2 * math.pi) if lens == EQUIRECT else 0.3 * side
+    pose = make_camera(eye).cam_from_world
+    return Camera("view", width, height, focal, focal, width / 2, height / 2, pose, lens=lens)
+
+
+def some_rays(lens: Lens, n: int = 2000) -> torch.Tensor:
+    rays = torch.randn(n, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    if lens.flat:
+        rays[:, 2] = rays[:, 2].abs() + 1.5
+    return rays / rays[:, 2:] if lens == ORTHO else torch.nn.functional.normalize(rays, dim=1)
+
+
+def test_rays_of_places_are_the_rays_that_meet_them(lens):
+    rays = some_rays(lens)
+    back = lens.rays(lens.places(rays))
+    seen = back.abs().sum(dim=1) > 0
+    assert seen.double().mean() > 0.8
+    torch.testing.assert_close(
+        torch.nn.functional.normalize(back, dim=1)[seen], torch.nn.functional.normalize(rays, dim=1)[seen]
+    )
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_places_are_opencvs(name):
+    model, fisheye = MODELS[name], name == "fisheye"
+    rays = some_rays(distortion(model).lens) if not fisheye else some_rays(opencv_lens((0.1,)))
+    project = cv2.fisheye.projectPoints if fisheye else cv2.projectPoints
+    zero, coefficients = np.zeros((1, 1, 3)), np.array(model[1])
+    points = (rays / rays[:, 2:]).numpy().reshape(-1, 1, 3)
+    expected = project(points, zero[0], zero[0], np.eye(3), coefficients)[0].reshape(-1, 2)
+    np.testing.assert_allclose(distortion(model).lens.places(rays).numpy(), expected, atol=1e-9)
+
+
+def test_a_lens_ends_where_its_radial_map_turns_back():
+    lens = opencv_lens((-0.3, 0.0))  # ρ (1 - 0.3 ρ²) grows up to ρ = 1.05
+    rays = lens.rays(torch.tensor([[0.69, 0.0], [0.72, 0.0]], dtype=torch.float64))
+    assert rays[0, 0] > 0.9
+    assert rays[1].abs().sum() == 0
+    far = lens.places(torch.tensor([[1.0, 0.0, 1.0], [3.0, 0.0, 1.0]], dtype=torch.float64))
+    assert far[1, 0] > far[0, 0]
+
+
+def test_a_hollow_lens_is_refused():
+    with pytest.raises(UsageError, match="leaves no image"):
+        opencv_lens((-1e9,)).places(torch.ones(1, 3))
+    with pytest.raises(UsageError, match="equirect projection has no distortion"):
+        Lens("equirect", radial=(0.1,))
+
+
+def test_splats_in_their_planes_are_the_derivative_of_the_lens(lens):
+    """A step of each Gaussian's axis moves its place as its plane says, by the lens's own derivative."""
+    scene = make_scene(60, dtype=torch.float64)
+    camera = view_through(lens)
+    splats = project(scene, camera)
+    assert splats.planes is not None
+    assert splats.rates is not None
+    local = (scene.means[splats.sources] - camera.centre) @ camera.cam_from_world[:3, :3].T
+    ahead = local[:, 2] if lens.flat else local.norm(dim=1)
+    torch.testing.assert_close(splats.depths, ahead)
+    rays = torch.cat([local[:, :2], torch.ones_like(local[:, 2:])], dim=1) if lens == ORTHO else local
+    right, down, along = torch.einsum("nij,nj->in", splats.planes, rays)
+    assert torch.stack([right, down]).div(along).abs().max() < 1e-9  # its own ray meets its centre
+    axes = rotation_matrices(scene.unit_quats[splats.sources]) * scene.scales[splats.sources][:, None]
+    steps = []
+    for axis in range(3):
+        step = 1e-6 * axes[:, :, axis] @ camera.cam_from_world[:3, :3].T
+        moved = rays + (torch.cat([step[:, :2], 0 * step[:, 2:]], dim=1) if lens == ORTHO else step)
+        right, down, along = torch.einsum("nij,nj->in", splats.planes, moved)
+        steps.append(torch.stack([right / along, down / along], dim=1) / 1e-6)
+    factor = torch.stack(steps, dim=2)
+    covs = (factor @ factor.mT).flatten(1)[:, [0, 1, 3]]
+    inside = (local[:, :2].abs() < local[:, 2:]).all(dim=1) if lens.flat else torch.ones_like(ahead, dtype=torch.bool)
+    torch.testing.assert_close(splats.covs[inside], covs[inside], rtol=1e-4, atol=1e-6)
+
+
+def test_a_pixel_of_a_plane_has_the_area_of_the_images_own(lens):
+    """Rates are px of the image per world unit: the square root of the area that a small square at the point covers."""
+    if lens.distorts and lens.flat:
+        pytest.skip("a flat lens samples as its pinhole does, as training did")
+    scene, camera = make_scene(60, dtype=torch.float64), view_through(lens)
+    splats = project(scene, camera)
+    assert splats.rates is not None
+    means, pose = scene.means[splats.sources], camera.cam_from_world
+    local = (means - camera.centre) @ pose[:3, :3].T
+    sight = (
+        torch.nn.functional.normalize(local, dim=1)
+        if lens != ORTHO
+        else torch.tensor([0.0, 0.0, 1.0]).to(local).expand_as(local)
+    )
+    a = torch.nn.functional.normalize(
+        torch.linalg.cross(sight, torch.tensor([0.3, 0.5, 0.1]).to(local).expand_as(local)), dim=1
+    )
+    b = torch.linalg.cross(sight, a)
+    places = [camera.pixels(lens.places(local + 1e-6 * step)) - camera.pixels(lens.places(local)) for step in (a, b)]
+    area = (places[0][:, 0] * places[1][:, 1] - places[0][:, 1] * places[1][:, 0]).abs()
+    torch.testing.assert_close(splats.rates, area.sqrt() / 1e-6, rtol=1e-3, atol=0.0)
+
+
+@pytest.mark.parametrize("rasterizer", ["eager", *({"compiled"} & ALL_RASTERIZERS.keys())])
+def test_tiles_draw_through_a_lens_what_the_reference_does(lens, rasterizer):
+    scene = make_scene(300)
+    training = TrainingViews.of(scene, [make_camera((0.0, -4.0, 0.0))])
+    camera = view_through(lens)
+    tiles, exact = (
+        Renderer.of(scene, training, "matched", rasterizer=ALL_RASTERIZERS[name])(camera)
+        for name in (rasterizer, "reference")
+    )
+    assert exact.alpha.mean() > 0.2
+    error = (tiles.rgb.double() - exact.rgb).abs()
+    assert error.max() < RULES_3DGS.min_alpha  # rounding can carry an alpha across the cut-off
+    assert error.mean() < 1e-6
+
+
+def big_and_small(n: int = 400) -> Gaussians:
+    scene = make_scene(n, dtype=torch.float64)
+    sizes = torch.linspace(-5.0, 1.0, n, dtype=torch.float64)[:, None]
+    return replace(scene, log_scales=scene.log_scales - scene.log_scales.mean(dim=1, keepdim=True) + sizes)
+
+
+def test_bounding_ellipses_contain_every_pixel_of_a_splat_through_a_lens(lens):
+    camera = view_through(lens, side=128)
+    splats = project(big_and_small(), camera).blurred(0.3, compensate=False)
+    ellipses = RAY.bounding_ellipses(splats, RULES_3DGS)
+    assert ellipses is not None
+    y, x = torch.meshgrid(*(torch.arange(side, dtype=torch.float64) + 0.5 for side in camera.hw), indexing="ij")
+    pixels = torch.stack([x, y], dim=-1).reshape(-1, 2)
+    for part in torch.arange(len(splats)).split(50):
+        own, around = splats[part], ellipses[part]
+        alpha = own.opacities * RAY.exact(own, pixels[:, None] - own.means)
+        drawn = alpha >= RULES_3DGS.min_alpha
+        turn = camera.fx * lens.period
+        offsets = pixels[:, None] - around.means
+        xx, xy, yy = around.covs.unbind(dim=1)
+        shifts = (0.0,) if not turn else (-turn, 0.0, turn)
+        nearest = torch.stack(
+            [
+                (
+                    yy * (offsets[..., 0] + s) ** 2
+                    - 2 * xy * (offsets[..., 0] + s) * offsets[..., 1]
+                    + xx * offsets[..., 1] ** 2
+                )
+                / around.dets
+                for s in shifts
+            ]
+        ).amin(dim=0)
+        reach = 2 * (own.opacities / RULES_3DGS.min_alpha).log()
+        assert (nearest <= reach)[drawn].all()
+
+
+def test_a_panorama_has_neither_seam_nor_pole():
+    """Turned by a quarter it shows the same, moved by a quarter; turned over, its poles are what the horizon was."""
+    scene = make_scene(300)
+    training = TrainingViews.of(scene, [make_camera((0.0, -4.0, 0.0))])
+    renderer = Renderer.of(scene, training, "classic", rasterizer="eager")
+    camera = view_through(EQUIRECT, side=96)
+    image = renderer(camera).rgb
+    quarter = torch.tensor([[0.0, 0, -1, 0], [0, 1, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1]], dtype=torch.float64)
+    turned = renderer(replace(camera, cam_from_world=quarter @ camera.cam_from_world)).rgb
+    torch.testing.assert_close(turned, image.roll(-camera.width // 4, dims=1), rtol=0, atol=1e-4)
+    over = torch.tensor([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], dtype=torch.float64)
+    rolled = renderer(replace(camera, cam_from_world=over @ camera.cam_from_world)).rgb
+    rays = EQUIRECT.rays(
+        (torch.cartesian_prod(torch.arange(96.0), torch.arange(192.0)).flip(1) + 0.5 - torch.tensor([96.0, 48.0]))
+        / camera.fx
+    )
+    there = camera.pixels(EQUIRECT.places(rays @ over[:3, :3].float())).view(96, 192, 2)
+    x, y = (there - 0.5).unbind(dim=-1)
+    expected = cv2.remap(image.numpy(), (x % 192).numpy(), y.numpy(), cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+    error = (torch.from_numpy(expected) - rolled)[8:-8].square().mean().sqrt()
+    assert error < 0.02  # interpolation
+
+
+def test_gradients_through_a_lens_are_finite_differences():
+    scene = make_scene(12, dtype=torch.float64)
+    camera = view_through(EQUIDISTANT, side=16)
+    training = TrainingViews.of(scene, [make_camera((0.0, -4.0, 0.0))])
+    weights = torch.rand(16, 16, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+
+    def loss(means: torch.Tensor) -> torch.Tensor:
+        moved = replace(scene, means=means)
+        return (Renderer.of(moved, training, "classic", rasterizer="eager")(camera).rgb * weights).sum()
+
+    means = scene.means.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(loss(means), means)
+    direction = torch.randn(means.shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    with torch.no_grad():
+        change = (loss(scene.means + 1e-6 * direction) - loss(scene.means - 1e-6 * direction)) / 2e-6
+    torch.testing.assert_close((gradient * direction).sum(), change, rtol=1e-4, atol=1e-6)
+
+
+def test_a_recipe_of_discs_says_that_it_has_no_lens():
+    scene = make_scene(10)
+    renderer = Renderer.of(scene, [make_camera((0.0, -4.0, 0.0))], "2dgs")
+    with pytest.raises(UsageError, match="recipe 2dgs draws pinhole views only"):
+        renderer(view_through(EQUIDISTANT))

@@ -1,4 +1,4 @@
-"""Pinhole cameras: the conventions for axes, pixel centres, and the order of height and width.
+"""Cameras: the conventions for axes, pixel centres, and the order of height and width.
 
 Camera frame: x right, y down, z forward (OpenCV).  Pixel (0, 0) covers [0, 1) × [0, 1); its centre is (0.5, 0.5).
 `cam_from_world` is float64: scenes far from the origin keep their digits until the camera's centre is subtracted.
@@ -19,6 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.colours import Colour
+from aaplug.core.lenses import PINHOLE, Lens
 from aaplug.system.contracts import Range, check_fields, contract
 from aaplug.system.errors import UsageError
 
@@ -36,16 +37,15 @@ Factor = Annotated[float, Range(above=0, most=MAX_FOCAL)]
 
 
 @dataclass(frozen=True)
-class Lens:
-    """Distortion of a photograph against its camera's pinhole, by OpenCV's models.
+class Undistortion:
+    """How a photograph becomes its camera's view: the lens that took it, against the pinhole that is drawn.
 
-    coefficients: k1, k2, p1, p2 and more in OpenCV's order; for a fisheye lens k1 to k4.
+    lens: that took it.
     size: width and height of the whole photograph, in px.  pinhole: its fx, fy, cx, cy, in the same px.
     window: left, top, width and height of the camera's view in it, in px.
     """
 
-    coefficients: tuple[float, ...]
-    fisheye: bool
+    lens: Lens
     size: tuple[int, int]
     pinhole: tuple[float, float, float, float]
     window: tuple[int, int, int, int]
@@ -53,12 +53,15 @@ class Lens:
 
 @dataclass(frozen=True)
 class Camera:
-    """One pinhole view.
+    """One view through a lens.
 
-    fx, fy, cx, cy: in px of this size.
+    fx, fy: focal lengths, in px of this size: px per unit of the lens's places (a radian, or of ortho a world unit).
+    cx, cy: the principal point, in px.
     trained_focal: px.  For a pose of the data set, the focal length at which training rendered it (or would have, for
         a held-out view); scaling the view keeps it.  None for a free camera.
-    photo: the photograph taken from here, if any.  lens: its distortion, if any.  Neither counts for equality.
+    photo: the photograph taken from here, if any.  undistortion: how it becomes this view, if it is not of this lens.
+        Neither counts for equality.
+    lens: maps rays to places in the image.
 
     Raises:
         UsageError: a number is out of range, or the pose is no rigid motion.
@@ -74,7 +77,8 @@ class Camera:
     cam_from_world: Float[Tensor, "4 4"]
     trained_focal: Focal | None = None
     photo: Path | None = None
-    lens: Lens | None = None
+    undistortion: Undistortion | None = None
+    lens: Lens = PINHOLE
 
     def __post_init__(self) -> None:
         try:
@@ -99,7 +103,7 @@ class Camera:
 
     @property
     def _scalars(self) -> tuple[object, ...]:
-        return self.name, *self.intrinsics, self.trained_focal
+        return self.name, *self.intrinsics, self.trained_focal, self.lens
 
     @property
     def intrinsics(self) -> tuple[float, float, float, float, int, int]:
@@ -123,11 +127,19 @@ class Camera:
 
     @contract
     def project(self, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 2"], Float[Tensor, " n"]]:
-        """Positions in px and depths in world units of world points, in float64."""
+        """Positions in px and depths along the optical axis in world units of world points, in float64."""
         pose = self.cam_from_world
         local = points.double() @ pose[:3, :3].T + pose[:3, 3]
-        x, y, z = local.unbind(dim=1)
-        return torch.stack([x / z * self.fx + self.cx, y / z * self.fy + self.cy], dim=1), z
+        return self.pixels(self.lens.places(local)), local[:, 2]
+
+    def pixels(self, places: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n 2"]:
+        """Places of the lens, in px."""
+        return places * places.new_tensor([self.fx, self.fy]) + places.new_tensor([self.cx, self.cy])
+
+    def rays(self, pixels: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n 3"]:
+        """Rays of positions in px, in the camera's frame; 0 where the lens sees nothing."""
+        offset = pixels.double() - pixels.new_tensor([self.cx, self.cy]).double()
+        return self.lens.rays(offset / offset.new_tensor([self.fx, self.fy])).to(pixels)
 
     @contract
     def scaled(self, factor: Factor) -> "Camera":
@@ -243,7 +255,8 @@ def look_at(eye: Float[Tensor, " 3"], target: Float[Tensor, " 3"], up: Float[Ten
 
 def digest_of_cameras(views: Sequence[Camera]) -> str:
     """Hash of the views as they were understood: names, sizes, intrinsics, poses, training focal lengths and lenses."""
-    values = [
-        [v.name, *v.intrinsics, v.cam_from_world.tolist(), v.trained_focal, v.lens and asdict(v.lens)] for v in views
-    ]
+    values = []
+    for view in views:
+        lenses = [asdict(lens) for lens in (view.lens, view.undistortion) if lens not in (PINHOLE, None)]
+        values.append([view.name, *view.intrinsics, view.cam_from_world.tolist(), view.trained_focal, lenses or None])
     return hashlib.sha256(json.dumps(values).encode()).hexdigest()

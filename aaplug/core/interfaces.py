@@ -79,11 +79,15 @@ class MatchesRates(Protocol):
 
 
 class Pixels(NamedTuple):
-    """Pixel centres of square tiles, in px: each tile's top left corner, and x and y of its P centres from there."""
+    """Pixel centres of square tiles, in px: each tile's top left corner, and x and y of its P centres from there.
+
+    For a pixel kernel that `ReadsRays`, x, y and z of each pixel's ray instead.
+    """
 
     corners: Float[Tensor, "t 2"]
-    x: Float[Tensor, " P"]
-    y: Float[Tensor, " P"]
+    x: Float[Tensor, "*t P"]
+    y: Float[Tensor, "*t P"]
+    z: Float[Tensor, "t P"] | None = None
 
 
 class Limits(NamedTuple):
@@ -161,6 +165,17 @@ class PixelKernel(Protocol):
 
     def exact(self, splats: Splats2D, offsets: Float[Tensor, "p m 2"]) -> Float[Tensor, "p m"]:
         """The same formula in float64, by its definition: alpha / opacity at `offsets` (px), uncapped and uncut."""
+        ...
+
+
+@runtime_checkable
+class ReadsRays(Protocol):
+    """A pixel kernel that reads the ray of each pixel in `Splats2D.camera`, not its place."""
+
+    def rays(
+        self, splats: Splats2D, x: Float[Tensor, "*n"], y: Float[Tensor, "*n"]
+    ) -> tuple[Float[Tensor, "*n"], Float[Tensor, "*n"], Float[Tensor, "*n"]]:
+        """x, y and z of the rays of pixels at x and y px; all are 0 where nothing is seen."""
         ...
 
 

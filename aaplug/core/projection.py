@@ -1,11 +1,13 @@
-"""From Gaussians and a camera to splats: EWA projection.
+"""From Gaussians and a camera to splats: EWA projection, by a pinhole or through another lens.
 
 n: Gaussians of the scene, m: those beyond the near plane.  A splat's covariance is M Mᵀ with the 2×3 factor M = J W R S
 (Zwicker et al., "EWA splatting", 2002; 3DGS, eq. 5).  Its determinant |a × b|² comes from the rows a and b of M, where
 nothing cancels.  The camera's centre is subtracted in float64; the rest runs in the scene's precision.
+
+Through a lens other than a pinhole, splats lie in planes of their own: see `core.sights`.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import reduce
 
@@ -16,7 +18,9 @@ from torch import Tensor
 from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import MAX_LOG_SCALE, Gaussians
 from aaplug.core.kernels import EAGER, EXAMPLE_SIZE, Kernel, Kernels, backward_of
+from aaplug.core.lenses import PINHOLE
 from aaplug.core.rules import NEAR, RULES_3DGS, Rules
+from aaplug.core.sights import sights
 from aaplug.core.splats import SELECT, Splats2D
 
 JACOBIAN_MARGIN = 0.3  # of half the image: 3DGS linearises no farther out (1.3 tan(fov/2))
@@ -26,6 +30,8 @@ MIN_FACING = 1e-6  # of depth: a disc at a flatter angle is a line, and its slop
 
 def project(scene: Gaussians, camera: Camera, kernels: Kernels = EAGER, rules: Rules = RULES_3DGS) -> Splats2D:
     """Splats of every Gaussian beyond the near plane, without colour and before any screen filter."""
+    if camera.lens != PINHOLE:
+        return _project_through(scene, camera, kernels, rules)
     shape = scene.means, scene.quats, scene.log_scales
     columns = kernels.run(PROJECT, *shape, *_camera_rows(scene.means, camera, rules))
     return _beyond(rules.near, columns, scene.opacities, kernels)
@@ -114,6 +120,14 @@ def _project(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Mean, packed covariance, determinant and depth of each Gaussian, written in columns so that the loop fuses."""
     centres, across, down, z = _linearised(means, centre, rotation, lens)
+    covs, dets = _shape(across, down, quats, log_scales)
+    return torch.stack(centres, dim=1), covs, dets, z
+
+
+def _shape(
+    across: Sequence[Tensor], down: Sequence[Tensor], quats: Float[Tensor, "n 4"], log_scales: Float[Tensor, "n 3"]
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:
+    """Packed covariance and determinant, from the rows of J W."""
     lengths = log_scales.clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE).exp().unbind(dim=1)
     quats = quats / quats.square().sum(dim=1, keepdim=True).sqrt()
     axes = zip(*rotation_rows(quats), strict=True)
@@ -124,8 +138,26 @@ def _project(
             factor.append(along.clamp(-MAX_SIGMA, MAX_SIGMA))
     covs = [sum_of(p * q for p, q in zip(*pair, strict=True)) for pair in ((a, a), (a, b), (b, b))]
     normal = [a[i - 2] * b[i - 1] - a[i - 1] * b[i - 2] for i in range(3)]
-    dets = sum_of(side * side for side in normal)
-    return torch.stack(centres, dim=1), torch.stack(covs, dim=1), dets, z
+    return torch.stack(covs, dim=1), sum_of(side * side for side in normal)
+
+
+def _project_through(scene: Gaussians, camera: Camera, kernels: Kernels, rules: Rules) -> Splats2D:
+    """Splats through a lens other than a pinhole, in their own planes."""
+    places, depths, rates, planes = sights(scene.means, camera, rules.near)
+    rotation = camera.cam_from_world[:3, :3].to(planes)
+    if camera.lens.projection == "pinhole":
+        rows = _camera_rows(scene.means, camera, rules)
+        _, covs, dets, _ = kernels.run(PROJECT, scene.means, scene.quats, scene.log_scales, *rows)
+    else:
+        if camera.lens.projection == "ortho":
+            axes = rotation[:2] * rotation.new_tensor([[camera.fx], [camera.fy]])
+        else:
+            axes = planes[:, :2] @ rotation / depths.clamp(min=rules.near)[:, None, None]
+        across, down = (axis.unbind(dim=-1) for axis in axes.unbind(dim=-2))
+        covs, dets = _shape(across, down, scene.unit_quats, scene.log_scales)
+    splats = _beyond(rules.near, (places, covs, dets, depths), scene.opacities, kernels)
+    own = {"planes": planes.index_select(0, splats.sources), "rates": rates.index_select(0, splats.sources)}
+    return replace(splats, **own, camera=camera)
 
 
 def _linearised(

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import Gaussians, joined
+from aaplug.core.lenses import PINHOLE
 from aaplug.core.projection import JACOBIAN_MARGIN
 from aaplug.core.rules import NEAR
 from aaplug.core.runs import runs_of, starts_of
@@ -225,6 +226,8 @@ class Cutter:
         if camera.trained_focal is None:
             pose = camera.cam_from_world.detach().double()
             depths = self.centres @ pose[2, :3] + pose[2, 3]
+            if not camera.lens.flat:
+                depths = torch.linalg.vector_norm(self.centres - camera.centre, dim=1)
             now = camera.focal / (depths - self.radii).clamp(min=NEAR)
             trained = torch.minimum(torch.maximum(now, self.lowest.double()), self.highest.double())
             rates = torch.where(self.highest > 0, now / trained, rates)
@@ -242,6 +245,8 @@ class Cutter:
 
     def _frustum(self, camera: Camera) -> tuple[Float[Tensor, "5 3"], Float[Tensor, " 5"]]:
         """Normals and offsets, in the world, of the planes around the view; normals · place + offset >= 0 inside."""
+        if camera.lens != PINHOLE:  # it may look anywhere
+            return torch.zeros(1, 3, dtype=torch.float64), torch.ones(1, dtype=torch.float64)
         margin = FILTER_REACH * max(1.0, self.training.relative_rate(camera))  # px
         rows = [[0.0, 0.0, 1.0, -NEAR]]
         sides = (camera.fx, camera.cx, camera.width), (camera.fy, camera.cy, camera.height)

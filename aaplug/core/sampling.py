@@ -16,7 +16,9 @@ from torch import Tensor
 
 from aaplug.core.cameras import Camera
 from aaplug.core.conventions import MIN_SEEN_SHARE
+from aaplug.core.lenses import PINHOLE
 from aaplug.core.rules import NEAR
+from aaplug.core.sights import sights
 from aaplug.system.errors import FrameError, UsageError
 
 IMAGE_MARGIN = 0.15  # of the image's side; equals 3DGS's clamp of the Jacobian at 1.3 tan(fov/2)
@@ -146,7 +148,11 @@ def rates_in_chunks(
         x, y, z = (torch.addmm(offset[:, i], local, rotation[:, i].T) for i in range(3))
         visible = (z > NEAR) & _inside(x.div_(z).mul_(fx).add_(cx), width)
         visible &= _inside(y.div_(z).mul_(fy).add_(cy), height)
-        yield part, torch.where(visible, focal / z, 0.0)
+        rates = torch.where(visible, focal / z, 0.0)
+        for i, camera in enumerate(cameras):
+            if camera.lens != PINHOLE:
+                rates[:, i] = _through(means[part], camera)
+        yield part, rates
 
 
 def mean_position(cameras: Sequence[Camera]) -> Float[Tensor, " 3"]:
@@ -154,6 +160,13 @@ def mean_position(cameras: Sequence[Camera]) -> Float[Tensor, " 3"]:
     if not cameras:
         raise UsageError("cameras", "there are none, and sampling bounds need at least one")
     return torch.stack([camera.centre for camera in cameras]).mean(dim=0)
+
+
+def _through(means: Float[Tensor, "c 3"], camera: Camera) -> Float[Tensor, " c"]:
+    """Rates through a lens."""
+    places, depths, rates, _ = sights(means, camera)
+    inside = _inside(places, places.new_tensor([camera.width, camera.height])).all(dim=1)
+    return torch.where((depths > NEAR) & inside, rates, 0.0)
 
 
 def _inside(position: Float[Tensor, "c v"], side: Float[Tensor, " v"]) -> Bool[Tensor, "c v"]:

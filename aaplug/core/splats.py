@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from aaplug.core.cameras import Camera
 from aaplug.core.kernels import EAGER, EXAMPLE_SIZE, Kernel, Kernels
 from aaplug.system.contracts import Range, check_fields, contract, described
 from aaplug.system.errors import UsageError
@@ -29,17 +30,24 @@ class Splats2D:
     window: px.  For a pixel kernel that averages alpha, the side of the square it averages over; for a disc kernel, the
         size of training's pixel, which sets its screen-space low-pass filter.
     depth_slopes: for discs, the relative decrease of inverse depth per px to the right and per px down.
+    camera: whose lens the splats are seen through; None for a pinhole's.  Then
+    planes: of the plane in which each splat is a Gaussian of covariance `covs`: axes in the camera's frame that point
+        right, down and ahead.  A ray d meets the plane right·d / ahead·d and down·d / ahead·d px from the centre.
+    rates: at which the view samples each splat, in px per world unit.
     """
 
     means: Float[Tensor, "m 2"]
     covs: Float[Tensor, "m 3"]  # xx, xy, yy in px²
     dets: Float[Tensor, " m"]  # px⁴
-    depths: Float[Tensor, " m"]  # world units
+    depths: Float[Tensor, " m"]  # world units; through a lens that is not flat, distances
     opacities: Float[Tensor, " m"]
     sources: Int[Tensor, " m"]  # index in the scene
     rgb: Float[Tensor, "m channels"] | None = None
     depth_slopes: Float[Tensor, "m 2"] | None = None
     window: float = 1.0
+    planes: Float[Tensor, "m 3 3"] | None = None
+    rates: Float[Tensor, " m"] | None = None
+    camera: Camera | None = None
 
     def __post_init__(self) -> None:
         check_fields(self)

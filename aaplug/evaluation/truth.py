@@ -196,7 +196,7 @@ class ViewTruth:
     def _photograph(self) -> Photograph:
         assert self.view.photo is not None
         downscale = DOWNSCALES[self.truth.protocol.downscale]
-        return downscale.read(self.view.photo, self.truth.renderer.background, self.view.lens)
+        return downscale.read(self.view.photo, self.truth.renderer.background, self.view.undistortion)
 
     @cached_property
     def _depth(self) -> float:

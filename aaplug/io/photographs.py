@@ -15,7 +15,7 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from aaplug.core.cameras import WHOLE_SLACK, Camera, Lens
+from aaplug.core.cameras import WHOLE_SLACK, Camera, Undistortion
 from aaplug.core.imaging import box_average, levels, quantised, resampled
 from aaplug.io.images import read_image, read_rgba
 from aaplug.io.lenses import undistorted
@@ -51,12 +51,14 @@ class Downscale:
 
     name: str
     protocol: str
-    read: Callable[[Path, Background, Lens | None], Photograph]
+    read: Callable[[Path, Background, Undistortion | None], Photograph]
 
 
-def read_photo(path: str | PathLike[str], background: Background, lens: Lens | None = None) -> Float[Tensor, "h w 3"]:
+def read_photo(
+    path: str | PathLike[str], background: Background, undistortion: Undistortion | None = None
+) -> Float[Tensor, "h w 3"]:
     """Read a photograph: composite it over `background`, undistort it by its lens, round it to 8 bits."""
-    return quantised(undistorted(read_image(path, background), lens))
+    return quantised(undistorted(read_image(path, background), undistortion))
 
 
 def photo_at(view: Camera, resized: Camera, background: Background) -> Float[Tensor, "h w 3"]:
@@ -65,18 +67,18 @@ def photo_at(view: Camera, resized: Camera, background: Background) -> Float[Ten
     Below the photograph's own size its pixels are averaged; above it they are interpolated (bicubic, which overshoots).
     """
     assert view.photo is not None
-    photograph = _box(view.photo, background, view.lens)
+    photograph = _box(view.photo, background, view.undistortion)
     return photograph.at(resized.hw, photograph.factor(view, resized.fx / view.fx))
 
 
-def _box(path: Path, background: Background, lens: Lens | None = None) -> Photograph:
-    photo = read_photo(path, background, lens)
+def _box(path: Path, background: Background, undistortion: Undistortion | None = None) -> Photograph:
+    photo = read_photo(path, background, undistortion)
     return Photograph((photo.shape[0], photo.shape[1]), lambda hw, factor: resampled(photo, factor, hw))
 
 
-def _rgba_box(path: Path, background: Background, lens: Lens | None = None) -> Photograph:
+def _rgba_box(path: Path, background: Background, undistortion: Undistortion | None = None) -> Photograph:
     """Mip-NeRF's multi-scale Blender data: RGBA halved in float, truncated to 8 bits when saved and when composited."""
-    halves = [undistorted(read_rgba(path), lens)]
+    halves = [undistorted(read_rgba(path), undistortion)]
     behind = torch.tensor(background)
 
     def at(hw: tuple[int, int], factor: float) -> Float[Tensor, "h w 3"]:
@@ -96,9 +98,9 @@ def _rgba_box(path: Path, background: Background, lens: Lens | None = None) -> P
     return Photograph((height, width), at)
 
 
-def _pil_bicubic(path: Path, background: Background, lens: Lens | None = None) -> Photograph:
+def _pil_bicubic(path: Path, background: Background, undistortion: Undistortion | None = None) -> Photograph:
     """3DGS's -r: Pillow's antialiased bicubic on the 8-bit photograph, rounded to 8 bits again."""
-    photo = read_photo(path, background, lens)
+    photo = read_photo(path, background, undistortion)
     picture = Image.fromarray(levels(photo, 8).byte().numpy())
 
     def at(hw: tuple[int, int], factor: float) -> Float[Tensor, "h w 3"]:

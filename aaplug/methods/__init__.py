@@ -45,7 +45,11 @@ SELECTIONS: Registry["Selection"] = Registry("selection", "aaplug.core.interface
 PIXEL_KERNELS: Registry["PixelKernel"] = Registry(
     "pixel kernel",
     "aaplug.core.interfaces:PixelKernel",
-    {"point": "aaplug.methods.pixel_kernels.point:POINT", "surfel": "aaplug.methods.pixel_kernels.surfel:SURFEL"},
+    {
+        "point": "aaplug.methods.pixel_kernels.point:POINT",
+        "ray": "aaplug.methods.pixel_kernels.ray:RAY",
+        "surfel": "aaplug.methods.pixel_kernels.surfel:SURFEL",
+    },
 )
 COMPOSITORS: Registry["Compositor"] = Registry("compositor", "aaplug.core.interfaces:Compositor", {})
 FORMS: Registry["Form"] = Registry(

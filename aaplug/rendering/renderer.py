@@ -25,6 +25,7 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.core.imaging import average_samples
 from aaplug.core.interfaces import Rasterizer
 from aaplug.core.kernels import Kernels
+from aaplug.core.lenses import PINHOLE
 from aaplug.core.projection import project, with_depth_slopes
 from aaplug.core.pyramids import Cutter, faded
 from aaplug.core.sampling import sampling_bounds
@@ -38,6 +39,8 @@ from aaplug.io.scenes import SceneLike, scene_of
 from aaplug.io.scenes.harmonics import without_harmonics
 from aaplug.io.scenes.scene import Scene
 from aaplug.methods.filters.smoothing import fuse_stored
+from aaplug.methods.pixel_kernels.point import POINT
+from aaplug.methods.pixel_kernels.ray import RAY, with_copies
 from aaplug.methods.recipe import RATE_TOLERANCE, Recipe
 from aaplug.methods.recipes import find_recipe, suited
 from aaplug.rasterizers import RASTERIZERS
@@ -203,8 +206,17 @@ class Renderer:
         background: None for the renderer's own.
         """
         colour = self.background if background is None else background
-        recipe, rules = self.recipe, self.training.convention.rules
+        recipe, rules = self._recipe_through(splats.camera), self.training.convention.rules
         return self.rasterizer(splats, hw, colour, recipe.pixel, recipe.compositor, rules)
+
+    def _recipe_through(self, camera: Camera | None) -> Recipe:
+        """The recipe, which draws splats on rays if the camera's lens is no pinhole."""
+        if camera is None or camera.lens == PINHOLE:
+            return self.recipe
+        if self.recipe.pixel is not POINT or self.recipe.compositor is not None:
+            problem = f"recipe {self.recipe.name} draws pinhole views only; auto, matched, classic, ewa and mip draw all"
+            raise UsageError("lens", problem)
+        return replace(self.recipe, pixel=RAY)
 
     @contract
     def sampled(self, camera: Camera) -> tuple[Camera, int]:
@@ -295,7 +307,7 @@ class Renderer:
             parts.append(replace(shade(local, chunk, camera, self.kernels), sources=splats.sources))
         splats = concatenated(parts)
         _check_colours(splats)
-        return splats
+        return with_copies(splats, self.training.convention.rules)
 
     def _projected(
         self, chunk: Gaussians, places: Int[Tensor, " m"] | int, shares: Float[Tensor, " m"] | None, camera: Camera
@@ -304,7 +316,7 @@ class Renderer:
 
         places: of each in the scene, or of the first if all follow.  shares: see `Cut`.
         """
-        recipe, training, kernels = self.recipe, self.training, self.kernels
+        recipe, training, kernels = self._recipe_through(camera), self.training, self.kernels
         rules = training.convention.rules
         splats = project(chunk, camera, kernels, rules)
         if recipe.selection is not None:

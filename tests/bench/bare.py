@@ -68,7 +68,7 @@ def _photograph(view: Camera, scale: float, background: Colour) -> Float[Tensor,
     """The middle of a view's photograph at a scale; None without a photograph that large."""
     if view.photo is None:
         return None
-    photo = quantised(read_photo(view.photo, background, view.lens))
+    photo = quantised(read_photo(view.photo, background, view.undistortion))
     if (factor := scale * view.width / photo.shape[1]) > 1:
         return None
     small = resampled(photo, factor, view.scaled(scale).hw)

@@ -5,9 +5,11 @@ from itertools import product
 from unittest.mock import patch
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from aaplug.core.ellipses import squared_cutoff, whitening
-from aaplug.core.interfaces import Compositor, Limits, PixelKernel, Pixels, Rasterizer
+from aaplug.core.interfaces import Compositor, Limits, PixelKernel, Pixels, Rasterizer, ReadsRays
 from aaplug.core.kernels import EAGER
 from aaplug.core.rules import RULES_3DGS, Rules
 from aaplug.core.splats import Render, Splats2D
@@ -52,7 +54,7 @@ def alpha_is_exact(pixel: PixelKernel) -> None:
         rows = pixel.raster_rows(splats.to(dtype), EAGER)[:-1, None].expand(-1, len(corners), -1)
         with patch("torch.compiler.is_compiling", lambda: compiling):  # noqa: B023 (called in the same turn)
             limits = Limits(*torch.tensor(Limits.by(rules)).unbind()) if compiling else Limits.by(rules)
-            alpha = pixel.alpha(rows, Pixels(corners, *centres.unbind(dim=1)), limits)
+            alpha = pixel.alpha(rows, _pixels(pixel, splats, corners, centres), limits)
         points = (corners[:, None] + centres).flatten(0, 1).double()
         exact = pixel.exact(splats, points[:, None] - splats.means) * splats.opacities
         exact = exact.T.unflatten(1, alpha.shape[1:])
@@ -65,6 +67,16 @@ def alpha_is_exact(pixel: PixelKernel) -> None:
         require(difference < most, f"they differ by {difference:.1e} in {dtype} with a window of {window} px")
 
 
+def _pixels(
+    pixel: PixelKernel, splats: Splats2D, corners: Float[Tensor, "t 2"], centres: Float[Tensor, "P 2"]
+) -> Pixels:
+    """Pixels of tiles, or their rays, as the pixel kernel reads them."""
+    x, y = centres.unbind(dim=1)
+    if isinstance(pixel, ReadsRays):
+        return Pixels(corners, *pixel.rays(splats, corners[:, :1] + x, corners[:, 1:] + y))
+    return Pixels(corners, x, y)
+
+
 @law_of("pixel kernel")
 def rows_hold_colours(pixel: PixelKernel) -> None:
     """A raster row has `columns` numbers with the colour, the padding row draws nothing, and a pass is whole steps."""
@@ -73,7 +85,9 @@ def rows_hold_colours(pixel: PixelKernel) -> None:
     rows = pixel.raster_rows(splats, EAGER)
     require(rows.shape == (10, pixel.columns), f"rows are of shape {tuple(rows.shape)}, not {(10, pixel.columns)}")
     torch.testing.assert_close(rows[:-1, RED : BLUE + 1], splats.rgb)
-    pixels = Pixels(torch.tensor([[0.0, 0.0], [8.0, 800.0]], dtype=F64), *tile_centres(rows))
+    pixels = _pixels(
+        pixel, splats, torch.tensor([[0.0, 0.0], [8.0, 800.0]], dtype=F64), torch.stack(tile_centres(rows), dim=1)
+    )
     drawn, padding = (rows[:-1, None].expand(-1, 2, -1), rows[-1:].expand(2, -1))
     require((pixel.alpha(drawn, pixels, Limits.by(RULES_3DGS)) > 0).any(), "draws nothing")
     require(pixel.alpha(padding, pixels, Limits.by(RULES_3DGS)).eq(0).all(), "the padding row draws")

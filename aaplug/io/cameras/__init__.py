@@ -64,6 +64,7 @@ def read_cameras(
     train_scale: float | None = None,
     images: str | None = None,
     test_every: int | None = None,
+    undistort: bool = False,
 ) -> CameraSet:
     """Read the cameras of a file or folder at their training size.
 
@@ -72,12 +73,13 @@ def read_cameras(
         train_scale: training size over the size in the files; overrides what the files say.
         images: the folder of the photos, relative to the dataset's root.
         test_every: every n-th view by name is a test view; 0 for no split.
+        undistort: straighten photographs whose lens distorts, and draw the pinhole that sees the same.
 
     Raises:
         FormatError: there are no cameras, or a file breaks its format.
         UsageError: an option does not fit.
     """
-    options = CameraFileOptions(train_scale, images, test_every)
+    options = CameraFileOptions(train_scale, images, test_every, undistort)
     if not os.path.exists(path):
         raise FormatError(path, "there is no such file or folder")
     path = Path(path)

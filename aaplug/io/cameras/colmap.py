@@ -2,13 +2,12 @@
 
 The root holds `images`, and a model in `sparse/0` or `sparse`: cameras (intrinsics) and images (poses), both .bin or
 both .txt.  Poses are world-to-camera, OpenCV axes, in world units; the centre of the first pixel is (0.5, 0.5); focal
-lengths and principal points are in px.  A camera with distortion becomes the pinhole at its principal point, and its
-photos are undistorted.  Points are not read.
+lengths and principal points are in px.  A camera keeps its lens, as far as `core.lenses` has it.  Points are not read.
 """
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.cameras import Camera, CameraSet
+from aaplug.core.lenses import EQUIDISTANT, Lens, opencv_lens
 from aaplug.io.cameras.cfg_args import WIDTH_CAP
 from aaplug.io.cameras.colmap_files import KINDS, Image, Intrinsics, read_cameras, read_images
 from aaplug.io.cameras.options import (
@@ -31,19 +31,24 @@ from aaplug.io.cameras.options import (
 )
 from aaplug.io.cameras.photos import distinct, photo_folder, with_photos, without_suffix
 from aaplug.io.cameras.poses import inverse, pose
-from aaplug.io.lenses import Distortion, lens_notes, undistorted_cameras
+from aaplug.io.lenses import Distortion, cameras_of_photographs, lens_notes
 from aaplug.io.values import Place, focal, number, pixels
 from aaplug.system.errors import FormatError, listing
 
 MIN_QUATERNION_LENGTH = 1e-6  # a shorter one counts as no rotation
-OPENCV_ORDER = {  # for each of OpenCV's coefficients, the index of the model's distortion parameter; -1 for 0
-    "SIMPLE_RADIAL": (0, -1, -1, -1),
-    "RADIAL": (0, 1, -1, -1),
-    "OPENCV": (0, 1, 2, 3),
-    "FULL_OPENCV": (0, 1, 2, 3, 4, 5, 6, 7),
-    "OPENCV_FISHEYE": (0, 1, 2, 3),
-    "SIMPLE_RADIAL_FISHEYE": (0, -1, -1, -1),
-    "RADIAL_FISHEYE": (0, 1, -1, -1),
+LENSES: dict[str, Callable[..., Lens]] = {  # by the model's distortion parameters, in COLMAP's order
+    "SIMPLE_RADIAL": lambda k1: opencv_lens((k1,)),
+    "RADIAL": lambda k1, k2: opencv_lens((k1, k2)),
+    "OPENCV": lambda *k: opencv_lens(k),
+    "FULL_OPENCV": lambda *k: opencv_lens(k),
+    "SIMPLE_FISHEYE": lambda: EQUIDISTANT,
+    "FISHEYE": lambda: EQUIDISTANT,
+    "SIMPLE_RADIAL_FISHEYE": lambda *k: opencv_lens(k, fisheye=True),
+    "RADIAL_FISHEYE": lambda *k: opencv_lens(k, fisheye=True),
+    "OPENCV_FISHEYE": lambda *k: opencv_lens(k, fisheye=True),
+    "THIN_PRISM_FISHEYE": lambda k1, k2, p1, p2, k3, k4, sx1, sy1: Lens(
+        "equidistant", (k1, k2, k3, k4), tangential=(p1, p2), prism=(sx1, 0.0, sy1, 0.0)
+    ),
 }
 
 name = "colmap"
@@ -72,10 +77,10 @@ def read(path: Path, options: CameraFileOptions) -> CameraSet:
     source = [replace(camera, name=name) for camera, name in zip(source, names, strict=True)]
     sizes, why = _training_sizes(source, options)
     lenses = [_distortion(intrinsics[image.camera_id]) for image in images]
-    trained = undistorted_cameras(trained_at(source, sizes), lenses)
+    trained = cameras_of_photographs(trained_at(source, sizes), lenses, options.undistort)
     split = every_nth(trained, options, LLFF_HOLD, "3DGS --eval's rule; `test_every` 0 for no split")
     kind = f"COLMAP ({images_file.suffix[1:]})"
-    return camera_set(kind, source, split, why, more=lens_notes(lenses, trained))
+    return camera_set(kind, source, split, why, more=lens_notes(lenses, trained, options.undistort))
 
 
 def _model_folder(path: Path) -> Path | None:
@@ -127,10 +132,8 @@ def _distortion(lens: Intrinsics) -> Distortion | None:
     rest = lens.parameters[lens.model.focals + 2 :]
     if lens.model.straight and not any(rest):
         return None
-    order = OPENCV_ORDER.get(lens.model.name)
-    values = [number(value, lens.place, "parameter") for value in rest]
-    coefficients = None if order is None else tuple((*values, 0.0)[i] for i in order)
-    return Distortion(lens.model.name, coefficients, lens.model.name.endswith("FISHEYE"))
+    values, lens_of = [number(value, lens.place, "parameter") for value in rest], LENSES.get(lens.model.name)
+    return Distortion(lens.model.name, lens_of(*values) if lens_of else None)
 
 
 def _rotation(image: Image) -> Float[Tensor, "3 3"]:

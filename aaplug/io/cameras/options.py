@@ -27,11 +27,13 @@ class CameraFileOptions:
     train_scale: training size over the size in the files.
     images: the folder of the photos.
     test_every: every n-th view is a test view; 0 for no split.
+    undistort: straighten photographs whose lens distorts, and draw the pinhole that sees the same.
     """
 
     train_scale: float | None = None
     images: str | None = None
     test_every: int | None = None
+    undistort: bool = False
 
     def __post_init__(self) -> None:
         check_fields(self)

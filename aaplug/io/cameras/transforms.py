@@ -21,6 +21,7 @@ from torch import Tensor
 
 from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.colours import WHITE
+from aaplug.core.lenses import opencv_lens
 from aaplug.io.cameras.options import (
     CameraFileOptions,
     Size,
@@ -34,7 +35,7 @@ from aaplug.io.cameras.options import (
 from aaplug.io.cameras.photos import PhotoFolder, distinct, last_part, refuse_folder, without_suffix
 from aaplug.io.cameras.poses import inverse, pose, pose_of_opengl, rigid
 from aaplug.io.images import PNG_SIGNATURE, image_size
-from aaplug.io.lenses import Distortion, lens_notes, undistorted_cameras
+from aaplug.io.lenses import Distortion, cameras_of_photographs, lens_notes
 from aaplug.io.values import (
     Entry,
     Place,
@@ -56,6 +57,7 @@ PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV")  # OPENCV is one if its coeff
 EXPORTED = "transform"  # key of a frame's 3×4 pose in `ns-export cameras`
 LAST_ROW = [0.0, 0.0, 0.0, 1.0]
 FISHEYE = "OPENCV_FISHEYE"
+OPENCV_ORDER = ("k1", "k2", "p1", "p2", "k3")
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 MIN_ANGLE = 1e-9  # rad: the smallest angle of view
 FILE_LISTS = ("train_filenames", "val_filenames", "test_filenames")  # nerfstudio's split
@@ -136,8 +138,8 @@ def read_source(file: Path, options: CameraFileOptions) -> Source:
     parser = None if exported else _dataparser(file.parent / DATAPARSER)
     cameras = [_camera(*each, spare, parser) for each in zip(frames, photos, names, strict=True)]
     lenses = [_distortion(frame) for frame in frames]
-    cameras = undistorted_cameras(cameras, lenses)
-    notes = lens_notes(lenses, cameras)
+    cameras = cameras_of_photographs(cameras, lenses, options.undistort)
+    notes = lens_notes(lenses, cameras, options.undistort)
     if exported:
         notes.append("frame: that in which nerfstudio trained (ns-export cameras); photos unknown")
     elif parser:
@@ -222,10 +224,9 @@ def _distortion(entry: Entry) -> Distortion | None:
     others = [number(value, entry.place, "distortion_params") for value in listed]
     others += [k["k5"], k["k6"]]
     if entry.fields.get("is_fisheye") or model == FISHEYE:
-        angular = tuple(k[key] for key in ("k1", "k2", "k3", "k4"))
-        return Distortion(model if model == FISHEYE else "fisheye", None if any(others) else angular, fisheye=True)
+        angular = opencv_lens(tuple(k[key] for key in ("k1", "k2", "k3", "k4")), fisheye=True)
+        return Distortion(model if model == FISHEYE else "fisheye", None if any(others) else angular)
     if model in PINHOLES and not any(others) and not any(k.values()):
         return None
     supported = model in PINHOLES and not any(others) and not k["k4"]
-    radial = tuple(k[key] for key in ("k1", "k2", "p1", "p2", "k3"))  # in OpenCV's order
-    return Distortion(model, radial if supported else None)
+    return Distortion(model, opencv_lens(tuple(k[key] for key in OPENCV_ORDER)) if supported else None)

@@ -83,13 +83,15 @@ class Matched:
     def rates(self, splats: Splats2D, camera: Camera, training: TrainingViews) -> Float[Tensor, " m"]:
         """Relative sampling rate r of each splat; the view's own r for Gaussians that no training camera saw."""
         view, at_pose = training.relative_rate(camera), camera.trained_focal is not None
-        if self.reference == "global" or (self.reference == "pose" and at_pose and view >= 1):
-            return torch.full_like(splats.depths, view)
         now = camera.focal / splats.depths
+        if splats.rates is not None:  # through a lens, which samples directions differently
+            view, now = view * splats.rates / now, splats.rates
+        if self.reference == "global" or (self.reference == "pose" and at_pose and training.relative_rate(camera) >= 1):
+            return torch.ones_like(splats.depths) * view
         in_training = now / view  # at this pose's training size
         if self.reference == "pose" and at_pose:
             highest = training.bounds.highest.index_select(0, splats.sources).to(now)  # 0 if no training camera saw it
-            rise = min(view**-RISE_SPEED, MAX_RISE)
+            rise = min(training.relative_rate(camera) ** -RISE_SPEED, MAX_RISE)
             return view * in_training / torch.minimum(rise * in_training, torch.maximum(highest, in_training))
         bounds = training.bounds[splats.sources]
         lowest, highest = (rate.to(now).where(bounds.seen, 1.0) for rate in (bounds.lowest, bounds.highest))

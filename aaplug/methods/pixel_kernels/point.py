@@ -57,21 +57,8 @@ class Point:
         return torch.cat([rows, functional.pad(more, (0, 0, 0, 1))], dim=1) if more.shape[1] else rows
 
     def alpha(self, rows: Float[Tensor, "*n t c"], pixels: Pixels, limits: Limits) -> Float[Tensor, "*n t P"]:
-        """2^(log2 o - u² - v²), 0 below the cut-off.
-
-        Compiled it is a polynomial, because a call in a loop stops vectorization.  Below the cut-off that may be
-        anything, and is left out.
-        """
-        u, v = forms_at(rows, pixels)
-        opacity = rows[..., OPACITY, None]
-        if torch.compiler.is_compiling():
-            h = torch.addcmul(torch.addcmul(opacity, u, u, value=-1), v, v, value=-1)
-            value = _polynomial(h, ROOT_OF_EXP2).pow(2**SQUARINGS)  # compiled to squarings
-            return torch.where(h >= limits.log2_min_alpha - LOG2_PADDING, value, 0.0)
-        exponent = torch.addcmul(opacity + LOG2_PADDING, u, u, value=-1)
-        exponent = torch.addcmul(exponent, v, v, value=-1)
-        # The exponent is clamped, because subnormal numbers are slow.
-        return limits.cut(exponent.clamp_(min=LOG2_PADDING).exp2_())
+        """2^(log2 o - u² - v²), 0 below the cut-off."""
+        return value_of(rows[..., OPACITY, None], *forms_at(rows, pixels), limits)
 
     def exact(self, splats: Splats2D, offsets: Float[Tensor, "p c 2"]) -> Float[Tensor, "p c"]:
         """exp(-dᵀ C⁻¹ d / 2)."""
@@ -128,6 +115,24 @@ def _point_rows(
     forms = [HALF_LOG2_E**0.5 * form for form in whitening_columns(covs, dets)]
     columns = [*forms, *means.unbind(dim=1), opacities.log2() - LOG2_PADDING, *rgb.unbind(dim=1)]
     return (torch.stack([functional.pad(column, (0, 1)) for column in columns], dim=1),)
+
+
+def value_of(
+    opacity: Float[Tensor, "*n t 1"], u: Float[Tensor, "*n t P"], v: Float[Tensor, "*n t P"], limits: Limits
+) -> Float[Tensor, "*n t P"]:
+    """2^(log2 o - u² - v²), of log2 o - LOG2_PADDING; 0 below the cut-off.
+
+    Compiled it is a polynomial, because a call in a loop stops vectorization.  Below the cut-off that may be anything,
+    and is left out.
+    """
+    if torch.compiler.is_compiling():
+        h = torch.addcmul(torch.addcmul(opacity, u, u, value=-1), v, v, value=-1)
+        value = _polynomial(h, ROOT_OF_EXP2).pow(2**SQUARINGS)  # compiled to squarings
+        return torch.where(h >= limits.log2_min_alpha - LOG2_PADDING, value, 0.0)
+    exponent = torch.addcmul(opacity + LOG2_PADDING, u, u, value=-1)
+    exponent = torch.addcmul(exponent, v, v, value=-1)
+    # The exponent is clamped, because subnormal numbers are slow.
+    return limits.cut(exponent.clamp_(min=LOG2_PADDING).exp2_())
 
 
 def _polynomial(x: Tensor, coefficients: tuple[float, ...]) -> Tensor:

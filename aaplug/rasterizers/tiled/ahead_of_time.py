@@ -33,6 +33,7 @@ from aaplug.core.kernels import EAGER, ONE_MORE, Kernel, Kernels
 from aaplug.methods.pixel_kernels.absolute import ABSOLUTE_POINT
 from aaplug.methods.pixel_kernels.gradients import SumsGradients
 from aaplug.methods.pixel_kernels.point import FROM_SUMS, POINT, POINT_ROWS, POINT_ROWS_BACKWARD
+from aaplug.methods.pixel_kernels.ray import RAY
 from aaplug.methods.recipe import Recipe
 from aaplug.rasterizers.tiled import backward, binning, forward, layout
 from aaplug.rasterizers.tiled.packages import CompiledKernels, Package
@@ -56,8 +57,9 @@ IMAGE_KERNELS: tuple[Kernel, ...] = (  # of every recipe with the pixel kernel `
     POINT_ROWS,
     forward.pass_kernel(POINT),
 )
-KERNELS: tuple[Kernel, ...] = (  # with those of gradients
+KERNELS: tuple[Kernel, ...] = (  # with those of lenses and of gradients
     *IMAGE_KERNELS,
+    forward.pass_kernel(RAY),
     backward.SLOTS,
     POINT_ROWS_BACKWARD,
     FROM_SUMS,

@@ -24,7 +24,7 @@ from aaplug.core.interfaces import Limits, PixelKernel, Pixels
 from aaplug.core.kernels import Kernel
 from aaplug.core.runs import starts_of
 from aaplug.methods.pixel_kernels.gradients import Move, SumsGradients, sums_by_autograd, sums_per_splat
-from aaplug.methods.pixel_kernels.raster_rows import PIXELS, RED, next_rows, tile_centres
+from aaplug.methods.pixel_kernels.raster_rows import PIXELS, RED, next_rows
 from aaplug.rasterizers.tiled.binning import Bins
 from aaplug.rasterizers.tiled.forward import (
     EXAMPLE_TILES,
@@ -33,6 +33,8 @@ from aaplug.rasterizers.tiled.forward import (
     Compositing,
     Segment,
     composite_forward,
+    coordinate_sizes,
+    coordinates_of,
     in_turn,
     less,
     name_of,
@@ -86,7 +88,7 @@ def _backward(
     What splats contribute in a tile is kept step by step, and summed over tiles at the end.
     """
     assert bins.pairs is not None
-    local, kernel = tile_centres(rows), step_kernel(how.pixel, how.channels)
+    local, kernel = how.centres(rows), step_kernel(how.pixel, how.channels)
     count = sum(len(before) for segment in segments for before in segment.before)
     if not count:
         return torch.zeros_like(rows)
@@ -100,7 +102,8 @@ def _backward(
         behind = light.index_select(0, segment.tiles)
         colours = tiles_of(grads, segment.tiles, bins.columns, how.kernels)
         step_of = first.index_select(0, segment.tiles) + segment.start // STEP
-        part = whole = [step_of, segment.lists, segment.corners, behind, *colours]
+        rays = how.rays_of(segment.corners[:, :2])
+        part = whole = [step_of, segment.lists, segment.corners, behind, *colours, *rays]
         run, shifts = None, shifts_of(len(segment.before), STEP, rows)
         for step, before in reversed([*enumerate(segment.before)]):
             n = len(before)
@@ -164,10 +167,12 @@ def _step(
     Updates `behind`, B_k in the module's docstring.
     gradients_and_rest: of d colours and alpha, [t, P]; then as in `forward._pass`.
     """
-    *colours, g_hidden, local_x, local_y, values, ahead_of_list, parts = gradients_and_rest
+    *planes, values, ahead_of_list, parts = gradients_and_rest
+    coordinates = coordinates_of(pixel)
+    *colours, g_hidden = planes[:-coordinates]
     limits, one = Limits.of(values), corners[:, 2:]
     before, passed = T, []
-    pixels = Pixels(corners, local_x, local_y)
+    pixels = Pixels(corners, *planes[-coordinates:])
     nearest = next_rows(rows, ids, lists[:, 0] + ahead_of_list, lists[:, 1], STEP)
     for row, alpha in in_turn(pixel, limits, nearest, pixels):
         through = transmitted(alpha, one, limits)
@@ -213,9 +218,9 @@ def step_kernel(pixel: PixelKernel, channels: int = 3) -> Kernel:
         name_of(pixel, channels) + "-backward",
         partial(_step, pixel),
         lambda: (*tiles_example(pixel, channels, len(planes)), torch.zeros(EXAMPLE_TILES, sums)),
-        ("m", "p", "t", "t", *("t" for _ in planes), None, None, None, None, "t"),
+        ("m", "p", "t", "t", *("t" for _ in planes), *coordinate_sizes(pixel), None, None, "t"),
         overlaps="within registers",
-        updates=(planes[1], planes[-1] + 5),
+        updates=(planes[1], planes[-1] + 3 + coordinates_of(pixel)),
     )
 
 

@@ -9,7 +9,7 @@ A pass composites the next splats of every tile.  Tiles are sorted by falling sp
 are always a prefix.  From time to time, tiles whose pixels are all saturated are dropped (compaction).
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 
@@ -18,7 +18,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
-from aaplug.core.interfaces import Limits, PixelKernel, Pixels
+from aaplug.core.interfaces import Limits, PixelKernel, Pixels, ReadsRays
 from aaplug.core.kernels import EAGER, Kernel, Kernels
 from aaplug.core.rules import RULES_3DGS, Rules
 from aaplug.core.splats import Splats2D
@@ -37,12 +37,27 @@ EXAMPLE_LIST = 16  # splats of each tile
 
 @dataclass(frozen=True)
 class Compositing:
-    """Settings of one frame's compositing.  channels: of a splat's colour.  kernels: runs its stages."""
+    """Settings of one frame's compositing.
+
+    kernels: run its stages.  channels: of a splat's colour.  rays: of places in px, if the pixel kernel reads them.
+    """
 
     pixel: PixelKernel
     rules: Rules
     kernels: Kernels
     channels: int = 3
+    rays: Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]] | None = None
+
+    def rays_of(self, origins: Float[Tensor, "t 2"]) -> list[Float[Tensor, "t P"]]:
+        """x, y and z of the rays of these tiles' pixels; none if the pixel kernel reads places."""
+        if self.rays is None:
+            return []
+        x, y = (origins[:, i, None] + along for i, along in enumerate(tile_centres(origins)))
+        return [*self.rays(x, y)]
+
+    def centres(self, like: Tensor) -> tuple[Float[Tensor, " P"], ...]:
+        """x and y of a tile's pixel centres, from its corner, in px; none if the pixel kernel reads rays."""
+        return tile_centres(like) if self.rays is None else ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +85,7 @@ def composite_forward(
 
     rows: raster rows; the last one is the padding row.
     """
-    local = tile_centres(rows)
+    local = how.centres(rows)
     planes = rows.new_zeros(how.channels + 1, len(bins.counts), PIXELS)
     order = torch.sort(bins.counts, descending=True, stable=True).indices
     filled = max(MIN_TILES, int((bins.counts > 0).sum()))
@@ -88,12 +103,15 @@ def _composite_block(
     bins: Bins,
     tiles: Int[Tensor, " t"],
     image: Float[Tensor, "d_and_1 t P"],
-    local: tuple[Float[Tensor, " P"], Float[Tensor, " P"]],
+    local: tuple[Float[Tensor, " P"], ...],
     how: Compositing,
     segments: list[Segment] | None,
 ) -> None:
     """Composite one block of tiles into `image`, until their splats run out or every pixel is saturated."""
     T, kernel = rows.new_ones(len(tiles), PIXELS), pass_kernel(how.pixel, how.channels, segments is not None)
+    rays = how.rays_of(bins.origins.index_select(0, tiles))
+    if rays:
+        T.mul_(rays[0].square().addcmul(rays[1], rays[1]).addcmul(rays[2], rays[2]) > 0)  # else nothing is seen
     planes, places = image, None  # of the tiles that are left, and where they lie in the image
     start, splats, limits = 0, how.pixel.splats_per_pass, rows.new_tensor(Limits.by(how.rules))
     while len(tiles):
@@ -104,7 +122,7 @@ def _composite_block(
         before, steps = [], [] if segments is None else _going(counts - start, STEP)
         if segments is not None:
             segments.append(Segment(tiles, start, lists, corners, before))
-        part = whole = [lists, corners, T, *planes.unbind()]
+        part = whole = [lists, corners, T, *planes.unbind(), *rays]
         passes, passed, run = 0, 0, None
         for i, (n, ahead) in enumerate(zip(going, shifts_of(len(going), splats, rows), strict=True)):
             if n < len(T):
@@ -131,7 +149,7 @@ def _composite_block(
             image.index_copy_(1, places, planes)
         places = rest if places is None else places.index_select(0, rest)
         tiles, T = tiles.index_select(0, rest), T.index_select(0, rest)
-        planes = planes.index_select(1, rest)
+        planes, rays = planes.index_select(1, rest), [x.index_select(0, rest) for x in rays]
 
 
 def _going(counts: Int[Tensor, " t"], at_once: int) -> list[int]:
@@ -161,13 +179,15 @@ def _pass(
 
     keeps: return the transmittance after every STEP of them, 0 where a pixel has stopped; else update T in place.
     corners: the last column is 1; multiplying by it makes the compiler keep one loop over tiles.
-    planes_and_rest: d colours and alpha, [t, P]; x and y of a tile's pixel centres, [P]; `Limits`; the first splat's
-        place after the beginning of the list.
+    planes_and_rest: d colours and alpha, [t, P]; x and y of a tile's pixel centres, [P], or x, y and z of rays, [t, P];
+        `Limits`; the first splat's place after the beginning of the list.
     """
-    *colours, hidden, local_x, local_y, values, ahead = planes_and_rest
+    *planes, values, ahead = planes_and_rest
+    coordinates = coordinates_of(pixel)
+    *colours, hidden = planes[:-coordinates]
     limits, one = Limits.of(values), corners[:, 2:]
     before, left = T, []
-    pixels = Pixels(corners, local_x, local_y)
+    pixels = Pixels(corners, *planes[-coordinates:])
     nearest = next_rows(rows, ids, lists[:, 0] + ahead, lists[:, 1], pixel.splats_per_pass)
     for row, alpha in in_turn(pixel, limits, nearest, pixels):
         after = before * transmitted(alpha, one, limits)
@@ -181,6 +201,11 @@ def _pass(
         return tuple(where_above(limits.below_min_transmittance, one * x, x) for x in left[STEP - 1 :: STEP])
     T.copy_(where_above(limits.below_min_transmittance, one * before, before))
     return ()
+
+
+def coordinates_of(pixel: PixelKernel) -> int:
+    """Number of a pixel's coordinates that a pixel kernel reads: those of its ray, or of its place."""
+    return 3 if isinstance(pixel, ReadsRays) else 2
 
 
 def in_turn(
@@ -240,13 +265,21 @@ def tiles_example(pixel: PixelKernel, channels: int, planes: int) -> tuple[Tenso
     at = torch.arange(tiles) * EXAMPLE_LIST
     lists = torch.stack([at, at + EXAMPLE_LIST], dim=1)
     pixels = [torch.full((tiles, PIXELS), 0.5) for _ in range(planes)]
-    limits = torch.tensor(Limits.by(RULES_3DGS))
-    return rows, ids, lists, torch.ones(tiles, 3), *pixels, *tile_centres(rows), limits, torch.tensor(0)
+    limits, x, y = torch.tensor(Limits.by(RULES_3DGS)), *tile_centres(rows)
+    if isinstance(pixel, ReadsRays):
+        x, y, z = (along.expand(tiles, PIXELS).contiguous() for along in (x, y, torch.ones_like(x)))
+        pixels, x, y = [*pixels, x], y, z
+    return rows, ids, lists, torch.ones(tiles, 3), *pixels, x, y, limits, torch.tensor(0)
 
 
 def name_of(pixel: PixelKernel, channels: int) -> str:
     """The name of a pixel kernel's passes."""
     return f"composite-{pixel.name}" if channels == 3 else f"composite-{pixel.name}-{channels}"
+
+
+def coordinate_sizes(pixel: PixelKernel) -> tuple[str | None, ...]:
+    """Leading sizes of the pixels' coordinates."""
+    return ("t",) * 3 if isinstance(pixel, ReadsRays) else (None, None)
 
 
 @cache
@@ -257,7 +290,7 @@ def pass_kernel(pixel: PixelKernel, channels: int = 3, keeps: bool = False) -> K
         name_of(pixel, channels) + ("-kept" if keeps else ""),
         partial(_pass, pixel, keeps),
         partial(tiles_example, pixel, channels, len(planes)),
-        ("m", "p", "t", "t", *("t" for _ in planes), None, None, None, None),
+        ("m", "p", "t", "t", *("t" for _ in planes), *coordinate_sizes(pixel), None, None),
         overlaps="freely",
         updates=tuple(planes)[keeps:],
         evaluations=pixel.splats_per_pass,

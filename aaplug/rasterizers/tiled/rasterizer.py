@@ -17,7 +17,7 @@ from torch import Tensor
 
 from aaplug.core.colours import Colour
 from aaplug.core.imaging import over
-from aaplug.core.interfaces import Compositor, PixelKernel
+from aaplug.core.interfaces import Compositor, PixelKernel, ReadsRays
 from aaplug.core.kernels import EAGER, Kernels
 from aaplug.core.rules import RULES_3DGS, Rules
 from aaplug.core.splats import Render, Splats2D
@@ -79,7 +79,8 @@ class Tiled:
                 raise UsageError(
                     f"pixel kernel {pixel.name}", f"raster_rows should return {expected}, got {tuple(rows.shape)}"
                 )
-            paint = partial(composite, rows, how=Compositing(pixel, rules, self.kernels, channels))
+            rays = partial(pixel.rays, splats) if isinstance(pixel, ReadsRays) else None
+            paint = partial(composite, rows, how=Compositing(pixel, rules, self.kernels, channels, rays))
             gradients = rows.requires_grad and torch.is_grad_enabled()
         else:
             paint, gradients = self._blender(splats, compositor, rules), False
