@@ -2,12 +2,15 @@
 
 import json
 import math
+import shlex
 from base64 import b64decode, b64encode
 from contextlib import ExitStack
+from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 import pytest
 import torch
+from aaplug_cli.main import main
 
 from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.imaging import quantised
@@ -388,8 +391,10 @@ def test_a_path_a_still_and_a_command_are_kept(opened, seen, tmp_path):
 
 @pytest.mark.parametrize("at", ["0", ""])
 def test_the_copied_command_draws_what_was_seen(opened, cli, at):
-    words = ("scene.ply", "--cameras", ".")
-    with serving("scene.ply", ".", port=0, rasterizer="eager", words=words) as where:
+    name = "it's a “$scene`.ply"
+    Path("scene.ply").rename(name)
+    words = (name, "--cameras", ".")
+    with serving(name, ".", port=0, rasterizer="eager", words=words) as where:
         page = opened(width=1003, where=where, permissions=["clipboard-read", "clipboard-write"])
         page.keyboard.press("3")  # 1/2
         page.fill("#background", "#204060")
@@ -405,9 +410,10 @@ def test_the_copied_command_draws_what_was_seen(opened, cli, at):
         command = page.evaluate("navigator.clipboard.readText()")
         size, shown = tuple(map(int, data(page, "size").split("x"))), image(page)
     assert len(command) < 150
-    program, *rest = command.replace('"', "").split(" ")  # which cmd, PowerShell and sh read alike
+    program, *rest = shlex.split(command)
     assert program == "aaplug"
-    assert cli(" ".join([*rest, "--rasterizer", "eager"]))[0] == 0
+    with pytest.raises(SystemExit, match="0"):
+        main([*rest, "--rasterizer", "eager"])
     drawn = read_image("view.png")
     assert (drawn.shape[1], drawn.shape[0]) == size
     small = torch.nn.functional.interpolate(shown.permute(2, 0, 1)[None], drawn.shape[:2], mode="nearest-exact")[0]

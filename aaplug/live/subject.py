@@ -24,6 +24,7 @@ from aaplug.methods import QUALITIES, RECIPES
 from aaplug.methods.recipes import find_recipe
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import AaplugError
+from aaplug.system.shells import command_line
 
 MAX_RENDERERS = 6  # in memory: a recipe with a world filter has Gaussians of its own
 MAX_PREVIEW_GAUSSIANS = 400_000  # that are drawn while the camera moves
@@ -108,7 +109,7 @@ class Subject:
             depth = 1.0
         return {
             "title": self.title,
-            "words": list(self.words),
+            "words": command_line(self.words),
             "gaussians": len(self.look.scene),
             "rasterizer": self.look.rasterizer.name,
             "assumed": self.cameras.assumed,

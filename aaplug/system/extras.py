@@ -6,6 +6,8 @@ from importlib.metadata import PackageNotFoundError, distribution
 from urllib.parse import urlsplit
 from urllib.request import url2pathname
 
+from aaplug.system.shells import command_line
+
 
 def install_command(extra: str) -> str:
     """The command that adds an extra to aaplug as it is installed here: from a folder, an address or the index.
@@ -17,8 +19,9 @@ def install_command(extra: str) -> str:
         origin = json.loads(distribution("aaplug").read_text("direct_url.json") or "{}")
     match origin:
         case {"url": str(url), "dir_info": {"editable": True}}:
-            return f"pip install -e '{url2pathname(urlsplit(url).path)}[{extra}]'"
+            wanted = "-e", f"{url2pathname(urlsplit(url).path)}[{extra}]"
         case {"url": str(url)}:
-            return f"pip install 'aaplug[{extra}] @ {url}'"
+            wanted = (f"aaplug[{extra}] @ {url}",)
         case _:
-            return f"pip install 'aaplug[{extra}]'"
+            wanted = (f"aaplug[{extra}]",)
+    return command_line(("pip", "install", *wanted))

@@ -138,13 +138,11 @@ function saveStill() {
   if (link.send({still: {width, height, side: sideSeen()}})) say("rendering the picture");
 }
 
-const quoted = (word) => /^[\w@%+=:,./-]+$/.test(word) ? word : /["$`]/.test(word) ? `'${word.replaceAll("'", "'\\''")}'` : `"${word}"`;
-
 function commandLine() { // what renders a side as it is seen, by the camera in VIEW_FILE
   const {recipe, quality} = state.sides[sideSeen()];
   const how = ["--recipe", recipe, ...(takesQuality(recipe) ? ["--quality", quality] : [])];
-  const colour = state.background ? ["--background", state.background] : [];
-  return ["aaplug", "render", ...about.words, ...colour, "--path", VIEW_FILE, ...how, "-o", "view.png"].map(quoted).join(" ");
+  const colour = state.background ? ["--background", `"${state.background}"`] : []; // to all shells # begins a remark
+  return ["aaplug render", about.words, ...colour, "--path", VIEW_FILE, ...how, "-o", "view.png"].join(" ");
 }
 
 async function copyCommand() { // and save the camera that it names
