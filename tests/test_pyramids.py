@@ -31,6 +31,7 @@ from aaplug.io.scenes.pyramid_folder import MANIFEST, hash_of, pyramid_of, read_
 from aaplug.levels.merging import Goal, merge_in_chunks
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import FormatError
+from aaplug.system.monitor import Monitor
 from aaplug.verbs.lod import lod
 from tests.conftest import make_camera, make_scene, make_splats
 
@@ -284,12 +285,20 @@ def test_a_folder_of_levels_is_a_scene(cli, folder):
     assert cli("lod levels --cameras . -o light.ply --simplify 0.5 --no-refine")[0] == 0
 
 
+class Interrupting(Monitor):
+    """Ends a run once the second level is merged."""
+
+    def say(self, text: str) -> None:
+        if "0.25 × the training rate" in text:
+            raise KeyboardInterrupt
+
+
 def test_building_goes_on_where_it_stopped(cli, folder):
     first = {file.name: file.read_bytes() for file in folder.iterdir()}
-    (folder / "scene_lod2.ply").unlink()
-    manifest = json.loads((folder / MANIFEST).read_text())
-    manifest["levels"].pop()
-    (folder / MANIFEST).write_text(json.dumps(manifest))
+    shutil.rmtree(folder)
+    with pytest.raises(KeyboardInterrupt):
+        lod("scene.ply", ".", folder, levels=2, steps=3, monitor=Interrupting())
+    assert {file.name: file.read_bytes() for file in folder.glob("*.ply")}.items() < first.items()
     unfinished = cli("info levels")
     assert unfinished[0] == 2
     assert "lists 2 of 3 levels, as making them was interrupted; `aaplug lod --resume`" in unfinished[2]
@@ -312,6 +321,17 @@ def test_fewer_levels_leave_nothing_of_more(cli, folder):
             files = [folder / MANIFEST, *folder.glob("*.ply")]
             assert read_scene(folder).bytes == sum(file.stat().st_size for file in files)
     assert not (folder / MANIFEST).exists()
+
+
+def test_an_earlier_runs_levels_go_whatever_they_are_called_and_no_input_does(cli, folder):
+    refused = cli("lod levels/scene_lod2.ply --cameras . -o levels --levels 1 --no-refine --overwrite")
+    assert refused[0] == 2
+    assert "scene_lod2.ply: is also the input" in refused[2]
+    Path("scene.ply").rename("other.ply")
+    Path("levels/other_lod2.ply").write_bytes(b"of a viewer, so in no manifest")
+    code, _, err = cli("lod other.ply --cameras . -o levels --levels 1 --no-refine --overwrite")
+    assert code == 0, err
+    assert sorted(file.name for file in folder.iterdir()) == [MANIFEST, "other_lod0.ply", "other_lod1.ply"]
 
 
 def in_manifest(**changes):
