@@ -702,6 +702,9 @@ def test_views_are_chosen_by_split_or_name(tmp_path):
         select_views(cameras, "v01,v1")
     with pytest.raises(UsageError):
         select_views(cameras, "")
+    for none in ("test", "all"):
+        with pytest.raises(UsageError, match=f"views: {none} has no views"):
+            select_views(CameraSet(cameras.train if none == "test" else (), ()), none)
     both = read_cameras(blender(tmp_path / "blender"))
     assert select_views(both, "r_0") == (both.test[0],), "a name in both splits is the test view"
 

@@ -170,6 +170,13 @@ def odd_tensors(x: Tensor) -> list[Any]:
     ]
 
 
+def empty_ones(noun: Any) -> list[Any]:
+    """A noun without all, or some, of what it holds."""
+    if isinstance(noun, aaplug.CameraSet):
+        return [aaplug.CameraSet(train, test) for train in ((), noun.train) for test in ((), noun.test)][:3]
+    return [noun[:0]] if isinstance(noun, aaplug.Gaussians | aaplug.Splats2D) else []
+
+
 def wrong_calls(folder: Path) -> Iterator[tuple[str, str, Any, bool, Callable[[], Any]]]:
     """Yield (function, parameter, value, whether it must be refused, call) of each call."""
     for name, (function, right) in right_calls(folder).items():
@@ -177,8 +184,7 @@ def wrong_calls(folder: Path) -> Iterator[tuple[str, str, Any, bool, Callable[[]
             if spec.kind in (spec.VAR_KEYWORD, spec.VAR_POSITIONAL):
                 continue
             thin = spec.kind is spec.KEYWORD_ONLY and len(inspect.signature(function).parameters) > MANY
-            thin = spec.kind is spec.KEYWORD_ONLY and len(inspect.signature(function).parameters) > MANY
-            values = list(ODD_VALUES[number % THIN :: THIN] if thin else ODD_VALUES)
+            values = list(ODD_VALUES[number % THIN :: THIN] if thin else ODD_VALUES) + empty_ones(right.get(parameter))
             unfit = list(STRANGERS)
             if isinstance(right.get(parameter), Tensor):
                 values += odd_tensors(right[parameter].detach())

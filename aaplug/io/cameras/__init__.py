@@ -105,10 +105,12 @@ def holds_cameras(path: str | PathLike[str]) -> bool:
 def select_views(cameras: CameraSet, spec: str) -> tuple[Camera, ...]:
     """The views named by `spec`: train, test, all, or view names separated by commas.
 
-    A name in both splits means the test view.  An unknown name raises UsageError.
+    A name in both splits means the test view.  An unknown name, or a split without views, raises UsageError.
     """
     groups = {"train": cameras.train, "test": cameras.test, "all": cameras.all}
     if spec in groups:
+        if not groups[spec]:
+            raise UsageError("views", f"{spec} has no views; the cameras have {len(cameras.all)} in all")
         return groups[spec]
     known = {camera.name: camera for camera in (*cameras.train, *cameras.test)}
     if spec in known:  # a name may itself hold a comma
