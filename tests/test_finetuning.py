@@ -1,6 +1,9 @@
 """Fine-tuning: gradients of the whole loss, bounds, densification, and runs that nothing can spoil."""
 
 import math
+import os
+import subprocess
+import sys
 from dataclasses import replace
 
 import pytest
@@ -19,7 +22,7 @@ from aaplug.finetuning.loop import advance, loss_at, run
 from aaplug.finetuning.losses import LOSSES, l1_dssim, l2, structural_similarity
 from aaplug.finetuning.parameters import RATES, between, extent, least_log_scales, leaves_of, scene_of
 from aaplug.finetuning.settings import CONSISTENCY, QUICK_SETTINGS, Settings, balance, settings_of
-from aaplug.finetuning.state import State, TuningJob, begin, load, save
+from aaplug.finetuning.state import DYNAMO_FOLDER, State, TuningJob, begin, load, save
 from aaplug.io.images import write_png
 from aaplug.lab.densification import (
     MIN_GRADIENT,
@@ -35,7 +38,7 @@ from aaplug.rasterizers import RASTERIZERS
 from aaplug.rendering.renderer import own_look
 from aaplug.system.errors import FormatError, UsageError
 from aaplug.verbs.finetune import finetune
-from tests.conftest import make_camera, make_scene
+from tests.conftest import ROOT, make_camera, make_scene
 
 F64 = torch.float64
 EYES = [(0.5, -3.5, 0.4), (2.0, -3.0, 1.0), (-2.5, -3.0, 0.2)]
@@ -360,3 +363,12 @@ def test_balanced_weights_are_against_the_roots_of_errors():
     found = balance(QUICK_SETTINGS, errors)
     assert found.weights == pytest.approx({0.5: 50.0, 0.25: 10.0, 0.125: 1.0})
     assert found.anchor == pytest.approx(QUICK_SETTINGS.anchor * 100)
+
+
+def test_a_run_begins_without_a_file_among_the_temporary_ones(tmp_path):
+    program = "from tests.test_finetuning import begin, make_job; begin(make_job()); import os; print(os.environ)"
+    environment = {k: v for k, v in os.environ.items() if k != DYNAMO_FOLDER} | {"TMPDIR": str(tmp_path)}
+    command = [sys.executable, "-c", program]
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True)
+    assert DYNAMO_FOLDER not in done.stdout
+    assert not [*tmp_path.iterdir()]

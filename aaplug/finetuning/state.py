@@ -4,10 +4,13 @@ A checkpoint is one file of everything that the next step depends on, written wh
 tensors, numbers and strings only, and is read as such: nothing in it is executed.
 """
 
+import os
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +28,10 @@ from aaplug.io.atomic import replacing
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.digests import digest_of_files
 from aaplug.system.errors import AaplugError, FormatError, UsageError, printable
+from aaplug.system.locks import scratch
 
 EPSILON = 1e-15  # of Adam (3DGS)
+DYNAMO, DYNAMO_FOLDER = "torch._dynamo", "TORCHINDUCTOR_CACHE_DIR"  # torch's compiler, which its optimizers import
 FORMAT, VERSION = "aaplug finetune", 5  # of a checkpoint
 
 
@@ -115,6 +120,11 @@ def begin(job: TuningJob) -> State:
 
 def optimizer(leaves: Leaves, settings: Settings) -> torch.optim.Adam:
     """Adam over the leaves that move."""
+    if DYNAMO not in sys.modules and DYNAMO_FOLDER not in os.environ:
+        with scratch() as folder:  # else it makes one that stays, though nothing is compiled
+            os.environ[DYNAMO_FOLDER] = str(folder)
+            import_module(DYNAMO)
+            del os.environ[DYNAMO_FOLDER]
     moving = [name for name in settings.rates if leaves[name].numel()]
     groups = [{"params": [leaves[name].requires_grad_()], "lr": 0.0, "name": name} for name in moving]
     return torch.optim.Adam(groups, eps=EPSILON)
