@@ -80,7 +80,13 @@ def test_images_are_the_renderers_also_from_a_checkpoint(method, scene_file, tmp
         assert np.abs(stored / 255 - found["color"]).max() < 0.6 / 255
 
 
-@pytest.mark.parametrize("settings", ["{", "[]", "{}", '{"recipe": 3}', '{"recipe": "auto", "background": [0, 2, 0]}'])
+ODD_SETTINGS = [
+    *("{", "[]", "{}", '{"recipe": "auto", "quality": "best", "background": [0, 2, 0]}'),
+    *('{"recipe": 3, "quality": "best", "background": [0, 0, 0]}', '{"recipe": "auto", "background": [0, 0, 0]}'),
+]
+
+
+@pytest.mark.parametrize("settings", ODD_SETTINGS)
 def test_settings_of_a_checkpoint_are_checked(method, scene_file, tmp_path, settings):
     method.Aaplug(train_dataset=dataset(), config_overrides={"scene": str(scene_file)}).save(str(tmp_path / "made"))
     (tmp_path / "made" / "aaplug.json").write_text(settings)
