@@ -236,6 +236,6 @@ def colour_of(text: str, where: str = "background") -> Colour:
     try:
         red, green, blue = ImageColor.getrgb(text)  # pyright: ignore[reportAssignmentType]
     except ValueError as error:
-        takes = "auto or an opaque colour as CSS writes it, such as white, '#ff8000' or 'rgb(255, 128, 0)'"
+        takes = 'auto or an opaque colour as CSS writes it, such as white, "#ff8000" or "rgb(255, 128, 0)"'
         raise UsageError(where, f"takes {takes}; got '{text[:MAX_VALUE_CHARACTERS]}'") from error
     return red / 255, green / 255, blue / 255

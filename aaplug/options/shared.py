@@ -64,7 +64,7 @@ class ViewOptions(FrameOptions):
     views: Annotated[str, VIEWS] = "test"
     """Views, by name or split."""
     background: Annotated[Background, flag("auto|COLOUR")] = "auto"
-    """Colour behind the scene as CSS writes it, such as white or '#ff8000'; auto is what training had."""
+    """Colour behind the scene as CSS writes it, such as white or "#ff8000"; auto is what training had."""
     threads: Annotated[int | None, THREADS] = None
     """Processor threads (default: all)."""
     rasterizer: Annotated[str | Rasterizer, names(*RASTERIZER_NAMES, kind="rasterizer"), DRAWING] = "auto"
