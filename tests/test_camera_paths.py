@@ -8,7 +8,8 @@ import torch
 
 from aaplug.core import camera_paths as paths
 from aaplug.core.cameras import CameraSet
-from aaplug.io.cameras.camera_path import read_camera_path, sniff
+from aaplug.io.cameras import read_camera_path
+from aaplug.io.cameras.camera_path import sniff
 from aaplug.system.errors import FormatError
 from tests.conftest import make_camera
 
@@ -71,7 +72,7 @@ def test_a_camera_path_is_opengl_with_a_vertical_angle(tmp_path):
 
 
 BROKEN = {
-    "no path": ([], "should be an object with 'camera_path'"),
+    "no path": ([], "no cameras of a known format"),
     "a fisheye": (document(camera_type="fisheye"), "camera_type should be perspective"),
     "no frames": (document(camera_path=[]), "list of frames"),
     "no size": (document(render_width=0), "render_width"),

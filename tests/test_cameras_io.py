@@ -15,8 +15,7 @@ import aaplug
 from aaplug.core.cameras import CameraSet
 from aaplug.core.colours import BLACK, WHITE
 from aaplug.core.lenses import PINHOLE, opencv_lens
-from aaplug.io.cameras import OWN, read_cameras, select_views
-from aaplug.io.cameras.camera_path import read_camera_path
+from aaplug.io.cameras import OWN, read_camera_path, read_cameras, select_views
 from aaplug.io.cameras.cfg_args import read_cfg_args
 from aaplug.io.cameras.options import CameraFileOptions
 from aaplug.system.errors import FormatError, UsageError

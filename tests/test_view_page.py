@@ -16,7 +16,7 @@ from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.imaging import quantised
 from aaplug.core.orbits import pinhole
 from aaplug.evaluation.metrics import psnr
-from aaplug.io.cameras.camera_path import read_camera_path
+from aaplug.io.cameras import read_camera_path
 from aaplug.io.images import read_image
 from aaplug.io.scenes import write_scene
 from aaplug.rendering.renderer import Renderer

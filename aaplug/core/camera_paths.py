@@ -101,6 +101,17 @@ def between(first: Camera, last: Camera, share: float) -> Camera:
     return replace(first, cam_from_world=pose, trained_focal=None, photo=None)
 
 
+def toward(first: Camera, last: Camera, share: float) -> Camera:
+    """As `between`, with the lens on its way too: focal lengths even in octaves, the principal point on a line."""
+    focal = {
+        name: getattr(first, name) * (getattr(last, name) / getattr(first, name)) ** share for name in ("fx", "fy")
+    }
+    middle = {
+        name: getattr(first, name) + share * (getattr(last, name) - getattr(first, name)) for name in ("cx", "cy")
+    }
+    return replace(between(first, last, share), **focal, **middle)
+
+
 def _part(rotation: Float[Tensor, "3 3"], share: float) -> Float[Tensor, "3 3"]:
     """A share of a rotation: exp(share · ln R) (Rodrigues)."""
     skew = (rotation - rotation.T) / 2

@@ -9,7 +9,7 @@ import hashlib
 import json
 import math
 import operator
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -28,6 +28,8 @@ MAX_SIDE = 2**31 - 1  # px: files store sides in 32 bits
 MAX_FOCAL = 1e9  # px: far above any real lens; what is computed from it stays finite
 MAX_DISTANCE = 1e18  # world units from the origin; its square fits into float32
 MIN_SINE = 1e-12  # between the direction of sight and up
+MAX_BLADES = 64
+MAX_EXPOSURES = 4096  # frames averaged to one
 MAX_ROTATION_ERROR = 1e-3  # largest error of an entry of R·Rᵀ that counts as rounding
 
 Side = Annotated[int, Range(1, MAX_SIDE)]  # px
@@ -62,6 +64,7 @@ class Camera:
     photo: the photograph taken from here, if any.  undistortion: how it becomes this view, if it is not of this lens.
         Neither counts for equality.
     lens: maps rays to places in the image.
+    exposure: aperture and shutter; None for an instant through a pinhole or another lens without an opening.
 
     Raises:
         UsageError: a number is out of range, or the pose is no rigid motion.
@@ -79,6 +82,7 @@ class Camera:
     photo: Path | None = None
     undistortion: Undistortion | None = None
     lens: Lens = PINHOLE
+    exposure: "Exposure | None" = None
 
     def __post_init__(self) -> None:
         try:
@@ -103,7 +107,7 @@ class Camera:
 
     @property
     def _scalars(self) -> tuple[object, ...]:
-        return self.name, *self.intrinsics, self.trained_focal, self.lens
+        return self.name, *self.intrinsics, self.trained_focal, self.lens, self.exposure
 
     @property
     def intrinsics(self) -> tuple[float, float, float, float, int, int]:
@@ -159,7 +163,7 @@ class Camera:
     def framed(self, width: Side, height: Side) -> "Camera":
         """The same pose in `width` × `height` px, square as before: the shorter side keeps its field of view."""
         factor = min(width, height) / min(self.hw)
-        middle = {"cx": width / 2, "cy": height / 2}
+        middle = {"cx": width / 2, "cy": height / 2, "exposure": self._exposed_as(lambda c: c.framed(width, height))}
         return replace(self, width=width, height=height, fx=self.fx * factor, fy=self.fy * factor, **middle)
 
     def as_trained(self) -> "Camera":
@@ -167,7 +171,56 @@ class Camera:
         return replace(self, trained_focal=self.focal)
 
     def _stretched(self, width: int, height: int, x: float, y: float) -> "Camera":
-        return replace(self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y)
+        stretched = {"fx": self.fx * x, "fy": self.fy * y, "cx": self.cx * x, "cy": self.cy * y}
+        exposure = self._exposed_as(lambda camera: camera._stretched(width, height, x, y))
+        return replace(self, width=width, height=height, **stretched, exposure=exposure)
+
+    def _exposed_as(self, change: "Callable[[Camera], Camera]") -> "Exposure | None":
+        """The exposure with its cameras changed."""
+        if self.exposure is None or self.exposure.motion is None:
+            return self.exposure
+        opened, closed = map(change, self.exposure.motion)
+        return replace(self.exposure, motion=(opened, closed))
+
+
+@dataclass(frozen=True)
+class Aperture:
+    """The opening of a thin lens.
+
+    radius: of the opening, in world units.  focus: depth of the plane that is sharp, in world units.
+    blades: corners of the opening, which lie on the circle of that radius; 0 for a disc.
+    """
+
+    radius: Annotated[float, Range(above=0, most=MAX_DISTANCE)]
+    focus: Annotated[float, Range(above=0, most=MAX_DISTANCE)]
+    blades: Annotated[int, Range(0, MAX_BLADES)] = 0
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        if self.blades in (1, 2):
+            raise UsageError("blades", f"expected 0 for a disc, or 3 and more, got {self.blades}")
+
+    @property
+    def variance(self) -> float:
+        """Variance of a place in the opening along any axis, in squared world units: second moment over area."""
+        return self.radius**2 * (2 + math.cos(2 * math.pi / self.blades) if self.blades else 3) / 12
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """What a frame gathers light over: the opening of its lens, and the time that its shutter is open.
+
+    aperture: None for a pinhole.
+    motion: the cameras where the shutter opens and where it closes; None for an instant.
+    samples: number of frames that are averaged.
+    """
+
+    aperture: Aperture | None = None
+    motion: tuple[Camera, Camera] | None = None
+    samples: Annotated[int, Range(1, MAX_EXPOSURES)] = 16
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args
 from aaplug.core.colours import Background
 from aaplug.core.conventions import MIN_SEEN_SHARE
 from aaplug.methods import QUALITIES, RateReference
-from aaplug.options.base import CAMERAS, DRAWING, ORBIT, Options, flag, names, number
+from aaplug.options.base import CAMERAS, DRAWING, FILM, ORBIT, Options, flag, names, number
 from aaplug.system.contracts import LazyType
 from aaplug.system.errors import MAX_VALUE_CHARACTERS, UsageError
 from aaplug.system.registry import names_of
@@ -40,6 +40,7 @@ RATE_REFERENCES = get_args(RateReference)
 MAX_SIDE = 16384  # px
 MAX_COORDINATE = 1e7  # world units
 DEFAULT_FOV = 50.0  # degrees
+DEFAULT_SENSOR = 0.036  # scene units: 36 mm, the width of full frame, where a scene unit is a metre
 
 V = TypeVar("V", bound="ViewOptions")
 _PLACE = number(-MAX_COORDINATE, MAX_COORDINATE, several=True, metavar="X Y Z")
@@ -103,6 +104,38 @@ class ImageOptions(Options):
     """Size in px, such as 400x400; -1 on one side keeps the aspect (-1x720)."""
     overwrite: bool = False
     """Replace existing outputs."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilmOptions(RecipeOptions):
+    """Aperture and shutter."""
+
+    f_stop: Annotated[float | None, number(0.01, 1000), FILM] = None
+    """Focal length over the aperture's diameter, such as 2.8; a smaller one defocuses more."""
+    sensor: Annotated[float | None, number(1e-9, 1e9, metavar="WIDTH"), FILM] = None
+    """Width of the sensor in scene units, which sets the focal length of --f-stop (default: 0.036)."""
+    focus_distance: Annotated[float | None, number(1e-9, 1e9, metavar="DISTANCE"), FILM] = None
+    """Depth of the plane that is sharp, in scene units from the camera."""
+    focus_at: Annotated[Sequence[float] | None, _PLACE, FILM] = None
+    """Instead, a place in that plane, X Y Z: the focus follows it along a path."""
+    blades: Annotated[int | None, number(3, 64, whole=True), FILM] = None
+    """Corners of the aperture (default: a disc)."""
+    shutter: Annotated[float | None, number(0.001, 1), FILM] = None
+    """Time that the shutter is open, of that from frame to frame of a path; film's usual is 0.5."""
+    samples: Annotated[int | None, number(0, 4096, whole=True, metavar="N"), FILM] = None
+    """Frames averaged to one (default: 16, or 1 with --quality fast); 0 ignores a path file's aperture."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.focus_at is not None and len(self.focus_at) != 3:
+            raise UsageError("focus_at", f"takes three numbers X Y Z, got {len(self.focus_at)}")
+        if self.focus_distance is not None and self.focus_at is not None:
+            raise UsageError("focus_distance", "and `focus_at` both set the focus; give one")
+        if self.f_stop is not None and self.focus_distance is None and self.focus_at is None:
+            raise UsageError("f_stop", "is an aperture without focus; give `focus_distance` or `focus_at`")
+        for name in ("sensor", "focus_distance", "focus_at", "blades"):
+            if self.f_stop is None and getattr(self, name) is not None:
+                raise UsageError(name, "belongs to `f_stop`")
 
 
 @dataclass(frozen=True, kw_only=True)

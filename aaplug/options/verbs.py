@@ -10,7 +10,7 @@ from typing import Annotated, Literal, get_args
 from aaplug.core.conventions import SpzAxes
 from aaplug.io import MOST_FPS
 from aaplug.io.atomic import AnyPath
-from aaplug.options.base import DRAWING, PYTHON_ONLY, REPORT, TUNING, Options, flag, names, number
+from aaplug.options.base import DRAWING, FILM, PYTHON_ONLY, REPORT, TUNING, Options, flag, names, number
 from aaplug.options.shared import (
     RECIPE_METAVAR,
     SCALE,
@@ -18,6 +18,7 @@ from aaplug.options.shared import (
     STEPS,
     THREADS,
     VIEWS,
+    FilmOptions,
     ImageOptions,
     OneProtocol,
     OneRecipe,
@@ -61,23 +62,25 @@ class WritingOptions(Options):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RenderOptions(RecipeOptions, ImageOptions):
+class RenderOptions(FilmOptions, ImageOptions):
     """Rendering."""
 
-    path: Annotated[AnyPath | None, flag("FILE.json")] = None
-    """Instead of --views: cameras of a path file, nerfstudio's camera_path.json or what the page of `view` saves."""
+    path: Annotated[AnyPath | None, flag("FILE")] = None
+    """Instead of --views: cameras of a path file, which `aaplug guide film-camera` lists."""
     bit_depth: Literal[8, 16] = 8
     """Bits per colour channel."""
+    camera_to: Annotated[str | None, flag("VIEW"), FILM] = None
+    """For one view: the view that the camera reaches while the shutter is open."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class VideoOptions(RecipeOptions, ImageOptions):
+class VideoOptions(FilmOptions, ImageOptions):
     """Rendering, and the camera path."""
 
     scale: Annotated[float | None, SCALE] = None
     """Size relative to the training size, or to that of a path file (default: 1)."""
-    path: Annotated[AnyPath, flag("zoom|dolly|orbit|FILE.json")] = "zoom"
-    """zoom (focal length), dolly (distance) or orbit from the first of --views, or nerfstudio's camera_path.json."""
+    path: Annotated[AnyPath, flag("zoom|dolly|orbit|FILE")] = "zoom"
+    """zoom (focal length), dolly (distance) or orbit from the first of --views, or a path file as of render."""
     beside: Annotated[str | Recipe | None, names("none", kind="recipe", metavar=f"none|{RECIPE_METAVAR}")] = "classic"
     """Recipe to show on the left; none shows --recipe alone."""
     start: Annotated[float, SCALE] = 1.0

@@ -4,6 +4,7 @@ Times are those of examples/guides/speed.md, on two cores; other machines differ
 """
 
 from collections.abc import Iterable
+from operator import mul
 from typing import NamedTuple
 
 from aaplug.core.cameras import Camera
@@ -28,9 +29,11 @@ def cost_of(renderers: Iterable[Renderer], views: Iterable[Camera]) -> Cost:
     views, found = list(views), Cost(0.0, 0.0, 0.0)
     for renderer in renderers:
         per_gaussian, per_sample = COMPILED if renderer.rasterizer.name == "compiled" else EAGER
-        samples = [view.width * view.height * renderer.samples(view) ** 2 for view in views]
+        counts, sides = zip(*map(renderer.frames, views), strict=True) if views else ((), ())
+        samples = [view.width * view.height * side**2 for view, side in zip(views, sides, strict=True)]
+        drawn = sum(map(mul, counts, samples))
         found = Cost(
-            found.seconds + per_gaussian * len(renderer.scene) * len(views) + per_sample * sum(samples),
+            found.seconds + per_gaussian * len(renderer.scene) * sum(counts) + per_sample * drawn,
             max(found.scene, renderer.scene.sh.untyped_storage().nbytes()),
             max(found.image, SAMPLE_BYTES * max(samples, default=0)),
         )

@@ -10,6 +10,7 @@ and weighing the samples of each pixel.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import reduce
 from os import PathLike
 from typing import NamedTuple
 
@@ -21,6 +22,7 @@ from aaplug.core.cameras import Camera, CameraSet, Factor
 from aaplug.core.colours import BLACK, Background, Colour, Share
 from aaplug.core.conventions import MIN_SEEN_SHARE
 from aaplug.core.culling import cull
+from aaplug.core.exposures import cells, sample_cameras
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.imaging import average_samples
 from aaplug.core.interfaces import Rasterizer
@@ -182,21 +184,38 @@ class Renderer:
             UsageError: a Gaussian in view has a colour that is NaN or infinite, or memory does not suffice.
         """
         with within_memory(f"view {camera.name} at {camera.width}x{camera.height}"):
-            return self.draw(camera).render
+            return self.draw(camera).render if camera.exposure is None else self.exposed(camera)
+
+    @contract
+    @on_free_cores()
+    def exposed(self, camera: Camera) -> Render:
+        """Render one view with its exposure: the mean of its frames."""
+        count, samples = self.frames(camera)
+        weight = self.sampling(camera, samples)[1] if count == 1 else 0.0
+        fine = self._fine(camera, samples)
+        frames = (self.paint(self.splats(each, samples), fine.hw) for each in sample_cameras(fine))
+        pixels = (average_samples(frame, samples, weight) for frame in frames)
+        rgb, alpha = reduce(lambda total, frame: Render(*map(torch.add, total, frame)), pixels)
+        return Render(rgb / count, alpha / count)
 
     @contract
     @on_free_cores()
     def draw(self, camera: Camera) -> Drawing:
         """Render one view and keep its splats, for example to read their gradients."""
         samples, weight = self.sampling(camera)
+        fine = self._fine(camera, samples)
+        splats = self.splats(fine, samples)
+        image = self.paint(splats, fine.hw)
+        return Drawing(average_samples(image, samples, weight), splats, fine.hw)
+
+    def _fine(self, camera: Camera, samples: int) -> Camera:
+        """The camera of the supersampled image; raises UsageError where memory does not suffice."""
         fine = camera if samples == 1 else camera.resized(camera.width * samples, camera.height * samples)
         pixels = fine.width * fine.height
         if pixels > UNCHECKED_SAMPLES and (lacking := lack_of_memory(SAMPLE_BYTES * pixels)):
             problem = f"with {samples}×{samples} samples per pixel would take {lacking}; a smaller image needs less"
             raise UsageError(f"view {camera.name} at {camera.width}x{camera.height}", problem)
-        splats = self.splats(fine, samples)
-        image = self.paint(splats, fine.hw)
-        return Drawing(average_samples(image, samples, weight), splats, fine.hw)
+        return fine
 
     @contract
     @on_free_cores()
@@ -243,6 +262,15 @@ class Renderer:
                 samples = int(min(samples, max(recipe.levels.most_samples, for_coarsest)))
         sampled_rate = max(10**-RATE_DIGITS, round(samples * rate, RATE_DIGITS))
         return samples, recipe.neighbours_at(sampled_rate) if weighs else 0.0
+
+    @contract
+    def frames(self, camera: Camera) -> tuple[int, int]:
+        """Frames that a view is the mean of, and samples along a pixel's side in each.
+
+        In all they are at least the recipe's samples, because the frames of an exposure share the pixel, too.
+        """
+        count = 1 if camera.exposure is None else camera.exposure.samples
+        return count, math.ceil(self.samples(camera) / math.sqrt(count) - RATE_TOLERANCE)
 
     @contract
     def coarsening(self, camera: Camera, samples: int) -> float:
@@ -329,6 +357,8 @@ class Renderer:
         elif places:
             splats = replace(splats, sources=own + places)
         splats = recipe.screen(splats, camera, training)
+        if camera.exposure is not None:
+            splats = splats.convolved(cells(splats, camera), compensate=True, floor=0.0)
         if shares is not None:
             splats = faded(splats, shares.index_select(0, own))
         ellipses = recipe.pixel.bounding_ellipses(splats, rules)

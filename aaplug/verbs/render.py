@@ -7,9 +7,10 @@ from typing import NamedTuple
 
 from aaplug.core.cameras import Camera
 from aaplug.io.atomic import AnyPath
-from aaplug.io.cameras.camera_path import read_camera_path
+from aaplug.io.cameras import read_camera_path, select_views
 from aaplug.io.scenes import SceneLike
 from aaplug.options.verbs import RenderOptions
+from aaplug.rendering.film import filmed
 from aaplug.rendering.frames import write_frames
 from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.rendering.renderer import Renderer
@@ -41,8 +42,11 @@ def render(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, optio
     """
     target = Path("images" if output is None else output)
     job = Job.of(scene, cameras, options, single=names_image(target))
-    path = None if options.path is None else read_camera_path(options.path).cameras
-    views = resized(path or job.views, options.scale, options.resolution, job.cameras.assumed and path is None)
+    file = None if options.path is None else read_camera_path(options.path)
+    size = options.scale, options.resolution, file.unsized if file else job.cameras.assumed
+    ends = select_views(job.cameras, options.camera_to) if options.camera_to else ()
+    views = resized(file.cameras if file else job.views, *size)
+    views = filmed(views, options, file is not None, file and file.shutter, resized(ends, *size))
     check = partial(image_paths, target, views, options.overwrite)
     paths = check()
     with running(options, target, check, job.inputs, folder=not names_image(target)) as workers:
@@ -60,12 +64,14 @@ def render(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, optio
 def description(renderer: Renderer, views: Sequence[Camera]) -> str:
     """Recipe, views, sizes and samples per pixel of the images to render, in words."""
     rates = [renderer.relative_rate(view) for view in views]
-    samples = sorted({renderer.samples(view) for view in views})
+    counts, samples = (sorted(set(column)) for column in zip(*map(renderer.frames, views), strict=True))
     grid = " or ".join(f"{n}×{n}" for n in samples)
+    exposed = any(view.exposure for view in views)
+    mean = f", mean of {' or '.join(map(str, counts))} frames" * exposed
     sizes = listing(sorted({f"{view.width}x{view.height}" for view in views}), most=3)
     span = " to ".join(dict.fromkeys(f"{rate:.3g}" for rate in (min(rates), max(rates))))
     kind = f"{renderer.training.convention.name} scene{' of 2D Gaussians' * renderer.scene.flat}"
     return (
         f"recipe: {renderer.recipe.name} for a {kind}, {len(views)} view{'s' * (len(views) != 1)} at {sizes}, "
-        f"{span} × the training rate: {grid} sample{'s' * (samples != [1])} per pixel"
+        f"{span} × the training rate: {grid} sample{'s' * (samples != [1])} per pixel{mean}"
     )

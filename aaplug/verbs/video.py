@@ -14,10 +14,11 @@ from aaplug.core.cameras import Camera
 from aaplug.evaluation.protocols import median_depth
 from aaplug.evaluation.report.contact_sheet import labelled, magnified
 from aaplug.io.atomic import AnyPath
-from aaplug.io.cameras.camera_path import read_camera_path
+from aaplug.io.cameras import read_camera_path
 from aaplug.io.scenes import SceneLike
 from aaplug.io.video import check_video
 from aaplug.options.verbs import VideoOptions
+from aaplug.rendering.film import filmed
 from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.rendering.videos import make_video
 from aaplug.system.errors import UsageError
@@ -53,13 +54,14 @@ def video(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, option
     """
     target = Path("video.webm" if output is None else output)
     file = None if str(options.path) in PATHS else read_camera_path(Path(options.path))
-    fps = options.fps or (DEFAULT_FPS if file is None else file.fps)
+    fps = options.fps or (file and file.fps) or DEFAULT_FPS
     check = partial(check_video, target, fps, options.overwrite)
     check()
     job = Job.of(scene, cameras, options)
     recipes = [job.recipe(name) for name in (options.beside or "none", options.recipe) if name != "none"]
     path = file.cameras if file else _built_in_path(job, fps)
-    views = resized(path, options.scale, options.resolution, job.cameras.assumed and file is None)
+    views = resized(path, options.scale, options.resolution, file.unsized if file else job.cameras.assumed)
+    views = filmed(views, options, True, file and file.shutter)
     labels = [{"auto": "aaplug auto"}.get(recipe.name, recipe.name) for recipe in recipes]
 
     def compose(index: int, images: Sequence[Float[Tensor, "h _ 3"]]) -> Float[Tensor, "h w 3"]:

@@ -14,6 +14,7 @@ from typing import Protocol, runtime_checkable
 
 from aaplug.core.cameras import Camera, CameraSet
 from aaplug.io.cameras import blender, camera_path, colmap, inria, inria_model, llff, multiscale, pinhole, transforms
+from aaplug.io.cameras.camera_path import CameraPath
 from aaplug.io.cameras.options import CameraFileOptions
 from aaplug.io.cameras.photos import files_of
 from aaplug.system.contracts import contract
@@ -54,6 +55,7 @@ class CameraFormat(Protocol):
 # the first that accepts a path is used
 OWN: tuple[CameraFormat, ...]
 OWN = (pinhole, camera_path, inria_model, colmap, blender, inria, multiscale, transforms, llff)
+PATH_FORMATS = (camera_path,)
 CAMERA_FORMATS = Registry[CameraFormat]("camera format", "aaplug.io.cameras:CameraFormat", named(OWN))
 
 
@@ -95,6 +97,20 @@ def read_cameras(
             return replace(cameras, files=files_of(path, cameras))
     signs = "; ".join(format.sign for format in formats)
     raise FormatError(path, f"holds no cameras of a known format; looked for: {signs}")
+
+
+def read_camera_path(path: str | PathLike[str]) -> CameraPath:
+    """Read the cameras of a path in order: of a path file, or of any file or folder that `read_cameras` takes.
+
+    Raises:
+        FormatError: there are no cameras, or a file breaks its format.
+        UsageError: a package is missing.
+    """
+    for format in PATH_FORMATS:
+        if format.sniff(Path(path)):
+            return format.path_of(Path(path))
+    views = read_cameras(path, test_every=0).all
+    return CameraPath(tuple(replace(view, trained_focal=None, photo=None) for view in views))
 
 
 def holds_cameras(path: str | PathLike[str]) -> bool:

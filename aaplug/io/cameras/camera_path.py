@@ -2,20 +2,21 @@
 
 {render_width, render_height, fps, camera_type, camera_path: [{camera_to_world, fov}]}.  camera_to_world: 16 numbers,
 row by row, OpenGL axes, in the frame of the trained scene; fov: the vertical angle in degrees; sizes in px.  The live
-page adds what makes a camera exact, in px: fl_x, fl_y, cx, cy and, at a pose of the data set, trained_focal.
+page adds what makes a camera exact, in px: fl_x, fl_y, cx, cy and, at a pose of the data set, trained_focal.  Our
+add-on for Blender adds shutter, a share of the time between frames, and to a frame an aperture {radius, focus, blades}.
 """
 
 import math
 import os
 from dataclasses import dataclass, replace
-from os import PathLike
 from pathlib import Path
 
-from aaplug.core.cameras import Camera, CameraSet
+from aaplug.core.cameras import Aperture, Camera, CameraSet, Exposure
 from aaplug.io.cameras.options import CameraFileOptions, described_sizes, file_sizes, undivided
 from aaplug.io.cameras.photos import refuse_folder
 from aaplug.io.cameras.poses import centred, inverse, pose_of_opengl
 from aaplug.io.values import Entry, entries, focal, mentions, number, object_of, pixels, read_json
+from aaplug.system.errors import UsageError
 
 KEY = "camera_path"
 PERSPECTIVE = "perspective"
@@ -29,10 +30,17 @@ sign = "a JSON file with camera_path (nerfstudio)"
 
 @dataclass(frozen=True)
 class CameraPath:
-    """Cameras in order, and the frame rate, in 1/s."""
+    """Cameras in order, and how they are filmed.
+
+    fps: frames per second; None if nothing says.
+    shutter: time that the shutter is open, as a share of that from frame to frame; None if nothing says.
+    unsized: the file gives no size, and an image of another shape keeps its pixels square.
+    """
 
     cameras: tuple[Camera, ...]
-    fps: float
+    fps: float | None = None
+    shutter: float | None = None
+    unsized: bool = False
 
 
 def sniff(path: Path) -> bool:
@@ -43,7 +51,7 @@ def sniff(path: Path) -> bool:
 def read(path: Path, options: CameraFileOptions) -> CameraSet:
     """The cameras.  They are free: not poses of a dataset, so they say nothing about the sampling of training."""
     refuse_folder(options)
-    cameras = read_camera_path(path).cameras
+    cameras = [replace(camera, exposure=None) for camera in path_of(path).cameras]
     sizes, _ = file_sizes(cameras, options)
     cameras = [camera.resized(*size) for camera, size in zip(cameras, sizes, strict=True)]
     split = undivided(cameras, "a path has no split")
@@ -52,9 +60,8 @@ def read(path: Path, options: CameraFileOptions) -> CameraSet:
     return CameraSet(split.train, split.test, notes=(note, split.note))
 
 
-def read_camera_path(path: str | PathLike[str]) -> CameraPath:
-    """Read the frames of a video; raises FormatError for a file that breaks its format."""
-    path = Path(path)
+def path_of(path: Path) -> CameraPath:
+    """The frames of a video; raises FormatError for a file that breaks its format."""
     about = object_of(read_json(path), path, "the path", f"'{KEY}', as nerfstudio writes", KEY)
     kind = about.fields.get("camera_type", PERSPECTIVE)
     about.place.expect(kind == PERSPECTIVE, "camera_type", PERSPECTIVE, kind)
@@ -63,7 +70,9 @@ def read_camera_path(path: str | PathLike[str]) -> CameraPath:
     about.place.expect(fps > 0, "fps", "above 0", fps)
     frames = entries(path, "frame", about.fields[KEY])
     digits = len(str(len(frames) - 1))
-    return CameraPath(tuple(_camera(entry, f"{i:0{digits}}", size) for i, entry in enumerate(frames)), fps)
+    shutter = about.get("shutter", number) if about.fields.get("shutter") is not None else None
+    about.place.expect(shutter is None or 0 < shutter <= 1, "shutter", "above 0, at most 1", shutter)
+    return CameraPath(tuple(_camera(entry, f"{i:0{digits}}", size) for i, entry in enumerate(frames)), fps, shutter)
 
 
 def _camera(entry: Entry, name: str, size: tuple[int, int]) -> Camera:
@@ -78,4 +87,16 @@ def _camera(entry: Entry, name: str, size: tuple[int, int]) -> Camera:
         for key, field in EXACT.items()
         if entry.fields.get(key) is not None
     }
-    return replace(centred(name, size, (f, f), cam_from_world), **exact)
+    return replace(centred(name, size, (f, f), cam_from_world), **exact, exposure=_exposure(entry))
+
+
+def _exposure(entry: Entry) -> Exposure | None:
+    if entry.fields.get("aperture") is None:
+        return None
+    about = entry.entry("aperture")
+    radius, focus = about.get("radius", number), about.get("focus", number)
+    blades = about.get("blades", number, 0.0)
+    try:
+        return Exposure(Aperture(radius, focus, int(blades)))
+    except UsageError as error:
+        raise entry.place.error(f"aperture: {error}") from error

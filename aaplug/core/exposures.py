@@ -1,0 +1,130 @@
+"""Frames with an aperture and a shutter, as means of frames of moved pinholes.
+
+Each sample of an exposure is one frame (Haeberli and Akeley, "The accumulation buffer", 1990).  One set of samples
+covers the pixel, the lens and the time together (Cook, Porter and Carpenter, "Distributed ray tracing", 1984).  A
+sample's camera stands at its place in the opening, its principal point moved so that the plane in focus stays.
+
+What follows is aaplug's own.  Each sample stands for a cell of the set, and so its splats are convolved with their path
+across that cell: samples that are few overlap instead of showing as ghosts.  A single sample takes the whole path,
+which is defocus as a filter.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import lru_cache
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from aaplug.core.camera_paths import toward
+from aaplug.core.cameras import Aperture, Camera
+from aaplug.core.rules import NEAR
+from aaplug.core.splats import Splats2D
+
+# Of a cell's variance, what its splats are convolved with; measured.  Opaque splats hide each other, and a wider filter
+# adds the energies of those that are hidden too.
+CELL_SHARE = 0.5
+DIMENSIONS = 5  # x and y in the pixel and in the lens, and time
+MAX_SHIFT = 1e6  # px: a splat that moves farther in an exposure looks the same
+MAX_GENERATORS = 256  # lattices tried
+
+
+def sample_cameras(camera: Camera) -> Iterator[Camera]:
+    """The camera of each sample of its exposure, which it keeps: `cells` reads it."""
+    exposure = camera.exposure
+    assert exposure is not None
+    for x, y, u, v, time in lattice(exposure.samples).tolist():
+        moved = camera if exposure.motion is None else toward(*exposure.motion, time)
+        right, down = (0.0, 0.0) if exposure.aperture is None else opening(exposure.aperture, u, v)
+        near = 0.0 if exposure.aperture is None else 1 / exposure.aperture.focus
+        pose = moved.cam_from_world.clone()
+        pose[:3, 3] -= pose.new_tensor([right, down, 0.0])
+        cx, cy = moved.cx + 0.5 - x + moved.fx * right * near, moved.cy + 0.5 - y + moved.fy * down * near
+        yield replace(camera, fx=moved.fx, fy=moved.fy, cx=cx, cy=cy, cam_from_world=pose)
+
+
+def cells(splats: Splats2D, camera: Camera) -> Float[Tensor, "m 3"]:
+    """Packed covariance in px² that one sample adds to each splat: of its path across the sample's cell.
+
+    N samples that fill an ellipse of covariance Σ evenly have cells of covariance √det Σ / N; along a line, of λ / N².
+    """
+    assert camera.exposure is not None
+    xx, xy, yy = spread(splats, camera).unbind(dim=1)
+    middle, half, count = (xx + yy) / 2, (xx - yy) / 2, camera.exposure.samples
+    radius = torch.hypot(half, xy)
+    longer, shorter = middle + radius, (middle - radius).clamp(min=0.0)
+    even = (longer * shorter).sqrt() / count
+    along, across = torch.maximum(even, longer / count**2), torch.minimum(even, shorter)
+    mean, turn = (along + across) / 2, (along - across) / 2 / radius.clamp(min=torch.finfo(xx.dtype).tiny)
+    return CELL_SHARE * torch.stack([mean + turn * half, turn * xy, mean - turn * half], dim=1)
+
+
+def spread(splats: Splats2D, camera: Camera) -> Float[Tensor, "m 3"]:
+    """Packed covariance in px² of each splat's path while the whole opening and time pass.
+
+    A place r of the opening moves a splat at depth z by f r (1/focus - 1/z) px; of even motion by d px, the covariance
+    is d dᵀ / 12.
+    """
+    exposure = camera.exposure
+    assert exposure is not None
+    path = splats.covs.new_zeros(len(splats), 3)
+    if (aperture := exposure.aperture) is not None:
+        scale = (1 / aperture.focus - 1 / splats.depths).square() * aperture.variance
+        path += scale[:, None] * path.new_tensor([camera.fx**2, 0.0, camera.fy**2])
+    if exposure.motion is not None:
+        x, y = (placed(splats, camera, exposure.motion[1]) - placed(splats, camera, exposure.motion[0])).unbind(dim=1)
+        path += torch.stack([x * x, x * y, y * y], dim=1) / 12
+    return path
+
+
+def placed(splats: Splats2D, camera: Camera, other: Camera) -> Float[Tensor, "m 2"]:
+    """Places in px, seen by another camera, of splats that this one sees."""
+    focal, middle = (splats.means.new_tensor(pair) for pair in ((camera.fx, camera.fy), (camera.cx, camera.cy)))
+    local = torch.cat([(splats.means - middle) / focal, torch.ones_like(splats.means[:, :1])], dim=1)
+    turn = other.cam_from_world[:3, :3] @ camera.cam_from_world[:3, :3].T
+    shift = other.cam_from_world[:3, 3] - turn @ camera.cam_from_world[:3, 3]
+    seen = (local * splats.depths[:, None]) @ turn.T.to(local) + shift.to(local)
+    focal, middle = (splats.means.new_tensor(pair) for pair in ((other.fx, other.fy), (other.cx, other.cy)))
+    return (seen[:, :2] / seen[:, 2:].clamp(min=NEAR) * focal + middle).clamp(-MAX_SHIFT, MAX_SHIFT)
+
+
+def opening(aperture: Aperture, u: float, v: float) -> tuple[float, float]:
+    """Right and down in world units of a place in the opening, from the unit square; areas keep their shares.
+
+    The square goes to the disc by Shirley and Chiu's concentric map (1997); in a polygon, each sector of the disc goes
+    to a triangle, where the tangent of the angle is even.
+    """
+    a, b = 2 * u - 1, 2 * v - 1
+    if a == b == 0:
+        return 0.0, 0.0
+    radius, angle = (a, b / a * math.pi / 4) if abs(a) > abs(b) else (b, math.pi / 2 - a / b * math.pi / 4)
+    if aperture.blades:
+        half = math.pi / aperture.blades
+        angle += math.pi * (radius < 0)
+        radius = abs(radius)
+        sector, share = divmod(angle / (2 * half), 1.0)
+        within = math.atan((2 * share - 1) * math.tan(half))
+        radius *= math.cos(half) / math.cos(within)
+        angle = (2 * sector + 1) * half + within
+    return aperture.radius * radius * math.cos(angle), aperture.radius * radius * math.sin(angle)
+
+
+@lru_cache(maxsize=16)
+def lattice(count: int) -> Float[Tensor, "count 5"]:
+    """Points of (0, 1)⁵ of mean 1/2: the rank-1 lattice of Korobov's form (1959) of least P₂ (Sloan and Joe 1994).
+
+    Along each axis there is one point in each of `count` equal parts.
+    """
+    index = torch.arange(count)
+    best, least = None, math.inf
+    tried = [a for a in range(1, max(2, count)) if math.gcd(a, count) == 1]
+    for generator in tried[:: -(-len(tried) // MAX_GENERATORS)]:
+        powers = [pow(generator, power, count) for power in range(DIMENSIONS)]
+        points = ((index[:, None] * torch.tensor(powers)) % count).double() / count
+        excess = float((1 + 2 * math.pi**2 * (points * (points - 1) + 1 / 6)).prod(dim=1).mean())
+        if excess < least:
+            best, least = points, excess
+    assert best is not None
+    return best + 0.5 / count

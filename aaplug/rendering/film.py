@@ -1,0 +1,97 @@
+"""Views with the aperture and the shutter that options ask for, checked before anything is drawn."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+
+from aaplug.core.camera_paths import toward
+from aaplug.core.cameras import Aperture, Camera, Exposure
+from aaplug.options.shared import DEFAULT_SENSOR, FilmOptions
+from aaplug.system.errors import UsageError
+
+SAMPLES, FAST_SAMPLES = 16, 1
+
+
+def filmed(
+    views: Sequence[Camera],
+    options: FilmOptions,
+    path: bool,
+    shutter: float | None = None,
+    camera_to: Sequence[Camera] = (),
+) -> list[Camera]:
+    """The views with an exposure each, where the options or the views themselves ask for one.
+
+    Args:
+        views: at the size to draw; the frames of one motion in order, if `path`.
+        options: they win over what the views and `shutter` say.
+        path: see `views`.
+        shutter: that the path's file asks for, as the option of that name.
+        camera_to: for one view, the camera where the shutter closes, at the same size.
+
+    Raises:
+        UsageError: the focus lies behind a camera, there is no motion to blur, or samples of nothing are asked for.
+    """
+    shutter = shutter if options.shutter is None else options.shutter
+    if options.samples == 0:
+        return [replace(view, exposure=None) for view in views]
+    apertures = [_aperture(view, options) for view in views]
+    motions: Sequence[tuple[Camera, Camera]] = ()
+    if camera_to:
+        if path or not len(views) == len(camera_to) == 1:
+            raise UsageError("camera_to", "names one view, for one view that is not of a path")
+        if options.shutter is not None:
+            raise UsageError("camera_to", "is where the shutter closes; leave out `shutter`")
+        motions = [(_instant(views[0]), _instant(camera_to[0]))]
+    elif shutter is not None:
+        if not path:
+            raise UsageError(
+                "shutter", "is a share of the time between frames of a path; for one view give `camera_to`"
+            )
+        motions = _motions([_instant(view) for view in views], shutter)
+    if motions and all(_still(*motion) for motion in motions):
+        raise UsageError("camera_to" if camera_to else "shutter", "finds no motion: the path has zero length")
+    if options.samples is not None and not any(apertures) and not motions:
+        raise UsageError("samples", "are of an aperture or a shutter; give `f_stop` or `shutter`")
+    count = options.samples or (FAST_SAMPLES if options.quality == "fast" else SAMPLES)
+    exposures = [
+        Exposure(aperture, motion, count) if aperture or motion else None
+        for aperture, motion in zip(apertures, motions or [None] * len(views), strict=True)
+    ]
+    return [replace(view, exposure=exposure) for view, exposure in zip(views, exposures, strict=True)]
+
+
+def _aperture(view: Camera, options: FilmOptions) -> Aperture | None:
+    """The aperture that the options give the view, or else its own."""
+    if options.f_stop is None:
+        return view.exposure and view.exposure.aperture
+    focus = options.focus_distance
+    if options.focus_at is not None:
+        place = torch.tensor([options.focus_at], dtype=torch.float64)
+        focus = float(view.project(place)[1])
+        if focus <= 0:
+            raise UsageError("focus_at", f"lies behind the camera of view {view.name}, at a depth of {focus:.4g}")
+    assert focus is not None
+    sensor = DEFAULT_SENSOR if options.sensor is None else options.sensor
+    focal = view.fx / view.width * sensor  # in scene units
+    return Aperture(focal / options.f_stop / 2, focus, options.blades or 0)
+
+
+def _instant(view: Camera) -> Camera:
+    return replace(view, exposure=None)
+
+
+def _motions(frames: Sequence[Camera], shutter: float) -> list[tuple[Camera, Camera]]:
+    """Cameras where the shutter opens and closes around each frame; beyond its ends a path goes straight on."""
+    if len(frames) < 2:
+        raise UsageError("shutter", "finds no motion: the path has one frame")
+    ends = toward(frames[0], frames[1], -1.0), toward(frames[-1], frames[-2], -1.0)
+    around = zip([ends[0], *frames[:-1]], frames, [*frames[1:], ends[1]], strict=True)
+    return [(toward(frame, before, shutter / 2), toward(frame, after, shutter / 2)) for before, frame, after in around]
+
+
+def _still(first: Camera, last: Camera) -> bool:
+    """Whether two cameras see the same."""
+    return first.intrinsics == last.intrinsics and torch.allclose(
+        first.cam_from_world, last.cam_from_world, 1e-9, 1e-12
+    )

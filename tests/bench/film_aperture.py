@@ -1,0 +1,122 @@
+"""Defocus and motion blur by few samples against 1024, and what they cost."""
+
+import math
+import time
+from collections.abc import Callable
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from statistics import median
+
+import torch
+
+from aaplug.core.camera_paths import orbit
+from aaplug.core.cameras import Aperture, Camera, Exposure
+from aaplug.evaluation.metrics import psnr
+from aaplug.io.cameras import read_cameras
+from aaplug.io.images import write_png
+from aaplug.rendering import renderer as rendering
+from aaplug.rendering.renderer import Renderer
+from tests.bench import heading, row
+from tests.conftest import SAMPLE, SHARED_DATA
+
+RADII = (2, 5, 10, 20, 40)  # px: of the largest circles of confusion, those of the farthest 1 % of the splats
+LENGTHS = (5, 10, 20, 40)  # px: median length of the splats' ways while the shutter is open
+NEAREST, FARTHEST = 0.1, 0.99  # quantiles of depth: in focus, and of the largest circle
+TRUTH = 1024  # samples
+
+
+def main(scale: float = 0.5, views: int = 1, rounds: int = 3, pictures: Path | None = None) -> None:
+    """Print figures for the sample scene, and for the chair where it is there.
+
+    scale: of the images, against training's.  views: test views of each scene.  rounds: of the timing.
+    pictures: a folder for the images.
+    """
+    chair = SHARED_DATA / "chair"
+    scenes = {"sample": (SAMPLE / "chair.ply", SAMPLE), "chair": (chair / "chair.ply", chair)}
+    for name, (scene, cameras) in scenes.items():
+        if scene.exists():
+            aperture(name, scene, cameras, scale, views, rounds, pictures)
+
+
+@torch.no_grad()
+def aperture(
+    name: str, scene: Path, cameras: Path, scale: float, views: int, rounds: int = 3, pictures: Path | None = None
+) -> None:
+    """Figures of one scene: PSNR in dB against 1024 samples, and time against separate frames."""
+    dataset = read_cameras(cameras)
+    renderer = Renderer.of(str(scene), dataset)
+    chosen = [camera.scaled(scale) for camera in dataset.test[: 3 * views : 3]]
+    for kind, steps, exposure in (("defocus", RADII, _aperture), ("motion", LENGTHS, _motion)):
+        heading(f"{name}, {kind}: dB from {TRUTH} samples", "px", "1", "4", "16", "16 plain", "pinhole", "time")
+        for size in steps:
+            figures: list[list[float]] = []
+            for view in chosen:
+                of = exposure(renderer, view, size)
+                truth = renderer(of(TRUTH)).rgb
+                images = {str(n): renderer(of(n)).rgb for n in (1, 4, 16)}
+                with without_cells():
+                    images["16 plain"] = renderer(of(16)).rgb
+                images["pinhole"] = renderer(view).rgb
+                ratio = _time(lambda of=of: renderer(of(16)), lambda of=of: _separate(renderer, of(16)), rounds)
+                figures.append([*(psnr(image, truth) or math.inf for image in images.values()), ratio])
+                for word, image in {**images, "truth": truth}.items() if pictures else ():
+                    write_png(pictures / f"{name}-{kind}-{size}-{word}.png", image, overwrite=True)
+            row(size, *(f"{sum(column) / len(column):.2f}" for column in zip(*figures, strict=True)))
+
+
+def _aperture(renderer: Renderer, view: Camera, radius: float) -> Callable[[int], Camera]:
+    """The view with so many samples of an aperture that makes circles of this radius (px)."""
+    depths = renderer.splats(view).depths
+    focus, far = float(depths.quantile(NEAREST)), float(depths.quantile(FARTHEST))
+    opening = Aperture(radius / (view.fx * (1 / focus - 1 / far)), focus)
+    return lambda samples: replace(view, exposure=Exposure(opening, None, samples))
+
+
+def _motion(renderer: Renderer, view: Camera, length: float) -> Callable[[int], Camera]:
+    """The view with so many samples of a motion around the scene that takes the splats so far (px)."""
+    depth = float(renderer.splats(view).depths.median())
+    up = -view.cam_from_world[1, :3]
+
+    def ends(turn: float) -> tuple[Camera, Camera]:
+        first, last = (
+            replace(orbit(view, side * turn, depth, up), trained_focal=view.trained_focal) for side in (-1, 1)
+        )
+        return first, last
+
+    def moved(turn: float) -> float:
+        first, last = (camera.project(renderer.scene.means)[0] for camera in ends(turn))
+        return float((last - first).norm(dim=1).median())
+
+    turn = 1e-3 * length / moved(1e-3)
+    return lambda samples: replace(view, exposure=Exposure(None, ends(turn), samples))
+
+
+@contextmanager
+def without_cells():
+    """Inside, samples stand for points, as plain supersampling's do."""
+    cells = rendering.cells
+    rendering.cells = lambda splats, _: torch.zeros_like(splats.covs)
+    try:
+        yield
+    finally:
+        rendering.cells = cells
+
+
+def _separate(renderer: Renderer, view: Camera) -> None:
+    """Draw the frames of the samples one by one, as sharp views."""
+    for camera in rendering.sample_cameras(view):
+        renderer(replace(camera, exposure=None))
+
+
+def _time(one: Callable[[], object], other: Callable[[], object], rounds: int) -> float:
+    """Median of the ratios of their times, taken in turns."""
+    ratios = []
+    for _ in range(rounds):
+        times = []
+        for call in (one, other):
+            start = time.perf_counter()
+            call()
+            times.append(time.perf_counter() - start)
+        ratios.append(times[0] / times[1])
+    return median(ratios)

@@ -1,0 +1,215 @@
+"""Aperture and shutter: samples of the lens and of time, and what each adds to the splats."""
+
+import json
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+import aaplug
+from aaplug.core.camera_paths import toward
+from aaplug.core.cameras import Aperture, CameraSet, Exposure
+from aaplug.core.exposures import CELL_SHARE, cells, lattice, opening, sample_cameras, spread
+from aaplug.core.projection import project
+from aaplug.evaluation.metrics import psnr
+from aaplug.io.cameras import read_camera_path
+from aaplug.options.shared import FilmOptions
+from aaplug.rendering.film import filmed
+from aaplug.system.errors import FormatError, UsageError
+from tests.conftest import make_camera, make_scene
+from tests.test_camera_paths import document
+
+VIEW = make_camera((0.0, -4.0, 0.0))
+MOVED = make_camera((0.5, -4.0, 0.2))
+APERTURE = Aperture(radius=0.1, focus=3.0)
+
+
+def exposed(aperture=None, motion=None, samples=16):
+    return replace(VIEW, exposure=Exposure(aperture, motion, samples))
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 16, 100, 1024])
+def test_a_lattice_has_one_point_in_each_part_of_each_axis(count):
+    points = lattice(count)
+    places = (points.sort(dim=0).values * count - 0.5).round()
+    assert torch.equal(places, torch.arange(count).double()[:, None].expand(-1, 5))
+    assert points.mean(dim=0).tolist() == pytest.approx([0.5] * 5)
+
+
+@pytest.mark.parametrize("blades", [0, 3, 4, 5, 6, 9])
+def test_places_fill_the_opening_evenly(blades):
+    aperture = Aperture(2.0, 1.0, blades)
+    side = (torch.arange(200) + 0.5) / 200
+    places = torch.tensor([opening(aperture, float(u), float(v)) for u in side for v in side])
+    assert float(places.norm(dim=1).max()) <= 2.0 + 1e-6
+    moments = places.T @ places / len(places)
+    assert moments.flatten().tolist() == pytest.approx([aperture.variance, 0, 0, aperture.variance], abs=2e-3 * 4)
+    if blades:
+        turned = torch.stack([torch.cos(t := torch.arange(blades) * 2 * math.pi / blades + math.pi / blades), t.sin()])
+        assert float((places.double() @ turned.double()).max()) <= 2.0 * math.cos(math.pi / blades) + 1e-6
+
+
+def test_the_plane_in_focus_stays_and_the_rest_moves():
+    sharp, blurred = torch.tensor([[0.3, -1.0, 0.2], [-0.4, -1.0, 0.0]]), torch.tensor([[0.3, 2.0, 0.2]])
+    still, _ = VIEW.project(sharp)
+    cameras = list(sample_cameras(exposed(APERTURE)))
+    shifts = torch.stack([camera.project(sharp)[0] - still for camera in cameras])
+    assert torch.allclose(shifts[:, 0], shifts[:, 1], atol=1e-9)  # within the pixel, and everywhere the same
+    assert float(shifts.abs().max()) < 0.5
+    far = torch.stack([camera.project(blurred)[0] for camera in cameras]) - VIEW.project(blurred)[0]
+    radius = VIEW.fx * APERTURE.radius * (1 / 3 - 1 / 6)
+    assert 0.8 * radius < float((far - shifts[:, :1]).norm(dim=2).max()) <= radius + 1e-9
+
+
+@pytest.mark.parametrize("aperture", [None, APERTURE, Aperture(0.2, 5.0, 6)])
+@pytest.mark.parametrize("motion", [None, (VIEW, MOVED)])
+def test_spread_is_the_covariance_of_the_places_of_many_samples(aperture, motion):
+    """The slow twin: places in float64 under the cameras of 4096 samples."""
+    if aperture is None and motion is None:
+        return
+    scene, camera = make_scene(30), exposed(aperture, motion, 4096)
+    middle = camera if motion is None else replace(camera, cam_from_world=toward(*motion, 0.5).cam_from_world)
+    splats = project(scene, middle)
+    means = scene.means[splats.sources]
+    bare = replace(middle, exposure=None)
+    places = torch.stack([each.project(means)[0] for each in sample_cameras(camera)])
+    pixel = torch.stack(
+        [each.project(means)[0] for each in sample_cameras(replace(bare, exposure=Exposure(None, None, 4096)))]
+    )
+    offsets = places - places.mean(dim=0)
+    pixel = pixel - pixel.mean(dim=0)
+    truth = (offsets[..., :, None] * offsets[..., None, :] - pixel[..., :, None] * pixel[..., None, :]).mean(dim=0)
+    found = spread(splats, middle).double()
+    assert torch.allclose(
+        found, torch.stack([truth[:, 0, 0], truth[:, 0, 1], truth[:, 1, 1]], dim=1), rtol=0.05, atol=0.05
+    )
+
+
+def test_cells_of_a_disc_are_round_and_those_of_a_line_lie_along_it():
+    splats = project(make_scene(30), VIEW)
+    round_cells, whole = (cells(splats, exposed(APERTURE, None, n)).double() for n in (16, 1))
+    disc = spread(splats, exposed(APERTURE)).double()
+    assert torch.allclose(whole, CELL_SHARE * disc, rtol=1e-3, atol=1e-6)
+    assert torch.allclose(round_cells, CELL_SHARE * disc / 16, rtol=1e-3, atol=1e-6)
+    line = spread(splats, exposed(None, (VIEW, MOVED))).double()
+    assert torch.allclose(
+        cells(splats, exposed(None, (VIEW, MOVED))).double(), CELL_SHARE * line / 256, rtol=0.02, atol=1e-3
+    )
+
+
+def test_few_samples_come_close_to_many_and_closer_than_samples_without_cells(monkeypatch):
+    scene = make_scene(200)
+    renderer = aaplug.Renderer.of(scene, [VIEW], "matched", min_seen=0.0)
+    many = renderer(exposed(APERTURE, (VIEW, MOVED), 1024)).rgb
+    few, one = (renderer(exposed(APERTURE, (VIEW, MOVED), n)).rgb for n in (16, 1))
+    monkeypatch.setattr("aaplug.rendering.renderer.cells", lambda splats, camera: torch.zeros_like(splats.covs))
+    plain, pinhole = renderer(exposed(APERTURE, (VIEW, MOVED), 16)).rgb, renderer(toward(VIEW, MOVED, 0.5)).rgb
+    figures = [psnr(image, many) for image in (few, plain, one, pinhole)]
+    assert figures[0] > 36
+    assert figures[0] > figures[1]
+    assert figures[2] > 26
+    assert figures[2] > figures[3] + 2
+
+
+@pytest.mark.parametrize("samples", [1, 16])
+def test_defocus_keeps_the_energy_of_a_faint_splat(samples):
+    scene = make_scene(1)[:1]
+    scene = replace(
+        scene, means=torch.zeros(1, 3), logit_opacities=torch.full((1,), 1.0), log_scales=torch.full((1, 3), -2.0)
+    )
+    renderer = aaplug.Renderer.of(scene, [VIEW], "matched", min_seen=0.0)
+    sharp, soft = renderer(VIEW).alpha, renderer(exposed(Aperture(0.6, 3.0), None, samples)).alpha
+    assert float(soft.max()) < 0.9 * float(sharp.max())
+    assert float(soft.sum()) == pytest.approx(float(sharp.sum()), rel=0.03)
+
+
+def test_sizes_take_the_exposure_along():
+    camera = exposed(APERTURE, (VIEW, MOVED))
+    for sized in (camera.scaled(0.5), camera.resized(30, 20), camera.framed(30, 20)):
+        opened, closed = sized.exposure.motion
+        assert opened.intrinsics == closed.intrinsics == sized.intrinsics
+
+
+def test_the_shutter_opens_and_closes_halfway_to_the_neighbours():
+    path = [make_camera((x, -4.0, 0.0)) for x in (0.0, 0.4, 1.2)]
+    views = filmed(path, FilmOptions(shutter=0.5), True)
+    places = [[camera.centre[0].item() for camera in view.exposure.motion] for view in views]
+    assert [x for pair in places for x in pair] == pytest.approx([-0.1, 0.1, 0.3, 0.6, 1.0, 1.4])
+    assert filmed(path, FilmOptions(), True) == path
+
+
+def test_an_f_stop_is_the_focal_length_over_the_diameter():
+    [view] = filmed([VIEW], FilmOptions(f_stop=2.0, sensor=0.1, focus_at=(0.0, 0.0, 0.0), blades=5), False)
+    assert view.exposure.aperture.radius == pytest.approx(0.1 * VIEW.fx / VIEW.width / 2 / 2)
+    assert (view.exposure.aperture.focus, view.exposure.aperture.blades) == (pytest.approx(4.0), 5)
+    assert view.exposure.samples == 16
+    fast = filmed([VIEW], FilmOptions(f_stop=2.0, focus_distance=1.0, quality="fast"), False)
+    assert fast[0].exposure.samples == 1
+
+
+WRONG = {
+    "focus": ({"f_stop": 2.0}, False, "f_stop"),
+    "two focuses": ({"f_stop": 2.0, "focus_distance": 1.0, "focus_at": (0.0, 0.0, 0.0)}, False, "focus_distance"),
+    "no aperture": ({"focus_distance": 1.0}, False, "focus_distance"),
+    "blades": ({"blades": 5}, False, "blades"),
+    "two numbers": ({"f_stop": 2.0, "focus_at": (0.0, 0.0)}, False, "focus_at"),
+    "behind": ({"f_stop": 2.0, "focus_at": (0.0, -5.0, 0.0)}, False, "behind the camera of view"),
+    "no path": ({"shutter": 0.5}, False, "camera_to"),
+    "one frame": ({"shutter": 0.5}, True, "one frame"),
+    "nothing": ({"samples": 4}, False, "samples"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_wrong_options_are_refused(case):
+    options, path, says = WRONG[case]
+    with pytest.raises(UsageError, match=says):
+        filmed([VIEW], FilmOptions(**options), path)
+
+
+def test_a_path_of_zero_length_is_refused():
+    with pytest.raises(UsageError, match="zero length"):
+        filmed([VIEW] * 3, FilmOptions(shutter=0.5), True)
+    with pytest.raises(UsageError, match="zero length"):
+        filmed([VIEW], FilmOptions(), False, camera_to=[VIEW])
+
+
+def test_nothing_is_drawn_after_a_mistake(tmp_path):
+    scene, cameras = make_scene(20), CameraSet((VIEW,), (VIEW,))
+    how = {"min_seen": 0.0, "views": "all"}
+    for options in ({"f_stop": 2.0, "focus_at": (0.0, -9.0, 0.0)}, {"camera_to": VIEW.name}, {"shutter": 0.5}):
+        with pytest.raises(UsageError):
+            aaplug.render(scene, cameras, tmp_path / "out", **how, **options)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_still_is_blurred_towards_another_view(tmp_path):
+    first, second = replace(VIEW, name="a"), replace(MOVED, name="b")
+    scene, cameras = make_scene(20), CameraSet((first, second), (first, second))
+    how = {"min_seen": 0.0, "views": "a", "samples": 4}
+    [written] = aaplug.render(scene, cameras, tmp_path / "a.png", camera_to="b", **how)
+    assert [camera.name for camera in written.view.exposure.motion] == ["a", "b"]
+
+
+def test_a_path_file_brings_its_aperture_and_shutter(tmp_path):
+    path = document(shutter=0.5)
+    frame = path["camera_path"][0]
+    moved = {**frame, "camera_to_world": [1, 0, 0, 1, *frame["camera_to_world"][4:]]}
+    path["camera_path"] = [{**f, "aperture": {"radius": 0.02, "focus": 3, "blades": 7}} for f in (frame, moved)]
+    (tmp_path / "path.json").write_text(json.dumps(path))
+    file = read_camera_path(tmp_path / "path.json")
+    views = filmed(file.cameras, FilmOptions(samples=4), True, file.shutter)
+    assert views[0].exposure.aperture == Aperture(0.02, 3.0, 7)
+    assert views[0].exposure.motion is not None
+    assert views[0].exposure.samples == 4
+    assert filmed(file.cameras, FilmOptions(samples=0), True, file.shutter)[0].exposure is None
+
+
+@pytest.mark.parametrize("wrong", [{"radius": 0, "focus": 3}, {"radius": 1}, {"radius": 1, "focus": 1, "blades": 2}, 3])
+def test_a_wrong_aperture_in_a_file_is_refused(tmp_path, wrong):
+    path = document()
+    path["camera_path"][0]["aperture"] = wrong
+    (tmp_path / "path.json").write_text(json.dumps(path))
+    with pytest.raises(FormatError, match=r"aperture|focus"):
+        read_camera_path(tmp_path / "path.json")
