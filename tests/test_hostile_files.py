@@ -11,11 +11,11 @@ from collections.abc import Callable
 
 import pytest
 
-from tests.bench.campaign import cameras, damaged, others, scenes
+from tests.bench.campaign import cameras, damaged, others, paths, scenes
 from tests.hostile import check
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="limits are Linux's")
-TARGETS = {**scenes(), **cameras(), **others()}
+TARGETS = {**scenes(), **cameras(), **paths(), **others()}
 FILES = 50  # of each reader
 
 

@@ -10,6 +10,7 @@ import os
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
+from importlib.util import find_spec
 from itertools import chain
 from pathlib import Path
 
@@ -21,7 +22,7 @@ import aaplug.verbs.evaluate  # noqa: F401  (imports the verbs before the childr
 from aaplug.evaluation.journal import Journal
 from aaplug.finetuning.state import begin, load, save
 from aaplug.io.batch_file import read_batch
-from aaplug.io.cameras import CAMERA_FORMATS, read_cameras
+from aaplug.io.cameras import CAMERA_FORMATS, read_camera_path, read_cameras
 from aaplug.io.images import read_image, read_rgba
 from aaplug.io.scenes import SCENE_FORMATS, WritableFormat, write_scene
 from tests.bench import heading, row
@@ -29,8 +30,11 @@ from tests.conftest import make_scene
 from tests.hostile import NAMES, Target, check, mutations, read_as_info_does, scene
 from tests.mutators import structured
 from tests.test_batch import SETTINGS
+from tests.test_camera_paths import document
 from tests.test_cameras_io import EXPORTED, FIXTURES, write_json
 from tests.test_finetuning import make_job
+from tests.test_path_formats import DOCUMENT, TIMELINE, USDA, glb, gltf_with_buffer
+from tests.test_path_formats import SETTINGS as VIEWER_SETTINGS
 
 SMALL_IMAGES = {"AAPLUG_IMAGE": "2000000", "AAPLUG_IMAGE_EXTRA": "1000000"}  # so that the children's memory suffices
 IMAGES = {
@@ -52,7 +56,7 @@ def main(mutations: int = 100_000, seed: int = 0, only: str = "") -> None:
     """
     logging.getLogger("aaplug").setLevel(logging.ERROR)
     torch.set_num_threads(1)
-    every = {**scenes(), **cameras(), **others()}
+    every = {**scenes(), **cameras(), **paths(), **others()}
     targets = {name: target for name, target in every.items() if only in name}
     each, total = -(-mutations // len(targets)), Counter[str]()
     heading("damaged files", "reader", "read", "refused", "s")
@@ -95,6 +99,24 @@ def cameras() -> dict[str, Target]:
         print(f"camera format {name}: no file to damage")
     exported = Target(lambda folder: write_json(folder / "transforms_train.json", [EXPORTED]), read_cameras)
     return {**targets, "cameras of ns-export": exported, "cameras of objects": _file("poses_bounds.npy", _objects())}
+
+
+def paths() -> dict[str, Target]:
+    """Camera paths of other programs, and one with an aperture."""
+    aperture = {"radius": 0.01, "focus": 3.0, "blades": 5}
+    frame = document()["camera_path"][0] | {"aperture": aperture}
+    files = {
+        "path.json": json.dumps(document(shutter=0.5, camera_path=[frame, frame])),
+        "settings.json": json.dumps(VIEWER_SETTINGS),
+        "document.json": json.dumps(DOCUMENT),
+        "timeline.json": json.dumps(TIMELINE),
+        **({"path.usda": USDA} if find_spec("pxr") else {}),
+    }
+    return {
+        **{f"path {name}": _file(name, text.encode(), read_camera_path) for name, text in files.items()},
+        "path path.glb": Target(glb, read_camera_path),
+        "path path.gltf": Target(gltf_with_buffer, read_camera_path),
+    }
 
 
 def _camera_target(make: Callable[[Path], Path], part: str) -> Target:

@@ -13,7 +13,21 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from aaplug.core.cameras import Camera, CameraSet
-from aaplug.io.cameras import blender, camera_path, colmap, inria, inria_model, llff, multiscale, pinhole, transforms
+from aaplug.io.cameras import (
+    blender,
+    camera_path,
+    colmap,
+    gltf,
+    inria,
+    inria_model,
+    lichtfeld,
+    llff,
+    multiscale,
+    pinhole,
+    supersplat,
+    transforms,
+    usd,
+)
 from aaplug.io.cameras.camera_path import CameraPath
 from aaplug.io.cameras.options import CameraFileOptions
 from aaplug.io.cameras.photos import files_of
@@ -55,7 +69,7 @@ class CameraFormat(Protocol):
 # the first that accepts a path is used
 OWN: tuple[CameraFormat, ...]
 OWN = (pinhole, camera_path, inria_model, colmap, blender, inria, multiscale, transforms, llff)
-PATH_FORMATS = (camera_path,)
+PATH_FORMATS = (camera_path, supersplat, lichtfeld, gltf, usd)
 CAMERA_FORMATS = Registry[CameraFormat]("camera format", "aaplug.io.cameras:CameraFormat", named(OWN))
 
 

@@ -1,0 +1,100 @@
+"""Animated cameras between their keyframes, at the times of a path's frames.
+
+n: keys.  f: frames.  Every function raises FormatError.
+"""
+
+import math
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from aaplug.core.cameras import WHOLE_SLACK, Camera
+from aaplug.core.projection import rotation_matrices
+from aaplug.io.cameras.poses import centred, inverse
+from aaplug.io.values import Place, focal
+
+MAX_FRAMES = 10_000  # of a path file: 5 minutes and a half at 30 a second
+FPS = 30.0  # frames per second, where the file does not say
+UNSIZED = (1920, 1080)  # px: width and height, where the file does not say
+MIN_LENGTH = 1e-6  # a shorter quaternion counts as no rotation
+
+
+def frame_times(first: float, last: float, fps: float, place: Place) -> Float[Tensor, " f"]:
+    """Times of a frame at `first` and of all whole frames up to `last`, in s."""
+    steps = max(0.0, (last - first) * fps)
+    place.expect(steps < MAX_FRAMES, "the animation", f"at most {MAX_FRAMES:,} frames", steps)
+    return first + torch.arange(math.floor(steps + WHOLE_SLACK) + 1, dtype=torch.float64) / fps
+
+
+def rising(times: Float[Tensor, " n"], place: Place, field: str) -> Float[Tensor, " n"]:
+    """The times of keys, which rise."""
+    place.expect(bool((times.diff() > 0).all()), field, "rising", times.tolist())
+    return times
+
+
+def segments(times: Float[Tensor, " n"], at: Float[Tensor, " f"]) -> tuple[Int[Tensor, " f"], Float[Tensor, " f"]]:
+    """The key before each time and the share of the way to the next; beyond the ends, the end."""
+    if len(times) == 1:
+        return torch.zeros(len(at), dtype=torch.int64), torch.zeros_like(at)
+    index = (torch.searchsorted(times, at, right=True) - 1).clamp(0, len(times) - 2)
+    return index, ((at - times[index]) / (times[index + 1] - times[index])).clamp(0.0, 1.0)
+
+
+def hermite(
+    start: Float[Tensor, "f c"],
+    out: Float[Tensor, "f c"],
+    into: Float[Tensor, "f c"],
+    end: Float[Tensor, "f c"],
+    share: Float[Tensor, " f"],
+) -> Float[Tensor, "f c"]:
+    """The cubic from `start` to `end`; out, into: its slopes there, per share (Hermite)."""
+    s = share[:, None]
+    bend = s * (1 - s)
+    return start + s * s * (3 - 2 * s) * (end - start) + bend * ((1 - s) * out - s * into)
+
+
+def slerp(first: Float[Tensor, "f 4"], last: Float[Tensor, "f 4"], share: Float[Tensor, " f"]) -> Float[Tensor, "f 4"]:
+    """Unit quaternions on the shorter way between unit quaternions (Shoemake 1985)."""
+    cosine = (first * last).sum(dim=1, keepdim=True)
+    last, cosine = torch.where(cosine < 0, -last, last), cosine.abs().clamp(max=1.0)
+    angle, s = torch.acos(cosine), share[:, None]
+    near = angle < 1e-6
+    sine = torch.where(near, 1.0, angle.sin())
+    a = torch.where(near, 1 - s, ((1 - s) * angle).sin() / sine)
+    b = torch.where(near, s, (s * angle).sin() / sine)
+    return torch.nn.functional.normalize(a * first + b * last, dim=1)
+
+
+def unit(quats: Float[Tensor, "n 4"], place: Place, field: str) -> Float[Tensor, "n 4"]:
+    """Quaternions of length 1."""
+    lengths = quats.norm(dim=1, keepdim=True)
+    place.expect(bool((lengths > MIN_LENGTH).all()), field, "not zero", quats.tolist()[int(lengths.argmin())])
+    return quats / lengths
+
+
+def rigid_motions(quats: Float[Tensor, "f 4"], places: Float[Tensor, "f 3"]) -> Float[Tensor, "f 4 4"]:
+    """Matrices of unit quaternions wxyz and translations."""
+    motions = torch.eye(4, dtype=torch.float64).repeat(len(quats), 1, 1)
+    motions[:, :3, :3], motions[:, :3, 3] = rotation_matrices(quats), places
+    return motions
+
+
+def cameras_of(
+    world_from_cam: Float[Tensor, "f 4 4"],
+    tangents: Float[Tensor, " f"],
+    side: Callable[[tuple[int, int]], float],
+    place: Place,
+    size: tuple[int, int] = UNSIZED,
+) -> tuple[Camera, ...]:
+    """Cameras named by number.
+
+    world_from_cam: rigid, OpenCV axes.  tangents: of half the angle of view along the side that `side` picks.
+    """
+    digits = len(str(len(tangents) - 1))
+    cameras = []
+    for index, (pose, tangent) in enumerate(zip(world_from_cam, tangents.tolist(), strict=True)):
+        f = focal(side(size) / 2 / tangent if tangent else math.inf, place, "the focal length")
+        cameras.append(centred(f"{index:0{digits}}", size, (f, f), inverse(pose, place, "the position")))
+    return tuple(cameras)

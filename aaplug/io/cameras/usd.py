@@ -1,0 +1,134 @@
+"""Cameras of USD, .usda, .usdc, .usd and .usdz: the first that time samples move, or else the first.
+
+A camera looks along -z with y up, in the stage's world.  Its focal length, apertures (the size of the film) and their
+offsets are in tenths of a world unit; f-stop, focus distance and shutter are UsdGeom.Camera's.  The frames are the time
+codes of the stage.  Layers that the file names must lie in its folder: others are refused before the stage is composed.
+"""
+
+import math
+import os
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from aaplug.core.cameras import Aperture, Camera, Exposure
+from aaplug.io.cameras.camera_path import CameraPath
+from aaplug.io.cameras.keyframes import MAX_FRAMES, UNSIZED
+from aaplug.io.cameras.poses import inverse, pose_of_opengl
+from aaplug.io.values import Place, focal, number
+from aaplug.system.errors import FormatError, UsageError
+from aaplug.system.extras import install_command
+
+UNIT = 10.0  # of the camera's lengths in a world unit
+MAX_LAYERS = 1000
+
+name = "usd"
+
+
+def sniff(path: Path) -> bool:
+    """True for a file of that name."""
+    return path.suffix.lower() in (".usd", ".usda", ".usdc", ".usdz")
+
+
+def path_of(path: Path) -> CameraPath:
+    """The camera at each time code, or at rest as a path of one frame."""
+    try:
+        Tf = _module("Tf")
+    except ImportError as error:
+        raise UsageError("path", f"{path.suffix} files need the extra `usd`: {install_command('usd')}") from error
+    try:
+        return _read(path)
+    except (Tf.ErrorException, UnicodeDecodeError) as error:  # its message may be no text
+        raise FormatError(path, "cannot be read: it breaks the format of USD") from error
+
+
+def _read(path: Path) -> CameraPath:
+    Usd, UsdGeom = _module("Usd"), _module("UsdGeom")
+    _check_layers(path)
+    stage = Usd.Stage.Open(str(path))
+    found = [UsdGeom.Camera(prim) for prim in stage.Traverse() if prim.IsA(UsdGeom.Camera)]
+    if not found:
+        raise FormatError(path, "holds no camera")
+    camera = next(filter(_moves, found), found[0])
+    place = Place(path, f"camera {camera.GetPath()}")
+    times, moving = [0.0], _moves(camera)
+    if stage.HasAuthoredTimeCodeRange() and moving:
+        first, last = (number(t, place, "time codes") for t in (stage.GetStartTimeCode(), stage.GetEndTimeCode()))
+        place.expect(0 <= last - first < MAX_FRAMES, "time codes", f"a range of at most {MAX_FRAMES:,}", [first, last])
+        times = [first + step for step in range(math.floor(last - first) + 1)]
+    elif moving:
+        raise place.error("it is animated, but the stage has no startTimeCode and endTimeCode")
+    digits = len(str(len(times) - 1))
+    cameras = [_camera(camera, Usd.TimeCode(t) if moving else Usd.TimeCode.Default(), place) for t in times]
+    named = tuple(replace(view, name=f"{i:0{digits}}") for i, (view, _) in enumerate(cameras))
+    fps = number(stage.GetTimeCodesPerSecond(), place, "timeCodesPerSecond")
+    place.expect(fps > 0, "timeCodesPerSecond", "above 0", fps)
+    return CameraPath(named, fps, cameras[0][1])
+
+
+def _module(name: str) -> Any:
+    """A module of the package `usd-core`, whose stubs are not complete."""
+    return import_module(f"pxr.{name}")
+
+
+def _check_layers(path: Path) -> None:
+    """Refuse layers outside of the file's folder, whoever names them."""
+    Sdf, home, left, seen = _module("Sdf"), path.parent.resolve(), [str(path)], set[str]()
+    while left:
+        layer = Sdf.Layer.FindOrOpen(left.pop())
+        if layer is None:
+            raise FormatError(path, "cannot be read: it is no USD, or a layer that it names is missing")
+        for asset in filter(None, layer.GetCompositionAssetDependencies()):
+            name = Sdf.ComputeAssetPathRelativeToLayer(layer, asset)
+            file = name.partition("[")[0]  # a package's own file stands in brackets
+            if "://" in asset or not Path(os.path.realpath(file)).is_relative_to(home):
+                raise FormatError(path, f"names a layer outside of its folder: {asset!r}")
+            if name not in seen:
+                seen.add(name)
+                left.append(name)
+        if len(seen) > MAX_LAYERS:
+            raise FormatError(path, f"names more than {MAX_LAYERS} layers")
+
+
+def _moves(camera: Any) -> bool:
+    """Whether the camera, or a prim above it, has time samples."""
+    UsdGeom, prim = _module("UsdGeom"), camera.GetPrim()
+    own = any(attribute.ValueMightBeTimeVarying() for attribute in prim.GetAttributes())
+    while prim and not own:
+        own = UsdGeom.Xformable(prim).TransformMightBeTimeVarying() if prim.IsA(UsdGeom.Xformable) else False
+        prim = prim.GetParent()
+    return own
+
+
+def _camera(camera: Any, time: Any, place: Place) -> tuple[Camera, float | None]:
+    """The camera at a time, and its shutter in time codes."""
+
+    def value(name: str) -> float:
+        return number(getattr(camera, f"Get{name}Attr")().Get(time), place, name)
+
+    kind = camera.GetProjectionAttr().Get(time)
+    place.expect(kind == "perspective", "projection", "perspective", kind)
+    length, across, down = value("FocalLength"), value("HorizontalAperture"), value("VerticalAperture")
+    right = length > 0 and across > 0 and down > 0 and 1 / 64 <= across / down <= 64
+    place.expect(right, "focalLength and apertures", "above 0, of a usual shape", (length, across, down))
+    width, rate = UNSIZED[0], UNSIZED[0] / across  # px per unit of the film
+    height = max(1, round(down * rate))
+    f = focal(length * rate, place, "focalLength")
+    cx = width / 2 - value("HorizontalApertureOffset") * rate
+    cy = height / 2 + value("VerticalApertureOffset") * rate
+    rows = [list(row) for row in camera.ComputeLocalToWorldTransform(time)]
+    motion = torch.tensor(rows, dtype=torch.float64).T
+    motion[:3, :3] /= motion[:3, :3].norm(dim=0)
+    place.expect(bool(motion.isfinite().all()), "its transform", "finite", rows)
+    pose = inverse(pose_of_opengl(motion, place, "its transform"), place, "its position")
+    stop, focus = value("FStop"), value("FocusDistance")
+    shutter = value("ShutterClose") - value("ShutterOpen")
+    try:
+        aperture = Exposure(Aperture(length / UNIT / stop / 2, focus)) if stop > 0 and focus > 0 else None
+        view = Camera("0", width, height, f, f, cx, cy, pose, exposure=aperture)
+    except UsageError as error:
+        raise place.error(str(error)) from error
+    return view, shutter if 0 < shutter <= 1 else None

@@ -1,0 +1,297 @@
+"""Camera paths of other programs: SuperSplat, LichtFeld Studio, glTF, USD, and the data sets' own formats."""
+
+import base64
+import json
+import math
+import struct
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from aaplug.io.cameras import read_camera_path
+from aaplug.system.errors import AaplugError, FormatError, UsageError
+from tests.test_cameras_io import FIXTURES
+
+SETTINGS = {
+    "version": 2,
+    "animTracks": [
+        {
+            "name": "cameraAnim", "duration": 2, "frameRate": 10, "loopMode": "none", "interpolation": "spline",
+            "smoothness": 1,
+            "keyframes": {
+                "times": [0, 10, 20],
+                "values": {
+                    "position": [0, 0, 4, 1, 0, 4, 2, 0, 4], "target": [0, 0, 0, 1, 0, 0, 2, 0, 0], "fov": [60, 60, 60]
+                },
+            },
+        }
+    ],
+}  # fmt: skip
+DOCUMENT = {
+    "timeline": {"frames": 20, "frameRate": 10, "smoothness": 1},
+    "poseSets": [
+        {
+            "name": "set0",
+            "poses": [{"frame": f, "position": [f, 0, 4], "target": [f, 0, 0], "fov": 60} for f in (0, 10)],
+        }
+    ],
+}
+HALF = math.sqrt(0.5)
+TIMELINE = {
+    "version": 4,
+    "keyframes": [
+        {"time": 0, "position": [0, 0, 4], "rotation": [1, 0, 0, 0], "focal_length_mm": 24, "easing": 0},
+        {"time": 1, "position": [2, 0, 4], "rotation": [HALF, 0, HALF, 0], "focal_length_mm": 48, "easing": 3},
+    ],
+}
+
+
+def gltf(binary: bytes, uri: str | None = None) -> dict:
+    """A camera under a parent that moves by 1 per second for 2 s, 10 keys a second, and turns by 90° about y."""
+    views = [(0, 84), (84, 252), (336, 8), (344, 32)]
+    return {
+        "asset": {"version": "2.0"},
+        "buffers": [{"byteLength": len(binary)} | ({"uri": uri} if uri else {})],
+        "bufferViews": [{"buffer": 0, "byteOffset": start, "byteLength": length} for start, length in views],
+        "accessors": [
+            {"bufferView": i, "componentType": 5126, "count": n, "type": kind}
+            for i, (n, kind) in enumerate([(21, "SCALAR"), (21, "VEC3"), (2, "SCALAR"), (2, "VEC4")])
+        ],
+        "cameras": [{"type": "perspective", "perspective": {"yfov": math.pi / 2, "aspectRatio": 2, "znear": 0.1}}],
+        "nodes": [{"children": [1]}, {"camera": 0, "translation": [0, 0, 5], "scale": [2, 2, 2]}],
+        "animations": [
+            {
+                "samplers": [{"input": 0, "output": 1}, {"input": 2, "output": 3}],
+                "channels": [
+                    {"sampler": 0, "target": {"node": 0, "path": "translation"}},
+                    {"sampler": 1, "target": {"node": 1, "path": "rotation"}},
+                ],
+            }
+        ],
+    }
+
+
+def binary() -> bytes:
+    times = np.arange(21, dtype="<f4") / 10
+    places = np.stack([times, 0 * times, 0 * times], axis=1)
+    return b"".join(
+        x.astype("<f4").tobytes()
+        for x in (times, places, np.array([0, 2]), np.array([[0, 0, 0, 1], [0, HALF, 0, HALF]]))
+    )
+
+
+def glb(folder: Path) -> Path:
+    document = json.dumps(gltf(binary())).encode()
+    document += b" " * (-len(document) % 4)
+    chunks = [(0x4E4F534A, document), (0x004E4942, binary())]
+    body = b"".join(struct.pack("<II", len(data), kind) + data for kind, data in chunks)
+    (folder / "path.glb").write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body)
+    return folder / "path.glb"
+
+
+def gltf_with_buffer(folder: Path) -> Path:
+    (folder / "path.bin").write_bytes(binary())
+    return written(folder, "path.gltf", gltf(binary(), "path.bin"))
+
+
+def written(folder: Path, name: str, content: object) -> Path:
+    (folder / name).write_text(content if isinstance(content, str) else json.dumps(content))
+    return folder / name
+
+
+def forward(camera):
+    return camera.cam_from_world[2, :3].tolist()
+
+
+def test_supersplat_settings_are_turned_into_the_scenes_axes(tmp_path):
+    path = read_camera_path(written(tmp_path, "settings.json", SETTINGS))
+    assert (path.fps, len(path.cameras), path.unsized) == (10, 20, True)
+    camera = path.cameras[5]
+    assert camera.centre.tolist() == pytest.approx([-0.5, 0, 4])  # the keys lie on a line
+    assert forward(camera) == pytest.approx([0, 0, -1])
+    assert camera.cam_from_world[1, :3].tolist() == pytest.approx([0, 1, 0])  # up is -y
+    assert 2 * math.degrees(math.atan(camera.width / 2 / camera.fx)) == pytest.approx(60)
+
+
+def test_supersplat_settings_of_version_1_have_one_angle_of_view(tmp_path):
+    first = {key: value for key, value in SETTINGS.items() if key != "version"} | {"camera": {"fov": 90}}
+    track = json.loads(json.dumps(SETTINGS["animTracks"][0]))
+    del track["keyframes"]["values"]["fov"]
+    path = read_camera_path(written(tmp_path, "settings.json", first | {"animTracks": [track]}))
+    assert path.cameras[0].fx == pytest.approx(path.cameras[0].width / 2)
+
+
+def test_supersplat_documents_go_round(tmp_path):
+    path = read_camera_path(written(tmp_path, "document.json", DOCUMENT))
+    places = [-camera.centre[0].item() for camera in path.cameras]
+    assert len(places) == 20
+    assert (places[0], places[10]) == (pytest.approx(0), pytest.approx(10))
+    assert places[5] == pytest.approx(places[15])
+
+
+def test_lichtfelds_timeline_is_turned_into_the_scenes_axes_and_eased(tmp_path):
+    path = read_camera_path(written(tmp_path, "timeline.json", TIMELINE))
+    assert (path.fps, len(path.cameras)) == (30, 31)
+    first, last = path.cameras[0], path.cameras[-1]
+    assert first.centre.tolist() == pytest.approx([0, 0, -4])
+    assert forward(first) == pytest.approx([0, 0, 1])
+    assert forward(last) == pytest.approx([-1, 0, 0], abs=1e-6)
+    assert 2 * math.degrees(math.atan(first.height / 2 / first.fy)) == pytest.approx(2 * math.degrees(math.atan(0.5)))
+    assert last.fy == pytest.approx(2 * first.fy)
+
+
+@pytest.mark.parametrize("kind", ["glb", "file", "data"])
+def test_a_camera_of_gltf_moves_with_the_nodes_above_it(tmp_path, kind):
+    if kind == "glb":
+        file = glb(tmp_path)
+    elif kind == "file":
+        file = gltf_with_buffer(tmp_path)
+    else:
+        uri = "data:application/octet-stream;base64," + base64.b64encode(binary()).decode()
+        file = written(tmp_path, "path.gltf", gltf(binary(), uri))
+    path = read_camera_path(file)
+    assert (path.fps, len(path.cameras)) == (10, 21)
+    camera = path.cameras[10]
+    assert camera.centre.tolist() == pytest.approx([1, 0, 5], abs=1e-6)
+    assert forward(camera) == pytest.approx([-HALF, 0, -HALF], abs=1e-6)  # halfway of 90°
+    assert (camera.width, camera.height, camera.fy) == (2160, 1080, pytest.approx(540))
+
+
+@pytest.mark.parametrize("way", ["STEP", "CUBICSPLINE"])
+def test_keys_of_gltf_step_or_lie_on_a_cubic(tmp_path, way):
+    document = gltf(binary(), "path.bin")
+    places = np.zeros((21, 3, 3), "<f4")
+    places[:, 1, 0] = np.arange(21) / 10
+    places[:, (0, 2), 0] = 1  # slopes of the line
+    data = binary() + (places.tobytes() if way == "CUBICSPLINE" else places[:, 1].tobytes())
+    document["buffers"][0]["byteLength"] = len(data)
+    document["bufferViews"][1] = {"buffer": 0, "byteOffset": 376, "byteLength": len(data) - 376}
+    document["accessors"][1]["count"] = 63 if way == "CUBICSPLINE" else 21
+    document["animations"][0]["samplers"][0]["interpolation"] = way
+    (tmp_path / "path.bin").write_bytes(data)
+    cameras = read_camera_path(written(tmp_path, "path.gltf", document)).cameras
+    assert [round(camera.centre[0].item(), 4) for camera in cameras] == [round(x / 10, 4) for x in range(21)]
+
+
+@pytest.mark.parametrize("uri", ["../path.bin", "/etc/hostname", "http://x/path.bin", "a\0b", "none.bin"])
+def test_no_buffer_is_read_beyond_the_folder(tmp_path, uri):
+    (tmp_path / "in").mkdir()
+    (tmp_path / "path.bin").write_bytes(binary())
+    with pytest.raises(FormatError):
+        read_camera_path(written(tmp_path / "in", "path.gltf", gltf(binary(), uri)))
+
+
+USDA = """#usda 1.0
+(
+    startTimeCode = 1
+    endTimeCode = 3
+    timeCodesPerSecond = 24
+    metersPerUnit = 1
+)
+def Xform "rig"
+{
+    double3 xformOp:translate.timeSamples = { 1: (0, 0, 5), 3: (2, 0, 5) }
+    uniform token[] xformOpOrder = ["xformOp:translate"]
+    def Camera "cam"
+    {
+        float focalLength.timeSamples = { 1: 18, 3: 36 }
+        float horizontalAperture = 36
+        float verticalAperture = 18
+        float horizontalApertureOffset = 3.6
+        float fStop = 2
+        float focusDistance = 5
+        double shutter:open = -0.25
+        double shutter:close = 0.25
+    }
+}
+"""
+
+
+def test_a_camera_of_usd_brings_lens_aperture_and_shutter(tmp_path):
+    pytest.importorskip("pxr")
+    path = read_camera_path(written(tmp_path, "path.usda", USDA))
+    assert (path.fps, path.shutter, len(path.cameras)) == (24, 0.5, 3)
+    first, middle, _ = path.cameras
+    assert (first.width, first.height, first.fx, first.cx) == (1920, 960, 960, pytest.approx(768))
+    assert middle.centre.tolist() == pytest.approx([1, 0, 5])
+    assert middle.fx == pytest.approx(1440)
+    assert forward(middle) == pytest.approx([0, 0, -1])
+    assert first.exposure.aperture.radius == pytest.approx(1.8 / 2 / 2)
+    assert first.exposure.aperture.focus == 5
+
+
+@pytest.mark.parametrize("layer", ["../out.usda", "/etc/out.usda", "http://x/a.usda"])
+def test_no_layer_is_read_beyond_the_folder(tmp_path, layer):
+    pytest.importorskip("pxr")
+    (tmp_path / "in").mkdir()
+    (tmp_path / "out.usda").write_text(USDA)
+    text = f'#usda 1.0\ndef "x" ( references = @{layer}@</rig> ) {{}}\n'
+    with pytest.raises(FormatError, match=r"outside|missing"):
+        read_camera_path(written(tmp_path / "in", "path.usda", text))
+    inside = "#usda 1.0\n(\n subLayers = [@inner.usda@]\n startTimeCode = 1\n endTimeCode = 2\n)\n"
+    written(tmp_path / "in", "inner.usda", USDA)
+    assert len(read_camera_path(written(tmp_path / "in", "outer.usda", inside)).cameras) == 2
+
+
+def test_usd_without_its_package_names_the_extra(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pxr.Tf", None)
+    with pytest.raises(UsageError, match="usd"):
+        read_camera_path(written(tmp_path, "path.usda", USDA))
+
+
+@pytest.mark.parametrize("name", ["colmap", "transforms", "inria", "pinhole"])
+def test_cameras_of_a_data_set_are_a_path_in_their_order(tmp_path, name):
+    make, _ = FIXTURES[name]
+    cameras = read_camera_path(make(tmp_path)).cameras
+    assert cameras
+    assert all(camera.trained_focal is None and camera.photo is None for camera in cameras)
+
+
+WRONG = {
+    "settings": ("a.json", SETTINGS, ("animTracks", 0, "keyframes", "times"), [0, 5, 5]),
+    "angle": ("a.json", SETTINGS, ("animTracks", 0, "keyframes", "values", "fov"), [60, 180, 60]),
+    "at the target": ("a.json", SETTINGS, ("animTracks", 0, "keyframes", "values", "target"), [0, 0, 4] * 3),
+    "too long": ("a.json", SETTINGS, ("animTracks", 0, "duration"), 1e9),
+    "version": ("a.json", SETTINGS, ("version",), 3),
+    "document": ("a.json", DOCUMENT, ("poseSets",), []),
+    "timeline": ("a.json", TIMELINE, ("version",), 5),
+    "no rotation": ("a.json", TIMELINE, ("keyframes", 1, "rotation"), [0, 0, 0, 0]),
+    "easing": ("a.json", TIMELINE, ("keyframes", 1, "easing"), 0.5),
+    "focal length": ("a.json", TIMELINE, ("keyframes", 1, "focal_length_mm"), 0),
+    "no camera": ("a.gltf", gltf(b"", "x"), ("nodes",), [{}]),
+    "a circle": ("a.gltf", gltf(b"", "x"), ("nodes", 1, "children"), [0]),
+    "orthographic": ("a.gltf", gltf(b"", "x"), ("cameras", 0, "type"), "orthographic"),
+    "no buffer": ("a.gltf", gltf(b"", "data:,"), ("buffers", 0, "byteLength"), 5),
+    "glTF 1": ("a.gltf", gltf(b"", "x"), ("asset", "version"), "1.0"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_a_broken_path_is_refused(tmp_path, case):
+    name, document, keys, value = WRONG[case]
+    document = json.loads(json.dumps(document))
+    part = document
+    for key in keys[:-1]:
+        part = part[key]
+    part[keys[-1]] = value
+    with pytest.raises(FormatError):
+        read_camera_path(written(tmp_path, name, document))
+
+
+def test_every_path_is_rigid_and_free(tmp_path):
+    names = (("a.json", SETTINGS), ("b.json", TIMELINE), ("c.json", DOCUMENT))
+    files = [written(tmp_path, name, content) for name, content in names]
+    for camera in [camera for file in [*files, glb(tmp_path)] for camera in read_camera_path(file).cameras]:
+        turn = camera.cam_from_world[:3, :3]
+        assert torch.allclose(turn @ turn.T, torch.eye(3, dtype=torch.float64), atol=1e-9)
+        assert camera.trained_focal is None
+
+
+def test_garbage_is_refused(tmp_path):
+    for name in ("a.json", "a.gltf", "a.glb", "a.usda"):
+        (tmp_path / name).write_bytes(b"\x00\x01garbage")
+        with pytest.raises(AaplugError):
+            read_camera_path(tmp_path / name)
