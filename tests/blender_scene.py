@@ -1,0 +1,75 @@
+"""Run in Blender's Python: exports an animated camera by the add-on, and where Blender itself sees 100 points.
+
+python blender_scene.py ADD-ON FOLDER [PROGRAM SPLATS CAMERAS]
+"""
+
+import importlib.util
+import json
+import random
+import sys
+from pathlib import Path
+
+import bpy
+from bpy_extras.object_utils import world_to_camera_view
+from mathutils import Matrix, Vector
+
+spec = importlib.util.spec_from_file_location("aaplug_camera", sys.argv[1])
+addon = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(addon)
+folder = Path(sys.argv[2])
+
+addon.register()
+scene = bpy.context.scene
+scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = 1280, 534, 50
+scene.render.fps, scene.frame_start, scene.frame_end = 25, 3, 7
+scene.render.use_motion_blur, scene.render.motion_blur_shutter = True, 0.4
+camera = scene.camera
+camera.scale = (1.5, 1.5, 1.5)
+for frame, lens, x, y in ((3, 35, 0.1, -0.05), (7, 80, -0.2, 0.15)):
+    camera.data.lens, camera.data.shift_x, camera.data.shift_y = lens, x, y
+    camera.location.x += frame
+    for path in ("lens", "shift_x", "shift_y"):
+        camera.data.keyframe_insert(path, frame=frame)
+    camera.keyframe_insert("location", frame=frame)
+camera.data.dof.use_dof, camera.data.dof.aperture_fstop, camera.data.dof.aperture_blades = True, 2.0, 6
+camera.data.dof.focus_distance = 7.0
+frames = addon.frames_of(scene)
+addon.write_path(scene, folder / "camera_path.json", frames)
+
+draws, seen = random.Random(0), []
+for frame in frames:
+    scene.frame_set(frame)
+    inside = camera.matrix_world.normalized()
+    points = [inside @ Vector((draws.uniform(-1, 1), draws.uniform(-1, 1), -draws.uniform(2, 9))) for _ in range(100)]
+    views = [world_to_camera_view(scene, camera, point) for point in points]
+    seen.append([[*point, view.x, view.y] for point, view in zip(points, views, strict=True)])
+
+origin = bpy.data.objects.new("splats", None)
+origin.matrix_world = Matrix.LocRotScale(Vector((1, 2, 3)), Matrix.Rotation(0.5, 3, "X"), Vector((2, 2, 2)))
+scene.collection.objects.link(origin)
+bpy.context.view_layer.update()
+scene.aaplug.frame = origin
+moved = addon.camera_path(scene, frames[:1])
+local = [[*(origin.matrix_world.inverted() @ Vector(row[:3])), *row[3:]] for row in seen[0]]
+(folder / "moved.json").write_text(json.dumps(moved))
+result = {"seen": seen, "local": local}
+
+if len(sys.argv) > 3:
+    scene.aaplug.frame = None
+    scene.aaplug.program, scene.aaplug.splats, scene.aaplug.cameras = sys.argv[3:]
+    scene.aaplug.folder, scene.aaplug.options = str(folder / "out"), "--samples 1 --min-seen 0 --threads 1"
+    scene.aaplug.goal = "BACKGROUND"
+    result["draw"] = list(bpy.ops.aaplug.draw(whole=True))
+    background = camera.data.background_images[0]
+    result["background"] = [*background.image.size, background.image.source, background.image_user.frame_duration]
+    scene.aaplug.goal = "NODE"
+    result["draw again"] = list(bpy.ops.aaplug.draw())
+    tree = getattr(scene, "compositing_node_group", None) or scene.node_tree
+    result["node"] = tree.nodes["aaplug"].image.name
+    scene.aaplug.splats = "nothing.ply"
+    try:
+        result["fails"] = list(bpy.ops.aaplug.draw())
+    except RuntimeError as error:
+        result["fails"] = str(error)
+addon.unregister()
+(folder / "result.json").write_text(json.dumps(result))
