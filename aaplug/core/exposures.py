@@ -80,14 +80,23 @@ def spread(splats: Splats2D, camera: Camera) -> Float[Tensor, "m 3"]:
 
 
 def placed(splats: Splats2D, camera: Camera, other: Camera) -> Float[Tensor, "m 2"]:
-    """Places in px, seen by another camera, of splats that this one sees."""
+    """Places in px, seen by another camera, of splats that this one sees; through a lens, in the splats' planes."""
     focal, middle = (splats.means.new_tensor(pair) for pair in ((camera.fx, camera.fy), (camera.cx, camera.cy)))
-    local = torch.cat([(splats.means - middle) / focal, torch.ones_like(splats.means[:, :1])], dim=1)
+    one = torch.ones_like(splats.means[:, :1])
+    if splats.planes is None or camera.lens.flat:
+        places = splats.means - middle if splats.planes is None else -splats.planes[:, :2, 2]
+        rays = torch.cat([places / focal, one], dim=1)
+    else:
+        rays = splats.planes[:, 2]
     turn = other.cam_from_world[:3, :3] @ camera.cam_from_world[:3, :3].T
     shift = other.cam_from_world[:3, 3] - turn @ camera.cam_from_world[:3, 3]
-    seen = (local * splats.depths[:, None]) @ turn.T.to(local) + shift.to(local)
-    focal, middle = (splats.means.new_tensor(pair) for pair in ((other.fx, other.fy), (other.cx, other.cy)))
-    return (seen[:, :2] / seen[:, 2:].clamp(min=NEAR) * focal + middle).clamp(-MAX_SHIFT, MAX_SHIFT)
+    seen = (rays * splats.depths[:, None]) @ turn.T.to(rays) + shift.to(rays)
+    if splats.planes is None:
+        zoom, offset = (seen.new_tensor(pair) for pair in ((other.fx, other.fy), (other.cx, other.cy)))
+        return (seen[:, :2] / seen[:, 2:].clamp(min=NEAR) * zoom + offset).clamp(-MAX_SHIFT, MAX_SHIFT)
+    zoom = seen.new_tensor([other.fx / camera.fx, other.fy / camera.fy])
+    right, down, ahead = torch.einsum("mij,mj->im", splats.planes, seen)
+    return (torch.stack([right, down], dim=1) / ahead.clamp(min=NEAR)[:, None] * zoom).clamp(-MAX_SHIFT, MAX_SHIFT)
 
 
 def opening(aperture: Aperture, u: float, v: float) -> tuple[float, float]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args
 from aaplug.core.colours import Background
 from aaplug.core.conventions import MIN_SEEN_SHARE
 from aaplug.methods import QUALITIES, RateReference
-from aaplug.options.base import CAMERAS, DRAWING, FILM, ORBIT, Options, flag, names, number
+from aaplug.options.base import CAMERAS, DRAWING, FILM, LENS, ORBIT, Options, flag, names, number
 from aaplug.system.contracts import LazyType
 from aaplug.system.errors import MAX_VALUE_CHARACTERS, UsageError
 from aaplug.system.registry import names_of
@@ -36,6 +36,7 @@ VIEWS = flag("NAME,...|test|train|all")
 RECIPE_NAMES = names_of("recipe", comparisons=False)
 RECIPE_METAVAR = "|".join([*RECIPE_NAMES, "..."])  # in `--help`
 RASTERIZER_NAMES = ("auto", "compiled")  # beside those of the registry
+LENS_NAMES = ("pinhole", "fisheye", "equisolid", "equirect", "vr180", "ortho")
 RATE_REFERENCES = get_args(RateReference)
 MAX_SIDE = 16384  # px
 MAX_COORDINATE = 1e7  # world units
@@ -136,6 +137,23 @@ class FilmOptions(RecipeOptions):
         for name in ("sensor", "focus_distance", "focus_at", "blades"):
             if self.f_stop is None and getattr(self, name) is not None:
                 raise UsageError(name, "belongs to `f_stop`")
+
+
+@dataclass(frozen=True, kw_only=True)
+class LensOptions(Options):
+    """The lens."""
+
+    lens: Annotated[str | None, names(*LENS_NAMES), LENS] = None
+    """Draw through another lens (default: that of the camera); equirect is 360x180 degrees, vr180 a pair of eyes."""
+    lens_angle: Annotated[float, number(1, 360, metavar="DEGREES"), LENS] = 180.0
+    """Angle that fisheye and equisolid show along the image's shorter side."""
+    eye_distance: Annotated[float | None, number(0, MAX_COORDINATE, metavar="UNITS"), LENS] = None
+    """Distance between the eyes of vr180, in the scene's units."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if (self.eye_distance is None) == (self.lens == "vr180"):
+            raise UsageError("eye_distance", "belongs to lens vr180, which needs it: about 0.064 m in scene units")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,6 +20,7 @@ from aaplug.options.shared import (
     VIEWS,
     FilmOptions,
     ImageOptions,
+    LensOptions,
     OneProtocol,
     OneRecipe,
     OneViewer,
@@ -62,7 +63,7 @@ class WritingOptions(Options):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RenderOptions(FilmOptions, ImageOptions):
+class RenderOptions(FilmOptions, ImageOptions, LensOptions):
     """Rendering."""
 
     path: Annotated[AnyPath | None, flag("FILE")] = None
@@ -74,7 +75,7 @@ class RenderOptions(FilmOptions, ImageOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class VideoOptions(FilmOptions, ImageOptions):
+class VideoOptions(FilmOptions, ImageOptions, LensOptions):
     """Rendering, and the camera path."""
 
     scale: Annotated[float | None, SCALE] = None

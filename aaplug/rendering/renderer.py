@@ -233,8 +233,8 @@ class Renderer:
         if camera is None or camera.lens == PINHOLE:
             return self.recipe
         if self.recipe.pixel is not POINT or self.recipe.compositor is not None:
-            problem = f"recipe {self.recipe.name} draws pinhole views only; auto, matched, classic, ewa and mip draw all"
-            raise UsageError("lens", problem)
+            problem = f"recipe {self.recipe.name} draws pinhole views only"
+            raise UsageError("lens", f"{problem}; auto, matched, classic, ewa and mip draw all")
         return replace(self.recipe, pixel=RAY)
 
     @contract

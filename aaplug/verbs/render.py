@@ -17,7 +17,7 @@ from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import listing
 from aaplug.system.executors import ProcessesIfLong
 from aaplug.verbs.verb import writes
-from aaplug.verbs.views import image_paths, names_image, resized
+from aaplug.verbs.views import image_paths, names_image, seen
 
 
 class Written(NamedTuple):
@@ -43,10 +43,10 @@ def render(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, optio
     target = Path("images" if output is None else output)
     job = Job.of(scene, cameras, options, single=names_image(target))
     file = None if options.path is None else read_camera_path(options.path)
-    size = options.scale, options.resolution, file.unsized if file else job.cameras.assumed
     ends = select_views(job.cameras, options.camera_to) if options.camera_to else ()
-    views = resized(file.cameras if file else job.views, *size)
-    views = filmed(views, options, file is not None, file and file.shutter, resized(ends, *size))
+    unsized = file.unsized if file else job.cameras.assumed
+    views, ends = (seen(job, each, unsized) for each in (file.cameras if file else job.views, ends))
+    views = filmed(views, options, file is not None, file and file.shutter, ends)
     check = partial(image_paths, target, views, options.overwrite)
     paths = check()
     with running(options, target, check, job.inputs, folder=not names_image(target)) as workers:

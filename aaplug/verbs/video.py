@@ -24,7 +24,7 @@ from aaplug.rendering.videos import make_video
 from aaplug.system.errors import UsageError
 from aaplug.system.executors import ProcessesIfLong
 from aaplug.verbs.verb import writes
-from aaplug.verbs.views import resized
+from aaplug.verbs.views import seen
 
 DEFAULT_FPS = 30.0  # frames per second, where neither the caller nor a path file says
 PANE_GAP = 4  # px
@@ -52,6 +52,8 @@ def video(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, option
     Raises:
         AaplugError: as `render`.
     """
+    if options.lens == "vr180":
+        raise UsageError("lens", "vr180 is a pair of images, which `render` writes; a video takes equirect")
     target = Path("video.webm" if output is None else output)
     file = None if str(options.path) in PATHS else read_camera_path(Path(options.path))
     fps = options.fps or (file and file.fps) or DEFAULT_FPS
@@ -60,7 +62,7 @@ def video(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, option
     job = Job.of(scene, cameras, options)
     recipes = [job.recipe(name) for name in (options.beside or "none", options.recipe) if name != "none"]
     path = file.cameras if file else _built_in_path(job, fps)
-    views = resized(path, options.scale, options.resolution, file.unsized if file else job.cameras.assumed)
+    views = seen(job, path, file.unsized if file else job.cameras.assumed)
     views = filmed(views, options, True, file and file.shutter)
     labels = [{"auto": "aaplug auto"}.get(recipe.name, recipe.name) for recipe in recipes]
 

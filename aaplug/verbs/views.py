@@ -1,15 +1,22 @@
 """Sizes of rendered views, and the files they go to: checked here, before any work."""
 
+import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from aaplug.core.cameras import Camera
+from aaplug.core.lenses import EQUIDISTANT, EQUIRECT, EQUISOLID, ORTHO, PINHOLE, Lens
+from aaplug.evaluation.protocols import median_depth
 from aaplug.io.atomic import check_output, refuse_existing
-from aaplug.options.shared import check_side, size_of
+from aaplug.options.shared import LensOptions, check_side, size_of
+from aaplug.options.verbs import RenderOptions, VideoOptions
+from aaplug.rendering.job import Job
 from aaplug.system.errors import OutputError, UsageError
 
 IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".exr", ".bmp", ".gif")  # any other name is a folder
+SeenOptions = RenderOptions | VideoOptions
 LONGEST_NAME = 200  # bytes; file systems take 255, and a number and a suffix are added
 
 
@@ -32,6 +39,59 @@ def resized(
     for view in sized:
         check_side(view.name, view.width, view.height)
     return sized
+
+
+def seen(job: Job[SeenOptions], views: Sequence[Camera], unsized: bool) -> list[Camera]:
+    """The views through the lens and at the size that a job's options ask for.
+
+    unsized: see `resized`, there `reframe`.
+    """
+    options = job.options
+    bent = through_lens(views, options, lambda view: median_depth(job.scene.gaussians().means, view))
+    return resized(bent, options.scale, options.resolution, unsized)
+
+
+def through_lens(views: Sequence[Camera], options: LensOptions, depth_of: Callable[[Camera], float]) -> list[Camera]:
+    """The views through the lens that the options name, with pixels as dense at the image's centre.
+
+    A fisheye shows its angle along the shorter side, equirect all around, vr180 half of that by two eyes, of which the
+    names say left and right.
+
+    depth_of: distance in world units at which ortho shows things as large as the view does.
+    """
+    if options.lens is None:
+        return [*views]
+    return [seen for view in views for seen in _through(view, options, depth_of)]
+
+
+def _through(view: Camera, options: LensOptions, depth_of: Callable[[Camera], float]) -> list[Camera]:
+    half, side = math.radians(options.lens_angle) / 2, min(view.hw)
+    if options.lens == "pinhole":
+        return [replace(view, lens=PINHOLE)]
+    if options.lens == "ortho":
+        factor = 1 / depth_of(view)
+        return [replace(view, lens=ORTHO, fx=view.fx * factor, fy=view.fy * factor, trained_focal=None)]
+    if options.lens in ("fisheye", "equisolid"):
+        lens = EQUIDISTANT if options.lens == "fisheye" else EQUISOLID
+        focal = side / 2 / (half if lens == EQUIDISTANT else 2 * math.sin(half / 2))
+        lens = replace(lens, max_angle=min(180.0, math.degrees(half)))
+        return [_centred(view, lens, view.width, view.height, focal)]
+    height = 2 * round(math.pi * view.focal / 2)
+    if options.lens == "equirect":
+        return [_centred(view, EQUIRECT, 2 * height, height, height / math.pi)]
+    eyes = []
+    for name, sign in (("left", 1), ("right", -1)):
+        eye = _centred(view, replace(EQUIRECT, max_angle=90.0), height, height, height / math.pi)
+        pose = eye.cam_from_world.clone()
+        pose[0, 3] += sign * (options.eye_distance or 0.0) / 2
+        eyes.append(replace(eye, name=f"{view.name}-{name}", cam_from_world=pose))
+    return eyes
+
+
+def _centred(view: Camera, lens: Lens, width: int, height: int, focal: float) -> Camera:
+    """A free camera in the view's place, with its principal point in the middle."""
+    size = {"width": width, "height": height, "cx": width / 2, "cy": height / 2, "fx": focal, "fy": focal}
+    return replace(view, lens=lens, **size, trained_focal=None, photo=None)
 
 
 def names_image(output: Path) -> bool:

@@ -1,0 +1,75 @@
+"""A room of small textured Gaussians, to look around in; made, not read."""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from aaplug.core.cameras import Camera, CameraSet, look_at
+from aaplug.core.gaussians import Gaussians
+from aaplug.core.spherical_harmonics import SH_C0
+
+SIDE = 6.0  # world units, of the cubic room around the origin
+FLATNESS = 0.1  # thickness of a Gaussian against its width
+FOCAL = 652.0  # px: that of a panorama of 4096 px at its horizon
+VIEWS = 12
+
+
+def room(per_side: int = 300, side: float = SIDE) -> Gaussians:
+    """Six walls of `per_side`² Gaussians each, half a step wide, with waves of colour on each.
+
+    Neighbours are alike: their order, by depth in a pinhole and by distance in a panorama, is not what is tested.
+    """
+    step = side / per_side
+    line = (torch.arange(per_side, dtype=torch.float64) + 0.5) * step - side / 2
+    a, b = (x.flatten() for x in torch.meshgrid(line, line, indexing="ij"))
+    means, scales, colours = [], [], []
+    for axis in range(3):
+        for sign in (-1.0, 1.0):
+            others = [i for i in range(3) if i != axis]
+            place = torch.empty(len(a), 3, dtype=torch.float64)
+            place[:, axis], place[:, others[0]], place[:, others[1]] = sign * side / 2, a, b
+            size = torch.full((len(a), 3), 0.5 * step, dtype=torch.float64)
+            size[:, axis] *= FLATNESS
+            waves = [(f * a + g * b + axis + sign).sin() for f, g in ((4, 1), (1, 3), (2, -2))]
+            colours.append(0.5 + 0.4 * torch.stack(waves, dim=1))
+            means.append(place)
+            scales.append(size)
+    count = 6 * len(a)
+    quats = torch.zeros(count, 4)
+    quats[:, 0] = 1
+    return Gaussians(
+        means=torch.cat(means).float(),
+        quats=quats,
+        log_scales=torch.cat(scales).log().float(),
+        logit_opacities=torch.full((count,), 4.0),
+        sh=((torch.cat(colours) - 0.5) / SH_C0).float()[:, None],
+    )
+
+
+def inside(side: float = SIDE, focal: float = FOCAL) -> CameraSet:
+    """Training views from near the middle of the room, all around."""
+    views = []
+    for i in range(VIEWS):
+        angle, height = 2 * math.pi * i / VIEWS, (-0.5, 0.0, 0.5)[i % 3]
+        eye = torch.tensor([0.05 * side * math.cos(angle), 0.05 * side * math.sin(angle), 0.0], dtype=torch.float64)
+        ahead = torch.tensor([math.cos(angle), math.sin(angle), height], dtype=torch.float64)
+        pose = look_at(eye, eye + ahead, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+        size = round(2 * focal)
+        views.append(Camera(f"view_{i}", size, size, focal, focal, size / 2, size / 2, pose).as_trained())
+    return CameraSet(tuple(views), tuple(views))
+
+
+def matrices(pose: Float[Tensor, "4 4"]) -> list[Float[Tensor, "4 4"]]:
+    """The poses of the six views of a cube around a camera: ahead, right, behind, left, up and down."""
+    faces = []
+    for yaw, pitch in ((0, 0), (90, 0), (180, 0), (270, 0), (0, 90), (0, -90)):
+        a, b = math.radians(yaw), math.radians(pitch)
+        turn, tilt = torch.eye(4, dtype=torch.float64), torch.eye(4, dtype=torch.float64)
+        turn[0, 0] = turn[2, 2] = math.cos(a)
+        turn[0, 2], turn[2, 0] = -math.sin(a), math.sin(a)
+        tilt[1, 1] = tilt[2, 2] = math.cos(b)
+        tilt[1, 2], tilt[2, 1] = math.sin(b), -math.sin(b)
+        faces.append(tilt @ turn @ pose)
+    return faces
