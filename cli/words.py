@@ -54,7 +54,7 @@ class Option(NamedTuple):
         """The value that words give; raises UsageError."""
         if self.argument is None and not words:
             return not self.default
-        takes, got = "no value", " ".join(words)[:MAX_VALUE_CHARACTERS] or "nothing"
+        takes, got = "no value", " ".join(words)[:MAX_VALUE_CHARACTERS].strip() or "nothing"
         if self.argument is not None:
             with suppress(ValueError):
                 value = self.argument.value(words)

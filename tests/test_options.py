@@ -100,6 +100,15 @@ REFUSED = {
 }
 
 
+def test_no_option_takes_an_empty_word():
+    """As a variable of a shell leaves it that is not set; a path would be the folder that the program runs in."""
+    for command in VERBS.values():
+        for option in command.options.values():
+            if option.argument is not None:
+                with pytest.raises(UsageError, match=r"takes .*, got nothing"):
+                    option.value([""] * (option.argument.count or 1))
+
+
 @pytest.mark.parametrize("words", REFUSED)
 def test_a_refusal_is_one_line(words, capsys):
     with pytest.raises(SystemExit) as stop:

@@ -57,7 +57,7 @@ class Argument:
         """The value that words give, several of them also between commas; raises ValueError."""
         if self.count is None:
             words = [part for word in words for part in word.split(",") if part]
-        if not words or len(words) != (self.count or len(words)):
+        if not words or not all(words) or len(words) != (self.count or len(words)):
             raise ValueError(words)
         values = tuple(map(self.read, words))
         return values[0] if self.count == 1 else values
