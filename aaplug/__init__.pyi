@@ -1,13 +1,14 @@
 """The public API, on one page."""
 
 # read and write
-from .io.cameras import read_cameras as read_cameras
+from .io.cameras import read_camera_path as read_camera_path, read_cameras as read_cameras
 from .io.images import read_image as read_image, write_png as write_png
 from .io.scenes import read_scene as read_scene, write_scene as write_scene
 from .io.scenes.scene import Scene as Scene
 
 # nouns
 from .core.cameras import Camera as Camera, CameraSet as CameraSet, look_at as look_at
+from .core.cameras import Aperture as Aperture, Exposure as Exposure
 from .system.errors import AaplugError as AaplugError, FormatError as FormatError, UsageError as UsageError
 from .core.conventions import Convention as Convention
 from .core.gaussians import Gaussians as Gaussians

@@ -11,6 +11,7 @@ import aaplug
 from aaplug.core.camera_paths import toward
 from aaplug.core.cameras import Aperture, CameraSet, Exposure
 from aaplug.core.exposures import CELL_SHARE, cells, lattice, opening, sample_cameras, spread
+from aaplug.core.lenses import Lens
 from aaplug.core.projection import project
 from aaplug.evaluation.metrics import psnr
 from aaplug.io.cameras import read_camera_path
@@ -166,6 +167,17 @@ def test_wrong_options_are_refused(case):
     options, path, says = WRONG[case]
     with pytest.raises(UsageError, match=says):
         filmed([VIEW], FilmOptions(**options), path)
+
+
+def test_a_lens_that_bends_moves_but_has_no_aperture():
+    panorama = replace(VIEW, lens=Lens("equirect"), fx=10.0, fy=10.0)
+    with pytest.raises(UsageError, match="an aperture needs"):
+        filmed([panorama], FilmOptions(f_stop=2.0, focus_distance=1.0), False)
+    renderer = aaplug.Renderer.of(make_scene(30), [VIEW], "matched", min_seen=0.0)
+    moving = replace(
+        panorama, exposure=Exposure(None, (panorama, replace(panorama, cam_from_world=MOVED.cam_from_world)), 4)
+    )
+    assert not torch.equal(renderer(moving).rgb, renderer(panorama).rgb)
 
 
 def test_a_path_of_zero_length_is_refused():

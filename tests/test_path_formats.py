@@ -242,7 +242,7 @@ def test_usd_without_its_package_names_the_extra(tmp_path, monkeypatch):
         read_camera_path(written(tmp_path, "path.usda", USDA))
 
 
-@pytest.mark.parametrize("name", ["colmap", "transforms", "inria", "pinhole"])
+@pytest.mark.parametrize("name", ["colmap", "transforms", "inria", "pinhole", "blender"])
 def test_cameras_of_a_data_set_are_a_path_in_their_order(tmp_path, name):
     make, _ = FIXTURES[name]
     cameras = read_camera_path(make(tmp_path)).cameras

@@ -60,7 +60,10 @@ def right_calls(folder: Path) -> dict[str, tuple[Callable[..., Any], dict[str, A
     def fields(noun: Any) -> dict[str, Any]:
         return {name: value for name, value in vars(noun).items() if name in inspect.signature(type(noun)).parameters}
 
+    aperture = aaplug.Aperture(0.1, 3.0)
+    exposure = aaplug.Exposure(aperture, (view, view), 2)
     nouns = (view, cameras, gaussians, splats, training, recipe, pyramid, aaplug.RULES_3DGS, gaussians.convention)
+    nouns += (aperture, exposure)
     calls = {type(noun).__name__: (type(noun), fields(noun)) for noun in nouns}
     plain = {"rasterizer": "eager", "min_seen": 0.0}
     verbs = {
@@ -92,6 +95,7 @@ def right_calls(folder: Path) -> dict[str, tuple[Callable[..., Any], dict[str, A
         "cameras_around": (aaplug.cameras_around, {"scene": gaussians, "orbit": aaplug.Orbit()}),
         "Orbit": (aaplug.Orbit, {"orbit": 3}),
         "read_cameras": (aaplug.read_cameras, {"path": folder}),
+        "read_camera_path": (aaplug.read_camera_path, {"path": folder}),
         "read_scene": (aaplug.read_scene, {"path": nowhere}),
         "read_image": (aaplug.read_image, {"path": picture}),
         "write_png": (aaplug.write_png, {"path": folder / "new.png", "rgb": rgb}),

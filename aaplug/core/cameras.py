@@ -64,10 +64,10 @@ class Camera:
     photo: the photograph taken from here, if any.  undistortion: how it becomes this view, if it is not of this lens.
         Neither counts for equality.
     lens: maps rays to places in the image.
-    exposure: aperture and shutter; None for an instant through a pinhole or another lens without an opening.
+    exposure: aperture and shutter; None for an instant, and for a lens without a size.
 
     Raises:
-        UsageError: a number is out of range, or the pose is no rigid motion.
+        UsageError: a number is out of range, the pose is no rigid motion, or a lens that bends has an aperture.
     """
 
     name: str
@@ -89,6 +89,8 @@ class Camera:
             check_fields(self)
             object.__setattr__(self, "cam_from_world", self.cam_from_world.double())
             self._check_pose()
+            if self.lens != PINHOLE and self.exposure is not None and self.exposure.aperture is not None:
+                raise UsageError("exposure", f"an aperture needs a lens without distortion, got {self.lens.projection}")
         except UsageError as error:
             if error.where == "name" or not self.name:
                 raise

@@ -60,8 +60,9 @@ def aperture(
                 images["pinhole"] = renderer(view).rgb
                 ratio = _time(lambda of=of: renderer(of(16)), lambda of=of: _separate(renderer, of(16)), rounds)
                 figures.append([*(psnr(image, truth) or math.inf for image in images.values()), ratio])
-                for word, image in {**images, "truth": truth}.items() if pictures else ():
-                    write_png(pictures / f"{name}-{kind}-{size}-{word}.png", image, overwrite=True)
+                if pictures is not None:
+                    for word, image in {**images, "truth": truth}.items():
+                        write_png(pictures / f"{name}-{kind}-{size}-{word}.png", image, overwrite=True)
             row(size, *(f"{sum(column) / len(column):.2f}" for column in zip(*figures, strict=True)))
 
 

@@ -113,6 +113,7 @@ def read_cameras(
     raise FormatError(path, f"holds no cameras of a known format; looked for: {signs}")
 
 
+@contract
 def read_camera_path(path: str | PathLike[str]) -> CameraPath:
     """Read the cameras of a path in order: of a path file, or of any file or folder that `read_cameras` takes.
 
@@ -123,8 +124,11 @@ def read_camera_path(path: str | PathLike[str]) -> CameraPath:
     for format in PATH_FORMATS:
         if format.sniff(Path(path)):
             return format.path_of(Path(path))
-    views = read_cameras(path, test_every=0).all
-    return CameraPath(tuple(replace(view, trained_focal=None, photo=None) for view in views))
+    try:
+        cameras = read_cameras(path, test_every=0)
+    except UsageError:  # of files that give the split: training views, then test views
+        cameras = read_cameras(path)
+    return CameraPath(tuple(replace(view, trained_focal=None, photo=None, undistortion=None) for view in cameras.all))
 
 
 def holds_cameras(path: str | PathLike[str]) -> bool:
