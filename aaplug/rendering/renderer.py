@@ -357,7 +357,7 @@ class Renderer:
         elif places:
             splats = replace(splats, sources=own + places)
         splats = recipe.screen(splats, camera, training)
-        if camera.exposure is not None and camera.lens == PINHOLE:
+        if camera.exposure is not None:
             splats = splats.convolved(cells(splats, camera), compensate=True, floor=0.0)
         if shares is not None:
             splats = faded(splats, shares.index_select(0, own))
