@@ -52,12 +52,12 @@ def verb(*options: type[Options] | Option) -> Callable[[Run], Run]:
 
 @verb(
     *SCENE_AND_CAMERAS,
-    output("PATH", "A folder for the images, or one .png for one view."),
+    output("PATH", "A folder for the images, or one file for one view: .png, .jpg, .webp, .exr, .npz."),
     verbs.RenderOptions,
     json_of("the files as one JSON object"),
 )
 def render(words: Words) -> Answer:
-    """Render views of a scene at any size to PNG.
+    """Render views of a scene at any size to image files.
 
     To measure how close images come to the truth, use evaluate; for a moving camera, video.
     """

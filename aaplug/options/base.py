@@ -30,6 +30,7 @@ class Group:
 
 CAMERAS = Group("camera", "How the camera files are read, and which of the scene's Gaussians they must see.")
 ORBIT = Group("orbit", "Without cameras: views on an orbit around the scene, and the training that is assumed.")
+FILES = Group("file", "What image files hold, and how.")
 DRAWING = Group("drawing", "How images are drawn: programs, memory and machines.")
 REPORT = Group("report", "Files beside the figures.")
 TUNING = Group("tuning", "The optimization, of which the defaults were measured.")

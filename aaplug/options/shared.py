@@ -5,12 +5,13 @@ import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args
 
 from aaplug.core.colours import Background
 from aaplug.core.conventions import MIN_SEEN_SHARE
+from aaplug.io.image_formats import IMAGE_FORMATS
 from aaplug.methods import QUALITIES, RateReference
-from aaplug.options.base import CAMERAS, DRAWING, ORBIT, Options, flag, names, number
+from aaplug.options.base import CAMERAS, DRAWING, FILES, ORBIT, Options, flag, names, number
 from aaplug.system.contracts import LazyType
 from aaplug.system.errors import MAX_VALUE_CHARACTERS, UsageError
 from aaplug.system.registry import names_of
@@ -103,6 +104,12 @@ class ImageOptions(Options):
     """Size in px, such as 400x400; -1 on one side keeps the aspect (-1x720)."""
     overwrite: bool = False
     """Replace existing outputs."""
+    format: Annotated[str | None, names(*IMAGE_FORMATS), FILES] = None
+    """Format of image files (default: that of the output's name, or png)."""
+    transparent: Annotated[bool, FILES] = False
+    """Store alpha and no background: straight in .png and .webp, premultiplied in .exr and .npz."""
+    bit_depth: Annotated[Literal[8, 16, 32] | None, names(8, 16, 32), FILES] = None
+    """Bits per channel (default: 8; .exr: 16, half precision, but 32 where a pass needs it; .npz: 32)."""
 
 
 @dataclass(frozen=True, kw_only=True)

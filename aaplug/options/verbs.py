@@ -66,8 +66,6 @@ class RenderOptions(RecipeOptions, ImageOptions):
 
     path: Annotated[AnyPath | None, flag("FILE.json")] = None
     """Instead of --views: cameras of a path file, nerfstudio's camera_path.json or what the page of `view` saves."""
-    bit_depth: Literal[8, 16] = 8
-    """Bits per colour channel."""
 
 
 @dataclass(frozen=True, kw_only=True)

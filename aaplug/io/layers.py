@@ -1,0 +1,81 @@
+"""Passes of a rendered view as one file, in a format of `IMAGE_FORMATS`.
+
+A pass is a tensor of floats, [height, width, channels] or [height, width].  Colours are premultiplied where there is an
+alpha.  A .png or .webp stores them straight, divided by alpha; an .exr or .npz as they are.
+"""
+
+import errno
+from collections.abc import Mapping
+from os import PathLike
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from aaplug.core.passes import PASSES
+from aaplug.io.atomic import replacing, replacing_file
+from aaplug.io.image_formats import Storage
+from aaplug.io.images import encode_jpeg, encode_webp, encoded
+from aaplug.system.contracts import contract
+
+JPEG_QUALITY = 95  # of 100
+MAX_HALF = 65504.0  # the largest finite half
+
+
+@contract
+def write_layers(
+    path: str | PathLike[str], layers: Mapping[str, Float[Tensor, "h w ..."]], storage: Storage, overwrite: bool = False
+) -> None:
+    """Write the passes that `storage` names, each of which `layers` holds.
+
+    Raises:
+        OutputError: see `replacing`.
+        UsageError: a .png, .jpg or .webp is to hold values that are NaN or infinite.
+    """
+    chosen = {name: layers[name].detach().float().cpu() for name in storage.passes}
+    if storage.format.name == "exr":
+        _write_exr(path, chosen, storage, overwrite)
+        return
+    file = b"" if storage.format.name == "npz" else _picture(chosen, storage)
+    with replacing(path, overwrite) as stream:
+        if file:
+            stream.write(file)
+        else:
+            arrays: dict[str, Any] = {name: layer.numpy() for name, layer in chosen.items()}
+            np.savez(stream, **arrays)
+
+
+def _picture(layers: Mapping[str, Float[Tensor, "h w ..."]], storage: Storage) -> bytes:
+    """A file of colours, of straight colours and alpha, or of alpha alone."""
+    image, alpha = layers.get("rgb"), layers.get("alpha")
+    if alpha is not None:
+        alpha = alpha[..., None]
+        image = alpha if image is None else torch.cat([torch.where(alpha > 0, image / alpha, 0.0), alpha], dim=2)
+    assert image is not None
+    if storage.format.name == "png":
+        return encoded(".png", image, bit_depth=storage.bit_depth)
+    return encode_webp(image, None) if storage.format.name == "webp" else encode_jpeg(image, JPEG_QUALITY)
+
+
+def _write_exr(
+    path: str | PathLike[str], layers: Mapping[str, Float[Tensor, "h w ..."]], storage: Storage, overwrite: bool
+) -> None:
+    """Write a file of named layers, as Blender and Nuke read them: R, G, B, A, depth.Z, normal.X ..."""
+    import OpenEXR  # an extra
+
+    channels = dict[str, np.ndarray]()
+    for name, layer in layers.items():
+        spec = PASSES[name]
+        half = storage.bit_depth == 16 and not spec.exact
+        for letter, plane in zip(spec.channels, layer.reshape(*layer.shape[:2], -1).unbind(dim=2), strict=True):
+            samples = plane.clamp(-MAX_HALF, MAX_HALF).half() if half else plane
+            channels[f"{spec.layer}.{letter}".lstrip(".")] = samples.contiguous().numpy()
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with replacing_file(path, overwrite, ".exr") as temporary:
+        try:
+            with OpenEXR.File(header, channels) as file:
+                file.write(str(temporary))
+        except RuntimeError as error:  # such as a full disk
+            raise OSError(errno.EIO, str(error)) from error
