@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import aaplug
-from aaplug.core.imaging import levels
+from aaplug.core.imaging import levels, linear
 from aaplug.io.image_formats import IMAGE_FORMATS, Storage
 from aaplug.io.images import read_image, read_rgba
 from aaplug.io.layers import write_layers
@@ -24,8 +24,8 @@ VIEWS = [make_camera((x / 2, -4.0, 0.3), (40, 30), name=f"v{x}") for x in range(
 GREEN = (0.2, 0.9, 0.4)
 
 
-def storage(name: str, *passes: str, **other) -> Storage:
-    return Storage.of(Path(f"a.{name}"), None, passes or ("rgb",), False, other.get("bit_depth"))
+def storage(name: str, *passes: str, colour: str | None = "srgb", **other) -> Storage:
+    return Storage.of(Path(f"a.{name}"), passes=passes or ("rgb",), colour=colour, **other)
 
 
 def layers(height: int = 5, width: int = 7) -> dict[str, torch.Tensor]:
@@ -124,7 +124,8 @@ def test_a_transparent_exr_over_the_background_is_the_opaque_image_where_colours
 
     cameras = aaplug.read_cameras(SAMPLE)
     view = cameras.test[0].scaled(0.25)
-    aaplug.render(SAMPLE / "chair.ply", cameras, tmp_path / "a.exr", views=view.name, scale=0.25, transparent=True)
+    options = {"views": view.name, "scale": 0.25, "transparent": True, "colour": "srgb"}
+    aaplug.render(SAMPLE / "chair.ply", cameras, tmp_path / "a.exr", **options)
     r, g, b, alpha = (OpenEXR.File(str(tmp_path / "a.exr")).channels()["RGBA"].pixels[..., i] for i in range(4))
     over = torch.from_numpy(np.stack([r, g, b], 2).astype(np.float32))
     over = over + (1 - torch.from_numpy(alpha.astype(np.float32)))[..., None] * torch.tensor(GREEN)
@@ -132,8 +133,52 @@ def test_a_transparent_exr_over_the_background_is_the_opaque_image_where_colours
     assert (levels(over, 8) - levels(opaque, 8)).abs().max() <= 1
 
 
+def light_of(value: float) -> float:
+    """IEC 61966-2-1, by its definition."""
+    return value / 12.92 if value <= 0.04045 else ((value + 0.055) / 1.055) ** 2.4
+
+
+def test_linear_colours_are_decoded_once_from_straight_ones():
+    values = torch.tensor([0.0, 0.02, 0.04045, 0.0405, 0.2, 0.5, 1.0, 1.3])
+    expected = torch.tensor([light_of(value) for value in values.tolist()])
+    assert torch.allclose(linear(values[:, None].expand(-1, 3))[:, 0], expected, rtol=1e-6)
+
+
+@needs_exr
+@pytest.mark.parametrize("name", ["exr", "npz"])
+def test_colours_are_stored_as_asked_and_the_file_says_how(tmp_path, name):
+    drawn = layers()
+    alpha = drawn["alpha"][..., None]
+    for passes, expected in (
+        (["rgb"], linear(drawn["rgb"])),
+        (["rgb", "alpha"], torch.where(alpha > 0, alpha * linear(drawn["rgb"] / alpha), 0.0)),
+    ):
+        how = storage(name, *passes, colour="linear", bit_depth=32)
+        write_layers(tmp_path / f"a.{name}", drawn, how, overwrite=True)
+        rgb, said = rgb_and_space(tmp_path / f"a.{name}")
+        assert np.array_equal(rgb, expected)
+        assert said == "lin_rec709_display"
+    default = Storage.of(Path(f"a.{name}"), bit_depth=32)
+    assert default.colour == {"exr": "linear", "npz": "srgb"}[name]
+    write_layers(tmp_path / f"s.{name}", drawn, replace(default, colour="srgb"))
+    rgb, said = rgb_and_space(tmp_path / f"s.{name}")
+    assert (np.array_equal(rgb, drawn["rgb"]), said) == (True, "srgb_rec709_display")
+
+
+def rgb_and_space(path: Path) -> tuple[np.ndarray, str]:
+    """The colours of a file, and how it says that they are stored."""
+    if path.suffix == ".npz":
+        with np.load(path) as found:
+            return found["rgb"], str(found["colorSpace"])
+    import OpenEXR
+
+    file = OpenEXR.File(str(path), separate_channels=True)
+    return np.stack([file.channels()[c].pixels for c in "RGB"], axis=2), file.header()["colorSpace"]
+
+
 REFUSED = {
-    "a.jpg --transparent": "--transparent: a .jpg cannot hold alpha, but .png, .webp, .exr, .npz can",
+    "a.png --colour linear": "--colour: a .png has no linear colours; .exr, .npz can",
+    "a.jpg --transparent": "--transparent: a .jpg cannot hold alpha; .png, .webp, .exr, .npz can",
     "a.jpg --bit-depth 16": "--bit-depth: a .jpg has 8 bits per channel, not 16",
     "a.png --bit-depth 32": "--bit-depth: a .png has 8 or 16 bits per channel, not 32",
     "a.png --format exr": "--format: is exr, but a.png is named as a .png",

@@ -18,6 +18,7 @@ class ImageFormat:
     """A format.
 
     suffixes: of its files, the usual one first.  passes: that it holds.  bit_depths: per channel, the default first.
+    colours: of `COLOURS`, the default first.
     needs: the package that writes it, from aaplug's extra of the format's name; None if that is always there.
     """
 
@@ -25,6 +26,7 @@ class ImageFormat:
     suffixes: tuple[str, ...]
     passes: tuple[str, ...]
     bit_depths: tuple[int, ...]
+    colours: tuple[str, ...] = ("srgb",)
     needs: str | None = None
 
     @property
@@ -33,12 +35,15 @@ class ImageFormat:
         return self.needs is not None and importlib.util.find_spec(self.needs) is None
 
 
+# Values of colours, with the name of KHR_gaussian_splatting for each: those that a display takes (IEC 61966-2-1), as
+# training has them, and those proportional to light.
+COLOURS = {"srgb": "srgb_rec709_display", "linear": "lin_rec709_display"}
 IMAGE_FORMATS = {
     "png": ImageFormat("png", (".png",), ("rgb", "alpha"), (8, 16)),
     "jpg": ImageFormat("jpg", (".jpg", ".jpeg"), ("rgb",), (8,)),
     "webp": ImageFormat("webp", (".webp",), ("rgb", "alpha"), (8,)),
-    "exr": ImageFormat("exr", (".exr",), tuple(PASSES), (16, 32), needs="OpenEXR"),
-    "npz": ImageFormat("npz", (".npz",), tuple(PASSES), (32,)),
+    "exr": ImageFormat("exr", (".exr",), tuple(PASSES), (16, 32), ("linear", "srgb"), needs="OpenEXR"),
+    "npz": ImageFormat("npz", (".npz",), tuple(PASSES), (32,), ("srgb", "linear")),
 }
 
 
@@ -49,18 +54,25 @@ class Storage:
     format: ImageFormat = IMAGE_FORMATS["png"]
     passes: tuple[str, ...] = ("rgb",)
     bit_depth: int = 8
+    colour: str = "srgb"
 
     @classmethod
     def of(
-        cls, output: PurePath, format: str | None, passes: Sequence[str], transparent: bool, bit_depth: int | None
+        cls,
+        output: PurePath,
+        format: str | None = None,
+        passes: Sequence[str] = ("rgb",),
+        transparent: bool = False,
+        bit_depth: int | None = None,
+        colour: str | None = None,
     ) -> "Storage":
         """The storage that options ask for, by the name of a format or else by the output's.
 
         transparent: adds alpha to the passes.
 
         Raises:
-            UsageError: the format cannot hold a pass or that many bits, is not that of the output, or its package is
-                not installed.
+            UsageError: the format cannot hold a pass, that many bits or such colours, is not that of the output, or its
+                package is not installed.
         """
         by_name = next((f.name for f in IMAGE_FORMATS.values() if output.suffix.lower() in f.suffixes), None)
         if format is not None and by_name not in (format, None):
@@ -71,17 +83,16 @@ class Storage:
         asked = tuple(dict.fromkeys([*passes, *["alpha"] * transparent]))
         for name in asked:
             if name not in chosen.passes:
-                option, holders = ("transparent" if name not in passes else "passes"), holders_of(name)
-                raise UsageError(option, f"a .{chosen.name} cannot hold {name}, but {listing(holders)} can")
+                holders = listing([f".{each.name}" for each in IMAGE_FORMATS.values() if name in each.passes])
+                option = "passes" if name in passes else "transparent"
+                raise UsageError(option, f"a .{chosen.name} cannot hold {name}; {holders} can")
         if bit_depth not in (*chosen.bit_depths, None):
             depths = " or ".join(map(str, chosen.bit_depths))
             raise UsageError("bit_depth", f"a .{chosen.name} has {depths} bits per channel, not {bit_depth}")
-        return cls(chosen, asked, bit_depth or chosen.bit_depths[0])
+        if colour not in (*chosen.colours, None):
+            holders = listing([f".{each.name}" for each in IMAGE_FORMATS.values() if colour in each.colours])
+            raise UsageError("colour", f"a .{chosen.name} has no {colour} colours; {holders} can")
+        return cls(chosen, asked, bit_depth or chosen.bit_depths[0], colour or chosen.colours[0])
 
 
 PNG = Storage()
-
-
-def holders_of(name: str) -> list[str]:
-    """The formats that hold a pass."""
-    return [f".{each.name}" for each in IMAGE_FORMATS.values() if name in each.passes]

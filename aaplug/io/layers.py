@@ -1,7 +1,8 @@
 """Passes of a rendered view as one file, in a format of `IMAGE_FORMATS`.
 
 A pass is a tensor of floats, [height, width, channels] or [height, width].  Colours are premultiplied where there is an
-alpha.  A .png or .webp stores them straight, divided by alpha; an .exr or .npz as they are.
+alpha.  A .png or .webp stores them straight, divided by alpha; an .exr or .npz as they are.  Linear colours are decoded
+from finished pixels, once: scenes are composited in the display values that training saw.
 """
 
 import errno
@@ -14,13 +15,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from aaplug.core.imaging import linear, straight
 from aaplug.core.passes import PASSES
 from aaplug.io.atomic import replacing, replacing_file
-from aaplug.io.image_formats import Storage
+from aaplug.io.image_formats import COLOURS, Storage
 from aaplug.io.images import encode_jpeg, encode_webp, encoded
 from aaplug.system.contracts import contract
 
 JPEG_QUALITY = 95  # of 100
+INTEROP_IDS = {"srgb": "srgb_rec709_display", "linear": "lin_rec709_scene"}  # of the Color Interop Forum
 MAX_HALF = 65504.0  # the largest finite half
 
 
@@ -35,6 +38,9 @@ def write_layers(
         UsageError: a .png, .jpg or .webp is to hold values that are NaN or infinite.
     """
     chosen = {name: layers[name].detach().float().cpu() for name in storage.passes}
+    if storage.colour == "linear" and "rgb" in chosen:
+        rgb, alpha = chosen["rgb"], chosen.get("alpha")
+        chosen["rgb"] = linear(rgb) if alpha is None else linear(straight(rgb, alpha)) * alpha[..., None]
     if storage.format.name == "exr":
         _write_exr(path, chosen, storage, overwrite)
         return
@@ -44,15 +50,15 @@ def write_layers(
             stream.write(file)
         else:
             arrays: dict[str, Any] = {name: layer.numpy() for name, layer in chosen.items()}
-            np.savez(stream, **arrays)
+            np.savez(stream, colorSpace=COLOURS[storage.colour], **arrays)
 
 
 def _picture(layers: Mapping[str, Float[Tensor, "h w ..."]], storage: Storage) -> bytes:
     """A file of colours, of straight colours and alpha, or of alpha alone."""
     image, alpha = layers.get("rgb"), layers.get("alpha")
     if alpha is not None:
-        alpha = alpha[..., None]
-        image = alpha if image is None else torch.cat([torch.where(alpha > 0, image / alpha, 0.0), alpha], dim=2)
+        matte = alpha[..., None]
+        image = matte if image is None else torch.cat([straight(image, alpha), matte], dim=2)
     assert image is not None
     if storage.format.name == "png":
         return encoded(".png", image, bit_depth=storage.bit_depth)
@@ -73,6 +79,8 @@ def _write_exr(
             samples = plane.clamp(-MAX_HALF, MAX_HALF).half() if half else plane
             channels[f"{spec.layer}.{letter}".lstrip(".")] = samples.contiguous().numpy()
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    if "rgb" in layers:
+        header |= {"colorSpace": COLOURS[storage.colour], "colorInteropID": INTEROP_IDS[storage.colour]}
     with replacing_file(path, overwrite, ".exr") as temporary:
         try:
             with OpenEXR.File(header, channels) as file:

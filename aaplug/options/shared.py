@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args
 
 from aaplug.core.colours import Background
 from aaplug.core.conventions import MIN_SEEN_SHARE
-from aaplug.io.image_formats import IMAGE_FORMATS
+from aaplug.io.image_formats import COLOURS, IMAGE_FORMATS
 from aaplug.methods import QUALITIES, RateReference
 from aaplug.options.base import CAMERAS, DRAWING, FILES, ORBIT, Options, flag, names, number
 from aaplug.system.contracts import LazyType
@@ -108,6 +108,8 @@ class ImageOptions(Options):
     """Format of image files (default: that of the output's name, or png)."""
     transparent: Annotated[bool, FILES] = False
     """Store alpha and no background: straight in .png and .webp, premultiplied in .exr and .npz."""
+    colour: Annotated[str | None, names(*COLOURS), FILES] = None
+    """Values of colours: srgb, as a display takes them, or linear in light (default: srgb; .exr: linear)."""
     bit_depth: Annotated[Literal[8, 16, 32] | None, names(8, 16, 32), FILES] = None
     """Bits per channel (default: 8; .exr: 16, half precision, but 32 where a pass needs it; .npz: 32)."""
 

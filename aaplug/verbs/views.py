@@ -46,7 +46,8 @@ def storage_of(output: Path, options: Drawn) -> tuple[Storage, Drawn]:
     Raises:
         UsageError: the format does not hold what is asked for, or there is to be a background and alpha.
     """
-    storage = Storage.of(output, options.format, ["rgb"], options.transparent, options.bit_depth)
+    stored = (options.transparent, options.bit_depth, options.colour)
+    storage = Storage.of(output, options.format, ["rgb"], *stored)
     if "alpha" not in storage.passes:
         return storage, options
     if options.background != "auto":
