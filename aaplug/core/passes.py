@@ -21,6 +21,7 @@ class Pass:
     exact: bool = True
 
 
+# `rendering.passes` states the rule of each
 PASSES = {
     "rgb": Pass("RGB", "", exact=False),
     "alpha": Pass("A", "", exact=False),

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import PurePath
 
-from aaplug.core.passes import PASSES
+from aaplug.core.passes import PASSES, NormalAxes
 from aaplug.system.errors import UsageError, listing
 from aaplug.system.extras import install_command
 
@@ -55,6 +55,7 @@ class Storage:
     passes: tuple[str, ...] = ("rgb",)
     bit_depth: int = 8
     colour: str = "srgb"
+    normal_axes: NormalAxes = "camera"
 
     @classmethod
     def of(
@@ -65,6 +66,7 @@ class Storage:
         transparent: bool = False,
         bit_depth: int | None = None,
         colour: str | None = None,
+        normal_axes: NormalAxes = "camera",
     ) -> "Storage":
         """The storage that options ask for, by the name of a format or else by the output's.
 
@@ -92,7 +94,7 @@ class Storage:
         if colour not in (*chosen.colours, None):
             holders = listing([f".{each.name}" for each in IMAGE_FORMATS.values() if colour in each.colours])
             raise UsageError("colour", f"a .{chosen.name} has no {colour} colours; {holders} can")
-        return cls(chosen, asked, bit_depth or chosen.bit_depths[0], colour or chosen.colours[0])
+        return cls(chosen, asked, bit_depth or chosen.bit_depths[0], colour or chosen.colours[0], normal_axes)
 
 
 PNG = Storage()

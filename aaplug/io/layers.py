@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from aaplug.core.imaging import linear, straight
@@ -29,7 +29,10 @@ MAX_HALF = 65504.0  # the largest finite half
 
 @contract
 def write_layers(
-    path: str | PathLike[str], layers: Mapping[str, Float[Tensor, "h w ..."]], storage: Storage, overwrite: bool = False
+    path: str | PathLike[str],
+    layers: Mapping[str, Float[Tensor, "h w ..."] | Int[Tensor, "h w"]],
+    storage: Storage,
+    overwrite: bool = False,
 ) -> None:
     """Write the passes that `storage` names, each of which `layers` holds.
 

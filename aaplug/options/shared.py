@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args
 
 from aaplug.core.colours import Background
 from aaplug.core.conventions import MIN_SEEN_SHARE
+from aaplug.core.passes import PASSES, NormalAxes
 from aaplug.io.image_formats import COLOURS, IMAGE_FORMATS
 from aaplug.methods import QUALITIES, RateReference
 from aaplug.options.base import CAMERAS, DRAWING, FILES, ORBIT, Options, flag, names, number
@@ -106,6 +107,10 @@ class ImageOptions(Options):
     """Replace existing outputs."""
     format: Annotated[str | None, names(*IMAGE_FORMATS), FILES] = None
     """Format of image files (default: that of the output's name, or png)."""
+    passes: Annotated[str | Sequence[str], names(*PASSES, metavar="rgb,depth,...", count=None), FILES] = ("rgb",)
+    """What image files hold: rgb, alpha, depth, depth-median, depth-nearest, normal, position, id, samples, bound."""
+    normal_axes: Annotated[NormalAxes, FILES] = "camera"
+    """Axes of normals: those of the world, or of the camera: right, up, towards the viewer."""
     transparent: Annotated[bool, FILES] = False
     """Store alpha and no background: straight in .png and .webp, premultiplied in .exr and .npz."""
     colour: Annotated[str | None, names(*COLOURS), FILES] = None

@@ -63,8 +63,8 @@ class _Writer:
 
     @torch.no_grad()
     def __call__(self, index: int) -> None:
-        image = self.renderer(self.views[index])
-        write_layers(self.paths[index], image._asdict(), self.storage, overwrite=True)
+        layers = self.renderer.passes(self.views[index], self.storage.passes, self.storage.normal_axes)
+        write_layers(self.paths[index], layers, self.storage, overwrite=True)
 
     def __getstate__(self) -> dict[str, Any]:
         """For another process, wherever it runs."""

@@ -46,8 +46,9 @@ def storage_of(output: Path, options: Drawn) -> tuple[Storage, Drawn]:
     Raises:
         UsageError: the format does not hold what is asked for, or there is to be a background and alpha.
     """
-    stored = (options.transparent, options.bit_depth, options.colour)
-    storage = Storage.of(output, options.format, ["rgb"], *stored)
+    passes = [options.passes] if isinstance(options.passes, str) else options.passes
+    stored = (options.transparent, options.bit_depth, options.colour, options.normal_axes)
+    storage = Storage.of(output, options.format, passes, *stored)
     if "alpha" not in storage.passes:
         return storage, options
     if options.background != "auto":
