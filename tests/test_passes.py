@@ -12,7 +12,7 @@ import torch
 import aaplug
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.lenses import Lens
-from aaplug.core.passes import PASSES
+from aaplug.core.passes import PASSES, NormalAxes
 from aaplug.core.splats import Splats2D
 from aaplug.io.image_formats import Storage
 from aaplug.io.scenes import write_scene
@@ -29,48 +29,56 @@ BLACK = (0.0, 0.0, 0.0)
 TILT = math.radians(35)  # of the plane against the image
 
 
-def plane(count: int = 120, side: float = 3.0) -> Gaussians:
-    """A textured square of discs in the plane through the origin whose normal is `NORMAL`, in any order."""
+def plane(tilt: float = TILT, count: int = 120, side: float = 3.0) -> Gaussians:
+    """A textured square of discs in the plane through the origin of `normal_of`, in any order."""
     at = (torch.arange(count) + 0.5) / count * side - side / 2
     u, v = (x.flatten() for x in torch.meshgrid(at, at, indexing="ij"))
     order = torch.randperm(len(u), generator=torch.Generator().manual_seed(0))
-    means = torch.stack([u, v * math.sin(TILT), v * math.cos(TILT)], dim=1)[order]
+    means = torch.stack([u, v * math.sin(tilt), v * math.cos(tilt)], dim=1)[order]
     n, width = len(means), 0.7 * side / count
     log_scales = torch.tensor([width, width, 1e-4]).log().expand(n, 3)
-    turn = (math.pi / 2 - TILT) / 2  # half the angle from z to the normal
+    turn = (math.pi / 2 - tilt) / 2  # half the angle from z to the normal
     quats = torch.tensor([math.cos(turn), math.sin(turn), 0.0, 0.0]).expand(n, 4)
     colours = torch.rand(n, 1, 3, generator=torch.Generator().manual_seed(1)) * 3 - 1.5
     return Gaussians(means, quats.contiguous(), log_scales.contiguous(), torch.full((n,), 4.0), colours)
 
 
-NORMAL = torch.tensor([0.0, -math.cos(TILT), math.sin(TILT)])  # towards cameras at negative y
+def normal_of(tilt: float) -> torch.Tensor:
+    """Towards cameras at negative y."""
+    return torch.tensor([0.0, -math.cos(tilt), math.sin(tilt)])
+
+
 CAMERA = make_camera((0.4, -4.0, 0.3), (96, 72), name="v")
+
+
+def plane_errors(tilt: float, scale: float, axes: NormalAxes = "world") -> dict[str, float]:
+    """Largest errors on a textured plane: of depths and of position as shares of the depth, of normals in degrees."""
+    renderer, camera = Renderer.of(plane(tilt), [CAMERA], rasterizer="eager"), CAMERA.scaled(scale)
+    assert renderer.samples(camera) == (1 if scale == 1 else 2)
+    drawn = renderer.passes(camera, list(PASSES), axes)
+    rotation, centre, normal = camera.cam_from_world[:3, :3].float(), camera.centre.float(), normal_of(tilt)
+    y, x = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
+    rays = torch.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, torch.ones_like(x)], dim=2)
+    depth = -(centre @ normal) / (rays @ rotation @ normal)
+    covered = drawn["alpha"] > 0.9
+    assert covered.float().mean() > 0.1
+    depths = {name: (drawn[name] / depth - 1).abs() for name in PASSES if name.startswith("depth")}
+    off = (drawn["position"] - centre - depth[..., None] * (rays @ rotation)).norm(dim=2) / depth
+    seen = normal if axes == "world" else rotation @ normal * torch.tensor([1.0, -1.0, -1.0])
+    angle = (drawn["normal"] @ seen).clamp(max=1).acos().rad2deg()
+    return {name: float(x[covered].max()) for name, x in (depths | {"position": off, "normal": angle}).items()}
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.25])
 @pytest.mark.parametrize("axes", ["camera", "world"])
 def test_depth_normal_and_position_of_a_textured_plane(scale, axes):
-    renderer = Renderer.of(plane(), [CAMERA], rasterizer="eager")
-    camera = CAMERA.scaled(scale)
-    assert renderer.samples(camera) == (1 if scale == 1 else 2)
-    limits = {"depth": 0.001, "depth-median": 0.015, "depth-nearest": 0.025}
-    drawn = renderer.passes(camera, [*limits, "normal", "position", "alpha"], axes)
-    rotation, centre = camera.cam_from_world[:3, :3].float(), camera.centre.float()
-    y, x = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
-    rays = torch.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, torch.ones_like(x)], dim=2)
-    depth = -(centre @ NORMAL) / (rays @ rotation @ NORMAL)
-    covered = drawn["alpha"] > 0.9
-    assert covered.float().mean() > 0.3
-    for name, limit in limits.items():
-        assert (drawn[name] / depth - 1).abs()[covered].max() < limit, name
-    place = centre + depth[..., None] * (rays @ rotation)
-    assert (drawn["position"] - place)[covered].norm(dim=1).max() < 0.002 * depth.max()
-    normal = NORMAL if axes == "world" else rotation @ NORMAL * torch.tensor([1.0, -1.0, -1.0])
-    assert (drawn["normal"] @ normal)[covered].clamp(max=1).acos().rad2deg().max() < 0.1
+    error = plane_errors(TILT, scale, axes)
+    limits = {"depth": 0.001, "depth-median": 0.015, "depth-nearest": 0.025, "position": 0.002, "normal": 0.1}
+    assert all(error[name] < limit for name, limit in limits.items()), error
 
 
 def test_the_depth_of_a_ball_is_that_of_its_centre():
-    ball = plane(1)
+    ball = plane(count=1)
     ball = replace(ball, log_scales=torch.full((1, 3), -1.0), means=torch.tensor([[0.3, 0.2, 0.1]]))
     drawn = Renderer.of(ball, [CAMERA], rasterizer="eager").passes(CAMERA, ["depth", "alpha"])
     seen = drawn["alpha"] > 0
@@ -107,13 +115,12 @@ GROUPS = [("nearest", "median", "number", "weight"), ("count", "weight", "number
 @pytest.mark.parametrize("shown", GROUPS)
 def test_the_order_of_splats_agrees_with_its_float64_twin(kernel, shown):
     pixel, splats = aaplug.PIXEL_KERNELS[kernel], numbered(make_splats(400, (60, 44)).to(torch.float64))
-    fast, exact = (
-        draw(splats, (44, 60), BLACK, pixel, Order.of(pixel, shown, splats)) for draw in (EAGER_TILED, REFERENCE)
-    )
+    order = Order.of(pixel, shown, splats)
+    fast, exact = (draw(splats, (44, 60), BLACK, pixel, order) for draw in (EAGER_TILED, REFERENCE))
     for name, a, b in zip(shown, (*fast.rgb.unbind(2), fast.alpha), (*exact.rgb.unbind(2), exact.alpha), strict=True):
         assert torch.allclose(a, b, rtol=1e-9, atol=1e-6), name
         assert len(a.unique()) > 20
-    half = EAGER_TILED(splats.to(torch.float32), (44, 60), BLACK, pixel, Order.of(pixel, shown, splats))
+    half = EAGER_TILED(splats.to(torch.float32), (44, 60), BLACK, pixel, order)
     assert (half.rgb[..., 2].double() - exact.rgb[..., 2]).abs().lt(1e-4).double().mean() > 0.999
 
 
@@ -245,16 +252,16 @@ LENSES = {
 
 @pytest.mark.parametrize("lens", LENSES)
 def test_through_a_lens_a_position_is_where_the_splat_is(lens):
-    """A small ball far off the axis: its place, its distance or depth, its id, and no more."""
+    """A ball far off the axis: its place, its distance or depth, its id, and no more."""
     kind, focal = LENSES[lens]
-    ball = replace(make_scene(1), means=torch.tensor([[0.7, 0.1, -0.2]]), log_scales=torch.full((1, 3), -3.0))
+    ball = replace(make_scene(1), means=torch.tensor([[0.7, 0.1, -0.2]]), log_scales=torch.full((1, 3), -2.0))
     ball = replace(ball, logit_opacities=torch.tensor([5.0]))
     camera = replace(CAMERA, lens=kind, fx=focal, fy=focal)
     drawn = Renderer.of(ball, [CAMERA], "matched", rasterizer="eager").passes(camera, list(PASSES))
-    seen = drawn["alpha"] > 0.2
+    seen = drawn["alpha"] > 0.5
     assert seen.any()
     place = drawn["position"][seen] - ball.means
-    assert place.norm(dim=1).max() < 0.2
+    assert place.norm(dim=1).max() < 0.4
     offset = ball.means[0].double() - camera.centre
     away = offset @ camera.cam_from_world[2, :3] if kind.flat else offset.norm()
     for name in ("depth", "depth-median", "depth-nearest"):

@@ -10,7 +10,7 @@ from typing import Annotated, Literal, get_args
 from aaplug.core.conventions import SpzAxes
 from aaplug.io import MOST_FPS
 from aaplug.io.atomic import AnyPath
-from aaplug.options.base import DRAWING, PYTHON_ONLY, REPORT, TUNING, Options, flag, names, number
+from aaplug.options.base import DRAWING, FILES, PYTHON_ONLY, REPORT, TUNING, Options, flag, names, number
 from aaplug.options.shared import (
     RECIPE_METAVAR,
     SCALE,
@@ -77,7 +77,7 @@ class VideoOptions(RecipeOptions, ImageOptions):
     path: Annotated[AnyPath, flag("zoom|dolly|orbit|FILE.json")] = "zoom"
     """zoom (focal length), dolly (distance) or orbit from the first of --views, or nerfstudio's camera_path.json."""
     beside: Annotated[str | Recipe | None, names("none", kind="recipe", metavar=f"none|{RECIPE_METAVAR}")] = "classic"
-    """Recipe to show on the left; none shows --recipe alone."""
+    """Recipe to show on the left of a video; none shows --recipe alone, as a frame sequence always does."""
     start: Annotated[float, SCALE] = 1.0
     """Sampling rate at the start of a zoom or dolly, relative to training."""
     end: Annotated[float, SCALE] = 0.125
@@ -86,6 +86,8 @@ class VideoOptions(RecipeOptions, ImageOptions):
     """Length in seconds of a zoom, dolly or orbit."""
     fps: Annotated[float | None, number(0.1, MOST_FPS)] = None
     """Frames per second (default: the path file's, or 30)."""
+    resume: Annotated[bool, FILES] = False
+    """Continue an interrupted frame sequence; finished frames are not drawn again."""
 
 
 @dataclass(frozen=True, kw_only=True)
