@@ -52,12 +52,12 @@ def verb(*options: type[Options] | Option) -> Callable[[Run], Run]:
 
 @verb(
     *SCENE_AND_CAMERAS,
-    output("PATH", "A folder for the images, or one .png for one view."),
+    output("PATH", "A folder for the images, or one file for one view: .png, .jpg, .webp, .exr, .npz."),
     verbs.RenderOptions,
     json_of("the files as one JSON object"),
 )
 def render(words: Words) -> Answer:
-    """Render views of a scene at any size to PNG.
+    """Render views of a scene at any size to image files.
 
     To measure how close images come to the truth, use evaluate; for a moving camera, video.
     """
@@ -182,12 +182,12 @@ def evaluate(words: Words) -> Answer:
 
 @verb(
     *SCENE_AND_CAMERAS,
-    output("FILE.webm", "The video: VP9 .webm, or H.264 .mp4."),
+    output("PATH", "The video: VP9 .webm, or H.264 .mp4; or frames of one file each: frame.####.exr."),
     verbs.VideoOptions,
     json_of("what was written as one JSON object"),
 )
 def video(words: Words) -> Answer:
-    """Render a camera path to a video, classic 3DGS and aaplug side by side.
+    """Render a camera path to a video, classic 3DGS and aaplug side by side, or to a frame sequence.
 
     For single images, use render; to move the camera by hand, view.
     """

@@ -203,7 +203,7 @@ def test_documented_commands_run(block, here, capsys):
         printed = capsys.readouterr()
         assert not stop.value.code, f"{line}\n{printed.err}"
         if {"-o"} & set(words):
-            output = here / words[words.index("-o") + 1]
+            output = here / words[words.index("-o") + 1].replace("####", "0001")  # a sequence's first frame
             assert output.exists(), f"{line} wrote no {output.name}"
             assert output not in before, f"{line} names an input as its output"
         else:

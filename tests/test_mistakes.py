@@ -85,7 +85,7 @@ def test_names_that_are_not_utf_8(cli):
 def test_a_folder_may_have_a_dot(cli):
     assert cli("render scene.ply --cameras . -o results_v1.0 --scale 0.5")[0] == 0
     assert [path.name for path in Path("results_v1.0").iterdir()] == ["r_0.png"]
-    assert "name a folder" in cli("render scene.ply --cameras . -o new.jpg --scale 0.5")[2]
+    assert "name a folder" in cli("render scene.ply --cameras . -o new.tiff --scale 0.5")[2]
 
 
 @pytest.mark.parametrize("before", ["--scale 0.5 0.25", "--scale=0.5,0.25", "--scale 0.5 0.25 --recipe mip"])

@@ -75,7 +75,7 @@ def test_a_number_outside_of_its_range_is_refused(group, name, specs):
 
 
 REFUSED = {
-    "render s.ply": "Missing: -o PATH, --output PATH: A folder for the images, or one .png for one view; see",
+    "render s.ply": "Missing: -o PATH, --output PATH: A folder for the images, or one file for one view; see",
     "render --nope": "Unrecognized options: --nope",
     "render s.ply -o out --scal 2": "Unrecognized options: --scal; did you mean --scale?; see",
     "render s.ply -o": "Missing value for argument '-o/--output'",
@@ -84,7 +84,7 @@ REFUSED = {
     "convert s.ply -o c.ply --for supersplatt": "--for: 'supersplatt' is not one of classic",
     "lod s.ply -o l.ply --for spark --no-refine": "--for: is what the result is tuned for: leave out --no-refine",
     "render s.ply -o out --scale x": "--scale: takes 0.001..64, got x",
-    "render s.ply -o out --bit-depth 9": "--bit-depth: '9' is not one of 8, 16",
+    "render s.ply -o out --bit-depth 9": "--bit-depth: '9' is not one of 8, 16, 32",
     "render s.ply -o out --threads 99999": "--threads: takes 1..",
     "finetune s.ply -o t.ply --scale 1,nan": "--scale: takes 0.001..64 ..., got 1.0, nan",
     "evaluate s.ply --scale": "--scale: takes 0.001..64 ..., got nothing",

@@ -309,9 +309,14 @@ def look_at(eye: Float[Tensor, " 3"], target: Float[Tensor, " 3"], up: Float[Ten
 
 
 def digest_of_cameras(views: Sequence[Camera]) -> str:
-    """Hash of the views as they were understood: names, sizes, intrinsics, poses, training focal lengths and lenses."""
+    """Hash of the views as they were understood: names, sizes, intrinsics, poses, training focal lengths and lenses.
+
+    An exposure counts too.
+    """
     values = []
     for view in views:
-        lenses = [asdict(lens) for lens in (view.lens, view.undistortion) if lens not in (PINHOLE, None)]
-        values.append([view.name, *view.intrinsics, view.cam_from_world.tolist(), view.trained_focal, lenses or None])
+        more: list[object] = [asdict(lens) for lens in (view.lens, view.undistortion) if lens not in (PINHOLE, None)]
+        if (exposure := view.exposure) is not None:
+            more += [repr(exposure.aperture), exposure.samples, digest_of_cameras(exposure.motion or ())]
+        values.append([view.name, *view.intrinsics, view.cam_from_world.tolist(), view.trained_focal, more or None])
     return hashlib.sha256(json.dumps(values).encode()).hexdigest()

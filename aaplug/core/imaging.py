@@ -17,6 +17,8 @@ from aaplug.core.splats import Render
 from aaplug.system.contracts import contract
 from aaplug.system.errors import UsageError
 
+SRGB_KNEE = 0.04045  # up to which sRGB is proportional to light
+
 
 @contract
 def over(rgb: Float[Tensor, "h w d"], alpha: Float[Tensor, "h w"], background: tuple[float, float, float]) -> Render:
@@ -25,6 +27,16 @@ def over(rgb: Float[Tensor, "h w d"], alpha: Float[Tensor, "h w"], background: t
         return Render(rgb, alpha)
     behind = functional.pad(rgb.new_tensor(background), (0, rgb.shape[2] - 3))
     return Render(torch.addcmul(rgb, (1 - alpha)[..., None], behind), alpha)
+
+
+def linear(rgb: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
+    """Values proportional to light, of those that a display takes (sRGB, IEC 61966-2-1), also above 1."""
+    return torch.where(rgb <= SRGB_KNEE, rgb / 12.92, ((rgb.clamp(min=SRGB_KNEE) + 0.055) / 1.055) ** 2.4)
+
+
+def straight(rgb: Float[Tensor, "h w 3"], alpha: Float[Tensor, "h w"]) -> Float[Tensor, "h w 3"]:
+    """Premultiplied colours divided by alpha; 0 where it is."""
+    return torch.where(alpha[..., None] > 0, rgb / alpha[..., None], 0.0)
 
 
 def average_samples(render: Render, n: int, neighbours: float = 0.0) -> Render:

@@ -24,6 +24,7 @@ from aaplug.gsplat.arguments import Options, View
 from aaplug.methods.filters.matched import Matched
 from aaplug.methods.pixel_kernels.absolute import AbsolutePoint
 from aaplug.methods.pixel_kernels.point import POINT
+from aaplug.rendering import channels
 from aaplug.system.cores import on_free_cores
 
 MIN_COMPENSATION = 1e-9  # gsplat has none; this one keeps the gradient of the root finite where the factor is 0
@@ -103,14 +104,14 @@ def draw(
 
 def features_of(splats: Splats2D, view: View, options: Options, kernels: Kernels) -> Float[Tensor, "m d"]:
     """Colours and depth of each splat, as far as `render_mode` draws them."""
-    channels = []
+    parts = []
     if options.coloured and view.features is not None:
-        channels.append(view.features.index_select(0, splats.sources))
+        parts.append(view.features.index_select(0, splats.sources))
     elif options.coloured:
-        channels.append(shade(splats, view.scene, view.camera, kernels).rgb)
+        parts.append(shade(splats, view.scene, view.camera, kernels).rgb)
     if options.render_mode != "RGB":
-        channels.append(splats.depths[:, None])
-    return torch.cat(channels, dim=1)
+        parts.append(splats.depths[:, None])
+    return torch.cat(parts, dim=1)
 
 
 def composited(
@@ -122,13 +123,11 @@ def composited(
     per_call: Sequence[int],
 ) -> Image:
     """Premultiplied channels, and alpha.  per_call: the numbers of channels of which one is drawn at a time."""
-    width = features.shape[1]
-    at_once = min(per_call, key=lambda count: -(-width // count))
-    images = []
-    for rgb in functional.pad(features, (0, -width % at_once)).split(at_once, dim=1):
-        part = replace(splats, rgb=rgb)
-        images.append(rasterizer(part, options.hw, BLACK, pixel, None, options.convention.rules))
-    return torch.cat([image.rgb for image in images], dim=2)[..., :width], images[0].alpha[..., None]
+    rules = options.convention.rules
+    image = channels.composited(
+        splats, features, lambda part: rasterizer(part, options.hw, BLACK, pixel, None, rules), per_call
+    )
+    return image.rgb, image.alpha[..., None]
 
 
 def finished(image: Float[Tensor, "h w d"], alpha: Float[Tensor, "h w 1"], view: View, options: Options) -> Tensor:

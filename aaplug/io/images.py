@@ -99,25 +99,28 @@ def write_png(
         OutputError: see `replacing`.
         UsageError: it is no image of finite floats [height, width, 3], or there is no such bit depth.
     """
-    png = _encoded(".png", rgb, bit_depth=bit_depth)
+    png = encoded(".png", rgb, bit_depth=bit_depth)
     with replacing(path, overwrite) as stream:
         stream.write(png)
 
 
-def encode_webp(rgb: Float[Tensor, "h w 3"], quality: int | None) -> bytes:
-    """A WebP file of colours clamped to [0, 1], in 8 bits.  quality: 1 to 100; None is lossless."""
-    return _encoded(".webp", rgb, cv2.IMWRITE_WEBP_QUALITY, LOSSLESS_WEBP if quality is None else quality)
+def encode_webp(rgb: Float[Tensor, "h w c"], quality: int | None) -> bytes:
+    """A WebP file of colours, and straight alpha if there is, clamped to [0, 1], in 8 bits.
+
+    quality: 1 to 100; None is lossless.
+    """
+    return encoded(".webp", rgb, cv2.IMWRITE_WEBP_QUALITY, LOSSLESS_WEBP if quality is None else quality)
 
 
 def encode_jpeg(rgb: Float[Tensor, "h w 3"], quality: int) -> bytes:
     """A JPEG file of colours clamped to [0, 1], with colour at full resolution.  quality: 1 to 100."""
     settings = cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444
-    return _encoded(".jpg", rgb, *settings)
+    return encoded(".jpg", rgb, *settings)
 
 
 def encode_png(rgb: Float[Tensor, "h w c"]) -> bytes:
     """A PNG file of 8 bits, of colours or of one channel, clamped to [0, 1]; quick rather than small."""
-    return _encoded(".png", rgb, cv2.IMWRITE_PNG_COMPRESSION, 1)
+    return encoded(".png", rgb, cv2.IMWRITE_PNG_COMPRESSION, 1)
 
 
 def checked_image(image: Any, channels: Sequence[int] = (3,)) -> Float[Tensor, "h w c"]:
@@ -131,12 +134,16 @@ def checked_image(image: Any, channels: Sequence[int] = (3,)) -> Float[Tensor, "
     return image.detach()
 
 
-def _encoded(suffix: str, rgb: Float[Tensor, "h w c"], *settings: int, bit_depth: int = 8) -> bytes:
-    """Samples in OpenCV's BGR order, converted in bands of rows to keep the float copies small, as a file."""
+def encoded(suffix: str, image: Float[Tensor, "h w c"], *settings: int, bit_depth: int = 8) -> bytes:
+    """The file of an image with 1, 3 or 4 channels, of which the fourth is straight alpha, clamped to [0, 1].
+
+    Bands of rows are converted to OpenCV's BGR order one by one, which keeps the float copies small.
+    """
     if bit_depth not in SAMPLE_TYPES:
         raise UsageError("bit_depth", not_one_of(bit_depth, map(str, SAMPLE_TYPES)))
-    rgb = checked_image(rgb, (1, 3))
-    bands = (levels(rows, bit_depth).flip(2).cpu().numpy() for rows in rgb.split(ROWS_PER_BAND))
+    image = checked_image(image, (1, 3, ALPHA_CHANNELS))
+    order = [2, 1, 0, 3][: image.shape[2]] if image.shape[2] > 1 else [0]
+    bands = (levels(rows, bit_depth)[..., order].cpu().numpy() for rows in image.split(ROWS_PER_BAND))
     samples = np.concatenate([band.astype(SAMPLE_TYPES[bit_depth]) for band in bands])
     success, file = cv2.imencode(suffix, samples, settings)
     assert success

@@ -31,6 +31,7 @@ class Group:
 CAMERAS = Group("camera", "How the camera files are read, and which of the scene's Gaussians they must see.")
 ORBIT = Group("orbit", "Without cameras: views on an orbit around the scene, and the training that is assumed.")
 LENS = Group("lens", "What projects the scene, beside the lens that the camera files state.")
+FILES = Group("file", "What image files hold, and how.")
 DRAWING = Group("drawing", "How images are drawn: programs, memory and machines.")
 FILM = Group("film", "Aperture and shutter: what lies out of focus, or moves while the shutter is open, is blurred.")
 REPORT = Group("report", "Files beside the figures.")

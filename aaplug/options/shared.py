@@ -5,12 +5,14 @@ import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args
 
 from aaplug.core.colours import Background
 from aaplug.core.conventions import MIN_SEEN_SHARE
+from aaplug.core.passes import PASSES, NormalAxes
+from aaplug.io.image_formats import COLOURS, IMAGE_FORMATS
 from aaplug.methods import QUALITIES, RateReference
-from aaplug.options.base import CAMERAS, DRAWING, FILM, LENS, ORBIT, Options, flag, names, number
+from aaplug.options.base import CAMERAS, DRAWING, FILES, FILM, LENS, ORBIT, Options, flag, names, number
 from aaplug.system.contracts import LazyType
 from aaplug.system.errors import MAX_VALUE_CHARACTERS, UsageError
 from aaplug.system.registry import names_of
@@ -105,6 +107,18 @@ class ImageOptions(Options):
     """Size in px, such as 400x400; -1 on one side keeps the aspect (-1x720)."""
     overwrite: bool = False
     """Replace existing outputs."""
+    format: Annotated[str | None, names(*IMAGE_FORMATS), FILES] = None
+    """Format of image files (default: that of the output's name, or png)."""
+    passes: Annotated[str | Sequence[str], names(*PASSES, metavar="rgb,depth,...", count=None), FILES] = ("rgb",)
+    """What image files hold: rgb, alpha, depth, depth-median, depth-nearest, normal, position, id, samples, bound."""
+    normal_axes: Annotated[NormalAxes, FILES] = "camera"
+    """Axes of normals: those of the world, or of the camera: right, up, towards the viewer."""
+    transparent: Annotated[bool, FILES] = False
+    """Store alpha and no background: straight in .png and .webp, premultiplied in .exr and .npz."""
+    colour: Annotated[str | None, names(*COLOURS), FILES] = None
+    """Values of colours: srgb, as a display takes them, or linear in light (default: srgb; .exr: linear)."""
+    bit_depth: Annotated[Literal[8, 16, 32] | None, names(8, 16, 32), FILES] = None
+    """Bits per channel (default: 8; .exr: 16, half precision, but 32 where a pass needs it; .npz: 32)."""
 
 
 @dataclass(frozen=True, kw_only=True)

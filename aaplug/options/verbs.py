@@ -10,7 +10,7 @@ from typing import Annotated, Literal, get_args
 from aaplug.core.conventions import SpzAxes
 from aaplug.io import MOST_FPS
 from aaplug.io.atomic import AnyPath
-from aaplug.options.base import DRAWING, FILM, PYTHON_ONLY, REPORT, TUNING, Options, flag, names, number
+from aaplug.options.base import DRAWING, FILES, FILM, PYTHON_ONLY, REPORT, TUNING, Options, flag, names, number
 from aaplug.options.shared import (
     RECIPE_METAVAR,
     SCALE,
@@ -68,8 +68,6 @@ class RenderOptions(FilmOptions, ImageOptions, LensOptions):
 
     path: Annotated[AnyPath | None, flag("FILE")] = None
     """Instead of --views: cameras of a path file, which `aaplug guide film-camera` lists."""
-    bit_depth: Literal[8, 16] = 8
-    """Bits per colour channel."""
     camera_to: Annotated[str | None, flag("VIEW"), FILM] = None
     """For one view: the view that the camera reaches while the shutter is open."""
 
@@ -83,7 +81,7 @@ class VideoOptions(FilmOptions, ImageOptions, LensOptions):
     path: Annotated[AnyPath, flag("zoom|dolly|orbit|FILE")] = "zoom"
     """zoom (focal length), dolly (distance) or orbit from the first of --views, or a path file as of render."""
     beside: Annotated[str | Recipe | None, names("none", kind="recipe", metavar=f"none|{RECIPE_METAVAR}")] = "classic"
-    """Recipe to show on the left; none shows --recipe alone."""
+    """Recipe to show on the left of a video; none shows --recipe alone, as a frame sequence always does."""
     start: Annotated[float, SCALE] = 1.0
     """Sampling rate at the start of a zoom or dolly, relative to training."""
     end: Annotated[float, SCALE] = 0.125
@@ -92,6 +90,8 @@ class VideoOptions(FilmOptions, ImageOptions, LensOptions):
     """Length in seconds of a zoom, dolly or orbit."""
     fps: Annotated[float | None, number(0.1, MOST_FPS)] = None
     """Frames per second (default: the path file's, or 30)."""
+    resume: Annotated[bool, FILES] = False
+    """Continue an interrupted frame sequence; finished frames are not drawn again."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,7 +14,8 @@ import torch
 
 from aaplug.core.cameras import Camera, photographs
 from aaplug.io.atomic import check_output
-from aaplug.io.images import write_png
+from aaplug.io.image_formats import PNG, Storage
+from aaplug.io.layers import write_layers
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.executors import Apply
 from aaplug.system.monitor import Tell
@@ -26,12 +27,13 @@ def write_frames(
     paths: Sequence[str | PathLike[str]],
     apply: Apply = map,
     *,
-    bit_depth: int = 8,
+    storage: Storage = PNG,
     overwrite: bool = False,
     tell: Tell = lambda done, total: None,
 ) -> None:
-    """Render every view to its .png, in order.
+    """Render every view to its file, in order.
 
+    storage: how; without a background where it holds alpha.
     apply: calls a function with every item, like `map`; see `core.executors`.
     tell: called with (views done, views in all).
 
@@ -44,7 +46,7 @@ def write_frames(
     photos = photographs(views)
     for path in files:
         check_output(path, overwrite, photos)
-    write = _Writer(renderer, tuple(views), files, bit_depth)
+    write = _Writer(renderer, tuple(views), files, storage)
     tell(0, total)
     for done, _ in enumerate(apply(write, range(total)), start=1):
         tell(done, total)
@@ -57,12 +59,12 @@ class _Writer:
     renderer: Renderer
     views: Sequence[Camera]
     paths: Sequence[Path]
-    bit_depth: int
+    storage: Storage
 
     @torch.no_grad()
     def __call__(self, index: int) -> None:
-        image = self.renderer(self.views[index]).rgb.float()
-        write_png(self.paths[index], image, self.bit_depth, overwrite=True)
+        layers = self.renderer.passes(self.views[index], self.storage.passes, self.storage.normal_axes)
+        write_layers(self.paths[index], layers, self.storage, overwrite=True)
 
     def __getstate__(self) -> dict[str, Any]:
         """For another process, wherever it runs."""

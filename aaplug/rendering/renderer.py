@@ -28,6 +28,7 @@ from aaplug.core.imaging import average_samples
 from aaplug.core.interfaces import Rasterizer
 from aaplug.core.kernels import Kernels
 from aaplug.core.lenses import PINHOLE
+from aaplug.core.passes import PASSES, NormalAxes
 from aaplug.core.projection import project, with_depth_slopes
 from aaplug.core.pyramids import Cutter, faded
 from aaplug.core.sampling import sampling_bounds
@@ -41,15 +42,18 @@ from aaplug.io.scenes import SceneLike, scene_of
 from aaplug.io.scenes.harmonics import without_harmonics
 from aaplug.io.scenes.scene import Scene
 from aaplug.methods.filters.smoothing import fuse_stored
+from aaplug.methods.order import Order, Shown
 from aaplug.methods.pixel_kernels.point import POINT
 from aaplug.methods.pixel_kernels.ray import RAY, with_copies
 from aaplug.methods.recipe import RATE_TOLERANCE, Recipe
 from aaplug.methods.recipes import find_recipe, suited
 from aaplug.rasterizers import RASTERIZERS
 from aaplug.rasterizers.choice import find_rasterizer, kernels_of
+from aaplug.rendering.channels import composited
+from aaplug.rendering.passes import by_order, channels_of, expected
 from aaplug.system.contracts import check_fields, contract
 from aaplug.system.cores import on_free_cores
-from aaplug.system.errors import UsageError, within_memory
+from aaplug.system.errors import UsageError, did_you_mean, not_one_of, within_memory
 
 GAUSSIANS_AT_ONCE = 1 << 20  # Gaussians projected at once, where no gradients are asked for
 SAMPLE_BYTES = 32.0  # per sample of an image: red, green, blue and alpha in float32, and a copy
@@ -172,7 +176,11 @@ class Renderer:
 
     def portable(self) -> "Renderer":
         """The same for another process, without the scene's file, which may be open."""
-        return replace(self, scene=replace(self.scene, origin=None), source=None)
+        origin = self.scene.origin
+        if origin is not None:  # rows stay where some of the file were dropped
+            whole = torch.equal(origin.rows, torch.arange(len(origin.rows)))
+            origin = None if whole else replace(origin, document=None)
+        return replace(self, scene=replace(self.scene, origin=origin), source=None)
 
     @contract
     def __call__(self, camera: Camera) -> Render:
@@ -216,6 +224,51 @@ class Renderer:
             problem = f"with {samples}×{samples} samples per pixel would take {lacking}; a smaller image needs less"
             raise UsageError(f"view {camera.name} at {camera.width}x{camera.height}", problem)
         return fine
+
+    @contract
+    @torch.no_grad()
+    @on_free_cores()
+    def passes(
+        self, camera: Camera, names: Sequence[str], normal_axes: NormalAxes = "camera"
+    ) -> dict[str, Float[Tensor, "h w ..."] | Int[Tensor, "h w"]]:
+        """Render passes of one view by name, such as depth and normal, without gradients.
+
+        `aaplug guide film` and `rendering.passes` state how each is resolved.  rgb is over the background, as alpha it
+        is [h, w].  Lengths are in world units; an id is the Gaussian's place in the scene's file, with levels of detail
+        its place in all of them, finest first.  All but rgb and alpha are of an instant, through a lens without a size.
+
+        normal_axes: of normals: "world"; or "camera": x right, y up, z towards the viewer.
+
+        Raises:
+            UsageError: there is no such pass; see `__call__`.
+        """
+        for name in names:
+            if name not in PASSES:
+                raise UsageError("passes", not_one_of(name, PASSES) + did_you_mean(name, PASSES))
+        with within_memory(f"view {camera.name} at {camera.width}x{camera.height}"):
+            exposed = None if camera.exposure is None else self.exposed(camera)
+            camera = replace(camera, exposure=None)
+            render, splats, hw = self.draw(camera)
+            rgb, alpha = exposed or render
+            found: dict[str, Tensor] = {"rgb": rgb, "alpha": alpha}
+            (samples, weight), fine = self.sampling(camera), self.sampled(camera)[0]
+            recipe, rules = self._recipe_through(splats.camera), self.training.convention.rules
+            channels = channels_of(names, splats, self.scene, self.training.bounds, fine, samples, normal_axes)
+            if channels:
+                per_call = (3, 4) if recipe.pixel is POINT and recipe.compositor is None else (3,)
+                whole = torch.cat([*channels.values()], dim=1)
+                image = composited(splats, whole, lambda part: self.paint(part, hw, BLACK), per_call)
+                found |= expected(names, channels, image, fine, samples, weight)
+
+            def draw(numbered: Splats2D, shown: Shown) -> Render:
+                return self.rasterizer(
+                    numbered, hw, BLACK, recipe.pixel, Order.of(recipe.pixel, shown, numbered), rules
+                )
+
+            found |= by_order(names, splats, samples, draw)
+            if "id" in found and self.scene.origin is not None:
+                found["id"] = torch.where(found["id"] < 0, found["id"], self.scene.origin.rows[found["id"]])
+        return {name: found[name] for name in names}
 
     @contract
     @on_free_cores()

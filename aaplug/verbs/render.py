@@ -17,7 +17,7 @@ from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import listing
 from aaplug.system.executors import ProcessesIfLong
 from aaplug.verbs.verb import writes
-from aaplug.verbs.views import image_paths, names_image, seen
+from aaplug.verbs.views import image_paths, names_image, seen, storage_of
 
 
 class Written(NamedTuple):
@@ -29,25 +29,26 @@ class Written(NamedTuple):
 
 @writes(RenderOptions)
 def render(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, options: RenderOptions) -> list[Written]:
-    """Render views at any resolution to PNG.
+    """Render views at any resolution to image files.
 
     Args:
         scene: a scene, its Gaussians, or the path of its file or folder.
         cameras: a camera set, its file or folder; or None for those of the scene's model folder, or without one for
             an orbit around the scene; or an `Orbit` of your own.
-        output: a folder (None: "images"), or one .png for one view.
+        output: a folder (None: "images"), or one image file for one view.
 
     Raises:
         AaplugError: an input cannot be read, an option does not fit, or an image cannot be written.
     """
     target = Path("images" if output is None else output)
+    storage, options = storage_of(target, options)
     job = Job.of(scene, cameras, options, single=names_image(target))
     file = None if options.path is None else read_camera_path(options.path)
     ends = select_views(job.cameras, options.camera_to) if options.camera_to else ()
     unsized = file.unsized if file else job.cameras.assumed
     views, ends = (seen(job, each, unsized) for each in (file.cameras if file else job.views, ends))
     views = filmed(views, options, file is not None, file and file.shutter, ends)
-    check = partial(image_paths, target, views, options.overwrite)
+    check = partial(image_paths, target, views, options.overwrite, storage.format.suffixes[0])
     paths = check()
     with running(options, target, check, job.inputs, folder=not names_image(target)) as workers:
         renderer = job.look(len(views)).by(job.recipe(options.recipe))
@@ -56,7 +57,7 @@ def render(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, optio
         job.say_assumed(renderer, views[0])
         with job.monitor.progress("rendering", "views") as tell:
             pool = workers.cluster or ProcessesIfLong(workers.threads)
-            how = {"bit_depth": options.bit_depth, "overwrite": options.overwrite, "tell": tell}
+            how = {"storage": storage, "overwrite": options.overwrite, "tell": tell}
             write_frames(renderer, views, paths, pool.map, **how)
     return [Written(*pair) for pair in zip(views, paths, strict=True)]
 

@@ -1,34 +1,39 @@
 """A video of a scene along a camera path, one recipe or two side by side."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core import camera_paths
-from aaplug.core.cameras import Camera
+from aaplug.core.cameras import Camera, digest_of_cameras
 from aaplug.evaluation.protocols import median_depth
 from aaplug.evaluation.report.contact_sheet import labelled, magnified
 from aaplug.io.atomic import AnyPath
 from aaplug.io.cameras import read_camera_path
+from aaplug.io.image_formats import PNG, Storage
 from aaplug.io.scenes import SceneLike
 from aaplug.io.video import check_video
 from aaplug.options.verbs import VideoOptions
 from aaplug.rendering.film import filmed
 from aaplug.rendering.job import CamerasLike, Job, running
+from aaplug.rendering.renderer import Renderer
 from aaplug.rendering.videos import make_video
-from aaplug.system.errors import UsageError
+from aaplug.system.errors import OutputError, UsageError, listing
 from aaplug.system.executors import ProcessesIfLong
+from aaplug.verbs.frame_sequences import FrameSequence
 from aaplug.verbs.verb import writes
-from aaplug.verbs.views import seen
+from aaplug.verbs.views import seen, storage_of
 
 DEFAULT_FPS = 30.0  # frames per second, where neither the caller nor a path file says
 PANE_GAP = 4  # px
 MAX_FRAMES = 100_000
+SEQUENCE = "such as frames/frame.####.exr"
 RECEDING_PATHS = ("zoom", "dolly")  # on which things become small
 
 
@@ -42,12 +47,13 @@ class Clip(NamedTuple):
 
 @writes(VideoOptions)
 def video(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, options: VideoOptions) -> Clip:
-    """Render a camera path to a video.
+    """Render a camera path to a video, or to a sequence of image files.
 
     Args:
         scene: see `render`.
         cameras: see `render`.
-        output: a .webm file (VP9), or .mp4 (H.264); None: "video.webm".
+        output: a .webm file (VP9), or .mp4 (H.264); None: "video.webm"; or a sequence, frame.####.exr, or with `format`
+            a folder for one.
 
     Raises:
         AaplugError: as `render`.
@@ -55,15 +61,30 @@ def video(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, option
     if options.lens == "vr180":
         raise UsageError("lens", "vr180 is a pair of images, which `render` writes; a video takes equirect")
     target = Path("video.webm" if output is None else output)
+    sequence = FrameSequence.of(target, options.format)
+    storage, options = storage_of(target if sequence is None else sequence.pattern, options)
+    if sequence is None and (storage != PNG or options.resume):
+        raise OutputError(target, f"a video holds 8-bit colours and is not resumed; name a sequence, {SEQUENCE}")
+    if sequence is not None and options.beside not in ("classic", "none", None):
+        raise UsageError("beside", "is for videos; a frame sequence shows `recipe` alone")
     file = None if str(options.path) in PATHS else read_camera_path(Path(options.path))
     fps = options.fps or (file and file.fps) or DEFAULT_FPS
     check = partial(check_video, target, fps, options.overwrite)
-    check()
+    if sequence is None:
+        check()
     job = Job.of(scene, cameras, options)
-    recipes = [job.recipe(name) for name in (options.beside or "none", options.recipe) if name != "none"]
+    beside = "none" if sequence is not None or options.beside is None else options.beside
+    recipes = [job.recipe(name) for name in (beside, options.recipe) if name != "none"]
     path = file.cameras if file else _built_in_path(job, fps)
     views = seen(job, path, file.unsized if file else job.cameras.assumed)
+    if len({view.hw for view in views}) > 1:
+        sizes = listing([f"{view.width}x{view.height}" for view in views], most=3)
+        raise UsageError("path", f"has frames of different sizes ({sizes} px); give `resolution`")
     views = filmed(views, options, True, file and file.shutter)
+    if sequence is not None:
+        sequence = replace(sequence, count=len(views))
+        check = partial(sequence.check, options.overwrite, options.resume)
+        check()
     labels = [{"auto": "aaplug auto"}.get(recipe.name, recipe.name) for recipe in recipes]
 
     def compose(index: int, images: Sequence[Float[Tensor, "h _ 3"]]) -> Float[Tensor, "h w 3"]:
@@ -73,7 +94,8 @@ def video(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, option
         return side_by_side(images, labels, rate, views[index].width / path[index].width)
 
     path_file = [] if file is None else [str(options.path)]
-    with running(options, target, check, [*job.inputs, *path_file]) as workers:
+    place = target if sequence is None else sequence.folder
+    with running(options, place, check, [*job.inputs, *path_file], folder=sequence is not None) as workers:
         look = job.look(len(views) * len(recipes))
         renderers = [look.by(recipe) for recipe in recipes]
         size = f"{views[0].width}x{views[0].height}"
@@ -82,9 +104,32 @@ def video(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, option
         job.say_assumed(renderers[-1], views[0])
         with job.monitor.progress("rendering", "images") as tell:
             pool = workers.cluster or ProcessesIfLong(workers.threads)
+            if sequence is not None:
+                left = sequence.begin(_request(job, renderers[0], views, storage, fps), options.resume)
+                sequence.write(renderers[0], views, left, storage, pool.map, tell)
+                return Clip(sequence.pattern, len(views), fps)
             how = {"overwrite": options.overwrite, "tell": tell, "folder": workers.cluster and target.parent}
             make_video(target, renderers, views, fps, compose, pool.map, **how)
     return Clip(target, len(views), fps)
+
+
+def _request(
+    job: Job[VideoOptions], renderer: Renderer, views: Sequence[Camera], storage: Storage, fps: float
+) -> dict[str, Any]:
+    """What the frames of a sequence depend on; a run continues another if these are equal."""
+    return {
+        "frames": len(views),
+        "fps": fps,
+        "size": f"{views[0].width}x{views[0].height}",
+        "scene": job.scene.digest,
+        "views": digest_of_cameras(views),
+        "training": digest_of_cameras(renderer.training.cameras),
+        "recipe": f"{renderer.recipe.name} {renderer.recipe.digest}",
+        "rasterizer": renderer.rasterizer.name,
+        "background": renderer.background,
+        "cull_margin": str(renderer.training.cull_margin),
+        "files": [storage.format.name, *storage.passes, storage.bit_depth, storage.colour, storage.normal_axes],
+    }
 
 
 def _built_in_path(job: Job[VideoOptions], fps: float) -> list[Camera]:

@@ -5,18 +5,22 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
 from aaplug.core.cameras import Camera
+from aaplug.core.colours import BLACK
 from aaplug.core.lenses import EQUIDISTANT, EQUIRECT, EQUISOLID, ORTHO, PINHOLE, Lens
 from aaplug.evaluation.protocols import median_depth
 from aaplug.io.atomic import check_output, refuse_existing
+from aaplug.io.image_formats import IMAGE_FORMATS, Storage
 from aaplug.options.shared import LensOptions, check_side, size_of
 from aaplug.options.verbs import RenderOptions, VideoOptions
 from aaplug.rendering.job import Job
 from aaplug.system.errors import OutputError, UsageError
 
-IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".exr", ".bmp", ".gif")  # any other name is a folder
-SeenOptions = RenderOptions | VideoOptions
+SUFFIXES = [suffix for each in IMAGE_FORMATS.values() for suffix in each.suffixes]
+IMAGES = (*SUFFIXES, ".tif", ".tiff", ".bmp", ".gif")  # any other name is a folder
+Drawn = TypeVar("Drawn", RenderOptions, VideoOptions)
 LONGEST_NAME = 200  # bytes; file systems take 255, and a number and a suffix are added
 
 
@@ -41,7 +45,7 @@ def resized(
     return sized
 
 
-def seen(job: Job[SeenOptions], views: Sequence[Camera], unsized: bool) -> list[Camera]:
+def seen(job: Job[Drawn], views: Sequence[Camera], unsized: bool) -> list[Camera]:
     """The views through the lens and at the size that a job's options ask for.
 
     unsized: see `resized`, there `reframe`.
@@ -94,23 +98,40 @@ def _centred(view: Camera, lens: Lens, width: int, height: int, focal: float) ->
     return replace(view, lens=lens, **size, trained_focal=None, photo=None)
 
 
+def storage_of(output: Path, options: Drawn) -> tuple[Storage, Drawn]:
+    """How images are stored, and the options; those for images with alpha have no background.
+
+    Raises:
+        UsageError: the format does not hold what is asked for, or there is to be a background and alpha.
+    """
+    passes = [options.passes] if isinstance(options.passes, str) else options.passes
+    stored = (options.transparent, options.bit_depth, options.colour, options.normal_axes)
+    storage = Storage.of(output, options.format, passes, *stored)
+    if "alpha" not in storage.passes:
+        return storage, options
+    if options.background != "auto":
+        raise UsageError("background", "is not stored where alpha is; leave one of them out")
+    return storage, options.on(BLACK)
+
+
 def names_image(output: Path) -> bool:
     """Whether a name is that of one image, not of a folder."""
     return output.suffix.lower() in IMAGES
 
 
-def image_paths(output: Path, views: Sequence[Camera], overwrite: bool) -> list[Path]:
-    """One .png per view in the folder `output`, or `output` itself if it is a .png.
+def image_paths(output: Path, views: Sequence[Camera], overwrite: bool, suffix: str = ".png") -> list[Path]:
+    """One file per view in the folder `output`, or `output` itself if it names one image.
 
     Raises:
-        OutputError: an image exists and `overwrite` is false, or one .png is named for several views.
+        OutputError: an image exists and `overwrite` is false, it is of no format, or one is named for several views.
     """
     if names_image(output):
-        if output.suffix.lower() != ".png" or len(views) != 1:
-            raise OutputError(output, f"name a folder, or one .png for one view ({len(views)} views asked for)")
+        if output.suffix.lower() not in SUFFIXES or len(views) != 1:
+            one = f"one {', '.join(SUFFIXES)} for one view"
+            raise OutputError(output, f"name a folder, or {one} ({len(views)} views asked for)")
         check_output(output, overwrite)
         return [output]
-    paths = [output / f"{name}.png" for name in file_names([view.name for view in views], "view", 5)]
+    paths = [output / f"{name}{suffix}" for name in file_names([view.name for view in views], "view", 5)]
     refuse_existing(paths, overwrite)
     return paths
 

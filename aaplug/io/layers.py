@@ -1,0 +1,92 @@
+"""Passes of a rendered view as one file, in a format of `IMAGE_FORMATS`.
+
+A pass is a tensor of floats, [height, width, channels] or [height, width].  Colours are premultiplied where there is an
+alpha.  A .png or .webp stores them straight, divided by alpha; an .exr or .npz as they are.  Linear colours are decoded
+from finished pixels, once: scenes are composited in the display values that training saw.
+"""
+
+import errno
+from collections.abc import Mapping
+from os import PathLike
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from aaplug.core.imaging import linear, straight
+from aaplug.core.passes import PASSES
+from aaplug.io.atomic import replacing, replacing_file
+from aaplug.io.image_formats import COLOURS, Storage
+from aaplug.io.images import encode_jpeg, encode_webp, encoded
+from aaplug.system.contracts import contract
+
+JPEG_QUALITY = 95  # of 100
+INTEROP_IDS = {"srgb": "srgb_rec709_display", "linear": "lin_rec709_scene"}  # of the Color Interop Forum
+MAX_HALF = 65504.0  # the largest finite half
+
+
+@contract
+def write_layers(
+    path: str | PathLike[str],
+    layers: Mapping[str, Float[Tensor, "h w ..."] | Int[Tensor, "h w"]],
+    storage: Storage,
+    overwrite: bool = False,
+) -> None:
+    """Write the passes that `storage` names, each of which `layers` holds.
+
+    Raises:
+        OutputError: see `replacing`.
+        UsageError: a .png, .jpg or .webp is to hold values that are NaN or infinite.
+    """
+    chosen = {name: layers[name].detach().float().cpu() for name in storage.passes}
+    if storage.colour == "linear" and "rgb" in chosen:
+        rgb, alpha = chosen["rgb"], chosen.get("alpha")
+        chosen["rgb"] = linear(rgb) if alpha is None else linear(straight(rgb, alpha)) * alpha[..., None]
+    if storage.format.name == "exr":
+        _write_exr(path, chosen, storage, overwrite)
+        return
+    file = b"" if storage.format.name == "npz" else _picture(chosen, storage)
+    with replacing(path, overwrite) as stream:
+        if file:
+            stream.write(file)
+        else:
+            arrays: dict[str, Any] = {name: layer.numpy() for name, layer in chosen.items()}
+            np.savez(stream, colorSpace=COLOURS[storage.colour], **arrays)
+
+
+def _picture(layers: Mapping[str, Float[Tensor, "h w ..."]], storage: Storage) -> bytes:
+    """A file of colours, of straight colours and alpha, or of alpha alone."""
+    image, alpha = layers.get("rgb"), layers.get("alpha")
+    if alpha is not None:
+        matte = alpha[..., None]
+        image = matte if image is None else torch.cat([straight(image, alpha), matte], dim=2)
+    assert image is not None
+    if storage.format.name == "png":
+        return encoded(".png", image, bit_depth=storage.bit_depth)
+    return encode_webp(image, None) if storage.format.name == "webp" else encode_jpeg(image, JPEG_QUALITY)
+
+
+def _write_exr(
+    path: str | PathLike[str], layers: Mapping[str, Float[Tensor, "h w ..."]], storage: Storage, overwrite: bool
+) -> None:
+    """Write a file of named layers, as Blender and Nuke read them: R, G, B, A, depth.Z, normal.X ..."""
+    import OpenEXR  # an extra
+
+    channels = dict[str, np.ndarray]()
+    for name, layer in layers.items():
+        spec = PASSES[name]
+        half = storage.bit_depth == 16 and not spec.exact
+        for letter, plane in zip(spec.channels, layer.reshape(*layer.shape[:2], -1).unbind(dim=2), strict=True):
+            samples = plane.clamp(-MAX_HALF, MAX_HALF).half() if half else plane
+            channels[f"{spec.layer}.{letter}".lstrip(".")] = samples.contiguous().numpy()
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    if "rgb" in layers:
+        header |= {"colorSpace": COLOURS[storage.colour], "colorInteropID": INTEROP_IDS[storage.colour]}
+    with replacing_file(path, overwrite, ".exr") as temporary:
+        try:
+            with OpenEXR.File(header, channels) as file:
+                file.write(str(temporary))
+        except RuntimeError as error:  # such as a full disk
+            raise OSError(errno.EIO, str(error)) from error

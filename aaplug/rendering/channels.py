@@ -1,0 +1,28 @@
+"""Channels of splats beside their colours, composited as colours are.
+
+m: splats; d: channels; h, w: px.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional
+
+from aaplug.core.splats import Render, Splats2D
+
+
+def composited(
+    splats: Splats2D, channels: Float[Tensor, "m d"], draw: Callable[[Splats2D], Render], per_call: Sequence[int]
+) -> Render:
+    """Premultiplied channels, and alpha.
+
+    draw: composites coloured splats over black.  per_call: the numbers of channels of which one is drawn at a time.
+    """
+    width = channels.shape[1]
+    at_once = min(per_call, key=lambda count: -(-width // count))
+    parts = functional.pad(channels, (0, -width % at_once)).split(at_once, dim=1)
+    images = [draw(replace(splats, rgb=part)) for part in parts]
+    return Render(torch.cat([image.rgb for image in images], dim=2)[..., :width], images[0].alpha)

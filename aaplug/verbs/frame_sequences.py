@@ -1,0 +1,135 @@
+"""Frame sequences: an image file a frame, named by its number from 1, and a record by which a run continues.
+
+A frame appears whole or not at all, so the frames that are there are done.  The record beside them, frame.json for
+frame.####.exr, holds what was asked for.
+"""
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from aaplug.core.cameras import Camera
+from aaplug.io.atomic import check_output, refuse_existing, replacing
+from aaplug.io.image_formats import Storage
+from aaplug.io.video import CODECS
+from aaplug.rendering.frames import write_frames
+from aaplug.rendering.renderer import Renderer
+from aaplug.system.errors import FormatError, OutputError, UsageError, listing
+from aaplug.system.executors import Apply
+from aaplug.system.monitor import Tell
+from aaplug.verbs.views import SUFFIXES, names_image
+
+PLACES = re.compile("#+")  # of a frame's number in a name
+SEPARATORS = "._-"  # between it and the rest
+USUAL_NAME = "frame.####"  # in a folder
+
+
+@dataclass(frozen=True)
+class FrameSequence:
+    """The files of `count` frames.  pattern: their path, with # for the digits of the number."""
+
+    pattern: Path
+    count: int = 0
+
+    @classmethod
+    def of(cls, output: Path, format: str | None) -> "FrameSequence | None":
+        """The sequence that an output names, or that a format asks for in a folder; else None.
+
+        Raises:
+            OutputError: the name has places for more than one number, or is that of no format.
+        """
+        if not PLACES.search(output.name):
+            is_file = names_image(output) or output.suffix.lower() in CODECS
+            return None if format is None or is_file else cls(output / f"{USUAL_NAME}.{format}")
+        if len(PLACES.findall(output.name)) > 1:
+            raise OutputError(output, "has places for two numbers; name a sequence such as frame.####.exr")
+        if output.suffix.lower() not in SUFFIXES:
+            raise OutputError(output, f"name frames of one of {', '.join(SUFFIXES)}")
+        return cls(output)
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the frames."""
+        return self.pattern.parent
+
+    @property
+    def paths(self) -> list[Path]:
+        """The frames' files, in order."""
+        [places] = PLACES.findall(self.pattern.name)
+        numbers = (f"{number:0{len(places)}d}" for number in range(1, self.count + 1))
+        return [self.folder / PLACES.sub(number, self.pattern.name) for number in numbers]
+
+    @property
+    def record(self) -> Path:
+        """File of what was asked for."""
+        name = PLACES.sub("", self.pattern.stem).strip(SEPARATORS)
+        return self.folder / f"{name or 'frames'}.json"
+
+    def check(self, overwrite: bool, resume: bool) -> None:
+        """Refuse, before any work, what must not be written.
+
+        Raises:
+            OutputError: a frame exists, and neither `overwrite` nor `resume` is set; or the folder holds further ones.
+        """
+        files = [*self.paths, self.record]
+        before, after = PLACES.split(self.pattern.name)
+        numbered = re.compile(rf"{re.escape(before)}\d+{re.escape(after)}", re.ASCII)
+        found = sorted(p.name for p in self.folder.iterdir()) if self.folder.is_dir() else []
+        further = [name for name in found if numbered.fullmatch(name) and self.folder / name not in files]
+        if further:
+            problem = f"holds {listing(further, most=3)}, which would follow these {self.count} frames; remove them"
+            raise OutputError(self.folder, problem)
+        refuse_existing(files, overwrite or resume)
+        if resume and not self.record.exists() and any(path.exists() for path in self.paths):
+            raise OutputError(self.record, "does not exist, which says what the frames show; pass `overwrite`")
+
+    def begin(self, request: Mapping[str, Any], resume: bool) -> list[int]:
+        """Places of the frames to draw; removes those that are there unless `resume` is set, and writes the record.
+
+        Raises:
+            UsageError: the frames are of another request.
+            FormatError: the record is damaged.
+        """
+        now = json.loads(json.dumps(request, allow_nan=False))
+        if resume and self.record.exists():
+            try:
+                before = dict(json.loads(self.record.read_bytes()))
+            except (OSError, ValueError, TypeError) as error:
+                raise FormatError(self.record, "is damaged; start again with `overwrite`") from error
+            changed = sorted(key for key in before.keys() | now.keys() if before.get(key) != now.get(key))
+            if changed:
+                problem = f"is of another request ({listing(changed)} changed since)"
+                raise UsageError(str(self.record), f"{problem}; repeat that request, or start again with `overwrite`")
+            return [place for place, path in enumerate(self.paths) if not path.exists()]
+        for path in self.paths:
+            if path.exists():
+                check_output(path, True)
+                path.unlink()
+        with replacing(self.record, True) as stream:
+            stream.write(json.dumps(now, indent=1).encode() + b"\n")
+        return list(range(self.count))
+
+    def write(
+        self,
+        renderer: Renderer,
+        views: Sequence[Camera],
+        left: Sequence[int],
+        storage: Storage,
+        apply: Apply,
+        tell: Tell,
+    ) -> None:
+        """Draw the frames at the places `left` of all views; errors as those of `write_frames`."""
+        done = self.count - len(left)
+
+        def tell_all(now: int, _: int) -> None:
+            tell(done + now, self.count)
+
+        paths = self.paths
+        files = [paths[place] for place in left]
+        if not left:
+            tell_all(0, 0)
+            return
+        write_frames(renderer, [views[place] for place in left], files, apply, storage=storage, tell=tell_all)

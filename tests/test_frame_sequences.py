@@ -1,0 +1,134 @@
+"""Frame sequences: numbered files that a run continues, to the bytes of a run that nothing stopped."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from aaplug.io.cameras.camera_path import CameraPath
+from aaplug.io.image_formats import IMAGE_FORMATS
+from aaplug.rendering.renderer import Renderer
+from tests.conftest import make_camera
+
+WORDS = "video scene.ply --cameras . --scale 0.5 --seconds 0.2 -o"
+PROGRAM = "from aaplug_cli.main import program; program()"
+FORMAT = "npz" if IMAGE_FORMATS["exr"].lacks else "exr"
+
+
+def bytes_of(folder: str) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted(Path(folder).iterdir())}
+
+
+def test_a_name_with_places_or_a_folder_with_a_format_is_a_sequence(cli):
+    code, out, _ = cli(f"{WORDS} a/shot_###.{FORMAT} --passes rgb,alpha,depth --json")
+    assert (code, json.loads(out)["frames"]) == (0, 6)
+    names = [f"shot_{i:03d}.{FORMAT}" for i in range(1, 7)]
+    assert sorted(bytes_of("a")) == sorted([*names, "shot.json"])
+    assert cli(f"{WORDS} b --format jpg --threads 2")[0] == 0
+    assert sorted(bytes_of("b")) == [*(f"frame.{i:04d}.jpg" for i in range(1, 7)), "frame.json"]
+
+
+def test_a_sequence_goes_on_where_it_was_stopped(cli, monkeypatch):
+    words = f"{WORDS} out/f.####.png --transparent"
+    assert cli(words)[0] == 0
+    whole, times = bytes_of("out"), {p.name: p.stat().st_mtime_ns for p in Path("out").iterdir()}
+    for number in (2, 5):
+        Path(f"out/f.{number:04d}.png").unlink()
+    code, _, err = cli(words)
+    assert (code, "already holds f.0001.png" in err) == (2, True), err
+    assert cli(f"{words} --resume")[0] == 0
+    assert bytes_of("out") == whole
+    again = {path.name for path in Path("out").iterdir() if path.stat().st_mtime_ns != times[path.name]}
+    assert again == {"f.0002.png", "f.0005.png"}
+    monkeypatch.setattr(Renderer, "passes", None)
+    assert cli(f"{words} --resume")[0] == 0  # nothing is left to draw
+
+
+def test_frames_of_another_request_are_not_continued(cli):
+    words = f"{WORDS} out/f.####.png"
+    assert cli(words)[0] == 0
+    before = bytes_of("out")
+    changes = {
+        "--transparent": "files", "--scale 0.25": "size, views", "--recipe classic": "recipe",
+        "--fps 31": "fps",
+    }  # fmt: skip
+    for change, said in changes.items():
+        code, _, err = cli(
+            f"{words} --resume {change}".replace("--scale 0.5 ", "" if "scale" in change else "--scale 0.5 ")
+        )
+        assert (code, f"is of another request ({said} changed since)" in err) == (2, True), err
+    Path("out/f.json").rename("f.json")
+    code, _, err = cli(f"{words} --resume")
+    assert (code, "f.json: does not exist, which says what the frames show" in err) == (2, True), err
+    Path("out/f.json").write_text("[1]")
+    code, _, err = cli(f"{words} --resume")
+    assert (code, "f.json: is damaged; start again with --overwrite" in err) == (2, True), err
+    Path("f.json").replace("out/f.json")
+    assert bytes_of("out") == before
+
+
+def test_a_new_sequence_leaves_no_frame_of_the_old_one(cli, monkeypatch):
+    words = f"{WORDS} out/f.####.png"
+    assert cli(words)[0] == 0
+    code, _, err = cli(f"{words} --overwrite --seconds 0.1".replace("--seconds 0.2 ", ""))
+    assert (code, "holds f.0004.png, f.0005.png, f.0006.png, which would follow these 3 frames" in err) == (2, True), (
+        err
+    )
+    with monkeypatch.context() as patch:  # stopped before its first frame
+        patch.setattr("aaplug.verbs.frame_sequences.write_frames", lambda *args, **how: sys.exit(3))
+        assert cli(f"{words} --overwrite --recipe classic")[0] == 3
+    assert sorted(bytes_of("out")) == ["f.json"]
+
+
+REFUSED = {
+    "v.exr": "a video holds 8-bit colours and is not resumed; name a sequence, such as frames/frame.####.exr",
+    "v.webm --transparent": "a video holds 8-bit colours and is not resumed",
+    "v.webm --resume": "a video holds 8-bit colours and is not resumed",
+    "v.png": "name a .webm or .mp4 file",
+    "##/a.png": "name a .webm or .mp4 file",
+    "a.##.##.png": "a.##.##.png: has places for two numbers; name a sequence such as frame.####.exr",
+    "a.##.png --beside mip": "--beside: is for videos; a frame sequence shows --recipe alone",
+    "a.##.png --passes depth": "--passes: a .png cannot hold depth",
+    "a.##.gif --format png": "a.##.gif: name frames of one of .png, .jpg",
+}
+
+
+@pytest.mark.parametrize("words", REFUSED)
+def test_what_is_no_sequence_is_refused_before_anything_is_drawn(cli, monkeypatch, words):
+    monkeypatch.setattr(Renderer, "draw", None)
+    before = sorted(Path().iterdir())
+    code, _, err = cli(f"{WORDS} {words}")
+    assert (code, REFUSED[words] in err) == (2, True), err
+    assert sorted(Path().iterdir()) == before
+
+
+def test_frames_of_different_sizes_are_refused(cli, monkeypatch):
+    path = CameraPath(tuple(make_camera(size=size) for size in ((40, 30), (30, 40))), 24.0)
+    monkeypatch.setattr("aaplug.verbs.video.read_camera_path", lambda _: path)
+    code, _, err = cli(f"{WORDS} out/a.##.png --path path.json")
+    assert (code, "--path: has frames of different sizes (20x15, 15x20 px)" in err) == (2, True), err
+    assert not Path("out").exists()
+
+
+def test_a_kill_loses_no_finished_frame_and_the_rest_ends_the_same(cli):
+    words = [*WORDS.replace("0.2", "1").split(), f"out/f.####.{FORMAT}", "--resume"]
+    command = [sys.executable, "-c", PROGRAM, *words]
+    run = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 120
+    while len(found := sorted(Path("out").glob(f"f.*.{FORMAT}"))) < 3 and run.poll() is None:
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+    run.send_signal(signal.SIGKILL)
+    run.wait()
+    found = {path: path.stat().st_mtime_ns for path in Path("out").glob(f"f.*.{FORMAT}")}
+    assert 3 <= len(found) < 30
+    assert cli(" ".join(words))[0] == 0
+    assert all(path.stat().st_mtime_ns == then for path, then in found.items())
+    resumed = bytes_of("out")
+    assert cli(" ".join(words).replace("out/", "whole/"))[0] == 0
+    assert resumed == bytes_of("whole")
+    assert len(resumed) == 31
