@@ -75,7 +75,7 @@ def test_a_number_outside_of_its_range_is_refused(group, name, specs):
 
 
 REFUSED = {
-    "render s.ply": "Missing: -o PATH, --output PATH: A folder for the images, or one file for one view; see",
+    "render s.ply": "Missing: -o PATH, --output PATH: A folder for the images, or one file for one view: .png",
     "render --nope": "Unrecognized options: --nope",
     "render s.ply -o out --scal 2": "Unrecognized options: --scal; did you mean --scale?; see",
     "render s.ply -o": "Missing value for argument '-o/--output'",

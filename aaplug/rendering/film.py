@@ -7,7 +7,6 @@ import torch
 
 from aaplug.core.camera_paths import toward
 from aaplug.core.cameras import Aperture, Camera, Exposure
-from aaplug.core.lenses import PINHOLE
 from aaplug.options.shared import DEFAULT_SENSOR, FilmOptions
 from aaplug.system.errors import UsageError
 
@@ -37,10 +36,6 @@ def filmed(
     if options.samples == 0:
         return [replace(view, exposure=None) for view in views]
     apertures = [_aperture(view, options) for view in views]
-    for view, aperture in zip(views, apertures, strict=True):
-        if aperture and view.lens != PINHOLE:
-            problem = f"is an aperture of pinhole views, and the lens of view {view.name} is {view.lens.projection}"
-            raise UsageError("f_stop", f"{problem}; `samples` 0 draws without one")
     motions: Sequence[tuple[Camera, Camera]] = ()
     if (camera_to or shutter is not None) and any(view.lens.projection == "ortho" for view in views):
         raise UsageError("camera_to" if camera_to else "shutter", "moves perspective views; the lens is ortho")
