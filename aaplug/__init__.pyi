@@ -9,6 +9,7 @@ from .io.scenes.scene import Scene as Scene
 # nouns
 from .core.cameras import Camera as Camera, CameraSet as CameraSet, look_at as look_at
 from .core.cameras import Aperture as Aperture, Exposure as Exposure
+from .core.lenses import Lens as Lens
 from .system.errors import AaplugError as AaplugError, FormatError as FormatError, UsageError as UsageError
 from .core.conventions import Convention as Convention
 from .core.gaussians import Gaussians as Gaussians

@@ -1,5 +1,7 @@
 """The pictures of examples/guides: two figures of one Gaussian, PSNR over scale, and the gallery's images."""
 
+import math
+from dataclasses import replace
 from importlib.resources import as_file, files
 from pathlib import Path
 
@@ -9,10 +11,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from aaplug.core.cameras import Camera, CameraSet
+from aaplug.core.cameras import Camera, CameraSet, look_at
 from aaplug.core.colours import WHITE
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.imaging import resampled
+from aaplug.core.lenses import EQUIDISTANT, ORTHO, opencv_lens
 from aaplug.core.training import TrainingViews
 from aaplug.evaluation.report.plots import COLOURS, MARKERS, Plot
 from aaplug.evaluation.results import CEILING, scale_name
@@ -21,7 +24,9 @@ from aaplug.io.images import encode_webp, read_image
 from aaplug.io.scenes import read_scene
 from aaplug.rendering.renderer import Renderer
 from tests.bench.concepts import concepts
+from tests.bench.film_lenses import panorama
 from tests.bench.method_tables import PSNR_COLUMN, Table, table
+from tests.bench.room import furnished, inside
 
 FOLDER = Path(__file__).resolve().parents[2] / "examples" / "guides" / "pictures"
 TITLES = {
@@ -50,9 +55,29 @@ def main() -> None:
         scene, cameras = read_scene(sample / "chair.ply").gaussians(), read_cameras(sample)
         pictures = {f"{plot.name}.svg": plot.svg().encode() for plot in (*concepts(scene, cameras), scales())}
         pictures |= gallery(scene, cameras)
+        pictures["lenses.webp"] = encode_webp(lenses(scene), ENLARGED_QUALITY)
     for name, content in pictures.items():
         (FOLDER / name).write_bytes(content)
         print(f"{FOLDER.name}/{name}: {len(content):,} bytes")
+
+
+def lenses(chair: Gaussians) -> Float[Tensor, "h w 3"]:
+    """A room with the chair: a panorama, and below it a fisheye of 180°, an orthographic and a distorted view."""
+    renderer = Renderer.of(furnished(chair), inside(), "auto", min_seen=0)
+    eye, up = torch.tensor([0.6, -2.3, -1.3]), torch.tensor([0.0, 0.0, 1.0])
+    level, down = (look_at(eye, torch.tensor([0.0, 0.0, height]), up) for height in (-1.3, -1.9))
+    side = 340  # px
+    middle = {"width": side, "height": side, "cx": side / 2, "cy": side / 2}
+    views = (  # focal length in px, and pose
+        (replace(EQUIDISTANT, max_angle=90.0), side / math.pi, level),
+        (ORTHO, side / 4, down),
+        (opencv_lens((-0.25, 0.06)), side / 2, down),
+    )
+    below = [
+        renderer(Camera("view", **middle, fx=focal, fy=focal, cam_from_world=pose, lens=lens)).rgb
+        for lens, focal, pose in views
+    ]
+    return torch.cat([renderer(panorama(level, 3 * side)).rgb, torch.cat(below, dim=1)]).clamp(0, 1)
 
 
 def scales() -> Plot:

@@ -1,19 +1,21 @@
 """A room of small textured Gaussians, to look around in; made, not read."""
 
 import math
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.cameras import Camera, CameraSet, look_at
-from aaplug.core.gaussians import Gaussians
+from aaplug.core.gaussians import Gaussians, joined
 from aaplug.core.spherical_harmonics import SH_C0
 
 SIDE = 6.0  # world units, of the cubic room around the origin
 FLATNESS = 0.1  # thickness of a Gaussian against its width
 FOCAL = 652.0  # px: that of a panorama of 4096 px at its horizon
 VIEWS = 12
+PALE = 0.3  # colour of the furnished room's walls against those of the bare one
 
 
 def room(per_side: int = 300, side: float = SIDE) -> Gaussians:
@@ -73,3 +75,12 @@ def matrices(pose: Float[Tensor, "4 4"]) -> list[Float[Tensor, "4 4"]]:
         tilt[1, 2], tilt[2, 1] = math.sin(b), -math.sin(b)
         faces.append(tilt @ turn @ pose)
     return faces
+
+
+def furnished(chair: Gaussians, side: float = SIDE) -> Gaussians:
+    """The room with the bundled chair on its floor."""
+    walls = room(200, side)
+    colour = torch.cat([walls.sh, walls.sh.new_zeros(len(walls), chair.sh.shape[1] - 1, 3)], dim=1)
+    drop = chair.means.new_tensor([0.0, 0.0, -side / 2 - float(chair.means[:, 2].quantile(0.001))])
+    chair = replace(chair, means=chair.means + drop, origin=None, extras={})
+    return joined([chair, replace(walls, sh=PALE * colour)])
