@@ -14,7 +14,7 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.core.lenses import Lens
 from aaplug.core.passes import PASSES, NormalAxes
 from aaplug.core.splats import Splats2D
-from aaplug.io.image_formats import Storage
+from aaplug.io.image_formats import IMAGE_FORMATS, PNG, Storage
 from aaplug.io.scenes import write_scene
 from aaplug.methods.order import Order
 from aaplug.rasterizers.reference import REFERENCE
@@ -233,6 +233,7 @@ def test_render_writes_passes_the_same_from_any_number_of_processes(tmp_path, cl
     with np.load(json.loads(out)["images"][0]["file"]) as found:
         assert {*names.split(",")} < {*found.files}
         assert found["normal"].shape == (48, 64, 3)
+        assert found["id"].dtype == np.int64
     scene, cameras = aaplug.read_scene("scene.ply"), aaplug.read_cameras(".")
     renderer = Renderer.of(scene, cameras, rasterizer="eager", background=BLACK)
     storage = Storage.of(Path("a.npz"), passes=names.split(","))
@@ -269,3 +270,12 @@ def test_through_a_lens_a_position_is_where_the_splat_is(lens):
     assert (drawn["id"][seen] == 0).all()
     assert (drawn["id"] >= 0).equal(drawn["alpha"] > 0)
     assert torch.allclose(drawn["normal"][seen].norm(dim=1), torch.ones(1))
+
+
+def test_an_exr_takes_no_ids_that_float_cannot_hold(monkeypatch, tmp_path):
+    renderer = Renderer.of(make_scene(60), [CAMERA], "classic", rasterizer="eager")
+    storage = replace(PNG, format=IMAGE_FORMATS["exr"], passes=("id",))
+    monkeypatch.setattr("aaplug.rendering.frames.MAX_NUMBER", 59)
+    with pytest.raises(UsageError, match=r"an \.exr holds ids up to 59, not 60; an \.npz does"):
+        write_frames(renderer, [CAMERA], [tmp_path / "a.exr"], storage=storage)
+    assert not list(tmp_path.iterdir())

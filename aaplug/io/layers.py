@@ -40,7 +40,8 @@ def write_layers(
         OutputError: see `replacing`.
         UsageError: a .png, .jpg or .webp is to hold values that are NaN or infinite.
     """
-    chosen = {name: layers[name].detach().float().cpu() for name in storage.passes}
+    chosen = {name: layers[name].detach().cpu() for name in storage.passes}
+    chosen = {name: layer.float() if layer.is_floating_point() else layer for name, layer in chosen.items()}
     if storage.colour == "linear" and "rgb" in chosen:
         rgb, alpha = chosen["rgb"], chosen.get("alpha")
         chosen["rgb"] = linear(rgb) if alpha is None else linear(straight(rgb, alpha)) * alpha[..., None]
@@ -79,7 +80,7 @@ def _write_exr(
         spec = PASSES[name]
         half = storage.bit_depth == 16 and not spec.exact
         for letter, plane in zip(spec.channels, layer.reshape(*layer.shape[:2], -1).unbind(dim=2), strict=True):
-            samples = plane.clamp(-MAX_HALF, MAX_HALF).half() if half else plane
+            samples = plane.clamp(-MAX_HALF, MAX_HALF).half() if half else plane.float()
             channels[f"{spec.layer}.{letter}".lstrip(".")] = samples.contiguous().numpy()
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     if "rgb" in layers:

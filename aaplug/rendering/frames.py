@@ -16,7 +16,9 @@ from aaplug.core.cameras import Camera, photographs
 from aaplug.io.atomic import check_output
 from aaplug.io.image_formats import PNG, Storage
 from aaplug.io.layers import write_layers
+from aaplug.rendering.passes import MAX_NUMBER
 from aaplug.rendering.renderer import Renderer
+from aaplug.system.errors import UsageError
 from aaplug.system.executors import Apply
 from aaplug.system.monitor import Tell
 
@@ -39,9 +41,11 @@ def write_frames(
 
     Raises:
         OutputError: an image cannot be written.
-        UsageError: a process died.
+        UsageError: a process died, or the format cannot hold the scene's ids.
     """
     total = len(views)
+    if "id" in storage.passes and storage.format.name == "exr" and len(renderer.scene) > MAX_NUMBER:
+        raise UsageError("passes", f"an .exr holds ids up to {MAX_NUMBER:,}, not {len(renderer.scene):,}; an .npz does")
     files = tuple(Path(path) for path in paths)
     photos = photographs(views)
     for path in files:

@@ -245,6 +245,9 @@ class Renderer:
         for name in names:
             if name not in PASSES:
                 raise UsageError("passes", not_one_of(name, PASSES) + did_you_mean(name, PASSES))
+        if {*names} <= {"rgb", "alpha"}:
+            image = self(camera)._asdict()
+            return {name: image[name] for name in names}
         with within_memory(f"view {camera.name} at {camera.width}x{camera.height}"):
             exposed = None if camera.exposure is None else self.exposed(camera)
             camera = replace(camera, exposure=None)
