@@ -79,7 +79,7 @@ def test_a_new_sequence_leaves_no_frame_of_the_old_one(cli, monkeypatch):
         err
     )
     with monkeypatch.context() as patch:  # stopped before its first frame
-        patch.setattr("aaplug.verbs.frame_sequences.write_frames", lambda *args, **how: sys.exit(3))
+        patch.setattr("aaplug.verbs.video.write_frames", lambda *args, **how: sys.exit(3))
         assert cli(f"{words} --overwrite --recipe classic")[0] == 3
     assert sorted(bytes_of("out")) == ["f.json"]
 

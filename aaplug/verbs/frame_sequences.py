@@ -6,20 +6,14 @@ frame.####.exr, holds what was asked for.
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from aaplug.core.cameras import Camera
 from aaplug.io.atomic import check_output, refuse_existing, replacing
-from aaplug.io.image_formats import Storage
 from aaplug.io.video import CODECS
-from aaplug.rendering.frames import write_frames
-from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import FormatError, OutputError, UsageError, listing
-from aaplug.system.executors import Apply
-from aaplug.system.monitor import Tell
 from aaplug.verbs.views import SUFFIXES, names_image
 
 PLACES = re.compile("#+")  # of a frame's number in a name
@@ -111,25 +105,3 @@ class FrameSequence:
         with replacing(self.record, True) as stream:
             stream.write(json.dumps(now, indent=1).encode() + b"\n")
         return list(range(self.count))
-
-    def write(
-        self,
-        renderer: Renderer,
-        views: Sequence[Camera],
-        left: Sequence[int],
-        storage: Storage,
-        apply: Apply,
-        tell: Tell,
-    ) -> None:
-        """Draw the frames at the places `left` of all views; errors as those of `write_frames`."""
-        done = self.count - len(left)
-
-        def tell_all(now: int, _: int) -> None:
-            tell(done + now, self.count)
-
-        paths = self.paths
-        files = [paths[place] for place in left]
-        if not left:
-            tell_all(0, 0)
-            return
-        write_frames(renderer, [views[place] for place in left], files, apply, storage=storage, tell=tell_all)

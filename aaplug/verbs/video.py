@@ -21,6 +21,7 @@ from aaplug.io.scenes import SceneLike
 from aaplug.io.video import check_video
 from aaplug.options.verbs import VideoOptions
 from aaplug.rendering.film import filmed
+from aaplug.rendering.frames import write_frames
 from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.rendering.renderer import Renderer
 from aaplug.rendering.videos import make_video
@@ -106,7 +107,12 @@ def video(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, option
             pool = workers.cluster or ProcessesIfLong(workers.threads)
             if sequence is not None:
                 left = sequence.begin(_request(job, renderers[0], views, storage, fps), options.resume)
-                sequence.write(renderers[0], views, left, storage, pool.map, tell)
+                files, done = sequence.paths, len(views) - len(left)
+                tell(done, len(views))
+                if left:
+                    files, cameras_left = [files[place] for place in left], [views[place] for place in left]
+                    how = {"storage": storage, "tell": lambda now, _: tell(done + now, len(views))}
+                    write_frames(renderers[0], cameras_left, files, pool.map, **how)
                 return Clip(sequence.pattern, len(views), fps)
             how = {"overwrite": options.overwrite, "tell": tell, "folder": workers.cluster and target.parent}
             make_video(target, renderers, views, fps, compose, pool.map, **how)
