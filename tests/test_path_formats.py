@@ -30,15 +30,6 @@ SETTINGS = {
         }
     ],
 }  # fmt: skip
-DOCUMENT = {
-    "timeline": {"frames": 20, "frameRate": 10, "smoothness": 1},
-    "poseSets": [
-        {
-            "name": "set0",
-            "poses": [{"frame": f, "position": [f, 0, 4], "target": [f, 0, 0], "fov": 60} for f in (0, 10)],
-        }
-    ],
-}
 HALF = math.sqrt(0.5)
 TIMELINE = {
     "version": 4,
@@ -124,12 +115,13 @@ def test_supersplat_settings_of_version_1_have_one_angle_of_view(tmp_path):
     assert path.cameras[0].fx == pytest.approx(path.cameras[0].width / 2)
 
 
-def test_supersplat_documents_go_round(tmp_path):
-    path = read_camera_path(written(tmp_path, "document.json", DOCUMENT))
+def test_supersplat_tracks_that_repeat_go_round(tmp_path):
+    track = {**SETTINGS["animTracks"][0], "loopMode": "repeat", "duration": 3}
+    path = read_camera_path(written(tmp_path, "settings.json", {**SETTINGS, "animTracks": [track]}))
     places = [-camera.centre[0].item() for camera in path.cameras]
-    assert len(places) == 20
-    assert (places[0], places[10]) == (pytest.approx(0), pytest.approx(10))
-    assert places[5] == pytest.approx(places[15])
+    assert len(places) == 30
+    assert [places[0], places[10], places[20]] == pytest.approx([0, 1, 2])
+    assert places[25] == pytest.approx(1, abs=0.2)  # on its way back
 
 
 def test_lichtfelds_timeline_is_turned_into_the_scenes_axes_and_eased(tmp_path):
@@ -256,7 +248,6 @@ WRONG = {
     "at the target": ("a.json", SETTINGS, ("animTracks", 0, "keyframes", "values", "target"), [0, 0, 4] * 3),
     "too long": ("a.json", SETTINGS, ("animTracks", 0, "duration"), 1e9),
     "version": ("a.json", SETTINGS, ("version",), 3),
-    "document": ("a.json", DOCUMENT, ("poseSets",), []),
     "timeline": ("a.json", TIMELINE, ("version",), 5),
     "no rotation": ("a.json", TIMELINE, ("keyframes", 1, "rotation"), [0, 0, 0, 0]),
     "easing": ("a.json", TIMELINE, ("keyframes", 1, "easing"), 0.5),
@@ -282,7 +273,7 @@ def test_a_broken_path_is_refused(tmp_path, case):
 
 
 def test_every_path_is_rigid_and_free(tmp_path):
-    names = (("a.json", SETTINGS), ("b.json", TIMELINE), ("c.json", DOCUMENT))
+    names = (("a.json", SETTINGS), ("b.json", TIMELINE))
     files = [written(tmp_path, name, content) for name, content in names]
     for camera in [camera for file in [*files, glb(tmp_path)] for camera in read_camera_path(file).cameras]:
         turn = camera.cam_from_world[:3, :3]

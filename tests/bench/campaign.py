@@ -33,8 +33,8 @@ from tests.test_batch import SETTINGS
 from tests.test_camera_paths import document
 from tests.test_cameras_io import EXPORTED, FIXTURES, write_json
 from tests.test_finetuning import make_job
-from tests.test_path_formats import DOCUMENT, TIMELINE, USDA, glb, gltf_with_buffer
 from tests.test_path_formats import SETTINGS as VIEWER_SETTINGS
+from tests.test_path_formats import TIMELINE, USDA, glb, gltf_with_buffer
 
 SMALL_IMAGES = {"AAPLUG_IMAGE": "2000000", "AAPLUG_IMAGE_EXTRA": "1000000"}  # so that the children's memory suffices
 IMAGES = {
@@ -108,7 +108,6 @@ def paths() -> dict[str, Target]:
     files = {
         "path.json": json.dumps(document(shutter=0.5, camera_path=[frame, frame])),
         "settings.json": json.dumps(VIEWER_SETTINGS),
-        "document.json": json.dumps(DOCUMENT),
         "timeline.json": json.dumps(TIMELINE),
         **({"path.usda": USDA} if find_spec("pxr") else {}),
     }

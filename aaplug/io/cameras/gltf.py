@@ -82,12 +82,7 @@ class _File:
 
     def items(self, key: str) -> list[Entry]:
         """The objects of a list of the document."""
-        if key not in self.root:
-            return []
-        return [
-            Entry(Place(self.path, f"{key}[{i}]"), e.fields)
-            for i, e in enumerate(entries(self.path, key, self.root.value(key)))
-        ]
+        return entries(self.path, key, self.root.value(key)) if key in self.root else []
 
     def item(self, key: str, owner: Entry, field: str) -> Entry:
         """The object that a field points to."""
@@ -97,26 +92,24 @@ class _File:
     def numbers(self, owner: Entry, field: str, kind: str) -> Float[Tensor, "n c"]:
         """The floats of the accessor that a field names."""
         accessor, width = self.item("accessors", owner, field), WIDTHS[kind]
-        right = (
-            accessor.get("type", text) == kind and accessor.value("componentType") == FLOAT and "sparse" not in accessor
-        )
-        accessor.place.expect(right, "it", f"dense floats of type {kind}", accessor.fields)
+        found = [accessor.fields.get("type"), accessor.fields.get("componentType"), "sparse" in accessor]
+        accessor.place.expect(found == [kind, FLOAT, False], "it", f"dense floats of type {kind}", accessor.fields)
         view = self.item("bufferViews", accessor, "bufferView")
-        data, size = self._buffer(self.item("buffers", view, "buffer")), 4 * width
-        start, length = (
-            natural(view.fields.get(key, 0), view.place, key, len(data)) for key in ("byteOffset", "byteLength")
+        data = self._buffer(self.item("buffers", view, "buffer"))
+        start, inner, length, count = (
+            natural(entry.fields.get(key, 0), entry.place, key, len(data))
+            for entry, key in (
+                (view, "byteOffset"),
+                (accessor, "byteOffset"),
+                (view, "byteLength"),
+                (accessor, "count"),
+            )
         )
-        stride = natural(view.fields.get("byteStride", size), view.place, "byteStride", 252)
-        offset = natural(accessor.fields.get("byteOffset", 0), accessor.place, "byteOffset", len(data))
-        count = natural(accessor.value("count"), accessor.place, "count", len(data))
-        end = offset + (count - 1) * stride + size
-        fits = count > 0 and stride >= size and end <= length and start + length <= len(data)
-        accessor.place.expect(fits, "it", f"values inside its buffer of {len(data)} bytes", f"{count} up to byte {end}")
-        found = torch.from_numpy(
-            np.ndarray((count, width), "<f4", data, start + offset, (stride, 4)).astype(np.float64)
-        )
-        accessor.place.expect(bool(found.isfinite().all()), "it", "finite", "NaN or infinity")
-        return found
+        fits = count > 0 and inner + 4 * width * count <= length <= len(data) - start
+        accessor.place.expect(fits, "it", f"values inside its buffer of {len(data)} bytes", accessor.fields)
+        values = np.frombuffer(data, "<f4", count * width, start + inner).reshape(count, width)
+        accessor.place.expect(bool(np.isfinite(values).all()), "it", "finite", "NaN or infinity")
+        return torch.from_numpy(values.astype(np.float64))
 
     def _buffer(self, buffer: Entry) -> bytes:
         if "uri" not in buffer:

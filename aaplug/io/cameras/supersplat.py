@@ -1,11 +1,8 @@
-"""Camera animations of SuperSplat: the settings of its viewer, versions 1 and 2, and the poses of its document.
+"""Camera animations of SuperSplat: the settings of its viewer, versions 1 and 2, which its export writes.
 
 Settings (playcanvas/supersplat-viewer, `src/schemas`, 2026): {animTracks: [{duration, frameRate, loopMode,
 interpolation, smoothness, keyframes: {times, values: {position, target, fov}}}]}.  duration is in s, times are in
 frames, position and target are flat lists; version 1 has one fov for all, in `camera`.
-
-Document (playcanvas/supersplat, 2026; `document.json` in a .ssproj): {timeline: {frames, frameRate, smoothness},
-poseSets: [{poses: [{frame, position, target, fov}]}]}.
 
 The viewer turns scenes by 180° about z, so the scene's x and y point against the world's, and up is the scene's -y.
 fov is the angle in degrees along the image's longer side.  Values lie on a cubic spline whose slopes are the mean
@@ -47,14 +44,14 @@ class Track(NamedTuple):
 
 
 def sniff(path: Path) -> bool:
-    """True for a file with the keys of settings or of a document."""
-    return mentions(path, ["animTracks", "poseSets"])
+    """True for a file with animations."""
+    return mentions(path, ["animTracks"])
 
 
 def path_of(path: Path) -> CameraPath:
     """The frames of the first animation."""
-    about = object_of(read_json(path), path, "it", "'animTracks' or 'poseSets', as SuperSplat writes")
-    track = _track(about) if "animTracks" in about else _document(about)
+    about = object_of(read_json(path), path, "it", "'animTracks', as SuperSplat writes", "animTracks")
+    track = _track(about)
     times = rising(track.times, about.place, "times")
     at = frame_times(0.0, track.frames - 1, 1.0, about.place)
     times, values = _looped(track) if track.loops else (times, track.values)
@@ -103,20 +100,6 @@ def _track(about: Entry) -> Track:
         track.fields.get("loopMode") == "repeat",
         track.fields.get("interpolation") == "step",
     )
-
-
-def _document(about: Entry) -> Track:
-    [poses, *_] = entries(about.place.file, "set of poses", about.value("poseSets"))
-    timeline = about.entry("timeline") if "timeline" in about else Entry(about.place, {})
-    fps = timeline.get("frameRate", number, FPS)
-    timeline.place.expect(fps > 0, "frameRate", "above 0", fps)
-    keys = entries(about.place.file, "pose", poses.value("poses"))
-    keys = sorted(keys, key=lambda key: key.get("frame", number))
-    times = torch.tensor([key.get("frame", number) for key in keys], dtype=torch.float64)
-    rows = [[*key.vector("position", 3), *key.vector("target", 3), key.get("fov", number, FOV)] for key in keys]
-    frames = timeline.get("frames", number, float(times[-1]) + 1)
-    values = torch.tensor(rows, dtype=torch.float64)
-    return Track(times, values, frames, fps, timeline.get("smoothness", number, 1.0), True, False)
 
 
 def _looped(track: Track) -> tuple[Float[Tensor, " n"], Float[Tensor, "n 7"]]:
