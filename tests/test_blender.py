@@ -10,7 +10,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from aaplug.io.cameras import read_camera_path
+import aaplug
+from aaplug.io.cameras import read_camera_path, read_cameras
+from aaplug.io.scenes import read_scene
 from tests.conftest import ROOT, SAMPLE
 
 ADD_ON = ROOT / "examples" / "blender" / "aaplug_camera.py"
@@ -69,3 +71,23 @@ def test_frames_are_drawn_and_loaded(exported):
     assert result["background"] == [640, 267, "SEQUENCE", 5]
     assert result["node"] == "aaplug"
     assert "nothing.ply" in str(result["fails"])
+
+
+def test_layers_of_an_exr_are_outputs_of_an_image_node_by_name(tmp_path):
+    pytest.importorskip("OpenEXR", reason="the extra exr is not installed")
+    passes = ["rgb", "alpha", "depth", "normal", "position", "id"]
+    scene, cameras = read_scene(SAMPLE / "chair.ply"), read_cameras(SAMPLE)
+    aaplug.render(scene, cameras, tmp_path / "a.exr", views="r_8", resolution="64x64", passes=passes)
+    script = (
+        "import bpy, sys\n"
+        "bpy.context.scene.use_nodes = True\n"
+        "tree = getattr(bpy.context.scene, 'node_tree', None) or bpy.data.node_groups.new('a', 'CompositorNodeTree')\n"
+        "node = tree.nodes.new('CompositorNodeImage')\n"
+        "node.image = bpy.data.images.load(sys.argv[1])\n"
+        "print('outputs', *(output.name for output in node.outputs if output.enabled))\n"
+    )
+    done = subprocess.run(
+        [PYTHON, "-c", script, str(tmp_path / "a.exr")], capture_output=True, text=True, timeout=500, check=True
+    )
+    [line] = [line for line in done.stdout.splitlines() if line.startswith("outputs")]
+    assert line.split()[1:] == ["Combined", "Alpha", "depth", "id", "normal", "position"]
