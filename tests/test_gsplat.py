@@ -9,6 +9,8 @@ from enum import Enum
 from fractions import Fraction
 from types import ModuleType
 
+import cv2
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -91,11 +93,14 @@ def covariances(quats: Tensor, scales: Tensor) -> Tensor:
     return factor @ factor.mT
 
 
-def projected_by(reference, values: dict[str, Tensor], views: dict[str, object]) -> tuple[Tensor, ...]:
+def projected_by(
+    reference, values: dict[str, Tensor], views: dict[str, object], model: str = "pinhole"
+) -> tuple[Tensor, ...]:
     """Radii, means, depths, conics and compensation by gsplat, [c, n, ...]."""
     sigma = values["covars"] if "covars" in values else covariances(values["quats"], values["scales"])
     tensors = values["means"], sigma, views["viewmats"], views["Ks"]
-    return reference._fully_fused_projection(*tensors, views["width"], views["height"], calc_compensations=True)
+    words = {"calc_compensations": True, "camera_model": model}
+    return reference._fully_fused_projection(*tensors, views["width"], views["height"], **words)
 
 
 def opaque(given: str) -> dict[str, Tensor]:
@@ -106,16 +111,24 @@ def opaque(given: str) -> dict[str, Tensor]:
     return values
 
 
-WIDE = (640, 480)
+WIDE, WORLD = (640, 480), 1e6
 
 
 @pytest.mark.parametrize("given", ["scales", "covars"])
+@pytest.mark.parametrize("model", ["pinhole", "fisheye", "ortho"])
 @pytest.mark.parametrize(("dtype", "px", "relative"), [(torch.float32, 1e-4, 1e-5), (F64, 1e-9, 1e-9)])
-def test_projection_equals_gsplats_on_a_thousand_cases(reference, dtype, px, relative, given):
+def test_projection_equals_gsplats_on_a_thousand_cases(reference, model, dtype, px, relative, given):
     values, views = opaque(given), unusual_views(20)
-    radii, means, depths, conics, factors = projected_by(reference, values, views)
+    if model != "pinhole":  # a larger world, in which the 1e-7 that gsplat adds to a fisheye's lengths does not count
+        for name, power in (("means", 1), ("scales", 1), ("covars", 2)):
+            values |= {name: values[name] * WORLD**power} if values.get(name) is not None else {}
+        views["viewmats"][:, :3, 3] *= WORLD
+    if model == "ortho":
+        views["Ks"][:, [0, 1], [0, 1]] /= 3 * WORLD
+    radii, means, depths, conics, factors = projected_by(reference, values, views, model)
     ours = {name: x.to(dtype) if isinstance(x, Tensor) else x for name, x in (values | views).items()}
-    _, _, meta = rasterization(**ours, packed=False, rasterize_mode="antialiased", rasterizer=Nothing())
+    words = {"packed": False, "rasterize_mode": "antialiased", "camera_model": model, "rasterizer": Nothing()}
+    _, _, meta = rasterization(**ours, **words)
     shown, theirs = ((x > 0).all(dim=2) for x in (meta["radii"], radii))
     both = shown & theirs
     assert both.sum() > 800
@@ -130,6 +143,53 @@ def test_projection_equals_gsplats_on_a_thousand_cases(reference, dtype, px, rel
     for name, expected in pairs.items():
         error = (meta[name].view_as(expected) - expected)[both].abs().amax(dim=1) / expected[both].abs().amax(dim=1)
         assert error.max() < relative, name
+
+
+LENSES = {
+    "distorted": ("pinhole", (-0.2, 0.05, 0.01, 0.1, 0.02, -0.01), (0.01, -0.02), (0.01, -0.01, 0.02, 0.01)),
+    "wide": ("pinhole", (0.0, 0.0, 0.0, 0.5, 0.0, 0.0)),  # its edges see slopes of 1.07, at places of 0.68
+    "fisheye": ("fisheye", (0.05, -0.02, 0.01, 0.003)),
+    "ortho": ("ortho",),
+}
+
+
+def lens_words(name: str, *shape: int) -> dict[str, object]:
+    """Arguments of a lens for cameras of this shape."""
+    model, *coefficients = LENSES[name]
+    names = ("radial_coeffs", "tangential_coeffs", "thin_prism_coeffs")
+    pairs = zip(names, coefficients, strict=False)
+    return {"camera_model": model} | {key: torch.tensor(k, dtype=F64).expand(*shape, -1) for key, k in pairs}
+
+
+@pytest.mark.parametrize("name", ["distorted", "wide", "fisheye"])
+def test_distortion_is_opencvs_linearised_at_each_centre(name):
+    values, views = gaussians(400) | {"opacities": torch.ones(400, dtype=F64)}, two_views()
+    values["means"] *= 2
+    views["Ks"][:, [0, 1], [0, 1]] = SIZE[0] / 2 / 0.68
+    words = lens_words(name, 2)
+    _, _, meta = rasterization(**values, **views, **words, eps2d=0.0, packed=False, with_ut=True, rasterizer=Nothing())
+    radial, tangential, prism = (*LENSES[name][1:], (0.0,) * 2, (0.0,) * 4)[:3]
+    order = radial if name == "fisheye" else (*radial[:2], *tangential[:2], *radial[2:], *(*prism, 0, 0)[:4])
+    project = cv2.fisheye.projectPoints if name == "fisheye" else cv2.projectPoints
+    zero, sigma = np.zeros((1, 3)), covariances(values["quats"], values["scales"])
+    for camera in range(2):
+        pose, K = views["viewmats"][camera], views["Ks"][camera].numpy()
+
+        def seen(points: Tensor, K: np.ndarray = K) -> Tensor:
+            return torch.from_numpy(project(points[:, None].numpy(), zero, zero, K, np.array(order))[0][:, 0])
+
+        local = values["means"] @ pose[:3, :3].T + pose[:3, 3]
+        steps = 1e-6 * torch.eye(3, dtype=F64)
+        jacobian = torch.stack([(seen(local + step) - seen(local - step)) / 2e-6 for step in steps], dim=2)
+        factor = jacobian @ pose[:3, :3]
+        means, slopes = seen(local), (local[:, :2] / local[:, 2:]).norm(dim=1)
+        inside = (meta["radii"][camera] > 0).all(dim=1) & ((means > 0) & (means < torch.tensor(SIZE))).all(dim=1)
+        inside &= slopes < 1.2  # up to which the radial maps grow
+        conics = torch.linalg.inv((factor @ sigma @ factor.mT)[inside]).flatten(1)[:, [0, 1, 3]]
+        assert inside.sum() > 50
+        assert name != "wide" or (local[:, 0] / local[:, 2])[inside].abs().max() > 1
+        torch.testing.assert_close(meta["means2d"][camera][inside], means[inside])
+        torch.testing.assert_close(meta["conics"][camera][inside], conics, rtol=1e-4, atol=1e-9)
 
 
 @pytest.mark.parametrize("function", [rasterization, rasterization_2dgs])
@@ -179,8 +239,10 @@ def test_images_equal_the_formula(mode, channels):
         assert mode == "antialiased" or (expected[0] - capped).abs().max() > 1e-4, "the cap should matter here"
 
 
-def test_depth_is_summed_by_weight_and_may_be_divided_by_alpha():
+@pytest.mark.parametrize("lens", [None, *LENSES])
+def test_depth_is_summed_by_weight_and_may_be_divided_by_alpha(lens):
     values, views = gaussians(), two_views()
+    views |= lens_words(lens, 2) if lens else {}
     backgrounds = torch.ones(2, 3, dtype=F64)
     images = {
         mode: rasterization(**values, **views, render_mode=mode, backgrounds=backgrounds, packed=False)
@@ -417,16 +479,24 @@ def test_cameras_may_have_colours_of_their_own():
         torch.testing.assert_close(image[camera], other[camera])
 
 
+@pytest.mark.parametrize("lens", [None, *LENSES])
 @pytest.mark.parametrize("packed", [True, False])
-def test_batches_of_scenes_are_drawn_one_by_one(packed):
+def test_batches_of_scenes_are_drawn_one_by_one(packed, lens):
     scenes, views = [gaussians(seed=seed) for seed in (1, 2)], two_views()
     together = {name: torch.stack([scene[name] for scene in scenes]) for name in scenes[0]}
     poses = {name: views[name].expand(2, *views[name].shape) for name in ("viewmats", "Ks")}
-    image, alpha, meta = rasterization(**together, **views | poses, packed=packed)
+    words = lens_words(lens, 2, 2) if lens else {}
+    own_words = [dict(words), dict(words)]
+    for key, x in words.items():
+        if isinstance(x, Tensor):  # each image has a lens of its own
+            words[key] = x * torch.tensor([[1, 0.5], [0, -0.2]], dtype=F64)[..., None]
+            for own, part in zip(own_words, words[key], strict=True):
+                own[key] = part
+    image, alpha, meta = rasterization(**together, **views | poses | words, packed=packed)
     assert alpha.shape == (2, 2, SIZE[1], SIZE[0], 1)
     assert meta["n_batches"] == 2
     for i, scene in enumerate(scenes):
-        alone, _, own = rasterization(**scene, **views, packed=packed)
+        alone, _, own = rasterization(**scene, **views, **own_words[i], packed=packed)
         torch.testing.assert_close(image[i], alone)
         part = meta["means2d"][meta["batch_ids"] == i] if packed else meta["means2d"][i]
         torch.testing.assert_close(part, own["means2d"])
@@ -471,8 +541,9 @@ def test_masked_pixels_are_black(mode):
 
 
 LIKE_DEFAULTS = {  # values that ask for what gsplat does by default
-    "distributed": None, "sparse_grad": None, "tile_size": None, "with_ut": 0, "with_eval3d": False, "macro_tile": True,
+    "distributed": None, "sparse_grad": None, "tile_size": None, "with_ut": None, "with_eval3d": False,
     "radial_coeffs": torch.zeros(2, 6), "tangential_coeffs": torch.zeros(2, 2), "thin_prism_coeffs": torch.zeros(2, 4),
+    "macro_tile": True,
     "rolling_shutter": Enum("RollingShutterType", ["GLOBAL"]).GLOBAL, "extra_signals": None, "renderer_config": None,
 }  # fmt: skip
 
@@ -492,7 +563,10 @@ def test_depth_needs_no_colours():
 # ---------------------------------------------------------------------------------------------------------- gradients
 
 
-@pytest.mark.parametrize(("given", "packed"), [("scales", True), ("covars", False), ("matched", True)])
+GIVEN = [("scales", True), ("covars", False), ("matched", True), *((lens, False) for lens in LENSES)]
+
+
+@pytest.mark.parametrize(("given", "packed"), GIVEN)
 def test_gradients_equal_finite_differences(given, packed):
     values, views = gaussians(12, degree=1) | {"backgrounds": torch.rand(2, 3, dtype=F64)}, two_views()
     views |= {"width": 12, "height": 9}
@@ -500,6 +574,7 @@ def test_gradients_equal_finite_differences(given, packed):
     fixed = {"packed": packed, "render_mode": "RGB+ED", "rasterize_mode": "antialiased", "sh_degree": 1}
     if given == "matched":
         fixed |= {"rasterize_mode": "matched", "relative_rate": 0.5}
+    fixed |= lens_words(given, 2) if given in LENSES else {}
     if given == "covars":
         values |= {"covars": covariances(values.pop("quats"), values.pop("scales"))}
         fixed |= {"quats": None, "scales": None}
@@ -523,9 +598,11 @@ def test_opaque_transparent_and_flat_gaussians_have_finite_gradients():
         assert gradient.isfinite().all()
 
 
+@pytest.mark.parametrize("lens", [None, "fisheye"])
 @pytest.mark.parametrize("packed", [True, False])
-def test_absolute_gradients_are_summed_over_pixels(packed):
+def test_absolute_gradients_are_summed_over_pixels(packed, lens):
     values, views = gaussians(12), cameras([make_camera(eye, (4, 2)) for eye in EYES])
+    views |= lens_words(lens, 2) if lens else {}
     image, alpha, meta = rasterization(**values, **views, packed=packed, absgrad=True)
     assert not image.requires_grad
     values["means"].requires_grad_()
@@ -728,12 +805,22 @@ WRONG = {
     'relative_rate: belongs to rasterize_mode="matched", which needs it': {"rasterize_mode": "matched"},
     "relative_rate: expected shape [2], got [3]": {"rasterize_mode": "matched", "relative_rate": torch.ones(3)},
     "relative_rate: expected numbers above 0, got -1.0": {"rasterize_mode": "matched", "relative_rate": -1.0},
-    "camera_model: only pinhole is supported on the CPU (pinhole cameras), got 'fisheye'": {"camera_model": "fisheye"},
+    "camera_model: 'ftheta' is not one of pinhole, ortho, fisheye": {"camera_model": "ftheta"},
     "distributed: only False is supported": {"distributed": True},
     "sparse_grad: only False is supported": {"sparse_grad": True},
-    "with_ut: only False is supported": {"with_ut": True},
-    "radial_coeffs: only None is supported on the CPU (pinhole cameras), got float32 [2, 6]": {
-        "radial_coeffs": torch.full((2, 6), 0.1)
+    "with_eval3d: only False is supported": {"with_eval3d": True},
+    "ftheta_coeffs: only None is supported on the CPU, got float32 [3]": {"ftheta_coeffs": torch.ones(3)},
+    "radial_coeffs: expected shape [2, 6], got [2, 4]": {"radial_coeffs": torch.ones(2, 4)},
+    "radial_coeffs: expected shape [2, 4], got [2, 6]": {"radial_coeffs": torch.ones(2, 6), "camera_model": "fisheye"},
+    "radial_coeffs: expected finite numbers, got NaN": {"radial_coeffs": torch.full((2, 6), math.nan)},
+    "radial_coeffs: camera_model ortho has none, got float32 [2, 6]": {
+        "radial_coeffs": torch.ones(2, 6),
+        "camera_model": "ortho",
+    },
+    "tangential_coeffs: expected a tensor [*b, c, 2] of floats or None": {"tangential_coeffs": torch.ones(2)},
+    "thin_prism_coeffs: camera_model fisheye has none, got float32 [2, 4]": {
+        "thin_prism_coeffs": torch.ones(2, 4),
+        "camera_model": "fisheye",
     },
     "viewmats_rs: only None is supported": {"viewmats_rs": torch.zeros(2, 4, 4)},
     "colors: expected colours for render_mode RGB, got None": {"colors": None},

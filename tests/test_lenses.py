@@ -186,6 +186,19 @@ def test_places_are_opencvs(name):
     np.testing.assert_allclose(distortion(model).lens.places(rays).numpy(), expected, atol=1e-9)
 
 
+def test_derivatives_are_those_of_places(lens):
+    if lens == EQUIRECT:
+        with pytest.raises(UsageError, match="equirect image, which has a seam"):
+            lens.derivatives(some_rays(lens))
+        return
+    rays = 2.5 * some_rays(lens)
+    rays[0] = torch.tensor([0.0, 0.0, 2.0])
+    steps = 1e-6 * torch.eye(3, dtype=torch.float64)
+    expected = torch.stack([(lens.places(rays + s) - lens.places(rays - s)) / 2e-6 for s in steps], dim=2)
+    kept = rays[:, 2] > -2.3 if not lens.flat else torch.ones(len(rays), dtype=torch.bool)  # not right behind
+    torch.testing.assert_close(lens.derivatives(rays)[kept], expected[kept], rtol=1e-5, atol=1e-6)
+
+
 def test_a_lens_ends_where_its_radial_map_turns_back():
     lens = opencv_lens((-0.3, 0.0))  # ρ (1 - 0.3 ρ²) grows up to ρ = 1.05
     rays = lens.rays(torch.tensor([[0.69, 0.0], [0.72, 0.0]], dtype=torch.float64))

@@ -103,6 +103,35 @@ class Lens:
             rays = torch.cat([plane * (angle.sin() / radius), angle.cos()], dim=-1)
         return self._within_angle(rays.where(inside[..., None], 0.0))
 
+    def derivatives(self, rays: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 2 3"]:
+        """Derivatives of `places` by the rays' x, y and z.
+
+        A ray r at the angle θ from the axis and the distance d from it, in the direction u, has the undistorted place
+        ρ(θ) u.  Its derivative by x and y is (ρ/d)(1 - u uᵀ) + ρ′ z/|r|² u uᵀ, and by z it is -ρ′ d/|r|² u.
+
+        Raises:
+            UsageError: the lens is equirect.
+        """
+        if self.projection == "equirect":
+            raise UsageError("lens", "an equirect image, which has a seam, is not linearised")
+        if self.projection == "ortho":
+            return rays.new_tensor([[1, 0, 0], [0, 1, 0]]).expand(*rays.shape[:-1], 2, 3)
+        across, z, square = _length(rays[..., :2]), rays[..., 2], rays.square().sum(dim=-1) + TINY
+        angle = torch.atan2(across, z)
+        if self.projection == "pinhole":
+            radius, growth = across / z, square / z**2
+        elif self.projection == "equidistant":
+            radius, growth = angle, torch.ones_like(angle)
+        else:
+            radius, growth = 2 * (angle / 2).sin(), (angle / 2).cos()
+        around, inwards = (radius / across)[..., None, None], (growth / square)[..., None, None]
+        u = (rays[..., :2] / across[..., None])[..., None]
+        rows = around * torch.eye(2).to(rays) + (inwards * z[..., None, None] - around) * u * u.mT
+        rows = torch.cat([rows, -inwards * rays[..., :2, None]], dim=-1)
+        if not self.distorts:
+            return rows
+        return torch.stack(self._brown(rays[..., :2] * around[..., 0])[1], dim=-1).unflatten(-1, (2, 2)) @ rows
+
     def areas(self, rays: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n"]:
         """Area of the image per solid angle (steradian) around rays, of a lens that is not flat."""
         across, ahead = _length(rays[..., :2]), rays[..., 2]

@@ -24,6 +24,7 @@ from aaplug.core.sights import sights
 from aaplug.core.splats import SELECT, Splats2D
 
 JACOBIAN_MARGIN = 0.3  # of half the image: 3DGS linearises no farther out (1.3 tan(fov/2))
+PLACES = 17  # along a side, by which the slopes that a distorting pinhole sees are found
 MAX_SIGMA = 1e9  # px: larger splats look the same, but their determinant overflows float32
 MIN_FACING = 1e-6  # of depth: a disc at a flatter angle is a line, and its slope overflows
 
@@ -46,9 +47,13 @@ def project_covariances(
 ) -> Splats2D:
     """The same for Gaussians of any covariance Σ, in squared world units, of which the upper triangle is read.
 
-    With T = J W, whose rows have the cross product n, det(T Σ Tᵀ) = nᵀ cof(Σ) n (Cauchy-Binet), in float64.
+    With T = J W, whose rows have the cross product n, det(T Σ Tᵀ) = nᵀ cof(Σ) n (Cauchy-Binet), in float64.  Through
+    another lens than a pinhole, J is the lens's own at each centre, and the splats are ellipses of the image.
     """
-    centres, across, down, depths = _linearised(means, *_camera_rows(means, camera, rules))
+    if camera.lens == PINHOLE:
+        centres, across, down, depths = _linearised(means, *_camera_rows(means, camera, rules))
+    else:
+        centres, across, down, depths = _linearised_through(means, camera, rules)
     (xx, xy, xz), (_, yy, yz), (_, _, zz) = (row.unbind(dim=1) for row in covariances.double().unbind(dim=1))
     sigma = torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], dim=1).unflatten(1, (3, 3))
     a, b = (torch.stack(row, dim=1).double() for row in (across, down))
@@ -102,12 +107,19 @@ def _camera_rows(
 
 
 def slope_limits(camera: Camera) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Smallest and largest x/z, and y/z, at which projection is linearised; slopes beyond are clamped."""
-    limits = []
-    for centre, focal, side in ((camera.cx, camera.fx, camera.width), (camera.cy, camera.fy, camera.height)):
-        margin = JACOBIAN_MARGIN * 0.5 * side / focal
-        limits.append((-centre / focal - margin, (side - centre) / focal + margin))
-    return limits[0], limits[1]
+    """Smallest and largest x/z, and y/z, at which projection is linearised; slopes beyond are clamped.
+
+    They are those of the image's edges, or the largest that a pinhole that distorts sees if that is more, and a margin.
+    """
+    sides = (camera.cx, camera.fx, camera.width), (camera.cy, camera.fy, camera.height)
+    ends = [(-centre / focal, (side - centre) / focal) for centre, focal, side in sides]
+    if camera.lens.distorts and camera.lens.projection == "pinhole":
+        grid = torch.cartesian_prod(*(torch.linspace(*pair, PLACES, dtype=torch.float64) for pair in ends))
+        seen = camera.lens.rays(grid).T.tolist()
+        ends = [(min(low, *slopes), max(high, *slopes)) for (low, high), slopes in zip(ends, seen, strict=False)]
+    margins = (JACOBIAN_MARGIN * 0.5 * side / focal for _, focal, side in sides)
+    x, y = ((low - margin, high + margin) for (low, high), margin in zip(ends, margins, strict=True))
+    return x, y
 
 
 def _project(
@@ -176,6 +188,23 @@ def _linearised(
     across = [fx / ahead * (i - clamped_x * k) for i, k in zip(world[0], world[2], strict=True)]
     down = [fy / ahead * (j - clamped_y * k) for j, k in zip(world[1], world[2], strict=True)]
     return [fx * slope_x + cx, fy * slope_y + cy], across, down, z
+
+
+def _linearised_through(
+    means: Float[Tensor, "n 3"], camera: Camera, rules: Rules
+) -> tuple[list[Tensor], list[Tensor], list[Tensor], Tensor]:
+    """The same through any lens, in float64 until the means are in px."""
+    lens, rotation = camera.lens, camera.cam_from_world[:3, :3].to(means.device)
+    x, y, z = ((means.double() - camera.centre.to(means.device)) @ rotation.T).unbind(dim=1)
+    ahead = z.clamp(min=rules.near)
+    rays = torch.stack([x, y, ahead], dim=1)
+    centres = camera.pixels(lens.places(rays)).to(means)
+    if lens.projection == "pinhole":
+        slopes = ((p / ahead).clamp(*ends) for p, ends in zip((x, y), slope_limits(camera), strict=True))
+        rays = torch.stack([*(slope * ahead for slope in slopes), ahead], dim=1)
+    rows = lens.derivatives(rays) * rays.new_tensor([camera.fx, camera.fy])[:, None] @ rotation
+    across, down = (list(row.unbind(dim=1)) for row in rows.unbind(dim=1))
+    return list(centres.unbind(dim=1)), across, down, z.to(means)
 
 
 def sum_of(terms: Iterable[Tensor]) -> Tensor:

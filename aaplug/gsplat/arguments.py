@@ -16,26 +16,35 @@ from torch import Tensor
 from aaplug.core.cameras import Camera
 from aaplug.core.conventions import Convention
 from aaplug.core.gaussians import MAX_LOG_SCALE, Gaussians
+from aaplug.core.lenses import EQUIDISTANT, ORTHO, PINHOLE, Lens, opencv_lens
 from aaplug.core.rules import Rules
 from aaplug.system.contracts import described
 from aaplug.system.errors import UsageError, not_one_of
+
+LENSES = {"pinhole": PINHOLE, "ortho": ORTHO, "fisheye": EQUIDISTANT}  # of camera models
+COEFFICIENTS = {  # numbers of a camera model's coefficients of distortion
+    "radial_coeffs": {"pinhole": 6, "fisheye": 4},
+    "tangential_coeffs": {"pinhole": 2},
+    "thin_prism_coeffs": {"pinhole": 4},
+}
 
 MODES = {
     "render_mode": ("RGB", "D", "ED", "RGB+D", "RGB+ED"),
     "rasterize_mode": ("classic", "antialiased", "matched"),
     "trained_mode": ("classic", "antialiased"),
+    "camera_model": tuple(LENSES),
 }
 
 FIXED: dict[str, object] = {  # arguments of gsplat 1.5 and 1.6 of which only the default, or its like, is supported
     "sparse_grad": False,
     "absgrad": False,  # of discs
     "distributed": False,
-    "camera_model": "pinhole",
+    "camera_model": "pinhole",  # of discs, as the following
     "with_ut": False,
-    "with_eval3d": False,
     "radial_coeffs": None,
     "tangential_coeffs": None,
     "thin_prism_coeffs": None,
+    "with_eval3d": False,
     "ftheta_coeffs": None,
     "rolling_shutter": "GLOBAL",
     "viewmats_rs": None,
@@ -86,6 +95,7 @@ class Options:
     trained_mode: str
     max_alpha: float
     global_z_order: bool = True
+    camera_model: str = "pinhole"
 
     def __post_init__(self) -> None:
         for name, modes in MODES.items():
@@ -144,7 +154,7 @@ def refuse(others: Mapping[str, object]) -> None:
         else:
             same = value == default or not (value or default)
         if not same:
-            words = f"only {default} is supported on the CPU (pinhole cameras), got {described(value)}"
+            words = f"only {default} is supported on the CPU, got {described(value)}"
             raise UsageError(name, words)
 
 
@@ -160,11 +170,14 @@ def views_of(
     covars: Tensor | None,
     relative_rate: float | Tensor | None,
     options: Options,
+    coefficients: Sequence[Tensor | None] = (None, None, None),
 ) -> list[View]:
     """One view for each camera of each batch, in this order; shapes as in `rasterization`.
 
+    coefficients: of distortion, as `COEFFICIENTS`.
+
     Raises:
-        UsageError: shapes do not fit each other, or a camera is no pinhole camera.
+        UsageError: shapes do not fit each other, or a camera is not of the options' model.
     """
     *batch, n, _ = means.shape
     c = viewmats.shape[-3]
@@ -196,6 +209,7 @@ def views_of(
         _per_image(colors, batch, c, per_camera),
         *(_per_image(x, batch, c, per_camera=True) for x in (backgrounds, viewmats, Ks)),
         _rates(relative_rate, (*batch, c), options),
+        _lenses(coefficients, (*batch, c), options.camera_model),
     ]
     return [_view(*row, options) for row in zip(*columns, strict=True)]  # pyright: ignore[reportCallIssue]
 
@@ -228,6 +242,26 @@ def _rates(relative_rate: float | Tensor | None, shape: Sequence[int], options: 
     return rates.expand(*shape).flatten().tolist()
 
 
+def _lenses(coefficients: Sequence[Tensor | None], shape: Sequence[int], model: str) -> list[Lens]:
+    """Each image's lens.  coefficients: as `COEFFICIENTS`."""
+    rows = []
+    for (name, counts), x in zip(COEFFICIENTS.items(), coefficients, strict=True):
+        count = counts.get(model, 0)
+        if x is None or not x.any():
+            x = torch.zeros(*shape, count)
+        elif not count:
+            raise UsageError(name, f"camera_model {model} has none, got {described(x)}")
+        check_shape(name, x, (*shape, count))
+        if not x.isfinite().all():
+            raise UsageError(name, "expected finite numbers, got NaN or infinity")
+        rows.append(x.flatten(0, -2).tolist())
+    lenses = []
+    for radial, tangential, prism in zip(*rows, strict=True):
+        distorted = opencv_lens((*radial[:2], *tangential, *radial[2:], *prism), fisheye=model == "fisheye")
+        lenses.append(distorted if distorted.distorts else LENSES[model])
+    return lenses
+
+
 def _view(
     means: Tensor,
     quats: Tensor,
@@ -239,13 +273,14 @@ def _view(
     viewmat: Tensor,
     K: Tensor,
     rate: float | None,
+    lens: Lens,
     options: Options,
 ) -> View:
     """One image's part of the arguments."""
     (fx, skew, cx), (below, fy, cy), last = K.tolist()
     if skew != 0 or below != 0 or last != [0, 0, 1] or not (fx > 0 and fy > 0):
         raise UsageError("Ks", f"expected fx, 0, cx; 0, fy, cy; 0, 0, 1 with fx and fy above 0, got {K.tolist()}")
-    camera = AnyPose("", options.width, options.height, fx, fy, cx, cy, viewmat.double())
+    camera = AnyPose("", options.width, options.height, fx, fy, cx, cy, viewmat.double(), lens=lens)
     if rate is not None:
         camera = replace(camera, trained_focal=camera.focal / rate)
     log_scales = scales.abs().clamp(min=math.exp(-MAX_LOG_SCALE)).log()

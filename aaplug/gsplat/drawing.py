@@ -15,7 +15,8 @@ from aaplug.core.colours import BLACK
 from aaplug.core.ellipses import squared_cutoff
 from aaplug.core.interfaces import PixelKernel, Rasterizer
 from aaplug.core.kernels import Kernels
-from aaplug.core.projection import project, project_covariances
+from aaplug.core.lenses import PINHOLE
+from aaplug.core.projection import project, project_covariances, rotation_matrices
 from aaplug.core.sampling import SamplingBounds
 from aaplug.core.shading import shade
 from aaplug.core.splats import Splats2D
@@ -56,11 +57,15 @@ class ViewSplats:
         axes, or a box outside of the image.
         """
         rules, camera = options.convention.rules, view.camera
-        if view.covars is None:
+        if view.covars is None and camera.lens == PINHOLE:
             splats = project(view.scene, camera, kernels, rules)
             splats = replace(splats, opacities=view.opacities.index_select(0, splats.sources))
         else:
-            splats = project_covariances(view.scene.means, view.covars, view.opacities, camera, rules)
+            sigma = view.covars
+            if sigma is None:
+                factor = rotation_matrices(view.scene.unit_quats.double()) * view.scene.scales.double()[:, None]
+                sigma = factor @ factor.mT
+            splats = project_covariances(view.scene.means, sigma, view.opacities, camera, rules)
         if options.rasterize_mode == "matched":
             splats = Matched("global")(splats, camera, TrainingViews(options.convention, [camera], NO_BOUNDS))
         else:

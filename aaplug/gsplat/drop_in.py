@@ -49,6 +49,11 @@ def rasterization(
     camera_model: str = "pinhole",
     segmented: bool = False,
     covars: Float[Tensor, "*b n 3 3"] | None = None,
+    with_ut: bool | None = False,
+    with_eval3d: bool | None = False,
+    radial_coeffs: Float[Tensor, "*b c radial"] | None = None,
+    tangential_coeffs: Float[Tensor, "*b c 2"] | None = None,
+    thin_prism_coeffs: Float[Tensor, "*b c 4"] | None = None,
     *,
     global_z_order: bool = True,
     masks: Bool[Tensor, "*b c h w"] | None = None,
@@ -58,11 +63,11 @@ def rasterization(
     rasterizer: str | Rasterizer = "auto",
     **others: object,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """Draw Gaussians into the images of several pinhole cameras, as `gsplat.rasterization` does.
+    """Draw Gaussians into the images of several cameras, as `gsplat.rasterization` does.
 
     n: Gaussians; c: cameras; k: spherical-harmonics coefficients per channel; d: channels; "...": batch dimensions, or
-    none.  Differentiable in everything but `Ks`, as gsplat is.  `meta["means2d"]` has the gradients that gsplat's
-    densification reads; the gradients of the other entries are not recorded there.
+    none.  Differentiable in everything but `Ks` and distortion, as gsplat is.  `meta["means2d"]` has the gradients that
+    gsplat's densification reads; the gradients of the other entries are not recorded there.
 
     Args:
         means: [..., n, 3], in world units.
@@ -86,7 +91,14 @@ def rasterization(
         rasterize_mode: "classic"; "antialiased", which also scales opacity by √(det C / det(C + eps2d·I)), without a
             floor; or aaplug's "matched", which draws at any rate what training drew at its own (`Matched`).
         tile_size, channel_chunk, segmented: without effect here.
-        sparse_grad, distributed, camera_model: only gsplat's defaults are supported.
+        sparse_grad, distributed, with_eval3d: only gsplat's defaults are supported.
+        camera_model: "pinhole"; "fisheye", equidistant, whose focal lengths are px per radian; or "ortho", px per world
+            unit.  A Gaussian is drawn as the ellipse that the lens, linearised at its centre, makes of it (EWA
+            splatting).  As in gsplat, a fisheye shows nothing behind the near plane, so 180° at most.
+        with_ut: without effect; the linearisation takes the place of the unscented transform.
+        radial_coeffs: OpenCV's k1 to k6 of a pinhole, [..., c, 6], or k1 to k4 of a fisheye, [..., c, 4].
+        tangential_coeffs: OpenCV's p1, p2 of a pinhole, [..., c, 2].
+        thin_prism_coeffs: OpenCV's s1 to s4 of a pinhole, [..., c, 4].
         global_z_order: depth is that along the optical axis; if False, the distance from the camera.
         masks: False for pixels of an image that are left black, as gsplat's trainer does, [..., c, height, width].
         covars: [..., n, 3, 3], in squared world units, instead of quats and scales; the upper triangle is read.
@@ -106,11 +118,11 @@ def rasterization(
     """
     options = Options(
         *(width, height, near_plane, far_plane, radius_clip, eps2d, None if colors is None else sh_degree, packed),
-        *(tile_size or 16, render_mode, rasterize_mode, trained_mode, max_alpha, global_z_order),
+        *(tile_size or 16, render_mode, rasterize_mode, trained_mode, max_alpha, global_z_order, camera_model),
     )
-    refuse({"sparse_grad": sparse_grad, "distributed": distributed, "camera_model": camera_model, **others})
+    refuse({"sparse_grad": sparse_grad, "distributed": distributed, "with_eval3d": with_eval3d, **others})
     tensors = (means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars)
-    views = views_of(*tensors, relative_rate, options)
+    views = views_of(*tensors, relative_rate, options, (radial_coeffs, tangential_coeffs, thin_prism_coeffs))
     painter = rasterizer_of(rasterizer) if isinstance(rasterizer, str) else rasterizer
     kernels = kernels_of(painter)
     parts = [ViewSplats.of(view, options, kernels) for view in views]
