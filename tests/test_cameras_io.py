@@ -14,7 +14,7 @@ from PIL import Image
 import aaplug
 from aaplug.core.cameras import CameraSet
 from aaplug.core.colours import BLACK, WHITE
-from aaplug.core.lenses import PINHOLE, opencv_lens
+from aaplug.core.lenses import EQUIRECT, PINHOLE, opencv_lens
 from aaplug.io.cameras import OWN, read_camera_path, read_cameras, select_views
 from aaplug.io.cameras.cfg_args import read_cfg_args
 from aaplug.io.cameras.options import CameraFileOptions
@@ -330,10 +330,34 @@ def test_photos_through_a_lens_that_is_not_known_are_not_used(tmp_path):
     assert "without photos" in cameras.notes[-1]
 
 
-def test_a_colmap_camera_that_sees_all_around_is_refused(tmp_path):
+@pytest.mark.parametrize("kind", ["colmap", "transforms"])
+def test_a_panorama_is_taken_as_it_is(tmp_path, kind):
+    if kind == "colmap":
+        colmap_txt(tmp_path / "sparse", *one_camera(1, (300.0, 310.0, 200.0, 100.0)))
+        (tmp_path / "sparse" / "cameras.txt").write_text("1 EQUIRECTANGULAR 400 200 400 200\n")
+    else:  # fl_x is nerfstudio's, no focal length in px per radian
+        frames = [{"file_path": "images/a.png", "camera_model": "EQUIRECTANGULAR", "fl_x": 200, "cx": 7}]
+        write_json(tmp_path / "transforms.json", transforms(frames, w=400, h=200))
+    path, width = tmp_path / "images" / "a.png", 200 if kind == "colmap" else 400
+    photo(path, 200, 100)
+    cameras = read_cameras(tmp_path)
+    (camera,) = cameras.train
+    assert (camera.lens, camera.photo, camera.undistortion) == (EQUIRECT, path, None)
+    assert camera.hw == (width // 2, width)
+    assert "1 cameras see 360° × 180° (EQUIRECTANGULAR)" in cameras.notes[-1]
+    assert not any("distorts" in note for note in cameras.notes)
+    right, down = torch.eye(3, dtype=torch.float64)[:2] @ camera.cam_from_world[:3, :3]
+    pixels, _ = camera.project(torch.stack([camera.centre + right, camera.centre + down]))
+    torch.testing.assert_close(pixels[0], torch.tensor([0.75 * width, 0.25 * width], dtype=torch.float64))
+    assert float(pixels[1, 1]) == pytest.approx(width / 2), "the last row looks down"
+    with pytest.raises(FormatError, match=r"camera a: its photograph is a panorama \(EQUIRECTANGULAR\), which"):
+        read_cameras(tmp_path, undistort=True)
+
+
+def test_a_colmap_panorama_has_a_size(tmp_path):
     colmap_txt(tmp_path, *one_camera(1, (300.0, 310.0, 200.0, 100.0)))
-    (tmp_path / "cameras.txt").write_text("1 EQUIRECTANGULAR 400 200 400 200\n")
-    refused(tmp_path, "EQUIRECTANGULAR, which has no focal length")
+    (tmp_path / "cameras.txt").write_text("1 EQUIRECTANGULAR 400 200 0 200\n")
+    refused(tmp_path, "parameter should be")
 
 
 def test_colmap_models_have_their_number_of_parameters(tmp_path):
@@ -461,7 +485,7 @@ def test_transforms_intrinsics_of_a_frame_come_first(tmp_path):
     [
         ({"k1": "a"}, "frame 0: k1 should be a number"),
         ({"distortion_params": 3}, "distortion_params should be a list"),
-        ({"camera_model": "EQUIRECTANGULAR"}, "camera_model is EQUIRECTANGULAR"),
+        ({"camera_model": "VR180_L"}, "camera_model is VR180_L, which has no focal length"),
         ({"camera_angle_x": 3.2}, "camera_angle_x should be above 0 and below π"),
         ({"file_path": "../x"}, "should stay within the dataset"),
         ({"transform_matrix": OPENGL[:3]}, "transform_matrix should be 4 rows of 4 numbers"),

@@ -4,6 +4,7 @@ The pinhole keeps the lens's focal length and principal point, so sampling rates
 Its view is cropped to what the photograph covers.  The centre of the first pixel is (0.5, 0.5) here, (0, 0) in OpenCV.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -16,11 +17,13 @@ from torch import Tensor
 from torch.nn import functional
 
 from aaplug.core.cameras import Camera, Undistortion
-from aaplug.core.lenses import Lens
+from aaplug.core.lenses import EQUIRECT, Lens
+from aaplug.system.errors import UsageError
 
 HALF_PIXEL = 0.5  # px: the centre of OpenCV's first pixel is 0
 MIN_SHARE = 0.5  # of a side: a photograph that covers less of its pinhole's view is not used
 CACHED_LENSES = 8  # since most photographs share one
+PANORAMA = "EQUIRECTANGULAR"  # by COLMAP's and nerfstudio's name
 
 
 @dataclass(frozen=True)
@@ -31,12 +34,20 @@ class Distortion:
     lens: Lens | None = None
 
 
+def panorama(width: int, height: int) -> tuple[float, float, float, float]:
+    """fx, fy, cx and cy, in px, of an image of 360° × 180°."""
+    return width / (2 * math.pi), height / math.pi, width / 2, height / 2
+
+
 def cameras_of_photographs(
     cameras: Sequence[Camera], distortions: Sequence[Distortion | None], undistort: bool
 ) -> list[Camera]:
     """The cameras with their lenses; without photographs that cannot be used.
 
     undistort: as pinholes instead, cropped to what their photographs cover.
+
+    Raises:
+        UsageError: a panorama is to be undistorted.
     """
     if not undistort:
         bent = []
@@ -50,6 +61,9 @@ def cameras_of_photographs(
         if distortion is None:
             pinholes.append(camera)
             continue
+        if distortion.lens == EQUIRECT:
+            problem = f"its photograph is a panorama ({distortion.name}), which no pinhole shows"
+            raise UsageError(f"camera {camera.name}", f"{problem}; leave out `undistort`")
         whole = window = None
         if camera.photo is not None and distortion.lens is not None:
             size, pinhole = (camera.width, camera.height), (camera.fx, camera.fy, camera.cx, camera.cy)
@@ -79,10 +93,14 @@ def undistorted(image: Float[Tensor, "h w c"], undistortion: Undistortion | None
 
 
 def lens_notes(distortions: Sequence[Distortion | None], cameras: Sequence[Camera], undistort: bool) -> list[str]:
-    """A note on the lenses that distort, with the names of their models, if there are any."""
-    pairs = [(lens, camera) for lens, camera in zip(distortions, cameras, strict=True) if lens]
+    """Notes on the panoramas and the lenses that distort, with the names of their models, if there are any."""
+    pairs = [
+        (lens, camera) for lens, camera in zip(distortions, cameras, strict=True) if lens and lens.name != PANORAMA
+    ]
+    panoramas = distortions.count(Distortion(PANORAMA, EQUIRECT))
+    notes = [f"{panoramas} cameras see 360° × 180° ({PANORAMA}), and so do their renders"] if panoramas else []
     if not pairs:
-        return []
+        return notes
     models = ", ".join(sorted({lens.name for lens, _ in pairs}))
     usable = sum(lens.lens is not None and camera.photo is not None for lens, camera in pairs)
     if undistort:
@@ -93,7 +111,7 @@ def lens_notes(distortions: Sequence[Distortion | None], cameras: Sequence[Camer
         what += (
             f"; {len(pairs) - usable} are drawn as pinholes, without photos (colmap image_undistorter converts them)"
         )
-    return [f"{len(pairs)} cameras have a lens that distorts ({models}): {what}"]
+    return [*notes, f"{len(pairs)} cameras have a lens that distorts ({models}): {what}"]
 
 
 @lru_cache(CACHED_LENSES)

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.cameras import Camera, CameraSet
-from aaplug.core.lenses import EQUIDISTANT, Lens, opencv_lens
+from aaplug.core.lenses import EQUIDISTANT, EQUIRECT, Lens, opencv_lens
 from aaplug.io.cameras.cfg_args import WIDTH_CAP
 from aaplug.io.cameras.colmap_files import KINDS, Image, Intrinsics, read_cameras, read_images
 from aaplug.io.cameras.options import (
@@ -31,7 +31,7 @@ from aaplug.io.cameras.options import (
 )
 from aaplug.io.cameras.photos import distinct, photo_folder, with_photos, without_suffix
 from aaplug.io.cameras.poses import inverse, pose
-from aaplug.io.lenses import Distortion, cameras_of_photographs, lens_notes
+from aaplug.io.lenses import PANORAMA, Distortion, cameras_of_photographs, lens_notes, panorama
 from aaplug.io.values import Place, focal, number, pixels
 from aaplug.system.errors import FormatError, listing
 
@@ -41,6 +41,7 @@ LENSES: dict[str, Callable[..., Lens]] = {  # by the model's distortion paramete
     "RADIAL": lambda k1, k2: opencv_lens((k1, k2)),
     "OPENCV": lambda *k: opencv_lens(k),
     "FULL_OPENCV": lambda *k: opencv_lens(k),
+    PANORAMA: lambda: EQUIRECT,
     "SIMPLE_FISHEYE": lambda: EQUIDISTANT,
     "FISHEYE": lambda: EQUIDISTANT,
     "SIMPLE_RADIAL_FISHEYE": lambda *k: opencv_lens(k, fisheye=True),
@@ -117,14 +118,16 @@ def _camera(image: Image, intrinsics: dict[int, Intrinsics]) -> Camera:
         raise image.place.error(f"uses camera {image.camera_id}, which cameras does not hold")
     lens = intrinsics[image.camera_id]
     values, n = [number(value, lens.place, "parameter") for value in lens.parameters], lens.model.focals
-    if not n:
-        raise lens.place.error(f"its model is {lens.model.name}, which has no focal length")
-    fx, fy = (focal(f, lens.place, "focal length") for f in (values[0], values[n - 1]))
+    if lens.model.name == PANORAMA:
+        fx, fy, cx, cy = panorama(*(pixels(side, lens.place, "parameter") for side in values))
+    else:
+        fx, fy = (focal(f, lens.place, "focal length") for f in (values[0], values[n - 1]))
+        cx, cy = values[n : n + 2]
     width, height = pixels(lens.width, lens.place, "width"), pixels(lens.height, lens.place, "height")
     translation = [number(value, image.place, "translation") for value in image.translation]
     cam_from_world = pose(_rotation(image), torch.tensor(translation, dtype=torch.float64), image.place, "quaternion")
     inverse(cam_from_world, image.place, "translation")  # refuses a centre that overflows
-    return Camera(image.name, width, height, fx, fy, values[n], values[n + 1], cam_from_world)
+    return Camera(image.name, width, height, fx, fy, cx, cy, cam_from_world)
 
 
 def _distortion(lens: Intrinsics) -> Distortion | None:

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.colours import WHITE
-from aaplug.core.lenses import opencv_lens
+from aaplug.core.lenses import EQUIRECT, opencv_lens
 from aaplug.io.cameras.options import (
     CameraFileOptions,
     Size,
@@ -35,7 +35,7 @@ from aaplug.io.cameras.options import (
 from aaplug.io.cameras.photos import PhotoFolder, distinct, last_part, refuse_folder, without_suffix
 from aaplug.io.cameras.poses import inverse, pose, pose_of_opengl, rigid
 from aaplug.io.images import PNG_SIGNATURE, image_size
-from aaplug.io.lenses import Distortion, cameras_of_photographs, lens_notes
+from aaplug.io.lenses import PANORAMA, Distortion, cameras_of_photographs, lens_notes, panorama
 from aaplug.io.values import (
     Entry,
     Place,
@@ -52,7 +52,7 @@ from aaplug.io.values import (
 from aaplug.system.errors import FormatError
 
 FILE = "transforms.json"
-PANORAMAS = ("EQUIRECTANGULAR", "OMNIDIRECTIONALSTEREO_L", "OMNIDIRECTIONALSTEREO_R", "VR180_L", "VR180_R")
+STEREO = ("OMNIDIRECTIONALSTEREO_L", "OMNIDIRECTIONALSTEREO_R", "VR180_L", "VR180_R")
 PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV")  # OPENCV is one if its coefficients are 0
 EXPORTED = "transform"  # key of a frame's 3×4 pose in `ns-export cameras`
 LAST_ROW = [0.0, 0.0, 0.0, 1.0]
@@ -198,13 +198,7 @@ def _camera(entry: Entry, photo: Path | None, name: str, spare: Size | None, par
     else:
         unknown = "its size is unknown: the file has no w and h, and there are no photos"
         raise entry.place.error(f"{unknown}; put the photos where file_path says, or add w and h (px) beside frames")
-    if "fl_x" in entry or "camera_angle_x" not in entry:
-        fx = entry.get("fl_x", focal)
-    else:
-        angle = entry.get("camera_angle_x", number)
-        entry.place.expect(MIN_ANGLE <= angle < math.pi, "camera_angle_x", "above 0 and below π, in radians", angle)
-        fx = focal(width / 2 / math.tan(angle / 2), entry.place, "camera_angle_x's focal length")
-    fy, cx, cy = entry.get("fl_y", focal, fx), entry.get("cx", number, width / 2), entry.get("cy", number, height / 2)
+    fx, fy, cx, cy = _intrinsics(entry, width, height)
     world_from_cam = pose_of_opengl(rigid(entry, "transform_matrix"), entry.place, "transform_matrix")
     if parser is not None:
         world_from_cam = parser.motion @ world_from_cam
@@ -213,10 +207,26 @@ def _camera(entry: Entry, photo: Path | None, name: str, spare: Size | None, par
     return Camera(name, width, height, fx, fy, cx, cy, cam_from_world, photo=photo)
 
 
+def _intrinsics(entry: Entry, width: int, height: int) -> tuple[float, float, float, float]:
+    """fx, fy, cx and cy, in px; those of a panorama follow from its size."""
+    if entry.get("camera_model", text, PINHOLES[0]) == PANORAMA:
+        return panorama(width, height)
+    if "fl_x" in entry or "camera_angle_x" not in entry:
+        fx = entry.get("fl_x", focal)
+    else:
+        angle = entry.get("camera_angle_x", number)
+        entry.place.expect(MIN_ANGLE <= angle < math.pi, "camera_angle_x", "above 0 and below π, in radians", angle)
+        fx = focal(width / 2 / math.tan(angle / 2), entry.place, "camera_angle_x's focal length")
+    fy, cx, cy = entry.get("fl_y", focal, fx), entry.get("cx", number, width / 2), entry.get("cy", number, height / 2)
+    return fx, fy, cx, cy
+
+
 def _distortion(entry: Entry) -> Distortion | None:
     """The distortion, None for a pinhole."""
     model = entry.get("camera_model", text, PINHOLES[0])
-    if model in PANORAMAS:
+    if model == PANORAMA:
+        return Distortion(model, EQUIRECT)
+    if model in STEREO:
         raise entry.place.error(f"its camera_model is {model}, which has no focal length")
     k = {key: entry.get(key, number, 0.0) for key in COEFFICIENTS}
     listed = entry.fields.get("distortion_params") or []
