@@ -11,7 +11,7 @@ import torch
 from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.lenses import EQUIDISTANT, EQUIRECT, EQUISOLID, ORTHO, Lens, opencv_lens
-from aaplug.core.projection import project, rotation_matrices
+from aaplug.core.projection import project, project_covariances, rotation_matrices
 from aaplug.core.rules import RULES_3DGS
 from aaplug.core.training import TrainingViews
 from aaplug.io.lenses import Distortion, cameras_of_photographs, undistorted
@@ -197,6 +197,18 @@ def test_derivatives_are_those_of_places(lens):
     expected = torch.stack([(lens.places(rays + s) - lens.places(rays - s)) / 2e-6 for s in steps], dim=2)
     kept = rays[:, 2] > -2.3 if not lens.flat else torch.ones(len(rays), dtype=torch.bool)  # not right behind
     torch.testing.assert_close(lens.derivatives(rays)[kept], expected[kept], rtol=1e-5, atol=1e-6)
+
+
+def test_beyond_its_image_a_distorting_pinhole_is_no_steeper():
+    """Brown's polynomial grows 8 times as steep at the corners of the box in which slopes are clamped."""
+    pose = torch.eye(4, dtype=torch.float64)
+    camera = Camera("view", 64, 64, 32.0, 32.0, 32.0, 32.0, pose, lens=opencv_lens((-0.25, 0.05)))
+    slopes = torch.cartesian_prod(*2 * [torch.linspace(-6, 6, 601, dtype=torch.float64)])
+    points = torch.cat([slopes, torch.ones_like(slopes[:, :1])], dim=1)
+    splats = project_covariances(points, torch.eye(3).expand(len(points), 3, 3), points[:, 2], camera)
+    spread, inside = splats.covs[:, 0] + splats.covs[:, 2], (camera.lens.places(points).abs() < 1.3).all(dim=1)
+    assert spread.max() < 1.1 * spread[inside].max()
+    assert spread.max() > 1.5 * spread[(camera.lens.places(points).abs() < 1).all(dim=1)].max(), "the margin counts"
 
 
 def test_a_lens_ends_where_its_radial_map_turns_back():

@@ -24,7 +24,7 @@ from aaplug.core.sights import sights
 from aaplug.core.splats import SELECT, Splats2D
 
 JACOBIAN_MARGIN = 0.3  # of half the image: 3DGS linearises no farther out (1.3 tan(fov/2))
-PLACES = 17  # along a side, by which the slopes that a distorting pinhole sees are found
+PLACES = 17  # along a side, at which it is found what a distorting pinhole sees
 MAX_SIGMA = 1e9  # px: larger splats look the same, but their determinant overflows float32
 MIN_FACING = 1e-6  # of depth: a disc at a flatter angle is a line, and its slope overflows
 
@@ -109,17 +109,27 @@ def _camera_rows(
 def slope_limits(camera: Camera) -> tuple[tuple[float, float], tuple[float, float]]:
     """Smallest and largest x/z, and y/z, at which projection is linearised; slopes beyond are clamped.
 
-    They are those of the image's edges, or the largest that a pinhole that distorts sees if that is more, and a margin.
+    They are those that the image sees, widened by the margin.
     """
-    sides = (camera.cx, camera.fx, camera.width), (camera.cy, camera.fy, camera.height)
-    ends = [(-centre / focal, (side - centre) / focal) for centre, focal, side in sides]
     if camera.lens.distorts and camera.lens.projection == "pinhole":
-        grid = torch.cartesian_prod(*(torch.linspace(*pair, PLACES, dtype=torch.float64) for pair in ends))
-        seen = camera.lens.rays(grid).T.tolist()
-        ends = [(min(low, *slopes), max(high, *slopes)) for (low, high), slopes in zip(ends, seen, strict=False)]
-    margins = (JACOBIAN_MARGIN * 0.5 * side / focal for _, focal, side in sides)
-    x, y = ((low - margin, high + margin) for (low, high), margin in zip(ends, margins, strict=True))
-    return x, y
+        x, y = ((float(slopes.min()), float(slopes.max())) for slopes in _seen_slopes(camera).T)
+        return x, y
+    return _widened(camera)
+
+
+def _widened(camera: Camera) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Ends of the image along x and y, widened by the margin, as places of the lens."""
+    ends = []
+    for centre, focal, side in ((camera.cx, camera.fx, camera.width), (camera.cy, camera.fy, camera.height)):
+        margin = JACOBIAN_MARGIN * 0.5 * side / focal
+        ends.append((-centre / focal - margin, (side - centre) / focal + margin))
+    return ends[0], ends[1]
+
+
+def _seen_slopes(camera: Camera) -> Float[Tensor, "p 2"]:
+    """x/z and y/z of places all over the widened image of a pinhole that distorts; 0 where it sees nothing."""
+    axes = (torch.linspace(*ends, PLACES, dtype=torch.float64) for ends in _widened(camera))
+    return camera.lens.rays(torch.cartesian_prod(*axes))[:, :2]
 
 
 def _project(
@@ -199,9 +209,12 @@ def _linearised_through(
     ahead = z.clamp(min=rules.near)
     rays = torch.stack([x, y, ahead], dim=1)
     centres = camera.pixels(lens.places(rays)).to(means)
-    if lens.projection == "pinhole":
-        slopes = ((p / ahead).clamp(*ends) for p, ends in zip((x, y), slope_limits(camera), strict=True))
-        rays = torch.stack([*(slope * ahead for slope in slopes), ahead], dim=1)
+    if lens.projection == "pinhole":  # Brown's polynomials are steep beyond what the image sees, also in its corners
+        (left, right), (top, bottom) = slope_limits(camera)
+        slopes = torch.stack([(x / ahead).clamp(left, right), (y / ahead).clamp(top, bottom)], dim=1)
+        farthest = _seen_slopes(camera).norm(dim=1).max().to(slopes)
+        slopes = slopes * (farthest / slopes.norm(dim=1, keepdim=True).clamp(min=farthest))
+        rays = torch.cat([slopes, torch.ones_like(slopes[:, :1])], dim=1) * ahead[:, None]
     rows = lens.derivatives(rays) * rays.new_tensor([camera.fx, camera.fy])[:, None] @ rotation
     across, down = (list(row.unbind(dim=1)) for row in rows.unbind(dim=1))
     return list(centres.unbind(dim=1)), across, down, z.to(means)
