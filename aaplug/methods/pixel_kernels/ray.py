@@ -7,6 +7,7 @@ seam, and its poles are like any other place.
 
 import math
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import torch
 from jaxtyping import Float
@@ -16,6 +17,7 @@ from torch.nn import functional
 from aaplug.core.ellipses import squared_cutoff, whitening, whitening_columns
 from aaplug.core.interfaces import Limits, Pixels
 from aaplug.core.kernels import Kernels
+from aaplug.core.lenses import Lens
 from aaplug.core.rules import Rules
 from aaplug.core.splats import Splats2D, concatenated
 from aaplug.methods.pixel_kernels.point import HALF_LOG2_E, LOG2_PADDING, value_of
@@ -24,6 +26,7 @@ from aaplug.methods.pixel_kernels.raster_rows import COLUMNS, OPACITY, TILE
 CORNERS = 12  # of the polygon around a splat's cut-off ellipse
 MIN_AHEAD = 1e-6  # lower bound of ahead·d: behind the plane no splat is seen
 MAX_GROWTH = 1.3  # of the affine map's ellipse until it holds the corners; beyond it, a box bounds the splat
+CACHED_IMAGES = 2  # whose rays are kept: views of a data set, and frames, share a lens
 SLACK = 1.01  # relative, of an ellipse: for rounding
 NEAR_POLE = 0.7  # share of the distance to a pole from which on a splat has the whole width
 BOX_MARGIN = 1.2  # for what lies between corners
@@ -45,7 +48,13 @@ class Ray:
         """Of the splats' camera; x, y and 1 without one."""
         if splats.camera is None:
             return x, y, torch.ones_like(x)
-        right, down, ahead = splats.camera.rays(torch.stack([x, y], dim=-1)).unbind(dim=-1)
+        camera = splats.camera
+        if camera.lens.distorts:  # inverting it takes longer than drawing
+            columns, rows = (place.long().clamp(0, side - 1) for place, side in ((x, camera.width), (y, camera.height)))
+            rays = rays_of_pixels(camera.lens, camera.intrinsics)[rows, columns].to(x)
+        else:
+            rays = camera.rays(torch.stack([x, y], dim=-1))
+        right, down, ahead = rays.unbind(dim=-1)
         return right.contiguous(), down.contiguous(), ahead.contiguous()
 
     def bounding_ellipses(self, splats: Splats2D, rules: Rules) -> Splats2D | None:
@@ -147,6 +156,15 @@ class Ray:
         if splats.camera is not None and splats.camera.lens.period:  # copies are for the tiles alone
             seen &= (splats.means[:, 0] - splats.camera.cx).abs() <= splats.camera.fx * splats.camera.lens.period / 2
         return torch.exp(-0.5 * white.square().sum(dim=2)) * seen
+
+
+@lru_cache(CACHED_IMAGES)
+def rays_of_pixels(lens: Lens, intrinsics: tuple[float, float, float, float, int, int]) -> Float[Tensor, "h w 3"]:
+    """Rays of the centres of an image's pixels, in float64.  intrinsics: see `Camera.intrinsics`."""
+    *values, width, height = intrinsics
+    y, x = torch.meshgrid(*(torch.arange(side, dtype=torch.float64) + 0.5 for side in (height, width)), indexing="ij")
+    fx, fy, cx, cy = values
+    return lens.rays(torch.stack([(x - cx) / fx, (y - cy) / fy], dim=-1))
 
 
 def with_copies(splats: Splats2D, rules: Rules) -> Splats2D:
