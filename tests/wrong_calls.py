@@ -63,7 +63,8 @@ def right_calls(folder: Path) -> dict[str, tuple[Callable[..., Any], dict[str, A
     aperture = aaplug.Aperture(0.1, 3.0)
     exposure = aaplug.Exposure(aperture, (view, view), 2)
     nouns = (view, cameras, gaussians, splats, training, recipe, pyramid, aaplug.RULES_3DGS, gaussians.convention)
-    nouns += (aperture, exposure)
+    lens = aaplug.Lens("equidistant", (0.01,))
+    nouns += (aperture, exposure, lens)
     calls = {type(noun).__name__: (type(noun), fields(noun)) for noun in nouns}
     plain = {"rasterizer": "eager", "min_seen": 0.0}
     verbs = {
@@ -129,6 +130,9 @@ def right_calls(folder: Path) -> dict[str, tuple[Callable[..., Any], dict[str, A
         "resized": (view, {"width": 4, "height": 4}),
         "framed": (view, {"width": 4, "height": 4}),
         "project": (view, {"points": torch.zeros(2, 3)}),
+        "pixels": (view, {"places": torch.zeros(2, 2)}),
+        "rays": (view, {"pixels": torch.zeros(2, 2)}),
+        "places": (lens, {"rays": torch.ones(2, 3)}),
         "to": (gaussians, {"dtype": torch.float64}),
         "level": (pyramid, {"number": 0}),
         "finer": (training, {"factor": 2.0}),

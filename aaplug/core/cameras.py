@@ -138,10 +138,12 @@ class Camera:
         local = points.double() @ pose[:3, :3].T + pose[:3, 3]
         return self.pixels(self.lens.places(local)), local[:, 2]
 
+    @contract
     def pixels(self, places: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n 2"]:
         """Places of the lens, in px."""
         return places * places.new_tensor([self.fx, self.fy]) + places.new_tensor([self.cx, self.cy])
 
+    @contract
     def rays(self, pixels: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n 3"]:
         """Rays of positions in px, in the camera's frame; 0 where the lens sees nothing."""
         offset = pixels.double() - pixels.new_tensor([self.cx, self.cy]).double()

@@ -15,16 +15,17 @@ lens is one-to-one, and a pixel out of its range has no ray.
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.system.contracts import check_fields
+from aaplug.system.contracts import Range, check_fields, contract
 from aaplug.system.errors import UsageError
 
 Projection = Literal["pinhole", "equidistant", "equisolid", "equirect", "ortho"]
+Angle = Annotated[float, Range(above=0, most=180)]  # degrees
 MAX_RADII = {"pinhole": 20.0, "equidistant": math.pi, "equisolid": 2.0}  # of an undistorted place that has a ray
 MIN_SLOPE = 0.05  # of the radial map: where it is flatter, the lens ends
 RADII = 4096  # at which the radial map is tabulated
@@ -48,7 +49,7 @@ class Lens:
     rational: tuple[float, ...] = ()
     tangential: tuple[float, float] = (0.0, 0.0)
     prism: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
-    max_angle: float = 180.0
+    max_angle: Angle = 180.0
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -70,6 +71,7 @@ class Lens:
         """Width of a full turn, after which places repeat; 0 if they do not."""
         return 2 * math.pi if self.projection == "equirect" else 0.0
 
+    @contract
     def places(self, rays: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 2"]:
         """Where rays meet the image.  A pinhole's rays need z > 0."""
         x, y, z = rays.unbind(dim=-1)
@@ -84,6 +86,7 @@ class Lens:
         radius = angle if self.projection == "equidistant" else 2 * (angle / 2).sin()
         return self._distorted(rays[..., :2] * (radius / across)[..., None])
 
+    @contract
     def rays(self, places: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n 3"]:
         """The ray of each place, of length 1 (a pinhole's and ortho's: z = 1); 0 where nothing is seen."""
         if self.projection == "equirect":
