@@ -25,7 +25,7 @@ from aaplug.core.culling import cull
 from aaplug.core.exposures import cells, sample_cameras
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.imaging import average_samples
-from aaplug.core.interfaces import Rasterizer
+from aaplug.core.interfaces import Compositor, Rasterizer
 from aaplug.core.kernels import Kernels
 from aaplug.core.lenses import PINHOLE
 from aaplug.core.passes import PASSES, NormalAxes
@@ -255,7 +255,7 @@ class Renderer:
             rgb, alpha = exposed or render
             found: dict[str, Tensor] = {"rgb": rgb, "alpha": alpha}
             (samples, weight), fine = self.sampling(camera), self.sampled(camera)[0]
-            recipe, rules = self._recipe_through(splats.camera), self.training.convention.rules
+            recipe = self._recipe_through(splats.camera)
             channels = channels_of(names, splats, self.scene, self.training.bounds, fine, samples, normal_axes)
             if channels:
                 per_call = (3, 4) if recipe.pixel is POINT and recipe.compositor is None else (3,)
@@ -264,9 +264,7 @@ class Renderer:
                 found |= expected(names, channels, image, fine, samples, weight)
 
             def draw(numbered: Splats2D, shown: Shown) -> Render:
-                return self.rasterizer(
-                    numbered, hw, BLACK, recipe.pixel, Order.of(recipe.pixel, shown, numbered), rules
-                )
+                return self.paint(numbered, hw, BLACK, Order.of(recipe.pixel, shown, numbered))
 
             found |= by_order(names, splats, samples, draw)
             if "id" in found and self.scene.origin is not None:
@@ -275,13 +273,21 @@ class Renderer:
 
     @contract
     @on_free_cores()
-    def paint(self, splats: Splats2D, hw: tuple[int, int], background: Colour | None = None) -> Render:
+    def paint(
+        self,
+        splats: Splats2D,
+        hw: tuple[int, int],
+        background: Colour | None = None,
+        compositor: Compositor | None = None,
+    ) -> Render:
         """Composite coloured splats into an image of height and width `hw` px.
 
-        background: None for the renderer's own.
+        background: None for the renderer's own.  compositor: instead of the recipe's.
         """
         colour = self.background if background is None else background
         recipe, rules = self._recipe_through(splats.camera), self.training.convention.rules
+        if compositor is not None:
+            recipe = replace(recipe, compositor=compositor)
         return self.rasterizer(splats, hw, colour, recipe.pixel, recipe.compositor, rules)
 
     def _recipe_through(self, camera: Camera | None) -> Recipe:
