@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from aaplug.core.cameras import Camera, Undistortion
+from aaplug.core.cameras import Camera, Exposure, Undistortion
 from aaplug.core.imaging import box_average, quantised
 from aaplug.core.lenses import EQUIDISTANT
 from aaplug.core.training import TrainingViews
@@ -309,7 +309,7 @@ def test_the_cache_tells_views_apart_by_all_that_their_images_depend_on(look, vi
     pose[0, 3] += 1
     bent = Undistortion(EQUIDISTANT, view.hw, (1.0,) * 4, (0, 0, *view.hw))
     others = {"photo": views[1].photo, "lens": EQUIDISTANT, "undistortion": bent, "cam_from_world": pose}
-    others |= {"trained_focal": 7.0, "name": "other"}
+    others |= {"trained_focal": 7.0, "name": "other", "exposure": Exposure(samples=2)}
     for field in fields(Camera):
         value = getattr(view, field.name)
         other = replace(view, **{field.name: others[field.name] if field.name in others else type(value)(value + 1)})
