@@ -1,4 +1,4 @@
-"""Passes, files and frame sequences: how true, how fast, how safe; and every pass of the sample as a picture."""
+"""The film camera: passes, files and frame sequences, lenses, aperture and shutter."""
 
 import math
 import os
@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable
 from itertools import product
 from pathlib import Path
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -22,7 +23,7 @@ from aaplug.evaluation.report.contact_sheet import labelled
 from aaplug.io.image_formats import Storage
 from aaplug.io.images import read_rgba, write_png
 from aaplug.io.layers import write_layers
-from tests.bench import heading, row
+from tests.bench import film_aperture, film_lenses, heading, row
 from tests.bench.kills import PROGRAM
 from tests.conftest import SAMPLE, make_camera, make_scene
 from tests.test_passes import plane_errors
@@ -165,12 +166,19 @@ def kills_of_a_sequence() -> None:
 LINES: list[Callable[[], None]] = [truth_of_passes, straight_files, cost_of_passes, kills_of_a_sequence]
 
 
-def main(pictures: Path | None = None) -> None:
+def main(pictures: Path | None = None, only: Literal["passes", "lenses", "aperture"] | None = None) -> None:
     """Print every table.
 
     Args:
-        pictures: folder for the contact sheet of the sample's passes.
+        pictures: folder for the contact sheet of the sample's passes, and for what aperture and shutter draw.
+        only: tables of one kind.
     """
+    if only in (None, "lenses"):
+        film_lenses.main()
+    if only in (None, "aperture"):
+        film_aperture.main(pictures=pictures)
+    if only not in (None, "passes"):
+        return
     if pictures is not None:
         write_png(pictures / "passes.png", contact_sheet(), overwrite=True)
     for line in LINES:
