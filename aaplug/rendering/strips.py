@@ -8,7 +8,9 @@ import torch
 from aaplug.core.cameras import Camera
 from aaplug.core.culling import cull
 from aaplug.core.imaging import average_samples
+from aaplug.core.lenses import PINHOLE
 from aaplug.core.splats import Render, Splats2D
+from aaplug.methods.pixel_kernels.ray import RAY
 from aaplug.rendering.renderer import Renderer
 
 SAMPLES_PER_STRIP = 1 << 19  # some 30 ms on two cores
@@ -28,17 +30,15 @@ def strips(
     left, right = columns or (0, camera.width)
     start, end = max(0, left - HALO), min(camera.width, right + HALO)
     fine = camera.resized(camera.width * samples, camera.height * samples)
-    splats = _moved(renderer.splats(fine, samples), -start * samples, 0)
-    pixel, rules, weight = (
-        renderer.recipe.pixel,
-        renderer.training.convention.rules,
-        renderer.sampling(camera, samples)[1],
-    )
+    splats = renderer.splats(fine, samples)
+    rules, weight = renderer.training.convention.rules, renderer.sampling(camera, samples)[1]
+    pixel = renderer.recipe.pixel if camera.lens == PINHOLE else RAY
     rows, parts = max(1, SAMPLES_PER_STRIP // ((end - start) * samples**2)), []
     for top in range(0, camera.height, rows):
         yield
         above, below = max(0, top - HALO), min(camera.height, top + rows + HALO)
-        moved, hw = _moved(splats, 0, -above * samples), ((below - above) * samples, (end - start) * samples)
+        hw = (below - above) * samples, (end - start) * samples
+        moved = _moved(splats, -start * samples, -above * samples, hw)
         ellipses = pixel.bounding_ellipses(moved, rules)
         visible = cull(moved, hw, kernels=renderer.kernels, ellipses=ellipses, rules=rules)
         strip = average_samples(renderer.paint(visible, hw), samples, weight)
@@ -47,5 +47,9 @@ def strips(
     return Render(*(torch.cat(images) for images in zip(*parts, strict=True)))
 
 
-def _moved(splats: Splats2D, right: int, down: int) -> Splats2D:
-    return replace(splats, means=splats.means + splats.means.new_tensor([right, down]))
+def _moved(splats: Splats2D, right: int, down: int, hw: tuple[int, int]) -> Splats2D:
+    """The splats as a camera sees them whose image is a part of theirs, of height and width `hw` px."""
+    camera = splats.camera
+    if camera is not None:
+        camera = replace(camera, cx=camera.cx + right, cy=camera.cy + down, height=hw[0], width=hw[1])
+    return replace(splats, means=splats.means + splats.means.new_tensor([right, down]), camera=camera)
