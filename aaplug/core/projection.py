@@ -12,7 +12,7 @@ from dataclasses import replace
 from functools import reduce
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from aaplug.core.cameras import Camera
@@ -82,15 +82,20 @@ def with_depth_slopes(splats: Splats2D, scene: Gaussians, camera: Camera) -> Spl
     A ray meets the plane through c with normal N at the inverse depth N·ray / N·c, which is linear in the pixel.
     """
     rotation = camera.cam_from_world[:3, :3].to(scene.means)
-    thinnest = scene.log_scales.argmin(dim=1).index_select(0, splats.sources)
-    axes = rotation_matrices(scene.unit_quats.index_select(0, splats.sources))
-    normals = axes.gather(2, thinnest[:, None, None].expand(-1, 3, 1)).squeeze(2) @ rotation.T
+    normals = thinnest_axes(scene, splats.sources) @ rotation.T
     offset = scene.means.index_select(0, splats.sources).double() - camera.centre.to(scene.means.device)
     facing = (normals * (offset.to(scene.means) @ rotation.T)).sum(dim=1)
     edge_on = facing.abs() < MIN_FACING * splats.depths
     facing = torch.where(edge_on, MIN_FACING * splats.depths, facing)
     focal = normals.new_tensor([camera.fx, camera.fy])
     return replace(splats, depth_slopes=-(splats.depths / facing)[:, None] * normals[:, :2] / focal)
+
+
+def thinnest_axes(scene: Gaussians, sources: Int[Tensor, " m"]) -> Float[Tensor, "m 3"]:
+    """Direction in the world, of either sign, along which each of these Gaussians is thinnest."""
+    thinnest = scene.log_scales.argmin(dim=1).index_select(0, sources)
+    axes = rotation_matrices(scene.unit_quats.index_select(0, sources))
+    return axes.gather(2, thinnest[:, None, None].expand(-1, 3, 1)).squeeze(2)
 
 
 def _camera_rows(

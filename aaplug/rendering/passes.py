@@ -27,7 +27,7 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.core.imaging import average_samples
 from aaplug.core.lenses import PINHOLE
 from aaplug.core.passes import NormalAxes
-from aaplug.core.projection import rotation_matrices, with_depth_slopes
+from aaplug.core.projection import thinnest_axes, with_depth_slopes
 from aaplug.core.sampling import SamplingBounds
 from aaplug.core.splats import Render, Splats2D
 from aaplug.methods.order import Shown
@@ -68,9 +68,7 @@ def channels_of(
         growth = _growth(splats, scene, camera) if camera.lens == PINHOLE else torch.zeros_like(splats.means)
         found["depth"] = torch.cat([depths - (growth * splats.means).sum(dim=1, keepdim=True), growth], dim=1)
     if "normal" in names:
-        thinnest = scene.log_scales.argmin(dim=1).index_select(0, sources)
-        axes = rotation_matrices(scene.unit_quats.index_select(0, sources)).to(depths)
-        normals = axes.gather(2, thinnest[:, None, None].expand(-1, 3, 1)).squeeze(2)
+        normals = thinnest_axes(scene, sources).to(depths)
         sights = (scene.means.index_select(0, sources).double() - camera.centre).to(depths)
         if camera.lens.projection == "ortho":
             sights = camera.cam_from_world[2, :3].to(depths)

@@ -255,7 +255,7 @@ class Renderer:
             rgb, alpha = exposed or render
             found: dict[str, Tensor] = {"rgb": rgb, "alpha": alpha}
             (samples, weight), fine = self.sampling(camera), self.sampled(camera)[0]
-            recipe = self._recipe_through(splats.camera)
+            recipe = self.recipe_through(splats.camera)
             channels = channels_of(names, splats, self.scene, self.training.bounds, fine, samples, normal_axes)
             if channels:
                 per_call = (3, 4) if recipe.pixel is POINT and recipe.compositor is None else (3,)
@@ -285,12 +285,12 @@ class Renderer:
         background: None for the renderer's own.  compositor: instead of the recipe's.
         """
         colour = self.background if background is None else background
-        recipe, rules = self._recipe_through(splats.camera), self.training.convention.rules
+        recipe, rules = self.recipe_through(splats.camera), self.training.convention.rules
         if compositor is not None:
             recipe = replace(recipe, compositor=compositor)
         return self.rasterizer(splats, hw, colour, recipe.pixel, recipe.compositor, rules)
 
-    def _recipe_through(self, camera: Camera | None) -> Recipe:
+    def recipe_through(self, camera: Camera | None) -> Recipe:
         """The recipe, which draws splats on rays if the camera's lens is no pinhole."""
         if camera is None or camera.lens == PINHOLE:
             return self.recipe
@@ -406,7 +406,7 @@ class Renderer:
 
         places: of each in the scene, or of the first if all follow.  shares: see `Cut`.
         """
-        recipe, training, kernels = self._recipe_through(camera), self.training, self.kernels
+        recipe, training, kernels = self.recipe_through(camera), self.training, self.kernels
         rules = training.convention.rules
         splats = project(chunk, camera, kernels, rules)
         if recipe.selection is not None:

@@ -8,9 +8,7 @@ import torch
 from aaplug.core.cameras import Camera
 from aaplug.core.culling import cull
 from aaplug.core.imaging import average_samples
-from aaplug.core.lenses import PINHOLE
 from aaplug.core.splats import Render, Splats2D
-from aaplug.methods.pixel_kernels.ray import RAY
 from aaplug.rendering.renderer import Renderer
 
 SAMPLES_PER_STRIP = 1 << 19  # some 30 ms on two cores
@@ -32,7 +30,7 @@ def strips(
     fine = camera.resized(camera.width * samples, camera.height * samples)
     splats = renderer.splats(fine, samples)
     rules, weight = renderer.training.convention.rules, renderer.sampling(camera, samples)[1]
-    pixel = renderer.recipe.pixel if camera.lens == PINHOLE else RAY
+    pixel = renderer.recipe_through(camera).pixel
     rows, parts = max(1, SAMPLES_PER_STRIP // ((end - start) * samples**2)), []
     for top in range(0, camera.height, rows):
         yield
