@@ -146,7 +146,7 @@ def test_an_f_stop_is_the_focal_length_over_the_diameter():
     assert (view.exposure.aperture.focus, view.exposure.aperture.blades) == (pytest.approx(4.0), 5)
     assert view.exposure.samples == 16
     fast = filmed([VIEW], FilmOptions(f_stop=2.0, focus_distance=1.0, quality="fast"), False)
-    assert fast[0].exposure.samples == 1
+    assert fast[0].exposure.samples == 5
 
 
 WRONG = {

@@ -5,8 +5,7 @@ covers the pixel, the lens and the time together (Cook, Porter and Carpenter, "D
 sample's camera stands at its place in the opening, its principal point moved so that the plane in focus stays.
 
 What follows is aaplug's own.  Each sample stands for a cell of the set, and so its splats are convolved with their path
-across that cell: samples that are few overlap instead of showing as ghosts.  A single sample takes the whole path,
-which is defocus as a filter.
+across that cell: samples that are few overlap instead of showing as ghosts.  A single sample takes the whole path.
 """
 
 import math

@@ -138,7 +138,7 @@ class FilmOptions(RecipeOptions):
     shutter: Annotated[float | None, number(0.001, 1), FILM] = None
     """Time that the shutter is open, of that from frame to frame of a path; film's usual is 0.5."""
     samples: Annotated[int | None, number(0, 4096, whole=True, metavar="N"), FILM] = None
-    """Frames averaged to one (default: 16, or 1 with --quality fast); 0 ignores a path file's aperture."""
+    """Frames averaged to one (default: 16, or 5 with --quality fast); 0 ignores a path file's aperture."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

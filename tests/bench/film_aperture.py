@@ -48,13 +48,13 @@ def aperture(
     renderer = Renderer.of(str(scene), dataset)
     chosen = [camera.scaled(scale) for camera in dataset.test[: 3 * views : 3]]
     for kind, steps, exposure in (("defocus", RADII, _aperture), ("motion", LENGTHS, _motion)):
-        heading(f"{name}, {kind}: dB from {TRUTH} samples", "px", "1", "4", "16", "16 plain", "pinhole", "time")
+        heading(f"{name}, {kind}: dB from {TRUTH} samples", "px", "1", "5", "16", "16 plain", "pinhole", "time")
         for size in steps:
             figures: list[list[float]] = []
             for view in chosen:
                 of = exposure(renderer, view, size)
                 truth = renderer(of(TRUTH)).rgb
-                images = {str(n): renderer(of(n)).rgb for n in (1, 4, 16)}
+                images = {str(n): renderer(of(n)).rgb for n in (1, 5, 16)}
                 with without_cells():
                     images["16 plain"] = renderer(of(16)).rgb
                 images["pinhole"] = renderer(view).rgb
