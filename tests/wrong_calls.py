@@ -80,6 +80,7 @@ def right_calls(folder: Path) -> dict[str, tuple[Callable[..., Any], dict[str, A
     }
     calls |= {
         **{name: (getattr(aaplug, name), right) for name, right in verbs.items()},
+        "refine_poses": (aaplug.refine_poses, {"scene": nowhere} | plain),
         "render": (
             aaplug.render,
             {"scene": gaussians, "cameras": cameras, "scale": 0.05, "recipe": "classic", **plain},

@@ -247,6 +247,8 @@ class FinetuneOptions(WritingOptions, ViewOptions):
     """Clone, split and prune every N steps; 0 for never (default: the method's own)."""
     truth: Annotated[str, names(*TRUTHS)] = "auto"
     """What the training size should look like: self is the scene's own render; auto takes photographs if all exist."""
+    poses: Annotated[bool, TUNING] = False
+    """Refine the poses of all cameras on their photographs first, for cameras that are slightly off."""
     upsampler: Annotated[str | None, flag("bicubic|lanczos|FILE"), TUNING] = None
     """For scales above the photographs': an interpolation or a network (.pb, .pt2); default: the scene's own render."""
     seed: Annotated[int, number(0, 2**31 - 1, whole=True, metavar="N"), TUNING] = 0
@@ -255,6 +257,14 @@ class FinetuneOptions(WritingOptions, ViewOptions):
     """Steps between checkpoints."""
     resume: bool = False
     """Continue an interrupted run from its checkpoint."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseOptions(ViewOptions):
+    """Whose poses to refine."""
+
+    views: Annotated[str, VIEWS] = "all"
+    """Views with photographs, by name or split."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -35,6 +35,7 @@ from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.digests import digest_of_files
 from aaplug.system.errors import UsageError
+from aaplug.verbs.refine_poses import refined
 from aaplug.verbs.verb import writes
 
 Image = Float[Tensor, "h w 3"]
@@ -87,7 +88,11 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
     upsampler = str(options.upsampler)
     upsampler = digest_of_files([upsampler]) if Path(upsampler).is_file() else upsampler
     with running(options, path, check, job.inputs):
-        raw, look, train = job.scene.gaussians(), job.look(settings.steps, gradients=True), job.cameras.train
+        raw, look = job.scene.gaussians(), job.look(settings.steps, gradients=True)
+        if options.poses:
+            job = replace(job, cameras=refined(job, look, job.cameras.all).cameras)
+            look = job.look(settings.steps, gradients=True)
+        train = job.cameras.train
         before = replace(look, scene=viewer.shown(look.scene), recipe=RECIPES[viewer.recipe])
         start = replace(before, scene=fuse_for(raw, look.training, viewer))
         truth = Truth(look, truth_source, enlarge=enlarge, memory=MEMORY)

@@ -1,0 +1,77 @@
+"""Poses of cameras, refined on their photographs."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from statistics import median
+
+from aaplug.core.cameras import Camera, CameraSet
+from aaplug.evaluation.truth import source_of
+from aaplug.finetuning.poses import RefinedPose, refine_pose
+from aaplug.io.scenes import SceneLike
+from aaplug.methods.recipes import find_recipe
+from aaplug.options.shared import ViewOptions
+from aaplug.options.verbs import PoseOptions
+from aaplug.rendering.job import CamerasLike, Job, running
+from aaplug.rendering.renderer import Renderer
+from aaplug.system.errors import UsageError
+from aaplug.verbs.verb import looks
+
+
+@dataclass(frozen=True, eq=False)
+class RefinedCameras:
+    """Cameras with refined poses, and how each view was moved, by its place in `cameras.all`."""
+
+    cameras: CameraSet
+    poses: tuple[RefinedPose, ...]
+
+
+@looks(PoseOptions)
+def refine_poses(scene: SceneLike | None, cameras: CamerasLike, options: PoseOptions) -> RefinedCameras:
+    """Move cameras until the scene looks like their photographs, coarse to fine.
+
+    Intrinsics stay.  A view stays where it is if it gains less than the scene's own errors could give it.
+
+    Args:
+        scene: see `render`.
+        cameras: see `render`; each view has a photograph.
+
+    Returns:
+        The cameras with the poses of `views` refined, and what became of each of these views.
+
+    Raises:
+        AaplugError: as `render`; also, a view has no photograph.
+    """
+    if scene is None:
+        raise UsageError("scene", "name one")
+    job = Job.of(scene, cameras, options)
+    with running(options, None, lambda: None, job.inputs):
+        return refined(job, job.look(len(job.views), gradients=True), job.views)
+
+
+def refined(job: Job[ViewOptions], look: Renderer, views: Sequence[Camera]) -> RefinedCameras:
+    """A job's cameras, with the poses of some views refined.
+
+    Raises:
+        UsageError: a view has no photograph.
+    """
+    source_of(views, "photographs")
+    renderer, poses = look.by(find_recipe("auto", quality="fast")), []
+    with job.monitor.progress("refining poses", "views") as tell:
+        for done, view in enumerate(views):
+            tell(done, len(views))
+            poses.append(refine_pose(renderer, view))
+    moved = {id(view): pose.camera for view, pose in zip(views, poses, strict=True)}
+    splits = {
+        split: tuple(moved.get(id(view), view) for view in getattr(job.cameras, split)) for split in ("train", "test")
+    }
+    changed = [pose for pose in poses if pose.degrees or pose.distance]
+    if changed:
+        turn, shift = (median(getattr(pose, name) for pose in changed) for name in ("degrees", "distance"))
+        before, after = (median(getattr(pose, name) for pose in changed) for name in ("before", "after"))
+        errors = f"error at half size from {before:.1f} to {after:.1f} of 255 levels"
+        job.monitor.say(
+            f"{len(changed)} of {len(poses)} poses moved, in the median by {turn:.2g}° and {shift:.2g} units: {errors}"
+        )
+    else:
+        job.monitor.say(f"all {len(poses)} poses stay: their photographs show nothing better")
+    return RefinedCameras(replace(job.cameras, **splits), tuple(poses))

@@ -1,0 +1,95 @@
+"""Refined poses: back at the truth from far and from near, and none that moves without a gain."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+import aaplug
+from aaplug.core.cameras import Camera, CameraSet
+from aaplug.finetuning.poses import moved_by, refine_pose
+from aaplug.io.images import write_png
+from aaplug.rendering.renderer import Renderer
+from tests.conftest import make_camera, make_scene
+
+CHANGE = torch.tensor([0.006, -0.008, 0.005, 0.004, -0.005, 0.006], dtype=torch.float64)  # radians, shares of the depth
+DEPTH = 4.0
+
+
+@pytest.fixture(scope="module")
+def photographed(tmp_path_factory):
+    """A scene and two views with photographs, which the scene itself made."""
+    scene, folder = make_scene(400, seed=3), tmp_path_factory.mktemp("photographs")
+    views = []
+    for i, eye in enumerate([(0.5, -4.0, 0.4), (2.6, -3.0, 1.0)]):
+        view = make_camera(eye, size=(160, 120), name=f"view{i}")
+        write_png(folder / f"{i}.png", Renderer.of(scene, [view], min_seen=0.0)(view).rgb.clamp(0, 1))
+        views.append(replace(view, photo=folder / f"{i}.png"))
+    return scene, CameraSet(tuple(views), tuple(views))
+
+
+def apart(a: Camera, b: Camera) -> tuple[float, float]:
+    """Angle in degrees and distance in world units between two cameras."""
+    cosine = ((a.cam_from_world[:3, :3] * b.cam_from_world[:3, :3]).sum() - 1) / 2
+    return math.degrees(math.acos(min(1.0, float(cosine)))), float((a.centre - b.centre).norm())
+
+
+def test_a_change_turns_about_the_point_ahead_and_shifts_by_shares_of_its_depth():
+    camera = make_camera((0.0, -4.0, 0.0))
+    ahead = camera.centre + DEPTH * camera.cam_from_world[2, :3]
+    turned = moved_by(camera, torch.cat([CHANGE[:3], torch.zeros(3)]), DEPTH)
+    place, depth = turned.project(ahead[None])
+    assert torch.allclose(place, camera.project(ahead[None])[0], atol=1e-9)
+    assert float(depth) == pytest.approx(DEPTH)
+    assert apart(turned, camera)[0] == pytest.approx(math.degrees(float(CHANGE[:3].norm())))
+    shifted = moved_by(camera, torch.cat([torch.zeros(3), CHANGE[3:]]), DEPTH)
+    assert apart(shifted, camera) == (pytest.approx(0, abs=1e-5), pytest.approx(DEPTH * float(CHANGE[3:].norm())))
+
+
+def test_the_gradient_of_a_change_equals_finite_differences():
+    camera, places = make_camera((0.5, -4.0, 0.4)), make_scene(20, dtype=torch.float64).means
+    for at in (CHANGE, torch.zeros(6, dtype=torch.float64)):
+        start = at.clone().requires_grad_()
+        assert torch.autograd.gradcheck(lambda change: moved_by(camera, change, DEPTH).project(places), start)
+
+
+def test_poses_that_are_off_come_back_and_right_ones_stay(photographed):
+    scene, cameras = photographed
+    off = CameraSet((moved_by(cameras.train[0], CHANGE, DEPTH), cameras.train[1]), ())
+    found = aaplug.refine_poses(scene, off, min_seen=0.0)
+    degrees, distance = apart(off.train[0], cameras.train[0])
+    left, right = found.cameras.train
+    assert apart(left, cameras.train[0])[0] < degrees / 5
+    assert apart(left, cameras.train[0])[1] < distance / 5
+    assert right == cameras.train[1]
+    first, second = found.poses
+    assert first.after < first.before / 5
+    assert (first.degrees, first.distance) == pytest.approx(apart(left, off.train[0]))
+    assert (second.degrees, second.distance, second.after) == (0.0, 0.0, second.before)
+
+
+def test_coarse_scales_lead_farther_than_fine_ones(photographed):
+    scene, cameras = photographed
+    renderer = Renderer.of(scene, cameras, min_seen=0.0)
+    off = moved_by(cameras.train[0], 6 * CHANGE, DEPTH)
+    coarse_to_fine, fine = (refine_pose(renderer, off, scales).camera for scales in ((1 / 8, 1 / 4, 1 / 2), (1 / 2,)))
+    assert apart(coarse_to_fine, cameras.train[0])[0] < apart(fine, cameras.train[0])[0] / 2
+
+
+def test_a_view_without_a_photograph_is_named(photographed):
+    scene, cameras = photographed
+    bare = CameraSet((replace(cameras.train[0], photo=None),), ())
+    with pytest.raises(aaplug.UsageError, match="view0: has no photograph"):
+        aaplug.refine_poses(scene, bare, min_seen=0.0)
+
+
+def test_finetune_refines_poses_first(photographed):
+    scene, cameras = photographed
+    off = tuple(moved_by(view, CHANGE, DEPTH) for view in cameras.train)
+    how = {"min_seen": 0.0, "steps": 1, "scale": (0.5,), "rasterizer": "eager"}
+    errors = []
+    for poses in (False, True):
+        tuned = aaplug.finetune(scene, CameraSet(off, off), None, poses=poses, **how)
+        errors.append(tuned.as_json()["before@1"]["PSNR"])
+    assert errors[1] > errors[0] + 6
