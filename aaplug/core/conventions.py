@@ -10,6 +10,7 @@ from aaplug.core.rules import RULES_3DGS, Rules
 from aaplug.system.contracts import Range, check_fields
 
 SpzAxes = Literal["auto", "opengl", "opencv"]  # of a .spz: as the cameras tell, its specification, splat-transform
+SpzVersion = Literal[3, 4]  # of a .spz to write: as older readers take it, or with its axes stated
 MAX_KERNEL = 1e6  # px²: what is computed from it stays finite
 MIN_SEEN_SHARE = 0.5  # cameras that see a smaller share of the Gaussians are taken to be in another frame
 

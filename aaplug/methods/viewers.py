@@ -4,9 +4,18 @@ A viewer adds a constant variance to every projected covariance, with or without
 """
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from aaplug.core.conventions import ANTIALIASED, CLASSIC, MIP, PLAYCANVAS, PLAYCANVAS_CLASSIC, Convention, SpzAxes
+from aaplug.core.conventions import (
+    ANTIALIASED,
+    CLASSIC,
+    MIP,
+    PLAYCANVAS,
+    PLAYCANVAS_CLASSIC,
+    Convention,
+    SpzAxes,
+    SpzVersion,
+)
 from aaplug.system.registry import Registry, named
 
 if TYPE_CHECKING:
@@ -28,6 +37,7 @@ class Viewer:
     cut: the end of a splat, in words.
     formats: suffixes of the scene files that the program is known to open, of those that aaplug writes.
     spz_axes: in which it takes the numbers of a .spz; "auto": those of the specification.
+    spz_version: of a .spz that it takes.
     """
 
     name: str
@@ -40,6 +50,7 @@ class Viewer:
     cut: str = "alpha < 1/255"
     formats: tuple[str, ...] = ("ply",)
     spz_axes: SpzAxes = "auto"
+    spz_version: SpzVersion = 4
 
     def convention_of(self, scene: "Gaussians") -> Convention:
         """The convention that the file of a scene for this viewer declares."""
@@ -63,9 +74,9 @@ class Viewer:
         without = "with it off, a converted scene can look worse than the original"
         return f"in {self.program}, turn anti-aliasing on: {self.settings} ({without})"
 
-    def axes(self, asked: SpzAxes) -> SpzAxes:
-        """Axes for a .spz: those asked for, or the program's own."""
-        return self.spz_axes if asked == "auto" else asked
+    def spz(self, asked: SpzAxes) -> "dict[str, Any]":
+        """How a .spz is written, for `write_scene`: axes as asked for, or the program's own, and its version."""
+        return {"spz_axes": self.spz_axes if asked == "auto" else asked, "spz_version": self.spz_version}
 
     def shown(self, scene: "Gaussians") -> "Gaussians":
         """The scene with the harmonics that the program draws."""
@@ -78,7 +89,7 @@ MIP_VIEWER = Viewer("mip", "Mip-Splatting's viewers", "mip", MIP, "a kernel of 0
 
 
 def _spark(name: str, recipe: str, convention: Convention, settings: str) -> Viewer:
-    how = {"sh_degree": 3, "cut": "√8 σ", "formats": ("ply", "spz", "splat"), "spz_axes": "opencv"}
+    how = {"sh_degree": 3, "cut": "√8 σ", "formats": ("ply", "spz", "splat"), "spz_axes": "opencv", "spz_version": 3}
     return Viewer(name, "Spark 2.2.0", recipe, convention, settings, **how)
 
 

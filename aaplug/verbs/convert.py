@@ -67,7 +67,7 @@ def convert(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opti
     rule, path = _rule(options), None if output is None else Path(output)
     job = Job.of(scene, cameras, options)
     viewer = rule if isinstance(rule, Viewer) else MIP_VIEWER
-    files = {"overwrite": options.overwrite, "spz_axes": viewer.axes(options.spz_axes)}
+    files = {"overwrite": options.overwrite, **viewer.spz(options.spz_axes)}
     check = partial(check_scene_output, path, options.overwrite, job.scene.files) if path else lambda: None
     check()
     with running(options, path, check, job.inputs) as workers:

@@ -102,7 +102,7 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
         record = {"for": viewer.name, "method": settings.name}
         result = tuned_scene(state, tuning, viewer.convention_of(raw), record)
         if path is not None:
-            write_scene(path, result, overwrite=options.overwrite, spz_axes=viewer.axes(options.spz_axes))
+            write_scene(path, result, overwrite=options.overwrite, **viewer.spz(options.spz_axes))
         closed = [Candidate("closed form", start)] * (len(start.scene.fused) > len(raw.fused))
         bounds = sampling_bounds(result.means, train)  # densification may have changed the number of Gaussians
         after = replace(start, scene=result, training=replace(start.training, bounds=bounds))

@@ -34,7 +34,7 @@ from aaplug.io.scenes.scene import FLOAT, Scene, matrix_of
 from aaplug.levels.clusters import rates_of
 from aaplug.levels.merging import Goal, merge, merge_in_chunks
 from aaplug.methods.filters.smoothing import fuse_stored
-from aaplug.methods.viewers import Viewer, find_viewer
+from aaplug.methods.viewers import MIP_VIEWER, Viewer, find_viewer
 from aaplug.options.verbs import LodOptions
 from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.rendering.renderer import Renderer
@@ -84,8 +84,8 @@ def lod(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, options:
             return levels
         lighter = maker.finished(maker(Level(whole, 1.0), goals_of(options, whole)[0]))
         if path is not None:
-            axes = maker.viewer.axes(options.spz_axes) if maker.viewer else options.spz_axes
-            write_scene(path, lighter.scene, overwrite=options.overwrite, spz_axes=axes)
+            how = (maker.viewer or MIP_VIEWER).spz(options.spz_axes)
+            write_scene(path, lighter.scene, overwrite=options.overwrite, **how)
         return [lighter]
 
 
