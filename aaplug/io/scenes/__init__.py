@@ -18,7 +18,7 @@ from aaplug.core.conventions import Convention, SpzAxes, SpzVersion
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.pyramids import Pyramid
 from aaplug.io.atomic import check_output
-from aaplug.io.scenes import compressed_ply, gltf, ksplat, ply, pt, sog, splat, spz
+from aaplug.io.scenes import compressed_ply, gltf, ksplat, ply, pt, sog, splat, spz, usd
 from aaplug.io.scenes.options import SceneFileOptions
 from aaplug.io.scenes.pyramid_folder import MANIFEST, is_pyramid, path_of, read_manifest, read_pyramid
 from aaplug.io.scenes.scene import MODEL_SCENE, SOG_FOLDER, Scene, described_faults, faults_of, library_errors
@@ -52,7 +52,10 @@ class SceneFormat(Protocol):
 
 @runtime_checkable
 class WritableFormat(SceneFormat, Protocol):
-    """A format that can be written too.  needs: a package that writing imports, from aaplug's extra `name`; or None."""
+    """A format that can be written too.  needs: a package that writing imports, or None.
+
+    It comes with aaplug's extra `extra`, if the format has such an attribute, or else of the format's name.
+    """
 
     @property
     def needs(self) -> str | None: ...  # noqa: D102
@@ -68,7 +71,18 @@ class WritableFormat(SceneFormat, Protocol):
 
 
 # the first that accepts a file is used
-OWN: tuple[SceneFormat, ...] = (compressed_ply, ply, spz, sog, pt, splat, ksplat, *gltf.FORMATS, sog.UNBUNDLED)
+OWN: tuple[SceneFormat, ...] = (
+    compressed_ply,
+    ply,
+    spz,
+    sog,
+    pt,
+    splat,
+    ksplat,
+    *gltf.FORMATS,
+    sog.UNBUNDLED,
+    *usd.FORMATS,
+)
 SCENE_FORMATS = Registry[SceneFormat]("scene format", "aaplug.io.scenes:SceneFormat", named(OWN))
 SceneLike = Scene | Gaussians | Pyramid | str | PathLike[str]
 
@@ -199,7 +213,8 @@ def check_scene_output(
         known = [f".{format.name}" for format in SCENE_FORMATS.values() if isinstance(format, WritableFormat)]
         raise OutputError(path, f"has no suffix of a format that can be written: {', '.join(known)}")
     if writer.needs is not None and importlib.util.find_spec(writer.needs) is None:
-        raise UsageError(str(path), f"writing .{writer.name} needs {writer.needs}: {install_command(writer.name)}")
+        command = install_command(getattr(writer, "extra", writer.name))
+        raise UsageError(str(path), f"writing .{writer.name} needs {writer.needs}: {command}")
     check_output(path, overwrite, inputs)
     return writer
 

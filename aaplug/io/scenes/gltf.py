@@ -24,16 +24,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.gaussians import Gaussians, joined
-from aaplug.core.placing import mirrored, placed
 from aaplug.core.spherical_harmonics import COLOUR_OFFSET, SH_C0
 from aaplug.io.atomic import replacing
 from aaplug.io.gltf import FLOAT, MAGIC, Accessor, Gltf, at_rest, glb_start
 from aaplug.io.scenes import spz
 from aaplug.io.scenes.options import SceneFileOptions
-from aaplug.io.scenes.packed import bytes_of, replacing_group
+from aaplug.io.scenes.packed import bytes_of, half_turn_about_z, of_degree, replacing_group, standing
 from aaplug.io.scenes.record import KEY, Facts, holdable, read_record, record_of
 from aaplug.io.scenes.scene import Scene, check_count, library_errors, logit_of
-from aaplug.io.values import Entry
+from aaplug.io.values import Entry, Place
 from aaplug.system.errors import FormatError, OutputError
 
 SPLATS, SPZ = "KHR_gaussian_splatting", "KHR_gaussian_splatting_compression_spz_2"
@@ -44,11 +43,9 @@ BYTES, VERTICES, POINTS = 5121, 34962, 0  # a componentType, a target and a mode
 COLOUR = "COLOR_0"
 MOST_DEGREE = 3
 MOST_BYTES = 2**32 - 1  # of a .glb, whose size is 32 bits
-UNALIKE = 1e-4  # of the scale: a difference between axes that counts as rounding
 ROOM = 8192  # bytes of JSON, padded so that the smallest and largest position can be filled in at the end
 EVIDENCE = "glTF does not say: assumed classic (3DGS default)"
 
-half_turn_about_z = partial(mirrored, signs=(-1.0, -1.0, 1.0))
 Rows = Callable[[int, int], Gaussians]
 
 
@@ -131,7 +128,7 @@ FORMATS = (GltfFormat("spz.glb"), GltfFormat("glb"), GltfFormat("gltf"))
 
 @dataclass(frozen=True)
 class Primitive:
-    """Points of a mesh.  load: their rows in OpenCV's axes, at the node's place; note: a fact worth printing."""
+    """Points of a mesh.  load: their rows; note: a fact worth printing."""
 
     count: int
     degree: int
@@ -160,7 +157,7 @@ def _primitives(document: Gltf) -> list[Primitive]:
             extensions = primitive.entry("extensions") if "extensions" in primitive else primitive
             if SPLATS in extensions:
                 part = _primitive(document, primitive, extensions.entry(SPLATS))
-                found.append(replace(part, load=_placed(mesh, motion, part.load)))
+                found.append(replace(part, load=partial(_standing, part.load, motion, mesh.place)))
     return found
 
 
@@ -175,7 +172,7 @@ def _primitive(document: Gltf, primitive: Entry, splats: Entry) -> Primitive:
     if SPZ in inner:
         view, _ = document.view(inner.entry(SPZ))
         file = spz.parsed(document.path, view.read(0, view.size))
-        load = partial(spz.rows, file.header, file.sections, half_turn_about_z)
+        load = partial(spz.rows, file.header, file.sections, spz.TURNS["opencv"])
         return Primitive(file.header.count, file.header.degree, load, extras, note)
     attributes = primitive.entry("attributes")
     degree = max((d for d in range(MOST_DEGREE + 1) if harmonics(d)[-1] in attributes), default=0)
@@ -188,27 +185,17 @@ def _primitive(document: Gltf, primitive: Entry, splats: Entry) -> Primitive:
     return Primitive(counts.pop(), degree, partial(_read, tables, degree), extras, note)
 
 
+def _standing(load: Rows, motion: Float[Tensor, "4 4"], place: Place, start: int, stop: int) -> Gaussians:
+    return standing(load(start, stop), motion, place)
+
+
 def _read(tables: dict[str, Accessor], degree: int, start: int, stop: int) -> Gaussians:
     def column(name: str) -> Tensor:
         return torch.from_numpy(tables[name].read(start, stop))
 
     sh = torch.stack([column(name) for name in harmonics(degree)], dim=1)
     quats, opacities = column("ROTATION").roll(1, dims=1), logit_of(column("OPACITY")[:, 0])
-    return half_turn_about_z(Gaussians(column("POSITION"), quats, column("SCALE").log(), opacities, sh))
-
-
-def _placed(mesh: Entry, motion: Float[Tensor, "4 4"], load: Rows) -> Rows:
-    """The rows where a node's transform, which is in glTF's axes, puts them."""
-    if torch.equal(motion, torch.eye(4, dtype=torch.float64)):
-        return load
-    axes = motion[:3, :3]
-    scale = float(torch.linalg.det(axes).clamp(min=0) ** (1 / 3))
-    error = (axes @ axes.T - scale**2 * torch.eye(3)).abs().max().item()
-    alike = scale > 0 and error <= UNALIKE * scale**2
-    mesh.place.expect(alike, "its node's transform", "a turn, a move and one scale", motion.tolist())
-    signs = torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64)
-    turn, move = signs[:, None] * axes / scale * signs, (signs * motion[:3, 3]).tolist()
-    return lambda start, stop: placed(load(start, stop), turn, scale, move)
+    return Gaussians(column("POSITION"), quats, column("SCALE").log(), opacities, sh)
 
 
 def _rows(parts: list[Primitive], degree: int, start: int, stop: int) -> Gaussians:
@@ -216,9 +203,7 @@ def _rows(parts: list[Primitive], degree: int, start: int, stop: int) -> Gaussia
     for part in parts:
         begin, end = max(start - first, 0), min(stop - first, part.count)
         if begin < end or (start == stop and not read):
-            rows = part.load(begin, max(begin, end))
-            missing = (degree + 1) ** 2 - rows.sh.shape[1]
-            read.append(replace(rows, sh=torch.nn.functional.pad(rows.sh, (0, 0, 0, missing))))
+            read.append(of_degree(part.load(begin, max(begin, end)), degree))
         first += part.count
     return joined(read)
 

@@ -6,6 +6,7 @@ Functions raise FormatError for a file that breaks its format.
 """
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from glob import escape
 from hashlib import sha256
@@ -16,14 +17,18 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from aaplug.core.placing import mirrored
+from aaplug.core.gaussians import Gaussians
+from aaplug.core.placing import mirrored, placed
 from aaplug.io.atomic import check_output, replacing
 from aaplug.io.limits import limit
 from aaplug.io.scenes.scene import logit_of
+from aaplug.io.values import Place
 from aaplug.system.errors import FormatError
 
 MAX_BYTE = 255
 HASH_DIGITS = 8  # in the name of a file that another one names
+UNALIKE = 1e-4  # of the scale: a difference between axes that counts as rounding
+half_turn_about_z = partial(mirrored, signs=(-1.0, -1.0, 1.0))  # from glTF's axes to OpenCV's, and back
 half_turn_about_x = partial(mirrored, signs=(1.0, -1.0, -1.0))  # from OpenGL's axes to OpenCV's, and back
 
 
@@ -91,3 +96,24 @@ def replacing_group(
         stream.write(whole(names))
     for file in earlier - {path.with_name(name) for name in names.values()}:
         file.unlink(missing_ok=True)
+
+
+def standing(scene: Gaussians, motion: Float[Tensor, "4 4"], place: Place) -> Gaussians:
+    """A scene in axes with y up and z forward where a transform in these axes puts it, in OpenCV's axes.
+
+    Raises FormatError if the transform does more than turn, move and scale alike along all axes.
+    """
+    if not torch.equal(motion, torch.eye(4, dtype=torch.float64)):
+        axes = motion[:3, :3]
+        scale = float(torch.linalg.det(axes).clamp(min=0) ** (1 / 3))
+        error = (axes @ axes.T - scale**2 * torch.eye(3)).abs().max().item()
+        alike = scale > 0 and error <= UNALIKE * scale**2
+        place.expect(alike, "its transform", "a turn, a move and one scale", motion.tolist())
+        scene = placed(scene, axes / scale, scale, motion[:3, 3].tolist())
+    return half_turn_about_z(scene)
+
+
+def of_degree(scene: Gaussians, degree: int) -> Gaussians:
+    """The scene with harmonics up to this degree: those above are left out, those that it lacks are 0."""
+    missing = (degree + 1) ** 2 - scene.sh.shape[1]
+    return replace(scene, sh=torch.nn.functional.pad(scene.sh, (0, 0, 0, missing)))
