@@ -36,6 +36,11 @@ GUIDES = {each.stem: each for each in sorted(HERE.glob("guides/*.md")) or sorted
 PROGRAM_KEYS = ("fused", "comments")  # of `info`, for programs; the table has words for the first
 
 
+WRITTEN = (
+    "File to write: .ply; .compressed.ply, .sog, .spz, .glb, .gltf, .usda, .usdc, .usdz or .splat, which keep less "
+    "(see `aaplug guide formats`)"
+)
+
 Run = Callable[[Words], Answer]
 
 
@@ -70,7 +75,7 @@ def render(words: Words) -> Answer:
 
 @verb(
     *SCENE_AND_CAMERAS,
-    output("FILE", "File to write: .ply, or .spz or .splat, which round values and keep less; with --batch, a folder."),
+    output("FILE", WRITTEN + "; with --batch, a folder."),
     verbs.ConvertOptions,
     *SEVERAL,
     json_of("what was done as one JSON object"),
@@ -98,7 +103,7 @@ def convert(words: Words) -> Answer:
 
 @verb(
     *SCENE_AND_CAMERAS,
-    output("PATH", "The one scene's file (.ply, .spz or .splat), or a folder for levels (.ply) or, with --batch, all."),
+    output("PATH", "The one scene's file (as of convert), or a folder for levels (.ply) or, with --batch, all."),
     verbs.LodOptions,
     *SEVERAL,
     json_of("what was made as one JSON object"),
@@ -243,6 +248,27 @@ def compare(words: Words) -> Answer:
     if failed:
         say(f"{lowest.scene} at {lowest.scale:g}: mean PSNR {lowest.value:.2f} dB is below {least:g} dB")
     return Answer(comparison.summary(), comparison.tables(), failed)
+
+
+@verb(
+    Option("scenes", flag("SCENE [SCENE ...]", read=Path, by_place=True, count=None), "The scenes, of any format.", ()),
+    CameraOptions,
+    output("FILE", WRITTEN + "."),
+    verbs.MergeOptions,
+    FileOptions,
+    json_of("what was done as one JSON object"),
+)
+def merge(words: Words) -> Answer:
+    """Put scenes into one file, each moved, turned and scaled, all by one rule of drawing.
+
+    Scenes of several rules are converted, for which --cameras, or each model folder's own, tell how finely training
+    sampled them.  To make one scene lighter, use lod.
+    """
+    scenes = [open_scene(words, path) for path in words.scenes]
+    cameras = read_cameras(words, scenes[0]) if words.cameras else None
+    merged = aaplug.merge(scenes, cameras, words.output, **told(words, verbs.MergeOptions))
+    say(f"wrote {words.output}: {len(merged):,} Gaussians, {merged.convention.name}")
+    return Answer({"output": str(words.output), "gaussians": len(merged), "convention": merged.convention.name})
 
 
 @verb(

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Literal, get_args
 
-from aaplug.core.conventions import SpzAxes
+from aaplug.core.conventions import CONVENTIONS, SpzAxes
 from aaplug.io import MOST_FPS
 from aaplug.io.atomic import AnyPath
 from aaplug.options.base import DRAWING, FILES, FILM, PYTHON_ONLY, REPORT, TUNING, Options, flag, names, number
@@ -19,6 +19,7 @@ from aaplug.options.shared import (
     THREADS,
     VIEWS,
     FilmOptions,
+    FrameOptions,
     ImageOptions,
     LensOptions,
     OneProtocol,
@@ -167,6 +168,20 @@ class ConvertOptions(WritingOptions, ViewOptions):
     """Without --for: keep training's energy (matched-energy, the default), or smooth as Mip-Splatting does."""
     variance: Annotated[float | None, number(0.001, 100)] = None
     """Without --for: variance to fuse, in px² at the training rate (default: 0.2)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MergeOptions(WritingOptions, FrameOptions):
+    """Where each scene goes, and by which rule the file is to be drawn."""
+
+    into: Annotated[str | None, names(*CONVENTIONS)] = None
+    """Rule that all scenes are converted to (default: theirs if they agree, else mip)."""
+    move: Annotated[Sequence[float] | None, number(-1e9, 1e9, several=True, metavar="X,Y,Z ...")] = None
+    """For each scene: how far it is moved, in world units, after the turn; 0,0,0 for none."""
+    turn: Annotated[Sequence[float] | None, number(-1e9, 1e9, several=True, metavar="X,Y,Z ...")] = None
+    """For each scene: degrees about x, then y, then z, or the four numbers w,x,y,z of a quaternion; 0,0,0 for none."""
+    scale: Annotated[Sequence[float] | None, number(1e-6, 1e6, several=True, metavar="FACTOR ...")] = None
+    """For each scene: how many times as large it becomes, about the origin of its file; 1 for none."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -58,7 +58,7 @@ def convert(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opti
     Args:
         scene: see `render`.
         cameras: see `render`; not needed where the scene stores a 3D filter.
-        output: file to write, .ply, .spz or .splat; None writes none.
+        output: file to write, of a format that can be written; None writes none.
 
     Raises:
         AaplugError: as `render`; also, something is fused already.

@@ -15,10 +15,14 @@ BLOCK = 1 << 24  # distances computed at once: 64 MB
 
 
 def codebook(values: Float[Tensor, " n"], entries: int) -> Float[Tensor, " entries"]:
-    """Increasing values such that the mean squared distance of the numbers to the nearest is small."""
+    """Increasing values such that the mean squared distance of at least one number to the nearest is small.
+
+    Where so many values are enough, each number is one of them.
+    """
     ordered = values.double().sort().values
-    if not len(ordered):
-        return torch.zeros(entries, dtype=values.dtype)
+    distinct = ordered.unique_consecutive()
+    if len(distinct) <= entries:
+        return torch.cat([distinct, distinct[-1:].expand(entries - len(distinct))]).to(values.dtype)
     sums = torch.cat([ordered.new_zeros(1), ordered.cumsum(0)])
     # between equal shares of the numbers, which serve the crowd, and equal steps, which serve the ends
     shares = torch.linspace(0, 1, entries, dtype=torch.float64)
