@@ -6,7 +6,9 @@ codes of the stage.  Layers that the file names must lie in its folder: others a
 """
 
 import math
+import os
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -16,28 +18,37 @@ from aaplug.core.cameras import Aperture, Camera, Exposure
 from aaplug.io.cameras.camera_path import CameraPath
 from aaplug.io.cameras.keyframes import MAX_FRAMES, UNSIZED
 from aaplug.io.cameras.poses import inverse, pose_of_opengl
-from aaplug.io.usd import SUFFIXES, module, stage_of
 from aaplug.io.values import Place, focal, number
 from aaplug.system.errors import FormatError, UsageError
+from aaplug.system.extras import install_command
 
 UNIT = 10.0  # of the camera's lengths in a world unit
+MAX_LAYERS = 1000
 
 name = "usd"
 
 
 def sniff(path: Path) -> bool:
     """True for a file of that name."""
-    return path.suffix[1:].lower() in SUFFIXES
+    return path.suffix.lower() in (".usd", ".usda", ".usdc", ".usdz")
 
 
 def path_of(path: Path) -> CameraPath:
     """The camera at each time code, or at rest as a path of one frame."""
-    with stage_of(path) as stage:
-        return _read(path, stage)
+    try:
+        Tf = _module("Tf")
+    except ImportError as error:
+        raise UsageError("path", f"{path.suffix} files need the extra `usd`: {install_command('usd')}") from error
+    try:
+        return _read(path)
+    except (Tf.ErrorException, UnicodeDecodeError) as error:  # its message may be no text
+        raise FormatError(path, "cannot be read: it breaks the format of USD") from error
 
 
-def _read(path: Path, stage: Any) -> CameraPath:
-    Usd, UsdGeom = module("Usd"), module("UsdGeom")
+def _read(path: Path) -> CameraPath:
+    Usd, UsdGeom = _module("Usd"), _module("UsdGeom")
+    _check_layers(path)
+    stage = Usd.Stage.Open(str(path))
     found = [UsdGeom.Camera(prim) for prim in stage.Traverse() if prim.IsA(UsdGeom.Camera)]
     if not found:
         raise FormatError(path, "holds no camera")
@@ -58,9 +69,33 @@ def _read(path: Path, stage: Any) -> CameraPath:
     return CameraPath(named, fps, cameras[0][1])
 
 
+def _module(name: str) -> Any:
+    """A module of the package `usd-core`, whose stubs are not complete."""
+    return import_module(f"pxr.{name}")
+
+
+def _check_layers(path: Path) -> None:
+    """Refuse layers outside of the file's folder, whoever names them."""
+    Sdf, home, left, seen = _module("Sdf"), path.parent.resolve(), [str(path)], set[str]()
+    while left:
+        layer = Sdf.Layer.FindOrOpen(left.pop())
+        if layer is None:
+            raise FormatError(path, "cannot be read: it is no USD, or a layer that it names is missing")
+        for asset in filter(None, layer.GetCompositionAssetDependencies()):
+            name = Sdf.ComputeAssetPathRelativeToLayer(layer, asset)
+            file = name.partition("[")[0]  # a package's own file stands in brackets
+            if "://" in asset or not Path(os.path.realpath(file)).is_relative_to(home):
+                raise FormatError(path, f"names a layer outside of its folder: {asset!r}")
+            if name not in seen:
+                seen.add(name)
+                left.append(name)
+        if len(seen) > MAX_LAYERS:
+            raise FormatError(path, f"names more than {MAX_LAYERS} layers")
+
+
 def _moves(camera: Any) -> bool:
     """Whether the camera, or a prim above it, has time samples."""
-    UsdGeom, prim = module("UsdGeom"), camera.GetPrim()
+    UsdGeom, prim = _module("UsdGeom"), camera.GetPrim()
     own = any(attribute.ValueMightBeTimeVarying() for attribute in prim.GetAttributes())
     while prim and not own:
         own = UsdGeom.Xformable(prim).TransformMightBeTimeVarying() if prim.IsA(UsdGeom.Xformable) else False

@@ -10,13 +10,18 @@ Written are floats, as the stage's default prim, with y up and a metre per unit.
 """
 
 import json
+import subprocess
+import sys
 from collections.abc import Iterable
 from dataclasses import dataclass
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from aaplug.core.gaussians import Gaussians, joined
 from aaplug.io.atomic import replacing_file
@@ -24,14 +29,17 @@ from aaplug.io.scenes.options import SceneFileOptions
 from aaplug.io.scenes.packed import floats, half_turn_about_z, of_degree, standing
 from aaplug.io.scenes.record import KEY, Facts, holdable, read_record, record_of
 from aaplug.io.scenes.scene import Scene, check_count, library_errors, logit_of
-from aaplug.io.usd import SUFFIXES, module, stage_of
-from aaplug.io.values import Place, parse_json
-from aaplug.system.errors import FormatError, OutputError
+from aaplug.io.values import Entry, Place, entries, object_of, parse_json, text
+from aaplug.system.errors import FormatError, OutputError, UsageError
+from aaplug.system.extras import install_command
+from aaplug.system.locks import scratch
 
+SUFFIXES = ("usda", "usdc", "usdz", "usd")
+PACKAGE = "pxr"  # of usd-core
+SECONDS, BYTES_PER_SECOND = 20.0, 1e6  # that reading a file may take, and its size for each further second
+HARMONICS, DEGREE = "radiance:sphericalHarmonicsCoefficients", "radiance:sphericalHarmonicsDegree"
 TYPE = "ParticleField3DGaussianSplat"
-HARMONICS = "radiance:sphericalHarmonicsCoefficients"
-DEGREE = "radiance:sphericalHarmonicsDegree"
-WIDTHS = {"positions": 3, "orientations": 4, "scales": 3, "opacities": 1, HARMONICS: 3}
+CHILD = Path(__file__).with_name("usd_child.py")  # a program of its own
 MAX_DEGREE = 4
 EXTENT_SIGMAS = 3.0  # from a Gaussian's centre
 # from axes with z up to axes with y up and z forward
@@ -44,7 +52,7 @@ class UsdFormat:
     """Files of one suffix.  Raises as `SceneFormat` and `WritableFormat`."""
 
     name: str
-    needs: str | None = "pxr"
+    needs: str | None = PACKAGE
     extra: str = "usd"
 
     def sniff(self, path: Path, head: bytes) -> bool:
@@ -52,17 +60,22 @@ class UsdFormat:
         return path.suffix[1:].lower() == self.name
 
     def open_scene(self, path: Path, options: SceneFileOptions) -> Scene:
-        """All prims of splats as one scene, in memory."""
-        with library_errors(path), stage_of(path, alone=True) as stage:
-            prims = [prim for prim in stage.Traverse() if str(prim.GetTypeName()) == TYPE]
-            if not prims:
-                raise FormatError(path, f"holds no {TYPE}; is it a mesh?")
-            parts = [_read(path, prim, str(module("UsdGeom").GetStageUpAxis(stage))) for prim in prims]
-            said = stage.GetRootLayer().customLayerData.get(KEY)
+        """All prims of splats as one scene, in memory; read by `usd_child`."""
+        if find_spec(PACKAGE) is None:
+            raise UsageError("path", f"{path.suffix} files need the extra `usd`: {install_command('usd')}")
+        with library_errors(path), scratch() as folder:
+            told, arrays = _told(path, folder / "arrays.npz")
+            stage = object_of(told, path, "the stage", "what is in it")
+            if "refused" in stage:
+                raise FormatError(path, stage.get("refused", text))
+            prims = entries(path, "prim", stage.value("prims"))
+            parts = [_read(path, prim, number, arrays, told["up"]) for number, prim in enumerate(prims)]
             degree = max(part.sh_degree for part in parts)
             scene = joined([of_degree(part, degree) for part in parts])
-        record = {} if said is None else {KEY: parse_json(str(said).encode(), path)}
-        facts = read_record(path, record, Facts(EVIDENCE))
+            check_count(path, len(scene))
+            said = told["record"]
+            record = {} if said is None else {KEY: parse_json(said.encode(), path)}
+            facts = read_record(path, record, Facts(EVIDENCE))
         return Scene(path, self.name, len(scene), degree, lambda start, stop: scene[start:stop], *facts)
 
     def write(
@@ -87,43 +100,45 @@ class UsdFormat:
 FORMATS = tuple(UsdFormat(suffix) for suffix in SUFFIXES)
 
 
-def _read(path: Path, prim: Any, up: str) -> Gaussians:
-    Usd, UsdGeom, place = module("Usd"), module("UsdGeom"), Place(path, f"prim {prim.GetPath()}")
-    time = Usd.TimeCode.EarliestTime()  # the default where nothing moves
+def module(name: str) -> Any:
+    """A module of usd-core, whose stubs are not complete."""
+    return import_module(f"{PACKAGE}.{name}")
 
-    def value(name: str) -> Any:
-        attribute = prim.GetAttribute(name)
-        return attribute.Get(time) if attribute else None
 
-    def column(name: str) -> np.ndarray:
-        found = value(name)
-        found = value(f"{name}h") if found is None or not len(found) else found
-        place.expect(found is not None, name, "an array", found)
-        array = np.asarray(found, np.float32)
-        fits = array.size % WIDTHS[name] == 0 and array.ndim <= 2
-        place.expect(fits, name, f"rows of {WIDTHS[name]} numbers", array.shape)
-        return array.reshape(-1, WIDTHS[name])
+def _told(path: Path, file: Path) -> tuple[Any, dict[str, np.ndarray]]:
+    """What the child says of a file, and the arrays that it leaves."""
+    command = [sys.executable, str(CHILD), str(path.resolve()), str(file)]
+    seconds = SECONDS + path.stat().st_size / BYTES_PER_SECOND
+    try:
+        run = subprocess.run(command, capture_output=True, timeout=seconds, check=True)
+    except (subprocess.SubprocessError, ValueError) as error:
+        raise FormatError(path, "cannot be read: it breaks the format of USD") from error
+    with np.load(file) as arrays:
+        return parse_json(run.stdout.splitlines()[-1], path), dict(arrays)
 
-    means, quats, scales, opacities = (column(name) for name in list(WIDTHS)[:4])
-    count, degree = len(means), value(DEGREE)
-    check_count(path, count)
+
+def _read(path: Path, prim: Entry, number: int, arrays: dict[str, np.ndarray], up: str) -> Gaussians:
+    place, degree = Place(path, f"prim {prim.value('name')}"), prim.value("degree")
     right = isinstance(degree, int) and 0 <= degree <= MAX_DEGREE
     place.expect(right, DEGREE, f"a whole number from 0 to {MAX_DEGREE}", degree)
-    sh, each = column(HARMONICS), (degree + 1) ** 2
-    for name, rows, wanted in (
-        ("orientations", quats, count),
-        ("scales", scales, count),
-        ("opacities", opacities, count),
-        (HARMONICS, sh, count * each),
-    ):
-        place.expect(len(rows) == wanted, name, f"{wanted:,} values", len(rows))
-    logits = logit_of(floats(opacities[:, 0]))
-    turned = floats(quats).roll(1, dims=1)  # numpy's view has the real part last
-    scene = Gaussians(floats(means), turned, floats(scales).log(), logits, floats(sh).reshape(count, each, 3))
-    rows = [list(row) for row in UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(time)]
-    motion = torch.tensor(rows, dtype=torch.float64).T
-    place.expect(bool(motion.isfinite().all()), "its transform", "finite", rows)
-    return standing(scene, FROM_Z_UP @ motion if up == "Z" else motion, place)
+    each = (degree + 1) ** 2
+
+    def column(name: str, width: int, rows: int | None = None) -> Tensor:
+        key = f"{number} {name}"
+        place.expect(key in arrays, name, "an array", None)
+        fits = arrays[key].dtype.kind == "f" and arrays[key].size == arrays[key].shape[0] * width
+        wanted = f"{arrays[key].shape[0] if rows is None else rows:,} values of {width} numbers"
+        place.expect(fits and rows in (None, arrays[key].shape[0]), name, wanted, arrays[key].shape)
+        return floats(arrays[key]).reshape(-1, width)
+
+    means = column("positions", 3)
+    count = len(means)
+    turned = column("orientations", 4, count).roll(1, dims=1)  # numpy's view has the real part last
+    logits, log_scales = logit_of(column("opacities", 1, count)[:, 0]), column("scales", 3, count).log()
+    sh = column(HARMONICS, 3, count * each).reshape(count, each, 3)
+    motion = prim.matrix("motion", 4, 4).T
+    standing_up = FROM_Z_UP @ motion if up == "Z" else motion
+    return standing(Gaussians(means, turned, log_scales, logits, sh), standing_up, place)
 
 
 def _stage(scene: Gaussians) -> Any:
