@@ -18,6 +18,7 @@ import torch
 from aaplug.core.conventions import CONVENTIONS
 from aaplug.core.gaussians import Gaussians
 from aaplug.io.scenes import read_scene, write_scene
+from aaplug.io.scenes.usd import module
 from tests.bench import heading, row
 
 SCRIPT = """
@@ -88,10 +89,8 @@ def main(scenes: int = 1000) -> None:
 
 
 def _usd(folder: Path, suffix: str) -> dict[str, int]:
-    from pxr import Usd, UsdValidation
-
-    found = Counter[str]()
-    context = UsdValidation.ValidationContext(UsdValidation.ValidationRegistry().GetOrLoadAllValidators())
+    found, Usd, Validation = Counter[str](), module("Usd"), module("UsdValidation")
+    context = Validation.ValidationContext(Validation.ValidationRegistry().GetOrLoadAllValidators())
     for seed in range(50):
         write_scene(folder / f"{seed}.{suffix}", random_scene(seed))
         found.update(e.GetMessage() for e in context.Validate(Usd.Stage.Open(str(folder / f"{seed}.{suffix}"))))
