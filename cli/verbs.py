@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from inspect import cleandoc
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -429,6 +429,19 @@ FIGURES: dict[str, Callable[["Figures"], str]] = {
     "ns/eval": lambda run: f"{run.ns_per_evaluation:.2f}",
     "GB": lambda run: f"{run.peak_bytes / 1e9:.1f}",
 }
+
+
+@verb(json_of("the table as a list of objects"))
+def viewers(words: Words) -> Answer:
+    """List the viewers that --for knows: what each adds to a splat, where a splat ends, and what to set there.
+
+    To fit a scene to one of them, use convert; to draw scenes as it does, compare.
+    """
+    from aaplug.methods.viewers import VIEWERS
+
+    headings = ("--for", "adds", "a splat ends at", "program, what to choose there, and how the rule is known")
+    rows = [(v.name, v.rule, v.end, f"{v.program} ({v.evidence}): {v.row()['settings']}") for v in VIEWERS.values()]
+    return Answer([asdict(viewer) for viewer in VIEWERS.values()], [table(rows, headings)])
 
 
 @verb(Option("name", names(*GUIDES, metavar="[NAME]", by_place=True), "The guide to print.", None))

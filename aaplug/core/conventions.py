@@ -39,4 +39,6 @@ MIP = Convention("mip", 0.1, compensated=True)  # Mip-Splatting (Yu et al. 2024)
 # PlayCanvas (engine 2.23.3) adds 0.3 in half pixels; what is fitted to it records that as its training
 PLAYCANVAS = Convention("playcanvas", 0.3 / 4, compensated=True)
 PLAYCANVAS_CLASSIC = Convention("playcanvas-classic", 0.3 / 4, compensated=False)  # its anti-aliasing is off
-CONVENTIONS = {c.name: c for c in (CLASSIC, ANTIALIASED, MIP, PLAYCANVAS, PLAYCANVAS_CLASSIC)}
+KHR = Convention("khr", 0.0, compensated=False)  # glTF's KHR_gaussian_splatting and OpenUSD: nothing is added
+CESIUM = Convention("cesium", 0.3 / 16, compensated=False)  # CesiumJS adds 0.3 in quarters of a pixel
+CONVENTIONS = {c.name: c for c in (CLASSIC, ANTIALIASED, MIP, PLAYCANVAS, PLAYCANVAS_CLASSIC, KHR, CESIUM)}

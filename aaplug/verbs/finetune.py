@@ -26,8 +26,8 @@ from aaplug.finetuning.state import TuningJob
 from aaplug.io.atomic import AnyPath, check_output, replacing
 from aaplug.io.images import write_png
 from aaplug.io.scenes import SceneLike, check_scene_output, write_scene
-from aaplug.methods import RECIPES
 from aaplug.methods.conversion import fuse_for
+from aaplug.methods.presets import recipe_of
 from aaplug.methods.viewers import FAST, VIEWERS
 from aaplug.options.verbs import FinetuneOptions
 from aaplug.rendering.cost import GRADIENTS, Cost, cost_of
@@ -88,7 +88,7 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
     upsampler = digest_of_files([upsampler]) if Path(upsampler).is_file() else upsampler
     with running(options, path, check, job.inputs):
         raw, look, train = job.scene.gaussians(), job.look(settings.steps, gradients=True), job.cameras.train
-        before = replace(look, scene=viewer.shown(look.scene), recipe=RECIPES[viewer.recipe])
+        before = replace(look, scene=viewer.shown(look.scene), recipe=recipe_of(viewer))
         start = replace(before, scene=fuse_for(raw, look.training, viewer))
         truth = Truth(look, truth_source, enlarge=enlarge, memory=MEMORY)
         tuning = TuningJob(start, train, truth, settings, upsampler, method.densify)

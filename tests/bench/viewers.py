@@ -32,6 +32,7 @@ from aaplug.io.images import read_image
 from aaplug.io.photographs import read_photo
 from aaplug.io.scenes import read_scene, write_scene
 from aaplug.methods.conversion import fuse_for
+from aaplug.methods.presets import recipe_of
 from aaplug.methods.viewers import VIEWERS, Viewer
 from aaplug.rendering.renderer import Renderer
 from aaplug.verbs.convert import convert
@@ -64,6 +65,8 @@ PAGES = {
     "spark-classic": Page("spark", {"preBlurAmount": 0.3, "blurAmount": 0}),
     "playcanvas": Page("playcanvas", {"antiAlias": True}, {"antiAlias": False}),
     "playcanvas-classic": Page("playcanvas", {"antiAlias": False}),
+    "babylon": Page("babylon", {"Compensation": True}, {"Compensation": False}),
+    "babylon-classic": Page("babylon", {"Compensation": False}),
     "mkkellogg": _mkkellogg(antialiased=True),
     "mkkellogg-mip": _mkkellogg(antialiased=True, kernel2DSize=0.1),
     "mkkellogg-classic": _mkkellogg(),
@@ -81,7 +84,8 @@ def main(
         views: their number.
         rows: of the table.
     """
-    subprocess.run(["npm", "install", "--no-audit", "--no-fund", "--silent"], cwd=FOLDER, check=True)
+    if not (FOLDER / "node_modules").exists():
+        subprocess.run(["npm", "install", "--no-audit", "--no-fund", "--silent"], cwd=FOLDER, check=True)
     work.mkdir(parents=True, exist_ok=True)
     with as_file(files("aaplug.io.sample")) as sample:
         scene, cameras = read_scene(sample / "chair.ply").gaussians(), read_cameras(sample)
@@ -104,7 +108,8 @@ class Bench:
 
     def converted(self, viewer: Viewer) -> Gaussians:
         """The scene for a viewer; made once for each rule and degree."""
-        path = self.work / f"{viewer.recipe}-{viewer.sh_degree}.ply"
+        assert viewer.convention is not None
+        path = self.work / f"{viewer.convention.name}-{viewer.sh_degree}.ply"
         if not path.exists():
             if self.steps == 0:  # `convert` would measure it too
                 scene = fuse_for(self.scene, TrainingViews.of(self.scene, self.cameras), viewer)
@@ -132,7 +137,7 @@ class Bench:
             photos = [_photograph(view, scale) for view in self.views]
             cell = f"{_mean(drawn, photos):.2f}"
             if viewer is not None:
-                own = Renderer.of(viewer.shown(scene), self.cameras, viewer.recipe, background=WHITE)
+                own = Renderer.of(viewer.shown(scene), self.cameras, recipe_of(viewer), background=WHITE)
                 predicted = [quantised(own(view.scaled(scale)).rgb) for view in self.views]
                 cell += f" ({_mean(drawn, predicted):.1f})"
             cells.append(cell)
@@ -142,15 +147,23 @@ class Bench:
         self, scene: Gaussians, page: str, options: Mapping[str, Any]
     ) -> dict[tuple[str, float], Float[Tensor, "h w 3"]]:
         """What a page draws, by view and scale."""
-        path, job = self.work / "shown.ply", self.work / "job.json"
-        write_scene(path, scene, overwrite=True)
+        job, shown = self.work / "job.json", self.work / "shown"
+        shown.mkdir(exist_ok=True)
+        write_scene(shown / "scene.ply", scene, overwrite=True)
         files = {(v.name, s): self.work / f"{v.name}@{s:g}.png" for v in self.views for s in SCALES}
         shots = [
             _shot(view.scaled(scale)) | {"file": str(files[view.name, scale])}
             for view in self.views
             for scale in SCALES
         ]
-        facts = {"page": page, "scene": str(path), "options": options, "shots": shots, "seconds": PAGE_SECONDS}
+        facts = {
+            "page": page,
+            "scene": str(shown),
+            "url": "scene.ply",
+            "options": options,
+            "shots": shots,
+            "seconds": PAGE_SECONDS,
+        }
         job.write_text(json.dumps(facts | {"chromium": _chromium()}))
         subprocess.run(["node", str(FOLDER / "run.mjs"), str(job)], check=True)
         return {key: read_image(file, WHITE) for key, file in files.items()}
