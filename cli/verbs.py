@@ -103,7 +103,7 @@ def convert(words: Words) -> Answer:
 
 @verb(
     *SCENE_AND_CAMERAS,
-    output("PATH", "The one scene's file (as of convert), or a folder for levels (.ply) or, with --batch, all."),
+    output("PATH", "The one scene's file (as of convert), or a folder for levels or, with --batch, for all."),
     verbs.LodOptions,
     *SEVERAL,
     json_of("what was made as one JSON object"),

@@ -5,10 +5,11 @@ Importing them takes no torch, so that help and mistakes on the command line are
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Literal, get_args
 
 from aaplug.core.conventions import CONVENTIONS, SpzAxes
-from aaplug.io import MOST_FPS
+from aaplug.io import MOST_FPS, StreamName
 from aaplug.io.atomic import AnyPath
 from aaplug.options.base import DRAWING, FILES, FILM, PYTHON_ONLY, REPORT, TUNING, Options, flag, names, number
 from aaplug.options.shared import (
@@ -203,6 +204,10 @@ class LodOptions(WritingOptions, ViewOptions):
     """With --simplify or --budget: size of the images that the scene is meant for (default: root of the share)."""
     viewer: OneViewer = None
     """Tune each file for spark, playcanvas or another of `aaplug guide viewers`, instead of for aaplug."""
+    to: Annotated[StreamName | None, names("sog", "3dtiles")] = None
+    """With levels: write them as a viewer streams them, sog (PlayCanvas) or 3dtiles (CesiumJS), tuned for its rule."""
+    page: Annotated[AnyPath | None, flag("NODE_MODULES", read=Path)] = None
+    """With --to: add a page that opens the result, and the viewer's program from this folder of npm packages."""
     refine: bool = True
     """Merge alone: do not tune the result to look like the scene, which takes minutes."""
     steps: Annotated[int | None, STEPS] = None
@@ -219,8 +224,12 @@ class LodOptions(WritingOptions, ViewOptions):
             raise UsageError("scale", "belongs to `simplify` and `budget`")
         if self.merge_below and self.single:
             raise UsageError("merge_below", "belongs to levels")
-        if self.resume and (self.single or self.viewer is not None):
-            raise UsageError("resume", "belongs to levels for aaplug")
+        if self.to is not None and self.single:
+            raise UsageError("to", "belongs to levels")
+        if self.page is not None and self.to is None:
+            raise UsageError("page", "belongs to `to`")
+        if self.resume and (self.single or (self.viewer is not None and self.to is None)):
+            raise UsageError("resume", "belongs to levels for aaplug, and to `to`")
         if self.viewer is not None and not self.tuning:
             raise UsageError("viewer", "is what the result is tuned for: leave out `refine`, and `steps` of 0")
 
