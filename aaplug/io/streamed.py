@@ -30,6 +30,7 @@ LEAF_GAUSSIANS = 1 << 16  # of the finest level in a part of space
 SWITCH = 1.5  # rate at which a viewer should change level, as a multiple of the coarser level's own
 EXTENT = 3.0  # standard deviations to which a tile's box holds its splats
 PLAYCANVAS_TANGENT = math.tan(math.radians(22.5))  # of half the field of view that its distances are meant for
+UPDATE_SHARE = 1 / 16  # of the first distance: PlayCanvas chooses levels again when the camera moved so far
 MAX_SCREEN_ERROR = 16.0  # px, `maximumScreenSpaceError` of CesiumJS by default
 ALWAYS = 1e6  # error of the root over that of the coarsest level, so that something is drawn at any distance
 SPLATS = ["KHR_gaussian_splatting", "KHR_gaussian_splatting_compression_spz_2"]
@@ -144,6 +145,7 @@ def _lod_meta(stream: Stream, parts: Sequence[Sequence[Gaussians]], rate: float)
         "app.scene.gsplat": {"antiAlias": True, "splatBudgetMode": "limit", "splatBudget": 0},
         "gsplat component": {"lodMultiplier": 2.0},
         "lodBaseDistance per px of the image's height": 1 / (PLAYCANVAS_TANGENT * SWITCH * rate),
+        "lodUpdateDistance per lodBaseDistance": UPDATE_SHARE,
     }
     return facts | {"lodLevels": len(counts), "filenames": filenames, "tree": tree}, settings
 

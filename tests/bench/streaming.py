@@ -111,7 +111,7 @@ def _options(name: StreamName, settings: Mapping[str, Any]) -> dict[str, Any]:
     """settings.json as the page takes it."""
     if name == "3dtiles":
         return settings["Cesium3DTileset"]
-    engine, component, distance = settings.values()
+    engine, component, distance, _ = settings.values()
     return {**engine, "component": component, "distancePerPixel": distance}
 
 
