@@ -2,8 +2,8 @@
 
 Two indexes: PlayCanvas's lod-meta.json, version 1, of SOG folders, and a tileset.json of 3D Tiles 1.1, of .glb files
 with KHR_gaussian_splatting_compression_spz_2, as CesiumJS takes them.  Level k is right from 2^-k of the training rate;
-a viewer should change to it where its pixels lie at `SWITCH` times that rate.  Both viewers choose by distance: at a
-distance d, an image h px high samples a world unit with h / (2 tan(fov / 2) d) px.
+a viewer should change to it where its pixels lie at `SWITCH` times that rate.  Both viewers choose by the distance of a
+part's nearest point: at a distance d, an image h px high samples a world unit with h / (2 tan(fov / 2) d) px.
 """
 
 import json
