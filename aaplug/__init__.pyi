@@ -36,6 +36,7 @@ from .verbs.evaluate import evaluate as evaluate
 from .verbs.finetune import finetune as finetune
 from .verbs.info import info as info
 from .verbs.lod import lod as lod
+from .verbs.merge import merge as merge
 from .verbs.refine_poses import refine_poses as refine_poses
 from .verbs.render import render as render
 from .verbs.video import video as video

@@ -39,7 +39,7 @@ class SceneOptions(FileOptions):
     """The scene."""
 
     scene: Annotated[Path | None, flag("SCENE", read=Path, by_place=True)] = None
-    """A scene (.ply, .compressed.ply, .spz, .sog, .splat, .ksplat) or a folder (INRIA model, SOG, levels of detail)."""
+    """A scene (.ply, .spz, .sog, .glb, .usdz, others: `aaplug guide formats`), or a folder with one or its levels."""
     model_path: Annotated[Path | None, flag("FOLDER", "-m", read=Path), SCENE_FILE] = None
     """An INRIA model folder, instead of SCENE."""
     iteration: Annotated[int | None, number(0, 10**9, whole=True, metavar="N"), SCENE_FILE] = None

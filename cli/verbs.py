@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from inspect import cleandoc
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -35,6 +35,11 @@ HERE = Path(__file__).resolve().parent
 GUIDES = {each.stem: each for each in sorted(HERE.glob("guides/*.md")) or sorted(HERE.glob("../examples/guides/*.md"))}
 PROGRAM_KEYS = ("fused", "comments")  # of `info`, for programs; the table has words for the first
 
+
+WRITTEN = (
+    "File to write: .ply; .compressed.ply, .sog, .spz, .glb, .gltf, .usda, .usdc, .usdz or .splat, which keep less "
+    "(see `aaplug guide formats`)"
+)
 
 Run = Callable[[Words], Answer]
 
@@ -70,7 +75,7 @@ def render(words: Words) -> Answer:
 
 @verb(
     *SCENE_AND_CAMERAS,
-    output("FILE", "File to write: .ply, or .spz or .splat, which round values and keep less; with --batch, a folder."),
+    output("FILE", WRITTEN + "; with --batch, a folder."),
     verbs.ConvertOptions,
     *SEVERAL,
     json_of("what was done as one JSON object"),
@@ -98,7 +103,7 @@ def convert(words: Words) -> Answer:
 
 @verb(
     *SCENE_AND_CAMERAS,
-    output("PATH", "The one scene's file (.ply, .spz or .splat), or a folder for levels (.ply) or, with --batch, all."),
+    output("PATH", "The one scene's file (as of convert), or a folder for levels or, with --batch, for all."),
     verbs.LodOptions,
     *SEVERAL,
     json_of("what was made as one JSON object"),
@@ -243,6 +248,27 @@ def compare(words: Words) -> Answer:
     if failed:
         say(f"{lowest.scene} at {lowest.scale:g}: mean PSNR {lowest.value:.2f} dB is below {least:g} dB")
     return Answer(comparison.summary(), comparison.tables(), failed)
+
+
+@verb(
+    Option("scenes", flag("SCENE [SCENE ...]", read=Path, by_place=True, count=None), "The scenes, of any format.", ()),
+    CameraOptions,
+    output("FILE", WRITTEN + "."),
+    verbs.MergeOptions,
+    FileOptions,
+    json_of("what was done as one JSON object"),
+)
+def merge(words: Words) -> Answer:
+    """Put scenes into one file, each moved, turned and scaled, all by one rule of drawing.
+
+    Scenes of several rules are converted, for which --cameras, or each model folder's own, tell how finely training
+    sampled them.  To make one scene lighter, use lod.
+    """
+    scenes = [open_scene(words, path) for path in words.scenes]
+    cameras = read_cameras(words, scenes[0]) if words.cameras else None
+    merged = aaplug.merge(scenes, cameras, words.output, **told(words, verbs.MergeOptions))
+    say(f"wrote {words.output}: {len(merged):,} Gaussians, {merged.convention.name}")
+    return Answer({"output": str(words.output), "gaussians": len(merged), "convention": merged.convention.name})
 
 
 @verb(
@@ -403,6 +429,19 @@ FIGURES: dict[str, Callable[["Figures"], str]] = {
     "ns/eval": lambda run: f"{run.ns_per_evaluation:.2f}",
     "GB": lambda run: f"{run.peak_bytes / 1e9:.1f}",
 }
+
+
+@verb(json_of("the table as a list of objects"))
+def viewers(words: Words) -> Answer:
+    """List the viewers that --for knows: what each adds to a splat, where a splat ends, and what to set there.
+
+    To fit a scene to one of them, use convert; to draw scenes as it does, compare.
+    """
+    from aaplug.methods.viewers import VIEWERS
+
+    headings = ("--for", "adds", "a splat ends at", "program, what to choose there, and how the rule is known")
+    rows = [(v.name, v.rule, v.end, f"{v.program} ({v.evidence}): {v.row()['settings']}") for v in VIEWERS.values()]
+    return Answer([asdict(viewer) for viewer in VIEWERS.values()], [table(rows, headings)])
 
 
 @verb(Option("name", names(*GUIDES, metavar="[NAME]", by_place=True), "The guide to print.", None))

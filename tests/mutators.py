@@ -34,6 +34,10 @@ def changed(data: bytes, rng: random.Random) -> bytes:
         return gzip.compress(changed(gzip.decompress(data), rng), 1)
     if data.startswith(b"PK\3\4"):
         return _changed_zip(data, rng)
+    if data.startswith(b"glTF") and rng.random() < 0.7:
+        end = 20 + int.from_bytes(data[12:16], "little")
+        tree = _changed_tree(json.loads(data[20:end]), rng)
+        return data[:12] + struct.pack("<I", len(tree)) + data[16:20] + tree + data[end:]
     with suppress(ValueError):
         return _changed_tree(json.loads(data), rng)
     header, end, body = data.partition(b"end_header\n")

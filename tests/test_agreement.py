@@ -81,7 +81,6 @@ def test_cameras_of_the_same_capture_are_not_doubted_whatever_the_background(
 
 @pytest.mark.parametrize("axes", ["opengl", "opencv"])
 def test_a_spz_is_read_as_fits_the_cameras(sample_scene, sample_cameras, tmp_path: Path, axes):
-    pytest.importorskip("gsply")
     scene = sample_scene[:: len(sample_scene) // 3000]
     write_scene(tmp_path / "a.spz", scene, spz_axes=axes)
     chosen = settled(read_scene(tmp_path / "a.spz"), sample_cameras)
@@ -91,8 +90,7 @@ def test_a_spz_is_read_as_fits_the_cameras(sample_scene, sample_cameras, tmp_pat
 
 
 def test_assumed_cameras_decide_nothing(sample_scene, tmp_path: Path):
-    pytest.importorskip("gsply")
-    write_scene(tmp_path / "a.spz", sample_scene[:100], spz_axes="opencv")
+    write_scene(tmp_path / "a.spz", sample_scene[:100], spz_axes="opencv", spz_version=3)
     opened = read_scene(tmp_path / "a.spz")
     assert opened.other is not None
     assert settled(opened, cameras_around(opened, Orbit())) is opened
@@ -121,8 +119,7 @@ def test_of_two_readings_each_is_decoded_once_and_what_is_odd_is_said_once(sampl
 
 
 def test_a_reading_that_the_cameras_may_change_is_told_as_such(sample_scene, tmp_path, capsys):
-    pytest.importorskip("gsply")
-    write_scene(tmp_path / "a.spz", sample_scene[:100], spz_axes="opencv")
+    write_scene(tmp_path / "a.spz", sample_scene[:100], spz_axes="opencv", spz_version=3)
     for axes, provisional in (("auto", True), ("opencv", False)):
         with pytest.raises(SystemExit):
             main(["info", str(tmp_path / "a.spz"), "--spz-axes", axes])
@@ -131,7 +128,6 @@ def test_a_reading_that_the_cameras_may_change_is_told_as_such(sample_scene, tmp
 
 
 def test_without_evidence_a_spz_follows_its_specification(sample_scene, sample_cameras, tmp_path: Path):
-    pytest.importorskip("gsply")
-    write_scene(tmp_path / "a.spz", sample_scene[:100], spz_axes="opencv")
+    write_scene(tmp_path / "a.spz", sample_scene[:100], spz_axes="opencv", spz_version=3)
     chosen = settled(read_scene(tmp_path / "a.spz"), without_photos(sample_cameras))
     assert torch.equal(chosen.gaussians().means, read_scene(tmp_path / "a.spz", spz_axes="opengl").gaussians().means)

@@ -16,6 +16,7 @@ OUTPUTS = {  # verb, words, what is claimed, what a rival writes there
     "render": (f"render {SCENE} -o images", "images", "r_0.png"),
     "one image": (f"render {SCENE} -o view.png", "view.png", ""),
     "convert": ("convert scene.ply --cameras . -o c.ply", "c.ply", ""),
+    "merge": ("merge scene.ply --cameras . --into mip -o m.glb", "m.glb", ""),
     "video": (f"video {SCENE} -o v.webm --seconds 0.1", "v.webm", ""),
     "lod": (f"lod {SCENE} -o light.ply --simplify 0.5 --no-refine", "light.ply", ""),
     "levels": (f"lod {SCENE} -o levels --levels 1 --no-refine", "levels", "lod.json"),

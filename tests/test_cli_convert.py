@@ -122,7 +122,6 @@ def test_what_was_tuned_converts_and_what_was_converted_does_not_again(cli):
 
 
 def test_a_file_fits_the_viewer_or_names_one_that_opens_it(cli):
-    pytest.importorskip("gsply")
     means = read_scene("scene.ply").gaussians().means
     for viewer, axes in (("spark", "opencv"), ("spark --spz-axes opengl", "opengl"), ("mip", "opengl")):
         code, _, err = cli(f"convert scene.ply --cameras . -o c.spz --for {viewer} --steps 0 --overwrite")

@@ -16,6 +16,7 @@ from aaplug.methods import FORMS, RECIPES
 from aaplug.methods.conversion import FITTED_VARIANCE, fuse, fuse_for
 from aaplug.methods.filters.dilation import Dilation
 from aaplug.methods.filters.energy import MatchedEnergy
+from aaplug.methods.presets import recipe_of
 from aaplug.methods.viewers import VIEWERS
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import UsageError
@@ -95,8 +96,8 @@ def test_harmonics_that_a_viewer_does_not_draw_are_not_written(tmp_path, cameras
 def test_playcanvas_adds_a_quarter_of_what_its_number_says():
     """Its 0.3 is in half pixels: measured, its pictures agree with 0.075 px² to 41 dB, with 0.3 px² to 37 and less."""
     for name, compensated in (("playcanvas", True), ("supersplat", True), ("playcanvas-classic", False)):
-        viewer, screen = VIEWERS[name], RECIPES[VIEWERS[name].recipe].screen
-        assert screen == Dilation(0.075, compensated)
+        viewer = VIEWERS[name]
+        assert recipe_of(viewer).screen == Dilation(0.075, compensated, smallest=0.125)
         assert viewer.convention is not None
         assert (viewer.convention.kernel, viewer.convention.compensated) == (0.075, compensated)
         assert viewer.switched == compensated
@@ -104,7 +105,8 @@ def test_playcanvas_adds_a_quarter_of_what_its_number_says():
 
 @pytest.mark.parametrize("viewer", VIEWERS.values(), ids=VIEWERS)
 def test_a_viewers_recipe_draws_by_its_rule(viewer):
-    assert RECIPES[viewer.recipe].screen == Dilation.of(viewer.convention)
+    rule = viewer.convention
+    assert recipe_of(viewer).screen == Dilation(rule.kernel, rule.compensated, viewer.smallest, viewer.apart)
 
 
 def test_a_scene_thinner_than_a_viewers_blur_keeps_some_area(cameras):

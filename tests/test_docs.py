@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from aaplug.io.scenes import SCENE_FORMATS
-from aaplug.methods.viewers import MOST_DEGREE, VIEWERS, Viewer
+from aaplug.methods.viewers import VIEWERS, Viewer
 
 ROOT = Path(__file__).resolve().parents[1]
 TEXTS = [ROOT / "README.md", *sorted((ROOT / "examples").rglob("*.md"))]
@@ -69,12 +69,8 @@ def test_every_format_has_a_row():
 
 def row_of(viewer: Viewer) -> str:
     """A viewer's row of the table in viewers.md."""
-    assert viewer.convention is not None
-    kernel, compensated = f"{viewer.convention.kernel:g} px²", "yes" if viewer.convention.compensated else "no"
-    choose = f"**anti-aliasing on:** {viewer.settings}" if viewer.switched else viewer.settings
-    degree = "any" if viewer.sh_degree == MOST_DEGREE else str(viewer.sh_degree)
-    cells = f"`{viewer.name}`", viewer.program, choose, kernel, compensated, degree, viewer.cut
-    return f"| {' | '.join(cells)} |"
+    name, *cells = viewer.row().values()
+    return f"| `{name}` | {' | '.join(cells)} |"
 
 
 @pytest.mark.parametrize("viewer", VIEWERS.values(), ids=VIEWERS)

@@ -13,6 +13,7 @@ from aaplug.lab.adaptive import ADAPTIVE_VARIANCE, Adaptive
 from aaplug.lab.pixel_size import ByPixelSize, PixelSizes, pixel_size
 from aaplug.lab.smoothing import LEAST_SHARE, AnisotropicSmoothing
 from aaplug.methods import RECIPES
+from aaplug.methods.filters.dilation import Dilation
 from aaplug.methods.filters.smoothing import BALANCE_FLOOR, Smoothing3D
 from aaplug.methods.recipes import suited
 from aaplug.rendering.renderer import Renderer
@@ -217,3 +218,28 @@ def test_the_low_pass_filter_follows_the_rate_where_it_is_matched(name, factor):
     squared = 2 * 0.5 / factor**2  # the nearest pixel centres are half a px away in x and y
     expected = scene.opacities.item() * math.exp(-squared / 2)
     assert alpha.max().item() == pytest.approx(expected, rel=1e-3)
+
+
+@pytest.mark.parametrize("apart", [0.0, 0.1**0.5])
+def test_a_viewers_clamps_are_those_of_its_shader(apart):
+    """Splat by splat: the axes as the vertex shaders of PlayCanvas and GaussianSplats3D take them, variances in px²."""
+    splats, smallest = project(SCENE, NEAR.scaled(0.2)), 0.5
+    raw = splats.blurred(0.1, compensate=True)
+    shown = Dilation(0.1, True, smallest, apart)(splats, NEAR, TrainingViews.of(SCENE, [NEAR]))
+    kept = 0
+    for (xx, xy, yy), opacity, after, covariance in zip(
+        raw.covs.tolist(), raw.opacities.tolist(), shown.opacities.tolist(), shown.covs.tolist(), strict=True
+    ):
+        mean, radius = (xx + yy) / 2, max(math.hypot((xx - yy) / 2, xy), apart)
+        longer, shorter = mean + radius, mean - radius
+        if longer < smallest or shorter <= 0:
+            assert after == 0
+            continue
+        kept += 1
+        u, v = xy, longer - xx
+        norm = math.hypot(u, v)
+        u, v = u / norm, v / norm
+        expected = longer * u * u + shorter * v * v, (longer - shorter) * u * v, longer * v * v + shorter * u * u
+        assert after == opacity
+        assert covariance == pytest.approx(expected, abs=1e-9)
+    assert 0 < kept < len(splats)

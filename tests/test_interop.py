@@ -85,7 +85,6 @@ def test_what_survives_splat_transform_is_whether_training_compensated(suffix, c
 @needs_it
 @pytest.mark.parametrize("convention", [CLASSIC, ANTIALIASED])
 def test_splat_transform_reads_our_spz(convention, tmp_path):
-    pytest.importorskip("gsply")
     ours, path = replace(read_scene(ORACLE).gaussians(), convention=convention), tmp_path / "ours.spz"
     write_scene(path, ours, spz_axes="opencv")
     transformed(path, tmp_path / "theirs.ply")

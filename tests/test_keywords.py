@@ -18,6 +18,7 @@ KEYWORDS = {
     "lod": ("merge_below=1.0", "merge_bellow=1.0"),
     "finetune": ("learning_rate=0.5", "lerning_rate=0.5"),
     "compare": ("any_frame=True", "anyframe=True"),
+    "merge": ("into='mip'", "in_to='mip'"),
     "video": ("seconds=3.0", "second=3.0"),
     "info": ("min_seen=0.1", "min_sen=0.1"),
     "bench": ("repeats=3", "repeat=3"),
@@ -32,7 +33,7 @@ SCENES = ["a.ply", "b.ply"]
 
 def call(verb: str, keyword: str) -> str:
     """A line that calls a verb with a keyword."""
-    inputs = "SCENES" if verb == "compare" else "SCENES[0]"
+    inputs = "SCENES" if verb in ("compare", "merge") else "SCENES[0]"
     return f"aaplug.{verb}({inputs}, 'cameras', {keyword})\n"
 
 

@@ -87,6 +87,7 @@ def right_calls(folder: Path) -> dict[str, tuple[Callable[..., Any], dict[str, A
         ),
         "info": (aaplug.info, {"scene": gaussians, "cameras": cameras, "min_seen": 0.0}),
         "compare": (aaplug.compare, {"scenes": [nowhere, nowhere], "output": folder / "compare"}),
+        "merge": (aaplug.merge, {"scenes": [gaussians, gaussians], "cameras": cameras, "min_seen": 0.0}),
         "serving": (aaplug.serving, {"scene": nowhere}),
         "view": (aaplug.view, {"scene": nowhere, "no_browser": True}),
         "bench": (aaplug.bench, {"scene": nowhere}),

@@ -10,6 +10,7 @@ from aaplug.core.rules import RULES_3DGS, Rules
 from aaplug.system.contracts import Range, check_fields
 
 SpzAxes = Literal["auto", "opengl", "opencv"]  # of a .spz: as the cameras tell, its specification, splat-transform
+SpzVersion = Literal[3, 4]  # of a .spz to write: as older readers take it, or with its axes stated
 MAX_KERNEL = 1e6  # px²: what is computed from it stays finite
 MIN_SEEN_SHARE = 0.5  # cameras that see a smaller share of the Gaussians are taken to be in another frame
 
@@ -38,4 +39,6 @@ MIP = Convention("mip", 0.1, compensated=True)  # Mip-Splatting (Yu et al. 2024)
 # PlayCanvas (engine 2.23.3) adds 0.3 in half pixels; what is fitted to it records that as its training
 PLAYCANVAS = Convention("playcanvas", 0.3 / 4, compensated=True)
 PLAYCANVAS_CLASSIC = Convention("playcanvas-classic", 0.3 / 4, compensated=False)  # its anti-aliasing is off
-CONVENTIONS = {c.name: c for c in (CLASSIC, ANTIALIASED, MIP, PLAYCANVAS, PLAYCANVAS_CLASSIC)}
+KHR = Convention("khr", 0.0, compensated=False)  # glTF's KHR_gaussian_splatting and OpenUSD: nothing is added
+CESIUM = Convention("cesium", 0.3 / 16, compensated=False)  # CesiumJS adds 0.3 in quarters of a pixel
+CONVENTIONS = {c.name: c for c in (CLASSIC, ANTIALIASED, MIP, PLAYCANVAS, PLAYCANVAS_CLASSIC, KHR, CESIUM)}

@@ -7,6 +7,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+MOST_COEFFICIENTS = 25  # per channel, of degree 4
+GOLDEN_ANGLE = 2.399963229728653  # π·(3 − √5) rad: directions at its multiples are spread evenly
 COLOUR_OFFSET = 0.5  # 3DGS stores colours around mid-grey
 
 SH_C0 = 0.28209479177387814
@@ -28,6 +30,22 @@ def sh_colour(sh: Float[Tensor, "m k 3"], directions: Float[Tensor, "m 3"]) -> F
     for basis, coefficients in zip(_sh_basis(directions, sh.shape[1]), sh.unbind(dim=1), strict=True):
         colour = colour + basis[:, None] * coefficients
     return colour
+
+
+def sh_turned(sh: Float[Tensor, "n k 3"], turn: Float[Tensor, "3 3"]) -> Float[Tensor, "n k 3"]:
+    """The harmonics of a scene that is turned: their colour along turn · d is what it was along d.
+
+    A rotation takes each degree to itself, so 2·25 directions determine the matrix (Green 2003, "Spherical Harmonic
+    Lighting"); it is solved in float64.
+    """
+    k = sh.shape[1]
+    sines = torch.linspace(-0.98, 0.98, 2 * MOST_COEFFICIENTS, dtype=torch.float64)
+    angles = GOLDEN_ANGLE * torch.arange(len(sines))
+    cosines = (1 - sines.square()).sqrt()
+    ways = torch.stack([cosines * angles.cos(), cosines * angles.sin(), sines], dim=1)
+    after, before = (torch.stack(_sh_basis(d, k), dim=1) for d in (ways, ways @ turn.double()))
+    matrix = torch.linalg.lstsq(after, before).solution
+    return torch.einsum("jk,nkc->njc", matrix, sh.double()).to(sh.dtype)
 
 
 def _sh_basis(directions: Float[Tensor, "m 3"], coefficients: int) -> list[Float[Tensor, " m"]]:

@@ -13,8 +13,8 @@ from aaplug.finetuning.parameters import between
 from aaplug.finetuning.session import tune, tuned_scene
 from aaplug.finetuning.settings import QUICK_SETTINGS, balance
 from aaplug.finetuning.state import TuningJob
-from aaplug.methods import RECIPES
 from aaplug.methods.conversion import fuse_for
+from aaplug.methods.presets import recipe_of
 from aaplug.methods.viewers import Viewer
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.monitor import SILENT, Monitor
@@ -48,7 +48,7 @@ def fit(
     steps: of the optimization; 0 keeps the closed form.
     """
     truth = Truth(look, enlarge=back_projected, memory=MEMORY)
-    original = replace(look, scene=viewer.shown(look.scene), recipe=RECIPES[viewer.recipe])
+    original = replace(look, scene=viewer.shown(look.scene), recipe=recipe_of(viewer))
 
     def measure(*candidates: Candidate) -> Report:
         with monitor.progress("measuring", "views") as tell:

@@ -20,8 +20,8 @@ from aaplug.finetuning.loop import run
 from aaplug.finetuning.parameters import RATES
 from aaplug.finetuning.settings import Settings
 from aaplug.finetuning.state import TuningJob, begin
-from aaplug.methods import RECIPES
 from aaplug.methods.conversion import TUNED
+from aaplug.methods.presets import recipe_of
 from aaplug.methods.viewers import Viewer
 from aaplug.options.verbs import LEVEL_STEPS
 from aaplug.rendering.renderer import Renderer
@@ -72,7 +72,7 @@ def refine(
     truth = Truth(look, memory=IMAGE_MEMORY)
     if viewer is not None:
         level = replace(viewer.shown(level), convention=viewer.convention_of(level))
-        look = replace(look, recipe=RECIPES[viewer.recipe])
+        look = replace(look, recipe=recipe_of(viewer))
     start = look.showing(level)
     before = _error(start, truth, probes, rate)
     if before < CLOSE_ENOUGH:

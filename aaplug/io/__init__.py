@@ -4,4 +4,8 @@ Every public function takes paths as `str | os.PathLike[str]`.  No file makes a 
 folder, or allocate more than `limits` allows.
 """
 
+from typing import Literal
+
 MOST_FPS = 1000  # frames per second of a video
+
+StreamName = Literal["sog", "3dtiles"]  # of `lod --to`

@@ -140,6 +140,20 @@ def read_start(path: Path, size: int) -> bytes:
         raise FormatError(path, f"cannot be read: {reason(error)}") from error
 
 
+def read_part(path: Path, start: int, size: int, short: bool = False) -> bytes:
+    """`size` bytes of a file from `start`; fewer are an error unless `short`."""
+    read_start(path, 0)  # checks that it is an ordinary file
+    try:
+        with path.open("rb") as file:
+            file.seek(start)
+            data = file.read(size)
+    except OSError as error:
+        raise FormatError(path, f"cannot be read: {reason(error)}") from error
+    if len(data) < size and not short:
+        raise FormatError(path, "was cut short while it was being read")
+    return data
+
+
 def read_bounded(path: Path, limit: int) -> bytes:
     """The bytes of a file that is not longer than `limit`."""
     data = read_start(path, limit + 1)

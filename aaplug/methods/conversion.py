@@ -82,6 +82,22 @@ def fuse_for(scene: Gaussians, training: TrainingViews, viewer: Viewer) -> Gauss
     return MatchedEnergy(FITTED_VARIANCE if fitted else trained.kernel - shown.kernel, shown)(scene, training)
 
 
+def carried(scene: Gaussians, training: TrainingViews, convention: Convention) -> Gaussians:
+    """The scene with the energy and the width that training showed, as one of another convention.
+
+    Widths are exact where the other kernel is smaller, but opacities are capped; where it is larger, Gaussians are
+    thinned as far as they can be.  Raises UsageError for 2D Gaussians.
+    """
+    if scene.convention == convention:
+        return scene
+    if scene.flat:
+        raise UsageError(scene.name, "holds 2D Gaussians, which closed-form conversion does not support")
+    variance = scene.convention.kernel - convention.kernel
+    if convention.compensated and not scene.convention.compensated:  # the smallest need room to keep their energy
+        variance = max(variance, FITTED_VARIANCE)
+    return MatchedEnergy(variance, convention)(scene, training)
+
+
 def blurring(fused: Sequence[Fusion]) -> list[Fusion]:
     """The fusions that added blur: all but merging and fine-tuning."""
     return [fusion for fusion in fused if fusion.method not in (MERGED, TUNED)]

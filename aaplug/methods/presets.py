@@ -1,17 +1,20 @@
-"""The recipes that a user picks, and those that predict PlayCanvas's pictures, each with its source."""
+"""The recipes that a user picks, and those that predict what other programs draw, each with its source."""
 
+from aaplug.methods import RECIPES
 from aaplug.methods.filters.dilation import (
     OF_ANTIALIASED,
     OF_CLASSIC,
     OF_MIP,
     OF_PLAYCANVAS,
     OF_PLAYCANVAS_CLASSIC,
+    Dilation,
     LowPass,
 )
 from aaplug.methods.filters.matched import BY_POSE
 from aaplug.methods.filters.smoothing import BY_VOLUME
 from aaplug.methods.pixel_kernels.surfel import SURFEL
 from aaplug.methods.recipe import Promises, Recipe, set_by
+from aaplug.methods.viewers import Viewer
 
 # Of a sample, the weight of those beside it where samples are few: it takes the noise off what compositing could not
 # resolve.  0.02 to 0.04 are best against the scenes' own look (examples/guides/methods.md).
@@ -91,3 +94,11 @@ PLAYCANVAS_CLASSIC_RECIPE = Recipe(
     "predicting their pictures; scenes converted for them",
     promises=Promises(keeps_energy=False),
 )
+
+
+def recipe_of(viewer: Viewer) -> Recipe:
+    """The recipe that predicts a viewer's pictures."""
+    if viewer.convention is None:
+        return RECIPES[viewer.recipe]
+    screen = Dilation(viewer.convention.kernel, viewer.convention.compensated, viewer.smallest, viewer.apart)
+    return Recipe(viewer.name, screen, viewer.program, "predicting its pictures")

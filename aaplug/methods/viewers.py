@@ -1,18 +1,32 @@
 """Viewers: programs that show scenes, each with the rule by which it turns covariances into pixels.
 
-A viewer adds a constant variance to every projected covariance, with or without compensation: its rule.
+A viewer adds a constant variance to every projected covariance, with or without compensation: its rule.  What else it
+does to a splat is here too, as far as it shows in pictures.
 """
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from aaplug.core.conventions import ANTIALIASED, CLASSIC, MIP, PLAYCANVAS, PLAYCANVAS_CLASSIC, Convention, SpzAxes
+from aaplug.core.conventions import (
+    ANTIALIASED,
+    CESIUM,
+    CLASSIC,
+    KHR,
+    MIP,
+    PLAYCANVAS,
+    PLAYCANVAS_CLASSIC,
+    Convention,
+    SpzAxes,
+    SpzVersion,
+)
+from aaplug.core.rules import RULES_3DGS
 from aaplug.system.registry import Registry, named
 
 if TYPE_CHECKING:
     from aaplug.core.gaussians import Gaussians
 
 MOST_DEGREE = 4  # of spherical harmonics in any file
+MEASURED, BY_SOURCE, BY_TEXT = "measured", "by its source, not tried", "by its text"
 
 
 @dataclass(frozen=True)
@@ -20,26 +34,40 @@ class Viewer:
     """A program with its settings, and the rule by which it then shows scenes.
 
     program: name and version that the rule was measured on or read from.
-    recipe: name of the recipe that implements the rule.
     convention: what the file must declare for this rule; None keeps the scene's own convention.
     settings: what to choose in the program, for the user.
+    evidence: how the rule is known.
+    recipe: name of the recipe that predicts its pictures; only where it has no convention of its own.
     switched: anti-aliasing is off there until these settings turn it on.
     sh_degree: highest degree of the harmonics that it draws.
-    cut: the end of a splat, in words.
+    cut: standard deviations at which a splat ends; None: only where its alpha is less than `floor`.
+    fades: the falloff is lowered to reach 0 at the cut.
+    floor: alpha below which a splat is not drawn at a pixel; 0: it has no such bound.
+    smallest: px²; a splat whose variance along its longer axis, with what was added, is less is not drawn.
+    apart: px²; least half difference of the variances along a splat's two axes, to which rounder ones are stretched.
+    levels: how it chooses levels of detail, in words; empty: it draws none.
     formats: suffixes of the scene files that the program is known to open, of those that aaplug writes.
     spz_axes: in which it takes the numbers of a .spz; "auto": those of the specification.
+    spz_version: of a .spz that it takes.
     """
 
     name: str
     program: str
-    recipe: str
     convention: Convention | None
     settings: str
+    evidence: str = BY_TEXT
+    recipe: str = "matched"
     switched: bool = False
     sh_degree: int = MOST_DEGREE
-    cut: str = "alpha < 1/255"
+    cut: float | None = None
+    fades: bool = False
+    floor: float = RULES_3DGS.min_alpha
+    smallest: float = 0.0
+    apart: float = 0.0
+    levels: str = ""
     formats: tuple[str, ...] = ("ply",)
     spz_axes: SpzAxes = "auto"
+    spz_version: SpzVersion = 4
 
     def convention_of(self, scene: "Gaussians") -> Convention:
         """The convention that the file of a scene for this viewer declares."""
@@ -52,6 +80,30 @@ class Viewer:
             return f"recipe {self.recipe}"
         return f"{self.convention.kernel:g} px², {'' if self.convention.compensated else 'not '}compensated"
 
+    @property
+    def end(self) -> str:
+        """Where a splat ends, and which splats are changed or left out, in words."""
+        ends = [] if self.cut is None else [f"{self.cut:.3g} σ" + (", fading out" if self.fades else "")]
+        ends += [f"alpha < {self.floor * 255:.2g}/255"] if self.floor and self.cut is None else []
+        ends += [f"drops variances < {self.smallest:g} px²"] if self.smallest else []
+        ends += [f"variances at least {2 * self.apart:.2g} px² apart"] if self.apart else []
+        return "; ".join(ends) or "nowhere"
+
+    def row(self) -> dict[str, str]:
+        """The rule by headings, in words."""
+        assert self.convention is not None
+        return {
+            "--for": self.name,
+            "program": self.program,
+            "settings": f"anti-aliasing on: {self.settings}" if self.switched else self.settings,
+            "adds": f"{self.convention.kernel:g} px²",
+            "compensated": "yes" if self.convention.compensated else "no",
+            "SH": "any" if self.sh_degree == MOST_DEGREE else str(self.sh_degree),
+            "a splat ends at": self.end,
+            "levels by": self.levels or "none",
+            "known": self.evidence,
+        }
+
     def advice(self, suffix: str = "ply") -> str:
         """One line on the settings to choose in the program for a file that was converted for it."""
         if suffix not in self.formats:
@@ -63,9 +115,9 @@ class Viewer:
         without = "with it off, a converted scene can look worse than the original"
         return f"in {self.program}, turn anti-aliasing on: {self.settings} ({without})"
 
-    def axes(self, asked: SpzAxes) -> SpzAxes:
-        """Axes for a .spz: those asked for, or the program's own."""
-        return self.spz_axes if asked == "auto" else asked
+    def spz(self, asked: SpzAxes) -> "dict[str, Any]":
+        """How a .spz is written, for `write_scene`: axes as asked for, or the program's own, and its version."""
+        return {"spz_axes": self.spz_axes if asked == "auto" else asked, "spz_version": self.spz_version}
 
     def shown(self, scene: "Gaussians") -> "Gaussians":
         """The scene with the harmonics that the program draws."""
@@ -73,29 +125,47 @@ class Viewer:
         return scene if scene.sh.shape[1] <= coefficients else replace(scene, sh=scene.sh[:, :coefficients])
 
 
-CLASSIC_VIEWER = Viewer("classic", "3DGS", "classic", CLASSIC, "nothing: anti-aliasing is off by default")
-MIP_VIEWER = Viewer("mip", "Mip-Splatting's viewers", "mip", MIP, "a kernel of 0.1, the default")
+ROOT_8 = 8**0.5  # standard deviations; the falloff there is exp(-4)
+NO_TAG = "nothing: the file has no tag"
+SMALLEST = 0.125  # px²: quads of less than two half pixels
+CLASSIC_VIEWER = Viewer("classic", "3DGS", CLASSIC, "nothing: anti-aliasing is off by default")
+MIP_VIEWER = Viewer("mip", "Mip-Splatting's viewers", MIP, "a kernel of 0.1, the default")
 
 
-def _spark(name: str, recipe: str, convention: Convention, settings: str) -> Viewer:
-    how = {"sh_degree": 3, "cut": "√8 σ", "formats": ("ply", "spz", "splat"), "spz_axes": "opencv"}
-    return Viewer(name, "Spark 2.2.0", recipe, convention, settings, **how)
+def _spark(name: str, convention: Convention, settings: str) -> Viewer:
+    files = {"formats": ("ply", "spz", "splat"), "spz_axes": "opencv", "spz_version": 3}
+    how = {"sh_degree": 3, "cut": ROOT_8, "floor": 0.5 / 255, **files}
+    levels = "size of a node over distance, within a budget of splats"
+    return Viewer(name, "Spark 2.2.0", convention, settings, MEASURED, levels=levels, **how)
 
 
-def _playcanvas(name: str, program: str, switch: str, compensated: bool) -> Viewer:
+def _playcanvas(name: str, program: str, switch: str, compensated: bool, evidence: str = MEASURED) -> Viewer:
     rule = PLAYCANVAS if compensated else PLAYCANVAS_CLASSIC
-    return Viewer(name, program, rule.name, rule, switch, compensated, sh_degree=3, cut="√8 σ, fading out")
+    how = {
+        "sh_degree": 3,
+        "cut": ROOT_8,
+        "fades": True,
+        "levels": "distance or a budget of splats",
+        "formats": ("ply", "sog"),
+        "smallest": SMALLEST,
+    }
+    return Viewer(name, program, rule, switch, evidence, switched=compensated, **how)
 
 
-def _mkkellogg(name: str, recipe: str, convention: Convention, settings: str) -> Viewer:
+def _babylon(name: str, switch: str, compensated: bool) -> Viewer:
+    rule = PLAYCANVAS if compensated else PLAYCANVAS_CLASSIC
+    how = {"sh_degree": 3, "cut": ROOT_8, "floor": 0.0, "formats": ("ply", "splat", "glb", "gltf")}
+    return Viewer(name, "Babylon.js 9.35.0", rule, switch, MEASURED, switched=compensated, **how)
+
+
+def _mkkellogg(name: str, convention: Convention, settings: str) -> Viewer:
     chosen = f"{settings}sphericalHarmonicsDegree: 2"
-    cut = "√8 σ; widths bent by √max(0.1, ·)"
-    how = {"sh_degree": 2, "cut": cut, "formats": ("ply", "splat")}
-    return Viewer(name, "GaussianSplats3D 0.4.7", recipe, convention, chosen, convention.compensated, **how)
+    how = {"sh_degree": 2, "cut": ROOT_8, "floor": 0.0, "apart": 0.1**0.5, "formats": ("ply", "splat")}
+    return Viewer(name, "GaussianSplats3D 0.4.7", convention, chosen, MEASURED, switched=convention.compensated, **how)
 
 
-def _gsplat(name: str, recipe: str, convention: Convention, settings: str) -> Viewer:
-    return Viewer(name, "gsplat 1.5.3", recipe, convention, settings, convention.compensated)
+def _gsplat(name: str, convention: Convention, settings: str) -> Viewer:
+    return Viewer(name, "gsplat 1.5.3", convention, settings, MEASURED, switched=convention.compensated)
 
 
 ENGINE, SUPERSPLAT, BRUSH = "PlayCanvas engine 2.23.3", "SuperSplat viewer 1.36.2", "Brush 2026-08"
@@ -105,27 +175,47 @@ VIEWERS: Registry[Viewer] = Registry(
     named(
         (
             CLASSIC_VIEWER,
-            Viewer("antialiased", "3DGS", "ewa", ANTIALIASED, "--antialiasing", switched=True),
+            Viewer("antialiased", "3DGS", ANTIALIASED, "--antialiasing", switched=True),
             MIP_VIEWER,
-            _spark("spark", "ewa", ANTIALIASED, "the defaults: preBlurAmount 0, blurAmount 0.3"),
-            _spark("spark-mip", "mip", MIP, "blurAmount: 0.1"),
-            _spark("spark-classic", "classic", CLASSIC, "preBlurAmount: 0.3, blurAmount: 0"),
+            Viewer("khr", "glTF KHR_gaussian_splatting", KHR, NO_TAG, sh_degree=3, cut=3.0, formats=("glb", "gltf")),
+            Viewer(
+                "usd", "OpenUSD 26.03's schema", KHR, NO_TAG, sh_degree=3, cut=3.0, formats=("usda", "usdc", "usdz")
+            ),
+            _spark("spark", ANTIALIASED, "the defaults: preBlurAmount 0, blurAmount 0.3"),
+            _spark("spark-mip", MIP, "blurAmount: 0.1"),
+            _spark("spark-classic", CLASSIC, "preBlurAmount: 0.3, blurAmount: 0"),
             _playcanvas("playcanvas", ENGINE, "app.scene.gsplat.antiAlias = true", True),
             _playcanvas("playcanvas-classic", ENGINE, "the default: app.scene.gsplat.antiAlias = false", False),
-            _playcanvas("supersplat", SUPERSPLAT, "aa in the page's address (?aa; WebGL)", True),
-            _playcanvas("supersplat-classic", SUPERSPLAT, "the default: no aa in the page's address", False),
-            _mkkellogg("mkkellogg", "ewa", ANTIALIASED, "antialiased: true, "),
-            _mkkellogg("mkkellogg-mip", "mip", MIP, "antialiased: true, kernel2DSize: 0.1, "),
-            _mkkellogg("mkkellogg-classic", "classic", CLASSIC, ""),
-            _gsplat("gsplat", "ewa", ANTIALIASED, 'rasterize_mode="antialiased"'),
-            _gsplat("gsplat-mip", "mip", MIP, 'rasterize_mode="antialiased", eps2d=0.1'),
-            _gsplat("gsplat-classic", "classic", CLASSIC, 'the default: rasterize_mode="classic"'),
-            Viewer("brush", BRUSH, "mip", MIP, "nothing: it follows the tag in the file"),
-            Viewer("brush-classic", BRUSH, "classic", CLASSIC, "nothing: it follows the tag in the file"),
+            _playcanvas("supersplat", SUPERSPLAT, "aa in the page's address (?aa; WebGL)", True, BY_SOURCE),
+            _playcanvas("supersplat-classic", SUPERSPLAT, "the default: no aa in the page's address", False, BY_SOURCE),
+            _babylon("babylon", "GaussianSplattingMaterial.Compensation = true", True),
+            _babylon("babylon-classic", "the default: GaussianSplattingMaterial.Compensation = false", False),
+            Viewer(
+                "cesium",
+                "CesiumJS 1.145.0",
+                CESIUM,
+                "nothing: it has no setting",
+                MEASURED,
+                sh_degree=3,
+                cut=ROOT_8,
+                floor=0.0,
+                levels="geometric error of a tile over distance (maximumScreenSpaceError)",
+                formats=("glb",),
+                smallest=SMALLEST,
+            ),
+            _mkkellogg("mkkellogg", ANTIALIASED, "antialiased: true, "),
+            _mkkellogg("mkkellogg-mip", MIP, "antialiased: true, kernel2DSize: 0.1, "),
+            _mkkellogg("mkkellogg-classic", CLASSIC, ""),
+            Viewer("unity", "UnityGaussianSplatting 1a03ecd", CLASSIC, "nothing", BY_SOURCE, sh_degree=3, cut=ROOT_8),
+            _gsplat("gsplat", ANTIALIASED, 'rasterize_mode="antialiased"'),
+            _gsplat("gsplat-mip", MIP, 'rasterize_mode="antialiased", eps2d=0.1'),
+            _gsplat("gsplat-classic", CLASSIC, 'the default: rasterize_mode="classic"'),
+            Viewer("brush", BRUSH, MIP, "nothing: it follows the tag in the file", BY_SOURCE),
+            Viewer("brush-classic", BRUSH, CLASSIC, "nothing: it follows the tag in the file", BY_SOURCE),
         )
     ),
 )
-FAST = Viewer("fast", "aaplug", "matched", None, "--recipe matched")
+FAST = Viewer("fast", "aaplug", None, "--recipe matched")
 
 
 def find_viewer(viewer: str | Viewer | None) -> Viewer | None:

@@ -5,10 +5,11 @@ Importing them takes no torch, so that help and mistakes on the command line are
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Literal, get_args
 
-from aaplug.core.conventions import SpzAxes
-from aaplug.io import MOST_FPS
+from aaplug.core.conventions import CONVENTIONS, SpzAxes
+from aaplug.io import MOST_FPS, StreamName
 from aaplug.io.atomic import AnyPath
 from aaplug.options.base import DRAWING, FILES, FILM, PYTHON_ONLY, REPORT, TUNING, Options, flag, names, number
 from aaplug.options.shared import (
@@ -19,6 +20,7 @@ from aaplug.options.shared import (
     THREADS,
     VIEWS,
     FilmOptions,
+    FrameOptions,
     ImageOptions,
     LensOptions,
     OneProtocol,
@@ -170,6 +172,20 @@ class ConvertOptions(WritingOptions, ViewOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
+class MergeOptions(WritingOptions, FrameOptions):
+    """Where each scene goes, and by which rule the file is to be drawn."""
+
+    into: Annotated[str | None, names(*CONVENTIONS)] = None
+    """Rule that all scenes are converted to (default: theirs if they agree, else mip)."""
+    move: Annotated[Sequence[float] | None, number(-1e9, 1e9, several=True, metavar="X,Y,Z ...")] = None
+    """For each scene: how far it is moved, in world units, after the turn; 0,0,0 for none."""
+    turn: Annotated[Sequence[float] | None, number(-1e9, 1e9, several=True, metavar="X,Y,Z ...")] = None
+    """For each scene: degrees about x, then y, then z, or the four numbers w,x,y,z of a quaternion; 0,0,0 for none."""
+    scale: Annotated[Sequence[float] | None, number(1e-6, 1e6, several=True, metavar="FACTOR ...")] = None
+    """For each scene: how many times as large it becomes, about the origin of its file; 1 for none."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class LodOptions(WritingOptions, ViewOptions):
     """How light, and how to tune."""
 
@@ -188,6 +204,10 @@ class LodOptions(WritingOptions, ViewOptions):
     """With --simplify or --budget: size of the images that the scene is meant for (default: root of the share)."""
     viewer: OneViewer = None
     """Tune each file for spark, playcanvas or another of `aaplug guide viewers`, instead of for aaplug."""
+    to: Annotated[StreamName | None, names("sog", "3dtiles")] = None
+    """With levels: write them as a viewer streams them, sog (PlayCanvas) or 3dtiles (CesiumJS), tuned for its rule."""
+    page: Annotated[AnyPath | None, flag("NODE_MODULES", read=Path)] = None
+    """With --to: add a page that opens the result, and the viewer's program from this folder of npm packages."""
     refine: bool = True
     """Merge alone: do not tune the result to look like the scene, which takes minutes."""
     steps: Annotated[int | None, STEPS] = None
@@ -204,8 +224,12 @@ class LodOptions(WritingOptions, ViewOptions):
             raise UsageError("scale", "belongs to `simplify` and `budget`")
         if self.merge_below and self.single:
             raise UsageError("merge_below", "belongs to levels")
-        if self.resume and (self.single or self.viewer is not None):
-            raise UsageError("resume", "belongs to levels for aaplug")
+        if self.to is not None and self.single:
+            raise UsageError("to", "belongs to levels")
+        if self.page is not None and self.to is None:
+            raise UsageError("page", "belongs to `to`")
+        if self.resume and (self.single or (self.viewer is not None and self.to is None)):
+            raise UsageError("resume", "belongs to levels for aaplug, and to `to`")
         if self.viewer is not None and not self.tuning:
             raise UsageError("viewer", "is what the result is tuned for: leave out `refine`, and `steps` of 0")
 

@@ -16,7 +16,7 @@ from aaplug.evaluation.truth import Truth
 from aaplug.io.atomic import AnyPath
 from aaplug.io.scenes import scene_of
 from aaplug.io.scenes.scene import Scene
-from aaplug.methods import RECIPES
+from aaplug.methods.presets import recipe_of
 from aaplug.methods.viewers import find_viewer
 from aaplug.options.verbs import COMPARED_SCALES, CompareOptions
 from aaplug.rendering.job import CamerasLike, Job, running
@@ -68,7 +68,7 @@ def compare(scenes: ScenesLike, cameras: CamerasLike, output: AnyPath | None, op
         renderers = [Renderer.of(scene, job.training(scene), recipe, **same) for scene in named.values()]
         truth = Truth(renderers[0], "reference", PROTOCOL)
         if viewer is not None:
-            recipe, pairs = RECIPES[viewer.recipe], zip(named.values(), renderers, strict=True)
+            recipe, pairs = recipe_of(viewer), zip(named.values(), renderers, strict=True)
             renderers = [Renderer.of(viewer.shown(s.gaussians()), r.training, recipe, **same) for s, r in pairs]
         candidates = [Candidate(name, renderer) for name, renderer in zip(named, renderers, strict=True)]
         task = Task(candidates, scales, views, truth, metrics, ceiling=False)

@@ -58,7 +58,7 @@ def convert(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opti
     Args:
         scene: see `render`.
         cameras: see `render`; not needed where the scene stores a 3D filter.
-        output: file to write, .ply, .spz or .splat; None writes none.
+        output: file to write, of a format that can be written; None writes none.
 
     Raises:
         AaplugError: as `render`; also, something is fused already.
@@ -67,7 +67,7 @@ def convert(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opti
     rule, path = _rule(options), None if output is None else Path(output)
     job = Job.of(scene, cameras, options)
     viewer = rule if isinstance(rule, Viewer) else MIP_VIEWER
-    files = {"overwrite": options.overwrite, "spz_axes": viewer.axes(options.spz_axes)}
+    files = {"overwrite": options.overwrite, **viewer.spz(options.spz_axes)}
     check = partial(check_scene_output, path, options.overwrite, job.scene.files) if path else lambda: None
     check()
     with running(options, path, check, job.inputs) as workers:

@@ -26,8 +26,8 @@ from aaplug.finetuning.state import TuningJob
 from aaplug.io.atomic import AnyPath, check_output, replacing
 from aaplug.io.images import write_png
 from aaplug.io.scenes import SceneLike, check_scene_output, write_scene
-from aaplug.methods import RECIPES
 from aaplug.methods.conversion import fuse_for
+from aaplug.methods.presets import recipe_of
 from aaplug.methods.viewers import FAST, VIEWERS
 from aaplug.options.verbs import FinetuneOptions
 from aaplug.rendering.cost import GRADIENTS, Cost, cost_of
@@ -93,7 +93,7 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
             job = replace(job, cameras=refined(job, look, job.cameras.all).cameras)
             look = job.look(settings.steps, gradients=True)
         train = job.cameras.train
-        before = replace(look, scene=viewer.shown(look.scene), recipe=RECIPES[viewer.recipe])
+        before = replace(look, scene=viewer.shown(look.scene), recipe=recipe_of(viewer))
         start = replace(before, scene=fuse_for(raw, look.training, viewer))
         truth = Truth(look, truth_source, enlarge=enlarge, memory=MEMORY)
         tuning = TuningJob(start, train, truth, settings, upsampler, method.densify)
@@ -107,7 +107,7 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
         record = {"for": viewer.name, "method": settings.name}
         result = tuned_scene(state, tuning, viewer.convention_of(raw), record)
         if path is not None:
-            write_scene(path, result, overwrite=options.overwrite, spz_axes=viewer.axes(options.spz_axes))
+            write_scene(path, result, overwrite=options.overwrite, **viewer.spz(options.spz_axes))
         closed = [Candidate("closed form", start)] * (len(start.scene.fused) > len(raw.fused))
         bounds = sampling_bounds(result.means, train)  # densification may have changed the number of Gaussians
         after = replace(start, scene=result, training=replace(start.training, bounds=bounds))

@@ -1,5 +1,6 @@
 """Levels of detail: lighter scene files for lower sampling rates."""
 
+import json
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -14,7 +15,7 @@ from torch import Tensor
 from aaplug.core.cameras import Camera, digest_of_cameras
 from aaplug.core.chunks import MAX_CHUNK_GAUSSIANS, chunks_of
 from aaplug.core.gaussians import Gaussians, digest_of_scene
-from aaplug.core.sampling import check_frame
+from aaplug.core.sampling import check_frame, median_rates
 from aaplug.finetuning.fitting import fit, steps_for
 from aaplug.finetuning.refining import refine
 from aaplug.io.atomic import AnyPath, refuse_existing, refuse_inputs
@@ -31,10 +32,11 @@ from aaplug.io.scenes.pyramid_folder import (
     write_manifest,
 )
 from aaplug.io.scenes.scene import FLOAT, Scene, matrix_of
+from aaplug.io.streamed import SETTINGS, STREAMS, leaves_of, parts_of, program_of, write_index, write_level, write_page
 from aaplug.levels.clusters import rates_of
 from aaplug.levels.merging import Goal, merge, merge_in_chunks
 from aaplug.methods.filters.smoothing import fuse_stored
-from aaplug.methods.viewers import Viewer, find_viewer
+from aaplug.methods.viewers import MIP_VIEWER, Viewer, find_viewer
 from aaplug.options.verbs import LodOptions
 from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.rendering.renderer import Renderer
@@ -56,8 +58,8 @@ def lod(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, options:
     Args:
         scene: see `render`.
         cameras: see `render`; they tell how finely each Gaussian was sampled, and levels are tuned on their views.
-        output: the one scene's file; or a folder for NAME_lod0.ply, the scene itself, to NAME_lodN.ply.  None writes
-            nothing.
+        output: the one scene's file; or a folder for NAME_lod0.ply, the scene itself, to NAME_lodN.ply, or for what
+            `to` names.  None writes nothing.
 
     Returns:
         The one scene; or all levels, first the scene itself.
@@ -78,14 +80,23 @@ def lod(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, options:
     with running(options, path, check, job.inputs, folder=not options.single):
         maker = _Maker.of(whole, job)
         if not options.single:
+            if path is not None and options.to is not None:
+                (path / STREAMS[options.to].index).unlink(missing_ok=True)
             levels = list(_levels(maker, path, files))
+            if path is not None and options.to is not None:
+                rates = median_rates(whole.means, job.cameras.train)
+                settings = write_index(path, options.to, levels, float(rates[rates > 0].median()))
+                if options.page is not None:
+                    write_page(path, options.to, Path(options.page))
+                job.monitor.say(f"set the viewer by {path / SETTINGS}: {json.dumps(settings)}")
+                stale = [*files, path / MANIFEST]  # what a run that is cut short resumes from
             for file in stale:
                 file.unlink(missing_ok=True)
             return levels
         lighter = maker.finished(maker(Level(whole, 1.0), goals_of(options, whole)[0]))
         if path is not None:
-            axes = maker.viewer.axes(options.spz_axes) if maker.viewer else options.spz_axes
-            write_scene(path, lighter.scene, overwrite=options.overwrite, spz_axes=axes)
+            how = (maker.viewer or MIP_VIEWER).spz(options.spz_axes)
+            write_scene(path, lighter.scene, overwrite=options.overwrite, **how)
         return [lighter]
 
 
@@ -109,7 +120,9 @@ class _Maker:
         """The maker that the options ask for."""
         if job.cameras.assumed and not job.options.tuning:
             return cls(scene, job, None, (), None)
-        return cls(scene, job, job.look(job.options.tuning or MAX_VIEWS), job.views, find_viewer(job.options.viewer))
+        streamed = STREAMS[job.options.to].viewer if job.options.to and job.options.tuning else None
+        viewer = find_viewer(job.options.viewer or streamed)
+        return cls(scene, job, job.look(job.options.tuning or MAX_VIEWS), job.views, viewer)
 
     def __call__(self, before: Level, goal: Goal) -> Level:
         """The level for a goal."""
@@ -180,10 +193,13 @@ def goals_of(options: LodOptions, scene: Gaussians) -> list[Goal]:
 
 
 def _levels(maker: _Maker, folder: Path | None, files: Sequence[Path]) -> Iterator[Level]:
-    """The scene and its levels, each written before the next is made; levels for a viewer are no pyramid."""
+    """The scene and its levels, each written before the next is made; levels for a viewer are no pyramid.
+
+    Streamed levels are cut before the pyramid, which they are made of, lists them; it is removed at the end.
+    """
     options = maker.job.options
     levels: list[Level] = []
-    pyramid = folder if options.viewer is None else None
+    pyramid = folder if options.viewer is None or options.to else None
     goals = goals_of(options, maker.scene)
     manifest = Manifest(_source(maker) if pyramid else "", MAX_CHUNK_GAUSSIANS, len(goals) + 1, ())
     if pyramid and options.resume and is_pyramid(pyramid):
@@ -196,13 +212,19 @@ def _levels(maker: _Maker, folder: Path | None, files: Sequence[Path]) -> Iterat
     levels = levels or [Level(maker.scene, 1.0, chunks_of(maker.scene.means, MAX_CHUNK_GAUSSIANS))]
     finest = levels[0].chunks
     assert finest is not None
+    leaves = leaves_of(levels[0])
     chunk_count = int(finest.max()) + 1
     for place in range(len(goals) + 1):
         if place >= len(levels):
             levels.append(maker(levels[-1], goals[place - 1]))
-        level = maker.finished(levels[place])
+        made = options.to is not None and place < len(manifest.levels)
+        level = levels[place] if made else maker.finished(levels[place])
         if folder is not None and place >= len(manifest.levels):
-            write_scene(files[place], level.scene, overwrite=options.overwrite or options.resume)
+            kept = level
+            if options.to is not None:
+                write_level(folder, options.to, place, parts_of(level, leaves))
+                kept = levels[place]
+            write_scene(files[place], kept.scene, overwrite=options.overwrite or options.resume)
             if pyramid:
                 assert level.chunks is not None
                 counts = torch.bincount(level.chunks, minlength=chunk_count).tolist()
@@ -217,7 +239,8 @@ def _source(maker: _Maker) -> str:
     cameras, options = maker.job.cameras, maker.job.options
     facts = [digest_of_scene(maker.scene), digest_of_cameras(cameras.train), cameras.background]
     choices = [options.merge_below, options.tuning, options.views, options.background, options.cull_margin]
-    return digest_of_values((MERGING_RULE, *facts, *choices))
+    streamed = () if options.to is None else (options.to, maker.viewer and maker.viewer.name)
+    return digest_of_values((MERGING_RULE, *facts, *choices, *streamed))
 
 
 def _outputs(output: Path | None, scene: Scene, options: LodOptions) -> tuple[list[Path], list[Path]]:
@@ -231,7 +254,11 @@ def _outputs(output: Path | None, scene: Scene, options: LodOptions) -> tuple[li
         raise OutputError(output, "levels go to a folder; for one scene, give `simplify` or `budget`")
     stem = scene.source.stem if scene.source else "scene"
     files = [output / f"{stem}_lod{level}.ply" for level in range((options.levels or DEFAULT_LEVELS) + 1)]
-    others = [output / MANIFEST] if options.viewer is None else []
+    others = [output / MANIFEST] if options.viewer is None or options.to else []
+    if options.to is not None:
+        refuse_existing([output / STREAMS[options.to].index], options.overwrite)
+        if options.page is not None:
+            program_of(options.to, Path(options.page))
     refuse_existing([*files, *others], options.overwrite or options.resume)
     if not options.overwrite:
         return files, []

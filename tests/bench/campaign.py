@@ -24,7 +24,7 @@ from aaplug.finetuning.state import begin, load, save
 from aaplug.io.batch_file import read_batch
 from aaplug.io.cameras import CAMERA_FORMATS, read_camera_path, read_cameras
 from aaplug.io.images import read_image, read_rgba
-from aaplug.io.scenes import SCENE_FORMATS, WritableFormat, write_scene
+from aaplug.io.scenes import SCENE_FORMATS, WritableFormat, sog, write_scene
 from tests.bench import heading, row
 from tests.conftest import make_scene
 from tests.hostile import NAMES, Target, check, mutations, read_as_info_does, scene
@@ -79,15 +79,16 @@ def scenes() -> dict[str, Target]:
     """The small scenes of the tests, and one of each other registered format that can be written."""
     targets = {f"scene {name}": scene(name) for name in NAMES}
     for format in SCENE_FORMATS.values():
-        if isinstance(format, WritableFormat) and format.needs is None:
+        if isinstance(format, WritableFormat) and (format.needs is None or find_spec(format.needs)):
             targets.setdefault(f"scene of {format.name}", Target(_written(format.name), read_as_info_does))
     return targets
 
 
 def _written(suffix: str) -> Callable[[Path], Path]:
     def make(folder: Path) -> Path:
-        write_scene(folder / f"scene.{suffix}", make_scene(20))
-        return folder / f"scene.{suffix}"
+        path = folder / (suffix if suffix == sog.META else f"scene.{suffix}")
+        write_scene(path, make_scene(20))
+        return path
 
     return make
 

@@ -12,7 +12,7 @@ import shutil
 import statistics
 import subprocess
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.resources import as_file, files
 from math import atan, degrees
 from pathlib import Path
@@ -31,7 +31,10 @@ from aaplug.io.cameras import read_cameras
 from aaplug.io.images import read_image
 from aaplug.io.photographs import read_photo
 from aaplug.io.scenes import read_scene, write_scene
+from aaplug.io.scenes.pyramid_folder import Level
+from aaplug.io.streamed import STREAMS, write_index, write_level
 from aaplug.methods.conversion import fuse_for
+from aaplug.methods.presets import recipe_of
 from aaplug.methods.viewers import VIEWERS, Viewer
 from aaplug.rendering.renderer import Renderer
 from aaplug.verbs.convert import convert
@@ -39,6 +42,7 @@ from tests.bench import heading, row
 from tests.bench.scenes import decibels
 
 FOLDER = Path(__file__).with_name("viewer_pages")
+TILES = STREAMS["3dtiles"].index
 SCALES = (1.0, 0.5, 0.25, 0.125)
 PAGE_SECONDS = 300.0  # that a page may take for one thing
 OPENGL = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))  # from OpenCV's axes
@@ -46,11 +50,15 @@ OPENGL = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))  
 
 @dataclass(frozen=True)
 class Page:
-    """How a page shows a viewer's row; `off`: the options with anti-aliasing off, where it is off by default."""
+    """How a page shows a viewer's row, of which file.
+
+    off: the options with anti-aliasing off, where it is off by default.
+    """
 
     name: str
     options: Mapping[str, Any]
     off: Mapping[str, Any] | None = None
+    file: str = "scene.ply"
 
 
 def _mkkellogg(**options: Any) -> Page:
@@ -64,6 +72,11 @@ PAGES = {
     "spark-classic": Page("spark", {"preBlurAmount": 0.3, "blurAmount": 0}),
     "playcanvas": Page("playcanvas", {"antiAlias": True}, {"antiAlias": False}),
     "playcanvas-classic": Page("playcanvas", {"antiAlias": False}),
+    "babylon": Page("babylon", {"Compensation": True}, {"Compensation": False}),
+    "babylon-classic": Page("babylon", {"Compensation": False}),
+    "cesium": Page("cesium", {}, file=TILES),
+    "khr in Babylon.js": Page("babylon", {}, file="scene.glb"),
+    "khr in CesiumJS": Page("cesium", {}, file=TILES),
     "mkkellogg": _mkkellogg(antialiased=True),
     "mkkellogg-mip": _mkkellogg(antialiased=True, kernel2DSize=0.1),
     "mkkellogg-classic": _mkkellogg(),
@@ -81,14 +94,15 @@ def main(
         views: their number.
         rows: of the table.
     """
-    subprocess.run(["npm", "install", "--no-audit", "--no-fund", "--silent"], cwd=FOLDER, check=True)
+    if not (FOLDER / "node_modules").exists():
+        subprocess.run(["npm", "install", "--no-audit", "--no-fund", "--silent"], cwd=FOLDER, check=True)
     work.mkdir(parents=True, exist_ok=True)
     with as_file(files("aaplug.io.sample")) as sample:
         scene, cameras = read_scene(sample / "chair.ply").gaussians(), read_cameras(sample)
         bench = Bench(work.resolve(), scene, cameras, cameras.test[:views], steps)
         heading("viewers", "`--for`", "scene", *(round(bench.views[0].width * scale) for scale in SCALES))
         for name in rows:
-            for label, cells in bench.rows(VIEWERS[name]):
+            for label, cells in bench.rows(VIEWERS[name.split()[0]], PAGES[name]):
                 row(f"`{name}`", label, *cells)
 
 
@@ -104,7 +118,8 @@ class Bench:
 
     def converted(self, viewer: Viewer) -> Gaussians:
         """The scene for a viewer; made once for each rule and degree."""
-        path = self.work / f"{viewer.recipe}-{viewer.sh_degree}.ply"
+        assert viewer.convention is not None
+        path = self.work / f"{viewer.convention.name}-{viewer.sh_degree}.ply"
         if not path.exists():
             if self.steps == 0:  # `convert` would measure it too
                 scene = fuse_for(self.scene, TrainingViews.of(self.scene, self.cameras), viewer)
@@ -114,46 +129,60 @@ class Bench:
             write_scene(path, scene)
         return read_scene(path).gaussians()
 
-    def rows(self, viewer: Viewer) -> Iterator[tuple[str, list[str]]]:
+    def rows(self, viewer: Viewer, page: Page) -> Iterator[tuple[str, list[str]]]:
         """The rows of a viewer: what is shown, and a cell per scale."""
-        page, converted = PAGES[viewer.name], self.converted(viewer)
-        yield "original", self.cells(viewer, self.scene, page.name, page.options)
+        converted = self.converted(viewer)
+        yield "original", self.cells(viewer, self.scene, page)
         if converted.fused:
-            yield "converted", self.cells(viewer, converted, page.name, page.options)
+            yield "converted", self.cells(viewer, converted, page)
         if page.off is not None:
-            yield "converted, anti-aliasing off", self.cells(None, converted, page.name, page.off)
+            yield "converted, anti-aliasing off", self.cells(None, converted, replace(page, options=page.off))
 
-    def cells(self, viewer: Viewer | None, scene: Gaussians, page: str, options: Mapping[str, Any]) -> list[str]:
+    def cells(self, viewer: Viewer | None, scene: Gaussians, page: Page) -> list[str]:
         """PSNR against photographs at each scale and, for a viewer, against its prediction."""
-        pictures = self.pictures(scene, page, options)
+        pictures = self.pictures(scene, page)
         cells = []
         for scale in SCALES:
             drawn = [pictures[view.name, scale] for view in self.views]
             photos = [_photograph(view, scale) for view in self.views]
             cell = f"{_mean(drawn, photos):.2f}"
             if viewer is not None:
-                own = Renderer.of(viewer.shown(scene), self.cameras, viewer.recipe, background=WHITE)
+                own = Renderer.of(viewer.shown(scene), self.cameras, recipe_of(viewer), background=WHITE)
                 predicted = [quantised(own(view.scaled(scale)).rgb) for view in self.views]
                 cell += f" ({_mean(drawn, predicted):.1f})"
             cells.append(cell)
         return cells
 
-    def pictures(
-        self, scene: Gaussians, page: str, options: Mapping[str, Any]
-    ) -> dict[tuple[str, float], Float[Tensor, "h w 3"]]:
+    def pictures(self, scene: Gaussians, page: Page) -> dict[tuple[str, float], Float[Tensor, "h w 3"]]:
         """What a page draws, by view and scale."""
-        path, job = self.work / "shown.ply", self.work / "job.json"
-        write_scene(path, scene, overwrite=True)
-        files = {(v.name, s): self.work / f"{v.name}@{s:g}.png" for v in self.views for s in SCALES}
-        shots = [
-            _shot(view.scaled(scale)) | {"file": str(files[view.name, scale])}
-            for view in self.views
-            for scale in SCALES
-        ]
-        facts = {"page": page, "scene": str(path), "options": options, "shots": shots, "seconds": PAGE_SECONDS}
-        job.write_text(json.dumps(facts | {"chromium": _chromium()}))
-        subprocess.run(["node", str(FOLDER / "run.mjs"), str(job)], check=True)
-        return {key: read_image(file, WHITE) for key, file in files.items()}
+        shown = self.work / "shown"
+        shown.mkdir(exist_ok=True)
+        if page.file == TILES:
+            write_tiles(shown, scene)
+        else:
+            write_scene(shown / page.file, scene, overwrite=True)
+        views = {(v.name, s): v.scaled(s) for v in self.views for s in SCALES}
+        return shoot(page.name, shown, page.file, page.options, views, self.work)
+
+
+def write_tiles(folder: Path, scene: Gaussians) -> None:
+    """Write a scene as one tile."""
+    write_level(folder, "3dtiles", 0, [scene])
+    write_index(folder, "3dtiles", [Level(scene, 1.0, torch.zeros(len(scene), dtype=torch.long))], 1.0)
+
+
+def shoot(
+    page: str, folder: Path, url: str, options: Mapping[str, Any], views: Mapping[Any, Camera], work: Path
+) -> dict[Any, Float[Tensor, "h w 3"]]:
+    """What a page draws of a file of a folder, by view.  work: folder of the pictures."""
+    work.mkdir(parents=True, exist_ok=True)
+    files = {key: (work / f"{place}.png").resolve() for place, key in enumerate(views)}
+    shots = [_shot(view) | {"file": str(files[key])} for key, view in views.items()]
+    facts = {"page": page, "scene": str(folder.resolve()), "url": url, "options": options, "shots": shots}
+    job = work / "job.json"
+    job.write_text(json.dumps(facts | {"seconds": PAGE_SECONDS, "chromium": _chromium()}))
+    subprocess.run(["node", str(FOLDER / "run.mjs"), str(job)], check=True)
+    return {key: read_image(file, WHITE) for key, file in files.items()}
 
 
 def _shot(camera: Camera) -> dict[str, Any]:

@@ -14,11 +14,11 @@ from os import PathLike
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-from aaplug.core.conventions import Convention, SpzAxes
+from aaplug.core.conventions import Convention, SpzAxes, SpzVersion
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.pyramids import Pyramid
 from aaplug.io.atomic import check_output
-from aaplug.io.scenes import compressed_ply, ksplat, ply, pt, sog, splat, spz
+from aaplug.io.scenes import compressed_ply, gltf, ksplat, ply, pt, sog, splat, spz, usd
 from aaplug.io.scenes.options import SceneFileOptions
 from aaplug.io.scenes.pyramid_folder import MANIFEST, is_pyramid, path_of, read_manifest, read_pyramid
 from aaplug.io.scenes.scene import MODEL_SCENE, SOG_FOLDER, Scene, described_faults, faults_of, library_errors
@@ -52,7 +52,10 @@ class SceneFormat(Protocol):
 
 @runtime_checkable
 class WritableFormat(SceneFormat, Protocol):
-    """A format that can be written too.  needs: a package that writing imports, from aaplug's extra `name`; or None."""
+    """A format that can be written too.  needs: a package that writing imports, or None.
+
+    It comes with aaplug's extra `extra`, if the format has such an attribute, or else of the format's name.
+    """
 
     @property
     def needs(self) -> str | None: ...  # noqa: D102
@@ -68,7 +71,18 @@ class WritableFormat(SceneFormat, Protocol):
 
 
 # the first that accepts a file is used
-OWN: tuple[SceneFormat, ...] = (compressed_ply, ply, spz, sog, pt, splat, ksplat)
+OWN: tuple[SceneFormat, ...] = (
+    compressed_ply,
+    ply,
+    spz,
+    sog,
+    pt,
+    splat,
+    ksplat,
+    *gltf.FORMATS,
+    sog.UNBUNDLED,
+    *usd.FORMATS,
+)
 SCENE_FORMATS = Registry[SceneFormat]("scene format", "aaplug.io.scenes:SceneFormat", named(OWN))
 SceneLike = Scene | Gaussians | Pyramid | str | PathLike[str]
 
@@ -132,11 +146,16 @@ def read_scene(
 
 @contract
 def write_scene(
-    path: str | PathLike[str], scene: Gaussians, *, overwrite: bool = False, spz_axes: SpzAxes = "auto"
+    path: str | PathLike[str],
+    scene: Gaussians,
+    *,
+    overwrite: bool = False,
+    spz_axes: SpzAxes = "auto",
+    spz_version: SpzVersion = 4,
 ) -> None:
     """Write a scene in the format of the path's suffix, with everything else that its source file held.
 
-    overwrite: replace an existing file.  spz_axes: see `open_scene`.
+    overwrite: replace an existing file.  spz_axes, spz_version: see `SceneFileOptions`.
 
     Raises:
         OutputError: no writable format has this suffix, the format cannot hold the scene, or the path is the scene's
@@ -144,7 +163,7 @@ def write_scene(
         UsageError: the package that writes the format is not installed.
     """
     source = [scene.origin.path] if scene.origin else []
-    write_parts(path, [scene], len(scene), source, overwrite=overwrite, spz_axes=spz_axes)
+    write_parts(path, [scene], len(scene), source, overwrite=overwrite, spz_axes=spz_axes, spz_version=spz_version)
 
 
 def write_parts(
@@ -155,6 +174,7 @@ def write_parts(
     *,
     overwrite: bool = False,
     spz_axes: SpzAxes = "auto",
+    spz_version: SpzVersion = 4,
 ) -> None:
     """Write a scene that comes in parts, at most `count` Gaussians of one convention and with the same columns.
 
@@ -162,7 +182,7 @@ def write_parts(
     """
     writer = check_scene_output(path, overwrite, inputs)
     storable = (_storable(path, part) for part in parts)
-    writer.write(Path(path), storable, count, overwrite, SceneFileOptions(spz_axes=spz_axes))
+    writer.write(Path(path), storable, count, overwrite, SceneFileOptions(spz_axes=spz_axes, spz_version=spz_version))
 
 
 def _storable(path: str | PathLike[str], part: Gaussians) -> Gaussians:
@@ -176,7 +196,7 @@ def _storable(path: str | PathLike[str], part: Gaussians) -> Gaussians:
 def written_format(path: str | PathLike[str]) -> WritableFormat | None:
     """The format that writes files of this suffix; None if none does."""
     name = Path(path).name.lower()
-    named = [format for format in SCENE_FORMATS.values() if name.endswith("." + format.name)]
+    named = [format for format in SCENE_FORMATS.values() if f".{name}".endswith("." + format.name)]
     found = max(named, key=lambda format: len(format.name), default=None)
     return found if isinstance(found, WritableFormat) else None
 
@@ -193,7 +213,8 @@ def check_scene_output(
         known = [f".{format.name}" for format in SCENE_FORMATS.values() if isinstance(format, WritableFormat)]
         raise OutputError(path, f"has no suffix of a format that can be written: {', '.join(known)}")
     if writer.needs is not None and importlib.util.find_spec(writer.needs) is None:
-        raise UsageError(str(path), f"writing .{writer.name} needs {writer.needs}: {install_command(writer.name)}")
+        command = install_command(getattr(writer, "extra", writer.name))
+        raise UsageError(str(path), f"writing .{writer.name} needs {writer.needs}: {command}")
     check_output(path, overwrite, inputs)
     return writer
 

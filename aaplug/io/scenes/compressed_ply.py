@@ -3,24 +3,28 @@
 Element "chunk": for every 256 Gaussians the smallest and largest position, log-scale and, in newer files, colour.
 Element "vertex": packed_position and packed_scale (11, 10, 11 bits between those), packed_rotation (2 bits for the
 largest component, 3 × 10 for the others), packed_color (4 bytes).  Element "sh", if any: a byte for each f_rest.
-The header's comments say how the scene was trained, as in a plain .ply.
+The header's comments say how the scene was trained, as in a plain .ply.  It is written in Morton order, so that the
+Gaussians of a chunk are neighbours and the steps between its bounds are small.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from aaplug.core.gaussians import Gaussians
+from aaplug.core.spherical_harmonics import COLOUR_OFFSET, SH_C0
+from aaplug.io.atomic import replacing
 from aaplug.io.scenes.options import SceneFileOptions
-from aaplug.io.scenes.packed import byte_opacities, floats, largest_last
+from aaplug.io.scenes.packed import byte_opacities, bytes_of, floats, largest_last, without_largest
 from aaplug.io.scenes.ply_document import Table, stamp_of
-from aaplug.io.scenes.ply_header import LITTLE, Element, Header, check_size, is_packed, read_header
-from aaplug.io.scenes.ply_tags import meaning
+from aaplug.io.scenes.ply_header import LITTLE, Element, Header, check_size, is_packed, parse, read_header
+from aaplug.io.scenes.ply_tags import meaning, stating
+from aaplug.io.scenes.record import whole
 from aaplug.io.scenes.scene import DEGREES, Scene, check_count, library_errors, sh_of_colour
 from aaplug.system.errors import FormatError
 
@@ -31,8 +35,11 @@ COLOUR_BOUNDS = [f"{end}_{c}" for end in ("min", "max") for c in ("r", "g", "b")
 ELEVEN_TEN_ELEVEN = ((21, 11), (11, 10), (0, 11))
 CHUNK_LENGTH = 256  # Gaussians
 SH_SPAN = 8.0  # harmonics lie between -4 and 4
+MOST_DEGREE = 3
+LARGEST_LOG_SCALE = 20.0  # absolute: a wider chunk of log-scales would leave its steps too coarse
 
 name = "compressed.ply"
+needs = None
 
 
 def sniff(path: Path, head: bytes) -> bool:
@@ -123,3 +130,52 @@ def _harmonic(values: np.ndarray) -> Float[Tensor, " n"]:
     ends = torch.from_numpy(values == 255).float()
     share = torch.where(torch.from_numpy((values == 0) | (values == 255)), ends, middle)
     return (share - 0.5) * SH_SPAN
+
+
+# Writing
+
+
+def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: SceneFileOptions) -> None:
+    """Write a scene, with values rounded to the format's steps."""
+    scene = whole(path, parts, name, MOST_DEGREE)
+    chunk = torch.arange(len(scene)) // CHUNK_LENGTH
+    colours = COLOUR_OFFSET + SH_C0 * scene.sh[:, 0]
+    log_scales = scene.log_scales.clamp(-LARGEST_LOG_SCALE, LARGEST_LOG_SCALE)
+    bounds, shares = zip(*(_bounded(values, chunk) for values in (scene.means, log_scales, colours)), strict=True)
+    rest, largest = without_largest(scene.unit_quats)
+    turns = _word(rest / 2**0.5 + 0.5, (20, 10), (10, 10), (0, 10)) | largest << 30
+    rgba = torch.cat([shares[2], scene.opacities[:, None]], dim=1)
+    words = [_word(shares[0], *ELEVEN_TEN_ELEVEN), turns, _word(shares[1], *ELEVEN_TEN_ELEVEN)]
+    words.append(_word(rgba, (24, 8), (16, 8), (8, 8), (0, 8)))
+    columns = {"chunk": [*BOUNDS, *SCALE_BOUNDS, *COLOUR_BOUNDS], "vertex": list(WORDS)}
+    tables = [torch.cat(bounds, dim=1).numpy().astype("<f4"), torch.stack(words, dim=1).numpy().astype("<u4")]
+    if scene.sh_degree:
+        steps = ((scene.sh[:, 1:].transpose(1, 2).flatten(1) / SH_SPAN + 0.5) * 256).floor()
+        columns["sh"] = [f"f_rest_{i}" for i in range(steps.shape[1])]
+        tables.append(bytes_of(steps))
+    kinds = {"chunk": "float", "vertex": "uint", "sh": "uchar"}
+    lines = ["ply", f"format {LITTLE} 1.0"]
+    for (element, names), table in zip(columns.items(), tables, strict=True):
+        lines += [f"element {element} {len(table)}", *(f"property {kinds[element]} {each}" for each in names)]
+    header = stating(parse("scene", [*lines, "end_header"], "\n"), None, scene.convention, scene.fused)
+    with replacing(path, overwrite) as stream:
+        stream.write(header.content)
+        for table in tables:
+            stream.write(table.tobytes())
+
+
+def _bounded(
+    values: Float[Tensor, "n 3"], chunk: Int[Tensor, " n"]
+) -> tuple[Float[Tensor, "c 6"], Float[Tensor, "n 3"]]:
+    """The smallest and largest values of each chunk, and each value as a fraction between them."""
+    index, empty = chunk[:, None].expand(-1, 3), values.new_zeros(-(-len(values) // CHUNK_LENGTH), 3)
+    low, high = (empty.scatter_reduce(0, index, values, how, include_self=False) for how in ("amin", "amax"))
+    span = high - low
+    return torch.cat([low, high], dim=1), (values - low[chunk]) / torch.where(span > 0, span, 1.0)[chunk]
+
+
+def _word(shares: Float[Tensor, "n c"], *fields: tuple[int, int]) -> Int[Tensor, " n"]:
+    """Fractions as fields of a word; the inverse of `_fractions`."""
+    parts = [(share * ((1 << bits) - 1)).round().long() << shift for share, (shift, bits) in zip(
+        shares.clamp(0, 1).unbind(dim=1), fields, strict=True)]  # fmt: skip
+    return torch.stack(parts).sum(dim=0)

@@ -1,24 +1,35 @@
-"""Shared by the compressed formats: bounded decompression, packed quaternions, and axes.
+"""Shared by the compressed formats: bounded decompression, packed quaternions, axes, and files of several files.
 
 n: rows.  Arrays are numpy's, as they come from files.
 
 Functions raise FormatError for a file that breaks its format.
 """
 
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
+from glob import escape
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from aaplug.core.gaussians import Gaussians
+from aaplug.core.placing import mirrored, placed
+from aaplug.io.atomic import check_output, replacing
 from aaplug.io.limits import limit
 from aaplug.io.scenes.scene import logit_of
+from aaplug.io.values import Place
 from aaplug.system.errors import FormatError
 
 MAX_BYTE = 255
+HASH_DIGITS = 8  # in the name of a file that another one names
+UNALIKE = 1e-4  # of the scale: a difference between axes that counts as rounding
+half_turn_about_z = partial(mirrored, signs=(-1.0, -1.0, 1.0))  # from glTF's axes to OpenCV's, and back
+half_turn_about_x = partial(mirrored, signs=(1.0, -1.0, -1.0))  # from OpenGL's axes to OpenCV's, and back
 
 
 def check_growth(path: Path, inflated: int, compressed: int) -> None:
@@ -36,6 +47,19 @@ def largest_last(rest: Float[Tensor, "n 3"], largest: Tensor) -> Float[Tensor, "
     return torch.cat([rest, missing[:, None]], dim=1).gather(1, order[largest.long()])
 
 
+def without_largest(quats: Float[Tensor, "n 4"]) -> tuple[Float[Tensor, "n 3"], Int[Tensor, " n"]]:
+    """What `largest_last` takes: the three smaller components, where the largest is positive, and its index."""
+    largest = quats.abs().argmax(dim=1)
+    others = torch.tensor([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[largest]
+    negative = quats.gather(1, largest[:, None]) < 0
+    return quats.gather(1, others) * torch.where(negative, -1.0, 1.0), largest
+
+
+def bytes_of(values: Tensor) -> np.ndarray:
+    """Values rounded to bytes, those beyond cut off."""
+    return values.clamp(0, MAX_BYTE).round().to(torch.uint8).numpy()
+
+
 def byte_opacities(alpha: np.ndarray) -> Float[Tensor, " n"]:
     """Logits of opacities stored as bytes."""
     return logit_of(floats(alpha) / MAX_BYTE)
@@ -46,16 +70,50 @@ def floats(values: np.ndarray) -> Tensor:
     return torch.from_numpy(values.astype(np.float32))
 
 
-def half_turn_about_x(scene: Gaussians) -> Gaussians:
-    """The scene with y and z negated: from OpenGL's axes to OpenCV's, or back.
+def replacing_group(
+    path: Path, beside: Mapping[str, bytes], whole: Callable[[Mapping[str, str]], bytes], overwrite: bool
+) -> None:
+    """Write a file that names others beside it, so that it and they appear together.
 
-    A harmonic of degree l and order m is multiplied by (−1)^(m < 0) for y and by (−1)^(l − |m|) for z.
+    The others' names carry a hash of their content, so that a file that is replaced never names a new one of them.
+    Those of an earlier version are removed at the end.
+
+    Args:
+        path: of the file that names the others.
+        beside: contents by plain name.
+        whole: makes its content of their names in the folder, by plain name.
+        overwrite: replace an existing file.
     """
-    orders = [(d, m) for d in range(scene.sh_degree + 1) for m in range(-d, d + 1)]
-    signs = torch.tensor([(-1.0) ** ((m < 0) + d - abs(m)) for d, m in orders])
-    return replace(
-        scene,
-        means=scene.means * torch.tensor([1.0, -1.0, -1.0]),
-        quats=scene.quats * torch.tensor([1.0, 1.0, -1.0, -1.0]),
-        sh=scene.sh * signs[:, None],
-    )
+    check_output(path, overwrite)
+    names, earlier = dict[str, str](), set[Path]()
+    for plain, content in beside.items():
+        stem, _, suffix = plain.rpartition(".")
+        names[plain] = f"{stem}-{sha256(content).hexdigest()[:HASH_DIGITS]}.{suffix}"
+        earlier |= set(path.parent.glob(f"{escape(stem)}-{'[0-9a-f]' * HASH_DIGITS}.{suffix}"))
+        with replacing(path.with_name(names[plain]), overwrite=True) as stream:
+            stream.write(content)
+    with replacing(path, overwrite) as stream:
+        stream.write(whole(names))
+    for file in earlier - {path.with_name(name) for name in names.values()}:
+        file.unlink(missing_ok=True)
+
+
+def standing(scene: Gaussians, motion: Float[Tensor, "4 4"], place: Place) -> Gaussians:
+    """A scene in axes with y up and z forward where a transform in these axes puts it, in OpenCV's axes.
+
+    Raises FormatError if the transform does more than turn, move and scale alike along all axes.
+    """
+    if not torch.equal(motion, torch.eye(4, dtype=torch.float64)):
+        axes = motion[:3, :3]
+        scale = float(torch.linalg.det(axes).clamp(min=0) ** (1 / 3))
+        error = (axes @ axes.T - scale**2 * torch.eye(3)).abs().max().item()
+        alike = scale > 0 and error <= UNALIKE * scale**2
+        place.expect(alike, "its transform", "a turn, a move and one scale", motion.tolist())
+        scene = placed(scene, axes / scale, scale, motion[:3, 3].tolist())
+    return half_turn_about_z(scene)
+
+
+def of_degree(scene: Gaussians, degree: int) -> Gaussians:
+    """The scene with harmonics up to this degree: those above are left out, those that it lacks are 0."""
+    missing = (degree + 1) ** 2 - scene.sh.shape[1]
+    return replace(scene, sh=torch.nn.functional.pad(scene.sh, (0, 0, 0, missing)))

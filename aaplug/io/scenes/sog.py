@@ -4,14 +4,18 @@ A Gaussian is a pixel of each image, row by row.  means: 16 bits per coordinate 
 sign(x)·ln(1 + |x|); quats: three bytes and the index of the largest component; scales and sh0 (colour, opacity):
 indices into a codebook, in version 1 bytes between mins and maxs; shN: 16-bit indices into a palette of 64 entries per
 row.  Images are read only if meta.json names plain files beside it.
+
+Version 2 is written, in Morton order: as one .sog, or as a meta.json with the images beside it.  meta.json's `model`
+tells that training compensated; the rest stays in a record of ours.
 """
 
 import io
 import json
+import math
 import re
 import warnings
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -23,11 +27,22 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from aaplug.core.conventions import CLASSIC, Convention
 from aaplug.core.gaussians import MAX_LOG_SCALE, Gaussians
+from aaplug.io.atomic import replacing
 from aaplug.io.limits import whole_limit
+from aaplug.io.scenes.codebooks import codebook, nearest_value, palette
 from aaplug.io.scenes.options import SceneFileOptions
-from aaplug.io.scenes.packed import byte_opacities, check_growth, floats, largest_last
+from aaplug.io.scenes.packed import (
+    MAX_BYTE,
+    byte_opacities,
+    bytes_of,
+    check_growth,
+    floats,
+    largest_last,
+    replacing_group,
+    without_largest,
+)
+from aaplug.io.scenes.record import KEY, Facts, read_record, record_of, whole
 from aaplug.io.scenes.scene import COMPENSATED, KERNEL_LOST, Scene, check_count, library_errors
 from aaplug.io.values import Entry, number, object_of, parse_json, read_bounded
 from aaplug.system.errors import FormatError
@@ -37,11 +52,16 @@ FILE_NAME = re.compile(r"[\w\-][\w\-.]{0,99}", re.ASCII)
 ZIP_SIGNATURE = b"PK\x03\x04"
 PALETTE_ROW = 64  # entries
 MAX_PALETTE_PIXELS = PALETTE_ROW * 15 * (1 << 10)  # 64 entries of 15 coefficients in each of 1024 rows
+MOST_DEGREE = 3
+LEVELS = 256  # of a codebook
+MAX_PALETTE = 1 << 16  # entries: labels have two bytes
+WEBP_EFFORT, WEBP_METHOD = 50, 4  # of 100 and 6: a tenth larger than the most, in a tenth of the time
 W_LARGEST = 252  # alpha of a quaternion whose w is largest; 253 to 255 stand for x, y, z
 BYTES_PER_PIXEL = 4
 SPARE_PIXELS = 1 << 16  # pixels allowed beyond twice the number of Gaussians
 
 name = "sog"
+needs = None
 
 Fetch = Callable[[str, int], bytes]
 
@@ -116,11 +136,13 @@ def _scene(path: Path, meta: Any, fetch: Fetch) -> Scene:
         raise root.place.error(f"{lacking[0]} is missing")
     palette = _palette(parts["shN"], version) if "shN" in parts else torch.zeros(1, 0, 3)
     degree = round((palette.shape[1] + 1) ** 0.5) - 1
-    convention, evidence, flat = _meaning(meta)
+    said, flat = _meaning(meta)
+    said = read_record(path, meta, said)
     load, notes = partial(_rows, parts, palette, version, flat), (f"version {version}",)
     files = [file for part in parts.values() for file in part.entry.value("files")] if path.name == META else []
     others = tuple(path.parent / file for file in files)
-    return Scene(path, name, count, degree, load, evidence, convention, flat=flat, notes=notes, others=others)
+    facts = {"flat": flat, "notes": notes, "others": others}
+    return Scene(path, name, count, degree, load, *said, **facts)
 
 
 def _part(path: Path, root: Entry, key: str, count: int, fetch: Fetch) -> Part:
@@ -152,16 +174,16 @@ def _image(path: Path, file: str, fetch: Fetch, count: int | None, noisy: bool) 
         return np.asarray(image.convert("RGBA")).reshape(-1, 4), width
 
 
-def _meaning(meta: dict[str, Any]) -> tuple[Convention, str, bool]:
+def _meaning(meta: dict[str, Any]) -> tuple[Facts, bool]:
     model = meta.get("model")
     if model is None:
-        return CLASSIC, "no model in meta.json: assumed classic (3DGS default)", False
+        return Facts("no model in meta.json: assumed classic (3DGS default)"), False
     said = f"model in meta.json: {json.dumps(model)[:40]}"
     if model == "antialiased":
-        return COMPENSATED, f"{said}; {KERNEL_LOST}", False
+        return Facts(f"{said}; {KERNEL_LOST}", COMPENSATED), False
     if model == "2dgs":
-        return CLASSIC, f"{said}: 2D Gaussians, taken for classic", True
-    return CLASSIC, said + ("" if model == "default" else " is unknown: assumed classic"), False
+        return Facts(f"{said}: 2D Gaussians, taken for classic"), True
+    return Facts(said + ("" if model == "default" else " is unknown: assumed classic")), False
 
 
 def _palette(part: Part, version: int) -> Float[Tensor, "p c 3"]:
@@ -216,3 +238,96 @@ def _quats(pixels: np.ndarray) -> Float[Tensor, "n 4"]:
     largest = torch.from_numpy(pixels[:, 3].astype(np.int64)) - W_LARGEST
     quats = largest_last(rest, largest.clamp(min=0))
     return torch.where(valid[:, None], quats, torch.tensor([1.0, 0.0, 0.0, 0.0]))
+
+
+# Writing
+
+
+def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: SceneFileOptions) -> None:
+    """Write one .sog, a zip of meta.json and the images."""
+    meta, images = encoded(path, parts)
+    with replacing(path, overwrite) as stream, zipfile.ZipFile(stream, "w") as archive:
+        for file, content in {**images, META: _json(meta, {file: file for file in images})}.items():
+            archive.writestr(zipfile.ZipInfo(file), content)
+
+
+class _Unbundled:
+    """The meta.json of a folder; it is read as `sog`."""
+
+    name, needs = META, None
+
+    def sniff(self, path: Path, head: bytes) -> bool:
+        return False
+
+    def open_scene(self, path: Path, options: SceneFileOptions) -> Scene:
+        return open_scene(path, options)
+
+    def write(
+        self, path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: SceneFileOptions
+    ) -> None:
+        meta, images = encoded(path, parts)
+        replacing_group(path, images, partial(_json, meta), overwrite)
+
+
+UNBUNDLED = _Unbundled()
+
+
+def encoded(path: Path, parts: Iterable[Gaussians]) -> tuple[dict[str, Any], dict[str, bytes]]:
+    """The meta.json of a scene, and its images by name; raises OutputError for what SOG cannot hold."""
+    scene = whole(path, parts, name, MOST_DEGREE, flat=True)
+    logs = scene.means.double().sign() * scene.means.double().abs().log1p()
+    least, most = logs.amin(dim=0), logs.amax(dim=0)
+    steps = ((logs - least) / torch.where(most > least, most - least, 1.0) * 65535).round().long()
+    rest, largest = without_largest(scene.unit_quats)
+    log_scales = scene.log_scales.clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE)
+    scale_levels, colour_levels = codebook(log_scales.flatten(), LEVELS), codebook(scene.sh[:, 0].flatten(), LEVELS)
+    colours, alphas = nearest_value(scene.sh[:, 0], colour_levels), bytes_of(scene.opacities[:, None] * 255)
+    quats = np.concatenate([bytes_of((rest / 2**0.5 + 0.5) * 255), (largest[:, None] + W_LARGEST).numpy()], axis=1)
+    tables = {
+        "means_l": (steps % 256).numpy(),
+        "means_u": (steps // 256).numpy(),
+        "scales": nearest_value(log_scales, scale_levels).numpy(),
+        "quats": quats,
+        "sh0": np.concatenate([colours.numpy(), alphas], axis=1),
+    }
+    width = -(-math.isqrt(len(scene)) // 4) * 4 + 4
+    images = {f"{key}.webp": _webp(table, width) for key, table in tables.items()}
+    meta = {
+        "version": 2,
+        "asset": {"generator": "aaplug"},
+        "count": len(scene),
+        **({"model": "2dgs"} if scene.flat else {"model": "antialiased"} if scene.convention.compensated else {}),
+        "means": {"mins": least.tolist(), "maxs": most.tolist(), "files": ["means_l.webp", "means_u.webp"]},
+        "scales": {"codebook": scale_levels.tolist(), "files": ["scales.webp"]},
+        "quats": {"files": ["quats.webp"]},
+        "sh0": {"codebook": colour_levels.tolist(), "files": ["sh0.webp"]},
+        KEY: record_of(scene),
+    }
+    if scene.sh_degree:
+        centres, labels = palette(scene.sh[:, 1:].flatten(1), MAX_PALETTE)
+        levels = codebook(centres.flatten(), LEVELS)
+        centres = nearest_value(centres, levels).reshape(-1, 3).numpy()
+        files = {"shN_centroids.webp": _webp(centres, PALETTE_ROW * (scene.sh.shape[1] - 1))}
+        files["shN_labels.webp"] = _webp(torch.stack([labels % 256, labels // 256], dim=1).numpy(), width)
+        images |= files
+        facts = {"count": len(centres) // (scene.sh.shape[1] - 1), "bands": scene.sh_degree}
+        meta["shN"] = {**facts, "codebook": levels.tolist(), "files": list(files)}
+    return meta, images
+
+
+def _json(meta: dict[str, Any], names: Mapping[str, str]) -> bytes:
+    """meta.json, with these names for the images."""
+    parts = {key: value | {"files": [names[file] for file in value["files"]]} for key, value in meta.items()
+             if isinstance(value, dict) and "files" in value}  # fmt: skip
+    return json.dumps(meta | parts, separators=(",", ":")).encode()
+
+
+def _webp(table: np.ndarray, width: int) -> bytes:
+    """A lossless image of rows of at most four bytes, opaque if they have no fourth; colours under alpha 0 stay."""
+    height = -(-len(table) // width)
+    pixels = np.zeros((height * width, 4), np.uint8)
+    pixels[:, 3] = MAX_BYTE
+    pixels[: len(table), : table.shape[1]] = table
+    image, stream = Image.fromarray(pixels.reshape(height, width, 4)), io.BytesIO()
+    image.save(stream, "WEBP", lossless=True, exact=True, quality=WEBP_EFFORT, method=WEBP_METHOD)
+    return stream.getvalue()

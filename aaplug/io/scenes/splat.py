@@ -4,7 +4,6 @@ Position and scales (float32, linear), colour and opacity (bytes), quaternion wx
 header, no harmonics above degree 0, and does not say how the scene was trained, so it is recognized by its suffix.
 """
 
-import logging
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -15,15 +14,15 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.core.spherical_harmonics import COLOUR_OFFSET, SH_C0
 from aaplug.io.atomic import replacing
 from aaplug.io.scenes.options import SceneFileOptions
-from aaplug.io.scenes.packed import byte_opacities, floats
+from aaplug.io.scenes.packed import byte_opacities, bytes_of, floats
+from aaplug.io.scenes.record import Facts, holdable, warn_of_losses
 from aaplug.io.scenes.scene import Scene, check_count, library_errors, read_rows, sh_of_colour
 from aaplug.system.errors import FormatError, OutputError
 
 RECORD = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
+MOST_DEGREE = 4  # of harmonics, of which degree 0 is written
 ZERO_BYTE = 128  # the byte that stands for a quaternion component of 0
 EVIDENCE = "the format does not say: assumed classic (3DGS default)"
-
-log = logging.getLogger("aaplug")
 
 name = "splat"
 needs = None
@@ -50,12 +49,10 @@ def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, o
     """Write a scene part by part; harmonics above degree 0 and the convention are lost, as a warning says."""
     with replacing(path, overwrite) as stream:
         for number, part in enumerate(parts):
-            lost = [f"harmonics of degrees 1 to {part.sh_degree}"] if part.sh_degree else []
-            if part.convention.compensated or part.fused:
-                lost.append(f"the record of its training ({part.convention.name})")
-            if lost and not number:
-                log.warning("%s: a .splat cannot hold %s; a .ply can", path, " and ".join(lost))
-            stream.write(_records(part).tobytes())
+            if not number:
+                lost = [f"harmonics of degrees 1 to {part.sh_degree}"] if part.sh_degree else []
+                warn_of_losses(path, name, part, Facts(EVIDENCE), lost)
+            stream.write(_records(holdable(path, part, name, MOST_DEGREE)).tobytes())
         if not stream.tell():
             raise OutputError(path, "cannot hold a scene without Gaussians; write a .ply")
 
@@ -74,6 +71,5 @@ def _records(scene: Gaussians) -> np.ndarray:
     rgba = torch.cat([rgb, scene.opacities[:, None]], dim=1)
     records["means"] = scene.means.numpy()
     records["scales"] = scene.scales.numpy()
-    records["rgba"] = (rgba.clamp(0, 1) * 255).round().numpy()
-    records["quats"] = (scene.unit_quats * ZERO_BYTE + ZERO_BYTE).round().clamp(0, 255).numpy()
+    records["rgba"], records["quats"] = bytes_of(rgba * 255), bytes_of(scene.unit_quats * ZERO_BYTE + ZERO_BYTE)
     return records

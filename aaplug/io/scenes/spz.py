@@ -4,10 +4,10 @@ Header: magic "NGSP", version, count (uint32 each), SH degree, bits of a positio
 Then sections, each for all Gaussians: positions (3 × 24-bit fixed point; float16 in version 1), opacities, colours,
 log-scales, quaternions, harmonics, mostly a byte per number.  Versions 1 to 3 are one gzip stream; version 4 has a
 longer header, a table of sizes, and a zstd stream per section.  Axes are x right, y up, z back; a scene here has y down
-and z forward.  Flag 1: trained with antialiasing; the file does not say with which kernel.
+and z forward.  Flag 1: trained with antialiasing; the file does not say with which kernel.  Flag 2: records follow the
+header (version 4) or the sections; Adobe's coordinate system among them names other axes.
 
-gsply (the extra `spz`) writes version 3, which every reader of the format knows.  It packs the numbers; this module
-adds the axes, the flag, and as many bits of a position's fraction as the scene allows.
+Version 4 is written with that record, version 3 for older readers without it, version 2 for glTF.
 """
 
 import gzip
@@ -15,7 +15,7 @@ import io
 import math
 import struct
 import zlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -26,15 +26,24 @@ import zstandard
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.conventions import CLASSIC, SpzAxes
+from aaplug.core.conventions import CLASSIC
 from aaplug.core.gaussians import Gaussians
+from aaplug.core.placing import mirrored
 from aaplug.io.atomic import replacing
 from aaplug.io.limits import whole_limit
 from aaplug.io.scenes.options import SceneFileOptions
-from aaplug.io.scenes.packed import byte_opacities, check_growth, floats, half_turn_about_x, largest_last
+from aaplug.io.scenes.packed import (
+    byte_opacities,
+    bytes_of,
+    check_growth,
+    floats,
+    half_turn_about_x,
+    largest_last,
+    without_largest,
+)
+from aaplug.io.scenes.record import Facts, holdable, warn_of_losses
 from aaplug.io.scenes.scene import COMPENSATED, KERNEL_LOST, Scene, check_count, library_errors
 from aaplug.system.errors import FormatError, OutputError
-from aaplug.system.locks import scratch
 
 MAGIC = b"NGSP"
 GZIP_SIGNATURE = b"\x1f\x8b"
@@ -51,14 +60,15 @@ MAX_FRACTION = 24  # bits of a position
 COLOUR_GAIN = 0.15  # stored colour over the harmonic of degree 0
 SCALE_STEPS, MIN_LOG_SCALE = 16.0, -10.0  # log-scales: steps per unit, and the smallest
 MAGNITUDE_MASK = 511  # 9 bits of a quaternion's component; the tenth is its sign
-WRITTEN_VERSION = 3
-MAX_WRITTEN_GAUSSIANS = 10_000_000  # accepted by readers of versions before 4 (nianticlabs/spz)
-MAX_WRITTEN_DEGREE = 3  # of harmonics that gsply writes
+MAX_OLD_GAUSSIANS, MAX_OLD_DEGREE = 10_000_000, 3  # accepted by readers of versions before 4 (nianticlabs/spz)
 MAX_WRITTEN_FRACTION = 20  # bits: a millionth of a unit
 POSITION_BITS = 23  # of a position's fixed-point number, beside its sign
-FLAGS_BYTE = 14  # place in the header
-ANTIALIASED_FLAG = 1
-MAX_LOGIT = 30.0  # in float32 its opacity is 1
+ANTIALIASED_FLAG, EXTENSIONS_FLAG = 1, 2
+RECORD = struct.Struct("<II")  # an extension's type and length
+COORDINATES = 0xADBE0003  # the type SPZ_ADOBE_coordinate_system: one of these numbers
+AXES = ("", "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF")  # where x, y and z point, by number
+AXES_WRITTEN = {"opengl": "RUB", "opencv": "RDF"}
+ZSTD_LEVEL = 9
 # TURNS lead from the axes of the file to OpenCV's, and back.
 TURNS: Mapping[str, Callable[[Gaussians], Gaussians]] = {"opengl": half_turn_about_x, "opencv": lambda scene: scene}
 AXES_NOTES = {
@@ -68,7 +78,7 @@ AXES_NOTES = {
 }
 
 name = "spz"
-needs = "gsply"
+needs = None
 
 
 @dataclass(frozen=True)
@@ -97,22 +107,35 @@ def sniff(path: Path, head: bytes) -> bool:
 def open_scene(path: Path, options: SceneFileOptions) -> Scene:
     """Decompress a scene; see `SceneFormat`."""
     with library_errors(path):
-        header, sections = _sections(path)
+        file = parsed(path, path.read_bytes())
+    header, sections, axes = file.header, file.sections, file.axes
     convention, evidence = CLASSIC, "the flag antialiased is not set: assumed classic"
     if header.flags & ANTIALIASED_FLAG:
         convention, evidence = COMPENSATED, f"the flag antialiased is set; {KERNEL_LOST}"
 
-    def reading(axes: SpzAxes, other: Scene | None = None) -> Scene:
-        load, notes = partial(_rows, header, sections, TURNS[axes]), (f"version {header.version}", AXES_NOTES[axes])
+    def reading(turn: Callable[[Gaussians], Gaussians], note: str, other: Scene | None = None) -> Scene:
+        load, notes = partial(rows, header, sections, turn), (f"version {header.version}", note)
         return Scene(path, name, header.count, header.degree, load, evidence, convention, notes=notes, other=other)
 
-    if options.spz_axes == "auto":  # the header does not name its writer
-        return reading("opengl", reading("opencv"))
-    return reading(options.spz_axes)
+    if options.spz_axes != "auto":
+        return reading(TURNS[options.spz_axes], AXES_NOTES[options.spz_axes])
+    if axes is not None:
+        signs = [1.0 if axis in "RDF" else -1.0 for axis in axes]
+        return reading(partial(mirrored, signs=signs), f"axes turned from {axes}, which the file states, to RDF")
+    return reading(TURNS["opengl"], AXES_NOTES["opengl"], reading(TURNS["opencv"], AXES_NOTES["opencv"]))
 
 
-def _sections(path: Path) -> tuple[Header, list[np.ndarray]]:
-    data = path.read_bytes()
+@dataclass(frozen=True)
+class Parsed:
+    """A file's header, its sections with a row per Gaussian, and the axes that it states."""
+
+    header: Header
+    sections: list[np.ndarray]
+    axes: str | None
+
+
+def parsed(path: Path, data: bytes) -> Parsed:
+    """The content of a file, or of a part of the file `path`."""
     zipped = data.startswith(GZIP_SIGNATURE)
     header = _header(
         path, zlib.decompressobj(GZIP_WINDOW).decompress(data, HEADER.size) if zipped else data[: HEADER.size]
@@ -121,12 +144,30 @@ def _sections(path: Path) -> tuple[Header, list[np.ndarray]]:
     if header.version >= STREAMS_VERSION:
         if zipped:
             raise FormatError(path, f"version {header.version} should not be one gzip stream")
-        parts: Iterable[bytes] = _streams(path, data, sizes)
+        parts, records = _streams(path, data, sizes)
     else:
         payload, ends = _payload(path, data, sum(sizes), zipped), np.cumsum(sizes).tolist()
         parts = (payload[end - size : end] for size, end in zip(sizes, ends, strict=True))
+        records = payload[sum(sizes) :]
     shaped = zip(parts, header.widths, strict=True)
-    return header, [np.frombuffer(part, np.uint8).reshape(header.count, width) for part, width in shaped]
+    sections = [np.frombuffer(part, np.uint8).reshape(header.count, width) for part, width in shaped]
+    return Parsed(header, sections, _axes(path, records) if header.flags & EXTENSIONS_FLAG else None)
+
+
+def _axes(path: Path, records: bytes) -> str | None:
+    """The axes that a file's records state, the last one that counts."""
+    found, at = None, 0
+    while at + RECORD.size <= len(records):
+        kind, length = RECORD.unpack_from(records, at)
+        at += RECORD.size
+        if kind == COORDINATES and length >= 4 and at + 4 <= len(records):
+            number = int.from_bytes(records[at : at + 4], "little")
+            if number >= len(AXES):
+                known = ", ".join(f"{i} ({axes})" for i, axes in enumerate(AXES) if axes)
+                raise FormatError(path, f"states the coordinate system {number}; known are {known}")
+            found = AXES[number] or None
+        at += length
+    return found
 
 
 def _header(path: Path, data: bytes) -> Header:
@@ -156,8 +197,8 @@ def _payload(path: Path, data: bytes, size: int, zipped: bool) -> bytes:
     return data[HEADER.size :]
 
 
-def _streams(path: Path, data: bytes, sizes: list[int]) -> Iterable[bytes]:
-    """The sections of version 4; an empty section has no stream."""
+def _streams(path: Path, data: bytes, sizes: list[int]) -> tuple[Iterable[bytes], bytes]:
+    """The sections of version 4, and the records before them; an empty section has no stream."""
     if len(data) < HEADER_4.size:
         raise FormatError(path, "is cut short in its header")
     *_, number, table = HEADER_4.unpack_from(data)
@@ -167,6 +208,11 @@ def _streams(path: Path, data: bytes, sizes: list[int]) -> Iterable[bytes]:
         what = f"has {number} streams listed at byte {table:,}"
         raise FormatError(path, f"{what}; {wanted} and a place within the file expected")
     check_growth(path, sum(sizes), len(data))
+    return _inflated(path, data, sizes, table, at), data[HEADER_4.size : table]
+
+
+def _inflated(path: Path, data: bytes, sizes: list[int], table: int, at: int) -> Iterable[bytes]:
+    number = sum(size > 0 for size in sizes)
     listed = iter(STREAM.unpack_from(data, table + i * STREAM.size) for i in range(number))
     for size in sizes:
         if not size:
@@ -185,9 +231,10 @@ def _streams(path: Path, data: bytes, sizes: list[int]) -> Iterable[bytes]:
         at += compressed
 
 
-def _rows(
+def rows(
     header: Header, sections: list[np.ndarray], turn: Callable[[Gaussians], Gaussians], start: int, stop: int
 ) -> Gaussians:
+    """The rows from start up to stop, turned by `turn`."""
     positions, alphas, colours, scales, quats, harmonics = (section[start:stop] for section in sections)
     n, k = len(positions), (header.degree + 1) ** 2
     sh = torch.zeros(n, k, 3)
@@ -219,51 +266,61 @@ def _threes(data: np.ndarray) -> Float[Tensor, "n 4"]:
 
 def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: SceneFileOptions) -> None:
     """Write a scene, with values rounded to the format's steps."""
-    turn = TURNS["opengl" if options.spz_axes == "auto" else options.spz_axes]
-    content = _packed(path, [turn(_checked(path, part)) for part in parts])
+    axes = "opengl" if options.spz_axes == "auto" else options.spz_axes
+    scenes = [TURNS[axes](part) for part in parts]
+    content = packed(path, scenes, options.spz_version, AXES_WRITTEN[axes])
+    kept = Facts("", COMPENSATED if scenes[0].convention.compensated else CLASSIC)
+    warn_of_losses(path, name, scenes[0], kept)
     with replacing(path, overwrite) as stream:
         stream.write(content)
 
 
-def _checked(path: Path, part: Gaussians) -> Gaussians:
-    """The part; refuses what the format cannot hold."""
-    if part.flat:
-        raise OutputError(path, "cannot hold 2D Gaussians; write a .ply")
-    if part.filter_3d is not None:
-        raise OutputError(path, "cannot hold a filter_3D; aaplug convert fuses it")
-    if part.sh_degree > MAX_WRITTEN_DEGREE:
-        degrees = f"up to degree {MAX_WRITTEN_DEGREE}, not {part.sh_degree}"
-        raise OutputError(path, f"gsply writes harmonics {degrees}; write a .ply")
-    return part
+def packed(path: Path, scenes: Sequence[Gaussians], version: int, axes: str) -> bytes:
+    """The content of a .spz of version 2, 3 or 4, which alone states these axes, the scenes' own.
 
-
-def _packed(path: Path, scenes: list[Gaussians]) -> bytes:
-    count = sum(map(len, scenes))
-    if count > MAX_WRITTEN_GAUSSIANS:
-        raise OutputError(path, f"readers take {MAX_WRITTEN_GAUSSIANS:,} Gaussians, not {count:,}; write a .ply")
-    from gsply.gsdata import GSData  # an optional package, and slow to import
-    from gsply.spz import write_spz
-
-    def column(values: Callable[[Gaussians], torch.Tensor]) -> np.ndarray:
-        return torch.cat([values(scene) for scene in scenes]).contiguous().numpy()
-
-    means = column(lambda s: s.means)
-    farthest = float(np.abs(means).max(initial=0.0))
+    Raises OutputError for a scene that it cannot hold.
+    """
+    old, count, first = version < STREAMS_VERSION, sum(map(len, scenes)), scenes[0]
+    for part in scenes:
+        holdable(path, part, name, MAX_OLD_DEGREE if old else MAX_DEGREE)
+    if old and count > MAX_OLD_GAUSSIANS:
+        raise OutputError(path, f"readers take {MAX_OLD_GAUSSIANS:,} Gaussians, not {count:,}; write a .ply")
+    farthest = max(float(part.means.abs().max()) if len(part) else 0.0 for part in scenes)
     fraction = POSITION_BITS - math.frexp(farthest)[1] if farthest else MAX_WRITTEN_FRACTION  # the farthest still fits
     if fraction < 1:
         raise OutputError(path, f"cannot hold positions as far as {farthest:g} from the origin; write a .ply")
-    with library_errors(path), scratch() as folder:
-        file = folder / "scene.spz"
-        data = GSData.from_arrays(
-            means=means,
-            scales=column(lambda s: s.log_scales),
-            quats=column(lambda s: s.unit_quats),
-            opacities=column(lambda s: s.logit_opacities.clamp(-MAX_LOGIT, MAX_LOGIT)),
-            sh0=column(lambda s: s.sh[:, 0]),
-            shN=column(lambda s: s.sh[:, 1:]),
-            format="ply",
-        )
-        write_spz(file, data, version=WRITTEN_VERSION, fractional_bits=min(fraction, MAX_WRITTEN_FRACTION))
-        content = bytearray(gzip.decompress(file.read_bytes()))
-    content[FLAGS_BYTE] = ANTIALIASED_FLAG * scenes[0].convention.compensated
-    return gzip.compress(content, mtime=0)
+    fraction = min(fraction, MAX_WRITTEN_FRACTION)
+    sections = [b"".join(columns) for columns in zip(*(_columns(s, version, fraction) for s in scenes), strict=True)]
+    flags = ANTIALIASED_FLAG * first.convention.compensated
+    facts = version, count, first.sh_degree, fraction
+    if old:
+        return gzip.compress(HEADER.pack(MAGIC, *facts, flags, 0) + b"".join(sections), mtime=0)
+    record = RECORD.pack(COORDINATES, 4) + AXES.index(axes).to_bytes(4, "little")
+    streams = [(zstandard.ZstdCompressor(ZSTD_LEVEL).compress(data), len(data)) for data in sections if data]
+    start = HEADER_4.pack(MAGIC, *facts, flags | EXTENSIONS_FLAG, len(streams), HEADER_4.size + len(record))
+    table = b"".join(STREAM.pack(len(data), size) for data, size in streams)
+    return start + record + table + b"".join(data for data, _ in streams)
+
+
+def _columns(scene: Gaussians, version: int, fraction: int) -> list[bytes]:
+    """The sections of a scene; the inverse of `rows`."""
+    fixed = (scene.means.double() * 2**fraction).round().to(torch.int32)
+    positions = fixed.numpy().astype("<i4").view(np.uint8).reshape(len(scene), 3, 4)[..., :3]
+    xyzw = scene.unit_quats.roll(-1, dims=1).double()
+    if version >= WORD_QUATERNIONS_VERSION:
+        rest, largest = without_largest(xyzw)
+        parts = (rest * (2**0.5 * MAGNITUDE_MASK)).round().long()
+        fields = parts.abs().clamp(max=MAGNITUDE_MASK) + (MAGNITUDE_MASK + 1) * (parts < 0)
+        words = largest << 30 | fields[:, 0] << 20 | fields[:, 1] << 10 | fields[:, 2]
+        quats = words.numpy().astype("<u4")
+    else:
+        quats = bytes_of((xyzw[:, :3] * torch.where(xyzw[:, 3:] < 0, -1.0, 1.0) + 1) * 127.5)
+    columns = [
+        positions,
+        bytes_of(scene.opacities * 255),
+        bytes_of((scene.sh[:, 0] * COLOUR_GAIN + 0.5) * 255),
+        bytes_of((scene.log_scales - MIN_LOG_SCALE) * SCALE_STEPS),
+        quats,
+        bytes_of(scene.sh[:, 1:] * 128 + 128),
+    ]
+    return [column.tobytes() for column in columns]

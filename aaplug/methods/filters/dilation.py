@@ -2,10 +2,14 @@
 
 from dataclasses import dataclass, replace
 
+import torch
+
 from aaplug.core.cameras import Camera
 from aaplug.core.conventions import ANTIALIASED, CLASSIC, MIP, PLAYCANVAS, PLAYCANVAS_CLASSIC, Convention
 from aaplug.core.splats import Splats2D
 from aaplug.core.training import TrainingViews
+
+TINY = 1e-12  # px⁴
 
 
 @dataclass(frozen=True)
@@ -14,10 +18,17 @@ class Dilation:
 
     0.3 uncompensated is 3DGS (Kerbl et al. 2023); 0.3 compensated is EWA splatting as in 3DGS --antialiasing and
     gsplat "antialiased"; 0.1 compensated is the 2D Mip filter (Mip-Splatting, eq. 10).
+
+    smallest: px²; a splat is not drawn if its variance along its longer axis, with what was added, is less.
+    apart: px²; half the difference of the variances along a splat's two axes is at least this.  A rounder splat is
+        stretched along u = (xy, apart - (xx - yy) / 2), as GaussianSplats3D does it, and is not drawn if its variance
+        across u is not positive.
     """
 
     variance: float
     compensated: bool
+    smallest: float = 0.0
+    apart: float = 0.0
 
     @classmethod
     def of(cls, convention: Convention) -> "Dilation":
@@ -26,7 +37,22 @@ class Dilation:
 
     def __call__(self, splats: Splats2D, camera: Camera, training: TrainingViews) -> Splats2D:
         """Filter the splats of one view."""
-        return splats.blurred(self.variance, self.compensated)
+        splats = splats.blurred(self.variance, self.compensated)
+        if not (self.smallest or self.apart):
+            return splats
+        xx, xy, yy = splats.covs.unbind(dim=1)
+        mean, slant = (xx + yy) / 2, (xx - yy) / 2
+        radius = (slant * slant + xy * xy).clamp(min=max(self.apart**2, TINY)).sqrt()
+        drawn = (mean + radius >= self.smallest) & (radius < mean)
+        columns = {"opacities": splats.opacities * drawn}
+        if self.apart:
+            along = radius - slant
+            norm = (xy * xy + along * along).clamp(min=TINY)
+            cosine, sine = radius * (xy * xy - along * along) / norm, radius * 2 * xy * along / norm
+            covs = torch.stack((mean + cosine, sine, mean - cosine), dim=1)
+            columns["covs"] = torch.where(drawn[:, None], covs, splats.covs)
+            columns["dets"] = torch.where(drawn, mean * mean - radius * radius, splats.dets)
+        return splats.with_columns(columns)
 
 
 @dataclass(frozen=True)

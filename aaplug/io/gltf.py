@@ -1,0 +1,224 @@
+"""glTF 2.0, .gltf and .glb: the document with its buffers and accessors, of cameras and of scenes.
+
+Buffers lie in the file itself or in files of its folder, never beyond, and are read part by part: a document takes no
+more memory than its JSON.  Every function raises FormatError for a file that breaks its format.
+"""
+
+import base64
+import binascii
+import json
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from aaplug.core.projection import rotation_matrices
+from aaplug.io.limits import whole_limit
+from aaplug.io.values import Entry, Place, entries, number, object_of, parse_json, read_bounded, read_part, text
+from aaplug.system.errors import FormatError
+
+MAGIC, VERSION, JSON_CHUNK, BINARY_CHUNK = b"glTF", 2, 0x4E4F534A, 0x004E4942
+HEADER, CHUNK = struct.Struct("<4sII"), struct.Struct("<II")
+WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}  # by componentType
+FLOAT = 5126
+SHORTEST_TURN = 1e-6  # a shorter quaternion counts as no rotation
+
+
+@dataclass(frozen=True)
+class Buffer:
+    """Bytes in memory, or a stretch of a file."""
+
+    path: Path
+    size: int
+    start: int = 0
+    held: bytes | None = None
+
+    def read(self, start: int, size: int) -> bytes:
+        """`size` bytes from `start`, which lie in the buffer."""
+        held = self.held
+        return read_part(self.path, self.start + start, size) if held is None else held[start : start + size]
+
+
+@dataclass(frozen=True)
+class Accessor:
+    """A table of numbers in a buffer.
+
+    stride: bytes from a row to the next.  most: the integer that stands for 1; None where numbers are as they are.
+    """
+
+    place: Place
+    buffer: Buffer
+    start: int
+    stride: int
+    dtype: np.dtype
+    width: int
+    count: int
+    most: int | None
+
+    def read(self, start: int, stop: int) -> np.ndarray:
+        """The rows from start up to stop, as float32."""
+        rows, item = stop - start, self.width * self.dtype.itemsize
+        if rows <= 0:
+            return np.zeros((0, self.width), np.float32)
+        data = self.buffer.read(self.start + start * self.stride, (rows - 1) * self.stride + item)
+        table = np.ndarray((rows, self.width), self.dtype, data, 0, (self.stride, self.dtype.itemsize))
+        values = table.astype(np.float32)
+        return values if self.most is None else np.maximum(values / self.most, -1)
+
+
+class Gltf:
+    """The document of a file."""
+
+    def __init__(self, path: Path) -> None:
+        start = read_part(path, 0, HEADER.size, short=True)
+        self.path, self.binary = path, Buffer(path, 0)
+        if start.startswith(MAGIC):
+            chunks = dict(reversed(list(_chunks(path))))  # the first of a kind counts
+            if JSON_CHUNK not in chunks:
+                raise FormatError(path, "should hold a JSON chunk, as .glb files do")
+            self.binary = chunks.get(BINARY_CHUNK, self.binary)
+            if chunks[JSON_CHUNK].size > whole_limit("JSON"):
+                raise FormatError(path, f"has a JSON chunk longer than {whole_limit('JSON')} bytes, the limit for one")
+            data = chunks[JSON_CHUNK].read(0, chunks[JSON_CHUNK].size)
+        else:
+            data = read_bounded(path, whole_limit("JSON"))
+        self.root = object_of(parse_json(data, path), path, "it", "'asset', as glTF has", "asset")
+        version = self.root.entry("asset").get("version", text)
+        self.root.place.expect(version.startswith("2."), "asset.version", "2", version)
+        self.files, self._lists = list[Path](), dict[str, list[Entry]]()  # files beside it, that were read
+
+    def items(self, key: str) -> list[Entry]:
+        """The objects of a list of the document."""
+        if key not in self._lists:
+            self._lists[key] = entries(self.path, key, self.root.value(key)) if key in self.root else []
+        return self._lists[key]
+
+    def item(self, key: str, owner: Entry, field: str) -> Entry:
+        """The object that a field points to."""
+        items = self.items(key)
+        return items[natural(owner.value(field), owner.place, field, len(items) - 1)]
+
+    def view(self, owner: Entry, field: str = "bufferView") -> tuple[Buffer, Entry]:
+        """The bytes of the buffer view that a field names, and its entry."""
+        view = self.item("bufferViews", owner, field)
+        view.place.expect("extensions" not in view, "extensions", "none", view.fields.get("extensions"))
+        buffer = self._buffer(self.item("buffers", view, "buffer"))
+        start = natural(view.fields.get("byteOffset", 0), view.place, "byteOffset", buffer.size)
+        size = natural(view.value("byteLength"), view.place, "byteLength", buffer.size - start)
+        held = None if buffer.held is None else buffer.held[start : start + size]
+        return Buffer(buffer.path, size, buffer.start + start, held), view
+
+    def accessor(self, owner: Entry, field: str, kind: str, types: tuple[int, ...] = (FLOAT,)) -> Accessor:
+        """The table that a field names, of this type, dense, with one of these component types."""
+        entry = self.item("accessors", owner, field)
+        component, normalized = entry.fields.get("componentType"), entry.fields.get("normalized", False)
+        right = entry.fields.get("type") == kind and component in types and "sparse" not in entry
+        what = f"a dense {kind} with a componentType of {', '.join(map(str, types))}"
+        entry.place.expect(right and isinstance(normalized, bool), field, what, entry.fields)
+        assert isinstance(component, int)
+        buffer, view = self.view(entry)
+        dtype, width = np.dtype(TYPES[component]), WIDTHS[kind]
+        item = width * dtype.itemsize
+        stride = natural(view.fields.get("byteStride", item), view.place, "byteStride", 252)
+        start = natural(entry.fields.get("byteOffset", 0), entry.place, "byteOffset", buffer.size)
+        count = natural(entry.value("count"), entry.place, "count", buffer.size)
+        inside = count > 0 and stride >= item and start + (count - 1) * stride + item <= buffer.size
+        entry.place.expect(inside, field, f"values inside its {buffer.size:,} bytes", entry.fields)
+        most = np.iinfo(dtype).max if normalized and component != FLOAT else None
+        return Accessor(entry.place, buffer, start, stride, dtype, width, count, most)
+
+    def numbers(self, owner: Entry, field: str, kind: str) -> Float[Tensor, "n c"]:
+        """The finite floats of the accessor that a field names, all in float64."""
+        found = self.accessor(owner, field, kind)
+        most = whole_limit("JSON") // 4
+        found.place.expect(found.count * found.width <= most, "count", f"at most {most:,} numbers", found.count)
+        values = found.read(0, found.count)
+        found.place.expect(bool(np.isfinite(values).all()), "it", "finite", "NaN or infinity")
+        return torch.from_numpy(values.astype(np.float64))
+
+    def chain(self, nodes: list[Entry], index: int) -> list[int]:
+        """A node and those above it."""
+        parents = {}
+        for above, node in enumerate(nodes):
+            children = node.fields.get("children", [])
+            node.place.expect(isinstance(children, list), "children", "a list of nodes", children)
+            for child in children:
+                parents[natural(child, node.place, "children", len(nodes) - 1)] = above
+        chain = [index]
+        while chain[-1] in parents:
+            chain.append(parents[chain[-1]])
+            if len(chain) > len(nodes):
+                raise FormatError(self.path, "its nodes lie in a circle")
+        return chain
+
+    def _buffer(self, buffer: Entry) -> Buffer:
+        if "uri" not in buffer:
+            return self.binary
+        address = buffer.get("uri", text)
+        if address.startswith("data:"):
+            try:
+                held = base64.b64decode(address.partition(",")[2], validate=True)
+            except (binascii.Error, ValueError) as error:
+                raise buffer.place.wrong("uri", "Base64", address[:40]) from error
+            return Buffer(self.path, len(held), 0, held)
+        try:
+            file, home = (self.path.parent / address).resolve(), self.path.parent.resolve()
+            buffer.place.expect(file.is_relative_to(home), "uri", "a file in the same folder", address)
+            size = file.stat().st_size
+        except (OSError, RuntimeError, ValueError) as error:
+            raise buffer.place.wrong("uri", "a file's name", address) from error
+        if file not in self.files:
+            self.files.append(file)
+        return Buffer(file, size)
+
+
+def natural(value: object, place: Place, field: str, most: int) -> int:
+    """`value` as a whole number from 0 to `most`."""
+    real = number(value, place, field)
+    place.expect(0 <= real <= most and real.is_integer(), field, f"a whole number from 0 to {most}", value)
+    return int(real)
+
+
+def at_rest(node: Entry) -> Float[Tensor, "4 4"]:
+    """A node's own transform: its matrix, or its translation, rotation and scale."""
+    if "matrix" in node:
+        return node.vector("matrix", 16).view(4, 4).T
+    motion = torch.eye(4, dtype=torch.float64)
+    if "rotation" in node:
+        turn = node.vector("rotation", 4)
+        node.place.expect(float(turn.norm()) > SHORTEST_TURN, "rotation", "not zero", turn.tolist())
+        motion[:3, :3] = rotation_matrices((turn / turn.norm()).roll(1)[None])[0]
+    if "scale" in node:
+        motion[:3, :3] *= node.vector("scale", 3)
+    if "translation" in node:
+        motion[:3, 3] = node.vector("translation", 3)
+    return motion
+
+
+def glb_start(document: dict[str, Any], binary: int, room: int = 0) -> bytes:
+    """All of a .glb that goes before its binary chunk of so many bytes; the JSON padded to at least `room` bytes."""
+    data = json.dumps(document, separators=(",", ":")).encode()
+    data += b" " * max(room - len(data), -len(data) % 4)
+    size = HEADER.size + 2 * CHUNK.size + len(data) + binary
+    return (
+        HEADER.pack(MAGIC, VERSION, size) + CHUNK.pack(len(data), JSON_CHUNK) + data + CHUNK.pack(binary, BINARY_CHUNK)
+    )
+
+
+def _chunks(path: Path) -> Iterator[tuple[int, Buffer]]:
+    """The chunks of a .glb, by kind."""
+    at, size = HEADER.size, path.stat().st_size
+    while at + CHUNK.size <= size:
+        length, kind = CHUNK.unpack(read_part(path, at, CHUNK.size))
+        at += CHUNK.size
+        if length > size - at:
+            raise FormatError(path, f"a chunk of {length} bytes expected, {size - at} left; the file is cut short")
+        yield kind, Buffer(path, length, at)
+        at += length

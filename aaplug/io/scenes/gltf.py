@@ -1,0 +1,300 @@
+"""glTF scenes by KHR_gaussian_splatting (ratified 2025): .glb, .gltf with a .bin beside it, and .spz.glb.
+
+A primitive of points has the attributes POSITION, ROTATION (xyzw), SCALE (linear), OPACITY (0 to 1) and the harmonics
+SH_DEGREE_l_COEF_n, of degree 0 to 3.  Floats are written, and COLOR_0 for programs that draw points; the integers that
+the extension allows are read.  A .spz.glb holds a .spz of version 2 instead (KHR_gaussian_splatting_compression_spz_2,
+a draft), its numbers in glTF's axes, as CesiumJS takes them.
+
+glTF's axes are x left, y up, z forward: a half turn about z leads to and from OpenCV's.  Transforms of nodes are
+applied, where they turn, move and scale alike along all axes.  glTF has no word for a convention: it stays in a record
+of ours in the primitive's `extras`.
+"""
+
+import json
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from aaplug.core.gaussians import Gaussians, joined
+from aaplug.core.spherical_harmonics import COLOUR_OFFSET, SH_C0
+from aaplug.io.atomic import replacing
+from aaplug.io.gltf import FLOAT, MAGIC, Accessor, Gltf, at_rest, glb_start
+from aaplug.io.scenes import spz
+from aaplug.io.scenes.options import SceneFileOptions
+from aaplug.io.scenes.packed import bytes_of, half_turn_about_z, of_degree, replacing_group, standing
+from aaplug.io.scenes.record import KEY, Facts, holdable, read_record, record_of
+from aaplug.io.scenes.scene import Scene, check_count, library_errors, logit_of
+from aaplug.io.values import Entry, Place
+from aaplug.system.errors import FormatError, OutputError
+
+SPLATS, SPZ = "KHR_gaussian_splatting", "KHR_gaussian_splatting_compression_spz_2"
+UNDERSTOOD = (SPLATS, SPZ, "KHR_mesh_quantization")  # what a file may require
+PREFIX = f"{SPLATS}:"
+SIGNED, UNSIGNED = (FLOAT, 5120, 5122), (FLOAT, 5121, 5123)  # types of components: float, and 8 and 16 bits
+BYTES, VERTICES, POINTS = 5121, 34962, 0  # a componentType, a target and a mode
+COLOUR = "COLOR_0"
+MOST_DEGREE = 3
+MOST_BYTES = 2**32 - 1  # of a .glb, whose size is 32 bits
+ROOM = 8192  # bytes of JSON, padded so that the smallest and largest position can be filled in at the end
+EVIDENCE = "glTF does not say: assumed classic (3DGS default)"
+
+Rows = Callable[[int, int], Gaussians]
+
+
+def harmonics(degree: int) -> list[str]:
+    """The attributes of all harmonics up to a degree."""
+    return [f"{PREFIX}SH_DEGREE_{d}_COEF_{n}" for d in range(degree + 1) for n in range(2 * d + 1)]
+
+
+@dataclass(frozen=True)
+class GltfFormat:
+    """Files of one suffix.
+
+    Raises as `SceneFormat` and `WritableFormat`.
+    """
+
+    name: str
+    needs: str | None = None
+
+    def sniff(self, path: Path, head: bytes) -> bool:
+        """True for the magic of a .glb that is not called .spz.glb, and for the suffix .gltf of JSON."""
+        if self.name == "gltf":
+            return path.suffix.lower() == ".gltf" and head.lstrip().startswith(b"{")
+        return head.startswith(MAGIC) and (self.name == "spz.glb") == path.name.lower().endswith(".spz.glb")
+
+    def open_scene(self, path: Path, options: SceneFileOptions) -> Scene:
+        """All primitives of splats that nodes place, or that none does, as one scene."""
+        with library_errors(path):
+            document = Gltf(path)
+            wanted = document.root.fields.get("extensionsRequired", [])
+            unknown = [each for each in wanted if each not in UNDERSTOOD] if isinstance(wanted, list) else [wanted]
+            document.root.place.expect(not unknown, "extensionsRequired", f"of {', '.join(UNDERSTOOD)}", unknown)
+            parts, facts = _primitives(document), Facts(EVIDENCE)
+            if not parts:
+                raise FormatError(path, f"holds no points with the extension {SPLATS}; is it a mesh?")
+            for part in parts:
+                facts = read_record(path, part.extras, facts)
+        count, degree = sum(part.count for part in parts), max(part.degree for part in parts)
+        check_count(path, count)
+        notes = (f"{len(parts)} primitives" if len(parts) > 1 else "", *{part.note for part in parts})
+        load, others = partial(_rows, parts, degree), tuple(document.files)
+        said = {"convention": facts.convention, "fused": facts.fused, "others": others}
+        return Scene(path, self.name, count, degree, load, facts.evidence, notes=tuple(filter(None, notes)), **said)
+
+    def write(
+        self, path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: SceneFileOptions
+    ) -> None:
+        """Write a scene: a .glb part by part, others at once."""
+        held = (half_turn_about_z(holdable(path, part, self.name, MOST_DEGREE)) for part in parts)
+        if self.name == "glb":
+            _write_glb(path, held, count, overwrite)
+            return
+        scenes = list(held)
+        document = _Document(path, scenes[0], sum(map(len, scenes)))
+        for part in scenes:
+            document.add(part)
+        if self.name == "spz.glb":
+            blob = spz.packed(path, scenes, 2, "RUB")
+            blob += bytes(-len(blob) % 4)
+            with replacing(path, overwrite) as stream:
+                stream.write(glb_start(document.json(blob=len(blob)), len(blob)) + blob)
+        else:
+            data = bytearray(document.size)
+            for part in scenes:
+                for at, values in document.placed(part):
+                    data[at : at + len(values)] = values
+            name = f"{path.stem}.bin"
+            whole = partial(_gltf, document)
+            replacing_group(path, {name: bytes(data)}, lambda names: whole(names[name]), overwrite)
+
+
+def _gltf(document: "_Document", uri: str) -> bytes:
+    return json.dumps(document.json(uri=uri), separators=(",", ":")).encode()
+
+
+FORMATS = (GltfFormat("spz.glb"), GltfFormat("glb"), GltfFormat("gltf"))
+
+
+# Reading
+
+
+@dataclass(frozen=True)
+class Primitive:
+    """Points of a mesh.  load: their rows; note: a fact worth printing."""
+
+    count: int
+    degree: int
+    load: Rows
+    extras: dict[str, Any]
+    note: str = ""
+
+
+def _primitives(document: Gltf) -> list[Primitive]:
+    nodes, found = document.items("nodes"), list[Primitive]()
+    holders = [(index, node) for index, node in enumerate(nodes) if "mesh" in node]
+    places: list[tuple[Entry, Float[Tensor, "4 4"]]] = []
+    for index, node in holders:
+        motion = torch.eye(4, dtype=torch.float64)
+        for above in document.chain(nodes, index):
+            motion = at_rest(nodes[above]) @ motion
+        places.append((document.item("meshes", node, "mesh"), motion))
+    if not holders:
+        places = [(mesh, torch.eye(4, dtype=torch.float64)) for mesh in document.items("meshes")]
+    for mesh, motion in places:
+        listed = mesh.value("primitives")
+        mesh.place.expect(isinstance(listed, list), "primitives", "a list", listed)
+        for fields in listed:
+            mesh.place.expect(isinstance(fields, dict), "primitives", "a list of objects", fields)
+            primitive = Entry(mesh.place, fields)
+            extensions = primitive.entry("extensions") if "extensions" in primitive else primitive
+            if SPLATS in extensions:
+                part = _primitive(document, primitive, extensions.entry(SPLATS))
+                found.append(replace(part, load=partial(_standing, part.load, motion, mesh.place)))
+    return found
+
+
+def _primitive(document: Gltf, primitive: Entry, splats: Entry) -> Primitive:
+    place = primitive.place
+    place.expect(primitive.fields.get("mode") == POINTS, "mode", "0 (points)", primitive.fields.get("mode"))
+    kernel, colours = splats.fields.get("kernel", "ellipse"), splats.fields.get("colorSpace")
+    place.expect(kernel == "ellipse", "kernel", "ellipse", kernel)
+    note = "its colours are linear, and are taken as they are" if colours == "lin_rec709_display" else ""
+    extras = primitive.entry("extras").fields if "extras" in primitive else {}
+    inner = splats.entry("extensions") if "extensions" in splats else splats
+    if SPZ in inner:
+        view, _ = document.view(inner.entry(SPZ))
+        file = spz.parsed(document.path, view.read(0, view.size))
+        load = partial(spz.rows, file.header, file.sections, spz.TURNS["opencv"])
+        return Primitive(file.header.count, file.header.degree, load, extras, note)
+    attributes = primitive.entry("attributes")
+    degree = max((d for d in range(MOST_DEGREE + 1) if harmonics(d)[-1] in attributes), default=0)
+    kinds = {"ROTATION": ("VEC4", SIGNED), "SCALE": ("VEC3", SIGNED), "OPACITY": ("SCALAR", UNSIGNED)}
+    tables = {key: document.accessor(attributes, PREFIX + key, *kind) for key, kind in kinds.items()}
+    tables["POSITION"] = document.accessor(attributes, "POSITION", "VEC3", tuple({*SIGNED, *UNSIGNED}))
+    tables |= {name: document.accessor(attributes, name, "VEC3") for name in harmonics(degree)}
+    counts = {table.count for table in tables.values()}
+    place.expect(len(counts) == 1, "attributes", "as many rows each", sorted(counts))
+    return Primitive(counts.pop(), degree, partial(_read, tables, degree), extras, note)
+
+
+def _standing(load: Rows, motion: Float[Tensor, "4 4"], place: Place, start: int, stop: int) -> Gaussians:
+    return standing(load(start, stop), motion, place)
+
+
+def _read(tables: dict[str, Accessor], degree: int, start: int, stop: int) -> Gaussians:
+    def column(name: str) -> Tensor:
+        return torch.from_numpy(tables[name].read(start, stop))
+
+    sh = torch.stack([column(name) for name in harmonics(degree)], dim=1)
+    quats, opacities = column("ROTATION").roll(1, dims=1), logit_of(column("OPACITY")[:, 0])
+    return Gaussians(column("POSITION"), quats, column("SCALE").log(), opacities, sh)
+
+
+def _rows(parts: list[Primitive], degree: int, start: int, stop: int) -> Gaussians:
+    read, first = list[Gaussians](), 0
+    for part in parts:
+        begin, end = max(start - first, 0), min(stop - first, part.count)
+        if begin < end or (start == stop and not read):
+            read.append(of_degree(part.load(begin, max(begin, end)), degree))
+        first += part.count
+    return joined(read)
+
+
+# Writing
+
+
+class _Document:
+    """The layout of a file of at most `count` Gaussians: a stretch of the buffer for each attribute."""
+
+    def __init__(self, path: Path, first: Gaussians, count: int) -> None:
+        widths = {"POSITION": 12, f"{PREFIX}ROTATION": 16, f"{PREFIX}SCALE": 12, f"{PREFIX}OPACITY": 4}
+        self.widths = widths | {COLOUR: 4} | dict.fromkeys(harmonics(first.sh_degree), 12)  # bytes a Gaussian
+        starts = np.cumsum([0, *self.widths.values()]) * count
+        self.starts = dict(zip(self.widths, starts[:-1].tolist(), strict=True))
+        self.size, self.first, self.room, self.count = int(starts[-1]), first, count, 0
+        self.path = path
+        self.least, self.most = torch.full((3,), torch.inf), torch.full((3,), -torch.inf)
+        self.written = 0
+
+    def add(self, part: Gaussians) -> None:
+        """Count a part."""
+        self.count += len(part)
+        if len(part):
+            self.least, self.most = self.least.minimum(part.means.amin(0)), self.most.maximum(part.means.amax(0))
+
+    def placed(self, part: Gaussians) -> list[tuple[int, bytes]]:
+        """The bytes of the next part's attributes, and where they go."""
+        rgba = torch.cat([COLOUR_OFFSET + SH_C0 * part.sh[:, 0], part.opacities[:, None]], dim=1)
+        values = [part.means, part.unit_quats.roll(-1, dims=1), part.scales, part.opacities]
+        columns = [each.contiguous().numpy().astype("<f4") for each in (*values, *part.sh.unbind(dim=1))]
+        columns.insert(4, bytes_of(rgba * 255))
+        starts = [start + self.written * self.widths[name] for name, start in self.starts.items()]
+        self.written += len(part)
+        return [(at, column.tobytes()) for at, column in zip(starts, columns, strict=True)]
+
+    def json(self, uri: str | None = None, blob: int | None = None) -> dict[str, Any]:
+        """The document; `blob`: the size of a .spz that holds the rows, instead of the attributes."""
+        if not self.count:
+            raise OutputError(self.path, "glTF cannot hold a scene without Gaussians; write a .ply")
+        views, accessors = list[dict[str, Any]](), list[dict[str, Any]]()
+        for name, width in self.widths.items():
+            kind = {4: "SCALAR", 12: "VEC3", 16: "VEC4"}[width] if name != COLOUR else "VEC4"
+            accessor = {"componentType": FLOAT, "count": self.count, "type": kind}
+            if name == COLOUR:
+                accessor |= {"componentType": BYTES, "normalized": True}
+            if name == "POSITION":
+                accessor |= {"min": self.least.tolist(), "max": self.most.tolist()}
+            if blob is None:
+                accessor["bufferView"] = len(views)
+                stretch = {"byteOffset": self.starts[name], "byteLength": self.count * width}
+                views.append({"buffer": 0, **stretch, "target": VERTICES})
+            accessors.append(accessor)
+        names, used = dict(zip(self.widths, range(len(self.widths)), strict=True)), [SPLATS]
+        splats: dict[str, Any] = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+        splats |= {"sortingMethod": "cameraDistance", "projection": "perspective"}
+        required = {}
+        if blob is not None:
+            views, used = [{"buffer": 0, "byteLength": blob}], [SPLATS, SPZ]
+            splats["extensions"], required = {SPZ: {"bufferView": 0}}, {"extensionsRequired": used}
+        primitive = {"attributes": names, "mode": POINTS, "extensions": {SPLATS: splats}}
+        primitive["extras"] = {KEY: record_of(self.first)}
+        return {
+            "asset": {"version": "2.0", "generator": "aaplug"},
+            "extensionsUsed": used,
+            **required,
+            "scene": 0,
+            "scenes": [{"nodes": [0]}],
+            "nodes": [{"mesh": 0}],
+            "meshes": [{"primitives": [primitive]}],
+            "buffers": [{"byteLength": self.size if blob is None else blob} | ({"uri": uri} if uri else {})],
+            "bufferViews": views,
+            "accessors": accessors,
+        }
+
+
+def _write_glb(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool) -> None:
+    """The JSON goes first and is known last, so it is padded and filled in at the end."""
+    parts = iter(parts)
+    first = next(parts)
+    document, room = _Document(path, first, count), ROOM + 4 * len(json.dumps(record_of(first)))
+    start = len(glb_start({}, 0, room))
+    if start + document.size > MOST_BYTES:
+        raise OutputError(path, f"a .glb has at most {MOST_BYTES:,} bytes, {document.size:,} needed; write a .ply")
+    with replacing(path, overwrite) as stream:
+        for part in chain([first], parts):
+            document.add(part)
+            for at, values in document.placed(part):
+                stream.seek(start + at)
+                stream.write(values)
+        stream.truncate(start + document.size)
+        stream.seek(0)
+        stream.write(glb_start(document.json(), document.size, room))
+        assert stream.tell() == start, (stream.tell(), start)

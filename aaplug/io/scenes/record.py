@@ -1,0 +1,84 @@
+"""What a format cannot say about a scene: kept in a record of ours where other programs leave one alone, or told.
+
+The one rule of all formats: what would change the picture is refused, what was only said about it is kept, in the
+format's own tag or in the record, and a warning names what reading the file again will not give.
+"""
+
+import logging
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from aaplug.core.chunks import curve
+from aaplug.core.conventions import CLASSIC, CONVENTIONS, Convention
+from aaplug.core.gaussians import Fusion, Gaussians, joined
+from aaplug.io.values import Entry, Place, text
+from aaplug.system.errors import OutputError
+
+KEY = "aaplug"  # of the record in a JSON document
+
+log = logging.getLogger("aaplug")
+
+
+class Facts(NamedTuple):
+    """What a file says about its scene; evidence: where, for the user."""
+
+    evidence: str
+    convention: Convention = CLASSIC
+    fused: tuple[Fusion, ...] = ()
+
+
+def record_of(scene: Gaussians) -> dict[str, Any]:
+    """The record of a scene, as JSON holds it."""
+    fused = [{"method": fusion.method, "settings": fusion.settings} for fusion in scene.fused]
+    return {"convention": scene.convention.name, **({"fused": fused} if fused else {})}
+
+
+def read_record(path: Path, holder: dict[str, Any], otherwise: Facts) -> Facts:
+    """The facts in a record among the keys of a JSON object, or `otherwise`; raises FormatError if it is damaged."""
+    if KEY not in holder:
+        return otherwise
+    record = Entry(Place(path, "its object"), holder).entry(KEY)
+    name = record.get("convention", text)
+    record.place.expect(name in CONVENTIONS, "convention", f"one of {', '.join(CONVENTIONS)}", name)
+    listed, fused = record.fields.get("fused", []), list[Fusion]()
+    record.place.expect(isinstance(listed, list), "fused", "a list", listed)
+    for each in listed:
+        record.place.expect(isinstance(each, dict), "fused", "a list of objects", each)
+        fusion = Entry(record.place, each)
+        settings = fusion.entry("settings").fields
+        pairs = {text(k, record.place, "a setting"): text(v, record.place, "a setting") for k, v in settings.items()}
+        fused.append(Fusion(fusion.get("method", text), pairs))
+    return Facts(f"aaplug's record in the file: {name}", CONVENTIONS[name], tuple(fused))
+
+
+def holdable(path: Path, part: Gaussians, format: str, degree: int, flat: bool = False) -> Gaussians:
+    """The part; raises OutputError for what the format cannot hold and would change the picture."""
+    if part.flat and not flat:
+        raise OutputError(path, f"a .{format} cannot hold 2D Gaussians; write a .ply")
+    if part.filter_3d is not None:
+        raise OutputError(path, f"a .{format} cannot hold a filter_3D; aaplug convert fuses it")
+    if part.sh_degree > degree:
+        degrees = f"harmonics of degree {part.sh_degree}, only up to {degree}"
+        raise OutputError(path, f"a .{format} cannot hold {degrees}; write a .ply")
+    return part
+
+
+def whole(path: Path, parts: Iterable[Gaussians], format: str, degree: int, flat: bool = False) -> Gaussians:
+    """All parts as one scene along a curve through space, for a format that sorts; raises as `holdable`.
+
+    The curve keeps neighbours together, which makes images compress and the bounds of chunks narrow.
+    """
+    scene = joined([holdable(path, part, format, degree, flat) for part in parts])
+    if not len(scene):
+        raise OutputError(path, f"a .{format} cannot hold a scene without Gaussians; write a .ply")
+    return scene[curve(scene.means.double()).argsort(stable=True)]
+
+
+def warn_of_losses(path: Path, format: str, scene: Gaussians, kept: Facts, also: Iterable[str] = ()) -> None:
+    """Name what a file does not tell of its scene's training, and other losses; `kept`: the facts that it tells."""
+    lost = list(also)
+    if scene.convention != kept.convention or scene.fused != kept.fused:
+        lost.append(f"the record of its training ({scene.convention.name})")
+    if lost:
+        log.warning("%s: a .%s cannot hold %s; a .ply can", path, format, " and ".join(lost))

@@ -1,0 +1,172 @@
+"""USD scenes: prims of the type ParticleField3DGaussianSplat (UsdVol 26.03), in .usda, .usdc and .usdz.
+
+positions, orientations (real part first), scales (linear), opacities (0 to 1) and
+radiance:sphericalHarmonicsCoefficients, (degree + 1)² of them a Gaussian, each as floats or as halves.  The axes of a
+stage have y up, as glTF's (see `gltf`), or z.  Transforms are applied, where they turn, move and scale alike along all
+axes; units are taken as they are.  USD has no word for a convention: it stays in a record of ours in the stage's
+`customLayerData`.
+
+Written are floats, as the stage's default prim, with y up and a metre per unit.
+"""
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterable
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from aaplug.core.gaussians import Gaussians, joined
+from aaplug.io.atomic import replacing_file
+from aaplug.io.scenes.options import SceneFileOptions
+from aaplug.io.scenes.packed import floats, half_turn_about_z, of_degree, standing
+from aaplug.io.scenes.record import KEY, Facts, holdable, read_record, record_of
+from aaplug.io.scenes.scene import Scene, check_count, library_errors, logit_of
+from aaplug.io.values import Entry, Place, entries, object_of, parse_json, text
+from aaplug.system.errors import FormatError, OutputError, UsageError
+from aaplug.system.extras import install_command
+from aaplug.system.locks import scratch
+
+SUFFIXES = ("usda", "usdc", "usdz", "usd")
+PACKAGE = "pxr"  # of usd-core
+SECONDS, BYTES_PER_SECOND = 20.0, 1e6  # that reading a file may take, and its size for each further second
+HARMONICS, DEGREE = "radiance:sphericalHarmonicsCoefficients", "radiance:sphericalHarmonicsDegree"
+TYPE = "ParticleField3DGaussianSplat"
+CHILD = Path(__file__).with_name("usd_child.py")  # a program of its own
+MAX_DEGREE = 4
+EXTENT_SIGMAS = 3.0  # from a Gaussian's centre
+# from axes with z up to axes with y up and z forward
+FROM_Z_UP = torch.tensor([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]], dtype=torch.float64)
+EVIDENCE = "USD does not say: assumed classic (3DGS default)"
+
+
+@dataclass(frozen=True)
+class UsdFormat:
+    """Files of one suffix.  Raises as `SceneFormat` and `WritableFormat`."""
+
+    name: str
+    needs: str | None = PACKAGE
+    extra: str = "usd"
+
+    def sniff(self, path: Path, head: bytes) -> bool:
+        """True for the suffix: a stage may begin like any text, or like any zip."""
+        return path.suffix[1:].lower() == self.name
+
+    def open_scene(self, path: Path, options: SceneFileOptions) -> Scene:
+        """All prims of splats as one scene, in memory; read by `usd_child`."""
+        if find_spec(PACKAGE) is None:
+            raise UsageError("path", f"{path.suffix} files need the extra `usd`: {install_command('usd')}")
+        with library_errors(path), scratch() as folder:
+            told, arrays = _told(path, folder / "arrays.npz")
+            stage = object_of(told, path, "the stage", "what is in it")
+            if "refused" in stage:
+                raise FormatError(path, stage.get("refused", text))
+            prims = entries(path, "prim", stage.value("prims"))
+            parts = [_read(path, prim, number, arrays, told["up"]) for number, prim in enumerate(prims)]
+            degree = max(part.sh_degree for part in parts)
+            scene = joined([of_degree(part, degree) for part in parts])
+            check_count(path, len(scene))
+            said = told["record"]
+            record = {} if said is None else {KEY: parse_json(said.encode(), path)}
+            facts = read_record(path, record, Facts(EVIDENCE))
+        return Scene(path, self.name, len(scene), degree, lambda start, stop: scene[start:stop], *facts)
+
+    def write(
+        self, path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, options: SceneFileOptions
+    ) -> None:
+        """Write a scene as one prim."""
+        scene = half_turn_about_z(joined([holdable(path, part, self.name, MAX_DEGREE) for part in parts]))
+        if not len(scene):
+            raise OutputError(path, f"a .{self.name} cannot hold a scene without Gaussians; write a .ply")
+        stage = _stage(scene)
+        with replacing_file(path, overwrite, f".{self.name}") as temporary:
+            if self.name != "usdz":
+                done = stage.GetRootLayer().Export(str(temporary))
+            else:
+                with replacing_file(temporary.with_suffix(".usdc"), overwrite=True, suffix=".usdc") as inner:
+                    stage.GetRootLayer().Export(str(inner))
+                    done = module("UsdUtils").CreateNewUsdzPackage(str(inner), str(temporary))
+            if not done:
+                raise OutputError(path, "cannot be written: usd-core failed")
+
+
+FORMATS = tuple(UsdFormat(suffix) for suffix in SUFFIXES)
+
+
+def module(name: str) -> Any:
+    """A module of usd-core, whose stubs are not complete."""
+    return import_module(f"{PACKAGE}.{name}")
+
+
+def _told(path: Path, file: Path) -> tuple[Any, dict[str, np.ndarray]]:
+    """What the child says of a file, and the arrays that it leaves."""
+    command = [sys.executable, str(CHILD), str(path.resolve()), str(file)]
+    seconds = SECONDS + path.stat().st_size / BYTES_PER_SECOND
+    try:
+        run = subprocess.run(command, capture_output=True, timeout=seconds, check=True)
+    except (subprocess.SubprocessError, ValueError) as error:
+        raise FormatError(path, "cannot be read: it breaks the format of USD") from error
+    with np.load(file) as arrays:
+        return parse_json(run.stdout.splitlines()[-1], path), dict(arrays)
+
+
+def _read(path: Path, prim: Entry, number: int, arrays: dict[str, np.ndarray], up: str) -> Gaussians:
+    place, degree = Place(path, f"prim {prim.value('name')}"), prim.value("degree")
+    right = isinstance(degree, int) and 0 <= degree <= MAX_DEGREE
+    place.expect(right, DEGREE, f"a whole number from 0 to {MAX_DEGREE}", degree)
+    each = (degree + 1) ** 2
+
+    def column(name: str, width: int, rows: int | None = None) -> Tensor:
+        key = f"{number} {name}"
+        place.expect(key in arrays, name, "an array", None)
+        fits = arrays[key].dtype.kind == "f" and arrays[key].size == arrays[key].shape[0] * width
+        wanted = f"{arrays[key].shape[0] if rows is None else rows:,} values of {width} numbers"
+        place.expect(fits and rows in (None, arrays[key].shape[0]), name, wanted, arrays[key].shape)
+        return floats(arrays[key]).reshape(-1, width)
+
+    means = column("positions", 3)
+    count = len(means)
+    turned = column("orientations", 4, count).roll(1, dims=1)  # numpy's view has the real part last
+    logits, log_scales = logit_of(column("opacities", 1, count)[:, 0]), column("scales", 3, count).log()
+    sh = column(HARMONICS, 3, count * each).reshape(count, each, 3)
+    motion = prim.matrix("motion", 4, 4).T
+    standing_up = FROM_Z_UP @ motion if up == "Z" else motion
+    return standing(Gaussians(means, turned, log_scales, logits, sh), standing_up, place)
+
+
+def _stage(scene: Gaussians) -> Any:
+    """A stage in memory with the scene, which is in its axes."""
+    Usd, UsdGeom, Sdf, Vt = (module(name) for name in ("Usd", "UsdGeom", "Sdf", "Vt"))
+    stage, types = Usd.Stage.CreateInMemory(), Sdf.ValueTypeNames
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    prim = stage.DefinePrim("/Splats", TYPE)
+    stage.SetDefaultPrim(prim)
+    stage.GetRootLayer().customLayerData = {KEY: json.dumps(record_of(scene))}
+    reach = EXTENT_SIGMAS * scene.scales.amax(dim=1, keepdim=True)
+    extent = torch.stack([(scene.means - reach).amin(dim=0), (scene.means + reach).amax(dim=0)])
+    triples = Vt.Vec3fArray.FromNumpy
+    values = {
+        "positions": (types.Point3fArray, triples(scene.means.numpy())),
+        "orientations": (types.QuatfArray, Vt.QuatfArray.FromNumpy(scene.unit_quats.roll(-1, dims=1).numpy())),
+        "scales": (types.Float3Array, triples(scene.scales.numpy())),
+        "opacities": (types.FloatArray, Vt.FloatArray.FromNumpy(scene.opacities.numpy())),
+        DEGREE: (types.Int, scene.sh_degree),
+        HARMONICS: (types.Float3Array, triples(scene.sh.reshape(-1, 3).contiguous().numpy())),
+        "extent": (types.Float3Array, triples(extent.numpy())),
+        "projectionModeHint": (types.Token, "perspective"),
+        "sortingModeHint": (types.Token, "zDepth"),
+    }
+    for name, (kind, value) in values.items():
+        attribute = prim.GetAttribute(name) or prim.CreateAttribute(name, kind, custom=False)
+        attribute.Set(value)
+        if name == HARMONICS:
+            attribute.SetMetadata("elementSize", scene.sh.shape[1])
+    return stage

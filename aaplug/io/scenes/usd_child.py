@@ -1,0 +1,78 @@
+"""Reads the splats of a USD stage for `usd`, as a program of its own: usd-core ends the process at some damaged files.
+
+Words: the file, and one for the arrays.  It prints what it found as a line of JSON; "refused" says why there is
+nothing.  Nothing of aaplug is imported, so that it starts at once.
+"""
+
+import json
+import os
+import sys
+from contextlib import suppress
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+
+Sdf, Usd, UsdGeom = (import_module(f"pxr.{name}") for name in ("Sdf", "Usd", "UsdGeom"))  # its stubs are not complete
+TYPE = "ParticleField3DGaussianSplat"
+DEGREE = "radiance:sphericalHarmonicsDegree"
+ARRAYS = ("positions", "orientations", "scales", "opacities", "radiance:sphericalHarmonicsCoefficients")
+MEMORY, GROWTH = 2 * 2**30, 20  # bytes of address space beside so many times the file's size
+
+
+def limit_memory(path: str) -> None:
+    """Let a file that announces more than it can hold fail here."""
+    with suppress(ImportError, ValueError, OSError):
+        import resource
+
+        most = MEMORY + GROWTH * os.path.getsize(path)
+        _, hard = resource.getrlimit(resource.RLIMIT_AS)
+        resource.setrlimit(resource.RLIMIT_AS, (most if hard < 0 else min(most, hard), hard))
+
+
+def foreign_layer(path: str) -> str | None:
+    """A layer that the stage is composed with, other than those of its own package; None if there is none."""
+    left, seen = [path], set[str]()
+    while left:
+        layer = Sdf.Layer.FindOrOpen(left.pop())
+        for asset in filter(None, layer.GetCompositionAssetDependencies()):
+            name = Sdf.ComputeAssetPathRelativeToLayer(layer, asset)
+            file, inside, _ = name.partition("[")
+            if not inside or os.path.realpath(file) != os.path.realpath(path):
+                return asset
+            if name not in seen:
+                seen.add(name)
+                left.append(name)
+    return None
+
+
+def found_in(path: str, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
+    """The stage's facts, and each prim's; its arrays go to `arrays` by number and name."""
+    asset = foreign_layer(path)
+    if asset is not None:
+        return {"refused": f"is composed with another layer, {asset!r}; flatten it into one file"}
+    stage, time = Usd.Stage.Open(path), Usd.TimeCode.EarliestTime()  # the default where nothing moves
+    prims = [prim for prim in stage.Traverse() if str(prim.GetTypeName()) == TYPE]
+    if not prims:
+        return {"refused": f"holds no {TYPE}; is it a mesh?"}
+    told = []
+    for number, prim in enumerate(prims):
+        for name in ARRAYS:
+            for each in (name, f"{name}h"):
+                value = prim.GetAttribute(each).Get(time) if prim.HasAttribute(each) else None
+                if value is not None and len(value):
+                    arrays[f"{number} {name}"] = np.asarray(value)
+                    break
+        motion = UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(time)
+        degree = prim.GetAttribute(DEGREE).Get(time)
+        told.append({"name": str(prim.GetPath()), "degree": degree, "motion": [list(row) for row in motion]})
+    record = stage.GetRootLayer().customLayerData.get("aaplug")
+    return {"up": str(UsdGeom.GetStageUpAxis(stage)), "prims": told, "record": None if record is None else str(record)}
+
+
+if __name__ == "__main__":
+    limit_memory(sys.argv[1])
+    read: dict[str, np.ndarray] = {}
+    answer = found_in(sys.argv[1], read)
+    np.savez(sys.argv[2], allow_pickle=False, **read)
+    print(json.dumps(answer))

@@ -1,0 +1,131 @@
+"""Streamed levels in their viewers: dB against the scene's own look from 1 to 1/16, ours and splat-transform's.
+
+It needs Node.js 22, npm and Chromium.  `aaplug lod --to` makes our levels; splat-transform (`-g cpu --decimate`) makes
+scenes of as many Gaussians, which are cut and indexed in the same way, so that both show equally many.  A cell has PSNR
+in dB between the viewer's picture and the scene's own training-size render, averaged over boxes.  The last column has
+the largest change between two of the frames while the camera moves out, as a root mean square in steps of 8 bits.
+"""
+
+import json
+import math
+import statistics
+import subprocess
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+import aaplug
+from aaplug.core.cameras import Camera
+from aaplug.core.colours import WHITE
+from aaplug.core.gaussians import Gaussians
+from aaplug.core.imaging import quantised, resampled
+from aaplug.core.sampling import median_rates
+from aaplug.io import StreamName
+from aaplug.io.scenes.pyramid_folder import Level
+from aaplug.io.streamed import SETTINGS, STREAMS, write_index, write_level
+from tests.bench import heading, row
+from tests.bench.scenes import decibels
+from tests.bench.viewers import shoot
+
+SCALES = (1.0, 0.5, 0.25, 0.125, 0.0625)
+PAGES = {"sog": "playcanvas", "3dtiles": "cesium"}
+FURTHEST = 16.0  # times the training distance, at the last frame
+MOVING_SIZE = 0.5  # of the training size, of the frames
+SPLAT_TRANSFORM = "node_modules/@playcanvas/splat-transform/bin/cli.mjs"
+
+
+def main(
+    scene: Path,
+    cameras: Path,
+    to: Sequence[StreamName] = ("sog", "3dtiles"),
+    work: Path = Path("out/streaming"),
+    modules: Path = Path("tests/bench/viewer_pages"),
+    node: str = "node",
+    steps: int | None = None,
+    views: int = 2,
+    frames: int = 120,
+) -> None:
+    """Print the table.
+
+    Args:
+        scene: a scene file.
+        cameras: its data set.
+        to: what to stream.
+        work: folder of levels and pictures; levels that are there are kept.
+        modules: folder of node_modules.
+        node: Node.js of version 22 or later.
+        steps: of the tuning; see `aaplug lod`.
+        views: their number.
+        frames: of the camera that moves out; 0 for none.
+    """
+    heading("streaming", "streamed", "levels", *(f"1/{1 / scale:g}" for scale in SCALES), "largest change")
+    whole, data = aaplug.read_scene(scene).gaussians(), aaplug.read_cameras(cameras)
+    seen = data.test[:: max(1, len(data.test) // views)][:views]
+    look = aaplug.Renderer.of(whole, data, "classic", background=WHITE)
+    truths = {view.name: look(view).rgb for view in seen}
+    sized = {(view.name, scale): view.scaled(scale) for view in seen for scale in SCALES}
+    out = [_moved(seen[0], whole, FURTHEST ** (t / max(1, frames - 1))).scaled(MOVING_SIZE) for t in range(frames)]
+    rates = median_rates(whole.means, data.train)
+    for name in to:
+        index, ours, theirs = STREAMS[name].index, work / f"{name}-ours", work / f"{name}-theirs"
+        if not (ours / index).exists():
+            aaplug.lod(whole, data, ours, to=name, steps=steps, resume=(ours / "lod.json").exists())
+        facts = json.loads((ours / index).read_text())
+        if not (theirs / index).exists():
+            command = [node, str((modules / SPLAT_TRANSFORM).resolve()), "-g", "cpu", str(scene)]
+            counts = facts.get("counts") or facts["asset"]["extras"]["counts"]
+            levels = list(_decimated(whole, counts, work, command))
+            for number, level in enumerate(levels):
+                write_level(theirs, name, number, [level.scene])
+            write_index(theirs, name, levels, float(rates[rates > 0].median()))
+        options = _options(name, json.loads((ours / SETTINGS).read_text()))
+        shown = {"ours": (ours, options), "splat-transform": (theirs, options)}
+        if name == "sog":
+            shown["splat-transform, anti-aliasing off"] = theirs, options | {"antiAlias": False}
+        for label, (folder, how) in shown.items():
+            pictures = work / f"{name}-{len(label)}"
+            drawn = shoot(PAGES[name], folder, index, how, sized | dict(enumerate(out)), pictures)
+            cells = [_mean([(drawn[v.name, s], _boxed(truths[v.name], s)) for v in seen]) for s in SCALES]
+            moving = [drawn[t] for t in range(frames)]
+            changes = [float((b - a).square().mean().sqrt()) * 255 for a, b in pairwise(moving)]
+            row(name, label, *cells, max(changes, default=math.nan))
+
+
+def _decimated(whole: Gaussians, counts: Sequence[int], work: Path, command: Sequence[str]) -> Iterator[Level]:
+    """splat-transform's scenes of so many Gaussians, as levels of one part of space."""
+    for number, count in enumerate(counts):
+        file, lighter = work.resolve() / f"decimated-{count}.ply", whole
+        if count < len(whole):
+            subprocess.run([*command, "--decimate", str(count), str(file), "-w", "-q"], check=True)
+            lighter = aaplug.read_scene(file).gaussians()
+        yield Level(lighter, 0.5**number, torch.zeros(len(lighter), dtype=torch.long))
+
+
+def _options(name: StreamName, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """settings.json as the page takes it."""
+    if name == "3dtiles":
+        return settings["Cesium3DTileset"]
+    engine, component, distance, _ = settings.values()
+    return {**engine, "component": component, "distancePerPixel": distance}
+
+
+def _moved(view: Camera, scene: Gaussians, times: float) -> Camera:
+    """The view from `times` its distance to the middle of the scene."""
+    pose = view.cam_from_world.clone()
+    middle = pose[:3, :3] @ scene.means.median(dim=0).values.to(pose) + pose[:3, 3]
+    pose[2, 3] += (times - 1) * middle[2]
+    return replace(view, cam_from_world=pose)
+
+
+def _boxed(image: Float[Tensor, "h w 3"], scale: float) -> Float[Tensor, "h w 3"]:
+    return quantised(resampled(image, scale))
+
+
+def _mean(pairs: Sequence[tuple[Tensor, Tensor]]) -> float:
+    return statistics.fmean(decibels(image, truth) for image, truth in pairs)

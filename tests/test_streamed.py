@@ -1,0 +1,130 @@
+"""Streamed levels: the files of `aaplug lod --to`, what interrupts them, and what is refused."""
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+import torch
+
+import aaplug
+from aaplug.core.sampling import median_rates
+from aaplug.io import streamed
+from aaplug.io.scenes import read_scene
+from aaplug.io.streamed import MAX_SCREEN_ERROR, SWITCH
+from aaplug.system.errors import OutputError, UsageError
+from tests.conftest import make_camera, make_scene
+
+LEVELS = 2
+SCENE = make_scene(400)
+CAMERAS = aaplug.CameraSet(tuple(make_camera(eye, (64, 48)) for eye in ((0.0, -4.0, 0.0), (3.0, -2.0, 1.0))), ())
+
+
+@pytest.fixture
+def small_leaves(monkeypatch):
+    monkeypatch.setattr(streamed, "LEAF_GAUSSIANS", 100)
+    monkeypatch.setattr("aaplug.verbs.lod.MAX_CHUNK_GAUSSIANS", 50)
+
+
+def made(folder, to, **how):
+    return aaplug.lod(SCENE, CAMERAS, folder, to=to, levels=LEVELS, refine=False, min_seen=0.0, **how)
+
+
+def test_streamed_sog_lists_every_part(tmp_path, small_leaves):
+    levels = made(tmp_path / "out", "sog")
+    index = json.loads((tmp_path / "out" / "lod-meta.json").read_text())
+    assert (index["version"], index["lodLevels"]) == (1, LEVELS + 1)
+    assert index["counts"] == [len(level.scene) for level in levels]
+    leaves = index["tree"]["children"]
+    assert len(leaves) > 1
+    for number in range(LEVELS + 1):
+        parts = [leaf["lods"][str(number)] for leaf in leaves if str(number) in leaf["lods"]]
+        assert sum(part["count"] for part in parts) == index["counts"][number]
+        for part in parts:
+            assert part["offset"] == 0
+            assert read_scene(tmp_path / "out" / index["filenames"][part["file"]]).count == part["count"]
+    means = torch.cat([level.scene.means for level in levels])
+    low, high = (torch.tensor(index["tree"]["bound"][end]) for end in ("min", "max"))
+    torch.testing.assert_close(torch.stack([low, high]), torch.stack([means.amin(dim=0), means.amax(dim=0)]))
+
+
+def test_3d_tiles_refine_where_a_level_is_no_longer_right(tmp_path, small_leaves):
+    """By the specification: an error over distance in px, and a child's box and error within its parent's."""
+    made(tmp_path / "out", "3dtiles")
+    index = json.loads((tmp_path / "out" / "tileset.json").read_text())
+    required = index["extensions"]["3DTILES_content_gltf"]["extensionsRequired"]
+    assert (index["asset"]["version"], required) == ("1.1", streamed.SPLATS)
+    assert index["root"]["transform"] == torch.eye(4).flatten().tolist()
+    rates = median_rates(SCENE.means, CAMERAS.train)
+    rate, counts = float(rates[rates > 0].median()), [0] * (LEVELS + 1)
+    for tile in index["root"]["children"]:
+        level = LEVELS
+        while tile:
+            scene = read_scene(tmp_path / "out" / tile["content"]["uri"]).gaussians()
+            counts[level] += len(scene)
+            middle, half = torch.tensor(tile["boundingVolume"]["box"]).split([3, 9])
+            inside = -scene.means[:, [0, 2, 1]] - middle
+            assert (inside.abs() <= half.reshape(3, 3).diagonal() + 1e-3).all()
+            assert (tile["refine"], "transform" in tile) == ("REPLACE", False)
+            expected = MAX_SCREEN_ERROR / (SWITCH * rate * 0.5**level) if level else 0.0
+            assert math.isclose(tile["geometricError"], expected, rel_tol=1e-5)
+            [tile] = tile.get("children", [None])
+            level -= 1
+        assert level == -1
+    assert counts == index["asset"]["extras"]["counts"]
+
+
+@pytest.mark.parametrize("to", ["sog", "3dtiles"])
+def test_a_run_that_was_cut_short_is_resumed(tmp_path, small_leaves, monkeypatch, to):
+    def contents(folder):
+        return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+    made(tmp_path / "whole", to)
+    written, resumed = streamed.write_level, []
+
+    def cut(folder, name, number, parts):
+        written(folder, name, number, parts[:1] if number else parts)
+        if number:
+            raise KeyboardInterrupt
+
+    def recorded(folder, name, number, parts):
+        resumed.append(number)
+        written(folder, name, number, parts)
+
+    monkeypatch.setattr("aaplug.verbs.lod.write_level", cut)
+    with pytest.raises(KeyboardInterrupt):
+        made(tmp_path / "out", to)
+    assert not (tmp_path / "out" / streamed.STREAMS[to].index).exists()
+    monkeypatch.setattr("aaplug.verbs.lod.write_level", recorded)
+    made(tmp_path / "out", to, resume=True)
+    assert resumed == [1, 2]
+    assert contents(tmp_path / "out") == contents(tmp_path / "whole")
+
+
+def test_levels_that_are_there_are_not_replaced(tmp_path):
+    made(tmp_path / "out", "sog")
+    with pytest.raises(OutputError, match="already holds lod-meta"):
+        made(tmp_path / "out", "sog", resume=True)
+    made(tmp_path / "out", "sog", overwrite=True)
+
+
+def test_a_page_has_the_viewer_beside_it(tmp_path):
+    with pytest.raises(UsageError, match="does not hold playcanvas/build"):
+        made(tmp_path / "out", "sog", page=tmp_path)
+    assert not (tmp_path / "out").exists()
+    program = tmp_path / "modules" / "playcanvas" / "build" / "playcanvas.min.mjs"
+    program.parent.mkdir(parents=True)
+    program.write_text("export {};")
+    made(tmp_path / "out", "sog", page=tmp_path / "modules")
+    page = (tmp_path / "out" / "index.html").read_text()
+    assert (tmp_path / "out" / "viewer" / program.name).read_text() == program.read_text()
+    assert f"./viewer/{program.name}" in page
+    assert "http" not in page
+    assert not list((tmp_path / "out").glob("*.ply"))
+
+
+def test_what_does_not_belong_together_is_refused(tmp_path):
+    with pytest.raises(UsageError, match="belongs to `to`"):
+        aaplug.lod(make_scene(9), CAMERAS, tmp_path, page=Path())
+    with pytest.raises(UsageError, match="belongs to levels"):
+        aaplug.lod(make_scene(9), CAMERAS, tmp_path / "a.ply", to="sog", simplify=0.5)
