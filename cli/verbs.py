@@ -370,6 +370,41 @@ def check_plugin(words: Words) -> Answer:
     return Answer([verdict._asdict() for verdict in verdicts], lines, any(each.problem for each in verdicts))
 
 
+@verb(
+    Option(
+        "program",
+        flag("[PROGRAM]", by_place=True),
+        "A command line in quotes, in which {scene}, {camera} and {image} stand for the .ply, the camera's .json and"
+        " the .png to write; without them, the three are added at the end.",
+        None,
+    ),
+    Option("images", flag("FOLDER", read=Path), "Instead: pictures made by hand, such as dilation.png.", None),
+    output(
+        "FOLDER", "Folder for scenes, cameras and pictures; without PROGRAM and --images they are written alone.", None
+    ),
+    verbs.ConformOptions,
+    json_of("the verdicts as one JSON object"),
+)
+def conform(words: Words) -> Answer:
+    """Judge a renderer by its pictures of ten tiny scenes, and name what it does wrong.
+
+    Exits with 1 if anything is.  To fit a scene to a viewer's rule instead, use convert --for.
+    """
+    verdict = aaplug.conform(words.program, words.images, words.output, **told(words, verbs.ConformOptions))
+    if verdict is None:
+        return Answer(None)
+    how = "" if verdict.stated else ", which fits best"
+    say(f"expected: {verdict.viewer.name} ({verdict.viewer.program}: {verdict.viewer.rule}){how}")
+    headings = ("test", "verdict", "error", "what is wrong")
+    rows = [
+        (f.test, "wrong" if f.wrong else "right", "" if f.error is None else f"{f.error:.1f}", f.wrong)
+        for f in verdict.findings
+    ]
+    facts = {"viewer": verdict.viewer.name, "stated": verdict.stated, "right": verdict.right}
+    tests = [finding._asdict() for finding in verdict.findings]
+    return Answer(facts | {"tests": tests}, [table(rows, headings)], not verdict.right)
+
+
 @verb(*SCENE_AND_CAMERAS, verbs.BenchOptions, json_of('one JSON object: the figures, or {"runs": [...]} of several'))
 def bench(words: Words) -> Answer:
     """Time the rasterizer on synthetic scenes, or on SCENE with --cameras (its first training view).

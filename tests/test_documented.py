@@ -65,6 +65,9 @@ ELSEWHERE = {  # commands of the tests and benches themselves, and what runs the
         ("aaplug view", "aaplug view scene.ply", "aaplug view scene.ply --cameras path/to/colmap --port 8123"),
         "test_view.py: it ends when it is interrupted",
     ),
+    'aaplug conform "aaplug render {scene} --cameras {camera} --recipe classic -o {image}" --for classic': (
+        "test_conform.py runs programs"
+    ),
     **dict.fromkeys(NERFBASELINES, "test_nerfbaselines.py, where the package is"),
     "python -m tests.guided -max_total_time=60": ".ci/run, twice for a third as long",
 }
