@@ -152,10 +152,23 @@ BATCH = Option(
 )
 
 
+MODELS = Option(
+    "models",
+    flag("FOLDER", read=Path),
+    "With a folder of the --protocol's scenes: the trained scenes, if they do not lie with the photographs.",
+    None,
+)
+SKIP = Option(
+    "skip", None, "With such a folder: leave out scenes that are missing or fail; the table says which.", False
+)
+
+
 @verb(
     SceneOptions,
     MORE_SCENES,
     BATCH,
+    MODELS,
+    SKIP,
     CameraOptions,
     Orbit,
     output("FOLDER", "Folder for results.json, per_view.json and results.csv.", None),
@@ -165,11 +178,16 @@ BATCH = Option(
 def evaluate(words: Words) -> Answer:
     """Measure recipes over scales, against photographs or against the scene's own look; of one scene or many.
 
-    To measure scene files against each other, use compare; for images only, render.
+    A folder of all scenes of NeRF-synthetic (--protocol blender) or Mip-NeRF 360 (360-zoom-out, 360-zoom-in) gives the
+    papers' table.  To measure scene files against each other, use compare; for images only, render.
     """
     if words.batch is not None or words.more:
         return batch_of_evaluations(words)
-    _ = path_of(words)  # refuses where none is named
+    path = path_of(words)  # refuses where none is named
+    from aaplug.evaluation.data_sets import is_set
+
+    if is_set(str(words.protocol), path) or words.models is not None or words.skip:
+        return batch_of_evaluations(words, of_set=True)
     from aaplug.evaluation.results import results, tables
     from aaplug.verbs.evaluate import check_results
 
