@@ -44,6 +44,7 @@ NERFBASELINES = (
 )
 ELSEWHERE = {  # commands of the tests and benches themselves, and what runs them instead
     "python -m tests.bench method_tables": "ten minutes; needs scenes beside the repository",
+    "python -m tests.bench claims": "test_site.py compares the page with what it writes",
     "python -m tests.bench pictures": "ten seconds; test_site.py draws the figure of the tables",
     "python -m tests.bench viewers": "minutes; needs Node.js and Chromium",
     **dict.fromkeys(
