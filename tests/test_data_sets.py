@@ -63,8 +63,9 @@ def test_what_is_missing_is_listed(tmp_path):
     check_whole("360-zoom-in", tmp_path / "data", found, skip=True)
     with pytest.raises(FormatError, match="lacks 9 of the 9"):
         check_whole("360-zoom-in", tmp_path, find_scenes("360-zoom-in", tmp_path), skip=True)
-    with pytest.raises(UsageError, match="no data set"):
-        find_scenes("self", tmp_path)
+    for refused in (lambda: find_scenes("self", tmp_path), lambda: aaplug.batch([], tmp_path, protocol="self")):
+        with pytest.raises(UsageError, match="no data set"):
+            refused()
 
 
 @pytest.fixture

@@ -56,6 +56,13 @@ PUBLISHED = {
 }
 
 
+def data_set_of(protocol: str) -> DataSet:
+    """The data set that a protocol is for; raises UsageError if it is for none."""
+    if protocol not in DATA_SETS:
+        raise UsageError("protocol", f"has no data set of its own: {not_one_of(protocol, DATA_SETS)}")
+    return DATA_SETS[protocol]
+
+
 class Found(NamedTuple):
     """Scenes of a data set: by name the trained scene and the folder of its data; and what is missing, in words."""
 
@@ -88,9 +95,7 @@ def find_scenes(protocol: str, data: Path, models: Path | None = None) -> Found:
     Raises:
         UsageError: the protocol is not one of a data set.
     """
-    if protocol not in DATA_SETS:
-        raise UsageError("protocol", f"has no data set of its own: {not_one_of(protocol, DATA_SETS)}")
-    data_set, root = DATA_SETS[protocol], models or data
+    data_set, root = data_set_of(protocol), models or data
     scenes, missing = dict[str, tuple[Path, Path]](), dict[str, str]()
     for scene in data_set.scenes:
         cameras = [place for place in _places(data_set, data, scene) if (place / data_set.cameras).exists()]

@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from aaplug.evaluation import PROTOCOLS
-from aaplug.evaluation.data_sets import Paper, paper
+from aaplug.evaluation.data_sets import Paper, data_set_of, paper
 from aaplug.evaluation.protocols import Protocol
 from aaplug.evaluation.report.files import as_json, write_texts
 from aaplug.evaluation.results import Report, as_csv, grid, method, results
@@ -136,7 +136,10 @@ def batch(
         AaplugError: there are results already, an option does not fit, or the summary cannot be written.
     """
     check_name(output)
-    found = None if protocol is None else PROTOCOLS.find(protocol, "protocol")
+    found = None
+    if protocol is not None:
+        data_set_of(protocol)  # refuses what has none
+        found = PROTOCOLS[protocol]
     folders = [Path(output) / slug for slug in file_names([name for name, _ in runs], "scene", 3)]
 
     def check() -> None:

@@ -1,5 +1,6 @@
 """What a renderer does wrong: ten tiny scenes, drawn by a program or by hand, against the pictures they should be."""
 
+import os
 import shlex
 import subprocess
 from collections.abc import Callable
@@ -18,7 +19,7 @@ from aaplug.io.images import read_image, write_png
 from aaplug.io.scenes import write_scene
 from aaplug.methods.viewers import CLASSIC_VIEWER, Viewer, find_viewer
 from aaplug.system.contracts import contract
-from aaplug.system.errors import FormatError, UsageError, reason
+from aaplug.system.errors import MAX_VALUE_CHARACTERS, FormatError, UsageError, reason
 from aaplug.system.executors import torch_threads
 from aaplug.system.monitor import SILENT, Monitor
 from aaplug.verbs.verb import check_name
@@ -60,6 +61,8 @@ def conform(
         raise UsageError("images", "and `program` both give the pictures; give one")
     if program is None and images is None and output is None:
         raise UsageError("program", "name a program, `images`, or an `output` folder for the scenes")
+    if images is not None and not os.path.isdir(images):
+        raise UsageError("images", f"is no folder: {str(images)[:MAX_VALUE_CHARACTERS]}")
     if found is not None and found.convention is None:
         raise UsageError("viewer", f"{found.name} draws each scene by its own convention; name one with a rule")
     with ExitStack() as stack, torch_threads(1):
