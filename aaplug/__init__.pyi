@@ -30,6 +30,7 @@ from .verbs.batch import batch as batch
 from .verbs.bench import bench as bench
 from .verbs.check_plugin import check_plugin as check_plugin
 from .verbs.compare import compare as compare
+from .verbs.conform import conform as conform
 from .verbs.convert import convert as convert
 from .verbs.demo import demo as demo
 from .verbs.evaluate import evaluate as evaluate

@@ -19,7 +19,7 @@ from .console import TERMINAL, quiet
 from .inputs import path_of, read_inputs, told
 from .words import Answer, Option, Words
 
-NOT_IN_A_FILE = ("batch", "more", "json", "resume", "overwrite")
+NOT_IN_A_FILE = ("batch", "more", "json", "resume", "overwrite", "models", "skip")
 ONCE = ("output", "threads", "memory", "rasterizer", "scheduler")  # for the whole batch, not for one scene
 
 SEVERAL = (  # options of a verb that `for_each_scene` repeats
@@ -40,12 +40,22 @@ SEVERAL = (  # options of a verb that `for_each_scene` repeats
 )
 
 
-def batch_of_evaluations(words: Words) -> Answer:
-    """Evaluate every scene that a batch file or the command line names."""
+def batch_of_evaluations(words: Words, of_set: bool = False) -> Answer:
+    """Evaluate every scene that a batch file or the command line names, or of a protocol's data set in a folder."""
+    from aaplug.evaluation.data_sets import check_whole, find_scenes
+
     if words.batch is not None:
         if others := words.more or words.scene or words.model_path:
             raise UsageError("batch", f"names the scenes; leave {others} out")
         scenes = scenes_of(words.batch, words.where(batch=None))
+    elif of_set:
+        data, protocol = path_of(words), str(words.protocol)
+        found = find_scenes(protocol, data, words.models)
+        check_whole(protocol, data, found, words.skip)
+        each = {"more": (), "model_path": None, "models": None}
+        scenes = [
+            (n, words.where(scene=model, cameras=cameras, **each)) for n, (model, cameras) in found.scenes.items()
+        ]
     else:
         paths = [path_of(words), *words.more]
         names = [path.stem if path.is_file() else path.name for path in paths]
@@ -65,6 +75,7 @@ def batch_of_evaluations(words: Words) -> Answer:
     with running(options, None, lambda: None, (), shared=first.output) as workers:
         runs = [(name, partial(run, scene, workers.cluster)) for name, scene in scenes]
         how = {"resume": options.resume, "overwrite": options.overwrite, "monitor": TERMINAL}
+        how |= {"protocol": words.protocol, "partly": words.skip} if of_set else {}
         batch = aaplug.batch(runs, first.output, **how)
     return Answer(batch.summary(), batch.tables(), bool(batch.failures))
 

@@ -157,10 +157,23 @@ BATCH = Option(
 )
 
 
+MODELS = Option(
+    "models",
+    flag("FOLDER", read=Path),
+    "With a folder of the --protocol's scenes: the trained scenes, if they do not lie with the photographs.",
+    None,
+)
+SKIP = Option(
+    "skip", None, "With such a folder: leave out scenes that are missing or fail; the table says which.", False
+)
+
+
 @verb(
     SceneOptions,
     MORE_SCENES,
     BATCH,
+    MODELS,
+    SKIP,
     CameraOptions,
     Orbit,
     output("FOLDER", "Folder for results.json, per_view.json and results.csv.", None),
@@ -170,11 +183,16 @@ BATCH = Option(
 def evaluate(words: Words) -> Answer:
     """Measure recipes over scales, against photographs or against the scene's own look; of one scene or many.
 
-    To measure scene files against each other, use compare; for images only, render.
+    A folder of all scenes of NeRF-synthetic (--protocol blender) or Mip-NeRF 360 (360-zoom-out, 360-zoom-in) gives the
+    papers' table.  To measure scene files against each other, use compare; for images only, render.
     """
     if words.batch is not None or words.more:
         return batch_of_evaluations(words)
-    _ = path_of(words)  # refuses where none is named
+    path = path_of(words)  # refuses where none is named
+    from aaplug.evaluation.data_sets import is_set
+
+    if is_set(str(words.protocol), path) or words.models is not None or words.skip:
+        return batch_of_evaluations(words, of_set=True)
     from aaplug.evaluation.results import results, tables
     from aaplug.verbs.evaluate import check_results
 
@@ -394,6 +412,41 @@ def check_plugin(words: Words) -> Answer:
     outcomes = [f"FAILED: {each.problem}" if each.problem else "passed" for each in verdicts]
     lines = [f"{v.kind} {v.name}: {v.law} {outcome}" for v, outcome in zip(verdicts, outcomes, strict=True)]
     return Answer([verdict._asdict() for verdict in verdicts], lines, any(each.problem for each in verdicts))
+
+
+@verb(
+    Option(
+        "program",
+        flag("[PROGRAM]", by_place=True),
+        "A command line in quotes, in which {scene}, {camera} and {image} stand for the .ply, the camera's .json and"
+        " the .png to write; without them, the three are added at the end.",
+        None,
+    ),
+    Option("images", flag("FOLDER", read=Path), "Instead: pictures made by hand, such as dilation.png.", None),
+    output(
+        "FOLDER", "Folder for scenes, cameras and pictures; without PROGRAM and --images they are written alone.", None
+    ),
+    verbs.ConformOptions,
+    json_of("the verdicts as one JSON object"),
+)
+def conform(words: Words) -> Answer:
+    """Judge a renderer by its pictures of ten tiny scenes, and name what it does wrong.
+
+    Exits with 1 if anything is.  To fit a scene to a viewer's rule instead, use convert --for.
+    """
+    verdict = aaplug.conform(words.program, words.images, words.output, **told(words, verbs.ConformOptions))
+    if verdict is None:
+        return Answer(None)
+    how = "" if verdict.stated else ", which fits best"
+    say(f"expected: {verdict.viewer.name} ({verdict.viewer.program}: {verdict.viewer.rule}){how}")
+    headings = ("test", "verdict", "error", "what is wrong")
+    rows = [
+        (f.test, "wrong" if f.wrong else "right", "" if f.error is None else f"{f.error:.1f}", f.wrong)
+        for f in verdict.findings
+    ]
+    facts = {"viewer": verdict.viewer.name, "stated": verdict.stated, "right": verdict.right}
+    tests = [finding._asdict() for finding in verdict.findings]
+    return Answer(facts | {"tests": tests}, [table(rows, headings)], not verdict.right)
 
 
 @verb(*SCENE_AND_CAMERAS, verbs.BenchOptions, json_of('one JSON object: the figures, or {"runs": [...]} of several'))

@@ -44,6 +44,7 @@ NERFBASELINES = (
 )
 ELSEWHERE = {  # commands of the tests and benches themselves, and what runs them instead
     "python -m tests.bench method_tables": "ten minutes; needs scenes beside the repository",
+    "python -m tests.bench claims": "test_site.py compares the page with what it writes",
     "python -m tests.bench pictures": "ten seconds; test_site.py draws the figure of the tables",
     "python -m tests.bench viewers": "minutes; needs Node.js and Chromium",
     **dict.fromkeys(
@@ -64,6 +65,9 @@ ELSEWHERE = {  # commands of the tests and benches themselves, and what runs the
     **dict.fromkeys(
         ("aaplug view", "aaplug view scene.ply", "aaplug view scene.ply --cameras path/to/colmap --port 8123"),
         "test_view.py: it ends when it is interrupted",
+    ),
+    'aaplug conform "aaplug render {scene} --cameras {camera} --recipe classic -o {image}" --for classic': (
+        "test_conform.py runs programs"
     ),
     **dict.fromkeys(NERFBASELINES, "test_nerfbaselines.py, where the package is"),
     "python -m tests.guided -max_total_time=60": ".ci/run, twice for a third as long",

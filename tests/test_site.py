@@ -12,6 +12,9 @@ import pytest
 import aaplug
 from aaplug.evaluation.results import CEILING
 from aaplug.methods import RECIPES
+from tests.bench.claims import CLAIMS
+from tests.bench.claims import PAGE as PAGE_OF_CLAIMS
+from tests.bench.claims import page as claims_page
 from tests.bench.method_tables import COLUMNS, SCALES, lines, short_table, table
 from tests.bench.pictures import CURVES, FOLDER, scales
 
@@ -52,6 +55,12 @@ def test_links_to_papers_say_what_they_lead_to():
 
 def test_the_short_table_is_made_from_the_csv():
     assert short_table() in METHODS
+
+
+def test_the_page_of_claims_is_made_from_the_result_files_to_the_digit():
+    assert PAGE_OF_CLAIMS.read_text() == claims_page()
+    assert len(CLAIMS) >= 20
+    assert all(claim.ours is None or claim.scenes for claim in CLAIMS)
 
 
 @pytest.mark.parametrize("scene", SCALES)

@@ -92,6 +92,7 @@ def right_calls(folder: Path) -> dict[str, tuple[Callable[..., Any], dict[str, A
         "view": (aaplug.view, {"scene": nowhere, "no_browser": True}),
         "bench": (aaplug.bench, {"scene": nowhere}),
         "batch": (aaplug.batch, {"runs": [], "output": folder / "batch"}),
+        "conform": (aaplug.conform, {"images": folder}),
         "check_plugin": (aaplug.check_plugin, {"module": "nope"}),
         "demo": (aaplug.demo, {"output": picture}),
         "warmup": (aaplug.warmup, {"recipe": "nope"}),

@@ -19,7 +19,7 @@ from aaplug.core.cameras import WHOLE_SLACK, Camera, Undistortion
 from aaplug.core.imaging import box_average, levels, quantised, resampled
 from aaplug.io.images import read_image, read_rgba
 from aaplug.io.lenses import undistorted
-from aaplug.system.errors import UsageError
+from aaplug.system.errors import FormatError, UsageError
 
 At = Callable[[tuple[int, int], float], Float[Tensor, "h w 3"]]
 Background = tuple[float, float, float]
@@ -41,8 +41,15 @@ class Photograph:
         """The density, relative to the photograph's own, of pixels `scale` times as dense as those of its view.
 
         A photograph may be larger or smaller than the size at which its view was trained.
+
+        Raises:
+            FormatError: it is not of the camera's shape.
         """
-        return scale * view.width / self.hw[1]
+        (height, width), rounding = self.hw, 1 + max(view.hw) / min(view.hw)  # px
+        if abs(height - width * view.height / view.width) > rounding:
+            cameras = f"the cameras say {view.width}x{view.height}"
+            raise FormatError(view.photo or view.name, f"is {width}x{height} px, of another shape than {cameras}")
+        return scale * view.width / width
 
 
 @dataclass(frozen=True)

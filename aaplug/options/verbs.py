@@ -306,6 +306,16 @@ class LiveOptions(ViewOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
+class ConformOptions(Options):
+    """What to expect."""
+
+    viewer: OneViewer = None
+    """Whose rule to expect, such as classic, mip or spark: `aaplug guide viewers` (default: the one that fits best)."""
+    overwrite: bool = False
+    """Replace existing outputs."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class BenchOptions(Options):
     """What to time."""
 

@@ -11,6 +11,9 @@ from typing import Any, TypeVar
 from rich.markup import escape
 from rich.table import Table
 
+from aaplug.evaluation import PROTOCOLS
+from aaplug.evaluation.data_sets import Paper, data_set_of, paper
+from aaplug.evaluation.protocols import Protocol
 from aaplug.evaluation.report.files import as_json, write_texts
 from aaplug.evaluation.results import Report, as_csv, grid, method, results
 from aaplug.io.atomic import AnyPath, refuse_existing, writing
@@ -21,25 +24,45 @@ from aaplug.verbs.evaluate import check_results
 from aaplug.verbs.verb import check_name
 from aaplug.verbs.views import file_names
 
-SUMMARY, RESULTS = "batch.json", "results.csv"
+SUMMARY, RESULTS, TABLE = "batch.json", "results.csv", "table.tex"
 
 T = TypeVar("T")
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Outcomes of the scenes, by the names of their folders: a report, or in words why there is none."""
+    """Outcomes of the scenes, by the names of their folders: a report, or in words why there is none.
+
+    protocol: of a data set, whose scenes these are; then there are no means unless all have finished.
+    partly: give the means of those that have finished all the same.
+    """
 
     names: Mapping[str, str]
     reports: Mapping[str, Report]
     failures: Mapping[str, str]
+    protocol: Protocol | None = None
+    partly: bool = False
+
+    @property
+    def whole(self) -> bool:
+        """True if means may be taken."""
+        return bool(self.reports) and (self.protocol is None or self.partly or not self.failures)
+
+    def papers(self) -> list[Paper]:
+        """Of a data set, a table for each metric as papers print it."""
+        if self.protocol is None or not self.whole:
+            return []
+        named = {self.names[folder]: report for folder, report in self.reports.items()}
+        first = next(iter(self.reports.values()))
+        return [paper(self.protocol, named, metric) for metric in first.compared]
 
     def summary(self) -> dict[str, Any]:
         """Status of every scene, and means over the finished ones of what all of them measured; JSON-ready."""
         scenes = {folder: {"name": name, "status": "done"} for folder, name in self.names.items()}
         for folder, error in self.failures.items():
             scenes[folder] |= {"status": "failed", "error": error}
-        return {"scenes": scenes, "mean_over": list(self.reports), "mean": self._means()}
+        over = list(self.reports) if self.whole else []
+        return {"scenes": scenes, "mean_over": over, "mean": self._means() if self.whole else {}}
 
     def _means(self) -> dict[str, dict[str, float | None]]:
         """By method and metric; None where a scene has no value, as means over different scenes do not compare."""
@@ -54,8 +77,10 @@ class Batch:
         """The means, one table per metric, and the status of every scene."""
         whys = [(name, self.failures.get(folder, "")) for folder, name in self.names.items()]
         scenes = status_table("why", [(name, "failed" if why else "done", why) for name, why in whys])
-        if not self.reports:
+        if not self.whole:
             return [scenes]
+        if self.protocol is not None:
+            return [*map(paper_table, self.papers()), scenes]
         first, means, grids = next(iter(self.reports.values())), self._means(), []
         over = f"mean of {len(self.reports)} scene{'s' * (len(self.reports) != 1)}"
         for metric in first.metrics:
@@ -63,6 +88,16 @@ class Batch:
             lines = [[metric.text(value) for value in line] for line in values]
             grids.append(grid(f"{metric.title}, {over}", first, lines))
         return [*grids, scenes]
+
+
+def paper_table(paper: Paper) -> Table:
+    """The table in print."""
+    table = Table(title=escape(paper.title), title_justify="left")
+    for i, heading in enumerate(paper.headings):
+        table.add_column(heading, justify="right" if i else "left", no_wrap=True)
+    for row in paper.rows:
+        table.add_row(*map(escape, row))
+    return table
 
 
 def status_table(heading: str, rows: Iterable[tuple[str, str, str]]) -> Table:
@@ -83,6 +118,8 @@ def batch(
     *,
     resume: bool = False,
     overwrite: bool = False,
+    protocol: str | None = None,
+    partly: bool = False,
     monitor: Monitor = SILENT,
 ) -> Batch:
     """Evaluate scenes into folders of their own, and write batch.json and results.csv beside these.
@@ -91,15 +128,22 @@ def batch(
         runs: scenes by name, each as `functools.partial(evaluate, scene, cameras, ...)`; called with `name`,
             `output`, `resume`, `overwrite` and `monitor`.
         output: folder of the scenes' folders.
+        protocol: of a data set, whose scenes these are: also write table.tex, a table as papers print it.  There are no
+            means unless all scenes finish.
+        partly: give the means of those that finish all the same.
 
     Raises:
         AaplugError: there are results already, an option does not fit, or the summary cannot be written.
     """
     check_name(output)
+    found = None
+    if protocol is not None:
+        data_set_of(protocol)  # refuses what has none
+        found = PROTOCOLS[protocol]
     folders = [Path(output) / slug for slug in file_names([name for name, _ in runs], "scene", 3)]
 
     def check() -> None:
-        refuse_existing([Path(output) / name for name in (SUMMARY, RESULTS)], overwrite or resume)
+        refuse_existing([Path(output) / name for name in (SUMMARY, RESULTS, TABLE)], overwrite or resume)
         for folder in folders:
             check_results(folder, resume, overwrite)
 
@@ -116,8 +160,10 @@ def batch(
                 failures[folder.name] = report
                 monitor.say(f"failed: {name}: {report}")
         names = {folder.name: name for folder, (name, _) in zip(folders, runs, strict=True)}
-        done = Batch(names, reports, failures)
+        done = Batch(names, reports, failures, found, partly)
         texts = {SUMMARY: as_json(done.summary()), RESULTS: as_csv(reports)}
+        if papers := done.papers():
+            texts[TABLE] = "\n".join(paper.as_latex() for paper in papers)
         for path in write_texts(output, texts, overwrite=True):  # checked at the start
             monitor.say(f"wrote {path}")
     return done

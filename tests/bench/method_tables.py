@@ -17,6 +17,7 @@ from aaplug.evaluation.results import CEILING, method, scale_name
 
 BATCH = Path(__file__).with_name("every_recipe.toml")
 TABLES = Path(__file__).resolve().parents[2] / "examples" / "guides" / "tables"
+MADE = TABLES / "made.json"  # by which command the tables were made, and at which commit
 PSNR_COLUMN = "PSNR (dB)"
 COLUMNS = ("recipe", "scale", PSNR_COLUMN, "SSIM", "evaluations (M)", "seconds")
 MILLION = 1e6
@@ -39,6 +40,8 @@ def main(folder: Path = Path("every_recipe")) -> None:
     for path in sorted(folder.glob("*/per_view.json")):
         with open(TABLES / f"{path.parent.name}.csv", "w", newline="", encoding="utf-8") as file:
             csv.writer(file, lineterminator="\n").writerows([COLUMNS, *lines(json.loads(path.read_text()))])
+    commit = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=True).stdout.strip()
+    MADE.write_text(json.dumps({"command": "python -m tests.bench method_tables", "commit": commit}) + "\n")
     print(short_table())
 
 

@@ -1,0 +1,160 @@
+"""All scenes of a paper's data set by one command: found by their layout, never averaged in silence."""
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+import aaplug
+from aaplug.evaluation.data_sets import DATA_SETS, MODEL, PUBLISHED, check_whole, find_scenes
+from aaplug.evaluation.journal import Journal
+from aaplug.io.scenes import read_scene, write_scene
+from aaplug.system.errors import FormatError, UsageError
+
+RUN = "evaluate data --protocol blender --recipe classic --scale 1 0.5 --rasterizer eager -o out"
+
+
+def make(path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.touch()
+
+
+def lay_out(protocol: str, data: Path, models: Path) -> None:
+    """Empty files as the full sets have them."""
+    for scene in DATA_SETS[protocol].scenes:
+        cameras = data / scene / DATA_SETS[protocol].cameras
+        make(cameras if cameras.suffix else cameras / "cameras.bin")
+        make(
+            models / scene / MODEL.replace("*", "30000") if models.name != "plain" else models / scene / f"{scene}.ply"
+        )
+
+
+@pytest.mark.parametrize("protocol", DATA_SETS)
+@pytest.mark.parametrize("model", ["models", "plain", "data"])
+def test_each_scene_of_the_full_sets_is_found(tmp_path, protocol, model):
+    lay_out(protocol, tmp_path / "data", tmp_path / model)
+    found = find_scenes(protocol, tmp_path / "data", None if model == "data" else tmp_path / model)
+    assert [*found.scenes] == [*DATA_SETS[protocol].scenes]
+    assert len(found.scenes) == (8 if protocol == "blender" else 9)
+    assert not found.missing
+
+
+def test_archives_and_checkpoints_of_nerfbaselines_are_found(tmp_path):
+    for scene in DATA_SETS["blender"].scenes:
+        make(tmp_path / "nerf_synthetic" / scene / "transforms_test.json")
+        make(tmp_path / "results" / "blender" / scene / "checkpoint" / MODEL.replace("*", "7000"))
+    found = find_scenes("blender", tmp_path, tmp_path / "results")
+    assert len(found.scenes) == 8
+    assert found.scenes["mic"][0] == tmp_path / "results" / "blender" / "mic" / "checkpoint"
+
+
+def test_what_is_missing_is_listed(tmp_path):
+    lay_out("360-zoom-in", tmp_path / "data", tmp_path / "models")
+    shutil.rmtree(tmp_path / "data" / "room")
+    shutil.rmtree(tmp_path / "models" / "stump")
+    found = find_scenes("360-zoom-in", tmp_path / "data", tmp_path / "models")
+    with pytest.raises(FormatError) as refused:
+        check_whole("360-zoom-in", tmp_path / "data", found, skip=False)
+    assert "lacks 2 of the 9 scenes of Mip-NeRF 360" in str(refused.value)
+    assert re.search(r"room: no sparse/0 in .*; stump: no point_cloud/iteration_N/point_cloud.ply", str(refused.value))
+    check_whole("360-zoom-in", tmp_path / "data", found, skip=True)
+    with pytest.raises(FormatError, match="lacks 9 of the 9"):
+        check_whole("360-zoom-in", tmp_path, find_scenes("360-zoom-in", tmp_path), skip=True)
+    for refused in (lambda: find_scenes("self", tmp_path), lambda: aaplug.batch([], tmp_path, protocol="self")):
+        with pytest.raises(UsageError, match="no data set"):
+            refused()
+
+
+@pytest.fixture
+def whole(cli):
+    """The program beside a small data set of the eight scenes, whose photographs are their own renders."""
+    for scene in DATA_SETS["blender"].scenes:
+        folder = Path("data") / scene
+        (folder / "test").mkdir(parents=True)
+        shutil.copy("scene.ply", folder / f"{scene}.ply")
+        shutil.copy("test/r_0.png", folder / "test")
+        for split in ("train", "test"):
+            shutil.copy(f"transforms_{split}.json", folder)
+    return cli
+
+
+def test_the_papers_table_and_resuming(whole, monkeypatch):
+    code, out, err = whole(RUN)
+    assert code == 0, err
+    assert "PSNR, NeRF-synthetic, mean of 8 of 8 scenes" in out
+    texts = {name: Path("out", name).read_bytes() for name in ("table.tex", "batch.json")}
+    latex = texts["table.tex"].decode()
+    assert r"\begin{tabular}{lccc}" in latex
+    assert "published" not in latex  # other scales than the papers'
+    assert r"{\scriptsize $\pm$ 0.00}" in latex
+    assert len(json.loads(texts["batch.json"])["mean_over"]) == 8
+    shutil.rmtree("out")
+    add, calls = Journal.add, []
+
+    def killed(self, *words):
+        calls.append(words)
+        if len(calls) == 5:
+            raise KeyboardInterrupt
+        add(self, *words)
+
+    monkeypatch.setattr(Journal, "add", killed)
+    assert whole(RUN)[0] != 0
+    assert not Path("out", "table.tex").exists()
+    monkeypatch.setattr(Journal, "add", add)
+    assert whole(f"{RUN} --resume")[0] == 0
+    assert {name: Path("out", name).read_bytes() for name in texts} == texts
+
+
+def test_the_papers_figures_stand_above_ours_at_their_scales(whole):
+    assert whole(RUN.replace("--scale 1 0.5", "--scale 1 0.5 0.25 0.125"))[0] == 0
+    table = Path("out", "table.tex").read_text()
+    assert "3DGS (published) & 33.33 & 26.95 & 21.38 & 17.69 & 24.84" in table
+    assert PUBLISHED["blender"]["Mip-Splatting"][-1] == 31.97
+
+
+def of_another_scene(folder: Path) -> str:
+    scene = read_scene(folder / "ship.ply").gaussians()
+    turned = aaplug.Gaussians(-scene.means + 6, scene.quats, scene.log_scales, scene.logit_opacities, scene.sh)
+    write_scene(folder / "ship.ply", turned, overwrite=True)
+    return "only 0.0% of its Gaussians are seen"
+
+
+def truncated(folder: Path) -> str:
+    photo = folder / "test" / "r_0.png"
+    photo.write_bytes(photo.read_bytes()[:-40])
+    return "r_0.png"
+
+
+def of_another_size(folder: Path) -> str:
+    photo = folder / "test" / "r_0.png"
+    Image.open(photo).resize((30, 30)).save(photo)
+    return "r_0.png: is 30x30 px, of another shape than the cameras say 64x48"
+
+
+@pytest.mark.parametrize("spoil", [of_another_scene, truncated, of_another_size])
+def test_a_scene_that_fails_is_named_and_not_averaged(whole, spoil):
+    named = spoil(Path("data", "ship"))
+    code, out, _ = whole(RUN)
+    assert code == 1
+    assert "mean of" not in out
+    assert not Path("out", "table.tex").exists()
+    summary = json.loads(Path("out", "batch.json").read_text())
+    assert (summary["mean_over"], summary["mean"]) == ([], {})
+    assert summary["scenes"]["ship"]["status"] == "failed"
+    assert named in summary["scenes"]["ship"]["error"], summary["scenes"]["ship"]
+    code, out, _ = whole(f"{RUN} --resume --skip")
+    assert code == 1
+    assert "mean of 7 of 8 scenes, without ship" in out
+
+
+def test_a_missing_scene_stops_before_any_work(whole):
+    shutil.rmtree("data/mic")
+    code, _, err = whole(RUN)
+    assert code != 0
+    assert "lacks 1 of the 8 scenes of NeRF-synthetic (--skip leaves them out): mic: no transforms_test.json" in err
+    assert not Path("out").exists()
+    assert whole(f"{RUN} --skip")[0] == 0
+    assert "without mic" in Path("out", "table.tex").read_text()
