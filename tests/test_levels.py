@@ -17,6 +17,7 @@ from aaplug.core.projection import project
 from aaplug.evaluation.metrics import psnr
 from aaplug.io.scenes import read_scene
 from aaplug.io.scenes.scene import Scene
+from aaplug.levels import pairing
 from aaplug.levels.clusters import MAX_OPACITY, clusters_of, merge_pairs, rates_of
 from aaplug.levels.covariances import area, areas, covariances, pack, quats_of, unpack
 from aaplug.levels.merging import Goal, merge, merge_in_chunks
@@ -27,6 +28,7 @@ from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import FrameError, OutputError, UsageError
 from aaplug.system.executors import torch_threads
 from tests.conftest import make_camera, make_scene
+from tests.wires import contrast, wires_over_checkerboard
 
 RATE = 20.0  # px per world unit
 
@@ -161,6 +163,18 @@ def test_a_lighter_scene_looks_like_the_scene(sample_scene, sample_cameras):
     assert (psnr(image, truth) or 0) > 38
     assert [fusion.method for fusion in level.fused] == [MERGED]
     assert not blurring(level.fused)
+
+
+@pytest.mark.parametrize(("level", "least", "blind"), [(2, 0.9, 0.85), (3, 0.8, 0.5)])
+def test_thin_things_keep_their_contrast(level, least, blind, monkeypatch):
+    """Wires 0.5 to 4 px wide close to a board; merging to the same count by distance alone loses them."""
+    scene, cameras = wires_over_checkerboard()
+    look, rates = Renderer.of(scene, cameras, "matched"), rates_of(scene, cameras.train)
+    found = merge(scene, rates, Goal.of_level(level))
+    assert least < contrast(look.showing(found), look, cameras.test, 2**level) < 1.1
+    monkeypatch.setattr(pairing, "costs", lambda a, b, rate, most: (b.means - a.means).square().sum(dim=1).float())
+    nearest = merge(scene, rates, Goal(0.5**level, len(found)))
+    assert contrast(look.showing(nearest), look, cameras.test, 2**level) < blind
 
 
 def test_without_cameras_levels_are_for_the_orbits_views():

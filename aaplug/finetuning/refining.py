@@ -44,6 +44,7 @@ USUAL_ERROR = 0.02  # root mean square error, of colours in [0, 1]
 DECAY = 0.03  # of the learning rates, at the end
 USUAL_STEPS_RATE = 1 / 4  # of the training rate: coarser levels take more steps, in inverse proportion
 MAX_STEPS_FACTOR = 8.0
+SMALLER_WEIGHT = 0.5  # of the loss at each of the smaller sizes, where errors are larger
 CLOSE_ENOUGH = 3.5e-5  # mean square error, 44.5 dB: a level that is closer is not tuned
 
 
@@ -55,6 +56,7 @@ def refine(
     steps: int = LEVEL_STEPS,
     viewer: Viewer | None = None,
     monitor: Monitor = SILENT,
+    smaller: Sequence[float] = (),
 ) -> Gaussians:
     """The level after tuning, or as it is where that does not help.
 
@@ -63,12 +65,14 @@ def refine(
     look: draws the scene as training showed it.
     poses: views to tune on, at the training size.
     viewer: what will draw the result; None for aaplug.
+    smaller: sizes of images, against those at `rate`, that should be right too; steps take all sizes equally often.
 
     Raises:
         UsageError: no step has a finite gradient.
     """
     steps = round(steps * min(MAX_STEPS_FACTOR, max(1.0, USUAL_STEPS_RATE / rate)))
-    views, probes = _views(poses, rate, steps)
+    scales = (rate, *(rate * size for size in smaller))
+    views, probes = _views(poses, scales, steps)
     truth = Truth(look, memory=IMAGE_MEMORY)
     if viewer is not None:
         level = replace(viewer.shown(level), convention=viewer.convention_of(level))
@@ -80,10 +84,12 @@ def refine(
     with torch.no_grad(), monitor.progress("rendering", "views") as tell:
         for number, view in enumerate(views):
             tell(number, len(views))
-            truth(view, rate)
+            for scale in scales:
+                truth(view, scale)
     factor = ALL_RATES_FACTOR * before**0.5 / USUAL_ERROR
     rates = {name: factor * RATE_FACTORS[name] * (1 / rate if name == "means" else 1) * r for name, r in RATES.items()}
-    job = TuningJob(start, views, truth, Settings("levels", steps, {rate: 1.0}, rates, decay=DECAY))
+    weights = {rate: 1.0} | dict.fromkeys(scales[1:], SMALLER_WEIGHT)
+    job = TuningJob(start, views, truth, Settings("levels", steps, weights, rates, decay=DECAY))
     state = begin(job)
     with monitor.progress("refining", "steps") as tell:
 
@@ -99,11 +105,11 @@ def refine(
     return replace(scene, fused=(*level.fused, record))
 
 
-def _views(poses: Sequence[Camera], rate: float, steps: int) -> tuple[list[Camera], list[Camera]]:
-    """Views to tune on, one a step and as many as fit into memory, and probes of the training size."""
+def _views(poses: Sequence[Camera], scales: Sequence[float], steps: int) -> tuple[list[Camera], list[Camera]]:
+    """Views to tune on, one a step and as many as fit into memory at all scales, and probes of the training size."""
     poses = spread(poses, MAX_POSES)
-    sizes = [size for size in VIEW_SIZES if size * rate <= 1] or [1.0]
-    area = statistics.mean((size * rate) ** 2 for size in sizes)
+    sizes = [size for size in VIEW_SIZES if size * scales[0] <= 1] or [1.0]
+    area = sum(scale**2 for scale in scales) * statistics.mean(size**2 for size in sizes)
     largest = max(camera.width * camera.height for camera in poses)
     count = max(1, min(steps, int(IMAGE_MEMORY / (BYTES_PER_PIXEL * area * largest))))
     between = [view.as_trained() for view in free_views(poses, VIEWS_BETWEEN)]

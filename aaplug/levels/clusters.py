@@ -70,6 +70,12 @@ class Clusters:
         """Everything but the labels, by name."""
         return {name: value for name, value in vars(self).items() if name not in ("labels", "opaque")}
 
+    @property
+    def by_columns(self) -> "Clusters":
+        """The same with each column's components apart in memory, where arithmetic on one of them is fastest."""
+        parted = {name: getattr(self, name).T.contiguous().T for name in ("means", "covs", "colours")}
+        return replace(self, **parted)
+
     @cached_property
     def opaque(self) -> "Clusters":
         """The same energies with opacities of at most `MAX_OPACITY`; the excess goes into the area."""

@@ -5,7 +5,7 @@ Gaussian is a 2D one whose covariance is a minor of the packed one, so every int
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import torch
 from jaxtyping import Float
@@ -66,20 +66,24 @@ def area(covs: Packed) -> Float[Tensor, " n"]:
     return areas(covs).mean(dim=1)
 
 
-def overlaps(total: Packed, offsets: Float[Tensor, "n 3"] | None = None) -> Float[Tensor, "n 3"]:
+def overlaps(total: Packed, offsets: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
     """∫ g h over the plane across each axis, of Gaussians g and h that integrate to 1.
 
-    total: the sum of their covariances.  offsets: between their means; None for none.
+    total: the sum of their covariances.  offsets: between their means.
     """
-    integrals = []
-    for (i, j), (a, b, c) in zip(PLANES, _minors(total), strict=True):
-        det = (a * c - b * b).clamp(min=torch.finfo(a.dtype).tiny)
-        peak = 1 / (2 * math.pi * det.sqrt())
-        if offsets is not None:
-            x, y = offsets[:, i], offsets[:, j]
-            peak = peak * torch.exp(-0.5 * (c * x * x - 2 * b * x * y + a * y * y) / det)
-        integrals.append(peak)
-    return torch.stack(integrals, dim=1)
+    minors = zip(PLANES, _minors(total), strict=True)
+    return torch.stack([overlap(minor, (offsets[:, i], offsets[:, j])) for (i, j), minor in minors], dim=1)
+
+
+def overlap(total: Sequence[Tensor], offset: Sequence[Tensor] | None = None) -> Float[Tensor, " n"]:
+    """`overlaps` in one plane, of covariances (xx, xy, yy) and offsets (x, y); no offsets are none."""
+    a, b, c = total
+    det = (a * c - b * b).clamp(min=torch.finfo(a.dtype).tiny)
+    peak = det.rsqrt() / (2 * math.pi)
+    if offset is None:
+        return peak
+    x, y = offset
+    return peak * torch.exp(-0.5 * (c * x * x - 2 * b * x * y + a * y * y) / det)
 
 
 def quats_of(rotations: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 4"]:

@@ -126,16 +126,25 @@ def merge_in_chunks(
 
 def rounds(clusters: Clusters, goal: Goal, tell: Callable[[int], None]) -> Clusters:
     """The clusters after all pairs are merged that the goal allows; `tell` is called with how many are gone."""
-    first, least = len(clusters), goal.count or 1
+    first, least, ceiling = len(clusters), goal.count or 1, -math.inf
+    edges = Edges.none(clusters)
     for tolerance in goal.tolerances:
         min_share = 0.0 if tolerance == math.inf else MIN_MERGED_SHARE
+        if tolerance > ceiling:  # one look at all pairs serves every tolerance of a level
+            ceiling = tolerance if goal.tolerance == math.inf else goal.tolerance
+            edges = edges_below(clusters, goal.rate, ceiling, goal.smallest)
         while len(clusters) > least:
-            smallest = goal.smallest if tolerance == goal.tolerance else 0.0
-            pairs = matching(edges_below(clusters, goal.rate, tolerance, smallest), len(clusters))
+            below = edges if tolerance == ceiling else edges[(edges.cost <= tolerance).nonzero()[:, 0]]
+            pairs = matching(below, len(clusters))
             pairs = pairs[torch.argsort(pairs.cost, stable=True)[: len(clusters) - least]]
             is_last = len(pairs) <= min_share * len(clusters)
             if len(pairs):
-                clusters = _merge_matching(clusters, pairs)
+                clusters, places = _merge_matching(clusters, pairs)
+                fresh = torch.zeros(len(clusters), dtype=torch.bool)
+                fresh[places[pairs.one]] = True
+                edges = Edges(places[edges.one], places[edges.other], edges.cost)
+                edges = edges[(~(fresh[edges.one] | fresh[edges.other])).nonzero()[:, 0]]
+                edges = Edges.joined([edges, edges_below(clusters, goal.rate, ceiling, goal.smallest, fresh)])
                 tell(first - len(clusters))
             if is_last:
                 break
@@ -167,8 +176,8 @@ def _order(scene: Gaussians, chunks: Int[Tensor, " n"]) -> Int[Tensor, " n"]:
     return order
 
 
-def _merge_matching(clusters: Clusters, pairs: Edges) -> Clusters:
-    """The clusters after these pairs are merged, in the order of their first ones."""
+def _merge_matching(clusters: Clusters, pairs: Edges) -> tuple[Clusters, Int[Tensor, " n"]]:
+    """The clusters after these pairs are merged, in the order of their first ones, and the new place of each."""
     one, other = pairs.one, pairs.other
     columns = {name: column.clone() for name, column in clusters.columns.items()}
     for name, values in merge_pairs(clusters[one], clusters[other]).columns.items():
@@ -177,7 +186,7 @@ def _merge_matching(clusters: Clusters, pairs: Edges) -> Clusters:
     stays[other] = False
     places = stays.cumsum(0) - 1
     places[other] = places[one]
-    return replace(clusters, **columns, labels=places[clusters.labels])[stays.nonzero()[:, 0]]
+    return replace(clusters, **columns, labels=places[clusters.labels])[stays.nonzero()[:, 0]], places
 
 
 def _hidden(scene: Gaussians, clusters: Clusters, rate: float) -> Bool[Tensor, " n"]:

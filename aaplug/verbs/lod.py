@@ -47,7 +47,8 @@ from aaplug.verbs.verb import writes
 
 DEFAULT_LEVELS = 4  # down to 1/16 of the training size
 MEGABYTE = 1e6
-MERGING_RULE = 2  # raised when merging or tuning changes, so that levels of two rules are not mixed
+SMALLER_IMAGES = (0.5,)  # of one lighter scene, which has no coarser level; a viewer's rule would bloat it there
+MERGING_RULE = 3  # raised when merging or tuning changes, so that levels of two rules are not mixed
 NORMAL_COLUMNS = 3  # that a .ply has beside a Gaussian's parameters
 
 
@@ -158,7 +159,10 @@ class _Maker:
             steps = options.steps if usual and options.steps is not None else usual
             fitted = fit(self.scene, self.viewer, look, self.views, steps, self.job.monitor)
             return level._replace(scene=fitted.scene)
-        scene = refine(level.scene, level.rate, look, self.views, options.tuning, self.viewer, self.job.monitor)
+        smaller = SMALLER_IMAGES if options.single and self.viewer is None else ()
+        scene = refine(
+            level.scene, level.rate, look, self.views, options.tuning, self.viewer, self.job.monitor, smaller
+        )
         return level._replace(scene=scene)
 
     def _visible(self, before: Level, goal: Goal) -> Float[Tensor, " n"] | None:
