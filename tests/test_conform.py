@@ -13,6 +13,7 @@ from aaplug.core.imaging import quantised
 from aaplug.evaluation.conformance import CAMERA, FAULTS, NONE, TESTS, Conformance, Fault, draw, judged
 from aaplug.io.cameras import read_cameras
 from aaplug.io.images import read_image, write_png
+from aaplug.methods.presets import recipe_of
 from aaplug.methods.viewers import VIEWERS, Viewer
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import AaplugError, UsageError
@@ -74,7 +75,7 @@ def test_what_no_fault_explains_is_shown_where_it_is():
 @pytest.mark.parametrize("rasterizer", ALL_RASTERIZERS.values(), ids=ALL_RASTERIZERS)
 def test_no_rasterizer_of_ours_is_accused(viewer, rasterizer):
     def drawn(scene):
-        renderer = Renderer.of(scene, [CAMERA], viewer_of.recipe, rasterizer=rasterizer, min_seen=0.0)
+        renderer = Renderer.of(scene, [CAMERA], recipe_of(viewer_of), rasterizer=rasterizer, min_seen=0.0)
         return quantised(renderer(CAMERA).rgb)
 
     viewer_of = VIEWERS[viewer]

@@ -395,7 +395,7 @@ def test_tuning_brings_a_level_closer(sample_scene, sample_cameras):
 def test_no_more_views_are_prepared_than_steps_look_at(sample_cameras):
     poses = sample_cameras.train
     for steps, most in ((1, 1), (5, 5), (10_000, 10_000)):
-        views, probes = refining._views(poses, 0.5, steps)
+        views, probes = refining._views(poses, (0.5,), steps)
         assert 0 < len(views) <= most
         assert probes
     assert len(views) > 5
@@ -404,14 +404,14 @@ def test_no_more_views_are_prepared_than_steps_look_at(sample_cameras):
 def test_a_level_is_tuned_over_the_rates_that_draw_it_and_on_free_poses_too(sample_cameras):
     poses = sample_cameras.train
     for some in (poses, poses[:1]):
-        views, _ = refining._views(some, 0.5, 10_000)
+        views, _ = refining._views(some, (0.5,), 10_000)
         trained = [view.width / some[0].width for view in views if view.trained_focal]
         assert min(trained) < 0.9
         assert max(trained) == pytest.approx(1.5, abs=0.01)
         assert all(view.width == some[0].width for view in views if not view.trained_focal)
-    share = statistics.mean(view.trained_focal is None for view in refining._views(poses, 0.5, 10_000)[0])
+    share = statistics.mean(view.trained_focal is None for view in refining._views(poses, (0.5,), 10_000)[0])
     assert 0.15 < share < 0.35
-    views, _ = refining._views(poses, 1.0, 100)  # never above training's rate
+    views, _ = refining._views(poses, (1.0,), 100)  # never above training's rate
     assert max(view.width for view in views) == poses[0].width
 
 

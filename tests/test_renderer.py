@@ -19,6 +19,7 @@ from aaplug.core.training import TrainingViews
 from aaplug.io.cameras import read_cameras
 from aaplug.io.scenes import read_scene
 from aaplug.methods import QUALITIES, RECIPES
+from aaplug.methods.filters.dilation import Dilation
 from aaplug.methods.filters.smoothing import Smoothing3D
 from aaplug.methods.pixel_kernels.surfel import SURFEL
 from aaplug.methods.presets import NEIGHBOURS
@@ -28,9 +29,6 @@ from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import FrameError, UsageError
 from tests.conftest import ROOT, make_camera, make_scene
 
-OWN_RECIPE = dict(
-    zip(CONVENTIONS, ("classic", "ewa", "mip", "playcanvas", "playcanvas-classic"), strict=True)
-)  # of each convention
 EYES = [(0.0, -4.0, 0.0), (3.0, -3.5, 1.0), (-1.0, -2.5, 1.5), (0.5, 5.0, -1.0)]
 
 
@@ -339,7 +337,8 @@ def test_quality_takes_the_fewest_samples_that_reach_its_rate(rate, fast, balanc
 def test_matched_is_training_itself_at_every_view_of_the_training_size(convention, reference, cameras):
     scene = replace(make_scene(200), convention=convention)
     training = TrainingViews.of(scene, cameras[1:])  # the first view is held out
-    trained = Renderer(scene, training, RECIPES[OWN_RECIPE[convention.name]])
+    screen = Dilation(convention.kernel, convention.compensated)
+    trained = Renderer(scene, training, replace(RECIPES["classic"], screen=screen))
     ours = [Renderer(scene, training, find_recipe(name, rate_reference=reference)) for name in ("matched", "auto")]
     for camera in cameras[:2]:
         expected = trained(camera).rgb

@@ -380,9 +380,9 @@ def judged(pictures: Mapping[str, Picture | str], viewer: Viewer | None = None) 
     viewer: whose rule to expect; None for the one that fits best, of those that differ in rule or degree.
     """
     seen = {t.name: _Seen(t, p.to(F64)) for t in TESTS if not isinstance(p := pictures[t.name], str)}
-    rules = dict[tuple[str, int], Viewer]()
+    rules = dict[tuple[Convention | None, int], Viewer]()
     for each in [viewer] if viewer else VIEWERS.values():
-        rules.setdefault((each.recipe, each.sh_degree), each)
+        rules.setdefault((each.convention, each.sh_degree), each)
 
     def explained(viewer: Viewer, fault: Fault) -> tuple[int, float]:
         """Tests that agree, and minus the error of all."""

@@ -21,7 +21,7 @@ from aaplug.levels.covariances import DIAGONAL, PLACES, PLANES, overlap
 
 PIXEL_BLUR = 0.3  # px²: variance of the level's pixel in comparisons; 0.1 to 1 give levels as good
 ALPHA_WEIGHT = 0.5  # of squared differences of alpha, beside those of red, green and blue
-NEIGHBOURS = 5  # along a curve that a cluster is compared with, on either side
+NEIGHBOURS = 10  # along a curve that a cluster is compared with, on either side
 CURVE_SHIFTS = (0.0, 0.23, 0.41)  # neighbours that one curve separates lie together on another
 PAIRS_PER_BATCH = 1 << 14  # compared at once: 2 MB, which stay in a core's cache
 MIN_COST_SHARE = 1e-6  # of a pair's own energy; float32 does not tell smaller changes of the image

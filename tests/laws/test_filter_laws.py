@@ -67,7 +67,8 @@ def test_matching_the_sharpest_rate_is_thinner_where_another_view_sampled_more_f
     sharpest = Matched("sharpest", pixel_variance=0.0)(splats, view, training)
     trained = splats.blurred(convention.kernel, convention.compensated)
     thinner = trained.covs[:, 0] - sharpest.covs[:, 0]
-    assert thinner[outdone].min() > 1e-3
+    if convention.kernel:  # else there is nothing to make thinner
+        assert thinner[outdone].min() > 1e-3
     torch.testing.assert_close(thinner[~outdone], torch.zeros_like(thinner[~outdone]))
 
 

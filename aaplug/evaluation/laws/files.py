@@ -55,7 +55,7 @@ def tells_scenes_apart(format: SceneFormat) -> None:
 
 @law_of("scene format")
 def reads_what_it_writes(format: SceneFormat) -> None:
-    """What it writes it takes, with as many Gaussians, at their places to 1 %."""
+    """What it writes it takes, with as many Gaussians, at their places to 1 %, in any order."""
     if not isinstance(format, WritableFormat):
         return
     scene = make_scene(COUNT)
@@ -65,7 +65,10 @@ def reads_what_it_writes(format: SceneFormat) -> None:
         require(format.sniff(path, path.read_bytes()[:64]), "does not take its own file")
         opened = format.open_scene(path, SceneFileOptions())
         require(opened.count == COUNT, f"wrote {COUNT} Gaussians and reads {opened.count}")
-        torch.testing.assert_close(opened.load(0, COUNT).means.float(), scene.means, rtol=0.01, atol=0.01)
+        means = opened.load(0, COUNT).means.float()
+        nearest = torch.cdist(means, scene.means).argmin(dim=1)
+        require(len(nearest.unique()) == COUNT, "Gaussians are doubled or lost")
+        torch.testing.assert_close(means, scene.means[nearest], rtol=0.01, atol=0.01)
         require(len(opened.load(5, 9)) == 4, "`load` does not return the rows from start up to stop")
 
 

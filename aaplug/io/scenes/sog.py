@@ -87,18 +87,22 @@ class Part:
 def sniff(path: Path, head: bytes) -> bool:
     """True for a meta.json, and for a zip with the suffix .sog or .zip."""
     zipped = head.startswith(ZIP_SIGNATURE) and path.suffix.lower() in (".sog", ".zip")
-    return zipped or (path.name == META and head.lstrip().startswith(b"{"))
+    return zipped or (_is_meta(path) and head.lstrip().startswith(b"{"))
 
 
 def open_scene(path: Path, options: SceneFileOptions) -> Scene:
     """See `SceneFormat`."""
     with library_errors(path):
-        if path.name == META:
+        if _is_meta(path):
             meta = parse_json(read_bounded(path, whole_limit("JSON")), path)
             return _scene(path, meta, partial(_from_folder, path))
         with zipfile.ZipFile(path) as archive:
             meta = parse_json(_from_zip(path, archive, META, whole_limit("JSON")), path)
             return _scene(path, meta, partial(_from_zip, path, archive))
+
+
+def _is_meta(path: Path) -> bool:
+    return f".{path.name}".endswith(f".{META}")
 
 
 def _from_folder(path: Path, file: str, most: int) -> bytes:
@@ -139,7 +143,7 @@ def _scene(path: Path, meta: Any, fetch: Fetch) -> Scene:
     said, flat = _meaning(meta)
     said = read_record(path, meta, said)
     load, notes = partial(_rows, parts, palette, version, flat), (f"version {version}",)
-    files = [file for part in parts.values() for file in part.entry.value("files")] if path.name == META else []
+    files = [file for part in parts.values() for file in part.entry.value("files")] if _is_meta(path) else []
     others = tuple(path.parent / file for file in files)
     facts = {"flat": flat, "notes": notes, "others": others}
     return Scene(path, name, count, degree, load, *said, **facts)
@@ -257,7 +261,7 @@ class _Unbundled:
     name, needs = META, None
 
     def sniff(self, path: Path, head: bytes) -> bool:
-        return False
+        return sniff(path, head)
 
     def open_scene(self, path: Path, options: SceneFileOptions) -> Scene:
         return open_scene(path, options)
