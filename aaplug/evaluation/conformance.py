@@ -25,6 +25,7 @@ from aaplug.core.rules import RULES_3DGS, Rules
 from aaplug.core.shading import shade
 from aaplug.core.splats import Splats2D
 from aaplug.io.scenes.scene import sh_of_colour
+from aaplug.methods.filters.dilation import limited
 from aaplug.methods.pixel_kernels.point import POINT, Point
 from aaplug.methods.viewers import VIEWERS, Viewer
 from aaplug.rasterizers.reference import REFERENCE
@@ -239,15 +240,6 @@ def _covs(change: Callable[[Tensor, Tensor, Tensor], tuple[Tensor, ...]]) -> Cal
     return changed
 
 
-def _bent(xx: Tensor, xy: Tensor, yy: Tensor) -> tuple[Tensor, ...]:
-    """Eigenvalues mid ± s with s = √max(0.1, mid² - det), the first along (xy, s - (xx - yy) / 2)."""
-    middle, half = (xx + yy) / 2, (xx - yy) / 2
-    spread = (half.square() + xy.square()).clamp(min=0.1).sqrt()
-    along = torch.nn.functional.normalize(torch.stack([xy, spread - half]), dim=0)
-    least, a, b = middle - spread, *along
-    return least + 2 * spread * a * a, 2 * spread * a * b, least + 2 * spread * b * b
-
-
 def _mirrored(scene: Gaussians) -> Gaussians:
     """Those behind the camera, drawn as if a negative depth were a positive one."""
     local = scene.means @ POSE[:3, :3].T + POSE[:3, 3]
@@ -268,6 +260,7 @@ def _by(depths: Callable[[Splats2D], Tensor]) -> Callable[[Splats2D], Splats2D]:
 
 
 GAMMA = 2.2
+BEND = 0.1**0.5  # px²
 FAULTS = (
     Fault("dilation: nothing is added to covariances", rule=lambda r: Rule(0.0, False)),
     Fault("dilation: twice the variance is added", rule=lambda r: r._replace(kernel=2 * r.kernel)),
@@ -276,7 +269,8 @@ FAULTS = (
     Fault("compensation: opacity should pay for what is added, and does not", rule=lambda r: Rule(r.kernel, False)),
     *(Fault(f"dilation: {c.kernel:g} px², {'' if c.compensated else 'not '}compensated, as {c.name} does",
             rule=partial(_rule_of, c)) for c in CONVENTIONS.values()),
-    Fault("dilation: widths of small splats are bent by √max(0.1, ·), as GaussianSplats3D does", splats=_covs(_bent)),
+    Fault("dilation: widths of small splats are bent by √max(0.1, ·), as GaussianSplats3D does",
+          splats=partial(limited, apart=BEND)),
     Fault("cut-off: splats end at 2 standard deviations", pixel=Ending(sigmas=2.0)),
     Fault("quads are mirrored: the covariance's xy has the wrong sign", splats=_covs(lambda a, b, c: (a, -b, c))),
     Fault("quads are turned: width and height are exchanged", splats=_covs(lambda a, b, c: (c, -b, a))),

@@ -19,10 +19,7 @@ class Dilation:
     0.3 uncompensated is 3DGS (Kerbl et al. 2023); 0.3 compensated is EWA splatting as in 3DGS --antialiasing and
     gsplat "antialiased"; 0.1 compensated is the 2D Mip filter (Mip-Splatting, eq. 10).
 
-    smallest: px²; a splat is not drawn if its variance along its longer axis, with what was added, is less.
-    apart: px²; half the difference of the variances along a splat's two axes is at least this.  A rounder splat is
-        stretched along u = (xy, apart - (xx - yy) / 2), as GaussianSplats3D does it, and is not drawn if its variance
-        across u is not positive.
+    smallest, apart: see `limited`.
     """
 
     variance: float
@@ -37,22 +34,34 @@ class Dilation:
 
     def __call__(self, splats: Splats2D, camera: Camera, training: TrainingViews) -> Splats2D:
         """Filter the splats of one view."""
-        splats = splats.blurred(self.variance, self.compensated)
-        if not (self.smallest or self.apart):
-            return splats
-        xx, xy, yy = splats.covs.unbind(dim=1)
-        mean, slant = (xx + yy) / 2, (xx - yy) / 2
-        radius = (slant * slant + xy * xy).clamp(min=max(self.apart**2, TINY)).sqrt()
-        drawn = (mean + radius >= self.smallest) & (radius < mean)
-        columns = {"opacities": splats.opacities * drawn}
-        if self.apart:
-            along = radius - slant
-            norm = (xy * xy + along * along).clamp(min=TINY)
-            cosine, sine = radius * (xy * xy - along * along) / norm, radius * 2 * xy * along / norm
-            covs = torch.stack((mean + cosine, sine, mean - cosine), dim=1)
-            columns["covs"] = torch.where(drawn[:, None], covs, splats.covs)
-            columns["dets"] = torch.where(drawn, mean * mean - radius * radius, splats.dets)
-        return splats.with_columns(columns)
+        return limited(splats.blurred(self.variance, self.compensated), self.smallest, self.apart)
+
+
+def limited(splats: Splats2D, smallest: float = 0.0, apart: float = 0.0) -> Splats2D:
+    """The splats as viewers with limits on a splat's size draw them.
+
+    Args:
+        splats: with what the viewer adds.
+        smallest: px²; a splat whose variance along its longer axis is less is not drawn.
+        apart: px²; half the difference of the variances along a splat's two axes is at least this.  A rounder splat is
+            stretched along u = (xy, apart - (xx - yy) / 2), as GaussianSplats3D does it, and is not drawn if its
+            variance across u is not positive.
+    """
+    if not (smallest or apart):
+        return splats
+    xx, xy, yy = splats.covs.unbind(dim=1)
+    mean, slant = (xx + yy) / 2, (xx - yy) / 2
+    radius = (slant * slant + xy * xy).clamp(min=max(apart**2, TINY)).sqrt()
+    drawn = (mean + radius >= smallest) & (radius < mean)
+    columns = {"opacities": splats.opacities * drawn}
+    if apart:
+        along = radius - slant
+        norm = (xy * xy + along * along).clamp(min=TINY)
+        cosine, sine = radius * (xy * xy - along * along) / norm, radius * 2 * xy * along / norm
+        covs = torch.stack((mean + cosine, sine, mean - cosine), dim=1)
+        columns["covs"] = torch.where(drawn[:, None], covs, splats.covs)
+        columns["dets"] = torch.where(drawn, mean * mean - radius * radius, splats.dets)
+    return splats.with_columns(columns)
 
 
 @dataclass(frozen=True)
