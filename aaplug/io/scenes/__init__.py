@@ -54,7 +54,8 @@ class SceneFormat(Protocol):
 class WritableFormat(SceneFormat, Protocol):
     """A format that can be written too.  needs: a package that writing imports, or None.
 
-    It comes with aaplug's extra `extra`, if the format has such an attribute, or else of the format's name.
+    It comes with aaplug's extra `extra`, if the format has such an attribute, or else of the format's name.  A format
+    whose files another one reads, names it as `read_as`.
     """
 
     @property

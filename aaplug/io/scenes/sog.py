@@ -258,10 +258,10 @@ def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, o
 class _Unbundled:
     """The meta.json of a folder; it is read as `sog`."""
 
-    name, needs = META, None
+    name, needs, read_as = META, None, name
 
     def sniff(self, path: Path, head: bytes) -> bool:
-        return sniff(path, head)
+        return False
 
     def open_scene(self, path: Path, options: SceneFileOptions) -> Scene:
         return open_scene(path, options)
