@@ -49,3 +49,9 @@ def placed(scene: Gaussians, turn: Float[Tensor, "3 3"], scale: float, move: Seq
         sh=sh_turned(scene.sh, turn),
         filter_3d=None if scene.filter_3d is None else scene.filter_3d * scale,
     )
+
+
+def box_of(scene: Gaussians, sigmas: float) -> Float[Tensor, "2 3"]:
+    """Smallest and largest coordinates of the Gaussians to so many standard deviations of each one's longest axis."""
+    reach = sigmas * scene.scales.amax(dim=1, keepdim=True)
+    return torch.stack([(scene.means - reach).amin(dim=0), (scene.means + reach).amax(dim=0)])

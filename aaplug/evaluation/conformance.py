@@ -260,7 +260,7 @@ def _by(depths: Callable[[Splats2D], Tensor]) -> Callable[[Splats2D], Splats2D]:
 
 
 GAMMA = 2.2
-BEND = 0.1**0.5  # px²
+BEND = VIEWERS["mkkellogg"].apart  # px²
 FAULTS = (
     Fault("dilation: nothing is added to covariances", rule=lambda r: Rule(0.0, False)),
     Fault("dilation: twice the variance is added", rule=lambda r: r._replace(kernel=2 * r.kernel)),

@@ -20,9 +20,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from aaplug.core.gaussians import Gaussians
+from aaplug.core.placing import box_of
 from aaplug.io import StreamName, stream_pages
 from aaplug.io.atomic import make_folder, replacing
-from aaplug.io.scenes import write_scene
+from aaplug.io.scenes import gltf, write_scene
 from aaplug.io.scenes.pyramid_folder import Level
 from aaplug.system.errors import OutputError, UsageError, reason
 
@@ -33,7 +34,7 @@ PLAYCANVAS_TANGENT = math.tan(math.radians(22.5))  # of half the field of view t
 UPDATE_SHARE = 1 / 16  # of the first distance: PlayCanvas chooses levels again when the camera moved so far
 MAX_SCREEN_ERROR = 16.0  # px, `maximumScreenSpaceError` of CesiumJS by default
 ALWAYS = 1e6  # error of the root over that of the coarsest level, so that something is drawn at any distance
-SPLATS = ["KHR_gaussian_splatting", "KHR_gaussian_splatting_compression_spz_2"]
+SPLATS = [gltf.SPLATS, gltf.SPZ]
 SETTINGS, PAGE = "settings.json", "index.html"
 Box = Float[Tensor, "2 3"]  # smallest and largest coordinates
 
@@ -185,12 +186,7 @@ def _tileset(stream: Stream, parts: Sequence[Sequence[Gaussians]], rate: float) 
 
 def _box(parts: Sequence[Gaussians], extent: float) -> Box:
     """The box around the Gaussians of parts to `extent` standard deviations."""
-    lows, highs = [], []
-    for part in parts:
-        if len(part):
-            reach = extent * part.scales.amax(dim=1, keepdim=True)
-            lows.append((part.means - reach).amin(dim=0))
-            highs.append((part.means + reach).amax(dim=0))
+    lows, highs = zip(*(box_of(part, extent) for part in parts if len(part)), strict=True)
     return torch.stack([torch.stack(lows).amin(dim=0), torch.stack(highs).amax(dim=0)]).double()
 
 

@@ -219,7 +219,7 @@ class _Document:
         self.widths = widths | {COLOUR: 4} | dict.fromkeys(harmonics(first.sh_degree), 12)  # bytes a Gaussian
         starts = np.cumsum([0, *self.widths.values()]) * count
         self.starts = dict(zip(self.widths, starts[:-1].tolist(), strict=True))
-        self.size, self.first, self.room, self.count = int(starts[-1]), first, count, 0
+        self.size, self.first, self.count = int(starts[-1]), first, 0
         self.path = path
         self.least, self.most = torch.full((3,), torch.inf), torch.full((3,), -torch.inf)
         self.written = 0

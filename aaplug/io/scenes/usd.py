@@ -24,6 +24,7 @@ import torch
 from torch import Tensor
 
 from aaplug.core.gaussians import Gaussians, joined
+from aaplug.core.placing import box_of
 from aaplug.io.atomic import replacing_file
 from aaplug.io.scenes.options import SceneFileOptions
 from aaplug.io.scenes.packed import floats, half_turn_about_z, of_degree, standing
@@ -150,8 +151,7 @@ def _stage(scene: Gaussians) -> Any:
     prim = stage.DefinePrim("/Splats", TYPE)
     stage.SetDefaultPrim(prim)
     stage.GetRootLayer().customLayerData = {KEY: json.dumps(record_of(scene))}
-    reach = EXTENT_SIGMAS * scene.scales.amax(dim=1, keepdim=True)
-    extent = torch.stack([(scene.means - reach).amin(dim=0), (scene.means + reach).amax(dim=0)])
+    extent = box_of(scene, EXTENT_SIGMAS)
     triples = Vt.Vec3fArray.FromNumpy
     values = {
         "positions": (types.Point3fArray, triples(scene.means.numpy())),
