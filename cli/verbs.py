@@ -387,6 +387,13 @@ def view(words: Words) -> Answer:
         "Compile what these recipes need, too; by default what auto, matched, classic and mip need.",
         (),
     ),
+    Option(
+        "bundle",
+        flag("FOLDER", read=Path),
+        "Compile into a folder, for other machines with the same torch: for x86-64-v3 and x86-64-v4."
+        " Where AAPLUG_KERNELS names the folder, no compiler is needed.",
+        None,
+    ),
     json_of("where the kernels are as one JSON object"),
 )
 def warmup(words: Words) -> Answer:
@@ -394,7 +401,7 @@ def warmup(words: Words) -> Answer:
 
     The other verbs work without it, only slower.  To measure how fast it is, use bench.
     """
-    kernels = aaplug.warmup(words.recipe, monitor=TERMINAL)
+    kernels = aaplug.warmup(words.recipe, words.bundle, monitor=TERMINAL)
     say(f"{len(kernels.names)} kernels in {kernels.folder}")
     return Answer({"folder": str(kernels.folder), "kernels": kernels.names})
 
@@ -466,7 +473,9 @@ def bench(words: Words) -> Answer:
     sizes = [(f"{run.gaussians:,}", f"{run.width}x{run.height}", run.rasterizer) for run in runs]
     figures = [(*size, *(text(run) for text in FIGURES.values())) for size, run in zip(sizes, runs, strict=True)]
     stages = [(*size, *(f"{ms:.0f}" for ms in run.stages_ms.values())) for size, run in zip(sizes, runs, strict=True)]
-    shown = [f"medians in ms; matmul is a 2048³ float32 product, {threads} threads"]
+    shown = [
+        f"medians in ms, {threads} threads; exp/eval: a frame's time for each evaluation, in exponentials of torch"
+    ]
     shown += [table(figures, (*headings, *FIGURES)), "stages in ms", table(stages, (*headings, *runs[0].stages_ms))]
     shown += [f"time grows as {name}^{value:.2f}" for name, value in exponents.items()]
     several = {"runs": [run.as_json() for run in runs], "exponents": exponents}
@@ -476,9 +485,8 @@ def bench(words: Words) -> Answer:
 FIGURES: dict[str, Callable[["Figures"], str]] = {
     "forward": lambda run: f"{run.forward_ms:.0f}",
     "+ back": lambda run: "" if run.forward_backward_ms is None else f"{run.forward_backward_ms:.0f}",
-    "matmul": lambda run: f"{run.matmul_ms:.0f}",
-    "share": lambda run: f"{run.share:.2f}",
-    "Mevals": lambda run: f"{run.evaluations / 1e6:.0f}",
+    "exp/eval": lambda run: f"{run.exponentials:.2f}",
+    "calls": lambda run: f"{sum(run.calls.values()):,}",
     "ns/eval": lambda run: f"{run.ns_per_evaluation:.2f}",
     "GB": lambda run: f"{run.peak_bytes / 1e9:.1f}",
 }

@@ -34,7 +34,9 @@ def test_figures_of_a_small_scene():
     assert run.tile_evaluations > 0
     assert run.ns_per_evaluation == pytest.approx(run.stages_ms["composite"] * 1e6 / run.evaluations)
     assert run.peak_bytes > 1e7
-    assert run.share == run.forward_ms / run.matmul_ms
+    assert run.exponentials == pytest.approx(run.forward_ms * 1e6 / run.evaluations / run.exponential_ns)
+    assert run.calls["operators"] > 100
+    assert run.calls["compiled kernels"] == 0
 
 
 def test_synthetic_scenes_cover_the_image_alike_at_every_size():

@@ -112,11 +112,46 @@ def copied_cache(built, empty_cache):
     return empty_cache / "kernels"
 
 
+linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="bundles are Linux's")
+
+
+@linux
+def test_a_bundle_is_used_where_nothing_is_compiled(built, empty_cache, monkeypatch):
+    """The best instruction set that the processor has.  What is unpacked goes to the cache, not to the bundle."""
+    kernel, bundle, (best, least) = binning.LISTS, empty_cache / "bundle", compiled.TARGETS
+    bundle.mkdir()
+    monkeypatch.setenv("AAPLUG_KERNELS", str(bundle))
+    for target, users in ((least, {"AVX2", "AVX512"}), (best, {"AVX512"})):
+        package = compiled._path_in(bundle, kernel, target)
+        shutil.copy(compiled._path_in(CACHE, kernel), package)
+        for capability in ("DEFAULT", "AVX2", "AVX512"):
+            monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda name=capability: name)
+            assert (compiled.package_path(kernel) == package) == (capability in users)
+    assert compiled.package_of(kernel) is not None
+    assert {path.suffix for path in bundle.iterdir()} == {".pt2"}
+    assert (empty_cache / "kernels" / package.name).with_suffix(".so").is_file()
+
+
+@linux
+def test_a_bundle_is_compiled_for_each_instruction_set_of_this_processor(empty_cache, monkeypatch):
+    built: list[object] = []
+    monkeypatch.setattr(compiled.Processes, "map", lambda pool, work, packages: built.extend(packages) or packages)
+    monkeypatch.setattr(compiled, "has_compiler", lambda: True)
+    monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: "AVX512")
+    made = aaplug.warmup(bundle=empty_cache / "bundle")
+    kernels = [kernel.name for kernel in (*compiled.KERNELS, *compiled.TRAINER_KERNELS)]
+    assert made.names == [f"{name} for {target.name}" for target in compiled.TARGETS for name in kernels]
+    assert len(built) == len(set(built)) == len(made.names)
+    monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: "DEFAULT")
+    with pytest.raises(UsageError, match="bundle: needs Linux and a processor of x86-64-v4 or x86-64-v3"):
+        aaplug.warmup(bundle=empty_cache / "bundle")
+
+
 def test_packages_are_compared_by_one_thread_which_is_undone_after_that(copied_cache, monkeypatch):
     counts, close = [], compiled._close
     monkeypatch.setattr(compiled, "_close", lambda *x: counts.append(torch.get_num_threads()) or close(*x))
     with torch_threads(2):
-        assert compiled._is_sound(compiled.KERNELS[0])
+        assert compiled._is_sound(compiled.KERNELS[0], compiled.package_path(compiled.KERNELS[0]))
         assert set(counts) == {1}
         assert torch.get_num_threads() == 2
 
@@ -129,10 +164,10 @@ def test_a_library_is_unpacked_and_compared_once_until_it_changes(copied_cache, 
         if change is not None:
             change()
         compared.clear()
-        assert compiled._is_sound(kernel)
+        assert compiled._is_sound(kernel, compiled.package_path(kernel))
         assert compared
         compared.clear()
-        assert compiled._is_sound(kernel)
+        assert compiled._is_sound(kernel, compiled.package_path(kernel))
         assert not compared
 
 
@@ -386,15 +421,15 @@ SECONDS = {  # to compile, measured; the others take 7 to 15
 def test_the_time_left_of_a_warmup_is_honest_from_the_first_kernel_on(empty_cache, monkeypatch, processes):
     taken, told = {kernel.name: SECONDS.get(kernel.name, 10) for kernel in compiled.KERNELS}, [(0.0, 0, 100)]
 
-    def in_turn(pool: object, work: object, names: Sequence[str]) -> Iterator[str]:
-        """Each name when it is done, as a pool would yield it."""
+    def in_turn(pool: object, work: object, packages: Sequence[tuple[str, None]]) -> Iterator[tuple[str, None]]:
+        """Each package when it is done, as a pool would yield it."""
         ends, free = [], [0.0] * processes
-        for name in names:
+        for name, _ in packages:
             ends.append((heapq.heappop(free) + taken[name], name))
             heapq.heappush(free, ends[-1][0])
         for now, name in sorted(ends):
             told.append((now, 0, 0))
-            yield name
+            yield name, None
 
     def tell(done: int, total: int) -> None:
         told[-1] = (told[-1][0], done, total)
@@ -477,7 +512,7 @@ def test_a_kernel_that_does_not_compile_is_named(empty_cache, monkeypatch):
 
     monkeypatch.setattr(torch._inductor, "aoti_compile_and_package", fails)
     with pytest.raises(UsageError, match=r"warmup: torch .* cannot compile 'slots' here"):
-        compiled._build((), "slots")
+        compiled._build(compiled.cache_folder(), (), ("slots", None))
 
 
 def test_an_unknown_name_lists_the_known_ones():

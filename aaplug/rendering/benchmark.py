@@ -1,13 +1,14 @@
-"""Timing the tiled rasterizer: stage by stage, forward and backward, beside a matrix product of this machine.
+"""Timing the tiled rasterizer: stage by stage, forward and backward, beside exponentials of this machine.
 
-Times are medians in ms.  Machines differ and their speed drifts, so compare the share of the matrix product.
+Times are medians in ms.  Machines differ and their speed drifts, so each frame is timed in turn with an array of
+exponentials: compositing computes one in each evaluation, also with whole vectors.
 """
 
 import math
 import resource
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from statistics import linear_regression, median
@@ -16,11 +17,12 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from aaplug.core.cameras import Camera, look_at
 from aaplug.core.culling import cull
 from aaplug.core.gaussians import Gaussians
-from aaplug.core.kernels import Kernels
+from aaplug.core.kernels import Kernel, Kernels, Runner
 from aaplug.core.projection import project
 from aaplug.core.pyramids import faded
 from aaplug.core.shading import shade
@@ -33,7 +35,8 @@ from aaplug.rasterizers.tiled.forward import Compositing
 from aaplug.rendering.renderer import Renderer
 
 DRAWN_AT_ONCE = 1 << 16  # Gaussians; a multiple of 16, so that the random numbers are those of one draw
-MATRIX_SIDE = 2048
+EXPONENTIALS = 1 << 18  # at once; their array fits the cache
+EXPONENTIAL_CALLS = 16
 FIELD_OF_VIEW = 50.0  # degrees, of the synthetic camera
 SEED = 0
 
@@ -45,6 +48,8 @@ class Figures:
     gaussians: those of the scene, or of the levels of detail that the view draws.
     evaluations: splat-pixel evaluations of compositing.  tile_evaluations: those of whole tiles that ellipses touch.
     peak_bytes: the most memory that the process has used so far.
+    calls: of torch's operators and of compiled kernels in a frame, each of which costs microseconds beside its work.
+    exponential_ns: of one float32 exponential by torch, with the same threads.
     """
 
     rasterizer: str
@@ -58,16 +63,43 @@ class Figures:
     ns_per_evaluation: float
     stages_ms: dict[str, float]
     peak_bytes: int
-    matmul_ms: float
+    calls: dict[str, int]
+    exponential_ns: float
 
     @property
-    def share(self) -> float:
-        """Forward time over the matrix product's."""
-        return self.forward_ms / self.matmul_ms
+    def exponentials(self) -> float:
+        """Time of a frame for each of its evaluations, in exponentials."""
+        return self.forward_ms * 1e6 / max(1, self.evaluations) / self.exponential_ns
 
     def as_json(self) -> dict[str, Any]:
         """One JSON-ready object."""
-        return {**self.__dict__, "forward_share_of_matmul": self.share}
+        return {**self.__dict__, "exponentials_per_evaluation": self.exponentials}
+
+
+class _Calls(TorchDispatchMode):
+    """Counts the calls of torch's operators."""
+
+    count = 0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        self.count += 1
+        return func(*args, **(kwargs or {}))
+
+
+class _CountingCompiled(Kernels):
+    """Runs kernels as the given ones do, and counts the calls of compiled ones."""
+
+    def __init__(self, kernels: Kernels):
+        self.kernels, self.name, self.tiles, self.count = kernels, kernels.name, kernels.tiles, 0
+
+    def runner(self, kernel: Kernel, args: tuple[Tensor, ...]) -> Runner:
+        run = self.kernels.runner(kernel, args)
+
+        def counting(*args: Tensor) -> Sequence[Tensor]:
+            self.count += run is not kernel.function
+            return run(*args)
+
+        return counting
 
 
 def measure(renderer: Renderer, camera: Camera, kernels: Kernels, repeats: int = 5, backward: bool = True) -> Figures:
@@ -81,8 +113,16 @@ def measure(renderer: Renderer, camera: Camera, kernels: Kernels, repeats: int =
     with torch.no_grad():
         stages, gaussians, tile_evaluations = _stages(renderer, camera, kernels, repeats)
         replace(renderer, rasterizer=rasterizer.counting(counts.append))(camera)
-        a = torch.ones(MATRIX_SIDE, MATRIX_SIDE)
-        frame, product = _timed(repeats, lambda: renderer(camera), lambda: a @ a)
+        counting = _CountingCompiled(kernels)
+        with _Calls() as operators:
+            replace(renderer, rasterizer=Tiled(counting))(camera)
+        numbers, results = torch.linspace(-8.0, 0.0, EXPONENTIALS), torch.empty(EXPONENTIALS)
+
+        def exponentials() -> None:
+            for _ in range(EXPONENTIAL_CALLS):
+                torch.exp(numbers, out=results)
+
+        frame, yardstick = _timed(repeats, lambda: renderer(camera), exponentials)
     gradients = _timed(repeats, lambda: gradient_step(renderer, camera))[0] if backward else None
     return Figures(
         rasterizer=kernels.name,
@@ -96,7 +136,8 @@ def measure(renderer: Renderer, camera: Camera, kernels: Kernels, repeats: int =
         ns_per_evaluation=stages["composite"] * 1e6 / max(1, sum(counts)),
         stages_ms=stages,
         peak_bytes=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024),
-        matmul_ms=product,
+        calls={"operators": operators.count, "compiled kernels": counting.count},
+        exponential_ns=yardstick * 1e6 / (EXPONENTIALS * EXPONENTIAL_CALLS),
     )
 
 

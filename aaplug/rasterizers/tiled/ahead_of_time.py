@@ -7,6 +7,9 @@ is never loaded, and a change of one kernel rebuilds that one.
 Beside the package lies the library that was unpacked from it, once for all processes, and the hash of that library if
 its results equalled the eager ones.  A library with another hash is unpacked and compared again.  A kernel that cannot
 be used is left aside with a warning: images, or their gradients, are then computed eagerly.
+
+A bundle is a folder of packages for an instruction set instead of one processor.  `AAPLUG_KERNELS` names it on machines
+that have no compiler.
 """
 
 import hashlib
@@ -20,6 +23,7 @@ import warnings
 import zipfile
 from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -92,10 +96,12 @@ OPTIONS = {
 TILING_HEURISTIC = "cpp.enable_tiling_heuristics"
 # Operations up to which inductor writes a value out again for each of its readers, where kernels are chained.
 CHAINED_OPTIONS = {"realize_opcount_threshold": 10}
+THIS_PROCESSOR = "native"  # as g++ calls its architecture
 OVERLAPS = {  # of `Kernel`; as the architecture, the only setting whose text reaches g++
-    "freely": "native -fschedule-insns",
-    "within registers": "native -fschedule-insns -fsched-pressure",
+    "freely": f"{THIS_PROCESSOR} -fschedule-insns",
+    "within registers": f"{THIS_PROCESSOR} -fschedule-insns -fsched-pressure",
 }
+BUNDLE_VARIABLE = "AAPLUG_KERNELS"  # of the environment: the folder of a bundle
 MAX_SIZE = 1 << 31
 LIBRARY_SUFFIXES = (".so", ".pyd", ".dll", ".dylib")  # of the library in a package, by system
 STANDARD_COMPILER = "clang++" if sys.platform == "darwin" else "g++"
@@ -105,6 +111,21 @@ RESULT_TOLERANCE = 1e-4
 
 log = logging.getLogger("aaplug")
 Run = Callable[[list[torch.Tensor]], list[torch.Tensor]]
+
+
+@dataclass(frozen=True)
+class Target:
+    """What packages are compiled for: all processors of an instruction set.
+
+    name: as compilers know it.  capability: as torch does.  bits: in a vector.
+    """
+
+    name: str
+    capability: str
+    bits: int
+
+
+TARGETS = (Target("x86-64-v4", "AVX512", 512), Target("x86-64-v3", "AVX2", 256))
 
 
 def kernels_of(recipes: Sequence[Recipe], gradients: bool = True) -> list[Kernel]:
@@ -131,11 +152,31 @@ def cache_folder() -> Path:
 
 
 def package_path(kernel: Kernel) -> Path:
-    """The file of a kernel's package for its present sources, this torch, compiler and processor."""
+    """The file of a kernel's package: the one compiled on this machine, or where there is none a bundle's."""
+    path, bundle = _path_in(cache_folder(), kernel), os.environ.get(BUNDLE_VARIABLE)
+    if bundle and not path.is_file():
+        packages = (_path_in(Path(bundle), kernel, target) for target in targets())
+        return next(filter(Path.is_file, packages), path)
+    return path
+
+
+def targets() -> tuple[Target, ...]:
+    """The instruction sets of this machine that bundles are made for, the best first."""
+    names = [target.capability for target in TARGETS]
+    best = torch.backends.cpu.get_cpu_capability()
+    return TARGETS[names.index(best) :] if sys.platform == "linux" and best in names else ()
+
+
+def _path_in(folder: Path, kernel: Kernel, target: Target | None = None) -> Path:
+    """The file of a kernel's package for its present sources and this torch, in a folder.
+
+    target: None for this processor and compiler.
+    """
     options = (OPTIONS, TILING_HEURISTIC, CHAINED_OPTIONS, OVERLAPS)
-    facts = (torch.__version__, options, _compiler(), _compiler_version(_compiler()), _processor(), sources_of(kernel))
+    machine = (_compiler(), _compiler_version(_compiler()), _processor()) if target is None else (target.name,)
+    facts = (torch.__version__, options, *machine, sources_of(kernel))
     key = hashlib.sha256("\0".join(map(str, facts)).encode()).hexdigest()[:16]
-    return cache_folder() / f"{kernel.name}-{key}.pt2"
+    return folder / f"{kernel.name}-{key}.pt2"
 
 
 def is_built(kernel: Kernel) -> bool:
@@ -196,7 +237,7 @@ def build(
     gradients: bool = True,
     names: Collection[str] | None = None,
 ) -> CompiledKernels:
-    """Build what is missing or broken, in one process per thread of torch, and load everything.
+    """Build what is missing or broken, and load everything.
 
     progress: told the percentage of the time for all that has been spent.
     recipes, gradients: see `kernels_of`.  names: of the kernels to build, instead.
@@ -207,13 +248,45 @@ def build(
     kernels = kernels_of(recipes, gradients)
     if names is not None:
         kernels = [kernel for kernel in (*kernels, *TRAINER_KERNELS) if kernel.name in names]
-    costs = {kernel.name: SLOW.get(kernel.name, 1) for kernel in kernels}
-    left = [kernel.name for kernel in kernels if not _is_sound(kernel)]
-    left.sort(key=lambda name: -costs[name])  # the longest come first, so that none is left over at the end
+    _build_all([(kernel, None) for kernel in kernels], cache_folder(), progress, recipes)
+    loaded = load()
+    if loaded is None and names is None:
+        raise UsageError("warmup", f"the packages in {cache_folder()} do not load")
+    return loaded or CompiledKernels(package_of, KERNELS, load_or_eager)
+
+
+def build_bundle(
+    folder: Path, progress: Tell = lambda done, total: None, recipes: Sequence[Recipe] = ()
+) -> list[tuple[Kernel, Target]]:
+    """Build what is missing of a bundle: all kernels, trainers' too, for each of `targets`.
+
+    Raises:
+        UsageError: as `build`; also, this machine has none of the instruction sets.
+    """
+    if not targets():
+        names = " or ".join(target.name for target in TARGETS)
+        raise UsageError("bundle", f"needs Linux and a processor of {names} to compile for them")
+    wanted = [(kernel, target) for target in targets() for kernel in (*kernels_of(recipes), *TRAINER_KERNELS)]
+    _build_all(wanted, folder, progress, recipes)
+    return wanted
+
+
+def _build_all(
+    wanted: Sequence[tuple[Kernel, Target | None]], folder: Path, progress: Tell, recipes: Sequence[Recipe]
+) -> None:
+    """Build what is missing or broken of these packages, in one process per thread of torch."""
+    costs = [SLOW.get(kernel.name, 1) for kernel, _ in wanted]
+    left = {
+        (kernel.name, target): cost
+        for (kernel, target), cost in zip(wanted, costs, strict=True)
+        if not _is_sound(kernel, package_path(kernel) if target is None else _path_in(folder, kernel, target))
+    }
+    # the longest come first, so that none is left over at the end
+    left = dict(sorted(left.items(), key=lambda item: -item[1]))
 
     def tell(at_work: int) -> None:
-        rest = sum(costs[name] for name in left) - sum(costs[name] for name in left[:at_work]) / 2  # they are half done
-        progress(round(100 - 100 * rest / sum(costs.values())), 100)
+        rest = sum(left.values()) - sum([*left.values()][:at_work]) / 2  # they are half done
+        progress(round(100 - 100 * rest / sum(costs)), 100)
 
     tell(0)
     if left:
@@ -221,13 +294,9 @@ def build(
             raise UsageError("warmup", "needs a C++ compiler (g++ or clang++) for torch to compile with")
         processes = min(torch.get_num_threads(), MAX_PROCESSES, len(left))
         pool = Processes(processes, torch_threads=os.cpu_count() or 1, ordered=False)
-        for name in pool.map(partial(_build, tuple(recipes)), tuple(left)):
-            left.remove(name)
+        for package in pool.map(partial(_build, folder, tuple(recipes)), tuple(left)):
+            del left[package]
             tell(processes)
-    loaded = load()
-    if loaded is None and names is None:
-        raise UsageError("warmup", f"the packages in {cache_folder()} do not load")
-    return loaded or CompiledKernels(package_of, KERNELS, load_or_eager)
 
 
 @cache
@@ -246,9 +315,9 @@ def package_of(kernel: Kernel) -> Package | None:
         return None
 
 
-def _is_sound(kernel: Kernel) -> bool:
+def _is_sound(kernel: Kernel, package: Path) -> bool:
     with suppress(UsageError):
-        return bool(_compared(kernel, package_path(kernel)))
+        return bool(_compared(kernel, package))
     return False
 
 
@@ -258,11 +327,12 @@ def _compared(kernel: Kernel, package: Path) -> Run:
     Raises:
         UsageError: it is not built, cannot be unpacked or loaded, or has other results.
     """
-    library, mark = package.with_suffix(".so"), package.with_suffix(".so.sha256")
+    library, mark = (cache_folder() / (package.stem + suffix) for suffix in (".so", ".so.sha256"))
     try:
         if mark.is_file() and library.is_file() and mark.read_text() == digest_of_files([library]):
             return _opened(library)
-        with zipfile.ZipFile(package) as members, scratch(str(package.parent)) as folder:
+        library.parent.mkdir(parents=True, exist_ok=True)
+        with zipfile.ZipFile(package) as members, scratch(str(library.parent)) as folder:
             [name] = [name for name in members.namelist() if name.endswith(LIBRARY_SUFFIXES)]
             (folder / library.name).write_bytes(members.read(name))
             (folder / mark.name).write_text(digest_of_files([folder / library.name]))
@@ -292,10 +362,11 @@ def _close(result: torch.Tensor, expected: torch.Tensor) -> bool:
     return bool((result - expected).abs().max() <= RESULT_TOLERANCE * (1 + expected.abs().max()))
 
 
-def _build(recipes: Sequence[Recipe], name: str) -> str:
-    """Build one kernel, by its name, so that it can run in another process; returns the name."""
+def _build(folder: Path, recipes: Sequence[Recipe], package: tuple[str, Target | None]) -> tuple[str, Target | None]:
+    """Build one package, by its kernel's name, so that it can run in another process; returns the package."""
+    name, target = package
     kernel = next(kernel for kernel in (*kernels_of(recipes), *TRAINER_KERNELS) if kernel.name == name)
-    path = package_path(kernel)
+    path = _path_in(folder, kernel, target)
     names = {name.removesuffix(ONE_MORE) for name in kernel.sizes if name is not None}
     sizes = {name: torch.export.Dim(f"size_{name}", min=2, max=MAX_SIZE) for name in names}
     sizes |= {name + ONE_MORE: size + 1 for name, size in sizes.items()}
@@ -304,17 +375,17 @@ def _build(recipes: Sequence[Recipe], name: str) -> str:
         path.parent.mkdir(parents=True, exist_ok=True)
         from torch.fx.experimental.proxy_tensor import make_fx  # takes a second
 
-        with scratch(str(path.parent)) as folder, warnings.catch_warnings(action="ignore"), torch.no_grad():
+        with scratch(str(path.parent)) as scratched, warnings.catch_warnings(action="ignore"), torch.no_grad():
             args = kernel.example()
             module = make_fx(kernel.function, tracing_mode="symbolic")(*args) if kernel.pulls_back else _Module(kernel)
             program = torch.export.export(module, args, dynamic_shapes=shapes if kernel.pulls_back else (shapes,))
-            package = torch._inductor.aoti_compile_and_package(
-                program, package_path=str(folder / "k.pt2"), inductor_configs=_configs(kernel)
+            made = torch._inductor.aoti_compile_and_package(
+                program, package_path=str(scratched / "k.pt2"), inductor_configs=_configs(kernel, target)
             )
-            path.with_suffix(".so").unlink(missing_ok=True)  # of the package that is replaced
-            os.replace(package, path)
+            (cache_folder() / f"{path.stem}.so").unlink(missing_ok=True)  # of the package that is replaced
+            os.replace(made, path)
         _compared(kernel, path)
-        return name
+        return package
     except UsageError:
         raise
     except OSError as error:
@@ -324,15 +395,24 @@ def _build(recipes: Sequence[Recipe], name: str) -> str:
         raise UsageError("warmup", problem) from error
 
 
-def _configs(kernel: Kernel) -> dict[str, Any]:
-    """Inductor's settings."""
+def _configs(kernel: Kernel, target: Target | None = None) -> dict[str, Any]:
+    """Inductor's settings.
+
+    Raises:
+        UsageError: this torch or the compiler takes no target.
+    """
     from torch._inductor.config import cpp  # takes long
 
     configs = OPTIONS | {TILING_HEURISTIC: not kernel.gathers} | (CHAINED_OPTIONS if kernel.chained else {})
     x86_linux = (sys.platform, platform.machine()) == ("linux", "x86_64")
     free = getattr(cpp, "march", "missing") is None  # known to this torch, and not set by the user
-    if kernel.overlaps and x86_linux and free and Path(_compiler()).name == STANDARD_COMPILER:
-        configs |= {"cpp.march": OVERLAPS[kernel.overlaps]}
+    if x86_linux and free and Path(_compiler()).name == STANDARD_COMPILER:
+        march = OVERLAPS[kernel.overlaps] if kernel.overlaps else THIS_PROCESSOR
+        if target is None:
+            return configs | {"cpp.march": march}
+        return configs | {"cpp.march": march.replace(THIS_PROCESSOR, target.name), "cpp.simdlen": target.bits}
+    if target is not None:
+        raise UsageError("bundle", f"needs {STANDARD_COMPILER} and a torch that tells it the architecture")
     return configs
 
 
