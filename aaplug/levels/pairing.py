@@ -7,7 +7,7 @@ colour or cross, so large Gaussians stay as they are.  Each cluster counts by it
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -28,6 +28,7 @@ MIN_COST_SHARE = 1e-6  # of a pair's own energy; float32 does not tell smaller c
 MAX_JITTER = 0.01  # share by which a cost is raised, so that among equal costs many pairs choose each other
 MAX_COST = 1e30  # of a pair whose cost overflows
 
+Index = Tensor | slice
 Plane = Sequence[Tensor]  # xx, xy and yy of covariances in a plane, or x and y of offsets
 
 
@@ -92,17 +93,24 @@ def edges_below(
     parts = [Edges.none(clusters)]
     for shift in CURVE_SHIFTS:
         order = torch.argsort(curve(clusters.means, shift), stable=True)
-        along, new = clusters[order].by_columns, None if fresh is None else fresh[order]
-        for step in range(1, min(NEIGHBOURS, len(order) - 1) + 1):
-            if new is None:
-                ends = [*range(0, len(order) - step, PAIRS_PER_BATCH), len(order) - step]
-                pairs = [(slice(i, j), slice(i + step, j + step)) for i, j in pairwise(ends)]
-            else:
-                near = (new[:-step] | new[step:]).nonzero()[:, 0]
-                pairs = [(i, i + step) for i in near.split(PAIRS_PER_BATCH)]
-            for one, other in pairs:
-                parts.append(_cheap(along[one], along[other], (order[one], order[other]), rate, tolerance, smallest))
+        along = clusters[order].by_columns
+        for one, other in _neighbours(len(order), None if fresh is None else fresh[order]):
+            parts.append(_cheap(along[one], along[other], (order[one], order[other]), rate, tolerance, smallest))
     return Edges.joined(parts)
+
+
+def _neighbours(count: int, fresh: Bool[Tensor, " n"] | None) -> Iterator[tuple[Index, Index]]:
+    """Places along a curve of the pairs to compare, a batch at a time."""
+    steps = range(1, min(NEIGHBOURS, count - 1) + 1)
+    if fresh is None and count > PAIRS_PER_BATCH:  # whole stretches of the curve need no indices
+        for step in steps:
+            for i, j in pairwise([*range(0, count - step, PAIRS_PER_BATCH), count - step]):
+                yield slice(i, j), slice(i + step, j + step)
+    elif steps:  # calls cost more than their work, so all steps share batches
+        fresh = torch.ones(count, dtype=torch.bool) if fresh is None else fresh
+        near = [(fresh[:-step] | fresh[step:]).nonzero()[:, 0] for step in steps]
+        ends = torch.cat(near), torch.cat([places + step for places, step in zip(near, steps, strict=True)])
+        yield from zip(*(each.split(PAIRS_PER_BATCH) for each in ends), strict=True)
 
 
 def _cheap(
