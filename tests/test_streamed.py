@@ -12,6 +12,7 @@ from aaplug.core.sampling import median_rates
 from aaplug.io import streamed
 from aaplug.io.scenes import read_scene
 from aaplug.io.streamed import MAX_SCREEN_ERROR, SWITCH
+from aaplug.methods.viewers import VIEWERS
 from aaplug.system.errors import OutputError, UsageError
 from tests.conftest import make_camera, make_scene
 
@@ -105,7 +106,27 @@ def test_levels_that_are_there_are_not_replaced(tmp_path):
     made(tmp_path / "out", "sog")
     with pytest.raises(OutputError, match="already holds lod-meta"):
         made(tmp_path / "out", "sog", resume=True)
-    made(tmp_path / "out", "sog", overwrite=True)
+
+
+@pytest.mark.parametrize("to", streamed.STREAMS)
+def test_parts_of_an_earlier_run_are_removed_and_nothing_else(tmp_path, small_leaves, monkeypatch, to):
+    made(tmp_path / "out", to)
+    many = streamed.part_folders(tmp_path / "out", to)
+    mine = sorted(many)[-1] / "notes.txt"
+    mine.write_text("keep")
+    monkeypatch.setattr(streamed, "LEAF_GAUSSIANS", 1000)
+    made(tmp_path / "out", to, overwrite=True)
+    few = streamed.part_folders(tmp_path / "out", to)
+    assert len(few) == LEVELS + 1 < len(many)
+    assert set((tmp_path / "out").glob("*_*")) == few | {mine.parent}
+    assert list(mine.parent.iterdir()) == [mine]
+
+
+@pytest.mark.parametrize(("to", "viewer"), [(to, stream.viewer) for to, stream in streamed.STREAMS.items()])
+def test_parts_are_for_their_viewer_also_without_tuning(tmp_path, to, viewer):
+    made(tmp_path / "out", to)
+    for folder in streamed.part_folders(tmp_path / "out", to):
+        assert read_scene(folder / streamed.STREAMS[to].content).convention == VIEWERS[viewer].convention
 
 
 def test_a_page_has_the_viewer_beside_it(tmp_path):

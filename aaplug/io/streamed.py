@@ -8,8 +8,10 @@ part's nearest point: at a distance d, an image h px high samples a world unit w
 
 import json
 import math
+import re
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -85,6 +87,22 @@ def write_level(folder: Path, name: StreamName, number: int, parts: Sequence[Gau
             path = folder / STREAMS[name].part(number, leaf)
             make_folder(path.parent)
             write_scene(path, part, overwrite=True)
+
+
+def part_folders(folder: Path, name: StreamName) -> set[Path]:
+    """The folders of the parts that the index in a folder lists; none without an index."""
+    stream = STREAMS[name]
+    text = (folder / stream.index).read_text("utf-8", "replace") if (folder / stream.index).is_file() else ""
+    return {folder / part for part in re.findall(rf'"(\d+_\d+)/{re.escape(stream.content)}"', text)}
+
+
+def remove_parts(folders: Iterable[Path], name: StreamName) -> None:
+    """Remove what `write_level` wrote into these folders, and those that are empty then."""
+    for folder in folders:
+        for file in [folder / STREAMS[name].content, *folder.glob("*.webp")]:
+            file.unlink(missing_ok=True)
+        with suppress(OSError):
+            folder.rmdir()
 
 
 def write_index(folder: Path, name: StreamName, levels: Sequence[Level], rate: float) -> Mapping[str, Any]:

@@ -16,6 +16,7 @@ from aaplug.core.cameras import Camera, digest_of_cameras
 from aaplug.core.chunks import MAX_CHUNK_GAUSSIANS, chunks_of
 from aaplug.core.gaussians import Gaussians, digest_of_scene
 from aaplug.core.sampling import check_frame, median_rates
+from aaplug.core.training import TrainingViews
 from aaplug.finetuning.fitting import fit, steps_for
 from aaplug.finetuning.refining import refine
 from aaplug.io.atomic import AnyPath, refuse_existing, refuse_inputs
@@ -32,9 +33,21 @@ from aaplug.io.scenes.pyramid_folder import (
     write_manifest,
 )
 from aaplug.io.scenes.scene import FLOAT, Scene, matrix_of
-from aaplug.io.streamed import SETTINGS, STREAMS, leaves_of, parts_of, program_of, write_index, write_level, write_page
+from aaplug.io.streamed import (
+    SETTINGS,
+    STREAMS,
+    leaves_of,
+    part_folders,
+    parts_of,
+    program_of,
+    remove_parts,
+    write_index,
+    write_level,
+    write_page,
+)
 from aaplug.levels.clusters import rates_of
 from aaplug.levels.merging import Goal, merge, merge_in_chunks
+from aaplug.methods.conversion import fuse_for
 from aaplug.methods.filters.smoothing import fuse_stored
 from aaplug.methods.viewers import MIP_VIEWER, Viewer, find_viewer
 from aaplug.options.verbs import LodOptions
@@ -81,7 +94,9 @@ def lod(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, options:
     with running(options, path, check, job.inputs, folder=not options.single):
         maker = _Maker.of(whole, job)
         if not options.single:
+            earlier = set[Path]()  # folders of the streamed parts that are replaced
             if path is not None and options.to is not None:
+                earlier = part_folders(path, options.to)
                 (path / STREAMS[options.to].index).unlink(missing_ok=True)
             levels = list(_levels(maker, path, files))
             if path is not None and options.to is not None:
@@ -90,6 +105,7 @@ def lod(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, options:
                 if options.page is not None:
                     write_page(path, options.to, Path(options.page))
                 job.monitor.say(f"set the viewer by {path / SETTINGS}: {json.dumps(settings)}")
+                remove_parts(earlier - part_folders(path, options.to), options.to)
                 stale = [*files, path / MANIFEST]  # what a run that is cut short resumes from
             for file in stale:
                 file.unlink(missing_ok=True)
@@ -119,10 +135,9 @@ class _Maker:
     @classmethod
     def of(cls, scene: Gaussians, job: Job[LodOptions]) -> "_Maker":
         """The maker that the options ask for."""
+        viewer = find_viewer(job.options.viewer or (job.options.to and STREAMS[job.options.to].viewer))
         if job.cameras.assumed and not job.options.tuning:
-            return cls(scene, job, None, (), None)
-        streamed = STREAMS[job.options.to].viewer if job.options.to and job.options.tuning else None
-        viewer = find_viewer(job.options.viewer or streamed)
+            return cls(scene, job, None, (), viewer)
         return cls(scene, job, job.look(job.options.tuning or MAX_VIEWS), job.views, viewer)
 
     def __call__(self, before: Level, goal: Goal) -> Level:
@@ -147,8 +162,13 @@ class _Maker:
         return self._tuned(level) if self.viewer is None else level
 
     def finished(self, level: Level) -> Level:
-        """The level as its file holds it: tuned for the viewer, if there is one."""
-        return level if self.viewer is None else self._tuned(level)
+        """The level as its file holds it: tuned or, without tuning, converted for the viewer, if there is one."""
+        if self.viewer is None or not len(level.scene):
+            return level
+        if self.job.options.tuning:
+            return self._tuned(level)
+        training = TrainingViews.of(level.scene, self.job.cameras, min_seen=0.0)
+        return level._replace(scene=fuse_for(level.scene, training, self.viewer))
 
     def _tuned(self, level: Level) -> Level:
         options, look = self.job.options, self.look
