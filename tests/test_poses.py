@@ -8,6 +8,7 @@ import torch
 
 import aaplug
 from aaplug.core.cameras import Camera, CameraSet
+from aaplug.evaluation.results import mean
 from aaplug.finetuning.poses import moved_by, refine_pose
 from aaplug.io.images import write_png
 from aaplug.rendering.renderer import Renderer
@@ -82,6 +83,19 @@ def test_a_view_without_a_photograph_is_named(photographed):
     bare = CameraSet((replace(cameras.train[0], photo=None),), ())
     with pytest.raises(aaplug.UsageError, match="view0: has no photograph"):
         aaplug.refine_poses(scene, bare, min_seen=0.0)
+
+
+def test_evaluate_tells_errors_of_poses_from_others(photographed):
+    scene, cameras = photographed
+    off = CameraSet(*[tuple(moved_by(view, CHANGE, DEPTH) for view in cameras.train)] * 2)
+    how = {"min_seen": 0.0, "recipe": "classic", "scale": (1.0,), "metric": "psnr", "rasterizer": "eager"}
+    before, after = (aaplug.evaluate(scene, off, None, poses=poses, **how) for poses in (False, True))
+    gained = mean(after.select("classic", 1.0), "PSNR") - mean(before.select("classic", 1.0), "PSNR")
+    assert gained > 6
+    [note] = [note for note in after.protocol["cameras"]["notes"] if "poses" in note]
+    assert note.startswith("2 of 2 poses moved")
+    with pytest.raises(aaplug.UsageError, match="poses: are refined on photographs"):
+        aaplug.evaluate(scene, off, None, poses=True, truth="self", **how)
 
 
 def test_finetune_refines_poses_first(photographed):

@@ -112,6 +112,8 @@ class EvaluateOptions(RecipeOptions):
     """One or more sizes relative to the training size (default: the protocol's)."""
     truth: Literal["auto", "photographs", "self"] = "auto"
     """Compare with photographs, or with the scene's own supersampled look; auto leaves it to the protocol."""
+    poses: Annotated[bool, REPORT] = False
+    """Refine the poses of the views on their photographs first: errors that then vanish were the cameras'."""
     metric: Annotated[str | Sequence[str] | None, METRICS] = None
     """Metrics, with flavours ssim:wang|3dgs, lpips:3dgs|vgg|alex (default: psnr ssim consistency energy-drift)."""
     lpips: Annotated[tuple[AnyPath, AnyPath] | None, flag("TRUNK HEADS", count=2), REPORT] = None

@@ -1,6 +1,7 @@
 """Recipes measured at several scales, against photographs or the scene's own supersampled look."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, get_args
@@ -21,6 +22,7 @@ from aaplug.options.verbs import EvaluateOptions, Layout
 from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.system.digests import digest_of_files
 from aaplug.system.errors import OutputError, UsageError, not_one_of
+from aaplug.verbs.refine_poses import refined
 from aaplug.verbs.verb import writes
 
 JOURNAL = "progress.jsonl"
@@ -51,10 +53,16 @@ def evaluate(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
     source = source_of(views, truth)
     if truth == "auto":
         job.monitor.say(f"truth: {source}{' (not every view has a photograph)' * (source == 'self')}")
+    if options.poses and source != "photographs":
+        raise UsageError("poses", "are refined on photographs, and the truth is the scene itself: leave out `poses`")
     everything, show = options.layout == "inria", options.show if options.report else "0"
     images = None if folder is None else ImageStore.of(folder, show, views, everything)
     with running(options, folder, check, job.inputs, folder=True) as workers:
-        look = job.look(len(views) * len(recipes) * len(scales))
+        frames = len(views) * len(recipes) * len(scales)
+        if options.poses:
+            job = replace(job, cameras=refined(job, job.look(frames, gradients=True), views).cameras)
+            views = job.views
+        look = job.look(frames)
         candidates = candidates_of(job.scene, look.training, recipes, look.rasterizer, look.background)
         task = Task(candidates, scales, views, Truth(look, source, protocol), metrics)
         job.announce(task.renderers, task.sized_views, cost=task.cost)

@@ -49,7 +49,7 @@ def refine_poses(scene: SceneLike | None, cameras: CamerasLike, options: PoseOpt
 
 
 def refined(job: Job[ViewOptions], look: Renderer, views: Sequence[Camera]) -> RefinedCameras:
-    """A job's cameras, with the poses of some views refined.
+    """A job's cameras, with the poses of some views refined, and a note that says by how much.
 
     Raises:
         UsageError: a view has no photograph.
@@ -65,13 +65,13 @@ def refined(job: Job[ViewOptions], look: Renderer, views: Sequence[Camera]) -> R
         split: tuple(moved.get(id(view), view) for view in getattr(job.cameras, split)) for split in ("train", "test")
     }
     changed = [pose for pose in poses if pose.degrees or pose.distance]
+    note = f"all {len(poses)} poses stay: their photographs show nothing better"
     if changed:
         turn, shift = (median(getattr(pose, name) for pose in changed) for name in ("degrees", "distance"))
         before, after = (median(getattr(pose, name) for pose in changed) for name in ("before", "after"))
         errors = f"error at half size from {before:.1f} to {after:.1f} of 255 levels"
-        job.monitor.say(
+        note = (
             f"{len(changed)} of {len(poses)} poses moved, in the median by {turn:.2g}° and {shift:.2g} units: {errors}"
         )
-    else:
-        job.monitor.say(f"all {len(poses)} poses stay: their photographs show nothing better")
-    return RefinedCameras(replace(job.cameras, **splits), tuple(poses))
+    job.monitor.say(note)
+    return RefinedCameras(replace(job.cameras, **splits, notes=(*job.cameras.notes, note)), tuple(poses))
