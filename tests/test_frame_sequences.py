@@ -91,7 +91,7 @@ REFUSED = {
     "v.png": "name a .webm or .mp4 file",
     "##/a.png": "name a .webm or .mp4 file",
     "a.##.##.png": "a.##.##.png: has places for two numbers; name a sequence such as frame.####.exr",
-    "a.##.png --beside mip": "--beside: is for videos; a frame sequence shows --recipe alone",
+    "a.##.png --beside mip": "--beside: is for videos of one eye; a frame sequence and vr180 show --recipe alone",
     "a.##.png --passes depth": "--passes: a .png cannot hold depth",
     "a.##.gif --format png": "a.##.gif: name frames of one of .png, .jpg",
 }

@@ -165,3 +165,33 @@ def test_the_program_follows_a_camera_path(cli):
     found, fps = read(Path("v.webm"))
     assert (found.shape, fps) == ((1, 40, 60, 3), 24)
     assert cli("video scene.ply --cameras . -o w.webm --path gone.json")[0] == 2
+
+
+VR = "--cameras . --lens vr180 --eye-distance 0.4 --resolution 24x24 --rasterizer eager"
+
+
+def test_both_eyes_are_side_by_side_in_a_video(cli):
+    code, _, err = cli(f"video scene.ply {VR} -o v.webm --seconds 0.1")
+    assert code == 0, err
+    frames, _ = read(Path("v.webm"))
+    assert frames.shape[2] == 2 * frames.shape[1] == 48
+    left, right = np.split(frames.astype(float), 2, axis=2)
+    assert np.abs(left - right).max() > 20
+    code, _, err = cli(f"video scene.ply {VR} -o frames/frame.####.png --seconds 0.1")
+    assert (code, "`render --path` writes both" in err) == (2, True)
+
+
+def test_the_shutter_of_an_eye_follows_that_eye(cli, monkeypatch):
+    shown = []
+    monkeypatch.setattr("aaplug.verbs.render.write_frames", lambda renderer, views, *_, **__: shown.extend(views))
+    frames = [json.loads(json.dumps(document()["camera_path"][0])) for _ in range(3)]
+    for place, frame in enumerate(frames):
+        frame["camera_to_world"][7] = 0.01 * place
+    Path("path.json").write_text(json.dumps(document(camera_path=frames)))
+    code, _, err = cli(f"render scene.ply {VR} -o out --path path.json --shutter 0.5 --samples 2")
+    assert code == 0, err
+    assert [view.name.rpartition("-")[2] for view in shown] == ["left", "right"] * (len(shown) // 2)
+    for view, other in zip(shown[::2], shown[1::2], strict=True):
+        opens, closes = view.exposure.motion
+        middle = (opens.centre + closes.centre) / 2
+        assert (middle - view.centre).norm() < 0.2 * (other.centre - view.centre).norm()

@@ -1,4 +1,4 @@
-"""A camera path as a video: one renderer's images, or those of several in one frame."""
+"""A camera path as a video: the images of one pane, or those of several in one frame."""
 
 from collections.abc import Callable, Sequence
 from os import PathLike
@@ -21,8 +21,7 @@ Image = Float[Tensor, "h w 3"]
 
 def make_video(
     path: str | PathLike[str],
-    renderers: Sequence[Renderer],
-    cameras: Sequence[Camera],
+    panes: Sequence[tuple[Renderer, Sequence[Camera]]],
     fps: float,
     compose: Callable[[int, Sequence[Image]], Image] = lambda _, images: images[0],
     apply: Apply = map,
@@ -31,9 +30,10 @@ def make_video(
     overwrite: bool = False,
     tell: Tell = lambda done, total: None,
 ) -> None:
-    """Render every camera with every renderer and write the video.
+    """Render the panes and write the video.
 
-    compose: makes one frame of its number and the renderers' images.  apply: as for `write_frames`.
+    panes: of each the renderer and a camera for every frame.
+    compose: makes one frame of its number and the panes' images.  apply: as for `write_frames`.
     folder: in which the images are kept until the video is written; None for the system's temporary files.
     tell: called with (images done, images in all).
 
@@ -43,18 +43,19 @@ def make_video(
     """
     path = Path(path)
     check_video(path, fps, overwrite)
-    count = len(cameras)
+    total = sum(len(cameras) for _, cameras in panes)
     with scratch(folder and str(folder)) as images:
-        panes: list[list[Path]] = []
-        for place, renderer in enumerate(renderers):
-            panes.append([images / f"{place}-{index:06d}.png" for index in range(count)])
+        files: list[list[Path]] = []
+        for place, (renderer, cameras) in enumerate(panes):
+            before = sum(map(len, files))
+            files.append([images / f"{place}-{index:06d}.png" for index in range(len(cameras))])
 
-            def tell_all(done: int, _: int, before: int = place * count) -> None:
-                tell(before + done, count * len(renderers))
+            def tell_all(done: int, _: int, before: int = before) -> None:
+                tell(before + done, total)
 
-            write_frames(renderer, cameras, panes[-1], apply, tell=tell_all)
+            write_frames(renderer, cameras, files[-1], apply, tell=tell_all)
         frames = (
-            compose(index, [read_image(file, None) for file in files])
-            for index, files in enumerate(zip(*panes, strict=True))
+            compose(index, [read_image(file, None) for file in each])
+            for index, each in enumerate(zip(*files, strict=True))
         )
         write_video(path, frames, fps, overwrite)

@@ -17,7 +17,7 @@ from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import listing
 from aaplug.system.executors import ProcessesIfLong
 from aaplug.verbs.verb import writes
-from aaplug.verbs.views import image_paths, names_image, seen, storage_of
+from aaplug.verbs.views import eyes_of, image_paths, names_image, seen, storage_of
 
 
 class Written(NamedTuple):
@@ -47,7 +47,12 @@ def render(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, optio
     ends = select_views(job.cameras, options.camera_to) if options.camera_to else ()
     unsized = file.unsized if file else job.cameras.assumed
     views, ends = (seen(job, each, unsized) for each in (file.cameras if file else job.views, ends))
-    views = filmed(views, options, file is not None, file and file.shutter, ends)
+    each_end = eyes_of(ends, options) if ends else [()] * len(eyes_of(views, options))
+    eyes = [
+        filmed(eye, options, file is not None, file and file.shutter, end)
+        for eye, end in zip(eyes_of(views, options), each_end, strict=True)
+    ]
+    views = [view for both in zip(*eyes, strict=True) for view in both]
     check = partial(image_paths, target, views, options.overwrite, storage.format.suffixes[0])
     paths = check()
     with running(options, target, check, job.inputs, folder=not names_image(target)) as workers:

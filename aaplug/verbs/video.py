@@ -29,7 +29,7 @@ from aaplug.system.errors import OutputError, UsageError, listing
 from aaplug.system.executors import ProcessesIfLong
 from aaplug.verbs.frame_sequences import FrameSequence
 from aaplug.verbs.verb import writes
-from aaplug.verbs.views import seen, storage_of
+from aaplug.verbs.views import eyes_of, seen, storage_of
 
 DEFAULT_FPS = 30.0  # frames per second, where neither the caller nor a path file says
 PANE_GAP = 4  # px
@@ -59,29 +59,31 @@ def video(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, option
     Raises:
         AaplugError: as `render`.
     """
-    if options.lens == "vr180":
-        raise UsageError("lens", "vr180 is a pair of images, which `render` writes; a video takes equirect")
     target = Path("video.webm" if output is None else output)
     sequence = FrameSequence.of(target, options.format)
     storage, options = storage_of(target if sequence is None else sequence.pattern, options)
     if sequence is None and (storage != PNG or options.resume):
         raise OutputError(target, f"a video holds 8-bit colours and is not resumed; name a sequence, {SEQUENCE}")
-    if sequence is not None and options.beside not in ("classic", "none", None):
-        raise UsageError("beside", "is for videos; a frame sequence shows `recipe` alone")
+    if options.lens == "vr180" and sequence is not None:
+        raise UsageError("lens", "vr180 is a pair of images, of which a sequence has one: `render --path` writes both")
+    alone = sequence is not None or options.lens == "vr180"
+    if alone and options.beside not in ("classic", "none", None):
+        raise UsageError("beside", "is for videos of one eye; a frame sequence and vr180 show `recipe` alone")
     file = None if str(options.path) in PATHS else read_camera_path(Path(options.path))
     fps = options.fps or (file and file.fps) or DEFAULT_FPS
     check = partial(check_video, target, fps, options.overwrite)
     if sequence is None:
         check()
     job = Job.of(scene, cameras, options)
-    beside = "none" if sequence is not None or options.beside is None else options.beside
+    beside = "none" if alone or options.beside is None else options.beside
     recipes = [job.recipe(name) for name in (beside, options.recipe) if name != "none"]
     path = file.cameras if file else _built_in_path(job, fps)
     views = seen(job, path, file.unsized if file else job.cameras.assumed)
     if len({view.hw for view in views}) > 1:
         sizes = listing([f"{view.width}x{view.height}" for view in views], most=3)
         raise UsageError("path", f"has frames of different sizes ({sizes} px); give `resolution`")
-    views = filmed(views, options, True, file and file.shutter)
+    eyes = [filmed(eye, options, True, file and file.shutter) for eye in eyes_of(views, options)]
+    views = eyes[0]
     if sequence is not None:
         sequence = replace(sequence, count=len(views))
         check = partial(sequence.check, options.overwrite, options.resume)
@@ -90,6 +92,8 @@ def video(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, option
 
     def compose(index: int, images: Sequence[Float[Tensor, "h _ 3"]]) -> Float[Tensor, "h w 3"]:
         share = index / len(views)
+        if len(eyes) > 1:  # side by side, as headsets take them
+            return torch.cat([*images], dim=1)
         receding = str(options.path) in RECEDING_PATHS
         rate = camera_paths.factor(share, options.start, options.end) if receding else 1.0
         return side_by_side(images, labels, rate, views[index].width / path[index].width)
@@ -101,7 +105,7 @@ def video(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, option
         renderers = [look.by(recipe) for recipe in recipes]
         size = f"{views[0].width}x{views[0].height}"
         job.monitor.say(f"{len(views)} frames of {size} px per pane, {fps:g} per second")
-        job.announce(renderers, views, processes=workers.threads, fewer="seconds or frames per second")
+        job.announce(renderers * len(eyes), views, processes=workers.threads, fewer="seconds or frames per second")
         job.say_assumed(renderers[-1], views[0])
         with job.monitor.progress("rendering", "images") as tell:
             pool = workers.cluster or ProcessesIfLong(workers.threads)
@@ -115,7 +119,8 @@ def video(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, option
                     write_frames(renderers[0], cameras_left, files, pool.map, **how)
                 return Clip(sequence.pattern, len(views), fps)
             how = {"overwrite": options.overwrite, "tell": tell, "folder": workers.cluster and target.parent}
-            make_video(target, renderers, views, fps, compose, pool.map, **how)
+            panes = [(renderer, eye) for renderer in renderers for eye in eyes]
+            make_video(target, panes, fps, compose, pool.map, **how)
     return Clip(target, len(views), fps)
 
 

@@ -55,6 +55,11 @@ def seen(job: Job[Drawn], views: Sequence[Camera], unsized: bool) -> list[Camera
     return resized(bent, options.scale, options.resolution, unsized)
 
 
+def eyes_of(views: Sequence[Camera], options: LensOptions) -> list[Sequence[Camera]]:
+    """The views of each eye, all as `seen` gives them: two lists for vr180, else one."""
+    return [views[::2], views[1::2]] if options.lens == "vr180" else [views]
+
+
 def through_lens(views: Sequence[Camera], options: LensOptions, depth_of: Callable[[Camera], float]) -> list[Camera]:
     """The views through the lens that the options name, with pixels as dense at the image's centre.
 
