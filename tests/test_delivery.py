@@ -136,6 +136,14 @@ def test_a_glb_written_in_parts_with_rows_left_out_is_whole(tmp_path: Path, monk
     assert len(glb_start(Gltf(tmp_path / "a.glb").root.fields, 0)) < (tmp_path / "a.glb").stat().st_size
 
 
+def test_cesium_counts_the_harmonics_of_an_spz_glb(tmp_path: Path):
+    """It draws those of 3, 8 or 15 attributes called SH_DEGREE_, and takes any other number for none."""
+    write_scene(tmp_path / "a.spz.glb", replace(oracle(), origin=None))
+    attributes = Gltf(tmp_path / "a.spz.glb").root.fields["meshes"][0]["primitives"][0]["attributes"]
+    assert sum("SH_DEGREE_" in name for name in attributes) == oracle().sh.shape[1] - 1
+    assert sorted(attributes.values()) == list(range(len(attributes)))
+
+
 # The checkers of the formats' makers
 
 

@@ -3,7 +3,7 @@
 A primitive of points has the attributes POSITION, ROTATION (xyzw), SCALE (linear), OPACITY (0 to 1) and the harmonics
 SH_DEGREE_l_COEF_n, of degree 0 to 3.  Floats are written, and COLOR_0 for programs that draw points; the integers that
 the extension allows are read.  A .spz.glb holds a .spz of version 2 instead (KHR_gaussian_splatting_compression_spz_2,
-a draft), its numbers in glTF's axes, as CesiumJS takes them.
+a draft), its numbers in glTF's axes, as CesiumJS takes them; degree 0 is named by COLOR_0 alone there.
 
 glTF's axes are x left, y up, z forward: a half turn about z leads to and from OpenCV's.  Transforms of nodes are
 applied, where they turn, move and scale alike along all axes.  glTF has no word for a convention: it stays in a record
@@ -244,8 +244,11 @@ class _Document:
         """The document; `blob`: the size of a .spz that holds the rows, instead of the attributes."""
         if not self.count:
             raise OutputError(self.path, "glTF cannot hold a scene without Gaussians; write a .ply")
-        views, accessors = list[dict[str, Any]](), list[dict[str, Any]]()
+        views, accessors, names, used = list[dict[str, Any]](), list[dict[str, Any]](), dict[str, int](), [SPLATS]
         for name, width in self.widths.items():
+            if blob is not None and name in harmonics(0):  # CesiumJS takes one more attribute for no harmonics at all
+                continue
+            names[name] = len(accessors)
             kind = {4: "SCALAR", 12: "VEC3", 16: "VEC4"}[width] if name != COLOUR else "VEC4"
             accessor = {"componentType": FLOAT, "count": self.count, "type": kind}
             if name == COLOUR:
@@ -257,7 +260,6 @@ class _Document:
                 stretch = {"byteOffset": self.starts[name], "byteLength": self.count * width}
                 views.append({"buffer": 0, **stretch, "target": VERTICES})
             accessors.append(accessor)
-        names, used = dict(zip(self.widths, range(len(self.widths)), strict=True)), [SPLATS]
         splats: dict[str, Any] = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
         splats |= {"sortingMethod": "cameraDistance", "projection": "perspective"}
         required = {}
