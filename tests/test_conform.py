@@ -62,6 +62,21 @@ def test_the_rule_is_found_where_none_is_stated():
     assert wrongs(stated) == {"dilation: 0.1 px², compensated, as mip does"}
 
 
+def test_one_odd_picture_does_not_change_the_rule():
+    """A picture that the rule of another viewer explains better, and no other does."""
+    names = ("dilation", "compensation", "gamma")
+    seen, others = (pictures(VIEWERS[name], white=True) for name in ("antialiased", "classic"))
+    seen["gamma"] = seen["gamma"] + 4 * (others["gamma"] - seen["gamma"])
+    verdict = judged({name: seen[name] if name in names else "none" for name in seen})
+    assert verdict.viewer.name == "antialiased"
+    assert [finding.test for finding in verdict.findings if finding.wrong and finding.error is not None] == ["gamma"]
+
+
+def test_no_splat_is_on_the_middle_row():
+    """There a round one lies along x, and PlayCanvas's axes are 0/0."""
+    assert all(abs(spot.y - CAMERA.height / 2) > 0.1 for test in TESTS for spot in test.spots)
+
+
 def test_what_no_fault_explains_is_shown_where_it_is():
     seen = pictures(CLASSIC)
     seen["order"] = seen["order"].clone()
