@@ -17,6 +17,8 @@ from tests.bench.claims import PAGE as PAGE_OF_CLAIMS
 from tests.bench.claims import page as claims_page
 from tests.bench.method_tables import COLUMNS, SCALES, lines, short_table, table
 from tests.bench.pictures import CURVES, FOLDER, scales
+from tests.bench.theory import CELLS, LARGEST_THIRD, error, laws
+from tests.bench.viewers import shown_table
 
 ROOT = Path(__file__).resolve().parents[1]
 GUIDES = ROOT / "examples" / "guides"
@@ -77,13 +79,38 @@ def test_lines_of_a_csv_are_means_and_a_median_of_seconds():
     assert list(lines(measured)) == [("auto", "0.25", "30.50", "", "3.0", "2.00")]
 
 
-def test_the_figure_of_the_tables_is_the_committed_one():
+@pytest.mark.parametrize(("plot", "least"), [(scales(), 4 * len(CURVES)), (laws(), 5)], ids=["scales", "theory"])
+def test_a_figure_of_tables_or_formulas_is_the_committed_one(plot, least):
     def curves(svg: str) -> list[str]:
         return re.findall(r'<path d="(M [^"]*)" clip-path', svg)
 
-    drawn, committed = curves(scales().svg()), curves((FOLDER / "scales.svg").read_text())
+    drawn, committed = curves(plot.svg()), curves((FOLDER / f"{plot.name}.svg").read_text())
     assert drawn == committed
-    assert len(drawn) >= 4 * len(CURVES)
+    assert len(drawn) >= least
+
+
+def test_halving_the_cells_of_a_merge_costs_eight_times_less_error():
+    """The curve of theory.md, statement 6."""
+    assert error(1 / 8) / error(1 / 16) == pytest.approx(8, rel=0.1)
+    assert all(error(cell) < LARGEST_THIRD * cell**3 / 6 for cell in CELLS)
+
+
+def test_each_plot_is_asked_for_once_and_names_its_files_their_command_and_commit(hooks):
+    texts = {path.name: path.read_text() for path in GUIDES.glob("*.md")}
+    pages = {name: hooks["drawn"](text) for name, text in texts.items()}
+    changed = {name: page for name, page in pages.items() if page != texts[name]}
+    assert changed.keys() == {"results.md", "claims.md", "viewers.md"}
+    for page in changed.values():
+        [figure] = re.findall(r'<figure class="plot">.*?</figure>', page, re.S)
+        assert "\n\n" not in figure
+        assert len(re.findall(r'<path d="M |<use ', figure)) > 20
+        assert re.search(
+            r"tables/\w+\.csv.*<code>.*tests\.bench \w+.*</code> made at commit [0-9a-f]{12}", figure, re.S
+        )
+
+
+def test_the_table_of_viewers_is_made_from_its_result_file():
+    assert shown_table() in (GUIDES / "viewers.md").read_text()
 
 
 def test_pictures_are_small_and_each_is_shown():

@@ -1,8 +1,9 @@
-"""What the site has beyond the guides: the API's pages, the tour, and the scripts that aaplug's own pages share."""
+"""What the site has beyond the guides: pages of the API, the tour, plots, and the scripts of aaplug's own pages."""
 
 import inspect
 import json
 import re
+import sys
 from collections.abc import Mapping
 from dataclasses import MISSING, Field, fields
 from pathlib import Path
@@ -17,6 +18,9 @@ from aaplug.options.base import Options, docs_of
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
+sys.path[:0] = [str(HERE), str(ROOT)]  # the plots, and the benches that read the result files
+from plots import drawn  # noqa: E402
+
 PAGES = ROOT / "aaplug" / "evaluation" / "report" / "pages"
 STUB = ROOT / "aaplug" / "__init__.pyi"
 SHARED = [PAGES / name for name in ("pictures.js", "comparing.js")]
@@ -127,8 +131,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Lead to the tour's page where a guide leads to the notebook."""
-    return markdown.replace("](../tour.ipynb", "](tour.md")
+    """Lead to the tour's page where a guide leads to the notebook; draw the plots."""
+    return drawn(markdown.replace("](../tour.ipynb", "](tour.md"))
 
 
 def on_post_build(config: MkDocsConfig) -> None:

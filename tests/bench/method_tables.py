@@ -8,7 +8,7 @@ short table of the page is printed.
 import csv
 import json
 import subprocess
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from statistics import mean, median
 from typing import Any
@@ -17,7 +17,7 @@ from aaplug.evaluation.results import CEILING, method, scale_name
 
 BATCH = Path(__file__).with_name("every_recipe.toml")
 TABLES = Path(__file__).resolve().parents[2] / "examples" / "guides" / "tables"
-MADE = TABLES / "made.json"  # by which command the tables were made, and at which commit
+MADE = TABLES / "made.json"  # by which command each table was made, and at which commit
 PSNR_COLUMN = "PSNR (dB)"
 COLUMNS = ("recipe", "scale", PSNR_COLUMN, "SSIM", "evaluations (M)", "seconds")
 MILLION = 1e6
@@ -38,11 +38,24 @@ def main(folder: Path = Path("every_recipe")) -> None:
     """Measure, write a CSV for every scene, and print the short table."""
     subprocess.run(["aaplug", "evaluate", "--batch", str(BATCH), "-o", str(folder), "--resume"], check=True)
     for path in sorted(folder.glob("*/per_view.json")):
-        with open(TABLES / f"{path.parent.name}.csv", "w", newline="", encoding="utf-8") as file:
-            csv.writer(file, lineterminator="\n").writerows([COLUMNS, *lines(json.loads(path.read_text()))])
-    commit = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=True).stdout.strip()
-    MADE.write_text(json.dumps({"command": "python -m tests.bench method_tables", "commit": commit}) + "\n")
+        keep(path.parent.name, [COLUMNS, *lines(json.loads(path.read_text()))], "python -m tests.bench method_tables")
     print(short_table())
+
+
+def keep(name: str, rows: Iterable[Sequence[str]], command: str) -> None:
+    """Write a table, and by which command it was made and at which commit."""
+    with open(TABLES / f"{name}.csv", "w", newline="", encoding="utf-8") as file:
+        csv.writer(file, lineterminator="\n").writerows(rows)
+    commit = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=True).stdout.strip()
+    made = json.loads(MADE.read_text()) | {name: {"command": command, "commit": commit}}
+    MADE.write_text(json.dumps(made, indent=1) + "\n")
+
+
+def made(*names: str) -> str:
+    """The command and the commit of tables, in words."""
+    facts = json.loads(MADE.read_text())
+    [fact] = {(facts[name]["command"], facts[name]["commit"]) for name in names}
+    return f"`{fact[0]}` made at commit {fact[1][:12]}"
 
 
 def lines(measured: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:

@@ -27,6 +27,7 @@ from tests.bench.concepts import concepts
 from tests.bench.film_lenses import panorama
 from tests.bench.method_tables import PSNR_COLUMN, Table, table
 from tests.bench.room import furnished, inside
+from tests.bench.theory import laws
 
 FOLDER = Path(__file__).resolve().parents[2] / "examples" / "guides" / "pictures"
 TITLES = {
@@ -44,6 +45,7 @@ GALLERY = (  # a view, its scale, and recipes that draw it
     ("r_24", 1 / 8, ("classic", "auto")),
     ("r_136", 4.0, ("classic", "auto")),
 )
+PANORAMA = 1024  # px: width, a quarter of that at the room's training rate
 MARGIN = 0.02  # of the image, around what is opaque
 DETAIL_CENTRE, DETAIL_SIDE = (0.46, 0.68), 0.2  # shares of an enlarged view, of which only this is kept
 ENLARGED_QUALITY = 80  # WebP: an enlarged view is smooth
@@ -53,9 +55,10 @@ def main() -> None:
     """Write all pictures."""
     with as_file(files("aaplug.io.sample")) as sample:
         scene, cameras = read_scene(sample / "chair.ply").gaussians(), read_cameras(sample)
-        pictures = {f"{plot.name}.svg": plot.svg().encode() for plot in (*concepts(scene, cameras), scales())}
+        pictures = {f"{plot.name}.svg": plot.svg().encode() for plot in (*concepts(scene, cameras), scales(), laws())}
         pictures |= gallery(scene, cameras)
         pictures["lenses.webp"] = encode_webp(lenses(scene), ENLARGED_QUALITY)
+        pictures |= {f"panorama-{recipe}.webp": around(scene, recipe) for recipe in ("classic", "auto")}
     for name, content in pictures.items():
         (FOLDER / name).write_bytes(content)
         print(f"{FOLDER.name}/{name}: {len(content):,} bytes")
@@ -80,6 +83,13 @@ def lenses(chair: Gaussians) -> Float[Tensor, "h w 3"]:
     return torch.cat([renderer(panorama(level, 3 * side)).rgb, torch.cat(below, dim=1)]).clamp(0, 1)
 
 
+def around(chair: Gaussians, recipe: str) -> bytes:
+    """A panorama of the furnished room at 1/4 of the rate that its cameras trained at."""
+    eye, ahead, up = torch.tensor([0.6, -2.3, -1.3]), torch.tensor([0.0, 0.0, -1.3]), torch.tensor([0.0, 0.0, 1.0])
+    renderer = Renderer.of(furnished(chair), inside(), recipe, min_seen=0)
+    return encode_webp(renderer(panorama(look_at(eye, ahead, up), PANORAMA)).rgb.clamp(0, 1), ENLARGED_QUALITY)
+
+
 def scales() -> Plot:
     """PSNR over scale from the tables of methods.md: a curve per recipe, and a panel per table."""
     return Plot("scales", "PSNR over scale, one line per recipe and one panel per scene", _scales_figure)
@@ -89,7 +99,7 @@ def _scales_figure(ink: str) -> Figure:
     figure = Figure(SCALES_SIZE, layout="constrained")
     panels = figure.subplots(2, 2).flat
     for axes, (scene, title) in zip(panels, TITLES.items(), strict=True):
-        _curves(axes, table(scene), ink)
+        curves(axes, table(scene), ink)
         axes.set_title(title)
         axes.set_ylabel("PSNR, dB")
     handles, labels = figure.axes[0].get_legend_handles_labels()
@@ -97,7 +107,8 @@ def _scales_figure(ink: str) -> Figure:
     return figure
 
 
-def _curves(axes: Axes, lines: Table, ink: str) -> None:
+def curves(axes: Axes, lines: Table, ink: str) -> None:
+    """PSNR over scale of a table, a line per recipe."""
     at = sorted({scale for _, scale in lines})
     for recipe, colour, marker in zip(CURVES, COLOURS, MARKERS, strict=True):
         values = [float(lines[recipe, scale][PSNR_COLUMN]) for scale in at]

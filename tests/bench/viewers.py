@@ -6,6 +6,7 @@ render by the row's rule, which is the prediction.  Where anti-aliasing must be 
 scene with it off.
 """
 
+import csv
 import json
 import os
 import shutil
@@ -39,11 +40,14 @@ from aaplug.methods.viewers import VIEWERS, Viewer
 from aaplug.rendering.renderer import Renderer
 from aaplug.verbs.convert import convert
 from tests.bench import heading, row
+from tests.bench.method_tables import TABLES, keep
 from tests.bench.scenes import decibels
 
 FOLDER = Path(__file__).with_name("viewer_pages")
 TILES = STREAMS["3dtiles"].index
 SCALES = (1.0, 0.5, 0.25, 0.125)
+VIEWS = 2
+COMMAND = "python -m tests.bench viewers --steps 0"
 PAGE_SECONDS = 300.0  # that a page may take for one thing
 OPENGL = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))  # from OpenCV's axes
 
@@ -84,9 +88,9 @@ PAGES = {
 
 
 def main(
-    work: Path = Path("out/viewers"), steps: int | None = None, views: int = 4, rows: Sequence[str] = tuple(PAGES)
+    work: Path = Path("out/viewers"), steps: int | None = None, views: int = VIEWS, rows: Sequence[str] = tuple(PAGES)
 ) -> None:
-    """Print the table.
+    """Print the table; of the closed forms and the usual views, put it into tables/viewers.csv, too.
 
     Args:
         work: folder of converted scenes and pictures.
@@ -100,10 +104,30 @@ def main(
     with as_file(files("aaplug.io.sample")) as sample:
         scene, cameras = read_scene(sample / "chair.ply").gaussians(), read_cameras(sample)
         bench = Bench(work.resolve(), scene, cameras, cameras.test[:views], steps)
-        heading("viewers", "`--for`", "scene", *(round(bench.views[0].width * scale) for scale in SCALES))
+        sizes = [str(round(bench.views[0].width * scale)) for scale in SCALES]
+        heading("viewers", "`--for`", "scene", *sizes)
+        measured = list[list[str]]()
         for name in rows:
             for label, cells in bench.rows(VIEWERS[name.split()[0]], PAGES[name]):
                 row(f"`{name}`", label, *cells)
+                measured.append([name, label, *cells])
+        if steps == 0 and views == VIEWS:
+            kept = [line for line in results() if line[0] not in rows] + measured
+            kept.sort(key=lambda line: list(PAGES).index(line[0]))
+            keep("viewers", [["for", "shown", *sizes], *kept], COMMAND)
+
+
+def results() -> list[list[str]]:
+    """The lines of viewers.csv."""
+    with open(TABLES / "viewers.csv", newline="", encoding="utf-8") as file:
+        return list(csv.reader(file))[1:]
+
+
+def shown_table() -> str:
+    """viewers.csv as Markdown."""
+    lines = [["`--for`", "shown", "800", "400", "200", "100"], ["---"] * 6]
+    lines += [[f"`{name}`", *cells] for name, *cells in results()]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines).replace(" --- ", "---")
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,35 @@
+"""Processor time of a view of the bundled chair by several recipes, in turn, both interpreted or both compiled."""
+
+import time
+from importlib.resources import as_file, files
+
+from aaplug.core.colours import WHITE
+from aaplug.io.cameras import read_cameras
+from aaplug.io.scenes import read_scene
+from aaplug.rendering.renderer import Renderer
+from tests.bench import heading, row
+from tests.bench.method_tables import keep
+
+RECIPES: dict[str, tuple[str, ...]] = {"eager": ("classic", "ewa", "mip", "sa-gs", "matched", "analytic")}
+RECIPES["compiled"] = RECIPES["eager"][:-1]  # the kernel of `analytic` is in the lab, and is interpreted
+ROUNDS = {"eager": 3, "compiled": 15}
+
+
+def main() -> None:
+    """Print the table, and write tables/times.csv: the least of some rounds, in ms."""
+    with as_file(files("aaplug.io.sample")) as sample:
+        scene, cameras = read_scene(sample / "chair.ply").gaussians(), read_cameras(sample)
+    view, lines = cameras.test[0], [("rasterizer", "recipe", "ms")]
+    heading("times", *lines[0])
+    for rasterizer, recipes in RECIPES.items():
+        drawn = {name: Renderer.of(scene, cameras, name, background=WHITE, rasterizer=rasterizer) for name in recipes}
+        least = dict.fromkeys(recipes, float("inf"))
+        for _ in range(ROUNDS[rasterizer]):
+            for name, renderer in drawn.items():
+                start = time.process_time()
+                renderer(view)
+                least[name] = min(least[name], time.process_time() - start)
+        lines += [(rasterizer, name, f"{1000 * seconds:.1f}") for name, seconds in least.items()]
+    for line in lines[1:]:
+        row(*line)
+    keep("times", lines, "OMP_NUM_THREADS=1 python -m tests.bench times")
