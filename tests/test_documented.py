@@ -38,7 +38,7 @@ SHORTER = {  # options that make a documented command quicker; they come last, s
 FITTING = ["--steps", "2"]  # of `convert --for`, likewise
 NERFBASELINES = (
     "nerfbaselines train --method aaplug --data chair --output run"
-    " --set scene=chair.ply --backend python --disable-output-artifact",
+    " --set scene=$PWD/chair.ply --backend python --disable-output-artifact",
     "nerfbaselines render --checkpoint run/checkpoint-0 --data chair --output predictions --backend python",
     "nerfbaselines evaluate predictions --output results.json",
 )

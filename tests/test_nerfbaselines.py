@@ -10,6 +10,9 @@ import torch
 
 from aaplug.core.cameras import Camera
 from aaplug.core.colours import WHITE
+from aaplug.core.imaging import quantised
+from aaplug.evaluation.data_sets import MIP_NERF_360, NERF_SYNTHETIC
+from aaplug.evaluation.metrics import psnr, ssim
 from aaplug.io.scenes import read_scene, write_scene
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import FormatError, UsageError
@@ -114,3 +117,19 @@ def test_nerfbaselines_finds_the_method_and_takes_it_for_one():
     package = pytest.importorskip("nerfbaselines", reason="the package nerfbaselines is not installed")
     with package.build_method_class(package.get_method_spec("aaplug"), backend="python") as found:
         assert issubclass(found, package.Method)
+
+
+def test_its_scenes_file_names_and_metrics_are_ours():
+    package = pytest.importorskip("nerfbaselines", reason="the package nerfbaselines is not installed")
+    from nerfbaselines import metrics
+
+    for name, data_set in (("blender", NERF_SYNTHETIC), ("mipnerf360", MIP_NERF_360)):
+        spec = package.get_dataset_spec(name)
+        assert {scene["id"] for scene in spec["metadata"]["scenes"]} == set(data_set.scenes)
+        assert (name in data_set.folders, spec["evaluation_protocol"]) == (True, "nerf")
+    generator = torch.Generator().manual_seed(0)
+    truth = quantised(torch.rand(40, 50, 3, generator=generator))
+    image = quantised((truth + 0.1 * torch.randn(40, 50, 3, generator=generator)).clamp(0, 1))
+    pair = image.numpy()[None], truth.numpy()[None]
+    assert float(metrics.psnr(*pair)[0]) == pytest.approx(float(psnr(image, truth)), abs=1e-3)
+    assert float(metrics.ssim(*pair)[0]) == pytest.approx(float(ssim(image, truth)), abs=1e-5)
