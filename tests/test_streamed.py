@@ -11,7 +11,7 @@ import aaplug
 from aaplug.core.sampling import median_rates
 from aaplug.io import streamed
 from aaplug.io.scenes import read_scene
-from aaplug.io.streamed import MAX_SCREEN_ERROR, SWITCH
+from aaplug.io.streamed import MAX_SCREEN_ERROR, TILE_SWITCH
 from aaplug.methods.viewers import VIEWERS
 from aaplug.system.errors import OutputError, UsageError
 from tests.conftest import make_camera, make_scene
@@ -67,7 +67,7 @@ def test_3d_tiles_refine_where_a_level_is_no_longer_right(tmp_path, small_leaves
             inside = -scene.means[:, [0, 2, 1]] - middle
             assert (inside.abs() <= half.reshape(3, 3).diagonal() + 1e-3).all()
             assert (tile["refine"], "transform" in tile) == ("REPLACE", False)
-            expected = MAX_SCREEN_ERROR / (SWITCH * rate * 0.5**level) if level else 0.0
+            expected = MAX_SCREEN_ERROR / (TILE_SWITCH * rate * 0.5**level) if level else 0.0
             assert math.isclose(tile["geometricError"], expected, rel_tol=1e-5)
             [tile] = tile.get("children", [None])
             level -= 1

@@ -31,6 +31,7 @@ from aaplug.system.errors import OutputError, UsageError, reason
 
 LEAF_GAUSSIANS = 1 << 16  # of the finest level in a part of space
 SWITCH = 1.5  # rate at which a viewer should change level, as a multiple of the coarser level's own
+TILE_SWITCH = 2.0  # the same of a tile, whose box holds the Gaussians' extents and so begins nearer than they do
 EXTENT = 3.0  # standard deviations to which a tile's box holds its splats
 PLAYCANVAS_TANGENT = math.tan(math.radians(22.5))  # of half the field of view that its distances are meant for
 UPDATE_SHARE = 1 / 16  # of the first distance: PlayCanvas chooses levels again when the camera moved so far
@@ -171,7 +172,7 @@ def _lod_meta(stream: Stream, parts: Sequence[Sequence[Gaussians]], rate: float)
 
 def _tileset(stream: Stream, parts: Sequence[Sequence[Gaussians]], rate: float) -> Indexed:
     def error(number: int) -> float:
-        return MAX_SCREEN_ERROR * 2.0**number / (SWITCH * rate)
+        return MAX_SCREEN_ERROR * 2.0**number / (TILE_SWITCH * rate)
 
     tiles = []
     for leaf, levels in enumerate(parts):
