@@ -44,6 +44,8 @@ def table(rows: Iterable[Sequence[str]], headings: Sequence[str] = ()) -> Any:
     grid = Table(*headings, show_header=bool(headings), box=None, pad_edge=False)
     for row in rows:
         grid.add_row(*map(escape, row))
+    for column in grid.columns:
+        column.overflow = "fold"  # a long name keeps its end
     return grid
 
 

@@ -505,6 +505,29 @@ def viewers(words: Words) -> Answer:
     return Answer([asdict(viewer) for viewer in VIEWERS.values()], [table(rows, headings)])
 
 
+@verb(json_of("the table as a list of objects"))
+def recipes(words: Words) -> Answer:
+    """List the recipes that --recipe knows: what each is and whose, its cost, and when to use it.
+
+    Samples are per pixel, at 1/2, 1/4 and 1/8 of the training size if they differ.  To measure recipes on a scene, use
+    evaluate.
+    """
+    from aaplug.methods import RECIPES
+    from aaplug.system.registry import names_of
+
+    used = names_of("recipe", comparisons=False)
+    facts = [
+        {"name": r.name, "source": r.source, "cost": r.cost, "when": r.when, "comparison": r.name not in used}
+        for r in RECIPES.values()
+    ]
+    headings = ("--recipe", "cost", "when to use it", "what it is, and whose")
+    tables = [
+        table(((f["name"], f["cost"], f["when"], f["source"]) for f in facts if f["comparison"] == of), headings)
+        for of in (False, True)
+    ]
+    return Answer(facts, [tables[0], "For comparison:", tables[1]])
+
+
 @verb(Option("name", names(*GUIDES, metavar="[NAME]", by_place=True), "The guide to print.", None))
 def guide(words: Words) -> Answer:
     """List the guides, or print one.

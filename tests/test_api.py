@@ -47,7 +47,7 @@ def test_an_option_that_is_none_is_refused_with_the_nearest_name():
         aaplug.render("scene.ply", scal=0.5)
 
 
-@pytest.mark.parametrize("verb", sorted(VERBS.keys() - {"guide", "viewers"}))  # which print alone
+@pytest.mark.parametrize("verb", sorted(VERBS.keys() - {"guide", "recipes", "viewers"}))  # which print alone
 def test_verbs_have_the_options_of_the_command_line(verb):
     parameters = inspect.signature(getattr(aaplug, verb.replace("-", "_"))).parameters
     missing = parameters.keys() - VERBS[verb].options.keys() - {"monitor", "name", "words"}

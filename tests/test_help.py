@@ -1,12 +1,16 @@
 """What --help says: an example, whole lines, and no word that belongs elsewhere."""
 
 import ast
+import json
 import re
 import sys
 from pathlib import Path
 
 import pytest
 from aaplug_cli.verbs import VERBS
+
+from aaplug.methods import RECIPES
+from aaplug.system.registry import names_of
 
 ROOT = Path(__file__).resolve().parents[1]
 GUIDES = sorted((ROOT / "examples" / "guides").glob("*.md"))
@@ -101,3 +105,19 @@ def test_texts_name_guides_that_are_there_and_not_their_files(cli):
     named = re.findall(r"`aaplug guide (\w+)`", "".join(path.read_text() for path in sources))
     assert {"cluster", "methods", "viewers"} <= set(named) <= {path.stem for path in GUIDES}
     assert not any("guides/" in cli(f"{verb} --help")[1] for verb in VERBS)
+
+
+def test_the_table_of_recipes_has_every_one_and_marks_those_for_comparison(cli, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "400")
+    used, compared = cli("recipes")[1].split("For comparison:")
+    facts = json.loads(cli("recipes --json")[1])
+    assert [each["name"] for each in facts] == list(RECIPES)
+    for each in facts:
+        row = " +".join(re.escape(each[key]) for key in ("name", "cost", "when", "source"))
+        assert re.search(rf"^{row} *$", compared if each["comparison"] else used, re.M), each["name"]
+    assert [each["name"] for each in facts if not each["comparison"]] == names_of("recipe", comparisons=False)
+
+
+def test_no_table_cuts_a_name_off(cli, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "60")
+    assert "…" not in cli("recipes")[1]

@@ -54,7 +54,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
 
 @pytest.fixture(scope="module")
 def finished(installed: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder in which one process with the plug-in has run the guide's commands and `evaluate --help`."""
+    """The folder in which one process with the plug-in has run the guide's commands, a `--help` and `recipes`."""
     folder = tmp_path_factory.mktemp("theirs")
     write_scene(folder / "scene.ply", few(read_scene(SAMPLE / "chair.ply").gaussians()))
     write_cameras(folder / "path" / "to" / "colmap")
@@ -62,7 +62,7 @@ def finished(installed: dict[str, str], tmp_path_factory: pytest.TempPathFactory
     lines = (LOOK.format(name=name, x=x, held_out=held) for name, x, held in views)
     (folder / "views.look").write_text("".join(lines))
     commands = [line for line in GUIDE.read_text().splitlines() if line.startswith("aaplug ")]
-    words = [shlex.split(command)[1:] for command in [*commands, "aaplug evaluate --help"]]
+    words = [shlex.split(command)[1:] for command in [*commands, "aaplug evaluate --help", "aaplug recipes"]]
     done = subprocess.run(
         [sys.executable, "-c", PROGRAM, json.dumps(words)], cwd=folder, env=installed, capture_output=True, text=True
     )
@@ -112,6 +112,11 @@ def test_help_knows_their_names(finished):
     text = (finished / "stdout").read_text()
     for name in ("soft-points", "mae", "row-by-row"):
         assert re.search(rf"[|{{,\s]{name}\b", text), name
+
+
+def test_the_table_of_recipes_has_theirs_among_those_to_use(finished):
+    used = (finished / "stdout").read_text().split("--recipe ")[-2]
+    assert re.search(r"^soft-points +1 sample .* nobody's: the example", used, re.M)
 
 
 def test_the_laws_run_over_what_the_plug_in_adds(finished):

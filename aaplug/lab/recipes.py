@@ -18,6 +18,7 @@ MIP_SPLATTING_CODE = Recipe(
     "Mip-Splatting as in its published code: the largest focal length for every camera",
     "parity with its published code; differs if focal lengths differ",
     world=LARGEST_FOCAL,
+    time=0.8,
     promises=Promises(opaque_when_near=False),
 )
 MIP_SPLATTING_BALANCED = Recipe(
@@ -26,6 +27,7 @@ MIP_SPLATTING_BALANCED = Recipe(
     "aaplug: Mip-Splatting with opacities balanced by the broadest face's area, not by volume, and bounded",
     "comparison: avoids most of mip-splatting's dimming",
     world=BALANCED,
+    time=1.0,
     promises=Promises(opaque_when_near=False),
 )
 MIP_SPLATTING_ANISOTROPIC = Recipe(
@@ -34,6 +36,7 @@ MIP_SPLATTING_ANISOTROPIC = Recipe(
     "aaplug: Mip-Splatting with directional bounds: smooths each axis by the information of all views along it",
     "comparison: measured to be no better than mip-splatting",
     world=ANISOTROPIC,
+    time=0.8,
     promises=Promises(opaque_when_near=False),
 )
 AAA = Recipe(
@@ -41,6 +44,7 @@ AAA = Recipe(
     ADAPTIVE,
     "AAA-Gaussians' adaptive 3D filter (ICCV 2025, arXiv 2504.12811), with its projected-area factor",
     "scenes trained with it",
+    time=1.1,
     promises=Promises(opaque_when_near=False),
 )
 MULTI_SCALE = Recipe(
@@ -58,12 +62,14 @@ ANALYTIC = Recipe(
     "distribution",
     "scenes trained with it",
     pixel=INTEGRAL,
+    time=6.0,
 )
 SA_GS = Recipe(
     "sa-gs",
     SCALE_ADAPTIVE,
     "SA-GS's 2D scale-adaptive filter (Song et al., arXiv 2403.19615): 0.3 r² px², one rate per view",
     "comparison: matched without its second step",
+    time=1.0,
     promises=Promises(equals_training=True, fades_when_small=False),
 )
 SA_GS_INTEGRAL = Recipe(
@@ -72,6 +78,7 @@ SA_GS_INTEGRAL = Recipe(
     "SA-GS's filter and integration; divides by the standard deviation (its code by the variance)",
     "comparison: it repeats blur that training applied already",
     pixel=INTEGRAL,
+    time=6.0,
 )
 SA_GS_SAMPLES = Recipe(
     "sa-gs-samples",
@@ -79,6 +86,7 @@ SA_GS_SAMPLES = Recipe(
     "SA-GS's filter and supersampling; composites the background with the true transmittance",
     "comparison: nine samples per pixel at every rate",
     grid=3,
+    time=1.9,
     promises=Promises(fades_when_small=False),
 )
 MATCHED_SAMPLES = Recipe(
@@ -87,6 +95,7 @@ MATCHED_SAMPLES = Recipe(
     "aaplug: matched, with 3×3 samples per pixel at every rate",
     "comparison: nine samples per pixel at every rate",
     grid=3,
+    time=1.8,
 )
 MATCHED_INTEGRAL = Recipe(
     "matched-integral",
@@ -94,6 +103,7 @@ MATCHED_INTEGRAL = Recipe(
     "aaplug: matched, with Analytic-Splatting's integral over the rest of the pixel",
     "comparison: slower than matched and no better",
     pixel=INTEGRAL,
+    time=6.0,
     promises=Promises(equals_training=True),
 )
 AA_2DGS = Recipe(
@@ -103,6 +113,7 @@ AA_2DGS = Recipe(
     "scenes of 2D Gaussians trained with it",
     world=FLAT,
     pixel=SURFEL_MIP,
+    time=45.0,
     promises=Promises(opaque_when_near=False),
 )
 GAUSSIAN_BLENDING = Recipe(
@@ -112,6 +123,7 @@ GAUSSIAN_BLENDING = Recipe(
     "scenes trained with it or with Analytic-Splatting",
     pixel=INTEGRAL,
     compositor=WINDOWED_LIGHT,
+    time=7.0,
 )
 MATCHED_BLENDING = Recipe(
     "matched-blending",
@@ -120,4 +132,5 @@ MATCHED_BLENDING = Recipe(
     "comparison: the best with one sample per pixel, but slower than several samples",
     pixel=INTEGRAL,
     compositor=WINDOWED_LIGHT,
+    time=7.0,
 )

@@ -28,6 +28,7 @@ AUTO = Recipe(
     neighbours=NEIGHBOURS,
     takes_quality=True,
     for_discs="2dgs-matched",
+    time=1.4,
     promises=Promises(equals_training=True),
     **set_by("balanced"),
 )
@@ -36,6 +37,7 @@ MATCHED = Recipe(
     BY_POSE,
     "aaplug: training's dilation rescaled to the new sampling rate, then the rest of the pixel's filter",
     "speed, zooming in: one sample per pixel",
+    time=1.0,
     promises=Promises(equals_training=True),
 )
 CLASSIC_RECIPE = Recipe(
@@ -43,6 +45,7 @@ CLASSIC_RECIPE = Recipe(
     OF_CLASSIC,
     "3DGS (Kerbl et al. 2023): +0.3 px²",
     "comparison: right only at the training size",
+    time=1.0,
     promises=Promises(equals_training=True, keeps_energy=False),
 )
 EWA = Recipe(
@@ -50,12 +53,14 @@ EWA = Recipe(
     OF_ANTIALIASED,
     "EWA splatting (Zwicker et al. 2002); 3DGS --antialiasing, gsplat antialiased: 0.3 px², compensated",
     "scenes trained with it",
+    time=1.0,
 )
 MIP_RECIPE = Recipe(
     "mip",
     OF_MIP,
     "Mip-Splatting's 2D Mip filter (Yu et al. 2024, eq. 10): 0.1 px², compensated",
     "scenes trained with it; scenes converted by aaplug",
+    time=1.0,
 )
 MIP_SPLATTING = Recipe(
     "mip-splatting",
@@ -63,6 +68,7 @@ MIP_SPLATTING = Recipe(
     "Mip-Splatting (Yu et al. 2024): 3D smoothing (eq. 9) with its volume factor, then the 2D Mip filter",
     "scenes trained with it; it dims others",
     world=BY_VOLUME,
+    time=0.8,
     promises=Promises(opaque_when_near=False),
 )
 SURFELS = Recipe(
@@ -71,6 +77,7 @@ SURFELS = Recipe(
     "2DGS (Huang et al. 2024): surfels intersected by rays, and a low-pass filter of √½ px",
     "scenes of 2D Gaussians at the training size; a 3D Gaussian becomes a surfel across its thinnest axis",
     pixel=SURFEL,
+    time=30.0,
     promises=Promises(keeps_energy=False),
 )
 SURFELS_MATCHED = Recipe(
@@ -80,18 +87,21 @@ SURFELS_MATCHED = Recipe(
     "scenes of 2D Gaussians at other sizes",
     target_rate=0.5,
     pixel=SURFEL,
+    time=30.0,
 )
 PLAYCANVAS_RECIPE = Recipe(
     "playcanvas",
     OF_PLAYCANVAS,
     "PlayCanvas and SuperSplat with anti-aliasing on: 0.3 in half pixels, that is 0.075 px², compensated",
     "predicting their pictures; scenes converted for them",
+    time=1.0,
 )
 PLAYCANVAS_CLASSIC_RECIPE = Recipe(
     "playcanvas-classic",
     OF_PLAYCANVAS_CLASSIC,
     "PlayCanvas and SuperSplat with anti-aliasing off: 0.075 px²",
     "predicting their pictures; scenes converted for them",
+    time=1.0,
     promises=Promises(keeps_energy=False),
 )
 
