@@ -70,6 +70,7 @@ from .core.interfaces import Limits as Limits, Pixels as Pixels
 from .core.kernels import Kernels as Kernels
 from .core.rules import RULES_3DGS as RULES_3DGS, Rules as Rules
 from .core.spherical_harmonics import COLOUR_OFFSET as COLOUR_OFFSET, SH_C0 as SH_C0
+from .core.spectra import frequency_response as frequency_response
 from .core.splats import Splats2D as Splats2D
 from .io.atomic import replacing as replacing
 from .io.cameras.options import CameraFileOptions as CameraFileOptions

@@ -321,7 +321,8 @@ def _text(value: Any) -> str:
         lines = any(isinstance(item, str) for item in value)
         return ("\n" if lines else "  ").join(_text(item) for item in value)
     if isinstance(value, dict):
-        return "  ".join(f"{name} px: {_text(share)}" for name, share in value.items())
+        between = "\n" if any(isinstance(item, dict) for item in value.values()) else "  "
+        return between.join(f"{name}{' px' * name.isdigit()}: {_text(item)}" for name, item in value.items())
     return f"{value:,}" if isinstance(value, int) else printable(str(value))
 
 

@@ -25,7 +25,11 @@ def test_info_with_cameras_tells_the_sampling(cli):
     facts = info("scene.ply", ".")
     assert facts["training_cameras"] == 3
     assert 0.5 < facts["seen_share"] <= 1
+    shares = facts["energy_above_nyquist_share"]
+    assert set(shares) == {"classic", "matched", "auto"}
+    assert 0 < shares["matched"]["at 1"] < shares["matched"]["at 1/8"] < 1
     assert json.loads(cli("info scene.ply --cameras . --json")[1]) == facts
+    assert f"at 1/8: {shares['auto']['at 1/8']:.4g}" in " ".join(cli("info scene.ply --cameras .")[1].split())
 
 
 def test_drop_bad_leaves_bad_gaussians_out_and_counts_them(cli):

@@ -107,6 +107,7 @@ def right_calls(folder: Path) -> dict[str, tuple[Callable[..., Any], dict[str, A
         "find_recipe": (aaplug.find_recipe, {"name": "auto"}),
         "look_at": (aaplug.look_at, dict(zip(("eye", "target", "up"), at, strict=True))),
         "smoothed_by": (aaplug.smoothed_by, {"scene": gaussians, "log_sigma": torch.zeros(20, 1), "volume": True}),
+        "frequency_response": (aaplug.frequency_response, {"splats": splats, "omega": torch.zeros(4, 2)}),
         "whitening": (aaplug.whitening, {"splats": splats}),
         "grown": (aaplug.grown, {"splats": splats, "radius": torch.ones(6, dtype=torch.float64), "min_alpha": 1 / 255}),
         "over": (aaplug.over, {"rgb": rgb, "alpha": rgb[..., 0], "background": (1.0, 1.0, 1.0)}),

@@ -5,22 +5,31 @@ sampling rate of any training view: Mip-Splatting's bound (arXiv 2311.16493).  T
 on surfaces, whose thin axis shows only edge-on.  Training drew that Gaussian widened by the convention's dilation.  At
 relative rate r its variance is r²(σ²ν² + dilation) px², which meets the bound at r = √(0.2 / (σ²ν² + dilation)): below
 that scale it aliases.
+
+Another measure takes all axes, opacities and the recipe into account: the share of the splats' energy that lies above
+the Nyquist rate of the samples (`core.spectra`).
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import product
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import MAX_LOG_SCALE, Gaussians
 from aaplug.core.sampling import SamplingBounds
+from aaplug.core.spectra import energies, shares_above_nyquist
 from aaplug.core.training import TrainingViews
 from aaplug.methods.filters.smoothing import NYQUIST_VARIANCE
+from aaplug.methods.pixel_kernels.point import POINT
+from aaplug.rendering.renderer import Renderer
 
 BINS = 48
+SPECTRUM_VIEWS = 3  # from which the energy above the Nyquist rate is taken
 LOWEST_LOG2, HIGHEST_LOG2 = -7.0, 5.0  # of extent over bound; the end bins of the histogram count what lies outside
 
 
@@ -32,6 +41,7 @@ class Coverage:
     edges, counts: histogram of extent over bound at the highest training rate; edges as log2.
     under: share below the bound.  begins: the scale below which half of the Gaussians, as training drew them, alias.
     aliased: (scale, share of the Gaussians, as training drew them, that are below the bound at that scale).
+    above_nyquist: of the splats' energy by recipe and scale, see `above_nyquist`.
     """
 
     gaussians: int
@@ -41,6 +51,7 @@ class Coverage:
     under: float | None
     begins: float | None
     aliased: tuple[tuple[float, float], ...]
+    above_nyquist: Mapping[tuple[str, float], float | None] = field(default_factory=dict)
 
 
 def middle_log_scales(scene: Gaussians) -> Float[Tensor, " n"]:
@@ -59,8 +70,33 @@ def aliasing_begins(multiple: float, dilation: float) -> float:
     return (NYQUIST_VARIANCE / (NYQUIST_VARIANCE * multiple**2 + dilation)) ** 0.5
 
 
-def coverage(scene: Gaussians, training: TrainingViews, scales: Sequence[float]) -> Coverage:
-    """Compare the scene's extents with their bounds, at the training size and at `scales`."""
+@torch.no_grad()
+def above_nyquist(renderer: Renderer, views: Sequence[Camera], scale: float) -> float | None:
+    """Share of the energy of a few views' splats above the Nyquist rate of their samples, at a scale.
+
+    Splats that others hide count as all do.  None if a sample is not a point, or nothing is seen.
+    """
+    if renderer.recipe.pixel is not POINT:
+        return None
+    total = above = 0.0
+    for view in views[:: -(-len(views) // SPECTRUM_VIEWS)]:
+        splats = renderer.splats(*renderer.sampled(view.scaled(scale)))
+        energy = energies(splats).double()
+        total, above = total + float(energy.sum()), above + float((energy * shares_above_nyquist(splats)).sum())
+    return above / total if total else None
+
+
+def coverage(
+    scene: Gaussians,
+    training: TrainingViews,
+    scales: Sequence[float],
+    renderers: Mapping[str, Renderer] | None = None,
+    views: Sequence[Camera] = (),
+) -> Coverage:
+    """Compare the scene's extents with their bounds, at the training size and at `scales`.
+
+    renderers: by recipe, of which the energy above the Nyquist rate is taken in some of `views`, if there are any.
+    """
     multiples = log_multiples(scene, training.bounds)
     logs = (multiples / math.log(2)).clamp(LOWEST_LOG2, HIGHEST_LOG2)
     histogram = torch.histogram(logs.cpu(), torch.linspace(LOWEST_LOG2, HIGHEST_LOG2, BINS + 1, dtype=torch.float64))
@@ -71,4 +107,6 @@ def coverage(scene: Gaussians, training: TrainingViews, scales: Sequence[float])
     dilated = (extents.square() + dilation / NYQUIST_VARIANCE).sqrt()
     under = int((multiples < 0).sum()) / len(multiples)
     begins = aliasing_begins(float(extents.median()), dilation)
-    return Coverage(*counts, under, begins, tuple((s, float((dilated * s < 1).double().mean())) for s in scales))
+    aliased = tuple((s, float((dilated * s < 1).double().mean())) for s in scales)
+    drawn = product((renderers or {}).items(), scales if views else ())
+    return Coverage(*counts, under, begins, aliased, {(n, s): above_nyquist(r, views, s) for (n, r), s in drawn})

@@ -23,6 +23,7 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.core.imaging import quantised
 from aaplug.core.interfaces import Rasterizer, WorldFilter
 from aaplug.core.training import TrainingViews
+from aaplug.evaluation.coverage import Coverage, coverage
 from aaplug.evaluation.image_store import ImageStore
 from aaplug.evaluation.journal import Journal
 from aaplug.evaluation.metric import Image, Metric, Series, TimedImage, TimedRenderer
@@ -124,6 +125,12 @@ class Task:
     def renderers(self) -> list[Renderer]:
         """Renderers of the candidates."""
         return [candidate.renderer for candidate in self.candidates]
+
+    def coverage(self, scene: Gaussians) -> Coverage:
+        """The scene's extents against their sampling bounds, and the candidates' energy above the Nyquist rate."""
+        renderers = {candidate.name: candidate.renderer for candidate in self.candidates}
+        views = self.views if self.resizes else ()
+        return coverage(scene, self.truth.renderer.training, self.scales, renderers, views)
 
     @property
     def resizes(self) -> bool:

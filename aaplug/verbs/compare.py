@@ -7,7 +7,6 @@ from pathlib import Path
 
 from aaplug.evaluation import PROTOCOLS
 from aaplug.evaluation.comparison import Comparison, compared_scenes, in_one_frame
-from aaplug.evaluation.coverage import coverage
 from aaplug.evaluation.engine import Candidate, Task, evaluate, facts_of
 from aaplug.evaluation.image_store import ImageStore
 from aaplug.evaluation.metrics import find_metrics
@@ -90,7 +89,7 @@ def compare(scenes: ScenesLike, cameras: CamerasLike, output: AnyPath | None, op
             report = evaluate(task, facts, tell, folder and folder / JOURNAL, options.resume, images, pool.map)
         comparison = Comparison(rows, report)
         if folder and images:
-            bounds = coverage(job.scene.gaussians(), look.training, report.scales)
+            bounds = task.coverage(job.scene.gaussians())
             replaces = options.overwrite or options.resume
             for file in write_comparison(comparison, task, folder, bounds, images, replaces):
                 say(f"wrote {file}")

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, get_args
 
 from aaplug.evaluation import PROTOCOLS
-from aaplug.evaluation.coverage import coverage
 from aaplug.evaluation.engine import Task, candidates_of, facts_of
 from aaplug.evaluation.engine import evaluate as measure
 from aaplug.evaluation.image_store import ImageStore
@@ -74,7 +73,7 @@ def evaluate(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
         with job.monitor.progress(f"evaluating {name}", "views") as tell:
             report = measure(task, facts, tell, folder and folder / JOURNAL, options.resume, images, apply)
         if folder and images:
-            bounds = coverage(job.scene.gaussians(), look.training, report.scales) if options.report else None
+            bounds = task.coverage(job.scene.gaussians()) if options.report else None
             for file in write_evaluation(report, name, folder, bounds, images, replaces):
                 job.monitor.say(f"wrote {file}")
     return report

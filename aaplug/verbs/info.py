@@ -4,9 +4,11 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from aaplug.core.cameras import CameraSet
+from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.orbits import Frame
-from aaplug.evaluation.coverage import aliasing_begins
+from aaplug.core.training import TrainingViews
+from aaplug.evaluation.coverage import above_nyquist, aliasing_begins
+from aaplug.evaluation.results import scale_name
 from aaplug.evaluation.survey import Survey, check_frame_of, survey
 from aaplug.io.scenes import SceneLike, scene_of
 from aaplug.io.scenes.ply import Document
@@ -15,12 +17,15 @@ from aaplug.methods.conversion import describe
 from aaplug.options.shared import FrameOptions, Orbit
 from aaplug.rendering.assumed import PROBE_ROWS, TRAINING_RATE, frame_around, rate_of
 from aaplug.rendering.job import CamerasLike, Job
+from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import UsageError
 from aaplug.verbs.verb import looks
 
 MAX_LOG_SCALE = 20.0  # larger ones are taken for scales
 MIN_STEPS = 1e4  # of float32 across the scene's extent: with fewer, positions are coarse
 PICTURE_SIDES = (3840, 1920, 1280, 640, 320)  # px: longer sides of pictures of the whole scene
+SPECTRUM_ROWS = 20  # Gaussians read at each place of the file, of which the splats' energy is taken
+SPECTRUM_RECIPES, SPECTRUM_SCALES = ("classic", "matched", "auto"), (1.0, 1 / 2, 1 / 4, 1 / 8)
 ULP = 2.0**-23  # of float32, relative
 
 
@@ -56,6 +61,7 @@ def info(scene: SceneLike | None, cameras: CamerasLike, options: FrameOptions) -
         sampling = _assumed_facts(statistics, job.cameras, frame_around(opened, orbit))
     else:
         sampling = _sampling_facts(statistics, job.cameras, opened.convention.kernel) if train else {}
+        sampling |= _spectrum_facts(opened, train) if train else {}
     comments = opened.document.header.comments if isinstance(opened.document, Document) else []
     problems = list(_problems(opened, statistics, comments))
     return _scene_facts(opened, statistics, comments) | sampling | {"problems": problems}
@@ -98,6 +104,18 @@ def _sampling_facts(statistics: Survey, cameras: CameraSet, kernel: float) -> di
         "aliasing_begins_at_scale": None if multiple is None else aliasing_begins(math.exp(multiple), kernel),
         "cameras": list(cameras.notes),
     }
+
+
+def _spectrum_facts(scene: Scene, train: Sequence[Camera]) -> dict[str, Any]:
+    """Share of the splats' energy above the Nyquist rate, by recipe and scale, from Gaussians of all over the file."""
+    some = scene.sample(SPECTRUM_ROWS)
+    training = TrainingViews.of(some, train)
+    shares = dict[str, dict[str, float]]()
+    for name in SPECTRUM_RECIPES:
+        renderer = Renderer.of(some, training, name)
+        found = {scale_name(scale): above_nyquist(renderer, train, scale) for scale in SPECTRUM_SCALES}
+        shares[name] = {f"at {scale}": share for scale, share in found.items() if share is not None}
+    return {"energy_above_nyquist_share": {name: found for name, found in shares.items() if found}}
 
 
 def _assumed_facts(statistics: Survey, cameras: CameraSet, frame: Frame) -> dict[str, Any]:

@@ -83,6 +83,8 @@ def plots(report: Report, bounds: Coverage) -> list[Plot]:
         curves.append(_curves(name, metric.title, partial(_mean, metric), report))
     title = "million splat-pixel evaluations per view"
     curves.append(_curves("evaluations", title, million_evaluations, report, from_zero=True))
+    title = "% of the splats' energy above the Nyquist rate"
+    curves.append(_curves("above-nyquist", title, partial(_above_nyquist, bounds), report, from_zero=True))
     share = "" if bounds.under is None else f": {bounds.under:.0%} are under it"
     words = f"Histogram of the Gaussians' extent over their sampling bound{share}"
     return [*(plot for plot in curves if plot is not None), Plot(BOUNDS, words, partial(_histogram, bounds))]
@@ -90,6 +92,11 @@ def plots(report: Report, bounds: Coverage) -> list[Plot]:
 
 def _mean(metric: Metric, report: Report, recipe: str, scale: float) -> float | None:
     return mean(report.select(recipe, scale), metric.name)
+
+
+def _above_nyquist(bounds: Coverage, report: Report, recipe: str, scale: float) -> float | None:
+    share = bounds.above_nyquist.get((recipe, scale))
+    return None if share is None else 100 * share
 
 
 def _curves(name: str, title: str, value: Value, report: Report, from_zero: bool = False) -> Plot | None:
@@ -107,8 +114,9 @@ def _curves(name: str, title: str, value: Value, report: Report, from_zero: bool
         figure, ceiling = Figure(FIGURE_INCHES), lines.pop(CEILING, None)
         axes = figure.add_subplot(title=title)
         for (recipe, line), colour, marker in zip(lines.items(), cycle(COLOURS), cycle(MARKERS), strict=False):
-            axes.plot(scales, line, marker=marker, ms=5, color=colour, label=recipe)
-        if ceiling is not None:
+            if not all(map(math.isnan, line)):
+                axes.plot(scales, line, marker=marker, ms=5, color=colour, label=recipe)
+        if ceiling is not None and not all(map(math.isnan, ceiling)):
             axes.plot(scales, ceiling, color=ink, ls=(0, (4, 3)), lw=1, label=CEILING, zorder=1)
         axes.set_xscale("log", base=2)
         axes.set_xticks(scales, [scale_name(scale) for scale in scales])
