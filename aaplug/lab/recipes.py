@@ -3,9 +3,11 @@
 `aaplug evaluate --recipe all` measures them with the others; examples/guides/methods.md has their figures.
 """
 
+from aaplug.lab.elliptical import ELLIPTICAL
 from aaplug.lab.filters import ADAPTIVE, ANISOTROPIC, BALANCED, FLAT, LARGEST_FOCAL, SCALE_ADAPTIVE
 from aaplug.lab.gaussian_blending import GAUSSIAN_BLENDING as WINDOWED_LIGHT
 from aaplug.lab.integral import INTEGRAL
+from aaplug.lab.obbl import BOUNDED_BAND_LIMIT, RENORMALIZED
 from aaplug.lab.pixel_size import BY_PIXEL_SIZE
 from aaplug.lab.surfel_mip import SURFEL_MIP
 from aaplug.methods.filters.dilation import NONE, OF_CLASSIC, OF_MIP, LowPass
@@ -39,6 +41,17 @@ MIP_SPLATTING_ANISOTROPIC = Recipe(
     time=0.8,
     promises=Promises(opaque_when_near=False),
 )
+OBBL = Recipe(
+    "obbl",
+    OF_MIP,
+    "AA-Splat's parts (Suh et al. 2026, arXiv 2603.29394) as aaplug reads them: 3D smoothing with opacities kept and "
+    "bounded, then the 2D Mip filter, and colours over alpha where a pixel is covered",
+    "comparison: pixel-aligned Gaussians of a feed-forward network",
+    world=BOUNDED_BAND_LIMIT,
+    compositor=RENORMALIZED,
+    time=80.0,
+    promises=Promises(opaque_when_near=False),
+)
 AAA = Recipe(
     "aaa",
     ADAPTIVE,
@@ -63,6 +76,15 @@ ANALYTIC = Recipe(
     "scenes trained with it",
     pixel=INTEGRAL,
     time=6.0,
+)
+EAA = Recipe(
+    "eaa",
+    NONE,
+    "MipSLAM's elliptical adaptive anti-aliasing (Li et al. 2026, eqs. 5, 6) as a third party reads it: no dilation, "
+    "alpha from weighted nodes in the pixel",
+    "comparison: analytic by sums over nodes, slower and no better",
+    pixel=ELLIPTICAL,
+    time=11.0,
 )
 SA_GS = Recipe(
     "sa-gs",

@@ -69,7 +69,7 @@ def lines(measured: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
             yield (
                 *(recipe, f"{scale:g}"),
                 *(f"{mean(psnr):.2f}" if psnr else "", f"{mean(ssim):.4f}" if ssim else ""),
-                *(f"{mean(work) / MILLION:.1f}" if work else "", f"{median(seconds):.2f}"),
+                *(f"{mean(work) / MILLION:.1f}" if any(work) else "", f"{median(seconds):.2f}"),
             )
 
 
