@@ -18,6 +18,7 @@ from aaplug.core.sampling import sampling_bounds
 from aaplug.core.training import TrainingViews
 from aaplug.evaluation.truth import MEMORY, Truth, back_projected
 from aaplug.finetuning import loop
+from aaplug.finetuning.groups import drawn, regroup
 from aaplug.finetuning.loop import advance, loss_at, run
 from aaplug.finetuning.losses import LOSSES, l1_dssim, l2, structural_similarity
 from aaplug.finetuning.parameters import RATES, between, extent, least_log_scales, leaves_of, scene_of
@@ -32,6 +33,7 @@ from aaplug.lab.densification import (
     densify_after_step,
     moments_after,
 )
+from aaplug.lab.mipmap_gs import MIPMAP_GS
 from aaplug.methods import RECIPES
 from aaplug.options.verbs import FinetuneOptions
 from aaplug.rasterizers import RASTERIZERS
@@ -208,12 +210,51 @@ def test_a_method_that_keeps_the_number_of_gaussians_says_so():
         settings_of(CONSISTENCY, FinetuneOptions(densify_every=2))
 
 
+def test_a_group_trains_alone_and_is_drawn_anew_as_the_published_code_does_in_proportion():
+    settings = replace(SETTINGS, steps=60, group_share=0.6)
+    job = replace(make_job(settings=settings), densify=None)
+    state, groups, moved = begin(job), [], {}
+    for step in range(60):
+        if step in (4, 29, 58):  # a group, and all
+            before = {name: leaf.detach().clone() for name, leaf in state.leaves.items()}
+            advance(job, state)
+            moved[step] = int((state.leaves["dc"] != before["dc"]).flatten(1).any(dim=1).sum())
+            inside = torch.arange(60) if state.group is None else state.group
+            others = torch.ones(60, dtype=torch.bool).index_fill_(0, inside, False)
+            for name, leaf in state.leaves.items():
+                assert torch.equal(leaf[others], before[name][others]), name
+        else:
+            state.step = step
+            regroup(state, settings)
+            state.step = step + 1
+        groups.append(state.group)
+    assert [i for i, group in enumerate(groups) if group is None] == [0, 1, 29, 58, 59]
+    assert {len(group) for group in groups if group is not None} == {36}
+    assert 0 < moved[4] <= 36 < moved[29]
+    assert not torch.equal(groups[2], groups[3])
+
+
+def test_groups_are_drawn_by_opacity():
+    opacities = torch.cat([torch.full((500,), 0.9), torch.full((500,), 0.1)])
+    group = drawn(opacities, 0.3, torch.Generator().manual_seed(1))
+    assert len(group.unique()) == 300
+    assert 230 < int((group < 500).sum()) < 290  # 300 draws with replacement would hit them 270 times
+
+
+def test_groups_need_a_number_of_gaussians_that_stays():
+    with pytest.raises(
+        UsageError, match="group_share: needs a number of Gaussians that stays, and mipmap-gs densifies"
+    ):
+        settings_of(MIPMAP_GS, FinetuneOptions(scale=(0.5,), group_share=0.6))
+
+
 # runs
 
 
-@pytest.mark.parametrize(("densify_every", "stopped_at"), [(0, 2), (2, 3)])
-def test_a_run_that_was_stopped_and_resumed_is_one_that_never_was(densify_every, stopped_at, tmp_path):
-    job = make_job(settings=replace(SETTINGS, densify_every=densify_every))
+@pytest.mark.parametrize(("densify_every", "group_share", "stopped_at"), [(0, 1.0, 2), (2, 1.0, 3), (0, 0.5, 3)])
+def test_a_run_that_was_stopped_and_resumed_is_one_that_never_was(densify_every, group_share, stopped_at, tmp_path):
+    settings = replace(SETTINGS, densify_every=densify_every, group_share=group_share)
+    job = replace(make_job(settings=settings), densify=densify_after_step if densify_every else None)
     whole = begin(job)
     assert run(job, whole, every=2)
     first, kept = begin(job), []
@@ -283,7 +324,7 @@ def test_checkpoints_of_others_are_refused(tmp_path):
         with pytest.raises(FormatError, match="damaged"):
             load(tmp_path / "damaged.pt", job)
     torch.save(torch.load(path) | {"version": 1}, tmp_path / "old.pt")
-    with pytest.raises(FormatError, match="another version: expected aaplug finetune 5, got aaplug finetune 1"):
+    with pytest.raises(FormatError, match="another version: expected aaplug finetune 6, got aaplug finetune 1"):
         load(tmp_path / "old.pt", job)
     with pytest.raises(UsageError, match="its steps was 6, now it is 13"):
         load(path, replace(job, settings=replace(SETTINGS, steps=13)))

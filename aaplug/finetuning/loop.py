@@ -14,9 +14,10 @@ from torch import Tensor
 
 from aaplug.core.cameras import Camera
 from aaplug.core.sampling import sampling_bounds
+from aaplug.finetuning.groups import others_kept, regroup
 from aaplug.finetuning.losses import LOSSES
 from aaplug.finetuning.parameters import extent, least_log_scales
-from aaplug.finetuning.settings import Settings
+from aaplug.finetuning.settings import SEED_STRIDE, Settings
 from aaplug.finetuning.state import State, TuningJob, snapshot, state_of
 from aaplug.rendering.renderer import Drawing
 from aaplug.system.errors import UsageError
@@ -26,7 +27,6 @@ MAX_LOGIT = 9.0  # largest opacity logit: opacity 0.9999, where the sigmoid's gr
 MAX_BAD_STEPS = 3  # consecutive steps without finite gradients before the run rolls back
 BACK_OFF = 0.5  # factor on all learning rates per rollback
 MAX_ROLLBACKS = 5
-SEED_STRIDE = 10_000_019  # from one of the user's seeds to the next
 SCALE_SEED = 3_000_000  # added for the scale of a step
 
 
@@ -73,6 +73,7 @@ def run(
 def advance(job: TuningJob, state: State) -> None:
     """Take one step; if a loss or gradient is not finite, only the step is counted."""
     settings = job.settings
+    regroup(state, settings)
     view, weights = _view_and_weights(settings, job.views, state.step)
     state.adam.zero_grad(set_to_none=True)
     losses, drawings = {}, []
@@ -92,7 +93,8 @@ def advance(job: TuningJob, state: State) -> None:
     for group in state.adam.param_groups:
         size = extent(job.start.training.cameras) if group["name"] == "means" else 1.0
         group["lr"] = settings.rates[group["name"]] * size * decay
-    state.adam.step()
+    with others_kept(state):
+        state.adam.step()
     _clamp_parameters(state)
     if job.densify:
         job.densify(job, state, drawings)

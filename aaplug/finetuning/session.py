@@ -45,7 +45,12 @@ def tune(
     def keep(state: State, fallback: Mapping[str, Any]) -> None:
         """Measure a few training views at the training size and the farthest scale; write the checkpoint; say both."""
         scales = list(dict.fromkeys([1.0, max(job.settings.weights, key=lambda s: abs(math.log(s)))]))
-        report = compare([Candidate("now", state.renderer(job))], spread(job.views, PROBE_VIEWS), scales, job.truth)
+        report = compare(
+            [Candidate("now", replace(state, group=None).renderer(job))],
+            spread(job.views, PROBE_VIEWS),
+            scales,
+            job.truth,
+        )
         psnr = {scale: mean(report.select("now", scale), PSNR.name) for scale in scales}
         state.probes.append({"step": state.step, "psnr": {f"{s:g}": v for s, v in psnr.items()}})
         losses = [loss for step in state.curve[-LOSS_STEPS:] for loss in step["loss"].values()]

@@ -9,6 +9,8 @@ from aaplug.methods.viewers import FAST, Viewer
 from aaplug.options.verbs import ANCHOR_WEIGHT, LOSS_WEIGHTS, FinetuneOptions
 from aaplug.system.errors import UsageError, not_one_of
 
+SEED_STRIDE = 10_000_019  # from one of the user's seeds to the next
+
 
 @dataclass(frozen=True)
 class Settings:
@@ -20,6 +22,7 @@ class Settings:
     decay: factor that the learning rates have reached at the end.
     loss: a name in `losses.LOSSES`.
     densify_every: steps between densifications, 0 for none.
+    group_share: of the Gaussians, that trains and is drawn at a time; see `groups`.
     """
 
     name: str
@@ -30,6 +33,7 @@ class Settings:
     decay: float = 1.0
     loss: str = "l2"
     densify_every: int = 0
+    group_share: float = 1.0
     seed: int = 0
 
 
@@ -86,11 +90,15 @@ def settings_of(method: Method, options: FinetuneOptions) -> Settings:
     settings = method.settings(options.scale, options.move, options.anchor)
     if options.densify_every and method.densify is None:
         raise UsageError("densify_every", f"the method {settings.name} keeps the number of Gaussians")
+    densify_every = settings.densify_every if options.densify_every is None else options.densify_every
+    if densify_every and options.group_share < 1:
+        raise UsageError("group_share", f"needs a number of Gaussians that stays, and {settings.name} densifies")
     return replace(
         settings,
         steps=settings.steps if options.steps is None else options.steps,
         rates={name: rate * options.learning_rate for name, rate in settings.rates.items()},
         loss=options.loss,
-        densify_every=settings.densify_every if options.densify_every is None else options.densify_every,
+        densify_every=densify_every,
+        group_share=options.group_share,
         seed=options.seed,
     )

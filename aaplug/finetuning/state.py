@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from aaplug.core.cameras import Camera, digest_of_cameras
@@ -32,7 +32,7 @@ from aaplug.system.locks import scratch
 
 EPSILON = 1e-15  # of Adam (3DGS)
 DYNAMO, DYNAMO_FOLDER = "torch._dynamo", "TORCHINDUCTOR_CACHE_DIR"  # torch's compiler, which its optimizers import
-FORMAT, VERSION = "aaplug finetune", 5  # of a checkpoint
+FORMAT, VERSION = "aaplug finetune", 6  # of a checkpoint
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +83,7 @@ class State:
     first_log_scales: of each Gaussian when the run or densification made it.
     bounds: sampling bounds; they are computed anew every `loop.BOUNDS_EVERY` steps and after each densification.
     gradients: sums over steps that the job's `densify` needs, by name.
+    group: places of the Gaussians that train and are drawn; None for all.
     bad_steps: consecutive steps without finite gradients.
     rollbacks: how often the run returned to an earlier state.
     curve: number, view and loss by scale of each step.  probes: PSNR measured on the way.
@@ -94,6 +95,7 @@ class State:
     first_log_scales: Float[Tensor, "n 3"]
     bounds: SamplingBounds
     gradients: dict[str, Tensor] = field(default_factory=dict)
+    group: Int[Tensor, " k"] | None = None
     bad_steps: int = 0
     rollbacks: int = 0
     curve: list[dict[str, Any]] = field(default_factory=list)
@@ -104,9 +106,11 @@ class State:
         return scene_of({n: leaf.detach() for n, leaf in self.leaves.items()}, job.start.scene)
 
     def renderer(self, job: TuningJob) -> Renderer:
-        """Draws the scene as it is now; differentiable in the leaves."""
-        training = replace(job.start.training, bounds=self.bounds)
-        return replace(job.start, scene=scene_of(self.leaves, job.start.scene), training=training)
+        """Draws the scene, or the group, as it is now; differentiable in the leaves."""
+        scene, bounds = scene_of(self.leaves, job.start.scene), self.bounds
+        if self.group is not None:
+            scene, bounds = scene[self.group], bounds[self.group]
+        return replace(job.start, scene=scene, training=replace(job.start.training, bounds=bounds))
 
 
 def begin(job: TuningJob) -> State:

@@ -13,8 +13,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from aaplug.core.gaussians import Gaussians
-from aaplug.finetuning.loop import SEED_STRIDE, update_bounds
+from aaplug.finetuning.loop import update_bounds
 from aaplug.finetuning.parameters import WHOLE, extent, leaves_of
+from aaplug.finetuning.settings import SEED_STRIDE
 from aaplug.finetuning.state import State, TuningJob, optimizer
 from aaplug.rendering.renderer import Drawing
 

@@ -271,6 +271,8 @@ class FinetuneOptions(WritingOptions, ViewOptions):
     """Factor on the method's learning rates."""
     densify_every: Annotated[int | None, STEPS, TUNING] = None
     """Clone, split and prune every N steps; 0 for never (default: the method's own)."""
+    group_share: Annotated[float, number(0.01, 1, metavar="SHARE"), TUNING] = 1.0
+    """Share of the Gaussians that is drawn and moves at a time, as in Group Training, whose share is 0.6."""
     truth: Annotated[str, names(*TRUTHS)] = "auto"
     """What the training size should look like: self is the scene's own render; auto takes photographs if all exist."""
     poses: Annotated[bool, TUNING] = False

@@ -1,37 +1,53 @@
 """The figures of examples/guides/methods.md on methods that papers name and aaplug has for comparison.
 
-Parts: the time of every recipe; `eaa` beside `analytic`; energy above the Nyquist rate; `obbl` on pixel-aligned
-Gaussians.
+Parts: the time of every recipe; `eaa` beside `analytic`; energy above the Nyquist rate; Group Training;
+separable sinc and anisotropic filters; `obbl` on pixel-aligned Gaussians.
 """
 
 import math
 import statistics
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
+import numpy as np
 import torch
+from torch import Tensor
 
 from aaplug.core.cameras import Camera, CameraSet
+from aaplug.core.ellipses import grown
 from aaplug.core.gaussians import Gaussians, joined
+from aaplug.core.interfaces import Limits, Pixels
+from aaplug.core.rules import Rules
 from aaplug.core.spherical_harmonics import SH_C0
+from aaplug.core.splats import Splats2D
+from aaplug.core.training import TrainingViews
 from aaplug.evaluation.coverage import above_nyquist
 from aaplug.evaluation.metric import Image
 from aaplug.evaluation.truth import Truth, ViewTruth
+from aaplug.io.scenes import read_scene
 from aaplug.lab.elliptical import Elliptical
+from aaplug.lab.integral import HALF_U, HALF_V, Integral, principal_columns
 from aaplug.lab.obbl import BoundedBandLimit
 from aaplug.methods import RECIPES
+from aaplug.methods.pixel_kernels.raster_rows import OPACITY, forms_at
 from aaplug.methods.recipe import Recipe
 from aaplug.rendering.renderer import Renderer
+from aaplug.verbs.finetune import finetune
 from tests.bench.scenes import Trained, decibels, trained
 
 SCALES = (1 / 2, 1 / 4, 1 / 8)
+SINC_RADIUS, SINC_NODES, SINC_VIEWS = 2.0, 12, 2  # px; frequencies of the quadrature; views, which are slow
+WIDE = 1.2  # px: standard deviation of a Gaussian without frequencies above the Nyquist rate
+STEPS = 200  # of fine-tuning
 ROUNDS = 5  # of timed renders
 VIEWS = "r_0", "r_40", "r_80", "r_120", "r_160"  # of the chair, as in the tables of methods.md
 CONTEXTS = 12  # views of the feed-forward network, about
 LEAST_ALPHA = 0.9  # of a pixel that gets a Gaussian
 SIGMAS = 0.05, 0.5  # px of a context view: standard deviations of pixel-aligned Gaussians
-OPACITY = 0.95  # of pixel-aligned Gaussians
+OPAQUE = 0.95  # opacity of pixel-aligned Gaussians
 BESIDE_OBBL = "classic", "matched", "auto", "mip", "mip-splatting", "mip-splatting-balanced", "obbl"
 BOUNDS = 0.95, 0.6, 0.4, 0.2
 
@@ -119,6 +135,96 @@ def nyquist(chair: Trained) -> None:
         row(f"`{name}`", *(f"{100 * (share or 0):.1f}" for share in shares))
 
 
+def groups(chair: Trained) -> None:
+    """PSNR at 1, 1/2, 1/4 and 1/8 of the chair tuned for `STEPS` steps, and processor seconds: plain and in groups."""
+    truths = photographs(chair, (1.0, *SCALES))
+    row("not tuned", *psnr(chair.renderer("matched"), truths))
+    for name, share in {"plain": 1.0, "groups of 0.6": 0.6}.items():
+        started = time.process_time()
+        options = {"steps": STEPS, "group_share": share, "views": ",".join(VIEWS)}
+        with TemporaryDirectory() as folder:
+            tuned = Path(folder) / "tuned.ply"
+            finetune(chair.scene, chair.cameras, tuned, **options)
+            scene = replace(chair, scene=read_scene(tuned).gaussians())
+        row(name, *psnr(scene.renderer("matched"), truths), f"{time.process_time() - started:.0f}")
+
+
+@dataclass(frozen=True)
+class Sinc(Integral):
+    """The Gaussian cut off at the Nyquist rate of the pixels, along the splat's axes: a separable sinc as pixel filter.
+
+    Along an axis of standard deviation σ it is σ √(2π) / π ∫ e^(-σ²ω²/2) cos(ωx) dω from 0 to π, which is negative in
+    places.
+
+    clamped: negative alpha is not drawn, as by 3DGS's cut-off; else it is composited, and adds to the light behind it.
+    """
+
+    name: str = "sinc"
+    clamped: bool = True
+
+    def bounding_ellipses(self, splats: Splats2D, rules: Rules) -> Splats2D:
+        """Ellipses that reach `SINC_RADIUS` px beyond."""
+        return grown(splats, torch.full_like(splats.dets, SINC_RADIUS), rules.min_alpha)
+
+    def alpha(self, rows: Tensor, pixels: Pixels, limits: Limits) -> Tensor:
+        """Opacity times both cut Gaussians."""
+        alpha = rows[..., OPACITY, None]
+        for form, half in zip(forms_at(rows, pixels), (HALF_U, HALF_V), strict=True):
+            sigma = 0.5 / rows[..., half, None].clamp(min=1e-6)
+            alpha = alpha * band_limited(form * sigma, sigma)
+        return limits.cut(alpha) if self.clamped else torch.where(alpha.abs() > limits.below_min_alpha, alpha, 0.0)
+
+
+def band_limited(x: Tensor, sigma: Tensor, nodes: int = SINC_NODES) -> Tensor:
+    """exp(-x²/2σ²) without its frequencies above π, by Gauss-Legendre quadrature; x and sigma in px.
+
+    A Gaussian wider than `WIDE` px has none, to 0.1 %.
+    """
+    total = torch.zeros_like(x * sigma)
+    for node, weight in zip(*np.polynomial.legendre.leggauss(nodes), strict=True):
+        omega = math.pi / 2 * (node + 1)
+        total = total + math.pi / 2 * weight * (-0.5 * (sigma * omega).square()).exp() * (omega * x).cos()
+    return torch.where(sigma > WIDE, (-0.5 * (x / sigma).square()).exp(), sigma * (2 / math.pi) ** 0.5 * total)
+
+
+@dataclass(frozen=True)
+class Floored:
+    """Widen by a Gaussian along those axes of a splat alone whose variance is below `variance` px², and keep energy."""
+
+    variance: float
+
+    def __call__(self, splats: Splats2D, camera: Camera, training: TrainingViews) -> Splats2D:
+        """Filter the splats of one view."""
+        ux, uy, vx, vy = principal_columns(splats.covs, splats.dets)
+        added = torch.zeros_like(splats.covs)
+        for x, y in ((ux, uy), (vx, vy)):
+            square = x * x + y * y  # 1 / variance along the axis
+            more = (self.variance - 1 / square).clamp(min=0.0) / square
+            added = added + more[:, None] * torch.stack([x * x, x * y, y * y], dim=1)
+        return splats.convolved(added, compensate=True)
+
+
+def sinc(chair: Trained) -> None:
+    """Lobes of a band-limited splat by its width, and PSNR of separable and anisotropic filters at 1/2, 1/4 and 1/8."""
+    at = torch.arange(-300, 301, dtype=torch.float64) / 100
+    for sigma in (0.1, 0.3, 0.5, 0.7, 1.0):
+        lobes = band_limited(at, torch.tensor(sigma, dtype=torch.float64), 8 * SINC_NODES)
+        light, lost = lobes.sum(), -lobes.clamp(max=0.0).sum()
+        row(f"σ = {sigma:g} px", max(0.0, float(-100 * lobes.min() / lobes.max())), abs(float(100 * lost / light)))
+    truths = photographs(chair)[:SINC_VIEWS]
+    analytic, mip = RECIPES["analytic"], RECIPES["mip"]
+    recipes = {
+        "mean over the square (analytic)": analytic,
+        "sinc, negative alpha not drawn": replace(analytic, pixel=Sinc()),
+        "sinc, negative alpha composited": replace(analytic, pixel=Sinc(clamped=False)),
+        "Gaussian, 0.1 px² (mip)": mip,
+        "Gaussian along thin axes alone, up to 0.1 px²": replace(mip, screen=Floored(0.1)),
+        "the same, up to 0.2 px²": replace(mip, screen=Floored(0.2)),
+    }
+    for name, recipe in recipes.items():
+        row(name, *psnr(chair.renderer(recipe, rasterizer="eager" if "sinc" in name else "auto"), truths))
+
+
 def pixel_aligned(opened: Trained, views: Sequence[Camera]) -> Trained:
     """A scene as a feed-forward network makes it: one Gaussian for each pixel of each view, from our depth pass.
 
@@ -140,7 +246,7 @@ def pixel_aligned(opened: Trained, views: Sequence[Camera]) -> Trained:
                 means=seen["position"][at],
                 quats=torch.randn(len(depths), 4, generator=g),
                 log_scales=drawn + (depths / view.focal).log()[:, None],
-                logit_opacities=torch.full_like(depths, OPACITY).logit(),
+                logit_opacities=torch.full_like(depths, OPAQUE).logit(),
                 sh=((colours - 0.5) / SH_C0)[:, None],
             )
         )
@@ -171,4 +277,4 @@ def obbl(chair: Trained) -> None:
         row(name, *psnr(renderer, truths), f"{taken[name]:.0f}" if name in taken else "")
 
 
-PARTS = {part.__name__: part for part in (times, eaa, nyquist, obbl)}
+PARTS = {part.__name__: part for part in (times, eaa, nyquist, groups, sinc, obbl)}
