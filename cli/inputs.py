@@ -32,6 +32,8 @@ class FileOptions(Options):
     """Also read gsplat's .pt, a pickle; only its tensors are loaded."""
     spz_axes: Annotated[SpzAxes, SCENE_FILE] = "auto"
     """Axes of a .spz: opengl (its specification), opencv (splat-transform, gsply), or auto: as the cameras tell."""
+    frames_apart: Annotated[bool, SCENE_FILE] = False
+    """The frames of a scene in time were trained apart: no Gaussian of one is in another."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +41,7 @@ class SceneOptions(FileOptions):
     """The scene."""
 
     scene: Annotated[Path | None, flag("SCENE", read=Path, by_place=True)] = None
-    """A scene (.ply, .spz, .sog, .glb, .usdz, others: `aaplug guide formats`), or a folder with one or its levels."""
+    """A scene (.ply, .spz, .sog, .glb, others: `aaplug guide formats`), or a folder: model, levels or frames."""
     model_path: Annotated[Path | None, flag("FOLDER", "-m", read=Path), SCENE_FILE] = None
     """An INRIA model folder, instead of SCENE."""
     iteration: Annotated[int | None, number(0, 10**9, whole=True, metavar="N"), SCENE_FILE] = None
@@ -85,6 +87,7 @@ def open_scene(words: Words, path: Path | None = None) -> "Scene":
         drop_bad=files.drop_bad,
         allow_checkpoint=files.allow_checkpoint,
         spz_axes=files.spz_axes,
+        frames_apart=files.frames_apart,
     )
     facts = f"{scene.count:,} Gaussians, SH degree {scene.sh_degree}, {scene.convention.name} ({scene.evidence})"
     say(f"scene: {scene.path}: {facts}")

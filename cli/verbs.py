@@ -75,7 +75,7 @@ def render(words: Words) -> Answer:
 
 @verb(
     *SCENE_AND_CAMERAS,
-    output("FILE", WRITTEN + "; with --batch, a folder."),
+    output("FILE", WRITTEN + "; with --batch or for a scene in time, a folder."),
     verbs.ConvertOptions,
     *SEVERAL,
     json_of("what was done as one JSON object"),

@@ -65,6 +65,7 @@ class Camera:
         Neither counts for equality.
     lens: maps rays to places in the image.
     exposure: aperture and shutter; None for an instant, and for a lens without a size.
+    frame: place, from 0, of the frame that it shows of a scene in time.
 
     Raises:
         UsageError: a number is out of range, the pose is no rigid motion, or a lens that bends has an aperture.
@@ -83,6 +84,7 @@ class Camera:
     undistortion: Undistortion | None = None
     lens: Lens = PINHOLE
     exposure: "Exposure | None" = None
+    frame: Annotated[int, Range(0)] = 0
 
     def __post_init__(self) -> None:
         try:
@@ -109,7 +111,7 @@ class Camera:
 
     @property
     def _scalars(self) -> tuple[object, ...]:
-        return self.name, *self.intrinsics, self.trained_focal, self.lens, self.exposure
+        return self.name, *self.intrinsics, self.trained_focal, self.lens, self.exposure, self.frame
 
     @property
     def intrinsics(self) -> tuple[float, float, float, float, int, int]:
@@ -313,12 +315,13 @@ def look_at(eye: Float[Tensor, " 3"], target: Float[Tensor, " 3"], up: Float[Ten
 def digest_of_cameras(views: Sequence[Camera]) -> str:
     """Hash of the views as they were understood: names, sizes, intrinsics, poses, training focal lengths and lenses.
 
-    An exposure counts too.
+    An exposure counts too, and the frame of a scene in time.
     """
     values = []
     for view in views:
         more: list[object] = [asdict(lens) for lens in (view.lens, view.undistortion) if lens not in (PINHOLE, None)]
         if (exposure := view.exposure) is not None:
             more += [repr(exposure.aperture), exposure.samples, digest_of_cameras(exposure.motion or ())]
+        more += [view.frame] * (view.frame > 0)
         values.append([view.name, *view.intrinsics, view.cam_from_world.tolist(), view.trained_focal, more or None])
     return hashlib.sha256(json.dumps(values).encode()).hexdigest()

@@ -64,21 +64,26 @@ class TimedRenderer:
         """Render one view, without gradients."""
         if self._evaluations is not None:
             self._evaluations.clear()
+        renderer = self.renderer.at(camera.frame)
         started = time.perf_counter()
         with torch.no_grad():
-            rgb, alpha = self.renderer(camera)
+            rgb, alpha = renderer(camera)
         seconds = time.perf_counter() - started
         evaluations = None if self._evaluations is None else sum(self._evaluations)
-        samples, background = self.renderer.samples(camera), self.renderer.background
+        samples, background = renderer.samples(camera), renderer.background
         return TimedImage(rgb.float(), alpha.float(), background, samples, seconds, evaluations)
 
     def motion(self, camera: Camera, first: TimedImage, scale: float = 1.0) -> list[Image]:
         """Frames, clamped to [0, 1], whose content moves by 1/4 px of the image that is `scale` times as large.
 
+        Of a scene in time they are the next frames instead, up to its last.
+
         first: the render of `camera` itself.
         """
         steps = [step / scale / SHIFT_STEPS for step in range(1, SHIFT_STEPS)]
-        views = (replace(camera, cx=camera.cx + step, cy=camera.cy + step) for step in steps)
+        views = [replace(camera, cx=camera.cx + step, cy=camera.cy + step) for step in steps]
+        if (frames := self.renderer.in_time) is not None:
+            views = [replace(camera, frame=k) for k in range(len(frames))[camera.frame + 1 :][: len(views)]]
         return [image.rgb.clamp(0, 1) for image in (first, *map(self, views))]
 
 

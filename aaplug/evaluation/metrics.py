@@ -155,7 +155,8 @@ FLICKER = Metric(
     unit="",
     ideal=1.0,
     digits=3,
-    protocol="frame-to-frame change over three steps of 1/4 px, over that of the training-size image, averaged down: "
+    protocol="frame-to-frame change over three steps of 1/4 px, or over the next three frames of a scene in time, over "
+    "that of the training-size image, averaged down: "
     "1 is motion alone; null at and above the training size",
     figure=_flicker,
 )

@@ -173,6 +173,9 @@ class ConvertOptions(WritingOptions, ViewOptions):
     """Without --for: variance to fuse, in px² at the training rate (default: 0.2)."""
 
 
+IN_TIME = (RenderOptions, VideoOptions, EvaluateOptions, ConvertOptions)  # of the verbs that take a scene in time
+
+
 @dataclass(frozen=True, kw_only=True)
 class MergeOptions(WritingOptions, FrameOptions):
     """Where each scene goes, and by which rule the file is to be drawn."""

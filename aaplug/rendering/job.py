@@ -23,7 +23,7 @@ from aaplug.core.training import TrainingViews
 from aaplug.io.atomic import AnyPath, writing
 from aaplug.io.cameras import read_cameras, select_views
 from aaplug.io.limits import lack_of_memory
-from aaplug.io.scenes import SceneLike, scene_of
+from aaplug.io.scenes import SceneLike, scene_of, still_scene_of
 from aaplug.io.scenes.harmonics import without_harmonics
 from aaplug.io.scenes.scene import Scene
 from aaplug.methods import RECIPES
@@ -31,7 +31,7 @@ from aaplug.methods.recipe import Recipe
 from aaplug.methods.recipes import find_recipe, suited
 from aaplug.options.base import Options
 from aaplug.options.shared import Orbit, RecipeOptions, ViewOptions
-from aaplug.options.verbs import ALL
+from aaplug.options.verbs import ALL, IN_TIME
 from aaplug.rasterizers.choice import find_rasterizer
 from aaplug.rendering.agreement import agreement, settled
 from aaplug.rendering.assumed import cameras_around, say_assumed
@@ -72,7 +72,7 @@ class Job(Generic[O_co]):
         Raises:
             AaplugError: a file cannot be read, or there is nothing to look at.
         """
-        opened = scene_of(scene)
+        opened = scene_of(scene) if isinstance(options, IN_TIME) else still_scene_of(scene)
         if cameras is None:
             cameras = opened.cameras or Orbit()
         if isinstance(cameras, Orbit):
@@ -93,8 +93,13 @@ class Job(Generic[O_co]):
 
     @cached_property
     def views(self: "Job[ViewOptions]") -> tuple[Camera, ...]:
-        """The views that the options name."""
-        return select_views(self.cameras, self.options.views)
+        """The views that the options name; of a scene in time, each at every frame."""
+        views = select_views(self.cameras, self.options.views)
+        return views if self.scene.frames is None else self.scene.frames.at_each(views)
+
+    def along(self, path: Sequence[Camera]) -> Sequence[Camera]:
+        """The cameras of a path, during which a scene in time passes once."""
+        return path if self.scene.frames is None else self.scene.frames.along(path)
 
     def look(self: "Job[ViewOptions]", frames: int | None, *, gradients: bool = False, check: bool = True) -> Renderer:
         """The scene as training showed it, with the background and rasterizer that the options ask for.
@@ -134,7 +139,8 @@ class Job(Generic[O_co]):
         """The training views of a scene; raises FrameError as `TrainingViews.of`."""
         options = self.options
         gaussians, _ = without_harmonics(scene)
-        return TrainingViews.of(gaussians, self.cameras, options.cull_margin, options.min_seen)
+        training = TrainingViews.of(gaussians, self.cameras, options.cull_margin, options.min_seen)
+        return training if scene.frames is None else scene.frames.over_all(training)
 
     def recipe(self: "Job[RecipeOptions]", recipe: str | Recipe) -> Recipe:
         """A recipe as it is, or by name as the options say; the rate reference goes to those that compare rates."""

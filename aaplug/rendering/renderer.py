@@ -39,6 +39,7 @@ from aaplug.io.cameras import read_cameras
 from aaplug.io.images import colour_of
 from aaplug.io.limits import lack_of_memory
 from aaplug.io.scenes import SceneLike, scene_of
+from aaplug.io.scenes.frames import SceneFrames
 from aaplug.io.scenes.harmonics import without_harmonics
 from aaplug.io.scenes.scene import Scene
 from aaplug.methods.filters.smoothing import fuse_stored
@@ -80,6 +81,7 @@ class Renderer:
     harmonics: reads those of the Gaussians from start up to stop, where `scene.sh` does not hold them; else None.
     cutter: picks what a view draws where `scene` has several levels of detail; else None.
     source: the scene as it is stored, from which `by` and `trained_at` prepare it anew; None in other processes.
+    in_time: the frames of a scene in time, of which `scene` is the first; else None.
     """
 
     scene: Gaussians
@@ -90,7 +92,9 @@ class Renderer:
     harmonics: Harmonics | None = None
     cutter: Cutter | None = None
     source: Scene | None = field(default=None, repr=False)
+    in_time: SceneFrames | None = None
     _rates: dict[tuple[object, ...], float] = field(default_factory=dict, init=False, repr=False)
+    _open: dict[int, "Renderer"] = field(default_factory=dict, init=False, repr=False)  # of the last frame drawn
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -137,6 +141,7 @@ class Renderer:
         gaussians, harmonics = (pyramid.scene, None) if pyramid else without_harmonics(source)
         if not isinstance(cameras, TrainingViews):
             training = TrainingViews.of(gaussians, cameras, cull_margin, min_seen)
+            training = source.frames.over_all(training) if source.frames else training
         elif len(cameras.bounds.views) == len(gaussians):
             training = cameras
         else:  # of other levels of detail
@@ -147,7 +152,7 @@ class Renderer:
         colour = background_colour(background, cameras)
         cutter = Cutter.of(pyramid, training) if pyramid else None
         filtered = _filtered(gaussians, training, recipe)
-        return cls(filtered, training, recipe, rasterizer, colour, harmonics, cutter, source)
+        return cls(filtered, training, recipe, rasterizer, colour, harmonics, cutter, source, source.frames)
 
     @contract
     def by(self, recipe: Recipe) -> "Renderer":
@@ -183,6 +188,28 @@ class Renderer:
         return replace(self, scene=replace(self.scene, origin=origin), source=None)
 
     @contract
+    def at(self, frame: int) -> "Renderer":
+        """The renderer of one frame of a scene in time, by its place from 0; itself for any other scene.
+
+        Raises:
+            UsageError: there is no such frame, or it holds another number of Gaussians than the others.
+        """
+        if self.in_time is None or frame == 0:
+            return self
+        if frame >= len(self.in_time):
+            raise UsageError("frame", f"expected one of 0 to {len(self.in_time) - 1}, got {frame}")
+        if frame not in self._open:
+            self._open.clear()
+            gaussians, harmonics = without_harmonics(self.in_time.open(self.in_time.paths[frame]))
+            training = self.in_time.training_of(gaussians, self.training)
+            if len(gaussians) != len(training.bounds.views):
+                training.also(gaussians)  # refuses it
+            filtered = _filtered(gaussians, training, self.recipe)
+            changes = {"scene": filtered, "training": training, "harmonics": harmonics}
+            self._open[frame] = replace(self, **changes, source=None, in_time=None)
+        return self._open[frame]
+
+    @contract
     def __call__(self, camera: Camera) -> Render:
         """Render one view: rgb and alpha of `camera.hw`.
 
@@ -192,7 +219,8 @@ class Renderer:
             UsageError: a Gaussian in view has a colour that is NaN or infinite, or memory does not suffice.
         """
         with within_memory(f"view {camera.name} at {camera.width}x{camera.height}"):
-            return self.draw(camera).render if camera.exposure is None else self.exposed(camera)
+            now = self.at(camera.frame)
+            return now.draw(camera).render if camera.exposure is None else now.exposed(camera)
 
     @contract
     @on_free_cores()
@@ -210,6 +238,8 @@ class Renderer:
     @on_free_cores()
     def draw(self, camera: Camera) -> Drawing:
         """Render one view and keep its splats, for example to read their gradients."""
+        if (now := self.at(camera.frame)) is not self:
+            return now.draw(camera)
         samples, weight = self.sampling(camera)
         fine = self._fine(camera, samples)
         splats = self.splats(fine, samples)
@@ -245,6 +275,8 @@ class Renderer:
         for name in names:
             if name not in PASSES:
                 raise UsageError("passes", not_one_of(name, PASSES) + did_you_mean(name, PASSES))
+        if (now := self.at(camera.frame)) is not self:
+            return now.passes(camera, names, normal_axes)
         if {*names} <= {"rgb", "alpha"}:
             image = self(camera)._asdict()
             return {name: image[name] for name in names}

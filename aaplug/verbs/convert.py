@@ -1,5 +1,6 @@
 """Conversion: a plain scene file that anti-aliased viewers show right."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -10,8 +11,9 @@ from aaplug.core.training import TrainingViews
 from aaplug.evaluation.results import Report, results
 from aaplug.evaluation.survey import check_frame_of
 from aaplug.finetuning.fitting import fit, steps_for
-from aaplug.io.atomic import AnyPath
+from aaplug.io.atomic import AnyPath, refuse_existing
 from aaplug.io.scenes import SceneLike, check_scene_output, write_parts, write_scene
+from aaplug.io.scenes.frames import SceneFrames
 from aaplug.methods import FORMS
 from aaplug.methods.conversion import MATCHED_ENERGY, Form, blurring, fuse
 from aaplug.methods.viewers import MIP_VIEWER, Viewer, find_viewer
@@ -28,7 +30,7 @@ class Converted:
     """A converted scene.
 
     gaussians: their number.
-    scene: None if it was large and went to the output in parts.
+    scene: None if it went to the output in parts, being large, or frame by frame.
     viewer: whose rule draws it.
     report: the original, the closed form and the result as the viewer shows them; None unless a viewer was named.
     """
@@ -56,9 +58,9 @@ def convert(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opti
     Files of more than a million Gaussians are converted to `output` in parts, unless a viewer is named.
 
     Args:
-        scene: see `render`.
+        scene: see `render`; of a scene in time every frame is converted.
         cameras: see `render`; not needed where the scene stores a 3D filter.
-        output: file to write, of a format that can be written; None writes none.
+        output: file to write, of a format that can be written, or a folder for frames; None writes none.
 
     Raises:
         AaplugError: as `render`; also, something is fused already.
@@ -68,9 +70,14 @@ def convert(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opti
     job = Job.of(scene, cameras, options)
     viewer = rule if isinstance(rule, Viewer) else MIP_VIEWER
     files = {"overwrite": options.overwrite, **viewer.spz(options.spz_axes)}
+    frames = job.scene.frames
+    outputs = [path / file.name for file in frames.paths] if path and frames else []
     check = partial(check_scene_output, path, options.overwrite, job.scene.files) if path else lambda: None
+    check = partial(refuse_existing, outputs, options.overwrite) if outputs else check
     check()
-    with running(options, path, check, job.inputs) as workers:
+    with running(options, path, check, job.inputs, folder=frames is not None) as workers:
+        if frames is not None:
+            return _converted_frames(job, rule, frames, outputs, files)
         if path and job.scene.path and job.scene.count > LARGE_SCENE and isinstance(rule, Form):
             return _converted_in_parts(job, rule, path, workers.threads, files)
         result = _closed_form(job, rule) if isinstance(rule, Form) else _fitted(job, rule)
@@ -102,6 +109,25 @@ def _closed_form(job: Job[ConvertOptions], form: Form) -> Converted:
         job.say_assumed(own_look(gaussians, training))
     fused = fuse(gaussians, training, form)
     return Converted(len(fused), fused, MIP_VIEWER)
+
+
+def _converted_frames(
+    job: Job[ConvertOptions], rule: Form | Viewer, frames: SceneFrames, outputs: Sequence[Path], files: Any
+) -> Converted:
+    """The closed form of a scene in time, frame by frame."""
+    if isinstance(rule, Viewer) or not outputs:
+        what = "fits each frame alone, which flickers: leave it out" if outputs else "of frames is a folder: name one"
+        raise UsageError("viewer" if outputs else "output", what)
+    job.say_assumed()
+    training, count = job.training(job.scene), 0
+    with job.monitor.progress("converting", "frames") as tell:
+        for done, (frame, output) in enumerate(zip(frames, outputs, strict=True), start=1):
+            gaussians = frame.gaussians()
+            fused = fuse(gaussians, frames.training_of(gaussians, training), rule)
+            write_scene(output, fused, **files)
+            count += len(fused)
+            tell(done, len(frames))
+    return Converted(count, None, MIP_VIEWER)
 
 
 def _converted_in_parts(job: Job[ConvertOptions], form: Form, path: Path, threads: int, files: Any) -> Converted:

@@ -32,7 +32,7 @@ def evaluate(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
     """Measure recipes at several scales.
 
     Args:
-        scene: see `render`.
+        scene: see `render`; of a scene in time each view counts at every frame, without its photograph.
         cameras: see `render`.
         output: folder for results.json, per_view.json and results.csv; None writes nothing.
 

@@ -32,7 +32,8 @@ def render(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, optio
     """Render views at any resolution to image files.
 
     Args:
-        scene: a scene, its Gaussians, or the path of its file or folder.
+        scene: a scene, its Gaussians, or the path of its file or folder; of a scene in time each view is drawn at every
+            frame, and a path shows it once.
         cameras: a camera set, its file or folder; or None for those of the scene's model folder, or without one for
             an orbit around the scene; or an `Orbit` of your own.
         output: a folder (None: "images"), or one image file for one view.
@@ -49,7 +50,7 @@ def render(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, optio
     views, ends = (seen(job, each, unsized) for each in (file.cameras if file else job.views, ends))
     each_end = eyes_of(ends, options) if ends else [()] * len(eyes_of(views, options))
     eyes = [
-        filmed(eye, options, file is not None, file and file.shutter, end)
+        filmed(job.along(eye) if file else eye, options, file is not None, file and file.shutter, end)
         for eye, end in zip(eyes_of(views, options), each_end, strict=True)
     ]
     views = [view for both in zip(*eyes, strict=True) for view in both]

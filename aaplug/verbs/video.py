@@ -51,7 +51,7 @@ def video(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, option
     """Render a camera path to a video, or to a sequence of image files.
 
     Args:
-        scene: see `render`.
+        scene: see `render`; a scene in time passes once.
         cameras: see `render`.
         output: a .webm file (VP9), or .mp4 (H.264); None: "video.webm"; or a sequence, frame.####.exr, or with `format`
             a folder for one.
@@ -82,7 +82,7 @@ def video(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, option
     if len({view.hw for view in views}) > 1:
         sizes = listing([f"{view.width}x{view.height}" for view in views], most=3)
         raise UsageError("path", f"has frames of different sizes ({sizes} px); give `resolution`")
-    eyes = [filmed(eye, options, True, file and file.shutter) for eye in eyes_of(views, options)]
+    eyes = [filmed(job.along(eye), options, True, file and file.shutter) for eye in eyes_of(views, options)]
     views = eyes[0]
     if sequence is not None:
         sequence = replace(sequence, count=len(views))

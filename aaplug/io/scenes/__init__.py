@@ -10,6 +10,7 @@ import importlib.util
 import re
 from collections.abc import Iterable
 from dataclasses import replace
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -19,6 +20,7 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.core.pyramids import Pyramid
 from aaplug.io.atomic import check_output
 from aaplug.io.scenes import compressed_ply, gltf, ksplat, ply, pt, sog, splat, spz, usd
+from aaplug.io.scenes.frames import SceneFrames, frame_files
 from aaplug.io.scenes.options import SceneFileOptions
 from aaplug.io.scenes.pyramid_folder import MANIFEST, is_pyramid, path_of, read_manifest, read_pyramid
 from aaplug.io.scenes.scene import MODEL_SCENE, SOG_FOLDER, Scene, described_faults, faults_of, library_errors
@@ -95,6 +97,15 @@ def scene_of(scene: SceneLike) -> Scene:
     return Scene.in_memory(scene) if isinstance(scene, Gaussians | Pyramid) else read_scene(scene)
 
 
+def still_scene_of(scene: SceneLike) -> Scene:
+    """The same, but for a scene in time, which it refuses with a UsageError."""
+    opened = scene_of(scene)
+    if opened.frames is not None:
+        takers = "render, video, evaluate and convert take it whole; here, name one of its files"
+        raise UsageError(str(opened.folder), f"is a scene in time, of {len(opened.frames)} frames: {takers}")
+    return opened
+
+
 @contract
 def read_scene(
     path: str | PathLike[str],
@@ -104,8 +115,9 @@ def read_scene(
     drop_bad: bool = False,
     allow_checkpoint: bool = False,
     spz_axes: SpzAxes = "auto",
+    frames_apart: bool = False,
 ) -> Scene:
-    """Open a scene: a file, or a folder of an INRIA model, of SOG images or of levels of detail.
+    """Open a scene: a file, or a folder of an INRIA model, of SOG images, of levels of detail or of frames.
 
     Its Gaussians are read when they are first asked for: `read_scene("scene.ply").gaussians()`.
 
@@ -118,14 +130,17 @@ def read_scene(
         allow_checkpoint: open a .pt too, a pickle, of which only tensors are read.
         spz_axes: of a .spz: "opengl" by its specification, "opencv" as splat-transform and gsply write them; "auto" is
             the first, with the second as `Scene.other`.
+        frames_apart: the frames of a scene in time were trained apart: no Gaussian of one is in another.
 
     Raises:
         FormatError: the file is missing, of no known format, or breaks its format.
     """
     options = SceneFileOptions(allow_checkpoint, spz_axes)
     with library_errors(Path(path)):
-        folder, manifest = (Path(path), read_manifest(path)) if is_pyramid(path) else (None, None)
-        path = find_scene(path, iteration)
+        given, manifest = Path(path), read_manifest(path) if is_pyramid(path) else None
+        path = find_scene(given, iteration)
+        in_time = manifest is None and path.parent == given and path.name != SOG_FOLDER
+        numbered = frame_files(given) if in_time else {}
     head = read_start(path, HEAD_BYTES)
     if not head:
         raise FormatError(path, "is empty")
@@ -135,7 +150,14 @@ def read_scene(
         known = ", ".join("." + format.name for format in formats)
         raise FormatError(path, f"is of no known scene format; aaplug reads {known}")
     scene = replace(format.open_scene(path, options), drop_bad=drop_bad)
-    if folder is not None and manifest is not None:
+    if numbered:
+        reading = partial(read_scene, convention=convention, drop_bad=drop_bad)
+        frames = SceneFrames((*numbered,), (*numbered.values(),), reading, frames_apart)
+        frames.check()
+        notes = (*scene.notes, f"the first of {len(frames)} frames, to {frames.paths[-1].name}")
+        scene = replace(scene, folder=given, frames=frames, others=frames.paths[1:], notes=notes)
+    if manifest is not None:
+        folder = given
         others = (folder / MANIFEST, *(folder / level.file for level in manifest.levels[1:]))
         notes = (*scene.notes, manifest.described)
         scene = replace(scene, folder=folder, read_levels=read_pyramid, others=others, notes=notes)
@@ -223,8 +245,8 @@ def check_scene_output(
 def find_scene(path: str | PathLike[str], iteration: int | None = None) -> Path:
     """The scene file that a path means.
 
-    A file means itself.  A folder means the last (or the given) iteration of an INRIA model, its SOG images, or the
-    finest of its levels of detail.
+    A file means itself.  A folder means the last (or the given) iteration of an INRIA model, its SOG images, the finest
+    of its levels of detail, or the first of its frames.
     Raises FormatError if the folder holds no scene, or not that iteration.
     """
     path = Path(path)
@@ -236,6 +258,8 @@ def find_scene(path: str | PathLike[str], iteration: int | None = None) -> Path:
     scenes = {int(match[1]): file for file in files if (match := pattern.fullmatch(file.parent.name))}
     if not scenes and (path / SOG_FOLDER).is_file():
         return path / SOG_FOLDER
+    if not scenes and (frames := frame_files(path)):
+        return path / next(iter(frames)).name
     if not scenes:
         raise FormatError(path, "holds no point_cloud/iteration_<N>/point_cloud.ply; name the scene's file")
     chosen = max(scenes) if iteration is None else iteration

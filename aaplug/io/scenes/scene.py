@@ -23,7 +23,9 @@ from aaplug.core.pyramids import Pyramid
 from aaplug.core.spherical_harmonics import COLOUR_OFFSET, SH_C0
 from aaplug.io.cameras import holds_cameras, read_cameras
 from aaplug.io.limits import lack_of_memory, whole_limit
+from aaplug.io.scenes.frames import SceneFrames
 from aaplug.system.contracts import contract
+from aaplug.system.digests import digest_of_values
 from aaplug.system.errors import AaplugError, FormatError, UsageError, listing, reason
 
 MODEL_SCENE = "point_cloud/iteration_*/point_cloud.ply"  # in an INRIA model folder
@@ -57,8 +59,9 @@ class Scene:
     flat: see `Gaussians`.
     notes: facts worth printing about how the file was understood, a line each.
     other: the same file read in another way, where it does not say which is right; its last note says how.
-    folder: of the levels of detail whose finest this is; else None.  read_levels: reads all of them.
-    others: further files that hold it: other levels of detail, images of SOG.
+    folder: of the levels of detail whose finest this is, or of the frames; else None.  read_levels: reads all levels.
+    frames: of a scene in time, of which this is the first; else None.
+    others: further files that hold it: other levels of detail or frames, images of SOG.
     drop_bad: rows that cannot be used are left out, instead of raising FormatError.
     memory: what was read of it, by name: each part is read once.
     """
@@ -77,6 +80,7 @@ class Scene:
     other: "Scene | None" = None
     folder: Path | None = None
     read_levels: Callable[[Path], Pyramid] | None = None
+    frames: SceneFrames | None = None
     others: tuple[Path, ...] = ()
     drop_bad: bool = False
     memory: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
@@ -128,7 +132,7 @@ class Scene:
 
     @property
     def file(self) -> Path | None:
-        """The file that it was read from, or its folder of levels of detail; None if it has none."""
+        """The file that it was read from, or its folder of levels of detail or frames; None if it has none."""
         path = self.folder or self.source
         return None if path is None else path.resolve()
 
@@ -186,7 +190,9 @@ class Scene:
 
     @property
     def digest(self) -> str:
-        """Hash of the Gaussians of all levels, with everything that they are drawn by."""
+        """Hash of the Gaussians of all levels or frames, with everything that they are drawn by."""
+        if self.frames is not None:
+            return digest_of_values([frame.digest for frame in self.frames])
         return digest_of_scene(self.gaussians() if self.levels is None else self.levels.scene)
 
     def raw(self, start: int, stop: int) -> Gaussians:

@@ -1,0 +1,152 @@
+"""A scene in time: a folder of numbered files, drawn with sampling bounds over all frames."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+import aaplug
+from aaplug.core.cameras import CameraSet
+from aaplug.core.conventions import MIP
+from aaplug.core.sampling import sampling_bounds
+from aaplug.io.images import read_image
+from aaplug.io.scenes import read_scene, write_scene
+from aaplug.rendering.renderer import Renderer
+from aaplug.system.errors import FormatError, UsageError
+from tests.bench.sequences import turning, write_sequence
+from tests.conftest import make_camera, make_scene
+
+FAR = make_camera((0.0, -4.0, 0.3), (24, 18), name="far")
+NEAR = replace(make_camera((0.0, -1.5, 0.0), (24, 18), name="near"), fx=90.0, fy=90.0)  # sees but a part
+CAMERAS = CameraSet((FAR, NEAR), (FAR,))
+COUNT = 3
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "in").mkdir()
+    return write_sequence(tmp_path / "in", make_scene(40), COUNT)
+
+
+def test_each_frame_is_drawn_as_its_file_alone_at_the_training_size(folder):
+    renderer = Renderer.of(folder, CAMERAS, "auto", rasterizer="eager")
+    for k, frame in enumerate(turning(make_scene(40), COUNT)):
+        alone = Renderer.of(frame, CAMERAS, "auto", rasterizer="eager")
+        assert renderer(replace(FAR, frame=k)).rgb.equal(alone(FAR).rgb)
+        assert renderer.passes(replace(FAR, frame=k), ["depth"])["depth"].equal(alone.passes(FAR, ["depth"])["depth"])
+    with pytest.raises(UsageError, match="expected one of 0 to 2, got 3"):
+        renderer(replace(FAR, frame=3))
+
+
+def test_rates_are_those_over_all_frames_unless_they_were_trained_apart(folder):
+    together, apart = (
+        Renderer.of(read_scene(folder, frames_apart=flag), CAMERAS, "mip-splatting", rasterizer="eager")
+        for flag in (False, True)
+    )
+    rates = [sampling_bounds(frame.means, CAMERAS.train) for frame in turning(make_scene(40), COUNT)]
+    bounds = together.training.bounds
+    assert bounds.highest.allclose(torch.stack([r.highest for r in rates]).amax(dim=0))
+    lowest = torch.stack([torch.where(r.seen, r.lowest, torch.inf) for r in rates]).amin(dim=0)
+    assert bounds.lowest.allclose(torch.where(bounds.seen, lowest, 0.0))
+    assert bounds.views.equal(torch.stack([r.views for r in rates]).sum(dim=0).int())
+    assert together.at(2).training is together.training
+    assert apart.at(2).training.bounds.highest.allclose(rates[2].highest)
+    growth = [r.at(2).scene.scales / r.scene.scales for r in (together, apart)]
+    assert growth[0].std() < growth[1].std()  # a close-up no longer pumps the filter
+
+
+def test_every_verb_that_takes_a_scene_in_time_takes_all_frames(folder, tmp_path):
+    scene = read_scene(folder)
+    assert scene.cameras is None
+    assert scene.title == "in"
+    assert len(scene.files) == COUNT
+    written = aaplug.render(folder, CAMERAS, tmp_path / "images", rasterizer="eager")
+    assert [image.file.name for image in written] == ["far-0001.png", "far-0002.png", "far-0003.png"]
+    images = [read_image(image.file, None) for image in written]
+    assert not images[0].equal(images[2])
+    how = {"path": "orbit", "seconds": 0.2, "rasterizer": "eager", "recipe": "classic"}
+    clip = aaplug.video(folder, CAMERAS, tmp_path / "clip" / "f.#.png", **how)
+    assert clip.frames == 6
+    path = [tmp_path / "clip" / f"f.{number}.png" for number in range(1, 7)]
+    still = aaplug.video(next(iter(turning(make_scene(40), 1))), CAMERAS, tmp_path / "still" / "f.#.png", **how)
+    same = [file.read_bytes() == (still.file.parent / file.name).read_bytes() for file in path]
+    assert same == [True, True, False, False, False, False]
+    report = aaplug.evaluate(folder, CAMERAS, recipe="matched", scale=[0.5], metric=("psnr", "flicker"))
+    assert [m.view for m in report.measurements if m.recipe == "matched"] == ["far-0001", "far-0002", "far-0003"]
+    converted = aaplug.convert(folder, CAMERAS, tmp_path / "out")
+    assert converted.gaussians == COUNT * 40
+    again = read_scene(tmp_path / "out")
+    assert again.convention.name == "mip"
+    assert len(again.frames or ()) == COUNT
+    assert scene.digest != again.digest
+
+
+def test_flicker_of_a_still_scene_in_time_is_undefined(tmp_path):
+    for number in (1, 2):
+        write_scene(tmp_path / f"{number}.ply", make_scene(40))
+    report = aaplug.evaluate(tmp_path, CAMERAS, recipe="matched", scale=[0.5], metric="flicker", views="far")
+    assert {m.values["flicker"] for m in report.measurements} == {None}
+
+
+def gap(folder):
+    (folder / "frame_0002.ply").unlink()
+
+
+def twice(folder):
+    (folder / "frame_002.ply").write_bytes((folder / "frame_0002.ply").read_bytes())
+
+
+def two(folder):
+    for number in (1, 2):
+        write_scene(folder / f"other{number}.ply", make_scene(3))
+
+
+def fewer(folder):
+    write_scene(folder / "frame_0002.ply", make_scene(39), overwrite=True)
+
+
+def degree(folder):
+    write_scene(folder / "frame_0003.ply", replace(make_scene(40), sh=make_scene(40).sh[:, :1]), overwrite=True)
+
+
+def convention(folder):
+    write_scene(folder / "frame_0003.ply", replace(make_scene(40), convention=MIP), overwrite=True)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (gap, "in: its frames frame_0001.ply to frame_0003.ply lack 2; or name one"),
+        (twice, "have a number twice"),
+        (two, "holds frames of 2 sequences (frame_####.ply, other####.ply)"),
+        (fewer, "frame_0002.ply: expected the number of Gaussians of frame_0001.ply, 40, got 39; pass `frames_apart`"),
+        (degree, "frame_0003.ply: expected the degree of harmonics of frame_0001.ply, "),
+        (convention, "frame_0003.ply: expected the convention of frame_0001.ply, classic, got mip"),
+    ],
+)
+def test_what_is_no_sequence_is_refused(folder, spoil, message):
+    spoil(folder)
+    with pytest.raises(FormatError) as caught:
+        read_scene(folder)
+    assert message in str(caught.value)
+    if spoil is fewer:
+        assert (
+            Renderer.of(read_scene(folder, frames_apart=True), CAMERAS, "auto")(replace(FAR, frame=1))
+            .rgb.isfinite()
+            .all()
+        )
+
+
+@pytest.mark.parametrize(
+    "verb", [aaplug.lod, aaplug.finetune, aaplug.info, lambda *inputs: aaplug.merge([*inputs[:1]])]
+)
+def test_other_verbs_refuse_a_scene_in_time(folder, verb):
+    with pytest.raises(UsageError, match="is a scene in time, of 3 frames: render, video, evaluate and convert"):
+        verb(folder, CAMERAS)
+
+
+def test_conversion_of_frames_needs_a_folder_and_no_fit(folder, tmp_path):
+    with pytest.raises(UsageError, match="output: of frames is a folder"):
+        aaplug.convert(folder, CAMERAS)
+    with pytest.raises(UsageError, match="viewer: fits each frame alone, which flickers"):
+        aaplug.convert(folder, CAMERAS, tmp_path / "out", viewer="spark")
