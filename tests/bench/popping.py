@@ -1,0 +1,169 @@
+"""Popping: what changes from frame to frame of a turn beyond the motion, by the order in which splats are composited.
+
+Frames are 1° of an orbit apart.  Their FLIP is compared with that of a truth, which sorts the splats of each pixel by
+their depth along its ray and takes 16 samples per pixel; what is above the truth's is popping.  Orders: by the depth of
+centres, as 3DGS; by that along the ray of the middle of a tile; the same with runs of `WINDOW` splats sorted again in
+each pixel (after StopThePop, Radl et al. 2024, arXiv 2402.00525); and by the depth along each pixel's ray.
+
+Under EWA's linear projection a Gaussian's depth, given the pixel, has the mean z + cᵀ C⁻¹ d, with c the covariance of
+depth and pixel, C that of the splat and d the offset from its centre.  `share` multiplies the second term: 0 is 3DGS.
+"""
+
+import time
+from dataclasses import replace
+from statistics import mean
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from aaplug.core.camera_paths import orbit, up_of
+from aaplug.core.cameras import Camera
+from aaplug.core.colours import Colour
+from aaplug.core.imaging import resampled
+from aaplug.core.kernels import EAGER
+from aaplug.core.projection import rotation_matrices
+from aaplug.core.rules import RULES_3DGS
+from aaplug.core.splats import Splats2D
+from aaplug.evaluation.metrics import flip
+from aaplug.evaluation.protocols import median_depth
+from aaplug.io.photographs import photo_at
+from aaplug.methods.pixel_kernels.raster_rows import TILE, tile_centres
+from aaplug.rasterizers.tiled.binning import bands
+from aaplug.rendering.renderer import Renderer
+from tests.bench import heading, row
+from tests.bench.scenes import decibels, trained
+
+DEGREES = 1.0  # of the orbit from frame to frame
+FRAMES = 3
+TRUTH_SAMPLES = 4  # along a pixel's side
+WINDOW = 8  # splats that a pixel sorts again
+VALUES_AT_ONCE = 6_000_000  # alphas held at once
+BEHIND = 1e9  # depth of what a tile does not draw
+CASES = (
+    ("centre", 0.0),
+    *(("tile", share) for share in (0.1, 0.2, 0.3, 1.0)),
+    *((kind, share) for share in (0.2, 1.0) for kind in ("window", "pixel")),
+)
+
+
+@torch.no_grad()
+def main(scene: str = "chair", size: int = 128, photographs: int = 2) -> None:
+    """Print popping, PSNR against photographs and seconds, of the middle of so many px a side."""
+    opened = trained(scene)
+    renderer, background = opened.renderer("matched", rasterizer="eager"), opened.checkpoint.background
+    view, up = opened.views(1)[0], up_of(opened.cameras)
+    depth = median_depth(opened.scene.means, view)
+    turns = [orbit(view, frame * DEGREES / 360, depth, up) for frame in range(FRAMES)]
+    frames = [_middle(replace(turn, trained_focal=view.trained_focal), size) for turn in turns]
+    truth = [
+        resampled(
+            composited(renderer, f.resized(size * TRUTH_SAMPLES, size * TRUTH_SAMPLES), "pixel", 1.0, background),
+            1 / TRUTH_SAMPLES,
+            (size, size),
+        )
+        for f in frames
+    ]
+    pairs = [(i, i + 1) for i in range(FRAMES - 1)]
+    motion = mean(flip(truth[a], truth[b]) or 0.0 for a, b in pairs)
+    seen = [_middle(v, size) for v in opened.views(photographs)]
+    photos = [photo_at(v, v, background) for v in opened.views(photographs)]
+    photos = [photo[_start(len(photo), size) :, _start(photo.shape[1], size) :][:size, :size] for photo in photos]
+    heading(f"{scene}, FLIP of the truth's motion: {motion:.4f}", "order", "share", "popping", "PSNR, dB", "s a frame")
+    for kind, share in CASES:
+        started = time.perf_counter()
+        images = [composited(renderer, frame, kind, share, background) for frame in frames]
+        seconds = (time.perf_counter() - started) / FRAMES
+        popping = mean(flip(images[a], images[b]) or 0.0 for a, b in pairs) - motion
+        close = mean(
+            decibels(composited(renderer, camera, kind, share, background).clamp(0, 1), photo)
+            for camera, photo in zip(seen, photos, strict=True)
+        )
+        row(kind, share, f"{popping:.5f}", close, seconds)
+
+
+def depth_gradients(renderer: Renderer, splats: Splats2D, camera: Camera) -> Float[Tensor, "m 2"]:
+    """Change of each Gaussian's depth along a pixel's ray, in world units per px right and down: C⁻¹ c."""
+    scene, turn = renderer.scene[splats.sources], camera.cam_from_world[:3, :3]
+    root = turn.float() @ rotation_matrices(scene.unit_quats) * scene.scales[:, None, :]
+    x, y, z = ((scene.means.double() - camera.centre) @ turn.T).float().unbind(dim=1)
+    right = (camera.fx / z)[:, None] * (root[:, 0] - (x / z)[:, None] * root[:, 2])
+    down = (camera.fy / z)[:, None] * (root[:, 1] - (y / z)[:, None] * root[:, 2])
+    c_x, c_y = ((across * root[:, 2]).sum(dim=1) for across in (right, down))
+    xx, xy, yy = splats.covs.unbind(dim=1)
+    return torch.stack([yy * c_x - xy * c_y, xx * c_y - xy * c_x], dim=1) / splats.dets[:, None]
+
+
+def composited(
+    renderer: Renderer, camera: Camera, kind: str, share: float, background: Colour
+) -> Float[Tensor, "h w 3"]:
+    """A view with splats composited in one of the orders."""
+    splats = renderer.splats(camera)
+    gradients, grid = (
+        share * depth_gradients(renderer, splats, camera),
+        (-(-camera.height // TILE), -(-camera.width // TILE)),
+    )
+    places = torch.stack(tile_centres(splats.means), dim=1)
+    image = splats.means.new_tensor(background).expand(grid[0] * grid[1], TILE * TILE, 3).clone()
+    done = 0
+    for bins in bands(splats, grid, EAGER):
+        left = torch.argsort(bins.counts, descending=True)[: int((bins.counts > 0).sum())]
+        while len(left):
+            longest = int(bins.counts[left[0]])
+            tiles, left = left.tensor_split([max(1, VALUES_AT_ONCE // (longest * TILE * TILE))])
+            k = torch.arange(longest)
+            drawn = k < bins.counts[tiles, None]
+            ids = bins.splats[(bins.first[tiles, None] + k).clamp(max=len(bins.splats) - 1)].long()
+            if kind != "centre":
+                middle = bins.origins[tiles, None] + TILE / 2 - splats.means[ids]
+                depths = splats.depths[ids] + (gradients[ids] * middle).sum(dim=2)
+                order = depths.masked_fill(~drawn, BEHIND).argsort(dim=1, stable=True)
+                ids, drawn = ids.gather(1, order), drawn.gather(1, order)
+            offsets = bins.origins[tiles, None, None] + places - splats.means[ids][:, :, None]
+            alpha = torch.where(drawn[..., None], alphas(splats, ids, offsets), 0.0)
+            ids = ids[..., None].expand_as(alpha)
+            if kind in ("window", "pixel"):
+                depths = splats.depths[ids] + (gradients[ids[..., 0]][:, :, None] * offsets).sum(dim=3)
+                alpha, ids = sorted_again(alpha, ids, depths, longest if kind == "pixel" else WINDOW)
+            light = torch.cumprod(1 - alpha, dim=1)
+            weights = alpha * torch.cat([torch.ones_like(light[:, :1]), light[:, :-1]], dim=1)
+            weights = torch.where(light >= RULES_3DGS.min_transmittance, weights, 0.0)
+            assert splats.rgb is not None
+            colours = torch.stack([(weights * channel[ids]).sum(dim=1) for channel in splats.rgb.T], dim=2)
+            image[tiles + done] = colours + (1 - weights.sum(dim=1))[..., None] * image.new_tensor(background)
+        done += len(bins.counts)
+    whole = image.unflatten(1, (TILE, TILE)).unflatten(0, grid).transpose(1, 2).flatten(2, 3).flatten(0, 1)
+    return whole[: camera.height, : camera.width]
+
+
+def alphas(splats: Splats2D, ids: Tensor, offsets: Float[Tensor, "t k P 2"]) -> Float[Tensor, "t k P"]:
+    """3DGS's alpha of each splat at offsets from its centre, in px."""
+    xx, xy, yy = splats.covs[ids].unbind(dim=2)
+    dx, dy = offsets.unbind(dim=3)
+    form = yy[..., None] * dx * dx - 2 * xy[..., None] * dx * dy + xx[..., None] * dy * dy
+    alpha = splats.opacities[ids][..., None] * torch.exp(-0.5 * form / splats.dets[ids][..., None])
+    return torch.where(alpha >= RULES_3DGS.min_alpha, alpha.clamp(max=RULES_3DGS.max_alpha), 0.0)
+
+
+def sorted_again(alpha: Tensor, ids: Tensor, depths: Tensor, window: int) -> tuple[Tensor, Tensor]:
+    """Alphas and splats of each pixel, those that it sees first, sorted in runs of `window`, then of shifted runs."""
+    depths = torch.where(alpha > 0, depths, torch.inf)
+    seen = (alpha == 0).byte().argsort(dim=1, stable=True)
+    alpha, ids, depths = (x.gather(1, seen) for x in (alpha, ids, depths))
+    for shift in (0, window // 2):
+        cuts = list(range(shift or window, depths.shape[1], window))
+        orders = [part.argsort(dim=1, stable=True) for part in depths.tensor_split(cuts, dim=1)]
+        starts = [0, *cuts]
+        order = torch.cat([part + start for part, start in zip(orders, starts, strict=True)], dim=1)
+        alpha, ids, depths = (x.gather(1, order) for x in (alpha, ids, depths))
+    return alpha, ids
+
+
+def _start(length: int, size: int) -> int:
+    return (length - size) // 2
+
+
+def _middle(view: Camera, size: int) -> Camera:
+    """The middle of a view."""
+    left, top = _start(view.width, size), _start(view.height, size)
+    return replace(view, width=size, height=size, cx=view.cx - left, cy=view.cy - top)
