@@ -19,7 +19,7 @@ from aaplug.methods.pixel_kernels.point import POINT
 from aaplug.methods.pixel_kernels.raster_rows import TILE
 from aaplug.rasterizers import reference
 from aaplug.rasterizers.reference import Reference
-from aaplug.rasterizers.tiled import Tiled, binning
+from aaplug.rasterizers.tiled import Tiled, binning, forward, rasterizer
 from tests.conftest import ALL_RASTERIZERS, make_splats, memory_taken, needs_peak_memory, splats_of
 
 F64 = torch.float64
@@ -186,6 +186,14 @@ def test_needles_rounded_to_float32_are_accurate():
         difference = (image.rgb - REFERENCE(exact, hw, WHITE).rgb).abs().amax(dim=2)
         worst = difference[~near_a_cutoff(exact, hw)].max().item()
         assert worst < TOLERANCE, f"{name} is {worst:.1e} off"
+
+
+def test_an_image_of_one_tile_has_as_many_tiles_as_compiled_kernels_take(monkeypatch):
+    grids = []
+    monkeypatch.setattr(rasterizer, "bands", lambda *args: grids.append(args[1]) or binning.bands(*args))
+    image = Tiled()(make_splats(20, (6, 6), 13), (6, 6), (0.0, 0.0, 0.0))
+    assert image.rgb.shape == (6, 6, 3)
+    assert grids == [(1, forward.MIN_TILES)]
 
 
 @pytest.mark.parametrize("way", [(1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1)])

@@ -1,7 +1,7 @@
 """Levels of detail against the scene they were made of: quality, milliseconds, lighter scenes.
 
-For a trained scene it makes a pyramid, kept in a folder of the working directory, and draws sizes from 1/2 to 1/32 with
-and without levels: PSNR in dB, SSIM and flicker against the scene's own look, PSNR against photographs, median
+For a trained scene it makes a pyramid, kept in a folder of the working directory, and draws the sizes of its levels
+with and without them: PSNR in dB, SSIM and flicker against the scene's own look, PSNR against photographs, median
 milliseconds, Gaussians projected and evaluations of a splat in a pixel.  Then come all levels in one scene by
 Multi-Scale 3DGS' rule, and lighter scenes beside splat-transform's `--decimate`.
 """
@@ -27,8 +27,7 @@ from tests.bench import heading, row
 from tests.bench.scenes import Trained, decibels, trained
 
 TEST_VIEWS = 5
-SCALES = (1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 32)
-LEVELS = 5
+LEVELS = 5  # of a pyramid, each for half the size of the one before
 SHARES = {1 / 4: (1 / 4, 1 / 8), 1 / 16: (1 / 8,)}  # of the Gaussians, and the scales that lighter scenes are tuned for
 RULES = ("matched", "classic")  # that lighter scenes are shown by
 VIEWER = "classic"  # of other programs: by the second rule
@@ -41,20 +40,28 @@ DECIMATED = {  # at 1/2, 1/4 and 1/8 by each of these, with @playcanvas/splat-tr
 METRICS = ("psnr", "ssim", "flicker")
 
 
-def main(scenes: Sequence[str] = ("chair", "snowmiku")) -> None:
-    """Print the tables of these scenes."""
+def main(scenes: Sequence[str] = ("chair", "snowmiku"), count: int = LEVELS, refine: bool = True) -> None:
+    """Print the tables of these scenes.
+
+    Args:
+        scenes: names of trained scenes.
+        count: number of levels.  Any other than the usual prints the table of levels alone.
+        refine: tune the levels.
+    """
     for name in scenes:
-        bench = Bench(name, trained(name))
-        levels(bench)
-        in_one(bench)
-        lighter(bench)
+        bench = Bench(name, trained(name), count)
+        levels(bench, refine)
+        if count == LEVELS:
+            in_one(bench)
+            lighter(bench)
 
 
 class Bench:
     """A scene, its look, and what test views should show."""
 
-    def __init__(self, name: str, opened: Trained):
-        self.name, self.opened = name, opened
+    def __init__(self, name: str, opened: Trained, count: int = LEVELS):
+        self.name, self.opened, self.count = name, opened, count
+        self.scales = tuple(0.5**level for level in range(1, count + 1))
         self.scene, self.cameras, self.training = opened.scene, opened.cameras, opened.training
         self.options = {"cull_margin": opened.checkpoint.cull_margin, "background": opened.checkpoint.background}
         self.look = opened.renderer("matched")
@@ -70,13 +77,13 @@ class Bench:
         """Recipe auto at all sizes."""
         views = ",".join(view.name for view in self.views)
         metrics = METRICS if truth == "self" else ("psnr",)
-        options = {"views": views, "scale": SCALES, "recipe": "auto", "quality": quality, "truth": truth}
+        options = {"views": views, "scale": self.scales, "recipe": "auto", "quality": quality, "truth": truth}
         return evaluate(scene, self.cameras, metric=metrics, **options, **self.options)
 
     def pyramid(self, folder: str, refine: bool = True) -> Pyramid:
         """Levels in a folder of the working directory; those that are there are kept."""
         started = time.perf_counter()
-        lod(self.scene, self.cameras, folder, levels=LEVELS, resume=True, refine=refine, **self.options)
+        lod(self.scene, self.cameras, folder, levels=self.count, resume=True, refine=refine, **self.options)
         print(f"\n{folder}: built or found in {time.perf_counter() - started:.0f} s")
         pyramid = read_pyramid(folder)
         print(f"levels: {', '.join(f'{size:,}' for size in pyramid.sizes)} Gaussians in {pyramid.count} chunks")
@@ -97,7 +104,7 @@ class Bench:
 
 def lighter(bench: Bench) -> None:
     """Lighter scenes, one sample per pixel."""
-    cases = [(rule, scale) for rule in RULES for scale in SCALES[:3]]
+    cases = [(rule, scale) for rule in RULES for scale in bench.scales[:3]]
     heading(bench.name, "", "Gaussians", *(f"{rule} 1/{1 / scale:g}" for rule, scale in cases))
 
     def add(label: str, scene: Gaussians) -> None:
@@ -120,8 +127,8 @@ def lighter(bench: Bench) -> None:
 @torch.no_grad()
 def in_one(bench: Bench) -> None:
     """All levels in one scene by Multi-Scale 3DGS' rule, beside 3DGS."""
-    together = in_one_scene(bench.scene, bench.cameras.train, LEVELS)
-    scales = (1.0, *SCALES)
+    together = in_one_scene(bench.scene, bench.cameras.train, bench.count)
+    scales = (1.0, *bench.scales)
     heading("all levels in one scene", "", *(f"1/{1 / scale:g}" for scale in scales))
     for recipe, scene in (("multi-scale", together), ("classic", bench.scene)):
         renderer = bench.renderer(scene, recipe)
@@ -129,16 +136,16 @@ def in_one(bench: Bench) -> None:
         row("splats", *(f"{len(renderer.splats(bench.views[0].scaled(scale))):,}" for scale in scales))
 
 
-def levels(bench: Bench) -> None:
+def levels(bench: Bench, refine: bool = True) -> None:
     """A pyramid against the scene."""
-    pyramid = bench.pyramid(f"{bench.name}-lod")
+    pyramid = bench.pyramid(f"{bench.name}-lod{bench.count}{'' if refine else '-merged'}", refine)
     columns = ("", "size", "own look", "SSIM", "flicker", "photographs", "ms", "Gaussians", "evaluations, M")
     heading(bench.name, *columns)
     for quality in ("fast", "balanced", "best"):
         for name, scene in (("levels", pyramid), ("the scene", bench.scene)):
             renderer = bench.renderer(scene, "auto", quality)
             own, photographs = (bench.report(scene, quality, truth) for truth in ("self", "photographs"))
-            for scale in SCALES:
+            for scale in bench.scales:
                 views, real = own.select("auto", scale), mean(photographs.select("auto", scale), PSNR.name)
                 ms = round(1e3 * statistics.median(view.seconds for view in views))
                 evaluations = statistics.mean(view.evaluations or 0 for view in views) / 1e6

@@ -25,7 +25,7 @@ from aaplug.methods.pixel_kernels.point import POINT
 from aaplug.methods.pixel_kernels.raster_rows import TILE, tile_centres
 from aaplug.rasterizers.tiled.backward import composite
 from aaplug.rasterizers.tiled.binning import MEMORY_BYTES, Bins, bands
-from aaplug.rasterizers.tiled.forward import Compositing
+from aaplug.rasterizers.tiled.forward import MIN_TILES, Compositing
 from aaplug.rasterizers.tiled.layout import placed
 from aaplug.rasterizers.tiled.packages import CountingKernels
 from aaplug.system.errors import UsageError
@@ -68,6 +68,8 @@ class Tiled:
     ) -> Render:
         """Draw the splats."""
         grid = (-(-hw[0] // TILE), -(-hw[1] // TILE))
+        if grid == (1, 1):
+            grid = (1, MIN_TILES)  # a lone tile would be drawn eagerly
         ellipses = pixel.bounding_ellipses(splats, rules) or splats
         if compositor is None:
             rows = pixel.raster_rows(splats, self.kernels)
