@@ -95,7 +95,7 @@ def convert(words: Words) -> Answer:
 
     how = "in parts" if result.scene is None else f"fused {fused_in(result.scene)}"
     say(f"wrote {words.output}: {how}; show it with {result.viewer.rule} ({result.viewer.name})")
-    say(result.viewer.advice(words.output.suffix[1:].lower()))
+    say(result.viewer.advice(words.output.suffix[1:].lower() or "ply"))
     title = "As the viewer draws it, against the scene's own training-size render:"
     shown = [] if result.report is None else [title, tables(result.report)[0]]
     return Answer({"output": str(words.output)} | result.as_json(), shown)
