@@ -9,8 +9,10 @@ import pytest
 import torch
 
 import aaplug
+from aaplug.core.gaussians import Gaussians
 from aaplug.core.imaging import quantised
-from aaplug.evaluation.conformance import CAMERA, FAULTS, NONE, TESTS, Conformance, Fault, draw, judged
+from aaplug.evaluation import conformance
+from aaplug.evaluation.conformance import CAMERA, FAULTS, NONE, TESTS, Conformance, Fault, judged
 from aaplug.io.cameras import read_cameras
 from aaplug.io.images import read_image, write_png
 from aaplug.methods.presets import recipe_of
@@ -31,6 +33,22 @@ BROKEN = [  # the ten things of the issue, and others that renderers were seen t
 CONVENTIONS = ("classic", "antialiased", "mip", "playcanvas", "playcanvas-classic")
 
 
+@pytest.fixture(scope="module", autouse=True)
+def drawn_once():
+    """What is expected of a renderer is drawn once for all of these tests."""
+    draw, memory = conformance.draw, dict[tuple[object, ...], torch.Tensor]()
+
+    def kept(scene: Gaussians, viewer: Viewer, broken: Fault = NONE, white: bool = False) -> torch.Tensor:
+        key = id(scene), viewer.name, broken.words, white
+        if key not in memory:
+            memory[key] = draw(scene, viewer, broken, white)
+        return memory[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(conformance, "draw", kept)
+        yield
+
+
 def fault(words: str) -> Fault:
     [found] = [fault for fault in FAULTS if words in fault.words]
     return found
@@ -38,7 +56,7 @@ def fault(words: str) -> Fault:
 
 def pictures(viewer: Viewer, broken: Fault = NONE, white: bool = False) -> dict[str, torch.Tensor | str]:
     """As a renderer stores them."""
-    return {test.name: quantised(draw(test.scene, viewer, broken, white).float()) for test in TESTS}
+    return {test.name: quantised(conformance.draw(test.scene, viewer, broken, white).float()) for test in TESTS}
 
 
 def wrongs(verdict: Conformance) -> set[str]:

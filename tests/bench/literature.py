@@ -96,7 +96,7 @@ def milliseconds(renderers: Mapping[str, Renderer], view: Camera) -> dict[str, f
 
 def row(name: str, *figures: float | str) -> None:
     """Print a row."""
-    cells = [f"{each:.2f}" if isinstance(each, float) else each for each in figures]
+    cells = [f"{each:.2f}" if isinstance(each, float) else str(each) for each in figures]
     print(f"| {name} | {' | '.join(cells)} |")
 
 
