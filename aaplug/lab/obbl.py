@@ -10,6 +10,7 @@ t: tiles; P: pixels per tile; p: pixels, or entries of `order`; m: splats.
 """
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from jaxtyping import Float, Int
@@ -17,7 +18,7 @@ from torch import Tensor
 
 from aaplug.core.gaussians import Fusion, Gaussians
 from aaplug.core.interfaces import Limits, Pixels
-from aaplug.core.kernels import EAGER, Kernels
+from aaplug.core.kernels import EAGER, Kernel, Kernels
 from aaplug.core.rules import Rules
 from aaplug.core.splats import Splats2D
 from aaplug.core.training import TrainingViews
@@ -29,6 +30,7 @@ from aaplug.rasterizers.reference import alphas
 MAX_OPACITY = 0.4  # of a band-limited Gaussian; measured (examples/guides/methods.md)
 OPAQUE_ABOVE = 0.5  # alpha of a pixel, from which it is taken as covered
 SPLATS_PER_PASS = 32
+SIZES = ("t", "t", None, None, "t")  # of a pass, which only runs eagerly
 BAND_LIMIT = Smoothing3D(opacity="kept")
 
 
@@ -72,12 +74,11 @@ class Renormalized:
         x, y = tile_centres(rows)
         corners = torch.stack([centres[0][:, 0] - x[0], centres[1][:, 0] - y[0]], dim=1)
         planes, light = rows.new_zeros(4, *centres[0].shape), rows.new_ones(centres[0].shape)
+        one = Kernel("renormalized", partial(_pass, rules), tuple, SIZES, evaluations=SPLATS_PER_PASS)
         for start in range(0, int(counts.amax()), SPLATS_PER_PASS):
-            nearest = next_rows(rows, order, first + start, first + counts, SPLATS_PER_PASS).transpose(0, 1)
-            alpha = POINT.alpha(nearest, Pixels(corners, x, y), Limits.by(rules)).clamp(max=rules.max_alpha)
-            weights, light = _weights(alpha, light, rules, 0)
-            colours = nearest[..., -3:].permute(2, 0, 1)[..., None]
-            planes = planes + torch.cat([(weights * colours).sum(dim=1), weights.sum(dim=0)[None]])
+            nearest = next_rows(rows, order, first + start, first + counts, SPLATS_PER_PASS)
+            more, light = kernels.run(one, nearest, corners, x, y, light)
+            planes = planes + more
         return self.renormalized(planes)
 
     def exact(
@@ -94,6 +95,22 @@ class Renormalized:
         """Colour and alpha over alpha, where that exceeds the bound."""
         covered = planes[3] > self.opaque_above
         return planes / torch.where(covered, planes[3], 1.0)
+
+
+def _pass(
+    rules: Rules,
+    nearest: Float[Tensor, "t K c"],
+    corners: Float[Tensor, "t 2"],
+    x: Float[Tensor, " P"],
+    y: Float[Tensor, " P"],
+    light: Float[Tensor, "t P"],
+) -> tuple[Float[Tensor, "4 t P"], Float[Tensor, "t P"]]:
+    """Premultiplied colour and alpha of the next splats of each tile, and the light behind them."""
+    nearest = nearest.transpose(0, 1)
+    alpha = POINT.alpha(nearest, Pixels(corners, x, y), Limits.by(rules)).clamp(max=rules.max_alpha)
+    weights, light = _weights(alpha, light, rules, 0)
+    colours = nearest[..., -3:].permute(2, 0, 1)[..., None]
+    return torch.cat([(weights * colours).sum(dim=1), weights.sum(dim=0)[None]]), light
 
 
 def _weights(alpha: Tensor, light: Tensor, rules: Rules, dim: int) -> tuple[Tensor, Tensor]:
