@@ -66,17 +66,17 @@ def test_the_plane_in_focus_stays_and_the_rest_moves():
 @pytest.mark.parametrize("aperture", [None, APERTURE, Aperture(0.2, 5.0, 6)])
 @pytest.mark.parametrize("motion", [None, (VIEW, MOVED)])
 def test_spread_is_the_covariance_of_the_places_of_many_samples(aperture, motion):
-    """The slow twin: places in float64 under the cameras of 4096 samples."""
+    """The slow twin: places in float64 under the cameras of 1024 samples."""
     if aperture is None and motion is None:
         return
-    scene, camera = make_scene(30), exposed(aperture, motion, 4096)
+    scene, camera = make_scene(30), exposed(aperture, motion, 1024)
     middle = camera if motion is None else replace(camera, cam_from_world=toward(*motion, 0.5).cam_from_world)
     splats = project(scene, middle)
     means = scene.means[splats.sources]
     bare = replace(middle, exposure=None)
     places = torch.stack([each.project(means)[0] for each in sample_cameras(camera)])
     pixel = torch.stack(
-        [each.project(means)[0] for each in sample_cameras(replace(bare, exposure=Exposure(None, None, 4096)))]
+        [each.project(means)[0] for each in sample_cameras(replace(bare, exposure=Exposure(None, None, 1024)))]
     )
     offsets = places - places.mean(dim=0)
     pixel = pixel - pixel.mean(dim=0)
@@ -102,7 +102,7 @@ def test_cells_of_a_disc_are_round_and_those_of_a_line_lie_along_it():
 def test_few_samples_come_close_to_many_and_closer_than_samples_without_cells(monkeypatch):
     scene = make_scene(200)
     renderer = aaplug.Renderer.of(scene, [VIEW], "matched", min_seen=0.0)
-    many = renderer(exposed(APERTURE, (VIEW, MOVED), 1024)).rgb
+    many = renderer(exposed(APERTURE, (VIEW, MOVED), 256)).rgb
     few, one = (renderer(exposed(APERTURE, (VIEW, MOVED), n)).rgb for n in (16, 1))
     monkeypatch.setattr("aaplug.rendering.renderer.cells", lambda splats, camera: torch.zeros_like(splats.covs))
     plain, pinhole = renderer(exposed(APERTURE, (VIEW, MOVED), 16)).rgb, renderer(toward(VIEW, MOVED, 0.5)).rgb
