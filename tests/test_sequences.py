@@ -137,6 +137,13 @@ def test_what_is_no_sequence_is_refused(folder, spoil, message):
         )
 
 
+def test_levels_of_detail_for_a_viewer_are_no_frames(tmp_path):
+    for number in range(12):
+        write_scene(tmp_path / f"scene_lod{number}.ply", make_scene(2))
+    with pytest.raises(FormatError, match="name the scene's file"):
+        read_scene(tmp_path)
+
+
 @pytest.mark.parametrize(
     "verb", [aaplug.lod, aaplug.finetune, aaplug.info, lambda *inputs: aaplug.merge([*inputs[:1]])]
 )

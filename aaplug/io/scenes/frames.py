@@ -20,7 +20,7 @@ from aaplug.system.errors import FormatError, listing
 if TYPE_CHECKING:
     from aaplug.io.scenes.scene import Scene
 
-NUMBERED = re.compile(r"(.*?)(\d+)((?:\.compressed)?\.ply)", re.ASCII)
+NUMBERED = re.compile(r"(.*?)(?<!\d)(?<!_lod)(\d+)((?:\.compressed)?\.ply)", re.ASCII)  # levels of detail are no frames
 
 
 @dataclass(frozen=True)
