@@ -47,6 +47,7 @@ def main(
     work: Path = Path("out/streaming"),
     modules: Path = Path("tests/bench/viewer_pages"),
     node: str = "node",
+    levels: int | None = None,
     steps: int | None = None,
     views: int = 2,
     frames: int = 120,
@@ -60,7 +61,8 @@ def main(
         work: folder of levels and pictures; levels that are there are kept.
         modules: folder of node_modules.
         node: Node.js of version 22 or later.
-        steps: of the tuning; see `aaplug lod`.
+        levels: coarser levels; see `aaplug lod`.
+        steps: of the tuning, as there.
         views: their number.
         frames: of the camera that moves out; 0 for none.
     """
@@ -75,15 +77,15 @@ def main(
     for name in to:
         index, ours, theirs = STREAMS[name].index, work / f"{name}-ours", work / f"{name}-theirs"
         if not (ours / index).exists():
-            aaplug.lod(whole, data, ours, to=name, steps=steps, resume=(ours / "lod.json").exists())
+            aaplug.lod(whole, data, ours, to=name, levels=levels, steps=steps, resume=(ours / "lod.json").exists())
         facts = json.loads((ours / index).read_text())
         if not (theirs / index).exists():
             command = [node, str((modules / SPLAT_TRANSFORM).resolve()), "-g", "cpu", str(scene)]
             counts = facts.get("counts") or facts["asset"]["extras"]["counts"]
-            levels = list(_decimated(whole, counts, work, command))
-            for number, level in enumerate(levels):
+            lighter = list(_decimated(whole, counts, work, command))
+            for number, level in enumerate(lighter):
                 write_level(theirs, name, number, [level.scene])
-            write_index(theirs, name, levels, float(rates[rates > 0].median()))
+            write_index(theirs, name, lighter, float(rates[rates > 0].median()))
         options = _options(name, json.loads((ours / SETTINGS).read_text()))
         shown = {"ours": (ours, options), "splat-transform": (theirs, options)}
         if name == "sog":
