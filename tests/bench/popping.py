@@ -42,7 +42,7 @@ VALUES_AT_ONCE = 6_000_000  # alphas held at once
 BEHIND = 1e9  # depth of what a tile does not draw
 CASES = (
     ("centre", 0.0),
-    *(("tile", share) for share in (0.1, 0.15, 0.2, 0.3, 1.0)),
+    *(("tile", share) for share in (0.1, 0.12, 0.15, 0.2, 0.3, 1.0)),
     *((kind, share) for share in (0.2, 1.0) for kind in ("window", "pixel")),
 )
 
