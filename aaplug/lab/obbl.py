@@ -25,7 +25,7 @@ from aaplug.core.training import TrainingViews
 from aaplug.methods.filters.smoothing import Smoothing3D
 from aaplug.methods.pixel_kernels.point import POINT
 from aaplug.methods.pixel_kernels.raster_rows import next_rows, tile_centres
-from aaplug.rasterizers.reference import alphas
+from aaplug.rasterizers.reference import composited
 
 MAX_OPACITY = 0.4  # of a band-limited Gaussian; measured (examples/guides/methods.md)
 OPAQUE_ABOVE = 0.5  # alpha of a pixel, from which it is taken as covered
@@ -84,11 +84,9 @@ class Renormalized:
     def exact(
         self, splats: Splats2D, centres: Float[Tensor, "p 2"], rules: Rules
     ) -> tuple[Float[Tensor, "p 3"], Float[Tensor, " p"]]:
-        """Premultiplied colour and transmittance, all splats at once."""
-        assert splats.rgb is not None
-        alpha = alphas(splats, centres, POINT, rules)
-        weights, _ = _weights(alpha, torch.ones_like(centres[:, 0]), rules, 1)
-        planes = self.renormalized(torch.cat([weights @ splats.rgb, weights.sum(dim=1, keepdim=True)], dim=1).T)
+        """Premultiplied colour and transmittance, from those of the reference."""
+        rgb, left = composited(splats, centres, POINT, rules)
+        planes = self.renormalized(torch.cat([rgb.T, 1 - left[None]]))
         return planes[:3].T, 1 - planes[3]
 
     def renormalized(self, planes: Float[Tensor, "4 *pixels"]) -> Float[Tensor, "4 *pixels"]:
@@ -105,24 +103,18 @@ def _pass(
     y: Float[Tensor, " P"],
     light: Float[Tensor, "t P"],
 ) -> tuple[Float[Tensor, "4 t P"], Float[Tensor, "t P"]]:
-    """Premultiplied colour and alpha of the next splats of each tile, and the light behind them."""
-    nearest = nearest.transpose(0, 1)
-    alpha = POINT.alpha(nearest, Pixels(corners, x, y), Limits.by(rules)).clamp(max=rules.max_alpha)
-    weights, light = _weights(alpha, light, rules, 0)
-    colours = nearest[..., -3:].permute(2, 0, 1)[..., None]
-    return torch.cat([(weights * colours).sum(dim=1), weights.sum(dim=0)[None]]), light
-
-
-def _weights(alpha: Tensor, light: Tensor, rules: Rules, dim: int) -> tuple[Tensor, Tensor]:
-    """Weights by which splats along `dim` are composited behind `light`, and the light that they leave.
+    """Premultiplied colour and alpha of the next splats of each tile, and the light behind them.
 
     A pixel stops before the splat that would bring the light below `rules.min_transmittance`; it then has none.
     """
-    after = light.unsqueeze(dim) * (1 - alpha).cumprod(dim=dim)
-    before = torch.cat([light.unsqueeze(dim), after.narrow(dim, 0, after.shape[dim] - 1)], dim=dim)
+    nearest = nearest.transpose(0, 1)
+    alpha = POINT.alpha(nearest, Pixels(corners, x, y), Limits.by(rules)).clamp(max=rules.max_alpha)
+    after = light * (1 - alpha).cumprod(dim=0)
     going = after >= rules.min_transmittance
-    last = after.select(dim, -1)
-    return torch.where(going, alpha * before, 0.0), torch.where(going.select(dim, -1), last, 0.0)
+    weights = torch.where(going, alpha * torch.cat([light[None], after[:-1]]), 0.0)
+    colours = nearest[..., -3:].permute(2, 0, 1)[..., None]
+    planes = torch.cat([(weights * colours).sum(dim=1), weights.sum(dim=0)[None]])
+    return planes, torch.where(going[-1], after[-1], 0.0)
 
 
 BOUNDED_BAND_LIMIT, RENORMALIZED = BoundedBandLimit(), Renormalized()

@@ -41,7 +41,7 @@ class Reference:
         splats = splats[torch.sort(splats.depths, stable=True).indices]
         y, x = (torch.arange(side, dtype=torch.float64, device=splats.means.device) + 0.5 for side in hw)
         strips = [
-            _strip(splats, strip, pixel, rules) if compositor is None else compositor.exact(splats, strip, rules)
+            composited(splats, strip, pixel, rules) if compositor is None else compositor.exact(splats, strip, rules)
             for strip in torch.cartesian_prod(y, x).flip(1).split(STRIP_PIXELS)
         ]
         rgb = torch.cat([rgb for rgb, _ in strips]).reshape(*hw, -1)
@@ -49,10 +49,10 @@ class Reference:
         return over(rgb, 1 - transmittance, background)
 
 
-def _strip(
+def composited(
     splats: Splats2D, centres: Float[Tensor, "p 2"], pixel: PixelKernel, rules: Rules
 ) -> tuple[Float[Tensor, "p d"], Float[Tensor, " p"]]:
-    """Premultiplied colour and transmittance."""
+    """Premultiplied colour and transmittance of splats in their order, front to back (3DGS, eq. 3)."""
     assert splats.rgb is not None
     rgb = centres.new_zeros(len(centres), splats.rgb.shape[1])
     transmittance = centres.new_ones(len(centres))
