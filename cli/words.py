@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import redirect_stderr, suppress
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, make_dataclass
 from functools import cached_property
-from importlib import import_module
 from io import StringIO
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, TypeVar, get_type_hints
@@ -117,8 +116,8 @@ class Words:
     def __init__(self, command: "Command", values: Mapping[str, Any]):
         self.command, self.values = command, dict(values)
 
-    def __reduce__(self) -> tuple[Any, tuple[str, dict[str, Any]]]:
-        return _words_of, (self.command.name, self.values)  # a worker of a cluster has a table of its own
+    def __reduce__(self) -> tuple[Any, tuple[Any, dict[str, Any]]]:
+        return _words_of, (self.command.run, self.values)  # a worker of a cluster has a table of its own
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__") or name == "values":
@@ -259,7 +258,6 @@ def worded(text: str, options: Iterable[Option]) -> str:
     return re.sub(r"`(\w+)`|\b([a-z]+(?:_[a-z]+)+)\b", lambda match: shown.get(match[1] or match[2], match[0]), text)
 
 
-def _words_of(verb: str, values: Mapping[str, Any]) -> Words:
-    """The words of a verb in the table, with these values."""
-    import_module(".verbs", __package__)  # fills the table, in a process that unpickles words before all else
-    return Words(VERBS[verb], values)
+def _words_of(run: Callable[[Words], Answer], values: Mapping[str, Any]) -> Words:
+    """The words of the verb that `run` carries out, whose module fills the table."""
+    return Words(next(command for command in VERBS.values() if command.run is run), values)

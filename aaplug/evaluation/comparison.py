@@ -29,7 +29,8 @@ from aaplug.core.gaussians import MAX_LOG_SCALE, Gaussians, digest_of_scene
 from aaplug.evaluation.alignment import mismatch
 from aaplug.evaluation.metrics import EQUAL, PSNR
 from aaplug.evaluation.results import Facts, Report, mean, spread_of, tables
-from aaplug.io.scenes.scene import Scene, usable
+from aaplug.io.scenes.faults import usable
+from aaplug.io.scenes.scene import Scene
 from aaplug.system.errors import FrameError, printable
 
 SAME_ROWS_DISTANCE = 0.01  # of the scene's size: the median distance within which rows are the same Gaussians

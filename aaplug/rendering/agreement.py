@@ -15,7 +15,8 @@ from aaplug.core.colours import BLACK, WHITE
 from aaplug.core.rules import NEAR
 from aaplug.core.training import TrainingViews
 from aaplug.io.photographs import photo_at
-from aaplug.io.scenes.scene import Scene, usable
+from aaplug.io.scenes.faults import usable
+from aaplug.io.scenes.scene import Scene
 from aaplug.rendering.renderer import Renderer, background_colour, own_look
 from aaplug.system.errors import AaplugError
 from aaplug.system.monitor import SILENT, Monitor

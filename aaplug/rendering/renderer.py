@@ -39,9 +39,8 @@ from aaplug.io.cameras import read_cameras
 from aaplug.io.images import colour_of
 from aaplug.io.limits import lack_of_memory
 from aaplug.io.scenes import SceneLike, scene_of
-from aaplug.io.scenes.frames import SceneFrames
 from aaplug.io.scenes.harmonics import without_harmonics
-from aaplug.io.scenes.scene import Scene
+from aaplug.io.scenes.scene import Scene, SceneFrames
 from aaplug.methods.filters.smoothing import fuse_stored
 from aaplug.methods.order import Order, Shown
 from aaplug.methods.pixel_kernels.point import POINT

@@ -13,7 +13,7 @@ from aaplug.evaluation.survey import check_frame_of
 from aaplug.finetuning.fitting import fit, steps_for
 from aaplug.io.atomic import AnyPath, refuse_existing
 from aaplug.io.scenes import SceneLike, check_scene_output, write_parts, write_scene
-from aaplug.io.scenes.frames import SceneFrames
+from aaplug.io.scenes.scene import SceneFrames
 from aaplug.methods import FORMS
 from aaplug.methods.conversion import MATCHED_ENERGY, Form, blurring, fuse
 from aaplug.methods.viewers import MIP_VIEWER, Viewer, find_viewer

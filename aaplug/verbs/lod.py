@@ -21,6 +21,7 @@ from aaplug.finetuning.fitting import fit, steps_for
 from aaplug.finetuning.refining import refine
 from aaplug.io.atomic import AnyPath, refuse_existing, refuse_inputs
 from aaplug.io.scenes import SceneLike, check_scene_output, write_scene, written_format
+from aaplug.io.scenes.columns import matrix_of
 from aaplug.io.scenes.pyramid_folder import (
     MANIFEST,
     Level,
@@ -32,7 +33,7 @@ from aaplug.io.scenes.pyramid_folder import (
     read_manifest,
     write_manifest,
 )
-from aaplug.io.scenes.scene import FLOAT, Scene, matrix_of
+from aaplug.io.scenes.scene import FLOAT, Scene
 from aaplug.io.streamed import (
     SETTINGS,
     STREAMS,

@@ -16,8 +16,8 @@ from aaplug.core.placing import placed
 from aaplug.core.training import TrainingViews
 from aaplug.io.atomic import AnyPath
 from aaplug.io.scenes import check_scene_output, still_scene_of, write_scene
+from aaplug.io.scenes.faults import check_values
 from aaplug.io.scenes.packed import of_degree
-from aaplug.io.scenes.scene import check_values
 from aaplug.methods.conversion import carried
 from aaplug.methods.filters.smoothing import fuse_stored
 from aaplug.options.verbs import MergeOptions

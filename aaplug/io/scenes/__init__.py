@@ -20,10 +20,12 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.core.pyramids import Pyramid
 from aaplug.io.atomic import check_output
 from aaplug.io.scenes import compressed_ply, gltf, ksplat, ply, pt, sog, splat, spz, usd
-from aaplug.io.scenes.frames import SceneFrames, frame_files
+from aaplug.io.scenes.faults import described_faults, faults_of
+from aaplug.io.scenes.frames import frame_files
 from aaplug.io.scenes.options import SceneFileOptions
 from aaplug.io.scenes.pyramid_folder import MANIFEST, is_pyramid, path_of, read_manifest, read_pyramid
-from aaplug.io.scenes.scene import MODEL_SCENE, SOG_FOLDER, Scene, described_faults, faults_of, library_errors
+from aaplug.io.scenes.rows import library_errors
+from aaplug.io.scenes.scene import MODEL_SCENE, SOG_FOLDER, Scene, SceneFrames
 from aaplug.io.values import read_start
 from aaplug.system.contracts import contract
 from aaplug.system.errors import FormatError, OutputError, UsageError

@@ -28,10 +28,12 @@ from aaplug.core.spherical_harmonics import COLOUR_OFFSET, SH_C0
 from aaplug.io.atomic import replacing
 from aaplug.io.gltf import FLOAT, MAGIC, Accessor, Gltf, at_rest, glb_start
 from aaplug.io.scenes import spz
+from aaplug.io.scenes.columns import logit_of
 from aaplug.io.scenes.options import SceneFileOptions
 from aaplug.io.scenes.packed import bytes_of, half_turn_about_z, of_degree, replacing_group, standing
 from aaplug.io.scenes.record import KEY, Facts, holdable, read_record, record_of
-from aaplug.io.scenes.scene import Scene, check_count, library_errors, logit_of
+from aaplug.io.scenes.rows import check_count, library_errors
+from aaplug.io.scenes.scene import Scene
 from aaplug.io.values import Entry, Place
 from aaplug.system.errors import FormatError, OutputError
 

@@ -12,7 +12,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from aaplug.core.gaussians import Gaussians, joined
-from aaplug.io.scenes.scene import Scene, library_errors
+from aaplug.io.scenes.rows import library_errors
+from aaplug.io.scenes.scene import Scene
 
 MAX_HARMONICS_BYTES = 2 * 10**9  # reading more for each view costs less than holding them; 10 M Gaussians of degree 3
 

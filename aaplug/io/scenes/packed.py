@@ -21,7 +21,7 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.core.placing import mirrored, placed
 from aaplug.io.atomic import check_output, replacing
 from aaplug.io.limits import limit
-from aaplug.io.scenes.scene import logit_of
+from aaplug.io.scenes.columns import logit_of
 from aaplug.io.values import Place
 from aaplug.system.errors import FormatError
 

@@ -17,7 +17,7 @@ from plyfile import PlyData, PlyElement
 from torch import Tensor
 
 from aaplug.io.scenes.ply_header import BIG, LITTLE, TEXT, Header
-from aaplug.io.scenes.scene import read_rows
+from aaplug.io.scenes.rows import read_rows
 from aaplug.system.errors import FormatError
 
 MAX_SPREAD = 16  # rows spread over more than this many times their number are read one by one

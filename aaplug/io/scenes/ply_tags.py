@@ -19,8 +19,9 @@ from pathlib import Path
 
 from aaplug.core.conventions import ANTIALIASED, CLASSIC, CONVENTIONS, MIP, Convention
 from aaplug.core.gaussians import Fusion
+from aaplug.io.scenes.columns import FILTER_COLUMN
 from aaplug.io.scenes.ply_header import Header
-from aaplug.io.scenes.scene import COMPENSATED, FILTER_COLUMN, KERNEL_LOST
+from aaplug.io.scenes.scene import COMPENSATED, KERNEL_LOST
 from aaplug.io.scenes.training_config import run_config
 from aaplug.system.errors import FormatError
 

@@ -5,45 +5,39 @@ A format decodes rows; this module checks their values, reports unusable ones, a
 """
 
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from torch import Tensor
 
-from aaplug.core.cameras import CameraSet
+from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.conventions import CLASSIC, MIP, Convention
-from aaplug.core.gaussians import MAX_LOG_SCALE, MIN_OPACITY, Fusion, Gaussians, Origin, digest_of_scene, joined
+from aaplug.core.gaussians import Fusion, Gaussians, Origin, digest_of_scene, joined
 from aaplug.core.pyramids import Pyramid
-from aaplug.core.spherical_harmonics import COLOUR_OFFSET, SH_C0
+from aaplug.core.training import TrainingViews
 from aaplug.io.cameras import holds_cameras, read_cameras
-from aaplug.io.limits import lack_of_memory, whole_limit
-from aaplug.io.scenes.frames import SceneFrames
+from aaplug.io.limits import lack_of_memory
+from aaplug.io.scenes.faults import check_values, described_faults, doubts_of, faults_of
+from aaplug.io.scenes.rows import library_errors
 from aaplug.system.contracts import contract
 from aaplug.system.digests import digest_of_values
-from aaplug.system.errors import AaplugError, FormatError, UsageError, listing, reason
+from aaplug.system.errors import FormatError, listing
 
 MODEL_SCENE = "point_cloud/iteration_*/point_cloud.ply"  # in an INRIA model folder
 SOG_FOLDER = "meta.json"  # marks a folder of SOG images
-SHORTEST_QUATERNION = 1e-12  # torch's `normalize` does not normalize a shorter one
 PROBES = 512  # evenly spaced places in the file, from which the frame check samples
 PART = 1 << 16  # Gaussians per part: 15 MB at degree 3
 FLOAT = 4  # bytes
-HUGE_LOG_SCALE = 20.0  # half a billion units
-HUGE_HARMONIC = 1e4  # trained harmonics stay below 10
 SHAPE_NUMBERS = 11  # of a Gaussian: mean, quaternion, scales, opacity
-MAX_REASON = 200  # characters of a library's message
-FILTER_COLUMN = "filter_3D"  # Mip-Splatting's 3D filter: a standard deviation in world units
 # A tag or flag tells that training compensated, not its kernel: splat-transform turns each format's into the others'.
 # All are read as Brush's, which introduced the tag: so a scene converted for the Mip rule keeps it in every format.
 COMPENSATED = MIP
 KERNEL_LOST = f"its kernel is not recorded, {COMPENSATED.kernel:g} px² assumed"
-DEGREES = {3 * ((d + 1) ** 2 - 1): d for d in range(5)}  # SH degree by number of f_rest columns
 
 log = logging.getLogger("aaplug")
 
@@ -80,7 +74,7 @@ class Scene:
     other: "Scene | None" = None
     folder: Path | None = None
     read_levels: Callable[[Path], Pyramid] | None = None
-    frames: SceneFrames | None = None
+    frames: "SceneFrames | None" = None
     others: tuple[Path, ...] = ()
     drop_bad: bool = False
     memory: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
@@ -258,6 +252,68 @@ class Scene:
             raise FormatError(self.name, f"its {self.count:,} Gaussians take {lacking}; {hint}")
 
 
+@dataclass(frozen=True)
+class SceneFrames:
+    """The frames of a scene in time, of which one is open at a time.
+
+    Gaussian i of each frame is the same thing at another time, unless the frames were trained apart.  Its sampling
+    rates are those over all frames and cameras, as Alias-Free 4D Gaussian Splatting (arXiv 2511.18367) takes the
+    maximum over time: filters that follow them do not change from frame to frame.
+
+    paths: their files, in order.  numbers: theirs, as the files' names write them.  open: opens one of the files.
+    apart: they were trained apart, so that each has sampling rates of its own.
+    """
+
+    paths: tuple[Path, ...]
+    numbers: tuple[str, ...]
+    open: Callable[[Path], Scene]
+    apart: bool = False
+
+    def __len__(self) -> int:
+        return len(self.paths)
+
+    def __iter__(self) -> Iterator[Scene]:
+        return map(self.open, self.paths)
+
+    def check(self) -> None:
+        """Read what every file says, without its rows.
+
+        Raises:
+            FormatError: a file breaks its format, or it is of another kind than the first, or it holds another number
+                of Gaussians and the frames were not trained apart.
+        """
+        kinds = [
+            {"degree of harmonics": s.sh_degree, "convention": s.convention.name, "2D Gaussians": s.flat}
+            | ({} if self.apart else {"number of Gaussians": s.count})
+            for s in self
+        ]
+        for path, kind in zip(self.paths, kinds, strict=True):
+            for name, value in kind.items():
+                if value != kinds[0][name]:
+                    hint = "; pass `frames_apart` if each frame was trained alone" * (name == "number of Gaussians")
+                    problem = f"expected the {name} of {self.paths[0].name}, {kinds[0][name]}, got {value}"
+                    raise FormatError(path, problem + hint)
+
+    def at_each(self, views: Sequence[Camera]) -> tuple[Camera, ...]:
+        """The views at every frame, a frame at a time; the number of the frame ends a view's name."""
+        moments = enumerate(self.numbers)
+        return tuple(replace(v, frame=k, name=f"{v.name}-{n}", photo=None) for k, n in moments for v in views)
+
+    def along(self, path: Sequence[Camera]) -> list[Camera]:
+        """The cameras of a path, during which the frames pass once."""
+        return [replace(view, frame=i * len(self) // len(path)) for i, view in enumerate(path)]
+
+    def over_all(self, training: TrainingViews) -> TrainingViews:
+        """The training views of the first frame, with sampling bounds over all; raises UsageError as `also`."""
+        for frame in () if self.apart else islice(self, 1, None):
+            training = training.also(frame.gaussians())
+        return training
+
+    def training_of(self, frame: Gaussians, training: TrainingViews) -> TrainingViews:
+        """The training views of a frame; training: of the scene."""
+        return TrainingViews.of(frame, training.cameras, training.cull_margin) if self.apart else training
+
+
 @dataclass(frozen=True, eq=False)
 class _Rows:
     """Reads rows of Gaussians in memory."""
@@ -266,156 +322,6 @@ class _Rows:
 
     def __call__(self, start: int, stop: int) -> Gaussians:
         return self.rows[start:stop]
-
-
-@contract
-@contextmanager
-def library_errors(path: Path) -> Iterator[None]:
-    """Report whatever a library raises about a damaged file as one FormatError."""
-    try:
-        with np.errstate(all="ignore"):  # NaN is reported by `faults_of`
-            yield
-    except AaplugError:
-        raise
-    except MemoryError as error:
-        raise FormatError(path, "does not fit into memory") from error
-    except OSError as error:
-        raise FormatError(path, f"cannot be read: {reason(error)}") from error
-    except Exception as error:  # plyfile, numpy, zlib, zipfile, Pillow and torch raise all kinds
-        what = " ".join(str(error).split())[:MAX_REASON]
-        raise FormatError(path, f"is damaged and cannot be read: {what}") from error
-
-
-def read_rows(path: Path, dtype: np.dtype, start: int, stop: int, offset: int = 0) -> np.ndarray:
-    """The rows from start up to stop of a table that begins at the byte `offset`."""
-    with library_errors(path):
-        rows = np.fromfile(path, dtype, stop - start, offset=offset + start * dtype.itemsize)
-    if len(rows) != stop - start:
-        raise FormatError(path, "was cut short while it was being read")
-    return rows
-
-
-@contract
-def check_count(path: Path, count: int) -> None:
-    """Refuse a scene of more Gaussians than the limit GAUSSIANS."""
-    most = whole_limit("GAUSSIANS")
-    if count > most:
-        raise FormatError(path, f"holds {count:,} Gaussians and the limit is {most:,}; AAPLUG_GAUSSIANS raises it")
-
-
-def matrix_of(scene: Gaussians) -> tuple[list[str], Float[Tensor, "n p"]]:
-    """The parameters as columns of a .ply: their names, and a matrix.  A flat scene has two scales.
-
-    f_rest is channel-major: f_rest_(c·(k − 1) + j) is coefficient 1 + j of channel c.
-    """
-    rest = scene.sh[:, 1:].transpose(1, 2).flatten(1)
-    scales = scene.log_scales[:, : 2 if scene.flat else 3]
-    parts = [scene.means, scene.sh[:, 0], rest, scene.logit_opacities[:, None], scales, scene.quats]
-    stems = {"f_dc": 3, "f_rest": rest.shape[1], "opacity": None, "scale": scales.shape[1], "rot": 4}
-    names = list("xyz")
-    for stem, number in stems.items():
-        names += [stem] if number is None else [f"{stem}_{i}" for i in range(number)]
-    if scene.filter_3d is not None:
-        names.append(FILTER_COLUMN)
-        parts.append(scene.filter_3d[:, None])
-    return names, torch.cat(parts, dim=1)
-
-
-def scene_of(names: Sequence[str], values: Float[Tensor, "n c"], degree: int, flat: bool) -> Gaussians:
-    """The scene in a matrix of named columns, in any order and among others: the inverse of `matrix_of`."""
-    at = {name: i for i, name in enumerate(names)}
-    k = (degree + 1) ** 2
-
-    def chosen(*wanted: str) -> Tensor:
-        return values.index_select(1, torch.tensor([at[name] for name in wanted]))
-
-    rest = [f"f_rest_{c * (k - 1) + j}" for j in range(k - 1) for c in range(3)]
-    scales = chosen(*(f"scale_{i}" for i in range(2 if flat else 3)))
-    if flat:
-        scales = torch.nn.functional.pad(scales, (0, 1), value=-MAX_LOG_SCALE)
-    return Gaussians(
-        means=chosen("x", "y", "z"),
-        quats=chosen(*(f"rot_{i}" for i in range(4))),
-        log_scales=scales,
-        logit_opacities=chosen("opacity")[:, 0],
-        sh=chosen(*(f"f_dc_{c}" for c in range(3)), *rest).reshape(-1, k, 3),
-        filter_3d=chosen(FILTER_COLUMN)[:, 0] if FILTER_COLUMN in at else None,
-        flat=flat,
-    )
-
-
-@contract
-def logit_of(opacity: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
-    """Logits of opacities; finite at 0 and 1."""
-    return opacity.clamp(MIN_OPACITY, 1 - MIN_OPACITY).logit()
-
-
-@contract
-def sh_of_colour(rgb: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
-    """Harmonics of degree 0 of colours in [0, 1]."""
-    return (rgb - COLOUR_OFFSET) / SH_C0
-
-
-def faults_of(scene: Gaussians) -> dict[str, Bool[Tensor, " n"]]:
-    """What no renderer can use, and in which rows: NaN, infinities, quaternions without a direction, negative filters.
-
-    A log-scale of -inf (no thickness) and a logit of +inf (opaque) are valid.
-    """
-    nans, infinities = dict[str, Tensor](), dict[str, Tensor]()
-    names, matrix = ([], torch.empty(0, 0)) if _finite(scene) else matrix_of(scene)
-    for name, values in zip(names, matrix.T, strict=True):
-        allowed = {"opacity": torch.inf, "scale": -torch.inf}.get(name.split("_")[0], torch.nan)
-        nans[f"NaN in {name}"] = values.isnan()
-        infinities[f"Inf in {name}"] = values.isinf() & (values != allowed)
-    length = torch.linalg.vector_norm(scene.quats, dim=-1)
-    finite = scene.quats.isfinite().all(dim=-1)
-    faults = {**nans, **infinities, "a quaternion of length zero": length <= SHORTEST_QUATERNION}
-    faults["a quaternion too long for float32"] = length.isinf() & finite
-    if scene.filter_3d is not None:
-        faults[f"a negative {FILTER_COLUMN}"] = scene.filter_3d < 0
-    return {text: rows for text, rows in faults.items() if rows.any()}
-
-
-def described_faults(faults: Mapping[str, Bool[Tensor, " n"]], start: int = 0) -> str:
-    """Faults in words, each with its first row, counted from `start`."""
-    words = []
-    for text, rows in faults.items():
-        first, *others = rows.nonzero()[:, 0].tolist()
-        words.append(f"row {start + first}{f' (and {len(others)} more)' if others else ''} has {text}")
-    return listing(words)
-
-
-def usable(scene: Gaussians) -> Gaussians:
-    """The Gaussians that renderers can use."""
-    faults = faults_of(scene)
-    return scene[~torch.stack(list(faults.values())).any(dim=0)] if faults else scene
-
-
-def check_values(scene: Gaussians) -> None:
-    """Refuse Gaussians in memory that no renderer can use."""
-    if faults := faults_of(scene):
-        raise UsageError(scene.name, f"{described_faults(faults)}; leave such Gaussians out")
-
-
-def doubts_of(scene: Gaussians) -> dict[str, int]:
-    """What renderers can use but hardly was meant, and in how many rows."""
-    if not len(scene):
-        return {}
-    doubts = dict[str, int]()
-    if scene.log_scales.max() > HUGE_LOG_SCALE:
-        rows = (scene.log_scales > HUGE_LOG_SCALE).any(dim=1)
-        doubts[f"a log-scale above {HUGE_LOG_SCALE:g}, a size that no view shows"] = int(rows.sum())
-    low, high = scene.sh.aminmax()
-    if max(-low, high) > HUGE_HARMONIC:
-        rows = (scene.sh.abs() > HUGE_HARMONIC).flatten(1).any(dim=1)
-        doubts[f"a harmonic beyond {HUGE_HARMONIC:g}, a colour far out of range"] = int(rows.sum())
-    return doubts
-
-
-def _finite(scene: Gaussians) -> bool:
-    fields = (scene.means, scene.quats, scene.log_scales, scene.logit_opacities, scene.sh)
-    values = fields if scene.filter_3d is None else (*fields, scene.filter_3d)
-    return all(bool(v.sum().isfinite()) or bool(v.isfinite().all()) for v in values)
 
 
 def _check(part: Gaussians, path: Path, drop_bad: bool, dropped: dict[str, int]) -> Bool[Tensor, " n"] | None:

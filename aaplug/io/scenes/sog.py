@@ -43,7 +43,8 @@ from aaplug.io.scenes.packed import (
     without_largest,
 )
 from aaplug.io.scenes.record import KEY, Facts, read_record, record_of, whole
-from aaplug.io.scenes.scene import COMPENSATED, KERNEL_LOST, Scene, check_count, library_errors
+from aaplug.io.scenes.rows import check_count, library_errors
+from aaplug.io.scenes.scene import COMPENSATED, KERNEL_LOST, Scene
 from aaplug.io.values import Entry, number, object_of, parse_json, read_bounded
 from aaplug.system.errors import FormatError
 

@@ -42,7 +42,8 @@ from aaplug.io.scenes.packed import (
     without_largest,
 )
 from aaplug.io.scenes.record import Facts, holdable, warn_of_losses
-from aaplug.io.scenes.scene import COMPENSATED, KERNEL_LOST, Scene, check_count, library_errors
+from aaplug.io.scenes.rows import check_count, library_errors
+from aaplug.io.scenes.scene import COMPENSATED, KERNEL_LOST, Scene
 from aaplug.system.errors import FormatError, OutputError
 
 MAGIC = b"NGSP"

@@ -1,0 +1,67 @@
+"""The parameters of Gaussians as the named columns of a .ply, and the values that other formats give."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from aaplug.core.gaussians import MAX_LOG_SCALE, MIN_OPACITY, Gaussians
+from aaplug.core.spherical_harmonics import COLOUR_OFFSET, SH_C0
+from aaplug.system.contracts import contract
+
+FILTER_COLUMN = "filter_3D"  # Mip-Splatting's 3D filter: a standard deviation in world units
+DEGREES = {3 * ((d + 1) ** 2 - 1): d for d in range(5)}  # SH degree by number of f_rest columns
+
+
+def matrix_of(scene: Gaussians) -> tuple[list[str], Float[Tensor, "n p"]]:
+    """The parameters as columns of a .ply: their names, and a matrix.  A flat scene has two scales.
+
+    f_rest is channel-major: f_rest_(c·(k − 1) + j) is coefficient 1 + j of channel c.
+    """
+    rest = scene.sh[:, 1:].transpose(1, 2).flatten(1)
+    scales = scene.log_scales[:, : 2 if scene.flat else 3]
+    parts = [scene.means, scene.sh[:, 0], rest, scene.logit_opacities[:, None], scales, scene.quats]
+    stems = {"f_dc": 3, "f_rest": rest.shape[1], "opacity": None, "scale": scales.shape[1], "rot": 4}
+    names = list("xyz")
+    for stem, number in stems.items():
+        names += [stem] if number is None else [f"{stem}_{i}" for i in range(number)]
+    if scene.filter_3d is not None:
+        names.append(FILTER_COLUMN)
+        parts.append(scene.filter_3d[:, None])
+    return names, torch.cat(parts, dim=1)
+
+
+def scene_of(names: Sequence[str], values: Float[Tensor, "n c"], degree: int, flat: bool) -> Gaussians:
+    """The scene in a matrix of named columns, in any order and among others: the inverse of `matrix_of`."""
+    at = {name: i for i, name in enumerate(names)}
+    k = (degree + 1) ** 2
+
+    def chosen(*wanted: str) -> Tensor:
+        return values.index_select(1, torch.tensor([at[name] for name in wanted]))
+
+    rest = [f"f_rest_{c * (k - 1) + j}" for j in range(k - 1) for c in range(3)]
+    scales = chosen(*(f"scale_{i}" for i in range(2 if flat else 3)))
+    if flat:
+        scales = torch.nn.functional.pad(scales, (0, 1), value=-MAX_LOG_SCALE)
+    return Gaussians(
+        means=chosen("x", "y", "z"),
+        quats=chosen(*(f"rot_{i}" for i in range(4))),
+        log_scales=scales,
+        logit_opacities=chosen("opacity")[:, 0],
+        sh=chosen(*(f"f_dc_{c}" for c in range(3)), *rest).reshape(-1, k, 3),
+        filter_3d=chosen(FILTER_COLUMN)[:, 0] if FILTER_COLUMN in at else None,
+        flat=flat,
+    )
+
+
+@contract
+def logit_of(opacity: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+    """Logits of opacities; finite at 0 and 1."""
+    return opacity.clamp(MIN_OPACITY, 1 - MIN_OPACITY).logit()
+
+
+@contract
+def sh_of_colour(rgb: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
+    """Harmonics of degree 0 of colours in [0, 1]."""
+    return (rgb - COLOUR_OFFSET) / SH_C0

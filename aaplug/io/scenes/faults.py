@@ -1,0 +1,77 @@
+"""Values of Gaussians that no renderer can use, and values that were hardly meant."""
+
+from collections.abc import Mapping
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from aaplug.core.gaussians import Gaussians
+from aaplug.io.scenes.columns import FILTER_COLUMN, matrix_of
+from aaplug.system.errors import UsageError, listing
+
+SHORTEST_QUATERNION = 1e-12  # torch's `normalize` does not normalize a shorter one
+HUGE_LOG_SCALE = 20.0  # half a billion units
+HUGE_HARMONIC = 1e4  # trained harmonics stay below 10
+
+
+def faults_of(scene: Gaussians) -> dict[str, Bool[Tensor, " n"]]:
+    """What no renderer can use, and in which rows: NaN, infinities, quaternions without a direction, negative filters.
+
+    A log-scale of -inf (no thickness) and a logit of +inf (opaque) are valid.
+    """
+    nans, infinities = dict[str, Tensor](), dict[str, Tensor]()
+    names, matrix = ([], torch.empty(0, 0)) if _finite(scene) else matrix_of(scene)
+    for name, values in zip(names, matrix.T, strict=True):
+        allowed = {"opacity": torch.inf, "scale": -torch.inf}.get(name.split("_")[0], torch.nan)
+        nans[f"NaN in {name}"] = values.isnan()
+        infinities[f"Inf in {name}"] = values.isinf() & (values != allowed)
+    length = torch.linalg.vector_norm(scene.quats, dim=-1)
+    finite = scene.quats.isfinite().all(dim=-1)
+    faults = {**nans, **infinities, "a quaternion of length zero": length <= SHORTEST_QUATERNION}
+    faults["a quaternion too long for float32"] = length.isinf() & finite
+    if scene.filter_3d is not None:
+        faults[f"a negative {FILTER_COLUMN}"] = scene.filter_3d < 0
+    return {text: rows for text, rows in faults.items() if rows.any()}
+
+
+def described_faults(faults: Mapping[str, Bool[Tensor, " n"]], start: int = 0) -> str:
+    """Faults in words, each with its first row, counted from `start`."""
+    words = []
+    for text, rows in faults.items():
+        first, *others = rows.nonzero()[:, 0].tolist()
+        words.append(f"row {start + first}{f' (and {len(others)} more)' if others else ''} has {text}")
+    return listing(words)
+
+
+def usable(scene: Gaussians) -> Gaussians:
+    """The Gaussians that renderers can use."""
+    faults = faults_of(scene)
+    return scene[~torch.stack(list(faults.values())).any(dim=0)] if faults else scene
+
+
+def check_values(scene: Gaussians) -> None:
+    """Refuse Gaussians in memory that no renderer can use."""
+    if faults := faults_of(scene):
+        raise UsageError(scene.name, f"{described_faults(faults)}; leave such Gaussians out")
+
+
+def doubts_of(scene: Gaussians) -> dict[str, int]:
+    """What renderers can use but hardly was meant, and in how many rows."""
+    if not len(scene):
+        return {}
+    doubts = dict[str, int]()
+    if scene.log_scales.max() > HUGE_LOG_SCALE:
+        rows = (scene.log_scales > HUGE_LOG_SCALE).any(dim=1)
+        doubts[f"a log-scale above {HUGE_LOG_SCALE:g}, a size that no view shows"] = int(rows.sum())
+    low, high = scene.sh.aminmax()
+    if max(-low, high) > HUGE_HARMONIC:
+        rows = (scene.sh.abs() > HUGE_HARMONIC).flatten(1).any(dim=1)
+        doubts[f"a harmonic beyond {HUGE_HARMONIC:g}, a colour far out of range"] = int(rows.sum())
+    return doubts
+
+
+def _finite(scene: Gaussians) -> bool:
+    fields = (scene.means, scene.quats, scene.log_scales, scene.logit_opacities, scene.sh)
+    values = fields if scene.filter_3d is None else (*fields, scene.filter_3d)
+    return all(bool(v.sum().isfinite()) or bool(v.isfinite().all()) for v in values)

@@ -1,0 +1,48 @@
+"""What every format needs to read rows: the errors of libraries as ours, rows of a table, the limit of a scene."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from aaplug.io.limits import whole_limit
+from aaplug.system.contracts import contract
+from aaplug.system.errors import AaplugError, FormatError, reason
+
+MAX_REASON = 200  # characters of a library's message
+
+
+@contract
+@contextmanager
+def library_errors(path: Path) -> Iterator[None]:
+    """Report whatever a library raises about a damaged file as one FormatError."""
+    try:
+        with np.errstate(all="ignore"):  # NaN is reported by `faults_of`
+            yield
+    except AaplugError:
+        raise
+    except MemoryError as error:
+        raise FormatError(path, "does not fit into memory") from error
+    except OSError as error:
+        raise FormatError(path, f"cannot be read: {reason(error)}") from error
+    except Exception as error:  # plyfile, numpy, zlib, zipfile, Pillow and torch raise all kinds
+        what = " ".join(str(error).split())[:MAX_REASON]
+        raise FormatError(path, f"is damaged and cannot be read: {what}") from error
+
+
+def read_rows(path: Path, dtype: np.dtype, start: int, stop: int, offset: int = 0) -> np.ndarray:
+    """The rows from start up to stop of a table that begins at the byte `offset`."""
+    with library_errors(path):
+        rows = np.fromfile(path, dtype, stop - start, offset=offset + start * dtype.itemsize)
+    if len(rows) != stop - start:
+        raise FormatError(path, "was cut short while it was being read")
+    return rows
+
+
+@contract
+def check_count(path: Path, count: int) -> None:
+    """Refuse a scene of more Gaussians than the limit GAUSSIANS."""
+    most = whole_limit("GAUSSIANS")
+    if count > most:
+        raise FormatError(path, f"holds {count:,} Gaussians and the limit is {most:,}; AAPLUG_GAUSSIANS raises it")
