@@ -163,6 +163,8 @@ def hold(item: int) -> None:
 
 
 HOLDS = """if __name__ == "__main__":
+    import signal
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # the tests may run where nohup ignores it
     from aaplug.system.executors import Processes
     from aaplug.system.locks import scratch
     from aaplug.system.signals import end_as_by_interrupt
@@ -182,13 +184,16 @@ def test_signals_that_end_a_program_leave_no_worker_and_no_temporary_file(tmp_pa
     environment = os.environ | {"TMPDIR": str(temporary), "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}
     streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with subprocess.Popen([sys.executable, str(script)], env=environment, start_new_session=True, **streams) as parent:
-        while (
-            parent.poll() is None and len([*temporary.glob("aaplug-scratch-*")]) < 4
-        ):  # its own, the pool's, two items'
-            time.sleep(0.01)
-        workers = psutil.Process(parent.pid).children()
-        send(parent.pid, getattr(signal, name))
-        _, err = parent.communicate(timeout=60)
+        try:
+            while (
+                parent.poll() is None and len([*temporary.glob("aaplug-scratch-*")]) < 4
+            ):  # its own, the pool's, 2 items'
+                time.sleep(0.01)
+            workers = psutil.Process(parent.pid).children()
+            send(parent.pid, getattr(signal, name))
+            _, err = parent.communicate(timeout=60)
+        finally:
+            parent.kill()
     assert err.splitlines()[-1] == "KeyboardInterrupt", err
     assert not psutil.wait_procs(workers, timeout=10)[1]
     assert not [*temporary.iterdir()]
