@@ -4,6 +4,7 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from threading import get_ident
 
 import pytest
 import torch
@@ -11,6 +12,7 @@ import torch
 import aaplug
 import aaplug.core.projection
 from aaplug.core.cameras import CameraSet
+from aaplug.core.chunks import chunks_of
 from aaplug.core.conventions import ANTIALIASED, CLASSIC, MIP
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.projection import project
@@ -129,6 +131,24 @@ def test_the_number_of_threads_plays_no_part(sample_scene):
         with torch_threads(threads):
             found.append(merged_to(len(scene) * 9 // 10, scene, rate=200.0))
     assert_equal(*found)
+
+
+def test_batches_of_chunks_may_be_merged_by_several_threads(monkeypatch):
+    monkeypatch.setattr("aaplug.levels.merging.GAUSSIANS_PER_BATCH", 100)
+    scene, goal = make_scene(700), Goal(0.25, tolerance=1e-2)
+    chunks, found, told = chunks_of(scene.means, 50), [], []
+    for threads in (1, 3):
+        with torch_threads(threads):
+            found.append(
+                merge_in_chunks(
+                    scene, torch.full((700,), RATE), chunks, goal, lambda *done: told.append((done, get_ident()))
+                )
+            )
+    assert len(found[0][0]) < 600
+    assert_equal(found[0][0], found[1][0])
+    assert torch.equal(found[0][1], found[1][1])
+    assert len({thread for _, thread in told}) > 1
+    assert max(done for done, _ in told) == (700, 700)
 
 
 def test_what_is_large_stays_and_what_is_small_is_merged():

@@ -44,6 +44,8 @@ def test_streamed_sog_lists_every_part(tmp_path, small_leaves):
         for part in parts:
             assert part["offset"] == 0
             assert read_scene(tmp_path / "out" / index["filenames"][part["file"]]).count == part["count"]
+    assert all(level.scene.sh.shape == (len(level.scene), *SCENE.sh.shape[1:]) for level in levels)
+    assert all(level.scene.sh.untyped_storage().nbytes() == 4 for level in levels), "harmonics stay in the files"
     means = torch.cat([level.scene.means for level in levels])
     low, high = (torch.tensor(index["tree"]["bound"][end]) for end in ("min", "max"))
     torch.testing.assert_close(torch.stack([low, high]), torch.stack([means.amin(dim=0), means.amax(dim=0)]))
@@ -84,7 +86,7 @@ def test_a_run_that_was_cut_short_is_resumed(tmp_path, small_leaves, monkeypatch
     written, resumed = streamed.write_level, []
 
     def cut(folder, name, number, parts):
-        written(folder, name, number, parts[:1] if number else parts)
+        written(folder, name, number, list(parts)[:1] if number else parts)
         if number:
             raise KeyboardInterrupt
 

@@ -20,12 +20,9 @@ def chunks_of(means: Float[Tensor, "n 3"], largest: int = MAX_CHUNK_GAUSSIANS) -
     first = torch.ones(len(codes), dtype=torch.bool)  # whether a chunk begins at a place
     if len(codes):
         first[1:] = False
-    open_ = torch.ones_like(first)  # whether the place's chunk has too many
     for depth in range(1, BITS + 1):
-        _, places, counts = torch.unique_consecutive(
-            torch.stack([first.cumsum(0), open_.long()]), dim=1, return_inverse=True, return_counts=True
-        )
-        open_ = counts[places] > largest
+        places = first.cumsum(0) - 1
+        open_ = torch.bincount(places)[places] > largest
         if not open_.any():
             break
         cells = codes >> 3 * (BITS - depth)

@@ -10,12 +10,12 @@ import json
 import math
 import re
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -28,11 +28,11 @@ from aaplug.io.atomic import make_folder, replacing
 from aaplug.io.scenes import gltf, write_scene
 from aaplug.io.scenes.pyramid_folder import Level
 from aaplug.system.errors import OutputError, UsageError, reason
+from aaplug.system.executors import Threads
 
 LEAF_GAUSSIANS = 1 << 16  # of the finest level in a part of space
 SWITCH = 1.5  # rate at which a viewer should change level, as a multiple of the coarser level's own
 TILE_SWITCH = 2.0  # the same of a tile, whose box holds the Gaussians' extents and so begins nearer than they do
-EXTENT = 3.0  # standard deviations to which a tile's box holds its splats
 PLAYCANVAS_TANGENT = math.tan(math.radians(22.5))  # of half the field of view that its distances are meant for
 UPDATE_SHARE = 1 / 16  # of the first distance: PlayCanvas chooses levels again when the camera moved so far
 MAX_SCREEN_ERROR = 16.0  # px, `maximumScreenSpaceError` of CesiumJS by default
@@ -40,6 +40,7 @@ ALWAYS = 1e6  # error of the root over that of the coarsest level, so that somet
 SPLATS = [gltf.SPLATS, gltf.SPZ]
 SETTINGS, PAGE = "settings.json", "index.html"
 Box = Float[Tensor, "2 3"]  # smallest and largest coordinates
+EMPTY_BOX = ((math.inf,) * 3, (-math.inf,) * 3)
 
 
 @dataclass(frozen=True)
@@ -50,12 +51,14 @@ class Stream:
     index: name of the index.
     content: name of a part's file.
     program: the viewer's program, as a file or folder of node_modules.
+    extent: standard deviations to which a part's box holds its Gaussians.
     """
 
     viewer: str
     index: str
     content: str
     program: str
+    extent: float = 0.0
 
     def part(self, level: int, leaf: int) -> str:
         """Path of a part, from its level and its part of space."""
@@ -64,7 +67,7 @@ class Stream:
 
 STREAMS = {
     "sog": Stream("playcanvas", "lod-meta.json", "meta.json", "playcanvas/build/playcanvas.min.mjs"),
-    "3dtiles": Stream("cesium", "tileset.json", "splats.spz.glb", "cesium/Build/Cesium"),
+    "3dtiles": Stream("cesium", "tileset.json", "splats.spz.glb", "cesium/Build/Cesium", 3.0),
 }
 
 
@@ -74,20 +77,26 @@ def leaves_of(finest: Level) -> Int[Tensor, " chunks"]:
     return (torch.bincount(finest.chunks).cumsum(0) - 1) // LEAF_GAUSSIANS
 
 
-def parts_of(level: Level, leaves: Int[Tensor, " chunks"]) -> list[Gaussians]:
+def parts_of(level: Level, leaves: Int[Tensor, " chunks"]) -> Iterator[Gaussians]:
     """A level's Gaussians by part of space."""
     assert level.chunks is not None
     owners = leaves[level.chunks]
-    return [level.scene[(owners == leaf).nonzero().squeeze(1)] for leaf in range(int(leaves.max()) + 1)]
+    for leaf in range(int(leaves.max()) + 1):
+        yield level.scene[(owners == leaf).nonzero().squeeze(1)]
 
 
-def write_level(folder: Path, name: StreamName, number: int, parts: Sequence[Gaussians]) -> None:
-    """Write the parts of a level, replacing what is there."""
-    for leaf, part in enumerate(parts):
+def write_level(folder: Path, name: StreamName, number: int, parts: Iterable[Gaussians]) -> None:
+    """Write the parts of a level, replacing what is there, in as many threads as torch has."""
+
+    def write(item: tuple[int, Gaussians]) -> None:
+        leaf, part = item
         if len(part):
             path = folder / STREAMS[name].part(number, leaf)
             make_folder(path.parent)
             write_scene(path, part, overwrite=True)
+
+    for _ in Threads(torch.get_num_threads()).map(write, enumerate(parts)):
+        pass
 
 
 def part_folders(folder: Path, name: StreamName) -> set[Path]:
@@ -111,9 +120,9 @@ def write_index(folder: Path, name: StreamName, levels: Sequence[Level], rate: f
 
     rate: of training, in px per world unit.
     """
-    leaves = leaves_of(levels[0])
-    parts = list(zip(*(parts_of(level, leaves) for level in levels), strict=True))
-    index, settings = {"sog": _lod_meta, "3dtiles": _tileset}[name](STREAMS[name], parts, rate)
+    leaves, stream = leaves_of(levels[0]), STREAMS[name]
+    parts = [[_Part.of(part, stream.extent) for part in parts_of(level, leaves)] for level in levels]
+    index, settings = {"sog": _lod_meta, "3dtiles": _tileset}[name](stream, [*zip(*parts, strict=True)], rate)
     for file, content in {SETTINGS: settings, STREAMS[name].index: index}.items():  # the index last: it is the mark
         with replacing(folder / file, overwrite=True) as stream:
             stream.write(json.dumps(content, indent=1).encode())
@@ -146,20 +155,32 @@ def write_page(folder: Path, name: StreamName, modules: Path) -> None:
         stream.write(files(stream_pages).joinpath(f"{name}.html").read_bytes())
 
 
+class _Part(NamedTuple):
+    """What an index tells of a part.  size: its Gaussians.  box: empty where the part is."""
+
+    size: int
+    box: Box
+
+    @classmethod
+    def of(cls, part: Gaussians, extent: float) -> "_Part":
+        """extent: standard deviations to which the box holds the Gaussians."""
+        return cls(len(part), box_of(part, extent).double() if len(part) else torch.tensor(EMPTY_BOX).double())
+
+
 Indexed = tuple[dict[str, Any], dict[str, Any]]  # an index, and the viewer's settings
 
 
-def _lod_meta(stream: Stream, parts: Sequence[Sequence[Gaussians]], rate: float) -> Indexed:
-    counts = [sum(map(len, level)) for level in zip(*parts, strict=True)]
+def _lod_meta(stream: Stream, parts: Sequence[Sequence[_Part]], rate: float) -> Indexed:
+    counts = [sum(part.size for part in level) for level in zip(*parts, strict=True)]
     filenames, children = [], []
     for leaf, levels in enumerate(parts):
         lods = {}
         for number, part in enumerate(levels):
-            if len(part):
-                lods[str(number)] = {"file": len(filenames), "offset": 0, "count": len(part)}
+            if part.size:
+                lods[str(number)] = {"file": len(filenames), "offset": 0, "count": part.size}
                 filenames.append(stream.part(number, leaf))
-        children.append({"bound": _bound(_box(levels, 0.0)), "lods": lods})
-    tree = {"bound": _bound(_box([part for levels in parts for part in levels], 0.0)), "children": children}
+        children.append({"bound": _bound(_box(levels)), "lods": lods})
+    tree = {"bound": _bound(_box([part for levels in parts for part in levels])), "children": children}
     facts = {"version": 1, "asset": {"generator": "aaplug"}, "count": counts[0], "counts": counts}
     settings = {
         "app.scene.gsplat": {"antiAlias": True, "splatBudgetMode": "limit", "splatBudget": 0},
@@ -170,15 +191,15 @@ def _lod_meta(stream: Stream, parts: Sequence[Sequence[Gaussians]], rate: float)
     return facts | {"lodLevels": len(counts), "filenames": filenames, "tree": tree}, settings
 
 
-def _tileset(stream: Stream, parts: Sequence[Sequence[Gaussians]], rate: float) -> Indexed:
+def _tileset(stream: Stream, parts: Sequence[Sequence[_Part]], rate: float) -> Indexed:
     def error(number: int) -> float:
         return MAX_SCREEN_ERROR * 2.0**number / (TILE_SWITCH * rate)
 
     tiles = []
     for leaf, levels in enumerate(parts):
-        volume, tile = _volume(_box(levels, EXTENT)), None
+        volume, tile = _volume(_box(levels)), None
         for number, part in enumerate(levels):
-            if len(part):
+            if part.size:
                 finer = {} if tile is None else {"children": [tile]}
                 content = {"content": {"uri": stream.part(number, leaf)}}
                 about = {"boundingVolume": volume, "geometricError": error(number) if finer else 0.0}
@@ -186,13 +207,13 @@ def _tileset(stream: Stream, parts: Sequence[Sequence[Gaussians]], rate: float) 
         tiles.append(tile)
     root = {
         "transform": torch.eye(4).flatten().tolist(),
-        "boundingVolume": _volume(_box([part for levels in parts for part in levels], EXTENT)),
+        "boundingVolume": _volume(_box([part for levels in parts for part in levels])),
         "geometricError": ALWAYS * error(len(parts[0]) - 1),
         "refine": "REPLACE",
         "children": tiles,
     }
     extension = {"extensionsUsed": SPLATS, "extensionsRequired": SPLATS}
-    counts = [sum(map(len, level)) for level in zip(*parts, strict=True)]
+    counts = [sum(part.size for part in level) for level in zip(*parts, strict=True)]
     index = {
         "asset": {"version": "1.1", "generator": "aaplug", "extras": {"counts": counts}},
         "extensionsUsed": ["3DTILES_content_gltf"],
@@ -203,10 +224,10 @@ def _tileset(stream: Stream, parts: Sequence[Sequence[Gaussians]], rate: float) 
     return index, {"Cesium3DTileset": {"maximumScreenSpaceError": MAX_SCREEN_ERROR, "dynamicScreenSpaceError": False}}
 
 
-def _box(parts: Sequence[Gaussians], extent: float) -> Box:
-    """The box around the Gaussians of parts to `extent` standard deviations."""
-    lows, highs = zip(*(box_of(part, extent) for part in parts if len(part)), strict=True)
-    return torch.stack([torch.stack(lows).amin(dim=0), torch.stack(highs).amax(dim=0)]).double()
+def _box(parts: Sequence[_Part]) -> Box:
+    """The box around the boxes of parts."""
+    lows, highs = torch.stack([part.box for part in parts]).unbind(dim=1)
+    return torch.stack([lows.amin(dim=0), highs.amax(dim=0)])
 
 
 def _bound(box: Box) -> dict[str, list[float]]:

@@ -7,6 +7,7 @@ the scene's order nor on the number of threads.
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -21,6 +22,7 @@ from aaplug.methods.conversion import MERGED
 from aaplug.methods.filters.matched import PIXEL_VARIANCE
 from aaplug.methods.filters.smoothing import fuse_stored
 from aaplug.system.errors import UsageError
+from aaplug.system.executors import Threads
 from aaplug.system.monitor import Tell
 
 MIN_MERGED_SHARE = 0.02  # of the clusters: after a round that merges fewer, more is allowed to change
@@ -107,18 +109,23 @@ def merge_in_chunks(
         visible = torch.full((len(scene),), torch.nan)
     order = _order(scene, chunks)
     along, total = chunks[order], len(scene) - (goal.count or 0)
-    parts, start = [], 0
-    while start < len(scene):
-        last = along[min(start + GAUSSIANS_PER_BATCH, len(scene)) - 1]
-        stop = int(torch.searchsorted(along, last, right=True))
-        batch = order[start:stop]
+    stops = [0]
+    while stops[-1] < len(scene):
+        last = along[min(stops[-1] + GAUSSIANS_PER_BATCH, len(scene)) - 1]
+        stops.append(int(torch.searchsorted(along, last, right=True)))
+    gone = dict.fromkeys(stops, 0)  # Gaussians that a batch is rid of, by its start
 
-        def tell_batch(done: int, start: int = start) -> None:
-            tell(min(start + done, total), total)
+    def merge_batch(ends: tuple[int, int]) -> tuple[Gaussians, Int[Tensor, " b"]]:
+        def tell_batch(done: int) -> None:
+            gone[ends[0]] = done
+            tell(min(sum(gone.values()), total), total)
 
+        batch = order[slice(*ends)]
         clusters = clusters_of(scene[batch], rates[batch], chunks[batch], visible[batch])
-        parts.append(_merge_batch(clusters, scene[batch], goal, tell_batch))
-        start = stop
+        return _merge_batch(clusters, scene[batch], goal, tell_batch)
+
+    workers = min(torch.get_num_threads(), len(stops) - 1)
+    parts = [*(Threads(workers).map if workers > 1 else map)(merge_batch, pairwise(stops))]
     lighter = replace(joined([part for part, _ in parts]), origin=None)
     record = Fusion(MERGED, {"rate": f"{goal.rate:.4g}", "from": str(len(scene))})
     return replace(lighter, fused=(*scene.fused, record)), torch.cat([part for _, part in parts])

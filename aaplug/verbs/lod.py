@@ -77,7 +77,8 @@ def lod(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, options:
             `to` names.  None writes nothing.
 
     Returns:
-        The one scene; or all levels, first the scene itself.
+        The one scene; or all levels, first the scene itself.  With `to` and an output, their harmonics are NaN and
+        take no memory: they are in the files.
 
     Raises:
         AaplugError: as `render`; also, the scene holds 2D Gaussians or none at all.
@@ -99,7 +100,12 @@ def lod(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, options:
             if path is not None and options.to is not None:
                 earlier = part_folders(path, options.to)
                 (path / STREAMS[options.to].index).unlink(missing_ok=True)
-            levels = list(_levels(maker, path, files))
+            levels = []
+            for level in _levels(maker, path, files):
+                kept = level.scene
+                if path is not None and options.to is not None:
+                    kept = replace(kept, sh=torch.full((1, 1, 1), torch.nan).expand(kept.sh.shape))
+                levels.append(level._replace(scene=kept))
             if path is not None and options.to is not None:
                 rates = median_rates(whole.means, job.cameras.train)
                 settings = write_index(path, options.to, levels, float(rates[rates > 0].median()))
@@ -223,7 +229,7 @@ def _levels(maker: _Maker, folder: Path | None, files: Sequence[Path]) -> Iterat
     Streamed levels are cut before the pyramid, which they are made of, lists them; it is removed at the end.
     """
     options = maker.job.options
-    levels: list[Level] = []
+    there: Iterator[Level] = iter(())
     pyramid = folder if options.viewer is None or options.to else None
     goals = goals_of(options, maker.scene)
     manifest = Manifest(_source(maker) if pyramid else "", MAX_CHUNK_GAUSSIANS, len(goals) + 1, ())
@@ -231,28 +237,25 @@ def _levels(maker: _Maker, folder: Path | None, files: Sequence[Path]) -> Iterat
         earlier = read_manifest(pyramid, unfinished=True)
         if earlier.source != manifest.source:
             raise UsageError("resume", f"{folder} holds levels of another scene, other cameras or other options")
-        levels = list(levels_in(pyramid, earlier))
-        manifest = replace(manifest, count=max(len(goals) + 1, len(levels)), levels=earlier.levels)
-        maker.job.monitor.say(f"resumed: {len(levels) - 1} levels are there")
-    levels = levels or [Level(maker.scene, 1.0, chunks_of(maker.scene.means, MAX_CHUNK_GAUSSIANS))]
-    finest = levels[0].chunks
-    assert finest is not None
-    leaves = leaves_of(levels[0])
-    chunk_count = int(finest.max()) + 1
+        there = levels_in(pyramid, earlier)
+        manifest = replace(manifest, count=max(len(goals) + 1, len(earlier.levels)), levels=earlier.levels)
+        maker.job.monitor.say(f"resumed: {len(earlier.levels) - 1} levels are there")
+    made = next(there, None) or Level(maker.scene, 1.0, chunks_of(maker.scene.means, MAX_CHUNK_GAUSSIANS))
+    leaves = leaves_of(made)
     for place in range(len(goals) + 1):
-        if place >= len(levels):
-            levels.append(maker(levels[-1], goals[place - 1]))
-        made = options.to is not None and place < len(manifest.levels)
-        level = levels[place] if made else maker.finished(levels[place])
-        if folder is not None and place >= len(manifest.levels):
+        if place:
+            made = next(there, None) or maker(made, goals[place - 1])
+        resumed = place < len(manifest.levels)
+        level = made if resumed and options.to is not None else maker.finished(made)
+        if folder is not None and not resumed:
             kept = level
             if options.to is not None:
                 write_level(folder, options.to, place, parts_of(level, leaves))
-                kept = levels[place]
+                kept = made
             write_scene(files[place], kept.scene, overwrite=options.overwrite or options.resume)
             if pyramid:
                 assert level.chunks is not None
-                counts = torch.bincount(level.chunks, minlength=chunk_count).tolist()
+                counts = torch.bincount(level.chunks, minlength=len(leaves)).tolist()
                 entry = LevelFile(files[place].name, level.rate, hash_of(files[place]), tuple(counts))
                 manifest = replace(manifest, levels=(*manifest.levels, entry))
                 write_manifest(pyramid, manifest)

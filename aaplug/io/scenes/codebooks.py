@@ -3,6 +3,7 @@
 n: numbers or rows.  c: columns of a row.  p: entries.  Nothing is random: the same input gives the same codebook.
 """
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -19,7 +20,7 @@ def codebook(values: Float[Tensor, " n"], entries: int) -> Float[Tensor, " entri
 
     Where so many values are enough, each number is one of them.
     """
-    ordered = values.double().sort().values
+    ordered = torch.from_numpy(np.sort(values.numpy())).double()  # several times faster than torch's
     distinct = ordered.unique_consecutive()
     if len(distinct) <= entries:
         return torch.cat([distinct, distinct[-1:].expand(entries - len(distinct))]).to(values.dtype)
