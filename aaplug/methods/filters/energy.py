@@ -13,6 +13,7 @@ for a viewer that blurs more than training did.  The method is aaplug's own.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import torch
 from jaxtyping import Float
@@ -30,6 +31,7 @@ MATCHED_VARIANCE = 0.2  # px² at the median training rate: 3DGS's 0.3 minus the
 MAX_FUSED_OPACITY = 0.9999  # cap: matching energy can demand an opacity above 1
 # px² at the median training rate: thinning stops here.  Below it no image changes visibly.
 MIN_THINNED_VARIANCE = 0.01
+GAUSSIANS_AT_ONCE = 1 << 16  # projected, which bounds memory and fits caches
 FIT_VIEWS = 25  # evenly spread training views over which the opacity factor is averaged
 
 
@@ -74,14 +76,16 @@ def _mean_log_factor(
     blur, rules = 0.0 if shown.compensated else shown.kernel, training.convention.rules
     total = torch.zeros_like(scene.logit_opacities, dtype=torch.float64)
     count = torch.zeros_like(total)
-    for camera in views:
-        raw, wide = (project(gaussians, camera, rules=rules) for gaussians in (scene, widened))
+    for start, camera in product(range(0, len(scene), GAUSSIANS_AT_ONCE), views):
+        part = slice(start, start + GAUSSIANS_AT_ONCE)
+        raw, wide = (project(gaussians[part], camera, rules=rules) for gaussians in (scene, widened))
         trained = raw.blurred(training.convention.kernel, training.convention.compensated)
         wide = wide.blurred(blur, compensate=False)
         factor = 0.5 * (trained.dets / wide.dets).log() + (trained.opacities / raw.opacities).log()
-        fitted = sampling_bounds(scene.means[raw.sources], [camera]).seen & factor.isfinite()
-        total.index_add_(0, raw.sources[fitted], factor[fitted].double())
-        count.index_add_(0, raw.sources[fitted], torch.ones_like(factor[fitted], dtype=torch.float64))
+        places = start + raw.sources
+        fitted = sampling_bounds(scene.means[places], [camera]).seen & factor.isfinite()
+        total.index_add_(0, places[fitted], factor[fitted].double())
+        count.index_add_(0, places[fitted], torch.ones_like(factor[fitted], dtype=torch.float64))
     return (total / count.clamp(min=1)).to(scene.logit_opacities)
 
 
