@@ -62,8 +62,11 @@ class Clusters:
         return len(self.means)
 
     def __getitem__(self, index: Tensor | slice) -> "Clusters":
-        """The clusters at `index`; the labels stay as they are."""
-        return replace(self, **{name: column[index] for name, column in self.columns.items()})
+        """The clusters at `index`, a slice or places; the labels stay as they are."""
+        if isinstance(index, slice):
+            return replace(self, **{name: column[index] for name, column in self.columns.items()})
+        # several times faster than [index], and components stay apart in memory
+        return replace(self, **{name: each.t().index_select(-1, index).t() for name, each in self.columns.items()})
 
     @property
     def columns(self) -> dict[str, Tensor]:

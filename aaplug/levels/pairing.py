@@ -24,6 +24,7 @@ ALPHA_WEIGHT = 0.5  # of squared differences of alpha, beside those of red, gree
 NEIGHBOURS = 10  # along a curve that a cluster is compared with, on either side
 CURVE_SHIFTS = (0.0, 0.23, 0.41)  # neighbours that one curve separates lie together on another
 PAIRS_PER_BATCH = 1 << 14  # compared at once: 2 MB, which stay in a core's cache
+GATHER_SHARE = 0.25  # of pairs that are too dear: where there are fewer, gathering the others costs more than it saves
 MIN_COST_SHARE = 1e-6  # of a pair's own energy; float32 does not tell smaller changes of the image
 MAX_JITTER = 0.01  # share by which a cost is raised, so that among equal costs many pairs choose each other
 MAX_COST = 1e30  # of a pair whose cost overflows
@@ -94,13 +95,14 @@ def edges_below(
     for shift in CURVE_SHIFTS:
         order = torch.argsort(curve(clusters.means, shift), stable=True)
         along = clusters[order].by_columns
-        for one, other in _neighbours(len(order), None if fresh is None else fresh[order]):
+        for one, other in _neighbours(along.chunks, None if fresh is None else fresh[order]):
             parts.append(_cheap(along[one], along[other], (order[one], order[other]), rate, tolerance, smallest))
     return Edges.joined(parts)
 
 
-def _neighbours(count: int, fresh: Bool[Tensor, " n"] | None) -> Iterator[tuple[Index, Index]]:
-    """Places along a curve of the pairs to compare, a batch at a time."""
+def _neighbours(chunks: Int[Tensor, " n"], fresh: Bool[Tensor, " n"] | None) -> Iterator[tuple[Index, Index]]:
+    """Places along a curve of the pairs to compare, a batch at a time; some may be of different chunks."""
+    count = len(chunks)
     steps = range(1, min(NEIGHBOURS, count - 1) + 1)
     if fresh is None and count > PAIRS_PER_BATCH:  # whole stretches of the curve need no indices
         for step in steps:
@@ -108,7 +110,7 @@ def _neighbours(count: int, fresh: Bool[Tensor, " n"] | None) -> Iterator[tuple[
                 yield slice(i, j), slice(i + step, j + step)
     elif steps:  # calls cost more than their work, so all steps share batches
         fresh = torch.ones(count, dtype=torch.bool) if fresh is None else fresh
-        near = [(fresh[:-step] | fresh[step:]).nonzero()[:, 0] for step in steps]
+        near = [((fresh[:-step] | fresh[step:]) & (chunks[:-step] == chunks[step:])).nonzero()[:, 0] for step in steps]
         ends = torch.cat(near), torch.cat([places + step for places, step in zip(near, steps, strict=True)])
         yield from zip(*(each.split(PAIRS_PER_BATCH) for each in ends), strict=True)
 
@@ -154,7 +156,8 @@ def costs(a: Clusters, b: Clusters, rate: float, most: float = math.inf) -> Floa
         if most < math.inf:
             dear = cost > most * px2
             cost[dear] = torch.inf
-            left = (~dear).nonzero()[:, 0]
+            if dear.sum() > GATHER_SHARE * len(dear):
+                left = (~dear).nonzero()[:, 0]
     return (cost.maximum(MIN_COST_SHARE * whole) / px2).nan_to_num(MAX_COST).clamp(max=MAX_COST)
 
 
