@@ -9,7 +9,7 @@ import torch
 
 from aaplug.core import shading
 from aaplug.core.gaussians import Gaussians
-from aaplug.core.projection import project
+from aaplug.core.projection import TILT_SHARE, project, with_ray_slopes
 from aaplug.core.shading import shade
 from aaplug.core.spherical_harmonics import sh_colour
 from tests.conftest import make_camera, make_scene, straight_camera
@@ -206,3 +206,18 @@ def test_gradients_of_colours_reach_only_the_gaussians_drawn():
     assert not (touched & ~shown).any()
     constant = sh.grad[:, 0][touched]  # of the first coefficient, where no channel is clamped at black
     assert constant.amax().item() == pytest.approx(0.28209479177387814)
+
+
+def test_ray_slopes_are_those_of_the_mean_depth_behind_a_pixel():
+    """Depth given the pixel, of the Gaussian of the linear projection's pixel and depth, from all its covariances."""
+    scene, camera = make_scene(1, seed=3, dtype=F64), straight_camera()
+    scene = replace(scene, means=torch.tensor([[0.3, -0.2, 4.0]], dtype=F64))
+    x, y, z = scene.means[0].tolist()
+    across, down = (camera.fx / z, 0, -camera.fx * x / z**2), (0, camera.fy / z, -camera.fy * y / z**2)
+    both = torch.tensor([across, down, (0, 0, 1)], dtype=F64)
+    joint = both @ world_covariance(scene) @ both.T
+    joint[:2, :2] += 0.3 * torch.eye(2, dtype=F64)
+    splats = with_ray_slopes(project(scene, camera).blurred(0.3, compensate=False), scene, camera)
+    expected = torch.linalg.solve(joint[:2, :2], joint[:2, 2])
+    assert expected.abs().min() > 1e-4
+    torch.testing.assert_close(splats.ray_slopes[0], TILT_SHARE * expected, rtol=1e-9, atol=0)

@@ -55,6 +55,27 @@ def test_splats_of_equal_depth_are_drawn_in_scene_order(rasterize, order):
     close(image.rgb[4, 4], expected)
 
 
+def test_each_tile_sorts_its_splats_by_their_depth_along_its_middle(rasterize):
+    # the red splat's depth falls by 0.1 to the right of its centre at 8 px: green's until x = 13, tiles change at 16
+    splats = splats_of(((8.0, 4.0), (1e9, 0.0, 1e9), 2.0, 0.5, RED), ((8.0, 4.0), (1e9, 0.0, 1e9), 1.5, 0.5, GREEN))
+    splats = replace(splats, ray_slopes=torch.tensor([[-0.1, 0.0], [0.0, 0.0]], dtype=F64))
+    image = rasterize(splats, (8, 24), BLACK)
+    close(image.rgb[4, :16], torch.tensor([[0.25, 0.5, 0.0]]).expand(16, 3))
+    close(image.rgb[4, 16:], torch.tensor([[0.5, 0.25, 0.0]]).expand(8, 3))
+
+
+def test_gradients_are_those_of_the_order_by_tile():
+    splats, gradients = make_splats(80, (17, 26), seed=4).to(F64), []
+    splats = replace(splats, ray_slopes=0.3 * (splats.means / 7).sin())
+    for draw in (TILED, REFERENCE):
+        values = {name: getattr(splats, name).clone().requires_grad_() for name in ("means", "opacities", "rgb")}
+        image = draw(replace(splats, **values), (17, 26), BLACK)
+        loss = (image.rgb * image.rgb.detach().roll(1, dims=2)).sum()
+        gradients.append(torch.autograd.grad(loss, [*values.values()]))
+    for tiled, exact in zip(*gradients, strict=True):
+        torch.testing.assert_close(tiled, exact, rtol=1e-8, atol=1e-8)
+
+
 @pytest.mark.parametrize(("alpha", "drawn"), [(1.001 / 255, True), (0.999 / 255, False)])
 def test_alphas_below_1_255_are_skipped(rasterize, alpha, drawn):
     variance = 2.0**2 / (2 * math.log(0.5 / alpha))  # alpha two pixels from the centre

@@ -13,6 +13,7 @@ from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.colours import WHITE
 from aaplug.core.conventions import CONVENTIONS, MIP
 from aaplug.core.imaging import average_samples, box_average
+from aaplug.core.lenses import Lens
 from aaplug.core.projection import project
 from aaplug.core.splats import Render
 from aaplug.core.training import TrainingViews
@@ -24,7 +25,9 @@ from aaplug.methods.filters.smoothing import Smoothing3D
 from aaplug.methods.pixel_kernels.surfel import SURFEL
 from aaplug.methods.presets import NEIGHBOURS
 from aaplug.methods.recipes import find_recipe, suited
+from aaplug.options.verbs import RenderOptions
 from aaplug.rendering import renderer as rendering
+from aaplug.rendering.job import Job
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import FrameError, UsageError
 from tests.conftest import ROOT, make_camera, make_scene
@@ -354,6 +357,19 @@ def test_best_is_the_average_of_the_image_of_the_training_size():
     torch.testing.assert_close(box_average(full, 4), boxes, atol=1e-6, rtol=0)
 
 
+def test_order_tile_draws_what_the_reference_does_and_lenses_refuse_it():
+    scene, camera = make_scene(200), make_camera(size=(64, 64))
+    eager, exact = (
+        Renderer.of(scene, [camera], find_recipe("auto", order="tile"), rasterizer=name)(camera).rgb
+        for name in ("eager", "reference")
+    )
+    assert (eager - exact).abs().max() < 1e-4
+    assert (eager - Renderer.of(scene, [camera], rasterizer="eager")(camera).rgb).abs().max() > 1e-3
+    assert Job.of(scene, CameraSet((camera,), ()), RenderOptions(order="tile")).recipe("auto").order == "tile"
+    with pytest.raises(UsageError, match="order: tile is for pinhole views"):
+        Renderer.of(scene, [camera], find_recipe("auto", order="tile"))(replace(camera, lens=Lens("equidistant")))
+
+
 # names ------------------------------------------------------------------------------------------
 
 
@@ -364,6 +380,7 @@ def test_best_is_the_average_of_the_image_of_the_training_size():
         ({"name": "auto", "quality": "great"}, "quality: 'great'"),
         ({"name": "classic", "rate_reference": "global"}, "rate_reference: .*classic"),
         ({"name": "matched", "rate_reference": "newest"}, "rate_reference: 'newest'"),
+        ({"name": "auto", "order": "newest"}, "order"),
     ],
 )
 def test_unknown_names_are_refused(words, culprit):

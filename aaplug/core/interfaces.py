@@ -217,7 +217,10 @@ class Compositor(Protocol):
 
 @runtime_checkable
 class Rasterizer(Protocol):
-    """Composites splats front to back over a background; splats of equal depth keep the given order."""
+    """Composites splats front to back over a background; splats of equal depth keep the given order.
+
+    Front to back is by `Splats2D.depths`, or tile by tile where there are `ray_slopes`.
+    """
 
     @property
     def name(self) -> str:

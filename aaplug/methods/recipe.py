@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.interfaces import Compositor, PixelKernel, ScreenFilter, Selection, WorldFilter
-from aaplug.methods import QUALITIES
+from aaplug.methods import QUALITIES, Order
 from aaplug.methods.pixel_kernels.point import POINT
 from aaplug.system.contracts import Range, check_fields, contract
 from aaplug.system.digests import digest_of_values
@@ -60,6 +60,7 @@ class Recipe:
     grid: smallest number of samples along a pixel's side, at any rate.
     neighbours: weight of the samples on either side of each, in the limit of a sampling rate of 0; see `neighbours_at`.
     takes_quality: `target_rate` is set by the user's choice of quality.
+    order: of splats, by depth: of their centres, or in each tile along the ray of its middle, which pops less.
     levels: how levels of detail are chosen; None draws the finest alone.
     for_discs: name of the recipe that takes its place for scenes of 2D Gaussians.
     time: of a view at 1/4 of the training size, over that of `classic`, as measured; None if it was not.
@@ -76,6 +77,7 @@ class Recipe:
     pixel: PixelKernel = POINT
     compositor: Compositor | None = None
     selection: Selection | None = None
+    order: Order = "depth"
     takes_quality: bool = False
     levels: LevelChoice | None = None
     for_discs: str | None = None

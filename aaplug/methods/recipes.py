@@ -5,7 +5,7 @@ from typing import Annotated
 
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.interfaces import MatchesRates
-from aaplug.methods import QUALITIES, RECIPES
+from aaplug.methods import QUALITIES, RECIPES, Order
 from aaplug.methods.recipe import Recipe, set_by
 from aaplug.system.contracts import Range, contract
 from aaplug.system.errors import UsageError, not_one_of
@@ -17,6 +17,7 @@ def find_recipe(
     *,
     quality: str = "balanced",
     rate_reference: str | None = None,
+    order: Order = "depth",
     target_rate: Annotated[float, Range(0)] | None = None,
 ) -> Recipe:
     """A recipe by name, with the user's choices.
@@ -25,6 +26,7 @@ def find_recipe(
         name: of `RECIPES`.
         quality: of `QUALITIES`: how finely `auto` samples a pixel.
         rate_reference: what `matched` and `auto` compare a Gaussian's sampling rate with.
+        order: of splats; see `Recipe`.
         target_rate: relative rate at which any recipe samples a pixel, instead of its own.
 
     Raises:
@@ -37,6 +39,8 @@ def find_recipe(
         if not isinstance(recipe.screen, MatchesRates):
             raise UsageError("rate_reference", f"recipe '{name}' compares no sampling rates")
         recipe = replace(recipe, screen=recipe.screen.with_reference(rate_reference))
+    if order != recipe.order:
+        recipe = replace(recipe, order=order)
     if recipe.takes_quality:
         recipe = replace(recipe, **set_by(quality))
     return recipe if target_rate is None else replace(recipe, target_rate=target_rate)
@@ -54,4 +58,4 @@ def suited(recipe: Recipe, scene: Gaussians) -> Recipe:
     if recipe.for_discs is None or not scene.flat:
         return recipe
     discs = RECIPES[recipe.for_discs]
-    return replace(discs, name=recipe.name, target_rate=recipe.target_rate)
+    return replace(discs, name=recipe.name, target_rate=recipe.target_rate, order=recipe.order)

@@ -1,13 +1,14 @@
 """The reference rasterizer: every splat at every pixel, in float64, in the order and by the stopping rule of 3DGS.
 
-p: pixels of a strip; c: splats of a chunk.  It has no tiles and no bounding ellipses; strips and chunks bound its
-memory.  Differentiable through autograd.
+p: pixels of a strip; c: splats of a chunk.  It has no bounding ellipses, and tiles only where splats have ray
+slopes; strips and chunks bound its memory.  Differentiable through autograd.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from aaplug.core.colours import Colour
@@ -16,6 +17,7 @@ from aaplug.core.interfaces import Compositor, PixelKernel
 from aaplug.core.rules import RULES_3DGS, Rules
 from aaplug.core.splats import Render, Splats2D
 from aaplug.methods.pixel_kernels.point import POINT
+from aaplug.methods.pixel_kernels.raster_rows import TILE
 
 STRIP_PIXELS = 4096
 CHUNK_SPLATS = 512
@@ -40,13 +42,31 @@ class Reference:
         splats = splats.to(torch.float64)
         splats = splats[torch.sort(splats.depths, stable=True).indices]
         y, x = (torch.arange(side, dtype=torch.float64, device=splats.means.device) + 0.5 for side in hw)
-        strips = [
-            composited(splats, strip, pixel, rules) if compositor is None else compositor.exact(splats, strip, rules)
-            for strip in torch.cartesian_prod(y, x).flip(1).split(STRIP_PIXELS)
+        centres = torch.cartesian_prod(y, x).flip(1)
+        strips = [*_strips(splats, centres)]
+        painted = [
+            composited(drawn, centres[at], pixel, rules)
+            if compositor is None
+            else compositor.exact(drawn, centres[at], rules)
+            for at, drawn in strips
         ]
-        rgb = torch.cat([rgb for rgb, _ in strips]).reshape(*hw, -1)
-        transmittance = torch.cat([t for _, t in strips]).reshape(hw)
-        return over(rgb, 1 - transmittance, background)
+        back = torch.cat([places for places, _ in strips]).argsort()
+        rgb, transmittance = (torch.cat(parts)[back] for parts in zip(*painted, strict=True))
+        return over(rgb.reshape(*hw, -1), 1 - transmittance.reshape(hw), background)
+
+
+def _strips(splats: Splats2D, centres: Float[Tensor, "n 2"]) -> Iterator[tuple[Int[Tensor, " p"], Splats2D]]:
+    """Places of some pixels and their splats, nearest first: of a tile each if splats have ray slopes."""
+    if splats.ray_slopes is None:
+        everywhere = torch.arange(len(centres), device=centres.device)
+        yield from ((places, splats) for places in everywhere.split(STRIP_PIXELS))
+        return
+    tiles, numbers = torch.unique((centres / TILE).floor(), dim=0, return_inverse=True)
+    for number, tile in enumerate(tiles):
+        places = (numbers == number).nonzero().squeeze(1)
+        ahead = ((TILE * (tile + 0.5) - splats.means) * splats.ray_slopes).sum(dim=1)
+        nearest = torch.sort((splats.depths + ahead).clamp(min=0.0), stable=True).indices
+        yield places, splats[nearest]
 
 
 def composited(

@@ -149,7 +149,7 @@ class Job(Generic[O_co]):
         options = self.options
         matches = isinstance(RECIPES.find(recipe, "recipe").screen, MatchesRates)
         reference = options.rate_reference if matches else None
-        return find_recipe(recipe, quality=options.quality, rate_reference=reference)
+        return find_recipe(recipe, quality=options.quality, rate_reference=reference, order=options.order)
 
     def recipes(self: "Job[RecipeOptions]", names: str | Recipe | Sequence[str | Recipe]) -> list[Recipe]:
         """Recipes as `recipe`, fitted to the scene; of "all", those that it has everything for."""

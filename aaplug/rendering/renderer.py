@@ -29,7 +29,7 @@ from aaplug.core.interfaces import Compositor, Rasterizer
 from aaplug.core.kernels import Kernels
 from aaplug.core.lenses import PINHOLE
 from aaplug.core.passes import PASSES, NormalAxes
-from aaplug.core.projection import project, with_depth_slopes
+from aaplug.core.projection import project, with_depth_slopes, with_ray_slopes
 from aaplug.core.pyramids import Cutter, faded
 from aaplug.core.sampling import sampling_bounds
 from aaplug.core.shading import shade
@@ -325,6 +325,8 @@ class Renderer:
         """The recipe, which draws splats on rays if the camera's lens is no pinhole."""
         if camera is None or camera.lens == PINHOLE:
             return self.recipe
+        if self.recipe.order == "tile":
+            raise UsageError("order", "tile is for pinhole views; depth draws all")
         if self.recipe.pixel is not POINT or self.recipe.compositor is not None:
             problem = f"recipe {self.recipe.name} draws pinhole views only"
             raise UsageError("lens", f"{problem}; auto, matched, classic, ewa and mip draw all")
@@ -427,6 +429,8 @@ class Renderer:
             local = replace(splats, sources=splats.sources - start)
             parts.append(replace(shade(local, chunk, camera, self.kernels), sources=splats.sources))
         splats = concatenated(parts)
+        if self.recipe.order == "tile":
+            splats = with_ray_slopes(splats, self.scene, camera)
         _check_colours(splats)
         return with_copies(splats, self.training.convention.rules)
 

@@ -81,6 +81,7 @@ def compare(scenes: ScenesLike, cameras: CamerasLike, output: AnyPath | None, op
             "options": {
                 "quality": options.quality,
                 "rate_reference": options.rate_reference or "pose",
+                "order": options.order,
                 "shown": options.show,
             },
         }

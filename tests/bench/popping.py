@@ -1,57 +1,69 @@
 """Popping: what changes from frame to frame of a turn beyond the motion, by the order in which splats are composited.
 
 Frames are 1° of an orbit apart.  Their FLIP is compared with that of a truth, which sorts the splats of each pixel by
-their depth along its ray and takes 16 samples per pixel; what is above the truth's is popping.  Orders: by the depth of
-centres, as 3DGS; by that along the ray of the middle of a tile; the same with runs of `WINDOW` splats sorted again in
-each pixel (after StopThePop, Radl et al. 2024, arXiv 2402.00525); and by the depth along each pixel's ray.
-
-Under EWA's linear projection a Gaussian's depth, given the pixel, has the mean z + cᵀ C⁻¹ d, with c the covariance of
-depth and pixel, C that of the splat and d the offset from its centre.  `share` multiplies the second term: 0 is 3DGS.
+their depth along its ray and takes 16 samples per pixel; what is above the truth's is popping.  Orders: those of
+`auto`, by depth and by tile, with several shares of the tilt (`projection.TILT_SHARE`); by tile, with runs of `WINDOW`
+splats sorted again in each pixel (after StopThePop, Radl et al. 2024, arXiv 2402.00525); and by the depth along each
+pixel's ray.  The last two are eager code of this bench.
 """
 
 import time
 from dataclasses import replace
-from statistics import mean
+from statistics import mean, median
+from unittest.mock import patch
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from aaplug.core import projection
 from aaplug.core.camera_paths import orbit, up_of
 from aaplug.core.cameras import Camera
 from aaplug.core.colours import Colour
 from aaplug.core.imaging import resampled
 from aaplug.core.kernels import EAGER
-from aaplug.core.projection import rotation_matrices
 from aaplug.core.rules import RULES_3DGS
 from aaplug.core.splats import Splats2D
 from aaplug.evaluation.metrics import flip
 from aaplug.evaluation.protocols import median_depth
 from aaplug.io.photographs import photo_at
 from aaplug.methods.pixel_kernels.raster_rows import TILE, tile_centres
+from aaplug.methods.recipes import find_recipe
 from aaplug.rasterizers.tiled.binning import bands
 from aaplug.rendering.renderer import Renderer
 from tests.bench import heading, row
 from tests.bench.scenes import decibels, trained
 
+TIMED_SCALES = (1.0, 0.5, 0.25)
 DEGREES = 1.0  # of the orbit from frame to frame
 FRAMES = 3
 TRUTH_SAMPLES = 4  # along a pixel's side
 WINDOW = 8  # splats that a pixel sorts again
 VALUES_AT_ONCE = 6_000_000  # alphas held at once
-BEHIND = 1e9  # depth of what a tile does not draw
+TURNS = 15  # frames that are timed, of each order in turn
 CASES = (
-    ("centre", 0.0),
+    ("depth", 0.0),
     *(("tile", share) for share in (0.1, 0.12, 0.15, 0.2, 0.3, 1.0)),
     *((kind, share) for share in (0.2, 1.0) for kind in ("window", "pixel")),
 )
 
 
 @torch.no_grad()
-def main(scene: str = "chair", size: int = 128, photographs: int = 2) -> None:
-    """Print popping, PSNR against photographs and seconds, of the middle of so many px a side."""
+def main(scene: str = "chair", size: int = 128, photographs: int = 2, whole: int = 8, others: bool = True) -> None:
+    """Print popping and PSNR against photographs of the middle of so many px a side; then whole views' PSNR and time.
+
+    others: print other orders and shares than `auto` has.
+    """
     opened = trained(scene)
     renderer, background = opened.renderer("matched", rasterizer="eager"), opened.checkpoint.background
+    orders = {order: opened.renderer(find_recipe("auto", order=order)) for order in ("depth", "tile")}
+
+    def drawn(camera: Camera, kind: str, share: float) -> Float[Tensor, "h w 3"]:
+        if kind not in orders:
+            return composited(renderer, camera, kind, share, background)
+        with patch.object(projection, "TILT_SHARE", share):
+            return orders[kind](camera).rgb
+
     view, up = opened.views(1)[0], up_of(opened.cameras)
     depth = median_depth(opened.scene.means, view)
     turns = [orbit(view, frame * DEGREES / 360, depth, up) for frame in range(FRAMES)]
@@ -69,40 +81,38 @@ def main(scene: str = "chair", size: int = 128, photographs: int = 2) -> None:
     seen = [_middle(v, size) for v in opened.views(photographs)]
     photos = [photo_at(v, v, background) for v in opened.views(photographs)]
     photos = [photo[_start(len(photo), size) :, _start(photo.shape[1], size) :][:size, :size] for photo in photos]
-    heading(f"{scene}, FLIP of the truth's motion: {motion:.4f}", "order", "share", "popping", "PSNR, dB", "s a frame")
-    for kind, share in CASES:
-        started = time.perf_counter()
-        images = [composited(renderer, frame, kind, share, background) for frame in frames]
-        seconds = (time.perf_counter() - started) / FRAMES
+    heading(f"{scene}, FLIP of the truth's motion: {motion:.4f}", "order", "share", "popping", "PSNR, dB")
+    for kind, share in CASES if others else (("depth", 0.0), ("tile", projection.TILT_SHARE)):
+        images = [drawn(frame, kind, share) for frame in frames]
         popping = mean(flip(images[a], images[b]) or 0.0 for a, b in pairs) - motion
         close = mean(
-            decibels(composited(renderer, camera, kind, share, background).clamp(0, 1), photo)
-            for camera, photo in zip(seen, photos, strict=True)
+            decibels(drawn(camera, kind, share).clamp(0, 1), photo) for camera, photo in zip(seen, photos, strict=True)
         )
-        row(kind, share, f"{popping:.5f}", close, seconds)
-
-
-def depth_gradients(renderer: Renderer, splats: Splats2D, camera: Camera) -> Float[Tensor, "m 2"]:
-    """Change of each Gaussian's depth along a pixel's ray, in world units per px right and down: C⁻¹ c."""
-    scene, turn = renderer.scene[splats.sources], camera.cam_from_world[:3, :3]
-    root = turn.float() @ rotation_matrices(scene.unit_quats) * scene.scales[:, None, :]
-    x, y, z = ((scene.means.double() - camera.centre) @ turn.T).float().unbind(dim=1)
-    right = (camera.fx / z)[:, None] * (root[:, 0] - (x / z)[:, None] * root[:, 2])
-    down = (camera.fy / z)[:, None] * (root[:, 1] - (y / z)[:, None] * root[:, 2])
-    c_x, c_y = ((across * root[:, 2]).sum(dim=1) for across in (right, down))
-    xx, xy, yy = splats.covs.unbind(dim=1)
-    return torch.stack([yy * c_x - xy * c_y, xx * c_y - xy * c_x], dim=1) / splats.dets[:, None]
+        row(kind, share, f"{popping:.5f}", close)
+    heading(f"{scene}, whole views", "order", "PSNR, dB", *(f"ms at {scale:g}" for scale in TIMED_SCALES))
+    views = opened.views(whole)
+    close = {
+        order: mean(decibels(paint(v).rgb.clamp(0, 1), photo_at(v, v, background)) for v in views)
+        for order, paint in orders.items()
+    }
+    times = {(order, scale): [] for order in orders for scale in TIMED_SCALES}
+    for _ in range(TURNS):
+        for (order, scale), taken in times.items():
+            started = time.perf_counter()
+            orders[order](view.scaled(scale))
+            taken.append(1000 * (time.perf_counter() - started))
+    for order in orders:
+        row(order, close[order], *(median(times[order, scale]) for scale in TIMED_SCALES))
 
 
 def composited(
     renderer: Renderer, camera: Camera, kind: str, share: float, background: Colour
 ) -> Float[Tensor, "h w 3"]:
-    """A view with splats composited in one of the orders."""
-    splats = renderer.splats(camera)
-    gradients, grid = (
-        share * depth_gradients(renderer, splats, camera),
-        (-(-camera.height // TILE), -(-camera.width // TILE)),
-    )
+    """A view with splats sorted by tile, then in each pixel: all of them, or in runs."""
+    with patch.object(projection, "TILT_SHARE", share):
+        splats = projection.with_ray_slopes(renderer.splats(camera), renderer.scene, camera)
+    assert splats.ray_slopes is not None
+    grid = (-(-camera.height // TILE), -(-camera.width // TILE))
     places = torch.stack(tile_centres(splats.means), dim=1)
     image = splats.means.new_tensor(background).expand(grid[0] * grid[1], TILE * TILE, 3).clone()
     done = 0
@@ -114,17 +124,11 @@ def composited(
             k = torch.arange(longest)
             drawn = k < bins.counts[tiles, None]
             ids = bins.splats[(bins.first[tiles, None] + k).clamp(max=len(bins.splats) - 1)].long()
-            if kind != "centre":
-                middle = bins.origins[tiles, None] + TILE / 2 - splats.means[ids]
-                depths = splats.depths[ids] + (gradients[ids] * middle).sum(dim=2)
-                order = depths.masked_fill(~drawn, BEHIND).argsort(dim=1, stable=True)
-                ids, drawn = ids.gather(1, order), drawn.gather(1, order)
             offsets = bins.origins[tiles, None, None] + places - splats.means[ids][:, :, None]
             alpha = torch.where(drawn[..., None], alphas(splats, ids, offsets), 0.0)
             ids = ids[..., None].expand_as(alpha)
-            if kind in ("window", "pixel"):
-                depths = splats.depths[ids] + (gradients[ids[..., 0]][:, :, None] * offsets).sum(dim=3)
-                alpha, ids = sorted_again(alpha, ids, depths, longest if kind == "pixel" else WINDOW)
+            depths = splats.depths[ids] + (splats.ray_slopes[ids[..., 0]][:, :, None] * offsets).sum(dim=3)
+            alpha, ids = sorted_again(alpha, ids, depths, longest if kind == "pixel" else WINDOW)
             light = torch.cumprod(1 - alpha, dim=1)
             weights = alpha * torch.cat([torch.ones_like(light[:, :1]), light[:, :-1]], dim=1)
             weights = torch.where(light >= RULES_3DGS.min_transmittance, weights, 0.0)

@@ -154,9 +154,12 @@ def composites_the_exact_image(compositor: Compositor) -> None:
 
 @law_of("rasterizer")
 def draws_what_the_reference_draws(rasterizer: Rasterizer) -> None:
-    """Images of any size are the reference's, whatever the order of the splats, the rules and the sizes of splats."""
-    for hw, rules, log_sigmas in product(((33, 44), (1, 1), (17, 3)), (RULES_3DGS, COARSE), ((-2.0, 0.0), (0.0, 4.0))):
+    """Images of any size are the reference's, whatever the rules, and the order, sizes and ray slopes of splats."""
+    sizes, sigmas = ((33, 44), (1, 1), (17, 3)), ((-2.0, 0.0), (0.0, 4.0))
+    for hw, rules, log_sigmas, tilt in product(sizes, (RULES_3DGS, COARSE), sigmas, (None, 0.0, 0.3)):
         splats = make_splats(150, hw, seed=1, log_sigmas=log_sigmas)
+        if tilt is not None:
+            splats = replace(splats, ray_slopes=tilt * (splats.means.roll(1, dims=0) / max(hw)).cos())
         splats = splats[torch.randperm(150, generator=torch.Generator().manual_seed(2))]
         image, exact = (draw(splats, hw, SKY, POINT, rules=rules) for draw in (rasterizer, Reference()))
         require(image.rgb.shape == (*hw, 3) and image.alpha.shape == hw, f"an image of {hw} is of another shape")

@@ -4,7 +4,8 @@ m: splats; s: spans; p: pairs of a splat and a tile; t: tiles.
 
 Each splat, nearest first, is paired with the tiles that its cut-off ellipse overlaps.  An ellipse is convex, so in one
 row of tiles it covers a run of columns.  A splat becomes one span per row, a span becomes pairs, and a stable sort of
-the pairs by tile does the rest.
+the pairs by tile does the rest.  Where splats have ray slopes, the pairs are first sorted by their depth along the ray
+of their tile's middle.
 
 Bands of whole tile rows bound the memory: each exceeds the budget of candidate pairs by at most its last row.
 """
@@ -86,15 +87,18 @@ def bands(
     gradients: bool = False,
 ) -> Iterator[Bins]:
     """Bins of bands of tile rows, from the top; with `pairs` if `gradients`.  Equal depths keep the given order."""
-    depths = splats.depths
-    # The bits of positive floats sort like the floats, and integers sort faster.
-    keys = depths.contiguous().view(torch.int32) if depths.dtype == torch.float32 else depths
-    order = torch.sort(keys, stable=True).indices
+    order = _sorted(splats.depths)
     columns = (splats.means, splats.covs, splats.dets, splats.opacities)
     limits = splats.means.new_tensor([grid[1], grid[0], rules.min_alpha])
     boxes = TileBoxes(*kernels.run(TABLE, *columns, limits))
     for rows in _rows(boxes, grid, min(MAX_PAIRS, max(1, int(memory / PAIR_BYTES)))):
-        yield _bin(boxes, order, rows, grid[1], kernels, gradients)
+        yield _bin(splats, boxes, order, rows, grid[1], kernels, gradients)
+
+
+def _sorted(depths: Float[Tensor, " m"]) -> Int[Tensor, " m"]:
+    """The order of depths; the bits of positive floats sort like the floats, and integers sort faster."""
+    keys = depths.contiguous().view(torch.int32) if depths.dtype == torch.float32 else depths
+    return torch.sort(keys, stable=True).indices
 
 
 def _table_rows(
@@ -142,7 +146,13 @@ def _rows(boxes: TileBoxes, grid: tuple[int, int], budget: int) -> list[tuple[in
 
 
 def _bin(
-    boxes: TileBoxes, order: Int[Tensor, " m"], rows: tuple[int, int], columns: int, kernels: Kernels, gradients: bool
+    drawn: Splats2D,
+    boxes: TileBoxes,
+    order: Int[Tensor, " m"],
+    rows: tuple[int, int],
+    columns: int,
+    kernels: Kernels,
+    gradients: bool,
 ) -> Bins:
     """Pair splats, nearest first, with the tiles that they overlap in a band of rows."""
     heights = (boxes.bottom.clamp(*rows) - boxes.top.clamp(*rows)).index_select(0, order)
@@ -152,17 +162,30 @@ def _bin(
     first = first.short() if size <= MAX_SHORT_TILES else first  # half as many bits sort in half the time
     starts = starts_of(widths)
     tiles, splats = kernels.run(PAIRS, runs_of(starts, widths), starts, first, owners)
-    by_tile, pairs = torch.sort(tiles, stable=True)
-    lists = kernels.run(LISTS, splats, pairs)[0] if len(pairs) else splats.new_zeros(1)
     tile = torch.arange(size, device=order.device)
+    origins = (torch.stack([tile % columns, tile // columns + rows[0]], dim=1) * TILE).to(boxes.table)
+    by_ray = _by_ray(drawn, splats, origins, tiles) if drawn.ray_slopes is not None else None
+    by_tile, pairs = torch.sort(tiles if by_ray is None else tiles.index_select(0, by_ray), stable=True)
+    pairs = pairs if by_ray is None else by_ray.index_select(0, pairs)
+    lists = kernels.run(LISTS, splats, pairs)[0] if len(pairs) else splats.new_zeros(1)
     ends = torch.searchsorted(by_tile, tile.to(tiles), right=True)
     counts = torch.diff(ends, prepend=ends.new_zeros(1))
-    origins = torch.stack([tile % columns, tile // columns + rows[0]], dim=1) * TILE
     by_splat = None
     if gradients:
         ahead = torch.cat([starts, starts.new_full((1,), len(pairs))])
         by_splat = Pairs(order, ahead.index_select(0, down), pairs, by_tile)
-    return Bins(lists, ends - counts, counts, origins.to(boxes.table), columns, by_splat)
+    return Bins(lists, ends - counts, counts, origins, columns, by_splat)
+
+
+def _by_ray(
+    drawn: Splats2D, splats: Int[Tensor, " p"], origins: Float[Tensor, "t 2"], tiles: Int[Tensor, " p"]
+) -> Int[Tensor, " p"]:
+    """The order of pairs by the depth of their splats along the rays of their tiles' middles."""
+    assert drawn.ray_slopes is not None
+    columns = [*(drawn.means - TILE / 2).unbind(dim=1), *drawn.ray_slopes.unbind(dim=1), drawn.depths]
+    x, y, right, down, depths = (column.index_select(0, splats) for column in columns)
+    left, top = (column.index_select(0, tiles.int()) for column in origins.unbind(dim=1))
+    return _sorted(torch.addcmul(depths, right, left - x).addcmul_(down, top - y).clamp_(min=0.0))
 
 
 def _spans(
