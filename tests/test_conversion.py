@@ -5,7 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from aaplug.core.cameras import Camera
+import aaplug
+from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.conventions import CONVENTIONS, MIP
 from aaplug.core.projection import project
 from aaplug.core.rules import Rules
@@ -128,3 +129,20 @@ def test_a_view_in_which_training_drew_a_gaussian_not_does_not_count():
     scene = replace(scene, means=torch.zeros(1, 3), convention=replace(CONVENTIONS["classic"], rules=Rules(near=5.0)))
     both, alone = (MatchedEnergy()(scene, TrainingViews.of(scene, views)) for views in ([near, far], [far]))
     torch.testing.assert_close(both.logit_opacities, alone.logit_opacities)
+
+
+def test_discs_are_smoothed_within_their_planes_and_stay_discs(cameras, tmp_path):
+    """Variances grow by 0.2 / rate² along two axes, and the integral over the disc stays (AA-2DGS's flat kernel)."""
+    scene = make_scene(20, seed=2)
+    scene = replace(scene, log_scales=scene.log_scales.index_fill(1, torch.tensor(2), -30.0), flat=True)
+    aaplug.convert(scene, CameraSet(tuple(cameras), ()), tmp_path / "discs.ply", min_seen=0.0)
+    fused = read_scene(tmp_path / "discs.ply").gaussians()
+    added = 0.2 / TrainingViews.of(scene, cameras, min_seen=0.0).bounds.highest_or_coarsest.square()
+    torch.testing.assert_close(fused.scales[:, :2].square(), scene.scales[:, :2].square() + added[:, None])
+    before, after = (s.opacities * s.scales[:, :2].prod(dim=1) for s in (scene, fused))
+    torch.testing.assert_close(after, before, rtol=1e-4, atol=0)
+    assert fused.flat
+    assert fused.convention == scene.convention
+    for options in ({"form": "matched-energy"}, {"viewer": "spark"}):
+        with pytest.raises(UsageError, match=r"2D Gaussians.*form mip-splatting smooths them"):
+            aaplug.convert(scene, CameraSet(tuple(cameras), ()), None, min_seen=0.0, **options)

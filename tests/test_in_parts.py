@@ -76,10 +76,12 @@ def test_a_failure_in_a_late_part_leaves_no_file(tmp_path: Path, cameras):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["in.ply"]
 
 
-def test_discs_are_not_converted(tmp_path: Path, cameras):
+def test_discs_are_converted_by_smoothing_alone(tmp_path: Path, cameras):
     path = saved(tmp_path, replace(make_scene(5), flat=True))
     with pytest.raises(UsageError, match="2D Gaussians"):
         list(convert_parts(read_scene(path), cameras, FORMS["matched-energy"]))
+    [part] = convert_parts(read_scene(path), cameras, FORMS["mip-splatting"])
+    assert part.flat
 
 
 def test_strangers_are_noticed_on_a_sample(tmp_path: Path, cameras):

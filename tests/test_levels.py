@@ -15,7 +15,7 @@ from aaplug.core.cameras import CameraSet
 from aaplug.core.chunks import chunks_of
 from aaplug.core.conventions import ANTIALIASED, CLASSIC, MIP
 from aaplug.core.gaussians import Gaussians
-from aaplug.core.projection import project
+from aaplug.core.projection import project, rotation_matrices
 from aaplug.evaluation.metrics import psnr
 from aaplug.io.scenes import read_scene
 from aaplug.io.scenes.scene import Scene
@@ -25,6 +25,7 @@ from aaplug.levels.covariances import area, areas, covariances, pack, quats_of, 
 from aaplug.levels.merging import Goal, merge, merge_in_chunks
 from aaplug.levels.pairing import MAX_COST, costs, edges_below, matching
 from aaplug.methods.conversion import MERGED, blurring
+from aaplug.methods.pixel_kernels.surfel import SURFEL
 from aaplug.rendering.assumed import cameras_around
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import FrameError, OutputError, UsageError
@@ -286,10 +287,31 @@ def test_a_level_may_have_no_gaussians(tmp_path, sample_cameras):
     assert renderer(sample_cameras.test[0].scaled(1 / 16)).alpha.max() == 0
 
 
+def test_levels_of_discs_are_discs_across_the_thinnest_axes_of_what_they_merge(tmp_path, sample_cameras):
+    """Two discs side by side in a plane become one in it, as wide as 3D Gaussians would become."""
+    pair = replace(make_scene(2), quats=torch.tensor([[0.9, 0.3, 0.2, 0.1]]).expand(2, 4), flat=True)
+    pair = replace(pair, log_scales=torch.tensor([[-2.0, -2.0, -30.0]]).expand(2, 3))
+    plane = rotation_matrices(pair.unit_quats)[0]
+    pair = replace(pair, means=plane[:, 0] * torch.tensor([[-0.02], [0.02]]))
+    solid = replace(pair, flat=False)
+    one, other = (merge(scene, torch.full((2,), 50.0), Goal.of_count(1, scene)) for scene in (pair, solid))
+    scales = one.log_scales[0]
+    assert one.flat
+    assert scales[2] == -30
+    torch.testing.assert_close(scales[:2], other.log_scales[0].sort(descending=True).values[:2])
+    normal = rotation_matrices(one.unit_quats)[0, :, 2]
+    assert abs(normal @ plane[:, 2]) > 1 - 1e-5
+    levels = aaplug.lod(pair, sample_cameras, tmp_path, levels=1, min_seen=0.0)
+    drawn = aaplug.Renderer.of(aaplug.read_scene(tmp_path), sample_cameras, rasterizer="eager")
+    assert all(level.scene.flat for level in levels)
+    assert drawn.recipe.pixel is SURFEL
+    assert drawn(sample_cameras.test[0].scaled(1 / 4)).rgb.isfinite().all()
+
+
 def test_what_cannot_be_merged_is_refused(tmp_path):
     flat = replace(make_scene(9), flat=True)
-    with pytest.raises(UsageError, match="2D Gaussians"):
-        aaplug.lod(flat, simplify=0.5)
+    with pytest.raises(UsageError, match="2D Gaussians, whose levels aaplug alone draws"):
+        aaplug.lod(flat, simplify=0.5, viewer="spark")
     with pytest.raises(UsageError, match="no Gaussians"):
         aaplug.lod(make_scene(0), simplify=0.5)
     away = make_scene(9)

@@ -18,10 +18,13 @@ from aaplug.system.errors import UsageError
 def smoothed_by(scene: Gaussians, log_sigma: Float[Tensor, "n k"], volume: bool) -> Gaussians:
     """Convolve each Gaussian with one of standard deviation e^log_sigma; -inf changes nothing.
 
-    log_sigma: one for all axes of a Gaussian, or one per axis.  volume: scale opacities by the volume factor.
+    log_sigma: one for all axes of a Gaussian, or one per axis; discs are smoothed within their planes only (AA-2DGS's
+        world-space flat kernel).  volume: scale opacities by the volume factor, of a disc that of its face.
     """
     if log_sigma.shape not in ((len(scene), 1), (len(scene), 3)):
         raise UsageError("log_sigma", f"expected [{len(scene)}, 1] or [{len(scene)}, 3], got {[*log_sigma.shape]}")
+    if scene.flat:
+        log_sigma = torch.cat([log_sigma.expand(-1, 3)[:, :2], torch.full_like(log_sigma[:, :1], -torch.inf)], dim=1)
     log_scales = 0.5 * torch.logaddexp(2 * scene.log_scales, 2 * log_sigma)
     smoothed = replace(scene, log_scales=log_scales)
     if not volume:

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from aaplug.core.cameras import Camera
-from aaplug.core.gaussians import MIN_OPACITY, Gaussians
+from aaplug.core.gaussians import MAX_LOG_SCALE, MIN_OPACITY, Gaussians
 from aaplug.core.rules import RULES_3DGS
 from aaplug.core.sampling import median_rates
 from aaplug.core.spherical_harmonics import COLOUR_OFFSET, SH_C0
@@ -183,12 +183,16 @@ def _shapes(clusters: Clusters, scene: Gaussians) -> dict[str, Tensor]:
     px2 = clusters.rates.double().square()
     variances, axes = torch.linalg.eigh(unpack(blur(covs, -scene.convention.kernel / px2)))
     variances = variances.maximum((MIN_SIGMA**2 / px2)[:, None])
+    if scene.flat:  # the disc across the thinnest axis
+        variances, axes = variances.flip(1), axes.flip(2)
     axes = axes * torch.linalg.det(axes)[:, None, None]  # a reflection becomes a rotation
     opacities = clusters.opacities / excess
     if scene.convention.compensated:
         opacities = opacities * area(covs) / area(pack((axes * variances[:, None]) @ axes.mT))
     logits = opacities.clamp(MIN_OPACITY, MAX_OPACITY).logit()
     log_scales = 0.5 * variances.log()
+    if scene.flat:
+        log_scales[:, 2] = -MAX_LOG_SCALE
     return {"means": clusters.means, "quats": quats_of(axes), "log_scales": log_scales, "logit_opacities": logits}
 
 

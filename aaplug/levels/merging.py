@@ -21,7 +21,6 @@ from aaplug.levels.pairing import Edges, edges_below, matching
 from aaplug.methods.conversion import MERGED
 from aaplug.methods.filters.matched import PIXEL_VARIANCE
 from aaplug.methods.filters.smoothing import fuse_stored
-from aaplug.system.errors import UsageError
 from aaplug.system.executors import Threads
 from aaplug.system.monitor import Tell
 
@@ -81,11 +80,8 @@ def merge(
 
     rates: training's sampling rate of each Gaussian, px per world unit; see `rates_of`.
     visible: share of each Gaussian that views show, see `visibility`; None where nothing is known of any.
-
-    Raises:
-        UsageError: the scene holds 2D Gaussians.
     """
-    if len(scene) <= (goal.count or 1) and not scene.flat:
+    if len(scene) <= (goal.count or 1):
         return scene
     return merge_in_chunks(scene, rates, torch.zeros(len(scene), dtype=torch.int64), goal, tell, visible)[0]
 
@@ -100,10 +96,9 @@ def merge_in_chunks(
 ) -> tuple[Gaussians, Int[Tensor, " m"]]:
     """A lighter scene and the chunk of each of its Gaussians, ascending; see `merge`.
 
-    No Gaussian of it stands for those of different chunks.
+    No Gaussian of it stands for those of different chunks.  2D Gaussians stay flat: discs across the thinnest axes of
+    the covariances that they are merged to.
     """
-    if scene.flat:
-        raise UsageError(scene.name, "holds 2D Gaussians, which cannot be merged")
     scene = fuse_stored(scene)
     if visible is None:
         visible = torch.full((len(scene),), torch.nan)

@@ -46,12 +46,16 @@ MIP_SPLATTING = Form(Smoothing3D(), uses_bounds=True)
 def fuse(scene: Gaussians, training: TrainingViews | None, form: Form = MATCHED_ENERGY) -> Gaussians:
     """Convert a scene to the Mip rule: fuse its stored 3D filter, or apply `form` if it stores none.
 
+    2D Gaussians keep their rule; `MIP_SPLATTING` smooths them within their planes.
+
     training: may be None if the scene stores a 3D filter.
 
     Raises:
         UsageError: something is fused already, the scene needs nothing, or cameras are missing.
     """
-    _check_convertible(scene)
+    if not (scene.flat and isinstance(form.filter, Smoothing3D)):
+        _check_discs(scene)
+    _check_unblurred(scene)
     if form.skips == scene.convention and scene.filter_3d is None:
         raise UsageError(scene.name, "was trained by the Mip rule and stores no 3D filter: there is nothing to fuse")
     if scene.filter_3d is not None:
@@ -60,7 +64,7 @@ def fuse(scene: Gaussians, training: TrainingViews | None, form: Form = MATCHED_
         raise UsageError(scene.name, "has no stored 3D filter: its conversion needs the training cameras")
     else:
         converted = form.filter(scene, training)
-    return replace(converted, convention=MIP)
+    return converted if scene.flat else replace(converted, convention=MIP)
 
 
 def fuse_for(scene: Gaussians, training: TrainingViews, viewer: Viewer) -> Gaussians:
@@ -73,7 +77,8 @@ def fuse_for(scene: Gaussians, training: TrainingViews, viewer: Viewer) -> Gauss
     """
     if viewer.convention is None:
         return fuse_stored(scene)
-    _check_convertible(scene)
+    _check_discs(scene)
+    _check_unblurred(scene)
     scene = fuse_stored(viewer.shown(scene))
     trained, shown = scene.convention, viewer.convention
     if trained == shown:
@@ -90,8 +95,7 @@ def carried(scene: Gaussians, training: TrainingViews, convention: Convention) -
     """
     if scene.convention == convention:
         return scene
-    if scene.flat:
-        raise UsageError(scene.name, "holds 2D Gaussians, which closed-form conversion does not support")
+    _check_discs(scene)
     variance = scene.convention.kernel - convention.kernel
     if convention.compensated and not scene.convention.compensated:  # the smallest need room to keep their energy
         variance = max(variance, FITTED_VARIANCE)
@@ -114,9 +118,13 @@ def fused_in(scene: Gaussians) -> str:
     return "; ".join(describe(fusion) for fusion in scene.fused) or "nothing"
 
 
-def _check_convertible(scene: Gaussians) -> None:
+def _check_discs(scene: Gaussians) -> None:
     if scene.flat:
-        raise UsageError(scene.name, "holds 2D Gaussians, which closed-form conversion does not support")
+        works = "form mip-splatting smooths them within their planes, for 2DGS's own renderers"
+        raise UsageError(scene.name, f"holds 2D Gaussians, whose pixel filter no other rule can replace; {works}")
+
+
+def _check_unblurred(scene: Gaussians) -> None:
     if blurs := blurring(scene.fused):
         done = "; ".join(map(describe, blurs))
         raise UsageError(scene.name, f"already has {done} fused; converting it again would blur it twice")

@@ -58,4 +58,5 @@ def suited(recipe: Recipe, scene: Gaussians) -> Recipe:
     if recipe.for_discs is None or not scene.flat:
         return recipe
     discs = RECIPES[recipe.for_discs]
-    return replace(discs, name=recipe.name, target_rate=recipe.target_rate, order=recipe.order)
+    kept = {name: getattr(recipe, name) for name in ("name", "target_rate", "order", "levels")}
+    return replace(discs, **kept)

@@ -130,6 +130,7 @@ NO_TAG = "nothing: the file has no tag"
 SMALLEST = 0.125  # px²: quads of less than two half pixels
 CLASSIC_VIEWER = Viewer("classic", "3DGS", CLASSIC, "nothing: anti-aliasing is off by default")
 MIP_VIEWER = Viewer("mip", "Mip-Splatting's viewers", MIP, "a kernel of 0.1, the default")
+DISC_VIEWER = Viewer("2dgs", "2DGS's renderers", None, "none", recipe="2dgs")
 
 
 def _spark(name: str, convention: Convention, settings: str) -> Viewer:

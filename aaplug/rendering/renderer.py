@@ -479,8 +479,12 @@ def _filtered(scene: Gaussians, training: TrainingViews, recipe: Recipe) -> Gaus
 def own_look(
     scene: SceneLike, training: TrainingViews, rasterizer: str | Rasterizer = "auto", background: Background = "auto"
 ) -> Renderer:
-    """A renderer of the scene by training's own rule, at any size (recipe `matched`); its finest level alone."""
-    return Renderer.of(scene, training, find_recipe("matched"), rasterizer=rasterizer, background=background)
+    """A renderer of the scene by training's own rule, at any size (recipe `matched`); its finest level alone.
+
+    2D Gaussians are drawn as discs, by `2dgs-matched` with one sample per pixel.
+    """
+    recipe = replace(find_recipe("matched"), for_discs=find_recipe("auto").for_discs)
+    return Renderer.of(scene, training, recipe, rasterizer=rasterizer, background=background)
 
 
 @contract

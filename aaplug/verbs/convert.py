@@ -15,8 +15,8 @@ from aaplug.io.atomic import AnyPath, refuse_existing
 from aaplug.io.scenes import SceneLike, check_scene_output, write_parts, write_scene
 from aaplug.io.scenes.scene import SceneFrames
 from aaplug.methods import FORMS
-from aaplug.methods.conversion import MATCHED_ENERGY, Form, blurring, fuse
-from aaplug.methods.viewers import MIP_VIEWER, Viewer, find_viewer
+from aaplug.methods.conversion import MATCHED_ENERGY, MIP_SPLATTING, Form, blurring, fuse
+from aaplug.methods.viewers import DISC_VIEWER, MIP_VIEWER, Viewer, find_viewer
 from aaplug.options.verbs import ConvertOptions
 from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.rendering.renderer import own_look
@@ -66,9 +66,9 @@ def convert(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opti
         AaplugError: as `render`; also, something is fused already.
         KeyboardInterrupt: Ctrl-C stopped the optimization; nothing is written.
     """
-    rule, path = _rule(options), None if output is None else Path(output)
-    job = Job.of(scene, cameras, options)
-    viewer = rule if isinstance(rule, Viewer) else MIP_VIEWER
+    job, path = Job.of(scene, cameras, options), None if output is None else Path(output)
+    rule = _rule(options, job.scene.flat)
+    viewer = rule if isinstance(rule, Viewer) else _shown_by(job)
     files = {"overwrite": options.overwrite, **viewer.spz(options.spz_axes)}
     frames = job.scene.frames
     outputs = [path / file.name for file in frames.paths] if path and frames else []
@@ -87,8 +87,8 @@ def convert(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opti
     return result
 
 
-def _rule(options: ConvertOptions) -> Form | Viewer:
-    """The rule to convert for: a viewer's, or the Mip rule by a closed form."""
+def _rule(options: ConvertOptions, flat: bool) -> Form | Viewer:
+    """The rule to convert for: a viewer's, or the Mip rule by a closed form; flat: of 2D Gaussians."""
     viewer = find_viewer(options.viewer)
     if viewer is not None:
         if options.form is not None or options.variance is not None:
@@ -96,8 +96,14 @@ def _rule(options: ConvertOptions) -> Form | Viewer:
         return viewer
     if options.steps is not None:
         raise UsageError("steps", "belongs to the fit to a viewer; name one with `viewer`")
-    form = MATCHED_ENERGY if options.form is None else FORMS.find(options.form, "form")
+    default = MIP_SPLATTING if flat else MATCHED_ENERGY
+    form = default if options.form is None else FORMS.find(options.form, "form")
     return form if options.variance is None else form.with_variance(options.variance)
+
+
+def _shown_by(job: Job[ConvertOptions]) -> Viewer:
+    """What shows a closed form right."""
+    return DISC_VIEWER if job.scene.flat else MIP_VIEWER
 
 
 def _closed_form(job: Job[ConvertOptions], form: Form) -> Converted:
@@ -108,7 +114,7 @@ def _closed_form(job: Job[ConvertOptions], form: Form) -> Converted:
         training = TrainingViews.of(gaussians, job.cameras, min_seen=job.options.min_seen)
         job.say_assumed(own_look(gaussians, training))
     fused = fuse(gaussians, training, form)
-    return Converted(len(fused), fused, MIP_VIEWER)
+    return Converted(len(fused), fused, _shown_by(job))
 
 
 def _converted_frames(
@@ -127,7 +133,7 @@ def _converted_frames(
             write_scene(output, fused, **files)
             count += len(fused)
             tell(done, len(frames))
-    return Converted(count, None, MIP_VIEWER)
+    return Converted(count, None, _shown_by(job))
 
 
 def _converted_in_parts(job: Job[ConvertOptions], form: Form, path: Path, threads: int, files: Any) -> Converted:
@@ -141,7 +147,7 @@ def _converted_in_parts(job: Job[ConvertOptions], form: Form, path: Path, thread
             check_frame_of(scene, train, job.options.min_seen)
     with job.monitor.progress("converting", "Gaussians") as tell:
         write_parts(path, convert_parts(scene, train, form, tell, threads=threads), scene.count, **files)
-    return Converted(scene.count, None, MIP_VIEWER)
+    return Converted(scene.count, None, _shown_by(job))
 
 
 def _fitted(job: Job[ConvertOptions], viewer: Viewer) -> Converted:

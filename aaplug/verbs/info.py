@@ -147,7 +147,7 @@ def _problems(scene: Scene, statistics: Survey, comments: Sequence[str]) -> Iter
     if statistics.filtered:
         yield "its filter_3D is not fused, and viewers ignore it: `aaplug convert` fuses it"
     if scene.flat:
-        yield "2D Gaussians: recipe auto draws them as discs, as 2DGS does; they cannot be converted"
+        yield "2D Gaussians: recipe auto draws them as discs, as 2DGS does; no viewer of `aaplug viewers` does"
     farthest = max(statistics.low.abs().max().item(), statistics.high.abs().max().item())
     extent = (statistics.high - statistics.low).max().item()
     if 0 < extent < MIN_STEPS * ULP * farthest:

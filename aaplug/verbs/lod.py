@@ -53,7 +53,7 @@ from aaplug.methods.filters.smoothing import fuse_stored
 from aaplug.methods.viewers import MIP_VIEWER, Viewer, find_viewer
 from aaplug.options.verbs import LodOptions
 from aaplug.rendering.job import CamerasLike, Job, running
-from aaplug.rendering.renderer import Renderer
+from aaplug.rendering.renderer import Renderer, own_look
 from aaplug.rendering.visibility import MAX_VIEWS, visibility
 from aaplug.system.digests import digest_of_values
 from aaplug.system.errors import FormatError, FrameError, OutputError, UsageError
@@ -143,9 +143,17 @@ class _Maker:
     def of(cls, scene: Gaussians, job: Job[LodOptions]) -> "_Maker":
         """The maker that the options ask for."""
         viewer = find_viewer(job.options.viewer or (job.options.to and STREAMS[job.options.to].viewer))
-        if job.cameras.assumed and not job.options.tuning:
+        if scene.flat and viewer is not None:
+            problem = "holds 2D Gaussians, whose levels aaplug alone draws"
+            raise UsageError(scene.name, f"{problem}: leave out `viewer` and `to`, or give 3D Gaussians")
+        if scene.flat and job.options.tuning:
+            job.monitor.say("2D Gaussians are merged alone: they have no fast gradients to tune by")
+        if job.cameras.assumed and (scene.flat or not job.options.tuning):
             return cls(scene, job, None, (), viewer)
-        return cls(scene, job, job.look(job.options.tuning or MAX_VIEWS), job.views, viewer)
+        look = job.look(job.options.tuning or MAX_VIEWS)
+        if scene.flat:  # what views show of discs is found by 3D Gaussians without thickness, whose gradients are fast
+            look = own_look(replace(scene, flat=False), look.training, look.rasterizer, look.background)
+        return cls(scene, job, look, job.views, viewer)
 
     def __call__(self, before: Level, goal: Goal) -> Level:
         """The level for a goal."""
@@ -179,7 +187,7 @@ class _Maker:
 
     def _tuned(self, level: Level) -> Level:
         options, look = self.job.options, self.look
-        if not options.tuning or look is None:
+        if not options.tuning or look is None or self.scene.flat:
             return level
         if self.viewer is not None and level.scene is self.scene:
             usual = steps_for(self.scene, self.viewer)
@@ -196,7 +204,7 @@ class _Maker:
         """Visibility of each Gaussian; None where nobody knows the cameras."""
         if self.look is None or self.job.cameras.assumed:
             return None
-        look = self.look if before.scene is self.scene else self.look.showing(before.scene)
+        look = self.look if before.scene is self.scene else self.look.showing(replace(before.scene, flat=False))
         scale = max(goal.rate, before.rate / 2)  # below that, many of its Gaussians are too faint to be drawn
         with self.job.monitor.progress("looking", "views") as tell:
             return visibility(look, self.views, scale, tell)
