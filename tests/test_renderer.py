@@ -28,7 +28,7 @@ from aaplug.methods.recipes import find_recipe, suited
 from aaplug.options.verbs import RenderOptions
 from aaplug.rendering import renderer as rendering
 from aaplug.rendering.job import Job
-from aaplug.rendering.renderer import Renderer
+from aaplug.rendering.renderer import Renderer, own_look
 from aaplug.system.errors import FrameError, UsageError
 from tests.conftest import ROOT, make_camera, make_scene
 
@@ -86,6 +86,7 @@ def test_auto_draws_discs_for_a_scene_of_2d_gaussians_only(cameras):
     assert Renderer.of(scene, cameras, rasterizer="eager").recipe.pixel is not SURFEL
     matched = Renderer.of(flat, cameras, "matched", rasterizer="eager")
     assert matched.recipe is RECIPES["matched"], "a named recipe is kept"
+    assert own_look(flat, TrainingViews.of(flat, cameras)).recipe.pixel is SURFEL
     best = suited(find_recipe("auto", quality="best"), flat)
     assert best.samples_at(0.25) == 4
 
