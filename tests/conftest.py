@@ -31,6 +31,7 @@ from aaplug.evaluation.laws.base import make_splats as make_splats
 from aaplug.io.cameras import read_cameras
 from aaplug.io.images import write_png
 from aaplug.io.scenes import read_scene, write_scene
+from aaplug.lab.learned import NAMES
 from aaplug.lab.pixel_size import PixelSizes
 from aaplug.rasterizers import RASTERIZERS
 from aaplug.rasterizers.tiled import Tiled, on_demand
@@ -191,14 +192,17 @@ def straight_camera(
 
 
 def sized(scene: Gaussians, always: bool = False) -> Gaussians:
-    """The scene with the pixel sizes of Multi-Scale 3DGS; in most views some Gaussians are too small or too large.
+    """The scene with the columns that recipes read: pixel sizes of Multi-Scale 3DGS, and learned filters.
+
+    By the first, in most views some Gaussians are too small or too large.
 
     always: every Gaussian is drawn at every size.
     """
     n = len(scene)
     base = (torch.arange(n) % 4 == 0) | always
     sizes = PixelSizes(torch.full((n,), 4.0), torch.full((n,), 8.0), base)
-    return replace(scene, extras=sizes.extras)
+    learned = {name: torch.linspace(-0.3, 0.3, n).roll(k) for k, name in enumerate(NAMES)}
+    return replace(scene, extras=sizes.extras | learned)
 
 
 def splats_of(*rows: tuple) -> Splats2D:

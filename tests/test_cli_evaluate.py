@@ -59,7 +59,7 @@ def test_all_leaves_out_what_does_not_suit_the_scene(cli):
     code, out, err = cli("evaluate scene.ply --cameras . --recipe all --scale 0.25 --json")
     assert code == 0
     assert "recipe multi-scale left out: the scene lacks" in err
-    assert set(json.loads(out)["_aaplug"]["recipes"]) == set(RECIPES) - {"multi-scale"}
+    assert set(json.loads(out)["_aaplug"]["recipes"]) == set(RECIPES) - {"multi-scale", "learned"}
 
 
 def test_a_protocol_names_itself_and_its_flavours(cli):

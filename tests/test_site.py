@@ -27,7 +27,7 @@ TOUR = ROOT / "examples" / "tour.ipynb"
 METHODS = (GUIDES / "methods.md").read_text()
 MOST = 2_000_000  # bytes of all pictures
 PAPER = re.compile(r"\]\(https://(arxiv\.org/abs/\d{4}\.\d{5}|doi\.org/\S+)\)")
-NOT_IN_TABLES = {"multi-scale", "playcanvas", "playcanvas-classic"}  # needs columns; are of viewers.md
+NOT_IN_TABLES = {"multi-scale", "learned", "playcanvas", "playcanvas-classic"}  # need columns; are of viewers.md
 OURS = ("aaplug", "PlayCanvas")  # first words of the sources that are no papers
 
 

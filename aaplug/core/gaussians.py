@@ -7,6 +7,7 @@ Activated values (scales, opacities, unit quaternions) are properties.
 
 import hashlib
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -21,6 +22,7 @@ from aaplug.system.errors import UsageError
 
 MAX_LOG_SCALE = 30.0  # larger |ln s| overflow float32 once squared; values are clamped on use
 COEFFICIENTS = (1, 4, 9, 16, 25)  # per channel, of degree 0 to 4
+LEARNED_COLUMN = re.compile(r"filter_(scale|opacity)_\d+")  # name of an extra that fine-tuning learns
 MIN_OPACITY = 1e-7  # keeps the logit finite in float32
 
 
@@ -133,6 +135,11 @@ class Gaussians:
     def columns(self) -> dict[str, Tensor]:
         """Every parameter that is present, by name."""
         return {name: value for name, value in vars(self).items() if isinstance(value, Tensor)}
+
+    @property
+    def learned(self) -> tuple[str, ...]:
+        """Names of the extras that hold learned filters."""
+        return tuple(name for name in self.extras if LEARNED_COLUMN.fullmatch(name))
 
     @property
     def tracked(self) -> bool:

@@ -11,7 +11,7 @@ compositor, rasterizer and recipe.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
@@ -75,6 +75,18 @@ class MatchesRates(Protocol):
         Raises:
             UsageError: there is no reference of that name.
         """
+        ...
+
+
+@runtime_checkable
+class ReadsColumns(Protocol):
+    """A screen filter that reads further columns of the scene, `Gaussians.extras`, by name."""
+
+    @property
+    def columns(self) -> tuple[str, ...]: ...  # noqa: D102
+
+    def reading(self, values: Mapping[str, Float[Tensor, " m"]]) -> ScreenFilter:
+        """The same filter for splats with these values of the columns."""
         ...
 
 

@@ -18,6 +18,7 @@ from aaplug.core.sampling import SamplingBounds
 from aaplug.methods.filters.smoothing import NYQUIST_VARIANCE
 
 Leaves = dict[str, Tensor]
+LEARNED_COLUMNS = "learned"  # leaf of the extras that hold learned filters, if the scene has any
 WHOLE = ("means", "quats", "log_scales", "logit_opacities")  # leaves that are columns of the scene
 
 RATES: Mapping[str, float] = {  # 3DGS's, per step; that of the means is a share of the scene's extent
@@ -34,6 +35,8 @@ EXTENT_MARGIN = 1.1  # times the training cameras' farthest distance from their 
 def leaves_of(scene: Gaussians) -> Leaves:
     """Copies of every parameter."""
     leaves = {name: getattr(scene, name) for name in WHOLE} | {"dc": scene.sh[:, :1], "rest": scene.sh[:, 1:]}
+    if scene.learned:
+        leaves[LEARNED_COLUMNS] = torch.stack([scene.extras[name] for name in scene.learned], dim=1)
     return {name: value.detach().clone() for name, value in leaves.items()}
 
 
@@ -44,8 +47,10 @@ def scene_of(leaves: Mapping[str, Tensor], like: Gaussians) -> Gaussians:
     """
     values = {name: leaves[name] for name in WHOLE}
     sh = torch.cat([leaves["dc"], leaves["rest"]], dim=1)
-    dropped = {} if len(sh) == len(like) else {"origin": None, "extras": {}}
-    return replace(like, **values, **dropped, sh=sh)
+    if len(sh) != len(like):
+        return replace(like, **values, sh=sh, origin=None, extras={})
+    learned = zip(like.learned, leaves[LEARNED_COLUMNS].unbind(dim=1), strict=True) if like.learned else ()
+    return replace(like, **values, sh=sh, extras={**like.extras, **dict(learned)})
 
 
 def between(start: Gaussians, end: Gaussians, share: float) -> Gaussians:

@@ -7,6 +7,7 @@ from aaplug.lab.elliptical import ELLIPTICAL
 from aaplug.lab.filters import ADAPTIVE, ANISOTROPIC, BALANCED, FLAT, LARGEST_FOCAL, SCALE_ADAPTIVE
 from aaplug.lab.gaussian_blending import GAUSSIAN_BLENDING as WINDOWED_LIGHT
 from aaplug.lab.integral import INTEGRAL
+from aaplug.lab.learned import LEARNED as BY_LEARNED_COLUMNS
 from aaplug.lab.obbl import BOUNDED_BAND_LIMIT, RENORMALIZED
 from aaplug.lab.pixel_size import BY_PIXEL_SIZE
 from aaplug.lab.surfel_mip import SURFEL_MIP
@@ -126,6 +127,14 @@ MATCHED_INTEGRAL = Recipe(
     "comparison: slower than matched and no better",
     pixel=INTEGRAL,
     time=6.0,
+    promises=Promises(equals_training=True),
+)
+LEARNED = Recipe(
+    "learned",
+    BY_LEARNED_COLUMNS,
+    "LOD-GS's learned filters (arXiv 2507.00554) on a scene that is trained: size and opacity by rate, then matched",
+    "one sample per pixel, for scenes of aaplug finetune --learn-filters",
+    time=1.3,
     promises=Promises(equals_training=True),
 )
 AA_2DGS = Recipe(

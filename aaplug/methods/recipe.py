@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 from aaplug.core.gaussians import Gaussians
-from aaplug.core.interfaces import Compositor, PixelKernel, ScreenFilter, Selection, WorldFilter
+from aaplug.core.interfaces import Compositor, PixelKernel, ReadsColumns, ScreenFilter, Selection, WorldFilter
 from aaplug.methods import QUALITIES, Order
 from aaplug.methods.pixel_kernels.point import POINT
 from aaplug.system.contracts import Range, check_fields, contract
@@ -117,7 +117,11 @@ class Recipe:
     @contract
     def lacks(self, scene: Gaussians) -> str | None:
         """The columns that a scene lacks for this recipe, in words; None if nothing."""
-        return None if self.selection is None else self.selection.lacks(scene)
+        if self.selection is not None:
+            return self.selection.lacks(scene)
+        columns = self.screen.columns if isinstance(self.screen, ReadsColumns) else ()
+        lacking = ", ".join(name for name in columns if name not in scene.extras)
+        return f"the scene lacks {lacking}; `aaplug finetune --learn-filters` makes them" if lacking else None
 
 
 # 100,000 Gaussians take some 20 ms on two cores, and 27 % of a large scene's a third of the time without levels

@@ -260,6 +260,8 @@ class FinetuneOptions(WritingOptions, ViewOptions):
     """Views that the result is measured on, by name or split; training views are what it is tuned on."""
     method: Annotated[str, names(kind="method")] = "consistency"
     """consistency makes one model for all scales; mipmap-gs makes one for a single --scale, as Mipmap-GS does."""
+    learn_filters: bool = False
+    """Learn a filter for each Gaussian by image size, for `--recipe learned`; the Gaussians stay as they are."""
     scale: Annotated[Sequence[float], SCALES] = tuple(LOSS_WEIGHTS)
     """Sizes against the training size that must look right, beside the training size itself."""
     steps: Annotated[int | None, STEPS] = None

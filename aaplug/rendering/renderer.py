@@ -25,7 +25,7 @@ from aaplug.core.culling import cull
 from aaplug.core.exposures import cells, sample_cameras
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.imaging import average_samples
-from aaplug.core.interfaces import Compositor, Rasterizer
+from aaplug.core.interfaces import Compositor, Rasterizer, ReadsColumns
 from aaplug.core.kernels import Kernels
 from aaplug.core.lenses import PINHOLE
 from aaplug.core.passes import PASSES, NormalAxes
@@ -448,12 +448,15 @@ class Renderer:
             splats = recipe.selection(splats, chunk)
         if recipe.pixel.needs_depth_slopes:
             splats = with_depth_slopes(splats, chunk, camera)
-        own = splats.sources
+        own, screen = splats.sources, recipe.screen
+        if isinstance(screen, ReadsColumns):
+            found = {name: chunk.extras[name] for name in screen.columns if name in chunk.extras}
+            screen = screen.reading({name: column.index_select(0, own) for name, column in found.items()})
         if not isinstance(places, int):
             splats = replace(splats, sources=places.index_select(0, own))
         elif places:
             splats = replace(splats, sources=own + places)
-        splats = recipe.screen(splats, camera, training)
+        splats = screen(splats, camera, training)
         if camera.exposure is not None:
             splats = splats.convolved(cells(splats, camera), compensate=True, floor=0.0)
         if shares is not None:

@@ -8,11 +8,13 @@ from pathlib import Path
 from statistics import mean
 from typing import Any
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import Gaussians
+from aaplug.core.interfaces import ReadsColumns
 from aaplug.core.sampling import sampling_bounds
 from aaplug.evaluation.engine import Candidate, compare
 from aaplug.evaluation.report.contact_sheet import contact_sheet
@@ -20,8 +22,9 @@ from aaplug.evaluation.results import Report, results
 from aaplug.evaluation.truth import MEMORY, Truth, back_projected, source_of, upsampled
 from aaplug.evaluation.upsamplers import find_upsampler
 from aaplug.finetuning import METHODS
+from aaplug.finetuning.parameters import LEARNED_COLUMNS
 from aaplug.finetuning.session import tune, tuned_scene
-from aaplug.finetuning.settings import Settings, settings_of
+from aaplug.finetuning.settings import CONSISTENCY_SETTINGS, Settings, settings_of
 from aaplug.finetuning.state import TuningJob
 from aaplug.io.atomic import AnyPath, check_output, replacing
 from aaplug.io.images import write_png
@@ -76,8 +79,13 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
         AaplugError: as `render`; also, the checkpoint is of another run, or no gradient is finite.
         KeyboardInterrupt: Ctrl-C stopped the run; its checkpoint is written.
     """
-    method, path = METHODS.find(options.method, "method"), None if output is None else Path(output)
+    if options.learn_filters and options.method != CONSISTENCY_SETTINGS.name:
+        raise UsageError("learn_filters", f"is a method of its own, beside {options.method}")
+    method = METHODS.find("learned-filters" if options.learn_filters else options.method, "method")
+    path = None if output is None else Path(output)
     settings, viewer = settings_of(method, options), options.viewer or method.viewer
+    if options.viewer and LEARNED_COLUMNS in settings.rates:
+        raise UsageError("viewer", "shows no learned filters; only aaplug's recipe learned does")
     if isinstance(viewer, str):
         viewer = FAST if viewer == FAST.name else VIEWERS.find(viewer, "viewer")
     job = Job.of(scene, cameras, options)
@@ -94,7 +102,11 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
             look = job.look(settings.steps, gradients=True)
         train = job.cameras.train
         before = replace(look, scene=viewer.shown(look.scene), recipe=recipe_of(viewer))
-        start = replace(before, scene=fuse_for(raw, look.training, viewer))
+        fused = fuse_for(raw, look.training, viewer)
+        if isinstance(screen := before.recipe.screen, ReadsColumns):
+            zeros = dict.fromkeys(screen.columns, torch.zeros_like(fused.logit_opacities))
+            fused = replace(fused, extras={**zeros, **fused.extras})
+        start = replace(before, scene=fused)
         truth = Truth(look, truth_source, enlarge=enlarge, memory=MEMORY)
         tuning = TuningJob(start, train, truth, settings, upsampler, method.densify)
         steps = f"{settings.name}, {settings.steps} steps, truth: {truth_source}"

@@ -1,7 +1,7 @@
 """The figures of examples/guides/methods.md on methods that papers name and aaplug has for comparison.
 
 Parts: the time of every recipe; `eaa` beside `analytic`; energy above the Nyquist rate; Group Training;
-separable sinc and anisotropic filters; `obbl` on pixel-aligned Gaussians.
+learned filters; separable sinc and anisotropic filters; `obbl` on pixel-aligned Gaussians.
 """
 
 import math
@@ -9,8 +9,7 @@ import statistics
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,7 +26,6 @@ from aaplug.core.training import TrainingViews
 from aaplug.evaluation.coverage import above_nyquist
 from aaplug.evaluation.metric import Image
 from aaplug.evaluation.truth import Truth, ViewTruth
-from aaplug.io.scenes import read_scene
 from aaplug.lab.elliptical import Elliptical
 from aaplug.lab.integral import HALF_U, HALF_V, Integral, principal_columns
 from aaplug.lab.obbl import BoundedBandLimit
@@ -41,7 +39,7 @@ from tests.bench.scenes import Trained, decibels, trained
 SCALES = (1 / 2, 1 / 4, 1 / 8)
 SINC_RADIUS, SINC_NODES, SINC_VIEWS = 2.0, 12, 2  # px; frequencies of the quadrature; views, which are slow
 WIDE = 1.2  # px: standard deviation of a Gaussian without frequencies above the Nyquist rate
-STEPS = 200  # of fine-tuning
+GROUP_STEPS = {"chair": 600, "snowmiku": 300}  # of fine-tuning; multiples of the periods of Group Training's schedule
 ROUNDS = 5  # of timed renders
 VIEWS = "r_0", "r_40", "r_80", "r_120", "r_160"  # of the chair, as in the tables of methods.md
 CONTEXTS = 12  # views of the feed-forward network, about
@@ -64,11 +62,12 @@ def main(parts: tuple[str, ...] = ()) -> None:
             part(chair)
 
 
-def photographs(opened: Trained, scales: Sequence[float] = SCALES) -> Truths:
-    """The views of `VIEWS` with what they should show."""
+def photographs(opened: Trained, scales: Sequence[float] = SCALES, views: Sequence[Camera] = ()) -> Truths:
+    """Views, by default those of `VIEWS`, with what they should show."""
     truth = Truth(opened.renderer("matched"), "photographs")
-    made = [ViewTruth(truth, view) for view in opened.cameras.test if view.name in VIEWS]
-    assert len(made) == len(VIEWS)
+    views = views or [view for view in opened.cameras.test if view.name in VIEWS]
+    made = [ViewTruth(truth, view) for view in views]
+    assert made
     return [(each.view, {s: image for s in scales if (image := each.compared(s)) is not None}) for each in made]
 
 
@@ -136,17 +135,46 @@ def nyquist(chair: Trained) -> None:
 
 
 def groups(chair: Trained) -> None:
-    """PSNR at 1, 1/2, 1/4 and 1/8 of the chair tuned for `STEPS` steps, and processor seconds: plain and in groups."""
-    truths = photographs(chair, (1.0, *SCALES))
-    row("not tuned", *psnr(chair.renderer("matched"), truths))
-    for name, share in {"plain": 1.0, "groups of 0.6": 0.6}.items():
-        started = time.process_time()
-        options = {"steps": STEPS, "group_share": share, "views": ",".join(VIEWS)}
-        with TemporaryDirectory() as folder:
-            tuned = Path(folder) / "tuned.ply"
-            finetune(chair.scene, chair.cameras, tuned, **options)
-            scene = replace(chair, scene=read_scene(tuned).gaussians())
-        row(name, *psnr(scene.renderer("matched"), truths), f"{time.process_time() - started:.0f}")
+    """PSNR at 1, 1/2, 1/4 and 1/8 after fine-tuning, and processor seconds: plain and in groups."""
+    for name, opened in {"chair": chair, "snowmiku": trained("snowmiku")}.items():
+        views, steps = opened.views(5), GROUP_STEPS[name]
+        truths = photographs(opened, (1.0, *SCALES), views)
+        row(f"{name}, not tuned", *psnr(opened.renderer("matched"), truths))
+        for kind, share in {"plain": 1.0, "groups of 0.6": 0.6}.items():
+            started = time.process_time()
+            tuned = finetune(opened.scene, opened.cameras, None, group_share=share, steps=steps, **options_of(opened))
+            figures = psnr(replace(opened, scene=tuned.scene).renderer("matched"), truths)
+            row(f"{name}, {steps} steps, {kind}", *figures, f"{time.process_time() - started:.0f}")
+
+
+def options_of(opened: Trained) -> dict[str, Any]:
+    """Options of fine-tuning a scene, measured on one view only."""
+    about = opened.checkpoint
+    return {"cull_margin": about.cull_margin, "background": about.background, "views": opened.views(5)[0].name}
+
+
+def learned(chair: Trained) -> None:
+    """PSNR from 1 to 1/16 by photographs, then by the own look, of learned filters and what they stand beside.
+
+    Then the seconds of learning, of one processor, and ms at 1/8 by one sample.
+    """
+    scales = (1.0, *SCALES, 1 / 16)
+    for name, opened in {"chair": chair, "snowmiku": trained("snowmiku")}.items():
+        look, views = Truth(opened.renderer("matched")), opened.views(5)
+        by_photographs = photographs(opened, scales, views)
+        truths = by_photographs, [(view, {s: look(view, s) for s in scales}) for view in views]
+        renderers = {"matched": opened.renderer("matched")}
+        renderers |= {f"auto, {quality}": opened.renderer(quality=quality) for quality in ("fast", "balanced")}
+        seconds = dict[str, float]()
+        for truth in ("photographs", "self"):
+            started = time.process_time()
+            tuned = finetune(opened.scene, opened.cameras, None, learn_filters=True, truth=truth, **options_of(opened))
+            seconds[f"learned, {truth}"] = time.process_time() - started
+            renderers[f"learned, {truth}"] = replace(opened, scene=tuned.scene).renderer("learned")
+        taken = milliseconds(renderers, views[0].scaled(1 / 8))
+        for each, renderer in renderers.items():
+            figures = [figure for truth in truths for figure in psnr(renderer, truth)]
+            row(f"{name}: {each}", *figures, f"{seconds.get(each, 0):.0f}", f"{taken[each]:.0f}")
 
 
 @dataclass(frozen=True)
@@ -277,4 +305,4 @@ def obbl(chair: Trained) -> None:
         row(name, *psnr(renderer, truths), f"{taken[name]:.0f}" if name in taken else "")
 
 
-PARTS = {part.__name__: part for part in (times, eaa, nyquist, groups, sinc, obbl)}
+PARTS = {part.__name__: part for part in (times, eaa, nyquist, groups, learned, sinc, obbl)}

@@ -11,6 +11,7 @@ from torch import Tensor
 from aaplug.core.camera_paths import zoomed
 from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import Gaussians
+from aaplug.core.interfaces import ReadsColumns
 from aaplug.methods import RECIPES
 from aaplug.methods.recipe import Recipe
 from aaplug.rendering.renderer import Renderer
@@ -28,9 +29,11 @@ OPAQUE = 4.0  # added to logits
 EQUAL = 1e-5  # of an image's range
 
 
-def with_levels(scene: Gaussians, base: Tensor) -> Gaussians:
-    """The scene with Multi-Scale 3DGS' columns; base: True where a Gaussian is always drawn."""
-    sizes = {"min_pixel_sizes": 4.0, "max_pixel_sizes": 8.0}
+def with_columns(scene: Gaussians, base: Tensor) -> Gaussians:
+    """The scene with the columns that recipes read, before learning; base: True where a Gaussian is always drawn."""
+    screens = (recipe.screen for recipe in RECIPES.values())
+    others = {name: 0.0 for screen in screens if isinstance(screen, ReadsColumns) for name in screen.columns}
+    sizes = {"min_pixel_sizes": 4.0, "max_pixel_sizes": 8.0} | others
     columns = {name: torch.full((len(scene),), size) for name, size in sizes.items()}
     return replace(scene, extras={**columns, "base_mask": base.float()})
 
@@ -46,7 +49,7 @@ def lone_splats() -> Gaussians:
         log_scales=torch.tensor([[WIDTH, THICKNESS, WIDTH]] * 16).log(),
         logit_opacities=torch.full((16,), OPACITY).logit(),
     )
-    return with_levels(scene, torch.ones(16))
+    return with_columns(scene, torch.ones(16))
 
 
 def _alpha(recipe: Recipe, scene: Gaussians, view: Camera) -> Tensor:
@@ -88,7 +91,7 @@ def _training_images(recipe: Recipe) -> list[Tensor]:
     cameras = [make_camera(eye) for eye in ((0.0, -4.0, 0.0), (3.0, -4.0, 1.0))]
     scene = make_scene(60)
     scene = replace(scene, logit_opacities=scene.logit_opacities + OPAQUE)
-    renderer = Renderer.of(with_levels(scene, torch.arange(60) % 4 == 0), cameras, recipe, rasterizer="eager")
+    renderer = Renderer.of(with_columns(scene, torch.arange(60) % 4 == 0), cameras, recipe, rasterizer="eager")
     return [renderer(camera).rgb for camera in cameras]
 
 

@@ -7,8 +7,9 @@ in the format whose name ends the file's name.
 """
 
 import importlib.util
+import logging
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from functools import partial
 from os import PathLike
@@ -31,6 +32,8 @@ from aaplug.system.contracts import contract
 from aaplug.system.errors import FormatError, OutputError, UsageError
 from aaplug.system.extras import install_command
 from aaplug.system.registry import Registry, named
+
+log = logging.getLogger("aaplug")
 
 HEAD_BYTES = 64  # of a file, passed to each format's `sniff`
 
@@ -59,7 +62,8 @@ class WritableFormat(SceneFormat, Protocol):
     """A format that can be written too.  needs: a package that writing imports, or None.
 
     It comes with aaplug's extra `extra`, if the format has such an attribute, or else of the format's name.  A format
-    whose files another one reads, names it as `read_as`.
+    whose files another one reads, names it as `read_as`.  One that writes the columns of `Gaussians.extras` has a true
+    `keeps_extras`; for others a warning names what is lost.
     """
 
     @property
@@ -206,16 +210,19 @@ def write_parts(
     inputs: files that are being read and may not be replaced.  Errors: see `write_scene`.
     """
     writer = check_scene_output(path, overwrite, inputs)
-    storable = (_storable(path, part) for part in parts)
+    storable = _storable(path, parts, getattr(writer, "keeps_extras", False))
     writer.write(Path(path), storable, count, overwrite, SceneFileOptions(spz_axes=spz_axes, spz_version=spz_version))
 
 
-def _storable(path: str | PathLike[str], part: Gaussians) -> Gaussians:
-    """The part as float32 on the CPU; raises OutputError for values that no renderer can use."""
-    part = replace(part, **{name: column.detach().cpu().float() for name, column in part.columns.items()})
-    if faults := faults_of(part):
-        raise OutputError(path, f"the scene to write cannot be used: {described_faults(faults)}")
-    return part
+def _storable(path: str | PathLike[str], parts: Iterable[Gaussians], keeps_extras: bool) -> Iterator[Gaussians]:
+    """The parts as float32 on the CPU; raises OutputError for values that no renderer can use."""
+    for place, part in enumerate(parts):
+        if part.extras and not keeps_extras and not place:
+            log.warning("%s: the format cannot hold the columns %s; a .ply can", path, ", ".join(part.extras))
+        part = replace(part, **{name: column.detach().cpu().float() for name, column in part.columns.items()})
+        if faults := faults_of(part):
+            raise OutputError(path, f"the scene to write cannot be used: {described_faults(faults)}")
+        yield part
 
 
 def written_format(path: str | PathLike[str]) -> WritableFormat | None:

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from aaplug.core.gaussians import Gaussians
+from aaplug.core.gaussians import LEARNED_COLUMN, Gaussians
 from aaplug.io.atomic import replacing
 from aaplug.io.scenes.columns import DEGREES, FILTER_COLUMN, matrix_of, scene_of, sh_of_colour
 from aaplug.io.scenes.options import SceneFileOptions
@@ -41,6 +41,7 @@ ROWS_PER_WRITE = 1 << 16  # 16 MB
 
 name = "ply"
 needs = None
+keeps_extras = True
 
 
 def sniff(path: Path, head: bytes) -> bool:
@@ -118,6 +119,7 @@ def _check_columns(header: Header) -> list[str]:
         f"coding: {header.coding}": header.coding != LITTLE,
         f"{len(double)} columns of float64, used as float32": double,
         "pixel sizes of Multi-Scale 3DGS, for the recipe multi-scale": all(c in columns for c in EXTRAS),
+        "learned filters, for the recipe learned": any(map(LEARNED_COLUMN.fullmatch, columns)),
         "colours from the columns red, green, blue; no harmonics": coloured,
     }
     return [note for note, applies in notes.items() if applies]
@@ -146,7 +148,8 @@ def _rows(document: Document, degree: int, flat: bool, start: int, stop: int) ->
         colours = np.stack([rows[c].astype(np.float32) for c in BYTE_COLOURS], axis=1)
         harmonics = sh_of_colour(torch.from_numpy(colours) / np.iinfo(np.uint8).max)
         names, values = (*names, *COLOURS), torch.cat([values, harmonics], dim=1)
-    extras = {c: torch.from_numpy(rows[c].astype(np.float32)) for c in EXTRAS if c in (rows.dtype.names or ())}
+    kept = [c for c in rows.dtype.names or () if c in EXTRAS or LEARNED_COLUMN.fullmatch(c)]
+    extras = {c: torch.from_numpy(rows[c].astype(np.float32)) for c in kept}
     return replace(scene_of(names, values, degree, flat), extras=extras)
 
 
@@ -200,13 +203,12 @@ def _records(header: Header, scene: Gaussians) -> np.ndarray:
         old = document.table.take(scene.origin.rows.cpu())
     for p in header.vertex.properties:
         was = old[p.name] if old is not None and p.name in (old.dtype.names or ()) else None
-        if p.name in parameters and not at_once:
-            new = values[:, parameters.index(p.name)]
+        if p.name in scene.extras or (p.name in parameters and not at_once):
+            extra = p.name in scene.extras
+            new = scene.extras[p.name].cpu().numpy() if extra else values[:, parameters.index(p.name)]
             if was is not None and p.code != "f4":
                 new = np.where(was.astype(np.float32) == new, was, new)
             records[p.name] = new
         elif p.name not in parameters and was is not None:
             records[p.name] = was
-        elif p.name in scene.extras:
-            records[p.name] = scene.extras[p.name].cpu().numpy()
     return records
