@@ -1,8 +1,9 @@
 """Upsamplers: an estimate of the truth for views larger than training's.
 
 Bicubic and Lanczos are built in.  A learned one is a file of the user: a network for OpenCV's `dnn_superres` under its
-usual name (ESPCN_x4.pb), or a torch program (.pt2, `torch.export`) that maps [1, 3, h, w] in [0, 1] to [1, 3, H, W].
-The network's image is resized to the size asked for: averaged where it is larger, bicubic where it is smaller.
+usual name (ESPCN_x4.pb), or a program that maps [1, 3, h, w] in [0, 1] to [1, 3, H, W]: an ONNX network (.onnx), which
+OpenCV runs, or torch's (.pt2, `torch.export`).  The network's image is resized to the size asked for: averaged where it
+is larger, bicubic where it is smaller.
 """
 
 import re
@@ -39,11 +40,12 @@ def find_upsampler(name: str) -> Upsampler:
     if name in UPSAMPLERS:
         return UPSAMPLERS[name]
     path = Path(name)
-    if path.suffix not in (".pb", ".pt2"):
-        raise UsageError("upsampler", f"expected {', '.join(UPSAMPLERS)} or a .pb or .pt2 file, got '{name}'")
+    if path.suffix not in (".pb", *PROGRAMS):
+        kinds = f"{', '.join(UPSAMPLERS)} or a .pb, {' or '.join(PROGRAMS)} file"
+        raise UsageError("upsampler", f"expected {kinds}, got '{name}'")
     if not path.is_file():
         raise FormatError(path, "does not exist")
-    network = _opencv(path) if path.suffix == ".pb" else _torch(path)
+    network = _opencv(path) if path.suffix == ".pb" else _program(path)
 
     def upsample(image: Tensor, hw: tuple[int, int]) -> Tensor:
         larger = network(image)
@@ -76,18 +78,38 @@ def _opencv(path: Path) -> Callable[[Tensor], Tensor]:
     return enlarge
 
 
+def _onnx(path: Path) -> Callable[[Tensor], Tensor]:
+    network = cv2.dnn.readNetFromONNX(str(path))
+
+    def run(image: Tensor) -> Tensor:
+        network.setInput(image.numpy())
+        return torch.from_numpy(network.forward())
+
+    return run
+
+
 def _torch(path: Path) -> Callable[[Tensor], Tensor]:
+    return torch.export.load(path).module()
+
+
+def _program(path: Path) -> Callable[[Tensor], Tensor]:
+    load, kind = PROGRAMS[path.suffix]
     try:
-        module = torch.export.load(path).module()
+        run = load(path)
     except Exception as error:  # torch fails in many ways on a wrong file
-        raise FormatError(path, "is not a program of torch.export") from error
+        raise FormatError(path, f"is not {kind}") from error
 
     def enlarge(image: Tensor) -> Tensor:
         with torch.no_grad():
             try:
-                larger = module(image.permute(2, 0, 1)[None])
-                return larger[0].permute(1, 2, 0).contiguous()
+                larger = run(image.permute(2, 0, 1)[None].contiguous())
             except Exception as error:
                 raise FormatError(path, f"does not take an image of {image.shape[1]}x{image.shape[0]} px") from error
+        if larger.ndim != 4 or larger.shape[1] != image.shape[2]:
+            raise FormatError(path, f"should give an image [1, 3, H, W], gives {[*larger.shape]}")
+        return larger[0].permute(1, 2, 0).contiguous()
 
     return enlarge
+
+
+PROGRAMS = {".pt2": (_torch, "a program of torch.export"), ".onnx": (_onnx, "an ONNX network that OpenCV can read")}

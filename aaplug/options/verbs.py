@@ -283,7 +283,7 @@ class FinetuneOptions(WritingOptions, ViewOptions):
     poses: Annotated[bool, TUNING] = False
     """Refine the poses of all cameras on their photographs first, for cameras that are slightly off."""
     upsampler: Annotated[str | None, flag("bicubic|lanczos|FILE"), TUNING] = None
-    """For scales above the photographs': an interpolation or a network (.pb, .pt2); default: the scene's own render."""
+    """For scales above the photographs': an interpolation or a network (.onnx, .pt2, .pb); default: own render."""
     seed: Annotated[int, number(0, 2**31 - 1, whole=True, metavar="N"), TUNING] = 0
     """Seed of the views and scales that the steps draw."""
     checkpoint_every: Annotated[int, number(1, 1_000_000, whole=True, metavar="N"), TUNING] = 100
