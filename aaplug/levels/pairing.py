@@ -94,7 +94,7 @@ def edges_below(
     parts = [Edges.none(clusters)]
     for shift in CURVE_SHIFTS:
         order = torch.argsort(curve(clusters.means, shift), stable=True)
-        along = clusters[order].by_columns
+        along = clusters[order]
         for one, other in _neighbours(along.chunks, None if fresh is None else fresh[order]):
             parts.append(_cheap(along[one], along[other], (order[one], order[other]), rate, tolerance, smallest))
     return Edges.joined(parts)
