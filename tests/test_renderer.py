@@ -5,6 +5,7 @@ import copy
 import itertools
 import pickle
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -358,7 +359,7 @@ def test_best_is_the_average_of_the_image_of_the_training_size():
     torch.testing.assert_close(box_average(full, 4), boxes, atol=1e-6, rtol=0)
 
 
-def test_order_tile_draws_what_the_reference_does_and_lenses_refuse_it():
+def test_order_tile_draws_what_the_reference_does_and_others_refuse_it():
     scene, camera = make_scene(200), make_camera(size=(64, 64))
     eager, exact = (
         Renderer.of(scene, [camera], find_recipe("auto", order="tile"), rasterizer=name)(camera).rgb
@@ -369,6 +370,15 @@ def test_order_tile_draws_what_the_reference_does_and_lenses_refuse_it():
     assert Job.of(scene, CameraSet((camera,), ()), RenderOptions(order="tile")).recipe("auto").order == "tile"
     with pytest.raises(UsageError, match="order: tile is for pinhole views"):
         Renderer.of(scene, [camera], find_recipe("auto", order="tile"))(replace(camera, lens=Lens("equidistant")))
+    with pytest.raises(UsageError, match="rasterizer: by-depth sorts by depth alone"):
+        Renderer.of(scene, [camera], find_recipe("auto", order="tile"), rasterizer=ByDepth())
+
+
+class ByDepth:
+    name = "by-depth"
+
+    def __call__(self, *args: Any, **options: Any) -> Render:
+        raise AssertionError
 
 
 # names ------------------------------------------------------------------------------------------

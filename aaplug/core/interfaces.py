@@ -231,7 +231,7 @@ class Compositor(Protocol):
 class Rasterizer(Protocol):
     """Composites splats front to back over a background; splats of equal depth keep the given order.
 
-    Front to back is by `Splats2D.depths`, or tile by tile where there are `ray_slopes`.
+    Front to back is by `Splats2D.depths`.
     """
 
     @property
@@ -275,6 +275,16 @@ class CountsEvaluations(Protocol):
 
     def counting(self, add: Callable[[int], None]) -> Rasterizer:
         """The same rasterizer; after each pass it calls `add` with that pass's evaluations."""
+        ...
+
+
+@runtime_checkable
+class SortsTiles(Protocol):
+    """A rasterizer that sorts the splats of each tile along its ray where they have `Splats2D.ray_slopes`."""
+
+    @property
+    def tile(self) -> int:
+        """Side of its tiles, in px."""
         ...
 
 

@@ -30,8 +30,8 @@ class Splats2D:
     window: px.  For a pixel kernel that averages alpha, the side of the square it averages over; for a disc kernel, the
         size of training's pixel, which sets its screen-space low-pass filter.
     depth_slopes: for discs, the relative decrease of inverse depth per px to the right and per px down.
-    ray_slopes: change of depth along a pixel's ray, in world units per px to the right and per px down; each tile then
-        sorts its splats by their depth along the ray of its middle, and without them by their depth.
+    ray_slopes: change of depth along a pixel's ray, in world units per px to the right and per px down; each tile of
+        a rasterizer that `SortsTiles` then sorts its splats by their depth along the ray of its middle.
     camera: whose lens the splats are seen through; None for a pinhole's.  Then
     planes: of the plane in which each splat is a Gaussian of covariance `covs`: axes in the camera's frame that point
         right, down and ahead.  A ray d meets the plane right·d / ahead·d and down·d / ahead·d px from the centre.

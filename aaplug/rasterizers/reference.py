@@ -28,6 +28,7 @@ class Reference:
     """Draws by each pixel kernel's exact twin; the image is float64."""
 
     name: str = "reference"
+    tile: int = TILE
 
     def __call__(
         self,

@@ -25,7 +25,7 @@ from aaplug.core.culling import cull
 from aaplug.core.exposures import cells, sample_cameras
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.imaging import average_samples
-from aaplug.core.interfaces import Compositor, Rasterizer, ReadsColumns
+from aaplug.core.interfaces import Compositor, Rasterizer, ReadsColumns, SortsTiles
 from aaplug.core.kernels import Kernels
 from aaplug.core.lenses import PINHOLE
 from aaplug.core.passes import PASSES, NormalAxes
@@ -97,6 +97,10 @@ class Renderer:
 
     def __post_init__(self) -> None:
         check_fields(self)
+        if self.recipe.order == "tile" and not isinstance(self.rasterizer, SortsTiles):
+            raise UsageError(
+                "rasterizer", f"{self.rasterizer.name} sorts by depth alone, and order tile needs `SortsTiles`"
+            )
 
     @classmethod
     @contract

@@ -49,6 +49,11 @@ class Tiled:
         """The name of its kernels: eager or compiled."""
         return self.kernels.name
 
+    @property
+    def tile(self) -> int:
+        """Side of its tiles, in px."""
+        return TILE
+
     def within(self, memory: float) -> "Tiled":
         """The same rasterizer with another memory budget, in bytes."""
         return replace(self, memory=memory)
