@@ -161,6 +161,11 @@ def browser():
         chromium.close()
 
 
+def click(box: Any) -> None:
+    """Click a box of a page itself: a picture that arrives may move it away from under a mouse."""
+    box.dispatch_event("click")
+
+
 MEASURE = """
 import torch
 torch.set_num_threads(1)

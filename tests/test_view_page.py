@@ -21,7 +21,7 @@ from aaplug.io.images import read_image
 from aaplug.io.scenes import write_scene
 from aaplug.rendering.renderer import Renderer
 from aaplug.verbs.view import serving
-from tests.conftest import make_camera, make_scene
+from tests.conftest import click, make_camera, make_scene
 from tests.test_view import decoded, with_photograph
 
 SEEN = "#picture"
@@ -297,13 +297,13 @@ def test_a_refusal_is_not_acknowledged(opened):
 
 def test_the_scale_sets_the_size_in_pixels(opened, seen):
     page = opened()
-    page.locator("#scales input").nth(2).check(force=True)  # 1/2
+    click(page.locator("#scales input").nth(2))  # 1/2
     at_rest(page, scale="0.5")
     camera = camera_of(page, seen[1])
     assert camera.focal == 0.5 * seen[1].train[0].focal
     assert camera.height == pytest.approx(2 * camera.focal * math.tan(math.radians(state(page)["fov"] / 2)), abs=1)
     assert page.locator(SEEN).bounding_box()["height"] == pytest.approx(500, abs=2)
-    page.locator("input[name=enlarge]").nth(1).check(force=True)
+    click(page.locator("input[name=enlarge]").nth(1))
     page.wait_for_function(f"document.querySelector('{SEEN}').width === {camera.width}")
     page.set_viewport_size({"width": 1000, "height": 420})
     says(page, f"dataset.size !== '{camera.width}x{camera.height}'")

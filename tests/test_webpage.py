@@ -18,7 +18,7 @@ from aaplug.evaluation.report.plots import plots
 from aaplug.io.images import image_size, write_png
 from aaplug.rendering.renderer import Renderer
 from aaplug.verbs.evaluate import evaluate
-from tests.conftest import make_camera, make_scene
+from tests.conftest import click, make_camera, make_scene
 
 NASTY = "</script><script>alert('x')</script>&amp;$\\frac$ “r_0”"
 PICTURE = "#stage canvas"
@@ -144,10 +144,11 @@ def labels(page, selector="#stage") -> list[str]:
 
 def choose(page, *roles: str):
     """Show these, at a scale that has photographs."""
-    page.locator("#scales input").nth(1).check(force=True)
+    click(page.locator("#scales input").nth(1))
     page.wait_for_selector("#roles input[value=truth]:enabled", state="attached")
     for box in page.locator("#roles input").all():
-        box.set_checked(box.get_attribute("value") in roles, force=True)
+        if box.is_checked() != (box.get_attribute("value") in roles):
+            click(box)
 
 
 def test_the_divider_works_by_mouse_and_by_keyboard(opened):
@@ -197,7 +198,7 @@ def test_the_lens_works_by_mouse_and_by_keyboard(opened):
 def test_the_lens_stands_beside_the_picture_and_names_what_it_shows(opened, size):
     page = opened(*size)
     choose(page, "truth", "classic", "auto")
-    page.locator("#lens").check(force=True)
+    click(page.locator("#lens"))
     wait(page, lens="0.500,0.500,8")
     assert labels(page, "#crops") == ["photograph", "classic", "auto"]
     pictures, crops = (
@@ -211,10 +212,10 @@ def test_the_lens_stands_beside_the_picture_and_names_what_it_shows(opened, size
     for share in (0.3, 0.7):  # of the crop, which shows the middle eighth of the picture's height
         away = (share - 0.5) / 8
         shown = pixel(page, share, share, "#crops canvas >> nth=0")
-        page.locator("#lens").uncheck(force=True)
+        click(page.locator("#lens"))
         wait(page, lens="off")
         assert shown == pixel(page, 0.5 + away * height / width, 0.5 + away)
-        page.locator("#lens").check(force=True)
+        click(page.locator("#lens"))
         wait(page, lens="0.500,0.500,8")
 
 
@@ -231,14 +232,14 @@ def test_any_number_of_recipes_stands_side_by_side_and_fits_the_screen(opened, s
         assert max(b["y"] + b["height"] for b in boxes) - min(b["y"] for b in boxes) < size[1]
         assert max(b["x"] + b["width"] for b in boxes) <= size[0]
         assert page.evaluate("document.documentElement.scrollWidth") == size[0]
-    page.locator("#roles input[value=auto]").click(force=True)  # the last one stays
+    click(page.locator("#roles input[value=auto]"))  # the last one stays
     page.wait_for_function("document.querySelector('#roles input[value=auto]').checked")
     assert data(page, "shown").endswith("|auto|image")
 
 
 def test_error_mode_explains_an_empty_side(opened):
     page = opened()
-    page.check("input[value=error]", force=True)
+    click(page.locator("input[value=error]"))
     wait(page, shown=f"{ESCAPED}|2×|classic+auto|error")
     assert all("no photograph at this scale" in label for label in labels(page))
     page.select_option("#view", "b")
@@ -260,11 +261,11 @@ def test_the_address_holds_what_one_sees(opened):
     before = page.evaluate("history.length")
     assert urlsplit(page.url).fragment == ""
     choose(page, "truth", "auto")
-    page.check("input[value=error]", force=True)
+    click(page.locator("input[value=error]"))
     page.focus("#split")
     for _ in range(30):
         page.keyboard.press("ArrowRight")
-    page.locator("#lens").check(force=True)
+    click(page.locator("#lens"))
     page.click("#stronger")
     page.wait_for_url("**lens**16")
     found = parse_qs(urlsplit(page.url).fragment)
