@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from aaplug.methods.recipe import Recipe
 
 RateReference = Literal["pose", "global", "sharpest", "interval"]  # what `matched` divides a sampling rate by
-Order = Literal["depth", "tile"]  # of splats
+SplatOrder = Literal["depth", "tile"]  # by depth of centres, or in each tile along the ray of its middle
 # Relative rate that each quality samples a pixel at.  A small image costs per Gaussian, not per pixel: at 1/8 of the
 # training size 2x2 samples take no more splat-pixel evaluations than `classic` with one.
 QUALITIES = {"fast": 0.25, "balanced": 0.5, "best": 1.0}

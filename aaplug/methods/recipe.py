@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.interfaces import Compositor, PixelKernel, ReadsColumns, ScreenFilter, Selection, WorldFilter
-from aaplug.methods import QUALITIES, Order
+from aaplug.methods import QUALITIES, SplatOrder
 from aaplug.methods.pixel_kernels.point import POINT
 from aaplug.system.contracts import Range, check_fields, contract
 from aaplug.system.digests import digest_of_values
@@ -77,7 +77,7 @@ class Recipe:
     pixel: PixelKernel = POINT
     compositor: Compositor | None = None
     selection: Selection | None = None
-    order: Order = "depth"
+    order: SplatOrder = "depth"
     takes_quality: bool = False
     levels: LevelChoice | None = None
     for_discs: str | None = None

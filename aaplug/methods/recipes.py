@@ -5,7 +5,7 @@ from typing import Annotated
 
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.interfaces import MatchesRates
-from aaplug.methods import QUALITIES, RECIPES, Order
+from aaplug.methods import QUALITIES, RECIPES, SplatOrder
 from aaplug.methods.recipe import Recipe, set_by
 from aaplug.system.contracts import Range, contract
 from aaplug.system.errors import UsageError, not_one_of
@@ -17,7 +17,7 @@ def find_recipe(
     *,
     quality: str = "balanced",
     rate_reference: str | None = None,
-    order: Order = "depth",
+    order: SplatOrder = "depth",
     target_rate: Annotated[float, Range(0)] | None = None,
 ) -> Recipe:
     """A recipe by name, with the user's choices.

@@ -11,7 +11,7 @@ from aaplug.core.colours import Background
 from aaplug.core.conventions import MIN_SEEN_SHARE
 from aaplug.core.passes import PASSES, NormalAxes
 from aaplug.io.image_formats import COLOURS, IMAGE_FORMATS
-from aaplug.methods import QUALITIES, Order, RateReference
+from aaplug.methods import QUALITIES, RateReference, SplatOrder
 from aaplug.options.base import CAMERAS, DRAWING, FILES, FILM, LENS, ORBIT, Options, flag, names, number
 from aaplug.system.contracts import LazyType
 from aaplug.system.errors import MAX_VALUE_CHARACTERS, UsageError
@@ -91,7 +91,7 @@ class RecipeOptions(ViewOptions):
     """How finely recipe auto samples: fast reaches a quarter of the training rate, balanced half, best all of it."""
     rate_reference: Annotated[str | None, names(*RATE_REFERENCES), DRAWING] = None
     """Sampling rate that matched and auto compare with (default: pose: global, but interval for free cameras)."""
-    order: Annotated[Order, DRAWING] = "depth"
+    order: Annotated[SplatOrder, DRAWING] = "depth"
     """Order of splats: depth, of their centres, or tile, their depth along the ray of each tile: colours pop less."""
     scheduler: Annotated[str | Executor | None, flag("local|tcp://HOST:PORT"), DRAWING] = None
     """Draw views on a Dask cluster: of --threads processes on this machine, or of the machines at an address."""

@@ -28,7 +28,11 @@ class Reference:
     """Draws by each pixel kernel's exact twin; the image is float64."""
 
     name: str = "reference"
-    tile: int = TILE
+
+    @property
+    def tile(self) -> int:
+        """Side of the tiles in which it sorts, in px."""
+        return TILE
 
     def __call__(
         self,
@@ -44,15 +48,15 @@ class Reference:
         splats = splats[torch.sort(splats.depths, stable=True).indices]
         y, x = (torch.arange(side, dtype=torch.float64, device=splats.means.device) + 0.5 for side in hw)
         centres = torch.cartesian_prod(y, x).flip(1)
-        strips = [*_strips(splats, centres)]
         painted = [
-            composited(drawn, centres[at], pixel, rules)
+            (at, *composited(drawn, centres[at], pixel, rules))
             if compositor is None
-            else compositor.exact(drawn, centres[at], rules)
-            for at, drawn in strips
+            else (at, *compositor.exact(drawn, centres[at], rules))
+            for at, drawn in _strips(splats, centres)
         ]
-        back = torch.cat([places for places, _ in strips]).argsort()
-        rgb, transmittance = (torch.cat(parts)[back] for parts in zip(*painted, strict=True))
+        places, rgb, transmittance = (torch.cat(parts) for parts in zip(*painted, strict=True))
+        back = places.argsort()
+        rgb, transmittance = rgb[back], transmittance[back]
         return over(rgb.reshape(*hw, -1), 1 - transmittance.reshape(hw), background)
 
 

@@ -81,7 +81,7 @@ def lod(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, options:
         take no memory: they are in the files.
 
     Raises:
-        AaplugError: as `render`; also, the scene holds 2D Gaussians or none at all.
+        AaplugError: as `render`; also, the scene holds no Gaussians, or 2D ones and `viewer` or `to` is given.
     """
     job = Job.of(scene, cameras, options)
     path = None if output is None else Path(output)

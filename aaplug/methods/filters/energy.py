@@ -31,7 +31,7 @@ MATCHED_VARIANCE = 0.2  # px² at the median training rate: 3DGS's 0.3 minus the
 MAX_FUSED_OPACITY = 0.9999  # cap: matching energy can demand an opacity above 1
 # px² at the median training rate: thinning stops here.  Below it no image changes visibly.
 MIN_THINNED_VARIANCE = 0.01
-GAUSSIANS_AT_ONCE = 1 << 16  # projected, which bounds memory and fits caches
+PROJECTED_AT_ONCE = 1 << 16  # Gaussians, which bounds memory and fits caches
 FIT_VIEWS = 25  # evenly spread training views over which the opacity factor is averaged
 
 
@@ -76,8 +76,8 @@ def _mean_log_factor(
     blur, rules = 0.0 if shown.compensated else shown.kernel, training.convention.rules
     total = torch.zeros_like(scene.logit_opacities, dtype=torch.float64)
     count = torch.zeros_like(total)
-    for start, camera in product(range(0, len(scene), GAUSSIANS_AT_ONCE), views):
-        part = slice(start, start + GAUSSIANS_AT_ONCE)
+    for start, camera in product(range(0, len(scene), PROJECTED_AT_ONCE), views):
+        part = slice(start, start + PROJECTED_AT_ONCE)
         raw, wide = (project(gaussians[part], camera, rules=rules) for gaussians in (scene, widened))
         trained = raw.blurred(training.convention.kernel, training.convention.compensated)
         wide = wide.blurred(blur, compensate=False)
