@@ -9,9 +9,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from aaplug.core.ellipses import grown
+from aaplug.core.interfaces import Limits, Pixels
+from aaplug.core.rules import Rules
 from aaplug.core.splats import Splats2D
-from aaplug.methods.pixel_kernels.raster_rows import UX, UY, VX, VY
-from aaplug.methods.pixel_kernels.surfel import Surfel, intersection
+from aaplug.methods.pixel_kernels.point import HALF_LOG2_E, exp2_of
+from aaplug.methods.pixel_kernels.raster_rows import OPACITY, UX, UY, VX, VY
+from aaplug.methods.pixel_kernels.surfel import SLOPE_X, SLOPE_Y, Surfel, intersection, met, reach
 
 DISC_VARIANCE = 0.1  # px²: variance of AA-2DGS's object-space Mip filter
 LEAST_FACTOR = 1e-8  # AA-2DGS adds this to 1/det V before the square root, as published
@@ -23,24 +27,23 @@ class SurfelMip(Surfel):
 
     name: str = "surfel-mip"
 
-    def filter_variance(self, window: float) -> float:
-        """Variance of the filter, in px²."""
-        return DISC_VARIANCE
+    def with_filter(self, discs: Splats2D, shift: Float[Tensor, " m"], rules: Rules) -> Splats2D:
+        """Ellipses of discs that are convolved with the filter."""
+        return grown(discs, (DISC_VARIANCE * reach(discs, rules)).sqrt(), rules.min_alpha)
 
-    def value(
-        self, rows: Tensor, e: tuple[Tensor, Tensor], ahead: Tensor, slopes: tuple[Tensor, Tensor], squared: Tensor
-    ) -> Tensor:
-        """The filtered disc; see `Surfel.value`."""
-        s, t = e[0] / ahead, e[1] / ahead
-        ux, uy, vx, vy = (rows[..., i, None] for i in (UX, UY, VX, VY))
-        j00, j01 = (ux + s * slopes[0]) / ahead, (uy + s * slopes[1]) / ahead
-        j10, j11 = (vx + t * slopes[0]) / ahead, (vy + t * slopes[1]) / ahead
+    def alpha(self, rows: Float[Tensor, "*n t c"], pixels: Pixels, limits: Limits) -> Float[Tensor, "*n t P"]:
+        """Opacity times the filtered disc; s, t, J and V are scaled as the forms of the raster rows are."""
+        s, t, inverse = met(rows, pixels)
+        ux, uy, vx, vy, nx, ny = (rows[..., i, None] for i in (UX, UY, VX, VY, SLOPE_X, SLOPE_Y))
+        j00, j01 = (ux + s * nx) * inverse, (uy + s * ny) * inverse
+        j10, j11 = (vx + t * nx) * inverse, (vy + t * ny) * inverse
         area = j00 * j11 - j01 * j10
         size = j00 * j00 + j01 * j01 + j10 * j10 + j11 * j11
-        k = DISC_VARIANCE
-        det = 1 + k * size + k * k * area * area
+        k = DISC_VARIANCE / HALF_LOG2_E
+        per_det = 1 / (1 + k * size + k * k * area * area)
         across = (j10 * s - j00 * t) ** 2 + (j11 * s - j01 * t) ** 2
-        return (1 / det + LEAST_FACTOR).sqrt() * (-0.5 * (s * s + t * t + k * across) / det).exp()
+        value = exp2_of(rows[..., OPACITY, None] - (s * s + t * t + k * across) * per_det, limits)
+        return limits.cut((per_det + LEAST_FACTOR).sqrt() * value)
 
     def exact(self, splats: Splats2D, offsets: Float[Tensor, "p c 2"]) -> Float[Tensor, "p c"]:
         """The filter as the paper expands it, with the Jacobian of the intersection of planes."""

@@ -58,7 +58,9 @@ class Point:
 
     def alpha(self, rows: Float[Tensor, "*n t c"], pixels: Pixels, limits: Limits) -> Float[Tensor, "*n t P"]:
         """2^(log2 o - u² - v²), 0 below the cut-off."""
-        return value_of(rows[..., OPACITY, None], *forms_at(rows, pixels), limits)
+        u, v = forms_at(rows, pixels)
+        h = torch.addcmul(rows[..., OPACITY, None], u, u, value=-1)
+        return exp2_of(torch.addcmul(h, v, v, value=-1), limits)
 
     def exact(self, splats: Splats2D, offsets: Float[Tensor, "p c 2"]) -> Float[Tensor, "p c"]:
         """exp(-dᵀ C⁻¹ d / 2)."""
@@ -117,22 +119,17 @@ def _point_rows(
     return (torch.stack([functional.pad(column, (0, 1)) for column in columns], dim=1),)
 
 
-def value_of(
-    opacity: Float[Tensor, "*n t 1"], u: Float[Tensor, "*n t P"], v: Float[Tensor, "*n t P"], limits: Limits
-) -> Float[Tensor, "*n t P"]:
-    """2^(log2 o - u² - v²), of log2 o - LOG2_PADDING; 0 below the cut-off.
+def exp2_of(h: Float[Tensor, "*any"], limits: Limits) -> Float[Tensor, "*any"]:
+    """2^(LOG2_PADDING + h); 0 below the cut-off.
 
     Compiled it is a polynomial, because a call in a loop stops vectorization.  Below the cut-off that may be anything,
     and is left out.
     """
     if torch.compiler.is_compiling():
-        h = torch.addcmul(torch.addcmul(opacity, u, u, value=-1), v, v, value=-1)
         value = _polynomial(h, ROOT_OF_EXP2).pow(2**SQUARINGS)  # compiled to squarings
         return torch.where(h >= limits.log2_min_alpha - LOG2_PADDING, value, 0.0)
-    exponent = torch.addcmul(opacity + LOG2_PADDING, u, u, value=-1)
-    exponent = torch.addcmul(exponent, v, v, value=-1)
     # The exponent is clamped, because subnormal numbers are slow.
-    return limits.cut(exponent.clamp_(min=LOG2_PADDING).exp2_())
+    return limits.cut((h + LOG2_PADDING).clamp_(min=LOG2_PADDING).exp2_())
 
 
 def _polynomial(x: Tensor, coefficients: tuple[float, ...]) -> Tensor:

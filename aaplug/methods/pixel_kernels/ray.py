@@ -20,7 +20,7 @@ from aaplug.core.kernels import Kernels
 from aaplug.core.lenses import Lens
 from aaplug.core.rules import Rules
 from aaplug.core.splats import Splats2D, concatenated
-from aaplug.methods.pixel_kernels.point import HALF_LOG2_E, LOG2_PADDING, value_of
+from aaplug.methods.pixel_kernels.point import HALF_LOG2_E, LOG2_PADDING, exp2_of
 from aaplug.methods.pixel_kernels.raster_rows import COLUMNS, OPACITY, TILE
 
 CORNERS = 12  # of the polygon around a splat's cut-off ellipse
@@ -143,7 +143,8 @@ class Ray:
             for at in (0, 3, rows.shape[-1] - 3)
         ]
         inverse = 1 / along[2].clamp(min=MIN_AHEAD)
-        return value_of(rows[..., OPACITY, None], along[0] * inverse, along[1] * inverse, limits)
+        u, v = along[0] * inverse, along[1] * inverse
+        return exp2_of(rows[..., OPACITY, None] - u * u - v * v, limits)
 
     def exact(self, splats: Splats2D, offsets: Float[Tensor, "p m 2"]) -> Float[Tensor, "p m"]:
         """exp(-dᵀ C⁻¹ d / 2) where the pixel's ray meets the splat's plane, at d from its centre."""

@@ -15,14 +15,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.ellipses import grown, squared_cutoff, whitening_columns
+from aaplug.core.ellipses import squared_cutoff, whitening_columns
 from aaplug.core.interfaces import Limits, Pixels
 from aaplug.core.kernels import Kernels
 from aaplug.core.rules import Rules
 from aaplug.core.splats import Splats2D
+from aaplug.methods.pixel_kernels.point import HALF_LOG2_E, LOG2_PADDING, exp2_of
 from aaplug.methods.pixel_kernels.raster_rows import COLUMNS, OPACITY, forms_at, offsets_at, rows_of
 
-SLOPE_X, SLOPE_Y, LOW_PASS_WIDTH = COLUMNS, COLUMNS + 1, COLUMNS + 2
+SLOPE_X, SLOPE_Y, FILTER = COLUMNS, COLUMNS + 1, COLUMNS + 2
 LOW_PASS = 2.0  # 1/px²: inverse variance of 2DGS's low-pass filter, whose σ is √½ px
 MIN_FILTER_WIDTH = 1e-3  # px: lower bound of the low-pass filter's width, which is a divisor
 IN_FRONT = 1e-3  # lower bound of w, and of 1 - R q for a disc near the camera plane
@@ -46,52 +47,50 @@ class Surfel:
         is an ellipse around -R C n / (1 - R q) with the covariance (C + R C n nᵀ C / (1 - R q)) / (1 - R q).
         """
         assert splats.depth_slopes is not None
-        cutoff = squared_cutoff(splats.opacities, rules.min_alpha)
-        cutoff = cutoff.clamp(min=torch.finfo(splats.means.dtype).tiny)
+        cutoff = reach(splats, rules)
         xx, xy, yy = splats.covs.unbind(dim=1)
         nx, ny = splats.depth_slopes.unbind(dim=1)
         cx, cy = xx * nx + xy * ny, xy * nx + yy * ny
         left = 1 - cutoff * (nx * cx + ny * cy)
         near = left > IN_FRONT
         left = left.clamp(min=IN_FRONT)
-        shift, stretch = -cutoff / left, cutoff / left
+        stretch = cutoff / left
+        shift = -stretch[:, None] * torch.stack([cx, cy], dim=1)
         covs = torch.stack([xx + stretch * cx * cx, xy + stretch * cx * cy, yy + stretch * cy * cy], dim=1)
-        ellipses = replace(
-            splats,
-            means=splats.means + shift[:, None] * torch.stack([cx, cy], dim=1),
-            covs=covs / left[:, None],
-            dets=splats.dets / left**3,
-            opacities=torch.where(near, splats.opacities, 0.0),
-        )
-        return grown(ellipses, (self.filter_variance(splats.window) * cutoff).sqrt(), rules.min_alpha)
+        discs = replace(splats, means=splats.means + shift, covs=covs / left[:, None], dets=splats.dets / left**3)
+        filtered = self.with_filter(discs, torch.hypot(*shift.unbind(dim=1)), rules)
+        return replace(filtered, opacities=torch.where(near, splats.opacities, 0.0))
+
+    def with_filter(self, discs: Splats2D, shift: Float[Tensor, " m"], rules: Rules) -> Splats2D:
+        """Ellipses that also contain the low-pass filter, a circle `shift` px from their centres.
+
+        A covariance contains a concentric circle of radius r if its least eigenvalue times the cut-off is at least r².
+        """
+        cutoff = reach(discs, rules)
+        radius = (self.filter_variance(discs.window) * cutoff).sqrt() + shift
+        half = 0.5 * (discs.covs[:, 0] + discs.covs[:, 2])
+        least = discs.dets / (half + (half * half - discs.dets).clamp(min=0).sqrt())
+        return discs.blurred((radius * radius / cutoff - least).clamp(min=0), compensate=False)
 
     def filter_variance(self, window: float) -> float:
-        """Variance of the filter beside the disc, in px², by which its bounding ellipse grows."""
+        """Variance of the filter beside the disc, in px²."""
         return max(window, MIN_FILTER_WIDTH) ** 2 / LOW_PASS
 
     def raster_rows(self, splats: Splats2D, kernels: Kernels) -> Float[Tensor, "m c"]:
-        """Whitening forms, depth slopes, and the width of the low-pass filter."""
+        """Scaled forms, opacity as its log2 (see `point`), depth slopes, and the scaled form of the low-pass filter."""
         assert splats.depth_slopes is not None
-        width = torch.full_like(splats.opacities, max(splats.window, MIN_FILTER_WIDTH))
-        forms = whitening_columns(splats.covs, splats.dets)
-        return rows_of(splats, forms, [*splats.depth_slopes.unbind(dim=1), width])
+        forms = [HALF_LOG2_E**0.5 * form for form in whitening_columns(splats.covs, splats.dets)]
+        opacities = splats.opacities.log2() - LOG2_PADDING
+        low_pass = torch.full_like(opacities, HALF_LOG2_E / self.filter_variance(splats.window))
+        columns = [*splats.depth_slopes.unbind(dim=1), low_pass]
+        return rows_of(replace(splats, opacities=opacities), forms, columns)
 
     def alpha(self, rows: Float[Tensor, "*n t c"], pixels: Pixels, limits: Limits) -> Float[Tensor, "*n t P"]:
-        """Opacity times the disc's value."""
-        e = forms_at(rows, pixels)
+        """2^(log2 o - ρ log2(e)/2), 0 below the cut-off."""
+        s, t, _ = met(rows, pixels)
         dx, dy = offsets_at(rows, pixels)
-        slopes = rows[..., SLOPE_X, None], rows[..., SLOPE_Y, None]
-        ahead = (1 - slopes[0] * dx - slopes[1] * dy).clamp(min=IN_FRONT)
-        value = self.value(rows, e, ahead, slopes, dx * dx + dy * dy)
-        return limits.cut(rows[..., OPACITY, None] * value)
-
-    def value(
-        self, rows: Tensor, e: tuple[Tensor, Tensor], ahead: Tensor, slopes: tuple[Tensor, Tensor], squared: Tensor
-    ) -> Tensor:
-        """The filtered disc.  e: whitened offset B d.  ahead: w.  slopes: n.  squared: |d|², in px²."""
-        on_disc = (e[0] * e[0] + e[1] * e[1]) / (ahead * ahead)
-        width = rows[..., LOW_PASS_WIDTH, None]
-        return (-0.5 * torch.minimum(on_disc, LOW_PASS * squared / (width * width))).exp()
+        on_disc, low_pass = s * s + t * t, rows[..., FILTER, None] * (dx * dx + dy * dy)
+        return exp2_of(rows[..., OPACITY, None] - torch.minimum(on_disc, low_pass), limits)
 
     def exact(self, splats: Splats2D, offsets: Float[Tensor, "p c 2"]) -> Float[Tensor, "p c"]:
         """2DGS's intersection of homogeneous planes (its eqs. 8 to 10), beside its low-pass filter."""
@@ -100,6 +99,19 @@ class Surfel:
         low_pass = LOW_PASS * squared / max(splats.window, MIN_FILTER_WIDTH) ** 2
         values = torch.exp(-0.5 * torch.minimum(s * s + t * t, low_pass))
         return torch.where(in_front, values, torch.exp(-0.5 * low_pass))
+
+
+def reach(splats: Splats2D, rules: Rules) -> Float[Tensor, " m"]:
+    """Squared cut-off, at least a positive number, which may be a divisor."""
+    return squared_cutoff(splats.opacities, rules.min_alpha).clamp(min=torch.finfo(splats.means.dtype).tiny)
+
+
+def met(rows: Float[Tensor, "*n t c"], pixels: Pixels) -> tuple[Tensor, Tensor, Tensor]:
+    """Where pixels' rays meet the discs, s and t, by the forms of the raster rows; and 1/w."""
+    u, v = forms_at(rows, pixels)
+    dx, dy = offsets_at(rows, pixels)
+    inverse = 1 / (1 - rows[..., SLOPE_X, None] * dx - rows[..., SLOPE_Y, None] * dy).clamp(min=IN_FRONT)
+    return u * inverse, v * inverse, inverse
 
 
 def intersection(splats: Splats2D, offsets: Float[Tensor, "p c 2"]) -> tuple[Tensor, ...]:
