@@ -28,7 +28,8 @@ def small_leaves(monkeypatch):
 
 
 def made(folder, to, **how):
-    return aaplug.lod(SCENE, CAMERAS, folder, to=to, levels=LEVELS, refine=False, min_seen=0.0, **how)
+    options = {"levels": LEVELS, "refine": False, "min_seen": 0.0, **how}
+    return aaplug.lod(SCENE, CAMERAS, folder, to=to, **options)
 
 
 def test_streamed_sog_lists_every_part(tmp_path, small_leaves):
@@ -82,12 +83,13 @@ def test_a_run_that_was_cut_short_is_resumed(tmp_path, small_leaves, monkeypatch
     def contents(folder):
         return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
-    made(tmp_path / "whole", to)
+    tuned = {"refine": True, "steps": 2}
+    made(tmp_path / "whole", to, **tuned)
     written, resumed = streamed.write_level, []
 
     def cut(folder, name, number, parts):
-        written(folder, name, number, list(parts)[:1] if number else parts)
-        if number:
+        written(folder, name, number, list(parts)[:1] if number == LEVELS else parts)
+        if number == LEVELS:
             raise KeyboardInterrupt
 
     def recorded(folder, name, number, parts):
@@ -96,11 +98,11 @@ def test_a_run_that_was_cut_short_is_resumed(tmp_path, small_leaves, monkeypatch
 
     monkeypatch.setattr("aaplug.verbs.lod.write_level", cut)
     with pytest.raises(KeyboardInterrupt):
-        made(tmp_path / "out", to)
+        made(tmp_path / "out", to, **tuned)
     assert not (tmp_path / "out" / streamed.STREAMS[to].index).exists()
     monkeypatch.setattr("aaplug.verbs.lod.write_level", recorded)
-    made(tmp_path / "out", to, resume=True)
-    assert resumed == [1, 2]
+    made(tmp_path / "out", to, resume=True, **tuned)
+    assert resumed == [LEVELS]
     assert contents(tmp_path / "out") == contents(tmp_path / "whole")
 
 

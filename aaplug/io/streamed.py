@@ -27,6 +27,7 @@ from aaplug.io import StreamName, stream_pages
 from aaplug.io.atomic import make_folder, replacing
 from aaplug.io.scenes import gltf, write_scene
 from aaplug.io.scenes.pyramid_folder import Level
+from aaplug.io.values import Place, numbers, read_json
 from aaplug.system.errors import OutputError, UsageError, reason
 from aaplug.system.executors import Threads
 
@@ -40,7 +41,7 @@ ALWAYS = 1e6  # error of the root over that of the coarsest level, so that somet
 SPLATS = [gltf.SPLATS, gltf.SPZ]
 SETTINGS, PAGE = "settings.json", "index.html"
 Box = Float[Tensor, "2 3"]  # smallest and largest coordinates
-EMPTY_BOX = ((math.inf,) * 3, (-math.inf,) * 3)
+FACTS = 7  # numbers that tell of a part: its size and its box
 
 
 @dataclass(frozen=True)
@@ -86,17 +87,26 @@ def parts_of(level: Level, leaves: Int[Tensor, " chunks"]) -> Iterator[Gaussians
 
 
 def write_level(folder: Path, name: StreamName, number: int, parts: Iterable[Gaussians]) -> None:
-    """Write the parts of a level, replacing what is there, in as many threads as torch has."""
+    """Write the parts of a level, replacing what is there, in as many threads as torch has; then what indexes tell."""
+    stream = STREAMS[name]
 
-    def write(item: tuple[int, Gaussians]) -> None:
+    def write(item: tuple[int, Gaussians]) -> list[float]:
         leaf, part = item
-        if len(part):
-            path = folder / STREAMS[name].part(number, leaf)
-            make_folder(path.parent)
-            write_scene(path, part, overwrite=True)
+        if not len(part):
+            return []
+        path = folder / stream.part(number, leaf)
+        make_folder(path.parent)
+        write_scene(path, part, overwrite=True)
+        return [float(len(part)), *box_of(part, stream.extent).flatten().tolist()]
 
-    for _ in Threads(torch.get_num_threads()).map(write, enumerate(parts)):
-        pass
+    facts = [*Threads(torch.get_num_threads()).map(write, enumerate(parts))]
+    with replacing(facts_file(folder, number), overwrite=True) as file:
+        file.write(json.dumps(facts).encode())
+
+
+def facts_file(folder: Path, number: int) -> Path:
+    """What an index tells of a level's parts, kept until the index is written."""
+    return folder / f"parts_{number}.json"
 
 
 def part_folders(folder: Path, name: StreamName) -> set[Path]:
@@ -115,18 +125,25 @@ def remove_parts(folders: Iterable[Path], name: StreamName) -> None:
             folder.rmdir()
 
 
-def write_index(folder: Path, name: StreamName, levels: Sequence[Level], rate: float) -> Mapping[str, Any]:
-    """Write the index, and what the viewer must be set to; returns the latter.
+def write_index(folder: Path, name: StreamName, levels: int, rate: float) -> Mapping[str, Any]:
+    """Write the index of so many levels, and what the viewer must be set to; returns the latter.
 
     rate: of training, in px per world unit.
     """
-    leaves, stream = leaves_of(levels[0]), STREAMS[name]
-    parts = [[_Part.of(part, stream.extent) for part in parts_of(level, leaves)] for level in levels]
+    stream = STREAMS[name]
+    parts = [_read_parts(facts_file(folder, number)) for number in range(levels)]
     index, settings = {"sog": _lod_meta, "3dtiles": _tileset}[name](stream, [*zip(*parts, strict=True)], rate)
-    for file, content in {SETTINGS: settings, STREAMS[name].index: index}.items():  # the index last: it is the mark
-        with replacing(folder / file, overwrite=True) as stream:
-            stream.write(json.dumps(content, indent=1).encode())
+    for file, content in {SETTINGS: settings, stream.index: index}.items():  # the index last: it is the mark
+        with replacing(folder / file, overwrite=True) as target:
+            target.write(json.dumps(content, indent=1).encode())
     return settings
+
+
+def _read_parts(path: Path) -> list["_Part"]:
+    """What `write_level` wrote of a level's parts."""
+    facts = [numbers(fact, FACTS if fact else 0, Place(path, "the list"), "a part") for fact in read_json(path)]
+    boxes = [torch.tensor(fact[1:], dtype=torch.float64).view(-1, 3) for fact in facts]
+    return [_Part(int(fact[0]), box) if fact else NOTHING for fact, box in zip(facts, boxes, strict=True)]
 
 
 def program_of(name: StreamName, modules: Path) -> Path:
@@ -161,12 +178,8 @@ class _Part(NamedTuple):
     size: int
     box: Box
 
-    @classmethod
-    def of(cls, part: Gaussians, extent: float) -> "_Part":
-        """extent: standard deviations to which the box holds the Gaussians."""
-        return cls(len(part), box_of(part, extent).double() if len(part) else torch.tensor(EMPTY_BOX).double())
 
-
+NOTHING = _Part(0, torch.tensor(((math.inf,) * 3, (-math.inf,) * 3), dtype=torch.float64))
 Indexed = tuple[dict[str, Any], dict[str, Any]]  # an index, and the viewer's settings
 
 

@@ -37,6 +37,7 @@ from aaplug.io.scenes.scene import FLOAT, Scene
 from aaplug.io.streamed import (
     SETTINGS,
     STREAMS,
+    facts_file,
     leaves_of,
     part_folders,
     parts_of,
@@ -108,12 +109,13 @@ def lod(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, options:
                 levels.append(level._replace(scene=kept))
             if path is not None and options.to is not None:
                 rates = median_rates(whole.means, job.cameras.train)
-                settings = write_index(path, options.to, levels, float(rates[rates > 0].median()))
+                settings = write_index(path, options.to, len(levels), float(rates[rates > 0].median()))
                 if options.page is not None:
                     write_page(path, options.to, Path(options.page))
                 job.monitor.say(f"set the viewer by {path / SETTINGS}: {json.dumps(settings)}")
                 remove_parts(earlier - part_folders(path, options.to), options.to)
-                stale = [*files, path / MANIFEST]  # what a run that is cut short resumes from
+                facts = [facts_file(path, number) for number in range(len(levels))]
+                stale = [*files, path / MANIFEST, *facts]  # what a run that is cut short resumes from
             for file in stale:
                 file.unlink(missing_ok=True)
             return levels

@@ -85,7 +85,7 @@ def main(
             lighter = list(_decimated(whole, counts, work, command))
             for number, level in enumerate(lighter):
                 write_level(theirs, name, number, [level.scene])
-            write_index(theirs, name, lighter, float(rates[rates > 0].median()))
+            write_index(theirs, name, len(lighter), float(rates[rates > 0].median()))
         options = _options(name, json.loads((ours / SETTINGS).read_text()))
         shown = {"ours": (ours, options), "splat-transform": (theirs, options)}
         if name == "sog":

@@ -32,7 +32,6 @@ from aaplug.io.cameras import read_cameras
 from aaplug.io.images import read_image
 from aaplug.io.photographs import read_photo
 from aaplug.io.scenes import read_scene, write_scene
-from aaplug.io.scenes.pyramid_folder import Level
 from aaplug.io.streamed import STREAMS, write_index, write_level
 from aaplug.methods.conversion import fuse_for
 from aaplug.methods.presets import recipe_of
@@ -192,7 +191,7 @@ class Bench:
 def write_tiles(folder: Path, scene: Gaussians) -> None:
     """Write a scene as one tile."""
     write_level(folder, "3dtiles", 0, [scene])
-    write_index(folder, "3dtiles", [Level(scene, 1.0, torch.zeros(len(scene), dtype=torch.long))], 1.0)
+    write_index(folder, "3dtiles", 1, 1.0)
 
 
 def shoot(
