@@ -12,7 +12,10 @@ from aaplug.lab.learned import NAMES
 from aaplug.methods import RECIPES
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import UsageError
+from aaplug.system.monitor import Monitor
 from aaplug.verbs.finetune import finetune
+from aaplug.verbs.lod import lod
+from aaplug.verbs.merge import merge
 from tests.conftest import make_camera, make_scene, sized
 
 VIEW = make_camera(size=(48, 36))
@@ -69,3 +72,11 @@ def test_who_does_not_draw_learned_filters_is_refused():
     for wrong in ({"viewer": "mip"}, {"method": "mipmap-gs"}):
         with pytest.raises(UsageError, match=r"method of its own|shows no learned filters"):
             finetune(scene, cameras, None, learn_filters=True, **wrong, **TUNING)
+
+
+def test_columns_that_merging_drops_are_named(monkeypatch):
+    said, cameras, dropped = list[str](), CameraSet((VIEW,), (VIEW,)), f"columns {', '.join(SCENE.extras)}"
+    monkeypatch.setattr(Monitor, "say", lambda self, text: said.append(text))
+    lod(SCENE, cameras, None, simplify=0.5, refine=False, min_seen=0.0)
+    merge([SCENE, SCENE], cameras, None)
+    assert [f"not have its {dropped}" in line for line in said if dropped in line] == [True] * 3

@@ -94,6 +94,8 @@ def lod(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, options:
     if not job.cameras.assumed:
         check_frame(whole.means, job.cameras.train, whole.name, options.min_seen)
     job.say_assumed()
+    if whole.extras:
+        job.monitor.say(f"{whole.name}: merged Gaussians do not have its columns {', '.join(whole.extras)}")
     with running(options, path, check, job.inputs, folder=not options.single):
         maker = _Maker.of(whole, job)
         if not options.single:

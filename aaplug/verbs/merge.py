@@ -68,6 +68,10 @@ def merge(scenes: ScenesLike, cameras: CamerasLike, output: AnyPath | None, opti
                 views = job.cameras.notes[0] if job.cameras.assumed else f"by {len(training.cameras)} cameras"
                 job.monitor.say(f"{scene.title}: converted from {part.convention.name} to {into.name}, {views}")
                 part = carried(part, training, into)
+            if part.extras:
+                options.monitor.say(
+                    f"{scene.title}: the merged scene does not have its columns {', '.join(part.extras)}"
+                )
             parts.append(replace(placed(part, turn, scale, move), extras={}, origin=None))
         degree, fused = max(part.sh_degree for part in parts), {str(f): f for part in parts for f in part.fused}
         merged = joined([replace(of_degree(part, degree), fused=tuple(fused.values())) for part in parts])
