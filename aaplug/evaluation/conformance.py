@@ -20,6 +20,7 @@ from aaplug.core.colours import BLACK, WHITE
 from aaplug.core.conventions import CONVENTIONS, Convention
 from aaplug.core.gaussians import Gaussians, joined
 from aaplug.core.interfaces import PixelKernel
+from aaplug.core.placing import placed
 from aaplug.core.projection import project
 from aaplug.core.rules import RULES_3DGS, Rules
 from aaplug.core.shading import shade
@@ -71,41 +72,33 @@ class Test:
     @cached_property
     def scene(self) -> Gaussians:
         """The Gaussians, of degree 3."""
-        inverse = torch.linalg.inv(POSE)
-        means, quats, scales, sh = [], [], [], []
-        turn = quaternion(inverse[:3, :3])
-        for spot in self.spots:
-            near = spot.depth / FOCAL  # world units a px
-            place = torch.tensor([(spot.x - SIDE / 2) * near, (spot.y - SIDE / 2) * near, spot.depth, 1.0], dtype=F64)
-            half = math.radians(spot.angle) / 2
-            quats.append(product(turn, torch.tensor([math.cos(half), 0, 0, math.sin(half)], dtype=F64)))
-            means.append((inverse @ place)[:3])
-            scales.append([abs(near) * sigma for sigma in (*spot.sigmas, min(spot.sigmas))])
-            rest = torch.zeros(15, 3, dtype=F64)
-            rest[: len(spot.rest)] = torch.tensor(spot.rest, dtype=F64).reshape(-1, 3)
-            sh.append(torch.cat([sh_of_colour(torch.tensor([[*spot.rgb]], dtype=F64)), rest]))
-        opacities = torch.tensor([spot.opacity for spot in self.spots], dtype=F64)
-        stacked = torch.stack(means), torch.stack(quats), torch.tensor(scales, dtype=F64).log(), opacities.logit()
-        return Gaussians(*stacked, torch.stack(sh)).to(torch.float32)
+        x, y, depth, opacity, angle = (
+            torch.tensor([getattr(spot, name) for spot in self.spots], dtype=F64)
+            for name in ("x", "y", "depth", "opacity", "angle")
+        )
+        near = depth / FOCAL  # world units a px
+        half, zero = angle.deg2rad() / 2, torch.zeros_like(angle)
+        sigmas = torch.tensor([(*spot.sigmas, min(spot.sigmas)) for spot in self.spots], dtype=F64)
+        sh = torch.zeros(len(self.spots), 16, 3, dtype=F64)
+        sh[:, :1] = sh_of_colour(torch.tensor([[*spot.rgb] for spot in self.spots], dtype=F64)[:, None])
+        for place, spot in enumerate(self.spots):
+            if spot.rest:
+                sh[place, 1 : 1 + len(spot.rest)] = torch.tensor(spot.rest, dtype=F64)
+        seen = Gaussians(
+            torch.stack([(x - SIDE / 2) * near, (y - SIDE / 2) * near, depth], dim=1),
+            torch.stack([half.cos(), zero, zero, half.sin()], dim=1),
+            (near.abs()[:, None] * sigmas).log(),
+            opacity.logit(),
+            sh[:, :1],
+        )
+        world = torch.linalg.inv(POSE)
+        return replace(placed(seen, world[:3, :3], 1.0, world[:3, 3].tolist()), sh=sh).to(torch.float32)
 
     @property
     def stored(self) -> Gaussians:
         """The Gaussians, and others beside the picture: some viewers do not draw a scene of a few Gaussians rightly."""
         beside = [Spot(-6.0, (i + 0.5) * SIDE / UNSEEN, (0.3, 0.3), depth=1.0 + i % 7) for i in range(UNSEEN)]
         return joined([self.scene, replace(self, spots=beside).scene])
-
-
-def quaternion(rotation: Float[Tensor, "3 3"]) -> Float[Tensor, " 4"]:
-    """Quaternion wxyz of a rotation by less than half a turn."""
-    w = math.sqrt(1 + float(rotation.trace())) / 2
-    skew = rotation - rotation.T
-    return torch.tensor([w, *(float(skew[i, j]) / (4 * w) for i, j in ((2, 1), (0, 2), (1, 0)))], dtype=F64)
-
-
-def product(p: Float[Tensor, " 4"], q: Float[Tensor, " 4"]) -> Float[Tensor, " 4"]:
-    """The rotation q, then p."""
-    scalar = p[0] * q[0] - p[1:] @ q[1:]
-    return torch.cat([scalar[None], p[0] * q[1:] + q[0] * p[1:] + torch.linalg.cross(p[1:], q[1:])])
 
 
 def _grid(count: int) -> list[tuple[float, float]]:
