@@ -1,15 +1,45 @@
-"""Tests.
+"""Tests, and how they check the types and shapes of what aaplug's functions take and return, by jaxtyping and beartype.
 
-jaxtyping checks types and shapes of what aaplug's functions take and return, of functions inside functions not: they
-are defined, and their checks compiled, at every call of the outer one, which took half of the time of all tests.
+Checks took half of the time of all tests.  So those of functions inside functions are left out, which would be compiled
+at every call of the outer one, and of each test the first `MOST_CHECKS` are made.
 """
 
 import ast
+from collections.abc import Callable
+from functools import wraps
 from typing import Any
 
+import jaxtyping
 from jaxtyping._import_hook import JaxtypingTransformer
 
+MOST_CHECKS = 5000  # of a test: twice as many as calls
+
+_left = MOST_CHECKS
 _visit = JaxtypingTransformer.visit_FunctionDef
+
+
+def check_again() -> None:
+    """Make the checks of another test."""
+    global _left
+    _left = MOST_CHECKS
+    jaxtyping.config.update("jaxtyping_disable", False)
+
+
+def checked(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The function with its checks."""
+    from beartype import beartype
+
+    check = beartype(function)
+
+    @wraps(function)
+    def counted(*args: Any, **options: Any) -> Any:
+        global _left
+        _left -= 1
+        if not _left:
+            jaxtyping.config.update("jaxtyping_disable", True)
+        return check(*args, **options)
+
+    return counted
 
 
 def _visit_outermost(self: JaxtypingTransformer, node: ast.FunctionDef) -> Any:

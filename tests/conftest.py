@@ -37,6 +37,7 @@ from aaplug.rasterizers import RASTERIZERS
 from aaplug.rasterizers.tiled import Tiled, on_demand
 from aaplug.rasterizers.tiled.ahead_of_time import load
 from aaplug.rendering.renderer import Renderer
+from tests import check_again
 
 COMPILED = load()
 on_demand.PATIENCE_SECONDS = 1e9  # tests compile nothing beside their work
@@ -58,7 +59,8 @@ def pytest_configure() -> None:
 
 @pytest.fixture(autouse=True)
 def own_log(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Restore the library's log handlers after each test: the command line replaces them."""
+    """Restore the library's log handlers after each test, which the command line replaces; check its types anew."""
+    check_again()
     logger = logging.getLogger("aaplug")
     monkeypatch.setattr(logger, "handlers", list(logger.handlers))
     monkeypatch.setattr(logger, "propagate", True)
