@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -18,35 +18,39 @@ from aaplug.io.images import write_png
 from aaplug.rendering import renderer as rendering
 from aaplug.rendering.renderer import Renderer
 from tests.bench import heading, row
+from tests.bench.scenes import CHECKPOINTS, trained
 from tests.conftest import SAMPLE, SHARED_DATA
 
+SCENES = ("sample", "chair", "snowmiku")
 RADII = (2, 5, 10, 20, 40)  # px: of the largest circles of confusion, those of the farthest 1 % of the splats
 LENGTHS = (5, 10, 20, 40)  # px: median length of the splats' ways while the shutter is open
 NEAREST, FARTHEST = 0.1, 0.99  # quantiles of depth: in focus, and of the largest circle
 TRUTH = 1024  # samples
 
 
-def main(scale: float = 0.5, views: int = 1, rounds: int = 3, pictures: Path | None = None) -> None:
-    """Print figures for the sample scene, and for the chair where it is there.
+def main(
+    scenes: Sequence[str] = SCENES, scale: float = 0.5, views: int = 5, rounds: int = 3, pictures: Path | None = None
+) -> None:
+    """Print figures of scenes: the sample, and trained ones where they are there.
 
     scale: of the images, against training's.  views: test views of each scene.  rounds: of the timing.
     pictures: a folder for the images.
     """
-    chair = SHARED_DATA / "chair"
-    scenes = {"sample": (SAMPLE / "chair.ply", SAMPLE), "chair": (chair / "chair.ply", chair)}
-    for name, (scene, cameras) in scenes.items():
-        if scene.exists():
-            aperture(name, scene, cameras, scale, views, rounds, pictures)
+    for name in scenes:
+        if name == SCENES[0]:
+            dataset = read_cameras(SAMPLE)
+            aperture(name, Renderer.of(SAMPLE / "chair.ply", dataset), dataset.test[:views], scale, rounds, pictures)
+        elif (SHARED_DATA / CHECKPOINTS[name].file).exists():
+            opened = trained(name)
+            aperture(name, opened.renderer(), opened.views(views), scale, rounds, pictures)
 
 
 @torch.no_grad()
 def aperture(
-    name: str, scene: Path, cameras: Path, scale: float, views: int, rounds: int = 3, pictures: Path | None = None
+    name: str, renderer: Renderer, views: Sequence[Camera], scale: float, rounds: int, pictures: Path | None
 ) -> None:
-    """Figures of one scene: PSNR in dB against 1024 samples, and time against separate frames."""
-    dataset = read_cameras(cameras)
-    renderer = Renderer.of(str(scene), dataset)
-    chosen = [camera.scaled(scale) for camera in dataset.test[: 3 * views : 3]]
+    """Figures of views of a scene: PSNR in dB against 1024 samples, and time against separate frames."""
+    chosen = [camera.scaled(scale) for camera in views]
     for kind, steps, exposure in (("defocus", RADII, _aperture), ("motion", LENGTHS, _motion)):
         heading(f"{name}, {kind}: dB from {TRUTH} samples", "px", "1", "5", "16", "16 plain", "pinhole", "time")
         for size in steps:
