@@ -9,7 +9,7 @@ import torch
 
 from aaplug.core import shading
 from aaplug.core.gaussians import Gaussians
-from aaplug.core.projection import TILT_SHARE, project, with_ray_slopes
+from aaplug.core.projection import project, with_ray_slopes
 from aaplug.core.shading import shade
 from aaplug.core.spherical_harmonics import sh_colour
 from tests.conftest import make_camera, make_scene, straight_camera
@@ -220,4 +220,4 @@ def test_ray_slopes_are_those_of_the_mean_depth_behind_a_pixel():
     splats = with_ray_slopes(project(scene, camera).blurred(0.3, compensate=False), scene, camera)
     expected = torch.linalg.solve(joint[:2, :2], joint[:2, 2])
     assert expected.abs().min() > 1e-4
-    torch.testing.assert_close(splats.ray_slopes[0], TILT_SHARE * expected, rtol=1e-9, atol=0)
+    torch.testing.assert_close(splats.ray_slopes[0], expected, rtol=1e-9, atol=0)

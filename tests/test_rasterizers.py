@@ -14,7 +14,7 @@ import torch
 
 from aaplug.core.ellipses import squared_cutoff
 from aaplug.core.kernels import EAGER
-from aaplug.core.splats import Render, Splats2D
+from aaplug.core.splats import NEARER, Render, Splats2D
 from aaplug.methods.pixel_kernels.point import POINT
 from aaplug.methods.pixel_kernels.raster_rows import TILE
 from aaplug.rasterizers import reference
@@ -56,9 +56,9 @@ def test_splats_of_equal_depth_are_drawn_in_scene_order(rasterize, order):
 
 
 def test_each_tile_sorts_its_splats_by_their_depth_along_its_middle(rasterize):
-    # the red splat's depth falls by 0.1 to the right of its centre at 8 px: green's until x = 13, tiles change at 16
+    # what counts of the red splat's depth falls by 0.1 a px: it is green's until x = 13, and tiles change at 16
     splats = splats_of(((8.0, 4.0), (1e9, 0.0, 1e9), 2.0, 0.5, RED), ((8.0, 4.0), (1e9, 0.0, 1e9), 1.5, 0.5, GREEN))
-    splats = replace(splats, ray_slopes=torch.tensor([[-0.1, 0.0], [0.0, 0.0]], dtype=F64))
+    splats = replace(splats, ray_slopes=torch.tensor([[-0.1 / NEARER, 0.0], [0.0, 0.0]], dtype=F64))
     image = rasterize(splats, (8, 24), BLACK)
     close(image.rgb[4, :16], torch.tensor([[0.25, 0.5, 0.0]]).expand(16, 3))
     close(image.rgb[4, 16:], torch.tensor([[0.5, 0.25, 0.0]]).expand(8, 3))
@@ -66,7 +66,7 @@ def test_each_tile_sorts_its_splats_by_their_depth_along_its_middle(rasterize):
 
 def test_gradients_are_those_of_the_order_by_tile():
     splats, gradients = make_splats(80, (17, 26), seed=4).to(F64), []
-    splats = replace(splats, ray_slopes=0.3 * (splats.means / 7).sin())
+    splats = replace(splats, ray_slopes=2.0 * (splats.means / 7).sin())
     for draw in (TILED, REFERENCE):
         values = {name: getattr(splats, name).clone().requires_grad_() for name in ("means", "opacities", "rgb")}
         image = draw(replace(splats, **values), (17, 26), BLACK)

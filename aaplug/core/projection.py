@@ -26,7 +26,6 @@ from aaplug.core.splats import SELECT, Splats2D
 JACOBIAN_MARGIN = 0.3  # of half the image: 3DGS linearises no farther out (1.3 tan(fov/2))
 PLACES = 17  # along a side, at which it is found what a distorting pinhole sees
 MAX_SIGMA = 1e9  # px: larger splats look the same, but their determinant overflows float32
-TILT_SHARE = 0.12  # of the tilt, in scenes that were trained without: more of it pops less and costs more dB
 MIN_FACING = 1e-6  # of depth: a disc at a flatter angle is a line, and its slope overflows
 
 
@@ -94,7 +93,7 @@ def with_depth_slopes(splats: Splats2D, scene: Gaussians, camera: Camera) -> Spl
 
 @torch.no_grad()
 def with_ray_slopes(splats: Splats2D, scene: Gaussians, camera: Camera) -> Splats2D:
-    """Add the ray slopes of a pinhole's filtered splats: `TILT_SHARE` of their tilts.
+    """Add the ray slopes of a pinhole's filtered splats: their tilts.
 
     Given a pixel d px from the splat's centre, the Gaussian's depth has the mean z + d · C⁻¹ c, with C the splat's
     covariance and c that of pixel and depth: the plane of the Gaussian's maxima along rays, of tilt C⁻¹ c
@@ -107,7 +106,7 @@ def with_ray_slopes(splats: Splats2D, scene: Gaussians, camera: Camera) -> Splat
     x, y = (sum_of(p * q for p, q in zip(row, along.squeeze(2).unbind(dim=1), strict=True)) for row in (across, down))
     xx, xy, yy = splats.covs.unbind(dim=1)
     tilts = torch.stack([yy * x - xy * y, xx * y - xy * x], dim=1) / splats.dets[:, None]
-    return replace(splats, ray_slopes=TILT_SHARE * tilts.nan_to_num(0.0, 0.0, 0.0))
+    return replace(splats, ray_slopes=tilts.nan_to_num(0.0, 0.0, 0.0))
 
 
 def thinnest_axes(scene: Gaussians, sources: Int[Tensor, " m"]) -> Float[Tensor, "m 3"]:

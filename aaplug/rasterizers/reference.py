@@ -15,7 +15,7 @@ from aaplug.core.colours import Colour
 from aaplug.core.imaging import over
 from aaplug.core.interfaces import Compositor, PixelKernel
 from aaplug.core.rules import RULES_3DGS, Rules
-from aaplug.core.splats import Render, Splats2D
+from aaplug.core.splats import Render, Splats2D, ordering_depths
 from aaplug.methods.pixel_kernels.point import POINT
 from aaplug.methods.pixel_kernels.raster_rows import TILE
 
@@ -70,7 +70,7 @@ def _strips(splats: Splats2D, centres: Float[Tensor, "n 2"]) -> Iterator[tuple[I
     for number, tile in enumerate(tiles):
         places = (numbers == number).nonzero().squeeze(1)
         ahead = ((TILE * (tile + 0.5) - splats.means) * splats.ray_slopes).sum(dim=1)
-        nearest = torch.sort((splats.depths + ahead).clamp(min=0.0), stable=True).indices
+        nearest = torch.sort(ordering_depths(splats.depths, ahead), stable=True).indices
         yield places, splats[nearest]
 
 

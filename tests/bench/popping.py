@@ -2,7 +2,7 @@
 
 Frames are 1° of an orbit apart.  Their FLIP is compared with that of a truth, which sorts the splats of each pixel by
 their depth along its ray and takes 16 samples per pixel; what is above the truth's is popping.  Orders: those of
-`auto`, by depth and by tile, with several shares of the tilt (`projection.TILT_SHARE`); by tile, with runs of `WINDOW`
+`auto`, by depth and by tile, with several shares of the change of depth (see `splats`); by tile, with runs of `WINDOW`
 splats sorted again in each pixel (after StopThePop, Radl et al. 2024, arXiv 2402.00525); and by the depth along each
 pixel's ray.  The last two are eager code of this bench.
 """
@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core import projection
+from aaplug.core import projection, splats
 from aaplug.core.camera_paths import orbit, up_of
 from aaplug.core.cameras import Camera
 from aaplug.core.colours import Colour
@@ -41,10 +41,12 @@ TRUTH_SAMPLES = 4  # along a pixel's side
 WINDOW = 8  # splats that a pixel sorts again
 VALUES_AT_ONCE = 6_000_000  # alphas held at once
 TURNS = 15  # frames that are timed, of each order in turn
+OWN = splats.NEARER, splats.FARTHER
 CASES = (
-    ("depth", 0.0),
-    *(("tile", share) for share in (0.1, 0.12, 0.15, 0.2, 0.3, 1.0)),
-    *((kind, share) for share in (0.2, 1.0) for kind in ("window", "pixel")),
+    ("depth", (0.0, 0.0)),
+    ("tile", OWN),
+    *(("tile", (share, share)) for share in (0.1, 0.12, 0.15, 0.2, 0.3, 1.0)),
+    *((kind, (share, share)) for share in (0.2, 1.0) for kind in ("window", "pixel")),
 )
 
 
@@ -58,10 +60,10 @@ def main(scene: str = "chair", size: int = 128, photographs: int = 2, whole: int
     renderer, background = opened.renderer("matched", rasterizer="eager"), opened.checkpoint.background
     orders = {order: opened.renderer(find_recipe("auto", order=order)) for order in ("depth", "tile")}
 
-    def drawn(camera: Camera, kind: str, share: float) -> Float[Tensor, "h w 3"]:
+    def drawn(camera: Camera, kind: str, shares: tuple[float, float]) -> Float[Tensor, "h w 3"]:
         if kind not in orders:
-            return composited(renderer, camera, kind, share, background)
-        with patch.object(projection, "TILT_SHARE", share):
+            return composited(renderer, camera, kind, shares[0], background)
+        with patch.multiple(splats, NEARER=shares[0], FARTHER=shares[1]):
             return orders[kind](camera).rgb
 
     view, up = opened.views(1)[0], up_of(opened.cameras)
@@ -81,14 +83,14 @@ def main(scene: str = "chair", size: int = 128, photographs: int = 2, whole: int
     seen = [_middle(v, size) for v in opened.views(photographs)]
     photos = [photo_at(v, v, background) for v in opened.views(photographs)]
     photos = [photo[_start(len(photo), size) :, _start(photo.shape[1], size) :][:size, :size] for photo in photos]
-    heading(f"{scene}, FLIP of the truth's motion: {motion:.4f}", "order", "share", "popping", "PSNR, dB")
-    for kind, share in CASES if others else (("depth", 0.0), ("tile", projection.TILT_SHARE)):
-        images = [drawn(frame, kind, share) for frame in frames]
+    heading(f"{scene}, FLIP of the truth's motion: {motion:.4f}", "order", "nearer", "farther", "popping", "PSNR, dB")
+    for kind, shares in CASES if others else CASES[:2]:
+        images = [drawn(frame, kind, shares) for frame in frames]
         popping = mean(flip(images[a], images[b]) or 0.0 for a, b in pairs) - motion
         close = mean(
-            decibels(drawn(camera, kind, share).clamp(0, 1), photo) for camera, photo in zip(seen, photos, strict=True)
+            decibels(drawn(camera, kind, shares).clamp(0, 1), photo) for camera, photo in zip(seen, photos, strict=True)
         )
-        row(kind, share, f"{popping:.5f}", close)
+        row(kind, *shares, f"{popping:.5f}", close)
     heading(f"{scene}, whole views", "order", "PSNR, dB", *(f"ms at {scale:g}" for scale in TIMED_SCALES))
     views = opened.views(whole)
     close = {
@@ -109,31 +111,30 @@ def composited(
     renderer: Renderer, camera: Camera, kind: str, share: float, background: Colour
 ) -> Float[Tensor, "h w 3"]:
     """A view with splats sorted by tile, then in each pixel: all of them, or in runs."""
-    with patch.object(projection, "TILT_SHARE", share):
-        splats = projection.with_ray_slopes(renderer.splats(camera), renderer.scene, camera)
-    assert splats.ray_slopes is not None
+    drawn = projection.with_ray_slopes(renderer.splats(camera), renderer.scene, camera)
+    assert drawn.ray_slopes is not None
+    assert drawn.rgb is not None
     grid = (-(-camera.height // TILE), -(-camera.width // TILE))
-    places = torch.stack(tile_centres(splats.means), dim=1)
-    image = splats.means.new_tensor(background).expand(grid[0] * grid[1], TILE * TILE, 3).clone()
+    places = torch.stack(tile_centres(drawn.means), dim=1)
+    image = drawn.means.new_tensor(background).expand(grid[0] * grid[1], TILE * TILE, 3).clone()
     done = 0
-    for bins in bands(splats, grid, EAGER):
+    for bins in bands(drawn, grid, EAGER):
         left = torch.argsort(bins.counts, descending=True)[: int((bins.counts > 0).sum())]
         while len(left):
             longest = int(bins.counts[left[0]])
             tiles, left = left.tensor_split([max(1, VALUES_AT_ONCE // (longest * TILE * TILE))])
             k = torch.arange(longest)
-            drawn = k < bins.counts[tiles, None]
+            there = k < bins.counts[tiles, None]
             ids = bins.splats[(bins.first[tiles, None] + k).clamp(max=len(bins.splats) - 1)].long()
-            offsets = bins.origins[tiles, None, None] + places - splats.means[ids][:, :, None]
-            alpha = torch.where(drawn[..., None], alphas(splats, ids, offsets), 0.0)
+            offsets = bins.origins[tiles, None, None] + places - drawn.means[ids][:, :, None]
+            alpha = torch.where(there[..., None], alphas(drawn, ids, offsets), 0.0)
             ids = ids[..., None].expand_as(alpha)
-            depths = splats.depths[ids] + (splats.ray_slopes[ids[..., 0]][:, :, None] * offsets).sum(dim=3)
+            depths = drawn.depths[ids] + share * (drawn.ray_slopes[ids[..., 0]][:, :, None] * offsets).sum(dim=3)
             alpha, ids = sorted_again(alpha, ids, depths, longest if kind == "pixel" else WINDOW)
             light = torch.cumprod(1 - alpha, dim=1)
             weights = alpha * torch.cat([torch.ones_like(light[:, :1]), light[:, :-1]], dim=1)
             weights = torch.where(light >= RULES_3DGS.min_transmittance, weights, 0.0)
-            assert splats.rgb is not None
-            colours = torch.stack([(weights * channel[ids]).sum(dim=1) for channel in splats.rgb.T], dim=2)
+            colours = torch.stack([(weights * channel[ids]).sum(dim=1) for channel in drawn.rgb.T], dim=2)
             image[tiles + done] = colours + (1 - weights.sum(dim=1))[..., None] * image.new_tensor(background)
         done += len(bins.counts)
     whole = image.unflatten(1, (TILE, TILE)).unflatten(0, grid).transpose(1, 2).flatten(2, 3).flatten(0, 1)

@@ -156,7 +156,7 @@ def composites_the_exact_image(compositor: Compositor) -> None:
 def draws_what_the_reference_draws(rasterizer: Rasterizer) -> None:
     """Images of any size are the reference's, whatever the rules, order and sizes, and ray slopes if it sorts tiles."""
     sizes, sigmas = ((33, 44), (1, 1), (17, 3)), ((-2.0, 0.0), (0.0, 4.0))
-    tilts = (None, 0.0, 0.3) if isinstance(rasterizer, SortsTiles) else (None,)
+    tilts = (None, 0.0, 2.0) if isinstance(rasterizer, SortsTiles) else (None,)
     for hw, rules, log_sigmas, tilt in product(sizes, (RULES_3DGS, COARSE), sigmas, tilts):
         splats = make_splats(150, hw, seed=1, log_sigmas=log_sigmas)
         if tilt is not None:

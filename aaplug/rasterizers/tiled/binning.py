@@ -22,7 +22,7 @@ from aaplug.core.ellipses import squared_cutoff
 from aaplug.core.kernels import Kernel, Kernels, materialized
 from aaplug.core.rules import RULES_3DGS, Rules
 from aaplug.core.runs import runs_of, starts_of
-from aaplug.core.splats import Splats2D
+from aaplug.core.splats import Splats2D, ordering_depths
 from aaplug.methods.pixel_kernels.raster_rows import TILE, splat_example
 
 MEMORY_BYTES = 1e9
@@ -185,7 +185,7 @@ def _by_ray(
     columns = [*(drawn.means - TILE / 2).unbind(dim=1), *drawn.ray_slopes.unbind(dim=1), drawn.depths]
     x, y, right, down, depths = (column.index_select(0, splats) for column in columns)
     left, top = (column.index_select(0, tiles.int()) for column in origins.unbind(dim=1))
-    return _sorted(torch.addcmul(depths, right, left - x).addcmul_(down, top - y).clamp_(min=0.0))
+    return _sorted(ordering_depths(depths, (right * (left - x)).addcmul_(down, top - y)))
 
 
 def _spans(
