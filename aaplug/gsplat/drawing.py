@@ -140,5 +140,7 @@ def finished(image: Float[Tensor, "h w d"], alpha: Float[Tensor, "h w 1"], view:
     if view.background is not None and options.coloured:
         image = image + (1 - alpha) * functional.pad(view.background, (0, image.shape[2] - len(view.background)))
     if options.render_mode.endswith("ED"):
-        image = torch.cat([image[..., :-1], image[..., -1:] / alpha.clamp(min=MIN_ALPHA_OF_DEPTH)], dim=2)
+        colours, depth = image.movedim(2, 0).split([image.shape[2] - 1, 1])  # as they lie in memory
+        depth = depth / alpha.movedim(2, 0).clamp(min=MIN_ALPHA_OF_DEPTH)
+        image = torch.cat([colours, depth]).movedim(0, 2)
     return image

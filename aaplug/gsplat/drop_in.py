@@ -133,7 +133,10 @@ def rasterization(
     images = [
         draw(part, view, options, painter, kernels, add) for part, view, add in zip(splats, views, adders, strict=True)
     ]
-    colours, alphas = (torch.stack(column).unflatten(0, layout.shape) for column in zip(*images, strict=True))
+    colours, alphas = (
+        torch.stack([image.contiguous() for image in column]).unflatten(0, layout.shape)
+        for column in zip(*images, strict=True)
+    )
     if masks is not None:
         check_shape("masks", masks, colours.shape[:-1])
         colours = colours * masks[..., None]

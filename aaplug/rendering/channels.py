@@ -25,4 +25,6 @@ def composited(
     at_once = min(per_call, key=lambda count: -(-width // count))
     parts = functional.pad(channels, (0, -width % at_once)).split(at_once, dim=1)
     images = [draw(replace(splats, rgb=part)) for part in parts]
-    return Render(torch.cat([image.rgb for image in images], dim=2)[..., :width], images[0].alpha)
+    planes = [image.rgb.movedim(2, 0) for image in images]  # as they lie in memory
+    planes[-1] = planes[-1][: width - at_once * (len(planes) - 1)]
+    return Render(torch.cat(planes).movedim(0, 2), images[0].alpha)

@@ -73,7 +73,7 @@ class _Composite(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None, None]:
         (rows,) = ctx.saved_tensors
-        if not any(grad.any() for grad in grads):  # as of channels that no loss reads
+        if not any(any(bound != 0 for bound in grad.aminmax()) for grad in grads):  # as of channels that no loss reads
             return torch.zeros_like(rows), None, None
         rgb, alpha = (grad.contiguous() for grad in grads)  # once: they are gathered for each segment
         return _backward(rows, [*rgb, alpha], *ctx.rest), None, None
