@@ -144,7 +144,7 @@ AA_2DGS = Recipe(
     "scenes of 2D Gaussians trained with it",
     world=FLAT,
     pixel=SURFEL_MIP,
-    time=45.0,
+    time=2.2,
     promises=Promises(opaque_when_near=False),
 )
 GAUSSIAN_BLENDING = Recipe(
