@@ -25,21 +25,21 @@ def check_again() -> None:
     jaxtyping.config.update("jaxtyping_disable", False)
 
 
-def checked(function: Callable[..., Any]) -> Callable[..., Any]:
+def with_checks(function: Callable[..., Any]) -> Callable[..., Any]:
     """The function with its checks."""
     from beartype import beartype
 
     check = beartype(function)
 
     @wraps(function)
-    def counted(*args: Any, **options: Any) -> Any:
+    def call(*args: Any, **options: Any) -> Any:
         global _left
         _left -= 1
         if not _left:
             jaxtyping.config.update("jaxtyping_disable", True)
         return check(*args, **options)
 
-    return counted
+    return call
 
 
 def _visit_outermost(self: JaxtypingTransformer, node: ast.FunctionDef) -> Any:

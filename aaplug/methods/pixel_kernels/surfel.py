@@ -47,7 +47,7 @@ class Surfel:
         is an ellipse around -R C n / (1 - R q) with the covariance (C + R C n nᵀ C / (1 - R q)) / (1 - R q).
         """
         assert splats.depth_slopes is not None
-        cutoff = reach(splats, rules)
+        cutoff = positive_cutoff(splats, rules)
         xx, xy, yy = splats.covs.unbind(dim=1)
         nx, ny = splats.depth_slopes.unbind(dim=1)
         cx, cy = xx * nx + xy * ny, xy * nx + yy * ny
@@ -58,15 +58,15 @@ class Surfel:
         shift = -stretch[:, None] * torch.stack([cx, cy], dim=1)
         covs = torch.stack([xx + stretch * cx * cx, xy + stretch * cx * cy, yy + stretch * cy * cy], dim=1)
         discs = replace(splats, means=splats.means + shift, covs=covs / left[:, None], dets=splats.dets / left**3)
-        filtered = self.with_filter(discs, torch.hypot(*shift.unbind(dim=1)), rules)
-        return replace(filtered, opacities=torch.where(near, splats.opacities, 0.0))
+        ellipses = self.with_filter(discs, torch.hypot(*shift.unbind(dim=1)), rules)
+        return replace(ellipses, opacities=torch.where(near, splats.opacities, 0.0))
 
     def with_filter(self, discs: Splats2D, shift: Float[Tensor, " m"], rules: Rules) -> Splats2D:
         """Ellipses that also contain the low-pass filter, a circle `shift` px from their centres.
 
         A covariance contains a concentric circle of radius r if its least eigenvalue times the cut-off is at least r².
         """
-        cutoff = reach(discs, rules)
+        cutoff = positive_cutoff(discs, rules)
         radius = (self.filter_variance(discs.window) * cutoff).sqrt() + shift
         half = 0.5 * (discs.covs[:, 0] + discs.covs[:, 2])
         least = discs.dets / (half + (half * half - discs.dets).clamp(min=0).sqrt())
@@ -87,7 +87,7 @@ class Surfel:
 
     def alpha(self, rows: Float[Tensor, "*n t c"], pixels: Pixels, limits: Limits) -> Float[Tensor, "*n t P"]:
         """2^(log2 o - ρ log2(e)/2), 0 below the cut-off."""
-        s, t, _ = met(rows, pixels)
+        s, t, _ = plane_coordinates(rows, pixels)
         dx, dy = offsets_at(rows, pixels)
         on_disc, low_pass = s * s + t * t, rows[..., FILTER, None] * (dx * dx + dy * dy)
         return exp2_of(rows[..., OPACITY, None] - torch.minimum(on_disc, low_pass), limits)
@@ -101,12 +101,12 @@ class Surfel:
         return torch.where(in_front, values, torch.exp(-0.5 * low_pass))
 
 
-def reach(splats: Splats2D, rules: Rules) -> Float[Tensor, " m"]:
+def positive_cutoff(splats: Splats2D, rules: Rules) -> Float[Tensor, " m"]:
     """Squared cut-off, at least a positive number, which may be a divisor."""
     return squared_cutoff(splats.opacities, rules.min_alpha).clamp(min=torch.finfo(splats.means.dtype).tiny)
 
 
-def met(rows: Float[Tensor, "*n t c"], pixels: Pixels) -> tuple[Tensor, Tensor, Tensor]:
+def plane_coordinates(rows: Float[Tensor, "*n t c"], pixels: Pixels) -> tuple[Tensor, Tensor, Tensor]:
     """Where pixels' rays meet the discs, s and t, by the forms of the raster rows; and 1/w."""
     u, v = forms_at(rows, pixels)
     dx, dy = offsets_at(rows, pixels)
