@@ -280,12 +280,12 @@ class CountsEvaluations(Protocol):
 
 @runtime_checkable
 class SortsTiles(Protocol):
-    """A rasterizer that sorts the splats of each tile along its ray where they have `Splats2D.ray_slopes`."""
+    """A rasterizer that sorts the splats of each tile along its ray where they have `Splats2D.ray_slopes`.
 
-    @property
-    def tile(self) -> int:
-        """Side of its tiles, in px."""
-        ...
+    tile: side of its tiles, in px.
+    """
+
+    tile: int
 
 
 @runtime_checkable

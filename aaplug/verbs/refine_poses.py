@@ -64,14 +64,14 @@ def refined(job: Job[ViewOptions], look: Renderer, views: Sequence[Camera]) -> R
     splits = {
         split: tuple(moved.get(id(view), view) for view in getattr(job.cameras, split)) for split in ("train", "test")
     }
-    changed = [pose for pose in poses if pose.degrees or pose.distance]
+    changed = [
+        (pose.degrees, pose.distance, pose.before, pose.after) for pose in poses if pose.degrees or pose.distance
+    ]
     note = f"all {len(poses)} poses stay: their photographs show nothing better"
     if changed:
-        turn, shift = (median(getattr(pose, name) for pose in changed) for name in ("degrees", "distance"))
-        before, after = (median(getattr(pose, name) for pose in changed) for name in ("before", "after"))
+        turn, shift, before, after = map(median, zip(*changed, strict=True))
         errors = f"error at half size from {before:.1f} to {after:.1f} of 255 levels"
-        note = (
-            f"{len(changed)} of {len(poses)} poses moved, in the median by {turn:.2g}° and {shift:.2g} units: {errors}"
-        )
+        moves = f"in the median by {turn:.2g}° and {shift:.2g} units"
+        note = f"{len(changed)} of {len(poses)} poses moved, {moves}: {errors}"
     job.monitor.say(note)
     return RefinedCameras(replace(job.cameras, **splits, notes=(*job.cameras.notes, note)), tuple(poses))
