@@ -13,7 +13,7 @@ from aaplug.io import streamed
 from aaplug.io.scenes import read_scene
 from aaplug.io.streamed import MAX_SCREEN_ERROR, TILE_SWITCH
 from aaplug.methods.viewers import VIEWERS
-from aaplug.system.errors import OutputError, UsageError
+from aaplug.system.errors import FormatError, OutputError, UsageError
 from tests.conftest import make_camera, make_scene
 
 LEVELS = 2
@@ -104,6 +104,13 @@ def test_a_run_that_was_cut_short_is_resumed(tmp_path, small_leaves, monkeypatch
     made(tmp_path / "out", to, resume=True, **tuned)
     assert resumed == [LEVELS]
     assert contents(tmp_path / "out") == contents(tmp_path / "whole")
+
+
+@pytest.mark.parametrize(("text", "said"), [("{}", "a list of parts"), ("[[1, 2]]", "7 numbers"), ("", "JSON")])
+def test_damaged_facts_of_parts_are_refused(tmp_path, text, said):
+    streamed.facts_file(tmp_path, 0).write_text(text)
+    with pytest.raises(FormatError, match=f"parts_0.json.*{said}"):
+        streamed.write_index(tmp_path, "sog", 1, 1.0)
 
 
 def test_levels_that_are_there_are_not_replaced(tmp_path):

@@ -141,7 +141,9 @@ def write_index(folder: Path, name: StreamName, levels: int, rate: float) -> Map
 
 def _read_parts(path: Path) -> list["_Part"]:
     """What `write_level` wrote of a level's parts."""
-    facts = [numbers(fact, FACTS if fact else 0, Place(path, "the list"), "a part") for fact in read_json(path)]
+    document, place = read_json(path), Place(path, "the file")
+    place.expect(isinstance(document, list), "it", "a list of parts", document)
+    facts = [numbers(fact, FACTS if fact else 0, place, "a part") for fact in document]
     boxes = [torch.tensor(fact[1:], dtype=torch.float64).view(-1, 3) for fact in facts]
     return [_Part(int(fact[0]), box) if fact else NOTHING for fact, box in zip(facts, boxes, strict=True)]
 
