@@ -6,16 +6,15 @@ at every call of the outer one, and of each test the first `MOST_CHECKS` are mad
 
 import ast
 from collections.abc import Callable
+from contextlib import suppress
 from functools import wraps
 from typing import Any
 
 import jaxtyping
-from jaxtyping._import_hook import JaxtypingTransformer
 
 MOST_CHECKS = 5000  # of a test: twice as many as calls
 
 _left = MOST_CHECKS
-_visit = JaxtypingTransformer.visit_FunctionDef
 
 
 def check_again() -> None:
@@ -42,8 +41,17 @@ def with_checks(function: Callable[..., Any]) -> Callable[..., Any]:
     return call
 
 
-def _visit_outermost(self: JaxtypingTransformer, node: ast.FunctionDef) -> Any:
-    return node if any(isinstance(parent, ast.FunctionDef) for parent in self._parents) else _visit(self, node)
+def _leave_inner_functions_out() -> None:
+    with suppress(ImportError):  # in a version without this name they are checked too
+        from jaxtyping._import_hook import JaxtypingTransformer
+
+        visit = JaxtypingTransformer.visit_FunctionDef
+
+        def visit_outermost(self: JaxtypingTransformer, node: ast.FunctionDef) -> Any:
+            inner = any(isinstance(parent, ast.FunctionDef) for parent in self._parents)
+            return node if inner else visit(self, node)
+
+        JaxtypingTransformer.visit_FunctionDef = visit_outermost
 
 
-JaxtypingTransformer.visit_FunctionDef = _visit_outermost
+_leave_inner_functions_out()
