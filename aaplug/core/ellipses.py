@@ -50,6 +50,11 @@ def squared_cutoff(
     return 2 * torch.log(opacities / min_alpha)
 
 
+def positive_cutoff(splats: Splats2D, min_alpha: float) -> Float[Tensor, " m"]:
+    """The squared cut-off, at least a tiny positive number, so that it can be a divisor."""
+    return squared_cutoff(splats.opacities, min_alpha).clamp(min=torch.finfo(splats.means.dtype).tiny)
+
+
 @contract
 def grown(splats: Splats2D, radius: Float[Tensor, " m"], min_alpha: Annotated[float, Range(above=0)]) -> Splats2D:
     """Splats whose cut-off ellipses contain every point within `radius` px of the given ones; for bounding only.
@@ -59,8 +64,7 @@ def grown(splats: Splats2D, radius: Float[Tensor, " m"], min_alpha: Annotated[fl
     """
     if radius.shape != splats.dets.shape:
         raise UsageError("radius", f"expected [{len(splats)}] numbers, got {[*radius.shape]}")
-    cutoff = squared_cutoff(splats.opacities, min_alpha)
-    cutoff = cutoff.clamp(min=torch.finfo(splats.means.dtype).tiny)
+    cutoff = positive_cutoff(splats, min_alpha)
     radius = radius.clamp(min=torch.finfo(splats.means.dtype).eps)  # it is divided by
     trace = splats.covs[:, 0] + splats.covs[:, 2]
     share = radius / (0.5 * cutoff * trace).sqrt()

@@ -9,20 +9,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.ellipses import grown
+from aaplug.core.ellipses import grown, positive_cutoff
 from aaplug.core.interfaces import Limits, Pixels
 from aaplug.core.rules import Rules
 from aaplug.core.splats import Splats2D
 from aaplug.methods.pixel_kernels.point import HALF_LOG2_E, exp2_of
 from aaplug.methods.pixel_kernels.raster_rows import OPACITY, UX, UY, VX, VY
-from aaplug.methods.pixel_kernels.surfel import (
-    SLOPE_X,
-    SLOPE_Y,
-    Surfel,
-    intersection,
-    plane_coordinates,
-    positive_cutoff,
-)
+from aaplug.methods.pixel_kernels.surfel import SLOPE_X, SLOPE_Y, Surfel, intersection, plane_coordinates
 
 DISC_VARIANCE = 0.1  # px²: variance of AA-2DGS's object-space Mip filter
 LEAST_FACTOR = 1e-8  # AA-2DGS adds this to 1/det V before the square root, as published
@@ -36,7 +29,7 @@ class SurfelMip(Surfel):
 
     def with_filter(self, discs: Splats2D, shift: Float[Tensor, " m"], rules: Rules) -> Splats2D:
         """Ellipses of discs that are convolved with the filter."""
-        return grown(discs, (DISC_VARIANCE * positive_cutoff(discs, rules)).sqrt(), rules.min_alpha)
+        return grown(discs, (DISC_VARIANCE * positive_cutoff(discs, rules.min_alpha)).sqrt(), rules.min_alpha)
 
     def alpha(self, rows: Float[Tensor, "*n t c"], pixels: Pixels, limits: Limits) -> Float[Tensor, "*n t P"]:
         """Opacity times the filtered disc; s, t, J and V are scaled as the forms of the raster rows are."""

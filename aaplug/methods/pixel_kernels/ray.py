@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from aaplug.core.ellipses import squared_cutoff, whitening, whitening_columns
+from aaplug.core.ellipses import positive_cutoff, squared_cutoff, whitening, whitening_columns
 from aaplug.core.interfaces import Limits, Pixels
 from aaplug.core.kernels import Kernels
 from aaplug.core.lenses import Lens
@@ -68,7 +68,7 @@ class Ray:
         if camera is None or planes is None:
             return None
         lens, tiny = camera.lens, torch.finfo(splats.means.dtype).tiny
-        cutoff = squared_cutoff(splats.opacities, rules.min_alpha).clamp(min=tiny)
+        cutoff = positive_cutoff(splats, rules.min_alpha)
         angles = torch.arange(CORNERS).to(cutoff) * (2 * math.pi / CORNERS)
         circle = torch.stack([angles.cos(), angles.sin()], dim=1) / math.cos(math.pi / CORNERS)
         xx, xy, _ = splats.covs.unbind(dim=1)

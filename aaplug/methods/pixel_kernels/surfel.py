@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.ellipses import squared_cutoff, whitening_columns
+from aaplug.core.ellipses import positive_cutoff, whitening_columns
 from aaplug.core.interfaces import Limits, Pixels
 from aaplug.core.kernels import Kernels
 from aaplug.core.rules import Rules
@@ -47,7 +47,7 @@ class Surfel:
         is an ellipse around -R C n / (1 - R q) with the covariance (C + R C n nᵀ C / (1 - R q)) / (1 - R q).
         """
         assert splats.depth_slopes is not None
-        cutoff = positive_cutoff(splats, rules)
+        cutoff = positive_cutoff(splats, rules.min_alpha)
         xx, xy, yy = splats.covs.unbind(dim=1)
         nx, ny = splats.depth_slopes.unbind(dim=1)
         cx, cy = xx * nx + xy * ny, xy * nx + yy * ny
@@ -66,7 +66,7 @@ class Surfel:
 
         A covariance contains a concentric circle of radius r if its least eigenvalue times the cut-off is at least r².
         """
-        cutoff = positive_cutoff(discs, rules)
+        cutoff = positive_cutoff(discs, rules.min_alpha)
         radius = (self.filter_variance(discs.window) * cutoff).sqrt() + shift
         half = 0.5 * (discs.covs[:, 0] + discs.covs[:, 2])
         least = discs.dets / (half + (half * half - discs.dets).clamp(min=0).sqrt())
@@ -99,11 +99,6 @@ class Surfel:
         low_pass = LOW_PASS * squared / max(splats.window, MIN_FILTER_WIDTH) ** 2
         values = torch.exp(-0.5 * torch.minimum(s * s + t * t, low_pass))
         return torch.where(in_front, values, torch.exp(-0.5 * low_pass))
-
-
-def positive_cutoff(splats: Splats2D, rules: Rules) -> Float[Tensor, " m"]:
-    """Squared cut-off, at least a positive number, which may be a divisor."""
-    return squared_cutoff(splats.opacities, rules.min_alpha).clamp(min=torch.finfo(splats.means.dtype).tiny)
 
 
 def plane_coordinates(rows: Float[Tensor, "*n t c"], pixels: Pixels) -> tuple[Tensor, Tensor, Tensor]:
