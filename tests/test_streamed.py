@@ -106,6 +106,19 @@ def test_a_run_that_was_cut_short_is_resumed(tmp_path, small_leaves, monkeypatch
     assert contents(tmp_path / "out") == contents(tmp_path / "whole")
 
 
+@pytest.mark.parametrize("to", streamed.STREAMS)
+def test_nothing_is_left_of_a_longer_run_that_was_cut_short(tmp_path, monkeypatch, to):
+    written = streamed.write_index
+    monkeypatch.setattr("aaplug.verbs.lod.write_index", lambda folder, *rest: written(tmp_path / "elsewhere", *rest))
+    with pytest.raises(FormatError, match="no such file"):
+        made(tmp_path / "out", to)
+    assert (tmp_path / "out" / "lod.json").exists()
+    monkeypatch.setattr("aaplug.verbs.lod.write_index", written)
+    made(tmp_path / "out", to, levels=LEVELS - 1, overwrite=True)
+    names = {path.name for path in (tmp_path / "out").iterdir() if path.is_file()}
+    assert names == {streamed.SETTINGS, streamed.STREAMS[to].index}
+
+
 @pytest.mark.parametrize(("text", "said"), [("{}", "a list of parts"), ("[[1, 2]]", "7 numbers"), ("", "JSON")])
 def test_damaged_facts_of_parts_are_refused(tmp_path, text, said):
     streamed.facts_file(tmp_path, 0).write_text(text)

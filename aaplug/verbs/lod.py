@@ -117,7 +117,7 @@ def lod(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, options:
                 job.monitor.say(f"set the viewer by {path / SETTINGS}: {json.dumps(settings)}")
                 remove_parts(earlier - part_folders(path, options.to), options.to)
                 facts = [facts_file(path, number) for number in range(len(levels))]
-                stale = [*files, path / MANIFEST, *facts]  # what a run that is cut short resumes from
+                stale += [*files, path / MANIFEST, *facts]  # what a run that is cut short resumes from
             for file in stale:
                 file.unlink(missing_ok=True)
             return levels
@@ -307,6 +307,7 @@ def _outputs(output: Path | None, scene: Scene, options: LodOptions) -> tuple[li
         with suppress(FormatError):
             stale += [output / level.file for level in read_manifest(output, unfinished=True).levels]
         stale.append(output / MANIFEST)
+    stale += takewhile(Path.is_file, (facts_file(output, level) for level in count(len(files))))
     stale = [file for file in stale if file not in (*files, *others)]
     refuse_inputs(stale, scene.files)
     return files, stale
