@@ -18,21 +18,14 @@ from aaplug.core.sampling import sampling_bounds
 from aaplug.core.training import TrainingViews
 from aaplug.evaluation.truth import MEMORY, Truth, back_projected
 from aaplug.finetuning import loop
-from aaplug.finetuning.groups import drawn, regroup
 from aaplug.finetuning.loop import advance, loss_at, run
 from aaplug.finetuning.losses import LOSSES, l1_dssim, l2, structural_similarity
 from aaplug.finetuning.parameters import RATES, between, extent, least_log_scales, leaves_of, scene_of
 from aaplug.finetuning.settings import CONSISTENCY, QUICK_SETTINGS, Settings, balance, settings_of
 from aaplug.finetuning.state import DYNAMO_FOLDER, State, TuningJob, begin, load, save
 from aaplug.io.images import write_png
-from aaplug.lab.densification import (
-    MIN_GRADIENT,
-    MIN_OPACITY,
-    SPLIT_SHRINKAGE,
-    densify,
-    densify_after_step,
-    moments_after,
-)
+from aaplug.lab.densification import MIN_GRADIENT, MIN_OPACITY, SPLIT_SHRINKAGE, densify, moments_after
+from aaplug.lab.group_training import GROUP_TRAINING, drawn, regroup
 from aaplug.lab.mipmap_gs import MIPMAP_GS
 from aaplug.methods import RECIPES
 from aaplug.options.verbs import FinetuneOptions
@@ -56,13 +49,14 @@ def make_job(
     scene = make_scene(n, seed=4, dtype=dtype)
     look = own_look(scene, TrainingViews.of(scene, VIEWS), RASTERIZERS["eager"], GREY)
     truth = Truth(look, enlarge=back_projected, memory=MEMORY)
-    return TuningJob(replace(look, recipe=RECIPES[recipe]), VIEWS, truth, settings, densify=densify_after_step)
+    return TuningJob(replace(look, recipe=RECIPES[recipe]), VIEWS, truth, settings, method=MIPMAP_GS)
 
 
 def after(job: TuningJob, steps: int | None = None) -> State:
     state = begin(job)
     for _ in range(job.settings.steps if steps is None else steps):
-        advance(job, state)
+        with job.method.around(job, state) as drawings:
+            advance(job, state, drawings)
     return state
 
 
@@ -211,13 +205,14 @@ def test_a_method_that_keeps_the_number_of_gaussians_says_so():
 
 
 def test_a_group_trains_alone_and_is_drawn_anew_as_the_published_code_does_in_proportion():
-    settings = replace(SETTINGS, steps=60, group_share=0.6)
-    job = replace(make_job(settings=settings), densify=None)
+    settings = replace(SETTINGS, steps=60)
+    job = replace(make_job(settings=settings), method=GROUP_TRAINING)
     state, groups, moved = begin(job), [], {}
     for step in range(60):
         if step in (4, 29, 58):  # a group, and all
             before = {name: leaf.detach().clone() for name, leaf in state.leaves.items()}
-            advance(job, state)
+            with job.method.around(job, state):
+                advance(job, state)
             moved[step] = int((state.leaves["dc"] != before["dc"]).flatten(1).any(dim=1).sum())
             inside = torch.arange(60) if state.group is None else state.group
             others = torch.ones(60, dtype=torch.bool).index_fill_(0, inside, False)
@@ -241,20 +236,14 @@ def test_groups_are_drawn_by_opacity():
     assert 230 < int((group < 500).sum()) < 290  # 300 draws with replacement would hit them 270 times
 
 
-def test_groups_need_a_number_of_gaussians_that_stays():
-    with pytest.raises(
-        UsageError, match="group_share: needs a number of Gaussians that stays, and mipmap-gs densifies"
-    ):
-        settings_of(MIPMAP_GS, FinetuneOptions(scale=(0.5,), group_share=0.6))
-
-
 # runs
 
 
-@pytest.mark.parametrize(("densify_every", "group_share", "stopped_at"), [(0, 1.0, 2), (2, 1.0, 3), (0, 0.5, 3)])
-def test_a_run_that_was_stopped_and_resumed_is_one_that_never_was(densify_every, group_share, stopped_at, tmp_path):
-    settings = replace(SETTINGS, densify_every=densify_every, group_share=group_share)
-    job = replace(make_job(settings=settings), densify=densify_after_step if densify_every else None)
+@pytest.mark.parametrize(
+    ("method", "densify_every", "stopped_at"), [(CONSISTENCY, 0, 2), (MIPMAP_GS, 2, 3), (GROUP_TRAINING, 0, 3)]
+)
+def test_a_run_that_was_stopped_and_resumed_is_one_that_never_was(method, densify_every, stopped_at, tmp_path):
+    job = replace(make_job(settings=replace(SETTINGS, densify_every=densify_every)), method=method)
     whole = begin(job)
     assert run(job, whole, every=2)
     first, kept = begin(job), []

@@ -14,7 +14,6 @@ from torch import Tensor
 
 from aaplug.core.cameras import Camera
 from aaplug.core.sampling import sampling_bounds
-from aaplug.finetuning.groups import others_kept, regroup
 from aaplug.finetuning.losses import LOSSES
 from aaplug.finetuning.parameters import extent, least_log_scales
 from aaplug.finetuning.settings import SEED_STRIDE, Settings
@@ -52,7 +51,8 @@ def run(
     """
     fallback = fallback or snapshot(state)
     while state.step < job.settings.steps and not stop():
-        advance(job, state)
+        with job.method.around(job, state) as drawings:
+            advance(job, state, drawings)
         if state.bad_steps >= MAX_BAD_STEPS:  # the step count continues, so other views follow
             step, rollbacks = state.step, state.rollbacks + 1
             if rollbacks > MAX_ROLLBACKS:
@@ -70,18 +70,18 @@ def run(
     return state.step >= job.settings.steps
 
 
-def advance(job: TuningJob, state: State) -> None:
-    """Take one step; if a loss or gradient is not finite, only the step is counted."""
+def advance(job: TuningJob, state: State, drawings: list[Drawing] | None = None) -> None:
+    """Take one step and add its drawings; if a loss or gradient is not finite, only the step is counted."""
     settings = job.settings
-    regroup(state, settings)
     view, weights = _view_and_weights(settings, job.views, state.step)
     state.adam.zero_grad(set_to_none=True)
-    losses, drawings = {}, []
+    losses = {}
     for scale, weight in weights.items():
         loss, drawing = loss_at(job, state, view, scale)
         (weight * loss).backward()
         losses[scale] = loss.item()
-        drawings += [drawing] if job.densify else []
+        if drawings is not None:
+            drawings.append(drawing)
     state.step += 1
     gradients = [leaf.grad for leaf in state.leaves.values() if leaf.grad is not None]
     if not all(map(math.isfinite, losses.values())) or not all(bool(g.sum().isfinite()) for g in gradients):
@@ -93,11 +93,8 @@ def advance(job: TuningJob, state: State) -> None:
     for group in state.adam.param_groups:
         size = extent(job.start.training.cameras) if group["name"] == "means" else 1.0
         group["lr"] = settings.rates[group["name"]] * size * decay
-    with others_kept(state):
-        state.adam.step()
+    state.adam.step()
     _clamp_parameters(state)
-    if job.densify:
-        job.densify(job, state, drawings)
     if state.step % BOUNDS_EVERY == 0 and "means" in settings.rates:
         update_bounds(job, state)
 

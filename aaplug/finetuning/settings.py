@@ -1,7 +1,9 @@
 """How to fine-tune: the settings of a run, and aaplug's method of choosing them."""
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
+from typing import Any
 
 from aaplug.finetuning.losses import LOSSES
 from aaplug.finetuning.parameters import RATES
@@ -22,7 +24,6 @@ class Settings:
     decay: factor that the learning rates have reached at the end.
     loss: a name in `losses.LOSSES`.
     densify_every: steps between densifications, 0 for none.
-    group_share: of the Gaussians, that trains and is drawn at a time; see `groups`.
     """
 
     name: str
@@ -33,7 +34,6 @@ class Settings:
     decay: float = 1.0
     loss: str = "l2"
     densify_every: int = 0
-    group_share: float = 1.0
     seed: int = 0
 
 
@@ -66,13 +66,13 @@ class Method:
 
     settings: of a run, from its scales, the parameters that move and the anchor.
     viewer: the usual one.
-    densify: called after each step with the `TuningJob`, the `State`, which it may change, and the step's drawings,
-        whose screen-space means retain their gradients; None for a method that keeps the number of Gaussians.
+    around: a context for each step, given the `TuningJob` and the `State`, which it may change.  It yields None, or a
+        list to which the step adds its drawings, whose screen-space means retain their gradients.
     """
 
     settings: Callable[[Sequence[float], Sequence[str], float], Settings]
     viewer: Viewer
-    densify: Callable[..., None] | None = None
+    around: Callable[..., AbstractContextManager[list[Any] | None]] = lambda job, state: nullcontext()
 
 
 CONSISTENCY = Method(consistency, FAST)
@@ -88,17 +88,14 @@ def settings_of(method: Method, options: FinetuneOptions) -> Settings:
     if options.loss not in LOSSES:
         raise UsageError("loss", not_one_of(options.loss, LOSSES))
     settings = method.settings(options.scale, options.move, options.anchor)
-    if options.densify_every and method.densify is None:
+    if options.densify_every and not settings.densify_every:
         raise UsageError("densify_every", f"the method {settings.name} keeps the number of Gaussians")
     densify_every = settings.densify_every if options.densify_every is None else options.densify_every
-    if densify_every and options.group_share < 1:
-        raise UsageError("group_share", f"needs a number of Gaussians that stays, and {settings.name} densifies")
     return replace(
         settings,
         steps=settings.steps if options.steps is None else options.steps,
         rates={name: rate * options.learning_rate for name, rate in settings.rates.items()},
         loss=options.loss,
         densify_every=densify_every,
-        group_share=options.group_share,
         seed=options.seed,
     )

@@ -6,7 +6,7 @@ tensors, numbers and strings only, and is read as such: nothing in it is execute
 
 import os
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
@@ -23,7 +23,7 @@ from aaplug.core.gaussians import Gaussians, digest_of_scene
 from aaplug.core.sampling import SamplingBounds
 from aaplug.evaluation.truth import Truth
 from aaplug.finetuning.parameters import Leaves, leaves_of, scene_of
-from aaplug.finetuning.settings import Settings
+from aaplug.finetuning.settings import CONSISTENCY, Method, Settings
 from aaplug.io.atomic import replacing
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.digests import digest_of_files
@@ -43,7 +43,7 @@ class TuningJob:
     views: training views, at the training size.
     truth: the images that renders are compared with.
     upsampler: what makes its larger images, as text that changes if it does.
-    densify: that of the `Method`.
+    method: the way to fine-tune.
     """
 
     start: Renderer
@@ -51,10 +51,7 @@ class TuningJob:
     truth: Truth
     settings: Settings
     upsampler: str = ""
-    densify: Callable[..., None] | None = None
-
-    def __post_init__(self) -> None:
-        assert self.densify or not self.settings.densify_every
+    method: Method = CONSISTENCY
 
     @cached_property
     def facts(self) -> dict[str, str]:
@@ -82,7 +79,7 @@ class State:
 
     first_log_scales: of each Gaussian when the run or densification made it.
     bounds: sampling bounds; they are computed anew every `loop.BOUNDS_EVERY` steps and after each densification.
-    gradients: sums over steps that the job's `densify` needs, by name.
+    gradients: sums over steps that densification needs, by name.
     group: places of the Gaussians that train and are drawn; None for all.
     bad_steps: consecutive steps without finite gradients.
     rollbacks: how often the run returned to an earlier state.

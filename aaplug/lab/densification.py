@@ -5,7 +5,8 @@ average over the views that drew it, a small Gaussian is cloned and a large one 
 Gaussians are pruned.  As in 3DGS, gradients are per half the image's side.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import torch
@@ -26,13 +27,16 @@ MIN_OPACITY = 0.005  # of a Gaussian that is not pruned (3DGS)
 SPLIT_SEED = 6_000_000  # added to the seed for the places of the halves
 
 
-def densify_after_step(job: TuningJob, state: State, drawings: Sequence[Drawing]) -> None:
-    """Add a step's gradients, and every `densify_every` steps change the number of Gaussians.
+@contextmanager
+def with_densification(job: TuningJob, state: State) -> Iterator[list[Drawing]]:
+    """After a step, add its gradients, and every `densify_every` steps change the number of Gaussians.
 
-    Those that stay keep their Adam moments.  drawings: after their backward passes; their means retain gradients.
+    Those that stay keep their Adam moments.
     """
+    drawings: list[Drawing] = []
+    yield drawings
     settings, sums = job.settings, state.gradients
-    if not settings.densify_every:
+    if not settings.densify_every or state.bad_steps:
         return
     if not sums:
         sums.update({name: torch.zeros(len(state.first_log_scales)) for name in ("total", "views")})

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from aaplug.finetuning.parameters import RATES
 from aaplug.finetuning.settings import Method, Settings
-from aaplug.lab.densification import densify_after_step
+from aaplug.lab.densification import with_densification
 from aaplug.methods.viewers import CLASSIC_VIEWER
 from aaplug.system.errors import UsageError
 
@@ -20,4 +20,4 @@ def mipmap_gs(scales: Sequence[float], move: Sequence[str] = (), anchor: float =
     return Settings("mipmap-gs", 1000, {scales[0]: 1.0}, RATES, densify_every=100)
 
 
-MIPMAP_GS = Method(mipmap_gs, CLASSIC_VIEWER, densify_after_step)
+MIPMAP_GS = Method(mipmap_gs, CLASSIC_VIEWER, with_densification)

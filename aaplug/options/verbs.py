@@ -259,7 +259,7 @@ class FinetuneOptions(WritingOptions, ViewOptions):
     views: Annotated[str, VIEWS] = "test"
     """Views that the result is measured on, by name or split; training views are what it is tuned on."""
     method: Annotated[str, names(kind="method")] = "consistency"
-    """consistency makes one model for all scales; mipmap-gs makes one for a single --scale, as Mipmap-GS does."""
+    """consistency: one model for all scales; group-training: the same, a share at a time; mipmap-gs: one scale."""
     learn_filters: bool = False
     """Learn a filter for each Gaussian by image size, for `--recipe learned`; the Gaussians stay as they are."""
     scale: Annotated[Sequence[float], SCALES] = tuple(LOSS_WEIGHTS)
@@ -276,8 +276,6 @@ class FinetuneOptions(WritingOptions, ViewOptions):
     """Factor on the method's learning rates."""
     densify_every: Annotated[int | None, STEPS, TUNING] = None
     """Clone, split and prune every N steps; 0 for never (default: the method's own)."""
-    group_share: Annotated[float, number(0.01, 1, metavar="SHARE"), TUNING] = 1.0
-    """Share of the Gaussians that is drawn and moves at a time, as in Group Training, whose share is 0.6."""
     truth: Annotated[str, names(*TRUTHS)] = "auto"
     """What the training size should look like: self is the scene's own render; auto takes photographs if all exist."""
     poses: Annotated[bool, TUNING] = False

@@ -108,7 +108,7 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
             fused = replace(fused, extras={**zeros, **fused.extras})
         start = replace(before, scene=fused)
         truth = Truth(look, truth_source, enlarge=enlarge, memory=MEMORY)
-        tuning = TuningJob(start, train, truth, settings, upsampler, method.densify)
+        tuning = TuningJob(start, train, truth, settings, upsampler, method)
         steps = f"{settings.name}, {settings.steps} steps, truth: {truth_source}"
         job.monitor.say(f"tuning for {start.recipe.name} ({start.recipe.source}): {steps}")
         cost = _cost(start, train, settings)

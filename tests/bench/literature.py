@@ -145,11 +145,11 @@ def groups(chair: Trained) -> None:
         views, steps = opened.views(5), GROUP_STEPS[name]
         truths = photographs(opened, (1.0, *SCALES), views)
         row(f"{name}, not tuned", *psnr(opened.renderer("matched"), truths))
-        for kind, share in {"plain": 1.0, "groups of 0.6": 0.6}.items():
+        for method in ("consistency", "group-training"):
             started = time.process_time()
-            tuned = finetune(opened.scene, opened.cameras, None, group_share=share, steps=steps, **options_of(opened))
+            tuned = finetune(opened.scene, opened.cameras, None, method=method, steps=steps, **options_of(opened))
             figures = psnr(replace(opened, scene=tuned.scene).renderer("matched"), truths)
-            row(f"{name}, {steps} steps, {kind}", *figures, f"{time.process_time() - started:.0f}")
+            row(f"{name}, {steps} steps, {method}", *figures, f"{time.process_time() - started:.0f}")
 
 
 def options_of(opened: Trained) -> dict[str, Any]:
