@@ -30,17 +30,13 @@ def frequency_response(splats: Splats2D, omega: Float[Tensor, "w 2"]) -> Float[T
     return light[:, None] * (-0.5 * (xx * x * x + 2 * xy * x * y + yy * y * y)).exp()
 
 
-def energies(splats: Splats2D) -> Float[Tensor, " m"]:
-    """Integral of the squared alpha, in px²: by Parseval that of |H|² / 4π², which is π o² √|C|."""
-    return math.pi * splats.opacities.square() * splats.dets.sqrt()
+def energies(splats: Splats2D) -> tuple[Float[Tensor, " m"], Float[Tensor, " m"]]:
+    """Integral of the squared alpha, in px², and its share outside the samples' band |ω| < π, along the splat's axes.
 
-
-def shares_above_nyquist(splats: Splats2D) -> Float[Tensor, " m"]:
-    """Share of each splat's energy outside the samples' band, the square |ω| < π, turned to the splat's axes.
-
-    |H|² is a Gaussian of standard deviations 1 / √(2λ) along the axes of C, whose variances are λ.
+    By Parseval it is that of |H|² / 4π², which is π o² √|C|.  |H|² is a Gaussian of standard deviations 1 / √(2λ) along
+    the axes of C, whose variances are λ.
     """
     xx, xy, yy = splats.covs.unbind(dim=1)
     longer = 0.5 * (xx + yy) + torch.hypot(0.5 * (xx - yy), xy)
     inside = (math.pi * longer.sqrt()).erf() * (math.pi * (splats.dets / longer).sqrt()).erf()
-    return 1 - inside
+    return math.pi * splats.opacities.square() * splats.dets.sqrt(), 1 - inside

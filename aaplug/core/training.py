@@ -63,18 +63,6 @@ class TrainingViews:
         return cls(scene.convention, views, bounds, cull_margin)
 
     @contract
-    def also(self, scene: Gaussians) -> "TrainingViews":
-        """The same with sampling bounds over another frame of the scene, too.
-
-        Raises:
-            UsageError: it holds another number of Gaussians.
-        """
-        if len(scene) != len(self.bounds.views):
-            problem = f"expected {len(self.bounds.views):,} Gaussians, as in the frames before, got {len(scene):,}"
-            raise UsageError(scene.name, problem)
-        return replace(self, bounds=self.bounds.over(sampling_bounds(scene.means, self.cameras)))
-
-    @contract
     def relative_rate(self, camera: Camera) -> float:
         """A view's focal length over training's: 1 at the training size, 1/2 at half of it.  Depth plays no part.
 

@@ -13,7 +13,6 @@ the Nyquist rate of the samples (`core.spectra`).
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import product
 
 import torch
 from jaxtyping import Float
@@ -22,7 +21,7 @@ from torch import Tensor
 from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import MAX_LOG_SCALE, Gaussians
 from aaplug.core.sampling import SamplingBounds
-from aaplug.core.spectra import energies, shares_above_nyquist
+from aaplug.core.spectra import energies
 from aaplug.core.training import TrainingViews
 from aaplug.methods.filters.smoothing import NYQUIST_VARIANCE
 from aaplug.methods.pixel_kernels.point import POINT
@@ -81,22 +80,13 @@ def above_nyquist(renderer: Renderer, views: Sequence[Camera], scale: float) -> 
     total = above = 0.0
     for view in views[:: -(-len(views) // SPECTRUM_VIEWS)]:
         splats = renderer.splats(*renderer.sampled(view.scaled(scale)))
-        energy = energies(splats).double()
-        total, above = total + float(energy.sum()), above + float((energy * shares_above_nyquist(splats)).sum())
+        energy, share = (column.double() for column in energies(splats))
+        total, above = total + float(energy.sum()), above + float(energy @ share)
     return above / total if total else None
 
 
-def coverage(
-    scene: Gaussians,
-    training: TrainingViews,
-    scales: Sequence[float],
-    renderers: Mapping[str, Renderer] | None = None,
-    views: Sequence[Camera] = (),
-) -> Coverage:
-    """Compare the scene's extents with their bounds, at the training size and at `scales`.
-
-    renderers: by recipe, of which the energy above the Nyquist rate is taken in some of `views`, if there are any.
-    """
+def coverage(scene: Gaussians, training: TrainingViews, scales: Sequence[float]) -> Coverage:
+    """Compare the scene's extents with their bounds, at the training size and at `scales`."""
     multiples = log_multiples(scene, training.bounds)
     logs = (multiples / math.log(2)).clamp(LOWEST_LOG2, HIGHEST_LOG2)
     histogram = torch.histogram(logs.cpu(), torch.linspace(LOWEST_LOG2, HIGHEST_LOG2, BINS + 1, dtype=torch.float64))
@@ -107,6 +97,4 @@ def coverage(
     dilated = (extents.square() + dilation / NYQUIST_VARIANCE).sqrt()
     under = int((multiples < 0).sum()) / len(multiples)
     begins = aliasing_begins(float(extents.median()), dilation)
-    aliased = tuple((s, float((dilated * s < 1).double().mean())) for s in scales)
-    drawn = product((renderers or {}).items(), scales if views else ())
-    return Coverage(*counts, under, begins, aliased, {(n, s): above_nyquist(r, views, s) for (n, r), s in drawn})
+    return Coverage(*counts, under, begins, tuple((s, float((dilated * s < 1).double().mean())) for s in scales))

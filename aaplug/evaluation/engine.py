@@ -23,7 +23,7 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.core.imaging import quantised
 from aaplug.core.interfaces import Rasterizer, WorldFilter
 from aaplug.core.training import TrainingViews
-from aaplug.evaluation.coverage import Coverage, coverage
+from aaplug.evaluation.coverage import Coverage, above_nyquist, coverage
 from aaplug.evaluation.image_store import ImageStore
 from aaplug.evaluation.journal import Journal
 from aaplug.evaluation.metric import Image, Metric, Series, TimedImage, TimedRenderer
@@ -128,9 +128,9 @@ class Task:
 
     def coverage(self, scene: Gaussians) -> Coverage:
         """The scene's extents against their sampling bounds, and the candidates' energy above the Nyquist rate."""
-        renderers = {candidate.name: candidate.renderer for candidate in self.candidates}
-        views = self.views if self.resizes else ()
-        return coverage(scene, self.truth.renderer.training, self.scales, renderers, views)
+        drawn = product(self.candidates, self.scales if self.resizes else ())
+        above = {(c.name, scale): above_nyquist(c.renderer, self.views, scale) for c, scale in drawn}
+        return replace(coverage(scene, self.truth.renderer.training, self.scales), above_nyquist=above)
 
     @property
     def resizes(self) -> bool:

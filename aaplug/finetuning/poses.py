@@ -29,9 +29,8 @@ LEAST_GAIN = 0.05  # share by which the squared error must fall: at right poses,
 
 @dataclass(frozen=True, eq=False)
 class RefinedPose:
-    """A camera and how it was moved.
+    """A camera, the angle by which it was turned, and the distance by which it was moved, in world units.
 
-    degrees: angle by which it was turned.  distance: by which it was moved, in world units.
     before, after: root mean square error against the photograph at half the training size, in 8-bit levels.
     """
 
@@ -47,28 +46,26 @@ def refine_pose(renderer: Renderer, view: Camera, scales: Sequence[float] = SCAL
 
     The view stays where it is if its error falls by less than `LEAST_GAIN`.
     """
-    camera, depth, photo = view, median_depth(renderer.scene.means, view), torch.empty(0)
+    camera, depth = view, median_depth(renderer.scene.means, view)
 
     def error(camera: Camera) -> Float[Tensor, ""]:
-        return LEVELS**2 * l2(renderer(camera).rgb, photo)
+        return LEVELS**2 * l2(renderer(camera.scaled(scale)).rgb, photo)
+
+    def closure() -> float:
+        px.grad = None
+        loss = error(moved_by(camera, px / focal, depth))
+        loss.backward()
+        return float(loss.detach())
 
     for scale in scales:
         sized = view.scaled(scale)
-        photo = photo_at(view, sized, renderer.background)
+        focal, photo = sized.focal, photo_at(view, sized, renderer.background)
         px = torch.zeros(6, dtype=torch.float64, requires_grad=True)
         how = {"max_iter": ITERATIONS, "tolerance_grad": 0.0, "tolerance_change": LEAST_CHANGE}
-        optimizer = torch.optim.LBFGS([px], **how, line_search_fn="strong_wolfe")
-
-        def closure(start: Camera = camera, scale: float = scale, px: Tensor = px, focal: float = sized.focal) -> float:
-            px.grad = None
-            loss = error(moved_by(start, px / focal, depth).scaled(scale))
-            loss.backward()
-            return float(loss.detach())
-
-        optimizer.step(closure)
-        camera = moved_by(camera, px.detach() / sized.focal, depth)
+        torch.optim.LBFGS([px], **how, line_search_fn="strong_wolfe").step(closure)
+        camera = moved_by(camera, px.detach() / focal, depth)
     with torch.no_grad():
-        before, after = (float(error(each.scaled(scales[-1]))) for each in (view, camera))
+        before, after = float(error(view)), float(error(camera))
     if after > (1 - LEAST_GAIN) * before:
         camera, after = view, before
     chord = float((camera.cam_from_world - view.cam_from_world)[:3, :3].norm())  # √8 sin(angle / 2)
@@ -84,10 +81,8 @@ def moved_by(camera: Camera, change: Float[Tensor, " 6"], depth: float) -> Camer
 
     change: rotation vector, in radians, and shift, over depth, in the camera's frame.
     """
-    x, y, z = change[:3].unbind()
-    zero = torch.zeros_like(x)
-    skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).view(3, 3)
-    turn, pivot = torch.linalg.matrix_exp(skew), change.new_tensor([0.0, 0.0, depth])
+    turn = torch.linalg.matrix_exp(torch.linalg.cross(torch.eye(3).to(change), change[:3].expand(3, 3)))
+    pivot = change.new_tensor([0.0, 0.0, depth])
     rotation, place = camera.cam_from_world[:3, :3], camera.cam_from_world[:3, 3]
     moved = torch.cat([turn @ rotation, (turn @ (place - pivot) + pivot + depth * change[3:])[:, None]], dim=1)
     return replace(camera, cam_from_world=torch.cat([moved, camera.cam_from_world[3:]]))

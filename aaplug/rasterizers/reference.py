@@ -6,6 +6,7 @@ slopes; strips and chunks bound its memory.  Differentiable through autograd.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float, Int
@@ -28,11 +29,7 @@ class Reference:
     """Draws by each pixel kernel's exact twin; the image is float64."""
 
     name: str = "reference"
-
-    @property
-    def tile(self) -> int:
-        """Side of the tiles in which it sorts, in px."""
-        return TILE
+    tile: ClassVar[int] = TILE  # px, side of the tiles in which it sorts
 
     def __call__(
         self,

@@ -23,7 +23,7 @@ from aaplug.core.training import TrainingViews
 from aaplug.io.atomic import AnyPath, writing
 from aaplug.io.cameras import read_cameras, select_views
 from aaplug.io.limits import lack_of_memory
-from aaplug.io.scenes import SceneLike, scene_of, still_scene_of
+from aaplug.io.scenes import SceneLike, scene_of
 from aaplug.io.scenes.harmonics import without_harmonics
 from aaplug.io.scenes.scene import Scene
 from aaplug.methods import RECIPES
@@ -72,7 +72,7 @@ class Job(Generic[O_co]):
         Raises:
             AaplugError: a file cannot be read, or there is nothing to look at.
         """
-        opened = scene_of(scene) if isinstance(options, IN_TIME) else still_scene_of(scene)
+        opened = scene_of(scene, still=not isinstance(options, IN_TIME))
         if cameras is None:
             cameras = opened.cameras or Orbit()
         if isinstance(cameras, Orbit):

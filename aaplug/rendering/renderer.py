@@ -205,8 +205,6 @@ class Renderer:
             self._open.clear()
             gaussians, harmonics = without_harmonics(self.in_time.open(self.in_time.paths[frame]))
             training = self.in_time.training_of(gaussians, self.training)
-            if len(gaussians) != len(training.bounds.views):
-                training.also(gaussians)  # refuses it
             filtered = _filtered(gaussians, training, self.recipe)
             changes = {"scene": filtered, "training": training, "harmonics": harmonics}
             self._open[frame] = replace(self, **changes, source=None, in_time=None)

@@ -13,7 +13,7 @@ from aaplug.evaluation.metrics import find_metrics
 from aaplug.evaluation.report.files import COMPARED, PAGE, write_comparison
 from aaplug.evaluation.truth import Truth
 from aaplug.io.atomic import AnyPath
-from aaplug.io.scenes import still_scene_of
+from aaplug.io.scenes import scene_of
 from aaplug.io.scenes.scene import Scene
 from aaplug.methods.presets import recipe_of
 from aaplug.methods.viewers import find_viewer
@@ -104,7 +104,7 @@ def check_compared(folder: Path | None, resume: bool, overwrite: bool) -> None:
 
 def _named(scenes: ScenesLike) -> dict[str, Scene]:
     """The scenes by name, opened; without names they get those of their files."""
-    opened = [still_scene_of(scene) for scene in (scenes.values() if isinstance(scenes, Mapping) else scenes)]
+    opened = [scene_of(scene, still=True) for scene in (scenes.values() if isinstance(scenes, Mapping) else scenes)]
     if len(opened) < 2:
         raise UsageError(
             "compare", f"needs two scenes or more, got {len(opened)}; the first is what others are held to"

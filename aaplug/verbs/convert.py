@@ -68,7 +68,7 @@ def convert(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opti
     """
     job, path = Job.of(scene, cameras, options), None if output is None else Path(output)
     rule = _rule(options, job.scene.flat)
-    viewer = rule if isinstance(rule, Viewer) else _shown_by(job)
+    viewer = rule if isinstance(rule, Viewer) else DISC_VIEWER if job.scene.flat else MIP_VIEWER
     files = {"overwrite": options.overwrite, **viewer.spz(options.spz_axes)}
     frames = job.scene.frames
     outputs = [path / file.name for file in frames.paths] if path and frames else []
@@ -77,14 +77,14 @@ def convert(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opti
     check()
     with running(options, path, check, job.inputs, folder=frames is not None) as workers:
         if frames is not None:
-            return _converted_frames(job, rule, frames, outputs, files)
+            return Converted(_write_frames(job, rule, frames, outputs, files), None, viewer)
         if path and job.scene.path and job.scene.count > LARGE_SCENE and isinstance(rule, Form):
-            return _converted_in_parts(job, rule, path, workers.threads, files)
-        result = _closed_form(job, rule) if isinstance(rule, Form) else _fitted(job, rule)
+            _write_in_parts(job, rule, path, workers.threads, files)
+            return Converted(job.scene.count, None, viewer)
+        fused, report = (_closed_form(job, rule), None) if isinstance(rule, Form) else _fitted(job, viewer)
         if path is not None:
-            assert result.scene is not None
-            write_scene(path, result.scene, **files)
-    return result
+            write_scene(path, fused, **files)
+    return Converted(len(fused), fused, viewer, report)
 
 
 def _rule(options: ConvertOptions, flat: bool) -> Form | Viewer:
@@ -101,26 +101,20 @@ def _rule(options: ConvertOptions, flat: bool) -> Form | Viewer:
     return form if options.variance is None else form.with_variance(options.variance)
 
 
-def _shown_by(job: Job[ConvertOptions]) -> Viewer:
-    """What shows a closed form right."""
-    return DISC_VIEWER if job.scene.flat else MIP_VIEWER
-
-
-def _closed_form(job: Job[ConvertOptions], form: Form) -> Converted:
+def _closed_form(job: Job[ConvertOptions], form: Form) -> Gaussians:
     """The closed form for the Mip rule."""
     gaussians = job.scene.gaussians()
     training = None
     if not blurring(gaussians.fused) and gaussians.filter_3d is None:  # else it needs no cameras, or is refused
         training = TrainingViews.of(gaussians, job.cameras, min_seen=job.options.min_seen)
         job.say_assumed(own_look(gaussians, training))
-    fused = fuse(gaussians, training, form)
-    return Converted(len(fused), fused, _shown_by(job))
+    return fuse(gaussians, training, form)
 
 
-def _converted_frames(
+def _write_frames(
     job: Job[ConvertOptions], rule: Form | Viewer, frames: SceneFrames, outputs: Sequence[Path], files: Any
-) -> Converted:
-    """The closed form of a scene in time, frame by frame."""
+) -> int:
+    """Write the closed form of a scene in time, frame by frame; returns the number of Gaussians."""
     if isinstance(rule, Viewer) or not outputs:
         what = "fits each frame alone, which flickers: leave it out" if outputs else "of frames is a folder: name one"
         raise UsageError("viewer" if outputs else "output", what)
@@ -129,15 +123,14 @@ def _converted_frames(
     with job.monitor.progress("converting", "frames") as tell:
         for done, (frame, output) in enumerate(zip(frames, outputs, strict=True), start=1):
             gaussians = frame.gaussians()
-            fused = fuse(gaussians, frames.training_of(gaussians, training), rule)
-            write_scene(output, fused, **files)
-            count += len(fused)
+            write_scene(output, fuse(gaussians, frames.training_of(gaussians, training), rule), **files)
+            count += len(gaussians)
             tell(done, len(frames))
-    return Converted(count, None, _shown_by(job))
+    return count
 
 
-def _converted_in_parts(job: Job[ConvertOptions], form: Form, path: Path, threads: int, files: Any) -> Converted:
-    """The closed form of a large file, written part by part."""
+def _write_in_parts(job: Job[ConvertOptions], form: Form, path: Path, threads: int, files: Any) -> None:
+    """Write the closed form of a large file part by part."""
     scene, train = job.scene, job.cameras.train
     if blurring(scene.fused) or scene.raw(0, min(1, scene.count)).filter_3d is not None:
         train = ()  # it needs no cameras, or is refused anyway
@@ -147,14 +140,13 @@ def _converted_in_parts(job: Job[ConvertOptions], form: Form, path: Path, thread
             check_frame_of(scene, train, job.options.min_seen)
     with job.monitor.progress("converting", "Gaussians") as tell:
         write_parts(path, convert_parts(scene, train, form, tell, threads=threads), scene.count, **files)
-    return Converted(scene.count, None, _shown_by(job))
 
 
-def _fitted(job: Job[ConvertOptions], viewer: Viewer) -> Converted:
-    """The scene optimized for a viewer."""
+def _fitted(job: Job[ConvertOptions], viewer: Viewer) -> tuple[Gaussians, Report]:
+    """The scene optimized for a viewer, and how close it came."""
     gaussians = job.scene.gaussians()
     steps = steps_for(gaussians, viewer) if job.options.steps is None else job.options.steps
     look = job.look(steps, gradients=True)
     job.say_assumed(look)
     fitted = fit(gaussians, viewer, look, job.views, steps, job.monitor)
-    return Converted(len(fitted.scene), fitted.scene, viewer, fitted.report)
+    return fitted.scene, fitted.report

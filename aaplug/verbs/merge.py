@@ -15,7 +15,7 @@ from aaplug.core.gaussians import Gaussians, joined
 from aaplug.core.placing import placed
 from aaplug.core.training import TrainingViews
 from aaplug.io.atomic import AnyPath
-from aaplug.io.scenes import check_scene_output, still_scene_of, write_scene
+from aaplug.io.scenes import check_scene_output, scene_of, write_scene
 from aaplug.io.scenes.faults import check_values
 from aaplug.io.scenes.packed import of_degree
 from aaplug.methods.conversion import carried
@@ -46,7 +46,7 @@ def merge(scenes: ScenesLike, cameras: CamerasLike, output: AnyPath | None, opti
         AaplugError: as `render`; also, some scenes hold 2D Gaussians and others do not, or there are not as many moves,
             turns or scales as scenes.
     """
-    opened = [still_scene_of(scene) for scene in (scenes.values() if isinstance(scenes, Mapping) else scenes)]
+    opened = [scene_of(scene, still=True) for scene in (scenes.values() if isinstance(scenes, Mapping) else scenes)]
     if not opened:
         raise UsageError("scenes", "there are none; name at least one")
     if len({scene.flat for scene in opened}) > 1:

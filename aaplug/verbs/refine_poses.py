@@ -61,17 +61,12 @@ def refined(job: Job[ViewOptions], look: Renderer, views: Sequence[Camera]) -> R
             tell(done, len(views))
             poses.append(refine_pose(renderer, view))
     moved = {id(view): pose.camera for view, pose in zip(views, poses, strict=True)}
-    splits = {
-        split: tuple(moved.get(id(view), view) for view in getattr(job.cameras, split)) for split in ("train", "test")
-    }
-    changed = [
-        (pose.degrees, pose.distance, pose.before, pose.after) for pose in poses if pose.degrees or pose.distance
-    ]
+    splits = {s: tuple(moved.get(id(v), v) for v in vars(job.cameras)[s]) for s in ("train", "test")}
+    changed = [(p.degrees, p.distance, p.before, p.after) for p in poses if p.after < p.before]
     note = f"all {len(poses)} poses stay: their photographs show nothing better"
     if changed:
         turn, shift, before, after = map(median, zip(*changed, strict=True))
-        errors = f"error at half size from {before:.1f} to {after:.1f} of 255 levels"
-        moves = f"in the median by {turn:.2g}° and {shift:.2g} units"
-        note = f"{len(changed)} of {len(poses)} poses moved, {moves}: {errors}"
+        moves = f"{len(changed)} of {len(poses)} poses moved, in the median by {turn:.2g}° and {shift:.2g} units"
+        note = f"{moves}: error at half size from {before:.1f} to {after:.1f} of 255 levels"
     job.monitor.say(note)
     return RefinedCameras(replace(job.cameras, **splits, notes=(*job.cameras.notes, note)), tuple(poses))

@@ -96,17 +96,15 @@ SCENE_FORMATS = Registry[SceneFormat]("scene format", "aaplug.io.scenes:SceneFor
 SceneLike = Scene | Gaussians | Pyramid | str | PathLike[str]
 
 
-def scene_of(scene: SceneLike) -> Scene:
-    """The scene itself, that of Gaussians in memory, or that of a path as `read_scene` opens it."""
-    if isinstance(scene, Scene):
-        return scene
-    return Scene.in_memory(scene) if isinstance(scene, Gaussians | Pyramid) else read_scene(scene)
+def scene_of(scene: SceneLike, still: bool = False) -> Scene:
+    """The scene itself, that of Gaussians in memory, or that of a path as `read_scene` opens it.
 
-
-def still_scene_of(scene: SceneLike) -> Scene:
-    """The same, but for a scene in time, which it refuses with a UsageError."""
-    opened = scene_of(scene)
-    if opened.frames is not None:
+    still: raise a UsageError for a scene in time.
+    """
+    if isinstance(scene, Gaussians | Pyramid):
+        return Scene.in_memory(scene)
+    opened = scene if isinstance(scene, Scene) else read_scene(scene)
+    if still and opened.frames is not None:
         takers = "render, video, evaluate and convert take it whole; here, name one of its files"
         raise UsageError(str(opened.folder), f"is a scene in time, of {len(opened.frames)} frames: {takers}")
     return opened

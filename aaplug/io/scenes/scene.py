@@ -19,6 +19,7 @@ from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.conventions import CLASSIC, MIP, Convention
 from aaplug.core.gaussians import Fusion, Gaussians, Origin, digest_of_scene, joined
 from aaplug.core.pyramids import Pyramid
+from aaplug.core.sampling import sampling_bounds
 from aaplug.core.training import TrainingViews
 from aaplug.io.cameras import holds_cameras, read_cameras
 from aaplug.io.limits import lack_of_memory
@@ -26,7 +27,7 @@ from aaplug.io.scenes.faults import check_values, described_faults, doubts_of, f
 from aaplug.io.scenes.rows import library_errors
 from aaplug.system.contracts import contract
 from aaplug.system.digests import digest_of_values
-from aaplug.system.errors import FormatError, listing
+from aaplug.system.errors import FormatError, UsageError, listing
 
 MODEL_SCENE = "point_cloud/iteration_*/point_cloud.ply"  # in an INRIA model folder
 SOG_FOLDER = "meta.json"  # marks a folder of SOG images
@@ -282,17 +283,13 @@ class SceneFrames:
             FormatError: a file breaks its format, or it is of another kind than the first, or it holds another number
                 of Gaussians and the frames were not trained apart.
         """
-        kinds = [
-            {"degree of harmonics": s.sh_degree, "convention": s.convention.name, "2D Gaussians": s.flat}
-            | ({} if self.apart else {"number of Gaussians": s.count})
-            for s in self
-        ]
+        names = ("degree of harmonics", "convention", "2D Gaussians", "number of Gaussians")
+        kinds = [(s.sh_degree, s.convention.name, s.flat, not self.apart and s.count) for s in self]
         for path, kind in zip(self.paths, kinds, strict=True):
-            for name, value in kind.items():
-                if value != kinds[0][name]:
-                    hint = "; pass `frames_apart` if each frame was trained alone" * (name == "number of Gaussians")
-                    problem = f"expected the {name} of {self.paths[0].name}, {kinds[0][name]}, got {value}"
-                    raise FormatError(path, problem + hint)
+            for name, value, first in zip(names, kind, kinds[0], strict=True):
+                if value != first:
+                    hint = "; pass `frames_apart` if each frame was trained alone" * (name == names[-1])
+                    raise FormatError(path, f"expected the {name} of {self.paths[0].name}, {first}, got {value}{hint}")
 
     def at_each(self, views: Sequence[Camera]) -> tuple[Camera, ...]:
         """The views at every frame, a frame at a time; the number of the frame ends a view's name."""
@@ -304,14 +301,20 @@ class SceneFrames:
         return [replace(view, frame=i * len(self) // len(path)) for i, view in enumerate(path)]
 
     def over_all(self, training: TrainingViews) -> TrainingViews:
-        """The training views of the first frame, with sampling bounds over all; raises UsageError as `also`."""
+        """The training views of the first frame, with sampling bounds over all; raises as `training_of`."""
         for frame in () if self.apart else islice(self, 1, None):
-            training = training.also(frame.gaussians())
+            self.training_of(gaussians := frame.gaussians(), training)
+            bounds = training.bounds.over(sampling_bounds(gaussians.means, training.cameras))
+            training = replace(training, bounds=bounds)
         return training
 
     def training_of(self, frame: Gaussians, training: TrainingViews) -> TrainingViews:
-        """The training views of a frame; training: of the scene."""
-        return TrainingViews.of(frame, training.cameras, training.cull_margin) if self.apart else training
+        """The training views of a frame; training: of the scene.  Raises UsageError for another number of Gaussians."""
+        if self.apart:
+            return TrainingViews.of(frame, training.cameras, training.cull_margin)
+        if len(frame) != (count := len(training.bounds.views)):
+            raise UsageError(frame.name, f"expected {count:,} Gaussians, as in the frames before, got {len(frame):,}")
+        return training
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -43,16 +44,12 @@ class Tiled:
 
     kernels: Kernels = EAGER
     memory: float = MEMORY_BYTES
+    tile: ClassVar[int] = TILE  # px, side of the tiles in which it sorts
 
     @property
     def name(self) -> str:
         """The name of its kernels: eager or compiled."""
         return self.kernels.name
-
-    @property
-    def tile(self) -> int:
-        """Side of its tiles, in px."""
-        return TILE
 
     def within(self, memory: float) -> "Tiled":
         """The same rasterizer with another memory budget, in bytes."""
