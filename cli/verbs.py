@@ -522,10 +522,8 @@ def recipes(words: Words) -> Answer:
         for r in RECIPES.values()
     ]
     headings = ("--recipe", "cost", "when to use it", "what it is, and whose")
-    tables = [
-        table(((f["name"], f["cost"], f["when"], f["source"]) for f in facts if f["comparison"] == of), headings)
-        for of in (False, True)
-    ]
+    rows = [[str(fact[key]) for key in ("name", "cost", "when", "source")] for fact in facts]
+    tables = [table(some, headings) for some in (rows[: len(used)], rows[len(used) :])]
     return Answer(facts, [tables[0], "For comparison:", tables[1]])
 
 

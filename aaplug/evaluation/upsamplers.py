@@ -17,6 +17,7 @@ from torch import Tensor
 
 from aaplug.system.errors import FormatError, UsageError
 
+Network = Callable[[Float[Tensor, "1 3 h w"]], Tensor]
 Upsampler = Callable[[Float[Tensor, "h w 3"], tuple[int, int]], Float[Tensor, "H W 3"]]
 OPENCV_NAME = re.compile(r"(edsr|espcn|fsrcnn|lapsrn).*_x(\d)\.pb", re.IGNORECASE)
 BYTE = 255.0
@@ -40,15 +41,28 @@ def find_upsampler(name: str) -> Upsampler:
     if name in UPSAMPLERS:
         return UPSAMPLERS[name]
     path = Path(name)
-    if path.suffix not in (".pb", *PROGRAMS):
-        kinds = f"{', '.join(UPSAMPLERS)} or a .pb, {' or '.join(PROGRAMS)} file"
-        raise UsageError("upsampler", f"expected {kinds}, got '{name}'")
+    if path.suffix not in NETWORKS:
+        *kinds, last = (*UPSAMPLERS, f"a {', '.join(NETWORKS)} file")
+        raise UsageError("upsampler", f"expected {', '.join(kinds)} or {last}, got '{name}'")
     if not path.is_file():
         raise FormatError(path, "does not exist")
-    network = _opencv(path) if path.suffix == ".pb" else _program(path)
+    load, kind = NETWORKS[path.suffix]
+    try:
+        network = load(path)
+    except FormatError:
+        raise
+    except Exception as error:  # torch and OpenCV fail in many ways on a wrong file
+        raise FormatError(path, f"is not {kind}") from error
 
     def upsample(image: Tensor, hw: tuple[int, int]) -> Tensor:
-        larger = network(image)
+        try:
+            with torch.no_grad():
+                larger = network(image.permute(2, 0, 1)[None].contiguous())
+        except Exception as error:
+            raise FormatError(path, f"does not take an image of {image.shape[1]}x{image.shape[0]} px") from error
+        if larger.ndim != 4 or larger.shape[1] != image.shape[2]:
+            raise FormatError(path, f"should give an image [1, 3, H, W], gives {[*larger.shape]}")
+        larger = larger[0].permute(1, 2, 0).contiguous()
         if tuple(larger.shape[:2]) == hw:
             return larger
         return _resized(cv2.INTER_AREA if larger.shape[0] > hw[0] else cv2.INTER_CUBIC)(larger, hw)
@@ -56,29 +70,22 @@ def find_upsampler(name: str) -> Upsampler:
     return upsample
 
 
-def _opencv(path: Path) -> Callable[[Tensor], Tensor]:
+def _opencv(path: Path) -> Network:
     match = OPENCV_NAME.fullmatch(path.name)
     if match is None:
         raise FormatError(path, "needs a name such as ESPCN_x4.pb, which gives network and factor")
     network = cv2.dnn_superres.DnnSuperResImpl.create()
-    try:
-        network.readModel(str(path))
-    except cv2.error as error:
-        raise FormatError(path, "is not a network that OpenCV can read") from error
+    network.readModel(str(path))
     network.setModel(match[1].lower(), int(match[2]))
 
-    def enlarge(image: Tensor) -> Tensor:
-        pixels = (image.flip(2) * BYTE).round().byte().numpy()  # BGR
-        try:
-            larger = network.upsample(pixels)
-        except cv2.error as error:
-            raise FormatError(path, f"is no {match[1]} network for x{match[2]}") from error
-        return torch.from_numpy(larger).flip(2).float() / BYTE
+    def run(image: Tensor) -> Tensor:
+        pixels = (image[0].flip(0).permute(1, 2, 0) * BYTE).round().byte().contiguous().numpy()  # BGR
+        return torch.from_numpy(network.upsample(pixels)).permute(2, 0, 1).flip(0)[None].float() / BYTE
 
-    return enlarge
+    return run
 
 
-def _onnx(path: Path) -> Callable[[Tensor], Tensor]:
+def _onnx(path: Path) -> Network:
     network = cv2.dnn.readNetFromONNX(str(path))
 
     def run(image: Tensor) -> Tensor:
@@ -88,28 +95,12 @@ def _onnx(path: Path) -> Callable[[Tensor], Tensor]:
     return run
 
 
-def _torch(path: Path) -> Callable[[Tensor], Tensor]:
+def _torch(path: Path) -> Network:
     return torch.export.load(path).module()
 
 
-def _program(path: Path) -> Callable[[Tensor], Tensor]:
-    load, kind = PROGRAMS[path.suffix]
-    try:
-        run = load(path)
-    except Exception as error:  # torch fails in many ways on a wrong file
-        raise FormatError(path, f"is not {kind}") from error
-
-    def enlarge(image: Tensor) -> Tensor:
-        with torch.no_grad():
-            try:
-                larger = run(image.permute(2, 0, 1)[None].contiguous())
-            except Exception as error:
-                raise FormatError(path, f"does not take an image of {image.shape[1]}x{image.shape[0]} px") from error
-        if larger.ndim != 4 or larger.shape[1] != image.shape[2]:
-            raise FormatError(path, f"should give an image [1, 3, H, W], gives {[*larger.shape]}")
-        return larger[0].permute(1, 2, 0).contiguous()
-
-    return enlarge
-
-
-PROGRAMS = {".pt2": (_torch, "a program of torch.export"), ".onnx": (_onnx, "an ONNX network that OpenCV can read")}
+NETWORKS = {  # by suffix: how one is loaded, and what it is
+    ".pb": (_opencv, "a network that OpenCV can read"),
+    ".onnx": (_onnx, "an ONNX network that OpenCV can read"),
+    ".pt2": (_torch, "a program of torch.export"),
+}

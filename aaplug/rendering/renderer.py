@@ -220,8 +220,7 @@ class Renderer:
             UsageError: a Gaussian in view has a colour that is NaN or infinite, or memory does not suffice.
         """
         with within_memory(f"view {camera.name} at {camera.width}x{camera.height}"):
-            now = self.at(camera.frame)
-            return now.draw(camera).render if camera.exposure is None else now.exposed(camera)
+            return self.draw(camera).render if camera.exposure is None else self.at(camera.frame).exposed(camera)
 
     @contract
     @on_free_cores()
