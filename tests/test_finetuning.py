@@ -21,14 +21,14 @@ from aaplug.finetuning import loop
 from aaplug.finetuning.loop import advance, loss_at, run
 from aaplug.finetuning.losses import LOSSES, l1_dssim, l2, structural_similarity
 from aaplug.finetuning.parameters import RATES, between, extent, least_log_scales, leaves_of, scene_of
-from aaplug.finetuning.settings import CONSISTENCY, QUICK_SETTINGS, Settings, balance, settings_of
+from aaplug.finetuning.settings import CONSISTENCY, QUICK_SETTINGS, Settings, balance
 from aaplug.finetuning.state import DYNAMO_FOLDER, State, TuningJob, begin, load, save
 from aaplug.io.images import write_png
+from aaplug.lab import densification
 from aaplug.lab.densification import MIN_GRADIENT, MIN_OPACITY, SPLIT_SHRINKAGE, densify, moments_after
 from aaplug.lab.group_training import GROUP_TRAINING, drawn, regroup
 from aaplug.lab.mipmap_gs import MIPMAP_GS
 from aaplug.methods import RECIPES
-from aaplug.options.verbs import FinetuneOptions
 from aaplug.rasterizers import RASTERIZERS
 from aaplug.rendering.renderer import own_look
 from aaplug.system.errors import FormatError, UsageError
@@ -49,7 +49,7 @@ def make_job(
     scene = make_scene(n, seed=4, dtype=dtype)
     look = own_look(scene, TrainingViews.of(scene, VIEWS), RASTERIZERS["eager"], GREY)
     truth = Truth(look, enlarge=back_projected, memory=MEMORY)
-    return TuningJob(replace(look, recipe=RECIPES[recipe]), VIEWS, truth, settings, method=MIPMAP_GS)
+    return TuningJob(replace(look, recipe=RECIPES[recipe]), VIEWS, truth, settings)
 
 
 def after(job: TuningJob, steps: int | None = None) -> State:
@@ -185,23 +185,19 @@ def test_the_optimizer_forgets_what_is_new_alone():
     assert found["step"] == 5
 
 
-def test_a_densified_scene_is_reported_with_its_own_bounds():
+def test_a_densified_scene_is_reported_with_its_own_bounds(monkeypatch):
     """The scene before has fewer Gaussians, and `matched` reads a bound of each."""
-    state = after(job := make_job(settings=replace(SETTINGS, steps=4, densify_every=2)))
+    monkeypatch.setattr(densification, "STEPS", 2)
+    state = after(job := replace(make_job(settings=replace(SETTINGS, steps=4)), method=MIPMAP_GS))
     here = sampling_bounds(state.leaves["means"].detach(), job.start.training.cameras)
     assert len(state.bounds.highest) == len(state.leaves["means"]) > 60
     torch.testing.assert_close(state.bounds.highest, here.highest, rtol=0.1, atol=0.0)
     cameras = CameraSet(VIEWS, VIEWS, background=GREY)
-    settings = {"method": "mipmap-gs", "scale": (0.25,), "steps": 3, "densify_every": 2}
+    settings = {"method": "mipmap-gs", "scale": (0.25,), "steps": 3}
     found = finetune(make_scene(60, seed=4), cameras, **settings, truth="self", views="view0", rasterizer="eager")
     assert len(found.scene) > 60
     assert [m.recipe for m in found.report.measurements] == ["before"] * 2 + ["after"] * 2
     assert all(m.values["PSNR"] for m in found.report.measurements if m.recipe == "after")
-
-
-def test_a_method_that_keeps_the_number_of_gaussians_says_so():
-    with pytest.raises(UsageError, match="densify_every: the method consistency keeps the number of Gaussians"):
-        settings_of(CONSISTENCY, FinetuneOptions(densify_every=2))
 
 
 def test_a_group_trains_alone_and_is_drawn_anew_as_the_published_code_does_in_proportion():
@@ -239,11 +235,10 @@ def test_groups_are_drawn_by_opacity():
 # runs
 
 
-@pytest.mark.parametrize(
-    ("method", "densify_every", "stopped_at"), [(CONSISTENCY, 0, 2), (MIPMAP_GS, 2, 3), (GROUP_TRAINING, 0, 3)]
-)
-def test_a_run_that_was_stopped_and_resumed_is_one_that_never_was(method, densify_every, stopped_at, tmp_path):
-    job = replace(make_job(settings=replace(SETTINGS, densify_every=densify_every)), method=method)
+@pytest.mark.parametrize(("method", "stopped_at"), [(CONSISTENCY, 2), (MIPMAP_GS, 3), (GROUP_TRAINING, 3)])
+def test_a_run_that_was_stopped_and_resumed_is_one_that_never_was(method, stopped_at, tmp_path, monkeypatch):
+    monkeypatch.setattr(densification, "STEPS", 2)
+    job = replace(make_job(), method=method)
     whole = begin(job)
     assert run(job, whole, every=2)
     first, kept = begin(job), []

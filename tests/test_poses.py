@@ -12,7 +12,6 @@ from aaplug.evaluation.results import mean
 from aaplug.finetuning.poses import moved_by, refine_pose
 from aaplug.io.images import write_png
 from aaplug.rendering.renderer import Renderer
-from aaplug.verbs.refine_poses import RefinedCameras
 from tests.conftest import make_camera, make_scene
 
 CHANGE = torch.tensor([0.006, -0.008, 0.005, 0.004, -0.005, 0.006], dtype=torch.float64)  # radians, shares of the depth
@@ -59,13 +58,13 @@ def test_the_gradient_of_a_change_equals_finite_differences():
 def test_poses_that_are_off_come_back_and_right_ones_stay(photographed):
     scene, cameras = photographed
     off = CameraSet((moved_by(cameras.train[0], CHANGE, DEPTH), cameras.train[1]), ())
-    found = aaplug.refine_poses(scene, off, min_seen=0.0)
+    found, poses = aaplug.refine_poses(scene, off, min_seen=0.0)
     degrees, distance = apart(off.train[0], cameras.train[0])
-    left, right = found.cameras.train
+    left, right = found.train
     assert apart(left, cameras.train[0])[0] < degrees / 5
     assert apart(left, cameras.train[0])[1] < distance / 5
     assert right == cameras.train[1]
-    first, second = found.poses
+    first, second = poses
     assert first.after < first.before / 5
     assert (first.degrees, first.distance) == pytest.approx(apart(left, off.train[0]))
     assert (second.degrees, second.distance, second.after) == (0.0, 0.0, second.before)
@@ -101,7 +100,7 @@ def test_evaluate_tells_errors_of_poses_from_others(photographed):
 
 def test_finetune_refines_poses_first(photographed, monkeypatch):
     scene, cameras = photographed
-    found = RefinedCameras(cameras, ())  # the search itself is tried above
+    found = cameras, ()  # the search itself is tried above
     monkeypatch.setattr("aaplug.verbs.finetune.refined", lambda job, look, views: found)
     off = tuple(moved_by(view, CHANGE, DEPTH) for view in cameras.train)
     how = {"min_seen": 0.0, "steps": 1, "scale": (0.5,), "rasterizer": "eager"}

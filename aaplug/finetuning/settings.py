@@ -23,7 +23,6 @@ class Settings:
     rates: learning rate by parameter; a parameter without one stays fixed.
     decay: factor that the learning rates have reached at the end.
     loss: a name in `losses.LOSSES`.
-    densify_every: steps between densifications, 0 for none.
     """
 
     name: str
@@ -33,7 +32,6 @@ class Settings:
     anchor: float = 0.0
     decay: float = 1.0
     loss: str = "l2"
-    densify_every: int = 0
     seed: int = 0
 
 
@@ -88,14 +86,10 @@ def settings_of(method: Method, options: FinetuneOptions) -> Settings:
     if options.loss not in LOSSES:
         raise UsageError("loss", not_one_of(options.loss, LOSSES))
     settings = method.settings(options.scale, options.move, options.anchor)
-    if options.densify_every and not settings.densify_every:
-        raise UsageError("densify_every", f"the method {settings.name} keeps the number of Gaussians")
-    densify_every = settings.densify_every if options.densify_every is None else options.densify_every
     return replace(
         settings,
         steps=settings.steps if options.steps is None else options.steps,
         rates={name: rate * options.learning_rate for name, rate in settings.rates.items()},
         loss=options.loss,
-        densify_every=densify_every,
         seed=options.seed,
     )

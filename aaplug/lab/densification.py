@@ -20,6 +20,7 @@ from aaplug.finetuning.settings import SEED_STRIDE
 from aaplug.finetuning.state import State, TuningJob, optimizer
 from aaplug.rendering.renderer import Drawing
 
+STEPS = 100  # between densifications (3DGS)
 MIN_GRADIENT = 2e-4  # from which a Gaussian is densified (3DGS)
 MAX_CLONED_SCALE = 0.01  # share of the scene's extent; larger Gaussians are split (3DGS)
 SPLIT_SHRINKAGE = 1.6  # divides the standard deviations of the two halves of a split (3DGS)
@@ -29,14 +30,14 @@ SPLIT_SEED = 6_000_000  # added to the seed for the places of the halves
 
 @contextmanager
 def with_densification(job: TuningJob, state: State) -> Iterator[list[Drawing]]:
-    """After a step, add its gradients, and every `densify_every` steps change the number of Gaussians.
+    """After a step, add its gradients, and every `STEPS` steps change the number of Gaussians.
 
     Those that stay keep their Adam moments.
     """
     drawings: list[Drawing] = []
     yield drawings
     settings, sums = job.settings, state.gradients
-    if not settings.densify_every or state.bad_steps:
+    if state.bad_steps:
         return
     if not sums:
         sums.update({name: torch.zeros(len(state.first_log_scales)) for name in ("total", "views")})
@@ -46,7 +47,7 @@ def with_densification(job: TuningJob, state: State) -> Iterator[list[Drawing]]:
         length = (splats.means.grad * splats.means.new_tensor([width / 2, height / 2])).norm(dim=1)
         sums["total"].index_add_(0, splats.sources, length.to(sums["total"]))
         sums["views"].index_add_(0, splats.sources, torch.ones_like(length).to(sums["views"]))
-    if state.step % settings.densify_every or state.step >= settings.steps:
+    if state.step % STEPS or state.step >= settings.steps:
         return
     generator = torch.Generator().manual_seed(settings.seed * SEED_STRIDE + SPLIT_SEED + state.step)
     means = sums["total"] / sums["views"].clamp(min=1)

@@ -17,7 +17,7 @@ def mipmap_gs(scales: Sequence[float], move: Sequence[str] = (), anchor: float =
     """
     if len(scales) != 1:
         raise UsageError("scale", "mipmap-gs makes one model for one scale; give one")
-    return Settings("mipmap-gs", 1000, {scales[0]: 1.0}, RATES, densify_every=100)
+    return Settings("mipmap-gs", 1000, {scales[0]: 1.0}, RATES)
 
 
 MIPMAP_GS = Method(mipmap_gs, CLASSIC_VIEWER, with_densification)

@@ -30,7 +30,6 @@ MIP_SPLATTING_BALANCED = Recipe(
     "aaplug: Mip-Splatting with opacities balanced by the broadest face's area, not by volume, and bounded",
     "comparison: avoids most of mip-splatting's dimming",
     world=BALANCED,
-    time=1.0,
     promises=Promises(opaque_when_near=False),
 )
 MIP_SPLATTING_ANISOTROPIC = Recipe(
@@ -92,7 +91,6 @@ SA_GS = Recipe(
     SCALE_ADAPTIVE,
     "SA-GS's 2D scale-adaptive filter (Song et al., arXiv 2403.19615): 0.3 r² px², one rate per view",
     "comparison: matched without its second step",
-    time=1.0,
     promises=Promises(equals_training=True, fades_when_small=False),
 )
 SA_GS_INTEGRAL = Recipe(

@@ -37,7 +37,6 @@ MATCHED = Recipe(
     BY_POSE,
     "aaplug: training's dilation rescaled to the new sampling rate, then the rest of the pixel's filter",
     "speed, zooming in: one sample per pixel",
-    time=1.0,
     promises=Promises(equals_training=True),
 )
 CLASSIC_RECIPE = Recipe(
@@ -45,7 +44,6 @@ CLASSIC_RECIPE = Recipe(
     OF_CLASSIC,
     "3DGS (Kerbl et al. 2023): +0.3 px²",
     "comparison: right only at the training size",
-    time=1.0,
     promises=Promises(equals_training=True, keeps_energy=False),
 )
 EWA = Recipe(
@@ -53,14 +51,12 @@ EWA = Recipe(
     OF_ANTIALIASED,
     "EWA splatting (Zwicker et al. 2002); 3DGS --antialiasing, gsplat antialiased: 0.3 px², compensated",
     "scenes trained with it",
-    time=1.0,
 )
 MIP_RECIPE = Recipe(
     "mip",
     OF_MIP,
     "Mip-Splatting's 2D Mip filter (Yu et al. 2024, eq. 10): 0.1 px², compensated",
     "scenes trained with it; scenes converted by aaplug",
-    time=1.0,
 )
 MIP_SPLATTING = Recipe(
     "mip-splatting",
@@ -94,14 +90,12 @@ PLAYCANVAS_RECIPE = Recipe(
     OF_PLAYCANVAS,
     "PlayCanvas and SuperSplat with anti-aliasing on: 0.3 in half pixels, that is 0.075 px², compensated",
     "predicting their pictures; scenes converted for them",
-    time=1.0,
 )
 PLAYCANVAS_CLASSIC_RECIPE = Recipe(
     "playcanvas-classic",
     OF_PLAYCANVAS_CLASSIC,
     "PlayCanvas and SuperSplat with anti-aliasing off: 0.075 px²",
     "predicting their pictures; scenes converted for them",
-    time=1.0,
     promises=Promises(keeps_energy=False),
 )
 

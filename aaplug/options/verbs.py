@@ -274,8 +274,6 @@ class FinetuneOptions(WritingOptions, ViewOptions):
     """Parameters that move."""
     learning_rate: Annotated[float, number(1e-6, 100), TUNING] = 1.0
     """Factor on the method's learning rates."""
-    densify_every: Annotated[int | None, STEPS, TUNING] = None
-    """Clone, split and prune every N steps; 0 for never (default: the method's own)."""
     truth: Annotated[str, names(*TRUTHS)] = "auto"
     """What the training size should look like: self is the scene's own render; auto takes photographs if all exist."""
     poses: Annotated[bool, TUNING] = False

@@ -59,7 +59,7 @@ def evaluate(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
     with running(options, folder, check, job.inputs, folder=True) as workers:
         frames = len(views) * len(recipes) * len(scales)
         if options.poses:
-            job = replace(job, cameras=refined(job, job.look(frames, gradients=True), views).cameras)
+            job = replace(job, cameras=refined(job, job.look(frames, gradients=True), views)[0])
             views = job.views
         look = job.look(frames)
         candidates = candidates_of(job.scene, look.training, recipes, look.rasterizer, look.background)

@@ -98,7 +98,7 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
     with running(options, path, check, job.inputs):
         raw, look = job.scene.gaussians(), job.look(settings.steps, gradients=True)
         if options.poses:
-            job = replace(job, cameras=refined(job, look, job.cameras.all).cameras)
+            job = replace(job, cameras=refined(job, look, job.cameras.all)[0])
             look = job.look(settings.steps, gradients=True)
         train = job.cameras.train
         before = replace(look, scene=viewer.shown(look.scene), recipe=recipe_of(viewer))

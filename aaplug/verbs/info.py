@@ -109,13 +109,11 @@ def _sampling_facts(statistics: Survey, cameras: CameraSet, kernel: float) -> di
 def _spectrum_facts(scene: Scene, train: Sequence[Camera]) -> dict[str, Any]:
     """Share of the splats' energy above the Nyquist rate, by recipe and scale, from Gaussians of all over the file."""
     some = scene.sample(SPECTRUM_ROWS)
-    training = TrainingViews.of(some, train)
-    shares = dict[str, dict[str, float]]()
-    for name in SPECTRUM_RECIPES:
-        renderer = Renderer.of(some, training, name)
-        found = {scale_name(scale): above_nyquist(renderer, train, scale) for scale in SPECTRUM_SCALES}
-        shares[name] = {f"at {scale}": share for scale, share in found.items() if share is not None}
-    return {"energy_above_nyquist_share": {name: found for name, found in shares.items() if found}}
+    by_recipe = {name: Renderer.of(some, TrainingViews.of(some, train), name) for name in SPECTRUM_RECIPES}
+    shares = {
+        n: {f"at {scale_name(s)}": above_nyquist(r, train, s) for s in SPECTRUM_SCALES} for n, r in by_recipe.items()
+    }
+    return {"energy_above_nyquist_share": shares}
 
 
 def _assumed_facts(statistics: Survey, cameras: CameraSet, frame: Frame) -> dict[str, Any]:

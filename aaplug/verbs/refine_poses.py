@@ -1,7 +1,7 @@
 """Poses of cameras, refined on their photographs."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from statistics import median
 
 from aaplug.core.cameras import Camera, CameraSet
@@ -16,17 +16,11 @@ from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import UsageError
 from aaplug.verbs.verb import looks
 
-
-@dataclass(frozen=True, eq=False)
-class RefinedCameras:
-    """Cameras with refined poses, and how each view was moved, by its place in `cameras.all`."""
-
-    cameras: CameraSet
-    poses: tuple[RefinedPose, ...]
+Refined = tuple[CameraSet, tuple[RefinedPose, ...]]
 
 
 @looks(PoseOptions)
-def refine_poses(scene: SceneLike | None, cameras: CamerasLike, options: PoseOptions) -> RefinedCameras:
+def refine_poses(scene: SceneLike | None, cameras: CamerasLike, options: PoseOptions) -> Refined:
     """Move cameras until the scene looks like their photographs, coarse to fine.
 
     Intrinsics stay.  A view stays where it is if it gains less than the scene's own errors could give it.
@@ -36,7 +30,7 @@ def refine_poses(scene: SceneLike | None, cameras: CamerasLike, options: PoseOpt
         cameras: see `render`; each view has a photograph.
 
     Returns:
-        The cameras with the poses of `views` refined, and what became of each of these views.
+        The cameras with the poses of `views` refined, and how each of these views was moved.
 
     Raises:
         AaplugError: as `render`; also, a view has no photograph.
@@ -48,7 +42,7 @@ def refine_poses(scene: SceneLike | None, cameras: CamerasLike, options: PoseOpt
         return refined(job, job.look(len(job.views), gradients=True), job.views)
 
 
-def refined(job: Job[ViewOptions], look: Renderer, views: Sequence[Camera]) -> RefinedCameras:
+def refined(job: Job[ViewOptions], look: Renderer, views: Sequence[Camera]) -> Refined:
     """A job's cameras, with the poses of some views refined, and a note that says by how much.
 
     Raises:
@@ -69,4 +63,4 @@ def refined(job: Job[ViewOptions], look: Renderer, views: Sequence[Camera]) -> R
         moves = f"{len(changed)} of {len(poses)} poses moved, in the median by {turn:.2g}° and {shift:.2g} units"
         note = f"{moves}: error at half size from {before:.1f} to {after:.1f} of 255 levels"
     job.monitor.say(note)
-    return RefinedCameras(replace(job.cameras, **splits, notes=(*job.cameras.notes, note)), tuple(poses))
+    return replace(job.cameras, **splits, notes=(*job.cameras.notes, note)), tuple(poses)
