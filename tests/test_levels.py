@@ -310,7 +310,7 @@ def test_levels_of_discs_are_discs_across_the_thinnest_axes_of_what_they_merge(t
 
 def test_what_cannot_be_merged_is_refused(tmp_path):
     flat = replace(make_scene(9), flat=True)
-    with pytest.raises(UsageError, match="2D Gaussians, whose levels aaplug alone draws"):
+    with pytest.raises(UsageError, match="2D Gaussians, whose levels only aaplug draws"):
         aaplug.lod(flat, simplify=0.5, viewer="spark")
     with pytest.raises(UsageError, match="no Gaussians"):
         aaplug.lod(make_scene(0), simplify=0.5)

@@ -116,8 +116,8 @@ def convention(folder):
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (gap, "in: its frames frame_0001.ply to frame_0003.ply lack 2; or name one"),
-        (twice, "have a number twice"),
+        (gap, "in: expected frame 2 after frame_0001.ply, got frame_0003.ply; or name one"),
+        (twice, "expected frame 3 after frame_0002.ply, got frame_002.ply"),
         (two, "holds frames of 2 sequences (frame_####.ply, other####.ply)"),
         (fewer, "frame_0002.ply: expected the number of Gaussians of frame_0001.ply, 40, got 39; pass `frames_apart`"),
         (degree, "frame_0003.ply: expected the degree of harmonics of frame_0001.ply, "),

@@ -280,10 +280,7 @@ class CountsEvaluations(Protocol):
 
 @runtime_checkable
 class SortsTiles(Protocol):
-    """A rasterizer that sorts the splats of each tile along its ray where they have `Splats2D.ray_slopes`.
-
-    tile: side of its tiles, in px.
-    """
+    """A rasterizer that sorts each tile's splats along its ray where they have `ray_slopes`.  tile: side in px."""
 
     tile: int
 

@@ -7,7 +7,7 @@ claims the output and connects the workers.
 import logging
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.util import find_spec
 from os import PathLike
@@ -93,13 +93,16 @@ class Job(Generic[O_co]):
 
     @cached_property
     def views(self: "Job[ViewOptions]") -> tuple[Camera, ...]:
-        """The views that the options name; of a scene in time, each at every frame."""
-        views = select_views(self.cameras, self.options.views)
-        return views if self.scene.frames is None else self.scene.frames.at_each(views)
+        """The views that the options name; of a scene in time, each at every frame, whose number ends its name."""
+        views, frames = select_views(self.cameras, self.options.views), self.scene.frames
+        moments = enumerate(frames.numbers if frames else ())
+        named = tuple(replace(v, frame=k, name=f"{v.name}-{n}", photo=None) for k, n in moments for v in views)
+        return named if frames else views
 
     def along(self, path: Sequence[Camera]) -> Sequence[Camera]:
         """The cameras of a path, during which a scene in time passes once."""
-        return path if self.scene.frames is None else self.scene.frames.along(path)
+        count = len(self.scene.frames or ())
+        return [replace(view, frame=i * count // len(path)) for i, view in enumerate(path)] if count else path
 
     def look(self: "Job[ViewOptions]", frames: int | None, *, gradients: bool = False, check: bool = True) -> Renderer:
         """The scene as training showed it, with the background and rasterizer that the options ask for.

@@ -98,9 +98,7 @@ class Renderer:
     def __post_init__(self) -> None:
         check_fields(self)
         if self.recipe.order == "tile" and not isinstance(self.rasterizer, SortsTiles):
-            raise UsageError(
-                "rasterizer", f"{self.rasterizer.name} sorts by depth alone, and order tile needs `SortsTiles`"
-            )
+            raise UsageError("rasterizer", f"{self.rasterizer.name} sorts by depth; order tile needs `SortsTiles`")
 
     @classmethod
     @contract

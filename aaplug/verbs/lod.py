@@ -148,8 +148,7 @@ class _Maker:
         """The maker that the options ask for."""
         viewer = find_viewer(job.options.viewer or (job.options.to and STREAMS[job.options.to].viewer))
         if scene.flat and viewer is not None:
-            problem = "holds 2D Gaussians, whose levels aaplug alone draws"
-            raise UsageError(scene.name, f"{problem}: leave out `viewer` and `to`, or give 3D Gaussians")
+            raise UsageError(scene.name, "holds 2D Gaussians, whose levels only aaplug draws; leave out `viewer`, `to`")
         if scene.flat and job.options.tuning:
             job.monitor.say("2D Gaussians are merged alone: they have no fast gradients to tune by")
         if job.cameras.assumed and (scene.flat or not job.options.tuning):

@@ -5,7 +5,7 @@ A format decodes rows; this module checks their values, reports unusable ones, a
 """
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from aaplug.core.cameras import Camera, CameraSet
+from aaplug.core.cameras import CameraSet
 from aaplug.core.conventions import CLASSIC, MIP, Convention
 from aaplug.core.gaussians import Fusion, Gaussians, Origin, digest_of_scene, joined
 from aaplug.core.pyramids import Pyramid
@@ -290,15 +290,6 @@ class SceneFrames:
                 if value != first:
                     hint = "; pass `frames_apart` if each frame was trained alone" * (name == names[-1])
                     raise FormatError(path, f"expected the {name} of {self.paths[0].name}, {first}, got {value}{hint}")
-
-    def at_each(self, views: Sequence[Camera]) -> tuple[Camera, ...]:
-        """The views at every frame, a frame at a time; the number of the frame ends a view's name."""
-        moments = enumerate(self.numbers)
-        return tuple(replace(v, frame=k, name=f"{v.name}-{n}", photo=None) for k, n in moments for v in views)
-
-    def along(self, path: Sequence[Camera]) -> list[Camera]:
-        """The cameras of a path, during which the frames pass once."""
-        return [replace(view, frame=i * len(self) // len(path)) for i, view in enumerate(path)]
 
     def over_all(self, training: TrainingViews) -> TrainingViews:
         """The training views of the first frame, with sampling bounds over all; raises as `training_of`."""
