@@ -510,8 +510,8 @@ def viewers(words: Words) -> Answer:
 def recipes(words: Words) -> Answer:
     """List the recipes that --recipe knows: what each is and whose, its cost, and when to use it.
 
-    Samples are per pixel, at 1/2, 1/4 and 1/8 of the training size if they differ.  To measure recipes on a scene, use
-    evaluate.
+    Samples are per pixel, at 1/2, 1/4 and 1/8 of the training size if they differ; without a time it is classic's.  To
+    measure recipes on a scene, use evaluate.
     """
     from aaplug.methods import RECIPES
     from aaplug.system.registry import names_of

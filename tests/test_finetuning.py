@@ -17,9 +17,9 @@ from aaplug.core.projection import rotation_matrices
 from aaplug.core.sampling import sampling_bounds
 from aaplug.core.training import TrainingViews
 from aaplug.evaluation.truth import MEMORY, Truth, back_projected
-from aaplug.finetuning import loop
+from aaplug.finetuning import LOSSES, loop
 from aaplug.finetuning.loop import advance, loss_at, run
-from aaplug.finetuning.losses import LOSSES, l1_dssim, l2, structural_similarity
+from aaplug.finetuning.losses import l2
 from aaplug.finetuning.parameters import RATES, between, extent, least_log_scales, leaves_of, scene_of
 from aaplug.finetuning.settings import CONSISTENCY, QUICK_SETTINGS, Settings, balance
 from aaplug.finetuning.state import DYNAMO_FOLDER, State, TuningJob, begin, load, save
@@ -27,6 +27,7 @@ from aaplug.io.images import write_png
 from aaplug.lab import densification
 from aaplug.lab.densification import MIN_GRADIENT, MIN_OPACITY, SPLIT_SHRINKAGE, densify, moments_after
 from aaplug.lab.group_training import GROUP_TRAINING, drawn, regroup
+from aaplug.lab.losses import l1_dssim, structural_similarity
 from aaplug.lab.mipmap_gs import MIPMAP_GS
 from aaplug.methods import RECIPES
 from aaplug.rasterizers import RASTERIZERS

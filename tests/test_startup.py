@@ -6,16 +6,14 @@ import subprocess
 import sys
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import get_args
 
 import pytest
 from aaplug_cli.verbs import VERBS
 
-from aaplug.finetuning.losses import LOSSES
 from aaplug.finetuning.parameters import RATES
 from aaplug.finetuning.settings import CONSISTENCY, CONSISTENCY_SETTINGS, settings_of
 from aaplug.methods import RECIPES
-from aaplug.options.verbs import TUNED_PARAMETERS, FinetuneOptions, LossName, RenderOptions
+from aaplug.options.verbs import TUNED_PARAMETERS, FinetuneOptions, RenderOptions
 from aaplug.system.errors import UsageError
 from aaplug.system.extras import install_command
 from aaplug.system.registry import REGISTRIES, _at, names_of
@@ -100,7 +98,6 @@ def test_names_are_known_before_what_they_name(kind):
 
 
 def test_other_names_agree_with_what_they_name():
-    assert tuple(LOSSES) == get_args(LossName)
     assert tuple(RATES) == TUNED_PARAMETERS
     assert settings_of(CONSISTENCY, FinetuneOptions()) == CONSISTENCY_SETTINGS
 

@@ -6,8 +6,7 @@ on surfaces, whose thin axis shows only edge-on.  Training drew that Gaussian wi
 relative rate r its variance is r²(σ²ν² + dilation) px², which meets the bound at r = √(0.2 / (σ²ν² + dilation)): below
 that scale it aliases.
 
-Another measure takes all axes, opacities and the recipe into account: the share of the splats' energy that lies above
-the Nyquist rate of the samples (`core.spectra`).
+The share of the splats' energy above the Nyquist rate (`core.spectra`) takes all axes, opacities and the recipe in too.
 """
 
 import math
@@ -40,7 +39,7 @@ class Coverage:
     edges, counts: histogram of extent over bound at the highest training rate; edges as log2.
     under: share below the bound.  begins: the scale below which half of the Gaussians, as training drew them, alias.
     aliased: (scale, share of the Gaussians, as training drew them, that are below the bound at that scale).
-    above_nyquist: of the splats' energy by recipe and scale, see `above_nyquist`.
+    above_nyquist: share of the splats' energy by recipe and scale.
     """
 
     gaussians: int

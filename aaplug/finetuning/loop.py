@@ -14,7 +14,7 @@ from torch import Tensor
 
 from aaplug.core.cameras import Camera
 from aaplug.core.sampling import sampling_bounds
-from aaplug.finetuning.losses import LOSSES
+from aaplug.finetuning import LOSSES
 from aaplug.finetuning.parameters import extent, least_log_scales
 from aaplug.finetuning.settings import SEED_STRIDE, Settings
 from aaplug.finetuning.state import State, TuningJob, snapshot, state_of

@@ -5,11 +5,11 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from typing import Any
 
-from aaplug.finetuning.losses import LOSSES
+from aaplug.finetuning import LOSSES
 from aaplug.finetuning.parameters import RATES
 from aaplug.methods.viewers import FAST, Viewer
 from aaplug.options.verbs import ANCHOR_WEIGHT, LOSS_WEIGHTS, FinetuneOptions
-from aaplug.system.errors import UsageError, not_one_of
+from aaplug.system.errors import UsageError
 
 SEED_STRIDE = 10_000_019  # from one of the user's seeds to the next
 
@@ -22,7 +22,7 @@ class Settings:
     anchor: weight of the loss at the training size, which every step adds.
     rates: learning rate by parameter; a parameter without one stays fixed.
     decay: factor that the learning rates have reached at the end.
-    loss: a name in `losses.LOSSES`.
+    loss: a name in `LOSSES`.
     """
 
     name: str
@@ -83,8 +83,7 @@ def settings_of(method: Method, options: FinetuneOptions) -> Settings:
     """
     if not options.move or any(name not in RATES for name in options.move):
         raise UsageError("move", f"needs parameters out of {', '.join(RATES)}")
-    if options.loss not in LOSSES:
-        raise UsageError("loss", not_one_of(options.loss, LOSSES))
+    LOSSES.find(options.loss, "loss")
     settings = method.settings(options.scale, options.move, options.anchor)
     return replace(
         settings,

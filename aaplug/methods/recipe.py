@@ -63,7 +63,7 @@ class Recipe:
     order: of splats, by depth: of their centres, or in each tile along the ray of its middle, which pops less.
     levels: how levels of detail are chosen; None draws the finest alone.
     for_discs: name of the recipe that takes its place for scenes of 2D Gaussians.
-    time: of a view at 1/4 of the training size, over that of `classic`, as measured; None if it was not.
+    time: of a view at 1/4 of the training size, over that of `classic`; None if that is about 1 or unknown.
     """
 
     name: str

@@ -6,7 +6,7 @@ Importing them takes no torch, so that help and mistakes on the command line are
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Literal
 
 from aaplug.core.conventions import CONVENTIONS, SpzAxes
 from aaplug.io import MOST_FPS, StreamName
@@ -44,7 +44,6 @@ METRICS = flag("|".join(map(metric_option, names_of("metric"))) + " ...", count=
 TIMED_RASTERIZERS = ("all", "compiled", "eager")
 LEVEL_STEPS = 1000  # for a level of 1/4 of the training rate and above; a smaller one takes more, of smaller images
 SINGLE_SCENE_FACTOR = 2  # times as many steps for one scene: its counts are met, so tuning has more to mend
-LossName = Literal["l2", "l1-dssim"]
 LOSS_WEIGHTS = {0.5: 1.0, 0.25: 2.0, 0.125: 1.0}  # by scale; measured, as are the two below
 ANCHOR_WEIGHT = 3.0  # of the loss at the training size, beside those of the scales
 TUNED_PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "dc", "rest")
@@ -266,8 +265,8 @@ class FinetuneOptions(WritingOptions, ViewOptions):
     """Sizes against the training size that must look right, beside the training size itself."""
     steps: Annotated[int | None, STEPS] = None
     """Number of steps (default: 1000)."""
-    loss: Annotated[str, names(*get_args(LossName)), TUNING] = "l2"
-    """l2, or 3DGS's 0.8 L1 + 0.2 D-SSIM."""
+    loss: Annotated[str, names(kind="loss"), TUNING] = "l2"
+    """l2, or for comparison 3DGS's 0.8 L1 + 0.2 D-SSIM."""
     anchor: Annotated[float, number(0, 1_000_000, metavar="WEIGHT"), TUNING] = ANCHOR_WEIGHT
     """Weight of the training size in every step, against 1 for the other scales."""
     move: Annotated[Sequence[str], names(*TUNED_PARAMETERS, count=None), TUNING] = TUNED_PARAMETERS

@@ -22,7 +22,7 @@ from aaplug.system.contracts import contract, described
 from aaplug.system.errors import UsageError, did_you_mean, not_one_of
 
 PREFIX = "aaplug."
-REGISTRIES = {  # place of each kind's registry; a kind, with underscores and an s, is an entry point group
+REGISTRIES = {  # place of each kind's registry; a kind's plural, with underscores, is an entry point group
     "world filter": "aaplug.methods:WORLD_FILTERS",
     "screen filter": "aaplug.methods:SCREEN_FILTERS",
     "selection": "aaplug.methods:SELECTIONS",
@@ -35,6 +35,7 @@ REGISTRIES = {  # place of each kind's registry; a kind, with underscores and an
     "metric": "aaplug.evaluation:METRICS",
     "protocol": "aaplug.evaluation:PROTOCOLS",
     "method": "aaplug.finetuning:METHODS",
+    "loss": "aaplug.finetuning:LOSSES",
     "scene format": "aaplug.io.scenes:SCENE_FORMATS",
     "camera format": "aaplug.io.cameras:CAMERA_FORMATS",
 }
@@ -189,7 +190,7 @@ def registry_of(kind: str) -> Any:  # a run-time check of a registry would load 
 
 def group_of(kind: str) -> str:
     """Name of the entry point group of a kind."""
-    return f"{PREFIX}{kind.replace(' ', '_')}s"
+    return f"{PREFIX}{kind.replace(' ', '_')}{'es' if kind.endswith('s') else 's'}"
 
 
 def _at(place: str) -> Any:

@@ -109,7 +109,7 @@ def times(chair: Trained) -> None:
     renderers = {name: chair.renderer(recipe) for name, recipe in RECIPES.items() if not recipe.lacks(chair.scene)}
     found = milliseconds(renderers, chair.views()[0].scaled(1 / 4))
     for name, taken in found.items():
-        row(name, taken / found["classic"], f"{RECIPES[name].time}")
+        row(name, taken / found["classic"], f"{RECIPES[name].time or 1}")
 
 
 def eaa(chair: Trained) -> None:

@@ -83,8 +83,8 @@ def plots(report: Report, bounds: Coverage) -> list[Plot]:
         curves.append(_curves(name, metric.title, partial(_mean, metric), report))
     title = "million splat-pixel evaluations per view"
     curves.append(_curves("evaluations", title, million_evaluations, report, from_zero=True))
-    title = "% of the splats' energy above the Nyquist rate"
-    curves.append(_curves("above-nyquist", title, partial(_above_nyquist, bounds), report, from_zero=True))
+    title, above = "share of the splats' energy above the Nyquist rate", bounds.above_nyquist
+    curves.append(_curves("above-nyquist", title, lambda _, *at: above.get(at), report, from_zero=True))
     share = "" if bounds.under is None else f": {bounds.under:.0%} are under it"
     words = f"Histogram of the Gaussians' extent over their sampling bound{share}"
     return [*(plot for plot in curves if plot is not None), Plot(BOUNDS, words, partial(_histogram, bounds))]
@@ -92,11 +92,6 @@ def plots(report: Report, bounds: Coverage) -> list[Plot]:
 
 def _mean(metric: Metric, report: Report, recipe: str, scale: float) -> float | None:
     return mean(report.select(recipe, scale), metric.name)
-
-
-def _above_nyquist(bounds: Coverage, report: Report, recipe: str, scale: float) -> float | None:
-    share = bounds.above_nyquist.get((recipe, scale))
-    return None if share is None else 100 * share
 
 
 def _curves(name: str, title: str, value: Value, report: Report, from_zero: bool = False) -> Plot | None:

@@ -277,12 +277,7 @@ class SceneFrames:
         return map(self.open, self.paths)
 
     def check(self) -> None:
-        """Read what every file says, without its rows.
-
-        Raises:
-            FormatError: a file breaks its format, or it is of another kind than the first, or it holds another number
-                of Gaussians and the frames were not trained apart.
-        """
+        """Read what every file says, without its rows; raises FormatError for one that is broken or of another kind."""
         names = ("degree of harmonics", "convention", "2D Gaussians", "number of Gaussians")
         kinds = [(s.sh_degree, s.convention.name, s.flat, not self.apart and s.count) for s in self]
         for path, kind in zip(self.paths, kinds, strict=True):
