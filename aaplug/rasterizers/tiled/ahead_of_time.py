@@ -97,10 +97,9 @@ TILING_HEURISTIC = "cpp.enable_tiling_heuristics"
 # Operations up to which inductor writes a value out again for each of its readers, where kernels are chained.
 CHAINED_OPTIONS = {"realize_opcount_threshold": 10}
 THIS_PROCESSOR = "native"  # as g++ calls its architecture
-OVERLAPS = {  # of `Kernel`; as the architecture, the only setting whose text reaches g++
-    "freely": f"{THIS_PROCESSOR} -fschedule-insns",
-    "within registers": f"{THIS_PROCESSOR} -fschedule-insns -fsched-pressure",
-}
+# g++'s options, of `Kernel.overlaps`; they follow the architecture, the only setting whose text reaches g++.
+SCHEDULING = {"freely": "-fschedule-insns", "within registers": "-fschedule-insns -fsched-pressure"}
+FEW_REGISTERS = "AVX2"  # 16: g++ has to count them in every kernel
 BUNDLE_VARIABLE = "AAPLUG_KERNELS"  # of the environment: the folder of a bundle
 MAX_SIZE = 1 << 31
 LIBRARY_SUFFIXES = (".so", ".pyd", ".dll", ".dylib")  # of the library in a package, by system
@@ -172,7 +171,7 @@ def _path_in(folder: Path, kernel: Kernel, target: Target | None = None) -> Path
 
     target: None for this processor and compiler.
     """
-    options = (OPTIONS, TILING_HEURISTIC, CHAINED_OPTIONS, OVERLAPS)
+    options = (OPTIONS, TILING_HEURISTIC, CHAINED_OPTIONS, SCHEDULING, FEW_REGISTERS)
     machine = (_compiler(), _compiler_version(_compiler()), _processor()) if target is None else (target.name,)
     facts = (torch.__version__, options, *machine, sources_of(kernel))
     key = hashlib.sha256("\0".join(map(str, facts)).encode()).hexdigest()[:16]
@@ -407,10 +406,10 @@ def _configs(kernel: Kernel, target: Target | None = None) -> dict[str, Any]:
     x86_linux = (sys.platform, platform.machine()) == ("linux", "x86_64")
     free = getattr(cpp, "march", "missing") is None  # known to this torch, and not set by the user
     if x86_linux and free and Path(_compiler()).name == STANDARD_COMPILER:
-        march = OVERLAPS[kernel.overlaps] if kernel.overlaps else THIS_PROCESSOR
-        if target is None:
-            return configs | {"cpp.march": march}
-        return configs | {"cpp.march": march.replace(THIS_PROCESSOR, target.name), "cpp.simdlen": target.bits}
+        capability = target.capability if target else torch.backends.cpu.get_cpu_capability()
+        overlaps = "within registers" if kernel.overlaps and capability == FEW_REGISTERS else kernel.overlaps
+        march = f"{target.name if target else THIS_PROCESSOR} {SCHEDULING[overlaps] if overlaps else ''}".strip()
+        return configs | {"cpp.march": march} | ({"cpp.simdlen": target.bits} if target else {})
     if target is not None:
         raise UsageError("bundle", f"needs {STANDARD_COMPILER} and a torch that tells it the architecture")
     return configs
