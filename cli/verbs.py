@@ -510,8 +510,8 @@ def viewers(words: Words) -> Answer:
 def recipes(words: Words) -> Answer:
     """List the recipes that --recipe knows: what each is and whose, its cost, and when to use it.
 
-    Samples are per pixel, at 1/2, 1/4 and 1/8 of the training size if they differ; without a time it is classic's.  To
-    measure recipes on a scene, use evaluate.
+    Samples are per pixel, at 1/2, 1/4 and 1/8 of the training size if they differ.  Where no time is given it is about
+    classic's, or not known.  To measure recipes on a scene, use evaluate.
     """
     from aaplug.methods import RECIPES
     from aaplug.system.registry import names_of
@@ -522,8 +522,8 @@ def recipes(words: Words) -> Answer:
         for r in RECIPES.values()
     ]
     headings = ("--recipe", "cost", "when to use it", "what it is, and whose")
-    rows = [[str(fact[key]) for key in ("name", "cost", "when", "source")] for fact in facts]
-    tables = [table(some, headings) for some in (rows[: len(used)], rows[len(used) :])]
+    rows = [[(f["name"], f["cost"], f["when"], f["source"]) for f in facts if f["comparison"] == of] for of in (0, 1)]
+    tables = [table(some, headings) for some in rows]
     return Answer(facts, [tables[0], "For comparison:", tables[1]])
 
 

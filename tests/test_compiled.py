@@ -118,7 +118,7 @@ linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="bundles
 @linux
 def test_a_bundle_is_used_where_nothing_is_compiled(built, empty_cache, monkeypatch):
     """The best instruction set that the processor has.  What is unpacked goes to the cache, not to the bundle."""
-    kernel, bundle, (best, least) = binning.LISTS, empty_cache / "bundle", compiled.TARGETS
+    kernel, bundle, (best, least) = binning.PAIRS, empty_cache / "bundle", compiled.TARGETS
     bundle.mkdir()
     monkeypatch.setenv("AAPLUG_KERNELS", str(bundle))
     for target, users in ((least, {"AVX2", "AVX512"}), (best, {"AVX512"})):
@@ -157,7 +157,7 @@ def test_packages_are_compared_by_one_thread_which_is_undone_after_that(copied_c
 
 
 def test_a_library_is_unpacked_and_compared_once_until_it_changes(copied_cache, monkeypatch):
-    kernel, compared = binning.LISTS, []
+    kernel, compared = binning.PAIRS, []
     monkeypatch.setattr(compiled, "_close", lambda *x: compared.append(x) or True)
     library = compiled.package_path(kernel).with_suffix(".so")
     for change in (None, library.unlink, lambda: library.write_bytes(b"damaged")):
@@ -202,7 +202,7 @@ def not_a_package(package: Path) -> None:
 
 
 def of_another_kernel(package: Path) -> None:
-    shutil.copy(CACHE / compiled.package_path(binning.LISTS).name, package)
+    shutil.copy(CACHE / compiled.package_path(binning.PAIRS).name, package)
 
 
 def of_another_machine(package: Path) -> None:

@@ -370,7 +370,7 @@ def test_order_tile_draws_what_the_reference_does_and_others_refuse_it():
     assert Job.of(scene, CameraSet((camera,), ()), RenderOptions(order="tile")).recipe("auto").order == "tile"
     with pytest.raises(UsageError, match="order: tile is for pinhole views"):
         Renderer.of(scene, [camera], find_recipe("auto", order="tile"))(replace(camera, lens=Lens("equidistant")))
-    with pytest.raises(UsageError, match="rasterizer: by-depth sorts by depth alone"):
+    with pytest.raises(UsageError, match="rasterizer: by-depth sorts by depth; order tile needs"):
         Renderer.of(scene, [camera], find_recipe("auto", order="tile"), rasterizer=ByDepth())
 
 

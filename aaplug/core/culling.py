@@ -29,7 +29,7 @@ def cull(
     bounds = splats if ellipses is None else ellipses
     columns = bounds.means, bounds.covs, bounds.dets, bounds.opacities
     (inside,) = kernels.run(CULL, *columns, size)
-    return splats.selected(inside.nonzero().squeeze(1), kernels)
+    return splats.selected(inside.nonzero().squeeze(1))
 
 
 def _inside(

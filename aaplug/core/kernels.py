@@ -28,7 +28,7 @@ class Kernel:
         outweighs the gathers.
     chained: each value is made of many before it, and several read it.  Inductor would write it out again for each.
     overlaps: it computes many independent values in turn, so g++ should schedule instructions before it allocates
-        registers: "freely", or "within registers" where it also keeps many sums.
+        registers: "freely", or "within registers" where it also keeps many sums, and on processors with few.
     pulls_back: the function computes gradients itself, so it is traced before it is compiled.
     updates: positions of the arguments that it updates in place; they must be contiguous.
     evaluations: splat-pixel evaluations of one call, per pixel of a tile; 0 for kernels that do not composite.

@@ -21,7 +21,7 @@ from aaplug.core.kernels import EAGER, EXAMPLE_SIZE, Kernel, Kernels, backward_o
 from aaplug.core.lenses import PINHOLE
 from aaplug.core.rules import NEAR, RULES_3DGS, Rules
 from aaplug.core.sights import sights
-from aaplug.core.splats import SELECT, Splats2D
+from aaplug.core.splats import Splats2D, picked
 
 JACOBIAN_MARGIN = 0.3  # of half the image: 3DGS linearises no farther out (1.3 tan(fov/2))
 PLACES = 17  # along a side, at which it is found what a distorting pinhole sees
@@ -35,7 +35,7 @@ def project(scene: Gaussians, camera: Camera, kernels: Kernels = EAGER, rules: R
         return _project_through(scene, camera, kernels, rules)
     shape = scene.means, scene.quats, scene.log_scales
     columns = kernels.run(PROJECT, *shape, *_camera_rows(scene.means, camera, rules))
-    return _beyond(rules.near, columns, scene.opacities, kernels)
+    return _beyond(rules.near, columns, scene.opacities)
 
 
 def project_covariances(
@@ -65,14 +65,12 @@ def project_covariances(
     return _beyond(rules.near, columns, opacities)
 
 
-def _beyond(
-    near: float, columns: tuple[Tensor, ...], opacities: Float[Tensor, " n"], kernels: Kernels = EAGER
-) -> Splats2D:
+def _beyond(near: float, columns: tuple[Tensor, ...], opacities: Float[Tensor, " n"]) -> Splats2D:
     """Splats of these means, covariances, determinants and depths, without those before the near plane."""
     means, covs, dets, depths = columns
     in_front = (depths > near).nonzero().squeeze(1)
     if len(in_front) < len(means):
-        means, covs, dets, depths, opacities = kernels.run(SELECT, in_front, *columns, opacities)
+        means, covs, dets, depths, opacities = (picked(column, in_front) for column in (*columns, opacities))
     return Splats2D(means, covs, dets, depths, opacities, in_front)
 
 
@@ -200,7 +198,7 @@ def _project_through(scene: Gaussians, camera: Camera, kernels: Kernels, rules: 
             axes = planes[:, :2] @ rotation / depths.clamp(min=rules.near)[:, None, None]
         across, down = (axis.unbind(dim=-1) for axis in axes.unbind(dim=-2))
         covs, dets = _shape(across, down, scene.unit_quats, scene.log_scales)
-    splats = _beyond(rules.near, (places, covs, dets, depths), scene.opacities, kernels)
+    splats = _beyond(rules.near, (places, covs, dets, depths), scene.opacities)
     own = {"planes": planes.index_select(0, splats.sources), "rates": rates.index_select(0, splats.sources)}
     return replace(splats, **own, camera=camera)
 

@@ -10,18 +10,16 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Any, NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from aaplug.core.cameras import Camera
-from aaplug.core.kernels import EAGER, EXAMPLE_SIZE, Kernel, Kernels
 from aaplug.system.contracts import Range, check_fields, contract, described
 from aaplug.system.errors import UsageError
 
 MIN_COMPENSATION = 0.005  # floor of the opacity factor, so that rounding erases no splat (3DGS)
 NEARER, FARTHER = 0.25, 0.12  # shares of the change of depth along a ray that count where it is negative, or positive
 Floor = Annotated[float, Range(0, 1)]
-SHAPE_COLUMNS = ("means", "covs", "dets", "depths", "opacities")  # floating point, and of every splat
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,13 +70,9 @@ class Splats2D:
         except (IndexError, RuntimeError, TypeError) as error:
             raise UsageError("index", f"expected places of {len(self)} splats, got {described(index)}") from error
 
-    def selected(self, rows: Int[Tensor, " k"], kernels: Kernels = EAGER) -> "Splats2D":
+    def selected(self, rows: Int[Tensor, " k"]) -> "Splats2D":
         """The splats at `rows`, each at most once."""
-        columns = self._columns()
-        shape = kernels.run(SELECT, rows, *(columns.pop(name) for name in SHAPE_COLUMNS))
-        sources = columns.pop("sources").index_select(0, rows)
-        others = {name: picked(column, rows) for name, column in columns.items()}
-        return self.with_columns({**dict(zip(SHAPE_COLUMNS, shape, strict=True)), "sources": sources, **others})
+        return self.with_columns({name: picked(column, rows) for name, column in self._columns().items()})
 
     @contract
     def to(self, dtype: torch.dtype) -> "Splats2D":
@@ -160,9 +154,9 @@ class Render(NamedTuple):
     alpha: Float[Tensor, "h w"]
 
 
-def picked(x: Float[Tensor, "n *c"], rows: Int[Tensor, " m"]) -> Float[Tensor, "m *c"]:
+def picked(x: Shaped[Tensor, "n *c"], rows: Int[Tensor, " m"]) -> Shaped[Tensor, "m *c"]:
     """Select rows, each at most once."""
-    return _Picked.apply(x, rows)  # pyright: ignore[reportReturnType]
+    return _Picked.apply(x, rows) if x.requires_grad else x.index_select(0, rows)  # pyright: ignore[reportReturnType]
 
 
 class _Picked(torch.autograd.Function):
@@ -178,17 +172,3 @@ class _Picked(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None]:
         (rows,) = ctx.saved_tensors
         return grads[0].new_zeros(ctx.shape).index_copy_(0, rows, grads[0]), None
-
-
-def _selected(rows: Int[Tensor, " k"], *columns: Float[Tensor, "m ..."]) -> tuple[Float[Tensor, "k ..."], ...]:
-    return tuple(picked(column, rows) for column in columns)
-
-
-def _select_example() -> tuple[Tensor, ...]:
-    m = EXAMPLE_SIZE
-    columns = (torch.linspace(0.0, 1.0, width * m) for width in (2, 3, 1, 1, 1))
-    means, covs, *scalars = columns
-    return torch.arange(0, m, 2), means.view(m, 2), covs.view(m, 3), *scalars
-
-
-SELECT = Kernel("select", _selected, _select_example, ("k", *5 * ("m",)))

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.system.errors import FormatError, UsageError
+from aaplug.system.errors import FormatError, UsageError, reason
 
 Network = Callable[[Float[Tensor, "1 3 h w"]], Tensor]
 Upsampler = Callable[[Float[Tensor, "h w 3"], tuple[int, int]], Float[Tensor, "H W 3"]]
@@ -59,7 +59,7 @@ def find_upsampler(name: str) -> Upsampler:
             with torch.no_grad():
                 larger = network(image.permute(2, 0, 1)[None].contiguous())
         except Exception as error:
-            raise FormatError(path, f"does not take an image of {image.shape[1]}x{image.shape[0]} px") from error
+            raise FormatError(path, f"fails on {image.shape[1]}x{image.shape[0]} px: {reason(error)}") from error
         if larger.ndim != 4 or larger.shape[1] != image.shape[2]:
             raise FormatError(path, f"should give an image [1, 3, H, W], gives {[*larger.shape]}")
         larger = larger[0].permute(1, 2, 0).contiguous()

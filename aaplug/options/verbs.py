@@ -258,7 +258,7 @@ class FinetuneOptions(WritingOptions, ViewOptions):
     views: Annotated[str, VIEWS] = "test"
     """Views that the result is measured on, by name or split; training views are what it is tuned on."""
     method: Annotated[str, names(kind="method")] = "consistency"
-    """consistency: one model for all scales; group-training: the same, a share at a time; mipmap-gs: one scale."""
+    """consistency: one model for all scales; group-training: the same, 60 % at a time; mipmap-gs: one scale."""
     learn_filters: bool = False
     """Learn a filter for each Gaussian by image size, for `--recipe learned`; the Gaussians stay as they are."""
     scale: Annotated[Sequence[float], SCALES] = tuple(LOSS_WEIGHTS)

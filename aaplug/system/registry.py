@@ -1,6 +1,6 @@
 """Registries of everything that is chosen by name, from aaplug and from installed plug-ins.
 
-A package adds an entry by an entry point in the group "aaplug.<kind>s", for example in its pyproject.toml:
+A package adds an entry by an entry point in the group of its kind, for example in its pyproject.toml:
 
     [project.entry-points."aaplug.screen_filters"]
     sharp = "their_package.sharp:SHARP"

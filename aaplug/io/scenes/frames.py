@@ -13,7 +13,7 @@ def frame_files(folder: Path) -> dict[Path, str]:
     """The numbers of the files of a scene in time, by file and in order; none if no two differ by a number alone.
 
     Raises:
-        FormatError: frames are missing or twice there, or there are frames of several sequences.
+        FormatError: frames are missing or there twice, or there are frames of several sequences.
     """
     matches = [match for path in folder.glob("*.ply") if (match := NUMBERED.fullmatch(path.name))]
     named: dict[tuple[str, str], list[re.Match[str]]] = {}

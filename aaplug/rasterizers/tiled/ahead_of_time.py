@@ -31,7 +31,7 @@ from typing import Any
 import platformdirs
 import torch
 
-from aaplug.core import culling, projection, shading, splats
+from aaplug.core import culling, projection, shading
 from aaplug.core.interfaces import RunsOwnKernels
 from aaplug.core.kernels import EAGER, ONE_MORE, Kernel, Kernels
 from aaplug.methods.pixel_kernels.absolute import ABSOLUTE_POINT
@@ -51,12 +51,10 @@ from aaplug.system.monitor import Tell
 IMAGE_KERNELS: tuple[Kernel, ...] = (  # of every recipe with the pixel kernel `POINT`
     projection.PROJECT,
     *map(shading.shade_kernel, shading.COMPILED_COEFFICIENTS),
-    splats.SELECT,
     culling.CULL,
     binning.TABLE,
     binning.SPANS,
     binning.PAIRS,
-    binning.LISTS,
     layout.lines_kernel(),
     POINT_ROWS,
     forward.pass_kernel(POINT),
@@ -99,7 +97,7 @@ CHAINED_OPTIONS = {"realize_opcount_threshold": 10}
 THIS_PROCESSOR = "native"  # as g++ calls its architecture
 # g++'s options, of `Kernel.overlaps`; they follow the architecture, the only setting whose text reaches g++.
 SCHEDULING = {"freely": "-fschedule-insns", "within registers": "-fschedule-insns -fsched-pressure"}
-FEW_REGISTERS = "AVX2"  # 16: g++ has to count them in every kernel
+MANY_REGISTERS = "AVX512"  # 32 of vectors; without it there are 16, and g++ has to count them wherever it schedules
 BUNDLE_VARIABLE = "AAPLUG_KERNELS"  # of the environment: the folder of a bundle
 MAX_SIZE = 1 << 31
 LIBRARY_SUFFIXES = (".so", ".pyd", ".dll", ".dylib")  # of the library in a package, by system
@@ -171,7 +169,7 @@ def _path_in(folder: Path, kernel: Kernel, target: Target | None = None) -> Path
 
     target: None for this processor and compiler.
     """
-    options = (OPTIONS, TILING_HEURISTIC, CHAINED_OPTIONS, SCHEDULING, FEW_REGISTERS)
+    options = (OPTIONS, TILING_HEURISTIC, CHAINED_OPTIONS, SCHEDULING, MANY_REGISTERS)
     machine = (_compiler(), _compiler_version(_compiler()), _processor()) if target is None else (target.name,)
     facts = (torch.__version__, options, *machine, sources_of(kernel))
     key = hashlib.sha256("\0".join(map(str, facts)).encode()).hexdigest()[:16]
@@ -407,7 +405,7 @@ def _configs(kernel: Kernel, target: Target | None = None) -> dict[str, Any]:
     free = getattr(cpp, "march", "missing") is None  # known to this torch, and not set by the user
     if x86_linux and free and Path(_compiler()).name == STANDARD_COMPILER:
         capability = target.capability if target else torch.backends.cpu.get_cpu_capability()
-        overlaps = "within registers" if kernel.overlaps and capability == FEW_REGISTERS else kernel.overlaps
+        overlaps = "within registers" if kernel.overlaps and capability != MANY_REGISTERS else kernel.overlaps
         march = f"{target.name if target else THIS_PROCESSOR} {SCHEDULING[overlaps] if overlaps else ''}".strip()
         return configs | {"cpp.march": march} | ({"cpp.simdlen": target.bits} if target else {})
     if target is not None:

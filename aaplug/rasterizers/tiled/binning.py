@@ -167,7 +167,7 @@ def _bin(
     by_ray = _by_ray(drawn, splats, origins, tiles) if drawn.ray_slopes is not None else None
     by_tile, pairs = torch.sort(tiles if by_ray is None else tiles.index_select(0, by_ray), stable=True)
     pairs = pairs if by_ray is None else by_ray.index_select(0, pairs)
-    lists = kernels.run(LISTS, splats, pairs)[0] if len(pairs) else splats.new_zeros(1)
+    lists = splats.index_select(0, pairs) if len(pairs) else splats.new_zeros(1)
     ends = torch.searchsorted(by_tile, tile.to(tiles), right=True)
     counts = torch.diff(ends, prepend=ends.new_zeros(1))
     by_splat = None
@@ -232,11 +232,6 @@ def _pairs(
     return (place + (first - starts)[spans]).to(first.dtype), owners[spans]
 
 
-def _lists(splats: Int[Tensor, " p"], pairs: Int[Tensor, " p"]) -> tuple[Int[Tensor, " p"]]:
-    """The splats of pairs, by tile."""
-    return (splats.index_select(0, pairs),)
-
-
 # --------------------------------------------------------------------------------------------------------- kernels
 
 
@@ -254,11 +249,6 @@ def _pairs_example() -> tuple[Tensor, ...]:
     return torch.arange(200_000, dtype=torch.int32) // 4, 4 * spans, (spans % 999).short(), spans
 
 
-def _lists_example() -> tuple[Tensor, ...]:
-    pairs = torch.arange(200_000)
-    return pairs.int(), pairs.flip(0)
-
-
 def _table_example() -> tuple[Tensor, ...]:
     return *splat_example(), torch.tensor([9.0, 9.0, RULES_3DGS.min_alpha])
 
@@ -266,4 +256,3 @@ def _table_example() -> tuple[Tensor, ...]:
 TABLE = Kernel("table", _table_rows, _table_example, ("m",) * 4 + (None,), gathers=True)
 SPANS = Kernel("spans", _spans, _spans_example, ("s", "m", "m", "m", None))
 PAIRS = Kernel("pairs", _pairs, _pairs_example, ("p", "s", "s", "s"))
-LISTS = Kernel("lists", _lists, _lists_example, ("p", "p"))
