@@ -93,7 +93,7 @@ def convert(words: Words) -> Answer:
     from aaplug.evaluation.results import tables
     from aaplug.methods.conversion import fused_in
 
-    how = "in parts" if result.scene is None else f"fused {fused_in(result.scene)}"
+    how = "part by part" if result.scene is None else f"fused {fused_in(result.scene)}"
     say(f"wrote {words.output}: {how}; show it with {result.viewer.rule} ({result.viewer.name})")
     say(result.viewer.advice(words.output.suffix[1:].lower() or "ply"))
     title = "As the viewer draws it, against the scene's own training-size render:"

@@ -144,6 +144,7 @@ REFUSED = {
     f"{LOD} -o scene.ply --simplify 0.5 --overwrite": ["is also the input"],
     f"{TUNE} --method mipmap-gs --scale 0.5 0.25": ["one model for one scale"],
     f"{TUNE} --upsampler nearest": ["expected bicubic, lanczos"],
+    f"{TUNE} --upsampler bicubic": ["--upsampler: makes what scales above 1 should show", "give such a --scale"],
     f"{TUNE} --truth photographs": ["has no photograph; --truth self"],
     f"{TUNE} --move size": ["--move: 'size' is not one of means"],
     f"{TUNE} --overwrite -o scene.ply": ["is also the input"],

@@ -42,7 +42,7 @@ def test_convert_fuses_a_stored_filter_without_cameras(cli, monkeypatch, large):
     scene = replace(make_scene(20), filter_3d=torch.full((20,), 0.01), convention=MIP)
     write_scene(Path("unfused.ply"), scene)
     code, _, err = cli("convert unfused.ply -o c.ply")
-    assert (code, "in parts" in err) == (0, large)
+    assert (code, "part by part" in err) == (0, large)
     found = read_scene(Path("c.ply")).gaussians()
     assert (fused(), found.filter_3d) == (["filter_3D"], None)
     expected = 0.5 * (scene.scales.square() + 0.01**2).log()

@@ -309,6 +309,8 @@ def test_levels_of_discs_are_discs_across_the_thinnest_axes_of_what_they_merge(t
 
 
 def test_what_cannot_be_merged_is_refused(tmp_path):
+    with pytest.raises(UsageError, match=r"simplify: above 1 is a count: expected a whole number, got 2\.5"):
+        aaplug.lod(make_scene(9), simplify=2.5)
     flat = replace(make_scene(9), flat=True)
     with pytest.raises(UsageError, match="2D Gaussians, whose levels only aaplug draws"):
         aaplug.lod(flat, simplify=0.5, viewer="spark")

@@ -155,5 +155,7 @@ def test_other_verbs_refuse_a_scene_in_time(folder, verb):
 def test_conversion_of_frames_needs_a_folder_and_no_fit(folder, tmp_path):
     with pytest.raises(UsageError, match="output: of frames is a folder"):
         aaplug.convert(folder, CAMERAS)
+    with pytest.raises(UsageError, match="output: of frames is a folder"):
+        aaplug.convert(folder, CAMERAS, tmp_path / "out.ply")
     with pytest.raises(UsageError, match="viewer: fits each frame alone, which flickers"):
         aaplug.convert(folder, CAMERAS, tmp_path / "out", viewer="spark")

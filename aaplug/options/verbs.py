@@ -226,6 +226,8 @@ class LodOptions(WritingOptions, ViewOptions):
             raise UsageError(given[1], f"cannot be combined with `{given[0]}`: each asks for other files")
         if self.scale is not None and not self.single:
             raise UsageError("scale", "belongs to `simplify` and `budget`")
+        if self.simplify is not None and self.simplify > 1 and self.simplify % 1:
+            raise UsageError("simplify", f"above 1 is a count: expected a whole number, got {self.simplify:g}")
         if self.merge_below and self.single:
             raise UsageError("merge_below", "belongs to levels")
         if self.to is not None and self.single:
@@ -260,7 +262,7 @@ class FinetuneOptions(WritingOptions, ViewOptions):
     method: Annotated[str, names(kind="method")] = "consistency"
     """consistency: one model for all scales; group-training: the same, 60 % at a time; mipmap-gs: one scale."""
     learn_filters: bool = False
-    """Learn a filter for each Gaussian by image size, for `--recipe learned`; the Gaussians stay as they are."""
+    """Learn a filter for each Gaussian at 1/2 to 1/16 and --scale, for `--recipe learned`; the Gaussians stay."""
     scale: Annotated[Sequence[float], SCALES] = tuple(LOSS_WEIGHTS)
     """Sizes against the training size that must look right, beside the training size itself."""
     steps: Annotated[int | None, STEPS] = None

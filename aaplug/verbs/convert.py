@@ -12,7 +12,7 @@ from aaplug.evaluation.results import Report, results
 from aaplug.evaluation.survey import check_frame_of
 from aaplug.finetuning.fitting import fit, steps_for
 from aaplug.io.atomic import AnyPath, refuse_existing
-from aaplug.io.scenes import SceneLike, check_scene_output, write_parts, write_scene
+from aaplug.io.scenes import SceneLike, check_scene_output, write_parts, write_scene, written_format
 from aaplug.io.scenes.scene import SceneFrames
 from aaplug.methods import FORMS
 from aaplug.methods.conversion import MATCHED_ENERGY, MIP_SPLATTING, Form, blurring, fuse
@@ -71,12 +71,16 @@ def convert(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opti
     viewer = rule if isinstance(rule, Viewer) else DISC_VIEWER if job.scene.flat else MIP_VIEWER
     files = {"overwrite": options.overwrite, **viewer.spz(options.spz_axes)}
     frames = job.scene.frames
+    if frames is not None and isinstance(rule, Viewer):
+        raise UsageError("viewer", "fits each frame alone, which flickers: leave it out")
+    if frames is not None and (path is None or written_format(path)):
+        raise UsageError("output", "of frames is a folder: name one")
     outputs = [path / file.name for file in frames.paths] if path and frames else []
     check = partial(check_scene_output, path, options.overwrite, job.scene.files) if path else lambda: None
     check = partial(refuse_existing, outputs, options.overwrite) if outputs else check
     check()
     with running(options, path, check, job.inputs, folder=frames is not None) as workers:
-        if frames is not None:
+        if frames is not None and isinstance(rule, Form):
             return Converted(_write_frames(job, rule, frames, outputs, files), None, viewer)
         if path and job.scene.path and job.scene.count > LARGE_SCENE and isinstance(rule, Form):
             _write_in_parts(job, rule, path, workers.threads, files)
@@ -112,18 +116,15 @@ def _closed_form(job: Job[ConvertOptions], form: Form) -> Gaussians:
 
 
 def _write_frames(
-    job: Job[ConvertOptions], rule: Form | Viewer, frames: SceneFrames, outputs: Sequence[Path], files: Any
+    job: Job[ConvertOptions], form: Form, frames: SceneFrames, outputs: Sequence[Path], files: Any
 ) -> int:
     """Write the closed form of a scene in time, frame by frame; returns the number of Gaussians."""
-    if isinstance(rule, Viewer) or not outputs:
-        what = "fits each frame alone, which flickers: leave it out" if outputs else "of frames is a folder: name one"
-        raise UsageError("viewer" if outputs else "output", what)
     job.say_assumed()
     training, count = job.training(job.scene), 0
     with job.monitor.progress("converting", "frames") as tell:
         for done, (frame, output) in enumerate(zip(frames, outputs, strict=True), start=1):
             gaussians = frame.gaussians()
-            write_scene(output, fuse(gaussians, frames.training_of(gaussians, training), rule), **files)
+            write_scene(output, fuse(gaussians, frames.training_of(gaussians, training), form), **files)
             count += len(gaussians)
             tell(done, len(frames))
     return count

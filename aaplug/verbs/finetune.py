@@ -93,6 +93,8 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
     check()
     truth_source = source_of(job.cameras.train, options.truth)
     enlarge = back_projected if options.upsampler is None else upsampled(find_upsampler(options.upsampler))
+    if options.upsampler is not None and max(settings.weights) <= 1:
+        raise UsageError("upsampler", "makes what scales above 1 should show, and there is none: give such a `scale`")
     upsampler = str(options.upsampler)
     upsampler = digest_of_files([upsampler]) if Path(upsampler).is_file() else upsampler
     with running(options, path, check, job.inputs):

@@ -268,7 +268,8 @@ def find_scene(path: str | PathLike[str], iteration: int | None = None) -> Path:
     if not scenes and (frames := frame_files(path)):
         return path / next(iter(frames)).name
     if not scenes:
-        raise FormatError(path, "holds no point_cloud/iteration_<N>/point_cloud.ply; name the scene's file")
+        known = f"point_cloud/iteration_<N>/point_cloud.ply, {MANIFEST}, {SOG_FOLDER} or numbered .ply files"
+        raise FormatError(path, f"holds no {known}; name the scene's file")
     chosen = max(scenes) if iteration is None else iteration
     if chosen not in scenes:
         raise FormatError(path, f"has no iteration {chosen}; it has {', '.join(map(str, sorted(scenes)))}")
