@@ -48,12 +48,11 @@ class SamplingBounds:
 
     def over(self, other: "SamplingBounds") -> "SamplingBounds":
         """The bounds of the same Gaussians over these cameras and others, or over two frames of a scene in time."""
-        highest = torch.maximum(self.highest, other.highest)
         lowest, nearest = (
             torch.where(self.seen & other.seen, torch.minimum(a, b), torch.maximum(a, b))
             for a, b in ((self.lowest, other.lowest), (self.nearest, other.nearest))
         )
-        return SamplingBounds(highest, lowest, nearest, self.views + other.views)
+        return SamplingBounds(torch.maximum(self.highest, other.highest), lowest, nearest, self.views + other.views)
 
     @property
     def seen(self) -> Bool[Tensor, " n"]:

@@ -70,8 +70,7 @@ def refine_pose(renderer: Renderer, view: Camera, scales: Sequence[float] = SCAL
         camera, after = view, before
     chord = float((camera.cam_from_world - view.cam_from_world)[:3, :3].norm())  # √8 sin(angle / 2)
     degrees = math.degrees(2 * math.asin(min(1.0, chord / math.sqrt(8))))
-    distance = float((camera.centre - view.centre).norm())
-    return RefinedPose(camera, degrees, distance, math.sqrt(before), math.sqrt(after))
+    return RefinedPose(camera, degrees, float((camera.centre - view.centre).norm()), before**0.5, after**0.5)
 
 
 def moved_by(camera: Camera, change: Float[Tensor, " 6"], depth: float) -> Camera:

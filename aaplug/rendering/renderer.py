@@ -203,9 +203,9 @@ class Renderer:
             self._open.clear()
             gaussians, harmonics = without_harmonics(self.in_time.open(self.in_time.paths[frame]))
             training = self.in_time.training_of(gaussians, self.training)
-            filtered = _filtered(gaussians, training, self.recipe)
-            changes = {"scene": filtered, "training": training, "harmonics": harmonics}
-            self._open[frame] = replace(self, **changes, source=None, in_time=None)
+            scene = _filtered(gaussians, training, self.recipe)
+            now = replace(self, scene=scene, training=training, harmonics=harmonics, source=None, in_time=None)
+            self._open[frame] = now
         return self._open[frame]
 
     @contract

@@ -12,8 +12,7 @@ NUMBERED = re.compile(r"(.*?)(?<!\d)(?<!_lod)(\d+)((?:\.compressed)?\.ply)", re.
 def frame_files(folder: Path) -> dict[Path, str]:
     """The numbers of the files of a scene in time, by file and in order; none if no two differ by a number alone.
 
-    Raises:
-        FormatError: frames are missing or there twice, or there are frames of several sequences.
+    Raises FormatError where frames are missing or there twice, or of several sequences.
     """
     matches = [match for path in folder.glob("*.ply") if (match := NUMBERED.fullmatch(path.name))]
     named: dict[tuple[str, str], list[re.Match[str]]] = {}
