@@ -105,6 +105,7 @@ REFUSED = {
     f"{RENDER} --recipe multi-scale": ["base_mask"],
     f"{RENDER} --scale 2 --resolution 8x8": ["give one"],
     f"{RENDER} --resolution 99999x9": ["16384"],
+    f"{RENDER} --lens-angle 90": ["--lens-angle: belongs to lenses fisheye and equisolid; name one as --lens"],
     "render --cameras . -o new": ["SCENE"],
     "render gone.ply --cameras . -o new": ["gone.ply"],
     "render scene.ply --cameras gone -o new": ["gone"],

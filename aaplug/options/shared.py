@@ -39,6 +39,7 @@ RECIPE_NAMES = names_of("recipe", comparisons=False)
 RECIPE_METAVAR = "|".join([*RECIPE_NAMES, "..."])  # in `--help`
 RASTERIZER_NAMES = ("auto", "compiled")  # beside those of the registry
 LENS_NAMES = ("pinhole", "fisheye", "equisolid", "equirect", "vr180", "ortho")
+HALF_TURN = 180.0  # degrees: what a fisheye shows, unless another angle is given
 RATE_REFERENCES = get_args(RateReference)
 MAX_SIDE = 16384  # px
 MAX_COORDINATE = 1e7  # world units
@@ -161,7 +162,7 @@ class LensOptions(Options):
 
     lens: Annotated[str | None, names(*LENS_NAMES), LENS] = None
     """Draw through another lens (default: that of the camera); equirect is 360x180 degrees, vr180 a pair of eyes."""
-    lens_angle: Annotated[float, number(1, 360, metavar="DEGREES"), LENS] = 180.0
+    lens_angle: Annotated[float, number(1, 360, metavar="DEGREES"), LENS] = HALF_TURN
     """Angle that fisheye and equisolid show along the image's shorter side."""
     eye_distance: Annotated[float | None, number(0, MAX_COORDINATE, metavar="UNITS"), LENS] = None
     """Distance between the eyes of vr180, in the scene's units."""
@@ -170,6 +171,8 @@ class LensOptions(Options):
         super().__post_init__()
         if (self.eye_distance is None) == (self.lens == "vr180"):
             raise UsageError("eye_distance", "belongs to lens vr180, which needs it: about 0.064 m in scene units")
+        if self.lens_angle != HALF_TURN and self.lens not in ("fisheye", "equisolid"):
+            raise UsageError("lens_angle", "belongs to lenses fisheye and equisolid; name one as `lens`")
 
 
 @dataclass(frozen=True, kw_only=True)
