@@ -84,7 +84,7 @@ EAA = Recipe(
     "alpha from weighted nodes in the pixel",
     "comparison: analytic by sums over nodes, slower and no better",
     pixel=ELLIPTICAL,
-    time=11.0,
+    time=13.0,
 )
 SA_GS = Recipe(
     "sa-gs",
@@ -142,7 +142,7 @@ AA_2DGS = Recipe(
     "scenes of 2D Gaussians trained with it",
     world=FLAT,
     pixel=SURFEL_MIP,
-    time=2.2,
+    time=2.4,
     promises=Promises(opaque_when_near=False),
 )
 GAUSSIAN_BLENDING = Recipe(
@@ -152,7 +152,7 @@ GAUSSIAN_BLENDING = Recipe(
     "scenes trained with it or with Analytic-Splatting",
     pixel=INTEGRAL,
     compositor=WINDOWED_LIGHT,
-    time=7.0,
+    time=11.0,
 )
 MATCHED_BLENDING = Recipe(
     "matched-blending",
@@ -161,5 +161,5 @@ MATCHED_BLENDING = Recipe(
     "comparison: the best with one sample per pixel, but slower than several samples",
     pixel=INTEGRAL,
     compositor=WINDOWED_LIGHT,
-    time=7.0,
+    time=10.0,
 )

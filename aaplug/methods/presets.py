@@ -73,7 +73,7 @@ SURFELS = Recipe(
     "2DGS (Huang et al. 2024): surfels intersected by rays, and a low-pass filter of √½ px",
     "scenes of 2D Gaussians at the training size; a 3D Gaussian becomes a surfel across its thinnest axis",
     pixel=SURFEL,
-    time=1.8,
+    time=2.0,
     promises=Promises(keeps_energy=False),
 )
 SURFELS_MATCHED = Recipe(
@@ -83,7 +83,7 @@ SURFELS_MATCHED = Recipe(
     "scenes of 2D Gaussians at other sizes",
     target_rate=0.5,
     pixel=SURFEL,
-    time=2.0,
+    time=2.3,
 )
 PLAYCANVAS_RECIPE = Recipe(
     "playcanvas",
