@@ -26,7 +26,7 @@ from aaplug.methods import RECIPES
 from aaplug.methods.pixel_kernels import point
 from aaplug.rasterizers import RASTERIZERS, choice
 from aaplug.rasterizers.choice import find_rasterizer
-from aaplug.rasterizers.tiled import Tiled, binning, forward, on_demand, packages
+from aaplug.rasterizers.tiled import Tiled, backward, binning, forward, on_demand, packages
 from aaplug.rasterizers.tiled import ahead_of_time as compiled
 from aaplug.rasterizers.tiled.packages import CompiledKernels, Package
 from aaplug.rendering.renderer import Renderer
@@ -154,6 +154,20 @@ def test_packages_are_compared_by_one_thread_which_is_undone_after_that(copied_c
         assert compiled._is_sound(compiled.KERNELS[0], compiled.package_path(compiled.KERNELS[0]))
         assert set(counts) == {1}
         assert torch.get_num_threads() == 2
+
+
+@linux
+@pytest.mark.parametrize("counted", [True, False])
+def test_a_compiler_counts_registers_where_there_are_few(counted, monkeypatch):
+    monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: "AVX2" if counted else "AVX512")
+    kernels = forward.pass_kernel(point.POINT), backward.step_kernel(point.POINT)
+    passes, step = (compiled._configs(kernel)["cpp.march"] for kernel in kernels)
+    assert ("-fsched-pressure" in passes) == counted
+    assert "-fsched-pressure" in step  # it keeps many sums
+    for target in compiled.TARGETS:
+        march = compiled._configs(kernels[0], target)["cpp.march"]
+        assert march.startswith(target.name)
+        assert ("-fsched-pressure" in march) == (target.capability == "AVX2")
 
 
 def test_a_library_is_unpacked_and_compared_once_until_it_changes(copied_cache, monkeypatch):
