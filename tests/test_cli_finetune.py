@@ -55,10 +55,10 @@ def test_finetune_writes_scene_report_and_pictures(whole):
 def test_a_run_stopped_by_ctrl_c_and_resumed_writes_what_an_uninterrupted_one_does(cli, monkeypatch, whole):
     real = loop.advance
 
-    def pressed(job, state, drawings):
+    def pressed(job, state):
         if state.step == 0:
             signal.raise_signal(signal.SIGINT)
-        real(job, state, drawings)
+        real(job, state)
 
     monkeypatch.setattr(loop, "advance", pressed)
     code, out, err = cli(RUN)
@@ -78,9 +78,9 @@ def test_a_run_killed_outright_resumes_from_its_checkpoint(cli, tmp_path, whole)
     program = (
         "import os, sys; from aaplug.finetuning import loop; from aaplug_cli.main import main\n"
         "real = loop.advance\n"
-        "def advance(job, state, drawings):\n"
+        "def advance(job, state):\n"
         "    if state.step == 2: os.kill(os.getpid(), 9)\n"
-        "    real(job, state, drawings)\n"
+        "    real(job, state)\n"
         "loop.advance = advance\n"
         "main(sys.argv[1:])"
     )

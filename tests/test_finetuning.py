@@ -56,8 +56,7 @@ def make_job(
 def after(job: TuningJob, steps: int | None = None) -> State:
     state = begin(job)
     for _ in range(job.settings.steps if steps is None else steps):
-        with job.method.around(job, state) as drawings:
-            advance(job, state, drawings)
+        advance(job, state)
     return state
 
 
@@ -208,8 +207,7 @@ def test_a_group_trains_alone_and_is_drawn_anew_as_the_published_code_does_in_pr
     for step in range(60):
         if step in (4, 29, 58):  # a group, and all
             before = {name: leaf.detach().clone() for name, leaf in state.leaves.items()}
-            with job.method.around(job, state):
-                advance(job, state)
+            advance(job, state)
             moved[step] = int((state.leaves["dc"] != before["dc"]).flatten(1).any(dim=1).sum())
             inside = torch.arange(60) if state.group is None else state.group
             others = torch.ones(60, dtype=torch.bool).index_fill_(0, inside, False)

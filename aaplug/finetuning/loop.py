@@ -51,8 +51,7 @@ def run(
     """
     fallback = fallback or snapshot(state)
     while state.step < job.settings.steps and not stop():
-        with job.method.around(job, state) as drawings:
-            advance(job, state, drawings)
+        advance(job, state)
         if state.bad_steps >= MAX_BAD_STEPS:  # the step count continues, so other views follow
             step, rollbacks = state.step, state.rollbacks + 1
             if rollbacks > MAX_ROLLBACKS:
@@ -70,8 +69,14 @@ def run(
     return state.step >= job.settings.steps
 
 
-def advance(job: TuningJob, state: State, drawings: list[Drawing] | None = None) -> None:
-    """Take one step and add its drawings; if a loss or gradient is not finite, only the step is counted."""
+def advance(job: TuningJob, state: State) -> None:
+    """Take one step, as the method has it; if a loss or gradient is not finite, the step is only counted."""
+    with job.method.around(job, state) as drawings:
+        _step(job, state, drawings)
+
+
+def _step(job: TuningJob, state: State, drawings: list[Drawing] | None) -> None:
+    """The step itself, which adds its drawings to the list if there is one."""
     settings = job.settings
     view, weights = _view_and_weights(settings, job.views, state.step)
     state.adam.zero_grad(set_to_none=True)

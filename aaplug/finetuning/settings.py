@@ -5,7 +5,6 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from typing import Any
 
-from aaplug.finetuning import LOSSES
 from aaplug.finetuning.parameters import RATES
 from aaplug.methods.viewers import FAST, Viewer
 from aaplug.options.verbs import ANCHOR_WEIGHT, LOSS_WEIGHTS, FinetuneOptions
@@ -83,7 +82,6 @@ def settings_of(method: Method, options: FinetuneOptions) -> Settings:
     """
     if not options.move or any(name not in RATES for name in options.move):
         raise UsageError("move", f"needs parameters out of {', '.join(RATES)}")
-    LOSSES.find(options.loss, "loss")
     settings = method.settings(options.scale, options.move, options.anchor)
     return replace(
         settings,

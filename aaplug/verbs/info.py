@@ -14,7 +14,6 @@ from aaplug.io.scenes import SceneLike, scene_of
 from aaplug.io.scenes.ply import Document
 from aaplug.io.scenes.scene import Scene
 from aaplug.methods.conversion import describe
-from aaplug.methods.pixel_kernels.point import POINT
 from aaplug.options.shared import FrameOptions, Orbit
 from aaplug.rendering.assumed import PROBE_ROWS, TRAINING_RATE, frame_around, rate_of
 from aaplug.rendering.job import CamerasLike, Job
@@ -110,11 +109,10 @@ def _sampling_facts(statistics: Survey, cameras: CameraSet, kernel: float) -> di
 def _spectrum_facts(scene: Scene, train: Sequence[Camera]) -> dict[str, Any]:
     """Share of the splats' energy above the Nyquist rate, by recipe and scale, from Gaussians of all over the file."""
     some = scene.sample(SPECTRUM_ROWS)
-    renderers = (Renderer.of(some, TrainingViews.of(some, train), name) for name in SPECTRUM_RECIPES)
-    points = [renderer for renderer in renderers if renderer.recipe.pixel is POINT]
+    renderers = {name: Renderer.of(some, TrainingViews.of(some, train), name) for name in SPECTRUM_RECIPES}
     at = {f"at {scale_name(scale)}": scale for scale in SPECTRUM_SCALES}
-    shares = {r.recipe.name: {name: above_nyquist(r, train, scale) for name, scale in at.items()} for r in points}
-    return {"energy_above_nyquist_share": shares}
+    shares = {n: {name: above_nyquist(r, train, scale) for name, scale in at.items()} for n, r in renderers.items()}
+    return {"energy_above_nyquist_share": {n: found for n, found in shares.items() if None not in found.values()}}
 
 
 def _assumed_facts(statistics: Survey, cameras: CameraSet, frame: Frame) -> dict[str, Any]:

@@ -289,9 +289,9 @@ class SceneFrames:
     def over_all(self, training: TrainingViews) -> TrainingViews:
         """The training views of the first frame, with sampling bounds over all; raises as `training_of`."""
         for frame in () if self.apart else islice(self, 1, None):
-            self.training_of(gaussians := frame.gaussians(), training)
-            bounds = training.bounds.over(sampling_bounds(gaussians.means, training.cameras))
-            training = replace(training, bounds=bounds)
+            training = self.training_of(gaussians := frame.gaussians(), training)
+            more = sampling_bounds(gaussians.means, training.cameras)
+            training = replace(training, bounds=training.bounds.over(more))
         return training
 
     def training_of(self, frame: Gaussians, training: TrainingViews) -> TrainingViews:
