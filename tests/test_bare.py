@@ -182,7 +182,7 @@ def test_how_much_a_picture_of_a_pyramid_hangs_on_the_rate():
     scene = make_scene(300)
     chunks = chunks_of(scene.means, 100)
     cameras = around(scene, Orbit(train_view="96x64"))
-    coarse, coarse_chunks = merge_in_chunks(scene, rates_of(scene, cameras.train), chunks, Goal(0.5, tolerance=1e3))
+    coarse, coarse_chunks, _ = merge_in_chunks(scene, rates_of(scene, cameras.train), chunks, Goal(0.5, tolerance=1e3))
     pyramid = Pyramid.of([scene, coarse], [chunks, coarse_chunks])
     shown = Renderer.of(pyramid, cameras, "auto", quality="fast", rasterizer="eager")
     view = replace(cameras.test[0], trained_focal=None)

@@ -145,9 +145,15 @@ def test_batches_of_chunks_may_be_merged_by_several_threads(monkeypatch):
                     scene, torch.full((700,), RATE), chunks, goal, lambda *done: told.append((done, get_ident()))
                 )
             )
-    assert len(found[0][0]) < 600
-    assert_equal(found[0][0], found[1][0])
-    assert torch.equal(found[0][1], found[1][1])
+    one, three = found
+    assert len(one.scene) < 600
+    assert_equal(one.scene, three.scene)
+    assert torch.equal(one.chunks, three.chunks)
+    assert torch.equal(one.parents, three.parents)
+    assert torch.equal(one.parents.unique(), torch.arange(len(one.scene)))
+    assert torch.equal(one.chunks[one.parents], chunks)
+    alone = one.parents.bincount()[one.parents] == 1
+    assert_equal(one.scene[one.parents[alone]], scene[alone])
     assert len({thread for _, thread in told}) > 1
     assert max(done for done, _ in told) == (700, 700)
 

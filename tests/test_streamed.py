@@ -2,14 +2,19 @@
 
 import json
 import math
+import struct
+import zlib
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 import aaplug
 from aaplug.core.sampling import median_rates
-from aaplug.io import streamed
+from aaplug.core.spherical_harmonics import SH_C0
+from aaplug.io import rad, streamed
 from aaplug.io.scenes import read_scene
 from aaplug.io.streamed import MAX_SCREEN_ERROR, TILE_SWITCH
 from aaplug.methods.viewers import VIEWERS
@@ -78,29 +83,102 @@ def test_3d_tiles_refine_where_a_level_is_no_longer_right(tmp_path, small_leaves
     assert counts == index["asset"]["extras"]["counts"]
 
 
-@pytest.mark.parametrize("to", ["sog", "3dtiles"])
+def read_rad(path):
+    """Properties by name, one row a Gaussian, read chunk by chunk as Spark does."""
+
+    def headed(at):
+        (length,) = struct.unpack_from("<I", data, at + 4)
+        return data[at : at + 4], json.loads(data[at + 8 : at + 8 + length]), at + 8 + -(-length // 8) * 8
+
+    def values(about, packed, count):
+        raw = np.frombuffer(zlib.decompress(packed, -15), np.uint8)
+        if about["encoding"] == "f32_lebytes":
+            return raw.reshape(4, 3, count).transpose(2, 1, 0).copy().view("<f4")[..., 0]
+        kind = {"f16": "<f2", "f32": "<f4", "ln_f16": "<f2", "s8": "i1", "u16": "<u2", "u32": "<u4"}[about["encoding"]]
+        return raw.view(kind).reshape(-1, count).T * (about.get("max", 127) / 127)
+
+    data = path.read_bytes()
+    magic, facts, start = headed(0)
+    assert (magic, facts["version"], facts["type"], facts["lodTree"]) == (b"RAD0", 1, "gsplat", True)
+    properties = {}
+    for place, chunk in enumerate(facts["chunks"]):
+        magic, about, at = headed(start + chunk["offset"])
+        assert (magic, about["base"], about["maxSh"]) == (b"RADC", place * facts["chunkSize"], facts["maxSh"])
+        at += 8
+        assert at + about["payloadBytes"] == start + chunk["offset"] + chunk["bytes"]
+        for entry in about["properties"]:
+            packed = data[at + entry["offset"] : at + entry["offset"] + entry["bytes"]]
+            properties.setdefault(entry["property"], []).append(values(entry, packed, about["count"]))
+    whole = {name: np.concatenate(parts) for name, parts in properties.items()}
+    assert len(whole["center"]) == facts["count"]
+    return whole
+
+
+def test_a_rad_is_a_tree_of_the_levels(tmp_path, monkeypatch):
+    """Spark draws the leaves nearby, and the coarsest level at its rate: it exchanges what is larger than a pixel."""
+    monkeypatch.setattr(rad, "CHUNK", 100)
+    monkeypatch.setattr(rad, "MAX_CHILDREN", 99)
+    seen = SCENE[median_rates(SCENE.means, CAMERAS.train) > 0]
+    small = replace(seen, log_scales=seen.log_scales - 2)
+    how = {"to": "rad", "levels": LEVELS, "refine": False, "min_seen": 0.0}
+    aaplug.lod(small, CAMERAS, tmp_path, **how)
+    levels, found = aaplug.lod(small, CAMERAS, None, **how), read_rad(tmp_path / "scene.rad")
+    assert len(levels[0].scene) > len(levels[1].scene) > len(levels[2].scene)
+    counts, starts = (found[name][:, 0].astype(int) for name in ("child_count", "child_start"))
+    children = [np.arange(start, start + count) for start, count in zip(starts, counts, strict=True)]
+    assert sorted([0, *np.concatenate(children)]) == [*range(len(counts))]
+    assert 1 < max(counts) <= 99
+    sizes = 2 * np.exp(found["scales"].astype(float)).mean(axis=1)
+    rates = median_rates(torch.from_numpy(found["center"].astype(np.float32)), CAMERAS.train).numpy()
+    span = float(np.abs(found["sh1"]).max())
+    for number, level in (0, levels[0]), (LEVELS, levels[-1]):
+        replaced = (counts > 0) & (sizes * rates * 0.5**number > (1.1 if number else 0))  # conversion widens
+        front, drawn = [0], []
+        while front:
+            place = front.pop()
+            if replaced[place] or found["alpha"][place] == 0:
+                front.extend(children[place])
+            else:
+                drawn.append(place)
+        assert len(drawn) == len(level.scene)
+        order, expected = (np.lexsort(means.T) for means in (found["center"][drawn], level.scene.means.numpy()))
+        rows, scene = np.array(drawn)[order], level.scene[torch.from_numpy(expected)]
+        for name, values, error in (
+            ("center", scene.means, 0.0),
+            ("alpha", scene.opacities[:, None], 1e-3),
+            ("rgb", 0.5 + SH_C0 * scene.sh[:, 0], 2e-3),
+            ("scales", scene.log_scales, 5e-3),
+            ("orientation", scene.unit_quats[:, 1:] * scene.quats[:, :1].sign(), 1e-6),
+            ("sh1", scene.sh[:, 1:4].flatten(1).clamp(-span, span), span / 253),
+        ):
+            torch.testing.assert_close(torch.from_numpy(found[name][rows]).float(), values, atol=error, rtol=0.0)
+
+
+@pytest.mark.parametrize("to", streamed.STREAMS)
 def test_a_run_that_was_cut_short_is_resumed(tmp_path, small_leaves, monkeypatch, to):
     def contents(folder):
         return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
     tuned = {"refine": True, "steps": 2}
     made(tmp_path / "whole", to, **tuned)
-    written, resumed = streamed.write_level, []
+    writer, number_at = ("write_front", 1) if to == "rad" else ("write_level", 2)
+    written, resumed = getattr(streamed, writer), []
 
-    def cut(folder, name, number, parts):
-        written(folder, name, number, list(parts)[:1] if number == LEVELS else parts)
-        if number == LEVELS:
+    def cut(*args):
+        last = args[number_at] == LEVELS
+        written(*args[:3], list(args[3])[:1]) if last and to != "rad" else written(*args)
+        if last:
             raise KeyboardInterrupt
 
-    def recorded(folder, name, number, parts):
-        resumed.append(number)
-        written(folder, name, number, parts)
+    def recorded(*args):
+        resumed.append(args[number_at])
+        written(*args)
 
-    monkeypatch.setattr("aaplug.verbs.lod.write_level", cut)
+    monkeypatch.setattr(f"aaplug.verbs.lod.{writer}", cut)
     with pytest.raises(KeyboardInterrupt):
         made(tmp_path / "out", to, **tuned)
     assert not (tmp_path / "out" / streamed.STREAMS[to].index).exists()
-    monkeypatch.setattr("aaplug.verbs.lod.write_level", recorded)
+    monkeypatch.setattr(f"aaplug.verbs.lod.{writer}", recorded)
     made(tmp_path / "out", to, resume=True, **tuned)
     assert resumed == [LEVELS]
     assert contents(tmp_path / "out") == contents(tmp_path / "whole")
@@ -126,13 +204,25 @@ def test_damaged_facts_of_parts_are_refused(tmp_path, text, said):
         streamed.write_index(tmp_path, "sog", 1, 1.0)
 
 
+def test_a_damaged_tree_is_refused(tmp_path):
+    front = streamed.Front.of(SCENE)
+    streamed.write_front(tmp_path, 0, front, 0)
+    assert torch.equal(streamed.read_front(tmp_path, 0).parents, front.parents)
+    streamed.write_front(tmp_path, 0, front._replace(parents=torch.arange(len(SCENE)) - 1), 0)
+    with pytest.raises(FormatError, match=r"tree\.npz.*does not belong to the 400 Gaussians"):
+        streamed.read_front(tmp_path, 0)
+    (tmp_path / "0_0" / streamed.TREE).write_bytes(b"PK")
+    with pytest.raises(FormatError, match=r"tree\.npz.*is damaged"):
+        streamed.write_index(tmp_path, "rad", 1, 1.0)
+
+
 def test_levels_that_are_there_are_not_replaced(tmp_path):
     made(tmp_path / "out", "sog")
     with pytest.raises(OutputError, match="already holds lod-meta"):
         made(tmp_path / "out", "sog", resume=True)
 
 
-@pytest.mark.parametrize("to", streamed.STREAMS)
+@pytest.mark.parametrize("to", ["sog", "3dtiles"])
 def test_parts_of_an_earlier_run_are_removed_and_nothing_else(tmp_path, small_leaves, monkeypatch, to):
     made(tmp_path / "out", to)
     many = streamed.part_folders(tmp_path / "out", to)

@@ -92,6 +92,9 @@ def _step(job: TuningJob, state: State, drawings: list[Drawing] | None) -> None:
     if not all(map(math.isfinite, losses.values())) or not all(bool(g.sum().isfinite()) for g in gradients):
         state.bad_steps += 1
         return
+    if job.moving is not None:
+        for gradient in gradients:
+            gradient[job.moving :] = 0
     state.bad_steps = 0
     state.curve.append({"step": state.step, "view": view.name, "loss": losses})
     decay = settings.decay ** (state.step / settings.steps) * BACK_OFF**state.rollbacks

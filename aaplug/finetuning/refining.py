@@ -14,7 +14,7 @@ import torch
 
 from aaplug.core.camera_paths import free_views
 from aaplug.core.cameras import Camera, spread
-from aaplug.core.gaussians import Fusion, Gaussians
+from aaplug.core.gaussians import Fusion, Gaussians, joined
 from aaplug.evaluation.truth import Truth
 from aaplug.finetuning.loop import run
 from aaplug.finetuning.parameters import RATES
@@ -57,6 +57,7 @@ def refine(
     viewer: Viewer | None = None,
     monitor: Monitor = SILENT,
     smaller: Sequence[float] = (),
+    beside: Gaussians | None = None,
 ) -> Gaussians:
     """The level after tuning, or as it is where that does not help.
 
@@ -66,6 +67,7 @@ def refine(
     poses: views to tune on, at the training size.
     viewer: what will draw the result; None for aaplug.
     smaller: sizes of images, against those at `rate`, that should be right too; steps take all sizes equally often.
+    beside: Gaussians that are drawn with the level and stay as they are.
 
     Raises:
         UsageError: no step has a finite gradient.
@@ -77,7 +79,7 @@ def refine(
     if viewer is not None:
         level = replace(viewer.shown(level), convention=viewer.convention_of(level))
         look = replace(look, recipe=recipe_of(viewer))
-    start = look.showing(level)
+    start = look.showing(level if beside is None else joined([level, beside]))
     before = _error(start, truth, probes, rate)
     if before < CLOSE_ENOUGH:
         return level
@@ -89,7 +91,8 @@ def refine(
     factor = ALL_RATES_FACTOR * before**0.5 / USUAL_ERROR
     rates = {name: factor * RATE_FACTORS[name] * (1 / rate if name == "means" else 1) * r for name, r in RATES.items()}
     weights = {rate: 1.0} | dict.fromkeys(scales[1:], SMALLER_WEIGHT)
-    job = TuningJob(start, views, truth, Settings("levels", steps, weights, rates, decay=DECAY))
+    settings = Settings("levels", steps, weights, rates, decay=DECAY)
+    job = TuningJob(start, views, truth, settings, moving=len(level))
     state = begin(job)
     with monitor.progress("refining", "steps") as tell:
 
@@ -102,7 +105,7 @@ def refine(
     if _error(replace(state.renderer(job), scene=scene), truth, probes, rate) >= before:
         return level
     record = Fusion(TUNED, {"steps": str(steps), "for": viewer.name if viewer else "levels"})
-    return replace(scene, fused=(*level.fused, record))
+    return replace(scene[: len(level)], fused=(*level.fused, record))
 
 
 def _views(poses: Sequence[Camera], scales: Sequence[float], steps: int) -> tuple[list[Camera], list[Camera]]:

@@ -8,4 +8,4 @@ from typing import Literal
 
 MOST_FPS = 1000  # frames per second of a video
 
-StreamName = Literal["sog", "3dtiles"]  # of `lod --to`
+StreamName = Literal["sog", "3dtiles", "rad"]  # of `lod --to`

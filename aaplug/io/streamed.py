@@ -4,31 +4,37 @@ Two indexes: PlayCanvas's lod-meta.json, version 1, of SOG folders, and a tilese
 with KHR_gaussian_splatting_compression_spz_2, as CesiumJS takes them.  Level k is right from 2^-k of the training rate;
 a viewer should change to it where its pixels lie at `SWITCH` times that rate.  Both viewers choose by the distance of a
 part's nearest point: at a distance d, an image h px high samples a world unit with h / (2 tan(fov / 2) d) px.
+
+Spark's .rad is one file of all levels, in which each Gaussian is exchanged for its children alone: see `Front`.
 """
 
 import json
 import math
 import re
 import shutil
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from aaplug.core.gaussians import Gaussians
+from aaplug.core.gaussians import Gaussians, joined
 from aaplug.core.placing import box_of
 from aaplug.io import StreamName, stream_pages
 from aaplug.io.atomic import make_folder, replacing
-from aaplug.io.scenes import gltf, write_scene
+from aaplug.io.rad import tree_of, write_rad
+from aaplug.io.scenes import gltf, read_scene, write_scene
 from aaplug.io.scenes.pyramid_folder import Level
+from aaplug.io.scenes.rows import library_errors
 from aaplug.io.values import Place, numbers, read_json
-from aaplug.system.errors import OutputError, UsageError, reason
+from aaplug.system.errors import FormatError, OutputError, UsageError, reason
 from aaplug.system.executors import Threads
 
 LEAF_GAUSSIANS = 1 << 16  # of the finest level in a part of space
@@ -39,6 +45,13 @@ UPDATE_SHARE = 1 / 16  # of the first distance: PlayCanvas chooses levels again 
 MAX_SCREEN_ERROR = 16.0  # px, `maximumScreenSpaceError` of CesiumJS by default
 ALWAYS = 1e6  # error of the root over that of the coarsest level, so that something is drawn at any distance
 SPLATS = [gltf.SPLATS, gltf.SPZ]
+SPARK = "@sparkjsdev/spark/dist/spark.module.min.js"
+THREE = (
+    "three/build/three.module.min.js",
+    "three/build/three.core.min.js",
+    "three/examples/jsm/postprocessing/Pass.js",
+)
+TREE = "tree.npz"  # beside a front's Gaussians, until the index is written
 SETTINGS, PAGE = "settings.json", "index.html"
 Box = Float[Tensor, "2 3"]  # smallest and largest coordinates
 FACTS = 7  # numbers that tell of a part: its size and its box
@@ -51,14 +64,14 @@ class Stream:
     viewer: for whose rule levels are tuned.
     index: name of the index.
     content: name of a part's file.
-    program: the viewer's program, as a file or folder of node_modules.
+    programs: what the page needs, as files or folders of node_modules.
     extent: standard deviations to which a part's box holds its Gaussians.
     """
 
     viewer: str
     index: str
     content: str
-    program: str
+    programs: tuple[str, ...]
     extent: float = 0.0
 
     def part(self, level: int, leaf: int) -> str:
@@ -67,9 +80,28 @@ class Stream:
 
 
 STREAMS = {
-    "sog": Stream("playcanvas", "lod-meta.json", "meta.json", "playcanvas/build/playcanvas.min.mjs"),
-    "3dtiles": Stream("cesium", "tileset.json", "splats.spz.glb", "cesium/Build/Cesium", 3.0),
+    "sog": Stream("playcanvas", "lod-meta.json", "meta.json", ("playcanvas/build/playcanvas.min.mjs",)),
+    "3dtiles": Stream("cesium", "tileset.json", "splats.spz.glb", ("cesium/Build/Cesium",), 3.0),
+    "rad": Stream("spark", "scene.rad", "front.ply", (SPARK, *THREE)),
 }
+
+
+class Front(NamedTuple):
+    """A tree so far: the Gaussians of the finest level, then those above them.
+
+    parents: place of each one's parent; -1 for one without, which is on the front: Spark draws it at the coarsest rate.
+    owners: of each on the front, the place of the coarsest level's Gaussian that stands for it.
+    """
+
+    scene: Gaussians
+    parents: Int[Tensor, " n"]
+    owners: Int[Tensor, " f"]
+
+    @classmethod
+    def of(cls, finest: Gaussians) -> "Front":
+        """The front of the finest level alone."""
+        bare = replace(finest, origin=None, extras={}, filter_3d=None)
+        return cls(bare, torch.full((len(finest),), -1), torch.arange(len(finest)))
 
 
 def leaves_of(finest: Level) -> Int[Tensor, " chunks"]:
@@ -104,25 +136,55 @@ def write_level(folder: Path, name: StreamName, number: int, parts: Iterable[Gau
         file.write(json.dumps(facts).encode())
 
 
+def write_front(folder: Path, number: int, front: Front, start: int) -> None:
+    """Write the Gaussians that a level adds to the front, from `start` on, and what their tree is with them."""
+    path = folder / STREAMS["rad"].part(number, 0)
+    make_folder(path.parent)
+    if start < len(front.scene):
+        write_scene(path, front.scene[start:], overwrite=True)
+    with replacing(path.with_name(TREE), overwrite=True) as stream:
+        np.savez(stream, parents=front.parents.numpy(), owners=front.owners.numpy())
+
+
+def read_front(folder: Path, number: int) -> Front:
+    """The front after a level; raises FormatError if a file is damaged or missing."""
+    paths = [folder / STREAMS["rad"].part(level, 0) for level in range(number + 1)]
+    tree = paths[-1].with_name(TREE)
+    with library_errors(tree), np.load(tree, allow_pickle=False) as arrays:
+        parents, owners = (torch.from_numpy(arrays[name]) for name in Front._fields[1:])
+    parts = [read_scene(path).gaussians() for path in paths if path.is_file()]
+    count, tops = sum(map(len, parts)), int((parents < 0).sum())
+    above = (parents < 0) | ((parents > torch.arange(len(parents))) & (parents < count))
+    if len(parents) != count or len(owners) != tops or not count or not bool(above.all()):
+        raise FormatError(tree, f"does not belong to the {count:,} Gaussians beside it")
+    return Front(joined([replace(part, origin=None) for part in parts]), parents, owners)
+
+
 def facts_file(folder: Path, number: int) -> Path:
     """What an index tells of a level's parts, kept until the index is written."""
     return folder / f"parts_{number}.json"
 
 
 def part_folders(folder: Path, name: StreamName) -> set[Path]:
-    """The folders of the parts that the index in a folder lists; none without an index."""
+    """The folders of the parts that the index in a folder lists, none without one; for a .rad those that are there."""
     stream = STREAMS[name]
+    if name == "rad":
+        return {path.parent for path in folder.glob(f"*_0/{TREE}")}
     text = (folder / stream.index).read_text("utf-8", "replace") if (folder / stream.index).is_file() else ""
     return {folder / part for part in re.findall(rf'"(\d+_\d+)/{re.escape(stream.content)}"', text)}
 
 
-def remove_parts(folders: Iterable[Path], name: StreamName) -> None:
-    """Remove what `write_level` wrote into these folders, and those that are empty then."""
-    for folder in folders:
-        for file in [folder / STREAMS[name].content, *folder.glob("*.webp")]:
+def remove_parts(folder: Path, name: StreamName, earlier: Set[Path]) -> None:
+    """Remove parts of an earlier run that the index does not list, or those that are in a .rad by now.
+
+    Of their folders, those that are empty then.
+    """
+    parts = part_folders(folder, name)
+    for part in parts if name == "rad" else earlier - parts:
+        for file in [part / STREAMS[name].content, part / TREE, *part.glob("*.webp")]:
             file.unlink(missing_ok=True)
         with suppress(OSError):
-            folder.rmdir()
+            part.rmdir()
 
 
 def write_index(folder: Path, name: StreamName, levels: int, rate: float) -> Mapping[str, Any]:
@@ -131,12 +193,22 @@ def write_index(folder: Path, name: StreamName, levels: int, rate: float) -> Map
     rate: of training, in px per world unit.
     """
     stream = STREAMS[name]
-    parts = [_read_parts(facts_file(folder, number)) for number in range(levels)]
-    index, settings = {"sog": _lod_meta, "3dtiles": _tileset}[name](stream, [*zip(*parts, strict=True)], rate)
-    for file, content in {SETTINGS: settings, stream.index: index}.items():  # the index last: it is the mark
-        with replacing(folder / file, overwrite=True) as target:
-            target.write(json.dumps(content, indent=1).encode())
+    if name == "rad":
+        front = read_front(folder, levels - 1)
+        write, settings = partial(write_rad, tree=tree_of(front.scene, front.parents)), _spark_settings(front)
+    else:
+        parts = [_read_parts(facts_file(folder, number)) for number in range(levels)]
+        index, settings = {"sog": _lod_meta, "3dtiles": _tileset}[name](stream, [*zip(*parts, strict=True)], rate)
+        write = partial(_write_json, value=index)
+    with replacing(folder / SETTINGS, overwrite=True) as target:
+        _write_json(target, settings)
+    with replacing(folder / stream.index, overwrite=True) as target:  # last: it is the mark
+        write(target)
     return settings
+
+
+def _write_json(stream: BinaryIO, value: Mapping[str, Any]) -> None:
+    stream.write(json.dumps(value, indent=1).encode())
 
 
 def _read_parts(path: Path) -> list["_Part"]:
@@ -148,13 +220,14 @@ def _read_parts(path: Path) -> list["_Part"]:
     return [_Part(int(fact[0]), box) if fact else NOTHING for fact, box in zip(facts, boxes, strict=True)]
 
 
-def program_of(name: StreamName, modules: Path) -> Path:
-    """The viewer's program in a folder node_modules; raises UsageError if it is not there."""
-    program = modules / STREAMS[name].program
-    if not program.exists():
-        package = STREAMS[name].program.partition("/")[0]
-        raise UsageError("page", f"{modules} does not hold {STREAMS[name].program}: `npm install {package}` makes it")
-    return program
+def programs_of(name: StreamName, modules: Path) -> list[Path]:
+    """What the page needs from a folder node_modules; raises UsageError if it is not there."""
+    programs = STREAMS[name].programs
+    for program in programs:
+        if not (modules / program).exists():
+            packages = " ".join(dict.fromkeys(re.findall(r"^(?:@[^/]+/)?[^/]+", "\n".join(programs), re.MULTILINE)))
+            raise UsageError("page", f"{modules} does not hold {program}: `npm install {packages}` makes it")
+    return [modules / program for program in programs]
 
 
 def write_page(folder: Path, name: StreamName, modules: Path) -> None:
@@ -162,12 +235,13 @@ def write_page(folder: Path, name: StreamName, modules: Path) -> None:
 
     A browser reads them from a server, such as `python -m http.server`; nothing is fetched from elsewhere.
     """
-    program, viewer = program_of(name, modules), make_folder(folder / "viewer")
+    viewer = make_folder(folder / "viewer")
     try:
-        if program.is_dir():
-            shutil.copytree(program, viewer, dirs_exist_ok=True)
-        else:
-            shutil.copy(program, viewer)
+        for program in programs_of(name, modules):
+            if program.is_dir():
+                shutil.copytree(program, viewer, dirs_exist_ok=True)
+            else:
+                shutil.copy(program, viewer)
     except OSError as error:
         raise OutputError(viewer, f"cannot be written: {reason(error)}") from error
     with replacing(folder / PAGE, overwrite=True) as stream:
@@ -237,6 +311,15 @@ def _tileset(stream: Stream, parts: Sequence[Sequence[_Part]], rate: float) -> I
         "root": root,
     }
     return index, {"Cesium3DTileset": {"maximumScreenSpaceError": MAX_SCREEN_ERROR, "dynamicScreenSpaceError": False}}
+
+
+def _spark_settings(front: Front) -> dict[str, Any]:
+    """What Spark must be set to, so that its budget does not lower the detail, and where the scene is."""
+    leaves = len(front.scene) - len(front.parents[front.parents >= 0].unique())
+    return {
+        "SparkRenderer": {"lodSplatCount": leaves, "lodRenderScale": 1.0},
+        "bound": _bound(box_of(front.scene, 0.0)),
+    }
 
 
 def _box(parts: Sequence[_Part]) -> Box:

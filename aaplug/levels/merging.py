@@ -7,7 +7,8 @@ the scene's order nor on the number of threads.
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import accumulate, pairwise
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -69,6 +70,19 @@ class Goal:
         return cls(0.5**level, tolerance=TOLERANCE, smallest=smallest)
 
 
+class Lighter(NamedTuple):
+    """A lighter scene.
+
+    chunks: of each of its Gaussians, ascending.
+    parents: of each Gaussian of the heavier scene, the place of the one that stands for it; where none does, that of a
+        neighbour's.
+    """
+
+    scene: Gaussians
+    chunks: Int[Tensor, " m"]
+    parents: Int[Tensor, " n"]
+
+
 def merge(
     scene: Gaussians,
     rates: Float[Tensor, " n"],
@@ -83,7 +97,7 @@ def merge(
     """
     if len(scene) <= (goal.count or 1):
         return scene
-    return merge_in_chunks(scene, rates, torch.zeros(len(scene), dtype=torch.int64), goal, tell, visible)[0]
+    return merge_in_chunks(scene, rates, torch.zeros(len(scene), dtype=torch.int64), goal, tell, visible).scene
 
 
 def merge_in_chunks(
@@ -93,8 +107,8 @@ def merge_in_chunks(
     goal: Goal,
     tell: Tell = lambda done, total: None,
     visible: Float[Tensor, " n"] | None = None,
-) -> tuple[Gaussians, Int[Tensor, " m"]]:
-    """A lighter scene and the chunk of each of its Gaussians, ascending; see `merge`.
+) -> Lighter:
+    """A lighter scene; see `merge`.
 
     No Gaussian of it stands for those of different chunks.  2D Gaussians stay flat: discs across the thinnest axes of
     the covariances that they are merged to.
@@ -110,7 +124,7 @@ def merge_in_chunks(
         stops.append(int(torch.searchsorted(along, last, right=True)))
     gone = dict.fromkeys(stops, 0)  # Gaussians that a batch is rid of, by its start
 
-    def merge_batch(ends: tuple[int, int]) -> tuple[Gaussians, Int[Tensor, " b"]]:
+    def merge_batch(ends: tuple[int, int]) -> Lighter:
         def tell_batch(done: int) -> None:
             gone[ends[0]] = done
             tell(min(sum(gone.values()), total), total)
@@ -121,9 +135,13 @@ def merge_in_chunks(
 
     workers = min(torch.get_num_threads(), len(stops) - 1)
     parts = [*(Threads(workers).map if workers > 1 else map)(merge_batch, pairwise(stops))]
-    lighter = replace(joined([part for part, _ in parts]), origin=None)
+    lighter = replace(joined([part.scene for part in parts]), origin=None)
     record = Fusion(MERGED, {"rate": f"{goal.rate:.4g}", "from": str(len(scene))})
-    return replace(lighter, fused=(*scene.fused, record)), torch.cat([part for _, part in parts])
+    starts = accumulate((len(part.scene) for part in parts), initial=0)
+    parents = torch.empty_like(order)
+    parents[order] = torch.cat([part.parents + start for part, start in zip(parts, starts, strict=False)])
+    chunks = torch.cat([part.chunks for part in parts])
+    return Lighter(replace(lighter, fused=(*scene.fused, record)), chunks, parents.clamp(0))
 
 
 def rounds(clusters: Clusters, goal: Goal, tell: Callable[[int], None]) -> Clusters:
@@ -153,17 +171,16 @@ def rounds(clusters: Clusters, goal: Goal, tell: Callable[[int], None]) -> Clust
     return clusters
 
 
-def _merge_batch(
-    clusters: Clusters, scene: Gaussians, goal: Goal, tell: Callable[[int], None]
-) -> tuple[Gaussians, Int[Tensor, " m"]]:
-    """The lighter scene of one batch and its chunks, without hidden Gaussians unless their count is the goal."""
+def _merge_batch(clusters: Clusters, scene: Gaussians, goal: Goal, tell: Callable[[int], None]) -> Lighter:
+    """The lighter scene of one batch, without hidden Gaussians unless their count is the goal."""
     result = rounds(clusters, goal, tell)
-    lighter, chunks = gaussians_of(result, scene, clusters.weights), result.chunks
+    lighter, chunks, parents = gaussians_of(result, scene, clusters.weights), result.chunks, result.labels
     if goal.count is None:
-        visible = (~_hidden(lighter, result, goal.rate)).nonzero()[:, 0]
-        lighter, chunks = lighter[visible], chunks[visible]
+        stays = ~_hidden(lighter, result, goal.rate)
+        visible = stays.nonzero()[:, 0]
+        lighter, chunks, parents = lighter[visible], chunks[visible], (stays.cumsum(0) - 1)[parents]
     tell(len(scene))
-    return lighter, chunks
+    return Lighter(lighter, chunks, parents)
 
 
 def _order(scene: Gaussians, chunks: Int[Tensor, " n"]) -> Int[Tensor, " n"]:

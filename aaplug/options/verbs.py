@@ -208,8 +208,8 @@ class LodOptions(WritingOptions, ViewOptions):
     """With --simplify or --budget: size of the images that the scene is meant for (default: root of the share)."""
     viewer: OneViewer = None
     """Tune each file for spark, playcanvas or another of `aaplug guide viewers`, instead of for aaplug."""
-    to: Annotated[StreamName | None, names("sog", "3dtiles")] = None
-    """With levels: write them as a viewer streams them, sog (PlayCanvas) or 3dtiles (CesiumJS), tuned for its rule."""
+    to: Annotated[StreamName | None, names("sog", "3dtiles", "rad")] = None
+    """With levels: stream them by sog (PlayCanvas), 3dtiles (CesiumJS) or rad (Spark), tuned for that viewer's rule."""
     page: Annotated[AnyPath | None, flag("NODE_MODULES", read=Path)] = None
     """With --to: add a page that opens the result, and the viewer's program from this folder of npm packages."""
     refine: bool = True

@@ -14,12 +14,13 @@ from torch import Tensor
 
 from aaplug.core.cameras import Camera, digest_of_cameras
 from aaplug.core.chunks import MAX_CHUNK_GAUSSIANS, chunks_of
-from aaplug.core.gaussians import Gaussians, digest_of_scene
+from aaplug.core.gaussians import Gaussians, digest_of_scene, joined
 from aaplug.core.sampling import check_frame, median_rates
 from aaplug.core.training import TrainingViews
 from aaplug.finetuning.fitting import fit, steps_for
 from aaplug.finetuning.refining import refine
 from aaplug.io.atomic import AnyPath, refuse_existing, refuse_inputs
+from aaplug.io.rad import NODE_SIZE
 from aaplug.io.scenes import SceneLike, check_scene_output, write_scene, written_format
 from aaplug.io.scenes.columns import matrix_of
 from aaplug.io.scenes.pyramid_folder import (
@@ -37,12 +38,15 @@ from aaplug.io.scenes.scene import FLOAT, Scene
 from aaplug.io.streamed import (
     SETTINGS,
     STREAMS,
+    Front,
     facts_file,
     leaves_of,
     part_folders,
     parts_of,
-    program_of,
+    programs_of,
+    read_front,
     remove_parts,
+    write_front,
     write_index,
     write_level,
     write_page,
@@ -60,6 +64,7 @@ from aaplug.system.digests import digest_of_values
 from aaplug.system.errors import FormatError, FrameError, OutputError, UsageError
 from aaplug.verbs.verb import writes
 
+MAX_NODE_SIZE = 1.0  # px: Spark replaces what is larger by its children
 DEFAULT_LEVELS = 4  # down to 1/16 of the training size
 MEGABYTE = 1e6
 SMALLER_IMAGES = (0.5,)  # of one lighter scene, which has no coarser level; a viewer's rule would bloat it there
@@ -115,7 +120,7 @@ def lod(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, options:
                 if options.page is not None:
                     write_page(path, options.to, Path(options.page))
                 job.monitor.say(f"set the viewer by {path / SETTINGS}: {json.dumps(settings)}")
-                remove_parts(earlier - part_folders(path, options.to), options.to)
+                remove_parts(path, options.to, earlier)
                 facts = [facts_file(path, number) for number in range(len(levels))]
                 stale += [*files, path / MANIFEST, *facts]  # what a run that is cut short resumes from
             for file in stale:
@@ -160,7 +165,8 @@ class _Maker:
 
     def __call__(self, before: Level, goal: Goal) -> Level:
         """The level for a goal."""
-        scene, unchanged, monitor = before.scene, before._replace(rate=goal.rate), self.job.monitor
+        scene, monitor = before.scene, self.job.monitor
+        unchanged = before._replace(rate=goal.rate, parents=torch.arange(len(scene)))
         if not len(scene):
             return unchanged
         try:
@@ -172,23 +178,48 @@ class _Maker:
         visible = self._visible(before, goal)
         with monitor.progress("merging", "Gaussians") as tell:
             if before.chunks is None:
-                lighter, chunks = merge(scene, rates, goal, tell, visible), None
+                level = Level(merge(scene, rates, goal, tell, visible), goal.rate)
             else:
-                lighter, chunks = merge_in_chunks(scene, rates, before.chunks, goal, tell, visible)
-        monitor.say(f"{len(lighter):,} Gaussians for {goal.rate:.3g} × the training rate")
-        level = Level(lighter, goal.rate, chunks)
+                lighter = merge_in_chunks(scene, rates, before.chunks, goal, tell, visible)
+                level = Level(lighter.scene, goal.rate, lighter.chunks, lighter.parents)
+        monitor.say(f"{len(level.scene):,} Gaussians for {goal.rate:.3g} × the training rate")
         return self._tuned(level) if self.viewer is None else level
 
-    def finished(self, level: Level) -> Level:
-        """The level as its file holds it: tuned or, without tuning, converted for the viewer, if there is one."""
+    def finished(self, level: Level, beside: Gaussians | None = None) -> Level:
+        """The level as its file holds it: tuned or, without tuning, converted for the viewer, if there is one.
+
+        beside: Gaussians that are drawn with the level, as they are.
+        """
         if self.viewer is None or not len(level.scene):
             return level
         if self.job.options.tuning:
-            return self._tuned(level)
+            return self._tuned(level, beside)
         training = TrainingViews.of(level.scene, self.job.cameras, min_seen=0.0)
         return level._replace(scene=fuse_for(level.scene, training, self.viewer))
 
-    def _tuned(self, level: Level) -> Level:
+    def above(self, front: Front | None, level: Level) -> Front:
+        """The front with a level above it: of its Gaussians, those that Spark draws at the level's rate.
+
+        A larger one would be replaced by its children, so they stay on the front.
+        """
+        if front is None or level.parents is None:
+            return Front.of(self.finished(level).scene)
+        owners, places = level.parents[front.owners], (front.parents < 0).nonzero()[:, 0]
+        try:
+            px = level.rate * rates_of(level.scene, self.job.cameras.train)
+        except FrameError:  # no camera sees any of what is left
+            return front._replace(owners=owners)
+        small = NODE_SIZE * level.scene.scales.mean(dim=1) * px <= MAX_NODE_SIZE
+        taken, goes = small.nonzero()[:, 0], small[owners]
+        new = self.finished(level._replace(scene=level.scene[taken]), front.scene[places[~goes]]).scene
+        parents = len(front.scene) + (small.cumsum(0) - 1)[owners[goes]]
+        return Front(
+            joined([front.scene, new]),
+            torch.cat([front.parents.index_copy(0, places[goes], parents), torch.full((len(new),), -1)]),
+            torch.cat([owners[~goes], taken]),
+        )
+
+    def _tuned(self, level: Level, beside: Gaussians | None = None, least: Float[Tensor, " n"] | None = None) -> Level:
         options, look = self.job.options, self.look
         if not options.tuning or look is None or self.scene.flat:
             return level
@@ -198,9 +229,8 @@ class _Maker:
             fitted = fit(self.scene, self.viewer, look, self.views, steps, self.job.monitor)
             return level._replace(scene=fitted.scene)
         smaller = SMALLER_IMAGES if options.single and self.viewer is None else ()
-        scene = refine(
-            level.scene, level.rate, look, self.views, options.tuning, self.viewer, self.job.monitor, smaller
-        )
+        how = (self.views, options.tuning, self.viewer, self.job.monitor, smaller, beside)
+        scene = refine(level.scene, level.rate, look, *how)
         return level._replace(scene=scene)
 
     def _visible(self, before: Level, goal: Goal) -> Float[Tensor, " n"] | None:
@@ -252,21 +282,28 @@ def _levels(maker: _Maker, folder: Path | None, files: Sequence[Path]) -> Iterat
         manifest = replace(manifest, count=max(len(goals) + 1, len(earlier.levels)), levels=earlier.levels)
         maker.job.monitor.say(f"resumed: {len(earlier.levels) - 1} levels are there")
     made = next(there, None) or Level(maker.scene, 1.0, chunks_of(maker.scene.means, MAX_CHUNK_GAUSSIANS))
-    leaves = leaves_of(made)
+    leaves, front = leaves_of(made), None
     for place in range(len(goals) + 1):
         if place:
             made = next(there, None) or maker(made, goals[place - 1])
-        resumed = place < len(manifest.levels)
-        level = made if resumed and options.to is not None else maker.finished(made)
-        if folder is not None and not resumed:
-            kept = level
-            if options.to is not None:
+        resumed, level, kept = place < len(manifest.levels), made, made
+        if options.to == "rad" and not resumed:
+            before = read_front(folder, place - 1) if folder and place and front is None else front
+            front = maker.above(before, made)
+            level = made._replace(scene=front.scene[front.parents < 0])
+            if folder is not None:
+                write_front(folder, place, front, len(before.scene) if before else 0)
+        elif options.to is None or not resumed:
+            level = maker.finished(made)
+            if options.to is None:
+                kept = level
+            elif folder is not None:
                 write_level(folder, options.to, place, parts_of(level, leaves))
-                kept = made
+        if folder is not None and not resumed:
             write_scene(files[place], kept.scene, overwrite=options.overwrite or options.resume)
             if pyramid:
-                assert level.chunks is not None
-                counts = torch.bincount(level.chunks, minlength=len(leaves)).tolist()
+                assert made.chunks is not None
+                counts = torch.bincount(made.chunks, minlength=len(leaves)).tolist()
                 entry = LevelFile(files[place].name, level.rate, hash_of(files[place]), tuple(counts))
                 manifest = replace(manifest, levels=(*manifest.levels, entry))
                 write_manifest(pyramid, manifest)
@@ -297,7 +334,7 @@ def _outputs(output: Path | None, scene: Scene, options: LodOptions) -> tuple[li
     if options.to is not None:
         refuse_existing([output / STREAMS[options.to].index], options.overwrite)
         if options.page is not None:
-            program_of(options.to, Path(options.page))
+            programs_of(options.to, Path(options.page))
     refuse_existing([*files, *others], options.overwrite or options.resume)
     if not options.overwrite:
         return files, []

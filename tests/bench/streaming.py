@@ -1,7 +1,8 @@
-"""Streamed levels in their viewers: dB against the scene's own look from 1 to 1/16, ours and splat-transform's.
+"""Streamed levels in their viewers: dB against the scene's own look from 1 to 1/16, ours and others'.
 
 It needs Node.js 22, npm and Chromium.  `aaplug lod --to` makes our levels; splat-transform (`-g cpu --decimate`) makes
-scenes of as many Gaussians, which are cut and indexed in the same way, so that both show equally many.  A cell has PSNR
+scenes of as many Gaussians, which are cut and indexed in the same way, so that both show equally many.  Beside a .rad
+is the tree that Spark itself makes of the scene; its page says how many splats each picture shows.  A cell has PSNR
 in dB between the viewer's picture and the scene's own training-size render, averaged over boxes.  The last column has
 the largest change between two of the frames while the camera moves out, as a root mean square in steps of 8 bits.
 """
@@ -27,6 +28,7 @@ from aaplug.core.gaussians import Gaussians
 from aaplug.core.imaging import quantised, resampled
 from aaplug.core.sampling import median_rates
 from aaplug.io import StreamName
+from aaplug.io.scenes import write_scene
 from aaplug.io.scenes.pyramid_folder import Level
 from aaplug.io.streamed import SETTINGS, STREAMS, write_index, write_level
 from tests.bench import heading, row
@@ -34,7 +36,7 @@ from tests.bench.scenes import decibels
 from tests.bench.viewers import shoot
 
 SCALES = (1.0, 0.5, 0.25, 0.125, 0.0625)
-PAGES = {"sog": "playcanvas", "3dtiles": "cesium"}
+PAGES = {"sog": "playcanvas", "3dtiles": "cesium", "rad": "spark"}
 FURTHEST = 16.0  # times the training distance, at the last frame
 MOVING_SIZE = 0.5  # of the training size, of the frames
 SPLAT_TRANSFORM = "node_modules/@playcanvas/splat-transform/bin/cli.mjs"
@@ -43,7 +45,7 @@ SPLAT_TRANSFORM = "node_modules/@playcanvas/splat-transform/bin/cli.mjs"
 def main(
     scene: Path,
     cameras: Path,
-    to: Sequence[StreamName] = ("sog", "3dtiles"),
+    to: Sequence[StreamName] = ("sog", "3dtiles", "rad"),
     work: Path = Path("out/streaming"),
     modules: Path = Path("tests/bench/viewer_pages"),
     node: str = "node",
@@ -78,21 +80,27 @@ def main(
         index, ours, theirs = STREAMS[name].index, work / f"{name}-ours", work / f"{name}-theirs"
         if not (ours / index).exists():
             aaplug.lod(whole, data, ours, to=name, levels=levels, steps=steps, resume=(ours / "lod.json").exists())
-        facts = json.loads((ours / index).read_text())
-        if not (theirs / index).exists():
+        options = _options(name, json.loads((ours / SETTINGS).read_text()))
+        shown = {"ours": (ours, index, options)}
+        if name == "rad":
+            theirs.mkdir(exist_ok=True)
+            write_scene(theirs / "scene.ply", whole, overwrite=True)
+            shown["Spark's own tree"] = theirs, "scene.ply", options | {"mesh": {"lod": "quality"}}
+        elif not (theirs / index).exists():
+            facts = json.loads((ours / index).read_text())
             command = [node, str((modules / SPLAT_TRANSFORM).resolve()), "-g", "cpu", str(scene)]
             counts = facts.get("counts") or facts["asset"]["extras"]["counts"]
             lighter = list(_decimated(whole, counts, work, command))
             for number, level in enumerate(lighter):
                 write_level(theirs, name, number, [level.scene])
             write_index(theirs, name, len(lighter), float(rates[rates > 0].median()))
-        options = _options(name, json.loads((ours / SETTINGS).read_text()))
-        shown = {"ours": (ours, options), "splat-transform": (theirs, options)}
+        if name != "rad":
+            shown["splat-transform"] = theirs, index, options
         if name == "sog":
-            shown["splat-transform, anti-aliasing off"] = theirs, options | {"antiAlias": False}
-        for label, (folder, how) in shown.items():
+            shown["splat-transform, anti-aliasing off"] = theirs, index, options | {"antiAlias": False}
+        for label, (folder, file, how) in shown.items():
             pictures = work / f"{name}-{len(label)}"
-            drawn = shoot(PAGES[name], folder, index, how, sized | dict(enumerate(out)), pictures)
+            drawn = shoot(PAGES[name], folder, file, how, sized | dict(enumerate(out)), pictures)
             cells = [_mean([(drawn[v.name, s], _boxed(truths[v.name], s)) for v in seen]) for s in SCALES]
             moving = [drawn[t] for t in range(frames)]
             changes = [float((b - a).square().mean().sqrt()) * 255 for a, b in pairwise(moving)]
@@ -113,6 +121,8 @@ def _options(name: StreamName, settings: Mapping[str, Any]) -> dict[str, Any]:
     """settings.json as the page takes it."""
     if name == "3dtiles":
         return settings["Cesium3DTileset"]
+    if name == "rad":
+        return settings["SparkRenderer"]
     engine, component, distance, _ = settings.values()
     return {**engine, "component": component, "distancePerPixel": distance}
 

@@ -65,11 +65,13 @@ class Level(NamedTuple):
 
     rate: the lowest sampling rate relative to training's that it is meant for.
     chunks: of each Gaussian; None if it belongs to no pyramid.
+    parents: of each Gaussian of the level before, the place of the one that stands for it; None if that is not known.
     """
 
     scene: Gaussians
     rate: float
     chunks: Int[Tensor, " n"] | None = None
+    parents: Int[Tensor, " m"] | None = None
 
 
 def pyramid_of(levels: Sequence[Level]) -> Pyramid:

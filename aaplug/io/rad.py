@@ -1,0 +1,155 @@
+"""RAD, version 1: one file with a tree of Gaussians, as Spark 2.1 and later streams it.
+
+No text specifies the format; this is what Spark's encoder and decoder (rad.rs) agree on.  "RAD0", the length of a JSON
+header and the header, then chunks of 65,536 Gaussians: "RADC", a header likewise, the payload's length, and property
+after property.  All parts are padded to 8 bytes; a property is deflated and holds one component after another.
+
+Gaussian 0 is the root.  The children of each lie side by side, so their count and the place of the first tell which
+they are.  Spark starts at the root and replaces the Gaussian that looks largest by its children, until none is larger
+than a pixel: see `NODE_SIZE`.
+"""
+
+import json
+import struct
+import zlib
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import Any, BinaryIO, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from aaplug.core.gaussians import Gaussians, joined
+from aaplug.core.placing import box_of
+from aaplug.core.spherical_harmonics import COLOUR_OFFSET, SH_C0
+
+VERSION = 1
+CHUNK = 1 << 16  # Gaussians
+NODE_SIZE = 2.0  # of a Gaussian for Spark, times the mean of its three standard deviations
+MAX_CHILDREN = CHUNK - 1  # a count has two bytes
+ALIGNMENT = 8  # bytes
+RAW_DEFLATE = -15  # zlib's window bits for data without a header
+DEFLATE_LEVEL = 6  # of 9
+INVISIBLE = -100.0  # logit of an opacity that is 0 in half precision
+SPANNED = 0.999  # share of colours, scales and harmonics that Spark's 8 bits reach
+MIN_SPAN = 1e-3  # of harmonics
+MAX_S8 = 127
+BANDS = (slice(1, 4), slice(4, 9), slice(9, 16))  # coefficients of degrees 1 to 3
+
+
+class Tree(NamedTuple):
+    """Gaussians from the root down, the children of each side by side.
+
+    counts: of each one's children; 0 at a leaf.
+    starts: place of the first child.
+    """
+
+    scene: Gaussians
+    counts: Int[Tensor, " n"]
+    starts: Int[Tensor, " n"]
+
+
+def tree_of(scene: Gaussians, parents: Int[Tensor, " n"]) -> Tree:
+    """The tree of Gaussians.
+
+    parents: place of each one's parent; -1 for none.  Above those are invisible Gaussians as large as the scene, which
+        Spark replaces at any distance.
+    """
+    low, high = box_of(scene, 0.0)
+    extent = (high - low).max().clamp(min=torch.finfo(torch.float32).tiny).log()
+    while len(tops := (parents < 0).nonzero()[:, 0]) > 1:
+        owners = torch.arange(len(tops)) // MAX_CHILDREN
+        above = scene[tops[::MAX_CHILDREN]]
+        shape = {"log_scales": extent.to(above.means).expand(len(above), 3), "sh": torch.zeros_like(above.sh)}
+        shape |= {"logit_opacities": torch.full_like(above.logit_opacities, INVISIBLE)}
+        middles = torch.stack([scene.means[tops[owners == owner]].mean(dim=0) for owner in range(len(above))])
+        parents = torch.cat([parents.index_copy(0, tops, len(scene) + owners), torch.full((len(above),), -1)])
+        scene = joined([scene, replace(above, means=middles, **shape)])
+    counts = torch.bincount(parents[parents >= 0], minlength=len(scene))
+    siblings = torch.argsort(parents, stable=True)  # first the root, then its children, and so on
+    firsts = 1 + counts.cumsum(0) - counts  # among the siblings
+    order, starts, below = [tops], list[Tensor](), 1
+    while len(order[-1]):  # the root, its children, theirs
+        count = counts[order[-1]]
+        ends = count.cumsum(0)
+        starts.append(below + ends - count)
+        below += int(ends[-1])
+        order.append(
+            siblings[(firsts[order[-1]] - ends + count).repeat_interleave(count) + torch.arange(int(ends[-1]))]
+        )
+    along = torch.cat(order)
+    return Tree(scene[along], counts[along], torch.cat(starts) * counts[along].sign())
+
+
+def write_rad(stream: BinaryIO, tree: Tree) -> None:
+    """Write a tree, its harmonics up to degree 3."""
+    degree = min(len(BANDS), tree.scene.sh_degree)
+    facts = {"version": VERSION, "maxSh": degree, "lodTree": True, "splatEncoding": _spans(tree.scene, degree)}
+    chunks = [_chunk(tree, facts, base) for base in range(0, len(tree.scene), CHUNK)]
+    sizes = np.array([len(chunk) for chunk in chunks])
+    ends = sizes.cumsum()
+    places = [{"offset": int(end - size), "bytes": int(size)} for size, end in zip(sizes, ends, strict=True)]
+    whole = {"type": "gsplat", "count": len(tree.scene), "chunkSize": CHUNK, "comment": "aaplug"}
+    stream.write(_headed(b"RAD0", facts | whole | {"allChunkBytes": int(ends[-1]), "chunks": places}))
+    stream.writelines(chunks)
+
+
+def _spans(scene: Gaussians, degree: int) -> dict[str, Any]:
+    """What Spark's 8 bits reach: of colours all of 0 to 1, of scales the largest, which the tree rests on."""
+    colours = _colours(scene)
+    spans = {"rgbMin": min(0.0, _quantile(colours, 1 - SPANNED)), "rgbMax": max(1.0, _quantile(colours, SPANNED))}
+    spans |= {"lnScaleMin": _quantile(scene.log_scales, 1 - SPANNED), "lnScaleMax": float(scene.log_scales.max())}
+    for band, coefficients in enumerate(BANDS[:degree], 1):
+        spans[f"sh{band}Max"] = max(MIN_SPAN, _quantile(scene.sh[:, coefficients].abs(), SPANNED))
+    return spans | {"lodOpacity": True}
+
+
+def _chunk(tree: Tree, facts: Mapping[str, Any], base: int) -> bytes:
+    """The chunk of the Gaussians from `base` on."""
+    payload, entries = bytearray(), []
+    rows = slice(base, base + CHUNK)
+    part = Tree(tree.scene[rows], tree.counts[rows], tree.starts[rows])
+    for about, values in _properties(part, facts["splatEncoding"]):
+        data = zlib.compress(values.tobytes(), DEFLATE_LEVEL, RAW_DEFLATE)
+        entries.append({"offset": len(payload), "bytes": len(data), "compression": "gz", **about})
+        payload += data + bytes(-len(data) % ALIGNMENT)
+    about = {"base": base, "count": len(part.scene), "payloadBytes": len(payload), "properties": entries}
+    return _headed(b"RADC", dict(facts) | about) + struct.pack("<Q", len(payload)) + payload
+
+
+def _properties(tree: Tree, spans: Mapping[str, float]) -> Iterator[tuple[dict[str, Any], "np.ndarray[Any, Any]"]]:
+    """Name and encoding of each property, and its values, one row a component."""
+
+    def floats(name: str, encoding: str, values: Tensor) -> tuple[dict[str, Any], "np.ndarray[Any, Any]"]:
+        return {"property": name, "encoding": encoding}, values.t().contiguous().numpy()
+
+    scene, half, quats = tree.scene, torch.float16, tree.scene.unit_quats
+    bytes_apart = scene.means.float().t().contiguous().view(torch.uint8).view(-1, 4)  # of each float the lowest first
+    yield floats("center", "f32_lebytes", bytes_apart)
+    yield floats("alpha", "f16", scene.opacities.to(half))
+    yield floats("rgb", "f16", _colours(scene).to(half))
+    yield floats("scales", "ln_f16", scene.log_scales.to(half))
+    yield floats("orientation", "f32", (quats[:, 1:] * torch.where(quats[:, :1] < 0, -1, 1)).float())  # w is the rest
+    for band, coefficients in enumerate(BANDS, 1):
+        if (span := spans.get(f"sh{band}Max")) is not None:
+            values = (scene.sh[:, coefficients].flatten(1) * (MAX_S8 / span)).round().clamp(-MAX_S8, MAX_S8)
+            about, array = floats(f"sh{band}", "s8", values.to(torch.int8))
+            yield about | {"min": -span, "max": span}, array
+    yield {"property": "child_count", "encoding": "u16"}, tree.counts.numpy().astype("<u2")
+    yield {"property": "child_start", "encoding": "u32"}, tree.starts.numpy().astype("<u4")
+
+
+def _colours(scene: Gaussians) -> Float[Tensor, "n 3"]:
+    return COLOUR_OFFSET + SH_C0 * scene.sh[:, 0]
+
+
+def _quantile(values: Tensor, share: float) -> float:
+    """The value that so large a share of the values lies below."""
+    return float(values.flatten().kthvalue(max(1, round(share * values.numel()))).values)
+
+
+def _headed(magic: bytes, header: Mapping[str, Any]) -> bytes:
+    text = json.dumps(header).encode()
+    return magic + struct.pack("<I", len(text)) + text + bytes(-len(text) % ALIGNMENT)
