@@ -126,7 +126,7 @@ REFUSED = {
     f"{VIDEO} --seconds 0": ["--seconds"],
     f"{VIDEO} --path scene.ply": ["scene.ply"],
     f"{EVALUATE} --recipe multi-scale": ["base_mask"],
-    f"{EVALUATE} --metric psnrr": ["--metric", "psnrr", "flip"],
+    f"{EVALUATE} --metric psnrr": ["--metric", "psnrr", "did you mean psnr?"],
     f"{EVALUATE} --metric ssim:alex": ["--metric", "ssim:3dgs"],
     "evaluate scene.ply --cameras . --report": ["--report", "--output"],
     f"{EVALUATE} --resume --overwrite": ["contradict"],

@@ -101,7 +101,7 @@ class Names(Argument):
         for each in value if isinstance(value, (list, tuple)) else [value]:
             name = str(each)[:MAX_VALUE_CHARACTERS]
             if each is not None and name not in names and (self.kind is None or isinstance(each, str)):
-                raise UsageError(option, not_one_of(name, names) + did_you_mean(name, names))
+                raise UsageError(option, not_one_of(name, names))
 
 
 def flag(metavar: str, *flags: str, read: Callable[[str], Any] = str, **how: Any) -> Argument:
