@@ -104,6 +104,19 @@ class Names(Argument):
                 raise UsageError(option, not_one_of(name, names))
 
 
+@dataclass(frozen=True, kw_only=True)
+class Text(Argument):
+    """Takes text that `parsed`, which is given it and the option, does not refuse."""
+
+    parsed: Callable[[str, str], object]
+
+    def check(self, option: str, value: Any) -> None:
+        """Refuse other text."""
+        for each in value if isinstance(value, (list, tuple)) else [value]:
+            if isinstance(each, str):
+                self.parsed(each, option)
+
+
 def flag(metavar: str, *flags: str, read: Callable[[str], Any] = str, **how: Any) -> Argument:
     """An option that takes any word."""
     return Argument(metavar=metavar, flags=flags, read=read, **how)

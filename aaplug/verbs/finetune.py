@@ -24,7 +24,7 @@ from aaplug.evaluation.upsamplers import find_upsampler
 from aaplug.finetuning import METHODS
 from aaplug.finetuning.parameters import LEARNED_COLUMNS
 from aaplug.finetuning.session import tune, tuned_scene
-from aaplug.finetuning.settings import CONSISTENCY_SETTINGS, Settings, settings_of
+from aaplug.finetuning.settings import Settings, settings_of
 from aaplug.finetuning.state import TuningJob
 from aaplug.io.atomic import AnyPath, check_output, replacing
 from aaplug.io.images import write_png
@@ -79,8 +79,6 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
         AaplugError: as `render`; also, the checkpoint is of another run, or no gradient is finite.
         KeyboardInterrupt: Ctrl-C stopped the run; its checkpoint is written.
     """
-    if options.learn_filters and options.method != CONSISTENCY_SETTINGS.name:
-        raise UsageError("learn_filters", f"is a method of its own, beside {options.method}")
     method = METHODS.find("learned-filters" if options.learn_filters else options.method, "method")
     path = None if output is None else Path(output)
     settings, viewer = settings_of(method, options), options.viewer or method.viewer
@@ -93,8 +91,6 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
     check()
     truth_source = source_of(job.cameras.train, options.truth)
     enlarge = back_projected if options.upsampler is None else upsampled(find_upsampler(options.upsampler))
-    if options.upsampler is not None and max(settings.weights) <= 1:
-        raise UsageError("upsampler", "makes what scales above 1 should show, and there is none: give such a `scale`")
     upsampler = str(options.upsampler)
     upsampler = digest_of_files([upsampler]) if Path(upsampler).is_file() else upsampler
     with running(options, path, check, job.inputs):
