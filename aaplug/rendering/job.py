@@ -145,21 +145,29 @@ class Job(Generic[O_co]):
         training = TrainingViews.of(gaussians, self.cameras, options.cull_margin, options.min_seen)
         return training if scene.frames is None else scene.frames.over_all(training)
 
-    def recipe(self: "Job[RecipeOptions]", recipe: str | Recipe) -> Recipe:
-        """A recipe as it is, or by name as the options say; the rate reference goes to those that compare rates."""
-        if isinstance(recipe, Recipe):
-            return recipe
-        options = self.options
-        matches = isinstance(RECIPES.find(recipe, "recipe").screen, MatchesRates)
-        reference = options.rate_reference if matches else None
-        return find_recipe(recipe, quality=options.quality, rate_reference=reference, order=options.order)
+    def named(self: "Job[RecipeOptions]", *recipes: str | Recipe) -> list[Recipe]:
+        """Recipes as they are, or by name as the options say; says which of these options none of them takes."""
+        options, found = self.options, list[Recipe]()
+        for recipe in recipes:
+            if isinstance(recipe, str):
+                matches = isinstance(RECIPES.find(recipe, "recipe").screen, MatchesRates)
+                reference = options.rate_reference if matches else None
+                recipe = find_recipe(recipe, quality=options.quality, rate_reference=reference, order=options.order)
+            found.append(recipe)
+        quality = any(recipe.takes_quality for recipe in found)
+        rates = any(isinstance(recipe.screen, MatchesRates) for recipe in found)
+        for name, taken in (("quality", quality), ("rate_reference", rates)):
+            if not taken and (value := getattr(options, name)) != getattr(RecipeOptions, name):
+                names = listing([recipe.name for recipe in found])
+                self.monitor.say(f"{name.replace('_', ' ')} {value} is not for recipe {names}")
+        return found
 
     def recipes(self: "Job[RecipeOptions]", names: str | Recipe | Sequence[str | Recipe]) -> list[Recipe]:
-        """Recipes as `recipe`, fitted to the scene; of "all", those that it has everything for."""
+        """Recipes as `named`, fitted to the scene; of "all", those that it has everything for."""
         gaussians, names = self.scene.gaussians(), [names] if isinstance(names, str | Recipe) else names
         if ALL not in names:
-            return [suited(self.recipe(name), gaussians) for name in names]
-        recipes = [self.recipe(name) for name in RECIPES]
+            return [suited(recipe, gaussians) for recipe in self.named(*names)]
+        recipes = self.named(*RECIPES)
         lacks = {recipe.name: recipe.lacks(gaussians) for recipe in recipes}
         for name, lack in lacks.items():
             if lack is not None:

@@ -57,7 +57,7 @@ def render(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, optio
     check = partial(image_paths, target, views, options.overwrite, storage.format.suffixes[0])
     paths = check()
     with running(options, target, check, job.inputs, folder=not names_image(target)) as workers:
-        renderer = job.look(len(views)).by(job.recipe(options.recipe))
+        renderer = job.look(len(views)).by(*job.named(options.recipe))
         job.monitor.say(description(renderer, views))
         job.announce([renderer], views, processes=workers.threads)
         job.say_assumed(renderer, views[0])

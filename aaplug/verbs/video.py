@@ -76,7 +76,7 @@ def video(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, option
         check()
     job = Job.of(scene, cameras, options)
     beside = "none" if alone or options.beside is None else options.beside
-    recipes = [job.recipe(name) for name in (beside, options.recipe) if name != "none"]
+    recipes = job.named(*(name for name in (beside, options.recipe) if name != "none"))
     path = file.cameras if file else _built_in_path(job, fps)
     views = seen(job, path, file.unsized if file else job.cameras.assumed)
     if len({view.hw for view in views}) > 1:
