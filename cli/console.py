@@ -15,6 +15,7 @@ from aaplug.system.errors import printable
 from aaplug.system.monitor import Monitor, Tell
 
 LINE_SECONDS = 10.0  # between progress lines where there is no terminal
+GAP = 2  # characters between the columns of a table
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -37,15 +38,26 @@ def show(things: Iterable[Any]) -> None:
 
 
 def table(rows: Iterable[Sequence[str]], headings: Sequence[str] = ()) -> Any:
-    """Texts in columns."""
+    """Texts in columns; no word is broken where the longest words of the columns fit side by side.
+
+    Widths are those of CSS's automatic table layout.
+    """
+    from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
 
     grid = Table(*headings, show_header=bool(headings), box=None, pad_edge=False)
+    rows = list(rows)
     for row in rows:
         grid.add_row(*map(escape, row))
-    for column in grid.columns:
+    columns = [[*cells] for cells in zip(*([headings] if headings else []), *rows, strict=True)]
+    least = [max(len(word) for cell in cells for word in [*cell.split(), ""]) for cells in columns]
+    most = [max(map(len, "\n".join(cells).split("\n"))) for cells in columns]
+    spare = Console().width - GAP * (len(columns) - 1) - sum(least)
+    for column, low, high in zip(grid.columns, least, most, strict=True):
         column.overflow = "fold"  # a long name keeps its end
+        if 0 <= spare < sum(most) - sum(least):
+            column.width = low + (high - low) * spare // (sum(most) - sum(least))
     return grid
 
 

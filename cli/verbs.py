@@ -501,8 +501,10 @@ def viewers(words: Words) -> Answer:
     """
     from aaplug.methods.viewers import VIEWERS
 
-    headings = ("--for", "adds", "a splat ends at", "program, what to choose there, and how the rule is known")
-    rows = [(v.name, v.rule, v.end, f"{v.program} ({v.evidence}): {v.row()['settings']}") for v in VIEWERS.values()]
+    headings = ("--for", "adds; where a splat ends", "program, what to choose there, and how the rule is known")
+    rows = [
+        (v.name, f"{v.rule}; {v.end}", f"{v.program} ({v.evidence}): {v.row()['settings']}") for v in VIEWERS.values()
+    ]
     return Answer([asdict(viewer) for viewer in VIEWERS.values()], [table(rows, headings)])
 
 

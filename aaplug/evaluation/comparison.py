@@ -261,9 +261,10 @@ class Comparison:
         facts = []
         for title, headings, rows in self.facts():
             table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
-            for place, heading in enumerate(headings):
-                table.add_column(heading, justify="right" if place else "left", overflow="fold")
-            for row in rows:
+            names, *lines = zip(headings, *rows, strict=True)  # scenes across, as there are more facts than scenes
+            for place, name in enumerate(names):
+                table.add_column(escape(printable(name)), justify="right" if place else "left", overflow="fold")
+            for row in lines:
                 table.add_row(*(escape(printable(cell)) for cell in row))
             facts.append(table)
         return [*facts, *tables(self.report)]
