@@ -256,7 +256,7 @@ class Comparison:
         protocol = {**report.protocol, "notes": report.notes}
         return {"reference": self.reference.name, "guard": guard, "scenes": scenes, "protocol": protocol}
 
-    def tables(self) -> list[Table]:
+    def tables(self) -> list[Table | str]:
         """The scenes, how their Gaussians differ, and every metric over scales."""
         facts = []
         for title, headings, rows in self.facts():
