@@ -11,7 +11,7 @@ from functools import cache
 from io import TextIOWrapper
 from typing import TYPE_CHECKING, Any
 
-from aaplug.system.errors import printable
+from aaplug.system.errors import counted, printable
 from aaplug.system.monitor import Monitor, Tell
 
 LINE_SECONDS = 10.0  # between progress lines where there is no terminal
@@ -105,7 +105,7 @@ class Terminal(Monitor):
 
     def working(self, workers: int) -> None:
         """Tell it with the progress."""
-        self._workers = f", {workers} worker{'s' * (workers != 1)}"
+        self._workers = f", {counted(workers, 'worker')}"
 
     def say(self, text: str) -> None:
         """One line of log."""
@@ -137,7 +137,7 @@ class Terminal(Monitor):
             now, pace = time.monotonic(), rate(done)
             if done == total or now - told >= LINE_SECONDS:
                 eta = f", about {(total - done) / rate.value:.0f} s left" if rate.value and done < total else ""
-                say(f"{what}: {done} of {total} {unit}{pace}{self._workers}{eta}")
+                say(f"{what}: {done:,} of {counted(total, unit.removesuffix('s'))}{pace}{self._workers}{eta}")
                 told = now
 
         return tell

@@ -269,6 +269,7 @@ def test_a_new_metric_that_is_undefined_is_reported_with_its_own_words(look, vie
     assert (found.values["odd"], found.values["nan"]) == (None, None)
     assert found.note == "too odd; not finite"
     assert results(report)["_aaplug"]["notes"] == ["too odd; not finite"]
+    assert str(tables(report)[0].title).endswith(", photographs, 1 view")
     lines = ["no odd at 1/2: too odd", "no nan at 1/2: not finite"]
     assert (len(tables(report)), tables(report)[1:3]) == (5, lines)
 

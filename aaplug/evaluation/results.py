@@ -16,6 +16,7 @@ from rich.table import Table
 from aaplug.evaluation import METRICS
 from aaplug.evaluation.metric import Metric, number
 from aaplug.evaluation.metrics import EQUAL, PSNR, SSIM
+from aaplug.system.errors import counted
 from aaplug.system.registry import named
 
 CEILING = "training size, resampled"  # a row of every table: the own training-size look
@@ -169,7 +170,7 @@ def method(recipe: str, scale: float) -> str:
 
 def tables(report: Report) -> list[Table | str]:
     """A table per metric, then seconds and evaluations per view; recipes down, scales across, the best value bold."""
-    subject, grids = f"{report.protocol['truth']}, {report.protocol['views']} views", list[Table | str]()
+    subject, grids = f"{report.protocol['truth']}, {counted(report.protocol['views'], 'view')}", list[Table | str]()
     for metric in report.metrics:
         variant, colon, _ = report.protocol.get("metrics", {}).get(metric.name, "").partition(":")
         flavour = f" {variant}" if colon and " " not in variant else ""

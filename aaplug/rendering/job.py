@@ -37,7 +37,7 @@ from aaplug.rendering.agreement import agreement, settled
 from aaplug.rendering.assumed import cameras_around, say_assumed
 from aaplug.rendering.cost import Cost, cost_of
 from aaplug.rendering.renderer import Renderer, background_colour, own_look
-from aaplug.system.errors import FrameError, UsageError, listing, within_memory
+from aaplug.system.errors import FrameError, UsageError, counted, listing, within_memory
 from aaplug.system.executors import PAYS_AFTER_SECONDS, Executor, torch_threads
 from aaplug.system.extras import install_command
 from aaplug.system.monitor import Monitor
@@ -199,12 +199,12 @@ class Job(Generic[O_co]):
         cost = cost or cost_of(renderers, views)
         needed = cost.scene + cost.image * (processes if cost.seconds > PAYS_AFTER_SECONDS else 1)
         sizes = listing(sorted({f"{view.width}x{view.height}" for view in views}), most=3)
-        images = len(views) * len(renderers)
-        what = f"{work or f'{images} image' + 's' * (images != 1)} at {sizes}"
+        what = f"{work or counted(len(views) * len(renderers), 'image')} at {sizes}"
         if lacking := lack_of_memory(needed):
             raise UsageError(what, f"would take {lacking}; a smaller `scale` or fewer `threads` need less")
         if cost.seconds >= LONG_JOB or needed >= LARGE_JOB:
-            minutes = f"about {cost.seconds / 60:.0f} minutes" if cost.seconds >= LONG_JOB else "under a minute"
+            minutes = counted(round(cost.seconds / 60), "minute")
+            minutes = f"about {minutes}" if cost.seconds >= LONG_JOB else "under a minute"
             memory = f", {needed / 1e9:.1f} GB" if needed >= LARGE_JOB else ""
             self.monitor.say(f"{what}: {minutes}{memory}; fewer {fewer} take less")
 

@@ -53,6 +53,11 @@ def listing(names: Sequence[str], most: int = 6) -> str:
     return first if len(names) <= most else f"{first} and {len(names) - most} more"
 
 
+def counted(number: int, noun: str) -> str:
+    """A number of things in words: 1 view, 30,500 Gaussians."""
+    return f"{number:,} {noun}{'s' * (number != 1)}"
+
+
 def not_one_of(name: object, names: Iterable[str], otherwise: str = "") -> str:
     """Message for a name that is none of these: ends with the one that is like it, or `otherwise`."""
     known = list(names)

@@ -18,7 +18,7 @@ from aaplug.evaluation.report.files import as_json, write_texts
 from aaplug.evaluation.results import Report, as_csv, method, metric_grid, results
 from aaplug.io.atomic import AnyPath, refuse_existing, writing
 from aaplug.system.contracts import contract
-from aaplug.system.errors import AaplugError, ClusterError, printable, within_memory
+from aaplug.system.errors import AaplugError, ClusterError, counted, printable, within_memory
 from aaplug.system.monitor import SILENT, Monitor
 from aaplug.verbs.evaluate import check_results
 from aaplug.verbs.verb import check_name
@@ -82,7 +82,7 @@ class Batch:
         if self.protocol is not None:
             return [*map(paper_table, self.papers()), scenes]
         first, means, grids = next(iter(self.reports.values())), self._means(), list[Table | str]()
-        over = f"mean of {len(self.reports)} scene{'s' * (len(self.reports) != 1)}"
+        over = f"mean of {counted(len(self.reports), 'scene')}"
         for metric in first.metrics:
             values = [[means.get(method(r, s), {}).get(metric.name) for s in first.scales] for r in first.recipes]
             lines = [[metric.text(value) for value in line] for line in values]

@@ -37,7 +37,7 @@ from aaplug.rendering.cost import GRADIENTS, Cost, cost_of
 from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.digests import digest_of_files
-from aaplug.system.errors import UsageError
+from aaplug.system.errors import UsageError, counted
 from aaplug.verbs.refine_poses import refined
 from aaplug.verbs.verb import writes
 
@@ -107,10 +107,10 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
         start = replace(before, scene=fused)
         truth = Truth(look, truth_source, enlarge=enlarge, memory=MEMORY)
         tuning = TuningJob(start, train, truth, settings, upsampler, method)
-        steps = f"{settings.name}, {settings.steps} steps, truth: {truth_source}"
+        steps = f"{settings.name}, {counted(settings.steps, 'step')}, truth: {truth_source}"
         job.monitor.say(f"tuning for {start.recipe.name} ({start.recipe.source}): {steps}")
         cost = _cost(start, train, settings)
-        job.announce([start], train, cost=cost, work=f"{settings.steps} steps", fewer="steps")
+        job.announce([start], train, cost=cost, work=counted(settings.steps, "step"), fewer="steps")
         job.say_assumed(look)
         checkpoint = path and _beside(path, "pt")
         state = tune(tuning, checkpoint, options.checkpoint_every, options.resume, job.monitor)

@@ -57,7 +57,7 @@ from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.rendering.renderer import Renderer, own_look
 from aaplug.rendering.visibility import MAX_VIEWS, visibility
 from aaplug.system.digests import digest_of_values
-from aaplug.system.errors import FormatError, FrameError, OutputError, UsageError
+from aaplug.system.errors import FormatError, FrameError, OutputError, UsageError, counted
 from aaplug.verbs.verb import writes
 
 DEFAULT_LEVELS = 4  # down to 1/16 of the training size
@@ -175,7 +175,7 @@ class _Maker:
                 lighter, chunks = merge(scene, rates, goal, tell, visible), None
             else:
                 lighter, chunks = merge_in_chunks(scene, rates, before.chunks, goal, tell, visible)
-        monitor.say(f"{len(lighter):,} Gaussians for {goal.rate:.3g} × the training rate")
+        monitor.say(f"{counted(len(lighter), 'Gaussian')} for {goal.rate:.3g} × the training rate")
         level = Level(lighter, goal.rate, chunks)
         return self._tuned(level) if self.viewer is None else level
 
@@ -229,7 +229,7 @@ def goals_of(options: LodOptions, scene: Gaussians) -> list[Goal]:
         assert options.simplify is not None
         count = round(options.simplify * (len(scene) if options.simplify <= 1 else 1))
     if count > len(scene):
-        raise UsageError("simplify", f"asks for {count:,} Gaussians, and the scene has {len(scene):,}")
+        raise UsageError("simplify", f"asks for {counted(count, 'Gaussian')}, and the scene has {len(scene):,}")
     goal = Goal.of_count(max(1, count), scene)
     return [goal if options.scale is None else replace(goal, rate=options.scale)]
 
@@ -250,7 +250,7 @@ def _levels(maker: _Maker, folder: Path | None, files: Sequence[Path]) -> Iterat
             raise UsageError("resume", f"{folder} holds levels of another scene, other cameras or other options")
         there = levels_in(pyramid, earlier)
         manifest = replace(manifest, count=max(len(goals) + 1, len(earlier.levels)), levels=earlier.levels)
-        maker.job.monitor.say(f"resumed: {len(earlier.levels) - 1} levels are there")
+        maker.job.monitor.say(f"resumed with {counted(len(earlier.levels) - 1, 'level')}")
     made = next(there, None) or Level(maker.scene, 1.0, chunks_of(maker.scene.means, MAX_CHUNK_GAUSSIANS))
     leaves = leaves_of(made)
     for place in range(len(goals) + 1):

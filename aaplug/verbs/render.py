@@ -14,7 +14,7 @@ from aaplug.rendering.film import filmed
 from aaplug.rendering.frames import write_frames
 from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.rendering.renderer import Renderer
-from aaplug.system.errors import listing
+from aaplug.system.errors import counted, listing
 from aaplug.system.executors import ProcessesIfLong
 from aaplug.verbs.verb import writes
 from aaplug.verbs.views import eyes_of, image_paths, names_image, seen, storage_of
@@ -79,6 +79,6 @@ def description(renderer: Renderer, views: Sequence[Camera]) -> str:
     span = " to ".join(dict.fromkeys(f"{rate:.3g}" for rate in (min(rates), max(rates))))
     kind = f"{renderer.training.convention.name} scene{' of 2D Gaussians' * renderer.scene.flat}"
     return (
-        f"recipe: {renderer.recipe.name} for a {kind}, {len(views)} view{'s' * (len(views) != 1)} at {sizes}, "
+        f"recipe: {renderer.recipe.name} for a {kind}, {counted(len(views), 'view')} at {sizes}, "
         f"{span} × the training rate: {grid} sample{'s' * (samples != [1])} per pixel{mean}"
     )

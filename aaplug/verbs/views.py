@@ -16,7 +16,7 @@ from aaplug.io.image_formats import IMAGE_FORMATS, Storage
 from aaplug.options.shared import LensOptions, check_side, size_of
 from aaplug.options.verbs import RenderOptions, VideoOptions
 from aaplug.rendering.job import Job
-from aaplug.system.errors import OutputError, UsageError
+from aaplug.system.errors import OutputError, UsageError, counted
 
 SUFFIXES = [suffix for each in IMAGE_FORMATS.values() for suffix in each.suffixes]
 IMAGES = (*SUFFIXES, ".tif", ".tiff", ".bmp", ".gif")  # any other name is a folder
@@ -122,7 +122,7 @@ def image_paths(output: Path, views: Sequence[Camera], overwrite: bool, suffix: 
     if names_image(output):
         if output.suffix.lower() not in SUFFIXES or len(views) != 1:
             one = f"one {', '.join(SUFFIXES)} for one view"
-            raise OutputError(output, f"name a folder, or {one} ({len(views)} views asked for)")
+            raise OutputError(output, f"name a folder, or {one} ({counted(len(views), 'view')} asked for)")
         check_output(output, overwrite)
         return [output]
     paths = [output / f"{name}{suffix}" for name in file_names([view.name for view in views], "view", 5)]
