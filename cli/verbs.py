@@ -124,7 +124,7 @@ def lod(words: Words) -> Answer:
 
 @verb(
     *SCENE_AND_CAMERAS,
-    output("FILE.ply", "File to write the scene to."),
+    output("FILE", WRITTEN + "."),
     verbs.FinetuneOptions,
     json_of("the report as JSON instead of the table"),
 )
