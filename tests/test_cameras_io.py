@@ -478,6 +478,9 @@ def test_transforms_intrinsics_of_a_frame_come_first(tmp_path):
     assert (first.fx, first.fy, first.cx, first.cy, first.hw) == (30, 31, 19, 9, (20, 40))
     assert (second.fx, second.fy, second.hw) == (50, 31, (20, 60))
     assert read_cameras(path, test_every=2).test[0].name == "a/1"
+    photo(tmp_path / "b" / "1.png", 60, 20)
+    twice = transforms([{"file_path": "b/1.png"}, {"file_path": "./b/1"}], **shared)
+    refused(write_json(path, twice), "names should be unique, but 'b/1.png' is there twice")
 
 
 @pytest.mark.parametrize(
