@@ -11,10 +11,11 @@ from functools import cache
 from io import TextIOWrapper
 from typing import TYPE_CHECKING, Any
 
-from aaplug.system.errors import printable
+from aaplug.system.errors import counted, printable
 from aaplug.system.monitor import Monitor, Tell
 
 LINE_SECONDS = 10.0  # between progress lines where there is no terminal
+GAP = 2  # characters between the columns of a table
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -37,15 +38,26 @@ def show(things: Iterable[Any]) -> None:
 
 
 def table(rows: Iterable[Sequence[str]], headings: Sequence[str] = ()) -> Any:
-    """Texts in columns."""
+    """Texts in columns; no word is broken where the longest words of the columns fit side by side.
+
+    Widths are those of CSS's automatic table layout.
+    """
+    from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
 
     grid = Table(*headings, show_header=bool(headings), box=None, pad_edge=False)
+    rows = list(rows)
     for row in rows:
         grid.add_row(*map(escape, row))
-    for column in grid.columns:
+    columns = [[*cells] for cells in zip(*([headings] if headings else []), *rows, strict=True)]
+    least = [max(len(word) for cell in cells for word in [*cell.split(), ""]) for cells in columns]
+    most = [max(map(len, "\n".join(cells).split("\n"))) for cells in columns]
+    spare = Console().width - GAP * (len(columns) - 1) - sum(least)
+    for column, low, high in zip(grid.columns, least, most, strict=True):
         column.overflow = "fold"  # a long name keeps its end
+        if 0 <= spare < sum(most) - sum(least):
+            column.width = low + (high - low) * spare // (sum(most) - sum(least))
     return grid
 
 
@@ -93,7 +105,7 @@ class Terminal(Monitor):
 
     def working(self, workers: int) -> None:
         """Tell it with the progress."""
-        self._workers = f", {workers} worker{'s' * (workers != 1)}"
+        self._workers = f", {counted(workers, 'worker')}"
 
     def say(self, text: str) -> None:
         """One line of log."""
@@ -125,7 +137,7 @@ class Terminal(Monitor):
             now, pace = time.monotonic(), rate(done)
             if done == total or now - told >= LINE_SECONDS:
                 eta = f", about {(total - done) / rate.value:.0f} s left" if rate.value and done < total else ""
-                say(f"{what}: {done} of {total} {unit}{pace}{self._workers}{eta}")
+                say(f"{what}: {done:,} of {counted(total, unit.removesuffix('s'))}{pace}{self._workers}{eta}")
                 told = now
 
         return tell

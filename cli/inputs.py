@@ -9,7 +9,7 @@ import aaplug
 from aaplug.core.conventions import CONVENTIONS, SpzAxes
 from aaplug.options.base import CAMERAS, Group, Options, flag, names, number
 from aaplug.options.shared import SCALE, Orbit
-from aaplug.system.errors import UsageError
+from aaplug.system.errors import UsageError, counted
 
 from .console import TERMINAL, say
 from .words import Words, options_of, worded
@@ -89,8 +89,8 @@ def open_scene(words: Words, path: Path | None = None) -> "Scene":
         spz_axes=files.spz_axes,
         frames_apart=files.frames_apart,
     )
-    facts = f"{scene.count:,} Gaussians, SH degree {scene.sh_degree}, {scene.convention.name} ({scene.evidence})"
-    say(f"scene: {scene.path}: {facts}")
+    facts = f"SH degree {scene.sh_degree}, {scene.convention.name} ({scene.evidence})"
+    say(f"scene: {scene.path}: {counted(scene.count, 'Gaussian')}, {facts}")
     for note in scene.notes:
         undecided = scene.other is not None and note == scene.notes[-1]
         text = f"unless the cameras tell otherwise, {note}" if undecided else note

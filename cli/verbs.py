@@ -11,7 +11,7 @@ import aaplug
 from aaplug.options import verbs
 from aaplug.options.base import REPORT, Options, flag, names, number
 from aaplug.options.shared import MAX_SIDE, RECIPE_METAVAR, FrameOptions, Orbit
-from aaplug.system.errors import UsageError, printable
+from aaplug.system.errors import UsageError, counted, printable
 
 from .batch import SEVERAL, batch_of_evaluations, for_each_scene
 from .console import TERMINAL, say, table
@@ -68,7 +68,7 @@ def render(words: Words) -> Answer:
     """
     inputs = read_inputs(words)
     written = aaplug.render(*inputs, words.output, **told(words, verbs.RenderOptions))
-    say(f"wrote {len(written)} image{'s' * (len(written) != 1)} to {words.output}")
+    say(f"wrote {counted(len(written), 'image')} to {words.output}")
     images = [{"view": v.name, "file": str(p), "width": v.width, "height": v.height} for v, p in written]
     return Answer({"recipe": words.recipe, "images": images})
 
@@ -124,7 +124,7 @@ def lod(words: Words) -> Answer:
 
 @verb(
     *SCENE_AND_CAMERAS,
-    output("FILE.ply", "File to write the scene to."),
+    output("FILE", WRITTEN + "."),
     verbs.FinetuneOptions,
     json_of("the report as JSON instead of the table"),
 )
@@ -285,7 +285,7 @@ def merge(words: Words) -> Answer:
     scenes = [open_scene(words, path) for path in words.scenes]
     cameras = read_cameras(words, scenes[0]) if words.cameras else None
     merged = aaplug.merge(scenes, cameras, words.output, **told(words, verbs.MergeOptions))
-    say(f"wrote {words.output}: {len(merged):,} Gaussians, {merged.convention.name}")
+    say(f"wrote {words.output}: {counted(len(merged), 'Gaussian')}, {merged.convention.name}")
     return Answer({"output": str(words.output), "gaussians": len(merged), "convention": merged.convention.name})
 
 
@@ -403,7 +403,7 @@ def warmup(words: Words) -> Answer:
     The other verbs work without it, only slower.  To measure how fast it is, use bench.
     """
     kernels = aaplug.warmup(words.recipe, words.bundle, monitor=TERMINAL)
-    say(f"{len(kernels.names)} kernels in {kernels.folder}")
+    say(f"{counted(len(kernels.names), 'kernel')} in {kernels.folder}")
     return Answer({"folder": str(kernels.folder), "kernels": kernels.names})
 
 
@@ -474,9 +474,8 @@ def bench(words: Words) -> Answer:
     sizes = [(f"{run.gaussians:,}", f"{run.width}x{run.height}", run.rasterizer) for run in runs]
     figures = [(*size, *(text(run) for text in FIGURES.values())) for size, run in zip(sizes, runs, strict=True)]
     stages = [(*size, *(f"{ms:.0f}" for ms in run.stages_ms.values())) for size, run in zip(sizes, runs, strict=True)]
-    shown = [
-        f"medians in ms, {threads} threads; exp/eval: a frame's time for each evaluation, in exponentials of torch"
-    ]
+    unit = "exp/eval: a frame's time for each evaluation, in exponentials of torch"
+    shown = [f"medians in ms, {counted(threads, 'thread')}; {unit}"]
     shown += [table(figures, (*headings, *FIGURES)), "stages in ms", table(stages, (*headings, *runs[0].stages_ms))]
     shown += [f"time grows as {name}^{value:.2f}" for name, value in exponents.items()]
     several = {"runs": [run.as_json() for run in runs], "exponents": exponents}
@@ -501,8 +500,10 @@ def viewers(words: Words) -> Answer:
     """
     from aaplug.methods.viewers import VIEWERS
 
-    headings = ("--for", "adds", "a splat ends at", "program, what to choose there, and how the rule is known")
-    rows = [(v.name, v.rule, v.end, f"{v.program} ({v.evidence}): {v.row()['settings']}") for v in VIEWERS.values()]
+    headings = ("--for", "adds; where a splat ends", "program, what to choose there, and how the rule is known")
+    rows = [
+        (v.name, f"{v.rule}; {v.end}", f"{v.program} ({v.evidence}): {v.row()['settings']}") for v in VIEWERS.values()
+    ]
     return Answer([asdict(viewer) for viewer in VIEWERS.values()], [table(rows, headings)])
 
 

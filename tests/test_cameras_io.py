@@ -318,7 +318,7 @@ def test_a_colmap_lens_that_distorts_is_the_pinhole_at_its_centre(tmp_path, writ
         assert (camera.undistortion.lens, camera.undistortion.window) == (lens, (0, 0, 200, 100))
         (bent_camera,) = read_cameras(path).train
         assert (bent_camera.lens, bent_camera.undistortion, bent_camera.photo) == (lens, None, camera.photo)
-        assert f"1 cameras have a lens that distorts ({MODEL_NAMES[model]})" in cameras.notes[-1]
+        assert f"1 camera with a lens that distorts ({MODEL_NAMES[model]})" in cameras.notes[-1]
 
 
 def test_photos_through_a_lens_that_is_not_known_are_not_used(tmp_path):
@@ -344,7 +344,7 @@ def test_a_panorama_is_taken_as_it_is(tmp_path, kind):
     (camera,) = cameras.train
     assert (camera.lens, camera.photo, camera.undistortion) == (EQUIRECT, path, None)
     assert camera.hw == (width // 2, width)
-    assert "1 cameras see 360° × 180° (EQUIRECTANGULAR)" in cameras.notes[-1]
+    assert "1 camera of 360° × 180° (EQUIRECTANGULAR)" in cameras.notes[-1]
     assert not any("distorts" in note for note in cameras.notes)
     right, down = torch.eye(3, dtype=torch.float64)[:2] @ camera.cam_from_world[:3, :3]
     pixels, _ = camera.project(torch.stack([camera.centre + right, camera.centre + down]))
@@ -478,6 +478,9 @@ def test_transforms_intrinsics_of_a_frame_come_first(tmp_path):
     assert (first.fx, first.fy, first.cx, first.cy, first.hw) == (30, 31, 19, 9, (20, 40))
     assert (second.fx, second.fy, second.hw) == (50, 31, (20, 60))
     assert read_cameras(path, test_every=2).test[0].name == "a/1"
+    photo(tmp_path / "b" / "1.png", 60, 20)
+    twice = transforms([{"file_path": "b/1.png"}, {"file_path": "./b/1"}], **shared)
+    refused(write_json(path, twice), "names should be unique, but 'b/1.png' is there twice")
 
 
 @pytest.mark.parametrize(
@@ -518,7 +521,7 @@ def test_a_lens_that_distorts_is_the_pinhole_at_its_centre(tmp_path, lens, name,
     file = write_json(tmp_path / "transforms.json", document)
     cameras = read_cameras(file, undistort=True)
     first, straight = cameras.train
-    assert f"1 cameras have a lens that distorts ({name})" in cameras.notes[-1]
+    assert f"1 camera with a lens that distorts ({name})" in cameras.notes[-1]
     assert (straight.lens, straight.undistortion) == (PINHOLE, None)
     bent = read_cameras(file).train[0]
     if coefficients is None:

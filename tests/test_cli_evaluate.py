@@ -15,9 +15,9 @@ from tests.test_cli import assert_refused
 
 
 def test_it_writes_results_and_prints_a_table(cli):
-    words = "evaluate scene.ply --cameras . -o out --recipe classic auto --scale 1 0.5"
-    code, out, _ = cli(words)
-    assert code == 0
+    words = "evaluate scene.ply --cameras . -o out --recipe classic auto --scale 1 0.5 --quality best"
+    code, out, err = cli(words)
+    assert (code, "is not for recipe" in err) == (0, False)
     assert "training size, resampled" in out
     results = json.loads(Path("out/results.json").read_text())
     assert results["auto@1"]["PSNR"] is None or results["auto@1"]["PSNR"] > 45

@@ -34,6 +34,9 @@ def test_finetune_without_steps_changes_no_byte(cli):
     words = "finetune scene.ply --cameras . -o tuned.ply --scale 0.5 --method mipmap-gs --steps 0"
     assert cli(words)[0] == 0
     assert Path("tuned.ply").read_bytes() == Path("scene.ply").read_bytes()
+    for name, same in (("same.ply", True), ("less.splat", False)):  # which has no harmonics
+        found = json.loads(cli(f"{words} --json -o {name}".replace("-o tuned.ply ", ""))[1])
+        assert (found["after@0.5"] == found["before@0.5"]) == same
 
 
 def test_finetune_writes_scene_report_and_pictures(whole):
@@ -65,6 +68,7 @@ def test_a_run_stopped_by_ctrl_c_and_resumed_writes_what_an_uninterrupted_one_do
     assert (code, out) == (130, "")
     assert "stopped at step 1; the checkpoint is written" in err
     assert [path.name for path in Path().glob("tuned.*")] == ["tuned.finetune.pt"]
+    Path("tuned.ply").touch()  # as if it had been killed while it measured
     monkeypatch.setattr(loop, "advance", real)
     code, out, err = cli(f"{RUN} --resume")
     assert (code, "resumed at step 1" in err, "before" in out) == (0, True, True)
@@ -96,3 +100,5 @@ def test_a_run_killed_before_its_first_checkpoint_starts_anew(cli, whole):
     code, _, err = cli(f"{RUN} --resume")
     assert (code, "there is no checkpoint yet: starting at step 0" in err) == (0, True)
     assert Path("tuned.ply").read_bytes() == (whole / "tuned.ply").read_bytes()
+    code, _, err = cli(f"{RUN} --resume")
+    assert (code, "tuned.ply: is of a run that is complete" in err) == (2, True)

@@ -162,7 +162,7 @@ def test_items_come_in_order_until_the_first_error_and_few_are_read_ahead(local)
 def test_an_item_whose_worker_dies_is_done_again_unless_it_kills_all(local, tmp_path, monkeypatch):
     assert list(local.map(partial(deadly_once, tmp_path / "died"), range(4))) == [0, 1, 4, 9]
     [said] = local.monitor.said
-    assert re.fullmatch(r"lost 1 of 1 workers \(tcp://127.0.0.1:\d+\); others do again what was begun there", said)
+    assert re.fullmatch(r"lost 1 of 1 worker \(tcp://127.0.0.1:\d+\); others do again what was begun there", said)
     monkeypatch.setattr(local.client.cluster.scheduler, "allowed_failures", 0)
     with pytest.raises(UsageError, match=r"worker tcp://\S+: died 1 times at one item: out of memory"):
         list(local.map(os._exit, [3]))

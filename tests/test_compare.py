@@ -69,6 +69,19 @@ def test_a_scene_equals_itself_at_every_scale(cli):
     assert out.count("∞") == 6
 
 
+def test_tables_break_no_word_at_80_columns(cli, monkeypatch):
+    names = ["a_scene_whose_name_is_long.ply", "another_whose_name_is_long.ply"]
+    for name in names:
+        write_scene(name, make_scene(20))
+    out = cli(f"compare {' '.join(names)} {WORDS} --min-seen 0 --metric psnr")[1].split()
+    assert [out.count(name) for name in names] == [4, 5]  # the facts, a metric, and two of cost; differences
+    for verb in ("viewers", "recipes"):
+        narrow = cli(verb)[1]
+        with monkeypatch.context() as patch:
+            patch.setenv("COLUMNS", "1000")
+            assert set(narrow.split()) == set(cli(verb)[1].split())
+
+
 def test_what_a_change_costs_is_measured_and_guarded(cli):
     scene = read_scene("scene.ply").gaussians()
     write_scene("dim.ply", replace(scene, logit_opacities=scene.logit_opacities - 0.3))

@@ -170,7 +170,7 @@ def test_a_program_that_fails_at_times(tmp_path):
     verdict = aaplug.conform(command, output=tmp_path / "kit")
     told = {finding.test: finding.wrong for finding in verdict.findings if finding.wrong}
     assert told == {
-        "order": "no picture: the program ended with 1: no such order",
+        "order": "no picture: the program ended with code 1: no such order",
         "gamma": "no picture: there is no gamma.png",
         "degree": "no picture: expected 64x64 px, got 32x64",
     }
@@ -202,7 +202,12 @@ def test_what_contradicts_itself_is_refused(tmp_path):
     for words, problem in [
         ({}, "name a program"),
         ({"program": "x", "images": tmp_path}, "both give the pictures"),
-        ({"program": "nowhere/at-all"}, "cannot be run"),
+        ({"program": "nowhere/at-all"}, "cannot be started: nowhere/at-all: no such file"),
+        (
+            {"program": "sh -c 'echo no such scene >&2; exit 3'"},
+            "none of 10 pictures: .*ended with code 3: no such scene",
+        ),
+        ({"images": tmp_path}, "images: gave none of 10 pictures: there is no dilation.png"),
         ({"program": "'open"}, "is no command line"),
         ({"images": tmp_path, "viewer": "nope"}, "nope"),
     ]:
@@ -212,5 +217,5 @@ def test_what_contradicts_itself_is_refused(tmp_path):
 
 def test_a_stale_picture_is_not_judged(tmp_path):
     aaplug.conform(lambda scene, camera, image: write_png(image, torch.zeros(64, 64, 3)), output=tmp_path / "kit")
-    again = aaplug.conform(lambda *paths: None, output=tmp_path / "kit", overwrite=True)
-    assert all(f.wrong == f"no picture: there is no {f.test}.png" for f in again.findings)
+    with pytest.raises(UsageError, match=r"none of 10 pictures: there is no dilation\.png"):
+        aaplug.conform(lambda *paths: None, output=tmp_path / "kit", overwrite=True)

@@ -13,11 +13,11 @@ from aaplug.core.imaging import box_average, quantised
 from aaplug.core.lenses import EQUIDISTANT
 from aaplug.core.training import TrainingViews
 from aaplug.evaluation import METRICS, PROTOCOLS
-from aaplug.evaluation.engine import NO_PHOTOGRAPH, Candidate, Task, candidates_of, compare, evaluate
+from aaplug.evaluation.engine import Candidate, Task, candidates_of, compare, evaluate
 from aaplug.evaluation.image_store import ImageStore
 from aaplug.evaluation.metric import Metric, TimedRenderer
 from aaplug.evaluation.metrics import CONSISTENCY, ENERGY, FLICKER, PSNR, SSIM, psnr
-from aaplug.evaluation.results import CEILING, as_csv, mean, per_view, results, scale_name, tables
+from aaplug.evaluation.results import CEILING, NO_PHOTOGRAPH, as_csv, mean, per_view, results, scale_name, tables
 from aaplug.evaluation.truth import CACHE_DTYPE, Truth, back_projected
 from aaplug.io.images import read_image, write_png
 from aaplug.methods import RECIPES
@@ -105,9 +105,12 @@ def test_reports_hold_every_view_recipe_and_scale(look, views):
     values = per_view(report)["matched@0.5"]["PSNR"]
     assert list(values) == ["a", "b"]
     assert results(report)["matched@0.5"]["PSNR"] == pytest.approx(sum(values.values()) / 2)
-    for table in tables(report):
+    grids = [table for table in tables(report) if not isinstance(table, str)]
+    for table in grids:
         assert table.row_count == 3
         assert [column.header for column in table.columns] == ["recipe", "1", "1/2", "2×"]
+    lines = [f"no {name} at 2×: {NO_PHOTOGRAPH}" for name in ("PSNR", "SSIM")]
+    assert (len(grids), [table for table in tables(report) if isinstance(table, str)]) == (4, lines)
     lines = as_csv({'a "scene"': report}).splitlines()
     assert lines[0] == "scene,protocol,recipe,scale,view,PSNR,SSIM,samples,evaluations,seconds,note"
     assert len(lines) == 1 + len(report.measurements)
@@ -266,7 +269,9 @@ def test_a_new_metric_that_is_undefined_is_reported_with_its_own_words(look, vie
     assert (found.values["odd"], found.values["nan"]) == (None, None)
     assert found.note == "too odd; not finite"
     assert results(report)["_aaplug"]["notes"] == ["too odd; not finite"]
-    assert len(tables(report)) == 5
+    assert str(tables(report)[0].title).endswith(", photographs, 1 view")
+    lines = ["no odd at 1/2: too odd", "no nan at 1/2: not finite"]
+    assert (len(tables(report)), tables(report)[1:3]) == (5, lines)
 
 
 def test_candidates_compare_as_by_hand(look, views):

@@ -75,9 +75,7 @@ def test_a_new_sequence_leaves_no_frame_of_the_old_one(cli, monkeypatch):
     words = f"{WORDS} out/f.####.png"
     assert cli(words)[0] == 0
     code, _, err = cli(f"{words} --overwrite --seconds 0.1".replace("--seconds 0.2 ", ""))
-    assert (code, "holds f.0004.png, f.0005.png, f.0006.png, which would follow these 3 frames" in err) == (2, True), (
-        err
-    )
+    assert (code, "holds f.0004.png, f.0005.png, f.0006.png, which would follow the 3 frames" in err) == (2, True), err
     with monkeypatch.context() as patch:  # stopped before its first frame
         patch.setattr("aaplug.verbs.video.write_frames", lambda *args, **how: sys.exit(3))
         assert cli(f"{words} --overwrite --recipe classic")[0] == 3

@@ -218,7 +218,7 @@ def test_gaussians_that_no_camera_sees_have_the_lowest_rate():
     scene.means[3] = torch.tensor([0.0, -9.0, 0.0])
     rates = rates_of(scene, [make_camera()])
     assert rates[3] == rates[torch.arange(20) != 3].min() > 0
-    with pytest.raises(FrameError, match="none of its Gaussians is seen by any of the 1 cameras"):
+    with pytest.raises(FrameError, match="none of its Gaussians is seen by any of 1 camera"):
         rates_of(replace(scene, means=scene.means + 1000), [make_camera()])
 
 

@@ -367,7 +367,8 @@ def test_order_tile_draws_what_the_reference_does_and_others_refuse_it():
     )
     assert (eager - exact).abs().max() < 1e-4
     assert (eager - Renderer.of(scene, [camera], rasterizer="eager")(camera).rgb).abs().max() > 1e-3
-    assert Job.of(scene, CameraSet((camera,), ()), RenderOptions(order="tile")).recipe("auto").order == "tile"
+    [auto] = Job.of(scene, CameraSet((camera,), ()), RenderOptions(order="tile")).named("auto")
+    assert auto.order == "tile"
     with pytest.raises(UsageError, match="order: tile is for pinhole views"):
         Renderer.of(scene, [camera], find_recipe("auto", order="tile"))(replace(camera, lens=Lens("equidistant")))
     with pytest.raises(UsageError, match="rasterizer: by-depth sorts by depth; order tile needs"):

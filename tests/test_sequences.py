@@ -9,6 +9,7 @@ import aaplug
 from aaplug.core.cameras import CameraSet
 from aaplug.core.conventions import MIP
 from aaplug.core.sampling import sampling_bounds
+from aaplug.evaluation.results import tables
 from aaplug.io.images import read_image
 from aaplug.io.scenes import read_scene, write_scene
 from aaplug.rendering.renderer import Renderer
@@ -56,7 +57,10 @@ def test_rates_are_those_over_all_frames_unless_they_were_trained_apart(folder):
 
 
 def test_every_verb_that_takes_a_scene_in_time_takes_all_frames(folder, tmp_path):
+    write_scene(folder / "other.ply", make_scene(40))
+    write_scene(folder / "frame_0004.splat", make_scene(40))
     scene = read_scene(folder)
+    assert scene.notes[-1] == "no frames, and left out: frame_0004.splat, other.ply"
     assert scene.cameras is None
     assert scene.title == "in"
     assert len(scene.files) == COUNT
@@ -86,6 +90,8 @@ def test_flicker_of_a_still_scene_in_time_is_undefined(tmp_path):
         write_scene(tmp_path / f"{number}.ply", make_scene(40))
     report = aaplug.evaluate(tmp_path, CAMERAS, recipe="matched", scale=[0.5], metric="flicker", views="far")
     assert {m.values["flicker"] for m in report.measurements} == {None}
+    why = "it needs a scale below the training size, and frames that differ"
+    assert tables(report)[0] == f"no flicker at 1/2: {why}"
 
 
 def gap(folder):

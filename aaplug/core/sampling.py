@@ -19,7 +19,7 @@ from aaplug.core.conventions import MIN_SEEN_SHARE
 from aaplug.core.lenses import PINHOLE
 from aaplug.core.rules import NEAR
 from aaplug.core.sights import sights
-from aaplug.system.errors import FrameError, UsageError
+from aaplug.system.errors import FrameError, UsageError, counted
 
 IMAGE_MARGIN = 0.15  # of the image's side; equals 3DGS's clamp of the Jacobian at 1.3 tan(fov/2)
 CHUNK_PAIRS = 4_000_000  # Gaussian-camera pairs held at once: about 150 MB
@@ -128,7 +128,7 @@ def check_seen(seen: Bool[Tensor, " n"], cameras: int, scene_name: str, min_shar
     if share < min_share:
         raise FrameError(
             scene_name,
-            f"only {share:.1%} of its Gaussians are seen by any of the {cameras} cameras (expected at least "
+            f"only {share:.1%} of its Gaussians are seen by any of {counted(cameras, 'camera')} (expected at least "
             f"{min_share:.0%}): scene and cameras are in different frames. nerfstudio scenes need the transform of "
             "dataparser_transforms.json, gsplat scenes were normalised unless trained with normalize_world_space "
             "off; if the cameras are right nevertheless, lower `min_seen`",

@@ -256,14 +256,15 @@ class Comparison:
         protocol = {**report.protocol, "notes": report.notes}
         return {"reference": self.reference.name, "guard": guard, "scenes": scenes, "protocol": protocol}
 
-    def tables(self) -> list[Table]:
+    def tables(self) -> list[Table | str]:
         """The scenes, how their Gaussians differ, and every metric over scales."""
         facts = []
         for title, headings, rows in self.facts():
             table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
-            for place, heading in enumerate(headings):
-                table.add_column(heading, justify="right" if place else "left", overflow="fold")
-            for row in rows:
+            names, *lines = zip(headings, *rows, strict=True)  # scenes across, as there are more facts than scenes
+            for place, name in enumerate(names):
+                table.add_column(escape(printable(name)), justify="right" if place else "left", overflow="fold")
+            for row in lines:
                 table.add_row(*(escape(printable(cell)) for cell in row))
             facts.append(table)
         return [*facts, *tables(self.report)]

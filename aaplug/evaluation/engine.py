@@ -28,7 +28,7 @@ from aaplug.evaluation.image_store import ImageStore
 from aaplug.evaluation.journal import Journal
 from aaplug.evaluation.metric import Image, Metric, Series, TimedImage, TimedRenderer
 from aaplug.evaluation.metrics import PSNR, SSIM
-from aaplug.evaluation.results import CEILING, Measurement, Report
+from aaplug.evaluation.results import CEILING, NO_PHOTOGRAPH, Measurement, Report
 from aaplug.evaluation.truth import Truth, ViewTruth, source_of
 from aaplug.io.photographs import DOWNSCALES
 from aaplug.io.scenes import SceneLike, scene_of
@@ -42,7 +42,6 @@ from aaplug.system.executors import Apply
 from aaplug.system.monitor import Tell
 
 PACKAGES = ("aaplug", "torch", "numpy", "opencv-contrib-python-headless")
-NO_PHOTOGRAPH = "no photograph is this large: metrics above the photographs' own size are undefined"
 EQUAL_IMAGES_SIDE = 64  # px: of images that equal their truth, metrics look at this corner
 
 Values = Mapping[str, float | None]

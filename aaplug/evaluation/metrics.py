@@ -140,6 +140,7 @@ CONSISTENCY = Metric(
     protocol="PSNR of the image against the recipe's own training-size image, box-averaged; null at and above that "
     "size, where the two are equal, and where scale 1 is not measured",
     figure=_consistency,
+    undefined="it needs a scale below the training size, and scale 1 among the scales",
 )
 ENERGY = Metric(
     "energy drift",
@@ -149,6 +150,7 @@ ENERGY = Metric(
     protocol="luminance of what is drawn, without the background, over the recipe's own at the training size, minus 1; "
     "null where scale 1 is not measured",
     figure=_energy_drift,
+    undefined="it needs scale 1 among the scales",
 )
 FLICKER = Metric(
     "flicker",
@@ -159,6 +161,7 @@ FLICKER = Metric(
     "that of the training-size image, averaged down: "
     "1 is motion alone; null at and above the training size",
     figure=_flicker,
+    undefined="it needs a scale below the training size, and frames that differ",
 )
 
 

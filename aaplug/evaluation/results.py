@@ -16,9 +16,11 @@ from rich.table import Table
 from aaplug.evaluation import METRICS
 from aaplug.evaluation.metric import Metric, number
 from aaplug.evaluation.metrics import EQUAL, PSNR, SSIM
+from aaplug.system.errors import counted
 from aaplug.system.registry import named
 
 CEILING = "training size, resampled"  # a row of every table: the own training-size look
+NO_PHOTOGRAPH = "no photograph is this large: metrics above the photographs' own size are undefined"
 TIME_DIGITS, COUNT_DIGITS = 3, 2  # decimals of seconds, and of million evaluations
 MILLION = 1e6
 
@@ -166,20 +168,33 @@ def method(recipe: str, scale: float) -> str:
     return f"{recipe}@{scale:g}"
 
 
-def tables(report: Report) -> list[Table]:
+def tables(report: Report) -> list[Table | str]:
     """A table per metric, then seconds and evaluations per view; recipes down, scales across, the best value bold."""
-    subject = f"{report.protocol['truth']}, {report.protocol['views']} views"
-    grids = []
+    subject, grids = f"{report.protocol['truth']}, {counted(report.protocol['views'], 'view')}", list[Table | str]()
     for metric in report.metrics:
         variant, colon, _ = report.protocol.get("metrics", {}).get(metric.name, "").partition(":")
         flavour = f" {variant}" if colon and " " not in variant else ""
         title = f"{metric.name}{flavour}{metric.title.removeprefix(metric.name)}, {subject}"
         rows = metric_cells(report, metric)
         lines = [[f"[bold]{cell.text}[/]" if cell.best else cell.text for cell in row] for row in rows]
-        grids.append(grid(title, report, lines, "italic"))
+        grids += metric_grid(title, report, metric, lines, "italic")
     for title, rows in cost_cells(report):
         grids.append(grid(title, report, [[cell.text for cell in row] for row in rows]))
     return grids
+
+
+def metric_grid(
+    title: str, report: Report, metric: Metric, lines: list[list[str]], ceiling: str | None = None
+) -> list[Table | str]:
+    """A metric's table as `grid`, unless it has no value at all, and a line that says at which scales, and why."""
+    columns = dict(zip(report.scales, zip(*lines, strict=True), strict=True))
+    empty = [scale for scale, column in columns.items() if {*column} == {metric.text(None)}]
+    table = [grid(title, report, lines, ceiling)] * (len(empty) < len(columns))
+    if not empty:
+        return [*table]
+    small = any(m.note == NO_PHOTOGRAPH for m in report.measurements if m.scale in empty)
+    why = NO_PHOTOGRAPH if small and metric.measure else metric.undefined
+    return [*table, f"no {metric.name} at {', '.join(map(scale_name, empty))}: {why}"]
 
 
 def grid(title: str, report: Report, lines: list[list[str]], ceiling: str | None = None) -> Table:

@@ -18,7 +18,7 @@ from torch.nn import functional
 
 from aaplug.core.cameras import Camera, Undistortion
 from aaplug.core.lenses import EQUIRECT, Lens
-from aaplug.system.errors import UsageError
+from aaplug.system.errors import UsageError, counted
 
 HALF_PIXEL = 0.5  # px: the centre of OpenCV's first pixel is 0
 MIN_SHARE = 0.5  # of a side: a photograph that covers less of its pinhole's view is not used
@@ -98,7 +98,7 @@ def lens_notes(distortions: Sequence[Distortion | None], cameras: Sequence[Camer
         (lens, camera) for lens, camera in zip(distortions, cameras, strict=True) if lens and lens.name != PANORAMA
     ]
     panoramas = distortions.count(Distortion(PANORAMA, EQUIRECT))
-    notes = [f"{panoramas} cameras see 360° × 180° ({PANORAMA}), and so do their renders"] if panoramas else []
+    notes = [f"{counted(panoramas, 'camera')} of 360° × 180° ({PANORAMA}), and so are the renders"] if panoramas else []
     if not pairs:
         return notes
     models = ", ".join(sorted({lens.name for lens, _ in pairs}))
@@ -108,10 +108,8 @@ def lens_notes(distortions: Sequence[Distortion | None], cameras: Sequence[Camer
     else:
         what = "renders are bent as their photos are; `undistort` straightens both"
     if usable < len(pairs):
-        what += (
-            f"; {len(pairs) - usable} are drawn as pinholes, without photos (colmap image_undistorter converts them)"
-        )
-    return [*notes, f"{len(pairs)} cameras have a lens that distorts ({models}): {what}"]
+        what += f"; {len(pairs) - usable} drawn as pinholes, without photos (colmap image_undistorter converts them)"
+    return [*notes, f"{counted(len(pairs), 'camera')} with a lens that distorts ({models}): {what}"]
 
 
 @lru_cache(CACHED_LENSES)

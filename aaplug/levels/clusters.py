@@ -18,7 +18,7 @@ from aaplug.core.rules import RULES_3DGS
 from aaplug.core.sampling import median_rates
 from aaplug.core.spherical_harmonics import COLOUR_OFFSET, SH_C0
 from aaplug.levels.covariances import Packed, area, areas, blur, covariances, outer, overlaps, pack, quats_of, unpack
-from aaplug.system.errors import FrameError
+from aaplug.system.errors import FrameError, counted
 
 MAX_OPACITY = RULES_3DGS.max_alpha  # of a merged Gaussian; no renderer shows more
 # An opacity above MAX_OPACITY is divided by its excess, and the Gaussian's area grows by this power of the excess.  The
@@ -89,7 +89,7 @@ def rates_of(scene: Gaussians, cameras: Sequence[Camera]) -> Float[Tensor, " n"]
     rates = median_rates(scene.means, cameras)
     positive = rates[rates > 0]
     if not len(positive):
-        raise FrameError(scene.name, f"none of its Gaussians is seen by any of the {len(cameras)} cameras")
+        raise FrameError(scene.name, f"none of its Gaussians is seen by any of {counted(len(cameras), 'camera')}")
     return torch.where(rates > 0, rates, positive.min())
 
 

@@ -101,7 +101,20 @@ class Names(Argument):
         for each in value if isinstance(value, (list, tuple)) else [value]:
             name = str(each)[:MAX_VALUE_CHARACTERS]
             if each is not None and name not in names and (self.kind is None or isinstance(each, str)):
-                raise UsageError(option, not_one_of(name, names) + did_you_mean(name, names))
+                raise UsageError(option, not_one_of(name, names))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Text(Argument):
+    """Takes text that `parsed`, which is given it and the option, does not refuse."""
+
+    parsed: Callable[[str, str], object]
+
+    def check(self, option: str, value: Any) -> None:
+        """Refuse other text."""
+        for each in value if isinstance(value, (list, tuple)) else [value]:
+            if isinstance(each, str):
+                self.parsed(each, option)
 
 
 def flag(metavar: str, *flags: str, read: Callable[[str], Any] = str, **how: Any) -> Argument:

@@ -5,6 +5,8 @@ import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from importlib import import_module
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args
 
 from aaplug.core.colours import Background
@@ -12,7 +14,7 @@ from aaplug.core.conventions import MIN_SEEN_SHARE
 from aaplug.core.passes import PASSES, NormalAxes
 from aaplug.io.image_formats import COLOURS, IMAGE_FORMATS
 from aaplug.methods import QUALITIES, RateReference, SplatOrder
-from aaplug.options.base import CAMERAS, DRAWING, FILES, FILM, LENS, ORBIT, Options, flag, names, number
+from aaplug.options.base import CAMERAS, DRAWING, FILES, FILM, LENS, ORBIT, Options, Text, flag, names, number
 from aaplug.system.contracts import LazyType
 from aaplug.system.errors import MAX_VALUE_CHARACTERS, UsageError
 from aaplug.system.registry import names_of
@@ -54,6 +56,39 @@ OneViewer = Annotated[str | Viewer | None, names(kind="viewer", metavar="VIEWER"
 OneProtocol = Annotated[str | Protocol, names(kind="protocol")]
 
 
+def size_of(text: str, where: str = "resolution", shape: tuple[int, int] | None = None) -> tuple[int, int]:
+    """Width and height of "400x300", in px.
+
+    where: the option that it is of.  shape: width and height whose aspect -1 on one side keeps.
+
+    Raises:
+        UsageError: it is no size, or a side is above `MAX_SIDE`.
+    """
+    free = r"|-1" if shape else ""
+    match = re.fullmatch(rf"([1-9]\d{{0,8}}{free})x([1-9]\d{{0,8}}{free})", text, re.ASCII)
+    if match is None or match[1] == match[2] == "-1":
+        raise UsageError(where, f"takes sizes such as 400x400, got {text[:MAX_VALUE_CHARACTERS]}")
+    width, height = int(match[1]), int(match[2])
+    if shape is not None and width < 0:
+        width = max(1, round(shape[0] * height / shape[1]))
+    elif shape is not None and height < 0:
+        height = max(1, round(shape[1] * width / shape[0]))
+    check_side(where, width, height)
+    return width, height
+
+
+def check_side(where: str, width: int, height: int) -> None:
+    """Refuse an image with a side above `MAX_SIDE`; raises UsageError."""
+    if max(width, height) > MAX_SIDE:
+        raise UsageError(where, f"would be {width}x{height} px; the limit is {MAX_SIDE} a side")
+
+
+def _check_colour(text: str, where: str) -> None:
+    """Refuse what is no colour; the module that knows colours imports torch, so it waits for one to be given."""
+    if text != "auto":
+        import_module("aaplug.io.images").colour_of(text, where)
+
+
 @dataclass(frozen=True, kw_only=True)
 class FrameOptions(Options):
     """Whether scene and cameras belong together."""
@@ -68,7 +103,7 @@ class ViewOptions(FrameOptions):
 
     views: Annotated[str, VIEWS] = "test"
     """Views, by name or split."""
-    background: Annotated[Background, flag("auto|COLOUR")] = "auto"
+    background: Annotated[Background, Text(metavar="auto|COLOUR", parsed=_check_colour)] = "auto"
     """Colour behind the scene as CSS writes it, such as white or "#ff8000"; auto is what training had."""
     threads: Annotated[int | None, THREADS] = None
     """Processor threads (default: all)."""
@@ -106,7 +141,7 @@ class ImageOptions(Options):
     """How to render; `aaplug evaluate --recipe all` lists further recipes, for comparison."""
     scale: Annotated[float | None, SCALE] = None
     """Size relative to the training size (default: 1)."""
-    resolution: Annotated[str | None, flag("WxH")] = None
+    resolution: Annotated[str | None, Text(metavar="WxH", parsed=partial(size_of, shape=(1, 1)))] = None
     """Size in px, such as 400x400; -1 on one side keeps the aspect (-1x720)."""
     overwrite: bool = False
     """Replace existing outputs."""
@@ -122,6 +157,11 @@ class ImageOptions(Options):
     """Values of colours: srgb, as a display takes them, or linear in light (default: srgb; .exr: linear)."""
     bit_depth: Annotated[Literal[8, 16, 32] | None, names(8, 16, 32), FILES] = None
     """Bits per channel (default: 8; .exr: 16, half precision, but 32 where a pass needs it; .npz: 32)."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.scale is not None and self.resolution is not None:
+            raise UsageError("scale", "and `resolution` both set the size; give one")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -191,7 +231,7 @@ class Orbit(Options):
     """Place to look from, X Y Z, instead of an orbit."""
     up: Annotated[Sequence[float] | None, _PLACE, ORBIT] = None
     """Direction that points up, X Y Z (default: 0 -1 0, or what file and colours say)."""
-    train_view: Annotated[str | None, flag("WxH"), ORBIT] = None
+    train_view: Annotated[str | None, Text(metavar="WxH", parsed=size_of), ORBIT] = None
     """Size in px of the training images, which are taken to show what the orbit shows (default: 1600x1066)."""
     train_rate: Annotated[float | None, number(1e-6, 1e9, metavar="RATE"), ORBIT] = None
     """Instead, px per world unit in the middle of the scene in training."""
@@ -202,33 +242,11 @@ class Orbit(Options):
             value = getattr(self, name)
             if value is not None and len(value) != 3:
                 raise UsageError(name, f"takes three numbers X Y Z, got {len(value)}")
-        if self.train_view is not None:
-            size_of(self.train_view, "train_view")
         if self.train_view is not None and self.train_rate is not None:
             raise UsageError("train_view", "and `train_rate` both set the training rate; give one")
         for name in ("orbit", "elevation"):
             if self.eye is not None and getattr(self, name) is not None:
                 raise UsageError("eye", f"is a single place, which `{name}` would change; give one")
-
-
-def size_of(text: str, where: str = "resolution") -> tuple[int, int]:
-    """Width and height of "400x300", in px; `where` is the option that it is of.
-
-    Raises:
-        UsageError: it is no size, or a side is above `MAX_SIDE`.
-    """
-    match = re.fullmatch(r"([1-9]\d{0,8})x([1-9]\d{0,8})", text, re.ASCII)
-    if match is None:
-        raise UsageError(where, f"takes sizes such as 400x400, got {text[:MAX_VALUE_CHARACTERS]}")
-    width, height = int(match[1]), int(match[2])
-    check_side(where, width, height)
-    return width, height
-
-
-def check_side(where: str, width: int, height: int) -> None:
-    """Refuse an image with a side above `MAX_SIDE`; raises UsageError."""
-    if max(width, height) > MAX_SIDE:
-        raise UsageError(where, f"would be {width}x{height} px; the limit is {MAX_SIDE} a side")
 
 
 def metric_option(name: str) -> str:

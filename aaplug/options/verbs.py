@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 from aaplug.core.conventions import CONVENTIONS, SpzAxes
 from aaplug.io import MOST_FPS, StreamName
 from aaplug.io.atomic import AnyPath
-from aaplug.options.base import DRAWING, FILES, FILM, PYTHON_ONLY, REPORT, TUNING, Options, flag, names, number
+from aaplug.options.base import DRAWING, FILES, FILM, PYTHON_ONLY, REPORT, TUNING, Options, Text, flag, names, number
 from aaplug.options.shared import (
     RECIPE_METAVAR,
     SCALE,
@@ -171,6 +171,13 @@ class ConvertOptions(WritingOptions, ViewOptions):
     variance: Annotated[float | None, number(0.001, 100)] = None
     """Without --for: variance to fuse, in px² at the training rate (default: 0.2)."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.viewer is not None and (self.form is not None or self.variance is not None):
+            raise UsageError("viewer", "sets form and variance itself; leave out `form`, `variance`")
+        if self.viewer is None and self.steps is not None:
+            raise UsageError("steps", "belongs to the fit to a viewer; name one with `viewer`")
+
 
 IN_TIME = (RenderOptions, VideoOptions, EvaluateOptions, ConvertOptions)  # of the verbs that take a scene in time
 
@@ -288,6 +295,14 @@ class FinetuneOptions(WritingOptions, ViewOptions):
     resume: bool = False
     """Continue an interrupted run from its checkpoint."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.learn_filters and self.method != "consistency":
+            raise UsageError("learn_filters", f"is a method of its own, beside {self.method}")
+        if self.upsampler is not None and max(self.scale) <= 1:
+            problem = "makes what scales above 1 should show, and there is none: give such a `scale`"
+            raise UsageError("upsampler", problem)
+
 
 @dataclass(frozen=True, kw_only=True)
 class PoseOptions(ViewOptions):
@@ -331,7 +346,7 @@ class BenchOptions(Options):
         1_000_000,
     )
     """Sizes of the synthetic scenes."""
-    resolution: Annotated[Sequence[str] | None, flag("WxH ...", count=None)] = None
+    resolution: Annotated[Sequence[str] | None, Text(metavar="WxH ...", parsed=size_of, count=None)] = None
     """Sizes of the images: all scenes at the first, the middle one at each (default: a view's or 800x800 1600x1060)."""
     rasterizer: Annotated[str, names(*TIMED_RASTERIZERS)] = "all"
     """Which to time; all: compiled, if `aaplug warmup` has run, and eager."""
@@ -341,8 +356,3 @@ class BenchOptions(Options):
     """Processor threads (default: all)."""
     forward_only: bool = False
     """Leave out the backward pass."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for size in self.resolution or ():
-            size_of(size)

@@ -37,7 +37,7 @@ from aaplug.rendering.agreement import agreement, settled
 from aaplug.rendering.assumed import cameras_around, say_assumed
 from aaplug.rendering.cost import Cost, cost_of
 from aaplug.rendering.renderer import Renderer, background_colour, own_look
-from aaplug.system.errors import FrameError, UsageError, listing, within_memory
+from aaplug.system.errors import FrameError, UsageError, counted, listing, within_memory
 from aaplug.system.executors import PAYS_AFTER_SECONDS, Executor, torch_threads
 from aaplug.system.extras import install_command
 from aaplug.system.monitor import Monitor
@@ -145,21 +145,29 @@ class Job(Generic[O_co]):
         training = TrainingViews.of(gaussians, self.cameras, options.cull_margin, options.min_seen)
         return training if scene.frames is None else scene.frames.over_all(training)
 
-    def recipe(self: "Job[RecipeOptions]", recipe: str | Recipe) -> Recipe:
-        """A recipe as it is, or by name as the options say; the rate reference goes to those that compare rates."""
-        if isinstance(recipe, Recipe):
-            return recipe
-        options = self.options
-        matches = isinstance(RECIPES.find(recipe, "recipe").screen, MatchesRates)
-        reference = options.rate_reference if matches else None
-        return find_recipe(recipe, quality=options.quality, rate_reference=reference, order=options.order)
+    def named(self: "Job[RecipeOptions]", *recipes: str | Recipe) -> list[Recipe]:
+        """Recipes as they are, or by name as the options say; says which of these options none of them takes."""
+        options, found = self.options, list[Recipe]()
+        for recipe in recipes:
+            if isinstance(recipe, str):
+                matches = isinstance(RECIPES.find(recipe, "recipe").screen, MatchesRates)
+                reference = options.rate_reference if matches else None
+                recipe = find_recipe(recipe, quality=options.quality, rate_reference=reference, order=options.order)
+            found.append(recipe)
+        quality = any(recipe.takes_quality for recipe in found)
+        rates = any(isinstance(recipe.screen, MatchesRates) for recipe in found)
+        for name, taken in (("quality", quality), ("rate_reference", rates)):
+            if not taken and (value := getattr(options, name)) != getattr(RecipeOptions, name):
+                names = listing([recipe.name for recipe in found])
+                self.monitor.say(f"{name.replace('_', ' ')} {value} is not for recipe {names}")
+        return found
 
     def recipes(self: "Job[RecipeOptions]", names: str | Recipe | Sequence[str | Recipe]) -> list[Recipe]:
-        """Recipes as `recipe`, fitted to the scene; of "all", those that it has everything for."""
+        """Recipes as `named`, fitted to the scene; of "all", those that it has everything for."""
         gaussians, names = self.scene.gaussians(), [names] if isinstance(names, str | Recipe) else names
         if ALL not in names:
-            return [suited(self.recipe(name), gaussians) for name in names]
-        recipes = [self.recipe(name) for name in RECIPES]
+            return [suited(recipe, gaussians) for recipe in self.named(*names)]
+        recipes = self.named(*RECIPES)
         lacks = {recipe.name: recipe.lacks(gaussians) for recipe in recipes}
         for name, lack in lacks.items():
             if lack is not None:
@@ -191,12 +199,12 @@ class Job(Generic[O_co]):
         cost = cost or cost_of(renderers, views)
         needed = cost.scene + cost.image * (processes if cost.seconds > PAYS_AFTER_SECONDS else 1)
         sizes = listing(sorted({f"{view.width}x{view.height}" for view in views}), most=3)
-        images = len(views) * len(renderers)
-        what = f"{work or f'{images} image' + 's' * (images != 1)} at {sizes}"
+        what = f"{work or counted(len(views) * len(renderers), 'image')} at {sizes}"
         if lacking := lack_of_memory(needed):
             raise UsageError(what, f"would take {lacking}; a smaller `scale` or fewer `threads` need less")
         if cost.seconds >= LONG_JOB or needed >= LARGE_JOB:
-            minutes = f"about {cost.seconds / 60:.0f} minutes" if cost.seconds >= LONG_JOB else "under a minute"
+            minutes = counted(round(cost.seconds / 60), "minute")
+            minutes = f"about {minutes}" if cost.seconds >= LONG_JOB else "under a minute"
             memory = f", {needed / 1e9:.1f} GB" if needed >= LARGE_JOB else ""
             self.monitor.say(f"{what}: {minutes}{memory}; fewer {fewer} take less")
 

@@ -53,7 +53,7 @@ from aaplug.rendering.channels import composited
 from aaplug.rendering.passes import by_order, channels_of, expected
 from aaplug.system.contracts import check_fields, contract
 from aaplug.system.cores import on_free_cores
-from aaplug.system.errors import UsageError, did_you_mean, not_one_of, within_memory
+from aaplug.system.errors import UsageError, not_one_of, within_memory
 
 GAUSSIANS_AT_ONCE = 1 << 20  # Gaussians projected at once, where no gradients are asked for
 SAMPLE_BYTES = 32.0  # per sample of an image: red, green, blue and alpha in float32, and a copy
@@ -272,7 +272,7 @@ class Renderer:
         """
         for name in names:
             if name not in PASSES:
-                raise UsageError("passes", not_one_of(name, PASSES) + did_you_mean(name, PASSES))
+                raise UsageError("passes", not_one_of(name, PASSES))
         if (now := self.at(camera.frame)) is not self:
             return now.passes(camera, names, normal_axes)
         if {*names} <= {"rgb", "alpha"}:

@@ -28,7 +28,7 @@ from distributed.client import ClosedClientError
 from distributed.comm.core import CommClosedError
 
 from aaplug.system.allocator import keep_freed_memory
-from aaplug.system.errors import MAX_VALUE_CHARACTERS, ClusterError, UsageError, listing, reason
+from aaplug.system.errors import MAX_VALUE_CHARACTERS, ClusterError, UsageError, counted, listing, reason
 from aaplug.system.executors import ITEMS_PER_WORKER, WORK_FILE_NAME, load, results, save, track_quietly
 from aaplug.system.locks import scratch
 from aaplug.system.monitor import Monitor
@@ -99,7 +99,7 @@ class Cluster:
             return
         present: dict[str, int] = self.client.nthreads()  # pyright: ignore[reportAssignmentType] (by address)
         if lost := self._workers - present.keys():
-            these = f"{len(lost)} of {len(self._workers)} workers ({listing(sorted(lost))})"
+            these = f"{len(lost)} of {counted(len(self._workers), 'worker')} ({listing(sorted(lost))})"
             self.monitor.say(f"lost {these}; others do again what was begun there")
         self._workers, self.threads = frozenset(present), sum(present.values())
         self.monitor.working(len(present))

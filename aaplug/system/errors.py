@@ -53,9 +53,15 @@ def listing(names: Sequence[str], most: int = 6) -> str:
     return first if len(names) <= most else f"{first} and {len(names) - most} more"
 
 
-def not_one_of(name: object, names: Iterable[str]) -> str:
-    """Message for a name that is none of these."""
-    return f"'{name}' is not one of {', '.join(names)}"
+def counted(number: int, noun: str) -> str:
+    """A number of things in words: 1 view, 30,500 Gaussians."""
+    return f"{number:,} {noun}{'s' * (number != 1)}"
+
+
+def not_one_of(name: object, names: Iterable[str], otherwise: str = "") -> str:
+    """Message for a name that is none of these: ends with the one that is like it, or `otherwise`."""
+    known = list(names)
+    return f"'{name}' is not one of {', '.join(known)}" + (did_you_mean(str(name), known) or otherwise)
 
 
 def did_you_mean(name: str, names: Iterable[str]) -> str:

@@ -179,8 +179,7 @@ def names_of(kind: str, comparisons: bool = True) -> list[str]:
 
 def unknown(name: str, names: Collection[str]) -> str:
     """Message for a name that is in no registry: the closest one, or the question for the package that adds it."""
-    hint = did_you_mean(name, names) or "; if a package adds it, is that installed?"
-    return not_one_of(name, names) + hint
+    return not_one_of(name, names, "; if a package adds it, is that installed?")
 
 
 def registry_of(kind: str) -> Any:  # a run-time check of a registry would load its entries

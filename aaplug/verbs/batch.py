@@ -15,10 +15,10 @@ from aaplug.evaluation import PROTOCOLS
 from aaplug.evaluation.data_sets import Paper, data_set_of, paper
 from aaplug.evaluation.protocols import Protocol
 from aaplug.evaluation.report.files import as_json, write_texts
-from aaplug.evaluation.results import Report, as_csv, grid, method, results
+from aaplug.evaluation.results import Report, as_csv, method, metric_grid, results
 from aaplug.io.atomic import AnyPath, refuse_existing, writing
 from aaplug.system.contracts import contract
-from aaplug.system.errors import AaplugError, ClusterError, printable, within_memory
+from aaplug.system.errors import AaplugError, ClusterError, counted, printable, within_memory
 from aaplug.system.monitor import SILENT, Monitor
 from aaplug.verbs.evaluate import check_results
 from aaplug.verbs.verb import check_name
@@ -73,7 +73,7 @@ class Batch:
                 means[name] = {key: None if None in each else fmean(each) for key, each in values.items()}
         return means
 
-    def tables(self) -> list[Table]:
+    def tables(self) -> list[Table | str]:
         """The means, one table per metric, and the status of every scene."""
         whys = [(name, self.failures.get(folder, "")) for folder, name in self.names.items()]
         scenes = status_table("why", [(name, "failed" if why else "done", why) for name, why in whys])
@@ -81,12 +81,12 @@ class Batch:
             return [scenes]
         if self.protocol is not None:
             return [*map(paper_table, self.papers()), scenes]
-        first, means, grids = next(iter(self.reports.values())), self._means(), []
-        over = f"mean of {len(self.reports)} scene{'s' * (len(self.reports) != 1)}"
+        first, means, grids = next(iter(self.reports.values())), self._means(), list[Table | str]()
+        over = f"mean of {counted(len(self.reports), 'scene')}"
         for metric in first.metrics:
             values = [[means.get(method(r, s), {}).get(metric.name) for s in first.scales] for r in first.recipes]
             lines = [[metric.text(value) for value in line] for line in values]
-            grids.append(grid(f"{metric.title}, {over}", first, lines))
+            grids += metric_grid(f"{metric.title}, {over}", first, metric, lines)
         return [*grids, scenes]
 
 

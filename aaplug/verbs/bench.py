@@ -17,7 +17,7 @@ from aaplug.rasterizers.tiled.ahead_of_time import build, load
 from aaplug.rendering.benchmark import Figures, exponent, measure, synthetic_camera, synthetic_scene
 from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.rendering.renderer import Renderer
-from aaplug.system.errors import UsageError
+from aaplug.system.errors import UsageError, counted
 from aaplug.system.monitor import Monitor
 from aaplug.verbs.verb import looks
 
@@ -54,7 +54,7 @@ def bench(scene: SceneLike | None, cameras: CamerasLike, options: BenchOptions) 
         kernels = _kernels(options.rasterizer, options.monitor)
         for (renderer, camera), each in product(work, kernels):
             run = measure(renderer, camera, each, options.repeats, not options.forward_only)
-            shape = f"{run.gaussians:,} Gaussians, {run.width}x{run.height}"
+            shape = f"{counted(run.gaussians, 'Gaussian')}, {run.width}x{run.height}"
             options.monitor.say(f"{shape}, {run.rasterizer}: {run.forward_ms:.0f} ms")
             runs.append(run)
     return Bench(runs, _exponents(runs))

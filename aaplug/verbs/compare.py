@@ -63,7 +63,7 @@ def compare(scenes: ScenesLike, cameras: CamerasLike, output: AnyPath | None, op
     inputs = [*job.inputs, *(file for scene in named.values() for file in scene.files)]
     with running(options, folder, check, inputs, folder=True) as workers:
         look = job.look(len(views) * len(scales) * len(rows))
-        recipe, same = job.recipe(options.recipe), {"rasterizer": look.rasterizer, "background": look.background}
+        [recipe], same = job.named(options.recipe), {"rasterizer": look.rasterizer, "background": look.background}
         renderers = [Renderer.of(scene, job.training(scene), recipe, **same) for scene in named.values()]
         truth = Truth(renderers[0], "reference", PROTOCOL)
         if viewer is not None:

@@ -26,6 +26,8 @@ from aaplug.verbs.verb import check_name
 
 PLACEHOLDERS = ("{scene}", "{camera}", "{image}")
 PROGRAM_SECONDS = 300.0  # that a program may take for a picture
+LACK = "no picture: "  # begins a finding
+TOLD_LINES = 3  # of the end of what a failed program says
 EXPECTED = "expected"  # folder of the pictures as they should be
 
 
@@ -52,7 +54,8 @@ def conform(
         viewer: whose rule to expect; None for the one that fits best (classic for pictures that are written alone).
 
     Raises:
-        UsageError: there is nothing to do, two things contradict each other, or the program cannot be run.
+        UsageError: there is nothing to do, two things contradict each other, or there is no picture at all, as of a
+            program that cannot be started.
         OutputError: a file exists and `overwrite` is false, or cannot be written.
     """
     check_name(output)
@@ -85,6 +88,10 @@ def conform(
                     problem = "" if program is None else _run(program, *paths, picture)
                     pictures[test.name] = problem or _picture(picture)
                     tell(done, len(files))
+            first = next(iter(pictures.values()))
+            if isinstance(first, str) and all(isinstance(picture, str) for picture in pictures.values()):
+                problem = f"gave none of {len(files)} pictures: {first.removeprefix(LACK)}"
+                raise UsageError("images" if program is None else "program", problem)
         verdict = judged(pictures, found) if pictures else None
         if output is not None:
             shown = verdict.viewer if verdict else found or CLASSIC_VIEWER
@@ -119,24 +126,25 @@ def _run(program: str | Callable[[Path, Path, Path], object], *paths: Path) -> s
     try:
         run = subprocess.run(words, capture_output=True, timeout=PROGRAM_SECONDS, check=False)
     except subprocess.TimeoutExpired:
-        return f"no picture: the program took more than {PROGRAM_SECONDS:g} s"
+        return f"{LACK}the program took more than {PROGRAM_SECONDS:g} s"
     except (OSError, ValueError) as error:
-        raise UsageError("program", f"cannot be run: {reason(error)}") from error
+        raise UsageError("program", f"cannot be started: {words[0]}: {reason(error)}") from error
     if not run.returncode:
         return ""
     told = (run.stderr or run.stdout).decode(errors="replace").split("\n")
-    return f"no picture: the program ended with {run.returncode}: {' '.join([line for line in told if line][-1:])}"
+    end = "; ".join([line.strip() for line in told if line.strip()][-TOLD_LINES:])
+    return f"{LACK}the program ended with code {run.returncode}: {end or 'it said nothing'}"
 
 
 def _picture(path: Path) -> Float[Tensor, "h w 3"] | str:
     """A renderer's picture; in words, why there is none."""
     if not path.is_file():
-        return f"no picture: there is no {path.name}"
+        return f"{LACK}there is no {path.name}"
     try:
         picture = read_image(path, BLACK)
     except FormatError as error:
-        return f"no picture: {error}"
+        return f"{LACK}{error}"
     height, width = picture.shape[:2]
     if (height, width) != CAMERA.hw:
-        return f"no picture: expected {SIDE}x{SIDE} px, got {width}x{height}"
+        return f"{LACK}expected {SIDE}x{SIDE} px, got {width}x{height}"
     return picture

@@ -95,11 +95,7 @@ def _rule(options: ConvertOptions, flat: bool) -> Form | Viewer:
     """The rule to convert for: a viewer's, or the Mip rule by a closed form; flat: of 2D Gaussians."""
     viewer = find_viewer(options.viewer)
     if viewer is not None:
-        if options.form is not None or options.variance is not None:
-            raise UsageError("viewer", "sets form and variance itself; leave out `form`, `variance`")
         return viewer
-    if options.steps is not None:
-        raise UsageError("steps", "belongs to the fit to a viewer; name one with `viewer`")
     default = MIP_SPLATTING if flat else MATCHED_ENERGY
     form = default if options.form is None else FORMS.find(options.form, "form")
     return form if options.variance is None else form.with_variance(options.variance)

@@ -24,11 +24,11 @@ from aaplug.evaluation.upsamplers import find_upsampler
 from aaplug.finetuning import METHODS
 from aaplug.finetuning.parameters import LEARNED_COLUMNS
 from aaplug.finetuning.session import tune, tuned_scene
-from aaplug.finetuning.settings import CONSISTENCY_SETTINGS, Settings, settings_of
+from aaplug.finetuning.settings import Settings, settings_of
 from aaplug.finetuning.state import TuningJob
 from aaplug.io.atomic import AnyPath, check_output, replacing
 from aaplug.io.images import write_png
-from aaplug.io.scenes import SceneLike, check_scene_output, write_scene
+from aaplug.io.scenes import SceneLike, check_scene_output, read_scene, write_scene, written_format
 from aaplug.methods.conversion import fuse_for
 from aaplug.methods.presets import recipe_of
 from aaplug.methods.viewers import FAST, VIEWERS
@@ -37,7 +37,7 @@ from aaplug.rendering.cost import GRADIENTS, Cost, cost_of
 from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.digests import digest_of_files
-from aaplug.system.errors import UsageError
+from aaplug.system.errors import OutputError, UsageError, counted
 from aaplug.verbs.refine_poses import refined
 from aaplug.verbs.verb import writes
 
@@ -48,7 +48,8 @@ Image = Float[Tensor, "h w 3"]
 class Tuned:
     """A fine-tuned scene.
 
-    report: the scene before, its closed form where that differs, and after, as the viewer shows them.
+    report: the scene before, its closed form where that differs, and after, as the output holds it and the viewer shows
+        them.
     curve: number, view and loss by scale of each step.  probes: PSNR measured on the way.
     """
 
@@ -79,8 +80,6 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
         AaplugError: as `render`; also, the checkpoint is of another run, or no gradient is finite.
         KeyboardInterrupt: Ctrl-C stopped the run; its checkpoint is written.
     """
-    if options.learn_filters and options.method != CONSISTENCY_SETTINGS.name:
-        raise UsageError("learn_filters", f"is a method of its own, beside {options.method}")
     method = METHODS.find("learned-filters" if options.learn_filters else options.method, "method")
     path = None if output is None else Path(output)
     settings, viewer = settings_of(method, options), options.viewer or method.viewer
@@ -89,12 +88,18 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
     if isinstance(viewer, str):
         viewer = FAST if viewer == FAST.name else VIEWERS.find(viewer, "viewer")
     job = Job.of(scene, cameras, options)
-    check = partial(_check, path, job.scene.files, options.resume, options.overwrite)
+    resumes = options.resume and path is not None and _beside(path, "pt").exists()
+    replaces = options.overwrite or resumes  # beside a checkpoint, the other files are of the same run
+    check = partial(_check, path, job.scene.files, options.resume, replaces)
     check()
+    if (
+        path is not None
+        and LEARNED_COLUMNS in settings.rates
+        and not getattr(written_format(path), "keeps_extras", False)
+    ):
+        raise OutputError(path, "holds no learned filters; a .ply does")
     truth_source = source_of(job.cameras.train, options.truth)
     enlarge = back_projected if options.upsampler is None else upsampled(find_upsampler(options.upsampler))
-    if options.upsampler is not None and max(settings.weights) <= 1:
-        raise UsageError("upsampler", "makes what scales above 1 should show, and there is none: give such a `scale`")
     upsampler = str(options.upsampler)
     upsampler = digest_of_files([upsampler]) if Path(upsampler).is_file() else upsampler
     with running(options, path, check, job.inputs):
@@ -111,20 +116,24 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
         start = replace(before, scene=fused)
         truth = Truth(look, truth_source, enlarge=enlarge, memory=MEMORY)
         tuning = TuningJob(start, train, truth, settings, upsampler, method)
-        steps = f"{settings.name}, {settings.steps} steps, truth: {truth_source}"
+        steps = f"{settings.name}, {counted(settings.steps, 'step')}, truth: {truth_source}"
         job.monitor.say(f"tuning for {start.recipe.name} ({start.recipe.source}): {steps}")
         cost = _cost(start, train, settings)
-        job.announce([start], train, cost=cost, work=f"{settings.steps} steps", fewer="steps")
+        job.announce([start], train, cost=cost, work=counted(settings.steps, "step"), fewer="steps")
         job.say_assumed(look)
         checkpoint = path and _beside(path, "pt")
         state = tune(tuning, checkpoint, options.checkpoint_every, options.resume, job.monitor)
         record = {"for": viewer.name, "method": settings.name}
         result = tuned_scene(state, tuning, viewer.convention_of(raw), record)
+        written = result
         if path is not None:
-            write_scene(path, result, overwrite=options.overwrite, **viewer.spz(options.spz_axes))
+            files = viewer.spz(options.spz_axes)
+            write_scene(path, result, overwrite=replaces, **files)
+            reading = {"convention": result.convention, "spz_axes": files["spz_axes"]}
+            written = read_scene(path, **reading).gaussians()  # many formats hold less
         closed = [Candidate("closed form", start)] * (len(start.scene.fused) > len(raw.fused))
-        bounds = sampling_bounds(result.means, train)  # densification may have changed the number of Gaussians
-        after = replace(start, scene=result, training=replace(start.training, bounds=bounds))
+        bounds = sampling_bounds(written.means, train)  # densification may have changed the number of Gaussians
+        after = replace(start, scene=written, training=replace(start.training, bounds=bounds))
         candidates = [Candidate("before", before), *closed, Candidate("after", after)]
         scales = sorted({1.0, *settings.weights}, reverse=True)
         truth = replace(truth, source=source_of(job.views))
@@ -132,10 +141,10 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
             report = compare(candidates, job.views, scales, truth, tell)
         tuned = Tuned(result, report, settings, state.curve, state.probes)
         if path is not None:
-            with replacing(_beside(path, "json"), options.overwrite) as stream:
+            with replacing(_beside(path, "json"), replaces) as stream:
                 stream.write(json.dumps(tuned.as_json() | {"curve": list(tuned.curve)}, indent=1).encode())
             sheet = _sheet(candidates, job.views[0], scales, truth)
-            write_png(_beside(path, "png"), sheet, overwrite=options.overwrite)
+            write_png(_beside(path, "png"), sheet, overwrite=replaces)
             _beside(path, "pt").unlink(missing_ok=True)
     return tuned
 
@@ -145,14 +154,16 @@ def _beside(scene: Path, kind: str) -> Path:
     return scene.with_suffix(f".finetune.{kind}")
 
 
-def _check(path: Path | None, inputs: Sequence[Path], resume: bool, overwrite: bool) -> None:
-    """Check, before any work, the checkpoints, and that the scene and the files beside it may be written."""
+def _check(path: Path | None, inputs: Sequence[Path], resume: bool, replaces: bool) -> None:
+    """Check, before any work, that the scene and the files beside it may be written; a complete run is not resumed."""
     if path is None:
         if resume:
             raise UsageError("resume", "needs the `output` of the interrupted run")
         return
-    check_scene_output(path, overwrite, inputs)
-    for kind, replaces in (("json", overwrite), ("png", overwrite), ("pt", resume or overwrite)):
+    if resume and not replaces and path.exists() and _beside(path, "json").exists():
+        raise OutputError(path, "is of a run that is complete: nothing is left to resume; `overwrite` starts anew")
+    check_scene_output(path, replaces, inputs)
+    for kind in ("json", "png", "pt"):
         check_output(_beside(path, kind), replaces, inputs)
 
 

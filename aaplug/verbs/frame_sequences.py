@@ -13,7 +13,7 @@ from typing import Any
 
 from aaplug.io.atomic import check_output, refuse_existing, replacing
 from aaplug.io.video import CODECS
-from aaplug.system.errors import FormatError, OutputError, UsageError, listing
+from aaplug.system.errors import FormatError, OutputError, UsageError, counted, listing
 from aaplug.verbs.views import SUFFIXES, names_image
 
 PLACES = re.compile("#+")  # of a frame's number in a name
@@ -74,7 +74,8 @@ class FrameSequence:
         found = sorted(p.name for p in self.folder.iterdir()) if self.folder.is_dir() else []
         further = [name for name in found if numbered.fullmatch(name) and self.folder / name not in files]
         if further:
-            problem = f"holds {listing(further, most=3)}, which would follow these {self.count} frames; remove them"
+            frames = counted(self.count, "frame")
+            problem = f"holds {listing(further, most=3)}, which would follow the {frames}; remove them"
             raise OutputError(self.folder, problem)
         refuse_existing(files, overwrite or resume)
         if resume and not self.record.exists() and any(path.exists() for path in self.paths):

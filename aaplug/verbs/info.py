@@ -18,7 +18,7 @@ from aaplug.options.shared import FrameOptions, Orbit
 from aaplug.rendering.assumed import PROBE_ROWS, TRAINING_RATE, frame_around, rate_of
 from aaplug.rendering.job import CamerasLike, Job
 from aaplug.rendering.renderer import Renderer
-from aaplug.system.errors import UsageError
+from aaplug.system.errors import UsageError, counted
 from aaplug.verbs.verb import looks
 
 MAX_LOG_SCALE = 20.0  # larger ones are taken for scales
@@ -132,7 +132,7 @@ def _assumed_facts(statistics: Survey, cameras: CameraSet, frame: Frame) -> dict
 def _problems(scene: Scene, statistics: Survey, comments: Sequence[str]) -> Iterator[str]:
     """Yield what is odd about the scene, each with what to do."""
     for text, number in statistics.faults.items():
-        yield f"{number:,} Gaussians have {text}: --drop-bad leaves them out"
+        yield f"{counted(number, 'Gaussian')} with {text}: --drop-bad leaves such out"
     if not scene.count:
         yield "the scene is empty: check that it is the right file"
     if not statistics.count:

@@ -61,7 +61,7 @@ from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.rendering.renderer import Renderer, own_look
 from aaplug.rendering.visibility import MAX_VIEWS, visibility
 from aaplug.system.digests import digest_of_values
-from aaplug.system.errors import FormatError, FrameError, OutputError, UsageError
+from aaplug.system.errors import FormatError, FrameError, OutputError, UsageError, counted
 from aaplug.verbs.verb import writes
 
 MAX_NODE_SIZE = 1.0  # px: Spark replaces what is larger by its children
@@ -182,7 +182,7 @@ class _Maker:
             else:
                 lighter = merge_in_chunks(scene, rates, before.chunks, goal, tell, visible)
                 level = Level(lighter.scene, goal.rate, lighter.chunks, lighter.parents)
-        monitor.say(f"{len(level.scene):,} Gaussians for {goal.rate:.3g} × the training rate")
+        monitor.say(f"{counted(len(level.scene), 'Gaussian')} for {goal.rate:.3g} × the training rate")
         return self._tuned(level) if self.viewer is None else level
 
     def finished(self, level: Level, beside: Gaussians | None = None) -> Level:
@@ -259,7 +259,7 @@ def goals_of(options: LodOptions, scene: Gaussians) -> list[Goal]:
         assert options.simplify is not None
         count = round(options.simplify * (len(scene) if options.simplify <= 1 else 1))
     if count > len(scene):
-        raise UsageError("simplify", f"asks for {count:,} Gaussians, and the scene has {len(scene):,}")
+        raise UsageError("simplify", f"asks for {counted(count, 'Gaussian')}, and the scene has {len(scene):,}")
     goal = Goal.of_count(max(1, count), scene)
     return [goal if options.scale is None else replace(goal, rate=options.scale)]
 
@@ -280,7 +280,7 @@ def _levels(maker: _Maker, folder: Path | None, files: Sequence[Path]) -> Iterat
             raise UsageError("resume", f"{folder} holds levels of another scene, other cameras or other options")
         there = levels_in(pyramid, earlier)
         manifest = replace(manifest, count=max(len(goals) + 1, len(earlier.levels)), levels=earlier.levels)
-        maker.job.monitor.say(f"resumed: {len(earlier.levels) - 1} levels are there")
+        maker.job.monitor.say(f"resumed with {counted(len(earlier.levels) - 1, 'level')}")
     made = next(there, None) or Level(maker.scene, 1.0, chunks_of(maker.scene.means, MAX_CHUNK_GAUSSIANS))
     leaves, front = leaves_of(made), None
     for place in range(len(goals) + 1):

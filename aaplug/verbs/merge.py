@@ -22,7 +22,7 @@ from aaplug.methods.conversion import carried
 from aaplug.methods.filters.smoothing import fuse_stored
 from aaplug.options.verbs import MergeOptions
 from aaplug.rendering.job import CamerasLike, Job, running
-from aaplug.system.errors import UsageError
+from aaplug.system.errors import UsageError, counted
 from aaplug.verbs.verb import ScenesLike, compares
 
 TURNS = (3, 4)  # numbers of a turn: degrees about x, y and z, or a quaternion
@@ -65,7 +65,8 @@ def merge(scenes: ScenesLike, cameras: CamerasLike, output: AnyPath | None, opti
             part = fuse_stored((job.scene if job else scene).gaussians())
             if job:
                 training = TrainingViews.of(part, job.cameras, min_seen=options.min_seen)
-                views = job.cameras.notes[0] if job.cameras.assumed else f"by {len(training.cameras)} cameras"
+                known = f"by {counted(len(training.cameras), 'camera')}"
+                views = job.cameras.notes[0] if job.cameras.assumed else known
                 job.monitor.say(f"{scene.title}: converted from {part.convention.name} to {into.name}, {views}")
                 part = carried(part, training, into)
             if part.extras:
@@ -92,7 +93,7 @@ def _places(
         width, rest = divmod(len(values), count)
         if rest or width not in widths:
             wanted = " or ".join(f"{count * each}" for each in widths)
-            raise UsageError(name, f"expected {wanted} numbers for {count} scenes, got {len(values)}")
+            raise UsageError(name, f"expected {wanted} numbers for {counted(count, 'scene')}, got {len(values)}")
         return [values[i * width : (i + 1) * width] for i in range(count)]
 
     turns = list[Float[Tensor, "3 3"]]()

@@ -13,7 +13,7 @@ from aaplug.options.shared import ViewOptions
 from aaplug.options.verbs import PoseOptions
 from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.rendering.renderer import Renderer
-from aaplug.system.errors import UsageError
+from aaplug.system.errors import UsageError, counted
 from aaplug.verbs.verb import looks
 
 Refined = tuple[CameraSet, tuple[RefinedPose, ...]]
@@ -57,10 +57,11 @@ def refined(job: Job[ViewOptions], look: Renderer, views: Sequence[Camera]) -> R
     moved = {id(view): pose.camera for view, pose in zip(views, poses, strict=True)}
     splits = {s: tuple(moved.get(id(v), v) for v in vars(job.cameras)[s]) for s in ("train", "test")}
     changed = [(p.degrees, p.distance, p.before, p.after) for p in poses if p.after < p.before]
-    note = f"all {len(poses)} poses stay: their photographs show nothing better"
+    count = counted(len(poses), "pose")
+    note = f"{count}: none moved, as photographs show nothing better"
     if changed:
         turn, shift, before, after = map(median, zip(*changed, strict=True))
-        moves = f"{len(changed)} of {len(poses)} poses moved, in the median by {turn:.2g}° and {shift:.2g} units"
+        moves = f"{len(changed)} of {count} moved, in the median by {turn:.2g}° and {shift:.2g} units"
         note = f"{moves}: error at half size from {before:.1f} to {after:.1f} of 255 levels"
     job.monitor.say(note)
     return replace(job.cameras, **splits, notes=(*job.cameras.notes, note)), tuple(poses)

@@ -14,7 +14,7 @@ from aaplug.rendering.film import filmed
 from aaplug.rendering.frames import write_frames
 from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.rendering.renderer import Renderer
-from aaplug.system.errors import listing
+from aaplug.system.errors import counted, listing
 from aaplug.system.executors import ProcessesIfLong
 from aaplug.verbs.verb import writes
 from aaplug.verbs.views import eyes_of, image_paths, names_image, seen, storage_of
@@ -57,7 +57,7 @@ def render(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, optio
     check = partial(image_paths, target, views, options.overwrite, storage.format.suffixes[0])
     paths = check()
     with running(options, target, check, job.inputs, folder=not names_image(target)) as workers:
-        renderer = job.look(len(views)).by(job.recipe(options.recipe))
+        renderer = job.look(len(views)).by(*job.named(options.recipe))
         job.monitor.say(description(renderer, views))
         job.announce([renderer], views, processes=workers.threads)
         job.say_assumed(renderer, views[0])
@@ -79,6 +79,6 @@ def description(renderer: Renderer, views: Sequence[Camera]) -> str:
     span = " to ".join(dict.fromkeys(f"{rate:.3g}" for rate in (min(rates), max(rates))))
     kind = f"{renderer.training.convention.name} scene{' of 2D Gaussians' * renderer.scene.flat}"
     return (
-        f"recipe: {renderer.recipe.name} for a {kind}, {len(views)} view{'s' * (len(views) != 1)} at {sizes}, "
+        f"recipe: {renderer.recipe.name} for a {kind}, {counted(len(views), 'view')} at {sizes}, "
         f"{span} × the training rate: {grid} sample{'s' * (samples != [1])} per pixel{mean}"
     )

@@ -25,7 +25,7 @@ from aaplug.rendering.frames import write_frames
 from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.rendering.renderer import Renderer
 from aaplug.rendering.videos import make_video
-from aaplug.system.errors import OutputError, UsageError, listing
+from aaplug.system.errors import OutputError, UsageError, counted, listing
 from aaplug.system.executors import ProcessesIfLong
 from aaplug.verbs.frame_sequences import FrameSequence
 from aaplug.verbs.verb import writes
@@ -76,7 +76,7 @@ def video(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, option
         check()
     job = Job.of(scene, cameras, options)
     beside = "none" if alone or options.beside is None else options.beside
-    recipes = [job.recipe(name) for name in (beside, options.recipe) if name != "none"]
+    recipes = job.named(*(name for name in (beside, options.recipe) if name != "none"))
     path = file.cameras if file else _built_in_path(job, fps)
     views = seen(job, path, file.unsized if file else job.cameras.assumed)
     if len({view.hw for view in views}) > 1:
@@ -104,7 +104,7 @@ def video(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, option
         look = job.look(len(views) * len(recipes))
         renderers = [look.by(recipe) for recipe in recipes]
         size = f"{views[0].width}x{views[0].height}"
-        job.monitor.say(f"{len(views)} frames of {size} px per pane, {fps:g} per second")
+        job.monitor.say(f"{counted(len(views), 'frame')} of {size} px per pane, {fps:g} per second")
         job.announce(renderers * len(eyes), views, processes=workers.threads, fewer="seconds or frames per second")
         job.say_assumed(renderers[-1], views[0])
         with job.monitor.progress("rendering", "images") as tell:

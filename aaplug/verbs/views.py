@@ -16,7 +16,7 @@ from aaplug.io.image_formats import IMAGE_FORMATS, Storage
 from aaplug.options.shared import LensOptions, check_side, size_of
 from aaplug.options.verbs import RenderOptions, VideoOptions
 from aaplug.rendering.job import Job
-from aaplug.system.errors import OutputError, UsageError
+from aaplug.system.errors import OutputError, UsageError, counted
 
 SUFFIXES = [suffix for each in IMAGE_FORMATS.values() for suffix in each.suffixes]
 IMAGES = (*SUFFIXES, ".tif", ".tiff", ".bmp", ".gif")  # any other name is a folder
@@ -24,35 +24,24 @@ Drawn = TypeVar("Drawn", RenderOptions, VideoOptions)
 LONGEST_NAME = 200  # bytes; file systems take 255, and a number and a suffix are added
 
 
-def resized(
-    views: Sequence[Camera], scale: float | None = None, resolution: str | None = None, reframe: bool = False
-) -> list[Camera]:
-    """The views at the size that `ImageOptions` describes.
-
-    reframe: pixels stay square where a resolution changes the aspect.
-
-    Raises:
-        UsageError: both are given, one is not a size, or an image would be larger than `MAX_SIDE`.
-    """
-    if scale is not None and resolution is not None:
-        raise UsageError("scale", "and `resolution` both set the size; give one")
-    if resolution is not None:
-        sized = [(view.framed if reframe else view.resized)(*_size(resolution, view)) for view in views]
-    else:
-        sized = [view.scaled(1.0 if scale is None else scale) for view in views]
-    for view in sized:
-        check_side(view.name, view.width, view.height)
-    return sized
-
-
 def seen(job: Job[Drawn], views: Sequence[Camera], unsized: bool) -> list[Camera]:
     """The views through the lens and at the size that a job's options ask for.
 
-    unsized: see `resized`, there `reframe`.
+    unsized: pixels stay square where a resolution changes the aspect.
+
+    Raises:
+        UsageError: an image would be larger than `MAX_SIDE`.
     """
     options = job.options
     bent = through_lens(views, options, lambda view: median_depth(job.scene.gaussians().means, view))
-    return resized(bent, options.scale, options.resolution, unsized)
+    if options.resolution is None:
+        sized = [view.scaled(options.scale or 1.0) for view in bent]
+    else:
+        sizes = [size_of(options.resolution, shape=(view.width, view.height)) for view in bent]
+        sized = [(v.framed if unsized else v.resized)(*size) for v, size in zip(bent, sizes, strict=True)]
+    for view in sized:
+        check_side(view.name, view.width, view.height)
+    return sized
 
 
 def eyes_of(views: Sequence[Camera], options: LensOptions) -> list[Sequence[Camera]]:
@@ -133,7 +122,7 @@ def image_paths(output: Path, views: Sequence[Camera], overwrite: bool, suffix: 
     if names_image(output):
         if output.suffix.lower() not in SUFFIXES or len(views) != 1:
             one = f"one {', '.join(SUFFIXES)} for one view"
-            raise OutputError(output, f"name a folder, or {one} ({len(views)} views asked for)")
+            raise OutputError(output, f"name a folder, or {one} ({counted(len(views), 'view')} asked for)")
         check_output(output, overwrite)
         return [output]
     paths = [output / f"{name}{suffix}" for name in file_names([view.name for view in views], "view", 5)]
@@ -147,18 +136,6 @@ def file_names(names: Sequence[str], nameless: str, digits: int) -> list[str]:
     if len({slug.casefold() for slug in slugs}) < len(slugs):
         return [f"{index:0{digits}d}_{slug}" for index, slug in enumerate(slugs)]
     return slugs
-
-
-def _size(text: str, view: Camera) -> tuple[int, int]:
-    """The size that the text means for a view: -1 on one side keeps the view's aspect."""
-    first, _, last = text.partition("x")
-    if first == "-1":
-        _, height = size_of(f"1x{last}")
-        return max(1, round(view.width * height / view.height)), height
-    if last == "-1":
-        width, _ = size_of(f"{first}x1")
-        return width, max(1, round(view.height * width / view.width))
-    return size_of(text)
 
 
 def _cut(slug: str) -> str:

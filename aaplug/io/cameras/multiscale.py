@@ -14,7 +14,7 @@ from aaplug.io.cameras.options import CameraFileOptions, described_sizes, explic
 from aaplug.io.cameras.photos import PhotoFolder, distinct, last_part, refuse_folder, without_suffix
 from aaplug.io.cameras.poses import centred, inverse, pose_of_opengl, rigid
 from aaplug.io.values import Entry, Place, focal, mentions, object_of, pixels, read_json, text
-from aaplug.system.errors import UsageError
+from aaplug.system.errors import UsageError, counted
 
 FILE = "metadata.json"
 COLUMNS = ("file_path", "cam2world", "width", "height", "focal")
@@ -39,7 +39,7 @@ def read(path: Path, options: CameraFileOptions) -> CameraSet:
     train, test = (_cameras(document, split) if split in document else [] for split in ("train", "test"))
     trained, held_out = (trained_at(views, file_sizes(views, options)[0]) for views in (train, test))
     split = explicit(trained, held_out, FILE) if held_out else undivided(trained, f"no test in {FILE}")
-    what = f"multi-scale Blender: {len(train) + len(test)} cameras, {described_sizes(train)}"
+    what = f"multi-scale Blender: {counted(len(train) + len(test), 'camera')}, {described_sizes(train)}"
     size = "training size: each photo's own, as all scales were trained on"
     return CameraSet(split.train, split.test, WHITE, (what, split.note, size, "background: white, Blender's custom"))
 

@@ -12,7 +12,7 @@ from aaplug.core.cameras import Camera, CameraSet
 from aaplug.io.images import image_size
 from aaplug.io.limits import whole_limit
 from aaplug.system.contracts import check_fields
-from aaplug.system.errors import FormatError, UsageError
+from aaplug.system.errors import FormatError, UsageError, counted
 
 LLFF_HOLD = 8  # every 8th view by name is a test view: LLFF, 3DGS --eval
 MAX_ASPECT_ERROR = 0.01  # relative difference between a photo's aspect and its camera's that rounding explains
@@ -61,7 +61,7 @@ def explicit(train: Sequence[Camera], test: Sequence[Camera], source: str) -> Sp
 def undivided(cameras: Sequence[Camera], source: str) -> Split:
     """No split: every camera is both a training and a test view."""
     views = tuple(cameras)
-    return Split(views, views, f"split: none, all {len(views)} cameras are train and test ({source})")
+    return Split(views, views, f"split: none, {counted(len(views), 'camera')} for both training and test ({source})")
 
 
 def every_nth(cameras: Sequence[Camera], options: CameraFileOptions, custom: int, source: str) -> Split:
@@ -129,7 +129,7 @@ def camera_set(
 
     source: the cameras as the file has them.  why: where the training size came from.  more: notes to add.
     """
-    format = f"{kind}: {len(source)} cameras, {described_sizes(source)} in the file"
+    format = f"{kind}: {counted(len(source), 'camera')}, {described_sizes(source)} in the file"
     size = f"training size: {described_sizes([*split.train, *split.test])} ({why})"
     return CameraSet(split.train, split.test, background, (format, split.note, size, *more))
 

@@ -132,7 +132,8 @@ def read_source(file: Path, options: CameraFileOptions) -> Source:
     folder = PhotoFolder(file.parent, file.parent)
     photos = [None if EXPORTED in f else folder.find(f.get("file_path", text), f.place) for f in frames]
     paths = [frame.get("file_path", text) for frame in frames]
-    names = distinct(file, paths, (last_part, without_suffix, str))
+    found = [str(photo.relative_to(file.parent)) if photo else path for path, photo in zip(paths, photos, strict=True)]
+    names = distinct(file, found, (last_part, without_suffix, str))
     photo = next(filter(None, photos), None)
     spare = image_size(photo) if photo else None  # for frames without w, h and photo
     parser = None if exported else _dataparser(file.parent / DATAPARSER)

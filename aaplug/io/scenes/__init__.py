@@ -29,7 +29,7 @@ from aaplug.io.scenes.rows import library_errors
 from aaplug.io.scenes.scene import MODEL_SCENE, SOG_FOLDER, Scene, SceneFrames
 from aaplug.io.values import read_start
 from aaplug.system.contracts import contract
-from aaplug.system.errors import FormatError, OutputError, UsageError
+from aaplug.system.errors import FormatError, OutputError, UsageError, listing
 from aaplug.system.extras import install_command
 from aaplug.system.registry import Registry, named
 
@@ -158,7 +158,11 @@ def read_scene(
         reading = partial(read_scene, convention=convention, drop_bad=drop_bad)
         frames = SceneFrames((*numbered,), (*numbered.values(),), reading, frames_apart)
         frames.check()
+        suffixes, names = tuple(f".{format.name}" for format in formats), {file.name for file in frames.paths}
+        others = sorted(f.name for f in given.iterdir() if f.name.lower().endswith(suffixes) and f.name not in names)
         notes = (*scene.notes, f"the first of {len(frames)} frames, to {frames.paths[-1].name}")
+        if others:
+            notes = (*notes, f"no frames, and left out: {listing(others)}")
         scene = replace(scene, folder=given, frames=frames, others=frames.paths[1:], notes=notes)
     if manifest is not None:
         folder = given

@@ -26,7 +26,7 @@ from aaplug.io.scenes.ply_header import LITTLE, Header, check_size, is_packed, p
 from aaplug.io.scenes.ply_tags import meaning_in_run, stating
 from aaplug.io.scenes.rows import check_count, library_errors
 from aaplug.io.scenes.scene import Scene
-from aaplug.system.errors import FormatError, OutputError, listing
+from aaplug.system.errors import FormatError, OutputError, counted, listing
 
 REST = re.compile(r"f_rest_\d+")
 COLOURS = ("f_dc_0", "f_dc_1", "f_dc_2")
@@ -117,7 +117,7 @@ def _check_columns(header: Header) -> list[str]:
     double = [p.name for p in used if p.code == "f8"]
     notes = {
         f"coding: {header.coding}": header.coding != LITTLE,
-        f"{len(double)} columns of float64, used as float32": double,
+        f"{counted(len(double), 'column')} of float64, used as float32": double,
         "pixel sizes of Multi-Scale 3DGS, for the recipe multi-scale": all(c in columns for c in EXTRAS),
         "learned filters, for the recipe learned": any(map(LEARNED_COLUMN.fullmatch, columns)),
         "colours from the columns red, green, blue; no harmonics": coloured,

@@ -164,7 +164,7 @@ def _bin(
     tiles, splats = kernels.run(PAIRS, runs_of(starts, widths), starts, first, owners)
     tile = torch.arange(size, device=order.device)
     origins = (torch.stack([tile % columns, tile // columns + rows[0]], dim=1) * TILE).to(boxes.table)
-    by_ray = None if drawn.ray_slopes is None else _by_ray(drawn, drawn.ray_slopes, splats, origins, tiles)
+    by_ray = _by_ray(drawn, splats, origins, tiles)
     by_tile, pairs = torch.sort(tiles if by_ray is None else tiles.index_select(0, by_ray), stable=True)
     pairs = pairs if by_ray is None else by_ray.index_select(0, pairs)
     lists = splats.index_select(0, pairs) if len(pairs) else splats.new_zeros(1)
@@ -178,10 +178,12 @@ def _bin(
 
 
 def _by_ray(
-    drawn: Splats2D, slopes: Tensor, splats: Int[Tensor, " p"], origins: Float[Tensor, "t 2"], tiles: Int[Tensor, " p"]
-) -> Int[Tensor, " p"]:
-    """The order of pairs by the depth of their splats along the rays of their tiles' middles."""
-    columns = [*(drawn.means - TILE / 2).unbind(dim=1), *slopes.unbind(dim=1), drawn.depths]
+    drawn: Splats2D, splats: Int[Tensor, " p"], origins: Float[Tensor, "t 2"], tiles: Int[Tensor, " p"]
+) -> Int[Tensor, " p"] | None:
+    """The order of pairs by the depth of their splats along the rays of their tiles' middles; None without slopes."""
+    if drawn.ray_slopes is None:
+        return None
+    columns = [*(drawn.means - TILE / 2).unbind(dim=1), *drawn.ray_slopes.unbind(dim=1), drawn.depths]
     x, y, right, down, depths = (column.index_select(0, splats) for column in columns)
     left, top = (column.index_select(0, tiles.int()) for column in origins.unbind(dim=1))
     return _sorted(ordering_depths(depths, (right * (left - x)).addcmul_(down, top - y)))
