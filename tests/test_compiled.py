@@ -187,7 +187,7 @@ def test_a_library_is_unpacked_and_compared_once_until_it_changes(copied_cache, 
 
 DRAWS = """if True:
     import os, resource, signal, sys
-    from tests.conftest import make_camera, make_scene
+    from aaplug.evaluation.laws.base import make_camera, make_scene
     from aaplug.rendering.renderer import Renderer
     resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
     renderer = Renderer.of(make_scene(100), [make_camera()], "classic")

@@ -133,8 +133,12 @@ RANGES = {"spz": (-1, 127 / 128), "spz.glb": (-1, 127 / 128), "compressed.ply": 
 SORTED = ("sog", "meta.json", "compressed.ply")  # formats whose writer sorts
 
 
-@pytest.mark.parametrize(("degree", "convention"), [(0, CLASSIC), (1, CLASSIC), (2, MIP), (3, ANTIALIASED), (3, MIP)])
-@pytest.mark.parametrize("name", WRITABLE)
+HELD = [(0, CLASSIC), (1, CLASSIC), (2, MIP), (3, ANTIALIASED), (3, MIP)]
+# files of USD differ in what holds their prims, so one scene is enough for all but the first
+WRITES = [(n, *held) for n in WRITABLE for held in HELD if n not in usd.SUFFIXES[1:] or held == (3, ANTIALIASED)]
+
+
+@pytest.mark.parametrize(("name", "degree", "convention"), WRITES)
 def test_what_is_written_is_read_within_steps_and_written_again_as_it_is(
     tmp_path: Path, expected, name, degree, convention, caplog
 ):
