@@ -32,7 +32,7 @@ from aaplug.io.scenes.spz import AXES, packed
 from aaplug.system.errors import FormatError, OutputError, UsageError
 from aaplug.system.registry import Registry, named
 from tests.conftest import SAMPLE
-from tests.scene_files import DATA, MADE, ksplat, oracle, splat, splats, spz, write_file
+from tests.scene_files import DATA, MADE, ksplat, oracle, splat, splats, write_file
 
 MADE_SPZ = ("v1.spz", "v2.spz", "raw.spz", "degree4.spz")
 CARRY_A_TAG = dict.fromkeys(
@@ -210,14 +210,6 @@ def test_a_format_that_is_not_written_says_which_are(tmp_path: Path, expected):
     for name in ("a.ksplat", "a.pt", "a"):
         with pytest.raises(OutputError, match=r"can be written: \.compressed\.ply, \.ply, \.spz, \.sog, \.splat"):
             write_scene(tmp_path / name, expected)
-
-
-def test_spz_axes_can_be_left_as_they_are(tmp_path: Path):
-    (tmp_path / "a.spz").write_bytes(spz(2))
-    turned = read_scene(tmp_path / "a.spz").gaussians()
-    stored = read_scene(tmp_path / "a.spz", spz_axes="opencv").gaussians()
-    assert torch.equal(stored.means, turned.means * torch.tensor([1.0, -1.0, -1.0]))
-    assert "axes as stored" in read_scene(tmp_path / "a.spz", spz_axes="opencv").notes[1]
 
 
 def test_a_half_turn_of_the_scene_is_a_half_turn_of_the_view():
