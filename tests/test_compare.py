@@ -230,7 +230,7 @@ def test_bad_input_is_one_line(cli, words):
     assert REFUSED[words] in err.splitlines()[-1]
 
 
-def test_files_and_a_continued_run(cli, plots_drawn_once, monkeypatch):
+def test_files_and_a_continued_run(cli, monkeypatch):
     scene = read_scene("scene.ply").gaussians()
     write_scene("dim.ply", replace(scene, logit_opacities=scene.logit_opacities - 1))
     words = f"compare scene.ply dim.ply {WORDS} -o out --show 1"
