@@ -1,10 +1,14 @@
 """Tests, and how they check the types and shapes of what aaplug's functions take and return, by jaxtyping and beartype.
 
 Checks took half of the time of all tests.  So those of functions inside functions are left out, which would be compiled
-at every call of the outer one, and of each test the first `MOST_CHECKS` are made.
+at every call of the outer one, and in each test the first `CHECKS_OF_EACH` of a function are made, and `MOST_CHECKS` in
+all.
+
+Programs that tests start have one thread, and threads that wait do not spin: tests run side by side.
 """
 
 import ast
+import os
 from collections.abc import Callable
 from contextlib import suppress
 from functools import wraps
@@ -12,31 +16,37 @@ from typing import Any
 
 import jaxtyping
 
-MOST_CHECKS = 5000  # of a test: twice as many as calls
+CHECKS_OF_EACH = 50  # of what a function takes or gives
+MOST_CHECKS = 10_000  # twice as many as calls
 
+os.environ |= {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive"}  # read when torch is imported, after this
+_test = 0
 _left = MOST_CHECKS
 
 
 def check_again() -> None:
     """Make the checks of another test."""
-    global _left
-    _left = MOST_CHECKS
+    global _test, _left
+    _test, _left = _test + 1, MOST_CHECKS
     jaxtyping.config.update("jaxtyping_disable", False)
 
 
 def with_checks(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function with its checks."""
+    """The function with its checks: jaxtyping's own, which does nothing else."""
     from beartype import beartype
 
-    check = beartype(function)
+    check, test, left = beartype(function), 0, CHECKS_OF_EACH
 
     @wraps(function)
     def call(*args: Any, **options: Any) -> Any:
         global _left
-        _left -= 1
+        nonlocal test, left
+        if test != _test:
+            test, left = _test, CHECKS_OF_EACH
+        left, _left = left - 1, _left - 1
         if not _left:
             jaxtyping.config.update("jaxtyping_disable", True)
-        return check(*args, **options)
+        return check(*args, **options) if left >= 0 else None
 
     return call
 

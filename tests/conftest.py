@@ -133,6 +133,24 @@ def cli(dataset, tmp_path, monkeypatch, capsys):
     return run
 
 
+_drawn: dict[tuple[str, str, str], bytes] = {}
+
+
+@pytest.fixture
+def plots_drawn_once(monkeypatch) -> None:
+    """Of the plots of one name the first is drawn, and its picture stands for the others: drawing takes longest."""
+    from aaplug.evaluation.report.plots import Plot  # programs that import this file need no matplotlib
+
+    draw = Plot._saved
+
+    def saved(plot: Plot, kind: str, ink: str, **settings: Any) -> bytes:
+        if (key := (plot.name, kind, ink)) not in _drawn:
+            _drawn[key] = draw(plot, kind, ink, **settings)
+        return _drawn[key]
+
+    monkeypatch.setattr(Plot, "_saved", saved)
+
+
 def write_transforms(folder: Path, split: str, eyes: list[tuple[float, float, float]]) -> None:
     cameras = [make_camera(eye, SIZE) for eye in eyes]
     flip = np.diag([1.0, -1.0, -1.0, 1.0])  # Blender looks along −z with y up

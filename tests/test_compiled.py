@@ -187,7 +187,7 @@ def test_a_library_is_unpacked_and_compared_once_until_it_changes(copied_cache, 
 
 DRAWS = """if True:
     import os, resource, signal, sys
-    from tests.conftest import make_camera, make_scene
+    from aaplug.evaluation.laws.base import make_camera, make_scene
     from aaplug.rendering.renderer import Renderer
     resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
     renderer = Renderer.of(make_scene(100), [make_camera()], "classic")
@@ -390,15 +390,20 @@ def test_a_compiler_that_does_not_run_has_no_version():
     assert compiled._compiler_version(sys.executable).startswith("Python 3.")
 
 
-def test_names_of_packages_are_the_same_in_every_process():
+def test_names_of_packages_and_digests_of_recipes_are_the_same_in_every_process():
     """Also where annotations of arrays are not checked, as in the user's process."""
     program = (
         "import json; from aaplug.methods import RECIPES; from aaplug.rasterizers.tiled.ahead_of_time import *;"
         "kernels = [*kernels_of([*RECIPES.values()]), *TRAINER_KERNELS];"
-        "print(json.dumps({kernel.name: package_path(kernel).name for kernel in kernels}))"
+        "packages = {kernel.name: package_path(kernel).name for kernel in kernels};"
+        "print(json.dumps([packages, {name: recipe.digest for name, recipe in RECIPES.items()}]))"
     )
-    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert json.loads(done.stdout) == paths(ALL_KERNELS)
+    other = os.environ | {"PYTHONHASHSEED": "7"}
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=ROOT, env=other, capture_output=True, text=True, check=True
+    )
+    digests = {name: recipe.digest for name, recipe in RECIPES.items()}
+    assert json.loads(done.stdout) == [paths(ALL_KERNELS), digests]
 
 
 def test_a_recipe_says_which_kernels_it_needs():

@@ -36,6 +36,7 @@ SHORTER = {  # options that make a documented command quicker; they come last, s
     "bench": ["--repeats", "1", "--gaussians", "100"],
 }
 FITTING = ["--steps", "2"]  # of `convert --for`, likewise
+ONE_WORKER = ["--threads", "1"]  # of `--scheduler local`
 NERFBASELINES = (
     "nerfbaselines train --method aaplug --data chair --output run"
     " --set scene=$PWD/chair.ply --backend python --disable-output-artifact",
@@ -177,7 +178,7 @@ def camera_path(folder: Path) -> dict[str, object]:
 
 
 @pytest.fixture
-def here(prepared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def here(prepared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, plots_drawn_once: None) -> Path:
     """A fresh copy of the folder, to run in."""
     shutil.copytree(prepared, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
@@ -199,9 +200,10 @@ def test_documented_commands_run(block, here, capsys):
     for line in lines_of(block):
         if line in ELSEWHERE:
             continue
-        program, verb, *words = shlex.split(line)
+        program, verb, *words = shlex.split(re.sub(r"--resolution \d+x\d+", "--resolution 64x36", line))
         assert program == "aaplug", f"{line}: run this too, or say in ELSEWHERE who does"
         shorter = FITTING if verb == "convert" and "--for" in words else SHORTER.get(verb, [])
+        shorter = ONE_WORKER if "local" in words else shorter
         with pytest.raises(SystemExit) as stop:
             main([verb, *words, *shorter])
         printed = capsys.readouterr()

@@ -16,7 +16,6 @@ import torch
 from aaplug.system.cores import FREE_CORES, FreeCores, Reading, on_free_cores
 from aaplug.system.errors import FormatError, UsageError, within_memory
 from aaplug.system.executors import Processes, Threads, torch_threads
-from aaplug.system.locks import scratch
 from tests.conftest import ROOT
 
 PARENT = """
@@ -157,18 +156,18 @@ def test_torch_has_as_many_threads_as_cores_are_free_and_then_its_own_number(mon
         assert torch.get_num_threads() == 2
 
 
-def hold(item: int) -> None:
+HOLDS = """
+import signal, time
+from aaplug.system.executors import Processes
+from aaplug.system.locks import scratch
+from aaplug.system.signals import end_as_by_interrupt
+
+def hold(item):
     with scratch():
         time.sleep(item)
 
-
-HOLDS = """if __name__ == "__main__":
-    import signal
+if __name__ == "__main__":
     signal.signal(signal.SIGHUP, signal.SIG_DFL)  # the tests may run where nohup ignores it
-    from aaplug.system.executors import Processes
-    from aaplug.system.locks import scratch
-    from aaplug.system.signals import end_as_by_interrupt
-    from tests.test_executors import hold
     end_as_by_interrupt()
     with scratch():
         print("working", flush=True)
@@ -222,9 +221,9 @@ LIMITED = """if True:
     import resource
     from pathlib import Path
     import torch
+    from aaplug.evaluation.laws.base import make_camera, make_scene
     from aaplug.rendering.renderer import Renderer
     from aaplug.system.errors import UsageError
-    from tests.conftest import make_camera, make_scene
     torch.set_num_threads(1)
     renderer = Renderer.of(make_scene(200), [make_camera()], "classic")
     renderer(make_camera())

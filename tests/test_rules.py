@@ -42,8 +42,8 @@ rules = each(OTHERS)
 
 def opaque_splats():
     """Splats of which many reach every cap, cut-off and stop."""
-    splats = make_splats(300, HW, 4, (0.0, 2.0)).to(F64)
-    slopes = torch.zeros(300, 2, dtype=F64)
+    splats = make_splats(150, HW, 4, (0.0, 2.0)).to(F64)
+    slopes = torch.zeros(150, 2, dtype=F64)
     return replace(splats, opacities=(1.1 * splats.opacities.sqrt()).clamp(max=1), depth_slopes=slopes)
 
 

@@ -4,31 +4,17 @@ import json
 import subprocess
 import sys
 
-import pytest
-
 from tests.conftest import ROOT
 
 LEAST_CALLS = 3000
 
 
-@pytest.fixture(scope="module")
-def ends():
+def test_every_public_function_refuses_wrong_values_at_once_and_in_our_words():
     command = [sys.executable, "-m", "tests.wrong_calls"]
-    return json.loads(subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True, timeout=300).stdout)
-
-
-def test_no_wrong_call_ends_in_an_error_of_another_library(ends):
-    assert not ends["raw"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True, timeout=300)
+    ends = json.loads(done.stdout)
     assert ends["calls"] >= LEAST_CALLS
-
-
-def test_every_public_function_is_called(ends):
-    assert not ends["forgotten"]
-
-
-def test_no_function_takes_a_stranger(ends):
-    assert not ends["passed"]
-
-
-def test_a_wrong_call_takes_less_than_a_second(ends):
-    assert not ends["slow"]
+    assert not ends["forgotten"], "functions that are not called"
+    assert not ends["raw"], "errors of another library"
+    assert not ends["passed"], "a stranger was taken"
+    assert not ends["slow"], "a second or more"
