@@ -4,11 +4,12 @@ Checks took half of the time of all tests.  So those of functions inside functio
 at every call of the outer one, and in each test the first `CHECKS_OF_EACH` of a function are made, and `MOST_CHECKS` in
 all.
 
-Programs that tests start have one thread, and threads that wait do not spin: tests run side by side.
+Tests run side by side, so they and the programs that they start have one thread, and threads that wait do not spin.
 """
 
 import ast
 import os
+import sys
 from collections.abc import Callable
 from contextlib import suppress
 from functools import wraps
@@ -19,7 +20,8 @@ import jaxtyping
 CHECKS_OF_EACH = 50  # of what a function takes or gives
 MOST_CHECKS = 10_000  # twice as many as calls
 
-os.environ |= {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive"}  # read when torch is imported, after this
+if "pytest" in sys.modules:  # benches measure without these; torch reads them when it is imported, after this
+    os.environ |= {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive"}
 _test = 0
 _left = MOST_CHECKS
 
