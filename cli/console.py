@@ -137,7 +137,8 @@ class Terminal(Monitor):
             now, pace = time.monotonic(), rate(done)
             if done == total or now - told >= LINE_SECONDS:
                 eta = f", about {(total - done) / rate.value:.0f} s left" if rate.value and done < total else ""
-                say(f"{what}: {done:,} of {counted(total, unit.removesuffix('s'))}{pace}{self._workers}{eta}")
+                all_of = counted(total, unit[:-1]) if unit.endswith("s") else f"{total} {unit}"
+                say(f"{what}: {done:,} of {all_of}{pace}{self._workers}{eta}")
                 told = now
 
         return tell

@@ -17,7 +17,17 @@ from aaplug.evaluation.engine import Candidate, Task, candidates_of, compare, ev
 from aaplug.evaluation.image_store import ImageStore
 from aaplug.evaluation.metric import Metric, TimedRenderer
 from aaplug.evaluation.metrics import CONSISTENCY, ENERGY, FLICKER, PSNR, SSIM, psnr
-from aaplug.evaluation.results import CEILING, NO_PHOTOGRAPH, as_csv, mean, per_view, results, scale_name, tables
+from aaplug.evaluation.results import (
+    CEILING,
+    NO_PHOTOGRAPH,
+    as_csv,
+    mean,
+    metric_grid,
+    per_view,
+    results,
+    scale_name,
+    tables,
+)
 from aaplug.evaluation.truth import CACHE_DTYPE, Truth, back_projected
 from aaplug.io.images import read_image, write_png
 from aaplug.methods import RECIPES
@@ -111,6 +121,10 @@ def test_reports_hold_every_view_recipe_and_scale(look, views):
         assert [column.header for column in table.columns] == ["recipe", "1", "1/2", "2×"]
     lines = [f"no {name} at 2×: {NO_PHOTOGRAPH}" for name in ("PSNR", "SSIM")]
     assert (len(grids), [table for table in tables(report) if isinstance(table, str)]) == (4, lines)
+    other = replace(report, measurements=tuple(replace(m, note="") for m in report.measurements))
+    cells = [["30", "–", "–"]] * 3
+    assert NO_PHOTOGRAPH in metric_grid("of two scenes", [other, report], report.metrics[0], cells)[-1]
+    assert NO_PHOTOGRAPH not in metric_grid("of one", [other], report.metrics[0], cells)[-1]
     lines = as_csv({'a "scene"': report}).splitlines()
     assert lines[0] == "scene,protocol,recipe,scale,view,PSNR,SSIM,samples,evaluations,seconds,note"
     assert len(lines) == 1 + len(report.measurements)

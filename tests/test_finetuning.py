@@ -60,6 +60,14 @@ def after(job: TuningJob, steps: int | None = None) -> State:
     return state
 
 
+def test_only_the_first_gaussians_move():
+    job = replace(make_job(settings=replace(SETTINGS, anchor=0.0)), moving=20)
+    scene = after(job).scene(job)
+    for name, column in scene.columns.items():
+        assert torch.equal(column[20:], job.start.scene.columns[name][20:]), name
+        assert not torch.equal(column[:20], job.start.scene.columns[name][:20]), name
+
+
 # losses
 
 

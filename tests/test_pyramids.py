@@ -304,7 +304,7 @@ def test_building_goes_on_where_it_stopped(cli, folder):
     assert "lists 2 of 3 levels, as making them was interrupted; `aaplug lod --resume`" in unfinished[2]
     code, _, err = cli("lod scene.ply --cameras . -o levels --levels 2 --steps 3 --resume")
     assert code == 0, err
-    assert "resumed: 1 level" in err
+    assert "resumed with 1 level" in err
     assert {file.name: file.read_bytes() for file in folder.iterdir()} == first
     refusal = cli("lod scene.ply --cameras . -o levels --levels 2 --steps 4 --resume")
     assert refusal[0] == 2

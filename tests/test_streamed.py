@@ -116,7 +116,7 @@ def read_rad(path):
 
 def test_a_rad_is_a_tree_of_the_levels(tmp_path, monkeypatch):
     """Spark draws the leaves nearby, and the coarsest level at its rate: it exchanges what is larger than a pixel."""
-    monkeypatch.setattr(rad, "CHUNK", 100)
+    monkeypatch.setattr(rad, "CHUNK_GAUSSIANS", 100)
     monkeypatch.setattr(rad, "MAX_CHILDREN", 99)
     seen = SCENE[median_rates(SCENE.means, CAMERAS.train) > 0]
     small = replace(seen, log_scales=seen.log_scales - 2)
@@ -159,7 +159,7 @@ def test_a_run_that_was_cut_short_is_resumed(tmp_path, small_leaves, monkeypatch
     def contents(folder):
         return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
-    tuned = {"refine": True, "steps": 2} if to == "sog" else {}
+    tuned = {} if to == "3dtiles" else {"refine": True, "steps": 2}
     made(tmp_path / "whole", to, **tuned)
     writer, number_at = ("write_front", 1) if to == "rad" else ("write_level", 2)
     written, resumed = getattr(streamed, writer), []
@@ -204,10 +204,53 @@ def test_damaged_facts_of_parts_are_refused(tmp_path, text, said):
         streamed.write_index(tmp_path, "sog", 1, 1.0)
 
 
+def test_every_gaussian_of_a_tree_has_its_parent_however_many_siblings(monkeypatch):
+    monkeypatch.setattr(rad, "MAX_CHILDREN", 5)
+    generator = torch.Generator().manual_seed(0)
+    parents = torch.cat([torch.randint(380, 400, (380,), generator=generator), torch.full((20,), -1)])
+    tree = rad.tree_of(SCENE, parents)
+    assert tree.counts.max() <= 5
+    above = torch.full((len(tree.scene),), -1)
+    for place, (count, start) in enumerate(zip(tree.counts.tolist(), tree.starts.tolist(), strict=True)):
+        assert (above[start : start + count] == -1).all()
+        above[start : start + count] = place
+    assert (above[1:] >= 0).all()
+    written = {tuple(mean): place for place, mean in enumerate(tree.scene.means.tolist())}
+    for mean, parent in zip(SCENE.means.tolist(), parents.tolist(), strict=True):
+        place = above[written[tuple(mean)]]
+        while tree.scene.opacities[place] == 0 and place > 0:
+            place = above[place]
+        assert place == (written[tuple(SCENE.means[parent].tolist())] if parent >= 0 else 0)
+
+
+@pytest.mark.parametrize("scene", ["faint", "large, of degree 4", "in float64"])
+def test_levels_that_add_nothing_to_a_tree(tmp_path, scene):
+    given = {
+        "faint": replace(SCENE, log_scales=SCENE.log_scales - 8, logit_opacities=SCENE.logit_opacities - 20),
+        "large, of degree 4": replace(make_scene(400, degree=4), log_scales=SCENE.log_scales + 3),
+        "in float64": SCENE.to(torch.float64),
+    }[scene]
+    levels = aaplug.lod(given, CAMERAS, tmp_path, to="rad", levels=3, refine=False, min_seen=0.0)
+    assert len(levels[0].scene) == 400
+    assert read_rad(tmp_path / "scene.rad")["child_count"][:, 0].max() > 0
+    assert {path.name for path in tmp_path.iterdir()} == {"scene.rad", streamed.SETTINGS}
+
+
+def test_settings_are_of_the_rule_that_levels_are_for(tmp_path):
+    for viewer, blur in ("spark-mip", (0.0, 0.1)), ("spark-classic", (0.3, 0.0)):
+        options = {"viewer": viewer, "refine": True, "steps": 1, "overwrite": True}
+        made(tmp_path, "rad", levels=1, **options)
+        found = json.loads((tmp_path / streamed.SETTINGS).read_text())["SparkRenderer"]
+        assert (found["preBlurAmount"], found["blurAmount"]) == blur
+
+
 def test_a_damaged_tree_is_refused(tmp_path):
     front = streamed.Front.of(SCENE)
     streamed.write_front(tmp_path, 0, front, 0)
     assert torch.equal(streamed.read_front(tmp_path, 0).parents, front.parents)
+    streamed.write_front(tmp_path, 0, front, len(SCENE))  # nothing new: the file of before is gone
+    with pytest.raises(FormatError, match="to the 0 Gaussians"):
+        streamed.read_front(tmp_path, 0)
     streamed.write_front(tmp_path, 0, front._replace(parents=torch.arange(len(SCENE)) - 1), 0)
     with pytest.raises(FormatError, match=r"tree\.npz.*does not belong to the 400 Gaussians"):
         streamed.read_front(tmp_path, 0)
@@ -220,6 +263,21 @@ def test_levels_that_are_there_are_not_replaced(tmp_path):
     made(tmp_path / "out", "sog")
     with pytest.raises(OutputError, match="already holds lod-meta"):
         made(tmp_path / "out", "sog", resume=True)
+
+
+def test_fronts_are_removed_and_nothing_else(tmp_path):
+    """Levels for another viewer in the same folder stay, and so do files whose names are like a front's."""
+    mine = [tmp_path / name / streamed.TREE for name in ("mine_0", "2_0/deeper")]
+    for path in mine:
+        path.parent.mkdir(parents=True)
+        path.write_text("keep")
+    made(tmp_path, "sog")
+    others = {path for path in tmp_path.rglob("*") if path.is_file() and path.name != streamed.SETTINGS}
+    made(tmp_path, "rad")
+    assert {path for path in tmp_path.rglob("*") if path.is_file() and path.name != streamed.SETTINGS} == {
+        *others,
+        tmp_path / "scene.rad",
+    }
 
 
 @pytest.mark.parametrize("to", ["sog", "3dtiles"])

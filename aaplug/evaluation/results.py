@@ -177,22 +177,26 @@ def tables(report: Report) -> list[Table | str]:
         title = f"{metric.name}{flavour}{metric.title.removeprefix(metric.name)}, {subject}"
         rows = metric_cells(report, metric)
         lines = [[f"[bold]{cell.text}[/]" if cell.best else cell.text for cell in row] for row in rows]
-        grids += metric_grid(title, report, metric, lines, "italic")
+        grids += metric_grid(title, [report], metric, lines, "italic")
     for title, rows in cost_cells(report):
         grids.append(grid(title, report, [[cell.text for cell in row] for row in rows]))
     return grids
 
 
 def metric_grid(
-    title: str, report: Report, metric: Metric, lines: list[list[str]], ceiling: str | None = None
+    title: str, reports: Sequence[Report], metric: Metric, lines: list[list[str]], ceiling: str | None = None
 ) -> list[Table | str]:
-    """A metric's table as `grid`, unless it has no value at all, and a line that says at which scales, and why."""
+    """A metric's table as `grid`, unless it has no value at all, and a line that says at which scales, and why.
+
+    reports: of the same recipes and scales, which the lines are means of.
+    """
+    report = reports[0]
     columns = dict(zip(report.scales, zip(*lines, strict=True), strict=True))
     empty = [scale for scale, column in columns.items() if {*column} == {metric.text(None)}]
     table = [grid(title, report, lines, ceiling)] * (len(empty) < len(columns))
     if not empty:
         return [*table]
-    small = any(m.note == NO_PHOTOGRAPH for m in report.measurements if m.scale in empty)
+    small = any(m.note == NO_PHOTOGRAPH for each in reports for m in each.measurements if m.scale in empty)
     why = NO_PHOTOGRAPH if small and metric.measure else metric.undefined
     return [*table, f"no {metric.name} at {', '.join(map(scale_name, empty))}: {why}"]
 

@@ -6,7 +6,7 @@ after property.  All parts are padded to 8 bytes; a property is deflated and hol
 
 Gaussian 0 is the root.  The children of each lie side by side, so their count and the place of the first tell which
 they are.  Spark starts at the root and replaces the Gaussian that looks largest by its children, until none is larger
-than a pixel: see `NODE_SIZE`.
+than a pixel: see `node_sizes`.
 """
 
 import json
@@ -26,9 +26,11 @@ from aaplug.core.placing import box_of
 from aaplug.core.spherical_harmonics import COLOUR_OFFSET, SH_C0
 
 VERSION = 1
-CHUNK = 1 << 16  # Gaussians
-NODE_SIZE = 2.0  # of a Gaussian for Spark, times the mean of its three standard deviations
-MAX_CHILDREN = CHUNK - 1  # a count has two bytes
+CHUNK_GAUSSIANS = 1 << 16
+MEAN_SIGMAS = 2.0  # a Gaussian's size for Spark, as a multiple of the mean of its three standard deviations
+MAX_NODE_SIZE = 1.0  # px: Spark replaces what is larger by its children
+MAX_CHILDREN = CHUNK_GAUSSIANS - 1  # a count has two bytes
+ROOT_SIGMAS = 3.0  # to which the root holds the Gaussians
 ALIGNMENT = 8  # bytes
 RAW_DEFLATE = -15  # zlib's window bits for data without a header
 DEFLATE_LEVEL = 6  # of 9
@@ -51,26 +53,34 @@ class Tree(NamedTuple):
     starts: Int[Tensor, " n"]
 
 
-def tree_of(scene: Gaussians, parents: Int[Tensor, " n"]) -> Tree:
-    """The tree of Gaussians.
+def node_sizes(scene: Gaussians) -> Float[Tensor, " n"]:
+    """The size of each Gaussian by which Spark chooses, in world units."""
+    return MEAN_SIGMAS * scene.scales.mean(dim=1)
 
-    parents: place of each one's parent; -1 for none.  Above those are invisible Gaussians as large as the scene, which
-        Spark replaces at any distance.
+
+def tree_of(scene: Gaussians, parents: Int[Tensor, " n"]) -> Tree:
+    """The tree of Gaussians; where there are too many siblings, or several without a parent, others come above them.
+
+    Those are invisible and as large as the scene, so Spark replaces them until all of it is smaller than a pixel.
+
+    parents: place of each one's parent; -1 for none.
     """
-    low, high = box_of(scene, 0.0)
-    extent = (high - low).max().clamp(min=torch.finfo(torch.float32).tiny).log()
-    while len(tops := (parents < 0).nonzero()[:, 0]) > 1:
-        owners = torch.arange(len(tops)) // MAX_CHILDREN
-        above = scene[tops[::MAX_CHILDREN]]
+    low, high = box_of(scene, ROOT_SIGMAS)
+    extent = (high - low).max().log()
+    while (family := _crowded(parents, len(scene))) is not None:
+        siblings = (parents == family).nonzero()[:, 0]
+        owners = torch.arange(len(siblings)) // MAX_CHILDREN
+        above = scene[siblings[::MAX_CHILDREN]]
         shape = {"log_scales": extent.to(above.means).expand(len(above), 3), "sh": torch.zeros_like(above.sh)}
         shape |= {"logit_opacities": torch.full_like(above.logit_opacities, INVISIBLE)}
-        middles = torch.stack([scene.means[tops[owners == owner]].mean(dim=0) for owner in range(len(above))])
-        parents = torch.cat([parents.index_copy(0, tops, len(scene) + owners), torch.full((len(above),), -1)])
+        middles = torch.stack([scene.means[siblings[owners == owner]].mean(dim=0) for owner in range(len(above))])
+        others = parents.new_full((len(above),), family)
+        parents = torch.cat([parents.index_copy(0, siblings, len(scene) + owners), others])
         scene = joined([scene, replace(above, means=middles, **shape)])
-    counts = torch.bincount(parents[parents >= 0], minlength=len(scene))
-    siblings = torch.argsort(parents, stable=True)  # first the root, then its children, and so on
+    counts = torch.bincount(parents + 1, minlength=len(scene) + 1)[1:]
+    siblings = torch.argsort(parents, stable=True)  # first the root, then the children of each
     firsts = 1 + counts.cumsum(0) - counts  # among the siblings
-    order, starts, below = [tops], list[Tensor](), 1
+    order, starts, below = [siblings[:1]], list[Tensor](), 1
     while len(order[-1]):  # the root, its children, theirs
         count = counts[order[-1]]
         ends = count.cumsum(0)
@@ -83,15 +93,23 @@ def tree_of(scene: Gaussians, parents: Int[Tensor, " n"]) -> Tree:
     return Tree(scene[along], counts[along], torch.cat(starts) * counts[along].sign())
 
 
+def _crowded(parents: Int[Tensor, " n"], count: int) -> int | None:
+    """The parent of too many; -1 where several have none."""
+    counts = torch.bincount(parents + 1, minlength=count + 1)
+    counts[0] = counts[0] > 1 and CHUNK_GAUSSIANS
+    most = int(counts.argmax())
+    return most - 1 if counts[most] > MAX_CHILDREN else None
+
+
 def write_rad(stream: BinaryIO, tree: Tree) -> None:
     """Write a tree, its harmonics up to degree 3."""
     degree = min(len(BANDS), tree.scene.sh_degree)
     facts = {"version": VERSION, "maxSh": degree, "lodTree": True, "splatEncoding": _spans(tree.scene, degree)}
-    chunks = [_chunk(tree, facts, base) for base in range(0, len(tree.scene), CHUNK)]
+    chunks = [_chunk(tree, facts, base) for base in range(0, len(tree.scene), CHUNK_GAUSSIANS)]
     sizes = np.array([len(chunk) for chunk in chunks])
     ends = sizes.cumsum()
     places = [{"offset": int(end - size), "bytes": int(size)} for size, end in zip(sizes, ends, strict=True)]
-    whole = {"type": "gsplat", "count": len(tree.scene), "chunkSize": CHUNK, "comment": "aaplug"}
+    whole = {"type": "gsplat", "count": len(tree.scene), "chunkSize": CHUNK_GAUSSIANS, "comment": "aaplug"}
     stream.write(_headed(b"RAD0", facts | whole | {"allChunkBytes": int(ends[-1]), "chunks": places}))
     stream.writelines(chunks)
 
@@ -109,7 +127,7 @@ def _spans(scene: Gaussians, degree: int) -> dict[str, Any]:
 def _chunk(tree: Tree, facts: Mapping[str, Any], base: int) -> bytes:
     """The chunk of the Gaussians from `base` on."""
     payload, entries = bytearray(), []
-    rows = slice(base, base + CHUNK)
+    rows = slice(base, base + CHUNK_GAUSSIANS)
     part = Tree(tree.scene[rows], tree.counts[rows], tree.starts[rows])
     for about, values in _properties(part, facts["splatEncoding"]):
         data = zlib.compress(values.tobytes(), DEFLATE_LEVEL, RAW_DEFLATE)

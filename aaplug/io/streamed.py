@@ -12,11 +12,12 @@ import json
 import math
 import re
 import shutil
-from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib.resources import files
+from itertools import count, takewhile
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
@@ -29,7 +30,7 @@ from aaplug.core.gaussians import Gaussians, joined
 from aaplug.core.placing import box_of
 from aaplug.io import StreamName, stream_pages
 from aaplug.io.atomic import make_folder, replacing
-from aaplug.io.rad import tree_of, write_rad
+from aaplug.io.rad import MAX_NODE_SIZE, tree_of, write_rad
 from aaplug.io.scenes import gltf, read_scene, write_scene
 from aaplug.io.scenes.pyramid_folder import Level
 from aaplug.io.scenes.rows import library_errors
@@ -142,6 +143,8 @@ def write_front(folder: Path, number: int, front: Front, start: int) -> None:
     make_folder(path.parent)
     if start < len(front.scene):
         write_scene(path, front.scene[start:], overwrite=True)
+    else:
+        path.unlink(missing_ok=True)  # of an earlier run
     with replacing(path.with_name(TREE), overwrite=True) as stream:
         np.savez(stream, parents=front.parents.numpy(), owners=front.owners.numpy())
 
@@ -153,10 +156,10 @@ def read_front(folder: Path, number: int) -> Front:
     with library_errors(tree), np.load(tree, allow_pickle=False) as arrays:
         parents, owners = (torch.from_numpy(arrays[name]) for name in Front._fields[1:])
     parts = [read_scene(path).gaussians() for path in paths if path.is_file()]
-    count, tops = sum(map(len, parts)), int((parents < 0).sum())
-    above = (parents < 0) | ((parents > torch.arange(len(parents))) & (parents < count))
-    if len(parents) != count or len(owners) != tops or not count or not bool(above.all()):
-        raise FormatError(tree, f"does not belong to the {count:,} Gaussians beside it")
+    total, tops = sum(map(len, parts)), int((parents < 0).sum())
+    above = (parents < 0) | ((parents > torch.arange(len(parents))) & (parents < total))
+    if len(parents) != total or len(owners) != tops or not total or not bool(above.all()):
+        raise FormatError(tree, f"does not belong to the {total:,} Gaussians beside it")
     return Front(joined([replace(part, origin=None) for part in parts]), parents, owners)
 
 
@@ -166,31 +169,35 @@ def facts_file(folder: Path, number: int) -> Path:
 
 
 def part_folders(folder: Path, name: StreamName) -> set[Path]:
-    """The folders of the parts that the index in a folder lists, none without one; for a .rad those that are there."""
+    """The folders of the parts that the index in a folder lists; none without an index, and none of a .rad."""
     stream = STREAMS[name]
     if name == "rad":
-        return {path.parent for path in folder.glob(f"*_0/{TREE}")}
+        return set()
     text = (folder / stream.index).read_text("utf-8", "replace") if (folder / stream.index).is_file() else ""
     return {folder / part for part in re.findall(rf'"(\d+_\d+)/{re.escape(stream.content)}"', text)}
 
 
-def remove_parts(folder: Path, name: StreamName, earlier: Set[Path]) -> None:
-    """Remove parts of an earlier run that the index does not list, or those that are in a .rad by now.
-
-    Of their folders, those that are empty then.
-    """
-    parts = part_folders(folder, name)
-    for part in parts if name == "rad" else earlier - parts:
-        for file in [part / STREAMS[name].content, part / TREE, *part.glob("*.webp")]:
+def remove_parts(folders: Iterable[Path], name: StreamName) -> None:
+    """Remove what `write_level` or `write_front` wrote into these folders, and those that are empty then."""
+    for folder in folders:
+        for file in [folder / STREAMS[name].content, *folder.glob(TREE if name == "rad" else "*.webp")]:
             file.unlink(missing_ok=True)
         with suppress(OSError):
-            part.rmdir()
+            folder.rmdir()
 
 
-def write_index(folder: Path, name: StreamName, levels: int, rate: float) -> Mapping[str, Any]:
+def front_folders(folder: Path) -> Iterator[Path]:
+    """The folders that `write_front` wrote into, of consecutive levels; nobody needs them once the index is written."""
+    paths = ((folder / STREAMS["rad"].part(number, 0)).parent for number in count())
+    return takewhile(lambda path: (path / TREE).is_file() or (path / STREAMS["rad"].content).is_file(), paths)
+
+
+def write_index(
+    folder: Path, name: StreamName, levels: int, rate: float, compensated: bool = True
+) -> Mapping[str, Any]:
     """Write the index of so many levels, and what the viewer must be set to; returns the latter.
 
-    rate: of training, in px per world unit.
+    rate: of training, in px per world unit.  compensated: levels are for a rule with compensation.
     """
     stream = STREAMS[name]
     if name == "rad":
@@ -200,6 +207,8 @@ def write_index(folder: Path, name: StreamName, levels: int, rate: float) -> Map
         parts = [_read_parts(facts_file(folder, number)) for number in range(levels)]
         index, settings = {"sog": _lod_meta, "3dtiles": _tileset}[name](stream, [*zip(*parts, strict=True)], rate)
         write = partial(_write_json, value=index)
+        if name == "sog":
+            settings["app.scene.gsplat"]["antiAlias"] = compensated
     with replacing(folder / SETTINGS, overwrite=True) as target:
         _write_json(target, settings)
     with replacing(folder / stream.index, overwrite=True) as target:  # last: it is the mark
@@ -315,11 +324,10 @@ def _tileset(stream: Stream, parts: Sequence[Sequence[_Part]], rate: float) -> I
 
 def _spark_settings(front: Front) -> dict[str, Any]:
     """What Spark must be set to, so that its budget does not lower the detail, and where the scene is."""
-    leaves = len(front.scene) - len(front.parents[front.parents >= 0].unique())
-    return {
-        "SparkRenderer": {"lodSplatCount": leaves, "lodRenderScale": 1.0},
-        "bound": _bound(box_of(front.scene, 0.0)),
-    }
+    leaves, rule = len(front.scene) - len(front.parents[front.parents >= 0].unique()), front.scene.convention
+    blur = {"preBlurAmount": 0.0, "blurAmount": 0.0, "blurAmount" if rule.compensated else "preBlurAmount": rule.kernel}
+    budget = {"lodSplatCount": leaves, "lodRenderScale": MAX_NODE_SIZE}
+    return {"SparkRenderer": blur | budget, "bound": _bound(box_of(front.scene, 0.0))}
 
 
 def _box(parts: Sequence[_Part]) -> Box:

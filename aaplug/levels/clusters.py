@@ -104,15 +104,15 @@ def clusters_of(
     chunks: see `Clusters`; None for one of all.
     visible: see `visibility`; NaN where nothing is known, None for all of each Gaussian.
     """
+    rates = rates.to(scene.means)
     max_log_scales = (MAX_SIGMA / rates).log()[:, None].to(scene.log_scales)
     raw = covariances(replace(scene, log_scales=scene.log_scales.minimum(max_log_scales)))
     covs = blur(raw, scene.convention.kernel / rates.square())
     opacities = scene.opacities
     if scene.convention.compensated:
         opacities = opacities * area(raw) / area(covs)
-    visible = (
-        torch.ones_like(opacities) if visible is None else visible.nan_to_num(USUAL_VISIBLE).clamp(min=MIN_VISIBLE)
-    )
+    share = torch.ones_like(opacities) if visible is None else visible.to(opacities)
+    visible = share.nan_to_num(USUAL_VISIBLE).clamp(min=MIN_VISIBLE)
     weights = opacities.clamp(min=MIN_OPACITY) * area(covs) * visible
     colours = COLOUR_OFFSET + SH_C0 * scene.sh[:, 0]
     labels = torch.arange(len(scene))

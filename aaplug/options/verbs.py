@@ -42,6 +42,7 @@ COMPARED_SCALES = (2.0, 1.0, 0.5, 0.25)
 COMPARED_METRICS = ("psnr", "ssim", "flicker")
 METRICS = flag("|".join(map(metric_option, names_of("metric"))) + " ...", count=None)
 TIMED_RASTERIZERS = ("all", "compiled", "eager")
+USUAL_METHOD = "consistency"  # of fine-tuning
 LEVEL_STEPS = 1000  # for a level of 1/4 of the training rate and above; a smaller one takes more, of smaller images
 SINGLE_SCENE_FACTOR = 2  # times as many steps for one scene: its counts are met, so tuning has more to mend
 LOSS_WEIGHTS = {0.5: 1.0, 0.25: 2.0, 0.125: 1.0}  # by scale; measured, as are the two below
@@ -266,7 +267,7 @@ class FinetuneOptions(WritingOptions, ViewOptions):
     """Who will show the scene: fast (aaplug's matched, the default) or a viewer of `aaplug guide viewers`."""
     views: Annotated[str, VIEWS] = "test"
     """Views that the result is measured on, by name or split; training views are what it is tuned on."""
-    method: Annotated[str, names(kind="method")] = "consistency"
+    method: Annotated[str, names(kind="method")] = USUAL_METHOD
     """consistency: one model for all scales; group-training: the same, 60 % at a time; mipmap-gs: one scale."""
     learn_filters: bool = False
     """Learn a filter for each Gaussian at 1/2 to 1/16 and --scale, for `--recipe learned`; the Gaussians stay."""
@@ -297,7 +298,7 @@ class FinetuneOptions(WritingOptions, ViewOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.learn_filters and self.method != "consistency":
+        if self.learn_filters and self.method != USUAL_METHOD:
             raise UsageError("learn_filters", f"is a method of its own, beside {self.method}")
         if self.upsampler is not None and max(self.scale) <= 1:
             problem = "makes what scales above 1 should show, and there is none: give such a `scale`"

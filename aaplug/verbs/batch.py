@@ -86,7 +86,7 @@ class Batch:
         for metric in first.metrics:
             values = [[means.get(method(r, s), {}).get(metric.name) for s in first.scales] for r in first.recipes]
             lines = [[metric.text(value) for value in line] for line in values]
-            grids += metric_grid(f"{metric.title}, {over}", first, metric, lines)
+            grids += metric_grid(f"{metric.title}, {over}", [*self.reports.values()], metric, lines)
         return [*grids, scenes]
 
 

@@ -20,7 +20,7 @@ from aaplug.core.training import TrainingViews
 from aaplug.finetuning.fitting import fit, steps_for
 from aaplug.finetuning.refining import refine
 from aaplug.io.atomic import AnyPath, refuse_existing, refuse_inputs
-from aaplug.io.rad import NODE_SIZE
+from aaplug.io.rad import MAX_NODE_SIZE, node_sizes
 from aaplug.io.scenes import SceneLike, check_scene_output, write_scene, written_format
 from aaplug.io.scenes.columns import matrix_of
 from aaplug.io.scenes.pyramid_folder import (
@@ -40,6 +40,7 @@ from aaplug.io.streamed import (
     STREAMS,
     Front,
     facts_file,
+    front_folders,
     leaves_of,
     part_folders,
     parts_of,
@@ -64,7 +65,6 @@ from aaplug.system.digests import digest_of_values
 from aaplug.system.errors import FormatError, FrameError, OutputError, UsageError, counted
 from aaplug.verbs.verb import writes
 
-MAX_NODE_SIZE = 1.0  # px: Spark replaces what is larger by its children
 DEFAULT_LEVELS = 4  # down to 1/16 of the training size
 MEGABYTE = 1e6
 SMALLER_IMAGES = (0.5,)  # of one lighter scene, which has no coarser level; a viewer's rule would bloat it there
@@ -112,15 +112,19 @@ def lod(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, options:
             for level in _levels(maker, path, files):
                 kept = level.scene
                 if path is not None and options.to is not None:
-                    kept = replace(kept, sh=torch.full((1, 1, 1), torch.nan).expand(kept.sh.shape))
+                    kept = replace(kept, sh=kept.sh.new_full((1, 1, 1), torch.nan).expand(kept.sh.shape))
                 levels.append(level._replace(scene=kept))
             if path is not None and options.to is not None:
                 rates = median_rates(whole.means, job.cameras.train)
-                settings = write_index(path, options.to, len(levels), float(rates[rates > 0].median()))
+                compensated = maker.viewer is None or maker.viewer.convention_of(whole).compensated
+                rate = float(rates[rates > 0].median())
+                settings = write_index(path, options.to, len(levels), rate, compensated)
                 if options.page is not None:
                     write_page(path, options.to, Path(options.page))
                 job.monitor.say(f"set the viewer by {path / SETTINGS}: {json.dumps(settings)}")
-                remove_parts(path, options.to, earlier)
+                remove_parts(earlier - part_folders(path, options.to), options.to)
+                if options.to == "rad":
+                    remove_parts(front_folders(path), "rad")
                 facts = [facts_file(path, number) for number in range(len(levels))]
                 stale += [*files, path / MANIFEST, *facts]  # what a run that is cut short resumes from
             for file in stale:
@@ -204,13 +208,17 @@ class _Maker:
         """
         if front is None or level.parents is None:
             return Front.of(self.finished(level).scene)
+        if not len(level.scene):
+            return front
         owners, places = level.parents[front.owners], (front.parents < 0).nonzero()[:, 0]
         try:
             px = level.rate * rates_of(level.scene, self.job.cameras.train)
         except FrameError:  # no camera sees any of what is left
             return front._replace(owners=owners)
-        small = NODE_SIZE * level.scene.scales.mean(dim=1) * px <= MAX_NODE_SIZE
+        small = node_sizes(level.scene) * px <= MAX_NODE_SIZE
         taken, goes = small.nonzero()[:, 0], small[owners]
+        if not len(taken):
+            return front._replace(owners=owners)
         new = self.finished(level._replace(scene=level.scene[taken]), front.scene[places[~goes]]).scene
         parents = len(front.scene) + (small.cumsum(0) - 1)[owners[goes]]
         return Front(
@@ -219,7 +227,7 @@ class _Maker:
             torch.cat([owners[~goes], taken]),
         )
 
-    def _tuned(self, level: Level, beside: Gaussians | None = None, least: Float[Tensor, " n"] | None = None) -> Level:
+    def _tuned(self, level: Level, beside: Gaussians | None = None) -> Level:
         options, look = self.job.options, self.look
         if not options.tuning or look is None or self.scene.flat:
             return level
@@ -287,12 +295,12 @@ def _levels(maker: _Maker, folder: Path | None, files: Sequence[Path]) -> Iterat
         if place:
             made = next(there, None) or maker(made, goals[place - 1])
         resumed, level, kept = place < len(manifest.levels), made, made
-        if options.to == "rad" and not resumed:
-            before = read_front(folder, place - 1) if folder and place and front is None else front
-            front = maker.above(before, made)
-            level = made._replace(scene=front.scene[front.parents < 0])
-            if folder is not None:
-                write_front(folder, place, front, len(before.scene) if before else 0)
+        if options.to == "rad":
+            start = len(front.scene) if front else 0
+            front = read_front(folder, place) if resumed and folder else maker.above(front, made)
+            level = Level(front.scene[front.parents < 0], made.rate)
+            if folder is not None and not resumed:
+                write_front(folder, place, front, start)
         elif options.to is None or not resumed:
             level = maker.finished(made)
             if options.to is None:
