@@ -65,18 +65,19 @@ def tree_of(scene: Gaussians, parents: Int[Tensor, " n"]) -> Tree:
 
     parents: place of each one's parent; -1 for none.
     """
-    low, high = box_of(scene, ROOT_SIGMAS)
-    extent = (high - low).max().log()
-    while (family := _crowded(parents, len(scene))) is not None:
+    means = scene.means
+    while (family := _crowded(parents)) is not None:
         siblings = (parents == family).nonzero()[:, 0]
         owners = torch.arange(len(siblings)) // MAX_CHILDREN
-        above = scene[siblings[::MAX_CHILDREN]]
-        shape = {"log_scales": extent.to(above.means).expand(len(above), 3), "sh": torch.zeros_like(above.sh)}
-        shape |= {"logit_opacities": torch.full_like(above.logit_opacities, INVISIBLE)}
-        middles = torch.stack([scene.means[siblings[owners == owner]].mean(dim=0) for owner in range(len(above))])
-        others = parents.new_full((len(above),), family)
-        parents = torch.cat([parents.index_copy(0, siblings, len(scene) + owners), others])
-        scene = joined([scene, replace(above, means=middles, **shape)])
+        sizes = torch.bincount(owners)
+        middles = means.new_zeros(len(sizes), 3).index_add(0, owners, means[siblings]) / sizes[:, None]
+        moved = parents.index_copy(0, siblings, len(means) + owners)
+        means, parents = torch.cat([means, middles]), torch.cat([moved, parents.new_full((len(sizes),), family)])
+    low, high = box_of(scene, ROOT_SIGMAS)
+    above = scene[torch.zeros(len(means) - len(scene), dtype=torch.int64)]
+    shape = {"log_scales": (high - low).max().log().expand(len(above), 3), "sh": torch.zeros_like(above.sh)}
+    shape |= {"logit_opacities": torch.full_like(above.logit_opacities, INVISIBLE)}
+    scene = joined([scene, replace(above, means=means[len(scene) :], **shape)])
     counts = torch.bincount(parents + 1, minlength=len(scene) + 1)[1:]
     siblings = torch.argsort(parents, stable=True)  # first the root, then the children of each
     firsts = 1 + counts.cumsum(0) - counts  # among the siblings
@@ -93,9 +94,9 @@ def tree_of(scene: Gaussians, parents: Int[Tensor, " n"]) -> Tree:
     return Tree(scene[along], counts[along], torch.cat(starts) * counts[along].sign())
 
 
-def _crowded(parents: Int[Tensor, " n"], count: int) -> int | None:
+def _crowded(parents: Int[Tensor, " n"]) -> int | None:
     """The parent of too many; -1 where several have none."""
-    counts = torch.bincount(parents + 1, minlength=count + 1)
+    counts = torch.bincount(parents + 1, minlength=len(parents) + 1)
     counts[0] = counts[0] > 1 and CHUNK_GAUSSIANS
     most = int(counts.argmax())
     return most - 1 if counts[most] > MAX_CHILDREN else None
