@@ -17,6 +17,7 @@ from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from aaplug.core.conventions import CLASSIC, Convention
+from aaplug.core.spherical_harmonics import COLOUR_OFFSET, SH_C0
 from aaplug.system.contracts import check_fields, contract, described
 from aaplug.system.errors import UsageError
 
@@ -103,6 +104,11 @@ class Gaussians:
     def opacities(self) -> Float[Tensor, " n"]:
         """Opacity at the centre, in [0, 1]."""
         return self.logit_opacities.sigmoid()
+
+    @property
+    def base_colours(self) -> Float[Tensor, "n 3"]:
+        """Colours without what depends on the view; those that training fitted may leave [0, 1]."""
+        return COLOUR_OFFSET + SH_C0 * self.sh[:, 0]
 
     @property
     def unit_quats(self) -> Float[Tensor, "n 4"]:

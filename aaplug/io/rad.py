@@ -23,7 +23,6 @@ from torch import Tensor
 
 from aaplug.core.gaussians import Gaussians, joined
 from aaplug.core.placing import box_of
-from aaplug.core.spherical_harmonics import COLOUR_OFFSET, SH_C0
 
 VERSION = 1
 CHUNK_GAUSSIANS = 1 << 16
@@ -117,7 +116,7 @@ def write_rad(stream: BinaryIO, tree: Tree) -> None:
 
 def _spans(scene: Gaussians, degree: int) -> dict[str, Any]:
     """What Spark's 8 bits reach: of colours all of 0 to 1, of scales the largest, which the tree rests on."""
-    colours = _colours(scene)
+    colours = scene.base_colours
     spans = {"rgbMin": min(0.0, _quantile(colours, 1 - SPANNED)), "rgbMax": max(1.0, _quantile(colours, SPANNED))}
     spans |= {"lnScaleMin": _quantile(scene.log_scales, 1 - SPANNED), "lnScaleMax": float(scene.log_scales.max())}
     for band, coefficients in enumerate(BANDS[:degree], 1):
@@ -141,27 +140,25 @@ def _chunk(tree: Tree, facts: Mapping[str, Any], base: int) -> bytes:
 def _properties(tree: Tree, spans: Mapping[str, float]) -> Iterator[tuple[dict[str, Any], "np.ndarray[Any, Any]"]]:
     """Name and encoding of each property, and its values, one row a component."""
 
-    def floats(name: str, encoding: str, values: Tensor) -> tuple[dict[str, Any], "np.ndarray[Any, Any]"]:
+    def property_of(name: str, encoding: str, values: Tensor) -> tuple[dict[str, Any], "np.ndarray[Any, Any]"]:
         return {"property": name, "encoding": encoding}, values.t().contiguous().numpy()
 
     scene, half, quats = tree.scene, torch.float16, tree.scene.unit_quats
     bytes_apart = scene.means.float().t().contiguous().view(torch.uint8).view(-1, 4)  # of each float the lowest first
-    yield floats("center", "f32_lebytes", bytes_apart)
-    yield floats("alpha", "f16", scene.opacities.to(half))
-    yield floats("rgb", "f16", _colours(scene).to(half))
-    yield floats("scales", "ln_f16", scene.log_scales.to(half))
-    yield floats("orientation", "f32", (quats[:, 1:] * torch.where(quats[:, :1] < 0, -1, 1)).float())  # w is the rest
+    yield property_of("center", "f32_lebytes", bytes_apart)
+    yield property_of("alpha", "f16", scene.opacities.to(half))
+    yield property_of("rgb", "f16", scene.base_colours.to(half))
+    yield property_of("scales", "ln_f16", scene.log_scales.to(half))
+    yield property_of(
+        "orientation", "f32", (quats[:, 1:] * torch.where(quats[:, :1] < 0, -1, 1)).float()
+    )  # w is the rest
     for band, coefficients in enumerate(BANDS, 1):
         if (span := spans.get(f"sh{band}Max")) is not None:
             values = (scene.sh[:, coefficients].flatten(1) * (MAX_S8 / span)).round().clamp(-MAX_S8, MAX_S8)
-            about, array = floats(f"sh{band}", "s8", values.to(torch.int8))
+            about, array = property_of(f"sh{band}", "s8", values.to(torch.int8))
             yield about | {"min": -span, "max": span}, array
     yield {"property": "child_count", "encoding": "u16"}, tree.counts.numpy().astype("<u2")
     yield {"property": "child_start", "encoding": "u32"}, tree.starts.numpy().astype("<u4")
-
-
-def _colours(scene: Gaussians) -> Float[Tensor, "n 3"]:
-    return COLOUR_OFFSET + SH_C0 * scene.sh[:, 0]
 
 
 def _quantile(values: Tensor, share: float) -> float:

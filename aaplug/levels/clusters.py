@@ -16,7 +16,6 @@ from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import MAX_LOG_SCALE, MIN_OPACITY, Gaussians
 from aaplug.core.rules import RULES_3DGS
 from aaplug.core.sampling import median_rates
-from aaplug.core.spherical_harmonics import COLOUR_OFFSET, SH_C0
 from aaplug.levels.covariances import Packed, area, areas, blur, covariances, outer, overlaps, pack, quats_of, unpack
 from aaplug.system.errors import FrameError, counted
 
@@ -114,7 +113,7 @@ def clusters_of(
     share = torch.ones_like(opacities) if visible is None else visible.to(opacities)
     visible = share.nan_to_num(USUAL_VISIBLE).clamp(min=MIN_VISIBLE)
     weights = opacities.clamp(min=MIN_OPACITY) * area(covs) * visible
-    colours = COLOUR_OFFSET + SH_C0 * scene.sh[:, 0]
+    colours = scene.base_colours
     labels = torch.arange(len(scene))
     chunks = torch.zeros_like(labels) if chunks is None else chunks
     return Clusters(scene.means.double(), covs, opacities, visible, weights, colours, rates, chunks, labels)

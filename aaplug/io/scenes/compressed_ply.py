@@ -17,7 +17,6 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from aaplug.core.gaussians import Gaussians
-from aaplug.core.spherical_harmonics import COLOUR_OFFSET, SH_C0
 from aaplug.io.atomic import replacing
 from aaplug.io.scenes.columns import DEGREES, sh_of_colour
 from aaplug.io.scenes.options import SceneFileOptions
@@ -141,7 +140,7 @@ def write(path: Path, parts: Iterable[Gaussians], count: int, overwrite: bool, o
     """Write a scene, with values rounded to the format's steps."""
     scene = whole(path, parts, name, MOST_DEGREE)
     chunk = torch.arange(len(scene)) // CHUNK_LENGTH
-    colours = COLOUR_OFFSET + SH_C0 * scene.sh[:, 0]
+    colours = scene.base_colours
     log_scales = scene.log_scales.clamp(-LARGEST_LOG_SCALE, LARGEST_LOG_SCALE)
     bounds, shares = zip(*(_bounded(values, chunk) for values in (scene.means, log_scales, colours)), strict=True)
     rest, largest = without_largest(scene.unit_quats)

@@ -24,7 +24,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from aaplug.core.gaussians import Gaussians, joined
-from aaplug.core.spherical_harmonics import COLOUR_OFFSET, SH_C0
 from aaplug.io.atomic import replacing
 from aaplug.io.gltf import FLOAT, MAGIC, Accessor, Gltf, at_rest, glb_start
 from aaplug.io.scenes import spz
@@ -234,7 +233,7 @@ class _Document:
 
     def placed(self, part: Gaussians) -> list[tuple[int, bytes]]:
         """The bytes of the next part's attributes, and where they go."""
-        rgba = torch.cat([COLOUR_OFFSET + SH_C0 * part.sh[:, 0], part.opacities[:, None]], dim=1)
+        rgba = torch.cat([part.base_colours, part.opacities[:, None]], dim=1)
         values = [part.means, part.unit_quats.roll(-1, dims=1), part.scales, part.opacities]
         columns = [each.contiguous().numpy().astype("<f4") for each in (*values, *part.sh.unbind(dim=1))]
         columns.insert(4, bytes_of(rgba * 255))

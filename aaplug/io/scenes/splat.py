@@ -11,7 +11,6 @@ import numpy as np
 import torch
 
 from aaplug.core.gaussians import Gaussians
-from aaplug.core.spherical_harmonics import COLOUR_OFFSET, SH_C0
 from aaplug.io.atomic import replacing
 from aaplug.io.scenes.columns import sh_of_colour
 from aaplug.io.scenes.options import SceneFileOptions
@@ -69,7 +68,7 @@ def _rows(path: Path, start: int, stop: int) -> Gaussians:
 
 def _records(scene: Gaussians) -> np.ndarray:
     records = np.zeros(len(scene), RECORD)
-    rgb = COLOUR_OFFSET + SH_C0 * scene.sh[:, 0]
+    rgb = scene.base_colours
     rgba = torch.cat([rgb, scene.opacities[:, None]], dim=1)
     records["means"] = scene.means.numpy()
     records["scales"] = scene.scales.numpy()
