@@ -15,13 +15,13 @@ from aaplug.core.cameras import CameraSet
 from aaplug.core.chunks import chunks_of
 from aaplug.core.conventions import ANTIALIASED, CLASSIC, MIP
 from aaplug.core.gaussians import Gaussians
-from aaplug.core.projection import project, rotation_matrices
+from aaplug.core.projection import project, quats_of, rotation_matrices
 from aaplug.evaluation.metrics import psnr
 from aaplug.io.scenes import read_scene
 from aaplug.io.scenes.scene import Scene
 from aaplug.levels import pairing
 from aaplug.levels.clusters import MAX_OPACITY, clusters_of, merge_pairs, rates_of
-from aaplug.levels.covariances import area, areas, covariances, pack, quats_of, unpack
+from aaplug.levels.covariances import area, areas, covariances, pack, unpack
 from aaplug.levels.merging import Goal, merge, merge_in_chunks
 from aaplug.levels.pairing import MAX_COST, costs, edges_below, matching
 from aaplug.methods.conversion import MERGED, blurring

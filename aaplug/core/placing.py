@@ -8,10 +8,10 @@ from dataclasses import replace
 
 import torch
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from aaplug.core.gaussians import Gaussians
+from aaplug.core.projection import quats_of
 from aaplug.core.spherical_harmonics import sh_turned
 
 
@@ -38,7 +38,7 @@ def placed(scene: Gaussians, turn: Float[Tensor, "3 3"], scale: float, move: Seq
     turn: a rotation matrix.  scale: above 0.  move: world units.
     """
     dtype, turn = scene.means.dtype, turn.double()
-    x, y, z, w = Rotation.from_matrix(turn.numpy()).as_quat().tolist()
+    w, x, y, z = quats_of(turn[None])[0].tolist()
     left = torch.tensor([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]], dtype=torch.float64)
     means = scale * (scene.means.double() @ turn.T) + torch.tensor(move, dtype=torch.float64)
     return replace(

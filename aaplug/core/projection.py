@@ -261,6 +261,19 @@ def rotation_matrices(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
     return torch.stack([torch.stack(row, dim=-1) for row in rotation_rows(quats)], dim=-2)
 
 
+def quats_of(rotations: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 4"]:
+    """Unit quaternions wxyz of rotation matrices, from each one's largest component (Shepperd 1978)."""
+    m = [[rotations[:, i, j] for j in range(3)] for i in range(3)]
+    x, y, z = m[2][1] - m[1][2], m[0][2] - m[2][0], m[1][0] - m[0][1]
+    xy, xz, yz = m[1][0] + m[0][1], m[2][0] + m[0][2], m[2][1] + m[1][2]
+    squares = [1 + s * m[0][0] + t * m[1][1] + s * t * m[2][2] for s, t in ((1, 1), (1, -1), (-1, 1), (-1, -1))]
+    w, xx, yy, zz = squares
+    rows = [(w, x, y, z), (x, xx, xy, xz), (y, xy, yy, yz), (z, xz, yz, zz)]
+    products = torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)  # 4 q qᵀ
+    largest = torch.stack(squares, dim=1).argmax(dim=1)
+    return torch.nn.functional.normalize(products[torch.arange(len(largest)), largest], dim=1)
+
+
 def _project_example() -> tuple[Tensor, ...]:
     generator = torch.Generator().manual_seed(0)
     means, log_scales = torch.rand(2, EXAMPLE_SIZE, 3, generator=generator).unbind()

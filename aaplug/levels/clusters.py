@@ -14,9 +14,10 @@ from torch import Tensor
 
 from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import MAX_LOG_SCALE, MIN_OPACITY, Gaussians
+from aaplug.core.projection import quats_of
 from aaplug.core.rules import RULES_3DGS
 from aaplug.core.sampling import median_rates
-from aaplug.levels.covariances import Packed, area, areas, blur, covariances, outer, overlaps, pack, quats_of, unpack
+from aaplug.levels.covariances import Packed, area, areas, blur, covariances, outer, overlaps, pack, unpack
 from aaplug.system.errors import FrameError, counted
 
 MAX_OPACITY = RULES_3DGS.max_alpha  # of a merged Gaussian; no renderer shows more

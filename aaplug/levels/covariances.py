@@ -84,16 +84,3 @@ def overlap(total: Sequence[Tensor], offset: Sequence[Tensor] | None = None) -> 
         return peak
     x, y = offset
     return peak * torch.exp(-0.5 * (c * x * x - 2 * b * x * y + a * y * y) / det)
-
-
-def quats_of(rotations: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 4"]:
-    """Unit quaternions wxyz of rotation matrices, from each one's largest component (Shepperd 1978)."""
-    m = [[rotations[:, i, j] for j in range(3)] for i in range(3)]
-    x, y, z = m[2][1] - m[1][2], m[0][2] - m[2][0], m[1][0] - m[0][1]
-    xy, xz, yz = m[1][0] + m[0][1], m[2][0] + m[0][2], m[2][1] + m[1][2]
-    squares = [1 + s * m[0][0] + t * m[1][1] + s * t * m[2][2] for s, t in ((1, 1), (1, -1), (-1, 1), (-1, -1))]
-    w, xx, yy, zz = squares
-    rows = [(w, x, y, z), (x, xx, xy, xz), (y, xy, yy, yz), (z, xz, yz, zz)]
-    products = torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)  # 4 q qᵀ
-    largest = torch.stack(squares, dim=1).argmax(dim=1)
-    return torch.nn.functional.normalize(products[torch.arange(len(largest)), largest], dim=1)

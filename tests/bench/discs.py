@@ -13,8 +13,7 @@ from torch import Tensor
 
 import aaplug
 from aaplug.core.gaussians import MAX_LOG_SCALE, Gaussians
-from aaplug.core.projection import rotation_matrices
-from aaplug.levels.covariances import quats_of
+from aaplug.core.projection import quats_of, rotation_matrices
 from aaplug.methods.recipe import Recipe
 from aaplug.methods.recipes import find_recipe
 from aaplug.rasterizers import RASTERIZERS
