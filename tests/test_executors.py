@@ -8,15 +8,20 @@ import subprocess
 import sys
 import time
 from itertools import count
+from typing import Any
 
 import psutil
 import pytest
 import torch
 
+import aaplug
+from aaplug.core.kernels import Kernel, Kernels
+from aaplug.rasterizers.tiled import Tiled
 from aaplug.system.cores import FREE_CORES, FreeCores, Reading, on_free_cores
 from aaplug.system.errors import FormatError, UsageError, within_memory
-from aaplug.system.executors import Processes, Threads, torch_threads
-from tests.conftest import ROOT
+from aaplug.system.executors import Processes, Threads, given_threads, torch_threads
+from aaplug.system.monitor import Monitor
+from tests.conftest import ROOT, SAMPLE
 
 PARENT = """
 import time
@@ -154,6 +159,41 @@ def test_torch_has_as_many_threads_as_cores_are_free_and_then_its_own_number(mon
         with on_free_cores():
             assert torch.get_num_threads() == 1
         assert torch.get_num_threads() == 2
+
+
+def test_inside_a_block_with_fewer_threads_free_cores_are_counted_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    with torch_threads(2):
+        monkeypatch.setattr(FREE_CORES, "count", lambda: 1)
+        with on_free_cores():
+            assert (torch.get_num_threads(), given_threads()) == (1, 2)
+            monkeypatch.setattr(FREE_CORES, "count", lambda: 4)
+            with on_free_cores():
+                assert torch.get_num_threads() == 2
+            with torch_threads(1), on_free_cores():
+                assert (torch.get_num_threads(), given_threads()) == (1, 1)
+            assert torch.get_num_threads() == 1
+
+
+def test_a_verb_draws_with_the_threads_it_was_given_and_does_the_rest_with_one(tmp_path, monkeypatch, sample_scene):
+    found = dict[str, set[int]](drawing=set(), rest=set())
+
+    class Watching(Kernels):
+        name = "watching"
+
+        def run(self, kernel: Kernel, *inputs: Any) -> Any:
+            found["drawing"].add(torch.get_num_threads())
+            return super().run(kernel, *inputs)
+
+    class Listening(Monitor):
+        def say(self, text: str) -> None:
+            found["rest"].add(torch.get_num_threads())
+
+    monkeypatch.setattr(FREE_CORES, "count", lambda: 4)
+    with torch_threads(2):
+        where = {"views": "r_8", "scale": 0.1, "rasterizer": Tiled(Watching()), "monitor": Listening()}
+        aaplug.render(sample_scene, SAMPLE, tmp_path / "images", **where)
+        assert torch.get_num_threads() == 2
+    assert found == {"drawing": {2}, "rest": {1}}
 
 
 HOLDS = """

@@ -32,7 +32,9 @@ from aaplug.lab.mipmap_gs import MIPMAP_GS
 from aaplug.methods import RECIPES
 from aaplug.rasterizers import RASTERIZERS
 from aaplug.rendering.renderer import own_look
+from aaplug.system.cores import FREE_CORES
 from aaplug.system.errors import FormatError, UsageError
+from aaplug.system.executors import torch_threads
 from aaplug.verbs.finetune import finetune
 from tests.conftest import ROOT, make_camera, make_scene
 
@@ -58,6 +60,17 @@ def after(job: TuningJob, steps: int | None = None) -> State:
     for _ in range(job.settings.steps if steps is None else steps):
         advance(job, state)
     return state
+
+
+def test_the_number_of_threads_plays_no_part(monkeypatch):
+    monkeypatch.setattr(FREE_CORES, "count", lambda: 2)
+    states = []
+    for threads in (1, 2):
+        with torch_threads(1, threads):
+            states.append(after(make_job(300)))
+    one, two = states
+    assert one.curve == two.curve
+    assert all(torch.equal(leaf, two.leaves[name]) for name, leaf in one.leaves.items())
 
 
 def test_only_the_first_gaussians_move():

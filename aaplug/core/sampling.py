@@ -19,6 +19,7 @@ from aaplug.core.conventions import MIN_SEEN_SHARE
 from aaplug.core.lenses import PINHOLE
 from aaplug.core.rules import NEAR
 from aaplug.core.sights import sights
+from aaplug.system.cores import on_free_cores
 from aaplug.system.errors import FrameError, UsageError, counted
 
 IMAGE_MARGIN = 0.15  # of the image's side; equals 3DGS's clamp of the Jacobian at 1.3 tan(fov/2)
@@ -74,6 +75,7 @@ class SamplingBounds:
 
 
 @torch.no_grad()
+@on_free_cores()
 def sampling_bounds(
     means: Float[Tensor, "n 3"], cameras: Sequence[Camera], chunk_pairs: int = CHUNK_PAIRS
 ) -> SamplingBounds:
@@ -96,6 +98,7 @@ def sampling_bounds(
     return SamplingBounds(highest, lowest, nearest, views)
 
 
+@on_free_cores()
 def median_rates(
     means: Float[Tensor, "n 3"], cameras: Sequence[Camera], chunk_pairs: int = CHUNK_PAIRS
 ) -> Float[Tensor, " n"]:

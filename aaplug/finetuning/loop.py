@@ -19,6 +19,7 @@ from aaplug.finetuning.parameters import extent, least_log_scales
 from aaplug.finetuning.settings import SEED_STRIDE, Settings
 from aaplug.finetuning.state import State, TuningJob, snapshot, state_of
 from aaplug.rendering.renderer import Drawing
+from aaplug.system.cores import on_free_cores
 from aaplug.system.errors import UsageError
 
 BOUNDS_EVERY = 100  # steps between computations of the sampling bounds (Mip-Splatting)
@@ -83,7 +84,8 @@ def _step(job: TuningJob, state: State, drawings: list[Drawing] | None) -> None:
     losses = {}
     for scale, weight in weights.items():
         loss, drawing = loss_at(job, state, view, scale)
-        (weight * loss).backward()
+        with on_free_cores():
+            (weight * loss).backward()
         losses[scale] = loss.item()
         if drawings is not None:
             drawings.append(drawing)
@@ -101,7 +103,8 @@ def _step(job: TuningJob, state: State, drawings: list[Drawing] | None) -> None:
     for group in state.adam.param_groups:
         size = extent(job.start.training.cameras) if group["name"] == "means" else 1.0
         group["lr"] = settings.rates[group["name"]] * size * decay
-    state.adam.step()
+    with on_free_cores():
+        state.adam.step()
     _clamp_parameters(state)
     if state.step % BOUNDS_EVERY == 0 and "means" in settings.rates:
         update_bounds(job, state)

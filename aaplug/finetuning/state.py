@@ -71,7 +71,6 @@ class TuningJob:
             "background": str(start.background),
             "cull margin": str(start.training.cull_margin),
             "rasterizer": start.rasterizer.name,
-            "number of threads": str(torch.get_num_threads()),  # it changes the order of sums
         }
 
 

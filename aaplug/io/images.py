@@ -33,6 +33,7 @@ from aaplug.io.atomic import replacing
 from aaplug.io.limits import whole_limit
 from aaplug.system.contracts import contract
 from aaplug.system.errors import MAX_VALUE_CHARACTERS, FormatError, UsageError, listing, not_one_of
+from aaplug.system.executors import torch_threads
 
 LOSSLESS_WEBP = 101  # OpenCV's quality for it
 SAMPLE_TYPES = {8: np.uint8, 16: np.uint16}  # by bit depth
@@ -134,6 +135,7 @@ def checked_image(image: Any, channels: Sequence[int] = (3,)) -> Float[Tensor, "
     return image.detach()
 
 
+@torch_threads(1)
 def encoded(suffix: str, image: Float[Tensor, "h w c"], *settings: int, bit_depth: int = 8) -> bytes:
     """The file of an image with 1, 3 or 4 channels, of which the fourth is straight alpha, clamped to [0, 1].
 
@@ -171,6 +173,7 @@ def _look(path: Path) -> _Header:
     return _Header(size, transparent)
 
 
+@torch_threads(1)
 def _read(path: Path, channels: int, finished: Callable[[Tensor], Tensor]) -> Float[Tensor, "h w c"]:
     """Values in [0, 1], RGB or RGBA, `finished` in bands of rows so that memory holds the samples and the result."""
     header = _look(path)

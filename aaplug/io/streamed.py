@@ -36,7 +36,7 @@ from aaplug.io.scenes.pyramid_folder import Level
 from aaplug.io.scenes.rows import library_errors
 from aaplug.io.values import Place, numbers, read_json
 from aaplug.system.errors import FormatError, OutputError, UsageError, reason
-from aaplug.system.executors import Threads
+from aaplug.system.executors import Threads, given_threads
 
 LEAF_GAUSSIANS = 1 << 16  # of the finest level in a part of space
 SWITCH = 1.5  # rate at which a viewer should change level, as a multiple of the coarser level's own
@@ -132,7 +132,7 @@ def write_level(folder: Path, name: StreamName, number: int, parts: Iterable[Gau
         write_scene(path, part, overwrite=True)
         return [float(len(part)), *box_of(part, stream.extent).flatten().tolist()]
 
-    facts = [*Threads(torch.get_num_threads()).map(write, enumerate(parts))]
+    facts = [*Threads(given_threads()).map(write, enumerate(parts))]
     with replacing(facts_file(folder, number), overwrite=True) as file:
         file.write(json.dumps(facts).encode())
 

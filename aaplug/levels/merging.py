@@ -22,7 +22,8 @@ from aaplug.levels.pairing import Edges, edges_below, matching
 from aaplug.methods.conversion import MERGED
 from aaplug.methods.filters.matched import PIXEL_VARIANCE
 from aaplug.methods.filters.smoothing import fuse_stored
-from aaplug.system.executors import Threads
+from aaplug.system.cores import on_free_cores
+from aaplug.system.executors import Threads, given_threads
 from aaplug.system.monitor import Tell
 
 MIN_MERGED_SHARE = 0.02  # of the clusters: after a round that merges fewer, more is allowed to change
@@ -124,6 +125,7 @@ def merge_in_chunks(
         stops.append(int(torch.searchsorted(along, last, right=True)))
     gone = dict.fromkeys(stops, 0)  # Gaussians that a batch is rid of, by its start
 
+    @on_free_cores()
     def merge_batch(ends: tuple[int, int]) -> Lighter:
         def tell_batch(done: int) -> None:
             gone[ends[0]] = done
@@ -133,7 +135,7 @@ def merge_in_chunks(
         clusters = clusters_of(scene[batch], rates[batch], chunks[batch], visible[batch])
         return _merge_batch(clusters, scene[batch], goal, tell_batch)
 
-    workers = min(torch.get_num_threads(), len(stops) - 1)
+    workers = min(given_threads(), len(stops) - 1)
     parts = [*(Threads(workers).map if workers > 1 else map)(merge_batch, pairwise(stops))]
     lighter = replace(joined([part.scene for part in parts]), origin=None)
     record = Fusion(MERGED, {"rate": f"{goal.rate:.4g}", "from": str(len(scene))})

@@ -33,6 +33,7 @@ from aaplug.rasterizers.tiled.backward import composite
 from aaplug.rasterizers.tiled.binning import bands
 from aaplug.rasterizers.tiled.forward import Compositing
 from aaplug.rendering.renderer import Renderer
+from aaplug.system.cores import on_free_cores
 
 DRAWN_AT_ONCE = 1 << 16  # Gaussians; a multiple of 16, so that the random numbers are those of one draw
 EXPONENTIALS = 1 << 18  # at once; their array fits the cache
@@ -102,6 +103,7 @@ class _CountingCompiled(Kernels):
         return counting
 
 
+@on_free_cores()
 def measure(renderer: Renderer, camera: Camera, kernels: Kernels, repeats: int = 5, backward: bool = True) -> Figures:
     """Time one view, of the levels of detail that the renderer picks for it if it has any.
 

@@ -14,8 +14,6 @@ from os import PathLike
 from pathlib import Path
 from typing import Generic, TypeVar
 
-import torch
-
 from aaplug.core.cameras import Camera, CameraSet, photographs
 from aaplug.core.colours import BLACK, WHITE
 from aaplug.core.interfaces import MatchesRates, TakesMemory
@@ -38,7 +36,7 @@ from aaplug.rendering.assumed import cameras_around, say_assumed
 from aaplug.rendering.cost import Cost, cost_of
 from aaplug.rendering.renderer import Renderer, background_colour, own_look
 from aaplug.system.errors import FrameError, UsageError, counted, listing, within_memory
-from aaplug.system.executors import PAYS_AFTER_SECONDS, Executor, torch_threads
+from aaplug.system.executors import PAYS_AFTER_SECONDS, Executor, given_threads, torch_threads
 from aaplug.system.extras import install_command
 from aaplug.system.monitor import Monitor
 
@@ -236,9 +234,9 @@ def running(
         OutputError: the output cannot be written.
         UsageError: the extra `cluster` is missing, nothing answers there, or the workers are unfit.
     """
-    threads = getattr(options, "threads", None) or torch.get_num_threads()
+    threads = getattr(options, "threads", None) or given_threads()
     scheduler = options.scheduler if isinstance(options, RecipeOptions) else None
-    with torch_threads(threads), writing(output, check, inputs, folder), within_memory("memory"):
+    with torch_threads(1, threads), writing(output, check, inputs, folder), within_memory("memory"):
         if not isinstance(scheduler, str):
             yield Workers(threads, scheduler)
             return

@@ -1,7 +1,7 @@
-"""Cores that other programs leave free, and drawing with as many threads.
+"""Cores that other programs leave free, and work with as many threads.
 
 At the end of every parallel loop OpenMP's threads wait for the last one.  Where another program uses that one's core,
-all wait for it, and a frame of many loops takes many times as long as by one thread.
+all wait for it, and work of many loops takes many times as long as by one thread.
 """
 
 import os
@@ -13,7 +13,7 @@ from pathlib import Path
 
 import torch
 
-from aaplug.system.executors import torch_threads
+from aaplug.system.executors import given_threads, torch_threads
 
 STATISTICS = Path("/proc/stat")  # Linux: clock ticks that each core spent in each state
 WAITS = (3, 4)  # columns of the states idle and waiting for a disk
@@ -62,11 +62,14 @@ FREE_CORES = FreeCores()
 
 @contextmanager
 def on_free_cores() -> Iterator[None]:
-    """Let torch use as many of its threads inside the block as there are free cores."""
-    threads = torch.get_num_threads()
-    free = FREE_CORES.count() if threads > 1 else threads
-    if free >= threads:
+    """Let torch use as many of the threads that it was given inside the block as there are free cores.
+
+    A block inside another counts anew.
+    """
+    given = given_threads()
+    threads = min(given, FREE_CORES.count()) if given > 1 else given
+    if threads == torch.get_num_threads():
         yield
     else:
-        with torch_threads(free):
+        with torch_threads(threads, given):
             yield

@@ -137,12 +137,14 @@ class ProcessesIfLong:
 
 
 _is_forked = False  # true in a process that began as a copy of another
+_local = threading.local()  # `given`: torch's number of threads outside of a block that uses fewer of them
 
 
 def _begin_forked() -> None:
     """Draw with one thread in the copy of a process: it has no others of OpenMP's, and would wait for them."""
     global _is_forked
     _is_forked = True
+    _local.given = None
     torch.set_num_threads(1)
 
 
@@ -150,15 +152,25 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_begin_forked)
 
 
+def given_threads() -> int:
+    """The number of threads that torch may use, of which it uses fewer inside `cores.on_free_cores`."""
+    return getattr(_local, "given", None) or torch.get_num_threads()
+
+
 @contextmanager
-def torch_threads(count: int) -> Iterator[None]:
-    """Let torch use `count` threads inside the block; one in a forked process."""
-    before = torch.get_num_threads()
+def torch_threads(count: int, given: int | None = None) -> Iterator[None]:
+    """Let torch use `count` threads inside the block; one in a forked process.
+
+    given: what `given_threads` says inside; None for `count`.
+    """
+    before, before_given = torch.get_num_threads(), getattr(_local, "given", None)
     torch.set_num_threads(1 if _is_forked else count)
+    _local.given = given
     try:
         yield
     finally:
         torch.set_num_threads(1 if _is_forked else before)  # it may have begun inside
+        _local.given = None if _is_forked else before_given
 
 
 def results(

@@ -17,6 +17,7 @@ from aaplug.options.base import Options, documented
 from aaplug.rendering.job import CamerasLike
 from aaplug.system.contracts import contract
 from aaplug.system.errors import OutputError, reason
+from aaplug.system.executors import given_threads, torch_threads
 
 P = ParamSpec("P")
 O_contra = TypeVar("O_contra", bound=Options, contravariant=True)
@@ -104,7 +105,8 @@ def _with(options: Any, optional: tuple[str, ...]) -> Any:
             bound = inputs.bind(*args, **own)
             bound.apply_defaults()
             check_name(bound.arguments.get("output"))
-            return body_checked(*bound.args, options.of(keywords))
+            with torch_threads(1, given_threads()):  # where more pay, and are free, `on_free_cores` takes them
+                return body_checked(*bound.args, options.of(keywords))
 
         fields = inspect.signature(options).parameters.values()
         signature = inspect.signature(body).replace(parameters=[*inputs.parameters.values(), *fields])

@@ -1,4 +1,7 @@
-"""A frame and a command beside a busy process: milliseconds and ratios, quiet and busy, by thread policy."""
+"""A frame, a command and a program beside a busy process: milliseconds and ratios, quiet and busy, by thread policy.
+
+The neighbour has a session of its own, as programs of other users have: Linux shares the cores between sessions first.
+"""
 
 import os
 import subprocess
@@ -18,13 +21,20 @@ from tests.bench.scenes import CHECKPOINTS, trained
 from tests.conftest import SHARED_DATA
 
 SPIN = "while True: pass"
+PROGRAM = """
+import aaplug
+from tests.conftest import SAMPLE
+scene, cameras = aaplug.read_scene(SAMPLE / "chair.ply"), aaplug.read_cameras(SAMPLE)
+aaplug.evaluate(scene, cameras, scale=[0.5, 0.25], recipe=["auto"])
+aaplug.convert(scene, cameras, "{folder}/chair.sog", overwrite=True)
+"""
 ENVIRONMENTS = ("", "OMP_WAIT_POLICY=passive", "GOMP_SPINCOUNT=1000", "GOMP_SPINCOUNT=10000")
 
 
 @contextmanager
 def neighbours(count: int) -> Iterator[None]:
     """`count` processes of normal priority, each of which keeps one core busy."""
-    others = [subprocess.Popen([sys.executable, "-c", SPIN]) for _ in range(count)]
+    others = [subprocess.Popen([sys.executable, "-c", SPIN], start_new_session=True) for _ in range(count)]
     time.sleep(2 * WINDOW_SECONDS)
     try:
         yield
@@ -63,7 +73,7 @@ def frames_within(environment: str, repeats: int) -> list[float]:
 
 
 def main(repeats: int = 5, frame: bool = False) -> None:
-    """Print two tables: the chair at 800x800 by environment, and `aaplug render` of its 25 views at 1/4.
+    """Print two tables: the chair at 800x800 by environment; `aaplug render` of its 25 views at 1/4, and a program.
 
     frame: print only this process's times of a frame.
     """
@@ -80,9 +90,11 @@ def main(repeats: int = 5, frame: bool = False) -> None:
         row(f"`{environment or 'as it is'}`", quiet, single, busy, busy / single)
     with TemporaryDirectory() as folder:
         words = f"aaplug render {SHARED_DATA / CHECKPOINTS['chair'].file} --scale 0.25 --overwrite -o {folder}/out"
-        render = partial(subprocess.run, words.split(), check=True, capture_output=True)
-        quiet = milliseconds(render, repeats)
-        with neighbours(1):
-            busy = milliseconds(render, repeats)
-    heading("`aaplug render` of 25 views of the chair at 1/4, ms", "quiet", "busy", "busy / quiet")
-    row(quiet, busy, busy / quiet)
+        program = [sys.executable, "-c", PROGRAM.format(folder=folder)]
+        heading("ms", "what", "quiet", "busy", "busy / quiet")
+        for what, command in (("`aaplug render`", words.split()), ("evaluates and converts the sample", program)):
+            run = partial(subprocess.run, command, check=True, capture_output=True)
+            quiet = milliseconds(run, repeats)
+            with neighbours(1):
+                busy = milliseconds(run, repeats)
+            row(what, quiet, busy, busy / quiet)

@@ -44,7 +44,7 @@ from aaplug.rasterizers.tiled.packages import CompiledKernels, Package
 from aaplug.rasterizers.tiled.sources import sources_of
 from aaplug.system.digests import digest_of_files
 from aaplug.system.errors import UsageError, reason
-from aaplug.system.executors import Processes, torch_threads
+from aaplug.system.executors import Processes, given_threads, torch_threads
 from aaplug.system.locks import scratch
 from aaplug.system.monitor import Tell
 
@@ -289,7 +289,7 @@ def _build_all(
     if left:
         if not has_compiler():
             raise UsageError("warmup", "needs a C++ compiler (g++ or clang++) for torch to compile with")
-        processes = min(torch.get_num_threads(), MAX_PROCESSES, len(left))
+        processes = min(given_threads(), MAX_PROCESSES, len(left))
         pool = Processes(processes, torch_threads=os.cpu_count() or 1, ordered=False)
         for package in pool.map(partial(_build, folder, tuple(recipes)), tuple(left)):
             del left[package]
