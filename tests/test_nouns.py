@@ -93,6 +93,14 @@ def test_a_camera_is_a_pinhole_at_a_rigid_pose(odd):
         replace(VIEWS[0], **odd)
 
 
+def test_the_last_row_of_a_pose_may_be_rounded():
+    off = torch.zeros(4, 4, dtype=torch.float64)
+    off[3] = torch.tensor([-1e-17, 1e-17, 0.0, 1e-16])
+    assert replace(VIEWS[0], cam_from_world=POSE + off).hw == VIEWS[0].hw
+    with pytest.raises(UsageError, match="0 0 0 1 below"):
+        replace(VIEWS[0], cam_from_world=POSE + 1e12 * off)
+
+
 @pytest.mark.parametrize(
     "odd", [{"cull_margin": math.nan}, {"cull_margin": -1.0}, {"min_seen": math.nan}, {"min_seen": -0.1}]
 )

@@ -31,6 +31,7 @@ MIN_SINE = 1e-12  # between the direction of sight and up
 MAX_BLADES = 64
 MAX_EXPOSURES = 4096  # frames averaged to one
 MAX_ROTATION_ERROR = 1e-3  # largest error of an entry of R·Rᵀ that counts as rounding
+MAX_LAST_ROW_ERROR = 1e-6  # the same of the row 0 0 0 1, which some inverses round, too
 
 Side = Annotated[int, Range(1, MAX_SIDE)]  # px
 Focal = Annotated[float, Range(above=0, most=MAX_FOCAL)]  # px
@@ -269,7 +270,8 @@ def check_rigid(pose: Sequence[Sequence[float]]) -> None:
     (a, b, c), (d, e, f), (g, h, i) = axes
     if a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) < 0:
         raise UsageError("cam_from_world", f"expected a rotation, got one that mirrors: {axes}")
-    if [*last] != [0, 0, 0, 1] or not all(abs(x) <= MAX_DISTANCE for x in place):
+    is_last = all(abs(x - expected) <= MAX_LAST_ROW_ERROR for x, expected in zip(last, (0, 0, 0, 1), strict=True))
+    if not is_last or not all(abs(x) <= MAX_DISTANCE for x in place):
         expected = f"a translation of at most {MAX_DISTANCE:g}, and 0 0 0 1 below"
         raise UsageError("cam_from_world", f"expected {expected}, got {place} and {last}")
 
