@@ -149,9 +149,8 @@ def _properties(tree: Tree, spans: Mapping[str, float]) -> Iterator[tuple[dict[s
     yield property_of("alpha", "f16", scene.opacities.to(half))
     yield property_of("rgb", "f16", scene.base_colours.to(half))
     yield property_of("scales", "ln_f16", scene.log_scales.to(half))
-    yield property_of(
-        "orientation", "f32", (quats[:, 1:] * torch.where(quats[:, :1] < 0, -1, 1)).float()
-    )  # w is the rest
+    upper = quats[:, 1:] * torch.where(quats[:, :1] < 0, -1, 1)  # w is the rest
+    yield property_of("orientation", "f32", upper.float())
     for band, coefficients in enumerate(BANDS, 1):
         if (span := spans.get(f"sh{band}Max")) is not None:
             values = (scene.sh[:, coefficients].flatten(1) * (MAX_S8 / span)).round().clamp(-MAX_S8, MAX_S8)
