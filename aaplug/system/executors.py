@@ -76,17 +76,15 @@ class Threads:
 
 @dataclass(frozen=True)
 class Processes:
-    """Fresh (spawned) processes.
+    """Fresh (spawned) processes, each with one torch thread.
 
     `work` is pickled once, to a file that all of them map, so it can hold a large scene; items and results travel
     through pipes.  A script that uses processes needs `if __name__ == "__main__":` around its calls.
 
-    torch_threads: of each process; None leaves torch's default.
     ordered: true for results in the order of the items, false for results as they finish.
     """
 
     workers: int
-    torch_threads: int | None = 1
     ordered: bool = True
 
     def map(self, work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
@@ -100,7 +98,7 @@ class Processes:
             save(work, folder / WORK_FILE_NAME)
             track_quietly()
             spawn = multiprocessing.get_context("spawn")
-            pool = ProcessPoolExecutor(self.workers, spawn, _start, (str(folder), self.torch_threads))
+            pool = ProcessPoolExecutor(self.workers, spawn, _start, (str(folder),))
             try:
                 most = ITEMS_PER_WORKER * self.workers
                 yield from results(lambda item: pool.submit(_call, item), items, lambda: most, self.ordered)
@@ -136,15 +134,21 @@ class ProcessesIfLong:
         yield from (map if workers < 2 else Processes(workers).map)(work, others)
 
 
+class _Given(threading.local):
+    """torch's number of threads outside of a block that uses fewer of them; None outside of all blocks."""
+
+    threads: int | None = None
+
+
 _is_forked = False  # true in a process that began as a copy of another
-_local = threading.local()  # `given`: torch's number of threads outside of a block that uses fewer of them
+_given = _Given()
 
 
 def _begin_forked() -> None:
     """Draw with one thread in the copy of a process: it has no others of OpenMP's, and would wait for them."""
     global _is_forked
     _is_forked = True
-    _local.given = None
+    _given.threads = None
     torch.set_num_threads(1)
 
 
@@ -154,7 +158,7 @@ if hasattr(os, "register_at_fork"):
 
 def given_threads() -> int:
     """The number of threads that torch may use, of which it uses fewer inside `cores.on_free_cores`."""
-    return getattr(_local, "given", None) or torch.get_num_threads()
+    return _given.threads or torch.get_num_threads()
 
 
 @contextmanager
@@ -163,14 +167,14 @@ def torch_threads(count: int, given: int | None = None) -> Iterator[None]:
 
     given: what `given_threads` says inside; None for `count`.
     """
-    before, before_given = torch.get_num_threads(), getattr(_local, "given", None)
+    before, before_given = torch.get_num_threads(), _given.threads
     torch.set_num_threads(1 if _is_forked else count)
-    _local.given = given
+    _given.threads = given
     try:
         yield
     finally:
         torch.set_num_threads(1 if _is_forked else before)  # it may have begun inside
-        _local.given = None if _is_forked else before_given
+        _given.threads = None if _is_forked else before_given
 
 
 def results(
@@ -227,7 +231,7 @@ def track_quietly() -> None:
 _work: Callable[[Any], Any] | None = None  # function of this worker process
 
 
-def _start(folder: str, threads: int | None) -> None:
+def _start(folder: str) -> None:
     """Begin a worker process: load the work, and end with the parent if that dies without shutting the pool down."""
     global _work
 
@@ -241,8 +245,7 @@ def _start(folder: str, threads: int | None) -> None:
     threading.Thread(target=end_with_parent, daemon=True).start()
     end_as_worker()
     keep_freed_memory()
-    if threads is not None:
-        torch.set_num_threads(threads)
+    torch.set_num_threads(1)
     _work = load(Path(folder) / WORK_FILE_NAME)
 
 

@@ -89,6 +89,7 @@ OPTIONS = {
     "realize_reads_threshold": 30,  # inputs are recomputed inside the loop, however much they read
     "assert_indirect_indexing": False,  # indices are our own, and checking each load is slow
     "cpp.enable_floating_point_contract_flag": "fast",  # multiply and add in one instruction
+    "cpp.dynamic_threads": True,  # as many as torch has when a kernel runs, not when it was compiled
 }
 # By this setting inductor leaves loops that gather scattered numbers scalar.
 TILING_HEURISTIC = "cpp.enable_tiling_heuristics"
@@ -290,7 +291,7 @@ def _build_all(
         if not has_compiler():
             raise UsageError("warmup", "needs a C++ compiler (g++ or clang++) for torch to compile with")
         processes = min(given_threads(), MAX_PROCESSES, len(left))
-        pool = Processes(processes, torch_threads=os.cpu_count() or 1, ordered=False)
+        pool = Processes(processes, ordered=False)
         for package in pool.map(partial(_build, folder, tuple(recipes)), tuple(left)):
             del left[package]
             tell(processes)
