@@ -135,7 +135,12 @@ def test_a_bundle_is_used_where_nothing_is_compiled(built, empty_cache, monkeypa
 @linux
 def test_a_bundle_is_compiled_for_each_instruction_set_of_this_processor(empty_cache, monkeypatch):
     built: list[object] = []
-    monkeypatch.setattr(compiled.Processes, "map", lambda pool, work, packages: built.extend(packages) or packages)
+
+    def no_work(pool: object, work: object, packages: Sequence[object]) -> Iterator[tuple[object, str]]:
+        built.extend(packages)
+        return ((package, "") for package in packages)
+
+    monkeypatch.setattr(compiled.Processes, "map", no_work)
     monkeypatch.setattr(compiled, "has_compiler", lambda: True)
     monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: "AVX512")
     made = aaplug.warmup(bundle=empty_cache / "bundle")
@@ -440,7 +445,7 @@ SECONDS = {  # to compile, measured; the others take 7 to 15
 def test_the_time_left_of_a_warmup_is_honest_from_the_first_kernel_on(empty_cache, monkeypatch, processes):
     taken, told = {kernel.name: SECONDS.get(kernel.name, 10) for kernel in compiled.KERNELS}, [(0.0, 0, 100)]
 
-    def in_turn(pool: object, work: object, packages: Sequence[tuple[str, None]]) -> Iterator[tuple[str, None]]:
+    def in_turn(pool: object, work: object, packages: Sequence[tuple[str, None]]) -> Iterator[tuple[object, str]]:
         """Each package when it is done, as a pool would yield it."""
         ends, free = [], [0.0] * processes
         for name, _ in packages:
@@ -448,7 +453,7 @@ def test_the_time_left_of_a_warmup_is_honest_from_the_first_kernel_on(empty_cach
             heapq.heappush(free, ends[-1][0])
         for now, name in sorted(ends):
             told.append((now, 0, 0))
-            yield name, None
+            yield (name, None), ""
 
     def tell(done: int, total: int) -> None:
         told[-1] = (told[-1][0], done, total)
@@ -525,13 +530,31 @@ def test_after_a_failed_build_auto_is_eager_and_says_why(empty_cache, monkeypatc
         find_rasterizer("compiled", 1, said.append)
 
 
-def test_a_kernel_that_does_not_compile_is_named(empty_cache, monkeypatch):
+def test_kernels_that_do_not_compile_are_named_and_leave_no_other_unbuilt(empty_cache, monkeypatch):
     def fails(*args, **options):
         raise KeyError("buf14")
 
+    monkeypatch.setattr(compiled.Processes, "map", lambda pool, work, packages: map(work, packages))
+    monkeypatch.setattr(compiled, "has_compiler", lambda: True)
     monkeypatch.setattr(torch._inductor, "aoti_compile_and_package", fails)
-    with pytest.raises(UsageError, match=r"warmup: torch .* cannot compile 'slots' here"):
-        compiled._build(compiled.cache_folder(), (), ("slots", None))
+    with pytest.raises(UsageError, match=r"warmup: torch .* cannot compile slots, spans here: 'buf14'"):
+        compiled.build(names={"slots", "spans"})
+
+
+def test_kernels_of_images_are_used_where_those_of_gradients_do_not_compile(monkeypatch):
+    kernels = CompiledKernels(lambda kernel: None)
+
+    def fails(**_):
+        raise UsageError("warmup", "torch cannot compile slots here")
+
+    for name, value in {"build": fails, "load": lambda: kernels, "is_built": lambda _: False}.items():
+        monkeypatch.setattr(choice, name, value)
+    monkeypatch.setattr(choice, "has_compiler", lambda: True)
+    said: list[str] = []
+    chosen = find_rasterizer("auto", choice.STEPS_THAT_PAY, said.append, gradients=True)
+    assert isinstance(chosen, Tiled)
+    assert chosen.kernels is kernels
+    assert "torch cannot compile slots here" in said[1]
 
 
 def test_an_unknown_name_lists_the_known_ones():

@@ -48,10 +48,13 @@ def find_rasterizer(
         try:
             kernels = build(gradients=gradients)
         except UsageError as error:
-            if name == "compiled":
-                raise
-            say(f"rasterizer: eager ({error})")
-            return RASTERIZERS["eager"]
+            kernels = load()
+            if kernels is None:
+                if name == "compiled":
+                    raise
+                say(f"rasterizer: eager ({error})")
+                return RASTERIZERS["eager"]
+            say(f"rasterizer: some kernels run eagerly, and slower ({error})")
     if kernels is not None:
         say("rasterizer: compiled")
         return Tiled(kernels)

@@ -272,7 +272,10 @@ def build_bundle(
 def _build_all(
     wanted: Sequence[tuple[Kernel, Target | None]], folder: Path, progress: Tell, recipes: Sequence[Recipe]
 ) -> None:
-    """Build what is missing or broken of these packages, in one process per thread of torch."""
+    """Build what is missing or broken of these packages, in one process per thread of torch.
+
+    A kernel that torch cannot compile leaves no other unbuilt.
+    """
     costs = [SLOW.get(kernel.name, 1) for kernel, _ in wanted]
     left = {
         (kernel.name, target): cost
@@ -292,9 +295,15 @@ def _build_all(
             raise UsageError("warmup", "needs a C++ compiler (g++ or clang++) for torch to compile with")
         processes = min(given_threads(), MAX_PROCESSES, len(left))
         pool = Processes(processes, ordered=False)
-        for package in pool.map(partial(_build, folder, tuple(recipes)), tuple(left)):
+        problems: dict[str, str] = {}
+        for package, problem in pool.map(partial(_build, folder, tuple(recipes)), tuple(left)):
             del left[package]
             tell(processes)
+            if problem:
+                problems[package[0]] = problem
+        if problems:
+            names, problem = ", ".join(sorted(problems)), next(iter(problems.values()))
+            raise UsageError("warmup", f"torch {torch.__version__} cannot compile {names} here: {problem}")
 
 
 @cache
@@ -360,8 +369,13 @@ def _close(result: torch.Tensor, expected: torch.Tensor) -> bool:
     return bool((result - expected).abs().max() <= RESULT_TOLERANCE * (1 + expected.abs().max()))
 
 
-def _build(folder: Path, recipes: Sequence[Recipe], package: tuple[str, Target | None]) -> tuple[str, Target | None]:
-    """Build one package, by its kernel's name, so that it can run in another process; returns the package."""
+def _build(
+    folder: Path, recipes: Sequence[Recipe], package: tuple[str, Target | None]
+) -> tuple[tuple[str, Target | None], str]:
+    """Build one package, by its kernel's name, so that it can run in another process.
+
+    Returns the package, and torch's words if it cannot compile it.
+    """
     name, target = package
     kernel = next(kernel for kernel in (*kernels_of(recipes), *TRAINER_KERNELS) if kernel.name == name)
     path = _path_in(folder, kernel, target)
@@ -383,14 +397,11 @@ def _build(folder: Path, recipes: Sequence[Recipe], package: tuple[str, Target |
             (cache_folder() / f"{path.stem}.so").unlink(missing_ok=True)  # of the package that is replaced
             os.replace(made, path)
         _compared(kernel, path)
-        return package
-    except UsageError:
-        raise
+        return package, ""
     except OSError as error:
         raise UsageError("warmup", f"cannot write {path.parent}: {reason(error)}") from error
     except Exception as error:  # a compiler can fail in any way
-        problem = f"torch {torch.__version__} cannot compile '{kernel.name}' here: {error}"
-        raise UsageError("warmup", problem) from error
+        return package, str(error) or type(error).__name__
 
 
 def _configs(kernel: Kernel, target: Target | None = None) -> dict[str, Any]:
