@@ -117,6 +117,15 @@ def test_gaussians_with_nan_are_refused_in_memory_as_from_a_file(column):
         scene_of(replace(SCENE, **{column: poisoned}))
 
 
+def test_gaussians_have_a_row_of_their_file_each(tmp_path):
+    write_scene(tmp_path / "scene.ply", SCENE)
+    read = read_scene(tmp_path / "scene.ply").gaussians()
+    columns = {name: torch.cat([column, column]) for name, column in read.columns.items()} | {"extras": {}}
+    with pytest.raises(UsageError, match="origin: expected a row of the file for each of"):
+        replace(read, **columns)
+    assert len(replace(read, **columns, origin=None)) == 2 * len(read)
+
+
 @pytest.mark.parametrize("background", [(1.0, 1.0), (1.0, 1.0, math.nan), (255.0, 0.0, 0.0), "bluish", 3])
 def test_a_background_is_a_colour(background):
     with pytest.raises(UsageError, match=r"background: (expected|takes)"):

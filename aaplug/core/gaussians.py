@@ -63,7 +63,8 @@ class Gaussians:
     extras: further columns of the file by name, for methods that know them.
 
     Raises:
-        UsageError: columns differ in length, precision or device, or are no tensors of these shapes.
+        UsageError: columns differ in length, precision or device, or are no tensors of these shapes; or the origin has
+            another number of rows.
     """
 
     means: Float[Tensor, "n 3"]
@@ -86,6 +87,9 @@ class Gaussians:
             if column.dtype != self.means.dtype or column.device != self.means.device:
                 means = f"{self.means.dtype} on {self.means.device}, as the means are"
                 raise UsageError(name, f"expected {means}, got {column.dtype} on {column.device}")
+        if self.origin is not None and len(self.origin.rows) != len(self):
+            rows = f"a row of the file for each of {len(self):,} Gaussians, got {len(self.origin.rows):,}"
+            raise UsageError("origin", f"expected {rows} (origin=None forgets the file)")
 
     def __len__(self) -> int:
         return self.means.shape[0]
