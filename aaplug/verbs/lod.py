@@ -286,10 +286,10 @@ def _levels(maker: _Maker, folder: Path | None, files: Sequence[Path]) -> Iterat
         earlier = read_manifest(pyramid, unfinished=True)
         if earlier.source != manifest.source:
             raise UsageError("resume", f"{folder} holds levels of another scene, other cameras or other options")
-        there = levels_in(pyramid, earlier)
+        there = levels_in(pyramid, earlier, start=1)  # the first is the scene itself
         manifest = replace(manifest, count=max(len(goals) + 1, len(earlier.levels)), levels=earlier.levels)
         maker.job.monitor.say(f"resumed with {counted(len(earlier.levels) - 1, 'level')}")
-    made = next(there, None) or Level(maker.scene, 1.0, chunks_of(maker.scene.means, MAX_CHUNK_GAUSSIANS))
+    made = Level(maker.scene, 1.0, chunks_of(maker.scene.means, MAX_CHUNK_GAUSSIANS))
     leaves, front = leaves_of(made), None
     for place in range(len(goals) + 1):
         if place:

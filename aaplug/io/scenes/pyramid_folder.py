@@ -119,10 +119,12 @@ def read_pyramid(folder: str | PathLike[str]) -> Pyramid:
     return pyramid_of(list(levels_in(folder, read_manifest(folder))))
 
 
-def levels_in(folder: str | PathLike[str], manifest: Manifest) -> Iterator[Level]:
-    """The levels of a folder; see `read_pyramid`."""
+def levels_in(folder: str | PathLike[str], manifest: Manifest, start: int = 0) -> Iterator[Level]:
+    """The levels of a folder from `start` on; see `read_pyramid`.  The files of those before it are checked, too."""
     for place, entry in enumerate(manifest.levels):
         path = path_of(Path(folder), entry)
+        if place < start:
+            continue
         scene, sizes = ply.open_scene(path, SceneFileOptions()).gaussians(), torch.tensor(entry.chunks)
         problem = FormatError(path, f"does not have the chunks that {MANIFEST} lists")
         if sum(entry.chunks) != len(scene):  # before memory is taken for as many as it says

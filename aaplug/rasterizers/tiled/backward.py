@@ -100,20 +100,22 @@ def _backward(
     light, steps_done, done = rows.new_zeros(len(steps), PIXELS), [], 0
     for segment in reversed(segments):
         behind = light.index_select(0, segment.tiles)
+        left = behind.clone()  # a step reads one and writes the other
         colours = tiles_of(grads, segment.tiles, bins.columns, how.kernels)
         step_of = first.index_select(0, segment.tiles) + segment.start // STEP
         rays = how.rays_of(segment.corners[:, :2])
-        part = whole = [step_of, segment.lists, segment.corners, behind, *colours, *rays]
+        part = whole = [step_of, segment.lists, segment.corners, *colours, *rays]
         run, shifts = None, shifts_of(len(segment.before), STEP, rows)
         for step, before in reversed([*enumerate(segment.before)]):
             n = len(before)
             if n != len(part[0]):
                 part = [x.narrow(0, 0, n) for x in whole]
             mine, lists, corners, *pixels = part
-            args = (rows, bins.splats, lists, corners, before, *pixels, *local, limits, shifts[step])
-            args = (*args, parts.narrow(0, done, n))
+            read, written = behind.narrow(0, 0, n), (parts.narrow(0, done, n), left.narrow(0, 0, n))
+            args = (rows, bins.splats, lists, corners, before, read, *pixels, *local, limits, shifts[step], *written)
             run = run or how.kernels.runner(kernel, args)
             run(*args)
+            behind, left = left, behind
             # Among the fewest tiles one may have no splats left: its step is none of the list.
             these = mine + step
             ends = lists[:, 1] - step * STEP
@@ -162,12 +164,13 @@ def _step(
     behind: Float[Tensor, "t P"],
     *gradients_and_rest: Tensor,
 ) -> tuple[()]:
-    """Write each tile's contributions to the gradients of K splats into `parts`, the last argument: [t, sums].
+    """Write each tile's contributions to the gradients of K splats into `parts`, the last argument but one: [t, sums].
 
-    Updates `behind`, B_k in the module's docstring.
+    behind: B_k of the module's docstring behind these splats; what is behind those before them is written into the last
+    argument; torch 2.8 compiles no kernel that updates it in place.
     gradients_and_rest: of d colours and alpha, [t, P]; then as in `forward._pass`.
     """
-    *planes, values, ahead_of_list, parts = gradients_and_rest
+    *planes, values, ahead_of_list, parts, left = gradients_and_rest
     coordinates = coordinates_of(pixel)
     *colours, g_hidden = planes[:-coordinates]
     limits, one = Limits.of(values), corners[:, 2:]
@@ -196,7 +199,7 @@ def _step(
         sums = pixel.sums(moves[::-1], colours, T, pixels)
     else:
         sums = sums_by_autograd(pixel, limits, moves[::-1], colours, pixels)
-    behind.copy_(light)
+    left.copy_(light)
     parts.copy_(sums)
     return ()
 
@@ -213,14 +216,14 @@ def _slots_example() -> tuple[Tensor, ...]:
 def step_kernel(pixel: PixelKernel, channels: int = 3) -> Kernel:
     """A backward step of one pixel kernel."""
     planes = range(4, 7 + channels)  # transmittance, B_k, and the gradients of colours and alpha
-    sums = STEP * sums_per_splat(pixel, channels)
+    widths = STEP * sums_per_splat(pixel, channels), PIXELS  # of the last two arguments
     return Kernel(
         name_of(pixel, channels) + "-backward",
         partial(_step, pixel),
-        lambda: (*tiles_example(pixel, channels, len(planes)), torch.zeros(EXAMPLE_TILES, sums)),
-        ("m", "p", "t", "t", *("t" for _ in planes), *coordinate_sizes(pixel), None, None, "t"),
+        lambda: (*tiles_example(pixel, channels, len(planes)), *(torch.zeros(EXAMPLE_TILES, n) for n in widths)),
+        ("m", "p", "t", "t", *("t" for _ in planes), *coordinate_sizes(pixel), None, None, "t", "t"),
         overlaps="within registers",
-        updates=(planes[1], planes[-1] + 3 + coordinates_of(pixel)),
+        updates=(last := planes[-1] + 3 + coordinates_of(pixel), last + 1),
     )
 
 
