@@ -36,6 +36,7 @@ REQUIRED = (*("x", "y", "z", *COLOURS, "opacity", *SCALES), *("rot_0", "rot_1", 
 NORMALS = ("nx", "ny", "nz")  # unused; 3DGS writes them, and some readers expect them
 EXTRAS = ("min_pixel_sizes", "max_pixel_sizes", "base_mask")  # of Multi-Scale 3DGS, of any type
 FLOAT_CODES = ("f4", "f8")
+ROWS_PER_PART = 1 << 16  # 16 MB of a scene of degree 3: few calls, and little memory beside the result
 ROWS_PER_CONVERSION = 1 << 12  # 1 MB, so that a column's stride stays within the cache
 ROWS_PER_WRITE = 1 << 16  # 16 MB
 
@@ -130,7 +131,18 @@ def _is_parameter(column: str) -> bool:
 
 
 def _rows(document: Document, degree: int, flat: bool, start: int, stop: int) -> Gaussians:
-    """The parameters as tensors, converted in chunks of rows."""
+    """The parameters as tensors, converted part by part, so that memory holds all of them once."""
+    part = _part(document, degree, flat, start, start)  # none, which has the columns
+    whole = {name: x.new_empty(stop - start, *x.shape[1:]) for name, x in {**part.columns, **part.extras}.items()}
+    for begin in range(start, stop, ROWS_PER_PART):
+        part = _part(document, degree, flat, begin, min(begin + ROWS_PER_PART, stop))
+        for name, column in {**part.columns, **part.extras}.items():
+            whole[name][begin - start :][: len(part)] = column
+    columns = {name: whole[name] for name in part.columns}
+    return replace(part, **columns, extras={name: whole[name] for name in part.extras})
+
+
+def _part(document: Document, degree: int, flat: bool, start: int, stop: int) -> Gaussians:
     table = document.table
     assert table is not None
     rows = table.read(start, stop)
