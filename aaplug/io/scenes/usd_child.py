@@ -63,7 +63,10 @@ def found_in(path: str, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
                 if value is not None and len(value):
                     arrays[f"{number} {name}"] = np.asarray(value)
                     break
-        motion = UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(time)
+        placed = UsdGeom.Xformable(prim)
+        if not placed:
+            return {"refused": f"needs usd-core 26.3 or newer, which knows {TYPE}"}
+        motion = placed.ComputeLocalToWorldTransform(time)
         degree = prim.GetAttribute(DEGREE).Get(time)
         told.append({"name": str(prim.GetPath()), "degree": degree, "motion": [list(row) for row in motion]})
     record = stage.GetRootLayer().customLayerData.get("aaplug")
