@@ -15,7 +15,7 @@ import aaplug
 from aaplug.core.sampling import median_rates
 from aaplug.core.spherical_harmonics import SH_C0
 from aaplug.io import rad, streamed
-from aaplug.io.scenes import read_scene
+from aaplug.io.scenes import pyramid_folder, read_scene
 from aaplug.io.streamed import MAX_SCREEN_ERROR, TILE_SWITCH
 from aaplug.methods.viewers import VIEWERS
 from aaplug.system.errors import FormatError, OutputError, UsageError
@@ -162,7 +162,7 @@ def test_a_run_that_was_cut_short_is_resumed(tmp_path, small_leaves, monkeypatch
     tuned = {} if to == "3dtiles" else {"refine": True, "steps": 2}
     made(tmp_path / "whole", to, **tuned)
     writer, number_at = ("write_front", 1) if to == "rad" else ("write_level", 2)
-    written, resumed = getattr(streamed, writer), []
+    written, resumed, read, opened = getattr(streamed, writer), [], pyramid_folder.ply.open_scene, set()
 
     def cut(*args):
         last = args[number_at] == LEVELS
@@ -179,8 +179,10 @@ def test_a_run_that_was_cut_short_is_resumed(tmp_path, small_leaves, monkeypatch
         made(tmp_path / "out", to, **tuned)
     assert not (tmp_path / "out" / streamed.STREAMS[to].index).exists()
     monkeypatch.setattr(f"aaplug.verbs.lod.{writer}", recorded)
+    monkeypatch.setattr(pyramid_folder.ply, "open_scene", lambda path, how: opened.add(path.name) or read(path, how))
     made(tmp_path / "out", to, resume=True, **tuned)
     assert resumed == [LEVELS]
+    assert {f"scene_lod{level}.ply" for level in range(LEVELS)} - opened == {"scene_lod0.ply"}  # the scene itself
     assert contents(tmp_path / "out") == contents(tmp_path / "whole")
 
 
