@@ -100,7 +100,7 @@ def _backward(
     light, steps_done, done = rows.new_zeros(len(steps), PIXELS), [], 0
     for segment in reversed(segments):
         behind = light.index_select(0, segment.tiles)
-        left = behind.clone()  # a step reads one and writes the other
+        lights = whole_lights = [behind, behind.clone()]  # a step reads the first and writes the second
         colours = tiles_of(grads, segment.tiles, bins.columns, how.kernels)
         step_of = first.index_select(0, segment.tiles) + segment.start // STEP
         rays = how.rays_of(segment.corners[:, :2])
@@ -109,19 +109,20 @@ def _backward(
         for step, before in reversed([*enumerate(segment.before)]):
             n = len(before)
             if n != len(part[0]):
-                part = [x.narrow(0, 0, n) for x in whole]
+                part, lights = ([x.narrow(0, 0, n) for x in of_all] for of_all in (whole, whole_lights))
             mine, lists, corners, *pixels = part
-            read, written = behind.narrow(0, 0, n), (parts.narrow(0, done, n), left.narrow(0, 0, n))
-            args = (rows, bins.splats, lists, corners, before, read, *pixels, *local, limits, shifts[step], *written)
+            behind, left = lights
+            args = (rows, bins.splats, lists, corners, before, behind, *pixels, *local, limits, shifts[step])
+            args = (*args, parts.narrow(0, done, n), left)
             run = run or how.kernels.runner(kernel, args)
             run(*args)
-            behind, left = left, behind
+            lights, whole_lights = lights[::-1], whole_lights[::-1]
             # Among the fewest tiles one may have no splats left: its step is none of the list.
             these = mine + step
             ends = lists[:, 1] - step * STEP
             steps_done.append(these if n > MIN_TILES else torch.where(lists[:, 0] < ends, these, total))
             done += n
-        light.index_copy_(0, segment.tiles, behind)
+        light.index_copy_(0, segment.tiles, whole_lights[0])
     # `part_of` tells where each step's contributions stand.  Steps behind saturated pixels contribute nothing.
     part_of = torch.full((total + 1,), count, dtype=torch.int32, device=rows.device)
     part_of.index_copy_(0, torch.cat(steps_done), torch.arange(count, dtype=torch.int32, device=rows.device))
