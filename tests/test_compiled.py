@@ -9,6 +9,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tempfile
 import zipfile
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -32,6 +33,7 @@ from aaplug.rasterizers.tiled.packages import CompiledKernels, Package
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.errors import UsageError
 from aaplug.system.executors import torch_threads
+from aaplug.system.locks import SCRATCH_PREFIX
 from tests.conftest import COMPILED, ROOT, make_camera, make_scene, sized
 
 ANSWER = 1e-5
@@ -533,14 +535,21 @@ def test_after_a_failed_build_auto_is_eager_and_says_why(empty_cache, monkeypatc
 
 
 def test_kernels_that_do_not_compile_are_named_and_leave_no_other_unbuilt(empty_cache, monkeypatch):
+    temporary = list[Path]()
+
     def fails(*args, **options):
+        temporary.append(Path(tempfile.gettempdir()))  # of torch, which leaves hundreds of MB there
         raise KeyError("buf14")
 
+    monkeypatch.setattr(tempfile, "tempdir", tempfile.tempdir)  # `_build` has a process of its own
+    monkeypatch.setattr(compiled.gc, "set_threshold", lambda *_: None)
     monkeypatch.setattr(compiled.Processes, "map", lambda pool, work, packages: map(work, packages))
     monkeypatch.setattr(compiled, "has_compiler", lambda: True)
     monkeypatch.setattr(torch._inductor, "aoti_compile_and_package", fails)
     with pytest.raises(UsageError, match=r"warmup: torch .* cannot compile slots, spans here: 'buf14'"):
         compiled.build(names={"slots", "spans"})
+    assert all(folder.name.startswith(SCRATCH_PREFIX) and not folder.exists() for folder in temporary)
+    assert len(temporary) == 2
 
 
 def test_kernels_of_images_are_used_where_those_of_gradients_do_not_compile(monkeypatch):

@@ -12,6 +12,7 @@ A bundle is a folder of packages for an instruction set instead of one processor
 that have no compiler.
 """
 
+import gc
 import hashlib
 import logging
 import os
@@ -19,6 +20,7 @@ import platform
 import shutil
 import subprocess
 import sys
+import tempfile
 import warnings
 import zipfile
 from collections.abc import Callable, Collection, Sequence
@@ -104,6 +106,7 @@ MAX_SIZE = 1 << 31
 LIBRARY_SUFFIXES = (".so", ".pyd", ".dll", ".dylib")  # of the library in a package, by system
 STANDARD_COMPILER = "clang++" if sys.platform == "darwin" else "g++"
 MAX_PROCESSES = 4  # compilers side by side: each takes most of a GB
+GARBAGE = (100_000, 50, 100)  # objects, and then collections, before one of garbage: torch's graphs have little of it
 # Share of the largest value by which a package's result may differ from the eager one, on the example.
 RESULT_TOLERANCE = 1e-4
 
@@ -296,11 +299,13 @@ def _build_all(
         processes = min(given_threads(), MAX_PROCESSES, len(left))
         pool = Processes(processes, ordered=False)
         problems: dict[str, str] = {}
-        for package, problem in pool.map(partial(_build, folder, tuple(recipes)), tuple(left)):
-            del left[package]
-            tell(processes)
-            if problem:
-                problems[package[0]] = problem
+        with scratch() as temporary:
+            build_one = partial(_build, folder, tuple(recipes), str(temporary))
+            for package, problem in pool.map(build_one, tuple(left)):
+                del left[package]
+                tell(processes)
+                if problem:
+                    problems[package[0]] = problem
         if problems:
             names, problem = ", ".join(sorted(problems)), next(iter(problems.values()))
             raise UsageError("warmup", f"torch {torch.__version__} cannot compile {names} here: {problem}")
@@ -370,12 +375,15 @@ def _close(result: torch.Tensor, expected: torch.Tensor) -> bool:
 
 
 def _build(
-    folder: Path, recipes: Sequence[Recipe], package: tuple[str, Target | None]
+    folder: Path, recipes: Sequence[Recipe], temporary: str, package: tuple[str, Target | None]
 ) -> tuple[tuple[str, Target | None], str]:
-    """Build one package, by its kernel's name, so that it can run in another process.
+    """Build one package, by its kernel's name, in a process that does nothing else.
 
+    temporary: a folder for what torch would leave among the system's temporary files: 600 MB of precompiled headers.
     Returns the package, and torch's words if it cannot compile it.
     """
+    tempfile.tempdir = temporary
+    gc.set_threshold(*GARBAGE)
     name, target = package
     kernel = next(kernel for kernel in (*kernels_of(recipes), *TRAINER_KERNELS) if kernel.name == name)
     path = _path_in(folder, kernel, target)
