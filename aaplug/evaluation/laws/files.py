@@ -12,6 +12,7 @@ from aaplug.io.cameras import CameraFormat
 from aaplug.io.scenes import SCENE_FORMATS, SceneFormat, WritableFormat
 from aaplug.io.scenes.options import SceneFileOptions
 from aaplug.system.errors import FormatError, UsageError
+from aaplug.system.locks import OUR_PREFIX
 
 from .base import law_of, make_scene, require
 
@@ -72,6 +73,21 @@ def reads_what_it_writes(format: SceneFormat) -> None:
         require(len(nearest.unique()) == COUNT, "Gaussians are doubled or lost")
         torch.testing.assert_close(means, scene.means[nearest], rtol=0.01, atol=0.01)
         require(len(opened.load(5, 9)) == 4, "`load` does not return the rows from start up to stop")
+
+
+@law_of("scene format")
+def writes_the_same_files_again(format: SceneFormat) -> None:
+    """The same scene gives the same names and bytes, and no other file is left beside them."""
+    if not isinstance(format, WritableFormat):
+        return
+    scene, files = make_scene(COUNT), list[dict[str, bytes]]()
+    for _ in range(2):
+        with tempfile.TemporaryDirectory() as folder:
+            format.write(Path(folder) / f"scene.{format.name}", [scene], COUNT, False, SceneFileOptions())
+            files.append({path.name: path.read_bytes() for path in Path(folder).rglob("*") if path.is_file()})
+    left = [name for name in files[0] if name.startswith(OUR_PREFIX)]
+    require(not left, f"leaves {left}")
+    require(files[0] == files[1], "writes other names or bytes the second time")
 
 
 @law_of("camera format")

@@ -10,6 +10,7 @@ Written are floats, as the stage's default prim, with y up and a metre per unit.
 """
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Iterable
@@ -44,6 +45,7 @@ HARMONICS, DEGREE = "radiance:sphericalHarmonicsCoefficients", "radiance:spheric
 TYPE = "ParticleField3DGaussianSplat"
 CHILD = Path(__file__).with_name("usd_child.py")  # a program of its own
 MAX_DEGREE = 4
+ZIP_EPOCH = 315_619_200  # s: 1980-01-02, which a zip holds in every time zone
 EXTENT_SIGMAS = 3.0  # from a Gaussian's centre
 # from axes with z up to axes with y up and z forward
 FROM_Z_UP = torch.tensor([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]], dtype=torch.float64)
@@ -93,9 +95,11 @@ class UsdFormat:
             if self.name != "usdz":
                 done = stage.GetRootLayer().Export(str(temporary))
             else:
-                with replacing_file(temporary.with_suffix(".usdc"), overwrite=True, suffix=".usdc") as inner:
-                    stage.GetRootLayer().Export(str(inner))
-                    done = module("UsdUtils").CreateNewUsdzPackage(str(inner), str(temporary))
+                with scratch(str(temporary.parent)) as folder:
+                    inner = folder / f"{path.stem}.usdc"
+                    done = stage.GetRootLayer().Export(str(inner))
+                    os.utime(inner, (ZIP_EPOCH, ZIP_EPOCH))  # the package holds it, and is to be the same each time
+                    done = done and module("UsdUtils").CreateNewUsdzPackage(str(inner), str(temporary))
             if not done:
                 raise OutputError(path, "cannot be written: usd-core failed")
 
