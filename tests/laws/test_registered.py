@@ -1,6 +1,7 @@
 """The laws that `aaplug check-plugin` runs: all that is registered keeps them, and broken objects do not."""
 
 import math
+import secrets
 from dataclasses import replace
 from itertools import chain
 from operator import attrgetter
@@ -90,6 +91,12 @@ class Forgetful:
         ply.write(path, [first], len(first), overwrite, options)
 
 
+class Untidy(Forgetful):
+    def write(self, path, parts, count, overwrite, options):
+        super().write(path, parts, count, overwrite, options)
+        path.with_name(secrets.token_hex()).touch()
+
+
 def promising(name: str) -> Recipe:
     return replace(RECIPES[name], promises=Promises(True, True, True, True))
 
@@ -112,6 +119,7 @@ BROKEN = {
     "is_ideal_for_the_truth": replace(METRICS["PSNR"], measure=lambda image, truth: 40.0),
     **dict.fromkeys(("tells_scenes_apart", "tells_cameras_apart"), Raising()),
     "reads_what_it_writes": Forgetful(),
+    "writes_the_same_files_again": Untidy(),
     **dict.fromkeys(("keeps_energy", "fades_when_small"), promising("classic")),
     "opaque_when_near": promising("mip-splatting"),
     "equals_training": promising("mip"),
@@ -120,8 +128,9 @@ BROKEN = {
 
 @pytest.mark.parametrize("law", [*chain(*LAWS.values())], ids=attrgetter("__name__"))
 def test_a_broken_object_breaks_the_law(law):
+    broken = BROKEN[law.__name__]
     with pytest.raises((AssertionError, GradcheckError, KeyError)):
-        law(BROKEN[law.__name__])
+        law(broken)
 
 
 @pytest.mark.parametrize("recipe", RECIPES.values(), ids=RECIPES)
