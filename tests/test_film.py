@@ -187,6 +187,19 @@ def test_a_path_of_zero_length_is_refused():
         filmed([VIEW], FilmOptions(), False, camera_to=[VIEW])
 
 
+def test_through_a_fisheye_of_another_aspect_pixels_are_square_and_a_stretched_view_is_told(cli, monkeypatch):
+    """A fisheye shows its angle along the shorter side."""
+    shown = []
+    monkeypatch.setattr("aaplug.verbs.render.write_frames", lambda renderer, views, *_, **__: shown.extend(views))
+    stretched = "resolution: 60x20 px stretches view r_0; -1 on one side keeps its aspect"
+    for lens in ("", "--lens fisheye --lens-angle 90"):
+        code, _, err = cli(f"render scene.ply --cameras . -o new --resolution 60x20 --rasterizer eager {lens}")
+        assert (code, stretched in err) == (0, not lens), err
+    plain, fisheye = shown
+    assert plain.fx / plain.fy == pytest.approx(60 / 20 * 48 / 64)
+    assert fisheye.fx == fisheye.fy == pytest.approx(10 / (math.pi / 4))
+
+
 def test_nothing_is_drawn_after_a_mistake(tmp_path):
     scene, cameras = make_scene(20), CameraSet((VIEW,), (VIEW,))
     how = {"min_seen": 0.0, "views": "all"}

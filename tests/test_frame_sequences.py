@@ -86,7 +86,7 @@ REFUSED = {
     "v.exr": "a video holds 8-bit colours and is not resumed; name a sequence, such as frames/frame.####.exr",
     "v.webm --transparent": "a video holds 8-bit colours and is not resumed",
     "v.webm --resume": "a video holds 8-bit colours and is not resumed",
-    "v.png": "name a .webm or .mp4 file",
+    "v.png": "name a .webm or .mp4 file, or frames such as name.####.png",
     "##/a.png": "name a .webm or .mp4 file",
     "a.##.##.png": "a.##.##.png: has places for two numbers; name a sequence such as frame.####.exr",
     "a.##.png --beside mip": "--beside: is for videos of one eye; a frame sequence and vr180 show --recipe alone",
@@ -107,7 +107,7 @@ def test_what_is_no_sequence_is_refused_before_anything_is_drawn(cli, monkeypatc
 def test_frames_of_different_sizes_are_refused(cli, monkeypatch):
     path = CameraPath(tuple(make_camera(size=size) for size in ((40, 30), (30, 40))), 24.0)
     monkeypatch.setattr("aaplug.verbs.video.read_camera_path", lambda _: path)
-    code, _, err = cli(f"{WORDS} out/a.##.png --path path.json")
+    code, _, err = cli(f"{WORDS.replace('--seconds 0.2 ', '')} out/a.##.png --path path.json")
     assert (code, "--path: has frames of different sizes (20x15, 15x20 px)" in err) == (2, True), err
     assert not Path("out").exists()
 

@@ -773,6 +773,7 @@ def test_patch_says_what_it_needs(monkeypatch, homes, missing):
 # ----------------------------------------------------------------------------------------------------------- mistakes
 
 WRONG = {
+    "scales: expected torch.float64, as means have, got torch.float32": {"scales": torch.ones(40, 3)},
     "means: expected a tensor [*b, n, 3] of floats, got float32 [40, 2]": {"means": torch.zeros(40, 2)},
     "quats: expected a tensor [*b, n, 4] of floats or None, got float32 [3, 4], n = 40": {"quats": torch.ones(3, 4)},
     "scales: expected a tensor [*b, n, 3] of floats or None, got float32 [40], n = 40": {"scales": torch.ones(40)},

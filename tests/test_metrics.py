@@ -2,6 +2,7 @@
 
 import importlib.util
 import math
+from functools import partial
 
 import pytest
 import torch
@@ -93,6 +94,13 @@ def test_a_metric_is_worse_the_farther_images_are(comparing, name):
     image, noise = torch.rand(64, 48, 3, generator=g), torch.rand(64, 48, 3, generator=g)
     near, far = (metric.compare(image.lerp(noise, share), image) for share in (0.1, 0.9))
     assert metric.loss(near) < metric.loss(far)
+
+
+def test_a_metric_gives_one_number_of_any_type():
+    square, image = partial(Metric, "square", "", 0.0, 2, ""), torch.full((4, 4, 3), 0.5)
+    assert type(square(measure=lambda a, b: (a * b).mean()).compare(image, image)) is float
+    with pytest.raises(UsageError, match="metric square: gives no number but Tensor"):
+        square(measure=lambda a, b: a * b).compare(image, image)
 
 
 def test_a_metric_of_neither_kind_is_refused():

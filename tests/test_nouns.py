@@ -25,8 +25,9 @@ SCENE = replace(sized(make_scene(6)), origin=ORIGIN)
 TRAINING = TrainingViews.of(SCENE, VIEWS)
 PYRAMID = Pyramid.of([SCENE], [torch.zeros(6, dtype=torch.int64)])
 CUTTER = Cutter.of(PYRAMID, TRAINING)
+IMAGE = Renderer.of(SCENE, TRAINING, "classic", rasterizer="eager")(VIEWS[0])
 VALUES = (VIEWS[0], CameraSet(VIEWS, VIEWS[:1]))
-LARGE = (SCENE, ORIGIN, TRAINING, TRAINING.bounds, make_splats(6, (8, 8)), PYRAMID, CUTTER, CUTTER(VIEWS[0]))
+LARGE = (SCENE, ORIGIN, TRAINING, TRAINING.bounds, make_splats(6, (8, 8)), PYRAMID, CUTTER, CUTTER(VIEWS[0]), IMAGE)
 COPIES = {"copy": copy.copy, "deepcopy": copy.deepcopy, "pickle": lambda noun: pickle.loads(pickle.dumps(noun))}
 
 

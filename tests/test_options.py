@@ -88,6 +88,11 @@ REFUSED = {
     "render s.ply -o out --scale 2 --resolution 8x8": "--scale: and --resolution both set the size; give one",
     "render s.ply -o out --resolution -1x-1": "--resolution: takes sizes such as 400x400, got -1x-1",
     "render s.ply -o out --resolution 99999x-1": "--resolution: would be 99999x99999 px; the limit is 16384 a side",
+    "render s.ply -o out --path p.json --views train": "--views: are replaced by --path; leave one of them out",
+    "render s.ply -o out --camera-to b --samples 0": "--camera-to: opens a shutter, which --samples of 0 ignores",
+    "render s.ply -o out --samples 0 --f-stop 2 --focus-distance 1": "--f-stop: is what --samples of 0 ignores",
+    "video s.ply -o v.mp4 --path orbit --start 0.5": "--start: belongs to a path of zoom, dolly, not to orbit",
+    "video s.ply -o v.mp4 --path a.json --seconds 2": "belongs to a path of zoom, dolly, orbit, not to a.json",
     "convert s.ply -o c.ply --steps 3": "--steps: belongs to the fit to a viewer; name one with --for",
     "convert s.ply -o c.ply --for gsplat --variance 0.1": "leave out --form, --variance",
     "finetune s.ply -o t.ply --upsampler bicubic": "makes what scales above 1 should show, and there is none",
@@ -172,6 +177,7 @@ for options, name, value in (
     (RenderOptions, "views", ["r_8"]), (RenderOptions, "resolution", (5, 5)), (RenderOptions, "overwrite", 1),
     (RenderOptions, "bit_depth", 7), (RenderOptions, "monitor", 3), (ConvertOptions, "form", 3),
     (EvaluateOptions, "layout", "tree"), (FinetuneOptions, "move", ["colour"]), (VideoOptions, "fps", "24"),
+    (EvaluateOptions, "scale", 0.5),
 ):
     try:
         options(**{name: value})

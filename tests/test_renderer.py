@@ -297,6 +297,8 @@ def test_a_free_camera_has_the_rate_of_its_distance(distance, rate):
     assert renderer.relative_rate(trained.scaled(0.25)) == 0.25
     unseeing = replace(free(make_camera((0.0, -9.0, 0.0))), cx=1e6)
     assert renderer.relative_rate(unseeing) == renderer.training.relative_rate(unseeing)
+    by_focal = replace(renderer, recipe=find_recipe("auto", rate_reference="global"))
+    assert by_focal.relative_rate(view) == renderer.training.relative_rate(view)
 
 
 def test_the_rate_of_a_free_camera_is_computed_once_per_pose(cameras, monkeypatch):

@@ -93,7 +93,9 @@ class Camera:
             object.__setattr__(self, "cam_from_world", self.cam_from_world.double())
             self._check_pose()
             if self.lens != PINHOLE and self.exposure is not None and self.exposure.aperture is not None:
-                raise UsageError("exposure", f"an aperture needs a lens without distortion, got {self.lens.projection}")
+                raise UsageError(
+                    "exposure", f"an aperture needs a pinhole lens without distortion, got {self.lens.projection}"
+                )
         except UsageError as error:
             if error.where == "name" or not self.name:
                 raise

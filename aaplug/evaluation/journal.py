@@ -98,7 +98,9 @@ class Journal:
             changed = dict.fromkeys(key for key in (*now, *before) if before.get(key) != now.get(key))
             if changed:
                 problem = f"is of another request ({listing(list(changed))} changed since)"
-                raise UsageError(str(path), f"{problem}; repeat that request, or start again with `overwrite`")
+                raise UsageError(
+                    str(path), f"{problem}; repeat that request, or start again with `overwrite`, not `resume`"
+                )
             for number, line in enumerate(lines[1:], start=2):
                 try:
                     view, measurements = line["view"], tuple(map(_measurement, line["measurements"]))

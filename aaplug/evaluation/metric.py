@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -136,11 +137,18 @@ class Metric:
 
     def compare(self, image: Image, truth: Image) -> float | None:
         """The value of `measure`; None where that is undefined, NaN or infinite."""
-        return _finite(self.measure(image, truth)) if self.measure else None
+        return self._number(self.measure(image, truth)) if self.measure else None
 
     def of(self, series: Series) -> float | None:
         """The value of `figure`; None where that is undefined, NaN or infinite."""
-        return _finite(self.figure(series)) if self.figure else None
+        return self._number(self.figure(series)) if self.figure else None
+
+    def _number(self, value: Any) -> float | None:
+        try:
+            number = None if value is None else float(value)
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise UsageError(f"metric {self.name}", f"gives no number but {type(value).__name__}: {error}") from error
+        return number if number is not None and math.isfinite(number) else None
 
     @property
     def title(self) -> str:
@@ -159,7 +167,3 @@ class Metric:
 def number(value: float | None, digits: int) -> str:
     """A value as tables show it."""
     return "–" if value is None else "∞" if value == math.inf else f"{value:.{digits}f}"
-
-
-def _finite(value: float | None) -> float | None:
-    return value if value is not None and math.isfinite(value) else None

@@ -11,3 +11,5 @@ gsplat's rules, written from gsplat's documentation.
 from aaplug.gsplat.drop_in import rasterization
 from aaplug.gsplat.patching import patch
 from aaplug.gsplat.surfels import rasterization_2dgs
+
+__all__ = ["patch", "rasterization", "rasterization_2dgs"]

@@ -190,6 +190,9 @@ def views_of(
         quats, scales = means.new_zeros(*batch, n, 4), torch.ones_like(means)
     elif quats is None or scales is None:
         raise UsageError("covars", "expected quats and scales, or covars")
+    for name, x in {"quats": quats, "scales": scales, "opacities": opacities}.items():
+        if x.dtype != means.dtype:
+            raise UsageError(name, f"expected {means.dtype}, as means have, got {x.dtype}")
     degree = options.sh_degree
     if colors is None:
         if options.coloured:

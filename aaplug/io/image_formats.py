@@ -83,6 +83,8 @@ class Storage:
         if chosen.lacks:
             raise UsageError("format", f"{chosen.name} needs {chosen.needs}: {install_command(chosen.name)}")
         asked = tuple(dict.fromkeys([*passes, *["alpha"] * transparent]))
+        if normal_axes != "camera" and "normal" not in asked:
+            raise UsageError("normal_axes", "are of the pass normal, which `passes` leaves out")
         for name in asked:
             if name not in chosen.passes:
                 holders = listing([f".{each.name}" for each in IMAGE_FORMATS.values() if name in each.passes])

@@ -43,7 +43,7 @@ def check_video(path: str | PathLike[str], fps: float, overwrite: bool) -> None:
         UsageError: `fps` is out of range.
     """
     if Path(path).suffix.lower() not in CODECS:
-        raise OutputError(path, f"name a {' or '.join(CODECS)} file")
+        raise OutputError(path, f"name a {' or '.join(CODECS)} file, or frames such as name.####.png")
     if not 0 < fps <= MOST_FPS:
         raise UsageError("fps", f"must be above 0 and at most {MOST_FPS}, got {fps:g}")
     check_output(path, overwrite)

@@ -80,8 +80,10 @@ class Number(Argument):
         values = [value] if self.count else value
         if value is None or (isinstance(values, (list, tuple)) and values and all(map(self._holds, values))):
             return
-        got = ", ".join(map(str, values)) if isinstance(values, (list, tuple)) else str(value)
-        raise UsageError(option, f"takes {self.takes}, got {got[:MAX_VALUE_CHARACTERS] or 'nothing'}")
+        listed = isinstance(values, (list, tuple))
+        got = ", ".join(map(str, values)) if listed else str(value)
+        takes = self.takes if listed else f"a list or tuple of {self.takes}"
+        raise UsageError(option, f"takes {takes}, got {got[:MAX_VALUE_CHARACTERS] or 'nothing'}")
 
     def _holds(self, value: Any) -> bool:
         kind = Integral if self.whole else Real  # NumPy's too

@@ -194,6 +194,9 @@ class FilmOptions(RecipeOptions):
         for name in ("sensor", "focus_distance", "focus_at", "blades"):
             if self.f_stop is None and getattr(self, name) is not None:
                 raise UsageError(name, "belongs to `f_stop`")
+        for name in ("f_stop", "shutter"):
+            if self.samples == 0 and getattr(self, name) is not None:
+                raise UsageError(name, "is what `samples` of 0 ignores; leave one of them out")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -33,7 +33,7 @@ from aaplug.options.shared import (
     metric_option,
     size_of,
 )
-from aaplug.system.errors import UsageError
+from aaplug.system.errors import UsageError, listing
 from aaplug.system.registry import names_of
 
 ALL = "all"  # instead of recipes' names: every recipe that the scene suits
@@ -48,6 +48,7 @@ SINGLE_SCENE_FACTOR = 2  # times as many steps for one scene: its counts are met
 LOSS_WEIGHTS = {0.5: 1.0, 0.25: 2.0, 0.125: 1.0}  # by scale; measured, as are the two below
 ANCHOR_WEIGHT = 3.0  # of the loss at the training size, beside those of the scales
 TUNED_PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "dc", "rest")
+ZOOMS = ("zoom", "dolly")  # paths whose sampling rate changes
 TRUTHS = ("auto", "self", "photographs")
 Layout = Literal["plain", "inria"]
 
@@ -73,6 +74,13 @@ class RenderOptions(FilmOptions, ImageOptions, LensOptions):
     camera_to: Annotated[str | None, flag("VIEW"), FILM] = None
     """For one view: the view that the camera reaches while the shutter is open."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.path is not None and self.views != RenderOptions.views:
+            raise UsageError("views", "are replaced by `path`; leave one of them out")
+        if self.samples == 0 and self.camera_to is not None:
+            raise UsageError("camera_to", "opens a shutter, which `samples` of 0 ignores; leave one of them out")
+
 
 @dataclass(frozen=True, kw_only=True)
 class VideoOptions(FilmOptions, ImageOptions, LensOptions):
@@ -94,6 +102,12 @@ class VideoOptions(FilmOptions, ImageOptions, LensOptions):
     """Frames per second (default: the path file's, or 30)."""
     resume: Annotated[bool, FILES] = False
     """Continue an interrupted frame sequence; finished frames are not drawn again."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, paths in (("start", ZOOMS), ("end", ZOOMS), ("seconds", (*ZOOMS, "orbit"))):
+            if str(self.path) not in paths and getattr(self, name) != getattr(VideoOptions, name):
+                raise UsageError(name, f"belongs to a path of {listing(paths)}, not to {self.path}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -54,7 +54,8 @@ def filmed(
     if motions and all(_still(*motion) for motion in motions):
         raise UsageError("camera_to" if camera_to else "shutter", "finds no motion: the path has zero length")
     if options.samples is not None and not any(apertures) and not motions:
-        raise UsageError("samples", "are of an aperture or a shutter; give `f_stop` or `shutter`")
+        moving = "`shutter`" if path else "`camera_to`"
+        raise UsageError("samples", f"are of an aperture or a shutter; give `f_stop` or {moving}")
     count = options.samples or (FAST_SAMPLES if options.quality == "fast" else SAMPLES)
     exposures = [
         Exposure(aperture, motion, count) if aperture or motion else None

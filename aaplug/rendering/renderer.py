@@ -381,9 +381,9 @@ class Renderer:
 
         At a data-set pose it is the ratio of focal lengths.  For a free camera, which may be nearer or farther than
         any training camera, it is the median over visible Gaussians of (rate now / nearest rate in the Gaussian's
-        training range); without any, the ratio of focal lengths.
+        training range); without any, and for a recipe that compares with "global", the ratio of focal lengths.
         """
-        if camera.trained_focal is not None:
+        if camera.trained_focal is not None or getattr(self.recipe.screen, "reference", None) == "global":
             return self.training.relative_rate(camera)
         key = (*camera.intrinsics, camera.cam_from_world.detach().cpu().numpy().tobytes())
         if key not in self._rates:

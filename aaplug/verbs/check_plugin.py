@@ -70,7 +70,9 @@ def _imported(module: str) -> ModuleType:
     try:
         return import_module(module)
     except Exception as error:  # a plug-in can fail in any way
-        raise UsageError(module, f"cannot be imported: {error}") from error
+        missing = isinstance(error, ModuleNotFoundError) and error.name == module
+        hint = "; give the name that `import` takes, not that of the installed package" if missing else ""
+        raise UsageError(module, f"cannot be imported: {error}{hint}") from error
 
 
 def _is_new(kind: str, value: Any) -> bool:

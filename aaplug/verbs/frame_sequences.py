@@ -97,7 +97,9 @@ class FrameSequence:
             changed = sorted(key for key in before.keys() | now.keys() if before.get(key) != now.get(key))
             if changed:
                 problem = f"is of another request ({listing(changed)} changed since)"
-                raise UsageError(str(self.record), f"{problem}; repeat that request, or start again with `overwrite`")
+                raise UsageError(
+                    str(self.record), f"{problem}; repeat that request, or start again with `overwrite`, not `resume`"
+                )
             return [place for place, path in enumerate(self.paths) if not path.exists()]
         for path in self.paths:
             if path.exists():

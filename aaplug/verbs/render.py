@@ -45,7 +45,7 @@ def render(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, optio
     storage, options = storage_of(target, options)
     job = Job.of(scene, cameras, options, single=names_image(target))
     file = None if options.path is None else read_camera_path(options.path)
-    ends = select_views(job.cameras, options.camera_to) if options.camera_to else ()
+    ends = select_views(job.cameras, options.camera_to, "camera_to") if options.camera_to else ()
     unsized = file.unsized if file else job.cameras.assumed
     views, ends = (seen(job, each, unsized) for each in (file.cameras if file else job.views, ends))
     each_end = eyes_of(ends, options) if ends else [()] * len(eyes_of(views, options))

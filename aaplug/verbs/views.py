@@ -21,13 +21,15 @@ from aaplug.system.errors import OutputError, UsageError, counted
 SUFFIXES = [suffix for each in IMAGE_FORMATS.values() for suffix in each.suffixes]
 IMAGES = (*SUFFIXES, ".tif", ".tiff", ".bmp", ".gif")  # any other name is a folder
 Drawn = TypeVar("Drawn", RenderOptions, VideoOptions)
+STRETCH = 0.02  # of the aspect, above which images are said to be stretched
 LONGEST_NAME = 200  # bytes; file systems take 255, and a number and a suffix are added
 
 
 def seen(job: Job[Drawn], views: Sequence[Camera], unsized: bool) -> list[Camera]:
     """The views through the lens and at the size that a job's options ask for.
 
-    unsized: pixels stay square where a resolution changes the aspect.
+    unsized: pixels stay square where a resolution changes the aspect, as they do through a lens that shows its angle
+        along the shorter side.
 
     Raises:
         UsageError: an image would be larger than `MAX_SIDE`.
@@ -38,7 +40,14 @@ def seen(job: Job[Drawn], views: Sequence[Camera], unsized: bool) -> list[Camera
         sized = [view.scaled(options.scale or 1.0) for view in bent]
     else:
         sizes = [size_of(options.resolution, shape=(view.width, view.height)) for view in bent]
-        sized = [(v.framed if unsized else v.resized)(*size) for v, size in zip(bent, sizes, strict=True)]
+        square = unsized or options.lens in ("fisheye", "equisolid", "ortho")
+        sized = [(v.framed if square else v.resized)(*size) for v, size in zip(bent, sizes, strict=True)]
+        stretched = [v for v, by in zip(sized, bent, strict=True) if abs(v.fx / by.fx * by.fy / v.fy - 1) > STRETCH]
+        if stretched and options.lens is None:
+            size = f"{stretched[0].width}x{stretched[0].height}"
+            job.monitor.say(
+                f"resolution: {size} px stretches view {stretched[0].name}; -1 on one side keeps its aspect"
+            )
     for view in sized:
         check_side(view.name, view.width, view.height)
     return sized
@@ -121,8 +130,8 @@ def image_paths(output: Path, views: Sequence[Camera], overwrite: bool, suffix: 
     """
     if names_image(output):
         if output.suffix.lower() not in SUFFIXES or len(views) != 1:
-            one = f"one {', '.join(SUFFIXES)} for one view"
-            raise OutputError(output, f"name a folder, or {one} ({counted(len(views), 'view')} asked for)")
+            one = f"one {', '.join(SUFFIXES)} for one image"
+            raise OutputError(output, f"name a folder, or {one} ({counted(len(views), 'image')} asked for)")
         check_output(output, overwrite)
         return [output]
     paths = [output / f"{name}{suffix}" for name in file_names([view.name for view in views], "view", 5)]

@@ -136,15 +136,16 @@ def holds_cameras(path: str | PathLike[str]) -> bool:
     return any(format.sniff(Path(path)) for format in CAMERA_FORMATS.values())
 
 
-def select_views(cameras: CameraSet, spec: str) -> tuple[Camera, ...]:
+def select_views(cameras: CameraSet, spec: str, option: str = "views") -> tuple[Camera, ...]:
     """The views named by `spec`: train, test, all, or view names separated by commas.
 
+    option: that `spec` is of, for errors.
     A name in both splits means the test view.  An unknown name, or a split without views, raises UsageError.
     """
     groups = {"train": cameras.train, "test": cameras.test, "all": cameras.all}
     if spec in groups:
         if not groups[spec]:
-            raise UsageError("views", f"{spec} has no views; the cameras have {len(cameras.all)} in all")
+            raise UsageError(option, f"{spec} has no views; the cameras have {len(cameras.all)} in all")
         return groups[spec]
     known = {camera.name: camera for camera in (*cameras.train, *cameras.test)}
     if spec in known:  # a name may itself hold a comma
@@ -152,5 +153,5 @@ def select_views(cameras: CameraSet, spec: str) -> tuple[Camera, ...]:
     names = dict.fromkeys(filter(None, map(str.strip, spec.split(",")))) or {spec: None}
     for name in (name for name in names if name not in known):
         close = difflib.get_close_matches(name, known, CLOSE_NAMES, cutoff=0) if name else list(known)
-        raise UsageError("views", f"there is no view {name!r}; train, test, all or names such as {listing(close, 3)}")
+        raise UsageError(option, f"there is no view {name!r}; train, test, all or names such as {listing(close, 3)}")
     return tuple(known[name] for name in names)

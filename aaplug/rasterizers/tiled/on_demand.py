@@ -11,11 +11,13 @@ import os
 import subprocess
 import sys
 import time
+from functools import cache
 
+import torch
 from torch import Tensor
 
 from aaplug.core.kernels import Kernel, Runner
-from aaplug.rasterizers.tiled.ahead_of_time import KERNELS, has_compiler, load_or_eager, package_of
+from aaplug.rasterizers.tiled.ahead_of_time import KERNELS, TRAINER_KERNELS, has_compiler, load_or_eager, package_of
 from aaplug.rasterizers.tiled.packages import CompiledKernels, Package
 
 PATIENCE_SECONDS = 20.0  # from the first kernel that is missing until it is compiled: a short program has ended by then
@@ -26,6 +28,8 @@ from aaplug.rasterizers.tiled.ahead_of_time import build
 getattr(os, "nice", int)(10)
 build(names=sys.argv[1:])
 """
+
+BUILT_BY_NAME = frozenset(kernel.name for kernel in (*KERNELS, *TRAINER_KERNELS))
 
 log = logging.getLogger("aaplug")
 
@@ -45,19 +49,23 @@ class OnDemandKernels(CompiledKernels):
         """The function that runs one stage for such arguments."""
         if time.monotonic() > self._next_look:
             self._look()
+        if args[0].dtype is torch.float64:
+            _tell_of_double()
         runner = super().runner(kernel, args)
         if self._missing and self._next_look == math.inf:
             self._next_look = time.monotonic() + PATIENCE_SECONDS
+            known = self._missing <= {kernel.name for kernel in KERNELS}
             log.warning(
-                "kernels run eagerly, several times slower, until they are compiled: beside this program after %.0f s, "
-                "or before it by `aaplug warmup`",
+                "kernels run eagerly, several times slower, until they are compiled: beside this program after "
+                "%.0f s%s",
                 PATIENCE_SECONDS,
+                ", or before it by `aaplug warmup`" if known else "",
             )
         return runner
 
     def _package(self, kernel: Kernel) -> Package | None:
         package = super()._package(kernel)
-        if package is None and kernel.name not in self._tried and self._can_build:
+        if package is None and kernel.name in BUILT_BY_NAME - self._tried and self._can_build:
             self._missing.add(kernel.name)
         return package
 
@@ -80,3 +88,8 @@ class OnDemandKernels(CompiledKernels):
             self._missing -= self._tried
             atexit.unregister(self._compiler.terminate)
             self._compiler, self._next_look = None, math.inf
+
+
+@cache
+def _tell_of_double() -> None:
+    log.warning("float64 is drawn eagerly; kernels are compiled for float32, which is several times as fast")
