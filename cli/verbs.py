@@ -88,14 +88,18 @@ def convert(words: Words) -> Answer:
     """
     if words.batch is not None:
         return for_each_scene(words, lambda scene: ".ply")
+    if words.resume:
+        raise UsageError("resume", "belongs to --batch")
     inputs = read_inputs(words)
     result = aaplug.convert(*inputs, words.output, **told(words, verbs.ConvertOptions))
     from aaplug.evaluation.results import tables
+    from aaplug.io.scenes import written_format
     from aaplug.methods.conversion import fused_in
 
     how = "part by part" if result.scene is None else f"fused {fused_in(result.scene)}"
     say(f"wrote {words.output}: {how}; show it with {result.viewer.rule} ({result.viewer.name})")
-    say(result.viewer.advice(words.output.suffix[1:].lower() or "ply"))
+    format = written_format(words.output)  # None for a folder of frames, which are .ply
+    say(result.viewer.advice("ply" if format is None else getattr(format, "read_as", None) or format.name))
     title = "As the viewer draws it, against the scene's own training-size render:"
     shown = [] if result.report is None else [title, tables(result.report)[0]]
     return Answer({"output": str(words.output)} | result.as_json(), shown)

@@ -93,6 +93,7 @@ REFUSED = {
     "render s.ply -o out --samples 0 --f-stop 2 --focus-distance 1": "--f-stop: is what --samples of 0 ignores",
     "video s.ply -o v.mp4 --path orbit --start 0.5": "--start: belongs to a path of zoom, dolly, not to orbit",
     "video s.ply -o v.mp4 --path a.json --seconds 2": "belongs to a path of zoom, dolly, orbit, not to a.json",
+    "lod s.ply -o l.ply --steps 3 --no-refine": "--steps: are of tuning, which --no-refine leaves out",
     "convert s.ply -o c.ply --steps 3": "--steps: belongs to the fit to a viewer; name one with --for",
     "convert s.ply -o c.ply --for gsplat --variance 0.1": "leave out --form, --variance",
     "finetune s.ply -o t.ply --upsampler bicubic": "makes what scales above 1 should show, and there is none",

@@ -268,18 +268,14 @@ def test_levels_that_are_there_are_not_replaced(tmp_path):
 
 
 def test_fronts_are_removed_and_nothing_else(tmp_path):
-    """Levels for another viewer in the same folder stay, and so do files whose names are like a front's."""
+    """Files whose names are like a front's stay."""
     mine = [tmp_path / name / streamed.TREE for name in ("mine_0", "2_0/deeper")]
     for path in mine:
         path.parent.mkdir(parents=True)
         path.write_text("keep")
-    made(tmp_path, "sog")
-    others = {path for path in tmp_path.rglob("*") if path.is_file() and path.name != streamed.SETTINGS}
     made(tmp_path, "rad")
-    assert {path for path in tmp_path.rglob("*") if path.is_file() and path.name != streamed.SETTINGS} == {
-        *others,
-        tmp_path / "scene.rad",
-    }
+    written = {path for path in tmp_path.rglob("*") if path.is_file()}
+    assert written == {*mine, tmp_path / "scene.rad", tmp_path / streamed.SETTINGS}
 
 
 @pytest.mark.parametrize("to", ["sog", "3dtiles"])
@@ -319,6 +315,10 @@ def test_a_page_has_the_viewer_beside_it(tmp_path):
 
 
 def test_what_does_not_belong_together_is_refused(tmp_path):
+    (tmp_path / "tileset.json").touch()
+    for overwrite in (False, True):
+        with pytest.raises(OutputError, match=r"holds levels for another viewer \(tileset.json\); name another folder"):
+            aaplug.lod(make_scene(9), CAMERAS, tmp_path, to="sog", overwrite=overwrite)
     with pytest.raises(UsageError, match="belongs to `to`"):
         aaplug.lod(make_scene(9), CAMERAS, tmp_path, page=Path())
     with pytest.raises(UsageError, match="belongs to levels"):

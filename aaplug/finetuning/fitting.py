@@ -60,7 +60,9 @@ def fit(
     start = replace(original, scene=fuse_for(scene, original.training, viewer))
     before = measure(Candidate(ORIGINAL, original), Candidate(CLOSED_FORM, start))
     if steps and _is_worse(before, CLOSED_FORM):
-        monitor.say("the closed form is worse than the original at some scale: starting from the original")
+        monitor.say(
+            "the closed form is worse than the original at some scale: starting from the original (steps of 0 keep it)"
+        )
         start = original
     psnr = {s: mean(before.select(ORIGINAL, s), PSNR.name) for s in before.scales}
     errors = {s: max(ROUNDING_ERROR, 0.0 if dB is None else 10 ** (-dB / 10)) for s, dB in psnr.items()}
@@ -76,7 +78,11 @@ def fit(
         record = Fusion(tuning.method, tuning.settings | {"share": f"{part:g}"})
         result = replace(between(original.scene, tuned, part), fused=(*earlier, record))
         report = report_of(result)
-    if state.step and _is_worse(report, CONVERTED):
+    if state.step and _is_worse(report, CONVERTED) and start is not original:
+        monitor.say("still worse than the original at some scale: keeping the closed form")
+        result = start.scene
+        report = report_of(result)
+    elif state.step and _is_worse(report, CONVERTED):
         monitor.say("still worse than the original at some scale: read the table before you use it")
     return Fitted(result, report)
 

@@ -46,7 +46,7 @@ class Viewer:
     smallest: px²; a splat whose variance along its longer axis, with what was added, is less is not drawn.
     apart: px²; least half difference of the variances along a splat's two axes, to which rounder ones are stretched.
     levels: how it chooses levels of detail, in words; empty: it draws none.
-    formats: suffixes of the scene files that the program is known to open, of those that aaplug writes.
+    formats: names of formats of the scene files that the program is known to open, of those that aaplug writes.
     spz_axes: in which it takes the numbers of a .spz; "auto": those of the specification.
     spz_version: of a .spz that it takes.
     """
@@ -110,6 +110,9 @@ class Viewer:
             others = (v for v in VIEWERS.values() if suffix in v.formats and v.convention == self.convention)
             known = " or ".join(f"{viewer.program} ({viewer.settings})" for viewer in others)
             return f"open the .{suffix} in {known}" if known else f"no viewer of this rule is known to open a .{suffix}"
+        nothing, _, why = self.settings.partition(": ")
+        if nothing in ("nothing", "none"):
+            return f"in {self.program}, there is nothing to choose" + (f": {why}" if why else "")
         if not self.switched:
             return f"in {self.program}, choose {self.settings}"
         without = "with it off, a converted scene can look worse than the original"
@@ -134,7 +137,7 @@ DISC_VIEWER = Viewer("2dgs", "2DGS's renderers", None, "none", recipe="2dgs")
 
 
 def _spark(name: str, convention: Convention, settings: str) -> Viewer:
-    files = {"formats": ("ply", "spz", "splat"), "spz_axes": "opencv", "spz_version": 3}
+    files = {"formats": ("ply", "compressed.ply", "spz", "sog", "splat"), "spz_axes": "opencv", "spz_version": 3}
     how = {"sh_degree": 3, "cut": ROOT_8, "floor": 0.5 / 255, **files}
     levels = "size of a node over distance, within a budget of splats"
     return Viewer(name, "Spark 2.2.0", convention, settings, MEASURED, levels=levels, **how)
@@ -147,7 +150,7 @@ def _playcanvas(name: str, program: str, switch: str, compensated: bool, evidenc
         "cut": ROOT_8,
         "fades": True,
         "levels": "distance or a budget of splats",
-        "formats": ("ply", "sog"),
+        "formats": ("ply", "compressed.ply", "sog"),
         "smallest": SMALLEST,
     }
     return Viewer(name, program, rule, switch, evidence, switched=compensated, **how)
@@ -155,7 +158,12 @@ def _playcanvas(name: str, program: str, switch: str, compensated: bool, evidenc
 
 def _babylon(name: str, switch: str, compensated: bool) -> Viewer:
     rule = PLAYCANVAS if compensated else PLAYCANVAS_CLASSIC
-    how = {"sh_degree": 3, "cut": ROOT_8, "floor": 0.0, "formats": ("ply", "splat", "glb", "gltf")}
+    how = {
+        "sh_degree": 3,
+        "cut": ROOT_8,
+        "floor": 0.0,
+        "formats": ("ply", "compressed.ply", "sog", "splat", "glb", "gltf"),
+    }
     return Viewer(name, "Babylon.js 9.35.0", rule, switch, MEASURED, switched=compensated, **how)
 
 

@@ -67,6 +67,7 @@ from aaplug.verbs.verb import writes
 
 DEFAULT_LEVELS = 4  # down to 1/16 of the training size
 MEGABYTE = 1e6
+HEADER_BYTES = 2500  # of a .ply at most, with the records of merging and tuning
 SMALLER_IMAGES = (0.5,)  # of one lighter scene, which has no coarser level; a viewer's rule would bloat it there
 MERGING_RULE = 3  # raised when merging or tuning changes, so that levels of two rules are not mixed
 NORMAL_COLUMNS = 3  # that a .ply has beside a Gaussian's parameters
@@ -262,7 +263,7 @@ def goals_of(options: LodOptions, scene: Gaussians) -> list[Goal]:
         return [Goal.of_level(level, options.merge_below) for level in levels]
     if options.budget is not None:
         gaussian_bytes = FLOAT * (len(matrix_of(scene[:0])[0]) + NORMAL_COLUMNS)
-        count = min(len(scene), int(options.budget * MEGABYTE / gaussian_bytes))
+        count = min(len(scene), int((options.budget * MEGABYTE - HEADER_BYTES) / gaussian_bytes))
     else:
         assert options.simplify is not None
         count = round(options.simplify * (len(scene) if options.simplify <= 1 else 1))
@@ -341,6 +342,9 @@ def _outputs(output: Path | None, scene: Scene, options: LodOptions) -> tuple[li
     others = [output / MANIFEST] if options.viewer is None or options.to else []
     if options.to is not None:
         refuse_existing([output / STREAMS[options.to].index], options.overwrite)
+        for name, stream in STREAMS.items():
+            if name != options.to and (output / stream.index).exists():
+                raise OutputError(output, f"holds levels for another viewer ({stream.index}); name another folder")
         if options.page is not None:
             programs_of(options.to, Path(options.page))
     refuse_existing([*files, *others], options.overwrite or options.resume)

@@ -76,7 +76,7 @@ def replacing_group(
     """Write a file that names others beside it, so that it and they appear together.
 
     The others' names carry a hash of their content, so that a file that is replaced never names a new one of them.
-    Those of an earlier version are removed at the end.
+    Those of an earlier version are removed at the end, unless another file of the same suffix names them.
 
     Args:
         path: of the file that names the others.
@@ -95,7 +95,9 @@ def replacing_group(
     with replacing(path, overwrite) as stream:
         stream.write(whole(names))
     for file in earlier - {path.with_name(name) for name in names.values()}:
-        file.unlink(missing_ok=True)
+        others = (other for other in path.parent.glob(f"*{path.suffix}") if other != path)
+        if not any(file.name.encode() in other.read_bytes() for other in others):
+            file.unlink(missing_ok=True)
 
 
 def standing(scene: Gaussians, motion: Float[Tensor, "4 4"], place: Place) -> Gaussians:
