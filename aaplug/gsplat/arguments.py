@@ -214,7 +214,19 @@ def views_of(
         _rates(relative_rate, (*batch, c), options),
         _lenses(coefficients, (*batch, c), options.camera_model),
     ]
-    return [_view(*row, options) for row in zip(*columns, strict=True)]  # pyright: ignore[reportCallIssue]
+    views = []
+    for mean, quat, scale, opacity, covar, colour, background, viewmat, K, rate, lens in zip(*columns, strict=True):
+        (fx, skew, cx), (below, fy, cy), last = K.tolist()
+        if skew != 0 or below != 0 or last != [0, 0, 1] or not (fx > 0 and fy > 0):
+            raise UsageError("Ks", f"expected fx, 0, cx; 0, fy, cy; 0, 0, 1 with fx and fy above 0, got {K.tolist()}")
+        camera = AnyPose("", options.width, options.height, fx, fy, cx, cy, viewmat.double(), lens=lens)
+        if rate is not None:
+            camera = replace(camera, trained_focal=camera.focal / rate)
+        log_scales = scale.abs().clamp(min=math.exp(-MAX_LOG_SCALE)).log()
+        sh = mean.new_zeros(n, 1, 3) if degree is None else colour[:, : (degree + 1) ** 2]
+        scene = Gaussians(mean, quat, log_scales, torch.zeros_like(opacity), sh, options.convention)
+        views.append(View(scene, opacity, covar, colour if degree is None else None, background, camera))
+    return views
 
 
 def check_shape(name: str, x: Tensor, shape: Sequence[int]) -> None:
@@ -263,31 +275,3 @@ def _lenses(coefficients: Sequence[Tensor | None], shape: Sequence[int], model: 
         distorted = opencv_lens((*radial[:2], *tangential, *radial[2:], *prism), fisheye=model == "fisheye")
         lenses.append(distorted if distorted.distorts else LENSES[model])
     return lenses
-
-
-def _view(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    covars: Tensor | None,
-    colors: Tensor,
-    background: Tensor | None,
-    viewmat: Tensor,
-    K: Tensor,
-    rate: float | None,
-    lens: Lens,
-    options: Options,
-) -> View:
-    """One image's part of the arguments."""
-    (fx, skew, cx), (below, fy, cy), last = K.tolist()
-    if skew != 0 or below != 0 or last != [0, 0, 1] or not (fx > 0 and fy > 0):
-        raise UsageError("Ks", f"expected fx, 0, cx; 0, fy, cy; 0, 0, 1 with fx and fy above 0, got {K.tolist()}")
-    camera = AnyPose("", options.width, options.height, fx, fy, cx, cy, viewmat.double(), lens=lens)
-    if rate is not None:
-        camera = replace(camera, trained_focal=camera.focal / rate)
-    log_scales = scales.abs().clamp(min=math.exp(-MAX_LOG_SCALE)).log()
-    degree, no_opacities = options.sh_degree, torch.zeros_like(opacities)
-    sh = means.new_zeros(len(means), 1, 3) if degree is None else colors[:, : (degree + 1) ** 2]
-    scene = Gaussians(means, quats, log_scales, no_opacities, sh, options.convention)
-    return View(scene, opacities, covars, colors if degree is None else None, background, camera)

@@ -12,8 +12,7 @@ from aaplug.core.cameras import Side
 from aaplug.core.conventions import CLASSIC
 from aaplug.core.interfaces import Rasterizer
 from aaplug.core.rules import RULES_GSPLAT
-from aaplug.core.splats import Splats2D
-from aaplug.gsplat.arguments import Options, View, refuse, views_of
+from aaplug.gsplat.arguments import Options, refuse, views_of
 from aaplug.gsplat.choice import rasterizer_of
 from aaplug.gsplat.disc_depths import distortion, median_depth
 from aaplug.gsplat.discs import Discs, normals_of_depth, splats_of
@@ -108,39 +107,24 @@ def rasterization_2dgs(
         for part, transform, move in zip(parts, layout.split(transforms), layout.split(gradient), strict=True)
     ]
     meta["means2d"] = layout.column([part.means for part in splats])
-    images = [
-        _draw(replace(part, means=means), discs.normals, view, options, painter, distloss, depth_mode)
-        for part, means, discs, view in zip(splats, layout.split(meta["means2d"]), parts, views, strict=True)
-    ]
+    images, surfaces, kernels = [], list[Tensor](), kernels_of(painter)
+    for part, means, discs, view in zip(splats, layout.split(meta["means2d"]), parts, views, strict=True):
+        with on_free_cores():
+            part = replace(part, means=means)
+            features = features_of(part, view, options, kernels)
+            channels = torch.cat([features, discs.normals], dim=1)
+            image, alpha = composited(part, channels, options, painter, SURFEL, (3,))
+            image, normals = image.split([features.shape[1], 3], dim=2)
+            image = finished(image, alpha, view, options)
+            median = median_depth(part, options, painter)
+            if options.coloured and options.render_mode != "RGB":
+                surfaces.append(normals_of_depth(median if depth_mode == "median" else image[..., -1:], view.camera))
+            normals = normals @ torch.linalg.inv(view.camera.cam_from_world[:3, :3]).T.to(normals)
+            distort = distortion(part, options, painter) if distloss else torch.zeros_like(alpha)
+            images.append((image, alpha, normals, distort, median))
     colours, alphas, normals, distort, median = (
-        torch.stack(column).unflatten(0, layout.shape) for column in list(zip(*images, strict=True))[:5]
+        torch.stack(column).unflatten(0, layout.shape) for column in zip(*images, strict=True)
     )
     meta["render_distort"] = distort
-    surfaces = [surface for *_, surface in images if surface is not None]
     surface = torch.stack(surfaces).unflatten(0, layout.shape).squeeze(0) if surfaces else None
     return colours, alphas, normals, surface, distort, median, meta
-
-
-@on_free_cores()
-def _draw(
-    splats: Splats2D,
-    normals: Float[Tensor, "m 3"],
-    view: View,
-    options: Options,
-    rasterizer: Rasterizer,
-    distloss: bool,
-    depth_mode: str,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor | None]:
-    """One image's part of what is returned, normals of depth last."""
-    features = features_of(splats, view, options, kernels_of(rasterizer))
-    channels = torch.cat([features, normals], dim=1)
-    image, alpha = composited(splats, channels, options, rasterizer, SURFEL, (3,))
-    image, normals = image.split([features.shape[1], 3], dim=2)
-    image = finished(image, alpha, view, options)
-    median = median_depth(splats, options, rasterizer)
-    surface = None
-    if options.coloured and options.render_mode != "RGB":
-        surface = normals_of_depth(median if depth_mode == "median" else image[..., -1:], view.camera)
-    normals = normals @ torch.linalg.inv(view.camera.cam_from_world[:3, :3]).T.to(normals)
-    distort = distortion(splats, options, rasterizer) if distloss else torch.zeros_like(alpha)
-    return image, alpha, normals, distort, median, surface
