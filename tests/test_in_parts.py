@@ -16,7 +16,7 @@ from aaplug.methods import FORMS
 from aaplug.methods.conversion import fuse
 from aaplug.methods.filters.smoothing import NYQUIST_VARIANCE
 from aaplug.system.errors import FormatError, FrameError, OutputError, UsageError
-from aaplug.verbs.in_parts import convert_parts
+from aaplug.verbs.convert import convert_parts
 from tests.conftest import make_camera, make_scene
 
 SIZE = 37  # Gaussians a part, so that the last one is not full

@@ -1,19 +1,24 @@
 """Conversion: a plain scene file that anti-aliased viewers show right."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import torch
+
+from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import Gaussians
+from aaplug.core.sampling import SamplingBounds, sampling_bounds
 from aaplug.core.training import TrainingViews
 from aaplug.evaluation.results import Report, results
 from aaplug.evaluation.survey import check_frame_of
 from aaplug.finetuning.fitting import fit, steps_for
 from aaplug.io.atomic import AnyPath, refuse_existing
 from aaplug.io.scenes import SceneLike, check_scene_output, write_parts, write_scene, written_format
-from aaplug.io.scenes.scene import SceneFrames
+from aaplug.io.scenes.scene import PART, Scene, SceneFrames
 from aaplug.methods import FORMS
 from aaplug.methods.conversion import MATCHED_ENERGY, MIP_SPLATTING, Form, blurring, fuse
 from aaplug.methods.viewers import DISC_VIEWER, MIP_VIEWER, Viewer, find_viewer
@@ -21,8 +26,11 @@ from aaplug.options.verbs import ConvertOptions
 from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.rendering.renderer import own_look
 from aaplug.system.errors import UsageError
-from aaplug.verbs.in_parts import LARGE_SCENE, convert_parts
+from aaplug.system.executors import Threads
+from aaplug.system.monitor import Tell
 from aaplug.verbs.verb import writes
+
+LARGE_SCENE = 1_000_000  # Gaussians: larger files are converted in parts; a million take 0.3 GB, and more at work
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,6 +145,47 @@ def _write_in_parts(job: Job[ConvertOptions], form: Form, path: Path, threads: i
             check_frame_of(scene, train, job.options.min_seen)
     with job.monitor.progress("converting", "Gaussians") as tell:
         write_parts(path, convert_parts(scene, train, form, tell, threads=threads), scene.count, **files)
+
+
+def convert_parts(
+    scene: Scene,
+    cameras: Sequence[Camera],
+    form: Form,
+    tell: Tell = lambda done, total: None,
+    size: int = PART,
+    threads: int = 1,
+) -> Iterator[Gaussians]:
+    """Yield the parts of a scene that may be larger than memory, each as `conversion.fuse` would convert the whole.
+
+    A closed form treats each Gaussian alone.  One value depends on all: the coarsest sampling rate, which stands in for
+    those of Gaussians that no camera sees; a first pass over the file finds it.
+
+    cameras: training cameras; none where the scene stores its 3D filter.
+    tell: called with (Gaussians done, Gaussians in all).
+    size: Gaussians per part.  threads: parts converted at once.
+    """
+    bounded, coarsest = bool(cameras) and form.uses_bounds, math.inf
+    for part in scene.parts(size) if bounded else ():
+        bounds = sampling_bounds(part.means, cameras)
+        if bounds.seen.any():
+            coarsest = min(coarsest, bounds.highest[bounds.seen].min().item())
+
+    def converted(part: Gaussians) -> Gaussians:
+        if not cameras:
+            return fuse(part, None, form)
+        none = torch.zeros(len(part))  # where the form reads no bounds
+        bounds = SamplingBounds(none, none, none, none.int())
+        if bounded:
+            bounds = sampling_bounds(part.means, cameras)
+            highest = torch.where(bounds.seen, bounds.highest, coarsest)
+            bounds = replace(bounds, highest=highest, views=bounds.views.clamp(min=1))
+        return fuse(part, TrainingViews(part.convention, cameras, bounds), form)
+
+    done = 0
+    for part in Threads(threads).map(converted, scene.parts(size)):
+        yield part
+        done += len(part)
+        tell(min(done, scene.count), scene.count)
 
 
 def _fitted(job: Job[ConvertOptions], viewer: Viewer) -> tuple[Gaussians, Report]:
