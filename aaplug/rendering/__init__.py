@@ -1,1 +1,1 @@
-"""From a prepared scene to images: the renderer, many frames, videos, and pools of workers."""
+"""From a prepared scene to images: the renderer, many frames, and pools of workers."""

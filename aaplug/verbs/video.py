@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import starmap
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,16 +18,18 @@ from aaplug.evaluation.report.contact_sheet import labelled, magnified
 from aaplug.io.atomic import AnyPath
 from aaplug.io.cameras import read_camera_path
 from aaplug.io.image_formats import PNG, Storage
+from aaplug.io.images import read_image
 from aaplug.io.scenes import SceneLike
-from aaplug.io.video import check_video
+from aaplug.io.video import check_video, write_video
 from aaplug.options.verbs import VideoOptions
 from aaplug.rendering.film import filmed
 from aaplug.rendering.frames import write_frames
 from aaplug.rendering.job import CamerasLike, Job, running
 from aaplug.rendering.renderer import Renderer
-from aaplug.rendering.videos import make_video
 from aaplug.system.errors import OutputError, UsageError, counted, listing
 from aaplug.system.executors import ProcessesIfLong
+from aaplug.system.locks import scratch
+from aaplug.system.monitor import Tell
 from aaplug.verbs.frame_sequences import FrameSequence
 from aaplug.verbs.verb import writes
 from aaplug.verbs.views import eyes_of, seen, storage_of
@@ -107,20 +110,27 @@ def video(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, option
         job.monitor.say(f"{counted(len(views), 'frame')} of {size} px per pane, {fps:g} per second")
         job.announce(renderers * len(eyes), views, processes=workers.threads, fewer="seconds or frames per second")
         job.say_assumed(renderers[-1], views[0])
+        panes, files = [(renderer, eye) for renderer in renderers for eye in eyes], list[list[Path]]()
         with job.monitor.progress("rendering", "images") as tell:
             pool = workers.cluster or ProcessesIfLong(workers.threads)
+
+            def tell_after(done: int) -> Tell:
+                return lambda now, _: tell(done + now, len(panes) * len(views))
+
             if sequence is not None:
                 left = sequence.begin(_request(job, renderers[0], views, storage, fps), options.resume)
-                files, done = sequence.paths, len(views) - len(left)
-                tell(done, len(views))
+                paths, cameras_left = [sequence.paths[place] for place in left], [views[place] for place in left]
+                tell_all = tell_after(len(views) - len(left))
+                tell_all(0, len(left))
                 if left:
-                    files, cameras_left = [files[place] for place in left], [views[place] for place in left]
-                    how = {"storage": storage, "tell": lambda now, _: tell(done + now, len(views))}
-                    write_frames(renderers[0], cameras_left, files, pool.map, **how)
+                    write_frames(renderers[0], cameras_left, paths, pool.map, storage=storage, tell=tell_all)
                 return Clip(sequence.pattern, len(views), fps)
-            how = {"overwrite": options.overwrite, "tell": tell, "folder": workers.cluster and target.parent}
-            panes = [(renderer, eye) for renderer in renderers for eye in eyes]
-            make_video(target, panes, fps, compose, pool.map, **how)
+            with scratch(str(target.parent) if workers.cluster else None) as kept:  # images until the video is written
+                for place, (renderer, eye) in enumerate(panes):
+                    files.append([kept / f"{place}-{index:06d}.png" for index in range(len(views))])
+                    write_frames(renderer, eye, files[-1], pool.map, tell=tell_after(place * len(views)))
+                images = ([read_image(file, None) for file in each] for each in zip(*files, strict=True))
+                write_video(target, starmap(compose, enumerate(images)), fps, options.overwrite)
     return Clip(target, len(views), fps)
 
 
