@@ -15,7 +15,7 @@ front of it:
 Where nothing is, an id is -1 and everything else 0.  m: splats; h, w: px of the pixels; H, W: of the samples.
 """
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection
 
 import torch
 from jaxtyping import Float, Int
@@ -46,27 +46,31 @@ STATISTICS = {
 MAX_NUMBER = 1 << 24  # up to which float32 holds every whole number
 
 
-def channels_of(
+def expected(
     names: Collection[str],
     splats: Splats2D,
     scene: Gaussians,
     bounds: SamplingBounds,
     camera: Camera,
     samples: int,
+    weight: float,
     normal_axes: NormalAxes,
-) -> dict[str, Float[Tensor, "m c"]]:
-    """What is composited for those passes of `names` that are expected values.
+    draw: Callable[[Float[Tensor, "m c"]], Render],
+) -> dict[str, Float[Tensor, "h w ..."]]:
+    """Those passes of `names` that are expected values.
 
-    camera: that of the supersampled image, with so many `samples` along a pixel's side.
-    depth: at the image's corner, and its growth per px to the right and down.
+    depth: composited as that at the image's corner, and its growth per px to the right and down.
     normal: the shortest axis, towards the camera.
     bound: the finest rate at which training sampled the Gaussian (`SamplingBounds.highest`) over that of the view's
         pixels; above 1 the view samples more coarsely.
+
+    camera: that of the supersampled image, with so many `samples` along a pixel's side.
+    weight: as in `average_samples`.  draw: composites channels, premultiplied.
     """
-    sources, depths, found = splats.sources, splats.depths[:, None], dict[str, Tensor]()
+    sources, depths, channels = splats.sources, splats.depths[:, None], dict[str, Tensor]()
     if {"depth", "position"} & {*names}:
         growth = _growth(splats, scene, camera) if camera.lens == PINHOLE else torch.zeros_like(splats.means)
-        found["depth"] = torch.cat([depths - (growth * splats.means).sum(dim=1, keepdim=True), growth], dim=1)
+        channels["depth"] = torch.cat([depths - (growth * splats.means).sum(dim=1, keepdim=True), growth], dim=1)
     if "normal" in names:
         normals = thinnest_axes(scene, sources).to(depths)
         sights = (scene.means.index_select(0, sources).double() - camera.centre).to(depths)
@@ -75,41 +79,13 @@ def channels_of(
         normals = torch.where((normals * sights).sum(dim=1, keepdim=True) > 0, -normals, normals)
         if normal_axes == "camera":
             normals = normals @ camera.cam_from_world[:3, :3].T.to(normals) * normals.new_tensor(TO_VIEWER)
-        found["normal"] = normals
+        channels["normal"] = normals
     if "bound" in names:
         rates = camera.focal / depths if splats.rates is None else splats.rates[:, None]
-        found["bound"] = bounds.highest.index_select(0, sources)[:, None].to(depths) * samples / rates
-    return found
-
-
-def _growth(splats: Splats2D, scene: Gaussians, camera: Camera) -> Float[Tensor, "m 2"]:
-    """Growth of depth on each splat's plane, in world units per px to the right and down.
-
-    The plane counts as far as the splat is flat; a ball has none.  Its tilt is at most `MOST_TILT`, and what it adds
-    within the splat at most half of the depth.
-    """
-    shortest, middle, _ = scene.scales.sort(dim=1).values.index_select(0, splats.sources).unbind(dim=1)
-    slopes = with_depth_slopes(splats, scene, camera).depth_slopes
-    assert slopes is not None
-    slopes = slopes * (1 - (shortest / middle).square())[:, None]
-    radii = SIGMAS * (splats.covs[:, 0] + splats.covs[:, 2]).sqrt()
-    most = (0.5 / radii).clamp(max=MOST_TILT / camera.focal)
-    lengths = slopes.norm(dim=1).clamp(min=torch.finfo(slopes.dtype).tiny)
-    return slopes * (splats.depths * (most / lengths).clamp(max=1.0))[:, None]
-
-
-def expected(
-    names: Collection[str],
-    channels: Mapping[str, Float[Tensor, "m c"]],
-    image: Render,
-    camera: Camera,
-    samples: int,
-    weight: float,
-) -> dict[str, Float[Tensor, "h w ..."]]:
-    """Those passes of `names` that are expected values.
-
-    image: the channels of `channels_of` composited, premultiplied.  The others are as there and in `average_samples`.
-    """
+        channels["bound"] = bounds.highest.index_select(0, sources)[:, None].to(depths) * samples / rates
+    if not channels:
+        return {}
+    image = draw(torch.cat([*channels.values()], dim=1))
     parts = image.rgb.split([channel.shape[1] for channel in channels.values()], dim=2)
     layers = dict(zip(channels, parts, strict=True))
     if "depth" in layers:
@@ -132,6 +108,22 @@ def expected(
     if "position" in found:
         found["position"] = torch.where(covered, found["position"].double() + camera.centre, 0.0).to(means)
     return {name: part if part.shape[2] > 1 else part[..., 0] for name, part in found.items()}
+
+
+def _growth(splats: Splats2D, scene: Gaussians, camera: Camera) -> Float[Tensor, "m 2"]:
+    """Growth of depth on each splat's plane, in world units per px to the right and down.
+
+    The plane counts as far as the splat is flat; a ball has none.  Its tilt is at most `MOST_TILT`, and what it adds
+    within the splat at most half of the depth.
+    """
+    shortest, middle, _ = scene.scales.sort(dim=1).values.index_select(0, splats.sources).unbind(dim=1)
+    slopes = with_depth_slopes(splats, scene, camera).depth_slopes
+    assert slopes is not None
+    slopes = slopes * (1 - (shortest / middle).square())[:, None]
+    radii = SIGMAS * (splats.covs[:, 0] + splats.covs[:, 2]).sqrt()
+    most = (0.5 / radii).clamp(max=MOST_TILT / camera.focal)
+    lengths = slopes.norm(dim=1).clamp(min=torch.finfo(slopes.dtype).tiny)
+    return slopes * (splats.depths * (most / lengths).clamp(max=1.0))[:, None]
 
 
 def by_order(

@@ -10,7 +10,7 @@ and weighing the samples of each pixel.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import reduce
+from functools import partial, reduce
 from os import PathLike
 from typing import NamedTuple
 
@@ -50,7 +50,7 @@ from aaplug.methods.recipes import find_recipe, suited
 from aaplug.rasterizers import RASTERIZERS
 from aaplug.rasterizers.choice import find_rasterizer, kernels_of
 from aaplug.rendering.channels import composited
-from aaplug.rendering.passes import by_order, channels_of, expected
+from aaplug.rendering.passes import by_order, expected
 from aaplug.system.contracts import check_fields, contract
 from aaplug.system.cores import on_free_cores
 from aaplug.system.errors import UsageError, not_one_of, within_memory
@@ -286,17 +286,15 @@ class Renderer:
             found: dict[str, Tensor] = {"rgb": rgb, "alpha": alpha}
             (samples, weight), fine = self.sampling(camera), self.sampled(camera)[0]
             recipe = self.recipe_through(splats.camera)
-            channels = channels_of(names, splats, self.scene, self.training.bounds, fine, samples, normal_axes)
-            if channels:
-                per_call = (3, 4) if recipe.pixel is POINT and recipe.compositor is None else (3,)
-                whole = torch.cat([*channels.values()], dim=1)
-                image = composited(splats, whole, lambda part: self.paint(part, hw, BLACK), per_call)
-                found |= expected(names, channels, image, fine, samples, weight)
+            per_call = (3, 4) if recipe.pixel is POINT and recipe.compositor is None else (3,)
+            paint = partial(self.paint, hw=hw, background=BLACK)
+            draw = partial(composited, splats, draw=paint, per_call=per_call)
+            found |= expected(names, splats, self.scene, self.training.bounds, fine, samples, weight, normal_axes, draw)
 
-            def draw(numbered: Splats2D, shown: Shown) -> Render:
-                return self.paint(numbered, hw, BLACK, Order.of(recipe.pixel, shown, numbered))
+            def draw_by_order(numbered: Splats2D, shown: Shown) -> Render:
+                return paint(numbered, compositor=Order.of(recipe.pixel, shown, numbered))
 
-            found |= by_order(names, splats, samples, draw)
+            found |= by_order(names, splats, samples, draw_by_order)
             if "id" in found and self.scene.origin is not None:
                 found["id"] = torch.where(found["id"] < 0, found["id"], self.scene.origin.rows[found["id"]])
         return {name: found[name] for name in names}
