@@ -10,9 +10,11 @@ from aaplug.evaluation.comparison import Comparison, compared_scenes, in_one_fra
 from aaplug.evaluation.engine import Candidate, Task, evaluate, facts_of
 from aaplug.evaluation.image_store import ImageStore
 from aaplug.evaluation.metrics import find_metrics
-from aaplug.evaluation.report.files import COMPARED, PAGE, write_comparison
+from aaplug.evaluation.report.files import COMPARED, PAGE, as_json, sheet_of, write_page, write_texts
+from aaplug.evaluation.results import as_csv
 from aaplug.evaluation.truth import Truth
 from aaplug.io.atomic import AnyPath
+from aaplug.io.images import write_png
 from aaplug.io.scenes import scene_of
 from aaplug.io.scenes.scene import Scene
 from aaplug.methods.presets import recipe_of
@@ -92,7 +94,13 @@ def compare(scenes: ScenesLike, cameras: CamerasLike, output: AnyPath | None, op
         if folder and images:
             bounds = task.coverage(job.scene.gaussians())
             replaces = options.overwrite or options.resume
-            for file in write_comparison(comparison, task, folder, bounds, images, replaces):
+            data, table, sheet = COMPARED
+            texts = {data: as_json(comparison.summary()), table: as_csv({"compare": report})}
+            files = write_texts(folder, texts, replaces)
+            title = f"{rows[0].name} and {', '.join(scene.name for scene in rows[1:])}"
+            files += write_page(folder, title, report, bounds, images, replaces, comparison.facts())
+            write_png(folder / sheet, sheet_of(comparison, task), overwrite=replaces)
+            for file in [*files, folder / sheet]:
                 say(f"wrote {file}")
     return comparison
 

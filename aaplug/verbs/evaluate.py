@@ -11,8 +11,8 @@ from aaplug.evaluation.engine import Task, candidates_of, facts_of
 from aaplug.evaluation.engine import evaluate as measure
 from aaplug.evaluation.image_store import ImageStore
 from aaplug.evaluation.metrics import find_metrics
-from aaplug.evaluation.report.files import PAGE, RESULTS, write_evaluation
-from aaplug.evaluation.results import Report
+from aaplug.evaluation.report.files import PAGE, RESULTS, as_json, write_page, write_texts
+from aaplug.evaluation.results import Report, as_csv, per_view, results
 from aaplug.evaluation.truth import Truth, source_of
 from aaplug.io.atomic import AnyPath, refuse_existing
 from aaplug.io.scenes import SceneLike
@@ -73,8 +73,11 @@ def evaluate(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
         with job.monitor.progress(f"evaluating {name}", "views") as tell:
             report = measure(task, facts, tell, folder and folder / JOURNAL, options.resume, images, apply)
         if folder and images:
-            bounds = task.coverage(job.scene.gaussians()) if options.report else None
-            for file in write_evaluation(report, name, folder, bounds, images, replaces):
+            texts = as_json(results(report)), as_json(per_view(report)), as_csv({name: report})
+            files = write_texts(folder, dict(zip(RESULTS, texts, strict=True)), replaces)
+            if options.report:
+                files += write_page(folder, name, report, task.coverage(job.scene.gaussians()), images, replaces)
+            for file in files:
                 job.monitor.say(f"wrote {file}")
     return report
 

@@ -20,36 +20,13 @@ from aaplug.evaluation.image_store import ImageStore
 from aaplug.evaluation.metric import TimedRenderer
 from aaplug.evaluation.metrics import PSNR
 from aaplug.evaluation.report.contact_sheet import contact_sheet
-from aaplug.evaluation.results import Facts, Report, as_csv, per_view, results
+from aaplug.evaluation.results import Facts, Report
 from aaplug.evaluation.truth import ViewTruth
 from aaplug.io.atomic import make_folder, replacing
-from aaplug.io.images import write_png
 
 RESULTS = ("results.json", "per_view.json", "results.csv")
 COMPARED = ("compare.json", "compare.csv", "contact-sheet.png")
 PAGE, PLOTS = "report.html", "plots"
-
-
-def write_evaluation(
-    report: Report, name: str, folder: Path, bounds: Coverage | None, images: ImageStore, overwrite: bool
-) -> list[Path]:
-    """Write the files and return their paths.  bounds: of the scene, for a page; None for none."""
-    texts = (as_json(results(report)), as_json(per_view(report)), as_csv({name: report}))
-    paths = write_texts(folder, dict(zip(RESULTS, texts, strict=True)), overwrite)
-    return paths if bounds is None else paths + write_page(folder, name, report, bounds, images, overwrite)
-
-
-def write_comparison(
-    comparison: Comparison, task: Task, folder: Path, bounds: Coverage, images: ImageStore, overwrite: bool
-) -> list[Path]:
-    """Write the files and return their paths.  bounds: of the reference.  images: those that the page shows."""
-    data, table, sheet = COMPARED
-    texts = {data: as_json(comparison.summary()), table: as_csv({"compare": comparison.report})}
-    paths = write_texts(folder, texts, overwrite)
-    title = f"{comparison.reference.name} and {', '.join(scene.name for scene in comparison.scenes[1:])}"
-    paths += write_page(folder, title, comparison.report, bounds, images, overwrite, comparison.facts())
-    write_png(folder / sheet, _sheet(comparison, task), overwrite=overwrite)
-    return [*paths, folder / sheet]
 
 
 def write_page(
@@ -90,7 +67,7 @@ def as_json(data: Any) -> str:
     return json.dumps(data, indent=1, allow_nan=False) + "\n"
 
 
-def _sheet(comparison: Comparison, task: Task) -> Float[Tensor, "H W 3"]:
+def sheet_of(comparison: Comparison, task: Task) -> Float[Tensor, "H W 3"]:
     """The view with the lowest PSNR at every scale: the truth, then every other scene and the map of its errors."""
     reference, report = comparison.reference.name, comparison.report
     values = [(m.values.get(PSNR.name), m.view) for m in report.measurements if m.recipe != reference]
