@@ -19,7 +19,6 @@ from aaplug.io.cameras import (
     colmap,
     gltf,
     inria,
-    inria_model,
     lichtfeld,
     llff,
     multiscale,
@@ -68,7 +67,7 @@ class CameraFormat(Protocol):
 
 # the first that accepts a path is used
 OWN: tuple[CameraFormat, ...]
-OWN = (pinhole, camera_path, inria_model, colmap, blender, inria, multiscale, transforms, llff)
+OWN = (pinhole, camera_path, inria.Model(), colmap, blender, inria, multiscale, transforms, llff)
 PATH_FORMATS = (camera_path, supersplat, lichtfeld, gltf, usd)
 CAMERA_FORMATS = Registry[CameraFormat]("camera format", "aaplug.io.cameras:CameraFormat", named(OWN))
 

@@ -64,6 +64,23 @@ def read(path: Path, options: CameraFileOptions) -> CameraSet:
     return camera_set("INRIA cameras.json", source, split, why, background)
 
 
+class Model:
+    """A 3DGS model folder, `cameras.json` with `cfg_args`: recognized before a COLMAP dataset in the same folder.
+
+    Only the model tells the training size.
+    """
+
+    name = "inria_model"
+    sign = "cameras.json with cfg_args (INRIA)"
+    read = staticmethod(read)
+
+    @staticmethod
+    def sniff(path: Path) -> bool:
+        """True for a folder that holds both files, or its cfg_args."""
+        folder = path.parent if path.name == cfg_args.NAME else path
+        return all(os.path.isfile(folder / file) for file in (FILE, cfg_args.NAME))
+
+
 def _camera(entry: Entry) -> Camera:
     rotation, position = entry.matrix("rotation", 3, 3), entry.vector("position", 3)
     size = entry.get("width", pixels), entry.get("height", pixels)
