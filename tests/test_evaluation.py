@@ -13,7 +13,7 @@ from aaplug.core.imaging import box_average, quantised
 from aaplug.core.lenses import EQUIDISTANT
 from aaplug.core.training import TrainingViews
 from aaplug.evaluation import METRICS, PROTOCOLS
-from aaplug.evaluation.engine import Candidate, Task, candidates_of, compare, evaluate
+from aaplug.evaluation.engine import Candidate, Task, candidates_of, evaluate
 from aaplug.evaluation.image_store import ImageStore
 from aaplug.evaluation.metric import Metric, TimedRenderer
 from aaplug.evaluation.metrics import CONSISTENCY, ENERGY, FLICKER, PSNR, SSIM, psnr
@@ -289,7 +289,8 @@ def test_a_new_metric_that_is_undefined_is_reported_with_its_own_words(look, vie
 
 def test_candidates_compare_as_by_hand(look, views):
     other = replace(look, background=(1.0, 1.0, 1.0))  # so it is drawn anew
-    report = compare([Candidate("own", look), Candidate("other", other)], views, (1.0, 0.5), Truth(look, memory=1e9))
+    candidates = [Candidate("own", look), Candidate("other", other)]
+    report = evaluate(Task(candidates, (1.0, 0.5), views, Truth(look, memory=1e9), ceiling=False))
     assert report.recipes == ("own", "other")
     assert report.select("own", 1.0)[0].values["PSNR"] > 60  # but for the float16 of the cached truth
     wanted = quantised(box_average(look(views[1]).rgb.clamp(0, 1), 2).to(CACHE_DTYPE).float())

@@ -181,17 +181,6 @@ def _answers(task: Task, view: int, measurements: Sequence[Measurement]) -> bool
     )
 
 
-def compare(
-    candidates: Sequence[Candidate],
-    views: Sequence[Camera],
-    scales: Sequence[float],
-    truth: Truth,
-    tell: Tell = lambda done, total: None,
-) -> Report:
-    """Candidates side by side, in PSNR and SSIM."""
-    return evaluate(Task(candidates, scales, views, truth, ceiling=False), tell=tell)
-
-
 def _checked(task: Task) -> Task:
     """The task, its views numbered where two have the same name, as views of two splits may."""
     if not (task.candidates and task.scales and task.views):

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 from aaplug.core.cameras import Camera, spread
 from aaplug.core.gaussians import Fusion, Gaussians
-from aaplug.evaluation.engine import Candidate, compare
+from aaplug.evaluation.engine import Candidate, Task, evaluate
 from aaplug.evaluation.metrics import PSNR
 from aaplug.evaluation.results import Report, mean
 from aaplug.evaluation.truth import MEMORY, Truth, back_projected
@@ -52,7 +52,8 @@ def fit(
 
     def measure(*candidates: Candidate) -> Report:
         with monitor.progress("measuring", "views") as tell:
-            return compare(candidates, spread(views, MAX_VIEWS), (1.0, *QUICK_SETTINGS.weights), truth, tell)
+            task = Task(candidates, (1.0, *QUICK_SETTINGS.weights), spread(views, MAX_VIEWS), truth, ceiling=False)
+            return evaluate(task, tell=tell)
 
     def report_of(result: Gaussians) -> Report:
         return before.with_more(measure(Candidate(CONVERTED, replace(original, scene=result))))

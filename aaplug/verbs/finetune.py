@@ -16,7 +16,7 @@ from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.interfaces import ReadsColumns
 from aaplug.core.sampling import sampling_bounds
-from aaplug.evaluation.engine import Candidate, compare
+from aaplug.evaluation.engine import Candidate, Task, evaluate
 from aaplug.evaluation.report.contact_sheet import contact_sheet
 from aaplug.evaluation.results import Report, results
 from aaplug.evaluation.truth import MEMORY, Truth, back_projected, source_of, upsampled
@@ -138,7 +138,7 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
         scales = sorted({1.0, *settings.weights}, reverse=True)
         truth = replace(truth, source=source_of(job.views))
         with job.monitor.progress("measuring", "views") as tell:
-            report = compare(candidates, job.views, scales, truth, tell)
+            report = evaluate(Task(candidates, scales, job.views, truth, ceiling=False), tell=tell)
         tuned = Tuned(result, report, settings, state.curve, state.probes)
         if path is not None:
             with replacing(_beside(path, "json"), replaces) as stream:
