@@ -156,13 +156,6 @@ def _tests() -> tuple[Test, ...]:
 TESTS = _tests()
 
 
-class Rule(NamedTuple):
-    """How a covariance becomes pixels: variance added in px², and whether opacity pays for it."""
-
-    kernel: float
-    compensated: bool
-
-
 @dataclass(frozen=True, eq=False)
 class Fault:
     """One thing that a renderer does wrong.  Each field changes a stage of the drawing.
@@ -173,7 +166,7 @@ class Fault:
     words: str
     scene: Callable[[Gaussians], Gaussians] = lambda scene: scene
     camera: Callable[[Camera], Camera] = lambda camera: camera
-    rule: Callable[[Rule], Rule] = lambda rule: rule
+    rule: Callable[[Convention], Convention] = lambda rule: rule
     splats: Callable[[Splats2D], Splats2D] = lambda splats: splats
     pixel: PixelKernel = POINT
     rules: Rules = RULES_3DGS
@@ -187,7 +180,7 @@ def draw(scene: Gaussians, viewer: Viewer, fault: Fault = NONE, white: bool = Fa
     """The picture by a viewer's rule, in float64, on black or white, with one fault."""
     assert viewer.convention is not None
     scene = fault.scene(viewer.shown(scene).to(F64))
-    camera, rule = fault.camera(CAMERA), fault.rule(_rule_of(viewer.convention))
+    camera, rule = fault.camera(CAMERA), fault.rule(viewer.convention)
     splats = project(scene, camera, rules=fault.rules).blurred(rule.kernel, rule.compensated)
     splats = fault.splats(shade(splats, scene, camera))
     return fault.image(
@@ -205,10 +198,6 @@ class Ending(Point):
         """0 beyond the end."""
         values = super().exact(splats, offsets)
         return torch.where(values < math.exp(-(self.sigmas**2) / 2), 0.0, values)
-
-
-def _rule_of(convention: Convention, _: Rule | None = None) -> Rule:
-    return Rule(convention.kernel, convention.compensated)
 
 
 def _sh(change: Callable[[Tensor], Tensor]) -> Callable[[Gaussians], Gaussians]:
@@ -255,13 +244,14 @@ def _by(depths: Callable[[Splats2D], Tensor]) -> Callable[[Splats2D], Splats2D]:
 GAMMA = 2.2
 BEND = VIEWERS["mkkellogg"].apart  # px²
 FAULTS = (
-    Fault("dilation: nothing is added to covariances", rule=lambda r: Rule(0.0, False)),
-    Fault("dilation: twice the variance is added", rule=lambda r: r._replace(kernel=2 * r.kernel)),
-    Fault("dilation: half of the variance is added", rule=lambda r: r._replace(kernel=r.kernel / 2)),
-    Fault("compensation: opacity pays for what is added, and should not", rule=lambda r: Rule(r.kernel, True)),
-    Fault("compensation: opacity should pay for what is added, and does not", rule=lambda r: Rule(r.kernel, False)),
+    Fault("dilation: nothing is added to covariances", rule=lambda r: replace(r, kernel=0.0, compensated=False)),
+    Fault("dilation: twice the variance is added", rule=lambda r: replace(r, kernel=2 * r.kernel)),
+    Fault("dilation: half of the variance is added", rule=lambda r: replace(r, kernel=r.kernel / 2)),
+    Fault("compensation: opacity pays for what is added, and should not", rule=lambda r: replace(r, compensated=True)),
+    Fault("compensation: opacity should pay for what is added, and does not",
+          rule=lambda r: replace(r, compensated=False)),
     *(Fault(f"dilation: {c.kernel:g} px², {'' if c.compensated else 'not '}compensated, as {c.name} does",
-            rule=partial(_rule_of, c)) for c in CONVENTIONS.values()),
+            rule=lambda _, c=c: c) for c in CONVENTIONS.values()),
     Fault("dilation: widths of small splats are bent by √max(0.1, ·), as GaussianSplats3D does",
           splats=partial(limited, apart=BEND)),
     Fault("cut-off: splats end at 2 standard deviations", pixel=Ending(sigmas=2.0)),
