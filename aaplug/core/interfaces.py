@@ -66,19 +66,6 @@ class ScreenFilter(Protocol):
 
 
 @runtime_checkable
-class MatchesRates(Protocol):
-    """A screen filter that divides each Gaussian's sampling rate by a selectable reference rate."""
-
-    def with_reference(self, reference: str) -> ScreenFilter:
-        """The same filter with another reference.
-
-        Raises:
-            UsageError: there is no reference of that name.
-        """
-        ...
-
-
-@runtime_checkable
 class ReadsColumns(Protocol):
     """A screen filter that reads further columns of the scene, `Gaussians.extras`, by name."""
 

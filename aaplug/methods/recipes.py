@@ -4,8 +4,8 @@ from dataclasses import replace
 from typing import Annotated
 
 from aaplug.core.gaussians import Gaussians
-from aaplug.core.interfaces import MatchesRates
 from aaplug.methods import QUALITIES, RECIPES, SplatOrder
+from aaplug.methods.filters.matched import Matched
 from aaplug.methods.recipe import Recipe, set_by
 from aaplug.system.contracts import Range, contract
 from aaplug.system.errors import UsageError, not_one_of
@@ -36,7 +36,7 @@ def find_recipe(
     if quality not in QUALITIES:
         raise UsageError("quality", not_one_of(quality, QUALITIES))
     if rate_reference is not None:
-        if not isinstance(recipe.screen, MatchesRates):
+        if not isinstance(recipe.screen, Matched):
             raise UsageError("rate_reference", f"recipe '{name}' compares no sampling rates")
         recipe = replace(recipe, screen=recipe.screen.with_reference(rate_reference))
     if order != recipe.order:

@@ -16,7 +16,7 @@ from typing import Generic, TypeVar
 
 from aaplug.core.cameras import Camera, CameraSet, photographs
 from aaplug.core.colours import BLACK, WHITE
-from aaplug.core.interfaces import MatchesRates, TakesMemory
+from aaplug.core.interfaces import TakesMemory
 from aaplug.core.training import TrainingViews
 from aaplug.io.atomic import AnyPath, writing
 from aaplug.io.cameras import read_cameras, select_views
@@ -25,6 +25,7 @@ from aaplug.io.scenes import SceneLike, scene_of
 from aaplug.io.scenes.harmonics import without_harmonics
 from aaplug.io.scenes.scene import Scene
 from aaplug.methods import RECIPES
+from aaplug.methods.filters.matched import Matched
 from aaplug.methods.recipe import Recipe
 from aaplug.methods.recipes import find_recipe, suited
 from aaplug.options.base import Options
@@ -148,12 +149,12 @@ class Job(Generic[O_co]):
         options, found = self.options, list[Recipe]()
         for recipe in recipes:
             if isinstance(recipe, str):
-                matches = isinstance(RECIPES.find(recipe, "recipe").screen, MatchesRates)
+                matches = isinstance(RECIPES.find(recipe, "recipe").screen, Matched)
                 reference = options.rate_reference if matches else None
                 recipe = find_recipe(recipe, quality=options.quality, rate_reference=reference, order=options.order)
             found.append(recipe)
         quality = any(recipe.takes_quality for recipe in found)
-        rates = any(isinstance(recipe.screen, MatchesRates) for recipe in found)
+        rates = any(isinstance(recipe.screen, Matched) for recipe in found)
         for name, taken in (("quality", quality), ("rate_reference", rates)):
             if not taken and (value := getattr(options, name)) != getattr(RecipeOptions, name):
                 names = listing([recipe.name for recipe in found])
