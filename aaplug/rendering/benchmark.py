@@ -8,7 +8,7 @@ import math
 import resource
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from statistics import linear_regression, median
@@ -22,7 +22,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from aaplug.core.cameras import Camera, look_at
 from aaplug.core.culling import cull
 from aaplug.core.gaussians import Gaussians
-from aaplug.core.kernels import Kernel, Kernels, Runner
+from aaplug.core.kernels import Kernels
 from aaplug.core.projection import project
 from aaplug.core.pyramids import faded
 from aaplug.core.shading import shade
@@ -32,6 +32,7 @@ from aaplug.rasterizers.tiled import Tiled
 from aaplug.rasterizers.tiled.backward import composite
 from aaplug.rasterizers.tiled.binning import bands
 from aaplug.rasterizers.tiled.forward import Compositing
+from aaplug.rasterizers.tiled.packages import CountingKernels
 from aaplug.rendering.renderer import Renderer
 from aaplug.system.cores import on_free_cores
 
@@ -87,35 +88,17 @@ class _Calls(TorchDispatchMode):
         return func(*args, **(kwargs or {}))
 
 
-class _CountingCompiled(Kernels):
-    """Runs kernels as the given ones do, and counts the calls of compiled ones."""
-
-    def __init__(self, kernels: Kernels):
-        self.kernels, self.name, self.tiles, self.count = kernels, kernels.name, kernels.tiles, 0
-
-    def runner(self, kernel: Kernel, args: tuple[Tensor, ...]) -> Runner:
-        run = self.kernels.runner(kernel, args)
-
-        def counting(*args: Tensor) -> Sequence[Tensor]:
-            self.count += run is not kernel.function
-            return run(*args)
-
-        return counting
-
-
 @on_free_cores()
 def measure(renderer: Renderer, camera: Camera, kernels: Kernels, repeats: int = 5, backward: bool = True) -> Figures:
     """Time one view, of the levels of detail that the renderer picks for it if it has any.
 
     kernels: run the stages, eagerly or compiled.  backward: also time the gradients of all parameters.
     """
-    rasterizer = Tiled(kernels)
-    renderer = replace(renderer, rasterizer=rasterizer)
-    counts: list[int] = []
+    renderer = replace(renderer, rasterizer=Tiled(kernels))
+    runs: list[tuple[int, bool]] = []  # of kernels: evaluations, and whether compiled
     with torch.no_grad():
         stages, gaussians, tile_evaluations = _stages(renderer, camera, kernels, repeats)
-        replace(renderer, rasterizer=rasterizer.counting(counts.append))(camera)
-        counting = _CountingCompiled(kernels)
+        counting = CountingKernels(kernels, lambda *run: runs.append(run))
         with _Calls() as operators:
             replace(renderer, rasterizer=Tiled(counting))(camera)
         numbers, results = torch.linspace(-8.0, 0.0, EXPONENTIALS), torch.empty(EXPONENTIALS)
@@ -125,6 +108,7 @@ def measure(renderer: Renderer, camera: Camera, kernels: Kernels, repeats: int =
                 torch.exp(numbers, out=results)
 
         frame, yardstick = _timed(repeats, lambda: renderer(camera), exponentials)
+    evaluations = sum(count for count, _ in runs)
     gradients = _timed(repeats, lambda: gradient_step(renderer, camera))[0] if backward else None
     return Figures(
         rasterizer=kernels.name,
@@ -133,12 +117,12 @@ def measure(renderer: Renderer, camera: Camera, kernels: Kernels, repeats: int =
         height=camera.height,
         forward_ms=frame,
         forward_backward_ms=gradients,
-        evaluations=sum(counts),
+        evaluations=evaluations,
         tile_evaluations=tile_evaluations,
-        ns_per_evaluation=stages["composite"] * 1e6 / max(1, sum(counts)),
+        ns_per_evaluation=stages["composite"] * 1e6 / max(1, evaluations),
         stages_ms=stages,
         peak_bytes=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024),
-        calls={"operators": operators.count, "compiled kernels": counting.count},
+        calls={"operators": operators.count, "compiled kernels": sum(compiled for _, compiled in runs)},
         exponential_ns=yardstick * 1e6 / (EXPONENTIALS * EXPONENTIAL_CALLS),
     )
 

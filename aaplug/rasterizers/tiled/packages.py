@@ -128,10 +128,10 @@ def _pulled_back(package: Package, args: Sequence[Tensor], grads: list[Tensor]) 
 
 
 class CountingKernels(Kernels):
-    """Runs kernels as the given ones do, and tells how many evaluations each compositing pass makes."""
+    """Runs kernels as the given ones do, and tells of each run."""
 
-    def __init__(self, kernels: Kernels, add: Callable[[int], None]):
-        """add: called with the number of splat-pixel evaluations of each pass."""
+    def __init__(self, kernels: Kernels, add: Callable[[int, bool], None]):
+        """add: called with a run's splat-pixel evaluations, 0 if it does not composite, and whether it is compiled."""
         self._kernels, self._add = kernels, add
         self.name, self.tiles = kernels.name, kernels.tiles
 
@@ -140,7 +140,8 @@ class CountingKernels(Kernels):
         run = self._kernels.runner(kernel, args)
 
         def counting(*args: Tensor) -> Sequence[Tensor]:
-            self._add(kernel.size("t", args) * kernel.evaluations * PIXELS)
+            evaluations = kernel.size("t", args) * kernel.evaluations * PIXELS if kernel.evaluations else 0
+            self._add(evaluations, run is not kernel.function)
             return run(*args)
 
-        return counting if kernel.evaluations else run
+        return counting

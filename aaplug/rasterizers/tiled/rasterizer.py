@@ -57,7 +57,7 @@ class Tiled:
 
     def counting(self, add: Callable[[int], None]) -> "Tiled":
         """The same rasterizer, which adds up the splat-pixel evaluations of compositing."""
-        return replace(self, kernels=CountingKernels(self.kernels, add))
+        return replace(self, kernels=CountingKernels(self.kernels, lambda count, _: add(count) if count else None))
 
     def __call__(
         self,
