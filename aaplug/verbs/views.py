@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
@@ -35,7 +35,7 @@ def seen(job: Job[Drawn], views: Sequence[Camera], unsized: bool) -> list[Camera
         UsageError: an image would be larger than `MAX_SIDE`.
     """
     options = job.options
-    bent = through_lens(views, options, lambda view: median_depth(job.scene.gaussians().means, view))
+    bent = views if options.lens is None else [seen for view in views for seen in _through_lens(job, view)]
     if options.resolution is None:
         sized = [view.scaled(options.scale or 1.0) for view in bent]
     else:
@@ -58,25 +58,18 @@ def eyes_of(views: Sequence[Camera], options: LensOptions) -> list[Sequence[Came
     return [views[::2], views[1::2]] if options.lens == "vr180" else [views]
 
 
-def through_lens(views: Sequence[Camera], options: LensOptions, depth_of: Callable[[Camera], float]) -> list[Camera]:
-    """The views through the lens that the options name, with pixels as dense at the image's centre.
+def _through_lens(job: Job[Drawn], view: Camera) -> list[Camera]:
+    """The view through the lens that the options name, with pixels as dense at the image's centre.
 
-    A fisheye shows its angle along the shorter side, equirect all around, vr180 half of that by two eyes, of which the
-    names say left and right.
-
-    depth_of: distance in world units at which ortho shows things as large as the view does.
+    Ortho shows things at the scene's median depth as large as the view does, a fisheye its angle along the shorter
+    side, equirect all around, vr180 half of that by two eyes, of which the names say left and right.
     """
-    if options.lens is None:
-        return [*views]
-    return [seen for view in views for seen in _through(view, options, depth_of)]
-
-
-def _through(view: Camera, options: LensOptions, depth_of: Callable[[Camera], float]) -> list[Camera]:
+    options = job.options
     half, side = math.radians(options.lens_angle) / 2, min(view.hw)
     if options.lens == "pinhole":
         return [replace(view, lens=PINHOLE)]
     if options.lens == "ortho":
-        factor = 1 / depth_of(view)
+        factor = 1 / median_depth(job.scene.gaussians().means, view)
         return [replace(view, lens=ORTHO, fx=view.fx * factor, fy=view.fy * factor, trained_focal=None)]
     if options.lens in ("fisheye", "equisolid"):
         lens = EQUIDISTANT if options.lens == "fisheye" else EQUISOLID
