@@ -2,10 +2,10 @@
 
 import sys
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from inspect import cleandoc
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import aaplug
 from aaplug.options import verbs
@@ -224,14 +224,6 @@ def video(words: Words) -> Answer:
     return Answer(clip._asdict() | {"file": str(clip.file)})
 
 
-@dataclass(frozen=True, kw_only=True)
-class GuardOptions(Options):
-    """A guard for pipelines."""
-
-    fail_under: Annotated[float | None, number(0, 200, unit="dB"), REPORT] = None
-    """Exit with 1 if the mean PSNR of a scene at any scale is below so many dB: --fail-under 40dB."""
-
-
 @verb(
     Option(
         "scenes",
@@ -243,7 +235,13 @@ class GuardOptions(Options):
     CameraOptions,
     output("FOLDER", "Folder for compare.json, compare.csv, report.html and contact-sheet.png.", None),
     verbs.CompareOptions,
-    GuardOptions,
+    Option(
+        "fail_under",
+        number(0, 200, unit="dB"),
+        "Exit with 1 if the mean PSNR of a scene at any scale is below so many dB: --fail-under 40dB.",
+        None,
+        REPORT,
+    ),
     FileOptions,
     Orbit,
     json_of("compare.json instead of the tables"),
