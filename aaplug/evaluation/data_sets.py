@@ -9,9 +9,8 @@ from typing import NamedTuple
 from aaplug.evaluation.metric import Metric
 from aaplug.evaluation.protocols import Protocol
 from aaplug.evaluation.results import Report, mean, scale_name
+from aaplug.io.scenes.scene import MODEL_SCENE
 from aaplug.system.errors import FormatError, UsageError, listing, not_one_of
-
-MODEL = "point_cloud/iteration_*/point_cloud.ply"  # of an INRIA model, and of nerfbaselines' checkpoint
 
 
 @dataclass(frozen=True)
@@ -100,13 +99,13 @@ def find_scenes(protocol: str, data: Path, models: Path | None = None) -> Found:
     for scene in data_set.scenes:
         cameras = [place for place in _places(data_set, data, scene) if (place / data_set.cameras).exists()]
         places = [place for place in _places(data_set, root, scene) if place.is_dir()]
-        trained = [place for place in places if any(place.glob(MODEL))]
+        trained = [place for place in places if any(place.glob(MODEL_SCENE))]
         trained += [place / f"{scene}.ply" for place in places if (place / f"{scene}.ply").is_file()]
         if cameras and trained:
             scenes[scene] = trained[0], cameras[0]
             continue
         problems = [] if cameras else [f"no {data_set.cameras} in {data / scene}"]
-        problems += [] if trained else [f"no {MODEL.replace('*', 'N')} and no {scene}.ply in {root / scene}"]
+        problems += [] if trained else [f"no {MODEL_SCENE.replace('*', 'N')} and no {scene}.ply in {root / scene}"]
         missing[scene] = ", ".join(problems)
     return Found(scenes, missing)
 

@@ -29,7 +29,7 @@ from aaplug.system.contracts import contract
 from aaplug.system.digests import digest_of_values
 from aaplug.system.errors import FormatError, UsageError, listing
 
-MODEL_SCENE = "point_cloud/iteration_*/point_cloud.ply"  # in an INRIA model folder
+MODEL_SCENE = "point_cloud/iteration_*/point_cloud.ply"  # in an INRIA model folder, and in nerfbaselines' checkpoint
 SOG_FOLDER = "meta.json"  # marks a folder of SOG images
 PROBES = 512  # evenly spaced places in the file, from which the frame check samples
 PART = 1 << 16  # Gaussians per part: 15 MB at degree 3
