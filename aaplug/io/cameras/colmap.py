@@ -12,11 +12,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from aaplug.core.cameras import Camera, CameraSet
 from aaplug.core.lenses import EQUIDISTANT, EQUIRECT, Lens, opencv_lens
+from aaplug.core.projection import rotation_matrices
 from aaplug.io.cameras.cfg_args import WIDTH_CAP
 from aaplug.io.cameras.colmap_files import KINDS, Image, Intrinsics, read_cameras, read_images
 from aaplug.io.cameras.options import (
@@ -125,7 +124,11 @@ def _camera(image: Image, intrinsics: dict[int, Intrinsics]) -> Camera:
         cx, cy = values[n : n + 2]
     width, height = pixels(lens.width, lens.place, "width"), pixels(lens.height, lens.place, "height")
     translation = [number(value, image.place, "translation") for value in image.translation]
-    cam_from_world = pose(_rotation(image), torch.tensor(translation, dtype=torch.float64), image.place, "quaternion")
+    length = math.hypot(*image.quaternion)
+    usable = MIN_QUATERNION_LENGTH <= length < math.inf
+    image.place.expect(usable, "quaternion", "finite and not zero", image.quaternion)
+    turn = rotation_matrices(torch.tensor([image.quaternion], dtype=torch.float64) / length)[0]
+    cam_from_world = pose(turn, torch.tensor(translation, dtype=torch.float64), image.place, "quaternion")
     inverse(cam_from_world, image.place, "translation")  # refuses a centre that overflows
     return Camera(image.name, width, height, fx, fy, cx, cy, cam_from_world)
 
@@ -137,13 +140,3 @@ def _distortion(lens: Intrinsics) -> Distortion | None:
         return None
     values, lens_of = [number(value, lens.place, "parameter") for value in rest], LENSES.get(lens.model.name)
     return Distortion(lens.model.name, lens_of(*values) if lens_of else None)
-
-
-def _rotation(image: Image) -> Float[Tensor, "3 3"]:
-    """The rotation of a quaternion wxyz: I + 2w[v]ₓ + 2[v]ₓ² after normalization."""
-    length = math.hypot(*image.quaternion)
-    usable = MIN_QUATERNION_LENGTH <= length < math.inf
-    image.place.expect(usable, "quaternion", "finite and not zero", image.quaternion)
-    w, x, y, z = (value / length for value in image.quaternion)
-    cross = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
-    return torch.eye(3, dtype=torch.float64) + 2 * w * cross + 2 * cross @ cross

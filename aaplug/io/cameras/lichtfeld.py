@@ -43,6 +43,7 @@ def path_of(path: Path) -> CameraPath:
     times = rising(torch.tensor([key.get("time", number) for key in keys], dtype=torch.float64), about.place, "times")
     places = torch.stack([key.vector("position", 3) for key in keys])
     quats = keyframes.unit(torch.stack([key.vector("rotation", 4) for key in keys]), about.place, "rotation")
+    quats = quats.roll(-1, dims=1)  # xyzw
     focals = torch.tensor([key.get("focal_length_mm", number) for key in keys], dtype=torch.float64)
     easings = [key.get("easing", number, 0.0) for key in keys]
     for key, easing, focal in zip(keys, easings, focals.tolist(), strict=True):
@@ -56,7 +57,7 @@ def path_of(path: Path) -> CameraPath:
     padded = torch.cat([places[:1], places, places[-1:]])
     slopes = (padded[2:] - padded[:-2]) / 2
     points = hermite(places[index], slopes[index], slopes[after], places[after], share)
-    motions = rigid_motions(slerp(quats[index], quats[after], share), points)
+    motions = rigid_motions(slerp(quats[index], quats[after], share).roll(1, dims=1), points)
     motions[:, :3] *= WORLD[:, None]
     motions[:, :3, :3] *= OPENCV_FROM_OPENGL
     tangents = SENSOR_HEIGHT / 2 / focals[index].lerp(focals[after], share)
