@@ -108,7 +108,7 @@ def test_alpha_is_one_minus_transmittance():
     assert (1 - (behind[1] - behind[0]).mean(dim=2) - alpha).abs().max() < 1e-5
 
 
-GROUPS = [("nearest", "median", "number", "weight"), ("count", "weight", "number", "median")]
+GROUPS = [("nearest", "median", "number", "weight"), ("count", "weight", "number", "median"), ("last",) * 4]
 
 
 @pytest.mark.parametrize("kernel", aaplug.PIXEL_KERNELS)

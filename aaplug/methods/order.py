@@ -23,7 +23,8 @@ HALF = 0.5  # transmittance at the median
 SPLATS = 16  # whose alphas are computed at once
 Rays = Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
 Shown = tuple[str, str, str, str]
-NOTHING = {"nearest": math.inf, "median": math.inf, "number": -1.0, "weight": 0.0, "count": 0.0}  # of no splats
+# of no splats
+NOTHING = {"nearest": math.inf, "median": math.inf, "number": -1.0, "weight": 0.0, "count": 0.0, "last": -1.0}
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,8 @@ class Order:
 
     shown: its red, green, blue and alpha.  nearest is the least depth; median that of the first splat behind which the
         transmittance is below a half; number and weight are of the splat of largest weight, and only together; count
-        says how many splats are drawn.
+        says how many splats are drawn; last is the number of the last one in front of which the transmittance is above
+        a half.
     rays: of places in px, if the pixel kernel reads them.
     """
 
@@ -61,7 +63,7 @@ class Order:
         kernels: Kernels,
         rules: Rules,
     ) -> Float[Tensor, "4 t P"]:
-        """The statistics, of `SPLATS` splats at a time; the tiles end where all their pixels have stopped."""
+        """The statistics, of `SPLATS` splats at a time; the tiles end where no pixel's change any more."""
         (x, y), local, limits = centres, tile_centres(rows), Limits.by(rules)
         corners = torch.stack([x[:, 0] - local[0][0], y[:, 0] - local[1][0]], dim=1)
         pixels, left = Pixels(corners, *local), torch.ones_like(x)
@@ -70,10 +72,11 @@ class Order:
             pixels = Pixels(corners, *rays)
             left = (torch.stack(rays) != 0).any(dim=0).to(x)  # without a ray nothing is seen
         found = {name: torch.full_like(x, NOTHING[name]) for name in dict.fromkeys(self.shown)}
+        enough = HALF if [*found] == ["last"] else 0.0  # light at which a pixel's statistics stand
         for start in range(0, int(counts.max()), SPLATS):
             nearest = next_rows(rows, order, first + start, first + counts, SPLATS).transpose(0, 1)
             left = _add(found, left, self.pixel.alpha(nearest, pixels, limits), nearest[..., RED : GREEN + 1], rules)
-            if not left.any():
+            if (left <= enough).all():
                 break
         return torch.stack([found[name] for name in self.shown])
 
@@ -90,6 +93,8 @@ class Order:
         weight = torch.where(behind >= rules.min_transmittance, alpha * behind / (1 - alpha), 0.0)
         depth, number = (column.expand_as(weight) for column in splats.rgb[:, :2].T)
         heaviest = weight.argmax(dim=1, keepdim=True)
+        in_half = (weight > 0) & (torch.cat([torch.ones_like(behind[:, :1]), behind[:, :-1]], dim=1) > HALF)
+        last = in_half.cumsum(dim=1).argmax(dim=1, keepdim=True)
         most = weight.gather(1, heaviest).squeeze(1)
         found = {
             "nearest": torch.where(weight > 0, depth, torch.inf).amin(dim=1),
@@ -97,9 +102,10 @@ class Order:
             "number": torch.where(most > 0, number.gather(1, heaviest).squeeze(1), -1.0),
             "weight": most,
             "count": (weight > 0).sum(dim=1).to(most),
+            "last": torch.where(in_half.any(dim=1), number.gather(1, last).squeeze(1), -1.0),
         }
-        *colours, last = (found[name] for name in self.shown)
-        return torch.stack(colours, dim=1), 1 - last
+        *colours, alpha = (found[name] for name in self.shown)
+        return torch.stack(colours, dim=1), 1 - alpha
 
 
 def _add(
@@ -112,16 +118,20 @@ def _add(
     """Take the next splats into the statistics, in place; returns what light they leave, 0 where a pixel stops."""
     behind = left * (1 - alpha.clamp(max=rules.max_alpha)).cumprod(dim=0)
     drawn = (alpha > 0) & (behind >= rules.min_transmittance)
+    before = torch.cat([left[None], behind[:-1]])
     depth, number = colours.unbind(dim=2)
     for name, here in (("nearest", drawn), ("median", drawn & (behind < HALF))):
         if name in found:
             found[name] = torch.minimum(found[name], torch.where(here, depth[..., None], torch.inf).amin(dim=0))
     if "number" in found:
-        weight = torch.where(drawn, torch.cat([left[None], behind[:-1]]) - behind, 0.0)
+        weight = torch.where(drawn, before - behind, 0.0)
         most, heaviest = weight.max(dim=0)
         heavier = most > found["weight"]
         found["number"] = torch.where(heavier, number.T.gather(1, heaviest), found["number"])
         found["weight"] = torch.where(heavier, most, found["weight"])
     if "count" in found:
         found["count"] += drawn.sum(dim=0)
+    if "last" in found:
+        for here, each in zip(drawn & (before > HALF), number, strict=True):
+            found["last"] = torch.where(here, each[:, None], found["last"])
     return torch.where(behind[-1] >= rules.min_transmittance, behind[-1], 0.0)
