@@ -71,71 +71,63 @@ class _Composite(torch.autograd.Function):
         return image
 
     @staticmethod
+    @on_free_cores()
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None, None]:
-        (rows,) = ctx.saved_tensors
-        if not any(any(bound != 0 for bound in grad.aminmax()) for grad in grads):  # as of channels that no loss reads
+        """Gradient of the raster rows.
+
+        What splats contribute in a tile is kept step by step, and summed over tiles at the end.
+        """
+        (rows,), (bins, segments, how) = ctx.saved_tensors, ctx.rest
+        count = sum(len(before) for segment in segments for before in segment.before)
+        zero = all(bound == 0 for grad in grads for bound in grad.aminmax())  # as of channels that no loss reads
+        if zero or not count:
             return torch.zeros_like(rows), None, None
         rgb, alpha = (grad.contiguous() for grad in grads)  # once: they are gathered for each segment
-        return _backward(rows, [*rgb, alpha], *ctx.rest), None, None
-
-
-@on_free_cores()
-def _backward(
-    rows: Float[Tensor, "m c"], grads: list[Float[Tensor, "h w"]], bins: Bins, segments: list[Segment], how: Compositing
-) -> Float[Tensor, "m c"]:
-    """Gradient of the raster rows.
-
-    What splats contribute in a tile is kept step by step, and summed over tiles at the end.
-    """
-    assert bins.pairs is not None
-    local, kernel = how.centres(rows), step_kernel(how.pixel, how.channels)
-    count = sum(len(before) for segment in segments for before in segment.before)
-    if not count:
-        return torch.zeros_like(rows)
-    columns, limits = sums_per_splat(how.pixel, how.channels), rows.new_tensor(Limits.by(how.rules))
-    parts = rows.new_empty(count + 1, STEP * columns)
-    parts[count] = 0
-    steps = (bins.counts + (STEP - 1)) // STEP
-    first, total = starts_of(steps), int(steps.sum())
-    light, steps_done, done = rows.new_zeros(len(steps), PIXELS), [], 0
-    for segment in reversed(segments):
-        behind = light.index_select(0, segment.tiles)
-        lights = whole_lights = [behind, behind.clone()]  # a step reads the first and writes the second
-        colours = tiles_of(grads, segment.tiles, bins.columns, how.kernels)
-        step_of = first.index_select(0, segment.tiles) + segment.start // STEP
-        rays = how.rays_of(segment.corners[:, :2])
-        part = whole = [step_of, segment.lists, segment.corners, *colours, *rays]
-        run, shifts = None, shifts_of(len(segment.before), STEP, rows)
-        for step, before in reversed([*enumerate(segment.before)]):
-            n = len(before)
-            if n != len(part[0]):
-                part, lights = ([x.narrow(0, 0, n) for x in of_all] for of_all in (whole, whole_lights))
-            mine, lists, corners, *pixels = part
-            behind, left = lights
-            args = (rows, bins.splats, lists, corners, before, behind, *pixels, *local, limits, shifts[step])
-            args = (*args, parts.narrow(0, done, n), left)
-            run = run or how.kernels.runner(kernel, args)
-            run(*args)
-            lights, whole_lights = lights[::-1], whole_lights[::-1]
-            # Among the fewest tiles one may have no splats left: its step is none of the list.
-            these = mine + step
-            ends = lists[:, 1] - step * STEP
-            steps_done.append(these if n > MIN_TILES else torch.where(lists[:, 0] < ends, these, total))
-            done += n
-        light.index_copy_(0, segment.tiles, whole_lights[0])
-    # `part_of` tells where each step's contributions stand.  Steps behind saturated pixels contribute nothing.
-    part_of = torch.full((total + 1,), count, dtype=torch.int32, device=rows.device)
-    part_of.index_copy_(0, torch.cat(steps_done), torch.arange(count, dtype=torch.int32, device=rows.device))
-    pairs = bins.pairs
-    shifts = (first * STEP - bins.first).int()
-    slots = part_of.new_empty(len(pairs.sorted))
-    how.kernels.run(SLOTS, slots, pairs.tiles, shifts, part_of, pairs.sorted)
-    summed = rows.new_zeros(len(rows), columns)
-    sums = functional.embedding_bag(slots, parts.view(-1, columns), pairs.starts, mode="sum")
-    summed.index_copy_(0, pairs.nearest, sums)
-    if isinstance(how.pixel, SumsGradients):
-        return how.pixel.from_sums(rows, summed, how.kernels)
-    return summed
+        local, kernel = how.centres(rows), step_kernel(how.pixel, how.channels)
+        columns, limits = sums_per_splat(how.pixel, how.channels), rows.new_tensor(Limits.by(how.rules))
+        parts = rows.new_empty(count + 1, STEP * columns)
+        parts[count] = 0
+        steps = (bins.counts + (STEP - 1)) // STEP
+        first, total = starts_of(steps), int(steps.sum())
+        light, steps_done, done = rows.new_zeros(len(steps), PIXELS), [], 0
+        for segment in reversed(segments):
+            behind = light.index_select(0, segment.tiles)
+            lights = whole_lights = [behind, behind.clone()]  # a step reads the first and writes the second
+            colours = tiles_of([*rgb, alpha], segment.tiles, bins.columns, how.kernels)
+            step_of = first.index_select(0, segment.tiles) + segment.start // STEP
+            rays = how.rays_of(segment.corners[:, :2])
+            part = whole = [step_of, segment.lists, segment.corners, *colours, *rays]
+            run, shifts = None, shifts_of(len(segment.before), STEP, rows)
+            for step, before in reversed([*enumerate(segment.before)]):
+                n = len(before)
+                if n != len(part[0]):
+                    part, lights = ([x.narrow(0, 0, n) for x in of_all] for of_all in (whole, whole_lights))
+                mine, lists, corners, *pixels = part
+                behind, left = lights
+                args = (rows, bins.splats, lists, corners, before, behind, *pixels, *local, limits, shifts[step])
+                args = (*args, parts.narrow(0, done, n), left)
+                run = run or how.kernels.runner(kernel, args)
+                run(*args)
+                lights, whole_lights = lights[::-1], whole_lights[::-1]
+                # Among the fewest tiles one may have no splats left: its step is none of the list.
+                these = mine + step
+                ends = lists[:, 1] - step * STEP
+                steps_done.append(these if n > MIN_TILES else torch.where(lists[:, 0] < ends, these, total))
+                done += n
+            light.index_copy_(0, segment.tiles, whole_lights[0])
+        # `part_of` tells where each step's contributions stand.  Steps behind saturated pixels contribute nothing.
+        part_of = torch.full((total + 1,), count, dtype=torch.int32, device=rows.device)
+        part_of.index_copy_(0, torch.cat(steps_done), torch.arange(count, dtype=torch.int32, device=rows.device))
+        pairs = bins.pairs
+        shifts = (first * STEP - bins.first).int()
+        slots = part_of.new_empty(len(pairs.sorted))
+        how.kernels.run(SLOTS, slots, pairs.tiles, shifts, part_of, pairs.sorted)
+        summed = rows.new_zeros(len(rows), columns)
+        sums = functional.embedding_bag(slots, parts.view(-1, columns), pairs.starts, mode="sum")
+        summed.index_copy_(0, pairs.nearest, sums)
+        if isinstance(how.pixel, SumsGradients):
+            summed = how.pixel.from_sums(rows, summed, how.kernels)
+        return summed, None, None
 
 
 def _slots(
