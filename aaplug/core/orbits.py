@@ -15,7 +15,7 @@ from torch import Tensor
 from aaplug.core.cameras import Camera, look_at
 from aaplug.core.gaussians import MIN_OPACITY, Gaussians
 from aaplug.core.rules import NEAR
-from aaplug.core.spherical_harmonics import COLOUR_OFFSET, sh_colour
+from aaplug.core.spherical_harmonics import COLOUR_OFFSET, even_directions, sh_colour
 from aaplug.system.errors import UsageError
 
 CORE_DISTANCES = 2.0  # median distances from the centre; Gaussians farther out count as surroundings
@@ -72,7 +72,7 @@ def frame_of(scene: Gaussians, up: Sequence[float] | None = None) -> Frame:
     points, sizes = scene.means.double(), scene.scales.amax(dim=1).double()
     size = float(sizes.median())
     weights = scene.opacities.double().clamp(min=MIN_OPACITY) * (size / sizes).clamp(max=1.0).square()
-    centre = _geometric_median(points, weights)
+    centre = geometric_median(points, weights, points.median(dim=0).values)
     shape = _shape(points - centre, weights)
     distances = _lengths(points - centre, shape)
     core = distances <= CORE_DISTANCES * _quantile(distances, weights, 0.5)
@@ -129,7 +129,7 @@ def training_side(scene: Gaussians) -> Float[Tensor, " 3"]:
     k = scene.sh.shape[1]
     if k == 1:
         return torch.zeros(3, dtype=torch.float64)
-    directions = _even_directions(COLOUR_DIRECTIONS)
+    directions = even_directions(COLOUR_DIRECTIONS).float()
     ones = torch.eye(k).repeat(len(directions), 1)[:, :, None].expand(-1, -1, 3)
     basis = sh_colour(ones, directions.repeat_interleave(k, dim=0))[:, 0].view(-1, k) - COLOUR_OFFSET
     varied = scene.sh[:, 1:].float() * scene.opacities[:, None, None].float().sqrt()
@@ -155,9 +155,10 @@ def _front(up: Float[Tensor, " 3"], side: Float[Tensor, " 3"], shape: Float[Tens
     return torch.nn.functional.normalize(level, dim=0)
 
 
-def _geometric_median(points: Float[Tensor, "n 3"], weights: Float[Tensor, " n"]) -> Float[Tensor, " 3"]:
-    """The place with the least weighted sum of distances to the points (Weiszfeld 1937)."""
-    centre = points.median(dim=0).values
+def geometric_median(
+    points: Float[Tensor, "n 3"], weights: Float[Tensor, " n"], centre: Float[Tensor, " 3"]
+) -> Float[Tensor, " 3"]:
+    """The place with the least weighted sum of distances to points, from a first `centre` on (Weiszfeld 1937)."""
     for _ in range(MAX_STEPS):
         distances = (points - centre).norm(dim=1)
         typical = float(distances.median())
@@ -201,11 +202,3 @@ def _quantile(values: Float[Tensor, " n"], weights: Float[Tensor, " n"], share: 
     running = weights[order].cumsum(dim=0)
     place = int(torch.searchsorted(running, share * running[-1]))
     return float(values[order][min(place, len(values) - 1)])
-
-
-def _even_directions(count: int) -> Float[Tensor, "count 3"]:
-    """Unit vectors spread evenly over the sphere, on a Fibonacci spiral."""
-    index = torch.arange(count) + 0.5
-    z, angle = 1 - 2 * index / count, math.pi * (1 + math.sqrt(5)) * index
-    level = (1 - z * z).sqrt()
-    return torch.stack([level * angle.cos(), level * angle.sin(), z], dim=1)

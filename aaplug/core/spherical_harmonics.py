@@ -3,12 +3,13 @@
 m: directions; k: coefficients per channel, (degree + 1)².
 """
 
+import math
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 MOST_COEFFICIENTS = 25  # per channel, of degree 4
-GOLDEN_ANGLE = 2.399963229728653  # π·(3 − √5) rad: directions at its multiples are spread evenly
 COLOUR_OFFSET = 0.5  # 3DGS stores colours around mid-grey
 
 SH_C0 = 0.28209479177387814
@@ -39,13 +40,18 @@ def sh_turned(sh: Float[Tensor, "n k 3"], turn: Float[Tensor, "3 3"]) -> Float[T
     Lighting"); it is solved in float64.
     """
     k = sh.shape[1]
-    sines = torch.linspace(-0.98, 0.98, 2 * MOST_COEFFICIENTS, dtype=torch.float64)
-    angles = GOLDEN_ANGLE * torch.arange(len(sines))
-    cosines = (1 - sines.square()).sqrt()
-    ways = torch.stack([cosines * angles.cos(), cosines * angles.sin(), sines], dim=1)
+    ways = even_directions(2 * MOST_COEFFICIENTS)
     after, before = (torch.stack(_sh_basis(d, k), dim=1) for d in (ways, ways @ turn.double()))
     matrix = torch.linalg.lstsq(after, before).solution
     return torch.einsum("jk,nkc->njc", matrix, sh.double()).to(sh.dtype)
+
+
+def even_directions(count: int) -> Float[Tensor, "count 3"]:
+    """Unit vectors spread evenly over the sphere, on a Fibonacci spiral, in float64."""
+    index = torch.arange(count, dtype=torch.float64) + 0.5
+    z, angle = 1 - 2 * index / count, math.pi * (1 + math.sqrt(5)) * index
+    level = (1 - z * z).sqrt()
+    return torch.stack([level * angle.cos(), level * angle.sin(), z], dim=1)
 
 
 def _sh_basis(directions: Float[Tensor, "m 3"], coefficients: int) -> list[Float[Tensor, " m"]]:

@@ -22,11 +22,11 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from aaplug.core.gaussians import Gaussians
+from aaplug.core.orbits import geometric_median
 
 MAX_QUERIES = 1024  # places of the other scene that are judged
 MAX_PLACES = 1 << 18  # places of a scene among which they are looked up
 CORE_RADIUS = 2.0  # median distances from the middle; principal axes are of what lies nearer
-MIDDLE_STEPS = 20  # of the iteration that finds the middle
 CERTAIN_DISTANCE = 0.5  # of the reference's spacing: nearer, no transform can tell more
 SURFACE_DISTANCE = 5.0  # of the reference's spacing: farther, Gaussians are not of the same surfaces
 BELIEVED_SHARE = 1 / 3  # of the distance as the scenes are: a transform that reaches this is believed
@@ -80,14 +80,8 @@ class Cloud:
 
     @cached_property
     def middle(self) -> Float[Tensor, " 3"]:
-        """Nearly the place with the least sum of distances (Weiszfeld 1937); it turns and grows with the points."""
-        middle = self.points.mean(dim=0)
-        for _ in range(MIDDLE_STEPS):
-            offsets = self.points - middle
-            distances = offsets.norm(dim=1)
-            pull = 1 / distances.clamp(min=UNNAMED_CHANGE * max(float(distances.median()), MIN_LENGTH))
-            middle = middle + (offsets * pull[:, None]).sum(dim=0) / pull.sum()
-        return middle
+        """Nearly the place with the least sum of distances; it turns and grows with the points."""
+        return geometric_median(self.points, torch.ones_like(self.points[:, 0]), self.points.mean(dim=0))
 
     @cached_property
     def size(self) -> float:
