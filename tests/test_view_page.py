@@ -12,9 +12,8 @@ import pytest
 import torch
 from aaplug_cli.main import main
 
-from aaplug.core.cameras import Camera, CameraSet
+from aaplug.core.cameras import Camera, CameraSet, centred
 from aaplug.core.imaging import quantised
-from aaplug.core.orbits import pinhole
 from aaplug.evaluation.metrics import psnr
 from aaplug.io.cameras import read_camera_path
 from aaplug.io.images import read_image
@@ -95,7 +94,7 @@ def camera_of(page, cameras: CameraSet) -> Camera:
     """The camera of the picture, from what the page says of itself."""
     fields = state(page)
     size, focal = tuple(map(int, data(page, "size").split("x"))), fields["scale"] * cameras.train[0].focal
-    return pinhole("seen", size, focal, torch.tensor(fields["pose"], dtype=torch.float64).view(4, 4))
+    return centred("seen", size, focal, torch.tensor(fields["pose"], dtype=torch.float64).view(4, 4))
 
 
 def image(page, selector=SEEN) -> torch.Tensor:

@@ -293,6 +293,13 @@ def spread(views: Sequence[Camera], most: int) -> Sequence[Camera]:
     return views[:: max(1, -(-len(views) // most))]
 
 
+def centred(
+    name: str, size: tuple[int, int], focal: float, pose: Float[Tensor, "4 4"], photo: Path | None = None
+) -> Camera:
+    """A free camera whose principal point is the image's centre.  size: width, height; focal: of both axes; in px."""
+    return Camera(name, *size, focal, focal, size[0] / 2, size[1] / 2, pose, photo=photo)
+
+
 @contract
 def look_at(eye: Float[Tensor, " 3"], target: Float[Tensor, " 3"], up: Float[Tensor, " 3"]) -> Float[Tensor, "4 4"]:
     """`cam_from_world` of a camera at `eye` that looks at `target`, with `up` pointing up in the image.

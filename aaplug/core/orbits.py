@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.cameras import Camera, look_at
+from aaplug.core.cameras import Camera, centred, look_at
 from aaplug.core.gaussians import MIN_OPACITY, Gaussians
 from aaplug.core.rules import NEAR
 from aaplug.core.spherical_harmonics import COLOUR_OFFSET, even_directions, sh_colour
@@ -104,13 +104,8 @@ def orbit(
         level = math.cos(turn) * frame.front + math.sin(turn) * side
         eye = frame.centre + distance * (math.cos(elevation) * level + math.sin(elevation) * frame.up)
         pose = look_at(eye, frame.centre, frame.up)
-        views.append(pinhole(f"{name}_{index:0{len(str(count - 1))}}", size, focal, pose))
+        views.append(centred(f"{name}_{index:0{len(str(count - 1))}}", size, focal, pose))
     return tuple(views)
-
-
-def pinhole(name: str, size: tuple[int, int], focal: float, pose: Float[Tensor, "4 4"]) -> Camera:
-    """A free camera with the principal point in the middle of its image."""
-    return Camera(name, *size, focal, focal, size[0] / 2, size[1] / 2, pose)
 
 
 def likely_up(side: Float[Tensor, " 3"]) -> tuple[float, float, float]:

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.cameras import Camera, look_at
+from aaplug.core.cameras import Camera, centred, look_at
 from aaplug.core.colours import BLACK, WHITE
 from aaplug.core.conventions import CONVENTIONS, Convention
 from aaplug.core.gaussians import Gaussians, joined
@@ -39,7 +39,7 @@ UNSEEN = 600  # Gaussians
 PATCH = 16  # px: side of the squares that pictures are compared in
 EYE = (2.2, -1.4, -3.1)  # looks at the origin
 POSE = look_at(torch.tensor(EYE), torch.zeros(3), torch.tensor([0.1, -1.0, 0.2]))
-CAMERA = Camera("camera", SIDE, SIDE, FOCAL, FOCAL, SIDE / 2, SIDE / 2, POSE).as_trained()
+CAMERA = centred("camera", (SIDE, SIDE), FOCAL, POSE).as_trained()
 DISTANCE = math.hypot(*EYE)
 GREY, RED = (0.6, 0.6, 0.6), (1.0, 0.2, 0.0)  # seen on black and on white
 

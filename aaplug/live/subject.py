@@ -10,11 +10,10 @@ from typing import Any
 import torch
 
 from aaplug.core.camera_paths import up_of
-from aaplug.core.cameras import Camera, CameraSet, spread
+from aaplug.core.cameras import Camera, CameraSet, centred, spread
 from aaplug.core.colours import Colour
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.imaging import quantised
-from aaplug.core.orbits import pinhole
 from aaplug.evaluation.metrics import psnr
 from aaplug.evaluation.protocols import median_depth
 from aaplug.io.scenes.scene import Scene
@@ -69,7 +68,7 @@ class Subject:
         """The camera of a picture; at a view of the data set its pixels are those of the view, scaled."""
         if request.at is None:
             pose = torch.tensor(request.pose, dtype=torch.float64).view(4, 4)
-            return pinhole("view", (request.width, request.height), request.focal, pose)
+            return centred("view", (request.width, request.height), request.focal, pose)
         view, left, top = self.placed_view(request)
         return replace(view, width=request.width, height=request.height, cx=view.cx + left, cy=view.cy + top)
 

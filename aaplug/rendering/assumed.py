@@ -11,9 +11,9 @@ from pathlib import Path
 
 import torch
 
-from aaplug.core.cameras import Camera, CameraSet, look_at
+from aaplug.core.cameras import Camera, CameraSet, centred, look_at
 from aaplug.core.gaussians import Gaussians
-from aaplug.core.orbits import Frame, frame_of, pinhole
+from aaplug.core.orbits import Frame, frame_of
 from aaplug.core.orbits import orbit as orbit_views
 from aaplug.core.sampling import sampling_bounds
 from aaplug.io.cameras import holds_cameras
@@ -101,7 +101,7 @@ def _assumed_training(
         return views, reason
     width, height = (max(1, round(side * factor)) for side in (views[0].width, views[0].height))
     focal = views[0].focal * factor  # the views at `factor` times their sampling rate, in whole pixels
-    return tuple(pinhole(v.name, (width, height), focal, v.cam_from_world).as_trained() for v in views), reason
+    return tuple(centred(v.name, (width, height), focal, v.cam_from_world).as_trained() for v in views), reason
 
 
 def _orbit_views(orbit: Orbit, frame: Frame, trained: Camera) -> tuple[Camera, ...]:
@@ -111,7 +111,7 @@ def _orbit_views(orbit: Orbit, frame: Frame, trained: Camera) -> tuple[Camera, .
     centre = frame.centre if orbit.look_at is None else frame.centre.new_tensor(orbit.look_at)
     if orbit.eye is not None:
         pose = _pose(frame.centre.new_tensor(orbit.eye), centre, frame)
-        return (pinhole("eye", size, min(size) / 2 / math.tan(fov / 2), pose),)
+        return (centred("eye", size, min(size) / 2 / math.tan(fov / 2), pose),)
     elevation = math.radians(ELEVATION if orbit.elevation is None else orbit.elevation)
     views = orbit_views(replace(frame, centre=centre), orbit.orbit or ORBIT_VIEWS, size, elevation, fov)
     if orbit.look_at is not None or orbit.fov != DEFAULT_FOV:

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from aaplug.core.cameras import Camera, look_at
+from aaplug.core.cameras import Camera, centred, look_at
 from aaplug.core.culling import cull
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.kernels import Kernels
@@ -146,8 +146,7 @@ def synthetic_camera(width: int, height: int) -> Camera:
     """The camera that looks at a synthetic scene."""
     focal = 0.5 * width / math.tan(math.radians(FIELD_OF_VIEW) / 2)
     eye, target, up = torch.tensor([[3.6, -3.0, 1.6], [0.0, 0.0, -0.1], [0.0, 0.0, 1.0]]).double()
-    pose = look_at(eye, target, up)
-    return Camera("bench", width, height, focal, focal, width / 2, height / 2, pose)
+    return centred("bench", (width, height), focal, look_at(eye, target, up))
 
 
 def synthetic_scene(n: int, seed: int = SEED) -> Gaussians:

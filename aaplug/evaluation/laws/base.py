@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from aaplug.core.cameras import Camera, look_at
+from aaplug.core.cameras import Camera, centred, look_at
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.splats import Splats2D
 
@@ -56,8 +56,7 @@ def make_camera(
     """A pose of the data set that looks at the origin; size is width and height in px."""
     focal = 0.5 * size[0] / math.tan(fov / 2)
     pose = look_at(torch.tensor(eye), torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
-    centre = size[0] / 2, size[1] / 2
-    return Camera(name, *size, focal, focal, *centre, pose).as_trained()
+    return centred(name, size, focal, pose).as_trained()
 
 
 def make_scene(n: int, seed: int = 0, dtype: torch.dtype = torch.float32, degree: int = 1) -> Gaussians:

@@ -11,10 +11,10 @@ import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from aaplug.core.cameras import Aperture, Camera, CameraSet, Exposure
+from aaplug.core.cameras import Aperture, Camera, CameraSet, Exposure, centred
 from aaplug.io.cameras.options import CameraFileOptions, described_sizes, file_sizes, undivided
 from aaplug.io.cameras.photos import refuse_folder
-from aaplug.io.cameras.poses import centred, inverse, pose_of_opengl
+from aaplug.io.cameras.poses import inverse, pose_of_opengl
 from aaplug.io.values import Entry, entries, focal, mentions, number, object_of, pixels, read_json
 from aaplug.system.errors import UsageError
 
@@ -87,7 +87,7 @@ def _camera(entry: Entry, name: str, size: tuple[int, int]) -> Camera:
         for key, field in EXACT.items()
         if entry.fields.get(key) is not None
     }
-    return replace(centred(name, size, (f, f), cam_from_world), **exact, exposure=_exposure(entry))
+    return replace(centred(name, size, f, cam_from_world), **exact, exposure=_exposure(entry))
 
 
 def _exposure(entry: Entry) -> Exposure | None:

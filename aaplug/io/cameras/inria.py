@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from aaplug.core.cameras import Camera, CameraSet
+from aaplug.core.cameras import Camera, CameraSet, centred
 from aaplug.core.colours import BLACK, WHITE
 from aaplug.io.cameras import cfg_args
 from aaplug.io.cameras.cfg_args import WIDTH_CAP, CfgArgs, read_cfg_args
@@ -29,7 +29,7 @@ from aaplug.io.cameras.options import (
     trained_at,
 )
 from aaplug.io.cameras.photos import photo_folder, with_photos
-from aaplug.io.cameras.poses import centred, inverse, pose
+from aaplug.io.cameras.poses import inverse, pose
 from aaplug.io.values import Entry, Place, entries, focal, mentions, pixels, read_json, text
 
 FILE = "cameras.json"
@@ -84,9 +84,9 @@ class Model:
 def _camera(entry: Entry) -> Camera:
     rotation, position = entry.matrix("rotation", 3, 3), entry.vector("position", 3)
     size = entry.get("width", pixels), entry.get("height", pixels)
-    focals = entry.get("fx", focal), entry.get("fy", focal)
+    fx, fy = entry.get("fx", focal), entry.get("fy", focal)
     cam_from_world = inverse(pose(rotation, position, entry.place, "rotation"), entry.place, "position")
-    return centred(entry.get("img_name", text), size, focals, cam_from_world)
+    return replace(centred(entry.get("img_name", text), size, fx, cam_from_world), fy=fy)
 
 
 def _training_sizes(

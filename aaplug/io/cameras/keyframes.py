@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from aaplug.core.cameras import WHOLE_SLACK, Camera
+from aaplug.core.cameras import WHOLE_SLACK, Camera, centred
 from aaplug.core.projection import rotation_matrices
-from aaplug.io.cameras.poses import centred, inverse
+from aaplug.io.cameras.poses import inverse
 from aaplug.io.values import Place, focal
 
 MAX_FRAMES = 10_000  # of a path file: 5 minutes and a half at 30 a second
@@ -93,5 +93,5 @@ def cameras_of(
     cameras = []
     for index, (pose, tangent) in enumerate(zip(world_from_cam, tangents.tolist(), strict=True)):
         f = focal(side(size) / 2 / tangent if tangent else math.inf, place, "the focal length")
-        cameras.append(centred(f"{index:0{digits}}", size, (f, f), inverse(pose, place, "the position")))
+        cameras.append(centred(f"{index:0{digits}}", size, f, inverse(pose, place, "the position")))
     return tuple(cameras)

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from aaplug.core.cameras import Camera, CameraSet
+from aaplug.core.cameras import Camera, CameraSet, centred
 from aaplug.io.cameras.options import (
     LLFF_HOLD,
     CameraFileOptions,
@@ -23,7 +23,7 @@ from aaplug.io.cameras.options import (
     trained_at,
 )
 from aaplug.io.cameras.photos import SUFFIXES, last_part, photo_folder, with_photos
-from aaplug.io.cameras.poses import centred, inverse, pose
+from aaplug.io.cameras.poses import inverse, pose
 from aaplug.io.limits import whole_limit
 from aaplug.io.values import Place, focal, number, pixels, read_bounded
 from aaplug.system.errors import FormatError
@@ -82,4 +82,4 @@ def _camera(row: np.ndarray, name: str, place: Place) -> Camera:
     f = focal(matrix[2, 4].item(), place, "focal length")
     down, right, back = matrix[:, :3].unbind(dim=1)
     world_from_cam = pose(torch.stack([right, down, -back], dim=1), matrix[:, 3], place, "rotation")
-    return centred(name, (width, height), (f, f), inverse(world_from_cam, place, "position"))
+    return centred(name, (width, height), f, inverse(world_from_cam, place, "position"))

@@ -8,11 +8,11 @@ its own size.
 import os
 from pathlib import Path
 
-from aaplug.core.cameras import Camera, CameraSet
+from aaplug.core.cameras import Camera, CameraSet, centred
 from aaplug.core.colours import WHITE
 from aaplug.io.cameras.options import CameraFileOptions, described_sizes, explicit, file_sizes, trained_at, undivided
 from aaplug.io.cameras.photos import PhotoFolder, distinct, last_part, refuse_folder, without_suffix
-from aaplug.io.cameras.poses import centred, inverse, pose_of_opengl, rigid
+from aaplug.io.cameras.poses import inverse, pose_of_opengl, rigid
 from aaplug.io.values import Entry, Place, focal, mentions, object_of, pixels, read_json, text
 from aaplug.system.errors import UsageError, counted
 
@@ -59,5 +59,5 @@ def _cameras(document: Entry, split: str) -> list[Camera]:
         world_from_cam = pose_of_opengl(rigid(item, "cam2world"), item.place, "cam2world")
         size, f = (item.get("width", pixels), item.get("height", pixels)), item.get("focal", focal)
         cam_from_world = inverse(world_from_cam, item.place, "cam2world")
-        cameras.append(centred(name, size, (f, f), cam_from_world, folder.find(photo, item.place)))
+        cameras.append(centred(name, size, f, cam_from_world, folder.find(photo, item.place)))
     return cameras

@@ -3,13 +3,11 @@
 Every function raises FormatError for values that are not a rigid motion.
 """
 
-from pathlib import Path
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.cameras import MAX_ROTATION_ERROR, Camera
+from aaplug.core.cameras import MAX_ROTATION_ERROR
 from aaplug.io.values import Entry, Place
 
 OPENCV_FROM_OPENGL = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)  # y and z change sign
@@ -44,17 +42,6 @@ def inverse(motion: Float[Tensor, "4 4"], place: Place, field: str) -> Float[Ten
     back[:3, 3] = -back[:3, :3] @ motion[:3, 3]
     place.expect(bool(back.isfinite().all()), field, "a smaller position", motion[:3, 3].tolist())
     return back
-
-
-def centred(
-    name: str,
-    size: tuple[int, int],
-    focals: tuple[float, float],
-    cam_from_world: Float[Tensor, "4 4"],
-    photo: Path | None = None,
-) -> Camera:
-    """A camera whose principal point is the image's centre.  size: width and height; focals: fx and fy; all in px."""
-    return Camera(name, *size, *focals, size[0] / 2, size[1] / 2, cam_from_world, photo=photo)
 
 
 def rigid(entry: Entry, field: str) -> Float[Tensor, "4 4"]:
