@@ -8,6 +8,7 @@ import pytest
 import torch
 from aaplug_cli.main import main
 
+import aaplug
 from aaplug.core.cameras import CameraSet
 from aaplug.core.colours import WHITE
 from aaplug.core.gaussians import Gaussians
@@ -61,8 +62,13 @@ def test_cameras_of_another_capture_are_refused_unless_min_seen_is_0(sample_scen
         aside = tuple(replace(view, cx=view.cx + 0.6 * view.width, photo=None) for view in cameras.train)
         scene, cameras = sample_scene, replace(cameras, train=aside, test=aside)
     job = Job.of(scene, cameras, ViewOptions())
-    with pytest.raises(FrameError, match=r"seem to be of different captures.*if they are right, pass `min_seen` 0"):
-        job.look(1)
+    for verb in (
+        lambda: job.look(1),
+        lambda: aaplug.convert(scene, cameras),
+        lambda: aaplug.merge([scene], cameras, into="mip"),
+    ):
+        with pytest.raises(FrameError, match=r"seem to be of different captures.*if they are right, pass `min_seen` 0"):
+            verb()
     replace(job, options=ViewOptions(min_seen=0.0)).look(1)
     assert "seem to be of different captures" in caplog.text
 

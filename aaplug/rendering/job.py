@@ -29,7 +29,7 @@ from aaplug.methods.filters.matched import Matched
 from aaplug.methods.recipe import Recipe
 from aaplug.methods.recipes import find_recipe, suited
 from aaplug.options.base import Options
-from aaplug.options.shared import Orbit, RecipeOptions, ViewOptions
+from aaplug.options.shared import FrameOptions, Orbit, RecipeOptions, ViewOptions
 from aaplug.options.verbs import ALL, IN_TIME
 from aaplug.rasterizers.choice import find_rasterizer
 from aaplug.rendering.agreement import agreement, settled
@@ -127,15 +127,21 @@ class Job(Generic[O_co]):
             rasterizer = rasterizer.within(options.memory * 1e9)
         training = self.training(self.scene)
         look = own_look(self.scene, training, rasterizer, colour)
-        if check and len(look.scene) and not self.cameras.assumed:
-            fit = agreement(look, self.cameras)
-            say(f"fit: {fit}")
-            if fit.doubt:
-                problem = f"scene and cameras seem to be of different captures: {fit.doubt}"
-                if options.min_seen > 0:
-                    raise FrameError(look.scene.name, f"{problem}; if they are right, pass `min_seen` 0")
-                log.warning("%s: %s", look.scene.name, problem)
+        if check:
+            self.check_fit(look)
         return look
+
+    def check_fit(self: "Job[FrameOptions]", look: Renderer) -> None:
+        """Say how well scene and cameras fit, which takes seconds; raises FrameError as `look`."""
+        if not len(look.scene) or self.cameras.assumed:
+            return
+        fit = agreement(look, self.cameras)
+        self.monitor.say(f"fit: {fit}")
+        if fit.doubt:
+            problem = f"scene and cameras seem to be of different captures: {fit.doubt}"
+            if self.options.min_seen > 0:
+                raise FrameError(look.scene.name, f"{problem}; if they are right, pass `min_seen` 0")
+            log.warning("%s: %s", look.scene.name, problem)
 
     def training(self: "Job[ViewOptions]", scene: Scene) -> TrainingViews:
         """The training views of a scene; raises FrameError as `TrainingViews.of`."""

@@ -115,7 +115,9 @@ def _closed_form(job: Job[ConvertOptions], form: Form) -> Gaussians:
     training = None
     if not blurring(gaussians.fused) and gaussians.filter_3d is None:  # else it needs no cameras, or is refused
         training = TrainingViews.of(gaussians, job.cameras, min_seen=job.options.min_seen)
-        job.say_assumed(own_look(gaussians, training))
+        look = own_look(gaussians, training)
+        job.check_fit(look)
+        job.say_assumed(look)
     return fuse(gaussians, training, form)
 
 

@@ -335,7 +335,7 @@ def _outputs(output: Path | None, scene: Scene, options: LodOptions) -> tuple[li
     if options.single:
         check_scene_output(output, options.overwrite, scene.files)
         return [output], []
-    if written_format(output):
+    if written_format(output) or output.suffix == Path(STREAMS["rad"].index).suffix:
         raise OutputError(output, "levels go to a folder; for one scene, give `simplify` or `budget`")
     stem = scene.source.stem if scene.source else "scene"
     files = [output / f"{stem}_lod{level}.ply" for level in range((options.levels or DEFAULT_LEVELS) + 1)]
