@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 import struct
 import zipfile
 from dataclasses import dataclass, replace
@@ -53,6 +54,16 @@ STEPS = {
     "level2.ksplat": (2e-4, 1e-3, 3e-3, 8e-3, 8e-3),
     "pt": (0.0, 0.0, 1e-6, 0.0, 0.0),
 }
+
+
+@pytest.mark.parametrize(("suffix", "far"), [("compressed.ply", 3e2), ("spz", 2e6)])
+def test_a_gaussian_far_away_that_moves_others_is_told(tmp_path: Path, caplog, suffix: str, far: float):
+    scene = replace(oracle(), origin=None)
+    write_scene(tmp_path / f"a.{suffix}", scene)
+    assert "moves" not in caplog.text
+    scene.means[3, 0] = far
+    write_scene(tmp_path / f"b.{suffix}", scene)
+    assert re.search(r"b\.\S+: a \.\S+ moves \d+ of \d+ Gaussians by more than their size", caplog.text)
 
 
 @pytest.fixture

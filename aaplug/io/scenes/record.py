@@ -9,13 +9,18 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
 from aaplug.core.chunks import curve
 from aaplug.core.conventions import CLASSIC, CONVENTIONS, Convention
 from aaplug.core.gaussians import Fusion, Gaussians, joined
 from aaplug.io.values import Entry, Place, text
-from aaplug.system.errors import OutputError
+from aaplug.system.errors import OutputError, counted
 
 KEY = "aaplug"  # of the record in a JSON document
+MOVED_SHARE = 0.01  # of the Gaussians: fewer, the smallest, are moved by their size in any scene
 
 log = logging.getLogger("aaplug")
 
@@ -73,6 +78,17 @@ def whole(path: Path, parts: Iterable[Gaussians], format: str, degree: int, flat
     if not len(scene):
         raise OutputError(path, f"a .{format} cannot hold a scene without Gaussians; write a .ply")
     return scene[curve(scene.means.double()).argsort(stable=True)]
+
+
+def warn_of_moves(path: Path, format: str, scene: Gaussians, moves: Float[Tensor, "n 3"] | float) -> None:
+    """Warn where rounding moves Gaussians by more than their size, as a few far away make it do.
+
+    moves: of each centre along each axis, in world units; or at most, along every axis.
+    """
+    far = torch.as_tensor(moves, dtype=torch.float32).expand_as(scene.means).norm(dim=1) > scene.scales.amax(dim=1)
+    if far.sum() > MOVED_SHARE * len(scene):
+        what = f"moves {int(far.sum()):,} of {counted(len(scene), 'Gaussian')} by more than their size"
+        log.warning("%s: a .%s %s, as some lie far away; a .ply does not", path, format, what)
 
 
 def warn_of_losses(path: Path, format: str, scene: Gaussians, kept: Facts, also: Iterable[str] = ()) -> None:

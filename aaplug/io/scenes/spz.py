@@ -41,7 +41,7 @@ from aaplug.io.scenes.packed import (
     largest_last,
     without_largest,
 )
-from aaplug.io.scenes.record import Facts, holdable, warn_of_losses
+from aaplug.io.scenes.record import Facts, holdable, warn_of_losses, warn_of_moves
 from aaplug.io.scenes.rows import check_count, library_errors
 from aaplug.io.scenes.scene import COMPENSATED, KERNEL_LOST, Scene
 from aaplug.system.errors import FormatError, OutputError
@@ -291,6 +291,8 @@ def packed(path: Path, scenes: Sequence[Gaussians], version: int, axes: str) -> 
     if fraction < 1:
         raise OutputError(path, f"cannot hold positions as far as {farthest:g} from the origin; write a .ply")
     fraction = min(fraction, MAX_WRITTEN_FRACTION)
+    for part in scenes:
+        warn_of_moves(path, name, part, 0.5**fraction / 2)
     sections = [b"".join(columns) for columns in zip(*(_columns(s, version, fraction) for s in scenes), strict=True)]
     flags = ANTIALIASED_FLAG * first.convention.compensated
     facts = version, count, first.sh_degree, fraction
