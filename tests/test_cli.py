@@ -127,6 +127,7 @@ REFUSED = {
     "video scene.ply --cameras . -o new.gif": ["new.gif", ".webm"],
     f"{VIDEO} --seconds 0": ["--seconds"],
     f"{VIDEO} --path scene.ply": ["scene.ply"],
+    f"{VIDEO} --path orbitt": ["--path: takes zoom, dolly, orbit or a file of cameras; there is no orbitt"],
     f"{EVALUATE} --recipe multi-scale": ["base_mask"],
     f"{EVALUATE} --metric psnrr": ["--metric", "psnrr", "did you mean psnr?"],
     f"{EVALUATE} --metric ssim:alex": ["--metric", "ssim:3dgs"],

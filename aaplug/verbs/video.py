@@ -72,6 +72,8 @@ def video(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, option
     alone = sequence is not None or options.lens == "vr180"
     if alone and options.beside not in ("classic", "none", None):
         raise UsageError("beside", "is for videos of one eye; a frame sequence and vr180 show `recipe` alone")
+    if str(options.path) not in PATHS and not Path(options.path).exists():
+        raise UsageError("path", f"takes {listing([*PATHS])} or a file of cameras; there is no {options.path}")
     file = None if str(options.path) in PATHS else read_camera_path(Path(options.path))
     fps = options.fps or (file and file.fps) or DEFAULT_FPS
     check = partial(check_video, target, fps, options.overwrite)
