@@ -187,24 +187,33 @@ def click(box: Any) -> None:
 
 
 MEASURE = """
-import torch
+import os, torch
 torch.set_num_threads(1)
 {prepare}
 def peak():
     words = open("/proc/self/status").read().split()
     return int(words[words.index("VmHWM:") + 1]) * 1024
-open("/proc/self/clear_refs", "w").write("5")  # resets the peak, which imports raised
-before = peak()
-{work}
-print(peak() - before)
+works = {works}
+for i, work in enumerate(works, 1):
+    if i < len(works) and os.fork():
+        assert os.wait()[1] == 0
+        continue
+    open("/proc/self/clear_refs", "w").write("5")  # resets the peak, which imports raised
+    before = peak()
+    exec(work)
+    print(peak() - before, flush=True)
+    os._exit(0)
 """
 
 
-def memory_taken(prepare: str, work: str) -> int:
-    """Bytes by which statements raise the peak of a fresh process; one that ran other tests has memory to reuse."""
-    command = [sys.executable, "-c", MEASURE.format(prepare=prepare, work=work)]
+def memory_taken(prepare: str, *works: str) -> list[int]:
+    """Bytes by which each of the statements raises the peak of a fresh process, or of a copy of it.
+
+    A process that ran others has memory to reuse.  A copy, of which all but the last are, also counts the code it runs.
+    """
+    command = [sys.executable, "-c", MEASURE.format(prepare=prepare, works=works)]
     run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True, timeout=120)
-    return int(run.stdout)
+    return [*map(int, run.stdout.split())]
 
 
 def straight_camera(
