@@ -8,11 +8,12 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
 
-from aaplug.io.atomic import check_output, claimed, output_folder, replacing
+from aaplug.io.atomic import check_output, claimed, output_folder, replacing, writing
 from aaplug.system.errors import OutputError
 from aaplug.system.locks import remove_left, scratch
 
@@ -82,8 +83,8 @@ def test_permissions_follow_the_umask_and_a_link_stays_a_link(output: Path, tmp_
 @pytest.mark.parametrize(
     ("name", "problem"),
     [
-        ("missing/out.ply", "folder does not exist"),
-        ("scene.ply/out.ply", "cannot be written"),
+        ("scene.ply/out.ply", "cannot be written: .*scene.ply is no folder"),
+        ("scene.ply/deeper/out.ply", "cannot be written: .*scene.ply is no folder"),
         (".", "is a folder"),
         ("x" * 300, "cannot be written"),
         ("nul\0", "cannot be written"),
@@ -98,6 +99,17 @@ def test_impossible_outputs_are_refused(output: Path, name: str, problem: str):
         check_output(output.parent / name, True)
     assert sorted(output.parent.iterdir()) == [output.parent / "pipe", output]
     assert output.read_bytes() == OLD
+
+
+def test_a_missing_folder_is_made_and_removed_if_nothing_is_written(tmp_path: Path):
+    path = tmp_path / "new" / "deeper" / "out.ply"
+    for claim in (writing(path, lambda: check_output(path, False), ()), nullcontext()):
+        with pytest.raises(ZeroDivisionError), claim, replacing(path, False) as stream:
+            stream.write(b"half")
+            raise ZeroDivisionError
+        assert not list(tmp_path.iterdir())
+    write(path, NEW, overwrite=False)
+    assert path.read_bytes() == NEW
 
 
 @pytest.mark.parametrize("disguise", ["dotted", "symlink", "hard link"])

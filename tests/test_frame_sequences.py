@@ -107,6 +107,7 @@ def test_what_is_no_sequence_is_refused_before_anything_is_drawn(cli, monkeypatc
 def test_frames_of_different_sizes_are_refused(cli, monkeypatch):
     path = CameraPath(tuple(make_camera(size=size) for size in ((40, 30), (30, 40))), 24.0)
     monkeypatch.setattr("aaplug.verbs.video.read_camera_path", lambda _: path)
+    Path("path.json").touch()
     code, _, err = cli(f"{WORDS.replace('--seconds 0.2 ', '')} out/a.##.png --path path.json")
     assert (code, "--path: has frames of different sizes (20x15, 15x20 px)" in err) == (2, True), err
     assert not Path("out").exists()

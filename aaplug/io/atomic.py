@@ -3,7 +3,9 @@
 A temporary file beside the output takes the output's name once all of its bytes are on the disk.  If writing fails or
 is interrupted, the old file is unchanged and the temporary file is removed.
 
-Functions raise OutputError for an output that exists while `overwrite` is false, has no folder or cannot be written.
+The folder of an output is made where it does not exist, and removed if writing fails and it is empty.
+
+Functions raise OutputError for an output that exists while `overwrite` is false or cannot be written.
 Inside `writing` they raise it, whatever `overwrite` says, for an output that is an input, also through symbolic or hard
 links.
 """
@@ -50,7 +52,7 @@ def replacing_file(path: AnyPath, overwrite: bool, suffix: str = ".tmp") -> Iter
     temporary = target.with_name(f"{OUR_PREFIX}{secrets.token_hex(TOKEN_BYTES)}{suffix}")
     remove_left(target.parent)
     try:
-        with new_file(temporary):
+        with output_folder(target.parent), new_file(temporary):
             yield temporary
             _sync(temporary, os.O_RDWR)
             os.replace(temporary, target)
@@ -96,7 +98,7 @@ def writing(
 
     check: refuses what must not be written.
     inputs: files that nothing in this process replaces before the outermost block ends.
-    folder: the output is one; it is made, and removed if it stays empty.
+    folder: the output is one.
     """
     if path is None:
         yield
@@ -105,8 +107,7 @@ def writing(
         _open_outputs.append(path)
         try:
             _inputs.update(_ids_of(inputs))
-            if folder:
-                stack.enter_context(output_folder(path))
+            stack.enter_context(output_folder(path if folder else Path(os.path.realpath(path)).parent))
             stack.enter_context(claimed(path, check))
             yield
         finally:
@@ -126,8 +127,9 @@ def check_output(path: AnyPath, overwrite: bool, inputs: Iterable[AnyPath] = ())
             raise OutputError(path, "is not an ordinary file")
         if path.exists() and not overwrite:
             raise OutputError(path, "exists; pass `overwrite` to replace it")
-        if not Path(os.path.realpath(path)).parent.is_dir():
-            raise OutputError(path, "cannot be written: its folder does not exist; make it first")
+        above = next(parent for parent in Path(os.path.realpath(path)).parents if parent.exists())
+        if not above.is_dir():
+            raise OutputError(path, f"cannot be written: {above} is no folder")
     except (OSError, ValueError) as error:  # no access, a name too long, or a NUL in it
         raise OutputError(path, f"cannot be written: {reason(error)}") from error
 

@@ -39,7 +39,7 @@ def check_video(path: str | PathLike[str], fps: float, overwrite: bool) -> None:
     """Refuse a video that cannot be written, before any work.
 
     Raises:
-        OutputError: it exists and `overwrite` is false, has no folder, or its suffix is not .webm or .mp4.
+        OutputError: it exists and `overwrite` is false, or its suffix is not .webm or .mp4.
         UsageError: `fps` is out of range.
     """
     if Path(path).suffix.lower() not in CODECS:
