@@ -51,17 +51,18 @@ def replacing_file(path: AnyPath, overwrite: bool, suffix: str = ".tmp") -> Iter
     target = Path(os.path.realpath(path))  # a link stays a link; its target is replaced
     temporary = target.with_name(f"{OUR_PREFIX}{secrets.token_hex(TOKEN_BYTES)}{suffix}")
     remove_left(target.parent)
-    try:
-        with output_folder(target.parent), new_file(temporary):
-            yield temporary
-            _sync(temporary, os.O_RDWR)
-            os.replace(temporary, target)
-    except BaseException as error:  # Ctrl-C too
-        with suppress(OSError):
-            temporary.unlink()
-        if cause := of_system(error):
-            raise OutputError(path, f"cannot be written: {reason(cause)}") from error
-        raise
+    with output_folder(target.parent):
+        try:
+            with new_file(temporary):
+                yield temporary
+                _sync(temporary, os.O_RDWR)
+                os.replace(temporary, target)
+        except BaseException as error:  # Ctrl-C too
+            with suppress(OSError):
+                temporary.unlink()
+            if cause := of_system(error):
+                raise OutputError(path, f"cannot be written: {reason(cause)}") from error
+            raise
     with suppress(OSError):  # makes the new name permanent; some systems cannot open a folder
         _sync(target.parent, os.O_RDONLY)
 
