@@ -152,7 +152,7 @@ class Render(NamedTuple):
 
     rgb: Float[Tensor, "h w channels"]
     alpha: Float[Tensor, "h w"]
-    __eq__, __hash__ = object.__eq__, object.__hash__  # of the same image: `==` of tensors is a tensor
+    __eq__, __ne__, __hash__ = object.__eq__, object.__ne__, object.__hash__  # as `==` of tensors is a tensor
 
 
 def picked(x: Shaped[Tensor, "n *c"], rows: Int[Tensor, " m"]) -> Shaped[Tensor, "m *c"]:

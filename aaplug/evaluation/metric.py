@@ -145,8 +145,10 @@ class Metric:
 
     def _number(self, value: Any) -> float | None:
         try:
-            number = None if value is None else float(value)
-        except (TypeError, ValueError, RuntimeError) as error:
+            if isinstance(value, str):
+                raise TypeError("text")
+            number = None if value is None else float(value.detach() if isinstance(value, Tensor) else value)
+        except (TypeError, ValueError, RuntimeError, OverflowError) as error:
             raise UsageError(f"metric {self.name}", f"gives no number but {type(value).__name__}: {error}") from error
         return number if number is not None and math.isfinite(number) else None
 

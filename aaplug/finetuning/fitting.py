@@ -1,4 +1,7 @@
-"""Fitting a scene to a viewer: the closed form, a short optimization, and a check that no scale became worse."""
+"""Fitting a scene to a viewer: the closed form, a short optimization, and a check that no scale became worse.
+
+Where tuning made one worse, parts of the change are tried, and then the closed form, if it is not worse itself.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -61,9 +64,8 @@ def fit(
     start = replace(original, scene=fuse_for(scene, original.training, viewer))
     before = measure(Candidate(ORIGINAL, original), Candidate(CLOSED_FORM, start))
     if steps and _is_worse(before, CLOSED_FORM):
-        monitor.say(
-            "the closed form is worse than the original at some scale: starting from the original (steps of 0 keep it)"
-        )
+        problem = "the closed form, which `--steps 0` keeps, is worse than the original at some scale"
+        monitor.say(f"{problem}: starting from the original")
         start = original
     psnr = {s: mean(before.select(ORIGINAL, s), PSNR.name) for s in before.scales}
     errors = {s: max(ROUNDING_ERROR, 0.0 if dB is None else 10 ** (-dB / 10)) for s, dB in psnr.items()}

@@ -190,9 +190,6 @@ def views_of(
         quats, scales = means.new_zeros(*batch, n, 4), torch.ones_like(means)
     elif quats is None or scales is None:
         raise UsageError("covars", "expected quats and scales, or covars")
-    for name, x in {"quats": quats, "scales": scales, "opacities": opacities}.items():
-        if x.dtype != means.dtype:
-            raise UsageError(name, f"expected {means.dtype}, as means have, got {x.dtype}")
     degree = options.sh_degree
     if colors is None:
         if options.coloured:
@@ -207,6 +204,10 @@ def views_of(
         raise UsageError("sh_degree", f"{degree} needs {(degree + 1) ** 2} coefficients, colors has {colors.shape[-2]}")
     if backgrounds is not None:
         check_shape("backgrounds", backgrounds, (*batch, c, 3 if degree is not None else colors.shape[-1]))
+    others = {"quats": quats, "scales": scales, "opacities": opacities, "colors": colors, "covars": covars}
+    for name, x in {**others, "backgrounds": backgrounds}.items():
+        if x is not None and x.dtype != means.dtype:
+            raise UsageError(name, f"expected {means.dtype}, as means have, got {x.dtype}")
     columns = [
         *(_per_image(x, batch, c) for x in (means, quats, scales, opacities, covars)),
         _per_image(colors, batch, c, per_camera),

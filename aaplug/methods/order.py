@@ -63,7 +63,7 @@ class Order:
         kernels: Kernels,
         rules: Rules,
     ) -> Float[Tensor, "4 t P"]:
-        """The statistics, of `SPLATS` splats at a time; the tiles end where no pixel's change any more."""
+        """The statistics, of `SPLATS` splats at a time; tiles end where no pixel's statistics can change."""
         (x, y), local, limits = centres, tile_centres(rows), Limits.by(rules)
         corners = torch.stack([x[:, 0] - local[0][0], y[:, 0] - local[1][0]], dim=1)
         pixels, left = Pixels(corners, *local), torch.ones_like(x)

@@ -82,7 +82,7 @@ class Number(Argument):
             return
         listed = isinstance(values, (list, tuple))
         got = ", ".join(map(str, values)) if listed else str(value)
-        takes = self.takes if listed else f"a list or tuple of {self.takes}"
+        takes = self.takes if listed else f"a list or tuple of {self.takes.removesuffix(' ...')}"
         raise UsageError(option, f"takes {takes}, got {got[:MAX_VALUE_CHARACTERS] or 'nothing'}")
 
     def _holds(self, value: Any) -> bool:

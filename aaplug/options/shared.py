@@ -181,7 +181,7 @@ class FilmOptions(RecipeOptions):
     shutter: Annotated[float | None, number(0.001, 1), FILM] = None
     """Time that the shutter is open, of that from frame to frame of a path; film's usual is 0.5."""
     samples: Annotated[int | None, number(0, 4096, whole=True, metavar="N"), FILM] = None
-    """Frames averaged to one (default: 16, or 5 with --quality fast); 0 ignores a path file's aperture."""
+    """Frames averaged to one (default: 16, or 5 with --quality fast); 0 ignores a path file's aperture and shutter."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -196,7 +196,7 @@ class FilmOptions(RecipeOptions):
                 raise UsageError(name, "belongs to `f_stop`")
         for name in ("f_stop", "shutter"):
             if self.samples == 0 and getattr(self, name) is not None:
-                raise UsageError(name, "is what `samples` of 0 ignores; leave one of them out")
+                raise UsageError(name, "is ignored by `samples` of 0; give one of the two")
 
 
 @dataclass(frozen=True, kw_only=True)

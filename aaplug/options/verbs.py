@@ -77,9 +77,9 @@ class RenderOptions(FilmOptions, ImageOptions, LensOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.path is not None and self.views != RenderOptions.views:
-            raise UsageError("views", "are replaced by `path`; leave one of them out")
+            raise UsageError("views", "are replaced by `path`; give one of the two")
         if self.samples == 0 and self.camera_to is not None:
-            raise UsageError("camera_to", "opens a shutter, which `samples` of 0 ignores; leave one of them out")
+            raise UsageError("camera_to", "opens a shutter, which `samples` of 0 ignores; give one of the two")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,7 +107,7 @@ class VideoOptions(FilmOptions, ImageOptions, LensOptions):
         super().__post_init__()
         for name, paths in (("start", ZOOMS), ("end", ZOOMS), ("seconds", (*ZOOMS, "orbit"))):
             if str(self.path) not in paths and getattr(self, name) != getattr(VideoOptions, name):
-                raise UsageError(name, f"belongs to a path of {listing(paths)}, not to {self.path}")
+                raise UsageError(name, f"is for the paths {listing(paths)}, not for {self.path}")
 
 
 @dataclass(frozen=True, kw_only=True)

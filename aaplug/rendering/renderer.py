@@ -41,6 +41,7 @@ from aaplug.io.limits import lack_of_memory
 from aaplug.io.scenes import SceneLike, scene_of
 from aaplug.io.scenes.harmonics import without_harmonics
 from aaplug.io.scenes.scene import Scene, SceneFrames
+from aaplug.methods.filters.matched import Matched
 from aaplug.methods.filters.smoothing import fuse_stored
 from aaplug.methods.order import Order, Shown
 from aaplug.methods.pixel_kernels.point import POINT
@@ -381,12 +382,17 @@ class Renderer:
         any training camera, it is the median over visible Gaussians of (rate now / nearest rate in the Gaussian's
         training range); without any, and for a recipe that compares with "global", the ratio of focal lengths.
         """
-        if camera.trained_focal is not None or getattr(self.recipe.screen, "reference", None) == "global":
+        if camera.trained_focal is not None or self._compares_with_global:
             return self.training.relative_rate(camera)
         key = (*camera.intrinsics, camera.cam_from_world.detach().cpu().numpy().tobytes())
         if key not in self._rates:
             self._rates[key] = self._median_rate(camera)
         return self._rates[key]
+
+    @property
+    def _compares_with_global(self) -> bool:
+        screen = self.recipe.screen
+        return isinstance(screen, Matched) and screen.reference == "global"
 
     @torch.no_grad()
     def _median_rate(self, camera: Camera) -> float:

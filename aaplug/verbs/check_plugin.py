@@ -70,7 +70,7 @@ def _imported(module: str) -> ModuleType:
     try:
         return import_module(module)
     except Exception as error:  # a plug-in can fail in any way
-        missing = isinstance(error, ModuleNotFoundError) and error.name == module
+        missing = isinstance(error, ModuleNotFoundError) and f"{module}.".startswith(f"{error.name}.")
         hint = "; give the name that `import` takes, not that of the installed package" if missing else ""
         raise UsageError(module, f"cannot be imported: {error}{hint}") from error
 

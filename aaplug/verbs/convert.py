@@ -24,7 +24,7 @@ from aaplug.methods.conversion import MATCHED_ENERGY, MIP_SPLATTING, Form, blurr
 from aaplug.methods.viewers import DISC_VIEWER, MIP_VIEWER, Viewer, find_viewer
 from aaplug.options.verbs import ConvertOptions
 from aaplug.rendering.job import CamerasLike, Job, running
-from aaplug.rendering.renderer import own_look
+from aaplug.rendering.renderer import background_colour, own_look
 from aaplug.system.errors import UsageError
 from aaplug.system.executors import Threads
 from aaplug.system.monitor import Tell
@@ -115,7 +115,7 @@ def _closed_form(job: Job[ConvertOptions], form: Form) -> Gaussians:
     training = None
     if not blurring(gaussians.fused) and gaussians.filter_3d is None:  # else it needs no cameras, or is refused
         training = TrainingViews.of(gaussians, job.cameras, min_seen=job.options.min_seen)
-        look = own_look(gaussians, training)
+        look = own_look(gaussians, training, background=background_colour(job.options.background, job.cameras))
         job.check_fit(look)
         job.say_assumed(look)
     return fuse(gaussians, training, form)
@@ -130,6 +130,8 @@ def _write_frames(
     with job.monitor.progress("converting", "frames") as tell:
         for done, (frame, output) in enumerate(zip(frames, outputs, strict=True), start=1):
             gaussians = frame.gaussians()
+            if done == 1:
+                job.check_fit(own_look(gaussians, frames.training_of(gaussians, training)))
             write_scene(output, fuse(gaussians, frames.training_of(gaussians, training), form), **files)
             count += len(gaussians)
             tell(done, len(frames))

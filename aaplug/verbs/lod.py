@@ -67,7 +67,8 @@ from aaplug.verbs.verb import writes
 
 DEFAULT_LEVELS = 4  # down to 1/16 of the training size
 MEGABYTE = 1e6
-HEADER_BYTES = 2500  # of a .ply at most, with the records of merging and tuning
+# At most, of the header of a .ply: the records of merging and tuning, and what it says of a column.
+RECORDS_BYTES, COLUMN_BYTES = 1500, 24
 SMALLER_IMAGES = (0.5,)  # of one lighter scene, which has no coarser level; a viewer's rule would bloat it there
 MERGING_RULE = 3  # raised when merging or tuning changes, so that levels of two rules are not mixed
 NORMAL_COLUMNS = 3  # that a .ply has beside a Gaussian's parameters
@@ -262,8 +263,11 @@ def goals_of(options: LodOptions, scene: Gaussians) -> list[Goal]:
         levels = range(1, (options.levels or DEFAULT_LEVELS) + 1)
         return [Goal.of_level(level, options.merge_below) for level in levels]
     if options.budget is not None:
-        gaussian_bytes = FLOAT * (len(matrix_of(scene[:0])[0]) + NORMAL_COLUMNS)
-        count = min(len(scene), int((options.budget * MEGABYTE - HEADER_BYTES) / gaussian_bytes))
+        columns = len(matrix_of(scene[:0])[0]) + NORMAL_COLUMNS
+        header = RECORDS_BYTES + COLUMN_BYTES * columns
+        count = min(len(scene), int((options.budget * MEGABYTE - header) / (FLOAT * columns)))
+        if count < 1 <= len(scene):
+            raise UsageError("budget", f"holds no Gaussian beside the header of a .ply, of up to {header:,} bytes")
     else:
         assert options.simplify is not None
         count = round(options.simplify * (len(scene) if options.simplify <= 1 else 1))

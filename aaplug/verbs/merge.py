@@ -22,7 +22,7 @@ from aaplug.methods.conversion import carried
 from aaplug.methods.filters.smoothing import fuse_stored
 from aaplug.options.verbs import MergeOptions
 from aaplug.rendering.job import CamerasLike, Job, running
-from aaplug.rendering.renderer import own_look
+from aaplug.rendering.renderer import background_colour, own_look
 from aaplug.system.errors import UsageError, counted
 from aaplug.verbs.verb import ScenesLike, compares
 
@@ -66,7 +66,7 @@ def merge(scenes: ScenesLike, cameras: CamerasLike, output: AnyPath | None, opti
             part = fuse_stored((job.scene if job else scene).gaussians())
             if job:
                 training = TrainingViews.of(part, job.cameras, min_seen=options.min_seen)
-                job.check_fit(own_look(part, training))
+                job.check_fit(own_look(part, training, background=background_colour("auto", job.cameras)))
                 known = f"by {counted(len(training.cameras), 'camera')}"
                 views = job.cameras.notes[0] if job.cameras.assumed else known
                 job.monitor.say(f"{scene.title}: converted from {part.convention.name} to {into.name}, {views}")

@@ -1,5 +1,6 @@
 """A video of a scene along a camera path, one recipe or two side by side."""
 
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -72,7 +73,7 @@ def video(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, option
     alone = sequence is not None or options.lens == "vr180"
     if alone and options.beside not in ("classic", "none", None):
         raise UsageError("beside", "is for videos of one eye; a frame sequence and vr180 show `recipe` alone")
-    if str(options.path) not in PATHS and not Path(options.path).exists():
+    if str(options.path) not in PATHS and not os.path.exists(options.path):
         raise UsageError("path", f"takes {listing([*PATHS])} or a file of cameras; there is no {options.path}")
     file = None if str(options.path) in PATHS else read_camera_path(Path(options.path))
     fps = options.fps or (file and file.fps) or DEFAULT_FPS
@@ -101,7 +102,7 @@ def video(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, option
             return torch.cat([*images], dim=1)
         receding = str(options.path) in RECEDING_PATHS
         rate = camera_paths.factor(share, options.start, options.end) if receding else 1.0
-        return side_by_side(images, labels, rate, views[index].width / path[index].width)
+        return side_by_side(images, labels, rate, min(views[index].hw) / min(path[index].hw))
 
     path_file = [] if file is None else [str(options.path)]
     place = target if sequence is None else sequence.folder

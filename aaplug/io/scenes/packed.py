@@ -5,6 +5,7 @@ n: rows.  Arrays are numpy's, as they come from files.
 Functions raise FormatError for a file that breaks its format.
 """
 
+import json
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
@@ -76,7 +77,7 @@ def replacing_group(
     """Write a file that names others beside it, so that it and they appear together.
 
     The others' names carry a hash of their content, so that a file that is replaced never names a new one of them.
-    Those of an earlier version are removed at the end, unless another file of the same suffix names them.
+    Those of an earlier version are removed at the end, where no other file of the same suffix names them.
 
     Args:
         path: of the file that names the others.
@@ -94,10 +95,17 @@ def replacing_group(
             stream.write(content)
     with replacing(path, overwrite) as stream:
         stream.write(whole(names))
-    for file in earlier - {path.with_name(name) for name in names.values()}:
-        others = (other for other in path.parent.glob(f"*{path.suffix}") if other != path)
-        if not any(file.name.encode() in other.read_bytes() for other in others):
-            file.unlink(missing_ok=True)
+    stale = {json.dumps(file.name).strip('"').encode(): file for file in earlier if file.name not in names.values()}
+    for other in path.parent.glob(f"*{path.suffix}") if stale else ():
+        if other == path or not other.is_file():
+            continue
+        try:
+            content = other.read_bytes()
+        except OSError:  # nobody knows what it names
+            return
+        stale = {name: file for name, file in stale.items() if name not in content}
+    for file in stale.values():
+        file.unlink(missing_ok=True)
 
 
 def standing(scene: Gaussians, motion: Float[Tensor, "4 4"], place: Place) -> Gaussians:

@@ -5,11 +5,10 @@ format's own tag or in the record, and a warning names what reading the file aga
 """
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -80,15 +79,16 @@ def whole(path: Path, parts: Iterable[Gaussians], format: str, degree: int, flat
     return scene[curve(scene.means.double()).argsort(stable=True)]
 
 
-def warn_of_moves(path: Path, format: str, scene: Gaussians, moves: Float[Tensor, "n 3"] | float) -> None:
-    """Warn where rounding moves Gaussians by more than their size, as a few far away make it do.
+def warn_of_moves(path: Path, format: str, moves: Sequence[tuple[Gaussians, Float[Tensor, "n 3"]]]) -> None:
+    """Warn where a format's steps move centres by more than their Gaussians' size, as some far away make them do.
 
-    moves: of each centre along each axis, in world units; or at most, along every axis.
+    moves: of each part of the scene the part, and how far rounding moves each centre, in world units.
     """
-    far = torch.as_tensor(moves, dtype=torch.float32).expand_as(scene.means).norm(dim=1) > scene.scales.amax(dim=1)
-    if far.sum() > MOVED_SHARE * len(scene):
-        what = f"moves {int(far.sum()):,} of {counted(len(scene), 'Gaussian')} by more than their size"
-        log.warning("%s: a .%s %s, as some lie far away; a .ply does not", path, format, what)
+    count = sum(len(part) for part, _ in moves)
+    far = sum(int((by.norm(dim=1) > part.scales.amax(dim=1)).sum()) for part, by in moves)
+    if far > MOVED_SHARE * count:
+        what = f"move {far:,} of {counted(count, 'Gaussian')} by more than their size"
+        log.warning("%s: the steps of a .%s, as wide as the scene, %s; a .ply has none", path, format, what)
 
 
 def warn_of_losses(path: Path, format: str, scene: Gaussians, kept: Facts, also: Iterable[str] = ()) -> None:

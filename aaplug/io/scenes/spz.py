@@ -291,8 +291,9 @@ def packed(path: Path, scenes: Sequence[Gaussians], version: int, axes: str) -> 
     if fraction < 1:
         raise OutputError(path, f"cannot hold positions as far as {farthest:g} from the origin; write a .ply")
     fraction = min(fraction, MAX_WRITTEN_FRACTION)
-    for part in scenes:
-        warn_of_moves(path, name, part, 0.5**fraction / 2)
+    warn_of_moves(
+        path, name, [(part, (part.means * 2**fraction).round() / 2**fraction - part.means) for part in scenes]
+    )
     sections = [b"".join(columns) for columns in zip(*(_columns(s, version, fraction) for s in scenes), strict=True)]
     flags = ANTIALIASED_FLAG * first.convention.compensated
     facts = version, count, first.sh_degree, fraction

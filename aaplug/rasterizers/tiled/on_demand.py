@@ -25,6 +25,8 @@ LOOK_SECONDS = 1.0  # between looks at the process that compiles
 COMPILER = """
 import os, sys
 from aaplug.rasterizers.tiled.ahead_of_time import build
+from aaplug.system.signals import end_as_worker
+end_as_worker()
 getattr(os, "nice", int)(10)
 build(names=sys.argv[1:])
 """
