@@ -127,12 +127,13 @@ def test_a_gltf_is_replaced_with_its_buffer(tmp_path: Path):
 
 def test_images_that_another_index_of_the_folder_names_stay(tmp_path: Path):
     scene = replace(oracle(), origin=None)
+    (tmp_path / "folder.json").mkdir()
     for name, part in {"meta.json": scene, "other.meta.json": scene[:10], "another.meta.json": scene}.items():
         write_scene(tmp_path / name, part)
     write_scene(tmp_path / "other.meta.json", scene[:20], overwrite=True)
-    counts = [len(read_scene(path).gaussians()) for path in sorted(tmp_path.glob("*.json"))]
+    counts = [len(read_scene(path).gaussians()) for path in sorted(tmp_path.glob("*meta.json"))]
     assert counts == [len(scene), len(scene), 20]
-    named = "".join(path.read_text() for path in tmp_path.glob("*.json"))
+    named = "".join(path.read_text() for path in tmp_path.glob("*meta.json"))
     assert all(image.name in named for image in tmp_path.glob("*.webp"))
 
 
