@@ -41,7 +41,7 @@ class SceneOptions(FileOptions):
     """The scene."""
 
     scene: Annotated[Path | None, flag("SCENE", read=Path, by_place=True)] = None
-    """A scene (.ply, .spz, .sog, .glb, others: `aaplug guide formats`), or a folder: model, levels or frames."""
+    """A scene (.ply, .spz, .sog, .glb, others: `aaplug guide formats`), or a folder: model, levels, for some frames."""
     model_path: Annotated[Path | None, flag("FOLDER", "-m", read=Path), SCENE_FILE] = None
     """An INRIA model folder, instead of SCENE."""
     iteration: Annotated[int | None, number(0, 10**9, whole=True, metavar="N"), SCENE_FILE] = None

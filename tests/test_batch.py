@@ -11,7 +11,7 @@ from aaplug.evaluation.journal import Journal
 from aaplug.evaluation.results import Measurement, Report
 from aaplug.io.atomic import claimed
 from aaplug.io.batch_file import read_batch
-from aaplug.system.errors import ClusterError, FormatError
+from aaplug.system.errors import ClusterError, FormatError, UsageError
 from aaplug.verbs.batch import batch as evaluate_all
 
 SETTINGS = """
@@ -231,6 +231,22 @@ def test_no_failure_of_a_scene_costs_another(tmp_path):
     # a mean over fewer scenes would not compare
     assert found.summary()["mean"] == {"auto@1": {"PSNR": None}}
     assert json.loads((tmp_path / "out/batch.json").read_text()) == found.summary()
+
+
+def test_a_resumed_batch_of_another_request_leaves_the_summary_and_tables_name_other_scales(tmp_path):
+    def refused(**settings):
+        raise UsageError("progress.jsonl", "is of another request")
+
+    def at(scale: float):
+        measured = Measurement("auto", scale, "view", {"PSNR": 30.0}, 1, 0.1)
+        return lambda **settings: Report((measured,), {"recipes": {}})
+
+    found = evaluate_all([("x", at(1.0)), ("y", at(0.5))], tmp_path / "out")
+    assert "no PSNR at 1: some scenes have other scales" in found.tables()
+    before = {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir() if path.is_file()}
+    found = evaluate_all([("x", refused), ("y", refused)], tmp_path / "out", resume=True)
+    assert len(found.failures) == 2
+    assert {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir() if path.is_file()} == before
 
 
 def test_two_batches_do_not_share_a_folder(batch):

@@ -248,7 +248,7 @@ def test_the_background_is_chosen_and_forgotten(opened):
     assert torch.equal(image(page)[2, 2], before)
 
 
-def test_a_dropped_scene_is_opened_for_this_page_alone(opened, tmp_path):
+def test_a_dropped_scene_is_opened_for_this_page_alone(opened, seen, tmp_path):
     one, two = opened(as_opened=True), opened(as_opened=True)
     drop = """([name, text]) => {
       const data = new DataTransfer();
@@ -263,6 +263,12 @@ def test_a_dropped_scene_is_opened_for_this_page_alone(opened, tmp_path):
     at_rest(one)
     assert one.inner_text("#facts").startswith("700 Gaussians")
     assert two.inner_text("#facts").startswith("200 Gaussians")
+    with serving(tmp_path / "other.ply", seen[1], port=0, rasterizer="eager") as address:
+        three = opened(where=address, as_opened=True)
+        three.evaluate(drop, ["other.ply", b64encode((tmp_path / "other.ply").read_bytes()).decode()])
+        three.locator("#said", has_text="opened other.ply").wait_for()  # of that name and count, but without cameras
+        assert "training rate assumed" in three.inner_text("#facts")
+        three.close()
 
 
 def test_full_screen_goes_on_and_off(opened):
@@ -313,6 +319,8 @@ def test_the_lens_shows_single_pixels_of_both_sides(opened):
     page.keyboard.press("1")
     page.keyboard.press("l")
     at_rest(page, scale="0.125")
+    says(page, "dataset.lens !== 'off'")
+    assert page.locator("#crops canvas").first.evaluate("crop => crop.width") > 50, "drawn before the pointer moves"
     page.mouse.move(*place(page, 0.4, 0.5))
     says(page, "dataset.lens.startsWith('0.4')")
     crops = [image(page, f"#crops figure:nth-child({i}) canvas") for i in (1, 2)]

@@ -188,7 +188,7 @@ def metric_grid(
 ) -> list[Table | str]:
     """A metric's table as `grid`, unless it has no value at all, and a line that says at which scales, and why.
 
-    reports: of the same recipes and scales, which the lines are means of.
+    reports: that the lines are means of; the first has their recipes and scales.
     """
     report = reports[0]
     columns = dict(zip(report.scales, zip(*lines, strict=True), strict=True))
@@ -198,6 +198,8 @@ def metric_grid(
         return [*table]
     small = any(m.note == NO_PHOTOGRAPH for each in reports for m in each.measurements if m.scale in empty)
     why = NO_PHOTOGRAPH if small and metric.measure else metric.undefined
+    if any(scale not in each.scales for each in reports for scale in empty):
+        why = "some scenes have other scales"
     return [*table, f"no {metric.name} at {', '.join(map(scale_name, empty))}: {why}"]
 
 

@@ -258,10 +258,10 @@ class LodOptions(WritingOptions, ViewOptions):
             raise UsageError("page", "belongs to `to`")
         if self.resume and (self.single or (self.viewer is not None and self.to is None)):
             raise UsageError("resume", "belongs to levels for aaplug, and to `to`")
-        if self.steps is not None and not self.refine:
-            raise UsageError("steps", "are of tuning, which `refine` leaves out")
         if self.viewer is not None and not self.tuning:
             raise UsageError("viewer", "is what the result is tuned for: leave out `refine`, and `steps` of 0")
+        if self.steps is not None and not self.refine:
+            raise UsageError("steps", "are of tuning, which `refine` leaves out")
 
     @property
     def single(self) -> bool:

@@ -161,6 +161,9 @@ def batch(
                 monitor.say(f"failed: {name}: {report}")
         names = {folder.name: name for folder, (name, _) in zip(folders, runs, strict=True)}
         done = Batch(names, reports, failures, found, partly)
+        if resume and not reports and (Path(output) / SUMMARY).exists():
+            monitor.say(f"no scene finished: {Path(output) / SUMMARY} and what is beside it stay as they were")
+            return done
         texts = {SUMMARY: as_json(done.summary()), RESULTS: as_csv(reports)}
         if papers := done.papers():
             texts[TABLE] = "\n".join(paper.as_latex() for paper in papers)

@@ -67,7 +67,8 @@ def slerp(first: Float[Tensor, "f 4"], last: Float[Tensor, "f 4"], share: Float[
 def unit(quats: Float[Tensor, "n 4"], place: Place, field: str) -> Float[Tensor, "n 4"]:
     """Quaternions of length 1."""
     lengths = quats.norm(dim=1, keepdim=True)
-    place.expect(bool((lengths > MIN_LENGTH).all()), field, "not zero", quats.tolist()[int(lengths.argmin())])
+    wrong = ~((lengths > MIN_LENGTH) & lengths.isfinite())[:, 0]  # squares of large numbers are infinite
+    place.expect(not wrong.any(), field, "a length above 0 and finite", quats.tolist()[int(wrong.int().argmax())])
     return quats / lengths
 
 

@@ -49,7 +49,8 @@ class PhotoFolder:
         except (OSError, RuntimeError):  # a loop of links
             inside = False
         if not inside:
-            raise place.error(f"photo {name!r} lies outside {self.home}; pass `images` to allow another folder")
+            hint = "pass `images` to allow another folder, or copy it where a link leads there"
+            raise place.error(f"photo {name!r} lies outside {self.home}; {hint}")
         return photo
 
 

@@ -35,7 +35,8 @@ const stepCamera = (by) => standIn(((state.at ?? (by > 0 ? -1 : 0)) + by + about
 // ----------------------------------------------------------------------------------------------------- from the server
 
 function hello(facts) {
-  const first = about === null, same = about !== null && about.title === facts.title && about.gaussians === facts.gaussians;
+  const first = about === null, shown = JSON.stringify([about?.title, about?.gaussians, about?.views]);
+  const same = shown === JSON.stringify([facts.title, facts.gaussians, facts.views]); // it was lost, or dropped again
   about = facts;
   at("lost").hidden = true;
   asked = "";

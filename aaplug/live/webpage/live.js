@@ -177,11 +177,11 @@ function draw() {
     cameras = camerasIn(about.views, state.pose, extent().focal, livePicture.size, state.depth);
     drawCameras(canvas, cameras, hovered);
   }
+  labels(); // they show the crops, which have no size before
   if (state.lens) {
     drawBox(canvas, box);
     drawCrops(box);
   }
-  labels();
   figures();
 }
 
