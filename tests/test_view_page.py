@@ -317,8 +317,8 @@ def test_the_scale_sets_the_size_in_pixels(opened, seen):
 def test_the_lens_shows_single_pixels_of_both_sides(opened):
     page = opened()
     page.keyboard.press("1")
-    page.keyboard.press("l")
     at_rest(page, scale="0.125")
+    page.keyboard.press("l")
     says(page, "dataset.lens !== 'off'")
     assert page.locator("#crops canvas").first.evaluate("crop => crop.width") > 50, "drawn before the pointer moves"
     page.mouse.move(*place(page, 0.4, 0.5))
