@@ -81,12 +81,13 @@ def fit(
         record = Fusion(tuning.method, tuning.settings | {"share": f"{part:g}"})
         result = replace(between(original.scene, tuned, part), fused=(*earlier, record))
         report = report_of(result)
-    if state.step and _is_worse(report, CONVERTED) and start is not original:
-        monitor.say("still worse than the original at some scale: keeping the closed form")
-        result = start.scene
-        report = report_of(result)
-    elif state.step and _is_worse(report, CONVERTED):
-        monitor.say("still worse than the original at some scale: read the table before you use it")
+    if state.step and _is_worse(report, CONVERTED):
+        kept = start is not original
+        then = "keeping the closed form" if kept else "read the table before you use it"
+        monitor.say(f"still worse than the original at some scale: {then}")
+        if kept:
+            result = start.scene
+            report = report_of(result)
     return Fitted(result, report)
 
 

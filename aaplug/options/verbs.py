@@ -48,7 +48,8 @@ SINGLE_SCENE_FACTOR = 2  # times as many steps for one scene: its counts are met
 LOSS_WEIGHTS = {0.5: 1.0, 0.25: 2.0, 0.125: 1.0}  # by scale; measured, as are the two below
 ANCHOR_WEIGHT = 3.0  # of the loss at the training size, beside those of the scales
 TUNED_PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "dc", "rest")
-ZOOMS = ("zoom", "dolly")  # paths whose sampling rate changes
+RECEDING_PATHS = ("zoom", "dolly")  # on which things become small
+BUILT_IN_PATHS = (*RECEDING_PATHS, "orbit")
 TRUTHS = ("auto", "self", "photographs")
 Layout = Literal["plain", "inria"]
 
@@ -105,7 +106,7 @@ class VideoOptions(FilmOptions, ImageOptions, LensOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, paths in (("start", ZOOMS), ("end", ZOOMS), ("seconds", (*ZOOMS, "orbit"))):
+        for name, paths in (("start", RECEDING_PATHS), ("end", RECEDING_PATHS), ("seconds", BUILT_IN_PATHS)):
             if str(self.path) not in paths and getattr(self, name) != getattr(VideoOptions, name):
                 raise UsageError(name, f"is for the paths {listing(paths)}, not for {self.path}")
 

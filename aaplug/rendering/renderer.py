@@ -382,17 +382,13 @@ class Renderer:
         any training camera, it is the median over visible Gaussians of (rate now / nearest rate in the Gaussian's
         training range); without any, and for a recipe that compares with "global", the ratio of focal lengths.
         """
-        if camera.trained_focal is not None or self._compares_with_global:
+        screen = self.recipe.screen
+        if camera.trained_focal is not None or (isinstance(screen, Matched) and screen.reference == "global"):
             return self.training.relative_rate(camera)
         key = (*camera.intrinsics, camera.cam_from_world.detach().cpu().numpy().tobytes())
         if key not in self._rates:
             self._rates[key] = self._median_rate(camera)
         return self._rates[key]
-
-    @property
-    def _compares_with_global(self) -> bool:
-        screen = self.recipe.screen
-        return isinstance(screen, Matched) and screen.reference == "global"
 
     @torch.no_grad()
     def _median_rate(self, camera: Camera) -> float:

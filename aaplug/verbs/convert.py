@@ -130,9 +130,11 @@ def _write_frames(
     with job.monitor.progress("converting", "frames") as tell:
         for done, (frame, output) in enumerate(zip(frames, outputs, strict=True), start=1):
             gaussians = frame.gaussians()
+            trained = frames.training_of(gaussians, training)
             if done == 1:
-                job.check_fit(own_look(gaussians, frames.training_of(gaussians, training)))
-            write_scene(output, fuse(gaussians, frames.training_of(gaussians, training), form), **files)
+                colour = background_colour(job.options.background, job.cameras)
+                job.check_fit(own_look(gaussians, trained, background=colour))
+            write_scene(output, fuse(gaussians, trained, form), **files)
             count += len(gaussians)
             tell(done, len(frames))
     return count

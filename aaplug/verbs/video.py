@@ -22,7 +22,7 @@ from aaplug.io.image_formats import PNG, Storage
 from aaplug.io.images import read_image
 from aaplug.io.scenes import SceneLike
 from aaplug.io.video import check_video, write_video
-from aaplug.options.verbs import VideoOptions
+from aaplug.options.verbs import RECEDING_PATHS, VideoOptions
 from aaplug.rendering.film import filmed
 from aaplug.rendering.frames import write_frames
 from aaplug.rendering.job import CamerasLike, Job, running
@@ -39,7 +39,6 @@ DEFAULT_FPS = 30.0  # frames per second, where neither the caller nor a path fil
 PANE_GAP = 4  # px
 MAX_FRAMES = 100_000
 SEQUENCE = "such as frames/frame.####.exr"
-RECEDING_PATHS = ("zoom", "dolly")  # on which things become small
 
 
 class Clip(NamedTuple):
