@@ -79,7 +79,7 @@ def whole(path: Path, parts: Iterable[Gaussians], format: str, degree: int, flat
     return scene[curve(scene.means.double()).argsort(stable=True)]
 
 
-def warn_of_moves(path: Path, format: str, moves: Sequence[tuple[Gaussians, Float[Tensor, "n 3"]]]) -> None:
+def warn_of_moves(path: Path, format: str, moves: Sequence[tuple[Gaussians, Float[Tensor, "_ 3"]]]) -> None:
     """Warn where a format's steps move centres by more than their Gaussians' size, as some far away make them do.
 
     moves: of each part of the scene the part, and how far rounding moves each centre, in world units.
