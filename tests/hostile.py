@@ -22,13 +22,13 @@ import torch
 from aaplug.evaluation.survey import survey
 from aaplug.io.scenes import read_scene
 from aaplug.system.errors import AaplugError
-from tests.scene_files import DATA, MADE, STORED, write_file
+from tests.scene_files import DATA, MADE, SEVERAL, STORED, write_file
 
 SECONDS = 1.0  # of processor time a file; other processes may make the clock's run longer
 GROWTH = 100 * 2**20  # bytes of resident memory beyond what the program itself has, which is about 200 MB
 MEMORY = 2**30  # bytes of address space beyond what the worker has when it starts
 BATCH = 500  # files a child
-NAMES = (*STORED, "run.pt", *MADE)
+NAMES = (*STORED, "run.pt", *MADE, *SEVERAL)
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,8 @@ def scene(name: str) -> Target:
         if "/" in name:
             shutil.copytree((DATA / name).parent, path.parent)
         elif name in NAMES:
-            path.write_bytes(write_file(folder, name).read_bytes())
+            content = write_file(folder, name).read_bytes()
+            path.write_bytes(content)
         return path
 
     return Target(make, read_as_info_does)

@@ -1,19 +1,32 @@
 """One small scene in every format: written by splat-transform where it can (tests/data), or else packed here."""
 
 import gzip
+import json
+import shutil
 import struct
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.lib import recfunctions as rfn
 
+from aaplug.core.conventions import CLASSIC
 from aaplug.core.gaussians import Gaussians
+from aaplug.core.placing import placed
 from aaplug.core.spherical_harmonics import SH_C0
-from aaplug.io.scenes import read_scene
+from aaplug.io.scenes import read_scene, write_scene
+from aaplug.io.scenes.lcc import FAR_RECORD, Z_UP
 
 DATA = Path(__file__).resolve().parent / "data"
 ORACLE = DATA / "oracle.ply"  # random, 40 Gaussians of degree 3, tagged mip; the others are made of it
+
+
+def write_json(path: Path, document: object) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(document))
+    return path
 
 
 def oracle() -> Gaussians:
@@ -92,6 +105,62 @@ def ksplat(level: int, degree: int = 2, per_bucket: int = 16) -> bytes:
     return bytes(main + section) + body + rows.tobytes()
 
 
+def lcc(folder: Path) -> Path:
+    """Two parts of space in an index of two levels, and the last Gaussians as the environment, z up."""
+    s, first, far = placed(oracle(), Z_UP.T, 1.0, (0.0, 0.0, 0.0)), 25, 5
+    low, high, span = s.scales.amin(dim=0), s.scales.amax(dim=0), s.sh[:, 1:].abs().max().item()
+    xyzw = s.unit_quats.roll(-1, dims=1)
+    largest = xyzw.abs().argmax(dim=1)
+    positive = xyzw * xyzw.gather(1, largest[:, None]).sign()
+    rest = torch.stack([torch.cat([q[:i], q[i + 1 :]]) for q, i in zip(positive, largest.tolist(), strict=True)])
+    tenth = torch.cat([((rest / 2**0.5 + 0.5) * 1023).round().long(), largest[:, None]], dim=1)
+    channels = ((s.sh[:, 1:] / span + 1) / 2 * torch.tensor([2047, 1023, 2047])).round().long()
+    rows = np.zeros(len(s), FAR_RECORD)
+    rows["means"], rows["rgba"], rows["scales"] = (
+        s.means,
+        rgba_bytes(s),
+        ((s.scales - low) / (high - low) * 65535).round(),
+    )
+    rows["quats"] = (tenth << torch.tensor([0, 10, 20, 30])).sum(dim=1)
+    rows["sh"][:, :15] = (channels << torch.tensor([0, 11, 21])).sum(dim=2)
+    near, index = rows[:-far], b""
+    for number, part in enumerate((near[:first], near[first:])):
+        start = 32 * (number * first)
+        index += struct.pack("<IIQIIQI", number << 16, len(part), start, 32 * len(part), 1, start, 32)
+    base, ends = [name for name in FAR_RECORD.names if name != "sh"], {"shcoef": ([-span] * 3, [span] * 3)}
+    ends["scale"] = low.tolist(), high.tolist()
+    attributes = [{"name": f"{sky}{k}", "min": v[0], "max": v[1]} for k, v in ends.items() for sky in ("", "env")]
+    (folder / "Index.bin").write_bytes(index)
+    (folder / "data.bin").write_bytes(rfn.repack_fields(near[base]).tobytes())
+    (folder / "shcoef.bin").write_bytes(near["sh"].tobytes())
+    (folder / "environment.bin").write_bytes(rows[-far:].tobytes())
+    meta = {"fileType": "Quality", "totalLevel": 2, "indexDataSize": 36, "attributes": attributes}
+    return write_json(folder / "scene.lcc", meta)
+
+
+def streamed_sog(folder: Path) -> Path:
+    """Two nodes of one SOG, and a coarser level that is missing."""
+    shutil.copytree(DATA / "oracle_sog", folder / "0_0", dirs_exist_ok=True)
+    lods = [{"0": {"file": 0, "offset": 0, "count": 25}, "1": {"file": 1, "offset": 0, "count": 3}}]
+    lods.append({"0": {"file": 0, "offset": 25, "count": 15}})
+    meta = {"version": 1, "filenames": ["0_0/meta.json", "1_0/meta.json"]}
+    return write_json(folder / "lod-meta.json", meta | {"tree": {"children": [{"lods": each} for each in lods]}})
+
+
+def lcc2(folder: Path) -> Path:
+    """A node of a .sog above two leaves of a .spz, z up."""
+    scene = replace(placed(oracle(), Z_UP.T, 1.0, (0.0, 0.0, 0.0)), origin=None, convention=CLASSIC)
+    write_scene(folder / "a.spz", scene[:30], overwrite=True, spz_axes="opencv")
+    write_scene(folder / "b.spz", scene[30:], overwrite=True, spz_axes="opencv")
+    leaves = {"a": {"data": {"3dgs": {"name": 0, "start": 0, "count": 20}}}}
+    leaves["b"] = {"data": {"3dgs": {"name": 0, "start": 20}}, "child": []}
+    tree = {"splatFiles": ["a.spz", "b.spz", "c.sog"], "data": {"env": {"name": 1}}}
+    tree["child"] = [{"data": {"3dgs": {"name": 2}}, "child": leaves}]
+    path = write_json(folder / "scene.lcc2", {"root": tree})
+    path.write_text(path.read_text().replace("}]}", "},]}"))  # as some writers leave it
+    return path
+
+
 def splats() -> dict[str, torch.Tensor]:
     """The scene as gsplat's trainer holds it."""
     s = oracle()
@@ -112,8 +181,13 @@ MADE: Mapping[str, Callable[[], bytes]] = {
 STORED = ("oracle.ply", "oracle.compressed.ply", "oracle_v3.spz", "oracle_v4.spz", "oracle.sog", "oracle_sog/meta.json")
 
 
+SEVERAL: Mapping[str, Callable[[Path], Path]] = {"scene.lcc": lcc, "lod-meta.json": streamed_sog, "scene.lcc2": lcc2}
+
+
 def write_file(folder: Path, name: str) -> Path:
-    """The file of that name of MADE or STORED, or a checkpoint, in a folder."""
+    """The file of that name of MADE, STORED or SEVERAL, or a checkpoint, in a folder."""
+    if name in SEVERAL:
+        return SEVERAL[name](folder)
     path = folder / name
     if name.endswith(".pt"):
         torch.save({"step": 1, "splats": splats()}, path)

@@ -21,15 +21,10 @@ from aaplug.io.cameras.options import CameraFileOptions
 from aaplug.system.errors import FormatError, UsageError
 from aaplug.system.registry import Registry, named
 from tests.conftest import make_camera
+from tests.scene_files import write_json
 from tests.test_camera_paths import document
 
 QUARTER_TURN = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]  # 90° about z
-
-
-def write_json(path, document):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(document))
-    return path
 
 
 def photo(path, width, height, mode="RGB"):

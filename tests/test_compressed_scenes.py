@@ -38,21 +38,34 @@ from tests.scene_files import DATA, MADE, ksplat, oracle, splat, splats, write_f
 MADE_SPZ = ("v1.spz", "v2.spz", "raw.spz", "degree4.spz")
 CARRY_A_TAG = dict.fromkeys(
     ("oracle.compressed.ply", "oracle_v3.spz", "oracle_v4.spz", "oracle.sog", "oracle_sog/meta.json", *MADE_SPZ), MIP
-)
-SUFFIXES = ("compressed.ply", "ply", "spz", "splat", "ksplat", "pt")  # the longest first
-TAGLESS = ("plain.splat", "level0.ksplat", "level1.ksplat", "level2.ksplat", "run.pt")
+) | {"lod-meta.json": MIP}
+SUFFIXES = (
+    "compressed.ply",
+    "ply",
+    "spz",
+    "splat",
+    "ksplat",
+    "pt",
+    "lcc",
+    "lcc2",
+    "lod-meta.json",
+)  # the longest first
+TAGLESS = ("plain.splat", "level0.ksplat", "level1.ksplat", "level2.ksplat", "run.pt", "scene.lcc", "scene.lcc2")
 # largest errors of position, log-scale, opacity, colour and harmonics: a step of each format
 STEPS = {
     "oracle.compressed.ply": (3e-3, 3e-3, 3e-3, 0.02, 0.02),
     **dict.fromkeys(MADE_SPZ, (3e-4, 0.04, 3e-3, 0.02, 6e-3)),
     "v1.spz": (2e-3, 0.04, 3e-3, 0.02, 6e-3),
     "spz": (3e-4, 0.04, 3e-3, 0.02, 0.07),  # its writers keep 4 or 5 bits of harmonics
+    "lcc2": (3e-4, 0.04, 3e-3, 0.02, 6e-3),
     "sog": (2e-4, 0.03, 4e-3, 0.03, 0.7),  # 256 values a codebook; harmonics share a palette
+    "lod-meta.json": (2e-4, 0.03, 4e-3, 0.03, 0.7),
     "splat": (0.0, 1e-5, 3e-3, 8e-3, 0.0),
     "level0.ksplat": (0.0, 1e-5, 3e-3, 8e-3, 0.0),
     "level1.ksplat": (2e-4, 1e-3, 3e-3, 8e-3, 1e-3),
     "level2.ksplat": (2e-4, 1e-3, 3e-3, 8e-3, 8e-3),
     "pt": (0.0, 0.0, 1e-6, 0.0, 0.0),
+    "lcc": (0.0, 2e-3, 3e-3, 8e-3, 2e-3),
 }
 
 
@@ -72,7 +85,7 @@ def expected() -> Gaussians:
 
 
 def kind_of(name: str) -> str:
-    return "sog" if "sog" in name else next(kind for kind in SUFFIXES if name.endswith("." + kind))
+    return "sog" if "sog" in name else next(kind for kind in SUFFIXES if f".{name}".endswith("." + kind))
 
 
 def in_the_same_order(scene: Gaussians, expected: Gaussians) -> Gaussians:
@@ -84,7 +97,7 @@ def in_the_same_order(scene: Gaussians, expected: Gaussians) -> Gaussians:
 
 @pytest.mark.parametrize("name", [*CARRY_A_TAG, *TAGLESS])
 def test_each_format_gives_the_scene_within_its_steps(tmp_path: Path, expected, name: str):
-    axes = "opencv" if name.startswith("oracle_v") else "opengl"  # splat-transform turns none
+    axes = "opencv" if name.startswith("oracle_v") else "auto"  # splat-transform turns none
     scene = read_scene(write_file(tmp_path, name), allow_checkpoint=True, spz_axes=axes).gaussians()
     position, scale, opacity, colour, rest = STEPS.get(name) or STEPS[kind_of(name)]
     assert len(scene) == len(expected)
@@ -123,6 +136,35 @@ def test_each_format_is_recognized_and_read_in_parts_and_written_as_ply(tmp_path
     for field in ("means", "quats", "log_scales", "logit_opacities", "sh"):
         assert torch.equal(torch.cat([getattr(p, field) for p in parts]), getattr(whole, field))
         assert torch.equal(getattr(again, field), getattr(whole, field))
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "match"),
+    [
+        ("scene.lcc", '"Quality"', '"Best"', "fileType should be Portable or Quality, not 'Best'"),
+        ("scene.lcc", 'Level": 2', 'Level": 3', "Index.bin: has 72 bytes, not a multiple of 52 for 3 levels"),
+        ("scene.lcc", "envscale", "sky", "attributes: envscale is missing"),
+        ("lod-meta.json", '"version": 1', '"version": 2', "version should be 1, not 2"),
+        ("lod-meta.json", "0_0/meta", "../meta", "names '../meta.json', which leads out of its folder"),
+        ("lod-meta.json", '"count": 25', '"count": 41', "names 41 rows from 0 of .*, which has 40"),
+        (
+            "lod-meta.json",
+            '"offset": 25, "count": 15',
+            '"offset": 0, "count": 16',
+            "names 41 Gaussians in files that hold 40",
+        ),
+        ("lod-meta.json", '"0":', '"2":', "names 0 Gaussians in files that hold 0"),
+        ("scene.lcc2", '"name": 0', '"name": 7', "name should be a whole number from 0 to 2, not 7"),
+        ("scene.lcc2", "b.spz", "scene.lcc2", "names 'scene.lcc2', which is neither a SOG nor a .spz"),
+    ],
+)
+def test_an_index_that_its_files_do_not_bear_out_is_refused(tmp_path: Path, name: str, old: str, new: str, match: str):
+    path = write_file(tmp_path, name)
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+    with pytest.raises(FormatError, match=match):
+        read_scene(path)
 
 
 WRITABLE = [f.name for f in OWN if isinstance(f, WritableFormat) and (f.needs is None or find_spec(f.needs))]

@@ -42,6 +42,7 @@ def test_streamed_sog_lists_every_part(tmp_path, small_leaves):
     index = json.loads((tmp_path / "out" / "lod-meta.json").read_text())
     assert (index["version"], index["lodLevels"]) == (1, LEVELS + 1)
     assert index["counts"] == [len(level.scene) for level in levels]
+    assert read_scene(tmp_path / "out").count == index["counts"][0]
     leaves = index["tree"]["children"]
     assert len(leaves) > 1
     for number in range(LEVELS + 1):

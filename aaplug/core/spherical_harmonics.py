@@ -11,6 +11,7 @@ from torch import Tensor
 
 MOST_COEFFICIENTS = 25  # per channel, of degree 4
 COLOUR_OFFSET = 0.5  # 3DGS stores colours around mid-grey
+ROUNDING = 1e-12  # of a rotation of harmonics: a smaller entry is 0
 
 SH_C0 = 0.28209479177387814
 SH_C1 = 0.4886025119029199
@@ -43,6 +44,7 @@ def sh_turned(sh: Float[Tensor, "n k 3"], turn: Float[Tensor, "3 3"]) -> Float[T
     ways = even_directions(2 * MOST_COEFFICIENTS)
     after, before = (torch.stack(_sh_basis(d, k), dim=1) for d in (ways, ways @ turn.double()))
     matrix = torch.linalg.lstsq(after, before).solution
+    matrix = torch.where(matrix.abs() > ROUNDING, matrix, 0.0)
     return torch.einsum("jk,nkc->njc", matrix, sh.double()).to(sh.dtype)
 
 

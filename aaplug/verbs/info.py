@@ -72,7 +72,7 @@ def _scene_facts(scene: Scene, statistics: Survey, comments: Sequence[str]) -> d
     return {
         "file": scene.name,
         "format": scene.format,
-        "bytes": scene.path and scene.path.stat().st_size,
+        "bytes": scene.bytes,
         "gaussians": scene.count,
         "unusable_gaussians": scene.count - statistics.count,
         "sh_degree": scene.sh_degree,

@@ -29,9 +29,10 @@ from tests.bench import heading, row
 from tests.conftest import make_scene
 from tests.hostile import NAMES, Target, check, mutations, read_as_info_does, scene
 from tests.mutators import structured
+from tests.scene_files import write_file, write_json
 from tests.test_batch import SETTINGS
 from tests.test_camera_paths import document
-from tests.test_cameras_io import EXPORTED, FIXTURES, write_json
+from tests.test_cameras_io import EXPORTED, FIXTURES
 from tests.test_finetuning import make_job
 from tests.test_path_formats import SETTINGS as VIEWER_SETTINGS
 from tests.test_path_formats import TIMELINE, USDA, glb, gltf_with_buffer
@@ -78,6 +79,11 @@ def damaged(name: str, target: Target, count: int, seed: int) -> Counter[str]:
 def scenes() -> dict[str, Target]:
     """The small scenes of the tests, and one of each other registered format that can be written."""
     targets = {f"scene {name}": scene(name) for name in NAMES}
+    index = Target(
+        lambda f: write_file(f, "scene.lcc").with_name("Index.bin"),
+        lambda p: read_as_info_does(p.with_name("scene.lcc")),
+    )
+    targets["scene scene.lcc, its index"] = index
     for format in SCENE_FORMATS.values():
         if isinstance(format, WritableFormat) and (format.needs is None or find_spec(format.needs)):
             targets.setdefault(f"scene of {format.name}", Target(_written(format.name), read_as_info_does))

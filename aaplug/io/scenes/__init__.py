@@ -20,13 +20,13 @@ from aaplug.core.conventions import Convention, SpzAxes, SpzVersion
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.pyramids import Pyramid
 from aaplug.io.atomic import check_output
-from aaplug.io.scenes import compressed_ply, gltf, ksplat, ply, pt, sog, splat, spz, usd
+from aaplug.io.scenes import chunked, compressed_ply, gltf, ksplat, lcc, ply, pt, sog, splat, spz, usd
 from aaplug.io.scenes.faults import described_faults, faults_of
 from aaplug.io.scenes.frames import frame_files
 from aaplug.io.scenes.options import SceneFileOptions
 from aaplug.io.scenes.pyramid_folder import MANIFEST, is_pyramid, path_of, read_manifest, read_pyramid
 from aaplug.io.scenes.rows import library_errors
-from aaplug.io.scenes.scene import MODEL_SCENE, SOG_FOLDER, Scene, SceneFrames
+from aaplug.io.scenes.scene import FOLDER_INDEXES, MODEL_SCENE, Scene, SceneFrames
 from aaplug.io.values import read_start
 from aaplug.system.contracts import contract
 from aaplug.system.errors import FormatError, OutputError, UsageError, listing
@@ -91,6 +91,8 @@ OWN: tuple[SceneFormat, ...] = (
     *gltf.FORMATS,
     sog.UNBUNDLED,
     *usd.FORMATS,
+    lcc,
+    *chunked.FORMATS,
 )
 SCENE_FORMATS = Registry[SceneFormat]("scene format", "aaplug.io.scenes:SceneFormat", named(OWN))
 SceneLike = Scene | Gaussians | Pyramid | str | PathLike[str]
@@ -121,7 +123,7 @@ def read_scene(
     spz_axes: SpzAxes = "auto",
     frames_apart: bool = False,
 ) -> Scene:
-    """Open a scene: a file, or a folder of an INRIA model, of SOG images, of levels of detail or of frames.
+    """Open a scene: a file, or a folder of an INRIA model, of SOG images, chunks, levels of detail or frames.
 
     Its Gaussians are read when they are first asked for: `read_scene("scene.ply").gaussians()`.
 
@@ -143,7 +145,7 @@ def read_scene(
     with library_errors(Path(path)):
         given, manifest = Path(path), read_manifest(path) if is_pyramid(path) else None
         path = find_scene(given, iteration)
-        in_time = manifest is None and path.parent == given and path.name != SOG_FOLDER
+        in_time = manifest is None and path.parent == given and path.name not in FOLDER_INDEXES
         numbered = frame_files(given) if in_time else {}
     head = read_start(path, HEAD_BYTES)
     if not head:
@@ -256,8 +258,8 @@ def check_scene_output(
 def find_scene(path: str | PathLike[str], iteration: int | None = None) -> Path:
     """The scene file that a path means.
 
-    A file means itself.  A folder means the last (or the given) iteration of an INRIA model, its SOG images, the finest
-    of its levels of detail, or the first of its frames.
+    A file means itself.  A folder means the last (or the given) iteration of an INRIA model, its SOG images or chunks,
+    the finest of its levels of detail, or the first of its frames.
     Raises FormatError if the folder holds no scene, or not that iteration.
     """
     path = Path(path)
@@ -267,12 +269,14 @@ def find_scene(path: str | PathLike[str], iteration: int | None = None) -> Path:
         return path_of(path, read_manifest(path).levels[0])
     pattern, files = re.compile(r"iteration_(\d+)", re.ASCII), path.glob(MODEL_SCENE)
     scenes = {int(match[1]): file for file in files if (match := pattern.fullmatch(file.parent.name))}
-    if not scenes and (path / SOG_FOLDER).is_file():
-        return path / SOG_FOLDER
+    if not scenes and (indexes := [path / index for index in FOLDER_INDEXES if (path / index).is_file()]):
+        return indexes[0]
     if not scenes and (frames := frame_files(path)):
         return path / next(iter(frames)).name
     if not scenes:
-        known = f"point_cloud/iteration_<N>/point_cloud.ply, {MANIFEST}, {SOG_FOLDER} or numbered .ply files"
+        known = (
+            f"point_cloud/iteration_<N>/point_cloud.ply, {MANIFEST}, {', '.join(FOLDER_INDEXES)} or numbered .ply files"
+        )
         raise FormatError(path, f"holds no {known}; name the scene's file")
     chosen = max(scenes) if iteration is None else iteration
     if chosen not in scenes:

@@ -23,13 +23,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from aaplug.core.gaussians import Gaussians, joined
+from aaplug.core.gaussians import Gaussians
 from aaplug.io.atomic import replacing
 from aaplug.io.gltf import FLOAT, MAGIC, Accessor, Gltf, at_rest, glb_start
 from aaplug.io.scenes import spz
 from aaplug.io.scenes.columns import logit_of
 from aaplug.io.scenes.options import SceneFileOptions
-from aaplug.io.scenes.packed import bytes_of, half_turn_about_z, of_degree, replacing_group, standing
+from aaplug.io.scenes.packed import bytes_of, half_turn_about_z, replacing_group, rows_of, standing
 from aaplug.io.scenes.record import KEY, Facts, holdable, read_record, record_of
 from aaplug.io.scenes.rows import check_count, library_errors
 from aaplug.io.scenes.scene import Scene
@@ -86,7 +86,7 @@ class GltfFormat:
         count, degree = sum(part.count for part in parts), max(part.degree for part in parts)
         check_count(path, count)
         notes = (f"{len(parts)} primitives" if len(parts) > 1 else "", *{part.note for part in parts})
-        load, others = partial(_rows, parts, degree), tuple(document.files)
+        load, others = partial(rows_of, parts, degree), tuple(document.files)
         said = {"convention": facts.convention, "fused": facts.fused, "others": others}
         return Scene(path, self.name, count, degree, load, facts.evidence, notes=tuple(filter(None, notes)), **said)
 
@@ -197,16 +197,6 @@ def _read(tables: dict[str, Accessor], degree: int, start: int, stop: int) -> Ga
     sh = torch.stack([column(name) for name in harmonics(degree)], dim=1)
     quats, opacities = column("ROTATION").roll(1, dims=1), logit_of(column("OPACITY")[:, 0])
     return Gaussians(column("POSITION"), quats, column("SCALE").log(), opacities, sh)
-
-
-def _rows(parts: list[Primitive], degree: int, start: int, stop: int) -> Gaussians:
-    read, first = list[Gaussians](), 0
-    for part in parts:
-        begin, end = max(start - first, 0), min(stop - first, part.count)
-        if begin < end or (start == stop and not read):
-            read.append(of_degree(part.load(begin, max(begin, end)), degree))
-        first += part.count
-    return joined(read)
 
 
 # Writing

@@ -6,19 +6,20 @@ Functions raise FormatError for a file that breaks its format.
 """
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from glob import escape
 from hashlib import sha256
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from aaplug.core.gaussians import Gaussians
+from aaplug.core.gaussians import Gaussians, joined
 from aaplug.core.placing import mirrored, placed
 from aaplug.io.atomic import check_output, replacing
 from aaplug.io.limits import limit
@@ -127,3 +128,24 @@ def of_degree(scene: Gaussians, degree: int) -> Gaussians:
     """The scene with harmonics up to this degree: those above are left out, those that it lacks are 0."""
     missing = (degree + 1) ** 2 - scene.sh.shape[1]
     return replace(scene, sh=torch.nn.functional.pad(scene.sh, (0, 0, 0, missing)))
+
+
+@runtime_checkable
+class Piece(Protocol):
+    """Some of a scene's rows: how many, and what reads those from start up to stop."""
+
+    @property
+    def count(self) -> int: ...  # noqa: D102
+
+    def load(self, start: int, stop: int, /) -> Gaussians: ...  # noqa: D102
+
+
+def rows_of(pieces: Sequence[Piece], degree: int, start: int, stop: int) -> Gaussians:
+    """The rows from start up to stop of pieces in a row, with harmonics up to this degree."""
+    read, first = list[Gaussians](), 0
+    for piece in pieces:
+        begin, end = max(start - first, 0), min(stop - first, piece.count)
+        if begin < end or (start == stop and not read):
+            read.append(of_degree(piece.load(begin, max(begin, end)), degree))
+        first += piece.count
+    return joined(read)

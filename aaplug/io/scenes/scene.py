@@ -30,7 +30,7 @@ from aaplug.system.digests import digest_of_values
 from aaplug.system.errors import FormatError, UsageError, listing
 
 MODEL_SCENE = "point_cloud/iteration_*/point_cloud.ply"  # in an INRIA model folder, and in nerfbaselines' checkpoint
-SOG_FOLDER = "meta.json"  # marks a folder of SOG images
+FOLDER_INDEXES = ("meta.json", "lod-meta.json")  # each marks a folder that is a scene: of SOG images, of chunks
 PROBES = 512  # evenly spaced places in the file, from which the frame check samples
 PART = 1 << 16  # Gaussians per part: 15 MB at degree 3
 FLOAT = 4  # bytes
@@ -123,7 +123,7 @@ class Scene:
             return "scene"
         if self.file.match(MODEL_SCENE):
             return self.file.parents[2].name
-        return self.file.parent.name if self.file.name == SOG_FOLDER else self.file.name
+        return self.file.parent.name if self.file.name in FOLDER_INDEXES else self.file.name
 
     @property
     def file(self) -> Path | None:

@@ -1,0 +1,152 @@
+"""XGRIDS' .lcc, read (github.com/xgrids/LCCWhitepaper, version 5): the finest level of detail and the environment.
+
+A JSON file, and beside it index.bin, data.bin, and for degree 3 shcoef.bin; environment.bin holds far splats.  Each
+part of space has an entry in index.bin: its number, then for each level a count and the place of its records in
+data.bin.  A record is position (float32), colour and opacity (bytes), linear scales (16 bits between the ends of
+`attributes`), a quaternion xyzw without its largest component (10 bits each) and a normal.  Harmonics have 11, 10 and
+11 bits between their ends, and lie at twice the record's place.  z is up.  The format does not tell of training.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from aaplug.core.gaussians import Gaussians
+from aaplug.core.placing import placed
+from aaplug.io.limits import whole_limit
+from aaplug.io.scenes.columns import sh_of_colour
+from aaplug.io.scenes.options import SceneFileOptions
+from aaplug.io.scenes.packed import MAX_BYTE, byte_opacities, floats, largest_last, rows_of
+from aaplug.io.scenes.rows import check_count, library_errors, read_rows
+from aaplug.io.scenes.scene import Scene
+from aaplug.io.scenes.splat import EVIDENCE
+from aaplug.io.values import Entry, entries, object_of, read_bounded, read_json, text, whole
+from aaplug.system.errors import FormatError
+
+FIELDS = [("means", "<f4", 3), ("rgba", "u1", 4), ("scales", "<u2", 3), ("quats", "<u4"), ("normals", "<u2", 3)]
+WORDS = ("sh", "<u4", 16)  # of harmonics; the last one is unused
+RECORD, HARMONICS = np.dtype(FIELDS), np.dtype([WORDS])
+FAR_RECORD = np.dtype([*FIELDS, WORDS])  # of the environment, with its harmonics
+LEVEL = [("count", "<u4"), ("start", "<u8"), ("size", "<u4")]
+KINDS = {"Portable": 0, "Quality": 3}  # degree of harmonics by fileType
+COEFFICIENTS = 15  # of harmonics, beside that of degree 0
+SHIFTS, MOST = np.array([0, 11, 21], np.uint32), np.array([2047, 1023, 2047], np.uint32)  # of a word's three channels
+QUATERNION_BITS, MOST_QUATERNION, MOST_SCALE = 10, 1023, 65535
+MAX_LEVELS = 64
+Z_UP = torch.tensor([[1, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)  # to y down and z forward
+CREDIT = "Data Organization Format originated from XGRIDS"  # its license asks to show it
+
+name = "lcc"
+
+
+class Table(NamedTuple):
+    """Rows of a file; start: byte of the first."""
+
+    file: Path
+    dtype: np.dtype
+    start: int
+
+
+@dataclass(frozen=True)
+class Records:
+    """Gaussians of a part of space, or the environment.
+
+    scales, sh: ends.  harmonics, sh: None for degree 0.
+    """
+
+    count: int
+    table: Table
+    harmonics: Table | None
+    scales: Float[Tensor, "2 3"]
+    sh: Float[Tensor, "2 3"] | None = None
+
+    def load(self, start: int, stop: int) -> Gaussians:
+        """The rows from start up to stop, in the file's axes."""
+        rows = read_rows(self.table.file, self.table.dtype, start, stop, self.table.start)
+        words = rows["quats"][:, None] >> np.arange(4, dtype=np.uint32) * QUATERNION_BITS
+        rest = (floats(words[:, :3] & MOST_QUATERNION) / MOST_QUATERNION - 0.5) * 2**0.5
+        quats = largest_last(rest, torch.from_numpy(words[:, 3].astype(np.int64))).roll(1, dims=1)
+        scales = torch.lerp(self.scales[0], self.scales[1], floats(rows["scales"]) / MOST_SCALE)
+        sh = sh_of_colour(floats(rows["rgba"][:, :3]) / MAX_BYTE)[:, None]
+        if self.harmonics is not None and self.sh is not None:
+            packed = read_rows(self.harmonics.file, self.harmonics.dtype, start, stop, self.harmonics.start)["sh"]
+            values = floats((packed[:, :COEFFICIENTS, None] >> SHIFTS & MOST) / MOST)
+            sh = torch.cat([sh, torch.lerp(self.sh[0], self.sh[1], values)], dim=1)
+        return Gaussians(floats(rows["means"]), quats, scales.log(), byte_opacities(rows["rgba"][:, 3]), sh)
+
+
+def sniff(path: Path, head: bytes) -> bool:
+    """True for JSON with the suffix .lcc."""
+    return path.suffix.lower() == ".lcc" and head.lstrip().startswith(b"{")
+
+
+def open_scene(path: Path, options: SceneFileOptions) -> Scene:
+    """The finest level, and the environment if there is one; see `SceneFormat`."""
+    with library_errors(path):
+        root = object_of(read_json(path), path, name, "totalLevel and attributes", "attributes")
+        kind, levels = root.get("fileType", text), root.get("totalLevel", partial(whole, most=MAX_LEVELS))
+        root.place.expect(kind in KINDS, "fileType", " or ".join(KINDS), kind)
+        degree, attributes = KINDS[kind], entries(path, "attribute", root.value("attributes"))
+        beside = {file.name.lower(): file for file in path.parent.iterdir()}
+        names = ("index.bin", "data.bin", *(["shcoef.bin"] if degree else []))
+        for lacking in set(names) - set(beside):
+            raise FormatError(path, f"needs {lacking} beside it")
+        index, data, *harmonics = (beside[each] for each in names)
+        ends = partial(_ends, path, {each.get("name", text): each for each in attributes})
+        kinds = ("scale", "shcoef") if degree else ("scale",)
+        pieces = _pieces(index, data, harmonics[0] if degree else None, levels, ends(kinds))
+        far = FAR_RECORD if degree else RECORD
+        if (sky := beside.get("environment.bin")) and sky.stat().st_size:
+            count, rest = divmod(sky.stat().st_size, far.itemsize)
+            if rest:
+                raise FormatError(sky, f"has {sky.stat().st_size:,} bytes, not a multiple of {far.itemsize}")
+            table = Table(sky, far, 0)
+            pieces.append(Records(count, table, table if degree else None, *ends([f"env{kind}" for kind in kinds])))
+    count = sum(piece.count for piece in pieces)
+    check_count(path, count)
+    used = tuple(beside[each] for each in (*names, "environment.bin") if each in beside)
+    notes = (f"the finest of {levels} levels", CREDIT)
+
+    def load(start: int, stop: int) -> Gaussians:
+        return turned_from_z_up(rows_of(pieces, degree, start, stop))
+
+    return Scene(path, name, count, degree, load, EVIDENCE, notes=notes, others=used)
+
+
+def turned_from_z_up(scene: Gaussians) -> Gaussians:
+    """A scene whose z axis points up, in OpenCV's axes: (x, y, z) becomes (x, -z, y), as splat-transform does it."""
+    return placed(scene, Z_UP, 1.0, (0.0, 0.0, 0.0))
+
+
+def _ends(path: Path, attributes: dict[str, Entry], wanted: Sequence[str]) -> list[Float[Tensor, "2 3"]]:
+    if lacking := set(wanted) - set(attributes):
+        raise FormatError(path, f"attributes: {min(lacking)} is missing")
+    found = [attributes[key] for key in wanted]
+    return [torch.stack([each.vector("min", 3), each.vector("max", 3)]).float() for each in found]
+
+
+def _pieces(index: Path, data: Path, harmonics: Path | None, levels: int, ends: list[Tensor]) -> list[Records]:
+    """Records of the finest level, part of space by part."""
+    entry = np.dtype([("part", "<u4"), ("levels", LEVEL, (levels,))])
+    held = read_bounded(index, whole_limit("JSON"))
+    if len(held) % entry.itemsize:
+        raise FormatError(index, f"has {len(held):,} bytes, not a multiple of {entry.itemsize} for {levels} levels")
+    finest = np.frombuffer(held, entry)["levels"][:, 0]
+    size = data.stat().st_size
+    whole = size if harmonics is None else min(size, harmonics.stat().st_size // 2)
+    counts, starts, sizes = (finest[key].astype(np.uint64) for key in ("count", "start", "size"))
+    wrong = (sizes != counts * RECORD.itemsize) | (starts > size) | (sizes > whole - np.minimum(starts, whole))
+    if wrong.any() or sizes.sum() > size:
+        raise FormatError(index, f"part {int(wrong.argmax())} should lie in {data.name}, of {whole:,} bytes")
+    found = list[Records]()
+    for start, count in zip(starts.tolist(), counts.tolist(), strict=True):
+        table = Table(data, RECORD, start)
+        found.append(Records(count, table, harmonics and Table(harmonics, HARMONICS, 2 * start), *ends))
+    return found
