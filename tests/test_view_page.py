@@ -263,6 +263,11 @@ def test_a_dropped_scene_is_opened_for_this_page_alone(opened, seen, tmp_path):
     at_rest(one)
     assert one.inner_text("#facts").startswith("700 Gaussians")
     assert two.inner_text("#facts").startswith("200 Gaussians")
+    one.select_option("#view", "0")
+    assert state(one)["pose"] != state(two)["pose"]
+    one.reload()
+    at_rest(one)
+    assert state(one)["pose"] == state(two)["pose"]  # the server's scene, without the camera of the other
     with serving(tmp_path / "other.ply", seen[1], port=0, rasterizer="eager") as address:
         three = opened(where=address, as_opened=True)
         three.evaluate(drop, ["other.ply", b64encode((tmp_path / "other.ply").read_bytes()).decode()])

@@ -41,7 +41,7 @@ function hello(facts) {
   at("lost").hidden = true;
   asked = "";
   if (same) return wake();
-  Object.assign(state, {background: null, paint: null});
+  Object.assign(state, {scene: `${facts.title}, ${facts.gaussians}`, background: null, paint: null});
   at("scales").replaceChildren();
   document.title = `${facts.title} · aaplug`;
   at("title").textContent = facts.title;
@@ -269,7 +269,7 @@ new ResizeObserver(() => { if (about) { controls(); draw(); wake(); } }).observe
 
 // -------------------------------------------------------------------------------------------------------- the address
 
-const ADDRESS_FIELDS = ["pose", "depth", "at", "base", "scale", "enlarge", "fov", "sides", "split", "lens", "x", "y", "zoom", "frustums", "fade", "paint", "background"];
+const ADDRESS_FIELDS = ["scene", "pose", "depth", "at", "base", "scale", "enlarge", "fov", "sides", "split", "lens", "x", "y", "zoom", "frustums", "fade", "paint", "background"];
 
 function address() {
   return `#${encodeURIComponent(JSON.stringify(Object.fromEntries(ADDRESS_FIELDS.map((name) => [name, state[name]]))))}`;
@@ -281,7 +281,7 @@ function fromAddress() { // the state that the address names, where it can be on
     const isView = (index) => Number.isInteger(index) && index >= 0 && index < about.views.length;
     const numbers = ["depth", "scale", "fov", "split", "x", "y", "zoom", "fade"].every((name) => Number.isFinite(fields[name]));
     const sides = fields.sides.every(({recipe, quality}) => about.recipes.some(({name}) => name === recipe) && about.qualities.includes(quality));
-    if (!numbers || !sides || fields.sides.length !== 2 || !isView(fields.base) || (fields.at !== null && !isView(fields.at))) return;
+    if (fields.scene !== state.scene || !numbers || !sides || fields.sides.length !== 2 || !isView(fields.base) || (fields.at !== null && !isView(fields.at))) return;
     if (fields.pose.length !== 16 || !fields.pose.every(Number.isFinite) || !(fields.scale > 0 && fields.depth > 0)) return;
     if (fields.paint !== null && !(fields.paint in about.paints)) return;
     fields.background = /^#[0-9a-f]{6}$/.test(fields.background) ? fields.background : null;

@@ -12,7 +12,7 @@ const ADDRESS_DELAY_MS = 200; // ms without a change before the address follows
 
 let about = null; // the facts about the scene, from the server
 const state = {
-  pose: null, depth: 1, at: null, base: 0, scale: 1, enlarge: true, fov: 50, sides: [], split: 0.5, lens: false, x: 0.5, y: 0.5,
+  scene: "", pose: null, depth: 1, at: null, base: 0, scale: 1, enlarge: true, fov: 50, sides: [], split: 0.5, lens: false, x: 0.5, y: 0.5,
   zoom: 8, frustums: false, fade: 0, paint: null, background: null, shake: false, record: false,
 };
 const livePicture = {id: 0, stage: "connecting", size: [1, 1], sheets: [sheetOf(1, 1)[0], sheetOf(1, 1)[0]], photo: null, overlay: null, camera: null};
