@@ -346,6 +346,9 @@ def test_one_stands_in_cameras_and_sees_their_photographs(opened, seen):
     faded = image(page)
     page.fill("#fade", "0")
     assert not torch.equal(image(page), faded)
+    page.keyboard.press("5")  # 2, larger than the photograph
+    at_rest(page, scale="2", psnr="")
+    assert page.inner_text("#psnr") == "no PSNR above the photograph's own size"
     page.keyboard.press(".")
     at_rest(page, at="1")
     assert page.inner_text("#psnr") == ""

@@ -22,7 +22,7 @@ from aaplug.core.colours import Colour
 from aaplug.core.imaging import quantised
 from aaplug.evaluation.metrics import psnr
 from aaplug.io.cameras.camera_path import EXACT
-from aaplug.io.images import encode_jpeg, encode_png
+from aaplug.io.images import encode_jpeg, encode_png, image_size
 from aaplug.io.photographs import photo_at
 from aaplug.live.messages import Order, PickRequest, PictureRequest, Side
 from aaplug.live.overlays import OVERLAYS, depth_map
@@ -174,7 +174,7 @@ class Pictures:
         return ladder
 
     def _photograph(self, request: PictureRequest, images: list[Tensor]) -> tuple[Part, dict[str, Any]]:
-        """The photograph at the picture's size, and the PSNR of both sides against the part of it in the picture."""
+        """The photograph at the picture's size; PSNR of both sides against what of it is seen, None above its size."""
         assert request.at is not None
         view, (placed, left, top) = self._subject.views[request.at], self._subject.placed_view(request)
         assert view.photo is not None
@@ -183,6 +183,7 @@ class Pictures:
         columns = max(0, left), min(request.width, left + placed.width)
         photo = photo[rows[0] - top : rows[1] - top, columns[0] - left : columns[1] - left]
         values = [psnr(quantised(image[slice(*rows), slice(*columns)]), photo) for image in images]
+        values = None if placed.width > image_size(view.photo)[0] else values
         whole = placed.hw == (rows[1] - rows[0], columns[1] - columns[0])
         return _part_at_rest("photo", columns, photo), {"psnr": values, "rows": rows, "whole": whole}
 

@@ -216,7 +216,8 @@ function labels() {
 function figures() { // for whoever reads the page by machine, and the photograph's figures
   const {psnr, whole} = livePicture.stage === "done" ? livePicture : {};
   const values = psnr && psnr.map((value, i) => `${nameOf(i)}: ${value === null ? "equal" : `${value.toFixed(2)} dB`}`);
-  at("psnr").textContent = values ? `${values.join("\n")}${whole ? "" : "\n(of what is seen)"}` : "";
+  const none = psnr === null ? "no PSNR above the photograph's own size" : "";
+  at("psnr").textContent = values ? `${values.join("\n")}${whole ? "" : "\n(of what is seen)"}` : none;
   Object.assign(canvas.dataset, {
     id: livePicture.id, stage: livePicture.stage, size: livePicture.size.join("x"), split: state.split.toFixed(3), lens: state.lens ? lensText(state) : "off",
     at: state.at ?? "", scale: state.scale, paint: livePicture.overlay ? state.paint : "", psnr: psnr ? psnr.join() : "",
