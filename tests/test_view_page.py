@@ -402,6 +402,9 @@ def test_a_path_a_still_and_a_command_are_kept(opened, seen, tmp_path):
     page.fill("#width", "100000")
     page.click("#still")
     page.locator("#said", has_text="size: is 100000x48 px").wait_for()
+    page.fill("#width", "abc")
+    page.click("#still")
+    page.locator("#said", has_text="got abc").wait_for()
 
 
 @pytest.mark.parametrize("at", ["0", ""])

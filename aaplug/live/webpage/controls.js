@@ -135,7 +135,7 @@ function savePath() {
 const sideSeen = () => state.split < 1 ? 1 : 0; // the right one, while some of it shows
 
 function saveStill() {
-  const [width, height] = ["width", "height"].map((id) => Number(at(id).value));
+  const [width, height] = ["width", "height"].map((id) => Number(at(id).value) || at(id).value);
   if (link.send({still: {width, height, side: sideSeen()}})) say("rendering the picture");
 }
 
