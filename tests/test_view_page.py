@@ -5,6 +5,7 @@ import math
 import shlex
 from base64 import b64decode, b64encode
 from contextlib import ExitStack
+from itertools import combinations
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
@@ -470,7 +471,7 @@ def test_a_lost_page_finds_its_server_again(opened, seen):
         assert state(page)["pose"] == pose
 
 
-@pytest.mark.parametrize(("size", "scheme"), [((390, 844), "light"), ((390, 844), "dark"), ((820, 1180), "light")])
+@pytest.mark.parametrize(("size", "scheme"), [((390, 844), "light"), ((375, 667), "dark"), ((820, 1180), "light")])
 def test_it_fits_a_phone_and_a_tablet(opened, size, scheme):
     page = opened(*size, scheme)
     assert page.evaluate("document.documentElement.scrollWidth") == size[0]
@@ -481,6 +482,18 @@ def test_it_fits_a_phone_and_a_tablet(opened, size, scheme):
     )
     assert small == 0
     assert page.locator(SEEN).bounding_box()["height"] > 200
+    for key in ("Home", "l"):
+        page.keyboard.press(key)
+    page.select_option("#paint", "cost")
+    at_rest(page, paint="cost")
+    over = [page.locator(name) for name in ("#names", "#crops", "#legend", "#hint", "#status")]
+    boxes = [box for each in over if (box := each.bounding_box())]
+    for one, other in combinations(boxes, 2):
+        apart = [
+            one[at] + one[side] <= other[at] or other[at] + other[side] <= one[at]
+            for at, side in (("x", "width"), ("y", "height"))
+        ]
+        assert any(apart), (one, other)
     page.keyboard.press("h")
     page.wait_for_function(f"document.querySelector('#stage').clientHeight === {size[1]}")
     assert decoded(page.screenshot()).std() > 1 / 255

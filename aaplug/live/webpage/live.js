@@ -205,7 +205,7 @@ function labels() {
   at("name-1").textContent = state.split < 1 ? nameOf(1) : "";
   at("crops").hidden = !state.lens;
   const {start} = about;
-  at("hint").hidden = !start || state.at !== start.view || state.scale !== start.scale;
+  at("hint").hidden = !start || state.at !== start.view || state.scale !== start.scale || state.lens || livePicture.overlay;
   at("legend").hidden = !livePicture.overlay;
   if (!livePicture.overlay) return;
   drawLegend(at("legend"), livePicture.overlay.legend);
