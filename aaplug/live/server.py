@@ -20,6 +20,7 @@ from ipaddress import ip_address
 from os import sep, strerror
 from pathlib import Path
 from shutil import disk_usage
+from socket import gethostname
 from tempfile import TemporaryDirectory
 from urllib.parse import parse_qs
 
@@ -63,8 +64,9 @@ class Server:
 
     @property
     def address(self) -> str:
-        """The address to open in a browser."""
-        host = f"[{self._host}]" if ":" in self._host else self._host
+        """The address to open in a browser; by the machine's name where all of its addresses are listened on."""
+        named = gethostname() if self._host in ("", "0.0.0.0") else self._host
+        host = f"[{named}]" if ":" in named else named
         token = "" if self._token is None else f"?token={self._token}"
         return f"http://{host}:{self._port}/{token}"
 
