@@ -40,7 +40,7 @@ class FileOptions(Options):
 class SceneOptions(FileOptions):
     """The scene."""
 
-    scene: Annotated[Path | None, flag("SCENE", read=Path, by_place=True)] = None
+    scene: Annotated[Path | None, flag("[SCENE]", read=Path, by_place=True)] = None
     """A scene (.ply, .spz, .sog, .glb, others: `aaplug guide formats`), or a folder: model, levels, for some frames."""
     model_path: Annotated[Path | None, flag("FOLDER", "-m", read=Path), SCENE_FILE] = None
     """An INRIA model folder, instead of SCENE."""

@@ -47,7 +47,7 @@ class Option(NamedTuple):
     @property
     def shown(self) -> str:
         """The option as messages name it."""
-        return self.flags[0] if self.flags else str(self.argument and self.argument.metavar)
+        return self.flags[0] if self.flags else str(self.argument and self.argument.metavar.split()[0].strip("[]"))
 
     def value(self, words: Sequence[str]) -> Any:
         """The value that words give; raises UsageError."""
