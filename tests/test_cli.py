@@ -149,6 +149,7 @@ REFUSED = {
     f"{LOD} -o scene.ply --simplify 0.5 --overwrite": ["is also the input"],
     f"{TUNE} --method mipmap-gs --scale 0.5 0.25": ["one model for one scale"],
     f"{TUNE} --upsampler nearest --scale 2": ["expected bicubic, lanczos"],
+    f"{TUNE} --upsampler bicubic": ["--upsampler: is for scales above the source images', and there is none"],
     f"{TUNE} --truth photographs": ["has no photograph; --truth self"],
     f"{TUNE} --move size": ["--move: 'size' is not one of means"],
     f"{TUNE} --overwrite -o scene.ply": ["is also the input"],

@@ -39,6 +39,16 @@ def test_finetune_without_steps_changes_no_byte(cli):
         assert (found["after@0.5"] == found["before@0.5"]) == same
 
 
+def test_an_upsampler_is_for_scales_above_the_photographs(cli):
+    shutil.copytree("test", "train")
+    for i in (1, 2):
+        shutil.copy("train/r_0.png", f"train/r_{i}.png")
+    words = "finetune scene.ply --cameras . -o tuned.ply --train-scale 0.5 --upsampler bicubic --steps 0 --scale"
+    code, _, err = cli(f"{words} 2")
+    assert (code, "--upsampler: is for scales above the source images', and there is none" in err) == (2, True)
+    assert cli(f"{words} 4")[0] == 0
+
+
 def test_finetune_writes_scene_report_and_pictures(whole):
     found = read_scene(whole / "tuned.ply").gaussians()
     assert found.convention == MIP

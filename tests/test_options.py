@@ -96,7 +96,6 @@ REFUSED = {
     "lod s.ply -o l.ply --steps 3 --no-refine": "--steps: are of tuning, which --no-refine leaves out",
     "convert s.ply -o c.ply --steps 3": "--steps: belongs to the fit to a viewer; name one with --for",
     "convert s.ply -o c.ply --for gsplat --variance 0.1": "leave out --form, --variance",
-    "finetune s.ply -o t.ply --upsampler bicubic": "makes what scales above 1 should show, and there is none",
     "finetune s.ply -o t.ply --learn-filters --method group-training": "is a method of its own, beside group-training",
     "render s.ply -o out --threads 99999": "--threads: takes 1..",
     "finetune s.ply -o t.ply --scale 1,nan": "--scale: takes 0.001..64 ..., got 1.0, nan",

@@ -317,9 +317,6 @@ class FinetuneOptions(WritingOptions, ViewOptions):
         super().__post_init__()
         if self.learn_filters and self.method != USUAL_METHOD:
             raise UsageError("learn_filters", f"is a method of its own, beside {self.method}")
-        if self.upsampler is not None and max(self.scale) <= 1:
-            problem = "makes what scales above 1 should show, and there is none: give such a `scale`"
-            raise UsageError("upsampler", problem)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -27,7 +27,7 @@ from aaplug.finetuning.session import tune, tuned_scene
 from aaplug.finetuning.settings import Settings, settings_of
 from aaplug.finetuning.state import TuningJob
 from aaplug.io.atomic import AnyPath, check_output, replacing
-from aaplug.io.images import write_png
+from aaplug.io.images import image_size, write_png
 from aaplug.io.scenes import SceneLike, check_scene_output, read_scene, write_scene, written_format
 from aaplug.methods.conversion import fuse_for
 from aaplug.methods.presets import recipe_of
@@ -99,6 +99,10 @@ def finetune(scene: SceneLike, cameras: CamerasLike, output: AnyPath | None, opt
     ):
         raise OutputError(path, "holds no learned filters; a .ply does")
     truth_source = source_of(job.cameras.train, options.truth)
+    photographs = truth_source == "photographs"
+    own = (image_size(v.photo)[0] / v.width if photographs and v.photo else 1.0 for v in job.cameras.train)
+    if options.upsampler is not None and max(options.scale) <= min(own):
+        raise UsageError("upsampler", "is for scales above the source images', and there is none: give such a `scale`")
     enlarge = back_projected if options.upsampler is None else upsampled(find_upsampler(options.upsampler))
     upsampler = str(options.upsampler)
     upsampler = digest_of_files([upsampler]) if Path(upsampler).is_file() else upsampler
