@@ -18,7 +18,7 @@ import aaplug
 from aaplug.core.imaging import quantised
 from aaplug.io.images import checked_image, image_size, read_image, read_rgba, write_png
 from aaplug.io.photographs import read_photo
-from aaplug.system.errors import FormatError, UsageError
+from aaplug.system.errors import FormatError, OutputError, UsageError
 from tests.conftest import memory_taken, needs_peak_memory
 
 WHITE, BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
@@ -48,6 +48,12 @@ def test_what_is_no_image_is_not_written(tmp_path, case):
     with pytest.raises(UsageError, match=re.escape(said)):
         write(image, **options)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_png_is_named_as_one(tmp_path):
+    with pytest.raises(OutputError, match=r"image\.jpg: is no name of a PNG"):
+        write_png(tmp_path / "image.jpg", random_image())
+    write_png(tmp_path / "image.PNG", random_image())
 
 
 @pytest.mark.parametrize("kind", [torch.float32, torch.float64])

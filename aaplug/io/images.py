@@ -32,7 +32,7 @@ from aaplug.core.imaging import levels
 from aaplug.io.atomic import replacing
 from aaplug.io.limits import whole_limit
 from aaplug.system.contracts import contract
-from aaplug.system.errors import MAX_VALUE_CHARACTERS, FormatError, UsageError, listing, not_one_of
+from aaplug.system.errors import MAX_VALUE_CHARACTERS, FormatError, OutputError, UsageError, listing, not_one_of
 from aaplug.system.executors import torch_threads
 
 LOSSLESS_WEBP = 101  # OpenCV's quality for it
@@ -97,9 +97,11 @@ def write_png(
     """Write colours, clamped to [0, 1], as a PNG of 8 or 16 bits.
 
     Raises:
-        OutputError: see `replacing`.
+        OutputError: see `replacing`; also, the file's name does not end in .png.
         UsageError: it is no image of finite floats [height, width, 3], or there is no such bit depth.
     """
+    if Path(path).suffix.lower() != ".png":
+        raise OutputError(path, "is no name of a PNG, which ends in .png; `aaplug.render` writes other formats")
     png = encoded(".png", rgb, bit_depth=bit_depth)
     with replacing(path, overwrite) as stream:
         stream.write(png)
