@@ -67,7 +67,7 @@ def test_help_of_a_verb_opens_with_when_to_use_it_and_when_another(cli, verb):
 def test_render_shows_few_options_before_those_with_a_heading(cli):
     text = HEADING.split(cli("render --help")[1])
     assert text[0].startswith("usage: aaplug render [-h] [OPTIONS] [SCENE]\n")  # or a model folder, by -m
-    headings, options = text[1::2], re.findall(r"^ {1,2}(-\w|--[a-z-]+|\[?[A-Z]+)\b", "".join(text[2:6:2]), re.MULTILINE)
+    headings, options = text[1::2], re.findall(r"(?m)^ {1,2}(-\w|--[a-z-]+|\[?[A-Z]+)\b", "".join(text[2:6:2]))
     assert headings[:3] == ["positional arguments", "options", "scene file options"]
     assert {"[SCENE", "-h", "-o", "--cameras", "--scale"} <= set(options)
     assert len(options) <= 15

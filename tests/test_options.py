@@ -84,6 +84,8 @@ REFUSED = {
     "convert s.ply -o c.ply --for supersplatt": "--for: 'supersplatt' is not one of classic",
     "lod s.ply -o l.ply --for spark --no-refine": "--for: is what the result is tuned for: leave out --no-refine",
     "render s.ply -o out --scale x": "--scale: takes 0.001..64, got x",
+    "render s.ply -o out --passes rgb,depth,rgb": "--passes: names one twice: rgb, depth, rgb",
+    "evaluate s.ply -o out --recipe mip mip": "--recipe: names one twice: mip, mip",
     "render s.ply -o out --bit-depth 9": "--bit-depth: '9' is not one of 8, 16, 32",
     "render s.ply -o out --scale 2 --resolution 8x8": "--scale: and --resolution both set the size; give one",
     "render s.ply -o out --resolution -1x-1": "--resolution: takes sizes such as 400x400, got -1x-1",

@@ -98,9 +98,12 @@ class Names(Argument):
     kind: str | None = None
 
     def check(self, option: str, value: Any) -> None:
-        """Refuse other names."""
+        """Refuse other names, and one that is given twice."""
         names = [*map(str, self.others), *(names_of(self.kind) if self.kind else ())]
-        for each in value if isinstance(value, (list, tuple)) else [value]:
+        values = value if isinstance(value, (list, tuple)) else [value]
+        if len(set(map(str, values))) < len(values):
+            raise UsageError(option, f"names one twice: {', '.join(map(str, values))}")
+        for each in values:
             name = str(each)[:MAX_VALUE_CHARACTERS]
             if each is not None and name not in names and (self.kind is None or isinstance(each, str)):
                 raise UsageError(option, not_one_of(name, names))
