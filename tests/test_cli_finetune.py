@@ -76,7 +76,7 @@ def test_a_run_stopped_by_ctrl_c_and_resumed_writes_what_an_uninterrupted_one_do
     monkeypatch.setattr(loop, "advance", pressed)
     code, out, err = cli(RUN)
     assert (code, out) == (130, "")
-    assert "stopped at step 1; the checkpoint is written" in err
+    assert "stopped at step 1; the checkpoint is written; --resume continues" in err
     assert [path.name for path in Path().glob("tuned.*")] == ["tuned.finetune.pt"]
     Path("tuned.ply").touch()  # as if it had been killed while it measured
     monkeypatch.setattr(loop, "advance", real)
