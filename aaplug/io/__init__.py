@@ -9,3 +9,4 @@ from typing import Literal
 MOST_FPS = 1000  # frames per second of a video
 
 StreamName = Literal["sog", "3dtiles", "rad"]  # of `lod --to`
+STREAM_INDEXES = {"sog": "lod-meta.json", "3dtiles": "tileset.json", "rad": "scene.rad"}  # files that viewers open

@@ -28,7 +28,7 @@ from torch import Tensor
 
 from aaplug.core.gaussians import Gaussians, joined
 from aaplug.core.placing import box_of
-from aaplug.io import StreamName, stream_pages
+from aaplug.io import STREAM_INDEXES, StreamName, stream_pages
 from aaplug.io.atomic import make_folder, replacing
 from aaplug.io.rad import MAX_NODE_SIZE, tree_of, write_rad
 from aaplug.io.scenes import gltf, read_scene, write_scene
@@ -81,9 +81,9 @@ class Stream:
 
 
 STREAMS = {
-    "sog": Stream("playcanvas", "lod-meta.json", "meta.json", ("playcanvas/build/playcanvas.min.mjs",)),
-    "3dtiles": Stream("cesium", "tileset.json", "splats.spz.glb", ("cesium/Build/Cesium",), 3.0),
-    "rad": Stream("spark", "scene.rad", "front.ply", (SPARK, *THREE)),
+    "sog": Stream("playcanvas", STREAM_INDEXES["sog"], "meta.json", ("playcanvas/build/playcanvas.min.mjs",)),
+    "3dtiles": Stream("cesium", STREAM_INDEXES["3dtiles"], "splats.spz.glb", ("cesium/Build/Cesium",), 3.0),
+    "rad": Stream("spark", STREAM_INDEXES["rad"], "front.ply", (SPARK, *THREE)),
 }
 
 

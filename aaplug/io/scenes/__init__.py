@@ -19,6 +19,7 @@ from typing import Protocol, runtime_checkable
 from aaplug.core.conventions import Convention, SpzAxes, SpzVersion
 from aaplug.core.gaussians import Gaussians
 from aaplug.core.pyramids import Pyramid
+from aaplug.io import STREAM_INDEXES
 from aaplug.io.atomic import check_output
 from aaplug.io.scenes import chunked, compressed_ply, gltf, ksplat, lcc, ply, pt, sog, splat, spz, usd
 from aaplug.io.scenes.faults import described_faults, faults_of
@@ -273,6 +274,8 @@ def find_scene(path: str | PathLike[str], iteration: int | None = None) -> Path:
         return indexes[0]
     if not scenes and (frames := frame_files(path)):
         return path / next(iter(frames)).name
+    if not scenes and (index := next((name for name in STREAM_INDEXES.values() if (path / name).is_file()), None)):
+        raise FormatError(path, f"holds levels for another viewer ({index}); name the scene that they were made of")
     if not scenes:
         known = (
             f"point_cloud/iteration_<N>/point_cloud.ply, {MANIFEST}, {', '.join(FOLDER_INDEXES)} or numbered .ply files"
