@@ -812,6 +812,7 @@ def test_what_a_plug_in_reads_is_checked(tmp_path, monkeypatch, change, message)
 def test_a_path_is_text_too(tmp_path):
     assert len(aaplug.read_cameras(str(inria(tmp_path))).all) == 1
     assert len(read_camera_path(str(write_json(tmp_path / "path.json", document()))).cameras) == 1
+    assert read_cameras(tmp_path / "path.json").notes[0].startswith("camera path: 1 free camera, ")
 
 
 # Real scenes ------------------------------------------------------------------------------------

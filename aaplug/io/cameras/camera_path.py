@@ -16,7 +16,7 @@ from aaplug.io.cameras.options import CameraFileOptions, described_sizes, file_s
 from aaplug.io.cameras.photos import refuse_folder
 from aaplug.io.cameras.poses import inverse, pose_of_opengl
 from aaplug.io.values import Entry, entries, focal, mentions, number, object_of, pixels, read_json
-from aaplug.system.errors import UsageError
+from aaplug.system.errors import UsageError, counted
 
 KEY = "camera_path"
 PERSPECTIVE = "perspective"
@@ -55,7 +55,7 @@ def read(path: Path, options: CameraFileOptions) -> CameraSet:
     sizes, _ = file_sizes(cameras, options)
     cameras = [camera.resized(*size) for camera, size in zip(cameras, sizes, strict=True)]
     split = undivided(cameras, "a path has no split")
-    what = f"camera path: {len(cameras)} free cameras, {described_sizes(cameras)}"
+    what = f"camera path: {counted(len(cameras), 'free camera')}, {described_sizes(cameras)}"
     note = f"{what}; used in place of training cameras, which would give better sampling bounds"
     return CameraSet(split.train, split.test, notes=(note, split.note))
 
