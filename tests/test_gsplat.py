@@ -587,12 +587,14 @@ def test_gradients_equal_finite_differences(given, packed):
     assert torch.autograd.gradcheck(draw, inputs, eps=1e-7, rtol=1e-4, atol=1e-4, fast_mode=True)
 
 
-def test_opaque_transparent_and_flat_gaussians_have_finite_gradients():
-    values, views = gaussians(), two_views()
+@pytest.mark.parametrize("lens", [None, "fisheye"])
+def test_opaque_transparent_flat_and_unturned_gaussians_have_finite_gradients(lens):
+    values, views = gaussians(), two_views() | (lens_words(lens, 2) if lens else {})
     values["opacities"][0], values["opacities"][1] = 0.0, 1.0
     values["scales"][2] = 0.0
     values["scales"][3, 0] = 0.0
-    leaves = [x.requires_grad_() for x in values.values()]
+    values["quats"][4] = 0.0
+    leaves = [x.requires_grad_() for x in (*values.values(), views["viewmats"])]
     image, _, _ = rasterization(**values, **views, rasterize_mode="antialiased")
     for gradient in torch.autograd.grad(image.square().sum(), leaves):
         assert gradient.isfinite().all()

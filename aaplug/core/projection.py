@@ -26,6 +26,7 @@ from aaplug.core.splats import Splats2D, picked
 JACOBIAN_MARGIN = 0.3  # of half the image: 3DGS linearises no farther out (1.3 tan(fov/2))
 PLACES = 17  # along a side, at which it is found what a distorting pinhole sees
 MAX_SIGMA = 1e9  # px: larger splats look the same, but their determinant overflows float32
+MIN_LENGTH = 1e-12  # of a quaternion, which one of length 0 is divided by; its gradient stays finite
 MIN_FACING = 1e-6  # of depth: a disc at a flatter angle is a line, and its slope overflows
 
 
@@ -172,7 +173,7 @@ def _shape(
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:
     """Packed covariance and determinant, from the rows of J W."""
     lengths = log_scales.clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE).exp().unbind(dim=1)
-    quats = quats / quats.square().sum(dim=1, keepdim=True).sqrt()
+    quats = quats / quats.square().sum(dim=1, keepdim=True).clamp(min=MIN_LENGTH**2).sqrt()
     axes = zip(*rotation_rows(quats), strict=True)
     a, b = [], []
     for axis, length in zip(axes, lengths, strict=True):

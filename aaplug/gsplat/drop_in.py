@@ -71,7 +71,7 @@ def rasterization(
 
     Args:
         means: [..., n, 3], in world units.
-        quats: wxyz, of any length but zero, [..., n, 4].
+        quats: wxyz, of any length; one of length zero turns nothing; [..., n, 4].
         scales: standard deviations, [..., n, 3], in world units.
         opacities: in [0, 1], [..., n].
         colors: channels, [..., n, d] or [..., c, n, d]; with `sh_degree` coefficients, [..., n, k, 3] or
