@@ -554,6 +554,14 @@ def test_arguments_that_ask_for_the_default_are_taken():
     assert rasterization(**values, **views, **LIKE_DEFAULTS)[0].equal(expected)
 
 
+@pytest.mark.parametrize("function", [rasterization, rasterization_2dgs])
+def test_autocast_changes_nothing(function):
+    values, views = gaussians(dtype=torch.float32, degree=1), two_views(torch.float32)
+    expected, *_ = function(**values, **views, sh_degree=1, render_mode="RGB+ED")
+    with torch.autocast("cpu"):
+        assert function(**values, **views, sh_degree=1, render_mode="RGB+ED")[0].equal(expected)
+
+
 def test_depth_needs_no_colours():
     values, views = gaussians(degree=1), two_views()
     expected, _, _ = rasterization(**values, **views, sh_degree=1, render_mode="ED")

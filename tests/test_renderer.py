@@ -138,6 +138,14 @@ def test_a_renderer_can_be_sent_to_another_process(cameras):
     assert again(cameras[0]).rgb.equal(renderer(cameras[0]).rgb)
 
 
+@pytest.mark.parametrize("recipe", ["auto", "2dgs", "analytic"])
+def test_autocast_changes_nothing(recipe, cameras):
+    renderer = Renderer.of(make_scene(30), cameras, recipe)
+    expected = renderer(cameras[0].scaled(1 / 2)).rgb
+    with torch.autocast("cpu"):
+        assert renderer(cameras[0].scaled(1 / 2)).rgb.equal(expected)
+
+
 def test_paths_are_read(sample_folder, sample_cameras):
     scene, view = sample_folder / "chair.ply", sample_cameras.test[0].scaled(0.125)
     by_path, by_hand = (

@@ -4,7 +4,8 @@ A kernel is a function of tensors.  Run eagerly it is plain array code, for any 
 `rasterizers.tiled.ahead_of_time` compiles the same source into few fused loops.  A stage asks its `Kernels` to run it.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Literal
 
@@ -101,6 +102,13 @@ class Kernels:
         It takes these arguments, and others that differ in their values and in leading sizes of at least 2.
         """
         return kernel.function
+
+
+@contextmanager
+def in_full_precision() -> Iterator[None]:
+    """Keep the caller's `torch.autocast` out of the block: bfloat16 has too few digits to place a splat."""
+    with torch.autocast("cpu", enabled=False):
+        yield
 
 
 def materialized(x: Tensor) -> Tensor:

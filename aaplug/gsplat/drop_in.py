@@ -9,6 +9,7 @@ from torch import Tensor
 from aaplug.core.cameras import Side
 from aaplug.core.conventions import CLASSIC
 from aaplug.core.interfaces import Rasterizer
+from aaplug.core.kernels import in_full_precision
 from aaplug.core.rules import RULES_GSPLAT
 from aaplug.gsplat.arguments import Options, check_shape, refuse, views_of
 from aaplug.gsplat.choice import rasterizer_of
@@ -22,6 +23,7 @@ From0 = Annotated[float, Range(0)]
 
 
 @contract
+@in_full_precision()
 def rasterization(
     means: Float[Tensor, "*b n 3"],
     quats: Float[Tensor, "*b n 4"] | None,
