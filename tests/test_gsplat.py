@@ -608,6 +608,17 @@ def test_opaque_transparent_flat_and_unturned_gaussians_have_finite_gradients(le
         assert gradient.isfinite().all()
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+@pytest.mark.parametrize("function", [rasterization, rasterization_2dgs])
+def test_gradients_have_no_gradients_and_say_so(function, dtype):
+    values, views = gaussians(12, dtype), two_views(dtype)
+    means = values["means"].requires_grad_()
+    image, *_ = function(**values, **views)
+    (gradient,) = torch.autograd.grad(image.square().sum(), means, create_graph=True)
+    with pytest.raises(RuntimeError, match="differentiate twice"):
+        gradient.square().sum().backward()
+
+
 @pytest.mark.parametrize("lens", [None, "fisheye"])
 @pytest.mark.parametrize("packed", [True, False])
 def test_absolute_gradients_are_summed_over_pixels(packed, lens):

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from aaplug.core.cameras import Camera
 from aaplug.core.gaussians import Gaussians
@@ -43,7 +44,8 @@ class _Shade(torch.autograd.Function):
         return parts[0] if len(parts) == 1 else torch.cat(parts)
 
     @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+    @once_differentiable
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
         sh, means, centre, sources = ctx.saved_tensors
         kernel = gradients_kernel(sh.shape[1])
         needs = ctx.needs_input_grad[:2]

@@ -18,6 +18,7 @@ from typing import Any
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
 from aaplug.core.interfaces import Limits, PixelKernel, Pixels
@@ -71,8 +72,9 @@ class _Composite(torch.autograd.Function):
         return image
 
     @staticmethod
+    @once_differentiable
     @on_free_cores()
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None, None]:
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Gradient of the raster rows.
 
         What splats contribute in a tile is kept step by step, and summed over tiles at the end.

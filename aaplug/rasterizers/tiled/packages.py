@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from aaplug.core.kernels import BACKWARD, Kernel, Kernels, Runner
 from aaplug.methods.pixel_kernels.raster_rows import PIXELS
@@ -107,7 +108,8 @@ class _Tracked(torch.autograd.Function):
         return tuple(package.run(list(args)))
 
     @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+    @once_differentiable
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
         args = ctx.saved_tensors
         results = iter(_pulled_back(ctx.package, args, [grad.contiguous() for grad in grads]))
         return None, None, *(next(results) if arg.is_floating_point() else None for arg in args)
