@@ -7,12 +7,18 @@ import shlex
 import subprocess
 import sys
 import tomllib
+from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 
+import numpy as np
 import pytest
 
+from aaplug.core.colours import Colour
+from aaplug.evaluation import METRICS
 from aaplug.io.images import image_size
 from aaplug.io.scenes import read_scene, write_scene
+from aaplug.verbs.check_plugin import check_plugin
 from tests.conftest import SAMPLE
 from tests.test_documented import GAUSSIANS, few, write_cameras
 
@@ -124,3 +130,13 @@ def test_the_laws_run_over_what_the_plug_in_adds(finished):
     for name in ("soft", "dull", "four-points", "row-by-row", "soft-points", "MAE", "balls", "look"):
         assert re.search(rf"\b{name}\b.*passed", text), f"no law ran over {name}"
     assert "failed" not in text
+
+
+def test_laws_name_what_breaks_them_and_leave_out_what_a_module_imports(monkeypatch):
+    module = ModuleType("imports")
+    odd = replace(METRICS["PSNR"], name="odd", measure=lambda image, truth: image)
+    vars(module).update(Colour=Colour, where=np.where, maximum=np.maximum, ODD=odd)
+    monkeypatch.setitem(sys.modules, "imports", module)
+    [verdict] = check_plugin("imports")
+    assert (verdict.kind, verdict.name) == ("metric", "odd")
+    assert verdict.problem.startswith("metric odd: gives no number but Tensor")

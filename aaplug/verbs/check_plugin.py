@@ -2,6 +2,7 @@
 
 import inspect
 from collections.abc import Iterator
+from contextlib import suppress
 from importlib import import_module
 from importlib.metadata import entry_points
 from types import ModuleType
@@ -80,6 +81,9 @@ def _is_new(kind: str, value: Any) -> bool:
     registry = registry_of(kind)
     if isinstance(value, type) or not isinstance(value, registry.type) or any(v is value for v in registry.values()):
         return False
-    call = vars(registry.type).get("__call__")
-    wanted = [] if call is None else list(inspect.signature(call).parameters)[1:]
-    return not wanted or list(inspect.signature(value).parameters)[: len(wanted)] == wanted
+    if (call := vars(registry.type).get("__call__")) is None:
+        return True
+    wanted = list(inspect.signature(call).parameters)[1:]
+    with suppress(ValueError):  # aliases of types and some functions of C tell no arguments
+        return list(inspect.signature(value).parameters)[: len(wanted)] == wanted
+    return False
