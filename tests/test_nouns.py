@@ -118,6 +118,13 @@ def test_gaussians_with_nan_are_refused_in_memory_as_from_a_file(column):
         scene_of(replace(SCENE, **{column: poisoned}))
 
 
+@pytest.mark.parametrize("index", [torch.tensor([6]), torch.zeros(5) > 0, slice(None, None, -1), slice(0.5, None)])
+@pytest.mark.parametrize("noun", [SCENE, make_splats(6, (8, 8))], ids=lambda noun: type(noun).__name__)
+def test_an_index_is_a_place_of_each(noun, index):
+    with pytest.raises(UsageError, match="index: expected places of 6 "):
+        noun[index]
+
+
 def test_gaussians_have_a_row_of_their_file_each(tmp_path):
     write_scene(tmp_path / "scene.ply", SCENE)
     read = read_scene(tmp_path / "scene.ply").gaussians()

@@ -132,7 +132,7 @@ class Gaussians:
             origin = self.origin and replace(self.origin, rows=self.origin.rows[rows])
             columns = {name: column[index] for name, column in self.columns.items()}
             extras = {name: column[index] for name, column in self.extras.items()}
-        except (IndexError, RuntimeError, TypeError) as error:
+        except (IndexError, RuntimeError, TypeError, ValueError) as error:
             raise UsageError("index", f"expected places of {len(self)} Gaussians, got {described(index)}") from error
         return replace(self, **columns, extras=extras, origin=origin)
 

@@ -67,7 +67,7 @@ class Splats2D:
                 return self.selected(index.nonzero().squeeze(1))
             # index_select is several times faster than [index]
             return self.with_columns({name: x.index_select(0, index) for name, x in self._columns().items()})
-        except (IndexError, RuntimeError, TypeError) as error:
+        except (IndexError, RuntimeError, TypeError, ValueError) as error:
             raise UsageError("index", f"expected places of {len(self)} splats, got {described(index)}") from error
 
     def selected(self, rows: Int[Tensor, " k"]) -> "Splats2D":
