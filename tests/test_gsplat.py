@@ -795,38 +795,57 @@ def test_patch_says_what_it_needs(monkeypatch, homes, missing):
 
 WRONG = {
     "scales: expected torch.float64, as means have, got torch.float32": {"scales": torch.ones(40, 3)},
-    "means: expected a tensor [*b, n, 3] of floats, got float32 [40, 2]": {"means": torch.zeros(40, 2)},
-    "quats: expected a tensor [*b, n, 4] of floats or None, got float32 [3, 4], n = 40": {"quats": torch.ones(3, 4)},
-    "scales: expected a tensor [*b, n, 3] of floats or None, got float32 [40], n = 40": {"scales": torch.ones(40)},
-    "opacities: expected a tensor [*b, n] of floats, got float32 [40, 1], n = 40": {"opacities": torch.ones(40, 1)},
+    "means: expected a tensor [*b, n, 3] of float32 or float64, got float32 [40, 2]": {"means": torch.zeros(40, 2)},
+    "quats: expected a tensor [*b, n, 4] of float32 or float64 or None, got float32 [3, 4], n = 40": {
+        "quats": torch.ones(3, 4)
+    },
+    "scales: expected a tensor [*b, n, 3] of float32 or float64 or None, got float32 [40], n = 40": {
+        "scales": torch.ones(40)
+    },
+    "opacities: expected a tensor [*b, n] of float32 or float64, got float32 [40, 1], n = 40": {
+        "opacities": torch.ones(40, 1)
+    },
     "colors: expected shape [40, 3], got [39, 3]": {"colors": torch.ones(39, 3)},
     "colors: expected shape [2, 40, 3], got [3, 40, 3]": {"colors": torch.ones(3, 40, 3)},
     "colors: expected shape [40, 9, 3], got [40, 9, 4]": {"colors": torch.ones(40, 9, 4), "sh_degree": 2},
     "sh_degree: 3 needs 16 coefficients, colors has 9": {"colors": torch.ones(40, 9, 3), "sh_degree": 3},
-    "viewmats: expected a tensor [*b, c, 4, 4] of floats, got float32 [2, 3, 4]": {"viewmats": torch.zeros(2, 3, 4)},
-    "Ks: expected a tensor [*b, c, 3, 3] of floats, got float32 [1, 3, 3], c = 2": {"Ks": torch.eye(3)[None]},
+    "viewmats: expected a tensor [*b, c, 4, 4] of float32 or float64, got float32 [2, 3, 4]": {
+        "viewmats": torch.zeros(2, 3, 4)
+    },
+    "Ks: expected a tensor [*b, c, 3, 3] of float32 or float64, got float32 [1, 3, 3], c = 2": {
+        "Ks": torch.eye(3)[None]
+    },
     "viewmats: expected a tensor": {"viewmats": torch.eye(4)},
     "viewmats: expected cameras": {"viewmats": torch.zeros(0, 4, 4), "Ks": torch.zeros(0, 3, 3)},
     "viewmats: expected matrices that can be inverted": {"viewmats": torch.zeros(2, 4, 4)},
     "Ks: expected finite numbers": {"Ks": torch.full((2, 3, 3), math.nan)},
     "width: expected an integer": {"width": 4.5},
-    "opacities: expected a tensor [*b, n] of floats": {"opacities": torch.ones(40).half()},
+    "opacities: expected a tensor [*b, n] of float32 or float64, got float16 [40]": {
+        "opacities": torch.ones(40).half()
+    },
+    "means: expected a tensor [*b, n, 3] of float32 or float64, got sparse_coo float32 [40, 3]": {
+        "means": torch.ones(40, 3).to_sparse()
+    },
     "Ks: expected fx, 0, cx; 0, fy, cy; 0, 0, 1": {"Ks": torch.ones(2, 3, 3)},
-    "backgrounds: expected a tensor [*b, c, d] of floats or None, got float32 [3], c = 2": {
+    "backgrounds: expected a tensor [*b, c, d] of float32 or float64 or None, got float32 [3], c = 2": {
         "backgrounds": torch.ones(3)
     },
     "covars: expected quats and scales, or covars": {"quats": None},
-    "covars: expected a tensor [*b, n, 3, 3] of floats or None, got float32 [40, 6], n = 40": {
+    "covars: expected a tensor [*b, n, 3, 3] of float32 or float64 or None, got float32 [40, 6], n = 40": {
         "covars": torch.ones(40, 6)
     },
     "render_mode: 'RGBD' is not one of RGB, D, ED, RGB+D, RGB+ED": {"render_mode": "RGBD"},
     "rasterize_mode: 'mip' is not one of classic, antialiased, matched": {"rasterize_mode": "mip"},
     "near_plane: expected a number above 0, got 0.0": {"near_plane": 0.0},
     "width: expected an integer from 1 to 2.14748e+09, got 0": {"width": 0},
-    "eps2d: expected a number from 0, got -0.1": {"eps2d": -0.1},
+    "eps2d: expected a number from 0 to 1e+06, got -0.1": {"eps2d": -0.1},
+    "eps2d: expected a number from 0 to 1e+06, got inf": {"eps2d": math.inf},
+    "max_alpha: expected a number above 0.00392157 to 0.999999, got 1.0": {"max_alpha": 1.0},
+    "max_alpha: expected a number above 0.00392157 to 0.999999, got -1": {"max_alpha": -1},
     'relative_rate: belongs to rasterize_mode="matched", which needs it': {"rasterize_mode": "matched"},
     "relative_rate: expected shape [2], got [3]": {"rasterize_mode": "matched", "relative_rate": torch.ones(3)},
-    "relative_rate: expected numbers above 0, got -1.0": {"rasterize_mode": "matched", "relative_rate": -1.0},
+    "relative_rate: expected finite numbers above 0, got -1.0": {"rasterize_mode": "matched", "relative_rate": -1.0},
+    "relative_rate: expected finite numbers above 0, got inf": {"rasterize_mode": "matched", "relative_rate": math.inf},
     "camera_model: 'ftheta' is not one of pinhole, ortho, fisheye": {"camera_model": "ftheta"},
     "distributed: only False is supported": {"distributed": True},
     "sparse_grad: only False is supported": {"sparse_grad": True},
@@ -839,7 +858,9 @@ WRONG = {
         "radial_coeffs": torch.ones(2, 6),
         "camera_model": "ortho",
     },
-    "tangential_coeffs: expected a tensor [*b, c, 2] of floats or None": {"tangential_coeffs": torch.ones(2)},
+    "tangential_coeffs: expected a tensor [*b, c, 2] of float32 or float64 or None": {
+        "tangential_coeffs": torch.ones(2)
+    },
     "thin_prism_coeffs: camera_model fisheye has none, got float32 [2, 4]": {
         "thin_prism_coeffs": torch.ones(2, 4),
         "camera_model": "fisheye",

@@ -253,8 +253,8 @@ def _rates(relative_rate: float | Tensor | None, shape: Sequence[int], options: 
     rates = torch.as_tensor(relative_rate, dtype=torch.float64)
     if rates.dim() > 0:
         check_shape("relative_rate", rates, shape)
-    if not (rates > 0).all():
-        raise UsageError("relative_rate", f"expected numbers above 0, got {relative_rate}")
+    if not ((rates > 0) & rates.isfinite()).all():
+        raise UsageError("relative_rate", f"expected finite numbers above 0, got {relative_rate}")
     return rates.expand(*shape).flatten().tolist()
 
 

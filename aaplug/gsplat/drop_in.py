@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from aaplug.core.cameras import Side
-from aaplug.core.conventions import CLASSIC
+from aaplug.core.conventions import CLASSIC, MAX_KERNEL
 from aaplug.core.interfaces import Rasterizer
 from aaplug.core.kernels import in_full_precision
 from aaplug.core.rules import RULES_GSPLAT
@@ -20,6 +20,8 @@ from aaplug.system.contracts import Range, contract
 
 Above0 = Annotated[float, Range(above=0)]
 From0 = Annotated[float, Range(0)]
+Kernel = Annotated[float, Range(0, MAX_KERNEL)]
+MaxAlpha = Annotated[float, Range(above=RULES_GSPLAT.min_alpha, most=1 - 1e-6)]
 
 
 @contract
@@ -37,7 +39,7 @@ def rasterization(
     near_plane: Above0 = RULES_GSPLAT.near,
     far_plane: Above0 = 1e10,
     radius_clip: From0 = 0.0,
-    eps2d: From0 = CLASSIC.kernel,
+    eps2d: Kernel = CLASSIC.kernel,
     sh_degree: Annotated[int, Range(0, 4)] | None = None,
     packed: bool = True,
     tile_size: Annotated[int, Range(1)] | None = 16,
@@ -61,7 +63,7 @@ def rasterization(
     masks: Bool[Tensor, "*b c h w"] | None = None,
     relative_rate: float | Float[Tensor, "..."] | None = None,
     trained_mode: str = "classic",
-    max_alpha: float = RULES_GSPLAT.max_alpha,
+    max_alpha: MaxAlpha = RULES_GSPLAT.max_alpha,
     rasterizer: str | Rasterizer = "auto",
     **others: object,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:

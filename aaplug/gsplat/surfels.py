@@ -18,7 +18,7 @@ from aaplug.gsplat.choice import rasterizer_of
 from aaplug.gsplat.disc_depths import distortion, median_depth
 from aaplug.gsplat.discs import Discs, normals_of_depth, splats_of
 from aaplug.gsplat.drawing import composited, features_of, finished
-from aaplug.gsplat.drop_in import Above0, From0
+from aaplug.gsplat.drop_in import Above0, From0, Kernel, MaxAlpha
 from aaplug.gsplat.table import Layout
 from aaplug.methods.pixel_kernels.surfel import SURFEL
 from aaplug.rasterizers.choice import kernels_of
@@ -44,7 +44,7 @@ def rasterization_2dgs(
     near_plane: Above0 = RULES_GSPLAT.near,
     far_plane: Above0 = 1e10,
     radius_clip: From0 = 0.0,
-    eps2d: From0 = CLASSIC.kernel,
+    eps2d: Kernel = CLASSIC.kernel,
     sh_degree: Annotated[int, Range(0, 4)] | None = None,
     packed: bool = False,
     tile_size: Annotated[int, Range(1)] | None = 16,
@@ -55,7 +55,7 @@ def rasterization_2dgs(
     distloss: bool = False,
     depth_mode: str = "expected",
     *,
-    max_alpha: float = RULES_GSPLAT.max_alpha,
+    max_alpha: MaxAlpha = RULES_GSPLAT.max_alpha,
     rasterizer: str | Rasterizer = "auto",
     **others: object,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor, Tensor, dict[str, Any]]:

@@ -133,6 +133,8 @@ def described(value: Any) -> str:
     if hasattr(value, "dtype") and hasattr(value, "shape"):
         where = "" if str(getattr(value, "device", "cpu")) == "cpu" else f" on {value.device}"
         kind = "" if str(value.dtype).startswith("torch.") else f"{type(value).__module__}'s "
+        if (layout := str(getattr(value, "layout", "torch.strided"))) != "torch.strided":
+            kind = f"{layout.removeprefix('torch.')} "
         return f"{kind}{str(value.dtype).removeprefix('torch.')} {list(value.shape)}{where}"
     if isinstance(value, SHOWN_TYPES):
         text = repr(value)
@@ -229,6 +231,6 @@ def _tensor_term(hint: Any) -> Term:
                 return False
         return True
 
-    kind = {"Float": "floats", "Int": "integers", "Bool": "booleans"}
+    kind = {"Float": " or ".join(FLOATS), "Int": "integers", "Bool": "booleans"}
     numbers = kind.get(hint.__name__.partition("[")[0], "numbers")
     return Term(holds, f"a tensor [{', '.join(map(str, dims))}] of {numbers}")
